@@ -1,37 +1,69 @@
 #!/usr/bin/env bash
-# Builds the wheel, installs it in an empty environment and trains from another directory.
+# Builds the wheel, installs it in an empty environment and trains from another directory. Of .venv, the environment
+# sees only the packages that the wheel depends on, as links: extras and tools must not be needed.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 repo=$PWD
-work=$(mktemp -d)
-trap 'rm -rf "$work"' EXIT
+folder=$(mktemp -d)
+trap 'rm -rf "$folder"' EXIT
 make wheel
-python3 -m venv "$work/venv"
-"$work/venv/bin/pip" install --quiet --disable-pip-version-check \
-  -c "$repo/constraints.txt" "$(ls -t "$repo"/dist/gsgan-*.whl | head -1)"
-cd "$work"
-export GSGAN_CACHE="$work/cache" # no caches of the checkout
-inside=$(venv/bin/python -m zipfile -l "$(ls -t "$repo"/dist/gsgan-*.whl | head -1)")
-for file in gsgan/conf/train.yaml gsgan/body/assets/free_body.npz gsgan/body/assets/body_space.npz gsgan/body/assets/ATTRIBUTION.md \
-  gsgan/synthetic/avatars/{blouse,polo}.glb gsgan/synthetic/avatars/{LICENSE,ATTRIBUTION.md} \
-  gsgan/splat/native.cpp gsgan/splat/kernels/tile.h gsgan/skeleton/templates.npz; do
-  [[ $inside == *"$file"* ]] || { echo "the wheel lacks $file"; exit 1; }
-done
-"$work/venv/bin/python" -c '
+wheel=$(ls -t dist/gsgan-*.whl | head -1)
+python=$folder/venv/bin/python
+.venv/bin/python -m venv --without-pip "$folder/venv"
+.venv/bin/pip --python "$python" install --quiet --no-deps --no-index "$wheel"
+.venv/bin/python - "$("$python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')" <<'END'
+import sys
+from importlib.metadata import distribution
+from pathlib import Path
+
+from packaging.requirements import Requirement
+
+site = Path(sys.argv[1])
+missing, linked = {"gsgan"}, set()
+while missing:
+    name = missing.pop()
+    linked.add(name)
+    for requirement in map(Requirement, distribution(name).requires or ()):
+        if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
+            missing |= {requirement.name} - linked
+    if name != "gsgan":
+        for entry in {path.parts[0] for path in distribution(name).files} - {"..", "__pycache__"}:
+            if not (site / entry).exists():
+                (site / entry).symlink_to(distribution(name).locate_file(entry))
+END
+cd "$folder"
+export GSGAN_CACHE="$folder/cache" # no caches of the checkout
+unset PYTHONPATH
+"$python" - <<'END'
 import shutil
+from importlib.util import find_spec
+from pathlib import Path
+
+import gsgan
 from gsgan.splat import build, native
+
+package = Path(gsgan.__file__).parent
+assert package.is_relative_to(Path.cwd()), package
+assert find_spec("pytest") is None and find_spec("viser") is None, "the environment is not empty"
+for file in (
+    "conf/train.yaml",
+    *("body/assets/free_body.npz", "body/assets/body_space.npz", "body/assets/ATTRIBUTION.md"),
+    *(f"synthetic/avatars/{name}" for name in ("blouse.glb", "polo.glb", "LICENSE", "ATTRIBUTION.md")),
+    *("splat/native.cpp", "splat/kernels/tile.h", "skeleton/templates.npz"),
+):
+    assert (package / file).is_file(), f"the wheel lacks {file}"
 if any(map(shutil.which, build.COMPILERS)):
     assert native.available(), native.why_not()
-'
-"$work/venv/bin/python" -m gsgan.train experiment=demo training=smoke \
-  size=small data.source.frames=12 data.source.test_frames=4 \
-  hydra.run.dir="$work/run"
-test -s "$work/run/metrics.json"
-"$work/venv/bin/python" -m gsgan.evaluate run="$work/run"
-"$work/venv/bin/python" -m gsgan.report run="$work/run" runs="$work/run" figures=[strip]
-"$work/venv/bin/python" -m gsgan
+END
+"$python" -m gsgan.train experiment=smoke \
+  data.source.frames=12 data.source.test_frames=4 data.source.rays_per_pixel=4 \
+  hydra.run.dir="$folder/run"
+test -s run/metrics.json
+"$python" -m gsgan.evaluate run="$folder/run"
+"$python" -m gsgan.report run="$folder/run" runs="$folder/run" figures=[strip]
+"$python" -m gsgan
 for command in prepare check fit; do
-  "$work/venv/bin/python" -m gsgan.$command --help >help.txt
+  "$python" -m gsgan.$command --help >help.txt
 done
-"$work/venv/bin/python" -m gsgan.bench speed --help >help.txt
-echo "the wheel works from $work"
+"$python" -m gsgan.bench speed --help >help.txt
+echo "the wheel works from $folder"

@@ -10,10 +10,11 @@ import os
 import shutil
 import sys
 from collections.abc import Callable, Iterator
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
+import hypothesis
 import numpy as np
 import pytest
 import torch
@@ -28,6 +29,14 @@ for folder in ("data", "prepare", "synthetic"):  # what tests of other folders s
     sys.path.insert(0, str(Path(__file__).parent / folder))
 torch.set_num_threads(1)  # tensors here are tiny: more threads only wait for each other
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # nor do those of the commands that tests start
+
+# Property tests: a few examples, the same ones every time; `make test-slow` searches with many.
+hypothesis.settings.register_profile(
+    "ci", max_examples=6, deadline=None, derandomize=True, database=None,
+    suppress_health_check=[hypothesis.HealthCheck.too_slow],
+)  # fmt: skip
+hypothesis.settings.register_profile("all", hypothesis.settings.get_profile("ci"), max_examples=60)
+hypothesis.settings.load_profile("ci")
 
 
 @pytest.fixture(autouse=True)
@@ -87,7 +96,7 @@ def capture(shared) -> Path:
     return shared("capture", make)
 
 
-@lru_cache(maxsize=128)
+@cache
 def composed(name: str, *overrides: str) -> DictConfig:
     from hydra import compose, initialize_config_dir
 

@@ -6,7 +6,7 @@ import pytest
 
 from gsgan.utils.config import config_folder
 
-DATA = sorted(path.stem for path in (config_folder() / "data").glob("*.yaml"))
+DATA = sorted(path.stem for path in (config_folder() / "data").glob("[!_]*.yaml"))
 
 
 @pytest.mark.parametrize("data", DATA)

@@ -8,7 +8,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from commands import ENVIRONMENT, TINY, arguments, refused, train
@@ -79,12 +78,7 @@ def test_nothing_has_moved_where_there_is_no_run(inside):
 
 @pytest.mark.parametrize(
     ("file", "text"),
-    [
-        ("config.yaml", "data: {"),
-        ("config.yaml", ""),
-        ("config.yaml", "[1]"),
-        ("hydra.yaml", "a: ["),
-    ],
+    [("config.yaml", "data: {"), ("config.yaml", ""), ("hydra.yaml", "a: [")],
 )
 def test_a_damaged_run_folder_is_one_sentence(file, text, run, tmp_path, inside):
     copy = shutil.copytree(run, tmp_path / "copy")
@@ -105,13 +99,6 @@ def test_evaluate_refuses_what_is_no_run(run, tmp_path, inside):
     refused(inside("evaluate", f"run={broken}"), "last.ckpt", "no checkpoint yet")
 
 
-def test_help(inside):
-    for command in ("train", "evaluate"):
-        result = inside(command, "--help")
-        assert result.returncode == 0
-        assert "hydra.run.dir" in result.stdout
-
-
 def test_the_list_of_commands(tmp_path):
     result = subprocess.run(
         [sys.executable, "-m", "gsgan"], cwd=tmp_path, capture_output=True, text=True, check=True
@@ -126,15 +113,6 @@ def weights(run: Path) -> dict[str, torch.Tensor]:
 
 def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
     return a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
-
-
-def test_same_seed_same_numbers_other_seed_others(run, capture, tmp_path, inside):
-    """The run was trained in another process."""
-    for folder, seed in (("again", 0), ("other", 1)):
-        given = (*arguments(capture, tmp_path / folder), "evaluate=false", f"seed={seed}")
-        assert inside("train", *given).returncode == 0
-    assert same(weights(run), weights(tmp_path / "again"))
-    assert not same(weights(run), weights(tmp_path / "other"))
 
 
 KILL = """
@@ -152,6 +130,7 @@ main()
 
 
 def test_killed_half_way_and_resumed_ends_with_the_same_weights(run, capture, tmp_path, inside):
+    """So the same seed gives the same numbers: `run` was trained in another process."""
     folder = tmp_path / "killed"
     given = [*arguments(capture, folder), "evaluate=false"]
     killed = subprocess.run(
@@ -209,65 +188,30 @@ def test_the_papers_command_fails_only_for_the_missing_path(inside):
     refused(missing, "/nowhere", "does not exist")
 
 
-def break_camera(root: Path) -> None:
+def test_bad_data_ends_in_one_sentence_and_leaves_nothing(capture, tmp_path, inside):
+    root = shutil.copytree(capture, tmp_path / "data")
     cameras = json.loads((root / "cameras.json").read_text())
     del cameras["cam01"]
     (root / "cameras.json").write_text(json.dumps(cameras))
+    refused(inside("train", *arguments(root, tmp_path / "run")), "cam01", "cameras.json")
+    assert not (tmp_path / "run").exists()
 
 
-def break_mask(root: Path) -> None:
-    import cv2
-
-    cv2.imwrite(str(root / "masks" / "cam00" / "000001.png"), np.zeros((5, 5), np.uint8))
-
-
-def break_joints(root: Path) -> None:
-    arrays = dict(np.load(root / "landmarks3d.npz"))
-    arrays["p"][:] = np.nan
-    np.savez(root / "landmarks3d.npz", **arrays)
-
-
-def break_frames(root: Path) -> None:
-    for path in (root / "images").rglob("*.*"):
-        path.unlink()
-
-
-def cut_image(root: Path) -> None:
+def test_an_image_that_cannot_be_read_ends_in_one_sentence(capture, tmp_path, inside):
+    """It is found when it is first read, perhaps after training began."""
+    root = shutil.copytree(capture, tmp_path / "data")
     path = next((root / "images" / "cam00").iterdir())
     path.write_bytes(path.read_bytes()[:60])
-
-
-@pytest.mark.parametrize(
-    ("corrupt", "words"),
-    [
-        (break_camera, ("cam01", "cameras.json")),
-        (break_mask, ("masks/cam00/000001.png",)),
-        (break_joints, ("landmarks3d.npz",)),
-        (break_frames, ("images",)),
-        (cut_image, ("images/cam00",)),
-    ],
-)
-def test_bad_data_ends_in_one_sentence_and_leaves_nothing(
-    capture, tmp_path, inside, corrupt, words
-):
-    root = shutil.copytree(capture, tmp_path / "data")
-    corrupt(root)
-    refused(inside("train", *arguments(root, tmp_path / "run")), *words)
-    if corrupt is cut_image:  # found when it is first read, perhaps after training began
-        assert not (tmp_path / "run" / "metrics.json").exists()
-    else:
-        assert not (tmp_path / "run").exists()
+    refused(inside("train", *arguments(root, tmp_path / "run")), "images/cam00")
+    assert not (tmp_path / "run" / "metrics.json").exists()
 
 
 @pytest.mark.parametrize(
     ("argument", "words"),
     [
-        ("data.root=/nowhere/at/all", ("/nowhere/at/all",)),
-        ("effects.view_dependence=9", ("view_dependence must be one of", "got 9")),
         ("trainer.precision=3-bits", ("3-bits",)),
         ("lpips.net=squeeze", ("lpips.net", "vgg or alex")),
         ("training.step_two.gan=wgan", ("training.step_two.gan", "logistic")),
-        ("model.segmentation.accuracy=best", ("model", "best")),
         ("model.deformation.width=abc", ("model:", "str")),
         ("seed=-1", ("seed", "-1")),
     ],
@@ -289,5 +233,9 @@ def test_two_processes_train_together_and_one_scores(capture, tmp_path):
 def test_a_name_that_hydra_does_not_know_ends_in_a_sentence(capture, tmp_path, inside, monkeypatch):
     """Under a tracer, as for coverage, Hydra would print its developers' view."""
     monkeypatch.setattr("hydra._internal.utils.is_under_debugger", lambda: False)
-    for argument, word in (("model=huge", "model/huge"), ("modle=full", "modle")):
+    for argument, word in (
+        ("model=huge", "model/huge"),
+        ("modle=full", "modle"),
+        ("accuracy@model.segmentation.accuracy=best", "accuracy/best"),
+    ):
         refused(inside("train", *arguments(capture, tmp_path / "run"), argument), word)

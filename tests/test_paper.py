@@ -11,7 +11,7 @@ from gsgan.model.stored import record
 from gsgan.report.departures import IDLE, clause, departures, flat
 from gsgan.utils.config import config_folder
 
-DATA = sorted(path.stem for path in (config_folder() / "data").glob("*.yaml"))
+DATA = sorted(path.stem for path in (config_folder() / "data").glob("[!_]*.yaml"))
 OURS = {  # what gsgan adds to the paper's method, and the value that leaves it out
     "effects.body_points": "off",
     "effects.colour_correction": "off",

@@ -23,7 +23,7 @@ from gsgan.data.fingerprint import fingerprint
 from gsgan.evaluate.run import make_scorer
 from gsgan.fit.fitter import Fitter, _wrong
 from gsgan.fit.frames import MaskedFrames
-from gsgan.fit.run import fit_before_training, run_fit, standard_settings
+from gsgan.fit.run import fit_before_training, run_fit
 from gsgan.fit.shape import fit_shape
 from gsgan.scene import BodyPose
 from gsgan.train.run import training_record
@@ -151,10 +151,6 @@ def test_unseen_joints(fit, people, tmp_path):
     assert np.isfinite(found["theta"]).all()
 
 
-def test_defaults_are_those_of_the_config(compose):
-    assert instantiate(compose("fit").fit) == instantiate(standard_settings())
-
-
 def test_a_fit_before_training_returns_the_data_with_its_poses(people, compose, tmp_path):
     data = GsganData(str(shutil.copytree(people, tmp_path / "plain")), size=48)
     assert data.lacks_body
@@ -214,7 +210,7 @@ def test_masks_without_anyone_are_refused(compose, people, tmp_path):
         run_fit(
             compose(
                 *("fit", f"data.root={empty}", f"out={tmp_path / 'a'}", *QUICK),
-                *("data.reader.consistency.frames=0", "data.reader.trust.watched_masks=0"),
+                *("data.reader.consistency.frames=0", "data.reader.consistency.watched_masks=0"),
             )
         )
 

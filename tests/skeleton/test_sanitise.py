@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from skeleton_poses import NAMES, REST, joint, noisy, rest, rotation
 
@@ -95,7 +95,6 @@ def test_invisible_joints_are_filled_in() -> None:
     seed=st.integers(0, 1000),
     lost=st.sets(st.sampled_from([j for j in range(33) if j not in (11, 12, 23)])),
 )
-@settings(deadline=None)
 def test_filled_in_joints_move_with_the_body(seed: int, lost: set[int]) -> None:
     p, R = noisy(seed), rotation(seed + 1)
     q, valid = sanitise(lose(p, sorted(lost)))

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from stability.cases.case import REFUSED, STATUSES, all_cases
-from stability.compared import assert_as_expected
+from stability.cases.case import REFUSED, STATUSES, all_cases, assert_as_expected
 
 CASES = all_cases()
 DRAWN = [case for case in CASES if case.subject in ("Gaussians", "scenes")]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
 import socket
 import time
@@ -17,6 +18,8 @@ from commands import refused
 viser = pytest.importorskip("viser", reason="the extra view is not installed")
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+if CHROMIUM is None and "CI" in os.environ:
+    raise FileNotFoundError("chromium is not installed: in CI the viewer's tests must run")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
 
 SOFTWARE = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")

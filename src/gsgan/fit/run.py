@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from hydra.utils import instantiate
 from numpy.typing import NDArray
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from torch import Tensor
 
 from gsgan.body.fingers import Fingers
@@ -30,7 +30,6 @@ from gsgan.fit.shape import fit_hands, fit_offsets, fit_shape
 from gsgan.scene import BodyPose
 from gsgan.skeleton import TEMPLATES
 from gsgan.utils.checks import whole
-from gsgan.utils.config import config_folder
 from gsgan.utils.console import make_console, progress
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import write_atomically, write_json, write_npz, writing
@@ -55,12 +54,12 @@ def run_fit(config: DictConfig) -> Path:
     return fit_body(data, settings, out, config.seed, device, config.shown, config.overwrite)
 
 
-def fit_before_training(data: GsganData, settings: DictConfig | None = None) -> GsganData:
+def fit_before_training(data: GsganData, settings: DictConfig) -> GsganData:
     """Fits the body of a capture that has no body poses.
 
     Args:
         data: the capture.
-        settings: the config group ``fit``; None for conf/fit/standard.yaml.
+        settings: the config group ``fit``.
 
     Returns:
         The data, which reads the capture again, with the new poses.
@@ -77,24 +76,11 @@ def fit_before_training(data: GsganData, settings: DictConfig | None = None) -> 
         skeleton=data.skeleton,
         **data.split_keys,
     )
-    chosen: Fit = instantiate(standard_settings() if settings is None else settings)
-    fit_body(seen, chosen, device=pick_device("auto"))
+    fit_body(seen, instantiate(settings), device=pick_device("auto"))
     for name, attribute in vars(GsganData).items():
         if isinstance(attribute, cached_property):
             vars(data).pop(name, None)
     return data
-
-
-def standard_settings() -> DictConfig:
-    """The config group ``fit`` as conf/fit/standard.yaml has it."""
-    folder = config_folder()
-    settings = OmegaConf.load(folder / "fit" / "standard.yaml")
-    assert isinstance(settings, DictConfig)
-    accuracy = OmegaConf.load(folder / "accuracy" / "standard.yaml")
-    merged = OmegaConf.merge({"accuracy": accuracy}, settings)
-    assert isinstance(merged, DictConfig)
-    del merged["defaults"]
-    return merged
 
 
 def fit_body(

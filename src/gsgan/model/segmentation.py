@@ -14,8 +14,7 @@ from gsgan.body import SkinnedBody
 from gsgan.body.smpl_names import group_of_part
 from gsgan.model.body_points import SkinnedGaussians, transformed
 from gsgan.scene import BodyPose, Camera, Frame, Gaussians, Raster
-from gsgan.splat import accuracy as named_accuracy
-from gsgan.splat import rasterise
+from gsgan.splat import ACCURACY, Accuracy, rasterise
 from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.tensors import full_precision
@@ -59,11 +58,11 @@ class Segmentation(SkinnedGaussians):
         points: int | None = None,
         opacity: float = 0.9,
         scale: float = 0.7,
-        accuracy: str = "standard",
+        accuracy: Accuracy = ACCURACY["standard"],
         labelled: bool = True,
     ) -> None:
         super().__init__(body, points, opacity, scale)
-        self.accuracy = named_accuracy(accuracy)
+        self.accuracy = accuracy
         self.map = class_map(body.label_names, body.vertex_labels, mode, hands_face)
         # Voted labels are saved, so that the vote is not repeated; the body's own are not.
         self.voted = body.label_source == "vote"

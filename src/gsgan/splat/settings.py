@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+import yaml
+
+from gsgan.utils.config import config_folder
 
 _EXTENTS = ("all", "opacity", "sigma")
 _DTYPES = {"float32": torch.float32, "float64": torch.float64}
@@ -73,12 +76,14 @@ class Accuracy:
         return self.extent == "all" and self.alpha_min == self.transmittance_min == 0
 
 
-exact = Accuracy("exact", 0.0, 0.0, "all", "float64", alpha_max=1.0)
-high = Accuracy("high", 1e-5, 1e-5, "opacity", "float32")
-standard = Accuracy("standard", 1 / 255, 1e-4, "opacity", "float32")
-draft = Accuracy("draft", 1 / 64, 1e-2, "sigma", "float32")
+def _preset(name: str) -> Accuracy:
+    preset = yaml.safe_load((config_folder() / "accuracy" / f"{name}.yaml").read_text())
+    del preset["_target_"]
+    return Accuracy(**preset)
 
-ACCURACY: dict[str, Accuracy] = {s.name: s for s in (exact, high, standard, draft)}
+
+ACCURACY: dict[str, Accuracy] = {n: _preset(n) for n in ("exact", "high", "standard", "draft")}
+"""The presets of conf/accuracy."""
 
 
 def accuracy(name: str) -> Accuracy:

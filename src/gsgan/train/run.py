@@ -96,7 +96,7 @@ def build_training(config: DictConfig) -> tuple[GsganData, AvatarTraining]:
     whole("seed", config.seed, 0)
     data = build_data(config)
     if data.lacks_body:
-        data = fit_before_training(data, config.get("fit"))
+        data = fit_before_training(data, config.fit)
     avatar = build_avatar(config, data.info, data.labelled("train"))
     torch.manual_seed(config.seed + DISCRIMINATOR_SALT)  # the same start beside every avatar
     with naming_group("training"):

@@ -32,13 +32,9 @@ def _vector(*xyz: float) -> Tensor:
     return torch.tensor(xyz, dtype=torch.float64)
 
 
-def _unit(*xyz: float) -> Tensor:
-    return normalize(_vector(*xyz), dim=0)
-
-
-def _millimetres(s: Tensor, count: float) -> Tensor:
-    """``[T, 1]``: so many lengths of 1 mm along the path."""
-    return count * MIN_LENGTH * s[:, None]
+def _through(s: Tensor, count: float, *direction: float) -> Tensor:
+    """``[T, 3]``: so many lengths of 1 mm to either side of zero, along a direction."""
+    return count * MIN_LENGTH * s[:, None] * normalize(_vector(*direction), dim=0)
 
 
 def _line(p: Tensor, joints: tuple[int, int], half: Tensor) -> None:
@@ -49,7 +45,7 @@ def _line(p: Tensor, joints: tuple[int, int], half: Tensor) -> None:
 
 def _shrinking_forearm(s: Tensor) -> Tensor:
     p = rest(len(s))
-    p[:, 15] = p[:, 13] + _millimetres(s, 3) * _unit(-0.8, -0.5, 0.3)
+    p[:, 15] = p[:, 13] + _through(s, 3, -0.8, -0.5, 0.3)
     return p
 
 
@@ -61,7 +57,7 @@ def _bending_arm(s: Tensor, around: float = 0.0, across: float = 0.0, reach: flo
     """
     p = rest(len(s))
     upper = _vector(*MEDIAPIPE33.rest_directions[0])
-    hinge = _unit(*(_vector(-1, 0, 0) + upper[0] * upper).tolist())
+    hinge = normalize(_vector(-1, 0, 0) + upper[0] * upper, dim=0)
     front = torch.linalg.cross(hinge, upper)
     angle = (around + reach * s)[:, None]
     d = angle.cos() * upper + angle.sin() * front + across * hinge
@@ -74,14 +70,14 @@ def _bending_arm(s: Tensor, around: float = 0.0, across: float = 0.0, reach: flo
 def _shoulders_through_the_spine(s: Tensor, direction: tuple[float, float, float]) -> Tensor:
     """The shoulder line, along the spine but for a part that passes zero."""
     p = rest(len(s))
-    _line(p, (11, 12), _vector(0, 0.15, 0) + _millimetres(s, 2) * _unit(*direction))
+    _line(p, (11, 12), _vector(0, 0.15, 0) + _through(s, 2, *direction))
     return p
 
 
 def _left_and_right_change_places(s: Tensor) -> Tensor:
     p = rest(len(s))
     for joints in ((23, 24), (11, 12)):
-        _line(p, joints, _millimetres(s, 2) * _unit(0.8, 0.0, -0.6))
+        _line(p, joints, _through(s, 2, 0.8, 0.0, -0.6))
     return p
 
 
@@ -89,20 +85,20 @@ def _hips_through_the_shoulders(s: Tensor) -> Tensor:
     """The spine passes zero, obliquely to the world's y axis."""
     p = rest(len(s))
     shift = p[:, [23, 24]].mean(1) - p[:, [11, 12]].mean(1)
-    shift = shift + _millimetres(s, 4) * _unit(0.1, 0.6, 0.8)
+    shift = shift + _through(s, 4, 0.1, 0.6, 0.8)
     p[:, [11, 12]] = p[:, [11, 12]] + shift[:, None]
     return p
 
 
 def _nose_through_the_ears(s: Tensor) -> Tensor:
     p = rest(len(s))
-    p[:, 0] = p[:, [7, 8]].mean(1) + _millimetres(s, 4) * _vector(0, 0, 1)
+    p[:, 0] = p[:, [7, 8]].mean(1) + _through(s, 4, 0, 0, 1)
     return p
 
 
 def _ears_through_each_other(s: Tensor) -> Tensor:
     p = rest(len(s))
-    _line(p, (7, 8), _millimetres(s, 2) * _unit(0.5, 0.6, 0.6))
+    _line(p, (7, 8), _through(s, 2, 0.5, 0.6, 0.6))
     return p
 
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import lru_cache, partial
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -23,46 +22,34 @@ def cases() -> Iterator[Case]:
     half_empty, empty = partial(_inputs, person=0.5), partial(_inputs, person=0.0)
     huge, large = partial(_inputs, scale=1e9), partial(_inputs, scale=1e6, shift=0.5)
     unbiased = partial(_painted, biased=False)
-    yield _case("an ordinary image", _inputs)
-    yield _case("half of the pixels all zero", half_empty)
-    yield _case("every pixel zero", empty)
-    yield _case(
-        "half of the pixels all zero, no biases",
-        half_empty,
-        unbiased,
-        note="Normalising a pixel that is zero in every channel: it stays zero.",
-    )
-    yield _case(
-        "every pixel zero, no biases",
-        empty,
-        unbiased,
-        note="The slope is 1e3 per normalisation, so 1e15 in all: this is why there are biases.",
-    )
     clamped = "F is clamped to ± 1e3 before it enters; beyond, its slope is 0."
-    yield _case("features of 1e9", huge, note=clamped)
-    yield _case("features of ± 1e6", large, note=clamped)
-    yield _case("features of 1e-6", partial(_inputs, scale=1e-6))
-    for name, half, within in (("bf16", torch.bfloat16, 0.05), ("fp16", torch.float16, 0.02)):
-        for what, make in (
+    zero = "Normalising a pixel that is zero in every channel: it stays zero."
+    steep = "The slope is 1e3 per normalisation, so 1e15 in all: this is why there are biases."
+    for name, make, run, note in (
+        ("an ordinary image", _inputs, _painted, ""),
+        ("half of the pixels all zero", half_empty, _painted, ""),
+        ("every pixel zero", empty, _painted, ""),
+        ("half of the pixels all zero, no biases", half_empty, unbiased, zero),
+        ("every pixel zero, no biases", empty, unbiased, steep),
+        ("features of 1e9", huge, _painted, clamped),
+        ("features of ± 1e6", large, _painted, clamped),
+        ("features of 1e-6", partial(_inputs, scale=1e-6), _painted, ""),
+    ):
+        yield Case("generator", name, make, run, note=note)
+    note = "The image only: half precision's gradients belong to a network whose activations near "
+    for half, dtype, within in (("bf16", torch.bfloat16, 0.05), ("fp16", torch.float16, 0.02)):
+        for name, make in (
             ("an ordinary image", _inputs),
             ("half of the pixels all zero", half_empty),
             ("features of 1e9", huge),
             ("features of ± 1e6", large),
         ):
-            yield _case(
-                f"{name} autocast, {what}",
-                make,
-                partial(_in_half_precision, half=half),
+            yield Case(
+                *("generator", f"{half} autocast, {name}", make),
+                partial(_in_half_precision, half=dtype),
                 tolerance=Tolerance(within),
-                note="The image only: half precision's gradients belong to a network whose "
-                "activations near 0 have the other sign.",
+                note=note + "0 have the other sign.",
             )
-
-
-def _case(
-    name: str, make: Callable[[], Inputs], run: Callable[..., Outputs] | None = None, **options: Any
-) -> Case:
-    return Case("generator", name, make, run or _painted, **options)
 
 
 @lru_cache(maxsize=8)

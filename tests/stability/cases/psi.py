@@ -23,21 +23,6 @@ SH_DEGREE, FEATURES = 1, 2
 NAMES = tuple(field.name for field in fields(Residuals))
 
 
-def cases() -> Iterator[Case]:
-    """All of them."""
-    yield from _saturated()
-    yield from _quaternions()
-    eye = composed(ordinary_residuals())["means"][:, 0].detach()
-    yield _case(
-        "camera a millimetre from a Gaussian's middle",
-        "The direction it is seen from turns by step / 1 mm; float32 places it to 1e-4 of 1 mm.",
-        {"tolerance": Tolerance(1e-4, 1e-3)},
-        eye=eye + torch.tensor([[6e-4, 0.0, 8e-4]], dtype=torch.float64),
-    )
-    yield from _skinned_frames()
-    yield from _first_step()
-
-
 @lru_cache(maxsize=8)
 def some_points(dtype: torch.dtype, device: torch.device) -> Densify:
     """Densify with so many points that none starts wider than Ψ allows."""
@@ -100,93 +85,92 @@ def composed(inputs: Inputs, frame: Numbers | None = None) -> dict[str, Tensor]:
     }
 
 
-def _case(
-    name: str, note: str = "", options: dict[str, Any] | None = None, **changes: float | Tensor
-) -> Case:
-    def inputs() -> Inputs:
-        made = ordinary_residuals()
-        for key, value in changes.items():
-            made[key] = torch.as_tensor(value, dtype=torch.float64).expand_as(made[key]).clone()
-        return made
-
-    return Case("Ψ", name, inputs, **{"run": composed, "note": note, **(options or {})})
+def _changed(**changes: float | Tensor) -> Inputs:
+    """Ordinary residuals but for the given ones."""
+    made = ordinary_residuals()
+    for key, value in changes.items():
+        made[key] = torch.as_tensor(value, dtype=torch.float64).expand_as(made[key]).clone()
+    return made
 
 
-def _saturated() -> Iterator[Case]:
-    yield _case("ordinary residuals")
-    for value in (1e3, -1e3):
-        note = "The mean stays a quarter of a body height away; the slope is 0."
-        yield _case(f"means' tanh saturated at {value:g}", note, means=value)
-    yield _case("means' tanh at 4", "Its slope is 1e-3.", means=4.0)
-    yield _case(
-        "means' tanh at 8",
-        "Its slope, 4e-7, is a difference of near-equal numbers: float32 has one digit of it.",
-        {"expect": FINITE_ONLY},
-        means=8.0,
-    )
-    round_ones = {"gradient_floor": {"quats": 1e-3}, "tolerance": Tolerance(gradients=1e-3)}
-    same = "The Gaussians are round, so turning them makes no difference."
-    for value in (1e3, -1e3):
-        note = f"Clamped before the exponential: nothing overflows, the slope is 0. {same}"
-        yield _case(f"scales' exponent at {value:g}", note, round_ones, scales=value)
-        note = "Clamped to ± 8, where the sigmoid is off 0 and 1; the slope beyond is 0."
-        yield _case(f"opacity's logit at {value:g}", note, opacities=value)
-        yield _case(f"colour at {value:g}", "At least 0, not bounded above.", sh=value)
-        everything = dict.fromkeys(NAMES, value)
-        yield _case(f"every residual at {value:g}", same, round_ones, **everything)
-
-
-def _quaternions() -> Iterator[Case]:
-    for name, w, x, note in (
-        (
-            "that cancels to 0",
-            *(-1.0, 0.0),
-            "It turns nothing, and has no slope: no direction is better than another.",
-        ),
-        ("that cancels to 1e-3", -1.0, 1e-3, "Its slope is 1e3."),
-        (
-            "that cancels to 6e-8",
-            *(-1.0 + 2.0**-24, 2.0**-25),
-            "The least float32 can hold beside 1. Its slope is 2e7, as it must be: clipping the "
-            "gradient's norm shortens that iteration's step.",
-        ),
-        ("of a thousand", 1e3, -7e2, ""),
-    ):
-        quats = torch.tensor([w, x, 0.0, 0.0], dtype=torch.float64)
-        yield _case(f"quaternion {name}", note, quats=quats)
-
-
-def _skinned_frames() -> Iterator[Case]:
-    """Frames of a skinned body's points: means of rotations, which shear, flatten and vanish."""
-    cos, sin = math.cos(2.6), math.sin(2.6)
-    folded = ((1 + cos) / 2, -sin / 2, 0.0, sin / 2, (1 + cos) / 2, 0.0, 0.0, 0.0, 1.0)
-    for name, frame, note in (
-        ("an elbow folded by 150 degrees", folded, "Half and half: a quarter as wide there."),
-        (
-            "two bones half a turn apart",
-            (0.0,) * 8 + (1.0,),
-            "Of rank 1: means move, and colours are seen, along one line only.",
-        ),
-        (
-            "four bones that cancel",
-            (0.0,) * 9,
-            "Gaussians shrink to points that no residual moves; no direction to be seen from.",
-        ),
-    ):
-        yield _case(f"frames of {name}", note, {"run": partial(composed, frame=frame)})
-
-
-def _first_step() -> Iterator[Case]:
-    camera = pinhole(focal=20.0, axis_angle=(3.14159265358979, 0, 0), t=(0.0, 0.85, 2.6))
+def cases() -> Iterator[Case]:
+    """All of them."""
+    for name, note, options, changes in (*_residuals(), *_quaternions(), _close_camera()):
+        yield Case("Ψ", name, partial(_changed, **changes), composed, note=note, **options)
+    for name, (frame, note) in FRAMES.items():
+        run = partial(composed, frame=frame)
+        yield Case("Ψ", f"frames of {name}", ordinary_residuals, run, note=note)
+    camera = pinhole(focal=20.0, axis_angle=(math.pi, 0, 0), t=(0.0, 0.85, 2.6))
     for name, p in (("the rest pose", rest()), ("an ordinary pose", noisy(5))):
         yield raster_case(
-            "Ψ",
-            f"step 0 on {name}",
-            lambda p=p: {"p": p, **camera},  # type: ignore[misc]
+            *("Ψ", f"step 0 on {name}", partial(dict, p=p, **camera)),
             draw=_step_zero,
             note="Exactly densify's Gaussians, grey and half transparent; only limbs shorter than "
             "5 mm start wider, at the least scale.",
         )
+
+
+Row = tuple[str, str, dict[str, Any], dict[str, Any]]  # name, note, options of the case, changes
+
+
+def _residuals() -> Iterator[Row]:
+    round_ones = {"gradient_floor": {"quats": 1e-3}, "tolerance": Tolerance(gradients=1e-3)}
+    same = "The Gaussians are round, so turning them makes no difference."
+    yield "ordinary residuals", "", {}, {}
+    yield "means' tanh at 4", "Its slope is 1e-3.", {}, {"means": 4.0}
+    note = "Its slope, 4e-7, is a difference of near-equal numbers: float32 has one digit of it."
+    yield "means' tanh at 8", note, {"expect": FINITE_ONLY}, {"means": 8.0}
+    for value in (1e3, -1e3):
+        note = "The mean stays a quarter of a body height away; the slope is 0."
+        yield f"means' tanh saturated at {value:g}", note, {}, {"means": value}
+        note = f"Clamped before the exponential: nothing overflows, the slope is 0. {same}"
+        yield f"scales' exponent at {value:g}", note, round_ones, {"scales": value}
+        note = "Clamped to ± 8, where the sigmoid is off 0 and 1; the slope beyond is 0."
+        yield f"opacity's logit at {value:g}", note, {}, {"opacities": value}
+        yield f"colour at {value:g}", "At least 0, not bounded above.", {}, {"sh": value}
+        yield f"every residual at {value:g}", same, round_ones, dict.fromkeys(NAMES, value)
+
+
+def _quaternions() -> Iterator[Row]:
+    tiny = (
+        "The least float32 can hold beside 1. Its slope is 2e7, as it must be: clipping the "
+        "gradient's norm shortens that iteration's step."
+    )
+    none = "It turns nothing, and has no slope: no direction is better than another."
+    for name, w, x, note in (
+        ("that cancels to 0", -1.0, 0.0, none),
+        ("that cancels to 1e-3", -1.0, 1e-3, "Its slope is 1e3."),
+        ("that cancels to 6e-8", -1.0 + 2.0**-24, 2.0**-25, tiny),
+        ("of a thousand", 1e3, -7e2, ""),
+    ):
+        quats = torch.tensor([w, x, 0.0, 0.0], dtype=torch.float64)
+        yield f"quaternion {name}", note, {}, {"quats": quats}
+
+
+def _close_camera() -> Row:
+    mean = composed(ordinary_residuals())["means"][:, 0].detach()
+    note = "The direction it is seen from turns by step / 1 mm; float32 places it to 1e-4 of 1 mm."
+    eye = mean + torch.tensor([[6e-4, 0.0, 8e-4]], dtype=torch.float64)
+    within = {"tolerance": Tolerance(1e-4, 1e-3)}
+    return "camera a millimetre from a Gaussian's middle", note, within, {"eye": eye}
+
+
+COS, SIN = math.cos(2.6), math.sin(2.6)
+FRAMES = {
+    "an elbow folded by 150 degrees": (
+        ((1 + COS) / 2, -SIN / 2, 0.0, SIN / 2, (1 + COS) / 2, 0.0, 0.0, 0.0, 1.0),
+        "Half and half: a quarter as wide there.",
+    ),
+    "two bones half a turn apart": (
+        (0.0,) * 8 + (1.0,),
+        "Of rank 1: means move, and colours are seen, along one line only.",
+    ),
+    "four bones that cancel": (
+        (0.0,) * 9,
+        "Gaussians shrink to points that no residual moves; no direction to be seen from.",
+    ),
+}
+"""Of a skinned body's points: means of rotations, which shear, flatten and vanish."""
 
 
 def _step_zero(

@@ -11,19 +11,11 @@ import torch
 from gsgan.scene import Camera
 from gsgan.skeleton import MEDIAPIPE33, recentre
 from stability.cases.case import FINITE_ONLY, REFUSED, Case, Inputs, Tolerance
-from stability.cases.raster import SIZE, Numbers, cloud, pinhole, raster_case
+from stability.cases.raster import SIZE, cloud, pinhole, raster_case
 
 FAR = (1e4, -2e4, 3e4)  # metres: where the origin of a survey may be
 
 _case = partial(raster_case, "scenes")
-
-
-def cases() -> Iterator[Case]:
-    """All of them."""
-    yield from _offsets()
-    yield from _units()
-    yield from _cameras()
-    yield from _refusals()
 
 
 def _scene(**camera: Any) -> Inputs:
@@ -48,81 +40,67 @@ def _recentred() -> Inputs:
     return {**scene, "means": scene["means"] - origin.unsqueeze(1), "t": camera.t}
 
 
-def _offsets() -> Iterator[Case]:
-    name = "world offset of 1e4 m, {}"
+CAMERAS: dict[str, dict[str, Any]] = {
+    "K with skew": {"skew": 4.0},
+    "principal point off centre": {"centre": (26.3, 5.1)},
+    "principal point outside the image": {"centre": (40.0, -6.0), "t": (-1.9, 1.3, 2.5)},
+    "pixels that are not square": {"aspect": 0.6},
+    "skew, off centre and not square": {"skew": -5.0, "centre": (11.0, 16.7), "aspect": 1.4},
+    "field of view of 160 degrees": {"focal": SIZE[1] / 11.3},
+    "long lens, 3 km away": {"focal": 4e4, "t": (0.1, -0.2, 3e3)},
+}
+
+
+def cases() -> Iterator[Case]:
+    """All of them."""
     yield _case(
-        name.format("as float32 holds it"),
+        "world offset of 1e4 m, as float32 holds it",
         _far,
         note="Nothing is lost beyond the rounding of the input: the offset cancels in float64.",
     )
     yield _case(
-        name.format("recentred in float64"),
+        "world offset of 1e4 m, recentred in float64",
         _recentred,
         same_numbers=False,
         note="Compared with the numbers before they were rounded.",
     )
     yield _case(
-        name.format("not recentred"),
+        "world offset of 1e4 m, not recentred",
         _far,
         same_numbers=False,
         expect=FINITE_ONLY,
         note="float32 holds 1e4 m to 1 mm: recentre joints and cameras in float64 first.",
     )
-
-
-def _units() -> Iterator[Case]:
-    def millimetres(*names: str) -> Inputs:
-        scene = _scene()
-        return {**scene, **{name: scene[name] * 1e3 for name in names}}
-
     other = "Another image, but the right one of what was given."
-    yield _case(
-        "everything in millimetres, given as metres",
-        lambda: millimetres("means", "scales", "t"),
-        note="The same image; a capture like this is refused where it is read.",
-    )
-    yield _case(
-        "Gaussians in millimetres, cameras in metres",
-        lambda: millimetres("means", "scales"),
-        note=other,
-    )
-    yield _case(
-        "Gaussians in metres, cameras in millimetres",
-        lambda: millimetres("t"),
-        tolerance=Tolerance(gradients=5e-4),
-        note=other,
-    )
-
-
-def _cameras() -> Iterator[Case]:
+    for name, parts, within, note in (
+        (
+            "everything in millimetres, given as metres",
+            ("means", "scales", "t"),
+            1e-4,
+            "The same image; a capture like this is refused where it is read.",
+        ),
+        ("Gaussians in millimetres, cameras in metres", ("means", "scales"), 1e-4, other),
+        ("Gaussians in metres, cameras in millimetres", ("t",), 5e-4, other),
+    ):
+        scene = partial(_times, dict.fromkeys(parts, 1e3))
+        yield _case(name, scene, tolerance=Tolerance(gradients=within), note=note)
     inside = {**cloud(40, scale=0.2, middle=(0.0, 0.0, 0.0)), **pinhole()}
     yield _case("camera inside the body", lambda: inside)
-    cameras: dict[str, dict[str, Any]] = {
-        "K with skew": {"skew": 4.0},
-        "principal point off centre": {"centre": (26.3, 5.1)},
-        "principal point outside the image": {"centre": (40.0, -6.0), "t": (-1.9, 1.3, 2.5)},
-        "pixels that are not square": {"aspect": 0.6},
-        "skew, off centre and not square": {"skew": -5.0, "centre": (11.0, 16.7), "aspect": 1.4},
-        "field of view of 160 degrees": {"focal": SIZE[1] / 11.3},
-        "long lens, 3 km away": {"focal": 4e4, "t": (0.1, -0.2, 3e3)},
-    }
-    for name, camera in cameras.items():
+    for name, camera in CAMERAS.items():
         yield _case(name, partial(_scene, **camera))
-
-
-def _refusals() -> Iterator[Case]:
-    for name, flip in (("mirrored camera", (1.0, 1.0, -1.0)), ("R that scales", (1.1, 1.1, 1.1))):
-        yield _case(name, partial(_with_rotation, flip), expect=REFUSED)
+    mirror = torch.tensor([[1.0], [1.0], [-1.0]], dtype=torch.float64)
+    for name, factor in (("mirrored camera", mirror), ("R that scales", 1.1)):
+        yield _case(name, partial(_times, {"R": factor}), expect=REFUSED)
     yield _case("a mean that is NaN", _with_nan, expect=REFUSED)
 
 
-def _with_rotation(diagonal: Numbers) -> Inputs:
+def _times(factors: dict[str, Any]) -> Inputs:
+    """The scene with some of its numbers multiplied."""
     scene = _scene()
-    return {**scene, "R": torch.diag(torch.tensor(diagonal, dtype=torch.float64)) @ scene["R"]}
+    return {**scene, **{name: scene[name] * factor for name, factor in factors.items()}}
 
 
 def _with_nan() -> Inputs:
     scene = _scene()
-    means = scene["means"].clone()
-    means[0, 7, 1] = float("nan")
-    return {**scene, "means": means}
+    scene["means"][0, 7, 1] = float("nan")
+    return scene
