@@ -65,8 +65,9 @@ def test_a_bare_skeleton_is_enough(run, scored):
     image = avatar.render(frame.skeleton, frame.camera)
     assert torch.equal(image, avatar.render(frame.skeleton, frame.camera, body=body))
     swapped = frame.skeleton[:, list(MEDIAPIPE33.mirror)]
-    with pytest.raises(ValueError, match="left and right are swapped"):
+    assert torch.isfinite(
         avatar.render(swapped, frame.camera)
+    ).all()  # a single frame is not judged
 
 
 def test_a_folder_without_a_run_or_a_checkpoint_is_one_sentence(run, tmp_path):

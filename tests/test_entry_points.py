@@ -73,7 +73,7 @@ def test_a_dataset_that_is_gone_is_asked_for(run, tmp_path, inside):
 
 
 def test_nothing_has_moved_where_there_is_no_run(inside):
-    refused(inside("bench", "speed", "data_root=/x"), "data_root", "give run= too")
+    refused(inside("bench", "speed", "data_root=/x"), "data_root and data_smpl require run=")
 
 
 @pytest.mark.parametrize(

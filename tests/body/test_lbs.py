@@ -7,6 +7,8 @@ from dataclasses import replace
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from gsgan.body.free import free_body
 from gsgan.body.lbs import (
@@ -122,6 +124,21 @@ def test_gradients_agree_with_finite_differences():
     assert torch.autograd.gradcheck(
         posed, (theta.requires_grad_(), transl.requires_grad_()), atol=1e-6
     )
+
+
+@given(st.lists(st.floats(-6.3, 6.3), min_size=9, max_size=9), st.floats(0, 1))
+def test_blends_never_stretch_and_slopes_are_finite(turns, share):
+    """A mean of rotations has no singular value above 1."""
+    theta = torch.tensor(turns, dtype=D).view(1, 3, 3).requires_grad_()
+    joints = torch.tensor([[0.0, 0, 0], [0.3, 0, 0], [0.6, 0, 0]], dtype=D)
+    bones = forward_kinematics(joints, (-1, 0, 1), axis_angle_to_matrix(theta), joints[:1])
+    pairs = torch.tensor([[0, 1], [1, 2], [0, 2], [2, 2]])
+    weights = torch.tensor([share, 1 - share], dtype=D).expand(4, 2)
+    A, t = blend_transforms(bones, pairs, weights)
+    assert float(torch.linalg.svdvals(A.detach()).max()) <= 1 + 1e-9
+    skin(torch.tensor([[0.7, 0.03, 0.02]], dtype=D).expand(4, 3), A, t).square().sum().backward()
+    assert theta.grad is not None
+    assert theta.grad.isfinite().all()
 
 
 def test_levels_put_parents_first():

@@ -18,6 +18,7 @@ from gsgan.body.smpl import read_smpl
 from gsgan.body.solve import Solver
 from gsgan.scene import BodyPose
 from gsgan.skeleton import MEDIAPIPE33
+from gsgan.skeleton.sides import refuse_swapped
 from gsgan.synthetic.free_subject import free_character, free_pose
 from gsgan.synthetic.posing import Choreography
 
@@ -239,9 +240,9 @@ def test_swapped_sides_are_refused_by_name(solver, poses, kind):
     with pytest.raises(
         ValueError, match=f"left and right are swapped: .* the left of {where} lies"
     ):
-        solver.solve(p, seen)
-    with pytest.raises(ValueError, match="left and right are swapped"):
-        solver.solve(p[3:4], seen[3:4])  # one frame only
+        refuse_swapped(p, seen > 0)
+    refuse_swapped(p[3:4], seen[3:4] > 0)  # a single frame may be an extreme pose
+    assert solver.solve(p[3:4], seen[3:4]).theta.isfinite().all()
 
 
 # -- SMPL

@@ -164,8 +164,8 @@ def test_held_out_cameras_are_not_used(fit, fitted, people, tmp_path):
     other = shutil.copytree(people, tmp_path / "other")
     for file in (other / "masks/cam03").iterdir():
         cv2.imwrite(str(file), np.full((96, 96), 255, np.uint8))
-    trust = "data.reader.consistency.frames=0"
-    changed = fit(trust, root=other, name="other")
+    lenient = "data.reader.consistency.frames=0"
+    changed = fit(lenient, root=other, name="other")
     np.testing.assert_array_equal(plain["theta"], changed["theta"])
     assert list(plain["fitted_to"]) == ["cam00", "cam01", "cam02"]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -322,7 +323,7 @@ def test_amc(tmp_path, proportions):
     path = write_amc(tmp_path)
     bvh, metres = read_amc(path, asf_of(path))
     assert metres == pytest.approx(0.0254 / 0.45)
-    hand = bvh.positions(bvh.rotations, bvh.root)[:, bvh.names.index("lhand")]
+    hand = bvh.posed()[:, bvh.names.index("lhand")]
     np.testing.assert_allclose(hand[0], [3 + 5 + 4.5, 17 + 8, 0], atol=1e-9)
     # C M C⁻¹ with C a quarter turn about y: about x in the bone's axes is about -z of the parent's
     np.testing.assert_allclose(hand[1], [3 - 4.5, 17 + 8 - 5, 0], atol=1e-9)
@@ -453,3 +454,61 @@ def test_real_files(proportions):
             lengths = [np.linalg.norm(f.rest[13] - f.rest[11]) for f in (again, proportions)]
             assert lengths[0] == pytest.approx(lengths[1], rel=1e-5), path
             assert (q[:, 23:25, 2].mean(1) > q[:, 29:33, 2].min(1)).all(), path
+
+
+def published(root: np.ndarray, body: np.ndarray, moves: np.ndarray) -> dict[str, dict[str, Any]]:
+    """The arrays of published files, with their keys and shapes, of a body's pose.
+
+    Args:
+        root: ``[F, 3]`` axis-angle.
+        body: ``[F, 63]`` of the 21 joints that SMPL, SMPL-H and SMPL-X share.
+        moves: ``[F, 3]`` metres.
+    """
+    F = len(root)
+    zeros = {n: np.zeros((F, n)) for n in (3, 6, 90)}
+    x = np.concatenate([root, body, zeros[3], zeros[6], zeros[90]], axis=1)
+    amass = {"trans": moves, "gender": np.array("neutral"), "betas": np.zeros(16)}
+    parts = {"root_orient": root, "pose_body": body, "pose_hand": zeros[90]}
+    parts |= {"pose_jaw": zeros[3], "pose_eye": zeros[6]}
+    smplx = amass | parts | {"poses": x, "mocap_frame_rate": np.array(60.0)}
+    smplx |= {"surface_model_type": np.array("smplx"), "num_betas": np.array(16)}
+    smplx |= {"mocap_time_length": np.array(F / 60)}
+    smpl = np.concatenate([body, zeros[6]], axis=1)
+    return {
+        "amass_smplh": amass
+        | {"poses": x[:, [*range(66), *range(75, 165)]], "dmpls": np.zeros((F, 8))}
+        | {"mocap_framerate": np.array(60.0)},
+        "amass_smplx": smplx | {"markers_latent": np.zeros((53, 3))},
+        "stage_two": smplx | {"latent_labels": np.array(["ARIEL"] * 53)},
+        "parts_only": {k: v for k, v in smplx.items() if k != "poses"},
+        "humman": {"betas": np.zeros((F, 10)), "body_pose": smpl}
+        | {"global_orient": root, "transl": moves},
+        "aist": {"smpl_poses": np.concatenate([root, smpl], axis=1), "smpl_trans": moves},
+    }
+
+
+@pytest.mark.parametrize(
+    "name", ["amass_smplh", "amass_smplx", "stage_two", "parts_only", "humman", "aist", "zju"]
+)
+def test_published_keys_of_the_smpl_family(tmp_path, shared, proportions, name):
+    from writers.smpl import write_smpl
+
+    model = shared("smplx.npz", lambda path: write_smpl(path, kind="smplx"))
+    rng = np.random.default_rng(2)
+    root, body = np.tile([0.1, 0.9, 0.2], (4, 1)), 0.3 * rng.standard_normal((4, 63))
+    moves = rng.standard_normal((4, 3))
+    files = published(root, body, moves)
+    skinned = read_smpl(model)
+    if name == "zju":  # rotates about the model's origin
+        J0 = skinned.rest_joints(torch.zeros(1, 10, dtype=torch.float64))[0, 0].numpy()
+        R = torch.from_numpy(rotation(root)).numpy()
+        poses = np.concatenate([np.zeros((4, 3)), body, np.zeros((4, 6))], axis=1)
+        files[name] = {"poses": poses, "Rh": root, "Th": moves + J0 - (R @ J0)}
+        files[name] |= {"shapes": np.zeros((4, 10))}
+    np.savez(tmp_path / "a.npz", **files[name])
+    motion = read_motion(tmp_path / "a.npz", Source(proportions, model))
+    theta = torch.zeros(4, len(skinned.parents), 3, dtype=torch.float64)
+    theta[:, :22] = torch.from_numpy(np.concatenate([root, body], axis=1)).reshape(4, 22, 3)
+    joints = skinned.posed_joints(theta, theta.new_zeros(1, 1), torch.from_numpy(moves)).numpy()
+    at = {11: 16, 13: 18, 15: 20, 12: 17, 14: 19, 16: 21, 23: 1, 25: 4, 27: 7, 24: 2, 26: 5, 28: 8}
+    np.testing.assert_allclose(motion.p[:, list(at)], joints[:, list(at.values())], atol=1e-6)

@@ -22,6 +22,8 @@ from gsgan.evaluate.scores import painter
 from gsgan.model.assemble import build_data
 from gsgan.model.runs import load, load_avatar
 from gsgan.model.stored import CHECKPOINT, CONFIG, load_config
+from gsgan.render import run as render_run
+from gsgan.skeleton import MEDIAPIPE33
 from gsgan.train.run import build_training
 from gsgan.utils.provenance import SOURCE_TYPE, verify
 
@@ -356,3 +358,29 @@ def test_the_picture_of_the_avatar(bare, landmarks):
     image = avatar.render(frame.skeleton, frame.camera)
     assert torch.equal(image, painting.image.clamp(0, 1))
     assert painting.features is None
+
+
+def test_what_is_rendered_stays_when_a_later_frame_fails(render, motion, tmp_path, monkeypatch):
+    painted, eight_bits = [], render_run.eight_bits
+
+    def failing(*given):
+        painted.append(given)
+        if len(painted) == 4:
+            raise ValueError("the skeleton is too small")
+        return eight_bits(*given)
+
+    monkeypatch.setattr(render_run, "eight_bits", failing)
+    result = render(f"motion={motion}", "out=a")
+    refused(result, "frame 3 cannot be rendered (the skeleton is too small)", "are in a")
+    assert len(list((tmp_path / "a").glob("*.png"))) == 3
+
+
+def test_a_swapped_motion_is_refused_and_an_extreme_frame_is_not(render, landmarks, tmp_path):
+    swapped = 1.1 * landmarks[:, list(MEDIAPIPE33.mirror)]
+    np.savez(tmp_path / "a.npz", p=swapped, fps=30)
+    refused(render(f"motion={tmp_path / 'a.npz'}", "out=a"), "a.npz", "left and right are swapped")
+    mixed = np.concatenate([1.1 * landmarks, swapped[:2]])
+    np.savez(tmp_path / "b.npz", p=mixed, fps=30)
+    result = render(f"motion={tmp_path / 'b.npz'}", "out=b", "start=11")
+    assert result.returncode == 0, result.stderr
+    assert len(list((tmp_path / "b").glob("*.png"))) == 3

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -124,6 +125,33 @@ def test_moving_world_and_camera_together_changes_nothing(backend, drawn, axis_a
     for name in want:
         limit = 1e-6 * max(1.0, float(want[name].abs().max()))
         torch.testing.assert_close(got[name], want[name], atol=limit, rtol=0)
+
+
+@every_backend
+@given(scenes())
+def test_the_order_of_the_list_and_an_opacity_of_0_change_nothing(backend, drawn):
+    """The gradient at an opacity of 0 is what the Gaussian would add: images are linear in it."""
+    scene, size = drawn
+    draw = partial(render, backend=backend, size=size, settings=uncut(HIGH))
+    n = scene["means"].shape[1]
+    lists = [k for k, v in scene.items() if k not in "KRt" and v.shape[1] == n]
+    kept = {**scene, "opacities": 0.5 * scene["opacities"]}
+    more = {**kept, **{k: torch.cat([kept[k].flip(1), kept[k][:, :1]], dim=1) for k in lists}}
+    opacity = torch.zeros(1, dtype=torch.float64, requires_grad=True)
+    more["opacities"] = torch.cat([more["opacities"][:, :n], opacity[None]], dim=1)
+    if len(torch.unique(scene["means"], dim=1)[0]) < n:
+        return  # two at one place: their order is that of the list
+    got, want = draw(more), draw(kept)
+    for name, value in want.items():
+        limit = 1e-9 * max(1.0, float(value.abs().max()))
+        torch.testing.assert_close(got[name].detach(), value, atol=limit, rtol=0)
+    got["features"].sum().backward()
+    assert opacity.grad is not None
+    with torch.no_grad():
+        half = {**more, "opacities": more["opacities"] + 0.5 * (torch.arange(n + 1) == n)}
+        slope = 2 * (draw(half)["features"].sum() - want["features"].sum())
+    limit = 1e-9 * max(1.0, float(slope.abs()))
+    torch.testing.assert_close(opacity.grad[0], slope, atol=limit, rtol=0)
 
 
 def error_bound(projected, size, accuracy):

@@ -6,8 +6,10 @@ import re
 from pathlib import Path
 
 import pytest
+import torch
 from omegaconf import OmegaConf
 
+from gsgan.scene import Camera
 from gsgan.utils.config import LONGEST_NAME, config_folder, folder_name, one_sentence, spelled_out
 from gsgan.utils.errors import ConfigError, DataError
 
@@ -109,6 +111,10 @@ def test_bugs_keep_their_traceback_and_mistakes_get_a_sentence():
     assert one_sentence(DataError("x.png: missing")) == "x.png: missing"
     assert one_sentence(ConfigError("run is not set")) == "run is not set"
     assert one_sentence(ZeroDivisionError("a bug")) is None
+    assert one_sentence(ValueError("of another library")) is None
+    with pytest.raises(ValueError, match="K must have shape") as caught:
+        Camera(*(torch.zeros(1),) * 3, size=(4, 4))
+    assert one_sentence(caught.value) == str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,6 @@ from gsgan.body.skinned import MarkedBody
 from gsgan.scene import BodyPose
 from gsgan.skeleton import MEDIAPIPE33, MEDIAPIPE33_HANDS, TEMPLATES, bone_frames, sanitise
 from gsgan.skeleton.hands import HAND, PALM
-from gsgan.skeleton.sides import refuse_swapped
 from gsgan.utils.tensors import constant
 
 BODY, ALL = len(MEDIAPIPE33.names), len(MEDIAPIPE33_HANDS.names)
@@ -137,8 +136,7 @@ class Solver(nn.Module):
                 above 0 counts alike for hands.
 
         Raises:
-            ValueError: on a wrong shape; with too few shoulders and hips (`sanitise`); where left
-                and right are swapped.
+            ValueError: on a wrong shape; with too few shoulders and hips (`sanitise`).
         """
         if skeleton.shape[1] not in SIZES:
             raise ValueError(
@@ -149,7 +147,6 @@ class Solver(nn.Module):
         hands, seen = skeleton[:, BODY:ALL], visibility[:, BODY:ALL]
         skeleton, visibility = skeleton[:, :BODY], visibility[:, :BODY]
         p, valid = sanitise(skeleton, visibility)
-        refuse_swapped(p.detach(), valid)
         shift = p[:, MEDIAPIPE33.hips].mean(1, keepdim=True)
         weight = (self.weights(valid) * torch.where(valid, visibility, 1).clamp(0, 1)).to(p)
         p, found = p - shift, None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import logging
 import math
 import os
@@ -109,6 +110,7 @@ class GsganData(LightningDataModule):
         **split_keys: Any,
     ) -> None:
         super().__init__()
+        inspect.signature(make_splits).bind_partial(**split_keys)  # an unknown key is an error
         if root is None and source is None:
             raise ConfigError(
                 f"data.root is not set: give the folder of {wanted}, e.g. "

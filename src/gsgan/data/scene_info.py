@@ -15,10 +15,11 @@ from gsgan.body import SkinnedBody, open_body
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import IGNORE_LABEL, read_labels
-from gsgan.data.proportions import Proportions, measure_proportions
+from gsgan.data.proportions import BODY, Proportions, measure_proportions
 from gsgan.data.skeletons import body_height
 from gsgan.data.splits import Item, Splits
 from gsgan.data.surface_colours import SurfaceColours, body_inside, surface_colours
+from gsgan.skeleton.sides import refuse_swapped
 from gsgan.skeleton.template import Vector
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.errors import DataError
@@ -88,6 +89,15 @@ class SceneInfo:
     face: tuple[Vector, ...] | None = None
 
 
+def refuse_swapped_sides(layout: Layout, frames: Sequence[int]) -> None:
+    """Refuses a capture whose left and right are swapped in most frames, with a DataError."""
+    try:
+        p, valid = layout.landmarks.joints(frames)
+        refuse_swapped(p[:, :BODY], valid[:, :BODY])
+    except ValueError as error:
+        raise DataError(f"{layout.root}: {error}") from None
+
+
 def scene_info(
     layout: Layout,
     splits: Splits,
@@ -107,6 +117,7 @@ def scene_info(
     items, body = splits.items["train"], layout.meta.body
     frames = sorted({frame for _, frame in items})
     p, valid = layout.landmarks.joints(frames)
+    refuse_swapped_sides(layout, frames)
     whole = layout.landmarks
     if layout.hands is not None:
         whole = whole.with_hands(layout.hands)

@@ -13,6 +13,7 @@ import torch
 from hydra.utils import instantiate
 from numpy.typing import NDArray
 from omegaconf import DictConfig
+from rich.console import Console
 from torch import Tensor
 
 from gsgan.body.fingers import Fingers
@@ -22,6 +23,7 @@ from gsgan.data.calibration import METRES
 from gsgan.data.crop import PersonCrop
 from gsgan.data.datamodule import GsganData
 from gsgan.data.formats.capture import LANDMARKS, POSES, SHAPE, CaptureReader
+from gsgan.data.scene_info import refuse_swapped_sides
 from gsgan.data.validation import spans
 from gsgan.fit.fitter import Fit, Fitter
 from gsgan.fit.frames import MaskedFrames
@@ -122,16 +124,12 @@ def fit_body(
     rows = torch.tensor([layout.frames.index(frame) for frame in frames.frames])
 
     with console.status("solving poses"):
+        refuse_swapped_sides(layout, data.trained)
         shape = fit_shape(*_joints(data, data.trained))
         start = _of_rows(_solve_with_fingers(data, shape), rows)
     fitter = Fitter(settings, frames, shaped_body(shape), start, seed)
-    with progress(console) as bars:
-        for _ in bars.track(range(settings.surface_steps), description="surface"):
-            fitter.surface_step()
-        for _ in bars.track(range(settings.sweeps), description="poses"):
-            fitter.sweep()
+    found = _registered(fitter, settings, console)
     with torch.no_grad():
-        found = fitter.pose()
         registered = found.to(torch.device("cpu"))
         shape = _refined(data, shape, frames.frames, registered)
     poses = {False: _solve(data, shape, layout.frames)}
@@ -147,6 +145,17 @@ def fit_body(
     lines = summary(report, folder, frames)
     console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
     return folder
+
+
+def _registered(fitter: Fitter, settings: Fit, console: Console) -> BodyPose:
+    """The poses after all steps of the fit."""
+    with progress(console) as bars:
+        for _ in bars.track(range(settings.surface_steps), description="surface"):
+            fitter.surface_step()
+        for _ in bars.track(range(settings.sweeps), description="poses"):
+            fitter.sweep()
+    with torch.no_grad():
+        return fitter.pose()
 
 
 def _folder(out: Path, overwrite: bool) -> Path:

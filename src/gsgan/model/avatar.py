@@ -158,8 +158,7 @@ class Avatar(nn.Module):
             background: RGB in [0, 1], or one number for all three.
 
         Raises:
-            ValueError: on wrong shapes, when too few shoulders and hips are finite, or when a body
-                pose must be solved and left and right are swapped.
+            ValueError: on wrong shapes, or when too few shoulders and hips are finite.
         """
         device = next(self.parameters()).device
         height = self.limb_length_sum

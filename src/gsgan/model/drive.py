@@ -26,11 +26,12 @@ from gsgan.data.proportions import (
 from gsgan.data.splits import SPLITS
 from gsgan.model.avatar import Avatar
 from gsgan.model.runs import Run
-from gsgan.motion.clip import FPS, checked, completed, frame_times, is_own, resampled, up_axis
+from gsgan.motion.clip import FPS, Clip, checked, completed, frame_times, is_own, resampled, up_axis
 from gsgan.motion.readers import Source, read_motion
 from gsgan.motion.retarget import expressed, face_in_head, joined, placed, retargeted
 from gsgan.scene import BodyPose, Camera, Frame, cat
-from gsgan.skeleton import complete_skeleton
+from gsgan.skeleton import complete_skeleton, sanitise
+from gsgan.skeleton.sides import refuse_swapped
 from gsgan.utils.checks import above, one_of
 from gsgan.utils.config import defaults_of
 from gsgan.utils.errors import ConfigError, DataError
@@ -182,6 +183,7 @@ def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
     source = Source(proportions, *files)
     motion = read_motion(Path(path).expanduser(), source)
     motion = checked(motion, float(config.min_visibility))
+    _refuse_swapped(motion)
     rate = config.motion_fps or motion.fps
     rate = float(above("motion_fps", rate)) if rate else FPS
     if config.up and motion.file_up and config.up != motion.file_up:
@@ -229,6 +231,14 @@ def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
     return Drive(p, visibility, body, list(range(len(p))), text)
 
 
+def _refuse_swapped(clip: Clip) -> None:
+    p, visibility = (torch.from_numpy(x[:, :BODY]) for x in (clip.p, clip.visibility))
+    try:
+        refuse_swapped(*sanitise(p, visibility))
+    except ValueError as error:
+        raise DataError(f"{clip.path}: {error}") from None
+
+
 def _frames(count: int) -> str:
     return "1 frame" if count == 1 else f"{count} frames"
 
@@ -256,8 +266,7 @@ def inputs_of(avatar: Avatar, drive: Drive, i: int) -> tuple[Tensor, Tensor, Bod
     """`joints_of`, and the body pose where the avatar needs one: the drive's, else solved.
 
     Raises:
-        ValueError: as `joints_of`; also when a body pose must be solved and left and right are
-            swapped.
+        ValueError: as `joints_of`.
     """
     p, visibility = joints_of(avatar, drive, i)
     if drive.body is not None and avatar.needs_body:

@@ -51,6 +51,8 @@ def _read_hierarchy(words: list[str]) -> list[_Joint]:
     rest = iter(words)
     for word in rest:
         if word in ("ROOT", "JOINT", "End"):
+            if (word == "ROOT") == bool(above):
+                raise ValueError(f"the {word} {next(rest)} is out of place")
             joint = _Joint(next(rest) + " end" * (word == "End"), above[-1] if above else -1)
             while (word := next(rest)) != "{":
                 joint.name += " " + word
@@ -84,16 +86,24 @@ def _rig_motion(joints: list[_Joint], values: Array, frame_time: float) -> RigMo
     offsets = np.array([joint.offset for joint in joints])
     if not (np.isfinite(values).all() and np.isfinite(offsets).all()):
         raise ValueError("a number is not finite")
-    rotations, root = np.empty((len(values), len(joints), 3, 3)), np.zeros((len(values), 3))
+    rotations = np.empty((len(values), len(joints), 3, 3))
+    local = np.broadcast_to(offsets, (len(values), *offsets.shape)).copy()
+    local[:, 0] = 0.0
     columns = iter(values.T)
     for j, joint in enumerate(joints):
         R = np.eye(3) if joint.parent < 0 else rotations[:, joint.parent]
+        moves = np.zeros(len(values), bool)
         for channel in joint.channels:
             axis, column = "XYZ".index(channel[0].upper()), next(columns)
             if channel.lower().endswith("rotation"):
                 R = R @ rotation(np.radians(column[:, None]) * np.eye(3)[axis])
-            elif joint.parent < 0:  # other joints keep their offsets: bones do not change length
-                root[:, axis] = column
+            else:
+                local[:, j, axis], moves = column, moves | (column != 0)
+        if joint.parent >= 0 and not moves.any():  # some programs count from the offset
+            local[:, j] = offsets[j]
         rotations[:, j] = R
     names, parents = zip(*((joint.name, joint.parent) for joint in joints), strict=True)
-    return RigMotion(names, parents, offsets, rotations, root, frame_time)
+    moving = parents.count(-1) > 1 or (local[:, 1:] != offsets[1:]).any()
+    return RigMotion(
+        *(names, parents, offsets, rotations, local[:, 0], frame_time), local if moving else None
+    )

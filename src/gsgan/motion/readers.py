@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from gsgan.body import free_body, open_body
-from gsgan.body.smpl import SkinnedModel, read_smpl
+from gsgan.body.smpl import SkinnedModel, from_zju, read_smpl
 from gsgan.data.calibration import METRES
 from gsgan.data.files import read_arrays, read_json, read_json_value
 from gsgan.data.formats import smpl_motion
@@ -39,9 +39,14 @@ WORLD_KEYS = (
     *("pose_world_landmarks", "poseWorldLandmarks", "world_landmarks", "worldLandmarks"),
     "POSE_WORLD_LANDMARKS",
 )
+# Keys of SMPL's parameters: AMASS, HuMMan, smplx, AIST++, ZJU-MoCap.
+POSE_KEYS = ("poses", "pose", "smpl_poses", "body_pose", "pose_body")
+PART_KEYS = ("pose_jaw", "pose_eye", "pose_hand")  # of SMPL-X, after the body
+ROOT_KEYS = ("Rh", "root_orient", "global_orient")
+MOVE_KEYS = ("trans", "transl", "smpl_trans", "Th")
+SHAPE_KEYS = ("betas", "shapes")
+WITHOUT_ROOT = (63, 69, 153, 162)  # numbers of poses of SMPL-X's body, SMPL, SMPL-H, SMPL-X
 LANDMARK = ("x", "y", "z", "visibility")
-POSE_KEYS = ("poses", "pose", "smpl_poses", "body_pose")
-ROOT_KEYS, MOVE_KEYS = ("global_orient", "root_orient"), ("trans", "transl", "smpl_trans")
 RATE_KEYS = ("fps", "mocap_framerate", "mocap_frame_rate")
 SMPL_BODY = 22  # joints that SMPL, SMPL-H and SMPL-X share
 LEG_UNITS = {"metres": 1.0, "decimetres": 0.1, "centimetres": 0.01, "inches": 0.0254}
@@ -87,8 +92,8 @@ def read_motion(path: Path, source: Source) -> Clip:
 
 def read_npz(path: Path, source: Source) -> Clip:
     """A motion in an npz file; the names of its arrays decide the kind."""
-    keys = ("p", "conf", "theta", "betas", "visibility", *WORLD_KEYS, *POSE_KEYS, *ROOT_KEYS)
-    arrays = read_arrays(path, (*keys, *MOVE_KEYS, *RATE_KEYS))
+    keys = ("p", "conf", "theta", "visibility", *WORLD_KEYS, *POSE_KEYS, *PART_KEYS, *ROOT_KEYS)
+    arrays = read_arrays(path, (*keys, *MOVE_KEYS, *SHAPE_KEYS, *RATE_KEYS))
     rate = _first(arrays, RATE_KEYS)
     fps = None if rate is None else rate_of(path, rate)
     if "p" in arrays:
@@ -108,8 +113,8 @@ def read_npz(path: Path, source: Source) -> Clip:
     )
 
 
-def _first(arrays: dict[str, NDArray[Any]], keys: tuple[str, ...]) -> Any:
-    return next((arrays[key] for key in keys if key in arrays), None)
+def _first(arrays: dict[str, NDArray[Any]], keys: tuple[str, ...], default: Any = None) -> Any:
+    return next((arrays[key] for key in keys if key in arrays), default)
 
 
 def _beside(path: Path) -> dict[str, Any]:
@@ -170,31 +175,55 @@ def _smpl(path: Path, arrays: dict[str, Any], fps: float | None, source: Source)
         )
     if not source.smpl.is_file():
         raise ConfigError(f"smpl={source.smpl} does not exist; expected a .pkl or .npz file")
-    model, poses = read_smpl(source.smpl), np.asarray(_first(arrays, POSE_KEYS), np.float64)
+    model, poses = read_smpl(source.smpl), _smpl_poses(path, arrays)
+    moves = _first(arrays, MOVE_KEYS)
+    moves = np.zeros((len(poses), 3)) if moves is None else np.asarray(moves, np.float64)
+    moves = moves.reshape(len(poses), 3)
+    betas = np.asarray(_first(arrays, SHAPE_KEYS, np.zeros(10)), np.float64)
+    betas = np.median(betas.reshape(-1, betas.shape[-1]), axis=0)[: model.shapedirs.shape[-1]]
+    good = np.isfinite(poses).all(1) & np.isfinite(moves).all(1)
+    theta = _for_model(np.nan_to_num(poses).reshape(len(poses), -1, 3), model)
+    moves = np.nan_to_num(moves)
+    if "Rh" in arrays:
+        J0 = model.rest_joints(torch.from_numpy(betas[None]))[0, 0].numpy()
+        theta[:, 0], moves = from_zju(theta[:, 0], moves, J0)
+    shapes = np.repeat(betas[None], len(poses), axis=0)
+    motion = smpl_motion.SmplMotion(np.arange(len(poses)), theta, moves, shapes)
+    p, conf = smpl_motion.landmarks_of(model, motion)
+    p[~good] = np.nan
+    return Clip(path, p, conf, fps, None, "metres")
+
+
+def _smpl_poses(path: Path, arrays: dict[str, Any]) -> Float:
+    """``[F, 3 n]`` axis-angle of n joints, the root first, whatever arrays hold them.
+
+    AMASS' SMPL-H files hold ``poses`` (156); its SMPL-X files hold ``poses`` (165) and its parts
+    too; HuMMan holds ``global_orient`` and ``body_pose`` (69); ZJU-MoCap an empty root in ``poses``
+    (72) and ``Rh``.
+    """
+    poses = np.asarray(_first(arrays, POSE_KEYS), np.float64)
     poses = poses.reshape(len(poses), -1)
     root = _first(arrays, ROOT_KEYS)
-    if root is not None and poses.shape[1] % 72:  # the root is stored separately
-        poses = np.concatenate([np.asarray(root).reshape(len(poses), 3), poses], axis=1)
+    if poses.shape[1] in WITHOUT_ROOT:
+        if root is None:
+            raise DataError(
+                f"{path} has poses without the root's rotation; expected one of "
+                f"{', '.join(ROOT_KEYS)} beside them"
+            )
+        root = np.asarray(root, np.float64).reshape(len(poses), 3)
+        parts = [np.asarray(arrays[key], np.float64) for key in PART_KEYS if key in arrays]
+        parts = parts if poses.shape[1] == WITHOUT_ROOT[0] and len(parts) == 3 else []
+        poses = np.concatenate([root, poses, *(x.reshape(len(poses), -1) for x in parts)], axis=1)
+    elif "Rh" in arrays:
+        poses = np.concatenate(
+            [np.asarray(arrays["Rh"], np.float64).reshape(-1, 3), poses[:, 3:]], 1
+        )
     if poses.shape[1] % 3 or poses.shape[1] < 3 * SMPL_BODY:
         raise DataError(
             f"{path}: the poses have {poses.shape[1]} numbers per frame; expected 3 for each of 22 "
             "or more SMPL joints"
         )
-    moves = _first(arrays, MOVE_KEYS)
-    moves = np.zeros((len(poses), 3)) if moves is None else np.asarray(moves, np.float64)
-    betas = np.asarray(arrays.get("betas", np.zeros(10)), np.float64)
-    betas = np.median(betas.reshape(-1, betas.shape[-1]), axis=0)[: model.shapedirs.shape[-1]]
-    good = np.isfinite(poses).all(1) & np.isfinite(moves).all(1)
-    theta = _for_model(np.nan_to_num(poses).reshape(len(poses), -1, 3), model)
-    motion = smpl_motion.SmplMotion(
-        np.arange(len(poses)),
-        theta,
-        np.nan_to_num(moves).reshape(-1, 3),
-        np.repeat(betas[None], len(poses), axis=0),
-    )
-    p, conf = smpl_motion.landmarks_of(model, motion)
-    p[~good] = np.nan
-    return Clip(path, p, conf, fps, None, "metres")
+    return poses
 
 
 def _for_model(theta: Float, model: SkinnedModel) -> Float:

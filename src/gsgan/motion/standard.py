@@ -1,7 +1,7 @@
 """The motion of a rig from a file, in standard axes and on the bones that people have.
 
-Convention: that of :mod:`gsgan.motion.rig`. A file's up axis and left side are found from its rest
-pose, lengths follow from the legs.
+Convention: that of :mod:`gsgan.motion.rig`. The up axis and the left side are found from the posed
+frames, lengths follow from the legs.
 """
 
 from __future__ import annotations
@@ -12,11 +12,19 @@ from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
+from scipy.spatial.transform import Rotation
 
-from gsgan.motion.rig import FINGERS, LEG, REQUIRED, SPINE, rest_turns
-from gsgan.motion.rotations import Array, blend, rotation, unit
+from gsgan.motion.rig import ARM, FINGERS, LEG, REQUIRED, SIDES, SPINE, limb_axes, rest_turns
+from gsgan.motion.rotations import Array, between, blend, rotation, unit
 from gsgan.utils.errors import DataError
 
+STANDING = np.radians(40)  # largest tilt of trunk and legs in a zero pose that is a standing person
+NEUTRAL = np.radians(10)  # the same, in a frame that stands so well that it serves as a zero pose
+UPRIGHT = np.radians(30)  # largest tilt of the trunk in frames whose average serves otherwise
+SAME = np.radians(1)  # frames that stand as well as the best one
+MOST = 100  # frames that calibrate
+BACKWARDS = 0.8  # share of knees and toes behind the body from which names are of the other side
+BENT = 0.15  # mean sine of the bend from which a limb's plane is known
 HOVER = 0.06  # legs: feet this high above the lowest of a second stand on the floor; no jump
 ROOM = 0.6  # metres from the origin that a motion may reach before its drift is subtracted
 DRIFT_SECONDS = 0.5  # standard deviation of the smoothing that separates drift from sway
@@ -81,21 +89,45 @@ def _stem(stem: str, sided: bool) -> tuple[str, int]:
 
 @dataclass(frozen=True)
 class RigMotion:
-    """The motion of a rig as a file has it: joints, parents first, and their world rotations."""
+    """The motion of a rig as a file has it: joints, parents first, and their world rotations since
+    the zero pose.
+
+    Args:
+        names: of the J joints; end sites are called "<joint> end".
+        parents: ``[J]``, -1 for roots.
+        offsets: ``[J, 3]`` from the parent in the zero pose, units and axes of the file.
+        rotations: ``[F, J, 3, 3]`` world, axes of the file.
+        root: ``[F, 3]`` position of the first joint.
+        frame_time: seconds.
+        local: ``[F, J, 3]`` positions in the parent's axes, in place of the offsets, or None where
+            only the root has position channels.
+    """
 
     names: tuple[str, ...]
     parents: tuple[int, ...]
-    offsets: Array  # [J, 3] from the parent at rest, units and axes of the file
-    rotations: Array  # [F, J, 3, 3] since the rest pose, axes of the file
-    root: Array  # [F, 3] position of the first joint
-    frame_time: float  # seconds
+    offsets: Array
+    rotations: Array
+    root: Array
+    frame_time: float
+    local: Array | None = None
 
-    def positions(self, rotations: Array, root: Array) -> Array:
-        """Joints ``[..., J, 3]`` for world rotations ``[..., J, 3, 3]``."""
-        p = np.zeros((*root.shape[:-1], len(self.names), 3))
-        p[..., 0, :] = root
+    def zero_pose(self) -> Array:
+        """Joints ``[J, 3]`` without any rotation, the first one at the origin."""
+        p = np.zeros((len(self.names), 3))
         for j, parent in enumerate(self.parents[1:], 1):
-            p[..., j, :] = p[..., parent, :] + rotations[..., parent, :, :] @ self.offsets[j]
+            p[j] = p[parent] + self.offsets[j] if parent >= 0 else self.offsets[j]
+        return p
+
+    def posed(self) -> Array:
+        """Joints ``[F, J, 3]`` of all frames, units and axes of the file."""
+        p = np.zeros((*self.root.shape[:-1], len(self.names), 3))
+        p[:, 0] = self.root
+        for j, parent in enumerate(self.parents[1:], 1):
+            offset = self.offsets[j] if self.local is None else self.local[:, j]
+            if parent < 0:
+                p[:, j] = offset
+            else:
+                p[:, j] = p[:, parent] + (self.rotations[:, parent] @ offset[..., None])[..., 0]
         return p
 
 
@@ -105,48 +137,226 @@ class StandardMotion:
 
     turns: dict[str, Array]  # [F, 3, 3]
     joints: dict[str, Array]  # [F, 3] positions, units of the file
-    leg: float  # the legs' length at rest, units of the file
+    leg: float  # the legs' length, units of the file
     up: str  # the axis of the file that points up, e.g. "y"
 
 
-def standard_motion(motion: RigMotion, path: Path) -> StandardMotion:
+@dataclass(frozen=True)
+class Reference:
+    """Poses in which bones have known turns: they calibrate the joints' own axes.
+
+    Args:
+        rotations: ``[N, J, 3, 3]`` world rotations of the joints, axes of the file.
+        axes: ``[N, 3, 3]`` rows left, back, up of the person, axes of the file.
+        joints: N times the joints' positions ``[J, 3]``, axes of the file.
+        zero: whether it is the zero pose.
+        neutral: whether the person stands upright and looks ahead; else the trunk has to be
+            calibrated by the joints' positions.
+    """
+
+    rotations: Array
+    axes: Array
+    joints: Array
+    zero: bool
+    neutral: bool
+
+
+def standard_motion(rig: RigMotion, path: Path) -> StandardMotion:
     """The motion of a tree of joints on the bones that people have.
 
+    The joints' own axes are calibrated by the zero pose where that is a standing person, else by
+    frames in which the person stands, else by the average of the upright frames and, for limbs, by
+    the planes in which they bend.
+
     Raises:
-        DataError: when a joint of the limbs is not found.
+        DataError: when a joint of the limbs is not found, or the file holds two people.
     """
-    known = {"Hips": 0} | known_joints(motion.names)
-    if missing := [bone for bone in REQUIRED if bone not in known]:
-        names = [name for name in motion.names if not name.endswith(" end")]
+    known = body_joints(rig, path)
+    posed = rig.posed()
+    up = upward(posed, known)
+    known = _by_side(posed, known, up)
+    reference = _reference(rig, posed, known, up)
+    same = reference.zero and np.allclose(reference.axes[0, 2], up)
+    axes = reference.axes[0] if same else person_axes(posed[:1], known, up)[0]
+    R, turns = _turns(rig, axes, known, reference)
+    if not reference.zero:
+        _bend_in_plane(turns, {bone: posed[:, j] @ axes.T for bone, j in known.items()})
+    ahead = turns["Hips"][0] @ (0.0, -1.0, 0.0)
+    yaw = rotation(np.array([0, 0, -np.arctan2(ahead[0], -ahead[1])]))
+    turns = {bone: yaw @ turn for bone, turn in turns.items()}
+    turns |= _trunk(rig, known, yaw @ R)
+    joints = {bone: posed[:, j] @ (yaw @ axes).T for bone, j in known.items()}
+    hip, knee, ankle = (joints["Left" + bone] for bone in LEG)
+    thigh, shin = (np.linalg.norm(a - b, axis=1) for a, b in ((hip, knee), (knee, ankle)))
+    at = int(np.abs(up).argmax())
+    name = ("-" if up[at] < 0 else "") + "xyz"[at]
+    return StandardMotion(turns, joints, float(np.median(thigh) + np.median(shin)), name)
+
+
+def body_joints(rig: RigMotion, path: Path) -> dict[str, int]:
+    """Mixamo's bone name → index, with the fingers' ends.
+
+    Raises:
+        DataError: when a joint of the limbs is not found, or the file holds two people.
+    """
+    known = known_joints(rig.names)
+    if missing := [bone for bone in REQUIRED if bone not in known and bone != "Hips"]:
+        names = [name for name in rig.names if not name.endswith(" end")]
         raise DataError(
             f"{path}: no joint found for {', '.join(missing)} among {', '.join(names)}; name the "
             f"joints as Mixamo does (LeftUpLeg, LeftLeg, LeftFoot, LeftArm, LeftForeArm, …)"
         )
-    unturned = np.broadcast_to(np.eye(3), (len(motion.names), 3, 3))
-    rest = motion.positions(unturned, np.zeros(3))
-    thighs = rest[known["LeftUpLeg"]] + rest[known["RightUpLeg"]]
-    height = thighs - rest[known["LeftFoot"]] - rest[known["RightFoot"]]
-    up = np.eye(3)[np.abs(height).argmax()] * np.sign(height[np.abs(height).argmax()])
-    left = rest[known["LeftUpLeg"]] - rest[known["RightUpLeg"]]
-    left = unit(left - (left @ up) * up)
-    axes = np.stack([left, np.cross(up, left), up])
+    lines = [_line(rig, known[side + "UpLeg"]) for side in SIDES]
+    shared = [j for j in lines[0] if j in lines[1]]
+    if not shared:
+        raise DataError(f"{path}: its legs belong to different roots; give a file of one person")
+    known.setdefault("Hips", shared[-1])
     for bone in list(known):
-        ends = [j for j, parent in enumerate(motion.parents) if parent == known[bone]]
+        ends = [j for j, parent in enumerate(rig.parents) if parent == known[bone]]
         if re.search(r"Hand\D+[23]$", bone) and ends:
             known.setdefault(bone[:-1] + str(int(bone[-1]) + 1), ends[0])
-    joint = {bone: axes @ rest[j] for bone, j in known.items()}
-    R = axes @ motion.rotations @ axes.T
-    ahead = R[0, known["Hips"]] @ (0.0, -1.0, 0.0)
-    yaw = rotation(np.array([0, 0, -np.arctan2(ahead[0], -ahead[1])]))
-    R, at_rest = yaw @ R, rest_turns(joint)
-    turns = {bone: R[:, j] @ at_rest.get(bone, np.eye(3)) for bone, j in known.items()}
-    turns |= _trunk(motion, known, R)
-    posed = motion.positions(motion.rotations, motion.root) @ (yaw @ axes).T
-    hip, knee, ankle = (joint["Left" + bone] for bone in LEG)
-    leg = float(np.linalg.norm(hip - knee) + np.linalg.norm(knee - ankle))
-    at = int(np.abs(up).argmax())
-    name = ("-" if up[at] < 0 else "") + "xyz"[at]
-    return StandardMotion(turns, {bone: posed[:, j] for bone, j in known.items()}, leg, name)
+    return known
+
+
+def _line(rig: RigMotion, j: int) -> list[int]:
+    """The joints above a joint, the root first."""
+    line: list[int] = []
+    while (j := rig.parents[j]) >= 0:
+        line.insert(0, j)
+    return line
+
+
+def _middle(p: Array, known: dict[str, int], bone: str) -> Array:
+    """``[..., 3]`` the middle of a pair of joints of poses ``[..., J, 3]``."""
+    return (p[..., known["Left" + bone], :] + p[..., known["Right" + bone], :]) / 2
+
+
+def upward(p: Array, known: dict[str, int]) -> Array:
+    """``[3]`` the coordinate axis that points up: along it, the shoulders are above the hips and
+    these above the feet in the largest share of the poses ``[F, J, 3]``."""
+    chest, hips, feet = (_middle(p, known, bone) for bone in ("Arm", "UpLeg", "Foot"))
+    trunk, legs = unit(chest - hips), unit(hips - feet)
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    above = ((trunk @ axes.T > 0.5) & (legs @ axes.T > 0.5)).mean(axis=0)
+    return np.asarray(axes[(above + 1e-3 * (trunk + legs).mean(axis=0) @ axes.T).argmax()])
+
+
+def person_axes(p: Array, known: dict[str, int], up: Array) -> Array:
+    """``[..., 3, 3]`` rows left, back, up of poses ``[..., J, 3]``; ``up [..., 3]`` is kept."""
+    left = p[..., known["LeftUpLeg"], :] - p[..., known["RightUpLeg"], :]
+    left = unit(left - (left * up).sum(-1, keepdims=True) * up)
+    up = np.broadcast_to(up, left.shape)
+    return np.stack([left, np.cross(up, left), up], axis=-2)
+
+
+def _by_side(p: Array, known: dict[str, int], up: Array) -> dict[str, int]:
+    """The joints, left and right exchanged where knees and toes would point backwards."""
+    back = person_axes(p, known, up)[:, 1]
+    votes = []
+    for side in SIDES:
+        hip, knee, ankle = (p[:, known[side + bone]] for bone in LEG)
+        votes.append(((knee - (hip + ankle) / 2) * back).sum(-1))
+        if side + "ToeBase" in known:
+            votes.append(((p[:, known[side + "ToeBase"]] - ankle) * back).sum(-1))
+    if np.mean(np.stack(votes) > 0) < BACKWARDS:
+        return known
+    other = {"Left": "Right", "Right": "Left"}
+    return {re.sub("^(Left|Right)", lambda m: other[m[1]], b): j for b, j in known.items()}
+
+
+def tilts(p: Array, known: dict[str, int], up: Array) -> Array:
+    """``[..., 7]`` radians by which trunk, thighs, shins, hips and shoulders of poses ``[..., J,
+    3]`` differ from those of a person who stands upright."""
+    axes = person_axes(p, known, up)
+    found = [(_middle(p, known, "Arm") - _middle(p, known, "UpLeg"), axes[..., 2, :])]
+    for side in SIDES:
+        hip, knee, ankle = (p[..., known[side + bone], :] for bone in LEG)
+        found += [(knee - hip, -axes[..., 2, :]), (ankle - knee, -axes[..., 2, :])]
+    for bone in ("UpLeg", "Arm"):
+        across = p[..., known["Left" + bone], :] - p[..., known["Right" + bone], :]
+        found.append((across, axes[..., 0, :]))
+    cosines = [(unit(v) * unit(w)).sum(-1) for v, w in found]
+    return np.arccos(np.stack(cosines, axis=-1).clip(-1, 1))
+
+
+def _reference(rig: RigMotion, posed: Array, known: dict[str, int], up: Array) -> Reference:
+    """The zero pose, if that is a standing person; else frames."""
+    zero = rig.zero_pose()
+    own = upward(zero[None], known)
+    if tilts(zero, known, own).max() < STANDING:
+        eye = np.broadcast_to(np.eye(3), (1, *rig.rotations.shape[1:]))
+        return Reference(eye, person_axes(zero[None], known, own), zero[None], True, True)
+    tilt = tilts(posed, known, up)
+    score = tilt.max(axis=-1)
+    best = float(score.min())
+    neutral = best < NEUTRAL
+    if neutral:
+        chosen = np.flatnonzero(score < best + SAME)
+    else:
+        chosen = np.flatnonzero(tilt[:, 0] < max(UPRIGHT, float(tilt[:, 0].min()) + SAME))
+    chosen = chosen[:: max(1, len(chosen) // MOST)]
+    p = posed[chosen]
+    return Reference(rig.rotations[chosen], person_axes(p, known, up), p, False, neutral)
+
+
+def _turns(
+    rig: RigMotion, axes: Array, known: dict[str, int], reference: Reference
+) -> tuple[Array, dict[str, Array]]:
+    """Turns ``[F, J, 3, 3]`` of all joints, and of the known bones with their turns at rest."""
+    back = reference.axes.mT
+    own = np.swapaxes(reference.rotations, -1, -2)  # [N, J, 3, 3]
+    at_rest = [
+        rest_turns({bone: A @ p[j] for bone, j in known.items()})
+        for A, p in zip(reference.axes, reference.joints, strict=True)
+    ]
+    if not reference.neutral:
+        _follow_positions(at_rest, known, reference)
+    R = axes @ rig.rotations
+    turns = {}
+    for bone, j in known.items():
+        if bone.endswith("4"):  # a finger's tip follows its last bone
+            continue
+        rest = np.stack([turn.get(bone, np.eye(3)) for turn in at_rest])
+        turns[bone] = R[:, j] @ _mean(own[:, j] @ back @ rest)
+    trunk = np.stack([turn.get("Hips", np.eye(3)) for turn in at_rest])
+    free = np.stack([_mean(own[:, j] @ back @ trunk) for j in range(own.shape[1])])
+    return R @ free, turns
+
+
+def _follow_positions(
+    at_rest: list[dict[str, Array]], known: dict[str, int], reference: Reference
+) -> None:
+    """Adds the turns of the trunk and the feet of frames in which the person does not stand."""
+    for turn, A, p in zip(at_rest, reference.axes, reference.joints, strict=True):
+        trunk = A @ (_middle(p, known, "Arm") - _middle(p, known, "UpLeg"))
+        turn["Hips"] = between(np.array([0.0, 0, 1]), trunk)
+        for side in SIDES:
+            if side + "ToeBase" in known:
+                toe = A @ (p[known[side + "ToeBase"]] - p[known[side + "Foot"]])
+                turn[side + "Foot"] = between(np.array([0.0, -1, 0]), toe * (1, 1, 0))
+                turn[side + "ToeBase"] = turn[side + "Foot"]
+
+
+def _bend_in_plane(turns: dict[str, Array], joints: dict[str, Array]) -> None:
+    """Twists limbs about their length so that elbows and knees bend in their planes on average."""
+    for side in SIDES:
+        for part in (LEG, ARM):
+            first, second, end = (side + bone for bone in part)
+            along, hinge = limb_axes(part, side)
+            lower = unit(joints[end] - joints[second])
+            local = (np.swapaxes(turns[first], -1, -2) @ lower[..., None])[..., 0]
+            away, forth = local @ hinge, local @ np.cross(hinge, along)
+            mean = ((forth + 1j * away) * np.hypot(forth, away)).mean()
+            if abs(mean) > BENT**2:
+                twisted = rotation(along * float(np.angle(mean)))
+                turns[first], turns[second] = turns[first] @ twisted, turns[second] @ twisted
+                if part == ARM and f"{side}HandMiddle1" not in joints:  # its palm is not known
+                    turns[end] = turns[end] @ twisted
+
+
+def _mean(R: Array) -> Array:
+    """The mean ``[3, 3]`` of rotations ``[N, 3, 3]``."""
+    return np.asarray(R[0] if len(R) == 1 else Rotation.from_matrix(R).mean().as_matrix())
 
 
 def floor_under(lowest: Array, leg: float, step: float) -> Array:
@@ -170,17 +380,10 @@ def drift(path: Array, step: float) -> Array:
     return np.asarray(smooth[pad : pad + len(path)])
 
 
-def _trunk(motion: RigMotion, known: dict[str, int], R: Array) -> dict[str, Array]:
+def _trunk(rig: RigMotion, known: dict[str, int], R: Array) -> dict[str, Array]:
     """Turns of spine, neck and collarbones, whatever their number, by their place in the tree."""
 
-    def above(bone: str) -> list[int]:
-        j = motion.parents[known[bone]]
-        line: list[int] = []
-        while j >= 0:
-            line, j = [j, *line], motion.parents[j]
-        return line
-
-    left, right, legs = above("LeftArm"), above("RightArm"), above("LeftUpLeg")
+    left, right, legs = (_line(rig, known[b]) for b in ("LeftArm", "RightArm", "LeftUpLeg"))
     spine = [j for j in left if j in right and j not in (*legs, known["Hips"])]
     chain, turns = [R[:, j] for j in (known["Hips"], *spine)], {}
     for k, bone in enumerate(SPINE, 1):
@@ -188,7 +391,7 @@ def _trunk(motion: RigMotion, known: dict[str, int], R: Array) -> dict[str, Arra
         low = int(at)
         turns[bone] = blend(chain[low], chain[min(low + 1, len(spine))], at - low)
     if "Head" in known:
-        neck = [j for j in above("Head") if j not in left]
+        neck = [j for j in _line(rig, known["Head"]) if j not in left]
         turns["Neck"] = R[:, neck[0]] if neck else blend(chain[-1], R[:, known["Head"]], 0.5)
     for side, line, other in (("Left", left, right), ("Right", right, left)):
         if collar := [j for j in line if j not in other]:

@@ -23,7 +23,7 @@ from gsgan.render.output import Output
 from gsgan.scene import Camera
 from gsgan.utils.checks import above, one_of, whole
 from gsgan.utils.console import make_console
-from gsgan.utils.errors import ConfigError
+from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import writing
 from gsgan.utils.images import Background, background, eight_bits
 from gsgan.utils.provenance import Signer
@@ -63,7 +63,13 @@ def render_config(config: DictConfig) -> None:
     if kept := len(drive.numbers) - len(missing):
         console.print(f"{kept} of {len(drive.numbers)} frames are already rendered")
     for i in track(missing, "rendering", console=console, transient=True):
-        image = _image(config, run, drive, cameras, index, i, paint_on)
+        try:
+            image = _image(config, run, drive, cameras, index, i, paint_on)
+        except ValueError as error:
+            raise DataError(
+                f"frame {drive.numbers[i]} cannot be rendered ({error}); the frames before it are "
+                f"in {output.folder}"
+            ) from error
         with writing(output.out):
             output.write(drive.numbers[i], image)
     with writing(output.out):

@@ -13,7 +13,9 @@ NOSE, LEGS = 0, ((25, 27, 29, 31), (26, 28, 30, 32))  # knee, ankle, heel, toes
 
 
 def refuse_swapped(p: Tensor, valid: Tensor) -> None:
-    """Refuses skeletons whose left and right are swapped in most frames.
+    """Refuses a capture or motion whose left and right are swapped in most frames.
+
+    A single frame never is: an extreme pose looks the same.
 
     Lines from right to left of hips, shoulders, ears and eyes must agree; and with the left as it
     follows from each foot and its shank, and from nose and eyes, whatever they are called.
@@ -25,6 +27,9 @@ def refuse_swapped(p: Tensor, valid: Tensor) -> None:
     Raises:
         ValueError: naming the pairs that are swapped.
     """
+
+    if len(p) < 2:
+        return
 
     def seen(v: Tensor, joints: tuple[int, ...]) -> Tensor:
         return v * valid[:, joints].all(1, keepdim=True)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from gsgan.motion.bvh import read_bvh
 from gsgan.motion.character import Animation, Character
-from gsgan.motion.rig import LEG, SIDES, Pose, Rig
+from gsgan.motion.rig import LEG, SIDES, SIGN, Pose, Rig
 from gsgan.motion.rotations import Array
 from gsgan.motion.standard import drift, floor_under, standard_motion
 from gsgan.synthetic.posing import blinks
@@ -48,6 +48,10 @@ class BvhMotion:
         offset = (joint["LeftUpLeg"] + joint["RightUpLeg"]) / 2 - joint["Hips"]
         thighs = (standard.joints["LeftUpLeg"] + standard.joints["RightUpLeg"]) / 2
         self._hips = thighs * self.rig.leg / standard.leg - self._turns["Hips"] @ offset
+        across = standard.joints["LeftUpLeg"] - standard.joints["RightUpLeg"]
+        width = float(np.median(np.linalg.norm(across, axis=1))) * self.rig.leg / standard.leg
+        # Legs that go straight down from wider hips would cross below narrow ones.
+        self._apart = max(0.0, width - self.rig.length("LeftUpLeg", "RightUpLeg")) / 2
         self._settle(bvh.frame_time)
 
     def _settle(self, step: float) -> None:
@@ -62,6 +66,7 @@ class BvhMotion:
             toe = side + "ToeBase" if side + "ToeBase" in self.rig.index else side + "Foot"
             ball = (pose.position(toe) + shift)[:, :2]
             ankle = pose.position(side + "Foot") + shift
+            ankle += SIGN[side] * self._apart * self._turns["Hips"][:, :, 0]
             ankle[:, 2] += (floor - low).clip(0)
             ankle[:, :2] += _held(ball, low - floor < CONTACT_HEIGHT * leg, leg, step)
             self._ankles.append(ankle)

@@ -137,7 +137,17 @@ def one_sentence(error: BaseException) -> str | None:
         return f"{where}: {str(error).splitlines()[0]}"
     if isinstance(error, (HydraException, OmegaConfBaseException)):
         return str(error).splitlines()[0]
+    if isinstance(error, ValueError) and _raised_here(error):
+        return str(error)
     return None
+
+
+def _raised_here(error: BaseException) -> bool:
+    """Whether a line of gsgan raised the error, about what it was given."""
+    at = error.__traceback__
+    while at is not None and at.tb_next is not None:
+        at = at.tb_next
+    return at is not None and at.tb_frame.f_globals["__name__"].startswith("gsgan.")
 
 
 def _without_worker(error: GsganError) -> str:
