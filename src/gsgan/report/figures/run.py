@@ -36,9 +36,6 @@ FIGURES: dict[str, Callable[[Sequence[Subject], Sequence[Shot]], Drawing]] = {
     "comparison": images.comparison,
     "ablation": partial(images.comparison, detail=True),
     "strip": images.strip,
-    "canny": images.canny,
-    "errors": images.errors,
-    "segmentation": images.segmentation,
     "training": images.training,
 }
 TRIMMED: dict[str, Any] = {"bbox_inches": "tight", "pad_inches": 0.02}
