@@ -1,8 +1,10 @@
-"""What the benchmark scripts share: their options, presets, training runs and plots."""
+"""What the benchmark scripts share: options, presets, training runs, plots and peak memory."""
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import gc
 import io
 import os
 import subprocess
@@ -10,6 +12,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import torch
 from hydra.utils import instantiate
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
@@ -18,11 +21,13 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gsgan.splat import Accuracy
+from gsgan.scene import Frame
+from gsgan.splat import Accuracy, buffers
 from gsgan.utils.config import config_folder
 from gsgan.utils.errors import GsganError
 
 HERE = Path(__file__).parent
+MEMORY_FRAMES = 4  # over which peak memory is taken
 
 
 def main(name: str, run: Callable[[DictConfig, Path], None]) -> None:
@@ -110,3 +115,41 @@ def png(figure: Figure) -> bytes:
     stream = io.BytesIO()
     figure.savefig(stream, format="png", metadata={"Software": ""})
     return stream.getvalue()
+
+
+def painting_memory(paint: Callable[[Frame], object], frames: Sequence[Frame]) -> float | None:
+    """Megabytes that painting takes on top of the avatar and its inputs; None where unavailable."""
+    few = frames[:MEMORY_FRAMES]
+    return peak_memory(lambda: [paint(frame) for frame in few], frames[0].skeleton.device)
+
+
+def peak_memory(action: Callable[[], object], device: torch.device) -> float | None:
+    """Megabytes by which the peak of this process grows while ``action`` runs a second time.
+
+    Convention: free memory is returned to the system first, and the system's record of the peak is
+    reset (``VmHWM`` of Linux); on CUDA it is the allocator's peak. None where neither is available.
+    """
+    action()  # builds what is built once
+    gc.collect()
+    buffers.forget()
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+    else:
+        with contextlib.suppress(OSError, AttributeError):  # glibc keeps what was freed for reuse
+            ctypes.CDLL(None).malloc_trim(0)
+        with contextlib.suppress(OSError), open("/proc/self/clear_refs", "w") as stream:
+            stream.write("5")
+    before = _peak(device)
+    action()
+    after = _peak(device)
+    return None if before is None or after is None else (after - before) / 1e6
+
+
+def _peak(device: torch.device) -> float | None:
+    """The peak since the reset, in bytes."""
+    if device.type == "cuda":
+        return float(torch.cuda.max_memory_allocated(device))
+    with contextlib.suppress(OSError, StopIteration), open("/proc/self/status") as stream:
+        line = next(line for line in stream if line.startswith("VmHWM:"))
+        return 1024.0 * int(line.split()[1])
+    return None

@@ -28,7 +28,6 @@ from gsgan.bench.speed import (
     PRECISIONS,
     deciles,
     make_painter,
-    painting_memory,
     place,
     set_backend,
     spread,
@@ -315,7 +314,7 @@ def quality(
         image = painter(frame).clamp(0, 1)
         rows.append({name: float(metric(image, frame.image)) for name, metric in metrics.items()})
     scores = pd.DataFrame(rows).replace([math.inf, -math.inf], math.nan)
-    memory = painting_memory(painter, frames) if isinstance(painter, Painter) else None
+    memory = bench_common.painting_memory(painter, frames) if isinstance(painter, Painter) else None
     return {**scores.mean(), "left_out": int(scores.isna().sum().sum()), "memory_mb": memory}
 
 

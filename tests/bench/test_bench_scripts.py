@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+import torch
 from commands import ROOT
 
 from gsgan.utils.errors import GsganError
@@ -77,6 +78,17 @@ def test_trade_off_compares_a_multirun(script, tmp_path, run):
     assert (tmp_path / "out" / "trade_off.png").is_file()
     assert "give either run=" in script("trade_off")
     assert "is not in struct" in script("trade_off", "colour=1")
+
+
+def test_peak_memory_is_what_an_action_takes_on_top_of_what_is_held(script):
+    from bench_common import peak_memory
+
+    held = torch.ones(20_000_000)  # 80 MB that must not count
+    found = peak_memory(lambda: torch.ones(5_000_000).exp(), torch.device("cpu"))
+    if found is None:
+        pytest.skip("this system does not report a peak of memory")
+    assert 20 < found < 70
+    assert held.sum() == 20_000_000
 
 
 def test_effects_decides_without_training(script, tmp_path):

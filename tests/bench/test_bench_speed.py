@@ -11,7 +11,7 @@ import torch
 from commands import refused
 
 from gsgan.bench.__main__ import main
-from gsgan.bench.common import cpu_name, environment, number, peak_memory, sentence
+from gsgan.bench.common import cpu_name, environment, number, sentence
 from gsgan.bench.speed import StageClock, deciles, make_painter, measure, spread, text
 from gsgan.model.avatar import UNWATCHED, unwatched
 from gsgan.utils.errors import ConfigError
@@ -106,15 +106,6 @@ def test_the_frames_are_spread_over_a_split(small):
         spread(data, 2, "novel_view")
 
 
-def test_peak_memory_is_what_an_action_takes_on_top_of_what_is_held():
-    held = torch.ones(20_000_000)  # 80 MB that must not count
-    found = peak_memory(lambda: torch.ones(5_000_000).exp(), torch.device("cpu"))
-    if found is None:
-        pytest.skip("this system does not report a peak of memory")
-    assert 20 < found < 70
-    assert held.sum() == 20_000_000
-
-
 def test_the_machine_is_described_without_its_host(tmp_path):
     where = environment(torch.device("cpu"))
     assert f"torch {where['versions']['torch']}" in sentence(where)
@@ -150,7 +141,7 @@ def test_the_table_adds_up():
     }
     times = pd.DataFrame(rows, index=["median", "p10", "p90"]).T
     settings = {"avatar": "untrained avatar", "image": "512 x 512"}
-    page = text(times, None, environment(torch.device("cpu")), settings, ["untrained weights"])
+    page = text(times, environment(torch.device("cpu")), settings, ["untrained weights"])
     assert "| F | 6.00 | 5.00 | 7.00 | 60% |" in page
     assert "| **end to end** | 10.0 | 9.00 | 12.0 | 100.0 frames/s |" in page
     assert "- untrained weights" in page

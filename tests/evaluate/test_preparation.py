@@ -60,8 +60,8 @@ def test_what_is_painted_outside_the_box_is_cleared_and_only_there(data, backgro
     )
     frame = data.dataset("train")[0]
     box = prepare.box(frame)
-    picture = prepare.image(Prediction({FULL: torch.full_like(frame.image, 0.3)}, {}, background),
-                            FULL, frame, box)  # fmt: skip
+    picture = prepare.image(Prediction({FULL: torch.full_like(frame.image, 0.3)}, {}),
+                            FULL, box)  # fmt: skip
     inside = box.expand_as(picture)
     assert bool((picture[inside] == 0.3).all())
     assert bool((picture[~inside] == prepare.background).all())

@@ -132,25 +132,6 @@ def test_the_floor_of_a_split_is_the_background_and_its_psnr_is_known():
         )
         assert found.variants[FULL]["psnr"] is None  # equal: its own alpha puts it on white too
         assert found.rows[FULL][0]["psnr"] == math.inf
-        assert not found.hidden_outline
-
-
-def test_an_opaque_image_on_black_hides_its_outline_on_white_and_says_so():
-    f = person()
-    fat = f.image.clone()
-    fat[..., 0:4, 0:4] = 0.9  # painted outside the truth's mask
-
-    def predict(f: Frame, _: object) -> Prediction:
-        return Prediction({FULL: fat}, {}, "black")
-
-    white = score_split([(("a", 0), f)], predict, scorer(MetricVariants(background="white")))
-    assert white.hidden_outline
-    assert white.rows[FULL][0]["psnr"] > 100
-    black = score_split([(("a", 0), f)], predict, scorer())
-    assert not black.hidden_outline
-    assert black.variants[FULL]["psnr"] == pytest.approx(
-        -10 * math.log10(16 * 0.81 / 576), abs=1e-4
-    )
 
 
 def test_each_image_of_an_avatar_is_put_on_white_by_its_own_alpha():
@@ -164,20 +145,6 @@ def test_each_image_of_an_avatar_is_put_on_white_by_its_own_alpha():
     assert found.variants[SPLAT]["psnr"] == pytest.approx(
         -10 * math.log10((56 * 0.3**2 + 8 * 0.15**2) / 576), abs=1e-4
     )
-    assert not found.hidden_outline
-
-
-def test_one_variant_without_alpha_takes_the_ground_truths_mask_and_says_so():
-    f = person()
-
-    def predict(f: Frame, _: object) -> Prediction:
-        return Prediction({FULL: 0.5 * f.image, SPLAT: f.image}, {FULL: 0.5 * f.mask})
-
-    found = score_split([(("a", 0), f)], predict, scorer(MetricVariants(background="white")))
-    assert found.hidden_outline
-    assert found.rows[SPLAT][0]["psnr"] > 100
-    assert found.rows[FULL][0]["psnr"] < 30
-    assert not score_split([(("a", 0), f)], predict, scorer()).hidden_outline
 
 
 def test_an_image_that_is_not_finite_is_an_error_that_names_it():

@@ -12,7 +12,6 @@ from gsgan.metrics.regions import (
     eight_bits,
     hard_outline,
     mask_crop,
-    moved_background,
     on_background,
     rectangle,
 )
@@ -23,16 +22,6 @@ def test_a_premultiplied_image_lets_the_background_through():
     alpha = torch.tensor([1.0, 0.5, 0.0]).view(1, 1, 1, 3)
     assert on_background(image, alpha, 1.0)[0, 0, 0].tolist() == pytest.approx([0.3, 0.5, 1.0])
     assert torch.equal(on_background(image, alpha, 0.0), image)
-
-
-def test_an_opaque_image_moves_by_the_ground_truths_mask():
-    image = torch.tensor([0.3, 0.0, 0.4, 0.0]).view(1, 1, 1, 4).expand(1, 3, 1, 4)
-    mask = torch.tensor([1.0, 1.0, 0.0, 0.0]).view(1, 1, 1, 4)
-    white = moved_background(image, mask, 0.0, 1.0)
-    # a hole inside stays black, what is painted outside is lost
-    assert white[0, 0, 0].tolist() == pytest.approx([0.3, 0.0, 1.0, 1.0])
-    back = moved_background(white, mask, 1.0, 0.0)
-    assert back[0, 0, 0].tolist() == pytest.approx([0.3, 0.0, 0.0, 0.0])
 
 
 def test_eight_bits():

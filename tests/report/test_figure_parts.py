@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -16,13 +13,10 @@ from gsgan.report.figures.layout import (
     STYLE,
     TALLEST,
     Panel,
-    Unavailable,
     draw_panels,
     written,
 )
-from gsgan.report.figures.run import FIGURES
-from gsgan.report.figures.subjects import Subject, choose_items, make_shots, measure
-from gsgan.report.runs import Run
+from gsgan.report.figures.subjects import choose_items, make_shots, measure
 from gsgan.utils.errors import ConfigError, DataError
 
 
@@ -40,12 +34,10 @@ def test_measures_in_closed_form():
     found = measure(truth + 0.1, truth)
     assert found["psnr"] == pytest.approx(20, abs=1e-4)
     assert found["edge_f1"] == 1
-    assert found["edge_ratio"] == 1
     same = measure(truth, truth)
     assert same["psnr"] is None  # infinite
     blank = measure(truth, torch.zeros_like(truth))
     assert blank["edge_f1"] is None
-    assert blank["edge_ratio"] is None
     assert written(None, 2, " dB") == "n/a"
 
 
@@ -119,62 +111,3 @@ def test_windows_hold_the_joints_and_have_one_size(data):
         in_picture = (reach >= 0) & (reach <= 32)
         assert bool(inside[in_picture].all())
         assert torch.equal(shot.truth, shot.window.cut(shot.frame.image))
-
-
-def subject_of(build, *overrides: str) -> Subject:
-    data, avatar, _ = build(*overrides)
-    model = overrides[0].removeprefix("model=") if overrides else "full"
-    return Subject(model, Run(Path("run"), model, {}, 0, {}), data, avatar.eval(), [])
-
-
-@pytest.mark.parametrize(
-    ("model", "figure", "words"),
-    [
-        ("splat_only", "segmentation", "has no segmentation S: the model leaves it out"),
-    ],
-)
-def test_a_figure_that_a_model_cannot_have_says_why(build, model, figure, words):
-    subject = subject_of(build, f"model={model}")
-    shots = make_shots(subject.data, "novel_pose", [("cam00", 4)], 0.2)
-    with rc_context(STYLE), pytest.raises(Unavailable, match=words):
-        FIGURES[figure]([subject], shots)
-
-
-def test_data_without_labels_has_no_segmentation_figure(build):
-    subject = subject_of(build)
-    shot = make_shots(subject.data, "novel_pose", [("cam00", 4)], 0.2)[0]
-    bare = replace(shot, frame=replace(shot.frame, labels=None))
-    with pytest.raises(Unavailable, match="no part labels"):
-        FIGURES["segmentation"]([subject], [bare])
-
-
-def test_what_is_kept_of_a_painting_is_on_the_cpu(build):
-    """Whatever of it shows; nothing else fills memory on the device that painted."""
-    subject = subject_of(build)
-    shot = make_shots(subject.data, "novel_pose", [("cam00", 4)], 0.2)[0]
-    render = subject.avatar.forward
-
-    def painted(*inputs):
-        found = render(*inputs)
-        tinted = None if found.colour is None else found.colour * 0.5
-        return replace(found, corrected=tinted)
-
-    subject.avatar.forward = painted
-    kept = subject.paint(shot)
-    for name in ("corrected", "alpha", "splat_alpha"):
-        assert getattr(kept, name) is None, name
-    assert kept.features.shape[1] == 3
-    assert kept.segmentation is not None
-    want = painted(*shot.frame.inputs).corrected
-    assert torch.equal(subject.colour(shot), shot.window.cut(want).clamp(0, 1))
-
-
-def test_a_splat_only_run_stands_for_splatting_alone(build):
-    """In place of Step I's colour, whose column it takes."""
-    full, splat = subject_of(build), subject_of(build, "model=splat_only")
-    shots = make_shots(full.data, "novel_pose", [("cam00", 4)], 0.2)
-    with rc_context(STYLE):
-        alone = images.canny([full], shots).numbers["cam00/000004"]
-        both = images.canny([full, splat], shots).numbers["cam00/000004"]
-    assert list(alone) == ["full", "Step I's colour"]
-    assert list(both) == ["full", "splat_only"]

@@ -1,15 +1,13 @@
-"""What benchmarks share: a description of the machine, their files, and peak memory."""
+"""What benchmarks share: a description of the machine, and their files."""
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
-import gc
 import importlib.metadata
 import json
 import os
 import platform
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
@@ -21,7 +19,6 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from gsgan.splat import buffers
 from gsgan.utils import pages
 from gsgan.utils.checks import whole
 from gsgan.utils.console import make_console
@@ -161,35 +158,3 @@ class Bench:
         if self.page is not None:
             pages.fill_block(self.page, *self.markers, docs or text, key="docs")
         self.console.print(f"tables and raw numbers: {self.folder}", markup=False, highlight=False)
-
-
-def peak_memory(action: Callable[[], object], device: torch.device) -> float | None:
-    """Megabytes by which the peak of this process grows while ``action`` runs a second time.
-
-    Convention: free memory is returned to the system first, and the system's record of the peak is
-    reset (``VmHWM`` of Linux); on CUDA it is the allocator's peak. None where neither is available.
-    """
-    action()  # builds what is built once
-    gc.collect()
-    buffers.forget()
-    if device.type == "cuda":
-        torch.cuda.reset_peak_memory_stats(device)
-    else:
-        with contextlib.suppress(OSError, AttributeError):  # glibc keeps what was freed for reuse
-            ctypes.CDLL(None).malloc_trim(0)
-        with contextlib.suppress(OSError), open("/proc/self/clear_refs", "w") as stream:
-            stream.write("5")
-    before = _peak(device)
-    action()
-    after = _peak(device)
-    return None if before is None or after is None else (after - before) / 1e6
-
-
-def _peak(device: torch.device) -> float | None:
-    """The peak since the reset, in bytes."""
-    if device.type == "cuda":
-        return float(torch.cuda.max_memory_allocated(device))
-    with contextlib.suppress(OSError, StopIteration), open("/proc/self/status") as stream:
-        line = next(line for line in stream if line.startswith("VmHWM:"))
-        return 1024.0 * int(line.split()[1])
-    return None

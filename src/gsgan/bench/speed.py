@@ -15,7 +15,7 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from gsgan.bench.common import Bench, check_whole, markdown, number, peak_memory, sentence
+from gsgan.bench.common import Bench, check_whole, markdown, number, sentence
 from gsgan.data.datamodule import GsganData
 from gsgan.model.assemble import build_avatar, build_data
 from gsgan.model.avatar import Avatar, unwatched
@@ -36,7 +36,6 @@ PRECISIONS: dict[str, torch.dtype | None] = {
     "16-mixed": torch.float16,
 }
 SPLITS = ("novel_pose", "novel_view", "train")  # frames come from the first that has any
-MEMORY_FRAMES = 4  # over which peak memory is taken
 Painter = Callable[[Frame], Tensor]
 
 
@@ -61,18 +60,16 @@ def run(config: DictConfig, folder: Path) -> None:
     bench = Bench.start("speed", config, folder)
     avatar, frames, name, marks = load_subject(config, bench.device)
     painter = make_painter(avatar, config.precision, config.backend)
-    with without_denormals():
-        with bench.progress() as progress:
-            task = progress.add_task("painting", total=config.warmup + config.frames)
-            times = measure(
-                avatar,
-                painter,
-                frames,
-                count=config.frames,
-                warmup=config.warmup,
-                tick=lambda: progress.advance(task),
-            )
-        memory = painting_memory(painter, frames)
+    with without_denormals(), bench.progress() as progress:
+        task = progress.add_task("painting", total=config.warmup + config.frames)
+        times = measure(
+            avatar,
+            painter,
+            frames,
+            count=config.frames,
+            warmup=config.warmup,
+            tick=lambda: progress.advance(task),
+        )
     settings = {"avatar": name, **settings_of(config, avatar, frames)}
     record = {
         "settings": settings,
@@ -82,9 +79,8 @@ def run(config: DictConfig, folder: Path) -> None:
             "stages": {stage: dict(row) for stage, row in times.drop([TOTAL, REST]).iterrows()},
             "rest": dict(times.loc[REST]),
         },
-        "memory_mb": memory,
     }
-    page = text(times, memory, bench.where, settings, marks)
+    page = text(times, bench.where, settings, marks)
     bench.write("From skeleton to image", page, record)
 
 
@@ -173,12 +169,6 @@ def without_denormals() -> Iterator[None]:
         torch.set_flush_denormal(False)
 
 
-def painting_memory(painter: Painter, frames: Sequence[Frame]) -> float | None:
-    """Megabytes that painting takes on top of the avatar and its inputs; None where unavailable."""
-    few = frames[:MEMORY_FRAMES]
-    return peak_memory(lambda: [painter(frame) for frame in few], frames[0].skeleton.device)
-
-
 class StageClock:
     """Replaces ``Avatar.stage`` while stages are timed; synchronises the device."""
 
@@ -263,7 +253,6 @@ def settings_of(config: DictConfig, avatar: Avatar, frames: Sequence[Frame]) -> 
 
 def text(
     times: pd.DataFrame,
-    memory: float | None,
     where: dict[str, Any],
     settings: dict[str, Any],
     marks: Sequence[str],
@@ -277,6 +266,5 @@ def text(
     table.columns = pd.Index(["stage", "median ms", "10 % below", "90 % below", "share"])
     how = ", ".join(f"{key} {value}" for key, value in settings.items())
     lines = [f"{sentence(where)}.", f"{how[0].upper()}{how[1:]}.", markdown(table)]
-    lines.append(f"Peak memory on top of the avatar: {number(memory)} MB.")
     lines += ["\n".join(f"- {mark}" for mark in marks)] if marks else []
     return "\n\n".join(lines)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import InitVar, dataclass
+from dataclasses import dataclass
 
 from gsgan.utils.checks import at_least, one_of
 from gsgan.utils.errors import ConfigError
@@ -51,10 +51,8 @@ class EffectSettings:
     scale_ratio: float = 1.3
     dark: float = 0.25
     body_inside: float = 0.95
-    view_spread: InitVar[object] = None  # both: in configs of earlier runs, ignored
-    colour_errors: InitVar[object] = None
 
-    def __post_init__(self, *_: object) -> None:
+    def __post_init__(self) -> None:
         for name in CHOICES:
             value = getattr(self, name)
             if isinstance(value, bool):

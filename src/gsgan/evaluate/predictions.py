@@ -24,7 +24,6 @@ from gsgan.metrics.regions import (
     eight_bits,
     hands_and_mouth,
     hard_outline,
-    moved_background,
     on_background,
 )
 from gsgan.scene import Frame
@@ -37,10 +36,6 @@ if TYPE_CHECKING:
 VERTEX_MARGIN = 0.05  # metres around the body's vertices, as in published scoring scripts
 JOINT_MARGIN = 0.2  # metres around joints, which are inside the body; as in `PersonCrop`
 FULL, SPLAT, FLOOR = "full", "splat", "floor"  # the floor is the all-background image
-HIDDEN_OUTLINE = (
-    "images without alpha are moved to the protocol's background by the ground truth's mask, which "
-    "hides their content outside it"
-)
 FIELDS = ("split", "camera", "camera_index", "frame")
 FIELD = re.compile(r"\{(.*?)\}")
 WRONG_BACKGROUND = 0.5  # share of the background's pixels that have the other background's colour
@@ -54,8 +49,7 @@ class Prediction:
     Args:
         images: by variant, ``[B, 3, H, W]``.
         alphas: by variant, ``[B, 1, H, W]`` of images on black, premultiplied; None or absent for
-            opaque images.
-        background: of opaque images, "black" or "white".
+            opaque images, which are on the protocol's background.
         segmentation: ``[B, classes, H, W]``, or None.
         labels: ``[B, H, W]`` ground truth in the classes of the segmentation; None where those are
             the frame's labels.
@@ -64,7 +58,6 @@ class Prediction:
 
     images: dict[str, Tensor]
     alphas: Mapping[str, Tensor | None]
-    background: str = "black"
     segmentation: Tensor | None = None
     labels: Tensor | None = None
     no_parts: str = "predictions are images, not a segmentation"
@@ -129,27 +122,16 @@ class Preparation:
             image, mask = hard_outline(image, mask), (mask >= 0.5).to(mask)
         return on_background(image, mask, self.background)
 
-    def image(
-        self, prediction: Prediction, variant: str, frame: Frame, box: Tensor | None
-    ) -> Tensor:
-        """``[B, 3, H, W]`` a prediction on the protocol's background: by its own alpha, or, where
-        it is opaque and on the other background, by the ground truth's mask."""
+    def image(self, prediction: Prediction, variant: str, box: Tensor | None) -> Tensor:
+        """``[B, 3, H, W]`` a prediction on the protocol's background, by its alpha."""
         image = prediction.images[variant].clamp(0, 1)
         alpha = prediction.alphas.get(variant)
         if alpha is not None:
             image = on_background(image, alpha.clamp(0, 1), self.background).clamp(0, 1)
-        elif prediction.background != self.measures.background:
-            old = BACKGROUNDS[prediction.background]
-            image = moved_background(image, frame.mask, old, self.background)
         image = eight_bits(image, self.measures.eight_bits)
         if box is not None and self.measures.region == "body_box_cleared":
             image = cleared(image, box, self.background)
         return image
-
-    def hides_outline(self, prediction: Prediction) -> bool:
-        """Whether an opaque image must be moved to this background by the ground truth's mask."""
-        opaque = any(prediction.alphas.get(name) is None for name in prediction.images)
-        return opaque and prediction.background != self.measures.background
 
     def box(self, frame: Frame) -> Tensor | None:
         """``[B, 1, H, W]`` the body's projected box, or None where it is not needed."""
@@ -191,7 +173,7 @@ class PredictionFolder:
             cover = (torch.from_numpy(alpha).float() / 255)[None, None].to(frame.image)
             return Prediction({FULL: image * cover}, {FULL: cover})
         self._check_background(path, image, frame.mask)
-        return Prediction({FULL: image}, {}, self.background)
+        return Prediction({FULL: image}, {})
 
     def _check_background(self, path: Path, image: Tensor, mask: Tensor) -> None:
         behind = image.permute(0, 2, 3, 1)[mask[:, 0] == 0]
@@ -199,8 +181,8 @@ class PredictionFolder:
         other, name = (white, "white") if self.background == "black" else (black, "black")
         if float(other.float().mean()) > WRONG_BACKGROUND:  # NaN without background
             raise DataError(
-                f"{path} has a {name} background, expected {self.background}; set "
-                f"predictions_background={name}, or give images with alpha"
+                f"{path} has a {name} background, expected {self.background}; give "
+                f"images on {self.background} or with alpha"
             )
 
 

@@ -31,7 +31,6 @@ from gsgan.evaluate.pictures import write_grid
 from gsgan.evaluate.predictions import (
     FLOOR,
     FULL,
-    HIDDEN_OUTLINE,
     BodyBoxes,
     Preparation,
     read_folder,
@@ -68,9 +67,8 @@ def evaluate_config(config: DictConfig) -> Results:
     for key in others:
         if config.get(key) is not None:
             raise ConfigError(f"{key}= cannot be given with {kind}=; leave it out")
-    for key in ("background", "predictions_background"):
-        if config[key] not in (None, *BACKGROUNDS):
-            raise ConfigError(f"{key} must be black, white or null; got {config[key]!r}")
+    if config.background not in (None, *BACKGROUNDS):
+        raise ConfigError(f"background must be black, white or null; got {config.background!r}")
     if config.get("drive") not in (None, "skeleton"):
         raise ConfigError(f"drive must be skeleton or null; got {config.drive!r}")
     if not config.splits or not set(config.splits) <= set(SPLITS):
@@ -118,7 +116,7 @@ def evaluate_predictions(config: DictConfig, console: Console, device: torch.dev
         config.predictions_pattern,
         {k: {item: own.camera(item).size for item in own.items} for k, own in datasets.items()},
         data.layout.camera_names,
-        config.predictions_background or _measures(data).background,
+        config.background or _measures(data).background,
     )
     chosen = HydraConfig.get().runtime.choices if HydraConfig.initialized() else {}
     method = Method(name, data=chosen.get("data"))
@@ -203,15 +201,14 @@ def _joined_splits(
     scores: dict[str, SplitScores], scorer: Scorer, data: GsganData, origin: dict[str, Any]
 ) -> Scored:
     """The scores of all splits, with the protocol's record and reasons for empty splits."""
-    record = scorer.protocol
-    if record is not None and any(found.hidden_outline for found in scores.values()):
-        record = record | {"departures": [*record["departures"], HIDDEN_OUTLINE]}
     variants = next((s.variants for s in scores.values() if s.variants), (FULL, FLOOR))
     results = {}
     for split, found in scores.items():
         reason = data.reasons.get(split, "no frames")
         held = found.variants or {name: empty(reason, scorer) for name in variants}
-        results[split] = {name: values | {"protocol": record} for name, values in held.items()}
+        results[split] = {
+            name: values | {"protocol": scorer.protocol} for name, values in held.items()
+        }
     table = (
         {"split": split, "variant": variant, **row}
         for split, found in scores.items()

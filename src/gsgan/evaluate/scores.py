@@ -165,13 +165,11 @@ class SplitScores:
     Args:
         variants: ``{variant: {metric: value}}`` as in metrics.json; empty without frames.
         rows: one per variant and image.
-        hidden_outline: a ground-truth mask was used as the alpha of a prediction.
         grid: rows of images to show, from `gsgan.evaluate.pictures.grid_rows`.
     """
 
     variants: dict[str, dict[str, Any]]
     rows: dict[str, list[Row]]
-    hidden_outline: bool = False
     grid: list[dict[str, Tensor]] = field(default_factory=list)
 
 
@@ -236,14 +234,12 @@ class _Tally:
     rows: dict[str, list[Row]] = field(default_factory=dict)
     grid: list[dict[str, Tensor]] = field(default_factory=list)
     matrices: dict[str, Tensor] = field(default_factory=dict)  # by camera
-    hidden: bool = False
     no_parts: str = ""
 
     def add(self, item: Item, frame: Frame, prediction: Prediction, *, show: bool) -> None:
         """Scores one frame."""
         prepare, (camera, number) = self.scorer.prepare, item
         target, box, regions = prepare.target(frame), prepare.box(frame), prepare.regions(frame)
-        self.hidden = self.hidden or prepare.hides_outline(prediction)
         images = {}
         for name, image in prediction.images.items():
             if bad := int((~torch.isfinite(image)).sum()):
@@ -251,7 +247,7 @@ class _Tally:
                     f"camera {camera}, frame {number}: {bad} values of the predicted image are not "
                     "finite; it cannot be scored"
                 )
-            images[name] = prepare.image(prediction, name, frame, box)
+            images[name] = prepare.image(prediction, name, box)
         if show:
             parts = prediction.segmentation
             painting = Rendering(images[FULL], corrected=images.get(SPLAT), segmentation=parts)
@@ -288,7 +284,7 @@ class _Tally:
             name: _variant(own, self.matrices if name == FULL else {}, reasons[name], self.scorer)
             for name, own in self.rows.items()
         }
-        return SplitScores(variants, self.rows, self.hidden, self.grid)
+        return SplitScores(variants, self.rows, self.grid)
 
 
 def _variant(

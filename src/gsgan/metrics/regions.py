@@ -36,15 +36,6 @@ def on_background(image: Tensor, alpha: Tensor, background: float) -> Tensor:
     return image + (1 - alpha) * background
 
 
-def moved_background(image: Tensor, mask: Tensor, old: float, new: float) -> Tensor:
-    """Moves an opaque image from one background to another by the ground truth's mask.
-
-    The content of the image outside the mask leaves [0, 1] and is lost, so errors of the outline
-    are hidden.
-    """
-    return (image + (1 - mask) * (new - old)).clamp(0, 1)
-
-
 def hard_outline(image: Tensor, mask: Tensor) -> Tensor:
     """Divides an image on black by its mask where that is at least one half; black elsewhere."""
     inside = mask >= 0.5

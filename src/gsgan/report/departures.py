@@ -17,7 +17,6 @@ IDLE = (
     *("training.seed", "training.log_every", "training.max_skipped", "training.skip_window"),
     *("training.rollback", "training.average_every", "training.perceptual.path"),
     *("training.schedule.epoch", "effects.impossible"),
-    *("effects.view_spread", "effects.colour_errors"),  # of earlier runs
 )
 
 

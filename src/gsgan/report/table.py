@@ -47,7 +47,6 @@ from gsgan.utils.errors import ConfigError
 from gsgan.utils.files import write_atomically
 from gsgan.utils.pages import check_block, fill_block
 
-CURVES = "report.png"
 BLOCK_END = "<!-- /report -->"
 FLOOR_LABEL = "all background (floor)"
 SPREAD = (
@@ -212,11 +211,7 @@ def make_tables(config: DictConfig) -> None:
     report = build(spec, runs, left_out, paper, allow_dirty=config.allow_dirty)
     now = f"{datetime.now():%Y-%m-%d_%H-%M-%S}"
     folder = Path(str(config.out or f"runs/report/{now}")).expanduser()
-    files: dict[str, str | bytes] = dict(files_of(report))
-    if spec.by:
-        from gsgan.report.curves import curves  # here: it imports matplotlib
-
-        files |= {CURVES: image} if (image := curves(report)) else {}
+    files = files_of(report)
     try:
         for name, content in files.items():
             write_atomically(folder / name, content)

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import torch
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from torch import Tensor
 from torch.nn import functional
 
-from gsgan.metrics.image import canny as canny_edges
 from gsgan.metrics.image import psnr
-from gsgan.metrics.segmentation import colour_labels, confusion, miou
 from gsgan.report.figures.layout import (
     COLUMN,
     SMALL,
@@ -31,9 +26,7 @@ from gsgan.report.training_curve import curve
 from gsgan.utils.errors import DataError
 from gsgan.utils.palette import COLOURS, MARKERS, VERMILLION
 
-ERROR_COLOURS = "magma_r"  # pale is no error; even steps of lightness, in grey print too
 DETAIL = 0.35  # sides of the ablation's box, as a share of the image's
-STEP_ONE = "Step I's colour"
 Images = list[dict[str, Tensor]]  # per shot, by name
 
 
@@ -100,87 +93,6 @@ def most_disputed(images: Tensor, share: float) -> tuple[slice, slice]:
     return slice(top, top + size[0]), slice(left, left + size[1])
 
 
-def canny(subjects: Sequence[Subject], shots: Sequence[Shot]) -> Drawing:
-    """Canny edges of the ground truth and of each image, with edge ratio and edge F1."""
-    images, numbers = _measured(subjects, shots, splatting=True)
-    look = {"cmap": "gray_r", "vmin": 0, "vmax": 1}
-    panels = []
-    for shot, held in zip(shots, images, strict=True):
-        truth = canny_edges(shot.truth[0])
-        panels.append([Panel(truth, f"{truth.sum()} px", framed=True, look=look)])
-        for name, image in held.items():
-            found = numbers[shot.name][name]
-            note = f"ratio {written(found['edge_ratio'], 2)}\nF1 {written(found['edge_f1'], 3)}"
-            panels[-1].append(Panel(canny_edges(image[0]), note, framed=True, look=look))
-    figure, _ = draw_panels(panels, titles=["truth", *images[0]])
-    caption = (
-        "Canny edges (thresholds 100 and 200 on 8-bit grey); below the ground truth, their number "
-        "of pixels. Ratio: edge pixels over the ground truth's. F1: of edges at most one pixel off."
-    )
-    return Drawing(figure, caption, numbers)
-
-
-def errors(subjects: Sequence[Subject], shots: Sequence[Shot]) -> Drawing:
-    """The ground truth and each image's absolute error on one scale, the mean below each map."""
-    images, numbers = _measured(subjects, shots, splatting=True)
-    maps = [
-        {name: (image - shot.truth).abs().mean(dim=1)[0] * 255 for name, image in held.items()}
-        for shot, held in zip(shots, images, strict=True)
-    ]
-    every = torch.cat([error.flatten() for held in maps for error in held.values()])
-    top = 5 * max(1, math.ceil(float(np.percentile(every.numpy(), 99.5)) / 5))
-    look = {"cmap": ERROR_COLOURS, "norm": Normalize(0, top)}
-    panels = []
-    for shot, held in zip(shots, maps, strict=True):
-        panels.append([Panel(shot.truth)])
-        for name, error in held.items():
-            numbers[shot.name][name]["error_mean"] = float(error.mean())
-            note = f"mean {error.mean():.2f}"
-            panels[-1].append(Panel(error.numpy(), note, framed=True, look=look))
-    figure, _ = draw_panels(panels, titles=["truth", *images[0]])
-    caption = (
-        "Absolute error of each pixel, mean over the three channels, in levels of 255; one scale "
-        f"for all maps, from pale (0) to dark ({top} or more). The mean is below each map."
-    )
-    return Drawing(figure, caption, numbers)
-
-
-def segmentation(subjects: Sequence[Subject], shots: Sequence[Shot]) -> Drawing:
-    """The image, its true parts, and each run's segmentation S with its mIoU.
-
-    Raises:
-        Unavailable: without part labels, or where a run has no S.
-    """
-    for subject in subjects:
-        if subject.avatar.segmentation is None:
-            why = subject.avatar.segmentation_why
-            raise Unavailable(f"{subject.name} has no segmentation S: {why}")
-    panels = []
-    numbers: dict[str, dict[str, Numbers]] = {}
-    for shot in shots:
-        cut, labels, row = shot.window.cut, shot.frame.labels, [Panel(shot.truth)]
-        if labels is None:
-            raise Unavailable("the data has no part labels")
-        numbers[shot.name] = {}
-        for subject in subjects:
-            parts, module = subject.paint(shot).segmentation, subject.avatar.segmentation
-            assert parts is not None
-            assert module is not None
-            parts, truth = module.to_score(cut(parts), cut(labels))
-            found = miou(confusion(parts, truth))["miou"]
-            row += [] if len(row) > 1 else [Panel(colour_labels(truth))]
-            note = f"mIoU {written(found, 3)}"
-            row.append(Panel(colour_labels(parts.argmax(dim=1)), note))
-            numbers[shot.name][subject.name] = {"miou": found}
-        panels.append(row)
-    titles = ["image", "true parts", *(subject.name for subject in subjects)]
-    caption = (
-        "The true parts and each run's segmentation S (most probable part). mIoU: mean over the "
-        "parts present, without the background."
-    )
-    return Drawing(draw_panels(panels, titles=titles)[0], caption, numbers)
-
-
 def training(subjects: Sequence[Subject], shots: Sequence[Shot]) -> Drawing:
     """PSNR of the watched images against minutes, a line per run, Step I's colour dashed.
 
@@ -229,19 +141,10 @@ def training(subjects: Sequence[Subject], shots: Sequence[Shot]) -> Drawing:
 
 
 def _measured(
-    subjects: Sequence[Subject], shots: Sequence[Shot], *, splatting: bool = False
+    subjects: Sequence[Subject], shots: Sequence[Shot]
 ) -> tuple[Images, dict[str, dict[str, Numbers]]]:
-    """Images of each shot by run, and their scores.
-
-    Args:
-        splatting: add Step I's colour of the first run, unless a run is of splatting alone.
-    """
-    images: Images = []
-    for shot in shots:
-        images.append({subject.name: subject.image(shot) for subject in subjects})
-        colour = subjects[0].colour(shot)
-        if splatting and colour is not None and all(s.run.name != "splat_only" for s in subjects):
-            images[-1][STEP_ONE] = colour
+    """Images of each shot by run, and their scores."""
+    images = [{subject.name: subject.image(shot) for subject in subjects} for shot in shots]
     return images, {
         shot.name: {name: measure(image, shot.truth) for name, image in held.items()}
         for shot, held in zip(shots, images, strict=True)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -37,13 +37,10 @@ class Unavailable(Exception):
 
 @dataclass(frozen=True)
 class Panel:
-    """One image ``[1, 3, h, w]`` in [0, 1], or ``[h, w]`` with options of ``imshow`` in ``look``; a
-    note below it, and a frame."""
+    """One image ``[1, 3, h, w]`` in [0, 1], and a note below it."""
 
-    image: Tensor | np.ndarray
+    image: Tensor
     note: str = ""
-    framed: bool = False
-    look: Mapping[str, Any] = field(default_factory=dict)
 
 
 def draw_panels(
@@ -73,9 +70,9 @@ def draw_panels(
     for i, row in enumerate(panels):
         for one, panel, image in zip(axes[i], row, shown[i], strict=True):
             one.set(xticks=[], yticks=[])
-            one.spines[:].set_visible(panel.framed)
+            one.spines[:].set_visible(False)
             extent = (0, image.shape[1], image.shape[0], 0)
-            one.imshow(image, interpolation="nearest", extent=extent, **panel.look)
+            one.imshow(image, interpolation="nearest", extent=extent)
             one.set_xlabel(panel.note, size=SMALL, labelpad=2)
     plain: dict[str, Any] = {"parse_math": False, "size": FONT}  # "$x" is no formula
     for one, title in zip(axes[0], titles, strict=False):
@@ -85,10 +82,8 @@ def draw_panels(
     return figure, axes
 
 
-def pixels(image: Tensor | np.ndarray) -> np.ndarray:
-    """``[h, w, 3]`` bytes of an image ``[1, 3, h, w]``; arrays as they are."""
-    if not isinstance(image, Tensor):
-        return image
+def pixels(image: Tensor) -> np.ndarray:
+    """``[h, w, 3]`` bytes of an image ``[1, 3, h, w]``."""
     shown = (image[0].detach().cpu().clamp(0, 1) * 255).round().byte()
     return shown.permute(1, 2, 0).numpy()
 

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
-import torch
 from omegaconf import DictConfig, OmegaConf
 from rich.progress import track
 
@@ -36,9 +35,6 @@ FIGURES: dict[str, Callable[[Sequence[Subject], Sequence[Shot]], Drawing]] = {
     "comparison": images.comparison,
     "ablation": partial(images.comparison, detail=True),
     "strip": images.strip,
-    "canny": images.canny,
-    "errors": images.errors,
-    "segmentation": images.segmentation,
     "training": images.training,
 }
 TRIMMED: dict[str, Any] = {"bbox_inches": "tight", "pad_inches": 0.02}
@@ -56,7 +52,6 @@ def make_figures(config: DictConfig) -> None:
     names = [one_of("figures", name, FIGURES) for name in _list(config.figures)]
     if not names:
         names = [name for name in FIGURES if len(folders) > 1 or name not in COMPARE]
-    formats = [one_of("formats", name, METADATA) for name in _list(config.formats) or METADATA]
     at_least("margin", config.margin, 0)
     out = folders[0] / "figures" if config.out is None else Path(config.out).expanduser()
     moved = DataPaths.from_config(config)
@@ -77,9 +72,9 @@ def make_figures(config: DictConfig) -> None:
             except Unavailable as reason:
                 lines.append(f"{name}: left out, {reason}")
                 continue
-            for kind in formats:
+            for kind, metadata in METADATA.items():
                 stream = io.BytesIO()
-                made[name].figure.savefig(stream, format=kind, metadata=METADATA[kind], **TRIMMED)
+                made[name].figure.savefig(stream, format=kind, metadata=metadata, **TRIMMED)
                 write_atomically(out / f"{name}.{kind}", stream.getvalue())
     if not made:
         raise ConfigError(f"no figure could be made: {'; '.join(lines)}")
@@ -117,7 +112,6 @@ def _draw(name: str, subjects: Sequence[Subject], config: DictConfig) -> Drawing
             one_camera=name == "strip",
         )
     shots = make_shots(data, split, items, config.margin)
-    _check_same_pixels(subjects, split, shots)
     drawing = FIGURES[name](subjects, shots)
     about = ""
     if name != "training":
@@ -126,20 +120,6 @@ def _draw(name: str, subjects: Sequence[Subject], config: DictConfig) -> Drawing
             f"which reach at least {config.margin:g} m beyond the joints, not of whole images."
         )
     return replace(drawing, caption=f"{drawing.caption}{about} Split {split}.")
-
-
-def _check_same_pixels(subjects: Sequence[Subject], split: str, shots: Sequence[Shot]) -> None:
-    """Refuses runs whose data has other images, cameras or skeletons under the same names."""
-    for subject in subjects[1:]:
-        dataset = subject.data.dataset(split)
-        for shot in shots:
-            a, b = shot.frame, dataset[dataset.items.index(shot.item)]
-            pairs = ((a.image, b.image), (a.camera.K, b.camera.K), (a.skeleton, b.skeleton))
-            if not all(torch.equal(x, y) for x, y in pairs):
-                raise ConfigError(
-                    f"figures: {subjects[0].run} and {subject.run} differ in the image, camera or "
-                    f"skeleton of {shot.name}; leave one of them out"
-                )
 
 
 def _list(value: Any) -> list[Any]:

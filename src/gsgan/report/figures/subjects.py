@@ -14,10 +14,9 @@ from gsgan.data.datamodule import GsganData
 from gsgan.data.fingerprint import fingerprint
 from gsgan.data.splits import SPLITS, Item
 from gsgan.data.validation import spans
-from gsgan.metrics.image import edge_scores, psnr
+from gsgan.metrics.image import edge_f1, psnr
 from gsgan.model.assemble import build_data
 from gsgan.model.avatar import Avatar
-from gsgan.model.rendering import Rendering
 from gsgan.model.runs import load_avatar
 from gsgan.model.stored import CHECKPOINT, DataPaths, load_config, read_checkpoint
 from gsgan.report.departures import NAME
@@ -123,39 +122,24 @@ class Subject:
     data: GsganData
     avatar: Avatar
     marks: list[str]
-    _painted: dict[Item, Rendering] = field(default_factory=dict, repr=False)
+    _images: dict[Item, Tensor] = field(default_factory=dict, repr=False)
 
-    def paint(self, shot: Shot) -> Rendering:
-        """The avatar's rendering of a shot's whole image, made once and kept on the CPU.
+    def image(self, shot: Shot) -> Tensor:
+        """``[1, 3, h, w]`` I_pred in [0, 1], as shown; rendered once and kept on the CPU.
 
         Raises:
             DataError: when the image is not finite.
         """
-        if shot.item not in self._painted:
+        if shot.item not in self._images:
             device = next(self.avatar.parameters()).device
             with torch.no_grad():
-                painting = self.avatar(*shot.frame.to(device).inputs)
-            # of F only the colour: all channels of every shot would fill the memory
-            parts = (painting.image, painting.colour, painting.segmentation)
-            image, colour, labels = (None if part is None else part.cpu() for part in parts)
-            if not all(part is None or part.isfinite().all() for part in (image, colour, labels)):
+                image = self.avatar(*shot.frame.to(device).inputs, maps=False).image
+            assert image is not None
+            if not image.isfinite().all():
                 where = f"{self.run.folder}: its image of {shot.name}"
                 raise DataError(f"{where} is not finite; train it again")
-            self._painted[shot.item] = Rendering(image, features=colour, segmentation=labels)
-        return self._painted[shot.item]
-
-    def image(self, shot: Shot) -> Tensor:
-        """``[1, 3, h, w]`` I_pred in [0, 1], as shown."""
-        image = self.paint(shot).image
-        assert image is not None
-        return shot.window.cut(image).clamp(0, 1)
-
-    def colour(self, shot: Shot) -> Tensor | None:
-        """``[1, 3, h, w]`` Step I's colour in [0, 1]; None where it is the image, or not made."""
-        colour = self.paint(shot).colour
-        if colour is None or self.avatar.generator is None:
-            return None
-        return shot.window.cut(colour).clamp(0, 1)
+            self._images[shot.item] = image.cpu()
+        return shot.window.cut(self._images[shot.item]).clamp(0, 1)
 
 
 def open_subjects(
@@ -208,15 +192,9 @@ def _open(folder: Path, moved: DataPaths, device: torch.device | str) -> Subject
 
 
 def measure(image: Tensor, truth: Tensor) -> Numbers:
-    """PSNR, edge F1 and edge-pixel ratio of one image ``[1, 3, h, w]`` as it is shown.
-
-    Returns:
-        ``psnr`` dB, ``edge_f1``, ``edge_ratio`` (edge pixels over the ground truth's); None where
-        not defined: equal images, or a ground truth without edges.
-    """
-    f1, ratio = edge_scores(image, truth)
-    scores = {"psnr": psnr(image, truth), "edge_f1": f1, "edge_ratio": ratio}
-    return {name: finite(score) for name, score in scores.items()}
+    """PSNR in dB and edge F1 of one image ``[1, 3, h, w]`` as it is shown; None where not defined:
+    equal images, or a ground truth without edges."""
+    return {"psnr": finite(psnr(image, truth)), "edge_f1": finite(edge_f1(image, truth))}
 
 
 def finite(score: Tensor) -> float | None:
