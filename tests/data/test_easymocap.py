@@ -37,7 +37,7 @@ LANDMARKS = {
     0: 0, 2: 16, 5: 15, 7: 18, 8: 17, 11: 5, 12: 2, 13: 6, 14: 3, 15: 7, 16: 4, 23: 12, 24: 9,
     25: 13, 26: 10, 27: 14, 28: 11, 29: 21, 30: 24, 31: 19, 32: 22,
 }  # fmt: skip
-NO_LOOK = Consistency(frames=0, watched_masks=0)
+NO_LOOK = Consistency(frames=0)
 
 
 def read(root: Path, smpl: Path | None = None, **settings: Any) -> Layout:

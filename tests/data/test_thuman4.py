@@ -27,7 +27,7 @@ from gsgan.utils.errors import ConfigError
 
 pytestmark = pytest.mark.usefixtures("model_once")
 
-NO_LOOK = Consistency(frames=0, watched_masks=0)
+NO_LOOK = Consistency(frames=0)
 
 
 def read(root: Path, smplx: Path | None, **settings: Any) -> Layout:

@@ -18,7 +18,7 @@ from writers.common import Subject, make_subject, write_object, write_picture
 
 from gsgan.body.smpl_names import CIHP
 from gsgan.data.dataset import CaptureDataset
-from gsgan.data.formats.consistency import Consistency, box_iou, mask_box
+from gsgan.data.formats.consistency import box_iou, mask_box
 from gsgan.data.formats.smpl_motion import SmplMotion, landmarks_of, posed
 from gsgan.data.formats.zju import ZjuReader, camera_folders, frame_number, read_annots
 from gsgan.data.layout import Layout
@@ -255,15 +255,6 @@ def test_a_camera_without_pictures_keeps_its_index(original: Path, smpl_file: Pa
     assert any("1 of 3 cameras have no images here: Camera_B2" in n for n in layout.notes)
 
 
-def test_a_mask_of_odd_area_is_noted_and_can_be_left_out(original: Path, smpl_file: Path) -> None:
-    write_picture(original / "mask/Camera_B1/000002.png", np.full((40, 40), 255, np.uint8))
-    layout = read(original, smpl_file, consistency=Consistency(frames=0))
-    assert any("more than 50% off the usual at frames 2 of 4" in note for note in layout.notes)
-    without = read(original, smpl_file, consistency=Consistency(frames=0), drop_frames="2")
-    assert without.frames == (0, 1, 3)
-    assert not any("off the usual" in note for note in without.notes)
-
-
 def test_labels_beyond_cihp_are_ignored(original: Path, smpl_file: Path) -> None:
     path = original / "mask_cihp/Camera_B1/000003.png"
     labels = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
@@ -312,7 +303,7 @@ def test_the_config_trains_with_segmentation_on_cihp_labels(
     assert data.layout.frames == (0, 1, 2)
     info = data.info
     assert (info.body, info.n_labels) == ("smpl", 20)
-    avatar = build_avatar(config, data).eval()
+    avatar = build_avatar(config, data.info).eval()
     assert avatar.segmentation is not None
     painting = avatar.paint(data.dataset("train")[0])
     assert painting.segmentation is not None

@@ -12,7 +12,7 @@ import numpy as np
 from gsgan.body.smpl import SkinnedModel, read_smpl
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.files import read_header
-from gsgan.data.formats.consistency import Consistency, check_consistency, watch_masks
+from gsgan.data.formats.consistency import Consistency, check_consistency
 from gsgan.data.layout import Found, Layout, assemble, dataset_folder
 from gsgan.data.pixels import MaskFile, mask_file
 from gsgan.data.splits import parse_frames
@@ -100,8 +100,8 @@ def finish(
             raise ConfigError(f"data.reader.drop_frames={drop_frames} leaves no frame")
         found = replace(found, images=images)
     layout = assemble(found, limits)
-    doubts = check_consistency(layout, found.points or layout.landmarks.seen, consistency, hint)
-    return replace(layout, notes=(*layout.notes, *doubts, *watch_masks(layout, consistency)))
+    check_consistency(layout, found.points or layout.landmarks.seen, consistency, hint)
+    return layout
 
 
 def body_model(root: Path, smpl: str | None, kind: str) -> tuple[Path, SkinnedModel]:
