@@ -365,7 +365,6 @@ def test_model_files_that_do_not_fit(written: dict[str, Path], tmp_path: Path) -
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"masks": "all"}, "data.reader.masks must be one of both, mask_cihp, mask, got 'all'"),
         ({"drop_frames": "a-b"}, "data.reader.drop_frames must be frame numbers"),
         ({"drop_frames": "0-9"}, "leaves no frame"),
     ],
