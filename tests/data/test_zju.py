@@ -303,7 +303,7 @@ def test_the_config_trains_with_segmentation_on_cihp_labels(
     assert (info.body, info.n_labels) == ("smpl", 20)
     avatar = build_avatar(config, data.info, data.labelled("train")).eval()
     assert avatar.segmentation is not None
-    painting = avatar.paint(data.dataset("train")[0])
+    painting = avatar(*data.dataset("train")[0].inputs)
     assert painting.segmentation is not None
     assert "class vote over 9 images" in avatar.segmentation_why
     assert painting.segmentation.shape == (1, avatar.segmentation.classes, 32, 32)

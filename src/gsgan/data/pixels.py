@@ -21,16 +21,14 @@ from gsgan.utils.errors import DataError
 Bytes = NDArray[np.uint8]
 
 IGNORE_LABEL = 255
-MASK_RULES = ("grey", "nonzero", "threshold", "label")
-"""grey: alpha 0..255. nonzero: any channel above 0 is the person. threshold: at least
-`PixelRules.threshold` is. label: part numbers, all but 0 are."""
 
 
 class MaskFile(NamedTuple):
     """One mask of one image.
 
     Args:
-        rule: one of `MASK_RULES`.
+        rule: ``grey``, alpha 0..255; ``nonzero``, any channel above 0 is the person; ``threshold``,
+            at least `PixelRules.threshold` is.
         path: relative to the dataset's root.
     """
 
@@ -38,10 +36,9 @@ class MaskFile(NamedTuple):
     path: str
 
 
-def mask_file(rule: str, path: str) -> MaskFile:
-    """A mask by its rule; a JPEG's "nonzero" is "threshold", as compression rings round edges."""
-    jpeg = path.lower().endswith((".jpg", ".jpeg"))
-    return MaskFile("threshold" if jpeg and rule == "nonzero" else rule, path)
+def mask_file(path: str) -> MaskFile:
+    """A mask of the rule "nonzero"; a JPEG's is "threshold", as compression rings round edges."""
+    return MaskFile("threshold" if path.lower().endswith((".jpg", ".jpeg")) else "nonzero", path)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from gsgan.data.cameras import CameraEntry
 from gsgan.data.files import read_header
 from gsgan.data.formats.consistency import Consistency, check_consistency
 from gsgan.data.layout import Found, Layout, assemble, dataset_folder
-from gsgan.data.pixels import MaskFile, mask_file
+from gsgan.data.pixels import MaskFile
 from gsgan.data.splits import parse_frames
 from gsgan.data.validation import Thresholds
 from gsgan.skeleton.smpl import TABLES
@@ -163,6 +163,6 @@ def one_mask_each(
 ) -> dict[str, dict[int, tuple[MaskFile, ...]]]:
     """Masks by camera and frame, one file per image, all of one rule."""
     return {
-        name: {f: (mask_file(rule, path),) for f, path in paths.items()}
+        name: {f: (MaskFile(rule, path),) for f, path in paths.items()}
         for name, paths in files.items()
     }

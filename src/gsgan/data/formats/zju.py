@@ -39,7 +39,7 @@ ANNOTS = ("annots.npy", "annots_new.npy")
 MILLIMETRES = 1e-3
 TRANSLATION = (0.05, 20.0)  # metres: plausible lengths of the cameras' T
 NAMED_FRAME = re.compile(r"\)_(\d+)")  # CoreView_313_Camera_(1)_0001_2019-08-23_16-08-50.592
-MASKS = {"mask_cihp": "label", "mask": "nonzero"}
+MASKS = ("mask_cihp", "mask")
 # Files may hold stray numbers beyond CIHP's.
 CIHP_TABLE = tuple(i if i < len(CIHP) else IGNORE_LABEL for i in range(256))
 FITS = {"refit": "new_params", "refined": "smpl_params", "first": "params"}
@@ -236,7 +236,7 @@ def _index_masks(
     """Masks and part labels by camera and frame."""
     masks: dict[str, dict[int, tuple[MaskFile, ...]]] = {name: {} for name in folders}
     labels: Files = {name: {} for name in folders}
-    for kind, rule in MASKS.items():
+    for kind in MASKS:
         for name, folder in folders.items():
             # mask/Camera_B1, or mask/images/00 as some copies have it
             places = (f"{kind}/{name}", f"{kind}/{folder}")
@@ -245,7 +245,8 @@ def _index_masks(
             if kind == "mask_cihp":
                 labels[name] = {f: path for f, path in files.items() if path.endswith(".png")}
             for frame, path in files.items():
-                masks[name][frame] = (*masks[name].get(frame, ()), mask_file(rule, path))
+                mask = MaskFile("nonzero", path) if kind == "mask_cihp" else mask_file(path)
+                masks[name][frame] = (*masks[name].get(frame, ()), mask)
     return masks, labels if any(labels.values()) else {}
 
 
