@@ -254,7 +254,7 @@ EASYMOCAP: dict[str, Damage] = {
     "must hold a list of people": people(lambda p: p.append(3)),
     "000001.json is not valid JSON": write("keypoints3d/000001.json", b"[" * 5000),
     "do not meet.*one person": image("mask/*/*.png", np.eye(40, dtype=np.uint8) * 255),
-    "mask does not exist; every image needs a mask": remove("mask"),
+    "mask/1/000000.png does not exist; every image needs a mask": remove("mask"),
 }
 
 
@@ -365,7 +365,6 @@ def test_model_files_that_do_not_fit(written: dict[str, Path], tmp_path: Path) -
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"masks": "all"}, "data.reader.masks must be one of both, mask_cihp, mask, got 'all'"),
         ({"drop_frames": "a-b"}, "data.reader.drop_frames must be frame numbers"),
         ({"drop_frames": "0-9"}, "leaves no frame"),
     ],

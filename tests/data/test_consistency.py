@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from make import edit_json, write_tiny_capture
@@ -20,7 +17,6 @@ from gsgan.data.formats.consistency import (
     far_cameras,
     inside_share,
     joint_distance,
-    mask_beyond,
     mask_distance,
 )
 from gsgan.data.layout import Layout
@@ -37,16 +33,6 @@ def read(root: Path, consistency: Consistency = SKELETON_LIMITS) -> Layout:
     return CaptureReader(consistency=consistency)(root, Thresholds())
 
 
-def turn(axis: tuple[float, float, float], degrees: float) -> Callable[[dict], None]:
-    def change(rig: dict) -> None:
-        r = cv2.Rodrigues(np.radians(degrees) * np.array(axis))[0]
-        camera = rig["cam02"]
-        camera["R"] = (r @ camera["R"]).tolist()
-        camera["t"] = (r @ camera["t"]).tolist()
-
-    return change
-
-
 def scale_K(factor: float) -> Callable[[dict], None]:
     def change(rig: dict) -> None:
         K = np.array(rig["cam02"]["K"])
@@ -60,11 +46,6 @@ def in_mm(rig: dict) -> None:
     rig["cam02"]["t"] = [1000 * x for x in rig["cam02"]["t"]]
 
 
-def exchanged(rig: dict) -> None:
-    for key in "Rt":
-        rig["cam01"][key], rig["cam02"][key] = rig["cam02"][key], rig["cam01"][key]
-
-
 def test_a_good_capture_needs_no_note(root: Path) -> None:
     assert read(root).notes == ()
 
@@ -72,7 +53,7 @@ def test_a_good_capture_needs_no_note(root: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (scale_K(0.5), r"inside: cam02 \d%; 100% in the other cameras\).*gsgan.check finds"),
+        (scale_K(0.5), r"inside: .*cam02 \d%, .*gsgan.check finds"),
         (in_mm, r"camera cam02 stands 3\.13e\+03 m from the person, the median camera 3 m"),
     ],
 )
@@ -85,51 +66,6 @@ def test_a_camera_that_is_wholly_wrong_is_refused(
     assert "\n" not in str(caught.value)
     assert str(root) in str(caught.value)
     assert read(root, Consistency(frames=0, min_box_iou=0)).notes == ()  # nothing is compared
-
-
-@pytest.mark.parametrize("change", [turn((0, 1, 0), 5), exchanged])
-def test_a_camera_that_is_wrong_is_named_in_a_note(
-    root: Path, change: Callable[[dict], None]
-) -> None:
-    edit_json(root / "cameras.json", change)
-    (note,) = read(root, Consistency(min_box_iou=0, least_inside=0)).notes
-    assert note.startswith("joints lie outside the masks (inside: ")
-    assert "cam02" in note
-    assert "cam00" not in note
-    with pytest.raises(DataError, match=r"inside: .*cam02"):
-        read(root, Consistency(min_box_iou=0, least_inside=0.9))
-
-
-def test_a_camera_whose_focal_length_alone_is_halved_is_named(root: Path) -> None:
-    def halve(rig: dict) -> None:
-        for i in (0, 1):
-            rig["cam02"]["K"][i][i] /= 2
-
-    edit_json(root / "cameras.json", halve)
-    consistency = Consistency(
-        min_box_iou=0, min_inside=0, least_inside=0
-    )  # where joints stay inside as well
-    (note,) = read(root, consistency).notes
-    assert re.match(r"masks reach .* beyond all joints \(share: cam02 \d\d%; [0-3]% in the o", note)
-    assert read(root, replace(consistency, max_beyond=1)).notes == ()
-    (other,) = read(root, replace(consistency, min_inside=0.9)).notes
-    assert other.startswith("joints lie outside the masks (inside: cam02 ")
-
-
-def test_the_share_of_a_mask_beyond_all_joints() -> None:
-    K = np.array([[100.0, 0, 50], [0, 200, 50], [0, 0, 1]])
-    camera = CameraEntry("c", K, np.eye(3), np.zeros(3), np.zeros(8), (100, 100))
-    mask = np.zeros((100, 100), np.uint8)
-    mask[50, 50:90] = 255
-    joints = np.array([[0.01, 0.005, 2], [5.0, 0, 2], [0, 0, -2]])
-    # at 2 m a pixel is 2 cm wide: 20 of 40 pixels lie within 0.39 m of the first joint
-    assert mask_beyond(mask, camera, joints, 0.39) == pytest.approx(20 / 40)
-    mask[50:90, 50] = 255  # and 1 cm high: those all do
-    assert mask_beyond(mask, camera, joints, 0.395) == pytest.approx(20 / 79)
-    moved = joints + np.array([0.8, 0, 0])
-    assert mask_beyond(mask, camera, moved, 0.39) == pytest.approx(59 / 79, abs=0.02)
-    assert np.isnan(mask_beyond(0 * mask, camera, joints, 0.3))
-    assert np.isnan(mask_beyond(mask, camera, joints[2:], 0.3))
 
 
 def test_the_share_of_joints_inside_a_mask() -> None:

@@ -21,14 +21,13 @@ from writers.easymocap import (
 )
 
 from gsgan.data.files import read_colour
-from gsgan.data.formats.consistency import Consistency
 from gsgan.data.formats.easymocap import EasymocapReader
 from gsgan.data.formats.smpl_motion import SmplMotion, posed
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_mask
 from gsgan.data.validation import Thresholds
 from gsgan.skeleton.smpl import to_mediapipe33
-from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.errors import DataError
 
 pytestmark = pytest.mark.usefixtures("model_once")
 
@@ -37,7 +36,6 @@ LANDMARKS = {
     0: 0, 2: 16, 5: 15, 7: 18, 8: 17, 11: 5, 12: 2, 13: 6, 14: 3, 15: 7, 16: 4, 23: 12, 24: 9,
     25: 13, 26: 10, 27: 14, 28: 11, 29: 21, 30: 24, 31: 19, 32: 22,
 }  # fmt: skip
-NO_LOOK = Consistency(frames=0, watched_masks=0)
 
 
 def read(root: Path, smpl: Path | None = None, **settings: Any) -> Layout:
@@ -147,18 +145,15 @@ def test_fits_give_skeletons_and_poses(written: Path, subject: Subject, smpl_fil
 
 
 def test_which_skeleton_is_taken(root: Path, smpl_file: Path) -> None:
-    def source(smpl: Path | None = None, **settings: Any) -> str:
-        return read(root, smpl, **settings).meta.skeleton_source
+    def source(smpl: Path | None = None) -> str:
+        return read(root, smpl).meta.skeleton_source
 
     assert source() == "body25 -> mediapipe33"
-    assert source(smpl_file, skeleton="keypoints3d") == "body25 -> mediapipe33"
-    refused(root, "smpl holds SMPL parameters but no joints", "data.smpl=", skeleton="smpl")
     shutil.rmtree(root / "keypoints3d")
     refused(root, "smpl holds SMPL parameters but no joints")
     assert source(smpl_file) == "smpl24 -> mediapipe33"
     shutil.rmtree(root / "smpl")
     refused(root, "has no skeletons; expected keypoints3d/ or smpl/")
-    refused(root, "expected smpl/ in it", skeleton="smpl")
 
 
 def test_pictures_and_masks_are_those_that_were_written(written: Path, subject: Subject) -> None:
@@ -240,20 +235,3 @@ def test_a_persons_own_mask_goes_before_nobodys(tmp_path: Path, subject: Subject
     assert layout.mask_path("2", 2).name == "000002_3.png"
     write_picture(root / "mask/1/first.png", np.zeros((40, 40), np.uint8))
     refused(root, "mask/1/first.png has no frame number", person=3)
-
-
-def test_mask_rules(root: Path) -> None:
-    write_picture(root / "mask/1/000000.png", np.full((40, 40), 100, np.uint8))
-    for rule, expected in (("nonzero", 255), ("threshold", 0), ("grey", 100), ("label", 255)):
-        layout = read(root, mask_rule=rule, consistency=NO_LOOK)
-        assert (read_mask(layout.mask_files("1", 0), layout.pixels) == expected).all()
-    with pytest.raises(ConfigError, match="mask_rule must be one of grey"):
-        EasymocapReader(mask_rule="soft")
-    with pytest.raises(ConfigError, match="skeleton must be one of auto, smpl, keypoints3d"):
-        EasymocapReader(skeleton="body25")
-
-
-def test_masks_that_are_missing(root: Path) -> None:
-    (root / "mask").rename(root / "mask-schp")
-    refused(root, str(root / "mask"), "every image needs a mask", "data.reader.masks")
-    assert read(root, masks="mask-schp").frames == (0, 1, 2, 3)

@@ -34,7 +34,6 @@ def grey(tmp_path: Path) -> Path:
     [
         ("grey", VALUES),
         ("nonzero", [[0, 255, 255], [255, 255, 255]]),
-        ("label", [[0, 255, 255], [255, 255, 255]]),
         ("threshold", [[0, 0, 0], [255, 255, 255]]),
     ],
 )
@@ -78,14 +77,13 @@ def test_the_ringing_of_a_jpeg_is_no_person(tmp_path: Path) -> None:
     mask = np.zeros((40, 40), np.uint8)
     mask[10:27, 11:30] = 255
     cv2.imwrite(str(tmp_path / "m.JPG"), mask)
-    ringing, sound = MaskFile("nonzero", "m.JPG"), mask_file("nonzero", "m.JPG")
+    ringing, sound = MaskFile("nonzero", "m.JPG"), mask_file("m.JPG")
     first, second = (
         read_mask([(f.rule, tmp_path / f.path)], PixelRules()) for f in (ringing, sound)
     )
     assert np.count_nonzero(first) > np.count_nonzero(mask)
     np.testing.assert_array_equal(second, mask)
-    assert mask_file("nonzero", "m.png").rule == "nonzero"
-    assert mask_file("label", "m.jpg").rule == "label"
+    assert mask_file("m.png").rule == "nonzero"
 
 
 def test_labels_go_through_their_table(grey: Path) -> None:

@@ -18,7 +18,7 @@ from writers.common import Subject, make_subject, write_object, write_picture
 
 from gsgan.body.smpl_names import CIHP
 from gsgan.data.dataset import CaptureDataset
-from gsgan.data.formats.consistency import Consistency, box_iou, mask_box
+from gsgan.data.formats.consistency import box_iou, mask_box
 from gsgan.data.formats.smpl_motion import SmplMotion, landmarks_of, posed
 from gsgan.data.formats.zju import ZjuReader, camera_folders, frame_number, read_annots
 from gsgan.data.layout import Layout
@@ -151,10 +151,9 @@ def test_masks_are_joined_and_small_labels_are_not_thresholded(
     other[8, 9] = 1
     write_picture(original / "mask_cihp/Camera_B1/000002.png", one)
     write_picture(original / "mask/Camera_B1/000002.png", np.repeat(other[..., None], 3, -1))
-    for masks, count in (("both", 2), ("mask", 1), ("mask_cihp", 1)):
-        layout = read(original, smpl_file, masks=masks)
-        mask = read_mask(layout.mask_files("Camera_B1", 2), layout.pixels)
-        assert (mask == 255).sum() == count
+    layout = read(original, smpl_file)
+    mask = read_mask(layout.mask_files("Camera_B1", 2), layout.pixels)
+    assert (mask == 255).sum() == 2
 
 
 def test_poses_of_69_are_padded(subject: Subject, smpl_file: Path, tmp_path: Path) -> None:
@@ -174,7 +173,6 @@ def test_the_refit_goes_before_the_first_fit_which_has_no_pose_blend_shapes(
     moved = replace(moved, joints=subject.joints + 0.01)
     writers.write_original(root, moved)
     check_skeletons(read(root, smpl_file), moved)
-    check_skeletons(read(root, smpl_file, fit="first"), first)
 
 
 NUMBERS = (1, 2, 19, 22)
@@ -253,15 +251,6 @@ def test_a_camera_without_pictures_keeps_its_index(original: Path, smpl_file: Pa
     assert layout.camera_names == ("Camera_B1", "Camera_B2", "Camera_B3")
     assert not layout.images["Camera_B2"]
     assert any("1 of 3 cameras have no images here: Camera_B2" in n for n in layout.notes)
-
-
-def test_a_mask_of_odd_area_is_noted_and_can_be_left_out(original: Path, smpl_file: Path) -> None:
-    write_picture(original / "mask/Camera_B1/000002.png", np.full((40, 40), 255, np.uint8))
-    layout = read(original, smpl_file, consistency=Consistency(frames=0))
-    assert any("more than 50% off the usual at frames 2 of 4" in note for note in layout.notes)
-    without = read(original, smpl_file, consistency=Consistency(frames=0), drop_frames="2")
-    assert without.frames == (0, 1, 3)
-    assert not any("off the usual" in note for note in without.notes)
 
 
 def test_labels_beyond_cihp_are_ignored(original: Path, smpl_file: Path) -> None:

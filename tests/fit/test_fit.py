@@ -210,7 +210,7 @@ def test_masks_without_anyone_are_refused(compose, people, tmp_path):
         run_fit(
             compose(
                 *("fit", f"data.root={empty}", f"out={tmp_path / 'a'}", *QUICK),
-                *("data.reader.consistency.frames=0", "data.reader.consistency.watched_masks=0"),
+                "data.reader.consistency.frames=0",
             )
         )
 

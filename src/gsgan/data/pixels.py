@@ -21,16 +21,14 @@ from gsgan.utils.errors import DataError
 Bytes = NDArray[np.uint8]
 
 IGNORE_LABEL = 255
-MASK_RULES = ("grey", "nonzero", "threshold", "label")
-"""grey: alpha 0..255. nonzero: any channel above 0 is the person. threshold: at least
-`PixelRules.threshold` is. label: part numbers, all but 0 are."""
 
 
 class MaskFile(NamedTuple):
     """One mask of one image.
 
     Args:
-        rule: one of `MASK_RULES`.
+        rule: ``grey``, alpha 0..255; ``nonzero``, any channel above 0 is the person; ``threshold``,
+            at least `PixelRules.threshold` is.
         path: relative to the dataset's root.
     """
 
@@ -38,10 +36,9 @@ class MaskFile(NamedTuple):
     path: str
 
 
-def mask_file(rule: str, path: str) -> MaskFile:
-    """A mask by its rule; a JPEG's "nonzero" is "threshold", as compression rings round edges."""
-    jpeg = path.lower().endswith((".jpg", ".jpeg"))
-    return MaskFile("threshold" if jpeg and rule == "nonzero" else rule, path)
+def mask_file(path: str) -> MaskFile:
+    """A mask of the rule "nonzero"; a JPEG's is "threshold", as compression rings round edges."""
+    return MaskFile("threshold" if path.lower().endswith((".jpg", ".jpeg")) else "nonzero", path)
 
 
 @dataclass(frozen=True)
@@ -57,7 +54,6 @@ class PixelRules:
         ignore_band: pixels of the stored image, side of the square by which the mask is dilated
             and eroded; labels in the band between become "ignore". 0 leaves it out.
         unsure_band: the same for colours: pixels in that band are left out of the loss.
-        unsure_alpha: pixels of an alpha strictly between these two are too; None leaves out none.
     """
 
     composed: bool = False
@@ -66,7 +62,6 @@ class PixelRules:
     label_table: tuple[int, ...] | None = None
     ignore_band: int = 0
     unsure_band: int = 0
-    unsure_alpha: tuple[int, int] | None = None
 
 
 def read_mask(files: Sequence[tuple[str, Path]], rules: PixelRules) -> Bytes:
@@ -147,20 +142,6 @@ def outline(mask: Bytes, band: int) -> NDArray[np.bool_]:
     return np.asarray(cv2.dilate(person, kernel) != cv2.erode(person, kernel))
 
 
-def read_unsure(files: Sequence[tuple[str, Path]], mask: Bytes, rules: PixelRules) -> Bytes | None:
-    """``[H, W]`` 255 at pixels that are left out of the loss, or None without such a rule.
-
-    Args:
-        files: (rule, path) of the masks, decoded again when the rules use alphas.
-        mask: ``[H, W]`` 0..255, the result of `read_mask`.
-        rules: of the dataset.
-    """
-    if rules.unsure_band == 0 and rules.unsure_alpha is None:
-        return None
-    unsure = outline(mask, rules.unsure_band)
-    if rules.unsure_alpha is not None:
-        low, high = rules.unsure_alpha
-        for _, path in files:
-            alpha = read_grey(path)
-            unsure |= (alpha > low) & (alpha < high)
-    return np.where(unsure, np.uint8(255), np.uint8(0))
+def unsure_pixels(mask: Bytes, band: int) -> Bytes | None:
+    """``[H, W]`` 255 in the `outline` of the mask ``[H, W]``, left out of the loss; None if 0."""
+    return None if band == 0 else outline(mask, band).astype(np.uint8) * np.uint8(255)

@@ -12,9 +12,9 @@ import numpy as np
 from gsgan.body.smpl import SkinnedModel, read_smpl
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.files import read_header
-from gsgan.data.formats.consistency import Consistency, check_consistency, watch_masks
+from gsgan.data.formats.consistency import Consistency, check_consistency
 from gsgan.data.layout import Found, Layout, assemble, dataset_folder
-from gsgan.data.pixels import MaskFile, mask_file
+from gsgan.data.pixels import MaskFile
 from gsgan.data.splits import parse_frames
 from gsgan.data.validation import Thresholds
 from gsgan.skeleton.smpl import TABLES
@@ -100,8 +100,8 @@ def finish(
             raise ConfigError(f"data.reader.drop_frames={drop_frames} leaves no frame")
         found = replace(found, images=images)
     layout = assemble(found, limits)
-    doubts = check_consistency(layout, found.points or layout.landmarks.seen, consistency, hint)
-    return replace(layout, notes=(*layout.notes, *doubts, *watch_masks(layout, consistency)))
+    check_consistency(layout, found.points or layout.landmarks.seen, consistency, hint)
+    return layout
 
 
 def body_model(root: Path, smpl: str | None, kind: str) -> tuple[Path, SkinnedModel]:
@@ -163,6 +163,6 @@ def one_mask_each(
 ) -> dict[str, dict[int, tuple[MaskFile, ...]]]:
     """Masks by camera and frame, one file per image, all of one rule."""
     return {
-        name: {f: (mask_file(rule, path),) for f, path in paths.items()}
+        name: {f: (MaskFile(rule, path),) for f, path in paths.items()}
         for name, paths in files.items()
     }

@@ -1,7 +1,7 @@
 """Do cameras, joints and masks fit together? The rules, and the one set of thresholds.
 
-Readers apply them to a few images when a dataset is opened (`check_consistency`, `watch_masks`);
-`gsgan.check` applies the same measures and thresholds to many. Pixel centres lie at +0.5.
+Readers apply them to a few images when a dataset is opened (`check_consistency`); `gsgan.check`
+applies the same measures and thresholds to many. Pixel centres lie at +0.5.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import NEAR, project
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_mask
-from gsgan.data.validation import spans
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.errors import DataError
 
@@ -31,7 +30,6 @@ T = TypeVar("T")
 
 LONGEST = 512  # pixels, longest side of a mask that joints are compared with
 TOLERANCE = 1.5  # pixels of that mask that a joint may always lie outside
-SAMPLED = 2000  # pixels of a mask whose distance to the joints is measured
 FAR_PIXELS = 1e4  # drawing coordinates are clipped to this: OpenCV's are 16 bit when shifted
 
 
@@ -48,10 +46,6 @@ class Consistency:
     min_inside: float = 0.9
     far_camera: float = 10.0
     joint_tolerance: float = 0.05
-    max_beyond: float = 0.1
-    joint_reach: float = 0.3
-    watched_masks: int = 48
-    mask_jump: float = 0.5
 
 
 class Comparison(NamedTuple):
@@ -61,8 +55,7 @@ class Comparison(NamedTuple):
         camera, frame, mask, empty: of the image; the (first) file of its mask, and whether that
             has no foreground.
         iou: overlap of the boxes of mask and projected body; NaN when one of them is empty.
-        inside, beyond: share of the visible joints inside the mask, and of the mask far from every
-            visible joint; NaN of none.
+        inside: share of the visible joints inside the mask; NaN of none.
     """
 
     camera: str
@@ -71,13 +64,12 @@ class Comparison(NamedTuple):
     empty: bool
     iou: float
     inside: float
-    beyond: float
 
 
 def check_consistency(
     layout: Layout, body: Callable[[int], Float], limits: Consistency, hint: str
-) -> list[str]:
-    """Checks that the projected body lies where the masks are, and that not all masks are empty.
+) -> None:
+    """Checks that the projected body and the joints lie where the masks are.
 
     Args:
         layout: the dataset.
@@ -85,11 +77,8 @@ def check_consistency(
         limits: how many frames, and the thresholds.
         hint: what to check when they do not fit.
 
-    Returns:
-        Notes on cameras whose joints lie outside their masks, or masks far from their joints.
-
     Raises:
-        DataError: naming the camera that is furthest off, or the first empty mask.
+        DataError: naming the camera that is furthest off, or the first of masks that are all empty.
     """
     compared = [
         _compare(layout, points, camera, frame, limits)
@@ -99,7 +88,7 @@ def check_consistency(
         if frame in files
     ]
     if not compared:
-        return []
+        return
     person = np.median(layout.landmarks.seen(compared[0].frame), axis=0)
     metres = {n: float(np.linalg.norm(c.centre - person)) for n, c in layout.cameras.items()}
     if far := far_cameras(metres, limits.far_camera):
@@ -117,7 +106,17 @@ def check_consistency(
             f"{median:.2f}, expected {limits.min_box_iou:g}; worst in camera {worst.camera}, frame "
             f"{worst.frame}: {worst.mask}); {hint}"
         )
-    return _notes(layout.root, compared, limits, hint)
+    inside = {
+        name: np.mean(shares)
+        for name in layout.cameras
+        if (shares := [x.inside for x in compared if x.camera == name and np.isfinite(x.inside)])
+    }
+    if inside and min(inside.values()) < limits.least_inside:
+        shares = ", ".join(f"{name} {share:.0%}" for name, share in inside.items())
+        raise DataError(
+            f"{layout.root}: joints lie outside the masks (inside: {shares}); {hint}: "
+            "python -m gsgan.check finds the wrong camera"
+        )
 
 
 def _compare(
@@ -133,7 +132,6 @@ def _compare(
         empty=not mask.any(),
         iou=box_iou(expected, found) if expected and found else np.nan,
         inside=inside_share(mask, camera, joints, limits.joint_tolerance),
-        beyond=mask_beyond(mask, camera, joints, limits.joint_reach),
     )
 
 
@@ -146,44 +144,6 @@ def far_cameras(metres: Mapping[str, float], factor: float) -> dict[str, str]:
         for name, distance in metres.items()
         if not median / factor <= distance <= median * factor
     }
-
-
-def _notes(root: Path, compared: Sequence[Comparison], limits: Consistency, hint: str) -> list[str]:
-    """One note on joints outside masks, one on masks beyond joints, where there are any."""
-    notes = []
-    inside, beyond = _means(compared, "inside"), _means(compared, "beyond")
-    outside = {name for name, share in inside.items() if share < limits.min_inside}
-    if outside:
-        text = f"joints lie outside the masks (inside: {_listed(inside, outside)})"
-        if min(inside.values()) < limits.least_inside:
-            raise DataError(f"{root}: {text}; {hint}: python -m gsgan.check finds the wrong camera")
-        notes.append(
-            f"{text}: python -m gsgan.check finds whether calibration, skeleton or masks are wrong"
-        )
-    wide = {n for n, share in beyond.items() if share > limits.max_beyond and n not in outside}
-    if wide:
-        notes.append(
-            f"masks reach more than {limits.joint_reach:g} m beyond all joints (share: "
-            f"{_listed(beyond, wide)}): focal lengths are too short, masks show more than the "
-            "person, or the skeleton lacks limbs: python -m gsgan.check reports more"
-        )
-    return notes
-
-
-def _means(compared: Sequence[Comparison], field: str) -> dict[str, float]:
-    """The mean of each camera's finite values."""
-    kept: dict[str, list[float]] = {}
-    for one in compared:
-        if np.isfinite(value := getattr(one, field)):
-            kept.setdefault(one.camera, []).append(value)
-    return {name: float(np.mean(some)) for name, some in kept.items()}
-
-
-def _listed(means: Mapping[str, float], named: set[str]) -> str:
-    """The shares of the named cameras, and the mean of the others."""
-    text = ", ".join(f"{name} {share:.0%}" for name, share in means.items() if name in named)
-    rest = [share for name, share in means.items() if name not in named]
-    return f"{text}; {np.mean(rest):.0%} in the other cameras" if rest else text
 
 
 def mask_distance(mask: Bool) -> Float:
@@ -223,35 +183,14 @@ def inside_share(mask: Bytes, camera: CameraEntry, joints: Float, tolerance: flo
     """
     if not mask.any():
         return np.nan
-    small, pixels, depth, focal = _reduced(mask, camera, joints)
-    outside = joint_distance(
-        mask_distance(small), pixels, depth, np.ones(len(joints), bool), float(focal[0])
-    )
-    known = ~np.isnan(outside)
-    allowed = np.maximum(tolerance, TOLERANCE * depth / focal[0])
-    return float((outside <= allowed)[known].mean()) if known.any() else np.nan
-
-
-def mask_beyond(mask: Bytes, camera: CameraEntry, joints: Float, reach: float) -> float:
-    """Share of a stored mask further than ``reach`` metres from all world points ``[N, 3]``.
-
-    Points behind the camera do not count; NaN without any, or of an empty mask. Evenly spaced
-    pixels represent a large mask.
-    """
-    small, pixels, depth, focal = _reduced(mask, camera, joints)
-    person, front = np.argwhere(small), depth > NEAR
-    if len(person) == 0 or not front.any():
-        return np.nan
-    some = person[:: -(-len(person) // SAMPLED), ::-1] + 0.5
-    metres = (some[:, None] - pixels[front]) / focal * depth[front, None]
-    return float((np.linalg.norm(metres, axis=-1).min(axis=1) > reach).mean())
-
-
-def _reduced(mask: Bytes, camera: CameraEntry, points: Float) -> tuple[Bool, Float, Float, Float]:
-    """The mask of at most `LONGEST` pixels; pixels ``[N, 2]``, depths ``[N]``, focal ``[2]``."""
     step = max(1, -(-max(mask.shape) // LONGEST))
-    pixels, depth = camera.stored_pixels(points) / step, project(camera, points)[1]
-    return np.asarray(mask[::step, ::step] > 127), pixels, depth, np.diag(camera.K)[:2] / step
+    small, focal = mask[::step, ::step] > 127, float(camera.K[0, 0]) / step
+    pixels, depth = camera.stored_pixels(joints) / step, project(camera, joints)[1]
+    everyone = np.ones(len(joints), bool)
+    outside = joint_distance(mask_distance(small), pixels, depth, everyone, focal)
+    known = ~np.isnan(outside)
+    allowed = np.maximum(tolerance, TOLERANCE * depth / focal)
+    return float((outside <= allowed)[known].mean()) if known.any() else np.nan
 
 
 def box_of(points: Float, camera: CameraEntry) -> Box | None:
@@ -283,23 +222,3 @@ def box_iou(a: Box, b: Box) -> float:
 def spread(values: Sequence[T], count: int) -> list[T]:
     """At most ``count`` of the values, evenly spaced, first and last included."""
     return [values[i] for i in evenly_spaced(len(values), count, ends=True)]
-
-
-def watch_masks(layout: Layout, limits: Consistency) -> list[str]:
-    """Notes on the frames at which the first camera's mask is empty or of an unusual area."""
-    camera = next((name for name, files in layout.masks.items() if files), None)
-    if camera is None or limits.watched_masks == 0:
-        return []
-    frames = spread(sorted(layout.masks[camera]), limits.watched_masks)
-    masks = (read_mask(layout.mask_files(camera, f), layout.pixels) for f in frames)
-    filled, areas = np.array([(mask.any(), np.count_nonzero(mask > 127)) for mask in masks]).T
-    filled = filled > 0
-    usual = float(np.median(areas[filled])) if filled.any() else 0.0
-    odd = filled & (np.abs(areas - usual) > limits.mask_jump * usual)
-    off = f"mask's area is more than {limits.mask_jump:.0%} off the usual"
-    return [
-        f"camera {camera}: the {case} at frames {spans(np.array(frames)[at].tolist())} of "
-        f"{len(frames)} compared; leave bad ones out with data.reader.drop_frames"
-        for case, at in (("mask is empty", ~filled), (off, odd))
-        if at.any()
-    ]

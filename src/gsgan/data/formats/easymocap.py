@@ -11,7 +11,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -32,12 +32,11 @@ from gsgan.data.formats.common import (
 from gsgan.data.formats.smpl_motion import landmarks_of, zju_motion
 from gsgan.data.joints import BODY, FROM_HANDS, SETS
 from gsgan.data.layout import BodyModel, Found, Meta
-from gsgan.data.pixels import MASK_RULES, MaskFile, PixelRules, mask_file
+from gsgan.data.pixels import MaskFile, mask_file
 from gsgan.data.skeletons import make_landmarks
 from gsgan.data.validation import Thresholds, spans
 from gsgan.skeleton.hands import HAND
 from gsgan.utils.arrays import as_floats
-from gsgan.utils.checks import one_of
 from gsgan.utils.errors import DataError
 
 Float = NDArray[np.float64]
@@ -58,11 +57,7 @@ HANDS_TO_33 = {landmark: BODY_25 + joint - BODY for landmark, joint in FROM_HAND
 class EasymocapReader(FolderReader):
     """Reads a folder of EasyMocap; conf/data/easymocap.yaml explains the settings."""
 
-    skeleton: str = "auto"
     person: int = 0
-    masks: str = "mask"
-    mask_rule: str = "nonzero"
-    threshold: int = 128
     distance: tuple[float, float] = (0.3, 30.0)
     fps: float | None = None
 
@@ -71,10 +66,6 @@ class EasymocapReader(FolderReader):
         "check that calibration, skeleton and masks are of one recording and one person "
         "(data.reader.person)"
     )
-
-    def __post_init__(self) -> None:
-        one_of("data.reader.skeleton", self.skeleton, ("auto", *SKELETONS))
-        one_of("data.reader.mask_rule", self.mask_rule, MASK_RULES)
 
     def find(self, root: Path, limits: Thresholds, smpl: str | None) -> Found:
         """The dataset's files, each checked separately.
@@ -89,7 +80,7 @@ class EasymocapReader(FolderReader):
             raise DataError(f"{root / 'images' / empty[0]} holds no images; expected 000000.jpg")
         cameras = self._cameras(root, images, notes)
         frames = {f for files in images.values() for f in files}
-        kind, place = self._source(root, smpl)
+        kind, place = _source(root, smpl)
         people = _read_people(root, place, frames, self.person, notes)
         motion = body = None
         if kind == "smpl":
@@ -110,29 +101,14 @@ class EasymocapReader(FolderReader):
             ),
             cameras=cameras,
             images=images,
-            masks=self._masks(root, names),
-            mask_folder=f"{self.masks}/{{camera}}",
+            masks=_masks(root, names, self.person),
+            mask_folder="mask/{camera}",
             landmarks=make_landmarks(ids, p, conf, limits.max_reach, notes, source=f"{place}/"),
             poses=None if motion is None else motion.poses(f"{place}/"),
-            pixels=PixelRules(threshold=self.threshold),
             calibration=root / "intri.yml and extri.yml",
             unit_hint=f"T in {root / 'extri.yml'} and {root / place} must be in metres",
             notes=tuple(notes),
         )
-
-    def _source(self, root: Path, smpl: str | None) -> tuple[str, str]:
-        """The kind of skeletons to use, and their folder."""
-        kinds = SKELETONS if self.skeleton == "auto" else (self.skeleton,)
-        places = [(k, pattern.format(kind=k)) for k in kinds for pattern in RESULTS]
-        places = [(kind, place) for kind, place in places if (root / place).is_dir()]
-        if not places:
-            names = "keypoints3d/ or smpl/" if self.skeleton == "auto" else f"{self.skeleton}/"
-            raise DataError(
-                f"{root} has no skeletons; expected {names} in it, or in output/: run EasyMocap's "
-                "reconstruction first"
-            )
-        usable = [(kind, place) for kind, place in places if kind != "smpl" or smpl is not None]
-        return (usable or places)[0]
 
     def _cameras(
         self, root: Path, images: Mapping[str, Mapping[int, str]], notes: list[str]
@@ -156,23 +132,34 @@ class EasymocapReader(FolderReader):
             for name in images
         }
 
-    def _masks(self, root: Path, names: list[str]) -> dict[str, dict[int, tuple[MaskFile, ...]]]:
-        """By camera and frame; only the person's own where the names hold an id."""
-        if not (root / self.masks).is_dir():
-            raise DataError(
-                f"{root / self.masks} does not exist; every image needs a mask, expected "
-                f"{self.masks}/<camera>/000000.png (data.reader.masks names the folder)"
-            )
-        found = {}
-        for name in names:
-            files = frame_files(root, f"{self.masks}/{name}", (".png", ".jpg"), _frame_and_person)
-            own: dict[int, tuple[MaskFile, ...]] = {}
-            for key, path in sorted(files.items()):  # a mask without an id comes first
-                frame, number = divmod(key, PEOPLE)
-                if number in (0, self.person + 1):
-                    own[frame] = (mask_file(self.mask_rule, path),)
-            found[name] = own
-        return found
+
+def _source(root: Path, smpl: str | None) -> tuple[str, str]:
+    """The kind of skeletons to use, fits where the user has the model, and their folder."""
+    places = [(kind, pattern.format(kind=kind)) for kind in SKELETONS for pattern in RESULTS]
+    places = [(kind, place) for kind, place in places if (root / place).is_dir()]
+    if not places:
+        raise DataError(
+            f"{root} has no skeletons; expected keypoints3d/ or smpl/ in it, or in output/: run "
+            "EasyMocap's reconstruction first"
+        )
+    usable = [(kind, place) for kind, place in places if kind != "smpl" or smpl is not None]
+    return (usable or places)[0]
+
+
+def _masks(
+    root: Path, names: Sequence[str], person: int
+) -> dict[str, dict[int, tuple[MaskFile, ...]]]:
+    """By camera and frame; only the person's own where the names hold an id."""
+    found = {}
+    for name in names:
+        files = frame_files(root, f"mask/{name}", (".png", ".jpg"), _frame_and_person)
+        own: dict[int, tuple[MaskFile, ...]] = {}
+        for key, path in sorted(files.items()):  # a mask without an id comes first
+            frame, number = divmod(key, PEOPLE)
+            if number in (0, person + 1):
+                own[frame] = (mask_file(path),)
+        found[name] = own
+    return found
 
 
 def _camera_folders(root: Path, contents: str) -> list[str]:

@@ -29,7 +29,6 @@ from gsgan.data.layout import BodyModel, Found, Meta
 from gsgan.data.pixels import IGNORE_LABEL, MaskFile, PixelRules, mask_file
 from gsgan.data.skeletons import make_landmarks
 from gsgan.data.validation import Thresholds
-from gsgan.utils.checks import one_of
 from gsgan.utils.errors import DataError
 from gsgan.utils.pickles import read_npy
 
@@ -38,8 +37,9 @@ Files = dict[str, dict[int, str]]
 
 ANNOTS = ("annots.npy", "annots_new.npy")
 MILLIMETRES = 1e-3
+TRANSLATION = (0.05, 20.0)  # metres: plausible lengths of the cameras' T
 NAMED_FRAME = re.compile(r"\)_(\d+)")  # CoreView_313_Camera_(1)_0001_2019-08-23_16-08-50.592
-MASKS = {"mask_cihp": "label", "mask": "nonzero"}
+MASKS = ("mask_cihp", "mask")
 # Files may hold stray numbers beyond CIHP's.
 CIHP_TABLE = tuple(i if i < len(CIHP) else IGNORE_LABEL for i in range(256))
 FITS = {"refit": "new_params", "refined": "smpl_params", "first": "params"}
@@ -50,10 +50,7 @@ UNBLENDED = "first"  # the fit whose body is posed without pose blend shapes
 class ZjuReader(FolderReader):
     """Reads a ZJU-MoCap subject; conf/data/zju_mocap.yaml explains the settings."""
 
-    masks: str = "both"
-    fit: str = "auto"
     ignore_band: int = 5
-    translation: tuple[float, float] = (0.05, 20.0)
     max_missing_masks: float = 0.5
 
     contents: ClassVar[str] = "a ZJU-MoCap subject (annots.npy and camera folders)"
@@ -61,10 +58,6 @@ class ZjuReader(FolderReader):
         "check that cameras, SMPL parameters and masks come from one release (the refined my_* "
         "ones do not fit CoreView images)"
     )
-
-    def __post_init__(self) -> None:
-        one_of("data.reader.masks", self.masks, ("both", *MASKS))
-        one_of("data.reader.fit", self.fit, ("auto", *FITS))
 
     def find(self, root: Path, limits: Thresholds, smpl: str | None) -> Found:
         """The subject's files, each checked separately.
@@ -78,11 +71,15 @@ class ZjuReader(FolderReader):
         folders = camera_folders(root, annots)
         images = _index_images(root, folders, notes)
         cameras = self._cameras(root, annots, images, limits)
-        fit, params = self._fit(root)
+        fit = next(((name, at) for name, at in FITS.items() if (root / at).is_dir()), None)
+        if fit is None:
+            looked = ", ".join(f"{folder}/" for folder in FITS.values())
+            raise DataError(f"{root} has no SMPL parameters; expected one of the folders {looked}")
+        kind, params = fit
         frames = {f for files in images.values() for f in files}
         motion = _read_motion(root, params, frames, model, notes)
-        masks, labels = self._masks(root, folders)
-        p, conf = landmarks_of(model, motion, fit != UNBLENDED)
+        masks, labels = _index_masks(root, folders)
+        p, conf = landmarks_of(model, motion, kind != UNBLENDED)
         row = {int(f): i for i, f in enumerate(motion.ids)}
         return Found(
             root=root,
@@ -106,7 +103,7 @@ class ZjuReader(FolderReader):
             ),
             calibration=annots.path,
             unit_hint=f"T in {annots.path} must be in millimetres, Th in {root / params} in metres",
-            points=lambda frame: posed(model, motion.rows([row[frame]]), fit != UNBLENDED)[0][0],
+            points=lambda frame: posed(model, motion.rows([row[frame]]), kind != UNBLENDED)[0][0],
             notes=tuple(notes),
         )
 
@@ -130,41 +127,13 @@ class ZjuReader(FolderReader):
                 rotation_tolerance=limits.rotation_tolerance,
             )
         length = float(np.median([np.linalg.norm(camera.t) for camera in cameras.values()]))
-        low, high = self.translation
+        low, high = TRANSLATION
         if not low <= length <= high:
             raise DataError(
                 f"{annots.path}: T is {length:.3g} m long (median, taken as millimetres), expected "
                 f"{low:g}-{high:g} m; this file's T is not in millimetres"
             )
         return cameras
-
-    def _fit(self, root: Path) -> tuple[str, str]:
-        """Name and folder of the requested fit, or with "auto" of the first that exists."""
-        fits = FITS if self.fit == "auto" else {self.fit: FITS[self.fit]}
-        for name, folder in fits.items():
-            if (root / folder).is_dir():
-                return name, folder
-        looked = ", ".join(f"{folder}/" for folder in fits.values())
-        raise DataError(f"{root} has no SMPL parameters; expected one of the folders {looked}")
-
-    def _masks(
-        self, root: Path, folders: Mapping[str, str]
-    ) -> tuple[dict[str, dict[int, tuple[MaskFile, ...]]], Files]:
-        """Masks and part labels by camera and frame."""
-        masks: dict[str, dict[int, tuple[MaskFile, ...]]] = {name: {} for name in folders}
-        labels: Files = {name: {} for name in folders}
-        for kind, rule in MASKS.items():
-            for name, folder in folders.items():
-                # mask/Camera_B1, or mask/images/00 as some copies have it
-                places = (f"{kind}/{name}", f"{kind}/{folder}")
-                place = next((p for p in places if (root / p).is_dir()), places[0])
-                files = frame_files(root, place, (".png", ".jpg"), frame_number)
-                if kind == "mask_cihp":
-                    labels[name] = {f: path for f, path in files.items() if path.endswith(".png")}
-                if self.masks in ("both", kind):
-                    for frame, path in files.items():
-                        masks[name][frame] = (*masks[name].get(frame, ()), mask_file(rule, path))
-        return masks, labels if any(labels.values()) else {}
 
 
 class Annots(NamedTuple):
@@ -259,6 +228,26 @@ def _index_images(root: Path, folders: Mapping[str, str], notes: list[str]) -> F
             f"{len(empty)} of {len(images)} cameras have no images here: {', '.join(empty)}"
         )
     return images
+
+
+def _index_masks(
+    root: Path, folders: Mapping[str, str]
+) -> tuple[dict[str, dict[int, tuple[MaskFile, ...]]], Files]:
+    """Masks and part labels by camera and frame."""
+    masks: dict[str, dict[int, tuple[MaskFile, ...]]] = {name: {} for name in folders}
+    labels: Files = {name: {} for name in folders}
+    for kind in MASKS:
+        for name, folder in folders.items():
+            # mask/Camera_B1, or mask/images/00 as some copies have it
+            places = (f"{kind}/{name}", f"{kind}/{folder}")
+            place = next((p for p in places if (root / p).is_dir()), places[0])
+            files = frame_files(root, place, (".png", ".jpg"), frame_number)
+            if kind == "mask_cihp":
+                labels[name] = {f: path for f, path in files.items() if path.endswith(".png")}
+            for frame, path in files.items():
+                mask = MaskFile("nonzero", path) if kind == "mask_cihp" else mask_file(path)
+                masks[name][frame] = (*masks[name].get(frame, ()), mask)
+    return masks, labels if any(labels.values()) else {}
 
 
 def _read_motion(
