@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -16,18 +13,14 @@ from gsgan.scene import Camera
 from gsgan.splat import rasterise
 from gsgan.utils.images import eight_bits
 
-if TYPE_CHECKING:
-    from gsgan.scene import Frame
-
 Bytes = NDArray[np.uint8]
 
 IMAGE, COLOUR, PARTS, ALPHA = "image", "Step I's colour", "segmentation S", "alpha"
-DEPTH, FEATURE, ERROR = "depth", "feature channel", "error against truth"
-ERROR_SCALE = 4.0  # differences from 1/4 on have the brightest colour
+DEPTH, FEATURE = "depth", "feature channel"
 
 
-def layers(avatar: Avatar, truth: bool) -> tuple[str, ...]:
-    """The layers of an avatar, with the error if there is a ground truth."""
+def layers(avatar: Avatar) -> tuple[str, ...]:
+    """The layers of an avatar."""
     names = [IMAGE, ALPHA]
     if avatar.splats is not None:
         names += [COLOUR, DEPTH]
@@ -35,7 +28,7 @@ def layers(avatar: Avatar, truth: bool) -> tuple[str, ...]:
         names.append(FEATURE)
     if avatar.segmentation is not None:
         names.append(PARTS)
-    return (*names, *[ERROR] * truth)
+    return tuple(names)
 
 
 def shown(
@@ -45,7 +38,6 @@ def shown(
     avatar: Avatar,
     behind: Tensor,
     channel: int = 0,
-    truth: Frame | None = None,
 ) -> Bytes:
     """``[H, W, 3]`` a layer of one painting.
 
@@ -56,15 +48,11 @@ def shown(
         avatar: that painted it.
         behind: ``[3, H, W]`` the background.
         channel: of F, for the feature layer; its values are stretched to the colour map's range.
-        truth: the frame with the ground truth, for the error layer.
     """
     assert painting.image is not None and painting.alpha is not None  # noqa: PT018
     image, alpha = painting.image[0].cpu(), painting.alpha[0].cpu()
     if layer == ALPHA:
         return _grey(alpha[0])
-    if layer == ERROR and truth is not None:
-        error = (image.clamp(0, 1) - truth.image[0]).abs().mean(dim=0)
-        return _coloured(error * ERROR_SCALE)
     if layer == PARTS and painting.segmentation is not None:
         return _parts(painting.segmentation[0].cpu())
     if layer == COLOUR and painting.features is not None and painting.splat_alpha is not None:
@@ -111,16 +99,3 @@ def _coloured(x: Tensor) -> Bytes:
     import matplotlib
 
     return np.asarray(matplotlib.colormaps["turbo"](x.clamp(0, 1).numpy(), bytes=True)[..., :3])
-
-
-def fitted(image: Bytes, aspect: float) -> Bytes:
-    """The image, padded with black until its width is ``aspect`` times its height."""
-    height, width = image.shape[:2]
-    want: Sequence[int] = (
-        (height, round(height * aspect))
-        if aspect * height >= width
-        else (round(width / aspect), width)
-    )
-    room = [(b - a) // 2 for a, b in zip((height, width), want, strict=True)]
-    sides = [(r, b - a - r) for r, a, b in zip(room, (height, width), want, strict=True)]
-    return np.pad(image, (*sides, (0, 0)))
