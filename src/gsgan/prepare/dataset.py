@@ -79,7 +79,7 @@ def write_files(root: Path, outcome: Outcome, key: str) -> None:
     for name, part in (("hands", hands), ("face", face)):
         if wanted[name] and p.shape[1] > BODY:
             write_npz(root / f"{name}3d.npz", **part)
-    for c, camera in enumerate(outcome.cameras) if solution.seen.any() else ():
+    for c, camera in enumerate(outcome.cameras):
         ratio = np.diag(camera.K)[:2] / np.diag(solution.cameras.K[c])[:2]
         uv = (solution.uv[c] * ratio).astype(np.float32)
         write_npz(

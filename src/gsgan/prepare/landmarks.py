@@ -1,4 +1,4 @@
-"""Landmarks from files: 2D of MediaPipe, OpenPose, EasyMocap; 3D of Pose2Sim and EasyMocap."""
+"""2D landmarks from the files of MediaPipe, OpenPose and EasyMocap."""
 
 from __future__ import annotations
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsgan.data.joints import ALL, BODY, FLIP_GROUPS, HAND_PAIRS, HANDS, WRISTS, known
-from gsgan.data.skeletons import frozen_joints
 from gsgan.prepare.camera_array import (
     FOCAL,
     MIN_VIEWS,
@@ -25,7 +24,6 @@ from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import above, at_least, whole
 
 REFINED = 200  # most frames that refine the cameras, evenly spaced
-FROZEN = 8  # equal positions in a row: another tool filled a gap
 LAG = 6  # frames by which clocks are compared, either way
 
 
@@ -194,36 +192,6 @@ def _corrected_detections(conf: Float, uv: Float, found: Corrected) -> tuple[Flo
         gone = found.left_out.repeat(HAND, axis=-1)
         seen[:, :, HANDS][gone], pixels[:, :, HANDS][gone] = 0.0, np.nan
     return seen, pixels
-
-
-def adopt(
-    cameras: CameraArray, time: Float, p: Float, conf: Float, settings: SolveSettings
-) -> Solution:
-    """Another tool's joints, cleansed and smoothed; the cameras stay as calibrated.
-
-    ``time [F]`` is in seconds, ``p [F, 33, 3]`` in metres with ``conf [F, 33]``. Positions that
-    repeat `FROZEN` times fill gaps, and become missing.
-    """
-    frozen = frozen_joints(p, FROZEN)
-    p, removed = cleanse(np.where(frozen[..., None], np.nan, p))
-    p = smooth(p, conf, time, settings.smoothing)
-    C, (F, J) = len(cameras), conf.shape
-    unseen, unknown = np.full((C, F, J), np.nan), np.full(C, np.nan)
-    return Solution(
-        cameras=cameras,
-        p=p,
-        conf=np.where(known(p), conf, 0.0),
-        views=np.zeros((F, J), np.int64),
-        error=unseen,
-        uv=np.full((C, F, J, 2), np.nan),
-        seen=np.zeros((C, F, J)),
-        flips=np.zeros((C, F, len(FLIP_GROUPS)), bool),
-        left_out=np.zeros((C, F, 2), bool),
-        delay=unknown,
-        gain=unknown,
-        stages={"smoothed": unseen},
-        removed=removed | {"frozen": int(frozen.sum())},
-    )
 
 
 def _flat(values: Float) -> Float:

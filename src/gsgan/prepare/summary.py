@@ -83,7 +83,7 @@ def _notes(outcome: Outcome, detections: Mapping[str, Detections]) -> list[str]:
         if decoded is not None and decoded < (1 - CUT) * source.count:
             text = f"only {decoded} of {source.count} frames can be decoded; is it damaged?"
             found.append(f"{name}: {text}")
-        if name in detections and (crowd := np.mean(detections[name].people > 1)) > CROWD:
+        if (crowd := np.mean(detections[name].people > 1)) > CROWD:
             text = f"more than one person in {crowd:.0%} of the frames; the one seen best was used"
             found.append(f"{name}: {text}")
         if abs(delay := solution.delay[c]) > DELAY and solution.gain[c] > DELAY_GAIN:
