@@ -18,7 +18,7 @@ from gsgan.data.cameras import CameraEntry
 from gsgan.data.formats.capture import read_capture
 from gsgan.data.joints import BODY, FACE, HANDS, joint_names, known
 from gsgan.prepare.camera_array import Float, Ints
-from gsgan.prepare.images import Written, scaled
+from gsgan.prepare.images import scaled
 from gsgan.prepare.options import Inputs, Options
 from gsgan.prepare.solve import Solution
 from gsgan.skeleton import MEDIAPIPE33
@@ -30,13 +30,13 @@ GENERATOR = "gsgan.prepare"
 
 @dataclass(frozen=True)
 class Outcome:
-    """All that a preparation found: ``frames [F]`` numbers, the images written by camera."""
+    """All that a preparation found: ``frames [F]`` numbers, of the images written by camera."""
 
     options: Options
     inputs: Inputs
     frames: Ints
     solution: Solution
-    written: Mapping[str, Written]
+    written: Mapping[str, list[int]]
 
     @property
     def cameras(self) -> list[CameraEntry]:

@@ -16,7 +16,7 @@ from gsgan.data.validation import Thresholds, check_distance
 from gsgan.prepare import landmarks
 from gsgan.prepare.camera_array import Bool, CameraArray, Float, Ints, undistort_points
 from gsgan.prepare.dataset import Outcome, exists, publish, write_files
-from gsgan.prepare.images import Written, check_values, find_masks, write_images
+from gsgan.prepare.images import find_masks, write_images
 from gsgan.prepare.landmarks import Detections
 from gsgan.prepare.mediapipe import run_tool, tool_key
 from gsgan.prepare.options import MEDIAPIPE, Inputs, Options, read_inputs
@@ -54,7 +54,7 @@ def prepare(options: Options, console: Console) -> Path:
     written = _write_images(options, inputs, masks, frames, solution, root)
     outcome = Outcome(options, inputs, frames, solution, written)
     write_files(root, outcome, key)
-    numbers = summarise(outcome, detections)
+    numbers = summarise(outcome)
     write_json(root / "prepare.json", numbers)
     publish(root, out)
     stages.remove_others()
@@ -92,8 +92,6 @@ def _read_people(
         found, masks = run_tool(options, inputs.sources, stages, console.print)
     if options.masks != MEDIAPIPE:
         masks = find_masks(options.folder("masks"), names)
-        for name, files in masks.items():
-            check_values(options.folder("masks") / name, files)
     if options.landmarks != MEDIAPIPE:
         found = landmarks.find_landmarks(options.folder("landmarks"), names)
     return {name: landmarks.read_detections(found[name]) for name in names}, masks
@@ -144,7 +142,7 @@ def _write_images(
     frames: Ints,
     solution: Solution,
     root: Path,
-) -> dict[str, Written]:
+) -> dict[str, list[int]]:
     """Writes the images of every frame that has a skeleton."""
     posed = set(frames[known(solution.p[:, :BODY]).any(1)].tolist())
     if not posed:
@@ -154,7 +152,7 @@ def _write_images(
         )
     cameras, offsets = {camera.name: camera for camera in inputs.cameras}, options.offsets or {}
 
-    def one(name: str, advance: Advance) -> Written:
+    def one(name: str, advance: Advance) -> list[int]:
         given = cameras[name], inputs.sources[name], masks[name], posed, offsets.get(name, 0)
         return write_images(
             root, *given, options.scale, options.format, options.mask_levels, advance
