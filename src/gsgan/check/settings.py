@@ -48,7 +48,6 @@ class Limits:
     frozen_frames: int = 5
     seen_share: float = 0.7
     reprojection: float = 0.05
-    colour_ratio: float = 1.15
     doubtful: float = 0.5
 
     def __post_init__(self) -> None:
