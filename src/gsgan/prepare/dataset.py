@@ -21,7 +21,6 @@ from gsgan.prepare.camera_array import Float, Ints
 from gsgan.prepare.images import scaled
 from gsgan.prepare.options import Inputs, Options
 from gsgan.prepare.solve import Solution
-from gsgan.skeleton import MEDIAPIPE33
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import write_json, write_npz, writing
 
@@ -72,24 +71,11 @@ def write_files(root: Path, outcome: Outcome, key: str) -> None:
         root / "landmarks3d.npz",
         **body,
         reproj_px=np.where(seen.any(0), mean, np.nan).astype(np.float32),
-        n_views=solution.views[:, :BODY].astype(np.int16),
-        edges=np.array(MEDIAPIPE33.edges),
     )
     wanted = {"hands": outcome.options.hands, "face": outcome.options.face}
     for name, part in (("hands", hands), ("face", face)):
         if wanted[name] and p.shape[1] > BODY:
             write_npz(root / f"{name}3d.npz", **part)
-    for c, camera in enumerate(outcome.cameras):
-        ratio = np.diag(camera.K)[:2] / np.diag(solution.cameras.K[c])[:2]
-        uv = (solution.uv[c] * ratio).astype(np.float32)
-        write_npz(
-            root / "landmarks2d" / f"{camera.name}.npz",
-            p=uv[:, :BODY],
-            conf=solution.seen[c, :, :BODY].astype(np.float32),
-            **({"hands": uv[:, HANDS], "face": uv[:, FACE]} if uv.shape[1] > BODY else {}),
-            frame_id=frames,
-            undistorted=np.array(True),
-        )
     meta = {
         "fps": outcome.inputs.fps,
         "unit": "m",

@@ -13,12 +13,11 @@ from gsgan.prepare.camera_array import (
     Bool,
     CameraArray,
     Float,
-    Ints,
     refine_cameras,
 )
 from gsgan.prepare.cleanse import cleanse, smooth
 from gsgan.prepare.hands import match_hands, misfits
-from gsgan.prepare.triangulate import SCALE, Triangulated, apply_flips, find_flips, plain, robust
+from gsgan.prepare.triangulate import Triangulated, apply_flips, find_flips, plain, robust
 from gsgan.skeleton.hands import HAND
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import above, at_least, whole
@@ -51,10 +50,7 @@ class Solution:
     cameras: CameraArray  # refined
     p: Float  # [F, J, 3] metres
     conf: Float  # [F, J] mean confidence of the cameras that see the joint, 0 where missing
-    views: Ints  # [F, J] cameras whose detection lies within the triangulation's scale
     error: Float  # [C, F, J] final reprojection error, full-size undistorted pixels
-    uv: Float  # [C, F, J, 2] undistorted detections, left and right corrected
-    seen: Float  # [C, F, J] their confidence
     flips: Bool  # [C, F, G] where left and right were swapped: `FLIP_GROUPS`, then the hands
     left_out: Bool  # [C, F, 2] detected hands that are not the person's, or are repeats
     delay: Float  # [C] of each camera's clock, see `clock_errors`
@@ -120,16 +116,12 @@ def solve(
     error = cameras.errors(p.reshape(-1, 3), _flat(found.uv)).reshape(conf.shape)
     stages["smoothed"] = error = np.where(found.weight > 0, error, np.nan)
 
-    seen, pixels = _corrected_detections(conf, uv, found)
     delay, gain = clock_errors(cameras, found.uv[:, :, :BODY], found.weight[:, :, :BODY])
     return Solution(
         cameras=CameraArray(given.K, cameras.R, cameras.t),
         p=p,
         conf=np.where(known(p), _mean_seen(found.weight, found.weight), 0.0),
-        views=(np.nan_to_num(error, nan=np.inf) <= SCALE).sum(0),
         error=error * to_pixels,
-        uv=pixels,
-        seen=seen,
         flips=found.flips,
         left_out=found.left_out,
         delay=delay,
@@ -182,16 +174,6 @@ def correct(cameras: CameraArray, uv: Float, conf: Float) -> Corrected:
     weight[:, :, HANDS] *= ~left_out.repeat(HAND, axis=-1)
     points = robust(cameras, _flat(sided), _flat(weight))
     return Corrected(sided, weight, np.dstack([flips, swapped[..., None]]), left_out, points)
-
-
-def _corrected_detections(conf: Float, uv: Float, found: Corrected) -> tuple[Float, Float]:
-    """Confidence and pixels of all detections, also those of little confidence."""
-    groups = (*FLIP_GROUPS, HAND_PAIRS)[: found.flips.shape[-1]]
-    seen, pixels = (apply_flips(v, found.flips, groups) for v in (conf, uv))
-    if uv.shape[2] == ALL:
-        gone = found.left_out.repeat(HAND, axis=-1)
-        seen[:, :, HANDS][gone], pixels[:, :, HANDS][gone] = 0.0, np.nan
-    return seen, pixels
 
 
 def _flat(values: Float) -> Float:

@@ -14,7 +14,6 @@ from gsgan.prepare.camera_array import CameraArray, camera_moves
 from gsgan.prepare.dataset import Outcome
 from gsgan.prepare.solve import Solution, median
 from gsgan.skeleton import MEDIAPIPE33
-from gsgan.skeleton.hands import HAND
 
 DELAY, DELAY_GAIN = 0.5, 0.05  # frames, and share of the error that correcting them must remove
 
@@ -29,7 +28,9 @@ def summarise(outcome: Outcome) -> dict[str, Any]:
             "turned_degrees": float(turned[c]),
             "moved_mm": float(moved[c]),
             "flipped_share": float(solution.swapped[c].mean()),
-            **_hands_and_face(solution, c),
+            "hands_px": median(solution.error[c][:, HANDS]),
+            "hands_swapped": int(solution.swapped_hands[c].sum()),
+            "face_px": median(solution.error[c][:, FACE]),
             "delay_frames": float(solution.delay[c]),
             "frames_with_person": int(np.isfinite(solution.error[c]).any(-1).sum()),
             "frames_written": len(outcome.written[name]),
@@ -49,26 +50,6 @@ def summarise(outcome: Outcome) -> dict[str, Any]:
         "calibration": {"file": inputs.calibration.path.name, "format": inputs.calibration.format},
         "notes": [*inputs.notes, *_late_clocks(outcome.solution, inputs.sources)],
         "settings": outcome.options.record(),
-    }
-
-
-def _hands_and_face(solution: Solution, c: int) -> dict[str, Any]:
-    """Hands and face in one camera; empty where they were not requested."""
-    seen = solution.seen[c]
-    if seen.shape[1] == BODY:
-        return {}
-    left_out, hands = solution.left_out[c], (seen[:, HANDS].reshape(len(seen), 2, HAND) > 0).any(-1)
-    return {
-        "hands": {
-            "found": int(hands.sum() + left_out.sum()),
-            "swapped_frames": int(solution.swapped_hands[c].sum()),
-            "left_out": int(left_out.sum()),
-            "error_px": median(solution.error[c][:, HANDS]),
-        },
-        "face": {
-            "found": int((seen[:, FACE] > 0).any(-1).sum()),
-            "error_px": median(solution.error[c][:, FACE]),
-        },
     }
 
 
