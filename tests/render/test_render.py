@@ -165,7 +165,7 @@ def test_the_subjects_own_motion_is_left_alone(render, capture, tmp_path):
     assert "on the subject's bones" in again.stdout, again.stderr
 
 
-def test_the_up_axis_of_a_rig_is_that_of_its_rest_pose(render, tmp_path):
+def test_the_up_axis_of_a_rig_can_be_given(render, tmp_path):
     from mannequin import mannequin, write_bvh
 
     from gsgan.synthetic.posing import Choreography
@@ -173,7 +173,10 @@ def test_the_up_axis_of_a_rig_is_that_of_its_rest_pose(render, tmp_path):
     person = mannequin()
     signing = Choreography(person).at(21 + np.arange(2) / 30)
     path = write_bvh(tmp_path / "a.bvh", person, signing, 1 / 30, scale=100.0)
-    refused(render(f"motion={path}", "up=x", "out=a"), "up=x: the rest pose", "leave up out")
+    for given, up in (((), "Z up"), (("up=-y",), "-Y up")):
+        result = render(f"motion={path}", f"out={up[0]}", *given)
+        assert result.returncode == 0, result.stderr
+        assert up in result.stdout
 
 
 def test_a_body_pose_drives_an_avatar_with_a_body(inside, run, capture, tmp_path):

@@ -26,7 +26,17 @@ from gsgan.data.proportions import (
 from gsgan.data.splits import SPLITS
 from gsgan.model.avatar import Avatar
 from gsgan.model.runs import Run
-from gsgan.motion.clip import FPS, Clip, checked, completed, frame_times, is_own, resampled, up_axis
+from gsgan.motion.clip import (
+    AXES,
+    FPS,
+    Clip,
+    checked,
+    completed,
+    frame_times,
+    is_own,
+    resampled,
+    up_axis,
+)
 from gsgan.motion.readers import Source, read_motion
 from gsgan.motion.retarget import expressed, face_in_head, joined, placed, retargeted
 from gsgan.scene import BodyPose, Camera, Frame, cat
@@ -179,18 +189,15 @@ def _shown(p: Float, proportions: Proportions) -> Float:
 def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
     proportions = run.proportions
     smpl, skeleton = config.smpl or run.body_file, config.skeleton
-    files = (None if x is None else Path(x).expanduser() for x in (smpl, skeleton))
-    source = Source(proportions, *files)
+    model, asf = (None if x is None else Path(x).expanduser() for x in (smpl, skeleton))
+    up = None if config.up is None else one_of("up", config.up, AXES)
+    source = Source(proportions, model, asf, up)
     motion = read_motion(Path(path).expanduser(), source)
     motion = checked(motion, float(config.min_visibility))
     _refuse_swapped(motion)
     rate = config.motion_fps or motion.fps
     rate = float(above("motion_fps", rate)) if rate else FPS
-    if config.up and motion.file_up and config.up != motion.file_up:
-        raise ConfigError(
-            f"up={config.up}: the rest pose of {motion.path} has {motion.file_up} up; leave up out"
-        )
-    up = (None if motion.file_up else config.up) or motion.up or up_axis(motion)
+    up = (None if motion.file_up else up) or motion.up or up_axis(motion)
     choice = one_of("retarget", config.retarget, ("auto", True, False))
     own = is_own(motion, proportions) if choice == "auto" else not choice
     if choice is False and motion.detached:

@@ -61,11 +61,13 @@ class Source:
         subject: the subject's proportions, for formats without face, hands and scale.
         smpl: an SMPL or SMPL-X model file, or None.
         skeleton: the ASF file of an AMC motion, or None for the one beside it.
+        up: the axis of a rig's file that points up, or None to find it from the frames.
     """
 
     subject: Proportions
     smpl: Path | None = None
     skeleton: Path | None = None
+    up: str | None = None
 
 
 def read_motion(path: Path, source: Source) -> Clip:
@@ -320,7 +322,7 @@ def read_amc_motion(path: Path, source: Source) -> Clip:
 
 
 def _rig(path: Path, motion: RigMotion, metres: float | None, source: Source) -> Clip:
-    standard = standard_motion(motion, path)
+    standard = standard_motion(motion, path, source.up)
     if metres is None:
         ratios = {
             unit: abs(np.log(standard.leg * x / source.subject.leg))

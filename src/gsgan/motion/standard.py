@@ -21,6 +21,7 @@ from gsgan.utils.errors import DataError
 STANDING = np.radians(40)  # largest tilt of trunk and legs in a zero pose that is a standing person
 NEUTRAL = np.radians(10)  # the same, in a frame that stands so well that it serves as a zero pose
 UPRIGHT = np.radians(30)  # largest tilt of the trunk in frames whose average serves otherwise
+SELDOM = 0.1  # share of frames in which a person stands, in motions on the floor
 SAME = np.radians(1)  # frames that stand as well as the best one
 MOST = 100  # frames that calibrate
 BACKWARDS = 0.8  # share of knees and toes behind the body from which names are of the other side
@@ -161,8 +162,13 @@ class Reference:
     neutral: bool
 
 
-def standard_motion(rig: RigMotion, path: Path) -> StandardMotion:
+def standard_motion(rig: RigMotion, path: Path, up: str | None = None) -> StandardMotion:
     """The motion of a tree of joints on the bones that people have.
+
+    Args:
+        rig: as read.
+        path: of the file, for messages.
+        up: the axis of the file that points up, e.g. "-y"; None finds it from the frames.
 
     The joints' own axes are calibrated by the zero pose where that is a standing person, else by
     frames in which the person stands, else by the average of the upright frames and, for limbs, by
@@ -173,11 +179,17 @@ def standard_motion(rig: RigMotion, path: Path) -> StandardMotion:
     """
     known = body_joints(rig, path)
     posed = rig.posed()
-    up = upward(posed, known)
-    known = _by_side(posed, known, up)
-    reference = _reference(rig, posed, known, up)
-    same = reference.zero and np.allclose(reference.axes[0, 2], up)
-    axes = reference.axes[0] if same else person_axes(posed[:1], known, up)[0]
+    zero, axis = rig.zero_pose()[None], np.zeros(3)
+    if up is None:
+        own = _upward(zero, known)
+        stands = tilts(zero, known, own).max() < STANDING
+        axis = _upward(posed, known, usual=own if stands else None)
+    else:
+        axis["xyz".index(up[-1])] = -1.0 if up.startswith("-") else 1.0
+    known = _by_side(posed, known, axis)
+    reference = _reference(rig, posed, known, axis)
+    same = reference.zero and np.allclose(reference.axes[0, 2], axis)
+    axes = reference.axes[0] if same else person_axes(posed[:1], known, axis)[0]
     R, turns = _turns(rig, axes, known, reference)
     if not reference.zero:
         _bend_in_plane(turns, {bone: posed[:, j] @ axes.T for bone, j in known.items()})
@@ -188,8 +200,8 @@ def standard_motion(rig: RigMotion, path: Path) -> StandardMotion:
     joints = {bone: posed[:, j] @ (yaw @ axes).T for bone, j in known.items()}
     hip, knee, ankle = (joints["Left" + bone] for bone in LEG)
     thigh, shin = (np.linalg.norm(a - b, axis=1) for a, b in ((hip, knee), (knee, ankle)))
-    at = int(np.abs(up).argmax())
-    name = ("-" if up[at] < 0 else "") + "xyz"[at]
+    at = int(np.abs(axis).argmax())
+    name = ("-" if axis[at] < 0 else "") + "xyz"[at]
     return StandardMotion(turns, joints, float(np.median(thigh) + np.median(shin)), name)
 
 
@@ -231,13 +243,16 @@ def _middle(p: Array, known: dict[str, int], bone: str) -> Array:
     return (p[..., known["Left" + bone], :] + p[..., known["Right" + bone], :]) / 2
 
 
-def upward(p: Array, known: dict[str, int]) -> Array:
+def _upward(p: Array, known: dict[str, int], usual: Array | None = None) -> Array:
     """``[3]`` the coordinate axis that points up: along it, the shoulders are above the hips and
-    these above the feet in the largest share of the poses ``[F, J, 3]``."""
+    these above the feet in the largest share of the poses ``[F, J, 3]``; or the ``usual`` one, if
+    the person stands along it in some poses and lies in the others."""
     chest, hips, feet = (_middle(p, known, bone) for bone in ("Arm", "UpLeg", "Foot"))
     trunk, legs = unit(chest - hips), unit(hips - feet)
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     above = ((trunk @ axes.T > 0.5) & (legs @ axes.T > 0.5)).mean(axis=0)
+    if usual is not None and above[(axes @ usual).argmax()] > SELDOM:
+        return usual
     return np.asarray(axes[(above + 1e-3 * (trunk + legs).mean(axis=0) @ axes.T).argmax()])
 
 
@@ -282,7 +297,7 @@ def tilts(p: Array, known: dict[str, int], up: Array) -> Array:
 def _reference(rig: RigMotion, posed: Array, known: dict[str, int], up: Array) -> Reference:
     """The zero pose, if that is a standing person; else frames."""
     zero = rig.zero_pose()
-    own = upward(zero[None], known)
+    own = _upward(zero[None], known)
     if tilts(zero, known, own).max() < STANDING:
         eye = np.broadcast_to(np.eye(3), (1, *rig.rotations.shape[1:]))
         return Reference(eye, person_axes(zero[None], known, own), zero[None], True, True)
