@@ -95,10 +95,10 @@ def on_screen(session, point) -> tuple[float, float]:
 
 def changed(session, page, action) -> bool:
     """Whether an action changes the image that rests."""
-    before, since = session.image.copy(), session.painted
+    before, since = session.image.copy(), session.started
     action()
     with contextlib.suppress(AssertionError):
-        until(lambda: session.painted > since and session.full, page)
+        until(lambda: session.started > since and session.full, page)
     return before.shape != session.image.shape or not np.array_equal(before, session.image)
 
 

@@ -33,40 +33,40 @@ def layers(avatar: Avatar) -> tuple[str, ...]:
 
 def shown(
     layer: str,
-    painting: Rendering,
+    rendering: Rendering,
     camera: Camera,
     avatar: Avatar,
     behind: Tensor,
     channel: int = 0,
 ) -> Bytes:
-    """``[H, W, 3]`` a layer of one painting.
+    """``[H, W, 3]`` one layer of a rendering.
 
     Args:
         layer: of `layers`.
-        painting: with maps, unless the layer is the image.
-        camera: of the painting.
-        avatar: that painted it.
+        rendering: with maps, unless the layer is the image.
+        camera: of the rendering.
+        avatar: that was rendered.
         behind: ``[3, H, W]`` the background.
         channel: of F, for the feature layer; its values are stretched to the colour map's range.
     """
-    assert painting.image is not None and painting.alpha is not None  # noqa: PT018
-    image, alpha = painting.image[0].cpu(), painting.alpha[0].cpu()
+    assert rendering.image is not None and rendering.alpha is not None  # noqa: PT018
+    image, alpha = rendering.image[0].cpu(), rendering.alpha[0].cpu()
     if layer == ALPHA:
         return _grey(alpha[0])
-    if layer == PARTS and painting.segmentation is not None:
-        return _parts(painting.segmentation[0].cpu())
-    if layer == COLOUR and painting.features is not None and painting.splat_alpha is not None:
-        return eight_bits(painting.features[0, :3].cpu(), painting.splat_alpha[0].cpu(), behind)
-    if layer == FEATURE and painting.features is not None:
-        return _coloured(_stretched(painting.features[0, 3 + channel].cpu()))
-    if layer == DEPTH and painting.gaussians is not None:
-        return _depth(painting, camera, avatar)
+    if layer == PARTS and rendering.segmentation is not None:
+        return _parts(rendering.segmentation[0].cpu())
+    if layer == COLOUR and rendering.features is not None and rendering.splat_alpha is not None:
+        return eight_bits(rendering.features[0, :3].cpu(), rendering.splat_alpha[0].cpu(), behind)
+    if layer == FEATURE and rendering.features is not None:
+        return _coloured(_stretched(rendering.features[0, 3 + channel].cpu()))
+    if layer == DEPTH and rendering.gaussians is not None:
+        return _depth(rendering, camera, avatar)
     return eight_bits(image, alpha, behind)
 
 
-def _depth(painting: Rendering, camera: Camera, avatar: Avatar) -> Bytes:
-    assert painting.gaussians is not None
-    raster = rasterise(painting.gaussians, camera, settings=avatar.accuracy, depth=True)
+def _depth(rendering: Rendering, camera: Camera, avatar: Avatar) -> Bytes:
+    assert rendering.gaussians is not None
+    raster = rasterise(rendering.gaussians, camera, settings=avatar.accuracy, depth=True)
     assert raster.depth is not None
     alpha = raster.alpha[0, 0].cpu()
     metres = raster.depth[0, 0].cpu() / alpha.clamp_min(1e-6)

@@ -78,8 +78,8 @@ class Viewer:
         self._wake, self._ended = threading.Event(), False
         self.server.on_client_connect(self._join)
         self.server.on_client_disconnect(lambda client: self.sessions.pop(client.client_id, None))
-        self._painter = threading.Thread(target=self._paint, daemon=True, name="painting")
-        self._painter.start()
+        self._renderer = threading.Thread(target=self._render, daemon=True, name="rendering")
+        self._renderer.start()
 
     @property
     def address(self) -> str:
@@ -103,7 +103,7 @@ class Viewer:
             return
         self._ended = True
         self._wake.set()
-        self._painter.join()
+        self._renderer.join()
         self.server.stop()
 
     def _camera(self, size: int) -> None:
@@ -123,7 +123,7 @@ class Viewer:
         self.sessions[client.client_id] = Session(client, self.show, self._wake.set)
         self._wake.set()
 
-    def _paint(self) -> None:
+    def _render(self) -> None:
         """Renders for each browser in turn, as long as one of them needs a new image."""
         while not self._ended:
             due = min((s.step() for s in list(self.sessions.values())), default=IDLE)
