@@ -143,10 +143,6 @@ def test_a_camera_with_empty_masks_is_an_error(copy, check):
     assert only(check(copy), "error").startswith("camera cam03: its masks are empty")
 
 
-def freeze(p):
-    p[4:10, 15:23] = p[4, 15:23]
-
-
 def exchange(p):
     p[5:7] = p[5:7][:, MIRROR]
 
@@ -175,8 +171,6 @@ def shrink(p):
 @pytest.mark.parametrize(
     ("change", "level", "named"),
     [
-        (freeze, "warning", "joints stand exactly still.* in 6 of 12 frames: 4-9 .*left_wrist"),
-        (exchange, "warning", "left and right are exchanged in 2 of 12 frames: 5-6"),
         (exchange, "warning", "nose or toes point backwards in 2 of 12 frames: 5-6"),
         (exchange_throughout, "error", "left and right are exchanged"),
         (jump, "warning", r"in 1 of 12 frames: 6 .frame 6: jumps: left_wrist 0.50 m"),

@@ -10,11 +10,7 @@ import pytest
 from make import skeletons
 
 from gsgan.prepare.dataset import standing_axis
-from gsgan.prepare.images import (
-    check_values,
-    find_masks,
-    tidy,
-)
+from gsgan.prepare.images import find_masks, tidy
 from gsgan.prepare.sources import Recording, find_sources, recording_notes
 from gsgan.utils.errors import DataError
 
@@ -68,18 +64,6 @@ def test_given_masks_by_number_and_by_person(tmp_path: Path):
     assert sorted(found["b"]) == [1, 2]
     with pytest.raises(DataError, match="holds no masks"):
         find_masks(tmp_path, ["c"])
-
-
-@pytest.mark.parametrize(("value", "refused"), [(1, True), (19, True), (0, False), (255, False)])
-def test_masks_of_small_numbers_are_refused(tmp_path: Path, value: int, refused: bool):
-    for number, highest in enumerate((0, value, 0)):
-        cv2.imwrite(str(tmp_path / f"{number}.png"), np.full((4, 4), highest, np.uint8))
-    files = {number: tmp_path / f"{number}.png" for number in range(3)}
-    if refused:
-        with pytest.raises(DataError, match=f"up to {value}; small numbers are labels"):
-            check_values(tmp_path, files)
-    else:
-        check_values(tmp_path, files)
 
 
 def test_sources_that_cannot_be_used(tmp_path: Path):

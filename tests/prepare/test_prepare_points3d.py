@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from make import skeletons
 
-from gsgan.data.joints import SETS
 from gsgan.motion.points import read_points3d
 from gsgan.utils.errors import DataError
 
@@ -78,25 +76,3 @@ def test_damaged_trc(tmp_path: Path, change, what: str):
     path.write_text(change(path.read_text()))
     with pytest.raises(DataError, match=what):
         read_points3d(path)
-
-
-def test_easymocap_zero_confidence_is_missing(tmp_path: Path):
-    truth, numbers = skeletons(2), SETS[25][1]
-    for f, p in enumerate(truth):
-        joints = np.zeros((67, 4))
-        joints[list(numbers.values())] = np.c_[p[list(numbers)], np.full(len(numbers), 0.8)]
-        joints[numbers[16]] = 0
-        people = [{"id": 0, "keypoints3d": joints.tolist()}]
-        (tmp_path / f"{f:06d}.json").write_text(json.dumps(people))
-    found = read_points3d(tmp_path)
-    seen = sorted(set(numbers) - {16})
-    np.testing.assert_allclose(found[1][:, seen], truth[:, seen])
-    assert (found[2][:, seen] == 0.8).all()
-    assert np.isnan(found[1][:, 16]).all()
-
-
-@pytest.mark.parametrize("text", ["{", "{}", "[3]", '[{"keypoints3d": [1, 2]}]', "[]"])
-def test_damaged_easymocap(tmp_path: Path, text: str):
-    (tmp_path / "000000.json").write_text(text)
-    with pytest.raises(DataError, match=str(tmp_path.name)):
-        read_points3d(tmp_path)

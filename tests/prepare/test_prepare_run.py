@@ -12,7 +12,6 @@ import pytest
 from capture_scenes import write_project
 from make import skeletons
 from rich.console import Console
-from test_prepare_points3d import write_trc
 
 import gsgan.prepare.mediapipe as tool
 from gsgan.data.formats.capture import read_capture
@@ -188,17 +187,6 @@ def test_errors_are_one_sentence(project: Path, break_it, more, what):
         prepare(options(project, **more), quiet())
     assert "\n" not in str(failure.value)
     assert not (project.parent / "out").exists()
-
-
-def test_joints_of_another_tool_take_the_place_of_detections(project: Path):
-    given = write_trc(project / "person.trc", skeletons(FRAMES))
-    out = prepare(options(project, landmarks="nowhere", landmarks3d=str(given)), quiet())
-    assert read_capture(out).frames == tuple(range(FRAMES))
-    found = np.load(out / "landmarks3d.npz")
-    assert (found["conf"][:, 1] == 0).all()  # an eye that the file does not have
-    np.testing.assert_allclose(found["p"][:, 11], skeletons(FRAMES)[:, 11], atol=1e-3)
-    assert json.loads((out / "prepare.json").read_text())["error_px"] == {"smoothed": None}
-    assert not (out / "landmarks2d").exists()
 
 
 def test_every_key_of_the_config_is_understood(project: Path, compose, capsys):

@@ -298,14 +298,6 @@ def test_cameras(render, bare, capture, motion, tmp_path):
     )
 
 
-def test_a_camera_inside_the_person(render, motion, tmp_path):
-    refused(
-        render(f"motion={motion}", "orbit.distance=0.05", "out=d"),
-        "the camera is inside the person", "cm from the",
-    )  # fmt: skip
-    assert not (tmp_path / "d").exists()
-
-
 @pytest.mark.parametrize(
     ("args", "message"),
     [
@@ -316,7 +308,6 @@ def test_a_camera_inside_the_person(render, motion, tmp_path):
         (("out=a", "motion=novel_pose", "start=9"), "start=9: the motion has 2 frames"),
         (("out=a", "compare=truth"), "compare=truth needs held-out frames"),
         (("out=a", "orbit.elevation=90"), "orbit.elevation must be"),
-        (("out=a", "c2pa.key=k.pem"), "go together"),
         (("out=a", "retarget=maybe"), "retarget must be one of auto"),
         (("out=a", "drive=body"), "drive must be one of None, skeleton"),
         (("out=a", "motion=[a.npz,b.npz]", "retarget=false"), "is not supported for a list"),

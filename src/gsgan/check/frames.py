@@ -16,8 +16,7 @@ from gsgan.check.settings import Limits
 from gsgan.check.views import CheckedData, MaskView, grouped, nanmedian
 from gsgan.data.files import read_arrays
 from gsgan.data.formats.consistency import Bool, Float
-from gsgan.data.joints import FLIP_GROUPS
-from gsgan.data.skeletons import bone_lengths, frozen_joints
+from gsgan.data.skeletons import bone_lengths
 from gsgan.data.validation import spans
 from gsgan.skeleton.template import SkeletonTemplate
 from gsgan.utils.arrays import expect_array
@@ -27,20 +26,13 @@ KINDS = {
     "mask": "the mask is not of the body's size",
     "jump": "joints jump",
     "limb": "limbs change their length",
-    "frozen": "joints stand exactly still, as gap filling leaves them",
-    "exchanged": "left and right are exchanged",
     "backwards": "nose or toes point backwards",
     "unseen": "few joints were seen",
     "detections": "joints lie far from their 2D detections",
 }
-PARTS = dict(zip(("face", "arms", "legs"), FLIP_GROUPS, strict=True))
 JUMP_RATIO = 4.0  # a jump exceeds the upper quartile of all by this: low frame rates pass
 LIMB_METRES = 0.06  # that a limb must be off as well: noise moves the ends of short bones
-RIGID = 0.05  # a joint whose bones change less is a computed one, which may stand still
 MIRRORED = 0.5  # share of frames facing backwards: then all of them are exchanged
-STILL = 1e-6  # metres: measured joints never repeat this closely
-SWAP_RATIO = 2.0  # exchanged sides must be this many times nearer to where they were
-SWAP_METRES = 0.06  # and this much nearer: crossing feet come close
 
 
 @dataclass(frozen=True)
@@ -76,13 +68,6 @@ def skeleton_doubts(subject: CheckedData, limits: Limits) -> list[Doubt]:
     odd = (change > limits.limb_share) & (change * nanmedian(lengths) > LIMB_METRES)
     doubt("limb", "length off its median: ", odd, lambda f, i: f"{bones[i]} {change[f, i]:.0%}")
 
-    still = frozen(p, int(limits.frozen_frames))
-    whole = np.asarray((still | ~subject.visible).all(1) & still.any(1))
-    still &= measured_joints(change, template) | whole[:, None]
-    doubt("frozen", "frozen: ", still, lambda _, j: names[j])
-
-    exchanged = np.stack([swapped(p, pairs) for pairs in PARTS.values()], 1)
-    doubt("exchanged", "left and right exchanged: ", exchanged, lambda _, i: list(PARTS)[i])
     backwards = facing(p, template)[:, None] < 0
     doubt("backwards", "", backwards, lambda *_: "nose or toes point backwards")
 
@@ -195,52 +180,7 @@ def jumped(distance: Float, limit: float) -> Bool:
 def length_change(lengths: Float) -> Float:
     """``[F, L]`` share by which limbs differ from their median length; NaN if unknown."""
     typical = nanmedian(lengths)
-    return np.asarray(np.abs(lengths - typical) / np.maximum(typical, STILL))
-
-
-def measured_joints(change: Float, template: SkeletonTemplate) -> Bool:
-    """``[J]`` joints with a bone whose `length_change` exceeds `RIGID` in some frame.
-
-    The bones of a posed body model keep their length, measured ones do not.
-    """
-    measured = np.zeros(len(template.names), bool)
-    measured[np.array(template.limbs)[(np.nan_to_num(change) > RIGID).any(0)]] = True
-    return measured
-
-
-def frozen(p: Float, least: int) -> Bool:
-    """``[F, J]`` joints that stand exactly still for at least ``least`` frames in a row.
-
-    Gap filling and copied frames do this; measured joints never do, computed ones may.
-    """
-    held = frozen_joints(p, least, STILL)
-    held[:-1] |= held[1:].copy()  # the first frame of each run
-    return held
-
-
-def swapped(p: Float, pairs: tuple[tuple[int, int], ...], metres: float = SWAP_METRES) -> Bool:
-    """``[F]`` frames in which a body part's left and right are exchanged.
-
-    From frame to frame the part is exchanged where exchanging brings it nearer to where it was:
-    mean distance `SWAP_RATIO` times and ``metres`` less. The smaller half of the frames that
-    these exchanges separate counts as wrong. ``pairs`` are (left, right) joints of the part.
-    """
-    state, sides = np.zeros(len(p), bool), p[:, np.array(pairs)]  # [F, N, 2, 3]
-    last = None
-    for f, now in enumerate(sides):
-        state[f] = state[f - 1] if f else False
-        if not np.isfinite(now).all((1, 2)).any():
-            continue
-        if last is not None:
-            straight = np.linalg.norm(now - last, axis=-1).sum(-1)
-            across = np.linalg.norm(now - last[:, ::-1], axis=-1).sum(-1)
-            shared = np.isfinite(straight)
-            if shared.any():
-                straight, across = straight[shared].mean(), across[shared].mean()
-                nearer = straight > SWAP_RATIO * across and (straight - across) / 2 > metres
-                state[f] ^= nearer
-        last = now
-    return state if state.mean() <= 0.5 else ~state
+    return np.asarray(np.abs(lengths - typical) / np.maximum(typical, 1e-6))
 
 
 def facing(p: Float, template: SkeletonTemplate) -> Float:

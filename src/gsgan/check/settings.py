@@ -45,10 +45,8 @@ class Limits:
     area_jump: float = 0.35
     joint_jump: float = 0.2
     limb_share: float = 0.3
-    frozen_frames: int = 5
     seen_share: float = 0.7
     reprojection: float = 0.05
-    colour_ratio: float = 1.15
     doubtful: float = 0.5
 
     def __post_init__(self) -> None:

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.ndimage import binary_opening
 from torch import Tensor
 
 from gsgan.data.files import LARGEST_FRAME
@@ -225,23 +224,6 @@ def hips_below(p: Float, valid: Bool) -> Float:
     out = p.copy()
     out[hung, hips[0]], out[hung, hips[1]] = (top + down + half)[hung], (top + down - half)[hung]
     return out
-
-
-def frozen_joints(p: Float, frames: int, tolerance: float = 0.0) -> Bool:
-    """``[F, J]`` joints ``p [F, J, D]`` that repeat their previous position in a long run.
-
-    Gap filling and copied frames do this. A run counts from ``frames`` equal positions on; its
-    first frame is not marked. Missing joints (NaN) never repeat.
-
-    Args:
-        p: positions.
-        frames: least length of a run.
-        tolerance: distance up to which two positions are equal.
-    """
-    same = np.zeros(p.shape[:2], bool)
-    same[1:] = np.linalg.norm(np.diff(p, axis=0), axis=-1) <= tolerance
-    # An opening keeps runs of equal steps; a run of n steps joins n + 1 frames.
-    return np.asarray(binary_opening(same, np.ones((max(1, frames - 1), 1))))
 
 
 def bone_lengths(p: Float, bones: Sequence[tuple[int, int]]) -> Float:

@@ -1,4 +1,4 @@
-"""Joints in 3D that another tool triangulated: .trc files of Pose2Sim, JSON files of EasyMocap."""
+"""3D joints that Pose2Sim triangulated: .trc files."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gsgan.data.files import frame_files, read_json_value
-from gsgan.data.joints import BODY, SETS, known
+from gsgan.data.files import frame_files
+from gsgan.data.joints import BODY, known
 from gsgan.data.skeletons import whole_frame_ids
 from gsgan.skeleton.template import MEDIAPIPE33
 from gsgan.utils.errors import DataError
@@ -30,21 +30,16 @@ def json_files(path: Path) -> dict[int, Path]:
 
 
 def read_points3d(path: Path) -> Numbered:
-    """3D joints that another tool triangulated: a .trc file, or a folder of EasyMocap JSON files.
+    """3D joints of a .trc file.
 
     Returns:
         ``frames [F]`` rising; ``p [F, 33, 3]`` metres, in the calibration's world, NaN = missing,
         as exact zeros are; ``conf [F, 33]``, 0 = missing.
 
     Raises:
-        DataError: when it is neither, damaged, or without shoulders and hips.
+        DataError: when it is damaged, or without shoulders and hips.
     """
-    if path.is_dir():
-        files = json_files(path)
-        both = np.stack([_read_people(file) for file in files.values()])
-        frames, p, conf = np.array(list(files)), both[..., :3], both[..., 3]
-    else:
-        frames, p, conf = _read_trc(path)
+    frames, p, conf = _read_trc(path)
     order = np.argsort(frames)
     p = np.where((p == 0).all(-1, keepdims=True), np.nan, p)[order]
     conf = np.where(known(p), conf[order], 0.0)
@@ -88,21 +83,3 @@ def _joint(name: str) -> int | None:
     word = re.sub("^l(?!eft)", "left", re.sub("^r(?!ight)", "right", word))
     plain = [name.replace("_", "") for name in MEDIAPIPE33.names]
     return plain.index(word) if word in plain else None
-
-
-def _read_people(path: Path) -> Float:
-    """``[33, 4]`` x, y, z, confidence of the person seen best; EasyMocap's zeros stay zeros."""
-    best, numbers = np.zeros((BODY, 4)), SETS[25][1]
-    try:
-        for person in read_json_value(path):
-            joints = np.array(person["keypoints3d"], np.float64)[list(numbers.values())]
-            if joints.shape[1] == 3:
-                joints = np.c_[joints, np.ones(len(joints))]
-            if joints[:, 3].sum() > best[:, 3].sum():
-                best[list(numbers)] = joints
-    except (ArithmeticError, ValueError, TypeError, LookupError) as error:
-        raise DataError(
-            f"{path} is not an EasyMocap keypoints3d file: expected a list of persons with "
-            f"(25, 4) numbers each ({error})"
-        ) from None
-    return best

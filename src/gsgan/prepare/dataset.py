@@ -18,10 +18,9 @@ from gsgan.data.cameras import CameraEntry
 from gsgan.data.formats.capture import read_capture
 from gsgan.data.joints import BODY, FACE, HANDS, joint_names, known
 from gsgan.prepare.camera_array import Float, Ints
-from gsgan.prepare.images import Written, scaled
+from gsgan.prepare.images import scaled
 from gsgan.prepare.options import Inputs, Options
 from gsgan.prepare.solve import Solution
-from gsgan.skeleton import MEDIAPIPE33
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import write_json, write_npz, writing
 
@@ -30,13 +29,13 @@ GENERATOR = "gsgan.prepare"
 
 @dataclass(frozen=True)
 class Outcome:
-    """All that a preparation found: ``frames [F]`` numbers, the images written by camera."""
+    """All that a preparation found: ``frames [F]`` numbers, of the images written by camera."""
 
     options: Options
     inputs: Inputs
     frames: Ints
     solution: Solution
-    written: Mapping[str, Written]
+    written: Mapping[str, list[int]]
 
     @property
     def cameras(self) -> list[CameraEntry]:
@@ -72,24 +71,11 @@ def write_files(root: Path, outcome: Outcome, key: str) -> None:
         root / "landmarks3d.npz",
         **body,
         reproj_px=np.where(seen.any(0), mean, np.nan).astype(np.float32),
-        n_views=solution.views[:, :BODY].astype(np.int16),
-        edges=np.array(MEDIAPIPE33.edges),
     )
     wanted = {"hands": outcome.options.hands, "face": outcome.options.face}
     for name, part in (("hands", hands), ("face", face)):
         if wanted[name] and p.shape[1] > BODY:
             write_npz(root / f"{name}3d.npz", **part)
-    for c, camera in enumerate(outcome.cameras) if solution.seen.any() else ():
-        ratio = np.diag(camera.K)[:2] / np.diag(solution.cameras.K[c])[:2]
-        uv = (solution.uv[c] * ratio).astype(np.float32)
-        write_npz(
-            root / "landmarks2d" / f"{camera.name}.npz",
-            p=uv[:, :BODY],
-            conf=solution.seen[c, :, :BODY].astype(np.float32),
-            **({"hands": uv[:, HANDS], "face": uv[:, FACE]} if uv.shape[1] > BODY else {}),
-            frame_id=frames,
-            undistorted=np.array(True),
-        )
     meta = {
         "fps": outcome.inputs.fps,
         "unit": "m",

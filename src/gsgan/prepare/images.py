@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,15 +14,12 @@ from numpy.typing import NDArray
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import Crop, resize, take, undistort_map
 from gsgan.data.files import frame_files, last_number, read_grey
-from gsgan.data.formats.consistency import spread
 from gsgan.prepare.sources import IMAGE_SUFFIXES, Recording
 from gsgan.prepare.stages import Advance
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import writing
 
 Bytes = NDArray[np.uint8]
-PROBED = 8  # masks per camera whose values are checked before any work is done
-PERSON = 128  # alpha that at least one pixel of them must have
 LEAST_BLOB = 0.02  # smaller pieces of a mask are removed, share of the largest
 QUALITY = 95  # of jpg, 1 to 100
 PNG_COMPRESSION = 3  # 0..9; higher is smaller and slower
@@ -35,14 +32,6 @@ def scaled(camera: CameraEntry, scale: float) -> CameraEntry:
     K[0] *= w / camera.size[1]
     K[1] *= h / camera.size[0]
     return replace(camera, K=K, dist=np.zeros_like(camera.dist), size=(h, w))
-
-
-@dataclass(frozen=True)
-class Written:
-    """The result of writing one camera's images."""
-
-    frames: list[int]  # common numbers that exist now
-    decoded: int | None  # images of the source; None when it was not read to its end
 
 
 def find_masks(folder: Path, names: Iterable[str]) -> dict[str, dict[int, Path]]:
@@ -62,17 +51,6 @@ def find_masks(folder: Path, names: Iterable[str]) -> dict[str, dict[int, Path]]
             raise DataError(f"{place} holds no masks; expected {name}/000000.png and so on")
         found[name] = {number: folder / path for number, path in files.items()}
     return found
-
-
-def check_values(folder: Path, files: Mapping[int, Path]) -> None:
-    """Refuses part numbers, or 0 and 1, with a DataError; one faint mask alone is legitimate."""
-    paths = [files[number] for number in sorted(files)]
-    highest = max((int(read_grey(path).max()) for path in spread(paths, PROBED)), default=0)
-    if 0 < highest < PERSON:
-        raise DataError(
-            f"{folder} holds masks with values up to {highest}; small numbers are labels, expected "
-            "alpha from 0 to 255"
-        )
 
 
 def tidy(mask: Bytes, levels: tuple[float, float]) -> Bytes:
@@ -97,7 +75,7 @@ def write_images(
     suffix: str,
     levels: tuple[float, float],
     advance: Advance,
-) -> Written:
+) -> list[int]:
     """Writes images/{camera}/%06d and masks/{camera}/%06d.png.
 
     Args:
@@ -110,6 +88,9 @@ def write_images(
         levels: alpha that becomes 0 and 1.
         advance: called for each frame.
 
+    Returns:
+        The common numbers of the frames that were written.
+
     Raises:
         DataError: when an image or mask is damaged or of the wrong size, or the disk is full.
     """
@@ -119,12 +100,11 @@ def write_images(
             folder.mkdir(parents=True, exist_ok=True)
     window, size = Crop(0, 0, camera.size), scaled(camera, scale).size
     mapping = undistort_map(camera.K, camera.dist, window) if camera.distorted else None
-    written, decoded, last = list[int](), 0, max(frames, default=-1)
+    written, last = list[int](), max(frames, default=-1)
     for number, image in source.images():
         frame = number + offset
         if frame > last:
-            return Written(written, None)
-        decoded += 1
+            break
         if frame not in frames or number not in masks:
             continue
         written.append(frame)
@@ -139,7 +119,7 @@ def write_images(
                 )
             straight = resize(take(pixels, window, mapping, exact=False), size, exact=False)
             _write(folder / f"{frame:06d}.{kind}", straight)
-    return Written(written, decoded)
+    return written
 
 
 def _write(path: Path, pixels: Bytes) -> None:

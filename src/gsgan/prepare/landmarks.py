@@ -1,4 +1,4 @@
-"""Landmarks from files: 2D of MediaPipe, OpenPose, EasyMocap; 3D of Pose2Sim and EasyMocap."""
+"""2D landmarks from the files of MediaPipe, OpenPose and EasyMocap."""
 
 from __future__ import annotations
 
@@ -31,7 +31,6 @@ class Detections:
     frame_id: Ints  # [F] rising
     px: Float  # [F, J, 2] pixels of the image as stored, pixel centres at +0.5; NaN = not seen
     conf: Float  # [F, J] in [0, 1], 0 = not seen
-    people: Ints  # [F] number of persons found
 
 
 def find_landmarks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
@@ -61,16 +60,15 @@ def read_detections(path: Path) -> Detections:
     """
     if path.is_dir():
         files = json_files(path)
-        px, conf, people = map(np.array, zip(*map(_read_frame, files.values()), strict=True))
+        px, conf = map(np.array, zip(*map(_read_frame, files.values()), strict=True))
         frames = np.array(list(files))
     else:
         frames, px, conf = _read_npz(path)
-        people = np.asarray((conf[:, :BODY] > 0).any(1), np.int64)
     order = np.argsort(frames)
     conf = np.where(known(px), np.nan_to_num(conf), 0.0)
     conf = np.clip(conf, 0.0, 1.0)[order]
     px = np.where(conf[..., None] > 0, px[order], np.nan)
-    return Detections(frames[order], px, conf, people[order])
+    return Detections(frames[order], px, conf)
 
 
 def gather(
@@ -120,7 +118,7 @@ def _read_npz(path: Path) -> Numbered:
     return frame_id, px, conf
 
 
-def _read_frame(path: Path) -> tuple[Float, Float, int]:
+def _read_frame(path: Path) -> tuple[Float, Float]:
     content = read_json(path)
     if isinstance(content.get("people"), list):
         keys, people = OPENPOSE_KEYS, content["people"]
@@ -137,9 +135,8 @@ def _read_frame(path: Path) -> tuple[Float, Float, int]:
             f"({error})"
         ) from None
     if not read:
-        return np.full((ALL, 2), np.nan), np.zeros(ALL), 0
-    px, conf = max(read, key=lambda one: float(one[1].sum()))  # the person seen best
-    return px, conf, len(read)
+        return np.full((ALL, 2), np.nan), np.zeros(ALL)
+    return max(read, key=lambda one: float(one[1].sum()))  # the person seen best
 
 
 def _person(person: Mapping[str, Any], keys: tuple[str, ...]) -> tuple[Float, Float]:

@@ -58,7 +58,6 @@ class Options:
     up_axis: str | None = None
     apply_rotation: bool = False
     landmarks: str = MEDIAPIPE
-    landmarks3d: str | None = None
     masks: str = MEDIAPIPE
     hands: bool = True
     face: bool = True
@@ -99,8 +98,7 @@ class Options:
     @property
     def needs_tool(self) -> bool:
         """Whether the MediaPipe tool has to run."""
-        landmarks = self.landmarks if self.landmarks3d is None else None
-        return MEDIAPIPE in (landmarks, self.masks)
+        return MEDIAPIPE in (self.landmarks, self.masks)
 
     def record(self) -> dict[str, Any]:
         """The settings that the dataset depends on, as plain values."""

@@ -13,15 +13,14 @@ from gsgan.check.run import check_capture
 from gsgan.data.joints import BODY, FACE, HANDS, known
 from gsgan.data.splits import parse_frames
 from gsgan.data.validation import Thresholds, check_distance
-from gsgan.motion.points import read_points3d
 from gsgan.prepare import landmarks
 from gsgan.prepare.camera_array import Bool, CameraArray, Float, Ints, undistort_points
 from gsgan.prepare.dataset import Outcome, exists, publish, write_files
-from gsgan.prepare.images import Written, check_values, find_masks, write_images
+from gsgan.prepare.images import find_masks, write_images
 from gsgan.prepare.landmarks import Detections
 from gsgan.prepare.mediapipe import run_tool, tool_key
 from gsgan.prepare.options import MEDIAPIPE, Inputs, Options, read_inputs
-from gsgan.prepare.solve import Solution, adopt, solve
+from gsgan.prepare.solve import Solution, solve
 from gsgan.prepare.sources import stamp
 from gsgan.prepare.stages import Advance, StageFolder, digest, each_camera
 from gsgan.prepare.summary import print_summary, summarise
@@ -49,16 +48,13 @@ def prepare(options: Options, console: Console) -> Path:
         return out
     stages = StageFolder(out.parent / f".{out.name}.prepare")
     detections, masks = _read_people(options, inputs, stages, console)
-    if options.landmarks3d is None:
-        frames, solution = _solved(options, inputs, detections, console)
-    else:
-        frames, solution = _adopted(options, inputs)
+    frames, solution = _solved(options, inputs, detections, console)
     root = stages.path("dataset", key)
     shutil.rmtree(root, ignore_errors=True)  # of a run that was killed
     written = _write_images(options, inputs, masks, frames, solution, root)
     outcome = Outcome(options, inputs, frames, solution, written)
     write_files(root, outcome, key)
-    numbers = summarise(outcome, detections)
+    numbers = summarise(outcome)
     write_json(root / "prepare.json", numbers)
     publish(root, out)
     stages.remove_others()
@@ -79,8 +75,8 @@ def _fingerprint(options: Options, inputs: Inputs) -> list[object]:
     """Everything that is read: images, calibration, landmark and mask files, the tool."""
     parts: list[object] = [source.fingerprint() for source in inputs.sources.values()]
     parts += [inputs.calibration.path.name, *(str(c) for c in inputs.cameras)]
-    for name in ("landmarks", "landmarks3d", "masks"):
-        if getattr(options, name) not in (None, MEDIAPIPE):
+    for name in ("landmarks", "masks"):
+        if getattr(options, name) != MEDIAPIPE:
             place = options.folder(name)
             parts += [stamp(p) for p in sorted((place, *place.rglob("*"))) if p.is_file()]
     return [*parts, tool_key() if options.needs_tool else None]
@@ -89,17 +85,13 @@ def _fingerprint(options: Options, inputs: Inputs) -> list[object]:
 def _read_people(
     options: Options, inputs: Inputs, stages: StageFolder, console: Console
 ) -> tuple[dict[str, Detections], dict[str, dict[int, Path]]]:
-    """2D landmarks, none where 3D joints are given, and masks by the camera's own frame numbers."""
+    """2D landmarks, and masks by the camera's own frame numbers."""
     names, found = list(inputs.sources), dict[str, Path]()
     masks: dict[str, dict[int, Path]] = {}
     if options.needs_tool:
         found, masks = run_tool(options, inputs.sources, stages, console.print)
     if options.masks != MEDIAPIPE:
         masks = find_masks(options.folder("masks"), names)
-        for name, files in masks.items():
-            check_values(options.folder("masks") / name, files)
-    if options.landmarks3d is not None:
-        return {}, masks
     if options.landmarks != MEDIAPIPE:
         found = landmarks.find_landmarks(options.folder("landmarks"), names)
     return {name: landmarks.read_detections(found[name]) for name in names}, masks
@@ -122,16 +114,6 @@ def _solved(
     _check_distance(inputs, plain(cameras, *flat))
     with console.status("finding 3D joints and refining the cameras"):
         return frames, solve(cameras, frames / inputs.fps, uv, conf, options.solve)
-
-
-def _adopted(options: Options, inputs: Inputs) -> tuple[Ints, Solution]:
-    """The joints of another tool."""
-    frames, p, conf = read_points3d(options.folder("landmarks3d"))
-    chosen = _chosen(options, frames)
-    frames, p, conf = frames[chosen], p[chosen], conf[chosen]
-    _check_distance(inputs, p.reshape(-1, 3))
-    cameras = CameraArray.of(inputs.cameras)
-    return frames, adopt(cameras, frames / inputs.fps, p, conf, options.solve)
 
 
 def _check_distance(inputs: Inputs, p: Float) -> None:
@@ -160,17 +142,17 @@ def _write_images(
     frames: Ints,
     solution: Solution,
     root: Path,
-) -> dict[str, Written]:
+) -> dict[str, list[int]]:
     """Writes the images of every frame that has a skeleton."""
     posed = set(frames[known(solution.p[:, :BODY]).any(1)].tolist())
     if not posed:
         raise DataError(
-            f"{options.landmarks3d or options.landmarks}: no body joint of any frame came out in "
+            f"{options.landmarks}: no body joint of any frame came out in "
             "3D; two cameras must see it at the same frame number"
         )
     cameras, offsets = {camera.name: camera for camera in inputs.cameras}, options.offsets or {}
 
-    def one(name: str, advance: Advance) -> Written:
+    def one(name: str, advance: Advance) -> list[int]:
         given = cameras[name], inputs.sources[name], masks[name], posed, offsets.get(name, 0)
         return write_images(
             root, *given, options.scale, options.format, options.mask_levels, advance

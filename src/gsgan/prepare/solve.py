@@ -7,25 +7,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsgan.data.joints import ALL, BODY, FLIP_GROUPS, HAND_PAIRS, HANDS, WRISTS, known
-from gsgan.data.skeletons import frozen_joints
 from gsgan.prepare.camera_array import (
     FOCAL,
     MIN_VIEWS,
     Bool,
     CameraArray,
     Float,
-    Ints,
     refine_cameras,
 )
 from gsgan.prepare.cleanse import cleanse, smooth
 from gsgan.prepare.hands import match_hands, misfits
-from gsgan.prepare.triangulate import SCALE, Triangulated, apply_flips, find_flips, plain, robust
+from gsgan.prepare.triangulate import Triangulated, apply_flips, find_flips, plain, robust
 from gsgan.skeleton.hands import HAND
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import above, at_least, whole
 
 REFINED = 200  # most frames that refine the cameras, evenly spaced
-FROZEN = 8  # equal positions in a row: another tool filled a gap
 LAG = 6  # frames by which clocks are compared, either way
 
 
@@ -53,10 +50,7 @@ class Solution:
     cameras: CameraArray  # refined
     p: Float  # [F, J, 3] metres
     conf: Float  # [F, J] mean confidence of the cameras that see the joint, 0 where missing
-    views: Ints  # [F, J] cameras whose detection lies within the triangulation's scale
     error: Float  # [C, F, J] final reprojection error, full-size undistorted pixels
-    uv: Float  # [C, F, J, 2] undistorted detections, left and right corrected
-    seen: Float  # [C, F, J] their confidence
     flips: Bool  # [C, F, G] where left and right were swapped: `FLIP_GROUPS`, then the hands
     left_out: Bool  # [C, F, 2] detected hands that are not the person's, or are repeats
     delay: Float  # [C] of each camera's clock, see `clock_errors`
@@ -122,16 +116,12 @@ def solve(
     error = cameras.errors(p.reshape(-1, 3), _flat(found.uv)).reshape(conf.shape)
     stages["smoothed"] = error = np.where(found.weight > 0, error, np.nan)
 
-    seen, pixels = _corrected_detections(conf, uv, found)
     delay, gain = clock_errors(cameras, found.uv[:, :, :BODY], found.weight[:, :, :BODY])
     return Solution(
         cameras=CameraArray(given.K, cameras.R, cameras.t),
         p=p,
         conf=np.where(known(p), _mean_seen(found.weight, found.weight), 0.0),
-        views=(np.nan_to_num(error, nan=np.inf) <= SCALE).sum(0),
         error=error * to_pixels,
-        uv=pixels,
-        seen=seen,
         flips=found.flips,
         left_out=found.left_out,
         delay=delay,
@@ -184,46 +174,6 @@ def correct(cameras: CameraArray, uv: Float, conf: Float) -> Corrected:
     weight[:, :, HANDS] *= ~left_out.repeat(HAND, axis=-1)
     points = robust(cameras, _flat(sided), _flat(weight))
     return Corrected(sided, weight, np.dstack([flips, swapped[..., None]]), left_out, points)
-
-
-def _corrected_detections(conf: Float, uv: Float, found: Corrected) -> tuple[Float, Float]:
-    """Confidence and pixels of all detections, also those of little confidence."""
-    groups = (*FLIP_GROUPS, HAND_PAIRS)[: found.flips.shape[-1]]
-    seen, pixels = (apply_flips(v, found.flips, groups) for v in (conf, uv))
-    if uv.shape[2] == ALL:
-        gone = found.left_out.repeat(HAND, axis=-1)
-        seen[:, :, HANDS][gone], pixels[:, :, HANDS][gone] = 0.0, np.nan
-    return seen, pixels
-
-
-def adopt(
-    cameras: CameraArray, time: Float, p: Float, conf: Float, settings: SolveSettings
-) -> Solution:
-    """Another tool's joints, cleansed and smoothed; the cameras stay as calibrated.
-
-    ``time [F]`` is in seconds, ``p [F, 33, 3]`` in metres with ``conf [F, 33]``. Positions that
-    repeat `FROZEN` times fill gaps, and become missing.
-    """
-    frozen = frozen_joints(p, FROZEN)
-    p, removed = cleanse(np.where(frozen[..., None], np.nan, p))
-    p = smooth(p, conf, time, settings.smoothing)
-    C, (F, J) = len(cameras), conf.shape
-    unseen, unknown = np.full((C, F, J), np.nan), np.full(C, np.nan)
-    return Solution(
-        cameras=cameras,
-        p=p,
-        conf=np.where(known(p), conf, 0.0),
-        views=np.zeros((F, J), np.int64),
-        error=unseen,
-        uv=np.full((C, F, J, 2), np.nan),
-        seen=np.zeros((C, F, J)),
-        flips=np.zeros((C, F, len(FLIP_GROUPS)), bool),
-        left_out=np.zeros((C, F, 2), bool),
-        delay=unknown,
-        gain=unknown,
-        stages={"smoothed": unseen},
-        removed=removed | {"frozen": int(frozen.sum())},
-    )
 
 
 def _flat(values: Float) -> Float:

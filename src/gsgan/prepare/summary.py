@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -12,17 +12,13 @@ from gsgan.check.report import Table
 from gsgan.data.joints import BODY, FACE, HANDS, known
 from gsgan.prepare.camera_array import CameraArray, camera_moves
 from gsgan.prepare.dataset import Outcome
-from gsgan.prepare.landmarks import Detections
 from gsgan.prepare.solve import Solution, median
 from gsgan.skeleton import MEDIAPIPE33
-from gsgan.skeleton.hands import HAND
 
-CROWD = 0.02  # share of frames with more than one person that is noted
-CUT = 0.02  # share of a video's frames that cannot be decoded
 DELAY, DELAY_GAIN = 0.5, 0.05  # frames, and share of the error that correcting them must remove
 
 
-def summarise(outcome: Outcome, detections: Mapping[str, Detections]) -> dict[str, Any]:
+def summarise(outcome: Outcome) -> dict[str, Any]:
     """The content of prepare.json; errors are medians, in pixels of the full-size image."""
     inputs, solution = outcome.inputs, outcome.solution
     turned, moved = camera_moves(CameraArray.of(inputs.cameras), solution.cameras)
@@ -32,15 +28,17 @@ def summarise(outcome: Outcome, detections: Mapping[str, Detections]) -> dict[st
             "turned_degrees": float(turned[c]),
             "moved_mm": float(moved[c]),
             "flipped_share": float(solution.swapped[c].mean()),
-            **_hands_and_face(solution, c),
+            "hands_px": median(solution.error[c][:, HANDS]),
+            "hands_swapped": int(solution.swapped_hands[c].sum()),
+            "face_px": median(solution.error[c][:, FACE]),
             "delay_frames": float(solution.delay[c]),
             "frames_with_person": int(np.isfinite(solution.error[c]).any(-1).sum()),
-            "frames_written": len(outcome.written[name].frames),
+            "frames_written": len(outcome.written[name]),
         }
         for c, name in enumerate(inputs.sources)
     }
     found = known(solution.p[:, :BODY]).mean(0)
-    kept = {frame for one in outcome.written.values() for frame in one.frames}
+    kept = {frame for one in outcome.written.values() for frame in one}
     return {
         "error_px": {stage: median(error) for stage, error in solution.stages.items()},
         "cameras": cameras,
@@ -50,42 +48,14 @@ def summarise(outcome: Outcome, detections: Mapping[str, Detections]) -> dict[st
         "frames_dropped": [frame for frame in outcome.frames.tolist() if frame not in kept],
         "fps": inputs.fps,
         "calibration": {"file": inputs.calibration.path.name, "format": inputs.calibration.format},
-        "notes": [*inputs.notes, *_notes(outcome, detections)],
+        "notes": [*inputs.notes, *_late_clocks(outcome.solution, inputs.sources)],
         "settings": outcome.options.record(),
     }
 
 
-def _hands_and_face(solution: Solution, c: int) -> dict[str, Any]:
-    """Hands and face in one camera; empty where they were not requested."""
-    seen = solution.seen[c]
-    if seen.shape[1] == BODY:
-        return {}
-    left_out, hands = solution.left_out[c], (seen[:, HANDS].reshape(len(seen), 2, HAND) > 0).any(-1)
-    return {
-        "hands": {
-            "found": int(hands.sum() + left_out.sum()),
-            "swapped_frames": int(solution.swapped_hands[c].sum()),
-            "left_out": int(left_out.sum()),
-            "error_px": median(solution.error[c][:, HANDS]),
-        },
-        "face": {
-            "found": int((seen[:, FACE] > 0).any(-1).sum()),
-            "error_px": median(solution.error[c][:, FACE]),
-        },
-    }
-
-
-def _notes(outcome: Outcome, detections: Mapping[str, Detections]) -> list[str]:
-    """Damaged videos, several persons, clocks that are late."""
-    found, solution = [], outcome.solution
-    for c, (name, source) in enumerate(outcome.inputs.sources.items()):
-        decoded = outcome.written[name].decoded
-        if decoded is not None and decoded < (1 - CUT) * source.count:
-            text = f"only {decoded} of {source.count} frames can be decoded; is it damaged?"
-            found.append(f"{name}: {text}")
-        if name in detections and (crowd := np.mean(detections[name].people > 1)) > CROWD:
-            text = f"more than one person in {crowd:.0%} of the frames; the one seen best was used"
-            found.append(f"{name}: {text}")
+def _late_clocks(solution: Solution, names: Iterable[str]) -> list[str]:
+    found = []
+    for c, name in enumerate(names):
         if abs(delay := solution.delay[c]) > DELAY and solution.gain[c] > DELAY_GAIN:
             text = f"its clock seems {delay:+.1f} frames late; if so, set offsets="
             found.append(f"{name}: {text}{{{name}: {round(delay)}}}")
@@ -113,20 +83,6 @@ def print_summary(numbers: Mapping[str, Any], console: Console) -> None:
         "Median error in pixels by stage; refinement, swapped sides, frames that clocks are late"
     )
     console.print(Table(headers, tuple(rows)).for_terminal(title))
-    parts = tuple(
-        (
-            name,
-            *(str(one["hands"][key]) for key in ("found", "swapped_frames", "left_out")),
-            _number(one["hands"]["error_px"], ".2f"),
-            str(one["face"]["found"]),
-            _number(one["face"]["error_px"], ".2f"),
-        )
-        for name, one in cameras.items()
-        if "hands" in one
-    )
-    if parts:
-        headers = ("camera", "hands", "swapped", "left out", "error px", "faces", "error px")
-        console.print(Table(headers, parts).for_terminal("Hands and faces"))
     notes = [*numbers["notes"], f"{numbers['frames']} frames at {numbers['fps']:g} per second"]
     if dropped := numbers["frames_dropped"]:
         notes.append(f"{len(dropped)} frames were dropped: no skeleton or no mask")

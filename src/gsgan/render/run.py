@@ -18,7 +18,7 @@ from gsgan.model.drive import Drive, drive_of, inputs_of
 from gsgan.model.runs import Run
 from gsgan.model.stored import CHECKPOINT
 from gsgan.motion.orbit import Orbit
-from gsgan.render.cameras import from_file, of_capture, of_entry, refuse_inside
+from gsgan.render.cameras import from_file, of_capture, of_entry
 from gsgan.render.output import Output
 from gsgan.scene import Camera
 from gsgan.utils.checks import above, one_of, whole
@@ -26,7 +26,6 @@ from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import writing
 from gsgan.utils.images import Background, background, eight_bits
-from gsgan.utils.provenance import Signer
 
 STILL_SECONDS = 4.0
 
@@ -46,7 +45,6 @@ def render_config(config: DictConfig) -> None:
     drive = _chosen(drive_of(config, run, fps), config, fps)
     console.print(drive.text, markup=False, highlight=False, soft_wrap=True)
     cameras, index = _cameras(config, run, drive)
-    refuse_inside(cameras, drive.p, drive.numbers)
     if config.compare is not None:
         one_of("compare", config.compare, ("truth",))
         if drive.truth is None:
@@ -80,17 +78,10 @@ def render_config(config: DictConfig) -> None:
 def _output(config: DictConfig) -> Output:
     if config.out is None:
         raise ConfigError("out is not set: give out=<video.mp4>, or out=<folder> for PNG files")
-    given = config.c2pa.certificate, config.c2pa.key
-    if (given[0] is None) != (given[1] is None):
-        raise ConfigError("c2pa.certificate and c2pa.key go together: give both")
-    signer = None
-    if given[0] is not None:
-        chain, key = (Path(x).expanduser() for x in given)
-        signer = Signer(chain, key, config.c2pa.algorithm)
     out = Path(config.out).expanduser()
     if out.suffix and out.suffix.lower() != ".mp4" and not out.is_dir():
         raise ConfigError(f"out={out} must be a .mp4 file, or a folder for PNG files")
-    return Output(out, float(above("fps", config.fps)), bool(config.provenance), signer)
+    return Output(out, float(above("fps", config.fps)), bool(config.provenance))
 
 
 def _chosen(drive: Drive, config: DictConfig, fps: float) -> Drive:
@@ -178,6 +169,5 @@ def _record(config: DictConfig, run: Run, drive: Drive, cameras: Camera) -> dict
         "background": str(config.background),
         "compare": config.compare,
         "provenance": bool(config.provenance),
-        "signed": config.c2pa.certificate,
         "inputs": hashed.hexdigest()[:16],
     }

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -16,18 +13,14 @@ from gsgan.scene import Camera
 from gsgan.splat import rasterise
 from gsgan.utils.images import eight_bits
 
-if TYPE_CHECKING:
-    from gsgan.scene import Frame
-
 Bytes = NDArray[np.uint8]
 
 IMAGE, COLOUR, PARTS, ALPHA = "image", "Step I's colour", "segmentation S", "alpha"
-DEPTH, FEATURE, ERROR = "depth", "feature channel", "error against truth"
-ERROR_SCALE = 4.0  # differences from 1/4 on have the brightest colour
+DEPTH, FEATURE = "depth", "feature channel"
 
 
-def layers(avatar: Avatar, truth: bool) -> tuple[str, ...]:
-    """The layers of an avatar, with the error if there is a ground truth."""
+def layers(avatar: Avatar) -> tuple[str, ...]:
+    """The layers of an avatar."""
     names = [IMAGE, ALPHA]
     if avatar.splats is not None:
         names += [COLOUR, DEPTH]
@@ -35,50 +28,45 @@ def layers(avatar: Avatar, truth: bool) -> tuple[str, ...]:
         names.append(FEATURE)
     if avatar.segmentation is not None:
         names.append(PARTS)
-    return (*names, *[ERROR] * truth)
+    return tuple(names)
 
 
 def shown(
     layer: str,
-    painting: Rendering,
+    rendering: Rendering,
     camera: Camera,
     avatar: Avatar,
     behind: Tensor,
     channel: int = 0,
-    truth: Frame | None = None,
 ) -> Bytes:
-    """``[H, W, 3]`` a layer of one painting.
+    """``[H, W, 3]`` one layer of a rendering.
 
     Args:
         layer: of `layers`.
-        painting: with maps, unless the layer is the image.
-        camera: of the painting.
-        avatar: that painted it.
+        rendering: with maps, unless the layer is the image.
+        camera: of the rendering.
+        avatar: that was rendered.
         behind: ``[3, H, W]`` the background.
         channel: of F, for the feature layer; its values are stretched to the colour map's range.
-        truth: the frame with the ground truth, for the error layer.
     """
-    assert painting.image is not None and painting.alpha is not None  # noqa: PT018
-    image, alpha = painting.image[0].cpu(), painting.alpha[0].cpu()
+    assert rendering.image is not None and rendering.alpha is not None  # noqa: PT018
+    image, alpha = rendering.image[0].cpu(), rendering.alpha[0].cpu()
     if layer == ALPHA:
         return _grey(alpha[0])
-    if layer == ERROR and truth is not None:
-        error = (image.clamp(0, 1) - truth.image[0]).abs().mean(dim=0)
-        return _coloured(error * ERROR_SCALE)
-    if layer == PARTS and painting.segmentation is not None:
-        return _parts(painting.segmentation[0].cpu())
-    if layer == COLOUR and painting.features is not None and painting.splat_alpha is not None:
-        return eight_bits(painting.features[0, :3].cpu(), painting.splat_alpha[0].cpu(), behind)
-    if layer == FEATURE and painting.features is not None:
-        return _coloured(_stretched(painting.features[0, 3 + channel].cpu()))
-    if layer == DEPTH and painting.gaussians is not None:
-        return _depth(painting, camera, avatar)
+    if layer == PARTS and rendering.segmentation is not None:
+        return _parts(rendering.segmentation[0].cpu())
+    if layer == COLOUR and rendering.features is not None and rendering.splat_alpha is not None:
+        return eight_bits(rendering.features[0, :3].cpu(), rendering.splat_alpha[0].cpu(), behind)
+    if layer == FEATURE and rendering.features is not None:
+        return _coloured(_stretched(rendering.features[0, 3 + channel].cpu()))
+    if layer == DEPTH and rendering.gaussians is not None:
+        return _depth(rendering, camera, avatar)
     return eight_bits(image, alpha, behind)
 
 
-def _depth(painting: Rendering, camera: Camera, avatar: Avatar) -> Bytes:
-    assert painting.gaussians is not None
-    raster = rasterise(painting.gaussians, camera, settings=avatar.accuracy, depth=True)
+def _depth(rendering: Rendering, camera: Camera, avatar: Avatar) -> Bytes:
+    assert rendering.gaussians is not None
+    raster = rasterise(rendering.gaussians, camera, settings=avatar.accuracy, depth=True)
     assert raster.depth is not None
     alpha = raster.alpha[0, 0].cpu()
     metres = raster.depth[0, 0].cpu() / alpha.clamp_min(1e-6)
@@ -111,16 +99,3 @@ def _coloured(x: Tensor) -> Bytes:
     import matplotlib
 
     return np.asarray(matplotlib.colormaps["turbo"](x.clamp(0, 1).numpy(), bytes=True)[..., :3])
-
-
-def fitted(image: Bytes, aspect: float) -> Bytes:
-    """The image, padded with black until its width is ``aspect`` times its height."""
-    height, width = image.shape[:2]
-    want: Sequence[int] = (
-        (height, round(height * aspect))
-        if aspect * height >= width
-        else (round(width / aspect), width)
-    )
-    room = [(b - a) // 2 for a, b in zip((height, width), want, strict=True)]
-    sides = [(r, b - a - r) for r, a, b in zip(room, (height, width), want, strict=True)]
-    return np.pad(image, (*sides, (0, 0)))

@@ -7,7 +7,6 @@ import io
 import logging
 import socket
 import threading
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -23,8 +22,6 @@ from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.images import background
 from gsgan.view.session import IDLE, Session, Show
-
-MEGABYTE = 1 << 20
 
 
 def view_config(config: DictConfig) -> None:
@@ -77,13 +74,12 @@ class Viewer:
         self.server.request_share_url = lambda verbose=True: None  # type: ignore[method-assign]
         self.server.gui.configure_theme(show_share_button=False, control_width="medium")
         self._camera(size)
-        limit = int(above("max_upload", config.max_upload) * MEGABYTE)
         self.sessions: dict[int, Session] = {}
         self._wake, self._ended = threading.Event(), False
-        self.server.on_client_connect(lambda client: self._join(client, limit))
+        self.server.on_client_connect(self._join)
         self.server.on_client_disconnect(lambda client: self.sessions.pop(client.client_id, None))
-        self._painter = threading.Thread(target=self._paint, daemon=True, name="painting")
-        self._painter.start()
+        self._renderer = threading.Thread(target=self._render, daemon=True, name="rendering")
+        self._renderer.start()
 
     @property
     def address(self) -> str:
@@ -107,7 +103,7 @@ class Viewer:
             return
         self._ended = True
         self._wake.set()
-        self._painter.join()
+        self._renderer.join()
         self.server.stop()
 
     def _camera(self, size: int) -> None:
@@ -123,12 +119,11 @@ class Viewer:
         self.server.initial_camera.look_at = np.nanmean(drive.p[0], axis=0)
         self.server.initial_camera.fov = float(np.radians(Orbit().fov))
 
-    def _join(self, client: Any, limit: int) -> None:
-        _bound_uploads(client, limit)
+    def _join(self, client: Any) -> None:
         self.sessions[client.client_id] = Session(client, self.show, self._wake.set)
         self._wake.set()
 
-    def _paint(self) -> None:
+    def _render(self) -> None:
         """Renders for each browser in turn, as long as one of them needs a new image."""
         while not self._ended:
             due = min((s.step() for s in list(self.sessions.values())), default=IDLE)
@@ -148,29 +143,3 @@ def import_viser() -> Any:
     except ImportError:
         raise ConfigError("the viewer needs the package viser: pip install 'gsgan[view]'") from None
     return viser
-
-
-def _bound_uploads(client: Any, limit: int) -> None:
-    """Drops uploads of more than ``limit`` bytes together, whatever size the browser declares.
-
-    viser itself collects the parts of an upload without a limit.
-    """
-    from viser import _messages
-
-    uploads: dict[str, Any] = client.gui._current_file_upload_states
-    connection = client._websock_connection
-
-    def check(_: int, message: Any) -> None:
-        state = uploads.get(message.transfer_uuid)
-        held = (max(s["total_bytes"], s["transferred_bytes"]) for s in uploads.values())
-        if state and sum(held) > limit:
-            uploads.pop(message.transfer_uuid)
-            total = state["total_bytes"]  # the browser stops waiting
-            ends = message.source_component_uuid, message.transfer_uuid, total, total
-            connection.queue_message(_messages.FileTransferPartAck(*ends))
-            text = f"Motion files are limited to {limit // MEGABYTE} MB."
-            client.add_notification("This file is too large", text, color="red")
-
-    register: Callable[..., None] = connection.register_handler
-    for kind in (_messages.FileTransferStartUpload, _messages.FileTransferPart):
-        register(kind, check)

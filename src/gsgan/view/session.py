@@ -24,7 +24,7 @@ from gsgan.utils.errors import GsganError
 from gsgan.utils.images import eight_bits
 from gsgan.utils.provenance import png_bytes
 from gsgan.view.drag import NAMES, dragged, position
-from gsgan.view.layers import ERROR, IMAGE, fitted, layers, shown
+from gsgan.view.layers import IMAGE, layers, shown
 
 Float = NDArray[np.float64]
 
@@ -69,7 +69,7 @@ class Session:
         self.drive, self.frame = show.drive, 0
         self.pose: Float | None = None  # dragged
         self.changed = self.moved = time.monotonic()
-        self.painted = 0.0  # when rendering of the current image began
+        self.started = 0.0  # when rendering of the current image began
         self.full = False  # whether the current image is of full size
         self.seconds = 0.0  # to render a full-size image
         self.times: deque[float] = deque(maxlen=200)
@@ -85,7 +85,7 @@ class Session:
     def _controls(self) -> None:
         gui, client = self.client.gui, self.client
         self.status = gui.add_text("images per second", "", disabled=True)
-        names = layers(self.show.avatar, self.drive.truth is not None)
+        names = layers(self.show.avatar)
         self.layer = gui.add_dropdown("layer", names, initial_value=IMAGE)
         last = max(0, self.show.avatar.splat_channels - 4)
         self.channel = gui.add_slider("channel of F", 0, max(1, last), 1, 0, visible=last > 0)
@@ -119,7 +119,7 @@ class Session:
         self._wake()
 
     def _played(self) -> None:
-        self.painted = 0.0  # the time since the last image is no part of the motion
+        self.started = 0.0  # the time since the last image is no part of the motion
         self.touch(moving=False)
 
     def _scrubbed(self, event: Any) -> None:
@@ -141,7 +141,6 @@ class Session:
             self._warn("This motion cannot be used", _message(error).replace(folder + "/", ""))
             return
         self.drive, self.description.content = drive, drive.text
-        self.layer.options = layers(self.show.avatar, drive.truth is not None)
         self.slider.max = max(1, len(drive.p) - 1)
         self.slider.value = 0
         self._scrub(0)
@@ -199,27 +198,27 @@ class Session:
             return drive
         return replace(drive, p=pose[None], visibility=drive.visibility[:, : len(pose)], body=None)
 
-    # -- painting
+    # -- rendering
 
     def step(self) -> float:
         """Renders an image if one is due; returns the seconds until the next one may be."""
         now = time.monotonic()
         if self.play.value and len(self.drive.p) > 1:
-            if (early := self.painted + 1 / self.show.fps - now) > 0:
+            if (early := self.started + 1 / self.show.fps - now) > 0:
                 return early
-            passed = max(1, round((now - self.painted) * self.show.fps)) if self.painted else 1
+            passed = max(1, round((now - self.started) * self.show.fps)) if self.started else 1
             self.frame, self.pose = (self.frame + passed) % len(self.drive.p), None
             self.slider.value = self.frame
             self.changed = self.moved = now
         moving = now - self.moved < RESTS
-        if self.painted > self.changed and (self.full or moving):
+        if self.started > self.changed and (self.full or moving):
             return self.moved + RESTS - now if moving else IDLE
         share = 1.0
         if moving and self.seconds:
             share = min(1.0, max(SMALLEST, (1 / self.show.rate / self.seconds) ** 0.5))
-        self.painted, self.full = now, False
+        self.started, self.full = now, False
         try:
-            self._paint(share)
+            self._render(share)
         except Exception as error:  # whatever the pose is, the thread renders for all browsers
             if self._problem != _message(error):  # once, not for every image
                 self._problem = _message(error)
@@ -247,23 +246,19 @@ class Session:
         world = [torch.tensor(np.array(a), dtype=torch.float32)[None] for a in (K, R, t)]
         return Camera(world[0], world[1], world[2], size)
 
-    def _paint(self, share: float) -> None:
-        avatar, layer = self.show.avatar, self.layer.value
-        current = self._current()
-        truth = current.truth(0) if layer == ERROR and current.truth else None
-        camera = self.camera(share) if truth is None else truth.camera
-        p, visibility, body = inputs_of(avatar, current, 0)
+    def _render(self, share: float) -> None:
+        avatar, layer, camera = self.show.avatar, self.layer.value, self.camera(share)
+        p, visibility, body = inputs_of(avatar, self._current(), 0)
         maps = layer != IMAGE or self.splats.value
         with torch.no_grad():
-            painting = avatar(p, visibility, camera.to(p.device), body, maps=maps)
+            rendering = avatar(p, visibility, camera.to(p.device), body, maps=maps)
         behind = self.show.behind(camera.size)
-        image = shown(layer, painting, camera, avatar, behind, int(self.channel.value), truth)
+        image = shown(layer, rendering, camera, avatar, behind, int(self.channel.value))
         self.image = image
-        whole = fitted(image, self.client.camera.aspect) if truth is not None else image
-        if self.splats.value and painting.gaussians is not None:  # the browser draws these instead
-            whole = eight_bits(behind, torch.ones(1), behind)
-        self.client.scene.set_background_image(whole, "jpeg", jpeg_quality=90)
-        self._place(painting.gaussians, np.asarray(p[0].cpu().numpy(), np.float64), body)
+        if self.splats.value and rendering.gaussians is not None:  # the browser draws these instead
+            image = eight_bits(behind, torch.ones(1), behind)
+        self.client.scene.set_background_image(image, "jpeg", jpeg_quality=90)
+        self._place(rendering.gaussians, np.asarray(p[0].cpu().numpy(), np.float64), body)
         self.times.append(time.monotonic())
         recent = [x for x in self.times if x > self.times[-1] - SPEED_OVER]
         rate = (len(recent) - 1) / max(recent[-1] - recent[0], 1e-6)
