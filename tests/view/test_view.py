@@ -30,7 +30,7 @@ PATIENCE = 60.0  # seconds
 def served(compose, run):
     from gsgan.view.server import Viewer
 
-    given = (f"run={run}", "port=0", "device=cpu", "background=white")
+    given = (f"run={run}", "port=0", "device=cpu", "max_upload=1", "background=white")
     made = Viewer(compose("view", *given))
     yield made
     made.stop()
@@ -203,6 +203,10 @@ def test_a_motion_is_loaded_and_bad_files_are_reported(open_page, capture, tmp_p
     upload(page, bad)
     page.get_by_text("This motion cannot be used").wait_for()
     assert page.get_by_text("bad.bvh").count()
+    large = tmp_path / "large.bvh"
+    large.write_bytes(b"x" * (2 << 20))
+    upload(page, large)
+    page.get_by_text("This file is too large").wait_for()
     upload(page, capture / "landmarks3d.npz")
     until(lambda: "landmarks3d.npz" in session.description.content, page)
     until(lambda: session.full, page)

@@ -7,6 +7,7 @@ import io
 import logging
 import socket
 import threading
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,8 @@ from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.images import background
 from gsgan.view.session import IDLE, Session, Show
+
+MEGABYTE = 1 << 20
 
 
 def view_config(config: DictConfig) -> None:
@@ -74,9 +77,10 @@ class Viewer:
         self.server.request_share_url = lambda verbose=True: None  # type: ignore[method-assign]
         self.server.gui.configure_theme(show_share_button=False, control_width="medium")
         self._camera(size)
+        limit = int(above("max_upload", config.max_upload) * MEGABYTE)
         self.sessions: dict[int, Session] = {}
         self._wake, self._ended = threading.Event(), False
-        self.server.on_client_connect(self._join)
+        self.server.on_client_connect(lambda client: self._join(client, limit))
         self.server.on_client_disconnect(lambda client: self.sessions.pop(client.client_id, None))
         self._renderer = threading.Thread(target=self._render, daemon=True, name="rendering")
         self._renderer.start()
@@ -119,7 +123,8 @@ class Viewer:
         self.server.initial_camera.look_at = np.nanmean(drive.p[0], axis=0)
         self.server.initial_camera.fov = float(np.radians(Orbit().fov))
 
-    def _join(self, client: Any) -> None:
+    def _join(self, client: Any, limit: int) -> None:
+        _bound_uploads(client, limit)
         self.sessions[client.client_id] = Session(client, self.show, self._wake.set)
         self._wake.set()
 
@@ -143,3 +148,29 @@ def import_viser() -> Any:
     except ImportError:
         raise ConfigError("the viewer needs the package viser: pip install 'gsgan[view]'") from None
     return viser
+
+
+def _bound_uploads(client: Any, limit: int) -> None:
+    """Drops uploads of more than ``limit`` bytes together, whatever size the browser declares.
+
+    viser itself collects the parts of an upload without a limit.
+    """
+    from viser import _messages
+
+    uploads: dict[str, Any] = client.gui._current_file_upload_states
+    connection = client._websock_connection
+
+    def check(_: int, message: Any) -> None:
+        state = uploads.get(message.transfer_uuid)
+        held = (max(s["total_bytes"], s["transferred_bytes"]) for s in uploads.values())
+        if state and sum(held) > limit:
+            uploads.pop(message.transfer_uuid)
+            total = state["total_bytes"]  # the browser stops waiting
+            ends = message.source_component_uuid, message.transfer_uuid, total, total
+            connection.queue_message(_messages.FileTransferPartAck(*ends))
+            text = f"Motion files are limited to {limit // MEGABYTE} MB."
+            client.add_notification("This file is too large", text, color="red")
+
+    register: Callable[..., None] = connection.register_handler
+    for kind in (_messages.FileTransferStartUpload, _messages.FileTransferPart):
+        register(kind, check)
