@@ -298,6 +298,14 @@ def test_cameras(render, bare, capture, motion, tmp_path):
     )
 
 
+def test_a_camera_inside_the_person(render, motion, tmp_path):
+    refused(
+        render(f"motion={motion}", "orbit.distance=0.05", "out=d"),
+        "the camera is inside the person", "cm from the",
+    )  # fmt: skip
+    assert not (tmp_path / "d").exists()
+
+
 @pytest.mark.parametrize(
     ("args", "message"),
     [

@@ -18,7 +18,7 @@ from gsgan.model.drive import Drive, drive_of, inputs_of
 from gsgan.model.runs import Run
 from gsgan.model.stored import CHECKPOINT
 from gsgan.motion.orbit import Orbit
-from gsgan.render.cameras import from_file, of_capture, of_entry
+from gsgan.render.cameras import from_file, of_capture, of_entry, refuse_inside
 from gsgan.render.output import Output
 from gsgan.scene import Camera
 from gsgan.utils.checks import above, one_of, whole
@@ -45,6 +45,7 @@ def render_config(config: DictConfig) -> None:
     drive = _chosen(drive_of(config, run, fps), config, fps)
     console.print(drive.text, markup=False, highlight=False, soft_wrap=True)
     cameras, index = _cameras(config, run, drive)
+    refuse_inside(cameras, drive.p, drive.numbers)
     if config.compare is not None:
         one_of("compare", config.compare, ("truth",))
         if drive.truth is None:
