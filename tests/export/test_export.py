@@ -1,4 +1,4 @@
-"""``python -m gsgan.export``: files and refusals of the real command."""
+"""``python -m gsgan.export``: files, cards and refusals of the real command."""
 
 from __future__ import annotations
 
@@ -9,18 +9,26 @@ from PIL import Image
 from gsgan.utils.provenance import png_bytes
 
 
-def test_a_sequence_of_ply_files(bare, tmp_path, inside):
+def test_a_sequence_of_ply_files_and_its_card(bare, tmp_path, inside):
     out = tmp_path / "poses"
     given = [f"run={bare}", f"out={out}", "motion=novel_pose"]
     result = inside("export", *given)
     assert result.returncode == 0, result.stderr
     files = sorted(path.name for path in out.iterdir())
-    assert files == ["000004.ply", "000005.ply"]
+    assert files == ["000004.ply", "000005.ply", "MODEL_CARD.md"]
     first, second = ((out / name).read_bytes() for name in files[:2])
     assert first[:3] == b"ply"
     assert first != second
+    card = (out / "MODEL_CARD.md").read_text()
+    for part in ("Effects", "Scores on held-out images", "Intended use", "Licence", "Apache-2.0"):
+        assert part in card
+    assert "license: other" in card
     refused(inside("export", *given), "exists", "overwrite=true")
-    assert inside("export", *given, "overwrite=true", "frames=1").returncode == 0
+    (out / "notes.ply").write_text("mine")
+    again = inside("export", *given, "overwrite=true", "licence=cc-by-nc-4.0", "frames=1")
+    assert again.returncode == 0, again.stderr
+    assert sorted(p.name for p in out.glob("*.ply")) == ["000004.ply", "notes.ply"]
+    assert "license: cc-by-nc-4.0" in (out / "MODEL_CARD.md").read_text()
 
 
 def test_a_file_in_place_of_a_folder_and_the_reverse(bare, tmp_path, inside):
@@ -37,13 +45,16 @@ def test_the_rest_pose_as_glb(bare, tmp_path, inside):
     result = inside("export", f"run={bare}", "format=gltf", f"out={out}")
     assert result.returncode == 0, result.stderr
     assert out.read_bytes()[:4] == b"glTF"
+    assert "KHR_gaussian_splatting" in (tmp_path / "rest.MODEL_CARD.md").read_text()
 
 
-def test_a_trained_run_as_safetensors(run, tmp_path, inside):
+def test_a_trained_run_as_safetensors_with_its_scores(run, tmp_path, inside):
     out = tmp_path / "one.safetensors"
     result = inside("export", f"run={run}", "format=safetensors", f"out={out}")
     assert result.returncode == 0, result.stderr
-    assert out.is_file()
+    card = (tmp_path / "one.MODEL_CARD.md").read_text()
+    assert "| novel_pose | final image |" in card
+    assert "marked: perceptual loss" in card
 
 
 def test_verify_reads_a_file(tmp_path, inside):

@@ -11,6 +11,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf, open_dict
 from rich.progress import track
 
+from gsgan.export.card import card
 from gsgan.export.splats import Splats, glb_bytes, ply_bytes, splats_of
 from gsgan.model.drive import REST, Drive, drive_of, inputs_of
 from gsgan.model.runs import Run
@@ -27,10 +28,11 @@ ENDINGS = {
     "torch": ".pt2",
     "safetensors": ".safetensors",
 }
+CARD = "MODEL_CARD.md"
 
 
 def export_config(config: DictConfig) -> None:
-    """Writes the export that a config describes.
+    """Writes the export that a config describes, and a model card beside it.
 
     Raises:
         ConfigError: when an option has an invalid value, or the output exists.
@@ -62,9 +64,17 @@ def export_config(config: DictConfig) -> None:
             splats = _splats(run, drive, i)
             up = run.proportions.up
             _write(name, ply_bytes(splats) if kind == "ply" else glb_bytes(splats, up))
+        if sequence and (out / CARD).is_file():  # what is left of a longer one
+            kept = {f"{number:06d}.ply" for number in drive.numbers}
+            with writing(out):
+                for path in out.glob("[0-9]" * 6 + ".ply"):
+                    if path.name not in kept:
+                        path.unlink()
     else:
         _write(out, _program(config, run, kind))
-    tell(f"written: {out}")
+    beside = out / CARD if sequence else out.with_name(f"{out.stem}.{CARD}")
+    _write(beside, card(run, kind, out.name, config.licence))
+    tell(f"written: {out}, {beside.name}")
 
 
 def _write(path: Path, content: str | bytes) -> None:
