@@ -316,6 +316,7 @@ def test_a_camera_inside_the_person(render, motion, tmp_path):
         (("out=a", "motion=novel_pose", "start=9"), "start=9: the motion has 2 frames"),
         (("out=a", "compare=truth"), "compare=truth needs held-out frames"),
         (("out=a", "orbit.elevation=90"), "orbit.elevation must be"),
+        (("out=a", "c2pa.key=k.pem"), "go together"),
         (("out=a", "retarget=maybe"), "retarget must be one of auto"),
         (("out=a", "drive=body"), "drive must be one of None, skeleton"),
         (("out=a", "motion=[a.npz,b.npz]", "retarget=false"), "is not supported for a list"),

@@ -47,7 +47,8 @@ def export_config(config: DictConfig) -> None:
         path = Path(config.verify).expanduser()
         found = verify(path)
         state = "marked as synthetic" if found.synthetic else "not marked as synthetic"
-        tell(f"{path.name}: {state}\n{found}")
+        for line in (f"{path.name}: {state}", *found.lines()):
+            tell(line)
         return
     kind = one_of("format", config.format, tuple(ENDINGS))
     out = _place(config, kind)

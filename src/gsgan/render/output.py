@@ -22,7 +22,7 @@ from PIL import Image
 from gsgan.data.files import read_colour
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import write_atomically
-from gsgan.utils.provenance import marked_mp4, png_bytes
+from gsgan.utils.provenance import Signer, marked_mp4, png_bytes, signed
 
 Bytes = NDArray[np.uint8]
 
@@ -40,11 +40,13 @@ class Output:
         out: a .mp4 file or a folder.
         fps: of the video.
         marked: whether files say that they are synthetic.
+        signer: signs the final files; None leaves them unsigned.
     """
 
     out: Path
     fps: float
     marked: bool = True
+    signer: Signer | None = None
 
     @property
     def video(self) -> bool:
@@ -100,7 +102,10 @@ class Output:
 
     def write(self, number: int, image: Bytes) -> None:
         """Writes a frame ``[H, W, 3 or 4]``."""
-        write_atomically(self.path(number), png_bytes(Image.fromarray(image), self.marked))
+        data = png_bytes(Image.fromarray(image), self.marked)
+        if self.signer is not None and not self.video:
+            data = signed(data, ".png", self.signer)
+        write_atomically(self.path(number), data)
 
     def finish(self, numbers: Sequence[int]) -> None:
         """Encodes the frames as a video and removes them; does nothing for a folder.
@@ -111,7 +116,10 @@ class Output:
         if not self.video:
             return
         data = encoded((read_colour(self.path(n)) for n in numbers), self.fps)
-        write_atomically(self.out, marked_mp4(data) if self.marked else data)
+        data = marked_mp4(data) if self.marked else data
+        if self.signer is not None:
+            data = signed(data, VIDEO, self.signer)
+        write_atomically(self.out, data)
         shutil.rmtree(self.folder)
 
 
