@@ -9,15 +9,22 @@ from pathlib import Path
 import numpy as np
 import pygltflib
 import pytest
+from PIL import Image
 from tiny_glb import BONES, TinyGlb
 
 from gsgan.body.free import free_body
 from gsgan.synthetic.anchors import FACE_NAMES
 from gsgan.synthetic.gltf import avatar_names, avatar_path, read_character
-from gsgan.synthetic.humanoid import mixamo_bone
+from gsgan.synthetic.humanoid import mixamo_bone, vrm_bone
 from gsgan.utils.errors import ConfigError, DataError
 
 VALID = Path(__file__).resolve().parents[3] / "shared" / "data" / "valid"
+VRM = {
+    "Hips": "hips", "Spine": "spine", "Neck": "neck", "Head": "head",
+    **{f"{side}{bone}": side.lower() + name for side in ("Left", "Right") for bone, name in {
+        "Arm": "UpperArm", "ForeArm": "LowerArm", "Hand": "Hand",
+        "UpLeg": "UpperLeg", "Leg": "LowerLeg", "Foot": "Foot"}.items()},
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -110,6 +117,37 @@ def test_the_four_largest_of_eight_weights_are_kept(tmp_path) -> None:
     np.testing.assert_allclose(character.bone_weight[0], np.array([0.35, 0.3, 0.2, 0.1]) / 0.95)
 
 
+def test_textures_factors_and_coverage(tmp_path) -> None:
+    glb = TinyGlb()
+    material = glb.doc.materials[0]
+    plain = read_character(glb.write(tmp_path / "opaque.glb")).surfaces[0]
+    assert plain.cutoff == 0
+    np.testing.assert_array_equal(plain.colour[0, 0], [200, 150, 120, 255])
+    material.alphaMode, material.alphaCutoff = "MASK", 0.3
+    colour = Image.fromarray(np.full((4, 4, 4), (180, 180, 180, 100), np.uint8))
+    material.pbrMetallicRoughness.baseColorTexture.index = glb.texture(colour, "WEBP")
+    material.pbrMetallicRoughness.baseColorFactor = [0.5, 1, 1, 0.5]
+    masked = read_character(glb.write(tmp_path / "masked.glb")).surfaces[0]
+    assert masked.cutoff == 0.3
+    np.testing.assert_allclose(masked.colour[0, 0], [132, 180, 180, 50], atol=1)  # linear halved
+
+
+@pytest.mark.parametrize("version", [0, 1])
+def test_vrm_maps_bones(tmp_path, version, tiny) -> None:
+    names = {bone: f"J_{k}" for k, bone in enumerate(BONES)}
+    glb = TinyGlb(names=names)
+    mapped = {VRM[bone]: k for k, bone in enumerate(BONES)}
+    bones = [{"bone": name, "node": k} for name, k in mapped.items()]
+    if version == 0:
+        glb.doc.extensions["VRM"] = {"humanoid": {"humanBones": bones}}
+    else:
+        named = {bone["bone"]: {"node": bone["node"]} for bone in bones}
+        glb.doc.extensions["VRMC_vrm"] = {"humanoid": {"humanBones": named}}
+    character = read_character(glb.write(tmp_path / "a.glb"))
+    assert set(character.bones) == set(BONES)
+    np.testing.assert_allclose(character.shapes["mouth_open"], tiny.shapes["mouth_open"])
+
+
 @pytest.mark.parametrize(("name", "bone"), [
     ("mixamorig:LeftForeArm", "LeftForeArm"), ("mixamorig9_Hips", "Hips"),
     ("mixamorigRightHandIndex1", "RightHandIndex1"), ("LeftUpLeg", "LeftUpLeg"),
@@ -117,6 +155,13 @@ def test_the_four_largest_of_eight_weights_are_kept(tmp_path) -> None:
 ])  # fmt: skip
 def test_names_of_mixamo(name, bone) -> None:
     assert mixamo_bone(name) == bone
+
+
+def test_names_of_vrm_thumbs_and_fingers() -> None:
+    assert vrm_bone("leftThumbProximal", 0) == "LeftHandThumb1"
+    assert vrm_bone("leftThumbProximal", 1) == "LeftHandThumb2"
+    assert vrm_bone("rightLittleDistal", 1) == "RightHandPinky3"
+    assert vrm_bone("jaw", 1) == "Jaw"
 
 
 def test_labels_and_landmarks_without_colours_fingers_or_eyes(tiny) -> None:

@@ -130,11 +130,29 @@ def test_textures_are_bilinear_and_repeat():
     textures = Textures((Surface("two", colours), plain()))
     uv = np.array([[0.25, 0.5], [0.75, 0.3], [0.5, 0.5], [1.25, 7.0], [-0.25, 0.5]], np.float32)
     zero = np.zeros(5, int)
-    rgb, normal = textures(zero, uv, zero)
+    rgb, coverage, normal = textures(zero, uv, zero)
     np.testing.assert_allclose(rgb[:, 0], [0, 1, 0.5, 0, 1], atol=1e-6)
+    np.testing.assert_allclose(coverage, rgb[:, 0])
     np.testing.assert_allclose(normal, np.tile([0, 0, 1], (5, 1)))
-    rgb, _ = textures(np.array([0, 1]), uv[:2], np.array([9, 9]))  # past the last level
+    rgb, _, _ = textures(np.array([0, 1]), uv[:2], np.array([9, 9]))  # past the last level
     np.testing.assert_allclose(rgb[:, 0], [0.5, GREY], rtol=1e-3)
+
+
+def test_rays_and_sun_pass_through_cut_outs():
+    colours = np.full((64, 64, 4), 255, np.uint8)
+    colours[16:48, 16:48, 3] = 0
+    holey, dark = Surface("holey", colours, cutoff=0.5), plain((40, 40, 40))
+    c = character([square(0.5, 0.5), square(0.0, 1.0)], [holey, dark], [1, 2])
+    light = replace(MATT, direction=(2, 0, 5))
+    view = from_above(size=60, focal=60.0)
+    image, alpha, labels = posed(c, light).render(view, 4)
+    assert labels[30, 30] == 2
+    assert at(view, labels, (0.4, 0, 0.5)) == 1
+    assert alpha[30, 30] == 1
+    hole, shaded = at(view, image, (-0.1, 0, 0)), at(view, image, (-0.66, 0, 0))
+    assert np.all(hole > 1.2 * shaded)  # the sun shines through the hole, 0.2 m to -x
+    opaque = character([square(0.5, 0.5), square(0.0, 1.0)], [replace(holey, cutoff=0), dark])
+    assert posed(opaque).render(view, 1)[2][30, 30] == 1
 
 
 def test_normal_map_tilts_towards_its_axes():

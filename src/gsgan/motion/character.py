@@ -19,11 +19,12 @@ Bytes = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Surface:
-    """A material: ``colour [h, w, 4]`` sRGB, opaque, ``normal [h, w, 3]`` map or None."""
+    """A material: ``colour [h, w, 4]`` sRGB and coverage, ``normal [h, w, 3]`` map or None."""
 
     name: str
     colour: Bytes
     normal: Bytes | None = None  # tangent space, OpenGL's convention (y up)
+    cutoff: float = 0.0  # coverage below which there is no surface; 0: opaque
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Any rigged ``.glb`` as a `Character`: VALID, Ready Player Me, Mixamo and their like."""
+"""Any rigged ``.glb`` as a `Character`: VALID, Ready Player Me, Mixamo, VRoid and their like."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from gsgan.synthetic.humanoid import (
     plain_shape,
 )
 from gsgan.synthetic.parts import LABEL_NAMES, face_labels
+from gsgan.synthetic.textures import linear, srgb
 from gsgan.utils.errors import ConfigError, DataError
 
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # glTF is y up
@@ -58,13 +59,14 @@ def avatar_path(name: str) -> Path:
 def read_character(path: Path) -> Character:
     """The person in a rigged ``.glb``.
 
-    All skinned meshes are merged; textures are opaque, and keep their resolution up to 2048 pixels
-    a side. The person is turned to face -Y, put on z = 0 with the
+    All skinned meshes are merged, and unskinned ones that hang on a bone; textures keep their
+    resolution up to 2048 pixels a side. The person is turned to face -Y, put on z = 0 with the
     hips over the origin, and scaled to metres: by the file's likeliest unit if that makes 1.2 to
     2.3 m, else to 1.7 m.
 
     Args:
-        path: a binary glTF 2 file whose bones are named as Mixamo's, with or without prefix.
+        path: a binary glTF 2 file whose bones are named as Mixamo's (with or without prefix) or
+            mapped by VRM's extensions.
 
     Raises:
         DataError: The file is missing, damaged, compressed in an unsupported way, or holds no
@@ -90,7 +92,7 @@ class _Rig:
         self.nodes = nodes
         self._worlds: dict[int, Array] = {}
         self.above = {child: i for i, node in enumerate(nodes) for child in node.children or ()}
-        named = humanoid_bones([node.name for node in nodes])
+        named = humanoid_bones([node.name for node in nodes], glb.doc.extensions or {})
         used = {joint for skin in skins for joint in skin.joints} | named.keys()
         self.ids = sorted(used, key=lambda i: (len(self.ancestors(i)), i))  # parents first
         self.number = {node: k for k, node in enumerate(self.ids)}
@@ -100,7 +102,7 @@ class _Rig:
             raise DataError(
                 f"{glb.path}: its {len(self.bones)} bones ({', '.join(self.bones[:6])}, …) do not "
                 f"include {', '.join(missing[:6])}{', …' * (len(missing) > 6)}; name them as "
-                "Mixamo does"
+                "Mixamo or VRM does"
             )
         self.parents = np.array([self.bone_above(self.above.get(i, -1)) for i in self.ids])
         self.joints = np.array([self.world(i)[:3, 3] for i in self.ids])
@@ -162,11 +164,11 @@ class _Part:
 
 
 def _parts(glb: Glb, rig: _Rig) -> list[_Part]:
-    """All skinned triangles; others are no part of the person."""
+    """All triangles that hang on bones; others are no part of the person."""
     return [
         _part(glb, rig, i, primitive)
         for i, node in enumerate(rig.nodes)
-        if node.mesh is not None and node.skin is not None
+        if node.mesh is not None and (node.skin is not None or rig.bone_above(i) >= 0)
         for primitive in glb.doc.meshes[node.mesh].primitives
         if primitive.mode in (None, TRIANGLES)
     ]
@@ -177,7 +179,7 @@ def _part(glb: Glb, rig: _Rig, number: int, primitive: Any) -> _Part:
     mesh = glb.doc.meshes[node.mesh]
     attributes = {k: v for k, v in vars(primitive.attributes).items() if v is not None}
     position = glb.accessor(attributes["POSITION"])
-    index, weight, matrix = _bound(glb, rig, number, attributes)
+    index, weight, matrix = _bound(glb, rig, number, attributes, len(position))
     linear = matrix[:, :3, :3]
     normals = np.zeros_like(position)  # of files without any: made of the faces later
     if "NORMAL" in attributes:
@@ -211,10 +213,15 @@ def _part(glb: Glb, rig: _Rig, number: int, primitive: Any) -> _Part:
 
 
 def _bound(
-    glb: Glb, rig: _Rig, number: int, attributes: dict[str, int]
+    glb: Glb, rig: _Rig, number: int, attributes: dict[str, int], count: int
 ) -> tuple[Ints, Array, Array]:
     """Bones and weights ``[V, 4]``, and matrices ``[V, 4, 4]`` to world axes."""
-    skin = glb.doc.skins[rig.nodes[number].skin]
+    node = rig.nodes[number]
+    if node.skin is None:
+        index, weight = np.full((count, 4), rig.bone_above(number)), np.zeros((count, 4))
+        weight[:, 0] = 1
+        return index, weight, np.broadcast_to(rig.world(number), (count, 4, 4))
+    skin = glb.doc.skins[node.skin]
     slots, weight = _four_largest(glb, attributes)
     matrices = np.array([rig.world(joint) for joint in skin.joints])
     if skin.inverseBindMatrices is not None:
@@ -246,13 +253,24 @@ def _surface(glb: Glb, material: int) -> Surface:
     if material < 0:
         return Surface("", np.full((1, 1, 4), 255, np.uint8))
     entry, base = glb.doc.materials[material], _base_texture(glb, material)
+    shader = entry.pbrMetallicRoughness
+    factor = np.array((shader and shader.baseColorFactor) or (1, 1, 1, 1), np.float64)
     colour = glb.image(base.index) if base else np.full((1, 1, 4), 255, np.uint8)
-    colour = np.concatenate([colour[..., :3], np.full_like(colour[..., 3:], 255)], -1)
+    if (factor != 1).any():  # the factor scales linear light
+        table = np.arange(256) / 255
+        scaled = np.clip(linear(table)[:, None] * factor[:3], 0, 1)
+        curve = np.c_[srgb(scaled), np.clip(table * factor[3], 0, 1)]
+        curve = np.rint(curve * 255).astype(np.uint8)
+        colour = np.stack([curve[colour[..., k], k] for k in range(4)], -1)
+    opaque = (entry.alphaMode or "OPAQUE") == "OPAQUE"
+    if opaque:
+        colour = np.concatenate([colour[..., :3], np.full_like(colour[..., 3:], 255)], -1)
     bump = entry.normalTexture
     return Surface(
         name=entry.name or "",
         colour=colour,
         normal=None if bump is None else glb.image(bump.index)[..., :3],
+        cutoff=0.0 if opaque else (0.5 if entry.alphaCutoff is None else entry.alphaCutoff),
     )
 
 

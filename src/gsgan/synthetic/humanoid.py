@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +21,29 @@ BONES = (
 )
 CANONICAL = {bone.lower(): bone for bone in BONES}
 
+VRM_LIMBS = {"shoulder": "Shoulder", "upperArm": "Arm", "lowerArm": "ForeArm", "hand": "Hand"}
+VRM_LIMBS |= {"upperLeg": "UpLeg", "lowerLeg": "Leg", "foot": "Foot", "toes": "ToeBase"}
+VRM_LIMBS |= {"eye": "Eye"}
+VRM_BONES = {"hips": "Hips", "spine": "Spine", "chest": "Spine1", "upperChest": "Spine2"}
+VRM_BONES |= {"neck": "Neck", "head": "Head", "jaw": "Jaw"}
+
+
+def vrm_bone(name: str, version: int) -> str | None:
+    """Mixamo's name of a humanoid bone of VRM; ``version`` 0 or 1 (thumbs differ)."""
+    if name in VRM_BONES:
+        return VRM_BONES[name]
+    side, rest = ("Left", name[4:]) if name.startswith("left") else ("Right", name[5:])
+    if (limb := rest[:1].lower() + rest[1:]) in VRM_LIMBS:
+        return side + VRM_LIMBS[limb]
+    match = re.fullmatch(r"(\w+?)(Metacarpal|Proximal|Intermediate|Distal)", rest)
+    if match is None:
+        return None
+    finger = {"Little": "Pinky"}.get(match[1], match[1])
+    segments = ["Proximal", "Intermediate", "Distal"]
+    if finger == "Thumb" and version == 1:
+        segments = ["Metacarpal", "Proximal", "Distal"]
+    return f"{side}Hand{finger}{segments.index(match[2]) + 1}"
+
 
 def mixamo_bone(name: str) -> str | None:
     """Mixamo's name without prefix of a bone, None for other bones."""
@@ -27,11 +51,19 @@ def mixamo_bone(name: str) -> str | None:
     return CANONICAL.get(re.sub(r"^mixamorig\d*", "", plain).lower())
 
 
-def humanoid_bones(names: Iterable[str | None]) -> dict[int, str]:
-    """Node number → Mixamo's bone name, of a document's node names."""
+def humanoid_bones(names: Iterable[str | None], extensions: Mapping[str, Any]) -> dict[int, str]:
+    """Node number → Mixamo's bone name, of a document's node names and extensions."""
+    if "VRMC_vrm" in extensions:
+        bones = extensions["VRMC_vrm"]["humanoid"]["humanBones"]
+        pairs = [(bone["node"], vrm_bone(name, 1)) for name, bone in bones.items()]
+    elif "VRM" in extensions:
+        bones = extensions["VRM"]["humanoid"]["humanBones"]
+        pairs = [(bone["node"], vrm_bone(bone["bone"], 0)) for bone in bones]
+    else:
+        pairs = [(node, mixamo_bone(name or "")) for node, name in enumerate(names)]
     found: dict[str, int] = {}
-    for node, name in enumerate(names):
-        if bone := mixamo_bone(name or ""):
+    for node, bone in pairs:
+        if bone is not None:
             found.setdefault(bone, node)
     return {node: bone for bone, node in found.items()}
 

@@ -52,8 +52,8 @@ class Textures:
         """``[N, 2]`` width and height in texels of surfaces ``[N]``."""
         return self._size[surface, 0]
 
-    def __call__(self, surface: Ints, uv: Floats, level: Ints) -> tuple[Floats, Floats]:
-        """Linear RGB and tangent-space normals ``[N, 3]`` each, bilinear.
+    def __call__(self, surface: Ints, uv: Floats, level: Ints) -> tuple[Floats, Floats, Floats]:
+        """Linear RGB ``[N, 3]``, coverage ``[N]`` and tangent-space normals ``[N, 3]``, bilinear.
 
         Args:
             surface: ``[N]`` index into the surfaces.
@@ -73,7 +73,7 @@ class Textures:
         out += self._texels[top + high[:, 0]] * (x * (1 - y))
         out += self._texels[bottom + low[:, 0]] * ((1 - x) * y)
         out += self._texels[bottom + high[:, 0]] * (x * y)
-        return out[:, :3], out[:, 4:7]
+        return out[:, :3], out[:, 3], out[:, 4:7]
 
 
 def _pyramid(surface: Surface) -> Iterator[Floats]:

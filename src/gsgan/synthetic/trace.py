@@ -7,6 +7,7 @@ Convention: metres, world frame; images are RGB, sRGB in [0, 1], premultiplied o
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,6 +31,7 @@ CLOTHES = ("upper_clothes", "lower_clothes", "left_shoe", "right_shoe")
 SKY_RAYS = 48  # directions in which each vertex looks for the sky
 SKY_OFFSET = 3e-3  # metres from the surface to sky rays
 SHADOW_OFFSET = 1e-3  # metres from the surface to shadow rays; less gives speckles
+LAYERS = 32  # cut-out surfaces that one ray passes at most
 SHOULDER = 0.5  # linear light from which the tone curve is compressed
 
 
@@ -79,6 +81,7 @@ class Appearance:
         self.faces = character.faces.astype(np.int32)
         self.uv = character.uv.astype(np.float32)
         self.textures = Textures(character.surfaces)
+        self.cutoff = np.array([s.cutoff for s in character.surfaces], np.float32)
         self.bumpy = any(s.normal is not None for s in character.surfaces)
         clothes = [name in CLOTHES for name in character.label_names]
         self.glossy = np.array(clothes, np.float32)[character.labels]
@@ -93,6 +96,18 @@ class Appearance:
         # log2 of texels per metre, along one side
         self.density = 0.5 * np.log2(np.maximum(texels, 1e-9) / np.maximum(twice_area, 1e-12))
 
+    def coverage(self, face: Ints, bary: Floats) -> Bools:
+        """Whether points of faces are on the surface, rather than cut out of it."""
+        surface = self.character.material[face]
+        solid = self.cutoff[surface] <= 0
+        k = np.flatnonzero(~solid)
+        uv = _blend(bary[k], self.uv[self.faces[face[k]]])
+        solid[k] = (
+            self.textures(surface[k], uv, np.zeros(len(k), np.int64))[1]
+            >= (self.cutoff[surface[k]])
+        )
+        return solid
+
 
 class Tracer:
     """Finds the first face of a mesh along rays, with Embree.
@@ -100,25 +115,49 @@ class Tracer:
     Args:
         vertices: ``[V, 3]``.
         faces: ``[F, 3]``.
+        solid: tells for faces ``[N]`` and barycentric weights ``[N, 3]`` which points stop a ray;
+            None: all.
     """
 
-    def __init__(self, vertices: Array, faces: NDArray[Any]) -> None:
+    def __init__(
+        self,
+        vertices: Array,
+        faces: NDArray[Any],
+        solid: Callable[[Ints, Floats], Bools] | None = None,
+    ) -> None:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
 
-        self._scene = EmbreeScene()
+        self._scene, self._solid = EmbreeScene(), solid
         self._mesh = TriangleMesh(self._scene, vertices.astype(np.float32), faces.astype(np.int32))
 
     def first(self, origins: Floats, directions: Floats) -> tuple[Ints, Floats]:
         """Face index ``[N]``, -1 for a miss, and barycentric weights ``[N, 3]``."""
-        hit = self._scene.run(origins, directions, query="INTERSECT", output=1)
-        u, v = hit["u"], hit["v"]
-        return hit["primID"].astype(np.int64), np.stack([1 - u - v, u, v], axis=1)
+        face, bary, distance = self._run(origins, directions)
+        if self._solid is None:
+            return face, bary
+        travelled, going = np.zeros(len(face), np.float32), np.arange(len(face))
+        for _ in range(LAYERS):
+            going = going[face[going] >= 0]
+            going = going[~self._solid(face[going], bary[going])]
+            if not len(going):
+                break
+            travelled[going] += distance[going] + np.float32(1e-5)
+            start = origins[going] + travelled[going, None] * directions[going]
+            face[going], bary[going], distance[going] = self._run(start, directions[going])
+        return face, bary
 
     def blocked(self, origins: Floats, directions: Floats) -> Bools:
         """Whether each ray ``[N]`` meets the mesh."""
+        if self._solid is not None:
+            return self.first(origins, directions)[0] >= 0
         hit: NDArray[np.int32] = self._scene.run(origins, directions, query="OCCLUDED")
         return hit >= 0  # 0 for a hit, whatever the face, and -1 for a miss
+
+    def _run(self, origins: Floats, directions: Floats) -> tuple[Ints, Floats, Floats]:
+        hit = self._scene.run(origins, directions, query="INTERSECT", output=1)
+        u, v = hit["u"], hit["v"]
+        return hit["primID"].astype(np.int64), np.stack([1 - u - v, u, v], axis=1), hit["tfar"]
 
 
 class PosedCharacter:
@@ -142,7 +181,8 @@ class PosedCharacter:
     ) -> None:
         self.appearance, self.light, self.wrinkles = appearance, light, wrinkles
         self.vertices, faces = vertices, appearance.faces
-        self.tracer = Tracer(vertices, faces)
+        solid = appearance.coverage if (appearance.cutoff > 0).any() else None
+        self.tracer = Tracer(vertices, faces, solid)
         X, N = vertices.astype(np.float32), normals.astype(np.float32)
         a, b = X[faces[:, 1]] - X[faces[:, 0]], X[faces[:, 2]] - X[faces[:, 0]]
         flat = _unit(np.cross(a, b))
@@ -229,7 +269,7 @@ class PosedCharacter:
         lifted = point - _blend(bary * np.minimum(depth, 0), corners[:, :, 3:6])
         level = looks.density[face] + np.log2(_norm(point - eye)[:, 0] * spacing)
         surface = looks.character.material[face]
-        colour, bump = looks.textures(surface, uv, np.rint(level).astype(np.int64))
+        colour, _, bump = looks.textures(surface, uv, np.rint(level).astype(np.int64))
         if looks.bumpy:
             T = self.tangent[face]
             T = _unit(T - _dot(T, normal) * normal)
