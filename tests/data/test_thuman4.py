@@ -20,7 +20,7 @@ from gsgan.data.formats.smpl_motion import SmplMotion, posed
 from gsgan.data.formats.smplx_rig import read_missing
 from gsgan.data.formats.thuman4 import Thuman4Reader
 from gsgan.data.layout import Layout
-from gsgan.data.pixels import read_mask, unsure_pixels
+from gsgan.data.pixels import read_mask, read_unsure
 from gsgan.data.validation import Thresholds
 from gsgan.skeleton.smpl import to_mediapipe33
 from gsgan.utils.errors import ConfigError
@@ -147,12 +147,14 @@ def test_listed_files_are_left_out(
     assert "every image in the folders is used" in read(root, smplx_file).notes[0]
 
 
-def test_a_lens_is_not_applied(
+def test_a_lens_is_not_applied_but_noted(
     tmp_path: Path, smplx_subject: SmplxSubject, smplx_file: Path
 ) -> None:
     root = write_thuman4(tmp_path / "s", smplx_subject, distCoeff=[0.1, 0, 0, 0, 0])
     layout = read(root, smplx_file)
     assert not any(camera.distorted for camera in layout.cameras.values())
+    assert any("gives 3 cameras lens distortion" in note for note in layout.notes)
+    assert read(root, smplx_file, undistort=True).cameras["cam00"].dist[0] == 0.1
 
 
 def test_frames_without_finite_parameters_are_dropped_and_named(
@@ -176,7 +178,7 @@ def test_the_config_reads_it_in_worker_processes(written: Path, smplx_file: Path
     config = compose(
         "train", "data=thuman4", f"data.root={written}", f"data.smpl={smplx_file}",
         "data.size=16", "data.workers=1", "data.test_cameras=[cam02]", "data.test_frames=3",
-        "data.reader.ignore_band=5",
+        "data.reader.ignore_alpha=[5,250]",
     )  # fmt: skip
     data = instantiate(config.data)
     batch = next(iter(data.train_dataloader()))
@@ -199,20 +201,22 @@ def test_an_alpha_of_exactly_the_threshold_is_the_person(root: Path, smplx_file:
 
 
 def test_the_unsure_band_is_an_option(root: Path, smplx_file: Path) -> None:
-    """A half plane with a grey strip: the outline's 5 x 5 band."""
+    """A half plane with a grey strip: the outline's 5 x 5 band, and alphas in between."""
     alpha = np.zeros((44, 52), np.uint8)
     alpha[:, 24:], alpha[:, :8] = 255, 100
     write_picture(root / "masks/cam00/00000000.jpg", alpha)
 
     def unsure(**settings: Any) -> np.ndarray | None:
         layout = read(root, smplx_file, consistency=NO_LOOK, **settings)
-        mask = read_mask(layout.mask_files("cam00", 0), layout.pixels)
-        return unsure_pixels(mask, layout.pixels.unsure_band)
+        files = layout.mask_files("cam00", 0)
+        return read_unsure(files, read_mask(files, layout.pixels), layout.pixels)
 
     assert unsure() is None
-    band = unsure(ignore_band=5)
+    band, both = unsure(ignore_band=5), unsure(ignore_band=5, ignore_alpha=(5, 250))
     assert band is not None
+    assert both is not None
     assert np.flatnonzero(band[20]).tolist() == [22, 23, 24, 25]
+    assert np.flatnonzero(both[20]).tolist() == [*range(8), 22, 23, 24, 25]
     layout = read(root, smplx_file, consistency=NO_LOOK, ignore_band=5)
     frame = CaptureDataset(layout, [("cam00", 0)], size=26)[0]
     assert frame.unsure is not None
@@ -224,6 +228,13 @@ def test_the_unsure_band_is_an_option(root: Path, smplx_file: Path) -> None:
     )
 
 
-def test_settings_out_of_range() -> None:
-    with pytest.raises(ConfigError, match="ignore_band must be a whole number of at least 0"):
-        Thuman4Reader(ignore_band=-1)
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"ignore_band": -1}, "ignore_band must be a whole number of at least 0"),
+        ({"ignore_alpha": (250, 5)}, "two rising alphas"),
+    ],
+)
+def test_settings_out_of_range(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        Thuman4Reader(**settings)

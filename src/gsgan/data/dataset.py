@@ -193,8 +193,9 @@ class CaptureDataset(Dataset[Frame]):
         def fit(image: Bytes, exact: bool) -> Bytes:
             return cropping.resize(cropping.take(image, window, mapping, exact), size, exact)
 
-        mask = pixels.read_mask(self.layout.mask_files(*item), rules)
-        unsure = pixels.unsure_pixels(mask, rules.unsure_band)
+        mask_files = self.layout.mask_files(*item)
+        mask = pixels.read_mask(mask_files, rules)
+        unsure = pixels.read_unsure(mask_files, mask, rules)
         image = read_colour(self.layout.image_path(*item))
         self._check_size(self.layout.image_path(*item), image, camera)
         self._check_size(self.layout.mask_path(*item), mask, camera)

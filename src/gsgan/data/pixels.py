@@ -54,6 +54,7 @@ class PixelRules:
         ignore_band: pixels of the stored image, side of the square by which the mask is dilated
             and eroded; labels in the band between become "ignore". 0 leaves it out.
         unsure_band: the same for colours: pixels in that band are left out of the loss.
+        unsure_alpha: pixels of an alpha strictly between these two are too; None leaves out none.
     """
 
     composed: bool = False
@@ -62,6 +63,7 @@ class PixelRules:
     label_table: tuple[int, ...] | None = None
     ignore_band: int = 0
     unsure_band: int = 0
+    unsure_alpha: tuple[int, int] | None = None
 
 
 def read_mask(files: Sequence[tuple[str, Path]], rules: PixelRules) -> Bytes:
@@ -142,6 +144,20 @@ def outline(mask: Bytes, band: int) -> NDArray[np.bool_]:
     return np.asarray(cv2.dilate(person, kernel) != cv2.erode(person, kernel))
 
 
-def unsure_pixels(mask: Bytes, band: int) -> Bytes | None:
-    """``[H, W]`` 255 in the `outline` of the mask ``[H, W]``, left out of the loss; None if 0."""
-    return None if band == 0 else outline(mask, band).astype(np.uint8) * np.uint8(255)
+def read_unsure(files: Sequence[tuple[str, Path]], mask: Bytes, rules: PixelRules) -> Bytes | None:
+    """``[H, W]`` 255 at pixels that are left out of the loss, or None without such a rule.
+
+    Args:
+        files: (rule, path) of the masks, decoded again when the rules use alphas.
+        mask: ``[H, W]`` 0..255, the result of `read_mask`.
+        rules: of the dataset.
+    """
+    if rules.unsure_band == 0 and rules.unsure_alpha is None:
+        return None
+    unsure = outline(mask, rules.unsure_band)
+    if rules.unsure_alpha is not None:
+        low, high = rules.unsure_alpha
+        for _, path in files:
+            alpha = read_grey(path)
+            unsure |= (alpha > low) & (alpha < high)
+    return np.where(unsure, np.uint8(255), np.uint8(0))

@@ -8,7 +8,7 @@ flat hand (``use_pca=False, flat_hand_mean=True`` in smplx's terms).
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, ClassVar
 
@@ -33,7 +33,7 @@ from gsgan.data.skeletons import make_landmarks
 from gsgan.data.validation import Thresholds, spans
 from gsgan.utils.arrays import as_floats
 from gsgan.utils.checks import whole
-from gsgan.utils.errors import DataError
+from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.pickles import read_npz
 
 Files = dict[str, dict[int, str]]
@@ -61,6 +61,8 @@ class SmplxRigReader(FolderReader):
 
     threshold: int = 128
     ignore_band: int = 0
+    ignore_alpha: tuple[int, int] | None = None
+    undistort: bool = False
     fps: float | None = 30.0
 
     layout: ClassVar[str]
@@ -78,7 +80,13 @@ class SmplxRigReader(FolderReader):
     )
 
     def __post_init__(self) -> None:
+        alpha = self.ignore_alpha
         whole("data.reader.ignore_band", self.ignore_band, 0)
+        if alpha is not None and not (len(alpha) == 2 and 0 <= alpha[0] < alpha[1] <= 255):
+            raise ConfigError(
+                "data.reader.ignore_alpha must be null or two rising alphas of 0 to 255 such as "
+                f"[5, 250], got {list(alpha)}"
+            )
 
     def find(self, root: Path, limits: Thresholds, smpl: str | None) -> Found:
         """The subject's files, each checked separately.
@@ -86,7 +94,7 @@ class SmplxRigReader(FolderReader):
         Raises:
             DataError: for whatever is missing or damaged, naming the file.
         """
-        notes: list[str] = []
+        alpha, notes = self.ignore_alpha, list[str]()
         for name in (self.calibration, PARAMETERS):
             if not (root / name).is_file():
                 raise DataError(
@@ -98,7 +106,7 @@ class SmplxRigReader(FolderReader):
         images = _index(root, entries, self.images, "images")
         masks = _index(root, entries, self.masks, "masks")
         _leave_out(images, root / MISSING, self.lists_missing, notes)
-        cameras = self._cameras(root, path, entries, images, limits)
+        cameras = self._cameras(root, path, entries, images, limits, notes)
         frames = {f for files in images.values() for f in files}
         motion = read_motion(root / PARAMETERS, frames, model, notes)
         row = {int(f): i for i, f in enumerate(motion.ids)}
@@ -118,7 +126,11 @@ class SmplxRigReader(FolderReader):
             mask_folder=self.masks,
             landmarks=make_landmarks(motion.ids, p, conf, limits.max_reach, notes, PARAMETERS),
             poses=motion.poses(PARAMETERS),
-            pixels=PixelRules(threshold=self.threshold, unsure_band=self.ignore_band),
+            pixels=PixelRules(
+                threshold=self.threshold,
+                unsure_band=self.ignore_band,
+                unsure_alpha=None if alpha is None else (alpha[0], alpha[1]),
+            ),
             calibration=path,
             unit_hint=f"T in {path} and transl in {root / PARAMETERS} must be in metres",
             points=lambda frame: posed(model, motion.rows([row[frame]]))[0][0],
@@ -132,6 +144,7 @@ class SmplxRigReader(FolderReader):
         entries: Mapping[str, Any],
         images: Files,
         limits: Thresholds,
+        notes: list[str],
     ) -> dict[str, CameraEntry]:
         """The cameras in the calibration's order."""
         cameras = {}
@@ -146,10 +159,18 @@ class SmplxRigReader(FolderReader):
                 K=numbers(where, entry["K"], "K", (9,)).reshape(3, 3),
                 R=numbers(where, entry["R"], "R", (9,)).reshape(3, 3),
                 t=entry["T"],
-                dist=None,  # the released images are rectified
+                dist=entry.get("distCoeff"),
                 size=image_size(root, images[name]),
                 pixel_centre=self.pixel_centre,
                 rotation_tolerance=limits.rotation_tolerance,
+            )
+        bent = [name for name, camera in cameras.items() if camera.distorted]
+        if bent and not self.undistort:
+            cameras = {name: replace(c, dist=np.zeros(8)) for name, c in cameras.items()}
+            notes.append(
+                f"{path} gives {len(bent)} cameras lens distortion ({bent[0]}, ...), which is not "
+                "applied, since the released images are rectified; if yours are not, set "
+                "data.reader.undistort=true"
             )
         return cameras
 
