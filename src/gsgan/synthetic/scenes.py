@@ -82,10 +82,6 @@ def ensure_synthetic(
     return root
 
 
-ensure_scene = ensure_synthetic
-"""The name under which config files request the synthetic person."""
-
-
 def _is_complete(root: Path) -> bool:
     return (root / "meta.json").is_file()
 
