@@ -166,9 +166,9 @@ def test_a_fitting_body_lies_in_its_mask_and_a_shifted_one_leaves_it(body):
 
 def synthetic_frame():
     from gsgan.data.datamodule import GsganData
-    from gsgan.synthetic.scenes import ensure_synthetic
+    from gsgan.synthetic.scenes import ensure_scene
 
-    root = ensure_synthetic(
+    root = ensure_scene(
         avatar="free_body", size=64, train_cameras=2, test_cameras=0, frames=2, test_frames=0,
         rays_per_pixel=1, workers=1, progress=False,
     )  # fmt: skip

@@ -12,7 +12,7 @@ from gsgan.data.crop import distort
 from gsgan.data.datamodule import GsganData
 from gsgan.synthetic.camera import undistort
 from gsgan.synthetic.scene_setup import Scene, SceneSettings, dataset_key
-from gsgan.synthetic.scenes import ensure_synthetic
+from gsgan.synthetic.scenes import ensure_scene
 from gsgan.synthetic.tint import Tint, make_tints
 from gsgan.utils.errors import ConfigError
 
@@ -36,7 +36,7 @@ def scene(tmp_path_factory):
     cache = tmp_path_factory.mktemp("cache")
 
     def run(**options):
-        return ensure_synthetic(cache=cache, workers=1, progress=False, **TINY, **options)
+        return ensure_scene(cache=cache, workers=1, progress=False, **TINY, **options)
 
     return run
 
