@@ -303,9 +303,10 @@ def test_key_depends_on_every_parameter():
     assert base == dataset_key(SceneSettings())
 
 
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(DataError, match=r"data.source.avatar: mine.glb does not exist"):
-        tiny(tmp_path, avatar="mine.glb")
+@pytest.mark.parametrize("parameters", [{"avatar": "mine.glb"}, {"motion": "mine.bvh"}])
+def test_a_missing_file_is_named(parameters, tmp_path):
+    with pytest.raises(DataError, match=r"data.source.*mine.* does not exist"):
+        tiny(tmp_path, **parameters)
 
 
 @pytest.mark.parametrize(
@@ -318,12 +319,12 @@ def test_a_missing_file_is_named(tmp_path):
         ({"lens": [0.1, 0.2]}, "lens must list 4 or 5 or 8"),
         ({"lens": -0.2}, "lens must be"),
         ({"lens": [0.1, float("nan"), 0, 0]}, "lens must be"),
-        ({"tint": -0.1}, "tint must be a number from 0.0 to 0.3"),
-        ({"gloss": 2}, "gloss must be a number from 0.0 to 1.0"),
+        ({"tint": -0.1}, "tint must be a number from 0 to 0.3"),
+        ({"gloss": 2}, "gloss must be a number from 0 to 1"),
         ({"test_scale": [9]}, "test_scale must be"),
         ({"test_scale": [2], "test_cameras": 0}, "set test_cameras"),
         ({"avatar": "nobody"}, "avatar must be blouse, polo, free_body or the path"),
-        ({"motion": "waltz"}, "motion must be one of choreography, signs"),
+        ({"motion": "waltz"}, "motion must be choreography, signs or the path of a .bvh"),
         ({"secondary": "some"}, "secondary must be one of True, False"),
     ],
 )

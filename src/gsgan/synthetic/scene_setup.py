@@ -18,13 +18,14 @@ from numpy.typing import NDArray
 from gsgan.body.free import free_body
 from gsgan.data.cameras import DISTORTION_LENGTHS
 from gsgan.motion.character import Character
+from gsgan.synthetic.bvh_motion import BvhMotion
 from gsgan.synthetic.camera import SceneCamera, look_at, through_lens, zoomed
 from gsgan.synthetic.choreography import EVERYDAY, held_out
 from gsgan.synthetic.controls import frame_times
 from gsgan.synthetic.free_subject import free_character, free_pose
 from gsgan.synthetic.gltf import avatar_names, avatar_path, read_character
 from gsgan.synthetic.posing import Choreography
-from gsgan.synthetic.secondary import Secondary
+from gsgan.synthetic.secondary import Moving, Secondary
 from gsgan.synthetic.signs import SIGNS, split_signs
 from gsgan.synthetic.tint import make_tints
 from gsgan.synthetic.trace import Appearance, Light, PosedCharacter, Wrinkles
@@ -94,7 +95,10 @@ class SceneSettings:
             self.avatar in named or str(self.avatar).endswith(".glb"),
             f"avatar must be {', '.join(named)} or the path of a rigged .glb, got {self.avatar!r}",
         )
-        one_of("data.source.motion", self.motion, tuple(PROGRAMMES))
+        _require(
+            self.motion in tuple(PROGRAMMES) or str(self.motion).endswith(".bvh"),
+            f"motion must be {', '.join(PROGRAMMES)} or the path of a .bvh, got {self.motion!r}",
+        )
         one_of("data.source.secondary", self.secondary, (True, False))
         _require(
             self.test_frames < self.frames,
@@ -124,17 +128,18 @@ def _require(holds: bool, message: str) -> None:
 def dataset_key(settings: SceneSettings) -> str:
     """Name of a dataset in the cache: its main parameters and a hash of all of them.
 
-    The avatar's file counts by its content, not by its path.
+    Files count by their content, not by their path.
 
     Raises:
-        DataError: when the file does not exist.
+        DataError: when a file does not exist.
     """
     parameters = asdict(settings)
-    if settings.avatar not in (*AVATARS, FREE_BODY):
-        path = Path(settings.avatar).expanduser()
-        if not path.is_file():
-            raise DataError(f"data.source.avatar: {path} does not exist")
-        parameters["avatar"] = hashlib.sha256(path.read_bytes()).hexdigest()
+    for name in ("avatar", "motion"):
+        if parameters[name] not in (*AVATARS, FREE_BODY, *PROGRAMMES):
+            path = Path(parameters[name]).expanduser()
+            if not path.is_file():
+                raise DataError(f"data.source.{name}: {path} does not exist")
+            parameters[name] = hashlib.sha256(path.read_bytes()).hexdigest()
     content = repr((VERSION, sorted(parameters.items())))
     digest = hashlib.sha256(content.encode()).hexdigest()[:12]
     effects = [name for name in ("lens", "tint", "gloss", "test_scale") if getattr(settings, name)]
@@ -163,14 +168,18 @@ class Scene:
 
     Raises:
         ConfigError: when a lens cannot be inverted up to the images' corners.
-        DataError: when the avatar's file cannot be used.
+        DataError: when the avatar's or the motion's file cannot be used.
     """
 
     def __init__(self, settings: SceneSettings) -> None:
         self.settings, self.light = settings, Light(gloss=settings.gloss or 0.0)
         self.character = character = load_character(settings.avatar)
         self.appearance = Appearance(character)
-        self.source = Choreography(character, settings.seed, PROGRAMMES[settings.motion])
+        self.source: Moving = (
+            Choreography(character, settings.seed, PROGRAMMES[settings.motion])
+            if settings.motion in PROGRAMMES
+            else BvhMotion(character, Path(settings.motion).expanduser(), settings.seed)
+        )
         times = frame_times(settings.frames, self.source.duration)
         self.motion = self.source.at(times)
         self.secondary = Secondary(character, self.source) if settings.secondary else None
@@ -237,7 +246,7 @@ class Scene:
 
 def extent(
     character: Character,
-    source: Choreography,
+    source: Moving,
     samples: int = 160,
     stride: int = 24,
     upper: bool = False,

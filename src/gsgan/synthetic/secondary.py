@@ -8,14 +8,15 @@ Convention: metres, seconds, world frame, Z up.
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import bilinear, lfilter
 from scipy.sparse import coo_array, csr_array
 
-from gsgan.motion.character import Character
+from gsgan.motion.character import Animation, Character
 from gsgan.motion.rotations import unit
-from gsgan.synthetic.posing import Choreography
 from gsgan.synthetic.trace import Wrinkles
 
 Array = NDArray[np.float64]
@@ -60,10 +61,18 @@ SLOPE, STIFFNESS = 0.8, 1.5  # of the deepest folds, and how soon they appear
 FLANK = 0.05  # metres from a limb's axis at which folds are fully one-sided
 
 
+class Moving(Protocol):
+    """A motion with poses at any times ``[F]``, in seconds from 0 to ``duration``."""
+
+    duration: float
+
+    def at(self, times: Array) -> Animation: ...
+
+
 class Secondary:
     """Offsets of the skinned vertices and normals of a character in motion."""
 
-    def __init__(self, character: Character, motion: Choreography) -> None:
+    def __init__(self, character: Character, motion: Moving) -> None:
         self.character = character
         # vertices that a seam of the texture duplicates move as one
         _, first, self._weld = np.unique(
@@ -155,7 +164,7 @@ class Secondary:
             loose += share * of_label * carried * far * far * (3 - 2 * far)
         return loose
 
-    def _springs(self, motion: Choreography) -> tuple[Array, Array]:
+    def _springs(self, motion: Moving) -> tuple[Array, Array]:
         """Times ``[T]`` and the sway ``[T, J, 3]`` of what hangs on each bone.
 
         A damped spring holds a mass at the middle of the bone's loose vertices.
