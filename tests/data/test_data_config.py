@@ -50,7 +50,7 @@ def test_synthetic_config_reads_what_the_generator_would_make(capture: Path) -> 
     from gsgan.synthetic.scene_setup import SceneSettings
 
     data = instantiate(conf("synthetic", "size=48", "source.frames=12", "source.test_frames=3"))
-    assert data.source.func.__name__ == "ensure_synthetic"
+    assert data.source.func.__name__ == "ensure_scene"
     given = dict(data.source.keywords)
     assert given.pop("workers") == 2
     assert SceneSettings(**given) == SceneSettings(size=48, frames=12, test_frames=3)

@@ -143,8 +143,6 @@ def test_listed_files_are_left_out(
     assert (2 in layout.images["cam01"], 3 in layout.images["cam02"]) == (False, False)
     assert "3 images named in" in layout.notes[0]
     assert "2 of them with a file" in layout.notes[0]
-    (root / "missing_img_files.txt").unlink()
-    assert "every image in the folders is used" in read(root, smplx_file).notes[0]
 
 
 def test_a_lens_is_not_applied_but_noted(

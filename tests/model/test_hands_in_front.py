@@ -9,7 +9,7 @@ import torch
 from gsgan.body import open_body
 from gsgan.data.datamodule import GsganData
 from gsgan.model.segmentation import HANDS, Segmentation
-from gsgan.synthetic import ensure_synthetic
+from gsgan.synthetic import ensure_scene
 from gsgan.synthetic.camera import pixel_rays
 from gsgan.synthetic.scene_setup import Scene, SceneSettings
 from gsgan.synthetic.trace import Tracer
@@ -43,7 +43,7 @@ def overlaps(scene: Scene, camera: str, frame: int) -> torch.Tensor:
 @pytest.mark.slow
 def test_the_hand_in_front_is_in_front(tmp_path):
     """With the exact body; docs/sign_language.md has the default person with a fitted one."""
-    root = ensure_synthetic(cache=tmp_path, workers=1, progress=False, **SCENE)
+    root = ensure_scene(cache=tmp_path, workers=1, progress=False, **SCENE)
     scene, data = Scene(SceneSettings(**SCENE)), GsganData(str(root), size=SIZE)
     dataset = data.dataset("train")
     body = open_body("free", label_names=data.info.label_names)

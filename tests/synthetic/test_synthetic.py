@@ -16,7 +16,7 @@ import torch
 from gsgan.body.free import free_body
 from gsgan.data.datamodule import GsganData
 from gsgan.scene import BodyPose
-from gsgan.synthetic import ensure_synthetic, scenes
+from gsgan.synthetic import ensure_scene, scenes
 from gsgan.synthetic.free_subject import free_pose
 from gsgan.synthetic.scene_setup import Scene, SceneSettings, dataset_key
 from gsgan.synthetic.trace import PosedCharacter
@@ -38,7 +38,7 @@ TINY = {
 
 
 def tiny(cache, **parameters):
-    return ensure_synthetic(cache=cache, progress=False, **{"workers": 1, **TINY, **parameters})
+    return ensure_scene(cache=cache, progress=False, **{"workers": 1, **TINY, **parameters})
 
 
 @pytest.fixture(scope="module")
@@ -263,8 +263,8 @@ def test_unwritable_folder_is_reported(tmp_path):
 @pytest.mark.slow
 def test_two_processes_at_once(tmp_path):
     code = (
-        "from pathlib import Path; from gsgan.synthetic import ensure_synthetic;"
-        f"print(ensure_synthetic(cache=Path({str(tmp_path)!r}), workers=1, progress=False,"
+        "from pathlib import Path; from gsgan.synthetic import ensure_scene;"
+        f"print(ensure_scene(cache=Path({str(tmp_path)!r}), workers=1, progress=False,"
         f" **{TINY!r}))"
     )
     processes = [
@@ -330,5 +330,5 @@ def test_a_missing_file_is_named(parameters, tmp_path):
 )
 def test_parameters_out_of_range_are_refused(parameters, message, tmp_path):
     with pytest.raises(ConfigError, match=message):
-        ensure_synthetic(cache=tmp_path, **parameters)
+        ensure_scene(cache=tmp_path, **parameters)
     assert not list(tmp_path.iterdir())

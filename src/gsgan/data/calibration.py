@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from gsgan.data.cameras import CameraEntry, make_camera, numbers
 from gsgan.data.files import read_json
-from gsgan.data.validation import Thresholds
 from gsgan.utils.arrays import as_floats
 from gsgan.utils.errors import DataError
 
@@ -162,7 +161,6 @@ def read_cameras(
     path: Path,
     content: Mapping[str, Any],
     conventions: Conventions,
-    rotation_tolerance: float = Thresholds.rotation_tolerance,
 ) -> dict[str, CameraEntry]:
     """The cameras of cameras.json by name, in metres, pixel centres moved to +0.5.
 
@@ -191,7 +189,6 @@ def read_cameras(
             size=(int(height), int(width)),
             scale=conventions.scale,
             pixel_centre=conventions.pixel_centre,
-            rotation_tolerance=rotation_tolerance,
         )
     return cameras
 

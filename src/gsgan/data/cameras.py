@@ -19,6 +19,7 @@ from gsgan.utils.errors import DataError
 Float = NDArray[np.float64]
 
 DISTORTION_LENGTHS = (4, 5, 8)
+ROTATION_TOLERANCE = 1e-3  # largest entry of R Rᵀ - I
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,6 @@ def make_camera(
     size: tuple[int, int],
     scale: float = 1.0,
     pixel_centre: float = 0.5,
-    rotation_tolerance: float = 1e-3,
 ) -> CameraEntry:
     """A camera from raw calibration values (lists, columns, arrays), checked and converted.
 
@@ -107,7 +107,6 @@ def make_camera(
         size: ``(H, W)`` pixels.
         scale: metres in one unit of the file.
         pixel_centre: the centre of the first pixel in the file's K, 0 or 0.5.
-        rotation_tolerance: largest entry of ``R Rᵀ - I`` allowed.
 
     Raises:
         DataError: naming the camera and the problem.
@@ -124,10 +123,10 @@ def make_camera(
     K[:2, 2] += 0.5 - pixel_centre
     R = numbers(where, R, "R", (3, 3))
     error = np.abs(R @ R.T - np.eye(3)).max()
-    if error > rotation_tolerance:
+    if error > ROTATION_TOLERANCE:
         raise DataError(
             f"{where}: R is not a rotation, R Rᵀ differs from the identity by {error:.3g} "
-            f"(allowed {rotation_tolerance:g})"
+            f"(allowed {ROTATION_TOLERANCE:g})"
         )
     if np.linalg.det(R) < 0:
         raise DataError(f"{where}: R mirrors; expected a rotation, world to OpenCV camera axes")

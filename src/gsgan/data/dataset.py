@@ -226,7 +226,7 @@ class CaptureDataset(Dataset[Frame]):
         if path is None:
             return np.full(camera.size, IGNORE_LABEL, np.uint8)
         meta, rules = self.layout.meta, self.layout.pixels
-        labels = pixels.read_labels(path, rules, meta.label_names, meta.labels_named_by)
+        labels = pixels.read_labels(path, rules, meta.label_names)
         self._check_size(path, labels, camera)
         return labels
 

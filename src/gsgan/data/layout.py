@@ -60,7 +60,6 @@ class Meta:
         skeleton: name of the landmark set.
         skeleton_source: origin of the landmarks, e.g. "smpl24 -> mediapipe33".
         label_names: names of the part numbers, background first, or None.
-        labels_named_by: the source of those names, for messages.
         splits: train_cameras, test_cameras, train_frames, test_frames of the dataset itself,
             unchecked.
         layout: name of the format.
@@ -73,7 +72,6 @@ class Meta:
     skeleton_source: str = "mediapipe33"
     body: BodyModel | None = None
     label_names: tuple[str, ...] | None = None
-    labels_named_by: str = "meta.json"
     splits: Mapping[str, Any] = field(default_factory=dict)
     layout: str = "bring-your-own"
 
@@ -192,10 +190,7 @@ def assemble(found: Found, limits: Thresholds) -> Layout:
         c: {f: p for f, p in found.labels.get(c, {}).items() if f in files}
         for c, files in images.items()
     }
-    labelled, count = (sum(len(files) for files in x.values()) for x in (labels, images))
-    labels = labels if labelled else {}
-    if 0 < labelled < count:
-        notes.append(f"{count - labelled} of {count} images have no labels, they count as 'ignore'")
+    labels = labels if any(labels.values()) else {}
     check_images(root, cameras, images, masks, labels, limits.header_stride, calibration)
     kept = {one.name: getattr(found, one.name) for one in fields(_Contents)}
     kept |= {"images": images, "masks": masks, "labels": labels, "notes": tuple(notes)}

@@ -102,16 +102,13 @@ def _one_mask(rule: str, path: Path, rules: PixelRules) -> Bytes:
     return np.asarray(cv2.threshold(values, least - 1, 255, cv2.THRESH_BINARY)[1], np.uint8)
 
 
-def read_labels(
-    path: Path, rules: PixelRules, names: Sequence[str] | None, named_by: str = "meta.json"
-) -> Bytes:
+def read_labels(path: Path, rules: PixelRules, names: Sequence[str] | None) -> Bytes:
     """``[H, W]`` part numbers, mapped by the rules' table; 255 is "ignore".
 
     Args:
         path: the label image.
         rules: of the dataset.
         names: the parts, background first; None if unknown.
-        named_by: the source of the names, for the message.
 
     Raises:
         DataError: when the file is damaged or holds a part that has no name.
@@ -123,7 +120,7 @@ def read_labels(
         highest = int(labels.max(where=labels != IGNORE_LABEL, initial=0))
         if highest >= len(names):
             raise DataError(
-                f"{path} holds the label {highest}; {named_by} names {len(names)} labels, "
+                f"{path} holds the label {highest}; the dataset names {len(names)} labels, "
                 f"so expected 0 to {len(names) - 1}, or {IGNORE_LABEL} for 'ignore'"
             )
     return labels

@@ -28,7 +28,6 @@ class Thresholds:
     min_hubs: int = 3  # the same of shoulders and hips; both shoulders are enough
     min_joints_in_view: int = 4  # a camera that sees fewer joints of a frame does not use it
     max_reach: float = 3.0  # metres from the median joint; one further out counts as missing
-    rotation_tolerance: float = 1e-3  # largest entry of R Rᵀ - I
     # metres, minimum and maximum median distance from the cameras to the person
     distance: tuple[float, float] = (0.3, 30.0)
     max_behind: float = 0.05  # share of joints behind a camera above which its pose is wrong
@@ -61,14 +60,6 @@ def drop_frames(
         raise DataError(
             f"{root} ({landmarks.source}) has no usable frame: "
             + "; ".join(f"{len(ids)} {reason}" for reason, ids in dropped.items())
-        )
-    if unseen := len(set(landmarks.p) - set(frames)):
-        notes.append(f"{unseen} frames in {landmarks.source} have no image and are not used")
-    uneven = [f"{name} {len(files)}" for name, files in images.items() if len(files) < len(frames)]
-    if uneven:
-        notes.append(
-            f"cameras with fewer than the {len(frames)} frames of all together: "
-            f"{', '.join(uneven)} (matched by frame number)"
         )
     return {name: {f: files[f] for f in files if f not in gone} for name, files in images.items()}
 

@@ -1,5 +1,5 @@
 """The default person: a rigged character, ray-traced from a ring of cameras on first use."""
 
-from gsgan.synthetic.scenes import ensure_synthetic
+from gsgan.synthetic.scenes import ensure_scene
 
-__all__ = ["ensure_synthetic"]
+__all__ = ["ensure_scene"]

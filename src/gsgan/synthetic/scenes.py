@@ -41,7 +41,7 @@ POLL_SECONDS = 0.05
 WORKER = "from gsgan.synthetic.scenes import trace_share; trace_share()"
 
 
-def ensure_synthetic(
+def ensure_scene(
     *, cache: Path | None = None, workers: int = 2, progress: bool = True, **parameters: Any
 ) -> Path:
     """The synthetic dataset with these parameters: found in the cache, or made there.
@@ -80,10 +80,6 @@ def ensure_synthetic(
                 f"that you may write to"
             ) from error
     return root
-
-
-ensure_scene = ensure_synthetic
-"""The name under which config files request the synthetic person."""
 
 
 def _is_complete(root: Path) -> bool:

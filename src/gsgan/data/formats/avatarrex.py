@@ -23,4 +23,3 @@ class AvatarrexReader(SmplxRigReader):
     calibration: ClassVar[str] = "calibration_full.json"
     images: ClassVar[str] = "{camera}"
     masks: ClassVar[str] = "{camera}/mask/pha"
-    lists_missing: ClassVar[bool] = False

@@ -102,9 +102,7 @@ def _find(root: Path, limits: Thresholds, smpl: str | None, reader: CaptureReade
     conventions = read_conventions(meta_path, meta_json)
     if conventions.scale != 1.0:
         notes.append(f"lengths converted from {meta.unit} to metres")
-    cameras = read_cameras(
-        root / "cameras.json", cameras_json, conventions, limits.rotation_tolerance
-    )
+    cameras = read_cameras(root / "cameras.json", cameras_json, conventions)
     images = _index_images(root, cameras)
     joints = SKELETONS[meta.skeleton]
     skeletons = _read_landmarks(root / LANDMARKS, joints, conventions, limits, notes)

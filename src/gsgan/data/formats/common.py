@@ -35,7 +35,6 @@ class FolderReader:
     drop_frames: Any = None
     distance: tuple[float, float] = (0.5, 20.0)
     max_missing_masks: float = 0.05
-    header_stride: int = 20
     pixel_centre: float = 0.0
     consistency: Consistency = field(default_factory=Consistency)
 
@@ -60,7 +59,7 @@ class FolderReader:
             limits,
             distance=(self.distance[0], self.distance[1]),
             max_missing_masks=self.max_missing_masks,
-            header_stride=self.header_stride,
+            header_stride=20,
         )
         found = self.find(folder, limits, smpl)
         return finish(found, limits, self.consistency, self.hint, self.drop_frames)

@@ -85,7 +85,7 @@ class EasymocapReader(FolderReader):
         motion = body = None
         if kind == "smpl":
             file, model = body_model(root / place, smpl, "smpl")
-            motion = zju_motion(people, model, notes)
+            motion = zju_motion(people, model)
             body = BodyModel("smpl", str(file), tuple(motion.betas[0].tolist()))
             ids, (p, conf) = motion.ids, landmarks_of(model, motion)
         else:
@@ -190,13 +190,11 @@ def _read_people(
 ) -> dict[int, tuple[str, Mapping[str, Any]]]:
     """The person's entry, with the file's name for messages, by frame that has images."""
     files = frame_files(root, folder, (".json",))
-    found, seen, crowded = {}, set[int](), list[int]()
+    found, seen = {}, set[int]()
     there = sorted(set(frames) & set(files))
     for frame in there:
         people = _people(root / files[frame])
         seen |= set(people)
-        if len(people) > 1:
-            crowded.append(frame)
         if person in people:
             found[frame] = (f"{root / files[frame]}, person {person}", people[person])
     if not found:
@@ -207,8 +205,6 @@ def _read_people(
         )
     if lacking := [frame for frame in there if frame not in found]:
         notes.append(f"{folder} lacks person {person} at frames {spans(lacking)}")
-    if crowded:
-        notes.append(f"{folder} has more people than person {person} at frames {spans(crowded)}")
     return found
 
 

@@ -18,7 +18,6 @@ from gsgan.utils.errors import DataError
 
 Float = NDArray[np.float64]
 CHUNK = 32  # frames posed at once: bounds memory, nothing else
-SHAPE_TOLERANCE = 1e-4  # spread of a shape coefficient over frames that is not worth a note
 ROOT_TOLERANCE = 1e-6  # radians in poses[:3] that count as none
 ZJU_SIZES = {"poses": (72, 69), "shapes": (10,), "Rh": (3,), "Th": (3,)}  # 69: no root
 
@@ -114,19 +113,16 @@ def _only(model: SkinnedModel, vertices: list[int]) -> SkinnedModel:
     )
 
 
-def zju_motion(
-    entries: Mapping[int, tuple[str, Any]], model: SkinnedModel, notes: list[str]
-) -> SmplMotion:
+def zju_motion(entries: Mapping[int, tuple[str, Any]], model: SkinnedModel) -> SmplMotion:
     """A motion from ZJU-MoCap's parameters, which EasyMocap writes too.
 
     Convention: the files' pose is ``R(Rh) x + Th`` of the body with an unrotated root, about the
-    model's origin (`gsgan.body.smpl.from_zju`); metres.
+    model's origin (`gsgan.body.smpl.from_zju`); metres. The body's shape is the frames' median.
 
     Args:
         entries: by frame, a name for messages and ``poses`` (72, or 69 without the root),
             ``shapes`` (10), ``Rh`` (3), ``Th`` (3).
         model: SMPL.
-        notes: gains a sentence when the shape changes between frames.
 
     Raises:
         DataError: when a parameter is missing, of another length, not finite, or the root turns.
@@ -143,12 +139,6 @@ def zju_motion(
             )
         rows.append(row)
     poses, shapes, Rh, Th = (np.stack(column) for column in zip(*rows, strict=True))
-    spread = float(np.ptp(shapes, axis=0).max(initial=0))
-    if spread > SHAPE_TOLERANCE:
-        notes.append(
-            f"the body's shape changes between frames (by up to {spread:.2g} in a coefficient); "
-            "its median is used"
-        )
     shape = np.median(shapes, axis=0)[: model.shapedirs.shape[-1]]
     J0 = model.rest_joints(torch.from_numpy(shape[None]))[0, 0].numpy()
     theta = poses.reshape(len(rows), -1, 3)

@@ -72,8 +72,6 @@ class SmplxRigReader(FolderReader):
     images: ClassVar[str]
     masks: ClassVar[str]
     """Folder of a camera's files, with ``{camera}``."""
-    lists_missing: ClassVar[bool]
-    """The release always has a missing_img_files.txt."""
     hint: ClassVar[str] = (
         f"check that calibration, {PARAMETERS} and masks are of one subject, and that data.smpl is "
         "the neutral SMPL-X"
@@ -105,8 +103,8 @@ class SmplxRigReader(FolderReader):
         entries = read_json(path)
         images = _index(root, entries, self.images, "images")
         masks = _index(root, entries, self.masks, "masks")
-        _leave_out(images, root / MISSING, self.lists_missing, notes)
-        cameras = self._cameras(root, path, entries, images, limits, notes)
+        _leave_out(images, root / MISSING, notes)
+        cameras = self._cameras(root, path, entries, images, notes)
         frames = {f for files in images.values() for f in files}
         motion = read_motion(root / PARAMETERS, frames, model, notes)
         row = {int(f): i for i, f in enumerate(motion.ids)}
@@ -143,7 +141,6 @@ class SmplxRigReader(FolderReader):
         path: Path,
         entries: Mapping[str, Any],
         images: Files,
-        limits: Thresholds,
         notes: list[str],
     ) -> dict[str, CameraEntry]:
         """The cameras in the calibration's order."""
@@ -162,7 +159,6 @@ class SmplxRigReader(FolderReader):
                 dist=entry.get("distCoeff"),
                 size=image_size(root, images[name]),
                 pixel_centre=self.pixel_centre,
-                rotation_tolerance=limits.rotation_tolerance,
             )
         bent = [name for name, camera in cameras.items() if camera.distorted]
         if bent and not self.undistort:
@@ -186,11 +182,9 @@ def _index(root: Path, cameras: Mapping[str, Any], place: str, kind: str) -> Fil
     return found
 
 
-def _leave_out(images: Files, path: Path, expected: bool, notes: list[str]) -> None:
+def _leave_out(images: Files, path: Path, notes: list[str]) -> None:
     """Removes the images that a missing_img_files.txt names from the index."""
     if not path.is_file():
-        if expected:
-            notes.append(f"{path} does not exist: every image in the folders is used")
         return
     named = read_missing(path, images)
     gone = sum(images[name].pop(frame, None) is not None for name, frame in named)

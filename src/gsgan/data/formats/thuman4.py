@@ -23,4 +23,3 @@ class Thuman4Reader(SmplxRigReader):
     calibration: ClassVar[str] = "calibration.json"
     images: ClassVar[str] = "images/{camera}"
     masks: ClassVar[str] = "masks/{camera}"
-    lists_missing: ClassVar[bool] = True

@@ -69,15 +69,15 @@ class ZjuReader(FolderReader):
         file, model = body_model(root, smpl, "smpl")
         notes = ["lengths of the cameras converted from mm to metres"]
         folders = camera_folders(root, annots)
-        images = _index_images(root, folders, notes)
-        cameras = self._cameras(root, annots, images, limits)
+        images = _index_images(root, folders)
+        cameras = self._cameras(root, annots, images)
         fit = next(((name, at) for name, at in FITS.items() if (root / at).is_dir()), None)
         if fit is None:
             looked = ", ".join(f"{folder}/" for folder in FITS.values())
             raise DataError(f"{root} has no SMPL parameters; expected one of the folders {looked}")
         kind, params = fit
         frames = {f for files in images.values() for f in files}
-        motion = _read_motion(root, params, frames, model, notes)
+        motion = _read_motion(root, params, frames, model)
         masks, labels = _index_masks(root, folders)
         p, conf = landmarks_of(model, motion, kind != UNBLENDED)
         row = {int(f): i for i, f in enumerate(motion.ids)}
@@ -89,7 +89,6 @@ class ZjuReader(FolderReader):
                 skeleton_source="smpl24 -> mediapipe33",
                 body=BodyModel("smpl", str(file), tuple(motion.betas[0].tolist())),
                 label_names=CIHP if labels else None,
-                labels_named_by="CIHP",
                 layout="ZJU-MoCap",
             ),
             cameras=cameras,
@@ -107,9 +106,7 @@ class ZjuReader(FolderReader):
             notes=tuple(notes),
         )
 
-    def _cameras(
-        self, root: Path, annots: Annots, images: Files, limits: Thresholds
-    ) -> dict[str, CameraEntry]:
+    def _cameras(self, root: Path, annots: Annots, images: Files) -> dict[str, CameraEntry]:
         """By name, in the order of annots.npy."""
         some = next(files for files in images.values() if files)
         cameras = {}
@@ -124,7 +121,6 @@ class ZjuReader(FolderReader):
                 size=image_size(root, files or some),
                 scale=MILLIMETRES,
                 pixel_centre=self.pixel_centre,
-                rotation_tolerance=limits.rotation_tolerance,
             )
         length = float(np.median([np.linalg.norm(camera.t) for camera in cameras.values()]))
         low, high = TRANSLATION
@@ -212,20 +208,15 @@ def frame_number(stem: str) -> int | None:
     return frame_of(named[1]) if named else last_number(stem)
 
 
-def _index_images(root: Path, folders: Mapping[str, str], notes: list[str]) -> Files:
+def _index_images(root: Path, folders: Mapping[str, str]) -> Files:
     """The images of each camera by frame number."""
     images = {
         name: frame_files(root, folder, IMAGES, frame_number) for name, folder in folders.items()
     }
-    empty = [name for name, files in images.items() if not files]
-    if len(empty) == len(images):
+    if not any(images.values()):
         raise DataError(
             f"{root}: no camera folder holds images; expected e.g. "
             f"{next(iter(folders.values()))}/000000.jpg"
-        )
-    if empty:
-        notes.append(
-            f"{len(empty)} of {len(images)} cameras have no images here: {', '.join(empty)}"
         )
     return images
 
@@ -250,9 +241,7 @@ def _index_masks(
     return masks, labels if any(labels.values()) else {}
 
 
-def _read_motion(
-    root: Path, folder: str, frames: Iterable[int], model: SkinnedModel, notes: list[str]
-) -> SmplMotion:
+def _read_motion(root: Path, folder: str, frames: Iterable[int], model: SkinnedModel) -> SmplMotion:
     """The parameters of the frames that have any, in the model's own convention."""
     files = frame_files(root, folder, (".npy",))
     ids = sorted(set(frames) & set(files))
@@ -262,4 +251,4 @@ def _read_motion(
             f"{len(files)} files ({', '.join(list(files.values())[:3]) or 'none'})"
         )
     entries = {i: (str(root / files[i]), read_npy(root / files[i])) for i in ids}
-    return zju_motion(entries, model, notes)
+    return zju_motion(entries, model)
