@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -13,14 +16,18 @@ from gsgan.scene import Camera
 from gsgan.splat import rasterise
 from gsgan.utils.images import eight_bits
 
+if TYPE_CHECKING:
+    from gsgan.scene import Frame
+
 Bytes = NDArray[np.uint8]
 
 IMAGE, COLOUR, PARTS, ALPHA = "image", "Step I's colour", "segmentation S", "alpha"
-DEPTH, FEATURE = "depth", "feature channel"
+DEPTH, FEATURE, ERROR = "depth", "feature channel", "error against truth"
+ERROR_SCALE = 4.0  # differences from 1/4 on have the brightest colour
 
 
-def layers(avatar: Avatar) -> tuple[str, ...]:
-    """The layers of an avatar."""
+def layers(avatar: Avatar, truth: bool) -> tuple[str, ...]:
+    """The layers of an avatar, with the error if there is a ground truth."""
     names = [IMAGE, ALPHA]
     if avatar.splats is not None:
         names += [COLOUR, DEPTH]
@@ -28,7 +35,7 @@ def layers(avatar: Avatar) -> tuple[str, ...]:
         names.append(FEATURE)
     if avatar.segmentation is not None:
         names.append(PARTS)
-    return tuple(names)
+    return (*names, *[ERROR] * truth)
 
 
 def shown(
@@ -38,6 +45,7 @@ def shown(
     avatar: Avatar,
     behind: Tensor,
     channel: int = 0,
+    truth: Frame | None = None,
 ) -> Bytes:
     """``[H, W, 3]`` one layer of a rendering.
 
@@ -48,11 +56,15 @@ def shown(
         avatar: that was rendered.
         behind: ``[3, H, W]`` the background.
         channel: of F, for the feature layer; its values are stretched to the colour map's range.
+        truth: the frame with the ground truth, for the error layer.
     """
     assert rendering.image is not None and rendering.alpha is not None  # noqa: PT018
     image, alpha = rendering.image[0].cpu(), rendering.alpha[0].cpu()
     if layer == ALPHA:
         return _grey(alpha[0])
+    if layer == ERROR and truth is not None:
+        error = (image.clamp(0, 1) - truth.image[0]).abs().mean(dim=0)
+        return _coloured(error * ERROR_SCALE)
     if layer == PARTS and rendering.segmentation is not None:
         return _parts(rendering.segmentation[0].cpu())
     if layer == COLOUR and rendering.features is not None and rendering.splat_alpha is not None:
@@ -99,3 +111,16 @@ def _coloured(x: Tensor) -> Bytes:
     import matplotlib
 
     return np.asarray(matplotlib.colormaps["turbo"](x.clamp(0, 1).numpy(), bytes=True)[..., :3])
+
+
+def fitted(image: Bytes, aspect: float) -> Bytes:
+    """The image, padded with black until its width is ``aspect`` times its height."""
+    height, width = image.shape[:2]
+    want: Sequence[int] = (
+        (height, round(height * aspect))
+        if aspect * height >= width
+        else (round(width / aspect), width)
+    )
+    room = [(b - a) // 2 for a, b in zip((height, width), want, strict=True)]
+    sides = [(r, b - a - r) for r, a, b in zip(room, (height, width), want, strict=True)]
+    return np.pad(image, (*sides, (0, 0)))

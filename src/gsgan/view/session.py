@@ -24,7 +24,7 @@ from gsgan.utils.errors import GsganError
 from gsgan.utils.images import eight_bits
 from gsgan.utils.provenance import png_bytes
 from gsgan.view.drag import NAMES, dragged, position
-from gsgan.view.layers import IMAGE, layers, shown
+from gsgan.view.layers import ERROR, IMAGE, fitted, layers, shown
 
 Float = NDArray[np.float64]
 
@@ -85,7 +85,7 @@ class Session:
     def _controls(self) -> None:
         gui, client = self.client.gui, self.client
         self.status = gui.add_text("images per second", "", disabled=True)
-        names = layers(self.show.avatar)
+        names = layers(self.show.avatar, self.drive.truth is not None)
         self.layer = gui.add_dropdown("layer", names, initial_value=IMAGE)
         last = max(0, self.show.avatar.splat_channels - 4)
         self.channel = gui.add_slider("channel of F", 0, max(1, last), 1, 0, visible=last > 0)
@@ -141,6 +141,7 @@ class Session:
             self._warn("This motion cannot be used", _message(error).replace(folder + "/", ""))
             return
         self.drive, self.description.content = drive, drive.text
+        self.layer.options = layers(self.show.avatar, drive.truth is not None)
         self.slider.max = max(1, len(drive.p) - 1)
         self.slider.value = 0
         self._scrub(0)
@@ -247,17 +248,21 @@ class Session:
         return Camera(world[0], world[1], world[2], size)
 
     def _render(self, share: float) -> None:
-        avatar, layer, camera = self.show.avatar, self.layer.value, self.camera(share)
-        p, visibility, body = inputs_of(avatar, self._current(), 0)
+        avatar, layer = self.show.avatar, self.layer.value
+        current = self._current()
+        truth = current.truth(0) if layer == ERROR and current.truth else None
+        camera = self.camera(share) if truth is None else truth.camera
+        p, visibility, body = inputs_of(avatar, current, 0)
         maps = layer != IMAGE or self.splats.value
         with torch.no_grad():
             rendering = avatar(p, visibility, camera.to(p.device), body, maps=maps)
         behind = self.show.behind(camera.size)
-        image = shown(layer, rendering, camera, avatar, behind, int(self.channel.value))
+        image = shown(layer, rendering, camera, avatar, behind, int(self.channel.value), truth)
         self.image = image
+        whole = fitted(image, self.client.camera.aspect) if truth is not None else image
         if self.splats.value and rendering.gaussians is not None:  # the browser draws these instead
-            image = eight_bits(behind, torch.ones(1), behind)
-        self.client.scene.set_background_image(image, "jpeg", jpeg_quality=90)
+            whole = eight_bits(behind, torch.ones(1), behind)
+        self.client.scene.set_background_image(whole, "jpeg", jpeg_quality=90)
         self._place(rendering.gaussians, np.asarray(p[0].cpu().numpy(), np.float64), body)
         self.times.append(time.monotonic())
         recent = [x for x in self.times if x > self.times[-1] - SPEED_OVER]

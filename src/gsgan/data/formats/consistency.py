@@ -112,9 +112,9 @@ def check_consistency(
         if (shares := [x.inside for x in compared if x.camera == name and np.isfinite(x.inside)])
     }
     if inside and min(inside.values()) < limits.least_inside:
-        shares = ", ".join(f"{name} {share:.0%}" for name, share in inside.items())
+        found = ", ".join(f"{name} {share:.0%}" for name, share in inside.items())
         raise DataError(
-            f"{layout.root}: joints lie outside the masks (inside: {shares}); {hint}: "
+            f"{layout.root}: joints lie outside the masks (inside: {found}); {hint}: "
             "python -m gsgan.check finds the wrong camera"
         )
 
