@@ -144,7 +144,7 @@ class PoseAndGenerator(nn.Module):
 
 
 def onnx_program(avatar: Avatar) -> bytes:
-    """A .onnx file of `PoseAndGenerator`; height and width can be any multiples of the UNet's stride.
+    """A .onnx file of `PoseAndGenerator`; height and width: any multiples of the UNet's stride.
 
     Raises:
         ConfigError: when the packages are missing, or the avatar has no generator.
