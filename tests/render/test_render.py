@@ -84,7 +84,7 @@ def expected(
     for i, item in enumerate(dataset.items):
         if item[0] != dataset.items[0][0]:  # one camera
             continue
-        image = prepare.image(predict(dataset[i], item), "full", dataset[i], None)
+        image = prepare.image(predict(dataset[i], item), "full", None)
         found[item] = (image[0] * 255).round().byte().permute(1, 2, 0).numpy()
     return found
 
