@@ -10,7 +10,7 @@ import torch
 from safetensors.torch import save_file
 
 import gsgan
-from gsgan.export.programs import Painter, onnx_program, torch_program, unfrozen
+from gsgan.export.programs import PoseAndGenerator, onnx_program, torch_program, unfrozen
 from gsgan.export.weights import load_weights, weights_bytes
 from gsgan.model.stored import read_checkpoint
 from gsgan.utils.errors import ConfigError, DataError
@@ -81,10 +81,10 @@ def test_onnx_paints_what_the_avatar_paints(model, painted):
     for got, want in zip(made, expected, strict=True):
         assert np.abs(got - want.numpy()).max() < PARITY
         assert want.std() > 1e-3
-    other = Painter(unfrozen(avatar)).inputs()  # of another size
+    other, _ = PoseAndGenerator(unfrozen(avatar)).inputs()  # of another size
     with torch.no_grad():
-        want = Painter(unfrozen(avatar))(**other.by_name)
-    got = session.run(None, {name: x.numpy() for name, x in other.by_name.items()})
+        want = PoseAndGenerator(unfrozen(avatar))(**other)
+    got = session.run(None, {name: x.numpy() for name, x in other.items()})
     assert np.abs(got[0] - want[0].numpy()).max() < PARITY
 
 

@@ -7,7 +7,6 @@ import io
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -61,9 +60,9 @@ class Whole(nn.Module):
             theta, transl: pose of the skinned body, where the avatar needs one.
         """
         body = None if theta is None or transl is None else BodyPose(theta, transl)
-        painting = self.avatar(skeleton, visibility, Camera(K, R, t, self.size), body)
-        assert painting.image is not None and painting.alpha is not None  # noqa: PT018
-        return painting.image.clamp(0, 1), painting.alpha.clamp(0, 1)
+        rendering = self.avatar(skeleton, visibility, Camera(K, R, t, self.size), body)
+        assert rendering.image is not None and rendering.alpha is not None  # noqa: PT018
+        return rendering.image.clamp(0, 1), rendering.alpha.clamp(0, 1)
 
 
 def torch_program(avatar: Avatar, size: tuple[int, int]) -> bytes:
@@ -88,15 +87,7 @@ def torch_program(avatar: Avatar, size: tuple[int, int]) -> bytes:
     return stream.getvalue()
 
 
-@dataclass(frozen=True)
-class Inputs:
-    """Example inputs of a `Painter`: those that its avatar needs."""
-
-    by_name: dict[str, Tensor]
-    times: dict[str, int]  # of images: pixels per pixel of the output
-
-
-class Painter(nn.Module):
+class PoseAndGenerator(nn.Module):
     """Images of the avatar's splats and skeleton in, its image out: pose encoder and UNet.
 
     Its inputs, by name: ``features`` F ``[1, C, H, W]``, ``fine`` F before it was averaged, where
@@ -119,8 +110,8 @@ class Painter(nn.Module):
         classes = 0 if avatar.segmentation is None else avatar.segmentation.classes
         self.channels = {"features": avatar.splat_channels, "segmentation": classes}
 
-    def inputs(self) -> Inputs:
-        """Examples, for the exporter."""
+    def inputs(self) -> tuple[dict[str, Tensor], dict[str, int]]:
+        """Examples by name, for the exporter; of images, the pixels per pixel of the output."""
         k = self.generator.supersample
         channels = self.channels | {"skeleton": len(self.template.draw_groups)}
         channels |= {"splat_alpha": int(self.splats), "fine": (k > 1) * channels["features"]}
@@ -129,7 +120,7 @@ class Painter(nn.Module):
         images = {n: torch.rand(1, channels[n], f * side, f * side) for n, f in times.items()}
         J = len(self.template.names)
         joints = {"omega": torch.rand(1, J, 6), "joints": torch.rand(1, J, 3)}
-        return Inputs(images | joints, times)
+        return images | joints, times
 
     def forward(
         self,
@@ -145,15 +136,15 @@ class Painter(nn.Module):
         assert self.pose_encoder is not None
         g = self.pose_encoder(omega, joints)
         if features is None:  # image_to_image: the drawing stands in F's place
-            painted = self.generator(skeleton, segmentation, None, g)
+            made = self.generator(skeleton, segmentation, None, g)
         else:
-            painted = self.generator(features, segmentation, skeleton, g, fine, splat_alpha)
-        painted = painted.clamp(0, 1)
-        return painted[:, :3], painted[:, 3:]
+            made = self.generator(features, segmentation, skeleton, g, fine, splat_alpha)
+        made = made.clamp(0, 1)
+        return made[:, :3], made[:, 3:]
 
 
 def onnx_program(avatar: Avatar) -> bytes:
-    """A .onnx file of `Painter`, for any height and width that are multiples of the UNet's stride.
+    """A .onnx file of `PoseAndGenerator`; height and width: any multiples of the UNet's stride.
 
     Raises:
         ConfigError: when the packages are missing, or the avatar has no generator.
@@ -163,22 +154,20 @@ def onnx_program(avatar: Avatar) -> bytes:
         import onnxscript  # noqa: F401
     except ImportError:
         raise ConfigError("format=onnx needs: pip install 'gsgan[export]'") from None
-    painter = Painter(unfrozen(avatar)).eval()
-    given, stride = painter.inputs(), painter.generator.stride
+    networks = PoseAndGenerator(unfrozen(avatar)).eval()
+    (given, times), stride = networks.inputs(), networks.generator.stride
     sides = [stride * Dim(name, min=1, max=LARGEST // stride) for name in ("h", "w")]
     shapes = {
-        name: {2 + i: given.times[name] * side for i, side in enumerate(sides)}
-        if name in given.times
-        else None
-        for name in given.by_name
+        name: {2 + i: times[name] * side for i, side in enumerate(sides)} if name in times else None
+        for name in given
     }
     with torch.no_grad(), quiet():
         program = torch.onnx.export(
-            painter,
-            kwargs=given.by_name,
+            networks,
+            kwargs=given,
             dynamo=True,
             dynamic_shapes=shapes,
-            input_names=list(given.by_name),
+            input_names=list(given),
             output_names=["image", "alpha"],
             verbose=False,
         )
