@@ -143,7 +143,6 @@ def test_decisions_survive_a_checkpoint(tmp_path):
     [
         ({"antialias": "maybe"}, "effects.antialias must be one of auto, on, off"),
         ({"view_dependence": 4}, "effects.view_dependence must be one of"),
-        ({"scale_ratio": 0.5}, "effects.scale_ratio must be a number of at least 1"),
         ({"degree_cameras": [4, 2, 8]}, "three rising numbers"),
         ({"only": ["colours"]}, "effects.only must list some of"),
         ({"only": "antialias"}, "effects.only must list some of"),

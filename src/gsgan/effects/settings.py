@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from gsgan.utils.checks import at_least, one_of
+from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError
 
 AUTO = "auto"
@@ -17,11 +17,6 @@ CHOICES: dict[str, tuple[str | int, ...]] = {
     "colour_correction": ON_OFF,
     "body_points": ON_OFF,
     "random_background": ON_OFF,
-}
-LEAST = {  # smallest value of each threshold
-    **dict.fromkeys(("view_residual", "colour_difference", "colour_share", "body_inside"), 0),
-    "dark": 0,
-    "scale_ratio": 1,
 }
 
 
@@ -61,8 +56,6 @@ class EffectSettings:
         if self.impossible is False:  # YAML's off
             object.__setattr__(self, "impossible", "off")
         one_of("effects.impossible", self.impossible, ("error", "off"))
-        for name, least in LEAST.items():
-            at_least(f"effects.{name}", getattr(self, name), least)
         counts = list(self.degree_cameras)
         if len(counts) != 3 or counts != sorted(counts):
             raise ConfigError(f"effects.degree_cameras must be three rising numbers, got {counts}")
