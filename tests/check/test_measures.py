@@ -1,4 +1,4 @@
-"""Units and settings."""
+"""Colours, units and settings."""
 
 from __future__ import annotations
 
@@ -12,15 +12,29 @@ from make import edit_json, write_landmarks
 from gsgan.check.frames import reprojection_errors, skeleton_doubts
 from gsgan.check.geometry import (
     axis_name,
+    geometry_drawing,
     geometry_findings,
     geometry_of,
 )
+from gsgan.check.report import Flagged
+from gsgan.check.sections import colour_table, mean_colours
 from gsgan.check.settings import Limits, Sampling
 from gsgan.check.views import complete, measure, sampled_items, subject_of
 from gsgan.data.datamodule import GsganData
 from gsgan.utils.errors import ConfigError
 
 SAMPLING = Sampling(images=8)
+
+
+@pytest.fixture
+def views(subject):
+    return measure(subject, sampled_items(subject, 8), SAMPLING)[0]
+
+
+def test_a_camera_of_another_colour_is_flagged(views):
+    dark = [replace(v, colour=v.colour * (0.7 if v.camera == "cam01" else 1)) for v in views]
+    table = colour_table(mean_colours(dark), Limits(colour_ratio=1.2))
+    assert [row[0] for row in table.rows if isinstance(row[2], Flagged)] == ["cam01"]
 
 
 def test_images_are_the_same_moments_in_every_camera(subject):
@@ -71,6 +85,14 @@ def test_a_person_of_ten_metres_is_an_error(subject):
 
 def test_the_nearest_axis_is_named():
     assert axis_name(np.array([0.1, -0.9, 0.3])) == "-y"
+
+
+def test_the_drawing_is_svg_with_every_camera(subject):
+    import xml.etree.ElementTree as tree
+
+    drawing = geometry_drawing(subject)
+    tree.fromstring(drawing)
+    assert all(f"<!-- {name} -->".encode() in drawing for name in subject.cameras)
 
 
 @pytest.mark.parametrize(

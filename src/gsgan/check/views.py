@@ -130,6 +130,7 @@ class MaskView:
             metres that they may.
         fullness: area of the mask over that of the estimated silhouette.
         lagged: ``[2 LAG + 1]`` mean metres outside with the skeleton of an earlier or later frame.
+        colour, weight: ``[3]`` summed RGB of the person, summed mask.
         mask, to_small: ``[h, w]`` small mask; ``[3, 3]`` maps pixels of the whole image to it.
     """
 
@@ -139,6 +140,8 @@ class MaskView:
     tolerance: float
     fullness: float
     lagged: Float
+    colour: Float
+    weight: float
     mask: Bool
     to_small: Float
 
@@ -265,6 +268,8 @@ def _view(subject: CheckedData, item: Item, sampling: Sampling) -> MaskView:
         tolerance=max(subject.consistency.joint_tolerance, TOLERANCE * metre),
         fullness=float(mask.sum() / max(1, int(body.sum()))),
         lagged=lagged,
+        colour=frame.image.double().sum((0, 2, 3)).numpy(),
+        weight=float(soft.sum(dtype=np.float64)),
         mask=cv2.resize(soft, small, interpolation=cv2.INTER_AREA) > 0.5,
         to_small=to_small,
     )
