@@ -255,7 +255,7 @@ def test_batches_need_one_size(capture: Path) -> None:
 
 
 def test_real_capture_splits_and_scene(real_capture: Path) -> None:
-    data = GsganData(str(real_capture), size=64, crop="person", info_samples=2)
+    data = GsganData(str(real_capture), size=128, crop="person", info_samples=4)
     assert len(data.dataset("train")) == 4 * 56
     assert data.splits.test_frames == tuple(range(56, 70))
     assert set(data.reasons) == {"novel_view"}
