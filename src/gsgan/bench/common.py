@@ -137,7 +137,7 @@ class Bench:
         Args:
             title, text: of the Markdown file; the block gets ``docs``, else ``text``.
             record, frame: of the JSON file, beside ``where``, and of the CSV file.
-            images: PNG bytes by name; for the page they go into ``pictures/`` beside it.
+            images: PNG bytes by name; for the page they go into ``images/`` beside it.
         """
         self.console.print(text, markup=False, highlight=False, soft_wrap=True)
         write_atomically(self.folder / f"{self.name}.md", f"# {title}\n\n{text.strip()}\n")
@@ -148,7 +148,7 @@ class Bench:
         for name, png in (images or {}).items():
             write_atomically(self.folder / name, png)
             if self.page is not None:
-                write_atomically(self.page.parent / "pictures" / name, png)
+                write_atomically(self.page.parent / "images" / name, png)
         if self.page is not None:
             pages.fill_block(self.page, *self.markers, docs or text, key="docs")
         self.console.print(f"tables and raw numbers: {self.folder}", markup=False, highlight=False)
