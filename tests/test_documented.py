@@ -125,7 +125,8 @@ def place(capture, run, bare, model_file, tmp_path_factory) -> Callable[[str], s
         return Path(shutil.copytree(run, folder() / name))
 
     def moving(name: str) -> Path:
-        from mannequin import mannequin, write_bvh
+        from conventions import write_bvh
+        from mannequin import mannequin
 
         from gsgan.synthetic.posing import Choreography
 

@@ -236,7 +236,8 @@ def test_people_filmed_from_the_waist_up_stand_upright(tmp_path, landmarks, prop
 
 
 def test_bvh(tmp_path, proportions):
-    from mannequin import mannequin, write_bvh
+    from conventions import write_bvh
+    from mannequin import mannequin
 
     from gsgan.synthetic.posing import Choreography
 

@@ -166,7 +166,8 @@ def test_the_subjects_own_motion_is_left_alone(render, capture, tmp_path):
 
 
 def test_the_up_axis_of_a_rig_can_be_given(render, tmp_path):
-    from mannequin import mannequin, write_bvh
+    from conventions import write_bvh
+    from mannequin import mannequin
 
     from gsgan.synthetic.posing import Choreography
 

@@ -1,15 +1,13 @@
-"""A small rig in a T pose for motion tests, points inside meshes, and a writer of BVH files."""
+"""A small rig in a T pose for motion tests, points inside meshes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
-from scipy.spatial.transform import Rotation
 
 from gsgan.motion.character import Animation, Character
 
@@ -112,51 +110,3 @@ def inside(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.nd
         hit = np.asarray(scene.run(points.astype(np.float32), rays)).astype(int)
         leaves += (hit >= 0) & (normal[hit] @ ray > 0)
     return leaves >= 3
-
-
-def write_bvh(
-    path: Path,
-    character: Character,
-    motion: Animation,
-    step: float,
-    *,
-    name: Callable[[str], str] = str,
-    axes: np.ndarray | None = None,
-    scale: float = 1.0,
-    order: str = "ZXY",
-) -> Path:
-    """Writes a motion as a BVH file, its axes the rows of ``axes``, in ``1 / scale`` metres."""
-    B = np.eye(3) if axes is None else axes
-    bones, parents = character.bones, character.parents
-    lines = ["HIERARCHY"]
-    columns: list[int] = []
-
-    def write(j: int, depth: int) -> None:
-        parent, pad = parents[j], "\t" * depth
-        above = character.joints[parent] if parent >= 0 else np.zeros(3)
-        offset = scale * B @ (character.joints[j] - above)
-        lines.extend([f"{pad}{'JOINT' if parent >= 0 else 'ROOT'} {name(bones[j])}", pad + "{"])
-        lines.append(pad + "\tOFFSET " + " ".join(f"{x:.6f}" for x in offset))
-        channels = [f"{a}rotation" for a in order]
-        if parent < 0:
-            channels = ["Xposition", "Yposition", "Zposition", *channels]
-        lines.append(f"{pad}\tCHANNELS {len(channels)} {' '.join(channels)}")
-        columns.append(j)
-        children = [k for k, p in enumerate(parents) if p == j]
-        for k in children:
-            write(k, depth + 1)
-        if not children:
-            end = [pad + "\tEnd Site", pad + "\t{", pad + "\t\tOFFSET 0 0 0.01", pad + "\t}"]
-            lines.extend(end)
-        lines.append(pad + "}")
-
-    write(0, 0)
-    lines += ["MOTION", f"Frames: {len(motion.joints)}", f"Frame Time: {step}"]
-    for R, joints in zip(motion.rotations, motion.joints, strict=True):
-        row = list(scale * B @ joints[0])
-        for j in columns:
-            local = R[j] if parents[j] < 0 else R[parents[j]].T @ R[j]
-            row += list(Rotation.from_matrix(B @ local @ B.T).as_euler(order, degrees=True))
-        lines.append(" ".join(f"{x:.6f}" for x in row))
-    path.write_text("\n".join(lines) + "\n")
-    return path

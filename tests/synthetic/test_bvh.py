@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from mannequin import mannequin, write_bvh
+from conventions import write_bvh
+from mannequin import mannequin
 
 from gsgan.motion.character import Animation
 from gsgan.motion.rig import REQUIRED
