@@ -6,15 +6,12 @@ import contextlib
 import ctypes
 import gc
 import io
-import json
 import os
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
-import pandas as pd
 import torch
 from hydra.utils import instantiate
 from matplotlib.axes import Axes
@@ -118,12 +115,6 @@ def png(figure: Figure) -> bytes:
     stream = io.BytesIO()
     figure.savefig(stream, format="png", metadata={"Software": ""})
     return stream.getvalue()
-
-
-def records(frame: pd.DataFrame) -> list[dict[str, Any]]:
-    """The rows as JSON values, with null for NaN and infinity."""
-    rows: list[dict[str, Any]] = json.loads(frame.to_json(orient="records", double_precision=15))
-    return rows
 
 
 def painting_memory(paint: Callable[[Frame], object], frames: Sequence[Frame]) -> float | None:
