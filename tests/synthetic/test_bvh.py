@@ -166,6 +166,15 @@ def test_a_file_without_a_required_joint(tmp_path, person, signing):
     assert len(REQUIRED) == 13
 
 
+def two_people(text: str) -> str:
+    """The same person twice, as two roots."""
+    tree, motion = text.removeprefix("HIERARCHY").split("MOTION")
+    *head, step = motion.strip().splitlines()[:2]
+    rows = motion.strip().splitlines()[2:]
+    lines = ["HIERARCHY", tree, tree.replace("ROOT Hips", "ROOT Hips2"), "MOTION", *head, step]
+    return "\n".join([*lines, *(f"{row} {row}" for row in rows)])
+
+
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
@@ -178,6 +187,8 @@ def test_a_file_without_a_required_joint(tmp_path, person, signing):
         (lambda text: text.replace("CHANNELS 3", "CHANNELS 99", 1), "is not a complete BVH file"),
         (lambda text: text.replace("Zrotation", "Wrotation", 1), "is not a complete BVH file"),
         (lambda text: "", "HIERARCHY"),
+        (lambda text: text.replace("ROOT", "JOINT", 1), "JOINT Hips is out of place"),
+        (two_people, "more than one person"),
     ],
 )
 def test_damaged_files_end_in_one_sentence(tmp_path, person, whole, damage, message):

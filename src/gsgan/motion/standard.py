@@ -220,14 +220,23 @@ def body_joints(rig: RigMotion, path: Path) -> dict[str, int]:
         )
     lines = [_line(rig, known[side + "UpLeg"]) for side in SIDES]
     shared = [j for j in lines[0] if j in lines[1]]
-    if not shared:
-        raise DataError(f"{path}: its legs belong to different roots; give a file of one person")
+    if (
+        not shared
+        or min(_count(rig, side + bone) for side in SIDES for bone in ("UpLeg", "Arm")) > 1
+    ):
+        raise DataError(f"{path} holds more than one person; give a file of one")
     known.setdefault("Hips", shared[-1])
     for bone in list(known):
         ends = [j for j, parent in enumerate(rig.parents) if parent == known[bone]]
         if re.search(r"Hand\D+[23]$", bone) and ends:
             known.setdefault(bone[:-1] + str(int(bone[-1]) + 1), ends[0])
     return known
+
+
+def _count(rig: RigMotion, bone: str) -> int:
+    """The number of joints that may be a bone, without the further segments below them."""
+    found = [j for j, name in enumerate(rig.names) if _bone(name)[0] == bone]
+    return sum(not set(_line(rig, j)) & set(found) for j in found)
 
 
 def _line(rig: RigMotion, j: int) -> list[int]:
