@@ -149,7 +149,7 @@ class Reference:
     Args:
         rotations: ``[N, J, 3, 3]`` world rotations of the joints, axes of the file.
         axes: ``[N, 3, 3]`` rows left, back, up of the person, axes of the file.
-        joints: N times the joints' positions ``[J, 3]``, axes of the file.
+        joints: ``[N, J, 3]`` positions, axes of the file.
         zero: whether it is the zero pose.
         neutral: whether the person stands upright and looks ahead; else the trunk has to be
             calibrated by the joints' positions.
@@ -180,14 +180,14 @@ def standard_motion(rig: RigMotion, path: Path, up: str | None = None) -> Standa
     known = body_joints(rig, path)
     posed = rig.posed()
     zero, axis = rig.zero_pose()[None], np.zeros(3)
+    at_zero = _upward(zero, known)
+    own = at_zero if tilts(zero, known, at_zero).max() < STANDING else None
     if up is None:
-        own = _upward(zero, known)
-        stands = tilts(zero, known, own).max() < STANDING
-        axis = _upward(posed, known, usual=own if stands else None)
+        axis = _upward(posed, known, usual=own)
     else:
         axis["xyz".index(up[-1])] = -1.0 if up.startswith("-") else 1.0
     known = _by_side(posed, known, axis)
-    reference = _reference(rig, posed, known, axis)
+    reference = _reference(rig, posed, known, axis, own)
     same = reference.zero and np.allclose(reference.axes[0, 2], axis)
     axes = reference.axes[0] if same else person_axes(posed[:1], known, axis)[0]
     R, turns = _turns(rig, axes, known, reference)
@@ -303,13 +303,14 @@ def tilts(p: Array, known: dict[str, int], up: Array) -> Array:
     return np.arccos(np.stack(cosines, axis=-1).clip(-1, 1))
 
 
-def _reference(rig: RigMotion, posed: Array, known: dict[str, int], up: Array) -> Reference:
-    """The zero pose, if that is a standing person; else frames."""
-    zero = rig.zero_pose()
-    own = _upward(zero[None], known)
-    if tilts(zero, known, own).max() < STANDING:
+def _reference(
+    rig: RigMotion, posed: Array, known: dict[str, int], up: Array, own: Array | None
+) -> Reference:
+    """The zero pose, if that is a person who stands along the axis ``own``; else frames."""
+    if own is not None:
+        zero = rig.zero_pose()[None]
         eye = np.broadcast_to(np.eye(3), (1, *rig.rotations.shape[1:]))
-        return Reference(eye, person_axes(zero[None], known, own), zero[None], True, True)
+        return Reference(eye, person_axes(zero, known, own), zero, True, True)
     tilt = tilts(posed, known, up)
     score = tilt.max(axis=-1)
     best = float(score.min())

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +14,6 @@ from gsgan.data.crop import PersonCrop, square_window
 from gsgan.scene import Camera, cat
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.utils.errors import ConfigError, DataError
-
-if TYPE_CHECKING:
-    pass
 
 Float = NDArray[np.float64]
 
