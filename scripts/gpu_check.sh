@@ -47,7 +47,7 @@ step raster 120 "$python" scripts/bench/raster.py device=cuda 'backends=[torch,g
   'gaussians=[8000]' 'sizes=[512]' 'channels=[3,32]' repeats=5 out="$out/raster"
 step speed_512 60 "${speed[@]}" hydra.run.dir="$out/speed_512"
 step speed_512_bf16 60 "${speed[@]}" precision=bf16-mixed hydra.run.dir="$out/speed_512_bf16"
-step speed_1024_bf16 60 "${speed[@]}" size.picture=1024 precision=bf16-mixed \
+step speed_1024_bf16 60 "${speed[@]}" size.image=1024 precision=bf16-mixed \
   hydra.run.dir="$out/speed_1024_bf16"
 step ddp_1 90 "$python" -m gsgan.train experiment=smoke trainer=ddp trainer.devices=1 \
   evaluate=false resume=false hydra.run.dir="$out/ddp_1"
@@ -59,7 +59,7 @@ fi
 step paper 300 "$python" -m gsgan.train experiment=paper "${data[@]}" data.size=512 \
   training.perceptual.weights=auto training.schedule.segmentation=50 \
   training.schedule.step_one=200 training.schedule.step_two=200 training.schedule.epoch=50 \
-  trainer.check_val_every_n_epoch=1 data.val_pictures=2 evaluate=false resume=false \
+  trainer.check_val_every_n_epoch=1 data.val_images=2 evaluate=false resume=false \
   hydra.run.dir="$out/paper"
 
 card=$(nvidia-smi --query-gpu=name,driver_version,memory.total --format=csv,noheader || echo unknown)

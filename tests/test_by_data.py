@@ -13,11 +13,11 @@ DATA = sorted(path.stem for path in (config_folder() / "data").glob("[!_]*.yaml"
 def test_large_captures_train_at_full_size_by_themselves(compose, data):
     config = compose("train", f"data={data}")
     large = data in ("thuman4", "zju_mocap", "avatarrex")
-    assert config.size.picture == (512 if large else 256 if data == "synthetic" else 128)
+    assert config.size.image == (512 if large else 256 if data == "synthetic" else 128)
     default = data == "synthetic"  # at 256² iterations take longer
     assert config.training.schedule.step_two == (250_000 if large else 3000 if default else 3200)
     small = compose("train", f"data={data}", "size=small", "training=demo")
-    assert (small.size.picture, small.training.schedule.step_two) == (128, 3200)
+    assert (small.size.image, small.training.schedule.step_two) == (128, 3200)
 
 
 @pytest.mark.parametrize(

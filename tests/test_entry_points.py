@@ -30,7 +30,7 @@ def test_a_run_leaves_metrics_pictures_config_log_and_checkpoint(run):
     assert (run / ".hydra" / "config.yaml").is_file()
     assert (run / "checkpoints" / "last.ckpt").is_file()
     assert (run / "logs" / "metrics.csv").is_file()
-    names = {path.name for path in (run / "pictures").iterdir()}
+    names = {path.name for path in (run / "grids").iterdir()}
     assert {"step_000000.png", "novel_view.png", "novel_pose.png"} <= names
 
 

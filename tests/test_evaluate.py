@@ -81,7 +81,7 @@ def test_images_of_a_run_score_as_the_run_does(run, painted, given, inside):
     if runs["commit"] is not None:  # a checkout: the run was trained and scored by the same code
         assert [code.removesuffix("+changes") for code in stored] == [runs["commit"]]
     assert "other" in result.stdout
-    assert {p.name for p in (out / "pictures").iterdir()} == {"novel_view.png", "novel_pose.png"}
+    assert {p.name for p in (out / "grids").iterdir()} == {"novel_view.png", "novel_pose.png"}
 
 
 def test_the_csv_holds_every_image_and_its_mean_is_the_score(run):
@@ -154,13 +154,13 @@ def test_a_run_is_scored_on_white_by_request(run, inside, tmp_path):
     from gsgan.model.stored import load_config
 
     copy = shutil.copytree(run, tmp_path / "copy")
-    result = inside("evaluate", f"run={copy}", "background=white", "pictures=1")
+    result = inside("evaluate", f"run={copy}", "background=white", "grid_rows=1")
     assert result.returncode == 0, result.stderr
     assert "scored on white" in result.stdout
     on_white = copy / "on_white"
     assert "scored on white" in (on_white / "metrics.md").read_text()
     assert scores(copy) == scores(run)  # its own stay
-    shown = cv2.imread(str(on_white / "pictures" / "novel_pose.png"))
+    shown = cv2.imread(str(on_white / "grids" / "novel_pose.png"))
     assert (shown[-1, 0] == 255).all()  # the truth's corner
     assert (shown[-1, 3 * shown.shape[1] // 5 + 1] > 128).all()  # and the painted one, fourth
     black, white = scores(run), scores(on_white)
@@ -304,7 +304,7 @@ def test_seconds_of_a_resumed_training_add_up(tiny, monkeypatch):
 
 
 def test_cameras_of_several_sizes_share_one_grid(tmp_path):
-    from gsgan.evaluate.pictures import CAPTION_HEIGHT, write_grid
+    from gsgan.evaluate.grids import CAPTION_HEIGHT, write_grid
 
     small, large = torch.ones(3, 2, 5), torch.ones(3, 4, 3)
     path = tmp_path / "grid.png"

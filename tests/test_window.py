@@ -25,7 +25,7 @@ def test_closed_form():
     found = window([[[-0.2, -0.2, 2.0], [0.2, 0.2, 2.0]]])
     assert found.size == (16, 16)  # 15 px rounded up to a multiple of 8
     assert found.corners == ((22, 42),)
-    assert found.picture == (HEIGHT, WIDTH)
+    assert found.whole == (HEIGHT, WIDTH)
 
 
 @pytest.mark.parametrize(

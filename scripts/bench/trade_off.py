@@ -53,7 +53,7 @@ SCORES = "metrics.json"  # what a finished run has, beside its checkpoint
 SEED = "seed"
 IGNORED = re.compile(r"^(data\.(source\.)?workers|hydra\..*|trainer(\..*)?|grid_rows)$")
 # Of a run's data: how it is read and sampled, not what is in it.
-SAMPLING = ("seed", "steps_per_epoch", "workers", "cache_mb", "batch_size", "val_pictures")
+SAMPLING = ("seed", "steps_per_epoch", "workers", "cache_mb", "batch_size", "val_images")
 # Metric: heading, digits, and 1 where more is better, -1 where less is.
 QUALITIES = {
     "psnr": ("PSNR dB", 2, 1),
@@ -165,7 +165,7 @@ def run(config: DictConfig, folder: Path) -> None:
     }
     second = "edge_f1" if perceptual is None else "lpips"
     images = {"trade_off.png": plot(frame, [*dict.fromkeys((config.quality, second))])}
-    docs = f"{page}\n\n![Quality against time per frame](pictures/trade_off.png)"
+    docs = f"{page}\n\n![Quality against time per frame](images/trade_off.png)"
     bench.write("Quality against time", page, record, frame, images, docs=docs)
 
 

@@ -246,12 +246,12 @@ class Window:
     Args:
         corners: ``(top, left)`` of each item, pixels.
         size: ``(H, W)`` of every box.
-        picture: ``(H, W)`` of the whole image.
+        whole: ``(H, W)`` of the whole image.
     """
 
     corners: tuple[tuple[int, int], ...]
     size: tuple[int, int]
-    picture: tuple[int, int]
+    whole: tuple[int, int]
 
     def camera(self, camera: Camera) -> Camera:
         """The cameras of the boxes."""
@@ -259,13 +259,13 @@ class Window:
             camera[i : i + 1].crop(top, left, self.size)
             for i, (top, left) in enumerate(self.corners)
         ]
-        return replace(cat(boxes), whole_height=self.picture[0])
+        return replace(cat(boxes), whole_height=self.whole[0])
 
-    def cut(self, picture: Tensor) -> Tensor:
+    def cut(self, images: Tensor) -> Tensor:
         """``[B, ..., H, W]`` reduced to the boxes."""
         height, width = self.size
         boxes = [
-            picture[i : i + 1, ..., top : top + height, left : left + width]
+            images[i : i + 1, ..., top : top + height, left : left + width]
             for i, (top, left) in enumerate(self.corners)
         ]
         return torch.cat(boxes)
@@ -283,7 +283,7 @@ class Window:
 
     def paste(self, boxes: Tensor) -> Tensor:
         """``[B, C, h, w]`` boxes back in whole images, zeros around them."""
-        (height, width), (whole_height, whole_width) = self.size, self.picture
+        (height, width), (whole_height, whole_width) = self.size, self.whole
         pasted = [
             functional.pad(
                 boxes[i : i + 1],

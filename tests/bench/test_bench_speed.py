@@ -167,7 +167,7 @@ def test_the_command_times_a_run_and_fills_the_page(run, tmp_path, inside):
 
 def test_the_command_times_an_untrained_avatar_at_its_size(capture, tmp_path, inside):
     out = tmp_path / "out"
-    given = ["size=tiny", "size.picture=64", f"data.root={capture}", "frames=1", "warmup=0"]
+    given = ["size=tiny", "size.image=64", f"data.root={capture}", "frames=1", "warmup=0"]
     done = inside("bench", "speed", *given, "model=splat_only", f"hydra.run.dir={out}")
     assert done.returncode == 0, done.stderr
     found = json.loads((out / "speed.json").read_text())

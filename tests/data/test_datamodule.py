@@ -144,10 +144,10 @@ def watched(**keys: Any) -> list[tuple[int, int]]:
 
 def test_pictures_watched_while_training_are_spread_over_held_out_poses(capture: Path) -> None:
     keys = {"root": str(capture), "test_frames": "5-9"}
-    assert watched(**keys, val_pictures=99) == [(c, f) for c in range(3) for f in range(5, 10)]
-    assert watched(**keys, val_pictures=3) == [(0, 7), (1, 7), (2, 7)]
+    assert watched(**keys, val_images=99) == [(c, f) for c in range(3) for f in range(5, 10)]
+    assert watched(**keys, val_images=3) == [(0, 7), (1, 7), (2, 7)]
     # without held-out poses: held-out cameras, and without those: training
-    none = {"root": str(capture), "test_share": 0, "val_pictures": 2}
+    none = {"root": str(capture), "test_share": 0, "val_images": 2}
     assert {c for c, _ in watched(**none, test_cameras=["cam01"])} == {1}
     assert len(watched(**none)) == 2
 

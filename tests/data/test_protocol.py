@@ -123,7 +123,7 @@ def test_protocols_that_cannot_be(changes: dict[str, Any], message: str) -> None
         ("lpips_region", None, "must be full or mask_crop_512; got None"),
         ("lpips_range", [0, 255], r"must be \[-1.0, 1.0\] or \[0.0, 1.0\]; got \(0, 255\)"),
         ("ssim_range", True, "must be 1.0 or 2.0; got True"),
-        ("psnr_pooling", "split", "must be picture or channels"),
+        ("psnr_pooling", "split", "must be image or channels"),
         ("eight_bits", True, "must be none or rounded or cut; got True"),
         ("truth_outline", 0.5, "must be soft or hard; got 0.5"),
         ("ssim_window", 7, "must be gaussian or uniform; got 7"),

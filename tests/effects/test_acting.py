@@ -118,7 +118,7 @@ def test_decisions_are_stored_and_taken_up_again(capture, inside, tmp_path):
     stored = checkpoint["gsgan"]["effects"]
     assert stored["view_dependence"]["value"] == 1
     assert stored["cameras"] == ["cam00", "cam01"]
-    result = inside("evaluate", f"run={folder}", "splits=[novel_pose]", "pictures=1")
+    result = inside("evaluate", f"run={folder}", "splits=[novel_pose]", "grid_rows=1")
     assert result.returncode == 0, result.stderr
 
 

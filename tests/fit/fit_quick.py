@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 QUICK = [
-    "size.picture=48",
+    "size.image=48",
     "fit.points=400",
     "fit.surface_steps=6",
     "fit.sweeps=3",

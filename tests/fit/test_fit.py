@@ -192,9 +192,9 @@ def test_an_empty_mask_does_not_affect_other_frames(fit, people, tmp_path, capsy
             mask[50:52, 50:52] = 255
         cv2.imwrite(str(holed / f"masks/{camera}/000001.png"), mask)
     capsys.readouterr()
-    whole_pictures = ("data.crop=null", "data.reader.consistency.frames=0")
-    found = fit(*whole_pictures, root=holed)
-    plain = fit(*whole_pictures, name="plain")
+    whole_images = ("data.crop=null", "data.reader.consistency.frames=0")
+    found = fit(*whole_images, root=holed)
+    plain = fit(*whole_images, name="plain")
     assert "left out" in capsys.readouterr().out
     others = [0, 2]
     apart = np.abs(plain["theta"] - found["theta"])[others].max()

@@ -112,7 +112,7 @@ def test_painting_reads_nothing_back_and_copies_nothing_over(
     with Reads() as reads:
         painting = paint()
     assert painting.image.device == META
-    assert painting.image.shape[-2:] == window.picture
+    assert painting.image.shape[-2:] == window.whole
     assert not reads.seen
     assert not copies
 

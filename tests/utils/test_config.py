@@ -162,7 +162,7 @@ def test_a_sweep_folder_has_a_name_that_file_systems_take(experiment, tmp_path):
     from hydra import compose, initialize_config_dir
     from omegaconf import open_dict
 
-    given = [*experiment, *MANY, "data.val_pictures=3", "effects.only=[a,b]", "logger=csv"]
+    given = [*experiment, *MANY, "data.val_images=3", "effects.only=[a,b]", "logger=csv"]
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         config = compose("train", overrides=given, return_hydra_config=True)
     with open_dict(config):

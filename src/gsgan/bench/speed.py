@@ -103,7 +103,7 @@ def load_subject(
         data = build_data(config)
         avatar, name = build_avatar(config, data.info, data.labelled("train")), "untrained avatar"
         marks = ["untrained weights: the time of F depends on the places of its Gaussians"]
-        size = (int(config.size.picture), int(config.size.picture))
+        size = (int(config.size.image), int(config.size.image))
         frames = [replace(f, camera=f.camera.resize(size)) for f in spread(data, config.poses)]
     avatar = place(avatar, device, channels_last=config.channels_last)
     return avatar, [frame.to(device) for frame in frames], name, marks

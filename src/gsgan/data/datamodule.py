@@ -98,7 +98,7 @@ class GsganData(LightningDataModule):
         size: int | None = None,
         crop: PersonCrop | str | None = None,
         batch_size: int = 1,
-        val_pictures: int = 24,
+        val_images: int = 24,
         steps_per_epoch: int | None = None,
         workers: int | None = None,
         seed: int = 0,
@@ -128,7 +128,7 @@ class GsganData(LightningDataModule):
         if steps_per_epoch is not None:
             whole("data.steps_per_epoch", steps_per_epoch, 1)
         self.steps_per_epoch = steps_per_epoch
-        self.val_pictures = whole("data.val_pictures", val_pictures, 1)
+        self.val_images = whole("data.val_images", val_images, 1)
         self.workers = default_workers() if workers is None else whole("data.workers", workers, 0)
         self.seed = whole("data.seed", seed, 0)
         self.cache_mb = at_least("data.cache_mb", cache_mb, 0)
@@ -328,7 +328,7 @@ class GsganData(LightningDataModule):
         The split is novel_pose, else novel_view, else train.
         """
         name = next((n for n in ("novel_pose", "novel_view") if self.splits.items[n]), "train")
-        return name, evenly_spaced(len(self.dataset(name)), self.val_pictures)
+        return name, evenly_spaced(len(self.dataset(name)), self.val_images)
 
     def val_dataloader(self) -> DataLoader[Frame]:
         """The images of `watched`."""

@@ -15,7 +15,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "lpips_channels": ("rgb", "bgr"),
     "ssim_window": ("gaussian", "uniform"),
     "ssim_range": (1.0, 2.0),
-    "psnr_pooling": ("picture", "channels"),
+    "psnr_pooling": ("image", "channels"),
     "eight_bits": ("none", "rounded", "cut"),
     "truth_outline": ("soft", "hard"),
 }
@@ -38,7 +38,7 @@ class MetricVariants:
         ssim_window: "gaussian" of 11 pixels, or "uniform" of 7, scikit-image's default.
         ssim_range: of the values, as passed to SSIM: 1, or 2 as tools assume for floats in [-1, 1],
             which gives higher values.
-        psnr_pooling: "picture", one error for all channels; "channels", the mean of their PSNRs.
+        psnr_pooling: "image", one error for all channels; "channels", the mean of their PSNRs.
         eight_bits: whether predictions are "rounded" or "cut" to 8 bits first.
         truth_outline: "soft", composed on the background with its mask as alpha; "hard", the image
             where the mask is at least one half, and the background elsewhere.
@@ -56,7 +56,7 @@ class MetricVariants:
     lpips_channels: Literal["rgb", "bgr"] = "rgb"
     ssim_window: Literal["gaussian", "uniform"] = "gaussian"
     ssim_range: float = 1.0
-    psnr_pooling: Literal["picture", "channels"] = "picture"
+    psnr_pooling: Literal["image", "channels"] = "image"
     eight_bits: Literal["none", "rounded", "cut"] = "none"
     truth_outline: Literal["soft", "hard"] = "soft"
 

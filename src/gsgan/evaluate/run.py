@@ -26,8 +26,8 @@ from gsgan.evaluate.files import (
     print_table,
     write_scored,
 )
+from gsgan.evaluate.grids import write_grid
 from gsgan.evaluate.origin import Method, origin, trained
-from gsgan.evaluate.pictures import write_grid
 from gsgan.evaluate.predictions import (
     FLOOR,
     FULL,
@@ -156,11 +156,11 @@ def evaluate_method(
     marks: Sequence[str] = (),
 ) -> Results:
     """Scores a method's predictions and writes metrics.json, scores.csv, facts.json, metrics.md and
-    ``pictures/``; nothing is written before everything is scored.
+    ``grids/``; nothing is written before everything is scored.
 
     Args:
         folder: for the results.
-        config: for ``lpips``, and, if set, ``background``, ``splits`` and ``pictures``.
+        config: for ``lpips``, and, if set, ``background``, ``splits`` and ``grid_rows``.
         console: prints progress and the table.
         data: with the splits.
         predict, method: the method, and what facts.json states about it.
@@ -174,18 +174,18 @@ def evaluate_method(
         GsganError: when a prediction cannot be scored.
     """
     scorer = make_scorer(config, data, marks)
-    pictures = 4 if config.get("pictures") is None else config.pictures
+    grid_rows = 4 if config.get("grid_rows") is None else config.grid_rows
     scores: dict[str, SplitScores] = {}
     for split in config.get("splits") or SPLITS:
         dataset = data.dataset(split)
-        count, rows = len(dataset), min(pictures, len(dataset))
+        count, rows = len(dataset), min(grid_rows, len(dataset))
         order = track(range(count), f"scoring {split}", console=console, transient=True)
         frames = ((dataset.items[i], dataset[i].to(device)) for i in order)
         shown = {round((i + 0.5) * count / rows - 0.5) for i in range(rows)}
         scores[split] = score_split(frames, predict, scorer, shown)
     for split, found in scores.items():
         if found.grid:
-            write_grid(found.grid, folder / "pictures" / f"{split}.png")
+            write_grid(found.grid, folder / "grids" / f"{split}.png")
     now = _joined_splits(scores, scorer, data, origin(method, data, device))
     whole, dropped = joined(now, folder, SPLITS)
     if dropped:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsgan.data.metric_variants import MetricVariants
 from gsgan.data.splits import Item
-from gsgan.evaluate.pictures import grid_rows
+from gsgan.evaluate.grids import grid_rows
 from gsgan.evaluate.predictions import FLOOR, FULL, SPLAT, Prediction, Preparation
 from gsgan.metrics.image import (
     Score,
@@ -165,7 +165,7 @@ class SplitScores:
     Args:
         variants: ``{variant: {metric: value}}`` as in metrics.json; empty without frames.
         rows: one per variant and image.
-        grid: rows of images to show, from `gsgan.evaluate.pictures.grid_rows`.
+        grid: rows of images to show, from `gsgan.evaluate.grids.grid_rows`.
     """
 
     variants: dict[str, dict[str, Any]]

@@ -23,20 +23,20 @@ OUTLINE = 2  # pixels
 UNIFORM_WINDOW = 7  # pixels, scikit-image's default
 
 
-def psnr(image: Tensor, target: Tensor, pooling: str = "picture") -> Tensor:
+def psnr(image: Tensor, target: Tensor, pooling: str = "image") -> Tensor:
     """Peak signal-to-noise ratio in dB; infinite for equal images (leave those out of means).
 
     Args:
         image, target: images.
-        pooling: "picture", one error for all channels; "channels", the mean of their PSNRs.
+        pooling: "image", one error for all channels; "channels", the mean of their PSNRs.
     """
     error = (image - target).square().flatten(2).mean(dim=2)
-    if pooling == "picture":
+    if pooling == "image":
         error = error.mean(dim=1, keepdim=True)
     return (-10 * error.log10()).mean(dim=1)
 
 
-def psnr_where(image: Tensor, target: Tensor, where: Tensor, pooling: str = "picture") -> Tensor:
+def psnr_where(image: Tensor, target: Tensor, where: Tensor, pooling: str = "image") -> Tensor:
     """PSNR of the pixels ``where [B, 1, H, W]`` in dB; NaN without any."""
     scores = [
         psnr(a[None, :, m, None], b[None, :, m, None], pooling)[0]

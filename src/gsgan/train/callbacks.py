@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 from torch import Tensor
 
-from gsgan.evaluate.pictures import grid_rows, write_grid
+from gsgan.evaluate.grids import grid_rows, write_grid
 from gsgan.scene import Frame
 from gsgan.utils.config import defaults_of
 from gsgan.utils.files import write_atomically
@@ -30,7 +30,7 @@ def _training(module: LightningModule) -> AvatarTraining:
     return cast("AvatarTraining", module)
 
 
-class PictureGrid(Callback):
+class ImageGrid(Callback):
     """Writes ground truth, Step I's colour, S, I_pred and error at each validation, as
     ``folder/step_000000.png`` with ``rows`` images spread over the validation frames."""
 

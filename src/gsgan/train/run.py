@@ -32,7 +32,7 @@ from gsgan.metrics.lpips import check_lpips
 from gsgan.model.assemble import build_avatar, build_data, naming_group
 from gsgan.model.stored import CHECKPOINT, read_checkpoint, record
 from gsgan.splat import resolve_backend
-from gsgan.train.callbacks import AtomicCheckpoints, LiveViewer, PictureGrid, ProgressLines
+from gsgan.train.callbacks import AtomicCheckpoints, ImageGrid, LiveViewer, ProgressLines
 from gsgan.train.module import AvatarTraining
 from gsgan.utils.checks import whole
 from gsgan.utils.console import make_console
@@ -248,7 +248,7 @@ def build_trainer(
 ) -> Trainer:
     """The Trainer of the config, as long as the schedule."""
     callbacks: list[Any] = [
-        PictureGrid(folder / "pictures", config.grid_rows),
+        ImageGrid(folder / "grids", config.grid_rows),
         ProgressLines(console),
         ModelCheckpoint(
             dirpath=folder / CHECKPOINT.parent,

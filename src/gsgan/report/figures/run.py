@@ -97,7 +97,7 @@ def _draw(name: str, subjects: Sequence[Subject], config: DictConfig) -> Drawing
         if any(subject.data.watched != (split, places) for subject in subjects):
             raise DataError(
                 "figures: the runs watched different images while training; give all the same "
-                "data.val_pictures"
+                "data.val_images"
             )
         items = [data.dataset(split).items[i] for i in places]
     else:

@@ -107,7 +107,7 @@ def make_shots(data: GsganData, split: str, items: Sequence[Item], margin: float
         p, camera = torch.cat([f.skeleton for f in batch]), cat([f.camera for f in batch])
         boxes = body_window(p, camera, margin=margin, multiple=1, least=LEAST, near=NEAR)
         for corner, frame in zip(boxes.corners, batch, strict=True):
-            window = Window((corner,), boxes.size, boxes.picture)
+            window = Window((corner,), boxes.size, boxes.whole)
             shots.append(Shot(items[len(shots)], frame, window))
     return shots
 
