@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -484,7 +485,8 @@ def published(root: np.ndarray, body: np.ndarray, moves: np.ndarray) -> dict[str
         "parts_only": {k: v for k, v in smplx.items() if k != "poses"},
         "humman": {"betas": np.zeros((F, 10)), "body_pose": smpl}
         | {"global_orient": root, "transl": moves},
-        "aist": {"smpl_poses": np.concatenate([root, smpl], axis=1), "smpl_trans": moves},
+        "aist": {"smpl_poses": np.concatenate([root, smpl], axis=1), "smpl_trans": 95 * moves}
+        | {"smpl_scaling": np.array([95.0]), "smpl_loss": np.array([0.1])},
     }
 
 
@@ -506,10 +508,31 @@ def test_published_keys_of_the_smpl_family(tmp_path, shared, proportions, name):
         poses = np.concatenate([np.zeros((4, 3)), body, np.zeros((4, 6))], axis=1)
         files[name] = {"poses": poses, "Rh": root, "Th": moves + J0 - (R @ J0)}
         files[name] |= {"shapes": np.zeros((4, 10))}
-    np.savez(tmp_path / "a.npz", **files[name])
-    motion = read_motion(tmp_path / "a.npz", Source(proportions, model))
+    path = tmp_path / {"aist": "a.pkl", "zju": "a.npy"}.get(name, "a.npz")
+    if path.suffix == ".pkl":
+        path.write_bytes(pickle.dumps(files[name]))
+    elif path.suffix == ".npy":
+        np.save(path, np.array(files[name]), allow_pickle=True)
+    else:
+        np.savez(path, **files[name])
+    motion = read_motion(path, Source(proportions, model))
     theta = torch.zeros(4, len(skinned.parents), 3, dtype=torch.float64)
     theta[:, :22] = torch.from_numpy(np.concatenate([root, body], axis=1)).reshape(4, 22, 3)
     joints = skinned.posed_joints(theta, theta.new_zeros(1, 1), torch.from_numpy(moves)).numpy()
     at = {11: 16, 13: 18, 15: 20, 12: 17, 14: 19, 16: 21, 23: 1, 25: 4, 27: 7, 24: 2, 26: 5, 28: 8}
     np.testing.assert_allclose(motion.p[:, list(at)], joints[:, list(at.values())], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ([1, 2], "holds no dictionary"),
+        ({"poses": "none"}, "'poses' must be an array of numbers"),
+        ({"verts": np.zeros((2, 6890, 3))}, "holds no known kind of motion"),
+        (Path("x"), "pathlib"),
+    ],
+)
+def test_other_pickles_are_one_sentence(tmp_path, proportions, content, message):
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps(content))
+    with pytest.raises(DataError, match=message):
+        read_motion(tmp_path / "a.pkl", Source(proportions))

@@ -13,8 +13,8 @@ from gsgan.motion.character import Animation
 from gsgan.motion.rig import REQUIRED
 from gsgan.motion.rotations import axis_angle, rotation
 from gsgan.motion.standard import ROOM, known_joints
-from gsgan.synthetic.bvh_motion import BvhMotion
 from gsgan.synthetic.posing import Choreography
+from gsgan.synthetic.recorded_motion import RecordedMotion
 from gsgan.utils.errors import DataError
 
 STEP = 1 / 30
@@ -79,7 +79,7 @@ def test_a_written_motion_is_read_back(tmp_path, person, signing, name, axes, sc
     path = write_bvh(
         tmp_path / "a.bvh", person, signing, STEP, name=name, axes=axes, scale=scale, order=order
     )
-    motion = BvhMotion(person, path)
+    motion = RecordedMotion(person, path)
     assert motion.duration == pytest.approx(60 * STEP)
     read = motion.at(np.arange(60) * STEP)
     # the first frame faces -Y
@@ -116,15 +116,15 @@ def test_other_proportions_and_missing_bones(tmp_path, person, signing):
     plain = mannequin(
         lambda bone: ("Hand" in bone[5:] and len(bone) > 9) or bone in ("Neck", "Spine2")
     )
-    motion = BvhMotion(plain, path).at(np.array([0.5]))
+    motion = RecordedMotion(plain, path).at(np.array([0.5]))
     assert motion.rotations.shape == (1, len(plain.bones), 3, 3)
     few = write_bvh(tmp_path / "b.bvh", plain, Choreography(plain).at(np.array([22.0])), STEP)
-    read = BvhMotion(person, few).at(np.array([0.0, 1.0]))  # a single frame stays
+    read = RecordedMotion(person, few).at(np.array([0.0, 1.0]))  # a single frame stays
     np.testing.assert_array_equal(read.joints[0], read.joints[1])
 
 
 def test_any_times_are_interpolated_and_named(tmp_path, person, signing):
-    motion = BvhMotion(person, write_bvh(tmp_path / "clip.bvh", person, signing, STEP))
+    motion = RecordedMotion(person, write_bvh(tmp_path / "clip.bvh", person, signing, STEP))
     near = motion.at(np.array([10.5 * STEP]))
     apart = angles(*motion.at(np.array([10, 11]) * STEP).rotations)
     half = angles(motion.at(np.array([10 * STEP])).rotations, near.rotations)[0]
@@ -140,7 +140,7 @@ def test_any_times_are_interpolated_and_named(tmp_path, person, signing):
 @pytest.mark.parametrize(("metres", "kept"), [(0.8, True), (9.0, False)])
 def test_long_ways_become_a_treadmill(tmp_path, person, metres, kept):
     path = write_bvh(tmp_path / "a.bvh", person, travelling(person, metres), STEP)
-    hips = BvhMotion(person, path).at(np.arange(60) * STEP).joints[:, 0]
+    hips = RecordedMotion(person, path).at(np.arange(60) * STEP).joints[:, 0]
     assert np.abs(hips[:, :2] - hips[:, :2].mean(axis=0)).max() <= ROOM
     assert np.ptp(hips[:, 1]) == pytest.approx(metres if kept else 0, abs=0.01)
 
@@ -148,7 +148,7 @@ def test_long_ways_become_a_treadmill(tmp_path, person, metres, kept):
 def test_feet_are_put_on_the_floor(tmp_path, person, signing):
     raised = replace(signing, joints=signing.joints + np.array([3.0, 1.0, 0.7]))
     path = write_bvh(tmp_path / "a.bvh", person, raised, STEP)
-    motion = BvhMotion(person, path).at(np.linspace(0, 2, 100))
+    motion = RecordedMotion(person, path).at(np.linspace(0, 2, 100))
     for R, joints in zip(motion.rotations, motion.joints, strict=True):
         assert -0.005 < person.skinned(R, joints)[0][:, 2].min() < 0.005
     foot = motion.joints[:, person.bones.index("LeftToeBase"), :2]
@@ -162,7 +162,7 @@ def test_a_file_without_a_required_joint(tmp_path, person, signing):
     with pytest.raises(
         DataError, match=r"a\.bvh: no joint found for LeftUpLeg, LeftLeg, .*LeftUpX"
     ):
-        BvhMotion(person, path)
+        RecordedMotion(person, path)
     assert len(REQUIRED) == 13
 
 
@@ -195,5 +195,5 @@ def test_damaged_files_end_in_one_sentence(tmp_path, person, whole, damage, mess
     path = tmp_path / "a.bvh"
     path.write_text(damage(whole))
     with pytest.raises(DataError, match=message) as error:
-        BvhMotion(person, path)
+        RecordedMotion(person, path)
     assert "a.bvh" in str(error.value)

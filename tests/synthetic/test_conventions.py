@@ -10,8 +10,8 @@ from mannequin import mannequin
 from gsgan.motion.character import Animation
 from gsgan.motion.readers import Source, read_motion
 from gsgan.motion.rotations import axis_angle
-from gsgan.synthetic.bvh_motion import BvhMotion
 from gsgan.synthetic.posing import Choreography
+from gsgan.synthetic.recorded_motion import RecordedMotion
 
 STEP = 1 / 30
 
@@ -62,7 +62,7 @@ def test_landmarks_agree(tmp_path, person, acted, source, as_t_pose, name):
 def test_the_subject_moves_alike(tmp_path, person, acted, as_t_pose, name):
     path = CONVENTIONS[name].write(tmp_path / "a.bvh", person, acted, STEP)
     times = np.arange(len(acted.joints)) * STEP
-    read, expected = (BvhMotion(person, file).at(times) for file in (path, as_t_pose))
+    read, expected = (RecordedMotion(person, file).at(times) for file in (path, as_t_pose))
     away = np.linalg.norm(axis_angle(expected.rotations.mT @ read.rotations), axis=-1)
     assert np.degrees(away).max() < 2.5  # arms lowered by 85 degrees: 2.0, of twist
     assert np.abs(read.joints - expected.joints).max() < 1e-3

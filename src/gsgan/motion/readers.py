@@ -31,6 +31,7 @@ from gsgan.scene import BodyPose
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.utils.arrays import as_floats, expect_array
 from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.pickles import read_npy, read_pickle
 
 Float = NDArray[np.float64]
 
@@ -48,6 +49,11 @@ SHAPE_KEYS = ("betas", "shapes")
 WITHOUT_ROOT = (63, 69, 153, 162)  # numbers of poses of SMPL-X's body, SMPL, SMPL-H, SMPL-X
 LANDMARK = ("x", "y", "z", "visibility")
 RATE_KEYS = ("fps", "mocap_framerate", "mocap_frame_rate")
+SCALE = "smpl_scaling"  # of AIST++: units of its translations in a metre
+ARRAYS = (
+    *("p", "conf", "theta", "visibility", SCALE, *WORLD_KEYS, *POSE_KEYS, *PART_KEYS, *ROOT_KEYS),
+    *(*MOVE_KEYS, *SHAPE_KEYS, *RATE_KEYS),
+)
 SMPL_BODY = 22  # joints that SMPL, SMPL-H and SMPL-X share
 LEG_UNITS = {"metres": 1.0, "decimetres": 0.1, "centimetres": 0.01, "inches": 0.0254}
 LEG_UNITS |= {"millimetres": 0.001, "CMU units (inches / 0.45)": 0.0254 / 0.45}
@@ -94,8 +100,21 @@ def read_motion(path: Path, source: Source) -> Clip:
 
 def read_npz(path: Path, source: Source) -> Clip:
     """A motion in an npz file; the names of its arrays decide the kind."""
-    keys = ("p", "conf", "theta", "visibility", *WORLD_KEYS, *POSE_KEYS, *PART_KEYS, *ROOT_KEYS)
-    arrays = read_arrays(path, (*keys, *MOVE_KEYS, *SHAPE_KEYS, *RATE_KEYS))
+    return _by_names(path, read_arrays(path, ARRAYS), source)
+
+
+def read_dictionary(path: Path, source: Source) -> Clip:
+    """A pickled dictionary of arrays, as of AIST++ (.pkl) or a frame of ZJU-MoCap (.npy)."""
+    content = (read_npy if path.suffix.lower() == ".npy" else read_pickle)(path)
+    if not isinstance(content, dict):
+        raise DataError(f"{path} holds no dictionary; expected one of arrays, such as 'poses'")
+    arrays = {key: as_floats(content[key]) for key in ARRAYS if key in content}
+    if empty := [key for key, values in arrays.items() if not values.size]:
+        raise DataError(f"{path}: {empty[0]!r} must be an array of numbers")
+    return _by_names(path, arrays, source)
+
+
+def _by_names(path: Path, arrays: dict[str, NDArray[Any]], source: Source) -> Clip:
     rate = _first(arrays, RATE_KEYS)
     fps = None if rate is None else rate_of(path, rate)
     if "p" in arrays:
@@ -180,7 +199,7 @@ def _smpl(path: Path, arrays: dict[str, Any], fps: float | None, source: Source)
     model, poses = read_smpl(source.smpl), _smpl_poses(path, arrays)
     moves = _first(arrays, MOVE_KEYS)
     moves = np.zeros((len(poses), 3)) if moves is None else np.asarray(moves, np.float64)
-    moves = moves.reshape(len(poses), 3)
+    moves = moves.reshape(len(poses), 3) / arrays.get(SCALE, 1.0)
     betas = np.asarray(_first(arrays, SHAPE_KEYS, np.zeros(10)), np.float64)
     betas = np.median(betas.reshape(-1, betas.shape[-1]), axis=0)[: model.shapedirs.shape[-1]]
     good = np.isfinite(poses).all(1) & np.isfinite(moves).all(1)
@@ -311,7 +330,7 @@ def _with_visibility(path: Path, points: NDArray[Any], visibility: Any) -> Float
 # -- rigs
 
 
-def read_bvh_motion(path: Path, source: Source) -> Clip:
+def read_recorded_motion(path: Path, source: Source) -> Clip:
     """A BVH file of a person; the unit is inferred from the length of the legs."""
     return _rig(path, read_bvh(path), None, source)
 
@@ -351,8 +370,10 @@ def read_trc(path: Path, source: Source) -> Clip:
 
 READERS: dict[str, Callable[[Path, Source], Clip]] = {
     ".npz": read_npz,
+    ".pkl": read_dictionary,
+    ".npy": read_dictionary,
     ".json": read_mediapipe_json,
-    ".bvh": read_bvh_motion,
+    ".bvh": read_recorded_motion,
     ".amc": read_amc_motion,
     ".trc": read_trc,
     ".pose": lambda path, source: read_pose(path, source.subject),

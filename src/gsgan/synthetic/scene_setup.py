@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 from gsgan.body.free import free_body
 from gsgan.data.cameras import DISTORTION_LENGTHS
 from gsgan.motion.character import Character
-from gsgan.synthetic.bvh_motion import BvhMotion
 from gsgan.synthetic.camera import SceneCamera, look_at, through_lens, zoomed
 from gsgan.synthetic.choreography import EVERYDAY, held_out
 from gsgan.synthetic.controls import frame_times
 from gsgan.synthetic.free_subject import free_character, free_pose
 from gsgan.synthetic.gltf import avatar_names, avatar_path, read_character
 from gsgan.synthetic.posing import Choreography
+from gsgan.synthetic.recorded_motion import RECORDED, RecordedMotion
 from gsgan.synthetic.secondary import Moving, Secondary
 from gsgan.synthetic.signs import SIGNS, split_signs
 from gsgan.synthetic.tint import make_tints
@@ -96,8 +96,9 @@ class SceneSettings:
             f"avatar must be {', '.join(named)} or the path of a rigged .glb, got {self.avatar!r}",
         )
         _require(
-            self.motion in tuple(PROGRAMMES) or str(self.motion).endswith(".bvh"),
-            f"motion must be {', '.join(PROGRAMMES)} or the path of a .bvh, got {self.motion!r}",
+            self.motion in tuple(PROGRAMMES) or str(self.motion).endswith(RECORDED),
+            f"motion must be {', '.join(PROGRAMMES)} or the path of a .bvh or .amc, "
+            f"got {self.motion!r}",
         )
         one_of("data.source.secondary", self.secondary, (True, False))
         _require(
@@ -178,7 +179,7 @@ class Scene:
         self.source: Moving = (
             Choreography(character, settings.seed, PROGRAMMES[settings.motion])
             if settings.motion in PROGRAMMES
-            else BvhMotion(character, Path(settings.motion).expanduser(), settings.seed)
+            else RecordedMotion(character, Path(settings.motion).expanduser(), settings.seed)
         )
         times = frame_times(settings.frames, self.source.duration)
         self.motion = self.source.at(times)

@@ -1,4 +1,4 @@
-"""A BVH file's motion on a character."""
+"""The motion of a BVH or AMC file on a character."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from gsgan.motion.asf import asf_of, read_amc
 from gsgan.motion.bvh import read_bvh
 from gsgan.motion.character import Animation, Character
 from gsgan.motion.rig import LEG, SIDES, SIGN, Pose, Rig
@@ -15,13 +16,14 @@ from gsgan.motion.rotations import Array
 from gsgan.motion.standard import drift, floor_under, standard_motion
 from gsgan.synthetic.posing import blinks
 
+RECORDED = (".bvh", ".amc")  # suffixes
 # A foot stands where it is this low and slow, legs and legs per second.
 CONTACT_HEIGHT, CONTACT_SPEED = 0.04, 0.3
 SECTION = 2.5  # seconds that share a passage's name
 
 
-class BvhMotion:
-    """A BVH file's motion on a character, at any times; after its end the last frame stays.
+class RecordedMotion:
+    """The motion of a file on a character, at any times; after its end the last frame stays.
 
     The person faces -Y in the first frame. A motion within `ROOM` of the middle of its path stays
     as recorded. Of a longer one, only what is faster than the smoothed path is kept, so that the
@@ -31,19 +33,20 @@ class BvhMotion:
 
     Args:
         character: the subject. What its rig or the file lacks rests on its parent.
-        path: a BVH file of a person, joints named as by Mixamo, MakeHuman, CMU, Blender, VRM, ….
+        path: a BVH file of a person, joints named as by Mixamo, MakeHuman, CMU, Blender, VRM, …;
+            or an AMC file with its ASF skeleton beside it.
         seed: of the blinks.
 
     Raises:
-        DataError: when the file is not a whole BVH file, or a joint of the limbs is not found.
+        DataError: when the file is damaged, or a joint of the limbs is not found.
     """
 
     def __init__(self, character: Character, path: Path, seed: int = 0) -> None:
         self.rig, self.seed, self.name = Rig(character), seed, path.stem
-        bvh = read_bvh(path)
-        self.duration = len(bvh.root) * bvh.frame_time
-        self._times = np.arange(len(bvh.root), dtype=np.float64) * bvh.frame_time
-        standard = standard_motion(bvh, path)
+        read = read_bvh(path) if path.suffix == ".bvh" else read_amc(path, asf_of(path))[0]
+        self.duration = len(read.root) * read.frame_time
+        self._times = np.arange(len(read.root), dtype=np.float64) * read.frame_time
+        standard = standard_motion(read, path)
         self._turns, joint = standard.turns, self.rig.joint
         offset = (joint["LeftUpLeg"] + joint["RightUpLeg"]) / 2 - joint["Hips"]
         thighs = (standard.joints["LeftUpLeg"] + standard.joints["RightUpLeg"]) / 2
@@ -52,7 +55,7 @@ class BvhMotion:
         width = float(np.median(np.linalg.norm(across, axis=1))) * self.rig.leg / standard.leg
         # Legs that go straight down from wider hips would cross below narrow ones.
         self._apart = max(0.0, width - self.rig.length("LeftUpLeg", "RightUpLeg")) / 2
-        self._settle(bvh.frame_time)
+        self._settle(read.frame_time)
 
     def _settle(self, step: float) -> None:
         """Moves the hips near the origin and to the floor, and finds the ankles' targets."""
