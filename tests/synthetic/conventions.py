@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from gsgan.motion.asf import asf_of, read_amc
 from gsgan.motion.character import Animation, Character
 from gsgan.motion.rotations import between, rotation
+from gsgan.motion.standard import known_joints
 
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 X_FORWARD = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # Z up; the person faces +X
@@ -102,6 +104,53 @@ def write_bvh(
         lines.append(" ".join(f"{x:.8f}" for x in row))
     path.write_text("\n".join(lines) + "\n")
     return path
+
+
+# -- recorded motions
+
+CMU = {"root": "Hips", "lowerback": "Spine", "upperback": "Spine1", "thorax": "Spine2"}
+CMU |= {"lowerneck": "Neck", "upperneck": "Neck1", "head": "Head"}
+CMU_SIDED = {"clavicle": "Shoulder", "lowerforearmtwist": "ForeArmTwist"}
+CMU_SIDED |= {"fingers": "HandMiddle1", "thumb": "HandThumb1"}
+
+
+@dataclass(frozen=True)
+class Bones:
+    """What `write_bvh` needs of a character."""
+
+    bones: tuple[str, ...]
+    parents: np.ndarray
+    joints: np.ndarray
+
+
+def recorded(path: Path, every: int) -> tuple[Bones, Animation]:
+    """An AMC motion with Mixamo's bone names, Z up; each ``every``-th frame."""
+    rig, metres = read_amc(path, asf_of(path))
+    known = {j: bone for bone, j in known_joints(rig.names).items()}
+
+    def bone(j: int) -> str:
+        name, side = rig.names[j], {"l": "Left", "r": "Right"}.get(rig.names[j][0], "")
+        return (
+            CMU.get(name)
+            or (side + CMU_SIDED.get(name[1:], "")) * (name[1:] in CMU_SIDED)
+            or (known.get(j, name))
+        )
+
+    def above(j: int) -> int:
+        parent = rig.parents[j]
+        return parent if parent < 0 or parent in kept else above(parent)
+
+    kept = [j for j, n in enumerate(rig.names) if not n.endswith((" end", "hipjoint"))]
+    parents = [kept.index(above(j)) if above(j) >= 0 else -1 for j in kept]
+    B = Y_UP.T
+    moved = Animation(
+        B @ rig.rotations[::every][:, kept] @ B.T,
+        metres * rig.posed()[::every][:, kept] @ B.T,
+        {},
+        (),
+    )
+    rest = metres * rig.zero_pose()[kept] @ B.T
+    return Bones(tuple(map(bone, kept)), np.array(parents), rest), moved
 
 
 # -- zero poses: `own` of `write_bvh`

@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
-from conventions import CONVENTIONS
+from conventions import CONVENTIONS, recorded
 from mannequin import mannequin
+from tiny_characters import from_front
 
+from gsgan.motion.asf import asf_of, read_amc
 from gsgan.motion.character import Animation
 from gsgan.motion.readers import Source, read_motion
+from gsgan.motion.rig import SIDES
 from gsgan.motion.rotations import axis_angle
+from gsgan.motion.standard import standard_motion
 from gsgan.synthetic.posing import Choreography
 from gsgan.synthetic.recorded_motion import RecordedMotion
+from gsgan.synthetic.scene_setup import load_character
+from gsgan.synthetic.trace import Appearance, Light, PosedCharacter
 
 STEP = 1 / 30
+CMU = Path(__file__).parents[3] / "shared/data/motion/cmu"
+LIMBS, FEET = [*range(11, 17), *range(23, 29)], [*range(29, 33)]  # landmarks
 
 
 def neutral(person, frames: int) -> Animation:
@@ -66,3 +76,61 @@ def test_the_subject_moves_alike(tmp_path, person, acted, as_t_pose, name):
     away = np.linalg.norm(axis_angle(expected.rotations.mT @ read.rotations), axis=-1)
     assert np.degrees(away).max() < 2.5  # arms lowered by 85 degrees: 2.0, of twist
     assert np.abs(read.joints - expected.joints).max() < 1e-3
+
+
+@pytest.mark.skipif(not CMU.is_dir(), reason="no motion files here")
+@pytest.mark.parametrize(
+    "clip",  # running, climbing, uneven ground
+    ["02_03", *(pytest.param(clip, marks=pytest.mark.slow) for clip in ("01_14", "03_01"))],
+)
+def test_recorded_motions_agree(tmp_path, source, clip):
+    """Joints of the limbs do, whatever is known of the zero pose; other landmarks are near."""
+    rig, motion = recorded(CMU / f"{clip}.amc", 12)
+    direct = read_motion(CMU / f"{clip}.amc", source).p[::12]
+    for name, convention in CONVENTIONS.items():
+        p = read_motion(convention.write(tmp_path / f"{name}.bvh", rig, motion, 0.1), source).p
+        away = np.linalg.norm(p - direct, axis=-1)
+        assert away[:, LIMBS].max() < 1e-3, name
+        assert np.median(away[:, FEET]) < 0.04, name
+
+
+@pytest.mark.skipif(not CMU.is_dir(), reason="no motion files here")
+def test_resting_feet_of_splayed_rigs_are_flat():
+    """CMU's zero pose stands with legs apart and with soles at right angles to them."""
+    path = CMU / "02_03.amc"
+    turns = standard_motion(read_amc(path, asf_of(path))[0], path).turns
+    for side in SIDES:
+        assert np.degrees(np.abs(np.arcsin(turns[side + "Foot"][:, 2, 0]))).mean() < 10
+
+
+@pytest.fixture(scope="module")
+def draw(person, acted, tmp_path_factory):
+    """Draws two frames of a convention's file as ground truth is drawn: ``[2, H, W, 3]``."""
+    character, folder = load_character("blouse"), tmp_path_factory.mktemp("drawn")
+    appearance = Appearance(character)
+
+    def images(name: str) -> np.ndarray:
+        path = CONVENTIONS[name].write(folder / f"{name}.bvh", person, acted, STEP)
+        poses = RecordedMotion(character, path).at(np.array([20.0, 50.0]) * STEP)
+        pairs = zip(poses.rotations, poses.joints, strict=True)
+        skinned = [character.skinned(*pose) for pose in pairs]
+        view = from_front(64, focal=80, height=0.9)
+        return np.stack(
+            [PosedCharacter(appearance, *s, Light()).render(view, 2)[0] for s in skinned]
+        )
+
+    return images
+
+
+@pytest.fixture(scope="module")
+def of_t_pose(draw):
+    return draw("t_pose")
+
+
+@pytest.mark.slow  # 20 seconds
+@pytest.mark.parametrize("name", list(CONVENTIONS)[1:])
+def test_the_same_person_is_drawn(draw, of_t_pose, name):
+    image = draw(name)
+    person = (of_t_pose.sum(-1) > 0) | (image.sum(-1) > 0)
+    assert person.mean() > 0.05
+    assert np.sqrt(((image - of_t_pose)[person] ** 2).mean()) < 0.03

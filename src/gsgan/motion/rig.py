@@ -23,6 +23,7 @@ SPINE = ("Spine", "Spine1", "Spine2")
 ARM, LEG = ("Arm", "ForeArm", "Hand"), ("UpLeg", "Leg", "Foot")
 REQUIRED = ("Hips", *(side + bone for side in SIDES for bone in LEG + ARM))
 FOREARM_TWIST = 0.55  # the forearm's share of the hand's twist: without twist bones, half each
+SPLAYED = 0.17  # sine of the angle of legs apart from which feet may be tilted with them
 REACH = 0.998  # longest reach of a limb in full lengths: below 1, so that it always bends
 SOLE = 0.02  # metres above the floor up to which a vertex of the resting foot is its sole
 
@@ -47,10 +48,16 @@ def rest_turns(joint: Mapping[str, Array]) -> dict[str, Array]:
     """Turns ``[3, 3]`` of a rest pose's limbs and fingers, from joint positions ``[3]`` by name.
 
     The other bones rest in the standard pose: where spines, collarbones and feet point differs
-    between rigs more than between people.
+    between rigs more than between people. Feet at right angles to legs that stand apart, as CMU's,
+    are tilted with them.
     """
     turns = {}
     for side in SIDES:
+        shin = unit(joint[side + "Foot"] - joint[side + "Leg"])
+        toe = unit(joint.get(side + "ToeBase", joint[side + "Foot"]) - joint[side + "Foot"])
+        tilt = between(np.array([0.0, 0, -1]), shin * (1, 0, 1))
+        if abs(shin[0]) > SPLAYED and abs(tilt[:, 0] @ toe) < abs(toe[0]):
+            turns[side + "Foot"] = turns[side + "ToeBase"] = tilt
         for part in (LEG, ARM):
             first, middle, end = (joint[side + bone] for bone in part)
             upper = between(limb_axes(part, side)[0], middle - first)

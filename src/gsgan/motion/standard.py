@@ -20,7 +20,7 @@ from gsgan.utils.errors import DataError
 
 STANDING = np.radians(40)  # largest tilt of trunk and legs in a zero pose that is a standing person
 NEUTRAL = np.radians(10)  # the same, in a frame that stands so well that it serves as a zero pose
-UPRIGHT = np.radians(30)  # largest tilt of the trunk in frames whose average serves otherwise
+UPRIGHT = np.radians(30)  # largest tilt of the trunk in frames that may serve otherwise
 SELDOM = 0.1  # share of frames in which a person stands, in motions on the floor
 SAME = np.radians(1)  # frames that stand as well as the best one
 MOST = 100  # frames that calibrate
@@ -188,16 +188,15 @@ def standard_motion(rig: RigMotion, path: Path, up: str | None = None) -> Standa
         axis["xyz".index(up[-1])] = -1.0 if up.startswith("-") else 1.0
     known = _by_side(posed, known, axis)
     reference = _reference(rig, posed, known, axis, own)
-    same = reference.zero and np.allclose(reference.axes[0, 2], axis)
-    axes = reference.axes[0] if same else person_axes(posed[:1], known, axis)[0]
+    axes = person_axes(posed[:1], known, axis)[0]  # by positions: whatever the zero pose is
     R, turns = _turns(rig, axes, known, reference)
+    joints = {bone: posed[:, j] @ axes.T for bone, j in known.items()}
     if not reference.zero:
-        _bend_in_plane(turns, {bone: posed[:, j] @ axes.T for bone, j in known.items()})
-    ahead = turns["Hips"][0] @ (0.0, -1.0, 0.0)
-    yaw = rotation(np.array([0, 0, -np.arctan2(ahead[0], -ahead[1])]))
-    turns = {bone: yaw @ turn for bone, turn in turns.items()}
-    turns |= _trunk(rig, known, yaw @ R)
-    joints = {bone: posed[:, j] @ (yaw @ axes).T for bone, j in known.items()}
+        _bend_in_plane(turns, joints)
+        _point_hands(turns, joints)
+        if not reference.neutral:
+            _flatten_feet(turns, joints)
+    turns |= _trunk(rig, known, R)
     hip, knee, ankle = (joints["Left" + bone] for bone in LEG)
     thigh, shin = (np.linalg.norm(a - b, axis=1) for a, b in ((hip, knee), (knee, ankle)))
     at = int(np.abs(axis).argmax())
@@ -259,9 +258,11 @@ def _upward(p: Array, known: dict[str, int], usual: Array | None = None) -> Arra
     chest, hips, feet = (_middle(p, known, bone) for bone in ("Arm", "UpLeg", "Foot"))
     trunk, legs = unit(chest - hips), unit(hips - feet)
     axes = np.concatenate([np.eye(3), -np.eye(3)])
-    above = ((trunk @ axes.T > 0.5) & (legs @ axes.T > 0.5)).mean(axis=0)
-    if usual is not None and above[(axes @ usual).argmax()] > SELDOM:
+    least = np.minimum(trunk @ axes.T, legs @ axes.T)
+    standing = (least > np.cos(UPRIGHT)).mean(axis=0)
+    if usual is not None and standing[(axes @ usual).argmax()] > SELDOM:
         return usual
+    above = (least > 0.5).mean(axis=0)
     return np.asarray(axes[(above + 1e-3 * (trunk + legs).mean(axis=0) @ axes.T).argmax()])
 
 
@@ -341,7 +342,8 @@ def _turns(
     for bone, j in known.items():
         if bone.endswith("4"):  # a finger's tip follows its last bone
             continue
-        rest = np.stack([turn.get(bone, np.eye(3)) for turn in at_rest])
+        hand = re.sub("(Hand).+", r"\1", bone)  # fingers of one joint rest as the hand
+        rest = np.stack([turn.get(bone, turn.get(hand, np.eye(3))) for turn in at_rest])
         turns[bone] = R[:, j] @ _mean(own[:, j] @ back @ rest)
     trunk = np.stack([turn.get("Hips", np.eye(3)) for turn in at_rest])
     free = np.stack([_mean(own[:, j] @ back @ trunk) for j in range(own.shape[1])])
@@ -377,6 +379,46 @@ def _bend_in_plane(turns: dict[str, Array], joints: dict[str, Array]) -> None:
                 turns[first], turns[second] = turns[first] @ twisted, turns[second] @ twisted
                 if part == ARM and f"{side}HandMiddle1" not in joints:  # its palm is not known
                     turns[end] = turns[end] @ twisted
+
+
+def _point_hands(turns: dict[str, Array], joints: dict[str, Array]) -> None:
+    """Points hands without a whole palm along their middle finger, thumbs to the front."""
+    for side in SIDES:
+        hand, middle = side + "Hand", f"{side}HandMiddle1"
+        if middle not in joints or f"{side}HandPinky1" in joints:
+            continue
+        along, _ = limb_axes(ARM, side)
+        calibration = between(along, _local(turns, joints, hand, middle))
+        thumbs = [bone for k in (1, 2, 3) if (bone := f"{side}HandThumb{k}") in joints]
+        if thumbs:
+            thumb = calibration.T @ _local(turns, joints, hand, thumbs[-1]) * (0, 1, 1)
+            calibration = calibration @ between(np.array([0.0, -1, 0]), thumb)
+        for bone in turns:
+            if bone.startswith(hand):
+                turns[bone] = turns[bone] @ calibration
+
+
+def _flatten_feet(turns: dict[str, Array], joints: dict[str, Array]) -> None:
+    """Pitches the feet so that they are flat, on average, in the frames in which they rest."""
+    for side in SIDES:
+        foot, toe = side + "Foot", side + "ToeBase"
+        if toe not in joints:
+            continue
+        ahead = unit(joints[toe] - joints[foot])
+        ends = np.stack([joints[foot], joints[toe]])
+        steps = np.diff(ends, axis=1, prepend=ends[:, :2][:, -1:])
+        speed = np.linalg.norm(steps, axis=-1)
+        rests = np.argsort(speed.max(axis=0))[: 1 + len(ahead) // 5]
+        down = float(np.median(ahead[rests, 2]))
+        flat = np.array([0, -np.sqrt(1 - down**2), down])
+        turns[foot] = turns[foot] @ between(flat, _local(turns, joints, foot, toe))
+        turns[toe] = turns[toe] @ _mean(turns[toe][rests].mT @ turns[foot][rests])
+
+
+def _local(turns: dict[str, Array], joints: dict[str, Array], bone: str, end: str) -> Array:
+    """``[3]`` direction from a bone's joint to another, in the bone's axes, mean over frames."""
+    away = unit(joints[end] - joints[bone])[..., None]
+    return unit((turns[bone].mT @ away)[..., 0].mean(axis=0))
 
 
 def _mean(R: Array) -> Array:
