@@ -91,7 +91,7 @@ def test_recorded_motions_agree(tmp_path, source, clip):
         p = read_motion(convention.write(tmp_path / f"{name}.bvh", rig, motion, 0.1), source).p
         away = np.linalg.norm(p - direct, axis=-1)
         assert away[:, LIMBS].max() < 1e-3, name
-        assert np.median(away[:, FEET]) < 0.04, name
+        assert np.median(away[:, FEET]) < 0.05, name
 
 
 @pytest.mark.skipif(not CMU.is_dir(), reason="no motion files here")
