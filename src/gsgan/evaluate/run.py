@@ -11,7 +11,8 @@ from typing import Any
 import pandas as pd
 import torch
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import ConfigKeyError
 from rich.console import Console
 from rich.progress import track
 
@@ -39,8 +40,14 @@ from gsgan.evaluate.scores import Predict, Scorer, SplitScores, empty, painter, 
 from gsgan.metrics.lpips import lpips
 from gsgan.metrics.regions import BACKGROUNDS
 from gsgan.model.assemble import build_data
-from gsgan.model.runs import load_avatar
-from gsgan.model.stored import CHECKPOINT, DataPaths, load_config, read_checkpoint
+from gsgan.model.runs import avatar_of, load_avatar
+from gsgan.model.stored import (
+    CHECKPOINT,
+    DataPaths,
+    load_config,
+    read_checkpoint,
+    read_config,
+)
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.tensors import pick_device
@@ -63,10 +70,12 @@ def evaluate_config(config: DictConfig) -> Results:
         )
     kind, others = "run", ["data", "protocol", "out", "method"]
     if config.run is None:
-        kind, others = "predictions", ["data_root", "data_smpl", "drive"]
+        kind, others = "predictions", ["data_root", "data_smpl", "drive", "on"]
     for key in others:
         if config.get(key) is not None:
             raise ConfigError(f"{key}= cannot be given with {kind}=; leave it out")
+    if config.get("on") is not None and config.data_root is not None:
+        raise ConfigError("data_root= cannot be given with on=; leave it out")
     if config.background not in (None, *BACKGROUNDS):
         raise ConfigError(f"background must be black, white or null; got {config.background!r}")
     if config.get("drive") not in (None, "skeleton"):
@@ -79,15 +88,22 @@ def evaluate_config(config: DictConfig) -> Results:
 
 def evaluate_folder(config: DictConfig, console: Console, device: torch.device) -> Results:
     """Loads the avatar of ``config.run`` and scores it."""
-    folder = Path(config.run).expanduser()
-    stored = load_config(folder, DataPaths.from_config(config))
-    data = build_data(stored)
-    avatar, marks = load_avatar(folder, stored, data)
-    state = read_checkpoint(folder / CHECKPOINT)["gsgan"]
-    out = folder
+    folder, other = Path(config.run).expanduser(), config.get("on") is not None
+    out, checkpoint = folder, read_checkpoint(folder / CHECKPOINT)
+    state = checkpoint["gsgan"]
+    if other:
+        stored = read_config(folder)
+        avatar, marks = avatar_of(folder, stored, checkpoint, config.data_smpl), [*state["marks"]]
+        data = build_data(other_capture(stored, config.on))
+        name = Path(data.layout.root).resolve().name
+        out, marks = folder / "on" / name, [*marks, f"on another capture: {name}", BY_SKELETON]
+    else:
+        stored = load_config(folder, DataPaths.from_config(config))
+        data = build_data(stored)
+        avatar, marks = load_avatar(folder, stored, data)
     if config.background not in (None, _measures(data).background):  # the protocol's scores stay
-        out = folder / f"on_{config.background}"
-    if config.drive is not None:
+        out = out / f"on_{config.background}"
+    if config.drive is not None and not other:
         out, marks = out / "by_skeleton", [*marks, BY_SKELETON]
     method = trained(
         folder,
@@ -96,10 +112,31 @@ def evaluate_folder(config: DictConfig, console: Console, device: torch.device) 
         train_seconds=state.get("train_seconds"),
         trained_by=state.get("code"),
     )
-    predict = painter(avatar.to(device), solve=config.drive is not None)
+    solve = config.drive is not None
+    predict = painter(avatar.to(device), solve=solve, colours=not other)
     return evaluate_method(
         out, config, console, data, predict, method=method, device=device, marks=marks
     )
+
+
+def other_capture(stored: DictConfig, on: str | DictConfig) -> DictConfig:
+    """A run's config with the data of another capture: its folder, or the keys that differ.
+
+    Body poses are left out, as they are of another body, and so are the run's splits.
+
+    Raises:
+        ConfigError: on a key that the run's data lacks.
+    """
+    config = stored.copy()
+    splits = ("train_cameras", "test_cameras", "train_frames", "test_frames")
+    own = dict.fromkeys(("root", "protocol", *splits)) | {"body": "none"}
+    config.data.merge_with(own)
+    OmegaConf.set_struct(config, True)
+    try:
+        config.data.merge_with({"root": on} if isinstance(on, str) else on)
+    except ConfigKeyError as error:
+        raise ConfigError(f"on: {str(error).splitlines()[0]} of the run's data") from None
+    return config
 
 
 def evaluate_predictions(config: DictConfig, console: Console, device: torch.device) -> Results:

@@ -173,18 +173,20 @@ class SplitScores:
     grid: list[dict[str, Tensor]] = field(default_factory=list)
 
 
-def painter(avatar: Avatar, *, solve: bool = False) -> Predict:
+def painter(avatar: Avatar, *, solve: bool = False, colours: bool = True) -> Predict:
     """The predictions of an avatar in eval mode: I_pred as ``full``, Step I's colour as ``splat``,
     each with its own alpha.
 
     Args:
         avatar: to evaluate.
         solve: solve every body pose from the skeleton, in place of the data's.
+        colours: correct for the cameras' colours; False where they are not those of training.
     """
 
     def predict(frame: Frame, item: Item) -> Prediction:
+        *inputs, camera_index = (replace(frame, body=None) if solve else frame).inputs
         with torch.no_grad():
-            painting = avatar(*(replace(frame, body=None) if solve else frame).inputs)
+            painting = avatar(*inputs, camera_index if colours else None)
         assert painting.image is not None
         images, alphas = {FULL: painting.image}, {FULL: painting.alpha}
         if painting.colour is not None:

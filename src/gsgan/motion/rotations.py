@@ -33,7 +33,7 @@ def between(a: Array, b: Array) -> Array:
     return rotation(unit(axis) * angle[..., None])
 
 
-def blend(a: Array, b: Array, share: float) -> Array:
+def blend(a: Array, b: Array, share: float | Array) -> Array:
     """Rotations on the shortest way from ``a`` to ``b``."""
     return a @ rotation(share * axis_angle(np.swapaxes(a, -1, -2) @ b))
 

@@ -48,6 +48,12 @@ class Controls:
         self.knuckle = still(*[[math.nan] * 3] * 2)
         self.pointing, self.facing = still(*[(0, -1, 0)] * 2), still(*[(-1, 0, 0)] * 2)
         self.foot = still(*[(0, 0)] * 2)  # [F, 2, 2] mirrored, body axes, metres from standing
+        # Limbs that leave steps and chest: their shares, in mirrored body axes on the floor. Feet:
+        # x, y, turned out, height, pitch (positive lifts the heel), the toes' share of it
+        self.free, self.hold = still(0, 0), still(0, 0)  # [F, 2] in [0, 1], of `step` and `grip`
+        self.step = still(*[(STANCE, 0, 0, 0, 0, 0)] * 2)  # [F, 2, 6]
+        self.knee = still(*[(0.1, -1, 0)] * 2)  # [F, 2, 3] where the knee of a free leg points
+        self.grip = still(*[(0.3, -0.1, 0.9)] * 2)  # [F, 2, 3] wrist; its hand: pointing, facing
         self.march = np.zeros(frames)  # [F] metres: least height of steps; 0: only where needed
         self.swing = np.zeros(frames)  # [F] share of the arms' swing with the legs
         self.mouth = np.zeros(frames)  # [F] opening with vowels, in [0, 1]

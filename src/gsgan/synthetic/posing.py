@@ -11,7 +11,7 @@ import numpy as np
 
 from gsgan.motion.character import Animation, Character
 from gsgan.motion.rig import ARM, FINGERS, LEG, SIDES, SIGN, SPINE, Pose, Rig, frame
-from gsgan.motion.rotations import Array, rotation, unit
+from gsgan.motion.rotations import Array, blend, rotation, unit
 from gsgan.synthetic import controls
 from gsgan.synthetic.choreography import EVERYDAY
 from gsgan.synthetic.controls import Controls, Programme, controls_at, passages_at, smoothstep
@@ -57,18 +57,23 @@ class Choreography:
         pose.set_turn("Hips", heading @ rotation(c.lean))
         pose.bend(SPINE, c.spine)
         pose.bend(("Neck", "Head"), c.head)
-        ankles = [self._foot(pose, side, *feet[i][:3]) for i, side in enumerate(SIDES)]
+        ankles = [
+            self._foot(pose, side, *_freed(c, i, *feet[i][:3])) for i, side in enumerate(SIDES)
+        ]
         pose.lower_hips(ankles)
         for i, side in enumerate(SIDES):
             middle = (c.path[:, 2:] + feet[i][0][:, 2:]) / 2
             pole = rotation(middle * Z) @ (0.1 * SIGN[side], -1.0, 0.0)
-            pose.reach(side, LEG, ankles[i], pole)
+            freed = (heading @ (c.knee[:, i] * (SIGN[side], 1, 1))[..., None])[..., 0]
+            pose.reach(side, LEG, ankles[i], pole + c.free[:, i, None] * (freed - pole))
             placed = None if np.isnan(c.knuckle[:, i]).any() else self._placed(pose, c, i, side)
             self._arm(pose, c, i, side, placed)
             self._hand(pose, c, i, side, placed)
         return pose.motion(self._face(c, times), passages_at(times, self.programme))
 
-    def _foot(self, pose: Pose, side: str, place: Array, height: Array, pitch: Array) -> Array:
+    def _foot(
+        self, pose: Pose, side: str, place: Array, height: Array, pitch: Array, toes: Array
+    ) -> Array:
         """Turns a foot, its toes flat while they stand; returns the ankle's position ``[F, 3]``."""
         joint, scale = self.rig.joint, self.rig.leg / controls.LEG
         ankle = joint[side + "Foot"]
@@ -76,7 +81,7 @@ class Choreography:
         heading = rotation(place[:, 2:] * Z)
         tilt = heading @ rotation(pitch[:, None] * X)
         pose.set_turn(side + "Foot", tilt)
-        off = 0.5 * pitch * smoothstep(height / 0.05)
+        off = pitch * np.maximum(0.5 * smoothstep(height / 0.05), toes)
         pose.set_turn(side + "ToeBase", heading @ rotation(off[:, None] * X))
         stand = scale * np.column_stack([place[:, :2], height])
         return stand + heading @ (toe * (0, 1, 1)) + tilt @ ((ankle - toe) * (0, 1, 1))
@@ -85,9 +90,7 @@ class Choreography:
         """Where the wrist has to be for the knuckle to be at its place, and the hand's turn."""
         joint, chest, sign = self.rig.joint, self.rig.chest, SIGN[side]
         scale, mirror = self.rig.arm / controls.ARM, np.array([sign, 1, 1])
-        along, palm = unit(c.pointing[:, i] * mirror), c.facing[:, i] * mirror
-        palm = unit(palm - (palm * along).sum(-1, keepdims=True) * along)
-        turn = pose.turn(chest) @ frame(along, palm) @ frame(sign * X, -Z).T
+        turn = pose.turn(chest) @ _hand_turn(c, i, side)
         middle = (joint["LeftArm"] + joint["RightArm"]) / 2
         origin = pose.position(chest) + pose.rotation(chest) @ (middle - joint[chest])
         place = scale * mirror * c.knuckle[:, i]
@@ -98,6 +101,13 @@ class Choreography:
             length = self.rig.turns[side + "Hand"].T @ length
         return knuckle - turn @ length, turn
 
+    def _gripping(self, c: Controls, i: int, side: str) -> Placed:
+        """Where `Controls.grip` places the wrist, and the hand's turn."""
+        scale, mirror = self.rig.leg / controls.LEG, np.array([SIGN[side], 1, 1])
+        heading = rotation(c.path[:, 2:] * Z)
+        wrist = c.path * (1, 1, 0) + (heading @ (c.grip[:, i] * mirror)[..., None])[..., 0]
+        return scale * wrist, heading @ _hand_turn(c, i, side)
+
     def _arm(
         self, pose: Pose, c: Controls, i: int, side: str, placed: Placed | None = None
     ) -> None:
@@ -107,6 +117,10 @@ class Choreography:
         if placed is not None:
             away = (placed[0] - pose.position(side + "Arm")) / scale
             wrist = (np.swapaxes(chest, -1, -2) @ away[..., None])[..., 0] * mirror
+        hold, grip = c.hold[:, i, None], self._gripping(c, i, side)[0]
+        away = (grip - pose.position(side + "Arm")) / scale
+        held = (np.swapaxes(chest, -1, -2) @ away[..., None])[..., 0] * mirror
+        wrist = wrist + hold * (held - wrist)
         lift = 0.4 * smoothstep((wrist[:, 2] + 0.15) / 0.6) - 0.05
         forth = 0.25 * smoothstep((-wrist[:, 1] - 0.2) / 0.3)
         raised = np.stack([0 * lift, -lift * SIGN[side], -forth * SIGN[side]], axis=1)
@@ -114,7 +128,7 @@ class Choreography:
         if collar in self.rig.index:
             pose.bend((collar,), raised)
         target = pose.position(side + "Arm") + scale * (chest @ (wrist * mirror)[..., None])[..., 0]
-        target = target if placed is None else placed[0]
+        target = target + hold * (grip - target) if placed is None else placed[0]
         pose.reach(side, ARM, target, (chest @ (c.elbow[:, i] * mirror)[..., None])[..., 0])
 
     def _hand(
@@ -123,7 +137,8 @@ class Choreography:
         """Turns the hand on the forearm, and bends the fingers."""
         roll = c.palm[:, i].clip(PRONATION, SUPINATION)[:, None]
         bend = rotation(-roll * X) @ rotation(c.flex[:, i, None] * SIGN[side] * Y)
-        pose.set_hand(side, pose.turn(side + "ForeArm") @ bend if placed is None else placed[1])
+        turn = pose.turn(side + "ForeArm") @ bend if placed is None else placed[1]
+        pose.set_hand(side, blend(turn, self._gripping(c, i, side)[1], c.hold[:, i, None]))
         thumbwards = -SIGN[side] * self.rig.turns[side + "Hand"][:, 2]
         for bone, finger, joint, hinge, straight, across in self.rig.fingers[side]:
             k = FINGERS.index(finger)
@@ -143,6 +158,26 @@ class Choreography:
             shapes[f"brow_up_{side}"] = c.brows.clip(0, 1)
             shapes[f"brow_down_{side}"] = (-c.brows).clip(0, 1)
         return shapes
+
+
+def _hand_turn(c: Controls, i: int, side: str) -> Array:
+    """``[F, 3, 3]`` the hand's turn in the axes of its `pointing` and `facing`."""
+    mirror = np.array([SIGN[side], 1, 1])
+    along, palm = unit(c.pointing[:, i] * mirror), c.facing[:, i] * mirror
+    palm = unit(palm - (palm * along).sum(-1, keepdims=True) * along)
+    return frame(along, palm) @ frame(SIGN[side] * X, -Z).T
+
+
+def _freed(c: Controls, i: int, place: Array, height: Array, pitch: Array) -> tuple[Array, ...]:
+    """A foot's place, height, pitch and toes: of its steps, or, as far as it is free, its own."""
+    x, y, out, *rest = c.step[:, i].T
+    sign, heading = 1 - 2 * i, c.path[:, 2]
+    cosine, sine = np.cos(heading), np.sin(heading)
+    x, y = c.path[:, 0] + cosine * sign * x - sine * y, c.path[:, 1] + sine * sign * x + cosine * y
+    own = np.column_stack([x, y, heading + sign * out, *rest])
+    stepped = np.column_stack([place, height, pitch, 0 * pitch])
+    found = stepped + c.free[:, i, None] * (own - stepped)
+    return found[:, :3], *found[:, 3:].T
 
 
 def blinks(times: Array, duration: float, seed: int) -> dict[str, Array]:

@@ -21,6 +21,7 @@ from gsgan.motion.character import Character
 from gsgan.synthetic.camera import SceneCamera, look_at, through_lens, zoomed
 from gsgan.synthetic.choreography import EVERYDAY, held_out
 from gsgan.synthetic.controls import frame_times
+from gsgan.synthetic.far import FAR
 from gsgan.synthetic.free_subject import free_character, free_pose
 from gsgan.synthetic.gltf import avatar_names, avatar_path, read_character
 from gsgan.synthetic.posing import Choreography
@@ -39,8 +40,10 @@ VERSION = 2
 """Of the generator. Raise it when any pixel changes: cached datasets are then made again."""
 
 AVATARS = avatar_names()
-DEFAULT, FREE_BODY, CHOREOGRAPHY, SIGNING = "polo", "free_body", "choreography", "signs"
-PROGRAMMES = {CHOREOGRAPHY: EVERYDAY, SIGNING: SIGNS}
+DEFAULT, FREE_BODY, CHOREOGRAPHY, SIGNING, FURTHER = (
+    *("polo", "free_body", "choreography", "signs", "far"),
+)
+PROGRAMMES = {CHOREOGRAPHY: EVERYDAY, SIGNING: SIGNS, FURTHER: FAR}
 ARC = math.radians(150)  # round the front of a person who signs
 # Least value of each whole number, and the ranges of those that may be None.
 LEAST = {"size": 8, "train_cameras": 1, "frames": 1, "rays_per_pixel": 1}

@@ -106,7 +106,7 @@ def entry(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], No
         def main() -> None:
             import hydra  # here: importing an entry point stays fast
 
-            sys.argv[1:] = map(spelled_out, sys.argv[1:])
+            sys.argv[1:] = [spelled_out(argument, name) for argument in sys.argv[1:]]
             command = hydra.main(
                 version_base="1.3", config_path=str(config_folder()), config_name=name
             )(run)
@@ -117,8 +117,13 @@ def entry(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], No
     return decorate
 
 
-def spelled_out(argument: str) -> str:
-    """``effects=[antialias]`` as ``effects.only=[antialias]``: Hydra would look for files."""
+def spelled_out(argument: str, command: str) -> str:
+    """``effects=[antialias]`` as ``effects.only=[antialias]``: Hydra would look for files.
+
+    And gsgan.evaluate's ``on.key=value`` as ``++on.key=value``: its keys are those of a run's data.
+    """
+    if command == "evaluate" and argument.startswith("on."):
+        return f"++{argument}"
     found = EFFECTS_LIST.fullmatch(argument)
     return argument if found is None else f"effects.only={found[1]}"
 
