@@ -19,6 +19,7 @@ from gsgan.data.proportions import BODY, Proportions, measure_proportions
 from gsgan.data.skeletons import body_height
 from gsgan.data.splits import Item, Splits
 from gsgan.data.surface_colours import SurfaceColours, body_inside, surface_colours
+from gsgan.data.training_poses import TrainingPoses, training_poses
 from gsgan.skeleton.sides import refuse_swapped
 from gsgan.skeleton.template import Vector
 from gsgan.utils.arrays import evenly_spaced
@@ -61,6 +62,7 @@ class SceneInfo:
         proportions: the subject's proportions.
         face: metres, the subject's face at rest in the head's frame, see `face_at_rest`; None for
             skeletons without a face.
+        poses: the spread of the training poses; None in checkpoints from before it was stored.
     """
 
     camera_names: tuple[str, ...]
@@ -87,6 +89,7 @@ class SceneInfo:
     body_inside: float | None = None
     proportions: Proportions | None = None
     face: tuple[Vector, ...] | None = None
+    poses: TrainingPoses | None = None
 
 
 def refuse_swapped_sides(layout: Layout, frames: Sequence[int]) -> None:
@@ -115,7 +118,7 @@ def scene_info(
         held_out: datasets of the held-out items; their images are not read.
     """
     items, body = splits.items["train"], layout.meta.body
-    frames = sorted({frame for _, frame in items})
+    frames, skeletons = sorted({frame for _, frame in items}), dataset.skeletons.p
     p, valid = layout.landmarks.joints(frames)
     refuse_swapped_sides(layout, frames)
     whole = layout.landmarks
@@ -146,6 +149,7 @@ def scene_info(
         body_inside=_body_inside(layout, dataset, samples),
         scale_train=_scale(dataset, samples),
         scale_test=(min(s[0] for s in scales), max(s[1] for s in scales)) if scales else None,
+        poses=training_poses(torch.from_numpy(np.stack([skeletons[f] for f in frames]))),
         proportions=measure_proportions(*whole.joints(frames), layout.meta.up_axis),
         **_lenses(layout, cameras, held_out),
     )

@@ -18,6 +18,8 @@ from rich.progress import track
 
 from gsgan.data.datamodule import GsganData
 from gsgan.data.metric_variants import MetricVariants
+from gsgan.data.training_poses import TrainingPoses
+from gsgan.evaluate.distances import write_distances
 from gsgan.evaluate.files import (
     FACTS_FILE,
     HEADER,
@@ -115,7 +117,11 @@ def evaluate_folder(config: DictConfig, console: Console, device: torch.device) 
     solve = config.drive is not None
     predict = painter(avatar.to(device), solve=solve, colours=not other)
     return evaluate_method(
-        out, config, console, data, predict, method=method, device=device, marks=marks
+        *(out, config, console, data, predict),
+        method=method,
+        device=device,
+        marks=marks,
+        poses=avatar.poses,
     )
 
 
@@ -191,6 +197,7 @@ def evaluate_method(
     method: Method,
     device: torch.device,
     marks: Sequence[str] = (),
+    poses: TrainingPoses | None = None,
 ) -> Results:
     """Scores a method's predictions and writes metrics.json, scores.csv, facts.json, metrics.md and
     ``grids/``; nothing is written before everything is scored.
@@ -203,6 +210,7 @@ def evaluate_method(
         predict, method: the method, and what facts.json states about it.
         device: of the frames.
         marks: notes that the tables must carry.
+        poses: of the training; with them also distance.csv and distance.png.
 
     Returns:
         As in metrics.json.
@@ -230,6 +238,9 @@ def evaluate_method(
         console.print(f"earlier scores of {names} were made in another way and are left out")
     write_scored(whole, folder)
     print_table(whole.results, whole.origin, console)
+    if poses is not None:
+        own = None if config.get("on") is None else Path(config.run).expanduser()
+        write_distances(folder, whole.rows, data, poses, console, own)
     console.print(f"scores: {folder}", markup=False, highlight=False, soft_wrap=True)
     return whole.results
 

@@ -18,6 +18,7 @@ from gsgan.evaluate.predictions import FLOOR, FULL, SPLAT, Prediction, Preparati
 from gsgan.metrics.image import (
     Score,
     edge_scores,
+    flicker,
     high_frequencies,
     person_box,
     psnr,
@@ -42,6 +43,7 @@ from gsgan.scene import Frame
 from gsgan.utils.errors import GsganError
 
 LPIPS_LEAST = 64  # pixels: AlexNet's last map is empty below
+NO_PAIR = "no two images are of consecutive frames, in one window of one camera"
 NO_LABELS = "the data has no part labels"
 NO_PARTS_OF_SPLAT = "Step I's colour is not a segmentation"
 NO_PARTS_OF_FLOOR = "an all-background image is not a segmentation"
@@ -131,6 +133,7 @@ def means(rows: Sequence[Mapping[str, Any]], lpips_reason: str = "") -> dict[str
         if not finite:
             no_score = "no image has a finite score" if left_out else "no image"
             missing = lpips_reason if metric.startswith("lpips") else ""
+            missing = NO_PAIR if metric == "flicker" else missing
             result[f"{metric}_reason"] = missing or no_score
     return result
 
@@ -237,6 +240,8 @@ class _Tally:
     grid: list[dict[str, Tensor]] = field(default_factory=list)
     matrices: dict[str, Tensor] = field(default_factory=dict)  # by camera
     no_parts: str = ""
+    before: dict[str, Tensor] = field(default_factory=dict)  # the last images by variant
+    last: tuple[Item, Frame, Tensor] | None = None  # of which item, and its ground truth
 
     def add(self, item: Item, frame: Frame, prediction: Prediction, *, show: bool) -> None:
         """Scores one frame."""
@@ -255,6 +260,7 @@ class _Tally:
             painting = Rendering(images[FULL], corrected=images.get(SPLAT), segmentation=parts)
             self.grid += grid_rows(replace(frame, image=target), painting)
         images[FLOOR] = torch.full_like(frame.image, prepare.background)
+        follows = self.last is not None and _follows(item, frame, *self.last[:2])
         for name, image in images.items():
             own = image_scores(
                 image,
@@ -265,7 +271,11 @@ class _Tally:
                 measures=prepare.measures,
                 lpips=self.scorer.lpips,
             )
+            if follows and self.last is not None:
+                last = self.before[name], self.last[2], self.last[1].mask
+                own["flicker"] = float(flicker(image, target, frame.mask, last))
             self.rows.setdefault(name, []).append({"camera": camera, "frame": number, **own})
+        self.before, self.last = images, (item, frame, target)
         self._add_parts(camera, frame, prediction)
 
     def _add_parts(self, camera: str, frame: Frame, prediction: Prediction) -> None:
@@ -287,6 +297,13 @@ class _Tally:
             for name, own in self.rows.items()
         }
         return SplitScores(variants, self.rows, self.grid)
+
+
+def _follows(item: Item, frame: Frame, before: Item, last: Frame) -> bool:
+    """Whether an item is of the next frame, its pixels seen through the same window."""
+    now, then = frame.camera, last.camera
+    same = now.size == then.size and all(map(torch.equal, (now.K, now.R), (then.K, then.R)))
+    return same and item == (before[0], before[1] + 1)
 
 
 def _variant(

@@ -55,6 +55,21 @@ def person_box(mask: Tensor) -> Tensor:
     return box
 
 
+def flicker(
+    image: Tensor, target: Tensor, mask: Tensor, before: tuple[Tensor, Tensor, Tensor]
+) -> Tensor:
+    """Mean |Δt image - Δt target| from the frame before to this one, in the box round the person
+    in both; NaN where both masks are empty.
+
+    Args:
+        image, target: ``[1, C, H, W]``.
+        mask: ``[1, 1, H, W]`` of the person.
+        before: the same three of the frame before, seen by the same camera.
+    """
+    change = ((image - before[0]) - (target - before[1])).abs().mean(dim=1, keepdim=True)
+    return change[person_box(torch.maximum(mask, before[2]))].mean()
+
+
 def psnr_inside(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
     """PSNR in the person's box without the pixels within `OUTLINE` of the mask's outline, whose
     error is due to the mask where masks are uneven; NaN where the mask is empty."""

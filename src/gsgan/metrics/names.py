@@ -44,6 +44,7 @@ IMAGE_METRICS = {
     "edge_ratio": Metric("edges", "edges", 3, "→1"),
     "edge_ratio_person": Metric("edges in box", "edges in box", 3, "→1"),
     "high_frequencies": Metric("detail", "detail", 3, "→1"),
+    "flicker": Metric("flicker in box", "flicker", 4, "↓"),
     "psnr_hands": Metric("PSNR dB hands", "hands", 2, "↑"),
     "ssim_hands": Metric("SSIM hands", "SSIM hands", 4, "↑"),
     "psnr_mouth": Metric("PSNR dB mouth", "mouth", 2, "↑"),

@@ -208,6 +208,7 @@ def _assembled(
         pose_encoder=parts.pose_encoder,
         generator=_generator(parts, template, deformation or surface, segmentation),
         colour=ColourCorrection(effects.cameras, scene.camera_names) if colours else None,
+        poses=scene.poses,
         solver=Solver(_required_body(scene, "the model")) if on_a_body else None,
         **{name: getattr(parts, name) for name in OPTIONS},
     )

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from gsgan.body.solve import Solver
+from gsgan.data.training_poses import TrainingPoses
 from gsgan.effects import Effects
 from gsgan.model.body_points import BodyPoints
 from gsgan.model.colour import ColourCorrection
@@ -63,6 +64,7 @@ class Avatar(nn.Module):
         pose_encoder, generator: None in ``splat_only``, where Step I's colour is the image.
         colour: per-camera colour correction, where that effect is on.
         solver: of body poses that are not given, for avatars on a skinned body.
+        poses: the spread of the training poses, or None.
         backend: that rasterises F, see `gsgan.splat.rasterise`.
         window_margin, window_multiple, window_least: of the rendered window, metres and pixels; see
             `gsgan.scene.body_window`. No margin renders whole images.
@@ -91,6 +93,7 @@ class Avatar(nn.Module):
         generator: Generator | None = None,
         colour: ColourCorrection | None = None,
         solver: Solver | None = None,
+        poses: TrainingPoses | None = None,
         backend: str = "auto",
         window_margin: float | None = 0.25,
         window_multiple: int = 16,
@@ -106,7 +109,7 @@ class Avatar(nn.Module):
         self.surface = surface
         self.segmentation, self.segmentation_why = segmentation, segmentation_why
         self.pose_encoder, self.generator, self.colour = pose_encoder, generator, colour
-        self.solver = solver
+        self.solver, self.poses = solver, poses
 
     @property
     def splats(self) -> Deformation | SurfaceGaussians | None:

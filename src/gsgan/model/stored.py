@@ -15,6 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 from gsgan.data.proportions import Proportions
 from gsgan.data.scene_info import SceneInfo
 from gsgan.data.surface_colours import SurfaceColours
+from gsgan.data.training_poses import TrainingPoses
 from gsgan.utils.errors import ConfigError, DataError
 
 CHECKPOINT = Path("checkpoints") / "last.ckpt"
@@ -159,7 +160,11 @@ def stored_scene(plain: Mapping[str, Any]) -> SceneInfo:
     values: dict[str, Any] = {
         key: tuple(value) if isinstance(value, list) else value for key, value in plain.items()
     }
-    for key, kind in (("surface", SurfaceColours), ("proportions", Proportions)):
-        if values[key] is not None:
+    for key, kind in (
+        ("surface", SurfaceColours),
+        ("proportions", Proportions),
+        ("poses", TrainingPoses),
+    ):
+        if values.get(key) is not None:
             values[key] = kind(**values[key])
     return SceneInfo(**values)

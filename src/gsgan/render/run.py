@@ -11,10 +11,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
 from rich.progress import track
 from torch import Tensor
 
-from gsgan.model.drive import Drive, drive_of, inputs_of
+from gsgan.data.training_poses import TrainingPoses
+from gsgan.model.avatar import Avatar
+from gsgan.model.drive import Drive, drive_of, inputs_of, joints_of
 from gsgan.model.runs import Run
 from gsgan.model.stored import CHECKPOINT
 from gsgan.motion.orbit import Orbit
@@ -74,7 +77,22 @@ def render_config(config: DictConfig) -> None:
             output.write(drive.numbers[i], image)
     with writing(output.out):
         output.finish(drive.numbers)
+    if run.avatar.poses is not None:
+        _print_distances(run.avatar.poses, run.avatar, drive, console)
     console.print(f"rendered: {output.out}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _print_distances(poses: TrainingPoses, avatar: Avatar, drive: Drive, console: Console) -> None:
+    """How far the motion is from the training poses: its median and farthest frame."""
+    p = torch.cat([joints_of(avatar, drive, i)[0] for i in range(len(drive.p))])
+    far = poses.distance(p)
+    most = int(far.argmax())
+    console.print(
+        f"distance from the training poses, in deviations: {far.median():.1f} in the median, "
+        f"{far[most]:.1f} in frame {drive.numbers[most]}",
+        highlight=False,
+        soft_wrap=True,
+    )
 
 
 def _output(config: DictConfig) -> Output:

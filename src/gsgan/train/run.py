@@ -155,9 +155,13 @@ def _evaluate(
         train_seconds=module.train_seconds,
         trained_by=module.code,
     )
-    predict, marks = painter(module.shown.eval()), module.marks
+    avatar = module.shown.eval()
     evaluate_method(
-        folder, config, console, data, predict, method=method, device=device, marks=marks
+        *(folder, config, console, data, painter(avatar)),
+        method=method,
+        device=device,
+        marks=module.marks,
+        poses=avatar.poses,
     )
 
 

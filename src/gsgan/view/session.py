@@ -85,6 +85,8 @@ class Session:
     def _controls(self) -> None:
         gui, client = self.client.gui, self.client
         self.status = gui.add_text("images per second", "", disabled=True)
+        known = self.show.avatar.poses is not None
+        self.far = gui.add_text("deviations from training", "", disabled=True, visible=known)
         names = layers(self.show.avatar, self.drive.truth is not None)
         self.layer = gui.add_dropdown("layer", names, initial_value=IMAGE)
         last = max(0, self.show.avatar.splat_channels - 4)
@@ -256,6 +258,8 @@ class Session:
         maps = layer != IMAGE or self.splats.value
         with torch.no_grad():
             rendering = avatar(p, visibility, camera.to(p.device), body, maps=maps)
+        if avatar.poses is not None:
+            self.far.value = f"{float(avatar.poses.distance(p)):.1f}"
         behind = self.show.behind(camera.size)
         image = shown(layer, rendering, camera, avatar, behind, int(self.channel.value), truth)
         self.image = image
