@@ -1,0 +1,92 @@
+"""The far choreography on rigs: limits, contact with the floor, hands at their places."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from mannequin import mannequin
+
+from gsgan.motion.rig import SIDES
+from gsgan.motion.rotations import axis_angle, twist
+from gsgan.synthetic.choreography import EVERYDAY
+from gsgan.synthetic.controls import frame_times
+from gsgan.synthetic.far import FAR
+from gsgan.synthetic.posing import Choreography
+from gsgan.synthetic.scene_setup import SceneSettings, extent, load_character, ring
+
+# Degrees since a T pose; a squat's hip and a kneeling foot are near what people can do.
+LIMITS = {"Spine": 25, "Spine1": 25, "Spine2": 25, "Neck": 30, "Head": 30, "Shoulder": 30}
+LIMITS |= {"Arm": 125, "ForeArm": 150, "Hand": 95, "UpLeg": 140, "Leg": 150, "Foot": 65}
+LIMITS |= {"ToeBase": 60}
+
+
+@pytest.fixture(scope="module")
+def polo():
+    return load_character("polo")
+
+
+@pytest.fixture(scope="module")
+def moves(polo):
+    times = frame_times(420, FAR.duration)
+    return times, Choreography(polo, 0, FAR).at(times)
+
+
+@pytest.mark.parametrize("seed", [0, 1])  # whose leading hands differ
+def test_joints_stay_within_their_limits(seed):
+    person = mannequin()
+    moves = Choreography(person, seed, FAR).at(frame_times(420, FAR.duration))
+
+    def local(name):
+        j = person.bones.index(name)
+        return (
+            np.swapaxes(moves.rotations[:, person.parents[j]], -1, -2) @ moves.rotations[:, j]
+        )
+
+    for bone, limit in LIMITS.items():
+        for name in (bone,) if bone in person.bones else ("Left" + bone, "Right" + bone):
+            angle = np.degrees(np.linalg.norm(axis_angle(local(name)), axis=-1))
+            assert angle.max() <= limit, (name, moves.passages[angle.argmax()])
+    for side in SIDES:
+        assert axis_angle(local(side + "Leg"))[:, 0].min() > 0.1  # knees bend forwards
+        for bone in ("ForeArm", "Hand"):
+            assert np.abs(np.degrees(twist(local(side + bone), 0))).max() < 60
+
+
+def test_the_person_is_on_the_floor_and_not_in_it(polo, moves):
+    times, motion = moves
+    for f in range(0, len(times), 7):
+        low = polo.skinned(motion.rotations[f], motion.joints[f])[0][:, 2].min()
+        assert low > -0.025, motion.passages[f]
+        assert low < 0.1 or motion.passages[f] == "climb"
+
+
+def test_hands_and_knees_rest_where_the_key_poses_place_them(polo, moves):
+    times, motion = moves
+    begin = FAR.ends[-2]
+    still = np.abs(times - begin - 0.25 * (FAR.ends[-1] - begin)).argmin()
+    assert motion.passages[still] == "crawl"
+    height = {bone: motion.joints[still, polo.bones.index(bone), 2] for bone in polo.bones}
+    for side in SIDES:
+        assert height[side + "Hand"] == pytest.approx(0.08, abs=0.02)
+        assert height[side + "Leg"] < 0.12
+    assert height["Hips"] < 0.65
+
+
+def test_the_person_goes_far_below_the_everyday_choreography(polo, moves):
+    times, motion = moves
+    hips = motion.joints[:, polo.bones.index("Hips"), 2]
+    assert hips.min() < 0.25
+    everyday = Choreography(polo).at(frame_times(200, EVERYDAY.duration))
+    assert everyday.joints[:, polo.bones.index("Hips"), 2].min() > 0.5
+
+
+def test_every_camera_sees_the_whole_person(polo):
+    source = Choreography(polo, 0, FAR)
+    settings = SceneSettings(size=64, motion="far")
+    points = extent(polo, source, samples=40, stride=200)
+    for view in ring(settings, extent(polo, source)):
+        x = points @ view.R.T + view.t
+        pixel = x @ view.K.T
+        pixel = pixel[:, :2] / pixel[:, 2:]
+        assert (x[:, 2] > 0.5).all()
+        assert ((pixel > 0) & (pixel < 64)).all()
