@@ -103,6 +103,36 @@ def test_the_csv_holds_every_image_and_its_mean_is_the_score(run):
                 assert sum(own) / len(own) == pytest.approx(expected, abs=1e-9)
 
 
+def test_a_run_is_scored_on_another_capture_against_the_distance_from_training(
+    run, capture, inside, tmp_path
+):
+    """The capture itself under another name: poses are solved, though it has some."""
+    own = shutil.copytree(run, tmp_path / "run")
+    other = shutil.copytree(capture, tmp_path / "other")
+    result = inside("evaluate", f"run={own}", f"on.root={other}", "on.test_frames=4-5")
+    assert result.returncode == 0, result.stderr
+    folder = own / "on" / "other"
+    for variants in scores(folder).values():
+        assert "on another capture: other" in variants["full"]["marks"]
+    assert inside("evaluate", f"run={own}", "drive=skeleton").returncode == 0
+    solved, found = scores(own / "by_skeleton"), scores(folder)
+    for split in found:
+        assert found[split]["full"]["psnr"] == pytest.approx(solved[split]["full"]["psnr"])
+        assert found[split]["full"]["flicker"] > 0
+    with (folder / "distance.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == sum(variants["full"]["images"] for variants in found.values())
+    assert len({row["distance"] for row in rows}) > 2
+    assert len({(row["frame"], row["distance"]) for row in rows}) == 6  # of the pose alone
+    assert cv2.imread(str(folder / "distance.png")) is not None
+    assert "by distance from the training poses" in result.stdout
+    for arguments, named in (
+        (["on.source.motion=far"], "Key 'source' is not in struct"),
+        ([f"on={other}", "data_root=a"], "data_root= cannot be given with on="),
+    ):
+        refused(inside("evaluate", f"run={own}", *arguments), named)
+
+
 def test_the_ground_truth_as_prediction_on_white(capture, given, inside, tmp_path):
     """On white, given as it is or as alpha: the truth scores nothing but its own 8-bit rounding."""
     from gsgan.data.datamodule import GsganData

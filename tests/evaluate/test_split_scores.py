@@ -147,6 +147,19 @@ def test_each_image_of_an_avatar_is_put_on_white_by_its_own_alpha():
     )
 
 
+def test_flicker_needs_consecutive_frames_of_one_camera_and_window():
+    f, noise = person(), 0.1 * torch.ones(1, 3, 24, 24)
+    moved = replace(f, camera=replace(f.camera, K=2 * f.camera.K))
+    items = [(("a", 0), f), (("a", 1), f), (("a", 3), f), (("b", 4), f), (("b", 5), moved)]
+    predict = Mock(side_effect=[Prediction({FULL: f.image + i % 2 * noise}, {}) for i in range(5)])
+    found = score_split(items, predict, scorer())
+    assert ["flicker" in row for row in found.rows[FULL]] == [False, True, False, False, False]
+    assert found.variants[FULL]["flicker"] == pytest.approx(0.1, abs=1e-2)  # rounded to 8 bits
+    assert found.variants[FLOOR]["flicker"] == 0  # the ground truth stands still
+    alone = score_split(items[:1], lambda f, _: Prediction({FULL: f.image}, {}), scorer())
+    assert "consecutive" in alone.variants[FULL]["flicker_reason"]
+
+
 def test_an_image_that_is_not_finite_is_an_error_that_names_it():
     f = person()
     broken = f.image.clone()

@@ -13,6 +13,7 @@ from torchmetrics.image import PeakSignalNoiseRatio, StructuralSimilarityIndexMe
 from gsgan.metrics.image import (
     edge_f1,
     edge_scores,
+    flicker,
     high_frequencies,
     person_box,
     psnr,
@@ -218,3 +219,15 @@ def test_an_edge_at_the_boxs_border_may_match_one_just_outside():
     where = torch.zeros(1, 1, 40, 40, dtype=torch.bool)
     where[..., 7:19, 7:19] = True
     assert float(edge_scores(image, target, where)[0]) == 1.0
+
+
+def test_flicker_is_the_change_of_the_error_in_the_box_of_both_frames():
+    mask, later = (square(at)[:, :1] for at in (8, 12))
+    truth = square(8), square(12)
+    shifted = truth[0] + 0.1, truth[1] + 0.1  # an error that stays does not flicker
+    assert float(flicker(shifted[1], truth[1], later, (shifted[0], truth[0], mask))) < 1e-6
+    image = truth[1] + 0.2 * mask * later  # in 8 x 8 of the 16 x 16 pixels round both
+    found = float(flicker(image, truth[1], later, (truth[0], truth[0], mask)))
+    assert found == pytest.approx(0.2 * 64 / 256, abs=1e-6)
+    empty = torch.zeros_like(mask)
+    assert math.isnan(float(flicker(image, truth[1], empty, (truth[0], truth[0], empty))))

@@ -123,6 +123,7 @@ def test_a_motion_of_another_person(render, motion, tmp_path):
     result = render(f"motion={motion}", "out=frames", "fps=15", "start=1", "frames=4", "pixels=40")
     assert result.returncode == 0, result.stderr
     assert "a.npz: 12 frames at 30 per second, metres, Z up -> 6 frames at 15" in result.stdout
+    assert "distance from the training poses, in deviations: " in result.stdout
     assert "on the subject's bones" in result.stdout
     files = sorted((tmp_path / "frames").glob("*.png"))
     assert [p.name for p in files] == [f"{i:06d}.png" for i in range(1, 5)]

@@ -149,7 +149,13 @@ def test_unknown_values_become_one_sentence(tiny, override, named):
     ],
 )
 def test_a_list_of_effects_is_a_value_and_no_list_of_files(said, meant):
-    assert spelled_out(said) == meant
+    assert spelled_out(said, "train") == meant
+
+
+def test_keys_of_another_capture_are_those_of_a_runs_data():
+    assert spelled_out("on.source.motion=far", "evaluate") == "++on.source.motion=far"
+    assert spelled_out("on=/path", "evaluate") == "on=/path"
+    assert spelled_out("on.source.motion=far", "render") == "on.source.motion=far"
 
 
 MANY = [f"training.recipes.psi.rate.{key}=0.{i}" for i, key in enumerate(("hold", "final"))] + [
