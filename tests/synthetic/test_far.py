@@ -38,9 +38,7 @@ def test_joints_stay_within_their_limits(seed):
 
     def local(name):
         j = person.bones.index(name)
-        return (
-            np.swapaxes(moves.rotations[:, person.parents[j]], -1, -2) @ moves.rotations[:, j]
-        )
+        return np.swapaxes(moves.rotations[:, person.parents[j]], -1, -2) @ moves.rotations[:, j]
 
     for bone, limit in LIMITS.items():
         for name in (bone,) if bone in person.bones else ("Left" + bone, "Right" + bone):
@@ -73,7 +71,7 @@ def test_hands_and_knees_rest_where_the_key_poses_place_them(polo, moves):
 
 
 def test_the_person_goes_far_below_the_everyday_choreography(polo, moves):
-    times, motion = moves
+    _times, motion = moves
     hips = motion.joints[:, polo.bones.index("Hips"), 2]
     assert hips.min() < 0.25
     everyday = Choreography(polo).at(frame_times(200, EVERYDAY.duration))
