@@ -79,9 +79,11 @@ class Perceptual(nn.Module):
         losses = torch.stack(
             [functional.mse_loss(a, b) for a, b in zip(self.features(image), truth, strict=True)]
         )
-        if self.training and int(self.calls) < self.warmup:
-            self.calls += 1
-            self.layer_loss += (losses.detach() - self.layer_loss) / self.calls
+        if self.training:  # without reading `calls`, for which the host would wait
+            warm = self.calls < self.warmup
+            self.calls += warm
+            step = (losses.detach() - self.layer_loss) / self.calls
+            self.layer_loss += torch.where(warm, step, 0.0)
         inverse = 1 / self.layer_loss.clamp_min(1e-12)
         return (losses * inverse / inverse.sum()).sum()
 

@@ -52,7 +52,7 @@ def shown(
     Args:
         layer: of `layers`.
         rendering: with maps, unless the layer is the image.
-        camera: of the rendering.
+        camera: of the rendering, on any device.
         avatar: that was rendered.
         behind: ``[3, H, W]`` the background.
         channel: of F, for the feature layer; its values are stretched to the colour map's range.
@@ -77,13 +77,16 @@ def shown(
 
 
 def _depth(rendering: Rendering, camera: Camera, avatar: Avatar) -> Bytes:
-    assert rendering.gaussians is not None
-    raster = rasterise(rendering.gaussians, camera, settings=avatar.accuracy, depth=True)
+    gaussians = rendering.gaussians
+    assert gaussians is not None
+    camera = camera.to(gaussians.means.device)
+    raster = rasterise(gaussians, camera, settings=avatar.accuracy, depth=True)
     assert raster.depth is not None
     alpha = raster.alpha[0, 0].cpu()
     metres = raster.depth[0, 0].cpu() / alpha.clamp_min(1e-6)
     seen = alpha > 0.5
-    near = 1 - _stretched(torch.where(seen, metres, metres[seen].mean() if seen.any() else 0.0))
+    mean = torch.where(seen, metres, 0.0).sum() / seen.sum().clamp_min(1)
+    near = 1 - _stretched(torch.where(seen, metres, mean))
     return _coloured(near) * seen.numpy()[..., None]
 
 
