@@ -1,7 +1,7 @@
 """Everything an avatar does, on another device than the host's.
 
-On torch's meta device under `FakeTensorMode` a tensor of another device in the path is an error, and
-so is every operation for which the host would wait; there are no values. The same list runs for
+On torch's meta device under `FakeTensorMode` a tensor of another device in the path is an error,
+and so is every operation for which the host would wait; there are no values. The same list runs for
 real on the device that GPU_CHECK_DEVICE names, by default CUDA.
 """
 

@@ -219,6 +219,21 @@ def test_baselines_train_with_the_same_schedule(make, model):
     assert moved(before, module, part.get(model, "avatar.deformation"))
 
 
+@pytest.mark.parametrize("model", ["full", "lbs_splat"])
+def test_bf16_leaves_the_gradients_of_step_one_alone(make, model):
+    """S and Step I are computed in float32: also backwards, so that bf16 trains the same weights."""
+    found = []
+    for precision in ("32-true", "bf16-mixed"):
+        short = ("training.schedule.segmentation=2", "training.schedule.step_one=4")
+        module, trainer, data = make(
+            f"model={model}", *short, "training.schedule.step_two=0", precision=precision
+        )
+        trainer.fit(module, data)
+        found.append(snapshot(module.avatar))
+    for name, value in found[0].items():
+        assert torch.equal(found[1][name], value), name
+
+
 def test_every_phase_runs_under_bf16_autocast(make):
     """Geometry, rasteriser and SSIM stay in float32: F is the same with and without autocast."""
     module, _, data = make()

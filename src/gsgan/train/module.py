@@ -25,6 +25,7 @@ from gsgan.train.rollback import Rollback, SkippedSteps
 from gsgan.train.schedule import SEGMENTATION, SPLATTING, STEP_ONE, Schedule
 from gsgan.utils.checks import at_least
 from gsgan.utils.errors import ConfigError, GsganError
+from gsgan.utils.tensors import full_precision
 
 PSNR_CAP = 100.0  # dB: one image equal to the ground truth would make the mean infinite
 SEED_STRIDE = 1_000_003  # a prime: (seed, step) pairs do not meet
@@ -236,7 +237,8 @@ class AvatarTraining(LightningModule):
         optimisers = {name: self._optimisers()[name] for name in names}
         for optimiser in optimisers.values():
             optimiser.zero_grad(set_to_none=True)
-        self.manual_backward(loss)
+        with full_precision(loss):  # else gradients of what is computed in float32 are rounded too
+            self.manual_backward(loss)
         norms = [
             clip(optimiser.optimizer, self.recipes[name].clip).to(loss.device)
             for name, optimiser in optimisers.items()
