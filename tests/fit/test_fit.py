@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import threading
 from pathlib import Path
 
 import cv2
@@ -154,9 +155,60 @@ def test_unseen_joints(fit, people, tmp_path):
 def test_a_fit_before_training_returns_the_data_with_its_poses(people, compose, tmp_path):
     data = GsganData(str(shutil.copytree(people, tmp_path / "plain")), size=48)
     assert data.lacks_body
-    data = fit_before_training(data, compose("fit", *QUICK, "fit.sweeps=1").fit)
+    settings = compose("fit", *QUICK, "fit.sweeps=1").fit
+    data = fit_before_training(data, settings, torch.device("cpu"))
     assert not data.lacks_body
     assert data.layout.poses.fitted
+
+
+def test_a_fit_before_training_reads_the_data_as_the_run_does(
+    people, compose, tmp_path, monkeypatch
+):
+    given, fitted = [], {}
+    keys = {"cache_mb": 7, "min_joints": 20, "distortion": "project", "train_frames": "0-1"}
+    data = GsganData(str(shutil.copytree(people, tmp_path / "plain")), size=48, **keys)
+
+    def fit_body(seen, settings, device):
+        given.append(device)
+        fitted.update(vars(seen))
+        assert settings.sweeps == 2
+        assert seen.trained == [0, 1]
+
+    monkeypatch.setattr("gsgan.fit.run.fit_body", fit_body)
+    settings, device = compose("fit", "fit.sweeps=2").fit, torch.device("meta")
+    assert fit_before_training(data, settings, device) is data
+    assert given == [device]
+    same = set(vars(data)) - {"size", "crop"}
+    assert {"cache_mb", "limits", "lens", "split_keys", "skeleton"} <= same
+    assert all(fitted[key] == getattr(data, key) for key in same - {"layout", "splits"})
+    assert (fitted["size"], fitted["crop"].margin, data.size) == (128, 0.2, 48)
+
+
+def test_of_two_processes_one_fits(people, fitted, compose, tmp_path, monkeypatch):
+    """The second finds the poses that the first wrote while it waited."""
+    root, fits, waits = shutil.copytree(people, tmp_path / "both"), [], threading.Event()
+    settings, device = compose("fit").fit, torch.device("cpu")
+    datas = [GsganData(str(root), size=48) for _ in range(2)]
+    assert all(data.lacks_body for data in datas)
+
+    def second():
+        waits.set()
+        fit_before_training(datas[1], settings, device)
+
+    other = threading.Thread(target=second)
+
+    def fit_body(seen, settings, device):
+        fits.append(seen)
+        other.start()
+        waits.wait()
+        for name in ("body_shape.npz", "body_pose.npz"):
+            shutil.copy(fitted / name, root)
+
+    monkeypatch.setattr("gsgan.fit.run.fit_body", fit_body)
+    fit_before_training(datas[0], settings, device)
+    other.join()
+    assert len(fits) == 1
+    assert all(data.layout.poses.fitted for data in datas)
 
 
 def test_held_out_cameras_are_not_used(fit, fitted, people, tmp_path):

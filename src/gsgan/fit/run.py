@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import ExitStack
+from copy import copy
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -34,10 +36,11 @@ from gsgan.skeleton import TEMPLATES
 from gsgan.utils.checks import whole
 from gsgan.utils.console import make_console, progress
 from gsgan.utils.errors import ConfigError, DataError
-from gsgan.utils.files import write_atomically, write_json, write_npz, writing
+from gsgan.utils.files import locked, write_atomically, write_json, write_npz, writing
 from gsgan.utils.tensors import pick_device
 
 SIZE, MARGIN = 128, 0.2  # pixels; metres around the person
+LOCK = ".body_fit.lock"
 
 
 def run_fit(config: DictConfig) -> Path:
@@ -56,12 +59,15 @@ def run_fit(config: DictConfig) -> Path:
     return fit_body(data, settings, out, config.seed, device, config.shown, config.overwrite)
 
 
-def fit_before_training(data: GsganData, settings: DictConfig) -> GsganData:
+def fit_before_training(data: GsganData, settings: DictConfig, device: torch.device) -> GsganData:
     """Fits the body of a capture that has no body poses.
 
+    Convention: of the processes of a run one fits, and the others wait for its files.
+
     Args:
-        data: the capture.
+        data: the capture, read as the run reads it.
         settings: the config group ``fit``.
+        device: of the run.
 
     Returns:
         The data, which reads the capture again, with the new poses.
@@ -69,16 +75,13 @@ def fit_before_training(data: GsganData, settings: DictConfig) -> GsganData:
     Raises:
         DataError: when the masks hold no person, or the folder is read-only.
     """
-    seen = GsganData(
-        root=str(data.layout.root),
-        reader=data.reader,
-        protocol=data.protocol,
-        size=SIZE,
-        crop=PersonCrop(margin=MARGIN),
-        skeleton=data.skeleton,
-        **data.split_keys,
-    )
-    fit_body(seen, instantiate(settings), device=pick_device("auto"))
+    root, seen = data.layout.root, copy(data)
+    seen.size, seen.crop = SIZE, PersonCrop(margin=MARGIN)
+    with ExitStack() as stack:
+        with writing(root):
+            stack.enter_context(locked(root / LOCK))
+        if not (root / POSES).exists():  # else made while this process waited
+            fit_body(seen, instantiate(settings), device=device)
     for name, attribute in vars(GsganData).items():
         if isinstance(attribute, cached_property):
             vars(data).pop(name, None)

@@ -34,7 +34,7 @@ from gsgan.synthetic.camera import SceneCamera
 from gsgan.synthetic.free_subject import free_pose
 from gsgan.synthetic.scene_setup import FREE_BODY, Scene, SceneSettings, dataset_key
 from gsgan.utils.errors import ConfigError, DataError
-from gsgan.utils.files import cache_root, write_atomically
+from gsgan.utils.files import cache_root, locked, write_atomically
 
 KINDS = ("images", "masks", "labels")
 POLL_SECONDS = 0.05
@@ -71,7 +71,7 @@ def ensure_scene(
     if not _is_complete(root):
         try:
             root.mkdir(parents=True, exist_ok=True)
-            with _locked(root.with_name(f".{root.name}.lock")):
+            with locked(root.with_name(f".{root.name}.lock")):
                 if not _is_complete(root):  # else made while this process waited
                     _write(root, settings, workers, progress)
         except OSError as error:
@@ -84,18 +84,6 @@ def ensure_scene(
 
 def _is_complete(root: Path) -> bool:
     return (root / "meta.json").is_file()
-
-
-@contextlib.contextmanager
-def _locked(lock: Path) -> Iterator[None]:
-    """Holds a lock that the system releases when the process dies."""
-    with lock.open("w") as file:
-        # not on Windows and some network file systems: two processes then write the same files
-        with contextlib.suppress(ImportError, OSError):
-            import fcntl
-
-            fcntl.flock(file, fcntl.LOCK_EX)
-        yield
 
 
 def _write(root: Path, settings: SceneSettings, workers: int, progress: bool) -> None:

@@ -96,7 +96,7 @@ def build_training(config: DictConfig) -> tuple[GsganData, AvatarTraining]:
     whole("seed", config.seed, 0)
     data = build_data(config)
     if data.lacks_body:
-        data = fit_before_training(data, config.fit)
+        data = fit_before_training(data, config.fit, device_of(config))
     avatar = build_avatar(config, data.info, data.labelled("train"))
     torch.manual_seed(config.seed + DISCRIMINATOR_SALT)  # the same start beside every avatar
     with naming_group("training"):
@@ -105,6 +105,14 @@ def build_training(config: DictConfig) -> tuple[GsganData, AvatarTraining]:
             record=training_record(config, data),
             scene=json.loads(json.dumps(asdict(data.info))),
         )
+
+
+def device_of(config: DictConfig) -> torch.device:
+    """Where Lightning will put the model of a process."""
+    if config.trainer.accelerator == "cpu" or not torch.cuda.is_available():
+        return torch.device("cpu")
+    chosen = config.trainer.devices
+    return torch.device("cuda", chosen[0] if OmegaConf.is_list(chosen) else 0)
 
 
 def _is_scored(folder: Path, checkpoint: Path) -> bool:
@@ -281,8 +289,6 @@ def describe(
 ) -> None:
     """Prints the data, the parts with their sizes, the effects and the stand-ins in use."""
     info, avatar = data.info, module.avatar
-    on_cpu = config.trainer.accelerator == "cpu" or not torch.cuda.is_available()
-    device = torch.device("cpu" if on_cpu else "cuda")  # where Lightning will put the model
     held_out = ", ".join(f"{len(data.dataset(name))} {name}" for name in data.eval_names)
     table = Table(title=f"gsgan: {folder}", show_header=False)
     table.add_row(
@@ -308,7 +314,8 @@ def describe(
         source = "part labels" if info.has_labels else "masks: the data has no part labels"
         table.add_row("", f"{avatar.segmentation_why}; S learns from {source}")
     if avatar.splats is not None:
-        table.add_row("rasteriser", resolve_backend(avatar.backend, device, avatar.accuracy)[0])
+        backend = resolve_backend(avatar.backend, device_of(config), avatar.accuracy)[0]
+        table.add_row("rasteriser", backend)
     s = module.schedule
     table.add_row(
         "schedule", f"segmentation {s.segmentation}, Step I {s.step_one}, Step II {s.step_two}"

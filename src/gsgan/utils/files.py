@@ -47,6 +47,18 @@ def writing(path: Path) -> Iterator[None]:
         raise DataError(f"{path} cannot be written ({error.strerror or error})") from None
 
 
+@contextlib.contextmanager
+def locked(lock: Path) -> Iterator[None]:
+    """Holds a lock that the system releases when the process dies."""
+    with lock.open("w") as file:
+        # not on Windows and some network file systems: two processes then write the same files
+        with contextlib.suppress(ImportError, OSError):
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
 def write_npz(path: Path, **arrays: Any) -> None:
     """Writes an npz completely or not at all."""
     stream = io.BytesIO()
