@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 from torch.nn import functional
+from torch.utils.weak import WeakTensorKeyDictionary
 
 from gsgan.utils.records import TensorRecord, cat
 from gsgan.utils.tensors import constant
@@ -238,6 +239,24 @@ class Frame(TensorRecord):
         """What an avatar renders from: skeleton, visibility, camera, body pose, camera index."""
         return self.skeleton, self.visibility, self.camera, self.body, self.camera_index
 
+    def unpacked(self) -> Frame:
+        """The frame with images in [0, 1] and labels as int64, of one whose pixels are bytes.
+
+        A quarter to an eighth as much is then loaded and moved to a device.
+        """
+        return replace(
+            self,
+            image=unit(self.image),
+            mask=unit(self.mask),
+            labels=None if self.labels is None else self.labels.long(),
+            unsure=None if self.unsure is None else unit(self.unsure),
+        )
+
+
+def unit(pixels: Tensor) -> Tensor:
+    """Bytes as float32 in [0, 1]."""
+    return pixels.to(torch.float32).div_(255)
+
 
 @dataclass(frozen=True)
 class Window:
@@ -255,11 +274,10 @@ class Window:
 
     def camera(self, camera: Camera) -> Camera:
         """The cameras of the boxes."""
-        boxes = [
-            camera[i : i + 1].crop(top, left, self.size)
-            for i, (top, left) in enumerate(self.corners)
-        ]
-        return replace(cat(boxes), whole_height=self.whole[0])
+        shift = torch.zeros_like(camera.K)
+        for i, (top, left) in enumerate(self.corners):
+            shift[i, 0, 2], shift[i, 1, 2] = left, top
+        return replace(camera, K=camera.K - shift, size=self.size, whole_height=self.whole[0])
 
     def cut(self, images: Tensor) -> Tensor:
         """``[B, ..., H, W]`` reduced to the boxes."""
@@ -375,7 +393,22 @@ def distort_within(points: Tensor, dist: Tensor) -> Tensor:
 
 
 def fold_radius(dist: Tensor) -> Tensor:
-    """``[B]`` of x/z, y/z: where lenses ``[B, 5]`` first fold back, p1 and p2 aside; else inf."""
+    """``[B]`` of x/z, y/z: where lenses ``[B, 5]`` first fold back, p1 and p2 aside; else inf.
+
+    Convention: computed once for a tensor without gradient, which must not be changed in place.
+    """
+    if dist.requires_grad or torch.compiler.is_compiling():
+        return _fold_radius(dist)
+    if (found := _folds.get(dist)) is None:
+        with torch.inference_mode(False), torch.no_grad():  # else of no use in training later
+            found = _folds[dist] = _fold_radius(dist)
+    return found
+
+
+_folds: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
+
+
+def _fold_radius(dist: Tensor) -> Tensor:
     k1, k2, _, _, k3 = dist.double().unbind(-1)
     # the slope 1 + 3 k1 s + 5 k2 s² + 7 k3 s³ by s = r², as a cubic in 1/s, whose first term is 1
     companion = torch.zeros(*k1.shape, 3, 3, dtype=k1.dtype, device=k1.device)

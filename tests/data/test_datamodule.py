@@ -8,6 +8,7 @@ import logging
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -129,6 +130,46 @@ def test_loaders_and_datasets(capture: Path) -> None:
     assert [int(i) for frame in poses for i in frame.frame_id] == [8, 9, 8, 9]
     with pytest.raises(ValueError, match="split must be one of train, novel_view, novel_pose"):
         data.dataset("test")
+
+
+def test_batches_travel_as_bytes_and_become_the_datasets_numbers(tmp_path: Path) -> None:
+    root = write_tiny_capture(tmp_path / "labelled", labels=True)
+    data = GsganData(str(root), size=16, batch_size=2, test_share=0)
+    dataset, batch = data.dataset("train"), next(iter(data.train_dataloader()))
+    pixels = [batch.image, batch.mask, batch.labels]
+    assert [x.dtype for x in pixels] == [torch.uint8] * 3
+    on_device = data.transfer_batch_to_device(batch, torch.device("cpu"), 0)
+    assert on_device.labels.dtype == torch.int64
+    names = data.layout.camera_names
+    for i in range(2):
+        item = (names[int(batch.camera_index[i])], int(batch.frame_id[i]))
+        one = dataset[dataset.items.index(item)]
+        for name in ("image", "mask", "labels"):
+            assert torch.equal(getattr(on_device, name)[i : i + 1], getattr(one, name))
+
+
+def test_on_a_gpu_batches_are_pinned_and_copied_while_the_host_goes_on(
+    capture: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = GsganData(str(capture), size=16)
+    assert not data.train_dataloader().pin_memory
+    data.trainer = SimpleNamespace(
+        strategy=SimpleNamespace(root_device=torch.device("cuda", 1)),
+        world_size=1,
+        global_rank=0,
+        current_epoch=0,
+    )
+    assert data.train_dataloader().pin_memory
+    frame, moved, pinned, plain = data.dataset("train")[0], [], [], torch.Tensor.to
+    monkeypatch.setattr(torch.Tensor, "pin_memory", lambda x: pinned.append(x) or x)
+    monkeypatch.setattr(
+        torch.Tensor, "to", lambda x, *to, **how: moved.append(how) or plain(x, *to, **how)
+    )
+    frame = frame.pin_memory()
+    assert any(x is frame.image for x in pinned)
+    assert any(x is frame.camera.K for x in pinned)
+    data.transfer_batch_to_device(frame, torch.device("cpu"), 0)
+    assert moved[: len(pinned)] == [{"non_blocking": True}] * len(pinned)
 
 
 def test_empty_split_has_no_loader_but_a_reason(capture: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsgan.scene import Camera, Gaussians, distort, fold_radius
+from gsgan.scene import Camera, Gaussians, Window, distort, fold_radius
 from gsgan.splat import accuracy, rasterise
 from gsgan.splat.lens import bend, undistort
 
@@ -59,6 +59,24 @@ def test_the_fold_is_where_the_slope_first_vanishes():
     s = float(found[2]) ** 2
     assert 1 + 0.3 * s - 0.07 * s**3 == pytest.approx(0, abs=1e-6)
     assert found[3:].tolist() == [float("inf")] * 2
+
+
+def test_the_fold_is_computed_once_for_the_cameras_of_a_lens(monkeypatch):
+    found, plain = [], torch.linalg.eigvals
+    monkeypatch.setattr(torch.linalg, "eigvals", lambda x: found.append(x) or plain(x))
+    whole = camera(BARREL)
+    points = torch.tensor([[[0.1, 0.2, 1.0]]])
+    window = Window(((8, 16),), (16, 16), whole.size)
+    with torch.inference_mode():
+        seen = whole.project(points)[0]
+    for other in (window.camera(whole), whole.crop(8, 16, (16, 16))):
+        assert torch.equal(other.project(points)[0], seen - torch.tensor([16.0, 8.0]))
+        bend(points, other.dist, near=0.01)
+    assert len(found) == 1
+    lens = whole.dist.clone().requires_grad_()  # a lens that learns is computed every time
+    torch.stack([fold_radius(lens), fold_radius(lens)]).sum().backward()
+    assert len(found) == 3
+    assert lens.grad.isfinite().all()
 
 
 def camera(dist, size=(40, 48)) -> Camera:

@@ -221,7 +221,7 @@ def test_baselines_train_with_the_same_schedule(make, model):
 
 @pytest.mark.parametrize("model", ["full", "lbs_splat"])
 def test_bf16_leaves_the_gradients_of_step_one_alone(make, model):
-    """S and Step I are computed in float32: also backwards, so that bf16 trains the same weights."""
+    """S and Step I are computed in float32, also backwards: bf16 trains the same weights."""
     found = []
     for precision in ("32-true", "bf16-mixed"):
         short = ("training.schedule.segmentation=2", "training.schedule.step_one=4")

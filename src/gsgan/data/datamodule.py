@@ -6,7 +6,8 @@ import inspect
 import logging
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +19,7 @@ import gsgan.utils.compat  # noqa: F401  (must come before lightning)
 import cv2
 import torch
 from lightning import LightningDataModule
-from torch.utils.data import DataLoader, Dataset, Subset
+from torch.utils.data import DataLoader, Subset
 
 from gsgan.data.crop import PersonCrop
 from gsgan.data.dataset import CaptureDataset, ImageCache, Lens, StepSampler, pass_order
@@ -319,7 +320,7 @@ class GsganData(LightningDataModule):
         steps = self.steps_per_epoch or per_pass
         sampler = StepSampler(len(dataset), self.batch_size, steps, self.seed, replicas, rank)
         sampler.set_epoch(epoch)
-        return self._loader(dataset, sampler)
+        return self._loader(dataset, sampler=sampler)
 
     @property
     def watched(self) -> tuple[str, list[int]]:
@@ -333,7 +334,7 @@ class GsganData(LightningDataModule):
     def val_dataloader(self) -> DataLoader[Frame]:
         """The images of `watched`."""
         name, places = self.watched
-        return self._loader(Subset(self.dataset(name), places))
+        return self._loader(self.dataset(name), places)
 
     def test_dataloader(self) -> list[DataLoader[Frame]]:
         """One loader per held-out split that is not empty, as in `eval_names`."""
@@ -343,19 +344,27 @@ class GsganData(LightningDataModule):
         self, batch: Frame, device: torch.device, dataloader_idx: int
     ) -> Frame:
         """The batch on the device; Lightning's own walk cannot rebuild frozen records."""
-        return batch.to(device)
+        return batch.to(device, non_blocking=True).unpacked()
 
     def _loader(
-        self, dataset: Dataset[Frame], sampler: StepSampler | None = None
+        self,
+        dataset: CaptureDataset,
+        places: Sequence[int] | None = None,
+        sampler: StepSampler | None = None,
     ) -> DataLoader[Frame]:
+        """Batches of `Frame` whose pixels are bytes, as `transfer_batch_to_device` takes them."""
+        packed = copy(dataset)
+        packed.packed = True
+        on_gpu = self.trainer is not None and self.trainer.strategy.root_device.type == "cuda"
         return DataLoader(
-            dataset,
+            packed if places is None else Subset(packed, places),
             batch_size=self.batch_size,
             sampler=sampler,
             collate_fn=cat,
             num_workers=self.workers,
             worker_init_fn=_quiet_worker,
             persistent_workers=self.workers > 0 and sampler is not None,
+            pin_memory=on_gpu,
         )
 
 

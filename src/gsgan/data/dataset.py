@@ -24,7 +24,7 @@ from gsgan.data.layout import Layout
 from gsgan.data.pixels import IGNORE_LABEL
 from gsgan.data.skeletons import Landmarks
 from gsgan.data.splits import Item
-from gsgan.scene import BodyPose, Camera, Frame
+from gsgan.scene import BodyPose, Camera, Frame, unit
 from gsgan.utils.checks import whole
 from gsgan.utils.errors import DataError
 
@@ -69,6 +69,8 @@ class ImageCache(LRUCache[Item, DecodedImage]):
 class CaptureDataset(Dataset[Frame]):
     """Items of a capture as `Frame` with batch size 1; collate them with `gsgan.scene.cat`.
 
+    With ``packed`` images, masks and labels stay bytes, see `Frame.unpacked`.
+
     Images are RGB in [0, 1] on black, cut to the window and scaled; K follows. By default they are
     undistorted with K kept, and ``camera.dist`` is None. The window depends on the skeleton and
     camera alone. Labels keep 255 as "ignore".
@@ -88,6 +90,8 @@ class CaptureDataset(Dataset[Frame]):
     Raises:
         ConfigError: when the size is not a whole number above 0.
     """
+
+    packed = False
 
     def __init__(
         self,
@@ -123,22 +127,26 @@ class CaptureDataset(Dataset[Frame]):
             decoded = self._load(item)
             if self.cache.getsizeof(decoded) <= self.cache.maxsize:
                 self.cache[item] = decoded
-        labels, poses = decoded.labels, self.layout.poses
-        body = None
+        labels, unsure = (
+            None if x is None else torch.from_numpy(x)[None]
+            for x in (decoded.labels, decoded.unsure)
+        )
+        body, poses = None, self.layout.poses
         if poses is not None:
             body = BodyPose(_float(poses.theta[frame]), _float(poses.transl[frame]))
-        return Frame(
-            image=_unit(decoded.image)[None],
-            mask=_unit(decoded.mask)[None, None],
+        found = Frame(
+            image=torch.from_numpy(decoded.image)[None],
+            mask=torch.from_numpy(decoded.mask)[None, None],
             camera=self.camera(item),
             skeleton=_float(self.skeletons.p[frame]),
             visibility=_float(self.skeletons.visibility[frame]),
             frame_id=torch.tensor([frame]),
             camera_index=torch.tensor([self._indices[name]]),
             body=body,
-            labels=None if labels is None else torch.from_numpy(labels).to(torch.int64)[None],
-            unsure=None if decoded.unsure is None else _unit(decoded.unsure)[None, None],
+            labels=labels,
+            unsure=None if unsure is None else unsure[None],
         )
+        return found if self.packed else found.unpacked()
 
     def inside(self, index: int) -> Tensor | None:
         """``[1, 1, H, W]`` 1 where a pixel of the item lies in the stored image; None where all do.
@@ -150,7 +158,7 @@ class CaptureDataset(Dataset[Frame]):
         mapping = self._mapping(camera, window)
         taken = cropping.take(np.full(camera.size, 255, np.uint8), window, mapping, exact=True)
         taken = cropping.resize(taken, self._target(window), exact=True)
-        return None if taken.all() else _unit(taken)[None, None]
+        return None if taken.all() else unit(torch.from_numpy(taken))[None, None]
 
     def _target(self, window: Crop) -> tuple[int, int]:
         return window.size if self.size is None else (self.size, self.size)
@@ -229,10 +237,6 @@ class CaptureDataset(Dataset[Frame]):
         labels = pixels.read_labels(path, rules, meta.label_names)
         self._check_size(path, labels, camera)
         return labels
-
-
-def _unit(pixels: Bytes) -> Tensor:
-    return torch.from_numpy(pixels).to(torch.float32).div_(255)
 
 
 def _float(array: NDArray[np.float64]) -> Tensor:

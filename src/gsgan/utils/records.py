@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
@@ -18,13 +18,20 @@ class TensorRecord:
 
     def to(self: S, *args: Any, **kwargs: Any) -> S:
         """A copy with every tensor sent through ``Tensor.to``; integer labels keep their dtype."""
+        return self._each(lambda value: _to(value, *args, **kwargs))
+
+    def pin_memory(self: S) -> S:
+        """A copy in page-locked memory, from which copies to a GPU run beside computations."""
+        return self._each(lambda value: value.pin_memory())
+
+    def _each(self: S, change: Callable[[Tensor], Tensor]) -> S:
         changes: dict[str, Any] = {}
         for field in fields(self):
             value = getattr(self, field.name)
             if isinstance(value, TensorRecord):
-                changes[field.name] = value.to(*args, **kwargs)
+                changes[field.name] = value._each(change)
             elif isinstance(value, Tensor):
-                changes[field.name] = _to(value, *args, **kwargs)
+                changes[field.name] = change(value)
         return replace(self, **changes)
 
     def __getitem__(self: S, index: slice) -> S:
