@@ -32,6 +32,8 @@ class Reads(TorchDispatchMode):
         name = func.overloadpacket.__name__
         if any(name.startswith(read) for read in READS):
             self.seen[name] += 1
+        if name == "lift_fresh":  # an index that is a list, or a tensor made of numbers
+            self.seen["a copy of numbers"] += 1
         if name == "repeat_interleave" and (kwargs or {}).get("output_size") is None:
             self.seen[name] += 1
         if name.startswith("index") and any(

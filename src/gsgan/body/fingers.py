@@ -14,6 +14,7 @@ from torch.nn.functional import normalize
 from gsgan.body.free import Body
 from gsgan.body.lbs import axis_angle_to_matrix, left_jacobian, shortest_turn
 from gsgan.skeleton.hands import FINGERS, HAND, PALM, PINKY, SHORT, palm_frames
+from gsgan.utils.tensors import constant
 
 # Per number, for the thumb and for the fingers: flexion, turn to the side and twist of the first
 # joint; flexion and turn to the side of the second, which represents the last two where a body has
@@ -102,7 +103,7 @@ class Fingers(nn.Module):
             seen: ``[B, 42]`` bool. A hand needs its wrist and the knuckles of index and little
                 finger, a finger its two landmarks nearest to the palm, its second joint one more.
         """
-        R = palm_frames(hands.unflatten(1, (2, HAND))[:, :, PALM]) @ self.palms.mT
+        R = palm_frames(_palms(hands)) @ self.palms.mT
         for steps in ROUNDS:
             turns = self._turned(R, hands, seen, steps)
             R, shift = _placed(self._posed(turns), hands, seen, R)
@@ -131,7 +132,7 @@ class Fingers(nn.Module):
     @staticmethod
     def placed(seen: Tensor) -> Tensor:
         """``[B, 2]`` bool: the hands whose palms have all their landmarks ``seen [B, 42]`` bool."""
-        return seen.unflatten(1, (2, HAND))[:, :, PALM].all(-1)
+        return _palms(seen).all(-1)
 
     def shown(self, seen: Tensor) -> Tensor:
         """``[B, 20]`` bool: the joints that the landmarks ``seen [B, 42]`` bool determine."""
@@ -151,7 +152,7 @@ class Fingers(nn.Module):
             [(x * seen)[:, :, part].sum(2) for part in (slice(0, 1), slice(1, None))]
             for x in (self.bones, bones)
         )
-        before, parts = torch.eye(3).to(bones), []
+        before, parts = torch.eye(3, dtype=bones.dtype, device=bones.device), []
         for axes, rest, now in zip(self.axes.split([3, 2], dim=1), rests, nows, strict=True):
             now = (now.unsqueeze(-2) @ before).squeeze(-2)
             turn = shortest_turn(*(normalize(x, dim=-1, eps=1e-9) for x in (rest, now)))
@@ -185,6 +186,11 @@ class Fingers(nn.Module):
         return torch.linalg.solve(H, g)
 
 
+def _palms(hands: Tensor) -> Tensor:
+    """The palms' landmarks ``[B, 2, 3, ...]`` of ``hands [B, 42, ...]``."""
+    return hands.unflatten(1, (2, HAND)).index_select(2, constant(PALM, hands, torch.int64))
+
+
 def _placed(x: Tensor, hands: Tensor, seen: Tensor, R: Tensor) -> tuple[Tensor, Tensor]:
     """Rotations ``[B, 2, 3, 3]`` and shifts ``[B, 2, 3]`` that move ``x [B, 42, 3]`` nearest to the
     landmarks seen, by Gauss-Newton steps from ``R``. Their gradients are always finite, unlike
@@ -193,7 +199,7 @@ def _placed(x: Tensor, hands: Tensor, seen: Tensor, R: Tensor) -> tuple[Tensor, 
     share = w / w.sum(2, keepdim=True).clamp_min(1)
     centre, goal = ((share * v).sum(2) for v in (x, y))
     away, towards = x - centre.unsqueeze(2), y - goal.unsqueeze(2)
-    eye = torch.eye(3).to(x)
+    eye = torch.eye(3, dtype=x.dtype, device=x.device)
     for _ in range(PLACING):
         now = away @ R.mT
         H = (share * now).mT @ now

@@ -7,6 +7,9 @@ rest frame is aligned with the world's axes: zero rotations are the rest pose.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
+from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -48,7 +51,7 @@ def left_jacobian(v: Tensor) -> Tensor:
     a = torch.where(small, 0.5 - squared / 24, (1 - angle.cos()) / safe)
     b = torch.where(small, 1 / 6 - squared / 120, (angle - angle.sin()) / (safe * angle))
     K = _cross_matrix(v)
-    return torch.eye(3).to(v) + a * K + b * (K @ K)
+    return torch.eye(3, dtype=v.dtype, device=v.device) + a * K + b * (K @ K)
 
 
 def _cross_matrix(v: Tensor) -> Tensor:
@@ -103,8 +106,8 @@ def forward_kinematics(
             f"got {list(transl.shape)}"
         )
     R, position = _accumulate(joints, parents, rotations, transl)
-    shift = position - (R @ joints.unsqueeze(-1)).squeeze(-1)
-    top = torch.cat([R, shift.unsqueeze(-1)], dim=-1)
+    shift = position - R @ joints.unsqueeze(-1)
+    top = torch.cat([R, shift], dim=-1)
     bottom = constant((0.0, 0.0, 0.0, 1.0), top).expand(*top.shape[:2], 1, 4)
     return torch.cat([top, bottom], dim=-2)
 
@@ -112,28 +115,36 @@ def forward_kinematics(
 def _accumulate(
     joints: Tensor, parents: Sequence[int], rotations: Tensor, transl: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """World rotations ``[B, J, 3, 3]`` and positions ``[B, J, 3]``, one level at a time."""
-    world_R: dict[int, Tensor] = {}
-    world_p: dict[int, Tensor] = {}
-    for level in kinematic_levels(parents):
-        R = rotations[:, level]
-        p = joints[..., level, :].expand(len(rotations), -1, -1)
-        above = [parents[j] for j in level]
-        if above[0] < 0:
-            p = p + transl.unsqueeze(1)
-        else:
-            parent_R = torch.stack([world_R[j] for j in above], dim=1)
-            parent_p = torch.stack([world_p[j] for j in above], dim=1)
-            offset = joints[..., level, :] - joints[..., above, :]
-            p = parent_p + (parent_R @ offset.unsqueeze(-1)).squeeze(-1)
-            R = parent_R @ R
-        world_R.update(zip(level, R.unbind(1), strict=True))
-        world_p.update(zip(level, p.unbind(1), strict=True))
-    order = range(len(parents))
-    return (
-        torch.stack([world_R[j] for j in order], dim=1),
-        torch.stack([world_p[j] for j in order], dim=1),
+    """World rotations ``[B, J, 3, 3]`` and positions ``[B, J, 3, 1]``, one level at a time."""
+    sizes, order, before, above, back = _plan(tuple(parents))
+
+    def taken(x: Tensor, index: tuple[int, ...], dim: int) -> Tensor:
+        return x.index_select(dim, constant(index, x, torch.int64))
+
+    rest = taken(joints, order, -2)
+    offsets = (rest - taken(joints, before, -2)).unsqueeze(-1).split(sizes, dim=-3)
+    R = list(taken(rotations, order, 1).split(sizes, dim=1))
+    roots = rest[..., : sizes[0], :].expand(len(rotations), -1, -1)
+    p = [(roots + transl.unsqueeze(1)).unsqueeze(-1)]
+    for level, index in enumerate(above, start=1):
+        parent_R, parent_p = taken(R[level - 1], index, 1), taken(p[-1], index, 1)
+        p.append(parent_p + parent_R @ offsets[level])
+        R[level] = parent_R @ R[level]
+    return taken(torch.cat(R, dim=1), back, 1), taken(torch.cat(p, dim=1), back, 1)
+
+
+@lru_cache(maxsize=64)
+def _plan(parents: tuple[int, ...]) -> tuple[Any, ...]:
+    """The sizes of the levels; the joints by level; their parents, or a root itself; by level the
+    parents' places in the level before; and the place of each joint among those by level."""
+    levels = kinematic_levels(parents)
+    order = tuple(joint for level in levels for joint in level)
+    before = tuple(j if parents[j] < 0 else parents[j] for j in order)
+    above = tuple(
+        tuple(upper.index(parents[j]) for j in level) for upper, level in pairwise(levels)
     )
+    back = tuple(order.index(j) for j in range(len(parents)))
+    return [len(level) for level in levels], order, before, above, back
 
 
 def check_weights(bone_weight: Tensor) -> None:

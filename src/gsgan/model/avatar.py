@@ -34,7 +34,7 @@ from gsgan.skeleton import (
     face_code,
 )
 from gsgan.splat import Accuracy, rasterise
-from gsgan.utils.tensors import full_precision
+from gsgan.utils.tensors import filled, full_precision
 
 LINE_WIDTH = 2.5  # sigma of p₂D's lines, pixels in an image 512 high
 UNWATCHED: AbstractContextManager[None] = nullcontext()  # entering it costs next to nothing
@@ -171,7 +171,7 @@ class Avatar(nn.Module):
         cameras = camera if len(camera) == len(p) else cat([camera] * len(p))
         body = None if body is None else body.to(device)
         rendering = self(p, seen, cameras.to(device), body, maps=False)
-        colour = rendering.image.new_tensor(background).expand(3).view(1, 3, 1, 1)
+        colour = filled(background, rendering.image).expand(3).view(1, 3, 1, 1)
         image = rendering.image.clamp(0, 1)
         return (image + (1 - rendering.alpha.clamp(0, 1)) * colour).clamp(0, 1)
 

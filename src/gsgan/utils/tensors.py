@@ -18,11 +18,12 @@ KEPT = 1 << 30  # bytes of freed memory that the process keeps
 LARGEST = 1 << 25  # bytes; glibc takes larger blocks from the system in any case
 
 
-def constant(values: Any, like: Tensor) -> Tensor:
-    """Nested tuples of numbers as a tensor with the dtype and device of ``like``; read only."""
+def constant(values: Any, like: Tensor, dtype: torch.dtype | None = None) -> Tensor:
+    """Nested tuples of numbers as a tensor on the device of ``like``, of its dtype unless another
+    is given; read only."""
     # what torch.export sees is a stand-in, and must not be kept
     make = _constant.__wrapped__ if torch.compiler.is_compiling() else _constant
-    return make(values, like.dtype, like.device)
+    return make(values, dtype or like.dtype, like.device)
 
 
 @lru_cache(maxsize=1024)
@@ -33,7 +34,7 @@ def _constant(values: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
 
 def filled(values: Any, like: Tensor) -> Tensor:
     """Like `constant` for values that change between calls: filled on the device, not copied."""
-    if isinstance(values, tuple):
+    if isinstance(values, tuple | list):
         return torch.stack([filled(value, like) for value in values])
     return like.new_full((), values)
 
