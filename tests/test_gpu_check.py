@@ -6,6 +6,7 @@ import os
 import shlex
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -42,31 +43,34 @@ def test_without_cuda_it_ends_with_one_sentence(tmp_path):
 
 
 @pytest.mark.slow
-def test_each_step_runs_once_and_its_options_exist(tmp_path, compose):
+@pytest.mark.parametrize("device", ["cuda", "cpu"])
+def test_each_step_runs_once_and_its_options_exist(tmp_path, compose, device):
     fake = tmp_path / "python"
     fake.write_text(FAKE)
     fake.chmod(0o755)
     out = tmp_path / "out"
-    assert check(tmp_path, str(fake)).returncode == 1  # one step fails at first
+    run = partial(check, tmp_path, str(fake), GPU_CHECK_DEVICE=device)
+    assert run().returncode == 1  # one step fails at first
     assert "failed after" in (tmp_path / "gpu.md").read_text()
     first = (out / "calls").read_text().splitlines()
-    assert check(tmp_path, str(fake)).returncode == 0
+    assert run().returncode == 0
     again = (out / "calls").read_text().splitlines()[len(first) :]
     assert [line for line in again if "gsgan" in line and "speed_1024" not in line] == []
     page = (tmp_path / "gpu.md").read_text()
     assert "failed" not in page
+    assert page.startswith("# On a GPU" if device == "cuda" else "# A rehearsal on a CPU")
     commands = [shlex.split(path.read_text())[1:] for path in sorted(out.glob("*.command"))]
-    assert len(commands) == 8
+    assert len(commands) == 12
     for words in commands:
         if words[1] == "pytest":
-            assert Path(words[-1]).exists()
+            assert all(Path(word).exists() for word in words if word.startswith("tests"))
         elif words[1] == "gsgan.bench":
             compose(f"bench_{words[2]}", *without_folder(words[3:]))
         elif words[0].endswith("raster.py"):
             options = OmegaConf.load(ROOT / words[0].replace(".py", ".yaml"))
             assert {word.split("=")[0] for word in words[1:]} <= set(options)
         else:
-            compose("train", *without_folder(words[2:]))
+            compose(words[1].removeprefix("gsgan."), *without_folder(words[2:]))
 
 
 def without_folder(overrides: list[str]) -> list[str]:
