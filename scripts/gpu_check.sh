@@ -55,9 +55,9 @@ if [[ $device == cpu ]]; then
   speed=("${speed[@]/size=full/size=tiny}" frames=2 warmup=1 poses=2)
   data=(data=synthetic data.source.size=32 data.source.train_cameras=2 data.source.test_cameras=1
     data.source.frames=4 data.source.test_frames=1 data.source.rays_per_pixel=1)
-  trainer=cpu ddp=(trainer=ddp trainer.accelerator=cpu) suite=(tests/test_scene.py)
-  fit=(size.image=48 fit.points=400 fit.surface_steps=4 fit.sweeps=2)
-  demo=(size=tiny fit.points=400 fit.surface_steps=4 fit.sweeps=2) video=(frames=3)
+  quick=(fit.points=400 fit.surface_steps=4 fit.sweeps=2) suite=(tests/test_scene.py)
+  trainer=cpu ddp=(trainer=ddp trainer.accelerator=cpu "${data[@]}" "${quick[@]}")
+  fit=(size.image=48 "${quick[@]}") demo=(size=tiny "${quick[@]}") video=(frames=3)
   raster=('backends=[torch]' 'gaussians=[500]' 'sizes=[64]' 'channels=[3]' repeats=1)
   paper=(size=tiny data.size=32 training.schedule.segmentation=2 training.schedule.step_one=2
     training.schedule.step_two=2 training.schedule.epoch=2)
@@ -92,7 +92,7 @@ step paper 300 "$python" -m gsgan.train experiment=paper trainer=$trainer \
   hydra.run.dir="$out/paper"
 
 [[ $device == cuda ]] && title="On a GPU" || title="A rehearsal on a CPU"
-card=$(nvidia-smi --query-gpu=name,driver_version,memory.total --format=csv,noheader || echo unknown)
+card=$(nvidia-smi --query-gpu=name,driver_version,memory.total --format=csv,noheader 2>/dev/null || echo unknown)
 {
   echo "# $title"
   echo
