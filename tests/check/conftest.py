@@ -51,7 +51,9 @@ def check(monkeypatch: pytest.MonkeyPatch):
         root: Path, images: int = 48, consistency: dict | None = None, **limits: float
     ) -> Report:
         sampling = Sampling(images=images, shown=1)
-        reader = CaptureReader(consistency=Consistency(min_box_iou=0.0, **(consistency or {})))
+        reader = CaptureReader(
+            consistency=Consistency(**({"least_inside": 0.2} | (consistency or {})))
+        )
         data = GsganData(root=str(root), reader=reader)
         # the forearm of the test person grows as it is raised
         return check_data(data, sampling, Limits(limb_share=2.0, **limits))

@@ -228,7 +228,7 @@ ZJU: dict[str, Damage] = {
     "2.npy: the first 3 numbers of 'poses' must be 0": params(poses=np.full((1, 72), 0.1)),
     "'Rh' must hold finite numbers": params(Rh=np.full((1, 3), np.nan)),
     "2.npy has no 'Rh'": objects("new_params/2.npy", lambda c: c.pop("Rh")),
-    "the projected body and the masks do not meet .*check that cameras": objects(
+    "joints lie outside the masks .*check that cameras": objects(
         "new_params/*.npy", lambda c: c.update(Th=c["Th"] + [[0.6, 0.8, 0.0]])
     ),
     "100% of all 12 images have no mask": remove("mask", "mask_cihp"),
@@ -253,7 +253,7 @@ EASYMOCAP: dict[str, Damage] = {
     "needs a whole 'id' that no other has, found 0": people(lambda p: p.append(p[0])),
     "must hold a list of people": people(lambda p: p.append(3)),
     "000001.json is not valid JSON": write("keypoints3d/000001.json", b"[" * 5000),
-    "do not meet.*one person": image("mask/*/*.png", np.eye(40, dtype=np.uint8) * 255),
+    "joints lie outside.*one person": image("mask/*/*.png", np.eye(40, dtype=np.uint8) * 255),
     "mask/1/000000.png does not exist; every image needs a mask": remove("mask"),
 }
 

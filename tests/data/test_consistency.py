@@ -13,7 +13,6 @@ from gsgan.data.cameras import CameraEntry
 from gsgan.data.formats.capture import SKELETON_LIMITS, CaptureReader
 from gsgan.data.formats.consistency import (
     Consistency,
-    box_of,
     far_cameras,
     inside_share,
     joint_distance,
@@ -65,7 +64,7 @@ def test_a_camera_that_is_wholly_wrong_is_refused(
         read(root)
     assert "\n" not in str(caught.value)
     assert str(root) in str(caught.value)
-    assert read(root, Consistency(frames=0, min_box_iou=0)).notes == ()  # nothing is compared
+    assert read(root, Consistency(frames=0)).notes == ()  # nothing is compared
 
 
 def test_the_share_of_joints_inside_a_mask() -> None:
@@ -79,18 +78,6 @@ def test_the_share_of_joints_inside_a_mask() -> None:
     assert inside_share(mask, camera, joints, 0.5) == 1
     assert np.isnan(inside_share(0 * mask, camera, joints, 0.05))
     assert np.isnan(inside_share(mask, camera, joints[3:], 0.05))
-
-
-def test_boxes_follow_skew_and_lens(root: Path) -> None:
-    K = np.array([[100.0, 30, 50], [0, 100, 50], [0, 0, 1]])
-    dist = np.array([-0.1, *[0.0] * 7])
-    camera = CameraEntry("c", K, np.eye(3), np.zeros(3), dist, (100, 100))
-    x, y = 0.2, 0.3
-    bend = 1 - 0.1 * (x * x + y * y)
-    u, v = (K @ [x * bend, y * bend, 1])[:2]
-    points = np.array([[0.0, 0, 2], [2 * x, 2 * y, 2]])
-    assert box_of(points, camera) == pytest.approx((50, 50, u, v))
-    assert box_of(points * [1, 1, -1], camera) is None
 
 
 def test_the_config_passes_its_settings(root: Path, compose) -> None:

@@ -19,10 +19,11 @@ from writers.easymocap import (
     write_easymocap,
     write_people,
 )
+from writers.smpl import posed
 
 from gsgan.data.files import read_colour
 from gsgan.data.formats.easymocap import EasymocapReader
-from gsgan.data.formats.smpl_motion import SmplMotion, posed
+from gsgan.data.formats.smpl_motion import SmplMotion
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_mask
 from gsgan.data.validation import Thresholds

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 from writers.common import write_picture
+from writers.smpl import posed
 from writers.smplx_rig import SmplxSubject
 from writers.thuman4 import write_thuman4
 
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.files import read_colour
 from gsgan.data.formats.consistency import Consistency
-from gsgan.data.formats.smpl_motion import SmplMotion, posed
+from gsgan.data.formats.smpl_motion import SmplMotion
 from gsgan.data.formats.smplx_rig import read_missing
 from gsgan.data.formats.thuman4 import Thuman4Reader
 from gsgan.data.layout import Layout

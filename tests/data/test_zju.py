@@ -15,11 +15,11 @@ import pytest
 import torch
 from writers import zju as writers
 from writers.common import Subject, make_subject, write_object, write_picture
+from writers.smpl import posed
 
 from gsgan.body.smpl_names import CIHP
 from gsgan.data.dataset import CaptureDataset
-from gsgan.data.formats.consistency import box_iou, mask_box
-from gsgan.data.formats.smpl_motion import SmplMotion, landmarks_of, posed
+from gsgan.data.formats.smpl_motion import SmplMotion, landmarks_of
 from gsgan.data.formats.zju import ZjuReader, camera_folders, frame_number, read_annots
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_labels, read_mask
@@ -260,16 +260,6 @@ def test_labels_beyond_cihp_are_ignored(original: Path, smpl_file: Path) -> None
     found = frame_of(read(original, smpl_file), 0, 3).labels
     assert found is not None
     assert set(found.unique().tolist()) <= {*range(20), 255}
-
-
-def test_boxes() -> None:
-    assert box_iou((0, 0, 2, 2), (0, 0, 2, 2)) == 1
-    assert box_iou((0, 0, 2, 2), (1, 0, 3, 2)) == pytest.approx(1 / 3)
-    assert box_iou((0, 0, 1, 1), (5, 5, 6, 6)) == 0
-    mask = np.zeros((8, 9), np.uint8)
-    assert mask_box(mask) is None
-    mask[2:4, 5:7] = 255
-    assert mask_box(mask) == (5, 2, 7, 4)
 
 
 # -- runs

@@ -7,13 +7,10 @@ one missing image must not shift the others.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.pixels import MaskFile, PixelRules
@@ -30,8 +27,6 @@ from gsgan.data.validation import (
 from gsgan.utils.errors import DataError
 
 MaskIndex = Mapping[str, Mapping[int, tuple[MaskFile, ...]]]
-Points = Callable[[int], NDArray[np.float64]]
-"""A frame's points on or in the body, ``[N, 3]`` metres."""
 
 
 @dataclass(frozen=True)
@@ -117,13 +112,11 @@ class Found(_Contents):
         mask_folder: where the masks of ``{camera}`` are expected, for messages.
         calibration: the file that holds the cameras, for messages.
         unit_hint: what to check when distances are implausible.
-        points: points on the body's surface, compared with the masks; None compares the joints.
     """
 
     mask_folder: str = "mask/{camera}"
     calibration: Path
     unit_hint: str
-    points: Points | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,10 +12,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import torch
 from writers import python2
 
 from gsgan.body import free_body
+from gsgan.body.smpl import SkinnedModel
 from gsgan.body.smpl_names import JOINT_NAMES
+from gsgan.data.formats.smpl_motion import SmplMotion
 from gsgan.skeleton.smpl import TABLES
 from gsgan.utils.files import write_atomically
 
@@ -227,3 +230,10 @@ def _faces(chosen: np.ndarray) -> np.ndarray:
     faces = place[free_body().faces.numpy()]
     kept = faces[(faces >= 0).all(axis=1)]
     return kept if len(kept) else np.array([[0, 1, 2]])
+
+
+def posed(model: SkinnedModel, motion: SmplMotion, pose_blend: bool = True) -> list[np.ndarray]:
+    """Vertices ``[F, V, 3]`` and joints ``[F, J, 3]`` of a reader's motion, metres."""
+    face = None if motion.expression is None else torch.from_numpy(motion.expression)
+    given = (torch.from_numpy(x) for x in (motion.theta, motion.betas, motion.transl))
+    return [x.numpy() for x in model.pose(*given, face, pose_blend=pose_blend)]

@@ -51,8 +51,8 @@ LANDMARKS, HANDS_FILE, FACE_FILE = "landmarks3d.npz", "hands3d.npz", "face3d.npz
 POSES, SHAPE = "body_pose.npz", "body_shape.npz"
 MASKS = (".png",)
 BODY_BONES = {"free": 56, "smpl": 24, "smplx": 55}
-SKELETON_LIMITS = Consistency(min_box_iou=0.0)
-"""Landmarks lie inside the body and may lack limbs, hence min_box_iou=0."""
+SKELETON_LIMITS = Consistency(least_inside=0.2)
+"""A capture's own landmarks are noisier than those of a fitted body."""
 
 
 @dataclass(frozen=True)

@@ -76,13 +76,13 @@ class FolderReader:
 def finish(
     found: Found, limits: Thresholds, consistency: Consistency, hint: str, drop_frames: Any = None
 ) -> Layout:
-    """Checks the files against each other and a few masks against the body.
+    """Checks the files against each other and a few masks against the joints.
 
     Args:
         found: by a reader.
         limits: thresholds.
         consistency: which images are compared.
-        hint: what to check when body and masks do not agree.
+        hint: what to check when joints and masks do not agree.
         drop_frames: frames to leave out, or None.
 
     Raises:
@@ -99,7 +99,7 @@ def finish(
             raise ConfigError(f"data.reader.drop_frames={drop_frames} leaves no frame")
         found = replace(found, images=images)
     layout = assemble(found, limits)
-    check_consistency(layout, found.points or layout.landmarks.seen, consistency, hint)
+    check_consistency(layout, consistency, hint)
     return layout
 
 

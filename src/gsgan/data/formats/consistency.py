@@ -6,10 +6,10 @@ applies the same measures and thresholds to many. Pixel centres lie at +0.5.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -25,7 +25,6 @@ from gsgan.utils.errors import DataError
 Bytes = NDArray[np.uint8]
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
-Box = tuple[float, float, float, float]
 T = TypeVar("T")
 
 LONGEST = 512  # pixels, longest side of a mask that joints are compared with
@@ -41,98 +40,53 @@ class Consistency:
     """
 
     frames: int = 3
-    min_box_iou: float = 0.5
-    least_inside: float = 0.2
+    least_inside: float = 0.5
     min_inside: float = 0.9
     far_camera: float = 10.0
     joint_tolerance: float = 0.05
 
 
-class Comparison(NamedTuple):
-    """One image's mask against what its camera should see.
-
-    Args:
-        camera, frame, mask, empty: of the image; the (first) file of its mask, and whether that
-            has no foreground.
-        iou: overlap of the boxes of mask and projected body; NaN when one of them is empty.
-        inside: share of the visible joints inside the mask; NaN of none.
-    """
-
-    camera: str
-    frame: int
-    mask: Path
-    empty: bool
-    iou: float
-    inside: float
-
-
-def check_consistency(
-    layout: Layout, body: Callable[[int], Float], limits: Consistency, hint: str
-) -> None:
-    """Checks that the projected body and the joints lie where the masks are.
+def check_consistency(layout: Layout, limits: Consistency, hint: str) -> None:
+    """Checks that the joints lie where the masks are.
 
     Args:
         layout: the dataset.
-        body: points on the body ``[N, 3]`` of a frame, metres, world.
         limits: how many frames, and the thresholds.
         hint: what to check when they do not fit.
 
     Raises:
-        DataError: naming the camera that is furthest off, or the first of masks that are all empty.
+        DataError: naming the cameras with the share of joints inside, or the first of masks that
+            are all empty.
     """
-    compared = [
-        _compare(layout, points, camera, frame, limits)
-        for frame in spread(list(layout.frames), limits.frames)
-        for points in [body(frame)]
-        for camera, files in layout.masks.items()
-        if frame in files
-    ]
-    if not compared:
+    frames = spread(list(layout.frames), limits.frames)
+    shares, masks, empty = dict[str, list[float]](), list[Path](), True
+    for name, camera in layout.cameras.items():
+        for frame in (f for f in frames if f in layout.masks[name]):
+            mask = read_mask(layout.mask_files(name, frame), layout.pixels)
+            masks.append(layout.mask_path(name, frame))
+            empty = empty and not mask.any()
+            joints = layout.landmarks.seen(frame)
+            share = inside_share(mask, camera, joints, limits.joint_tolerance)
+            if np.isfinite(share):
+                shares.setdefault(name, []).append(share)
+    if not masks:
         return
-    person = np.median(layout.landmarks.seen(compared[0].frame), axis=0)
+    person = np.median(layout.landmarks.seen(frames[0]), axis=0)
     metres = {n: float(np.linalg.norm(c.centre - person)) for n, c in layout.cameras.items()}
     if far := far_cameras(metres, limits.far_camera):
         raise DataError(f"{layout.root}: {next(iter(far.values()))}")
-    if all(one.empty for one in compared):
+    if empty:
         raise DataError(
-            f"{compared[0].mask} shows no person, nor does any of the {len(compared)} masks "
-            "compared; expected values above 0 where the person is"
+            f"{masks[0]} shows no person, nor does any of the {len(masks)} masks compared; "
+            "expected values above 0 where the person is"
         )
-    known = [one for one in compared if np.isfinite(one.iou)]
-    if known and (median := float(np.median([one.iou for one in known]))) < limits.min_box_iou:
-        worst = min(known, key=lambda one: one.iou)
-        raise DataError(
-            f"{layout.root}: the projected body and the masks do not meet (their boxes overlap by "
-            f"{median:.2f}, expected {limits.min_box_iou:g}; worst in camera {worst.camera}, frame "
-            f"{worst.frame}: {worst.mask}); {hint}"
-        )
-    inside = {
-        name: np.mean(shares)
-        for name in layout.cameras
-        if (shares := [x.inside for x in compared if x.camera == name and np.isfinite(x.inside)])
-    }
+    inside = {name: np.mean(found) for name, found in shares.items()}
     if inside and min(inside.values()) < limits.least_inside:
-        found = ", ".join(f"{name} {share:.0%}" for name, share in inside.items())
+        text = ", ".join(f"{name} {share:.0%}" for name, share in inside.items())
         raise DataError(
-            f"{layout.root}: joints lie outside the masks (inside: {found}); {hint}: "
+            f"{layout.root}: joints lie outside the masks (inside: {text}); {hint}: "
             "python -m gsgan.check finds the wrong camera"
         )
-
-
-def _compare(
-    layout: Layout, points: Float, name: str, frame: int, limits: Consistency
-) -> Comparison:
-    camera, joints = layout.cameras[name], layout.landmarks.seen(frame)
-    mask = read_mask(layout.mask_files(name, frame), layout.pixels)
-    expected, found = box_of(points, camera), mask_box(mask)
-    return Comparison(
-        camera=name,
-        frame=frame,
-        mask=layout.mask_path(name, frame),
-        empty=not mask.any(),
-        iou=box_iou(expected, found) if expected and found else np.nan,
-        inside=inside_share(mask, camera, joints, limits.joint_tolerance),
-    )
 
 
 def far_cameras(metres: Mapping[str, float], factor: float) -> dict[str, str]:
@@ -191,32 +145,6 @@ def inside_share(mask: Bytes, camera: CameraEntry, joints: Float, tolerance: flo
     known = ~np.isnan(outside)
     allowed = np.maximum(tolerance, TOLERANCE * depth / focal)
     return float((outside <= allowed)[known].mean()) if known.any() else np.nan
-
-
-def box_of(points: Float, camera: CameraEntry) -> Box | None:
-    """(left, top, right, bottom) of world points ``[N, 3]`` in the stored (distorted) image."""
-    _, depth = project(camera, points)
-    pixels = camera.stored_pixels(points[depth > NEAR])
-    if len(pixels) == 0:
-        return None
-    edges = np.clip([pixels.min(0), pixels.max(0)], 0, camera.size[::-1])
-    (left, top), (right, bottom) = edges.tolist()
-    return left, top, right, bottom
-
-
-def mask_box(mask: Bytes) -> Box | None:
-    """The box of a mask's person, None when it is empty."""
-    left, top, width, height = cv2.boundingRect((mask > 127).astype(np.uint8))
-    return (left, top, left + width, top + height) if width else None
-
-
-def box_iou(a: Box, b: Box) -> float:
-    """Intersection over union of two boxes."""
-    width = min(a[2], b[2]) - max(a[0], b[0])
-    height = min(a[3], b[3]) - max(a[1], b[1])
-    both = max(width, 0.0) * max(height, 0.0)
-    total = sum((box[2] - box[0]) * (box[3] - box[1]) for box in (a, b)) - both
-    return both / total if total > 0 else 0.0
 
 
 def spread(values: Sequence[T], count: int) -> list[T]:

@@ -49,26 +49,6 @@ class SmplMotion:
             source,
         )
 
-    def rows(self, chosen: slice | list[int]) -> SmplMotion:
-        """The motion at some rows."""
-        face = None if self.expression is None else self.expression[chosen]
-        return SmplMotion(
-            self.ids[chosen], self.theta[chosen], self.transl[chosen], self.betas[chosen], face
-        )
-
-
-def posed(model: SkinnedModel, motion: SmplMotion, pose_blend: bool = True) -> tuple[Float, Float]:
-    """Vertices ``[F, V, 3]`` and joints ``[F, J, 3]``, metres, world; for few frames at a time."""
-    face = None if motion.expression is None else torch.from_numpy(motion.expression)
-    vertices, joints = model.pose(
-        torch.from_numpy(motion.theta),
-        torch.from_numpy(motion.betas),
-        torch.from_numpy(motion.transl),
-        face,
-        pose_blend=pose_blend,
-    )
-    return vertices.numpy(), joints.numpy()
-
 
 def landmarks_of(
     model: SkinnedModel, motion: SmplMotion, pose_blend: bool = True
@@ -83,8 +63,11 @@ def landmarks_of(
     small = _only(model, vertices)
     p, conf = [], []
     for first in range(0, len(motion.ids), CHUNK):
-        found, joints = posed(small, motion.rows(slice(first, first + CHUNK)), pose_blend)
-        for v, j in zip(found, joints, strict=True):
+        part = slice(first, first + CHUNK)
+        given = (torch.from_numpy(x[part]) for x in (motion.theta, motion.betas, motion.transl))
+        face = None if motion.expression is None else torch.from_numpy(motion.expression[part])
+        found, joints = small.pose(*given, face, pose_blend=pose_blend)
+        for v, j in zip(found.numpy(), joints.numpy(), strict=True):
             full = np.full((len(model.v_template), 3), np.nan)
             full[vertices] = v[: len(vertices)]
             one_p, one_conf = to_mediapipe33(j, full, cast(Literal["smpl", "smplx"], model.kind))

@@ -26,7 +26,7 @@ from gsgan.data.formats.common import (
     one_mask_each,
     up_axis,
 )
-from gsgan.data.formats.smpl_motion import SmplMotion, landmarks_of, posed
+from gsgan.data.formats.smpl_motion import SmplMotion, landmarks_of
 from gsgan.data.layout import BodyModel, Found, Meta
 from gsgan.data.pixels import PixelRules
 from gsgan.data.skeletons import make_landmarks
@@ -107,7 +107,6 @@ class SmplxRigReader(FolderReader):
         cameras = self._cameras(root, path, entries, images, notes)
         frames = {f for files in images.values() for f in files}
         motion = read_motion(root / PARAMETERS, frames, model, notes)
-        row = {int(f): i for i, f in enumerate(motion.ids)}
         p, conf = landmarks_of(model, motion)
         return Found(
             root=root,
@@ -131,7 +130,6 @@ class SmplxRigReader(FolderReader):
             ),
             calibration=path,
             unit_hint=f"T in {path} and transl in {root / PARAMETERS} must be in metres",
-            points=lambda frame: posed(model, motion.rows([row[frame]]))[0][0],
             notes=tuple(notes),
         )
 

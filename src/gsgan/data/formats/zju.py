@@ -24,7 +24,7 @@ from gsgan.body.smpl_names import CIHP
 from gsgan.data.cameras import CameraEntry, make_camera
 from gsgan.data.files import frame_files, frame_of, last_number
 from gsgan.data.formats.common import IMAGES, FolderReader, body_model, image_size, up_axis
-from gsgan.data.formats.smpl_motion import SmplMotion, landmarks_of, posed, zju_motion
+from gsgan.data.formats.smpl_motion import SmplMotion, landmarks_of, zju_motion
 from gsgan.data.layout import BodyModel, Found, Meta
 from gsgan.data.pixels import IGNORE_LABEL, MaskFile, PixelRules, mask_file
 from gsgan.data.skeletons import make_landmarks
@@ -80,7 +80,6 @@ class ZjuReader(FolderReader):
         motion = _read_motion(root, params, frames, model)
         masks, labels = _index_masks(root, folders)
         p, conf = landmarks_of(model, motion, kind != UNBLENDED)
-        row = {int(f): i for i, f in enumerate(motion.ids)}
         return Found(
             root=root,
             meta=Meta(
@@ -102,7 +101,6 @@ class ZjuReader(FolderReader):
             ),
             calibration=annots.path,
             unit_hint=f"T in {annots.path} must be in millimetres, Th in {root / params} in metres",
-            points=lambda frame: posed(model, motion.rows([row[frame]]), kind != UNBLENDED)[0][0],
             notes=tuple(notes),
         )
 
