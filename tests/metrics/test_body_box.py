@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import torch
 
-from gsgan.metrics.regions import box_corners, box_mask, inside_hull, pixel_centres
+from gsgan.metrics.regions import box_corners, box_mask, inside_hull
 from gsgan.scene import Camera, distort
 
 
@@ -50,16 +51,12 @@ def test_a_box_that_reaches_behind_the_camera_is_cut_at_the_near_plane():
     assert torch.equal(mask, expected)
 
 
-def test_pixel_centres_decide_and_flat_polygons_cover_nothing():
-    triangle = torch.tensor([[0.0, 0.0], [3.0, 0.0], [0.0, 3.0]])
-    centres = pixel_centres(camera((3, 3)))
-    assert centres[0, 2].tolist() == [2.5, 0.5]  # x, y
-    assert inside_hull(triangle, centres).tolist() == [
-        [True, True, True],
-        [True, True, False],
-        [True, False, False],
-    ]
-    assert torch.equal(inside_hull(triangle.flip(0), centres), inside_hull(triangle, centres))
+def test_points_on_the_edge_are_inside_and_flat_polygons_cover_nothing():
+    triangle = np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 3.0]])
+    centres = np.stack(np.meshgrid(np.arange(3) + 0.5, np.arange(3) + 0.5), axis=-1)
+    expected = [[True, True, True], [True, True, False], [True, False, False]]
+    assert inside_hull(triangle, centres).tolist() == expected
+    assert inside_hull(triangle[::-1], centres).tolist() == expected
     assert not inside_hull(triangle[:2], centres).any()
 
 

@@ -8,9 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from gsgan.data.crop import distort
+from gsgan.data.crop import distort, undistort
 from gsgan.data.datamodule import GsganData
-from gsgan.synthetic.camera import undistort
 from gsgan.synthetic.scene_setup import Scene, SceneSettings, dataset_key
 from gsgan.synthetic.scenes import ensure_scene
 from gsgan.synthetic.tint import Tint, make_tints
@@ -77,6 +76,9 @@ def test_undistort_inverts_distort():
     np.testing.assert_allclose(undistort(distort(x, dist), dist), x, atol=1e-9)
     np.testing.assert_array_equal(undistort(x, np.zeros(5)), x)
     assert undistort(np.zeros((0, 2)), dist).shape == (0, 2)
+    fold = np.array([-0.5, 0, 0, 0, 0])  # at r = 0.816, shown at 0.544
+    found = undistort(np.array([[0.5, 0.0], [0.56, 0.0], [0.0, 3.0]]), fold)
+    assert np.isnan(found).any(axis=1).tolist() == [False, True, True]
 
 
 def test_the_ray_of_a_points_pixel_hits_the_point(stage):

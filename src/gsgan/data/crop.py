@@ -19,6 +19,11 @@ Float = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
 NEAR = 1e-2  # metres: points nearer than this are not seen
+FOUND = 1e-8  # of x/z: largest error of an undistorted point
+# OpenCV's default of 5 iterations is pixels off in the corners of a strong lens.
+CONVERGED = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 400, 1e-12)
+# Only OpenCV 5 takes the criteria without "Iter".
+_undistort = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
 
 
 class Pinhole(Protocol):
@@ -175,6 +180,16 @@ def distort(points: Float, dist: Float) -> Float:
     nothing = np.zeros(3)
     shown = cv2.projectPoints(rays, nothing, nothing, np.eye(3), dist)[0]
     return np.asarray(shown, np.float64).reshape(points.shape)
+
+
+def undistort(points: Float, dist: Float) -> Float:
+    """``[N, 2]`` the inverse of `distort`, to `FOUND`; NaN where there is none: beyond the fold."""
+    if points.size == 0:
+        return points
+    eye = np.eye(3)
+    found = _undistort(points[:, None], eye, dist, R=eye, P=eye, criteria=CONVERGED)[:, 0]
+    error = np.abs(distort(found, dist) - points).max(axis=1, keepdims=True)
+    return np.asarray(np.where(error < FOUND, found, np.nan))
 
 
 def _through_lens(K: Float, dist: Float, u: Float, v: Float) -> Float:

@@ -12,7 +12,7 @@ import os
 import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,26 +26,8 @@ JPEG_SIGNATURE, JPEG_END, JPEG_SCAN = b"\xff\xd8", b"\xff\xd9", b"\xff\xda"
 LARGEST_FRAME = 10**9  # frame numbers beyond it are dates or damage
 
 
-class Header(NamedTuple):
-    """The header of an image file.
-
-    Args:
-        size: ``(H, W)`` pixels.
-        depth: bits per channel.
-        channels: 1 grey, 3 colour, 2 and 4 with an alpha channel (4 in a JPEG is CMYK).
-        palette: colours are looked up, values are not intensities.
-        jpeg: a JPEG, else a PNG.
-    """
-
-    size: tuple[int, int]
-    depth: int
-    channels: int
-    palette: bool
-    jpeg: bool
-
-
-def read_header(path: Path) -> Header:
-    """The header of a PNG or JPEG; no pixel is decoded.
+def read_header(path: Path) -> tuple[tuple[int, int], int, str]:
+    """``(H, W)``, bits per channel and Pillow's mode of a PNG or JPEG; no pixel is decoded.
 
     Raises:
         DataError: when the file is missing, empty, cut inside its header, or neither format.
@@ -54,9 +36,7 @@ def read_header(path: Path) -> Header:
         with Image.open(path, formats=("PNG", "JPEG")) as image:
             stored = re.search(r";(\d+)", str(image.tile[0][3]))  # e.g. RGB;16B, L;4
             depth = int(stored[1]) if stored else 1 if image.mode == "1" else 8
-            jpeg, palette = image.format != "PNG", image.mode == "P"
-            size = image.height, image.width
-            return Header(size, depth, len(image.getbands()), palette, jpeg)
+            return (image.height, image.width), depth, image.mode
     except UnidentifiedImageError:
         pass
     except OSError as error:
@@ -78,17 +58,17 @@ def check_image(path: Path, kind: str, size: tuple[int, int], expected_by: str) 
     Raises:
         DataError: on a wrong size, bit depth, or channel layout.
     """
-    header = read_header(path)
-    if header.size != size:
+    found, depth, mode = read_header(path)
+    if found != size:
         raise DataError(
-            f"{path} is {header.size[1]}x{header.size[0]} pixels (width x height), but "
+            f"{path} is {found[1]}x{found[0]} pixels (width x height), but "
             f"{expected_by} has {size[1]}x{size[0]}; scale one of them so that they agree"
         )
-    if header.depth > 8 or (kind == "labels" and header.depth != 8):
-        raise DataError(f"{path} has {header.depth} bits a channel; expected 8 (save it as 8-bit)")
-    if header.jpeg and header.channels == 4:
+    if depth > 8 or (kind == "labels" and depth != 8):
+        raise DataError(f"{path} has {depth} bits a channel; expected 8 (save it as 8-bit)")
+    if mode == "CMYK":
         raise DataError(f"{path} is a CMYK JPEG; expected RGB or grey (convert it to RGB)")
-    if (header.palette and kind != "image") or (kind == "labels" and header.channels != 1):
+    if (mode == "P" and kind != "image") or (kind == "labels" and mode != "L"):
         raise DataError(
             f"{path} is a palette PNG or has colours; expected 8-bit grey values for a {kind} file"
         )

@@ -9,15 +9,17 @@ from __future__ import annotations
 from typing import Literal
 
 import cv2
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from gsgan.data.crop import Float, undistort
 from gsgan.metrics.image import person_box
 from gsgan.scene import Camera, Frame
 from gsgan.skeleton import TEMPLATES, SkeletonTemplate
 from gsgan.skeleton.hands import HAND
-from gsgan.splat.lens import straight_pixels
 from gsgan.utils.tensors import constant
 
 BACKGROUNDS = {"black": 0.0, "white": 1.0}
@@ -138,12 +140,14 @@ def box_mask(corners: Tensor, camera: Camera) -> Tensor:
     if len(seen) == 0:
         return torch.zeros(1, *camera.size, dtype=torch.bool, device=corners.device)
     pixels = (seen / seen[:, 2:]) @ camera.K[0].double().T
-    hull = cv2.convexHull(pixels[:, :2].float().cpu().numpy())[:, 0]
-    polygon = torch.from_numpy(hull).double().to(corners.device)
-    if camera.dist is None:
-        return inside_hull(polygon, pixel_centres(camera))[None]
-    straight, known = straight_pixels(camera)
-    return inside_hull(polygon, straight[0])[None] & known
+    hull = cv2.convexHull(pixels[:, :2].float().cpu().numpy())[:, 0].astype(np.float64)
+    shown = np.stack(np.meshgrid(*(np.arange(n) + 0.5 for n in camera.size[::-1])), axis=-1)
+    if camera.dist is not None:
+        K = camera.K[0].double().cpu().numpy()
+        rays = (shown - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T
+        straight = undistort(rays.reshape(-1, 2), camera.dist[0].double().cpu().numpy())
+        shown = (straight @ K[:2, :2].T + K[:2, 2]).reshape(shown.shape)
+    return torch.from_numpy(inside_hull(hull, shown))[None].to(corners.device)
 
 
 def in_front(x_cam: Tensor) -> Tensor:
@@ -155,22 +159,15 @@ def in_front(x_cam: Tensor) -> Tensor:
     return torch.cat([x_cam[x_cam[:, 2] > NEAR], a + share * (b - a)])
 
 
-def pixel_centres(camera: Camera) -> Tensor:
-    """``[H, W, 2]`` float64."""
-    y, x = (torch.arange(n, device=camera.K.device, dtype=torch.float64) + 0.5 for n in camera.size)
-    return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
-
-
-def inside_hull(hull: Tensor, points: Tensor) -> Tensor:
+def inside_hull(hull: Float, points: Float) -> NDArray[np.bool_]:
     """``[...]`` whether points ``[..., 2]`` are in a convex polygon ``[n, 2]``; false if n < 3."""
     if len(hull) < 3:
-        return torch.zeros(points.shape[:-1], dtype=torch.bool, device=hull.device)
-    sides = []
-    for start, end in zip(hull, hull.roll(-1, 0), strict=True):
-        along, away = end - start, points - start
-        sides.append(along[0] * away[..., 1] - along[1] * away[..., 0])
-    side = torch.stack(sides)
-    return (side >= 0).all(0) | (side <= 0).all(0)
+        return np.zeros(points.shape[:-1], np.bool_)
+    x, y = np.moveaxis(points, -1, 0)
+    ends = zip(hull, np.roll(hull, -1, axis=0), strict=True)
+    sides = [(b - a)[0] * (y - a[1]) - (b - a)[1] * (x - a[0]) for a, b in ends]
+    side = np.stack(sides)
+    return np.asarray((side >= 0).all(0) | (side <= 0).all(0))
 
 
 # -- boxes of hands and mouth

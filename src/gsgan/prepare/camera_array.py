@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
@@ -13,7 +12,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.crop import NEAR
+from gsgan.data.crop import NEAR, undistort
 from gsgan.data.joints import known
 
 MIN_VIEWS = 2
@@ -22,11 +21,6 @@ STEPS = 30  # of the optimiser
 SCALE = 5.0  # error at which a detection counts half, thousandths of the focal length
 SETTLED = 1e-7  # relative change of the cost at which the refinement ends
 LEAST_SQUARE = 1e-12  # square pixels: keeps the residual's scaling finite at an error of 0
-
-# OpenCV's default of 5 iterations is pixels off in the corners of a strong lens.
-CONVERGED = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-10)
-# Only OpenCV 5 takes the criteria without "Iter".
-_undistort = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -103,10 +97,7 @@ def undistort_points(camera: CameraEntry, px: Float) -> Float:
         return np.asarray(px, np.float64)
     out = np.full(px.shape, np.nan)
     rays = np.c_[px[seen], np.ones(seen.sum())] @ np.linalg.inv(camera.K).T
-    straight = _undistort(
-        rays[:, None, :2], np.eye(3), camera.dist, R=np.eye(3), P=np.eye(3), criteria=CONVERGED
-    )[:, 0]
-    out[seen] = straight @ camera.K[:2, :2].T + camera.K[:2, 2]
+    out[seen] = undistort(rays[:, :2], camera.dist) @ camera.K[:2, :2].T + camera.K[:2, 2]
     return out
 
 

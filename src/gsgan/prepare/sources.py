@@ -77,7 +77,7 @@ def _sources_in(folder: Path, rotate: bool) -> dict[str, Recording]:
             continue
         if path.is_dir() and (files := frame_files(folder, path.name, IMAGE_SUFFIXES)):
             paths = {number: folder / files[number] for number in sorted(files)}
-            size = read_header(next(iter(paths.values()))).size
+            size = read_header(next(iter(paths.values())))[0]
             source = Recording(path.name, path, size, None, paths, len(paths))
         elif path.suffix.lower() in VIDEO_SUFFIXES:
             source = _video(path, rotate)

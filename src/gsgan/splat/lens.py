@@ -1,4 +1,4 @@
-"""Applies lens distortion to Gaussians, because rasterisers support pinholes only; and inverts it.
+"""Applies lens distortion to Gaussians, because rasterisers support pinholes only.
 
 Convention: OpenCV's model (k1 k2 p1 p2 k3), see `gsgan.scene.distort`.
 """
@@ -13,9 +13,6 @@ from torch import Tensor
 from gsgan.scene import RIM, Camera, Gaussians, distort, fold_radius
 from gsgan.splat.project import rotations
 from gsgan.utils.tensors import constant
-
-ITERATIONS = 20  # of Newton's method: usually 4 are enough; points near a lens's fold need more
-FOUND = 1e-9  # of x/z, in float64: maximum error of a solution
 
 
 def as_pinhole_sees(gaussians: Gaussians, camera: Camera, near: float) -> tuple[Gaussians, Camera]:
@@ -88,62 +85,3 @@ def bend(x_cam: Tensor, dist: Tensor, near: float) -> tuple[Tensor, Tensor, Tens
     eye = torch.eye(3, dtype=top.dtype, device=top.device)
     jacobian = torch.where(moves.unsqueeze(-1), torch.cat([top, bottom], dim=-2), eye)
     return torch.where(moves, moved, x_cam), jacobian, (ahead & beyond).squeeze(-1)
-
-
-def undistort(points: Tensor, dist: Tensor, iterations: int = ITERATIONS) -> tuple[Tensor, Tensor]:
-    """The inverse of `distort`, by Newton's method, computed in float64.
-
-    Args:
-        points: ``[B, M, 2]`` as the lenses ``dist [B, 5]`` show them.
-        dist: coefficients.
-        iterations: at most.
-
-    Returns:
-        Points ``[B, M, 2]`` of the z = 1 plane, finite, and whether each was found ``[B, M]``:
-        beyond the fold of a lens there is none, or one that only the polynomial shows.
-    """
-    target, lens = points.double(), dist.double()
-    x = target
-    for _ in range(iterations):
-        bent, jacobian = distort(x, lens)
-        a, b, c, d = jacobian.flatten(-2).unbind(-1)
-        det = a * d - b * c
-        det = torch.where(det.abs() < FOUND, torch.full_like(det, FOUND), det)
-        error = bent - target
-        if bool((error.abs() < FOUND).all()):
-            break
-        step = torch.stack(
-            [d * error[..., 0] - b * error[..., 1], a * error[..., 1] - c * error[..., 0]], dim=-1
-        )
-        x = x - (step / det.unsqueeze(-1)).clamp(-0.5, 0.5)  # far out the slope is misleading
-    bent, jacobian = distort(x, lens)
-    # beyond the fold the polynomial mirrors: a solution there is not what the lens shows
-    upright = torch.linalg.det(jacobian) > 0
-    upright &= x.norm(dim=-1) < fold_radius(lens).unsqueeze(-1)
-    found = ((bent - target).abs().amax(dim=-1) < FOUND) & upright
-    return torch.where(found.unsqueeze(-1), x, target).to(points.dtype), found
-
-
-def straight_pixels(camera: Camera) -> tuple[Tensor, Tensor]:
-    """Where a pinhole shows what each pixel of cameras with a lens shows.
-
-    Returns:
-        Pixels ``[B, H, W, 2]`` float64, and whether there is such a place ``[B, H, W]``.
-
-    Raises:
-        ValueError: for cameras without a lens.
-    """
-    if camera.dist is None:
-        raise ValueError("straight_pixels: expected cameras with dist, got pinholes")
-    height, width = camera.size
-    K = camera.K.double()
-    v, u = torch.meshgrid(
-        torch.arange(height, device=K.device) + 0.5,
-        torch.arange(width, device=K.device) + 0.5,
-        indexing="ij",
-    )
-    seen = torch.stack([u, v, torch.ones_like(u)], dim=-1).reshape(1, -1, 3).to(K)
-    straight, found = undistort((seen @ torch.linalg.inv(K).mT)[..., :2], camera.dist)
-    ones = torch.ones_like(straight[..., :1])
-    pixels = (torch.cat([straight, ones], dim=-1) @ K.mT)[..., :2]
-    return pixels.unflatten(1, (height, width)), found.unflatten(1, (height, width))

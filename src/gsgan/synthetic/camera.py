@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gsgan.data.crop import distort
+from gsgan.data.crop import distort, undistort
 from gsgan.motion.rotations import unit
 from gsgan.utils.errors import ConfigError
 
@@ -20,8 +20,6 @@ Ints = NDArray[np.int64]
 
 RADIUS = 2.8  # metres from the middle of the scene to the cameras
 MARGIN = 0.02  # share of the image kept free at each edge, over all frames and cameras
-EXACT = 1e-10  # residual of x/z up to which an undistorted point counts as found
-FURTHEST = 10.0  # bound of x/z in the search
 GOLDEN = (5**0.5 - 1) / 2
 
 
@@ -49,38 +47,12 @@ class SceneCamera:
         return x[:, :2] / x[:, 2:]
 
     def bend(self, directions: Array) -> Array:
-        """The unit world rays ``[N, 3]`` seen where a pinhole sees the unit ``directions``.
-
-        Raises:
-            ConfigError: when the distortion cannot be inverted there.
-        """
+        """The unit world rays ``[N, 3]`` seen where a pinhole sees the unit ``directions``."""
         if self.dist is None:
             return directions
         rays = directions @ self.R.T
         straight = undistort(rays[:, :2] / rays[:, 2:], self.dist)
         return unit(np.concatenate([straight, np.ones((len(rays), 1))], axis=1) @ self.R)
-
-
-def undistort(points: Array, dist: Array, iterations: int = 200) -> Array:
-    """The inverse of `gsgan.data.crop.distort` on ``[N, 2]``, exact to `EXACT`, by fixed point.
-
-    Raises:
-        ConfigError: when a point has no inverse: the distortion folds back.
-    """
-    found = points
-    for _ in range(iterations):
-        error = points - distort(found, dist)
-        if not np.abs(error).max(initial=0) >= EXACT:
-            break
-        found = np.clip(found + error, -FURTHEST, FURTHEST)
-    lost = ~(np.abs(points - distort(found, dist)) < EXACT).all(axis=1)
-    if lost.any():
-        x, y = points[lost][0]
-        raise ConfigError(
-            f"synthetic data: lens {dist.tolist()} folds back near x/z = {x:.2f}, y/z = {y:.2f}, "
-            "within the image; give weaker coefficients"
-        )
-    return found
 
 
 def pixel_offsets(rays: int) -> Array:
@@ -131,8 +103,18 @@ def zoomed(view: SceneCamera, scale: float) -> SceneCamera:
 
 
 def through_lens(view: SceneCamera, dist: Array) -> SceneCamera:
-    """The same camera with a lens, which is checked up to the image's corners."""
+    """The same camera with a lens.
+
+    Raises:
+        ConfigError: when the distortion folds back within the image.
+    """
     H, W = view.size
     corners = np.array([[x, y, 1.0] for x in (0, W / 2, W) for y in (0, H / 2, H)])
-    undistort((corners @ np.linalg.inv(view.K).T)[:, :2], dist)
+    points = (corners @ np.linalg.inv(view.K).T)[:, :2]
+    if (lost := np.isnan(undistort(points, dist)).any(axis=1)).any():
+        x, y = points[lost][0]
+        raise ConfigError(
+            f"synthetic data: lens {dist.tolist()} folds back near x/z = {x:.2f}, y/z = {y:.2f}, "
+            "within the image; give weaker coefficients"
+        )
     return replace(view, dist=dist)

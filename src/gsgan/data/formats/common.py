@@ -154,7 +154,7 @@ def image_size(root: Path, files: Mapping[int, str]) -> tuple[int, int]:
     Raises:
         DataError: when it is damaged.
     """
-    return read_header(root / next(iter(files.values()))).size
+    return read_header(root / next(iter(files.values())))[0]
 
 
 def one_mask_each(

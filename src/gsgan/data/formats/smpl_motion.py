@@ -64,9 +64,13 @@ def landmarks_of(
     p, conf = [], []
     for first in range(0, len(motion.ids), CHUNK):
         part = slice(first, first + CHUNK)
-        given = (torch.from_numpy(x[part]) for x in (motion.theta, motion.betas, motion.transl))
-        face = None if motion.expression is None else torch.from_numpy(motion.expression[part])
-        found, joints = small.pose(*given, face, pose_blend=pose_blend)
+        found, joints = small.pose(
+            torch.from_numpy(motion.theta[part]),
+            torch.from_numpy(motion.betas[part]),
+            torch.from_numpy(motion.transl[part]),
+            None if motion.expression is None else torch.from_numpy(motion.expression[part]),
+            pose_blend=pose_blend,
+        )
         for v, j in zip(found.numpy(), joints.numpy(), strict=True):
             full = np.full((len(model.v_template), 3), np.nan)
             full[vertices] = v[: len(vertices)]
