@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import pytest
+from omegaconf import OmegaConf
 from report_folders import protocol, report_of, row, table, texts, write_run, zju
 
-from gsgan.report.departures import NAME
 from gsgan.report.paper import read_paper
-from gsgan.report.runs import Run
+from gsgan.report.runs import NAME
 from gsgan.utils.errors import ConfigError
 
 ABLATION = {"rows": [{"run": "full"}, {"run": "wo_seg"}], "paper": "ablation"}
@@ -50,24 +50,37 @@ def test_otherwise_they_have_a_table_of_their_own_with_the_reason(tmp_path, held
     assert all(r.origin == departed for r in paper.rows)
 
 
-def test_only_runs_of_experiment_paper_have_the_papers_name(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("experiment", "overrides", "departed"),
+    [
+        ("paper", [], ""),
+        ("paper", ["model=full", "seed=1", "training.log_every=5", "data.root=/x"], ""),
+        ("paper", ["training.step_two.perceptual=2", "size=tiny"],
+         "training.step_two.perceptual=2, size=tiny"),
+        ("demo", [], "experiment=demo"),
+        (None, [], None),
+    ],
+)  # fmt: skip
+def test_only_runs_of_experiment_paper_have_the_papers_name(
+    tmp_path, experiment, overrides, departed
+):
     rows = [{"run": "full"}, {"run": "full", "label": "C", "variant": "splat"}]
     rows.append({"run": "wo_seg", "label": "w/o S"})
-    spec = table(**(ABLATION | VIEW | {"rows": rows}))
     runs = [paper_run(tmp_path / name, model=name) for name in ("full", "wo_seg")]
-    for departed, labels in (
-        ([], [NAME, f"{NAME}, w/o S"]),
-        (["model.low_pass"], ["full", "w/o S"]),
-        (None, ["full", "w/o S"]),
-    ):
-        monkeypatch.setattr(Run, "departures", lambda run, departed=departed: departed)
-        (grid,) = report_of(spec, *runs).grids
-        ours = [r.label for r in grid.rows if r.kind != "paper"]
-        assert [label for label in ours if label in labels] == labels
-        assert ours.count(NAME) == (departed == [])
-        notes = " ".join(note for r in grid.rows for note in r.notes)
-        assert ("differs from experiment=paper in model.low_pass" in notes) == bool(departed)
-        assert ("no config says whether" in notes) == (departed is None)
+    for run in runs if experiment else ():
+        (run / ".hydra").mkdir()
+        held = {
+            "runtime": {"choices": {"experiment": experiment}},
+            "overrides": {"task": overrides},
+        }
+        OmegaConf.save({"hydra": held}, run / ".hydra" / "hydra.yaml")
+    (grid,) = report_of(table(**(ABLATION | VIEW | {"rows": rows})), *runs).grids
+    ours = [r.label for r in grid.rows if r.kind != "paper"]
+    assert (f"{NAME}, w/o S" in ours) == (departed == "")
+    assert ours.count(NAME) == (departed == "")
+    notes = " ".join(note for r in grid.rows for note in r.notes)
+    assert (f"differs from experiment=paper: {departed}" in notes) == bool(departed)
+    assert ("no config says whether" in notes) == (departed is None)
 
 
 def test_another_split_is_not_the_papers(tmp_path):

@@ -6,6 +6,7 @@ import glob
 import json
 import math
 import os
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,14 +16,18 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gsgan.model.stored import choices
-from gsgan.report.departures import departures, settings_of
+from gsgan.model.stored import hydra_record, record
 from gsgan.utils.errors import ConfigError, DataError
 
 METRICS_FILE, FACTS_FILE = "metrics.json", "facts.json"
 CONFIG = Path(".hydra") / "config.yaml"
 DATA = "data (cameras, frames, split, image size, crop or fitted poses)"
 TOLERANCE = 1e-3  # between equal floats, for rounding
+NAME = "GaussianGAN (paper)"
+PAPER = ("paper", "paper_slp")  # experiments that set the paper's method
+# Overrides that change the method; the model is one of the paper's ablations.
+METHOD = re.compile(r"[+~]*(?!model=)(model|training|effects|accuracy|size|segments)[.@=]")
+IDLE = ("model.backend", "training.log_every", "training.perceptual.path")  # change no result
 
 
 @dataclass(frozen=True)
@@ -36,6 +41,8 @@ class Run:
         seed: None for predictions.
         scores: ``{split: {variant: {metric: value}}}``.
         settings: the training config by dotted key, without seed and paths; None for predictions.
+        departures: what its command line changes of ``experiment=paper``, whose models are those of
+            the paper's ablations; None where Hydra recorded nothing.
         facts: contents of facts.json; empty where nothing was scored yet.
     """
 
@@ -45,6 +52,7 @@ class Run:
     seed: int | None
     scores: dict[str, dict[str, dict[str, Any]]]
     settings: dict[str, Any] | None = None
+    departures: list[str] | None = None
     facts: dict[str, Any] = field(default_factory=dict)
 
     def __str__(self) -> str:
@@ -75,11 +83,6 @@ class Run:
         name = str(self.facts.get("commit") or "unknown")
         short = name[:9] if len(name) == 40 else name
         return f"{short} + changes" if self.facts.get("dirty") else short
-
-    def departures(self) -> list[str] | None:
-        """Settings in which it differs from ``experiment=paper``; None where it has no config."""
-        data = str(self.data.get("name"))
-        return None if self.settings is None else departures(self.settings, self.name, data)
 
     def planned(self, *, segmentation: bool) -> int:
         """Iterations of the whole schedule, 0 where there is none; ``segmentation`` adds the phase
@@ -174,27 +177,49 @@ def read_run(folder: Path, *, scored: bool = True) -> Run:
         scores = json.loads((folder / METRICS_FILE).read_text()) if scored else {}
         found = folder / FACTS_FILE
         facts = json.loads(found.read_text()) if found.is_file() else {}
-        settings, chosen = _read_config(folder)
+        settings, hydra = _read_settings(folder), hydra_record(folder)
+        chosen = OmegaConf.select(hydra, "hydra.runtime.choices") or {}
         name = facts.get("model") or facts.get("method") or chosen.get("model") or folder.name
         data = dict(facts.get("data", {"name": chosen.get("data")}))
     except (OSError, ValueError, TypeError, yaml.YAMLError, OmegaConfBaseException) as error:
         reason = str(error).splitlines()[0]
         raise DataError(f"{folder}: damaged ({reason}); score the run again") from None
-    run = Run(folder, str(name), data, facts.get("seed"), scores, settings, facts)
+    departed = _departures(hydra, chosen)
+    run = Run(folder, str(name), data, facts.get("seed"), scores, settings, departed, facts)
     done, planned = facts.get("iterations"), run.planned(segmentation=False)
     if scored and done is not None and done < planned:
         raise DataError(f"{folder}: scored after {done} of at least {planned} iterations")
     return run
 
 
-def _read_config(folder: Path) -> tuple[dict[str, Any] | None, dict[str, Any]]:
-    """The settings by dotted key, and the groups' choices; (None, {}) for predictions."""
+def _read_settings(folder: Path) -> dict[str, Any] | None:
+    """The config by dotted key, without the keys that differ between seeds and machines; None for
+    predictions."""
     if not (folder / CONFIG).is_file():
-        return None, {}
+        return None
     config = OmegaConf.load(folder / CONFIG)
     if not isinstance(config, DictConfig):
         raise ValueError(f"{CONFIG} is not a config")
-    return settings_of(config), choices(folder)
+    config.seed = 0  # data and training interpolate it
+    return dict(flat(record(config)))
+
+
+def flat(value: Any, at: str = "") -> Iterator[tuple[str, Any]]:
+    """A nested config by dotted key."""
+    if isinstance(value, Mapping) and value:
+        for key, held in value.items():
+            yield from flat(held, f"{at}.{key}" if at else str(key))
+    else:
+        yield at, value
+
+
+def _departures(hydra: DictConfig, chosen: Mapping[str, Any]) -> list[str] | None:
+    if not chosen:
+        return None
+    if chosen.get("experiment") not in PAPER:
+        return [f"experiment={chosen.get('experiment')}"]
+    given = OmegaConf.select(hydra, "hydra.overrides.task") or ()
+    return [text for text in given if METHOD.match(text) and text.partition("=")[0] not in IDLE]
 
 
 def by_settings(run: Run, keys: Sequence[str]) -> Run:

@@ -16,9 +16,8 @@ from omegaconf import DictConfig
 from rich.markdown import Markdown
 
 from gsgan.metrics.names import BOX_METRICS, METRICS
-from gsgan.report.departures import NAME, clause
 from gsgan.report.paper import PaperTable, read_paper
-from gsgan.report.runs import DATA, Run, by_settings, check_same, find_runs, read_runs
+from gsgan.report.runs import DATA, NAME, Run, by_settings, check_same, find_runs, read_runs
 from gsgan.report.spec import (
     FLOOR,
     MEAN,
@@ -317,11 +316,10 @@ def _row(part: Part, spec: RowSpec, *, beside_paper: bool) -> Row:
         return Row(label, cells, ("0", NO_RUN, NO_RUN, NO_RUN), notes=("no scored run",))
     notes = list(dict.fromkeys(_marks(runs, part.split)))
     if beside_paper:  # named as the paper's method where all runs are
-        departures = [run.departures() for run in runs]
-        if None in departures:
+        if any(run.departures is None for run in runs):
             notes.append("no config says whether it is experiment=paper")
-        elif found := next(filter(None, departures), None):
-            notes.append(clause(found))
+        elif found := next(filter(None, (run.departures for run in runs)), None):
+            notes.append(f"differs from experiment=paper: {', '.join(found)}")
         else:
             label = NAME if shown == ("full", PAINTED) else f"{NAME}, {label}"
     counts = [len(part.of(spec.run, column)) for column in part.columns if column != MEAN]

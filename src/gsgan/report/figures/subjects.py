@@ -19,8 +19,7 @@ from gsgan.model.assemble import build_data
 from gsgan.model.avatar import Avatar
 from gsgan.model.runs import load_avatar
 from gsgan.model.stored import CHECKPOINT, DataPaths, load_config, read_checkpoint
-from gsgan.report.departures import NAME
-from gsgan.report.runs import DATA, Run, check_same, read_run
+from gsgan.report.runs import DATA, NAME, Run, check_same, read_run
 from gsgan.scene import Frame, Window, body_window, cat
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import one_of
@@ -182,7 +181,7 @@ def _open(folder: Path, moved: DataPaths, device: torch.device | str) -> Subject
     run = read_run(folder, scored=False)
     run = replace(run, seed=config.seed, data=run.data | {"fingerprint": fingerprint(data)})
     name = TITLES.get(run.name, run.name)
-    if run.name == "full" and run.departures() == []:
+    if run.name == "full" and run.departures == []:
         name = NAME
     step = int(read_checkpoint(folder / CHECKPOINT)["gsgan"]["step"])
     total = run.planned(segmentation=avatar.segmentation is not None)
