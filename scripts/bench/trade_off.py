@@ -38,8 +38,7 @@ from gsgan.metrics.lpips import lpips
 from gsgan.model.assemble import build_data
 from gsgan.model.avatar import Avatar
 from gsgan.model.runs import load_avatar
-from gsgan.model.stored import CHECKPOINT, DataPaths, load_config
-from gsgan.report.training_curve import curve
+from gsgan.model.stored import CHECKPOINT, DataPaths, load_config, read_checkpoint
 from gsgan.scene import Frame
 from gsgan.splat import BACKENDS, Accuracy
 from gsgan.utils.checks import above, between, one_of
@@ -153,7 +152,8 @@ def run(config: DictConfig, folder: Path) -> None:
     points = [*runs, *ways(subject, config.settings)]
     painters, frames, marks = load(points, config, bench)
     found, samples = measure(points, painters, frames, perceptual, config, bench)
-    seconds = {p.folder: c.seconds[-1] for p in runs if (c := curve(p.label, p.folder))}
+    checkpoints = {p.folder: read_checkpoint(p.folder / CHECKPOINT) for p in runs}
+    seconds = {folder: held["gsgan"]["train_seconds"] for folder, held in checkpoints.items()}
     frame = make_rows(points, found, samples, seconds)
     about = {"split": config.split, "images": len(frames), "subject": subject.name}
     page = text(frame, config.quality, about, bench.where, marks)

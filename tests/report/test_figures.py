@@ -127,32 +127,6 @@ def test_an_unfinished_run_is_marked_in_captions(twin, tmp_path, inside):
     assert message in (tmp_path / "out" / "captions.md").read_text()
 
 
-def test_training_curves_join_the_parts_of_a_resumed_run(twin, tmp_path, inside):
-    for log in twin.glob("logs*"):
-        shutil.rmtree(log)
-    head = "epoch,step,val/psnr,val/psnr_splat,val/seconds\n"
-    parts = {
-        "logs": "0,0,8.0,8.0,0\n1,99,20.0,19.0,60\n1,120,,,\n2,199,1.0,1.0,99\n",
-        "logs_000150": "2,199,22.0,20.0,120\n3,299,23.0,21.0,18",  # killed within the line
-    }
-    for name, text in parts.items():
-        (twin / name).mkdir()
-        (twin / name / "metrics.csv").write_text(head + text)
-    given = (f"run={twin}", f"out={tmp_path / 'out'}", "figures=training")
-    result = inside("report", *given)
-    assert result.returncode == 0, result.stdout + result.stderr
-    entry = json.loads((tmp_path / "out" / "figures.json").read_text())["figures"]["training"]
-    assert entry["numbers"]["training"]["gsgan"] == {
-        "seconds": [0, 60, 120], "psnr": [8, 20, 22], "psnr_colour": [8, 19, 20]
-    }  # fmt: skip
-    assert "watched while training" in entry["caption"]
-    (twin / "logs_000150" / "metrics.csv").write_bytes(b"\xff\xfe\x00")
-    refused(inside("report", *given), "logs_000150", "not a readable log", "UnicodeDecodeError")
-    shutil.rmtree(twin / "logs_000150")
-    (twin / "logs" / "metrics.csv").write_text(head)
-    refused(inside("report", *given), str(twin), "has no log of two validations", "logger=csv")
-
-
 def test_a_collapsed_run_is_not_drawn(twin, tmp_path, inside):
     path = twin / "checkpoints" / "last.ckpt"
     checkpoint = torch.load(path, weights_only=True)

@@ -187,7 +187,8 @@ def undistort(points: Float, dist: Float) -> Float:
     if points.size == 0:
         return points
     eye = np.eye(3)
-    found: Float = _undistort(points[:, None], eye, dist, R=eye, P=eye, criteria=CONVERGED)[:, 0]
+    raw = _undistort(points[:, None], eye, dist, R=eye, P=eye, criteria=CONVERGED)[:, 0]
+    found = raw.astype(np.float64)
     error = np.abs(distort(found, dist) - points).max(axis=1, keepdims=True)
     return np.asarray(np.where(error < FOUND, found, np.nan))
 

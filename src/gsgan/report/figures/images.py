@@ -1,30 +1,18 @@
-"""Each figure: images side by side, and quality against training time."""
+"""Each figure: images side by side."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
-from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from torch import Tensor
 from torch.nn import functional
 
 from gsgan.metrics.image import psnr
-from gsgan.report.figures.layout import (
-    COLUMN,
-    SMALL,
-    Drawing,
-    Panel,
-    Unavailable,
-    draw_panels,
-    written,
-)
+from gsgan.report.figures.layout import Drawing, Panel, draw_panels, written
 from gsgan.report.figures.subjects import Numbers, Shot, Subject, finite, measure
-from gsgan.report.training_curve import curve
-from gsgan.utils.errors import DataError
-from gsgan.utils.palette import COLOURS, MARKERS, VERMILLION
+from gsgan.utils.palette import VERMILLION
 
 DETAIL = 0.35  # sides of the ablation's box, as a share of the image's
 Images = list[dict[str, Tensor]]  # per shot, by name
@@ -91,53 +79,6 @@ def most_disputed(images: Tensor, share: float) -> tuple[slice, slice]:
     sums = functional.avg_pool2d(spread.double(), size, stride=1)[0, 0]
     top, left = divmod(int(sums.argmax()), sums.shape[1])
     return slice(top, top + size[0]), slice(left, left + size[1])
-
-
-def training(subjects: Sequence[Subject], shots: Sequence[Shot]) -> Drawing:
-    """PSNR of the watched images against minutes, a line per run, Step I's colour dashed.
-
-    Raises:
-        Unavailable: when a run has no log that can be read.
-    """
-    figure = Figure((COLUMN, 0.75 * COLUMN), layout="constrained")
-    axes = figure.add_subplot()
-    shown: list[float] = []
-    numbers: dict[str, Any] = {}
-    for k, subject in enumerate(subjects):
-        try:
-            found = curve(subject.name, subject.run.folder)
-        except DataError as error:
-            raise Unavailable(str(error)) from error
-        if found is None or found.seconds[-1] <= 0:
-            raise Unavailable(
-                f"{subject.run.folder} has no log of two validations and their time (logger=csv "
-                "writes one)"
-            )
-        parts = (found.seconds, found.psnr, found.colour)
-        numbers[subject.name] = dict(zip(("seconds", "psnr", "psnr_colour"), parts, strict=True))
-        minutes = [second / 60 for second in found.seconds]
-        look: dict[str, Any] = {"color": COLOURS[k % len(COLOURS)], "lw": 1.0}
-        marker = MARKERS[k % len(MARKERS)]
-        axes.plot(minutes, found.psnr, marker=marker, markersize=3, label=subject.name, **look)
-        lines = [found.psnr]
-        if subject.avatar.generator is not None and found.colour:
-            axes.plot(minutes, found.colour, ls="--", **look)
-            lines.append(found.colour)
-        # without the untrained start, many dB below the rest
-        shown += [v for line in lines for m, v in zip(minutes, line, strict=True) if m > 0]
-    axes.set_xlabel("minutes of training", fontsize=SMALL)
-    axes.set_ylabel("PSNR of watched images, dB", fontsize=SMALL)
-    axes.tick_params(labelsize=SMALL)
-    room = 0.08 * max(max(shown) - min(shown), 0.1)
-    axes.set(xlim=(0, None), ylim=(min(shown) - room, max(shown) + room))
-    axes.grid(visible=True, alpha=0.25)
-    for text in axes.legend(fontsize=SMALL, frameon=False, loc=4).get_texts():
-        text.set_parse_math(False)
-    caption = (
-        f"PSNR of the {len(shots)} held-out images that were watched while training, against "
-        "minutes of training; dashed, Step I's colour of the same model."
-    )
-    return Drawing(figure, caption, {"training": numbers})
 
 
 def _measured(

@@ -21,7 +21,7 @@ from gsgan.report.figures.layout import STYLE, Drawing, Unavailable
 from gsgan.report.figures.subjects import Shot, Subject, choose_items, make_shots, open_subjects
 from gsgan.utils.checks import at_least, one_of, whole
 from gsgan.utils.console import make_console
-from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.errors import ConfigError
 from gsgan.utils.files import write_atomically
 from gsgan.utils.tensors import pick_device
 
@@ -35,7 +35,6 @@ FIGURES: dict[str, Callable[[Sequence[Subject], Sequence[Shot]], Drawing]] = {
     "comparison": images.comparison,
     "ablation": partial(images.comparison, detail=True),
     "strip": images.strip,
-    "training": images.training,
 }
 TRIMMED: dict[str, Any] = {"bbox_inches": "tight", "pad_inches": 0.02}
 COMPARE = ("comparison", "ablation")  # need a second run
@@ -89,36 +88,24 @@ def make_figures(config: DictConfig) -> None:
 
 def _draw(name: str, subjects: Sequence[Subject], config: DictConfig) -> Drawing:
     """One figure with its whole caption."""
-    data = subjects[0].data
+    data, split = subjects[0].data, config.split
     if name in COMPARE and len(subjects) < 2:
         raise Unavailable("there is one run; add others as compare=[<folder>,…]")
-    if name == "training":
-        split, places = data.watched
-        if any(subject.data.watched != (split, places) for subject in subjects):
-            raise DataError(
-                "figures: the runs watched different images while training; give all the same "
-                "data.val_images"
-            )
-        items = [data.dataset(split).items[i] for i in places]
-    else:
-        split = config.split
-        frames = [whole("frames", frame, 0) for frame in dict.fromkeys(_list(config.frames))]
-        items = choose_items(
-            data,
-            split,
-            frames=frames or None,
-            camera=None if config.camera is None else str(config.camera),
-            count=whole(f"shots.{name}", config.shots.get(name), 1),
-            one_camera=name == "strip",
-        )
+    frames = [whole("frames", frame, 0) for frame in dict.fromkeys(_list(config.frames))]
+    items = choose_items(
+        data,
+        split,
+        frames=frames or None,
+        camera=None if config.camera is None else str(config.camera),
+        count=whole(f"shots.{name}", config.shots.get(name), 1),
+        one_camera=name == "strip",
+    )
     shots = make_shots(data, split, items, config.margin)
     drawing = FIGURES[name](subjects, shots)
-    about = ""
-    if name != "training":
-        about = (
-            f" Images: {', '.join(shot.name for shot in shots)}. Numbers are of the windows shown, "
-            f"which reach at least {config.margin:g} m beyond the joints, not of whole images."
-        )
+    about = (
+        f" Images: {', '.join(shot.name for shot in shots)}. Numbers are of the windows shown, "
+        f"which reach at least {config.margin:g} m beyond the joints, not of whole images."
+    )
     return replace(drawing, caption=f"{drawing.caption}{about} Split {split}.")
 
 
