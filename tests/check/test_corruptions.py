@@ -39,7 +39,7 @@ def test_a_good_capture_has_nothing_wrong(good, check):
     report = check(good)
     assert report.findings == ()
     cameras = report.numbers["cameras"]
-    assert all(score["inside"] == 1 and score["lag"] == 0 for score in cameras.values())
+    assert all(score["inside"] == 1 for score in cameras.values())
     assert all(s["overlap"] > max(s["rivals"].values()) for s in cameras.values())
     assert report.numbers["camera_distance"] == pytest.approx(3.0, abs=0.1)
 
@@ -90,37 +90,6 @@ def test_mirrored_images_are_named(copy, check):
     sentence = only(check(copy), "error")
     assert sentence.startswith("camera cam01: ")
     assert "mirrored images" in sentence.split(" would fit its masks better")[0]
-
-
-def test_a_camera_out_of_step_is_named(copy, check):
-    def run_sideways(p):  # quickly, and in no rhythm that another lag would fit
-        p[..., 0] += 0.15 * np.array([0, 2, 3, 1, 0, 3, 0, 1, 3, 2, 0, 1])[:, None]
-
-    edit_landmarks(copy, run_sideways)
-    redraw(copy)
-    for kind in ("images", "masks", "labels"):
-        for frame in range(11):
-            folder = copy / kind / "cam00"
-            (folder / f"{frame + 1:06d}.png").replace(folder / f"{frame:06d}.png")
-    report = check(copy, consistency={"joint_tolerance": 0.02}, joint_jump=1.0)
-    (found,) = (f for f in report.findings if f.topic == "synchronisation")
-    assert found.level == "error"
-    assert found.sentence.startswith("camera cam00: its images fit the skeleton 1 frame(s) later")
-
-
-def redraw(root: Path) -> None:
-    """Pictures and masks anew for changed landmarks."""
-    import json
-
-    from make import draw_person
-
-    with np.load(root / "landmarks3d.npz") as held:
-        p = held["p"]
-    for name, camera in json.loads((root / "cameras.json").read_text()).items():
-        for frame, joints in enumerate(p):
-            image, mask = draw_person(camera, joints)
-            cv2.imwrite(str(root / f"images/{name}/{frame:06d}.png"), image[..., ::-1])
-            cv2.imwrite(str(root / f"masks/{name}/{frame:06d}.png"), mask)
 
 
 def test_missing_images_are_a_warning(copy, check):
@@ -248,7 +217,7 @@ def test_focal_lengths_of_half_are_named(copy, check):
     errors = [f.sentence for f in check(copy, **limits).findings if f.level == "error"]
     (found,) = (s for s in errors if "far larger than the body" in s)
     assert all(f"{name} " in found for name in names)
-    assert not any("clock" in s or "would fit" in s for s in errors)
+    assert not any("would fit" in s for s in errors)
 
 
 def test_a_camera_that_training_refuses_is_explained_by_the_check(copy, check):

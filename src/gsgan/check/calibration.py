@@ -17,9 +17,6 @@ from gsgan.data.formats.consistency import spread
 TOPIC = "calibration"
 MIRRORED = "mirrored images"
 TRIED = 8  # images per camera on which calibrations are tried, at most
-LEAST_VIEWS = 3  # at a lag in time, for it to count
-LAG_METRES = 0.002  # that a lag must gain: less is noise
-LAG_LEFT = 0.01  # metres that it may leave: good captures have 0.001
 CREDIBLE_OVERLAP = 0.35  # the right calibration has 0.6 to 0.7, with slim masks 0.4
 SHARE_OF_ANY_CAMERA = 0.5  # of a standing person's joints lie in the mask from any camera
 OUTSIDE_RATIO = 3.0  # times the other cameras' distance: noisy landmarks are off in all of them
@@ -36,9 +33,7 @@ class CameraScore:
         fullness: median area of the mask over that of the estimated silhouette.
         rivals: the mean overlap with other calibrations, best first; by the name of their camera,
             or `MIRRORED`.
-        lag: frames by which the skeleton must be moved to fit best; 0 when nothing is gained.
-        outside, lag_outside: metres, mean distance of the joints from the mask, without and with
-            the lag.
+        outside: metres, mean distance of the joints from the mask.
     """
 
     name: str
@@ -46,9 +41,7 @@ class CameraScore:
     overlap: float
     fullness: float
     rivals: dict[str, float]
-    lag: int
     outside: float
-    lag_outside: float
 
     @property
     def best_rival(self) -> float:
@@ -74,9 +67,7 @@ class CameraScore:
         return [name for name, overlap in self.rivals.items() if overlap > least]
 
 
-def score_cameras(
-    subject: CheckedData, views: Sequence[MaskView], limits: Limits
-) -> list[CameraScore]:
+def score_cameras(subject: CheckedData, views: Sequence[MaskView]) -> list[CameraScore]:
     """Scores every camera of which an image could be read."""
     scores = []
     for name, own in grouped(views).items():
@@ -91,7 +82,7 @@ def score_cameras(
                 _fit(subject, chosen, camera),
                 float(np.median([view.fullness for view in own])),
                 dict(sorted(rivals.items(), key=lambda rival: -rival[1])),
-                *_lag(own, limits),
+                known_mean(view.distance for view in own if view.mask.any()),
             )
         )
     return scores
@@ -122,29 +113,6 @@ def _fit(subject: CheckedData, views: Sequence[MaskView], camera: CameraEntry) -
         skeleton = subject.p[row], subject.visible[row], subject.template
         overlaps.append(overlap(view.mask, body_silhouette(view.small(camera), *skeleton)))
     return float(np.mean(overlaps))
-
-
-def _lag(views: Sequence[MaskView], limits: Limits) -> tuple[int, float, float]:
-    """The best lag, and the mean metres outside without and with it.
-
-    Each lag is compared with none on the views that have both, as the first frames have none
-    before them. Empty masks are left out.
-    """
-    table = np.array([view.lagged for view in views if view.mask.any()])
-    if len(table) == 0:
-        return 0, np.nan, np.nan
-    reach = table.shape[1] // 2
-    best, left = 0, known_mean(table[:, reach].tolist())
-    outside, most = left, 0.0
-    for column in range(table.shape[1]):
-        known = ~np.isnan(table[:, [reach, column]]).any(1)
-        if np.count_nonzero(known) < max(LEAST_VIEWS, len(views) / 2):
-            continue
-        before, after = table[known, reach].mean(), table[known, column].mean()
-        enough = before - after >= max(LAG_METRES, limits.lag_gain * before)
-        if enough and after <= LAG_LEFT and before - after > most:
-            best, left, most = column - reach, float(after), before - after
-    return best, outside, left
 
 
 def known_mean(values: Iterable[float]) -> float:
@@ -190,23 +158,10 @@ def calibration_findings(
         wrong = any(s.wrong(limits) for s in scores)
         return [Finding("error" if wrong else "warning", TOPIC, text)]
     for score in scores:
-        if score.lag and (score not in beaten or score.name in named):
-            found.append(_late(score))
-            named.add(score.name)
-        elif score.name not in named and (finding := _of_one(score, scores, limits, min_inside)):
+        if score.name not in named and (finding := _of_one(score, scores, limits, min_inside)):
             found.append(finding)
             named.add(score.name)
     return found + small_errors([s for s in scores if s.name not in named], limits)
-
-
-def _late(score: CameraScore) -> Finding:
-    when = "later" if score.lag > 0 else "earlier"
-    text = (
-        f"camera {score.name}: its images fit the skeleton {abs(score.lag)} frame(s) {when} better "
-        f"(joints {100 * score.lag_outside:.1f} cm outside the masks instead of "
-        f"{100 * score.outside:.1f}); its clock or numbering is off: add {score.lag:+d}"
-    )
-    return Finding("error", "synchronisation", text)
 
 
 def _of_one(

@@ -62,7 +62,7 @@ class Measurements:
             broken[LISTED_BROKEN:] = [f"{len(broken)} sampled images cannot be read"]
         self.broken = [Finding("error", "files", text) for text in broken]
         self.geometry = geometry.geometry_of(subject)
-        self.cameras = score_cameras(subject, self.views, limits)
+        self.cameras = score_cameras(subject, self.views)
         self.wrong = {*self.geometry.far, *(s.name for s in self.cameras if s.wrong(limits))}
         self.colours = mean_colours(self.views)
         self.info, self.no_info = None, ""
@@ -70,8 +70,8 @@ class Measurements:
             self.info = data.info
         except DataError as error:  # named among the findings
             self.no_info = str(error)
-        unfit = self.wrong | {s.name for s in self.cameras if s.lag}
-        doubts = [*skeleton_doubts(subject, limits), *mask_doubts(self.views, limits, unfit)]
+        masks = mask_doubts(self.views, limits, self.wrong)
+        doubts = [*skeleton_doubts(subject, limits), *masks]
         self.doubts = sorted(doubts, key=lambda doubt: doubt.frame)
         self.reasons: dict[int, list[str]] = {}
         for doubt in self.doubts:
@@ -183,12 +183,10 @@ def _agreement(m: Measurements) -> Section:
             (f"{s.overlap:.2f}", False),
             (f"{s.best_rival:.2f}", s.beaten(m.limits)),
             (f"{s.fullness:.2f}", s.oversized(m.limits)),
-            (f"{s.lag:+d}" if s.lag else "0", s.lag != 0),
         )
         cells.append(tuple(Flagged(text) if bad else text for text, bad in columns))
     headers = (
         "camera", "joints inside mask", "outside by cm", "overlap", "best other", "mask / body",
-        "lag",
     )  # fmt: skip
     found = calibration_findings(m.cameras, m.limits, min_inside, m.geometry.far)
     table = Table(headers, tuple(cells))

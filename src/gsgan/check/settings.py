@@ -39,7 +39,6 @@ class Limits:
     inside_error: float = 0.7
     fullness: float = 2.0
     better_fit: float = 0.05
-    lag_gain: float = 0.3
     outside: float = 0.004
     frame_outside: float = 0.3
     area_jump: float = 0.35

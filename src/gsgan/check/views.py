@@ -45,7 +45,6 @@ if TYPE_CHECKING:
 
 FAR = 0.3  # metres: distances of joints from the mask are clipped to this before they are averaged
 SMALL = 128  # pixels, longest side of the masks that calibrations are tried on
-LAG = 4  # frames by which a camera is tried earlier and later
 TAIL = 64  # bytes: some writers append a few after the end mark
 END_MARKS = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8": b"\xff\xd9"}  # by first bytes
 FLESH = 0.07  # metres of body about every bone: between an arm and a thigh
@@ -129,7 +128,6 @@ class MaskView:
         outside, tolerance: ``[J]`` metres by which joints lie outside the mask, NaN where unknown;
             metres that they may.
         fullness: area of the mask over that of the estimated silhouette.
-        lagged: ``[2 LAG + 1]`` mean metres outside with the skeleton of an earlier or later frame.
         colour, weight: ``[3]`` summed RGB of the person, summed mask.
         mask, to_small: ``[h, w]`` small mask; ``[3, 3]`` maps pixels of the whole image to it.
     """
@@ -139,7 +137,6 @@ class MaskView:
     outside: Float
     tolerance: float
     fullness: float
-    lagged: Float
     colour: Float
     weight: float
     mask: Bool
@@ -158,6 +155,12 @@ class MaskView:
     def beyond(self) -> Bool:
         """``[J]`` joints outside the mask by more than the tolerance."""
         return np.asarray(self.outside > self.tolerance)
+
+    @property
+    def distance(self) -> float:
+        """Metres, mean distance of the known joints from the mask; NaN of none."""
+        metres = np.minimum(self.outside[self.known], FAR)
+        return float(metres.mean()) if len(metres) else np.nan
 
     @property
     def inside(self) -> float:
@@ -245,29 +248,18 @@ def _view(subject: CheckedData, item: Item, sampling: Sampling) -> MaskView:
     focal, soft = float(camera.K[0, 0]), frame.mask[0, 0].numpy()
     mask, visible = np.asarray(soft > 0.5), subject.visible[row]
     body = body_silhouette(camera, subject.p[row], visible, subject.template)
-    metre = float(np.median(project(camera, subject.p[row][visible])[1])) / focal  # per pixel
-    distance = mask_distance(mask)
-
-    def outside(row: int) -> Float:
-        pixels, depth = project(camera, subject.p[row])
-        seen = subject.visible[row] & inside(entry, subject.p[row])  # not in the padding
-        return joint_distance(distance, pixels, depth, seen, focal)
-
-    lagged = np.full(2 * LAG + 1, np.nan)
-    for i, steps in enumerate(range(-LAG, LAG + 1)):
-        other = subject.rows.get(number + steps * subject.step)
-        if other is not None and not np.isnan(metres := outside(other)).all():
-            lagged[i] = np.minimum(metres[~np.isnan(metres)], FAR).mean()
+    pixels, depth = project(camera, subject.p[row])
+    metre = float(np.median(depth[visible])) / focal  # per pixel
+    seen = visible & inside(entry, subject.p[row])  # not in the padding
     factor = min(1.0, SMALL / max(mask.shape))
     small = [max(1, round(side * factor)) for side in mask.shape[::-1]]
     to_small = np.diag([*np.array(small) / mask.shape[::-1], 1]) @ camera.K @ np.linalg.inv(entry.K)
     return MaskView(
         camera=name,
         frame=number,
-        outside=outside(row),
+        outside=joint_distance(mask_distance(mask), pixels, depth, seen, focal),
         tolerance=max(subject.consistency.joint_tolerance, TOLERANCE * metre),
         fullness=float(mask.sum() / max(1, int(body.sum()))),
-        lagged=lagged,
         colour=frame.image.double().sum((0, 2, 3)).numpy(),
         weight=float(soft.sum(dtype=np.float64)),
         mask=cv2.resize(soft, small, interpolation=cv2.INTER_AREA) > 0.5,
