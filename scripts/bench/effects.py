@@ -14,6 +14,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
+from timing import interleaved, median
 
 from gsgan.bench.common import NOTHING, Bench, check_whole, markdown, sentence
 from gsgan.effects import decide as decide_effects
@@ -24,7 +25,6 @@ from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import one_of
 from gsgan.utils.config import config_folder
 from gsgan.utils.errors import ConfigError, GsganError
-from gsgan.utils.timing import interleaved, median
 
 DEFAULT = "default person"
 SPLITS = ("novel_view", "novel_pose")

@@ -18,6 +18,7 @@ import bench_common
 import pandas as pd
 import torch
 from omegaconf import DictConfig, OmegaConf
+from timing import interleaved, median
 from torch import Tensor
 
 from gsgan.bench.common import NOTHING, Bench, check_whole, markdown, number, records, sentence
@@ -26,7 +27,6 @@ from gsgan.scene import Camera, Gaussians, Raster
 from gsgan.skeleton import MEDIAPIPE33, Densify
 from gsgan.splat import BACKENDS, Accuracy, project, rasterise, reference, resolve_backend
 from gsgan.synthetic.camera import look_at
-from gsgan.utils.timing import interleaved, median
 
 # The reference holds every Gaussian at every pixel: others are compared with it, it is not timed.
 TIMED = tuple(backend for backend in BACKENDS if backend not in ("auto", "reference"))

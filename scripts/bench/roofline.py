@@ -13,6 +13,7 @@ import pandas as pd
 import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
+from timing import interleaved
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
@@ -25,7 +26,6 @@ from gsgan.scene import Camera, Frame, Gaussians
 from gsgan.splat import Accuracy
 from gsgan.splat.project import project
 from gsgan.utils.config import config_folder
-from gsgan.utils.timing import interleaved
 
 PER_PAIR = 20  # operations to evaluate a Gaussian at a pixel; then 2 per channel
 SIDE, COPIED = 1024, 1 << 26  # of the matrix product; bytes of the copy

@@ -19,6 +19,7 @@ import bench_common
 import numpy as np
 import pandas as pd
 from omegaconf import DictConfig, OmegaConf
+from timing import interleaved
 from torch import Tensor
 from torch.nn import functional
 
@@ -43,10 +44,10 @@ from gsgan.scene import Frame
 from gsgan.splat import BACKENDS, Accuracy
 from gsgan.utils.checks import above, between, one_of
 from gsgan.utils.errors import ConfigError, DataError
-from gsgan.utils.palette import BLACK, COLOURS, GREY, MARKERS
-from gsgan.utils.timing import interleaved
+from gsgan.utils.palette import BLACK, COLOURS, GREY
 
 BASE = "base"
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h")
 SCORES = "metrics.json"  # what a finished run has, beside its checkpoint
 # Of a multirun's overrides: a point is the mean over seeds; others do not change what is trained.
 SEED = "seed"

@@ -26,7 +26,6 @@ from gsgan.splat import BACKENDS, resolve_backend
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError
-from gsgan.utils.timing import timed, wait
 
 TOTAL, REST = "end to end", "between stages"
 # Lightning's names, as in conf/trainer.
@@ -167,6 +166,23 @@ def without_denormals() -> Iterator[None]:
         yield
     finally:
         torch.set_flush_denormal(False)
+
+
+def timed(action: Callable[[], object], device: torch.device | None) -> float:
+    """Milliseconds of one call, device synchronised."""
+    wait(device)
+    start = time.perf_counter()
+    result = action()
+    wait(device)
+    took = 1000 * (time.perf_counter() - start)
+    del result  # freed after the measurement
+    return took
+
+
+def wait(device: torch.device | None) -> None:
+    """Synchronises a CUDA device."""
+    if device is not None and device.type == "cuda":
+        torch.cuda.synchronize(device)
 
 
 class StageClock:

@@ -1,4 +1,4 @@
-"""Colours and markers of all plots, distinct with any colour vision (Okabe and Ito)."""
+"""Colours of all plots, distinct with any colour vision (Okabe and Ito)."""
 
 from __future__ import annotations
 
@@ -7,5 +7,3 @@ BLUE, VERMILLION, PURPLE = "#0072b2", "#d55e00", "#cc79a7"
 GREY = "#777777"
 
 COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, BLACK)  # in the order of use
-# Ten markers and seven colours: 70 different pairs.
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h")

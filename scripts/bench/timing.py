@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import statistics
-import time
 from collections.abc import Callable, Hashable, Mapping
 from typing import TypeVar
 
 import torch
+
+from gsgan.bench.speed import timed
 
 Key = TypeVar("Key", bound=Hashable)
 
@@ -57,20 +58,3 @@ def interleaved(
 def median(samples: list[float] | None) -> float | None:
     """The median, or None without samples."""
     return statistics.median(samples) if samples else None
-
-
-def timed(action: Callable[[], object], device: torch.device | None) -> float:
-    """Milliseconds of one call, device synchronised."""
-    wait(device)
-    start = time.perf_counter()
-    result = action()
-    wait(device)
-    took = 1000 * (time.perf_counter() - start)
-    del result  # freed after the measurement
-    return took
-
-
-def wait(device: torch.device | None) -> None:
-    """Synchronises a CUDA device."""
-    if device is not None and device.type == "cuda":
-        torch.cuda.synchronize(device)

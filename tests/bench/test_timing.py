@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
-import pytest
+import sys
 
-from gsgan.utils import timing
-from gsgan.utils.timing import interleaved
+import pytest
+from commands import ROOT
+
+from gsgan.bench import speed
+
+sys.path.append(str(ROOT / "scripts" / "bench"))
+from timing import interleaved
 
 
 class Clock:
@@ -28,7 +33,7 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch):
     clock = Clock()
-    monkeypatch.setattr(timing.time, "perf_counter", lambda: clock.now)
+    monkeypatch.setattr(speed.time, "perf_counter", lambda: clock.now)
     return clock
 
 
