@@ -11,7 +11,6 @@ from make import edit_json, write_landmarks
 
 from gsgan.check.frames import reprojection_errors, skeleton_doubts
 from gsgan.check.geometry import (
-    axis_name,
     geometry_drawing,
     geometry_findings,
     geometry_of,
@@ -21,6 +20,7 @@ from gsgan.check.sections import colour_table, mean_colours
 from gsgan.check.settings import Limits, Sampling
 from gsgan.check.views import complete, measure, sampled_items, subject_of
 from gsgan.data.datamodule import GsganData
+from gsgan.data.proportions import axis_name
 from gsgan.utils.errors import ConfigError
 
 SAMPLING = Sampling(images=8)

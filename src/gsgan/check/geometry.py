@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from gsgan.check.report import Finding, Flagged, Table
 from gsgan.check.views import CheckedData, nanmedian
 from gsgan.data.formats.consistency import Float, far_cameras
+from gsgan.data.proportions import axis_name
 from gsgan.skeleton.sanitise import limb_length_sum
 from gsgan.utils.palette import BLACK, COLOURS, GREY
 
@@ -62,12 +63,6 @@ def geometry_of(subject: CheckedData) -> Geometry:
         # Of two cameras neither is the median one.
         far=far_cameras(distances, subject.consistency.far_camera) if len(distances) > 2 else {},
     )
-
-
-def axis_name(direction: Float) -> str:
-    """The nearest axis: "z" or "-y"."""
-    axis = int(np.argmax(np.abs(direction)))
-    return ("-" if direction[axis] < 0 else "") + "xyz"[axis]
 
 
 def geometry_findings(subject: CheckedData, geometry: Geometry) -> list[Finding]:

@@ -6,7 +6,6 @@ import reprlib
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -69,18 +68,6 @@ class CameraEntry:
         dist = torch.from_numpy(self.dist[None, :5]) if lens and self.keeps_lens else None
         camera = Camera(K, R, t, self.size, dist).crop(window.top, window.left, window.size)
         return (camera if size is None else camera.resize(size)).to(torch.float32)
-
-    def stored_pixels(self, points: Float) -> Float:
-        """``[N, 2]`` world points ``[N, 3]`` in the stored, distorted image.
-
-        Skew is applied, unlike in OpenCV's own projection. Points behind the camera get meaningless
-        pixels: mask them by depth.
-        """
-        if len(points) == 0:
-            return np.zeros((0, 2))
-        turn = cv2.Rodrigues(self.R)[0]
-        bent = cv2.projectPoints(points, turn, self.t, np.eye(3), self.dist)[0][:, 0]
-        return np.asarray(bent @ self.K[:2, :2].T + self.K[:2, 2], np.float64)
 
 
 def make_camera(

@@ -104,7 +104,7 @@ class PersonCrop:
         height, width = view.size
         pixels, depth = project(view, joints)
         if dist is not None:
-            pixels = _through_lens(view.K, dist, *pixels.T)
+            pixels = through_lens(view.K, dist, *pixels.T)
         taken = usable & (depth > NEAR)
         if not taken.any():
             return square_window(view.size)
@@ -159,7 +159,7 @@ def undistort_map(K: Float, dist: Float, crop: Crop) -> NDArray[np.float32]:
         maps = cv2.initUndistortRectifyMap(stored, dist, np.eye(3), seen, size, cv2.CV_32FC1)
         pixels = np.stack(maps, axis=-1)
     else:
-        pixels = (_through_lens(K, dist, *_grid(crop)) - 0.5).astype(np.float32)
+        pixels = (through_lens(K, dist, *_grid(crop)) - 0.5).astype(np.float32)
     limit = fold_radius(K, dist, crop)
     if limit is not None:
         x, y = _unproject(K, *_grid(crop))
@@ -193,7 +193,7 @@ def undistort(points: Float, dist: Float) -> Float:
     return np.asarray(np.where(error < FOUND, found, np.nan))
 
 
-def _through_lens(K: Float, dist: Float, u: Float, v: Float) -> Float:
+def through_lens(K: Float, dist: Float, u: Float, v: Float) -> Float:
     """``[..., 2]`` pixels where the lens shows what a pinhole shows at pixels u, v ``[...]``."""
     shown = distort(np.stack(_unproject(K, u, v), axis=-1), dist)
     return shown @ K[:2, :2].T + K[:2, 2]

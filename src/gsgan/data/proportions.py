@@ -217,6 +217,12 @@ def upright(up: str) -> Float:
     return np.stack([first, np.cross(above, first), above])
 
 
+def axis_name(direction: Float) -> str:
+    """The axis nearest to a direction ``[3]``: "z" or "-y"; the inverse of `upright`."""
+    axis = int(np.abs(direction).argmax())
+    return ("-" if direction[axis] < 0 else "") + "xyz"[axis]
+
+
 def middle(p: Float, pair: tuple[int, int]) -> Float:
     """``[..., 3]`` the middle of two joints of ``[..., J, 3]``."""
     return np.asarray(p[..., pair, :].mean(axis=-2))

@@ -17,6 +17,7 @@ import gsgan
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.formats.capture import read_capture
 from gsgan.data.joints import BODY, FACE, HANDS, joint_names, known
+from gsgan.data.proportions import axis_name
 from gsgan.prepare.camera_array import Float, Ints
 from gsgan.prepare.images import scaled
 from gsgan.prepare.options import Inputs, Options
@@ -96,9 +97,7 @@ def standing_axis(p: Float) -> str:
     legs = np.concatenate([p[:, 0] - (p[:, 27] + p[:, 28]) / 2, (p[:, 11] - p[:, 23])])
     head = p[:, [7, 8]].mean(1) - p[:, [11, 12]].mean(1)
     above = next((a for a in (legs[known(legs)], head[known(head)]) if len(a)), legs[:0])
-    up = np.median(above, axis=0) if len(above) else np.array([0.0, 0.0, 1.0])
-    axis = int(np.abs(up).argmax())
-    return ("-" if up[axis] < 0 else "") + "xyz"[axis]
+    return axis_name(np.median(above, axis=0)) if len(above) else "z"
 
 
 def exists(out: Path, key: str, overwrite: bool) -> bool:

@@ -53,36 +53,23 @@ def _check_types(gaussians: Gaussians, camera: Camera) -> None:
 def _check_camera(camera: Camera) -> None:
     """K is a pinhole's, R a rotation."""
     K, R, t = (x.detach().double() for x in (camera.K, camera.R, camera.t))
-    identity = torch.eye(3, dtype=R.dtype, device=R.device)
-    rows = [
-        (K[:, 0, 0], K[:, 1, 1]),
-        ((K[:, 2] - identity[2]).abs().amax(-1), K[:, 1, 0].abs()),
-        ((R @ R.mT - identity).abs().amax((-2, -1)), torch.linalg.det(R)),
-        (K.sum((-2, -1)) + R.sum((-2, -1)) + t.sum(-1), K[:, 0, 1]),
-    ]
-    host = torch.stack([torch.stack(row) for row in rows]).tolist()  # [4, 2, B]
-    for i in range(len(camera)):
-        (fx, fy), (last_row, k10), (off, det), (total, _) = ((a[i], b[i]) for a, b in host)
-        if not math.isfinite(total):
-            raise ValueError(f"rasterise: Camera.K, R and t of item {i} must be finite")
-        if not (fx > 0 and fy > 0):
+    identity = torch.eye(3, dtype=R.dtype)
+    off = (R @ R.mT - identity).abs().amax((-2, -1))
+    rules = (
+        ("K", K.isfinite().all((-2, -1)), "finite"),
+        ("R", R.isfinite().all((-2, -1)), "finite"),
+        ("t", t.isfinite().all(-1), "finite"),
+        ("K", (K[:, 0, 0] > 0) & (K[:, 1, 1] > 0), "of fx, fy > 0"),
+        ("K", (K[:, 2] == identity[2]).all(-1) & (K[:, 1, 0] == 0), "[fx s cx; 0 fy cy; 0 0 1]"),
+        ("R", off <= ROTATION, f"a rotation, R Rᵀ the identity to {ROTATION:g}"),
+        ("R", torch.linalg.det(R) > 0, "a rotation: it mirrors; flip one axis of R and t"),
+    )
+    for name, good, expected in rules:
+        if not good.all():
+            i = int((~good).nonzero()[0])
             raise ValueError(
-                f"rasterise: Camera.K of item {i} must have fx, fy > 0, got {fx}, {fy}"
-            )
-        if last_row > 0 or k10 > 0:
-            raise ValueError(
-                f"rasterise: Camera.K of item {i} must be [fx s cx; 0 fy cy; 0 0 1], "
-                f"got {camera.K[i].tolist()}"
-            )
-        if off > ROTATION:
-            raise ValueError(
-                f"rasterise: Camera.R of item {i} must be a rotation, but R Rᵀ differs from the "
-                f"identity by {off:.3g} (tolerance {ROTATION:.3g})"
-            )
-        if det < 0:
-            raise ValueError(
-                f"rasterise: Camera.R of item {i} must have det +1, got {det:.3g}: a mirrored "
-                "camera; flip one axis of R and t"
+                f"rasterise: Camera.{name} of item {i} must be {expected}, got "
+                f"{getattr(camera, name)[i].tolist()}"
             )
 
 

@@ -15,13 +15,13 @@ from gsgan.data.files import read_header
 from gsgan.data.formats.consistency import Consistency, check_consistency
 from gsgan.data.layout import Found, Layout, assemble, dataset_folder
 from gsgan.data.pixels import MaskFile
+from gsgan.data.proportions import axis_name
 from gsgan.data.splits import parse_frames
 from gsgan.data.validation import Thresholds
 from gsgan.skeleton.smpl import TABLES
 from gsgan.utils.errors import ConfigError, DataError
 
 IMAGES = (".jpg", ".jpeg", ".png")
-AXES = ("x", "y", "z")
 MODELS = {"smpl": ("SMPL", "SMPL_NEUTRAL.pkl"), "smplx": ("SMPL-X", "SMPLX_NEUTRAL.npz")}
 
 
@@ -143,9 +143,7 @@ def body_model(root: Path, smpl: str | None, kind: str) -> tuple[Path, SkinnedMo
 
 def up_axis(cameras: Iterable[CameraEntry]) -> str:
     """The world axis nearest to the mean of the cameras' upward directions, e.g. "-z"."""
-    up = np.mean([-camera.R[1] for camera in cameras], axis=0)
-    axis = int(np.abs(up).argmax())
-    return ("-" if up[axis] < 0 else "") + AXES[axis]
+    return axis_name(np.mean([-camera.R[1] for camera in cameras], axis=0))
 
 
 def image_size(root: Path, files: Mapping[int, str]) -> tuple[int, int]:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.crop import NEAR, project
+from gsgan.data.crop import NEAR, project, through_lens
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_mask
 from gsgan.utils.arrays import evenly_spaced
@@ -139,7 +139,8 @@ def inside_share(mask: Bytes, camera: CameraEntry, joints: Float, tolerance: flo
         return np.nan
     step = max(1, -(-max(mask.shape) // LONGEST))
     small, focal = mask[::step, ::step] > 127, float(camera.K[0, 0]) / step
-    pixels, depth = camera.stored_pixels(joints) / step, project(camera, joints)[1]
+    straight, depth = project(camera, joints)
+    pixels = through_lens(camera.K, camera.dist, *straight.T) / step
     everyone = np.ones(len(joints), bool)
     outside = joint_distance(mask_distance(small), pixels, depth, everyone, focal)
     known = ~np.isnan(outside)
