@@ -81,15 +81,6 @@ def expected(run: Path, found: dict) -> dict:
     return numbers
 
 
-def test_a_figure_that_cannot_be_made_is_named_and_the_rest_is_made(run, tmp_path, inside):
-    given = (f"run={run}", f"out={tmp_path / 'out'}", *FEW)
-    result = inside("report", *given, "figures=[ablation,strip]")
-    assert result.returncode == 0, result.stderr
-    assert "ablation: left out, there is one run" in result.stdout
-    assert {p.name for p in (tmp_path / "out").glob("*.png")} == {"strip.png"}
-    refused(inside("report", *given, "figures=ablation"), "no figure could be made", "one run")
-
-
 def test_names_in_print(run, twin, tmp_path, inside):
     given = (f"run={run}", f"compare={twin}", f"out={tmp_path / 'out'}", *FEW)
     result = inside("report", *given, "figures=strip", "names=[ours,'cost $5 {x_1}']")
@@ -146,6 +137,7 @@ def test_a_collapsed_run_is_not_drawn(twin, tmp_path, inside):
         (("compare=[{run}]",), ("a run is given twice",)),
         (("compare=[/nowhere]",), ("/nowhere", "not a run folder")),
         (("figures=[strip,stripe]",), ("figures must be one of comparison", "stripe")),
+        (("figures=[ablation,strip]",), ("figures=ablation compares runs",)),
         (("split=test",), ("split must be one of", "test")),
         (("frames=[99]",), ("lacks 99", "4-5")),
         (("frames=[a]",), ("frames must be a whole number",)),

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from gsgan.motion.rig import SIDES
 from gsgan.motion.rotations import axis_angle, twist
 from gsgan.synthetic.controls import frame_times
-from gsgan.synthetic.gltf import avatar_path, read_character
+from gsgan.synthetic.gltf import AVATARS, read_character
 from gsgan.synthetic.posing import Choreography
 from gsgan.synthetic.scene_setup import VERSION, Scene, SceneSettings, dataset_key
 from gsgan.synthetic.signs import HELD_OUT, SIGNS, split_signs
@@ -40,7 +40,7 @@ TINY = {
 
 @pytest.fixture(scope="module")
 def polo():
-    return read_character(avatar_path("polo"))
+    return read_character(AVATARS["polo"])
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,7 @@ from gsgan.synthetic.humanoid import (
 )
 from gsgan.synthetic.parts import LABEL_NAMES, face_labels
 from gsgan.synthetic.textures import linear, srgb
-from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.errors import DataError
 
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # glTF is y up
 HEIGHTS = (1.2, 2.3)  # metres: heights that are taken as they are
@@ -34,26 +34,8 @@ TRIANGLES = 4
 DAMAGED = (ArithmeticError, AttributeError, AssertionError, LookupError, OSError, RuntimeError,
            TypeError, ValueError, struct.error)  # fmt: skip
 
-
-AVATARS = Path(__file__).with_name("avatars")
-
-
-def avatar_names() -> tuple[str, ...]:
-    """Names of the avatars that come with gsgan."""
-    return tuple(sorted(path.stem for path in AVATARS.glob("*.glb")))
-
-
-def avatar_path(name: str) -> Path:
-    """The file of an avatar that comes with gsgan.
-
-    Raises:
-        ConfigError: There is no such avatar.
-    """
-    if name not in avatar_names():
-        raise ConfigError(
-            f"no avatar {name!r}; expected {', '.join(avatar_names())} or the path of a .glb"
-        )
-    return AVATARS / f"{name}.glb"
+AVATARS = {path.stem: path for path in sorted(Path(__file__).with_name("avatars").glob("*.glb"))}
+"""Files of the avatars that come with gsgan, by name."""
 
 
 def read_character(path: Path) -> Character:

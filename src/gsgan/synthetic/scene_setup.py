@@ -23,7 +23,7 @@ from gsgan.synthetic.choreography import EVERYDAY, held_out
 from gsgan.synthetic.controls import frame_times
 from gsgan.synthetic.far import FAR
 from gsgan.synthetic.free_subject import free_character, free_pose
-from gsgan.synthetic.gltf import avatar_names, avatar_path, read_character
+from gsgan.synthetic.gltf import AVATARS, read_character
 from gsgan.synthetic.posing import Choreography
 from gsgan.synthetic.recorded_motion import RECORDED, RecordedMotion
 from gsgan.synthetic.secondary import Moving, Secondary
@@ -39,7 +39,6 @@ Array = NDArray[np.float64]
 VERSION = 2
 """Of the generator. Raise it when any pixel changes: cached datasets are then made again."""
 
-AVATARS = avatar_names()
 DEFAULT, FREE_BODY, CHOREOGRAPHY, SIGNING, FURTHER = (
     *("polo", "free_body", "choreography", "signs", "far"),
 )
@@ -161,7 +160,7 @@ def load_character(avatar: str) -> Character:
     """
     if avatar == FREE_BODY:
         return free_character()
-    return read_character(avatar_path(avatar) if avatar in AVATARS else Path(avatar).expanduser())
+    return read_character(AVATARS.get(avatar) or Path(avatar).expanduser())
 
 
 class Scene:

@@ -31,10 +31,6 @@ class Drawing:
     numbers: dict[str, Any]
 
 
-class Unavailable(Exception):
-    """What the runs lack for a figure; the other figures are still made."""
-
-
 @dataclass(frozen=True)
 class Panel:
     """One image ``[1, 3, h, w]`` in [0, 1], and a note below it."""

@@ -1,4 +1,4 @@
-"""Draws the figures of ``run`` that the runs allow, and reports the reasons for the others."""
+"""Draws the figures of ``run``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rich.progress import track
 
 from gsgan.model.stored import DataPaths, load_config
 from gsgan.report.figures import images
-from gsgan.report.figures.layout import STYLE, Drawing, Unavailable
+from gsgan.report.figures.layout import STYLE, Drawing
 from gsgan.report.figures.subjects import Shot, Subject, choose_items, make_shots, open_subjects
 from gsgan.utils.checks import at_least, one_of, whole
 from gsgan.utils.console import make_console
@@ -44,13 +44,18 @@ def make_figures(config: DictConfig) -> None:
     """Draws the figures of ``config`` and writes images, captions and numbers into ``out``.
 
     Raises:
-        ConfigError: on a wrong value, runs of different data, or when no figure could be made.
+        ConfigError: on a wrong value, runs of different data, or a comparison of one run.
         DataError: when a run or its data cannot be read.
     """
     folders = [Path(str(f)).expanduser() for f in (config.run, *_list(config.compare))]
     names = [one_of("figures", name, FIGURES) for name in _list(config.figures)]
     if not names:
         names = [name for name in FIGURES if len(folders) > 1 or name not in COMPARE]
+    if len(folders) < 2 and (lacking := [name for name in names if name in COMPARE]):
+        raise ConfigError(
+            f"figures={lacking[0]} compares runs, but there is one; add others as "
+            "compare=[<folder>,…]"
+        )
     at_least("margin", config.margin, 0)
     out = folders[0] / "figures" if config.out is None else Path(config.out).expanduser()
     moved = DataPaths.from_config(config)
@@ -62,24 +67,17 @@ def make_figures(config: DictConfig) -> None:
         raise ConfigError(f"out={out}: cannot be written to ({error.strerror})") from error
     logging.getLogger("fontTools").setLevel(logging.WARNING)  # it logs every glyph of a PDF
     subjects = open_subjects(folders, config.names, moved, pick_device(config.device))
-    console, lines = make_console(), []
-    made: dict[str, Drawing] = {}
+    console, made = make_console(), dict[str, Drawing]()
     with matplotlib.rc_context(STYLE):
         for name in track(list(dict.fromkeys(names)), "drawing", console=console, transient=True):
-            try:
-                made[name] = _draw(name, subjects, config)
-            except Unavailable as reason:
-                lines.append(f"{name}: left out, {reason}")
-                continue
+            made[name] = _draw(name, subjects, config)
             for kind, metadata in METADATA.items():
                 stream = io.BytesIO()
                 made[name].figure.savefig(stream, format=kind, metadata=metadata, **TRIMMED)
                 write_atomically(out / f"{name}.{kind}", stream.getvalue())
-    if not made:
-        raise ConfigError(f"no figure could be made: {'; '.join(lines)}")
     marks = sorted({mark for subject in subjects for mark in subject.marks})
     _write_record(out, made, subjects, marks)
-    lines += [f"marked: {mark}" for mark in marks]
+    lines = [f"marked: {mark}" for mark in marks]
     lines.append(
         f"figures: {out}: {', '.join(made)} ({CAPTIONS} has their captions, {RECORD} their numbers)"
     )
@@ -89,8 +87,6 @@ def make_figures(config: DictConfig) -> None:
 def _draw(name: str, subjects: Sequence[Subject], config: DictConfig) -> Drawing:
     """One figure with its whole caption."""
     data, split = subjects[0].data, config.split
-    if name in COMPARE and len(subjects) < 2:
-        raise Unavailable("there is one run; add others as compare=[<folder>,…]")
     frames = [whole("frames", frame, 0) for frame in dict.fromkeys(_list(config.frames))]
     items = choose_items(
         data,
