@@ -33,6 +33,7 @@ from gsgan.synthetic.posing import Choreography
 from gsgan.synthetic.scene_setup import load_character
 
 JOINTS, NEAREST = 75, 8  # landmarks of body and hands; training frames that bind points
+COLLARS = 0.18  # of the arm's turn: CMU's clips have collarbones that do not move
 PARTS = {  # by the name of a point's bone, first match
     "head": "Head|Neck|.*Eye|Jaw",
     "hands": ".*Hand.*",
@@ -54,7 +55,7 @@ def animation(character: Character, clip: str) -> Animation:
         source = Choreography(character, int(seed))
         return source.at(frame_times(int(frames), source.duration))
     path, first, last, frames = clip.rsplit(":", 3)
-    source = RecordedMotion(character, Path(path).expanduser())
+    source = RecordedMotion(character, Path(path).expanduser(), collars=COLLARS)
     return source.at(np.linspace(float(first), float(last), int(frames)))
 
 

@@ -7,7 +7,10 @@ is one degree of freedom: an angle about an axis, spread over the turns of a cha
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -23,7 +26,7 @@ Axes = tuple[Tensor, Tensor, Tensor]  # along a limb's upper bone, across it, al
 # Per role. A limb's twist is smaller near the trunk than at its far end; the forearm's ends at the
 # wrist.
 FREE: dict[str, Chain] = {
-    "spine": (("spine05", 1 / 3), ("spine03", 1 / 3), ("spine01", 1 / 3)),
+    "spine": (("spine05", 1.0), ("spine03", 1.0), ("spine01", 1.0)),
     "neck": (("neck01", 0.5), ("head", 0.5)),
     "collar": (("clavicle.{}", 1.0),),
     "arm": (("upperarm01.{}", 0.8), ("upperarm02.{}", 0.2)),
@@ -36,7 +39,7 @@ FREE: dict[str, Chain] = {
     "toe": (("toe1-1.{}", 1.0),),
 }
 SMPL: dict[str, Chain] = {
-    "spine": (("spine1", 1 / 3), ("spine2", 1 / 3), ("spine3", 1 / 3)),
+    "spine": (("spine1", 1.0), ("spine2", 1.0), ("spine3", 1.0)),
     "neck": (("neck", 0.5), ("head", 0.5)),
     "collar": (("{}_collar", 1.0),),
     "arm": (("{}_shoulder", 1.0),),
@@ -49,11 +52,9 @@ SMPL: dict[str, Chain] = {
     "toe": (("{}_foot", 1.0),),
 }
 # Standard deviation of each number about the rest pose: wide where a joint turns freely, narrow
-# across hinges and where 33 landmarks do not determine the turn.
+# across hinges and where 33 landmarks do not determine the turn. That of `TRUNK` is learnt.
 SPREAD = {
-    "spine": 0.25,
     "neck": 0.5,
-    "collar": 0.2,
     "arm": 1.5,
     "arm_twist": 0.7,
     "elbow": 1.5,
@@ -73,6 +74,11 @@ SPREAD = {
 }
 LEAST = {"knee": -0.1, "elbow": -0.7}  # a hinge does not bend backwards; elbows are bent at rest
 SIDES = {"left": "L", "right": "R"}
+SPINE = ("spine1", "spine2", "spine3")  # from the pelvis to the chest
+TRUNK = (
+    *(f"{joint}_{axis}" for joint in SPINE for axis in "xyz"),
+    *(f"{side}_collar_{axis}" for side in SIDES for axis in "yz"),
+)
 BENT = 0.15  # sine: an elbow that is bent more at rest determines its hinge
 AT_JOINT = 1e-4  # metres
 XYZ = ("x", "y", "z")
@@ -160,7 +166,8 @@ def build_rig(body: MarkedBody) -> Rig:
     axes = dict(zip(XYZ, rest_axes(body), strict=True))
     turns = _Turns(body, chains)
     turns.append((0, {f"root_{k}": axis for k, axis in zip(XYZ, torch.eye(3), strict=True)}))
-    turns.put("spine", {f"spine_{k}": axis for k, axis in axes.items()})
+    for k, joint in enumerate(SPINE):
+        turns.put("spine", {f"{joint}_{i}": axis for i, axis in axes.items()}, slice(k, k + 1))
     turns.put("neck", {f"neck_{k}": axis for k, axis in axes.items()})
     limbs: dict[str, Axes] = {}
     for side, letter in SIDES.items():
@@ -263,14 +270,32 @@ def _rig(body: MarkedBody, turns: _Turns, limbs: dict[str, Axes]) -> Rig:
     )
 
 
-def spreads(rig: Rig) -> tuple[Tensor, Tensor]:
-    """``[D]`` standard deviation of each number, infinite for the root's; and its least value."""
+def prior(rig: Rig) -> tuple[Tensor, Tensor]:
+    """``[D, D]`` the precision matrix of the numbers about the rest pose, 0 for the root's; and
+    ``[D]`` the least value of each."""
     spread, least = [torch.inf] * 6, [-torch.inf] * 6
     for name in rig.names[6:]:
         key = name.removeprefix("left_").removeprefix("right_")
-        spread.append(SPREAD.get(key) or SPREAD[key.split("_")[0]])
+        known = torch.inf if name in TRUNK else SPREAD.get(key) or SPREAD[key.split("_")[0]]
+        spread.append(known)
         least.append(LEAST.get(key, -torch.inf))
-    return torch.tensor(spread), torch.tensor(least)
+    precision = torch.tensor(spread).square().reciprocal().diag()
+    trunk = torch.tensor([rig.names.index(name) for name in TRUNK])
+    precision[trunk[:, None], trunk] = trunk_covariance().inverse().float()
+    return precision, torch.tensor(least)
+
+
+@lru_cache(maxsize=1)
+def trunk_covariance() -> Tensor:
+    """``[13, 13]`` square radians, float64: of `TRUNK`, learnt by scripts/learn_trunk.py.
+
+    It says how the bends of spine and collarbones go together, which landmarks of hips and
+    shoulders leave open: each pair shows neither the pitch of the pelvis nor that of the chest.
+
+    Source: motions of the CMU Graphics Lab Motion Capture Database; see ATTRIBUTION.md.
+    """
+    values = json.loads((Path(__file__).with_name("assets") / "trunk.json").read_text())
+    return torch.tensor(values["covariance"], dtype=torch.float64)
 
 
 def _limb(names: tuple[str, ...], words: str, axes: Axes) -> Limb:

@@ -40,6 +40,7 @@ GROUPS = {  # by the joint's name in the free body | in SMPL's family; the other
     "head": r"head|jaw|.*_eye",
 }
 WRISTS = ("wrist.L", "wrist.R")
+BACK = (0.0, 1.0, 0.0)  # of the free body
 LANDMARKS, HANDS_SHAPE = (len(MEDIAPIPE33.names), 3), (2, 2, 3)
 
 B = TypeVar("B", bound=MarkedBody)
@@ -56,6 +57,7 @@ class BodyShape:
             skeletons have them: detectors and rigs define joints differently. None means zero.
         hands: ``[2, 2, 3]`` metres at rest, left and right: the offset of the person's wrist from
             the body's, and of the rest of the hand. None means zero.
+        spine: ``[1]`` metres: how far the spine's joints are behind the body's. None means zero.
 
     Raises:
         ValueError: on wrong shapes.
@@ -65,17 +67,19 @@ class BodyShape:
     stretch: Tensor
     offsets: Tensor | None = None
     hands: Tensor | None = None
+    spine: Tensor | None = None
 
     def __post_init__(self) -> None:
         off = LANDMARKS if self.offsets is None else self.offsets.shape
         hands = HANDS_SHAPE if self.hands is None else self.hands.shape
-        given = (self.coefficients.ndim, self.stretch.shape, off, hands)
-        if given != (1, (len(STRETCHED),), LANDMARKS, HANDS_SHAPE):
+        spine = (1,) if self.spine is None else self.spine.shape
+        given = (self.coefficients.ndim, self.stretch.shape, off, hands, spine)
+        if given != (1, (len(STRETCHED),), LANDMARKS, HANDS_SHAPE, (1,)):
             raise ValueError(
                 f"BodyShape: expected coefficients [K], stretch [{len(STRETCHED)}], offsets "
-                f"{list(LANDMARKS)}, hands {list(HANDS_SHAPE)}, got "
+                f"{list(LANDMARKS)}, hands {list(HANDS_SHAPE)}, spine [1], got "
                 f"{list(self.coefficients.shape)}, {list(self.stretch.shape)}, {list(off)}, "
-                f"{list(hands)}"
+                f"{list(hands)}, {list(spine)}"
             )
 
     def arrays(self) -> dict[str, NDArray[np.float32]]:
@@ -83,27 +87,32 @@ class BodyShape:
         return {name: x.detach().numpy() for name, x in vars(self).items() if x is not None}
 
     def flat(self) -> Tensor:
-        """``[K + 8 + 99]`` all numbers, with hands 12 more, to store; see `of_flat`."""
+        """``[K + 8 + 99]`` all numbers, with hands 12 and a spine 1 more, to store; see `of_flat`."""
         off = self.stretch.new_zeros(LANDMARKS) if self.offsets is None else self.offsets
-        hands = [] if self.hands is None else [self.hands.flatten()]
-        return torch.cat([self.coefficients, self.stretch, off.flatten(), *hands])
+        more = [x.flatten() for x in (self.hands, self.spine) if x is not None]
+        return torch.cat([self.coefficients, self.stretch, off.flatten(), *more])
 
     @classmethod
     def of_flat(cls, values: Tensor) -> BodyShape:
         """The shape of the free body whose numbers `flat` gave.
 
         Raises:
-            ValueError: when the count is neither that with hands nor that without.
+            ValueError: when the count is that of no shape.
         """
         sizes = [free_space().coefficients, len(STRETCHED), math.prod(LANDMARKS)]
-        with_hands = [*sizes, math.prod(HANDS_SHAPE)]
-        if values.shape not in ((sum(sizes),), (sum(with_hands),)):
-            raise ValueError(
-                f"BodyShape: expected {sum(sizes)} or {sum(with_hands)} numbers, got "
-                f"{list(values.shape)}"
-            )
-        K, stretch, off, *hands = values.split(with_hands if len(values) > sum(sizes) else sizes)
-        return cls(K, stretch, off.view(LANDMARKS), *(x.view(HANDS_SHAPE) for x in hands))
+        hands = math.prod(HANDS_SHAPE)
+        counts = [sum(sizes) + more for more in (0, 1, hands, hands + 1)]
+        if values.ndim != 1 or len(values) not in counts:
+            known = " or ".join(map(str, counts))
+            raise ValueError(f"BodyShape: expected {known} numbers, got {list(values.shape)}")
+        K, stretch, off, more = values.split([*sizes, len(values) - sum(sizes)])
+        return cls(
+            K,
+            stretch,
+            off.view(LANDMARKS),
+            more[:hands].view(HANDS_SHAPE) if len(more) >= hands else None,
+            more[-1:] if len(more) in (1, hands + 1) else None,
+        )
 
 
 @dataclass(frozen=True)
@@ -146,6 +155,10 @@ class ShapeSpace(Generic[B]):
         body = _stretched(replace(self.body, **moved), shape.stretch)
         if shape.offsets is not None:
             body = replace(body, landmarks=body.landmarks + shape.offsets)
+        if shape.spine is not None:
+            spine = [name.startswith("spine") for name in body.joint_names]
+            back = shape.spine * torch.outer(given.new_tensor(spine), given.new_tensor(BACK))
+            body = replace(body, joints=body.joints + back)
         return body if shape.hands is None else _with_hands(body, shape.hands)
 
 

@@ -16,7 +16,7 @@ from torch.nn.functional import normalize
 from gsgan.body.fingers import Fingers
 from gsgan.body.free import Body
 from gsgan.body.lbs import axis_angle_to_matrix, left_jacobian, shortest_turn
-from gsgan.body.rig import ancestors, build_rig, spreads
+from gsgan.body.rig import SPINE, ancestors, build_rig, prior
 from gsgan.body.skinned import MarkedBody
 from gsgan.scene import BodyPose
 from gsgan.skeleton import MEDIAPIPE33, MEDIAPIPE33_HANDS, TEMPLATES, bone_frames, sanitise
@@ -70,7 +70,7 @@ class Solver(nn.Module):
     known: Tensor  # [N] bool
     replaced: Tensor  # [2, 33] bool, `ON_HANDS`
     precision: Tensor  # [33] of the body's own landmarks
-    prior: Tensor  # [D] precisions
+    prior: Tensor  # [D, D] precisions
     least: Tensor  # [D]
     matrix: Tensor  # [D, 3 T] from numbers to the turns' axis-angles
     follows: Tensor  # [E, N, 1] bool, whether a landmark follows an entry's turn
@@ -103,10 +103,10 @@ class Solver(nn.Module):
             rest, _ = sanitise(torch.where(known[:, None], own, torch.nan)[None])
             matrix = body.joints.new_zeros(len(rig.names), len(rig.joint), 3)
             matrix[rig.entry_number, rig.entry_turn] = rig.entry_axis.to(matrix)
-            spread, least = spreads(rig)
+            precision, least = prior(rig)
             held = {
                 "precision": known / _noise().square(),
-                "prior": spread.square().reciprocal(),
+                "prior": precision,
                 "least": least,
                 "matrix": matrix.flatten(1),
                 "follows": ancestors(rig.parent)[rig.carrier].mT[rig.entry_turn, :, None],
@@ -218,11 +218,11 @@ class Solver(nn.Module):
         hubs = bone_frames(p[:, :BODY]).hubs @ self.rest_hubs.mT
         pelvis, chest, head = hubs.unbind(1)
         q = p.new_zeros(len(p), len(self.prior))
-        for name, R in (("spine", pelvis.mT @ chest), ("neck", chest.mT @ head)):
-            numbers = self.rig.numbers(name)
-            q[:, numbers] = (
-                log_of(R) @ normalize(self.matrix[numbers].unflatten(1, (-1, 3)).sum(1)).mT
-            )
+        for names, R in ((SPINE, pelvis.mT @ chest), (("neck",), chest.mT @ head)):
+            for name in names:
+                numbers = self.rig.numbers(name)
+                axes = normalize(self.matrix[numbers].unflatten(1, (-1, 3)).sum(1))
+                q[:, numbers] = log_of(R) @ axes.mT / len(names)
         for limb in self.rig.limbs:
             first, middle, end = (p[:, i] for i in limb.points)
             bones = torch.stack([middle - first, end - middle], dim=1) @ hubs[:, limb.hub]
@@ -296,10 +296,11 @@ class Solver(nn.Module):
         below = (q - self.least).clamp_max(0)
         stop = (below < 0) / BEYOND**2
         cost = 2 * ROBUST**2 * (root - 1).sum(-1)
-        cost = cost + (self.prior * q.square() + stop * below.square().nan_to_num()).sum(-1)
+        pull = q @ self.prior
+        cost = cost + (pull * q + stop * below.square().nan_to_num()).sum(-1)
         g = (weighted @ at.residual.flatten(1).unsqueeze(-1)).squeeze(-1)
-        g = g + self.prior * q + stop * below
-        return cost, g, weighted @ J.mT + torch.diag_embed(self.prior + stop + FLOOR), w
+        g = g + pull + stop * below
+        return cost, g, weighted @ J.mT + self.prior + torch.diag_embed(stop + FLOOR), w
 
     def descend(
         self, q: Tensor, root: Tensor, p: Tensor, weight: Tensor, steps: int = STEPS

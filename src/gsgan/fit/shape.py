@@ -21,6 +21,9 @@ from gsgan.utils.errors import DataError
 FRAMES = 24  # at most: every frame shows the same lengths
 # Standard deviations of the prior: coefficients have 1.
 STRETCH, OFFSET = 0.1, 0.015  # of a stretch's logarithm; metres
+# Metres by which the spine's joints are behind the body's: the bodies of vertebrae are behind the
+# line from hips to shoulders; mean and standard deviation.
+BEHIND, DEPTH = 0.04, 0.02
 # Pairs of landmarks whose distance hardly depends on the pose, and pairs whose distance does; and
 # the standard deviations of the distance's logarithm in the first guess.
 RIGID = (
@@ -147,9 +150,9 @@ def _usable(skeletons: Tensor, visibility: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _shape(space: ShapeSpace[B], x: Tensor) -> BodyShape:
-    """The shape of the numbers: coefficients, logarithms of stretches, offsets."""
-    K, n = space.coefficients, len(STRETCHED)
-    return BodyShape(x[:K], x[K : K + n].exp(), _offsets(space, x[K + n :]))
+    """The shape of the numbers: coefficients, logarithms of stretches, the spine, offsets."""
+    K, stretch, spine, offsets = x.split([space.coefficients, len(STRETCHED), 1, 99])
+    return BodyShape(K, stretch.exp(), _offsets(space, offsets), spine=BEHIND + spine)
 
 
 def _offsets(space: ShapeSpace[B], values: Tensor) -> Tensor:
@@ -161,7 +164,8 @@ def _offsets(space: ShapeSpace[B], values: Tensor) -> Tensor:
 
 def _prior(space: ShapeSpace[MarkedBody]) -> Tensor:
     """``[S]`` precisions of all numbers."""
-    parts = ((space.coefficients, 1.0), (len(STRETCHED), STRETCH), (99, OFFSET * 2**0.5))
+    parts = ((space.coefficients, 1.0), (len(STRETCHED), STRETCH), (1, DEPTH),
+             (99, OFFSET * 2**0.5))  # fmt: skip
     return torch.cat([torch.full((n,), 1 / sigma**2, dtype=torch.float64) for n, sigma in parts])
 
 
@@ -202,7 +206,7 @@ def _fit_lengths(space: ShapeSpace[MarkedBody], p: Tensor, seen: Tensor) -> Tens
         return ((at[a] - at[b]).norm(dim=-1).log() - target) / sigma
 
     prior = _prior(space)
-    prior[space.coefficients + len(STRETCHED) :] *= 100  # offsets come last
+    prior[-99:] *= 100  # offsets
     x = torch.zeros_like(prior)
 
     def cost(x: Tensor) -> Tensor:
@@ -229,7 +233,7 @@ def _fit_landmarks(space: ShapeSpace[MarkedBody], x: Tensor, p: Tensor, seen: Te
     shift = p[:, MEDIAPIPE33.hips].mean(1, keepdim=True)
     p = p - shift
     prior, share = _prior(space), min(1.0, INDEPENDENT / len(p))
-    own = space.coefficients + len(STRETCHED)
+    own = len(x) - 99
     symmetric = torch.func.jacfwd(partial(_offsets, space))(x[own:])
     held: tuple[Tensor, Tensor] | None = None
     for _ in range(STEPS):

@@ -12,7 +12,7 @@ from gsgan.motion.asf import asf_of, read_amc
 from gsgan.motion.bvh import read_bvh
 from gsgan.motion.character import Animation, Character
 from gsgan.motion.rig import LEG, SIDES, SIGN, Pose, Rig
-from gsgan.motion.rotations import Array
+from gsgan.motion.rotations import Array, blend
 from gsgan.motion.standard import drift, floor_under, standard_motion
 from gsgan.synthetic.posing import blinks
 
@@ -36,18 +36,25 @@ class RecordedMotion:
         path: a BVH file of a person, joints named as by Mixamo, MakeHuman, CMU, Blender, VRM, …;
             or an AMC file with its ASF skeleton beside it.
         seed: of the blinks.
+        collars: share of the upper arms' turns that collarbones take, for files such as CMU's
+            whose collarbones do not move; None leaves them as they are.
 
     Raises:
         DataError: when the file is damaged, or a joint of the limbs is not found.
     """
 
-    def __init__(self, character: Character, path: Path, seed: int = 0) -> None:
+    def __init__(
+        self, character: Character, path: Path, seed: int = 0, collars: float | None = None
+    ) -> None:
         self.rig, self.seed, self.name = Rig(character), seed, path.stem
         read = read_bvh(path) if path.suffix == ".bvh" else read_amc(path, asf_of(path))[0]
         self.duration = len(read.root) * read.frame_time
         self._times = np.arange(len(read.root), dtype=np.float64) * read.frame_time
         standard = standard_motion(read, path)
         self._turns, joint = standard.turns, self.rig.joint
+        for side in SIDES if collars is not None else ():
+            chest, arm = self._turns["Spine2"], self._turns[side + "Arm"]
+            self._turns[side + "Shoulder"] = blend(chest, arm, collars)
         offset = (joint["LeftUpLeg"] + joint["RightUpLeg"]) / 2 - joint["Hips"]
         thighs = (standard.joints["LeftUpLeg"] + standard.joints["RightUpLeg"]) / 2
         self._hips = thighs * self.rig.leg / standard.leg - self._turns["Hips"] @ offset

@@ -260,8 +260,9 @@ def read_shape(path: Path) -> tuple[float, ...]:
     """
     K = free_space().coefficients
     names = {"coefficients": (K,), "stretch": (len(STRETCHED),), "offsets": LANDMARKS_SHAPE}
-    arrays = read_arrays(path, (*names, "hands"))
-    if "hands" in arrays:
-        names["hands"] = HANDS_SHAPE
+    arrays = read_arrays(path, (*names, "hands", "spine"))
+    for name, size in (("hands", HANDS_SHAPE), ("spine", (1,))):
+        if name in arrays:
+            names[name] = size
     parts = [expect_array(arrays, name, shape, path).ravel() for name, shape in names.items()]
     return tuple(np.concatenate(parts).astype(np.float64).tolist())
