@@ -20,8 +20,8 @@ from torch import Tensor
 
 from gsgan.body import free_body
 from gsgan.body.rig import SPINE, TRUNK, build_rig, rest_axes
-from gsgan.synthetic.recorded_motion import RecordedMotion
 from gsgan.synthetic.free_subject import free_character, free_pose
+from gsgan.synthetic.recorded_motion import RecordedMotion
 
 RATE = 15  # frames per second
 COLLARS = 0.18  # share of the arm's turn: CMU's collarbones do not move
@@ -59,7 +59,9 @@ def covariance(clips: list[Path]) -> Tensor:
 
 
 if __name__ == "__main__":
-    ask = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    ask = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     ask.add_argument("clips", type=Path, nargs="+", help="AMC files")
     asset = Path(__file__).parents[1] / "src" / "gsgan" / "body" / "assets" / "trunk.json"
     ask.add_argument("--out", type=Path, default=asset)

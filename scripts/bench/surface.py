@@ -1,6 +1,6 @@
 """Distance of a character's true surface from the body solved from its exact landmarks, by part.
 
-    python scripts/bench/surface.py avatar=person.glb train='[a.amc:0:2:30]' test='[far@b.amc:4:9:40]'
+    python scripts/bench/surface.py avatar=a.glb train='[a.amc:0:2:30]' test='[far@b.amc:4:9:40]'
 
 The shape is fitted to the landmarks of the training frames, and the poses of all frames are solved
 from landmarks alone; no image is rendered. Every point of the true surface is bound to its nearest
@@ -27,9 +27,9 @@ from gsgan.body.solve import Solver
 from gsgan.fit.shape import fit_hands, fit_shape
 from gsgan.motion.character import Animation, Character
 from gsgan.scene import BodyPose
-from gsgan.synthetic.recorded_motion import RecordedMotion
 from gsgan.synthetic.controls import frame_times
 from gsgan.synthetic.posing import Choreography
+from gsgan.synthetic.recorded_motion import RecordedMotion
 from gsgan.synthetic.scene_setup import load_character
 
 JOINTS, NEAREST = 75, 8  # landmarks of body and hands; training frames that bind points
@@ -80,7 +80,8 @@ class Bound:
         vertices = (A @ body.vertices.unsqueeze(-1)).squeeze(-1) + t
         step = -(-len(points) // NEAREST)
         apart = sum(
-            torch.cdist(x, v).square() for x, v in zip(points[::step], vertices[::step], strict=True)
+            torch.cdist(x, v).square()
+            for x, v in zip(points[::step], vertices[::step], strict=True)
         )
         self.nearest = apart.argmin(1)
         A, t = A[:, self.nearest], t[:, self.nearest]
@@ -94,13 +95,41 @@ class Bound:
 
 
 def parts(character: Character, chosen: NDArray[np.int64]) -> dict[str, Tensor]:
+    """Which of the chosen vertices are of each part."""
     names = [character.bones[j] for j in character.dominant_bones()[chosen]]
     of = [next((p for p, rule in PARTS.items() if re.fullmatch(rule, n)), "") for n in names]
     return {part: torch.tensor([o == part for o in of]) for part in PARTS if part in of}
 
 
 def rms(error: Tensor) -> float:
+    """Of vectors ``[..., 3]`` metres, in millimetres."""
     return 1000 * float(error.square().sum(-1).mean().sqrt())
+
+
+@torch.no_grad()
+def errors(
+    found: dict[str, tuple[Tensor, ...]], masks: dict[str, Tensor]
+) -> dict[str, dict[str, float]]:
+    """Millimetres by set and part: RMS of the surface, medians of landmarks."""
+    marks, points = found["training"]
+    seen = torch.ones(len(marks), JOINTS)
+    shape = fit_shape(marks[:, :33], seen[:, :33])
+    shape = fit_hands(shape, Solver(shaped_body(shape)).solve(marks, seen), marks, seen)
+    body = shaped_body(shape)
+    solver = Solver(body)
+    pose = {name: solver.solve(p, torch.ones(p.shape[:2])) for name, (p, _) in found.items()}
+    bound, table = Bound(body, pose["training"], points), {}
+    for name, (p, x) in found.items():
+        error = bound.error(pose[name], x)
+        off = (body.posed_landmarks(pose[name]) - p[:, :33]).norm(dim=-1)
+        hands = (body.posed_hands(pose[name]) - p[:, 33:]).norm(dim=-1)
+        table[name] = {
+            **{part: rms(error[:, mask]) for part, mask in masks.items()},
+            "landmarks, median": 1000 * float(off.median()),
+            "landmarks, 90 %": 1000 * float(off.quantile(0.9)),
+            "hand landmarks, median": 1000 * float(hands.median()),
+        }
+    return table
 
 
 def run(options: DictConfig, out: Path) -> None:
@@ -111,22 +140,7 @@ def run(options: DictConfig, out: Path) -> None:
     for name, clip in (word.split("@") for word in options.test):
         sets.setdefault(name, []).append(clip)
     found = {name: truth(character, clips, chosen) for name, clips in sets.items()}
-    marks, points = found["training"]
-    with torch.no_grad():
-        shape = fit_shape(marks[:, :33], torch.ones(len(marks), 33))
-        seen = torch.ones(len(marks), JOINTS)
-        shape = fit_hands(shape, Solver(shaped_body(shape)).solve(marks, seen), marks, seen)
-        body = shaped_body(shape)
-        solver = Solver(body)
-        pose = {n: solver.solve(p, torch.ones(p.shape[:2])) for n, (p, _) in found.items()}
-        bound = Bound(body, pose["training"], points)
-        table: dict[str, dict[str, float]] = {}
-        for name, (p, x) in found.items():
-            error = bound.error(pose[name], x)
-            of = {part: rms(error[:, mask]) for part, mask in parts(character, chosen).items()}
-            off = 1000 * (body.posed_landmarks(pose[name]) - p[:, :33]).norm(dim=-1)
-            hands = 1000 * (body.posed_hands(pose[name]) - p[:, 33:]).norm(dim=-1)
-            table[name] = of | {"landmarks": float(off.median()), "landmarks 90 %": float(off.quantile(0.9)), "hand landmarks": float(hands.median())}
+    table = errors(found, parts(character, chosen))
     rows = [f"| part | {' | '.join(table)} |", "|---" * (len(table) + 1) + "|"]
     for part in table["training"]:
         rows.append(f"| {part} | {' | '.join(f'{t[part]:.1f}' for t in table.values())} |")

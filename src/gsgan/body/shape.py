@@ -87,7 +87,7 @@ class BodyShape:
         return {name: x.detach().numpy() for name, x in vars(self).items() if x is not None}
 
     def flat(self) -> Tensor:
-        """``[K + 8 + 99]`` all numbers, with hands 12 and a spine 1 more, to store; see `of_flat`."""
+        """``[K + 8 + 99]`` all numbers, to store; 12 more of hands, 1 of a spine; see `of_flat`."""
         off = self.stretch.new_zeros(LANDMARKS) if self.offsets is None else self.offsets
         more = [x.flatten() for x in (self.hands, self.spine) if x is not None]
         return torch.cat([self.coefficients, self.stretch, off.flatten(), *more])

@@ -52,9 +52,10 @@ class RecordedMotion:
         self._times = np.arange(len(read.root), dtype=np.float64) * read.frame_time
         standard = standard_motion(read, path)
         self._turns, joint = standard.turns, self.rig.joint
-        for side in SIDES if collars is not None else ():
-            chest, arm = self._turns["Spine2"], self._turns[side + "Arm"]
-            self._turns[side + "Shoulder"] = blend(chest, arm, collars)
+        if collars is not None:
+            chest = self._turns["Spine2"]
+            for side in SIDES:
+                self._turns[side + "Shoulder"] = blend(chest, self._turns[side + "Arm"], collars)
         offset = (joint["LeftUpLeg"] + joint["RightUpLeg"]) / 2 - joint["Hips"]
         thighs = (standard.joints["LeftUpLeg"] + standard.joints["RightUpLeg"]) / 2
         self._hips = thighs * self.rig.leg / standard.leg - self._turns["Hips"] @ offset

@@ -11,8 +11,8 @@
     face3d.npz        optional, the same (F,30,3), names (30,): lips, brows and lids
     body_pose.npz     optional theta (F,bones,3), transl (F,3), frame_id (F,); betas (S,) of SMPL
                       by gsgan.fit also theta_hands and transl_hands, which follow hands3d.npz
-    body_shape.npz    optional coefficients (K,), stretch (8,), offsets (33,3), hands (2,2,3) where
-                      some were seen: of the free body, by gsgan.fit
+    body_shape.npz    optional coefficients (K,), stretch (8,), offsets (33,3), spine (1,), hands
+                      (2,2,3) where some were seen: of the free body, by gsgan.fit
 """
 
 from __future__ import annotations
