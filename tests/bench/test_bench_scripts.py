@@ -64,6 +64,15 @@ def test_roofline_measures_each_stage(script, tmp_path, capture):
     assert table.loc["UNet", "flop"] < table.loc["end to end", "flop"]
 
 
+def test_surface_measures_each_part(script, tmp_path):
+    clips = ["train=[choreography:0:5]", "test=[held@choreography:1:2]"]
+    assert not script("surface", *clips, "points=400")
+    table = read(tmp_path, "surface")
+    assert set(table) == {"training", "held"}
+    assert all(0.5 < table[name]["chest"] < 40 for name in table)
+    assert table["training"]["landmarks, median"] < 5
+
+
 def test_trade_off_compares_a_multirun(script, tmp_path, run):
     for name in ("one", "two"):
         shutil.copytree(run, tmp_path / "sweep" / name)

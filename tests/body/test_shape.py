@@ -178,3 +178,18 @@ def test_an_upper_body_has_a_shape():
     arm = [(b.landmarks[11] - b.landmarks[13]).norm() for b in (found, body)]
     torch.testing.assert_close(*arm, atol=0.01, rtol=0)
     assert stature(found) == pytest.approx(stature(body), abs=0.15)
+
+
+def test_the_depth_of_the_spine_is_found_where_the_trunk_bends():
+    found = []
+    for depth in (0.0, 0.07):
+        body = shaped_body(BodyShape(torch.zeros(K), torch.ones(8), spine=torch.tensor([depth])))
+        pose = moving(body)
+        bends = 0.4 * torch.rand(20, generator=torch.Generator().manual_seed(1))
+        for joint in ("spine05", "spine03"):
+            pose.theta[:, body.joint_names.index(joint), 0] = bends
+        p = body.posed_landmarks(pose)
+        shape = fit_shape(p, torch.ones(p.shape[:2]))
+        found.append(float(shape.spine))
+        assert torch.equal(BodyShape.of_flat(shape.flat()).spine, shape.spine)
+    assert found[0] + 0.01 < found[1] < 0.08
