@@ -49,7 +49,9 @@ def test_fingers_move_what_is_on_the_body(made):
     p, seen = frame.skeleton, frame.visibility
     with_hands = avatar.body_pose(p, seen).theta
     without = avatar.body_pose(p, torch.cat([seen[:, :33], 0 * seen[:, HANDS]], 1)).theta
-    moved = (with_hands - without).norm(dim=-1)[0] > 0.02  # radians
+    off = (with_hands - without).norm(dim=-1)[0]
+    assert off.max() > 3 * off[free_body().joint_names.index("root")]  # the trunk leans little
+    moved = off > 0.15  # radians
     fingers = set(avatar.solver.fingers.joints.tolist())
     moved = set(moved.nonzero().flatten().tolist())
     arms = re.compile(r"(wrist|lowerarm|upperarm|shoulder|clavicle)")
