@@ -91,10 +91,10 @@ def evaluate_config(config: DictConfig) -> Results:
 def evaluate_folder(config: DictConfig, console: Console, device: torch.device) -> Results:
     """Loads the avatar of ``config.run`` and scores it."""
     folder, other = Path(config.run).expanduser(), config.get("on") is not None
-    out, checkpoint = folder, read_checkpoint(folder / CHECKPOINT)
+    out, stored = folder, read_config(folder)
+    checkpoint = read_checkpoint(folder / CHECKPOINT)
     state = checkpoint["gsgan"]
     if other:
-        stored = read_config(folder)
         avatar, marks = avatar_of(folder, stored, checkpoint, config.data_smpl), [*state["marks"]]
         data = build_data(other_capture(stored, config.on))
         name = Path(data.layout.root).resolve().name
