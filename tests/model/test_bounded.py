@@ -45,7 +45,9 @@ def test_stability_an_opacity_and_a_scale_beyond_their_bounds_come_back():
         net.table[:, 7:10] = 20.0  # log scales: far above the largest
         net.table[:, at] = 40.0  # logits: saturated
     pose, root = torch.zeros(1, 99), torch.zeros(1, 3)
-    gaussians = net.compose(points, net.residuals(points, pose, root), torch.ones(1, 3))
+    gaussians = net.compose(
+        points, net.residuals(points, pose, root, torch.eye(3)[None]), torch.ones(1, 3)
+    )
     (gaussians.opacities.sum() + gaussians.covariances.diagonal(dim1=-2, dim2=-1).sum()).backward()
     assert torch.isfinite(net.table.grad).all()
     assert (net.table.grad[:, 7:10] > 0).all()

@@ -324,7 +324,10 @@ def test_a_missing_file_is_named(parameters, tmp_path):
         ({"test_scale": [9]}, "test_scale must be"),
         ({"test_scale": [2], "test_cameras": 0}, "set test_cameras"),
         ({"avatar": "nobody"}, "avatar must be blouse, polo, free_body or the path"),
-        ({"motion": "waltz"}, "motion must be choreography, signs, far or the path of a .bvh or .amc"),
+        (
+            {"motion": "waltz"},
+            "motion must be choreography, signs, far or the path of a .bvh or .amc",
+        ),
         ({"secondary": "some"}, "secondary must be one of True, False"),
     ],
 )

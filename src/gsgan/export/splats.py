@@ -99,8 +99,8 @@ def _posed(
     points = avatar.points(p, valid, frames, body)
     root = root_of(p)
     face = face_code(p, frames.head, avatar.template)
-    code = psi.pose_code(p, root, frames.hubs[:, 0], None, face)
-    residuals = psi.residuals(points, code, root)
+    pelvis = frames.hubs[:, 0]
+    residuals = psi.residuals(points, psi.pose_code(p, root, pelvis, None, face), root, pelvis)
     return psi.compose(points, residuals, eye), residuals.sh, points.frames
 
 

@@ -107,10 +107,14 @@ class Deformation(nn.Module):
         """(parameters, multiplier of the learning rate)."""
         return [(list(self.parameters()), 1.0)]
 
-    def residuals(self, points: Points, pose: Tensor, root: Tensor) -> Residuals:
-        """ΔG of posed points, from the `pose_code` and the pelvis ``root`` ``[B, 3]`` (metres)."""
+    def residuals(self, points: Points, pose: Tensor, root: Tensor, pelvis: Tensor) -> Residuals:
+        """ΔG of posed points, from the `pose_code` and the pelvis: ``root [B, 3]`` (metres) and
+        axes ``[B, 3, 3]`` (columns)."""
         position = (points.means - root[:, None]) / self.body_height
-        normals, code = points.normals, positional_encoding(position, self.position_octaves)
+        normals = points.normals
+        if self.pose_frame == "pelvis":
+            position, normals = position @ pelvis, normals @ pelvis
+        code = positional_encoding(position, self.position_octaves)
         if torch.is_grad_enabled() and not (code.requires_grad or normals.requires_grad):
             x = self._trained(code, normals, pose)
         else:
@@ -251,7 +255,8 @@ class Deformation(nn.Module):
     ) -> Gaussians:
         """Ĝ for joints ``p`` ``[B, J, 3]``, seen from ``eye`` ``[B, 3]`` (both world, metres)."""
         root = root_of(p)
-        residuals = self.residuals(points, self.pose_code(p, root, pelvis, noise, face), root)
+        code = self.pose_code(p, root, pelvis, noise, face)
+        residuals = self.residuals(points, code, root, pelvis)
         return self.compose(points, residuals, eye)
 
 
