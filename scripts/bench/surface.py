@@ -30,7 +30,7 @@ from gsgan.scene import BodyPose
 from gsgan.synthetic.controls import frame_times
 from gsgan.synthetic.posing import Choreography
 from gsgan.synthetic.recorded_motion import RecordedMotion
-from gsgan.synthetic.scene_setup import load_character
+from gsgan.synthetic.scene_setup import PROGRAMMES, load_character
 
 JOINTS, NEAREST = 75, 8  # landmarks of body and hands; training frames that bind points
 COLLARS = 0.18  # of the arm's turn: CMU's clips have collarbones that do not move
@@ -49,10 +49,10 @@ PARTS = {  # by the name of a point's bone, first match
 
 
 def animation(character: Character, clip: str) -> Animation:
-    """The poses of ``file:first second:last second:frames``, or of the choreography."""
-    if clip.startswith("choreography"):
+    """The poses of ``file:first second:last second:frames``, or of a choreography."""
+    if (name := clip.split(":")[0]) in PROGRAMMES:
         _, seed, frames = clip.split(":")
-        source = Choreography(character, int(seed))
+        source = Choreography(character, int(seed), PROGRAMMES[name])
         return source.at(frame_times(int(frames), source.duration))
     path, first, last, frames = clip.rsplit(":", 3)
     source = RecordedMotion(character, Path(path).expanduser(), collars=COLLARS)
