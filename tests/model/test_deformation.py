@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -115,3 +116,13 @@ def test_residuals_in_the_pelvis_frame_do_not_know_the_heading(densify):
         code = psi.pose_code(q, root, pelvis, None)
         found.append(psi.residuals(moved, code, root, pelvis).sh)
     torch.testing.assert_close(found[0], found[1], atol=1e-4, rtol=0)
+
+
+def test_the_step_scales_offsets_up_to_the_same_bound(densify):
+    slow, p = small(densify, mean_step=0.1), rest()
+    at_rest = run(slow, densify, p).means
+    for value, expected in ((1.0, 0.1), (1e4, 20.0)):
+        slow.head.bias.data[:3] = value
+        moved = (run(slow, densify, p).means - at_rest).norm(dim=-1)
+        reach = 3**0.5 * slow.mean_bound * slow.body_height * math.tanh(expected)
+        torch.testing.assert_close(moved, torch.full_like(moved, reach), rtol=1e-4, atol=0)

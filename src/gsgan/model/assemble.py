@@ -181,7 +181,8 @@ def _assembled(
     deformation = surface = None
     if parts.deformation and (points := body_points or parts.densify):
         rest, joints = points.rest_points, len(template.names)
-        deformation = parts.deformation(rest_points=rest, joints=joints, **sizes)
+        step = {"mean_step": body_points.mean_step} if body_points else {}
+        deformation = parts.deformation(rest_points=rest, joints=joints, **sizes, **step)
     if parts.surface:
         surface = parts.surface(body=_required_body(scene, "model.surface"), **sizes)
     segmentation = None

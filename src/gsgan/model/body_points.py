@@ -116,6 +116,7 @@ class BodyPoints(nn.Module):
         body_height: metres, the length scale of Ψ's input.
         points: vertices used, spread evenly over the surface; None for all.
         sigma: initial standard deviation, as a share of the distance to the nearest neighbour.
+        mean_step: of Ψ: its means move by this share of what they would on a skeleton's points.
     """
 
     rest_points: Tensor
@@ -129,10 +130,12 @@ class BodyPoints(nn.Module):
         *,
         points: int | None = None,
         sigma: float = 0.7,
+        mean_step: float = 1.0,
     ) -> None:
         super().__init__()
         above("model.body_points.sigma", sigma)
-        self.points, self.sigma = SkinnedPoints(body, points), sigma
+        above("model.body_points.mean_step", mean_step)
+        self.points, self.sigma, self.mean_step = SkinnedPoints(body, points), sigma, mean_step
         rest = (self.points.means - self.points.means.mean(dim=0)) / body_height
         self.register_buffer("rest_points", rest, persistent=False)
         normals = vertex_normals(body.vertices.float(), body.faces)[self.points.chosen]

@@ -48,6 +48,7 @@ class Deformation(nn.Module):
         width, layers: the MLP's trunk.
         embedding: learned numbers per point.
         features: channels beside the three of colour.
+        mean_step: what residuals of means are multiplied by: with Adam, how fast means move.
         sh_degree: 0 (no view dependence) to 3.
 
     The other settings are explained in conf/model/full.yaml.
@@ -75,6 +76,7 @@ class Deformation(nn.Module):
         pose_frame: str = "world",
         opacity: float = 0.5,
         mean_bound: float | None = 0.25,
+        mean_step: float = 1.0,
         scale_min: float = 1e-4,
         scale_max: float = 0.06,
         logit_bound: float = 8.0,
@@ -88,6 +90,7 @@ class Deformation(nn.Module):
         self.active_degree = sh_degree  # raised during training; higher degrees are not computed
         self.position_octaves, self.pose_frame = position_octaves, pose_frame
         self.opacity, self.mean_bound, self.logit_bound = opacity, mean_bound, logit_bound
+        self.mean_step = mean_step
         self.scale_range = (scale_min, scale_max)
         self.register_buffer("rest_code", positional_encoding(rest_points.float(), rest_octaves))
         self.embedding = nn.Parameter(0.1 * torch.randn(points, embedding))
@@ -129,9 +132,8 @@ class Deformation(nn.Module):
                 x = functional.relu(layer(x), inplace=True)
         raw, parts = self._head(x)
         means, quats, scales, opacities, sh, features = raw.split(parts, dim=-1)
-        return Residuals(
-            means, quats, scales, opacities[..., 0], sh.unflatten(-1, (-1, 3)), features
-        )
+        sh, opacities = sh.unflatten(-1, (-1, 3)), opacities[..., 0]
+        return Residuals(self.mean_step * means, quats, scales, opacities, sh, features)
 
     def _point_part(self) -> Tensor:
         """``[N, width]``: the part of the first layer that depends on the point alone."""
