@@ -9,7 +9,7 @@ import logging
 import os
 import shutil
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -40,7 +40,7 @@ hypothesis.settings.load_profile("ci")
 
 
 @pytest.fixture(autouse=True)
-def _loggers_stay_on() -> Iterator[None]:
+def _loggers_stay_on():
     """A command run in this process configures logging, which may switch loggers off for good."""
     yield
     for logger in logging.root.manager.loggerDict.values():
@@ -50,7 +50,7 @@ def _loggers_stay_on() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable], Path]:
+def shared(tmp_path_factory):
     """``shared(name, make)``: a path made once for all workers of pytest-xdist; read only."""
     root = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
@@ -70,7 +70,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable]
 
 
 @pytest.fixture(scope="session")
-def capture(shared) -> Path:
+def capture(shared):
     """A small capture with labels and body poses: 3 cameras (one held out), 6 frames (2 held)."""
     from make import write_tiny_capture
 
@@ -179,7 +179,7 @@ def inside(tmp_path, monkeypatch, capfd):
 
 
 @pytest.fixture(scope="session")
-def run(capture: Path, shared, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(capture, shared, tmp_path_factory):
     """A finished tiny run, made by the real command once, and copied for each worker."""
     from commands import train
 
@@ -194,7 +194,7 @@ def run(capture: Path, shared, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 
 @pytest.fixture(scope="session")
-def bare(capture: Path, shared, tmp_path_factory) -> Path:
+def bare(capture, shared, tmp_path_factory):
     """A tiny run whose avatar is driven by skeletons alone."""
     from commands import train
 
@@ -207,7 +207,7 @@ def bare(capture: Path, shared, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def dance() -> BodyPose:
+def dance():
     """A smooth motion of the free body: it waves, walks sideways and turns a little."""
     rng, body = np.random.default_rng(3), free_body()
     ends = 0.35 * rng.standard_normal((2, len(body.parents), 3))
@@ -219,7 +219,7 @@ def dance() -> BodyPose:
 
 
 @pytest.fixture(scope="session")
-def landmarks(dance) -> np.ndarray:
+def landmarks(dance):
     """``[12, 33, 3]`` metres, Z up: the landmarks of that motion."""
     return free_body().posed_landmarks(dance).double().numpy()
 
@@ -231,7 +231,7 @@ def proportions(landmarks):
 
 
 @pytest.fixture(scope="session")
-def signing(dance) -> np.ndarray:
+def signing(dance):
     """``[12, 75, 3]`` metres, Z up: the free body's motion with its hands."""
     body = free_body()
     both = torch.cat([body.posed_landmarks(dance), body.posed_hands(dance)], dim=1)

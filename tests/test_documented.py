@@ -57,7 +57,7 @@ def is_part(line: str, lines: list[str]) -> bool:
 
 
 @pytest.fixture(scope="session")
-def model_file(shared) -> Callable[[str], Path]:
+def model_file(shared):
     """A model file like SMPL's or SMPL-X's, of the default person, by kind."""
     from writers.smpl import write_smpl
 
@@ -69,7 +69,7 @@ def model_file(shared) -> Callable[[str], Path]:
 
 
 @pytest.fixture
-def place(capture, run, bare, model_file, tmp_path_factory) -> Callable[[str], str]:
+def place(capture, run, bare, model_file, tmp_path_factory):
     """Puts real, tiny files in the place of a documented line's placeholders."""
 
     def folder() -> Path:

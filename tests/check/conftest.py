@@ -13,7 +13,7 @@ from gsgan.check.settings import Limits, Sampling
 
 
 @pytest.fixture(scope="session")
-def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def good(tmp_path_factory):
     """Four cameras, twelve frames, 2D detections included."""
     from make import write_landmarks, write_tiny_capture
 
@@ -29,13 +29,13 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def copy(good: Path, tmp_path: Path) -> Path:
+def copy(good, tmp_path):
     """A copy of the good capture."""
     return Path(shutil.copytree(good, tmp_path / "capture"))
 
 
 @pytest.fixture
-def check(monkeypatch: pytest.MonkeyPatch):
+def check(monkeypatch):
     """Checks a folder: ``check(root, joint_jump=0.1, consistency={"min_inside": 0.7})``."""
     from gsgan.check import geometry, overlays
     from gsgan.check.run import check_data
@@ -62,7 +62,7 @@ def check(monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.fixture
-def subject(good: Path):
+def subject(good):
     """The good capture as the checks see it."""
     from gsgan.check.views import subject_of
     from gsgan.data.datamodule import GsganData

@@ -21,7 +21,7 @@ def every_frame(
     root: Path, consistency: Consistency = SKELETON_LIMITS, **kwargs: object
 ) -> list[Frame]:
     layout = read_capture(root, consistency=consistency)
-    dataset = CaptureDataset(layout, items(layout), **kwargs)  # type: ignore[arg-type]
+    dataset = CaptureDataset(layout, items(layout), **kwargs)
     return [dataset[i] for i in range(len(dataset))]
 
 

@@ -15,7 +15,7 @@ torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")
-def real_capture() -> Path:
+def real_capture():
     """The prepared real capture, which is not part of the project."""
     default = HERE.parents[2] / "shared" / "data" / "real_capture"
     path = Path(os.environ.get("GSGAN_REAL_CAPTURE", default))
@@ -25,7 +25,7 @@ def real_capture() -> Path:
 
 
 @pytest.fixture(scope="session")
-def smpl_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def smpl_file(tmp_path_factory):
     """A file like SMPL's, of the default person."""
     from writers.smpl import write_smpl
 
@@ -35,7 +35,7 @@ def smpl_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def subject(smpl_file: Path):
+def subject(smpl_file):
     """Three cameras, four frames, 40 x 40 pixels; do not write into it."""
     from writers.common import make_subject
 
@@ -43,7 +43,7 @@ def subject(smpl_file: Path):
 
 
 @pytest.fixture(scope="session")
-def smplx_file() -> Path:
+def smplx_file():
     """A file like SMPL-X's, of the default person."""
     from writers.smplx_rig import smplx_once
 
@@ -51,7 +51,7 @@ def smplx_file() -> Path:
 
 
 @pytest.fixture(scope="session")
-def smplx_subject(smplx_file: Path):
+def smplx_subject(smplx_file):
     """Three cameras, four frames, 52 x 44 pixels; do not write into it."""
     from writers.smplx_rig import smplx_subject
 
@@ -59,12 +59,12 @@ def smplx_subject(smplx_file: Path):
 
 
 @pytest.fixture(scope="session")
-def _models_read() -> dict:
+def _models_read():
     return {}
 
 
 @pytest.fixture
-def model_once(monkeypatch: pytest.MonkeyPatch, _models_read: dict):
+def model_once(monkeypatch, _models_read):
     """A model file is read once for all tests that share it: it has some 40 MB."""
     from gsgan.body.smpl import read_smpl
     from gsgan.data.formats import common

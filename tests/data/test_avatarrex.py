@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from writers.avatarrex import SERIALS, write_avatarrex
-from writers.smplx_rig import SmplxSubject
 
 from gsgan.data.files import read_colour
 from gsgan.data.formats.avatarrex import AvatarrexReader
@@ -24,11 +23,11 @@ def read(root: Path, smplx: Path) -> Layout:
 
 
 @pytest.fixture
-def root(tmp_path: Path, smplx_subject: SmplxSubject) -> Path:
+def root(tmp_path, smplx_subject):
     return write_avatarrex(tmp_path / "avatarrex_zzr", smplx_subject)
 
 
-def test_read_equals_written(root: Path, smplx_subject: SmplxSubject, smplx_file: Path) -> None:
+def test_read_equals_written(root, smplx_subject, smplx_file):
     layout = read(root, smplx_file)
     assert layout.notes == ()  # a lens of zeros and a list that is not there need no note
     assert layout.camera_names == SERIALS  # the calibration's order, which indices count
@@ -51,9 +50,7 @@ def test_read_equals_written(root: Path, smplx_subject: SmplxSubject, smplx_file
     assert layout.meta.layout == "AvatarReX"
 
 
-def test_the_list_of_missing_files_is_optional_and_names_serials(
-    root: Path, smplx_file: Path
-) -> None:
+def test_the_list_of_missing_files_is_optional_and_names_serials(root, smplx_file):
     (root / "missing_img_files.txt").write_text(
         f"D:\\avatarrex_zzr\\{SERIALS[1]}\\00000002.jpg\n{SERIALS[0]}/mask/pha/00000000.jpg\n"
     )
@@ -62,7 +59,7 @@ def test_the_list_of_missing_files_is_optional_and_names_serials(
     assert list(layout.images[SERIALS[0]]) == [1, 2, 3]
 
 
-def test_the_config_reads_it(root: Path, smplx_file: Path, compose) -> None:
+def test_the_config_reads_it(root, smplx_file, compose):
     from hydra.utils import instantiate
 
     config = compose(

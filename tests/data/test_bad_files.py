@@ -121,12 +121,12 @@ def meta(**changes: object) -> Damage:
 
 def landmarks(**changed: object) -> Damage:
     defaults = {"p": skeletons(4), "frame_id": np.arange(4)}
-    return lambda root: write_landmarks(root, **(defaults | changed))  # type: ignore[arg-type]
+    return lambda root: write_landmarks(root, **(defaults | changed))
 
 
 def poses(**changed: object) -> Damage:
     held = {"theta": np.zeros((4, 56, 3)), "transl": np.zeros((4, 3)), "frame_id": np.arange(4)}
-    return lambda root: np.savez(root / "body_pose.npz", **(held | changed))  # type: ignore[arg-type]
+    return lambda root: np.savez(root / "body_pose.npz", **(held | changed))
 
 
 def turned_round(rig: dict) -> None:
@@ -295,7 +295,7 @@ SMPL: dict[str, Path] = {}
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory: pytest.TempPathFactory, subject, smpl_file) -> dict[str, Path]:
+def written(tmp_path_factory, subject, smpl_file):
     """A folder in every format; do not write into it."""
     SMPL["smpl"], root = smpl_file, tmp_path_factory.mktemp("formats")
     write_tiny_capture(root / "capture")
@@ -308,9 +308,7 @@ def written(tmp_path_factory: pytest.TempPathFactory, subject, smpl_file) -> dic
 @pytest.mark.parametrize(
     ("kind", "message"), [(kind, message) for kind, (bad, _) in FORMATS.items() for message in bad]
 )
-def test_damage_is_refused_in_one_sentence(
-    written: dict[str, Path], tmp_path: Path, kind: str, message: str
-) -> None:
+def test_damage_is_refused_in_one_sentence(written, tmp_path, kind, message):
     root = Path(shutil.copytree(written[kind], tmp_path / kind))
     FORMATS[kind][0][message](root)
     with pytest.raises(DataError, match=message) as caught:
@@ -331,7 +329,7 @@ BAD_WHEN_DECODED: dict[str, Damage] = {
 
 
 @pytest.mark.parametrize("message", BAD_WHEN_DECODED)
-def test_a_damaged_image_is_refused_when_it_is_read(tmp_path: Path, message: str) -> None:
+def test_a_damaged_image_is_refused_when_it_is_read(tmp_path, message):
     names = {"label_names": ["background", "upper", "lower"]}
     layout = read_capture(write_tiny_capture(tmp_path, suffix="jpg", labels=True, meta=names))
     dataset = CaptureDataset(layout, items(layout))
@@ -349,7 +347,7 @@ def zju(root: Path, smpl: Path | None, **settings: Any) -> Layout:
     return ZjuReader(**settings)(root, Thresholds(), None if smpl is None else str(smpl))
 
 
-def test_model_files_that_do_not_fit(written: dict[str, Path], tmp_path: Path) -> None:
+def test_model_files_that_do_not_fit(written, tmp_path):
     with pytest.raises(DataError, match=r"SMPL parameters but no joints.*data.smpl=/path"):
         zju(written["zju"], None)
     with pytest.raises(ConfigError, match=r"data.smpl=.*none.pkl does not exist"):
@@ -369,14 +367,12 @@ def test_model_files_that_do_not_fit(written: dict[str, Path], tmp_path: Path) -
         ({"drop_frames": "0-9"}, "leaves no frame"),
     ],
 )
-def test_settings_that_cannot_be(
-    written: dict[str, Path], settings: dict[str, Any], message: str
-) -> None:
+def test_settings_that_cannot_be(written, settings, message):
     with pytest.raises(ConfigError, match=message):
         zju(written["zju"], SMPL["smpl"], **settings)
 
 
-def test_wrong_folders_and_frame_numbers(tmp_path: Path) -> None:
+def test_wrong_folders_and_frame_numbers(tmp_path):
     with pytest.raises(DataError, match=r"nowhere does not exist; expected the folder"):
         read_capture(tmp_path / "nowhere")
     (tmp_path / "file").touch()

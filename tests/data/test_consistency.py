@@ -24,7 +24,7 @@ from gsgan.utils.errors import DataError
 
 
 @pytest.fixture
-def root(tmp_path: Path) -> Path:
+def root(tmp_path):
     return write_tiny_capture(tmp_path / "c", cameras=4, frames=3, size=(64, 96))
 
 
@@ -45,7 +45,7 @@ def in_mm(rig: dict) -> None:
     rig["cam02"]["t"] = [1000 * x for x in rig["cam02"]["t"]]
 
 
-def test_a_good_capture_needs_no_note(root: Path) -> None:
+def test_a_good_capture_needs_no_note(root):
     assert read(root).notes == ()
 
 
@@ -56,9 +56,7 @@ def test_a_good_capture_needs_no_note(root: Path) -> None:
         (in_mm, r"camera cam02 stands 3\.13e\+03 m from the person, the median camera 3 m"),
     ],
 )
-def test_a_camera_that_is_wholly_wrong_is_refused(
-    root: Path, change: Callable[[dict], None], message: str
-) -> None:
+def test_a_camera_that_is_wholly_wrong_is_refused(root, change, message):
     edit_json(root / "cameras.json", change)
     with pytest.raises(DataError, match=message) as caught:
         read(root)
@@ -67,7 +65,7 @@ def test_a_camera_that_is_wholly_wrong_is_refused(
     assert read(root, Consistency(frames=0)).notes == ()  # nothing is compared
 
 
-def test_the_share_of_joints_inside_a_mask() -> None:
+def test_the_share_of_joints_inside_a_mask():
     K = np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
     camera = CameraEntry("c", K, np.eye(3), np.zeros(3), np.zeros(8), (100, 100))
     mask = np.zeros((100, 100), np.uint8)
@@ -80,7 +78,7 @@ def test_the_share_of_joints_inside_a_mask() -> None:
     assert np.isnan(inside_share(mask, camera, joints[3:], 0.05))
 
 
-def test_the_config_passes_its_settings(root: Path, compose) -> None:
+def test_the_config_passes_its_settings(root, compose):
     from hydra.utils import instantiate
 
     edit_json(root / "cameras.json", scale_K(0.5))
@@ -112,7 +110,7 @@ def test_unseen_joints_are_not_judged_and_an_empty_mask_is_infinitely_far():
     assert np.isnan(metres[1])
 
 
-def test_far_cameras_are_those_beyond_the_factor() -> None:
+def test_far_cameras_are_those_beyond_the_factor():
     metres = {"a": 3.0, "b": 3.2, "c": 31.0, "d": 0.2, "e": 2.9}
     found = far_cameras(metres, 10.0)
     assert list(found) == ["c", "d"]

@@ -26,7 +26,7 @@ def conf(name: str, *overrides: str) -> Any:
 
 
 @pytest.mark.parametrize("name", ["capture", "zju_mocap", "thuman4", "avatarrex", "easymocap"])
-def test_a_dataset_without_root_says_so(name: str) -> None:
+def test_a_dataset_without_root_says_so(name):
     with pytest.raises(InstantiationException) as caught:
         instantiate(conf(name))
     cause = caught.value.__cause__
@@ -34,7 +34,7 @@ def test_a_dataset_without_root_says_so(name: str) -> None:
     assert str(cause).startswith("data.root is not set: give the folder of a")
 
 
-def test_capture_config_builds_and_reads(capture: Path) -> None:
+def test_capture_config_builds_and_reads(capture):
     data = instantiate(conf("capture", f"root={capture}", "size=20", "train_frames=0-3"))
     assert len(data.dataset("train")) == 12
     assert data.dataset("train")[0].image.shape == (1, 3, 20, 20)
@@ -45,7 +45,7 @@ def test_capture_config_builds_and_reads(capture: Path) -> None:
     assert instantiate(conf("capture", f"root={capture}", "crop=person")).crop is not None
 
 
-def test_synthetic_config_reads_what_the_generator_would_make(capture: Path) -> None:
+def test_synthetic_config_reads_what_the_generator_would_make(capture):
     """The generator is not run here: its parameters are checked, its folder replaced."""
     from gsgan.synthetic.scene_setup import SceneSettings
 
@@ -59,7 +59,7 @@ def test_synthetic_config_reads_what_the_generator_would_make(capture: Path) -> 
 
 
 @pytest.mark.parametrize("name", ["capture", "synthetic"])
-def test_other_groups_set_size_seed_and_length_of_an_epoch(name: str) -> None:
+def test_other_groups_set_size_seed_and_length_of_an_epoch(name):
     alone = conf(name)
     assert (alone.seed, alone.steps_per_epoch) == (0, None)
     among = conf(name, "+seed=7", "+training={schedule: {epoch: 250}}")
@@ -72,7 +72,7 @@ def test_other_groups_set_size_seed_and_length_of_an_epoch(name: str) -> None:
         assert with_group.source.size == 32
 
 
-def test_a_wrong_root_says_so(tmp_path: Path) -> None:
+def test_a_wrong_root_says_so(tmp_path):
     data = instantiate(conf("capture", f"root={tmp_path / 'no'}"))
     with pytest.raises(DataError, match=r"data.root=.*no does not exist"):
         data.setup()

@@ -42,7 +42,7 @@ def draws(sampler: StepSampler, epochs: Iterator[int] | range) -> list[int]:
     return order
 
 
-def test_every_pass_takes_each_item_once_across_epochs() -> None:
+def test_every_pass_takes_each_item_once_across_epochs():
     order = draws(StepSampler(items=7, batch_size=2, steps=5, seed=3), range(7))
     assert len(order) == 70
     passes = [order[i : i + 7] for i in range(0, 70, 7)]
@@ -50,7 +50,7 @@ def test_every_pass_takes_each_item_once_across_epochs() -> None:
     assert len({tuple(p) for p in passes}) > 5
 
 
-def test_a_resumed_run_sees_the_order_of_an_unbroken_one() -> None:
+def test_a_resumed_run_sees_the_order_of_an_unbroken_one():
     whole = draws(StepSampler(7, 2, 5, seed=3), range(6))
     assert draws(StepSampler(7, 2, 5, seed=3), range(4, 6)) == whole[40:]
     assert draws(StepSampler(7, 2, 5, seed=4), range(6)) != whole
@@ -58,7 +58,7 @@ def test_a_resumed_run_sees_the_order_of_an_unbroken_one() -> None:
     assert not torch.equal(pass_order(9, 0, 5), pass_order(9, 1, 4))
 
 
-def test_processes_share_the_draws_of_a_step() -> None:
+def test_processes_share_the_draws_of_a_step():
     alone = draws(StepSampler(11, 4, 6, seed=0), range(2))
     pair = [draws(StepSampler(11, 2, 6, seed=0, replicas=2, rank=r), range(2)) for r in (0, 1)]
     joined = [pair[r][2 * s + i] for s in range(12) for r in (0, 1) for i in (0, 1)]
@@ -104,7 +104,7 @@ def fit(capture: Path, folder: Path, epochs: int, ckpt: Path | None = None) -> R
     return model
 
 
-def test_lightning_trains_validates_and_resumes_in_order(capture: Path, tmp_path: Path) -> None:
+def test_lightning_trains_validates_and_resumes_in_order(capture, tmp_path):
     whole = fit(capture, tmp_path / "whole", 4)
     assert len(whole.seen) == 4 * 3 * 2
     assert len(whole.validated) == 4 * 2  # 4 held-out pictures in twos, every epoch
@@ -117,7 +117,7 @@ def test_lightning_trains_validates_and_resumes_in_order(capture: Path, tmp_path
 # --- the module ---------------------------------------------------------------------------------
 
 
-def test_loaders_and_datasets(capture: Path) -> None:
+def test_loaders_and_datasets(capture):
     data = GsganData(str(capture), size=16, batch_size=2, test_cameras=["cam02"], crop="person")
     batch = next(iter(data.train_dataloader()))
     assert isinstance(batch, Frame)
@@ -132,7 +132,7 @@ def test_loaders_and_datasets(capture: Path) -> None:
         data.dataset("test")
 
 
-def test_batches_travel_as_bytes_and_become_the_datasets_numbers(tmp_path: Path) -> None:
+def test_batches_travel_as_bytes_and_become_the_datasets_numbers(tmp_path):
     root = write_tiny_capture(tmp_path / "labelled", labels=True)
     data = GsganData(str(root), size=16, batch_size=2, test_share=0)
     dataset, batch = data.dataset("train"), next(iter(data.train_dataloader()))
@@ -148,9 +148,7 @@ def test_batches_travel_as_bytes_and_become_the_datasets_numbers(tmp_path: Path)
             assert torch.equal(getattr(on_device, name)[i : i + 1], getattr(one, name))
 
 
-def test_on_a_gpu_batches_are_pinned_and_copied_while_the_host_goes_on(
-    capture: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_on_a_gpu_batches_are_pinned_and_copied_while_the_host_goes_on(capture, monkeypatch):
     data = GsganData(str(capture), size=16)
     assert not data.train_dataloader().pin_memory
     data.trainer = SimpleNamespace(
@@ -172,7 +170,7 @@ def test_on_a_gpu_batches_are_pinned_and_copied_while_the_host_goes_on(
     assert moved[: len(pinned)] == [{"non_blocking": True}] * len(pinned)
 
 
-def test_empty_split_has_no_loader_but_a_reason(capture: Path) -> None:
+def test_empty_split_has_no_loader_but_a_reason(capture):
     data = GsganData(str(capture), test_share=0)
     assert data.test_dataloader() == []
     assert set(data.reasons) == {"novel_view", "novel_pose"}
@@ -183,7 +181,7 @@ def watched(**keys: Any) -> list[tuple[int, int]]:
     return [(int(f.camera_index), int(f.frame_id)) for f in frames]
 
 
-def test_pictures_watched_while_training_are_spread_over_held_out_poses(capture: Path) -> None:
+def test_pictures_watched_while_training_are_spread_over_held_out_poses(capture):
     keys = {"root": str(capture), "test_frames": "5-9"}
     assert watched(**keys, val_images=99) == [(c, f) for c in range(3) for f in range(5, 10)]
     assert watched(**keys, val_images=3) == [(0, 7), (1, 7), (2, 7)]
@@ -193,7 +191,7 @@ def test_pictures_watched_while_training_are_spread_over_held_out_poses(capture:
     assert len(watched(**none)) == 2
 
 
-def test_the_source_is_called_when_data_is_needed_only(capture: Path) -> None:
+def test_the_source_is_called_when_data_is_needed_only(capture):
     calls = []
 
     def make(root: Path) -> Path:
@@ -207,7 +205,7 @@ def test_the_source_is_called_when_data_is_needed_only(capture: Path) -> None:
     assert data.layout.root == capture
 
 
-def test_notes_reach_the_log(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_notes_reach_the_log(tmp_path, caplog):
     root = write_tiny_capture(tmp_path, frames=4, unit="mm")
     with caplog.at_level(logging.WARNING, logger="gsgan"):
         GsganData(str(root), test_frames=[3, 77]).setup()
@@ -215,7 +213,7 @@ def test_notes_reach_the_log(tmp_path: Path, caplog: pytest.LogCaptureFixture) -
     assert "1 frames of the splits are not usable or do not exist: 77" in caplog.text
 
 
-def test_scene_info(capture: Path) -> None:
+def test_scene_info(capture):
     info = GsganData(str(capture), size=24, test_cameras=["cam02"]).info
     assert info.camera_names == ("cam00", "cam01", "cam02")
     assert info.n_train_cameras == 2
@@ -233,7 +231,7 @@ def test_scene_info(capture: Path) -> None:
     json.dumps(asdict(info))  # plain values, so that a checkpoint can hold it
 
 
-def test_scene_info_sees_the_lens_of_training_cameras_only(tmp_path: Path) -> None:
+def test_scene_info_sees_the_lens_of_training_cameras_only(tmp_path):
     root = write_tiny_capture(tmp_path, meta={"body": "free"})
     rig = json.loads((root / "cameras.json").read_text())
     rig["cam01"]["dist"] = [0.1, 0, 0, 0]
@@ -247,7 +245,7 @@ def test_scene_info_sees_the_lens_of_training_cameras_only(tmp_path: Path) -> No
     assert info.body == "free"
 
 
-def test_a_capture_may_be_posed_by_the_users_own_smpl_file(tmp_path: Path) -> None:
+def test_a_capture_may_be_posed_by_the_users_own_smpl_file(tmp_path):
     root = write_tiny_capture(tmp_path, frames=4, meta={"body": "smpl"})
     poses = {"theta": np.zeros((4, 24, 3)), "transl": np.zeros((4, 3)), "frame_id": np.arange(4)}
     np.savez(root / "body_pose.npz", **poses, betas=np.array([0.5, -1.0]))
@@ -259,7 +257,7 @@ def test_a_capture_may_be_posed_by_the_users_own_smpl_file(tmp_path: Path) -> No
         GsganData(str(root)).setup()
 
 
-def test_labels_are_counted_without_the_ignore_value(tmp_path: Path) -> None:
+def test_labels_are_counted_without_the_ignore_value(tmp_path):
     root = write_tiny_capture(tmp_path, cameras=1, frames=2, labels=True)
     cv2.imwrite(str(root / "labels/cam00/000001.png"), np.full((24, 32), 255, np.uint8))
     layout = read_capture(root)
@@ -281,12 +279,12 @@ def test_labels_are_counted_without_the_ignore_value(tmp_path: Path) -> None:
         ({"root": None}, "data.root is not set: give the folder of a capture"),
     ],
 )
-def test_config_values_out_of_range(capture: Path, keys: dict[str, Any], message: str) -> None:
+def test_config_values_out_of_range(capture, keys, message):
     with pytest.raises(ConfigError, match=message):
         GsganData(**({"root": str(capture)} | keys))
 
 
-def test_batches_need_one_size(capture: Path) -> None:
+def test_batches_need_one_size(capture):
     GsganData(str(capture), batch_size=2).setup()
     with pytest.raises(ConfigError, match=r"data.size is not set and images differ in size"):
         GsganData(str(capture), batch_size=2, crop="person").setup()
@@ -295,7 +293,7 @@ def test_batches_need_one_size(capture: Path) -> None:
 # --- the real capture ---------------------------------------------------------------------------
 
 
-def test_real_capture_splits_and_scene(real_capture: Path) -> None:
+def test_real_capture_splits_and_scene(real_capture):
     data = GsganData(str(real_capture), size=128, crop="person", info_samples=4)
     assert len(data.dataset("train")) == 4 * 56
     assert data.splits.test_frames == tuple(range(56, 70))
@@ -306,7 +304,7 @@ def test_real_capture_splits_and_scene(real_capture: Path) -> None:
     assert data.info.surface.difference > 0.03  # white balance differs between the cameras
 
 
-def test_a_picture_damaged_under_a_worker_process_is_one_sentence(tmp_path: Path) -> None:
+def test_a_picture_damaged_under_a_worker_process_is_one_sentence(tmp_path):
     root = write_tiny_capture(tmp_path, frames=4)
     data = GsganData(str(root), workers=1)
     data.setup()

@@ -44,13 +44,13 @@ def read(root: Path, smpl: Path | None = None, **settings: Any) -> Layout:
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory: pytest.TempPathFactory, subject: Subject) -> Path:
+def written(tmp_path_factory, subject):
     """Keypoints and fits; do not write into it."""
     return write_easymocap(tmp_path_factory.mktemp("easymocap") / "take", subject)
 
 
 @pytest.fixture
-def root(written: Path, tmp_path: Path) -> Path:
+def root(written, tmp_path):
     """The same to damage."""
     return Path(shutil.copytree(written, tmp_path / "take"))
 
@@ -83,7 +83,7 @@ def check_cameras(layout: Layout, subject: Subject) -> None:
         assert entry.size == camera.size[::-1]
 
 
-def test_cameras_are_paired_by_name(written: Path, subject: Subject) -> None:
+def test_cameras_are_paired_by_name(written, subject):
     """extri.yml lists them the other way round, and a "none" stands in both."""
     layout = read(written)
     check_cameras(layout, subject)
@@ -92,14 +92,12 @@ def test_cameras_are_paired_by_name(written: Path, subject: Subject) -> None:
 
 
 @pytest.mark.parametrize("options", [{"sizes": False}, {"lens": "D"}, {"both": False}])
-def test_other_ways_to_write_the_calibration(
-    root: Path, subject: Subject, options: dict[str, Any]
-) -> None:
+def test_other_ways_to_write_the_calibration(root, subject, options):
     write_calibration(root, subject, **options)
     check_cameras(read(root), subject)
 
 
-def test_keypoints_are_the_landmarks_that_body_25_knows(written: Path, subject: Subject) -> None:
+def test_keypoints_are_the_landmarks_that_body_25_knows(written, subject):
     layout = read(written)
     for i, frame in enumerate(subject.frames):
         joints = body_25(subject, i)
@@ -117,7 +115,7 @@ def test_keypoints_are_the_landmarks_that_body_25_knows(written: Path, subject: 
     assert layout.poses is None
 
 
-def test_hands_give_the_fingers(tmp_path: Path, subject: Subject) -> None:
+def test_hands_give_the_fingers(tmp_path, subject):
     root = write_easymocap(tmp_path / "take", subject, hands=True, output="output/")
     landmarks = read(root).landmarks
     hands = hand_joints(subject, 2)[:, :3].reshape(2, 21, 3)
@@ -127,9 +125,8 @@ def test_hands_give_the_fingers(tmp_path: Path, subject: Subject) -> None:
             assert landmarks.visibility[2][landmark + side] == 0.8
 
 
-def test_fits_give_skeletons_and_poses(written: Path, subject: Subject, smpl_file: Path) -> None:
+def test_fits_give_skeletons_and_poses(written, subject, smpl_file):
     layout = read(written, smpl_file)  # auto: fits, since the model is there
-    assert layout.poses is not None
     for i, frame in enumerate(subject.frames):
         p, conf = to_mediapipe33(subject.joints[i], subject.vertices[i])
         assert np.allclose(layout.landmarks.p[frame][conf > 0], p[conf > 0], atol=1e-5)
@@ -141,11 +138,10 @@ def test_fits_give_skeletons_and_poses(written: Path, subject: Subject, smpl_fil
     motion = SmplMotion(np.array(subject.frames), theta, transl, betas)
     assert np.allclose(posed(subject.model, motion)[0], subject.vertices, atol=1e-6)
     assert layout.meta.skeleton_source == "smpl24 -> mediapipe33"
-    assert layout.meta.body is not None
     assert (layout.meta.body.kind, layout.meta.body.file) == ("smpl", str(smpl_file))
 
 
-def test_which_skeleton_is_taken(root: Path, smpl_file: Path) -> None:
+def test_which_skeleton_is_taken(root, smpl_file):
     def source(smpl: Path | None = None) -> str:
         return read(root, smpl).meta.skeleton_source
 
@@ -157,7 +153,7 @@ def test_which_skeleton_is_taken(root: Path, smpl_file: Path) -> None:
     refused(root, "has no skeletons; expected keypoints3d/ or smpl/")
 
 
-def test_pictures_and_masks_are_those_that_were_written(written: Path, subject: Subject) -> None:
+def test_pictures_and_masks_are_those_that_were_written(written, subject):
     layout = read(written)
     for i, frame in enumerate(subject.frames):
         for c, name in enumerate(NAMES):
@@ -167,7 +163,7 @@ def test_pictures_and_masks_are_those_that_were_written(written: Path, subject: 
             assert np.abs(image - subject.images[i][c]).mean() < 12
 
 
-def test_the_config_reads_it_in_worker_processes(written: Path, smpl_file: Path, compose) -> None:
+def test_the_config_reads_it_in_worker_processes(written, smpl_file, compose):
     from hydra.utils import instantiate
 
     config = compose(
@@ -180,7 +176,7 @@ def test_the_config_reads_it_in_worker_processes(written: Path, smpl_file: Path,
     assert data.splits.test_cameras == ("10",)
 
 
-def test_omissions_are_noted(root: Path, subject: Subject) -> None:
+def test_omissions_are_noted(root, subject):
     shutil.rmtree(root / "images/2")
     edit_people(root, lambda people: people[0].update(id=5), frame=1)
     (root / "keypoints3d/000002.json").unlink()
@@ -204,7 +200,7 @@ def test_omissions_are_noted(root: Path, subject: Subject) -> None:
     refused(root, "has no person 7 in the 3 of its 3 files", "(found: 0, 1, 5)", person=7)
 
 
-def test_joints_without_confidence_are_unknown(root: Path) -> None:
+def test_joints_without_confidence_are_unknown(root):
     """EasyMocap writes zeros with confidence 0, or below, where it saw nothing."""
 
     def change(people: list[Any]) -> None:
@@ -226,7 +222,7 @@ def test_joints_without_confidence_are_unknown(root: Path) -> None:
 # --- masks --------------------------------------------------------------------------------------
 
 
-def test_a_persons_own_mask_goes_before_nobodys(tmp_path: Path, subject: Subject) -> None:
+def test_a_persons_own_mask_goes_before_nobodys(tmp_path, subject):
     root = write_easymocap(tmp_path / "take", subject, person=3, pid=True)
     write_picture(root / "mask/1/000000.png", np.full((40, 40), 255, np.uint8))
     write_picture(root / "mask/1/000000_0.png", np.full((40, 40), 255, np.uint8))

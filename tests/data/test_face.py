@@ -17,7 +17,7 @@ FACE = slice(75, 105)
 
 
 @pytest.fixture
-def root(tmp_path: Path) -> Path:
+def root(tmp_path):
     root = write_tiny_capture(tmp_path / "capture")
     write_hands(root, 4)
     return root
@@ -28,7 +28,7 @@ def every_frame(root: Path):
     return data, [data.dataset("train")[i] for i in (0, 2)]
 
 
-def test_skeletons_have_105_joints(root: Path) -> None:
+def test_skeletons_have_105_joints(root):
     p = write_face(root, 4)
     data, frames = every_frame(root)
     for frame in frames:
@@ -42,7 +42,7 @@ def test_skeletons_have_105_joints(root: Path) -> None:
     assert hands.info.face is None
 
 
-def test_the_face_at_rest_is_the_median_of_the_training_frames(root: Path) -> None:
+def test_the_face_at_rest_is_the_median_of_the_training_frames(root):
     p = write_face(root, 4)
     p[3] += 1  # the held-out frame
     p[1, 5] = np.nan
@@ -56,7 +56,7 @@ def test_the_face_at_rest_is_the_median_of_the_training_frames(root: Path) -> No
     )
 
 
-def test_lengths_are_in_the_captures_unit(tmp_path: Path) -> None:
+def test_lengths_are_in_the_captures_unit(tmp_path):
     root = write_tiny_capture(tmp_path, unit="mm")
     write_hands(root, 4, per_metre=1000)
     p = write_face(root, 4, per_metre=1000)
@@ -65,7 +65,7 @@ def test_lengths_are_in_the_captures_unit(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kept", [slice(0, 0), slice(2, 4), slice(0, 4)])
-def test_a_frame_without_a_face_has_one_at_rest_on_the_head(root: Path, kept: slice) -> None:
+def test_a_frame_without_a_face_has_one_at_rest_on_the_head(root, kept):
     """Without a row, and with NaN or confidence 0 in it."""
     p = write_face(root, 4)
     p[0, :12], conf = np.nan, np.ones((4, 30))
@@ -78,7 +78,7 @@ def test_a_frame_without_a_face_has_one_at_rest_on_the_head(root: Path, kept: sl
     assert away.max() < 0.15
 
 
-def test_captures_without_a_face_are_refused_by_name(root: Path) -> None:
+def test_captures_without_a_face_are_refused_by_name(root):
     with pytest.raises(ConfigError, match=r"needs a capture's face3d.npz, .*mediapipe33_hands"):
         assert GsganData(str(root), **WHOLE).layout
     write_face(root, 4)
@@ -95,7 +95,7 @@ def test_captures_without_a_face_are_refused_by_name(root: Path) -> None:
         ({"names": np.array(["lip"] * 30)}, r"'names' must be those .*from mouth_outer_0 to"),
     ],
 )
-def test_damaged_files_are_named(root: Path, damage: dict, message: str) -> None:
+def test_damaged_files_are_named(root, damage, message):
     write_face(root, 4, **damage)
     with pytest.raises(DataError, match=rf"face3d.npz: .*{message}"):
         read_capture(root)

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 from formats_list import PARAMETERS, Format
-from writers.common import Subject
 
 from gsgan.data.dataset import CaptureDataset
 from gsgan.utils.errors import GsganError
@@ -121,9 +120,7 @@ def read_all(kind: Format, root: Path, smpl: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", PARAMETERS)
-def test_damage_ends_in_a_good_read_or_in_one_sentence(
-    kind: Format, subject: Subject, smpl_file: Path, tmp_path: Path
-) -> None:
+def test_damage_ends_in_a_good_read_or_in_one_sentence(kind, subject, smpl_file, tmp_path):
     kind.write(tmp_path / "whole", subject)
     read_all(kind, tmp_path / "whole", smpl_file)
     rng = np.random.default_rng([SEED, *kind.name.encode()])

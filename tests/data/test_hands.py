@@ -16,7 +16,7 @@ HANDS = {"size": 32, "skeleton": "mediapipe33_hands", "body": "none"}
 
 
 @pytest.fixture
-def root(tmp_path: Path) -> Path:
+def root(tmp_path):
     return write_tiny_capture(tmp_path / "capture")
 
 
@@ -25,7 +25,7 @@ def every_frame(root: Path, **settings):
     return data, [data.dataset(split)[i] for split, i in (("train", 0), ("train", 2))]
 
 
-def test_skeletons_have_75_joints(root: Path) -> None:
+def test_skeletons_have_75_joints(root):
     p = write_hands(root, 4)
     data, (frame, later) = every_frame(root)
     for one in (frame, later):
@@ -39,7 +39,7 @@ def test_skeletons_have_75_joints(root: Path) -> None:
     assert data.info.body_height == plain.info.body_height
 
 
-def test_a_missing_hand_is_not_seen_and_hangs_on_the_forearm(root: Path) -> None:
+def test_a_missing_hand_is_not_seen_and_hangs_on_the_forearm(root):
     p = write_hands(root, 4)
     p[:, :21] = np.nan
     conf = np.ones((4, 42))
@@ -54,7 +54,7 @@ def test_a_missing_hand_is_not_seen_and_hangs_on_the_forearm(root: Path) -> None
         assert away.max() < 0.3
 
 
-def test_frames_without_a_row_have_no_hands(root: Path) -> None:
+def test_frames_without_a_row_have_no_hands(root):
     p = write_hands(root, 4)
     np.savez(root / "hands3d.npz", p=p[2:], frame_id=np.arange(2, 4))
     _, (frame, _) = every_frame(root)
@@ -63,7 +63,7 @@ def test_frames_without_a_row_have_no_hands(root: Path) -> None:
     assert frame.visibility[0, :33].all()
 
 
-def test_a_capture_without_hands_is_refused_by_name(root: Path) -> None:
+def test_a_capture_without_hands_is_refused_by_name(root):
     with pytest.raises(ConfigError, match=r"needs a capture's hands3d.npz, which .*capture lacks"):
         assert GsganData(str(root), **HANDS).layout
     with pytest.raises(ConfigError, match=r"data\.skeleton must be one of"):
@@ -78,13 +78,13 @@ def test_a_capture_without_hands_is_refused_by_name(root: Path) -> None:
         ({"frame_id": np.zeros(4)}, "frame_id 0 appears more than once"),
     ],
 )
-def test_damaged_files_are_named(root: Path, damage: dict, message: str) -> None:
+def test_damaged_files_are_named(root, damage, message):
     write_hands(root, 4, **damage)
     with pytest.raises(DataError, match=rf"hands3d.npz: .*{message}"):
         read_capture(root)
 
 
-def test_fitted_poses_have_their_fingers_with_hands_alone(root: Path) -> None:
+def test_fitted_poses_have_their_fingers_with_hands_alone(root):
     write_hands(root, 4)
     shape = {"coefficients": np.zeros(10), "stretch": np.ones(8), "offsets": np.zeros((33, 3))}
     np.savez(root / "body_shape.npz", **shape)

@@ -31,7 +31,7 @@ def resident() -> int:
 
 
 @pytest.fixture(scope="module")
-def layout(tmp_path_factory: pytest.TempPathFactory) -> Layout:
+def layout(tmp_path_factory):
     root = tmp_path_factory.mktemp("memory") / "c"
     return read_capture(
         write_tiny_capture(root, cameras=2, frames=6, size=(256, 256), suffix="jpg")
@@ -45,7 +45,7 @@ def long_dataset(layout: Layout, count: int) -> CaptureDataset:
     return CaptureDataset(layout, repeated, 256, cache=ImageCache(CACHE))
 
 
-def test_memory_does_not_grow_with_the_pictures_read(layout: Layout) -> None:
+def test_memory_does_not_grow_with_the_pictures_read(layout):
     dataset, read = long_dataset(layout, WARM + READ), 0
     for i in range(WARM):
         assert dataset[i] is not None
@@ -69,7 +69,7 @@ def index_bytes(root: Path) -> int:
     return held
 
 
-def test_the_index_takes_a_kilobyte_a_picture(tmp_path: Path) -> None:
+def test_the_index_takes_a_kilobyte_a_picture(tmp_path):
     few = write_tiny_capture(tmp_path / "few", cameras=2, frames=10, size=(16, 16))
     many = write_tiny_capture(tmp_path / "many", cameras=2, frames=110, size=(16, 16))
     index_bytes(few)  # what is imported or made once

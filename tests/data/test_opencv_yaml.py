@@ -15,7 +15,7 @@ HEAD = "%YAML:1.0\n---\n"
 MATRIX = "M: !!opencv-matrix\n   rows: 2\n   cols: 1\n   dt: d\n   data: [ 1., -2.5e-3 ]\n"
 
 
-def test_opencvs_files_are_read_as_opencv_reads_them(tmp_path: Path) -> None:
+def test_opencvs_files_are_read_as_opencv_reads_them(tmp_path):
     path, names, rng = (
         str(tmp_path / "rig.yml"),
         ["01", "cam a", "1e3", "ü"],
@@ -39,7 +39,7 @@ def test_opencvs_files_are_read_as_opencv_reads_them(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("head", ["%YAML:1.0\r\n---\r\n", "%YAML 1.2\n---\n", "\ufeff%YAML:1.0\n"])
-def test_heads(tmp_path: Path, head: str) -> None:
+def test_heads(tmp_path, head):
     (tmp_path / "a.yml").write_bytes((head + "names:\n- 002\n" + MATRIX + "...\n").encode())
     found = read_opencv_yaml(tmp_path / "a.yml")
     assert found["names"] == ["002"]  # unquoted numbers stay the names they are
@@ -62,7 +62,7 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("text", DAMAGE.values(), ids=DAMAGE.keys())
-def test_damage_is_one_sentence(tmp_path: Path, text: str) -> None:
+def test_damage_is_one_sentence(tmp_path, text):
     path = tmp_path / "a.yml"
     path.write_text(text)
     with pytest.raises(DataError, match="is not readable as OpenCV YAML") as failure:

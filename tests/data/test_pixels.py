@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -23,7 +21,7 @@ RULES = PixelRules()
 
 
 @pytest.fixture
-def grey(tmp_path: Path) -> Path:
+def grey(tmp_path):
     path = tmp_path / "grey.png"
     cv2.imwrite(str(path), VALUES)
     return path
@@ -37,13 +35,11 @@ def grey(tmp_path: Path) -> Path:
         ("threshold", [[0, 0, 0], [255, 255, 255]]),
     ],
 )
-def test_mask_rules(grey: Path, rule: str, expected: object) -> None:
+def test_mask_rules(grey, rule, expected):
     assert np.array_equal(read_mask([(rule, grey)], RULES), expected)
 
 
-def test_masks_are_joined_by_their_maximum_and_must_agree_in_size(
-    grey: Path, tmp_path: Path
-) -> None:
+def test_masks_are_joined_by_their_maximum_and_must_agree_in_size(grey, tmp_path):
     other = tmp_path / "other.png"
     cv2.imwrite(str(other), VALUES[:, ::-1])
     mask = read_mask([("threshold", grey), ("threshold", other)], RULES)
@@ -57,7 +53,7 @@ def test_masks_are_joined_by_their_maximum_and_must_agree_in_size(
         read_mask([("grey", grey), ("grey", other)], RULES)
 
 
-def test_a_mask_of_0_and_1_is_no_alpha(tmp_path: Path) -> None:
+def test_a_mask_of_0_and_1_is_no_alpha(tmp_path):
     path = tmp_path / "ones.png"
     cv2.imwrite(str(path), np.eye(3, dtype=np.uint8))
     with pytest.raises(DataError, match="holds 0 and 1; expected alpha from 0 to 255"):
@@ -65,7 +61,7 @@ def test_a_mask_of_0_and_1_is_no_alpha(tmp_path: Path) -> None:
     assert np.array_equal(read_mask([("nonzero", path)], RULES), 255 * np.eye(3))
 
 
-def test_any_channel_counts_but_not_transparency(tmp_path: Path) -> None:
+def test_any_channel_counts_but_not_transparency(tmp_path):
     path = tmp_path / "colour.png"
     picture = np.zeros((1, 3, 4), np.uint8)
     picture[0, 1, 2], picture[..., 3] = 9, 255
@@ -73,7 +69,7 @@ def test_any_channel_counts_but_not_transparency(tmp_path: Path) -> None:
     assert np.array_equal(read_mask([("nonzero", path)], RULES), [[0, 255, 0]])
 
 
-def test_the_ringing_of_a_jpeg_is_no_person(tmp_path: Path) -> None:
+def test_the_ringing_of_a_jpeg_is_no_person(tmp_path):
     mask = np.zeros((40, 40), np.uint8)
     mask[10:27, 11:30] = 255
     cv2.imwrite(str(tmp_path / "m.JPG"), mask)
@@ -86,7 +82,7 @@ def test_the_ringing_of_a_jpeg_is_no_person(tmp_path: Path) -> None:
     assert mask_file("m.png").rule == "nonzero"
 
 
-def test_labels_go_through_their_table(grey: Path) -> None:
+def test_labels_go_through_their_table(grey):
     table = [255] * 256
     table[0], table[1], table[200] = 0, 2, 1
     labels = read_labels(grey, PixelRules(label_table=tuple(table)), ["none", "a", "b"])
@@ -95,7 +91,7 @@ def test_labels_go_through_their_table(grey: Path) -> None:
         read_labels(grey, RULES, ["none", "a"])
 
 
-def test_the_band_lies_on_both_sides_of_the_outline() -> None:
+def test_the_band_lies_on_both_sides_of_the_outline():
     mask = np.zeros((11, 11), np.uint8)
     mask[3:8, 3:8] = 255
     labels = (mask > 0).astype(np.uint8)

@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
 import pytest
 import ten_frames
 from make import write_tiny_capture
 from omegaconf import OmegaConf
 
 from gsgan.data.formats.capture import read_capture
-from gsgan.data.layout import Layout
 from gsgan.data.splits import make_splits, parse_frames, parse_names
-from gsgan.utils.errors import ConfigError, DataError, GsganError
+from gsgan.utils.errors import ConfigError, DataError
 
 capture = ten_frames.capture
 
 
 @pytest.fixture(scope="module")
-def layout(capture: Path) -> Layout:
+def layout(capture):
     return read_capture(capture)
 
 
-def test_default_splits_hold_out_the_last_frames(layout: Layout) -> None:
+def test_default_splits_hold_out_the_last_frames(layout):
     splits = make_splits(layout)
     assert splits.train_cameras == ("cam00", "cam01", "cam02")
     assert splits.train_frames == tuple(range(8))
@@ -35,7 +31,7 @@ def test_default_splits_hold_out_the_last_frames(layout: Layout) -> None:
     assert make_splits(layout, test_share=0).reasons["novel_pose"].startswith("no frame")
 
 
-def test_splits_of_the_config_with_ranges_and_the_rest(layout: Layout) -> None:
+def test_splits_of_the_config_with_ranges_and_the_rest(layout):
     splits = make_splits(layout, test_cameras=["cam01"], train_frames=["0-2", 5])
     assert splits.train_cameras == ("cam00", "cam02")
     assert splits.test_frames == (3, 4, 6, 7, 8, 9)
@@ -46,7 +42,7 @@ def test_splits_of_the_config_with_ranges_and_the_rest(layout: Layout) -> None:
     assert make_splits(layout, test_frames="4-5").train_frames == (0, 1, 2, 3, 6, 7, 8, 9)
 
 
-def test_splits_of_meta_json_give_way_to_the_config(tmp_path: Path) -> None:
+def test_splits_of_meta_json_give_way_to_the_config(tmp_path):
     held = {"test_cameras": ["cam01"], "train_frames": [0, 1], "test_frames": [2, 3]}
     layout = read_capture(write_tiny_capture(tmp_path, splits=held))
     splits = make_splits(layout)
@@ -57,7 +53,7 @@ def test_splits_of_meta_json_give_way_to_the_config(tmp_path: Path) -> None:
     assert (mine.train_frames, mine.test_frames) == ((1, 2, 3), (0,))
 
 
-def test_frames_that_are_not_there_are_noted(layout: Layout) -> None:
+def test_frames_that_are_not_there_are_noted(layout):
     splits = make_splits(layout, train_frames="5-20", test_frames=[0, 99])
     assert (splits.train_frames, splits.test_frames) == ((5, 6, 7, 8, 9), (0,))
     assert splits.notes == ("12 frames of the splits are not usable or do not exist: 10-20, 99",)
@@ -83,14 +79,12 @@ def test_frames_that_are_not_there_are_noted(layout: Layout) -> None:
         ({"test_share": 1.0}, ConfigError, r"data.test_share must be in \[0, 1\)"),
     ],
 )
-def test_splits_that_cannot_be(
-    layout: Layout, keys: dict[str, Any], error: type[GsganError], message: str
-) -> None:
+def test_splits_that_cannot_be(layout, keys, error, message):
     with pytest.raises(error, match=message):
         make_splits(layout, **keys)
 
 
-def test_frames_and_names_are_parsed() -> None:
+def test_frames_and_names_are_parsed():
     assert parse_frames("3-5, 1,4", "x") == (1, 3, 4, 5)
     assert parse_frames([2, "7", "0-1"], "x") == (0, 1, 2, 7)
     assert parse_frames(6, "x") == (6,)

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from writers.common import write_picture
 from writers.smpl import posed
-from writers.smplx_rig import SmplxSubject
 from writers.thuman4 import write_thuman4
 
 from gsgan.data.dataset import CaptureDataset
@@ -36,13 +35,13 @@ def read(root: Path, smplx: Path | None, **settings: Any) -> Layout:
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory: pytest.TempPathFactory, smplx_subject: SmplxSubject) -> Path:
+def written(tmp_path_factory, smplx_subject):
     """A subject with nothing missing; do not write into it."""
     return write_thuman4(tmp_path_factory.mktemp("thuman4") / "subject00", smplx_subject)
 
 
 @pytest.fixture
-def root(written: Path, tmp_path: Path) -> Path:
+def root(written, tmp_path):
     """The same to damage."""
     return Path(shutil.copytree(written, tmp_path / "subject00"))
 
@@ -55,9 +54,7 @@ def edit_params(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
     np.savez(root / "smpl_params.npz", **arrays)
 
 
-def test_cameras_are_those_that_were_written(
-    written: Path, smplx_subject: SmplxSubject, smplx_file: Path
-) -> None:
+def test_cameras_are_those_that_were_written(written, smplx_subject, smplx_file):
     layout = read(written, smplx_file)
     assert layout.camera_names == ("cam00", "cam01", "cam02")
     assert layout.frames == (0, 1, 2, 3)
@@ -72,12 +69,9 @@ def test_cameras_are_those_that_were_written(
     ),)  # fmt: skip
 
 
-def test_skeletons_and_poses_are_those_that_were_written(
-    written: Path, smplx_subject: SmplxSubject, smplx_file: Path
-) -> None:
+def test_skeletons_and_poses_are_those_that_were_written(written, smplx_subject, smplx_file):
     layout = read(written, smplx_file)
     s = smplx_subject
-    assert layout.poses is not None
     for i, frame in enumerate(s.frames):
         p, conf = to_mediapipe33(s.joints[i], s.vertices[i], "smplx")
         seen = conf > 0
@@ -89,14 +83,11 @@ def test_skeletons_and_poses_are_those_that_were_written(
         assert np.allclose(posed(s.model, motion)[0][0], s.vertices[i], atol=1e-6)
     meta = layout.meta
     assert (meta.skeleton_source, meta.up_axis, meta.fps) == ("smplx -> mediapipe33", "-z", 30)
-    assert meta.body is not None
     assert (meta.body.kind, meta.body.file) == ("smplx", str(smplx_file))
     assert np.allclose(meta.body.betas, s.params["betas"][0])
 
 
-def test_pictures_and_masks_are_those_that_were_written(
-    written: Path, smplx_subject: SmplxSubject, smplx_file: Path
-) -> None:
+def test_pictures_and_masks_are_those_that_were_written(written, smplx_subject, smplx_file):
     layout = read(written, smplx_file)
     for i, frame in enumerate(smplx_subject.frames):
         for c, name in enumerate(layout.camera_names):
@@ -109,7 +100,7 @@ def test_pictures_and_masks_are_those_that_were_written(
             assert np.abs(image - smplx_subject.images[i][c]).mean() < 12  # chroma of a small JPEG
 
 
-def test_hands_move_their_landmarks(root: Path, smplx_file: Path) -> None:
+def test_hands_move_their_landmarks(root, smplx_file):
     """Without finger poses the thumbs lie elsewhere, all else stays, and it is noted."""
     bent = read(root, smplx_file)
     edit_params(root, lambda arrays: [arrays.pop(f"{s}_hand_pose") for s in ("left", "right")])
@@ -119,23 +110,17 @@ def test_hands_move_their_landmarks(root: Path, smplx_file: Path) -> None:
     moved[bent.landmarks.visibility[3] == 0] = 0  # stand-ins
     assert np.flatnonzero(moved > 2e-3).tolist() == [21, 22]
     assert moved[:21].max() < 1e-12
-    assert flat.poses is not None
     assert (flat.poses.theta[3][25:] == 0).all()
 
 
-def test_only_the_first_row_of_betas_counts(
-    root: Path, smplx_subject: SmplxSubject, smplx_file: Path
-) -> None:
+def test_only_the_first_row_of_betas_counts(root, smplx_subject, smplx_file):
     betas = smplx_subject.params["betas"]
     edit_params(root, lambda arrays: arrays.update(betas=np.concatenate([betas, betas + 3])))
     meta = read(root, smplx_file).meta
-    assert meta.body is not None
     assert np.allclose(meta.body.betas, betas[0])
 
 
-def test_listed_files_are_left_out(
-    tmp_path: Path, smplx_subject: SmplxSubject, smplx_file: Path
-) -> None:
+def test_listed_files_are_left_out(tmp_path, smplx_subject, smplx_file):
     listed = ("images\\cam01\\00000002.jpg", "./cam02/00000003.jpg", "", "cam00/00000099.jpg")
     root = write_thuman4(tmp_path / "s", smplx_subject, listed)
     layout = read(root, smplx_file)
@@ -146,9 +131,7 @@ def test_listed_files_are_left_out(
     assert "2 of them with a file" in layout.notes[0]
 
 
-def test_a_lens_is_not_applied_but_noted(
-    tmp_path: Path, smplx_subject: SmplxSubject, smplx_file: Path
-) -> None:
+def test_a_lens_is_not_applied_but_noted(tmp_path, smplx_subject, smplx_file):
     root = write_thuman4(tmp_path / "s", smplx_subject, distCoeff=[0.1, 0, 0, 0, 0])
     layout = read(root, smplx_file)
     assert not any(camera.distorted for camera in layout.cameras.values())
@@ -156,9 +139,7 @@ def test_a_lens_is_not_applied_but_noted(
     assert read(root, smplx_file, undistort=True).cameras["cam00"].dist[0] == 0.1
 
 
-def test_frames_without_finite_parameters_are_dropped_and_named(
-    root: Path, smplx_file: Path
-) -> None:
+def test_frames_without_finite_parameters_are_dropped_and_named(root, smplx_file):
     def change(arrays: dict[str, Any]) -> None:
         arrays["body_pose"][1, 7] = np.nan
         for key in arrays.keys() - {"betas"}:
@@ -171,7 +152,7 @@ def test_frames_without_finite_parameters_are_dropped_and_named(
     assert any("without a row in smpl_params.npz: 1, 3" in note for note in layout.notes)
 
 
-def test_the_config_reads_it_in_worker_processes(written: Path, smplx_file: Path, compose) -> None:
+def test_the_config_reads_it_in_worker_processes(written, smplx_file, compose):
     from hydra.utils import instantiate
 
     config = compose(
@@ -191,7 +172,7 @@ def test_the_config_reads_it_in_worker_processes(written: Path, smplx_file: Path
 # --- masks --------------------------------------------------------------------------------------
 
 
-def test_an_alpha_of_exactly_the_threshold_is_the_person(root: Path, smplx_file: Path) -> None:
+def test_an_alpha_of_exactly_the_threshold_is_the_person(root, smplx_file):
     path = root / "masks/cam00/00000000.jpg"
     for value, expected in ((127, 0), (128, 255)):
         write_picture(path, np.full((44, 52), value, np.uint8))
@@ -199,7 +180,7 @@ def test_an_alpha_of_exactly_the_threshold_is_the_person(root: Path, smplx_file:
         assert (read_mask(layout.mask_files("cam00", 0), layout.pixels) == expected).all()
 
 
-def test_the_unsure_band_is_an_option(root: Path, smplx_file: Path) -> None:
+def test_the_unsure_band_is_an_option(root, smplx_file):
     """A half plane with a grey strip: the outline's 5 x 5 band, and alphas in between."""
     alpha = np.zeros((44, 52), np.uint8)
     alpha[:, 24:], alpha[:, :8] = 255, 100
@@ -212,13 +193,10 @@ def test_the_unsure_band_is_an_option(root: Path, smplx_file: Path) -> None:
 
     assert unsure() is None
     band, both = unsure(ignore_band=5), unsure(ignore_band=5, ignore_alpha=(5, 250))
-    assert band is not None
-    assert both is not None
     assert np.flatnonzero(band[20]).tolist() == [22, 23, 24, 25]
     assert np.flatnonzero(both[20]).tolist() == [*range(8), 22, 23, 24, 25]
     layout = read(root, smplx_file, consistency=NO_LOOK, ignore_band=5)
     frame = CaptureDataset(layout, [("cam00", 0)], size=26)[0]
-    assert frame.unsure is not None
     assert frame.unsure.shape == (1, 1, 26, 26)
     assert frame.unsure.unique().tolist() == [0, 1]
     assert (
@@ -234,6 +212,6 @@ def test_the_unsure_band_is_an_option(root: Path, smplx_file: Path) -> None:
         ({"ignore_alpha": (250, 5)}, "two rising alphas"),
     ],
 )
-def test_settings_out_of_range(settings: dict[str, Any], message: str) -> None:
+def test_settings_out_of_range(settings, message):
     with pytest.raises(ConfigError, match=message):
         Thuman4Reader(**settings)

@@ -39,13 +39,13 @@ def frame_of(layout: Layout, camera: int, frame: int) -> Frame:
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory: pytest.TempPathFactory, subject: Subject) -> Path:
+def written(tmp_path_factory, subject):
     """The original release; do not write into it."""
     return writers.write_original(tmp_path_factory.mktemp("zju") / "CoreView_377", subject)
 
 
 @pytest.fixture
-def original(written: Path, tmp_path: Path) -> Path:
+def original(written, tmp_path):
     """The same to damage."""
     return Path(shutil.copytree(written, tmp_path / "CoreView_377"))
 
@@ -73,7 +73,6 @@ def check_skeletons(layout: Layout, subject: Subject, vertices: bool = True) -> 
 
 def check_poses(layout: Layout, subject: Subject, blend: bool = True) -> None:
     """theta and transl, in the model's own convention, give the vertices that were written."""
-    assert layout.poses is not None
     theta, transl = (
         np.stack([held[f] for f in subject.frames])
         for held in (layout.poses.theta, layout.poses.transl)
@@ -93,13 +92,10 @@ def check_images(layout: Layout, subject: Subject) -> None:
             assert np.abs(stored - subject.images[i][c]).mean() < 12  # chroma of a small JPEG
             if layout.labels:
                 path = layout.label_path(name, frame)
-                assert path is not None
                 assert np.array_equal(read_labels(path, layout.pixels, CIHP), labels)
 
 
-def test_the_original_release_is_read_as_it_was_written(
-    written: Path, subject: Subject, smpl_file: Path
-) -> None:
+def test_the_original_release_is_read_as_it_was_written(written, subject, smpl_file):
     layout = read(written, smpl_file)
     assert layout.camera_names == ("Camera_B1", "Camera_B2", "Camera_B3")
     assert layout.frames == (0, 1, 2, 3)
@@ -110,21 +106,17 @@ def test_the_original_release_is_read_as_it_was_written(
     assert layout.notes == ("lengths of the cameras converted from mm to metres",)
     meta = layout.meta
     assert (meta.skeleton_source, meta.up_axis) == ("smpl24 -> mediapipe33", "-z")
-    assert meta.body is not None
     assert (meta.body.kind, meta.body.file) == ("smpl", str(smpl_file))
     assert np.allclose(meta.body.betas, subject.shapes)
     assert meta.label_names == CIHP
 
 
-def test_the_outline_of_the_labels_is_ignored_as_wide_as_asked(
-    subject: Subject, smpl_file: Path, tmp_path: Path
-) -> None:
+def test_the_outline_of_the_labels_is_ignored_as_wide_as_asked(subject, smpl_file, tmp_path):
     plain = replace(subject, cameras=[replace(c, dist=np.zeros(5)) for c in subject.cameras])
     root = writers.write_original(tmp_path / "s", plain)
     found = {}
     for band in (0, 3, 5):
         labels = frame_of(read(root, smpl_file, ignore_band=band), 0, 0).labels
-        assert labels is not None
         found[band] = int((labels == 255).sum())
         kept = labels[0].numpy() != 255
         assert np.array_equal(labels[0].numpy()[kept], subject.labels[0][0][kept])
@@ -132,9 +124,7 @@ def test_the_outline_of_the_labels_is_ignored_as_wide_as_asked(
 
 
 @pytest.mark.parametrize("masks", ["mask", "mask_cihp"])
-def test_one_of_the_two_masks_is_enough(
-    subject: Subject, smpl_file: Path, tmp_path: Path, masks: str
-) -> None:
+def test_one_of_the_two_masks_is_enough(subject, smpl_file, tmp_path, masks):
     root = writers.write_original(tmp_path / "s", subject, masks=(masks,))
     layout = read(root, smpl_file)
     assert bool(layout.labels) == (masks == "mask_cihp")
@@ -142,9 +132,7 @@ def test_one_of_the_two_masks_is_enough(
     check_images(layout, subject)
 
 
-def test_masks_are_joined_and_small_labels_are_not_thresholded(
-    original: Path, smpl_file: Path
-) -> None:
+def test_masks_are_joined_and_small_labels_are_not_thresholded(original, smpl_file):
     empty = np.zeros((40, 40), np.uint8)
     one = empty.copy()
     one[3, 4], other = 7, empty.copy()
@@ -156,14 +144,14 @@ def test_masks_are_joined_and_small_labels_are_not_thresholded(
     assert (mask == 255).sum() == 2
 
 
-def test_poses_of_69_are_padded(subject: Subject, smpl_file: Path, tmp_path: Path) -> None:
+def test_poses_of_69_are_padded(subject, smpl_file, tmp_path):
     root = writers.write_original(tmp_path / "s", subject, poses=69)
     check_poses(read(root, smpl_file), subject)
 
 
 def test_the_refit_goes_before_the_first_fit_which_has_no_pose_blend_shapes(
-    smpl_file: Path, subject: Subject, tmp_path: Path
-) -> None:
+    smpl_file, subject, tmp_path
+):
     first = make_subject(smpl_file, pose_blend=False)
     assert np.abs(first.vertices - subject.vertices).max() > 1e-4
     root = writers.write_original(tmp_path / "s", first, params="params")
@@ -179,7 +167,7 @@ NUMBERS = (1, 2, 19, 22)
 
 
 @pytest.mark.parametrize("renamed", [False, True])
-def test_subjects_313_and_315(smpl_file: Path, tmp_path: Path, renamed: bool) -> None:
+def test_subjects_313_and_315(smpl_file, tmp_path, renamed):
     odd = make_subject(smpl_file, cameras=4, first_frame=1, pose_blend=False)
     root = writers.write_313(tmp_path / "CoreView_313", odd, NUMBERS, renamed)
     layout = read(root, smpl_file)
@@ -190,7 +178,7 @@ def test_subjects_313_and_315(smpl_file: Path, tmp_path: Path, renamed: bool) ->
     check_images(layout, odd)
 
 
-def test_frame_numbers_of_long_names() -> None:
+def test_frame_numbers_of_long_names():
     name = "CoreView_313_Camera_(1)_0042_2019-08-23_16-08-50.592"
     assert frame_number(name) == 42
     assert frame_number("0042") == 42
@@ -198,7 +186,7 @@ def test_frame_numbers_of_long_names() -> None:
     assert frame_number("frame") is None
 
 
-def test_21_cameras_keep_their_own_numbers(tmp_path: Path) -> None:
+def test_21_cameras_keep_their_own_numbers(tmp_path):
     numbers = [*range(1, 20), 22, 23]
     for n in numbers:
         (tmp_path / f"Camera ({n})").mkdir()
@@ -210,9 +198,7 @@ def test_21_cameras_keep_their_own_numbers(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("listed", ["backslash", "slash", "none"])
-def test_the_refined_release(
-    subject: Subject, smpl_file: Path, tmp_path: Path, listed: str
-) -> None:
+def test_the_refined_release(subject, smpl_file, tmp_path, listed):
     root = writers.write_refined(tmp_path / "my_377", subject, listed)
     layout = read(root, smpl_file)
     assert layout.camera_names == ("00", "01", "02")
@@ -223,7 +209,7 @@ def test_the_refined_release(
     assert not layout.labels
 
 
-def test_landmarks_from_few_vertices_are_those_of_all(subject: Subject) -> None:
+def test_landmarks_from_few_vertices_are_those_of_all(subject):
     betas = np.repeat(subject.shapes[None], 4, 0)
     theta = subject.poses.reshape(4, 24, 3).copy()
     theta[:, 0] = subject.Rh
@@ -236,7 +222,7 @@ def test_landmarks_from_few_vertices_are_those_of_all(subject: Subject) -> None:
         assert np.allclose(p[conf > 0], expected[conf > 0], atol=1e-12)
 
 
-def test_the_index_is_small_and_goes_to_worker_processes(written: Path, smpl_file: Path) -> None:
+def test_the_index_is_small_and_goes_to_worker_processes(written, smpl_file):
     layout = read(written, smpl_file)
     held = pickle.dumps(layout)
     # per frame: 33 landmarks, 24 rotations, and three names a picture; no vertices, no pixels
@@ -245,29 +231,26 @@ def test_the_index_is_small_and_goes_to_worker_processes(written: Path, smpl_fil
     assert torch.equal(again.image, frame_of(layout, 1, 3).image)
 
 
-def test_a_camera_without_pictures_keeps_its_index(original: Path, smpl_file: Path) -> None:
+def test_a_camera_without_pictures_keeps_its_index(original, smpl_file):
     shutil.rmtree(original / "Camera_B2")
     layout = read(original, smpl_file)
     assert layout.camera_names == ("Camera_B1", "Camera_B2", "Camera_B3")
     assert not layout.images["Camera_B2"]
 
 
-def test_labels_beyond_cihp_are_ignored(original: Path, smpl_file: Path) -> None:
+def test_labels_beyond_cihp_are_ignored(original, smpl_file):
     path = original / "mask_cihp/Camera_B1/000003.png"
     labels = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     labels[labels == 5] = 109
     write_picture(path, labels)
     found = frame_of(read(original, smpl_file), 0, 3).labels
-    assert found is not None
     assert set(found.unique().tolist()) <= {*range(20), 255}
 
 
 # -- runs
 
 
-def test_the_config_trains_with_segmentation_on_cihp_labels(
-    compose, written: Path, smpl_file: Path
-) -> None:
+def test_the_config_trains_with_segmentation_on_cihp_labels(compose, written, smpl_file):
     from gsgan.model.runs import build_avatar, build_data
 
     config = compose(
@@ -285,20 +268,15 @@ def test_the_config_trains_with_segmentation_on_cihp_labels(
     info = data.info
     assert (info.body, info.n_labels) == ("smpl", 20)
     avatar = build_avatar(config, info, data.labelled("train")).eval()
-    assert avatar.segmentation is not None
     painting = avatar(*data.dataset("train")[0].inputs)
-    assert painting.segmentation is not None
     assert "class vote over 9 images" in avatar.segmentation_why
     assert painting.segmentation.shape == (1, avatar.segmentation.classes, 32, 32)
     assert set(avatar.segmentation.map.names) < set(CIHP)
-    assert painting.image is not None
     assert torch.isfinite(painting.image).all()
 
 
 @pytest.mark.slow
-def test_a_run_is_scored_with_its_model_file_elsewhere(
-    written: Path, smpl_file: Path, tmp_path: Path, inside
-) -> None:
+def test_a_run_is_scored_with_its_model_file_elsewhere(written, smpl_file, tmp_path, inside):
     first, now, run = (
         tmp_path / smpl_file.name,
         tmp_path / "moved" / smpl_file.name,

@@ -63,7 +63,6 @@ def test_light_from_one_side_is_no_tint():
     means = [float(f.image.sum() / f.mask.sum()) for f in frames[0]]
     assert max(means) - min(means) > 0.3  # what a mean over the person would fall for
     seen = surface_colours(frames)
-    assert seen is not None
     assert seen.difference < 0.02
     assert seen.residual < 0.05
 
@@ -71,15 +70,12 @@ def test_light_from_one_side_is_no_tint():
 def test_a_tint_is_measured():
     tint = [(1.0, 1.0, 1.0), (1.0, 1.0, 0.8), (1.0, 1.0, 1.0)]
     seen = surface_colours(moments(tint=tint))
-    assert seen is not None
     # blue 0.7 x light, a fifth less of it: light on shared surface is 0.3 to 0.7
     assert 0.04 < seen.difference < 0.1
 
 
 def test_highlights_are_what_is_left():
     matt, glossy = (surface_colours(moments(gloss=g)) for g in (0.0, 0.5))
-    assert matt is not None
-    assert glossy is not None
     assert glossy.residual > 2 * matt.residual
 
 

@@ -21,7 +21,7 @@ from gsgan.metrics.regions import box_corners, box_mask
 
 
 @pytest.fixture(scope="module")
-def data(capture) -> GsganData:
+def data(capture):
     return GsganData(str(capture))
 
 

@@ -25,7 +25,7 @@ SPLITS = {
 
 
 @pytest.fixture(scope="session")
-def people(tmp_path_factory) -> Path:
+def people(tmp_path_factory):
     """Four cameras around a person, one held out, five frames, two held out, in centimetres; read
     only."""
     root = tmp_path_factory.mktemp("people")
@@ -33,7 +33,7 @@ def people(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def fitted(people, tmp_path_factory) -> Path:
+def fitted(people, tmp_path_factory):
     """These people with their registered body poses; read only."""
     root = shutil.copytree(people, tmp_path_factory.mktemp("fitted") / "people")
     with initialize_config_dir(str(config_folder()), version_base="1.3"):

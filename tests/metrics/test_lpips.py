@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import torch
 from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
@@ -20,7 +18,7 @@ RANGES = [(-1.0, 1.0), (0.0, 1.0)]
 
 
 @pytest.fixture(scope="module")
-def hub(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def hub(tmp_path_factory):
     """A torch cache with a file laid out as torchvision's AlexNet, random where LPIPS looks."""
     from torchvision.models import alexnet
 
@@ -36,7 +34,7 @@ def hub(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def direct(hub: Path):
+def direct(hub):
     """torchmetrics' own LPIPS on the same numbers, one for each range it is fed."""
     before = torch.hub.get_dir()
     torch.hub.set_dir(hub)
@@ -50,12 +48,12 @@ def direct(hub: Path):
 
 
 @pytest.fixture(scope="module")
-def scores(hub: Path):
+def scores(hub):
     return {fed: lpips("alex", str(hub / "checkpoints"), fed)[0] for fed in RANGES}
 
 
 @pytest.fixture(scope="module")
-def pictures() -> tuple[torch.Tensor, torch.Tensor]:
+def pictures():
     generator = torch.Generator().manual_seed(1)
     a, b = (torch.rand(2, 3, 64, 64, generator=generator) for _ in range(2))
     return a, b

@@ -85,7 +85,6 @@ def test_what_is_off_builds_no_parameter(build, model, absent):
         assert not any(name.startswith(part) for name in names)
     painting = avatar(*frame.inputs)
     assert painting.segmentation is None
-    assert painting.image is not None
     assert avatar.segmentation is None
     assert avatar.segmentation_why == "the model leaves it out"
 

@@ -15,7 +15,7 @@ HEIGHT = 1.7
 
 
 @pytest.fixture
-def densify() -> Densify:
+def densify():
     return Densify(points_per_limb=5, face_points=200, torso_points=200)
 
 

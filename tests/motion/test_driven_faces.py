@@ -35,14 +35,14 @@ TURNED = rotation(np.array([0.2, 0.7, 0.0]))  # by 42 degrees
 
 
 @pytest.fixture(scope="module")
-def rest() -> np.ndarray:
+def rest():
     """``[30, 3]`` the subject's face at rest, in the head's axes: up is y, ahead is z."""
     p = np.array(HOLISTIC.rest_positions)
     return p[EXPRESSION] - p[list(HOLISTIC.head)].mean(0)
 
 
 @pytest.fixture(scope="module")
-def moves() -> np.ndarray:
+def moves():
     """``[12, 30, 3]`` offsets: two frames with an open mouth, two with raised brows."""
     offsets = np.zeros((12, 30, 3))
     offsets[3:5, LOWER] = 0, -0.012, 0.002
@@ -51,7 +51,7 @@ def moves() -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def talking(signing, rest, moves) -> np.ndarray:
+def talking(signing, rest, moves):
     """``[12, 105, 3]`` another person with that face, whose head turns by itself."""
     heads, centre = head_of(signing)
     head = heads @ np.stack([rotation(np.array([0, a, 0])) for a in np.linspace(-0.6, 0.6, 12)])

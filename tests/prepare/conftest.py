@@ -6,7 +6,7 @@ import pytest
 
 
 @pytest.fixture(autouse=True)
-def check(monkeypatch: pytest.MonkeyPatch):
+def check(monkeypatch):
     """Leaves the check at the end out; gives the function that makes it."""
     from gsgan.check.run import check_capture
 

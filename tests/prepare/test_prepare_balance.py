@@ -35,7 +35,7 @@ def toml_of(qca: Path, out: Path) -> Path:
     text = ""
     for camera in ElementTree.parse(qca).getroot().iter("camera"):
         window, pose, lens = (
-            {key: float(value) for key, value in camera.find(tag).attrib.items()}  # type: ignore[union-attr]
+            {key: float(value) for key, value in camera.find(tag).attrib.items()}
             for tag in ("fov_video", "transform", "intrinsic")
         )
         R = np.diag([1, -1, -1]) @ [[pose[f"r{i}{j}"] for j in (1, 2, 3)] for i in (1, 2, 3)]
@@ -56,7 +56,7 @@ def toml_of(qca: Path, out: Path) -> Path:
 
 
 @pytest.mark.skipif(not (DATA / "balance_videos").is_dir(), reason="no balance videos")
-def test_real_videos_become_a_capture_that_trains(tmp_path: Path, check):
+def test_real_videos_become_a_capture_that_trains(tmp_path, check):
     """The calibration is a degree or two off; the joints end within 6 px of the detections."""
     source = DATA / "balance_videos"
     calibration = str(toml_of(source / "Calib.qca.txt", tmp_path / "Calib.toml"))
@@ -86,7 +86,7 @@ def test_real_videos_become_a_capture_that_trains(tmp_path: Path, check):
 
 
 @pytest.mark.skipif(not (DATA / "hands_videos").is_dir(), reason="no videos of hands")
-def test_gestures_in_front_of_webcams(tmp_path: Path):
+def test_gestures_in_front_of_webcams(tmp_path):
     """His legs are outside every image."""
     source = str(DATA / "hands_videos")
     given = Options(source, str(tmp_path / "out"), frames="6-60", offsets={"cam_1": -1})

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from capture_scenes import (
@@ -30,14 +28,14 @@ def equal(found, expected, lens: int = 5) -> None:
         np.testing.assert_allclose(read.dist[:lens], camera.dist[:lens], atol=1e-12)
 
 
-def test_easymocap_pairs_by_name_though_the_orders_differ(tmp_path: Path):
+def test_easymocap_pairs_by_name_though_the_orders_differ(tmp_path):
     cameras = ring(dist=LENS)
     calibration = read_calibration(write_easymocap(tmp_path, cameras))
     assert calibration.format == "OpenCV YAML"
     equal(calibration.cameras, cameras)
 
 
-def test_easymocap_camera_without_its_other_half(tmp_path: Path):
+def test_easymocap_camera_without_its_other_half(tmp_path):
     write_easymocap(tmp_path, ring())
     text = (tmp_path / "extri.yml").read_text().replace("T_cam1", "T_camX")
     (tmp_path / "extri.yml").write_text(text)
@@ -48,12 +46,12 @@ def test_easymocap_camera_without_its_other_half(tmp_path: Path):
         read_calibration(tmp_path / "intri.yml")
 
 
-def test_pose2sim_toml(tmp_path: Path):
+def test_pose2sim_toml(tmp_path):
     cameras = ring(dist=(*LENS[:4], 0))
     equal(read_calibration(write_toml(tmp_path / "Calib.toml", cameras)).cameras, cameras)
 
 
-def test_aniposelib_toml_in_millimetres(tmp_path: Path):
+def test_aniposelib_toml_in_millimetres(tmp_path):
     cameras = ring(dist=LENS)
     path = write_toml(tmp_path / "calibration.toml", cameras, unit=1000, lens=5)
     equal(read_calibration(path, unit_scale=1e-3).cameras, cameras)
@@ -73,7 +71,7 @@ rotation = {rotation}
 """
 
 
-def test_caliscope(tmp_path: Path):
+def test_caliscope(tmp_path):
     """A quarter turn about y as a vector and as a matrix; ignored and uncalibrated cameras."""
     vector, matrix = [0.0, np.pi / 2, 0.0], [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]
     path = tmp_path / "camera_array.toml"
@@ -99,14 +97,14 @@ def test_caliscope(tmp_path: Path):
         read_calibration(path)
 
 
-def test_fisheye_is_refused(tmp_path: Path):
+def test_fisheye_is_refused(tmp_path):
     path = write_toml(tmp_path / "Calib.toml", ring())
     path.write_text(path.read_text().replace("fisheye = false", "fisheye = true", 1))
     with pytest.raises(DataError, match=r"cam_00.*fisheye"):
         read_calibration(path)
 
 
-def test_own_json_has_its_unit(tmp_path: Path):
+def test_own_json_has_its_unit(tmp_path):
     cameras = ring(dist=LENS)
     equal(read_calibration(write_own(tmp_path / "cameras.json", cameras)).cameras, cameras)
     (tmp_path / "meta.json").write_text('{"unit": "mm"}')
@@ -114,7 +112,7 @@ def test_own_json_has_its_unit(tmp_path: Path):
     np.testing.assert_allclose(found["cam1"].t, cameras[1].t / 1000)
 
 
-def test_pixel_centre_is_a_setting(tmp_path: Path):
+def test_pixel_centre_is_a_setting(tmp_path):
     path = write_toml(tmp_path / "Calib.toml", ring())
     half, zero = read_calibration(path, pixel_centre=0.5), read_calibration(path)
     shift = zero.cameras["cam0"].K - half.cameras["cam0"].K
@@ -122,7 +120,7 @@ def test_pixel_centre_is_a_setting(tmp_path: Path):
 
 
 @pytest.mark.parametrize("content", ["", "hello", "%YAML:1.0\n---\nx: [", "[a]\nmatrix = ["])
-def test_errors_are_one_sentence(tmp_path: Path, content: str):
+def test_errors_are_one_sentence(tmp_path, content):
     path = tmp_path / "intri.yml"
     path.write_text(content)
     (tmp_path / "extri.yml").write_text(content)
@@ -131,7 +129,7 @@ def test_errors_are_one_sentence(tmp_path: Path, content: str):
     assert "\n" not in str(failure.value)
 
 
-def test_finds_the_one_calibration_of_a_project(tmp_path: Path):
+def test_finds_the_one_calibration_of_a_project(tmp_path):
     with pytest.raises(DataError, match="holds no calibration"):
         find_calibration(tmp_path)
     (tmp_path / "Config.toml").write_text("[project]\nframe_rate = 60\n")

@@ -29,7 +29,7 @@ from gsgan.prepare.stages import StageFolder
 from gsgan.utils.errors import ConfigError, DataError, GsganError
 
 
-def test_a_folder_with_a_users_file_is_never_removed(tmp_path: Path):
+def test_a_folder_with_a_users_file_is_never_removed(tmp_path):
     (tmp_path / "thesis.txt").write_text("do not lose")
     given = MediaPipe(folder=str(tmp_path), python=sys.executable)
     with pytest.raises(ConfigError, match="holds something else"):
@@ -37,7 +37,7 @@ def test_a_folder_with_a_users_file_is_never_removed(tmp_path: Path):
     assert (tmp_path / "thesis.txt").read_text() == "do not lose"
 
 
-def test_a_half_made_environment_is_made_again(tmp_path: Path):
+def test_a_half_made_environment_is_made_again(tmp_path):
     place = tmp_path / "env"
     missing = MediaPipe(folder=str(place), python=str(tmp_path / "python9"))
     for _ in range(2):  # the second time the folder is there, with the marker
@@ -50,14 +50,12 @@ def test_a_half_made_environment_is_made_again(tmp_path: Path):
 def load_detector(monkeypatch):
     monkeypatch.setitem(sys.modules, "mediapipe", SimpleNamespace())
     spec = importlib.util.spec_from_file_location("detect_tool", tool.SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
 
 
-def test_the_tool_reads_images_as_stored_and_by_number(tmp_path: Path, monkeypatch):
+def test_the_tool_reads_images_as_stored_and_by_number(tmp_path, monkeypatch):
     detector = load_detector(monkeypatch)
     data = cv2.imencode(".jpg", np.zeros((4, 6, 3), np.uint8))[1].tobytes()
     # orientation (0x112) 6: turned by 90 degrees
@@ -76,7 +74,7 @@ def test_the_tool_reads_images_as_stored_and_by_number(tmp_path: Path, monkeypat
 
 
 @pytest.mark.parametrize("number", [0.5, np.nan])
-def test_frame_numbers_must_be_whole(tmp_path: Path, number: float):
+def test_frame_numbers_must_be_whole(tmp_path, number):
     px, ids = np.ones((2, BODY, 2)), np.array([1, number])
     np.savez(tmp_path / "a.npz", px=px, conf=px[..., 0], frame_id=ids)
     with pytest.raises(DataError, match="whole numbers"):
@@ -87,7 +85,7 @@ def test_frame_numbers_must_be_whole(tmp_path: Path, number: float):
         read_points3d(path)
 
 
-def test_results_with_other_keys_are_removed_by_stage(tmp_path: Path):
+def test_results_with_other_keys_are_removed_by_stage(tmp_path):
     for stage in ("tool-a", "tool-a-b", "solution"):
         for key in (1, 2):
             StageFolder(tmp_path).path(stage, key).mkdir()
@@ -100,7 +98,7 @@ def test_results_with_other_keys_are_removed_by_stage(tmp_path: Path):
     assert len(list(tmp_path.iterdir())) == 10  # stages that the run did not use stay
 
 
-def test_an_old_dataset_stays_when_the_new_one_cannot_be_moved(tmp_path: Path, monkeypatch):
+def test_an_old_dataset_stays_when_the_new_one_cannot_be_moved(tmp_path, monkeypatch):
     new, out, replace = tmp_path / "new", tmp_path / "out", os.replace
     for folder in (new, out):
         folder.mkdir()
@@ -122,7 +120,7 @@ def test_an_old_dataset_stays_when_the_new_one_cannot_be_moved(tmp_path: Path, m
     "more",
     [{"fps": "abc"}, {"workers": "x"}, {"offsets": {"a": "b"}}, {"mask_levels": (0.8, 0.3)}],
 )
-def test_options_of_the_wrong_kind(more: dict):
+def test_options_of_the_wrong_kind(more):
     with pytest.raises(ConfigError, match=next(iter(more))):
         Options("source", "out", **more)
 
@@ -175,7 +173,7 @@ READERS = {
 
 
 @pytest.mark.parametrize("kind", READERS)
-def test_damaged_files_are_one_sentence_or_read(tmp_path: Path, kind: str):
+def test_damaged_files_are_one_sentence_or_read(tmp_path, kind):
     read, write = READERS[kind]
     path = write(tmp_path)
     data, rng = path.read_bytes(), np.random.default_rng(5)

@@ -69,7 +69,7 @@ def test_hands_that_agree_are_left_alone():
 
 
 @pytest.mark.parametrize("cameras", [[1], [0, 3], [0, 1, 2, 3]])
-def test_swapped_hands_are_put_right(cameras: list[int]):
+def test_swapped_hands_are_put_right(cameras):
     """In one camera, in half of them, and in all, where only the wrists show it."""
     rig, p, uv, conf = seen()
     swapped = np.zeros(conf.shape[:2], bool)

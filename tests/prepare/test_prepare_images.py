@@ -28,7 +28,7 @@ def source(name: str, fps: float = 30.0, count: int = 100, turned: int = 0) -> R
         (source("b", turned=90), "rotate it by 90 degrees"),
     ],
 )
-def test_sources_that_differ_are_noted(other: Recording, what: str | None):
+def test_sources_that_differ_are_noted(other, what):
     found = recording_notes({"a": source("a"), "b": other})
     assert len(found) == (what is not None)
     assert what is None or what in found[0]
@@ -55,7 +55,7 @@ def test_masks_lose_their_haze_and_their_crumbs():
     assert tidy(np.zeros_like(mask), (0, 1)).max() == 0
 
 
-def test_given_masks_by_number_and_by_person(tmp_path: Path):
+def test_given_masks_by_number_and_by_person(tmp_path):
     for name in ("a/000001.png", "a/000007.png", "b/000001_0.png", "b/000002_0.png"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
@@ -66,7 +66,7 @@ def test_given_masks_by_number_and_by_person(tmp_path: Path):
         find_masks(tmp_path, ["c"])
 
 
-def test_sources_that_cannot_be_used(tmp_path: Path):
+def test_sources_that_cannot_be_used(tmp_path):
     (tmp_path / "cam").mkdir()
     cv2.imwrite(str(tmp_path / "cam" / "1.png"), np.zeros((4, 6, 3), np.uint8))
     assert find_sources(tmp_path)["cam"].size == (4, 6)

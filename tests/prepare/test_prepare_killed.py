@@ -25,7 +25,7 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork, no chi
 
 
 @pytest.fixture(scope="module")
-def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def project(tmp_path_factory):
     return write_project(tmp_path_factory.mktemp("killed") / "project", 3, 4, (64, 48))
 
 
@@ -90,15 +90,13 @@ STAGES: dict[str, Callable[[Path, int], bool]] = {
 
 
 @pytest.fixture(scope="module")
-def whole(project: Path) -> dict[str, bytes]:
+def whole(project):
     """The images of an undisturbed run."""
     return images(prepare(options(project, project.parent / "undisturbed"), quiet()))
 
 
 @pytest.mark.parametrize("stage", STAGES)
-def test_a_killed_process_leaves_nothing_incomplete_and_is_resumed(
-    project: Path, whole: dict[str, bytes], tmp_path: Path, stage: str
-) -> None:
+def test_a_killed_process_leaves_nothing_incomplete_and_is_resumed(project, whole, tmp_path, stage):
     out = tmp_path / "out"
     given = options(project, out)
     assert killed(lambda: prepare(given, quiet()), STAGES[stage])
@@ -109,9 +107,7 @@ def test_a_killed_process_leaves_nothing_incomplete_and_is_resumed(
     assert len(read_capture(out).frames) == 4
 
 
-def test_an_earlier_dataset_outlives_a_kill(
-    project: Path, whole: dict[str, bytes], tmp_path: Path
-) -> None:
+def test_an_earlier_dataset_outlives_a_kill(project, whole, tmp_path):
     out = tmp_path / "out"
     prepare(options(project, out, frames="0-2"), quiet())
     again = options(project, out, overwrite=True)
@@ -124,7 +120,7 @@ def test_an_earlier_dataset_outlives_a_kill(
     assert not (tmp_path / ".out.old").exists()
 
 
-def test_a_failure_or_an_interrupt_stops_the_other_cameras() -> None:
+def test_a_failure_or_an_interrupt_stops_the_other_cameras():
     steps: list[int] = []
 
     def work(name: str, report: Callable[[int, int], None]) -> None:

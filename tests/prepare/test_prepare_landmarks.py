@@ -24,7 +24,7 @@ def write_people(folder: Path, frame: int, *people: dict) -> None:
     (folder / f"cam_{frame:012d}_keypoints.json").write_text(json.dumps({"people": people}))
 
 
-def test_openpose_body_25_keeps_the_persons_sides(tmp_path: Path):
+def test_openpose_body_25_keeps_the_persons_sides(tmp_path):
     write_people(tmp_path / "a_json", 7, {"pose_keypoints_2d": triples(25)})
     found = read_detections(tmp_path / "a_json")
     assert found.frame_id.tolist() == [7]
@@ -36,7 +36,7 @@ def test_openpose_body_25_keeps_the_persons_sides(tmp_path: Path):
 
 
 @pytest.mark.parametrize("count", SETS)
-def test_every_set_maps_left_to_left(count: int):
+def test_every_set_maps_left_to_left(count):
     mapping = SETS[count][1]
     assert len(set(mapping.values())) == len(mapping)
     for j, twin in enumerate(MEDIAPIPE33.mirror):
@@ -44,7 +44,7 @@ def test_every_set_maps_left_to_left(count: int):
     assert {11, 12, 23, 24} <= set(mapping)
 
 
-def test_zero_confidence_is_missing_and_the_best_seen_person_is_taken(tmp_path: Path):
+def test_zero_confidence_is_missing_and_the_best_seen_person_is_taken(tmp_path):
     faint = {"pose_keypoints_2d": [5.0, 5.0, 0.1] * 17}
     clear = {"pose_keypoints_2d": [8.0, 8.0, 0.9] * 16 + [0, 0, 0]}
     write_people(tmp_path / "a", 0, faint, clear)
@@ -55,7 +55,7 @@ def test_zero_confidence_is_missing_and_the_best_seen_person_is_taken(tmp_path: 
     assert (found.conf[1] == 0).all()
 
 
-def test_npz_of_the_tool(tmp_path: Path):
+def test_npz_of_the_tool(tmp_path):
     px = np.full((2, BODY, 2), 4.0)
     px[0, 3] = np.nan
     hand = np.full((2, HAND, 2), np.nan)
@@ -70,7 +70,7 @@ def test_npz_of_the_tool(tmp_path: Path):
     assert len(hand_names()) == 2 * HAND
 
 
-def test_face_of_the_tool(tmp_path: Path):
+def test_face_of_the_tool(tmp_path):
     """The mesh's landmarks by name: the right corner of the mouth is 61, the left outer lid 263."""
     px, mesh = np.full((2, BODY, 2), 4.0), np.full((2, 468, 2), np.nan)
     mesh[1] = np.arange(468)[:, None]
@@ -106,14 +106,14 @@ def test_joints_beyond_the_image_are_not_seen():
         ('{"people": [{"pose_keypoints_2d": [1, 2, 0.5]}]}', "of 17 .COCO., 25"),
     ],
 )
-def test_damaged_json_names_the_file(tmp_path: Path, content: str, what: str):
+def test_damaged_json_names_the_file(tmp_path, content, what):
     (tmp_path / "f_000001.json").write_text(content)
     with pytest.raises(DataError, match=what) as failure:
         read_detections(tmp_path)
     assert "f_000001.json" in str(failure.value)
 
 
-def test_a_camera_without_landmarks_is_named(tmp_path: Path):
+def test_a_camera_without_landmarks_is_named(tmp_path):
     (tmp_path / "a.npz").touch()
     (tmp_path / "b_json").mkdir()
     assert list(find_landmarks(tmp_path, ["a", "b"])) == ["a", "b"]
@@ -121,7 +121,7 @@ def test_a_camera_without_landmarks_is_named(tmp_path: Path):
         find_landmarks(tmp_path, ["a", "c"])
 
 
-def test_cameras_meet_by_number_and_offset(tmp_path: Path):
+def test_cameras_meet_by_number_and_offset(tmp_path):
     for name, ids in (("a", [0, 1, 2]), ("b", [3, 4])):
         px = np.zeros((len(ids), BODY, 2)) + np.array(ids)[:, None, None]
         np.savez(tmp_path / f"{name}.npz", px=px, conf=np.ones(px.shape[:2]), frame_id=ids)

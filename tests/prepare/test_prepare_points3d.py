@@ -50,7 +50,7 @@ def write_trc(path: Path, p: np.ndarray, unit: str = "m") -> Path:
 
 
 @pytest.mark.parametrize("unit", ["m", "mm"])
-def test_trc_units_axes_and_names_are_converted(tmp_path: Path, unit: str):
+def test_trc_units_axes_and_names_are_converted(tmp_path, unit):
     p = skeletons(4)
     p[2, 15] = np.nan
     found = read_points3d(write_trc(tmp_path / "a.trc", p, unit))
@@ -71,7 +71,7 @@ def test_trc_units_axes_and_names_are_converted(tmp_path: Path, unit: str):
         (lambda text: text.replace("Shoulder", "Sh").replace("Hip", "H"), "no shoulders and hips"),
     ],
 )
-def test_damaged_trc(tmp_path: Path, change, what: str):
+def test_damaged_trc(tmp_path, change, what):
     path = write_trc(tmp_path / "a.trc", skeletons(2))
     path.write_text(change(path.read_text()))
     with pytest.raises(DataError, match=what):

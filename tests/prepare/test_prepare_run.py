@@ -25,7 +25,7 @@ CAMERAS, FRAMES, SIZE = 3, 6, (96, 80)
 
 
 @pytest.fixture
-def project(tmp_path: Path) -> Path:
+def project(tmp_path):
     """A project folder: videos, calibration, 2D landmarks and masks of a known person."""
     return write_project(tmp_path / "project", CAMERAS, FRAMES, SIZE)
 
@@ -46,7 +46,7 @@ def quiet() -> Console:
     return Console(file=io.StringIO())
 
 
-def test_videos_become_a_capture_that_training_reads(project: Path):
+def test_videos_become_a_capture_that_training_reads(project):
     out = prepare(options(project, solve=SolveSettings()), quiet())
     layout = read_capture(out)
     assert layout.camera_names == ("cam00", "cam01", "cam02")
@@ -79,7 +79,7 @@ def test_the_numbers_have_every_stage_and_the_dataset_is_checked(project, monkey
     assert json.loads((out / "check.json").read_text())["errors"] == 0
 
 
-def test_images_are_undistorted_and_scaled(project: Path):
+def test_images_are_undistorted_and_scaled(project):
     out = prepare(options(project, scale=0.5, format="png"), quiet())
     camera = read_capture(out).cameras["cam00"]
     assert camera.size == (SIZE[1] // 2, SIZE[0] // 2)
@@ -93,7 +93,7 @@ def test_images_are_undistorted_and_scaled(project: Path):
     assert inside.mean() > 0.9
 
 
-def test_the_same_again_is_left_alone_and_another_refused(project: Path):
+def test_the_same_again_is_left_alone_and_another_refused(project):
     out = prepare(options(project), quiet())
     before = (out / "meta.json").stat().st_mtime_ns
     prepare(options(project), quiet())
@@ -105,7 +105,7 @@ def test_the_same_again_is_left_alone_and_another_refused(project: Path):
     assert [p.name for p in out.parent.iterdir() if p.name.startswith(".")] == []
 
 
-def test_other_folders_are_never_overwritten(project: Path):
+def test_other_folders_are_never_overwritten(project):
     out = project.parent / "out"
     out.mkdir()
     (out / "thesis.txt").write_text("do not lose")
@@ -114,7 +114,7 @@ def test_other_folders_are_never_overwritten(project: Path):
     assert (out / "thesis.txt").read_text() == "do not lose"
 
 
-def test_a_camera_with_missing_masks_keeps_the_rest(project: Path):
+def test_a_camera_with_missing_masks_keeps_the_rest(project):
     (project / "masks" / "cam01" / "000003.png").unlink()
     out = prepare(options(project, frames="1-5"), quiet())
     layout = read_capture(out)
@@ -122,7 +122,7 @@ def test_a_camera_with_missing_masks_keeps_the_rest(project: Path):
     assert sorted(layout.images["cam00"]) == [1, 2, 3, 4, 5]
 
 
-def test_offsets_move_a_cameras_numbers(project: Path):
+def test_offsets_move_a_cameras_numbers(project):
     late = options(project, offsets={"cam02": 1})
     out = prepare(late, quiet())
     assert sorted(read_capture(out).images["cam02"]) == list(
@@ -132,7 +132,7 @@ def test_offsets_move_a_cameras_numbers(project: Path):
         prepare(options(project, offsets={"cam09": 1}, out=str(project / "x")), quiet())
 
 
-def test_folders_of_images_need_a_frame_rate(project: Path):
+def test_folders_of_images_need_a_frame_rate(project):
     for video in (project / "videos").iterdir():
         video.unlink()
     (project / "videos").rmdir()
@@ -181,7 +181,7 @@ def no_detections(project: Path) -> None:
         (one_video, {}, "only the camera cam00"),
     ],
 )
-def test_errors_are_one_sentence(project: Path, break_it, more, what):
+def test_errors_are_one_sentence(project, break_it, more, what):
     break_it(project)
     with pytest.raises(GsganError, match=what) as failure:
         prepare(options(project, **more), quiet())
@@ -189,7 +189,7 @@ def test_errors_are_one_sentence(project: Path, break_it, more, what):
     assert not (project.parent / "out").exists()
 
 
-def test_every_key_of_the_config_is_understood(project: Path, compose, capsys):
+def test_every_key_of_the_config_is_understood(project, compose, capsys):
     config = compose(
         "prepare",
         f"source={project}",
@@ -249,7 +249,7 @@ def with_stub(project: Path, monkeypatch, bad: str = "") -> Options:
     return options(project, landmarks="mediapipe", masks="mediapipe", mediapipe=mediapipe)
 
 
-def test_the_tool_runs_once_per_camera(project: Path, monkeypatch):
+def test_the_tool_runs_once_per_camera(project, monkeypatch):
     given = with_stub(project, monkeypatch)
     out = prepare(given, quiet())
     assert len(read_capture(out).frames) == FRAMES
@@ -260,13 +260,13 @@ def test_the_tool_runs_once_per_camera(project: Path, monkeypatch):
     assert calls == []
 
 
-def test_the_message_of_a_failing_tool_is_its_last_line(project: Path, monkeypatch):
+def test_the_message_of_a_failing_tool_is_its_last_line(project, monkeypatch):
     with pytest.raises(DataError, match=r"cam01\.avi: the MediaPipe tool failed: the stub refuses"):
         prepare(with_stub(project, monkeypatch, bad="cam01"), quiet())
     assert not (project.parent / "out").exists()
 
 
-def test_the_environment_is_only_made_with_setup(project: Path):
+def test_the_environment_is_only_made_with_setup(project):
     missing = MediaPipe(folder=str(project / "nothing"))
     with pytest.raises(ConfigError, match="add setup=true"):
         prepare(options(project, landmarks="mediapipe", mediapipe=missing), quiet())

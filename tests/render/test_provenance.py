@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime
 import io
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,14 +17,14 @@ PIXELS = np.arange(16 * 16 * 3, dtype=np.uint8).reshape(16, 16, 3)
 
 
 @pytest.fixture
-def png(tmp_path) -> Path:
+def png(tmp_path):
     path = tmp_path / "a.png"
     path.write_bytes(png_bytes(Image.fromarray(PIXELS)))
     return path
 
 
 @pytest.fixture
-def mp4(tmp_path) -> Path:
+def mp4(tmp_path):
     pytest.importorskip("av")
     path = tmp_path / "a.mp4"
     path.write_bytes(marked_mp4(encoded(iter([PIXELS] * 3), 30)))
@@ -86,7 +85,7 @@ def test_files_that_cannot_be_read(png, mp4, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def signer(tmp_path_factory) -> Signer:
+def signer(tmp_path_factory):
     """A certificate for content credentials, of an authority of its own."""
     pytest.importorskip("c2pa")
     from cryptography import x509

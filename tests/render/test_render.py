@@ -34,7 +34,7 @@ def read(path: Path) -> np.ndarray:
 
 
 @pytest.fixture
-def motion(tmp_path, landmarks) -> Path:
+def motion(tmp_path, landmarks):
     path = tmp_path / "a.npz"
     np.savez(path, p=1.1 * landmarks, fps=30)
     return path
@@ -51,7 +51,7 @@ def render(inside, bare, tmp_path):
 
 
 @pytest.fixture
-def fitted(capture, tiny, tmp_path) -> Path:
+def fitted(capture, tiny, tmp_path):
     """A run that has just begun, of an avatar on a body whose shape `gsgan.fit` wrote."""
     root = shutil.copytree(capture, tmp_path / "fitted")
     shape = replace(free_space().neutral(), offsets=0.02 * torch.ones(33, 3))

@@ -24,7 +24,7 @@ pytestmark = pytest.mark.slow  # make test runs `report run=` as the README has 
 
 
 @pytest.fixture
-def twin(run, tmp_path) -> Path:
+def twin(run, tmp_path):
     """Another run on the same data."""
     return Path(shutil.copytree(run, tmp_path / "twin"))
 

@@ -27,7 +27,7 @@ def densify(**options: Any) -> Densify:
     return Densify(dtype=F64, **options)
 
 
-def test_counts_and_layout() -> None:
+def test_counts_and_layout():
     d = densify()
     assert d.n_points == 5400
     assert d.part_id.unique_consecutive().tolist() == list(range(24))
@@ -41,7 +41,7 @@ def test_counts_and_layout() -> None:
 
 
 @pytest.mark.parametrize("sampler", SAMPLERS)
-def test_limb_points_lie_on_their_cylinders(sampler: Any) -> None:
+def test_limb_points_lie_on_their_cylinders(sampler):
     """Radius a tenth of the length, between the two joints, for every limb."""
     p = noisy(0)
     points = densify(sampler=sampler)(p)
@@ -64,7 +64,7 @@ def test_limb_points_lie_on_their_cylinders(sampler: Any) -> None:
 
 
 @pytest.mark.parametrize("sampler", SAMPLERS)
-def test_face_points_lie_on_the_sphere(sampler: Any) -> None:
+def test_face_points_lie_on_the_sphere(sampler):
     p = noisy(1)
     points = densify(sampler=sampler, face_radius_scale=0.7)(p).means[0, 4400:4900]
     face = p[0, :11]
@@ -75,7 +75,7 @@ def test_face_points_lie_on_the_sphere(sampler: Any) -> None:
 
 
 @pytest.mark.parametrize("sampler", SAMPLERS)
-def test_torso_points_lie_on_the_box(sampler: Any) -> None:
+def test_torso_points_lie_on_the_box(sampler):
     p = rest()
     points = densify(sampler=sampler)(p).means[0, 4900:]
     centre = REST[list(MEDIAPIPE33.torso)].mean(0)
@@ -90,7 +90,7 @@ def test_torso_points_lie_on_the_box(sampler: Any) -> None:
     )
 
 
-def test_cube_edges_are_the_longest_distance() -> None:
+def test_cube_edges_are_the_longest_distance():
     p = noisy(2)
     points = densify(torso="cube")(p)
     corners = p[0, list(MEDIAPIPE33.torso)]
@@ -100,14 +100,14 @@ def test_cube_edges_are_the_longest_distance() -> None:
     assert (local.abs().max(0).values > 0.98 * expected).all()
 
 
-def test_torso_edges_are_kept_within_range() -> None:
+def test_torso_edges_are_kept_within_range():
     p = rest()
     p[0, [11, 12]] = p[0, [23, 24]] + torch.tensor([0.0, 0.01, 0.0], dtype=F64)
     height = densify()(p).local()[0, 4900:, 1].abs().max() * 2
     assert height == pytest.approx(0.25 * 0.47, rel=1e-6)
 
 
-def test_normals_point_out() -> None:
+def test_normals_point_out():
     d = densify()
     points = d(rest())
     world = points.normals[0]
@@ -122,7 +122,7 @@ def test_normals_point_out() -> None:
     assert ((points.means[0] - centre) * world).sum(-1).min() > 0
 
 
-def test_scales_are_the_mean_spacing() -> None:
+def test_scales_are_the_mean_spacing():
     p = noisy(3)
     points, f = densify()(p), bone_frames(p)
     h = f.lengths[0, 5]
@@ -142,7 +142,7 @@ def test_scales_are_the_mean_spacing() -> None:
 
 
 @given(seed=st.integers(0, 10_000))
-def test_a_rigid_motion_moves_every_point_with_it(seed: int) -> None:
+def test_a_rigid_motion_moves_every_point_with_it(seed):
     d, p, R = densify(), noisy(seed, sigma=0.05), rotation(seed + 1)
     shift = torch.tensor([0.3, -4.0, 2.0], dtype=F64)
     a, b = d(p), d(p @ R.mT + shift)
@@ -153,7 +153,7 @@ def test_a_rigid_motion_moves_every_point_with_it(seed: int) -> None:
     torch.testing.assert_close(b.local(), a.local(), atol=1e-6, rtol=0)
 
 
-def test_index_is_identity_under_noise() -> None:
+def test_index_is_identity_under_noise():
     """Landmark noise of 1 mm moves each point a little; it never swaps two of them."""
     d, p = densify(), noisy(4)
     a, b = d(p).means, d(p + 1e-3 * (noisy(5, sigma=1.0) - rest())).means
@@ -162,7 +162,7 @@ def test_index_is_identity_under_noise() -> None:
     assert own.max() < 0.03
 
 
-def test_local_coordinates_scale_with_the_limb_only() -> None:
+def test_local_coordinates_scale_with_the_limb_only():
     """Another pose with the same bone lengths: the same local coordinates."""
     p = rest()
     bent = p.clone()
@@ -174,7 +174,7 @@ def test_local_coordinates_scale_with_the_limb_only() -> None:
     assert (d(bent).means - d(p).means).abs().max() > 0.1
 
 
-def test_rest_points_are_the_rest_pose_in_body_heights() -> None:
+def test_rest_points_are_the_rest_pose_in_body_heights():
     d = densify()
     root = REST[[23, 24]].mean(0)
     torch.testing.assert_close(d.rest_points * 1.7 + root, d(rest()).means[0])
@@ -182,7 +182,7 @@ def test_rest_points_are_the_rest_pose_in_body_heights() -> None:
     assert d.rest_points.requires_grad is False
 
 
-def test_unseen_joints_mark_their_points() -> None:
+def test_unseen_joints_mark_their_points():
     valid = torch.ones(4, 33, dtype=torch.bool)
     valid[3, 1:11] = False  # the nose is enough to place the head
     valid[0, 15] = False  # left wrist: forearm and the three bones of the hand that start there
@@ -198,7 +198,7 @@ def test_unseen_joints_mark_their_points() -> None:
 
 
 @pytest.mark.parametrize("torso", ["fit", "cube"])
-def test_gradcheck(torso: Any) -> None:
+def test_gradcheck(torso):
     d = densify(points_per_limb=2, face_points=3, torso_points=3, torso=torso)
     p = noisy(6, batch=2, sigma=0.04).requires_grad_()
 
@@ -209,7 +209,7 @@ def test_gradcheck(torso: Any) -> None:
     assert torch.autograd.gradcheck(values, (p,), fast_mode=True)
 
 
-def test_batch_items_do_not_mix() -> None:
+def test_batch_items_do_not_mix():
     d, p = densify(), noisy(7, batch=3)
     together = d(p)
     for b in range(3):
@@ -218,7 +218,7 @@ def test_batch_items_do_not_mix() -> None:
         torch.testing.assert_close(together.scales[b : b + 1], alone.scales, atol=1e-12, rtol=0)
 
 
-def test_even_samplers_cover_evenly() -> None:
+def test_even_samplers_cover_evenly():
     """The largest gap is smaller than that of random points."""
     random = np.random.default_rng(0).normal(size=(500, 3))
     random /= np.linalg.norm(random, axis=1, keepdims=True)
@@ -232,7 +232,7 @@ def test_even_samplers_cover_evenly() -> None:
 
 
 @pytest.mark.parametrize("n", [1, 7, 500])
-def test_even_samplers_return_the_requested_number(n: int) -> None:
+def test_even_samplers_return_the_requested_number(n):
     for points, normals in (
         even_cylinder(n),
         even_sphere(n),
@@ -243,12 +243,10 @@ def test_even_samplers_return_the_requested_number(n: int) -> None:
 
 
 @pytest.mark.slow
-def test_shipped_templates_can_be_made_again() -> None:
+def test_shipped_templates_can_be_made_again():
     pytest.importorskip("trimesh")
     script = Path(__file__).parents[2] / "scripts" / "make_skeleton_templates.py"
     spec = importlib.util.spec_from_file_location("make_skeleton_templates", script)
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     made = module.make_templates()
@@ -268,6 +266,6 @@ def test_shipped_templates_can_be_made_again() -> None:
         ({"sampler": "trimesh", "points_per_limb": 64}, "has 200 cylinder points.*64"),
     ],
 )
-def test_unknown_options_are_named(options: dict[str, Any], message: str) -> None:
+def test_unknown_options_are_named(options, message):
     with pytest.raises(ConfigError, match=message):
         Densify(**options)

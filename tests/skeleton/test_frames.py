@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 import torch
 from hypothesis import given
@@ -24,14 +22,14 @@ def all_rotations(f: BoneFrames) -> Tensor:
     return torch.cat([f.hubs, f.limbs, f.local, f.torso.unsqueeze(1)], dim=1)
 
 
-def test_rest_hubs_are_the_body_axes() -> None:
+def test_rest_hubs_are_the_body_axes():
     f = bone_frames(rest())
     eye = torch.eye(3, dtype=torch.float64)
     torch.testing.assert_close(f.hubs[0], eye.expand(3, 3, 3), atol=1e-12, rtol=0)
     torch.testing.assert_close(f.torso[0], eye, atol=1e-12, rtol=0)
 
 
-def test_limb_frames_point_along_the_bones() -> None:
+def test_limb_frames_point_along_the_bones():
     p = noisy(0, batch=3)
     f = bone_frames(p)
     start, end = (list(x) for x in zip(*MEDIAPIPE33.limbs, strict=True))
@@ -42,14 +40,14 @@ def test_limb_frames_point_along_the_bones() -> None:
     torch.testing.assert_close(f.lengths, (bones.square().sum(-1) + 1e-6).sqrt())
 
 
-def test_local_rotation_is_relative_to_the_parent() -> None:
+def test_local_rotation_is_relative_to_the_parent():
     f = bone_frames(noisy(1))
     frames = torch.cat([f.hubs, f.limbs], dim=1)
     parents = frames[:, list(MEDIAPIPE33.limb_parents)]
     torch.testing.assert_close(parents @ f.local, frames[:, N_HUBS:])
 
 
-def test_swing_is_the_shortest_rotation() -> None:
+def test_swing_is_the_shortest_rotation():
     """Against Rodrigues: I + [v]x + [v]x² / (1 + c)."""
     a = torch.nn.functional.normalize(torch.tensor([[0.6, -0.6, 0.5]], dtype=torch.float64))
     b = (rotation(3) @ a.mT).mT
@@ -60,7 +58,7 @@ def test_swing_is_the_shortest_rotation() -> None:
 
 
 @given(angle=st.floats(-0.05, 0.05), roll=st.floats(0, 6.28))
-def test_swing_near_the_antipode_still_hits_its_target(angle: float, roll: float) -> None:
+def test_swing_near_the_antipode_still_hits_its_target(angle, roll):
     a = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
     x, y = torch.tensor([roll], dtype=torch.float64).cos(), torch.tensor([roll]).sin()
     s, c = torch.tensor([angle]).sin(), torch.tensor([angle]).cos()
@@ -73,7 +71,7 @@ def test_swing_near_the_antipode_still_hits_its_target(angle: float, roll: float
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize("name", DEGENERATE)
-def test_degenerate_poses_stay_finite(name: str, dtype: torch.dtype) -> None:
+def test_degenerate_poses_stay_finite(name, dtype):
     p = DEGENERATE[name].clone().to(dtype).requires_grad_()
     f = bone_frames(p)
     code = omega(p, None, rotation(0).to(dtype).unsqueeze(0), frames=f)
@@ -81,12 +79,11 @@ def test_degenerate_poses_stay_finite(name: str, dtype: torch.dtype) -> None:
     assert_rotation(rotation_from_6d(code.detach()), 1e-5)
     weights = torch.linspace(-1, 1, f.limbs.numel(), dtype=dtype).view_as(f.limbs)
     ((f.limbs * weights).sum() + f.lengths.sum() + (code * code.detach().cos()).sum()).backward()
-    assert p.grad is not None
     assert p.grad.isfinite().all()
 
 
 @given(seed=st.integers(0, 10_000))
-def test_frames_turn_with_the_body(seed: int) -> None:
+def test_frames_turn_with_the_body(seed):
     p, R = noisy(seed, sigma=0.06), rotation(seed + 1)
     shift = torch.tensor([3.0, -2.0, 5.0], dtype=torch.float64)
     a, b = bone_frames(p), bone_frames(p @ R.mT + shift)
@@ -97,7 +94,7 @@ def test_frames_turn_with_the_body(seed: int) -> None:
     torch.testing.assert_close(b.lengths, a.lengths, atol=1e-9, rtol=0)
 
 
-def test_only_the_hubs_of_omega_depend_on_rigid_motions() -> None:
+def test_only_the_hubs_of_omega_depend_on_rigid_motions():
     p, R, R_cam = noisy(5), rotation(6), rotation(7).unsqueeze(0)
     a, b = omega(p, None, R_cam), omega(p @ R.mT + 1.0, None, R_cam)
     hubs = [*MEDIAPIPE33.shoulders, *MEDIAPIPE33.hips]
@@ -108,7 +105,7 @@ def test_only_the_hubs_of_omega_depend_on_rigid_motions() -> None:
     torch.testing.assert_close(omega(p @ R.mT, None, R_cam @ R.mT), a, atol=1e-9, rtol=0)
 
 
-def test_omega_layout() -> None:
+def test_omega_layout():
     p, R_cam = noisy(8), rotation(9).unsqueeze(0)
     f = bone_frames(p)
     code = rotation_from_6d(omega(p, None, R_cam))[0]
@@ -128,7 +125,7 @@ def test_omega_layout() -> None:
     torch.testing.assert_close(f.hubs[0, HEAD] @ code[9] @ at_rest, now)
 
 
-def test_omega_is_identity_without_swing() -> None:
+def test_omega_is_identity_without_swing():
     """A pose built from the rest directions: every limb and face code is the identity."""
     p = rest()
     for (a, b), d in zip(MEDIAPIPE33.limbs, MEDIAPIPE33.rest_directions, strict=True):
@@ -139,7 +136,7 @@ def test_omega_is_identity_without_swing() -> None:
     torch.testing.assert_close(code, eye, atol=1e-9, rtol=0)
 
 
-def test_head_falls_back_to_eyes_then_chest() -> None:
+def test_head_falls_back_to_eyes_then_chest():
     """With eyes for ears the frame is the same on a rigid head; with neither it is the chest's."""
     R, p = rotation(2), rest()
     face = list(MEDIAPIPE33.face)
@@ -155,21 +152,21 @@ def test_head_falls_back_to_eyes_then_chest() -> None:
     torch.testing.assert_close(f.hubs[0, HEAD], f.hubs[0, CHEST])
 
 
-def test_a_line_along_the_spine_is_replaced_by_the_other() -> None:
+def test_a_line_along_the_spine_is_replaced_by_the_other():
     R = rotation(4)
     f = bone_frames(DEGENERATE["collinear_shoulders"] @ R.mT)
     torch.testing.assert_close(f.hubs[0, CHEST], R, atol=1e-9, rtol=0)
     torch.testing.assert_close(f.hubs[0, PELVIS], R, atol=1e-9, rtol=0)
 
 
-def test_zero_length_bone_keeps_its_parents_frame() -> None:
+def test_zero_length_bone_keeps_its_parents_frame():
     f = bone_frames(DEGENERATE["zero_length"])
     eye = torch.eye(3, dtype=torch.float64)
     torch.testing.assert_close(f.local[0, LIMB[(13, 15)]], eye, atol=1e-12, rtol=0)
     assert f.lengths[0, LIMB[(13, 15)]] == pytest.approx(1e-3)
 
 
-def test_gradcheck() -> None:
+def test_gradcheck():
     p = noisy(11, sigma=0.05).requires_grad_()
     R_cam = rotation(1).unsqueeze(0)
 
@@ -180,7 +177,7 @@ def test_gradcheck() -> None:
     assert torch.autograd.gradcheck(values, (p,), fast_mode=True)
 
 
-def test_float32_far_from_the_origin_matches_its_own_quantised_input() -> None:
+def test_float32_far_from_the_origin_matches_its_own_quantised_input():
     """No loss beyond the resolution of the input: differences are taken first."""
     p = (noisy(3) + 1e4).float()
     a, b = bone_frames(p), bone_frames(p.double())
@@ -188,13 +185,12 @@ def test_float32_far_from_the_origin_matches_its_own_quantised_input() -> None:
     torch.testing.assert_close(a.hubs.double(), b.hubs, atol=2e-5, rtol=0)
 
 
-def test_constants_from_inference_mode_can_be_used_for_training() -> None:
+def test_constants_from_inference_mode_can_be_used_for_training():
     constants.cache_clear()
     with torch.inference_mode():
         bone_frames(rest())
     p = rest().requires_grad_()
     bone_frames(p).limbs.sum().backward()
-    assert p.grad is not None
 
 
 @pytest.mark.parametrize(
@@ -207,11 +203,11 @@ def test_constants_from_inference_mode_can_be_used_for_training() -> None:
         ({"valid": torch.ones(2, 33, dtype=torch.bool)}, r"valid must.*\[2, 33\]"),
     ],
 )
-def test_misuse_is_named(change: dict[str, Any], message: str) -> None:
+def test_misuse_is_named(change, message):
     with pytest.raises(ValueError, match=message):
         bone_frames(**({"p": rest()} | change))
 
 
-def test_omega_misuse_is_named() -> None:
+def test_omega_misuse_is_named():
     with pytest.raises(ValueError, match=r"R_cam must have shape \[1, 3, 3\], got \[3, 3\]"):
         omega(rest(), None, EYE[0])

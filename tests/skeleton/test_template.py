@@ -7,12 +7,12 @@ import pytest
 
 from gsgan.skeleton import MEDIAPIPE33 as T
 from gsgan.skeleton import TEMPLATES
-from gsgan.skeleton.template import N_HUBS, SkeletonTemplate
+from gsgan.skeleton.template import N_HUBS
 
 every_template = pytest.mark.parametrize("t", TEMPLATES.values(), ids=TEMPLATES)
 
 
-def test_counts() -> None:
+def test_counts():
     assert len(T.names) == len(set(T.names)) == 33
     assert len(T.edges) == len(set(T.edges)) == 35
     assert len(T.limbs) == len(set(T.limbs)) == 22
@@ -23,12 +23,12 @@ def test_counts() -> None:
     ]
 
 
-def test_limbs_are_the_edges_outside_face_and_trunk() -> None:
+def test_limbs_are_the_edges_outside_face_and_trunk():
     off = [e for e in T.edges if max(e) > 10 and not set(e) <= set(T.torso)]
     assert sorted(off) == sorted(T.limbs)
 
 
-def test_every_segment_is_drawn_once() -> None:
+def test_every_segment_is_drawn_once():
     drawn = [edge for _, group in T.draw_groups for edge in group]
     assert sorted(drawn) == sorted([*T.edges, T.ears])
 
@@ -41,20 +41,20 @@ def _components(edges: tuple[tuple[int, int], ...], joints: int = 33) -> int:
 
 
 @every_template
-def test_gnn_edges_join_the_components(t: SkeletonTemplate) -> None:
+def test_gnn_edges_join_the_components(t):
     assert _components(T.edges) == 3
     assert _components(t.gnn_edges, len(t.names)) == 1
     assert len({frozenset(edge) for edge in t.gnn_edges}) == len(t.gnn_edges)
 
 
 @every_template
-def test_tables_have_a_row_per_joint(t: SkeletonTemplate) -> None:
+def test_tables_have_a_row_per_joint(t):
     assert len(t.names) == len(set(t.names)) == len(t.rest_positions) == len(t.mirror)
     drawn = {joint for _, group in t.draw_groups for edge in group for joint in edge}
     assert drawn == set(range(len(t.names)))
 
 
-def test_parents_come_first_and_end_at_the_joint() -> None:
+def test_parents_come_first_and_end_at_the_joint():
     for level, limbs in enumerate(T.levels):
         for limb in limbs:
             parent = T.limb_parents[limb]
@@ -68,14 +68,14 @@ def test_parents_come_first_and_end_at_the_joint() -> None:
     assert T.limbs[by_limb[(29, 31)] - N_HUBS] == (25, 27)
 
 
-def test_every_joint_below_the_trunk_ends_one_bone() -> None:
+def test_every_joint_below_the_trunk_ends_one_bone():
     assert sorted(T.incoming) == [*range(13, 23), *range(25, 33)]
     assert T.limbs[T.incoming[19]] == (15, 19)  # not from the little finger
     assert T.limbs[T.incoming[31]] == (27, 31)  # not from the heel
 
 
 @every_template
-def test_mirror_swaps_sides_of_the_rest_pose(t: SkeletonTemplate) -> None:
+def test_mirror_swaps_sides_of_the_rest_pose(t):
     rest, mirror = np.asarray(t.rest_positions), list(t.mirror)
     np.testing.assert_allclose(rest[mirror] * [-1, 1, 1], rest)
     assert [mirror[m] for m in mirror] == list(range(len(t.names)))
@@ -84,7 +84,7 @@ def test_mirror_swaps_sides_of_the_rest_pose(t: SkeletonTemplate) -> None:
     assert (rest[left, 0] > 0).all()
 
 
-def test_rest_pose_is_a_person() -> None:
+def test_rest_pose_is_a_person():
     rest = np.asarray(T.rest_positions)
     assert 0 < rest[:, 1].min() < 0.05
     assert 1.5 < rest[:, 1].max() < T.stature == 1.7
@@ -93,7 +93,7 @@ def test_rest_pose_is_a_person() -> None:
     assert T.limb_length_sum == pytest.approx(4.298279, abs=1e-5)
 
 
-def test_rest_directions_are_unit_and_mirrored() -> None:
+def test_rest_directions_are_unit_and_mirrored():
     directions = np.asarray(T.rest_directions)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-12)
     for (a, b), d in zip(T.limbs, directions, strict=True):

@@ -44,7 +44,7 @@ def code_of(p: Tensor) -> Tensor:
     return found
 
 
-def test_counts() -> None:
+def test_counts():
     assert len(T.names) == len(set(T.names)) == len(T.rest_positions) == 105
     assert T.names[:75] == MEDIAPIPE33_HANDS.names
     assert T.names[FACE] == FACE_NAMES
@@ -56,7 +56,7 @@ def test_counts() -> None:
     assert T.limb_length_sum == MEDIAPIPE33.limb_length_sum
 
 
-def test_the_face_continues_the_poses_own() -> None:
+def test_the_face_continues_the_poses_own():
     """Corners of lids and lips are those of eyes and mouth; lips, nose, lids, brows follow."""
     for own, pose in (("left_lid_inner", "left_eye_inner"), ("mouth_outer_6", "mouth_right")):
         a, b = (T.rest_positions[T.names.index(name)] for name in (own, pose))
@@ -69,13 +69,13 @@ def test_the_face_continues_the_poses_own() -> None:
     torch.testing.assert_close(hub, torch.eye(3, dtype=F64))
 
 
-def test_a_face_at_rest_has_the_code_zero_however_the_head_is_turned() -> None:
+def test_a_face_at_rest_has_the_code_zero_however_the_head_is_turned():
     p = head_turned(REST) @ rotation(2).mT + 3.0
     torch.testing.assert_close(code_of(p), torch.zeros(1, 30, 3, dtype=F64), atol=1e-10, rtol=0)
     assert face_code(p[:, :33], bone_frames(p[:, :33]).head, MEDIAPIPE33) is None
 
 
-def test_a_lip_that_moves_by_5_mm_changes_the_code_by_1() -> None:
+def test_a_lip_that_moves_by_5_mm_changes_the_code_by_1():
     p = head_turned(REST)
     moved = p.clone()
     moved[:, LIP] -= 0.005 * (p[:, 11] - p[:, 23]) / (p[:, 11] - p[:, 23]).norm()
@@ -90,14 +90,14 @@ def test_a_lip_that_moves_by_5_mm_changes_the_code_by_1() -> None:
     assert not own[:, FACE, 3:].any()
 
 
-def test_codes_of_the_other_joints_are_those_without_a_face() -> None:
+def test_codes_of_the_other_joints_are_those_without_a_face():
     p, R = head_turned(REST), rotation(4)[None]
     ours = omega(p, None, R, T)
     assert torch.equal(ours[:, :75], omega(p[:, :75], None, R, MEDIAPIPE33_HANDS))
 
 
 @pytest.mark.parametrize("lost", [[LIP], [*T.expression], [*T.expression, 9, 10], [*range(11)]])
-def test_a_missing_face_rests_on_the_turned_head(lost: list[int]) -> None:
+def test_a_missing_face_rests_on_the_turned_head(lost):
     turned = head_turned(REST, 5)
     p = turned.clone()
     p[:, lost] = torch.nan
@@ -110,7 +110,7 @@ def test_a_missing_face_rests_on_the_turned_head(lost: list[int]) -> None:
     torch.testing.assert_close(code_of(q), torch.zeros(1, 30, 3, dtype=F64), atol=1e-6, rtol=0)
 
 
-def test_a_missing_face_moves_no_further_than_the_head() -> None:
+def test_a_missing_face_moves_no_further_than_the_head():
     p, step = REST.clone(), 1e-3
     p[:, FACE] = torch.nan
     moved = p.clone()
@@ -119,7 +119,7 @@ def test_a_missing_face_moves_no_further_than_the_head() -> None:
     assert (a - b)[:, FACE].norm(dim=-1).max() < 10 * step
 
 
-def test_a_persons_own_face_rests_in_place_of_the_templates() -> None:
+def test_a_persons_own_face_rests_in_place_of_the_templates():
     own = REST[0, FACE] + 0.01 * torch.randn(30, 3, dtype=F64)
     p = torch.cat([REST[:, :75], own[None]], 1)
     local = in_head(p[:, FACE], p, bone_frames(p, None, T).hubs[:, HEAD], T)
@@ -131,7 +131,7 @@ def test_a_persons_own_face_rests_in_place_of_the_templates() -> None:
     torch.testing.assert_close(sanitise(lost, None, mine)[0], whole, atol=1e-9, rtol=0)
 
 
-def test_slopes_are_finite_where_the_head_vanishes() -> None:
+def test_slopes_are_finite_where_the_head_vanishes():
     p = REST.clone()
     p[:, list(T.face)] = p[:, :1].clone()
     p.requires_grad_()
@@ -140,7 +140,7 @@ def test_slopes_are_finite_where_the_head_vanishes() -> None:
     assert (p.grad[:, FACE].norm(dim=-1) > 0).all()
 
 
-def test_skeletons_with_and_without_a_face_drive_each_others_templates() -> None:
+def test_skeletons_with_and_without_a_face_drive_each_others_templates():
     for joints in (33, 75):
         q, seen = complete_skeleton(REST[0, :joints], None, T, T.limb_length_sum)
         torch.testing.assert_close(q, REST.float(), atol=1e-5, rtol=0)
@@ -151,7 +151,7 @@ def test_skeletons_with_and_without_a_face_drive_each_others_templates() -> None
         assert seen.all()
 
 
-def test_brows_eyes_and_lips_are_drawn_in_channels_of_their_own() -> None:
+def test_brows_eyes_and_lips_are_drawn_in_channels_of_their_own():
     view = camera((256, 256))
     image = draw_skeleton(REST, None, view, T)
     assert torch.equal(image[:, :18], draw_skeleton(REST[:, :75], None, view, MEDIAPIPE33_HANDS))

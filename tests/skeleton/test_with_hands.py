@@ -35,7 +35,7 @@ def noisy(seed: int, size: float = 0.01) -> Tensor:
     return REST + size * torch.randn(1, 75, 3, generator=generator, dtype=F64)
 
 
-def test_counts() -> None:
+def test_counts():
     assert len(T.names) == len(set(T.names)) == 75
     assert T.names[:33] == MEDIAPIPE33.names
     assert T.names[33 + HAND + 8] == "right_index_tip"
@@ -50,7 +50,7 @@ def test_counts() -> None:
         named_template("hands")
 
 
-def test_the_rest_pose_has_hands() -> None:
+def test_the_rest_pose_has_hands():
     rest = np.asarray(T.rest_positions)
     for hand, (wrist, index, pinky, thumb) in zip(
         HANDS, ((15, 19, 17, 21), (16, 20, 18, 22)), strict=True
@@ -61,7 +61,7 @@ def test_the_rest_pose_has_hands() -> None:
         assert (tips < 0.22).all()
 
 
-def test_parents_come_first() -> None:
+def test_parents_come_first():
     level_of = {limb: k for k, level in enumerate(T.levels) for limb in level}
     assert sorted(level_of) == list(range(64))
     for limb, parent in enumerate(T.limb_parents):
@@ -72,13 +72,13 @@ def test_parents_come_first() -> None:
             assert all(level_of[k] < level_of[limb] for k in knuckles)
 
 
-def test_size_is_that_of_the_body_without_hands() -> None:
+def test_size_is_that_of_the_body_without_hands():
     p = noisy(0)
     assert T.limb_length_sum == MEDIAPIPE33.limb_length_sum
     torch.testing.assert_close(limb_length_sum(p, None, T), limb_length_sum(p[:, :33]))
 
 
-def test_frames_of_the_body_are_the_same_with_and_without_hands() -> None:
+def test_frames_of_the_body_are_the_same_with_and_without_hands():
     p = noisy(1, 0.05)
     both, body = bone_frames(p, None, T), bone_frames(p[:, :33])
     assert torch.equal(both.limbs[:, :22], body.limbs)
@@ -89,7 +89,7 @@ def test_frames_of_the_body_are_the_same_with_and_without_hands() -> None:
     assert torch.equal(own[:, :33], other)
 
 
-def test_frames_are_rotations_that_turn_with_the_skeleton() -> None:
+def test_frames_are_rotations_that_turn_with_the_skeleton():
     p, R = noisy(2), rotation(5)
     frames, turned = bone_frames(p, None, T), bone_frames(p @ R.mT, None, T)
     assert_rotation(frames.limbs[0])
@@ -98,7 +98,7 @@ def test_frames_are_rotations_that_turn_with_the_skeleton() -> None:
     torch.testing.assert_close(turned.local[:, list(T.fingers)], frames.local[:, list(T.fingers)])
 
 
-def test_a_turned_forearm_turns_the_fingers_frames() -> None:
+def test_a_turned_forearm_turns_the_fingers_frames():
     """What no bone of the 33 landmarks shows: the hand turns about the forearm's axis."""
     p, hand = REST.clone(), HANDS[0]
     axis = torch.nn.functional.normalize(p[0, 15] - p[0, 13], dim=0)
@@ -110,7 +110,7 @@ def test_a_turned_forearm_turns_the_fingers_frames() -> None:
     torch.testing.assert_close(after, turn @ before)
 
 
-def test_a_palm_that_vanishes_has_finite_frames_and_slopes() -> None:
+def test_a_palm_that_vanishes_has_finite_frames_and_slopes():
     p = REST.clone()
     p[:, HANDS[0]] = p[:, 15:16]
     p.requires_grad_()
@@ -124,7 +124,7 @@ def test_a_palm_that_vanishes_has_finite_frames_and_slopes() -> None:
 @pytest.mark.parametrize(
     "gone", [[33 + 8], [*range(33, 75)], [33 + 5, 33 + 6], [15, *range(33, 54)]]
 )
-def test_missing_joints_are_placed_at_rest(gone: list[int]) -> None:
+def test_missing_joints_are_placed_at_rest(gone):
     R = rotation(3)
     p = REST @ R.mT + torch.tensor([1.0, 2.0, -3.0], dtype=F64)
     lost = p.clone()
@@ -134,14 +134,14 @@ def test_missing_joints_are_placed_at_rest(gone: list[int]) -> None:
     torch.testing.assert_close(q, p, atol=1e-9, rtol=0)
 
 
-def test_a_missing_hand_follows_the_forearm_and_has_the_subjects_size() -> None:
+def test_a_missing_hand_follows_the_forearm_and_has_the_subjects_size():
     p = 1.2 * REST
     p[:, HANDS[1]] = NAN
     q, _ = sanitise(p, None, T)
     torch.testing.assert_close(q, 1.2 * REST, atol=1e-9, rtol=0)
 
 
-def test_skeletons_without_hands_drive_a_template_that_has_some_and_the_reverse() -> None:
+def test_skeletons_without_hands_drive_a_template_that_has_some_and_the_reverse():
     p = noisy(4).float()
     q, seen = complete_skeleton(p[0, :33], None, T, T.limb_length_sum)
     assert q.shape == (1, 75, 3)
@@ -155,7 +155,7 @@ def test_skeletons_without_hands_drive_a_template_that_has_some_and_the_reverse(
         complete_skeleton(p[:, :60], None, T, T.limb_length_sum)
 
 
-def test_points_lie_on_thin_cylinders_along_the_fingers() -> None:
+def test_points_lie_on_thin_cylinders_along_the_fingers():
     d, p = Densify("mediapipe33_hands", dtype=F64), noisy(5, 0.003)
     points, lengths = d(p), bone_frames(p, None, T).lengths[0]
     assert d.n_points == 5400 + 40 * 60
@@ -174,7 +174,7 @@ def test_points_lie_on_thin_cylinders_along_the_fingers() -> None:
     torch.testing.assert_close(points.scales[:, -1000:], body.scales[:, -1000:])
 
 
-def test_points_of_a_missing_hand_are_not_seen() -> None:
+def test_points_of_a_missing_hand_are_not_seen():
     p = REST.clone()
     p[:, HANDS[0]] = NAN
     q, valid = sanitise(p, None, T)
@@ -185,7 +185,7 @@ def test_points_of_a_missing_hand_are_not_seen() -> None:
     assert seen[~left].all()
 
 
-def test_fingers_are_drawn_in_channels_of_their_own() -> None:
+def test_fingers_are_drawn_in_channels_of_their_own():
     view = camera((96, 96))
     image = draw_skeleton(REST, None, view, T)
     assert image.shape == (1, 18, 96, 96)
@@ -202,7 +202,7 @@ def test_fingers_are_drawn_in_channels_of_their_own() -> None:
     assert torch.equal(hidden[0, :13], image[0, :13])
 
 
-def test_a_palm_points_out_of_the_left_hand_and_into_the_right() -> None:
+def test_a_palm_points_out_of_the_left_hand_and_into_the_right():
     """In the rest pose the palms face the thighs: the left one -x, the right one +x."""
     left, right = (palm_frames(REST[:, hand][:, PALM])[0, :, 2] for hand in HANDS)
     assert left[0] < -0.7

@@ -37,7 +37,7 @@ Load = Callable[..., tuple[bool, str]]
 
 
 @pytest.fixture
-def load_afresh(monkeypatch: pytest.MonkeyPatch) -> Load:
+def load_afresh(monkeypatch):
     """available() and why_not() as in a fresh process."""
 
     def load(cache: Path, **environment: str) -> tuple[bool, str]:
@@ -54,21 +54,21 @@ def is_one_sentence(text: str) -> bool:
     return text[:1].isupper() and text.endswith(".") and "\n" not in text
 
 
-def test_compiler_that_does_not_run(tmp_path: Path, load_afresh: Load) -> None:
+def test_compiler_that_does_not_run(tmp_path, load_afresh):
     yes, reason = load_afresh(tmp_path, CXX="/bin/false", PATH="")
     assert not yes
     assert "/bin/false" in reason
     assert is_one_sentence(reason)
 
 
-def test_no_compiler(tmp_path: Path, load_afresh: Load) -> None:
+def test_no_compiler(tmp_path, load_afresh):
     yes, reason = load_afresh(tmp_path, CXX="", PATH=str(tmp_path))
     assert not yes
     assert "No C++ compiler is found" in reason
     assert is_one_sentence(reason)
 
 
-def test_compiler_that_cannot_compile(tmp_path: Path, load_afresh: Load) -> None:
+def test_compiler_that_cannot_compile(tmp_path, load_afresh):
     # Answers --version like a compiler, then fails with a message.
     fake = tmp_path / "fake"
     fake.write_text(
@@ -82,7 +82,7 @@ def test_compiler_that_cannot_compile(tmp_path: Path, load_afresh: Load) -> None
     assert list((tmp_path / "native").iterdir()) == []
 
 
-def test_cache_that_cannot_be_written(tmp_path: Path, load_afresh: Load) -> None:
+def test_cache_that_cannot_be_written(tmp_path, load_afresh):
     (tmp_path / "file").write_text("")
     yes, reason = load_afresh(tmp_path / "file")
     assert not yes
@@ -91,7 +91,7 @@ def test_cache_that_cannot_be_written(tmp_path: Path, load_afresh: Load) -> None
 
 
 @pytest.fixture(scope="module")
-def quick_compiler(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def quick_compiler(tmp_path_factory):
     """A compiler that compiles this one program, has no OpenMP, and takes ``SLOW`` seconds."""
     folder = tmp_path_factory.mktemp("compiler")
     library = shutil.copy(build.library()[0]._name, folder)
@@ -110,13 +110,13 @@ def quick_compiler(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @needs_kernel
-def test_builds_without_openmp(tmp_path: Path, quick_compiler: Path, load_afresh: Load) -> None:
+def test_builds_without_openmp(tmp_path, quick_compiler, load_afresh):
     assert load_afresh(tmp_path, CXX=str(quick_compiler)) == (True, "")
 
 
 @pytest.mark.slow
 @needs_kernel
-def test_one_thread_without_openmp(tmp_path: Path) -> None:
+def test_one_thread_without_openmp(tmp_path):
     command = [*build.compiler(), *build.BASE_FLAGS, str(build.SOURCE), "-o", f"{tmp_path}/x.so"]
     assert subprocess.run(command, check=False).returncode == 0
     library = build.open_library(tmp_path / "x.so")
@@ -126,7 +126,7 @@ def test_one_thread_without_openmp(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @needs_kernel
-def test_two_processes_build_at_once(tmp_path: Path, quick_compiler: Path) -> None:
+def test_two_processes_build_at_once(tmp_path, quick_compiler):
     answers: list[tuple[bool, str]] = []
 
     def build() -> None:

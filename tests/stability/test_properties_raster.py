@@ -10,7 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsgan.splat import ACCURACY, Accuracy, project, rasterise
+from gsgan.splat import ACCURACY, project, rasterise
 from gsgan.splat.project import rotations
 from gsgan.splat.reference import _alphas, _pixel_chunks, _sorted
 from stability.cases.case import Inputs, Tolerance, assert_as_expected, drawing_backends
@@ -87,7 +87,7 @@ def test_values_and_gradients_are_finite_and_alpha_in_0_to_1(backend, drawn):
 @every_backend
 @pytest.mark.parametrize("accuracy", [uncut(HIGH), HIGH], ids=lambda s: s.name)
 @given(scenes())
-def test_values_and_gradients_are_right(backend, accuracy: Accuracy, drawn):
+def test_values_and_gradients_are_right(backend, accuracy, drawn):
     scene, size = drawn
     # Below the cap of alpha: rounding decides which side of it an alpha is on, and the gradient
     # jumps there (the cap itself is a case of its own).
@@ -146,7 +146,6 @@ def test_the_order_of_the_list_and_an_opacity_of_0_change_nothing(backend, drawn
         limit = 1e-9 * max(1.0, float(value.abs().max()))
         torch.testing.assert_close(got[name].detach(), value, atol=limit, rtol=0)
     got["features"].sum().backward()
-    assert opacity.grad is not None
     with torch.no_grad():
         half = {**more, "opacities": more["opacities"] + 0.5 * (torch.arange(n + 1) == n)}
         slope = 2 * (draw(half)["features"].sum() - want["features"].sum())

@@ -46,7 +46,7 @@ def landmark(character, name: str) -> np.ndarray:
     return points[character.anchor_names.index(name)]
 
 
-def test_geometry_is_metric_upright_and_faces_minus_y(tiny) -> None:
+def test_geometry_is_metric_upright_and_faces_minus_y(tiny):
     np.testing.assert_allclose(tiny.vertices[:, 2].min(), 0, atol=1e-6)
     np.testing.assert_allclose(np.ptp(tiny.vertices[:, 2]), 1.77, atol=1e-5)
     np.testing.assert_allclose(joint(tiny, "LeftHand"), [0.7, 0, 1.42], atol=1e-5)
@@ -57,7 +57,7 @@ def test_geometry_is_metric_upright_and_faces_minus_y(tiny) -> None:
     np.testing.assert_allclose(np.linalg.norm(tiny.normals, axis=1), 1)  # made: the file has none
 
 
-def test_a_sparse_morph_moves_only_its_vertices(tiny) -> None:
+def test_a_sparse_morph_moves_only_its_vertices(tiny):
     assert set(tiny.shapes) == {"mouth_open"}
     moved = np.flatnonzero(tiny.shapes["mouth_open"].any(1))
     assert len(moved) == 8
@@ -65,7 +65,7 @@ def test_a_sparse_morph_moves_only_its_vertices(tiny) -> None:
 
 
 @pytest.mark.parametrize("unit", [0.01, 1.0, 3.7, 100.0])
-def test_the_unit_is_found_from_the_height(tmp_path, unit, tiny) -> None:
+def test_the_unit_is_found_from_the_height(tmp_path, unit, tiny):
     other = read_character(TinyGlb(unit=unit).write(tmp_path / "a.glb"))
     scale = 1.7 / 1.77 if unit in (0.01, 3.7) else 1  # no usual unit: 1.7 m tall
     np.testing.assert_allclose(other.vertices, scale * tiny.vertices, atol=1e-5)
@@ -73,7 +73,7 @@ def test_the_unit_is_found_from_the_height(tmp_path, unit, tiny) -> None:
                                atol=1e-6)  # fmt: skip
 
 
-def test_another_heading_and_place_make_no_difference(tmp_path, tiny) -> None:
+def test_another_heading_and_place_make_no_difference(tmp_path, tiny):
     glb = TinyGlb()
     root = pygltflib.Node(
         name="Armature", translation=[3, 1, 2], rotation=[0, 1, 0, 0], children=[0]
@@ -84,7 +84,7 @@ def test_another_heading_and_place_make_no_difference(tmp_path, tiny) -> None:
     np.testing.assert_allclose(other.joints, tiny.joints, atol=1e-5)
 
 
-def test_quantised_positions_are_those_of_floats(tmp_path, tiny) -> None:
+def test_quantised_positions_are_those_of_floats(tmp_path, tiny):
     """KHR_mesh_quantization: the inverse bind matrices take integers back to metres."""
     glb = TinyGlb()
     x = tiny.vertices @ np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]).T
@@ -100,7 +100,7 @@ def test_quantised_positions_are_those_of_floats(tmp_path, tiny) -> None:
     np.testing.assert_allclose(other.vertices, tiny.vertices, atol=1e-4)
 
 
-def test_the_four_largest_of_eight_weights_are_kept(tmp_path) -> None:
+def test_the_four_largest_of_eight_weights_are_kept(tmp_path):
     glb = TinyGlb()
     attributes = glb.doc.meshes[0].primitives[0].attributes
     count = glb.doc.accessors[attributes.POSITION].count
@@ -117,7 +117,7 @@ def test_the_four_largest_of_eight_weights_are_kept(tmp_path) -> None:
     np.testing.assert_allclose(character.bone_weight[0], np.array([0.35, 0.3, 0.2, 0.1]) / 0.95)
 
 
-def test_textures_factors_and_coverage(tmp_path) -> None:
+def test_textures_factors_and_coverage(tmp_path):
     glb = TinyGlb()
     material = glb.doc.materials[0]
     plain = read_character(glb.write(tmp_path / "opaque.glb")).surfaces[0]
@@ -133,7 +133,7 @@ def test_textures_factors_and_coverage(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("version", [0, 1])
-def test_vrm_maps_bones(tmp_path, version, tiny) -> None:
+def test_vrm_maps_bones(tmp_path, version, tiny):
     names = {bone: f"J_{k}" for k, bone in enumerate(BONES)}
     glb = TinyGlb(names=names)
     mapped = {VRM[bone]: k for k, bone in enumerate(BONES)}
@@ -153,18 +153,18 @@ def test_vrm_maps_bones(tmp_path, version, tiny) -> None:
     ("mixamorigRightHandIndex1", "RightHandIndex1"), ("LeftUpLeg", "LeftUpLeg"),
     ("HeadTop_End", None), ("Hair1", None),
 ])  # fmt: skip
-def test_names_of_mixamo(name, bone) -> None:
+def test_names_of_mixamo(name, bone):
     assert mixamo_bone(name) == bone
 
 
-def test_names_of_vrm_thumbs_and_fingers() -> None:
+def test_names_of_vrm_thumbs_and_fingers():
     assert vrm_bone("leftThumbProximal", 0) == "LeftHandThumb1"
     assert vrm_bone("leftThumbProximal", 1) == "LeftHandThumb2"
     assert vrm_bone("rightLittleDistal", 1) == "RightHandPinky3"
     assert vrm_bone("jaw", 1) == "Jaw"
 
 
-def test_labels_and_landmarks_without_colours_fingers_or_eyes(tiny) -> None:
+def test_labels_and_landmarks_without_colours_fingers_or_eyes(tiny):
     name = np.array(tiny.label_names)[tiny.labels]
     assert tiny.label_names == free_body().label_names
     assert {"upper_clothes", "face_neck", "left_hand", "right_shoe"} <= set(name)
@@ -177,7 +177,7 @@ def test_labels_and_landmarks_without_colours_fingers_or_eyes(tiny) -> None:
     np.testing.assert_allclose(landmark(tiny, "right_hip"), joint(tiny, "RightUpLeg"))
 
 
-def test_names_of_materials_decide_labels(tmp_path) -> None:
+def test_names_of_materials_decide_labels(tmp_path):
     glb = TinyGlb()
     glb.doc.materials[0].name = "Wolf3D_Outfit_Footwear"
     character = read_character(glb.write(tmp_path / "a.glb"))
@@ -215,7 +215,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("message", BAD)
-def test_bad_files_end_in_one_sentence(tmp_path, message) -> None:
+def test_bad_files_end_in_one_sentence(tmp_path, message):
     glb, path = TinyGlb(), tmp_path / "a.glb"
     BAD[message](glb)
     with pytest.raises(DataError, match=message) as error:
@@ -224,7 +224,7 @@ def test_bad_files_end_in_one_sentence(tmp_path, message) -> None:
     assert "\n" not in str(error.value)
 
 
-def test_damaged_bytes_end_in_one_sentence(tmp_path) -> None:
+def test_damaged_bytes_end_in_one_sentence(tmp_path):
     path = tmp_path / "a.glb"
     with pytest.raises(DataError, match="no such file"):
         read_character(path)
@@ -239,7 +239,7 @@ def test_damaged_bytes_end_in_one_sentence(tmp_path) -> None:
             read_character(path)
 
 
-def test_avatars_are_whole(avatar) -> None:
+def test_avatars_are_whole(avatar):
     assert AVATARS[avatar.name].stat().st_size < 4e6
     assert 1.6 < np.ptp(avatar.vertices[:, 2]) < 1.9
     assert (avatar.labels >= 1).all()
@@ -252,7 +252,7 @@ def test_avatars_are_whole(avatar) -> None:
     assert max(np.abs(v).max() for v in avatar.shapes.values()) < 0.04  # metres
 
 
-def test_sides_of_avatars(avatar) -> None:
+def test_sides_of_avatars(avatar):
     """Left is +X: bones, shapes and landmarks agree."""
     for name in ("smile", "blink", "brow_up"):
         offsets = np.linalg.norm(avatar.shapes[f"{name}_left"], axis=1)
@@ -262,7 +262,7 @@ def test_sides_of_avatars(avatar) -> None:
             assert landmark(avatar, name)[0] > 0.005, name
 
 
-def test_face_landmarks_of_avatars_lie_on_the_face(avatar) -> None:
+def test_face_landmarks_of_avatars_lie_on_the_face(avatar):
     for side in ("left", "right"):
         eye = avatar.joints[avatar.bones.index(f"{side.capitalize()}Eye")]
         seen = landmark(avatar, f"{side}_eye")
@@ -281,7 +281,7 @@ def test_face_landmarks_of_avatars_lie_on_the_face(avatar) -> None:
     assert landmark(avatar, "nose")[1] < ring[:, 1].min()
 
 
-def test_avatars_are_their_originals() -> None:
+def test_avatars_are_their_originals():
     """The bake moved no vertex by more than its quantisation, and kept landmarks and labels."""
     pytest.importorskip("meshoptimizer")
     source = VALID / "White_M_1_Casual.glb"
@@ -299,7 +299,7 @@ def test_avatars_are_their_originals() -> None:
     np.testing.assert_allclose(*counts, rtol=0.02)
 
 
-def test_compressed_files_without_the_decoder_name_the_extra(monkeypatch) -> None:
+def test_compressed_files_without_the_decoder_name_the_extra(monkeypatch):
     source = VALID / "White_M_1_Casual.glb"
     if not source.is_file():
         pytest.skip(f"no original avatar at {source}")
@@ -308,7 +308,7 @@ def test_compressed_files_without_the_decoder_name_the_extra(monkeypatch) -> Non
         read_character(source)
 
 
-def test_normal_maps_of_avatars_have_y_up(avatar) -> None:
+def test_normal_maps_of_avatars_have_y_up(avatar):
     """A bump's slopes are those of one surface: d(slope x)/dy = d(slope y)/dx, y up."""
     x, y, z = np.moveaxis(avatar.surfaces[0].normal.astype(float) / 127.5 - 1, -1, 0)
     down = np.gradient(x / np.maximum(z, 0.2), axis=0)

@@ -123,7 +123,7 @@ def _images() -> Iterator[Case]:
         yield raster_case(
             "LBS",
             name,
-            lambda arm=arm: arm,  # type: ignore[misc]
+            lambda arm=arm: arm,
             draw=_rendered,
             note=note,
         )

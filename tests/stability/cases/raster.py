@@ -63,7 +63,6 @@ def raster_case(
 def render(inputs: Inputs, backend: str, *, size: Size, settings: Accuracy) -> dict[str, Tensor]:
     """Features, alpha and depth of a scene."""
     raster = rasterise(*records(inputs, size), settings=settings, backend=backend, depth=True)
-    assert raster.depth is not None
     return {"features": raster.features, "alpha": raster.alpha, "depth": raster.depth}
 
 

@@ -41,7 +41,7 @@ def cases() -> Iterator[Case]:
         within = 1e-3 if note == _ANGLE else 1e-4
         yield _case(
             name,
-            lambda x=x: {"x": x},  # type: ignore[misc]
+            lambda x=x: {"x": x},
             lambda inputs: {"rotation": rotation_from_6d(inputs["x"])},
             tolerance=Tolerance(within, within),
             note=note,
