@@ -1,25 +1,12 @@
-"""Overlaps and silhouettes against values known in advance."""
+"""The estimated silhouette against values known in advance."""
 
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
-from gsgan.check.views import body_silhouette, overlap
+from gsgan.check.views import body_silhouette
 from gsgan.data.cameras import CameraEntry
 from gsgan.skeleton.template import MEDIAPIPE33
-
-
-def square(size=(40, 60), rows=slice(10, 20), columns=slice(20, 40)):
-    mask = np.zeros(size, bool)
-    mask[rows, columns] = True
-    return mask
-
-
-def test_overlap():
-    a, b = square(), square(columns=slice(30, 50))
-    assert overlap(a, b) == pytest.approx(1 / 3)
-    assert overlap(a & ~a, b & ~b) == 0
 
 
 def silhouette(pixels, depth=2.0, visible=None, size=(200, 120), focal=200.0):

@@ -5,10 +5,15 @@ from __future__ import annotations
 import struct
 import zlib
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from writers.smpl import posed
 
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.formats.capture import SKELETON_LIMITS, read_capture
 from gsgan.data.formats.consistency import Consistency
+from gsgan.data.formats.smpl_motion import SmplMotion
 from gsgan.data.layout import Layout
 from gsgan.scene import Frame
 
@@ -35,3 +40,22 @@ def png(width: int, height: int, depth: int, kind: int, row: bytes) -> bytes:
     data = zlib.compress((b"\0" + row) * height)
     start = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + palette
     return start + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+
+
+def check_cameras(layout: Layout, cameras: list) -> None:
+    """Cameras are read as they were written, but for pixel centres, which are ours at +0.5."""
+    for entry, camera in zip(layout.cameras.values(), cameras, strict=True):
+        assert np.allclose(entry.K - camera.K, [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], atol=1e-6)
+        assert np.allclose(entry.R, camera.R, atol=1e-6)
+        assert np.allclose(entry.t, camera.t, atol=1e-6)
+        assert np.allclose(entry.dist[:5], camera.dist, atol=1e-6)
+        assert entry.size == camera.size[::-1]
+
+
+def check_poses(layout: Layout, subject: Any, blend: bool = True) -> None:
+    """theta and transl, in the model's own convention, give the vertices that were written."""
+    held = (layout.poses.theta, layout.poses.transl)
+    theta, transl = (np.stack([of[f] for f in subject.frames]) for of in held)
+    betas = np.repeat(subject.shapes[None], len(theta), 0)
+    motion = SmplMotion(np.array(subject.frames), theta, transl, betas)
+    assert np.allclose(posed(subject.model, motion, blend)[0], subject.vertices, atol=1e-6)

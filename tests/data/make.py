@@ -176,3 +176,21 @@ def edit_json(path: Path, change: Any) -> None:
     content = json.loads(path.read_text())
     change(content)
     path.write_text(json.dumps(content))
+
+
+def edit_npz(path: Path, change: Any) -> None:
+    """Applies ``change`` to the arrays in an npz file, in place."""
+    with np.load(path) as archive:
+        arrays = dict(archive)
+    change(arrays)
+    np.savez(path, **arrays)
+
+
+def damaged(data: bytes, rng: np.random.Generator) -> bytes:
+    """Cut off, or some bytes changed; half of them in the head, which matters most."""
+    if rng.random() < 0.3:
+        return data[: rng.integers(max(len(data), 1))]
+    changed = bytearray(data)
+    for i in range(rng.integers(1, 6) if data else 0):
+        changed[rng.integers(min(len(data), 200) if i % 2 else len(data))] = rng.integers(256)
+    return bytes(changed)

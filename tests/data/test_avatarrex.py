@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from capture_frames import check_cameras
 from writers.avatarrex import SERIALS, write_avatarrex
 
 from gsgan.data.files import read_colour
@@ -32,10 +33,8 @@ def test_read_equals_written(root, smplx_subject, smplx_file):
     assert layout.notes == ()  # a lens of zeros and a list that is not there need no note
     assert layout.camera_names == SERIALS  # the calibration's order, which indices count
     s = smplx_subject
-    for c, (name, camera) in enumerate(zip(SERIALS, s.cameras, strict=True)):
-        assert np.allclose(layout.cameras[name].t, camera.t, atol=1e-6)
-        assert np.allclose(layout.cameras[name].R, camera.R, atol=1e-6)
-        assert layout.cameras[name].size == camera.size[::-1]
+    check_cameras(layout, s.cameras)
+    for c, name in enumerate(SERIALS):
         assert layout.image_path(name, 1) == root / name / "00000001.jpg"
         assert layout.mask_path(name, 1) == root / name / "mask/pha/00000001.jpg"
         image = read_colour(layout.image_path(name, 1)).astype(int)

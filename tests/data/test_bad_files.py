@@ -12,7 +12,15 @@ import cv2
 import numpy as np
 import pytest
 from capture_frames import items, png
-from make import edit_json, skeletons, write_landmarks, write_tiny_capture
+from make import (
+    edit_json,
+    edit_npz,
+    skeletons,
+    write_face,
+    write_hands,
+    write_landmarks,
+    write_tiny_capture,
+)
 from PIL import Image
 from writers.common import write_object
 from writers.easymocap import write_easymocap
@@ -81,14 +89,7 @@ def edited(name: str, change: Callable[[Any], object]) -> Damage:
 
 def arrays(name: str, change: Callable[[dict[str, Any]], object]) -> Damage:
     """Changes the arrays of an npz file."""
-
-    def damage(root: Path) -> None:
-        with np.load(root / name) as archive:
-            held = dict(archive)
-        change(held)
-        np.savez(root / name, **held)
-
-    return damage
+    return lambda root: edit_npz(root / name, change)
 
 
 def objects(pattern: str, change: Callable[[Any], object]) -> Damage:
@@ -127,6 +128,14 @@ def landmarks(**changed: object) -> Damage:
 def poses(**changed: object) -> Damage:
     held = {"theta": np.zeros((4, 56, 3)), "transl": np.zeros((4, 3)), "frame_id": np.arange(4)}
     return lambda root: np.savez(root / "body_pose.npz", **(held | changed))
+
+
+def hands(**changed: object) -> Damage:
+    return lambda root: write_hands(root, 4, **changed)
+
+
+def face(**changed: object) -> Damage:
+    return lambda root: write_face(root, 4, **changed)
 
 
 def turned_round(rig: dict) -> None:
@@ -177,6 +186,11 @@ CAPTURE: dict[str, Damage] = {
     "has no array 'frame_id'": lambda root: np.savez(root / "landmarks3d.npz", p=skeletons(4)),
     "no usable frame: 4 with fewer than 12 joints": landmarks(p=np.full((4, 33, 3), np.nan)),
     "no usable frame: 4 without a row in landmarks3d": landmarks(frame_id=np.arange(100, 104)),
+    r"hands3d.npz: .*'p' must have shape \(any, 42, 3\)": hands(p=np.zeros((4, 21, 3))),
+    r"hands3d.npz: .*'conf' must have shape \(4, 42\)": hands(conf=np.ones((4, 33))),
+    "hands3d.npz: .*frame_id 0 appears more than once": hands(frame_id=np.zeros(4)),
+    r"face3d.npz: .*'p' must have shape \(any, 30, 3\)": face(p=np.zeros((4, 468, 3))),
+    "'names' must be those .*from mouth_outer_0 to": face(names=np.array(["lip"] * 30)),
     r"'theta' must have shape \(4, any, 3\)": poses(theta=np.zeros((4, 168))),
     "masks/cam00/000000.png shows no person, nor": image("masks/*/*.png", GREY),
     "000001.png has 16 bits a channel": image("masks/cam00/000001.png", GREY.astype(np.uint16)),

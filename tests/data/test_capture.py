@@ -16,10 +16,9 @@ from gsgan.data.dataset import CaptureDataset, ImageCache
 from gsgan.data.files import cut_off
 from gsgan.data.formats.capture import CaptureReader, read_capture
 from gsgan.data.formats.consistency import Consistency
-from gsgan.data.skeletons import fill_missing
-from gsgan.data.validation import Thresholds, spans
+from gsgan.data.validation import Thresholds
 from gsgan.scene import cat
-from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.errors import DataError
 
 
 def test_frame_holds_what_its_docstring_says(tmp_path):
@@ -97,8 +96,6 @@ def test_a_band_round_the_outline_is_left_out_of_the_loss(tmp_path):
     assert (person & ~band).any()
     edge = (person[:, 1:] != person[:, :-1]).nonzero()
     assert band[edge[:, 0], edge[:, 1]].all()
-    with pytest.raises(ConfigError, match=r"data\.reader\.ignore_band must be a whole number"):
-        CaptureReader(ignore_band=-1)
 
 
 def test_landmark_rows_in_any_order(tmp_path):
@@ -135,16 +132,6 @@ def test_missing_joints_stand_in_from_the_nearest_frame(tmp_path):
     others = np.delete(truth[3], [16, 21], axis=0)
     assert np.allclose(joints[3, 21], others.mean(0), atol=1e-6)
     assert any("1 joints further than 3 m" in note for note in layout.notes)
-
-
-def test_nearest_in_time_counts_frame_numbers_not_rows():
-    p = np.arange(4.0)[:, None, None] * np.ones((4, 1, 3))
-    valid = np.array([[True], [False], [False], [True]])
-    filled = fill_missing(p, valid, np.array([0, 10, 90, 100]))
-    assert filled[:, 0, 0].tolist() == [0, 0, 3, 3]
-    filled = fill_missing(p, valid, np.array([0, 80, 90, 100]))
-    assert filled[:, 0, 0].tolist() == [0, 3, 3, 3]
-    assert (fill_missing(p, np.zeros((4, 1), bool), np.arange(4)) == 0).all()
 
 
 def test_frames_with_too_few_joints_are_dropped_and_counted(tmp_path):
@@ -245,11 +232,6 @@ def test_cache_keeps_within_its_bound_and_changes_nothing(tmp_path):
     assert cached[0].image.shape == (1, 3, 24, 32)  # the last one used is still held
     with pytest.raises(DataError, match="does not exist"):
         cached[2]
-
-
-def test_spans():
-    assert spans([3, 1, 2, 7]) == "1-3, 7"
-    assert spans([5]) == "5"
 
 
 def test_loose_calibration_habits_are_accepted(tmp_path):

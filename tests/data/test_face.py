@@ -9,8 +9,7 @@ import pytest
 from make import skeletons, write_face, write_hands, write_tiny_capture
 
 from gsgan.data.datamodule import GsganData
-from gsgan.data.formats.capture import read_capture
-from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.errors import ConfigError
 
 WHOLE = {"size": 32, "skeleton": "holistic", "body": "none"}
 FACE = slice(75, 105)
@@ -85,17 +84,3 @@ def test_captures_without_a_face_are_refused_by_name(root):
     (root / "hands3d.npz").unlink()
     with pytest.raises(ConfigError, match=r"needs a capture's hands3d.npz, .*=mediapipe33$"):
         assert GsganData(str(root), **WHOLE).layout
-
-
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        ({"p": np.zeros((4, 468, 3))}, r"'p' must have shape \(any, 30, 3\), found \(4, 468, 3\)"),
-        ({"conf": np.ones((4, 42))}, r"'conf' must have shape \(4, 30\)"),
-        ({"names": np.array(["lip"] * 30)}, r"'names' must be those .*from mouth_outer_0 to"),
-    ],
-)
-def test_damaged_files_are_named(root, damage, message):
-    write_face(root, 4, **damage)
-    with pytest.raises(DataError, match=rf"face3d.npz: .*{message}"):
-        read_capture(root)

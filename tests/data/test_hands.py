@@ -70,20 +70,6 @@ def test_a_capture_without_hands_is_refused_by_name(root):
         GsganData(str(root), skeleton="hands")
 
 
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        ({"p": np.zeros((4, 21, 3))}, r"'p' must have shape \(any, 42, 3\), found \(4, 21, 3\)"),
-        ({"conf": np.ones((4, 33))}, r"'conf' must have shape \(4, 42\)"),
-        ({"frame_id": np.zeros(4)}, "frame_id 0 appears more than once"),
-    ],
-)
-def test_damaged_files_are_named(root, damage, message):
-    write_hands(root, 4, **damage)
-    with pytest.raises(DataError, match=rf"hands3d.npz: .*{message}"):
-        read_capture(root)
-
-
 def test_fitted_poses_have_their_fingers_with_hands_alone(root):
     write_hands(root, 4)
     shape = {"coefficients": np.zeros(10), "stretch": np.ones(8), "offsets": np.zeros((33, 3))}

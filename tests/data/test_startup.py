@@ -8,7 +8,7 @@ import weakref
 import numpy as np
 import pytest
 import torch
-from make import write_tiny_capture
+from make import edit_npz, write_tiny_capture
 from operators import Calls
 
 from gsgan.data.datamodule import GsganData, default_workers
@@ -24,11 +24,12 @@ def without_mouth(capture, tmp_path):
     import shutil
 
     root = shutil.copytree(capture, tmp_path / "smpl")
-    with np.load(root / "landmarks3d.npz") as held:
-        arrays = dict(held)
-    arrays["p"][:, MOUTH] = np.nan
-    arrays["conf"][:, MOUTH] = 0
-    np.savez(root / "landmarks3d.npz", **arrays)
+
+    def change(arrays):
+        arrays["p"][:, MOUTH] = np.nan
+        arrays["conf"][:, MOUTH] = 0
+
+    edit_npz(root / "landmarks3d.npz", change)
     return root
 
 

@@ -13,14 +13,13 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from capture_frames import check_cameras, check_poses
 from writers import zju as writers
-from writers.common import Subject, make_subject, write_object, write_picture
-from writers.smpl import posed
+from writers.common import Subject, make_subject, write_picture
 
 from gsgan.body.smpl_names import CIHP
 from gsgan.data.dataset import CaptureDataset
-from gsgan.data.formats.smpl_motion import SmplMotion, landmarks_of
-from gsgan.data.formats.zju import ZjuReader, camera_folders, frame_number, read_annots
+from gsgan.data.formats.zju import ZjuReader
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_labels, read_mask
 from gsgan.data.validation import Thresholds
@@ -50,18 +49,6 @@ def original(written, tmp_path):
     return Path(shutil.copytree(written, tmp_path / "CoreView_377"))
 
 
-def check_cameras(layout: Layout, subject: Subject) -> None:
-    for entry, camera in zip(layout.cameras.values(), subject.cameras, strict=True):
-        K = camera.K + np.array(
-            [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
-        )  # our pixel centres are at +0.5
-        assert np.allclose(entry.K, K, atol=1e-6)
-        assert np.allclose(entry.R, camera.R, atol=1e-6)
-        assert np.allclose(entry.t, camera.t, atol=1e-6)
-        assert np.allclose(entry.dist[:5], camera.dist, atol=1e-6)
-        assert entry.size == camera.size[::-1]
-
-
 def check_skeletons(layout: Layout, subject: Subject, vertices: bool = True) -> None:
     for i, frame in enumerate(subject.frames):
         p, conf = to_mediapipe33(subject.joints[i], subject.vertices[i] if vertices else None)
@@ -69,17 +56,6 @@ def check_skeletons(layout: Layout, subject: Subject, vertices: bool = True) -> 
         assert np.allclose(layout.landmarks.p[frame][seen], p[seen], atol=1e-5)
         assert np.array_equal(layout.landmarks.visibility[frame], conf)
         assert np.isfinite(layout.landmarks.p[frame]).all()
-
-
-def check_poses(layout: Layout, subject: Subject, blend: bool = True) -> None:
-    """theta and transl, in the model's own convention, give the vertices that were written."""
-    theta, transl = (
-        np.stack([held[f] for f in subject.frames])
-        for held in (layout.poses.theta, layout.poses.transl)
-    )
-    betas = np.repeat(subject.shapes[None], len(theta), 0)
-    motion = SmplMotion(np.array(subject.frames), theta, transl, betas)
-    assert np.allclose(posed(subject.model, motion, blend)[0], subject.vertices, atol=1e-6)
 
 
 def check_images(layout: Layout, subject: Subject) -> None:
@@ -99,7 +75,7 @@ def test_the_original_release_is_read_as_it_was_written(written, subject, smpl_f
     layout = read(written, smpl_file)
     assert layout.camera_names == ("Camera_B1", "Camera_B2", "Camera_B3")
     assert layout.frames == (0, 1, 2, 3)
-    check_cameras(layout, subject)
+    check_cameras(layout, subject.cameras)
     check_skeletons(layout, subject)
     check_poses(layout, subject)
     check_images(layout, subject)
@@ -173,28 +149,9 @@ def test_subjects_313_and_315(smpl_file, tmp_path, renamed):
     layout = read(root, smpl_file)
     assert layout.camera_names == tuple(f"Camera ({n})" for n in NUMBERS)
     assert layout.frames == (1, 2, 3, 4)
-    check_cameras(layout, odd)
+    check_cameras(layout, odd.cameras)
     check_skeletons(layout, odd)
     check_images(layout, odd)
-
-
-def test_frame_numbers_of_long_names():
-    name = "CoreView_313_Camera_(1)_0042_2019-08-23_16-08-50.592"
-    assert frame_number(name) == 42
-    assert frame_number("0042") == 42
-    assert frame_number("000042") == 42
-    assert frame_number("frame") is None
-
-
-def test_21_cameras_keep_their_own_numbers(tmp_path):
-    numbers = [*range(1, 20), 22, 23]
-    for n in numbers:
-        (tmp_path / f"Camera ({n})").mkdir()
-    cams = {key: [np.eye(3).tolist()] * 21 for key in "KRTD"}
-    ims = [{"ims": [f"Camera ({n})/0001.jpg" for n in numbers]}]
-    write_object(tmp_path / "annots.npy", {"cams": cams, "ims": ims})
-    names = list(camera_folders(tmp_path, read_annots(tmp_path)))
-    assert (names[19], names[20]) == ("Camera (22)", "Camera (23)")
 
 
 @pytest.mark.parametrize("listed", ["backslash", "slash", "none"])
@@ -202,24 +159,11 @@ def test_the_refined_release(subject, smpl_file, tmp_path, listed):
     root = writers.write_refined(tmp_path / "my_377", subject, listed)
     layout = read(root, smpl_file)
     assert layout.camera_names == ("00", "01", "02")
-    check_cameras(layout, subject)
+    check_cameras(layout, subject.cameras)
     check_skeletons(layout, subject)
     check_poses(layout, subject)
     check_images(layout, subject)
     assert not layout.labels
-
-
-def test_landmarks_from_few_vertices_are_those_of_all(subject):
-    betas = np.repeat(subject.shapes[None], 4, 0)
-    theta = subject.poses.reshape(4, 24, 3).copy()
-    theta[:, 0] = subject.Rh
-    motion = SmplMotion(np.arange(4), theta, subject.Th, betas)
-    for blend in (True, False):
-        vertices, joints = posed(subject.model, motion, blend)
-        expected, conf = to_mediapipe33(joints, vertices)
-        p, found = landmarks_of(subject.model, motion, blend)
-        assert np.array_equal(conf, found)
-        assert np.allclose(p[conf > 0], expected[conf > 0], atol=1e-12)
 
 
 def test_the_index_is_small_and_goes_to_worker_processes(written, smpl_file):

@@ -129,15 +129,6 @@ def test_an_effect_that_the_model_lacks_is_off_or_refused(model, effect, why):
     assert not getattr(decide(scene(), replace(forced, impossible="off"), model), effect).on
 
 
-def test_decisions_survive_a_checkpoint(tmp_path):
-    import torch
-
-    tinted = decide(scene(surface=replace(ALIKE, difference=0.07)), EffectSettings())
-    assert tinted.cameras == CAMERAS
-    torch.save(tinted.plain(), tmp_path / "effects.pt")
-    assert Effects.from_plain(torch.load(tmp_path / "effects.pt", weights_only=True)) == tinted
-
-
 @pytest.mark.parametrize(
     ("wrong", "named"),
     [

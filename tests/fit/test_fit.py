@@ -14,7 +14,7 @@ import torch
 from commands import refused
 from fit_quick import QUICK
 from hydra.utils import instantiate
-from make import write_hands, write_tiny_capture
+from make import edit_npz, write_hands, write_tiny_capture
 
 import gsgan.utils.compat  # noqa: F401
 from gsgan.body.shape import BodyShape, free_space, shaped_body
@@ -34,9 +34,7 @@ from gsgan.utils.errors import ConfigError, DataError
 def with_landmarks(people: Path, to: Path, change) -> Path:
     """A copy of the capture whose landmarks ``change`` alters in place."""
     shutil.copytree(people, to)
-    arrays = dict(np.load(to / "landmarks3d.npz"))
-    change(arrays)
-    np.savez(to / "landmarks3d.npz", **arrays)
+    edit_npz(to / "landmarks3d.npz", change)
     return to
 
 

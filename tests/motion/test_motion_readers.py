@@ -178,28 +178,6 @@ def test_bad_json(tmp_path, proportions, content, message):
         standard(path, proportions)
 
 
-def test_pose2sim(tmp_path, landmarks, proportions):
-    names = [n for n in MEDIAPIPE33.names if "eye" not in n]
-    shown = [f"{n[0].upper()}{n.split('_')[1]}" if "_" in n[4:] else n for n in names]
-    shown = [n if n not in ("Lfoot", "Rfoot") else n[0] + "BigToe" for n in shown]
-    lines = [
-        "PathFileType\t4\t(X/Y/Z)\ta.trc",
-        "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits",
-    ]
-    lines += [f"50\t50\t12\t{len(shown)}\tmm", "Frame#\tTime\t" + "\t\t\t".join(shown), ""]
-    for i, p in enumerate(landmarks[:, [MEDIAPIPE33.names.index(n) for n in names]]):
-        numbers = "\t".join(f"{1000 * x:.9f}" for x in p[:, [1, 2, 0]].ravel())
-        lines.append(f"{i}\t{i / 50}\t{numbers}")
-    path = tmp_path / "a.trc"
-    path.write_text("\n".join(lines))
-    p, motion = standard(path, proportions)
-    assert motion.fps == 50
-    np.testing.assert_allclose(directions(p), directions(landmarks), atol=1e-6)
-    path.write_text("\n".join(lines)[:700])
-    with pytest.raises(DataError, match=r"a\.trc"):
-        standard(path, proportions)
-
-
 def test_pose_files_with_axes_of_unknown_scale(tmp_path, landmarks, proportions):
     names = [n.upper() for n in MEDIAPIPE33.names]
 

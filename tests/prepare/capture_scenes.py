@@ -49,37 +49,11 @@ def turned(cameras: CameraArray, camera: int, degrees: float, metres: float) -> 
 # ------------------------------------------------ calibration files, as other tools write them
 
 
-def _matrix(name: str, value: np.ndarray) -> str:
-    value = np.atleast_2d(value)
-    data = ", ".join(repr(float(v)) for v in value.ravel())
-    return (
-        f"{name}: !!opencv-matrix\n   rows: {value.shape[0]}\n   cols: {value.shape[1]}\n"
-        f"   dt: d\n   data: [ {data} ]\n"
-    )
-
-
 def centred_at_zero(camera: CameraEntry) -> np.ndarray:
     """K as OpenCV counts: from the centre of the first pixel."""
     K = camera.K.copy()
     K[:2, 2] -= 0.5
     return K
-
-
-def write_easymocap(folder: Path, cameras: Sequence[CameraEntry], sizes: bool = True) -> Path:
-    """intri.yml and extri.yml, the second in another order and with a "none" among the names."""
-    head = "%YAML:1.0\n---\nnames:\n"
-    intri = head + "".join(f'   - "{c.name}"\n' for c in cameras) + '   - "none"\n'
-    for c in cameras:
-        intri += _matrix(f"K_{c.name}", centred_at_zero(c))
-        intri += _matrix(f"dist_{c.name}", c.dist[None, :5])
-        intri += f"H_{c.name}: {c.size[0]}\nW_{c.name}: {c.size[1]}\n" if sizes else ""
-    extri = head + "".join(f'   - "{c.name}"\n' for c in reversed(cameras))
-    for c in reversed(cameras):
-        extri += _matrix(f"R_{c.name}", cv2.Rodrigues(c.R)[0]) + _matrix(f"Rot_{c.name}", c.R)
-        extri += _matrix(f"T_{c.name}", c.t[:, None])
-    (folder / "intri.yml").write_text(intri)
-    (folder / "extri.yml").write_text(extri)
-    return folder / "intri.yml"
 
 
 def write_toml(

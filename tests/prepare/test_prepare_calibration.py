@@ -7,7 +7,6 @@ import pytest
 from capture_scenes import (
     LENS,
     ring,
-    write_easymocap,
     write_own,
     write_toml,
 )
@@ -26,24 +25,6 @@ def equal(found, expected, lens: int = 5) -> None:
         np.testing.assert_allclose(read.R, camera.R, atol=1e-9)
         np.testing.assert_allclose(read.t, camera.t, atol=1e-9)
         np.testing.assert_allclose(read.dist[:lens], camera.dist[:lens], atol=1e-12)
-
-
-def test_easymocap_pairs_by_name_though_the_orders_differ(tmp_path):
-    cameras = ring(dist=LENS)
-    calibration = read_calibration(write_easymocap(tmp_path, cameras))
-    assert calibration.format == "OpenCV YAML"
-    equal(calibration.cameras, cameras)
-
-
-def test_easymocap_camera_without_its_other_half(tmp_path):
-    write_easymocap(tmp_path, ring())
-    text = (tmp_path / "extri.yml").read_text().replace("T_cam1", "T_camX")
-    (tmp_path / "extri.yml").write_text(text)
-    with pytest.raises(DataError, match=r"extri\.yml lacks .*cam1"):
-        read_calibration(tmp_path / "intri.yml")
-    (tmp_path / "extri.yml").unlink()
-    with pytest.raises(DataError, match=r"extri\.yml does not exist"):
-        read_calibration(tmp_path / "intri.yml")
 
 
 def test_pose2sim_toml(tmp_path):
@@ -136,6 +117,6 @@ def test_finds_the_one_calibration_of_a_project(tmp_path):
     (tmp_path / "calibration").mkdir()
     path = write_toml(tmp_path / "calibration" / "Calib.toml", ring())
     assert find_calibration(tmp_path) == path
-    write_easymocap(tmp_path, ring())
+    write_own(tmp_path / "cameras.json", ring())
     with pytest.raises(DataError, match=r"more than one.*Calib\.toml"):
         find_calibration(tmp_path)

@@ -13,9 +13,10 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from capture_scenes import LENS, ring, write_easymocap, write_own, write_toml
-from make import skeletons
+from capture_scenes import LENS, ring, write_own, write_toml
+from make import damaged, skeletons
 from test_prepare_points3d import write_trc
+from writers.easymocap import write_calibration
 
 import gsgan.prepare.mediapipe as tool
 from gsgan.data.calibration import read_calibration
@@ -135,16 +136,6 @@ def test_strong_lenses_are_undistorted_to_the_corners():
     np.testing.assert_allclose(undistort_points(camera, bent), straight, atol=1e-3)
 
 
-def damaged(data: bytes, rng: np.random.Generator) -> bytes:
-    """Cut off, or some bytes changed."""
-    if rng.random() < 0.3:
-        return data[: rng.integers(len(data))]
-    changed = bytearray(data)
-    for at in rng.integers(len(data), size=rng.integers(1, 6)):
-        changed[at] = rng.integers(256)
-    return bytes(changed)
-
-
 def person(tmp_path: Path) -> Path:
     path = tmp_path / "0.json"
     path.write_text(json.dumps({"people": [{"pose_keypoints_2d": [3.5, 4.0, 0.9] * 25}]}))
@@ -157,13 +148,14 @@ def tool_npz(tmp_path: Path) -> Path:
     return tmp_path / "a.npz"
 
 
-def extrinsics(tmp_path: Path) -> Path:
-    return write_easymocap(tmp_path, ring(dist=LENS)).with_name("extri.yml")
+def opencv_yaml(folder: Path, name: str) -> Path:
+    write_calibration(folder, SimpleNamespace(cameras=ring(dist=LENS)[:3]))
+    return folder / name
 
 
 READERS = {
-    "intri": (read_calibration, lambda p: write_easymocap(p, ring(dist=LENS))),
-    "extri": (read_calibration, extrinsics),
+    "intri": (read_calibration, lambda p: opencv_yaml(p, "intri.yml")),
+    "extri": (read_calibration, lambda p: opencv_yaml(p, "extri.yml")),
     "toml": (read_calibration, lambda p: write_toml(p / "Calib.toml", ring(dist=LENS))),
     "json": (read_calibration, lambda p: write_own(p / "cameras.json", ring(dist=LENS))),
     "openpose": (lambda p: read_detections(p.parent), person),

@@ -9,6 +9,7 @@ import pytest
 from make import skeletons
 
 from gsgan.motion.points import read_points3d
+from gsgan.motion.readers import Source, read_motion
 from gsgan.utils.errors import DataError
 
 MARKERS = {
@@ -50,7 +51,7 @@ def write_trc(path: Path, p: np.ndarray, unit: str = "m") -> Path:
 
 
 @pytest.mark.parametrize("unit", ["m", "mm"])
-def test_trc_units_axes_and_names_are_converted(tmp_path, unit):
+def test_trc_units_axes_and_names_are_converted(tmp_path, proportions, unit):
     p = skeletons(4)
     p[2, 15] = np.nan
     found = read_points3d(write_trc(tmp_path / "a.trc", p, unit))
@@ -60,6 +61,7 @@ def test_trc_units_axes_and_names_are_converted(tmp_path, unit):
     assert np.isnan(found[1][:, unknown]).all()
     assert (found[2][:, unknown] == 0).all()
     assert found[2][2, 15] == 0
+    assert read_motion(tmp_path / "a.trc", Source(proportions)).fps == 60
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from make import damaged
 from writers import python2
 
 from gsgan.utils.errors import DataError
@@ -227,15 +228,6 @@ def test_a_missing_file_and_a_folder(tmp_path, read):
         read(tmp_path)
 
 
-def _damaged(content: bytes, rng: np.random.Generator) -> bytes:
-    if rng.random() < 0.3:
-        return content[: rng.integers(len(content))]
-    changed = bytearray(content)
-    for _ in range(rng.integers(1, 4)):
-        changed[rng.integers(len(changed))] = rng.integers(256)
-    return bytes(changed)
-
-
 @pytest.mark.parametrize("kind", ["protocol 0", "protocol 2", "protocol 4", "npy", "npz"])
 def test_damage_is_read_or_refused_and_nothing_else(tmp_path, kind):
     smpl_like = {
@@ -258,7 +250,7 @@ def test_damage_is_read_or_refused_and_nothing_else(tmp_path, kind):
     rng, sentences = np.random.default_rng(0), []
     for _ in range(100):
         try:
-            reader(write(tmp_path, _damaged(stream.getvalue(), rng)))
+            reader(write(tmp_path, damaged(stream.getvalue(), rng)))
         except DataError as error:
             sentences.append(str(error))
     assert len(sentences) > 25

@@ -173,8 +173,9 @@ def _as_data_error(path: Path, what: str) -> Iterator[None]:
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror or error}") from None
     except _Refused as error:
+        name = " ".join(str(error).split())  # of a damaged file: it may have line breaks
         raise DataError(
-            f"{path} asks for {error}, which is not allowed, since a pickle can run code; nothing "
+            f"{path} asks for {name}, which is not allowed, since a pickle can run code; nothing "
             "was run: save its content as plain arrays with numpy.savez"
         ) from None
     except Exception as error:
