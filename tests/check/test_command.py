@@ -89,14 +89,6 @@ def test_warnings_end_with_1_where_strict(good, command, tmp_path, strict, ends)
     assert code == ends
 
 
-def test_data_that_cannot_be_read_leave_a_report_too(copy, command):
-    (copy / "meta.json").write_text("{")
-    code, output, page = command(f"data.root={copy}", *FEW)
-    assert code == 1
-    assert "Traceback" not in output
-    assert "meta.json is not valid JSON" in page
-
-
 def test_names_from_the_data_are_escaped(copy, command):
     (copy / "images" / "cam00").rename(copy / "images" / "<b>&")
     code, _, page = command(f"data.root={copy}", *FEW)

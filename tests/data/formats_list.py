@@ -26,13 +26,7 @@ from gsgan.data.validation import Thresholds
 
 @dataclass(frozen=True)
 class Format:
-    """One format on disk.
-
-    Args:
-        name: for the test's name.
-        write: a subject into a folder that does not exist yet.
-        read: the folder, with the subject's model file.
-    """
+    """How a subject is written into a new folder, and read with the subject's model file."""
 
     name: str
     write: Callable[[Path, Subject], object]

@@ -85,24 +85,9 @@ def write_tiny_capture(
     meta: dict[str, Any] | None = None,
     first_frame: int = 0,
 ) -> Path:
-    """Writes a valid capture in the bring-your-own layout.
+    """Writes a valid capture in the bring-your-own layout: cameras cam00, cam01, … on a ring.
 
-    Args:
-        root: where to; made if need be.
-        cameras: on a ring round the person, named cam00, cam01, ...
-        frames: moments.
-        size: (w, h) pixels.
-        suffix: of the pictures, png or jpg.
-        labels: write part labels too (0, 1 = upper half, 2 = lower half).
-        body_pose: write a pose of 56 bones too.
-        unit: in which lengths are written.
-        dist: lens distortion of every camera.
-        splits: for meta.json.
-        meta: further keys for meta.json.
-        first_frame: number of the first frame.
-
-    Returns:
-        root.
+    ``labels``: 0, 1 = upper half, 2 = lower half; ``body_pose``: 56 bones; ``size``: (w, h).
     """
     per_metre = {"m": 1, "cm": 100, "mm": 1000}[unit]
     root.mkdir(parents=True, exist_ok=True)

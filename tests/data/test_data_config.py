@@ -11,7 +11,7 @@ from hydra import compose, initialize_config_dir
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 
-from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.errors import ConfigError
 
 capture = ten_frames.capture
 
@@ -70,9 +70,3 @@ def test_other_groups_set_size_seed_and_length_of_an_epoch(name):
     assert conf(name).size in (128, 256)
     if name == "synthetic":
         assert with_group.source.size == 32
-
-
-def test_a_wrong_root_says_so(tmp_path):
-    data = instantiate(conf("capture", f"root={tmp_path / 'no'}"))
-    with pytest.raises(DataError, match=r"data.root=.*no does not exist"):
-        data.setup()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
 from gsgan.metrics.regions import box_corners, box_mask, inside_hull
@@ -26,12 +27,19 @@ def test_corners_are_the_bounds_and_a_margin():
     assert corners.amax(0).tolist() == [1.5, 1.5, 4.5]
 
 
-def test_a_box_before_the_camera_covers_its_near_face():
-    """Near face at z = 1 from -0.4 to 0.4: 4 pixels either side of the middle."""
-    points = torch.tensor([[-0.4, -0.4, 1.0], [0.4, 0.4, 2.0]])
-    mask = box_mask(box_corners(points, 0.0), camera())
+@pytest.mark.parametrize(
+    ("points", "rows", "columns"),
+    [
+        # a face at z = 1 from -0.4 to 0.4: 4 pixels either side of the middle
+        ([[-0.4, -0.4, 1.0], [0.4, 0.4, 2.0]], slice(6, 14), slice(6, 14)),
+        # x from 0.5 on, cut at the near plane: what is near covers all that is right of it
+        ([[0.5, -100.0, -5.0], [0.6, 100.0, 1.0]], slice(0, 20), slice(15, 20)),
+    ],
+)
+def test_a_box_covers_its_near_face(points, rows, columns):
+    mask = box_mask(box_corners(torch.tensor(points), 0.0), camera())
     expected = torch.zeros(1, 20, 20, dtype=torch.bool)
-    expected[:, 6:14, 6:14] = True
+    expected[:, rows, columns] = True
     assert torch.equal(mask, expected)
 
 
@@ -40,15 +48,6 @@ def test_a_box_behind_the_camera_covers_nothing_and_one_around_it_everything():
     behind = ahead * torch.tensor([1.0, 1.0, -1.0])
     assert not box_mask(box_corners(behind, 0.0), camera()).any()
     assert box_mask(box_corners(torch.cat([ahead, behind]), 0.0), camera()).all()
-
-
-def test_a_box_that_reaches_behind_the_camera_is_cut_at_the_near_plane():
-    """To the right of the axis: x from 0.5 on; what is near covers all that is right of it."""
-    points = torch.tensor([[0.5, -100.0, -5.0], [0.6, 100.0, 1.0]])
-    mask = box_mask(box_corners(points, 0.0), camera())
-    expected = torch.zeros(1, 20, 20, dtype=torch.bool)
-    expected[:, :, 15:] = True  # at z = 1: 10 + 10 * 0.5
-    assert torch.equal(mask, expected)
 
 
 def test_points_on_the_edge_are_inside_and_flat_polygons_cover_nothing():

@@ -74,11 +74,6 @@ def test_ssim_is_torchmetrics(value_range):
     assert ours == pytest.approx(float(metric(image, target)), abs=1e-6)
 
 
-def test_a_wrong_range_makes_ssim_higher():
-    image, target = pair()
-    assert (ssim(image, target, value_range=2.0) > ssim(image, target)).all()
-
-
 def test_ssim_of_equal_images_is_one_and_of_slivers_undefined():
     image = torch.rand(3, 3, 16, 16)
     torch.testing.assert_close(ssim(image, image), torch.ones(3))
@@ -103,11 +98,6 @@ def test_uniform_ssim_is_its_definition_window_by_window(value_range):
         scores.append(np.mean(windows))
     found = ssim_uniform(image, target, value_range=value_range)
     assert found.tolist() == pytest.approx(scores, abs=1e-9)
-
-
-def test_equal_images_are_infinite():
-    image = torch.rand(1, 3, 16, 16)
-    assert math.isinf(float(psnr(image, image)))
 
 
 def test_the_persons_box_leaves_the_background_out():

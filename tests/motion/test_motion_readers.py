@@ -436,13 +436,7 @@ def test_real_files(proportions):
 
 
 def published(root: np.ndarray, body: np.ndarray, moves: np.ndarray) -> dict[str, dict[str, Any]]:
-    """The arrays of published files, with their keys and shapes, of a body's pose.
-
-    Args:
-        root: ``[F, 3]`` axis-angle.
-        body: ``[F, 63]`` of the 21 joints that SMPL, SMPL-H and SMPL-X share.
-        moves: ``[F, 3]`` metres.
-    """
+    """Arrays with published keys and shapes; ``body [F, 63]`` is of SMPL-H's 21 joints."""
     F = len(root)
     zeros = {n: np.zeros((F, n)) for n in (3, 6, 90)}
     x = np.concatenate([root, body, zeros[3], zeros[6], zeros[90]], axis=1)

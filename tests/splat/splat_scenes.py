@@ -7,6 +7,7 @@ from dataclasses import fields, replace
 
 import pytest
 import torch
+from stability.cases import raster
 from torch import Tensor
 
 from gsgan.scene import Camera, Gaussians, Raster
@@ -44,19 +45,8 @@ def cloud(
     dtype: torch.dtype = torch.float64,
 ) -> Gaussians:
     """Random Gaussians two metres in front of ``camera()``."""
-    g = torch.Generator().manual_seed(seed)
-
-    def rand(*shape: int) -> Tensor:
-        return torch.rand(batch, n, *shape, generator=g, dtype=torch.float64)
-
-    low, high = opacity
-    return Gaussians(
-        means=(rand(3) - 0.5) * torch.tensor([1.6, 1.2, 1.0]) + torch.tensor([0.0, 0.0, 2.0]),
-        quats=rand(4) * 2 - 1,
-        scales=scale * torch.exp(rand(3) * 2 - 1),
-        opacities=low + (high - low) * rand(),
-        features=rand(channels),
-    ).to(dtype)
+    scene = raster.cloud(n, channels, batch=batch, seed=seed, scale=scale, opacity=opacity)
+    return Gaussians(**scene).to(dtype)
 
 
 def one(
@@ -178,9 +168,9 @@ every_setting = pytest.mark.parametrize("settings", list(ACCURACY))
 def draw(gaussians, cam, settings, backend, depth=True):
     """The image and the gradients of a random weighting of it."""
     gaussians, cam = leaves(gaussians), leaves(cam)
-    raster = rasterise(gaussians, cam, settings=settings, backend=backend, depth=depth)
-    loss(raster).backward()
-    return raster, gradients(gaussians, cam)
+    drawn = rasterise(gaussians, cam, settings=settings, backend=backend, depth=depth)
+    loss(drawn).backward()
+    return drawn, gradients(gaussians, cam)
 
 
 def assert_like_reference(
@@ -202,10 +192,10 @@ def assert_like_reference(
         assert error(got_grads[name], grad) < gradient, name
 
 
-def turned(cam: Camera) -> Camera:
+def turned(cam: Camera, skew: float = 3.0, offset: float = 2.5) -> Camera:
     """Rotated, shifted, with skew, an off-centre principal point and non-square pixels."""
     axis = torch.tensor([[0, -0.1, 0.05], [0.1, 0, 0.2], [-0.05, -0.2, 0]], dtype=cam.K.dtype)
     K = cam.K.clone()
-    K[:, 0, 1], K[:, 0, 2], K[:, 1, 1] = 3.0, K[:, 0, 2] + 2.5, K[:, 1, 1] * 0.8
+    K[:, 0, 1], K[:, 0, 2], K[:, 1, 1] = skew, K[:, 0, 2] + offset, K[:, 1, 1] * 0.8
     R = torch.matrix_exp(axis).expand_as(cam.R).clone()
     return replace(cam, K=K, R=R, t=cam.t + torch.tensor([0.1, -0.05, 0.3], dtype=cam.t.dtype))

@@ -6,9 +6,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from splat_scenes import BACKENDS, camera, cloud, needs_native, with_covariances
+from splat_scenes import BACKENDS, camera, cloud, needs_native, turned, with_covariances
 
-from gsgan.scene import Camera
 from gsgan.splat import ACCURACY, native_project, project, rasterise, sh_to_colour
 
 EXACT = ACCURACY["exact"]
@@ -18,21 +17,12 @@ every_backend = pytest.mark.parametrize("backend", BACKENDS)
 every_shape = pytest.mark.parametrize("shape", ["quats", "covariances"])
 
 
-def turned(cam: Camera) -> Camera:
-    """Skew, an off-centre principal point, non-square pixels, a rotation and a shift."""
-    axis = torch.tensor([[0, -0.1, 0.05], [0.1, 0, 0.2], [-0.05, -0.2, 0]], dtype=torch.float64)
-    K = cam.K.clone()
-    K[:, 0, 1], K[:, 0, 2], K[:, 1, 1] = 0.7, K[:, 0, 2] + 0.5, K[:, 1, 1] * 0.8
-    R = torch.matrix_exp(axis).expand_as(cam.R).clone()
-    return replace(cam, K=K, R=R, t=cam.t + torch.tensor([0.1, -0.05, 0.3], dtype=torch.float64))
-
-
 def scene(shape: str, n: int = 3, batch: int = 1):
     """A few Gaussians, a small camera, and the names of the given tensors."""
     gaussians = cloud(n, 2, scale=0.15, batch=batch)
     gaussians = with_covariances(gaussians) if shape == "covariances" else gaussians
     names = [name for name, value in vars(gaussians).items() if value is not None]
-    return gaussians, turned(camera((3, 4), focal=4.0, batch=batch)), names
+    return gaussians, turned(camera((3, 4), focal=4.0, batch=batch), skew=0.7, offset=0.5), names
 
 
 def checked(function, *tensors) -> bool:

@@ -10,6 +10,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from gsgan.motion.character import Animation, Character
+from gsgan.motion.rotations import axis_angle, twist
 
 TRUNK = {
     "Hips": (None, (0, 0.02, 0.98)),
@@ -110,3 +111,19 @@ def inside(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.nd
         hit = np.asarray(scene.run(points.astype(np.float32), rays)).astype(int)
         leaves += (hit >= 0) & (normal[hit] @ ray > 0)
     return leaves >= 3
+
+
+def local(person: Character, motion: Animation, name: str) -> np.ndarray:
+    """Rotations ``[F, 3, 3]`` of a bone against its parent, from the T pose."""
+    j = person.bones.index(name)
+    return np.swapaxes(motion.rotations[:, person.parents[j]], -1, -2) @ motion.rotations[:, j]
+
+
+def assert_limits(person: Character, motion: Animation, limits: dict, twisted: float) -> None:
+    """Bones rotate at most so many degrees; forearms and hands, which wring skin, twist less."""
+    for bone, limit in limits.items():
+        for name in (bone,) if bone in person.bones else ("Left" + bone, "Right" + bone):
+            angle = np.degrees(np.linalg.norm(axis_angle(local(person, motion, name)), axis=-1))
+            assert angle.max() <= limit, (name, motion.passages[angle.argmax()])
+    for name in ("LeftForeArm", "LeftHand", "RightForeArm", "RightHand"):
+        assert np.abs(np.degrees(twist(local(person, motion, name), 0))).max() < twisted, name

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from mannequin import inside, mannequin
+from mannequin import assert_limits, inside, mannequin
 from scipy.spatial import cKDTree
 
 from gsgan.motion.rig import SIDES
-from gsgan.motion.rotations import axis_angle, twist
+from gsgan.motion.rotations import axis_angle
 from gsgan.synthetic.controls import frame_times
 from gsgan.synthetic.gltf import AVATARS, read_character
 from gsgan.synthetic.posing import Choreography
@@ -75,16 +75,8 @@ def test_signs_are_short_and_some_are_held_out_whole():
 
 
 def test_wrists_and_fingers_stay_within_their_limits(polo, signing):
-    def local(name):
-        j = polo.bones.index(name)
-        return np.swapaxes(signing.rotations[:, polo.parents[j]], 1, 2) @ signing.rotations[:, j]
-
-    for side in SIDES:
-        for bone, limit in (("Arm", 125), ("ForeArm", 150), ("Hand", 75), ("HandIndex1", 100)):
-            angle = np.degrees(np.linalg.norm(axis_angle(local(side + bone)), axis=-1))
-            assert angle.max() <= limit, side + bone
-        for bone in ("ForeArm", "Hand"):
-            assert np.abs(np.degrees(twist(local(side + bone), 0))).max() < 50, side + bone
+    limits = {"Arm": 125, "ForeArm": 150, "Hand": 75, "HandIndex1": 100}
+    assert_limits(polo, signing, limits, twisted=50)
 
 
 def test_motion_is_smooth(polo):

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from mannequin import SHAPES, inside, mannequin, reposed
+from mannequin import SHAPES, assert_limits, inside, local, mannequin, reposed
 
 from gsgan.motion.rig import SIDES, Pose, Rig, two_bone
 from gsgan.motion.rotations import axis_angle, between, blend, rotation, twist
@@ -47,22 +47,10 @@ def joint(person, motion, name):
     return motion.joints[:, person.bones.index(name)]
 
 
-def local(person, motion, name):
-    """Rotations ``[F, 3, 3]`` of a bone against its parent, degrees' axes as the T pose."""
-    j = person.bones.index(name)
-    return np.swapaxes(motion.rotations[:, person.parents[j]], -1, -2) @ motion.rotations[:, j]
-
-
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_joints_stay_within_their_limits(person, seed):
     moves = Choreography(person, seed).at(frame_times(350, EVERYDAY.duration))
-    for bone, limit in LIMITS.items():
-        for name in (bone,) if bone in person.bones else ("Left" + bone, "Right" + bone):
-            angle = np.degrees(np.linalg.norm(axis_angle(local(person, moves, name)), axis=-1))
-            assert angle.max() <= limit, name
-    for side in SIDES:
-        for bone in ("ForeArm", "Hand"):  # together the range of the forearm, none wrings the skin
-            assert np.abs(np.degrees(twist(local(person, moves, side + bone), 0))).max() < 45
+    assert_limits(person, moves, LIMITS, twisted=45)
 
 
 def test_knees_and_elbows_are_hinges(person, dense):

@@ -31,13 +31,7 @@ def body_25(subject: Subject, frame: int) -> np.ndarray:
 def write_calibration(
     root: Path, subject: Subject, sizes: bool = True, lens: str = "dist", both: bool = True
 ) -> None:
-    """intri.yml and extri.yml by OpenCV, names in another order and with a "none" among them.
-
-    Args:
-        sizes: say H and W.
-        lens: key of the lens, "dist" or "D".
-        both: say Rot beside R.
-    """
+    """intri.yml and extri.yml by OpenCV, names in another order and with a "none" among them."""
     root.mkdir(parents=True, exist_ok=True)
     cameras = dict(zip(NAMES, subject.cameras, strict=True))
     intri = cv2.FileStorage(str(root / "intri.yml"), cv2.FILE_STORAGE_WRITE)
@@ -76,15 +70,7 @@ def write_easymocap(
     pid: bool = False,
     hands: bool = False,
 ) -> Path:
-    """A recording and its results.
-
-    Args:
-        kinds: of results.
-        output: folder of the results, "" or "output/".
-        person: id of the subject.
-        pid: masks are named by frame and person.
-        hands: 67 joints.
-    """
+    """A recording and its results in ``output``; with ``pid`` masks are named by person too."""
     write_calibration(root, subject)
     for i, frame in enumerate(subject.frames):
         for c, name in enumerate(NAMES):

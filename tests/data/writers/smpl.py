@@ -53,17 +53,10 @@ def write_smpl(
     drop: tuple[str, ...] = (),
     replace: dict[str, Any] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Writes a model file and returns the arrays in it.
+    """Writes a model file (.npz: plain arrays, else a pickle) and returns the arrays in it.
 
-    Args:
-        path: .npz writes plain arrays; anything else a pickle.
-        kind: 24 or 55 joints.
-        chumpy: shapedirs as a chumpy object, as in the original male and female files.
-        protocol: of the pickle; 0 and 2 as Python 2 wrote them.
-        vertices: how many; None for the model's own 6890 or 10475.
-        sparse: the regressor as scipy's csc_matrix.
-        drop: keys left out.
-        replace: other values for some keys.
+    ``chumpy`` and protocols 0 and 2 are as the original files have them; ``vertices`` None are the
+    model's own 6890 or 10475; keys in ``drop`` are left out.
     """
     plain = smpl_arrays(kind, vertices)
     content: dict[str, Any] = {**plain, **(replace or {})}

@@ -65,12 +65,8 @@ def write_original(
 def write_313(
     root: Path, subject: Subject, numbers: tuple[int, ...], renamed: bool = False
 ) -> Path:
-    """Subjects 313 and 315: ``Camera (1)``, long names, frames from 1, nested lists.
-
-    Args:
-        numbers: of the cameras, e.g. (1, 2, 19, 22).
-        renamed: ``Camera (1)/0001.jpg``, as some copies have it.
-    """
+    """Subjects 313 and 315: ``Camera (1)``, frames from 1, nested lists; long names or, renamed,
+    ``Camera (1)/0001.jpg``."""
     ims = []
     for i, frame in enumerate(subject.frames):
         stems = [f"{frame:04d}" if renamed else OLD_NAME.format(n, frame) for n in numbers]
@@ -84,12 +80,8 @@ def write_313(
 
 
 def write_refined(root: Path, subject: Subject, listed: str = "backslash") -> Path:
-    """my_377 and its like: images/00, mask/00, smpl_params.
-
-    Args:
-        listed: "backslash" or "slash" paths in annots.npy, or "none": annots_new.npy alone, whose
-            list of pictures is empty.
-    """
+    """my_377 and its like: images/00, mask/00, smpl_params. Paths are listed with a "backslash" or
+    "slash", or in annots_new.npy alone ("none")."""
     names = [f"{i:02d}" for i in range(len(subject.cameras))]
     ims = []
     for i, frame in enumerate(subject.frames):

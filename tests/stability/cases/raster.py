@@ -146,16 +146,18 @@ def cloud(
     n: int = 12,
     channels: int = 3,
     *,
+    batch: int = 1,
+    seed: int = 0,
     scale: float = 0.08,
     opacity: tuple[float, float] = (0.05, 0.95),
     middle: Numbers = (0.0, 0.0, 2.0),
     extent: Numbers = (1.6, 1.2, 1.0),
 ) -> Inputs:
     """Random Gaussians that fill most of the image, two metres away."""
-    generator = torch.Generator().manual_seed(0)
+    generator = torch.Generator().manual_seed(seed)
 
     def rand(*shape: int) -> Tensor:
-        return torch.rand(1, n, *shape, generator=generator, dtype=torch.float64)
+        return torch.rand(batch, n, *shape, generator=generator, dtype=torch.float64)
 
     low, high = opacity
     place = torch.tensor([list(extent), list(middle)], dtype=torch.float64)

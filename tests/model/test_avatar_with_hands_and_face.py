@@ -1,7 +1,8 @@
-"""Avatars of skeletons with a face: every part takes 105 joints, and the face may be missing."""
+"""Avatars of skeletons with hands and a face: every part takes them, and both may be missing."""
 
 from __future__ import annotations
 
+import re
 import shutil
 
 import numpy as np
@@ -11,14 +12,16 @@ from commands import TINY
 from make import write_face, write_hands
 
 import gsgan
+from gsgan.body import free_body
 from gsgan.export.splats import splats_of
 from gsgan.model.assemble import build_data
-from gsgan.model.drive import inputs_of, rest_pose
+from gsgan.model.body_points import BodyPoints
+from gsgan.model.drive import Drive, inputs_of, rest_pose
 from gsgan.model.pose_graph import pose_inputs
 from gsgan.model.stored import load_config
-from gsgan.skeleton import bone_frames, face_code
+from gsgan.skeleton import TEMPLATES, bone_frames, face_code
 
-FACE = slice(75, 105)
+FACE, HANDS = slice(75, 105), slice(33, 75)
 UP = torch.tensor([0, 0, 0.005])
 AXES = torch.tensor([1.0, 1, -1])  # left, up, front from the capture's x, z, y
 
@@ -37,10 +40,17 @@ def made(build, signing):
     return lambda *given: build(f"data.root={signing}", "data.skeleton=holistic", *given)
 
 
-@pytest.mark.parametrize("model", ["full", "wo_gcn", "image_to_image", "lbs_splat"])
-def test_every_model_takes_a_face(made, model):
-    _, avatar, frame = made(f"model={model}")
-    assert frame.skeleton.shape == (1, 105, 3)
+@pytest.fixture
+def handed(build, signing):
+    return lambda *given: build(f"data.root={signing}", "data.skeleton=mediapipe33_hands", *given)
+
+
+@pytest.mark.parametrize("skeleton", ["holistic", "mediapipe33_hands"])
+@pytest.mark.parametrize("model", ["full", "wo_gcn", "splat_only", "image_to_image", "lbs_splat"])
+def test_every_model_takes_hands_and_a_face(build, signing, model, skeleton):
+    _, avatar, frame = build(f"data.root={signing}", f"data.skeleton={skeleton}", f"model={model}")
+    assert avatar.template.names == TEMPLATES[skeleton].names
+    assert frame.skeleton.shape == (1, len(avatar.template.names), 3)
     with torch.no_grad():
         image = avatar(*frame.inputs).image
     assert image.shape == frame.image.shape
@@ -100,3 +110,58 @@ def test_a_run_with_a_face_is_trained_loaded_and_driven_without(inside, signing,
 
 def _centred(face):
     return face - face.mean(0)
+
+
+def test_fingers_move_what_is_on_the_body(handed):
+    """Solved from skeletons: the fingers that the hands show, at rest without them."""
+    _, avatar, frame = handed("effects.body_points=on", "model=splat_only")
+    assert isinstance(avatar.body_points, BodyPoints)
+    p, seen = frame.skeleton, frame.visibility
+    with_hands = avatar.body_pose(p, seen).theta
+    without = avatar.body_pose(p, torch.cat([seen[:, :33], 0 * seen[:, HANDS]], 1)).theta
+    off = (with_hands - without).norm(dim=-1)[0]
+    assert off.max() > 3 * off[free_body().joint_names.index("root")]  # the trunk leans little
+    moved = off > 0.15  # radians
+    fingers = set(avatar.solver.fingers.joints.tolist())
+    moved = set(moved.nonzero().flatten().tolist())
+    arms = re.compile(r"(wrist|lowerarm|upperarm|shoulder|clavicle)")
+    assert all(arms.match(free_body().joint_names[i]) for i in moved - fingers)
+    assert len(moved & fingers) > 8
+
+
+def test_a_skeleton_without_hands_drives_it_and_hands_drive_one_without(handed, build):
+    _, avatar, frame = handed("model=splat_only")
+    given = frame.skeleton[0], frame.camera
+    whole = avatar.render(*given)
+    unseen = frame.visibility[0].clone()
+    unseen[HANDS] = 0
+    bare = avatar.render(given[0][:33], given[1])
+    assert bare.isfinite().all()
+    assert whole.shape == bare.shape
+    lost = given[0].clone()
+    lost[HANDS] = torch.nan
+    assert torch.equal(avatar.render(lost, given[1]), bare)
+    _, plain, frame = build("model=splat_only")
+    assert torch.equal(plain.render(*given), plain.render(given[0][:33], given[1]))
+
+
+def test_a_missing_hand_rests_on_its_arm(handed):
+    """Through rendering: no hand at the origin or elsewhere, in G or in S."""
+    _, avatar, frame = handed("effects.body_points=on", "model.segmentation.mode=hands")
+    p = frame.skeleton[0].clone()
+    p[33:54] = torch.nan
+    drive = Drive(p[None].numpy(), np.ones((1, 75)), None, [0], "")
+    given, seen, body = inputs_of(avatar, drive, 0)
+    painting = avatar(given, seen, frame.camera, body)
+    assert painting.image.isfinite().all()
+    S = avatar.segmentation
+    hand = S.truth_table[S.vertex_labels[avatar.body_points.points.chosen]] == 1
+    assert hand.sum() > 5
+    assert (painting.gaussians.means[0, hand] - p[15]).norm(dim=-1).max() < 0.25
+    wrist, depth = (x[0, 0] for x in frame.camera.project(p[None, 15:16]))
+    left = painting.segmentation[0, 1]
+    assert left.isfinite().all()
+    assert left.max() > 0.5
+    seen = (left > 0.3).nonzero().flip(1) + 0.5
+    reach = 0.25 * frame.camera.K[0, 0, 0] / depth
+    assert (seen - wrist).norm(dim=-1).max() < reach
