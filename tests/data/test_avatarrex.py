@@ -14,7 +14,7 @@ from gsgan.data.formats.avatarrex import AvatarrexReader
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_mask
 from gsgan.data.validation import Thresholds
-from gsgan.skeleton.smpl import to_mediapipe33
+from gsgan.skeleton.smpl_landmarks import to_mediapipe33
 
 pytestmark = pytest.mark.usefixtures("model_once")
 

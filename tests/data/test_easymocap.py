@@ -26,7 +26,7 @@ from gsgan.data.formats.easymocap import EasymocapReader
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_mask
 from gsgan.data.validation import Thresholds
-from gsgan.skeleton.smpl import to_mediapipe33
+from gsgan.skeleton.smpl_landmarks import to_mediapipe33
 from gsgan.utils.errors import DataError
 
 pytestmark = pytest.mark.usefixtures("model_once")

@@ -23,7 +23,7 @@ from gsgan.data.formats.thuman4 import Thuman4Reader
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_mask, read_unsure
 from gsgan.data.validation import Thresholds
-from gsgan.skeleton.smpl import to_mediapipe33
+from gsgan.skeleton.smpl_landmarks import to_mediapipe33
 from gsgan.utils.errors import ConfigError
 
 pytestmark = pytest.mark.usefixtures("model_once")

@@ -24,7 +24,7 @@ from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_labels, read_mask
 from gsgan.data.validation import Thresholds
 from gsgan.scene import Frame
-from gsgan.skeleton.smpl import to_mediapipe33
+from gsgan.skeleton.smpl_landmarks import to_mediapipe33
 
 pytestmark = pytest.mark.usefixtures("model_once")
 

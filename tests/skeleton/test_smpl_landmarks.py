@@ -9,7 +9,7 @@ from writers.smpl import joint_positions, smpl_arrays
 
 from gsgan.body import free_body
 from gsgan.skeleton import MEDIAPIPE33, bone_frames, limb_length_sum, sanitise
-from gsgan.skeleton.smpl import to_mediapipe33
+from gsgan.skeleton.smpl_landmarks import to_mediapipe33
 
 NAMES = MEDIAPIPE33.names
 LIMBS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")

@@ -30,7 +30,7 @@ from gsgan.body.skinned import MarkedBody
 from gsgan.body.smpl_files import Floats, read_arrays
 from gsgan.body.smpl_names import JOINT_NAMES, Parts, part_names, part_of_joint
 from gsgan.skeleton import MEDIAPIPE33
-from gsgan.skeleton.smpl import TABLES, to_mediapipe33
+from gsgan.skeleton.smpl_landmarks import TABLES, to_mediapipe33
 
 KINDS = {24: "smpl", 55: "smplx"}
 

@@ -209,12 +209,12 @@ def _filled(
         q = _put(q, valid, ends, q[:, starts] + bone * scale[:, None, None])
         if bare := [limb for limb in limbs if limb in template.bare]:
             # two limbs for one bone, as from elbow to wrist: both end at the same place
-            twins = [_twin(template, limb) for limb in bare]
-            q = _put(q, valid, c.ends[bare], q[:, c.ends[twins]])
+            same = [_same_bone(template, limb) for limb in bare]
+            q = _put(q, valid, c.ends[bare], q[:, c.ends[same]])
     return torch.where(valid.unsqueeze(-1), p, q + root)
 
 
-def _twin(template: SkeletonTemplate, bare: int) -> int:
+def _same_bone(template: SkeletonTemplate, bare: int) -> int:
     start = template.limbs[bare][0]
     return next(i for i, (a, _) in enumerate(template.limbs) if a == start and i != bare)
 

@@ -19,7 +19,7 @@ from gsgan.body import free_body
 from gsgan.body.smpl import SkinnedModel
 from gsgan.body.smpl_names import JOINT_NAMES
 from gsgan.data.formats.smpl_motion import SmplMotion
-from gsgan.skeleton.smpl import TABLES
+from gsgan.skeleton.smpl_landmarks import TABLES
 from gsgan.utils.files import write_atomically
 
 Kind = Literal["smpl", "smplx"]

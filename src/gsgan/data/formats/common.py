@@ -18,7 +18,7 @@ from gsgan.data.pixels import MaskFile
 from gsgan.data.proportions import axis_name
 from gsgan.data.splits import parse_frames
 from gsgan.data.validation import Thresholds
-from gsgan.skeleton.smpl import TABLES
+from gsgan.skeleton.smpl_landmarks import TABLES
 from gsgan.utils.errors import ConfigError, DataError
 
 IMAGES = (".jpg", ".jpeg", ".png")

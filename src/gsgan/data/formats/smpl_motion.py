@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gsgan.body.smpl import SkinnedModel, from_zju
 from gsgan.data.skeletons import Poses
-from gsgan.skeleton.smpl import TABLES, to_mediapipe33
+from gsgan.skeleton.smpl_landmarks import TABLES, to_mediapipe33
 from gsgan.utils.arrays import as_floats
 from gsgan.utils.errors import DataError
 
