@@ -39,3 +39,12 @@ def refused(result, *words: str) -> None:
     text = " ".join(result.stderr.split())
     for word in words:
         assert word in text, text
+
+
+def quiet_trainer(folder: Path, **options):
+    """A trainer on the CPU that writes and shows nothing."""
+    from lightning import Trainer
+
+    off = ("logger", "enable_checkpointing", "enable_progress_bar", "enable_model_summary")
+    given = {"accelerator": "cpu", "num_sanity_val_steps": 0} | dict.fromkeys(off, False)
+    return Trainer(default_root_dir=folder, **(given | options))

@@ -79,9 +79,16 @@ def test_a_folder_without_a_run_or_a_checkpoint_is_one_sentence(run, tmp_path):
         gsgan.load(tmp_path)
 
 
-def test_importing_gsgan_is_light():
-    code = "import sys, gsgan; print('torch' in sys.modules)"
+@pytest.mark.parametrize(
+    ("module", "heavy"),
+    [("gsgan", "torch"), ("gsgan.scene", "lightning kornia torchmetrics cv2 hydra")],
+)
+def test_importing_is_light(module, heavy):
+    code = f"import sys, {module}; print([m for m in {heavy.split()} if m in sys.modules])"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert out.stdout.strip() == "False"
+    assert out.stdout.strip() == "[]"
+
+
+def test_a_name_that_gsgan_does_not_have():
     with pytest.raises(AttributeError, match="no attribute 'lode'"):
         _ = gsgan.lode

@@ -102,14 +102,6 @@ def test_joint_distance_in_metres():
     assert np.isnan(metres[3:]).all()  # off the picture, unknown, behind the camera
 
 
-def test_unseen_joints_are_not_judged_and_an_empty_mask_is_infinitely_far():
-    distance = mask_distance(np.zeros((8, 8), bool))
-    pixels = np.full((2, 2), 4.0)
-    metres = joint_distance(distance, pixels, np.ones(2), np.array([True, False]), 10.0)
-    assert metres[0] == np.inf
-    assert np.isnan(metres[1])
-
-
 def test_far_cameras_are_those_beyond_the_factor():
     metres = {"a": 3.0, "b": 3.2, "c": 31.0, "d": 0.2, "e": 2.9}
     found = far_cameras(metres, 10.0)

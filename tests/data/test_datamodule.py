@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import ten_frames
 import torch
+from commands import quiet_trainer
 from make import skeletons, write_tiny_capture
 
 from gsgan.data.datamodule import GsganData, StepSampler, count_labels, pass_order
@@ -89,16 +90,7 @@ class Recorder(lightning.LightningModule):
 def fit(capture: Path, folder: Path, epochs: int, ckpt: Path | None = None) -> Recorder:
     data = GsganData(str(capture), batch_size=2, steps_per_epoch=3, seed=5, test_cameras=["cam01"])
     model = Recorder()
-    trainer = lightning.Trainer(
-        default_root_dir=folder,
-        max_epochs=epochs,
-        accelerator="cpu",
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        num_sanity_val_steps=0,
-    )
+    trainer = quiet_trainer(folder, max_epochs=epochs)
     trainer.fit(model, datamodule=data, ckpt_path=ckpt)
     trainer.save_checkpoint(folder / "last.ckpt")
     return model

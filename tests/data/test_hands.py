@@ -54,15 +54,6 @@ def test_a_missing_hand_is_not_seen_and_hangs_on_the_forearm(root):
         assert away.max() < 0.3
 
 
-def test_frames_without_a_row_have_no_hands(root):
-    p = write_hands(root, 4)
-    np.savez(root / "hands3d.npz", p=p[2:], frame_id=np.arange(2, 4))
-    _, (frame, _) = every_frame(root)
-    assert int(frame.frame_id) == 0
-    assert not frame.visibility[0, 33:].any()
-    assert frame.visibility[0, :33].all()
-
-
 def test_a_capture_without_hands_is_refused_by_name(root):
     with pytest.raises(ConfigError, match=r"needs a capture's hands3d.npz, which .*capture lacks"):
         assert GsganData(str(root), **HANDS).layout

@@ -53,14 +53,6 @@ def test_masks_are_joined_by_their_maximum_and_must_agree_in_size(grey, tmp_path
         read_mask([("grey", grey), ("grey", other)], RULES)
 
 
-def test_a_mask_of_0_and_1_is_no_alpha(tmp_path):
-    path = tmp_path / "ones.png"
-    cv2.imwrite(str(path), np.eye(3, dtype=np.uint8))
-    with pytest.raises(DataError, match="holds 0 and 1; expected alpha from 0 to 255"):
-        read_mask([("grey", path)], RULES)
-    assert np.array_equal(read_mask([("nonzero", path)], RULES), 255 * np.eye(3))
-
-
 def test_any_channel_counts_but_not_transparency(tmp_path):
     path = tmp_path / "colour.png"
     picture = np.zeros((1, 3, 4), np.uint8)

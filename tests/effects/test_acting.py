@@ -149,17 +149,3 @@ def test_all_means_all_that_this_model_can_have(build):
     _, avatar, frame = build("effects=all", "model=image_to_image")
     assert {name for name, effect in avatar.effects if effect.on} == set()
     assert torch.isfinite(avatar(*frame.inputs).image).all()
-
-
-def test_the_real_capture_calls_for_colour_correction():
-    from pathlib import Path
-
-    from gsgan.data.datamodule import GsganData
-    from gsgan.effects import EffectSettings, decide
-
-    root = Path(__file__).parents[3] / "shared" / "data" / "real_capture"
-    if not root.is_dir():
-        pytest.skip("the real capture is not at hand")
-    effects = decide(GsganData(str(root), size=128, crop="person").info, EffectSettings())
-    assert effects.colour_correction.on
-    assert not effects.view_dependence.on

@@ -64,16 +64,6 @@ def test_equal_images_are_kept_out_of_the_mean():
     assert "lpips_left_out" not in found
 
 
-def test_image_scores_name_a_reason_for_every_none():
-    image = torch.zeros(1, 3, 16, 16)
-    result = means([image_scores(image, image)], "no weights")  # PSNR infinite, no edges
-    assert result["psnr"] is None
-    assert result["psnr_left_out"] == 1
-    assert "finite" in result["psnr_reason"]
-    assert result["lpips_reason"] == "no weights"
-    assert result["ssim"] == pytest.approx(1.0)
-
-
 def test_means_by_camera_and_over_all():
     f = person()
     errors = {("a", 0): 0.1, ("a", 1): 0.01, ("b", 0): 0.001}

@@ -142,16 +142,6 @@ def test_ssim_of_chosen_pixels_is_its_map_there():
     assert math.isnan(float(nowhere))
 
 
-def test_psnr_of_chosen_pixels():
-    target, where = torch.zeros(2, 3, 8, 8), torch.zeros(2, 1, 8, 8, dtype=torch.bool)
-    where[0, 0, 1, 1] = True
-    image = target.clone()
-    image[0, :, 1, 1] = 0.1
-    scores = psnr_where(image, target, where)
-    assert float(scores[0]) == pytest.approx(20.0, abs=1e-5)
-    assert math.isnan(float(scores[1]))
-
-
 def test_high_frequencies_of_known_waves():
     x = torch.arange(32.0)
     slow, fast = (torch.cos(2 * math.pi * f * x) for f in (0.125, 0.375))

@@ -142,13 +142,6 @@ def test_a_trained_avatar_without_its_body_is_refused_in_one_sentence(
         load_avatar(tmp_path, config, data)
 
 
-def test_without_the_frames_body_pose_it_is_solved(build):
-    _, avatar, frame = build(ON)
-    bare = replace(frame, body=None)
-    body = avatar.body_pose(frame.skeleton, frame.visibility)
-    assert torch.equal(avatar(*bare.inputs).image, avatar(*replace(frame, body=body).inputs).image)
-
-
 def test_a_fitting_body_lies_in_its_mask_and_a_shifted_one_leaves_it(body):
     frame = synthetic_frame()
     exact = body_inside(frame, body)

@@ -258,17 +258,16 @@ def test_votes_are_kept_in_the_checkpoint_and_not_held_again(foreign, tiny, tmp_
     assert torch.equal(S, again)
 
 
-def test_votes_of_another_body_are_refused(foreign, tiny):
+@pytest.mark.parametrize(
+    ("votes", "words"),
+    [
+        (torch.ones(7).long(), "labels of 7 vertices do not fit this free body"),
+        (None, "no training image with labels"),
+    ],
+)
+def test_votes_of_another_body_and_no_votes_are_refused(foreign, tiny, votes, words):
     from gsgan.model.assemble import build_avatar, build_data
 
     config = tiny(f"data.root={foreign}")
-    with pytest.raises(DataError, match="labels of 7 vertices do not fit this free body"):
-        build_avatar(config, build_data(config).info, vertex_labels=torch.ones(7).long())
-
-
-def test_without_pictures_foreign_labels_are_refused(foreign, tiny):
-    from gsgan.model.assemble import build_avatar, build_data
-
-    config = tiny(f"data.root={foreign}")
-    with pytest.raises(DataError, match="no training image with labels"):
-        build_avatar(config, build_data(config).info)
+    with pytest.raises(DataError, match=words):
+        build_avatar(config, build_data(config).info, vertex_labels=votes)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gsgan.model.deformation import Deformation, _unit_quat
+from gsgan.model.deformation import Deformation
 from gsgan.skeleton import MEDIAPIPE33, Densify, bone_frames
 
 HEIGHT = 1.7
@@ -59,13 +59,6 @@ def test_invisible_parts_have_no_opacity(densify):
     assert (gaussians.opacities[~points.valid] == 0).all()
     assert (gaussians.opacities[points.valid] > 0).all()
     assert 0 < int((~points.valid).sum()) < densify.n_points
-
-
-def test_unit_quat_is_identity_at_zero_and_unit_elsewhere():
-    residual = torch.tensor([[0.0, 0, 0, 0], [3.0, 1, -2, 0.5]])
-    quats = _unit_quat(residual)
-    torch.testing.assert_close(quats[0], torch.tensor([1.0, 0, 0, 0]))
-    torch.testing.assert_close(quats.norm(dim=-1), torch.ones(2))
 
 
 def test_psi_is_told_where_the_surface_looks_unless_it_shall_not_be(densify):

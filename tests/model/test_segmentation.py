@@ -50,17 +50,6 @@ def test_probabilities_sum_to_one_and_cover_the_body():
     assert not person[0].any()
 
 
-def test_left_hand_is_on_the_picture_right():
-    """The body faces the camera, so its left (+x) appears on the right."""
-    S = Segmentation(free_body(), points=2000)(rest_pose(), facing_camera())
-    names = free_body().label_names
-    left = next(i for i, n in enumerate(names) if "left" in n and "hand" in n)
-    right = next(i for i, n in enumerate(names) if "right" in n and "hand" in n)
-    columns = torch.arange(SIZE).float()
-    centre = [float((S[0, i].sum(0) * columns).sum() / S[0, i].sum()) for i in (left, right)]
-    assert centre[0] > SIZE / 2 > centre[1]
-
-
 def test_loss_is_finite_where_a_class_was_never_hit_and_ignores_255():
     S = torch.zeros(1, 3, 1, 2, requires_grad=True)
     loss = segmentation_loss(S, torch.tensor([[[1, 255]]]))

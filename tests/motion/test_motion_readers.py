@@ -24,6 +24,8 @@ from gsgan.skeleton import MEDIAPIPE33
 from gsgan.utils.errors import DataError
 
 REAL = Path(__file__).parents[3] / "shared" / "data" / "motion"
+# Landmarks and the joints of the SMPL family that lie there.
+SMPL_AT = {11: 16, 13: 18, 15: 20, 12: 17, 14: 19, 16: 21, 23: 1, 25: 4, 27: 7, 24: 2, 26: 5, 28: 8}
 Y_DOWN = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # of Z up: MediaPipe's image axes
 
 
@@ -127,9 +129,8 @@ def test_smpl_and_amass(tmp_path, shared, proportions, kind, numbers):
     theta[0, 18, 2] = 1.5
     shape = body.v_template.new_zeros(1, 1)
     joints = body.posed_joints(theta, shape, shape.new_zeros(1, 3))[0].numpy()
-    at = {11: 16, 13: 18, 15: 20, 12: 17, 14: 19, 16: 21, 23: 1, 25: 4, 27: 7, 24: 2, 26: 5, 28: 8}
     truth = np.zeros((1, 33, 3))
-    truth[0, list(at)] = joints[list(at.values())] @ upright(up_axis(motion)).T
+    truth[0, list(SMPL_AT)] = joints[list(SMPL_AT.values())] @ upright(up_axis(motion)).T
     np.testing.assert_allclose(directions(p)[:1], directions(truth), atol=1e-6)
     np.savez(path, poses=poses[:, :50])
     with pytest.raises(DataError, match="50 numbers per frame"):
@@ -490,8 +491,9 @@ def test_published_keys_of_the_smpl_family(tmp_path, shared, proportions, name):
     theta = torch.zeros(4, len(skinned.parents), 3, dtype=torch.float64)
     theta[:, :22] = torch.from_numpy(np.concatenate([root, body], axis=1)).reshape(4, 22, 3)
     joints = skinned.posed_joints(theta, theta.new_zeros(1, 1), torch.from_numpy(moves)).numpy()
-    at = {11: 16, 13: 18, 15: 20, 12: 17, 14: 19, 16: 21, 23: 1, 25: 4, 27: 7, 24: 2, 26: 5, 28: 8}
-    np.testing.assert_allclose(motion.p[:, list(at)], joints[:, list(at.values())], atol=1e-6)
+    np.testing.assert_allclose(
+        motion.p[:, list(SMPL_AT)], joints[:, list(SMPL_AT.values())], atol=1e-6
+    )
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gsgan.data.joints import BODY, FACE, FACE_MESH, RIGHT, SETS
-from gsgan.prepare.landmarks import find_landmarks, gather, inside, read_detections
+from gsgan.prepare.landmarks import gather, inside, read_detections
 from gsgan.skeleton.hands import HAND, hand_names
 from gsgan.skeleton.template import MEDIAPIPE33
 from gsgan.utils.errors import DataError
@@ -111,14 +111,6 @@ def test_damaged_json_names_the_file(tmp_path, content, what):
     with pytest.raises(DataError, match=what) as failure:
         read_detections(tmp_path)
     assert "f_000001.json" in str(failure.value)
-
-
-def test_a_camera_without_landmarks_is_named(tmp_path):
-    (tmp_path / "a.npz").touch()
-    (tmp_path / "b_json").mkdir()
-    assert list(find_landmarks(tmp_path, ["a", "b"])) == ["a", "b"]
-    with pytest.raises(DataError, match=r"camera c.*found a\.npz, b_json"):
-        find_landmarks(tmp_path, ["a", "c"])
 
 
 def test_cameras_meet_by_number_and_offset(tmp_path):

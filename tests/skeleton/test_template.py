@@ -54,13 +54,19 @@ def test_tables_have_a_row_per_joint(t):
     assert drawn == set(range(len(t.names)))
 
 
-def test_parents_come_first_and_end_at_the_joint():
-    for level, limbs in enumerate(T.levels):
-        for limb in limbs:
-            parent = T.limb_parents[limb]
-            assert (parent < N_HUBS) == (level == 0)
-            if level:
-                assert parent - N_HUBS in T.levels[level - 1]
+@every_template
+def test_parents_come_first(t):
+    level_of = {limb: k for k, level in enumerate(t.levels) for limb in level}
+    assert sorted(level_of) == list(range(len(t.limbs)))
+    for limb, parent in enumerate(t.limb_parents):
+        if parent >= t.n_hubs:
+            assert level_of[parent - t.n_hubs] < level_of[limb]
+        elif parent >= N_HUBS:  # a palm is known once its knuckles are
+            knuckles = (t.incoming[j] for j in t.palms[parent - N_HUBS][1:])
+            assert all(level_of[k] < level_of[limb] for k in knuckles)
+
+
+def test_parents_end_at_the_joint():
     assert [len(level) for level in T.levels] == [4, 4, 14]
     by_limb = dict(zip(T.limbs, T.limb_parents, strict=True))
     assert T.limbs[by_limb[(13, 15)] - N_HUBS] == (11, 13)

@@ -21,7 +21,6 @@ from gsgan.skeleton import (
     sanitise,
 )
 from gsgan.skeleton.hands import HAND, PALM, palm_frames
-from gsgan.skeleton.template import N_HUBS
 from gsgan.utils.errors import ConfigError
 
 F64, T = torch.float64, MEDIAPIPE33_HANDS
@@ -59,17 +58,6 @@ def test_the_rest_pose_has_hands():
         tips = np.linalg.norm(rest[hand][[8, 12, 16, 20]] - rest[wrist], axis=-1)
         assert (tips > 0.13).all()
         assert (tips < 0.22).all()
-
-
-def test_parents_come_first():
-    level_of = {limb: k for k, level in enumerate(T.levels) for limb in level}
-    assert sorted(level_of) == list(range(64))
-    for limb, parent in enumerate(T.limb_parents):
-        if parent >= T.n_hubs:
-            assert level_of[parent - T.n_hubs] < level_of[limb]
-        elif parent >= N_HUBS:  # a palm is known once its knuckles are
-            knuckles = (T.incoming[j] for j in T.palms[parent - N_HUBS][1:])
-            assert all(level_of[k] < level_of[limb] for k in knuckles)
 
 
 def test_size_is_that_of_the_body_without_hands():

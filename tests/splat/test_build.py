@@ -54,17 +54,17 @@ def is_one_sentence(text: str) -> bool:
     return text[:1].isupper() and text.endswith(".") and "\n" not in text
 
 
-def test_compiler_that_does_not_run(tmp_path, load_afresh):
-    yes, reason = load_afresh(tmp_path, CXX="/bin/false", PATH="")
+@pytest.mark.parametrize(
+    ("environment", "word"),
+    [
+        ({"CXX": "/bin/false", "PATH": ""}, "/bin/false"),
+        ({"CXX": "", "PATH": "/nowhere"}, "No C++ compiler is found"),
+    ],
+)
+def test_compilers_that_do_not_run(tmp_path, load_afresh, environment, word):
+    yes, reason = load_afresh(tmp_path, **environment)
     assert not yes
-    assert "/bin/false" in reason
-    assert is_one_sentence(reason)
-
-
-def test_no_compiler(tmp_path, load_afresh):
-    yes, reason = load_afresh(tmp_path, CXX="", PATH=str(tmp_path))
-    assert not yes
-    assert "No C++ compiler is found" in reason
+    assert word in reason
     assert is_one_sentence(reason)
 
 

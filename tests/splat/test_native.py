@@ -129,10 +129,11 @@ def assert_same(
         assert error <= gradient_tolerance * largest + 1e-300, f"gradient of {name}: {error:.2e}"
 
 
-def test_box_extent_is_a_per_pixel_cut_off():
+@pytest.mark.parametrize(("extent", "of"), [(3.5, "sigma"), (float("inf"), "all")])
+def test_extents_are_a_per_pixel_cut_off_or_without_bound(extent, of):
     p = scene(N=20, seed=4)
-    p = replace(p, extents=torch.full_like(p.extents, 3.5))
-    assert_same(p, (21, 35), replace(EXACT, extent="sigma"), 1e-13, 1e-13)
+    p = replace(p, extents=torch.full_like(p.extents, extent))
+    assert_same(p, (21, 35), replace(EXACT, extent=of), 1e-13, 1e-13)
 
 
 @pytest.mark.parametrize(
@@ -234,9 +235,3 @@ def test_values_that_are_not_finite_are_refused(name):
         native.composite(p, (21, 35), HIGH, False)
     hidden = replace(p, visible=torch.tensor([[True] * 5, [False] * 5]))
     assert native.composite(hidden, (21, 35), HIGH, False)[0].isfinite().all()
-
-
-def test_extents_without_bound():
-    p = scene(N=6)
-    p = replace(p, extents=torch.full_like(p.extents, float("inf")))
-    assert_same(p, (21, 35), EXACT, 1e-13, 1e-13)

@@ -81,10 +81,7 @@ def test_exact_uses_the_reference_unless_a_backend_is_requested():
     assert resolve_backend("torch", CPU, ACCURACY["exact"]) == ("torch", "")
 
 
-def test_cuda_uses_torch_without_gsplat():
-    name, reason = resolve_backend("auto", torch.device("cuda"), ACCURACY["high"])
-    assert name == "torch"
-    assert "gsplat is not installed" in reason
+def test_cuda_does_not_use_native():
     name, reason = resolve_backend("native", torch.device("cuda"), ACCURACY["high"])
     assert name == "torch"
     assert "CPU only" in reason

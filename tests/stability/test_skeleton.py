@@ -49,11 +49,8 @@ EASY_JOINTS = [j for j in range(33) if j not in (11, 12, 23, 24)]
 
 @st.composite
 def skeletons(draw: st.DrawFn, trunk: bool = False) -> Tensor:
-    """``[1, 33, 3]`` float64: noisy, with joints on top of each other or bones in line.
-
-    Args:
-        trunk: whether the trunk may collapse too, or the skeleton be one of the hard ones.
-    """
+    """``[1, 33, 3]`` float64: noisy, with joints that coincide or bones in line; with ``trunk`` the
+    trunk may collapse too, or the skeleton be one of the hard ones."""
     joints = st.sampled_from(list(range(33)) if trunk else EASY_JOINTS)
     p = noisy(draw(st.integers(0, 2**16)), sigma=draw(st.sampled_from([0.0, 1e-4, 0.05, 0.3])))
     if trunk and draw(st.booleans()):

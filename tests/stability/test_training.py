@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from lightning import Trainer
+from commands import quiet_trainer
 from torch.utils.data import DataLoader
 
 from gsgan.scene import Frame, cat
@@ -35,15 +35,7 @@ def make(tiny, tmp_path):
                 *overrides,
             )
         )
-        trainer = Trainer(
-            max_epochs=1,
-            accelerator="cpu",
-            logger=False,
-            enable_checkpointing=False,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-            default_root_dir=tmp_path,
-        )
+        trainer = quiet_trainer(tmp_path, max_epochs=1)
         frame = data.dataset("train")[0]
         return (
             module,

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from mannequin import SHAPES, assert_limits, inside, local, mannequin, reposed
 
-from gsgan.motion.rig import SIDES, Pose, Rig, two_bone
-from gsgan.motion.rotations import axis_angle, between, blend, rotation, twist
+from gsgan.motion.rig import SIDES, Pose, Rig
+from gsgan.motion.rotations import axis_angle, rotation
 from gsgan.synthetic.choreography import COMBINATION, EVERYDAY, PASSAGES, held_out
 from gsgan.synthetic.controls import frame_times, passages_at
 from gsgan.synthetic.footsteps import Footsteps
@@ -211,25 +211,3 @@ def test_held_out_count_is_exact(frames):
         test = held_out(passages_at(frame_times(frames, EVERYDAY.duration), EVERYDAY), count)
         assert len(set(test)) == count
         assert set(test) < set(range(frames))
-
-
-def test_two_bone_reaches_its_target_with_the_right_lengths():
-    target, pole = np.array([[0.3, -0.2, -0.3], [9.0, 0, 0]]), np.array([[0.0, 1, 0], [0, 1, 0]])
-    upper, lower, hinge = two_bone(target, pole, 0.3, 0.25)
-    end = 0.3 * upper + 0.25 * lower
-    np.testing.assert_allclose(end[0], target[0], atol=1e-12)
-    np.testing.assert_allclose(end[1, 0], 0.998 * 0.55)
-    assert upper[0, 1] > target[0, 1] / np.linalg.norm(target[0])  # bends to the pole's side
-    cross = np.cross(upper, lower)
-    np.testing.assert_allclose(cross / np.linalg.norm(cross, axis=1, keepdims=True), hinge)
-
-
-def test_rotations():
-    v = np.array([[0.7, -0.2, 0.4], [0, 0, 0]])
-    R = rotation(v)
-    np.testing.assert_allclose(axis_angle(R), v, atol=1e-12)
-    a, b = np.array([0.0, 0.6, -0.8]), np.array([1.0, 0, 0])
-    np.testing.assert_allclose(between(a, b) @ a, b, atol=1e-12)
-    np.testing.assert_allclose(between(a, a), np.eye(3), atol=1e-12)
-    np.testing.assert_allclose(blend(np.eye(3), R[0], 0.5) @ blend(np.eye(3), R[0], 0.5), R[0])
-    np.testing.assert_allclose(twist(rotation(np.array([1.2, 0, 0])), 0), 1.2)

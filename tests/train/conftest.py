@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
+from commands import quiet_trainer
 from lightning import Trainer
 
 from gsgan.train.module import AvatarTraining
@@ -17,12 +18,8 @@ def make(tiny, tmp_path):
 
     def run(*overrides: str, **trainer) -> tuple[AvatarTraining, Trainer, object]:
         data, module = build_training(tiny(*overrides))
-        options = {
-            "max_epochs": math.ceil(module.schedule.total / module.schedule.epoch),
-            "accelerator": "cpu", "logger": False,
-            "enable_checkpointing": False, "enable_progress_bar": False,
-            "enable_model_summary": False, "num_sanity_val_steps": 0, "limit_val_batches": 0,
-        }  # fmt: skip
-        return module, Trainer(**(options | trainer), default_root_dir=tmp_path), data
+        epochs = math.ceil(module.schedule.total / module.schedule.epoch)
+        options = {"max_epochs": epochs, "limit_val_batches": 0} | trainer
+        return module, quiet_trainer(tmp_path, **options), data
 
     return run

@@ -6,7 +6,7 @@ import resource
 
 import pytest
 import torch
-from lightning import Trainer
+from commands import quiet_trainer
 
 from gsgan.train.module import AvatarTraining
 from gsgan.train.run import build_training
@@ -40,11 +40,7 @@ def test_200_iterations_learn_within_memory_and_do_not_collapse(compose, tmp_pat
     keep_freed_memory()
     data, module = build_training(config)
     module.to(memory_format=torch.channels_last)
-    trainer = Trainer(
-        max_epochs=4, accelerator="cpu", logger=False, enable_checkpointing=False,
-        enable_progress_bar=False, enable_model_summary=False, num_sanity_val_steps=0,
-        limit_val_batches=0, default_root_dir=tmp_path,
-    )  # fmt: skip
+    trainer = quiet_trainer(tmp_path, max_epochs=4, limit_val_batches=0)
     trainer.fit(module, data)
     assert module.step == STEP_ONE + BEFORE_GAN + GAN
     assert not module.skipped.steps

@@ -36,16 +36,8 @@ class Camera:
 class Subject:
     """What was written, for comparison with what is read.
 
-    Args:
-        model: the body, as read from its file.
-        cameras: C of them.
-        frames: F frame numbers.
-        poses: ``[F, 72]`` axis-angle, root zero.
-        shapes: ``[10]``.
-        Rh, Th: ``[F, 3]`` EasyMocap's.
-        joints, vertices: ``[F, 24, 3]`` and ``[F, 6890, 3]`` metres, world.
-        joints_before, rest: ``[F, 24, 3]`` without Rh and Th; ``[24, 3]`` of the shaped rest pose.
-        images, labels: ``[F][C]`` pictures ``[H, W, 3]`` RGB and ``[H, W]`` CIHP numbers.
+    ``poses [F, 72]`` axis-angle, root zero; ``joints [F, 24, 3]``, ``vertices [F, 6890, 3]`` in
+    metres, world; ``joints_before`` without Rh and Th; ``images``, ``labels``: ``[F][C]``, CIHP.
     """
 
     model: SkinnedModel

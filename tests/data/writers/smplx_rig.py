@@ -30,13 +30,8 @@ STRAIGHT = (0.0,) * 5
 class SmplxSubject:
     """What was written, for comparison with what is read.
 
-    Args:
-        model: the body, as read from its file.
-        cameras: C of them, without a lens.
-        frames: F frame numbers, from 0.
-        params: the arrays of smpl_params.npz.
-        joints, vertices: ``[F, 55, 3]`` and ``[F, 10475, 3]`` metres, world.
-        images, alphas: ``[F][C]`` pictures ``[H, W, 3]`` RGB and ``[H, W]`` 0..255.
+    ``joints [F, 55, 3]``, ``vertices [F, 10475, 3]`` metres, world; ``images``, ``alphas``:
+    ``[F][C]`` pictures ``[H, W, 3]`` RGB and ``[H, W]`` 0..255.
     """
 
     model: SkinnedModel
@@ -139,14 +134,7 @@ def write_rig(
     masks: str,
     lens: dict[str, Any],
 ) -> None:
-    """Calibration, parameters, pictures and masks.
-
-    Args:
-        names: of the cameras.
-        calibration: its file.
-        images, masks: a camera's folders, with ``{}``.
-        lens: further keys of each camera in the calibration.
-    """
+    """Calibration, parameters, pictures and masks; ``lens``: further keys of each camera."""
     entries = {}
     for c, (name, camera) in enumerate(zip(names, subject.cameras, strict=True)):
         entries[name] = {

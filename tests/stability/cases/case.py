@@ -43,25 +43,18 @@ class Tolerance:
 
 @dataclass(frozen=True)
 class Case:
-    """One hard case.
+    """One hard case; ``name`` and ``note`` are for readers of the table.
 
     Args:
-        subject: what is tested: ``Gaussians``, ``scenes``, ``skeleton``, ...
-        name: a few plain words; unique within the subject.
-        inputs: makes the inputs by name, in float64. Every floating input gets a gradient, the
-            others are passed as they are.
-        run: inputs → outputs by name; where ``settings`` are given it is called with the name of a
-            backend as well. Every output is compared. Those that depend on an input are weighted
-            and summed to the scalar whose gradients are compared. May warn, or raise ValueError
-            where the input must be refused.
+        inputs: makes the inputs by name, in float64; every floating one gets a gradient.
+        run: inputs → outputs by name; with ``settings`` it is called with a backend's name as well.
+            Every output is compared, and the gradients of their weighted sum. May warn, or raise
+            ValueError where the input must be refused.
         settings: of the rasteriser: the case runs on each backend that draws with them.
-        tolerance: at float32.
-        same_numbers: whether float64 starts from the inputs as rounded to float32 (only the
-            rounding of the code counts) or from the inputs in float64.
-        gradient_floor: by input, a gradient whose largest entry is below this counts as zero: only
-            for gradients that are zero in exact arithmetic. ``note`` gives the reason.
+        same_numbers: whether float64 starts from the inputs as rounded to float32.
+        gradient_floor: by input, a gradient below this counts as zero: only for gradients that are
+            zero in exact arithmetic. ``note`` gives the reason.
         expect: the status that the case must get, one of ``STATUSES``.
-        note: for readers of the table; empty where the name says all.
     """
 
     subject: str

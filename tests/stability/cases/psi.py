@@ -62,12 +62,7 @@ def ordinary_residuals(seed: int = 0, sigma: float = 0.3) -> Inputs:
 
 
 def composed(inputs: Inputs, frame: Numbers | None = None) -> dict[str, Tensor]:
-    """Ĝ of given residuals.
-
-    Args:
-        inputs: as ``ordinary_residuals`` makes them.
-        frame: the nine numbers of a matrix, for every point in place of its part's.
-    """
+    """Ĝ of given residuals; ``frame``: nine numbers for every point in place of its part's."""
     p = inputs["p"]
     points = some_points(p.dtype, p.device)(p)
     if frame is not None:

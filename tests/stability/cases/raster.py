@@ -46,16 +46,7 @@ def raster_case(
     draw: Callable[..., Outputs] | None = None,
     **options: Any,
 ) -> Case:
-    """A case that runs on each backend of the rasteriser.
-
-    Args:
-        subject, name, options: of ``Case``.
-        scene: makes Gaussians and camera in float64.
-        size: (H, W) pixels.
-        settings: the same for the backend and the reference.
-        draw: called as ``draw(inputs, backend, size=size, settings=settings)``; by default
-            ``render``.
-    """
+    """A case that runs on each backend of the rasteriser, drawn by ``draw`` (default: `render`)."""
     run = partial(draw or render, size=size, settings=settings)
     return Case(subject, name, scene, run, settings, **options)
 
