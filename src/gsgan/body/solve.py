@@ -6,6 +6,7 @@ Convention: metres, world frame, radians.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -13,7 +14,8 @@ from kornia.geometry.conversions import quaternion_to_axis_angle, rotation_matri
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
-from gsgan.body.fingers import Fingers
+from gsgan.body import compiled, fingers
+from gsgan.body.fingers import PLACING, ROUNDS, Fingers
 from gsgan.body.free import Body
 from gsgan.body.lbs import axis_angle_to_matrix, left_jacobian, shortest_turn
 from gsgan.body.rig import SPINE, ancestors, build_rig, prior
@@ -21,6 +23,7 @@ from gsgan.body.skinned import MarkedBody
 from gsgan.scene import BodyPose
 from gsgan.skeleton import MEDIAPIPE33, MEDIAPIPE33_HANDS, TEMPLATES, bone_frames, sanitise
 from gsgan.skeleton.hands import HAND, PALM
+from gsgan.skeleton.tensors import constants
 from gsgan.utils.tensors import constant
 
 BODY, ALL = len(MEDIAPIPE33.names), len(MEDIAPIPE33_HANDS.names)
@@ -143,6 +146,8 @@ class Solver(nn.Module):
                 f"Solver: the skeleton must have {', '.join(map(str, SIZES))} joints, got "
                 f"{skeleton.shape[1]}"
             )
+        if not self._live(skeleton) and compiled.available(skeleton):
+            return self._compiled(skeleton, visibility)
         # the 33 landmarks, about the middle of the hips
         hands, seen = skeleton[:, BODY:ALL], visibility[:, BODY:ALL]
         skeleton, visibility = skeleton[:, :BODY], visibility[:, :BODY]
@@ -170,6 +175,54 @@ class Solver(nn.Module):
             turns = torch.where(found.shown.unsqueeze(-1), found.turns, theta[:, joints])
             theta = theta.index_copy(1, joints, turns)
         return BodyPose(theta, transl + shift[:, 0])
+
+    def _compiled(self, skeleton: Tensor, visibility: Tensor) -> BodyPose:
+        """`solve` on the CPU: a GPU would be bound by its thousands of small operations."""
+        p, shown = skeleton.cpu(), visibility.to("cpu", skeleton.dtype)
+        body, valid = sanitise(p[:, :BODY], shown[:, :BODY])
+        hands = None
+        if self.fingers is not None and p.shape[1] > BODY:
+            landmarks = p[:, BODY:ALL]
+            hands = landmarks, (shown[:, BODY:ALL] > 0) & landmarks.isfinite().all(-1)
+        seen = body, shown[:, :BODY], valid
+        found = compiled.solve(self._constants, self._counts(), _settings(), seen, hands)
+        return BodyPose(*(x.to(skeleton.device) for x in found))
+
+    def _counts(self) -> dict[str, int]:
+        """Those of `compiled.COUNTS`."""
+        rig, limbs = self.rig, len(self.rig.limbs)
+        sizes = (self.parents, len(rig.joint), len(rig.names), len(rig.entry_turn))
+        more = (len(self.landmarks), 1 + len(SPINE), limbs, STEPS)
+        rounds = (len(ROUNDS), PLACING)
+        return dict(zip(compiled.COUNTS, (*sizes, *more, *rounds), strict=True))
+
+    @cached_property
+    def _constants(self) -> dict[str, Tensor]:
+        """Those of `compiled.CONSTANTS`."""
+        with torch.inference_mode(False), torch.no_grad():
+            template = constants(MEDIAPIPE33, self.joints.device, self.joints.dtype)
+            bends = [(name, 0, len(SPINE)) for name in SPINE] + [("neck", 1, 1)]
+            own = {
+                **{name: getattr(self, name) for name in compiled.RIG if hasattr(self, name)},
+                "parent": self.rig.parent,
+                "head_from_eyes": template.head_from_eyes,
+                "torso": template.torso,
+                "head": template.head_points,
+                "bend_numbers": torch.tensor([self.rig.numbers(name) for name, _, _ in bends]),
+                "bend_hub": torch.tensor([hub for _, hub, _ in bends]),
+                "bend_axes": torch.stack([self._axes(name) / n for name, _, n in bends]),
+            }
+            for name in ("hub", "points", "numbers", "axes", "bend"):
+                values = [torch.as_tensor(getattr(limb, name)) for limb in self.rig.limbs]
+                own[f"limb_{name}"] = torch.stack(values)
+            if self.fingers is not None:
+                buffers = {**dict(self.fingers.named_buffers()), "rounds": torch.tensor(ROUNDS)}
+                own |= {f"finger_{name}": buffers[name] for name in compiled.FINGERS}
+            return compiled.held(own)
+
+    def _axes(self, name: str) -> Tensor:
+        """``[3, 3]`` unit axes, by rows, of the numbers of a chain."""
+        return normalize(self.matrix[self.rig.numbers(name)].unflatten(1, (-1, 3)).sum(1))
 
     def weights(self, valid: Tensor) -> Tensor:
         """``[B, 33]`` precisions of landmarks, 0 where not ``valid [B, 33]``, bool.
@@ -211,6 +264,11 @@ class Solver(nn.Module):
         theta[:, list(whole)] = log_of(torch.stack(list(whole.values()), dim=1))
         return theta, q[:, 3:6]
 
+    def _live(self, p: Tensor) -> bool:
+        """Whether a pose of ``p`` carries gradients."""
+        inputs = (p, self.joints, self.landmarks)
+        return torch.is_grad_enabled() and any(x.requires_grad for x in inputs)
+
     # -- the first guess
 
     def guess(self, p: Tensor) -> tuple[Tensor, Tensor]:
@@ -221,8 +279,7 @@ class Solver(nn.Module):
         for names, R in ((SPINE, pelvis.mT @ chest), (("neck",), chest.mT @ head)):
             for name in names:
                 numbers = self.rig.numbers(name)
-                axes = normalize(self.matrix[numbers].unflatten(1, (-1, 3)).sum(1))
-                q[:, numbers] = log_of(R) @ axes.mT / len(names)
+                q[:, numbers] = log_of(R) @ self._axes(name).mT / len(names)
         for limb in self.rig.limbs:
             first, middle, end = (p[:, i] for i in limb.points)
             bones = torch.stack([middle - first, end - middle], dim=1) @ hubs[:, limb.hub]
@@ -334,12 +391,15 @@ class Solver(nn.Module):
         approaches that of the exact solution, whose matrix is not Gauss-Newton's."""
         with torch.no_grad():
             H = self.normal(q, self.linear(q, root, p), weight)[2]
-        live = torch.is_grad_enabled() and any(
-            x.requires_grad for x in (p, self.joints, self.landmarks)
-        )
-        for _ in range(GRADIENT_STEPS if live else 1):
+        for _ in range(GRADIENT_STEPS if self._live(p) else 1):
             q = q - _solved(H, self.normal(q, self.linear(q, root, p), weight)[1])
         return q
+
+
+def _settings() -> dict[str, float]:
+    """The numbers of `compiled.NUMBERS`."""
+    own = {name: globals()[name.upper()] for name in compiled.NUMBERS[:-2]}
+    return {**own, "finger_noise": fingers.NOISE, "trace": fingers.TRACE}
 
 
 def _noise() -> Tensor:

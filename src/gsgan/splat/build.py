@@ -52,7 +52,7 @@ DTYPES = {torch.float32: "float32", torch.float64: "float64"}
 # Functions of the library, one per dtype; each takes a job and at most one more pointer.
 _FUNCTIONS = (
     *("forward", "backward", "free", "project", "project_backward"),
-    *("compose", "compose_backward", "photometric"),
+    *("compose", "compose_backward", "photometric", "solve"),
 )
 
 _LOCK = threading.Lock()

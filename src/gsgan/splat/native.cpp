@@ -21,6 +21,7 @@
 #include "kernels/forward.h"
 #include "kernels/photometric.h"
 #include "kernels/project.h"
+#include "kernels/solve.h"
 
 #ifdef _OPENMP
 #include <omp.h>
@@ -131,6 +132,9 @@ int gsgan_compose_backward_float32(const ComposeJob* job) {
 int gsgan_compose_backward_float64(const ComposeJob* job) {
   return gsgan::compose_backward<double>(*job);
 }
+int64_t gsgan_solve_job_size() { return sizeof(SolveJob); }
+int gsgan_solve_float32(const SolveJob* job) { return gsgan::solve<float>(*job); }
+int gsgan_solve_float64(const SolveJob* job) { return gsgan::solve<double>(*job); }
 int gsgan_photometric_float32(const PhotometricJob* job) { return gsgan::photometric<float>(*job); }
 int gsgan_photometric_float64(const PhotometricJob* job) {
   return gsgan::photometric<double>(*job);
