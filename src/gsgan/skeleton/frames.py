@@ -20,7 +20,7 @@ from gsgan.skeleton.face import face_code
 from gsgan.skeleton.hands import palm_frames
 from gsgan.skeleton.rotation6d import across, rotation_from_6d, rotation_to_6d, unit
 from gsgan.skeleton.template import CHEST, HEAD, MEDIAPIPE33, SkeletonTemplate
-from gsgan.skeleton.tensors import FOLDED, Constants, check_skeleton, constants
+from gsgan.skeleton.tensors import FOLDED, Constants, Level, check_skeleton, constants
 
 MIN_LENGTH = 1e-3
 """Metres: a shorter bone or baseline has no direction (1 mm, below any landmark's accuracy)."""
@@ -89,29 +89,40 @@ def bone_frames(
     # baselines are differences of nearby points: exact once the root is subtracted
     q = p - p[:, template.hips[0], None].detach()
     trunk = _trunk(q, c)
-    hubs = torch.cat([trunk[:, :2], _head(q, valid, trunk[:, 1], c)], dim=1)
+    known = _hubs(q, valid, trunk, c)
     if template.palms:
-        hubs = torch.cat([hubs, _palms(q, trunk[:, 1:2], c)], dim=1)
+        known = torch.cat([known, palms_of(q, trunk[:, 1:2], c)], dim=1)
 
     bones = q.index_select(1, c.ends) - q.index_select(1, c.starts)
     length2 = bones.square().sum(-1, keepdim=True)
-    directions, _ = _shortened(bones)
     lengths = (length2.squeeze(-1) + MIN_LENGTH**2).sqrt()
-
-    known, relative = hubs, []
+    relative = []
     for level in c.levels:
         parent = known.index_select(1, level.parents)
-        d = (directions.index_select(1, level.limbs).unsqueeze(-2) @ parent).squeeze(-2)
-        local = level.swing.to(d)
-        relative.append(local)
-        known = torch.cat([known, parent @ local], dim=1)
+        relative.append(swings(bones.index_select(1, level.limbs), parent, level))
+        known = torch.cat([known, parent @ relative[-1]], dim=1)
     return BoneFrames(
-        hubs=hubs,
+        hubs=known[:, : template.n_hubs],
         limbs=known[:, template.n_hubs :].index_select(1, c.limb_order),
         local=torch.cat(relative, dim=1).index_select(1, c.limb_order),
         lengths=lengths,
         torso=trunk[:, 2],
     )
+
+
+def swings(bones: Tensor, parent: Tensor, level: Level) -> Tensor:
+    """``[B, M, 3, 3]`` frames relative to ``parent [B, M, 3, 3]`` of a level's ``[B, M, 3]``."""
+    directions, _ = _shortened(bones)
+    return level.swing.to((directions.unsqueeze(-2) @ parent).squeeze(-2))
+
+
+def hubs_of(q: Tensor, valid: Tensor, c: Constants) -> Tensor:
+    """``[B, 3, 3, 3]`` frames of pelvis, chest and head of joints near the origin."""
+    return _hubs(q, valid, _trunk(q, c), c)
+
+
+def _hubs(q: Tensor, valid: Tensor, trunk: Tensor, c: Constants) -> Tensor:
+    return torch.cat([trunk[:, :2], _head(q, valid, trunk[:, 1], c)], dim=1)
 
 
 def _trunk(q: Tensor, c: Constants) -> Tensor:
@@ -162,7 +173,7 @@ def _head(q: Tensor, valid: Tensor, chest: Tensor, c: Constants) -> Tensor:
     return head.unsqueeze(1)
 
 
-def _palms(q: Tensor, chest: Tensor, c: Constants) -> Tensor:
+def palms_of(q: Tensor, chest: Tensor, c: Constants) -> Tensor:
     """``[B, hands, 3, 3]`` frames of the palms; of one that vanishes, the chest's ``[B, 1, 3, 3]``.
 
     Fingers' swings then start from the palm, which turns with the forearm as no bone shows.

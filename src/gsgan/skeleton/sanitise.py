@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
 from gsgan.scene import Camera
-from gsgan.skeleton.frames import bone_frames
+from gsgan.skeleton.frames import bone_frames, hubs_of, palms_of, swings
 from gsgan.skeleton.holistic import TEMPLATES
-from gsgan.skeleton.template import CHEST, MEDIAPIPE33, SkeletonTemplate
-from gsgan.skeleton.tensors import check_skeleton, constants
+from gsgan.skeleton.template import CHEST, HEAD, MEDIAPIPE33, N_HUBS, SkeletonTemplate
+from gsgan.skeleton.tensors import Constants, check_skeleton, constants
+from gsgan.utils.tensors import constant
 
 SIZES = {len(t.names) for t in TEMPLATES.values()}
 MIN_TRUNK_JOINTS = 3
@@ -181,8 +184,8 @@ def _filled(
 ) -> Tensor:
     c = constants(template, p.device, p.dtype)
     # the origin of the completion: a seen hip or shoulder
-    order = torch.tensor([*template.hips, *template.shoulders], device=p.device)
-    first = order[valid[:, order].to(torch.uint8).argmax(-1)]
+    order = constant((*template.hips, *template.shoulders), p, torch.int64)
+    first = order[valid.index_select(1, order).to(torch.uint8).argmax(-1)]
     root = p.gather(1, first[:, None, None].expand(-1, 1, 3)).detach()
     q = torch.where(valid.unsqueeze(-1), p, 0.0)
     q = torch.where(valid.unsqueeze(-1), q - root, 0.0)
@@ -193,25 +196,64 @@ def _filled(
         scale = torch.as_tensor(body_height, dtype=p.dtype, device=p.device)
         scale = (scale / template.limb_length_sum).expand(len(p))
 
-    rest_frames = bone_frames(c.rest.unsqueeze(0), None, template)
-    q = _complete_trunk(q, valid, template, c.rest)
-    q = _complete_face(q, valid, template, c.rest, scale)
-    tree = set(template.incoming.values())
-    for level in template.levels:
-        limbs = [limb for limb in level if limb in tree]
-        starts, ends = (c.starts[limbs], c.ends[limbs])
-        frames = bone_frames(q, valid, template)
-        now, at_rest = (
-            torch.cat([f.hubs, f.limbs], dim=1)[:, [template.limb_parents[i] for i in limbs]]
-            for f in (frames, rest_frames)
-        )
-        bone = (now @ at_rest.mT @ (c.rest[ends] - c.rest[starts]).unsqueeze(-1)).squeeze(-1)
-        q = _put(q, valid, ends, q[:, starts] + bone * scale[:, None, None])
-        if bare := [limb for limb in limbs if limb in template.bare]:
+    q = _complete_trunk(q, valid, template, c)
+    known = hubs_of(q, valid, c)  # what is placed below moves none of them
+    q = _complete_face(q, valid, template, known, scale)
+    for level, bones in zip(c.levels, _bones(template, p.device, p.dtype), strict=True):
+        if template.palms:  # their knuckles may have been placed
+            hubs, palms, limbs = known.tensor_split((N_HUBS, template.n_hubs), dim=1)
+            palms = palms_of(q, hubs[:, CHEST : CHEST + 1], c)
+            known = torch.cat([hubs, palms, limbs], dim=1)
+        frames = known.index_select(1, bones.frames)
+        bone = (frames @ bones.rest.unsqueeze(-1)).squeeze(-1) * scale[:, None, None]
+        q = _put(q, valid, bones.ends, q.index_select(1, bones.starts) + bone)
+        if template.bare:
             # two limbs for one bone, as from elbow to wrist: both end at the same place
-            same = [_same_bone(template, limb) for limb in bare]
-            q = _put(q, valid, c.ends[bare], q[:, c.ends[same]])
+            q = _put(q, valid, bones.bare, q.index_select(1, bones.same))
+        if level is c.levels[-1]:
+            break
+        parent = known.index_select(1, level.parents)
+        starts, ends = c.starts[level.limbs], c.ends[level.limbs]
+        found = q.index_select(1, ends) - q.index_select(1, starts)
+        known = torch.cat([known, parent @ swings(found, parent, level)], dim=1)
     return torch.where(valid.unsqueeze(-1), p, q + root)
+
+
+class _Bones(NamedTuple):
+    """A level's bones that place joints."""
+
+    frames: Tensor  # [M] into the frames so far
+    starts: Tensor  # [M]
+    ends: Tensor  # [M]
+    rest: Tensor  # [M, 3] metres, in these frames
+    bare: Tensor  # [K] ends of bare limbs
+    same: Tensor  # [K] and the joints in their places
+
+
+@lru_cache(maxsize=64)
+def _bones(
+    template: SkeletonTemplate, device: torch.device, dtype: torch.dtype
+) -> tuple[_Bones, ...]:
+    def index(values: list[int]) -> Tensor:
+        return torch.tensor(values, dtype=torch.int64, device=device)
+
+    with torch.inference_mode(False), torch.no_grad():
+        c = constants(template, device, dtype)
+        at_rest = bone_frames(c.rest.unsqueeze(0), None, template)
+        frames = torch.cat([at_rest.hubs, at_rest.limbs], dim=1)[0]
+        tree, found = set(template.incoming.values()), []
+        for level, tensors in zip(template.levels, c.levels, strict=True):
+            placed = [k for k, limb in enumerate(level) if limb in tree]
+            limbs = tensors.limbs[placed]
+            starts, ends = c.starts[limbs], c.ends[limbs]
+            hung = frames[[template.limb_parents[level[k]] for k in placed]]
+            rest = (hung.mT @ (c.rest[ends] - c.rest[starts]).unsqueeze(-1)).squeeze(-1)
+            bare = [limb for limb in level if limb in tree and limb in template.bare]
+            same = [template.limbs[_same_bone(template, limb)][1] for limb in bare]
+            bare = [template.limbs[limb][1] for limb in bare]
+            of_parents = tensors.parents[placed]
+            found.append(_Bones(of_parents, starts, ends, rest, index(bare), index(same)))
+        return tuple(found)
 
 
 def _same_bone(template: SkeletonTemplate, bare: int) -> int:
@@ -221,40 +263,42 @@ def _same_bone(template: SkeletonTemplate, bare: int) -> int:
 
 def _put(q: Tensor, valid: Tensor, joints: Tensor, where_to: Tensor) -> Tensor:
     """``q`` with the unseen ones of ``joints`` at ``where_to [B, len(joints), 3]``."""
-    new = torch.where(valid[:, joints].unsqueeze(-1), q[:, joints], where_to)
-    return q.index_copy(1, joints, new)
+    seen = valid.index_select(1, joints).unsqueeze(-1)
+    return q.index_copy(1, joints, torch.where(seen, q.index_select(1, joints), where_to))
 
 
-def _complete_trunk(q: Tensor, valid: Tensor, template: SkeletonTemplate, rest: Tensor) -> Tensor:
+def _complete_trunk(q: Tensor, valid: Tensor, template: SkeletonTemplate, c: Constants) -> Tensor:
     """One missing corner: its partner plus the other line, scaled by the rest skeleton's ratio."""
-    (l_sh, r_sh), (l_hip, r_hip) = template.shoulders, template.hips
-    ratio = (rest[l_sh] - rest[r_sh]).norm() / (rest[l_hip] - rest[r_hip]).norm()
-    hips, shoulders = q[:, l_hip] - q[:, r_hip], q[:, l_sh] - q[:, r_sh]
-    corners = torch.tensor(template.torso, device=q.device)
-    upper = (q[:, r_sh] + hips * ratio, q[:, l_sh] - hips * ratio)
-    lower = (q[:, r_hip] + shoulders / ratio, q[:, l_hip] - shoulders / ratio)
-    return _put(q, valid, corners, torch.stack([*upper, *lower], dim=1))
+    l_sh, r_sh, l_hip, r_hip = c.rest.index_select(0, c.torso)
+    ratio = (l_sh - r_sh).norm() / (l_hip - r_hip).norm()
+    l_sh, r_sh, l_hip, r_hip = q.index_select(1, c.torso).unbind(1)
+    hips, shoulders = (l_hip - r_hip) * ratio, (l_sh - r_sh) / ratio
+    corners = (r_sh + hips, l_sh - hips, r_hip + shoulders, l_hip - shoulders)
+    return _put(q, valid, c.torso, torch.stack(corners, dim=1))
 
 
 def _complete_face(
-    q: Tensor, valid: Tensor, template: SkeletonTemplate, rest: Tensor, scale: Tensor
+    q: Tensor, valid: Tensor, template: SkeletonTemplate, hubs: Tensor, scale: Tensor
 ) -> Tensor:
     """Places unseen joints of the face: the rest face, aligned with the seen joints, else with the
     shoulders; then unseen landmarks of lips, brows and lids, at rest.
 
     These landmarks are not scaled: the template has the subject's own, in metres.
     """
-    frames = bone_frames(q, valid, template)
-    face = torch.tensor(template.face, device=q.device)
-    seen = valid[:, face].to(q.dtype).unsqueeze(-1)
+    c = constants(template, q.device, q.dtype)
+    face = constant(template.face, q, torch.int64)
+    shoulders = c.torso[:2]
+    joints, rest = q.index_select(1, face), c.rest.index_select(0, face)
+    seen = valid.index_select(1, face).to(q.dtype).unsqueeze(-1)
     anchored = seen.any(1)  # [B, 1]
     weight = seen / seen.sum(1, keepdim=True).clamp_min(1.0)
-    shoulders = list(template.shoulders)
-    now = torch.where(anchored, (q[:, face] * weight).sum(1), q[:, shoulders].mean(1))
-    at_rest = torch.where(anchored, (rest[face] * weight).sum(1), rest[shoulders].mean(0))
-    R = torch.where(anchored.unsqueeze(-1), frames.head, frames.hubs[:, CHEST])
-    offset = (rest[face] - at_rest.unsqueeze(1)) @ R.mT
+    below, rest_below = (x.index_select(-2, shoulders).mean(-2) for x in (q, c.rest))
+    now = torch.where(anchored, (joints * weight).sum(1), below)
+    at_rest = torch.where(anchored, (rest * weight).sum(1), rest_below)
+    chest, head = hubs[:, CHEST], hubs[:, HEAD]
+    offset = (rest - at_rest.unsqueeze(1)) @ torch.where(anchored.unsqueeze(-1), head, chest).mT
     q = _put(q, valid, face, now.unsqueeze(1) + offset * scale[:, None, None])
-    c = constants(template, q.device, q.dtype)
+    if not template.expression:
+        return q
     centre = q.index_select(1, c.head_points).mean(1, keepdim=True)
-    return _put(q, valid, c.expression, centre + c.face_rest @ frames.head.mT)
+    return _put(q, valid, c.expression, centre + c.face_rest @ head.mT)
