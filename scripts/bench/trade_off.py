@@ -92,7 +92,7 @@ class Painter:
         self.avatar, self.way = avatar, way
 
     def __call__(self, frame: Frame) -> Tensor:
-        """``[B, 3, H, W]`` I_pred in the frame's own size, float32, not clamped."""
+        """``[B, 3, H, W]`` I_pred in the frame's own size, float32."""
         way, size = self.way, frame.camera.size
         if way.scale != 1:
             side = (max(1, round(size[0] * way.scale)), max(1, round(size[1] * way.scale)))

@@ -197,10 +197,12 @@ class BodyPose(TensorRecord):
     Args:
         theta: ``[B, bones, 3]`` axis-angle of each bone relative to its parent, radians.
         transl: ``[B, 3]`` metres, added to the root.
+        bones: ``[B, bones, 4, 4]`` transforms of the bones since rest, where they are known.
     """
 
     theta: Tensor
     transl: Tensor
+    bones: Tensor | None = None
 
 
 @dataclass(frozen=True)

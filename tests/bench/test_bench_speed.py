@@ -12,12 +12,26 @@ from commands import refused
 
 from gsgan.bench.__main__ import main
 from gsgan.bench.common import cpu_name, environment, number, sentence
-from gsgan.bench.speed import StageClock, deciles, make_painter, measure, spread, text
+from gsgan.bench.speed import StageClock, deciles, in_batches, make_painter, measure, spread, text
 from gsgan.model.avatar import UNWATCHED, unwatched
 from gsgan.utils.errors import ConfigError
 
 ALL = [
-    *("window", "skeleton", "densify", "Ψ", "F", "S", "p₂D", "Ω", "pose encoder", "UNet", "paste"),
+    *(
+        "solve",
+        "window",
+        "skeleton",
+        "bones",
+        "densify",
+        "Ψ",
+        "F",
+        "S",
+        "p₂D",
+        "Ω",
+        "pose encoder",
+        "UNet",
+        "paste",
+    ),
 ]
 
 
@@ -31,8 +45,8 @@ def small(build):
 
 
 def test_the_median_and_deciles():
-    assert deciles(range(11)) == {"median": 5.0, "p10": 1.0, "p90": 9.0}
-    assert deciles([7.0]) == {"median": 7.0, "p10": 7.0, "p90": 7.0}
+    assert deciles(range(11)) == {"median": 5.0, "p10": 1.0, "p90": 9.0, "least": 0.0}
+    assert deciles([7.0]) == dict.fromkeys(("median", "p10", "p90", "least"), 7.0)
 
 
 def test_every_stage_is_timed_and_the_avatar_is_left_unwatched(small):
@@ -77,6 +91,14 @@ def test_what_a_model_lacks_has_no_stage(build, model, absent, there):
     stages = set(measure(avatar, painter, [frame], count=1, warmup=0).index)
     assert there <= stages
     assert not absent & stages
+
+
+def test_batches_are_timed_per_image(small):
+    *_, frame = small
+    sizes = []
+    times = in_batches(lambda batch: sizes.append(len(batch)), [frame, frame], None, 3, 7)
+    assert sizes == [3, 3, 3]
+    assert 0 < times["least"] <= times["median"]
 
 
 def test_the_clock_adds_up_what_one_stage_takes_twice():
@@ -134,16 +156,16 @@ def test_numbers_have_their_significant_digits(value, digits, shown):
 
 def test_the_table_adds_up():
     rows = {
-        "F": (6, 5, 7),
-        "UNet": (3, 2, 4),
-        "between stages": (1, 1, 1),
-        "end to end": (10, 9, 12),
+        "F": (6, 5, 7, 4),
+        "UNet": (3, 2, 4, 2),
+        "between stages": (1, 1, 1, 1),
+        "end to end": (10, 9, 12, 8),
     }
-    times = pd.DataFrame(rows, index=["median", "p10", "p90"]).T
+    times = pd.DataFrame(rows, index=["median", "p10", "p90", "least"]).T
     settings = {"avatar": "untrained avatar", "image": "512 x 512"}
     page = text(times, environment(torch.device("cpu")), settings, ["untrained weights"])
-    assert "| F | 6.00 | 5.00 | 7.00 | 60% |" in page
-    assert "| **end to end** | 10.0 | 9.00 | 12.0 | 100.0 frames/s |" in page
+    assert "| F | 6.00 | 5.00 | 7.00 | 4.00 | 60% |" in page
+    assert "| **end to end** | 10.0 | 9.00 | 12.0 | 8.00 | 100.0 frames/s |" in page
     assert "- untrained weights" in page
 
 
@@ -160,6 +182,8 @@ def test_the_command_times_a_run_and_fills_the_page(run, tmp_path, inside):
     assert found["settings"]["avatar"] == f"trained run {run.name}"
     assert found["settings"]["precision"] == "32-true"
     assert found["where"]["threads"] >= 1
+    assert 0 < found["times_ms"]["batches"]["least"] <= found["times_ms"]["batches"]["median"]
+    assert "- in batches of 8: " in page.read_text()
     assert "old" not in page.read_text()
     assert "| UNet |" in page.read_text()
     assert torch.tensor([1e-310], dtype=torch.float64) * 1 > 0  # denormals are there again

@@ -15,7 +15,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from gsgan.splat import gsplat_backend, rasterise
+from gsgan.splat import gsplat_backend, native, rasterise
 
 META = torch.device("meta")
 READS = ("_local_scalar_dense", "nonzero", "masked_select", "unique", "is_nonzero", "equal")
@@ -41,6 +41,16 @@ class Reads(TorchDispatchMode):
             for i in (args[1] if isinstance(args[1], list | tuple) else ())
         ):
             self.seen["index by a mask"] += 1
+        return func(*args, **(kwargs or {}))
+
+
+class OnDevice(Reads):
+    """The same of operators on `META` alone."""
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        flat = torch.utils._pytree.tree_leaves((args, kwargs))
+        if any(isinstance(x, torch.Tensor) and x.device == META for x in flat):
+            return super().__torch_dispatch__(func, types, args, kwargs)
         return func(*args, **(kwargs or {}))
 
 
@@ -75,6 +85,18 @@ def drawn(gaussians, camera, settings, want_depth):
     return features, features[:, :1], None
 
 
+def on_meta(avatar, monkeypatch):
+    """The avatar as on a GPU, whose rasteriser is stood in for."""
+    monkeypatch.setattr(gsplat_backend, "why_not", lambda settings, device: "")
+    monkeypatch.setattr(gsplat_backend, "draw", drawn)
+    monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())  # knows no meta device
+    avatar = avatar.to(META).eval()
+    avatar.backend = "gsplat"
+    if avatar.segmentation is not None:
+        avatar.segmentation.backend = "gsplat"
+    return avatar
+
+
 @pytest.mark.parametrize(
     ("model", "scene"),
     [
@@ -97,13 +119,7 @@ def test_painting_reads_nothing_back_and_copies_nothing_over(
     window = avatar.window(frame.skeleton, frame.camera)
     assert window is not None
     frame = window.frame(frame).to(META)
-    monkeypatch.setattr(gsplat_backend, "why_not", lambda settings, device: "")
-    monkeypatch.setattr(gsplat_backend, "draw", drawn)
-    monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())  # knows no meta device
-    avatar = avatar.to(META).eval()
-    avatar.backend = "gsplat"
-    if avatar.segmentation is not None:
-        avatar.segmentation.backend = "gsplat"
+    avatar = on_meta(avatar, monkeypatch)
 
     def paint():
         with torch.no_grad():
@@ -115,6 +131,28 @@ def test_painting_reads_nothing_back_and_copies_nothing_over(
         painting = paint()
     assert painting.image.device == META
     assert painting.image.shape[-2:] == window.whole
+    assert not reads.seen
+    assert not copies
+
+
+@pytest.mark.skipif(not native.available(), reason=native.why_not())
+@pytest.mark.parametrize("model", ["full", "lbs_splat"])
+def test_a_bare_skeleton_is_solved_on_the_host_and_reads_nothing_back(
+    build, monkeypatch, copies, model
+):
+    """Of avatars on a body."""
+    _, avatar, frame = build(f"model={model}", "effects=all")
+    assert avatar.needs_body
+    skeleton = frame.skeleton[0]
+    with torch.no_grad():
+        avatar.solver.solve(frame.skeleton, frame.visibility)  # its constants lie on the host
+    avatar = on_meta(avatar, monkeypatch)
+    avatar.render(skeleton, frame.camera)
+    copies.clear()
+    with OnDevice() as reads:
+        image = avatar.render(skeleton, frame.camera)
+    assert image.device == META
+    assert image.shape[-2:] == frame.camera.size
     assert not reads.seen
     assert not copies
 

@@ -21,7 +21,7 @@ from gsgan.model.assemble import build_avatar, build_data
 from gsgan.model.avatar import Avatar, unwatched
 from gsgan.model.runs import load_avatar
 from gsgan.model.stored import DataPaths, load_config
-from gsgan.scene import Frame
+from gsgan.scene import Frame, cat
 from gsgan.splat import BACKENDS, resolve_backend
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import one_of
@@ -39,10 +39,11 @@ Painter = Callable[[Frame], Tensor]
 
 
 def run(config: DictConfig, folder: Path) -> None:
-    """Times an avatar; writes ``speed.md`` and ``speed.json``.
+    """Times ``avatar.render(skeleton, camera)``; writes ``speed.md`` and ``speed.json``.
 
-    Convention: one image at a time; poses, cameras and images stay on the device, so reading and
-    displaying them is not included.
+    Convention: bare skeletons, one at a time as a camera delivers them, and in batches. Skeletons
+    and cameras are on the CPU, images stay on the device: reading and displaying them is not
+    included.
 
     Args:
         config: as conf/bench_speed.yaml.
@@ -52,7 +53,7 @@ def run(config: DictConfig, folder: Path) -> None:
         ConfigError: on a value out of range.
         DataError: when the run or its data cannot be read.
     """
-    check_whole(config, frames=1, warmup=0, poses=1, seed=0)
+    check_whole(config, frames=1, warmup=0, poses=1, batch=1, seed=0)
     one_of("channels_last", config.channels_last, (True, False))
     one_of("precision", config.precision, PRECISIONS)
     one_of("backend", config.backend, BACKENDS)
@@ -69,6 +70,8 @@ def run(config: DictConfig, folder: Path) -> None:
             warmup=config.warmup,
             tick=lambda: progress.advance(task),
         )
+        batches = in_batches(painter, frames, bench.device, config.batch, config.frames)
+    marks = [*marks, f"in batches of {config.batch}: {spoken(batches)} an image"]
     settings = {"avatar": name, **settings_of(config, avatar, frames)}
     record = {
         "settings": settings,
@@ -77,6 +80,7 @@ def run(config: DictConfig, folder: Path) -> None:
             "total": dict(times.loc[TOTAL]),
             "stages": {stage: dict(row) for stage, row in times.drop([TOTAL, REST]).iterrows()},
             "rest": dict(times.loc[REST]),
+            "batches": batches,
         },
     }
     page = text(times, bench.where, settings, marks)
@@ -86,7 +90,7 @@ def run(config: DictConfig, folder: Path) -> None:
 def load_subject(
     config: DictConfig, device: torch.device
 ) -> tuple[Avatar, list[Frame], str, list[str]]:
-    """An avatar in eval mode, frames of one image each, a name, and notes for the table.
+    """An avatar in eval mode, frames of one image each on the CPU, a name, and notes for the table.
 
     The avatar of ``run`` with its held-out poses, or an untrained one of ``config.model``.
     """
@@ -105,7 +109,7 @@ def load_subject(
         size = (int(config.size.image), int(config.size.image))
         frames = [replace(f, camera=f.camera.resize(size)) for f in spread(data, config.poses)]
     avatar = place(avatar, device, channels_last=config.channels_last)
-    return avatar, [frame.to(device) for frame in frames], name, marks
+    return avatar, frames, name, marks
 
 
 def spread(data: GsganData, count: int, split: str | None = None) -> list[Frame]:
@@ -137,7 +141,7 @@ def set_backend(avatar: Avatar, backend: str) -> None:
 
 
 def make_painter(avatar: Avatar, precision: str = "32-true", backend: str = "auto") -> Painter:
-    """A function of a frame that returns I_pred ``[B, 3, H, W]``, not clamped.
+    """A function of a frame that returns its image ``[B, 3, H, W]``, rendered from its skeleton.
 
     Args:
         avatar: in eval mode.
@@ -149,11 +153,9 @@ def make_painter(avatar: Avatar, precision: str = "32-true", backend: str = "aut
 
     @torch.inference_mode()
     def paint(frame: Frame) -> Tensor:
-        kind = frame.skeleton.device.type
+        kind = next(avatar.parameters()).device.type
         with torch.autocast(kind, dtype=dtype or torch.bfloat16, enabled=dtype is not None):
-            image = avatar(*frame.inputs, maps=False).image
-        assert image is not None
-        return image
+            return avatar.render(frame.skeleton, frame.camera, visibility=frame.visibility)
 
     return paint
 
@@ -214,10 +216,10 @@ def measure(
     """Paints ``count`` frames end to end and as many by stage, in turn, after ``warmup`` frames.
 
     Returns:
-        ``median p10 p90`` in milliseconds by stage, then ``between stages`` (of the frames timed by
-        stage, the time outside all stages) and ``end to end`` (without waiting between stages).
+        ``median p10 p90 least`` in milliseconds by stage, then ``between stages`` (of the frames
+        timed by stage, the time outside all stages) and ``end to end`` (without waiting between stages).
     """
-    device = frames[0].skeleton.device
+    device = next(avatar.parameters()).device
     samples: dict[str, list[float]] = {}
     for i in range(-warmup, count):
         frame, clock = frames[i % len(frames)], StageClock(device)
@@ -236,15 +238,32 @@ def measure(
     return pd.DataFrame({name: deciles(s) for name, s in samples.items()}).T
 
 
+def in_batches(
+    painter: Painter, frames: Sequence[Frame], device: torch.device, size: int, count: int
+) -> dict[str, float]:
+    """`deciles` of the milliseconds per image, of at least ``count`` images in batches."""
+    starts = range(0, count, size)
+    groups = [cat([frames[(i + k) % len(frames)] for k in range(size)]) for i in starts]
+    return deciles([timed(lambda group=group: painter(group), device) / size for group in groups])  # type: ignore[misc]
+
+
 def deciles(samples: Sequence[float]) -> dict[str, float]:
-    """The median, and the two deciles around it, linear between samples."""
-    found = np.quantile(samples, [0.5, 0.1, 0.9])
-    return dict(zip(("median", "p10", "p90"), map(float, found), strict=True))
+    """The median, the two deciles around it, linear between samples, and the least."""
+    found = np.quantile(samples, [0.5, 0.1, 0.9, 0])
+    return dict(zip(("median", "p10", "p90", "least"), map(float, found), strict=True))
+
+
+def spoken(times: dict[str, float]) -> str:
+    """The median and the least, in words."""
+    return (
+        f"{number(times['median'])} ms in the median and {number(times['least'])} ms at the least"
+    )
 
 
 def settings_of(config: DictConfig, avatar: Avatar, frames: Sequence[Frame]) -> dict[str, Any]:
     """The settings on which the times depend, by printed name."""
     height, width = frames[0].camera.size
+    device = next(avatar.parameters()).device
     windows = [avatar.window(frame.skeleton, frame.camera) for frame in frames]
     pixels = sum(height * width if w is None else w.size[0] * w.size[1] for w in windows)
     found: dict[str, Any] = {
@@ -256,7 +275,7 @@ def settings_of(config: DictConfig, avatar: Avatar, frames: Sequence[Frame]) -> 
         "frames": config.frames,
     }
     if avatar.splats is not None:
-        backend, _ = resolve_backend(config.backend, frames[0].skeleton.device, avatar.accuracy)
+        backend, _ = resolve_backend(config.backend, device, avatar.accuracy)
         found |= {"accuracy": avatar.accuracy.name, "backend": backend}
         found["channels of F"] = avatar.splat_channels
         found["supersampling of F"] = avatar.accuracy.supersample
@@ -279,7 +298,7 @@ def text(
     table = times.map(number)
     table.insert(0, "stage", [*stages.index, f"**{TOTAL}**"])
     table["share"] = [*shares, f"{1000 / total['median']:.1f} frames/s"]
-    table.columns = pd.Index(["stage", "median ms", "10 % below", "90 % below", "share"])
+    table.columns = pd.Index(["stage", "median ms", "10 % below", "90 % below", "least", "share"])
     how = ", ".join(f"{key} {value}" for key, value in settings.items())
     lines = [f"{sentence(where)}.", f"{how[0].upper()}{how[1:]}.", markdown(table)]
     lines += ["\n".join(f"- {mark}" for mark in marks)] if marks else []

@@ -130,7 +130,8 @@ class Solver(nn.Module):
     def solve(self, skeleton: Tensor, visibility: Tensor) -> BodyPose:
         """The pose of each skeleton; differentiable in the skeleton and in the body.
 
-        Convention: joints that no visible landmark determines stay at rest, see `at_rest`.
+        Convention: joints that no visible landmark determines stay at rest, see `at_rest`. Without
+        gradients the arithmetic is compiled code on the CPU, where that is available.
 
         Args:
             skeleton: ``[B, J, 3]`` metres, world: of a template. With 75 joints or more the fingers
@@ -148,6 +149,7 @@ class Solver(nn.Module):
             )
         if not self._live(skeleton) and compiled.available(skeleton):
             return self._compiled(skeleton, visibility)
+        skeleton, visibility = (x.to(self.joints.device) for x in (skeleton, visibility))
         # the 33 landmarks, about the middle of the hips
         hands, seen = skeleton[:, BODY:ALL], visibility[:, BODY:ALL]
         skeleton, visibility = skeleton[:, :BODY], visibility[:, :BODY]
@@ -177,7 +179,7 @@ class Solver(nn.Module):
         return BodyPose(theta, transl + shift[:, 0])
 
     def _compiled(self, skeleton: Tensor, visibility: Tensor) -> BodyPose:
-        """`solve` on the CPU: a GPU would be bound by its thousands of small operations."""
+        """`solve` by compiled code."""
         p, shown = skeleton.cpu(), visibility.to("cpu", skeleton.dtype)
         body, valid = sanitise(p[:, :BODY], shown[:, :BODY])
         hands = None

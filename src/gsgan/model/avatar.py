@@ -149,7 +149,8 @@ class Avatar(nn.Module):
     ) -> Tensor:
         """The image ``[B, 3, H, W]`` of a new pose, RGB in [0, 1], corrected for no camera.
 
-        Convention: inputs are moved to the avatar's device, where the image stays.
+        Convention: the image stays on the avatar's device. Inputs are best left on the CPU: the
+        body is solved there while a GPU still renders the image before.
 
         Args:
             skeleton: ``[J, 3]`` or ``[B, J, 3]`` metres, world frame; NaN for joints not seen. An
@@ -163,17 +164,45 @@ class Avatar(nn.Module):
         Raises:
             ValueError: on wrong shapes, or when too few shoulders and hips are finite.
         """
-        device = next(self.parameters()).device
+        visibility = None if visibility is None else visibility.cpu()
         height = self.limb_length_sum
-        p, seen = complete_skeleton(skeleton.to(device), visibility, self.template, height)
+        p, seen = complete_skeleton(skeleton.cpu(), visibility, self.template, height)
         if len(camera) not in (1, len(p)):
             raise ValueError(f"render: expected 1 or {len(p)} cameras, got {len(camera)}")
         cameras = camera if len(camera) == len(p) else cat([camera] * len(p))
-        body = None if body is None else body.to(device)
-        rendering = self(p, seen, cameras.to(device), body, maps=False)
+        rendering = self.rendered(p, seen, cameras.to("cpu"), body, maps=False)
+        assert rendering.image is not None
+        assert rendering.alpha is not None
         colour = filled(background, rendering.image).expand(3).view(1, 3, 1, 1)
         image = rendering.image.clamp(0, 1)
         return (image + (1 - rendering.alpha.clamp(0, 1)) * colour).clamp(0, 1)
+
+    def rendered(
+        self,
+        skeleton: Tensor,
+        visibility: Tensor,
+        camera: Camera,
+        body: BodyPose | None = None,
+        camera_index: Tensor | None = None,
+        *,
+        maps: bool = True,
+    ) -> Rendering:
+        """`forward` of inputs on the CPU, where the body is solved and the window found.
+
+        Convention: nothing is read back from the avatar's device.
+        """
+        device = next(self.parameters()).device
+        body = self.body_pose(skeleton, visibility) if body is None else body
+        window = self.window(skeleton, camera)
+        rendering = self(
+            skeleton.to(device),
+            visibility.to(device),
+            (camera if window is None else window.camera(camera)).to(device),
+            None if body is None else body.to(device),
+            None if camera_index is None else camera_index.to(device),
+            maps=maps,
+        )
+        return rendering if window is None else self._pasted(rendering, window)
 
     def forward(
         self,
@@ -219,8 +248,9 @@ class Avatar(nn.Module):
         if camera_index is not None:
             rendering = self._corrected(rendering, camera_index)
         rendering = rendering if maps else rendering.only_image()
-        if window is None:
-            return rendering
+        return rendering if window is None else self._pasted(rendering, window)
+
+    def _pasted(self, rendering: Rendering, window: Window) -> Rendering:
         with self.stage("paste"):
             return rendering.pasted(window)
 
@@ -257,6 +287,10 @@ class Avatar(nn.Module):
             with self.stage("skeleton"):
                 valid = visibility > 0
                 frames = bone_frames(p, valid, self.template)
+            follows = self.body_points or self.surface or self.segmentation
+            if body is not None and follows is not None:
+                with self.stage("bones"):
+                    body = follows.points.with_bones(body)  # once for G and S
             gaussians = self.splat(p, valid, frames, camera, body, pose_noise)
             if gaussians is not None:
                 raster = self._rasterised(gaussians, camera, supersample)

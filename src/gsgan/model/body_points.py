@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -60,14 +61,21 @@ class SkinnedPoints(nn.Module):
     def __len__(self) -> int:
         return len(self.means)
 
+    def with_bones(self, pose: BodyPose) -> BodyPose:
+        """The pose with the transforms of its bones, computed once for all that follow the body."""
+        if pose.bones is not None:
+            return pose
+        rotations = axis_angle_to_matrix(pose.theta)
+        bones = forward_kinematics(self.joints, self.parents, rotations, pose.transl)
+        return replace(pose, bones=bones)
+
     def blend(self, pose: BodyPose) -> tuple[Tensor, Tensor]:
         """The affine map of each point: ``A [B, N, 3, 3]`` and ``t [B, N, 3]``.
 
         A blend of rotations is not a rotation, so shapes are transformed as covariances ``A Σ Aᵀ``.
         """
-        bones = forward_kinematics(
-            self.joints, self.parents, axis_angle_to_matrix(pose.theta), pose.transl
-        )
+        bones = self.with_bones(pose).bones
+        assert bones is not None
         return blend_transforms(bones, self.bone_index, self.bone_weight)
 
 

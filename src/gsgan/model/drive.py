@@ -259,18 +259,18 @@ def rest_pose(proportions: Proportions) -> Drive:
 
 def joints_of(avatar: Avatar, drive: Drive, i: int) -> tuple[Tensor, Tensor]:
     """Joints ``[1, J, 3]`` of frame i, metres, finite, and their visibility ``[1, J]``; 0 marks a
-    stand-in. J is that of the avatar's skeleton. Both are on the avatar's device.
+    stand-in. J is that of the avatar's skeleton. Both are on the CPU.
 
     Raises:
         ValueError: when fewer than three of shoulders and hips are known.
     """
-    device = next(avatar.parameters()).device
-    p, seen = (torch.from_numpy(x[i : i + 1]).to(device) for x in (drive.p, drive.visibility))
+    p, seen = (torch.from_numpy(x[i : i + 1]) for x in (drive.p, drive.visibility))
     return complete_skeleton(p, seen, avatar.template, avatar.limb_length_sum)
 
 
 def inputs_of(avatar: Avatar, drive: Drive, i: int) -> tuple[Tensor, Tensor, BodyPose | None]:
-    """`joints_of`, and the body pose where the avatar needs one: the drive's, else solved.
+    """`joints_of`, and the body pose where the avatar needs one: the drive's, else solved; for
+    `Avatar.rendered`.
 
     Raises:
         ValueError: as `joints_of`.

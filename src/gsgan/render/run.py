@@ -166,8 +166,10 @@ def _image(
     camera = cameras[at]
     with torch.no_grad():
         p, visibility, body = inputs_of(run.avatar, drive, i)
-        colours = None if index is None else index[at].to(p.device)
-        found = run.avatar(p, visibility, camera.to(p.device), body, colours, maps=False)
+        colours = None if index is None else index[at]
+        found = run.avatar.rendered(p, visibility, camera, body, colours, maps=False)
+    assert found.image is not None
+    assert found.alpha is not None
     tiles = [(found.image[0].cpu(), found.alpha[0].cpu())]
     if config.compare is not None:
         assert drive.truth is not None

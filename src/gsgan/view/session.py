@@ -257,7 +257,7 @@ class Session:
         p, visibility, body = inputs_of(avatar, current, 0)
         maps = layer != IMAGE or self.splats.value
         with torch.no_grad():
-            rendering = avatar(p, visibility, camera.to(p.device), body, maps=maps)
+            rendering = avatar.rendered(p, visibility, camera, body, maps=maps)
         if avatar.poses is not None:
             self.far.value = f"{float(avatar.poses.distance(p)):.1f}"
         behind = self.show.behind(camera.size)
