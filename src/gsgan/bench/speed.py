@@ -217,7 +217,8 @@ def measure(
 
     Returns:
         ``median p10 p90 least`` in milliseconds by stage, then ``between stages`` (of the frames
-        timed by stage, the time outside all stages) and ``end to end`` (without waiting between stages).
+        timed by stage, the time outside all stages) and ``end to end`` (without waiting between
+        stages).
     """
     device = next(avatar.parameters()).device
     samples: dict[str, list[float]] = {}
