@@ -71,7 +71,8 @@ def run(config: DictConfig, folder: Path) -> None:
             tick=lambda: progress.advance(task),
         )
         batches = in_batches(painter, frames, bench.device, config.batch, config.frames)
-    marks = [*marks, f"in batches of {config.batch}: {spoken(batches)} an image"]
+    median, least = number(batches["median"]), number(batches["least"])
+    marks = [*marks, f"in batches of {config.batch}: {median} ms an image, at the least {least}"]
     settings = {"avatar": name, **settings_of(config, avatar, frames)}
     record = {
         "settings": settings,
@@ -252,13 +253,6 @@ def deciles(samples: Sequence[float]) -> dict[str, float]:
     """The median, the two deciles around it, linear between samples, and the least."""
     found = np.quantile(samples, [0.5, 0.1, 0.9, 0])
     return dict(zip(("median", "p10", "p90", "least"), map(float, found), strict=True))
-
-
-def spoken(times: dict[str, float]) -> str:
-    """The median and the least, in words."""
-    return (
-        f"{number(times['median'])} ms in the median and {number(times['least'])} ms at the least"
-    )
 
 
 def settings_of(config: DictConfig, avatar: Avatar, frames: Sequence[Frame]) -> dict[str, Any]:

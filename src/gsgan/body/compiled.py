@@ -61,8 +61,7 @@ def solve(
     the bit in any batch and with any number of threads.
 
     Args:
-        constants: `held` ones, by the names of `CONSTANTS`; those of fingers only with hands.
-        counts, numbers: by the names of `COUNTS` and `NUMBERS`.
+        constants, counts, numbers: by `CONSTANTS`, `COUNTS`, `NUMBERS`; `held`, fingers with hands.
         body: ``[B, 33, 3]`` finite, their visibility ``[B, 33]``, and ``[B, 33]`` bool, whether
             they were seen.
         hands: ``[B, 42, 3]``, and ``[B, 42]`` bool, whether they were seen and are finite.

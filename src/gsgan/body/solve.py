@@ -192,11 +192,10 @@ class Solver(nn.Module):
 
     def _counts(self) -> dict[str, int]:
         """Those of `compiled.COUNTS`."""
-        rig, limbs = self.rig, len(self.rig.limbs)
+        rig = self.rig
         sizes = (self.parents, len(rig.joint), len(rig.names), len(rig.entry_turn))
-        more = (len(self.landmarks), 1 + len(SPINE), limbs, STEPS)
-        rounds = (len(ROUNDS), PLACING)
-        return dict(zip(compiled.COUNTS, (*sizes, *more, *rounds), strict=True))
+        more = (len(self.landmarks), 1 + len(SPINE), len(rig.limbs), STEPS, len(ROUNDS), PLACING)
+        return dict(zip(compiled.COUNTS, (*sizes, *more), strict=True))
 
     @cached_property
     def _constants(self) -> dict[str, Tensor]:

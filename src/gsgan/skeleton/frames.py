@@ -89,7 +89,7 @@ def bone_frames(
     # baselines are differences of nearby points: exact once the root is subtracted
     q = p - p[:, template.hips[0], None].detach()
     trunk = _trunk(q, c)
-    known = _hubs(q, valid, trunk, c)
+    known = torch.cat([trunk[:, :2], _head(q, valid, trunk[:, 1], c)], dim=1)
     if template.palms:
         known = torch.cat([known, palms_of(q, trunk[:, 1:2], c)], dim=1)
 
@@ -118,10 +118,7 @@ def swings(bones: Tensor, parent: Tensor, level: Level) -> Tensor:
 
 def hubs_of(q: Tensor, valid: Tensor, c: Constants) -> Tensor:
     """``[B, 3, 3, 3]`` frames of pelvis, chest and head of joints near the origin."""
-    return _hubs(q, valid, _trunk(q, c), c)
-
-
-def _hubs(q: Tensor, valid: Tensor, trunk: Tensor, c: Constants) -> Tensor:
+    trunk = _trunk(q, c)
     return torch.cat([trunk[:, :2], _head(q, valid, trunk[:, 1], c)], dim=1)
 
 
