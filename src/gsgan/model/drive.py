@@ -269,8 +269,7 @@ def joints_of(avatar: Avatar, drive: Drive, i: int) -> tuple[Tensor, Tensor]:
 
 
 def inputs_of(avatar: Avatar, drive: Drive, i: int) -> tuple[Tensor, Tensor, BodyPose | None]:
-    """`joints_of`, and the body pose where the avatar needs one: the drive's, else solved; for
-    `Avatar.rendered`.
+    """`joints_of`, and the body pose where the avatar needs one: the drive's, else solved.
 
     Raises:
         ValueError: as `joints_of`.
