@@ -1,7 +1,5 @@
 """Runs commands as a user does, for the tests of entry points."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

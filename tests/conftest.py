@@ -1,7 +1,5 @@
 """Fixtures of all tests: few threads, a tiny capture, a tiny config, a tiny trained run."""
 
-from __future__ import annotations
-
 import copy
 import fcntl
 import importlib.util

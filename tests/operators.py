@@ -1,7 +1,5 @@
 """Counting what torch is asked to do."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 from torch.utils._python_dispatch import TorchDispatchMode

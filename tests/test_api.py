@@ -1,7 +1,5 @@
 """``gsgan.load`` and ``Avatar.render``: five lines of Python from a run folder to an image."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

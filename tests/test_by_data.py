@@ -1,7 +1,5 @@
 """What data and machine decide by themselves, and the factors that belong to a study."""
 
-from __future__ import annotations
-
 import pytest
 
 from gsgan.utils.config import config_folder

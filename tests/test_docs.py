@@ -1,7 +1,5 @@
 """The docs say what is there: pages, links, budgets, the comments of conf/, the website."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

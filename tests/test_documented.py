@@ -5,8 +5,6 @@ in a newcomer's first pages are composed, and run with the slow tests. `tests/te
 those of docs/examples/.
 """
 
-from __future__ import annotations
-
 import re
 import runpy
 import shutil

@@ -1,7 +1,5 @@
 """The commands as a user types them: real processes, tiny runs, and every way to go wrong."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """``gsgan.evaluate predictions=``: any method's images, scored like those of a run."""
 
-from __future__ import annotations
-
 import csv
 import json
 import shutil

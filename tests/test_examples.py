@@ -1,7 +1,5 @@
 """The scripts of docs/examples/ run, on tiny data; the commands they start run in this process."""
 
-from __future__ import annotations
-
 import importlib
 import re
 from types import ModuleType, SimpleNamespace

@@ -1,7 +1,5 @@
 """The examples of docs/extending.md: a dataset format, a loss term, a generator, a baseline."""
 
-from __future__ import annotations
-
 import json
 import shutil
 

@@ -1,7 +1,5 @@
 """scripts/gpu_check.sh without a GPU: what it says, and that its steps run once and compose."""
 
-from __future__ import annotations
-
 import os
 import shlex
 import subprocess

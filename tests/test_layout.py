@@ -1,7 +1,5 @@
 """The layout of src/gsgan: few entries, short files, imports that point one way."""
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterator
 from graphlib import TopologicalSorter

@@ -1,7 +1,5 @@
 """`experiment=paper` is one line for every data set, and only its runs bear the paper's name."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

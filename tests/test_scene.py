@@ -1,7 +1,5 @@
 """The nouns check their shapes, move, stack, crop and project."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import pytest

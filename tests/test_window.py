@@ -1,7 +1,5 @@
 """The window holds the person, follows from joints and camera, and pastes back where it was."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

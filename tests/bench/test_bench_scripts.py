@@ -1,7 +1,5 @@
 """The scripts of scripts/bench run tiny and write their tables."""
 
-from __future__ import annotations
-
 import json
 import runpy
 import shutil

@@ -1,7 +1,5 @@
 """`gsgan.bench speed`: stages, precision and memory of a tiny avatar, and error messages."""
 
-from __future__ import annotations
-
 import json
 import platform
 

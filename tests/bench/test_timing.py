@@ -1,7 +1,5 @@
 """Interleaving, patience, medians."""
 
-from __future__ import annotations
-
 import sys
 
 import pytest

@@ -1,7 +1,5 @@
 """Finger joints of the free body from hand landmarks: accuracy, limits, missing hands, damage."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The free body's asset: valid geometry, left and right, rigid bones."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

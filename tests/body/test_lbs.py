@@ -1,7 +1,5 @@
 """Linear blend skinning against closed forms."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

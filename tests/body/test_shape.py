@@ -1,7 +1,5 @@
 """The free body's shape space, stretches, and shapes from skeletons."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 

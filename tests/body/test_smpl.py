@@ -1,7 +1,5 @@
 """Models of the SMPL family: pickled files, and poses with a closed form."""
 
-from __future__ import annotations
-
 import math
 import pickle
 

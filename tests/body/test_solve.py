@@ -1,7 +1,5 @@
 """From skeletons to poses of the free body and of SMPL's: accuracy, hinges, damage."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """A small good capture, and copies of it to be damaged."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The command: report, JSON, exit code; and the real capture's findings."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re

@@ -1,7 +1,5 @@
 """Good data passes; every damage is found, named, and an error where training would be wasted."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Colours, units and settings."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

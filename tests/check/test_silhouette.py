@@ -1,7 +1,5 @@
 """The estimated silhouette against values known in advance."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from gsgan.check.views import body_silhouette

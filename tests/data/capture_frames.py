@@ -1,7 +1,5 @@
 """Reads whole captures, and writes PNGs of any kind, for the tests of the reader."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Fixtures of the data tests; `make` beside this file becomes importable."""
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Every format that has a reader, each with the writer that tests it: add yours to `FORMATS`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

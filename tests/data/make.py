@@ -1,7 +1,5 @@
 """A small valid capture on disk, made in milliseconds: coloured discs round the joints."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

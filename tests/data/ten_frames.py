@@ -1,7 +1,5 @@
 """The capture that the tests of splits, loaders and config files share."""
 
-from __future__ import annotations
-
 import pytest
 from make import write_tiny_capture
 

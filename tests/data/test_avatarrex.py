@@ -1,7 +1,5 @@
 """AvatarReX: where it differs from THuman4.0 (tests of what they share are in test_thuman4)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Damaged files of every format: one sentence that names the file, one case for each message."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The reader: what a `Frame` holds, and which frames it takes."""
 
-from __future__ import annotations
-
 import shutil
 import struct
 

@@ -1,7 +1,5 @@
 """The reader: the person's window, its size, and what lenses do to it."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Joints, cameras and masks that do not belong together are refused or named when data are read."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

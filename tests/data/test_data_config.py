@@ -1,7 +1,5 @@
 """The config files of the data: what they build, and what they take from other groups."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

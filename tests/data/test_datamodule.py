@@ -1,7 +1,5 @@
 """Sampling order, loaders, and what the scene is said to be like."""
 
-from __future__ import annotations
-
 import functools
 import json
 import logging

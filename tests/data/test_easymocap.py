@@ -1,7 +1,5 @@
 """EasyMocap's folders: what is read equals what was written."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The face of a capture: 105 joints with data.skeleton=holistic."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Damaged files of every format: a good read or one sentence; no hang, no traceback."""
 
-from __future__ import annotations
-
 import shutil
 import signal
 from collections.abc import Iterator

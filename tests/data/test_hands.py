@@ -1,7 +1,5 @@
 """Hands of a capture: 75 joints with data.skeleton=mediapipe33_hands, 33 without."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Memory is measured: it follows the cache's bound and the index, never the pictures read."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import tracemalloc

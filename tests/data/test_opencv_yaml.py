@@ -1,7 +1,5 @@
 """OpenCV's YAML: what OpenCV wrote is read as OpenCV reads it; what is damaged is one sentence."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

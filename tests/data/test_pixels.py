@@ -1,7 +1,5 @@
 """What the numbers in image, mask and label files mean."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Protocols: who trains, who tests, and what is written beside the numbers."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

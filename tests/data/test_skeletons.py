@@ -1,7 +1,5 @@
 """Lengths of bones by frame."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from gsgan.data.skeletons import bone_lengths

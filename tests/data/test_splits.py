@@ -1,7 +1,5 @@
 """Which frames and cameras are trained on, and which are held out."""
 
-from __future__ import annotations
-
 import pytest
 import ten_frames
 from make import write_tiny_capture

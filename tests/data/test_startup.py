@@ -1,7 +1,5 @@
 """What opening a capture does once, so that nothing does it for every image."""
 
-from __future__ import annotations
-
 import gc
 import weakref
 

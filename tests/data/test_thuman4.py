@@ -1,7 +1,5 @@
 """THuman4.0: what is read equals what was written."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The distance from the training poses: its unit, what it ignores, and what it does not."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

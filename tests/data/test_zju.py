@@ -1,7 +1,5 @@
 """ZJU-MoCap: what is read equals what was written, in each layout it is found in."""
 
-from __future__ import annotations
-
 import json
 import pickle
 import shutil

@@ -1,7 +1,5 @@
 """What an effect does to the avatar: built and computed when on, absent when off."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """What a lens does to the pictures and the paintings, whatever the effects say."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

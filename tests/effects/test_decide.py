@@ -1,7 +1,5 @@
 """The rules: pure decisions from what a scene is like and what the user says."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Colours on shared surface: tints are seen, sides lit differently are not taken for them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

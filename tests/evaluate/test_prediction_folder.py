@@ -1,7 +1,5 @@
 """A folder of predictions: names, missing, repeated and extra images, broken files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

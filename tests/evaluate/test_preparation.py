@@ -1,7 +1,5 @@
 """What a protocol does to images, on real frames: the body's box, clearing, 8 bits."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import pytest

@@ -1,7 +1,5 @@
 """What is written: every digit, and never scores of different ways in one table."""
 
-from __future__ import annotations
-
 import csv
 import math
 

@@ -1,7 +1,5 @@
 """Tables: the floor, the marks and what was scored always show, None is n/a, JSON is strict."""
 
-from __future__ import annotations
-
 import json
 
 import pandas as pd

@@ -1,7 +1,5 @@
 """Means, reasons, cameras; regions of a protocol; mIoU against torchmetrics."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from unittest.mock import Mock

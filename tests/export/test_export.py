@@ -1,7 +1,5 @@
 """``python -m gsgan.export``: files, cards and refusals of the real command."""
 
-from __future__ import annotations
-
 import pytest
 from commands import refused
 from PIL import Image

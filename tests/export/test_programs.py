@@ -1,7 +1,5 @@
 """ONNX, torch.export and safetensors give the avatar's image."""
 
-from __future__ import annotations
-
 import io
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Exported Gaussians: what other programs read is what the avatar draws."""
 
-from __future__ import annotations
-
 import io
 
 import numpy as np

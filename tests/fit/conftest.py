@@ -1,7 +1,5 @@
 """People to fit to, and fits of them."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Settings of a fit that takes seconds."""
 
-from __future__ import annotations
-
 QUICK = [
     "size.image=48",
     "fit.points=400",

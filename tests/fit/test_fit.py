@@ -1,7 +1,5 @@
 """`gsgan.fit`: poses fill the masks better, and held-out images are not used."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import threading

@@ -1,7 +1,5 @@
 """Losses: closed forms, signs, hard inputs, and what stands in for VGG."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Pixels that are not to be learned from: no loss and no gradient there, the same elsewhere."""
 
-from __future__ import annotations
-
 import torch
 
 from gsgan.losses.photometric import photometric, without_unsure

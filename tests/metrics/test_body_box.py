@@ -1,7 +1,5 @@
 """The body's projected box: cases that can be counted by hand."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

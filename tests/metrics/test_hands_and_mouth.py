@@ -1,7 +1,5 @@
 """Boxes of hands and mouth: cases that can be counted by hand, and the scores in them."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

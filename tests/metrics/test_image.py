@@ -1,7 +1,5 @@
 """Scores of pictures: closed forms, and torchmetrics called directly."""
 
-from __future__ import annotations
-
 import math
 
 import cv2

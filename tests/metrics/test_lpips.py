@@ -1,7 +1,5 @@
 """LPIPS: never from random weights by itself; its arithmetic is torchmetrics'."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity

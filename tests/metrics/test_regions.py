@@ -1,7 +1,5 @@
 """What is scored of a picture: closed forms of backgrounds, 8 bits, clearing and crops."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """The whole avatar: shapes, starts, gradients to every part, and the window's promise."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import pytest

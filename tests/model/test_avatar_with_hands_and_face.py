@@ -1,7 +1,5 @@
 """Avatars of skeletons with hands and a face: every part takes them, and both may be missing."""
 
-from __future__ import annotations
-
 import re
 import shutil
 

@@ -1,7 +1,5 @@
 """G on a skinned body: where the points are, that nothing else is built, that Ψ learns there."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """A bound that a parameter can come back from."""
 
-from __future__ import annotations
-
 import torch
 
 from gsgan.model.colour import ColourCorrection

@@ -1,7 +1,5 @@
 """The class vote: what is hidden has no vote, majorities win, ties and gaps take the nearest."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import shutil

@@ -1,7 +1,5 @@
 """Compiled operations against the tensor operations that define them: values and gradients."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

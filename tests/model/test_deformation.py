@@ -1,7 +1,5 @@
 """Ψ starts exactly at G, moves with the body, and stays finite where it saturates."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """A frozen avatar paints as the avatar in training does, and follows its weights."""
 
-from __future__ import annotations
-
 import copy
 
 import pytest

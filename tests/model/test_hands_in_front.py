@@ -1,7 +1,5 @@
 """S shows the hand in front where hands cross and touch, against ray-traced labels."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -5,8 +5,6 @@ the host (a tensor made of numbers) is counted beside it. The rasteriser itself 
 gsplat's is not ours, and the portable one waits twice, see `gsgan.splat.tile_lists`.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from contextlib import nullcontext
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Generator, discriminator, pose encoders, encoding: shapes, starts, gradients, hard inputs."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch.nn import functional

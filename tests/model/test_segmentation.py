@@ -1,7 +1,5 @@
 """S: probabilities that sum to one, move with the body, and learn."""
 
-from __future__ import annotations
-
 import math
 import shutil
 from functools import cache

@@ -1,7 +1,5 @@
 """Faces of motion files: the offset from a face at rest arrives in the axes of the driven head."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Hands of motion files: finger directions stay, lengths are the subject's, gaps are not seen."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Every motion format gives the skeletons that were written into it."""
 
-from __future__ import annotations
-
 import json
 import pickle
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Retargeting: directions stay, lengths are the subject's, feet are on the ground."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

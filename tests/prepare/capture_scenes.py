@@ -1,7 +1,5 @@
 """Rigs, motions and files with known ground truth for the tests of `gsgan.prepare`."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

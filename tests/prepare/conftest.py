@@ -1,7 +1,5 @@
 """A prepared dataset is checked by its own tests, and once in test_prepare_run.py."""
 
-from __future__ import annotations
-
 import pytest
 
 

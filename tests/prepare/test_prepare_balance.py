@@ -1,7 +1,5 @@
 """Real videos: four cameras around a man, and four webcams before a man who sits and gestures."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

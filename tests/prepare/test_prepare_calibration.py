@@ -1,7 +1,5 @@
 """Calibration files of other tools are read as the cameras that they describe."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from capture_scenes import (

@@ -1,7 +1,5 @@
 """Damaged files, full disks, folders with other content."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import os

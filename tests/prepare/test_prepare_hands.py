@@ -1,7 +1,5 @@
 """Hands and face across views: swapped, missing, repeated and wild detections."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from capture_scenes import ring

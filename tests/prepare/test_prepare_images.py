@@ -1,7 +1,5 @@
 """The images of a dataset: sources, masks, undistortion, and what is noted about them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

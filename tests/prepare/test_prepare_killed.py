@@ -1,7 +1,5 @@
 """A process killed (SIGKILL) at any stage: the next run makes the same dataset."""
 
-from __future__ import annotations
-
 import io
 import os
 import signal

@@ -1,7 +1,5 @@
 """2D landmarks from files of several detectors."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

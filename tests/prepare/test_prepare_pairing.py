@@ -1,7 +1,5 @@
 """Videos find their calibrated cameras by name."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """3D joints that another tool wrote: units, axes, names, filled gaps."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

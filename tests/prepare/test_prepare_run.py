@@ -1,7 +1,5 @@
 """`gsgan.prepare` from videos on disk to a dataset that training reads."""
 
-from __future__ import annotations
-
 import io
 import json
 from pathlib import Path

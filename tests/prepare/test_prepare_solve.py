@@ -1,7 +1,5 @@
 """Triangulation, flips, refinement, smoothing on motions with known ground truth."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from capture_scenes import LENS, ring, seen, turned

@@ -1,7 +1,5 @@
 """Marks of synthetic images and videos, written and read back."""
 
-from __future__ import annotations
-
 import datetime
 import io
 

@@ -1,7 +1,5 @@
 """``gsgan.render``: images of evaluation, cameras, backgrounds, going on, clear messages."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Run folders written by hand: known scores, real files."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

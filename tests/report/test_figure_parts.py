@@ -1,7 +1,5 @@
 """The parts of the figures, on images whose numbers are known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """``gsgan.report run=…`` as a user types it: every figure, and every error."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

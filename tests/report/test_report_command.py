@@ -1,7 +1,5 @@
 """``python -m gsgan.report`` as a user types it, and its config."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

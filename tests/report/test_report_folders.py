@@ -1,7 +1,5 @@
 """Which folders are runs, what is read from them, and which are left out."""
 
-from __future__ import annotations
-
 import json
 import re
 

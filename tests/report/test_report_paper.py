@@ -1,7 +1,5 @@
 """The paper's numbers: as printed, marked, beside the same data and protocol only."""
 
-from __future__ import annotations
-
 import pytest
 from omegaconf import OmegaConf
 from report_folders import protocol, report_of, row, table, texts, write_run, zju

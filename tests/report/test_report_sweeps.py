@@ -1,7 +1,5 @@
 """``table.by``: a sweep over settings as rows."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

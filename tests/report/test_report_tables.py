@@ -1,7 +1,5 @@
 """Tables of handmade runs: every number in closed form, every mixture refused by name."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """Markdown, LaTeX and CSV of one report: escaped, complete, well formed."""
 
-from __future__ import annotations
-
 import io
 import re
 

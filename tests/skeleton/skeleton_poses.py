@@ -1,7 +1,5 @@
 """Skeletons for the tests: the rest pose, plausible and degenerate ones, rigid motions."""
 
-from __future__ import annotations
-
 import torch
 from stability.cases.poses import DEGENERATE, REST, noisy, rest
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Densify: counts and layout, points on their surfaces, one body point per index."""
 
-from __future__ import annotations
-
 import importlib.util
 import math
 from pathlib import Path

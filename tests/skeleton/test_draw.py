@@ -1,7 +1,5 @@
 """The drawn skeleton: analytic values, omitted segments, gradients."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Any

@@ -1,7 +1,5 @@
 """Bone frames and Ω: rotations everywhere, motion with the body, finite at the singular poses."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from hypothesis import given

@@ -1,7 +1,5 @@
 """6D rotations: round trip, degenerate columns, gradients."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from skeleton_poses import rotation

@@ -1,7 +1,5 @@
 """Sanitise: every joint finite, seen ones untouched, missing ones where a body has them."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from hypothesis import given

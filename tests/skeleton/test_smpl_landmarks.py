@@ -1,7 +1,5 @@
 """SMPL and SMPL-X to MediaPipe's 33 landmarks: known where the body has them, NaN elsewhere."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """The constants: counts and structure of MediaPipe and the method notes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The skeleton with a face: where the face rests, and what its code shows of an expression."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """The skeleton with hands: its table, and that every part of the method follows from it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Small scenes and comparisons shared by the rasteriser's tests."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import fields, replace
 

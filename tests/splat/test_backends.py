@@ -1,7 +1,5 @@
 """Every backend against analytic values, the naive loops, and the exact reference."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

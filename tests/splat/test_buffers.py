@@ -1,7 +1,5 @@
 """Reused memory: always zeros, and never memory that is still in use."""
 
-from __future__ import annotations
-
 import gc
 from concurrent.futures import ThreadPoolExecutor
 

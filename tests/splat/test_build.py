@@ -1,7 +1,5 @@
 """The compiler, the cache and the loading of the kernel, and the reasons why it may be missing."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Finite differences in float64, beyond test_backends.py: colour, projection alone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

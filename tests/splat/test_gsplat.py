@@ -5,8 +5,6 @@ ignored, K gets no gradient, a covariance is read from its upper triangle. What 
 arguments it gets must be what our own backends draw.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import logging
 import sys

@@ -1,7 +1,5 @@
 """The lens: OpenCV's numbers, its inverse, and splats as a lens shows them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

@@ -1,7 +1,5 @@
 """The compiled kernel: cut-offs, the exponential, threads, memory; see also test_backends.py."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

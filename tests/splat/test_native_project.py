@@ -1,7 +1,5 @@
 """The compiled projection against the portable one: values, gradients, untouched Gaussians."""
 
-from __future__ import annotations
-
 import ctypes
 from dataclasses import replace
 

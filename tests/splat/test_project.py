@@ -1,7 +1,5 @@
 """Projection: closed forms, extents, quaternions."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

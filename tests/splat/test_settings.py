@@ -1,7 +1,5 @@
 """Accuracy presets, their configs, and the choice of a backend."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import asdict, fields, replace
 from pathlib import Path

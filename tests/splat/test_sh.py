@@ -1,7 +1,5 @@
 """Spherical harmonics: closed forms, orthogonality, the 0.5 of 3D Gaussian splatting."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

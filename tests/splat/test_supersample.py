@@ -1,7 +1,5 @@
 """Supersampling: drawing larger, then averaging."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """The argument checks of rasterise: errors and their messages."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Every hard case by name, on each backend: right in values and gradients, or refused."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """The comparison with float64: it finds what is wrong, and only that."""
 
-from __future__ import annotations
-
 import math
 import warnings
 

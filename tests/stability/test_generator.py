@@ -1,7 +1,5 @@
 """What half precision may and may not change."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch.nn import functional

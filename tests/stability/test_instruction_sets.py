@@ -1,7 +1,5 @@
 """The hard cases on instruction sets this machine would not choose: kernels round differently."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """D-SSIM on nearly flat images and under autocast."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from kornia.losses import ssim_loss

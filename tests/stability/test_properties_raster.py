@@ -1,7 +1,5 @@
 """What holds of every scene: searched for counter-examples among random ones."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

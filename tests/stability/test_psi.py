@@ -1,7 +1,5 @@
 """Ψ: its Gaussians are bounded for any residuals."""
 
-from __future__ import annotations
-
 import torch
 from hypothesis import given
 from hypothesis import strategies as st

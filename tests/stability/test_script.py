@@ -1,7 +1,5 @@
 """``make stability``: its tables, its exit."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import math

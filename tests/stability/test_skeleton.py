@@ -1,7 +1,5 @@
 """Hard skeletons: no jump of a frame where none is forced, and motions that commute."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from hypothesis import given

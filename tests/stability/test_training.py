@@ -1,7 +1,5 @@
 """Training survives: bad gradients move nothing and are counted; hard skeletons stay finite."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

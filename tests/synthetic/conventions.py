@@ -1,7 +1,5 @@
 """One motion as BVH files in the conventions of many tools."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

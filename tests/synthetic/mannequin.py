@@ -1,7 +1,5 @@
 """A small rig in a T pose for motion tests, points inside meshes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """BVH files on characters: names, axes, units, drift, the floor, and damaged files."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """One motion written in many conventions is read as the same motion."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The far choreography on rigs: limits, contact with the floor, hands at their places."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from mannequin import assert_limits, local, mannequin

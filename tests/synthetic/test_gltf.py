@@ -1,7 +1,5 @@
 """Rigged .glb files read as characters: geometry, bones, textures, labels, landmarks, errors."""
 
-from __future__ import annotations
-
 import re
 import sys
 from pathlib import Path

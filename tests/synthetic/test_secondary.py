@@ -1,7 +1,5 @@
 """Sway and wrinkles: what is added to linear blend skinning."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The signs: joints within their limits, hands that touch and cross, unseen signs, the cameras."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from mannequin import assert_limits, inside, mannequin

@@ -1,7 +1,5 @@
 """The synthetic dataset: complete or absent, reproducible, with consistent files."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

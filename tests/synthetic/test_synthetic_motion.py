@@ -1,7 +1,5 @@
 """The choreography on rigs: limits, feet, limbs and trunk, face, and its held-out frames."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

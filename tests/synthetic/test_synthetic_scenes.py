@@ -1,7 +1,5 @@
 """Variants of the default person: lens, tint, gloss and test_scale change what they should."""
 
-from __future__ import annotations
-
 import json
 
 import cv2

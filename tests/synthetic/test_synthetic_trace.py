@@ -1,7 +1,5 @@
 """The tracer of characters: geometry, light, textures, masks and labels."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

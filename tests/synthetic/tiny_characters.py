@@ -1,7 +1,5 @@
 """Small characters of a few faces, and cameras that look at them."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from gsgan.motion.character import Character, Surface

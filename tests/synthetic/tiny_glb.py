@@ -1,7 +1,5 @@
 """A small rigged person of boxes, written as .glb with pygltflib."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 from typing import Any

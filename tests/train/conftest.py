@@ -1,7 +1,5 @@
 """A tiny training module with its Trainer."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """CUDA against the CPU: the same images, gradients and first iteration."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 from pathlib import Path

@@ -5,8 +5,6 @@ and so is every operation for which the host would wait; there are no values. Th
 real on the device that GPU_CHECK_DEVICE names, by default CUDA.
 """
 
-from __future__ import annotations
-
 import os
 from contextlib import ExitStack, nullcontext
 from dataclasses import fields, replace

@@ -1,7 +1,5 @@
 """The paper's size, 512² with full widths, trains on a CPU."""
 
-from __future__ import annotations
-
 import resource
 
 import pytest

@@ -1,7 +1,5 @@
 """What stops a run, what does not, and rates that follow the schedule."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

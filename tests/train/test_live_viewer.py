@@ -1,7 +1,5 @@
 """``viewer=true``: the viewer during training."""
 
-from __future__ import annotations
-
 import sys
 from urllib.error import URLError
 from urllib.request import urlopen

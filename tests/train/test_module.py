@@ -1,7 +1,5 @@
 """The training scheme: every phase learns what it should, guards hold, randomness is derived."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

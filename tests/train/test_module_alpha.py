@@ -1,7 +1,5 @@
 """What teaches alpha: the splats' in step one, the generator's in step two."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

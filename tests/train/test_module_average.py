@@ -1,7 +1,5 @@
 """The moving average of the weights: its formula, and that it is what is scored."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

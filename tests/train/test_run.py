@@ -1,7 +1,5 @@
 """What a run does to its folder before it trains."""
 
-from __future__ import annotations
-
 from gsgan.train.run import remove_old_results
 
 

@@ -1,7 +1,5 @@
 """Schedules are pure maps from the iteration to a value."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Checks of config values: the value comes back, or one sentence names the key."""
 
-from __future__ import annotations
-
 import pytest
 
 from gsgan.utils.checks import above, at_least, between, one_of, whole

@@ -1,7 +1,5 @@
 """Configs compose, match their constructors key for key, and ablations differ by a line or two."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Pickles are read, never run: allowed content comes back whole, the rest is one sentence."""
 
-from __future__ import annotations
-
 import io
 import os
 import pickle

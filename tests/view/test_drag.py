@@ -1,7 +1,5 @@
 """Dragged joints: bones keep their lengths, the joint goes where it can."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

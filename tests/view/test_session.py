@@ -1,7 +1,5 @@
 """A session without a browser, from bare skeletons, on the device that GPU_CHECK_DEVICE names."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from types import SimpleNamespace

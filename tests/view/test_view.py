@@ -1,7 +1,5 @@
 """The viewer in a browser: Chromium without a screen, driven by Playwright."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shutil

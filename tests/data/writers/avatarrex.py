@@ -1,7 +1,5 @@
 """AvatarReX on disk."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from writers.smplx_rig import SmplxSubject, write_rig

@@ -4,8 +4,6 @@ Everything here is worked out independently of the readers: the posed body follo
 formula, pictures are drawn where OpenCV projects the body's vertices, lens distortion included.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

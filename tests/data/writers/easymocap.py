@@ -1,7 +1,5 @@
 """An EasyMocap folder on disk: calibration, pictures, masks, 3D keypoints and SMPL fits."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -4,8 +4,6 @@ Python 3 cannot write these: its text is unicode and its bytes go through a code
 named without being imported, so chumpy and scipy need not be there.
 """
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,7 +1,5 @@
 """Model files like SMPL's and SMPL-X's, made from the free body, pickled as the originals are."""
 
-from __future__ import annotations
-
 import pickle
 import sys
 import types

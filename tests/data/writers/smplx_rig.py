@@ -4,8 +4,6 @@ The posed body is worked out independently of the readers: posed with an unrotat
 model, then turned about its pelvis and moved.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """ZJU-MoCap in each of its layouts, byte-level habits included."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

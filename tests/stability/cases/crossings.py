@@ -6,8 +6,6 @@ passing a singularity without a jump means. A path straight through the point wh
 changes sign turns by half a turn within a few millimetres: fast, but not at once.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import partial

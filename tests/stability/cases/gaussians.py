@@ -3,8 +3,6 @@
 Each case renders the hard Gaussians among ordinary ones, so that their effect on others counts too.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import replace

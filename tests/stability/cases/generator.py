@@ -1,7 +1,5 @@
 """Hard inputs of the generator: empty pixels, unbounded features, half precision."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import lru_cache, partial
 

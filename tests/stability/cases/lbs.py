@@ -1,7 +1,5 @@
 """Hard skinning: weights that do not sum to one, blends that are no rotation, bones of size 0."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from functools import partial

@@ -1,7 +1,5 @@
 """Hard losses and scores: equal and flat images, saturated discriminators, absent classes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import lru_cache, partial
 

@@ -3,8 +3,6 @@
 Convention: float64, metres, body axes (x = the subject's left, y = up, z = out of the chest).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import torch

@@ -1,7 +1,5 @@
 """Hard residuals of Ψ: saturated, overflowing, cancelling."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import fields, replace

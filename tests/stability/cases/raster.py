@@ -6,8 +6,6 @@ their own, ``other means`` and so on, so that the gradients of the hard ones are
 own size. Metres and pixels; the camera is at the origin and looks along +z unless stated otherwise.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial

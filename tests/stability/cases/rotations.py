@@ -1,7 +1,5 @@
 """Hard 6D rotations: columns without a direction, and columns of the same direction."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Hard cases of whole scenes: the world's origin, its unit, the camera."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import partial
 from typing import Any

@@ -1,7 +1,5 @@
 """Hard skeletons: frames, body points and pose code where a direction or a length is lost."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from functools import lru_cache, partial

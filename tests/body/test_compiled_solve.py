@@ -1,7 +1,5 @@
 """The compiled solve against the one by tensor operations, which defines it."""
 
-from __future__ import annotations
-
 import ctypes
 import math
 import os
