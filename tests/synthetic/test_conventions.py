@@ -93,6 +93,20 @@ def test_recorded_motions_agree(tmp_path, source, clip):
 
 
 @pytest.mark.skipif(not CMU.is_dir(), reason="no motion files here")
+def test_one_frame_of_a_run(tmp_path, source):
+    """A foot in the air is not taken for a flat one."""
+    rig, motion = recorded(CMU / "02_03.amc", 12)
+    one = Animation(motion.rotations[:1], motion.joints[:1], {}, ())
+    p, expected = (
+        read_motion(CONVENTIONS[name].write(tmp_path / "a.bvh", rig, one, 0.1), source).p
+        for name in ("bones_along_x", "t_pose")
+    )
+    away = np.linalg.norm(p - expected, axis=-1)
+    assert away[:, LIMBS].max() < 1e-3
+    assert away[:, FEET].max() < 0.2
+
+
+@pytest.mark.skipif(not CMU.is_dir(), reason="no motion files here")
 def test_resting_feet_of_splayed_rigs_are_flat():
     """CMU's zero pose stands with legs apart and with soles at right angles to them."""
     path = CMU / "02_03.amc"

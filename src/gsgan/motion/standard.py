@@ -25,6 +25,7 @@ SELDOM = 0.1  # share of frames in which a person stands, in motions on the floo
 SAME = np.radians(1)  # frames that stand as well as the best one
 MOST = 100  # frames that calibrate
 BACKWARDS = 0.8  # share of knees and toes behind the body from which names are of the other side
+STEEPEST = -0.7  # sine of the slope from ankle to toes of a flat foot: steeper ones are in the air
 BENT = 0.15  # mean sine of the bend from which a limb's plane is known
 HOVER = 0.06  # legs: feet this high above the lowest of a second stand on the floor; no jump
 ROOM = 0.6  # metres from the origin that a motion may reach before its drift is subtracted
@@ -409,7 +410,7 @@ def _flatten_feet(turns: dict[str, Array], joints: dict[str, Array]) -> None:
         steps = np.diff(ends, axis=1, prepend=ends[:, :2][:, -1:])
         speed = np.linalg.norm(steps, axis=-1)
         rests = np.argsort(speed.max(axis=0))[: 1 + len(ahead) // 5]
-        down = float(np.median(ahead[rests, 2]))
+        down = float(np.median(ahead[rests, 2]).clip(STEEPEST, 0))
         flat = np.array([0, -np.sqrt(1 - down**2), down])
         turns[foot] = turns[foot] @ between(flat, _local(turns, joints, foot, toe))
         turns[toe] = turns[toe] @ _mean(turns[toe][rests].mT @ turns[foot][rests])
