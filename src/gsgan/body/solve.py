@@ -399,8 +399,11 @@ class Solver(nn.Module):
 
 def _settings() -> dict[str, float]:
     """The numbers of `compiled.NUMBERS`."""
-    own = {name: globals()[name.upper()] for name in compiled.NUMBERS[:-2]}
-    return {**own, "finger_noise": fingers.NOISE, "trace": fingers.TRACE}
+    values = (
+        *(CONVERGED, DAMPING, EASIER, HARDER, FLOOR, ROBUST, BEYOND, HELD, NOISE, STRAIGHT, SHARP),
+        *(fingers.NOISE, fingers.TRACE),
+    )
+    return dict(zip(compiled.NUMBERS, values, strict=True))
 
 
 def _noise() -> Tensor:

@@ -21,9 +21,8 @@ NOISE = 0.03  # metres: a direction that varied less in training counts as varyi
 class TrainingPoses:
     """The spread of the training poses, as plain values.
 
-    The distance is Mahalanobis's, with `NOISE` added to the covariance, so that neither landmarks'
-    noise nor directions that a short capture hardly has decide; it is in units of the training
-    poses' own, whose root mean square is 1.
+    The distance is Mahalanobis's, with `NOISE` added to the covariance: it bounds the weight of
+    directions with little spread. It is scaled so that the training poses' root mean square is 1.
 
     Args:
         mean: ``[99]`` metres, the mean pose.
