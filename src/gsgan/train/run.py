@@ -11,6 +11,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import gsgan.utils.compat  # noqa: F401  (must come before lightning)
+
+# isort: split
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
