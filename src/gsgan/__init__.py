@@ -3,8 +3,6 @@
 From Python: ``avatar = gsgan.load("runs/…")``, then ``image = avatar.render(skeleton, camera)``.
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:

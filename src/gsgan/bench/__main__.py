@@ -1,7 +1,5 @@
 """``python -m gsgan.bench speed [key=value]``: milliseconds from skeleton to image, by stage."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

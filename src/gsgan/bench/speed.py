@@ -1,7 +1,5 @@
 """``python -m gsgan.bench speed``: milliseconds from skeleton to image, by stage."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager

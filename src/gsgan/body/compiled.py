@@ -4,8 +4,6 @@
 frame with hands, which take 15 times as long.
 """
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Mapping
 

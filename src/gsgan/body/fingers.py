@@ -3,8 +3,6 @@
 Convention: metres, radians; a joint's turn is its axis-angle in `BodyPose.theta`.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

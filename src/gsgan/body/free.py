@@ -4,8 +4,6 @@ Convention: metres; Z up, the person faces -Y, the person's left is +X; rest pos
 from the trunk. The asset in this package is made by scripts/bake_free_body.py.
 """
 
-from __future__ import annotations
-
 import zipfile
 from dataclasses import dataclass
 from functools import lru_cache

@@ -4,8 +4,6 @@ Convention: metres; column vectors, ``x_posed = A @ x_rest + t``; batch first. E
 rest frame is aligned with the world's axes: zero rotations are the rest pose.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import lru_cache
 from itertools import pairwise

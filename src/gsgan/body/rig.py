@@ -5,8 +5,6 @@ its axis-angle v linear in the body's numbers; a joint has one or more, applied 
 is one degree of freedom: an angle about an axis, spread over the turns of a chain.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from functools import lru_cache

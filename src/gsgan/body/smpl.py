@@ -8,8 +8,6 @@ parameters made with ``flat_hand_mean=False`` need the model's mean hand pose ad
 Source: blend skinning of SMPL and SMPL-X, from the published equations.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path

@@ -3,8 +3,6 @@
 Source: keys and shapes in public loaders.
 """
 
-from __future__ import annotations
-
 import zipfile
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@
 Source: public loaders.
 """
 
-from __future__ import annotations
-
 from typing import Literal, get_args
 
 Parts = Literal["clothes", "cihp", "joints"]

@@ -3,8 +3,6 @@
 Convention: metres, world frame, radians.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple

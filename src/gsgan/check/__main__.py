@@ -1,7 +1,5 @@
 """``python -m gsgan.check data=…``: check a dataset before training."""
 
-from __future__ import annotations
-
 import sys
 
 from omegaconf import DictConfig

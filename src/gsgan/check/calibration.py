@@ -1,7 +1,5 @@
 """How well each camera's calibration fits its masks, and whether another would fit better."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations

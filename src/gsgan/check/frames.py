@@ -4,8 +4,6 @@ Convention: ``p [F, J, 3]`` metres, NaN where a joint is not visible, frames in 
 cannot be measured (too few neighbours, joints not visible) is not flagged.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 

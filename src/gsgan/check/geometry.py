@@ -1,7 +1,5 @@
 """Units and geometry: distances of the cameras, height of the person, the up axis."""
 
-from __future__ import annotations
-
 import io
 from dataclasses import dataclass
 

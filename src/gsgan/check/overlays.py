@@ -1,7 +1,5 @@
 """Images with the skeleton, hands, face and the mask's outline drawn on them."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 
 import cv2

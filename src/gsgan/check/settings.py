@@ -3,8 +3,6 @@
 Thresholds that a reader applies as well are those of `gsgan.data.formats.consistency.Consistency`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from gsgan.utils.checks import above

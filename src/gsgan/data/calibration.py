@@ -4,8 +4,6 @@ cameras.json is the bring-your-own layout's calibration:
 ``{camera: {K 3x3, R 3x3, t 3, dist 0/4/5/8, size [w, h]}}``
 """
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Callable, Mapping

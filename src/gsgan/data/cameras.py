@@ -1,7 +1,5 @@
 """One calibrated camera, checked and converted from raw calibration values."""
 
-from __future__ import annotations
-
 import reprlib
 from dataclasses import dataclass
 from typing import Any

@@ -4,8 +4,6 @@ A crop follows from the skeleton and the camera alone, never from the image or i
 time nothing else is known, and a box that follows the true mask would leak the answer.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Protocol
 

@@ -1,7 +1,5 @@
 """The LightningDataModule: one capture, its splits, its loaders, and facts about the scene."""
 
-from __future__ import annotations
-
 import inspect
 import logging
 import math

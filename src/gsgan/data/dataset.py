@@ -1,7 +1,5 @@
 """A capture as a torch dataset of `Frame`, one camera and frame per item; its sampling order."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -4,8 +4,6 @@ Every function turns problems with a file into one `DataError` that names the fi
 unpickles.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """The joints of a capture, 33 + 2 x 21 + 30 of the face, and their numbers in other detectors."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -5,8 +5,6 @@ format in the same way. Files are matched by camera name and by frame number, ne
 one missing image must not shift the others.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path

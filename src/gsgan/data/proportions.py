@@ -4,8 +4,6 @@ Convention: metres; standard axes have Z up. The standard pose is an upright T: 
 person's left is +X, palms down, legs straight down, the middle of the hips at the origin.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

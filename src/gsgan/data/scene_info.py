@@ -1,7 +1,5 @@
 """Properties of the scene, computed from the training split."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass

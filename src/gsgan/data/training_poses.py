@@ -4,8 +4,6 @@ Convention: a pose is where the body's 33 landmarks are in the pelvis's axes, me
 turn of the whole body, fingers and face do not count.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """What a dataset must satisfy before it is used, in any format, with named thresholds."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The values requested for each effect, and the thresholds of ``auto``."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The table of effects that a run and a check print."""
 
-from __future__ import annotations
-
 from rich.table import Table
 
 from gsgan.effects.record import Effects

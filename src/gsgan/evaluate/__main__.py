@@ -1,7 +1,5 @@
 """``python -m gsgan.evaluate``: score a run, or any method's images, on the held-out splits."""
 
-from __future__ import annotations
-
 from omegaconf import DictConfig
 
 from gsgan.utils.config import entry

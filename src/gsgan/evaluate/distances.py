@@ -1,7 +1,5 @@
 """Scores against the distance from the training poses: distance.csv and distance.png."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 

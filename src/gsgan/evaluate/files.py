@@ -1,7 +1,5 @@
 """The results of an evaluation: metrics.json, scores.csv, facts.json and tables of the scores."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Image grids with captions."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Scores a run folder, or a folder of any method's images, on the held-out splits."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import replace

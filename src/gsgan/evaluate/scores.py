@@ -1,7 +1,5 @@
 """Scores of images and segmentations, and of all frames of a split."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """``python -m gsgan.export``: write an avatar in the format of other programs."""
 
-from __future__ import annotations
-
 from omegaconf import DictConfig
 
 from gsgan.utils.config import entry

@@ -1,7 +1,5 @@
 """The model card written beside an exported file."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

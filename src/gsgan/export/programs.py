@@ -1,7 +1,5 @@
 """The avatar's networks as programs for other runtimes: ONNX and ``torch.export``."""
 
-from __future__ import annotations
-
 import copy
 import io
 import warnings

@@ -1,7 +1,5 @@
 """Writes the export that a config describes."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from pathlib import Path
 from typing import cast

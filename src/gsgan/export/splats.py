@@ -1,8 +1,6 @@
 """The Gaussians of a pose as other programs expect them: scales, quaternions, harmonics in world
 axes; written as .ply (3D Gaussian splatting) and as glTF (KHR_gaussian_splatting)."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Weights as safetensors: what `gsgan.load` needs of a run, in one file without pickle."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """``python -m gsgan.fit data.root=<folder>``: the body and its poses that fit the masks."""
 
-from __future__ import annotations
-
 from omegaconf import DictConfig
 
 from gsgan.utils.config import entry

@@ -1,7 +1,5 @@
 """Registration of a body to silhouettes: one surface for all frames, one pose per frame."""
 
-from __future__ import annotations
-
 import math
 import random
 from dataclasses import dataclass

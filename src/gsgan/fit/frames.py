@@ -1,7 +1,5 @@
 """The frames of a capture that the fit uses, with their images."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 

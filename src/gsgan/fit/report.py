@@ -1,7 +1,5 @@
 """What a fit reports: numbers per joint and frame, and an image of outlines over the frames."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

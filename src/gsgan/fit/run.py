@@ -1,7 +1,5 @@
 """`gsgan.fit`: a capture in, the person's body and its pose in every frame out."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import ExitStack
 from copy import copy

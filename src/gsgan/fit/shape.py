@@ -1,7 +1,5 @@
 """Fits a person's shape to skeletons, and its hands and landmarks to known poses."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Adversarial losses and feature matching (paper Sec. 3.5)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """L_perc: distance between features of a pretrained VGG-16, or of a marked random network."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from pathlib import Path
 from typing import Any

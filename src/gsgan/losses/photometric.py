@@ -1,7 +1,5 @@
 """L1 and D-SSIM, as Step I uses them (paper Eq. for L_Ψ)."""
 
-from __future__ import annotations
-
 import ctypes
 from typing import Any
 

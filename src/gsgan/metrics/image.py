@@ -4,8 +4,6 @@ Convention: images ``[B, 3, H, W]``, RGB in [0, 1]; every function returns one s
 ``[B]``, because papers report the mean over images, not the score of pooled errors.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import cv2

@@ -1,7 +1,5 @@
 """LPIPS with pretrained weights, or the reason why there is none."""
 
-from __future__ import annotations
-
 import tempfile
 from pathlib import Path
 

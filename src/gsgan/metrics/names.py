@@ -1,7 +1,5 @@
 """The metrics of an evaluation by their key in metrics.json, as tables print them."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 

@@ -1,7 +1,5 @@
 """Scores of part segmentations, and part labels as colours."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torchmetrics.functional.classification import multiclass_confusion_matrix

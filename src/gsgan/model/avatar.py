@@ -1,7 +1,5 @@
 """The avatar: skeleton and camera in, image out."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace

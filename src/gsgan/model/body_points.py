@@ -1,7 +1,5 @@
 """Canonical points and Gaussians on a skinned body, moved by linear blend skinning (LBS)."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

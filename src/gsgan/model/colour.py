@@ -1,7 +1,5 @@
 """An affine colour map per training camera, for exposure and white balance."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -3,8 +3,6 @@
 `gsgan.model.deformation.Deformation` calls it, and defines the same by tensor operations.
 """
 
-from __future__ import annotations
-
 import ctypes
 from typing import Any
 

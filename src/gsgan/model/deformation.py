@@ -1,7 +1,5 @@
 """Ψ: the pose-guided deformation of fixed Gaussians G into Ĝ (paper Sec. 3.3)."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """The multi-scale patch discriminator, whose features also serve L_feat (paper Sec. 3.5)."""
 
-from __future__ import annotations
-
 from torch import Tensor, nn
 from torch.nn import functional
 

@@ -1,7 +1,5 @@
 """The generator: a UNet with two encoders, modulated by the pose (paper Sec. 3.5)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 

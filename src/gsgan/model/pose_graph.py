@@ -1,7 +1,5 @@
 """The pose encoder: skeleton to the global style code g ∈ R³⁵ (paper Sec. 3.5)."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """The novel-view segmentation module: a skinned body splatted into part probabilities S."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

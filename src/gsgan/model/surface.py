@@ -1,7 +1,5 @@
 """The ``lbs_splat`` baseline: Gaussians on the body's surface, moved by linear blend skinning."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -6,8 +6,6 @@ of its own, C; the angles M of a frame turn it by ``C M C⁻¹`` relative to its
 Source: the description of the formats that the CMU motion capture database refers to.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Reads motion capture in the BVH format."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 

@@ -4,8 +4,6 @@ Convention: metres; Z up, the rest pose stands on z = 0 and faces -Y, the person
 texture coordinates runs down.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

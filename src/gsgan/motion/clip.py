@@ -4,8 +4,6 @@ Convention: landmarks ``p [F, J, 3]`` in metres are MediaPipe's 33; or 75, with 
 hand and of the right one; or 105, also with the 30 of the face.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any

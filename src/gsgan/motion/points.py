@@ -1,7 +1,5 @@
 """3D joints that Pose2Sim triangulated: .trc files."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The reader of .pose files: MediaPipe's body, hands and face, read by the package pose-format."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import combinations, pairwise
 from pathlib import Path

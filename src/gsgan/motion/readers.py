@@ -1,7 +1,5 @@
 """Readers of motion files, one per format."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 Convention: standard axes (`gsgan.data.proportions`), Z up, metres.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 

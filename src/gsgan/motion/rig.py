@@ -6,8 +6,6 @@ poses differ share turns. Pairs are left, right; "mirrored" vectors have x point
 middle of the body on both sides.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """Rotations and directions as NumPy arrays, batched over leading dimensions."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation

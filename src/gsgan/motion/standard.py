@@ -4,8 +4,6 @@ Convention: that of :mod:`gsgan.motion.rig`. The up axis and the left side are f
 frames, lengths follow from the legs.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``python -m gsgan.prepare source=<folder> out=<folder>``: videos to a capture for training."""
 
-from __future__ import annotations
-
 from omegaconf import DictConfig
 
 from gsgan.utils.config import entry

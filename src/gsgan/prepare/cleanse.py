@@ -1,7 +1,5 @@
 """Trajectories: joints that no body can have are removed, the rest is smoothed in time."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from gsgan.data.joints import ALL, BODY, FACE, HANDS, PALM, WRISTS, known

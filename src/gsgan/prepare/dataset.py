@@ -1,7 +1,5 @@
 """The dataset's files beside the images, and its place on disk."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

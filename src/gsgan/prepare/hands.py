@@ -1,7 +1,5 @@
 """Hands: which detection is whose, in every camera."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

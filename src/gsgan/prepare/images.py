@@ -1,7 +1,5 @@
 """Images and masks of the finished capture: found, cleaned, undistorted, scaled, written."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """2D landmarks from the files of MediaPipe, OpenPose and EasyMocap."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The MediaPipe tool: its environment, and running it on every camera."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

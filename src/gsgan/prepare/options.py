@@ -1,7 +1,5 @@
 """The options of `gsgan.prepare`, and the images and cameras that they name."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`gsgan.prepare`: calibrated, synchronised videos in, a capture for `data=capture` out."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Mapping
 from pathlib import Path

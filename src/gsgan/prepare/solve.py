@@ -1,7 +1,5 @@
 """From 2D detections to 3D joints and refined cameras, with the error after every stage."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The recordings: one video or one folder of images per camera, and which camera took which."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

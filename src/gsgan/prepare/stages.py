@@ -1,7 +1,5 @@
 """Results of finished stages on disk, and work on all cameras at once with progress bars."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

@@ -1,7 +1,5 @@
 """How a preparation went: the numbers of prepare.json, and a short table of them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Triangulation from several cameras, robust against wrong detections and swapped sides."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations

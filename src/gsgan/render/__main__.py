@@ -1,7 +1,5 @@
 """``python -m gsgan.render``: drive a trained avatar with a motion, into a video or PNG files."""
 
-from __future__ import annotations
-
 from omegaconf import DictConfig
 
 from gsgan.utils.config import entry

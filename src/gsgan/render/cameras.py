@@ -1,7 +1,5 @@
 """Cameras to render with: an orbit, a camera of the capture, or those of a calibration file."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 

@@ -4,8 +4,6 @@ A folder holds ``000000.png`` and so on, and render.json, which records what the
 frames of a video are kept in a hidden folder beside it until it is written.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import shutil

@@ -1,7 +1,5 @@
 """Renders a motion, or held-out frames, with the avatar of a run."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable
 from pathlib import Path

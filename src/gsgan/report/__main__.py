@@ -1,7 +1,5 @@
 """``python -m gsgan.report``: tables of scored runs (runs=[…]) and figures of one run (run=…)."""
 
-from __future__ import annotations
-
 from omegaconf import DictConfig
 
 from gsgan.utils.config import entry

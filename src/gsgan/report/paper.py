@@ -1,7 +1,5 @@
 """The numbers printed in the paper, and when they are comparable with runs."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

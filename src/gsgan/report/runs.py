@@ -1,7 +1,5 @@
 """Run folders: finding and reading them, and whether two of them are comparable."""
 
-from __future__ import annotations
-
 import glob
 import json
 import math

@@ -1,7 +1,5 @@
 """The content of a table, as set in ``conf/table``."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Tables of ``runs``: rows and columns, statistics over seeds, and notes."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

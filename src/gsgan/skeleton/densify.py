@@ -1,7 +1,5 @@
 """Algorithm 1: a few thousand surface points on the bones, the same points in every pose."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from importlib.resources import files
 from itertools import combinations

@@ -1,7 +1,5 @@
 """p₂D: the skeleton projected and drawn as soft limbs, one channel per body part."""
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
 

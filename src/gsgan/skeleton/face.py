@@ -5,8 +5,6 @@ left out, because the pose's own ears, eyes and nose determine the head's positi
 Convention: as in `gsgan.skeleton.template`.
 """
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 from torch import Tensor

@@ -8,8 +8,6 @@ straight limb). Only products, square roots and selections are used, no inverse 
 values and gradients stay finite on straight, folded and vanishing bones.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

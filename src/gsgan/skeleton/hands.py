@@ -1,7 +1,5 @@
 """MediaPipe's 21 landmarks of a hand: names, fingers, connections, and the frame of the palm."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import torch

@@ -3,8 +3,6 @@
 Convention: as in `gsgan.skeleton.template`. Constants only.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """The continuous 6D representation of a rotation: its first two columns."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

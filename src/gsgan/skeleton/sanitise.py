@@ -1,7 +1,5 @@
 """Completes skeletons: unseen joints are filled in before any arithmetic."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Detects skeletons whose left and right are swapped."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize

@@ -4,8 +4,6 @@ The system maps and clears new memory page by page, which takes 12 to 20 % of th
 image of 512² pixels with supersampling. Clearing memory that is already mapped is much faster.
 """
 
-from __future__ import annotations
-
 import math
 import weakref
 from collections import deque

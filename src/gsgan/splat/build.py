@@ -6,8 +6,6 @@ later. A file's name is a hash of all that it depends on, so that no stale file 
 ``GSGAN_MARCH`` (e.g. ``x86-64``) compiles for that processor instead of this one.
 """
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import hashlib

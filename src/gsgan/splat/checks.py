@@ -1,7 +1,5 @@
 """Argument checks of ``rasterise``: each message has the argument, the expectation, the value."""
 
-from __future__ import annotations
-
 import math
 
 import torch

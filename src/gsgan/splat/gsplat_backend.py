@@ -14,8 +14,6 @@ Differences between gsplat and ``Accuracy``, which `given_up` describes:
 - Gradients are summed in no fixed order: their last bits differ between runs.
 """
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import math

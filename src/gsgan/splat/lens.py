@@ -3,8 +3,6 @@
 Convention: OpenCV's model (k1 k2 p1 p2 k3), see `gsgan.scene.distort`.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

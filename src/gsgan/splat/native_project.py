@@ -4,8 +4,6 @@ The many small operations of :func:`gsgan.splat.project.project` take as long as
 kernel. They remain the portable path, and the reference in tests.
 """
 
-from __future__ import annotations
-
 import ctypes
 import math
 from typing import Any

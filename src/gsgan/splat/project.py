@@ -1,7 +1,5 @@
 """EWA projection of 3D Gaussians to ellipses on the image, shared by every backend."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

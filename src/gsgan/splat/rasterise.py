@@ -1,7 +1,5 @@
 """rasterise(): the entry point to every backend."""
 
-from __future__ import annotations
-
 import json
 import logging
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """The reference: every Gaussian at every pixel, plain autograd, no tiles."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Accuracy settings: the named cut-offs of the rasteriser."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

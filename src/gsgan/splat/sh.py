@@ -1,7 +1,5 @@
 """Real spherical harmonics up to degree 3: view-dependent colour."""
 
-from __future__ import annotations
-
 import math
 
 import torch

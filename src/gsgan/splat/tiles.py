@@ -8,8 +8,6 @@ backward pass. Neither takes a logarithm nor divides by ``1 - alpha``, so an opa
 (alpha = 1) and thousands of layers are no special cases.
 """
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_left
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Landmarks of a character: joints, and vertices found once on the rest pose."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -3,8 +3,6 @@
 Convention: metres, world frame; OpenCV cameras and lenses, pixel centres at +0.5.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

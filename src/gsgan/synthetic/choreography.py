@@ -4,8 +4,6 @@ Convention: that of :mod:`gsgan.synthetic.controls`. Passages write into neutral
 times in [0, 1] through the passage.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

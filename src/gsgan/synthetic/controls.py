@@ -6,8 +6,6 @@ wrists and feet go; feet follow in steps, planned ahead, and stand still between
 vectors have x pointing away from the middle of the body on both sides.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

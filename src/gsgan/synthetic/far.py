@@ -3,8 +3,6 @@
 Convention: that of :mod:`gsgan.synthetic.controls`. far.yaml has the key poses.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -3,8 +3,6 @@
 Convention: that of :mod:`gsgan.synthetic.controls`.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

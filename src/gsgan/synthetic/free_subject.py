@@ -3,8 +3,6 @@
 Its motion is that of any other character; its file has `body_pose.npz` beside the landmarks.
 """
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

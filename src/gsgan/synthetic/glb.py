@@ -1,7 +1,5 @@
 """The numbers and images inside a binary glTF 2 file."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 from typing import Any, cast

@@ -1,7 +1,5 @@
 """Any rigged ``.glb`` as a `Character`: VALID, Ready Player Me, Mixamo, VRoid and their like."""
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Bone and face shape names of common rigs, as those of Mixamo and a canonical set of shapes."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping
 from typing import Any

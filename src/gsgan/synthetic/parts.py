@@ -1,7 +1,5 @@
 """Part labels of a character's faces, from names, bones and colours."""
 
-from __future__ import annotations
-
 import re
 from typing import cast
 

@@ -3,8 +3,6 @@
 Convention: that of :mod:`gsgan.motion.rig`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

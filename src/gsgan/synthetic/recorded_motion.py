@@ -1,7 +1,5 @@
 """The motion of a BVH or AMC file on a character."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -3,8 +3,6 @@
 Everything here follows from :class:`SceneSettings` alone: workers rebuild the scene from them.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections.abc import Sequence

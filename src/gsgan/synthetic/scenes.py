@@ -9,8 +9,6 @@ Workers are separate programs rather than children of multiprocessing, which wou
 user's main script again, and fail where it is a notebook or lacks a ``__main__`` guard.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

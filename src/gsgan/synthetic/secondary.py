@@ -6,8 +6,6 @@ on the pose. Both are smooth over the mesh, and the same whichever moments are r
 Convention: metres, seconds, world frame, Z up.
 """
 
-from __future__ import annotations
-
 from typing import Protocol
 
 import numpy as np

@@ -5,8 +5,6 @@ mirrored chest axes from the middle of the shoulders: the mouth is at (0, -0.18,
 are gestures with the hand shapes, contacts and occlusions of signs, and have no meaning.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -3,8 +3,6 @@
 Convention: v runs down, texel centres at +0.5, textures repeat; colours in linear light.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

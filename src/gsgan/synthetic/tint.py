@@ -3,8 +3,6 @@
 Convention: RGB, sRGB in [0, 1], premultiplied on black.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

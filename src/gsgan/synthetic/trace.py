@@ -5,8 +5,6 @@ An independent renderer: splatting takes no part in making the training data.
 Convention: metres, world frame; images are RGB, sRGB in [0, 1], premultiplied on black.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

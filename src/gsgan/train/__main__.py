@@ -1,7 +1,5 @@
 """``python -m gsgan.train``: train an avatar, then score it on what was held out."""
 
-from __future__ import annotations
-
 from omegaconf import DictConfig
 
 from gsgan.utils.config import entry

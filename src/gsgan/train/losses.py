@@ -1,7 +1,5 @@
 """The losses of Step I and Step II: weights and weighted sums (paper Sec. 3.5, Alg. 2)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from typing import Any

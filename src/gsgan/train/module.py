@@ -1,7 +1,5 @@
 """The paper's training scheme (Alg. 2) as one LightningModule with manual optimisation."""
 
-from __future__ import annotations
-
 import time
 from functools import partial
 from typing import Any

@@ -1,7 +1,5 @@
 """Guards of the training: skipped steps, and the return from a collapse."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """One training run from config to metrics.json."""
 
-from __future__ import annotations
-
 import json
 import logging
 import time

@@ -1,7 +1,5 @@
 """Arrays from files: present, of the expected shape, and numbers, or one clear sentence."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

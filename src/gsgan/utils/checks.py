@@ -1,7 +1,5 @@
 """Checks of config values: each returns the value, or raises a `ConfigError` that names the key."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 

@@ -6,8 +6,6 @@ the compiled operators, so declaring their schemas is enough. Import this module
 torchmetrics, kornia or torchvision.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 

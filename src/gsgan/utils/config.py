@@ -1,7 +1,5 @@
 """The config folder, and the entry point of a command: start, errors, exit status."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import re

@@ -1,7 +1,5 @@
 """Errors that are shown to the user as one sentence, without a traceback."""
 
-from __future__ import annotations
-
 
 class GsganError(Exception):
     """An error that the user can fix: the message names what, where and what to do."""

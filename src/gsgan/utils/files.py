@@ -1,7 +1,5 @@
 """Files that are written completely or not at all, also by a run that is killed."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

@@ -1,7 +1,5 @@
 """8-bit images: backgrounds, compositing, captions, JPEG."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

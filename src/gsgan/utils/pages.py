@@ -1,7 +1,5 @@
 """Markdown tables, and marked blocks of a page that a command fills."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Colours of all plots, distinct with any colour vision (Okabe and Ito)."""
 
-from __future__ import annotations
-
 BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"
 BLUE, VERMILLION, PURPLE = "#0072b2", "#d55e00", "#cc79a7"
 GREY = "#777777"

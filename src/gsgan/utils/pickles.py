@@ -4,8 +4,6 @@ A pickle is a program that may call any function. `_Unpickler` gives it only the
 `ALLOWED`: they build numpy arrays, and stand-ins for the classes of chumpy and scipy.
 """
 
-from __future__ import annotations
-
 import copyreg
 import io
 import math

@@ -4,8 +4,6 @@ Source: IPTC's Digital Source Type in XMP; ISO 16684-1 and Adobe's XMP specifica
 its place in PNG (iTXt) and MP4 (a uuid box); C2PA for signatures.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import re

@@ -1,7 +1,5 @@
 """Frozen dataclasses of tensors that move between devices and stack together."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar

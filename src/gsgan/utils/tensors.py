@@ -1,7 +1,5 @@
 """Small helpers for tensors: constants, precision, devices."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 from collections.abc import Callable

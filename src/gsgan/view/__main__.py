@@ -1,7 +1,5 @@
 """``python -m gsgan.view``: look at a trained avatar in the browser, play motions, drag joints."""
 
-from __future__ import annotations
-
 from omegaconf import DictConfig
 
 from gsgan.utils.config import entry

@@ -1,7 +1,5 @@
 """Inverse kinematics: dragged joints, with bones of constant length."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

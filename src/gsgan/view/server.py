@@ -1,7 +1,5 @@
 """The viewer's server: one thread that renders, one session per browser."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import logging

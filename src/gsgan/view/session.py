@@ -1,7 +1,5 @@
 """One browser's view of the avatar: camera, pose, layer, and which image is rendered next."""
 
-from __future__ import annotations
-
 import tempfile
 import time
 from collections import deque

@@ -8,8 +8,6 @@
     missing_img_files.txt   optional: images to leave out, one per line
 """
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 from gsgan.data.formats.smplx_rig import SmplxRigReader

@@ -15,8 +15,6 @@
                       (2,2,3) where some were seen: of the free body, by gsgan.fit
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The shared part of the readers: settings, the user's body model, and the final checks."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path

@@ -4,8 +4,6 @@ Readers apply them to a few images when a dataset is opened (`check_consistency`
 applies the same measures and thresholds to many. Pixel centres lie at +0.5.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

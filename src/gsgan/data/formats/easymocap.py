@@ -8,8 +8,6 @@
     smpl/%06d.json               SMPL fits: also output/smpl
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace

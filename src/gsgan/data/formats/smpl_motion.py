@@ -1,7 +1,5 @@
 """A motion of SMPL or SMPL-X parameters, and the landmarks that follow from it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, cast

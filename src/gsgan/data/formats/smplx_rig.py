@@ -5,8 +5,6 @@ row i is frame i; the first row of betas is the subject's; hands are full rotati
 flat hand (``use_pca=False, flat_hand_mean=True`` in smplx's terms).
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath

@@ -1,7 +1,5 @@
 """Each figure: images side by side."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

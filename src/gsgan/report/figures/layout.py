@@ -1,7 +1,5 @@
 """Sizes in print, and images in rows and columns."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

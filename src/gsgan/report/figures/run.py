@@ -1,7 +1,5 @@
 """Draws the figures of ``run``."""
 
-from __future__ import annotations
-
 import io
 import json
 import logging

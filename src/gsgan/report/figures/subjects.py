@@ -1,7 +1,5 @@
 """The content of figures: images of a split, and the avatars that render them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
