@@ -16,8 +16,11 @@ from gsgan.body.lbs import (
     forward_kinematics,
     kinematic_levels,
     skin,
+    stretched,
 )
+from gsgan.body.skinned import SkinnedBody, stretch_terms
 from gsgan.body.smpl import SkinnedModel
+from gsgan.scene import BodyPose
 
 torch.set_num_threads(1)
 D = torch.float64
@@ -180,3 +183,67 @@ def test_an_smpl_model_refuses_such_weights_when_it_is_made():
             weights=torch.tensor([[1.0], [0.0]], dtype=D), parents=(-1,),
             faces=torch.zeros(1, 3, dtype=torch.long),
         )  # fmt: skip
+
+
+@pytest.fixture
+def bent_tube():
+    """A tube along x, a hinge in its middle, weights that change smoothly over 0.4 m."""
+    x, angle = torch.meshgrid(
+        torch.linspace(0, 1, 81, dtype=D), torch.arange(24, dtype=D) * math.pi / 12, indexing="ij"
+    )
+    vertices = torch.stack([x, 0.1 * angle.cos(), 0.1 * angle.sin()], dim=-1).reshape(-1, 3)
+    a = torch.arange(80 * 24)
+    right = a // 24 * 24 + (a + 1) % 24
+    faces = torch.cat(
+        [torch.stack([a, right, a + 24], 1), torch.stack([right, right + 24, a + 24], 1)]
+    )
+    share = ((vertices[:, 0] - 0.3) / 0.4).clamp(0, 1)
+    share = share * share * (3 - 2 * share)
+    return SkinnedBody(
+        vertices=vertices,
+        faces=faces.flip(1),
+        joints=torch.tensor([[0.0, 0, 0], [0.5, 0, 0]], dtype=D),
+        joint_names=("shoulder", "elbow"),
+        parents=(-1, 0),
+        bone_index=torch.tensor([[0, 1]]).expand(len(vertices), 2),
+        bone_weight=torch.stack([1 - share, share], dim=1),
+        vertex_labels=torch.zeros(len(vertices), dtype=torch.int64),
+        label_names=("all",),
+        label_source="own",
+    )
+
+
+@pytest.mark.parametrize("turn", [0.0, 1.0, 2.8])
+def test_the_jacobian_predicts_where_neighbours_go(bent_tube, turn):
+    """Without the gradients of the weights the same prediction is several times as far off."""
+    theta = torch.zeros(1, 2, 3, dtype=D)
+    theta[0, 1, 2] = turn
+    bones = bent_tube.transforms(BodyPose(theta=theta, transl=torch.zeros(1, 3, dtype=D)))
+    A, t = blend_transforms(bones, bent_tube.bone_index, bent_tube.bone_weight)
+    J = stretched(A, bones, *stretch_terms(bent_tube))
+    posed = skin(bent_tube.vertices, A, t)[0]
+    inner = torch.arange(24 * 30, 24 * 50)
+    step = (bent_tube.vertices[inner + 48] - bent_tube.vertices[inner]).unsqueeze(-1)  # 2.5 cm
+    moved = posed[inner + 48] - posed[inner]
+    off, off_plain = (((M[0, inner] @ step).squeeze(-1) - moved).norm(dim=-1).max() for M in (J, A))
+    assert off <= 0.005
+    if turn == 0:
+        torch.testing.assert_close(J[0], torch.eye(3, dtype=D).expand_as(J[0]), atol=1e-6, rtol=0)
+    else:
+        assert off < 0.4 * off_plain
+
+
+def test_all_bones_turned_alike_stretch_nothing_far_from_the_origin(bent_tube):
+    bones = torch.eye(4).repeat(1, 2, 1, 1)
+    bones[..., :3, :3] = rz(70).float()
+    bones[..., :3, 3] = torch.tensor([500.0, -3.0, 1.0])
+    A, _ = blend_transforms(bones, bent_tube.bone_index, bent_tube.bone_weight)
+    J = stretched(A, bones, *stretch_terms(bent_tube))
+    torch.testing.assert_close(J[0], rz(70).float().expand_as(J[0]), atol=1e-5, rtol=0)
+
+
+def test_stretch_terms_of_degenerate_surfaces_are_finite(bent_tube):
+    flat = replace(bent_tube, vertices=torch.zeros_like(bent_tube.vertices))
+    loose = replace(bent_tube, faces=bent_tube.faces[:1])  # most vertices have no edge
+    for body in (flat, loose):
+        assert stretch_terms(body)[1].isfinite().all()

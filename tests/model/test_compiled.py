@@ -52,6 +52,7 @@ def test_geometry(monkeypatch, bound):
         torch.rand(B, N) > 0.2,
         torch.arange(N),
         frames[..., 0],
+        stretched=torch.randn(B, N, 3, 3, **wide),
     )
     quats = torch.randn(B, N, 4, **wide)
     quats[0, 0] = torch.tensor([-1.0, 0, 0, 0])  # turns nothing

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import embedding_bag
 
 from gsgan.utils.tensors import constant
 
@@ -192,12 +193,35 @@ def blend_transforms(
         )
     weight = bone_weight.to(transforms.dtype)
     weight = weight / weight.sum(-1, keepdim=True)
-    rows = transforms[:, :, :3].flatten(2)
-    blended = rows.new_zeros(len(rows), len(bone_index), rows.shape[-1])
-    for k in range(bone_index.shape[1]):  # per bone: a quarter of the memory
-        blended = blended + weight[:, k, None] * rows[:, bone_index[:, k]]
-    affine = blended.unflatten(-1, (3, 4))
+    bones = transforms[:, :, :3].transpose(0, 1).flatten(1)
+    blended = embedding_bag(bone_index, bones, per_sample_weights=weight, mode="sum")
+    affine = blended.unflatten(1, (-1, 3, 4)).transpose(0, 1)
     return affine[..., :3], affine[..., 3]
+
+
+def stretched(A: Tensor, transforms: Tensor, columns: Tensor, factors: Tensor) -> Tensor:
+    """The Jacobian of skinning at each vertex: how the surface about it turns and stretches.
+
+    ``A`` is that of constant weights. Where weights change along the surface, skinning also pulls
+    neighbours apart: in a high kick, vertices of the hip by centimetres, while A shrinks there.
+
+    Args:
+        A: ``[B, V, 3, 3]`` from :func:`blend_transforms`.
+        transforms: ``[B, J, 4, 4]`` from :func:`forward_kinematics`.
+        columns, factors: from :func:`gsgan.body.skinned.stretch_terms`.
+
+    Returns:
+        ``[B, V, 3, 3]``: ``A + Σ_b (ΔB_b x_c) ∇w_bᵀ``.
+
+    Source: Tarini et al., Accurate and Efficient Lighting for Skinned Models, 2014.
+    """
+    turns, places = transforms[:, :, :3].split((3, 1), dim=-1)
+    # Gradients sum to zero: less the root's place, numbers are as small as distances of bones.
+    table = torch.cat([turns, places - places[:, :1]], dim=-1).permute(1, 3, 0, 2).flatten(2)
+    terms = embedding_bag(
+        columns, table.flatten(0, 1), per_sample_weights=factors.to(table), mode="sum"
+    )
+    return A + terms.unflatten(1, (-1, 3)).unflatten(0, (-1, 3)).permute(2, 0, 3, 1)
 
 
 def skin(vertices: Tensor, A: Tensor, t: Tensor) -> Tensor:

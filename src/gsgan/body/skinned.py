@@ -18,6 +18,8 @@ from gsgan.body.lbs import (
 )
 from gsgan.scene import BodyPose
 
+SMOOTHED = 3  # averages over a vertex's edges before its weights' gradients: weights have steps
+
 
 @dataclass(frozen=True, kw_only=True)
 class SkinnedBody:
@@ -130,3 +132,43 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     for corner in faces.unbind(1):
         summed.index_add_(0, corner, face)
     return torch.nn.functional.normalize(summed, dim=-1, eps=1e-20)
+
+
+def stretch_terms(body: SkinnedBody, bones_kept: int = 4) -> tuple[Tensor, Tensor]:
+    """The terms of `gsgan.body.lbs.stretched`: how skinning weights change along the surface.
+
+    Their gradients follow in the least squares sense from the differences along a vertex's edges,
+    for the bones whose weights change most. They lie in the surface, and their sum is zero.
+
+    Returns:
+        ``[3 V, 4 bones_kept]``: of each vertex and axis, columns of the bones' transforms, int64
+        from 0 to 4 J, and their factors: products of the vertex's position and the gradients.
+
+    Source: ours.
+    """
+    x, faces = body.vertices.double(), body.faces
+    count, bones = len(x), len(body.joints)
+    dense = x.new_zeros(count, bones).scatter_add_(1, body.bone_index, body.bone_weight.double())
+    dense = dense / dense.sum(1, keepdim=True)
+    edges = torch.cat([faces[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
+    a, b = torch.cat([edges, edges.flip(1)]).unique(dim=0).T
+    step, normals = x[b] - x[a], vertex_normals(x, faces)
+    degree = torch.bincount(a, minlength=count).clamp_min(1).to(x).unsqueeze(1)
+    smooth = dense
+    for _ in range(SMOOTHED):
+        smooth = (smooth + torch.zeros_like(smooth).index_add_(0, a, smooth[b]) / degree) / 2
+    square = x.new_zeros(count, 3, 3).index_add_(0, a, step.unsqueeze(2) * step.unsqueeze(1))
+    size = square.diagonal(dim1=1, dim2=2).sum(1).clamp_min(1e-12)[:, None, None]
+    square = square + size * (
+        normals.unsqueeze(2) * normals.unsqueeze(1) + 1e-6 * torch.eye(3).to(x)
+    )
+    moved = step.unsqueeze(2) * (smooth[b] - smooth[a]).unsqueeze(1)
+    slope = torch.linalg.solve(square, x.new_zeros(count, 3, bones).index_add_(0, a, moved)).mT
+    slope = slope - (slope @ normals.unsqueeze(-1)) * normals.unsqueeze(1)
+    index = slope.norm(dim=-1).topk(min(bones_kept, bones), dim=1).indices
+    slope = slope.gather(1, index.unsqueeze(-1).expand(-1, -1, 3))
+    slope = slope - slope.mean(1, keepdim=True)
+    homogeneous = torch.cat([x, torch.ones_like(x[:, :1])], dim=1)
+    factors = slope.mT.unsqueeze(-1) * homogeneous[:, None, None]
+    columns = (4 * index.unsqueeze(-1) + torch.arange(4))[:, None].expand_as(factors)
+    return columns.flatten(2).flatten(0, 1), factors.flatten(2).flatten(0, 1).float()

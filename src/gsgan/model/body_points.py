@@ -10,7 +10,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from gsgan.body import SkinnedBody, axis_angle_to_matrix, blend_transforms, forward_kinematics
-from gsgan.body.skinned import vertex_normals
+from gsgan.body.lbs import stretched
+from gsgan.body.skinned import stretch_terms, vertex_normals
 from gsgan.scene import BodyPose, Gaussians
 from gsgan.skeleton import Points
 from gsgan.utils.checks import above, whole
@@ -33,6 +34,8 @@ class SkinnedPoints(nn.Module):
     joints: Tensor
     bone_index: Tensor
     bone_weight: Tensor
+    stretch_columns: Tensor
+    stretch_factors: Tensor
     means: Tensor
     chosen: Tensor
     spacing: Tensor
@@ -46,10 +49,13 @@ class SkinnedPoints(nn.Module):
         chosen = farthest_points(vertices, every if count is None else min(count, every))
         self.parents = body.parents
         means = vertices[chosen]
+        columns, factors = (x.unflatten(0, (-1, 3))[chosen] for x in stretch_terms(body))
         for name, value in {
             "joints": body.joints.float(),
             "bone_index": body.bone_index[chosen],
             "bone_weight": body.bone_weight[chosen].float(),
+            "stretch_columns": columns.flatten(0, 1),
+            "stretch_factors": factors.flatten(0, 1),
             "means": means,
             "chosen": chosen,
             "spacing": neighbour_distance(means).clamp_min(1e-4),
@@ -70,11 +76,21 @@ class SkinnedPoints(nn.Module):
     def blend(self, pose: BodyPose) -> tuple[Tensor, Tensor]:
         """The affine map of each point: ``A [B, N, 3, 3]`` and ``t [B, N, 3]``.
 
-        A blend of rotations is not a rotation, so shapes are transformed as covariances ``A Σ Aᵀ``.
+        A blend of rotations is not a rotation; shapes are transformed by :meth:`shapes`.
         """
         bones = self.with_bones(pose).bones
         assert bones is not None
         return blend_transforms(bones, self.bone_index, self.bone_weight)
+
+    def shapes(self, pose: BodyPose, A: Tensor) -> Tensor:
+        """The linear map of each point's shape, ``J [B, N, 3, 3]``: covariances become ``J Σ Jᵀ``.
+
+        With ``A`` of :meth:`blend`, to which it adds the stretch of the surface, so that Gaussians
+        leave no holes where skinning pulls their means apart.
+        """
+        bones = self.with_bones(pose).bones
+        assert bones is not None
+        return stretched(A, bones, self.stretch_columns, self.stretch_factors)
 
 
 class SkinnedGaussians(nn.Module):
@@ -98,16 +114,16 @@ class SkinnedGaussians(nn.Module):
         self.logit_opacities = nn.Parameter(torch.full((count,), logit))
 
     def deformed(
-        self, A: Tensor, means: Tensor, log_scales: Tensor, logits: Tensor, features: Tensor
+        self, J: Tensor, means: Tensor, log_scales: Tensor, logits: Tensor, features: Tensor
     ) -> Gaussians:
-        """Gaussians at ``means [B, N, 3]``, their shapes transformed by ``A [B, N, 3, 3]``."""
+        """Gaussians at ``means [B, N, 3]``, their shapes transformed by ``J [B, N, 3, 3]``."""
 
         def make() -> Tensor:
             unit = functional.normalize(self.quats, dim=-1, eps=1e-6)
             return quaternion_to_rotation_matrix(unit) * log_scales.exp().unsqueeze(-2)
 
-        axes = A @ derived(self, "axes", make, *self.parameters(recurse=False))
-        opacities = torch.sigmoid(logits).expand(len(A), -1)
+        axes = J @ derived(self, "axes", make, *self.parameters(recurse=False))
+        opacities = torch.sigmoid(logits).expand(len(J), -1)
         return Gaussians(means, None, None, opacities, features, covariances=axes @ axes.mT)
 
 
@@ -165,6 +181,7 @@ class BodyPoints(nn.Module):
             valid=torch.ones_like(scales, dtype=torch.bool),
             part_id=self.part_id,
             normals=moved_normals(A, self.rest_normals),
+            stretched=self.points.shapes(pose, A),
         )
 
 

@@ -14,7 +14,7 @@ from gsgan.splat import build, native
 
 RESIDUALS = 11  # mean 3, quaternion 4, scale 3, opacity 1
 OUTPUTS = ("means", "covariances", "opacities")
-INPUTS = ("raw", "means", "frames", "scales", "valid")
+INPUTS = ("raw", "means", "frames", "shapes", "scales", "valid")
 _Job = build.job_type(
     ("count", "threads", "stride"),
     ("mean_bound", "unit", "scale_low", "scale_high", "logit", "logit_bound"),
@@ -36,6 +36,7 @@ def geometry(
     raw: Tensor,
     means: Tensor,
     frames: Tensor,
+    shapes: Tensor,
     scales: Tensor,
     valid: Tensor,
     numbers: tuple[float, ...],
@@ -44,14 +45,14 @@ def geometry(
 
     Args:
         raw: ``[B, N, 11]`` residuals of mean, quaternion, scale and opacity.
-        means, frames, scales, valid: of `gsgan.skeleton.Points`, without gradient.
+        means, frames, shapes, scales, valid: of `gsgan.skeleton.Points`, without gradient.
         numbers: bound of the means in metres (0: none), metres of a residual of 1 without a bound,
             least and largest logarithm of a scale, the opacity's logit and its bound.
 
     Returns:
         ``[B, N, 3]``, ``[B, N, 3, 3]``, ``[B, N]``.
     """
-    return _Geometry.apply(raw, means, frames, scales, valid, numbers)  # type: ignore[no-any-return]
+    return _Geometry.apply(raw, means, frames, shapes, scales, valid, numbers)  # type: ignore[no-any-return]
 
 
 class _Geometry(torch.autograd.Function):
@@ -77,7 +78,7 @@ class _Geometry(torch.autograd.Function):
         d_raw = raw.new_empty(*raw.shape[:2], RESIDUALS)
         build.point(job, [*(f"g_{name}" for name in OUTPUTS), "d_raw"], [*incoming, d_raw])
         build.function("compose_backward", raw.dtype)(ctypes.byref(job))
-        return d_raw, *[None] * 5
+        return d_raw, *[None] * 6
 
 
 def _job(

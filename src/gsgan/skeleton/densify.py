@@ -40,11 +40,17 @@ class Points:
     valid: Tensor  # [B, N] bool, False on parts whose joints are unseen
     part_id: Tensor  # [N] int64 into the parts
     normals: Tensor  # [B, N, 3] outward, world frame, unit length
+    stretched: Tensor | None = None  # [B, N, 3, 3] what moves shapes, where frames do not
 
     @property
     def frames(self) -> Tensor:
         """``[B, N, 3, 3]``: each point's part frame."""
         return self.rotations.index_select(1, self.part_id)
+
+    @property
+    def shapes(self) -> Tensor:
+        """``[B, N, 3, 3]``: what shapes are transformed by, as covariances."""
+        return self.frames if self.stretched is None else self.stretched
 
     def local(self) -> Tensor:
         """``[B, N, 3]`` metres: the points in their parts' frames, invariant to rigid motions.

@@ -16,7 +16,7 @@ struct ComposeJob {
   double unit;                            // metres of an unbounded residual of 1
   double scale_low, scale_high;           // of the logarithm
   double logit, logit_bound;
-  const void *raw, *means, *frames, *scales;
+  const void *raw, *means, *frames, *shapes, *scales;
   const uint8_t* valid;
   void *out_means, *out_covariances, *out_opacities;
   const void *g_means, *g_covariances, *g_opacities;
@@ -41,16 +41,18 @@ inline double leading_back(double x, double low, double high, double g) {
 // One point's intermediate values.
 struct Composed {
   double F[9], bent[3], offset[3];       // frame; mean's residual, bounded and in metres
+  double S[9];                           // what shapes are transformed by
   double n[4], length, R[9];             // quaternion and its rotation
-  double log_scale[3], scale[3], A[9];   // A = F R diag(scale)
+  double log_scale[3], scale[3], A[9];   // A = S R diag(scale)
   double logit, opacity;
 };
 
 template <class T> Composed composed(const ComposeJob& job, int64_t i) {
   const T* raw = static_cast<const T*>(job.raw) + i * job.stride;
   const T* frame = static_cast<const T*>(job.frames) + 9 * i;
+  const T* shape = static_cast<const T*>(job.shapes) + 9 * i;
   Composed c;
-  for (int k = 0; k < 9; ++k) c.F[k] = frame[k];
+  for (int k = 0; k < 9; ++k) c.F[k] = frame[k], c.S[k] = shape[k];
   for (int k = 0; k < 3; ++k) {
     c.bent[k] = job.mean_bound > 0 ? std::tanh(double(raw[k])) : double(raw[k]);
     c.offset[k] = c.bent[k] * (job.mean_bound > 0 ? job.mean_bound : job.unit);
@@ -70,7 +72,7 @@ template <class T> Composed composed(const ComposeJob& job, int64_t i) {
   }
   for (int r = 0; r < 9; r += 3)
     for (int k = 0; k < 3; ++k)
-      c.A[r + k] = (c.F[r] * R[k] + c.F[r + 1] * R[3 + k] + c.F[r + 2] * R[6 + k]) * c.scale[k];
+      c.A[r + k] = (c.S[r] * R[k] + c.S[r + 1] * R[3 + k] + c.S[r + 2] * R[6 + k]) * c.scale[k];
   c.logit = job.logit + raw[10];
   c.opacity = 1 / (1 + std::exp(-within(c.logit, -job.logit_bound, job.logit_bound)));
   return c;
@@ -106,14 +108,14 @@ template <class T> void compose_one_backward(const ComposeJob& job, int64_t i) {
   }
   if (job.g_covariances) {
     const T* g = static_cast<const T*>(job.g_covariances) + 9 * i;
-    double M[9];  // the gradient of R diag(scale): Fᵀ (G + Gᵀ) A
+    double M[9];  // the gradient of R diag(scale): Sᵀ (G + Gᵀ) A
     for (int r = 0; r < 3; ++r)
       for (int k = 0; k < 3; ++k) {
         M[3 * r + k] = 0;
         for (int a = 0; a < 3; ++a)
           for (int b = 0; b < 3; ++b)
             M[3 * r + k] +=
-                c.F[3 * a + r] * (double(g[3 * a + b]) + g[3 * b + a]) * c.A[3 * b + k];
+                c.S[3 * a + r] * (double(g[3 * a + b]) + g[3 * b + a]) * c.A[3 * b + k];
       }
     for (int k = 0; k < 3; ++k) {
       const double by_scale = M[k] * c.R[k] + M[3 + k] * c.R[3 + k] + M[6 + k] * c.R[6 + k];
