@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsgan.body.free import Body, free_body, free_body_path
-from gsgan.body.lbs import blend_transforms, skin
+from gsgan.body.lbs import skin
 from gsgan.body.skinned import MarkedBody
 from gsgan.body.smpl import read_smpl
 from gsgan.body.smpl_names import fitting_parts
@@ -196,15 +196,21 @@ def _stretched(body: B, stretch: Tensor) -> B:
         places.append(places[parent] + S[parent] @ (joints[joint] - joints[parent]))
     moved = torch.stack(places)
     shift = moved - (S @ joints.unsqueeze(-1)).squeeze(-1)
-    T = torch.cat([torch.cat([S, shift.unsqueeze(-1)], dim=-1), constant_row(S)], dim=-2)
-    A, t = blend_transforms(T.unsqueeze(0), body.bone_index, body.bone_weight)
+    # As lbs.blend_transforms, which has no forward-mode derivative. Its rounding decides which
+    # vertices become Gaussians (farthest points), so a trained avatar needs the same sums.
+    maps, weight = torch.cat([S, shift.unsqueeze(-1)], dim=-1).flatten(1), body.bone_weight.to(S)
+    weight = weight / weight.sum(-1, keepdim=True)
+    blended = sum(
+        w.unsqueeze(-1) * maps[b] for b, w in zip(body.bone_index.T, weight.T, strict=True)
+    )
+    A, t = blended.unflatten(-1, (3, 4)).split((3, 1), dim=-1)
     points = {"landmarks": body.landmark_bone}
     if isinstance(body, Body):
         points["hand_landmarks"] = body.hand_bone
     carried = {
         n: (S[b] @ getattr(body, n).unsqueeze(-1)).squeeze(-1) + shift[b] for n, b in points.items()
     }
-    return replace(body, vertices=skin(body.vertices, A[0], t[0]), joints=moved, **carried)
+    return replace(body, vertices=skin(body.vertices, A, t.squeeze(-1)), joints=moved, **carried)
 
 
 def _with_hands(body: B, hands: Tensor) -> B:
@@ -228,11 +234,6 @@ def _with_hands(body: B, hands: Tensor) -> B:
 def _side_of_hand(joint: str) -> int:
     """1 for a joint of the free body's left hand, 2 for the right hand's, else 0."""
     return ".LR".index(joint[-1]) if group_of(joint) == "hand" else 0
-
-
-def constant_row(S: Tensor) -> Tensor:
-    """``[J, 1, 4]``: the last row of homogeneous transforms."""
-    return S.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(S), 1, 4)
 
 
 # -- spaces
