@@ -116,6 +116,13 @@ class Avatar(nn.Module):
         return self.deformation or self.surface
 
     @property
+    def rest_points(self) -> Tensor:
+        """``[N, 3]`` G at rest, in body heights, of an avatar with Ψ."""
+        points = self.body_points or self.densify
+        assert points is not None
+        return points.rest_points
+
+    @property
     def splat_channels(self) -> int:
         """Channels of F, colour included; 0 where nothing is splatted."""
         return 0 if self.splats is None else 3 + self.splats.features

@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from copy import deepcopy
+from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from gsgan.model.avatar import Avatar
 from gsgan.model.deformation import ResidualGaussians, Residuals
 from gsgan.scene import BodyPose
 from gsgan.skeleton import Points
 from gsgan.splat.sh import sh_basis
+from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError
 
 HARMONICS = 9  # of degrees 0, 1 and 2
-RIDGE = 0.1
+RIDGE = 0.02
+FOLLOW = ("means", "sh", "features")
+# Multipliers of the learning rate: bare parameters need higher rates than an MLP's weights.
+RATES = {"means": 1.0, "quats": 1.0, "scales": 5.0, "opacities": 25.0, "sh": 10.0, "features": 10.0}
 UNIT = math.sqrt(4 * math.pi)  # makes the first harmonic 1, and the mean square of each
 Pose = tuple[Tensor, Tensor, BodyPose | None]  # joints, visibility, body: `gsgan.model.drive`
 
@@ -45,33 +51,70 @@ class Harmonic(ResidualGaussians):
         rest_points: ``[N, 3]``; only their number is used.
         body_height: metres, the subject's constant length scale.
         joints: not used.
+        follow: names of `Residuals` that follow the normals; the others are constant.
         settings: of `ResidualGaussians`.
 
     Source: ours.
     """
 
     def __init__(
-        self, rest_points: Tensor, body_height: float, joints: int = 33, **settings: object
+        self,
+        rest_points: Tensor,
+        body_height: float,
+        joints: int = 33,
+        *,
+        follow: Sequence[str] = FOLLOW,
+        **settings: Any,
     ) -> None:
-        super().__init__(body_height, **settings)  # type: ignore[arg-type]
-        count = len(rest_points)
-        self.coefficients = nn.Parameter(torch.zeros(count, HARMONICS, sum(self.parts)))
+        super().__init__(body_height, **settings)
+        for name in follow:
+            one_of("model.deformation.follow", name, tuple(RATES))
+        self.raw = nn.ParameterDict(
+            [  # a dictionary would be sorted
+                (name, torch.zeros(len(rest_points), HARMONICS if name in follow else 1, size))
+                for name, size in zip(RATES, self.parts, strict=True)
+            ]
+        )
+
+    def parameter_groups(self) -> list[tuple[list[nn.Parameter], float]]:
+        """(parameters, multiplier of the learning rate)."""
+        return [([self.raw[name]], rate) for name, rate in RATES.items()]
+
+    @property
+    def coefficients(self) -> Tensor:
+        """``[N, 9, C]``: C is mean 3, quaternion 4, scale 3, opacity 1, colour 3 (d+1)² and
+        features; `_geometry` and `colour_from` make Gaussians of the sums. Means count in
+        `mean_step`."""
+        lacking = ((0, 0, 0, HARMONICS - x.shape[1]) for x in self.raw.values())
+        padded = map(functional.pad, self.raw.values(), lacking)
+        return torch.cat(list(padded), dim=-1)
 
     def residuals(self, points: Points, pose: Tensor, root: Tensor, pelvis: Tensor) -> Residuals:
         """ΔG of posed points; pose, root and pelvis are not used."""
-        basis = harmonics(points.normals)  # [B, N, 9]
-        return self._parted(torch.einsum("bnk,nkc->bnc", basis, self._active(self.coefficients)))
+        basis, found = harmonics(points.normals), []  # [B, N, 9]
+        for name, values in self.raw.items():
+            used = values[..., : 3 * (self.active_degree + 1) ** 2] if name == "sh" else values
+            # a product with N small matrices takes several times as long
+            found.append((basis[..., : used.shape[1], None] * used).sum(-2))
+        return self._parted(torch.cat(found, dim=-1))
 
 
 @torch.no_grad()
-def distilled(avatar: Avatar, poses: Iterable[Pose], ridge: float = RIDGE) -> Avatar:
+def distilled(
+    avatar: Avatar,
+    poses: Iterable[Pose],
+    *,
+    follow: Sequence[str] = FOLLOW,
+    ridge: float = RIDGE,
+) -> Avatar:
     """A frozen copy of an avatar with `Harmonic` residuals in Ψ's place: the least-squares fit to
     Ψ's over poses. An avatar that has such residuals already is copied.
 
     Args:
         avatar: trained, with Ψ.
-        poses: joints ``[1, J, 3]``, visibility ``[1, J]`` and body pose of each, as
+        poses: joints ``[1, J, 3]``, visibility ``[1, J]`` and body pose of each (None: solved), as
             `gsgan.model.drive.inputs_of` and `gsgan.scene.Frame.inputs` have them.
+        follow: see `Harmonic`; the others get their mean over the poses.
         ridge: penalty of each squared coefficient but the first, beside the mean over poses of the
             squared error.
 
@@ -83,34 +126,44 @@ def distilled(avatar: Avatar, poses: Iterable[Pose], ridge: float = RIDGE) -> Av
         raise ConfigError("only avatars with Ψ have residuals to distil (model=full, splat_only)")
     if isinstance(psi, Harmonic):
         return found
-    solved = ridge_regression(_samples(avatar, poses), ridge)
-    solved[..., :3] /= psi.mean_step
     settings = ("features", "sh_degree", "opacity", "mean_bound", "mean_step", "logit_bound")
     low, high = psi.scale_range
-    found.deformation = Harmonic(
-        solved,
+    found.deformation = fitted = Harmonic(
+        avatar.rest_points,
         psi.body_height,
+        follow=follow,
         scale_min=low,
         scale_max=high,
         **{name: getattr(psi, name) for name in settings},
     )
-    found.deformation.coefficients.copy_(solved)
+    maps, mean = ridge_regression(_samples(avatar, poses), ridge)
+    maps[..., :3] /= psi.mean_step
+    mean[..., :3] /= psi.mean_step
+    given = zip(maps.split(psi.parts, dim=-1), mean.split(psi.parts, dim=-1), strict=True)
+    for raw, (linear, constant) in zip(fitted.raw.values(), given, strict=True):
+        raw.copy_(linear if raw.shape[1] > 1 else constant.unsqueeze(1))
     return found.freeze()
 
 
 def _samples(avatar: Avatar, poses: Iterable[Pose]) -> Iterator[tuple[Tensor, Tensor]]:
     """Harmonics ``[N, 9]`` and residuals ``[N, C]`` of each pose."""
-    for p, visibility, body in poses:
+    for p, visibility, given in poses:
+        body = avatar.body_pose(p, visibility) if given is None else given
         points, residuals = avatar.residuals(p, visibility > 0, body)
         yield harmonics(points.normals[0]), _joined(residuals)[0]
 
 
-def ridge_regression(samples: Iterable[tuple[Tensor, Tensor]], ridge: float) -> Tensor:
-    """``[N, K, C]`` float64: N linear maps, each from its own K inputs to C outputs.
+def ridge_regression(
+    samples: Iterable[tuple[Tensor, Tensor]], ridge: float
+) -> tuple[Tensor, Tensor]:
+    """N linear maps, each from its own K inputs to C outputs, and the outputs' means.
 
     Args:
-        samples: pairs ``[N, K]``, ``[N, C]``.
+        samples: pairs ``[N, K]``, ``[N, C]``; the first input is 1.
         ridge: see `distilled`; the first input has no penalty.
+
+    Returns:
+        ``[N, K, C]`` and ``[N, C]``, float64.
     """
     count, gram, moment = 0, torch.zeros(()), torch.zeros(())
     for inputs, outputs in samples:
@@ -118,7 +171,8 @@ def ridge_regression(samples: Iterable[tuple[Tensor, Tensor]], ridge: float) -> 
         count, gram, moment = count + 1, gram + x @ x.mT, moment + x @ y
     penalty = torch.full_like(gram[0, 0], ridge)
     penalty[0] = 0
-    return torch.linalg.solve(gram / count + torch.diag(penalty), moment / count)
+    gram, moment = gram / count, moment / count
+    return torch.linalg.solve(gram + torch.diag(penalty), moment), moment[:, 0]
 
 
 def _joined(residuals: Residuals) -> Tensor:
