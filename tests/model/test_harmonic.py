@@ -4,9 +4,12 @@ import math
 
 import pytest
 import torch
+from commands import arguments
 
 from gsgan.model.harmonic import Harmonic, distilled, harmonics, ridge_regression
+from gsgan.model.runs import load
 from gsgan.skeleton.densify import Points, even_sphere
+from gsgan.train.run import start_from
 from gsgan.utils.errors import ConfigError
 
 FIRST = torch.tensor([1.0, *[0.0] * 8])
@@ -58,10 +61,8 @@ def test_degenerate_normals_and_frames_give_finite_gaussians_and_gradients(frame
     values = (made.means, made.covariances, made.opacities, made.features)
     assert all(bool(torch.isfinite(x).all()) for x in values)
     sum(x.square().sum() for x in values).backward()
-    grads = [raw.grad for raw in model.parameters()]
-    assert all(bool(torch.isfinite(x).all()) for x in grads)
-    assert torch.isfinite(normals.grad).all()
-    slopes = torch.cat([x[:2, 1:].flatten() for x in grads])
+    assert all(bool(torch.isfinite(x.grad).all()) for x in model.parameters())
+    slopes = torch.cat([x.grad[:2].flatten() for x in model.slopes.values()])
     assert float(slopes.abs().max()) == 0  # no direction, no slope
 
 
@@ -102,3 +103,31 @@ def test_the_regression_finds_linear_maps_and_prefers_the_mean():
 def test_an_avatar_without_psi_is_refused(build):
     with pytest.raises(ConfigError, match="only avatars with Ψ"):
         distilled(build("model=lbs_splat")[1], [])
+
+
+SMALLER = "model=harmonic size.body_points=400 size.features=1"
+
+
+def test_training_starts_at_the_least_squares_fit(inside, run, build, capture, tmp_path):
+    folder = tmp_path / "fast"
+    given = ("model/deformation=harmonic", f"distil={run}", "training=smoke", "evaluate=false")
+    one = [f"training.schedule.{x}=0" for x in ("segmentation", "step_two")]
+    one += ["training.schedule.step_one=1", "training.schedule.epoch=1"]
+    done = inside("train", *arguments(capture, folder), *given, *one)
+    assert done.returncode == 0, done.stderr
+    frame = build()[2]
+    p, _, camera, body, _ = frame.inputs
+    fast, psi = (load(x, device="cpu") for x in (folder, run))
+    assert isinstance(fast.deformation, Harmonic)
+    ours, theirs = (x.render(p, camera, body=body) for x in (fast, psi))
+    assert float((ours - theirs).abs().mean()) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [("model=splat_only", "add model=harmonic"), (SMALLER, "has other Gaussians")],
+)
+def test_training_does_not_start_at_another_kind_of_run(run, build, given, message):
+    data, avatar, _ = build(*given.split())
+    with pytest.raises(ConfigError, match=message):
+        start_from(avatar, data, run)

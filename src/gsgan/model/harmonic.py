@@ -9,7 +9,6 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from gsgan.model.avatar import Avatar
 from gsgan.model.deformation import ResidualGaussians, Residuals
@@ -21,6 +20,9 @@ from gsgan.utils.errors import ConfigError
 
 HARMONICS = 9  # of degrees 0, 1 and 2
 RIDGE = 0.02
+SLOPE_RATE = (
+    0.1  # of a slope's learning rate to its constant's: else they fit few poses too closely
+)
 FOLLOW = ("means", "sh", "features")
 # Multipliers of the learning rate: bare parameters need higher rates than an MLP's weights.
 RATES = {"means": 1.0, "quats": 1.0, "scales": 5.0, "opacities": 25.0, "sh": 10.0, "features": 10.0}
@@ -69,33 +71,39 @@ class Harmonic(ResidualGaussians):
         super().__init__(body_height, **settings)
         for name in follow:
             one_of("model.deformation.follow", name, tuple(RATES))
-        self.raw = nn.ParameterDict(
-            [  # a dictionary would be sorted
-                (name, torch.zeros(len(rest_points), HARMONICS if name in follow else 1, size))
-                for name, size in zip(RATES, self.parts, strict=True)
-            ]
+        count, sizes = len(rest_points), dict(zip(RATES, self.parts, strict=True))
+        # lists of pairs, since dictionaries would be sorted
+        self.constants = nn.ParameterDict([(x, torch.zeros(count, n)) for x, n in sizes.items()])
+        self.slopes = nn.ParameterDict(
+            [(x, torch.zeros(count, HARMONICS - 1, n)) for x, n in sizes.items() if x in follow]
         )
 
     def parameter_groups(self) -> list[tuple[list[nn.Parameter], float]]:
         """(parameters, multiplier of the learning rate)."""
-        return [([self.raw[name]], rate) for name, rate in RATES.items()]
+        constants = [([x], RATES[name]) for name, x in self.constants.items()]
+        return constants + [([x], SLOPE_RATE * RATES[name]) for name, x in self.slopes.items()]
 
     @property
     def coefficients(self) -> Tensor:
         """``[N, 9, C]``: C is mean 3, quaternion 4, scale 3, opacity 1, colour 3 (d+1)² and
         features; `_geometry` and `colour_from` make Gaussians of the sums. Means count in
         `mean_step`."""
-        lacking = ((0, 0, 0, HARMONICS - x.shape[1]) for x in self.raw.values())
-        padded = map(functional.pad, self.raw.values(), lacking)
-        return torch.cat(list(padded), dim=-1)
+        found = []
+        for name, constant in self.constants.items():
+            none = constant.new_zeros(len(constant), HARMONICS - 1, constant.shape[-1])
+            slopes = self.slopes.get(name, none)
+            found.append(torch.cat([constant.unsqueeze(1), slopes], dim=1))
+        return torch.cat(found, dim=-1)
 
     def residuals(self, points: Points, pose: Tensor, root: Tensor, pelvis: Tensor) -> Residuals:
         """ΔG of posed points; pose, root and pelvis are not used."""
-        basis, found = harmonics(points.normals), []  # [B, N, 9]
-        for name, values in self.raw.items():
-            used = values[..., : 3 * (self.active_degree + 1) ** 2] if name == "sh" else values
-            # a product with N small matrices takes several times as long
-            found.append((basis[..., : used.shape[1], None] * used).sum(-2))
+        basis, found = harmonics(points.normals)[..., 1:, None], []  # [B, N, 8, 1]
+        for name, constant in self.constants.items():
+            used = 3 * (self.active_degree + 1) ** 2 if name == "sh" else constant.shape[-1]
+            values = constant[:, :used].expand(len(basis), -1, -1)
+            if name in self.slopes:
+                values = values + (basis * self.slopes[name][..., :used]).sum(-2)
+            found.append(values)
         return self._parted(torch.cat(found, dim=-1))
 
 
@@ -139,9 +147,11 @@ def distilled(
     maps, mean = ridge_regression(_samples(avatar, poses), ridge)
     maps[..., :3] /= psi.mean_step
     mean[..., :3] /= psi.mean_step
-    given = zip(maps.split(psi.parts, dim=-1), mean.split(psi.parts, dim=-1), strict=True)
-    for raw, (linear, constant) in zip(fitted.raw.values(), given, strict=True):
-        raw.copy_(linear if raw.shape[1] > 1 else constant.unsqueeze(1))
+    parts = (x.split(psi.parts, dim=-1) for x in (maps, mean))
+    for name, linear, constant in zip(RATES, *parts, strict=True):
+        fitted.constants[name].copy_(linear[:, 0] if name in follow else constant)
+        if name in follow:
+            fitted.slopes[name].copy_(linear[:, 1:])
     return found.freeze()
 
 
