@@ -17,6 +17,7 @@ from gsgan.skeleton import Points
 from gsgan.splat.sh import sh_basis
 from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError
+from gsgan.utils.tensors import derived
 
 HARMONICS = 9  # of degrees 0, 1 and 2
 RIDGE = 0.02
@@ -97,13 +98,18 @@ class Harmonic(ResidualGaussians):
 
     def residuals(self, points: Points, pose: Tensor, root: Tensor, pelvis: Tensor) -> Residuals:
         """ΔG of posed points; pose, root and pelvis are not used."""
-        basis, found = harmonics(points.normals)[..., 1:, None], []  # [B, N, 8, 1]
+        given, parts = list(self.slopes.values()), {}
+        if given:
+            slopes = derived(self, "slopes", lambda: torch.cat(given, dim=-1), *given)
+            # a product with N small matrices takes longer
+            moved = (harmonics(points.normals)[..., 1:, None] * slopes).sum(-2)
+            sizes = [x.shape[-1] for x in given]
+            parts = dict(zip(self.slopes, moved.split(sizes, dim=-1), strict=True))
+        found = []
         for name, constant in self.constants.items():
             used = 3 * (self.active_degree + 1) ** 2 if name == "sh" else constant.shape[-1]
-            values = constant[:, :used].expand(len(basis), -1, -1)
-            if name in self.slopes:
-                values = values + (basis * self.slopes[name][..., :used]).sum(-2)
-            found.append(values)
+            values = constant.expand(len(points.means), -1, -1)[..., :used]
+            found.append(values + parts[name][..., :used] if name in parts else values)
         return self._parted(torch.cat(found, dim=-1))
 
 
