@@ -365,13 +365,7 @@ class Avatar(nn.Module):
     def residuals(
         self, p: Tensor, valid: Tensor, body: BodyPose | None
     ) -> tuple[Points, Residuals]:
-        """G in pose and Ψ's ΔG, without noise.
-
-        Args:
-            p: ``[B, J, 3]`` metres, finite.
-            valid: ``[B, J]``.
-            body: poses of the skinned body, if the avatar needs them.
-        """
+        """G in pose and Ψ's ΔG without noise; arguments as for `splat`."""
         assert self.deformation is not None
         frames = bone_frames(p, valid, self.template)
         points, root, pelvis = self.points(p, valid, frames, body), root_of(p), frames.hubs[:, 0]

@@ -1,7 +1,5 @@
 """Residuals without a network: each Gaussian's are linear in nine harmonics of its own normal."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from copy import deepcopy
@@ -21,9 +19,7 @@ from gsgan.utils.tensors import derived
 
 HARMONICS = 9  # of degrees 0, 1 and 2
 RIDGE = 0.02
-SLOPE_RATE = (
-    0.1  # of a slope's learning rate to its constant's: else they fit few poses too closely
-)
+SLOPE_RATE = 0.1  # times the constant's: else slopes overfit the training poses
 FOLLOW = ("means", "sh", "features")
 # Multipliers of the learning rate: bare parameters need higher rates than an MLP's weights.
 RATES = {"means": 1.0, "quats": 1.0, "scales": 5.0, "opacities": 25.0, "sh": 10.0, "features": 10.0}
@@ -140,16 +136,10 @@ def distilled(
         raise ConfigError("only avatars with Ψ have residuals to distil (model=full, splat_only)")
     if isinstance(psi, Harmonic):
         return found
-    settings = ("features", "sh_degree", "opacity", "mean_bound", "mean_step", "logit_bound")
-    low, high = psi.scale_range
-    found.deformation = fitted = Harmonic(
-        avatar.rest_points,
-        psi.body_height,
-        follow=follow,
-        scale_min=low,
-        scale_max=high,
-        **{name: getattr(psi, name) for name in settings},
-    )
+    same = ("features", "sh_degree", "opacity", "mean_bound", "mean_step", "logit_bound")
+    settings: dict[str, Any] = {name: getattr(psi, name) for name in same}
+    settings["scale_min"], settings["scale_max"] = psi.scale_range
+    fitted = Harmonic(avatar.rest_points, psi.body_height, follow=follow, **settings)
     maps, mean = ridge_regression(_samples(avatar, poses), ridge)
     maps[..., :3] /= psi.mean_step
     mean[..., :3] /= psi.mean_step
@@ -158,6 +148,7 @@ def distilled(
         fitted.constants[name].copy_(linear[:, 0] if name in follow else constant)
         if name in follow:
             fitted.slopes[name].copy_(linear[:, 1:])
+    found.deformation = fitted
     return found.freeze()
 
 
@@ -166,7 +157,8 @@ def _samples(avatar: Avatar, poses: Iterable[Pose]) -> Iterator[tuple[Tensor, Te
     for p, visibility, given in poses:
         body = avatar.body_pose(p, visibility) if given is None else given
         points, residuals = avatar.residuals(p, visibility > 0, body)
-        yield harmonics(points.normals[0]), _joined(residuals)[0]
+        values = [getattr(residuals, name).reshape(points.scales.numel(), -1) for name in RATES]
+        yield harmonics(points.normals[0]), torch.cat(values, dim=-1)
 
 
 def ridge_regression(
@@ -189,10 +181,3 @@ def ridge_regression(
     penalty[0] = 0
     gram, moment = gram / count, moment / count
     return torch.linalg.solve(gram + torch.diag(penalty), moment), moment[:, 0]
-
-
-def _joined(residuals: Residuals) -> Tensor:
-    """``[B, N, C]``: mean 3, quaternion 4, scale 3, opacity 1, colour 3 (d+1)², features."""
-    r = residuals
-    parts = (r.means, r.quats, r.scales, r.opacities.unsqueeze(-1), r.sh.flatten(-2), r.features)
-    return torch.cat(parts, dim=-1)
