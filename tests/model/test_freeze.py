@@ -7,7 +7,7 @@ import torch
 
 MODELS = [
     *((model, "none") for model in ("full", "wo_gcn", "lbs_splat", "image_to_image")),
-    *((model, "all") for model in ("full", "wo_seg", "lbs_splat", "splat_only")),
+    *((model, "all") for model in ("full", "wo_seg", "lbs_splat", "splat_only", "harmonic")),
 ]
 
 

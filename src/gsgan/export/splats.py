@@ -17,7 +17,6 @@ from gsgan import __version__
 from gsgan.data.proportions import upright
 from gsgan.model.avatar import Avatar
 from gsgan.scene import BodyPose, Gaussians
-from gsgan.skeleton import bone_frames, face_code, root_of
 from gsgan.skeleton.densify import even_sphere
 from gsgan.splat.sh import MAX_DEGREE, sh_basis
 from gsgan.utils.errors import ConfigError
@@ -93,12 +92,7 @@ def _posed(
     psi = avatar.deformation
     if psi is None:
         raise ConfigError("this avatar has no Gaussians (model=image_to_image) to export")
-    frames = bone_frames(p, valid, avatar.template)
-    points = avatar.points(p, valid, frames, body)
-    root = root_of(p)
-    face = face_code(p, frames.head, avatar.template)
-    pelvis = frames.hubs[:, 0]
-    residuals = psi.residuals(points, psi.pose_code(p, root, pelvis, None, face), root, pelvis)
+    points, residuals = avatar.residuals(p, valid, body)
     return psi.compose(points, residuals, eye), residuals.sh, points.frames
 
 

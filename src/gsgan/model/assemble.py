@@ -22,7 +22,7 @@ from gsgan.model.avatar import Avatar
 from gsgan.model.body_points import BodyPoints
 from gsgan.model.class_vote import ClassVote, labelled_body
 from gsgan.model.colour import ColourCorrection
-from gsgan.model.deformation import Deformation
+from gsgan.model.deformation import ResidualGaussians
 from gsgan.model.generator import Generator
 from gsgan.model.segmentation import Segmentation
 from gsgan.model.surface import SurfaceGaussians
@@ -111,7 +111,7 @@ class AvatarParts:
 
     accuracy: Accuracy
     densify: Densify | None
-    deformation: Callable[..., Deformation] | None
+    deformation: Callable[..., ResidualGaussians] | None
     segmentation: Callable[..., Segmentation] | None
     pose_encoder: nn.Module | None
     generator: Callable[..., Generator] | None
@@ -218,7 +218,7 @@ def _assembled(
 def _generator(
     parts: AvatarParts,
     template: SkeletonTemplate,
-    splats: Deformation | SurfaceGaussians | None,
+    splats: ResidualGaussians | SurfaceGaussians | None,
     segmentation: Segmentation | None,
 ) -> Generator | None:
     """The UNet; where nothing is splatted the drawn skeleton takes F's place."""

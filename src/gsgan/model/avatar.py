@@ -13,7 +13,7 @@ from gsgan.data.training_poses import TrainingPoses
 from gsgan.effects import Effects
 from gsgan.model.body_points import BodyPoints
 from gsgan.model.colour import ColourCorrection
-from gsgan.model.deformation import Deformation, bounded
+from gsgan.model.deformation import ResidualGaussians, Residuals, bounded
 from gsgan.model.generator import Generator
 from gsgan.model.pose_graph import pose_inputs
 from gsgan.model.rendering import Rendering
@@ -30,6 +30,7 @@ from gsgan.skeleton import (
     complete_skeleton,
     draw_skeleton,
     face_code,
+    root_of,
 )
 from gsgan.splat import Accuracy, rasterise
 from gsgan.utils.tensors import filled, full_precision
@@ -81,7 +82,7 @@ class Avatar(nn.Module):
         limb_length_sum: float,
         body_height: float,
         template: SkeletonTemplate = MEDIAPIPE33,
-        deformation: Deformation | None = None,
+        deformation: ResidualGaussians | None = None,
         densify: Densify | None = None,
         body_points: BodyPoints | None = None,
         surface: SurfaceGaussians | None = None,
@@ -110,9 +111,16 @@ class Avatar(nn.Module):
         self.solver, self.poses = solver, poses
 
     @property
-    def splats(self) -> Deformation | SurfaceGaussians | None:
+    def splats(self) -> ResidualGaussians | SurfaceGaussians | None:
         """The part that makes Gaussians and learns in Step I."""
         return self.deformation or self.surface
+
+    @property
+    def rest_points(self) -> Tensor:
+        """``[N, 3]`` G at rest, in body heights, of an avatar with Ψ."""
+        points = self.body_points or self.densify
+        assert points is not None
+        return points.rest_points
 
     @property
     def splat_channels(self) -> int:
@@ -353,6 +361,17 @@ class Avatar(nn.Module):
                 return self.body_points(body)  # type: ignore[no-any-return]
             assert self.densify is not None
             return self.densify(p, valid, frames)  # type: ignore[no-any-return]
+
+    def residuals(
+        self, p: Tensor, valid: Tensor, body: BodyPose | None
+    ) -> tuple[Points, Residuals]:
+        """G in pose and Ψ's ΔG without noise; arguments as for `splat`."""
+        assert self.deformation is not None
+        frames = bone_frames(p, valid, self.template)
+        points, root, pelvis = self.points(p, valid, frames, body), root_of(p), frames.hubs[:, 0]
+        face = face_code(p, frames.head, self.template)
+        code = self.deformation.pose_code(p, root, pelvis, None, face)
+        return points, self.deformation.residuals(points, code, root, pelvis)
 
     def _rasterised(self, gaussians: Gaussians, camera: Camera, supersample: bool) -> Raster:
         """F."""

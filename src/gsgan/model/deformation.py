@@ -32,46 +32,32 @@ class Residuals:
     features: Tensor  # [B, N, F]
 
 
-class Deformation(nn.Module):
-    """A shared MLP over points, conditioned on the pose; its last layer starts at zero.
+class ResidualGaussians(nn.Module):
+    """Gaussians Ĝ = G + ΔG: bounds, activations and colour. A subclass computes ΔG.
 
     Residuals live in the frame of the point's body part and turn with it, so an arm keeps its
     shape when it moves. With every residual at zero the Gaussians are exactly those of densify:
     isotropic, grey, half transparent.
 
     Args:
-        rest_points: ``[N, 3]`` points on the rest skeleton, in body heights (the point's identity).
         body_height: metres, the subject's constant length scale.
-        joints: joints in the skeleton.
-        width, layers: the MLP's trunk.
-        embedding: learned numbers per point.
         features: channels beside the three of colour.
         mean_step: what residuals of means are multiplied by: with Adam, how fast means move.
         sh_degree: 0 (no view dependence) to 3.
 
-    The other settings are explained in conf/model/full.yaml.
+    The other settings are explained in conf/model/deformation/psi.yaml.
 
-    Source: paper Sec. 3.3, without the table.
+    Source: paper Sec. 3.3.
     """
 
-    rest_code: Tensor
+    pose_frame = "world"
 
     def __init__(
         self,
-        rest_points: Tensor,
         body_height: float,
-        joints: int = 33,
         *,
-        width: int = 256,
-        layers: int = 4,
-        embedding: int = 32,
         features: int = 29,
         sh_degree: int = 1,
-        rest_octaves: int = 6,
-        position_octaves: int = 2,
-        normals: bool = False,
-        free_table: bool = True,
-        pose_frame: str = "world",
         opacity: float = 0.5,
         mean_bound: float | None = 0.25,
         mean_step: float = 1.0,
@@ -81,28 +67,12 @@ class Deformation(nn.Module):
     ) -> None:
         super().__init__()
         one_of("model.deformation: sh_degree", sh_degree, range(4))
-        one_of("model.deformation.pose_frame", pose_frame, ("world", "pelvis"))
-        whole("model.deformation: layers", layers, 2)
-        points = rest_points.shape[0]
         self.body_height, self.features, self.sh_degree = float(body_height), features, sh_degree
         self.active_degree = sh_degree  # raised during training; higher degrees are not computed
-        self.position_octaves, self.pose_frame = position_octaves, pose_frame
         self.opacity, self.mean_bound, self.logit_bound = opacity, mean_bound, logit_bound
         self.mean_step = mean_step
         self.scale_range = (scale_min, scale_max)
-        self.register_buffer("rest_code", positional_encoding(rest_points.float(), rest_octaves))
-        self.embedding = nn.Parameter(0.1 * torch.randn(points, embedding))
-        point_size = encoded_size(3, rest_octaves) + embedding
-        self.from_point = nn.Linear(point_size, width)
-        self.from_position = nn.Linear(encoded_size(3, position_octaves), width, bias=False)
-        self.from_pose = nn.Linear(3 * joints, width, bias=False)
-        self.from_normal = nn.Linear(3, width, bias=False) if normals else None
-        self.trunk = nn.ModuleList(nn.Linear(width, width) for _ in range(layers - 1))
         self.parts = (3, 4, 3, 1, 3 * (sh_degree + 1) ** 2, features)
-        self.head = nn.Linear(width, sum(self.parts))
-        nn.init.zeros_(self.head.weight)
-        nn.init.zeros_(self.head.bias)
-        self.table = nn.Parameter(torch.zeros(points, sum(self.parts))) if free_table else None
 
     def parameter_groups(self) -> list[tuple[list[nn.Parameter], float]]:
         """(parameters, multiplier of the learning rate)."""
@@ -111,71 +81,23 @@ class Deformation(nn.Module):
     def residuals(self, points: Points, pose: Tensor, root: Tensor, pelvis: Tensor) -> Residuals:
         """ΔG of posed points, from the `pose_code` and the pelvis: ``root [B, 3]`` (metres) and
         axes ``[B, 3, 3]`` (columns)."""
-        position = (points.means - root[:, None]) / self.body_height
-        normals = points.normals
-        if self.pose_frame == "pelvis":
-            position, normals = position @ pelvis, normals @ pelvis
-        code = positional_encoding(position, self.position_octaves)
-        if torch.is_grad_enabled() and not (code.requires_grad or normals.requires_grad):
-            x = self._trained(code, normals, pose)
-        else:
-            weight = self.from_position.weight
-            if self.from_normal is not None:
-                code = torch.cat([code, normals], dim=-1)
-                weight = torch.cat([weight, self.from_normal.weight], dim=1)
-            start = self._point_part() + self.from_pose(pose).unsqueeze(1)
-            x = torch.baddbmm(start, code, weight.mT.expand(len(pose), -1, -1))
-            x = functional.relu(x, inplace=True)
-            for layer in self.trunk:
-                x = functional.relu(layer(x), inplace=True)
-        raw, parts = self._head(x)
-        means, quats, scales, opacities, sh, features = raw.split(parts, dim=-1)
+        raise NotImplementedError
+
+    def _active(self, values: Tensor) -> Tensor:
+        """Raw residuals ``[..., sum(parts)]`` without the harmonics above the active degree: those
+        start at zero and get no gradient until they are active."""
+        if self.active_degree >= self.sh_degree:
+            return values
+        first, last = sum(self.parts[:4]), sum(self.parts[:5])
+        active = values[..., : first + 3 * (self.active_degree + 1) ** 2]
+        return torch.cat([active, values[..., last:]], dim=-1)
+
+    def _parted(self, raw: Tensor) -> Residuals:
+        """The residuals of raw numbers ``[B, N, ...]``, those of `_active`."""
+        sizes = (*self.parts[:4], 3 * (self.active_degree + 1) ** 2, self.features)
+        means, quats, scales, opacities, sh, features = raw.split(sizes, dim=-1)
         sh, opacities = sh.unflatten(-1, (-1, 3)), opacities[..., 0]
         return Residuals(self.mean_step * means, quats, scales, opacities, sh, features)
-
-    def _point_part(self) -> Tensor:
-        """``[N, width]``: the part of the first layer that depends on the point alone."""
-        layer, own = self.from_point, self.embedding
-
-        def make() -> Tensor:
-            found: Tensor = layer(torch.cat([self.rest_code, own], dim=-1))
-            return found
-
-        return derived(self, "point part", make, layer.weight, layer.bias, own, self.rest_code)
-
-    def _trained(self, code: Tensor, normals: Tensor, pose: Tensor) -> Tensor:
-        """The trunk's output; its layers are one operation, which computes no unused gradient."""
-        given, weights = [self.rest_code, code], [self.from_position.weight]
-        from_rest, from_embedding = self.from_point.weight.split(
-            [self.rest_code.shape[-1], self.embedding.shape[-1]], dim=-1
-        )
-        if self.from_normal is not None:
-            given.append(normals)
-            weights.append(self.from_normal.weight)
-        size = code.shape[:2]
-        known = torch.cat([x.expand(*size, -1) for x in given], dim=-1)
-        weight = torch.cat([from_rest, *weights, from_embedding], dim=-1)
-        bias = self.from_point.bias + self.from_pose(pose)
-        layers = [x for layer in self.trunk for x in (layer.weight, layer.bias)]
-        x: Tensor = _Trunk.apply(known, self.embedding.expand(*size, -1), weight, bias, *layers)
-        return x
-
-    def _head(self, x: Tensor) -> tuple[Tensor, tuple[int, ...]]:
-        """The raw residuals ``[B, N, ...]`` and the sizes of their parts, without the harmonics
-        above the active degree: those start at zero and get no gradient until they are active."""
-        if self.active_degree >= self.sh_degree:
-            raw = self.head(x)
-            return raw if self.table is None else raw + self.table, self.parts
-        colours = 3 * (self.active_degree + 1) ** 2
-        parts = (*self.parts[:4], colours, self.features)
-        first, last = sum(parts[:5]), sum(self.parts[:5])
-
-        def active(values: Tensor) -> Tensor:
-            return torch.cat([values[..., :first], values[..., last:]], dim=-1)
-
-        weight = active(self.head.weight.mT).mT
-        raw = functional.linear(x, weight, active(self.head.bias))
-        return raw if self.table is None else raw + active(self.table), parts
 
     def compose(self, points: Points, residuals: Residuals, eye: Tensor) -> Gaussians:
         """Ĝ = G + ΔG: bounds and activations, then colour as seen from ``eye`` ``[B, 3]``.
@@ -258,6 +180,109 @@ class Deformation(nn.Module):
         code = self.pose_code(p, root, pelvis, noise, face)
         residuals = self.residuals(points, code, root, pelvis)
         return self.compose(points, residuals, eye)
+
+
+class Deformation(ResidualGaussians):
+    """Ψ: a shared MLP over points, conditioned on the pose; its last layer starts at zero.
+
+    Args:
+        rest_points: ``[N, 3]`` points on the rest skeleton, in body heights (the point's identity).
+        body_height: metres, the subject's constant length scale.
+        joints: joints in the skeleton.
+        width, layers: the MLP's trunk.
+        embedding: learned numbers per point.
+        settings: of `ResidualGaussians`.
+
+    The other settings are explained in conf/model/deformation/psi.yaml.
+
+    Source: paper Sec. 3.3, without the table.
+    """
+
+    rest_code: Tensor
+
+    def __init__(
+        self,
+        rest_points: Tensor,
+        body_height: float,
+        joints: int = 33,
+        *,
+        width: int = 256,
+        layers: int = 4,
+        embedding: int = 32,
+        rest_octaves: int = 6,
+        position_octaves: int = 2,
+        normals: bool = False,
+        free_table: bool = True,
+        pose_frame: str = "world",
+        **settings: Any,
+    ) -> None:
+        super().__init__(body_height, **settings)
+        one_of("model.deformation.pose_frame", pose_frame, ("world", "pelvis"))
+        whole("model.deformation: layers", layers, 2)
+        points = rest_points.shape[0]
+        self.position_octaves, self.pose_frame = position_octaves, pose_frame
+        self.register_buffer("rest_code", positional_encoding(rest_points.float(), rest_octaves))
+        self.embedding = nn.Parameter(0.1 * torch.randn(points, embedding))
+        point_size = encoded_size(3, rest_octaves) + embedding
+        self.from_point = nn.Linear(point_size, width)
+        self.from_position = nn.Linear(encoded_size(3, position_octaves), width, bias=False)
+        self.from_pose = nn.Linear(3 * joints, width, bias=False)
+        self.from_normal = nn.Linear(3, width, bias=False) if normals else None
+        self.trunk = nn.ModuleList(nn.Linear(width, width) for _ in range(layers - 1))
+        self.head = nn.Linear(width, sum(self.parts))
+        nn.init.zeros_(self.head.weight)
+        nn.init.zeros_(self.head.bias)
+        self.table = nn.Parameter(torch.zeros(points, sum(self.parts))) if free_table else None
+
+    def residuals(self, points: Points, pose: Tensor, root: Tensor, pelvis: Tensor) -> Residuals:
+        """See `ResidualGaussians.residuals`."""
+        position = (points.means - root[:, None]) / self.body_height
+        normals = points.normals
+        if self.pose_frame == "pelvis":
+            position, normals = position @ pelvis, normals @ pelvis
+        code = positional_encoding(position, self.position_octaves)
+        if torch.is_grad_enabled() and not (code.requires_grad or normals.requires_grad):
+            x = self._trained(code, normals, pose)
+        else:
+            weight = self.from_position.weight
+            if self.from_normal is not None:
+                code = torch.cat([code, normals], dim=-1)
+                weight = torch.cat([weight, self.from_normal.weight], dim=1)
+            start = self._point_part() + self.from_pose(pose).unsqueeze(1)
+            x = torch.baddbmm(start, code, weight.mT.expand(len(pose), -1, -1))
+            x = functional.relu(x, inplace=True)
+            for layer in self.trunk:
+                x = functional.relu(layer(x), inplace=True)
+        weight, bias = self._active(self.head.weight.mT).mT, self._active(self.head.bias)
+        raw = functional.linear(x, weight, bias)
+        return self._parted(raw if self.table is None else raw + self._active(self.table))
+
+    def _point_part(self) -> Tensor:
+        """``[N, width]``: the part of the first layer that depends on the point alone."""
+        layer, own = self.from_point, self.embedding
+
+        def make() -> Tensor:
+            found: Tensor = layer(torch.cat([self.rest_code, own], dim=-1))
+            return found
+
+        return derived(self, "point part", make, layer.weight, layer.bias, own, self.rest_code)
+
+    def _trained(self, code: Tensor, normals: Tensor, pose: Tensor) -> Tensor:
+        """The trunk's output; its layers are one operation, which computes no unused gradient."""
+        given, weights = [self.rest_code, code], [self.from_position.weight]
+        from_rest, from_embedding = self.from_point.weight.split(
+            [self.rest_code.shape[-1], self.embedding.shape[-1]], dim=-1
+        )
+        if self.from_normal is not None:
+            given.append(normals)
+            weights.append(self.from_normal.weight)
+        size = code.shape[:2]
+        known = torch.cat([x.expand(*size, -1) for x in given], dim=-1)
+        weight = torch.cat([from_rest, *weights, from_embedding], dim=-1)
+        bias = self.from_point.bias + self.from_pose(pose)
+        layers = [x for layer in self.trunk for x in (layer.weight, layer.bias)]
+        x: Tensor = _Trunk.apply(known, self.embedding.expand(*size, -1), weight, bias, *layers)
+        return x
 
 
 def _unit_quat(residual: Tensor) -> Tensor:

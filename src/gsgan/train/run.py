@@ -31,6 +31,9 @@ from gsgan.evaluate.scores import painter
 from gsgan.fit.run import fit_before_training
 from gsgan.metrics.lpips import check_lpips
 from gsgan.model.assemble import build_avatar, build_data, naming_group
+from gsgan.model.avatar import Avatar
+from gsgan.model.harmonic import Harmonic, distilled
+from gsgan.model.runs import load
 from gsgan.model.stored import CHECKPOINT, read_checkpoint, record
 from gsgan.splat import resolve_backend
 from gsgan.train.callbacks import AtomicCheckpoints, ImageGrid, LiveViewer, ProgressLines
@@ -68,6 +71,8 @@ def run_training(config: DictConfig) -> None:
     done = 0 if resume is None else int(read_checkpoint(resume)["gsgan"]["step"])
     if resume is None:
         remove_old_results(folder)
+        if config.distil is not None:
+            start_from(module.avatar, data, Path(config.distil).expanduser())
     elif done >= module.schedule.total and (not config.evaluate or _is_scored(folder, resume)):
         console.print(
             f"{folder}: trained and scored before; nothing to do (gsgan.evaluate scores it again)",
@@ -106,6 +111,29 @@ def build_training(config: DictConfig) -> tuple[GsganData, AvatarTraining]:
             record=training_record(config, data),
             scene=json.loads(json.dumps(asdict(data.info))),
         )
+
+
+def start_from(avatar: Avatar, data: GsganData, run: Path) -> None:
+    """Starts an avatar with `Harmonic` residuals as another run's: the least-squares fit to its Ψ
+    over the training poses, and its other weights.
+
+    Raises:
+        ConfigError: when the avatars do not go together.
+        DataError: when the folder holds no run.
+    """
+    if not isinstance(avatar.deformation, Harmonic):
+        raise ConfigError("distil: only residuals without Ψ start from a run; add model=harmonic")
+    trained, frames = load(run, device="cpu"), data.dataset("train")
+    once = {frame: i for i, (_, frame) in enumerate(frames.items)}.values()  # by one camera each
+    poses = (frames[i].inputs for i in once)
+    fitted = distilled(trained, ((p, seen, body) for p, seen, _, body, _ in poses))
+    try:
+        torch.testing.assert_close(fitted.rest_points, avatar.rest_points, atol=1e-3, rtol=0)
+        avatar.load_state_dict(fitted.state_dict(), strict=False)
+    except (RuntimeError, AssertionError):
+        raise ConfigError(
+            f"distil: {run} has other Gaussians; give its data, size and effects"
+        ) from None
 
 
 def device_of(config: DictConfig) -> torch.device:

@@ -1,0 +1,183 @@
+"""Residuals without a network: each Gaussian's are linear in nine harmonics of its own normal."""
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from copy import deepcopy
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from gsgan.model.avatar import Avatar
+from gsgan.model.deformation import ResidualGaussians, Residuals
+from gsgan.scene import BodyPose
+from gsgan.skeleton import Points
+from gsgan.splat.sh import sh_basis
+from gsgan.utils.checks import one_of
+from gsgan.utils.errors import ConfigError
+from gsgan.utils.tensors import derived
+
+HARMONICS = 9  # of degrees 0, 1 and 2
+RIDGE = 0.02
+SLOPE_RATE = 0.1  # times the constant's: else slopes overfit the training poses
+FOLLOW = ("means", "sh", "features")
+# Multipliers of the learning rate: bare parameters need higher rates than an MLP's weights.
+RATES = {"means": 1.0, "quats": 1.0, "scales": 5.0, "opacities": 25.0, "sh": 10.0, "features": 10.0}
+UNIT = math.sqrt(4 * math.pi)  # makes the first harmonic 1, and the mean square of each
+Pose = tuple[Tensor, Tensor, BodyPose | None]  # joints, visibility, body: `gsgan.model.drive`
+
+
+def harmonics(normals: Tensor) -> Tensor:
+    """``[..., 9]``: the real spherical harmonics of degrees 0 to 2, the first one 1.
+
+    Convention: `gsgan.splat.sh.sh_basis` times √(4π). A normal of length r has r and r² times the
+    harmonics of degree 1 and 2: where skinning flattens the surface, and normals fade to zero, the
+    first one alone is left. A normal that is not finite counts as zero.
+
+    Args:
+        normals: ``[..., 3]`` in world axes, of length 1 or less.
+
+    Source: the irradiance of a convex diffuse surface under distant light is within 1 % of such a
+    function (Ramamoorthi and Hanrahan, 2001).
+    """
+    return UNIT * sh_basis(normals.nan_to_num(0.0, 0.0, 0.0), 2)
+
+
+class Harmonic(ResidualGaussians):
+    """Linear functions of the `harmonics` of each point's posed normal, in Ψ's place.
+
+    Args:
+        rest_points: ``[N, 3]``; only their number is used.
+        body_height: metres, the subject's constant length scale.
+        joints: not used.
+        follow: names of `Residuals` that follow the normals; the others are constant.
+        settings: of `ResidualGaussians`.
+
+    Source: ours.
+    """
+
+    def __init__(
+        self,
+        rest_points: Tensor,
+        body_height: float,
+        joints: int = 33,
+        *,
+        follow: Sequence[str] = FOLLOW,
+        **settings: Any,
+    ) -> None:
+        super().__init__(body_height, **settings)
+        for name in follow:
+            one_of("model.deformation.follow", name, tuple(RATES))
+        count, sizes = len(rest_points), dict(zip(RATES, self.parts, strict=True))
+        # lists of pairs, since dictionaries would be sorted
+        self.constants = nn.ParameterDict([(x, torch.zeros(count, n)) for x, n in sizes.items()])
+        self.slopes = nn.ParameterDict(
+            [(x, torch.zeros(count, HARMONICS - 1, n)) for x, n in sizes.items() if x in follow]
+        )
+
+    def parameter_groups(self) -> list[tuple[list[nn.Parameter], float]]:
+        """(parameters, multiplier of the learning rate)."""
+        constants = [([x], RATES[name]) for name, x in self.constants.items()]
+        return constants + [([x], SLOPE_RATE * RATES[name]) for name, x in self.slopes.items()]
+
+    @property
+    def coefficients(self) -> Tensor:
+        """``[N, 9, C]``: C is mean 3, quaternion 4, scale 3, opacity 1, colour 3 (d+1)² and
+        features; `_geometry` and `colour_from` make Gaussians of the sums. Means count in
+        `mean_step`."""
+        found = []
+        for name, constant in self.constants.items():
+            none = constant.new_zeros(len(constant), HARMONICS - 1, constant.shape[-1])
+            slopes = self.slopes.get(name, none)
+            found.append(torch.cat([constant.unsqueeze(1), slopes], dim=1))
+        return torch.cat(found, dim=-1)
+
+    def residuals(self, points: Points, pose: Tensor, root: Tensor, pelvis: Tensor) -> Residuals:
+        """ΔG of posed points; pose, root and pelvis are not used."""
+        given, parts = list(self.slopes.values()), {}
+        if given:
+            slopes = derived(self, "slopes", lambda: torch.cat(given, dim=-1), *given)
+            # a product with N small matrices takes longer
+            moved = (harmonics(points.normals)[..., 1:, None] * slopes).sum(-2)
+            sizes = [x.shape[-1] for x in given]
+            parts = dict(zip(self.slopes, moved.split(sizes, dim=-1), strict=True))
+        found = []
+        for name, constant in self.constants.items():
+            used = 3 * (self.active_degree + 1) ** 2 if name == "sh" else constant.shape[-1]
+            values = constant.expand(len(points.means), -1, -1)[..., :used]
+            found.append(values + parts[name][..., :used] if name in parts else values)
+        return self._parted(torch.cat(found, dim=-1))
+
+
+@torch.no_grad()
+def distilled(
+    avatar: Avatar,
+    poses: Iterable[Pose],
+    *,
+    follow: Sequence[str] = FOLLOW,
+    ridge: float = RIDGE,
+) -> Avatar:
+    """A frozen copy of an avatar with `Harmonic` residuals in Ψ's place: the least-squares fit to
+    Ψ's over poses. An avatar that has such residuals already is copied.
+
+    Args:
+        avatar: trained, with Ψ.
+        poses: joints ``[1, J, 3]``, visibility ``[1, J]`` and body pose of each (None: solved), as
+            `gsgan.model.drive.inputs_of` and `gsgan.scene.Frame.inputs` have them.
+        follow: see `Harmonic`; the others get their mean over the poses.
+        ridge: penalty of each squared coefficient but the first, beside the mean over poses of the
+            squared error.
+
+    Raises:
+        ConfigError: when the avatar has no Ψ.
+    """
+    found, psi = deepcopy(avatar), avatar.deformation
+    if psi is None:
+        raise ConfigError("only avatars with Ψ have residuals to distil (model=full, splat_only)")
+    if isinstance(psi, Harmonic):
+        return found
+    same = ("features", "sh_degree", "opacity", "mean_bound", "mean_step", "logit_bound")
+    settings: dict[str, Any] = {name: getattr(psi, name) for name in same}
+    settings["scale_min"], settings["scale_max"] = psi.scale_range
+    fitted = Harmonic(avatar.rest_points, psi.body_height, follow=follow, **settings)
+    maps, mean = ridge_regression(_samples(avatar, poses), ridge)
+    maps[..., :3] /= psi.mean_step
+    mean[..., :3] /= psi.mean_step
+    parts = (x.split(psi.parts, dim=-1) for x in (maps, mean))
+    for name, linear, constant in zip(RATES, *parts, strict=True):
+        fitted.constants[name].copy_(linear[:, 0] if name in follow else constant)
+        if name in follow:
+            fitted.slopes[name].copy_(linear[:, 1:])
+    found.deformation = fitted
+    return found.freeze()
+
+
+def _samples(avatar: Avatar, poses: Iterable[Pose]) -> Iterator[tuple[Tensor, Tensor]]:
+    """Harmonics ``[N, 9]`` and residuals ``[N, C]`` of each pose."""
+    for p, visibility, given in poses:
+        body = avatar.body_pose(p, visibility) if given is None else given
+        points, residuals = avatar.residuals(p, visibility > 0, body)
+        values = [getattr(residuals, name).reshape(points.scales.numel(), -1) for name in RATES]
+        yield harmonics(points.normals[0]), torch.cat(values, dim=-1)
+
+
+def ridge_regression(
+    samples: Iterable[tuple[Tensor, Tensor]], ridge: float
+) -> tuple[Tensor, Tensor]:
+    """N linear maps, each from its own K inputs to C outputs, and the outputs' means.
+
+    Args:
+        samples: pairs ``[N, K]``, ``[N, C]``; the first input is 1.
+        ridge: see `distilled`; the first input has no penalty.
+
+    Returns:
+        ``[N, K, C]`` and ``[N, C]``, float64.
+    """
+    count, gram, moment = 0, torch.zeros(()), torch.zeros(())
+    for inputs, outputs in samples:
+        x, y = inputs.double().unsqueeze(-1), outputs.double().unsqueeze(-2)
+        count, gram, moment = count + 1, gram + x @ x.mT, moment + x @ y
+    penalty = torch.full_like(gram[0, 0], ridge)
+    penalty[0] = 0
+    gram, moment = gram / count, moment / count
+    return torch.linalg.solve(gram + torch.diag(penalty), moment), moment[:, 0]
