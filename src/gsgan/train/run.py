@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
+from signal import SIGTERM
 from typing import Any
 
 import gsgan.utils.compat  # noqa: F401  (must come before lightning)
@@ -14,9 +15,11 @@ import gsgan.utils.compat  # noqa: F401  (must come before lightning)
 # isort: split
 import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from hydra.utils import instantiate
 from lightning import Trainer, seed_everything
 from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
+from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
 from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
@@ -137,13 +140,13 @@ def _fit(
         else:
             console.print(f"resuming from {resume}", soft_wrap=True)
         trainer.fit(module, data, ckpt_path=None if resume is None else str(resume))
-    except SystemExit:  # Lightning's answer to Ctrl-C
+    except SystemExit as error:  # Lightning's answer to Ctrl-C and SIGTERM
         console.print(
             f"interrupted at iteration {module.step}; the same command with "
             f"hydra.run.dir={folder} resumes from its last checkpoint",
             soft_wrap=True,
         )
-        raise
+        raise SystemExit(error.code or 128 + SIGTERM) from None  # Lightning ends a SIGTERM with 0
 
 
 def _evaluate(
@@ -274,15 +277,25 @@ def build_trainer(
         callbacks.append(LiveViewer(folder, config, data, console))
     if console.is_terminal:
         callbacks.append(RichProgressBar())
-    return instantiate(
+    trainer: Trainer = instantiate(
         config.trainer,
         max_epochs=-(-module.schedule.total // len(data.train_dataloader())),
         callbacks=callbacks,
+        default_root_dir=folder,
         plugins=[AtomicCheckpoints()],
         # a logger overwrites its files: each part of a resumed run has its own folder
         logger=instantiate(config.logger, version=logs),
         enable_progress_bar=console.is_terminal,
     )
+    if isinstance(launcher := trainer.strategy.launcher, _SubprocessScriptLauncher) and (
+        HydraConfig.get().mode == RunMode.MULTIRUN
+        and not launcher.cluster_environment.creates_processes_externally
+    ):
+        raise ConfigError(
+            f"{trainer.world_size} processes in a sweep: each would start the whole sweep; leave "
+            "out -m, or let torchrun or SLURM start the processes"
+        )
+    return trainer
 
 
 def describe(
