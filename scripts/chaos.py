@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import copy
 import errno
 import hashlib
 import importlib
@@ -41,6 +42,8 @@ import gsgan.utils.compat  # noqa: F401  (before lightning)
 # isort: split
 import cv2
 import torch
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from omegaconf import DictConfig
 
 from gsgan.synthetic.scenes import ensure_scene
 from gsgan.utils.errors import GsganError
@@ -143,6 +146,19 @@ def command(stage: Stage, place: dict[str, Path], again: bool) -> None:
     given = [*stage.arguments, *(stage.again if again else ())]
     sys.argv = [f"gsgan.{stage.command}", *(a.format(**place) for a in given)]
     importlib.import_module(f"gsgan.{stage.command}.__main__").main()
+
+
+def remember_configs() -> None:
+    """Makes Hydra compose each config once, which takes most of the time of a tiny run."""
+    compose, known = ConfigLoaderImpl.load_configuration, dict[str, DictConfig]()
+
+    def load(self: ConfigLoaderImpl, *given: object, **named: object) -> DictConfig:
+        key = repr((given, named))
+        if key not in known:
+            known[key] = compose(self, *given, **named)  # type: ignore[arg-type]
+        return copy.deepcopy(known[key])
+
+    ConfigLoaderImpl.load_configuration = load  # type: ignore[method-assign, assignment]
 
 
 def operations(strike: Callable[[int], None], within: Path) -> None:
@@ -255,7 +271,7 @@ class Chaos:
         """The undisturbed result of a stage; before that it runs in this process, which imports
         what all children need."""
         log, numbers = self.folder / "log", self.folder / "numbers.json"
-        place = self.place(name, self.folder / "whole" / name)
+        place = self.place(name, self.folder / "trial")
         with log.open("w") as out, contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):
             command(STAGES[name], place, again=False)
         place = self.place(name, place["out"])
@@ -268,6 +284,7 @@ class Chaos:
 
         status = os.waitpid(child(work, log), 0)[1]
         assert status == 0, log.read_text()[-2000:]
+        shutil.copytree(place["out"], self.folder / "whole" / name)
         return Truth(result(name, place["out"]), *json.loads(numbers.read_text()))
 
     def kill(self, name: str, way: str, truth: Truth) -> None:
@@ -419,6 +436,7 @@ def main() -> None:
         os.environ["GSGAN_CACHE"] = str(cache)
         inputs(chaos.base)
         os.environ["COLUMNS"] = "120"
+        remember_configs()
         truths = {}
         for name in sorted(names, key=lambda name: name != "train"):
             truths[name] = truth = chaos.prepare(name)

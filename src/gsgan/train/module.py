@@ -185,8 +185,7 @@ class AvatarTraining(LightningModule):
         maps = None
         if self.discriminator is not None and self.schedule.adversarial(self.step):
             maps = self.step_two.discriminator_maps(self.discriminator, rendering, frame)
-            pairs = zip(maps.real, maps.fake, strict=True)
-            self.rollback.watch(logits=sum((a[-1] - b[-1]).abs().mean() for a, b in pairs))
+            self.rollback.watch(logits=maps.difference)
         terms = self.step_two_terms(rendering, frame, maps)
         losses = {f"step_two/{name}": term for name, term in terms.items()}
         self._descend(losses, *self._splatting(), "generator")
