@@ -1,6 +1,7 @@
 """Memory of a long training, of many rendered images, and of a viewer with three browsers.
 
-    python scripts/soak.py [train images viewer] [--minutes 60] [--images 10000] [--interactions 1000]
+    python scripts/soak.py [train images viewer] [--minutes 60] [--images 10000]
+        [--interactions 1000]
 
 Everything is tiny (16² or 32²), so that it is repeated as often as possible in the time. Writes the
 resident memory of every two seconds to ``memory.csv`` and prints, for each part, its median in the
@@ -21,6 +22,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +36,7 @@ TINY = [
     *("data.source.test_frames=2", "data.source.train_cameras=3", "data.source.test_cameras=1"),
     *("data.source.rays_per_pixel=1", "data.source.workers=1", "data.source.secondary=false"),
 ]
+JOINING = threading.Lock()
 EVERY, ALLOWED, CLIENTS = 2.0, 0.02, 3  # seconds; growth; browsers
 
 
@@ -77,7 +80,8 @@ def gsgan(command: str, *arguments: str) -> subprocess.Popen[bytes]:
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     return subprocess.Popen(
         [sys.executable, "-m", f"gsgan.{command}", *arguments],
-        **{"env": environment, "stdout": subprocess.DEVNULL},  # type: ignore[call-overload]
+        env=environment,
+        stdout=subprocess.DEVNULL,
     )
 
 
@@ -126,7 +130,8 @@ def viewer(run: Path, curve: Curve, count: int) -> str:
             thread.join()
     made.stop()
     assert not failures, failures[0]
-    return f"{count:,} interactions of {CLIENTS} clients in {(time.monotonic() - began) / 60:.1f} minutes"
+    minutes = (time.monotonic() - began) / 60
+    return f"{count:,} interactions of {CLIENTS} clients in {minutes:.1f} minutes"
 
 
 def browse(viewer: Any, count: int, seed: int, failures: list[str]) -> None:
@@ -143,11 +148,14 @@ def _browse(viewer: Any, count: int, rng: random.Random) -> None:
     from websockets.sync.client import connect
 
     address = viewer.address
-    known = set(viewer.sessions)
-    with connect(
-        address.replace("http", "ws", 1), origin=address.partition("/?")[0],
-        subprotocols=[f"viser-v{viser.__version__}"], max_size=None,
-    ) as socket:  # fmt: skip
+    with JOINING:  # one after the other: else it is unknown whose session is whose
+        known = set(viewer.sessions)
+        socket = connect(
+            address.replace("http", "ws", 1),
+            origin=address.partition("/?")[0],
+            subprotocols=[f"viser-v{viser.__version__}"],
+            max_size=None,
+        )
         threading.Thread(target=lambda: [None for _ in socket], daemon=True).start()
 
         def send(kind: str, **fields: Any) -> None:
@@ -161,9 +169,9 @@ def _browse(viewer: Any, count: int, rng: random.Random) -> None:
                 look_at=(0.0, 0.0, 1.0), up_direction=(0.0, 0.0, 1.0),
             )  # fmt: skip
 
-        port = socket.local_address[1]
         look()
-        session = wait(lambda: _session(viewer, port, known))
+        session = viewer.sessions[wait(lambda: set(viewer.sessions) - known).pop()]
+    with socket:
         controls = (session.slider, session.layer, session.bones, session.mesh, session.splats)
         for _ in range(count):
             before = session.started
@@ -171,23 +179,18 @@ def _browse(viewer: Any, count: int, rng: random.Random) -> None:
             if control is None:
                 look()
             else:
-                options = getattr(control, "options", None)
-                value = rng.choice(options) if options else not control.value
                 if control is session.slider:
-                    value = rng.randrange(int(control.max) + 1)
+                    choices = range(int(control.max) + 1)
+                else:
+                    choices = getattr(control, "options", (False, True))
+                value = rng.choice([x for x in choices if x != control.value])
                 send("GuiUpdateMessage", uuid=control._impl.uuid, updates={"value": value})
-            wait(lambda: session.full and session.started > before)
+            wait(partial(_answered, session, before))
 
 
-def _session(viewer: Any, port: int, known: set[int]) -> Any:
-    for number, session in list(viewer.sessions.items()):
-        if number not in known and number not in taken:
-            taken.add(number)
-            return session
-    return None
-
-
-taken: set[int] = set()
+def _answered(session: Any, before: float) -> bool:
+    """Whether a full-size image was rendered since."""
+    return bool(session.full and session.started > before)
 
 
 def wait(holds: Callable[[], Any], seconds: float = 300) -> Any:

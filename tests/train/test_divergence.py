@@ -1,4 +1,4 @@
-"""What is not finite is skipped, counted and named; what collapses is undone; then the run stops."""
+"""What is not finite is skipped and named, what collapses is undone; at last the run stops."""
 
 import dataclasses
 import re

@@ -58,7 +58,7 @@ def test_processes_skip_together_and_stop_together(make):
 
 
 def test_another_number_of_processes_is_refused(make):
-    module, trainer, data = make()
+    module, _, _ = make()
     checkpoint: dict = {}
     module.on_save_checkpoint(checkpoint)
     assert checkpoint["gsgan"]["processes"] == 1
