@@ -15,11 +15,9 @@ import gsgan.utils.compat  # noqa: F401  (must come before lightning)
 # isort: split
 import torch
 from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from hydra.utils import instantiate
 from lightning import Trainer, seed_everything
 from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
-from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
 from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
@@ -277,7 +275,7 @@ def build_trainer(
         callbacks.append(LiveViewer(folder, config, data, console))
     if console.is_terminal:
         callbacks.append(RichProgressBar())
-    trainer: Trainer = instantiate(
+    return instantiate(
         config.trainer,
         max_epochs=-(-module.schedule.total // len(data.train_dataloader())),
         callbacks=callbacks,
@@ -287,15 +285,6 @@ def build_trainer(
         logger=instantiate(config.logger, version=logs),
         enable_progress_bar=console.is_terminal,
     )
-    if isinstance(launcher := trainer.strategy.launcher, _SubprocessScriptLauncher) and (
-        HydraConfig.get().mode == RunMode.MULTIRUN
-        and not launcher.cluster_environment.creates_processes_externally
-    ):
-        raise ConfigError(
-            f"{trainer.world_size} processes in a sweep: each would start the whole sweep; leave "
-            "out -m, or let torchrun or SLURM start the processes"
-        )
-    return trainer
 
 
 def describe(

@@ -96,7 +96,10 @@ def entry(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], No
                 _print_error("interrupted")
                 sys.exit(130)
             except Exception as error:
-                _explain(error)
+                message = one_sentence(error)
+                if message is None:
+                    raise
+                _print_error(message)
                 _remove_unused_folder()
                 sys.exit(FAILED)
 
@@ -118,7 +121,10 @@ def entry(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], No
                     f"{error}\n{cause}" if isinstance(cause, OmegaConfBaseException) else str(error)
                 )
             except OSError as error:
-                _explain(error)
+                message = one_sentence(error)
+                if message is None:
+                    raise
+                _print_error(message)
                 sys.exit(FAILED)
 
         return main
@@ -186,14 +192,6 @@ def _remove_unused_folder() -> None:
     folder = Path(settings.runtime.output_dir)
     if {path.name for path in folder.iterdir()} <= {subfolder, f"{settings.job.name}.log"}:
         shutil.rmtree(folder)
-
-
-def _explain(error: Exception) -> None:
-    """Prints an error that the user can correct; raises any other."""
-    message = one_sentence(error)
-    if message is None:
-        raise error
-    _print_error(message)
 
 
 def _print_error(message: str) -> None:
