@@ -329,8 +329,11 @@ class Chaos:
         if way == "no space" and ("Traceback" in text or status in (99, -signal.SIGALRM)):
             self.problem(name, way, f"{what}: no sentence but {text[-1500:]}")
             return
-        if status == 0 and self.equal(name, expected, out):
-            self.counts[name, way, "too late"] += 1  # it had finished
+        if status == 0:
+            if self.equal(name, expected, out):
+                self.counts[name, way, "too late"] += 1  # it had finished
+            else:
+                self.problem(name, way, f"{what}: unfinished, but the exit status is 0")
             return
         try:
             self.whole(name, out, again=True, make=False)

@@ -2,7 +2,6 @@
 
 import os
 import runpy
-import shutil
 import subprocess
 import sys
 
@@ -13,16 +12,18 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork, no chi
 WAYS = ("SIGKILL", "SIGTERM", "SIGINT", "operation", "no space")
 
 
-@pytest.mark.parametrize("stage", ["data", "export", "images"])
-def test_a_command_that_is_killed_finishes_when_it_is_started_again(stage, bare, tmp_path):
+@pytest.mark.parametrize("stage", ["data", "prepare"])
+def test_a_command_that_is_killed_finishes_when_it_is_started_again(stage, tmp_path):
     tools = runpy.run_path(str(ROOT / "scripts" / "chaos.py"))
     chaos = tools["Chaos"](tmp_path, seed=0)
-    shutil.copytree(bare, chaos.base / "run")
+    chaos.base.mkdir()
+    tools["inputs"](chaos.base)
     truth = chaos.prepare(stage)
     for way in WAYS:
         chaos.kill(stage, way, truth)
     assert not chaos.problems
     assert chaos.kills(stage) >= 2  # the others came too late
+    print(dict(chaos.counts))
 
 
 @pytest.mark.slow
