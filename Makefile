@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help install train test test-slow stability gpu lint format docs wheel clean
+.PHONY: help install train test test-slow stability chaos soak gpu lint format docs wheel clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 18
@@ -32,6 +32,12 @@ test-slow: $(STAMP) ## run the tests that take minutes, and all examples of the 
 
 stability: $(STAMP) ## compare every hard case with float64 (ARGS="--page docs/results/stability.md")
 	$(BIN)/python scripts/stability.py $(ARGS)
+
+chaos: $(STAMP) ## kill every command at random moments, compare what resuming gives (ARGS="--kills 20 --disk")
+	$(BIN)/python scripts/chaos.py $(ARGS)
+
+soak: $(STAMP) ## memory over an hour of training, 10,000 images, 1,000 interactions with the viewer
+	$(BIN)/python scripts/soak.py $(ARGS)
 
 gpu: $(STAMP) ## check everything that needs CUDA and write docs/results/gpu.md (at most 20 minutes, resumes)
 	PYTHON=$(BIN)/python scripts/gpu_check.sh

@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 from commands import ROOT, TINY
 
-# A GPU's settings: one kind of machine runs the tests.
-ELSEWHERE = ("trainer=gpu", "trainer=ddp")
+# Settings of a GPU or of several processes: one kind of machine, and one process, runs the tests.
+ELSEWHERE = ("trainer=gpu", "trainer=ddp", "trainer=ddp_cpu")
 REPORTS = ("ablation", "ablation_skeleton", "gan")  # blocks of docs/results/ablations.md
 SMALL_BENCH = {
     "speed": ["size=tiny", "frames=2", "warmup=1", "poses=2", "data.root=/path/to/capture"],

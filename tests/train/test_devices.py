@@ -94,9 +94,9 @@ def gradients(module: AvatarTraining) -> set[str]:
     names = {id(p): name for name, p in module.named_parameters()}
     module._names = list(groups)
 
-    def descend(loss, *wanted):
+    def descend(losses, *wanted):
         module.zero_grad(set_to_none=True)
-        loss.backward()
+        sum(losses.values()).backward()
         for name in wanted:
             parameters = [p for part, _ in groups[name] for p in part]
             assert not [names[id(p)] for p in parameters if p.grad is None]

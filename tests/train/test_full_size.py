@@ -43,7 +43,7 @@ def test_200_iterations_learn_within_memory_and_do_not_collapse(compose, tmp_pat
     assert module.step == STEP_ONE + BEFORE_GAN + GAN
     assert not module.skipped.steps
     assert module.rollback.done == 0
-    assert module.rollback.share() > 0.5  # alpha, as a share of the masks'
+    assert module.rollback.problem() == ""
     fallen = {name: _fallen(values) for name, values in logged.items()}
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
     print(f"\n{memory:.1f} GB at most; last tenth of each loss over its first: {fallen}")

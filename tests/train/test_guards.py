@@ -19,7 +19,7 @@ def skipping(make, *overrides):
 def test_non_finite_gradients_far_apart_never_stop_a_run(make):
     module = skipping(make, "training.max_skipped=3", "training.skip_window=100")
     for step in range(0, 2000, 60):  # two in every window
-        module.skipped.add(step, ["psi"])
+        module.skipped.add(step)
     assert len(module.skipped.steps) == 2
 
 
@@ -28,12 +28,12 @@ def test_a_resumed_run_starts_counting_anew_and_may_change_the_limit(make, tiny)
 
     module = skipping(make, "training.max_skipped=20")
     for step in range(19):
-        module.skipped.add(step, ["psi"])
+        module.skipped.add(step)
     checkpoint: dict = {}
     module.on_save_checkpoint(checkpoint)
     again = skipping(make, "training.max_skipped=20")
     again.on_load_checkpoint(checkpoint)
-    again.skipped.add(0, ["psi"])  # no twentieth
+    again.skipped.add(0)  # no twentieth
     assert record(tiny("training.max_skipped=3")) == record(tiny("training.max_skipped=300"))
 
 
@@ -44,17 +44,16 @@ def test_ranks_decide_together_whether_the_person_has_vanished():
     """Two ranks: one sees the person, one does not; alone they would decide differently."""
     ranks = [Rollback(memory=0.0), Rollback(memory=0.0)]
     for rank, alpha in zip(ranks, (0.3, 0.0), strict=True):
-        rank.watch(torch.full((1, 1, 4, 4), alpha), torch.full((1, 1, 4, 4), 0.3))
-    alone = [rank.share() for rank in ranks]
-    assert alone[0] > 0.9
-    assert alone[1] == 0
-    held = [torch.stack([rank.alpha, rank.mask]) for rank in ranks]
+        maps = (torch.full((1, 1, 4, 4), x) for x in (alpha, 0.3))
+        rank.watch(**dict(zip(("alpha", "mask"), maps, strict=True)))
+    assert ranks[0].problem() == ""
+    assert "has vanished" in ranks[1].problem()
+    held = [torch.stack([rank.means["alpha"], rank.means["mask"]]) for rank in ranks]
 
     def over_ranks(value):
         return torch.stack(held).mean(0)
 
-    shares = [rank.share(over_ranks) for rank in ranks]
-    assert shares == [pytest.approx(0.5)] * 2
+    assert [rank.problem(over_ranks) for rank in ranks] == [""] * 2
 
 
 def test_training_asks_all_ranks(make, monkeypatch):
@@ -76,8 +75,8 @@ def test_an_alpha_that_is_not_finite_is_no_collapse():
     rollback = Rollback()
     mask = torch.full((1, 1, 4, 4), 0.3)
     for alpha in (0.3, float("nan"), 0.3):
-        rollback.watch(torch.full((1, 1, 4, 4), alpha), mask)
-    assert 0.5 < rollback.share() < 1
+        rollback.watch(alpha=torch.full((1, 1, 4, 4), alpha), mask=mask)
+    assert rollback.problem() == ""
 
 
 # --- rates

@@ -234,11 +234,11 @@ def evaluate_method(
     if dropped:
         names = ", ".join(dropped)
         console.print(f"earlier scores of {names} were made in another way and are left out")
-    write_scored(whole, folder)
     print_table(whole.results, whole.origin, console)
     if poses is not None:
         own = None if config.get("on") is None else Path(config.run).expanduser()
         write_distances(folder, whole.rows, data, poses, console, own)
+    write_scored(whole, folder)  # last: where metrics.json is new, everything is
     console.print(f"scores: {folder}", markup=False, highlight=False, soft_wrap=True)
     return whole.results
 

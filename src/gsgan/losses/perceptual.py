@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor, distributed, nn
 from torch.nn import functional
 
 from gsgan.utils.errors import ConfigError, DataError
@@ -19,8 +19,8 @@ class Perceptual(nn.Module):
     """Squared feature distance, the layers weighted by the inverse of their first losses.
 
     No weights are published for these layers, so they are measured: each layer's weight is the
-    inverse of its mean loss over the first ``warmup`` calls (weights sum to 1), then frozen and
-    stored in the checkpoint.
+    inverse of its mean loss over the first ``warmup`` calls of all processes (weights sum to 1),
+    then frozen and stored in the checkpoint.
 
     Args:
         weights: ``vgg16`` (its file must exist), ``auto`` (vgg16 if its file exists, else a small
@@ -80,10 +80,19 @@ class Perceptual(nn.Module):
         if self.training:  # without reading `calls`, for which the host would wait
             warm = self.calls < self.warmup
             self.calls += warm
-            step = (losses.detach() - self.layer_loss) / self.calls
+            step = (_over_processes(losses.detach()) - self.layer_loss) / self.calls
             self.layer_loss += torch.where(warm, step, 0.0)
         inverse = 1 / self.layer_loss.clamp_min(1e-12)
         return (losses * inverse / inverse.sum()).sum()
+
+
+def _over_processes(value: Tensor) -> Tensor:
+    """The mean over the processes of a training."""
+    if not (distributed.is_available() and distributed.is_initialized()):
+        return value
+    value = value.clone()
+    distributed.all_reduce(value)
+    return value / distributed.get_world_size()
 
 
 def _leave_out(module: nn.Module, state: dict[str, Any], prefix: str, _: Any) -> None:

@@ -43,6 +43,8 @@ def prepare(options: Options, console: Console) -> Path:
     key = digest([STAGE_VERSION, options.record(), _fingerprint(options, inputs)])
     if exists(out, key, options.overwrite):
         console.print(f"{out} exists already, made from the same images and settings")
+        if not (out / "check.json").is_file():  # killed before its last file
+            check_capture(out, out / "check.html", console)
         return out
     stages = StageFolder(out.parent / f".{out.name}.prepare")
     detections, masks = _read_people(options, inputs, stages, console)

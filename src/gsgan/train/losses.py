@@ -110,6 +110,12 @@ class DiscriminatorMaps:
         found = _Through.apply(self.image, (self.copy, list(terms.values())))
         return dict(zip(terms, found, strict=True))
 
+    @property
+    def difference(self) -> Tensor:
+        """``[scales]`` mean absolute differences of the logits of both images."""
+        pairs = zip(self.fake, self.real, strict=True)
+        return torch.stack([(a[-1] - b[-1]).detach().abs().mean() for a, b in pairs])
+
     def loss(self) -> Tensor:
         """The discriminator's loss."""
         return discriminator_loss(self.real, self.fake, self.gan)

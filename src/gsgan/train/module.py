@@ -1,8 +1,10 @@
 """The paper's training scheme (Alg. 2) as one LightningModule with manual optimisation."""
 
 import time
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeVar
 
 import gsgan.utils.compat  # noqa: F401  (must come before lightning)
 
@@ -19,13 +21,14 @@ from gsgan.model.rendering import Rendering
 from gsgan.scene import Frame
 from gsgan.train.losses import DiscriminatorMaps, StepOneLoss, StepTwoLoss
 from gsgan.train.optimisers import MovingAverage, Recipe, check_recipes, clip, parameter_groups
-from gsgan.train.rollback import Rollback, SkippedSteps
+from gsgan.train.rollback import Rollback, SkippedSteps, likely_cause, save_batch
 from gsgan.train.schedule import SEGMENTATION, SPLATTING, STEP_ONE, Schedule
 from gsgan.utils.checks import at_least
 from gsgan.utils.errors import ConfigError, GsganError
 from gsgan.utils.tensors import full_precision
 
 PSNR_CAP = 100.0  # dB: one image equal to the ground truth would make the mean infinite
+T = TypeVar("T")
 SEED_STRIDE = 1_000_003  # a prime: (seed, step) pairs do not meet
 
 
@@ -109,6 +112,11 @@ class AvatarTraining(LightningModule):
         return self.seconds_before + now
 
     @property
+    def processes(self) -> int:
+        """Of the training; each has its own batch."""
+        return 1 if self._trainer is None else self.trainer.world_size
+
+    @property
     def marks(self) -> list[str]:
         """Notes that must accompany the scores of this run."""
         mark = self.perceptual.mark if self.perceptual is not None else None
@@ -146,40 +154,45 @@ class AvatarTraining(LightningModule):
             )
         window = self.avatar.window(frame.skeleton, frame.camera)
         frame = frame if window is None else window.frame(frame)
-        phase = self.schedule.phase(self.step)
+        phase, self._frame = self.schedule.phase(self.step), frame
         if phase == SEGMENTATION:
-            assert self.avatar.segmentation is not None
-            loss = self.avatar.segmentation.loss(frame)
-            self._descend(loss, "segmentation")
-            self._log("segmentation/nll", loss)
+            self._train_segmentation(frame)
         elif phase == STEP_ONE:
             self._train_step_one(frame)
         else:
             self._train_step_two(frame)
         self.step += 1
 
+    def _train_segmentation(self, frame: Frame) -> None:
+        assert self.avatar.segmentation is not None
+        loss = self._computed(partial(self.avatar.segmentation.loss, frame))
+        if loss is not None:
+            self._descend({"segmentation/nll": loss}, "segmentation")
+
     def _train_step_one(self, frame: Frame) -> None:
-        loss = self.step_one_loss(self._rendered(frame, generate=False), frame)
-        self._descend(loss, *self._splatting())
+        rendering = self._computed(partial(self._rendered, frame, generate=False))
+        if rendering is None:
+            return
+        loss = self.step_one_loss(rendering, frame)
+        self._descend({"step_one/loss": loss}, *self._splatting())
         if self.average is not None and self.avatar.generator is None:  # this is its last step
             self.average.update(self.avatar, self.step)
-        self._log("step_one/loss", loss)
 
     def _train_step_two(self, frame: Frame) -> None:
-        rendering = self._rendered(frame, generate=True)
+        rendering = self._computed(partial(self._rendered, frame, generate=True))
+        if rendering is None:
+            return
         maps = None
         if self.discriminator is not None and self.schedule.adversarial(self.step):
             maps = self.step_two.discriminator_maps(self.discriminator, rendering, frame)
+            self.rollback.watch(logits=maps.difference)
         terms = self.step_two_terms(rendering, frame, maps)
-        self._descend(torch.stack(list(terms.values())).sum(), *self._splatting(), "generator")
+        losses = {f"step_two/{name}": term for name, term in terms.items()}
+        self._descend(losses, *self._splatting(), "generator")
         if self.average is not None:
             self.average.update(self.avatar, self.step)
-        for name, term in terms.items():
-            self._log(f"step_two/{name}", term)
         if maps is not None:
-            loss = maps.loss()
-            self._descend(loss, "discriminator")
-            self._log("step_two/discriminator", loss)
+            self._descend({"step_two/discriminator": maps.loss()}, "discriminator")
 
     def _rendered(self, frame: Frame, *, generate: bool) -> Rendering:
         rendering: Rendering = self.avatar(
@@ -188,8 +201,9 @@ class AvatarTraining(LightningModule):
             generate=generate,
             supersample=self.schedule.fine(self.step),
         )
-        if rendering.splat_alpha is not None:
-            self.rollback.watch(rendering.splat_alpha, frame.mask)
+        if rendering.splat_alpha is not None and rendering.colour is not None:
+            seen = {"alpha": rendering.splat_alpha, "colour": rendering.colour.detach().abs()}
+            self.rollback.watch(**seen, mask=frame.mask)
         return rendering
 
     # -- losses
@@ -229,9 +243,55 @@ class AvatarTraining(LightningModule):
         """The optimisers of the parts that make Step I's image."""
         return [name for name in SPLATTING if name in self._names]
 
-    def _descend(self, loss: Tensor, *names: str) -> None:
-        """One backward pass and one step of each named optimiser; none if a gradient is not
-        finite."""
+    def _computed(self, compute: Callable[[], T]) -> T | None:
+        """The result, or None in every process where one cannot compute it: where data or weights
+        are not finite, or far away, the rasteriser refuses them with a ValueError."""
+        found, problem = None, ""
+        try:
+            found = compute()
+        except ValueError as error:
+            problem = str(error)
+        failed = found is None
+        if self.processes > 1:  # none may wait for another
+            flag = torch.tensor(float(failed), device=self.device)
+            failed = bool(self.trainer.strategy.reduce(flag, reduce_op="max"))
+        if not failed:
+            return found
+        self._skip({}, problem or "another process could not render its images")
+        return None
+
+    def _skip(self, losses: Mapping[str, Tensor], problem: str) -> None:
+        """Counts a skipped iteration and prints why; after too many the run stops."""
+        stop = self.skipped.add(self.step)
+        held = {
+            name: [p for group in optimiser.param_groups for p in group["params"]]
+            for name, optimiser in self._optimisers().items()
+        }
+        cause, count = likely_cause(self._frame, held, losses, problem), self.skipped.count
+        if stop:
+            raise self._stopped(
+                f"{count} were skipped; likely cause: {cause}; correct it, or go on with a larger "
+                "training.max_skipped"
+            )
+        self.print(
+            f"iteration {self.step}: skipped ({count}, at most {self.skipped.most}): {cause}"
+        )
+
+    def _stopped(self, why: str) -> GsganError:
+        """The error that ends a run, with the batch saved."""
+        path = Path(self.trainer.default_root_dir) / f"stopped_{self.trainer.global_rank}.pt"
+        save_batch(path, self.step, self._frame, why)
+        return GsganError(
+            f"training stopped at iteration {self.step}: {why} (its batch: {path}; the last good "
+            "checkpoint is kept)"
+        )
+
+    def _descend(self, losses: Mapping[str, Tensor], *names: str) -> None:
+        """One backward pass of the losses' sum and one step of each named optimiser; none if a
+        gradient is not finite."""
+        loss = torch.stack(list(losses.values())).sum()
+        for name, term in losses.items():
+            self._log(name, term)
         optimisers = {name: self._optimisers()[name] for name in names}
         for optimiser in optimisers.values():
             optimiser.zero_grad(set_to_none=True)
@@ -242,7 +302,7 @@ class AvatarTraining(LightningModule):
             for name, optimiser in optimisers.items()
         ]
         if not bool(torch.isfinite(torch.stack(norms)).all()):
-            self.print(self.skipped.add(self.step, names))
+            self._skip(losses, f"a gradient of {', '.join(names)} was not finite")
             return
         for name, optimiser in optimisers.items():
             for group in optimiser.param_groups:
@@ -257,40 +317,41 @@ class AvatarTraining(LightningModule):
     def on_train_epoch_end(self) -> None:
         """Restores the last good state when the person has vanished, before it is saved."""
         # over all processes, so that they decide alike
-        share = self.rollback.share(partial(self.trainer.strategy.reduce, reduce_op="mean"))
-        if share >= self.rollback.collapse:
-            self.rollback.keep(self, share)
+        what = self.rollback.problem(partial(self.trainer.strategy.reduce, reduce_op="mean"))
+        if not what:
+            if what is not None:
+                self.rollback.keep(self)
             return
         optimisers = [wrapped.optimizer for wrapped in self._optimisers().values()]
-        what = f"the rendered person has vanished (alpha is {share:.1%} of the masks')"
         if not self.rollback.restore(self, optimisers):
-            raise GsganError(
-                f"training stopped at iteration {self.step}: {what}, also after "
-                f"{self.rollback.done} returns to a good state; start again with a lower "
-                "training.recipes.psi.rate.peak (the last good checkpoint is kept)"
+            raise self._stopped(
+                f"{what}, also after {self.rollback.done} returns to a good state; start again "
+                "with a lower training.recipes.psi.rate.peak"
             )
         self.print(
             f"iteration {self.step}: {what}; back to the last good state, Ψ's learning rate times "
             f"{self.rollback.rate:g} ({self.rollback.done} of at most {self.rollback.most})"
         )
 
-    # -- randomness: from (seed, iteration, rank), so that resuming changes nothing
+    # -- randomness: from (seed, iteration), so that resuming changes nothing
 
-    def _random(self, salt: int) -> torch.Generator:
-        rank = self.trainer.global_rank if self._trainer is not None else 0
-        state = (self.seed * SEED_STRIDE + self.step) * 64 + 2 * (rank % 32) + salt
-        return torch.Generator().manual_seed(state % (2**63))
+    def _random(self, draw: Callable[..., Tensor], salt: int, size: int, *shape: int) -> Tensor:
+        """``[size, *shape]`` this process's rows of numbers drawn for the batches of all processes,
+        so that several processes draw what one with the whole batch would."""
+        state = (self.seed * SEED_STRIDE + self.step) * 64 + salt
+        ranks, rank = self.processes, 0 if self._trainer is None else self.trainer.global_rank
+        generator = torch.Generator().manual_seed(state % (2**63))
+        return draw((ranks * size, *shape), generator=generator)[rank * size : (rank + 1) * size]
 
     def _background(self, frame: Frame) -> Tensor | None:
         if not self.random_background:
             return None
-        return torch.rand((len(frame), 3, 1, 1), generator=self._random(0)).to(frame.image)
+        return self._random(torch.rand, 0, len(frame), 3, 1, 1).to(frame.image)
 
     def _pose_noise(self, skeleton: Tensor) -> Tensor | None:
         if not self.pose_noise:
             return None
-        noise = torch.randn(skeleton.shape, generator=self._random(1))
-        return self.pose_noise * noise.to(skeleton)
+        return self.pose_noise * self._random(torch.randn, 1, *skeleton.shape).to(skeleton)
 
     # -- validation, logs and checkpoints
 
@@ -310,11 +371,12 @@ class AvatarTraining(LightningModule):
 
     def _log(self, name: str, value: Tensor) -> None:
         if self.step % self.log_every == 0 and self._trainer is not None:
-            self.log(name, value.detach())
+            self.log(name, value.detach(), sync_dist=True)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["gsgan"] = {
             "step": self.step,
+            "processes": self.processes,
             "rollbacks": self.rollback.done,
             "averaged": self.average is not None and self.average.started,
             "train_seconds": self.train_seconds,
@@ -328,6 +390,11 @@ class AvatarTraining(LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         state = checkpoint["gsgan"]
         self.avatar.effects.check_same(state["effects"])
+        if (before := state.get("processes", self.processes)) != self.processes:
+            raise ConfigError(
+                f"the run was trained by {before} processes, and {self.processes} would draw "
+                f"other batches; resume with trainer.devices × trainer.num_nodes = {before}"
+            )
         self.step = state["step"]
         self.rollback.done = state["rollbacks"]
         self.seconds_before = state["train_seconds"]

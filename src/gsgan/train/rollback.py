@@ -1,26 +1,34 @@
-"""Guards of the training: skipped steps, and the return from a collapse."""
+"""Guards of the training: skipped steps, their likely cause, and the return from a collapse."""
 
+import io
 from collections import deque
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from gsgan.scene import Frame
 from gsgan.utils.checks import between, whole
-from gsgan.utils.errors import GsganError
+from gsgan.utils.files import write_atomically, writing
+
+FARTHEST = 1e6  # a weight beyond it has exploded
+BRIGHTEST = 10.0  # mean of an image whose ground truth is within 0 and 1, likewise
+SAME = 1e-7  # mean difference of a discriminator's logits that no longer follow the image
 
 
 @dataclass
 class Rollback:
-    """Restores the last good state when the rendered person vanishes.
+    """Restores the last good state when training has collapsed while gradients stay finite.
 
-    All opacities can fall to 0 for good while gradients stay finite. The rendered alpha then falls
-    far below the masks'.
+    Three collapses are known: the rendered person vanishes, as all opacities can fall to 0 for
+    good; Ψ explodes, and its colours with it; the discriminator's logits of real and generated
+    images become equal.
 
-    Convention: both are averaged over recent iterations, so that a fall within an epoch is seen.
-    Optimisers restart after a restoration, because their momenta point into the collapse.
+    Convention: all values are averaged over recent iterations, so that a fall within an epoch is
+    seen. Optimisers restart after a restoration, because their momenta point into the collapse.
 
     Settings: conf/training/long.yaml.
     """
@@ -31,8 +39,7 @@ class Rollback:
     most: int = 3
     slower: float = 0.5
     done: int = 0
-    alpha: Tensor | None = None
-    mask: Tensor | None = None
+    means: dict[str, Tensor] = field(default_factory=dict)
     _state: dict[str, Any] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
@@ -47,33 +54,43 @@ class Rollback:
         """Factor on Ψ's learning rate."""
         return self.slower**self.done
 
-    def share(self, over_ranks: Callable[[Tensor], Tensor] = lambda value: value) -> float:
-        """Rendered alpha as a share of the masks', by means over all ranks; infinite at first."""
-        if self.alpha is None or self.mask is None:
-            return float("inf")
-        alpha, mask = over_ranks(torch.stack([self.alpha, self.mask])).tolist()
-        return alpha / mask if mask else float("inf")
-
-    def watch(self, alpha: Tensor, mask: Tensor) -> None:
-        """Adds one iteration's alpha and mask."""
-        for name, value in (("alpha", alpha), ("mask", mask)):
-            now, before = value.detach().mean(), getattr(self, name)
-            before = torch.zeros_like(now) if before is None else before
+    def watch(self, **values: Tensor) -> None:
+        """Adds one iteration's values: the ``alpha`` and ``mask`` of the person, the absolute
+        ``colour`` of the rendering, the absolute difference of the discriminator's ``logits``."""
+        for name, value in values.items():
+            now = value.detach().float().mean()
+            before = self.means.get(name, torch.zeros_like(now))
             mixed = self.memory * before + (1 - self.memory) * now
             # non-finite values are left to the gradients' check
-            setattr(self, name, torch.where(torch.isfinite(now), mixed, before))
+            self.means[name] = torch.where(torch.isfinite(now), mixed, before)
 
-    def keep(self, module: nn.Module, share: float) -> None:
-        """Keeps a copy of the state when it is good."""
-        if share >= self.healthy:
-            self._state = {k: v.detach().clone() for k, v in module.state_dict().items()}
+    def problem(self, over_ranks: Callable[[Tensor], Tensor] = lambda value: value) -> str | None:
+        """What has collapsed, by means over all ranks: "" for nothing; None for a state that is not
+        good enough to be kept."""
+        if not self.means:
+            return ""
+        names = sorted(self.means)
+        held = torch.stack([self.means[name] for name in names])
+        means = dict(zip(names, over_ranks(held).tolist(), strict=True))
+        share = means["alpha"] / means["mask"] if means.get("mask") else float("inf")
+        if share < self.collapse:
+            return f"the rendered person has vanished (alpha is {share:.1%} of the masks')"
+        if (mean := means.get("colour", 0.0)) > BRIGHTEST:
+            return f"Ψ has exploded (its colours are {mean:.3g} in the mean, images within 0 and 1)"
+        if means.get("logits", 1.0) < SAME:
+            return "the discriminator has collapsed (real and generated images are equal to it)"
+        return "" if share >= self.healthy else None
+
+    def keep(self, module: nn.Module) -> None:
+        """Keeps a copy of the state."""
+        self._state = {k: v.detach().clone() for k, v in module.state_dict().items()}
 
     def restore(self, module: nn.Module, optimisers: Sequence[torch.optim.Optimizer]) -> bool:
         """Restores the last good state; False where there is none, or after too many times."""
         if self._state is None or self.done >= self.most:
             return False
         self.done += 1
-        self.alpha = self.mask = None
+        self.means.clear()
         module.load_state_dict(self._state)
         for optimiser in optimisers:
             optimiser.state.clear()
@@ -81,26 +98,73 @@ class Rollback:
 
 
 class SkippedSteps:
-    """Counts iterations with non-finite gradients; ``most`` within ``window`` stop the run."""
+    """Counts skipped iterations; ``most`` within ``window`` are too many."""
 
     def __init__(self, most: int, window: int) -> None:
         self.most, self.window = most, window
         self.steps: deque[int] = deque()  # within the window
 
-    def add(self, step: int, names: Sequence[str]) -> str:
-        """A message on the skipped step of these optimisers; a GsganError after too many."""
+    def add(self, step: int) -> bool:
+        """Counts an iteration; whether that is one too many."""
         if step not in self.steps:  # the discriminator's may follow the generator's
             self.steps.append(step)
         while self.steps[0] <= step - self.window:
             self.steps.popleft()
-        count = f"{len(self.steps)} of the last {self.window} iterations"
-        if len(self.steps) >= self.most:
-            raise GsganError(
-                f"training stopped at iteration {step}: {count} had gradients that were not "
-                "finite; check the data, lower training.recipes.*.rate.peak, or go on with a "
-                "larger training.max_skipped"
+        return len(self.steps) >= self.most
+
+    @property
+    def count(self) -> str:
+        """For messages."""
+        return f"{len(self.steps)} of the last {self.window} iterations"
+
+
+def likely_cause(
+    frame: Frame,
+    parameters: Mapping[str, Sequence[Tensor]],
+    losses: Mapping[str, Tensor],
+    problem: str,
+) -> str:
+    """Why an iteration has no finite gradient: its data, the weights, a loss, in this order.
+
+    Args:
+        frame: the batch.
+        parameters: by optimiser.
+        losses: the terms by name; empty where they could not be computed.
+        problem: what was noticed, the answer if all of these are finite.
+    """
+    items = f"frame {frame.frame_id.tolist()}, camera {frame.camera_index.tolist()}"
+    if bad := _not_finite(asdict(frame)):
+        return f"{', '.join(bad)} of the data is not finite ({items}, counted from 0)"
+    for name, held in parameters.items():
+        largest = max((float(p.detach().abs().max()) for p in held if p.numel()), key=_or_infinite)
+        if not _or_infinite(largest) <= FARTHEST:
+            return (
+                f"the weights of {name} have exploded (up to {largest:.3g}): resume from the last "
+                f"checkpoint with a lower training.recipes.{name}.rate.peak"
             )
-        return (
-            f"iteration {step}: a gradient of {', '.join(names)} was not finite; skipped "
-            f"({count}, at most {self.most})"
-        )
+    if bad := _not_finite(dict(losses)):
+        return f"the loss {', '.join(bad)} is not finite ({items})"
+    return problem
+
+
+def _or_infinite(value: float) -> float:
+    return float("inf") if value != value else value
+
+
+def _not_finite(values: Mapping[str, Any], before: str = "") -> list[str]:
+    """Names of the tensors that hold NaN or infinity."""
+    found = []
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            found += _not_finite(value, f"{before}{name}.")
+        elif isinstance(value, Tensor) and not bool(torch.isfinite(value).all()):
+            found.append(before + name)
+    return found
+
+
+def save_batch(path: Path, step: int, frame: Frame, cause: str) -> None:
+    """Writes the batch of a run that stops, as plain tensors that ``torch.load`` reads."""
+    stream = io.BytesIO()
+    torch.save({"step": step, "cause": cause, "frame": asdict(frame.to("cpu"))}, stream)
+    with writing(path):
+        write_atomically(path, stream.getvalue())

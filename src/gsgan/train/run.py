@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
+from signal import SIGTERM
 from typing import Any
 
 import gsgan.utils.compat  # noqa: F401  (must come before lightning)
@@ -165,13 +166,13 @@ def _fit(
         else:
             console.print(f"resuming from {resume}", soft_wrap=True)
         trainer.fit(module, data, ckpt_path=None if resume is None else str(resume))
-    except SystemExit:  # Lightning's answer to Ctrl-C
+    except SystemExit as error:  # Lightning's answer to Ctrl-C and SIGTERM
         console.print(
             f"interrupted at iteration {module.step}; the same command with "
             f"hydra.run.dir={folder} resumes from its last checkpoint",
             soft_wrap=True,
         )
-        raise
+        raise SystemExit(error.code or 128 + SIGTERM) from None  # Lightning ends a SIGTERM with 0
 
 
 def _evaluate(
@@ -306,6 +307,7 @@ def build_trainer(
         config.trainer,
         max_epochs=-(-module.schedule.total // len(data.train_dataloader())),
         callbacks=callbacks,
+        default_root_dir=folder,
         plugins=[AtomicCheckpoints()],
         # a logger overwrites its files: each part of a resumed run has its own folder
         logger=instantiate(config.logger, version=logs),

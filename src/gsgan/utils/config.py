@@ -1,7 +1,9 @@
 """The config folder, and the entry point of a command: start, errors, exit status."""
 
+import errno
 import functools
 import hashlib
+import os
 import re
 import shutil
 import sys
@@ -9,7 +11,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException, InstantiationException
+from hydra.errors import CompactHydraException, HydraException, InstantiationException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
@@ -18,6 +20,7 @@ from gsgan.utils.errors import GsganError
 
 FAILED = 1
 LONGEST_NAME = 200  # bytes of a sweep's folder; file systems take 255, files beside it need some
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 EFFECTS_LIST = re.compile(r"effects=(\[[^\[\]]*\])")
 
 
@@ -108,7 +111,21 @@ def entry(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], No
             command = hydra.main(
                 version_base="1.3", config_path=str(config_folder()), config_name=name
             )(run)
-            command()
+            # else Hydra prints the traceback of a file of its own that it cannot write, and exits
+            os.environ.setdefault("HYDRA_FULL_ERROR", "1")
+            try:
+                command()
+            except CompactHydraException as error:
+                cause = error.__cause__
+                sys.exit(
+                    f"{error}\n{cause}" if isinstance(cause, OmegaConfBaseException) else str(error)
+                )
+            except OSError as error:
+                message = one_sentence(error)
+                if message is None:
+                    raise
+                _print_error(message)
+                sys.exit(FAILED)
 
         return main
 
@@ -138,6 +155,11 @@ def one_sentence(error: BaseException) -> str | None:
         if isinstance(cause, (ValueError, TypeError)):
             return f"{where}: {cause}"
         return f"{where}: {str(error).splitlines()[0]}"
+    if isinstance(error, OSError) and error.errno in NO_ROOM:
+        return (
+            f"{error.filename or 'a file'} cannot be written ({error.strerror}): make room, then "
+            "start the same command again"
+        )
     if isinstance(error, (HydraException, OmegaConfBaseException)):
         return str(error).splitlines()[0]
     if isinstance(error, ValueError) and _raised_here(error):

@@ -1,0 +1,67 @@
+"""Two processes train as one process with the whole batch, and stop together."""
+
+import json
+import os
+
+import pytest
+import torch
+from lightning import Callback
+
+from gsgan.utils.errors import ConfigError
+
+TWO = {"devices": 2, "strategy": "ddp_fork_find_unused_parameters_true"}
+pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
+
+
+class Losses(Callback):
+    """Writes the losses of every iteration to a file."""
+
+    def __init__(self, path) -> None:
+        self.path, self.held = path, []
+
+    def on_train_batch_end(self, trainer, *_):
+        self.held.append({k: float(v) for k, v in trainer.callback_metrics.items()})
+        if trainer.is_global_zero:
+            self.path.write_text(json.dumps(self.held))
+
+
+def test_two_processes_have_the_losses_of_one_with_the_whole_batch(make, tmp_path):
+    """In float32 sums are rounded differently: 2e-6 of the loss is what was measured."""
+    found = []
+    for batch, more in ((2, {}), (1, TWO)):
+        path = tmp_path / f"{batch}.json"
+        given = {"use_distributed_sampler": False, "callbacks": [Losses(path)]} | more
+        torch.manual_seed(0)
+        module, trainer, data = make(
+            f"data.batch_size={batch}", "model.window_margin=null", **given
+        )
+        trainer.fit(module, data)
+        found.append(json.loads(path.read_text()))
+    one, two = found
+    assert len(one) == module.schedule.total
+    for expected, losses in zip(one, two, strict=True):
+        assert losses == pytest.approx(expected, rel=1e-5)
+
+
+class SpoilOne(Callback):
+    def on_train_batch_start(self, trainer, module, batch, batch_idx):
+        if trainer.global_rank == 1 and module.step >= 5:
+            batch.skeleton.fill_(float("nan"))
+
+
+def test_processes_skip_together_and_stop_together(make):
+    module, trainer, data = make(
+        "training.max_skipped=3", callbacks=[SpoilOne()], use_distributed_sampler=False, **TWO
+    )
+    with pytest.raises(Exception, match="stopped at iteration 7: 3 of the last"):
+        trainer.fit(module, data)
+
+
+def test_another_number_of_processes_is_refused(make):
+    module, _, _ = make()
+    checkpoint: dict = {}
+    module.on_save_checkpoint(checkpoint)
+    assert checkpoint["gsgan"]["processes"] == 1
+    checkpoint["gsgan"]["processes"] = 2
+    with pytest.raises(ConfigError, match="trained by 2 processes, and 1 would draw"):
+        module.on_load_checkpoint(checkpoint)
