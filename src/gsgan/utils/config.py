@@ -10,11 +10,13 @@ from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, InstantiationException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
 from gsgan.utils.errors import GsganError
+from gsgan.utils.sweeps import note, run_job
 
 FAILED = 1
 LONGEST_NAME = 200  # bytes of a sweep's folder; file systems take 255, files beside it need some
@@ -49,6 +51,7 @@ def folder_name(overrides: str) -> str:
 
     A name that had to be changed ends in a digest of the overrides, so no two runs share a folder.
     """
+    overrides = overrides or "defaults"
     name = re.sub(r"[^A-Za-z0-9_.+-]", "_", overrides)
     if name == overrides and len(name) <= LONGEST_NAME:
         return name
@@ -76,13 +79,17 @@ OmegaConf.register_new_resolver("if_gpu", if_gpu, replace=True)
 def entry(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
     """Turns a function of a config into a command with Hydra's grammar and one-sentence errors.
 
+    Each job of a sweep (``-m``) is the same command in a process of its own.
+
     Args:
         name: of the config file, without ``.yaml``, and of the command.
     """
 
     def decorate(task: Callable[[DictConfig], None]) -> Callable[[], None]:
         @functools.wraps(task)
-        def run(config: DictConfig) -> None:
+        def run(config: DictConfig) -> float | None:
+            if HydraConfig.get().mode == RunMode.MULTIRUN:
+                return run_job(name, config.get("objective"))
             import gsgan.utils.compat  # noqa: F401  (before lightning and torchmetrics)
             from gsgan.utils.tensors import keep_freed_memory
 
@@ -97,8 +104,10 @@ def entry(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], No
                 if message is None:
                     raise
                 _print_error(message)
+                note(Path(HydraConfig.get().runtime.output_dir), message)
                 _remove_unused_folder()
                 sys.exit(FAILED)
+            return None
 
         @functools.wraps(task)
         def main() -> None:
