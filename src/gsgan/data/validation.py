@@ -9,13 +9,17 @@ from numpy.typing import NDArray
 
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import NEAR, inside, project
-from gsgan.data.files import check_image
+from gsgan.data.files import FrameFiles, check_image
 from gsgan.data.pixels import MaskFile
 from gsgan.data.skeletons import HUBS, Landmarks, Poses
 from gsgan.utils.errors import DataError
 
+Images = Mapping[str, FrameFiles]
 Index = Mapping[str, Mapping[int, str]]
 """Paths relative to the root, by camera name and frame number."""
+
+
+MOST_HEADERS = 10_000  # read on opening, in even steps; every image is checked again when decoded
 
 
 @dataclass(frozen=True)
@@ -30,17 +34,17 @@ class Thresholds:
     distance: tuple[float, float] = (0.3, 30.0)
     max_behind: float = 0.05  # share of joints behind a camera above which its pose is wrong
     max_missing_masks: float = 0.0  # largest share of images without a mask
-    header_stride: int = 1  # of images whose header is read on opening, 0.1 ms each; 1 reads all
+    header_stride: int = 1  # of images whose header is read on opening, 0.1 ms each
 
 
 def drop_frames(
     root: Path,
-    images: Index,
+    images: Images,
     landmarks: Landmarks,
     poses: Poses | None,
     limits: Thresholds,
     notes: list[str],
-) -> Index:
+) -> Images:
     """The images without the frames that lack a usable skeleton or pose; notes say why.
 
     Raises:
@@ -53,13 +57,13 @@ def drop_frames(
             dropped.setdefault(reason, []).append(frame)
     for reason, ids in dropped.items():
         notes.append(f"{len(ids)} of {len(frames)} frames dropped, {reason}: {spans(ids)}")
-    gone = {frame for ids in dropped.values() for frame in ids}
+    gone = [frame for ids in dropped.values() for frame in ids]
     if len(gone) == len(frames):
         raise DataError(
             f"{root} ({landmarks.source}) has no usable frame: "
             + "; ".join(f"{len(ids)} {reason}" for reason, ids in dropped.items())
         )
-    return {name: {f: files[f] for f in files if f not in gone} for name, files in images.items()}
+    return {name: files.without(gone) for name, files in images.items()}
 
 
 def _unusable(
@@ -139,21 +143,20 @@ def check_distance(
 
 def drop_unseen(
     cameras: Mapping[str, CameraEntry],
-    images: Index,
+    images: Images,
     landmarks: Landmarks,
     limits: Thresholds,
     calibration: Path,
     notes: list[str],
-) -> Index:
+) -> Images:
     """The images without those in which too few joints are in view.
 
     Raises:
         DataError: when a camera never sees the person.
     """
-    kept: dict[str, Mapping[int, str]] = {}
+    kept = dict(images)
     for name, files in images.items():
         if not (frames := list(files)):
-            kept[name] = {}
             continue
         seen = inside(cameras[name], np.stack([landmarks.p[f] for f in frames]))
         seen &= np.stack([landmarks.visibility[f] for f in frames]) > 0
@@ -169,23 +172,23 @@ def drop_unseen(
                 f"camera {name}: {len(lost)} frames dropped, fewer than "
                 f"{limits.min_joints_in_view} joints in view: {spans(lost)}"
             )
-        kept[name] = {f: files[f] for f, ok in zip(frames, enough, strict=True) if ok}
+            kept[name] = files.without(lost)
     return kept
 
 
 def drop_unmasked(
-    images: Index,
+    images: Images,
     masks: Mapping[str, Mapping[int, tuple[MaskFile, ...]]],
     expected: Mapping[str, Path],
     limits: Thresholds,
     notes: list[str],
-) -> Index:
+) -> Images:
     """The images that have a mask; a note says how many were left out.
 
     Raises:
         DataError: when more are missing than allowed, naming one in the ``expected`` folders.
     """
-    lost = [(c, f) for c, files in images.items() for f in files if not masks[c].get(f)]
+    lost = [(c, f) for c, files in images.items() for f in files if f not in masks[c]]
     if not lost:
         return images
     (camera, frame), count = lost[0], sum(len(files) for files in images.values())
@@ -201,23 +204,24 @@ def drop_unmasked(
         f"{len(lost)} of {count} images have no mask and are left out "
         f"(first: camera {camera}, frame {frame})"
     )
-    return {c: {f: p for f, p in files.items() if masks[c].get(f)} for c, files in images.items()}
+    return {c: files.without(f for d, f in lost if d == c) for c, files in images.items()}
 
 
 def check_images(
     root: Path,
     cameras: Mapping[str, CameraEntry],
-    images: Index,
+    images: Images,
     masks: Mapping[str, Mapping[int, tuple[MaskFile, ...]]],
     labels: Index,
     stride: int,
     calibration: Path,
 ) -> None:
-    """Checks sizes and channel layouts, from the headers alone.
+    """Checks sizes and channel layouts, from the headers alone, of `MOST_HEADERS` images at most.
 
     Raises:
         DataError: on the first file that does not fit.
     """
+    stride = max(stride, -(-sum(map(len, images.values())) // MOST_HEADERS))
     for name, files in images.items():
         size = cameras[name].size
         for frame in list(files)[::stride]:
