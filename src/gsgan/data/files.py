@@ -224,10 +224,10 @@ def frame_files(
         number: frame number of a file's stem; by default the last group of digits.
 
     Raises:
-        DataError: when a name has no number, or two names have the same.
+        DataError: when a name has no number, two names have the same, or a link leads out.
     """
     place, found = root / folder, dict[int, str]()
-    for name in sorted(os.listdir(place)) if place.is_dir() else ():
+    for name in sorted(own_entries(place, root)) if place.is_dir() else ():
         stem, _, suffix = name.rpartition(".")
         if f".{suffix.lower()}" not in suffixes or name.startswith("."):
             continue
@@ -243,6 +243,25 @@ def frame_files(
             )
         found[frame] = name
     return FrameFiles(folder, found)
+
+
+def own_entries(folder: Path, root: Path) -> list[str]:
+    """The names in a dataset's folder.
+
+    Raises:
+        DataError: when one of them, or the folder, is a link to a place outside the dataset, which
+            then could have any file of this machine read.
+    """
+    home = root.resolve()
+    with os.scandir(folder) as found:
+        entries = list(found)
+    for link in (folder, *(Path(entry) for entry in entries if entry.is_symlink())):
+        if not link.resolve().is_relative_to(home):
+            raise DataError(
+                f"{link} is a link to {link.resolve()}, outside the dataset; copy the files into "
+                f"{root}, or mount their folder there"
+            )
+    return [entry.name for entry in entries]
 
 
 def last_number(stem: str) -> int | None:

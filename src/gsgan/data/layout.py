@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.files import FrameFiles
+from gsgan.data.files import FrameFiles, own_entries
 from gsgan.data.pixels import MaskFile, PixelRules
 from gsgan.data.skeletons import Landmarks, Poses
 from gsgan.data.validation import (
@@ -155,12 +155,13 @@ def dataset_folder(root: str | Path, expected: str) -> Path:
     """The dataset's folder.
 
     Raises:
-        DataError: when it does not exist, naming the ``expected`` content.
+        DataError: when it does not exist, naming the ``expected`` content, or a link leads out.
     """
     folder = Path(root).expanduser()
     if not folder.is_dir():
         problem = "is a file, not a folder" if folder.exists() else "does not exist"
         raise DataError(f"data.root={root} {problem}; expected the folder that holds {expected}")
+    own_entries(folder, folder)
     return folder
 
 

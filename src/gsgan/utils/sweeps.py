@@ -53,10 +53,8 @@ def run_job(command: str, objective: str | None) -> float | None:
     given = (*settings.overrides.task, *settings.overrides.hydra)
     arguments = [x for x in given if not OF_THE_SWEEP.match(x)]
     quoted = str(folder).replace("\\", "\\\\").replace("'", "\\'")
-    status = _status(
-        [sys.executable, "-m", f"gsgan.{command}", *arguments, "hydra.mode=RUN"]
-        + [f"hydra.run.dir='{quoted}'"]
-    )
+    own = ("hydra.mode=RUN", f"hydra.run.dir='{quoted}'")
+    status = _status([sys.executable, "-m", f"gsgan.{command}", *arguments, *own])
     if status == 0:
         try:
             score = None if objective is None else _score(folder / "metrics.json", objective)
