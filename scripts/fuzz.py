@@ -2,10 +2,10 @@
 
     python scripts/fuzz.py [--count 10000] [--only bvh,ckpt] [--page docs/results/fuzz.md]
 
-Each read runs in a child process with a limit on memory and processor time, and an audit hook that
-ends it when it starts a program, opens a connection, or writes outside its folder. A good outcome is
-a read, or one sentence (GsganError). Hostile files, which run code where they are unpickled or
-instantiated carelessly, are among the files that are damaged.
+Each read runs in a child process with a limit on memory and processor time, and an audit hook
+that ends it when it starts a program, opens a connection, or writes outside its folder. A good
+outcome is a read, or one sentence (GsganError). Hostile files, which run code where they are
+unpickled or instantiated carelessly, are among the files that are damaged.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ ROOT = Path(__file__).parents[1]
 for folder in ("", "data", "prepare", "motion", "synthetic"):
     sys.path.insert(0, str(ROOT / "tests" / folder))
 
-import numpy as np
-import torch
+import numpy as np  # noqa: E402
+import torch  # noqa: E402
 
 MEMORY = 2 << 30  # bytes that a read may take
 SECONDS = 10  # of the processor
@@ -45,8 +45,10 @@ BATCH = 50  # files a child process
 OUTCOMES = ("read", "refused", "traceback", "memory", "hang", "killed", "code")
 GOOD = ("read", "refused")
 CODE = 77  # exit status of a child that did what no reader may do
-FORBIDDEN = re.compile(r"os\.(system|exec|posix_spawn|fork|remove|rename|rmdir|mkdir|symlink)"
-                       r"|subprocess\.Popen|socket\.connect|shutil\.rmtree|ctypes\.dlopen")  # fmt: skip
+FORBIDDEN = re.compile(
+    r"os\.(system|exec|posix_spawn|fork|remove|rename|rmdir|mkdir|symlink)|subprocess\.Popen"
+    r"|socket\.connect|shutil\.rmtree|ctypes\.dlopen"
+)
 
 Reader = Callable[[Path], object]
 
@@ -110,7 +112,7 @@ def seeds(home: Path, run: Path) -> dict[str, list[tuple[Path, Reader]]]:
     np.savez(home / "objects.npz", p=np.array([Hostile()], dtype=object))
     add("npz", home / "objects.npz", move)
     for kind, name in (("smplx", "body.npz"), ("smpl", "smpl.pkl")):
-        write_smpl(home / name, kind=kind)
+        write_smpl(home / name, kind=kind, vertices=300)
         add(name[-3:], home / name, read_smpl)
     for name in ("body.pkl", "motion.pkl"):
         (home / name).write_bytes(pickle.dumps({"poses": Hostile()}, 2))

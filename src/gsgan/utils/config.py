@@ -88,13 +88,13 @@ def entry(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], No
     def decorate(task: Callable[[DictConfig], None]) -> Callable[[], None]:
         @functools.wraps(task)
         def run(config: DictConfig) -> float | None:
-            if HydraConfig.get().mode == RunMode.MULTIRUN:
-                return run_job(name, config.get("objective"))
-            import gsgan.utils.compat  # noqa: F401  (before lightning and torchmetrics)
-            from gsgan.utils.tensors import keep_freed_memory
-
-            keep_freed_memory()
             try:
+                if HydraConfig.get().mode == RunMode.MULTIRUN:
+                    return run_job(name, config.get("objective"))
+                import gsgan.utils.compat  # noqa: F401  (before lightning and torchmetrics)
+                from gsgan.utils.tensors import keep_freed_memory
+
+                keep_freed_memory()
                 task(config)
             except KeyboardInterrupt:
                 _print_error("interrupted")
