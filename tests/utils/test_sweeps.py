@@ -101,13 +101,13 @@ def test_a_job_is_the_same_command_in_the_same_folder(tmp_path, monkeypatch):
 def test_a_signal_reaches_the_job_first_then_the_launcher(tmp_path):
     order = tmp_path / "order"
     before = signal.signal(signal.SIGUSR2, lambda *_: order.open("a").write("launcher\n"))
+    asks = f"sleep 0.5; kill -USR2 {os.getpid()}; sleep 5 & wait"
     try:
-        line = f"trap 'echo job >> {order}; exit 75' USR2; sleep 0.5; kill -USR2 {os.getpid()}; sleep 5 & wait"
+        line = f"trap 'echo job >> {order}; exit 75' USR2; {asks}"
         assert sweeps._status([*SHELL, line]) == sweeps.STOPPED
         assert order.read_text() == "job\nlauncher\n"
         # a job that has finished needs no requeueing
-        line = f"trap 'exit 0' USR2; sleep 0.5; kill -USR2 {os.getpid()}; sleep 5 & wait"
-        assert sweeps._status([*SHELL, line]) == 0
+        assert sweeps._status([*SHELL, f"trap 'exit 0' USR2; {asks}"]) == 0
         assert order.read_text() == "job\nlauncher\n"
     finally:
         signal.signal(signal.SIGUSR2, before)

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ Index = Mapping[str, Mapping[int, str]]
 
 
 MOST_HEADERS = 10_000  # read on opening, in even steps; every image is checked again when decoded
+MOST_FRAMES = 10_000  # on which the cameras are checked, in even steps
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,7 @@ def spans(ids: list[int]) -> str:
 def check_geometry(
     root: Path,
     cameras: Mapping[str, CameraEntry],
-    images: Index,
+    images: Images,
     landmarks: Landmarks,
     limits: Thresholds,
     calibration: Path,
@@ -105,9 +107,9 @@ def check_geometry(
     Raises:
         DataError: naming the ``calibration`` file and camera, or the distance and ``unit_hint``.
     """
-    frames = sorted({f for files in images.values() for f in files})
-    joints = np.stack([landmarks.p[f] for f in frames])
-    valid = np.stack([landmarks.visibility[f] for f in frames]) > 0
+    frames, joints, valid = _seen(images, landmarks)
+    some = slice(None, None, -(-len(frames) // MOST_FRAMES))
+    joints, valid = joints[some], valid[some]
     check_distance(root, list(cameras.values()), joints[valid], limits.distance, unit_hint)
     for camera in cameras.values():
         depth = project(camera, joints)[1][valid]
@@ -117,6 +119,13 @@ def check_geometry(
                 f"{calibration}, camera {camera.name}: {behind:.0%} of the joints lie "
                 "behind it; R and t must map world to camera (x_cam = R x + t), z forward"
             )
+
+
+def _seen(images: Images, landmarks: Landmarks) -> tuple[list[int], NDArray[Any], NDArray[Any]]:
+    """The frames of any camera ``[F]``, rising, their joints ``[F, J, 3]``, and which are seen."""
+    frames = np.unique(np.concatenate([files.frames for files in images.values()])).tolist()
+    visibility = np.stack([landmarks.visibility[f] for f in frames])
+    return frames, np.stack([landmarks.p[f] for f in frames]), visibility > 0
 
 
 def check_distance(
@@ -154,12 +163,12 @@ def drop_unseen(
     Raises:
         DataError: when a camera never sees the person.
     """
-    kept = dict(images)
+    kept, (known, joints, valid) = dict(images), _seen(images, landmarks)
     for name, files in images.items():
         if not (frames := list(files)):
             continue
-        seen = inside(cameras[name], np.stack([landmarks.p[f] for f in frames]))
-        seen &= np.stack([landmarks.visibility[f] for f in frames]) > 0
+        rows = np.searchsorted(known, files.frames)
+        seen = inside(cameras[name], joints[rows]) & valid[rows]
         enough = seen.sum(1) >= limits.min_joints_in_view
         if not enough.any():
             raise DataError(
