@@ -52,7 +52,9 @@ def test_one_camera_trains_and_the_others_test_every_fourth_frame(layout):
     assert splits.test_cameras == ("cam01", "cam02", "cam03")
     assert tuple(splits.items["train"]) == tuple(("cam00", f) for f in range(6))
     # 0 and 4 train (from another camera): a novel view; 8 does not: a novel pose
-    assert tuple(splits.items["novel_view"]) == tuple((f"cam0{c}", f) for c in (1, 2, 3) for f in (0, 4))
+    assert tuple(splits.items["novel_view"]) == tuple(
+        (f"cam0{c}", f) for c in (1, 2, 3) for f in (0, 4)
+    )
     assert tuple(splits.items["novel_pose"]) == tuple((f"cam0{c}", 8) for c in (1, 2, 3))
     assert splits.reasons == {}
 
