@@ -197,7 +197,7 @@ def drop_unmasked(
     Raises:
         DataError: when more are missing than allowed, naming one in the ``expected`` folders.
     """
-    lost = [(c, f) for c, files in images.items() for f in files if f not in masks[c]]
+    lost = [(c, f) for c, files in images.items() for f in sorted({*files} - {*masks[c]})]
     if not lost:
         return images
     (camera, frame), count = lost[0], sum(len(files) for files in images.values())

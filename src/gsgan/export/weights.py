@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from gsgan.model.avatar import Avatar
 from gsgan.model.runs import avatar_of
@@ -15,6 +16,10 @@ from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.tensors import pick_device
 
 KEPT = ("effects", "scene", "marks")  # of a checkpoint's facts
+DAMAGED = (
+    *(AttributeError, LookupError, RecursionError, TypeError, ValueError),
+    OmegaConfBaseException,
+)
 MISSING = "safetensors files need: pip install 'gsgan[export]'"
 
 
@@ -64,10 +69,15 @@ def load_weights(path: str | Path, *, device: str = "auto") -> Avatar:
         raise DataError(f"{path}: not a readable safetensors file ({error})") from None
     if not {"config", "gsgan"} <= metadata.keys():
         raise DataError(f"{path}: not written by gsgan.export (its metadata has no config)")
-    config = OmegaConf.create(json.loads(metadata["config"]))
-    _refuse_other_classes(path, config)
-    checkpoint = {"gsgan": json.loads(metadata["gsgan"]), "state_dict": state}
-    return avatar_of(path, config, checkpoint).to(pick_device(device))
+    try:
+        config = OmegaConf.create(json.loads(metadata["config"]))
+        _refuse_other_classes(path, config)
+        checkpoint = {"gsgan": json.loads(metadata["gsgan"]), "state_dict": state}
+        avatar = avatar_of(path, config, checkpoint)
+    except DAMAGED as error:
+        reason = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise DataError(f"{path}: its metadata is damaged ({reason}); export it again") from None
+    return avatar.to(pick_device(device))
 
 
 def _refuse_other_classes(path: Path, config: Any) -> None:
