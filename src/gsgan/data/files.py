@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from copy import copy
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import cv2
 import numpy as np
@@ -201,7 +201,7 @@ class FrameFiles(Mapping[int, str]):
     def __len__(self) -> int:
         return len(self.frames)
 
-    def without(self, frames: Iterable[int]) -> FrameFiles:
+    def without(self, frames: Iterable[int]) -> Self:
         """Those of the other frames."""
         keep = np.isin(self.frames, np.fromiter(frames, np.int64), invert=True)
         found = copy(self)

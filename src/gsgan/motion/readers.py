@@ -342,7 +342,8 @@ def _rig(path: Path, motion: RigMotion, metres: float | None, source: Source) ->
     try:
         standard = standard_motion(motion, path, source.up)
     except (ValueError, ArithmeticError) as error:  # of numbers that are finite, but absurd
-        raise DataError(f"{path} holds no motion of a person ({error}); export it again") from error
+        reason = str(error).splitlines()[0]
+        raise DataError(f"{path} is no motion of a person ({reason}); export it again") from error
     if metres is None:
         ratios = {
             unit: abs(np.log(standard.leg * x / source.subject.leg))

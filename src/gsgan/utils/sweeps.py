@@ -1,7 +1,5 @@
 """Jobs of a sweep: a process each, so that one that dies does not end the others."""
 
-from __future__ import annotations
-
 import ctypes
 import json
 import re

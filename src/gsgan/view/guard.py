@@ -1,7 +1,5 @@
 """Which requests the viewer's server answers: viser itself answers any web page."""
 
-from __future__ import annotations
-
 import ipaddress
 import socket
 from collections.abc import Iterator
