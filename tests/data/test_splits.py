@@ -23,7 +23,7 @@ def test_default_splits_hold_out_the_last_frames(layout):
     assert splits.train_frames == tuple(range(8))
     assert splits.test_frames == (8, 9)
     assert len(splits.items["train"]) == 24
-    assert splits.items["novel_view"] == ()
+    assert not splits.items["novel_view"]
     assert splits.reasons == {"novel_view": "no camera is held out (data.test_cameras)"}
     assert set(splits.items["novel_pose"]) == {(c, f) for c in layout.cameras for f in (8, 9)}
     assert make_splits(layout, test_share=0).reasons["novel_pose"].startswith("no frame")

@@ -4,6 +4,7 @@ import pytest
 from commands import refused
 from PIL import Image
 
+from gsgan.utils.errors import DataError
 from gsgan.utils.provenance import png_bytes
 
 
@@ -53,6 +54,25 @@ def test_a_trained_run_as_safetensors_with_its_scores(run, tmp_path, inside):
     card = (tmp_path / "one.MODEL_CARD.md").read_text()
     assert "| novel_pose | final image |" in card
     assert "marked: perceptual loss" in card
+
+
+def test_safetensors_name_no_class_but_gsgans_own(run, tmp_path):
+    from gsgan.export.weights import load_weights, weights_bytes
+    from gsgan.model.runs import load
+    from gsgan.model.stored import CHECKPOINT, read_checkpoint
+
+    facts = read_checkpoint(run / CHECKPOINT)["gsgan"]
+    content, path = weights_bytes(run, load(run), facts), tmp_path / "a.safetensors"
+    path.write_bytes(content)
+    assert load_weights(path).splats is not None
+    target = b"gsgan.model.deformation.Deformation"
+    for other in (b"os.system", b"${oc.env:HOME}", b"gsgan.utils.files.write_atomically"):
+        path.write_bytes(content.replace(target, other.ljust(len(target))))
+        with pytest.raises(DataError, match="not a class of gsgan"):
+            load_weights(path)
+    path.write_bytes(content.replace(b'\\"model\\"', b'\\"modem\\"'))
+    with pytest.raises(DataError, match="metadata is damaged"):
+        load_weights(path)
 
 
 def test_verify_reads_a_file(tmp_path, inside):

@@ -23,6 +23,7 @@ def sweep(tmp_path):
             write_run(folder / f"{model}_{seed}", model, seed, psnr=psnr)
     (folder / "unfinished" / ".hydra").mkdir(parents=True)
     (folder / "unfinished" / ".hydra" / "config.yaml").write_text("seed: 0\n")
+    (folder / "unfinished" / "unfinished.txt").write_text("it was killed by SIGKILL")
     return folder
 
 
@@ -31,6 +32,7 @@ def test_it_writes_all_files_and_names_what_it_left_out(sweep, tmp_path, inside)
     assert result.returncode == 0, result.stderr
     assert "30.50 ± 0.71" in result.stdout
     assert "Left out: unfinished" in result.stdout
+    assert "it was killed by SIGKILL" in result.stdout
     out = tmp_path / "tables"
     assert {path.name for path in out.iterdir()} == FILES
     held = pd.read_csv(out / "report.csv").set_index(["table", "row", "column"])["mean"]

@@ -214,7 +214,7 @@ class GsganData(LightningDataModule):
     @property
     def trained(self) -> list[int]:
         """Frames of the training split, rising."""
-        return sorted({frame for _, frame in self.splits.items["train"]})
+        return self.splits.items["train"].frames
 
     @cached_property
     def face(self) -> tuple[Vector, ...] | None:
@@ -228,7 +228,7 @@ class GsganData(LightningDataModule):
     def registered_held_out(self) -> tuple[int, ...]:
         """Frames of held-out poses whose body `gsgan.fit` registered to their own masks."""
         poses, items = self.layout.poses, self.splits.items
-        frames = {frame for _, frame in items["novel_pose"]} - {*self.trained}
+        frames = {*items["novel_pose"].frames} - {*self.trained}
         return tuple(sorted(frames & (poses.registered if poses else frozenset())))
 
     @cached_property
@@ -305,7 +305,8 @@ class GsganData(LightningDataModule):
     def labelled(self, split: str) -> Subset[Frame]:
         """The items of a split whose images have part labels; may be empty."""
         dataset = self.dataset(split)
-        chosen = [i for i, item in enumerate(dataset.items) if self.layout.label_path(*item)]
+        labelled = dataset.items if self.layout.labels else ()
+        chosen = [i for i, item in enumerate(labelled) if self.layout.label_path(*item)]
         return Subset(dataset, chosen)
 
     def train_dataloader(self) -> DataLoader[Frame]:

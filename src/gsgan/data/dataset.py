@@ -102,7 +102,7 @@ class CaptureDataset(Dataset[Frame]):
         skeletons: Landmarks | None = None,
     ) -> None:
         self.layout = layout
-        self.items = tuple(items)
+        self.items = items
         self.size = None if size is None else whole("data.size", size, 1)
         self.crop = crop
         self.lens = lens

@@ -8,9 +8,10 @@ import contextlib
 import json
 import os
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from copy import copy
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import cv2
 import numpy as np
@@ -21,6 +22,7 @@ from gsgan.utils.errors import DataError
 from gsgan.utils.pickles import read_npz
 
 JPEG_SIGNATURE, JPEG_END, JPEG_SCAN = b"\xff\xd8", b"\xff\xd9", b"\xff\xda"
+LAST_DIGITS = re.compile(r"([0-9]+)[^0-9]*$")
 LARGEST_FRAME = 10**9  # frame numbers beyond it are dates or damage
 
 
@@ -172,12 +174,47 @@ def read_arrays(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
     return read_npz(path, names, objects=False)
 
 
+class FrameFiles(Mapping[int, str]):
+    """Paths of files by frame number, rising.
+
+    Convention: kept in two arrays. Of millions of paths as objects, every loading process would
+    soon have a copy, since Python writes to an object that is read.
+
+    Args:
+        folder: before every name.
+        names: of the files, by frame number in any order.
+    """
+
+    def __init__(self, folder: str, names: Mapping[int, str]) -> None:
+        self.folder, self.frames = folder, np.array(sorted(names), np.int64)
+        self._names = np.array([os.fsencode(names[f]) for f in self.frames.tolist()])
+
+    def __getitem__(self, frame: int) -> str:
+        place = int(self.frames.searchsorted(frame))
+        if place == len(self.frames) or self.frames[place] != frame:
+            raise KeyError(frame)
+        return f"{self.folder}/{os.fsdecode(self._names[place])}"
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self.frames.tolist())
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def without(self, frames: Iterable[int]) -> Self:
+        """Those of the other frames."""
+        keep = np.isin(self.frames, np.fromiter(frames, np.int64), invert=True)
+        found = copy(self)
+        found.frames, found._names = self.frames[keep], self._names[keep]
+        return found
+
+
 def frame_files(
     root: Path,
     folder: str,
     suffixes: tuple[str, ...],
     number: Callable[[str], int | None] | None = None,
-) -> dict[int, str]:
+) -> FrameFiles:
     """Paths relative to ``root`` of the images in one of its folders, by frame number.
 
     Args:
@@ -187,36 +224,50 @@ def frame_files(
         number: frame number of a file's stem; by default the last group of digits.
 
     Raises:
-        DataError: when a name has no number, or two names have the same.
+        DataError: when a name has no number, two names have the same, or a link leads out.
     """
     place, found = root / folder, dict[int, str]()
-    if not place.is_dir():
-        return found
-    with os.scandir(place) as entries:
-        names = sorted(entry.name for entry in entries)
-    for name in names:
-        stem, suffix = os.path.splitext(name)
-        if suffix.lower() not in suffixes or name.startswith("."):
+    for name in sorted(own_entries(place, root)) if place.is_dir() else ():
+        stem, _, suffix = name.rpartition(".")
+        if f".{suffix.lower()}" not in suffixes or name.startswith("."):
             continue
         frame = (number or last_number)(stem)
         if frame is None:
             raise DataError(
                 f"{place / name} has no frame number up to {LARGEST_FRAME} in its name; number the "
-                f"frames 0, 1, 2 … equally in all cameras, e.g. 000012{suffix}"
+                f"frames 0, 1, 2 … equally in all cameras, e.g. 000012.{suffix}"
             )
         if frame in found:
             raise DataError(
-                f"{place} holds frame {frame} twice, as {found[frame].rpartition('/')[2]} and "
-                f"{name}; keep one of them"
+                f"{place} holds frame {frame} twice, as {found[frame]} and {name}; keep one of them"
             )
-        found[frame] = f"{folder}/{name}"
-    return found
+        found[frame] = name
+    return FrameFiles(folder, found)
+
+
+def own_entries(folder: Path, root: Path) -> list[str]:
+    """The names in a dataset's folder.
+
+    Raises:
+        DataError: when one of them, or the folder, is a link to a place outside the dataset, which
+            then could have any file of this machine read.
+    """
+    home = root.resolve()
+    with os.scandir(folder) as found:
+        entries = list(found)
+    for link in (folder, *(Path(entry) for entry in entries if entry.is_symlink())):
+        if not link.resolve().is_relative_to(home):
+            raise DataError(
+                f"{link} is a link to {link.resolve()}, outside the dataset; copy the files into "
+                f"{root}, or mount their folder there"
+            )
+    return [entry.name for entry in entries]
 
 
 def last_number(stem: str) -> int | None:
     """The last group of digits in a file's stem; None above `LARGEST_FRAME`."""
-    digits = re.findall(r"[0-9]+", stem)
-    return frame_of(digits[-1]) if digits else None
+    found = LAST_DIGITS.search(stem)
+    return frame_of(found[1]) if found else None
 
 
 def frame_of(digits: str) -> int | None:

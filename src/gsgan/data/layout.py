@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from gsgan.data.cameras import CameraEntry
+from gsgan.data.files import FrameFiles, own_entries
 from gsgan.data.pixels import MaskFile, PixelRules
 from gsgan.data.skeletons import Landmarks, Poses
 from gsgan.data.validation import (
@@ -78,7 +79,7 @@ class _Contents:
         meta: about the whole.
         cameras: by name, in the order of `camera_index`.
         images: by camera and frame.
-        masks: by camera and frame, one or more per image.
+        masks: by camera and frame, one or more per image; also of images that are left out.
         labels: by camera and frame; empty without labels.
         landmarks: by frame.
         hands: 21 landmarks of the left hand and of the right one by frame, or None.
@@ -91,7 +92,7 @@ class _Contents:
     root: Path
     meta: Meta
     cameras: Mapping[str, CameraEntry]
-    images: Index
+    images: Mapping[str, FrameFiles]
     masks: MaskIndex
     labels: Index = field(default_factory=dict)
     landmarks: Landmarks
@@ -154,12 +155,13 @@ def dataset_folder(root: str | Path, expected: str) -> Path:
     """The dataset's folder.
 
     Raises:
-        DataError: when it does not exist, naming the ``expected`` content.
+        DataError: when it does not exist, naming the ``expected`` content, or a link leads out.
     """
     folder = Path(root).expanduser()
     if not folder.is_dir():
         problem = "is a file, not a folder" if folder.exists() else "does not exist"
         raise DataError(f"data.root={root} {problem}; expected the folder that holds {expected}")
+    own_entries(folder, folder)
     return folder
 
 
@@ -176,13 +178,12 @@ def assemble(found: Found, limits: Thresholds) -> Layout:
     images = drop_unseen(cameras, images, marks, limits, calibration, notes)
     folders = {name: root / found.mask_folder.format(camera=name) for name in cameras}
     images = drop_unmasked(images, found.masks, folders, limits, notes)
-    masks = {c: {f: found.masks[c][f] for f in files} for c, files in images.items()}
     labels = {
         c: {f: p for f, p in found.labels.get(c, {}).items() if f in files}
         for c, files in images.items()
     }
     labels = labels if any(labels.values()) else {}
-    check_images(root, cameras, images, masks, labels, limits.header_stride, calibration)
+    check_images(root, cameras, images, found.masks, labels, limits.header_stride, calibration)
     kept = {one.name: getattr(found, one.name) for one in fields(_Contents)}
-    kept |= {"images": images, "masks": masks, "labels": labels, "notes": tuple(notes)}
+    kept |= {"images": images, "labels": labels, "notes": tuple(notes)}
     return Layout(**kept, frames=tuple(sorted({f for files in images.values() for f in files})))

@@ -116,7 +116,7 @@ def scene_info(
         held_out: datasets of the held-out items; their images are not read.
     """
     items, body = splits.items["train"], layout.meta.body
-    frames, skeletons = sorted({frame for _, frame in items}), dataset.skeletons.p
+    frames, skeletons = items.frames, dataset.skeletons.p
     p, valid = layout.landmarks.joints(frames)
     refuse_swapped_sides(layout, frames)
     whole = layout.landmarks
@@ -124,13 +124,13 @@ def scene_info(
         whole = whole.with_hands(layout.hands)
     middles = torch.stack([q[v].mean(0) for q, v in zip(p, valid, strict=True)])
     x, y, z = middles.median(0).values.tolist()
-    cameras = {camera for camera, _ in dataset.items}
+    cameras = set(items.cameras)
     names = tuple(name for name in layout.cameras if name in cameras)
     scales = [_scale(data, samples) for data in held_out if data.items]
     return SceneInfo(
         camera_names=layout.camera_names,
         n_train_cameras=len(cameras),
-        has_labels=any(layout.label_path(*item) for item in items),
+        has_labels=bool(layout.labels) and any(layout.label_path(*item) for item in items),
         has_body_pose=layout.poses is not None,
         body=None if body is None else body.kind,
         skeleton=layout.meta.skeleton,
@@ -153,7 +153,7 @@ def scene_info(
     )
 
 
-def count_labels(layout: Layout, items: tuple[Item, ...]) -> int:
+def count_labels(layout: Layout, items: Sequence[Item]) -> int:
     """Part labels, background included: as many as have names, else up to the highest one.
 
     Without names every label image of the items is read once.
@@ -239,11 +239,13 @@ def _shared_surface(
     dataset: CaptureDataset, cameras: tuple[str, ...], samples: int
 ) -> SurfaceColours | None:
     """Colours compared in frames that all training cameras have; None with a single camera."""
-    index = {item: i for i, item in enumerate(dataset.items)}
-    shared = sorted({f for _, f in dataset.items if all((c, f) in index for c in cameras)})
     if len(cameras) < 2:
         return None
+    frames: dict[str, set[int]] = {}
+    for camera, frame in dataset.items:
+        frames.setdefault(camera, set()).add(frame)
+    shared, place = sorted(set.intersection(*frames.values())), dataset.items.index
     chosen = [shared[i] for i in evenly_spaced(len(shared), samples, ends=True)]
     # Subsets read a frame when it is needed: all of them at full size take gigabytes.
-    moments = [Subset(dataset, [index[c, f] for c in cameras]) for f in chosen]
+    moments = [Subset(dataset, [place((c, f)) for c in cameras]) for f in chosen]
     return surface_colours(moments)  # type: ignore[arg-type]

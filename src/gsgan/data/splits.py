@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from gsgan.data.files import LARGEST_FRAME
 from gsgan.data.layout import Layout
@@ -22,6 +25,48 @@ SIDES: tuple[Literal["train", "test"], ...] = ("train", "test")
 Item = tuple[str, int]  # camera name, frame number
 
 
+class Items(Sequence[Item]):
+    """(camera, frame) pairs, camera by camera; kept in arrays like `FrameFiles`.
+
+    Args:
+        frames: ``[N]`` of each camera.
+    """
+
+    def __init__(self, frames: Mapping[str, NDArray[np.int64]]) -> None:
+        self._of = {name: numbers for name, numbers in frames.items() if len(numbers)}
+        self._ends = np.cumsum([0, *map(len, self._of.values())])
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Those with an item."""
+        return tuple(self._of)
+
+    @property
+    def frames(self) -> list[int]:
+        """The frame numbers, rising, each once."""
+        return np.unique(np.concatenate([*self._of.values(), np.empty(0, np.int64)])).tolist()
+
+    def __len__(self) -> int:
+        return int(self._ends[-1])
+
+    def __getitem__(self, index: int) -> Item:  # type: ignore[override]
+        place = range(len(self))[index]
+        camera = int(self._ends.searchsorted(place, side="right")) - 1
+        name = self.cameras[camera]
+        return name, int(self._of[name][place - self._ends[camera]])
+
+    def __iter__(self) -> Iterator[Item]:
+        return ((name, f) for name, frames in self._of.items() for f in frames.tolist())
+
+    def index(self, item: Item, *_: int) -> int:  # type: ignore[override]
+        """The place of an item; a ValueError where it is none."""
+        camera = self.cameras.index(item[0])
+        found = np.flatnonzero(self._of[item[0]] == item[1])
+        if not len(found):
+            raise ValueError(f"{item} is not in the split")
+        return int(self._ends[camera] + found[0])
+
+
 @dataclass(frozen=True)
 class Splits:
     """Training and held-out cameras and frames.
@@ -30,7 +75,7 @@ class Splits:
     ``novel_pose`` train cameras × test frames.
 
     Args:
-        items: (camera, frame) pairs that exist, by split, in a fixed order.
+        items: those that exist, by split.
         reasons: why a split is empty, for those that are.
         notes: requested frames that the capture lacks.
     """
@@ -39,7 +84,7 @@ class Splits:
     test_cameras: tuple[str, ...]
     train_frames: tuple[int, ...]
     test_frames: tuple[int, ...]
-    items: dict[str, tuple[Item, ...]]
+    items: dict[str, Items]
     reasons: dict[str, str]
     notes: tuple[str, ...] = ()
 
@@ -108,7 +153,7 @@ def _splits(
     layout: Layout,
     cameras: tuple[tuple[str, ...], tuple[str, ...]],
     frames: tuple[tuple[int, ...], tuple[int, ...]],
-    items: dict[str, tuple[Item, ...]],
+    items: dict[str, Items],
     reasons: dict[str, str],
     notes: tuple[str, ...],
 ) -> Splits:
@@ -123,8 +168,8 @@ def _splits(
     return Splits(*cameras, *frames, items, reasons, notes)
 
 
-def _items(layout: Layout, cameras: Sequence[str], frames: Sequence[int]) -> tuple[Item, ...]:
-    return tuple((c, f) for c in cameras for f in frames if f in layout.images[c])
+def _items(layout: Layout, cameras: Sequence[str], frames: Sequence[int]) -> Items:
+    return Items({c: np.intersect1d(frames, layout.images[c].frames) for c in cameras})
 
 
 def protocol_splits(layout: Layout, protocol: Protocol) -> Splits:

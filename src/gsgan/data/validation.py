@@ -3,19 +3,25 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import NEAR, inside, project
-from gsgan.data.files import check_image
+from gsgan.data.files import FrameFiles, check_image
 from gsgan.data.pixels import MaskFile
 from gsgan.data.skeletons import HUBS, Landmarks, Poses
 from gsgan.utils.errors import DataError
 
+Images = Mapping[str, FrameFiles]
 Index = Mapping[str, Mapping[int, str]]
 """Paths relative to the root, by camera name and frame number."""
+
+
+MOST_HEADERS = 10_000  # read on opening, in even steps; every image is checked again when decoded
+MOST_FRAMES = 10_000  # on which the cameras are checked, in even steps
 
 
 @dataclass(frozen=True)
@@ -30,17 +36,17 @@ class Thresholds:
     distance: tuple[float, float] = (0.3, 30.0)
     max_behind: float = 0.05  # share of joints behind a camera above which its pose is wrong
     max_missing_masks: float = 0.0  # largest share of images without a mask
-    header_stride: int = 1  # of images whose header is read on opening, 0.1 ms each; 1 reads all
+    header_stride: int = 1  # of images whose header is read on opening, 0.1 ms each
 
 
 def drop_frames(
     root: Path,
-    images: Index,
+    images: Images,
     landmarks: Landmarks,
     poses: Poses | None,
     limits: Thresholds,
     notes: list[str],
-) -> Index:
+) -> Images:
     """The images without the frames that lack a usable skeleton or pose; notes say why.
 
     Raises:
@@ -53,13 +59,13 @@ def drop_frames(
             dropped.setdefault(reason, []).append(frame)
     for reason, ids in dropped.items():
         notes.append(f"{len(ids)} of {len(frames)} frames dropped, {reason}: {spans(ids)}")
-    gone = {frame for ids in dropped.values() for frame in ids}
+    gone = [frame for ids in dropped.values() for frame in ids]
     if len(gone) == len(frames):
         raise DataError(
             f"{root} ({landmarks.source}) has no usable frame: "
             + "; ".join(f"{len(ids)} {reason}" for reason, ids in dropped.items())
         )
-    return {name: {f: files[f] for f in files if f not in gone} for name, files in images.items()}
+    return {name: files.without(gone) for name, files in images.items()}
 
 
 def _unusable(
@@ -90,7 +96,7 @@ def spans(ids: list[int]) -> str:
 def check_geometry(
     root: Path,
     cameras: Mapping[str, CameraEntry],
-    images: Index,
+    images: Images,
     landmarks: Landmarks,
     limits: Thresholds,
     calibration: Path,
@@ -101,9 +107,9 @@ def check_geometry(
     Raises:
         DataError: naming the ``calibration`` file and camera, or the distance and ``unit_hint``.
     """
-    frames = sorted({f for files in images.values() for f in files})
-    joints = np.stack([landmarks.p[f] for f in frames])
-    valid = np.stack([landmarks.visibility[f] for f in frames]) > 0
+    frames, joints, valid = _seen(images, landmarks)
+    some = slice(None, None, -(-len(frames) // MOST_FRAMES))
+    joints, valid = joints[some], valid[some]
     check_distance(root, list(cameras.values()), joints[valid], limits.distance, unit_hint)
     for camera in cameras.values():
         depth = project(camera, joints)[1][valid]
@@ -113,6 +119,13 @@ def check_geometry(
                 f"{calibration}, camera {camera.name}: {behind:.0%} of the joints lie "
                 "behind it; R and t must map world to camera (x_cam = R x + t), z forward"
             )
+
+
+def _seen(images: Images, landmarks: Landmarks) -> tuple[list[int], NDArray[Any], NDArray[Any]]:
+    """The frames of any camera ``[F]``, rising, their joints ``[F, J, 3]``, and which are seen."""
+    frames = np.unique(np.concatenate([files.frames for files in images.values()])).tolist()
+    visibility = np.stack([landmarks.visibility[f] for f in frames])
+    return frames, np.stack([landmarks.p[f] for f in frames]), visibility > 0
 
 
 def check_distance(
@@ -139,24 +152,23 @@ def check_distance(
 
 def drop_unseen(
     cameras: Mapping[str, CameraEntry],
-    images: Index,
+    images: Images,
     landmarks: Landmarks,
     limits: Thresholds,
     calibration: Path,
     notes: list[str],
-) -> Index:
+) -> Images:
     """The images without those in which too few joints are in view.
 
     Raises:
         DataError: when a camera never sees the person.
     """
-    kept: dict[str, Mapping[int, str]] = {}
+    kept, (known, joints, valid) = dict(images), _seen(images, landmarks)
     for name, files in images.items():
         if not (frames := list(files)):
-            kept[name] = {}
             continue
-        seen = inside(cameras[name], np.stack([landmarks.p[f] for f in frames]))
-        seen &= np.stack([landmarks.visibility[f] for f in frames]) > 0
+        rows = np.searchsorted(known, files.frames)
+        seen = inside(cameras[name], joints[rows]) & valid[rows]
         enough = seen.sum(1) >= limits.min_joints_in_view
         if not enough.any():
             raise DataError(
@@ -169,23 +181,23 @@ def drop_unseen(
                 f"camera {name}: {len(lost)} frames dropped, fewer than "
                 f"{limits.min_joints_in_view} joints in view: {spans(lost)}"
             )
-        kept[name] = {f: files[f] for f, ok in zip(frames, enough, strict=True) if ok}
+            kept[name] = files.without(lost)
     return kept
 
 
 def drop_unmasked(
-    images: Index,
+    images: Images,
     masks: Mapping[str, Mapping[int, tuple[MaskFile, ...]]],
     expected: Mapping[str, Path],
     limits: Thresholds,
     notes: list[str],
-) -> Index:
+) -> Images:
     """The images that have a mask; a note says how many were left out.
 
     Raises:
         DataError: when more are missing than allowed, naming one in the ``expected`` folders.
     """
-    lost = [(c, f) for c, files in images.items() for f in files if not masks[c].get(f)]
+    lost = [(c, f) for c, files in images.items() for f in sorted({*files} - {*masks[c]})]
     if not lost:
         return images
     (camera, frame), count = lost[0], sum(len(files) for files in images.values())
@@ -201,23 +213,24 @@ def drop_unmasked(
         f"{len(lost)} of {count} images have no mask and are left out "
         f"(first: camera {camera}, frame {frame})"
     )
-    return {c: {f: p for f, p in files.items() if masks[c].get(f)} for c, files in images.items()}
+    return {c: files.without(f for d, f in lost if d == c) for c, files in images.items()}
 
 
 def check_images(
     root: Path,
     cameras: Mapping[str, CameraEntry],
-    images: Index,
+    images: Images,
     masks: Mapping[str, Mapping[int, tuple[MaskFile, ...]]],
     labels: Index,
     stride: int,
     calibration: Path,
 ) -> None:
-    """Checks sizes and channel layouts, from the headers alone.
+    """Checks sizes and channel layouts, from the headers alone, of `MOST_HEADERS` images at most.
 
     Raises:
         DataError: on the first file that does not fit.
     """
+    stride = max(stride, -(-sum(map(len, images.values())) // MOST_HEADERS))
     for name, files in images.items():
         size = cameras[name].size
         for frame in list(files)[::stride]:

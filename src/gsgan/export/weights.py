@@ -1,18 +1,25 @@
 """Weights as safetensors: what `gsgan.load` needs of a run, in one file without pickle."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from gsgan.model.avatar import Avatar
 from gsgan.model.runs import avatar_of
 from gsgan.model.stored import read_config
+from gsgan.utils.config import config_folder
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.tensors import pick_device
 
 KEPT = ("effects", "scene", "marks")  # of a checkpoint's facts
+DAMAGED = (
+    *(AttributeError, LookupError, RecursionError, TypeError, ValueError),
+    OmegaConfBaseException,
+)
 MISSING = "safetensors files need: pip install 'gsgan[export]'"
 
 
@@ -46,7 +53,7 @@ def load_weights(path: str | Path, *, device: str = "auto") -> Avatar:
         device: as for `gsgan.load`.
 
     Raises:
-        DataError: when it is missing, damaged, or of another program.
+        DataError: when it is missing, damaged, of another program, or names classes of one.
         ConfigError: when the package safetensors is missing.
     """
     try:
@@ -62,6 +69,29 @@ def load_weights(path: str | Path, *, device: str = "auto") -> Avatar:
         raise DataError(f"{path}: not a readable safetensors file ({error})") from None
     if not {"config", "gsgan"} <= metadata.keys():
         raise DataError(f"{path}: not written by gsgan.export (its metadata has no config)")
-    config = OmegaConf.create(json.loads(metadata["config"]))
-    checkpoint = {"gsgan": json.loads(metadata["gsgan"]), "state_dict": state}
-    return avatar_of(path, config, checkpoint).to(pick_device(device))
+    try:
+        config = OmegaConf.create(json.loads(metadata["config"]))
+        _refuse_other_classes(path, config)
+        checkpoint = {"gsgan": json.loads(metadata["gsgan"]), "state_dict": state}
+        avatar = avatar_of(path, config, checkpoint)
+    except DAMAGED as error:
+        reason = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise DataError(f"{path}: its metadata is damaged ({reason}); export it again") from None
+    return avatar.to(pick_device(device))
+
+
+def _refuse_other_classes(path: Path, config: Any) -> None:
+    """A config names the classes that it builds: only those in conf/ are taken from a file that may
+    come from anybody."""
+    shipped = "\n".join(file.read_text() for file in config_folder().rglob("*.yaml"))
+    known = {"", *re.findall(r"_target_: *([\w.]+)", shipped)}
+    pending = [OmegaConf.to_container(config)]
+    while pending:
+        node = pending.pop()
+        if isinstance(node, dict) and node.get("_target_", "") not in known:
+            raise DataError(
+                f"{path} names {node['_target_']!r}, which is not a class of gsgan's own configs; "
+                "load the run folder that it was exported from"
+            )
+        if isinstance(node, (dict, list)):
+            pending += node.values() if isinstance(node, dict) else node

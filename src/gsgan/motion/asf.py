@@ -45,7 +45,7 @@ def read_amc(amc: Path, asf: Path) -> tuple[RigMotion, float]:
     """
     try:
         bones, parents, scale, radians = _skeleton(asf)
-    except (ValueError, KeyError, IndexError) as error:
+    except (ValueError, KeyError, IndexError, ArithmeticError) as error:
         raise DataError(f"{asf} is not a complete ASF skeleton ({_reason(error)})") from error
     try:
         return _motion(amc, bones, parents, radians), scale

@@ -339,7 +339,11 @@ def read_amc_motion(path: Path, source: Source) -> Clip:
 
 
 def _rig(path: Path, motion: RigMotion, metres: float | None, source: Source) -> Clip:
-    standard = standard_motion(motion, path, source.up)
+    try:
+        standard = standard_motion(motion, path, source.up)
+    except (ValueError, ArithmeticError) as error:  # of numbers that are finite, but absurd
+        reason = str(error).splitlines()[0]
+        raise DataError(f"{path} is no motion of a person ({reason}); export it again") from error
     if metres is None:
         ratios = {
             unit: abs(np.log(standard.leg * x / source.subject.leg))

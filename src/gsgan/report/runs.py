@@ -16,6 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gsgan.model.stored import hydra_record, record
 from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.sweeps import unfinished
 
 METRICS_FILE, FACTS_FILE = "metrics.json", "facts.json"
 CONFIG = Path(".hydra") / "config.yaml"
@@ -170,7 +171,8 @@ def read_run(folder: Path, *, scored: bool = True) -> Run:
     """
     for name in (METRICS_FILE, FACTS_FILE) if scored else ():
         if not (folder / name).is_file():
-            raise DataError(f"{folder}: no {name}; the run is not finished, or was not scored")
+            why = unfinished(folder) or "the run is not finished, or was not scored"
+            raise DataError(f"{folder}: no {name}; {why}")
     try:
         scores = json.loads((folder / METRICS_FILE).read_text()) if scored else {}
         found = folder / FACTS_FILE

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import io
+import signal
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -131,6 +132,28 @@ class LiveViewer(Callback):
     def _stop(self) -> None:
         if self.viewer is not None:
             self.viewer.stop()
+
+
+class StopOnSignal(Callback):
+    """Ends training after the epoch, once its checkpoint is written, if a scheduler asked for it.
+
+    Convention: SIGUSR1 and SIGUSR2 ask, which SLURM sends before a job's time is up; from the
+    construction on. Lightning installs no handler of its own where there is one.
+    """
+
+    def __init__(self) -> None:
+        self.asked = False
+        for name in ("SIGUSR1", "SIGUSR2"):
+            if hasattr(signal, name):
+                signal.signal(getattr(signal, name), self._ask)
+
+    def _ask(self, *_: Any) -> None:
+        self.asked = True
+
+    def on_train_epoch_end(self, trainer: Trainer, module: LightningModule) -> None:
+        # over all processes, which need not have had the signal in the same epoch
+        self.asked = trainer.strategy.reduce_boolean_decision(self.asked, all=False)
+        trainer.should_stop |= self.asked
 
 
 class AtomicCheckpoints(TorchCheckpointIO):

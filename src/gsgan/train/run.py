@@ -2,6 +2,7 @@
 
 import json
 import logging
+import sys
 import time
 import warnings
 from collections.abc import Mapping
@@ -16,7 +17,7 @@ import gsgan.utils.compat  # noqa: F401  (must come before lightning)
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
-from lightning import Trainer, seed_everything
+from lightning import Callback, Trainer, seed_everything
 from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
 from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
@@ -37,11 +38,18 @@ from gsgan.model.harmonic import Harmonic, distilled
 from gsgan.model.runs import load
 from gsgan.model.stored import CHECKPOINT, read_checkpoint, record
 from gsgan.splat import resolve_backend
-from gsgan.train.callbacks import AtomicCheckpoints, ImageGrid, LiveViewer, ProgressLines
+from gsgan.train.callbacks import (
+    AtomicCheckpoints,
+    ImageGrid,
+    LiveViewer,
+    ProgressLines,
+    StopOnSignal,
+)
 from gsgan.train.module import AvatarTraining
 from gsgan.utils.checks import whole
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
+from gsgan.utils.sweeps import STOPPED
 
 # A training iteration takes this many times as long as rendering: arithmetic of the networks at
 # 512² with VGG-16 and the discriminator. With small ones at 128² it was 3.4.
@@ -59,6 +67,7 @@ def run_training(config: DictConfig) -> None:
     console.quiet = getattr(rank_zero_only, "rank", 0) != 0
     folder = Path(HydraConfig.get().runtime.output_dir)
     _quiet_lightning()
+    stop = StopOnSignal()
     torch.set_flush_denormal(True)  # black background decays into denormals: slow on CPUs
     check_lpips(config.lpips.net, config.lpips.path)  # now, not after hours of training
     if config.viewer:
@@ -86,8 +95,15 @@ def run_training(config: DictConfig) -> None:
     describe(console, folder, config, data, module)
     module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     logs = "logs" if resume is None else f"logs_{done:06d}"
-    trainer = build_trainer(config, folder, module, data, console, logs)
+    trainer = build_trainer(config, folder, module, data, console, logs, stop)
     _fit(trainer, module, data, resume, folder, console)
+    if module.step < module.schedule.total:
+        console.print(
+            f"stopped by a signal at iteration {module.step}; the same command with "
+            f"hydra.run.dir={folder} goes on",
+            soft_wrap=True,
+        )
+        sys.exit(STOPPED)
     if trainer.is_global_zero:
         if config.evaluate:
             _evaluate(trainer, module, data, config, folder, console)
@@ -287,9 +303,11 @@ def build_trainer(
     data: GsganData,
     console: Console,
     logs: str,
+    *callbacks: Callback,
 ) -> Trainer:
     """The Trainer of the config, as long as the schedule."""
-    callbacks: list[Any] = [
+    used: list[Any] = [
+        *callbacks,
         ImageGrid(folder / "grids", config.grid_rows),
         ProgressLines(console),
         ModelCheckpoint(
@@ -300,13 +318,13 @@ def build_trainer(
         ),
     ]
     if config.viewer:
-        callbacks.append(LiveViewer(folder, config, data, console))
+        used.append(LiveViewer(folder, config, data, console))
     if console.is_terminal:
-        callbacks.append(RichProgressBar())
+        used.append(RichProgressBar())
     return instantiate(
         config.trainer,
         max_epochs=-(-module.schedule.total // len(data.train_dataloader())),
-        callbacks=callbacks,
+        callbacks=used,
         default_root_dir=folder,
         plugins=[AtomicCheckpoints()],
         # a logger overwrites its files: each part of a resumed run has its own folder

@@ -12,11 +12,13 @@ from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import CompactHydraException, HydraException, InstantiationException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
 from gsgan.utils.errors import GsganError
+from gsgan.utils.sweeps import note, run_job
 
 FAILED = 1
 LONGEST_NAME = 200  # bytes of a sweep's folder; file systems take 255, files beside it need some
@@ -52,6 +54,7 @@ def folder_name(overrides: str) -> str:
 
     A name that had to be changed ends in a digest of the overrides, so no two runs share a folder.
     """
+    overrides = overrides or "defaults"
     name = re.sub(r"[^A-Za-z0-9_.+-]", "_", overrides)
     if name == overrides and len(name) <= LONGEST_NAME:
         return name
@@ -79,18 +82,22 @@ OmegaConf.register_new_resolver("if_gpu", if_gpu, replace=True)
 def entry(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
     """Turns a function of a config into a command with Hydra's grammar and one-sentence errors.
 
+    Each job of a sweep (``-m``) is the same command in a process of its own.
+
     Args:
         name: of the config file, without ``.yaml``, and of the command.
     """
 
     def decorate(task: Callable[[DictConfig], None]) -> Callable[[], None]:
         @functools.wraps(task)
-        def run(config: DictConfig) -> None:
-            import gsgan.utils.compat  # noqa: F401  (before lightning and torchmetrics)
-            from gsgan.utils.tensors import keep_freed_memory
-
-            keep_freed_memory()
+        def run(config: DictConfig) -> float | None:
             try:
+                if HydraConfig.get().mode == RunMode.MULTIRUN:
+                    return run_job(name, config.get("objective"))
+                import gsgan.utils.compat  # noqa: F401  (before lightning and torchmetrics)
+                from gsgan.utils.tensors import keep_freed_memory
+
+                keep_freed_memory()
                 task(config)
             except KeyboardInterrupt:
                 _print_error("interrupted")
@@ -100,8 +107,10 @@ def entry(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], No
                 if message is None:
                     raise
                 _print_error(message)
+                note(Path(HydraConfig.get().runtime.output_dir), message)
                 _remove_unused_folder()
                 sys.exit(FAILED)
+            return None
 
         @functools.wraps(task)
         def main() -> None:

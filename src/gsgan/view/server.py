@@ -20,9 +20,11 @@ from gsgan.utils.checks import above, between, whole
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.images import background
+from gsgan.view.guard import guarded
 from gsgan.view.session import IDLE, Session, Show
 
 MEGABYTE = 1 << 20
+MOST_UPLOADS = 8  # of a browser at the same time
 
 
 def view_config(config: DictConfig) -> None:
@@ -69,7 +71,8 @@ class Viewer:
         except OSError as error:
             raise ConfigError(f"host={host} is not an address of this machine ({error})") from None
         logging.getLogger("websockets").setLevel(logging.WARNING)
-        with contextlib.redirect_stdout(io.StringIO()):  # viser's own banner
+        # without viser's own banner
+        with contextlib.redirect_stdout(io.StringIO()), guarded(host):
             self.server = viser.ViserServer(host, port, label="gsgan", verbose=False)
         # viser's share button would put the avatar on a public address
         self.server.request_share_url = lambda verbose=True: None  # type: ignore[method-assign]
@@ -149,7 +152,8 @@ def import_viser() -> Any:
 
 
 def _bound_uploads(client: Any, limit: int) -> None:
-    """Drops uploads of more than ``limit`` bytes together, whatever size the browser declares.
+    """Drops uploads beyond `MOST_UPLOADS`, or of more than ``limit`` bytes together, whatever size
+    the browser declares.
 
     viser itself collects the parts of an upload without a limit.
     """
@@ -161,7 +165,7 @@ def _bound_uploads(client: Any, limit: int) -> None:
     def check(_: int, message: Any) -> None:
         state = uploads.get(message.transfer_uuid)
         held = (max(s["total_bytes"], s["transferred_bytes"]) for s in uploads.values())
-        if state and sum(held) > limit:
+        if state and (sum(held) > limit or len(uploads) > MOST_UPLOADS):
             uploads.pop(message.transfer_uuid)
             total = state["total_bytes"]  # the browser stops waiting
             ends = message.source_component_uuid, message.transfer_uuid, total, total

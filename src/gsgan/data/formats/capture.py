@@ -32,7 +32,7 @@ from gsgan.data.calibration import (
     read_conventions,
 )
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.files import frame_files, read_arrays, read_json
+from gsgan.data.files import FrameFiles, frame_files, read_arrays, read_json
 from gsgan.data.formats.common import IMAGES, finish, one_mask_each
 from gsgan.data.formats.consistency import Consistency
 from gsgan.data.layout import BodyModel, Found, Layout, Meta, dataset_folder
@@ -158,7 +158,7 @@ def _read_meta(path: Path, content: Mapping[str, Any], smpl: str | None) -> Meta
     )
 
 
-def _index_images(root: Path, cameras: Mapping[str, CameraEntry]) -> dict[str, dict[int, str]]:
+def _index_images(root: Path, cameras: Mapping[str, CameraEntry]) -> dict[str, FrameFiles]:
     folder = root / "images"
     if not folder.is_dir():
         raise DataError(f"{folder} does not exist; expected images/<camera>/000000.jpg and so on")

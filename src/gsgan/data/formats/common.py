@@ -1,6 +1,6 @@
 """The shared part of the readers: settings, the user's body model, and the final checks."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -11,7 +11,7 @@ from gsgan.body.smpl import SkinnedModel, read_smpl
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.files import read_header
 from gsgan.data.formats.consistency import Consistency, check_consistency
-from gsgan.data.layout import Found, Layout, assemble, dataset_folder
+from gsgan.data.layout import Found, Layout, MaskIndex, assemble, dataset_folder
 from gsgan.data.pixels import MaskFile
 from gsgan.data.proportions import axis_name
 from gsgan.data.splits import parse_frames
@@ -88,11 +88,8 @@ def finish(
         ConfigError: when ``drop_frames`` is malformed or leaves no frame.
     """
     if drop_frames is not None:
-        gone = set(parse_frames(drop_frames, "data.reader.drop_frames"))
-        images = {
-            name: {f: path for f, path in files.items() if f not in gone}
-            for name, files in found.images.items()
-        }
+        gone = parse_frames(drop_frames, "data.reader.drop_frames")
+        images = {name: files.without(gone) for name, files in found.images.items()}
         if not any(images.values()):
             raise ConfigError(f"data.reader.drop_frames={drop_frames} leaves no frame")
         found = replace(found, images=images)
@@ -153,11 +150,22 @@ def image_size(root: Path, files: Mapping[int, str]) -> tuple[int, int]:
     return read_header(root / next(iter(files.values())))[0]
 
 
-def one_mask_each(
-    files: Mapping[str, Mapping[int, str]], rule: str
-) -> dict[str, dict[int, tuple[MaskFile, ...]]]:
+class _Masks(Mapping[int, tuple[MaskFile, ...]]):
+    """Files as masks, one per image, all of one rule; made when they are asked for."""
+
+    def __init__(self, files: Mapping[int, str], rule: str) -> None:
+        self.files, self.rule = files, rule
+
+    def __getitem__(self, frame: int) -> tuple[MaskFile, ...]:
+        return (MaskFile(self.rule, self.files[frame]),)
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self.files)
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+
+def one_mask_each(files: Mapping[str, Mapping[int, str]], rule: str) -> MaskIndex:
     """Masks by camera and frame, one file per image, all of one rule."""
-    return {
-        name: {f: (MaskFile(rule, path),) for f, path in paths.items()}
-        for name, paths in files.items()
-    }
+    return {name: _Masks(paths, rule) for name, paths in files.items()}

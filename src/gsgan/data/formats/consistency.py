@@ -59,7 +59,7 @@ def check_consistency(layout: Layout, limits: Consistency, hint: str) -> None:
     frames = spread(list(layout.frames), limits.frames)
     shares, masks, empty = dict[str, list[float]](), list[Path](), True
     for name, camera in layout.cameras.items():
-        for frame in (f for f in frames if f in layout.masks[name]):
+        for frame in (f for f in frames if f in layout.images[name]):
             mask = read_mask(layout.mask_files(name, frame), layout.pixels)
             masks.append(layout.mask_path(name, frame))
             empty = empty and not mask.any()

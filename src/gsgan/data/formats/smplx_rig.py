@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gsgan.body.smpl import SkinnedModel
 from gsgan.data.cameras import CameraEntry, make_camera, numbers
-from gsgan.data.files import frame_files, last_number, read_json
+from gsgan.data.files import FrameFiles, frame_files, last_number, read_json
 from gsgan.data.formats.common import (
     IMAGES,
     FolderReader,
@@ -34,7 +34,7 @@ from gsgan.utils.checks import whole
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.pickles import read_npz
 
-Files = dict[str, dict[int, str]]
+Files = dict[str, FrameFiles]
 """Paths relative to the root, by camera and frame."""
 Float = NDArray[np.float64]
 
@@ -183,7 +183,10 @@ def _leave_out(images: Files, path: Path, notes: list[str]) -> None:
     if not path.is_file():
         return
     named = read_missing(path, images)
-    gone = sum(images[name].pop(frame, None) is not None for name, frame in named)
+    gone = 0
+    for camera, files in images.items():
+        images[camera] = files.without(frame for name, frame in named if name == camera)
+        gone += len(files) - len(images[camera])
     notes.append(f"{len(named)} images named in {path} are left out, {gone} of them with a file")
     if empty := [name for name, files in images.items() if not files]:
         raise DataError(f"{path} leaves no image of camera {empty[0]}")

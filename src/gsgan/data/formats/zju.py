@@ -22,7 +22,7 @@ import numpy as np
 from gsgan.body.smpl import SkinnedModel
 from gsgan.body.smpl_names import CIHP
 from gsgan.data.cameras import CameraEntry, make_camera
-from gsgan.data.files import frame_files, frame_of, last_number
+from gsgan.data.files import FrameFiles, frame_files, frame_of, last_number
 from gsgan.data.formats.common import IMAGES, FolderReader, body_model, image_size, up_axis
 from gsgan.data.formats.smpl_motion import SmplMotion, landmarks_of, zju_motion
 from gsgan.data.layout import BodyModel, Found, Meta
@@ -32,7 +32,7 @@ from gsgan.data.validation import Thresholds
 from gsgan.utils.errors import DataError
 from gsgan.utils.pickles import read_npy
 
-Files = dict[str, dict[int, str]]
+Files = Mapping[str, Mapping[int, str]]
 """Paths relative to the root, by camera and frame."""
 
 ANNOTS = ("annots.npy", "annots_new.npy")
@@ -206,7 +206,7 @@ def frame_number(stem: str) -> int | None:
     return frame_of(named[1]) if named else last_number(stem)
 
 
-def _index_images(root: Path, folders: Mapping[str, str]) -> Files:
+def _index_images(root: Path, folders: Mapping[str, str]) -> dict[str, FrameFiles]:
     """The images of each camera by frame number."""
     images = {
         name: frame_files(root, folder, IMAGES, frame_number) for name, folder in folders.items()
@@ -224,7 +224,7 @@ def _index_masks(
 ) -> tuple[dict[str, dict[int, tuple[MaskFile, ...]]], Files]:
     """Masks and part labels by camera and frame."""
     masks: dict[str, dict[int, tuple[MaskFile, ...]]] = {name: {} for name in folders}
-    labels: Files = {name: {} for name in folders}
+    labels: dict[str, dict[int, str]] = {name: {} for name in folders}
     for kind in MASKS:
         for name, folder in folders.items():
             # mask/Camera_B1, or mask/images/00 as some copies have it

@@ -1,0 +1,128 @@
+"""Jobs of a sweep: a process each, so that one that dies does not end the others."""
+
+import ctypes
+import json
+import re
+import signal
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig
+
+from gsgan.utils.console import make_console
+from gsgan.utils.errors import ConfigError
+
+MARK = "unfinished.txt"
+"""In a job's folder until it has ended well; says why it has not."""
+STARTED = "it was started and has not ended"
+STOPPED = 75  # exit status of a job that can go on: EX_TEMPFAIL of sysexits.h
+PR_SET_PDEATHSIG = 1
+STOPS = tuple(
+    getattr(signal, name)
+    for name in ("SIGINT", "SIGTERM", "SIGUSR1", "SIGUSR2")
+    if hasattr(signal, name)
+)
+OF_THE_SWEEP = re.compile(r"[+~]*hydra[./](mode|run|sweep|sweeper|launcher)\b")
+
+
+def run_job(command: str, objective: str | None) -> float | None:
+    """Runs one job of a sweep as a command of its own, in its own folder.
+
+    Convention: a job that fails does not raise, since that would end some sweepers; it leaves
+    `MARK` in its folder and has no score. A signal that asks this process to stop is passed on,
+    and takes effect here when the job has ended: submitit requeues a job in its handler.
+
+    Args:
+        command: ``train`` of ``python -m gsgan.train``.
+        objective: ``split.variant.metric`` of the metrics.json that the job writes, or None.
+
+    Returns:
+        The score of that name; None without an objective, or if the job has failed.
+    """
+    settings = HydraConfig.get()
+    folder = Path(settings.runtime.output_dir)
+    mark = folder / MARK
+    mark.write_text(STARTED)
+    given = (*settings.overrides.task, *settings.overrides.hydra)
+    arguments = [x for x in given if not OF_THE_SWEEP.match(x)]
+    quoted = str(folder).replace("\\", "\\\\").replace("'", "\\'")
+    own = ("hydra.mode=RUN", f"hydra.run.dir='{quoted}'")
+    status = _status([sys.executable, "-m", f"gsgan.{command}", *arguments, *own])
+    if status == 0:
+        try:
+            score = None if objective is None else _score(folder / "metrics.json", objective)
+        except ConfigError as error:
+            mark.write_text(str(error))
+        else:
+            mark.unlink()
+            return score
+    elif status < 0:
+        mark.write_text(f"it was killed by {signal.Signals(-status).name}")
+    elif status == STOPPED:
+        mark.write_text("it was stopped by a signal, after a checkpoint")
+    elif mark.read_text() == STARTED:
+        mark.write_text("it ended with a traceback")
+    return None
+
+
+def _status(command: list[str]) -> int:
+    """The exit status of a command, negative for a signal; see `run_job`."""
+    received: list[int] = []
+
+    def relay(number: int, _: Any) -> None:
+        received.append(number)
+        child.send_signal(number)
+
+    # Linux kills the job with its parent: the sweep may be started again at once
+    prctl = ctypes.CDLL(None).prctl if sys.platform == "linux" else None
+    bound = prctl and partial(prctl, PR_SET_PDEATHSIG, signal.SIGKILL)
+    with subprocess.Popen(command, preexec_fn=bound) as child:
+        before = {number: signal.signal(number, relay) for number in STOPS}
+        try:
+            status = child.wait()
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+    if received and status:
+        signal.raise_signal(received[0])
+    return status
+
+
+def _score(path: Path, name: str) -> float:
+    found: Any = json.loads(path.read_text())
+    for key in name.split("."):
+        found = found.get(key) if isinstance(found, dict) else None
+    if not isinstance(found, (int, float)):
+        raise ConfigError(f"objective={name}: {path} has no such score; name split.variant.metric")
+    return float(found)
+
+
+def unfinished(folder: Path) -> str | None:
+    """Why the job in a folder is unfinished, or None."""
+    mark = folder / MARK
+    return mark.read_text() if mark.is_file() else None
+
+
+def note(folder: Path, message: str) -> None:
+    """Records why the job in a folder failed, if it is one of a sweep."""
+    if (mark := folder / MARK).is_file():
+        mark.write_text(message)
+
+
+class NameUnfinished(Callback):
+    """Names the unfinished jobs when a sweep ends, and ends it with exit status 1."""
+
+    def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
+        """Called by Hydra."""
+        folders = sorted(mark.parent for mark in Path(config.hydra.sweep.dir).rglob(MARK))
+        if folders:
+            console = make_console()
+            console.print(f"{len(folders)} jobs are unfinished; the same command continues them:")
+            for folder in folders:
+                console.print(f"{folder}: {unfinished(folder)}", soft_wrap=True, highlight=False)
+            sys.exit(1)

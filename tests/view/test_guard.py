@@ -1,0 +1,57 @@
+"""Web pages other than the viewer's own cannot connect to it."""
+
+import pytest
+
+from gsgan.view.guard import guarded, refusal
+
+HOST = "127.0.0.1:8080"
+
+
+@pytest.mark.parametrize(
+    ("host", "origin", "served"),
+    [
+        (HOST, None, "127.0.0.1"),  # no browser
+        (HOST, f"http://{HOST}", "127.0.0.1"),
+        ("localhost:9999", "http://localhost:9999", "127.0.0.1"),  # a forwarded port
+        ("[::1]:8080", "http://[::1]:8080", "::1"),
+        ("192.168.0.7:8080", "http://192.168.0.7:8080", "0.0.0.0"),
+        ("studio.lab:8080", "http://studio.lab:8080", "Studio.lab"),
+    ],
+)
+def test_the_viewers_own_page_is_answered(host, origin, served):
+    assert refusal(host, origin, served) is None
+
+
+@pytest.mark.parametrize(
+    ("host", "origin"),
+    [
+        (HOST, "http://evil.example"),
+        (HOST, "null"),  # a file, a sandboxed frame
+        (HOST, "http://127.0.0.1:3000"),  # another server of this machine
+        (HOST, f"http://{HOST}.evil.example"),
+        ("evil.example:8080", "http://evil.example:8080"),  # DNS rebinding
+        ("evil.example:8080", None),
+        (None, None),
+    ],
+)
+def test_other_pages_are_refused(host, origin):
+    assert refusal(host, origin, "127.0.0.1")
+
+
+def test_visers_server_refuses_them():
+    viser = pytest.importorskip("viser", reason="the extra view is not installed")
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect
+
+    with guarded("127.0.0.1"):
+        server = viser.ViserServer("127.0.0.1", 0, verbose=False)
+    try:
+        address = f"127.0.0.1:{server.get_port()}"
+        version = [f"viser-v{viser.__version__}"]
+        with connect(f"ws://{address}", origin=f"http://{address}", subprotocols=version):
+            pass
+        for origin in ("http://evil.example", "null"):
+            with pytest.raises(InvalidStatus, match="403"):
+                connect(f"ws://{address}", origin=origin, subprotocols=version)
+    finally:
+        server.stop()
