@@ -34,8 +34,6 @@ class SkinnedPoints(nn.Module):
     joints: Tensor
     bone_index: Tensor
     bone_weight: Tensor
-    stretch_columns: Tensor
-    stretch_factors: Tensor
     means: Tensor
     chosen: Tensor
     spacing: Tensor
@@ -49,13 +47,10 @@ class SkinnedPoints(nn.Module):
         chosen = farthest_points(vertices, every if count is None else min(count, every))
         self.parents = body.parents
         means = vertices[chosen]
-        columns, factors = (x.unflatten(0, (-1, 3))[chosen] for x in stretch_terms(body))
         for name, value in {
             "joints": body.joints.float(),
             "bone_index": body.bone_index[chosen],
             "bone_weight": body.bone_weight[chosen].float(),
-            "stretch_columns": columns.flatten(0, 1),
-            "stretch_factors": factors.flatten(0, 1),
             "means": means,
             "chosen": chosen,
             "spacing": neighbour_distance(means).clamp_min(1e-4),
@@ -76,21 +71,11 @@ class SkinnedPoints(nn.Module):
     def blend(self, pose: BodyPose) -> tuple[Tensor, Tensor]:
         """The affine map of each point: ``A [B, N, 3, 3]`` and ``t [B, N, 3]``.
 
-        A blend of rotations is not a rotation; shapes are transformed by :meth:`shapes`.
+        A blend of rotations is not a rotation, so shapes are transformed as covariances ``A Σ Aᵀ``.
         """
         bones = self.with_bones(pose).bones
         assert bones is not None
         return blend_transforms(bones, self.bone_index, self.bone_weight)
-
-    def shapes(self, pose: BodyPose, A: Tensor) -> Tensor:
-        """The linear map of each point's shape, ``J [B, N, 3, 3]``: covariances become ``J Σ Jᵀ``.
-
-        With ``A`` of :meth:`blend`, to which it adds the stretch of the surface, so that Gaussians
-        leave no holes where skinning pulls their means apart.
-        """
-        bones = self.with_bones(pose).bones
-        assert bones is not None
-        return stretched(A, bones, self.stretch_columns, self.stretch_factors)
 
 
 class SkinnedGaussians(nn.Module):
@@ -114,16 +99,16 @@ class SkinnedGaussians(nn.Module):
         self.logit_opacities = nn.Parameter(torch.full((count,), logit))
 
     def deformed(
-        self, J: Tensor, means: Tensor, log_scales: Tensor, logits: Tensor, features: Tensor
+        self, A: Tensor, means: Tensor, log_scales: Tensor, logits: Tensor, features: Tensor
     ) -> Gaussians:
-        """Gaussians at ``means [B, N, 3]``, their shapes transformed by ``J [B, N, 3, 3]``."""
+        """Gaussians at ``means [B, N, 3]``, their shapes transformed by ``A [B, N, 3, 3]``."""
 
         def make() -> Tensor:
             unit = functional.normalize(self.quats, dim=-1, eps=1e-6)
             return quaternion_to_rotation_matrix(unit) * log_scales.exp().unsqueeze(-2)
 
-        axes = J @ derived(self, "axes", make, *self.parameters(recurse=False))
-        opacities = torch.sigmoid(logits).expand(len(J), -1)
+        axes = A @ derived(self, "axes", make, *self.parameters(recurse=False))
+        opacities = torch.sigmoid(logits).expand(len(A), -1)
         return Gaussians(means, None, None, opacities, features, covariances=axes @ axes.mT)
 
 
@@ -139,6 +124,7 @@ class BodyPoints(nn.Module):
         points: vertices used, spread evenly over the surface; None for all.
         sigma: initial standard deviation, as a share of the distance to the nearest neighbour.
         mean_step: of Ψ: its means move by this share of what they would on a skeleton's points.
+        stretch: shapes also follow the stretch of the surface, see `gsgan.body.lbs.stretched`.
     """
 
     rest_points: Tensor
@@ -153,6 +139,7 @@ class BodyPoints(nn.Module):
         points: int | None = None,
         sigma: float = 0.7,
         mean_step: float = 1.0,
+        stretch: bool = False,
     ) -> None:
         super().__init__()
         above("model.body_points.sigma", sigma)
@@ -163,6 +150,11 @@ class BodyPoints(nn.Module):
         normals = vertex_normals(body.vertices.float(), body.faces)[self.points.chosen]
         self.register_buffer("rest_normals", normals, persistent=False)
         self.register_buffer("part_id", torch.arange(len(self.points)), persistent=False)
+        self.stretch = stretch
+        if stretch:
+            terms = [x.unflatten(0, (-1, 3))[self.points.chosen] for x in stretch_terms(body)]
+            for name, x in zip(("columns", "factors"), terms, strict=True):
+                self.register_buffer(f"stretch_{name}", x.flatten(0, 1), persistent=False)
 
     @property
     def n_points(self) -> int:
@@ -171,7 +163,9 @@ class BodyPoints(nn.Module):
 
     def forward(self, pose: BodyPose) -> Points:
         """G in pose; each point is its own part, its frame the linear part of its skinning."""
+        pose = self.points.with_bones(pose)
         A, t = self.points.blend(pose)
+        stretch = self.stretch and (pose.bones, self.stretch_columns, self.stretch_factors)
         scales = (self.sigma * self.points.spacing).expand(len(A), -1)
         return Points(
             means=transformed(A, t, self.points.means),
@@ -181,7 +175,7 @@ class BodyPoints(nn.Module):
             valid=torch.ones_like(scales, dtype=torch.bool),
             part_id=self.part_id,
             normals=moved_normals(A, self.rest_normals),
-            stretched=self.points.shapes(pose, A),
+            stretched=stretched(A, *stretch) if stretch else None,
         )
 
 

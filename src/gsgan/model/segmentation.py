@@ -103,15 +103,14 @@ class Segmentation(SkinnedGaussians):
         return functional.one_hot(self.truth_table[labels], self.classes)[:, 1:].float()
 
     def gaussians(self, pose: BodyPose) -> Gaussians:
-        """The body's Gaussians in pose: covariances J Σ Jᵀ, features = one-hot class."""
+        """The body's Gaussians in pose: covariances A Σ Aᵀ, features = one-hot class."""
         A, t = self.points.blend(pose)
         log_scales: Tensor = self.log_scales
         logits: Tensor = self.logit_opacities
         if self.common is not None:
             log_scales, logits = log_scales + self.common[0], logits + self.common[1]
         means, features = transformed(A, t, self.points.means), self.one_hot.expand(len(A), -1, -1)
-        shapes = self.points.shapes(pose, A)
-        return self.deformed(shapes, means, log_scales, logits, features)
+        return self.deformed(A, means, log_scales, logits, features)
 
     def raster(self, pose: BodyPose, camera: Camera) -> Raster:
         """The splatted body: features are its classes, alpha its silhouette."""

@@ -73,7 +73,7 @@ class SurfaceGaussians(SkinnedGaussians):
         low, high = (math.log(bound * self.body_height) for bound in self.scale_range)
         sh = self.sh[:, : (self.active_degree + 1) ** 2].expand(len(A), -1, -1, -1)
         return self.deformed(
-            self.points.shapes(pose, A),
+            A,
             means,
             bounded(self.log_scales, low, high),
             bounded(self.logit_opacities, -self.logit_bound, self.logit_bound),
