@@ -35,6 +35,7 @@ Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 TRUNK = (*SHOULDERS, *HIPS)
+AXES = ("x", "y", "z", "-x", "-y", "-z")
 FPS = 30.0  # assumed where neither the file nor the user gives it
 OWN = 0.02  # largest relative difference of bone lengths at which a motion is the subject's own
 SELDOM = 0.2  # a joint seen in a smaller share of the frames counts as a false detection
