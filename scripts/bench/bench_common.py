@@ -6,12 +6,15 @@ import contextlib
 import ctypes
 import gc
 import io
+import json
 import os
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
+import pandas as pd
 import torch
 from hydra.utils import instantiate
 from matplotlib.axes import Axes
@@ -28,6 +31,12 @@ from gsgan.utils.errors import GsganError
 
 HERE = Path(__file__).parent
 MEMORY_FRAMES = 4  # over which peak memory is taken
+
+
+def records(frame: pd.DataFrame) -> list[dict[str, Any]]:
+    """The rows as JSON values, with null for NaN and infinity."""
+    rows: list[dict[str, Any]] = json.loads(frame.to_json(orient="records", double_precision=15))
+    return rows
 
 
 def main(name: str, run: Callable[[DictConfig, Path], None]) -> None:

@@ -21,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 from timing import interleaved, median
 from torch import Tensor
 
-from gsgan.bench.common import NOTHING, Bench, check_whole, markdown, number, records, sentence
+from gsgan.bench.common import NOTHING, Bench, check_whole, markdown, number, sentence
 from gsgan.body.free import free_body
 from gsgan.scene import Camera, Gaussians, Raster
 from gsgan.skeleton import MEDIAPIPE33, Densify
@@ -75,7 +75,7 @@ def run(config: DictConfig, folder: Path) -> None:
             progress.advance(task)
     frame = pd.DataFrame(rows)
     text = f"{sentence(bench.where)}. Medians of interleaved runs.\n\n{table(frame)}"
-    record = {"bench": OmegaConf.to_container(config), "rows": records(frame)}
+    record = {"bench": OmegaConf.to_container(config), "rows": bench_common.records(frame)}
     bench.write("What accuracy costs in time", text, record, frame)
 
 

@@ -161,7 +161,7 @@ def run(config: DictConfig, folder: Path) -> None:
     record = {
         **about,
         "marks": marks,
-        "rows": common.records(frame),
+        "rows": bench_common.records(frame),
         "front": [frame.label[i] for i in front(frame, config.quality)],
     }
     second = "edge_f1" if perceptual is None else "lpips"

@@ -35,14 +35,13 @@ def copy(good, tmp_path):
 @pytest.fixture
 def check(monkeypatch):
     """Checks a folder: ``check(root, joint_jump=0.1, consistency={"min_inside": 0.7})``."""
-    from gsgan.check import geometry, overlays
+    from gsgan.check import overlays
     from gsgan.check.run import check_data
     from gsgan.data.datamodule import GsganData
     from gsgan.data.formats.capture import CaptureReader
     from gsgan.data.formats.consistency import Consistency
 
     # tests of the command draw them
-    monkeypatch.setattr(geometry, "geometry_drawing", lambda _: b"<?")
     monkeypatch.setattr(overlays, "strip", lambda *_, **__: b"")
 
     def run(

@@ -55,7 +55,6 @@ def test_a_good_capture_passes_and_leaves_a_report(good, command, tmp_path):
     assert len(strips) == 4  # one per camera
     strip = cv2.imdecode(np.frombuffer(base64.b64decode(strips[0]), np.uint8), 1)
     assert strip.shape == (360 + 18, 270 + 4 + 270, 3)
-    assert page.count("data:image/svg+xml;base64,") == 1  # the cameras
     for camera in ("cam00", "cam01", "cam02", "cam03"):
         assert f"camera {camera}" in page
     numbers = json.loads((tmp_path / "work" / "check.json").read_text())

@@ -9,7 +9,6 @@ from make import edit_json, edit_npz
 
 from gsgan.check.frames import reprojection_errors, skeleton_doubts
 from gsgan.check.geometry import (
-    geometry_drawing,
     geometry_findings,
     geometry_of,
 )
@@ -79,14 +78,6 @@ def test_a_person_of_ten_metres_is_an_error(subject):
     (finding,) = geometry_findings(subject, tall)
     assert finding.level == "error"
     assert "10 m" in finding.sentence
-
-
-def test_the_drawing_is_svg_with_every_camera(subject):
-    import xml.etree.ElementTree as tree
-
-    drawing = geometry_drawing(subject)
-    tree.fromstring(drawing)
-    assert all(f"<!-- {name} -->".encode() in drawing for name in subject.cameras)
 
 
 @pytest.mark.parametrize(

@@ -79,12 +79,6 @@ def markdown(frame: pd.DataFrame) -> str:
     return pages.markdown(list(frame.columns), frame.astype(str).to_numpy().tolist())
 
 
-def records(frame: pd.DataFrame) -> list[dict[str, Any]]:
-    """The rows as JSON values, with null for NaN and infinity."""
-    rows: list[dict[str, Any]] = json.loads(frame.to_json(orient="records", double_precision=15))
-    return rows
-
-
 def check_whole(config: DictConfig, **least: int) -> None:
     """Raises ConfigError for keys that are not whole numbers of at least the given value."""
     for name, low in least.items():

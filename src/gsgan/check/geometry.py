@@ -1,18 +1,15 @@
 """Units and geometry: distances of the cameras, height of the person, the up axis."""
 
-import io
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 
 from gsgan.check.report import Finding, Flagged, Table
 from gsgan.check.views import CheckedData, nanmedian
 from gsgan.data.formats.consistency import Float, far_cameras
 from gsgan.data.proportions import axis_name
 from gsgan.skeleton.sanitise import limb_length_sum
-from gsgan.utils.palette import BLACK, COLOURS, GREY
 
 POSSIBLE = (0.4, 3.0)  # metres of person: outside, units are wrong
 PLAUSIBLE = (1.2, 2.1)  # metres: smaller is a child or a wrong unit, taller is rare
@@ -111,30 +108,3 @@ def lens_table(subject: CheckedData, geometry: Geometry) -> Table:
         "camera", "pixels", "focal fx, fy", "centre (share)", "distortion", "distance m", "images",
     )  # fmt: skip
     return Table(headers, tuple(rows))
-
-
-def geometry_drawing(subject: CheckedData) -> bytes:
-    """Cameras, viewing directions and the person's path, from above and from the side: an SVG."""
-    figure = Figure((9, 4.5), layout="tight")
-    first = np.roll(np.abs(subject.up), 1)  # an axis of the ground
-    row, hips = len(subject.frames) // 2, subject.p[:, list(subject.template.hips)].mean(1)
-    centres = np.stack([camera.centre for camera in subject.cameras.values()])
-    reach = 0.25 * max(1.0, float(np.ptp(centres, axis=0).max()))  # metres
-    titles = {"seen from above": np.cross(subject.up, first), "seen from the side": subject.up}
-    for axes, (title, up) in zip(figure.subplots(1, 2), titles.items(), strict=True):
-        plane = np.stack([first, up])
-        axes.plot(*plane @ hips.T, color=GREY)
-        for edge in map(list, subject.template.edges):
-            if subject.visible[row, edge].all():
-                axes.plot(*plane @ subject.p[row, edge].T, color=BLACK, linewidth=1)
-        for i, (name, camera) in enumerate(subject.cameras.items()):
-            colour = COLOURS[i % len(COLOURS)]
-            line = plane @ np.stack([camera.centre, camera.centre + reach * camera.R[2]], 1)
-            axes.plot(*line, color=colour, linestyle=":", marker="o", markevery=[0])
-            axes.annotate(name, tuple(line[:, 0]), (4, 4), textcoords="offset points", color=colour)
-        axes.set(title=title, xlabel=f"{axis_name(first)} (m)", ylabel=f"{axis_name(up)} (m)")
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.grid(alpha=0.3)
-    stream = io.BytesIO()
-    figure.savefig(stream, format="svg")
-    return stream.getvalue()

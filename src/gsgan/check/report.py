@@ -85,7 +85,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Figure:
-    """An encoded image, JPEG or SVG, and the caption below it."""
+    """A JPEG and the caption below it."""
 
     caption: str
     image: bytes
@@ -93,8 +93,7 @@ class Figure:
     @property
     def source(self) -> str:
         """A data URL, for the page."""
-        kind = "svg+xml" if self.image.startswith(b"<?") else "jpeg"
-        return f"data:image/{kind};base64,{base64.b64encode(self.image).decode()}"
+        return f"data:image/jpeg;base64,{base64.b64encode(self.image).decode()}"
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,6 @@ MEANS = (
     "effects below show whether training corrects it; effects.colour_correction=on always does."
 )
 EFFECTS = "What is off is neither built nor computed; effects.<name>= forces one (docs/effects.md)."
-DRAWING = "The cameras, their viewing directions (dotted), the person and the path (grey)."
 
 
 class Measurements:
@@ -106,7 +105,6 @@ def sections(m: Measurements) -> tuple[Section, ...]:
         geometry.geometry_table(m.subject, m.geometry),
         geometry.lens_table(m.subject, m.geometry),
     )
-    drawing = Figure(DRAWING, geometry.geometry_drawing(m.subject))
     table = colour_table(m.colours, m.limits)
     strips = [
         Figure(
@@ -117,7 +115,7 @@ def sections(m: Measurements) -> tuple[Section, ...]:
     found = tuple(geometry.geometry_findings(m.subject, m.geometry))
     return (
         _contents(m),
-        Section("Units and cameras", units, found, (drawing,)),
+        Section("Units and cameras", units, found),
         _agreement(m),
         Section("Overlays", figures=tuple(strips), text=overlays.LEGEND),
         _frames(m),

@@ -20,6 +20,7 @@ from gsgan.data.proportions import (
     HIPS,
     SHOULDERS,
     Proportions,
+    axis_name,
     length,
     middle,
     upright,
@@ -34,11 +35,11 @@ Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 TRUNK = (*SHOULDERS, *HIPS)
+AXES = ("x", "y", "z", "-x", "-y", "-z")
 FPS = 30.0  # assumed where neither the file nor the user gives it
 OWN = 0.02  # largest relative difference of bone lengths at which a motion is the subject's own
 SELDOM = 0.2  # a joint seen in a smaller share of the frames counts as a false detection
 GAP = 5  # frames: in a longer gap a hand or face is not seen
-AXES = ("x", "y", "z", "-x", "-y", "-z")
 PARENT = {b: a for a, b in MEDIAPIPE33.limbs if b not in TRUNK}
 
 
@@ -146,8 +147,7 @@ def up_axis(motion: Clip) -> str:
     """The axis nearest to the median direction from hips to shoulders, e.g. "-y"."""
     known = np.nan_to_num(motion.p)
     spine = np.median(middle(known, SHOULDERS) - middle(known, HIPS), axis=0)
-    axis = int(np.abs(spine).argmax())
-    return ("-" if spine[axis] < 0 else "") + AXES[axis]
+    return axis_name(spine)
 
 
 def completed(motion: Clip, up: str) -> Float:

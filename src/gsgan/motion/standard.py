@@ -12,6 +12,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 from scipy.spatial.transform import Rotation
 
+from gsgan.data.proportions import axis_name
 from gsgan.motion.rig import ARM, FINGERS, LEG, REQUIRED, SIDES, SPINE, limb_axes, rest_turns
 from gsgan.motion.rotations import Array, between, blend, rotation, unit
 from gsgan.utils.errors import DataError
@@ -198,9 +199,8 @@ def standard_motion(rig: RigMotion, path: Path, up: str | None = None) -> Standa
     turns |= _trunk(rig, known, R)
     hip, knee, ankle = (joints["Left" + bone] for bone in LEG)
     thigh, shin = (np.linalg.norm(a - b, axis=1) for a, b in ((hip, knee), (knee, ankle)))
-    at = int(np.abs(axis).argmax())
-    name = ("-" if axis[at] < 0 else "") + "xyz"[at]
-    return StandardMotion(turns, joints, float(np.median(thigh) + np.median(shin)), name)
+    leg = float(np.median(thigh) + np.median(shin))
+    return StandardMotion(turns, joints, leg, axis_name(axis))
 
 
 def body_joints(rig: RigMotion, path: Path) -> dict[str, int]:
