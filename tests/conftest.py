@@ -205,6 +205,18 @@ def bare(capture, shared, tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
+def on_body(capture, shared):
+    """``on_body()``: a tiny run whose Gaussians are on the body's surface."""
+    from commands import train
+
+    def make(folder: Path) -> None:
+        result = train(capture, folder, "effects.body_points=on", "evaluate=false")
+        assert result.returncode == 0, result.stdout + result.stderr
+
+    return lambda: shared("on_body", make)
+
+
+@pytest.fixture(scope="session")
 def dance():
     """A smooth motion of the free body: it waves, walks sideways and turns a little."""
     rng, body = np.random.default_rng(3), free_body()

@@ -67,7 +67,7 @@ def model_file(shared):
 
 
 @pytest.fixture
-def place(capture, run, bare, model_file, tmp_path_factory):
+def place(capture, run, bare, on_body, model_file, tmp_path_factory):
     """Puts real, tiny files in the place of a documented line's placeholders."""
 
     def folder() -> Path:
@@ -160,6 +160,7 @@ def place(capture, run, bare, model_file, tmp_path_factory):
 
     makers: dict[str, Callable[[], Path | str]] = {
         "gsgan.render run=<run folder>": lambda: f"gsgan.render run={bare}",
+        "run=<run folder> format=html": lambda: f"run={on_body()} format=html",
         "/path/to/dance.bvh": lambda: moving("dance.bvh"),
         "/path/to/walk.bvh": lambda: moving("walk.bvh"),
         **{f"/path/to/sign_{i}.pose": partial(sign, f"sign_{i}.pose") for i in (1, 2, 3)},

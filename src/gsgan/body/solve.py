@@ -185,8 +185,12 @@ class Solver(nn.Module):
             landmarks = p[:, BODY:ALL]
             hands = landmarks, (shown[:, BODY:ALL] > 0) & landmarks.isfinite().all(-1)
         seen = body, shown[:, :BODY], valid
-        found = compiled.solve(self._constants, self._counts(), _settings(), seen, hands)
+        found = compiled.solve(*self.job(), seen, hands)
         return BodyPose(*(x.to(skeleton.device) for x in found))
+
+    def job(self) -> tuple[dict[str, Tensor], dict[str, int], dict[str, float]]:
+        """Constants, counts and numbers of the compiled solve, see `compiled`."""
+        return self._constants, self._counts(), _settings()
 
     def _counts(self) -> dict[str, int]:
         """Those of `compiled.COUNTS`."""

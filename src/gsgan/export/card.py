@@ -20,6 +20,8 @@ HOLDS = {
     "out. Rasterisation is not part of it.",
     "torch": "The whole avatar as a program of `torch.export`: skeleton and camera in, image and "
     "alpha out. Import `gsgan.splat` before loading it.",
+    "html": "A page that renders the avatar in a browser, without its networks: Step I's colour, "
+    "with residuals linear in the harmonics of each Gaussian's normal.",
     "safetensors": "The weights, with the config as metadata: "
     "`gsgan.export.weights.load_weights(file)` gives the avatar.",
 }

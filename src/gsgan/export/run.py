@@ -1,5 +1,6 @@
 """Writes the export that a config describes."""
 
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import cast
@@ -10,8 +11,10 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from rich.progress import track
 
 from gsgan.export.card import card
+from gsgan.export.page import page, refuse_unsuitable
 from gsgan.export.splats import Splats, glb_bytes, ply_bytes, splats_of
 from gsgan.model.drive import REST, Drive, drive_of, inputs_of
+from gsgan.model.harmonic import Harmonic, distilled
 from gsgan.model.runs import Run
 from gsgan.utils.checks import above, one_of, whole
 from gsgan.utils.console import make_console
@@ -25,8 +28,10 @@ ENDINGS = {
     "onnx": ".onnx",
     "torch": ".pt2",
     "safetensors": ".safetensors",
+    "html": ".html",
 }
 CARD = "MODEL_CARD.md"
+DISTILLED = 200  # training poses over which Ψ's residuals are fitted, at most
 
 
 def export_config(config: DictConfig) -> None:
@@ -55,7 +60,8 @@ def export_config(config: DictConfig) -> None:
         config.device = "cpu"
     run = Run.load(config)
     if kind in ("ply", "gltf"):
-        drive = _poses(config, run, kind)
+        rest = config.motion is None and kind == "gltf"
+        drive = _poses(_with_motion(config, REST) if rest else config, run)
         tell(drive.text)
         numbers = range(len(drive.p)) if sequence else range(1)
         for i in track(numbers, "writing", console=console, transient=True):
@@ -69,6 +75,8 @@ def export_config(config: DictConfig) -> None:
                 for path in out.glob("[0-9]" * 6 + ".ply"):
                     if path.name not in kept:
                         path.unlink()
+    elif kind == "html":
+        _write(out, _page(config, run, out.stem, tell))
     else:
         _write(out, _program(config, run, kind))
     beside = out / CARD if sequence else out.with_name(f"{out.stem}.{CARD}")
@@ -99,10 +107,31 @@ def _place(config: DictConfig, kind: str) -> Path:
     return out
 
 
-def _poses(config: DictConfig, run: Run, kind: str) -> Drive:
-    """The frames to export; by default the rest pose for glTF, a held-out one for .ply."""
-    if config.motion is None and kind == "gltf":
-        config = cast(DictConfig, OmegaConf.merge(config, {"motion": REST}))
+def _page(config: DictConfig, run: Run, name: str, tell: Callable[[str], None]) -> str:
+    """The text of a .html file; each motion is one of its own."""
+    refuse_unsuitable(run.avatar)
+    motions = {}
+    for motion in [config.motion] if isinstance(config.motion, str) else config.motion or ():
+        drive = _poses(_with_motion(config, str(motion)), run)
+        tell(drive.text)
+        motions[Path(motion).stem] = drive, float(config.fps)
+    if not isinstance(run.avatar.deformation, Harmonic):
+        drive = drive_of(_with_motion(config, "train"), run, 1.0)
+        chosen = np.unique(np.linspace(0, len(drive.p) - 1, DISTILLED).round().astype(int))
+        poses = [inputs_of(run.avatar, drive, i) for i in chosen.tolist()]
+        avatar = distilled(run.avatar, poses)
+        tell(f"distilled from {len(poses)} training poses")
+    else:
+        avatar = run.avatar
+    return page(run, avatar, motions, name)
+
+
+def _with_motion(config: DictConfig, motion: str) -> DictConfig:
+    return cast(DictConfig, OmegaConf.merge(config, {"motion": motion}))
+
+
+def _poses(config: DictConfig, run: Run) -> Drive:
+    """The frames to export; by default a held-out one."""
     drive = drive_of(config, run, float(above("fps", config.fps)))
     start = whole("start", config.start, 0)
     if start >= len(drive.p):

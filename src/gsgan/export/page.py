@@ -1,0 +1,231 @@
+"""An avatar as one web page: quantised Gaussians, the body's solver, motions and the renderer.
+
+Convention: the page evaluates `gsgan.model.harmonic` and projects as `gsgan.splat.project` does
+(src/gsgan/export/web). Its block is a JSON header and little-endian arrays, deflated.
+"""
+
+import base64
+import hashlib
+import html
+import json
+import math
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gsgan.body import compiled
+from gsgan.body.free import Body
+from gsgan.body.solve import Solver
+from gsgan.data.proportions import upright
+from gsgan.model.avatar import Avatar
+from gsgan.model.drive import Drive, rest_pose
+from gsgan.model.harmonic import Harmonic
+from gsgan.model.runs import Run
+from gsgan.motion.rotations import rotation
+from gsgan.skeleton import complete_skeleton
+from gsgan.utils.errors import ConfigError
+from gsgan.utils.provenance import SOFTWARE, SOURCE_TYPE, XMP
+
+WEB = Path(__file__).with_name("web")
+VERSION = 1  # of the block
+ALPHA_MIN = 1 / 255  # of the page, where the avatar's own is less
+KINDS = {"i1": "int8", "u1": "uint8", "i2": "int16", "u2": "uint16", "f4": "float32"}
+BEFORE_COLOUR = (
+    11  # numbers of a Gaussian before its colour: mean 3, quaternion 4, scale 3, opacity
+)
+
+Arrays = dict[str, NDArray]
+Plain = dict[str, object]
+
+
+def refuse_unsuitable(avatar: Avatar) -> None:
+    """Refuses avatars that a page cannot hold.
+
+    Raises:
+        ConfigError: naming the reason.
+    """
+    if avatar.body_points is None or avatar.deformation is None or avatar.solver is None:
+        raise ConfigError(
+            "format=html needs Gaussians on a skinned body and residuals of Ψ: an avatar with "
+            "effects.body_points, not model=lbs_splat or image_to_image"
+        )
+    if avatar.solver.fingers is None:
+        raise ConfigError(
+            "format=html publishes the body that the avatar moves with, which the licence of "
+            "SMPL's model files does not allow; train on the free body (data.smpl=null)"
+        )
+
+
+def page(run: Run, avatar: Avatar, motions: Mapping[str, tuple[Drive, float]], name: str) -> str:
+    """The text of a page.
+
+    Args:
+        run: the avatar's.
+        avatar: its `distilled` copy.
+        motions: drives and their frames per second by name.
+        name: the page's title.
+    """
+    content = base64.b64encode(zlib.compress(block(run, avatar, motions, name), 9)).decode()
+    style, script = ((WEB / file).read_text() for file in ("page.css", "gsgan.js"))
+    text = (WEB / "page.html").read_text()
+    for key, value in {
+        "script_hash": _hash(script),
+        "style_hash": _hash(style),
+        "software": SOFTWARE,
+        "source_type": SOURCE_TYPE,
+        "name": html.escape(name),
+        "style": style,
+        "avatar": content,
+        "script": script,
+    }.items():
+        text = text.replace(f"{{{key}}}", value)
+    return text
+
+
+def _hash(text: str) -> str:
+    """A source of a Content-Security-Policy: this text and nothing else."""
+    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+
+
+def block(run: Run, avatar: Avatar, motions: Mapping[str, tuple[Drive, float]], name: str) -> bytes:
+    """The avatar's header and arrays, see web/content.ts."""
+    header, arrays = gaussians_of(avatar)
+    people, more = body_of(run)
+    header |= people | {"version": VERSION, "name": name, "xmp": XMP}
+    arrays |= more
+    listed = []
+    still = {"rest pose": (rest_pose(run.proportions), 1.0)}
+    for i, (title, (drive, fps)) in enumerate((still | dict(motions)).items()):
+        theta, transl = poses_of(avatar, drive)
+        arrays[f"theta{i}"], step = quantised(theta, 32767)
+        arrays[f"transl{i}"] = transl
+        listed.append({"name": title, "fps": fps, "frames": len(theta), "step": float(step)})
+    header["motions"] = listed
+    places, data = {}, b""
+    for key, array in arrays.items():
+        kind = next(kind for kind, dtype in KINDS.items() if array.dtype == dtype)
+        places[key] = (kind, len(data), array.size)
+        data += _padded(array.astype(f"<{kind}").tobytes())
+    text = json.dumps(header | {"arrays": places}).encode()
+    text += b" " * (-len(text) % 8)
+    return len(text).to_bytes(8, "little") + text + data
+
+
+def _padded(data: bytes) -> bytes:
+    return data + bytes(-len(data) % 8)
+
+
+def quantised(values: NDArray, most: int) -> tuple[NDArray, NDArray]:
+    """Whole numbers within ± ``most`` and their step; of a matrix one step a row."""
+    largest = np.abs(values).max(axis=-1 if values.ndim == 2 else None, keepdims=values.ndim == 2)
+    step = np.maximum(largest, 1e-12) / most
+    kind = np.int8 if most < 128 else np.int16
+    return np.rint(values / step).astype(kind), np.asarray(step, np.float32)
+
+
+def gaussians_of(avatar: Avatar) -> tuple[Plain, Arrays]:
+    """The Gaussians at rest, their skinning, and the coefficients of their numbers.
+
+    Convention: what `gsgan.model.deformation` adds to residuals before it bounds them is added to
+    the first coefficient.
+    """
+    on_body, linear = avatar.body_points, avatar.deformation
+    assert on_body is not None
+    assert isinstance(linear, Harmonic)
+    points, degree = on_body.points, linear.active_degree
+    numbers = BEFORE_COLOUR + 3 * (degree + 1) ** 2
+    table = linear.coefficients.detach().double()[..., :numbers].clone()
+    table[..., :3] *= linear.mean_step
+    table[:, 0, 3] += 1
+    table[:, 0, 7:10] += (on_body.sigma * points.spacing).log()[:, None].double()
+    table[:, 0, 10] += math.log(linear.opacity / (1 - linear.opacity))
+    rows = table.permute(2, 1, 0).numpy()  # [numbers, 9, N]
+    follow = np.flatnonzero(rows[:, 1:].any((1, 2)))
+    first, first_step = quantised(rows[:, 0], 32767)
+    others, steps = quantised(rows[follow, 1:].reshape(-1, len(table)), 127)
+    means, weight = points.means.numpy(), points.bone_weight.double().numpy()
+    low = float(means.min())
+    step = float(means.max() - low) / 65535
+    weight = weight / weight.sum(1, keepdims=True)
+    settings = avatar.accuracy
+    header: Plain = {
+        "count": len(table),
+        "degree": degree,
+        "follow": follow.tolist(),
+        "weights": weight.shape[1],
+        "range": (low, step),
+        "bound": (linear.mean_bound or 0) * linear.body_height,
+        "height": linear.body_height,
+        "scales": [math.log(limit * linear.body_height) for limit in linear.scale_range],
+        "logit": linear.logit_bound,
+        "lowPass": settings.low_pass,
+        "alphaMin": max(settings.alpha_min, ALPHA_MIN),
+        "alphaMax": settings.alpha_max,
+        "fovClamp": settings.fov_clamp,
+        "near": settings.near,
+        "antialias": settings.antialias,
+        "supersample": settings.supersample,
+    }
+    return header, {
+        "mean": np.rint((means - low) / step).astype(np.uint16),
+        "normal": np.rint(32767 * on_body.rest_normals.numpy()).astype(np.int16),
+        "bone": points.bone_index.numpy().astype(np.uint8),
+        "weight": np.rint(65535 * weight).astype(np.uint16),
+        "first": first,
+        "others": others,
+        "steps": np.concatenate([first_step, steps])[:, 0],
+    }
+
+
+def body_of(run: Run) -> tuple[Plain, Arrays]:
+    """The body's landmarks and solver, the subject's proportions and the world's axes."""
+    body, subject = run.body, run.proportions
+    assert isinstance(body, Body)
+    assert run.avatar.solver is not None
+    header: Plain = {
+        "bones": len(body.parents),
+        "axes": (upright(subject.up).T @ rotation(np.array([0, 0, subject.facing]))).tolist(),
+        "ground": subject.ground,
+        "centre": list(run.scene.centre),
+        "rest": subject.rest.tolist(),
+    }
+    header["axes"] = [x for row in header["axes"] for x in row]  # type: ignore[attr-defined]
+    landmarks = torch.cat([body.landmarks, body.hand_landmarks]).float().numpy()
+    carrier = torch.cat([body.landmark_bone, body.hand_bone]).numpy()
+    return header, {
+        "landmark": landmarks,
+        "carrier": carrier.astype(np.uint8),
+        "body": np.frombuffer(solver_block(run.avatar.solver, body.parents), np.uint8),
+    }
+
+
+def solver_block(solver: Solver, parents: tuple[int, ...]) -> bytes:
+    """``struct Body`` of web/solve.cpp for 32-bit addresses, which count from its start."""
+    constants, counts, numbers = solver.job()
+    integers = np.array([1, 1, *(counts[name] for name in compiled.COUNTS)], "<i8").tobytes()
+    head = integers + np.array([numbers[n] for n in compiled.NUMBERS], "<f8").tobytes()
+    given = [constants[name].numpy() for name in compiled.CONSTANTS]
+    slots = len(given) + len(compiled.FRAMES)
+    slots += slots % 2  # structures are multiples of eight bytes
+    start, addresses, data = len(head) + 4 * (slots + 2), np.zeros(slots + 2, "<u4"), b""
+    for slot, array in (*enumerate(given), (slots, np.array(parents))):
+        addresses[slot] = start + len(data)
+        data += array.astype(f"<{array.dtype.kind}8").tobytes()
+    return head + addresses.tobytes() + data
+
+
+@torch.no_grad()
+def poses_of(avatar: Avatar, drive: Drive) -> tuple[NDArray, NDArray]:
+    """``theta [F, J, 3]`` and ``transl [F, 3]`` of a drive: its own, else solved."""
+    body = drive.body
+    if body is None:
+        p, seen = (torch.from_numpy(x) for x in (drive.p, drive.visibility))
+        body = avatar.body_pose(
+            *complete_skeleton(p, seen, avatar.template, avatar.limb_length_sum)
+        )
+    assert body is not None
+    return body.theta.float().numpy(), body.transl.float().numpy()
