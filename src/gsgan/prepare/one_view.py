@@ -135,8 +135,8 @@ class View:
 def solve_view(seen: Seen, focal: bool = True) -> View:
     """The person and the camera that fit what one camera saw.
 
-    The focal length starts from several values, since nearby solutions hide each other:
-    landmarks of a body that bends freely fit almost any focal length. Keyframes tell it and the shape; then all
+    The focal length starts from several values: landmarks of a body that bends freely fit almost
+    any of them, and wrong ones hide the right one. Keyframes determine it and the shape; then all
     frames are solved together, smooth in time.
 
     Args:
