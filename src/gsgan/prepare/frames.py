@@ -16,7 +16,9 @@ from gsgan.prepare.sources import Bytes, Recording, opened, video_recording
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import write_npz, writing
 
-RATE, MOST = 12.0, 400  # images per second, and in total; longer videos are sampled more thinly
+RATE = 12.0  # images per second, unless that makes fewer than FEW or more than MOST
+FEW, MOST = 60, 400
+LEAST = 12  # images of use, without which there is no solution
 LONGEST = 1920  # pixels of the longer side: larger images are reduced
 TIMES = "times.npz"  # written last
 LEAST_JOINTS, CONFIDENT = 16, 0.5  # of 33: fewer are not a whole person
@@ -49,7 +51,8 @@ def sample(video: Path, folder: Path) -> tuple[Recording, Float]:
 
 def _extract(source: Recording, folder: Path) -> None:
     rate = source.fps or 30.0
-    every = max(1 / RATE, source.count / rate / MOST)
+    seconds = source.count / rate
+    every = max(min(1 / RATE, seconds / FEW), seconds / MOST)
     shrink = min(1.0, LONGEST / max(source.size))
     video, number, numbers, times = opened(source.path, True), -1, list[int](), list[float]()
     while video.grab() and len(times) < 2 * MOST:  # the header's length may be wrong
@@ -160,7 +163,7 @@ def check_enough(video: Path, frames: int, left: dict[str, Bool]) -> None:
         DataError: with the number of frames left out, by reason.
     """
     used = frames - sum(int(one.sum()) for one in left.values())
-    if used >= LEAST_JOINTS:
+    if used >= LEAST:
         return
     why = ", ".join(f"{reason}: {int(one.sum())}" for reason, one in left.items() if one.any())
     raise DataError(

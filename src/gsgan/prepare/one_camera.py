@@ -19,7 +19,17 @@ from gsgan.data.joints import ALL, ARM_PAIRS, BODY, FLIP_GROUPS, HANDS, LEFT, LE
 from gsgan.prepare import landmarks
 from gsgan.prepare.camera_array import Bool, CameraArray, Float, Ints
 from gsgan.prepare.cleanse import cleanse, smooth
-from gsgan.prepare.frames import check_enough, extents, left_out, look, sample
+from gsgan.prepare.frames import (
+    FEW,
+    LONGEST,
+    MOST,
+    RATE,
+    check_enough,
+    extents,
+    left_out,
+    look,
+    sample,
+)
 from gsgan.prepare.images import find_masks
 from gsgan.prepare.mediapipe import run_tool
 from gsgan.prepare.one_view import FEET, Seen, View, solve_view
@@ -75,7 +85,7 @@ def solve_video(options: Options, stages: StageFolder, console: Console) -> Film
     """
     video = options.folder("source")
     with console.status("taking images from the video"):
-        folder = stages.path("frames", [video.name, *stamp(video)])
+        folder = stages.path("frames", [*stamp(video), RATE, FEW, MOST, LONGEST])
         source, time = sample(video, folder)
     found, masks = _detect(options, source, stages, console)
     numbers = np.array(list(source.files))
@@ -176,7 +186,7 @@ def _solve(
         values[swapped] = values[swapped][:, mirror]
     u = np.nan_to_num(px - np.array(size[::-1]) / 2) / guess
     given = Seen(*(torch.from_numpy(x) for x in (u, conf, world, time)))
-    return solve_view(given, options.focal is None), guess
+    return solve_view(given, options.landmark_noise, options.focal is None), guess
 
 
 def _doubtful(view: View) -> Bool:

@@ -24,8 +24,8 @@ from gsgan.skeleton import MEDIAPIPE33
 from gsgan.utils.arrays import evenly_spaced
 
 KEYFRAMES = 50  # at most, for shape and focal length
-FOCAL_SPREAD = 0.2  # standard deviation of the guess's logarithm
-NOISE, LEAST_NOISE = 0.01, 0.001  # of landmarks, share of the person's size: at first, at least
+FOCAL_SPREAD = 0.07  # of the guess, as a logarithm: small, as frames are not independent
+NOISE = 0.01  # of landmarks in the first steps, share of the person's size
 DEPTH = 0.25  # metres, standard deviation of the detector's own 3D landmarks
 ACCELERATION = 8.0  # metres per square second, standard deviation
 SLIDING, GROUND = 0.1, 0.02  # metres per second, metres: of a standing foot
@@ -35,9 +35,8 @@ OUTLIER = 3.0  # standard deviations at which a landmark counts half
 LIMBS = 0.05  # weight of the prior of arms and legs, which would make them shorter
 GAP = 0.5  # seconds: motion is not smooth over a longer gap
 ZOOMS = (-0.4, -0.2, 0.0, 0.2, 0.4)  # logarithms of focal lengths to start from
-ROUNDS, STEPS, SETTLED = 2, 15, 1e-4
+STEPS, SETTLED = 20, 1e-4
 MIN_STANDING = 8  # landmarks of feet: fewer do not show the ground
-MEDIAN_ERROR = 1.18  # of 2D errors, standard deviations
 DAMPING, EASIER, HARDER = 1e-3, 0.3, 10.0
 NEAR = 0.2  # metres before the camera
 FEET = [29, 31, 30, 32]  # heels and toes
@@ -132,7 +131,7 @@ class View:
     standing: Tensor
 
 
-def solve_view(seen: Seen, focal: bool = True) -> View:
+def solve_view(seen: Seen, noise: float, focal: bool = True) -> View:
     """The person and the camera that fit what one camera saw.
 
     The focal length starts from several values: landmarks of a body that bends freely fit almost
@@ -141,6 +140,8 @@ def solve_view(seen: Seen, focal: bool = True) -> View:
 
     Args:
         seen: of all frames.
+        noise: standard deviation of landmarks, share of the person's size in the image. A body that
+            bends fits nearly all of it, so residuals do not tell it.
         focal: whether the focal length is unknown; else the guess is exact.
     """
     standing = Problem(seen).standing_feet()
@@ -153,15 +154,12 @@ def solve_view(seen: Seen, focal: bool = True) -> View:
     few, found = at[::2], []
     for zoom in ZOOMS if focal else (0.0,):
         state, _ = problem(few, NOISE, focal=False).minimise(problem(few, NOISE).start(zoom), 10)
-        _, cost = problem(few, NOISE / 3, focal=False).minimise(state, 8)
-        found.append((cost + zoom**2 / FOCAL_SPREAD**2, zoom))
+        _, cost = problem(few, min(noise, NOISE / 3), focal=False).minimise(state, 8)
+        found.append((cost, zoom))
     keys = problem(at, NOISE, focal=False)
     state, _ = keys.minimise(keys.start(min(found)[1]), 10)
-    noise = NOISE
-    for _ in range(ROUNDS):
-        noise = max(LEAST_NOISE, min(NOISE, keys.noise_of(state)))
-        keys = problem(at, noise, focal=focal)
-        state, _ = keys.minimise(state)
+    keys = problem(at, noise, focal=focal)
+    state, _ = keys.minimise(state)
     spread = keys.spread(state) if focal else 0.0
 
     # all frames: first one by one, then as a motion
@@ -420,7 +418,7 @@ class Problem:
         # elimination of the poses
         H = H + torch.diag_embed(damping * torch.diagonal(H, dim1=-2, dim2=-1))
         right = torch.cat([cross, g[..., None]], dim=-1).reshape(F * D, -1)
-        inner = _banded(H, beside, right)
+        inner = _banded(H, beside, right) if self.smooth else _blocks(H, right)
         flat = right[:, :-1].mT
         S = common - flat @ inner[:, :-1]
         c = torch.linalg.solve(S + damping * common.diag().diag(), flat @ inner[:, -1] - slope)
@@ -473,11 +471,6 @@ class Problem:
         standing = torch.cat([slow, none]) & torch.cat([none, slow])
         return (standing & (self.seen.weight[:, FEET] > 0)).to(depth)
 
-    def noise_of(self, at: State) -> float:
-        """The landmarks' noise in a solution, share of the person's size."""
-        share = self.errors(at)[1] / self.seen.size[:, None]
-        return float(share.nanmedian()) / MEDIAN_ERROR
-
     def errors(self, at: State) -> tuple[Tensor, Tensor]:
         """Landmarks ``[F, 33, 3]`` and their reprojection errors ``[F, 33]``, NaN = not seen."""
         X = self.landmarks(at, self.solver(at.common))
@@ -490,6 +483,12 @@ def _add(W: Tensor, frames: slice, values: Tensor) -> None:
     """Adds ``values [F, 4, 3, 3]`` to the blocks of `FEET`."""
     for i, foot in enumerate(FEET):
         W[frames, foot] += values[:, i]
+
+
+def _blocks(H: Tensor, right: Tensor) -> Tensor:
+    """Solves the equations with diagonal blocks ``H [F, D, D]``."""
+    F, D, _ = H.shape
+    return torch.cholesky_solve(right.view(F, D, -1), torch.linalg.cholesky(H)).view(F * D, -1)
 
 
 def _banded(H: Tensor, beside: list[Tensor], right: Tensor) -> Tensor:

@@ -52,6 +52,7 @@ class Options:
     crop_px: int = 16
     height: float | None = None
     focal: float | None = None
+    landmark_noise: float = 0.008
     offsets: Mapping[str, int] | None = None
     frames: Any = None
     fps: float | None = None
@@ -86,6 +87,7 @@ class Options:
         for name in ("fps", "height", "focal"):
             if getattr(self, name) is not None:
                 above(name, getattr(self, name))
+        above("landmark_noise", self.landmark_noise)
         whole("workers", self.workers, 1)
         above("scale", between("scale", self.scale, 0, 1))
         one_of("format", self.format, ("jpg", "png"))
