@@ -25,7 +25,7 @@ LEAST_JOINTS, CONFIDENT = 16, 0.5  # of 33: fewer are not a whole person
 BLURRED = 0.3  # share of the usual sharpness
 JUMP = 0.5  # of the person's size from image to image: the detector found somebody else
 SHARP_SIZE = 256  # pixels: sharpness is measured on the person at this height
-CORNERS = 200  # of the background, that show a moving camera
+CORNERS, FEW_CORNERS = 200, 20  # of the background, that show a moving camera: most, least
 
 
 def sample(video: Path, folder: Path) -> tuple[Recording, Float]:
@@ -148,7 +148,7 @@ def _flow(before: Bytes, after: Bytes, box: Ints) -> Float:
     margin = (bottom - top) // 8
     mask[max(top - margin, 0) : bottom + margin, max(left - margin, 0) : right + margin] = 0
     points = cv2.goodFeaturesToTrack(before, CORNERS, 0.01, 8, mask=mask)
-    if points is None:
+    if points is None or len(points) < FEW_CORNERS:
         return np.zeros(2)
     start = np.asarray(points, np.float32)
     moved, found, _ = cv2.calcOpticalFlowPyrLK(before, after, start, start.copy())

@@ -26,8 +26,11 @@ from gsgan.utils.arrays import evenly_spaced
 KEYFRAMES = 50  # at most, for shape and focal length
 FOCAL_SPREAD = 0.07  # of the guess, as a logarithm: small, as frames are not independent
 NOISE = 0.01  # of landmarks in the first steps, share of the person's size
-DEPTH = 0.25  # metres, standard deviation of the detector's own 3D landmarks
+# Metres, standard deviation of the detector's own 3D landmarks, beside 2D landmarks of that noise:
+# the more exact these are, the more they say of depth themselves.
+DEPTH = 0.11
 ACCELERATION = 8.0  # metres per square second, standard deviation
+ACCELERATIONS = 10.0  # independent ones per second
 SLIDING, GROUND = 0.1, 0.02  # metres per second, metres: of a standing foot
 BALANCE = 0.08  # metres by which the trunk is not above standing feet
 STILL = 0.25  # metres per second: a slower foot stands
@@ -41,6 +44,8 @@ DAMPING, EASIER, HARDER = 1e-3, 0.3, 10.0
 NEAR = 0.2  # metres before the camera
 FEET = [29, 31, 30, 32]  # heels and toes
 LIMB = re.compile(r"arm_|elbow$|thigh_|knee$")
+# The residual of a landmark in two and in three dimensions, of the feet, and of balance.
+GROUPS = torch.arange(71).repeat_interleave(torch.tensor([2] * 33 + [3] * 33 + [1] * 4 + [2]))
 OWN = 4  # numbers of `State.common` before those of the shape
 HIPS = list(MEDIAPIPE33.hips)
 TRUNK = list(MEDIAPIPE33.torso)
@@ -84,29 +89,36 @@ class State:
 
 @dataclass
 class Normal:
-    """Normal equations of landmarks, before the chain rule.
+    """Normal equations by landmarks, ``N`` of 99 numbers a frame, before the chain rule.
 
     Args:
         cost: scalar.
-        g: ``[F, 33, 3]`` half the gradient.
-        whole: ``[F, 33, 3, 33, 3]``; ``near [2, F, 33]`` times the identity couples a frame with
-            those one and two later.
-        cross: ``[F, 33, 3, 4]`` between landmarks and the first of the common unknowns.
+        g, W: ``[F, N]`` half the gradient, and ``[F, N, N]``.
+        near: ``[2, F, N]`` diagonals that couple a frame with those one and two later.
+        cross: ``[F, N, 4]`` between landmarks and the first of the common unknowns.
         slope, common: ``[4]``, ``[4, 4]`` of the latter.
     """
 
     cost: Tensor
     g: Tensor
-    whole: Tensor
+    W: Tensor
     near: Tensor
     cross: Tensor
     slope: Tensor
     common: Tensor
 
-    @property
-    def W(self) -> Tensor:
-        """``[F, 33, 3, 3]`` the blocks of single landmarks, to be added to."""
-        return self.whole.diagonal(dim1=1, dim2=3).permute(0, 3, 1, 2)
+    def add_motion(self, X: Tensor, c: Tensor, weight: Tensor) -> None:
+        """Adds squares of ``c[0] X[f] + c[1] X[f + 1] + …``: ``c [K, n]``, ``weight [n, 33]``."""
+        n = c.shape[1]
+        r = sum(c[k, :, None, None] * X[k : k + n] for k in range(len(c)))
+        square = r.square().sum(-1) / OUTLIER**2
+        self.cost = self.cost + (weight * OUTLIER**2 * square.log1p()).sum()
+        w = (weight / (1 + square)).repeat_interleave(3, dim=1)
+        for k, a in enumerate(c):
+            self.g[k : k + n] += w * a[:, None] * r.flatten(1)
+            self.W.diagonal(dim1=1, dim2=2)[k : k + n] += w * a[:, None].square()
+            for gap, b in enumerate(c[k + 1 :]):
+                self.near[gap, k : k + n] += w * (a * b)[:, None]
 
 
 @dataclass(frozen=True)
@@ -202,13 +214,15 @@ class Problem:
         standing: Tensor | None = None,
     ) -> None:
         self.seen, self.smooth = seen, smooth
-        self.standing = standing
+        none = seen.weight.new_zeros(len(seen.weight), len(FEET))
+        self.standing = none if standing is None else standing
         self.noise = (noise * seen.size)[:, None]
+        self.depth = DEPTH * (NOISE / noise) ** 0.5
         self.space = without_surface(free_space())
         own = torch.tensor([FOCAL_SPREAD**-2.0, *[1e-3] * (OWN - 1)], dtype=torch.float64)
         self.prior = torch.cat([own, shape_prior(self.space)])
         self.free = torch.full_like(self.prior, shape, dtype=torch.bool)
-        self.free[0], self.free[1:OWN] = focal, standing is not None
+        self.free[0], self.free[1:OWN] = focal, bool(self.standing.any())
         rays = self._rays()
         turn = shortest_turn(rays.new_tensor([0.0, 0, 1]).expand_as(rays), rays)
         self.world = (axis_angle_to_matrix(turn).unsqueeze(1) @ seen.world.unsqueeze(-1))[..., 0]
@@ -245,7 +259,7 @@ class Problem:
         t[:, 2] = t[:, 2].clamp_min(1.0)
         p = self.world + t[:, None]
         q, root = solver.descend(*solver.guess(p), p, solver.weights(w > 0))
-        if self.standing is not None:
+        if self.standing.any():
             common[OWN - 1] = p[:, FEET, 1].median()
         return State(q, root, common)
 
@@ -253,124 +267,63 @@ class Problem:
         """``[F, 33, 3]``."""
         return solver.points(solver.transforms(at.q, at.root, solver.joints), solver.landmarks)
 
-    def terms(self, X: Tensor, own: Tensor) -> Normal:
-        """Everything that depends on landmarks ``X [F, 33, 3]``."""
-        F, J, _ = X.shape
-        focal, z = own[0].exp(), X[..., 2].clamp_min(NEAR)
-        # reprojection
-        shown = focal * X[..., :2] / z[..., None]
-        r = torch.where(self.seen.weight[..., None] > 0, shown - self.seen.u, 0.0)
-        square = r.square().sum(-1) / (OUTLIER * self.noise) ** 2
-        w = self.seen.weight / self.noise**2
-        cost = (w * (OUTLIER * self.noise) ** 2 * square.log1p()).sum()
-        w = w / (1 + square)
-        P = X.new_zeros(F, J, 2, 3)
-        P[..., 0, 0] = P[..., 1, 1] = focal / z
-        P[..., 2] = -shown / z[..., None]
-        wP = w[..., None, None] * P
+    def residuals(self, x: Tensor, own: Tensor, *of_frame: Tensor) -> Tensor:
+        """``[R]`` of one frame's landmarks ``x [33, 3]``, in standard deviations: see `GROUPS`."""
+        u, world, noise = of_frame
+        shown = own[0].exp() * x[:, :2] / x[:, 2:].clamp_min(NEAR)
+        hang = x - x[HIPS].mean(0) - world
+        feet = x[FEET]
+        height = feet[:, 1] - own[1] * feet[:, 0] - own[2] * feet[:, 2] - own[3]
+        trunk = x[TRUNK].mean(0) - feet.mean(0)  # above the feet: what tells the ground's slope
+        aside = torch.stack([trunk[0] + own[1] * trunk[1], trunk[2] + own[2] * trunk[1]])
+        parts = ((shown - u) / noise, hang / self.depth, height / GROUND, aside / BALANCE)
+        return torch.cat([part.flatten() for part in parts])
+
+    def terms(self, X: Tensor, own: Tensor, linear: bool = True) -> Normal:
+        """The cost of landmarks ``X [F, 33, 3]``, and with ``linear`` its derivatives."""
+        seen, F = self.seen, len(X)
+        hung = X - X[:, HIPS].mean(1, keepdim=True)
+        w = seen.weight.unsqueeze(-1)  # the detector's own 3D landmarks are of any scale
+        scale = (w * hung * self.world).sum() / (w * self.world.square()).sum()
+        data = (seen.u, scale * self.world, self.noise)
+        every = (0, None, 0, 0, 0)
+        r = torch.vmap(self.residuals, every)(X, own, *data)
+        both = self.standing[:, :2].amax(1, keepdim=True) * self.standing[:, 2:].amax(
+            1, keepdim=True
+        )
+        weight = torch.cat([seen.weight, seen.weight, self.standing, both], dim=1)
+        square = r.new_zeros(weight.shape).index_add_(1, GROUPS, r.square()) / OUTLIER**2
+        cost = (weight * OUTLIER**2 * square.log1p()).sum()
+        w = (weight / (1 + square))[:, GROUPS]
+        A, C = r.new_zeros(F, r.shape[1], X[0].numel()), r.new_zeros(F, r.shape[1], OWN)
+        if linear:
+            A, C = torch.vmap(torch.func.jacfwd(self.residuals, (0, 1)), every)(X, own, *data)
+            A = A.flatten(2)
+        wA, wC, wr = w[..., None] * A, w[..., None] * C, (w * r)[..., None]
         found = Normal(
             cost=cost,
-            g=(wP * r[..., None]).sum(-2),
-            whole=X.new_zeros(F, J, 3, J, 3),
-            near=X.new_zeros(2, F, J),
-            cross=X.new_zeros(F, J, 3, OWN),
-            slope=X.new_zeros(OWN),
-            common=X.new_zeros(OWN, OWN),
+            g=(A.mT @ wr)[..., 0],
+            W=A.mT @ wA,
+            near=A.new_zeros(2, F, A.shape[-1]),
+            cross=A.mT @ wC,
+            slope=(C.mT @ wr).sum(0)[..., 0],
+            common=(C.mT @ wC).sum(0),
         )
-        found.W.add_(wP.mT @ P)
-        found.cross[..., 0] = (wP * shown[..., None]).sum(-2)
-        found.slope[0] = (w[..., None] * r * shown).sum()
-        found.common[0, 0] = (w[..., None] * shown**2).sum()
-        self._add_world(found, X)
         if self.smooth:
-            self._add_motion(found, X)
-        if self.standing is not None:
-            self._add_ground(found, X, own, self.standing)
+            step = seen.time.diff()
+            before, after = step[:-1], step[1:]
+            c = torch.stack([1 / before, -1 / before - 1 / after, 1 / after])
+            w = (before + after < GAP) * (before + after) * ACCELERATIONS
+            found.add_motion(X, c * 2 / (before + after) / ACCELERATION, w[:, None].expand(-1, 33))
+            w = torch.zeros_like(seen.weight[1:])
+            w[:, FEET] = self.standing[:-1] * self.standing[1:] * (step < GAP)[:, None]
+            found.add_motion(X, torch.stack([-1 / step, 1 / step]) / SLIDING, w)
         return found
-
-    def _add_world(self, found: Normal, X: Tensor) -> None:
-        """The detector's own 3D landmarks, of any scale, hang on the middle of the hips."""
-        w = self.seen.weight.unsqueeze(-1) / DEPTH**2
-        own = X - X[:, HIPS].mean(1, keepdim=True)
-        scale = (w * own * self.world).sum() / (w * self.world**2).sum()
-        r = own - scale * self.world
-        square = r.square() / (OUTLIER * DEPTH) ** 2
-        found.cost += (w * (OUTLIER * DEPTH) ** 2 * square.log1p()).sum()
-        w = w / (1 + square)
-        found.g += w * r
-        found.W.add_(torch.diag_embed(w))
-
-    def _add_motion(self, found: Normal, X: Tensor) -> None:
-        h = self.seen.time.diff()
-        before, after = h[:-1], h[1:]
-        c = torch.stack([1 / before, -1 / before - 1 / after, 1 / after]) * 2 / (before + after)
-        r = torch.einsum("kf,kfjx->fjx", c, torch.stack([X[:-2], X[1:-1], X[2:]]))
-        w = (before + after < GAP) / ACCELERATION**2 * (before + after) / 2 * 20  # per 1/20 s
-        square = r.square().sum(-1) / (OUTLIER * ACCELERATION) ** 2
-        found.cost += (w[:, None] * (OUTLIER * ACCELERATION) ** 2 * square.log1p()).sum()
-        w = w[:, None] / (1 + square)
-        eye = torch.eye(3, dtype=X.dtype)
-        for k in range(3):
-            at = slice(k, k + len(r))
-            found.g[at] += (w * c[k][:, None])[..., None] * r
-            found.W[at].add_((w * c[k][:, None] ** 2)[..., None, None] * eye)
-        found.near[0, : len(r)] += w * (c[0] * c[1])[:, None]
-        found.near[0, 1 : 1 + len(r)] += w * (c[1] * c[2])[:, None]
-        found.near[1, : len(r)] += w * (c[0] * c[2])[:, None]
-
-    def _add_ground(self, found: Normal, X: Tensor, own: Tensor, standing: Tensor) -> None:
-        x = X[:, FEET]
-        off = x[..., 1] - own[1] * x[..., 0] - own[2] * x[..., 2] - own[3]
-        square = off.square() / (OUTLIER * GROUND) ** 2
-        found.cost += (standing * OUTLIER**2 * square.log1p()).sum()
-        w = standing / GROUND**2 / (1 + square)
-        normal = torch.stack([-own[1], torch.ones_like(own[1]), -own[2]])
-        by = -torch.stack([torch.zeros_like(off), x[..., 0], x[..., 2], torch.ones_like(off)], -1)
-        found.g[:, FEET] += (w * off)[..., None] * normal
-        _add(found.W, slice(None), w[..., None, None] * torch.outer(normal, normal))
-        found.cross[:, FEET] += w[..., None, None] * normal[:, None] * by[..., None, :]
-        found.slope += ((w * off)[..., None] * by).sum((0, 1))
-        found.common += torch.einsum("fk,fki,fkj->ij", w, by, by)
-        self._add_balance(found, X, own, standing)
-        if not self.smooth:
-            return
-        step = self.seen.time.diff()[:, None]
-        w = standing[:-1] * standing[1:] * (step < GAP) / (SLIDING * step) ** 2
-        r = x[1:] - x[:-1]
-        square = r.square().sum(-1) / (OUTLIER * SLIDING * step) ** 2
-        found.cost += (w * (OUTLIER * SLIDING * step) ** 2 * square.log1p()).sum()
-        w = w / (1 + square)
-        eye = torch.eye(3, dtype=X.dtype)
-        for at, sign in ((slice(1, None), 1.0), (slice(0, -1), -1.0)):
-            found.g[at, FEET] += sign * w[..., None] * r
-            _add(found.W, at, w[..., None, None] * eye)
-        found.near[0, :-1, FEET] -= w
-
-    def _add_balance(self, found: Normal, X: Tensor, own: Tensor, standing: Tensor) -> None:
-        """The trunk is above the feet: what tells the ground's slope."""
-        k = X.new_zeros(X.shape[1])
-        k[TRUNK], k[FEET] = 1 / len(TRUNK), -1 / len(FEET)
-        m = torch.einsum("n,fnx->fx", k, X)
-        A = X.new_zeros(2, 3)
-        A[0, 0], A[0, 1], A[1, 1], A[1, 2] = 1, own[1], own[2], 1
-        r = m @ A.mT
-        square = r.square().sum(-1) / (OUTLIER * BALANCE) ** 2
-        w = (standing[:, :2].amax(1) * standing[:, 2:].amax(1)) / BALANCE**2
-        found.cost += (w * (OUTLIER * BALANCE) ** 2 * square.log1p()).sum()
-        w = w / (1 + square)
-        by = X.new_zeros(len(X), 2, OWN)
-        by[:, 0, 1] = by[:, 1, 2] = m[:, 1]
-        wr, rows = w[:, None] * r, torch.einsum("n,rx->rnx", k, A)
-        found.g += torch.einsum("fr,rnx->fnx", wr, rows)
-        found.whole += w[:, None, None, None, None] * torch.einsum("rnx,rmy->nxmy", rows, rows)
-        found.cross += torch.einsum("f,rnx,frk->fnxk", w, rows, by)
-        found.slope += torch.einsum("fr,frk->k", wr, by)
-        found.common += torch.einsum("f,fri,frk->ik", w, by, by)
 
     def cost(self, at: State) -> Tensor:
         """The whole cost."""
         solver = self.solver(at.common)
-        found = self.terms(self.landmarks(at, solver), at.common[:OWN])
+        found = self.terms(self.landmarks(at, solver), at.common[:OWN], linear=False)
         below = below_least(at.q, solver.least)
         return found.cost + self._own(at, solver, below)
 
@@ -392,24 +345,22 @@ class Problem:
             G[..., OWN:] = self._by_shape(at, solver).flatten(1, 2)
         # the chain rule
         stop, amount = below_least(at.q, solver.least)
-        W = found.whole.view(F, N, N)
-        H = J.mT @ (W @ J) + solver.prior + torch.diag_embed(stop + FLOOR)
-        g = (J.mT @ found.g.flatten(1)[..., None])[..., 0] + at.q @ solver.prior + stop * amount
-        near = found.near.repeat_interleave(3, dim=-1).unsqueeze(-1)
+        H = J.mT @ (found.W @ J) + solver.prior + torch.diag_embed(stop + FLOOR)
+        g = (J.mT @ found.g[..., None])[..., 0] + at.q @ solver.prior + stop * amount
+        near = found.near.unsqueeze(-1)
         beside = [J[k + 1 :].mT @ (near[k, : F - k - 1] * J[: F - k - 1]) for k in (0, 1)]
-        WG = W @ G
+        WG = found.W @ G
         for k in (1, 2):
             WG[: F - k] += near[k - 1, : F - k] * G[k:]
             WG[k:] += near[k - 1, : F - k] * G[: F - k]
         cross = J.mT @ WG
-        own = found.cross.flatten(1, 2)
-        cross[..., :OWN] += J.mT @ own
+        cross[..., :OWN] += J.mT @ found.cross
         common = torch.einsum("fni,fnj->ij", G, WG) + self.prior.diag()
-        by_own = torch.einsum("fni,fnj->ij", G, own)
+        by_own = torch.einsum("fni,fnj->ij", G, found.cross)
         common[:, :OWN] += by_own
         common[:OWN] += by_own.mT
         common[:OWN, :OWN] += found.common
-        slope = torch.einsum("fni,fn->i", G, found.g.flatten(1)) + self.prior * at.common
+        slope = torch.einsum("fni,fn->i", G, found.g) + self.prior * at.common
         slope[:OWN] += found.slope
         cross[..., ~self.free] = 0
         common[~self.free], common[:, ~self.free] = 0, 0
@@ -479,16 +430,10 @@ class Problem:
         return X, torch.where(self.seen.weight > 0, off, torch.nan)
 
 
-def _add(W: Tensor, frames: slice, values: Tensor) -> None:
-    """Adds ``values [F, 4, 3, 3]`` to the blocks of `FEET`."""
-    for i, foot in enumerate(FEET):
-        W[frames, foot] += values[:, i]
-
-
 def _blocks(H: Tensor, right: Tensor) -> Tensor:
     """Solves the equations with diagonal blocks ``H [F, D, D]``."""
     F, D, _ = H.shape
-    return torch.cholesky_solve(right.view(F, D, -1), torch.linalg.cholesky(H)).view(F * D, -1)
+    return torch.cholesky_solve(right.view(F, D, -1), torch.linalg.cholesky(H)).reshape(F * D, -1)
 
 
 def _banded(H: Tensor, beside: list[Tensor], right: Tensor) -> Tensor:
