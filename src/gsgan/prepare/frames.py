@@ -27,6 +27,14 @@ JUMP = 0.5  # of the person's size from image to image: the detector found someb
 SHARP_SIZE = 256  # pixels: sharpness is measured on the person at this height
 CORNERS, FEW_CORNERS = 200, 20  # of the background, that show a moving camera: most, least
 
+LeftOut = dict[str, Bool]
+"""``[F]`` which frames are left out, by reason."""
+
+
+def sampling() -> list[float]:
+    """What the sampled images depend on beside the video."""
+    return [RATE, FEW, MOST, LONGEST]
+
 
 def sample(video: Path, folder: Path) -> tuple[Recording, Float]:
     """Evenly spaced images of a video as a folder, and their times ``[F]`` in seconds.
@@ -75,7 +83,7 @@ def _extract(source: Recording, folder: Path) -> None:
     write_npz(folder / TIMES, number=np.array(numbers), time=np.array(times))
 
 
-def left_out(px: Float, conf: Float, sharp: Float) -> dict[str, Bool]:
+def left_out(px: Float, conf: Float, sharp: Float) -> LeftOut:
     """``[F]`` which frames are no use, by reason; a frame has one reason at most.
 
     Args:
@@ -87,10 +95,10 @@ def left_out(px: Float, conf: Float, sharp: Float) -> dict[str, Bool]:
     found: dict[str, Bool] = {
         "nobody, or too little of a person": np.asarray(sure.sum(1) < LEAST_JOINTS)
     }
-    found["shoulders or hips cut off"] = ~(conf[:, HUBS] > 0).all(1)
+    found["shoulders or hips cut off"] = np.asarray((conf[:, HUBS] <= 0).any(1))
     middle = np.nanmean(np.where(np.isfinite(px[:, HUBS]), px[:, HUBS], np.nan), axis=1)
     size = np.nanmedian(extents(px))
-    good = ~np.logical_or.reduce(list(found.values()))
+    good = np.asarray(~np.logical_or.reduce(list(found.values())))
     here, state = np.median(middle[good], axis=0) if good.any() else np.zeros(2), good.copy()
     last: Float | None = None
     for f in np.flatnonzero(good):
@@ -99,7 +107,8 @@ def left_out(px: Float, conf: Float, sharp: Float) -> dict[str, Bool]:
         state[f] = last is not None and np.linalg.norm(middle[f] - last) < JUMP * size
         last = middle[f] if state[f] else last
     found["somebody else"] = good & ~state
-    found["blurred"] = sharp < BLURRED * np.median(sharp[state]) if state.any() else ~state
+    usual = np.median(sharp[state]) if state.any() else np.inf
+    found["blurred"] = np.asarray(sharp < BLURRED * usual)
     taken = np.zeros(len(px), bool)
     for reason, frames in found.items():
         found[reason] = frames & ~taken
@@ -130,8 +139,8 @@ def look(files: Sequence[Path], px: Float) -> tuple[Float, float]:
         crop = image[top : bottom + 1, left : right + 1]
         if len(seen) > 1 and min(crop.shape) > 1:
             share = SHARP_SIZE / crop.shape[0]
-            small = cv2.resize(crop, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
-            sharp[f] = cv2.Laplacian(small, cv2.CV_64F).var()
+            sized = cv2.resize(crop, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
+            sharp[f] = cv2.Laplacian(sized, cv2.CV_64F).var()
         small = np.asarray(cv2.resize(image, None, fx=0.25, fy=0.25), np.uint8)
         if before is not None:
             moves.append(_flow(before, small, box // 4))
@@ -156,7 +165,7 @@ def _flow(before: Bytes, after: Bytes, box: Ints) -> Float:
     return np.median(steps, axis=0) if len(steps) else np.zeros(2)
 
 
-def check_enough(video: Path, frames: int, left: dict[str, Bool]) -> None:
+def check_enough(video: Path, frames: int, left: LeftOut) -> None:
     """Refuses a video of which too few frames are of use.
 
     Raises:

@@ -19,17 +19,7 @@ from gsgan.data.joints import ALL, ARM_PAIRS, BODY, FLIP_GROUPS, HANDS, LEFT, LE
 from gsgan.prepare import landmarks
 from gsgan.prepare.camera_array import Bool, CameraArray, Float, Ints
 from gsgan.prepare.cleanse import cleanse, smooth
-from gsgan.prepare.frames import (
-    FEW,
-    LONGEST,
-    MOST,
-    RATE,
-    check_enough,
-    extents,
-    left_out,
-    look,
-    sample,
-)
+from gsgan.prepare.frames import LeftOut, check_enough, left_out, look, sample, sampling
 from gsgan.prepare.images import find_masks
 from gsgan.prepare.mediapipe import run_tool
 from gsgan.prepare.one_view import FEET, Seen, View, solve_view
@@ -47,7 +37,8 @@ FILM = np.hypot(36.0, 24.0)  # millimetres, the diagonal that equivalent focal l
 USUAL = 30.0  # millimetres: phones' main cameras have 24 to 28 and record a part of their image
 OVERCONFIDENT = 3.0  # errors of focal lengths over the solution's own estimate, on synthetic scenes
 DOUBTFUL = 3.0  # times the usual error of a frame
-SHORT, TURN, MOVED, OTHERS = 8.0, 300, 0.03, 0.2  # seconds, degrees, shares that are noted
+SHORT, TURN = 8.0, 300  # seconds, degrees: less is in doubt
+MOVED, OTHERS, FEET_SEEN = 0.03, 0.2, 0.5  # shares: more, more, less is in doubt
 DIRECTIONS = 12
 SWAPPED = [j for pair in (*ARM_PAIRS[:3], *LEG_PAIRS[:3]) for j in pair]
 
@@ -85,7 +76,7 @@ def solve_video(options: Options, stages: StageFolder, console: Console) -> Film
     """
     video = options.folder("source")
     with console.status("taking images from the video"):
-        folder = stages.path("frames", [*stamp(video), RATE, FEW, MOST, LONGEST])
+        folder = stages.path("frames", [*stamp(video), sampling()])
         source, time = sample(video, folder)
     found, masks = _detect(options, source, stages, console)
     numbers = np.array(list(source.files))
@@ -120,10 +111,10 @@ def solve_video(options: Options, stages: StageFolder, console: Console) -> Film
         stages={"fitted": error[:, :, :BODY]},
         removed=removed,
     )
-    measured = _measured(options, view, guess, camera, p, time[kept], left, moved, seen)
+    measured = _measured(view, camera, p, time[kept], seen, left) | {"background_moved": moved}
     calibration = Calibration(video, "estimated from the person", {camera.name: camera})
     fps = round(1 / float(np.median(np.diff(time))), 3)
-    notes = tuple(_notes(measured))
+    notes = tuple(_notes(measured, options, natural_height(view.shape)))
     inputs = Inputs({source.name: source}, calibration, (camera,), notes, fps)
     return Filmed(inputs, masks, numbers[kept], solution, measured)
 
@@ -249,86 +240,48 @@ def _with_hands(
 
 
 def _measured(
-    options: Options,
-    view: View,
-    guess: float,
-    camera: CameraEntry,
-    p: Float,
-    time: Float,
-    left: Mapping[str, Bool],
-    moved: float,
-    seen: Detected,
+    view: View, camera: CameraEntry, p: Float, time: Float, detected: Detected, left: LeftOut
 ) -> dict[str, Any]:
     """The numbers of prepare.json that only a video of one camera has."""
-    diagonal = float(np.hypot(*camera.size))
     focal = float(camera.K[0, 0])
     side = p[:, 11, :2] - p[:, 12, :2]
     toward = camera.centre[:2] - p[:, [23, 24], :2].mean(1)
-    turn = np.arctan2(*np.moveaxis(side, -1, 0)) - np.arctan2(*np.moveaxis(toward, -1, 0))
-    filled = np.unique(np.floor(DIRECTIONS * (turn / (2 * np.pi) % 1)))
+    turn = np.arctan2(*side.T) - np.arctan2(*toward.T)
+    directions = np.unique(np.floor(DIRECTIONS * (turn / (2 * np.pi) % 1)))
     return {
         "focal_px": focal,
-        "focal_mm_equivalent": focal / diagonal * FILM,
+        "focal_mm": focal / float(np.hypot(*camera.size)) * FILM,
         "focal_uncertainty": OVERCONFIDENT * view.spread,
-        "focal_given": options.focal is not None,
-        "height_m": options.height or natural_height(view.shape),
-        "height_given": options.height is not None,
-        "distance_m": float(np.median(np.linalg.norm(p[:, 23] - camera.centre, axis=-1))),
-        "error_share": float(np.nanmedian(view.error.numpy()) * guess / np.median(_sizes(seen))),
-        "directions_degrees": 360 // DIRECTIONS * len(filled),
+        "degrees_seen": 360 // DIRECTIONS * len(directions),
         "seconds": float(np.ptp(time)),
-        "frames_sampled": len(next(iter(left.values()))),
-        "frames_left_out": {reason: int(one.sum()) for reason, one in left.items() if one.any()},
-        "background_moved": moved,
-        "several_faces": float((seen.faces > 1).mean()),
-        "feet_seen": float((seen.conf[:, FEET] > 0).any(1).mean()),
-        "ground_found": view.ground is not None,
+        "sampled": len(next(iter(left.values()))),
+        "left_out": {reason: int(one.sum()) for reason, one in left.items() if one.any()},
+        "several_faces": float((detected.faces > 1).mean()),
+        "feet_seen": float((detected.conf[:, FEET] > 0).any(1).mean()),
+        "standing": view.ground is not None,
     }
 
 
-def _sizes(seen: Detected) -> Float:
-    size = extents(seen.px[:, :BODY])
-    return size[np.isfinite(size)]
-
-
-def _notes(found: Mapping[str, Any]) -> list[str]:
-    """Sentences on what was estimated, and what is in doubt."""
-    focal = f"focal length {found['focal_px']:.0f} pixels ({found['focal_mm_equivalent']:.0f} mm)"
-    spread = f", estimated, standard deviation {found['focal_uncertainty']:.0%}: focal=<mm> sets it"
-    notes = [focal + ("" if found["focal_given"] else spread)]
-    if not found["height_given"]:
-        notes.append(
-            f"height {found['height_m']:.2f} m is that of a usual body; height=<m> sets it"
-        )
-    left, total = found["frames_left_out"], found["frames_sampled"]
-    if left:
-        reasons = ", ".join(f"{reason} {count}" for reason, count in left.items())
-        notes.append(f"left out of {total} sampled images: {reasons}")
+def _notes(found: Mapping[str, Any], options: Options, natural: float) -> list[str]:
+    """Sentences on what was estimated, and on what is in doubt."""
+    notes = [f"focal length {found['focal_px']:.0f} pixels, {found['focal_mm']:.0f} mm on film"]
+    if options.focal is None:
+        notes[0] += f", ± {found['focal_uncertainty']:.0%}, estimated; focal=<mm> sets it"
+    if options.height is None:
+        notes.append(f"height {natural:.2f} m, as a usual body of this shape; height=<m> sets it")
+    if found["left_out"]:
+        reasons = ", ".join(f"{reason} {count}" for reason, count in found["left_out"].items())
+        notes.append(f"left out of {found['sampled']} sampled images: {reasons}")
+    few, turned, moved, others, feet = (
+        found[name]
+        for name in ("seconds", "degrees_seen", "background_moved", "several_faces", "feet_seen")
+    )
     doubts = (
-        (found["seconds"] < SHORT, f"{found['seconds']:.1f} s are short, 20 to 40 are better"),
-        (
-            found["directions_degrees"] < TURN,
-            f"the person was filmed from {found['directions_degrees']} of 360 degrees; the rest "
-            "was never seen and stays a guess",
-        ),
-        (
-            found["background_moved"] > MOVED,
-            f"the camera moved by {found['background_moved']:.0%} of the image, which counts as "
-            "the person's motion",
-        ),
-        (
-            found["several_faces"] > OTHERS,
-            f"{found['several_faces']:.0%} of the images show more than one face: is somebody "
-            "else in the video?",
-        ),
-        (
-            found["feet_seen"] < 0.5,
-            "the feet are hardly ever in the image: legs, height and distance are guesses",
-        ),
-        (not found["ground_found"], "no foot stood still: the ground's place is a guess"),
-        (
-            found["error_share"] > 0.01,
-            f"landmarks fit to {found['error_share']:.1%} of the person's size only",
-        ),
+        (few < SHORT, f"{few:.1f} seconds are short, 20 to 40 are better"),
+        (turned < TURN, f"only {turned} of 360 degrees were filmed; training guesses the rest"),
+        (moved > MOVED, f"the background moved by {moved:.0%} of the image; it counts as still"),
+        (others > OTHERS, f"{others:.0%} of the images show more than one face"),
+        (feet < FEET_SEEN, f"feet are in {feet:.0%} of the images; legs and distance are guesses"),
+        (not found["standing"], "no foot stood still, so the ground is a guess"),
     )
     return notes + [f"doubtful: {text}" for wrong, text in doubts if wrong]

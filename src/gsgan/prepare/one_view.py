@@ -110,7 +110,7 @@ class Normal:
     def add_motion(self, X: Tensor, c: Tensor, weight: Tensor) -> None:
         """Adds squares of ``c[0] X[f] + c[1] X[f + 1] + …``: ``c [K, n]``, ``weight [n, 33]``."""
         n = c.shape[1]
-        r = sum(c[k, :, None, None] * X[k : k + n] for k in range(len(c)))
+        r = torch.stack([a[:, None, None] * X[k : k + n] for k, a in enumerate(c)]).sum(0)
         square = r.square().sum(-1) / OUTLIER**2
         self.cost = self.cost + (weight * OUTLIER**2 * square.log1p()).sum()
         w = (weight / (1 + square)).repeat_interleave(3, dim=1)
