@@ -89,25 +89,22 @@ def left_out(px: Float, conf: Float, sharp: Float) -> LeftOut:
     Args:
         px: ``[F, 33, 2]``, NaN = not seen or outside the image.
         conf: ``[F, 33]``.
-        sharp: ``[F]`` of `sharpness`.
+        sharp: ``[F]`` of `look`.
     """
     sure = conf > CONFIDENT
     found: dict[str, Bool] = {
         "nobody, or too little of a person": np.asarray(sure.sum(1) < LEAST_JOINTS)
     }
     found["shoulders or hips cut off"] = np.asarray((conf[:, HUBS] <= 0).any(1))
-    middle = np.nanmean(np.where(np.isfinite(px[:, HUBS]), px[:, HUBS], np.nan), axis=1)
-    size = np.nanmedian(extents(px))
+    middle, size = px[:, HUBS].mean(1), extents(px)
     good = np.asarray(~np.logical_or.reduce(list(found.values())))
-    here, state = np.median(middle[good], axis=0) if good.any() else np.zeros(2), good.copy()
-    last: Float | None = None
+    same, before = good.copy(), -1
     for f in np.flatnonzero(good):
-        if last is None:
-            last = middle[f] if np.linalg.norm(middle[f] - here) < 4 * JUMP * size else None
-        state[f] = last is not None and np.linalg.norm(middle[f] - last) < JUMP * size
-        last = middle[f] if state[f] else last
-    found["somebody else"] = good & ~state
-    usual = np.median(sharp[state]) if state.any() else np.inf
+        reach = JUMP * (f - before) * size[f]
+        same[f] = before < 0 or np.linalg.norm(middle[f] - middle[before]) < reach
+        before = f if same[f] else before
+    found["somebody else"] = good & ~same
+    usual = np.median(sharp[same]) if same.any() else np.inf
     found["blurred"] = np.asarray(sharp < BLURRED * usual)
     taken = np.zeros(len(px), bool)
     for reason, frames in found.items():
