@@ -108,7 +108,7 @@ def left_out(px: Float, conf: Float, sharp: Float) -> LeftOut:
     found["blurred"] = np.asarray(sharp < BLURRED * usual)
     taken = np.zeros(len(px), bool)
     for reason, frames in found.items():
-        found[reason] = frames & ~taken
+        found[reason] = np.asarray(frames & ~taken)
         taken |= frames
     return found
 
