@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from gsgan.data.files import read_arrays, read_grey
+from gsgan.data.joints import known
 from gsgan.data.skeletons import HUBS
 from gsgan.prepare.camera_array import Bool, Float, Ints
 from gsgan.prepare.images import QUALITY
@@ -102,7 +103,7 @@ def left_out(px: Float, conf: Float, sharp: Float) -> LeftOut:
     for f in np.flatnonzero(good):
         reach = JUMP * (f - before) * size[f]
         same[f] = before < 0 or np.linalg.norm(middle[f] - middle[before]) < reach
-        before = f if same[f] else before
+        before = int(f) if same[f] else before
     found["somebody else"] = good & ~same
     usual = np.median(sharp[same]) if same.any() else np.inf
     found["blurred"] = np.asarray(sharp < BLURRED * usual)
@@ -115,7 +116,7 @@ def left_out(px: Float, conf: Float, sharp: Float) -> LeftOut:
 
 def extents(px: Float) -> Float:
     """``[F]`` the diagonal of the box round the seen landmarks ``[F, 33, 2]``; NaN without any."""
-    seen = np.isfinite(px).all(-1)
+    seen = known(px)
     low, high = (np.where(seen[..., None], px, s) for s in (np.inf, -np.inf))
     size = np.linalg.norm(high.max(1) - low.min(1), axis=-1)
     return np.where(seen.any(1), size, np.nan)
@@ -130,7 +131,7 @@ def look(files: Sequence[Path], px: Float) -> tuple[Float, float]:
     before: Bytes | None = None
     for f, path in enumerate(files):
         image = read_grey(path)
-        seen = px[f][np.isfinite(px[f]).all(-1)]
+        seen = px[f][known(px[f])]
         box = np.r_[seen.min(0), seen.max(0)].astype(np.int64) if len(seen) else np.zeros(4, int)
         left, top, right, bottom = box.clip(0).tolist()
         crop = image[top : bottom + 1, left : right + 1]
