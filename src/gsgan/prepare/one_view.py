@@ -28,7 +28,7 @@ FOCAL_SPREAD = 0.07  # of the guess, as a logarithm: small, as frames are not in
 NOISE = 0.01  # of landmarks in the first steps, share of the person's size
 # Metres, standard deviation of the detector's own 3D landmarks, beside 2D landmarks of that noise:
 # the more exact these are, the more they say of depth themselves.
-DEPTH = 0.11
+DEPTH = 0.08
 ACCELERATION = 8.0  # metres per square second, standard deviation
 ACCELERATIONS = 10.0  # independent ones per second
 SLIDING, GROUND = 0.1, 0.02  # metres per second, metres: of a standing foot
