@@ -98,6 +98,11 @@ def place(capture, run, bare, on_body, model_file, tmp_path_factory):
 
         return write_project(folder() / "videos")
 
+    def video() -> Path:
+        from one_person import film
+
+        return film(folder() / "one_video")
+
     def predictions() -> Path:
         import cv2
 
@@ -177,6 +182,7 @@ def place(capture, run, bare, on_body, model_file, tmp_path_factory):
         "/path/to/avatarrex_zzr": lambda: rig("avatarrex_zzr"),
         "/path/to/take": take,
         "/path/to/videos": videos,
+        "/path/to/me.mp4": video,
         "/path/to/predictions": predictions,
         "/path/to/sweep": lambda: run,
         "data.test_frames=300-399": lambda: "data.test_frames=4-5",
@@ -299,7 +305,12 @@ def test_every_documented_command_runs(line, place, capture, execute, tmp_path, 
     if name == "gsgan.prepare":  # MediaPipe is not at hand: its output is given
         source = next(a for a in arguments if a.startswith("source=")).removeprefix("source=")
         arguments = [a for a in arguments if a != "setup=true"]
-        arguments += [f"landmarks={source}/pose", f"masks={source}/masks"]
+        if source.endswith(".avi"):
+            arguments += [f"landmarks={Path(source).parent}/landmarks", "hands=false"]
+            source = str(Path(source).parent)
+        else:
+            arguments += [f"landmarks={source}/pose"]
+        arguments += [f"masks={source}/masks"]
     if name == "gsgan.view":
         monkeypatch.setattr("gsgan.view.server.Viewer.serve", lambda viewer: None)
     result = execute(line, arguments)

@@ -353,8 +353,7 @@ class Solver(nn.Module):
         w = weight / root
         J = at.by_number.flatten(2)
         weighted = (at.by_number * w[:, None, :, None]).flatten(2)
-        below = (q - self.least).clamp_max(0)
-        stop = (below < 0) / BEYOND**2
+        stop, below = below_least(q, self.least)
         cost = 2 * ROBUST**2 * (root - 1).sum(-1)
         pull = q @ self.prior
         cost = cost + (pull * q + stop * below.square().nan_to_num()).sum(-1)
@@ -430,6 +429,12 @@ def _solved(H: Tensor, g: Tensor) -> Tensor:
     """``H⁻¹ g`` for positive definite ``H [B, D, D]``."""
     factor, _ = torch.linalg.cholesky_ex(H)
     return torch.cholesky_solve(g.unsqueeze(-1), factor).squeeze(-1)
+
+
+def below_least(q: Tensor, least: Tensor) -> tuple[Tensor, Tensor]:
+    """How numbers ``q [B, D]`` are held back below their ``least [D]``: precisions, amounts."""
+    below = (q - least).clamp_max(0)
+    return (below < 0) / BEYOND**2, below
 
 
 def log_of(R: Tensor) -> Tensor:

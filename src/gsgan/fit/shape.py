@@ -52,7 +52,7 @@ def fit_shape(skeletons: Tensor, visibility: Tensor) -> BodyShape:
     Raises:
         DataError: when no frame shows enough of shoulders, hips and limbs.
     """
-    reduced = _without_surface(free_space())
+    reduced = without_surface(free_space())
     p, seen = _usable(skeletons, visibility)
     x = _fit_lengths(reduced, p, seen)
     found = vars(_fit_landmarks(reduced, x, p, seen))
@@ -147,7 +147,7 @@ def _usable(skeletons: Tensor, visibility: Tensor) -> tuple[Tensor, Tensor]:
     return p, valid
 
 
-def _shape(space: ShapeSpace[B], x: Tensor) -> BodyShape:
+def shape_of(space: ShapeSpace[B], x: Tensor) -> BodyShape:
     """The shape of the numbers: coefficients, logarithms of stretches, the spine, offsets."""
     K, stretch, spine, offsets = x.split([space.coefficients, len(STRETCHED), 1, 99])
     return BodyShape(K, stretch.exp(), _offsets(space, offsets), spine=BEHIND + spine)
@@ -160,7 +160,7 @@ def _offsets(space: ShapeSpace[B], values: Tensor) -> Tensor:
     return (offsets + mirrored) / 2 - (mirrored @ across).unsqueeze(-1) * across
 
 
-def _prior(space: ShapeSpace[MarkedBody]) -> Tensor:
+def shape_prior(space: ShapeSpace[MarkedBody]) -> Tensor:
     """``[S]`` precisions of all numbers."""
     parts = ((space.coefficients, 1.0), (len(STRETCHED), STRETCH), (1, DEPTH),
              (99, OFFSET * 2**0.5))  # fmt: skip
@@ -200,10 +200,10 @@ def _fit_lengths(space: ShapeSpace[MarkedBody], p: Tensor, seen: Tensor) -> Tens
         raise DataError("fit_shape: no frame shows a limb of which the body has both ends")
 
     def off(x: Tensor) -> Tensor:
-        at = space.shaped(_shape(space, x)).landmarks
+        at = space.shaped(shape_of(space, x)).landmarks
         return ((at[a] - at[b]).norm(dim=-1).log() - target) / sigma
 
-    prior = _prior(space)
+    prior = shape_prior(space)
     prior[-99:] *= 100  # offsets
     x = torch.zeros_like(prior)
 
@@ -230,14 +230,14 @@ def _fit_landmarks(space: ShapeSpace[MarkedBody], x: Tensor, p: Tensor, seen: Te
     """Fits shape and poses together; the poses are eliminated from the normal equations."""
     shift = p[:, MEDIAPIPE33.hips].mean(1, keepdim=True)
     p = p - shift
-    prior, share = _prior(space), min(1.0, INDEPENDENT / len(p))
+    prior, share = shape_prior(space), min(1.0, INDEPENDENT / len(p))
     own = len(x) - 99
     symmetric = torch.func.jacfwd(partial(_offsets, space))(x[own:])
     held: tuple[Tensor, Tensor] | None = None
     for _ in range(STEPS):
         # the poses of the current shape, and their normal equations
         with torch.no_grad():
-            solver = Solver(space.shaped(_shape(space, x)))
+            solver = Solver(space.shaped(shape_of(space, x)))
             weight = solver.weights(seen)
             start = solver.guess(p) if held is None else held
             q, root = solver.descend(*start, p, weight, POSE_STEPS if held else 10)
@@ -260,18 +260,18 @@ def _fit_landmarks(space: ShapeSpace[MarkedBody], x: Tensor, p: Tensor, seen: Te
         A = (direct - cross.mT @ inner[..., :-1]).sum(0) * share + prior.diag()
         c = (slope - (cross.mT @ inner[..., -1:]).squeeze(-1)).sum(0) * share + prior * x
         x = x - torch.linalg.solve(A, c)
-    return _shape(space, x)
+    return shape_of(space, x)
 
 
 def _posed(
     space: ShapeSpace[B], solver: Solver, q: Tensor, root: Tensor, own: Tensor, offsets: Tensor
 ) -> Tensor:
     """``[F, 33, 3]`` the landmarks of a shape in poses."""
-    body = space.shaped(_shape(space, torch.cat([own, offsets])))
+    body = space.shaped(shape_of(space, torch.cat([own, offsets])))
     return solver.points(solver.transforms(q, root, body.joints), body.landmarks.nan_to_num())
 
 
-def _without_surface(space: ShapeSpace[B]) -> ShapeSpace[MarkedBody]:
+def without_surface(space: ShapeSpace[B]) -> ShapeSpace[MarkedBody]:
     """The space in float64 with one vertex: landmarks are all that is compared."""
     body = space.body
     small = MarkedBody(

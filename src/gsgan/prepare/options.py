@@ -50,6 +50,9 @@ class Options:
     unit: str | None = None
     pixel_centre: float = 0.0
     crop_px: int = 16
+    height: float | None = None
+    focal: float | None = None
+    landmark_noise: float = 0.008
     offsets: Mapping[str, int] | None = None
     frames: Any = None
     fps: float | None = None
@@ -70,7 +73,10 @@ class Options:
     format: str = "jpg"
 
     def __post_init__(self) -> None:
-        for name, what in (("source", "folder with the videos"), ("out", "folder to make")):
+        for name, what in (
+            ("source", "folder with the videos, or one video"),
+            ("out", "folder to make"),
+        ):
             if not getattr(self, name):
                 raise ConfigError(f"give {name}=<{what}>")
         for name, choices in (("unit", UNITS), ("up_axis", AXES)):
@@ -78,8 +84,10 @@ class Options:
                 one_of(name, getattr(self, name), choices)
         if self.pixel_centre not in (0, 0.5):
             raise ConfigError(f"pixel_centre must be 0 or 0.5, got {self.pixel_centre!r}")
-        if self.fps is not None:
-            above("fps", self.fps)
+        for name in ("fps", "height", "focal"):
+            if getattr(self, name) is not None:
+                above(name, getattr(self, name))
+        above("landmark_noise", self.landmark_noise)
         whole("workers", self.workers, 1)
         above("scale", between("scale", self.scale, 0, 1))
         one_of("format", self.format, ("jpg", "png"))
@@ -97,6 +105,11 @@ class Options:
     def needs_tool(self) -> bool:
         """Whether the MediaPipe tool has to run."""
         return MEDIAPIPE in (self.landmarks, self.masks)
+
+    @property
+    def one_camera(self) -> bool:
+        """Whether the source is one video, whose camera is estimated."""
+        return self.folder("source").is_file()
 
     def record(self) -> dict[str, Any]:
         """The settings that the dataset depends on, as plain values."""

@@ -1,7 +1,8 @@
-"""`gsgan.prepare`: calibrated, synchronised videos in, a capture for `data=capture` out."""
+"""`gsgan.prepare`: videos in, a capture for `data=capture` out."""
 
 import shutil
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from gsgan.prepare.dataset import Outcome, exists, publish, write_files
 from gsgan.prepare.images import find_masks, write_images
 from gsgan.prepare.landmarks import Detections
 from gsgan.prepare.mediapipe import run_tool, tool_key
+from gsgan.prepare.one_camera import solve_video
 from gsgan.prepare.options import MEDIAPIPE, Inputs, Options, read_inputs
 from gsgan.prepare.solve import Solution, solve
 from gsgan.prepare.sources import stamp
@@ -39,7 +41,7 @@ def prepare(options: Options, console: Console) -> Path:
         GsganError: on anything the user can correct.
     """
     out = options.folder("out")
-    inputs = read_inputs(options)
+    inputs = None if options.one_camera else read_inputs(options)
     key = digest([STAGE_VERSION, options.record(), _fingerprint(options, inputs)])
     if exists(out, key, options.overwrite):
         console.print(f"{out} exists already, made from the same images and settings")
@@ -47,14 +49,21 @@ def prepare(options: Options, console: Console) -> Path:
             check_capture(out, out / "check.html", console)
         return out
     stages = StageFolder(out.parent / f".{out.name}.prepare")
-    detections, masks = _read_people(options, inputs, stages, console)
-    frames, solution = _solved(options, inputs, detections, console)
+    extra: dict[str, object] = {}
+    if inputs is None:
+        filmed = solve_video(options, stages, console)
+        inputs, masks, frames = filmed.inputs, filmed.masks, filmed.frames
+        solution, extra = filmed.solution, {"one_camera": filmed.numbers}
+        options = replace(options, face=False)
+    else:
+        detections, masks = _read_people(options, inputs, stages, console)
+        frames, solution = _solved(options, inputs, detections, console)
     root = stages.path("dataset", key)
     shutil.rmtree(root, ignore_errors=True)  # of a run that was killed
     written = _write_images(options, inputs, masks, frames, solution, root)
     outcome = Outcome(options, inputs, frames, solution, written)
     write_files(root, outcome, key)
-    numbers = summarise(outcome)
+    numbers = summarise(outcome) | extra
     write_json(root / "prepare.json", numbers)
     publish(root, out)
     stages.remove_others()
@@ -71,10 +80,12 @@ def prepare(options: Options, console: Console) -> Path:
     return out
 
 
-def _fingerprint(options: Options, inputs: Inputs) -> list[object]:
+def _fingerprint(options: Options, inputs: Inputs | None) -> list[object]:
     """Everything that is read: images, calibration, landmark and mask files, the tool."""
-    parts: list[object] = [source.fingerprint() for source in inputs.sources.values()]
-    parts += [inputs.calibration.path.name, *(str(c) for c in inputs.cameras)]
+    parts: list[object] = [stamp(options.folder("source"))]
+    if inputs is not None:
+        parts = [source.fingerprint() for source in inputs.sources.values()]
+        parts += [inputs.calibration.path.name, *(str(c) for c in inputs.cameras)]
     for name in ("landmarks", "masks"):
         if getattr(options, name) != MEDIAPIPE:
             place = options.folder(name)

@@ -38,7 +38,7 @@ class Recording:
     def images(self) -> Iterator[tuple[int, Bytes]]:
         """(number, BGR image ``[H, W, 3]``), in order; a video's are numbered from 0."""
         if not self.files:
-            yield from enumerate(_decoded(_open(self.path, self.rotate)))
+            yield from enumerate(_decoded(opened(self.path, self.rotate)))
         for number, path in self.files.items():
             yield number, np.asarray(cv2.cvtColor(read_colour(path), cv2.COLOR_RGB2BGR), np.uint8)
 
@@ -78,7 +78,7 @@ def _sources_in(folder: Path, rotate: bool) -> dict[str, Recording]:
             size = read_header(next(iter(paths.values())))[0]
             source = Recording(path.name, path, size, None, paths, len(paths))
         elif path.suffix.lower() in VIDEO_SUFFIXES:
-            source = _video(path, rotate)
+            source = video_recording(path, rotate)
         else:
             continue
         if source.name in sources:
@@ -87,8 +87,13 @@ def _sources_in(folder: Path, rotate: bool) -> dict[str, Recording]:
     return sources
 
 
-def _video(path: Path, rotate: bool) -> Recording:
-    video = _open(path, rotate)
+def video_recording(path: Path, rotate: bool) -> Recording:
+    """A video whose first image can be decoded.
+
+    Raises:
+        DataError: when it cannot.
+    """
+    video = opened(path, rotate)
     fps = float(video.get(cv2.CAP_PROP_FPS))
     turned = int(video.get(cv2.CAP_PROP_ORIENTATION_META))
     count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
@@ -99,7 +104,12 @@ def _video(path: Path, rotate: bool) -> Recording:
     return Recording(path.stem, path, (len(first), len(first[0])), rate, {}, count, turned, rotate)
 
 
-def _open(path: Path, rotate: bool) -> cv2.VideoCapture:
+def opened(path: Path, rotate: bool) -> cv2.VideoCapture:
+    """A video, turned upright or as stored.
+
+    Raises:
+        DataError: when it cannot be opened.
+    """
     video = cv2.VideoCapture(str(path))
     if not video.isOpened():
         raise DataError(f"{path} cannot be opened as a video; convert it to H.264 MP4")

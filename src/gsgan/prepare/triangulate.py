@@ -197,7 +197,7 @@ def _group_flips(cameras: CameraArray, uv: Float, weight: Float, pairs: Pairs) -
     few = (weight > 0).sum(-1) < LEAST_JOINTS
     price = np.where(few, np.inf, FLIP_GAIN * weight.sum(-1))
     flips = cheapest_flips(lambda f, at: points(f, at)[1], np.zeros((C, F), bool), price)
-    flips = flips ^ _exchanged(points(flips, everywhere)[0])
+    flips = flips ^ exchanged(points(flips, everywhere)[0])
     votes = weight.sum(-1)
     return ~flips if (votes * flips).sum() > votes.sum() / 2 else flips
 
@@ -227,7 +227,7 @@ def cheapest_flips(
     return flips
 
 
-def _exchanged(p: Float) -> Bool:
+def exchanged(p: Float) -> Bool:
     """``[F]`` frames whose sides ``p [F, J, 3]`` are exchanged against the first frame's."""
     state = np.zeros(len(p), bool)
     last, before = p[0], known(p[0])

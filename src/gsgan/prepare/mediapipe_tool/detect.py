@@ -8,9 +8,12 @@ per image. Writes an npz:
     px (F,33,2), conf (F,33)     pixels of the image as stored, first pixel's centre at (0.5, 0.5)
     left, right (F,21,2)         the person's hands; NaN = not found
     face (F,468,2)               MediaPipe's face mesh; NaN = not found
+    world (F,33,3)               metres from the middle of the hips, x right, y down, z away
+    left_z, right_z (F,21)       depth of the hands' landmarks from their wrist, pixels
+    faces (F,)                   number of faces, of any person
     frame_id (F,)
 
-and masks/%06d.png, 0..255. Depth estimates are not written: they are relative, not metric.
+and masks/%06d.png, 0..255. Depths are guesses: they start the solution from one camera.
 """
 
 import json
@@ -101,18 +104,23 @@ class Detector:
         holistic = options.hands or options.face
         kind = solutions.holistic.Holistic if holistic else solutions.pose.Pose
         self.body = kind(smooth_landmarks=False)
+        self.faces = solutions.face_detection.FaceDetection(model_selection=1)
         self.segmenter = solutions.pose.Pose(static_image_mode=True, enable_segmentation=True)
 
     def landmarks(self, image: Any) -> dict[str, Any]:
-        found = self.body.process(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+        rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+        found = self.body.process(rgb)
         size = image.shape[1], image.shape[0]
         pose = found.pose_landmarks
         visibility = [p.visibility for p in pose.landmark] if pose else [0.0] * JOINTS
+        hands = {side: getattr(found, f"{side}_hand_landmarks", None) for side in ("left", "right")}
         return {
             "px": pixels(pose, size, JOINTS),
             "conf": np.array(visibility, np.float32),
-            "left": pixels(getattr(found, "left_hand_landmarks", None), size, HAND),
-            "right": pixels(getattr(found, "right_hand_landmarks", None), size, HAND),
+            "world": space(found.pose_world_landmarks),
+            "faces": len(self.faces.process(rgb).detections or ()),
+            **{side: pixels(hand, size, HAND) for side, hand in hands.items()},
+            **{f"{side}_z": depth(hand, size, HAND) for side, hand in hands.items()},
             "face": pixels(getattr(found, "face_landmarks", None), size, FACE),
         }
 
@@ -141,6 +149,20 @@ def pixels(landmarks: Any, size: tuple[int, int], count: int) -> Any:
     if landmarks is None:
         return np.full((count, 2), np.nan, np.float32)
     return np.array([(p.x * size[0], p.y * size[1]) for p in landmarks.landmark], np.float32)
+
+
+def depth(landmarks: Any, size: tuple[int, int], count: int) -> Any:
+    """``[count]``; MediaPipe's numbers are shares of the image's width."""
+    if landmarks is None:
+        return np.full(count, np.nan, np.float32)
+    return np.array([p.z * size[0] for p in landmarks.landmark], np.float32)
+
+
+def space(landmarks: Any) -> Any:
+    """``[33, 3]`` metres."""
+    if landmarks is None:
+        return np.full((JOINTS, 3), np.nan, np.float32)
+    return np.array([(p.x, p.y, p.z) for p in landmarks.landmark], np.float32)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,123 @@
+"""`gsgan.prepare` from one video of one uncalibrated camera."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from one_person import film, turning, world_landmarks
+from rich.console import Console
+
+from gsgan.data.formats.capture import read_capture
+from gsgan.prepare.frames import sample
+from gsgan.prepare.one_view import Seen, solve_view
+from gsgan.prepare.options import Options
+from gsgan.prepare.run import prepare
+from gsgan.utils.errors import DataError
+
+GUESS = 1.2  # the first guess of the focal length over the true one
+
+
+def aligned(p, truth):
+    """Points after the rigid motion and scale that bring them nearest to the true ones."""
+    a, b = p - p.mean((0, 1)), truth - truth.mean((0, 1))
+    U, S, V = np.linalg.svd(np.einsum("fni,fnj->ij", a, b))
+    sign = np.diag([1, 1, np.linalg.det(U @ V)])
+    return (S * np.diag(sign)).sum() / (a**2).sum() * a @ U @ sign @ V + truth.mean((0, 1))
+
+
+def options(video, **more) -> Options:
+    folder = video.parent
+    given = {
+        "source": str(video),
+        "out": str(folder / "capture"),
+        "landmarks": str(folder / "landmarks"),
+        "masks": str(folder / "masks"),
+        "hands": False,
+        "landmark_noise": 0.002,
+        "height": 1.7,
+        "focal": 520 / np.hypot(360, 640) * np.hypot(36, 24),
+    }
+    return Options(**given | more)
+
+
+@pytest.fixture(scope="session")
+def filmed(tmp_path_factory):
+    return film(tmp_path_factory.mktemp("one_video"))
+
+
+@pytest.mark.slow
+def test_focal_length_and_landmarks_are_found():
+    truth = turning(48)
+    u = truth[..., :2] / truth[..., 2:] / GUESS
+    seen = Seen(
+        *map(torch.tensor, (u, np.ones(u.shape[:2]), world_landmarks(truth), np.arange(48) / 10))
+    )
+    found = solve_view(seen, noise=0.001)
+    error = np.linalg.norm(aligned(found.p.numpy(), truth) - truth, axis=-1)
+    assert GUESS * found.focal == pytest.approx(1, abs=0.05)
+    assert np.median(error) < 0.025
+
+
+def test_a_video_becomes_a_capture_that_training_reads(filmed, tmp_path):
+    out = prepare(options(filmed, out=str(tmp_path / "capture")), Console(quiet=True))
+    capture, numbers = read_capture(out), json.loads((out / "prepare.json").read_text())
+    assert list(capture.cameras) == ["me"]
+    found = np.load(out / "landmarks3d.npz")
+    p, truth = found["p"], turning(18)[found["frame_id"]]
+    assert len(p) >= 16
+    assert np.median(np.linalg.norm(aligned(p, truth) - truth, axis=-1)) < 0.03
+    assert np.abs(np.percentile(p[:, 29:33, 2], 50)) < 0.06  # feet on the ground, z upwards
+    notes = " ".join(numbers["notes"])
+    assert "3.4 seconds are short" in notes
+    assert "focal" in notes
+
+
+def spoiled(filmed, tmp_path, change):
+    """The film with changed landmarks."""
+    import shutil
+
+    folder = shutil.copytree(filmed.parent, tmp_path / "film")
+    arrays = dict(np.load(folder / "landmarks/me.npz"))
+    change(arrays)
+    np.savez(folder / "landmarks/me.npz", **arrays)
+    return folder / "me.avi"
+
+
+def nobody(arrays):
+    arrays["conf"][:] = 0
+
+
+def no_depth(arrays):
+    del arrays["world"]
+
+
+def hips_cut_off(arrays):
+    arrays["px"][:, 23:25, 1] = 700
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (nobody, "only 0 of 18 sampled images show one whole person"),
+        (no_depth, "one camera needs the array world"),
+        (hips_cut_off, "shoulders or hips cut off: "),
+    ],
+)
+def test_videos_without_a_whole_person_end_in_one_sentence(filmed, tmp_path, change, message):
+    with pytest.raises(DataError, match=message):
+        prepare(options(spoiled(filmed, tmp_path, change)), Console(quiet=True))
+
+
+def test_long_large_videos_are_sampled(tmp_path):
+    video = cv2.VideoWriter(
+        str(tmp_path / "me.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 60, (2400, 16)
+    )
+    for f in range(330):
+        video.write(np.full((16, 2400, 3), f // 2, np.uint8))
+    video.release()
+    recording, time = sample(tmp_path / "me.avi", tmp_path / "frames")
+    assert recording.size == (13, 1920)
+    np.testing.assert_allclose(np.diff(time), 1 / 12, atol=1e-3)
+    assert list(recording.files) == list(range(0, 330, 5))
