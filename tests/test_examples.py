@@ -1,6 +1,7 @@
 """The scripts of docs/examples/ run, on tiny data; the commands they start run in this process."""
 
 import importlib
+import os
 import re
 from types import ModuleType, SimpleNamespace
 
@@ -31,6 +32,7 @@ def script(inside, monkeypatch):
         return module
 
     monkeypatch.syspath_prepend(str(FOLDER))
+    monkeypatch.setenv("PYTHONPATH", str(FOLDER), prepend=os.pathsep)  # of a sweep's jobs
     return example
 
 

@@ -98,8 +98,7 @@ def test_degrees_above_the_active_one_are_neither_computed_nor_moved(build):
     assert psi.table.grad[:, 11:14].any()
     assert not psi.head.weight.grad[above].any()
     psi.active_degree = 1
-    trunk = torch.zeros(1, len(psi.table), psi.head.in_features)
-    assert psi._head(trunk)[0].shape[-1] == sum(psi.parts) - 3 * (9 - 4)
+    assert psi._active(psi.head.bias).shape[-1] == sum(psi.parts) - 3 * (9 - 4)
 
 
 def test_decisions_are_stored_and_taken_up_again(capture, inside, tmp_path):

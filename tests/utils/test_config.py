@@ -1,5 +1,6 @@
 """Configs compose, match their constructors key for key, and ablations differ by a line or two."""
 
+import importlib.util
 import re
 from pathlib import Path
 
@@ -30,7 +31,10 @@ def test_every_option_composes(compose):
         OmegaConf.to_container(config.training, resolve=True)
         model = OmegaConf.to_container(config.model, resolve=True)
         assert model["_target_"].startswith("gsgan.")
+    found = importlib.util.find_spec("hydra_plugins.hydra_optuna_sweeper") is not None
     for experiment in options("experiment"):
+        if experiment == "search" and not found:  # its sweeper is in the extra sweep
+            continue
         config = compose("train", f"experiment={experiment}")
         OmegaConf.to_container(config.training, resolve=True)
 

@@ -45,7 +45,7 @@ def job(tmp_path, monkeypatch):
 
     def run(line: str, objective: str | None = None):
         settings = SimpleNamespace(
-            runtime=SimpleNamespace(output_dir=str(tmp_path)),
+            runtime=SimpleNamespace(output_dir=str(tmp_path), config_sources=[]),
             overrides=SimpleNamespace(task=["seed=1"], hydra=["hydra.mode=MULTIRUN"]),
         )
         monkeypatch.setattr(sweeps.HydraConfig, "get", lambda: settings)
@@ -81,7 +81,10 @@ def test_a_job_returns_the_score_that_a_search_asks_for(job, tmp_path):
 
 def test_a_job_is_the_same_command_in_the_same_folder(tmp_path, monkeypatch):
     settings = SimpleNamespace(
-        runtime=SimpleNamespace(output_dir=str(tmp_path / "it's")),
+        runtime=SimpleNamespace(
+            output_dir=str(tmp_path / "it's"),
+            config_sources=[SimpleNamespace(provider="command-line", path="/own")],
+        ),
         overrides=SimpleNamespace(
             task=["seed=1", "logger=csv"],
             hydra=["hydra.mode=MULTIRUN", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2",
@@ -93,7 +96,7 @@ def test_a_job_is_the_same_command_in_the_same_folder(tmp_path, monkeypatch):
     commands = []
     monkeypatch.setattr(sweeps, "_status", lambda command: commands.append(command) or 0)
     sweeps.run_job("train", None)
-    own = ["hydra.mode=RUN", f"hydra.run.dir='{tmp_path}/it\\'s'"]
+    own = ["hydra.mode=RUN", f"hydra.run.dir='{tmp_path}/it\\'s'", "--config-dir", "/own"]
     given = ["seed=1", "logger=csv", "hydra.verbose=true", *own]
     assert commands == [[sys.executable, "-m", "gsgan.train", *given]]
 

@@ -126,9 +126,9 @@ def entry(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], No
                 command()
             except CompactHydraException as error:
                 cause = error.__cause__
-                sys.exit(
-                    f"{error}\n{cause}" if isinstance(cause, OmegaConfBaseException) else str(error)
-                )
+                more = f"\n{cause}" if isinstance(cause, OmegaConfBaseException) else ""
+                print(f"{error}{more}", file=sys.stderr)
+                sys.exit(FAILED)
             except OSError as error:
                 message = one_sentence(error)
                 if message is None:

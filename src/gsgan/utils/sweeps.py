@@ -51,7 +51,10 @@ def run_job(command: str, objective: str | None) -> float | None:
     given = (*settings.overrides.task, *settings.overrides.hydra)
     arguments = [x for x in given if not OF_THE_SWEEP.match(x)]
     quoted = str(folder).replace("\\", "\\\\").replace("'", "\\'")
-    own = ("hydra.mode=RUN", f"hydra.run.dir='{quoted}'")
+    own = ["hydra.mode=RUN", f"hydra.run.dir='{quoted}'"]
+    for source in settings.runtime.config_sources:
+        if source.provider == "command-line":  # --config-dir, of which Hydra takes one
+            own += ["--config-dir", source.path]
     status = _status([sys.executable, "-m", f"gsgan.{command}", *arguments, *own])
     if status == 0:
         try:
