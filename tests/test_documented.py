@@ -28,7 +28,7 @@ SMALL_BENCH = {
         *("settings.precisions=[]", "settings.windows=[]", "repeats=1", "images=1"),
     ],
     "raster": [
-        *("repeats=1", "gaussians=[300]", "channels=[3]", "sizes=[32]", "windows=1", "window=16"),
+        *("repeats=1", "gaussians=[300]", "channels=[3]", "sizes=[32]", "windows=1", "window=16")
     ],
 }
 

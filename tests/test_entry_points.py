@@ -75,8 +75,7 @@ def test_nothing_has_moved_where_there_is_no_run(inside):
 
 
 @pytest.mark.parametrize(
-    ("file", "text"),
-    [("config.yaml", "data: {"), ("config.yaml", ""), ("hydra.yaml", "a: [")],
+    ("file", "text"), [("config.yaml", "data: {"), ("config.yaml", ""), ("hydra.yaml", "a: [")]
 )
 def test_a_damaged_run_folder_is_one_sentence(file, text, run, tmp_path, inside):
     copy = shutil.copytree(run, tmp_path / "copy")

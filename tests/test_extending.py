@@ -135,14 +135,7 @@ def test_a_loss_term(tiny):
 
 
 def test_a_generator(build):
-    keys = (
-        "base",
-        "multipliers",
-        "style_share",
-        "rgb_skip",
-        "feature_bound",
-        "patch",
-    )
+    keys = ("base", "multipliers", "style_share", "rgb_skip", "feature_bound", "patch")
     _, avatar, frame = build(
         f"model.generator._target_={HERE}.OneLayer", *(f"~model.generator.{key}" for key in keys)
     )

@@ -29,7 +29,7 @@ ALL = [
         "pose encoder",
         "UNet",
         "paste",
-    ),
+    )
 ]
 
 

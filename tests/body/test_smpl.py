@@ -163,9 +163,7 @@ def test_the_root_turns_about_its_own_joint_and_expression_moves_the_face(small)
     vertices, joints = model.pose(theta, betas, torch.zeros(2, 3), face.expand(2, -1))
     torch.testing.assert_close(joints[0, 0], joints[1, 0])
     np.testing.assert_allclose(
-        vertices[0].numpy(),
-        written["v_template"] + 2 * written["shapedirs"][..., 11],
-        atol=1e-12,
+        vertices[0].numpy(), written["v_template"] + 2 * written["shapedirs"][..., 11], atol=1e-12
     )
     torch.testing.assert_close(
         model.posed_joints(theta, betas, torch.zeros(2, 3), face.expand(2, -1)), joints

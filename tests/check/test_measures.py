@@ -8,10 +8,7 @@ import pytest
 from make import edit_json, edit_npz
 
 from gsgan.check.frames import reprojection_errors, skeleton_doubts
-from gsgan.check.geometry import (
-    geometry_findings,
-    geometry_of,
-)
+from gsgan.check.geometry import geometry_findings, geometry_of
 from gsgan.check.report import Flagged
 from gsgan.check.sections import colour_table, mean_colours
 from gsgan.check.settings import Limits, Sampling

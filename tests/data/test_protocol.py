@@ -82,11 +82,7 @@ def test_new_poses_seen_by_a_camera_that_trains(layout):
             "protocol one requests camera 21; the capture has 4: cam00, cam01",
         ),
         ({"train_cameras": [-1]}, DataError, "requests camera -1"),
-        (
-            {"test_cameras": ["cam9"]},
-            DataError,
-            "requests camera cam9; the capture has 4: cam00",
-        ),
+        ({"test_cameras": ["cam9"]}, DataError, "requests camera cam9; the capture has 4: cam00"),
         ({"test_cameras": [0]}, ConfigError, "frame 0 of camera cam00 is in both splits"),
         ({"train_frames": "50-60"}, DataError, "nothing to train on with cameras cam00"),
         ({"train_frames": {"377": "0-3"}}, ConfigError, "protocol.subject is None: the frames"),

@@ -27,11 +27,7 @@ def parameters(avatar) -> int:
 
 @pytest.mark.parametrize(
     ("effect", "word", "adds"),
-    [
-        ("view_dependence", "1", True),
-        ("antialias", "on", False),
-        ("colour_correction", "on", True),
-    ],
+    [("view_dependence", "1", True), ("antialias", "on", False), ("colour_correction", "on", True)],
 )
 def test_off_builds_no_parameter_and_calls_no_operator(build, effect, word, adds):
     _, off, frame = build(NONE)

@@ -159,10 +159,7 @@ def test_an_image_that_is_not_finite_is_an_error_that_names_it():
 def test_every_split_has_every_metric_or_a_reason():
     f = person()
     found = score_split([(("a", 0), f)], lambda f, _: Prediction({FULL: f.image}, {}), scorer())
-    for values in (
-        *found.variants.values(),
-        empty("none held out", scorer()),
-    ):
+    for values in (*found.variants.values(), empty("none held out", scorer())):
         for metric in (
             "psnr",
             "ssim_person",
@@ -217,9 +214,7 @@ def test_miou_of_a_split_without_parts_is_none():
     f = replace(person(), labels=torch.zeros(1, 24, 24, dtype=torch.long))
     parts = segmentation(f.labels, 3)
     found = score_split(
-        [(("a", 0), f)],
-        lambda f, _: Prediction({FULL: f.image}, {}, segmentation=parts),
-        scorer(),
+        [(("a", 0), f)], lambda f, _: Prediction({FULL: f.image}, {}, segmentation=parts), scorer()
     )
     assert found.variants[FULL]["miou"] is None
     assert found.variants[FULL]["miou_reason"] == "the ground truth has no part"

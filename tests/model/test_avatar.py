@@ -71,10 +71,7 @@ def test_a_missing_body_pose_is_solved_from_the_skeleton(build):
 
 @pytest.mark.parametrize(
     ("model", "absent"),
-    [
-        ("wo_seg", ["segmentation"]),
-        ("splat_only", ["segmentation", "pose_encoder", "generator"]),
-    ],
+    [("wo_seg", ["segmentation"]), ("splat_only", ["segmentation", "pose_encoder", "generator"])],
 )
 def test_what_is_off_builds_no_parameter(build, model, absent):
     _, avatar, frame = build(f"model={model}")

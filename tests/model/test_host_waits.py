@@ -184,10 +184,7 @@ def test_the_portable_rasteriser_waits_twice(build, monkeypatch):
         monkeypatch.setattr(checks, name, lambda *_: None)
     with Reads() as reads, torch.no_grad():
         raster = rasterise(
-            painting.gaussians,
-            replace(frame.camera),
-            settings=avatar.accuracy,
-            backend="torch",
+            painting.gaussians, replace(frame.camera), settings=avatar.accuracy, backend="torch"
         )
     assert reads.seen == {"_local_scalar_dense": 1}  # and one list of numbers
     torch.testing.assert_close(raster.features, plain.features, atol=1e-5, rtol=0)

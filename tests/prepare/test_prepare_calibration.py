@@ -2,12 +2,7 @@
 
 import numpy as np
 import pytest
-from capture_scenes import (
-    LENS,
-    ring,
-    write_own,
-    write_toml,
-)
+from capture_scenes import LENS, ring, write_own, write_toml
 
 from gsgan.data.calibration import find_calibration, read_calibration
 from gsgan.prepare.sources import matching_cameras, pair_cameras

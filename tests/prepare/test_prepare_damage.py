@@ -116,8 +116,7 @@ def test_an_old_dataset_stays_when_the_new_one_cannot_be_moved(tmp_path, monkeyp
 
 
 @pytest.mark.parametrize(
-    "more",
-    [{"fps": "abc"}, {"workers": "x"}, {"offsets": {"a": "b"}}, {"mask_levels": (0.8, 0.3)}],
+    "more", [{"fps": "abc"}, {"workers": "x"}, {"offsets": {"a": "b"}}, {"mask_levels": (0.8, 0.3)}]
 )
 def test_options_of_the_wrong_kind(more):
     with pytest.raises(ConfigError, match=next(iter(more))):

@@ -7,12 +7,7 @@ from make import distorted_pixels, skeletons
 
 from gsgan.data.joints import FLIP_GROUPS
 from gsgan.prepare import triangulate
-from gsgan.prepare.camera_array import (
-    CameraArray,
-    camera_moves,
-    refine_cameras,
-    undistort_points,
-)
+from gsgan.prepare.camera_array import CameraArray, camera_moves, refine_cameras, undistort_points
 from gsgan.prepare.cleanse import cleanse, smooth
 from gsgan.prepare.solve import SolveSettings, clock_errors, median, solve
 from gsgan.prepare.triangulate import apply_flips, find_flips, plain, robust

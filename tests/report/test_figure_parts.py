@@ -6,14 +6,7 @@ import torch
 from matplotlib import rc_context
 
 from gsgan.report.figures import images
-from gsgan.report.figures.layout import (
-    COLUMN,
-    STYLE,
-    TALLEST,
-    Panel,
-    draw_panels,
-    written,
-)
+from gsgan.report.figures.layout import COLUMN, STYLE, TALLEST, Panel, draw_panels, written
 from gsgan.report.figures.subjects import choose_items, make_shots, measure
 from gsgan.utils.errors import ConfigError, DataError
 

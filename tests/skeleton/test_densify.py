@@ -231,11 +231,7 @@ def test_even_samplers_cover_evenly():
 
 @pytest.mark.parametrize("n", [1, 7, 500])
 def test_even_samplers_return_the_requested_number(n):
-    for points, normals in (
-        even_cylinder(n),
-        even_sphere(n),
-        even_box(n, (1.0, 2.0, 0.5)),
-    ):
+    for points, normals in (even_cylinder(n), even_sphere(n), even_box(n, (1.0, 2.0, 0.5))):
         assert points.shape == normals.shape == (n, 3)
         np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
 

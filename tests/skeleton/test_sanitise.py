@@ -6,11 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from skeleton_poses import NAMES, REST, joint, noisy, rest, rotation
 
-from gsgan.skeleton import (
-    MEDIAPIPE33,
-    limb_length_sum,
-    sanitise,
-)
+from gsgan.skeleton import MEDIAPIPE33, limb_length_sum, sanitise
 
 NAN = float("nan")
 HANDS_FEET_HEAD = [*range(11), *range(17, 23), *range(29, 33)]

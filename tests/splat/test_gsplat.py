@@ -28,14 +28,7 @@ from splat_scenes import (
 from stability.cases.case import drawing_backends
 
 from gsgan.scene import Camera, Gaussians
-from gsgan.splat import (
-    ACCURACY,
-    gsplat_backend,
-    project,
-    rasterise,
-    reference,
-    resolve_backend,
-)
+from gsgan.splat import ACCURACY, gsplat_backend, project, rasterise, reference, resolve_backend
 
 CPU, CUDA = torch.device("cpu"), torch.device("cuda")
 STANDARD = ACCURACY["standard"]

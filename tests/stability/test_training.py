@@ -108,8 +108,7 @@ def test_when_it_recurs_the_run_stops_with_a_clear_message(make, capsys):
     module, frame, fit = make((0, 5, 0), "training.max_skipped=2")
     poison(module, PARTS["psi"][1], {1, 2}, float("nan"))
     with pytest.raises(
-        GsganError,
-        match=r"at iteration 2: 2 of the last 1000 .* larger training.max_sk",
+        GsganError, match=r"at iteration 2: 2 of the last 1000 .* larger training.max_sk"
     ):
         fit([frame] * 5)
     assert "skipped (1 of the last 1000 iterations, at most 2)" in capsys.readouterr().out

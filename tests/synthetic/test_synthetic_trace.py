@@ -11,13 +11,7 @@ from gsgan.motion.character import Surface
 from gsgan.synthetic import trace
 from gsgan.synthetic.camera import SceneCamera, pixel_offsets, pixel_rays
 from gsgan.synthetic.textures import Textures, linear
-from gsgan.synthetic.trace import (
-    Appearance,
-    Light,
-    PosedCharacter,
-    Wrinkles,
-    encode,
-)
+from gsgan.synthetic.trace import Appearance, Light, PosedCharacter, Wrinkles, encode
 
 GREY = 0.21586  # linear light of sRGB 128
 MATT = Light(direction=(0, 3, 4), sun=(0.4, 0.3, 0.2), sky=(0.3,) * 3, ground=(0.1,) * 3,

@@ -7,12 +7,7 @@ import torch
 from lightning import Trainer
 from torch.utils.data import DataLoader
 
-from gsgan.losses.adversarial import (
-    FORMS,
-    discriminator_loss,
-    feature_matching,
-    generator_loss,
-)
+from gsgan.losses.adversarial import FORMS, discriminator_loss, feature_matching, generator_loss
 from gsgan.model.discriminator import Discriminator
 from gsgan.train.losses import DiscriminatorMaps, discriminate
 from gsgan.utils.errors import ConfigError, GsganError

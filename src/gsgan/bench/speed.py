@@ -280,10 +280,7 @@ def settings_of(config: DictConfig, avatar: Avatar, frames: Sequence[Frame]) -> 
 
 
 def text(
-    times: pd.DataFrame,
-    where: dict[str, Any],
-    settings: dict[str, Any],
-    marks: Sequence[str],
+    times: pd.DataFrame, where: dict[str, Any], settings: dict[str, Any], marks: Sequence[str]
 ) -> str:
     """The block of the page: the machine, the settings, the table, the notes."""
     stages, total = times.drop(TOTAL), times.loc[TOTAL]

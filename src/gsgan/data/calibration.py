@@ -156,9 +156,7 @@ def choose(
 
 
 def read_cameras(
-    path: Path,
-    content: Mapping[str, Any],
-    conventions: Conventions,
+    path: Path, content: Mapping[str, Any], conventions: Conventions
 ) -> dict[str, CameraEntry]:
     """The cameras of cameras.json by name, in metres, pixel centres moved to +0.5.
 

@@ -81,8 +81,7 @@ def surface_colours(moments: Sequence[Sequence[Frame]]) -> SurfaceColours | None
     left = [pair - median for pair, median in zip(pairs, medians, strict=True)]
     brightness = np.abs(np.concatenate(left).mean(axis=1))
     return SurfaceColours(
-        difference=float(np.abs(medians).max()),
-        residual=float(np.quantile(brightness, RESIDUAL)),
+        difference=float(np.abs(medians).max()), residual=float(np.quantile(brightness, RESIDUAL))
     )
 
 

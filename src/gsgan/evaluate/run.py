@@ -29,25 +29,13 @@ from gsgan.evaluate.files import (
 )
 from gsgan.evaluate.grids import write_grid
 from gsgan.evaluate.origin import Method, origin, trained
-from gsgan.evaluate.predictions import (
-    FLOOR,
-    FULL,
-    BodyBoxes,
-    Preparation,
-    read_folder,
-)
+from gsgan.evaluate.predictions import FLOOR, FULL, BodyBoxes, Preparation, read_folder
 from gsgan.evaluate.scores import Predict, Scorer, SplitScores, empty, painter, score_split
 from gsgan.metrics.lpips import lpips
 from gsgan.metrics.regions import BACKGROUNDS
 from gsgan.model.assemble import build_data
 from gsgan.model.runs import avatar_of, load_avatar
-from gsgan.model.stored import (
-    CHECKPOINT,
-    DataPaths,
-    load_config,
-    read_checkpoint,
-    read_config,
-)
+from gsgan.model.stored import CHECKPOINT, DataPaths, load_config, read_checkpoint, read_config
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.tensors import pick_device

@@ -27,13 +27,7 @@ from gsgan.metrics.image import (
     ssim_where,
 )
 from gsgan.metrics.names import BOX_METRICS, IMAGE_METRICS, METRICS, PART_METRICS
-from gsgan.metrics.regions import (
-    BACKGROUNDS,
-    cleared,
-    describe_boxes,
-    mask_crop,
-    rectangle,
-)
+from gsgan.metrics.regions import BACKGROUNDS, cleared, describe_boxes, mask_crop, rectangle
 from gsgan.metrics.segmentation import confusion, miou
 from gsgan.model.avatar import Avatar
 from gsgan.model.rendering import Rendering

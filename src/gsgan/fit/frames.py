@@ -35,11 +35,7 @@ class MaskedFrames:
     """
 
     def __init__(
-        self,
-        data: GsganData,
-        device: torch.device,
-        least_mask: float = 0.1,
-        held_out: bool = False,
+        self, data: GsganData, device: torch.device, least_mask: float = 0.1, held_out: bool = False
     ) -> None:
         layout, cameras = data.layout, data.splits.train_cameras
         trained = data.trained

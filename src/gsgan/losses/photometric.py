@@ -108,9 +108,7 @@ def _compiled(image: Tensor, target: Tensor) -> bool:
 
 
 _Job = build.job_type(
-    ("planes", "H", "W", "threads"),
-    ("l1", "l2", "ssim"),
-    ("image", "target", "d_image", "totals"),
+    ("planes", "H", "W", "threads"), ("l1", "l2", "ssim"), ("image", "target", "d_image", "totals")
 )  # struct PhotometricJob of splat/kernels/photometric.h
 
 

@@ -77,12 +77,7 @@ def rectangle(where: Tensor, least: int = 1) -> tuple[slice, slice] | None:
 
 
 def mask_crop(
-    image: Tensor,
-    mask: Tensor,
-    background: float,
-    *,
-    margin: int = 50,
-    size: int = 512,
+    image: Tensor, mask: Tensor, background: float, *, margin: int = 50, size: int = 512
 ) -> Tensor | None:
     """The mask's box and a margin, centred in a square of the background, resized.
 

@@ -111,11 +111,7 @@ class Harmonic(ResidualGaussians):
 
 @torch.no_grad()
 def distilled(
-    avatar: Avatar,
-    poses: Iterable[Pose],
-    *,
-    follow: Sequence[str] = FOLLOW,
-    ridge: float = RIDGE,
+    avatar: Avatar, poses: Iterable[Pose], *, follow: Sequence[str] = FOLLOW, ridge: float = RIDGE
 ) -> Avatar:
     """A frozen copy of an avatar with `Harmonic` residuals in Ψ's place: the least-squares fit to
     Ψ's over poses. An avatar that has such residuals already is copied.

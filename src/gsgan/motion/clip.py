@@ -109,13 +109,7 @@ def checked(motion: Clip, least_visibility: float) -> Clip:
     q, shown = mixed(p[before], p[after], share), visibility[nearest]
     q = np.where(np.isfinite(q), q, p[nearest])
     q[:, BODY:], shown[:, BODY:] = p[:, BODY:], visibility[:, BODY:]
-    return replace(
-        motion,
-        p=q,
-        visibility=shown,
-        body=body,
-        filled=int((~good).sum()),
-    )
+    return replace(motion, p=q, visibility=shown, body=body, filled=int((~good).sum()))
 
 
 def neighbours(known: Bool) -> tuple[NDArray[np.int64], NDArray[np.int64], Float]:

@@ -140,9 +140,7 @@ def _to_metres(
 
 
 def _parts_to_metres(
-    parts: Sequence[tuple[Float, Float]],
-    rest: Sequence[Float],
-    lengths: Sequence[tuple[int, int]],
+    parts: Sequence[tuple[Float, Float]], rest: Sequence[Float], lengths: Sequence[tuple[int, int]]
 ) -> list[Float]:
     """Both hands, or the face, ``[F, n, 3]``, of points and confidences.
 

@@ -9,10 +9,7 @@ from gsgan.skeleton.hands import FINGER_BONES, HAND
 
 Bones = tuple[tuple[int, int], ...]
 # Bones of constant length, as (inner, outer) joint: the outer one is removed when it differs.
-BODY_BONES = (
-    *((11, 13), (13, 15), (12, 14), (14, 16)),
-    *((23, 25), (25, 27), (24, 26), (26, 28)),
-)
+BODY_BONES = (*((11, 13), (13, 15), (12, 14), (14, 16)), *((23, 25), (25, 27), (24, 26), (26, 28)))
 HAND_ROOTS = [BODY, BODY + HAND]
 HAND_BONES = tuple((start, start + knuckle) for start in HAND_ROOTS for knuckle in PALM)
 FINGERS = tuple((start + a, start + b) for start in HAND_ROOTS for a, b in FINGER_BONES)

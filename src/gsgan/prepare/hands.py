@@ -5,12 +5,7 @@ from numpy.typing import NDArray
 
 from gsgan.data.joints import HAND_PAIRS
 from gsgan.prepare.camera_array import Bool, CameraArray, Float
-from gsgan.prepare.triangulate import (
-    FLIP_GAIN,
-    apply_flips,
-    cheapest_flips,
-    points_and_cost,
-)
+from gsgan.prepare.triangulate import FLIP_GAIN, apply_flips, cheapest_flips, points_and_cost
 from gsgan.skeleton.hands import HAND
 
 # Errors and distances are in thousandths of the focal length.
@@ -19,12 +14,7 @@ MAX_ERROR = 20.0  # median error beyond which a detected hand is left out
 OWN_PAIRS = tuple((j, j + HAND) for j in range(len(HAND_PAIRS)))
 
 
-def match_hands(
-    cameras: CameraArray,
-    uv: Float,
-    weight: Float,
-    wrists: Float,
-) -> Bool:
+def match_hands(cameras: CameraArray, uv: Float, weight: Float, wrists: Float) -> Bool:
     """``[C, F]`` in which camera and frame left and right hand are swapped.
 
     Each view starts with the assignment whose hands are nearer to the wrists of the pose; then one

@@ -5,14 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsgan.data.joints import ALL, BODY, FLIP_GROUPS, HAND_PAIRS, HANDS, WRISTS, known
-from gsgan.prepare.camera_array import (
-    FOCAL,
-    MIN_VIEWS,
-    Bool,
-    CameraArray,
-    Float,
-    refine_cameras,
-)
+from gsgan.prepare.camera_array import FOCAL, MIN_VIEWS, Bool, CameraArray, Float, refine_cameras
 from gsgan.prepare.cleanse import cleanse, smooth
 from gsgan.prepare.hands import match_hands, misfits
 from gsgan.prepare.triangulate import Triangulated, apply_flips, find_flips, plain, robust

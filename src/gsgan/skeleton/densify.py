@@ -124,10 +124,7 @@ class Densify(nn.Module):
         dtype: torch.dtype | None = None,
     ) -> None:
         super().__init__()
-        for name, value, known in (
-            ("torso", torso, Torso),
-            ("sampler", sampler, Sampler),
-        ):
+        for name, value, known in (("torso", torso, Torso), ("sampler", sampler, Sampler)):
             if value not in get_args(known):
                 expected = ", ".join(get_args(known))
                 raise ConfigError(f"Densify: {name} must be one of {expected}, got {value!r}")

@@ -53,9 +53,7 @@ def root_of(p: Tensor, template: SkeletonTemplate = MEDIAPIPE33) -> Tensor:
 
 
 def bone_frames(
-    p: Tensor,
-    valid: Tensor | None = None,
-    template: SkeletonTemplate = MEDIAPIPE33,
+    p: Tensor, valid: Tensor | None = None, template: SkeletonTemplate = MEDIAPIPE33
 ) -> BoneFrames:
     """The frames of trunk, head and limbs.
 
@@ -193,10 +191,7 @@ def _faded(v: Tensor, fallback: Tensor) -> Tensor:
 def _shortened(v: Tensor) -> tuple[Tensor, Tensor]:
     """v divided by the larger of its length and `MIN_LENGTH`, and the squared result's length."""
     length2 = v.square().sum(-1, keepdim=True)
-    return (
-        v * length2.clamp_min(MIN_LENGTH**2).rsqrt(),
-        (length2 / MIN_LENGTH**2).clamp_max(1),
-    )
+    return (v * length2.clamp_min(MIN_LENGTH**2).rsqrt(), (length2 / MIN_LENGTH**2).clamp_max(1))
 
 
 def omega(

@@ -9,14 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from gsgan.skeleton.face import (
-    FACE,
-    FACE_NAMES,
-    face_groups,
-    face_links,
-    face_mirror,
-    rest_face,
-)
+from gsgan.skeleton.face import FACE, FACE_NAMES, face_groups, face_links, face_mirror, rest_face
 from gsgan.skeleton.hands import (
     FINGER_NAMES,
     FINGERS,
@@ -54,11 +47,7 @@ def _limbs(side: int) -> tuple[Edge, ...]:
     """The forearm to the hand's own wrist, the palm's bones, and the fingers' from base to tip."""
     wrist, chains = STARTS[side], _chains(STARTS[side])
     palm = tuple((wrist, base) for base, *_ in chains)
-    return (
-        (ARMS[side][1], wrist),
-        *palm,
-        *(pair for chain in chains for pair in pairwise(chain)),
-    )
+    return ((ARMS[side][1], wrist), *palm, *(pair for chain in chains for pair in pairwise(chain)))
 
 
 def _hand_at_rest() -> np.ndarray:

@@ -85,9 +85,7 @@ TABLES = {
 
 
 def to_mediapipe33(
-    joints: ArrayLike,
-    vertices: ArrayLike | None = None,
-    kind: Literal["smpl", "smplx"] = "smpl",
+    joints: ArrayLike, vertices: ArrayLike | None = None, kind: Literal["smpl", "smplx"] = "smpl"
 ) -> tuple[Floats, Floats]:
     """MediaPipe's 33 landmarks of posed SMPL or SMPL-X bodies.
 

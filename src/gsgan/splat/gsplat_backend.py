@@ -90,10 +90,7 @@ def unsuited(gaussians: Gaussians, camera: Camera) -> str:
 
 
 def draw(
-    gaussians: Gaussians,
-    camera: Camera,
-    settings: Accuracy,
-    want_depth: bool,
+    gaussians: Gaussians, camera: Camera, settings: Accuracy, want_depth: bool
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Projects and blends.
 

@@ -13,13 +13,7 @@ from torch import Tensor
 
 from gsgan.scene import Camera, Gaussians
 from gsgan.splat import build
-from gsgan.splat.project import (
-    EXP_UNDERFLOW,
-    EXTENT_MARGIN,
-    QUAT_MIN,
-    Projected,
-    field_of_view,
-)
+from gsgan.splat.project import EXP_UNDERFLOW, EXTENT_MARGIN, QUAT_MIN, Projected, field_of_view
 from gsgan.splat.settings import Accuracy
 
 _INPUTS = ("means", "quats", "scales", "covariances", "opacities")

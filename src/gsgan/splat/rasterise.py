@@ -112,11 +112,7 @@ def resolve_backend(name: str, device: torch.device, settings: Accuracy) -> tupl
 
 
 def _draw(
-    name: str,
-    gaussians: Gaussians,
-    camera: Camera,
-    settings: Accuracy,
-    depth: bool,
+    name: str, gaussians: Gaussians, camera: Camera, settings: Accuracy, depth: bool
 ) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
     """Features, alpha and depth by one backend; where it averages what is supersampled, alpha is
     averaged, and averaged features follow."""

@@ -119,11 +119,7 @@ def _pairs(rows: Tensor, first: Tensor, spans: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _reaches(
-    projected: Projected,
-    rows: Tensor,
-    tile_xy: Tensor,
-    settings: Accuracy,
-    tiling: Tiling,
+    projected: Projected, rows: Tensor, tile_xy: Tensor, settings: Accuracy, tiling: Tiling
 ) -> Tensor:
     """Whether the ellipse ``alpha >= alpha_min`` reaches the pixel centres of the tile.
 

@@ -31,10 +31,7 @@ U_MAX = 1e15
 
 
 def composite(
-    projected: Projected,
-    size: tuple[int, int],
-    settings: Accuracy,
-    want_depth: bool,
+    projected: Projected, size: tuple[int, int], settings: Accuracy, want_depth: bool
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Blends ellipses front to back, ties by index.
 

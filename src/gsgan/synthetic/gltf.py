@@ -14,13 +14,7 @@ from gsgan.motion.character import Character, Ints, Surface
 from gsgan.motion.rotations import Array
 from gsgan.synthetic.anchors import anchor_names, with_anchors
 from gsgan.synthetic.glb import Glb
-from gsgan.synthetic.humanoid import (
-    REQUIRED,
-    WANTED,
-    canonical_shapes,
-    humanoid_bones,
-    plain_shape,
-)
+from gsgan.synthetic.humanoid import REQUIRED, WANTED, canonical_shapes, humanoid_bones, plain_shape
 from gsgan.synthetic.parts import LABEL_NAMES, face_labels
 from gsgan.synthetic.textures import linear, srgb
 from gsgan.utils.errors import DataError

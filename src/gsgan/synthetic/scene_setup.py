@@ -246,11 +246,7 @@ class Scene:
 
 
 def extent(
-    character: Character,
-    source: Moving,
-    samples: int = 160,
-    stride: int = 24,
-    upper: bool = False,
+    character: Character, source: Moving, samples: int = 160, stride: int = 24, upper: bool = False
 ) -> Array:
     """``[N, 3]`` points that a motion reaches, metres; with ``upper`` from the waist upwards.
 

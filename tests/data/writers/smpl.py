@@ -24,10 +24,7 @@ Kind = Literal["smpl", "smplx"]
 BODY_PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19)
 FINGER_PARENTS = [w if j == 0 else 24 + 15 * h + 3 * f + j for h, w in ((0, 20), (1, 21))
                   for f in range(5) for j in range(3)]  # fmt: skip
-PARENTS = {
-    "smpl": (*BODY_PARENTS, 20, 21),
-    "smplx": (*BODY_PARENTS, 15, 15, 15, *FINGER_PARENTS),
-}
+PARENTS = {"smpl": (*BODY_PARENTS, 20, 21), "smplx": (*BODY_PARENTS, 15, 15, 15, *FINGER_PARENTS)}
 FREE_BONES = {  # SMPL's joint to the free body's bone that starts there; {} is the side
     "pelvis": "root", "spine1": "spine03", "spine2": "spine02", "spine3": "spine01",
     "neck": "neck01", "head": "head", "hip": "upperleg01.{}", "knee": "lowerleg01.{}",

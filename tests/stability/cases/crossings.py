@@ -117,10 +117,7 @@ CROSSINGS: dict[str, tuple[Path, str]] = {
         _shrinking_forearm,
         "Below 1 mm its swing fades to none: at most 20 times step / 1 mm.",
     ),
-    "an arm through straight": (
-        _bending_arm,
-        "At most 8 times the bend's step.",
-    ),
+    "an arm through straight": (_bending_arm, "At most 8 times the bend's step."),
     "a forearm past its fold, two degrees beside": (
         partial(_bending_arm, around=math.pi, across=0.035),
         "The roll goes round with the way to the antipode: at most 8 times step / 2 degrees.",

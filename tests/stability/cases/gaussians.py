@@ -61,9 +61,7 @@ def cases() -> Iterator[Case]:
 def _alone(name: str, mean: Numbers = ON_PIXEL, options: Any = None, **shape: Any) -> Case:
     """One hard Gaussian among a dozen ordinary ones."""
     return _case(
-        name,
-        lambda: {**among(cloud(), gaussians([mean], **shape)), **pinhole()},
-        **(options or {}),
+        name, lambda: {**among(cloud(), gaussians([mean], **shape)), **pinhole()}, **(options or {})
     )
 
 

@@ -118,10 +118,4 @@ def _images() -> Iterator[Case]:
         ("all bones of scale 0", "bone scale", [0.0, 0.0, 0.0], "All Gaussians are points."),
     ):
         arm = {**_arm(**{key: value}), **camera}
-        yield raster_case(
-            "LBS",
-            name,
-            lambda arm=arm: arm,
-            draw=_rendered,
-            note=note,
-        )
+        yield raster_case("LBS", name, lambda arm=arm: arm, draw=_rendered, note=note)

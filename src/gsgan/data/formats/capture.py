@@ -24,13 +24,7 @@ import numpy as np
 
 from gsgan.body.shape import HANDS_SHAPE, STRETCHED, free_space
 from gsgan.body.shape import LANDMARKS as LANDMARKS_SHAPE
-from gsgan.data.calibration import (
-    METRES,
-    Conventions,
-    choose,
-    read_cameras,
-    read_conventions,
-)
+from gsgan.data.calibration import METRES, Conventions, choose, read_cameras, read_conventions
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.files import FrameFiles, frame_files, read_arrays, read_json
 from gsgan.data.formats.common import IMAGES, finish, one_mask_each

@@ -20,13 +20,7 @@ from numpy.typing import NDArray
 from gsgan.data.calibration import read_calibration
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.files import frame_files, natural_order, read_json_value
-from gsgan.data.formats.common import (
-    IMAGES,
-    FolderReader,
-    body_model,
-    image_size,
-    up_axis,
-)
+from gsgan.data.formats.common import IMAGES, FolderReader, body_model, image_size, up_axis
 from gsgan.data.formats.smpl_motion import landmarks_of, zju_motion
 from gsgan.data.joints import BODY, FROM_HANDS, SETS
 from gsgan.data.layout import BodyModel, Found, Meta

@@ -132,12 +132,7 @@ class SmplxRigReader(FolderReader):
         )
 
     def _cameras(
-        self,
-        root: Path,
-        path: Path,
-        entries: Mapping[str, Any],
-        images: Files,
-        notes: list[str],
+        self, root: Path, path: Path, entries: Mapping[str, Any], images: Files, notes: list[str]
     ) -> dict[str, CameraEntry]:
         """The cameras in the calibration's order."""
         cameras = {}

@@ -38,10 +38,7 @@ class Panel:
 
 
 def draw_panels(
-    panels: Sequence[Sequence[Panel]],
-    *,
-    titles: Sequence[str] = (),
-    names: Sequence[str] = (),
+    panels: Sequence[Sequence[Panel]], *, titles: Sequence[str] = (), names: Sequence[str] = ()
 ) -> tuple[Figure, np.ndarray]:
     """Equal panels by row, with titles above the columns and names left of the rows.
 
