@@ -51,6 +51,25 @@ def test_a_turned_body_turns_points_and_frames(body):
     )
 
 
+def test_in_a_high_kick_stretched_shapes_reach_their_neighbours(body):
+    """An edge of the posed mesh is the image of the edge at rest under its vertex's shape."""
+    placed = BodyPoints(body, 1.7, stretch=True)
+    kick = rest(body)
+    kick.theta[0, body.joint_names.index("upperleg01.L"), 0] = -2.6
+    points = placed(kick)
+    assert torch.equal(points.means, BodyPoints(body, 1.7)(kick).means)
+    torch.testing.assert_close(placed(rest(body)).shapes, points.shapes * 0 + torch.eye(3))
+    a, b = body.faces[:, 0], body.faces[:, 1]
+    edge = (body.vertices[b] - body.vertices[a]).unsqueeze(-1)
+    posed = (points.means[0, b] - points.means[0, a]).norm(dim=-1)
+    pulled = posed > 1.5 * edge.norm(dim=1).squeeze()
+    assert pulled.sum() > 100
+    reach = (points.shapes[0, a] @ edge).squeeze(-1).norm(dim=-1)[pulled] / posed[pulled]
+    plain = (points.frames[0, a] @ edge).squeeze(-1).norm(dim=-1)[pulled] / posed[pulled]
+    assert plain.median() < 0.6
+    assert 0.85 < reach.median() < 1.15
+
+
 def test_normals_point_out_of_the_posed_body(body):
     """Against trimesh, which knows the whole mesh: no formula shared."""
     import trimesh

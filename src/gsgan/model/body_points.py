@@ -130,6 +130,8 @@ class BodyPoints(nn.Module):
     rest_points: Tensor
     rest_normals: Tensor
     part_id: Tensor
+    stretch_columns: Tensor
+    stretch_factors: Tensor
 
     def __init__(
         self,
@@ -164,8 +166,8 @@ class BodyPoints(nn.Module):
     def forward(self, pose: BodyPose) -> Points:
         """G in pose; each point is its own part, its frame the linear part of its skinning."""
         pose = self.points.with_bones(pose)
+        assert pose.bones is not None
         A, t = self.points.blend(pose)
-        stretch = self.stretch and (pose.bones, self.stretch_columns, self.stretch_factors)
         scales = (self.sigma * self.points.spacing).expand(len(A), -1)
         return Points(
             means=transformed(A, t, self.points.means),
@@ -175,7 +177,9 @@ class BodyPoints(nn.Module):
             valid=torch.ones_like(scales, dtype=torch.bool),
             part_id=self.part_id,
             normals=moved_normals(A, self.rest_normals),
-            stretched=stretched(A, *stretch) if stretch else None,
+            stretched=stretched(A, pose.bones, self.stretch_columns, self.stretch_factors)
+            if self.stretch
+            else None,
         )
 
 
