@@ -166,7 +166,7 @@ def no_detections(project: Path) -> None:
     [
         (lambda p: None, {"unit": "mm"}, r"cameras\.json: cameras stand 0\.003 m .* unit=mm"),
         (in_centimetres, {}, r"cameras\.json: cameras stand 3\d\d m .* unit=mm, cm or m"),
-        (lambda p: None, {"source": "nowhere"}, "nowhere holds no videos"),
+        (lambda p: None, {"source": "nowhere"}, "nowhere does not exist"),
         (lambda p: (p / "cameras.json").unlink(), {}, "holds no calibration"),
         (lambda p: (p / "pose" / "cam01.npz").unlink(), {}, "no landmarks of the camera cam01"),
         (lambda p: (p / "pose" / "cam01.npz").write_bytes(b"PK"), {}, r"cam01\.npz"),

@@ -62,6 +62,10 @@ def find_sources(folder: Path, rotate: bool = False) -> dict[str, Recording]:
     for place in (*(folder / name for name in INSIDE), folder):
         if place.is_dir() and (sources := _sources_in(place, rotate)):
             return sources
+    if not folder.exists():
+        raise DataError(
+            f"source: {folder} does not exist; expected a folder of videos, or one video"
+        )
     raise DataError(
         f"{folder} holds no videos ({' '.join(VIDEO_SUFFIXES)}) and no folders of images "
         f"({' '.join(IMAGE_SUFFIXES)}); expected one per camera"
