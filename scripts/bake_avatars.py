@@ -3,8 +3,7 @@
 Run it once with the glTF versions of the VALID avatar library at hand (LICENSE and ATTRIBUTION.md
 beside the result name the sources): `python scripts/bake_avatars.py FOLDER`. The result is
 deterministic. Teeth and tongue are decimated, shapes that gsgan does not use are dropped, vertices
-are quantised, normal maps turned to glTF's convention; colours are copied as they are. Run
-scripts/label_avatars.py afterwards.
+are quantised, normal maps turned to glTF's convention; colours are copied as they are.
 """
 
 from __future__ import annotations

@@ -48,7 +48,7 @@ assert find_spec("pytest") is None and find_spec("viser") is None, "the environm
 for file in (
     "conf/train.yaml",
     *("body/assets/free_body.npz", "body/assets/body_space.npz", "body/assets/ATTRIBUTION.md"),
-    *(f"synthetic/avatars/{name}" for name in ("blouse.glb", "polo.glb", "blouse.npz", "polo.npz", "LICENSE", "ATTRIBUTION.md")),
+    *(f"synthetic/avatars/{name}" for name in ("blouse.glb", "polo.glb", "LICENSE", "ATTRIBUTION.md")),
     *(f"export/web/{name}" for name in ("gsgan.js", "page.html", "page.css")),
     *("splat/native.cpp", "splat/kernels/tile.h", "skeleton/templates.npz"),
 ):

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from gsgan.body.skinned import vertex_normals
 from gsgan.motion.character import Character, Ints, Surface
 from gsgan.motion.rotations import Array
-from gsgan.synthetic.anchors import anchor_names, with_anchors
+from gsgan.synthetic.anchors import with_anchors
 from gsgan.synthetic.glb import Glb
 from gsgan.synthetic.humanoid import REQUIRED, WANTED, canonical_shapes, humanoid_bones, plain_shape
 from gsgan.synthetic.parts import LABEL_NAMES, face_labels
@@ -309,10 +309,5 @@ def _character(glb: Glb, rig: _Rig) -> Character:
         anchor_joint=np.zeros(0, np.int64),
         anchor_vertex=np.zeros(0, np.int64),
     )
-    if glb.path in AVATARS.values():
-        with np.load(glb.path.with_suffix(".npz")) as found:  # by scripts/label_avatars.py
-            labels, joint, vertex = (found[name].astype(np.int64) for name in found)
-        return replace(character, labels=labels, anchor_names=anchor_names(),
-                       anchor_joint=joint, anchor_vertex=vertex)  # fmt: skip
     names = np.repeat([part.name for part in parts], counts)
     return with_anchors(replace(character, labels=face_labels(character, names)))
