@@ -51,13 +51,22 @@ def test_a_turned_body_turns_points_and_frames(body):
     )
 
 
+def test_a_shapes_last_bits_choose_no_other_points(body):
+    noise = 1 + 2e-7 * torch.randn(body.vertices.shape, generator=torch.Generator().manual_seed(0))
+    noisy = replace(body, vertices=body.vertices * noise)
+    chosen = BodyPoints(body, 1.7, points=2000).points.chosen
+    assert torch.equal(BodyPoints(noisy, 1.7, points=2000).points.chosen, chosen)
+    other = BodyPoints(replace(noisy, template=None), 1.7, points=2000).points.chosen
+    assert not torch.equal(other, chosen)  # what the template is for
+
+
 def test_in_a_high_kick_stretched_shapes_reach_their_neighbours(body):
     """An edge of the posed mesh is the image of the edge at rest under its vertex's shape."""
-    placed = BodyPoints(body, 1.7, stretch=True)
+    placed = BodyPoints(body, 1.7)
     kick = rest(body)
     kick.theta[0, body.joint_names.index("upperleg01.L"), 0] = -2.6
     points = placed(kick)
-    assert torch.equal(points.means, BodyPoints(body, 1.7)(kick).means)
+    assert torch.equal(points.means, BodyPoints(body, 1.7, stretch=False)(kick).means)
     torch.testing.assert_close(placed(rest(body)).shapes, points.shapes * 0 + torch.eye(3))
     a, b = body.faces[:, 0], body.faces[:, 1]
     edge = (body.vertices[b] - body.vertices[a]).unsqueeze(-1)

@@ -104,5 +104,6 @@ def _body(arrays: dict[str, np.ndarray]) -> Body:
         parents=tuple(int(p) for p in arrays["parents"]),
         face_labels=face_labels,
         vertex_labels=majority_vertex_labels(faces, face_labels, len(arrays["vertices"])),
+        template=fields["vertices"],
         **fields,
     )

@@ -196,8 +196,7 @@ def _stretched(body: B, stretch: Tensor) -> B:
         places.append(places[parent] + S[parent] @ (joints[joint] - joints[parent]))
     moved = torch.stack(places)
     shift = moved - (S @ joints.unsqueeze(-1)).squeeze(-1)
-    # As lbs.blend_transforms, which has no forward-mode derivative. Its rounding decides which
-    # vertices become Gaussians (farthest points), so a trained avatar needs the same sums.
+    # As lbs.blend_transforms, which has no forward-mode derivative.
     maps, weight = torch.cat([S, shift.unsqueeze(-1)], dim=-1).flatten(1), body.bone_weight.to(S)
     weight = weight / weight.sum(-1, keepdim=True)
     blended = sum(

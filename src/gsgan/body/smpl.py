@@ -172,6 +172,7 @@ class SkinnedModel:
             vertex_labels=torch.tensor(own)[first],
             label_names=names,
             label_source="own" if parts == "joints" else "guess",
+            template=self.v_template.float(),
             landmarks=landmarks.float(),
             landmark_bone=bones,
         )

@@ -22,6 +22,7 @@ from gsgan.body.free import Body
 from gsgan.body.solve import Solver
 from gsgan.data.proportions import upright
 from gsgan.model.avatar import Avatar
+from gsgan.model.body_points import BodyPoints
 from gsgan.model.drive import Drive, rest_pose
 from gsgan.model.harmonic import Harmonic
 from gsgan.model.runs import Run
@@ -31,7 +32,7 @@ from gsgan.utils.errors import ConfigError
 from gsgan.utils.provenance import SOFTWARE, SOURCE_TYPE, XMP
 
 WEB = Path(__file__).with_name("web")
-VERSION = 1  # of the block
+VERSION = 2  # of the block
 ALPHA_MIN = 1 / 255  # of the page, where the avatar's own is less
 KINDS = {"i1": "int8", "u1": "uint8", "i2": "int16", "u2": "uint16", "f4": "float32"}
 BEFORE_COLOUR = (
@@ -151,12 +152,16 @@ def gaussians_of(avatar: Avatar) -> tuple[Plain, Arrays]:
     low = float(means.min())
     step = float(means.max() - low) / 65535
     weight = weight / weight.sum(1, keepdims=True)
+    slope_bone, slopes = slopes_of(on_body)
+    slope, slope_step = quantised(slopes.flatten(), 32767)
     settings = avatar.accuracy
     header: Plain = {
         "count": len(table),
         "degree": degree,
         "follow": follow.tolist(),
         "weights": weight.shape[1],
+        "slopes": slopes.shape[1],
+        "slopeStep": float(slope_step),
         "range": (low, step),
         "bound": (linear.mean_bound or 0) * linear.body_height,
         "height": linear.body_height,
@@ -178,7 +183,23 @@ def gaussians_of(avatar: Avatar) -> tuple[Plain, Arrays]:
         "first": first,
         "others": others,
         "steps": np.concatenate([first_step, steps])[:, 0],
+        "slopeBone": slope_bone,
+        "slope": slope,
     }
+
+
+def slopes_of(on_body: BodyPoints) -> tuple[NDArray, NDArray]:
+    """Bones ``[N, n]`` and the gradients ``[N, n, 3]`` of their weights, 1 / metre.
+
+    Source: `gsgan.body.skinned.stretch_terms`, whose factors are these times (x, 1).
+    """
+    if not on_body.stretch:
+        return np.zeros((on_body.n_points, 1), np.uint8), np.zeros((on_body.n_points, 1, 3))
+    columns, factors = (
+        x.view(on_body.n_points, 3, -1, 4).numpy()
+        for x in (on_body.stretch_columns, on_body.stretch_factors)
+    )
+    return (columns[:, 0, :, 0] // 4).astype(np.uint8), factors[..., 3].swapaxes(1, 2)
 
 
 def body_of(run: Run) -> tuple[Plain, Arrays]:

@@ -43,8 +43,9 @@ class SkinnedPoints(nn.Module):
         if count is not None:
             whole("points", count, 1)
         vertices = body.vertices.float()
+        template = vertices if body.template is None else body.template.float()
         every = len(vertices)
-        chosen = farthest_points(vertices, every if count is None else min(count, every))
+        chosen = farthest_points(template, every if count is None else min(count, every))
         self.parents = body.parents
         means = vertices[chosen]
         for name, value in {
@@ -141,7 +142,7 @@ class BodyPoints(nn.Module):
         points: int | None = None,
         sigma: float = 0.7,
         mean_step: float = 1.0,
-        stretch: bool = False,
+        stretch: bool = True,
     ) -> None:
         super().__init__()
         above("model.body_points.sigma", sigma)

@@ -9,6 +9,8 @@ export interface Header {
   follow: number[]; // numbers of a Gaussian that follow its normal
   bones: number; // J
   weights: number; // bones of each Gaussian
+  slopes: number; // bones whose weights change along the surface
+  slopeStep: number; // of their gradients, 1 / metre
   range: [number, number]; // least and step of the quantised means, metres
   bound: number; // of the means' residuals, metres
   height: number; // metres: the unit of these residuals where they have no bound

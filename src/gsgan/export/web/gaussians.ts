@@ -27,6 +27,8 @@ export class Gaussians {
   private readonly h: Header;
   private readonly bone: Uint8Array;
   private readonly weight: Float32Array;
+  private readonly slopeBone: Uint8Array; // [N, slopes]
+  private readonly slope: Float32Array; // [N, slopes, 3] gradients of skinning weights
   private readonly rest: Float32Array;
   private readonly normal: Float32Array;
   private readonly first: Float32Array; // [N, numbers] of the first harmonic
@@ -48,6 +50,8 @@ export class Gaussians {
     this.numbers = BEFORE_COLOUR + 3 * (h.degree + 1) ** 2;
     this.bone = content.array("bone", "u1");
     this.weight = Float32Array.from(content.array("weight", "u2"), (w) => w / 65535);
+    this.slopeBone = content.array("slopeBone", "u1");
+    this.slope = Float32Array.from(content.array("slope", "i2"), (x) => h.slopeStep * x);
     const [least, step] = h.range;
     this.rest = Float32Array.from(content.array("mean", "u2"), (x) => least + step * x);
     this.normal = Float32Array.from(content.array("normal", "i2"), (x) => x / 32767);
@@ -113,6 +117,7 @@ export class Gaussians {
       mean[3 * i + 1] = j * u + e * v + o * w + ty;
       mean[3 * i + 2] = p * u + q * v + r * w + tz;
       if (shapes) this.shape(i, raw);
+      this.stretch(i, A, bones);
       this.spread(i, A);
       this.opacity[i] = 1 / (1 + Math.exp(-clamp(raw[10]!, -h.logit, h.logit)));
       this.colour.set(raw.subarray(BEFORE_COLOUR), i * (numbers - BEFORE_COLOUR));
@@ -121,6 +126,20 @@ export class Gaussians {
 
   private moved(x: number): number {
     return this.h.bound ? this.h.bound * Math.tanh(x) : this.h.height * x;
+  }
+
+  /** Adds the stretch of the surface to A: gsgan.body.lbs.stretched. */
+  private stretch(i: number, A: Float64Array, bones: ArrayLike<number>): void {
+    const { rest, slope, slopeBone } = this, n = this.h.slopes;
+    const x = rest[3 * i]!, y = rest[3 * i + 1]!, z = rest[3 * i + 2]!;
+    for (let k = n * i; k < n * (i + 1); ++k) {
+      const at = 12 * slopeBone[k]!, u = slope[3 * k]!, v = slope[3 * k + 1]!, w = slope[3 * k + 2]!;
+      for (let row = 0; row < 3; ++row) {
+        const of = at + 3 * row, place = bones[at + 9 + row]! - bones[9 + row]!; // from the root's
+        const moved = bones[of]! * x + bones[of + 1]! * y + bones[of + 2]! * z + place;
+        A[3 * row]! += moved * u, A[3 * row + 1]! += moved * v, A[3 * row + 2]! += moved * w;
+      }
+    }
   }
 
   /** R S of the raw quaternion and log scales. */
