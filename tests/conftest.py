@@ -251,3 +251,17 @@ def signing(dance):
 @pytest.fixture(scope="session")
 def signer(signing):
     return measure_proportions(torch.from_numpy(signing), torch.ones(signing.shape[:2]).bool(), "z")
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    """A browser without a screen; in CI there must be one."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    found = shutil.which("chromium") or shutil.which("google-chrome")
+    if found is None:
+        (pytest.fail if "CI" in os.environ else pytest.skip)("chromium is not installed")
+    flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    with playwright.sync_playwright() as tool:
+        browser = tool.chromium.launch(executable_path=found, args=flags)
+        yield browser
+        browser.close()

@@ -1,8 +1,6 @@
 """The viewer in a browser: Chromium without a screen, driven by Playwright."""
 
 import contextlib
-import os
-import shutil
 import socket
 import time
 from dataclasses import replace
@@ -14,13 +12,6 @@ import torch
 from commands import refused
 
 viser = pytest.importorskip("viser", reason="the extra view is not installed")
-playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
-if CHROMIUM is None and "CI" in os.environ:
-    raise FileNotFoundError("chromium is not installed: in CI the viewer's tests must run")
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
-
-SOFTWARE = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 PATIENCE = 60.0  # seconds
 
 
@@ -38,14 +29,6 @@ def served(compose, run):
 def viewer(bare, compose):
     with served(compose, bare) as made:
         yield made
-
-
-@pytest.fixture(scope="module")
-def chromium():
-    with playwright.sync_playwright() as tool:
-        browser = tool.chromium.launch(executable_path=CHROMIUM, args=list(SOFTWARE))
-        yield browser
-        browser.close()
 
 
 @pytest.fixture

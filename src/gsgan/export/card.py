@@ -11,6 +11,10 @@ from gsgan.effects.table import rows
 from gsgan.model.runs import Run
 from gsgan.utils.pages import markdown
 
+LINEAR = (
+    "without its networks: Step I's colour, with residuals linear in the harmonics of each "
+    "Gaussian's normal."
+)
 HOLDS = {
     "ply": "The avatar's Gaussians in one pose per file, in the convention of 3D Gaussian "
     "splatting. They show Step I's colour; the generator's image needs gsgan.",
@@ -20,8 +24,8 @@ HOLDS = {
     "out. Rasterisation is not part of it.",
     "torch": "The whole avatar as a program of `torch.export`: skeleton and camera in, image and "
     "alpha out. Import `gsgan.splat` before loading it.",
-    "html": "A page that renders the avatar in a browser, without its networks: Step I's colour, "
-    "with residuals linear in the harmonics of each Gaussian's normal.",
+    "html": f"A page that renders the avatar in a browser, {LINEAR}",
+    "bin": f"The avatar of a web page, for gsgan.js in a page of your own, {LINEAR}",
     "safetensors": "The weights, with the config as metadata: "
     "`gsgan.export.weights.load_weights(file)` gives the avatar.",
 }

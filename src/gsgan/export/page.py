@@ -51,26 +51,18 @@ def refuse_unsuitable(avatar: Avatar) -> None:
     """
     if avatar.body_points is None or avatar.deformation is None or avatar.solver is None:
         raise ConfigError(
-            "format=html needs Gaussians on a skinned body and residuals of Ψ: an avatar with "
+            "a page needs Gaussians on a skinned body and residuals of Ψ: an avatar with "
             "effects.body_points, not model=lbs_splat or image_to_image"
         )
     if avatar.solver.fingers is None:
         raise ConfigError(
-            "format=html publishes the body that the avatar moves with, which the licence of "
+            "a page publishes the body that the avatar moves with, which the licence of "
             "SMPL's model files does not allow; train on the free body (data.smpl=null)"
         )
 
 
-def page(run: Run, avatar: Avatar, motions: Mapping[str, tuple[Drive, float]], name: str) -> str:
-    """The text of a page.
-
-    Args:
-        run: the avatar's.
-        avatar: its `distilled` copy.
-        motions: drives and their frames per second by name.
-        name: the page's title.
-    """
-    content = base64.b64encode(zlib.compress(block(run, avatar, motions, name), 9)).decode()
+def page(content: bytes, name: str) -> str:
+    """The text of a page that shows the `block`'s avatar; the name is its title."""
     style, script = ((WEB / file).read_text() for file in ("page.css", "gsgan.js"))
     text = (WEB / "page.html").read_text()
     for key, value in {
@@ -80,7 +72,7 @@ def page(run: Run, avatar: Avatar, motions: Mapping[str, tuple[Drive, float]], n
         "source_type": SOURCE_TYPE,
         "name": html.escape(name),
         "style": style,
-        "avatar": content,
+        "avatar": base64.b64encode(content).decode(),
         "script": script,
     }.items():
         text = text.replace(f"{{{key}}}", value)
@@ -93,7 +85,14 @@ def _hash(text: str) -> str:
 
 
 def block(run: Run, avatar: Avatar, motions: Mapping[str, tuple[Drive, float]], name: str) -> bytes:
-    """The avatar's header and arrays, see web/content.ts."""
+    """The avatar's header and arrays, deflated; see web/content.ts.
+
+    Args:
+        run: the avatar's.
+        avatar: its `distilled` copy.
+        motions: drives and their frames per second by name.
+        name: the avatar's.
+    """
     header, arrays = gaussians_of(avatar)
     people, more = body_of(run)
     header |= people | {"version": VERSION, "name": name, "xmp": XMP}
@@ -113,7 +112,7 @@ def block(run: Run, avatar: Avatar, motions: Mapping[str, tuple[Drive, float]], 
         data += _padded(array.astype(f"<{kind}").tobytes())
     text = json.dumps(header | {"arrays": places}).encode()
     text += b" " * (-len(text) % 8)
-    return len(text).to_bytes(8, "little") + text + data
+    return zlib.compress(len(text).to_bytes(8, "little") + text + data, 9)
 
 
 def _padded(data: bytes) -> bytes:

@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from rich.progress import track
 
 from gsgan.export.card import card
-from gsgan.export.page import page, refuse_unsuitable
+from gsgan.export.page import block, page, refuse_unsuitable
 from gsgan.export.splats import Splats, glb_bytes, ply_bytes, splats_of
 from gsgan.model.drive import REST, Drive, drive_of, inputs_of
 from gsgan.model.harmonic import Harmonic, distilled
@@ -29,6 +29,7 @@ ENDINGS = {
     "torch": ".pt2",
     "safetensors": ".safetensors",
     "html": ".html",
+    "bin": ".bin",
 }
 CARD = "MODEL_CARD.md"
 DISTILLED = 200  # training poses over which Ψ's residuals are fitted, at most
@@ -75,8 +76,10 @@ def export_config(config: DictConfig) -> None:
                 for path in out.glob("[0-9]" * 6 + ".ply"):
                     if path.name not in kept:
                         path.unlink()
-    elif kind == "html":
-        _write(out, _page(config, run, out.stem, tell))
+    elif kind in ("html", "bin"):
+        title = out.name.split(".")[0]
+        content = _block(config, run, title, tell)
+        _write(out, content if kind == "bin" else page(content, title))
     else:
         _write(out, _program(config, run, kind))
     beside = out / CARD if sequence else out.with_name(f"{out.stem}.{CARD}")
@@ -107,8 +110,8 @@ def _place(config: DictConfig, kind: str) -> Path:
     return out
 
 
-def _page(config: DictConfig, run: Run, name: str, tell: Callable[[str], None]) -> str:
-    """The text of a .html file; each motion is one of its own."""
+def _block(config: DictConfig, run: Run, name: str, tell: Callable[[str], None]) -> bytes:
+    """The content of a .bin file, and of a page; each motion is one of its own."""
     refuse_unsuitable(run.avatar)
     motions = {}
     for motion in [config.motion] if isinstance(config.motion, str) else config.motion or ():
@@ -123,7 +126,7 @@ def _page(config: DictConfig, run: Run, name: str, tell: Callable[[str], None]) 
         tell(f"distilled from {len(poses)} training poses")
     else:
         avatar = run.avatar
-    return page(run, avatar, motions, name)
+    return block(run, avatar, motions, name)
 
 
 def _with_motion(config: DictConfig, motion: str) -> DictConfig:

@@ -144,13 +144,12 @@ def start_from(avatar: Avatar, data: GsganData, run: Path) -> None:
     once = {frame: i for i, (_, frame) in enumerate(frames.items)}.values()  # by one camera each
     poses = (frames[i].inputs for i in once)
     fitted = distilled(trained, ((p, seen, body) for p, seen, _, body, _ in poses))
-    try:
-        torch.testing.assert_close(fitted.rest_points, avatar.rest_points, atol=1e-3, rtol=0)
-        avatar.load_state_dict(fitted.state_dict(), strict=False)
-    except (RuntimeError, AssertionError):
-        raise ConfigError(
-            f"distil: {run} has other Gaussians; give its data, size and effects"
-        ) from None
+    state, own = {"rest_points": fitted.rest_points, **fitted.state_dict()}, avatar.state_dict()
+    own["rest_points"] = avatar.rest_points
+    alike = all(x.shape == own[name].shape for name, x in state.items() if name in own)
+    if not (alike and torch.allclose(state.pop("rest_points"), avatar.rest_points, atol=1e-3)):
+        raise ConfigError(f"distil: {run} has other Gaussians; give its data, size and effects")
+    avatar.load_state_dict(state, strict=False)
 
 
 def device_of(config: DictConfig) -> torch.device:
