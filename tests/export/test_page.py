@@ -43,7 +43,7 @@ def avatar(build, tmp_path, dance, landmarks):
     data, avatar, _ = build("model=harmonic", "effects.body_points=on", "effects.view_dependence=1")
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
-        for numbers in avatar.deformation.parameters():
+        for numbers in (*avatar.deformation.parameters(), *avatar.body_points.parameters()):
             numbers += 0.3 * torch.randn(numbers.shape, generator=generator)
     avatar.deformation.active_degree, avatar.window_margin = 1, None
     run = Run(tmp_path, None, {}, avatar.freeze(), opened=data)

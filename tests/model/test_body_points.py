@@ -60,6 +60,34 @@ def test_a_shapes_last_bits_choose_no_other_points(body):
     assert not torch.equal(other, chosen)  # what the template is for
 
 
+def test_learnt_weights_start_as_the_bodys_and_find_another_persons(body):
+    torch.manual_seed(0)
+    poses = replace(rest(body, 8), theta=0.4 * torch.randn(8, len(body.joints), 3))
+    own, learnt = (BodyPoints(body, 1.7, points=300, controls=n) for n in (0, 60))
+    assert (learnt(poses).means - own(poses).means).norm(dim=-1).max() < 0.01
+    other = BodyPoints(body, 1.7, points=300, controls=60)
+    with torch.no_grad():
+        other.points.learnt.field += torch.randn_like(other.points.learnt.field)
+        truth = other(poses).means
+    field = learnt.points.learnt.field
+    optimiser = torch.optim.Adam([field], 0.05)
+
+    def error():
+        return (learnt(poses).means - truth).square().sum(-1).mean()
+
+    before = error().sqrt()
+    for _ in range(60):
+        optimiser.zero_grad()
+        error().backward()
+        optimiser.step()
+    assert error().sqrt() < 0.3 * before
+    with torch.no_grad():
+        field *= 1e4
+    weight = learnt.points.weights[1]
+    torch.testing.assert_close(weight.sum(1), torch.ones(300))
+    assert torch.autograd.grad(learnt(poses).means.sum(), field)[0].isfinite().all()
+
+
 def test_in_a_high_kick_stretched_shapes_reach_their_neighbours(body):
     """An edge of the posed mesh is the image of the edge at rest under its vertex's shape."""
     placed = BodyPoints(body, 1.7)

@@ -44,8 +44,9 @@ def test_geometry(monkeypatch, bound):
     wide = {"dtype": torch.float64}
     psi = Deformation(torch.randn(N, 3), 1.7, width=8, layers=2, sh_degree=0, mean_bound=bound)
     frames = torch.randn(B, N, 3, 3, **wide)  # skinned frames shear
+    means = torch.randn(B, N, 3, **wide, requires_grad=True)
     points = Points(
-        torch.randn(B, N, 3, **wide),
+        means,
         frames,
         frames[..., 0],
         0.01 + torch.rand(B, N, **wide),
@@ -66,7 +67,7 @@ def test_geometry(monkeypatch, bound):
         made = psi.compose(points, Residuals(*raw, *rest), torch.ones(B, 3, **wide))
         found = [made.means, made.covariances, made.opacities]
         loss = sum((x * w).sum() for x, w in zip(found, weights, strict=True))
-        return [x.detach() for x in found] + list(torch.autograd.grad(loss, raw))
+        return [x.detach() for x in found] + list(torch.autograd.grad(loss, [means, *raw]))
 
     torch.testing.assert_close(*both(monkeypatch, compiled, "has_geometry", run), **CLOSE)
 

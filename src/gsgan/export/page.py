@@ -147,7 +147,8 @@ def gaussians_of(avatar: Avatar) -> tuple[Plain, Arrays]:
     follow = np.flatnonzero(rows[:, 1:].any((1, 2)))
     first, first_step = quantised(rows[:, 0], 32767)
     others, steps = quantised(rows[follow, 1:].reshape(-1, len(table)), 127)
-    means, weight = points.means.numpy(), points.bone_weight.double().numpy()
+    means, bones = points.means.numpy(), points.weights[0].numpy()
+    weight = points.weights[1].detach().double().numpy()
     low = float(means.min())
     step = float(means.max() - low) / 65535
     weight = weight / weight.sum(1, keepdims=True)
@@ -177,7 +178,7 @@ def gaussians_of(avatar: Avatar) -> tuple[Plain, Arrays]:
     return header, {
         "mean": np.rint((means - low) / step).astype(np.uint16),
         "normal": np.rint(32767 * on_body.rest_normals.numpy()).astype(np.int16),
-        "bone": points.bone_index.numpy().astype(np.uint8),
+        "bone": bones.astype(np.uint8),
         "weight": np.rint(65535 * weight).astype(np.uint16),
         "first": first,
         "others": others,

@@ -19,6 +19,59 @@ from gsgan.utils.tensors import derived
 
 NORMAL_FLOOR = 1e-2  # share of the area at rest, below which rounding errors dominate a normal
 ROWS = 1024  # points compared with all others at a time
+NEAREST, BONES = 4, 6  # controls that correct a point; bones that it may follow
+LEAST = 1e-3  # a possible weight below it starts there, so that it can grow
+
+
+class LearntWeights(nn.Module):
+    """The skinning weights of points: a softmax of the body's logarithms and a learnt field.
+
+    A person's hips and shoulders do not bend where the body's do. The field has a number per bone
+    at controls spread over the body, and is interpolated between them: points that few images show
+    follow their neighbours.
+
+    Args:
+        means: ``[N, 3]`` metres, at rest.
+        bone_index, bone_weight: ``[N, n]`` of the body.
+        joints: J, the number of bones.
+        controls: of the field.
+
+    Source: ours.
+    """
+
+    index: Tensor
+    start: Tensor
+    near: Tensor
+    share: Tensor
+
+    def __init__(
+        self, means: Tensor, bone_index: Tensor, bone_weight: Tensor, joints: int, controls: int
+    ) -> None:
+        super().__init__()
+        count = min(controls, len(means))
+        places = means[farthest_points(means, count)]
+        distance, near = torch.cdist(means, places).topk(min(NEAREST, count), largest=False)
+        share = functional.softmax(-2 * (distance / distance.mean()).square(), dim=1)
+        own = bone_weight / bone_weight.sum(1, keepdim=True)
+        dense = means.new_zeros(len(means), joints).scatter_add_(1, bone_index, own)
+        interpolate = means.new_zeros(len(means), count).scatter_add_(1, near, share)
+        total = interpolate.sum(0).clamp_min(1e-6).unsqueeze(1)
+        around = interpolate @ (interpolate.mT @ dense / total)  # weights of the neighbourhood
+        index = ((dense > LEAST) + around).topk(min(BONES, joints), dim=1).indices
+        possible = (dense + around).gather(1, index) > LEAST
+        start = dense.gather(1, index).clamp_min(LEAST).log().masked_fill(~possible, -30.0)
+        for name, value in {"index": index, "start": start, "near": near, "share": share}.items():
+            self.register_buffer(name, value, persistent=False)
+        self.field = nn.Parameter(means.new_zeros(count, joints))
+
+    def forward(self) -> Tensor:
+        """``[N, BONES]``: the weights of bones ``index``; rows sum to 1."""
+
+        def make() -> Tensor:
+            moved = self.field[self.near.unsqueeze(-1), self.index.unsqueeze(1)]
+            return (self.start + (self.share.unsqueeze(-1) * moved).sum(1)).softmax(1)
+
+        return derived(self, "weights", make, self.field)
 
 
 class SkinnedPoints(nn.Module):
@@ -27,6 +80,7 @@ class SkinnedPoints(nn.Module):
     Args:
         body: vertices, weights and joints.
         count: vertices used, spread evenly over the surface; None for all.
+        controls: of `LearntWeights`; 0 keeps the body's weights.
 
     Source: paper Sec. 3.4.
     """
@@ -38,7 +92,7 @@ class SkinnedPoints(nn.Module):
     chosen: Tensor
     spacing: Tensor
 
-    def __init__(self, body: SkinnedBody, count: int | None = None) -> None:
+    def __init__(self, body: SkinnedBody, count: int | None = None, controls: int = 0) -> None:
         super().__init__()
         if count is not None:
             whole("points", count, 1)
@@ -57,6 +111,8 @@ class SkinnedPoints(nn.Module):
             "spacing": neighbour_distance(means).clamp_min(1e-4),
         }.items():
             self.register_buffer(name, value, persistent=False)
+        own = self.means, self.bone_index, self.bone_weight, len(body.joints)
+        self.learnt = LearntWeights(*own, controls) if controls else None
 
     def __len__(self) -> int:
         return len(self.means)
@@ -69,6 +125,13 @@ class SkinnedPoints(nn.Module):
         bones = forward_kinematics(self.joints, self.parents, rotations, pose.transl)
         return replace(pose, bones=bones)
 
+    @property
+    def weights(self) -> tuple[Tensor, Tensor]:
+        """Bones of each point and their weights, ``[N, n]`` each."""
+        if self.learnt is None:
+            return self.bone_index, self.bone_weight
+        return self.learnt.index, self.learnt()
+
     def blend(self, pose: BodyPose) -> tuple[Tensor, Tensor]:
         """The affine map of each point: ``A [B, N, 3, 3]`` and ``t [B, N, 3]``.
 
@@ -76,7 +139,7 @@ class SkinnedPoints(nn.Module):
         """
         bones = self.with_bones(pose).bones
         assert bones is not None
-        return blend_transforms(bones, self.bone_index, self.bone_weight)
+        return blend_transforms(bones, *self.weights)
 
 
 class SkinnedGaussians(nn.Module):
@@ -126,6 +189,8 @@ class BodyPoints(nn.Module):
         sigma: initial standard deviation, as a share of the distance to the nearest neighbour.
         mean_step: of Ψ: its means move by this share of what they would on a skeleton's points.
         stretch: shapes also follow the stretch of the surface, see `gsgan.body.lbs.stretched`.
+        controls: of `LearntWeights`; 0 keeps the body's skinning weights.
+        rate: of these weights' learning, times that of Ψ.
     """
 
     rest_points: Tensor
@@ -143,11 +208,15 @@ class BodyPoints(nn.Module):
         sigma: float = 0.7,
         mean_step: float = 1.0,
         stretch: bool = True,
+        controls: int = 0,
+        rate: float = 1.0,
     ) -> None:
         super().__init__()
         above("model.body_points.sigma", sigma)
         above("model.body_points.mean_step", mean_step)
-        self.points, self.sigma, self.mean_step = SkinnedPoints(body, points), sigma, mean_step
+        self.points = SkinnedPoints(body, points, whole("model.body_points.controls", controls, 0))
+        self.sigma, self.mean_step = sigma, mean_step
+        self.rate = above("model.body_points.rate", rate)
         rest = (self.points.means - self.points.means.mean(dim=0)) / body_height
         self.register_buffer("rest_points", rest, persistent=False)
         normals = vertex_normals(body.vertices.float(), body.faces)[self.points.chosen]
@@ -169,9 +238,12 @@ class BodyPoints(nn.Module):
         pose = self.points.with_bones(pose)
         assert pose.bones is not None
         A, t = self.points.blend(pose)
+        means = transformed(A, t, self.points.means)
+        if not pose.bones.requires_grad:  # weights learn by where the means are, not by shapes
+            A, t = A.detach(), t.detach()
         scales = (self.sigma * self.points.spacing).expand(len(A), -1)
         return Points(
-            means=transformed(A, t, self.points.means),
+            means=means,
             rotations=A,
             origins=t,
             scales=scales,

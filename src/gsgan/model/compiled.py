@@ -22,11 +22,12 @@ _Job = build.job_type(
 )
 
 
-def has_geometry(raw: Tensor, *fixed: Tensor) -> bool:
-    """Whether `geometry` can be used: on a CPU, where only ``raw`` needs a gradient."""
+def has_geometry(raw: Tensor, means: Tensor, *fixed: Tensor) -> bool:
+    """Whether `geometry` can be used: on a CPU, where only raw and means need a gradient."""
     return (
         raw.device.type == "cpu"
         and raw.dtype in build.DTYPES
+        and means.dtype == raw.dtype
         and not any(x.requires_grad or x.dtype not in (raw.dtype, torch.bool) for x in fixed)
         and native.available()
     )
@@ -41,11 +42,12 @@ def geometry(
     valid: Tensor,
     numbers: tuple[float, ...],
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Means, covariances and opacities of Ĝ; differentiable once, in ``raw``.
+    """Means, covariances and opacities of Ĝ; differentiable once, in ``raw`` and ``means``.
 
     Args:
         raw: ``[B, N, 11]`` residuals of mean, quaternion, scale and opacity.
-        means, frames, shapes, scales, valid: of `gsgan.skeleton.Points`, without gradient.
+        means, frames, shapes, scales, valid: of `gsgan.skeleton.Points`; the last four without a
+            gradient.
         numbers: bound of the means in metres (0: none), metres of a residual of 1 without a bound,
             least and largest logarithm of a scale, the opacity's logit and its bound.
 
@@ -78,7 +80,7 @@ class _Geometry(torch.autograd.Function):
         d_raw = raw.new_empty(*raw.shape[:2], RESIDUALS)
         build.point(job, [*(f"g_{name}" for name in OUTPUTS), "d_raw"], [*incoming, d_raw])
         build.function("compose_backward", raw.dtype)(ctypes.byref(job))
-        return d_raw, *[None] * 6
+        return d_raw, grads[0], *[None] * 5  # an output's mean is the given one and an offset
 
 
 def _job(

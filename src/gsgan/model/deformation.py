@@ -236,7 +236,9 @@ class Deformation(ResidualGaussians):
 
     def residuals(self, points: Points, pose: Tensor, root: Tensor, pelvis: Tensor) -> Residuals:
         """See `ResidualGaussians.residuals`."""
-        position = (points.means - root[:, None]) / self.body_height
+        # Only a skeleton's gradient passes through Ψ's inputs, not one of skinning weights.
+        means = points.means if root.requires_grad else points.means.detach()
+        position = (means - root[:, None]) / self.body_height
         normals = points.normals
         if self.pose_frame == "pelvis":
             position, normals = position @ pelvis, normals @ pelvis

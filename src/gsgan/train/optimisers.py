@@ -57,6 +57,8 @@ def parameter_groups(
     if avatar.splats is not None:
         head = list(feature_head.parameters()) if feature_head is not None else []
         groups["psi"] = [*avatar.splats.parameter_groups(), (head, 1.0)]
+        if (on_body := avatar.body_points) is not None:
+            groups["psi"].append((list(on_body.parameters()), on_body.rate))
     if avatar.colour is not None:
         groups["colour"] = [(list(avatar.colour.parameters()), 1.0)]
     if avatar.generator is not None and avatar.pose_encoder is not None:
