@@ -1,4 +1,4 @@
-"""Colours, units and settings."""
+"""Sampled images, units and settings."""
 
 from dataclasses import replace
 
@@ -9,25 +9,12 @@ from make import edit_json, edit_npz
 
 from gsgan.check.frames import reprojection_errors, skeleton_doubts
 from gsgan.check.geometry import geometry_findings, geometry_of
-from gsgan.check.report import Flagged
-from gsgan.check.sections import colour_table, mean_colours
 from gsgan.check.settings import Limits, Sampling
 from gsgan.check.views import complete, measure, sampled_items, subject_of
 from gsgan.data.datamodule import GsganData
 from gsgan.utils.errors import ConfigError
 
 SAMPLING = Sampling(images=8)
-
-
-@pytest.fixture
-def views(subject):
-    return measure(subject, sampled_items(subject, 8), SAMPLING)[0]
-
-
-def test_a_camera_of_another_colour_is_flagged(views):
-    dark = [replace(v, colour=v.colour * (0.7 if v.camera == "cam01" else 1)) for v in views]
-    table = colour_table(mean_colours(dark), Limits(colour_ratio=1.2))
-    assert [row[0] for row in table.rows if isinstance(row[2], Flagged)] == ["cam01"]
 
 
 def test_images_are_the_same_moments_in_every_camera(subject):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
@@ -14,7 +13,7 @@ from gsgan.check.calibration import calibration_findings, score_cameras
 from gsgan.check.frames import frame_findings, mask_doubts, shortened, skeleton_doubts
 from gsgan.check.report import Figure, Finding, Flagged, Section, Table, counted
 from gsgan.check.settings import Limits, Sampling
-from gsgan.data.formats.consistency import Float, spread
+from gsgan.data.formats.consistency import spread
 from gsgan.effects import EffectSettings, decide
 from gsgan.effects.table import HEADERS, rows
 from gsgan.utils.errors import DataError
@@ -22,17 +21,12 @@ from gsgan.utils.errors import DataError
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
 
-DARK = 0.05  # darker mean colours give no ratio
 LISTED_BROKEN = 6
 TABLE_FRAMES = 40  # doubtful frames listed
 AGREEMENT = (
     "Joints are compared with masks, undistorted. Overlap is that of the mask with the silhouette "
     "estimated from the skeleton (about 0.7 in a good capture); 'best other' is what the "
     "calibration of another camera or mirrored images would reach."
-)
-MEANS = (
-    "Mean colour of the person; the side that a camera sees changes it as well as exposure. The "
-    "effects below show whether training corrects it; effects.colour_correction=on always does."
 )
 EFFECTS = "What is off is neither built nor computed; effects.<name>= forces one (docs/effects.md)."
 
@@ -63,7 +57,6 @@ class Measurements:
         self.geometry = geometry.geometry_of(subject)
         self.cameras = score_cameras(subject, self.views)
         self.wrong = {*self.geometry.far, *(s.name for s in self.cameras if s.wrong(limits))}
-        self.colours = mean_colours(self.views)
         self.info, self.no_info = None, ""
         try:
             self.info = data.info
@@ -84,10 +77,6 @@ class Measurements:
                 s.name: asdict(s) | {"rivals": dict(list(s.rivals.items())[:3])}
                 for s in self.cameras
             },
-            "colours": {
-                name: {"mean": mean.tolist(), "to_median": ratio.tolist()}
-                for name, (mean, ratio) in self.colours.items()
-            },
             "camera_distance": self.geometry.distance,
             "stature": self.geometry.stature,
             "doubtful_frames": {str(frame): text for frame, text in self.reasons.items()},
@@ -105,7 +94,6 @@ def sections(m: Measurements) -> tuple[Section, ...]:
         geometry.geometry_table(m.subject, m.geometry),
         geometry.lens_table(m.subject, m.geometry),
     )
-    table = colour_table(m.colours, m.limits)
     strips = [
         Figure(
             f"camera {name}", overlays.strip(m.subject, spread(own, m.sampling.shown), m.reasons)
@@ -119,7 +107,6 @@ def sections(m: Measurements) -> tuple[Section, ...]:
         _agreement(m),
         Section("Overlays", figures=tuple(strips), text=overlays.LEGEND),
         _frames(m),
-        Section("Colours of the cameras", (table,), text=MEANS),
         _effects(m),
     )
 
@@ -221,24 +208,3 @@ def _effects(m: Measurements) -> Section:
     if m.info is None:
         return Section(title, text=f"Not decided: {m.no_info}")
     return Section(title, (Table(HEADERS, tuple(rows(decide(m.info, m.effects)))),), text=EFFECTS)
-
-
-def mean_colours(seen: Sequence[views.MaskView]) -> dict[str, tuple[Float, Float]]:
-    """``[3]`` mean RGB of the person, and its ratio to the median camera's, by camera."""
-    means = {
-        name: np.asarray(sum(view.colour for view in own)) / sum(view.weight for view in own)
-        for name, own in views.grouped(seen).items()
-        if sum(view.weight for view in own) > 0
-    }
-    middle = np.maximum(np.median(list(means.values()) or [np.ones(3)], axis=0), DARK)
-    return {name: (mean, mean / middle) for name, mean in means.items()}
-
-
-def colour_table(colours: Mapping[str, tuple[Float, Float]], limits: Limits) -> Table:
-    """One row per camera; flagged where it differs too much from the median camera."""
-    rows = []
-    for name, (mean, ratio) in colours.items():
-        texts = [" ".join(f"{v:.2f}" for v in values) for values in (mean, ratio)]
-        differs = np.abs(np.log(np.maximum(ratio, 1e-6))).max() > np.log(limits.colour_ratio)
-        rows.append((name, texts[0], Flagged(texts[1]) if differs else texts[1]))
-    return Table(("camera", "mean RGB of the person", "to the median camera"), tuple(rows))

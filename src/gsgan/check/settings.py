@@ -44,7 +44,6 @@ class Limits:
     limb_share: float = 0.3
     seen_share: float = 0.7
     reprojection: float = 0.05
-    colour_ratio: float = 1.15
     doubtful: float = 0.5
 
     def __post_init__(self) -> None:

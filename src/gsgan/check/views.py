@@ -128,7 +128,6 @@ class MaskView:
         outside, tolerance: ``[J]`` metres by which joints lie outside the mask, NaN where unknown;
             metres that they may.
         fullness: area of the mask over that of the estimated silhouette.
-        colour, weight: ``[3]`` summed RGB of the person, summed mask.
         mask, to_small: ``[h, w]`` small mask; ``[3, 3]`` maps pixels of the whole image to it.
     """
 
@@ -137,8 +136,6 @@ class MaskView:
     outside: Float
     tolerance: float
     fullness: float
-    colour: Float
-    weight: float
     mask: Bool
     to_small: Float
 
@@ -260,8 +257,6 @@ def _view(subject: CheckedData, item: Item, sampling: Sampling) -> MaskView:
         outside=joint_distance(mask_distance(mask), pixels, depth, seen, focal),
         tolerance=max(subject.consistency.joint_tolerance, TOLERANCE * metre),
         fullness=float(mask.sum() / max(1, int(body.sum()))),
-        colour=frame.image.double().sum((0, 2, 3)).numpy(),
-        weight=float(soft.sum(dtype=np.float64)),
         mask=cv2.resize(soft, small, interpolation=cv2.INTER_AREA) > 0.5,
         to_small=to_small,
     )
