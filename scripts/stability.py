@@ -22,10 +22,10 @@ from rich.progress import track
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 sys.path.insert(0, str(Path(__file__).resolve().parent / "bench"))
 
-from bench_common import records
+from bench_common import Bench, records
 from stability.cases.case import compare_all
 
-from gsgan.bench.common import Bench, markdown, number, sentence
+from gsgan.bench.common import markdown, number, sentence
 from gsgan.utils.errors import GsganError
 from gsgan.utils.files import write_atomically
 

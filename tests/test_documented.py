@@ -20,7 +20,6 @@ from commands import ROOT, TINY
 
 # Settings of a GPU or of several processes: one kind of machine, and one process, runs the tests.
 ELSEWHERE = ("trainer=gpu", "trainer=ddp", "trainer=ddp_cpu")
-REPORTS = ("ablation", "ablation_skeleton", "gan")  # blocks of docs/results/ablations.md
 SMALL_BENCH = {
     "speed": ["size=tiny", "frames=2", "warmup=1", "poses=2", "data.root=/path/to/capture"],
     "trade_off": [
@@ -118,12 +117,6 @@ def place(capture, run, bare, on_body, model_file, tmp_path_factory):
                 cv2.imwrite(str(path), picture[..., ::-1])
         return root
 
-    def report_page() -> Path:
-        page = folder() / "page.md"
-        blocks = (f"<!-- report:{name} -->\n<!-- /report -->" for name in REPORTS)
-        page.write_text("# Page\n\n" + "\n\n".join(blocks) + "\n")
-        return page
-
     def another_run(name: str) -> Path:
         return Path(shutil.copytree(run, folder() / name))
 
@@ -189,8 +182,6 @@ def place(capture, run, bare, on_body, model_file, tmp_path_factory):
         "runs=runs/ablation_skeleton": lambda: f"runs={run.parent}",
         "runs=runs/ablation_gan": lambda: f"runs={run.parent}",
         "runs=runs/ablation": lambda: f"runs={run.parent}",
-        "/path/to/page.md": report_page,
-        "fill=docs/results/ablations.md": lambda: f"fill={report_page()}",
     }
 
     def fill(line: str) -> str:

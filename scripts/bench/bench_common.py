@@ -1,4 +1,4 @@
-"""What the benchmark scripts share: options, presets, training runs, plots and peak memory."""
+"""What the benchmark scripts share: files, options, presets, training runs, plots, peak memory."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +24,128 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from gsgan.bench.common import check_whole, environment, sentence
 from gsgan.scene import Frame
 from gsgan.splat import Accuracy, buffers
 from gsgan.utils.config import config_folder
-from gsgan.utils.errors import GsganError
+from gsgan.utils.console import make_console
+from gsgan.utils.errors import ConfigError, GsganError
+from gsgan.utils.files import write_atomically
+from gsgan.utils.tensors import pick_device
 
 HERE = Path(__file__).parent
 MEMORY_FRAMES = 4  # over which peak memory is taken
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A benchmark: ``name`` of its files and (with - for _) of its block in a Markdown page."""
+
+    name: str
+    folder: Path
+    console: Console
+    device: torch.device
+    where: dict[str, Any]  # from `environment`
+    page: Path | None
+
+    @classmethod
+    def start(cls, name: str, config: DictConfig, folder: Path) -> Bench:
+        """Sets the number of threads, selects the device and prints a line about the machine.
+
+        Raises:
+            ConfigError: on an unusable device, or a page without the block.
+        """
+        if config.threads is not None:
+            check_whole(config, threads=1)
+            torch.set_num_threads(config.threads)
+        device, page = pick_device(config.get("device", "cpu")), config.docs and Path(config.docs)
+        bench = cls(name, folder, make_console(), device, environment(device), page)
+        if page is not None:  # before anything is measured
+            check_block(page, *bench.markers)
+        bench.console.print(sentence(bench.where), highlight=False)
+        return bench
+
+    @property
+    def markers(self) -> tuple[str, str]:
+        """The comments around the block in the page."""
+        return f"<!-- bench:{self.name.replace('_', '-')} -->", "<!-- end -->"
+
+    def progress(self) -> Progress:
+        """A progress bar with a description."""
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+        return Progress(*columns, TimeElapsedColumn(), console=self.console, transient=True)
+
+    def write(
+        self,
+        title: str,
+        text: str,
+        record: Mapping[str, Any],
+        frame: pd.DataFrame | None = None,
+        images: Mapping[str, bytes] | None = None,
+        docs: str | None = None,
+    ) -> None:
+        """Prints the text; writes the files of the folder and the block of the page.
+
+        Args:
+            title, text: of the Markdown file; the block gets ``docs``, else ``text``.
+            record, frame: of the JSON file, beside ``where``, and of the CSV file.
+            images: PNG bytes by name; for the page they go into ``images/`` beside it.
+        """
+        self.console.print(text, markup=False, highlight=False, soft_wrap=True)
+        write_atomically(self.folder / f"{self.name}.md", f"# {title}\n\n{text.strip()}\n")
+        content = json.dumps({"where": self.where, **record}, indent=1)
+        write_atomically(self.folder / f"{self.name}.json", content)
+        if frame is not None:
+            write_atomically(self.folder / f"{self.name}.csv", frame.to_csv(index=False))
+        for name, png in (images or {}).items():
+            write_atomically(self.folder / name, png)
+            if self.page is not None:
+                write_atomically(self.page.parent / "images" / name, png)
+        if self.page is not None:
+            fill_block(self.page, *self.markers, docs or text)
+        self.console.print(f"tables and raw numbers: {self.folder}", markup=False, highlight=False)
+
+
+def fill_block(page: Path, start: str, end: str, text: str) -> None:
+    """Replaces the text between the marker ``start`` and the next ``end``.
+
+    Args:
+        page: a Markdown file.
+        start, end: the markers, HTML comments.
+        text: to write between them.
+
+    Raises:
+        ConfigError: when the page is missing or has no such block.
+    """
+    head, tail = _around(page, start, end)
+    write_atomically(page, f"{head}\n\n{text.strip()}\n\n{tail}")
+
+
+def check_block(page: Path, start: str, end: str) -> None:
+    """Checks that ``fill_block`` will find its block, before anything long begins.
+
+    Raises:
+        ConfigError: as ``fill_block`` does.
+    """
+    _around(page, start, end)
+
+
+def _around(page: Path, start: str, end: str) -> tuple[str, str]:
+    """A page up to the start of a block, and from its end."""
+    try:
+        text = page.read_text()
+    except FileNotFoundError:
+        raise ConfigError(f"docs={page}: no such page; give a Markdown file or docs=null") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"docs={page} cannot be read as a page: {error}") from None
+    head, found, rest = text.partition(start)
+    _, closed, tail = rest.partition(end)
+    if not found or not closed:
+        raise ConfigError(f"docs={page}: expected a block {start} … {end}, found none; add one")
+    return head + start, end + tail
 
 
 def records(frame: pd.DataFrame) -> list[dict[str, Any]]:

@@ -16,7 +16,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from timing import interleaved, median
 
-from gsgan.bench.common import NOTHING, Bench, check_whole, markdown, sentence
+from gsgan.bench.common import NOTHING, check_whole, markdown, sentence
 from gsgan.effects import decide as decide_effects
 from gsgan.model.assemble import build_data
 from gsgan.model.runs import load_avatar
@@ -70,7 +70,7 @@ def run(config: DictConfig, folder: Path) -> None:
             effect that was called for gained nothing.
     """
     check(config)
-    bench = Bench.start("effects", config, folder)
+    bench = bench_common.Bench.start("effects", config, folder)
     rows = list(rows_of(config))
     trainings = {name: words for row in rows for name, words in row.runs.items()}
     metrics = {}

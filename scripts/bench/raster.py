@@ -21,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 from timing import interleaved, median
 from torch import Tensor
 
-from gsgan.bench.common import NOTHING, Bench, check_whole, markdown, number, sentence
+from gsgan.bench.common import NOTHING, check_whole, markdown, number, sentence
 from gsgan.body.free import free_body
 from gsgan.scene import Camera, Gaussians, Raster
 from gsgan.skeleton import MEDIAPIPE33, Densify
@@ -61,7 +61,7 @@ def run(config: DictConfig, folder: Path) -> None:
         ConfigError: on a value out of range.
     """
     check_whole(config, repeats=1, windows=1, window=1, seed=0)
-    bench = Bench.start("raster", config, folder)
+    bench = bench_common.Bench.start("raster", config, folder)
     settings = [bench_common.preset(name) for name in config.settings]
     grid = list(product(config.gaussians, config.channels, config.sizes))
     rows: list[dict[str, Any]] = []

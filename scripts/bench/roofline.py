@@ -19,7 +19,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import flop_registry
 
-from gsgan.bench.common import NOTHING, Bench, check_whole, markdown, number, sentence
+from gsgan.bench.common import NOTHING, check_whole, markdown, number, sentence
 from gsgan.bench.speed import REST, TOTAL, load_subject, make_painter, measure, without_denormals
 from gsgan.model.avatar import Avatar, unwatched
 from gsgan.scene import Camera, Frame, Gaussians
@@ -42,7 +42,7 @@ def run(config: DictConfig, folder: Path) -> None:
         ConfigError: on a value out of range.
     """
     check_whole(config, frames=1, warmup=0, poses=1)
-    bench = Bench.start("roofline", config, folder)
+    bench = bench_common.Bench.start("roofline", config, folder)
     tables, peak = [], peaks(bench.device)
     for size in config.sizes:
         with initialize_config_dir(str(config_folder()), version_base="1.3"):

@@ -24,7 +24,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from gsgan.bench import common
-from gsgan.bench.common import NOTHING, Bench, markdown, number
+from gsgan.bench.common import NOTHING, markdown, number
 from gsgan.bench.speed import (
     PRECISIONS,
     deciles,
@@ -146,7 +146,7 @@ def run(config: DictConfig, folder: Path) -> None:
     above("patience", config.patience)
     one_of("split", config.split, ("novel_pose", "novel_view"))
     one_of("quality", config.quality, QUALITIES)
-    bench = Bench.start("trade_off", config, folder)
+    bench = bench_common.Bench.start("trade_off", config, folder)
     perceptual, _ = lpips(config.lpips.net, config.lpips.path)
     runs = trained(config, bench)
     subject = standard_run(runs).folder
@@ -170,7 +170,7 @@ def run(config: DictConfig, folder: Path) -> None:
     bench.write("Quality against time", page, record, frame, images, docs=docs)
 
 
-def trained(config: DictConfig, bench: Bench) -> list[Point]:
+def trained(config: DictConfig, bench: bench_common.Bench) -> list[Point]:
     """The runs to compare: those of ``runs``, or the one of ``run``."""
     if (config.run is None) == (config.runs is None):
         raise ConfigError("give either run=<a trained run> or runs=<the folder of a multirun>")
@@ -231,7 +231,7 @@ def ways(folder: Path, settings: Mapping[str, Any]) -> list[Point]:
 
 
 def load(
-    points: Sequence[Point], config: DictConfig, bench: Bench
+    points: Sequence[Point], config: DictConfig, bench: bench_common.Bench
 ) -> tuple[list[Painter], list[Frame], list[str]]:
     """A painter per point, the frames that all paint, and notes that the tables must carry.
 
@@ -271,7 +271,7 @@ def measure(
     frames: Sequence[Frame],
     perceptual: Score | None,
     config: DictConfig,
-    bench: Bench,
+    bench: bench_common.Bench,
 ) -> tuple[list[dict[str, Any]], list[list[float]]]:
     """Of every point the scores, and milliseconds per frame.
 

@@ -40,19 +40,6 @@ def test_it_writes_all_files_and_names_what_it_left_out(sweep, tmp_path, inside)
     assert not (tmp_path / "outputs").exists()  # Hydra left nothing
 
 
-def test_it_fills_a_block_of_a_page_again_and_again(sweep, tmp_path, inside):
-    page = tmp_path / "page.md"
-    page.write_text("# P\n<!-- report:ablation -->old<!-- /report -->\nafter\n")
-    for _ in range(2):
-        given = [f"runs=[{sweep}]", "table=ablation", "out=t", f"fill={page}"]
-        assert inside("report", *given).returncode == 0
-    text = page.read_text()
-    assert text.startswith("# P\n<!-- report:ablation -->\n\n**novel_pose")
-    assert text.endswith("<!-- /report -->\nafter\n")
-    assert "old" not in text
-    assert str(tmp_path) not in text  # no path of this machine
-
-
 def test_a_wrong_value_ends_in_one_message_before_anything_is_written(sweep, tmp_path, inside):
     runs = f"runs=[{sweep}]"
     refused(inside("report"), "runs and run are not set")
@@ -62,9 +49,7 @@ def test_a_wrong_value_ends_in_one_message_before_anything_is_written(sweep, tmp
     refused(inside("report", runs, "out=a", "table.metrics=[fid]"), "fid", "psnr")
     refused(inside("report", runs, "out=a", "table.rows=[{model: full}]"), "model")
     page = tmp_path / "page.md"
-    page.write_text("no block")
-    refused(inside("report", runs, "out=a", f"fill={page}"), "expected a block", "report:plain")
-    refused(inside("report", runs, "out=a", "fill=gone.md"), "gone.md: no such page")
+    page.write_text("a file")
     assert not (tmp_path / "a").exists()
     refused(inside("report", runs, f"out={page}/x"), "cannot be written")
 

@@ -1,14 +1,12 @@
-"""What benchmarks share: a description of the machine, and their files."""
+"""What benchmarks share: a description of the machine, and tables."""
 
 from __future__ import annotations
 
 import contextlib
 import importlib.metadata
-import json
 import os
 import platform
 from collections.abc import Mapping
-from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -16,14 +14,9 @@ from typing import Any
 import pandas as pd
 import torch
 from omegaconf import DictConfig
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from gsgan.utils import pages
 from gsgan.utils.checks import whole
-from gsgan.utils.console import make_console
-from gsgan.utils.files import write_atomically
-from gsgan.utils.tensors import pick_device
 
 NOTHING = "–"  # for a value that was not measured
 
@@ -83,72 +76,3 @@ def check_whole(config: DictConfig, **least: int) -> None:
     """Raises ConfigError for keys that are not whole numbers of at least the given value."""
     for name, low in least.items():
         whole(name, config[name], low)
-
-
-@dataclass(frozen=True)
-class Bench:
-    """A benchmark: ``name`` of its files and (with - for _) of its block in a Markdown page."""
-
-    name: str
-    folder: Path
-    console: Console
-    device: torch.device
-    where: dict[str, Any]  # from `environment`
-    page: Path | None
-
-    @classmethod
-    def start(cls, name: str, config: DictConfig, folder: Path) -> Bench:
-        """Sets the number of threads, selects the device and prints a line about the machine.
-
-        Raises:
-            ConfigError: on an unusable device, or a page without the block.
-        """
-        if config.threads is not None:
-            check_whole(config, threads=1)
-            torch.set_num_threads(config.threads)
-        device, page = pick_device(config.get("device", "cpu")), config.docs and Path(config.docs)
-        bench = cls(name, folder, make_console(), device, environment(device), page)
-        if page is not None:  # before anything is measured
-            pages.check_block(page, *bench.markers, key="docs")
-        bench.console.print(sentence(bench.where), highlight=False)
-        return bench
-
-    @property
-    def markers(self) -> tuple[str, str]:
-        """The comments around the block in the page."""
-        return f"<!-- bench:{self.name.replace('_', '-')} -->", "<!-- end -->"
-
-    def progress(self) -> Progress:
-        """A progress bar with a description."""
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-        return Progress(*columns, TimeElapsedColumn(), console=self.console, transient=True)
-
-    def write(
-        self,
-        title: str,
-        text: str,
-        record: Mapping[str, Any],
-        frame: pd.DataFrame | None = None,
-        images: Mapping[str, bytes] | None = None,
-        docs: str | None = None,
-    ) -> None:
-        """Prints the text; writes the files of the folder and the block of the page.
-
-        Args:
-            title, text: of the Markdown file; the block gets ``docs``, else ``text``.
-            record, frame: of the JSON file, beside ``where``, and of the CSV file.
-            images: PNG bytes by name; for the page they go into ``images/`` beside it.
-        """
-        self.console.print(text, markup=False, highlight=False, soft_wrap=True)
-        write_atomically(self.folder / f"{self.name}.md", f"# {title}\n\n{text.strip()}\n")
-        content = json.dumps({"where": self.where, **record}, indent=1)
-        write_atomically(self.folder / f"{self.name}.json", content)
-        if frame is not None:
-            write_atomically(self.folder / f"{self.name}.csv", frame.to_csv(index=False))
-        for name, png in (images or {}).items():
-            write_atomically(self.folder / name, png)
-            if self.page is not None:
-                write_atomically(self.page.parent / "images" / name, png)
-        if self.page is not None:
-            pages.fill_block(self.page, *self.markers, docs or text, key="docs")
-        self.console.print(f"tables and raw numbers: {self.folder}", markup=False, highlight=False)

@@ -13,7 +13,7 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from gsgan.bench.common import Bench, check_whole, markdown, number, sentence
+from gsgan.bench.common import check_whole, environment, markdown, number, sentence
 from gsgan.data.datamodule import GsganData
 from gsgan.model.assemble import build_avatar, build_data
 from gsgan.model.avatar import Avatar, unwatched
@@ -23,7 +23,10 @@ from gsgan.scene import Frame, cat
 from gsgan.splat import BACKENDS, resolve_backend
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import one_of
+from gsgan.utils.console import make_console, progress
 from gsgan.utils.errors import ConfigError
+from gsgan.utils.files import write_atomically, write_json
+from gsgan.utils.tensors import pick_device
 
 TOTAL, REST = "end to end", "between stages"
 # Lightning's names, as in conf/trainer.
@@ -55,24 +58,29 @@ def run(config: DictConfig, folder: Path) -> None:
     one_of("channels_last", config.channels_last, (True, False))
     one_of("precision", config.precision, PRECISIONS)
     one_of("backend", config.backend, BACKENDS)
-    bench = Bench.start("speed", config, folder)
-    avatar, frames, name, marks = load_subject(config, bench.device)
+    if config.threads is not None:
+        check_whole(config, threads=1)
+        torch.set_num_threads(config.threads)
+    console, device = make_console(), pick_device(config.device)
+    where = environment(device)
+    avatar, frames, name, marks = load_subject(config, device)
     painter = make_painter(avatar, config.precision, config.backend)
-    with without_denormals(), bench.progress() as progress:
-        task = progress.add_task("painting", total=config.warmup + config.frames)
+    with without_denormals(), progress(console) as bars:
+        task = bars.add_task("painting", total=config.warmup + config.frames)
         times = measure(
             avatar,
             painter,
             frames,
             count=config.frames,
             warmup=config.warmup,
-            tick=lambda: progress.advance(task),
+            tick=lambda: bars.advance(task),
         )
-        batches = in_batches(painter, frames, bench.device, config.batch, config.frames)
+        batches = in_batches(painter, frames, device, config.batch, config.frames)
     median, least = number(batches["median"]), number(batches["least"])
     marks = [*marks, f"in batches of {config.batch}: {median} ms an image, at the least {least}"]
     settings = {"avatar": name, **settings_of(config, avatar, frames)}
     record = {
+        "where": where,
         "settings": settings,
         "marks": marks,
         "times_ms": {
@@ -82,8 +90,11 @@ def run(config: DictConfig, folder: Path) -> None:
             "batches": batches,
         },
     }
-    page = text(times, bench.where, settings, marks)
-    bench.write("From skeleton to image", page, record)
+    page = text(times, where, settings, marks)
+    console.print(page, markup=False, highlight=False, soft_wrap=True)
+    write_atomically(folder / "speed.md", f"# From skeleton to image\n\n{page}\n")
+    write_json(folder / "speed.json", record)
+    console.print(f"tables and raw numbers: {folder}", markup=False, highlight=False)
 
 
 def load_subject(
@@ -282,7 +293,7 @@ def settings_of(config: DictConfig, avatar: Avatar, frames: Sequence[Frame]) -> 
 def text(
     times: pd.DataFrame, where: dict[str, Any], settings: dict[str, Any], marks: Sequence[str]
 ) -> str:
-    """The block of the page: the machine, the settings, the table, the notes."""
+    """The content of speed.md: the machine, the settings, the table, the notes."""
     stages, total = times.drop(TOTAL), times.loc[TOTAL]
     shares = [f"{share:.0%}" for share in stages["median"] / stages["median"].sum()]
     table = times.map(number)

@@ -28,7 +28,6 @@ from gsgan.report.spec import (
     written,
 )
 from gsgan.report.write import (
-    MARKDOWN,
     NO_RUN,
     NOT_HAD,
     TERMINAL,
@@ -42,9 +41,7 @@ from gsgan.report.write import (
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.files import write_atomically
-from gsgan.utils.pages import check_block, fill_block
 
-BLOCK_END = "<!-- /report -->"
 FLOOR_LABEL = "all background (floor)"
 SPREAD = (
     "Mean ± sample standard deviation over seeds, as many as the column seeds says; one seed has "
@@ -194,16 +191,12 @@ def make_tables(config: DictConfig) -> None:
     """Writes the table ``config.table`` of ``config.runs`` into ``config.out``.
 
     Raises:
-        ConfigError: on runs that do not exist or are not comparable, or on a page or
-            folder that cannot be written.
+        ConfigError: on runs that do not exist or are not comparable, or on a folder that cannot be
+            written.
     """
     given = [config.runs] if isinstance(config.runs, str) else config.runs
     spec: TableSpec = instantiate(config.table)
     paper = None if spec.paper is None else read_paper(spec.paper)
-    page = None if config.fill is None else Path(str(config.fill)).expanduser()
-    start = f"<!-- report:{spec.name} -->"
-    if page is not None:
-        check_block(page, start, BLOCK_END, key="fill")
     runs, left_out = read_runs(find_runs([str(entry) for entry in given]))
     report = build(spec, runs, left_out, paper, allow_dirty=config.allow_dirty)
     now = f"{datetime.now():%Y-%m-%d_%H-%M-%S}"
@@ -212,16 +205,12 @@ def make_tables(config: DictConfig) -> None:
     try:
         for name, content in files.items():
             write_atomically(folder / name, content)
-        if page is not None:
-            fill_block(page, start, BLOCK_END, MARKDOWN.body(report), key="fill")
     except OSError as error:
         where = error.filename or folder
         raise ConfigError(f"{where} cannot be written: {error.strerror}") from None
     console = make_console()
     console.print(Markdown(TERMINAL.body(report)))
-    filled = "" if page is None else f"\nfilled: {page}"
-    done = f"tables: {folder}/{{{','.join(files)}}}{filled}"
-    console.print(done, markup=False, soft_wrap=True)
+    console.print(f"tables: {folder}/{{{','.join(files)}}}", markup=False, soft_wrap=True)
 
 
 def build(
