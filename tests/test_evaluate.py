@@ -219,9 +219,15 @@ def test_a_run_is_scored_as_skeletons_alone_drive_it(run, inside, tmp_path):
     copy = shutil.copytree(run, tmp_path / "copy")
     result = inside("evaluate", f"run={copy}", "drive=skeleton", "splits=[novel_pose]")
     assert result.returncode == 0, result.stderr
-    assert "driven by skeletons alone" in (copy / "by_skeleton" / "metrics.md").read_text()
+    assert (
+        "driven by skeletons alone"
+        in (copy / "by_skeleton" / "novel_pose" / "metrics.md").read_text()
+    )
     assert scores(copy) == scores(run)
-    driven, exact = scores(copy / "by_skeleton")["novel_pose"], scores(run)["novel_pose"]
+    driven, exact = (
+        scores(copy / "by_skeleton" / "novel_pose")["novel_pose"],
+        scores(run)["novel_pose"],
+    )
     assert driven["full"]["marks"][-1] == "driven by skeletons alone"
     assert driven["full"]["psnr"] != exact["full"]["psnr"]
     assert driven["floor"]["psnr"] == exact["floor"]["psnr"]

@@ -1,7 +1,7 @@
 """The results of an evaluation: metrics.json, scores.csv, facts.json and tables of the scores."""
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from gsgan.evaluate.origin import SAME, caption
+from gsgan.evaluate.origin import caption
 from gsgan.metrics.names import METRICS
 from gsgan.utils import pages
 from gsgan.utils.files import write_atomically
@@ -19,8 +19,7 @@ from gsgan.utils.files import write_atomically
 METRICS_FILE, SCORES_FILE, FACTS_FILE, TABLE_FILE = NAMES = (
     *("metrics.json", "scores.csv", "facts.json", "metrics.md"),
 )
-PLACE = {"split": str, "variant": str, "camera": str, "frame": int}
-HEADER = (*PLACE, *METRICS)
+HEADER = ("split", "variant", "camera", "frame", *METRICS)
 Results = dict[str, dict[str, dict[str, Any]]]
 TITLE = "Held-out cameras (novel_view) and poses (novel_pose)"
 IN_TERMINAL = (  # narrow; metrics.md has all metrics
@@ -57,48 +56,6 @@ def write_scored(scored: Scored, folder: Path) -> None:
     write_atomically(folder / FACTS_FILE, origin)
     results = json.dumps(scored.results, indent=2, allow_nan=False)
     write_atomically(folder / METRICS_FILE, results)
-
-
-def read_rows(path: Path) -> pd.DataFrame:
-    """Reads scores.csv; a KeyError when a column is missing."""
-    empty: dict[str, list[str]] = {metric: [""] for metric in METRICS}
-    table = pd.read_csv(
-        path, dtype=PLACE, keep_default_na=False, na_values=empty, float_precision="round_trip"
-    )
-    return table[list(HEADER)]
-
-
-def joined(now: Scored, folder: Path, splits: Iterable[str]) -> tuple[Scored, list[str]]:
-    """Adds the scores that ``folder`` has of other splits if they were made in the same way.
-
-    Returns:
-        All scores in the order of ``splits``, and the earlier splits that had to be dropped.
-    """
-    if not (folder / METRICS_FILE).is_file():
-        return now, []
-    others: list[str] = []
-    try:
-        results: Results = json.loads((folder / METRICS_FILE).read_text())
-        others = [split for split in results if split not in now.results]
-        rows = read_rows(folder / SCORES_FILE)
-        origin = json.loads((folder / FACTS_FILE).read_text())
-        ways = [_way(origin, results[split]["full"]) for split in others]
-        ways += [_way(now.origin, scored["full"]) for scored in now.results.values()]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):  # damaged
-        return now, others
-    if any(way != ways[-1] for way in ways):
-        return now, others
-    results |= now.results
-    rows = pd.concat([rows[rows["split"].isin(others)], now.rows])
-    order = [split for split in splits if split in results]
-    rows = pd.concat([rows[rows["split"] == split] for split in order])
-    return Scored({split: results[split] for split in order}, rows, now.origin), []
-
-
-def _way(origin: dict[str, Any], scores: dict[str, Any]) -> list[Any]:
-    """How a split was scored, which must be equal for all splits of a table."""
-    way = [origin["data"]["fingerprint"], *(origin[key] for key in SAME)]
-    return way + [scores.get(key) for key in ("marks", "protocol", "lpips_name", "boxes")]
 
 
 # -- tables

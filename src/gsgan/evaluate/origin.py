@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
 
 DIRTY = "+changes"
-# Scores that differ in one of these are not in one table.
-SAME = ("method", "model", "protocol", "seed", "iterations", "version", "commit", "dirty")
 
 
 @dataclass(frozen=True)

@@ -18,15 +18,7 @@ from gsgan.data.datamodule import GsganData
 from gsgan.data.metric_variants import MetricVariants
 from gsgan.data.training_poses import TrainingPoses
 from gsgan.evaluate.distances import write_distances
-from gsgan.evaluate.files import (
-    FACTS_FILE,
-    HEADER,
-    Results,
-    Scored,
-    joined,
-    print_table,
-    write_scored,
-)
+from gsgan.evaluate.files import FACTS_FILE, HEADER, Results, Scored, print_table, write_scored
 from gsgan.evaluate.grids import write_grid
 from gsgan.evaluate.origin import Method, origin, trained
 from gsgan.evaluate.predictions import FLOOR, FULL, BodyBoxes, Preparation, read_folder
@@ -93,6 +85,8 @@ def evaluate_folder(config: DictConfig, console: Console, device: torch.device) 
         out = out / f"on_{config.background}"
     if config.drive is not None and not other:
         out, marks = out / "by_skeleton", [*marks, BY_SKELETON]
+    if len({*config.splits}) < len(SPLITS):  # the scores of both splits stay
+        out = out / config.splits[0]
     method = trained(
         folder,
         seed=stored.seed,
@@ -217,11 +211,7 @@ def evaluate_method(
     for split, found in scores.items():
         if found.grid:
             write_grid(found.grid, folder / "grids" / f"{split}.png")
-    now = _joined_splits(scores, scorer, data, origin(method, data, device))
-    whole, dropped = joined(now, folder, SPLITS)
-    if dropped:
-        names = ", ".join(dropped)
-        console.print(f"earlier scores of {names} were made in another way and are left out")
+    whole = _joined_splits(scores, scorer, data, origin(method, data, device))
     print_table(whole.results, whole.origin, console)
     if poses is not None:
         own = None if config.get("on") is None else Path(config.run).expanduser()
