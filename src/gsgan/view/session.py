@@ -22,7 +22,7 @@ from gsgan.utils.errors import GsganError
 from gsgan.utils.images import eight_bits
 from gsgan.utils.provenance import png_bytes
 from gsgan.view.drag import NAMES, dragged, position
-from gsgan.view.layers import ERROR, IMAGE, fitted, layers, shown
+from gsgan.view.layers import IMAGE, layers, shown
 
 Float = NDArray[np.float64]
 
@@ -85,10 +85,7 @@ class Session:
         self.status = gui.add_text("images per second", "", disabled=True)
         known = self.show.avatar.poses is not None
         self.far = gui.add_text("deviations from training", "", disabled=True, visible=known)
-        names = layers(self.show.avatar, self.drive.truth is not None)
-        self.layer = gui.add_dropdown("layer", names, initial_value=IMAGE)
-        last = max(0, self.show.avatar.splat_channels - 4)
-        self.channel = gui.add_slider("channel of F", 0, max(1, last), 1, 0, visible=last > 0)
+        self.layer = gui.add_dropdown("layer", layers(self.show.avatar), initial_value=IMAGE)
         with gui.add_folder("motion"):
             self.slider = gui.add_slider("frame", 0, max(1, len(self.drive.p) - 1), 1, 0)
             self.play = gui.add_checkbox("play", False)
@@ -101,7 +98,7 @@ class Session:
             self.mesh = gui.add_checkbox("body", False, visible=self.show.body is not None)
             self.splats = gui.add_checkbox("Gaussians", False)
         save = gui.add_button("save the image")
-        for control in (self.layer, self.channel, self.bones, self.mesh, self.splats):
+        for control in (self.layer, self.bones, self.mesh, self.splats):
             control.on_update(lambda _: self.touch(moving=False))
         self.play.on_update(lambda _: self._played())
         self.handles.on_update(lambda _: self._show_handles())
@@ -141,7 +138,6 @@ class Session:
             self._warn("This motion cannot be used", _message(error).replace(folder + "/", ""))
             return
         self.drive, self.description.content = drive, drive.text
-        self.layer.options = layers(self.show.avatar, drive.truth is not None)
         self.slider.max = max(1, len(drive.p) - 1)
         self.slider.value = 0
         self._scrub(0)
@@ -250,8 +246,7 @@ class Session:
     def _render(self, share: float) -> None:
         avatar, layer = self.show.avatar, self.layer.value
         current = self._current()
-        truth = current.truth(0) if layer == ERROR and current.truth else None
-        camera = self.camera(share) if truth is None else truth.camera
+        camera = self.camera(share)
         p, visibility, body = inputs_of(avatar, current, 0)
         maps = layer != IMAGE or self.splats.value
         with torch.no_grad():
@@ -259,17 +254,15 @@ class Session:
         if avatar.poses is not None:
             self.far.value = f"{float(avatar.poses.distance(p)):.1f}"
         behind = self.show.behind(camera.size)
-        image = shown(layer, rendering, camera, avatar, behind, int(self.channel.value), truth)
-        self.image = image
-        whole = fitted(image, self.client.camera.aspect) if truth is not None else image
+        self.image = drawn = shown(layer, rendering, camera, avatar, behind)
         if self.splats.value and rendering.gaussians is not None:  # the browser draws these instead
-            whole = eight_bits(behind, torch.ones(1), behind)
-        self.client.scene.set_background_image(whole, "jpeg", jpeg_quality=90)
+            drawn = eight_bits(behind, torch.ones(1), behind)
+        self.client.scene.set_background_image(drawn, "jpeg", jpeg_quality=90)
         self._place(rendering.gaussians, np.asarray(p[0].cpu().numpy(), np.float64), body)
         self.times.append(time.monotonic())
         recent = [x for x in self.times if x > self.times[-1] - SPEED_OVER]
         rate = (len(recent) - 1) / max(recent[-1] - recent[0], 1e-6)
-        height, width = image.shape[:2]
+        height, width = self.image.shape[:2]
         shown_rate = f"{rate:.1f} at " if len(recent) > 1 else ""
         self.status.value = f"{shown_rate}{width} × {height}"
 
