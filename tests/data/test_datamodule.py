@@ -115,9 +115,9 @@ def test_loaders_and_datasets(capture):
     assert len(data.train_dataloader()) == 8  # 2 cameras × 8 frames in twos
     assert data.eval_names == ("novel_view", "novel_pose")
     assert data.reasons == {}
-    views, poses = data.test_dataloader()
-    assert [int(i) for frame in views for i in frame.camera_index] == [2] * 8
-    assert [int(i) for frame in poses for i in frame.frame_id] == [8, 9, 8, 9]
+    views, poses = (data.dataset(name) for name in data.eval_names)
+    assert {camera for camera, _ in views.items} == {"cam02"}
+    assert [frame for _, frame in poses.items] == [8, 9, 8, 9]
     with pytest.raises(ValueError, match="split must be one of train, novel_view, novel_pose"):
         data.dataset("test")
 
@@ -160,9 +160,9 @@ def test_on_a_gpu_batches_are_pinned_and_copied_while_the_host_goes_on(capture, 
     assert moved[: len(pinned)] == [{"non_blocking": True}] * len(pinned)
 
 
-def test_empty_split_has_no_loader_but_a_reason(capture):
+def test_empty_split_has_a_reason(capture):
     data = GsganData(str(capture), test_share=0)
-    assert data.test_dataloader() == []
+    assert data.eval_names == ()
     assert set(data.reasons) == {"novel_view", "novel_pose"}
 
 

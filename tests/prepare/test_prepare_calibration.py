@@ -5,7 +5,7 @@ import pytest
 from capture_scenes import LENS, ring, write_own, write_toml
 
 from gsgan.data.calibration import find_calibration, read_calibration
-from gsgan.prepare.sources import matching_cameras, pair_cameras
+from gsgan.prepare.sources import pair_cameras
 from gsgan.utils.errors import DataError
 
 
@@ -56,7 +56,6 @@ def test_caliscope(tmp_path):
     )
     calibration = read_calibration(find_calibration(tmp_path))
     assert list(calibration.cameras) == ["0", "3"]
-    assert calibration.ignored == ("5",)
     for camera in calibration.cameras.values():
         np.testing.assert_allclose(camera.K, [[900, 0, 618.75], [0, 910, 395], [0, 0, 1]])
         np.testing.assert_allclose(camera.R, matrix, atol=1e-12)
@@ -65,7 +64,6 @@ def test_caliscope(tmp_path):
         assert camera.size == (720, 1280)
     videos = ["cam_0", "cam_3"]
     assert pair_cameras(videos, list(calibration.cameras), {}) == {"cam_0": "0", "cam_3": "3"}
-    assert matching_cameras("cam_5", calibration.ignored)
     path.write_text(path.read_text().replace("ignore = true", "ignore = false"))
     with pytest.raises(DataError, match=r"\[5\] lacks 'matrix'"):
         read_calibration(path)

@@ -57,18 +57,12 @@ class Calibration:
         format: its name in words.
         cameras: by name, metres, K with pixel centres at +0.5; a size of (0, 0) is unknown.
         notes: one sentence for each omission or oddity.
-        ignored: names of cameras that the file says to ignore.
     """
 
     path: Path
     format: str
     cameras: dict[str, CameraEntry]
     notes: tuple[str, ...] = ()
-    ignored: tuple[str, ...] = ()
-
-
-Cameras = Mapping[str, CameraEntry | None]
-"""Cameras by name; None is one that the file says to ignore."""
 
 
 def find_calibration(folder: Path) -> Path:
@@ -115,12 +109,10 @@ def read_calibration(
     for name, (fits, reader) in FORMATS.items():
         if fits(head):
             notes: list[str] = []
-            found = reader(path, unit_scale, pixel_centre, notes)
-            cameras = {key: camera for key, camera in found.items() if camera is not None}
+            cameras = reader(path, unit_scale, pixel_centre, notes)
             if not cameras:
                 raise DataError(f"{path} ({name}) lists no camera that can be used")
-            ignored = tuple(key for key in found if key not in cameras)
-            return Calibration(path, name, cameras, tuple(notes), ignored)
+            return Calibration(path, name, cameras, tuple(notes))
     raise DataError(f"{path} is not a known calibration; expected {KNOWN}")
 
 
@@ -189,7 +181,9 @@ def read_cameras(
     return cameras
 
 
-def _read_json(path: Path, scale: float | None, pixel_centre: float, notes: list[str]) -> Cameras:
+def _read_json(
+    path: Path, scale: float | None, pixel_centre: float, notes: list[str]
+) -> dict[str, CameraEntry]:
     """A meta.json beside the file gives its unit and pixel centre."""
     meta = path.with_name("meta.json")
     found = read_conventions(meta, read_json(meta)) if meta.is_file() else Conventions()
@@ -199,25 +193,24 @@ def _read_json(path: Path, scale: float | None, pixel_centre: float, notes: list
 # -- TOML of Pose2Sim, aniposelib and caliscope
 
 
-def _read_toml(path: Path, scale: float | None, pixel_centre: float, notes: list[str]) -> Cameras:
+def _read_toml(
+    path: Path, scale: float | None, pixel_centre: float, notes: list[str]
+) -> dict[str, CameraEntry]:
     """Cameras by name: size [w, h], matrix, distortions, rotation, translation.
 
     Convention: world to camera; the rotation is a Rodrigues vector, or a matrix; metres as Pose2Sim
     and caliscope write them. caliscope has one table per camera in another, [cameras.0]: the number
-    is its name, and a camera that it ignores is None here. aniposelib keeps the unit of its
+    is its name; a camera that it ignores is left out. aniposelib keeps the unit of its
     calibration board, often mm, without naming it: give it with ``unit``.
     """
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError, RecursionError) as error:
         raise DataError(f"{path} is not readable as TOML: {error}") from None
-    cameras: dict[str, CameraEntry | None] = {}
+    cameras: dict[str, CameraEntry] = {}
     inner = content.get("cameras")
     for table, entry in (inner if isinstance(inner, dict) else content).items():
-        if table in TOML_OTHER_TABLES or not isinstance(entry, dict):
-            continue
-        if entry.get("ignore"):
-            cameras[table] = None
+        if table in TOML_OTHER_TABLES or not isinstance(entry, dict) or entry.get("ignore"):
             continue
         name = str(entry.get("name", table))
         if name in cameras:
@@ -295,7 +288,9 @@ def read_opencv_yaml(path: Path) -> dict[str, Any]:
     )
 
 
-def _read_yaml(path: Path, scale: float | None, pixel_centre: float, notes: list[str]) -> Cameras:
+def _read_yaml(
+    path: Path, scale: float | None, pixel_centre: float, notes: list[str]
+) -> dict[str, CameraEntry]:
     """Cameras by name: K, dist (or D), H, W from intri; Rot or R (Rodrigues), T from extri.
 
     Convention: metres; world to camera. The two files list names in different orders and with
@@ -343,7 +338,7 @@ def _read_yaml(path: Path, scale: float | None, pixel_centre: float, notes: list
     return cameras
 
 
-Reader = Callable[[Path, float | None, float, list[str]], Cameras]
+Reader = Callable[[Path, float | None, float, list[str]], dict[str, CameraEntry]]
 """Cameras of a path, by metres in a unit (None: the format's own) and K's pixel centre; notes."""
 FORMATS: dict[str, tuple[Callable[[str], bool], Reader]] = {
     "OpenCV YAML": (lambda head: head.lstrip().startswith("%YAML"), _read_yaml),

@@ -288,7 +288,7 @@ class GsganData(LightningDataModule):
 
     @property
     def eval_names(self) -> tuple[str, ...]:
-        """The splits behind `test_dataloader`, in their order."""
+        """The held-out splits that are not empty."""
         return tuple(name for name in SPLITS[1:] if self.splits.items[name])
 
     def dataset(self, split: str) -> CaptureDataset:
@@ -334,10 +334,6 @@ class GsganData(LightningDataModule):
         """The images of `watched`."""
         name, places = self.watched
         return self._loader(self.dataset(name), places)
-
-    def test_dataloader(self) -> list[DataLoader[Frame]]:
-        """One loader per held-out split that is not empty, as in `eval_names`."""
-        return [self._loader(self.dataset(name)) for name in self.eval_names]
 
     def transfer_batch_to_device(
         self, batch: Frame, device: torch.device, dataloader_idx: int

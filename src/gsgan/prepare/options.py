@@ -10,14 +10,7 @@ from gsgan.data.cameras import CameraEntry
 from gsgan.motion.points import UNITS
 from gsgan.prepare.camera_array import MIN_VIEWS
 from gsgan.prepare.solve import SolveSettings
-from gsgan.prepare.sources import (
-    Recording,
-    find_sources,
-    fit_size,
-    matching_cameras,
-    pair_cameras,
-    recording_notes,
-)
+from gsgan.prepare.sources import Recording, find_sources, fit_size, pair_cameras, recording_notes
 from gsgan.utils.checks import above, between, one_of, whole
 from gsgan.utils.errors import ConfigError, DataError
 
@@ -148,11 +141,6 @@ def read_inputs(options: Options) -> Inputs:
     scale = None if options.unit is None else UNITS[options.unit]  # None: the format's own
     calibration = read_calibration(path, scale, options.pixel_centre)
     notes, cameras = list(calibration.notes), []
-    named = {*(options.cameras or {})}
-    named |= {n for n in sources if matching_cameras(n, [*calibration.cameras])}
-    for name in [n for n in sources if matching_cameras(n, calibration.ignored) and n not in named]:
-        notes.append(f"{name}: left out, {path.name} says to ignore its camera")
-        del sources[name]
     if len(sources) < MIN_VIEWS:
         raise DataError(
             f"{folder} holds only the camera {next(iter(sources), 'none')}; 3D needs two"
