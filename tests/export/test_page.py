@@ -9,6 +9,7 @@ import json
 import shutil
 import subprocess
 import threading
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -46,7 +47,8 @@ def avatar(build, tmp_path, dance, landmarks):
         for numbers in (*avatar.deformation.parameters(), *avatar.body_points.parameters()):
             numbers += 0.3 * torch.randn(numbers.shape, generator=generator)
     avatar.deformation.active_degree, avatar.window_margin = 1, None
-    run = Run(tmp_path, None, {}, avatar.freeze(), opened=data)
+    run = Run(tmp_path, None, {"scene": asdict(data.info)}, avatar.freeze())
+    run.data = data
     seen = np.ones(landmarks.shape[:2])
     drive = Drive(landmarks, seen, dance, list(range(len(seen))), "")
     content = block(run, run.avatar, {"dance": (drive, 30.0)}, "a & b")

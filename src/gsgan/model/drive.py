@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
@@ -14,7 +13,6 @@ from numpy.typing import NDArray
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from gsgan.data.dataset import ImageCache
 from gsgan.data.proportions import (
     BODY,
     EXPRESSION,
@@ -48,7 +46,6 @@ from gsgan.utils.errors import ConfigError, DataError
 
 Float = NDArray[np.float64]
 REST = "rest"
-CACHE = 1 << 26  # bytes of decoded images, for comparisons with the ground truth
 
 
 @dataclass(frozen=True)
@@ -134,8 +131,7 @@ def _chosen(config: DictConfig, run: Run, fps: float) -> Drive:
 
 def _held_out(config: DictConfig, run: Run, split: str) -> Drive:
     """Frames of a split, seen by one camera."""
-    dataset = copy(run.data.dataset(split))
-    dataset.cache = ImageCache(CACHE)  # a run in training uses the dataset's own at the same time
+    dataset = run.data.dataset(split)
     if not dataset.items:
         raise DataError(f"motion={split}: the run has no such frames ({run.data.reasons[split]})")
     names = list(dict.fromkeys(camera for camera, _ in dataset.items))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -123,10 +124,9 @@ class Run:
     Args:
         folder: of the run.
         stored: its config.
-        checkpoint: ``gsgan`` of its checkpoint; empty where training has not written one yet.
+        checkpoint: ``gsgan`` of its checkpoint.
         avatar: frozen.
         paths: of its dataset and body model file.
-        opened: its dataset, or None.
     """
 
     folder: Path
@@ -134,7 +134,6 @@ class Run:
     checkpoint: dict[str, Any]
     avatar: Avatar
     paths: DataPaths = field(default_factory=DataPaths)
-    opened: GsganData | None = None
 
     @classmethod
     def load(cls, config: DictConfig) -> Run:
@@ -151,17 +150,15 @@ class Run:
         avatar = avatar_of(folder, stored, checkpoint, paths.smpl).to(pick_device(config.device))
         return cls(folder, stored, checkpoint["gsgan"], avatar, paths)
 
-    @property
+    @cached_property
     def data(self) -> GsganData:
         """The run's dataset."""
-        if self.opened is None:
-            self.opened = build_data(load_config(self.folder, self.paths))
-        return self.opened
+        return build_data(load_config(self.folder, self.paths))
 
     @property
     def scene(self) -> SceneInfo:
         """Facts about the scene."""
-        return stored_scene(self.checkpoint["scene"]) if self.opened is None else self.opened.info
+        return stored_scene(self.checkpoint["scene"])
 
     @property
     def body(self) -> MarkedBody | None:

@@ -1,8 +1,7 @@
-"""The output of a run while it trains: image grids, progress lines, viewer, checkpoints."""
+"""The output of a run while it trains: image grids, progress lines, checkpoints."""
 
 from __future__ import annotations
 
-import copy
 import io
 import signal
 import time
@@ -12,19 +11,15 @@ from typing import TYPE_CHECKING, Any, cast
 import torch
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.plugins.io import TorchCheckpointIO
-from omegaconf import DictConfig
 from rich.console import Console
 from torch import Tensor
 
 from gsgan.evaluate.grids import grid_rows, write_grid
 from gsgan.scene import Frame
-from gsgan.utils.config import defaults_of
 from gsgan.utils.files import write_atomically
 
 if TYPE_CHECKING:
-    from gsgan.data.datamodule import GsganData
     from gsgan.train.module import AvatarTraining
-    from gsgan.view.server import Viewer
 
 
 def _training(module: LightningModule) -> AvatarTraining:
@@ -87,51 +82,6 @@ class ProgressLines(Callback):
             left = spent / done * (total - step)
             line += f"  {done / spent:5.1f} it/s, {left / 60:4.1f} min left"
         self.console.print(line, highlight=False, soft_wrap=True)
-
-
-class LiveViewer(Callback):
-    """Serves `gsgan.view` during training, with the weights of the last validation.
-
-    Convention: a thread of the viewer renders a frozen copy, only while a browser is connected.
-
-    Args:
-        folder: of the run.
-        config: of the run.
-        data: its dataset, whose held-out poses are the motion.
-        console: prints the address.
-    """
-
-    def __init__(self, folder: Path, config: DictConfig, data: GsganData, console: Console) -> None:
-        self.folder, self.config, self.data, self.console = folder, config, data, console
-        self.viewer: Viewer | None = None
-
-    def on_validation_end(self, trainer: Trainer, module: LightningModule) -> None:
-        if not trainer.is_global_zero:
-            return
-        with torch.inference_mode(False):  # the copy outlives the validation
-            avatar = copy.deepcopy(_training(module).shown).freeze()
-        if self.viewer is not None:
-            self.viewer.swap(avatar)
-            return
-        from gsgan.model.runs import Run
-        from gsgan.view.server import Viewer
-
-        run = Run(self.folder, self.config, {}, avatar, opened=self.data)
-        self.viewer = Viewer(defaults_of("view"), run)
-        self.console.print(f"viewer: {self.viewer.address}", highlight=False)
-
-    def teardown(self, trainer: Trainer, module: LightningModule, stage: str) -> None:
-        if stage == "fit":
-            self._stop()
-
-    def on_exception(
-        self, trainer: Trainer, module: LightningModule, exception: BaseException
-    ) -> None:
-        self._stop()  # Lightning calls no teardown; a sweep goes on in this process
-
-    def _stop(self) -> None:
-        if self.viewer is not None:
-            self.viewer.stop()
 
 
 class StopOnSignal(Callback):

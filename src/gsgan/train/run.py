@@ -38,13 +38,7 @@ from gsgan.model.harmonic import Harmonic, distilled
 from gsgan.model.runs import load
 from gsgan.model.stored import CHECKPOINT, read_checkpoint, record
 from gsgan.splat import resolve_backend
-from gsgan.train.callbacks import (
-    AtomicCheckpoints,
-    ImageGrid,
-    LiveViewer,
-    ProgressLines,
-    StopOnSignal,
-)
+from gsgan.train.callbacks import AtomicCheckpoints, ImageGrid, ProgressLines, StopOnSignal
 from gsgan.train.module import AvatarTraining
 from gsgan.utils.checks import whole
 from gsgan.utils.console import make_console
@@ -70,10 +64,6 @@ def run_training(config: DictConfig) -> None:
     stop = StopOnSignal()
     torch.set_flush_denormal(True)  # black background decays into denormals: slow on CPUs
     check_lpips(config.lpips.net, config.lpips.path)  # now, not after hours of training
-    if config.viewer:
-        from gsgan.view.server import import_viser
-
-        import_viser()
 
     data, module = build_training(config)
     seed_everything(config.seed, workers=True, verbose=False)
@@ -316,8 +306,6 @@ def build_trainer(
             save_on_train_epoch_end=True,
         ),
     ]
-    if config.viewer:
-        used.append(LiveViewer(folder, config, data, console))
     if console.is_terminal:
         used.append(RichProgressBar())
     return instantiate(

@@ -12,7 +12,6 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from gsgan.data.proportions import upright
-from gsgan.model.avatar import Avatar
 from gsgan.model.drive import Drive, drive_of
 from gsgan.model.runs import Run
 from gsgan.motion.orbit import Orbit
@@ -49,12 +48,11 @@ class Viewer:
 
     Args:
         config: the options of conf/view.yaml.
-        run: to show in place of ``config.run``.
     """
 
-    def __init__(self, config: DictConfig, run: Run | None = None) -> None:
+    def __init__(self, config: DictConfig) -> None:
         viser = import_viser()
-        self.run, fps = run or Run.load(config), float(above("fps", config.fps))
+        self.run, fps = Run.load(config), float(above("fps", config.fps))
 
         def read(motion: str) -> Drive:
             return drive_of(OmegaConf.merge(config, {"motion": motion}), self.run, fps)  # type: ignore[arg-type]
@@ -91,12 +89,6 @@ class Viewer:
         """What to open in a browser."""
         host = self.server.get_host()
         return f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}"
-
-    def swap(self, avatar: Avatar) -> None:
-        """Shows another avatar of the same run: one with newer weights."""
-        self.run.avatar = self.show.avatar = avatar
-        for session in list(self.sessions.values()):
-            session.touch(moving=False)
 
     def serve(self) -> None:
         """Waits until interrupted."""

@@ -39,7 +39,7 @@ class Show:
     """What all sessions share.
 
     Args:
-        avatar: frozen; `Viewer.swap` replaces it.
+        avatar: frozen.
         body: that the avatar moves with, or None.
         drive: the first motion.
         read: reads the motion in an uploaded file.
