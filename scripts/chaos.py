@@ -22,6 +22,7 @@ import importlib
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -207,6 +208,8 @@ def result(name: str, place: Path) -> dict[str, str]:
         if any(part.startswith((".", "logs_")) for part in inside.parts):
             continue
         content = weights(path) if path.suffix == ".ckpt" else path.read_bytes()
+        if path.suffix == ".md":
+            content = re.sub(rb"commit \w+", b"", content)  # of a tree that changed meanwhile
         found[str(inside)] = hashlib.sha256(content).hexdigest()
     assert found, f"{name} left nothing in {place}"
     return found
