@@ -283,7 +283,7 @@ class Chaos:
         """The undisturbed result of a stage; before that it runs in this process, which imports
         what all children need."""
         log, numbers = self.folder / "log", self.folder / "numbers.json"
-        place = self.place(name, self.folder / "trial")
+        place = self.place(name, self.folder / "disk" / "out")
         with log.open("w") as out, contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):
             try:
                 command(STAGES[name], place, again=False)
@@ -306,7 +306,7 @@ class Chaos:
     def kill(self, name: str, way: str, truth: Truth) -> None:
         """One kill, the same command again, and the comparison."""
         expected = truth.result
-        out = self.folder / "trial"
+        out = self.folder / "disk" / "out"
         place, log = self.place(name, out), self.folder / "log"
         at = self.random.randint(1, truth.operations)
         moment = self.random.uniform(0, truth.seconds)
