@@ -372,10 +372,9 @@ class Chaos:
 
     def disk(self, name: str, expected: dict[str, str], share: float) -> None:
         """The command on a file system with room for a share of its result, then with room."""
-        kept = self.base / (STAGES[name].inputs or "none")
-        held = [p for at in (self.folder / "whole" / name, kept) for p in at.rglob("*")]
-        pages = sum(-(-p.stat().st_size // 4096) for p in held if p.is_file())
-        with mounted(self.folder / "disk", 4096 * int(2 + share * pages)) as room:
+        kept = pages(self.base / (STAGES[name].inputs or "none"))
+        made = pages(self.folder / "whole" / name) - kept
+        with mounted(self.folder / "disk", 4096 * int(2 + kept + share * made)) as room:
             try:
                 place = self.place(name, room / "out")
             except OSError:
@@ -411,6 +410,11 @@ def processor_seconds(pid: int) -> float:
         started = (p.read_text().split() for p in Path(f"/proc/{pid}/task").glob("*/children"))
         return spent + sum(processor_seconds(int(one)) for some in started for one in some)
     return 0.0
+
+
+def pages(folder: Path) -> int:
+    """Of memory that a folder's files take in a tmpfs."""
+    return sum(-(-path.stat().st_size // 4096) for path in folder.rglob("*") if path.is_file())
 
 
 def run(*arguments: str) -> None:
@@ -478,7 +482,7 @@ def main() -> None:
                     chaos.kill(name, ways[i % len(ways)], truths[name])
             write(chaos, names, given.out)
         for share in (0.0, 0.2, 0.4, 0.6, 0.8, 0.95) if given.disk else ():
-            for name in names:
+            for name in given.only.split(","):
                 chaos.disk(name, truths[name].result, share)
     write(chaos, names, given.out)
     if chaos.problems:
