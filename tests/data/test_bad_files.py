@@ -198,7 +198,7 @@ CAPTURE: dict[str, Damage] = {
     "000001.png is not a valid PNG or JPEG": write("images/cam00/000001.png", b""),
     "000000.jpg is a CMYK JPEG": cmyk,
     "is a palette PNG": write("masks/cam00/000001.png", png(32, 24, 8, 3, bytes(32))),
-    "holds frame 1 twice, as 000001.png and 0001.png": write("images/cam00/0001.png", b""),
+    "frame 1 is there twice, as 000001.png and 0001.png": write("images/cam00/0001.png", b""),
 }
 
 

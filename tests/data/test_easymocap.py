@@ -212,4 +212,4 @@ def test_a_persons_own_mask_goes_before_nobodys(tmp_path, subject):
     assert layout.mask_path("1", 0).name == "000000_3.png"
     assert layout.mask_path("2", 2).name == "000002_3.png"
     write_picture(root / "mask/1/first.png", np.zeros((40, 40), np.uint8))
-    refused(root, "mask/1/first.png has no frame number", person=3)
+    refused(root, "mask/1: first.png has no frame number", person=3)

@@ -58,9 +58,9 @@ def project(view: Pinhole, points: Float) -> tuple[Float, Float]:
     Lens distortion is not applied. Points nearer than `NEAR` get finite, meaningless pixels: mask
     them by depth.
     """
-    x_cam = points @ view.R.T + view.t
+    x_cam = np.tensordot(points, view.R.T, 1) + view.t
     depth = x_cam[..., 2]
-    uvw = (x_cam / np.maximum(depth, NEAR)[..., None]) @ view.K.T
+    uvw = np.tensordot(x_cam / np.maximum(depth, NEAR)[..., None], view.K.T, 1)
     return uvw[..., :2], depth
 
 

@@ -10,6 +10,7 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from copy import copy
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Self
 
@@ -187,7 +188,8 @@ class FrameFiles(Mapping[int, str]):
 
     def __init__(self, folder: str, names: Mapping[int, str]) -> None:
         self.folder, self.frames = folder, np.array(sorted(names), np.int64)
-        self._names = np.array([os.fsencode(names[f]) for f in self.frames.tolist()])
+        held = [names[f] for f in self.frames.tolist()]
+        self._names = np.array(os.fsencode("/".join(held)).split(b"/")[: len(held)])
 
     def __getitem__(self, frame: int) -> str:
         place = int(self.frames.searchsorted(frame))
@@ -226,23 +228,37 @@ def frame_files(
     Raises:
         DataError: when a name has no number, two names have the same, or a link leads out.
     """
-    place, found = root / folder, dict[int, str]()
-    for name in sorted(own_entries(place, root)) if place.is_dir() else ():
+    place = root / folder
+    names = tuple(sorted(own_entries(place, root))) if place.is_dir() else ()
+    try:
+        found = copy(_by_frame(names, suffixes, number or last_number))
+    except DataError as error:
+        raise DataError(f"{place}: {error}") from None
+    found.folder = folder
+    return found
+
+
+@lru_cache(maxsize=1)  # cameras mostly have files of the same names
+def _by_frame(
+    names: tuple[str, ...], suffixes: tuple[str, ...], number: Callable[[str], int | None]
+) -> FrameFiles:
+    found = dict[int, str]()
+    for name in names:
         stem, _, suffix = name.rpartition(".")
         if f".{suffix.lower()}" not in suffixes or name.startswith("."):
             continue
-        frame = (number or last_number)(stem)
+        frame = number(stem)
         if frame is None:
             raise DataError(
-                f"{place / name} has no frame number up to {LARGEST_FRAME} in its name; number the "
+                f"{name} has no frame number up to {LARGEST_FRAME} in its name; number the "
                 f"frames 0, 1, 2 … equally in all cameras, e.g. 000012.{suffix}"
             )
         if frame in found:
             raise DataError(
-                f"{place} holds frame {frame} twice, as {found[frame]} and {name}; keep one of them"
+                f"frame {frame} is there twice, as {found[frame]} and {name}; keep one of them"
             )
         found[frame] = name
-    return FrameFiles(folder, found)
+    return FrameFiles("", found)
 
 
 def own_entries(folder: Path, root: Path) -> list[str]:

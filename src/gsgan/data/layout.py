@@ -186,4 +186,4 @@ def assemble(found: Found, limits: Thresholds) -> Layout:
     check_images(root, cameras, images, found.masks, labels, limits.header_stride, calibration)
     kept = {one.name: getattr(found, one.name) for one in fields(_Contents)}
     kept |= {"images": images, "labels": labels, "notes": tuple(notes)}
-    return Layout(**kept, frames=tuple(sorted({f for files in images.values() for f in files})))
+    return Layout(**kept, frames=tuple(sorted(set[int]().union(*images.values()))))

@@ -169,7 +169,8 @@ def _splits(
 
 
 def _items(layout: Layout, cameras: Sequence[str], frames: Sequence[int]) -> Items:
-    return Items({c: np.intersect1d(frames, layout.images[c].frames) for c in cameras})
+    some = np.array(frames, np.int64)
+    return Items({c: np.intersect1d(some, layout.images[c].frames, True) for c in cameras})
 
 
 def protocol_splits(layout: Layout, protocol: Protocol) -> Splits:

@@ -52,7 +52,7 @@ def drop_frames(
     Raises:
         DataError: when no frame is left.
     """
-    frames = sorted({frame for files in images.values() for frame in files})
+    frames = sorted(set[int]().union(*images.values()))
     dropped: dict[str, list[int]] = {}
     for frame in frames:
         if reason := _unusable(frame, landmarks, poses, limits):
@@ -123,7 +123,7 @@ def check_geometry(
 
 def _seen(images: Images, landmarks: Landmarks) -> tuple[list[int], NDArray[Any], NDArray[Any]]:
     """The frames of any camera ``[F]``, rising, their joints ``[F, J, 3]``, and which are seen."""
-    frames = np.unique(np.concatenate([files.frames for files in images.values()])).tolist()
+    frames = sorted(set[int]().union(*images.values()))
     visibility = np.stack([landmarks.visibility[f] for f in frames])
     return frames, np.stack([landmarks.p[f] for f in frames]), visibility > 0
 
