@@ -1,6 +1,7 @@
 """`gsgan.prepare` from one video of one uncalibrated camera."""
 
 import json
+import struct
 
 import cv2
 import numpy as np
@@ -10,7 +11,7 @@ from one_person import film, turning, world_landmarks
 from rich.console import Console
 
 from gsgan.data.formats.capture import read_capture
-from gsgan.prepare.frames import sample
+from gsgan.prepare.frames import look, sample
 from gsgan.prepare.one_view import Seen, solve_view
 from gsgan.prepare.options import Options
 from gsgan.prepare.run import prepare
@@ -121,3 +122,33 @@ def test_long_large_videos_are_sampled(tmp_path):
     assert recording.size == (13, 1920)
     np.testing.assert_allclose(np.diff(time), 1 / 12, atol=1e-3)
     assert list(recording.files) == list(range(0, 330, 5))
+
+
+def test_vertical_phone_videos_are_turned_as_their_metadata_say(tmp_path):
+    path = tmp_path / "me.mp4"
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 10, (64, 32))
+    stored = np.zeros((32, 64, 3), np.uint8)
+    stored[:, :32] = 255  # the left half
+    for _ in range(12):
+        video.write(stored)
+    video.release()
+    content = bytearray(path.read_bytes())
+    at = content.find(b"tkhd") + 44  # of the track's matrix: version and times are before it
+    content[at : at + 36] = struct.pack(">9i", 0, 1 << 16, 0, -(1 << 16), 0, 0, 0, 0, 1 << 30)
+    path.write_bytes(content)
+    recording, _ = sample(path, tmp_path / "frames")
+    image = cv2.imread(str(recording.files[0]), cv2.IMREAD_GRAYSCALE)
+    assert recording.size == image.shape == (64, 32)
+    assert image[:24].mean() > 200  # a quarter turn clockwise: left is up
+    assert image[40:].mean() < 50
+
+
+def test_a_moving_camera_is_measured(tmp_path):
+    wall = np.random.default_rng(0).integers(0, 255, (40, 60), np.uint8)
+    wall = cv2.resize(wall, None, fx=16, fy=16, interpolation=cv2.INTER_CUBIC)
+    paths = [tmp_path / f"{f}.png" for f in range(10)]
+    for f, path in enumerate(paths):
+        cv2.imwrite(str(path), wall[:480, 8 * f : 8 * f + 640])
+    px = np.full((10, 33, 2), 320.0) + np.random.default_rng(1).uniform(-60, 60, (10, 33, 2))
+    assert look(paths, px)[1] == pytest.approx(72 / 800, rel=0.1)
+    assert look([paths[0]] * 10, px)[1] < 0.002

@@ -74,7 +74,7 @@ def run_tool(
         for name, folder in folders.items()
     }
     if masks and (empty := [name for name, files in found.items() if not files]):
-        raise DataError(f"MediaPipe found nobody in {empty[0]}; remove it, or give masks=<folder>")
+        raise DataError(f"MediaPipe found nobody in {empty[0]}; show a person, or leave it out")
     return results, found
 
 

@@ -166,7 +166,7 @@ def solve_view(seen: Seen, noise: float, focal: bool = True) -> View:
     few, found = at[::2], []
     for zoom in ZOOMS if focal else (0.0,):
         state, _ = problem(few, NOISE, focal=False).minimise(problem(few, NOISE).start(zoom), 10)
-        _, cost = problem(few, NOISE / 3, focal=False).minimise(state, 8)
+        _, cost = problem(few, noise, focal=False).minimise(state, 8)
         found.append((cost, zoom))
     keys = problem(at, NOISE, focal=False)
     state, _ = keys.minimise(keys.start(min(found)[1]), 10)
