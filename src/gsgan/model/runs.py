@@ -102,7 +102,11 @@ def _trained(
     }
     labels = state.get("segmentation.vertex_labels")
     effects = Effects.from_plain(stored["effects"])
-    avatar = build_avatar(config, scene, effects=effects, vertex_labels=labels)
+    try:
+        avatar = build_avatar(config, scene, effects=effects, vertex_labels=labels)
+    except (TypeError, ValueError, OverflowError) as error:
+        reason = str(error).split("\n")[0]
+        raise DataError(f"{folder / CONFIG}: no avatar can be built from it: {reason}") from error
     if "segmentation.quats" in state and avatar.segmentation is None:
         raise DataError(
             f"{folder}: trained with S, which cannot be built now: {avatar.segmentation_why}; set "

@@ -151,8 +151,8 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         raise DataError(f"{path}: no such file; the run has no checkpoint yet") from error
     except Exception as error:
         raise DataError(f"{path}: not a readable checkpoint; remove it to start over") from error
-    if not isinstance(checkpoint, dict) or "gsgan" not in checkpoint:
-        raise DataError(f"{path}: not a checkpoint of gsgan (it has no 'gsgan' entry)")
+    if not (isinstance(checkpoint, dict) and {"gsgan", "state_dict"} <= checkpoint.keys()):
+        raise DataError(f"{path}: not a checkpoint of gsgan (no entries 'gsgan' and 'state_dict')")
     return checkpoint
 
 
