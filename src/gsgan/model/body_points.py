@@ -31,7 +31,7 @@ class LearntWeights(nn.Module):
     follow their neighbours.
 
     Args:
-        means: ``[N, 3]`` metres, at rest.
+        places: ``[N, 3]`` metres, on the body's template: a shape's rounding moves no control.
         bone_index, bone_weight: ``[N, n]`` of the body.
         joints: J, the number of bones.
         controls: of the field.
@@ -45,16 +45,16 @@ class LearntWeights(nn.Module):
     share: Tensor
 
     def __init__(
-        self, means: Tensor, bone_index: Tensor, bone_weight: Tensor, joints: int, controls: int
+        self, places: Tensor, bone_index: Tensor, bone_weight: Tensor, joints: int, controls: int
     ) -> None:
         super().__init__()
-        count = min(controls, len(means))
-        places = means[farthest_points(means, count)]
-        distance, near = torch.cdist(means, places).topk(min(NEAREST, count), largest=False)
+        count = min(controls, len(places))
+        at = places[farthest_points(places, count)]
+        distance, near = torch.cdist(places, at).topk(min(NEAREST, count), largest=False)
         share = functional.softmax(-2 * (distance / distance.mean()).square(), dim=1)
         own = bone_weight / bone_weight.sum(1, keepdim=True)
-        dense = means.new_zeros(len(means), joints).scatter_add_(1, bone_index, own)
-        interpolate = means.new_zeros(len(means), count).scatter_add_(1, near, share)
+        dense = places.new_zeros(len(places), joints).scatter_add_(1, bone_index, own)
+        interpolate = places.new_zeros(len(places), count).scatter_add_(1, near, share)
         total = interpolate.sum(0).clamp_min(1e-6).unsqueeze(1)
         around = interpolate @ (interpolate.mT @ dense / total)  # weights of the neighbourhood
         index = ((dense > LEAST) + around).topk(min(BONES, joints), dim=1).indices
@@ -62,7 +62,7 @@ class LearntWeights(nn.Module):
         start = dense.gather(1, index).clamp_min(LEAST).log().masked_fill(~possible, -30.0)
         for name, value in {"index": index, "start": start, "near": near, "share": share}.items():
             self.register_buffer(name, value, persistent=False)
-        self.field = nn.Parameter(means.new_zeros(count, joints))
+        self.field = nn.Parameter(places.new_zeros(count, joints))
 
     def forward(self) -> Tensor:
         """``[N, BONES]``: the weights of bones ``index``; rows sum to 1."""
@@ -111,7 +111,7 @@ class SkinnedPoints(nn.Module):
             "spacing": neighbour_distance(means).clamp_min(1e-4),
         }.items():
             self.register_buffer(name, value, persistent=False)
-        own = self.means, self.bone_index, self.bone_weight, len(body.joints)
+        own = template[chosen], self.bone_index, self.bone_weight, len(body.joints)
         self.learnt = LearntWeights(*own, controls) if controls else None
 
     def __len__(self) -> int:
