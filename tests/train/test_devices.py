@@ -147,8 +147,8 @@ def test_layers_and_export(start, place):
     with torch.no_grad():
         rendering = avatar(*frame.inputs)
         behind = torch.zeros(3, 1, 1)
-        for layer in layers(avatar, truth=True):  # camera and ground truth are the host's
-            image = shown(layer, rendering, truth.camera, avatar, behind, 0, truth)
+        for layer in layers(avatar):  # the camera is the host's
+            image = shown(layer, rendering, truth.camera, avatar, behind)
             assert image.shape == (*truth.camera.size, 3)
         splats = splats_of(avatar, frame.skeleton, frame.visibility > 0, frame.body)
         assert splats.means.shape == rendering.gaussians.means[0].shape

@@ -90,7 +90,7 @@ def test_the_image_arrives_and_follows_slider_camera_and_joint(open_page):
     assert session.image.min() < 250  # somebody is there
 
     def scrub():
-        box = page.get_by_role("slider").nth(1)
+        box = page.get_by_role("slider").first
         box.focus()
         box.press("ArrowRight")
 
@@ -135,8 +135,7 @@ def test_layers_and_3d(open_page):
 
         changed(session, page, choose)
         seen.append(session.image.tobytes())
-    assert len(seen) >= 5
-    assert len(set(seen)) >= len(seen) - 1  # an untrained avatar's features are all zero
+    assert len(set(seen)) == len(seen) >= 4
     page.get_by_label("skeleton").check()
     page.get_by_label("Gaussians").check()
     until(lambda: len(session._nodes) == 2, page)
