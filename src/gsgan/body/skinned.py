@@ -28,8 +28,8 @@ class SkinnedBody:
     Convention: metres; the axes depend on the body (the free body has Z up, SMPL's have Y up); the
     root rotates about its own joint. ``label_source`` is the source of a vertex's part: "own", the
     body's definition; "guess", its joint, where the true part depends on the clothes; "vote", the
-    data's label images. Vertices are picked on the template: it has no rounding of a shape's, which
-    another processor would do otherwise.
+    data's label images. Subsets of vertices are chosen on ``template``, so that they do not depend
+    on how a processor rounds a person's shape.
 
     Raises:
         ValueError: when a vertex has no skinning weight, or one that is negative or not finite.
@@ -45,7 +45,7 @@ class SkinnedBody:
     vertex_labels: Tensor  # [V] int64 part of each vertex, see label_names
     label_names: tuple[str, ...]  # of each part, background first
     label_source: Literal["own", "guess", "vote"] = "own"
-    template: Tensor | None = None  # [V, 3] the body before its shape, where it has one
+    template: Tensor | None = None  # [V, 3] metres, the body before it is shaped
 
     def __post_init__(self) -> None:
         check_weights(self.bone_weight)

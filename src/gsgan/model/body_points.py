@@ -26,15 +26,15 @@ LEAST = 1e-3  # a possible weight below it starts there, so that it can grow
 class LearntWeights(nn.Module):
     """The skinning weights of points: a softmax of the body's logarithms and a learnt field.
 
-    A person's hips and shoulders do not bend where the body's do. The field has a number per bone
-    at controls spread over the body, and is interpolated between them: points that few images show
-    follow their neighbours.
+    A person's hips and shoulders do not bend where the body's do. The field has one number per bone
+    at each control, is interpolated between controls, and starts at zero: points that few images
+    show follow their neighbours.
 
     Args:
-        places: ``[N, 3]`` metres, on the body's template: a shape's rounding moves no control.
+        places: ``[N, 3]`` metres, the points on the body's template; controls are chosen from them.
         bone_index, bone_weight: ``[N, n]`` of the body.
         joints: J, the number of bones.
-        controls: of the field.
+        controls: number of controls, spread over the body.
 
     Source: ours.
     """
@@ -239,7 +239,7 @@ class BodyPoints(nn.Module):
         assert pose.bones is not None
         A, t = self.points.blend(pose)
         means = transformed(A, t, self.points.means)
-        if not pose.bones.requires_grad:  # weights learn by where the means are, not by shapes
+        if not pose.bones.requires_grad:  # only the means give the weights a gradient
             A, t = A.detach(), t.detach()
         scales = (self.sigma * self.points.spacing).expand(len(A), -1)
         return Points(
