@@ -114,7 +114,11 @@ STAGES = {
         "render",
         ["run={base}/run", "motion=novel_pose", "pixels=16", "frames=8", "out={out}/video.mp4"],
     ),
-    "images": Stage("render", ["run={base}/run", "motion=rest", "frames=8", "out={out}/images"]),
+    "images": Stage(
+        "render",
+        ["run={base}/run", "motion=rest", "frames=8", "out={out}/images"],
+        again=("overwrite=true",),
+    ),
     "export": Stage(
         "export", ["run={base}/run", "frames=4", "out={out}/splats"], again=("overwrite=true",)
     ),

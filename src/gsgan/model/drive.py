@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
@@ -37,7 +36,7 @@ from gsgan.motion.clip import (
 )
 from gsgan.motion.readers import Source, read_motion
 from gsgan.motion.retarget import expressed, face_in_head, joined, placed, retargeted
-from gsgan.scene import BodyPose, Camera, Frame, cat
+from gsgan.scene import BodyPose, Camera, cat
 from gsgan.skeleton import complete_skeleton, sanitise
 from gsgan.skeleton.sides import refuse_swapped
 from gsgan.utils.checks import above, one_of
@@ -59,7 +58,6 @@ class Drive:
         body: F poses of the skinned body, or None.
         numbers: of the frames, for their file names.
         text: a description in one line.
-        truth: returns the dataset's frame by index, or None.
         camera: F cameras and their indices, if the frames have their own.
     """
 
@@ -68,13 +66,12 @@ class Drive:
     body: BodyPose | None
     numbers: list[int]
     text: str
-    truth: Callable[[int], Frame] | None = None
     camera: tuple[Camera, Tensor] | None = None
 
     def rows(self, chosen: NDArray[np.int64]) -> Drive:
         """The frames at some indices, numbered from 0 if an index repeats."""
         own = len(set(chosen.tolist())) == len(chosen)
-        at, truth, camera = torch.from_numpy(chosen), self.truth, self.camera
+        at, camera = torch.from_numpy(chosen), self.camera
         index = chosen.tolist()
         return replace(
             self,
@@ -82,7 +79,6 @@ class Drive:
             visibility=self.visibility[chosen],
             body=None if self.body is None else BodyPose(self.body.theta[at], self.body.transl[at]),
             numbers=[self.numbers[i] for i in index] if own else list(range(len(index))),
-            truth=None if truth is None else lambda place: truth(index[place]),
             camera=None if camera is None else (_rows(camera[0], at), camera[1][at]),
         )
 
@@ -116,7 +112,7 @@ def _chosen(config: DictConfig, run: Run, fps: float) -> Drive:
         found = _held_out(config, run, split)
         frame = found.numbers[0]
         still = found.rows(np.zeros(1, np.int64))
-        return replace(still, text=f"frame {frame} of {split}, held still", truth=None, camera=None)
+        return replace(still, text=f"frame {frame} of {split}, held still", camera=None)
     if OmegaConf.is_list(config.motion):
         if config.retarget is False:
             raise ConfigError("retarget=false is not supported for a list of motions")
@@ -144,7 +140,6 @@ def _held_out(config: DictConfig, run: Run, split: str) -> Drive:
     if poses is not None and run.avatar.needs_body:
         stacked = (np.stack([part[f] for f in frames]) for part in (poses.theta, poses.transl))
         body = BodyPose(*(torch.from_numpy(x).float() for x in stacked))
-    place = {item: i for i, item in enumerate(dataset.items)}
     index = torch.tensor([layout.camera_names.index(items[0][0])] * len(items))
     seen = (cat([dataset.camera(item) for item in items]), index) if own else None
     return Drive(
@@ -153,7 +148,6 @@ def _held_out(config: DictConfig, run: Run, split: str) -> Drive:
         body=body,
         numbers=frames,
         text=f"{split}: {len(frames)} frames" + f" of camera {camera}" * own,
-        truth=(lambda i: dataset[place[items[i]]]) if own else None,
         camera=seen,
     )
 

@@ -1,6 +1,6 @@
 """Cameras to render with: an orbit, a camera of the capture, or those of a calibration file."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -10,13 +10,9 @@ from gsgan.data.calibration import read_calibration
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import PersonCrop, square_window
 from gsgan.scene import Camera, cat
-from gsgan.skeleton import MEDIAPIPE33
 from gsgan.utils.errors import ConfigError, DataError
 
 Float = NDArray[np.float64]
-
-FLESH = 0.1  # metres: a camera nearer to a bone than this is inside the person
-SEGMENTS = np.array([*MEDIAPIPE33.edges, (11, 24), (12, 23)])  # bones and the trunk's diagonals
 
 
 def of_entry(
@@ -67,29 +63,3 @@ def of_capture(entries: Mapping[str, CameraEntry], name: str) -> CameraEntry:
             f"of {', '.join(entries)}"
         )
     return entries[name]
-
-
-def refuse_inside(cameras: Camera, p: Float, names: Sequence[int]) -> None:
-    """Refuses cameras inside the person.
-
-    Args:
-        cameras: one, or one per skeleton.
-        p: ``[F, 33, 3]`` metres, world frame; NaN where unknown.
-        names: frame numbers, for the message.
-
-    Raises:
-        ConfigError: naming the first frame and the nearest bone.
-    """
-    centres = cameras.centre.double().numpy()
-    start, end = p[:, SEGMENTS[:, 0]], p[:, SEGMENTS[:, 1]]
-    along, to = end - start, centres[:, None] - start
-    share = (to * along).sum(-1) / np.maximum((along**2).sum(-1), 1e-12)
-    away = np.linalg.norm(to - share.clip(0, 1)[..., None] * along, axis=-1)
-    away = np.where(np.isfinite(away), away, np.inf)
-    if len(bad := np.flatnonzero(away.min(axis=1) < FLESH)):
-        first = int(bad[0])
-        joint = MEDIAPIPE33.names[SEGMENTS[int(away[first].argmin()), 1]].replace("_", " ")
-        raise ConfigError(
-            f"the camera is inside the person in {len(bad)} of {len(p)} frames, first in frame "
-            f"{names[first]}, {100 * away[first].min():.0f} cm from the {joint}; move it away"
-        )

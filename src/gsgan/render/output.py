@@ -1,13 +1,11 @@
-"""Frames and videos on disk: files are written atomically, interrupted renders can be resumed.
+"""Frames and videos on disk: every file is written completely or not at all.
 
-A folder holds ``000000.png`` and so on, and render.json, which records what they depend on. The
-frames of a video are kept in a hidden folder beside it until it is written.
+A folder holds ``000000.png`` and so on, and render.json, which says what was rendered.
 """
 
 import io
 import json
-import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -17,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from gsgan.data.files import read_colour
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import write_atomically
 from gsgan.utils.provenance import Signer, marked_mp4, png_bytes, signed
@@ -51,21 +48,12 @@ class Output:
         """Whether the output is a video."""
         return self.out.suffix.lower() == VIDEO
 
-    @property
-    def folder(self) -> Path:
-        """The folder of the frames."""
-        return self.out.with_name(f".{self.out.name}.frames") if self.video else self.out
-
-    def path(self, number: int) -> Path:
-        """The file of a frame."""
-        return self.folder / f"{number:06d}.png"
-
     def begin(self, record: dict[str, Any], overwrite: bool) -> None:
-        """Prepares the folder; existing frames of the same render are kept.
+        """Checks the place of a video, or prepares the folder of frames.
 
         Args:
-            record: what the images depend on, for render.json.
-            overwrite: replace another render.
+            record: of what is rendered, for render.json.
+            overwrite: replace a video, or the frames of a folder.
 
         Raises:
             ConfigError: when the output exists, or PyAV is missing.
@@ -74,51 +62,38 @@ class Output:
             _av()
             if self.out.exists() and not overwrite:
                 raise ConfigError(f"out={self.out} exists; give overwrite=true or another name")
-        stored, record = self.folder / RECORD, json.loads(json.dumps(record))
-        if (
-            self.folder.exists()
-            and not stored.is_file()
-            and (not self.folder.is_dir() or any(self.folder.iterdir()))
-        ):
-            raise ConfigError(
-                f"out={self.out} is not empty and holds no render; give another folder"
-            )
-        try:
-            same = stored.is_file() and json.loads(stored.read_text()) == record
-        except ValueError:
-            same = False
-        if stored.is_file() and not same:
-            if not overwrite and not self.video:
+            self.out.parent.mkdir(parents=True, exist_ok=True)  # else found when all is painted
+            return
+        if self.out.exists() and (not self.out.is_dir() or any(self.out.glob("[!.]*"))):
+            if not (self.out / RECORD).is_file():
                 raise ConfigError(
-                    f"out={self.out} holds frames of another render; give overwrite=true or "
-                    "another folder"
+                    f"out={self.out} is not empty and holds no render; give another folder"
                 )
-            for path in self.folder.glob("[0-9]*.png"):
+            if not overwrite:
+                raise ConfigError(
+                    f"out={self.out} holds a render; give overwrite=true or another folder"
+                )
+            for path in self.out.glob("[0-9]*.png"):
                 path.unlink()
-        if not same:
-            write_atomically(stored, json.dumps(record, indent=2))
+        write_atomically(self.out / RECORD, json.dumps(record, indent=2))
 
-    def write(self, number: int, image: Bytes) -> None:
-        """Writes a frame ``[H, W, 3 or 4]``."""
-        data = png_bytes(Image.fromarray(image), self.marked)
-        if self.signer is not None and not self.video:
-            data = signed(data, ".png", self.signer)
-        write_atomically(self.path(number), data)
-
-    def finish(self, numbers: Sequence[int]) -> None:
-        """Encodes the frames as a video and removes them; does nothing for a folder.
+    def write(self, numbers: Sequence[int], images: Iterable[Bytes]) -> None:
+        """Writes frames ``[H, W, 3 or 4]``: PNG files named by number, or a video.
 
         Raises:
-            DataError: when a frame cannot be read, or this build of PyAV has no H.264.
+            DataError: when this build of PyAV has no H.264.
         """
-        if not self.video:
+        if self.video:
+            data = encoded(images, self.fps)
+            data = marked_mp4(data) if self.marked else data
+            write_atomically(self.out, self._signed(data, VIDEO))
             return
-        data = encoded((read_colour(self.path(n)) for n in numbers), self.fps)
-        data = marked_mp4(data) if self.marked else data
-        if self.signer is not None:
-            data = signed(data, VIDEO, self.signer)
-        write_atomically(self.out, data)
-        shutil.rmtree(self.folder)
+        for number, image in zip(numbers, images, strict=True):
+            data = png_bytes(Image.fromarray(image), self.marked)
+            write_atomically(self.out / f"{number:06d}.png", self._signed(data, ".png"))
+
+    def _signed(self, data: bytes, suffix: str) -> bytes:
+        return data if self.signer is None else signed(data, suffix, self.signer)
 
 
 def _av() -> Any:
@@ -131,7 +106,7 @@ def _av() -> Any:
     return av
 
 
-def encoded(images: Iterator[Bytes], fps: float) -> bytes:
+def encoded(images: Iterable[Bytes], fps: float) -> bytes:
     """An MP4 file of images ``[H, W, 3]``, H.264; odd sides repeat their last row or column."""
     av, stream, out = _av(), None, io.BytesIO()
     with av.open(out, "w", format="mp4") as container:

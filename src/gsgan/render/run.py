@@ -1,9 +1,7 @@
 """Renders a motion, or held-out frames, with the avatar of a run."""
 
-import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -17,12 +15,11 @@ from gsgan.data.training_poses import TrainingPoses
 from gsgan.model.avatar import Avatar
 from gsgan.model.drive import Drive, drive_of, inputs_of, joints_of
 from gsgan.model.runs import Run
-from gsgan.model.stored import CHECKPOINT
 from gsgan.motion.orbit import Orbit
-from gsgan.render.cameras import from_file, of_capture, of_entry, refuse_inside
+from gsgan.render.cameras import from_file, of_capture, of_entry
 from gsgan.render.output import Output
 from gsgan.scene import Camera
-from gsgan.utils.checks import above, one_of, whole
+from gsgan.utils.checks import above, whole
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import writing
@@ -47,34 +44,17 @@ def render_config(config: DictConfig) -> None:
     drive = _chosen(drive_of(config, run, fps), config, fps)
     console.print(drive.text, markup=False, highlight=False, soft_wrap=True)
     cameras, index = _cameras(config, run, drive)
-    refuse_inside(cameras, drive.p, drive.numbers)
-    if config.compare is not None:
-        one_of("compare", config.compare, ("truth",))
-        if drive.truth is None:
-            raise ConfigError(
-                "compare=truth needs held-out frames seen by their own camera: give "
-                "motion=novel_pose or novel_view, and one of its cameras or none"
-            )
-        assert drive.camera is not None
-        if cameras.size != drive.camera[0].size:
-            raise ConfigError("compare=truth shows images of the data's size; leave pixels out")
+    record = {"run": str(run.folder.resolve()), "drive": drive.text, "frames": drive.numbers}
+    painted = track(
+        _images(run, drive, cameras, index, paint_on),
+        "rendering",
+        total=len(drive.p),
+        console=console,
+        transient=True,
+    )
     with writing(output.out):
-        output.begin(_record(config, run, drive, cameras), bool(config.overwrite))
-    missing = [i for i, n in enumerate(drive.numbers) if not output.path(n).is_file()]
-    if kept := len(drive.numbers) - len(missing):
-        console.print(f"{kept} of {len(drive.numbers)} frames are already rendered")
-    for i in track(missing, "rendering", console=console, transient=True):
-        try:
-            image = _image(config, run, drive, cameras, index, i, paint_on)
-        except ValueError as error:
-            raise DataError(
-                f"frame {drive.numbers[i]} cannot be rendered ({error}); the frames before it are "
-                f"in {output.folder}"
-            ) from error
-        with writing(output.out):
-            output.write(drive.numbers[i], image)
-    with writing(output.out):
-        output.finish(drive.numbers)
+        output.begin(record, bool(config.overwrite))
+        output.write(drive.numbers, painted)
     if run.avatar.poses is not None:
         _print_distances(run.avatar.poses, run.avatar, drive, console)
     console.print(f"rendered: {output.out}", markup=False, highlight=False, soft_wrap=True)
@@ -114,7 +94,7 @@ def _chosen(drive: Drive, config: DictConfig, fps: float) -> Drive:
     start, total = whole("start", config.start, 0), len(drive.p)
     if start >= total:
         raise ConfigError(f"start={start}: the motion has {total} frames at {fps:g} per second")
-    still = total == 1 and drive.truth is None
+    still = total == 1 and drive.camera is None
     count = round(STILL_SECONDS * fps) if still else total - start
     if config.frames is not None:
         count = whole("frames", config.frames, 1)
@@ -150,52 +130,27 @@ def _cameras(config: DictConfig, run: Run, drive: Drive) -> tuple[Camera, Tensor
 # -- images
 
 
-def _image(
-    config: DictConfig,
+def _images(
     run: Run,
     drive: Drive,
     cameras: Camera,
     index: Tensor | None,
-    i: int,
     paint_on: Callable[[tuple[int, int]], Background],
-) -> NDArray[np.uint8]:
-    """``[H, W, 3 or 4]`` one frame, with the ground truth at its left if requested."""
-    at = slice(i, i + 1) if len(cameras) > 1 else slice(0, 1)
-    camera = cameras[at]
-    with torch.no_grad():
-        p, visibility, body = inputs_of(run.avatar, drive, i)
-        colours = None if index is None else index[at]
-        found = run.avatar.rendered(p, visibility, camera, body, colours, maps=False)
-    assert found.image is not None
-    assert found.alpha is not None
-    tiles = [(found.image[0].cpu(), found.alpha[0].cpu())]
-    if config.compare is not None:
-        assert drive.truth is not None
-        frame = drive.truth(i)
-        tiles.insert(0, (frame.image[0], frame.mask[0]))
-    return np.concatenate([eight_bits(*pair, paint_on(camera.size)) for pair in tiles], axis=1)
+) -> Iterator[NDArray[np.uint8]]:
+    """``[H, W, 3 or 4]`` each frame.
 
-
-def _record(config: DictConfig, run: Run, drive: Drive, cameras: Camera) -> dict[str, Any]:
-    """What the images depend on: a render is resumed only if this is unchanged."""
-    hashed = hashlib.sha256((run.folder / CHECKPOINT).read_bytes())
-    parts = [drive.p, drive.visibility, cameras.K.numpy(), cameras.R.numpy(), cameras.t.numpy()]
-    if drive.body is not None:
-        parts += [drive.body.theta.numpy(), drive.body.transl.numpy()]
-    if cameras.dist is not None:
-        parts.append(cameras.dist.numpy())
-    if (image := Path(str(config.background)).expanduser()).is_file():
-        hashed.update(image.read_bytes())
-    for part in parts:
-        hashed.update(np.ascontiguousarray(part).tobytes())
-    return {
-        "run": str(run.folder.resolve()),
-        "drive": drive.text,
-        "frames": drive.numbers,
-        "size": list(cameras.size),
-        "background": str(config.background),
-        "compare": config.compare,
-        "provenance": bool(config.provenance),
-        "signed": config.c2pa.certificate,
-        "inputs": hashed.hexdigest()[:16],
-    }
+    Raises:
+        DataError: when a frame cannot be rendered.
+    """
+    for i, number in enumerate(drive.numbers):
+        at = slice(i, i + 1) if len(cameras) > 1 else slice(0, 1)
+        camera, colours = cameras[at], None if index is None else index[at]
+        try:
+            with torch.no_grad():
+                p, visibility, body = inputs_of(run.avatar, drive, i)
+                found = run.avatar.rendered(p, visibility, camera, body, colours, maps=False)
+            assert found.image is not None
+            assert found.alpha is not None
+            yield eight_bits(found.image[0].cpu(), found.alpha[0].cpu(), paint_on(camera.size))
+        except ValueError as error:
+            raise DataError(f"frame {number} cannot be rendered ({error})") from error
