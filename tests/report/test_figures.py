@@ -56,7 +56,7 @@ def test_every_figure_is_made_with_numbers_of_the_images_shown(run, twin, tmp_pa
     found = record["comparison"]["numbers"]
     assert found == expected(run, found)
     twins = list(found["cam00/000004"])
-    assert twins == ["gsgan, one", "gsgan, twin"]
+    assert twins == ["gsgan (1)", "gsgan (2)"]
 
 
 def expected(run: Path, found: dict) -> dict:
@@ -77,16 +77,6 @@ def expected(run: Path, found: dict) -> dict:
         }
         numbers[name] = dict.fromkeys(panels, score)
     return numbers
-
-
-def test_names_in_print(run, twin, tmp_path, inside):
-    given = (f"run={run}", f"compare={twin}", f"out={tmp_path / 'out'}", *FEW)
-    result = inside("report", *given, "figures=strip", "names=[ours,'cost $5 {x_1}']")
-    assert result.returncode == 0, result.stdout + result.stderr
-    record = json.loads((tmp_path / "out" / "figures.json").read_text())
-    assert list(record["runs"]) == ["ours", "cost $5 {x_1}"]
-    refused(inside("report", *given, "names=[ours]"), "names must be 2 different texts")
-    refused(inside("report", *given, "names=[ours,ours]"), "names must be 2 different texts")
 
 
 @pytest.mark.parametrize(

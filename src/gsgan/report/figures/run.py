@@ -64,7 +64,7 @@ def make_figures(config: DictConfig) -> None:
     except OSError as error:
         raise ConfigError(f"out={out}: cannot be written to ({error.strerror})") from error
     logging.getLogger("fontTools").setLevel(logging.WARNING)  # it logs every glyph of a PDF
-    subjects = open_subjects(folders, config.names, moved, pick_device(config.device))
+    subjects = open_subjects(folders, moved, pick_device(config.device))
     console, made = make_console(), dict[str, Drawing]()
     with matplotlib.rc_context(STYLE):
         for name in track(list(dict.fromkeys(names)), "drawing", console=console, transient=True):

@@ -140,36 +140,24 @@ class Subject:
 
 
 def open_subjects(
-    folders: Sequence[Path],
-    names: Sequence[str] | None,
-    moved: DataPaths,
-    device: torch.device | str,
+    folders: Sequence[Path], moved: DataPaths, device: torch.device | str
 ) -> list[Subject]:
-    """The avatars of run folders; without ``names`` they have their models', with the folder where
-    models are equal.
+    """The avatars of run folders, named as their models, with a number where models are equal.
 
     Raises:
-        ConfigError: on wrong names, a folder given twice, or runs of different data.
+        ConfigError: on a folder given twice, or runs of different data.
         DataError: when a run cannot be read.
     """
-    if names is not None and not len(set(map(str, names))) == len(names) == len(folders):
-        raise ConfigError(
-            f"names must be {len(folders)} different texts, the run's first; got {names}"
-        )
     if len({folder.resolve() for folder in folders}) < len(folders):
         raise ConfigError("a run is given twice; every run in run and compare must differ")
     subjects = [_open(folder, moved, device) for folder in folders]
     runs = [subject.run for subject in subjects]
     check_same("figures", runs, [{DATA: run.data["fingerprint"]} for run in runs])
-    if names is None:
-        models = [subject.name for subject in subjects]
-        names = [
-            model if models.count(model) < 2 else f"{model}, {folder.resolve().name}"
-            for model, folder in zip(models, folders, strict=True)
-        ]
-        if len(set(names)) < len(names):
-            raise ConfigError(f"the runs' names in print are equal ({names[0]}); give names=[…]")
-    return [replace(s, name=str(name)) for s, name in zip(subjects, names, strict=True)]
+    models = [subject.name for subject in subjects]
+    return [
+        s if models.count(s.name) < 2 else replace(s, name=f"{s.name} ({i})")
+        for i, s in enumerate(subjects, 1)
+    ]
 
 
 def _open(folder: Path, moved: DataPaths, device: torch.device | str) -> Subject:
