@@ -116,7 +116,7 @@ UNLISTED = (
         "training.schedule.coarse",
     ),
     *("model.segmentation.hands_face", "training.perceptual.width", "training.recipes.psi.span"),
-    *("model.backend", "model.window_multiple", "model.window_least", "model.class_vote"),
+    *("model.backend", "model.window_multiple", "model.window_least"),
     *("training.seed", "training.log_every", "training.max_skipped", "training.skip_window"),
     *("training.rollback", "training.average_every", "training.perceptual.path"),
     *("training.schedule.epoch", "effects.impossible"),

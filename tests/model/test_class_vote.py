@@ -13,7 +13,7 @@ from gsgan.body import SkinnedBody, free_body, open_body
 from gsgan.body.shape import BodyShape
 from gsgan.body.smpl_names import CIHP
 from gsgan.model.body_points import neighbour_distance
-from gsgan.model.class_vote import ClassVote, seen
+from gsgan.model.class_vote import class_vote, seen
 from gsgan.scene import BodyPose, Camera, Frame
 from gsgan.utils.errors import DataError
 
@@ -101,16 +101,16 @@ def test_majority_ties_and_the_unseen():
     left = torch.ones(SIZE, SIZE)
     left[:, SIZE // 2 :] = 2
     other = torch.full((SIZE, SIZE), 3)
-    vote = ClassVote()(body, [picture(left), picture(left), picture(other)], 4)
+    vote = class_vote(body, [picture(left), picture(left), picture(other)], 4)
     x = body.vertices[:, 0]
     assert (vote.labels[x < -0.01] == 1).all()  # the hidden plate follows the one before it
     assert (vote.labels[x > 0.01] == 2).all()
     assert vote.images == 3
     assert vote.decided == pytest.approx(17 * 17 / len(body.vertices))
-    tied = ClassVote()(body, [picture(left), picture(other)], 4)
+    tied = class_vote(body, [picture(left), picture(other)], 4)
     assert tied.labels.unique().tolist() == [1, 2]  # the first of equals, where none has won
     right_only = torch.where(left == 2, 2, 255)
-    few = ClassVote()(body, [picture(left), picture(other), picture(right_only)], 4)
+    few = class_vote(body, [picture(left), picture(other), picture(right_only)], 4)
     assert (few.labels == 2).all()  # the left is tied throughout: its nearest neighbours decide
 
 
@@ -119,12 +119,12 @@ def test_background_ignored_and_unknown_pixels_have_no_vote():
     labels = torch.zeros(SIZE, SIZE)
     labels[:, ::3], labels[:, 1::3] = 255, 9
     with pytest.raises(DataError, match=r"in none of 1 images .* or choose model=wo_seg"):
-        ClassVote()(body, [picture(labels)], 4)
+        class_vote(body, [picture(labels)], 4)
     labels[SIZE // 2] = 3
-    assert (ClassVote()(body, [picture(labels)] * 2, 4).labels == 3).all()
+    assert (class_vote(body, [picture(labels)] * 2, 4).labels == 3).all()
 
 
-def test_the_number_of_pictures_is_bounded_and_they_are_spread():
+def test_the_number_of_pictures_is_bounded_and_they_are_spread(monkeypatch):
     looked = []
 
     class Watched(list):
@@ -133,7 +133,8 @@ def test_the_number_of_pictures_is_bounded_and_they_are_spread():
             return super().__getitem__(index)
 
     pictures = Watched([picture(torch.ones(SIZE, SIZE))] * 10)
-    assert ClassVote(vote_frames=3)(rigid(plate(2.0)), pictures, 2).images == 3
+    monkeypatch.setattr("gsgan.model.class_vote.VOTE_FRAMES", 3)
+    assert class_vote(rigid(plate(2.0)), pictures, 2).images == 3
     assert looked == [1, 5, 8]
 
 
@@ -176,22 +177,22 @@ def test_the_vote_finds_clothes_that_joints_do_not_tell(zju, tmp_path):
     """0.971 of all vertices when written (the joints' guess: 0.195), hidden ones included."""
     folder, smpl, truth = zju
     frames, body = frames_of(folder, smpl)
-    votes = ClassVote()(body, frames, len(CIHP))
+    votes = class_vote(body, frames, len(CIHP))
     assert (votes.labels == truth).double().mean() > 0.94
     assert (body.vertex_labels == truth).double().mean() < 0.4
-    assert torch.equal(ClassVote()(body, frames, len(CIHP)).labels, votes.labels)
+    assert torch.equal(class_vote(body, frames, len(CIHP)).labels, votes.labels)
 
     damaged = shutil.copytree(folder, tmp_path / "damaged")
     maps = sorted((damaged / "mask_cihp").rglob("*.png"))
     for path in maps[::2]:  # all background, as where the parser found nobody
         cv2.imwrite(str(path), np.zeros((80, 80), np.uint8))
     frames, _ = frames_of(damaged, smpl)
-    votes = ClassVote()(body, frames, len(CIHP))
+    votes = class_vote(body, frames, len(CIHP))
     assert (votes.labels == truth).double().mean() > 0.92  # 0.957 when written
 
     maps[1].write_bytes(maps[1].read_bytes()[:60])
     with pytest.raises(DataError, match=str(maps[1].relative_to(damaged))):
-        ClassVote()(body, frames, len(CIHP))
+        class_vote(body, frames, len(CIHP))
 
 
 # --- in an avatar --------------------------------------------------------------------------------
@@ -207,7 +208,10 @@ def foreign(capture, tmp_path):
     return folder
 
 
-FEW = "model.class_vote.vote_frames=2"
+@pytest.fixture
+def few(monkeypatch):
+    """Votes are held over two images."""
+    monkeypatch.setattr("gsgan.model.class_vote.VOTE_FRAMES", 2)
 
 
 def no_vote(*_):
@@ -215,28 +219,30 @@ def no_vote(*_):
 
 
 def test_labels_that_are_the_bodys_own_are_not_voted_on(build, monkeypatch):
-    monkeypatch.setattr(ClassVote, "__call__", no_vote)
+    monkeypatch.setattr("gsgan.model.class_vote.class_vote", no_vote)
     _, avatar, _ = build()
     assert avatar.segmentation is not None
     assert "no class vote" in avatar.segmentation_why
     assert "segmentation.vertex_labels" not in avatar.state_dict()
 
 
-def test_a_fitted_body_gets_the_persons_clothes(capture, tmp_path, build):
+def test_a_fitted_body_gets_the_persons_clothes(capture, tmp_path, build, few):
     """Its own labels have those of the person it was modelled on."""
     folder = shutil.copytree(capture, tmp_path / "fitted")
     shape = BodyShape(torch.zeros(10), torch.ones(8), torch.zeros(33, 3))
     np.savez(folder / "body_shape.npz", **shape.arrays())
-    _, avatar, _ = build(f"data.root={folder}", FEW)
+    _, avatar, _ = build(f"data.root={folder}")
     assert "class vote over 2 images" in avatar.segmentation_why
 
 
-def test_votes_are_kept_in_the_checkpoint_and_not_held_again(foreign, tiny, tmp_path, monkeypatch):
+def test_votes_are_kept_in_the_checkpoint_and_not_held_again(
+    foreign, tiny, tmp_path, monkeypatch, few
+):
     from gsgan.model.runs import load_avatar
     from gsgan.model.stored import CHECKPOINT
     from gsgan.train.run import build_training
 
-    config = tiny(f"data.root={foreign}", FEW)
+    config = tiny(f"data.root={foreign}")
     data, module = build_training(config)
     avatar = module.avatar
     assert "class vote over 2 images" in avatar.segmentation_why
@@ -248,7 +254,7 @@ def test_votes_are_kept_in_the_checkpoint_and_not_held_again(foreign, tiny, tmp_
     module.on_save_checkpoint(checkpoint)
     torch.save(checkpoint, path)
 
-    monkeypatch.setattr(ClassVote, "__call__", no_vote)
+    monkeypatch.setattr("gsgan.model.class_vote.class_vote", no_vote)
     loaded, _ = load_avatar(tmp_path / "run", config, data)
     frame = data.dataset("train")[0]
     with torch.no_grad():

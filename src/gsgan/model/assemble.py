@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -20,7 +20,7 @@ from gsgan.data.scene_info import SceneInfo
 from gsgan.effects import Effects, EffectSettings, ModelParts, decide
 from gsgan.model.avatar import Avatar
 from gsgan.model.body_points import BodyPoints
-from gsgan.model.class_vote import ClassVote, labelled_body
+from gsgan.model.class_vote import labelled_body
 from gsgan.model.colour import ColourCorrection
 from gsgan.model.deformation import ResidualGaussians
 from gsgan.model.generator import Generator
@@ -80,7 +80,7 @@ def build_avatar(
         effects = effects or decide(scene, _effect_settings(config), parts.in_effects)
         labelled: tuple[SkinnedBody | None, str] = None, "the model leaves it out"
         if parts.segmentation is not None:
-            labelled = labelled_body(scene, parts.class_vote, images, vertex_labels)
+            labelled = labelled_body(scene, images, vertex_labels)
         return _assembled(parts, scene, effects, labelled, config.seed)
 
 
@@ -99,7 +99,6 @@ class AvatarParts:
             either nothing is splatted and the UNet paints the drawn skeleton alone
             (``image_to_image``).
         segmentation: S; None leaves it out (``wo_seg``).
-        class_vote: gives S's vertices their parts where the data's labels are not the body's own.
         pose_encoder, generator: Ω (or the flat skeleton) to g; the UNet. Without them Step I's
             colour is the image (``splat_only``).
         low_pass, supersample, backend: of F, and of S where it has them.
@@ -117,7 +116,6 @@ class AvatarParts:
     generator: Callable[..., Generator] | None
     surface: Callable[..., SurfaceGaussians] | None = None
     body_points: Callable[..., BodyPoints] | None = None
-    class_vote: ClassVote = field(default_factory=ClassVote)
     low_pass: float = 0.3
     supersample: int = 1
     backend: str = "auto"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -15,20 +14,20 @@ from gsgan.model.body_points import ROWS, neighbour_distance
 from gsgan.model.segmentation import IGNORE
 from gsgan.scene import Camera, Frame
 from gsgan.utils.arrays import evenly_spaced
-from gsgan.utils.checks import above, whole
 from gsgan.utils.errors import DataError
 
-NEIGHBOUR = 4  # the distance to this neighbour is the gap between vertices
+VOTE_FRAMES = 100  # images, at most
+NEIGHBOUR = 4  # within the distance to this neighbour a vertex hides what is behind it: no gaps
+# Metres behind the nearest surface that still count as seen: more than between neighbours on a
+# slanted surface, less than a limb's thickness.
+DEPTH_TOLERANCE = 0.03
 CELLS = 2.0  # cells of the depth map per median occluder radius
 WIDEST = 8  # cells, the largest occluder radius: a disc close to the camera would fill the map
 MOST_CELLS = 2048  # along a side of the depth map
 
 
 def labelled_body(
-    scene: SceneInfo,
-    vote: ClassVote,
-    images: Subset[Frame] | None = None,
-    vertex_labels: Tensor | None = None,
+    scene: SceneInfo, images: Subset[Frame] | None = None, vertex_labels: Tensor | None = None
 ) -> tuple[SkinnedBody | None, str]:
     """The body, and a clause on where its labels come from, or why there is no body.
 
@@ -71,7 +70,7 @@ def labelled_body(
             f"labels: the images' parts are {', '.join(names)}, the {scene.body} body has others, "
             "and there is no training image with labels to vote on them; choose model=wo_seg"
         )
-    votes = vote(body, images, len(names))
+    votes = class_vote(body, images, len(names))
     body = body.voted(votes.labels, names)
     missing = len(names) - 1 - len(votes.labels.unique())
     return body, (
@@ -88,66 +87,49 @@ class Votes(NamedTuple):
     images: int  # number of images used
 
 
-@dataclass(frozen=True)
-class ClassVote:
-    """Settings of the vote; call it to vote.
+def class_vote(body: SkinnedBody, images: Subset[Frame], n_labels: int) -> Votes:
+    """Votes over frames of one item each, for ``n_labels`` labels, background included.
 
     Each vertex gets a vote for the label at its pixel from every image in which the body does not
     hide it. Background and ignored pixels do not count: there the fit is off, or the label image is
     empty. Vertices without a majority (never seen, or a tie) take the label of the nearest vertex
     with one, at rest. Nothing is random.
 
-    Settings: conf/model/full.yaml. An occluder radius of 1 closes the gaps of an even mesh. The
-    depth tolerance is larger than the differences between neighbours on a slanted surface, and
-    smaller than a limb's thickness.
+    Raises:
+        DataError: when an image file is damaged, or no vertex lies on a labelled pixel.
 
     Source: paper Sec. 3.4, which gives each vertex one class but not how.
     """
+    chosen = evenly_spaced(len(images), VOTE_FRAMES)
+    reach = neighbour_distance(body.vertices.float(), NEIGHBOUR)
+    votes = torch.zeros(len(body.vertices), n_labels, dtype=torch.int64)
+    for index in chosen:
+        _count(votes, body, reach, images[index])
+    if not votes.any():
+        raise DataError(
+            f"labels: in none of {len(chosen)} images is the posed body on a labelled pixel; "
+            "check that labels, cameras and body poses belong together, or choose model=wo_seg"
+        )
+    labels, decided = _majority(votes)
+    decided = decided if decided.any() else votes.any(dim=1)  # ties alone: the first label
+    labels = _from_the_nearest(body.vertices.float(), labels, decided)
+    return Votes(labels, float(decided.double().mean()), len(chosen))
 
-    vote_frames: int = 100
-    occluder_radius: float = 1.0
-    depth_tolerance: float = 0.03
 
-    def __post_init__(self) -> None:
-        whole("model.class_vote.vote_frames", self.vote_frames, 1)
-        above("model.class_vote.occluder_radius", self.occluder_radius)
-        above("model.class_vote.depth_tolerance", self.depth_tolerance)
-
-    def __call__(self, body: SkinnedBody, images: Subset[Frame], n_labels: int) -> Votes:
-        """Votes over frames of one item each, for ``n_labels`` labels, background included.
-
-        Raises:
-            DataError: when an image file is damaged, or no vertex lies on a labelled pixel.
-        """
-        chosen = evenly_spaced(len(images), self.vote_frames)
-        reach = self.occluder_radius * neighbour_distance(body.vertices.float(), NEIGHBOUR)
-        votes = torch.zeros(len(body.vertices), n_labels, dtype=torch.int64)
-        for index in chosen:
-            self._count(votes, body, reach, images[index])
-        if not votes.any():
-            raise DataError(
-                f"labels: in none of {len(chosen)} images is the posed body on a labelled pixel; "
-                "check that labels, cameras and body poses belong together, or choose model=wo_seg"
-            )
-        labels, decided = _majority(votes)
-        decided = decided if decided.any() else votes.any(dim=1)  # ties alone: the first label
-        labels = _from_the_nearest(body.vertices.float(), labels, decided)
-        return Votes(labels, float(decided.double().mean()), len(chosen))
-
-    def _count(self, votes: Tensor, body: SkinnedBody, reach: Tensor, frame: Frame) -> None:
-        """Adds one image's votes to ``[V, n_labels]``."""
-        if frame.labels is None or frame.body is None:
-            return
-        posed = body.posed_vertices(frame.body)[0]
-        shown = seen(posed, reach, frame.camera, self.depth_tolerance)
-        pixel, _ = frame.camera.project(posed[None])
-        column, row = pixel[0].floor().long().unbind(-1)
-        h, w = frame.labels.shape[-2:]
-        inside = shown & (column >= 0) & (column < w) & (row >= 0) & (row < h)
-        vertex = inside.nonzero().squeeze(-1)
-        label = frame.labels[0, row[vertex], column[vertex]]
-        valid = (label > 0) & (label != IGNORE) & (label < votes.shape[1])
-        votes[vertex[valid], label[valid]] += 1  # each vertex once: no index occurs twice
+def _count(votes: Tensor, body: SkinnedBody, reach: Tensor, frame: Frame) -> None:
+    """Adds one image's votes to ``[V, n_labels]``."""
+    if frame.labels is None or frame.body is None:
+        return
+    posed = body.posed_vertices(frame.body)[0]
+    shown = seen(posed, reach, frame.camera, DEPTH_TOLERANCE)
+    pixel, _ = frame.camera.project(posed[None])
+    column, row = pixel[0].floor().long().unbind(-1)
+    h, w = frame.labels.shape[-2:]
+    inside = shown & (column >= 0) & (column < w) & (row >= 0) & (row < h)
+    vertex = inside.nonzero().squeeze(-1)
+    label = frame.labels[0, row[vertex], column[vertex]]
+    valid = (label > 0) & (label != IGNORE) & (label < votes.shape[1])
+    votes[vertex[valid], label[valid]] += 1  # each vertex once: no index occurs twice
 
 
 def seen(points: Tensor, reach: Tensor, camera: Camera, tolerance: float) -> Tensor:
