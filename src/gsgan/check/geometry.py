@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from gsgan.check.report import Finding, Flagged, Table
+from gsgan.check.report import Finding, Table
 from gsgan.check.views import CheckedData, nanmedian
 from gsgan.data.formats.consistency import Float, far_cameras
 from gsgan.data.proportions import axis_name
@@ -94,14 +94,13 @@ def lens_table(subject: CheckedData, geometry: Geometry) -> Table:
     rows = []
     for name, camera in subject.cameras.items():
         (height, width), K = camera.size, camera.K
-        distance = f"{geometry.distances[name]:.2f}"
         rows.append((
             name,
             f"{width}×{height}",
             f"{K[0, 0]:.0f}, {K[1, 1]:.0f}",
             f"{K[0, 2] / width:.2f}, {K[1, 2] / height:.2f}",
             " ".join(f"{c:.3g}" for c in np.trim_zeros(camera.dist, "b")) or "none",
-            Flagged(distance) if name in geometry.far else distance,
+            f"{geometry.distances[name]:.2f}",
             str(len(subject.pairs[name])),
         ))  # fmt: skip
     headers = (

@@ -39,8 +39,7 @@ img { max-width: 100%; border: 1px solid #ddd; } .wide { overflow-x: auto; }
 {% if section.text %}<p>{{ section.text }}</p>{% endif %}
 {% for table in section.tables %}<div class="wide"><table>
 <tr>{% for header in table.headers %}<th>{{ header }}</th>{% endfor %}</tr>
-{% for row in table.rows %}<tr>{% for cell in row %}
-<td{% if cell is flagged %} class="error"{% endif %}>{{ cell }}</td>
+{% for row in table.rows %}<tr>{% for cell in row %}<td>{{ cell }}</td>
 {% endfor %}</tr>{% endfor %}</table></div>{% endfor %}
 {% for figure in section.figures %}<figure>
 <img alt="{{ figure.caption }}" src="{{ figure.source }}">
@@ -61,10 +60,6 @@ class Finding:
     sentence: str
 
 
-class Flagged(str):
-    """The text of a table's cell whose value is out of bounds."""
-
-
 @dataclass(frozen=True)
 class Table:
     """Rows of text."""
@@ -73,13 +68,12 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
 
     def for_terminal(self, title: str | None = None) -> RichTable:
-        """The table as rich prints it, flagged cells in red."""
+        """The table as rich prints it."""
         drawn = RichTable(title=title, title_justify="left", title_style="bold")
         for header in self.headers:
             drawn.add_column(header, overflow="fold")
         for row in self.rows:
-            styles = (STYLES["error"] if isinstance(cell, Flagged) else "" for cell in row)
-            drawn.add_row(*map(Text, row, styles))
+            drawn.add_row(*map(Text, row))
         return drawn
 
 
@@ -154,7 +148,6 @@ def listed(names: Iterable[object], most: int = 6) -> str:
 def page(report: Report) -> str:
     """The report as one HTML file: no scripts, images embedded, nothing fetched."""
     environment = Environment(autoescape=True, trim_blocks=True)
-    environment.tests["flagged"] = lambda cell: isinstance(cell, Flagged)
     colour = "error" if report.errors else "warning" if report.warnings else "good"
     return environment.from_string(PAGE).render(report=report, colour=colour)
 

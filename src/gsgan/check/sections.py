@@ -11,7 +11,7 @@ from rich.console import Console
 from gsgan.check import geometry, overlays, views
 from gsgan.check.calibration import calibration_findings, score_cameras
 from gsgan.check.frames import frame_findings, mask_doubts, shortened, skeleton_doubts
-from gsgan.check.report import Figure, Finding, Flagged, Section, Table, counted
+from gsgan.check.report import Figure, Finding, Section, Table, counted
 from gsgan.check.settings import Limits, Sampling
 from gsgan.data.formats.consistency import spread
 from gsgan.effects import EffectSettings, decide
@@ -159,22 +159,23 @@ def _split(data: GsganData, name: str) -> str:
 
 
 def _agreement(m: Measurements) -> Section:
-    min_inside, cells = m.subject.consistency.min_inside, []
-    for s in m.cameras:
-        columns = (
-            (s.name, False),
-            (f"{s.inside:.1%}", not s.inside >= min_inside),
-            ("–" if np.isnan(s.outside) else f"{100 * s.outside:.1f}", False),
-            (f"{s.overlap:.2f}", False),
-            (f"{s.best_rival:.2f}", s.beaten(m.limits)),
-            (f"{s.fullness:.2f}", s.oversized(m.limits)),
+    rows = tuple(
+        (
+            s.name,
+            f"{s.inside:.1%}",
+            "–" if np.isnan(s.outside) else f"{100 * s.outside:.1f}",
+            f"{s.overlap:.2f}",
+            f"{s.best_rival:.2f}",
+            f"{s.fullness:.2f}",
         )
-        cells.append(tuple(Flagged(text) if bad else text for text, bad in columns))
+        for s in m.cameras
+    )
     headers = (
         "camera", "joints inside mask", "outside by cm", "overlap", "best other", "mask / body",
     )  # fmt: skip
+    min_inside = m.subject.consistency.min_inside
     found = calibration_findings(m.cameras, m.limits, min_inside, m.geometry.far)
-    table = Table(headers, tuple(cells))
+    table = Table(headers, rows)
     return Section("Skeleton, masks and cameras", (table,), tuple(found), text=AGREEMENT)
 
 
