@@ -10,7 +10,7 @@ from commands import refused
 
 from gsgan.bench.__main__ import main
 from gsgan.bench.common import cpu_name, environment, number, sentence
-from gsgan.bench.speed import StageClock, deciles, in_batches, make_painter, measure, spread, text
+from gsgan.bench.speed import deciles, in_batches, make_painter, measure, spread, text
 from gsgan.model.avatar import UNWATCHED, unwatched
 from gsgan.utils.errors import ConfigError
 
@@ -97,17 +97,6 @@ def test_batches_are_timed_per_image(small):
     times = in_batches(lambda batch: sizes.append(len(batch)), [frame, frame], None, 3, 7)
     assert sizes == [3, 3, 3]
     assert 0 < times["least"] <= times["median"]
-
-
-def test_the_clock_adds_up_what_one_stage_takes_twice():
-    clock = StageClock(torch.device("cpu"))
-    for _ in range(2):
-        with clock("F"):
-            pass
-    once = clock.frame["F"]
-    with clock("F"):
-        sum(range(100_000))
-    assert clock.frame["F"] > once > 0
 
 
 def test_precision_reaches_the_networks_and_not_the_image_type(small):

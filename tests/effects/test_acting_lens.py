@@ -20,20 +20,6 @@ def bent(tmp_path):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("word", [NONE, "effects.only=[antialias]", "effects.only=[]"])
-def test_with_all_effects_off_a_lens_is_followed_still(build, bent, word):
-    """It is the camera's own, and no choice; taken as a pinhole's only where a word says so."""
-    at = (f"data.root={bent}", "data.size=64")
-    data, avatar, _ = build(*at, word)
-    assert avatar.effects.distortion.value == "undistort"
-    assert data.dataset("novel_view")[0].camera.dist is None
-    wanted = build(*at)[0].dataset("novel_view")[0].image
-    assert torch.equal(data.dataset("novel_view")[0].image, wanted)
-    ignored, avatar, _ = build(*at, word, "effects.distortion=off")
-    assert not avatar.effects.distortion.on
-    assert not torch.equal(ignored.dataset("novel_view")[0].image, wanted)
-
-
 def test_paintings_follow_the_lens_with_every_map(build, bent):
     data, avatar, _ = build(
         *(f"data.root={bent}", "data.size=64", "effects.distortion=project"),

@@ -26,11 +26,3 @@ def test_nothing_changes_without_them():
     image, target, unsure = pictures()
     assert without_unsure(target, image, None) is target
     assert photometric(image, target, unsure=0 * unsure) == photometric(image, target)
-
-
-def test_all_unsure_teaches_nothing():
-    image, target, unsure = pictures()
-    loss = photometric(image, target, l2=1.0, unsure=torch.ones_like(unsure))
-    loss.backward()
-    assert abs(float(loss)) < 1e-6
-    assert image.grad.abs().max() < 1e-6

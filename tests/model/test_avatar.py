@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from gsgan.model.assemble import build_avatar
-from gsgan.skeleton import sanitise
 
 
 def test_paints_every_part(build):
@@ -49,15 +48,6 @@ def test_gradients_reach_every_trained_part(build):
         grads = [p.grad for p in getattr(avatar, part).parameters()]
         assert any(g is not None and float(g.abs().max()) > 0 for g in grads), part
     assert all(p.grad is None for p in avatar.segmentation.parameters())  # trained on its own
-
-
-def test_a_missing_joint_still_paints(build):
-    _, avatar, frame = build()
-    skeleton, visibility = frame.skeleton.clone(), frame.visibility.clone()
-    skeleton[0, 15], visibility[0, 15] = float("nan"), 0
-    skeleton, _ = sanitise(skeleton, visibility)
-    painting = avatar(*dataclasses.replace(frame, skeleton=skeleton, visibility=visibility).inputs)
-    assert torch.isfinite(painting.image).all()
 
 
 def test_a_missing_body_pose_is_solved_from_the_skeleton(build):

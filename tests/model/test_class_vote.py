@@ -124,20 +124,6 @@ def test_background_ignored_and_unknown_pixels_have_no_vote():
     assert (class_vote(body, [picture(labels)] * 2, 4).labels == 3).all()
 
 
-def test_the_number_of_pictures_is_bounded_and_they_are_spread(monkeypatch):
-    looked = []
-
-    class Watched(list):
-        def __getitem__(self, index):
-            looked.append(index)
-            return super().__getitem__(index)
-
-    pictures = Watched([picture(torch.ones(SIZE, SIZE))] * 10)
-    monkeypatch.setattr("gsgan.model.class_vote.VOTE_FRAMES", 3)
-    assert class_vote(rigid(plate(2.0)), pictures, 2).images == 3
-    assert looked == [1, 5, 8]
-
-
 # --- on a dataset: SMPL's mesh, CIHP's labels -----------------------------------------------------
 
 

@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from gsgan.splat import gsplat_backend, native, rasterise
+from gsgan.splat import gsplat_backend, native
 
 META = torch.device("meta")
 READS = ("_local_scalar_dense", "nonzero", "masked_select", "unique", "is_nonzero", "equal")
@@ -163,28 +163,3 @@ def test_the_window_is_read_back_once(build, monkeypatch):
         avatar.window(frame.skeleton, frame.camera)
     assert len(lists) == 1
     assert not reads.seen
-
-
-def test_the_portable_rasteriser_waits_twice(build, monkeypatch):
-    """As on CUDA: the stop that only a CPU makes is left out."""
-    from gsgan.splat import checks, tiles
-
-    _, avatar, frame = build("effects=none")
-    with torch.no_grad():
-        painting = avatar(*frame.inputs)
-    plain = rasterise(painting.gaussians, frame.camera, settings=avatar.accuracy, backend="torch")
-    stopping = tiles._Walk.__init__
-
-    def without_stop(self, *args):
-        stopping(self, *args)
-        self.stops = False
-
-    monkeypatch.setattr(tiles._Walk, "__init__", without_stop)
-    for name in ("_check_camera", "_check_gaussians"):  # on a CPU only
-        monkeypatch.setattr(checks, name, lambda *_: None)
-    with Reads() as reads, torch.no_grad():
-        raster = rasterise(
-            painting.gaussians, replace(frame.camera), settings=avatar.accuracy, backend="torch"
-        )
-    assert reads.seen == {"_local_scalar_dense": 1}  # and one list of numbers
-    torch.testing.assert_close(raster.features, plain.features, atol=1e-5, rtol=0)

@@ -279,16 +279,6 @@ def test_one_clear_sentence(render, tmp_path, motion, args, message):
     assert not list(tmp_path.glob("a*/*.png"))
 
 
-def test_a_frame_without_a_trunk_is_filled(render, motion, landmarks, tmp_path):
-    p = 1.1 * landmarks
-    p[7, [11, 23]] = np.nan
-    np.savez(motion, p=p, fps=30)
-    result = render(f"motion={motion}", "out=a")
-    assert result.returncode == 0, result.stderr
-    assert "1 frame without shoulders or hips filled" in result.stdout
-    assert len(list((tmp_path / "a").glob("*.png"))) == 12
-
-
 def test_other_folders_are_not_touched(render, motion, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "000000.png").write_text("mine")

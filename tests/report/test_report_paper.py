@@ -108,19 +108,6 @@ def test_every_printed_value_is_a_number(name):
     assert paper.title in grid.title
 
 
-def test_the_mean_that_method_md_quotes_follows_from_the_table():
-    (held,) = read_paper("zju").rows
-    values = [float(v["psnr"]) for s, v in held["values"].items() if s != "mean"]
-    assert sum(values) / len(values) == pytest.approx(32.93, abs=0.005)
-
-
-def test_private_or_pooled_numbers_never_stand_beside(tmp_path):
-    for name in ("slp", "miou"):
-        run = paper_run(tmp_path / name, record=None)
-        spec = table(metrics=["psnr"], splits=["novel_view"], paper=name)
-        assert "Not beside" in report_of(spec, run).grids[-1].remarks[0]
-
-
 def test_an_unknown_entry_is_refused():
     with pytest.raises(ConfigError, match=r"table\.paper=tables: paper\.yaml has zju"):
         read_paper("tables")

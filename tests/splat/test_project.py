@@ -129,34 +129,3 @@ def test_rotations_are_rotations():
     eye = torch.eye(3).double().expand_as(R)
     torch.testing.assert_close(R @ R.mT, eye)
     torch.testing.assert_close(torch.linalg.det(R), torch.ones(1, 20).double())
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("value", [0.0, 1e-30])
-def test_zero_quaternions_are_the_identity_without_a_gradient(dtype, value):
-    quat = torch.full((4,), value, dtype=dtype, requires_grad=True)
-    R = rotations(quat)
-    assert torch.equal(R, torch.eye(3, dtype=dtype))
-    (R * torch.arange(9.0, dtype=dtype).view(3, 3)).sum().backward()
-    assert torch.equal(quat.grad, torch.zeros(4, dtype=dtype))
-
-
-def test_rotations_gradcheck_of_non_unit_quaternions():
-    quats = cloud(5).quats[0] * torch.tensor([0.01, 0.3, 1.0, 4.0, 30.0]).double().unsqueeze(-1)
-    assert torch.autograd.gradcheck(rotations, quats.requires_grad_(), eps=1e-7, atol=1e-4)
-
-
-@pytest.mark.parametrize("degrees", [0.0, 0.1, 45.0, 89.9, 90.0])
-@pytest.mark.parametrize("length", [300.0, 1e5])
-def test_factors_of_a_needle_match_its_covariance(degrees, length):
-    # Σ = L² d dᵀ + low-pass: along the needle q = s² / (L² + 0.3), across it q = s² / 0.3.
-    angle, metres = math.radians(degrees), length / 200
-    turn = (math.cos(angle / 2), 0.0, 0.0, math.sin(angle / 2))
-    needle = one(scale=(metres, metres * 1e-4, metres * 1e-4), quat=turn)
-    factor_p, k, r = project(needle, camera((96, 96), focal=400.0), HIGH).factors[0, 0].tolist()
-    for sigma, dx, dy in (
-        (math.hypot(length, math.sqrt(0.3)), math.cos(angle), math.sin(angle)),
-        (math.sqrt(0.3 + (length * 1e-4) ** 2), -math.sin(angle), math.cos(angle)),
-    ):
-        q = (factor_p * sigma * (dx + k * dy)) ** 2 + (r * sigma * dy) ** 2
-        assert q == pytest.approx(1.0, abs=1e-6)

@@ -61,20 +61,3 @@ def test_gradients_match_the_mean(backend):
 
     inputs = (scene.means, scene.opacities, scene.features, torch.zeros(2, dtype=torch.float64))
     assert torch.autograd.gradcheck(draw, [x.clone().requires_grad_() for x in inputs])
-
-
-def test_lens_distortion_with_supersampling():
-    scene, cam = cloud(20), camera((12, 16), focal=20.0)
-    cam = replace(cam, dist=torch.tensor([[-0.28, 0.09, 0.001, -0.0008, -0.01]]).double())
-    settings = replace(EXACT, supersample=2)
-    larger = rasterise(scene, cam.resize((24, 32)), settings=EXACT)
-    found = rasterise(scene, cam, settings=settings)
-    torch.testing.assert_close(found.features, avg_pool2d(larger.features, 2))
-
-
-def test_nothing_to_draw_gives_an_empty_image():
-    scene = cloud(0)
-    raster = rasterise(scene, camera((3, 4)), settings=replace(HIGH, supersample=2), depth=True)
-    assert raster.features.shape == (1, 3, 3, 4)
-    assert not raster.features.any()
-    assert not raster.depth.any()

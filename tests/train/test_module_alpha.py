@@ -80,23 +80,3 @@ def test_on_black_step_one_compares_the_splats_alpha_with_the_mask():
     over = with_alpha(painting, frame, colour, None)
     assert torch.equal(over, without(painting, frame, colour, None))
     assert bool(torch.autograd.grad(over, alpha)[0].any())
-
-
-@pytest.mark.parametrize("word", ["on", "off"])
-def test_step_one_teaches_the_splats_alpha_with_and_without_a_random_background(make, word):
-    """On black and without a weight, a black person could as well be transparent."""
-    module, _, data = make(f"effects.random_background={word}", "training.step_one.feature_head=0")
-    frame = data.dataset("train")[0]
-    painting = module.avatar(*frame.inputs)
-    alpha = painting.splat_alpha.detach().requires_grad_()
-    seen = replace(painting, splat_alpha=alpha)
-    (slope,) = torch.autograd.grad(module.step_one_loss(seen, frame), alpha)
-    missing = (alpha < 0.9) & (frame.mask == 1)
-    assert bool(missing.any())
-    if word == "off":
-        assert bool((slope[missing] < 0).all())
-        module.step_one = replace(module.step_one, alpha=0.0)
-        loss = module.step_one_loss(seen, frame)
-        assert torch.autograd.grad(loss, alpha, allow_unused=True) == (None,)
-    else:
-        assert bool(slope.any())

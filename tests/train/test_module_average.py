@@ -46,22 +46,6 @@ def test_the_average_follows_its_formula():
     assert values == pytest.approx(expected)
 
 
-def test_an_average_of_every_fourth_iteration_forgets_as_fast():
-    layer = torch.nn.Linear(1, 1)
-    torch.nn.init.constant_(layer.weight, 1.0)
-    often, seldom = MovingAverage(layer, 0.99), MovingAverage(layer, 0.99, every=4)
-    for average in (often, seldom):  # past the quick start
-        for step in range(4000):
-            average.update(layer, step)
-    torch.nn.init.constant_(layer.weight, 2.0)
-    for step in range(40):
-        often.update(layer, step)
-        seldom.update(layer, step)
-    expected = 2 - 0.99**40
-    for average in (often, seldom):
-        assert float(average.module.weight.detach()) == pytest.approx(expected, abs=1e-5)
-
-
 def test_the_average_is_updated_when_the_config_says(make):
     module, trainer, data = make("training.average_every=5", "training.schedule.step_one=0")
     trainer.fit(module, data)
