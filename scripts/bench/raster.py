@@ -170,7 +170,7 @@ def draw_windows(
     images = []
     for top, left in corners:
         moved = replace(projected, means=projected.means - projected.means.new_tensor([left, top]))
-        features, alpha, _ = reference.composite(moved, (side, side), settings, False)
+        features, alpha = reference.composite(moved, (side, side), settings)
         images.append(torch.cat([features, alpha], dim=1)[0])
     return images
 

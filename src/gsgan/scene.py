@@ -179,14 +179,12 @@ class Raster(TensorRecord):
     Args:
         features: ``[B, C, H, W]`` premultiplied by alpha; the caller adds the background.
         alpha: ``[B, 1, H, W]`` in [0, 1].
-        depth: ``[B, 1, H, W]`` metres times alpha, or None when it was not requested.
         fine: ``[B, C, kH, kW]`` features before supersampling averages k² of them to a pixel, or
             None without supersampling.
     """
 
     features: Tensor
     alpha: Tensor
-    depth: Tensor | None = None
     fine: Tensor | None = None
 
 

@@ -76,11 +76,11 @@ def copies(monkeypatch):
     return seen
 
 
-def drawn(gaussians, camera, settings, want_depth):
+def drawn(gaussians, camera, settings):
     """What gsplat would return, empty."""
     batch, (height, width) = len(camera), camera.size
     features = gaussians.features.new_zeros(batch, gaussians.features.shape[-1], height, width)
-    return features, features[:, :1], None
+    return features, features[:, :1]
 
 
 def on_meta(avatar, monkeypatch):

@@ -94,7 +94,7 @@ def leaves(record):
 def loss(raster: Raster) -> Tensor:
     """A fixed random weighting of all outputs."""
     g = torch.Generator().manual_seed(7)
-    outputs = [x for x in (raster.features, raster.alpha, raster.depth) if x is not None]
+    outputs = raster.features, raster.alpha
     weights = [torch.randn(x.shape, generator=g, dtype=torch.float64).to(x) for x in outputs]
     return sum((x * w).sum() for x, w in zip(outputs, weights, strict=True))
 
@@ -163,10 +163,10 @@ fast_backend = pytest.mark.parametrize("backend", [b for b in BACKENDS if b != "
 every_setting = pytest.mark.parametrize("settings", list(ACCURACY))
 
 
-def draw(gaussians, cam, settings, backend, depth=True):
+def draw(gaussians, cam, settings, backend):
     """The image and the gradients of a random weighting of it."""
     gaussians, cam = leaves(gaussians), leaves(cam)
-    drawn = rasterise(gaussians, cam, settings=settings, backend=backend, depth=depth)
+    drawn = rasterise(gaussians, cam, settings=settings, backend=backend)
     loss(drawn).backward()
     return drawn, gradients(gaussians, cam)
 
@@ -183,7 +183,7 @@ def assert_like_reference(
     """Values and gradients equal those of the reference with the same settings."""
     got, got_grads = draw(gaussians, cam, settings, backend)
     want, want_grads = draw(gaussians, cam, settings, "reference")
-    for name in ("features", "alpha", "depth"):
+    for name in ("features", "alpha"):
         assert error(getattr(got, name), getattr(want, name)) < value, name
     for name, grad in want_grads.items():
         assert torch.isfinite(got_grads[name]).all(), name

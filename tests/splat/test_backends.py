@@ -37,7 +37,7 @@ def test_one_gaussian_matches_the_closed_form(backend, settings):
     scale, opacity, features = 0.1, 0.8, (1.0, 0.5, 0.25)
     cam = camera((9, 11), focal=20.0)
     gaussians = one((0.0, 0.0, 2.0), scale=(scale,) * 3, opacity=opacity, features=features)
-    raster = rasterise(gaussians, cam, settings=settings, backend=backend, depth=True)
+    raster = rasterise(gaussians, cam, settings=settings, backend=backend)
     variance = (20.0 * scale / 2) ** 2 + 0.3
     y, x = torch.meshgrid(torch.arange(9) + 0.5 - 4.5, torch.arange(11) + 0.5 - 5.5, indexing="ij")
     alpha = opacity * torch.exp(-0.5 * (x * x + y * y).double() / variance)
@@ -45,17 +45,15 @@ def test_one_gaussian_matches_the_closed_form(backend, settings):
     torch.testing.assert_close(raster.alpha[0, 0], alpha, rtol=1e-6, atol=1e-7)
     for channel, value in zip(raster.features[0], features, strict=True):
         torch.testing.assert_close(channel, value * alpha, rtol=1e-6, atol=1e-7)
-    torch.testing.assert_close(raster.depth[0, 0], 2.0 * alpha, rtol=1e-6, atol=1e-7)
 
 
 @every_backend
 def test_two_layers_blend_front_to_back(backend):
     far = one((0, 0, 3.0), scale=(50.0,) * 3, opacity=0.5, features=(0.0, 1.0))
     near = one((0, 0, 2.0), scale=(50.0,) * 3, opacity=0.25, features=(1.0, 0.0))
-    raster = rasterise(join(far, near), camera((1, 1)), settings=DENSE, backend=backend, depth=True)
+    raster = rasterise(join(far, near), camera((1, 1)), settings=DENSE, backend=backend)
     torch.testing.assert_close(raster.features.flatten(), torch.tensor([0.25, 0.375]).double())
     assert raster.alpha.item() == pytest.approx(1 - 0.75 * 0.5)
-    assert raster.depth.item() == pytest.approx(0.25 * 2 + 0.375 * 3)
 
 
 @every_backend
@@ -166,15 +164,14 @@ def test_a_batch_equals_its_items(backend):
     both, both_grads = draw(gaussians, cam, CUT, backend)
     for i in range(2):
         g, c = leaves(gaussians[i : i + 1]), leaves(cam[i : i + 1])
-        single = rasterise(g, c, settings=CUT, backend=backend, depth=True)
+        single = rasterise(g, c, settings=CUT, backend=backend)
         assert torch.equal(single.features, both.features[i : i + 1])
         assert torch.equal(single.alpha, both.alpha[i : i + 1])
         weights = torch.Generator().manual_seed(7)
         total = 0.0
-        for x in (both.features, both.alpha, both.depth):
-            w = torch.randn(x.shape, generator=weights, dtype=torch.float64)[i : i + 1]
-            part = {id(both.features): single.features, id(both.alpha): single.alpha}
-            total = total + (part.get(id(x), single.depth) * w).sum()
+        for whole, part in ((both.features, single.features), (both.alpha, single.alpha)):
+            w = torch.randn(whole.shape, generator=weights, dtype=torch.float64)[i : i + 1]
+            total = total + (part * w).sum()
         total.backward()
         for name, grad in gradients(g, c).items():
             torch.testing.assert_close(grad, both_grads[name][i : i + 1], rtol=1e-9, atol=1e-12)
@@ -187,6 +184,5 @@ def test_the_same_input_gives_the_same_bits(backend, dtype):
     first, first_grads = draw(gaussians, cam, "high", backend)
     second, second_grads = draw(gaussians, cam, "high", backend)
     assert torch.equal(first.features, second.features)
-    assert torch.equal(first.depth, second.depth)
     for name, grad in first_grads.items():
         assert torch.equal(grad, second_grads[name]), name

@@ -91,9 +91,8 @@ class StandIn:
             Camera(K, viewmats[:, 0, :3, :3], viewmats[:, 0, :3, 3], (height, width)),
             settings,
         )
-        features, alpha, depth = reference.composite(ellipses, (height, width), settings, True)
-        layers = {"RGB": [features], "RGB+D": [features, depth]}[render_mode]
-        as_gsplat_has_it = [x.movedim(1, -1).unsqueeze(1) for x in (torch.cat(layers, 1), alpha)]
+        images = reference.composite(ellipses, (height, width), settings)
+        as_gsplat_has_it = [x.movedim(1, -1).unsqueeze(1) for x in images]
         return *as_gsplat_has_it, {}
 
 
@@ -123,11 +122,11 @@ def scene(shape: str = "quats", channels: int = 3, batch: int = 2) -> tuple[Gaus
     return gaussians.to(torch.float32), turned(camera(batch=batch)).to(torch.float32)
 
 
-def drawn(gaussians, cam, backend, settings=STANDARD, depth=True):
+def drawn(gaussians, cam, backend, settings=STANDARD):
     """The raster and its gradients; none of K, as in gsplat."""
     gaussians, cam = leaves(gaussians), leaves(cam)
     cam.K.requires_grad_(False)
-    raster = rasterise(gaussians, cam, settings=settings, backend=backend, depth=depth)
+    raster = rasterise(gaussians, cam, settings=settings, backend=backend)
     loss(raster).backward()
     return raster, gradients(gaussians, cam)
 
@@ -165,14 +164,6 @@ def test_the_settings_that_gsplat_takes_are_passed_on(mock, changes):
     want = drawn(gaussians, cam, "reference", settings)
     assert error(want[0].features, plain.features) > 1e-2
     assert_same(drawn(gaussians, cam, "gsplat", settings), want)
-
-
-def test_without_depth_none_is_drawn(mock):
-    gaussians, cam = scene()
-    got, want = drawn(gaussians, cam, "gsplat", depth=False), drawn(gaussians, cam, "torch")
-    assert got[0].depth is None
-    assert mock.calls[-1].render_mode == "RGB"
-    assert error(got[0].features, want[0].features) < 2e-5
 
 
 def test_a_camera_far_from_the_origin_costs_no_digits(mock):

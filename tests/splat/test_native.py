@@ -15,9 +15,9 @@ pytestmark = pytest.mark.skipif(not native.available(), reason=native.why_not() 
 
 
 EXACT, HIGH, STANDARD, DRAFT = (ACCURACY[n] for n in ("exact", "high", "standard", "draft"))
-LEAVES = ("means", "factors", "opacities", "features", "depths")
+LEAVES = ("means", "factors", "opacities", "features")
 
-Composite = Callable[..., tuple[Tensor, Tensor, Tensor | None]]
+Composite = Callable[..., tuple[Tensor | None, ...]]
 
 
 @pytest.fixture(autouse=True)
@@ -95,7 +95,7 @@ def values_and_gradients(
 ) -> tuple[list[Tensor], list[Tensor]]:
     """Images, and the gradients of a random weighted sum of all of them."""
     leaves, q = with_leaves(p)
-    images = [x for x in composite(q, size, cut, True) if x is not None]
+    images = [x for x in composite(q, size, cut) if x is not None]
     g = torch.Generator().manual_seed(1)
     loss = sum(
         (x * torch.randn(x.shape, generator=g, dtype=torch.float64).to(x.dtype)).sum()
@@ -118,7 +118,7 @@ def assert_same(
     want, want_gradients = values_and_gradients(
         reference.composite, in_dtype(p, torch.float64), size, cut
     )
-    for name, x, y in zip(("features", "alpha", "depth"), got, want, strict=True):
+    for name, x, y in zip(("features", "alpha"), got, want, strict=True):
         error = (x.double() - y).abs().max().item()
         assert error <= tolerance, f"{name}: {error:.2e}"
     for name, x, y in zip(LEAVES, got_gradients, want_gradients, strict=True):
@@ -141,13 +141,13 @@ def test_accuracy_of_the_exponential(dtype, ulps):
     # 4001 pixels in a row of one Gaussian whose mean is on the first centre: -q/2 = -(x / 317)^2.
     # Squares of integers times a power of two keep q exact.
     p = one((0.5, 0.5), 1.0, 256.0, dtype=dtype)
-    alpha = native.composite(p, (1, 2400), EXACT, False)[1][0, 0, 0]
+    alpha = native.composite(p, (1, 2400), EXACT)[1][0, 0, 0]
     q = torch.arange(2400, dtype=torch.float64) ** 2 / 256.0**2
     want = torch.exp(-0.5 * q)
     relative = (alpha.double() - want).abs() / want
     assert want.min() < 1e-19
     # Alpha is 1 - (1 - alpha): the weights are the exponential itself.
-    features = native.composite(p, (1, 2400), EXACT, False)[0][0, 0, 0]
+    features = native.composite(p, (1, 2400), EXACT)[0][0, 0, 0]
     relative = (features.double() - want).abs() / want
     # u = p dx is rounded twice and squared, q once: three units of the exponent's size, up to 44.
     allowed = torch.finfo(dtype).eps * (ulps + 1.5 * q)
@@ -156,7 +156,7 @@ def test_accuracy_of_the_exponential(dtype, ulps):
 
 def test_cap_stops_value_and_gradient():
     leaves, q = with_leaves(one((0.5, 0.5), 1.0, 3.0))
-    features, alpha, *_ = native.composite(q, (1, 1), replace(EXACT, alpha_max=0.9), False)
+    features, alpha, *_ = native.composite(q, (1, 1), replace(EXACT, alpha_max=0.9))
     assert features.item() == pytest.approx(0.9)
     assert alpha.item() == pytest.approx(0.9)
     gradients = torch.autograd.grad(features.sum() + alpha.sum(), leaves[:4])
@@ -169,7 +169,7 @@ def test_stop_is_by_incoming_transmittance():
     p = one((0.5, 0.5), 0.5, 3.0, n=9)
     for bound, want in ((0.25, 0.875), (0.26, 0.75)):
         leaves, q = with_leaves(p)
-        alpha = native.composite(q, (1, 1), replace(EXACT, transmittance_min=bound), False)[1]
+        alpha = native.composite(q, (1, 1), replace(EXACT, transmittance_min=bound))[1]
         assert alpha.item() == want
         (g,) = torch.autograd.grad(alpha.sum(), leaves[2])
         assert (g[0] != 0).sum() == (3 if bound == 0.25 else 2)
@@ -198,13 +198,12 @@ def test_memory_budget_of_the_backward_changes_no_bit(monkeypatch):
 
 def test_gradient_of_one_output_only_and_twice():
     leaves, q = with_leaves(scene(N=10))
-    features, alpha, *_ = native.composite(q, (21, 35), EXACT, True)
+    _, alpha, *_ = native.composite(q, (21, 35), EXACT)
     first = torch.autograd.grad(alpha.sum(), leaves[2], retain_graph=True)[0]
     again = torch.autograd.grad(alpha.sum(), leaves[2], retain_graph=True)[0]
     assert torch.equal(first, again)
-    assert torch.autograd.grad(features.sum(), leaves[4], allow_unused=True)[0] is None
     with torch.no_grad():
-        assert not native.composite(q, (21, 35), EXACT, False)[0].requires_grad
+        assert not native.composite(q, (21, 35), EXACT)[0].requires_grad
 
 
 def test_strided_inputs_and_gradients():
@@ -216,8 +215,8 @@ def test_strided_inputs_and_gradients():
         }
     )
     leaves, q = with_leaves(strided)
-    features = native.composite(q, (21, 35), EXACT, False)[0]
-    assert torch.equal(features, native.composite(p, (21, 35), EXACT, False)[0])
+    features = native.composite(q, (21, 35), EXACT)[0]
+    assert torch.equal(features, native.composite(p, (21, 35), EXACT)[0])
     (strange,) = torch.autograd.grad(features.sum(), leaves[3], retain_graph=True)
     (plain,) = torch.autograd.grad(features, leaves[3], torch.ones_like(features))
     assert torch.equal(strange, plain)
@@ -230,6 +229,6 @@ def test_values_that_are_not_finite_are_refused(name):
     value[1, 3] = float("nan")
     p = replace(p, **{name: value, "visible": torch.ones(2, 5, dtype=torch.bool)})
     with pytest.raises(ValueError, match="Gaussian 3 of batch item 1"):
-        native.composite(p, (21, 35), HIGH, False)
+        native.composite(p, (21, 35), HIGH)
     hidden = replace(p, visible=torch.tensor([[True] * 5, [False] * 5]))
-    assert native.composite(hidden, (21, 35), HIGH, False)[0].isfinite().all()
+    assert native.composite(hidden, (21, 35), HIGH)[0].isfinite().all()

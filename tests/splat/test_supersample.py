@@ -16,12 +16,10 @@ EXACT, HIGH = ACCURACY["exact"], ACCURACY["high"]
 @pytest.mark.parametrize("name", ["exact", "high", "standard", "draft"])
 def test_it_is_the_mean_of_the_larger_image(backend, name):
     scene, cam = cloud(12, batch=2), camera((7, 10), batch=2)
-    larger = rasterise(
-        scene, cam.resize((21, 30)), settings=ACCURACY[name], backend=backend, depth=True
-    )
+    larger = rasterise(scene, cam.resize((21, 30)), settings=ACCURACY[name], backend=backend)
     settings = replace(ACCURACY[name], supersample=3)
-    found = rasterise(scene, cam, settings=settings, backend=backend, depth=True)
-    for image in ("features", "alpha", "depth"):
+    found = rasterise(scene, cam, settings=settings, backend=backend)
+    for image in ("features", "alpha"):
         mean = avg_pool2d(getattr(larger, image), 3)
         assert mean.shape[-2:] == (7, 10)
         torch.testing.assert_close(getattr(found, image), mean, rtol=1e-12, atol=1e-12)
@@ -54,10 +52,8 @@ def test_gradients_match_the_mean(backend):
     def draw(means, opacities, features, focal):
         changed = replace(scene, means=means, opacities=opacities, features=features)
         K = cam.K + torch.diag(torch.cat([focal, focal.new_zeros(1)]))
-        raster = rasterise(
-            changed, replace(cam, K=K), settings=settings, backend=backend, depth=True
-        )
-        return raster.features, raster.alpha, raster.depth
+        raster = rasterise(changed, replace(cam, K=K), settings=settings, backend=backend)
+        return raster.features, raster.alpha
 
     inputs = (scene.means, scene.opacities, scene.features, torch.zeros(2, dtype=torch.float64))
     assert torch.autograd.gradcheck(draw, [x.clone().requires_grad_() for x in inputs])

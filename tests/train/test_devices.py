@@ -70,12 +70,12 @@ def place(request, monkeypatch):
 HELD = (torch.Tensor, TensorRecord)
 
 
-def drawn(gaussians, camera, settings, want_depth):
+def drawn(gaussians, camera, settings):
     """In place of gsplat: images of the right size, with a gradient for everything given."""
     parts = (gaussians.means, gaussians.covariances, gaussians.opacities, gaussians.features)
     one = sum(x.sum() for x in (*parts, camera.K, camera.R, camera.t))
     features = one.expand(len(camera), gaussians.features.shape[-1], *camera.size)
-    return features, features[:, :1], features[:, :1] if want_depth else None
+    return features, features[:, :1]
 
 
 def no_values(x):
@@ -147,8 +147,8 @@ def test_layers_and_export(start, place):
     with torch.no_grad():
         rendering = avatar(*frame.inputs)
         behind = torch.zeros(3, 1, 1)
-        for layer in layers(avatar):  # the camera is the host's
-            image = shown(layer, rendering, truth.camera, avatar, behind)
+        for layer in layers(avatar):
+            image = shown(layer, rendering, behind)
             assert image.shape == (*truth.camera.size, 3)
         splats = splats_of(avatar, frame.skeleton, frame.visibility > 0, frame.body)
         assert splats.means.shape == rendering.gaussians.means[0].shape

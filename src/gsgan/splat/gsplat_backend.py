@@ -89,9 +89,7 @@ def unsuited(gaussians: Gaussians, camera: Camera) -> str:
     return ""
 
 
-def draw(
-    gaussians: Gaussians, camera: Camera, settings: Accuracy, want_depth: bool
-) -> tuple[Tensor, Tensor, Tensor | None]:
+def draw(gaussians: Gaussians, camera: Camera, settings: Accuracy) -> tuple[Tensor, Tensor]:
     """Projects and blends.
 
     Convention: as ``gsgan.splat.rasterise``, for inputs for which ``why_not`` and ``unsuited`` are
@@ -101,15 +99,13 @@ def draw(
         gaussians: N >= 1 Gaussians per batch item, of at most float32.
         camera: one camera per batch item.
         settings: near, low_pass and antialias are passed on; the rest is compiled in.
-        want_depth: whether to blend depths too.
 
     Returns:
-        features ``[B, C, H, W]`` premultiplied, alpha ``[B, 1, H, W]``, depth ``[B, 1, H, W]`` or
-        None.
+        features ``[B, C, H, W]`` premultiplied, alpha ``[B, 1, H, W]``.
 
     Source: Ye et al., gsplat: An open-source library for Gaussian splatting (version 1.5.3).
     """
-    (H, W), C = camera.size, gaussians.features.shape[-1]
+    H, W = camera.size
     means, viewmats = _seen_from_the_camera(gaussians.means, camera)
     colours, alphas, _ = importlib.import_module("gsplat").rasterization(
         means=means,
@@ -126,13 +122,9 @@ def draw(
         eps2d=settings.low_pass,
         packed=False,
         backgrounds=None,
-        # "D" blends depths like colours; "ED" would divide them by alpha.
-        render_mode="RGB+D" if want_depth else "RGB",
         rasterize_mode="antialiased" if settings.antialias else "classic",
     )
-    image = colours.squeeze(1).movedim(-1, 1)
-    depth = image[:, C : C + 1] if want_depth else None
-    return image[:, :C], alphas.squeeze(1).movedim(-1, 1), depth
+    return colours.squeeze(1).movedim(-1, 1), alphas.squeeze(1).movedim(-1, 1)
 
 
 def _shapes(gaussians: Gaussians) -> dict[str, Tensor | None]:
@@ -190,7 +182,7 @@ def _measured_cap(device: torch.device) -> tuple[float | None, str]:
     camera = Camera(K, torch.eye(3, device=device)[None], torch.zeros(1, 3, device=device), (1, 1))
     try:
         with torch.no_grad():
-            alpha = draw(gaussians, camera, _PROBE, want_depth=True)[1]
+            alpha = draw(gaussians, camera, _PROBE)[1]
         return float(alpha), ""
     except Exception as error:  # no compiler, unknown GPU, other version: torch is used
         line = ": ".join([type(error).__name__, *str(error).strip().splitlines()[:1]])

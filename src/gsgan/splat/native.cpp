@@ -51,7 +51,7 @@ template <class T> int forward(Job& job, void** handle) {
     const Status status = bin(job, *plan);
     if (status != OK) return status;
     const Inputs<T> in(job);
-    auto scratch = scratches<T>(job, job.C + (job.out_depth != nullptr), false);
+    auto scratch = scratches<T>(job, job.C, false);
 #pragma omp parallel for schedule(dynamic, 1) num_threads(int(job.threads))
     for (int64_t t = 0; t < plan->tiles; ++t)
       forward_tile(job, in, *plan, t, *scratch[thread_index()]);
@@ -66,9 +66,9 @@ template <class T> int backward(Job& job, const void* handle) {
   try {
     const Plan<T>& plan = *static_cast<const Plan<T>*>(handle);
     const Inputs<T> in(job);
-    const int64_t channels = job.C + (job.g_depth != nullptr), stride = GEOMETRY + channels;
+    const int64_t stride = GEOMETRY + job.C;
     const int64_t budget = std::max<int64_t>(1, job.slot_bytes / int64_t(stride * sizeof(T)));
-    auto scratch = scratches<T>(job, channels, true);
+    auto scratch = scratches<T>(job, job.C, true);
     std::vector<int64_t> cursor(plan.gaussian_start.begin(), plan.gaussian_start.end() - 1);
     std::vector<double> sums(job.B * job.N * GEOMETRY, 0.0);
     Buffer<T> slots;

@@ -24,9 +24,9 @@ SLOT_BYTES = 1 << 28
 _OUT_OF_MEMORY, _NOT_FINITE = 1, 2
 
 _INPUTS = ("means", "factors", "opacities", "features", "depths", "extents")
-_OUTPUTS = ("out_features", "out_alpha", "out_depth", "out_average")
-_GRADS_OUT = ("g_features", "g_alpha", "g_depth", "g_average")
-_GRADS_IN = ("d_means", "d_factors", "d_opacities", "d_features", "d_depths")
+_OUTPUTS = ("out_features", "out_alpha", "out_average")
+_GRADS_OUT = ("g_features", "g_alpha", "g_average")
+_GRADS_IN = ("d_means", "d_factors", "d_opacities", "d_features")
 AVERAGES = (1, 2, 4, 8)  # supersampling that is averaged here: divisors of a tile
 
 _Job = build.job_type(
@@ -51,12 +51,8 @@ def why_not() -> str:
 
 
 def composite(
-    projected: Projected,
-    size: tuple[int, int],
-    settings: Accuracy,
-    want_depth: bool,
-    times: int = 1,
-) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
+    projected: Projected, size: tuple[int, int], settings: Accuracy, times: int = 1
+) -> tuple[Tensor, Tensor, Tensor | None]:
     """Blends ellipses front to back on the CPU.
 
     Convention: pixel centres at +0.5; ``alpha = min(alpha_max, o exp(-q / 2))`` inside the extent,
@@ -71,23 +67,20 @@ def composite(
         size: (H, W) pixels.
         settings: alpha_min, transmittance_min, alpha_max, and whether the extent is ``sigma``:
             only then ``projected.extents`` cut off pixels.
-        want_depth: whether to blend depths too.
         times: one of ``AVERAGES``: above 1 features and alpha are also averaged over so many pixels
             each way.
 
     Returns:
         features ``[B, C, H, W]`` premultiplied, channels last where they are averaged; alpha
-        ``[B, 1, H / times, W / times]``, depth ``[B, 1, H, W]`` or None, and averaged features
-        ``[B, C, H / times, W / times]`` or None.
-        Differentiable once in means, factors, opacities, features, and in depths through the depth
-        output.
+        ``[B, 1, H / times, W / times]``, and averaged features ``[B, C, H / times, W / times]`` or
+        None. Differentiable once in means, factors, opacities and features.
 
     Raises:
         ValueError: on a visible Gaussian that is not finite.
 
     Source: paper Sec. 3.1; tiles after 3D Gaussian splatting, gradients derived in native.cpp.
     """
-    composed: tuple[Tensor, Tensor, Tensor | None, Tensor | None] = _Composite.apply(
+    composed: tuple[Tensor, Tensor, Tensor | None] = _Composite.apply(
         projected.means,
         projected.factors,
         projected.opacities,
@@ -95,7 +88,7 @@ def composite(
         projected.depths,
         projected.extents,
         projected.visible,
-        *(size, settings, want_depth, times, torch.is_grad_enabled()),
+        *(size, settings, times, torch.is_grad_enabled()),
     )
     return composed
 
@@ -125,10 +118,9 @@ class _Composite(torch.autograd.Function):
         visible: Tensor,
         size: tuple[int, int],
         settings: Accuracy,
-        want_depth: bool,
         times: int,
         grad_enabled: bool,
-    ) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
         tensors = [means, factors, opacities, features, depths, extents]
         inputs = [x.detach().contiguous() for x in tensors]
         shown = visible.contiguous()
@@ -142,7 +134,6 @@ class _Composite(torch.autograd.Function):
         outputs = [
             drawn,
             zeros((B, 1, *coarse), dtype),
-            zeros((B, 1, *size), dtype) if want_depth else None,
             zeros((B, C, *coarse), dtype) if times > 1 else None,
         ]
         job = _job(size, settings, inputs, shown, times)
@@ -168,15 +159,10 @@ class _Composite(torch.autograd.Function):
         if ctx.times > 1 and grads[0] is not None:
             incoming[0] = grads[0].contiguous(memory_format=torch.channels_last)
         build.point(job, _GRADS_OUT, incoming)
-        with_depth = incoming[2] is not None
-        outgoing: list[Tensor | None] = [
-            torch.zeros_like(x) for x in inputs[: 5 if with_depth else 4]
-        ]
+        outgoing = [torch.zeros_like(x) for x in inputs[: len(_GRADS_IN)]]
         build.point(job, _GRADS_IN, outgoing)
         run = build.function("backward", inputs[3].dtype)
         _raise_for(run(ctypes.byref(job), ctx.plan.pointer), job)
-        if not with_depth:
-            outgoing.append(None)
         needed = [
             g if need else None for g, need in zip(outgoing, ctx.needs_input_grad, strict=False)
         ]

@@ -26,7 +26,6 @@ def rasterise(
     *,
     settings: Accuracy | str = "high",
     backend: str = "auto",
-    depth: bool = False,
 ) -> Raster:
     """Draws Gaussians as a camera sees them.
 
@@ -41,10 +40,9 @@ def rasterise(
         backend: ``auto`` (the fastest on the device; its differences from the settings are logged
             once), ``reference``, ``torch``, ``native`` or ``gsplat``. A backend that cannot be used
             is replaced by ``torch``, and the reason is logged once.
-        depth: whether to return the depth (metres times alpha).
 
     Returns:
-        features ``[B, C, H, W]``, alpha ``[B, 1, H, W]`` and depth, in the Gaussians' dtype; with
+        features ``[B, C, H, W]`` and alpha ``[B, 1, H, W]``, in the Gaussians' dtype; with
         supersampling also the features before averaging.
 
     Raises:
@@ -55,7 +53,7 @@ def rasterise(
     """
     settings = accuracy(settings) if isinstance(settings, str) else settings
     if torch.compiler.is_compiling():
-        return _recorded(gaussians, camera, settings, backend, depth)
+        return _recorded(gaussians, camera, settings, backend)
     checks.check(gaussians, camera)
     if camera.dist is not None:
         gaussians, camera = as_pinhole_sees(gaussians, camera, settings.near)
@@ -70,13 +68,13 @@ def rasterise(
     if times > 1:
         drawn = camera.resize((camera.size[0] * times, camera.size[1] * times))
     with tiles.full_precision(gaussians.means.device):
-        features, alpha, z, average = _draw(name, gaussians, drawn, settings, depth)
+        features, alpha, average = _draw(name, gaussians, drawn, settings)
         if times > 1:
             fine = features.to(out)
             if average is None:
                 average, alpha = avg_pool2d(features, times), avg_pool2d(alpha, times)
-            features, z = average, None if z is None else avg_pool2d(z, times)
-    return Raster(features.to(out), alpha.to(out), None if z is None else z.to(out), fine)
+            features = average
+    return Raster(features.to(out), alpha.to(out), fine)
 
 
 def resolve_backend(name: str, device: torch.device, settings: Accuracy) -> tuple[str, str]:
@@ -112,19 +110,19 @@ def resolve_backend(name: str, device: torch.device, settings: Accuracy) -> tupl
 
 
 def _draw(
-    name: str, gaussians: Gaussians, camera: Camera, settings: Accuracy, depth: bool
-) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
-    """Features, alpha and depth by one backend; where it averages what is supersampled, alpha is
-    averaged, and averaged features follow."""
+    name: str, gaussians: Gaussians, camera: Camera, settings: Accuracy
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Features and alpha by one backend; where it averages what is supersampled, alpha is averaged,
+    and averaged features follow."""
     if name == "gsplat":
-        return *gsplat_backend.draw(gaussians, camera, settings, depth), None
+        return *gsplat_backend.draw(gaussians, camera, settings), None
     if name == "native":
         projected = native_project.project(gaussians, camera, settings)
         times = settings.supersample if settings.supersample in native.AVERAGES else 1
-        return native.composite(projected, camera.size, settings, depth, times)
+        return native.composite(projected, camera.size, settings, times)
     projected = project(gaussians, camera, settings)
     composite = reference.composite if name == "reference" else tiles.composite
-    return *composite(projected, camera.size, settings, depth), None
+    return *composite(projected, camera.size, settings), None
 
 
 def _warn_once(message: str) -> None:
@@ -136,18 +134,16 @@ def _warn_once(message: str) -> None:
 # -- what torch.export records
 
 
-def _recorded(
-    gaussians: Gaussians, camera: Camera, settings: Accuracy, backend: str, depth: bool
-) -> Raster:
+def _recorded(gaussians: Gaussians, camera: Camera, settings: Accuracy, backend: str) -> Raster:
     """The operator that ``torch.export`` records in place of `rasterise`, without gradient."""
-    assert gaussians.covariances is not None and not depth  # noqa: PT018  (as avatars splat)
+    assert gaussians.covariances is not None  # as avatars splat
     features, alpha, fine = _rasterise(
         *(gaussians.means, gaussians.covariances, gaussians.opacities, gaussians.features),
         *(camera.K, camera.R, camera.t, camera.dist, *camera.size),
         json.dumps(asdict(settings)),
         backend,
     )
-    return Raster(features, alpha, None, fine if settings.supersample > 1 else None)
+    return Raster(features, alpha, fine if settings.supersample > 1 else None)
 
 
 @torch.library.custom_op("gsgan::rasterise", mutates_args=())

@@ -11,34 +11,27 @@ CHUNK_ELEMENTS = 1 << 22
 
 
 def composite(
-    projected: Projected, size: tuple[int, int], settings: Accuracy, want_depth: bool
-) -> tuple[Tensor, Tensor, Tensor | None]:
+    projected: Projected, size: tuple[int, int], settings: Accuracy
+) -> tuple[Tensor, Tensor]:
     """Blends ellipses front to back, ties by index.
 
     Args:
         projected: the ellipses.
         size: (H, W) pixels.
         settings: honours alpha_min, transmittance_min, alpha_max and a ``sigma`` extent.
-        want_depth: whether to blend depths too.
 
     Returns:
-        features ``[B, C, H, W]`` premultiplied, alpha ``[B, 1, H, W]``, depth ``[B, 1, H, W]`` or
-        None.
+        features ``[B, C, H, W]`` premultiplied, alpha ``[B, 1, H, W]``.
 
     Source: paper Sec. 3.1, ``C = Σ c_i α_i Π_{j<i} (1 - α_j)``.
     """
     front_to_back = _sorted(projected)
-    values = front_to_back.features
-    if want_depth:
-        depths = front_to_back.depths.to(values.dtype)
-        values = torch.cat([values, depths.unsqueeze(-1)], dim=-1)
     chunks = []
     for pixels in _pixel_chunks(projected, size):
         weights, left = _blend(_alphas(front_to_back, pixels, settings), settings)
-        chunks.append(torch.cat([weights @ values, 1 - left], dim=-1))
+        chunks.append(torch.cat([weights @ front_to_back.features, 1 - left], dim=-1))
     image = torch.cat(chunks, dim=1).mT.unflatten(-1, size)
-    C = front_to_back.features.shape[-1]
-    return image[:, :C], image[:, -1:], image[:, C : C + 1] if want_depth else None
+    return image[:, : projected.features.shape[-1]], image[:, -1:]  # zeros where N is 0
 
 
 def _sorted(projected: Projected) -> Projected:

@@ -31,28 +31,24 @@ U_MAX = 1e15
 
 
 def composite(
-    projected: Projected, size: tuple[int, int], settings: Accuracy, want_depth: bool
-) -> tuple[Tensor, Tensor, Tensor | None]:
+    projected: Projected, size: tuple[int, int], settings: Accuracy
+) -> tuple[Tensor, Tensor]:
     """Blends ellipses front to back, ties by index.
 
     Args:
         projected: the ellipses.
         size: (H, W) pixels.
         settings: alpha_min, transmittance_min, alpha_max, and the extent of ``projected``.
-        want_depth: whether to blend depths too.
 
     Returns:
-        features ``[B, C, H, W]`` premultiplied, alpha ``[B, 1, H, W]``, depth ``[B, 1, H, W]`` or
-        None.
+        features ``[B, C, H, W]`` premultiplied, alpha ``[B, 1, H, W]``.
 
     Source: paper Sec. 3.1; Kerbl et al., 3D Gaussian splatting (tiles).
     """
     tiling = Tiling.for_device(projected.means.device)
     C = projected.features.shape[-1]
-    # Depth and alpha are blended like features; the value of alpha is 1 in every layer.
+    # Alpha is blended like features; its value is 1 in every layer.
     values = [projected.features, torch.ones_like(projected.features[..., :1])]
-    if want_depth:
-        values.append(projected.depths.to(projected.features.dtype).unsqueeze(-1))
     geometry = torch.cat([projected.means, projected.factors], dim=-1)
     with torch.no_grad():
         lists = tile_lists(projected, size, settings, tiling)
@@ -62,7 +58,7 @@ def composite(
     alpha = blended[:, C : C + 1]
     # Rounding may sum the weights to 1 + 1e-7; the gradient must not stop there.
     alpha = alpha - (alpha.detach() - 1).clamp_min(0)
-    return blended[:, :C], alpha, blended[:, C + 1 :] if want_depth else None
+    return blended[:, :C], alpha
 
 
 @contextmanager

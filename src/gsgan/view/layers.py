@@ -1,43 +1,35 @@
 """The viewer's layers: the image, or one of the maps that it is made from."""
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from gsgan.metrics.segmentation import colour_labels
 from gsgan.model.avatar import Avatar
 from gsgan.model.rendering import Rendering
-from gsgan.scene import Camera
-from gsgan.splat import rasterise
 from gsgan.utils.images import eight_bits
 
 Bytes = NDArray[np.uint8]
 
 IMAGE, COLOUR, PARTS, ALPHA = "image", "Step I's colour", "segmentation S", "alpha"
-DEPTH = "depth"
 
 
 def layers(avatar: Avatar) -> tuple[str, ...]:
     """The layers of an avatar."""
     names = [IMAGE, ALPHA]
     if avatar.splats is not None:
-        names += [COLOUR, DEPTH]
+        names.append(COLOUR)
     if avatar.segmentation is not None:
         names.append(PARTS)
     return tuple(names)
 
 
-def shown(
-    layer: str, rendering: Rendering, camera: Camera, avatar: Avatar, behind: Tensor
-) -> Bytes:
+def shown(layer: str, rendering: Rendering, behind: Tensor) -> Bytes:
     """``[H, W, 3]`` one layer of a rendering.
 
     Args:
         layer: of `layers`.
         rendering: with maps, unless the layer is the image.
-        camera: of the rendering, on any device.
-        avatar: that was rendered.
         behind: ``[3, H, W]`` the background.
     """
     assert rendering.image is not None and rendering.alpha is not None  # noqa: PT018
@@ -49,35 +41,8 @@ def shown(
         return np.asarray((colours.permute(1, 2, 0) * 255).byte().cpu().numpy())
     if layer == COLOUR and rendering.features is not None and rendering.splat_alpha is not None:
         return eight_bits(rendering.features[0, :3].cpu(), rendering.splat_alpha[0].cpu(), behind)
-    if layer == DEPTH and rendering.gaussians is not None:
-        return _depth(rendering, camera, avatar)
     return eight_bits(image, alpha, behind)
-
-
-def _depth(rendering: Rendering, camera: Camera, avatar: Avatar) -> Bytes:
-    gaussians = rendering.gaussians
-    assert gaussians is not None
-    camera = camera.to(gaussians.means.device)
-    raster = rasterise(gaussians, camera, settings=avatar.accuracy, depth=True)
-    assert raster.depth is not None
-    alpha = raster.alpha[0, 0].cpu()
-    metres = raster.depth[0, 0].cpu() / alpha.clamp_min(1e-6)
-    seen = alpha > 0.5
-    mean = torch.where(seen, metres, 0.0).sum() / seen.sum().clamp_min(1)
-    near = 1 - _stretched(torch.where(seen, metres, mean))
-    return _coloured(near) * seen.numpy()[..., None]
-
-
-def _stretched(x: Tensor) -> Tensor:
-    low, high = torch.aminmax(x)
-    return (x - low) / (high - low).clamp_min(1e-6)
 
 
 def _grey(x: Tensor) -> Bytes:
     return np.repeat((x.clamp(0, 1) * 255).byte().numpy()[..., None], 3, axis=2)
-
-
-def _coloured(x: Tensor) -> Bytes:
-    import matplotlib
-
-    return np.asarray(matplotlib.colormaps["turbo"](x.clamp(0, 1).numpy(), bytes=True)[..., :3])

@@ -254,7 +254,7 @@ class Session:
         if avatar.poses is not None:
             self.far.value = f"{float(avatar.poses.distance(p)):.1f}"
         behind = self.show.behind(camera.size)
-        self.image = drawn = shown(layer, rendering, camera, avatar, behind)
+        self.image = drawn = shown(layer, rendering, behind)
         if self.splats.value and rendering.gaussians is not None:  # the browser draws these instead
             drawn = eight_bits(behind, torch.ones(1), behind)
         self.client.scene.set_background_image(drawn, "jpeg", jpeg_quality=90)

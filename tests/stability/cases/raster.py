@@ -50,9 +50,17 @@ def raster_case(
 
 
 def render(inputs: Inputs, backend: str, *, size: Size, settings: Accuracy) -> dict[str, Tensor]:
-    """Features, alpha and depth of a scene."""
-    raster = rasterise(*records(inputs, size), settings=settings, backend=backend, depth=True)
-    return {"features": raster.features, "alpha": raster.alpha, "depth": raster.depth}
+    """Features, alpha and depth of a scene; depths are drawn as one more channel."""
+    gaussians, camera = records(inputs, size)
+    # in float64, as the rasteriser computes geometry
+    wide = camera.to(torch.float64).to_camera(gaussians.means.double())
+    depths = wide[..., 2:].to(gaussians.means)
+    values = torch.cat([gaussians.features, depths], dim=-1)
+    raster = rasterise(
+        replace(gaussians, features=values), camera, settings=settings, backend=backend
+    )
+    features, depth = raster.features[:, :-1], raster.features[:, -1:]
+    return {"features": features, "alpha": raster.alpha, "depth": depth}
 
 
 def rendered(

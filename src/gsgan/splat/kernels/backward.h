@@ -118,7 +118,6 @@ template <class T> void load_gradients(const Job& job, const Tile& tile, Scratch
     else
       std::fill_n(to, PIXELS, T(0));
   };
-  if (job.g_depth) read(job.g_depth, tile.b, s.image.get() + job.C * PIXELS);
   if (job.times == 1) {
     for (int64_t c = 0; c < job.C; ++c)
       read(job.g_features, tile.b * job.C + c, s.image.get() + c * PIXELS);
@@ -148,7 +147,7 @@ void backward_tile(const Job& job, const Inputs<T>& in, const Plan<T>& plan, int
   const int64_t start = plan.tile_start[index], end = plan.tile_start[index + 1];
   if (start == end) return;
   const Tile tile = tile_at(job, plan, index);
-  const int64_t channels = job.C + (job.g_depth != nullptr), stride = GEOMETRY + channels;
+  const int64_t channels = job.C, stride = GEOMETRY + channels;
   const Cutoffs<T> cut(job);
   load_gradients(job, tile, s);
   std::fill_n(s.behind.get(), PIXELS, T(0));
@@ -178,10 +177,8 @@ void backward_tile(const Job& job, const Inputs<T>& in, const Plan<T>& plan, int
 template <class T>
 void reduce(const Job& job, const Plan<T>& plan, const T* slots, int64_t from, int64_t to,
             std::vector<int64_t>& cursor, double* sums) {
-  const int64_t total = job.B * job.N, channels = job.C + (job.g_depth != nullptr);
-  const int64_t stride = GEOMETRY + channels;
+  const int64_t total = job.B * job.N, stride = GEOMETRY + job.C;
   T* d_features = static_cast<T*>(job.d_features);
-  double* d_depths = job.d_depths;
 #pragma omp parallel for schedule(static) num_threads(int(job.threads))
   for (int64_t i = 0; i < total; ++i) {
     for (; cursor[i] < plan.gaussian_start[i + 1]; ++cursor[i]) {
@@ -190,7 +187,6 @@ void reduce(const Job& job, const Plan<T>& plan, const T* slots, int64_t from, i
       const T* slot = slots + (entry - from) * stride;
       for (int k = 0; k < GEOMETRY; ++k) sums[GEOMETRY * i + k] += slot[k];
       for (int64_t c = 0; c < job.C; ++c) d_features[i * job.C + c] += slot[GEOMETRY + c];
-      if (d_depths) d_depths[i] += slot[GEOMETRY + job.C];
     }
   }
 }

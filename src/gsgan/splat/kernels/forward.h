@@ -68,10 +68,9 @@ void forward_tile(const Job& job, const Inputs<T>& in, Plan<T>& plan, int64_t in
   const int64_t start = plan.tile_start[index], end = plan.tile_start[index + 1];
   if (start == end) return;
   const Tile tile = tile_at(job, plan, index);
-  const int64_t plane = job.H * job.W, channels = job.C + (job.out_depth != nullptr);
+  const int64_t plane = job.H * job.W, channels = job.C;
   T* features = static_cast<T*>(job.out_features) + tile.b * job.C * plane;
   T* alpha = static_cast<T*>(job.out_alpha) + tile.b * (plane / (job.times * job.times));
-  T* depth = job.out_depth ? static_cast<T*>(job.out_depth) + tile.b * plane : nullptr;
   const Cutoffs<T> cut(job);
   start_transmittance(tile, s.transmittance.get());
   std::fill_n(s.image.get(), channels * PIXELS, T(0));
@@ -88,7 +87,6 @@ void forward_tile(const Job& job, const Inputs<T>& in, Plan<T>& plan, int64_t in
   }
   plan.chunks_done[index] = chunk;
   for (int k = 0; k < PIXELS; ++k) s.transmittance[k] = T(1) - s.transmittance[k];
-  if (depth) write_plane(depth, job.W, tile, s.image.get() + job.C * PIXELS);
   if (job.times == 1) {
     for (int64_t c = 0; c < job.C; ++c)
       write_plane(features + c * plane, job.W, tile, s.image.get() + c * PIXELS);

@@ -25,11 +25,10 @@ struct Job {
   const double* depths;  // in T, close ones could be equal
   const void* extents;
   const uint8_t* visible;
-  void *out_features, *out_alpha, *out_depth, *out_average;  // zeros on entry
-  const void *g_features, *g_alpha, *g_depth, *g_average;
+  void *out_features, *out_alpha, *out_average;  // zeros on entry
+  const void *g_features, *g_alpha, *g_average;
   double *d_means, *d_factors;
   void *d_opacities, *d_features;
-  double* d_depths;
   int64_t bad;  // out: index of a Gaussian that is not finite
 };
 

@@ -13,7 +13,7 @@ constexpr int GROUP = 8;     // channels per register block
 constexpr int GEOMETRY = 6;  // sums per entry before the features', see entry_geometry
 template <class T> constexpr int SUBS = LANES / Simd<T>::W;  // registers per cell
 
-// One thread's working memory; channels: C, plus 1 with depth.
+// One thread's working memory.
 template <class T> struct Scratch {
   Scratch(int64_t channels, bool backward)
       : features(CHUNK * channels),
@@ -171,8 +171,7 @@ void load_chunk(const Job& job, const Inputs<T>& in, const Plan<T>& plan, const 
     s.ex[k] = g.ex;
     s.ey[k] = g.ey;
     T* f = s.features.get() + k * channels;
-    for (int64_t j = 0; j < job.C; ++j) f[j] = in.features[i * job.C + j];
-    if (channels > job.C) f[job.C] = T(in.depths[i]);
+    for (int64_t j = 0; j < channels; ++j) f[j] = in.features[i * channels + j];
     uint32_t mask = again ? plan.cells[start + k]
                           : reached_cells(s.place[k], g.ex, g.ey, g.level);
     if (job.keep) plan.cells[start + k] = uint16_t(mask);
