@@ -107,7 +107,7 @@ STAGES = {
             *("masks={base}/project/masks", "workers=1", "out={out}/dataset"),
         ],
     ),
-    "fit": Stage("fit", [*FIT, "data.root={out}", "device=cpu", "shown=1"], "people"),
+    "fit": Stage("fit", [*FIT, "data.root={out}", "device=cpu"], "people"),
     "train": Stage("train", [*TINY, "hydra.run.dir={out}/run"], share=1.5),
     "evaluate": Stage("evaluate", ["run={out}", "device=cpu"], "run"),
     "render": Stage(

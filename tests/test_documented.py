@@ -292,7 +292,7 @@ def test_every_documented_command_runs(line, place, capture, execute, tmp_path, 
         arguments = tiny_bench(Path(name).stem, arguments, capture)
     if name == "gsgan.fit":
         arguments += ["size.image=32", "fit.points=200", "fit.surface_steps=2"]
-        arguments += ["fit.sweeps=1", "shown=1", f"out={tmp_path / 'fit'}"]
+        arguments += ["fit.sweeps=1", f"out={tmp_path / 'fit'}"]
     if name == "gsgan.prepare":  # MediaPipe is not at hand: its output is given
         source = next(a for a in arguments if a.startswith("source=")).removeprefix("source=")
         arguments = [a for a in arguments if a != "setup=true"]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from commands import ENVIRONMENT, TINY, arguments, refused, train
+from commands import ENVIRONMENT, arguments, refused
 
 METRICS = {"psnr", "ssim", "lpips", "edge_f1", "miou"}
 
@@ -162,25 +162,6 @@ def test_a_folder_with_another_run_is_not_overwritten(run, capture, inside):
     assert (run / "checkpoints" / "last.ckpt").read_bytes() == before
 
 
-@pytest.mark.slow
-def test_multirun_trains_and_scores_each_model(capture, tmp_path, inside):
-    models = ["splat_only", "wo_feat"]
-    result = inside(
-        "train", "-m", f"model={','.join(models)}", *TINY, f"data.root={capture}",
-        f"hydra.sweep.dir={tmp_path / 'sweep'}",
-    )  # fmt: skip
-    assert result.returncode == 0, result.stdout + result.stderr
-    found = sorted((tmp_path / "sweep").rglob("metrics.json"))
-    assert len(found) == 2
-    for path, model in zip(found, models, strict=True):
-        assert f"model-{model}_" in path.parent.name
-    scores = json.loads(found[0].read_text())["novel_pose"]
-    assert scores["full"]["psnr"] == scores["splat"]["psnr"]
-    assert scores["full"]["miou_reason"] == "the model has no segmentation"
-    again = inside("evaluate", f"run={found[0].parent}")  # no "=" or "," in the folder's name
-    assert again.returncode == 0, again.stderr
-
-
 def test_the_papers_command_fails_only_for_the_missing_path(inside):
     refused(inside("train", "model=full", "data=thuman4"), "data.root is not set")
     missing = inside("train", "data=zju_mocap", "data.root=/nowhere")
@@ -217,16 +198,6 @@ def test_an_image_that_cannot_be_read_ends_in_one_sentence(capture, tmp_path, in
 )
 def test_a_wrong_value_ends_in_one_sentence(capture, tmp_path, inside, argument, words):
     refused(inside("train", *arguments(capture, tmp_path / "run"), argument), *words)
-
-
-@pytest.mark.slow
-def test_two_processes_train_together_and_one_scores(capture, tmp_path):
-    """trainer=ddp on two CPU processes (gloo)."""
-    given = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"]
-    result = train(capture, tmp_path / "ddp", *given, "trainer.precision=32-true")
-    assert result.returncode == 0, result.stdout + result.stderr
-    assert (tmp_path / "ddp" / "metrics.json").is_file()
-    assert result.stdout.count("run folder:") == 1
 
 
 def test_a_name_that_hydra_does_not_know_ends_in_a_sentence(capture, tmp_path, inside, monkeypatch):

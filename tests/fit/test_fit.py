@@ -286,18 +286,10 @@ def test_the_rims_of_an_undistorted_image_are_unsure(tmp_path):
     assert float(frame.unsure[0, 0, 24, 24]) == 0
 
 
-def test_the_image_shows_every_camera(fit, tmp_path):
-    fit("shown=2")
-    picture = cv2.imread(str(tmp_path / "out/body_fit.png"))
-    assert picture.shape[1] == 3 * 300
-    assert picture.shape[0] > 2 * 300
-
-
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
         (["out=/proc/no"], "cannot be written"),
-        (["shown=0"], "shown must be"),
         (["fit.sweeps=0"], "fit.sweeps"),
         (["fit.points=2.5"], "fit.points"),
         (["fit.noise=0"], "fit.noise"),

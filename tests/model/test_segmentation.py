@@ -165,25 +165,6 @@ def test_hands_only_are_two_classes_and_all_else_background_that_hides():
     assert (S[:, 0][trunk] > 0.9).all()  # the body is background
 
 
-def test_the_trunk_hides_a_hand_behind_it():
-    """Seen from behind, hands before the belly: they must not shine through."""
-    body, K, t = free_body(), facing_camera().K, facing_camera().t
-    segmentation = Segmentation(body, points=2500, mode="hands")
-    back = Camera(K, torch.tensor([[[-1.0, 0, 0], [0, 0, -1.0], [0, -1.0, 0]]]), t, (SIZE, SIZE))
-    pose = rest_pose()
-    with torch.no_grad():
-        points = segmentation.points
-        hand = body.vertex_labels[points.chosen] == body.label_names.index("left_hand")
-        # The hand's vertices moved before the trunk, at the front (the body faces -y).
-        chest = body.landmarks[[11, 12, 23, 24]].mean(0)
-        shift = chest + torch.tensor([0.0, -0.25, 0.0]) - points.means[hand].mean(0)
-        points.means[hand] += shift
-        before = segmentation(pose, facing_camera())[0, 1]
-        behind = segmentation(pose, back)[0, 1]
-    assert float(before.sum()) > 4
-    assert float(behind.sum()) < 0.02 * float(before.sum())
-
-
 def test_classes_of_modes_and_labels_without_a_vertex():
     names = ("background", "hat", "left_hand", "coat", "right_hand", "face")
     vertices = torch.tensor([2, 4, 4, 3])

@@ -3,11 +3,9 @@
 import json
 import re
 
-import cv2
-import numpy as np
 import pytest
 from omegaconf import OmegaConf
-from report_folders import report_of, row, table, texts, write_run
+from report_folders import write_run
 
 from gsgan.report.runs import find_runs, read_run, read_runs
 from gsgan.utils.errors import ConfigError, DataError
@@ -103,23 +101,3 @@ def test_it_reads_what_evaluate_writes(run):
     assert (read.name, read.seed) == ("full", 0)
     assert read.data["fingerprint"] == facts["data"]["fingerprint"]
     assert read.settings["training.schedule.epoch"] == 4
-
-
-def test_scored_predictions_stand_beside_a_run(run, capture, tmp_path, inside):
-    """A method's black images have exactly the floor's scores."""
-    from gsgan.model.assemble import build_data
-    from gsgan.model.stored import load_config
-
-    for camera, frame in build_data(load_config(run)).dataset("novel_pose").items:
-        path = tmp_path / "black" / "novel_pose" / camera / f"{frame:06d}.png"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(path), np.zeros((32, 32, 3), np.uint8))
-    given = ["data=capture", "data.size=32", "data.crop=null", f"data.root={capture}"]
-    given += ["splits=[novel_pose]"]
-    result = inside("evaluate", f"predictions={tmp_path / 'black'}", *given)
-    assert result.returncode == 0, result.stderr
-    report = report_of(table(metrics=["psnr"]), run, tmp_path / "black_scores")
-    (grid,) = report.grids
-    assert [r.label for r in grid.rows] == ["full", "black", "all background (floor)"]
-    assert texts(row(grid, "black")) == texts(row(grid, "all background (floor)"))
-    assert row(grid, "black").origin[0] == "1"

@@ -63,21 +63,6 @@ def test_latex_is_escaped_balanced_and_rectangular(report):
     assert r"Left out: bad\_run: damaged \textless{}x\textgreater{}" in text
 
 
-@pytest.mark.parametrize(
-    ("raw", "spelled"),
-    [
-        ("a_b 50%", r"a\_b 50\%"),
-        ("\\{x}", r"\textbackslash{}\{x\}"),
-        ("~^", r"\textasciitilde{}\textasciicircum{}"),
-        ("1 ± −2", r"1 $\pm$ $-$2"),
-        ("[0, 1]\n*a", "{[}0, 1{]} {*}a"),  # after \\\\ they would be an argument, a command
-        ("é π", r"é {[}U+03C0{]}"),
-    ],
-)
-def test_latex_escapes(raw, spelled):
-    assert write.LATEX.escape(raw) == spelled
-
-
 def test_the_terminal_shows_it_all_without_markup(report):
     console = Console(record=True, width=160)
     console.print(Markdown(write.TERMINAL.body(report)))

@@ -39,13 +39,12 @@ def test_rate_holds_then_descends_to_its_end():
 
 @pytest.mark.parametrize(("shape", "half"), [("linear", 0.505), ("exponential", 0.1)])
 def test_rate_shapes(shape, half):
-    rate = Rate(peak=1.0, hold=0.0, until=0.5, final=0.01, shape=shape)
-    assert math.isclose(rate.at(25, 0, 100), half, rel_tol=1e-9)
-    assert math.isclose(rate.at(50, 0, 100), 0.01, rel_tol=1e-9)
-    assert math.isclose(rate.at(99, 0, 100), 0.01, rel_tol=1e-9)
+    rate = Rate(peak=1.0, hold=0.0, final=0.01, shape=shape)
+    assert math.isclose(rate.at(50, 0, 100), half, rel_tol=1e-9)
+    assert math.isclose(rate.at(100, 0, 100), 0.01, rel_tol=1e-9)
 
 
-@pytest.mark.parametrize("wrong", [{"shape": "step"}, {"hold": 0.9, "until": 0.5}])
+@pytest.mark.parametrize("wrong", [{"shape": "step"}, {"hold": 1.1}])
 def test_impossible_rates_are_refused(wrong):
     with pytest.raises(ConfigError, match="rate"):
         Rate(**({"peak": 1.0} | wrong))

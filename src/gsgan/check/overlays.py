@@ -29,20 +29,12 @@ LEGEND = (
 )
 
 
-def strip(
-    subject: CheckedData,
-    views: Sequence[MaskView],
-    doubtful: Collection[int] = (),
-    named: bool = False,
-) -> bytes:
-    """A row of at least one tile as a JPEG; captions of ``doubtful`` frames are red.
-
-    Captions have the camera as well when ``named``.
-    """
+def strip(subject: CheckedData, views: Sequence[MaskView], doubtful: Collection[int] = ()) -> bytes:
+    """A row of at least one tile as a JPEG; captions of ``doubtful`` frames are red."""
     tiles = []
     for view in views:
         known, out = int(view.known.sum()), int(view.beyond.sum())
-        text = f"{view.camera}  " * named + f"{view.frame}   {known - out}/{known} inside"
+        text = f"{view.frame}   {known - out}/{known} inside"
         colour = OUTSIDE if view.frame in doubtful else NEUTRAL
         captioned = caption(tile(subject, view), text, colour)
         tiles += [captioned, np.full((len(captioned), GAP, 3), 255, np.uint8)]

@@ -186,20 +186,11 @@ def _frames(m: Measurements) -> Section:
         f"frames, masks in {counted(len(m.views), 'image')}. At most {TABLE_FRAMES} are listed; "
         "the JSON file has all."
     )
-    worst = sorted(
-        (view for view in m.views if view.frame in m.reasons),
-        key=lambda view: np.nan_to_num(view.inside),
-    )[: m.sampling.shown]
-    title = "Doubtful frames with most joints outside the mask"
-    figures = (
-        [Figure(title, overlays.strip(m.subject, worst, m.reasons, named=True))] if worst else []
-    )
     return Section(
         "Doubtful frames",
         (Table(("frame", "why"), table[:TABLE_FRAMES]),) if table else (),
         tuple(frame_findings(m.subject, m.doubts, m.limits)),
-        tuple(figures),
-        text,
+        text=text,
     )
 
 

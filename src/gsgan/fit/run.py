@@ -27,11 +27,10 @@ from gsgan.data.scene_info import refuse_swapped_sides
 from gsgan.data.validation import spans
 from gsgan.fit.fitter import Fit, Fitter
 from gsgan.fit.frames import MaskedFrames
-from gsgan.fit.report import REPORT, SHEET, fit_report, fit_sheet, summary
+from gsgan.fit.report import REPORT, fit_report, summary
 from gsgan.fit.shape import fit_hands, fit_offsets, fit_shape
 from gsgan.scene import BodyPose
 from gsgan.skeleton import TEMPLATES
-from gsgan.utils.checks import whole
 from gsgan.utils.console import make_console, progress
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import locked, write_atomically, write_json, write_npz, writing
@@ -50,11 +49,10 @@ def run_fit(config: DictConfig) -> Path:
     Raises:
         ConfigError, DataError: on anything the user can correct.
     """
-    whole("shown", config.shown, 1)
     settings: Fit = instantiate(config.fit)
     data: GsganData = instantiate(config.data, _convert_="all")
     device, out = pick_device(config.device), None if config.out is None else str(config.out)
-    return fit_body(data, settings, out, config.seed, device, config.shown, config.overwrite)
+    return fit_body(data, settings, out, config.seed, device, config.overwrite)
 
 
 def fit_before_training(data: GsganData, settings: DictConfig, device: torch.device) -> GsganData:
@@ -92,7 +90,6 @@ def fit_body(
     out: str | None = None,
     seed: int = 0,
     device: torch.device | None = None,
-    shown: int = 4,
     overwrite: bool = False,
 ) -> Path:
     """Fits the shape to the skeletons, solves the poses from them and registers them to the masks.
@@ -107,7 +104,6 @@ def fit_body(
         out: folder to write into; None for the capture's own.
         seed: of the order of frames and cameras.
         device: of the images; None for the CPU.
-        shown: number of frames in the image.
         overwrite: whether to replace the files of an earlier fit.
 
     Returns:
@@ -139,8 +135,6 @@ def fit_body(
     driven = _of_rows(poses[_by_hands(data)], rows).to(device)
     report = fit_report(fitter, shaped_body(shape).to(device), driven, found)
     kept = registered if settings.held_out or settings.keep else None
-    with writing(folder / SHEET):
-        write_atomically(folder / SHEET, fit_sheet(fitter, layout.camera_names, found, shown))
     write_json(folder / REPORT, report)
     _write_body(folder, data, frames, shape, poses, rows, kept)
     lines = summary(report, folder, frames)

@@ -123,12 +123,11 @@ _SHAPES = {
 
 @dataclass(frozen=True)
 class Rate:
-    """A learning rate over one span: warm-up, constant, descent, constant.
+    """A learning rate over one span: warm-up, constant, descent.
 
     Args:
         peak: the rate.
         hold: share of the span before the descent begins.
-        until: share of the span at which it ends.
         final: rate at the end, as a share of the peak.
         warmup: iterations of linear warm-up.
         shape: of the descent, ``cosine``, ``linear`` or ``exponential``.
@@ -136,20 +135,19 @@ class Rate:
 
     peak: float
     hold: float = 0.5
-    until: float = 1.0
     final: float = 0.0
     warmup: int = 0
     shape: str = "cosine"
 
     def __post_init__(self) -> None:
         one_of("rate.shape", self.shape, _SHAPES)
-        between("rate.hold", self.hold, 0, between("rate.until", self.until, 0, 1))
+        between("rate.hold", self.hold, 0, 1)
 
     def at(self, step: int, start: int, end: int) -> float:
         """The rate at iteration ``step`` of the span [start, end)."""
         done = (step - start) / max(1, end - start)
         scale = min(1.0, (step - start + 1) / (self.warmup + 1))
         if done > self.hold:
-            fallen = min(1.0, (done - self.hold) / max(1e-9, self.until - self.hold))
+            fallen = min(1.0, (done - self.hold) / max(1e-9, 1 - self.hold))
             scale *= _SHAPES[self.shape](fallen, self.final)
         return self.peak * scale
