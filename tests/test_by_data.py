@@ -49,9 +49,9 @@ def test_a_long_run_without_a_gpu_is_refused_with_its_price_until_it_is_asked_fo
 # --- factors that make baselines train equally long
 
 
-@pytest.mark.parametrize("model", ["splat_only", "lbs_splat", "image_to_image"])
+@pytest.mark.parametrize("model", ["splat_only", "harmonic", "lbs_splat", "image_to_image"])
 def test_a_baseline_is_stretched_by_an_experiment_only(compose, model):
     assert compose("train", f"model={model}", "training=paper").training.schedule.stretch == 1
-    study = compose("train", "experiment=ablation", f"model={model}")
+    study = compose("train", "experiment=study", f"model={model}")
     assert study.training.schedule.stretch == study.equal_time[model] > 1
-    assert compose("train", "experiment=ablation").training.schedule.stretch == 1
+    assert compose("train", "experiment=study").training.schedule.stretch == 1

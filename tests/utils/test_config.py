@@ -157,7 +157,7 @@ MANY = [f"training.recipes.psi.rate.{key}=0.{i}" for i, key in enumerate(("hold"
 ]
 
 
-@pytest.mark.parametrize("experiment", [[], ["experiment=ablation"]])
+@pytest.mark.parametrize("experiment", [[], ["experiment=study"]])
 def test_a_sweep_folder_has_a_name_that_file_systems_take(experiment, tmp_path):
     from hydra import compose, initialize_config_dir
     from omegaconf import open_dict
