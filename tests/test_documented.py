@@ -179,9 +179,7 @@ def place(capture, run, bare, on_body, model_file, tmp_path_factory):
         "/path/to/predictions": predictions,
         "/path/to/sweep": lambda: run,
         "data.test_frames=300-399": lambda: "data.test_frames=4-5",
-        "runs=runs/ablation_skeleton": lambda: f"runs={run.parent}",
-        "runs=runs/ablation_gan": lambda: f"runs={run.parent}",
-        "runs=runs/ablation": lambda: f"runs={run.parent}",
+        "runs=runs/study": lambda: f"runs={run.parent}",
     }
 
     def fill(line: str) -> str:

@@ -18,6 +18,7 @@ from timing import interleaved, median
 
 from gsgan.bench.common import NOTHING, check_whole, markdown, sentence
 from gsgan.effects import decide as decide_effects
+from gsgan.fit.before_training import fit_before_training
 from gsgan.model.assemble import build_data
 from gsgan.model.runs import load_avatar
 from gsgan.model.stored import load_config
@@ -122,8 +123,10 @@ def rows_of(config: DictConfig) -> Iterator[Row]:
             runs = {f"{effect}-off": off, f"{effect}-on": [*off, turn_on]} if config.train else {}
             yield Row(effect, effect, True, case.split, scene, runs)
         row = Row(effect, DEFAULT, not scene, case.split)
-        if config.train and (not scene or (config.default and case.get("elsewhere", True))):
-            row.runs = {"default-off": base, f"default-{effect}": [*base, turn_on]}
+        if config.train and not scene:  # the default person calls for it: the base has it
+            row.runs = {f"{effect}-off": [*base, f"effects.{effect}=off"], "default": base}
+        elif config.train and config.default and case.get("elsewhere", True):
+            row.runs = {"default": base, f"default-{effect}": [*base, turn_on]}
         yield row
 
 
@@ -131,7 +134,10 @@ def decide(row: Row, base: Sequence[str]) -> None:
     """Fills in whether `auto` turns the effect on in the scene, and its reason."""
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         config = compose("train", [*base, *row.overrides, f"effects.{row.effect}=auto"])
-    decisions = decide_effects(build_data(config).info, instantiate(config.effects))
+    data = build_data(config)
+    if data.lacks_body:
+        data = fit_before_training(data, config.fit, torch.device("cpu"))
+    decisions = decide_effects(data.info, instantiate(config.effects))
     found = getattr(decisions, row.effect)
     row.auto, row.why = found.on, found.why
 

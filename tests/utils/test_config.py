@@ -157,7 +157,7 @@ MANY = [f"training.recipes.psi.rate.{key}=0.{i}" for i, key in enumerate(("hold"
 ]
 
 
-@pytest.mark.parametrize("experiment", [[], ["experiment=study"]])
+@pytest.mark.parametrize("experiment", [[], ["experiment=study"], ["experiment=ablation_capture"]])
 def test_a_sweep_folder_has_a_name_that_file_systems_take(experiment, tmp_path):
     from hydra import compose, initialize_config_dir
     from omegaconf import open_dict
@@ -167,6 +167,7 @@ def test_a_sweep_folder_has_a_name_that_file_systems_take(experiment, tmp_path):
         config = compose("train", overrides=given, return_hydra_config=True)
     with open_dict(config):
         config.hydra.job.num = 7
+    assert Path(config.hydra.sweep.dir).parts[0] == "runs"  # resolved before Hydra knows its choices
     name = config.hydra.sweep.subdir
     assert len(name.encode()) <= LONGEST_NAME + 2
     assert not set(name) & set("[],=/ ")
