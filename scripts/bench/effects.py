@@ -18,7 +18,7 @@ from timing import interleaved, median
 
 from gsgan.bench.common import NOTHING, check_whole, markdown, sentence
 from gsgan.effects import decide as decide_effects
-from gsgan.fit.before_training import fit_before_training
+from gsgan.fit.run import fit_before_training
 from gsgan.model.assemble import build_data
 from gsgan.model.runs import load_avatar
 from gsgan.model.stored import load_config
