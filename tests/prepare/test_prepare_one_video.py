@@ -12,6 +12,7 @@ from rich.console import Console
 
 from gsgan.data.formats.capture import read_capture
 from gsgan.prepare.frames import look, sample
+from gsgan.prepare.one_camera import FOCAL, stated_focal
 from gsgan.prepare.one_view import Seen, solve_view
 from gsgan.prepare.options import Options
 from gsgan.prepare.run import prepare
@@ -141,6 +142,19 @@ def test_vertical_phone_videos_are_turned_as_their_metadata_say(tmp_path):
     assert recording.size == image.shape == (64, 32)
     assert image[:24].mean() > 200  # a quarter turn clockwise: left is up
     assert image[40:].mean() < 50
+
+
+@pytest.mark.parametrize(("stated", "found"), [("26", 26), ("26.500000", 26.5), ("", None)])
+def test_the_focal_length_that_a_phone_states(tmp_path, stated, found):
+    av, path = pytest.importorskip("av"), tmp_path / "phone.mov"
+    with av.open(str(path), "w", options={"movflags": "use_metadata_tags"}) as file:
+        if stated:
+            file.metadata[FOCAL] = stated
+        stream = file.add_stream("mpeg4", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        file.mux(stream.encode(av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8))))
+        file.mux(stream.encode())
+    assert stated_focal(path) == found
 
 
 def test_a_moving_camera_is_measured(tmp_path):

@@ -167,7 +167,7 @@ def test_a_sweep_folder_has_a_name_that_file_systems_take(experiment, tmp_path):
         config = compose("train", overrides=given, return_hydra_config=True)
     with open_dict(config):
         config.hydra.job.num = 7
-    assert Path(config.hydra.sweep.dir).parts[0] == "runs"  # resolved before Hydra knows its choices
+    assert Path(config.hydra.sweep.dir).parts[0] == "runs"  # without Hydra's own resolver
     name = config.hydra.sweep.subdir
     assert len(name.encode()) <= LONGEST_NAME + 2
     assert not set(name) & set("[],=/ ")

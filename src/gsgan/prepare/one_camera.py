@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,6 +36,8 @@ from gsgan.utils.errors import DataError
 
 FILM = np.hypot(36.0, 24.0)  # millimetres, the diagonal that equivalent focal lengths refer to
 USUAL = 30.0  # millimetres: phones' main cameras have 24 to 28 and record a part of their image
+# How Apple's phones state it, in millimetres; not which part of the image was recorded.
+FOCAL = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
 OVERCONFIDENT = 3.0  # errors of focal lengths over the solution's own estimate, on synthetic scenes
 DOUBTFUL = 3.0  # times the usual error of a frame
 SHORT, TURN = 8.0, 300  # seconds, degrees: less is in doubt
@@ -88,7 +91,10 @@ def solve_video(options: Options, stages: StageFolder, console: Console) -> Film
     check_enough(video, len(numbers), left)
     use = ~np.logical_or.reduce(list(left.values()))
     with console.status("solving for the camera, the body and its poses"):
-        view, guess = _solve(options, detected[use], time[use], source.size)
+        stated = stated_focal(video)
+        first = options.focal or stated or USUAL
+        guess = float(np.hypot(*source.size) * first / FILM)
+        view = _solve(options, detected[use], time[use], source.size, guess)
     doubtful = _doubtful(view)
     left["doubtful pose"] = np.zeros(len(use), bool)
     left["doubtful pose"][np.flatnonzero(use)[doubtful]] = True
@@ -114,6 +120,7 @@ def solve_video(options: Options, stages: StageFolder, console: Console) -> Film
     measured = _measured(view, camera, p, time[kept], seen, left) | {"background_moved": moved}
     calibration = Calibration(video, "estimated from the person", {camera.name: camera})
     fps = round(1 / float(np.median(np.diff(time))), 3)
+    measured |= {"focal_stated": stated}
     notes = tuple(_notes(measured, options, natural_height(view.shape)))
     inputs = Inputs({source.name: source}, calibration, (camera,), notes, fps)
     return Filmed(inputs, masks, numbers[kept], solution, measured)
@@ -165,11 +172,22 @@ def _read(path: Path, numbers: Ints, size: tuple[int, int]) -> tuple[Detected, B
     return detected, there
 
 
+def stated_focal(video: Path) -> float | None:
+    """The focal length in a video's metadata, in millimetres; None where they have none, or
+    without the extra ``render``."""
+    try:
+        import av
+    except ImportError:
+        return None
+    with av.open(str(video)) as file:
+        stated = re.match(r"[\d.]+", file.metadata.get(FOCAL, ""))
+    return float(stated[0]) or None if stated else None
+
+
 def _solve(
-    options: Options, seen: Detected, time: Float, size: tuple[int, int]
-) -> tuple[View, float]:
-    """The solution, and the focal length in pixels that it starts from."""
-    guess = float(np.hypot(*size) * (options.focal or USUAL) / FILM)
+    options: Options, seen: Detected, time: Float, size: tuple[int, int], guess: float
+) -> View:
+    """The solution, which starts from a focal length of so many pixels."""
     px, conf, world = seen.px[:, :BODY].copy(), seen.conf[:, :BODY].copy(), seen.world.copy()
     conf[conf <= options.solve.min_confidence] = 0
     swapped, mirror = exchanged(world[:, SWAPPED]), list(MEDIAPIPE33.mirror)
@@ -177,7 +195,7 @@ def _solve(
         values[swapped] = values[swapped][:, mirror]
     u = np.nan_to_num(px - np.array(size[::-1]) / 2) / guess
     given = Seen(*(torch.from_numpy(x) for x in (u, conf, world, time)))
-    return solve_view(given, options.landmark_noise, options.focal is None), guess
+    return solve_view(given, options.landmark_noise, options.focal is None)
 
 
 def _doubtful(view: View) -> Bool:
@@ -266,7 +284,9 @@ def _notes(found: Mapping[str, Any], options: Options, natural: float) -> list[s
     """Sentences on what was estimated, and on what is in doubt."""
     notes = [f"focal length {found['focal_px']:.0f} pixels, {found['focal_mm']:.0f} mm on film"]
     if options.focal is None:
-        notes[0] += f", ± {found['focal_uncertainty']:.0%}, estimated; focal=<mm> sets it"
+        stated = found["focal_stated"]
+        origin = f" from the {stated:g} mm that the file states" if stated else ""
+        notes[0] += f", ± {found['focal_uncertainty']:.0%}, estimated{origin}; focal=<mm> sets it"
     if options.height is None:
         notes.append(f"height {natural:.2f} m, as a usual body of this shape; height=<m> sets it")
     if found["left_out"]:
