@@ -34,6 +34,7 @@ from gsgan.bench.speed import (
     spread,
     without_denormals,
 )
+from gsgan.data.datamodule import GsganData
 from gsgan.metrics.image import edge_f1, psnr, ssim
 from gsgan.metrics.lpips import lpips
 from gsgan.model.assemble import build_data
@@ -60,6 +61,7 @@ QUALITIES = {
     "ssim": ("SSIM", 4, 1),
     "edge_f1": ("edge F1", 3, 1),
     "lpips": ("LPIPS", 4, -1),
+    "far": ("far PSNR dB", 2, 1),  # of another capture of the person, where one is given
 }
 ORDER = (BLACK, *COLOURS[:-1], GREY)  # the base point's first
 
@@ -151,8 +153,8 @@ def run(config: DictConfig, folder: Path) -> None:
     runs = trained(config, bench)
     subject = standard_run(runs).folder
     points = [*runs, *ways(subject, config.settings)]
-    painters, frames, marks = load(points, config, bench)
-    found, samples = measure(points, painters, frames, perceptual, config, bench)
+    painters, frames, far, marks = load(points, config, bench)
+    found, samples = measure(points, painters, frames, far, perceptual, config, bench)
     checkpoints = {p.folder: read_checkpoint(p.folder / CHECKPOINT) for p in runs}
     seconds = {folder: held["gsgan"]["train_seconds"] for folder, held in checkpoints.items()}
     frame = make_rows(points, found, samples, seconds)
@@ -164,7 +166,7 @@ def run(config: DictConfig, folder: Path) -> None:
         "rows": bench_common.records(frame),
         "front": [frame.label[i] for i in front(frame, config.quality)],
     }
-    second = "edge_f1" if perceptual is None else "lpips"
+    second = "far" if far else "edge_f1" if perceptual is None else "lpips"
     images = {"trade_off.png": plot(frame, [*dict.fromkeys((config.quality, second))])}
     docs = f"{page}\n\n![Quality against time per frame](images/trade_off.png)"
     bench.write("Quality against time", page, record, frame, images, docs=docs)
@@ -232,8 +234,9 @@ def ways(folder: Path, settings: Mapping[str, Any]) -> list[Point]:
 
 def load(
     points: Sequence[Point], config: DictConfig, bench: bench_common.Bench
-) -> tuple[list[Painter], list[Frame], list[str]]:
-    """A painter per point, the frames that all paint, and notes that the tables must carry.
+) -> tuple[list[Painter], list[Frame], list[Frame], list[str]]:
+    """A painter per point, the frames that all paint, those of ``far_root``, and notes that the
+    tables must carry.
 
     Raises:
         ConfigError: when the runs do not share their data, or the split has no frame.
@@ -253,8 +256,14 @@ def load(
         avatar, found = load_avatar(folder, stored, data)
         avatars[folder] = place(avatar, bench.device, channels_last=True)
         marks |= dict.fromkeys(found)
-    frames = [frame.to(bench.device) for frame in spread(data, config.images, config.split)]
-    return [Painter(avatars[point.folder], point.way) for point in points], frames, list(marks)
+
+    def shown(data: GsganData) -> list[Frame]:
+        return [frame.to(bench.device) for frame in spread(data, config.images, config.split)]
+
+    elsewhere = DataPaths(config.far_root, config.data_smpl)
+    far = shown(build_data(load_config(first, elsewhere))) if config.far_root else []
+    painters = [Painter(avatars[point.folder], point.way) for point in points]
+    return painters, shown(data), far, list(marks)
 
 
 def _content(config: DictConfig) -> dict[Any, Any]:
@@ -269,6 +278,7 @@ def measure(
     points: Sequence[Point],
     painters: Sequence[Painter],
     frames: Sequence[Frame],
+    far: Sequence[Frame],
     perceptual: Score | None,
     config: DictConfig,
     bench: bench_common.Bench,
@@ -288,6 +298,8 @@ def measure(
         for point, painter in zip(points, painters, strict=True):
             progress.update(task, description=f"scoring {point.factor} {point.label}")
             found.append(quality(painter, frames, perceptual))
+            if far:
+                found[-1]["far"] = quality(painter, far, None)["psnr"]
             progress.advance(task)
         progress.update(task, description="timing")
         samples = interleaved(

@@ -71,17 +71,19 @@ def test_surface_measures_each_part(script, tmp_path):
     assert table["training"]["landmarks, median"] < 5
 
 
-def test_trade_off_compares_a_multirun(script, tmp_path, run):
+def test_trade_off_compares_a_multirun(script, tmp_path, run, capture):
     for name in ("one", "two"):
         shutil.copytree(run, tmp_path / "sweep" / name)
     words = tmp_path / "sweep" / "two" / ".hydra" / "overrides.yaml"
     words.write_text(words.read_text() + "- twist=odd\n")
     given = [f"runs={tmp_path / 'sweep'}", "repeats=1", "images=1", "settings.scales=[0.5]"]
+    given.append(f"far_root={capture}")
     given += ["settings.accuracies=[draft]", "settings.backends=[]", "settings.precisions=[]"]
     assert not script("trade_off", *given)
     found = read(tmp_path, "trade_off")["rows"]
     assert [row["label"] for row in found] == ["base", "odd", "draft", "× 0.5", "whole image"]
     assert all(row["psnr"] > 5 and row["ms"] > 0 for row in found)
+    assert all(row["far"] == pytest.approx(row["psnr"]) for row in found)  # the same capture
     assert (tmp_path / "out" / "trade_off.png").is_file()
     assert "give either run=" in script("trade_off")
     assert "is not in struct" in script("trade_off", "colour=1")
