@@ -27,7 +27,7 @@ def main() -> None:
     if sys.argv[1:2] != [SUBJECT]:
         sys.exit(OTHERS)
     del sys.argv[1]
-    entry("bench_speed")(bench)()
+    entry("bench_speed", bench)()
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ def check(config: DictConfig) -> None:
         sys.exit(FAILED)
 
 
-main = entry("check")(check)
+main = entry("check", check)
 
 if __name__ == "__main__":
     main()

@@ -1,22 +1,8 @@
 """``python -m gsgan.fit data.root=<folder>``: the body and its poses that fit the masks."""
 
-from omegaconf import DictConfig
-
 from gsgan.utils.config import entry
 
-
-def fit(config: DictConfig) -> None:
-    """Fits the body to the skeletons and masks of ``config.data``.
-
-    Raises:
-        GsganError: on anything the user can correct.
-    """
-    from gsgan.fit.run import run_fit
-
-    run_fit(config)
-
-
-main = entry("fit")(fit)
+main = entry("fit", "gsgan.fit.run.run_fit")
 
 if __name__ == "__main__":
     main()

@@ -16,7 +16,7 @@ def prepare(config: DictConfig) -> None:
     run(Options(**instantiate(config, _convert_="all")), make_console())
 
 
-main = entry("prepare")(prepare)
+main = entry("prepare", prepare)
 
 if __name__ == "__main__":
     main()

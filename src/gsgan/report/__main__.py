@@ -23,7 +23,7 @@ def report(config: DictConfig) -> None:
         make_figures(config)
 
 
-main = entry("report")(report)
+main = entry("report", report)
 
 if __name__ == "__main__":
     main()

@@ -1,7 +1,6 @@
 """The config folder, and the entry point of a command: start, errors, exit status."""
 
 import errno
-import functools
 import hashlib
 import os
 import re
@@ -13,6 +12,7 @@ from pathlib import Path
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import CompactHydraException, HydraException, InstantiationException
 from hydra.types import RunMode
+from hydra.utils import get_method
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
@@ -79,66 +79,62 @@ OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)
 OmegaConf.register_new_resolver("if_gpu", if_gpu, replace=True)
 
 
-def entry(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
-    """Turns a function of a config into a command with Hydra's grammar and one-sentence errors.
+def entry(name: str, task: Callable[[DictConfig], object] | str) -> Callable[[], None]:
+    """A command with Hydra's grammar and one-sentence errors.
 
     Each job of a sweep (``-m``) is the same command in a process of its own.
 
     Args:
         name: of the config file, without ``.yaml``, and of the command.
+        task: a function of the config, or its full name, which is imported when the command runs.
     """
 
-    def decorate(task: Callable[[DictConfig], None]) -> Callable[[], None]:
-        @functools.wraps(task)
-        def run(config: DictConfig) -> float | None:
-            try:
-                if HydraConfig.get().mode == RunMode.MULTIRUN:
-                    return run_job(name, config.get("objective"))
-                import gsgan.utils.compat  # noqa: F401  (before lightning and torchmetrics)
-                from gsgan.utils.tensors import keep_freed_memory
+    def run(config: DictConfig) -> float | None:
+        try:
+            if HydraConfig.get().mode == RunMode.MULTIRUN:
+                return run_job(name, config.get("objective"))
+            import gsgan.utils.compat  # noqa: F401  (before lightning and torchmetrics)
+            from gsgan.utils.tensors import keep_freed_memory
 
-                keep_freed_memory()
-                task(config)
-            except KeyboardInterrupt:
-                _print_error("interrupted")
-                sys.exit(130)
-            except Exception as error:
-                message = one_sentence(error)
-                if message is None:
-                    raise
-                _print_error(message)
-                note(Path(HydraConfig.get().runtime.output_dir), message)
-                _remove_unused_folder()
-                sys.exit(FAILED)
-            return None
+            keep_freed_memory()
+            (get_method(task) if isinstance(task, str) else task)(config)
+        except KeyboardInterrupt:
+            _print_error("interrupted")
+            sys.exit(130)
+        except Exception as error:
+            message = one_sentence(error)
+            if message is None:
+                raise
+            _print_error(message)
+            note(Path(HydraConfig.get().runtime.output_dir), message)
+            _remove_unused_folder()
+            sys.exit(FAILED)
+        return None
 
-        @functools.wraps(task)
-        def main() -> None:
-            import hydra  # here: importing an entry point stays fast
+    def main() -> None:
+        import hydra  # here: importing an entry point stays fast
 
-            sys.argv[1:] = [spelled_out(argument, name) for argument in sys.argv[1:]]
-            command = hydra.main(
-                version_base="1.3", config_path=str(config_folder()), config_name=name
-            )(run)
-            # else Hydra prints the traceback of a file of its own that it cannot write, and exits
-            os.environ.setdefault("HYDRA_FULL_ERROR", "1")
-            try:
-                command()
-            except CompactHydraException as error:
-                cause = error.__cause__
-                more = f"\n{cause}" if isinstance(cause, OmegaConfBaseException) else ""
-                print(f"{error}{more}", file=sys.stderr)
-                sys.exit(FAILED)
-            except OSError as error:
-                message = one_sentence(error)
-                if message is None:
-                    raise
-                _print_error(message)
-                sys.exit(FAILED)
+        sys.argv[1:] = [spelled_out(argument, name) for argument in sys.argv[1:]]
+        command = hydra.main(
+            version_base="1.3", config_path=str(config_folder()), config_name=name
+        )(run)
+        # else Hydra prints the traceback of a file of its own that it cannot write, and exits
+        os.environ.setdefault("HYDRA_FULL_ERROR", "1")
+        try:
+            command()
+        except CompactHydraException as error:
+            cause = error.__cause__
+            more = f"\n{cause}" if isinstance(cause, OmegaConfBaseException) else ""
+            print(f"{error}{more}", file=sys.stderr)
+            sys.exit(FAILED)
+        except OSError as error:
+            message = one_sentence(error)
+            if message is None:
+                raise
+            _print_error(message)
+            sys.exit(FAILED)
 
-        return main
-
-    return decorate
+    return main
 
 
 def spelled_out(argument: str, command: str) -> str:
