@@ -11,14 +11,16 @@ from rich.console import Console
 from rich.progress import track
 from torch import Tensor
 
+from gsgan.data.calibration import read_calibration
+from gsgan.data.cameras import CameraEntry
+from gsgan.data.crop import PersonCrop, square_window
 from gsgan.data.training_poses import TrainingPoses
 from gsgan.model.avatar import Avatar
 from gsgan.model.drive import Drive, drive_of, inputs_of, joints_of
 from gsgan.model.runs import Run
 from gsgan.motion.orbit import Orbit
-from gsgan.render.cameras import from_file, of_capture, of_entry
 from gsgan.render.output import Output
-from gsgan.scene import Camera
+from gsgan.scene import Camera, cat
 from gsgan.utils.checks import above, whole
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError, DataError
@@ -122,9 +124,49 @@ def _cameras(config: DictConfig, run: Run, drive: Drive) -> tuple[Camera, Tensor
         return orbit.cameras(drive.p, run.proportions, run.scene, size, trained or size), None
     if (path := Path(name).expanduser()).is_file():
         return from_file(path, drive.p, size), None
-    entry = of_capture(run.data.layout.cameras, name)
+    if name not in (entries := run.data.layout.cameras):
+        raise ConfigError(
+            f"camera={name} is neither a camera of the run's data nor a file; choose orbit or one "
+            f"of {', '.join(entries)}"
+        )
     crop, lens = run.data.crop, run.stored.data.get("lens") == "project"
-    return of_entry(entry, drive.p, size, crop, lens), None
+    return of_entry(entries[name], drive.p, size, crop, lens), None
+
+
+def of_entry(
+    entry: CameraEntry, p: NDArray[np.float64], size: int, crop: PersonCrop | None, lens: bool
+) -> Camera:
+    """A calibrated camera with square images, cropped to the whole motion if training cropped.
+
+    Args:
+        entry: the camera.
+        p: ``[F, 33, 3]`` metres, world frame.
+        size: pixels.
+        crop: of the training images, or None.
+        lens: keep its distortion, see `CameraEntry.seen`.
+    """
+    window = square_window(entry.size)
+    if crop is not None:
+        joints = p.reshape(-1, 3)
+        known: NDArray[np.bool_] = np.asarray(np.isfinite(joints).all(-1))
+        window = crop.window(entry, joints, known)
+    return entry.seen(window, (size, size), lens=lens)
+
+
+def from_file(path: Path, p: NDArray[np.float64], size: int) -> Camera:
+    """The camera of a calibration file, or its cameras, one per skeleton ``[F, 33, 3]``.
+
+    Raises:
+        DataError: when it cannot be read, or the number of cameras is neither 1 nor F.
+    """
+    found = list(read_calibration(path).cameras.values())
+    if len(found) not in (1, len(p)):
+        raise DataError(
+            f"{path} holds {len(found)} cameras; expected 1, or {len(p)}, one per frame"
+        )
+    if any(0 in entry.size for entry in found):
+        raise DataError(f"{path} lacks an image size; every camera needs one")
+    return cat([of_entry(entry, p, size, None, lens=True) for entry in found])
 
 
 # -- images

@@ -15,16 +15,18 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from gsgan.body import SkinnedBody
+from gsgan.metrics.segmentation import colour_labels
 from gsgan.model.avatar import Avatar
 from gsgan.model.drive import Drive, inputs_of, joints_of
+from gsgan.model.rendering import Rendering
 from gsgan.scene import BodyPose, Camera, Gaussians
 from gsgan.utils.errors import GsganError
 from gsgan.utils.images import eight_bits
 from gsgan.utils.provenance import png_bytes
 from gsgan.view.drag import NAMES, dragged, position
-from gsgan.view.layers import IMAGE, layers, shown
 
 Float = NDArray[np.float64]
+Bytes = NDArray[np.uint8]
 
 IDLE = 0.1  # seconds between two checks whether an image is due
 RESTS = 0.3  # seconds without movement after which the full-size image is rendered
@@ -32,6 +34,7 @@ SMALLEST = 0.25  # least scale of the images while something moves
 WIDEST = 3.0  # bound on the aspect ratio, since a browser window can have any
 SPEED_OVER = 2.0  # seconds over which the displayed rate is averaged
 YELLOW, GREY = (255, 200, 0), (160, 165, 175)
+IMAGE, COLOUR, PARTS, ALPHA = "image", "Step I's colour", "segmentation S", "alpha"  # layers
 
 
 @dataclass
@@ -297,6 +300,37 @@ class Session:
         if self.pose is None:
             for name, gizmo in self._gizmos.items():
                 gizmo.position = position(p, name)
+
+
+def layers(avatar: Avatar) -> tuple[str, ...]:
+    """The layers of an avatar."""
+    names = [IMAGE, ALPHA]
+    if avatar.splats is not None:
+        names.append(COLOUR)
+    if avatar.segmentation is not None:
+        names.append(PARTS)
+    return tuple(names)
+
+
+def shown(layer: str, rendering: Rendering, behind: torch.Tensor) -> Bytes:
+    """``[H, W, 3]`` one layer of a rendering.
+
+    Args:
+        layer: of `layers`.
+        rendering: with maps, unless the layer is the image.
+        behind: ``[3, H, W]`` the background.
+    """
+    assert rendering.image is not None and rendering.alpha is not None  # noqa: PT018
+    image, alpha = rendering.image[0].cpu(), rendering.alpha[0].cpu()
+    if layer == ALPHA:
+        grey = (alpha[0].clamp(0, 1) * 255).byte().numpy()
+        return np.repeat(grey[..., None], 3, axis=2)
+    if layer == PARTS and rendering.segmentation is not None:
+        colours = colour_labels(rendering.segmentation.argmax(dim=1))[0]
+        return np.asarray((colours.permute(1, 2, 0) * 255).byte().cpu().numpy())
+    if layer == COLOUR and rendering.features is not None and rendering.splat_alpha is not None:
+        return eight_bits(rendering.features[0, :3].cpu(), rendering.splat_alpha[0].cpu(), behind)
+    return eight_bits(image, alpha, behind)
 
 
 def _message(error: Exception) -> str:
