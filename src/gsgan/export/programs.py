@@ -2,9 +2,7 @@
 
 import copy
 import io
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
+from warnings import catch_warnings
 
 import torch
 from torch import Tensor, nn
@@ -79,7 +77,7 @@ def torch_program(avatar: Avatar, size: tuple[int, int]) -> bytes:
         given += [torch.zeros(1, bones, 3), torch.zeros(1, 3)]
     program = Whole(unfrozen(avatar), size)
     stream = io.BytesIO()
-    with torch.no_grad(), quiet():
+    with torch.no_grad(), catch_warnings(action="ignore"):  # about its own internals
         program(*given)  # constants are made once, outside of the recording
         torch.export.save(torch.export.export(program, tuple(given), strict=False), stream)
     return stream.getvalue()
@@ -159,7 +157,7 @@ def onnx_program(avatar: Avatar) -> bytes:
         name: {2 + i: times[name] * side for i, side in enumerate(sides)} if name in times else None
         for name in given
     }
-    with torch.no_grad(), quiet():
+    with torch.no_grad(), catch_warnings(action="ignore"):  # about its own internals
         program = torch.onnx.export(
             networks,
             kwargs=given,
@@ -172,11 +170,3 @@ def onnx_program(avatar: Avatar) -> bytes:
     assert program is not None
     content: bytes = program.model_proto.SerializeToString()
     return content
-
-
-@contextmanager
-def quiet() -> Iterator[None]:
-    """Suppresses the exporter's warnings about its own internals."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
