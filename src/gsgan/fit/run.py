@@ -123,7 +123,7 @@ def fit_body(
     with console.status("solving poses"):
         refuse_swapped_sides(layout, data.trained)
         shape = fit_shape(*_joints(data, data.trained))
-        start = _of_rows(_solve_with_fingers(data, shape), rows)
+        start = _solve_with_fingers(data, shape)[rows]
     fitter = Fitter(settings, frames, shaped_body(shape), start, seed)
     found = _registered(fitter, settings, console)
     with torch.no_grad():
@@ -132,7 +132,7 @@ def fit_body(
     poses = {False: _solve(data, shape, layout.frames)}
     if layout.hands is not None:
         poses[True] = _solve(data, shape, layout.frames, hands=True)
-    driven = _of_rows(poses[_by_hands(data)], rows).to(device)
+    driven = poses[_by_hands(data)][rows].to(device)
     report = fit_report(fitter, shaped_body(shape).to(device), driven, found)
     kept = registered if settings.held_out or settings.keep else None
     write_json(folder / REPORT, report)
@@ -167,10 +167,6 @@ def _folder(out: Path, overwrite: bool) -> Path:
         if not overwrite:
             raise ConfigError(f"{out / POSES} exists already; overwrite=true replaces it")
     return out
-
-
-def _of_rows(poses: BodyPose, rows: Tensor) -> BodyPose:
-    return BodyPose(poses.theta[rows], poses.transl[rows])
 
 
 def _write_body(

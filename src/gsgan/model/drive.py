@@ -77,15 +77,10 @@ class Drive:
             self,
             p=self.p[chosen],
             visibility=self.visibility[chosen],
-            body=None if self.body is None else BodyPose(self.body.theta[at], self.body.transl[at]),
+            body=None if self.body is None else self.body[at],
             numbers=[self.numbers[i] for i in index] if own else list(range(len(index))),
-            camera=None if camera is None else (_rows(camera[0], at), camera[1][at]),
+            camera=None if camera is None else (camera[0][at], camera[1][at]),
         )
-
-
-def _rows(camera: Camera, at: Tensor) -> Camera:
-    dist = None if camera.dist is None else camera.dist[at]
-    return replace(camera, K=camera.K[at], R=camera.R[at], t=camera.t[at], dist=dist)
 
 
 def drive_of(config: DictConfig, run: Run, fps: float) -> Drive:
@@ -200,8 +195,7 @@ def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
     if own:
         p = resampled(motion.p, rate, fps)
         if motion.body is not None and run.avatar.needs_body:
-            at = torch.from_numpy(nearest)
-            body = BodyPose(motion.body.theta[at], motion.body.transl[at])
+            body = motion.body[torch.from_numpy(nearest)]
     else:
         standard = upright(proportions.up)
         centre = standard @ np.array(run.scene.centre)

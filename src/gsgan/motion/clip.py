@@ -104,8 +104,7 @@ def checked(motion: Clip, least_visibility: float) -> Clip:
     before, after, share = neighbours(good)
     nearest = np.where(share > 0.5, after, before)
     if body is not None:
-        share, at = np.rint(share), torch.from_numpy(nearest)
-        body = BodyPose(body.theta[at], body.transl[at])
+        share, body = np.rint(share), body[torch.from_numpy(nearest)]
     q, shown = mixed(p[before], p[after], share), visibility[nearest]
     q = np.where(np.isfinite(q), q, p[nearest])
     q[:, BODY:], shown[:, BODY:] = p[:, BODY:], visibility[:, BODY:]

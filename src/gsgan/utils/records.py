@@ -32,16 +32,14 @@ class TensorRecord:
                 changes[field.name] = change(value)
         return replace(self, **changes)
 
-    def __getitem__(self: S, index: slice) -> S:
-        """The batch items of a slice; the batch dimension stays."""
-        if not isinstance(index, slice):
+    def __getitem__(self: S, index: slice | Tensor) -> S:
+        """The batch items of a slice or at indices ``[n]``; the batch dimension stays."""
+        if isinstance(index, int):
             raise TypeError(f"{type(self).__name__} takes a slice of the batch, got {index!r}")
         changes: dict[str, Any] = {}
         for field in fields(self):
             value = getattr(self, field.name)
-            if isinstance(value, (TensorRecord, Tensor)) or (
-                isinstance(value, tuple) and field.metadata.get("batched")
-            ):
+            if isinstance(value, (TensorRecord, Tensor)):
                 changes[field.name] = value[index]
         return replace(self, **changes)
 
