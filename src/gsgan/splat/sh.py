@@ -38,9 +38,21 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
     if degree >= 1:
         basis += [-_C1 * y, _C1 * z, -_C1 * x]
     if degree >= 2:
-        basis += _degree_2(x, y, z)
+        k0, k1, k2 = _C2
+        basis += [k0 * x * y, -k0 * y * z, k1 * (2 * z * z - x * x - y * y), -k0 * x * z]
+        basis.append(k2 * (x * x - y * y))
     if degree >= 3:
-        basis += _degree_3(x, y, z)
+        k0, k1, k2, k3, k4 = _C3
+        xx, yy, zz = x * x, y * y, z * z
+        basis += [
+            -k0 * y * (3 * xx - yy),
+            k1 * x * y * z,
+            -k2 * y * (4 * zz - xx - yy),
+            k3 * z * (2 * zz - 3 * xx - 3 * yy),
+            -k2 * x * (4 * zz - xx - yy),
+            k4 * z * (xx - yy),
+            -k0 * x * (xx - 3 * yy),
+        ]
     return torch.stack(basis, dim=-1)
 
 
@@ -72,28 +84,3 @@ def sh_to_colour(sh: Tensor, directions: Tensor) -> Tensor:
         return _C0 * sh[..., 0, :] + 0.5
     basis = sh_basis(torch.nn.functional.normalize(directions, dim=-1), degree)
     return (basis.unsqueeze(-1) * sh).sum(-2) + 0.5
-
-
-def _degree_2(x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
-    k0, k1, k2 = _C2
-    return [
-        k0 * x * y,
-        -k0 * y * z,
-        k1 * (2 * z * z - x * x - y * y),
-        -k0 * x * z,
-        k2 * (x * x - y * y),
-    ]
-
-
-def _degree_3(x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
-    k0, k1, k2, k3, k4 = _C3
-    xx, yy, zz = x * x, y * y, z * z
-    return [
-        -k0 * y * (3 * xx - yy),
-        k1 * x * y * z,
-        -k2 * y * (4 * zz - xx - yy),
-        k3 * z * (2 * zz - 3 * xx - 3 * yy),
-        -k2 * x * (4 * zz - xx - yy),
-        k4 * z * (xx - yy),
-        -k0 * x * (xx - 3 * yy),
-    ]
