@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from gsgan.body.free import free_body, free_body_path, majority_vertex_labels, read_body
+from gsgan.body.skinned import carry
 from gsgan.scene import BodyPose
 from gsgan.utils.errors import DataError
 
@@ -118,7 +119,7 @@ def test_bones_keep_their_lengths_in_any_pose():
 def test_landmarks_are_at_the_joints_of_the_same_name():
     body = free_body().to(torch.float64)
     pose = poses(3)
-    p, joints = body.posed_landmarks(pose), body.posed_joints(pose)
+    p, joints = body.posed_landmarks(pose), carry(body.transforms(pose), body.joints)
     for landmark, joint in ((13, "lowerarm01.L"), (26, "lowerleg01.R"), (15, "wrist.L")):
         at = joints[:, body.joint_names.index(joint)]
         torch.testing.assert_close(p[:, landmark], at, atol=1e-6, rtol=0)

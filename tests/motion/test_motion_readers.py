@@ -126,7 +126,7 @@ def test_smpl_and_amass(tmp_path, shared, proportions, kind, numbers):
     theta = torch.zeros(1, len(body.parents), 3, dtype=torch.float64)
     theta[0, 18, 2] = 1.5
     shape = body.v_template.new_zeros(1, 1)
-    joints = body.posed_joints(theta, shape, shape.new_zeros(1, 3))[0].numpy()
+    joints = body.pose(theta, shape, shape.new_zeros(1, 3))[1][0].numpy()
     truth = np.zeros((1, 33, 3))
     truth[0, list(SMPL_AT)] = joints[list(SMPL_AT.values())] @ upright(up_axis(motion)).T
     np.testing.assert_allclose(directions(p)[:1], directions(truth), atol=1e-6)
@@ -488,7 +488,7 @@ def test_published_keys_of_the_smpl_family(tmp_path, shared, proportions, name):
     motion = read_motion(path, Source(proportions, model))
     theta = torch.zeros(4, len(skinned.parents), 3, dtype=torch.float64)
     theta[:, :22] = torch.from_numpy(np.concatenate([root, body], axis=1)).reshape(4, 22, 3)
-    joints = skinned.posed_joints(theta, theta.new_zeros(1, 1), torch.from_numpy(moves)).numpy()
+    joints = skinned.pose(theta, theta.new_zeros(1, 1), torch.from_numpy(moves))[1].numpy()
     np.testing.assert_allclose(
         motion.p[:, list(SMPL_AT)], joints[:, list(SMPL_AT.values())], atol=1e-6
     )

@@ -255,8 +255,8 @@ def test_shipped_templates_can_be_made_again():
     [
         ({"torso": "ball"}, "torso must be one of fit, cube, got 'ball'"),
         ({"sampler": "random"}, "sampler must be one of even, trimesh, got 'random'"),
-        ({"face_points": 0}, r"at least one point, got \(200, 0, 500, 60\)"),
-        ({"radius_ratio": 0.0}, "must be positive, got 0.0"),
+        ({"face_points": 0}, "face_points must be a whole number of at least 1, got 0"),
+        ({"radius_ratio": 0.0}, "radius_ratio must be a number above 0, got 0.0"),
         ({"sampler": "trimesh", "points_per_limb": 64}, "has 200 cylinder points.*64"),
     ],
 )

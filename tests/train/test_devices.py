@@ -23,7 +23,7 @@ from gsgan.train.module import AvatarTraining
 from gsgan.train.optimisers import parameter_groups
 from gsgan.utils import tensors
 from gsgan.utils.records import TensorRecord
-from gsgan.view.layers import layers, shown
+from gsgan.view.session import layers, shown
 
 REAL = os.environ.get("GPU_CHECK_DEVICE", "cuda")
 CACHES = (tensors._constant, skeleton_tensors.constants, draw._segment_ends)

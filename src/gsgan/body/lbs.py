@@ -16,14 +16,14 @@ from torch.nn.functional import embedding_bag
 from gsgan.utils.tensors import constant
 
 
-def axis_angle_to_matrix(axis_angle: Tensor, small: float = 1e-6) -> Tensor:
+def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
     """Rotation matrices ``[..., 3, 3]`` of axis-angle vectors ``[..., 3]`` in radians.
 
-    Rodrigues' formula, and below ``small`` squared radians its Taylor series: values and gradients
-    are finite at zero rotation.
+    Rodrigues' formula, and below 1e-6 squared radians its Taylor series: values and gradients are
+    finite at zero rotation.
     """
     squared = (axis_angle * axis_angle).sum(-1)[..., None, None]
-    is_small = squared < small
+    is_small = squared < 1e-6
     angle = torch.where(is_small, torch.ones_like(squared), squared).sqrt()
     a = torch.where(is_small, 1 - squared / 6, angle.sin() / angle)
     # (1 - cos x) / x² with the half angle: no cancellation near zero
@@ -60,18 +60,9 @@ def _cross_matrix(v: Tensor) -> Tensor:
 
 
 def kinematic_levels(parents: Sequence[int]) -> list[list[int]]:
-    """The joints grouped by depth, roots (parent -1) first: a level depends on earlier ones only.
-
-    Raises:
-        ValueError: when a parent does not come before its child.
-    """
+    """Joints by depth, roots (parent -1) first; each parent comes before its children."""
     depth: list[int] = []
-    for joint, parent in enumerate(parents):
-        if not -1 <= parent < joint:
-            raise ValueError(
-                f"kinematic_levels: parents must come before their children, "
-                f"got parent {parent} for joint {joint}"
-            )
+    for parent in parents:
         depth.append(0 if parent < 0 else depth[parent] + 1)
     return [[j for j, d in enumerate(depth) if d == level] for level in range(max(depth) + 1)]
 
@@ -181,16 +172,8 @@ def blend_transforms(
     Returns:
         ``A [B, V, 3, 3]`` and ``t [B, V, 3]``.
 
-    Raises:
-        ValueError: when the two tables differ in shape.
-
     Source: paper Sec. 3.4, ``x_o = (Σ_b w_b ΔB_b) x_c``.
     """
-    if bone_index.shape != bone_weight.shape or bone_index.ndim != 2:
-        raise ValueError(
-            f"blend_transforms: bone_index and bone_weight must share a shape [V, n], "
-            f"got {list(bone_index.shape)} and {list(bone_weight.shape)}"
-        )
     weight = bone_weight.to(transforms.dtype)
     weight = weight / weight.sum(-1, keepdim=True)
     bones = transforms[:, :, :3].transpose(0, 1).flatten(1)

@@ -18,6 +18,7 @@ from gsgan.body.lbs import (
 )
 from gsgan.scene import BodyPose
 
+KEPT = 4  # bones whose weights change most
 SMOOTHED = 3  # averages over a vertex's edges before its weights' gradients: weights have steps
 
 
@@ -102,11 +103,6 @@ class SkinnedBody:
         A, t = self.pose(pose)
         return skin(self.vertices.to(A), A, t)
 
-    def posed_joints(self, pose: BodyPose) -> Tensor:
-        """``[B, J, 3]`` metres, world frame."""
-        own = torch.arange(len(self.parents), device=self.joints.device)
-        return carry(self.transforms(pose), self.joints, own)
-
 
 @dataclass(frozen=True, kw_only=True)
 class MarkedBody(SkinnedBody):
@@ -120,9 +116,9 @@ class MarkedBody(SkinnedBody):
         return carry(self.transforms(pose), self.landmarks, self.landmark_bone)
 
 
-def carry(transforms: Tensor, points: Tensor, bones: Tensor) -> Tensor:
-    """Points ``[N, 3]``, each moved rigidly with its bone: ``[B, N, 3]``."""
-    T = transforms[:, bones]
+def carry(transforms: Tensor, points: Tensor, bones: Tensor | None = None) -> Tensor:
+    """``[B, N, 3]``: points ``[N, 3]`` moved rigidly with their bones; None: one of each bone."""
+    T = transforms if bones is None else transforms[:, bones]
     return (T[..., :3, :3] @ points.to(T)[..., None]).squeeze(-1) + T[..., :3, 3]
 
 
@@ -136,14 +132,14 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     return torch.nn.functional.normalize(summed, dim=-1, eps=1e-20)
 
 
-def stretch_terms(body: SkinnedBody, bones_kept: int = 4) -> tuple[Tensor, Tensor]:
+def stretch_terms(body: SkinnedBody) -> tuple[Tensor, Tensor]:
     """The terms of `gsgan.body.lbs.stretched`: how skinning weights change along the surface.
 
     Their gradients follow in the least squares sense from the differences along a vertex's edges,
     for the bones whose weights change most. They lie in the surface, and their sum is zero.
 
     Returns:
-        ``[3 V, 4 bones_kept]``: of each vertex and axis, columns of the bones' transforms, int64
+        ``[3 V, 4 KEPT]``: of each vertex and axis, columns of the bones' transforms, int64
         from 0 to 4 J, and their factors: products of the vertex's position and the gradients.
 
     Source: ours.
@@ -167,7 +163,7 @@ def stretch_terms(body: SkinnedBody, bones_kept: int = 4) -> tuple[Tensor, Tenso
     moved = step.unsqueeze(2) * (smooth[b] - smooth[a]).unsqueeze(1)
     slope = torch.linalg.solve(square, x.new_zeros(count, 3, bones).index_add_(0, a, moved)).mT
     slope = slope - (slope @ normals.unsqueeze(-1)) * normals.unsqueeze(1)
-    index = slope.norm(dim=-1).topk(min(bones_kept, bones), dim=1).indices
+    index = slope.norm(dim=-1).topk(min(KEPT, bones), dim=1).indices
     slope = slope.gather(1, index.unsqueeze(-1).expand(-1, -1, 3))
     slope = slope - slope.mean(1, keepdim=True)
     homogeneous = torch.cat([x, torch.ones_like(x[:, :1])], dim=1)

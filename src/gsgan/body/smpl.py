@@ -17,14 +17,8 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from gsgan.body.lbs import (
-    axis_angle_to_matrix,
-    blend_transforms,
-    check_weights,
-    forward_kinematics,
-    skin,
-)
-from gsgan.body.skinned import MarkedBody
+from gsgan.body.lbs import axis_angle_to_matrix, blend_transforms, forward_kinematics, skin
+from gsgan.body.skinned import MarkedBody, carry
 from gsgan.body.smpl_files import Floats, read_arrays
 from gsgan.body.smpl_names import JOINT_NAMES, Parts, part_names, part_of_joint
 from gsgan.skeleton import MEDIAPIPE33
@@ -35,11 +29,7 @@ KINDS = {24: "smpl", 55: "smplx"}
 
 @dataclass(frozen=True, eq=False)
 class SkinnedModel:
-    """A body model with shape and pose blend shapes, in float64 on the CPU.
-
-    Raises:
-        ValueError: when a vertex has no skinning weight, or one that is negative or not finite.
-    """
+    """A body model with shape and pose blend shapes, in float64 on the CPU."""
 
     kind: str  # "smpl" (24 joints), "smplx" (55) or "generic"
     v_template: Tensor  # [V, 3] metres, the mean shape
@@ -50,9 +40,6 @@ class SkinnedModel:
     weights: Tensor  # [V, J], rows sum to 1
     parents: tuple[int, ...]  # of each joint, -1 for the root
     faces: Tensor  # [F, 3] int64
-
-    def __post_init__(self) -> None:
-        check_weights(self.weights)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -118,20 +105,15 @@ class SkinnedModel:
         Raises:
             ValueError: on shapes that do not fit, naming the argument.
         """
-        transforms, rotations, rest = self._transforms(theta, betas, transl, expression)
+        rotations = axis_angle_to_matrix(theta.to(self.v_template))
+        rest = self.rest_joints(betas, expression).expand(len(theta), -1, -1)
+        transforms = forward_kinematics(rest, self.parents, rotations, transl.to(rest))
         vertices = self.rest_vertices(betas, expression)
         if pose_blend:
             eye = torch.eye(3, dtype=rotations.dtype)
             feature = (rotations[:, 1:] - eye).flatten(1)
             vertices = _add("theta", vertices, self.posedirs, feature)
-        return skin(vertices, *blend_transforms(transforms, *self.bones)), _moved(transforms, rest)
-
-    def posed_joints(
-        self, theta: Tensor, betas: Tensor, transl: Tensor, expression: Tensor | None = None
-    ) -> Tensor:
-        """``[B, J, 3]`` joints as :meth:`pose` gives them, without posing a vertex."""
-        transforms, _, rest = self._transforms(theta, betas, transl, expression)
-        return _moved(transforms, rest)
+        return skin(vertices, *blend_transforms(transforms, *self.bones)), carry(transforms, rest)
 
     def as_body(self, betas: ArrayLike = (), parts: Parts = "clothes") -> MarkedBody:
         """The shaped body as a `MarkedBody`: float32, one part per vertex, no blend shapes.
@@ -200,20 +182,6 @@ class SkinnedModel:
         bones = torch.tensor([carriers.get(name, 0) for name in MEDIAPIPE33.names])
         return torch.from_numpy(p), bones
 
-    def _transforms(
-        self, theta: Tensor, betas: Tensor, transl: Tensor, expression: Tensor | None
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Bone transforms ``[B, J, 4, 4]``, rotations ``[B, J, 3, 3]``, rest joints."""
-        J = len(self.parents)
-        if theta.ndim != 3 or theta.shape[1:] != (J, 3):
-            raise ValueError(
-                f"SkinnedModel: theta must have shape [B, {J}, 3], got {list(theta.shape)}"
-            )
-        rotations = axis_angle_to_matrix(theta.to(self.v_template))
-        rest = self.rest_joints(betas, expression).expand(len(theta), -1, -1)
-        moved = forward_kinematics(rest, self.parents, rotations, transl.to(rest))
-        return moved, rotations, rest
-
 
 def _add(name: str, base: Tensor, directions: Tensor, coefficients: Tensor | None) -> Tensor:
     """``base [N, 3]`` plus directions ``[N, 3, n]`` times coefficients ``[B, n]`` or fewer."""
@@ -227,11 +195,6 @@ def _add(name: str, base: Tensor, directions: Tensor, coefficients: Tensor | Non
         )
     given = coefficients.to(base)
     return base + (directions[..., : given.shape[1]] @ given.mT).permute(2, 0, 1)
-
-
-def _moved(transforms: Tensor, joints: Tensor) -> Tensor:
-    """Joints ``[B, J, 3]``, each with its own bone."""
-    return (transforms[..., :3, :3] @ joints[..., None]).squeeze(-1) + transforms[..., :3, 3]
 
 
 def read_smpl(path: Path | str) -> SkinnedModel:

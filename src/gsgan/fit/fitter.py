@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from gsgan.body import Body, blend_transforms
+from gsgan.body import Body, blend_transforms, skin
 from gsgan.body.skinned import carry, vertex_normals
 from gsgan.fit.frames import MaskedFrames, around
-from gsgan.model.body_points import SkinnedPoints, farthest_points, transformed
+from gsgan.model.body_points import SkinnedPoints, farthest_points
 from gsgan.scene import BodyPose, Camera, Frame, Gaussians
 from gsgan.splat import Accuracy, rasterise
 from gsgan.utils.checks import above, at_least, between, whole
@@ -93,7 +93,7 @@ class Surface(nn.Module):
         bones, points = self.body.transforms(pose), self.points
         A, t = blend_transforms(bones, points.bone_index, points.bone_weight)
         out = self.basis @ (REACH * torch.tanh(self.offsets / REACH))
-        means = transformed(A, t, points.means + out.unsqueeze(-1) * self.normals)
+        means = skin(points.means + out.unsqueeze(-1) * self.normals, A, t)
         axes = A * (SIGMA * points.spacing * self.log_scale.exp())[:, None, None]
         opacities = means.new_full(means.shape[:2], OPACITY)
         person = Gaussians(means, None, None, opacities, opacities[..., None], axes @ axes.mT)

@@ -6,8 +6,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from gsgan.utils.errors import ConfigError
-
 Maps = Sequence[Sequence[Tensor]]  # per scale: feature maps, the logits last
 Term = Callable[[Tensor, Tensor], Tensor]
 softplus, relu = functional.softplus, functional.relu
@@ -24,8 +22,6 @@ COMPARING = ("relativistic",)  # forms whose generator loss depends on the real 
 
 
 def _loss(form: str, which: int, real: Maps, fake: Maps) -> Tensor:
-    if form not in _FORMS:
-        raise ConfigError(f"training.step_two.gan must be one of {', '.join(FORMS)}; got {form!r}")
     term, scales = _FORMS[form][which], zip(real, fake, strict=True)
     return torch.stack([term(r[-1].float(), f[-1].float()).mean() for r, f in scales]).sum()
 
@@ -39,9 +35,6 @@ def discriminator_loss(real: Maps, fake: Maps, form: str = "logistic") -> Tensor
             the logits of the pair at each position (the paired form, RpGAN, of
             Jolicoeur-Martineau 2019; here both show the same frame). What both share
             cancels, so use it where generated images are close to the ground truth.
-
-    Raises:
-        ConfigError: on an unknown form.
     """
     return _loss(form, 0, real, fake)
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from gsgan.splat import build, native
 from gsgan.utils.tensors import full_precision
 
-HALF_WINDOW = 5  # pixels: an image with a shorter side cannot be reflected
+HALF_WINDOW, SIGMA = 5, 1.5  # pixels, of the Gaussian; shorter sides cannot be reflected
 
 
 def d_ssim(image: Tensor, target: Tensor) -> Tensor:
@@ -21,14 +21,7 @@ def d_ssim(image: Tensor, target: Tensor) -> Tensor:
     return d_ssim_map(image, target).mean()
 
 
-def d_ssim_map(
-    image: Tensor,
-    target: Tensor,
-    *,
-    window: int = 11,
-    sigma: float = 1.5,
-    k: tuple[float, float] = (0.01, 0.03),
-) -> Tensor:
+def d_ssim_map(image: Tensor, target: Tensor, *, k: tuple[float, float] = (0.01, 0.03)) -> Tensor:
     """1 - SSIM at every pixel, accurate in float32 for flat and nearly equal images too.
 
     Convention: computed in float32 at least, autocast has no effect; borders are reflected. SSIM's
@@ -38,9 +31,7 @@ def d_ssim_map(
     gradients wrong by tens of per cent.
 
     Args:
-        image, target: ``[B, C, H, W]`` in [0, 1], both sides longer than half the window.
-        window: side of the Gaussian window in pixels, odd.
-        sigma: its standard deviation in pixels.
+        image, target: ``[B, C, H, W]`` in [0, 1], both sides longer than `HALF_WINDOW`.
         k: the stabilising constants, relative to the range.
 
     Returns:
@@ -55,7 +46,7 @@ def d_ssim_map(
         middle, shift = (v.detach().mean((-2, -1), keepdim=True) for v in (image, difference))
         x, y, d = image - middle, target - (middle - shift), difference - shift
         moments = torch.cat([x, d, x.square() + y.square(), d.square()], dim=1)
-        kernel = get_gaussian_kernel1d(window, sigma, device=x.device, dtype=wide)
+        kernel = get_gaussian_kernel1d(2 * HALF_WINDOW + 1, SIGMA, device=x.device, dtype=wide)
         mean, gap, power, gap_power = filter2d_separable(moments, kernel, kernel).chunk(4, dim=1)
         variances = power - mean.square() - (mean - gap).square()
         structure = (gap_power - gap.square()) / (variances + k[1] ** 2)

@@ -9,7 +9,7 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor, nn
 from torch.nn import functional
 
-from gsgan.body import SkinnedBody, axis_angle_to_matrix, blend_transforms, forward_kinematics
+from gsgan.body import SkinnedBody, axis_angle_to_matrix, blend_transforms, forward_kinematics, skin
 from gsgan.body.lbs import stretched
 from gsgan.body.skinned import stretch_terms, vertex_normals
 from gsgan.scene import BodyPose, Gaussians
@@ -238,7 +238,7 @@ class BodyPoints(nn.Module):
         pose = self.points.with_bones(pose)
         assert pose.bones is not None
         A, t = self.points.blend(pose)
-        means = transformed(A, t, self.points.means)
+        means = skin(self.points.means, A, t)
         if not pose.bones.requires_grad:  # only the means give the weights a gradient
             A, t = A.detach(), t.detach()
         scales = (self.sigma * self.points.spacing).expand(len(A), -1)
@@ -254,11 +254,6 @@ class BodyPoints(nn.Module):
             if self.stretch
             else None,
         )
-
-
-def transformed(A: Tensor, t: Tensor, points: Tensor) -> Tensor:
-    """``[B, N, 3]``: ``A x + t`` of points ``[N, 3]``, each by its own map."""
-    return (A @ points.unsqueeze(-1)).squeeze(-1) + t
 
 
 def moved_normals(A: Tensor, normals: Tensor) -> Tensor:

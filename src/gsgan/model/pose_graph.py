@@ -18,6 +18,7 @@ from gsgan.skeleton import (
     root_of,
 )
 
+NEIGHBOUR = 0.05  # initial weight of an edge; the diagonal starts at 1
 READOUT_START = 0.8  # initial standard deviation of g for joint channels of 1
 
 
@@ -29,19 +30,18 @@ class GraphLayer(nn.Module):
     Args:
         mask: ``[J, J]`` of 0 and 1, the diagonal set; an identity mask makes a per-joint layer.
         inputs, outputs: channels.
-        neighbour: initial weight of an edge; the diagonal starts at 1.
 
     Source: after the graph layers of DANBO (Su et al., 2022).
     """
 
     mask: Tensor
 
-    def __init__(self, mask: Tensor, inputs: int, outputs: int, neighbour: float = 0.05) -> None:
+    def __init__(self, mask: Tensor, inputs: int, outputs: int) -> None:
         super().__init__()
         joints = mask.shape[0]
         self.register_buffer("mask", mask, persistent=False)
         identity = torch.eye(joints)
-        self.adjacency = nn.Parameter(identity + neighbour * (mask - identity))
+        self.adjacency = nn.Parameter(identity + NEIGHBOUR * (mask - identity))
         self.weight = nn.Parameter(torch.empty(joints, inputs, outputs))
         bound = 1 / math.sqrt(inputs)
         nn.init.uniform_(self.weight, -bound, bound)

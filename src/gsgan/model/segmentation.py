@@ -8,9 +8,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from gsgan.body import SkinnedBody
+from gsgan.body import SkinnedBody, skin
 from gsgan.body.smpl_names import group_of_part
-from gsgan.model.body_points import SkinnedGaussians, transformed
+from gsgan.model.body_points import SkinnedGaussians
 from gsgan.scene import BodyPose, Camera, Frame, Gaussians, Raster
 from gsgan.splat import ACCURACY, Accuracy, rasterise
 from gsgan.utils.checks import one_of
@@ -18,6 +18,7 @@ from gsgan.utils.errors import ConfigError
 from gsgan.utils.tensors import full_precision
 
 IGNORE = 255
+FLOOR = 1e-6  # inside logarithms, so that a class without splats has a gradient
 HANDS = ("left_hand", "right_hand")
 FACE = "face_neck"
 
@@ -88,8 +89,8 @@ class Segmentation(SkinnedGaussians):
     def truth(self, labels: Tensor) -> Tensor:
         """The data's label images ``[B, H, W]`` as classes of S; 255 is ignored.
 
-        Labels that no vertex has become classes beyond S's channels, up to ``map.truth_classes``:
-        scores count them as missed, the loss ignores them.
+        Labels that no vertex has become classes beyond S's channels: scores count them as missed,
+        the loss ignores them.
         """
         return self.truth_table[labels]
 
@@ -109,7 +110,7 @@ class Segmentation(SkinnedGaussians):
         logits: Tensor = self.logit_opacities
         if self.common is not None:
             log_scales, logits = log_scales + self.common[0], logits + self.common[1]
-        means, features = transformed(A, t, self.points.means), self.one_hot.expand(len(A), -1, -1)
+        means, features = skin(self.points.means, A, t), self.one_hot.expand(len(A), -1, -1)
         return self.deformed(A, means, log_scales, logits, features)
 
     def raster(self, pose: BodyPose, camera: Camera) -> Raster:
@@ -143,8 +144,8 @@ def _classes_as_loaded(segmentation: nn.Module, _: Any) -> None:
     segmentation.one_hot.copy_(segmentation._classes_of_points())
 
 
-def segmentation_loss(segmentation: Tensor, labels: Tensor, floor: float = 1e-6) -> Tensor:
-    """Cross-entropy of rendered probabilities: mean of -log(P of the true class + floor).
+def segmentation_loss(segmentation: Tensor, labels: Tensor) -> Tensor:
+    """Cross-entropy of rendered probabilities: mean of -log(P of the true class + `FLOOR`).
 
     There is no softmax: the maps are probabilities. Pixels whose label has no channel (255, and
     classes that no vertex has) are left out. Without any other pixel the loss is 0.
@@ -152,29 +153,25 @@ def segmentation_loss(segmentation: Tensor, labels: Tensor, floor: float = 1e-6)
     Args:
         segmentation: ``[B, classes, H, W]``.
         labels: ``[B, H, W]`` int64, see `Segmentation.truth`.
-        floor: added inside the logarithm, so that a class without splats has a gradient.
     """
     labels = torch.where(labels < segmentation.shape[1], labels, IGNORE)
-    log = (segmentation + floor).log()
+    log = (segmentation + FLOOR).log()
     total = functional.nll_loss(log, labels, ignore_index=IGNORE, reduction="sum")
     return total / (labels != IGNORE).sum().clamp_min(1)
 
 
-def silhouette_loss(
-    alpha: Tensor, mask: Tensor, unsure: Tensor | None = None, floor: float = 1e-6
-) -> Tensor:
+def silhouette_loss(alpha: Tensor, mask: Tensor, unsure: Tensor | None = None) -> Tensor:
     """Binary cross-entropy of the splatted body's silhouette, for data without part labels.
 
     Args:
         alpha: ``[B, 1, H, W]`` of `Segmentation.raster`.
         mask: ``[B, 1, H, W]`` in [0, 1].
         unsure: ``[B, 1, H, W]`` above 0 at pixels to leave out, or None.
-        floor: added inside the logarithms.
 
     Returns:
         The mean over the other pixels; 0 where there are none.
     """
-    loss = -(mask * (alpha + floor).log() + (1 - mask) * (1 - alpha + floor).log())
+    loss = -(mask * (alpha + FLOOR).log() + (1 - mask) * (1 - alpha + FLOOR).log())
     sure = torch.ones_like(loss) if unsure is None else (unsure <= 0).to(loss)
     return (loss * sure).sum() / sure.sum().clamp_min(1)
 
@@ -193,11 +190,6 @@ class ClassMap:
 
     def __len__(self) -> int:
         return len(self.names)
-
-    @property
-    def truth_classes(self) -> int:
-        """Classes of the ground truth, those without a channel included."""
-        return len(self.names) + len(self.absent)
 
     def as_table(self) -> Tensor:
         """``[256]`` int64: the class of each label; IGNORE for unnamed ones and 255."""

@@ -5,8 +5,8 @@ import math
 import torch
 from torch import Tensor, nn
 
-from gsgan.body import SkinnedBody
-from gsgan.model.body_points import SkinnedGaussians, transformed
+from gsgan.body import SkinnedBody, skin
+from gsgan.model.body_points import SkinnedGaussians
 from gsgan.model.deformation import bounded, colour_from
 from gsgan.scene import BodyPose, Gaussians
 from gsgan.utils.checks import one_of
@@ -69,7 +69,7 @@ class SurfaceGaussians(SkinnedGaussians):
         """The Gaussians in pose, coloured as seen from ``eye`` ``[B, 3]`` (world, metres)."""
         A, t = self.points.blend(pose)
         offsets = self.mean_bound * self.body_height * torch.tanh(self.offsets)
-        means = transformed(A, t, self.points.means + offsets)
+        means = skin(self.points.means + offsets, A, t)
         low, high = (math.log(bound * self.body_height) for bound in self.scale_range)
         sh = self.sh[:, : (self.active_degree + 1) ** 2].expand(len(A), -1, -1, -1)
         return self.deformed(

@@ -12,7 +12,7 @@ from gsgan.skeleton.holistic import (
     template_of,
 )
 from gsgan.skeleton.rotation6d import rotation_from_6d, rotation_to_6d
-from gsgan.skeleton.sanitise import complete_skeleton, limb_length_sum, recentre, sanitise
+from gsgan.skeleton.sanitise import complete_skeleton, limb_length_sum, sanitise
 from gsgan.skeleton.template import MEDIAPIPE33, SkeletonTemplate
 
 __all__ = [
@@ -32,7 +32,6 @@ __all__ = [
     "limb_length_sum",
     "named_template",
     "omega",
-    "recentre",
     "root_of",
     "rotation_from_6d",
     "rotation_to_6d",

@@ -14,6 +14,7 @@ from gsgan.skeleton.frames import MIN_LENGTH, BoneFrames, bone_frames
 from gsgan.skeleton.holistic import named_template
 from gsgan.skeleton.template import MEDIAPIPE33, SkeletonTemplate
 from gsgan.skeleton.tensors import Swing, check_skeleton, constants
+from gsgan.utils.checks import above, one_of, whole
 from gsgan.utils.errors import ConfigError
 
 Torso = Literal["fit", "cube"]
@@ -22,6 +23,7 @@ Samples = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 GOLDEN = (5**0.5 - 1) / 2
 PLASTIC = 1.32471795724474602596  # root of x³ = x + 1, the two-dimensional golden ratio
+COUNTS = ("points_per_limb", "face_points", "torso_points", "points_per_finger_bone")
 TORSO_RANGE = (0.25, 4.0)  # of the box's edges (``fit``), in multiples of the rest pose's
 
 
@@ -124,25 +126,16 @@ class Densify(nn.Module):
         dtype: torch.dtype | None = None,
     ) -> None:
         super().__init__()
-        for name, value, known in (("torso", torso, Torso), ("sampler", sampler, Sampler)):
-            if value not in get_args(known):
-                expected = ", ".join(get_args(known))
-                raise ConfigError(f"Densify: {name} must be one of {expected}, got {value!r}")
+        one_of("Densify: sampler", sampler, get_args(Sampler))
         counts = (points_per_limb, face_points, torso_points, points_per_finger_bone)
-        if min(counts) < 1:
-            raise ConfigError(f"Densify: every part must have at least one point, got {counts}")
-        ratios = (radius_ratio, face_radius_scale, finger_radius_ratio, sigma)
-        if min(ratios) <= 0:
-            raise ConfigError(
-                "Densify: radius_ratio, face_radius_scale, finger_radius_ratio and sigma must be "
-                f"positive, got {', '.join(map(str, ratios))}"
-            )
-        self.template = named_template(template)
-        self.counts = counts
-        self.radius_ratio, self.finger_radius_ratio = radius_ratio, finger_radius_ratio
-        self.face_radius_scale = face_radius_scale
-        self.torso = torso
-        self.sigma = sigma
+        for name, count in zip(COUNTS, counts, strict=True):
+            whole(f"Densify: {name}", count, 1)
+        self.template, self.counts = named_template(template), counts
+        self.radius_ratio = above("Densify: radius_ratio", radius_ratio)
+        self.finger_radius_ratio = above("Densify: finger_radius_ratio", finger_radius_ratio)
+        self.face_radius_scale = above("Densify: face_radius_scale", face_radius_scale)
+        self.torso = one_of("Densify: torso", torso, get_args(Torso))
+        self.sigma = above("Densify: sigma", sigma)
         self._make_buffers(sampler, dtype or torch.get_default_dtype())
 
     @property
@@ -204,8 +197,7 @@ class Densify(nn.Module):
         """Moves the points to a pose.
 
         Convention: metres, world frame; differentiable in p. Far from the world's origin the
-        resolution of the dtype limits the result (1 mm at 1e4 m in float32): see
-        :func:`gsgan.skeleton.recentre`.
+        resolution of the dtype limits the result (1 mm at 1e4 m in float32).
 
         Args:
             p: ``[B, J, 3]`` finite joints (see :func:`gsgan.skeleton.sanitise`).

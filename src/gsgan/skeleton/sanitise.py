@@ -1,6 +1,5 @@
 """Completes skeletons: unseen joints are filled in before any arithmetic."""
 
-from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -8,7 +7,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from gsgan.scene import Camera
 from gsgan.skeleton.frames import bone_frames, hubs_of, palms_of, swings
 from gsgan.skeleton.holistic import TEMPLATES
 from gsgan.skeleton.template import CHEST, HEAD, MEDIAPIPE33, N_HUBS, SkeletonTemplate
@@ -73,8 +71,6 @@ def sanitise(
         template: defines the joints and the rest pose.
         body_height: the subject's h_body as of :func:`limb_length_sum`, a number or ``[B]``,
             which scales the missing bones. None: from the seen limbs.
-        min_visibility: a joint at or below it is unseen.
-        min_trunk_joints: number of shoulders and hips that must be seen, 3 or 4.
 
     Returns:
         ``p [B, J, 3]`` finite, and ``valid [B, J]`` bool.
@@ -127,28 +123,6 @@ def complete_skeleton(
         shown = pad(shown[:, :J], missing)
     p, valid = sanitise(p, None, template, body_height)
     return p, valid * shown
-
-
-def recentre(
-    p: Tensor, camera: Camera, template: SkeletonTemplate = MEDIAPIPE33
-) -> tuple[Tensor, Camera, Tensor]:
-    """Moves the world's origin to the left hip; the image stays the same.
-
-    Convention: float32 has a resolution of 1 mm at 1e4 m. A capture in large coordinates (survey,
-    geographic) is exact in float32 only if it is recentred in float64 first, joints and cameras
-    together.
-
-    Args:
-        p: ``[B, J, 3]`` metres, finite.
-        camera: of the same batch.
-        template: names the hips.
-
-    Returns:
-        The moved joints, the moved camera, and the old position ``[B, 3]`` of the new origin.
-    """
-    root = p[:, template.hips[0]].detach()
-    shift = (camera.R @ root.to(camera.R).unsqueeze(-1)).squeeze(-1)
-    return p - root.unsqueeze(1), replace(camera, t=camera.t + shift), root
 
 
 def _estimated_hips(p: Tensor, valid: Tensor, template: SkeletonTemplate) -> Tensor:

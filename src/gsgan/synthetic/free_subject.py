@@ -7,12 +7,12 @@ import re
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 
 from gsgan.body.free import free_body
 from gsgan.body.skinned import vertex_normals
 from gsgan.motion.character import Animation, Character, Surface
 from gsgan.motion.rig import FINGERS
+from gsgan.motion.rotations import axis_angle
 from gsgan.scene import BodyPose
 
 # Mixamo's names of the free body's joints; other joints keep their names and follow their parents.
@@ -79,6 +79,5 @@ def free_pose(motion: Animation) -> BodyPose:
     body, R = free_body(), motion.rotations
     parents = np.array(body.parents)
     local = np.where((parents < 0)[:, None, None], R, np.swapaxes(R[:, parents], -1, -2) @ R)
-    theta = Rotation.from_matrix(local.reshape(-1, 3, 3)).as_rotvec().reshape(*R.shape[:2], 3)
     transl = motion.joints[:, 0] - body.joints[0].double().numpy()
-    return BodyPose(torch.from_numpy(theta).float(), torch.from_numpy(transl).float())
+    return BodyPose(torch.from_numpy(axis_angle(local)).float(), torch.from_numpy(transl).float())

@@ -6,8 +6,6 @@ from typing import Any
 
 import torch
 
-from gsgan.scene import Camera
-from gsgan.skeleton import MEDIAPIPE33, recentre
 from stability.cases.case import FINITE_ONLY, REFUSED, Case, Inputs, Tolerance
 from stability.cases.raster import SIZE, cloud, pinhole, raster_case
 
@@ -30,12 +28,11 @@ def _far() -> Inputs:
 
 
 def _recentred() -> Inputs:
-    """The far scene moved to the origin with the person's joints, in float64."""
+    """The far scene moved to the origin, in float64: to where a joint of the person may be."""
     scene = _far()
-    joints = scene["means"][:, :1] + torch.tensor(MEDIAPIPE33.rest_positions, dtype=torch.float64)
-    camera = Camera(scene["K"], scene["R"], scene["t"], SIZE)
-    _, camera, origin = recentre(joints, camera)
-    return {**scene, "means": scene["means"] - origin.unsqueeze(1), "t": camera.t}
+    origin = scene["means"][:, 0] + torch.tensor([0.095, 0.92, 0.0], dtype=torch.float64)
+    moved = scene["t"] + (scene["R"] @ origin.unsqueeze(-1)).squeeze(-1)
+    return {**scene, "means": scene["means"] - origin.unsqueeze(1), "t": moved}
 
 
 CAMERAS: dict[str, dict[str, Any]] = {
