@@ -5,7 +5,8 @@ import dataclasses
 import pytest
 import torch
 
-from gsgan.model.assemble import build_avatar
+from gsgan.model.assemble import build_avatar, naming_group
+from gsgan.utils.errors import ConfigError
 
 
 def test_paints_every_part(build):
@@ -135,3 +136,9 @@ def test_stability_overflowing_features_are_bounded(build):
         painting = avatar(*frame.inputs)
     assert float(painting.gaussians.features.max()) == 10
     assert torch.isfinite(painting.image).all()
+
+
+def test_an_error_of_several_lines_is_one_sentence():
+    with pytest.raises(ConfigError) as error, naming_group("model"):
+        raise RuntimeError("not enough memory\nframe #0: 0x0")
+    assert str(error.value) == "model: not enough memory"

@@ -8,6 +8,7 @@ import torch
 
 from gsgan.model.deformation import Deformation
 from gsgan.skeleton import MEDIAPIPE33, Densify, bone_frames
+from gsgan.utils.errors import ConfigError
 
 HEIGHT = 1.7
 
@@ -45,6 +46,11 @@ def test_step_zero_is_exactly_the_initial_gaussians(densify):
         gaussians.features[..., :3], torch.full((1, densify.n_points, 3), 0.5)
     )
     assert (gaussians.features[..., 3:] == 0).all()
+
+
+def test_billions_of_layers_are_refused(densify):
+    with pytest.raises(ConfigError, match="layers must be a number from 2 to 1000"):
+        small(densify, layers=2**31)
 
 
 def test_invisible_parts_have_no_opacity(densify):

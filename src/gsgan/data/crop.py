@@ -66,10 +66,9 @@ def project(view: Pinhole, points: Float) -> tuple[Float, Float]:
 
 def inside(view: Pinhole, points: Float) -> NDArray[np.bool_]:
     """``[...]`` whether world points ``[..., 3]`` project into the image; False for NaN."""
-    pixels, depth = project(view, points)
-    height, width = view.size
-    u, v = pixels[..., 0], pixels[..., 1]
-    return (depth > NEAR) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    uvw = np.tensordot(points, (view.K @ view.R).T, 1) + view.K @ view.t  # not divided: it is slow
+    (u, v, depth), (height, width) = np.moveaxis(uvw, -1, 0), view.size
+    return (depth > NEAR) & (u >= 0) & (u < width * depth) & (v >= 0) & (v < height * depth)
 
 
 @dataclass(frozen=True)

@@ -229,7 +229,7 @@ def frame_files(
         DataError: when a name has no number, two names have the same, or a link leads out.
     """
     place = root / folder
-    names = tuple(sorted(own_entries(place, root))) if place.is_dir() else ()
+    names = frozenset(own_entries(place, root) if place.is_dir() else ())
     try:
         found = copy(_by_frame(names, suffixes, number or last_number))
     except DataError as error:
@@ -240,10 +240,10 @@ def frame_files(
 
 @lru_cache(maxsize=1)  # cameras mostly have files of the same names
 def _by_frame(
-    names: tuple[str, ...], suffixes: tuple[str, ...], number: Callable[[str], int | None]
+    names: frozenset[str], suffixes: tuple[str, ...], number: Callable[[str], int | None]
 ) -> FrameFiles:
     found = dict[int, str]()
-    for name in names:
+    for name in sorted(names):
         stem, _, suffix = name.rpartition(".")
         if f".{suffix.lower()}" not in suffixes or name.startswith("."):
             continue

@@ -243,7 +243,7 @@ def naming_group(group: str) -> Iterator[None]:
     try:
         yield
     except (TypeError, ValueError, RuntimeError) as error:
-        raise ConfigError(f"{group}: {error}") from error
+        raise ConfigError(f"{group}: {str(error).partition(chr(10))[0]}") from error
 
 
 def _required_body(scene: SceneInfo, part: str) -> MarkedBody:

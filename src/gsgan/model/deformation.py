@@ -14,7 +14,7 @@ from gsgan.model import compiled
 from gsgan.scene import Gaussians
 from gsgan.skeleton import Points, root_of
 from gsgan.splat.sh import sh_to_colour
-from gsgan.utils.checks import one_of, whole
+from gsgan.utils.checks import between, one_of, whole
 from gsgan.utils.tensors import constant, derived
 
 QUAT_FLOOR = 1e-12  # inside the root that normalises a quaternion: q0 + δq ≈ 0 stays finite
@@ -218,7 +218,7 @@ class Deformation(ResidualGaussians):
     ) -> None:
         super().__init__(body_height, **settings)
         one_of("model.deformation.pose_frame", pose_frame, ("world", "pelvis"))
-        whole("model.deformation: layers", layers, 2)
+        between("model.deformation: layers", whole("model.deformation: layers", layers, 2), 2, 1000)
         points = rest_points.shape[0]
         self.position_octaves, self.pose_frame = position_octaves, pose_frame
         self.register_buffer("rest_code", positional_encoding(rest_points.float(), rest_octaves))
