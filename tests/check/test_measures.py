@@ -8,7 +8,7 @@ import pytest
 from make import edit_json, edit_npz
 
 from gsgan.check.frames import reprojection_errors, skeleton_doubts
-from gsgan.check.geometry import geometry_findings, geometry_of
+from gsgan.check.sections import geometry_findings, geometry_of
 from gsgan.check.settings import Limits, Sampling
 from gsgan.check.views import complete, measure, sampled_items, subject_of
 from gsgan.data.datamodule import GsganData

@@ -8,9 +8,8 @@ import pytest
 
 from gsgan.data.crop import distort, undistort
 from gsgan.data.datamodule import GsganData
-from gsgan.synthetic.scene_setup import Scene, SceneSettings, dataset_key
+from gsgan.synthetic.scene_setup import Scene, SceneSettings, Tint, dataset_key, make_tints
 from gsgan.synthetic.scenes import ensure_scene
-from gsgan.synthetic.tint import Tint, make_tints
 from gsgan.utils.errors import ConfigError
 
 LENS = (-0.28, 0.09, 0.001, -0.0008, -0.01)

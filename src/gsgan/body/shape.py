@@ -214,7 +214,8 @@ def _stretched(body: B, stretch: Tensor) -> B:
 
 def _with_hands(body: B, hands: Tensor) -> B:
     """The body with wrists and hands moved by ``hands [2, 2, 3]``, see `BodyShape`."""
-    sides = torch.tensor([_side_of_hand(name) for name in body.joint_names])
+    names = body.joint_names  # 1: of the left hand, 2: of the right hand, 0: others
+    sides = torch.tensor([".LR".index(n[-1]) if group_of(n) == "hand" else 0 for n in names])
     moves = torch.cat([torch.zeros_like(hands[:1, 1]), hands[:, 1]])  # [3, 3], none first
     weight = body.bone_weight.unsqueeze(-1)
     out: dict[str, Any] = {
@@ -228,11 +229,6 @@ def _with_hands(body: B, hands: Tensor) -> B:
         own = body.hand_landmarks + moves[sides[body.hand_bone]]
         out["hand_landmarks"] = own.index_copy(0, torch.tensor([WRIST, HAND + WRIST]), at)
     return replace(body, **out)
-
-
-def _side_of_hand(joint: str) -> int:
-    """1 for a joint of the free body's left hand, 2 for the right hand's, else 0."""
-    return ".LR".index(joint[-1]) if group_of(joint) == "hand" else 0
 
 
 # -- spaces

@@ -61,9 +61,10 @@ def skeleton_doubts(subject: CheckedData, limits: Limits) -> list[Doubt]:
     doubt("jump", "jumps: ", jumps, lambda row, j: f"{names[j]} {jump[row, j]:.2f} m")
 
     lengths = bone_lengths(p, template.limbs)
-    change = length_change(lengths)
+    typical = nanmedian(lengths)
+    change = np.abs(lengths - typical) / np.maximum(typical, 1e-6)
     bones = [f"{names[a]} to {names[b]}" for a, b in template.limbs]
-    odd = (change > limits.limb_share) & (change * nanmedian(lengths) > LIMB_METRES)
+    odd = (change > limits.limb_share) & (change * typical > LIMB_METRES)
     doubt("limb", "length off its median: ", odd, lambda f, i: f"{bones[i]} {change[f, i]:.0%}")
 
     backwards = facing(p, template)[:, None] < 0
@@ -173,12 +174,6 @@ def jumped(distance: Float, limit: float) -> Bool:
     known = np.pad(np.nan_to_num(distance), ((1, 1), (0, 0)))
     before, here, after = known[:-2], known[1:-1], known[2:]
     return np.asarray((here > limit) & (here >= before) & (here >= after))
-
-
-def length_change(lengths: Float) -> Float:
-    """``[F, L]`` share by which limbs differ from their median length; NaN if unknown."""
-    typical = nanmedian(lengths)
-    return np.asarray(np.abs(lengths - typical) / np.maximum(typical, 1e-6))
 
 
 def facing(p: Float, template: SkeletonTemplate) -> Float:

@@ -2,21 +2,123 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 from rich.console import Console
 
-from gsgan.check import geometry, overlays, views
+from gsgan.check import overlays, views
 from gsgan.check.calibration import calibration_findings, score_cameras
 from gsgan.check.frames import frame_findings, mask_doubts, shortened, skeleton_doubts
 from gsgan.check.report import Figure, Finding, Section, Table, counted
 from gsgan.check.settings import Limits, Sampling
-from gsgan.data.formats.consistency import spread
+from gsgan.check.views import CheckedData, nanmedian
+from gsgan.data.formats.consistency import Float, far_cameras, spread
+from gsgan.data.proportions import axis_name
 from gsgan.effects import EffectSettings, decide
 from gsgan.effects.table import HEADERS, rows
+from gsgan.skeleton.sanitise import limb_length_sum
 from gsgan.utils.errors import DataError
+
+POSSIBLE = (0.4, 3.0)  # metres of person: outside, units are wrong
+PLAUSIBLE = (1.2, 2.1)  # metres: smaller is a child or a wrong unit, taller is rare
+LEAN = 50.0  # degrees from trunk to up axis, median over frames: nobody stands like that
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Where cameras and person are.
+
+    Args:
+        distances: metres from the person, by camera.
+        stature: metres, median over frames, estimated from limb lengths.
+        up, lean: ``[3]`` direction of the trunk, median over frames; degrees from the up axis.
+        far: a message for each camera that is far too near or far.
+    """
+
+    distances: dict[str, float]
+    stature: float
+    up: Float
+    lean: float
+    far: dict[str, str]
+
+    @property
+    def distance(self) -> float:
+        """Metres, of the median camera."""
+        return float(np.median(list(self.distances.values())))
+
+
+def geometry_of(subject: CheckedData) -> Geometry:
+    """Measures the cameras and the person."""
+    template, p = subject.template, subject.seen_p
+    sums = limb_length_sum(torch.from_numpy(subject.p), torch.from_numpy(subject.visible), template)
+    shoulders, hips = (p[:, list(j)].mean(1) for j in (template.shoulders, template.hips))
+    trunk = shoulders - hips
+    axis = nanmedian(trunk / np.linalg.norm(trunk, axis=-1, keepdims=True))
+    axis = axis if np.isfinite(axis).all() else subject.up
+    cosine = axis @ subject.up / np.linalg.norm(axis)
+    centre = np.median(subject.p[subject.visible], axis=0)
+    distances = {n: float(np.linalg.norm(c.centre - centre)) for n, c in subject.cameras.items()}
+    return Geometry(
+        distances=distances,
+        stature=float(sums.nanmedian()) / template.limb_length_sum * template.stature,
+        up=axis,
+        lean=float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))),
+        # Of two cameras neither is the median one.
+        far=far_cameras(distances, subject.consistency.far_camera) if len(distances) > 2 else {},
+    )
+
+
+def geometry_findings(subject: CheckedData, geometry: Geometry) -> list[Finding]:
+    """Implausible units, a camera in another unit, an up axis that is not up."""
+    found = [Finding("error", "units", text) for text in geometry.far.values()]
+    stature = geometry.stature
+    if not PLAUSIBLE[0] <= stature <= PLAUSIBLE[1]:
+        text = f"limb lengths suggest a person of {stature:.3g} m; check unit and joint order"
+        possible = POSSIBLE[0] <= stature <= POSSIBLE[1]
+        found.append(Finding("warning" if possible else "error", "units", text))
+    if geometry.lean > LEAN:
+        way, axis = axis_name(geometry.up), subject.layout.meta.up_axis
+        text = f"the trunk points along {way}, {geometry.lean:.0f} degrees from the up axis {axis}"
+        found.append(Finding("warning", "units", text))
+    return found
+
+
+def geometry_table(subject: CheckedData, geometry: Geometry) -> Table:
+    """Units and sizes."""
+    meta, distances = subject.layout.meta, geometry.distances.values()
+    near, far = min(distances), max(distances)
+    rows = (
+        ("unit of the files", meta.unit),
+        ("camera to person", f"{geometry.distance:.2f} m (median; {near:.2f} to {far:.2f})"),
+        ("person's height", f"{geometry.stature:.2f} m, from limb lengths"),
+        ("up axis", f"{meta.up_axis}; the trunk leans {geometry.lean:.0f}° from it"),
+        ("frames per second", "not given" if meta.fps is None else f"{meta.fps:g}"),
+    )
+    return Table(("what", "how much"), rows)
+
+
+def lens_table(subject: CheckedData, geometry: Geometry) -> Table:
+    """Size, lens and place, one row per camera."""
+    rows = []
+    for name, camera in subject.cameras.items():
+        (height, width), K = camera.size, camera.K
+        rows.append((
+            name,
+            f"{width}×{height}",
+            f"{K[0, 0]:.0f}, {K[1, 1]:.0f}",
+            f"{K[0, 2] / width:.2f}, {K[1, 2] / height:.2f}",
+            " ".join(f"{c:.3g}" for c in np.trim_zeros(camera.dist, "b")) or "none",
+            f"{geometry.distances[name]:.2f}",
+            str(len(subject.pairs[name])),
+        ))  # fmt: skip
+    headers = (
+        "camera", "pixels", "focal fx, fy", "centre (share)", "distortion", "distance m", "images",
+    )  # fmt: skip
+    return Table(headers, tuple(rows))
+
 
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
@@ -54,7 +156,7 @@ class Measurements:
         if len(broken) > LISTED_BROKEN:
             broken[LISTED_BROKEN:] = [f"{len(broken)} sampled images cannot be read"]
         self.broken = [Finding("error", "files", text) for text in broken]
-        self.geometry = geometry.geometry_of(subject)
+        self.geometry = geometry_of(subject)
         self.cameras = score_cameras(subject, self.views)
         self.wrong = {*self.geometry.far, *(s.name for s in self.cameras if s.wrong(limits))}
         self.info, self.no_info = None, ""
@@ -90,17 +192,14 @@ class Measurements:
 
 def sections(m: Measurements) -> tuple[Section, ...]:
     """Every section, in reading order."""
-    units = (
-        geometry.geometry_table(m.subject, m.geometry),
-        geometry.lens_table(m.subject, m.geometry),
-    )
+    units = (geometry_table(m.subject, m.geometry), lens_table(m.subject, m.geometry))
     strips = [
         Figure(
             f"camera {name}", overlays.strip(m.subject, spread(own, m.sampling.shown), m.reasons)
         )
         for name, own in views.grouped(m.views).items()
     ]
-    found = tuple(geometry.geometry_findings(m.subject, m.geometry))
+    found = tuple(geometry_findings(m.subject, m.geometry))
     return (
         _contents(m),
         Section("Units and cameras", units, found),

@@ -173,7 +173,9 @@ def edge_scores(
     """
     scores, kernel = [], np.ones((2 * tolerance + 1, 2 * tolerance + 1), np.uint8)
     for i, pair in enumerate(zip(image, target, strict=True)):
-        edges, truth = (canny(x, low, high) for x in pair)
+        whole = ((x.detach().cpu().clamp(0, 1) * 255).round().byte() for x in pair)
+        grey = (cv2.cvtColor(x.permute(1, 2, 0).numpy(), cv2.COLOR_RGB2GRAY) for x in whole)
+        edges, truth = (cv2.Canny(x, low, high) > 0 for x in grey)
         near = [cv2.dilate(x.astype(np.uint8), kernel) > 0 for x in (edges, truth)]
         if where is not None:
             inside = where[i, 0].cpu().numpy()
@@ -188,10 +190,3 @@ def edge_scores(
         scores.append((2 * precision * recall / total if total else 0.0, count / expected))
     f1, ratio = torch.tensor(scores, dtype=torch.float64).unbind(1)
     return f1, ratio
-
-
-def canny(image: Tensor, low: float = 100.0, high: float = 200.0) -> np.ndarray:
-    """``[H, W]`` bool: Canny edges of one image ``[3, H, W]``, found on 8-bit grey with these
-    hysteresis thresholds."""
-    rgb = (image.detach().cpu().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()
-    return cv2.Canny(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), low, high) > 0

@@ -189,7 +189,8 @@ def hands_and_mouth(frame: Frame, template: SkeletonTemplate) -> dict[str, Tenso
     seen, size = (frame.visibility > 0) & (depth > NEAR), frame.camera.size
     hands = [slice(wrist, wrist + HAND) for wrist, *_ in template.palms]
     boxes = [landmark_box(pixels[:, h], seen[:, h], size, HAND_MARGIN) for h in hands]
-    corners, lips = mouth_corners(template), lip_landmarks(template)
+    corners = [template.names.index(f"mouth_{side}") for side in ("left", "right")]
+    lips = lip_landmarks(template)
     distance = frame.camera.to_camera(frame.skeleton).norm(dim=-1)
     ahead = distance[:, corners].mean(dim=1) < distance[:, list(template.ears)].mean(dim=1)
     if lips:
@@ -218,11 +219,6 @@ def describe_boxes(skeleton: str) -> str | None:
 def lip_landmarks(template: SkeletonTemplate) -> list[int]:
     """The joints around the lips; none where the skeleton has no face landmarks."""
     return [i for i, name in enumerate(template.names) if name.startswith("mouth_outer")]
-
-
-def mouth_corners(template: SkeletonTemplate) -> list[int]:
-    """The pose landmarks at the mouth's corners, left and right."""
-    return [template.names.index(f"mouth_{side}") for side in ("left", "right")]
 
 
 def mouth_square(corners: Tensor, camera: Camera) -> Tensor:

@@ -328,16 +328,6 @@ def _with_visibility(path: Path, points: NDArray[Any], visibility: Any) -> Float
 # -- rigs
 
 
-def read_recorded_motion(path: Path, source: Source) -> Clip:
-    """A BVH file of a person; the unit is inferred from the length of the legs."""
-    return _rig(path, read_bvh(path), None, source)
-
-
-def read_amc_motion(path: Path, source: Source) -> Clip:
-    """An AMC file and its ASF skeleton."""
-    return _rig(path, *read_amc(path, source.skeleton or asf_of(path)), source)
-
-
 def _rig(path: Path, motion: RigMotion, metres: float | None, source: Source) -> Clip:
     try:
         standard = standard_motion(motion, path, source.up)
@@ -375,8 +365,10 @@ READERS: dict[str, Callable[[Path, Source], Clip]] = {
     ".pkl": read_dictionary,
     ".npy": read_dictionary,
     ".json": read_mediapipe_json,
-    ".bvh": read_recorded_motion,
-    ".amc": read_amc_motion,
+    ".bvh": lambda path, source: _rig(path, read_bvh(path), None, source),  # a length by the legs
+    ".amc": lambda path, source: _rig(
+        path, *read_amc(path, source.skeleton or asf_of(path)), source
+    ),
     ".trc": read_trc,
     ".pose": lambda path, source: read_pose(path, source.subject),
 }

@@ -95,7 +95,8 @@ def solve_video(options: Options, stages: StageFolder, console: Console) -> Film
         first = options.focal or stated or USUAL
         guess = float(np.hypot(*source.size) * first / FILM)
         view = _solve(options, detected[use], time[use], source.size, guess)
-    doubtful = _doubtful(view)
+    errors = np.nanmedian(view.error.numpy(), axis=1)
+    doubtful = errors > DOUBTFUL * np.median(errors)
     left["doubtful pose"] = np.zeros(len(use), bool)
     left["doubtful pose"][np.flatnonzero(use)[doubtful]] = True
     camera, p = _in_world(source, view, guess, options.height)
@@ -196,11 +197,6 @@ def _solve(
     u = np.nan_to_num(px - np.array(size[::-1]) / 2) / guess
     given = Seen(*(torch.from_numpy(x) for x in (u, conf, world, time)))
     return solve_view(given, options.landmark_noise, options.focal is None)
-
-
-def _doubtful(view: View) -> Bool:
-    error = np.nanmedian(view.error.numpy(), axis=1)
-    return np.asarray(error > DOUBTFUL * np.median(error))
 
 
 def natural_height(shape: BodyShape) -> float:

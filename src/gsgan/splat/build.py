@@ -115,8 +115,11 @@ def function(name: str, dtype: torch.dtype) -> Any:
 def _load_once() -> tuple[ctypes.CDLL | None, str]:
     try:
         command = compiler()
-        folder, key = _cache_folder(), cache_key(command)
-        path = folder / f"{key}.so"
+        # all that a compiled kernel depends on
+        parts = (_source(), repr(BASE_FLAGS), repr(_flags()), repr(command))
+        key = hashlib.sha256("\0".join((*parts, _version(command), _cpu())).encode()).hexdigest()
+        folder = _cache_folder()
+        path = folder / f"{key[:24]}.so"
         if path.is_file() and (loaded := open_library(path)) is not None:
             return loaded, ""
         _build(command, path)
@@ -164,12 +167,6 @@ def _flags() -> tuple[tuple[str, ...], ...]:
     return ((f"-march={march}", "-fopenmp"), (f"-march={march}",)) if march else _NATIVE_FLAGS
 
 
-def cache_key(command: list[str]) -> str:
-    """Hash of everything a compiled kernel depends on: source, flags, compiler, CPU."""
-    parts = (_source(), repr(BASE_FLAGS), repr(_flags()), repr(command), _version(command), _cpu())
-    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
-
-
 def _source() -> str:
     headers = sorted(HEADERS.glob("*.h"))
     if not SOURCE.is_file() or not headers:
@@ -210,13 +207,9 @@ def _build(command: list[str], library: Path) -> None:
             if done.returncode == 0 and target.is_file():
                 os.replace(target, library)
                 return
-            message = message or _first_error(done.stderr)
+            wrong = [line for line in done.stderr.splitlines() if "error" in line.lower()]
+            message = message or "".join(f": {line.strip().rstrip('.')}" for line in wrong[:1])
     raise Unavailable(f"The compiler {shlex.join(command)!r} failed on the native kernel{message}.")
-
-
-def _first_error(stderr: str) -> str:
-    lines = [line.strip().rstrip(".") for line in stderr.splitlines() if "error" in line.lower()]
-    return f": {lines[0]}" if lines else ""
 
 
 def _run(command: list[str]) -> subprocess.CompletedProcess[str]:

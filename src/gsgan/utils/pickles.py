@@ -70,18 +70,6 @@ def _reconstruct(*_class_shape_and_code: Any) -> NDArray[Any]:
     return _Array((0,), np.uint8)
 
 
-def _from_buffer(content: Any, dtype: _DType, shape: Any, order: Any) -> NDArray[Any]:
-    return np.frombuffer(content, dtype.value).reshape(shape, order=order).copy()
-
-
-def _scalar(dtype: _DType, content: Any) -> Any:
-    return np.frombuffer(_bytes(content), dtype.value)[0]
-
-
-def _encode(text: str, _encoding: str) -> bytes:
-    return text.encode("latin1")
-
-
 class _Chumpy:
     """Stands in for ``chumpy.ch.Ch``, an array."""
 
@@ -125,9 +113,13 @@ ALLOWED: dict[tuple[str, str], Any] = {
     ("numpy", "ndarray"): "numpy.ndarray",  # pickles only name the class
     ("numpy", "dtype"): _DType,
     ("numpy.core.multiarray", "_reconstruct"): _reconstruct,
-    ("numpy.core.multiarray", "scalar"): _scalar,
-    ("numpy.core.numeric", "_frombuffer"): _from_buffer,
-    ("_codecs", "encode"): _encode,
+    ("numpy.core.multiarray", "scalar"): lambda dtype, content: np.frombuffer(
+        _bytes(content), dtype.value
+    )[0],
+    ("numpy.core.numeric", "_frombuffer"): lambda content, dtype, shape, order: (
+        np.frombuffer(content, dtype.value).reshape(shape, order=order).copy()
+    ),
+    ("_codecs", "encode"): lambda text, _encoding: text.encode("latin1"),
     ("copyreg", "_reconstructor"): copyreg._reconstructor,  # type: ignore[attr-defined]
     ("builtins", "object"): object,
     ("builtins", "set"): set,
