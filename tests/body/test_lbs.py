@@ -12,7 +12,6 @@ from gsgan.body.free import free_body
 from gsgan.body.lbs import (
     axis_angle_to_matrix,
     blend_transforms,
-    check_weights,
     forward_kinematics,
     kinematic_levels,
     skin,
@@ -51,44 +50,10 @@ def test_axis_angle_gradient_at_zero_is_the_cross_matrix():
     assert J[0, 0].abs().max() == 0
 
 
-def test_end_of_a_bent_chain_matches_trigonometry():
-    rotations = torch.stack([rz(0), rz(90), rz(0)])[None]
-    T = forward_kinematics(CHAIN, (-1, 0, 1), rotations, torch.tensor([[0.0, 0, 5]], dtype=D))
-    tip = T[0, 2] @ torch.tensor([3.0, 0, 0, 1], dtype=D)
-    torch.testing.assert_close(tip, torch.tensor([1.0, 2, 5, 1], dtype=D), atol=1e-15, rtol=0)
-
-
-def test_root_turns_about_its_own_joint():
-    joints = torch.tensor([[1.0, 0, 0]], dtype=D)
-    T = forward_kinematics(joints, (-1,), rz(180)[None, None], torch.zeros(1, 3, dtype=D))
-    end = T[0, 0] @ torch.tensor([2.0, 0, 0, 1], dtype=D)
-    torch.testing.assert_close(end[:3], torch.zeros(3, dtype=D), atol=1e-15, rtol=0)
-
-
 def test_rest_pose_is_the_identity():
     eye = torch.eye(3, dtype=D).expand(2, 3, 3, 3)
     T = forward_kinematics(CHAIN, (-1, 0, 1), eye, torch.zeros(2, 3, dtype=D))
     assert torch.equal(T, torch.eye(4, dtype=D).expand(2, 3, 4, 4))
-
-
-def test_siblings_do_not_move_each_other():
-    joints = torch.tensor([[0.0, 0, 0], [1, 0, 0], [-1, 0, 0]], dtype=D)
-    rotations = torch.stack([rz(0), rz(40), rz(0)])[None]
-    T = forward_kinematics(joints, (-1, 0, 0), rotations, torch.zeros(1, 3, dtype=D))
-    torch.testing.assert_close(T[0, 2], torch.eye(4, dtype=D))
-    assert not torch.allclose(T[0, 1], torch.eye(4, dtype=D))
-
-
-def test_half_and_half_weights_average_the_two_bones():
-    a, b = torch.eye(4, dtype=D), torch.eye(4, dtype=D)
-    a[:3, 3] = torch.tensor([2.0, 0, 0])
-    b[:3, :3] = rz(180)
-    A, t = blend_transforms(
-        torch.stack([a, b])[None], torch.tensor([[0, 1]]), torch.tensor([[0.5, 0.5]], dtype=D)
-    )
-    expected = torch.diag(torch.tensor([0.0, 0.0, 1.0], dtype=D))  # the collapse LBS is known for
-    torch.testing.assert_close(A[0, 0], expected, atol=1e-15, rtol=0)
-    torch.testing.assert_close(t[0, 0], torch.tensor([1.0, 0, 0], dtype=D))
 
 
 def test_weights_are_renormalised():
@@ -96,11 +61,6 @@ def test_weights_are_renormalised():
     T[0, 1, 0, 3] = 4
     _, t = blend_transforms(T, torch.tensor([[0, 1]]), torch.tensor([[30, 90]], dtype=torch.uint8))
     assert t[0, 0, 0] == 3
-
-
-def test_skin_applies_the_affine_map():
-    A, t = 2 * torch.eye(3, dtype=D).expand(1, 1, 3, 3), torch.ones(1, 1, 3, dtype=D)
-    assert skin(torch.tensor([[1.0, 2, 3]], dtype=D), A, t).tolist() == [[[3, 5, 7]]]
 
 
 def test_gradients_agree_with_finite_differences():
@@ -140,28 +100,12 @@ def test_levels_put_parents_first():
     assert kinematic_levels((-1, 0, 0, 1, 3)) == [[0], [1, 2], [3], [4]]
 
 
-@pytest.mark.parametrize(
-    ("name", "arguments"),
-    [
-        ("rotations", (CHAIN, (-1, 0, 1), torch.zeros(1, 2, 3, 3), torch.zeros(1, 3))),
-        ("transl", (CHAIN, (-1, 0, 1), torch.zeros(2, 3, 3, 3), torch.zeros(1, 3))),
-    ],
-)
-def test_wrong_shapes_name_the_argument(name, arguments):
-    with pytest.raises(ValueError, match=name):
-        forward_kinematics(*arguments)
-
-
 @pytest.mark.parametrize("wrong", [[0.0, 0.0], [1.5, -0.5], [math.nan, 1.0], [math.inf, 1.0]])
-def test_vertices_without_weight_are_refused(wrong):
-    with pytest.raises(ValueError, match="1 vertices without"):
-        check_weights(torch.tensor([[0.5, 0.5], wrong]))
-
-
-def test_a_body_refuses_such_weights_when_it_is_made():
+def test_a_body_refuses_vertices_without_weight_when_it_is_made(wrong):
     body = free_body()
-    weight = body.bone_weight.clone()
+    weight = body.bone_weight.float()
     weight[7] = 0
+    weight[7, :2] = torch.tensor(wrong)
     with pytest.raises(ValueError, match="1 vertices without"):
         replace(body, bone_weight=weight)
 

@@ -8,12 +8,16 @@ from typing import Any
 import numpy as np
 from writers.smpl import posed
 
+from gsgan.body.smpl_names import CIHP
 from gsgan.data.dataset import CaptureDataset
+from gsgan.data.files import read_colour
 from gsgan.data.formats.capture import SKELETON_LIMITS, read_capture
 from gsgan.data.formats.consistency import Consistency
 from gsgan.data.formats.smpl_motion import SmplMotion
 from gsgan.data.layout import Layout
+from gsgan.data.pixels import read_labels, read_mask
 from gsgan.scene import Frame
+from gsgan.skeleton.smpl_landmarks import to_mediapipe33
 
 
 def items(layout: Layout) -> list[tuple[str, int]]:
@@ -57,3 +61,28 @@ def check_poses(layout: Layout, subject: Any, blend: bool = True) -> None:
     betas = np.repeat(subject.shapes[None], len(theta), 0)
     motion = SmplMotion(np.array(subject.frames), theta, transl, betas)
     assert np.allclose(posed(subject.model, motion, blend)[0], subject.vertices, atol=1e-6)
+
+
+def check_skeletons(layout: Layout, subject: Any, kind: str = "smpl") -> None:
+    for i, frame in enumerate(subject.frames):
+        p, conf = to_mediapipe33(subject.joints[i], subject.vertices[i], kind)
+        assert np.allclose(layout.landmarks.p[frame][conf > 0], p[conf > 0], atol=1e-5)
+        assert np.array_equal(layout.landmarks.visibility[frame], conf)
+        assert np.isfinite(layout.landmarks.p[frame]).all()
+
+
+def check_images(layout: Layout, subject: Any) -> None:
+    """Colours, masks and labels, but for what a JPEG turns."""
+    soft = hasattr(subject, "alphas")
+    for i, frame in enumerate(subject.frames):
+        for c, name in enumerate(layout.camera_names):
+            cover = subject.alphas[i][c] if soft else 255 * (subject.labels[i][c] > 0)
+            mask = read_mask(layout.mask_files(name, frame), layout.pixels)
+            clear = np.abs(cover.astype(int) - 127.5) > 12
+            assert np.array_equal(mask[clear], np.where(cover > 127, 255, 0)[clear])
+            assert set(np.unique(mask)) <= {0, 255}
+            image = read_colour(layout.image_path(name, frame)).astype(int)
+            assert np.abs(image - subject.images[i][c]).mean() < 12  # chroma of a small JPEG
+            if layout.labels:
+                found = read_labels(layout.label_path(name, frame), layout.pixels, CIHP)
+                assert np.array_equal(found, subject.labels[i][c])

@@ -1,6 +1,7 @@
 """Fixtures of the data tests; `make` beside this file becomes importable."""
 
 import os
+import shutil
 import sys
 from pathlib import Path
 
@@ -54,6 +55,12 @@ def smplx_subject(smplx_file):
     from writers.smplx_rig import smplx_subject
 
     return smplx_subject(smplx_file)
+
+
+@pytest.fixture
+def root(written, tmp_path):
+    """A copy of the folder that a file's tests share, to damage."""
+    return Path(shutil.copytree(written, tmp_path / written.name))
 
 
 @pytest.fixture(scope="session")

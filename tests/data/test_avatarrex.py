@@ -2,17 +2,13 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
-from capture_frames import check_cameras
+from capture_frames import check_cameras, check_images, check_skeletons
 from writers.avatarrex import SERIALS, write_avatarrex
 
-from gsgan.data.files import read_colour
 from gsgan.data.formats.avatarrex import AvatarrexReader
 from gsgan.data.layout import Layout
-from gsgan.data.pixels import read_mask
 from gsgan.data.validation import Thresholds
-from gsgan.skeleton.smpl_landmarks import to_mediapipe33
 
 pytestmark = pytest.mark.usefixtures("model_once")
 
@@ -32,18 +28,11 @@ def test_read_equals_written(root, smplx_subject, smplx_file):
     assert layout.camera_names == SERIALS  # the calibration's order, which indices count
     s = smplx_subject
     check_cameras(layout, s.cameras)
-    for c, name in enumerate(SERIALS):
+    for name in SERIALS:
         assert layout.image_path(name, 1) == root / name / "00000001.jpg"
         assert layout.mask_path(name, 1) == root / name / "mask/pha/00000001.jpg"
-        image = read_colour(layout.image_path(name, 1)).astype(int)
-        assert np.abs(image - s.images[1][c]).mean() < 12
-        alpha = s.alphas[1][c].astype(int)
-        clear = np.abs(alpha - 127.5) > 12
-        mask = read_mask(layout.mask_files(name, 1), layout.pixels)
-        assert np.array_equal(mask[clear], np.where(alpha > 127, 255, 0)[clear])
-    for i, frame in enumerate(s.frames):
-        p, conf = to_mediapipe33(s.joints[i], s.vertices[i], "smplx")
-        assert np.allclose(layout.landmarks.p[frame][conf > 0], p[conf > 0], atol=1e-5)
+    check_images(layout, s)
+    check_skeletons(layout, s, "smplx")
     assert layout.meta.layout == "AvatarReX"
 
 

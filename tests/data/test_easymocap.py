@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from capture_frames import check_cameras, check_poses
+from capture_frames import check_cameras, check_images, check_poses, check_skeletons
 from writers.common import write_picture
 from writers.easymocap import (
     NAMES,
@@ -19,12 +19,9 @@ from writers.easymocap import (
     write_people,
 )
 
-from gsgan.data.files import read_colour
 from gsgan.data.formats.easymocap import EasymocapReader
 from gsgan.data.layout import Layout
-from gsgan.data.pixels import read_mask
 from gsgan.data.validation import Thresholds
-from gsgan.skeleton.smpl_landmarks import to_mediapipe33
 from gsgan.utils.errors import DataError
 
 pytestmark = pytest.mark.usefixtures("model_once")
@@ -44,12 +41,6 @@ def read(root: Path, smpl: Path | None = None, **settings: Any) -> Layout:
 def written(tmp_path_factory, subject):
     """Keypoints and fits; do not write into it."""
     return write_easymocap(tmp_path_factory.mktemp("easymocap") / "take", subject)
-
-
-@pytest.fixture
-def root(written, tmp_path):
-    """The same to damage."""
-    return Path(shutil.copytree(written, tmp_path / "take"))
 
 
 def edit_people(
@@ -115,9 +106,7 @@ def test_hands_give_the_fingers(tmp_path, subject):
 
 def test_fits_give_skeletons_and_poses(written, subject, smpl_file):
     layout = read(written, smpl_file)  # auto: fits, since the model is there
-    for i, frame in enumerate(subject.frames):
-        p, conf = to_mediapipe33(subject.joints[i], subject.vertices[i])
-        assert np.allclose(layout.landmarks.p[frame][conf > 0], p[conf > 0], atol=1e-5)
+    check_skeletons(layout, subject)
     check_poses(layout, subject)
     assert layout.meta.skeleton_source == "smpl24 -> mediapipe33"
     assert (layout.meta.body.kind, layout.meta.body.file) == ("smpl", str(smpl_file))
@@ -136,13 +125,7 @@ def test_which_skeleton_is_taken(root, smpl_file):
 
 
 def test_pictures_and_masks_are_those_that_were_written(written, subject):
-    layout = read(written)
-    for i, frame in enumerate(subject.frames):
-        for c, name in enumerate(NAMES):
-            mask = read_mask(layout.mask_files(name, frame), layout.pixels)
-            assert np.array_equal(mask, np.where(subject.labels[i][c] > 0, 255, 0))
-            image = read_colour(layout.image_path(name, frame)).astype(int)
-            assert np.abs(image - subject.images[i][c]).mean() < 12
+    check_images(read(written), subject)
 
 
 def test_the_config_reads_it_in_worker_processes(written, smpl_file, compose):

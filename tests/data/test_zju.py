@@ -11,18 +11,17 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from capture_frames import check_cameras, check_poses
+from capture_frames import check_cameras, check_images, check_poses, check_skeletons
 from writers import zju as writers
-from writers.common import Subject, make_subject, write_picture
+from writers.common import make_subject, write_picture
 
 from gsgan.body.smpl_names import CIHP
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.formats.zju import ZjuReader
 from gsgan.data.layout import Layout
-from gsgan.data.pixels import read_labels, read_mask
+from gsgan.data.pixels import read_mask
 from gsgan.data.validation import Thresholds
 from gsgan.scene import Frame
-from gsgan.skeleton.smpl_landmarks import to_mediapipe33
 
 pytestmark = pytest.mark.usefixtures("model_once")
 
@@ -39,34 +38,6 @@ def frame_of(layout: Layout, camera: int, frame: int) -> Frame:
 def written(tmp_path_factory, subject):
     """The original release; do not write into it."""
     return writers.write_original(tmp_path_factory.mktemp("zju") / "CoreView_377", subject)
-
-
-@pytest.fixture
-def original(written, tmp_path):
-    """The same to damage."""
-    return Path(shutil.copytree(written, tmp_path / "CoreView_377"))
-
-
-def check_skeletons(layout: Layout, subject: Subject, vertices: bool = True) -> None:
-    for i, frame in enumerate(subject.frames):
-        p, conf = to_mediapipe33(subject.joints[i], subject.vertices[i] if vertices else None)
-        seen = conf > 0
-        assert np.allclose(layout.landmarks.p[frame][seen], p[seen], atol=1e-5)
-        assert np.array_equal(layout.landmarks.visibility[frame], conf)
-        assert np.isfinite(layout.landmarks.p[frame]).all()
-
-
-def check_images(layout: Layout, subject: Subject) -> None:
-    for i, frame in enumerate(subject.frames):
-        for c, name in enumerate(layout.camera_names):
-            labels = subject.labels[i][c]
-            mask = read_mask(layout.mask_files(name, frame), layout.pixels)
-            assert np.array_equal(mask, np.where(labels > 0, 255, 0))
-            stored = cv2.imread(str(layout.image_path(name, frame)))[..., ::-1].astype(int)
-            assert np.abs(stored - subject.images[i][c]).mean() < 12  # chroma of a small JPEG
-            if layout.labels:
-                path = layout.label_path(name, frame)
-                assert np.array_equal(read_labels(path, layout.pixels, CIHP), labels)
 
 
 def test_the_original_release_is_read_as_it_was_written(written, subject, smpl_file):
@@ -106,14 +77,14 @@ def test_one_of_the_two_masks_is_enough(subject, smpl_file, tmp_path, masks):
     check_images(layout, subject)
 
 
-def test_masks_are_joined_and_small_labels_are_not_thresholded(original, smpl_file):
+def test_masks_are_joined_and_small_labels_are_not_thresholded(root, smpl_file):
     empty = np.zeros((40, 40), np.uint8)
     one = empty.copy()
     one[3, 4], other = 7, empty.copy()
     other[8, 9] = 1
-    write_picture(original / "mask_cihp/Camera_B1/000002.png", one)
-    write_picture(original / "mask/Camera_B1/000002.png", np.repeat(other[..., None], 3, -1))
-    layout = read(original, smpl_file)
+    write_picture(root / "mask_cihp/Camera_B1/000002.png", one)
+    write_picture(root / "mask/Camera_B1/000002.png", np.repeat(other[..., None], 3, -1))
+    layout = read(root, smpl_file)
     mask = read_mask(layout.mask_files("Camera_B1", 2), layout.pixels)
     assert (mask == 255).sum() == 2
 
@@ -173,19 +144,19 @@ def test_the_index_is_small_and_goes_to_worker_processes(written, smpl_file):
     assert torch.equal(again.image, frame_of(layout, 1, 3).image)
 
 
-def test_a_camera_without_pictures_keeps_its_index(original, smpl_file):
-    shutil.rmtree(original / "Camera_B2")
-    layout = read(original, smpl_file)
+def test_a_camera_without_pictures_keeps_its_index(root, smpl_file):
+    shutil.rmtree(root / "Camera_B2")
+    layout = read(root, smpl_file)
     assert layout.camera_names == ("Camera_B1", "Camera_B2", "Camera_B3")
     assert not layout.images["Camera_B2"]
 
 
-def test_labels_beyond_cihp_are_ignored(original, smpl_file):
-    path = original / "mask_cihp/Camera_B1/000003.png"
+def test_labels_beyond_cihp_are_ignored(root, smpl_file):
+    path = root / "mask_cihp/Camera_B1/000003.png"
     labels = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     labels[labels == 5] = 109
     write_picture(path, labels)
-    found = frame_of(read(original, smpl_file), 0, 3).labels
+    found = frame_of(read(root, smpl_file), 0, 3).labels
     assert set(found.unique().tolist()) <= {*range(20), 255}
 
 

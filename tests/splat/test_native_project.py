@@ -83,21 +83,6 @@ def test_float32_is_rounded_once():
     assert got.extents.dtype == torch.float32
 
 
-def test_bits_do_not_depend_on_threads():
-    gaussians, cam = cloud(3000, 1, batch=2), turned(camera(batch=2))
-    before, results = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2, 3):
-            torch.set_num_threads(threads)
-            p, grads = with_gradients(native_project.project, gaussians, cam, WIDE["high"])
-            results.append([p.means, p.factors, *grads.values()])
-    finally:
-        torch.set_num_threads(before)
-    for other in results[1:]:
-        pairs = zip(results[0], other, strict=True)
-        assert all(x is y is None or torch.equal(x, y) for x, y in pairs)
-
-
 def test_no_gaussians():
     gaussians, cam = leaves(cloud(0, 2, batch=2)), leaves(camera(batch=2))
     p = native_project.project(gaussians, cam, ACCURACY["high"])

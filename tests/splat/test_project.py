@@ -106,11 +106,6 @@ def test_visible_where_the_footprint_overlaps_the_image(x, visible):
     assert project(one((x, 0.0, 2.0)), camera(), STANDARD).visible.item() is visible
 
 
-@pytest.mark.parametrize(("z", "visible"), [(0.01, False), (0.0101, True), (-1.0, False)])
-def test_near_plane(z, visible):
-    assert project(one((0.0, 0.0, z)), camera(), HIGH).visible.item() is visible
-
-
 def test_extents_and_visibility_have_no_gradient():
     gaussians = cloud(5)
     p = project(replace(gaussians, means=gaussians.means.requires_grad_()), camera(), HIGH)

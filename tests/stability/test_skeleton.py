@@ -137,6 +137,9 @@ def test_frames_and_points_turn_and_move_with_the_skeleton(p, angles, metres):
     expected = here.means @ R.mT + shift[:, :1]
     torch.testing.assert_close(there.means, expected, atol=1e-6, rtol=0)
     torch.testing.assert_close(there.scales, here.scales, atol=1e-9, rtol=0)
+    torch.testing.assert_close(there.frames, R @ here.frames, atol=1e-6, rtol=0)
+    torch.testing.assert_close(there.normals, here.normals @ R.mT, atol=1e-6, rtol=0)
+    torch.testing.assert_close(there.local(), here.local(), atol=1e-6, rtol=0)
 
 
 @given(skeletons())
