@@ -185,6 +185,16 @@ def test_a_body_pose_drives_an_avatar_with_a_body(inside, run, capture, tmp_path
     assert result.returncode == 0, result.stderr
 
 
+def test_residuals_can_be_distilled(inside, on_body, tmp_path):
+    images = []
+    for value in ("false", "true"):
+        given = ["motion=train", "frames=1", f"distilled={value}", f"out={tmp_path / value}"]
+        result = inside("render", f"run={on_body()}", *given)
+        assert result.returncode == 0, result.stderr
+        images.append(read(next((tmp_path / value).glob("*.png"))) / 255)
+    assert 0 < np.abs(images[0] - images[1]).max() < 0.5
+
+
 def test_a_video(render, tmp_path):
     av = pytest.importorskip("av")
     result = render("motion=novel_pose", "background=white", "out=a.mp4", "fps=7.5")

@@ -5,8 +5,8 @@ import pytest
 import torch
 from matplotlib import rc_context
 
-from gsgan.report.figures import images
 from gsgan.report.figures.layout import COLUMN, STYLE, TALLEST, Panel, draw_panels, written
+from gsgan.report.figures.run import most_disputed
 from gsgan.report.figures.subjects import choose_items, make_shots, measure
 from gsgan.utils.errors import ConfigError, DataError
 
@@ -35,12 +35,12 @@ def test_measures_in_closed_form():
 def test_the_box_lies_where_the_runs_differ():
     runs = torch.zeros(3, 3, 20, 10)
     runs[1, :, 12:16, 6:9] = 1.0
-    rows, columns = images.most_disputed(runs, 0.3)
+    rows, columns = most_disputed(runs, 0.3)
     assert (rows.stop - rows.start, columns.stop - columns.start) == (6, 3)
     assert rows.start <= 12
     assert rows.stop >= 16
     assert (columns.start, columns.stop) == (6, 9)
-    whole = images.most_disputed(torch.zeros(2, 3, 5, 5), 1.0)
+    whole = most_disputed(torch.zeros(2, 3, 5, 5), 1.0)
     assert whole == (slice(0, 5), slice(0, 5))
 
 

@@ -52,7 +52,9 @@ def read_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], tuple[int, ...]]:
     parents = _parents(expect_array(raw, "kintree_table", (2, None), path), path)
     J = len(parents)
     directions = expect_array(raw, "shapedirs", (V, 3, None), path)
-    S = _shape_count(J, directions.shape[-1])
+    S = directions.shape[-1]
+    if J == SMPLX_JOINT_COUNT:  # shape and expression: 300 + 100, or 10 + 10
+        S = 300 if S >= 400 else 10 if S == 20 else S
     floats = {
         "v_template": v_template,
         "shapedirs": directions,
@@ -81,16 +83,6 @@ def _raw(path: Path) -> dict[str, Any]:
             "file itself (.pkl or .npz), not fitted parameters"
         )
     return content
-
-
-def _shape_count(joints: int, directions: int) -> int:
-    """Number of a file's directions that are body shape; the rest are expression.
-
-    SMPL-X concatenates them: 300 + 100, or 10 + 10.
-    """
-    if joints == SMPLX_JOINT_COUNT and directions >= 400:
-        return 300
-    return 10 if joints == SMPLX_JOINT_COUNT and directions == 20 else directions
 
 
 def _parents(table: NDArray[Any], path: Path) -> tuple[int, ...]:

@@ -66,7 +66,5 @@ def write_grid(rows: Sequence[dict[str, Tensor]], path: Path, least: int = 160) 
     for i, caption in enumerate(rows[0]):
         at = (i * scale * width + 4, CAPTION_HEIGHT - 7)
         cv2.putText(header, caption, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
-    ok, data = cv2.imencode(".png", np.concatenate([header, pixels])[..., ::-1])
-    if not ok:
-        raise OSError(f"{path}: the image could not be encoded as PNG")
-    write_atomically(path, data.tobytes())
+    encoded = cv2.imencode(".png", np.concatenate([header, pixels])[..., ::-1])[1]
+    write_atomically(path, encoded.tobytes())

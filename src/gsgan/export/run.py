@@ -16,8 +16,7 @@ from gsgan import __version__
 from gsgan.effects.table import rows
 from gsgan.export.page import block, page, refuse_unsuitable
 from gsgan.export.splats import Splats, glb_bytes, ply_bytes, splats_of
-from gsgan.model.drive import REST, Drive, drive_of, inputs_of
-from gsgan.model.harmonic import Harmonic, distilled
+from gsgan.model.drive import REST, Drive, distilled_of, drive_of, inputs_of
 from gsgan.model.runs import Run
 from gsgan.utils.checks import above, one_of, whole
 from gsgan.utils.console import make_console
@@ -138,7 +137,6 @@ ENDINGS = {
     "bin": ".bin",
 }
 CARD = "MODEL_CARD.md"
-DISTILLED = 200  # training poses over which Ψ's residuals are fitted, at most
 
 
 def export_config(config: DictConfig) -> None:
@@ -224,15 +222,7 @@ def _block(config: DictConfig, run: Run, name: str, tell: Callable[[str], None])
         drive = _poses(_with_motion(config, str(motion)), run)
         tell(drive.text)
         motions[Path(motion).stem] = drive, float(config.fps)
-    if not isinstance(run.avatar.deformation, Harmonic):
-        drive = drive_of(_with_motion(config, "train"), run, 1.0)
-        chosen = np.unique(np.linspace(0, len(drive.p) - 1, DISTILLED).round().astype(int))
-        poses = [inputs_of(run.avatar, drive, i) for i in chosen.tolist()]
-        avatar = distilled(run.avatar, poses)
-        tell(f"distilled from {len(poses)} training poses")
-    else:
-        avatar = run.avatar
-    return block(run, avatar, motions, name)
+    return block(run, distilled_of(config, run), motions, name)
 
 
 def _with_motion(config: DictConfig, motion: str) -> DictConfig:

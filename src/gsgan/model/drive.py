@@ -22,6 +22,7 @@ from gsgan.data.proportions import (
 )
 from gsgan.data.splits import SPLITS
 from gsgan.model.avatar import Avatar
+from gsgan.model.harmonic import Harmonic, distilled
 from gsgan.model.runs import Run
 from gsgan.motion.clip import (
     AXES,
@@ -39,12 +40,14 @@ from gsgan.motion.retarget import expressed, face_in_head, joined, placed, retar
 from gsgan.scene import BodyPose, Camera, cat
 from gsgan.skeleton import complete_skeleton, sanitise
 from gsgan.skeleton.sides import refuse_swapped
+from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import above, one_of
 from gsgan.utils.config import defaults_of
 from gsgan.utils.errors import ConfigError, DataError
 
 Float = NDArray[np.float64]
 REST = "rest"
+DISTILLED = 200  # training poses over which Ψ's residuals are fitted, at most
 
 
 @dataclass(frozen=True)
@@ -262,3 +265,13 @@ def inputs_of(avatar: Avatar, drive: Drive, i: int) -> tuple[Tensor, Tensor, Bod
     if drive.body is not None and avatar.needs_body:
         return p, visibility, drive.body[i : i + 1].to(p)
     return p, visibility, avatar.body_pose(p, visibility)
+
+
+def distilled_of(config: DictConfig, run: Run) -> Avatar:
+    """A run's avatar with Ψ's residuals as linear functions, fitted over training poses: see
+    `gsgan.model.harmonic.distilled`."""
+    if isinstance(run.avatar.deformation, Harmonic):
+        return run.avatar
+    drive = drive_of(cast(DictConfig, OmegaConf.merge(config, {"motion": "train"})), run, 1.0)
+    chosen = evenly_spaced(len(drive.p), DISTILLED, ends=True)
+    return distilled(run.avatar, (inputs_of(run.avatar, drive, i) for i in chosen))

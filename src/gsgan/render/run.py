@@ -16,7 +16,7 @@ from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import PersonCrop, square_window
 from gsgan.data.training_poses import TrainingPoses
 from gsgan.model.avatar import Avatar
-from gsgan.model.drive import Drive, drive_of, inputs_of, joints_of
+from gsgan.model.drive import Drive, distilled_of, drive_of, inputs_of, joints_of
 from gsgan.model.runs import Run
 from gsgan.motion.orbit import Orbit
 from gsgan.render.output import Output
@@ -43,6 +43,8 @@ def render_config(config: DictConfig) -> None:
     paint_on = background(str(config.background), output.video)
     fps = float(above("fps", config.fps))
     run = Run.load(config)
+    if config.distilled:
+        run.avatar = distilled_of(config, run)
     drive = _chosen(drive_of(config, run, fps), config, fps)
     console.print(drive.text, markup=False, highlight=False, soft_wrap=True)
     cameras, index = _cameras(config, run, drive)

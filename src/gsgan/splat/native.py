@@ -6,72 +6,13 @@ When it cannot be built, ``available()`` is False and ``why_not()`` has the reas
 from __future__ import annotations
 
 import ctypes
-import math
-import weakref
-from collections import deque
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from gsgan.splat import build
-
-CACHE_LINE = 64  # bytes; rows of tiles are whole cache lines
-LARGE = 1 << 20  # bytes from which memory is reused
-KEPT = 1 << 28  # maximum bytes of unused memory that a process keeps
-
-_NAMES = {torch.float32: "float32", torch.float64: "float64"}
-# By size in bytes. A deque's append and pop are atomic: finalisers run in any thread, at any time.
-_free: dict[int, deque[NDArray[np.uint8]]] = {}
-
-
-def zeros(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-    """Zeros on the CPU, aligned to cache lines.
-
-    Large ones may reuse the memory of earlier ones that have been freed.
-
-    Args:
-        shape: of the tensor.
-        dtype: float32 or float64.
-    """
-    used = math.prod(shape) * dtype.itemsize
-    size = used + CACHE_LINE
-    kept = _take(size) if size >= LARGE else None
-    # numpy's large zeros are huge pages, which the system clears on first access.
-    memory = np.zeros(size, np.uint8) if kept is None else kept
-    first = -memory.ctypes.data % CACHE_LINE
-    # Sliced in numpy: autograd forbids in-place changes of views made by torch.
-    array = memory[first : first + used].view(_NAMES[dtype]).reshape(shape)
-    if size >= LARGE:  # the array lives as long as the tensors that share its memory
-        weakref.finalize(array, _give_back, memory).atexit = False
-    tensor = torch.from_numpy(array)
-    return tensor if kept is None else tensor.zero_()
-
-
-def kept() -> int:
-    """Bytes of unused memory that are kept for reuse."""
-    return sum(size * len(same) for size, same in list(_free.items()))
-
-
-def forget() -> None:
-    """Frees the unused memory, as before a measurement of memory."""
-    _free.clear()
-
-
-def _take(size: int) -> NDArray[np.uint8] | None:
-    try:
-        return _free[size].pop()
-    except (KeyError, IndexError):
-        return None
-
-
-def _give_back(memory: NDArray[np.uint8]) -> None:
-    if kept() + memory.nbytes > KEPT:
-        _free.clear()
-    _free.setdefault(memory.nbytes, deque()).append(memory)
-
+from gsgan.splat.buffers import zeros
 
 if TYPE_CHECKING:
     from gsgan.splat.project import Projected

@@ -12,7 +12,7 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from gsgan.data.proportions import upright
-from gsgan.model.drive import Drive, drive_of
+from gsgan.model.drive import Drive, distilled_of, drive_of
 from gsgan.model.runs import Run
 from gsgan.motion.orbit import Orbit
 from gsgan.utils.checks import above, between, whole
@@ -53,6 +53,8 @@ class Viewer:
     def __init__(self, config: DictConfig) -> None:
         viser = import_viser()
         self.run, fps = Run.load(config), float(above("fps", config.fps))
+        if config.distilled:
+            self.run.avatar = distilled_of(config, self.run)
 
         def read(motion: str) -> Drive:
             return drive_of(OmegaConf.merge(config, {"motion": motion}), self.run, fps)  # type: ignore[arg-type]
