@@ -103,7 +103,7 @@ def test_levels_put_parents_first():
 @pytest.mark.parametrize("wrong", [[0.0, 0.0], [1.5, -0.5], [math.nan, 1.0], [math.inf, 1.0]])
 def test_a_body_refuses_vertices_without_weight_when_it_is_made(wrong):
     body = free_body()
-    weight = body.bone_weight.float()
+    weight = body.bone_weight.float().clone()
     weight[7] = 0
     weight[7, :2] = torch.tensor(wrong)
     with pytest.raises(ValueError, match="1 vertices without"):
