@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 
 from gsgan.check.settings import Sampling
@@ -27,9 +26,7 @@ from gsgan.data.dataset import CaptureDataset
 from gsgan.data.formats.consistency import (
     FAR_PIXELS,
     TOLERANCE,
-    Bool,
     Consistency,
-    Float,
     joint_distance,
     mask_distance,
     spread,
@@ -37,6 +34,7 @@ from gsgan.data.formats.consistency import (
 from gsgan.data.layout import Layout
 from gsgan.data.splits import Item
 from gsgan.skeleton.template import MEDIAPIPE33, SkeletonTemplate
+from gsgan.utils.arrays import Bool, Float, Ints
 from gsgan.utils.console import progress
 from gsgan.utils.errors import DataError
 
@@ -65,7 +63,7 @@ class CheckedData:
 
     layout: Layout
     consistency: Consistency
-    frames: NDArray[np.int64]
+    frames: Ints
     pairs: Mapping[str, tuple[int, ...]]
     p: Float
     visible: Bool

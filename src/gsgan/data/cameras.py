@@ -6,14 +6,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from gsgan.data.crop import Crop
 from gsgan.scene import Camera
-from gsgan.utils.arrays import as_floats
+from gsgan.utils.arrays import Float, as_floats
 from gsgan.utils.errors import DataError
-
-Float = NDArray[np.float64]
 
 DISTORTION_LENGTHS = (4, 5, 8)
 ROTATION_TOLERANCE = 1e-3  # largest entry of R Rᵀ - I

@@ -11,10 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsgan.utils.arrays import Bytes, Float
 from gsgan.utils.checks import above
-
-Float = NDArray[np.float64]
-Bytes = NDArray[np.uint8]
 
 NEAR = 1e-2  # metres: points nearer than this are not seen
 FOUND = 1e-8  # of x/z: largest error of an undistorted point

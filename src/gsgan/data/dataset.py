@@ -23,10 +23,10 @@ from gsgan.data.pixels import IGNORE_LABEL
 from gsgan.data.skeletons import Landmarks
 from gsgan.data.splits import Item
 from gsgan.scene import BodyPose, Camera, Frame, unit
+from gsgan.utils.arrays import Bytes
 from gsgan.utils.checks import whole
 from gsgan.utils.errors import DataError
 
-Bytes = NDArray[np.uint8]
 Lens = Literal["undistort", "ignore", "raw"]
 
 

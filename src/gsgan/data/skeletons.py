@@ -26,10 +26,8 @@ from gsgan.skeleton.face import FACE
 from gsgan.skeleton.hands import HAND
 from gsgan.skeleton.template import HEAD, Vector
 from gsgan.skeleton.tensors import constants
+from gsgan.utils.arrays import Bool, Float
 from gsgan.utils.errors import DataError
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 SKELETONS = {"mediapipe33": 33}
 HUBS = (11, 12, 23, 24)  # shoulders and hips: the bone frames of the whole body depend on them

@@ -4,8 +4,8 @@ import numpy as np
 
 from gsgan.data.joints import ALL, BODY, FACE, HANDS, PALM, WRISTS, known
 from gsgan.data.skeletons import bone_lengths
-from gsgan.prepare.camera_array import Bool, Float
 from gsgan.skeleton.hands import FINGER_BONES, HAND
+from gsgan.utils.arrays import Bool, Float
 
 Bones = tuple[tuple[int, int], ...]
 # Bones of constant length, as (inner, outer) joint: the outer one is removed when it differs.

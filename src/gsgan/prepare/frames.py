@@ -11,9 +11,9 @@ import numpy as np
 from gsgan.data.files import read_arrays, read_grey
 from gsgan.data.joints import known
 from gsgan.data.skeletons import HUBS
-from gsgan.prepare.camera_array import Bool, Float, Ints
 from gsgan.prepare.images import QUALITY
-from gsgan.prepare.sources import Bytes, Recording, opened, video_recording
+from gsgan.prepare.sources import Recording, opened, video_recording
+from gsgan.utils.arrays import Bool, Bytes, Float, Ints
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import write_npz, writing
 

@@ -18,7 +18,7 @@ from gsgan.data.cameras import CameraEntry
 from gsgan.data.files import read_arrays
 from gsgan.data.joints import ALL, ARM_PAIRS, BODY, FLIP_GROUPS, HANDS, LEFT, LEG_PAIRS, RIGHT
 from gsgan.prepare import landmarks
-from gsgan.prepare.camera_array import Bool, CameraArray, Float, Ints
+from gsgan.prepare.camera_array import CameraArray
 from gsgan.prepare.cleanse import cleanse, smooth
 from gsgan.prepare.frames import LeftOut, check_enough, left_out, look, sample, sampling
 from gsgan.prepare.images import find_masks
@@ -31,7 +31,7 @@ from gsgan.prepare.stages import StageFolder
 from gsgan.prepare.triangulate import exchanged
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.skeleton.hands import HAND
-from gsgan.utils.arrays import expect_array
+from gsgan.utils.arrays import Bool, Float, Ints, expect_array
 from gsgan.utils.errors import DataError
 
 FILM = np.hypot(36.0, 24.0)  # millimetres, the diagonal that equivalent focal lengths refer to

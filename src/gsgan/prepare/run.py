@@ -15,14 +15,7 @@ from gsgan.data.joints import BODY, FACE, HANDS, known
 from gsgan.data.splits import parse_frames
 from gsgan.data.validation import Thresholds, check_distance
 from gsgan.prepare import landmarks
-from gsgan.prepare.camera_array import (
-    Bool,
-    CameraArray,
-    Float,
-    Ints,
-    camera_moves,
-    undistort_points,
-)
+from gsgan.prepare.camera_array import CameraArray, camera_moves, undistort_points
 from gsgan.prepare.dataset import Outcome, exists, publish, write_files
 from gsgan.prepare.images import find_masks, write_images
 from gsgan.prepare.landmarks import Detections
@@ -34,6 +27,7 @@ from gsgan.prepare.sources import stamp
 from gsgan.prepare.stages import Advance, StageFolder, digest, each_camera
 from gsgan.prepare.triangulate import plain
 from gsgan.skeleton import MEDIAPIPE33
+from gsgan.utils.arrays import Bool, Float, Ints
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import write_json
 

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gsgan.data.crop import NEAR
 from gsgan.data.joints import known
-from gsgan.prepare.camera_array import MIN_VIEWS, Bool, CameraArray, Float
+from gsgan.prepare.camera_array import MIN_VIEWS, CameraArray
+from gsgan.utils.arrays import Bool, Float, Ints
 
 # Errors are in thousandths of the focal length: pixels, at a focal length of 1000 pixels.
 SCALE = 3.5  # error at which a detection counts half (Cauchy's weight)
@@ -190,7 +190,7 @@ def _group_flips(cameras: CameraArray, uv: Float, weight: Float, pairs: Pairs) -
     C, F, _ = weight.shape
     everywhere = np.arange(F)
 
-    def points(flips: Bool, frames: NDArray[np.int64]) -> tuple[Float, Float]:
+    def points(flips: Bool, frames: Ints) -> tuple[Float, Float]:
         sided, seen = (apply_flips(v[:, frames], flips[..., None], local) for v in (uv, weight))
         return points_and_cost(cameras, sided, seen)
 
@@ -202,9 +202,7 @@ def _group_flips(cameras: CameraArray, uv: Float, weight: Float, pairs: Pairs) -
     return ~flips if (votes * flips).sum() > votes.sum() / 2 else flips
 
 
-def cheapest_flips(
-    cost_of: Callable[[Bool, NDArray[np.int64]], Float], flips: Bool, price: Float
-) -> Bool:
+def cheapest_flips(cost_of: Callable[[Bool, Ints], Float], flips: Bool, price: Float) -> Bool:
     """``flips [C, F]``, one camera at a time changed as long as that saves more than its price.
 
     Args:

@@ -8,6 +8,11 @@ from numpy.typing import NDArray
 
 from gsgan.utils.errors import DataError
 
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+Bytes = NDArray[np.uint8]
+Ints = NDArray[np.int64]
+
 
 def expect_array(
     arrays: dict[str, NDArray[Any]], name: str, shape: tuple[int | None, ...], path: Path
@@ -30,7 +35,7 @@ def expect_array(
     return array
 
 
-def as_floats(raw: Any) -> NDArray[np.float64]:
+def as_floats(raw: Any) -> Float:
     """A float64 copy of lists or arrays; empty when they are ragged or hold no numbers."""
     try:
         return np.array(raw, np.float64)

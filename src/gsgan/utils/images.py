@@ -6,16 +6,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from PIL import Image, ImageColor, ImageOps
 from torch import Tensor
 
+from gsgan.utils.arrays import Bytes
 from gsgan.utils.errors import ConfigError
 
 BAR = 18  # pixels of the caption above a tile
 QUALITY = 88  # of the JPEG
 
-Bytes = NDArray[np.uint8]
 Background = Tensor | None
 
 

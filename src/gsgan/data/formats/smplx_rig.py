@@ -11,7 +11,6 @@ from pathlib import Path, PurePosixPath
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gsgan.body.smpl import SkinnedModel
 from gsgan.data.cameras import CameraEntry, make_camera, numbers
@@ -29,14 +28,13 @@ from gsgan.data.layout import BodyModel, Found, Meta
 from gsgan.data.pixels import PixelRules
 from gsgan.data.skeletons import make_landmarks
 from gsgan.data.validation import Thresholds, spans
-from gsgan.utils.arrays import as_floats
+from gsgan.utils.arrays import Float, as_floats
 from gsgan.utils.checks import whole
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.pickles import read_npz
 
 Files = dict[str, FrameFiles]
 """Paths relative to the root, by camera and frame."""
-Float = NDArray[np.float64]
 
 PARAMETERS = "smpl_params.npz"
 MISSING = "missing_img_files.txt"
