@@ -14,13 +14,13 @@ from gsgan.check.calibration import calibration_findings, score_cameras
 from gsgan.check.frames import frame_findings, mask_doubts, shortened, skeleton_doubts
 from gsgan.check.report import Figure, Finding, Section, Table, counted
 from gsgan.check.settings import Limits, Sampling
-from gsgan.check.views import CheckedData, nanmedian
+from gsgan.check.views import CheckedData
 from gsgan.data.formats.consistency import far_cameras, spread
 from gsgan.data.proportions import axis_name
 from gsgan.effects import EffectSettings, decide
 from gsgan.effects.table import HEADERS, rows
 from gsgan.skeleton.sanitise import limb_length_sum
-from gsgan.utils.arrays import Float
+from gsgan.utils.arrays import Float, nanmedian
 from gsgan.utils.errors import DataError
 
 POSSIBLE = (0.4, 3.0)  # metres of person: outside, units are wrong

@@ -6,7 +6,6 @@ A silhouette estimated from the skeleton is what masks are compared with; pixel 
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -169,13 +168,6 @@ def grouped(views: Sequence[MaskView]) -> dict[str, list[MaskView]]:
         name: [v for v in views if v.camera == name]
         for name in dict.fromkeys(v.camera for v in views)
     }
-
-
-def nanmedian(values: Float) -> Float:
-    """Median over the first axis, NaN where nothing is known, without a warning."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
-        return np.asarray(np.nanmedian(values, axis=0))
 
 
 def sampled_items(subject: CheckedData, images: int) -> tuple[Item, ...]:

@@ -26,7 +26,7 @@ from gsgan.skeleton.face import FACE
 from gsgan.skeleton.hands import HAND
 from gsgan.skeleton.template import HEAD, Vector
 from gsgan.skeleton.tensors import constants
-from gsgan.utils.arrays import Bool, Float
+from gsgan.utils.arrays import Bool, Float, nanmedian
 from gsgan.utils.errors import DataError
 
 SKELETONS = {"mediapipe33": 33}
@@ -121,8 +121,7 @@ def make_landmarks(
     """
     visibility = np.where(np.isfinite(p).all(-1), np.nan_to_num(conf), 0.0).clip(0, 1)
     valid = visibility > 0
-    centre, some = np.zeros((len(p), 1, 3)), valid.any(-1)
-    centre[some, 0] = np.nanmedian(np.where(valid[some, :, None], p[some], np.nan), axis=1)
+    centre = np.nan_to_num(nanmedian(np.where(valid[..., None], p, np.nan), 1))[:, None]
     with np.errstate(over="ignore"):  # absurdly far is far
         distance = np.linalg.norm(np.nan_to_num(p, posinf=0, neginf=0) - centre, axis=-1)
     far = valid & (distance > max_reach)

@@ -18,7 +18,7 @@ from gsgan.prepare.triangulate import (
     robust,
 )
 from gsgan.skeleton.hands import HAND
-from gsgan.utils.arrays import Bool, Float, Ints, evenly_spaced
+from gsgan.utils.arrays import Bool, Float, Ints, evenly_spaced, nanmedian
 from gsgan.utils.checks import above, at_least, whole
 
 # Errors and distances are in thousandths of the focal length.
@@ -63,11 +63,7 @@ def misfits(error: Float) -> Bool:
 
     They are another person's, something else, or the same hand detected twice.
     """
-    by_hand = error.reshape(*error.shape[:2], 2, HAND)
-    middle = np.full(by_hand.shape[:3], np.nan)
-    seen = np.isfinite(by_hand).any(-1)
-    middle[seen] = np.nanmedian(by_hand[seen], axis=-1)
-    return middle > MAX_ERROR
+    return nanmedian(error.reshape(*error.shape[:2], 2, HAND), -1) > MAX_ERROR
 
 
 REFINED = 200  # most frames that refine the cameras, evenly spaced

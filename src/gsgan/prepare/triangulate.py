@@ -9,7 +9,7 @@ import numpy as np
 from gsgan.data.crop import NEAR
 from gsgan.data.joints import known
 from gsgan.prepare.camera_array import MIN_VIEWS, CameraArray
-from gsgan.utils.arrays import Bool, Float, Ints
+from gsgan.utils.arrays import Bool, Float, Ints, nanmedian
 
 # Errors are in thousandths of the focal length: pixels, at a focal length of 1000 pixels.
 SCALE = 3.5  # error at which a detection counts half (Cauchy's weight)
@@ -87,7 +87,8 @@ def _robust(
     error = cameras.errors(p, uv)
     certainty = np.linalg.eigvalsh(information)
     missing = certainty[:, 0] * MAX_ELONGATION**2 < certainty[:, 2]
-    missing |= _median(error, weight > 0) > max_error
+    used = np.where(weight > 0, np.nan_to_num(error, nan=np.nan, posinf=FAR), np.nan)
+    missing |= nanmedian(used) > max_error
     missing |= (weight > 0).sum(0) < MIN_VIEWS
     p = np.where(missing[:, None], np.nan, p)
     return Triangulated(p, np.where(missing, 0.0, reweighted), np.where(missing, np.nan, error))
@@ -136,13 +137,6 @@ def _best_pair(cameras: CameraArray, uv: Float, weight: Float, a: Float, b: Floa
         better = (new < cost) & np.isfinite(p).all(-1)
         best, cost = np.where(better[:, None], p, best), np.where(better, new, cost)
     return best
-
-
-def _median(error: Float, used: Bool) -> Float:
-    """``[N]`` median over the used cameras, 0 where there are none."""
-    masked = np.where(used, np.nan_to_num(error, nan=np.nan, posinf=FAR), np.nan)
-    masked[:, np.isnan(masked).all(0)] = 0.0
-    return np.asarray(np.nanmedian(masked, axis=0))
 
 
 def find_flips(cameras: CameraArray, uv: Float, weight: Float, groups: Sequence[Pairs]) -> Bool:

@@ -1,5 +1,6 @@
 """Arrays from files: present, of the expected shape, and numbers, or one clear sentence."""
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,13 @@ def as_floats(raw: Any) -> Float:
         return np.array(raw, np.float64)
     except (TypeError, ValueError, OverflowError):
         return np.zeros(0)
+
+
+def nanmedian(values: Float, axis: int = 0) -> Float:
+    """The median along an axis, NaN where nothing is known, without numpy's warning."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        return np.asarray(np.nanmedian(values, axis=axis))
 
 
 def evenly_spaced(count: int, most: int, *, ends: bool = False) -> list[int]:
