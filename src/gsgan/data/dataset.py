@@ -48,20 +48,12 @@ class DecodedImage:
 
 
 class ImageCache(LRUCache[Item, DecodedImage]):
-    """The most recently used images.
-
-    Args:
-        limit: bytes; 0 keeps nothing.
-    """
-
-    def __init__(self, limit: int) -> None:
-        super().__init__(maxsize=limit)
+    """The most recently used images, of at most so many bytes; 0 keeps nothing."""
 
     @staticmethod
     def getsizeof(value: DecodedImage) -> int:
         """Bytes held."""
-        parts = (value.image, value.mask, value.labels, value.unsure)
-        return sum(part.nbytes for part in parts if part is not None)
+        return sum(part.nbytes for part in vars(value).values() if part is not None)
 
 
 class CaptureDataset(Dataset[Frame]):

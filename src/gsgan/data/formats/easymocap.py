@@ -57,11 +57,7 @@ class EasymocapReader(FolderReader):
     )
 
     def find(self, root: Path, limits: Thresholds, smpl: str | None) -> Found:
-        """The dataset's files, each checked separately.
-
-        Raises:
-            DataError: for whatever is missing or damaged, naming the file.
-        """
+        """See `FolderReader.find`."""
         notes: list[str] = []
         names = _camera_folders(root, self.contents)
         images = {name: frame_files(root, f"images/{name}", IMAGES) for name in names}

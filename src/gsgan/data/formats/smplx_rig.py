@@ -83,11 +83,7 @@ class SmplxRigReader(FolderReader):
             )
 
     def find(self, root: Path, limits: Thresholds, smpl: str | None) -> Found:
-        """The subject's files, each checked separately.
-
-        Raises:
-            DataError: for whatever is missing or damaged, naming the file.
-        """
+        """See `FolderReader.find`."""
         alpha, notes = self.ignore_alpha, list[str]()
         for name in (self.calibration, PARAMETERS):
             if not (root / name).is_file():
