@@ -45,7 +45,6 @@ from gsgan.scene import Frame
 from gsgan.splat import BACKENDS, Accuracy
 from gsgan.utils.checks import above, between, one_of
 from gsgan.utils.errors import ConfigError, DataError
-from gsgan.utils.palette import BLACK, COLOURS, GREY
 
 BASE = "base"
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h")
@@ -63,7 +62,8 @@ QUALITIES = {
     "lpips": ("LPIPS", 4, -1),
     "far": ("far PSNR dB", 2, 1),  # of another capture of the person, where one is given
 }
-ORDER = (BLACK, *COLOURS[:-1], GREY)  # the base point's first
+# The base point's first, then Okabe and Ito's, which are distinct with any colour vision.
+ORDER = ("#000000", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#777777")
 
 Score = Callable[[Tensor, Tensor], Tensor]
 

@@ -7,7 +7,7 @@ import pytest
 from gsgan.data.scene_info import SceneInfo
 from gsgan.data.surface_colours import SurfaceColours
 from gsgan.effects import NAMES, Effects, EffectSettings, ModelParts, decide
-from gsgan.effects.settings import CHOICES
+from gsgan.effects.decide import CHOICES
 from gsgan.utils.errors import ConfigError
 
 ALIKE = SurfaceColours(difference=0.01, residual=0.05)

@@ -18,7 +18,7 @@ import gsgan.utils.compat  # noqa: F401
 from gsgan.body.shape import BodyShape, free_space, shaped_body
 from gsgan.body.solve import Solver
 from gsgan.data.datamodule import GsganData
-from gsgan.data.fingerprint import fingerprint
+from gsgan.evaluate.origin import fingerprint
 from gsgan.evaluate.run import make_scorer
 from gsgan.fit.fitter import Fitter, _wrong
 from gsgan.fit.frames import MaskedFrames

@@ -9,12 +9,11 @@ from numpy.typing import NDArray
 from gsgan.check.views import CheckedData, MaskView
 from gsgan.data.crop import NEAR, Crop, project, resize, take, undistort_map
 from gsgan.data.files import read_colour
-from gsgan.data.formats.consistency import FAR_PIXELS, Float
+from gsgan.data.formats.consistency import FAR_PIXELS
 from gsgan.data.pixels import read_mask
 from gsgan.skeleton.hands import HAND
+from gsgan.utils.arrays import Bytes, Float
 from gsgan.utils.images import caption, encode
-
-Bytes = NDArray[np.uint8]
 
 HEIGHT = 360  # pixels of a tile
 ASPECT = 0.75  # width to height of a tile: a standing person

@@ -14,12 +14,13 @@ from gsgan.check.calibration import calibration_findings, score_cameras
 from gsgan.check.frames import frame_findings, mask_doubts, shortened, skeleton_doubts
 from gsgan.check.report import Figure, Finding, Section, Table, counted
 from gsgan.check.settings import Limits, Sampling
-from gsgan.check.views import CheckedData, nanmedian
-from gsgan.data.formats.consistency import Float, far_cameras, spread
+from gsgan.check.views import CheckedData
+from gsgan.data.formats.consistency import far_cameras, spread
 from gsgan.data.proportions import axis_name
 from gsgan.effects import EffectSettings, decide
-from gsgan.effects.table import HEADERS, rows
+from gsgan.effects.record import HEADERS
 from gsgan.skeleton.sanitise import limb_length_sum
+from gsgan.utils.arrays import Float, nanmedian
 from gsgan.utils.errors import DataError
 
 POSSIBLE = (0.4, 3.0)  # metres of person: outside, units are wrong
@@ -298,4 +299,5 @@ def _effects(m: Measurements) -> Section:
     title = "Effects that the scene calls for"
     if m.info is None:
         return Section(title, text=f"Not decided: {m.no_info}")
-    return Section(title, (Table(HEADERS, tuple(rows(decide(m.info, m.effects)))),), text=EFFECTS)
+    decided = decide(m.info, m.effects).rows()
+    return Section(title, (Table(HEADERS, tuple(decided)),), text=EFFECTS)

@@ -6,7 +6,6 @@ A silhouette estimated from the skeleton is what masks are compared with; pixel 
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -17,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 
 from gsgan.check.settings import Sampling
@@ -27,9 +25,7 @@ from gsgan.data.dataset import CaptureDataset
 from gsgan.data.formats.consistency import (
     FAR_PIXELS,
     TOLERANCE,
-    Bool,
     Consistency,
-    Float,
     joint_distance,
     mask_distance,
     spread,
@@ -37,6 +33,7 @@ from gsgan.data.formats.consistency import (
 from gsgan.data.layout import Layout
 from gsgan.data.splits import Item
 from gsgan.skeleton.template import MEDIAPIPE33, SkeletonTemplate
+from gsgan.utils.arrays import Bool, Float, Ints
 from gsgan.utils.console import progress
 from gsgan.utils.errors import DataError
 
@@ -65,7 +62,7 @@ class CheckedData:
 
     layout: Layout
     consistency: Consistency
-    frames: NDArray[np.int64]
+    frames: Ints
     pairs: Mapping[str, tuple[int, ...]]
     p: Float
     visible: Bool
@@ -171,13 +168,6 @@ def grouped(views: Sequence[MaskView]) -> dict[str, list[MaskView]]:
         name: [v for v in views if v.camera == name]
         for name in dict.fromkeys(v.camera for v in views)
     }
-
-
-def nanmedian(values: Float) -> Float:
-    """Median over the first axis, NaN where nothing is known, without a warning."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
-        return np.asarray(np.nanmedian(values, axis=0))
 
 
 def sampled_items(subject: CheckedData, images: int) -> tuple[Item, ...]:

@@ -14,11 +14,10 @@ from typing import Any
 import cv2
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from gsgan.data.cameras import CameraEntry, make_camera, numbers
 from gsgan.data.files import read_json
-from gsgan.utils.arrays import as_floats
+from gsgan.utils.arrays import Float, as_floats
 from gsgan.utils.errors import DataError
 
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
@@ -253,7 +252,7 @@ class _Loader(yaml.BaseLoader):
     """YAML of text and matrices; nothing in a file is run."""
 
 
-def _matrix(loader: _Loader, node: yaml.MappingNode) -> NDArray[np.float64]:
+def _matrix(loader: _Loader, node: yaml.MappingNode) -> Float:
     """``[rows, cols]`` of an ``!!opencv-matrix``."""
     parts = loader.construct_mapping(node, deep=True)
     values = np.array([float(text) for text in parts["data"]], np.float64)

@@ -6,17 +6,28 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from gsgan.data.crop import Crop
 from gsgan.scene import Camera
-from gsgan.utils.arrays import as_floats
+from gsgan.utils.arrays import Float, as_floats
 from gsgan.utils.errors import DataError
-
-Float = NDArray[np.float64]
 
 DISTORTION_LENGTHS = (4, 5, 8)
 ROTATION_TOLERANCE = 1e-3  # largest entry of R Rᵀ - I
+
+
+@dataclass(frozen=True)
+class Crop:
+    """A rectangle of whole pixels; it may reach beyond the image.
+
+    Args:
+        top: row of its first pixel.
+        left: column of its first pixel.
+        size: ``(H, W)`` pixels.
+    """
+
+    top: int
+    left: int
+    size: tuple[int, int]
 
 
 @dataclass(frozen=True)

@@ -5,16 +5,14 @@ time nothing else is known, and a box that follows the true mask would leak the 
 """
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsgan.data.cameras import CameraEntry, Crop
+from gsgan.utils.arrays import Bytes, Float
 from gsgan.utils.checks import above
-
-Float = NDArray[np.float64]
-Bytes = NDArray[np.uint8]
 
 NEAR = 1e-2  # metres: points nearer than this are not seen
 FOUND = 1e-8  # of x/z: largest error of an undistorted point
@@ -24,35 +22,7 @@ CONVERGED = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 400, 1e-12)
 _undistort = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
 
 
-class Pinhole(Protocol):
-    """The parts of a camera that cropping needs: ``K R t`` as in `gsgan.scene`, size ``(H, W)``."""
-
-    @property
-    def K(self) -> Float: ...
-    @property
-    def R(self) -> Float: ...
-    @property
-    def t(self) -> Float: ...
-    @property
-    def size(self) -> tuple[int, int]: ...
-
-
-@dataclass(frozen=True)
-class Crop:
-    """A rectangle of whole pixels; it may reach beyond the image.
-
-    Args:
-        top: row of its first pixel.
-        left: column of its first pixel.
-        size: ``(H, W)`` pixels.
-    """
-
-    top: int
-    left: int
-    size: tuple[int, int]
-
-
-def project(view: Pinhole, points: Float) -> tuple[Float, Float]:
+def project(view: CameraEntry, points: Float) -> tuple[Float, Float]:
     """Pixels ``[..., 2]`` (centres at +0.5) and depths ``[...]`` of world points ``[..., 3]``.
 
     Lens distortion is not applied. Points nearer than `NEAR` get finite, meaningless pixels: mask
@@ -64,7 +34,7 @@ def project(view: Pinhole, points: Float) -> tuple[Float, Float]:
     return uvw[..., :2], depth
 
 
-def inside(view: Pinhole, points: Float) -> NDArray[np.bool_]:
+def inside(view: CameraEntry, points: Float) -> NDArray[np.bool_]:
     """``[...]`` whether world points ``[..., 3]`` project into the image; False for NaN."""
     uvw = np.tensordot(points, (view.K @ view.R).T, 1) + view.K @ view.t  # not divided: it is slow
     (u, v, depth), (height, width) = np.moveaxis(uvw, -1, 0), view.size
@@ -86,7 +56,7 @@ class PersonCrop:
         above("data.crop.margin", self.margin)
 
     def window(
-        self, view: Pinhole, joints: Float, usable: NDArray[np.bool_], dist: Float | None = None
+        self, view: CameraEntry, joints: Float, usable: NDArray[np.bool_], dist: Float | None = None
     ) -> Crop:
         """The crop round the usable joints, clipped to the image, then made square.
 

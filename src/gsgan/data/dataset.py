@@ -23,10 +23,10 @@ from gsgan.data.pixels import IGNORE_LABEL
 from gsgan.data.skeletons import Landmarks
 from gsgan.data.splits import Item
 from gsgan.scene import BodyPose, Camera, Frame, unit
+from gsgan.utils.arrays import Bytes
 from gsgan.utils.checks import whole
 from gsgan.utils.errors import DataError
 
-Bytes = NDArray[np.uint8]
 Lens = Literal["undistort", "ignore", "raw"]
 
 
@@ -48,20 +48,12 @@ class DecodedImage:
 
 
 class ImageCache(LRUCache[Item, DecodedImage]):
-    """The most recently used images.
-
-    Args:
-        limit: bytes; 0 keeps nothing.
-    """
-
-    def __init__(self, limit: int) -> None:
-        super().__init__(maxsize=limit)
+    """The most recently used images, of at most so many bytes; 0 keeps nothing."""
 
     @staticmethod
     def getsizeof(value: DecodedImage) -> int:
         """Bytes held."""
-        parts = (value.image, value.mask, value.labels, value.unsure)
-        return sum(part.nbytes for part in parts if part is not None)
+        return sum(part.nbytes for part in vars(value).values() if part is not None)
 
 
 class CaptureDataset(Dataset[Frame]):

@@ -1,14 +1,11 @@
 """The joints of a capture, 33 + 2 x 21 + 30 of the face, and their numbers in other detectors."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gsgan.skeleton.face import FACE_NAMES
 from gsgan.skeleton.hands import HAND, hand_names
 from gsgan.skeleton.template import MEDIAPIPE33
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
+from gsgan.utils.arrays import Bool, Float
 
 BODY = len(MEDIAPIPE33.names)
 LEFT, RIGHT = slice(BODY, BODY + HAND), slice(BODY + HAND, BODY + 2 * HAND)

@@ -13,12 +13,10 @@ from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from gsgan.data.files import read_grey, read_stored
+from gsgan.utils.arrays import Bool, Bytes
 from gsgan.utils.errors import DataError
-
-Bytes = NDArray[np.uint8]
 
 IGNORE_LABEL = 255
 
@@ -133,7 +131,7 @@ def with_ignored_border(labels: Bytes, mask: Bytes, band: int) -> Bytes:
     return np.where(outline(mask, band), np.uint8(IGNORE_LABEL), labels)
 
 
-def outline(mask: Bytes, band: int) -> NDArray[np.bool_]:
+def outline(mask: Bytes, band: int) -> Bool:
     """``[H, W]`` where the mask dilated and eroded by a square of this side differ; 0: nowhere."""
     if band == 0:
         return np.zeros(mask.shape, np.bool_)

@@ -9,16 +9,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from gsgan.skeleton import HOLISTIC, MEDIAPIPE33, bone_frames, sanitise
 from gsgan.skeleton.face import FACE
 from gsgan.skeleton.hands import FINGER_BONES, HAND, INDEX, PINKY, WRIST
 from gsgan.skeleton.template import CHEST, HEAD, PELVIS
+from gsgan.utils.arrays import Bool, Float
 from gsgan.utils.errors import DataError
-
-Float = NDArray[np.float64]
 
 SHOULDERS, EARS, HIPS = (11, 12), (7, 8), (23, 24)
 ARMS = ((11, 13), (13, 15)), ((12, 14), (14, 16))
@@ -165,7 +163,7 @@ def _plain(p: Float) -> tuple[tuple[float, float, float], ...]:
     return tuple((x, y, z) for x, y, z in p.tolist())
 
 
-def _hands(p: Float, seen: NDArray[np.bool_]) -> dict[int, Float]:
+def _hands(p: Float, seen: Bool) -> dict[int, Float]:
     """Each hand of joints ``[F, J, 3]`` as `_hand` gives it, by its wrist; empty without any.
 
     A hand that is never seen whole is the other one's mirror image.

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch.utils.data import Subset
 
-from gsgan.body import SkinnedBody, open_body
+from gsgan.body import open_body
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import IGNORE_LABEL, read_labels
@@ -217,22 +217,15 @@ def _darkest(dataset: CaptureDataset, samples: int) -> float:
 
 def _body_inside(layout: Layout, dataset: CaptureDataset, samples: int) -> float | None:
     """Mean share of the posed body inside the masks of some training images."""
-    mesh = _mesh(layout)
+    body, mesh = layout.meta.body, None
+    if body is not None and layout.poses is not None:
+        with suppress(DataError):  # no model file
+            mesh = open_body(body.kind, body.file, body.betas)
     if mesh is None:
         return None
     chosen = evenly_spaced(len(dataset.items), MOST_BODY_IMAGES * samples, ends=True)
     shares = [body_inside(dataset[i], mesh) for i in chosen]
     return float(np.mean([share for share in shares if share is not None] or [0.0]))
-
-
-def _mesh(layout: Layout) -> SkinnedBody | None:
-    """The body that the capture's poses move; None if they or its model file are missing."""
-    body = layout.meta.body
-    if body is None or layout.poses is None:
-        return None
-    with suppress(DataError):
-        return open_body(body.kind, body.file, body.betas)
-    return None
 
 
 def _shared_surface(

@@ -26,10 +26,8 @@ from gsgan.skeleton.face import FACE
 from gsgan.skeleton.hands import HAND
 from gsgan.skeleton.template import HEAD, Vector
 from gsgan.skeleton.tensors import constants
+from gsgan.utils.arrays import Bool, Float, nanmedian
 from gsgan.utils.errors import DataError
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 SKELETONS = {"mediapipe33": 33}
 HUBS = (11, 12, 23, 24)  # shoulders and hips: the bone frames of the whole body depend on them
@@ -123,8 +121,7 @@ def make_landmarks(
     """
     visibility = np.where(np.isfinite(p).all(-1), np.nan_to_num(conf), 0.0).clip(0, 1)
     valid = visibility > 0
-    centre, some = np.zeros((len(p), 1, 3)), valid.any(-1)
-    centre[some, 0] = np.nanmedian(np.where(valid[some, :, None], p[some], np.nan), axis=1)
+    centre = np.nan_to_num(nanmedian(np.where(valid[..., None], p, np.nan), 1))[:, None]
     with np.errstate(over="ignore"):  # absurdly far is far
         distance = np.linalg.norm(np.nan_to_num(p, posinf=0, neginf=0) - centre, axis=-1)
     far = valid & (distance > max_reach)

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gsgan.data.files import LARGEST_FRAME
 from gsgan.data.layout import Layout
 from gsgan.data.protocol import Protocol
 from gsgan.data.validation import spans
+from gsgan.utils.arrays import Ints
 from gsgan.utils.errors import ConfigError, DataError
 
 T = TypeVar("T", int, str)
@@ -32,7 +32,7 @@ class Items(Sequence[Item]):
         frames: ``[N]`` of each camera.
     """
 
-    def __init__(self, frames: Mapping[str, NDArray[np.int64]]) -> None:
+    def __init__(self, frames: Mapping[str, Ints]) -> None:
         self._of = {name: numbers for name, numbers in frames.items() if len(numbers)}
         self._ends = np.cumsum([0, *map(len, self._of.values())])
 

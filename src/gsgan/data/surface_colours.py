@@ -16,14 +16,13 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from gsgan.scene import Frame
+from gsgan.utils.arrays import Bool, Float, Ints
 
 if TYPE_CHECKING:
     from gsgan.body.skinned import SkinnedBody
 
-Float = NDArray[np.float64]
 
 VOXEL = 0.025  # metres, of the hull and of the occlusion test
 AIR = 0.3  # metres of space around the joints that is carved
@@ -120,7 +119,7 @@ def _hull(frames: Sequence[Frame]) -> Float:
     return voxels
 
 
-def _place(frame: Frame, points: Float) -> tuple[NDArray[np.int64], NDArray[np.bool_], Float]:
+def _place(frame: Frame, points: Float) -> tuple[Ints, Bool, Float]:
     """Whole pixels ``[V, 2]``, whether they are in the image ``[V]``, depths ``[V]``."""
     height, width = frame.camera.size
     at, depth = frame.camera.project(torch.from_numpy(points)[None].to(frame.camera.K))

@@ -6,9 +6,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
+from rich.table import Table
+
 from gsgan.utils.errors import ConfigError
 
 OFF = "off"
+HEADERS = ("effect", "", "why")
 
 
 @dataclass(frozen=True)
@@ -64,6 +67,19 @@ class Effects:
     def degree(self) -> int:
         """Degree of the spherical harmonics."""
         return int(self.view_dependence.value)
+
+    def rows(self) -> list[tuple[str, str, str]]:
+        """One row per effect: name, value, why."""
+        return [(name, str(one.value) if one.on else OFF, one.why) for name, one in self]
+
+    def table(self) -> Table:
+        """The rows for a terminal."""
+        table = Table(title="effects", title_justify="left")
+        for header in HEADERS:
+            table.add_column(header, overflow="fold")
+        for row in self.rows():
+            table.add_row(*row, style="dim" if row[1] == OFF else None)
+        return table
 
     def plain(self) -> dict[str, Any]:
         """Plain values, as a checkpoint holds them."""

@@ -13,6 +13,7 @@ from gsgan.metrics.segmentation import colour_labels
 from gsgan.model.rendering import Rendering
 from gsgan.scene import Frame
 from gsgan.utils.files import write_atomically
+from gsgan.utils.images import to_bytes
 
 CAPTION_HEIGHT = 22
 ERROR_GAIN = 4.0  # errors are small: they are shown brighter by this factor
@@ -58,10 +59,10 @@ def write_grid(rows: Sequence[dict[str, Tensor]], path: Path, least: int = 160) 
     padded = [
         [pad(x, (0, width - x.shape[-1], 0, height - x.shape[-2])) for x in row] for row in images
     ]
-    body = torch.cat([torch.cat(row, dim=-1) for row in padded], dim=-2).clamp(0, 1)
+    body = torch.cat([torch.cat(row, dim=-1) for row in padded], dim=-2)
     scale = max(1, -(-least // width))
     body = body.repeat_interleave(scale, -1).repeat_interleave(scale, -2)
-    pixels = (body * 255).round().byte().permute(1, 2, 0).numpy()
+    pixels = to_bytes(body)
     header = np.full((CAPTION_HEIGHT, pixels.shape[1], 3), 255, np.uint8)
     for i, caption in enumerate(rows[0]):
         at = (i * scale * width + 4, CAPTION_HEIGHT - 7)

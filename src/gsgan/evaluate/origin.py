@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import subprocess
 from dataclasses import asdict, dataclass
 from datetime import datetime
@@ -11,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from gsgan import __version__
-from gsgan.data.fingerprint import fingerprint
 from gsgan.model.stored import choices
 
 if TYPE_CHECKING:
@@ -67,6 +68,23 @@ def origin(method: Method, data: GsganData, device: torch.device) -> dict[str, A
         "device": str(device),
         "torch": torch.__version__,
     }
+
+
+def fingerprint(data: GsganData) -> str:
+    """A short hash of cameras, frames, splits, image size and fitted body poses, independent of the
+    contents of images and of where the files are."""
+    layout = data.layout
+    content: dict[str, Any] = {
+        "cameras": {name: list(camera.size) for name, camera in layout.cameras.items()},
+        "frames": list(layout.frames),
+        "splits": {k: [list(item) for item in items] for k, items in data.splits.items.items()},
+        "size": data.size,
+        "crop": None if data.crop is None else asdict(data.crop),
+    }
+    if layout.poses is not None and layout.poses.fitted:  # other poses are other inputs
+        content["poses"] = layout.poses.digest(layout.frames)
+    plain = json.dumps(content, sort_keys=True).encode()
+    return hashlib.sha256(plain).hexdigest()[:12]
 
 
 def training_code() -> list[str]:

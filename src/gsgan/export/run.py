@@ -13,7 +13,6 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from rich.progress import track
 
 from gsgan import __version__
-from gsgan.effects.table import rows
 from gsgan.export.page import block, page, refuse_unsuitable
 from gsgan.export.splats import Splats, glb_bytes, ply_bytes, splats_of
 from gsgan.model.drive import REST, Drive, distilled_of, drive_of, inputs_of
@@ -85,7 +84,7 @@ def card(run: Run, kind: str, name: str, licence: str | None) -> str:
         f"---\n{yaml.safe_dump(head, sort_keys=False)}---",
         f"# {name}\n\nOne person's avatar, trained with gsgan (GaussianGAN). {HOLDS[kind]}",
         f"## Data and training\n\n{markdown(('', ''), known)}",
-        f"## Effects\n\n{markdown(('effect', '', 'why'), rows(run.avatar.effects))}",
+        f"## Effects\n\n{markdown(('effect', '', 'why'), run.avatar.effects.rows())}",
         "## Scores on held-out images\n\n" + "\n\n".join([_scores(run.folder), *marks]),
         f"## Intended use\n\n{USE}",
         "## Licence\n\n" + (licence or _licence(data.get("name"))),

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from gsgan.losses.photometric import d_ssim_map
+from gsgan.utils.images import to_bytes
 
 Score = Callable[[Tensor, Tensor], Tensor]
 SSIM_CONSTANTS = (0.01, 0.03)
@@ -173,8 +174,7 @@ def edge_scores(
     """
     scores, kernel = [], np.ones((2 * tolerance + 1, 2 * tolerance + 1), np.uint8)
     for i, pair in enumerate(zip(image, target, strict=True)):
-        whole = ((x.detach().cpu().clamp(0, 1) * 255).round().byte() for x in pair)
-        grey = (cv2.cvtColor(x.permute(1, 2, 0).numpy(), cv2.COLOR_RGB2GRAY) for x in whole)
+        grey = (cv2.cvtColor(to_bytes(x), cv2.COLOR_RGB2GRAY) for x in pair)
         edges, truth = (cv2.Canny(x, low, high) > 0 for x in grey)
         near = [cv2.dilate(x.astype(np.uint8), kernel) > 0 for x in (edges, truth)]
         if where is not None:

@@ -11,15 +11,15 @@ from typing import Literal
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from gsgan.data.crop import Float, undistort
+from gsgan.data.crop import undistort
 from gsgan.metrics.image import person_box
 from gsgan.scene import Camera, Frame
 from gsgan.skeleton import TEMPLATES, SkeletonTemplate
 from gsgan.skeleton.hands import HAND
+from gsgan.utils.arrays import Bool, Float
 from gsgan.utils.tensors import constant
 
 BACKGROUNDS = {"black": 0.0, "white": 1.0}
@@ -154,7 +154,7 @@ def in_front(x_cam: Tensor) -> Tensor:
     return torch.cat([x_cam[x_cam[:, 2] > NEAR], a + share * (b - a)])
 
 
-def inside_hull(hull: Float, points: Float) -> NDArray[np.bool_]:
+def inside_hull(hull: Float, points: Float) -> Bool:
     """``[...]`` whether points ``[..., 2]`` are in a convex polygon ``[n, 2]``; false if n < 3."""
     if len(hull) < 3:
         return np.zeros(points.shape[:-1], np.bool_)

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
@@ -14,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import NEAR, undistort
 from gsgan.data.joints import known
+from gsgan.utils.arrays import Bool, Float, Ints
 
 MIN_VIEWS = 2
 FOCAL = 1000.0  # pixels; errors are then thousandths of the focal length
@@ -21,10 +21,6 @@ STEPS = 30  # of the optimiser
 SCALE = 5.0  # error at which a detection counts half, thousandths of the focal length
 SETTLED = 1e-7  # relative change of the cost at which the refinement ends
 LEAST_SQUARE = 1e-12  # square pixels: keeps the residual's scaling finite at an error of 0
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ import numpy as np
 
 from gsgan.data.joints import ALL, BODY, FACE, HANDS, PALM, WRISTS, known
 from gsgan.data.skeletons import bone_lengths
-from gsgan.prepare.camera_array import Bool, Float
 from gsgan.skeleton.hands import FINGER_BONES, HAND
+from gsgan.utils.arrays import Bool, Float, nanmedian
 
 Bones = tuple[tuple[int, int], ...]
 # Bones of constant length, as (inner, outer) joint: the outer one is removed when it differs.
@@ -30,16 +30,12 @@ def cleanse(p: Float) -> tuple[Float, dict[str, int]]:
     person of any size fits. J is 33, or 105 with hands and face; metres.
     """
     p, seen = p.copy(), known(p)
-    centre = np.full((len(p), 1, 3), np.nan)
-    rows = seen.any(1)
-    centre[rows, 0] = np.nanmedian(p[rows], axis=1)
-    far = seen & (np.linalg.norm(p - centre, axis=-1) > MAX_REACH)
+    far = seen & (np.linalg.norm(p - nanmedian(p, 1)[:, None], axis=-1) > MAX_REACH)
     if p.shape[1] == ALL:
         gap = np.linalg.norm(p[:, HAND_ROOTS] - p[:, WRISTS], axis=-1)
         far[:, HANDS] |= (gap > WRIST).repeat(HAND, axis=1)
-        rows = seen[:, FACE].any(1)
-        middle = np.nanmedian(p[rows, FACE], axis=1, keepdims=True)
-        far[rows, FACE] |= np.linalg.norm(p[rows, FACE] - middle, axis=-1) > FACE_RADIUS
+        face = p[:, FACE]
+        far[:, FACE] |= np.linalg.norm(face - nanmedian(face, 1)[:, None], axis=-1) > FACE_RADIUS
     far &= seen
     p[far] = np.nan
     wrong = np.zeros(far.shape, bool)

@@ -11,9 +11,9 @@ import numpy as np
 from gsgan.data.files import read_arrays, read_grey
 from gsgan.data.joints import known
 from gsgan.data.skeletons import HUBS
-from gsgan.prepare.camera_array import Bool, Float, Ints
 from gsgan.prepare.images import QUALITY
-from gsgan.prepare.sources import Bytes, Recording, opened, video_recording
+from gsgan.prepare.sources import Recording, opened, video_recording
+from gsgan.utils.arrays import Bool, Bytes, Float, Ints
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import write_npz, writing
 
@@ -21,6 +21,7 @@ RATE = 12.0  # images per second, unless that makes fewer than FEW or more than 
 FEW, MOST = 60, 400
 LEAST = 12  # images of use, without which there is no solution
 LONGEST = 1920  # pixels of the longer side: larger images are reduced
+SAMPLING = [RATE, FEW, MOST, LONGEST]  # what the sampled images depend on beside the video
 TIMES = "times.npz"  # written last
 LEAST_JOINTS, CONFIDENT = 16, 0.5  # of 33: fewer are not a whole person
 BLURRED = 0.3  # share of the usual sharpness
@@ -30,11 +31,6 @@ CORNERS, FEW_CORNERS = 200, 20  # of the background, that show a moving camera: 
 
 LeftOut = dict[str, Bool]
 """``[F]`` which frames are left out, by reason."""
-
-
-def sampling() -> list[float]:
-    """What the sampled images depend on beside the video."""
-    return [RATE, FEW, MOST, LONGEST]
 
 
 def sample(video: Path, folder: Path) -> tuple[Recording, Float]:

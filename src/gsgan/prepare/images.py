@@ -7,17 +7,16 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import Crop, resize, take, undistort_map
 from gsgan.data.files import frame_files, last_number, read_grey
 from gsgan.prepare.sources import IMAGE_SUFFIXES, Recording
 from gsgan.prepare.stages import Advance
+from gsgan.utils.arrays import Bytes
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import writing
 
-Bytes = NDArray[np.uint8]
 LEAST_BLOB = 0.02  # smaller pieces of a mask are removed, share of the largest
 QUALITY = 95  # of jpg, 1 to 100
 PNG_COMPRESSION = 3  # 0..9; higher is smaller and slower

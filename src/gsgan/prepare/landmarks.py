@@ -11,9 +11,8 @@ from gsgan.data.files import read_arrays, read_json
 from gsgan.data.joints import ALL, BODY, FACE, FACE_MESH, FROM_HANDS, LEFT, RIGHT, SETS, known
 from gsgan.data.skeletons import whole_frame_ids
 from gsgan.motion.points import Numbered, json_files
-from gsgan.prepare.camera_array import Float, Ints
 from gsgan.skeleton.hands import HAND
-from gsgan.utils.arrays import expect_array
+from gsgan.utils.arrays import Float, Ints, expect_array
 from gsgan.utils.errors import DataError
 
 MESH = 468  # landmarks of MediaPipe's face mesh

@@ -8,6 +8,8 @@ import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from gsgan.prepare.images import find_masks
+from gsgan.prepare.landmarks import find_landmarks
 from gsgan.prepare.options import MEDIAPIPE, MediaPipe, Options
 from gsgan.prepare.sources import Recording
 from gsgan.prepare.stages import Advance, StageFolder, each_camera
@@ -29,6 +31,21 @@ def environment_of(tool: MediaPipe) -> Path:
 def tool_key() -> list[str]:
     """What the detections depend on."""
     return [SCRIPT.read_text(), REQUIREMENTS.read_text()]
+
+
+def find_people(
+    options: Options,
+    sources: Mapping[str, Recording],
+    stages: StageFolder,
+    say: Callable[[str], None],
+) -> tuple[dict[str, Path], dict[str, dict[int, Path]]]:
+    """Landmark files by source, and its masks by frame number: given ones, or those of the tool."""
+    found, masks = run_tool(options, sources, stages, say) if options.needs_tool else ({}, {})
+    if options.masks != MEDIAPIPE:
+        masks = find_masks(options.folder("masks"), sources)
+    if options.landmarks != MEDIAPIPE:
+        found = find_landmarks(options.folder("landmarks"), sources)
+    return found, masks
 
 
 def run_tool(

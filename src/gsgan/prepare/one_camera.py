@@ -18,20 +18,19 @@ from gsgan.data.cameras import CameraEntry
 from gsgan.data.files import read_arrays
 from gsgan.data.joints import ALL, ARM_PAIRS, BODY, FLIP_GROUPS, HANDS, LEFT, LEG_PAIRS, RIGHT
 from gsgan.prepare import landmarks
-from gsgan.prepare.camera_array import Bool, CameraArray, Float, Ints
+from gsgan.prepare.camera_array import CameraArray
 from gsgan.prepare.cleanse import cleanse, smooth
-from gsgan.prepare.frames import LeftOut, check_enough, left_out, look, sample, sampling
-from gsgan.prepare.images import find_masks
-from gsgan.prepare.mediapipe import run_tool
+from gsgan.prepare.frames import SAMPLING, LeftOut, check_enough, left_out, look, sample
+from gsgan.prepare.mediapipe import find_people
 from gsgan.prepare.one_view import FEET, Seen, View, solve_view
-from gsgan.prepare.options import MEDIAPIPE, Inputs, Options
+from gsgan.prepare.options import Inputs, Options
 from gsgan.prepare.solve import Solution
 from gsgan.prepare.sources import Recording, stamp
 from gsgan.prepare.stages import StageFolder
 from gsgan.prepare.triangulate import exchanged
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.skeleton.hands import HAND
-from gsgan.utils.arrays import expect_array
+from gsgan.utils.arrays import Bool, Float, Ints, expect_array
 from gsgan.utils.errors import DataError
 
 FILM = np.hypot(36.0, 24.0)  # millimetres, the diagonal that equivalent focal lengths refer to
@@ -79,11 +78,11 @@ def solve_video(options: Options, stages: StageFolder, console: Console) -> Film
     """
     video = options.folder("source")
     with console.status("taking images from the video"):
-        folder = stages.path("frames", [*stamp(video), sampling()])
+        folder = stages.path("frames", [*stamp(video), SAMPLING])
         source, time = sample(video, folder)
-    found, masks = _detect(options, source, stages, console)
+    found, masks = find_people(options, {source.name: source}, stages, console.print)
     numbers = np.array(list(source.files))
-    detected, there = _read(found, numbers, source.size)
+    detected, there = _read(found[source.name], numbers, source.size)
     there &= np.isin(numbers, list(masks[source.name]))
     with console.status("choosing frames"):
         sharp, moved = look(list(source.files.values()), detected.px[:, :BODY])
@@ -125,21 +124,6 @@ def solve_video(options: Options, stages: StageFolder, console: Console) -> Film
     notes = tuple(_notes(measured, options, natural_height(view.shape)))
     inputs = Inputs({source.name: source}, calibration, (camera,), notes, fps)
     return Filmed(inputs, masks, numbers[kept], solution, measured)
-
-
-def _detect(
-    options: Options, source: Recording, stages: StageFolder, console: Console
-) -> tuple[Path, dict[str, dict[int, Path]]]:
-    """The npz of landmarks, and masks by frame number."""
-    sources, found = {source.name: source}, dict[str, Path]()
-    masks: dict[str, dict[int, Path]] = {}
-    if options.needs_tool:
-        found, masks = run_tool(options, sources, stages, console.print)
-    if options.masks != MEDIAPIPE:
-        masks = find_masks(options.folder("masks"), sources)
-    if options.landmarks != MEDIAPIPE:
-        found = landmarks.find_landmarks(options.folder("landmarks"), sources)
-    return found[source.name], masks
 
 
 def _read(path: Path, numbers: Ints, size: tuple[int, int]) -> tuple[Detected, Bool]:

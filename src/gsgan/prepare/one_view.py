@@ -223,16 +223,12 @@ class Problem:
         self.prior = torch.cat([own, shape_prior(self.space)])
         self.free = torch.full_like(self.prior, shape, dtype=torch.bool)
         self.free[0], self.free[1:OWN] = focal, bool(self.standing.any())
-        rays = self._rays()
+        w = seen.weight.unsqueeze(-1)
+        middle = (w * seen.u.nan_to_num()).sum(1) / w.sum(1).clamp_min(1e-9)
+        rays = torch.cat([middle, torch.ones_like(middle[:, :1])], dim=1)  # to the seen landmarks
+        rays = rays / rays.norm(dim=1, keepdim=True)
         turn = shortest_turn(rays.new_tensor([0.0, 0, 1]).expand_as(rays), rays)
         self.world = (axis_angle_to_matrix(turn).unsqueeze(1) @ seen.world.unsqueeze(-1))[..., 0]
-
-    def _rays(self) -> Tensor:
-        """``[F, 3]`` unit directions to the middle of the seen landmarks."""
-        w = self.seen.weight.unsqueeze(-1)
-        middle = (w * self.seen.u.nan_to_num()).sum(1) / w.sum(1).clamp_min(1e-9)
-        ray = torch.cat([middle, torch.ones_like(middle[:, :1])], dim=1)
-        return ray / ray.norm(dim=1, keepdim=True)
 
     def solver(self, common: Tensor) -> Solver:
         """Of the body with a shape."""
@@ -324,14 +320,9 @@ class Problem:
         """The whole cost."""
         solver = self.solver(at.common)
         found = self.terms(self.landmarks(at, solver), at.common[:OWN], linear=False)
-        below = below_least(at.q, solver.least)
-        return found.cost + self._own(at, solver, below)
-
-    def _own(self, at: State, solver: Solver, below: tuple[Tensor, Tensor]) -> Tensor:
-        """Cost of the priors of numbers and shape."""
-        stop, amount = below
+        stop, amount = below_least(at.q, solver.least)
         pull = ((at.q @ solver.prior) * at.q).sum() + (stop * amount.square()).sum()
-        return pull + (self.prior * at.common.square()).sum()
+        return found.cost + (pull + (self.prior * at.common.square()).sum())
 
     def step(self, at: State, damping: float) -> tuple[State, Tensor]:
         """One step, and the inverse of the common unknowns' covariance."""

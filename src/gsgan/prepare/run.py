@@ -15,18 +15,11 @@ from gsgan.data.joints import BODY, FACE, HANDS, known
 from gsgan.data.splits import parse_frames
 from gsgan.data.validation import Thresholds, check_distance
 from gsgan.prepare import landmarks
-from gsgan.prepare.camera_array import (
-    Bool,
-    CameraArray,
-    Float,
-    Ints,
-    camera_moves,
-    undistort_points,
-)
+from gsgan.prepare.camera_array import CameraArray, camera_moves, undistort_points
 from gsgan.prepare.dataset import Outcome, exists, publish, write_files
-from gsgan.prepare.images import find_masks, write_images
+from gsgan.prepare.images import write_images
 from gsgan.prepare.landmarks import Detections
-from gsgan.prepare.mediapipe import run_tool, tool_key
+from gsgan.prepare.mediapipe import find_people, tool_key
 from gsgan.prepare.one_camera import solve_video
 from gsgan.prepare.options import MEDIAPIPE, Inputs, Options, read_inputs
 from gsgan.prepare.solve import Solution, median, solve
@@ -34,6 +27,7 @@ from gsgan.prepare.sources import stamp
 from gsgan.prepare.stages import Advance, StageFolder, digest, each_camera
 from gsgan.prepare.triangulate import plain
 from gsgan.skeleton import MEDIAPIPE33
+from gsgan.utils.arrays import Float, Ints
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import write_json
 
@@ -143,7 +137,8 @@ def prepare(options: Options, console: Console) -> Path:
         solution, extra = filmed.solution, {"one_camera": filmed.numbers}
         options = replace(options, face=False)
     else:
-        detections, masks = _read_people(options, inputs, stages, console)
+        found, masks = find_people(options, inputs.sources, stages, console.print)
+        detections = {n: landmarks.read_detections(found[n]) for n in inputs.sources}
         frames, solution = _solved(options, inputs, detections, console)
     root = stages.path("dataset", key)
     shutil.rmtree(root, ignore_errors=True)  # of a run that was killed
@@ -180,27 +175,16 @@ def _fingerprint(options: Options, inputs: Inputs | None) -> list[object]:
     return [*parts, tool_key() if options.needs_tool else None]
 
 
-def _read_people(
-    options: Options, inputs: Inputs, stages: StageFolder, console: Console
-) -> tuple[dict[str, Detections], dict[str, dict[int, Path]]]:
-    """2D landmarks, and masks by the camera's own frame numbers."""
-    names, found = list(inputs.sources), dict[str, Path]()
-    masks: dict[str, dict[int, Path]] = {}
-    if options.needs_tool:
-        found, masks = run_tool(options, inputs.sources, stages, console.print)
-    if options.masks != MEDIAPIPE:
-        masks = find_masks(options.folder("masks"), names)
-    if options.landmarks != MEDIAPIPE:
-        found = landmarks.find_landmarks(options.folder("landmarks"), names)
-    return {name: landmarks.read_detections(found[name]) for name in names}, masks
-
-
 def _solved(
     options: Options, inputs: Inputs, detections: Mapping[str, Detections], console: Console
 ) -> tuple[Ints, Solution]:
     """The joints and cameras that fit the 2D landmarks of the chosen frames."""
     frames, px, conf = landmarks.gather(detections, options.offsets or {})
-    chosen = _chosen(options, frames)
+    chosen = np.ones(len(frames), bool)
+    if options.frames is not None:
+        chosen = np.isin(frames, parse_frames(options.frames, "frames"))
+    if not chosen.any():
+        raise DataError(f"{options.folder('source')}: frames={options.frames} leaves no frame")
     joints = slice(None if options.hands or options.face else BODY)
     frames, px, conf = frames[chosen], px[:, chosen, joints], conf[:, chosen, joints]
     for part, wanted in ((HANDS, options.hands), (FACE, options.face)):
@@ -221,16 +205,6 @@ def _check_distance(inputs: Inputs, p: Float) -> None:
         raise DataError(f"{where}: no joint was seen by two cameras; do frame numbers agree?")
     hint = "is the calibration in another unit? Set unit=mm, cm or m"
     check_distance(where, inputs.cameras, seen, Thresholds.distance, hint)
-
-
-def _chosen(options: Options, frames: Ints) -> Bool:
-    """``[F]`` which frames ``options.frames`` selects."""
-    chosen = np.ones(len(frames), bool)
-    if options.frames is not None:
-        chosen = np.isin(frames, parse_frames(options.frames, "frames"))
-    if not chosen.any():
-        raise DataError(f"{options.folder('source')}: frames={options.frames} leaves no frame")
-    return chosen
 
 
 def _write_images(

@@ -3,10 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gsgan.data.joints import ALL, BODY, FLIP_GROUPS, HAND_PAIRS, HANDS, WRISTS, known
-from gsgan.prepare.camera_array import FOCAL, MIN_VIEWS, Bool, CameraArray, Float, refine_cameras
+from gsgan.prepare.camera_array import FOCAL, MIN_VIEWS, CameraArray, refine_cameras
 from gsgan.prepare.cleanse import cleanse, smooth
 from gsgan.prepare.triangulate import (
     FLIP_GAIN,
@@ -19,7 +18,7 @@ from gsgan.prepare.triangulate import (
     robust,
 )
 from gsgan.skeleton.hands import HAND
-from gsgan.utils.arrays import evenly_spaced
+from gsgan.utils.arrays import Bool, Float, Ints, evenly_spaced, nanmedian
 from gsgan.utils.checks import above, at_least, whole
 
 # Errors and distances are in thousandths of the focal length.
@@ -49,7 +48,7 @@ def match_hands(cameras: CameraArray, uv: Float, weight: Float, wrists: Float) -
     loss = np.where(known, HAND * certain * np.log1p((off / WRIST) ** 2), 0.0)
     kept, swapped = loss[..., 0, 0] + loss[..., 1, 1], loss[..., 0, 1] + loss[..., 1, 0]
 
-    def cost_of(flips: Bool, at: NDArray[np.int64]) -> Float:
+    def cost_of(flips: Bool, at: Ints) -> Float:
         sided, seen = (apply_flips(v[:, at], flips[..., None], [OWN_PAIRS]) for v in (uv, weight))
         far = np.where(flips, swapped[:, at], kept[:, at]).sum(0)
         return np.asarray(points_and_cost(cameras, sided, seen)[1] + far)
@@ -64,11 +63,7 @@ def misfits(error: Float) -> Bool:
 
     They are another person's, something else, or the same hand detected twice.
     """
-    by_hand = error.reshape(*error.shape[:2], 2, HAND)
-    middle = np.full(by_hand.shape[:3], np.nan)
-    seen = np.isfinite(by_hand).any(-1)
-    middle[seen] = np.nanmedian(by_hand[seen], axis=-1)
-    return middle > MAX_ERROR
+    return nanmedian(error.reshape(*error.shape[:2], 2, HAND), -1) > MAX_ERROR
 
 
 REFINED = 200  # most frames that refine the cameras, evenly spaced

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.files import frame_files, natural_order, read_colour, read_header
+from gsgan.utils.arrays import Bytes
 from gsgan.utils.errors import DataError
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mts", ".mpg", ".mpeg")
@@ -18,8 +18,6 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 INSIDE = ("videos", "images")  # where EasyMocap and Pose2Sim projects keep them
 
 DIFFERENT = 0.01  # share by which frame rates or lengths must differ to be noted
-
-Bytes = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gsgan.data.crop import NEAR
 from gsgan.data.joints import known
-from gsgan.prepare.camera_array import MIN_VIEWS, Bool, CameraArray, Float
+from gsgan.prepare.camera_array import MIN_VIEWS, CameraArray
+from gsgan.utils.arrays import Bool, Float, Ints, nanmedian
 
 # Errors are in thousandths of the focal length: pixels, at a focal length of 1000 pixels.
 SCALE = 3.5  # error at which a detection counts half (Cauchy's weight)
@@ -87,7 +87,8 @@ def _robust(
     error = cameras.errors(p, uv)
     certainty = np.linalg.eigvalsh(information)
     missing = certainty[:, 0] * MAX_ELONGATION**2 < certainty[:, 2]
-    missing |= _median(error, weight > 0) > max_error
+    used = np.where(weight > 0, np.nan_to_num(error, nan=np.nan, posinf=FAR), np.nan)
+    missing |= nanmedian(used) > max_error
     missing |= (weight > 0).sum(0) < MIN_VIEWS
     p = np.where(missing[:, None], np.nan, p)
     return Triangulated(p, np.where(missing, 0.0, reweighted), np.where(missing, np.nan, error))
@@ -138,13 +139,6 @@ def _best_pair(cameras: CameraArray, uv: Float, weight: Float, a: Float, b: Floa
     return best
 
 
-def _median(error: Float, used: Bool) -> Float:
-    """``[N]`` median over the used cameras, 0 where there are none."""
-    masked = np.where(used, np.nan_to_num(error, nan=np.nan, posinf=FAR), np.nan)
-    masked[:, np.isnan(masked).all(0)] = 0.0
-    return np.asarray(np.nanmedian(masked, axis=0))
-
-
 def find_flips(cameras: CameraArray, uv: Float, weight: Float, groups: Sequence[Pairs]) -> Bool:
     """``[C, F, G]`` which camera swapped which group of joints in which frame.
 
@@ -190,7 +184,7 @@ def _group_flips(cameras: CameraArray, uv: Float, weight: Float, pairs: Pairs) -
     C, F, _ = weight.shape
     everywhere = np.arange(F)
 
-    def points(flips: Bool, frames: NDArray[np.int64]) -> tuple[Float, Float]:
+    def points(flips: Bool, frames: Ints) -> tuple[Float, Float]:
         sided, seen = (apply_flips(v[:, frames], flips[..., None], local) for v in (uv, weight))
         return points_and_cost(cameras, sided, seen)
 
@@ -202,9 +196,7 @@ def _group_flips(cameras: CameraArray, uv: Float, weight: Float, pairs: Pairs) -
     return ~flips if (votes * flips).sum() > votes.sum() / 2 else flips
 
 
-def cheapest_flips(
-    cost_of: Callable[[Bool, NDArray[np.int64]], Float], flips: Bool, price: Float
-) -> Bool:
+def cheapest_flips(cost_of: Callable[[Bool, Ints], Float], flips: Bool, price: Float) -> Bool:
     """``flips [C, F]``, one camera at a time changed as long as that saves more than its price.
 
     Args:

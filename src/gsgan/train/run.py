@@ -25,7 +25,6 @@ from rich.console import Console
 from rich.table import Table
 
 from gsgan.data.datamodule import GsganData
-from gsgan.effects.table import effects_table
 from gsgan.evaluate.files import NAMES
 from gsgan.evaluate.origin import trained, training_code
 from gsgan.evaluate.run import evaluate_method
@@ -359,7 +358,7 @@ def describe(
     console.print(table)
     for mark in module.marks:
         console.print(f"stand-in in use: {mark}", highlight=False)
-    console.print(effects_table(avatar.effects))
+    console.print(avatar.effects.table())
 
 
 def _quiet_lightning() -> None:

@@ -1,5 +1,6 @@
 """Arrays from files: present, of the expected shape, and numbers, or one clear sentence."""
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -7,6 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsgan.utils.errors import DataError
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+Bytes = NDArray[np.uint8]
+Ints = NDArray[np.int64]
 
 
 def expect_array(
@@ -30,12 +36,19 @@ def expect_array(
     return array
 
 
-def as_floats(raw: Any) -> NDArray[np.float64]:
+def as_floats(raw: Any) -> Float:
     """A float64 copy of lists or arrays; empty when they are ragged or hold no numbers."""
     try:
         return np.array(raw, np.float64)
     except (TypeError, ValueError, OverflowError):
         return np.zeros(0)
+
+
+def nanmedian(values: Float, axis: int = 0) -> Float:
+    """The median along an axis, NaN where nothing is known, without numpy's warning."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        return np.asarray(np.nanmedian(values, axis=axis))
 
 
 def evenly_spaced(count: int, most: int, *, ends: bool = False) -> list[int]:

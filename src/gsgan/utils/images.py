@@ -6,16 +6,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from PIL import Image, ImageColor, ImageOps
 from torch import Tensor
 
+from gsgan.utils.arrays import Bytes
 from gsgan.utils.errors import ConfigError
 
 BAR = 18  # pixels of the caption above a tile
 QUALITY = 88  # of the JPEG
 
-Bytes = NDArray[np.uint8]
 Background = Tensor | None
 
 
@@ -64,8 +63,13 @@ def eight_bits(image: Tensor, alpha: Tensor, behind: Background) -> Bytes:
         straight = torch.where(shown, image / alpha.clamp_min(1e-6), 0.0).clamp(0, 1)
         image = torch.cat([straight, alpha])
     else:
-        image = (image + (1 - alpha) * behind).clamp(0, 1)
-    return (image * 255).round().byte().permute(1, 2, 0).numpy()
+        image = image + (1 - alpha) * behind
+    return to_bytes(image)
+
+
+def to_bytes(image: Tensor) -> Bytes:
+    """``[H, W, C]`` of an image ``[C, H, W]``, clamped to [0, 1] and rounded to 8 bits."""
+    return (image.detach().cpu().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()
 
 
 def caption(image: Bytes, text: str, colour: tuple[int, int, int]) -> Bytes:

@@ -11,18 +11,14 @@ from typing import TypeVar
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import NEAR, project, through_lens
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_mask
-from gsgan.utils.arrays import evenly_spaced
+from gsgan.utils.arrays import Bool, Bytes, Float, evenly_spaced
 from gsgan.utils.errors import DataError
 
-Bytes = NDArray[np.uint8]
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 T = TypeVar("T")
 
 LONGEST = 512  # pixels, longest side of a mask that joints are compared with

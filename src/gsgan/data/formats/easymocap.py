@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gsgan.data.calibration import read_calibration
 from gsgan.data.cameras import CameraEntry
@@ -28,10 +27,8 @@ from gsgan.data.pixels import MaskFile, mask_file
 from gsgan.data.skeletons import make_landmarks
 from gsgan.data.validation import Thresholds, spans
 from gsgan.skeleton.hands import HAND
-from gsgan.utils.arrays import as_floats
+from gsgan.utils.arrays import Float, Ints, as_floats
 from gsgan.utils.errors import DataError
-
-Float = NDArray[np.float64]
 
 SKELETONS = {"smpl": "smpl24 -> mediapipe33", "keypoints3d": "body25 -> mediapipe33"}
 RESULTS = ("{kind}", "output/{kind}", "output-{kind}/{kind}")
@@ -60,11 +57,7 @@ class EasymocapReader(FolderReader):
     )
 
     def find(self, root: Path, limits: Thresholds, smpl: str | None) -> Found:
-        """The dataset's files, each checked separately.
-
-        Raises:
-            DataError: for whatever is missing or damaged, naming the file.
-        """
+        """See `FolderReader.find`."""
         notes: list[str] = []
         names = _camera_folders(root, self.contents)
         images = {name: frame_files(root, f"images/{name}", IMAGES) for name in names}
@@ -218,7 +211,7 @@ def _people(path: Path) -> dict[int, Mapping[str, Any]]:
 
 def _read_keypoints(
     people: Mapping[int, tuple[str, Mapping[str, Any]]],
-) -> tuple[NDArray[np.int64], Float, Float]:
+) -> tuple[Ints, Float, Float]:
     """MediaPipe's 33 landmarks from BODY_25, with hands where they are there.
 
     Convention: joints that BODY_25 lacks (corners of the eyes, mouth; without hands also fingers)

@@ -6,15 +6,13 @@ from typing import Any, Literal, cast
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from gsgan.body.smpl import SkinnedModel, from_zju
 from gsgan.data.skeletons import Poses
 from gsgan.skeleton.smpl_landmarks import TABLES, to_mediapipe33
-from gsgan.utils.arrays import as_floats
+from gsgan.utils.arrays import Float, Ints, as_floats
 from gsgan.utils.errors import DataError
 
-Float = NDArray[np.float64]
 CHUNK = 32  # frames posed at once: bounds memory, nothing else
 ROOT_TOLERANCE = 1e-6  # radians in poses[:3] that count as none
 ZJU_SIZES = {"poses": (72, 69), "shapes": (10,), "Rh": (3,), "Th": (3,)}  # 69: no root
@@ -32,7 +30,7 @@ class SmplMotion:
         expression: ``[F, E]``, or None.
     """
 
-    ids: NDArray[np.int64]
+    ids: Ints
     theta: Float
     transl: Float
     betas: Float

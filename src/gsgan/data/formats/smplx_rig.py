@@ -11,7 +11,6 @@ from pathlib import Path, PurePosixPath
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gsgan.body.smpl import SkinnedModel
 from gsgan.data.cameras import CameraEntry, make_camera, numbers
@@ -29,14 +28,13 @@ from gsgan.data.layout import BodyModel, Found, Meta
 from gsgan.data.pixels import PixelRules
 from gsgan.data.skeletons import make_landmarks
 from gsgan.data.validation import Thresholds, spans
-from gsgan.utils.arrays import as_floats
+from gsgan.utils.arrays import Float, as_floats
 from gsgan.utils.checks import whole
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.pickles import read_npz
 
 Files = dict[str, FrameFiles]
 """Paths relative to the root, by camera and frame."""
-Float = NDArray[np.float64]
 
 PARAMETERS = "smpl_params.npz"
 MISSING = "missing_img_files.txt"
@@ -85,11 +83,7 @@ class SmplxRigReader(FolderReader):
             )
 
     def find(self, root: Path, limits: Thresholds, smpl: str | None) -> Found:
-        """The subject's files, each checked separately.
-
-        Raises:
-            DataError: for whatever is missing or damaged, naming the file.
-        """
+        """See `FolderReader.find`."""
         alpha, notes = self.ignore_alpha, list[str]()
         for name in (self.calibration, PARAMETERS):
             if not (root / name).is_file():

@@ -60,11 +60,7 @@ class ZjuReader(FolderReader):
     )
 
     def find(self, root: Path, limits: Thresholds, smpl: str | None) -> Found:
-        """The subject's files, each checked separately.
-
-        Raises:
-            DataError: for whatever is missing or damaged, naming the file.
-        """
+        """See `FolderReader.find`."""
         annots = read_annots(root)
         file, model = body_model(root, smpl, "smpl")
         notes = ["lengths of the cameras converted from mm to metres"]

@@ -8,6 +8,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from gsgan.utils.images import to_bytes
+
 COLUMN, PAGE = 3.5, 7.16  # inches, width of a figure in one column and across the page
 TALLEST = 1.9  # inches, maximum height of a row of images, without its text
 FONT, SMALL = 8.0, 7.0  # points
@@ -48,7 +50,7 @@ def draw_panels(
         The figure, and its axes ``[rows, columns]``, in pixels of the images, pixel centres at
         +0.5.
     """
-    shown = [[pixels(panel.image) for panel in row] for row in panels]
+    shown = [[to_bytes(panel.image[0]) for panel in row] for row in panels]
     aspect = max(image.shape[0] / image.shape[1] for row in shown for image in row)
     rows, columns = len(panels), len(panels[0])
     width = COLUMN if columns <= 3 else PAGE
@@ -71,12 +73,6 @@ def draw_panels(
     for one, name in zip(axes[:, 0], names, strict=False):
         one.set_ylabel(name, labelpad=2, **plain)
     return figure, axes
-
-
-def pixels(image: Tensor) -> np.ndarray:
-    """``[h, w, 3]`` bytes of an image ``[1, 3, h, w]``."""
-    shown = (image[0].detach().cpu().clamp(0, 1) * 255).round().byte()
-    return shown.permute(1, 2, 0).numpy()
 
 
 def written(value: float | None, digits: int, unit: str = "") -> str:

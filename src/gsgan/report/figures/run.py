@@ -34,9 +34,9 @@ from gsgan.utils.checks import at_least, one_of, whole
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.files import write_atomically
-from gsgan.utils.palette import VERMILLION
 from gsgan.utils.tensors import pick_device
 
+VERMILLION = "#d55e00"  # of Okabe and Ito, distinct with any colour vision
 DETAIL = 0.35  # sides of the ablation's box, as a share of the image's
 Images = list[dict[str, Tensor]]  # per shot, by name
 

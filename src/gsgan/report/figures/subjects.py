@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from gsgan.data.datamodule import GsganData
-from gsgan.data.fingerprint import fingerprint
 from gsgan.data.splits import SPLITS, Item
 from gsgan.data.validation import spans
+from gsgan.evaluate.origin import fingerprint
 from gsgan.metrics.image import edge_f1, psnr
 from gsgan.model.assemble import build_data
 from gsgan.model.avatar import Avatar
