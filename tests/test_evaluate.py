@@ -14,6 +14,10 @@ from commands import refused
 from gsgan.utils.errors import GsganError
 
 DATA = ("data=capture", "data.size=32", "data.crop=null", "size=tiny", "lpips.path=null")
+PROTOCOL = (
+    *("protocol=paper_thuman4", "protocol.train_cameras=[cam00,cam01]", "data.size=32"),
+    *("protocol.test_cameras=[cam02]", "protocol.train_frames=0-3", "protocol.test_frames=0-3"),
+)
 
 
 @pytest.fixture(scope="session")
@@ -153,14 +157,9 @@ def test_the_ground_truth_as_prediction_on_white(capture, given, inside, tmp_pat
                 path.parent.mkdir(exist_ok=True)
                 order = [2, 1, 0, 3] if kind == "alpha" else [2, 1, 0]
                 cv2.imwrite(str(path), np.ascontiguousarray(pixels.numpy()[..., order]))
-    protocol = [
-        *("protocol=paper_thuman4", "protocol.train_cameras=[cam00,cam01]"),
-        *("protocol.test_cameras=[cam02]", "protocol.train_frames=0-3"),
-        *("protocol.test_frames=0-3", "data.size=32"),
-    ]
     named = "predictions_pattern='{camera}_{frame}.png'"
     for kind in ("opaque", "alpha"):
-        result = inside("evaluate", f"predictions={tmp_path / kind}", named, *given, *protocol)
+        result = inside("evaluate", f"predictions={tmp_path / kind}", named, *given, *PROTOCOL)
         assert result.returncode == 0, result.stderr
         found = scores(tmp_path / f"{kind}_scores")["novel_view"]
         psnr = found["full"]["psnr"]
@@ -213,12 +212,7 @@ def test_a_run_is_scored_on_white_by_request(run, inside, tmp_path):
 
 
 def test_another_background_departs_from_the_protocol(copy, given, inside):
-    protocol = [
-        *("protocol=paper_thuman4", "protocol.train_cameras=[cam00,cam01]"),
-        *("protocol.test_cameras=[cam02]", "protocol.train_frames=0-3"),
-        *("protocol.test_frames=0-3", "data.size=32"),
-    ]
-    arguments = [f"predictions={copy}", "splits=[novel_view]", *given, *protocol]
+    arguments = [f"predictions={copy}", "splits=[novel_view]", *given, *PROTOCOL]
     for word in ("null", "white"):
         result = inside("evaluate", *arguments, f"background={word}")
         refused(result, "has a black background, expected white", "with alpha")

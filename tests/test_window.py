@@ -2,8 +2,9 @@
 
 import pytest
 import torch
+from frames import frame_of
 
-from gsgan.scene import Camera, Frame, Window, body_window
+from gsgan.scene import Camera, Window, body_window
 
 HEIGHT, WIDTH = 60, 100
 
@@ -72,17 +73,8 @@ def test_the_boxs_camera_sees_the_same_point():
 def test_a_frame_seen_through_its_box_is_cut_in_every_map():
     """With ``unsure`` left whole, the loss would compare pictures of two sizes."""
     pixels = torch.arange(HEIGHT * WIDTH, dtype=torch.float32).view(1, 1, HEIGHT, WIDTH)
-    frame = Frame(
-        image=pixels.expand(1, 3, -1, -1),
-        mask=pixels,
-        camera=camera(),
-        skeleton=torch.zeros(1, 2, 3),
-        visibility=torch.ones(1, 2),
-        frame_id=torch.tensor([0]),
-        camera_index=torch.tensor([0]),
-        labels=pixels[:, 0].long(),
-        unsure=pixels,
-    )
+    labels = pixels[:, 0].long()
+    frame = frame_of(pixels.expand(1, 3, -1, -1), pixels, labels=labels, unsure=pixels)
     seen = window([[[-0.2, -0.2, 2.0], [0.2, 0.2, 2.0]]]).frame(frame)
     cut = pixels[..., 22:38, 42:58]
     assert torch.equal(seen.unsure, cut)

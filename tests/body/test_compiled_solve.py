@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from solved import damaged, shown
 from torch import Tensor
 from writers.smpl import write_smpl
 
@@ -18,7 +19,6 @@ from gsgan.body.solve import Solver
 from gsgan.scene import BodyPose
 from gsgan.splat import build, native
 from gsgan.synthetic.free_subject import free_character, free_pose
-from gsgan.synthetic.posing import Choreography
 from gsgan.synthetic.recorded_motion import RecordedMotion
 
 pytestmark = pytest.mark.skipif(not native.available(), reason=native.why_not())
@@ -27,17 +27,6 @@ CMU = Path(
     os.environ.get("GSGAN_CMU", Path(__file__).parents[3] / "shared" / "data" / "motion" / "cmu")
 )
 SAME = 1e-4  # metres, the surface's: float32 against float64
-
-
-@pytest.fixture(scope="module")
-def solver() -> Solver:
-    return Solver(free_body())
-
-
-@pytest.fixture(scope="module")
-def poses() -> BodyPose:
-    motion = Choreography(free_character(), seed=11)
-    return free_pose(motion.at(np.arange(0.4, motion.duration, 1.0)))
 
 
 @pytest.fixture
@@ -53,14 +42,6 @@ def both(monkeypatch):
     return solved
 
 
-def landmarks(truth: BodyPose, noise: float = 0.0) -> tuple[Tensor, Tensor]:
-    """``[B, 75, 3]`` and their visibility."""
-    body = free_body()
-    p = torch.cat([body.posed_landmarks(truth), body.posed_hands(truth)], dim=1)
-    p = p + noise * torch.randn(p.shape, generator=torch.Generator().manual_seed(0))
-    return p, torch.ones(p.shape[:2])
-
-
 def apart(pair: tuple[BodyPose, BodyPose], body: MarkedBody | None = None) -> Tensor:
     """``[B, V]`` metres between the surfaces of two solutions."""
     a, b = ((body or free_body()).posed_vertices(pose) for pose in pair)
@@ -70,7 +51,7 @@ def apart(pair: tuple[BodyPose, BodyPose], body: MarkedBody | None = None) -> Te
 @pytest.mark.parametrize("joints", [33, 75])
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 def test_choreography_has_the_same_poses(solver, poses, both, joints, noise):
-    p, seen = (x[:, :joints] for x in landmarks(poses, noise))
+    p, seen = (x[:, :joints] for x in shown(poses, noise))
     assert apart(both(solver, p, seen)).max() < SAME
 
 
@@ -80,14 +61,14 @@ def test_motion_capture_has_the_same_poses(solver, both, clip):
         pytest.skip(f"no motion capture in {CMU} (set GSGAN_CMU)")
     motion = RecordedMotion(free_character(), CMU / f"{clip}.amc")
     times = np.arange(0.0, min(motion.duration, 20.0), 0.5)
-    p, seen = landmarks(free_pose(motion.at(times)))
+    p, seen = shown(free_pose(motion.at(times)))
     assert apart(both(solver, p, seen)).max() < SAME
 
 
 @pytest.mark.parametrize("joints", [33, 75])
 def test_hidden_landmarks_give_the_same_poses(solver, poses, both, joints):
     """A third of all but the trunk's. A limb of which only the end is seen has two solutions."""
-    p, seen = (x[:, :joints].clone() for x in landmarks(poses, 0.005))
+    p, seen = (x[:, :joints].clone() for x in shown(poses, 0.005))
     lost = torch.rand(seen.shape, generator=torch.Generator().manual_seed(4)) < 0.3
     lost[:, [11, 12, 23, 24]] = False
     seen[lost], p[lost] = 0, math.nan
@@ -97,44 +78,9 @@ def test_hidden_landmarks_give_the_same_poses(solver, poses, both, joints):
 
 
 def test_landmarks_that_are_seen_weakly_weigh_the_same(solver, poses, both):
-    p, seen = landmarks(poses, 0.02)
+    p, seen = shown(poses, 0.02)
     seen = torch.rand(seen.shape, generator=torch.Generator().manual_seed(4)) * 1.5 + 0.01
     assert apart(both(solver, p, seen)).max() < SAME
-
-
-def damaged(kind: str) -> tuple[Tensor, Tensor]:
-    p, seen = landmarks(BodyPose(torch.zeros(2, 56, 3), torch.zeros(2, 3)))
-    if kind == "straight legs":
-        p[:, 25:27] = (p[:, 23:25] + p[:, 27:29]) / 2
-    elif kind == "one point":
-        p[:] = p[:, :1]
-    elif kind == "no arm":
-        p[:, 13], p[:, 15] = p[:, 11], p[:, 11]
-    elif kind == "folded limbs":
-        p[:, 15], p[:, 27] = p[:, 11], p[:, 23]
-    elif kind == "NaN":
-        p[:, 13:23] = math.nan
-    elif kind == "NaN visibility":
-        seen[:, 13:40] = math.nan
-    elif kind == "infinite":
-        p[0, 0], p[1, 31], p[0, 40] = math.inf, -math.inf, math.inf
-    elif kind == "far":
-        p += 1e4
-    elif kind == "only the trunk":
-        seen[:] = 0
-        seen[:, [11, 12, 23, 24]] = 1
-    elif kind == "estimated hips":
-        seen[:, 23:33] = 0
-        p[:, 23:25] += 0.03
-    elif kind == "hands of one point":
-        p[:, 33:54] = p[:, 33:34]
-    elif kind == "lost fingers":
-        seen[:, 36:40], seen[:, 54], seen[:, 60:64] = 0, 0, 0
-    elif kind == "lying on the side":
-        p = p[..., [2, 0, 1]]
-    elif kind == "upside down":
-        p = p * torch.tensor([-1.0, 1.0, -1.0])
-    return p, seen
 
 
 ALIKE = ("straight legs", "no arm", "NaN", "NaN visibility", "infinite", "only the trunk")
@@ -155,7 +101,7 @@ def test_skeletons_without_one_answer_have_finite_poses(solver, kind):
 
 
 def test_a_frame_is_the_same_to_the_bit_in_any_batch_and_with_any_threads(solver, poses):
-    p, seen = landmarks(poses, 0.01)
+    p, seen = shown(poses, 0.01)
     together = solver.solve(p, seen)
     try:
         torch.set_num_threads(2)
@@ -184,7 +130,7 @@ def test_bodies_of_the_users_files_have_the_same_poses(tmp_path, both, kind):
 
 
 def test_double_precision_stays(poses, both):
-    p, seen = (x[:3].double() for x in landmarks(poses))
+    p, seen = (x[:3].double() for x in shown(poses))
     fast, slow = both(Solver(free_body().to(torch.float64)), p, seen)
     torch.testing.assert_close(fast.theta, slow.theta, atol=1e-9, rtol=0)
     torch.testing.assert_close(fast.transl, slow.transl, atol=1e-9, rtol=0)
@@ -192,7 +138,7 @@ def test_double_precision_stays(poses, both):
 
 def test_poses_with_gradients_are_solved_by_tensor_operations(solver, poses, monkeypatch):
     monkeypatch.setattr(compiled, "solve", None)
-    p, seen = landmarks(poses[:1])
+    p, seen = shown(poses[:1])
     assert solver.solve(p.requires_grad_(), seen).theta.requires_grad
     with torch.no_grad(), pytest.raises(TypeError):
         solver.solve(p, seen)

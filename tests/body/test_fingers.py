@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from solved import shown
 from torch import Tensor
 
 from gsgan.body import axis_angle_to_matrix, free_body
@@ -16,31 +17,10 @@ from gsgan.body.solve import Solver, log_of
 from gsgan.fit.shape import fit_hands
 from gsgan.scene import BodyPose
 from gsgan.skeleton.hands import FINGERS, HAND
-from gsgan.synthetic.free_subject import free_character, free_pose
-from gsgan.synthetic.posing import Choreography
 
 torch.set_num_threads(1)
 LEFT, RIGHT = slice(33, 33 + HAND), slice(33 + HAND, 33 + 2 * HAND)
 JOINTS = [i for i, name in enumerate(free_body().joint_names) if name.startswith("finger")]
-
-
-@pytest.fixture(scope="module")
-def poses() -> BodyPose:
-    """Of a motion that signs and makes fists."""
-    motion = Choreography(free_character(), seed=11)
-    return free_pose(motion.at(np.arange(0.4, motion.duration, 1.0)))
-
-
-@pytest.fixture(scope="module")
-def solver() -> Solver:
-    return Solver(free_body())
-
-
-def shown(truth: BodyPose, noise: float = 0.0) -> tuple[Tensor, Tensor]:
-    body = free_body()
-    p = torch.cat([body.posed_landmarks(truth), body.posed_hands(truth)], dim=1)
-    p = p + noise * torch.randn(p.shape, generator=torch.Generator().manual_seed(0))
-    return p, torch.ones(p.shape[:2])
 
 
 def degrees_off(got: Tensor, truth: Tensor) -> Tensor:

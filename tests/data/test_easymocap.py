@@ -1,6 +1,5 @@
 """EasyMocap's folders: what is read equals what was written."""
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -9,15 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 from capture_frames import check_cameras, check_images, check_poses, check_skeletons
+from make import edit_json
 from writers.common import write_picture
-from writers.easymocap import (
-    NAMES,
-    body_25,
-    hand_joints,
-    write_calibration,
-    write_easymocap,
-    write_people,
-)
+from writers.easymocap import NAMES, body_25, hand_joints, write_calibration, write_easymocap
 
 from gsgan.data.formats.easymocap import EasymocapReader
 from gsgan.data.layout import Layout
@@ -43,14 +36,8 @@ def written(tmp_path_factory, subject):
     return write_easymocap(tmp_path_factory.mktemp("easymocap") / "take", subject)
 
 
-def edit_people(
-    root: Path, change: Callable[[list[Any]], object], kind: str = "keypoints3d", frame: int = 1
-) -> Path:
-    path = root / kind / f"{frame:06d}.json"
-    people = json.loads(path.read_text())
-    change(people)
-    write_people(path, people)
-    return path
+def edit_people(root: Path, change: Callable[[list[Any]], object], frame: int = 1) -> None:
+    edit_json(root / f"keypoints3d/{frame:06d}.json", change)
 
 
 def refused(root: Path, *parts: str, smpl: Path | None = None, **settings: Any) -> None:

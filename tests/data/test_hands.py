@@ -55,8 +55,6 @@ def test_a_missing_hand_is_not_seen_and_hangs_on_the_forearm(root):
 def test_a_capture_without_hands_is_refused_by_name(root):
     with pytest.raises(ConfigError, match=r"needs a capture's hands3d.npz, which .*capture lacks"):
         assert GsganData(str(root), **HANDS).layout
-    with pytest.raises(ConfigError, match=r"data\.skeleton must be one of"):
-        GsganData(str(root), skeleton="hands")
 
 
 def test_fitted_poses_have_their_fingers_with_hands_alone(root):

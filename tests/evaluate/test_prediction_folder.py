@@ -6,9 +6,10 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from frames import frame_of
 
 from gsgan.evaluate.predictions import PredictionFolder, read_folder
-from gsgan.scene import Camera, Frame
+from gsgan.scene import Frame
 from gsgan.utils.errors import ConfigError, DataError
 
 CAMERAS = ("cam1", "cam10", "B (2)")
@@ -98,16 +99,7 @@ def test_a_repeated_image_is_named(tmp_path):
 def frame() -> Frame:
     mask = torch.zeros(1, 1, *SIZE)
     mask[..., 2:4, 2:5] = 1
-    eye = torch.eye(3)[None]
-    return Frame(
-        image=0.5 * mask.expand(1, 3, -1, -1),
-        mask=mask,
-        camera=Camera(eye, eye, torch.zeros(1, 3), SIZE),
-        skeleton=torch.zeros(1, 33, 3),
-        visibility=torch.ones(1, 33),
-        frame_id=torch.tensor([3]),
-        camera_index=torch.tensor([0]),
-    )
+    return frame_of(0.5 * mask.expand(1, 3, -1, -1), mask)
 
 
 def one(

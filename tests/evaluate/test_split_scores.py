@@ -6,6 +6,7 @@ from unittest.mock import Mock
 
 import pytest
 import torch
+from frames import frame_of
 from torchmetrics.classification import MulticlassJaccardIndex
 
 from gsgan.data.metric_variants import MetricVariants
@@ -13,30 +14,15 @@ from gsgan.evaluate.predictions import FLOOR, FULL, SPLAT, Prediction, Preparati
 from gsgan.evaluate.scores import Scorer, confusion, image_scores, means, miou, painter, score_split
 from gsgan.metrics.image import psnr, ssim, ssim_uniform
 from gsgan.model.rendering import Rendering
-from gsgan.scene import Camera, Frame
+from gsgan.scene import Frame
 from gsgan.utils.errors import GsganError
-
-
-def frame(image: torch.Tensor, mask: torch.Tensor, labels: torch.Tensor | None = None) -> Frame:
-    size = tuple(image.shape[-2:])
-    eye = torch.eye(3)[None]
-    return Frame(
-        image=image,
-        mask=mask,
-        camera=Camera(eye, eye, torch.zeros(1, 3), size),
-        skeleton=torch.zeros(1, 33, 3),
-        visibility=torch.ones(1, 33),
-        frame_id=torch.tensor([0]),
-        camera_index=torch.tensor([0]),
-        labels=labels,
-    )
 
 
 def person(size: int = 24) -> Frame:
     """A grey person of 8 x 8 pixels on black, her last column half covered."""
     mask = torch.zeros(1, 1, size, size)
     mask[..., 8:16, 8:15], mask[..., 8:16, 15] = 1.0, 0.5
-    return frame(0.4 * mask.expand(1, 3, -1, -1), mask)
+    return frame_of(0.4 * mask.expand(1, 3, -1, -1), mask)
 
 
 def scorer(measures: MetricVariants | None = None) -> Scorer:
@@ -164,7 +150,7 @@ def test_miou_is_torchmetrics_jaccard_index_over_the_split():
     predicted, labels = (torch.randint(0, 4, (3, 9, 9), generator=generator) for _ in range(2))
     labels[:, 0] = 255
     maps = segmentation(predicted, 4)
-    f = frame(torch.zeros(1, 3, 9, 9), torch.zeros(1, 1, 9, 9))
+    f = frame_of(torch.zeros(1, 3, 9, 9), torch.zeros(1, 1, 9, 9))
     frames = [(("ab"[i > 0], i), replace(f, labels=labels[i : i + 1])) for i in range(3)]
     found = score_split(
         frames,

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from frames import frame_of
 
 from gsgan.body import SkinnedBody, free_body, open_body
 from gsgan.body.shape import BodyShape
@@ -46,13 +47,9 @@ def rigid(vertices: torch.Tensor) -> SkinnedBody:
 
 def picture(labels: torch.Tensor) -> Frame:
     """A frame of the rest pose with these labels ``[H, W]``."""
-    return Frame(
-        image=torch.zeros(1, 3, SIZE, SIZE), mask=torch.ones(1, 1, SIZE, SIZE), camera=camera(),
-        skeleton=torch.zeros(1, 33, 3), visibility=torch.ones(1, 33),
-        frame_id=torch.zeros(1).long(), camera_index=torch.zeros(1).long(),
-        body=BodyPose(torch.zeros(1, 1, 3), torch.zeros(1, 3)),
-        labels=labels[None].long(),
-    )  # fmt: skip
+    blank, body = torch.zeros(1, 3, SIZE, SIZE), BodyPose(torch.zeros(1, 1, 3), torch.zeros(1, 3))
+    labels = labels[None].long()
+    return frame_of(blank, 1 + blank[:, :1], camera=camera(), body=body, labels=labels)
 
 
 # --- what is seen ------------------------------------------------------------------------------

@@ -128,7 +128,6 @@ def test_runs_that_do_not_belong_in_one_column_are_refused_by_name(tmp_path, hel
     ("held", "message"),
     [
         ({"marks": ["stand-in"]}, "differ in marks: none and stand-in"),
-        ({"facts": {"iterations": 10}}, "differ in iterations: 7000 and 10"),
         ({"record": protocol("p", scale=1.0)}, "differ in values of the protocol: scale"),
     ],
 )

@@ -1,23 +1,11 @@
 """Skeletons for the tests: the rest pose, plausible and degenerate ones, rigid motions."""
 
 import torch
-from stability.cases.poses import DEGENERATE, REST, noisy, rest
+from stability.cases.poses import DEGENERATE, REST, noisy, rest  # noqa: F401 (for those who import them here)
 from torch import Tensor
 
 from gsgan.scene import Camera
 from gsgan.skeleton import MEDIAPIPE33
-
-__all__ = [
-    "DEGENERATE",
-    "NAMES",
-    "REST",
-    "assert_rotation",
-    "camera",
-    "joint",
-    "noisy",
-    "rest",
-    "rotation",
-]
 
 NAMES = MEDIAPIPE33.names
 

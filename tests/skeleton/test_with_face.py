@@ -139,10 +139,11 @@ def test_slopes_are_finite_where_the_head_vanishes():
 
 
 def test_skeletons_with_and_without_a_face_drive_each_others_templates():
-    for joints in (33, 75):
-        q, seen = complete_skeleton(REST[0, :joints], None, T, T.limb_length_sum)
-        torch.testing.assert_close(q, REST.float(), atol=1e-5, rtol=0)
-        assert seen[0].tolist() == [1.0] * joints + [0.0] * (105 - joints)
+    for joints, t in ((33, MEDIAPIPE33_HANDS), (33, T), (75, T)):
+        q, seen = complete_skeleton(REST[0, :joints], None, t, t.limb_length_sum)
+        whole = len(t.names)
+        torch.testing.assert_close(q, REST[:, :whole].float(), atol=1e-5, rtol=0)
+        assert seen[0].tolist() == [1.0] * joints + [0.0] * (whole - joints)
     for template in (MEDIAPIPE33, MEDIAPIPE33_HANDS):
         q, seen = complete_skeleton(REST, None, template, T.limb_length_sum)
         assert torch.equal(q, REST[:, : len(template.names)].float())
