@@ -132,10 +132,22 @@ def sweep(folder: Path, capture: Path, *given: str) -> subprocess.CompletedProce
     return subprocess.run(command, check=False, capture_output=True, text=True)
 
 
-@plugin("joblib_launcher")
-def test_a_failed_job_is_named_and_ends_no_other(capture, tmp_path):
-    given = ("model=splat_only", "evaluate=false", "hydra/launcher=joblib")
-    done = sweep(tmp_path / "sweep", capture, "seed=-1,0", *given, "hydra.launcher.n_jobs=2")
+@pytest.mark.parametrize(
+    "launcher",
+    [
+        pytest.param(
+            ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2"), marks=plugin("joblib_launcher")
+        ),
+        pytest.param(
+            ("hydra/launcher=ray", "+hydra.launcher.ray.init.num_cpus=2"),
+            marks=(plugin("ray_launcher"), pytest.mark.slow),
+        ),
+    ],
+    ids=["joblib", "ray"],
+)
+def test_a_failed_job_is_named_and_ends_no_other(capture, tmp_path, launcher):
+    given = ("model=splat_only", "evaluate=false", *launcher)
+    done = sweep(tmp_path / "sweep", capture, "seed=-1,0", *given)
     assert done.returncode == 1, done.stdout + done.stderr
     assert "1 jobs are unfinished" in done.stdout
     bad, good = sorted(path for path in (tmp_path / "sweep").iterdir() if path.is_dir())
