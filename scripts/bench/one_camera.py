@@ -2,7 +2,7 @@
 
     python scripts/bench/one_camera.py --avatar blouse --landmarks noise --folder build/one
 
-Traces the person from three cameras. The first is the video: its image is padded until the
+Traces the person from four sides. The first is the video: its image is padded until the
 principal point is its centre, as a phone's is, and set before a wall; focal length and height are
 not given to `gsgan.prepare`. Landmarks are ``exact`` or ``noise`` (0.5 % of the person's size, 5 %
 of landmarks and 3 % of frames missing) with a detector's depth, both with true masks, or
@@ -156,7 +156,7 @@ def main() -> None:
         size=given.size,
         frames=given.frames,
         test_frames=given.frames // 4,
-        train_cameras=1,
+        train_cameras=2,
         test_cameras=2,
         rays_per_pixel=given.rays,
     )
