@@ -66,7 +66,7 @@ def film(scene: Path, folder: Path, landmarks: str) -> SimpleNamespace:
         str(folder / f"{NAME}.avi"), cv2.VideoWriter_fourcc(*"MJPG"), fps, whole
     )
     video.set(cv2.VIDEOWRITER_PROP_QUALITY, 98)
-    wall = np.random.default_rng(0).integers(150, 190, (24, 24, 3), np.uint8)
+    wall = np.random.default_rng(0).integers(150, 190, (96, 96, 3), np.uint8)
     wall = cv2.resize(wall, whole, interpolation=cv2.INTER_CUBIC)
     for path in images:
         pair = []
