@@ -25,7 +25,7 @@ train: $(STAMP) ## train an avatar of the default person, then score it (minutes
 	$(BIN)/python -m gsgan.train experiment=demo $(ARGS)
 
 test: $(STAMP) ## run the tests with coverage, one process per core (ARGS: one process, no coverage)
-	$(BIN)/python -m pytest $(if $(ARGS),$(ARGS),-n auto --dist worksteal --cov --cov-report=term:skip-covered --cov-fail-under=93)
+	$(BIN)/python $(if $(ARGS),-m pytest $(ARGS),-m slipcover -m pytest -n auto --dist worksteal)
 
 test-slow: $(STAMP) ## run the tests that take minutes, and all examples of the property tests
 	$(BIN)/python -m pytest -m 'slow or hypothesis' --hypothesis-profile=all $(ARGS)

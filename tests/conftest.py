@@ -154,11 +154,32 @@ def denormals():
     torch.set_flush_denormal(False)
 
 
+def forked(command: list[str]) -> int:
+    """The exit status of a sweep's job, run by a child that has imported everything already."""
+    from hydra.core.global_hydra import GlobalHydra
+
+    sys.stdout.flush()
+    child = os.fork()
+    if not child:
+        GlobalHydra.instance().clear()  # the sweep's
+        sys.argv, code = [command[2], *command[3:]], 1
+        try:
+            importlib.import_module(entry_module(command[2].removeprefix("gsgan."))).main()
+            code = 0
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else int(end.code is not None)
+        finally:
+            sys.stdout.flush()
+            os._exit(code)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
 @pytest.fixture
 def inside(tmp_path, monkeypatch, capfd):
-    """Runs a command in this process, which saves the seconds of its imports."""
+    """Runs a command in this process, a sweep's jobs in forks: saves the seconds of imports."""
 
     def run(command: str, *args: str):
+        monkeypatch.setattr("gsgan.utils.sweeps._status", forked)
         monkeypatch.chdir(tmp_path)
         monkeypatch.setenv("COLUMNS", "120")
         monkeypatch.setattr(sys, "argv", [f"gsgan.{command}", *args])

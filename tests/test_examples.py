@@ -12,7 +12,7 @@ from PIL import Image
 
 FOLDER = ROOT / "docs" / "examples"
 TINY = ["size=tiny", "data.size=32", "data.body=none"]
-FEW = ["segmentation=2", "step_one=2", "step_two=4", "discriminator_start=1", "epoch=4"]
+FEW = ["segmentation=1", "step_one=1", "step_two=2", "discriminator_start=1", "epoch=4"]
 EACH_STEP = ["training.log_every=1", "+trainer.log_every_n_steps=1"]
 SHORT = [*TINY, *(f"training.schedule.{phase}" for phase in FEW)]
 
