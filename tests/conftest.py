@@ -212,29 +212,27 @@ def run(capture, shared, tmp_path_factory):
     return shutil.copytree(shared("run", make), tmp_path_factory.mktemp("runs") / "one")
 
 
+def trained(capture: Path, folder: Path, *overrides: str) -> None:
+    """Makes a tiny run that is not scored, in a fork."""
+    from commands import arguments
+
+    words = [*arguments(capture, folder), *overrides, "evaluate=false"]
+    assert forked([sys.executable, "-m", "gsgan.train", *words]) == 0
+
+
 @pytest.fixture(scope="session")
 def bare(capture, shared, tmp_path_factory):
     """A tiny run whose avatar is driven by skeletons alone."""
-    from commands import train
-
-    def make(folder: Path) -> None:
-        off = ("model=wo_seg", "effects.body_points=off", "evaluate=false")
-        result = train(capture, folder, *off)
-        assert result.returncode == 0, result.stdout + result.stderr
-
-    return shutil.copytree(shared("bare", make), tmp_path_factory.mktemp("runs") / "bare")
+    off = ("model=wo_seg", "effects.body_points=off")
+    folder = shared("bare", lambda folder: trained(capture, folder, *off))
+    return shutil.copytree(folder, tmp_path_factory.mktemp("runs") / "bare")
 
 
 @pytest.fixture(scope="session")
 def on_body(capture, shared):
     """``on_body()``: a tiny run whose Gaussians are on the body's surface."""
-    from commands import train
-
-    def make(folder: Path) -> None:
-        result = train(capture, folder, "effects.body_points=on", "evaluate=false")
-        assert result.returncode == 0, result.stdout + result.stderr
-
-    return lambda: shared("on_body", make)
+    on = "effects.body_points=on"
+    return lambda: shared("on_body", lambda folder: trained(capture, folder, on))
 
 
 @pytest.fixture(scope="session")
