@@ -1,14 +1,17 @@
 """An avatar of one video against the truth: the default person, or a rigged character.
 
     python scripts/bench/one_camera.py --avatar blouse --landmarks noise --folder build/one
+    python scripts/bench/one_camera.py --video cam01.mp4 --rig /path/to/capture --folder build/real
 
 Traces the person from four sides. The first is the video: its image is padded until the
 principal point is its centre, as a phone's is, and set before a wall; focal length and height are
 not given to `gsgan.prepare`. Landmarks are ``exact`` or ``noise`` (0.5 % of the person's size, 5 %
 of landmarks and 3 % of frames missing) with a detector's depth, both with true masks, or
 ``mediapipe``'s with its masks. The other cameras are moved into the estimated world by a similarity
-and join the capture, on which an avatar is trained from the video alone. Further words are
-overrides of `gsgan.train`. Finished steps are kept: the same command continues.
+and join the capture, on which an avatar is trained from the video alone. With ``--video`` the
+truth is a capture of several real cameras instead, one of which, of the video's name, took the
+video; landmarks and masks are MediaPipe's. Further words are overrides of `gsgan.train`. Finished
+steps are kept: the same command continues.
 """
 
 from __future__ import annotations
@@ -104,12 +107,13 @@ def similarity(p, truth, scaled: bool):
     return s, A, truth.mean(0) - s * A @ p.mean(0)
 
 
-def join(scene: Path, capture: Path, folder: Path, camera: SimpleNamespace) -> list[int]:
-    """The capture with the scene's other cameras in its world; returns its held-out frames."""
+def join(scene: Path, capture: Path, folder: Path, own: str, camera: SimpleNamespace) -> list[int]:
+    """The capture with the scene's cameras but the video's in its world; returns its frames."""
     found, truth = np.load(capture / "landmarks3d.npz"), np.load(scene / "landmarks3d.npz")["p"]
     frames = found["frame_id"]
-    seen = np.isfinite(found["p"][:, :33]).all(-1)
-    p, truth = found["p"][:, :33][seen], truth[frames][seen]
+    p, truth = found["p"][:, :33], truth[frames, :33]
+    seen = np.isfinite(p + truth).all(-1)
+    p, truth = p[seen], truth[seen]
     for scaled in (False, True):
         s, A, b = similarity(p, truth, scaled)
         error = 1000 * np.linalg.norm(s * p @ A.T + b - truth, axis=-1)
@@ -121,17 +125,17 @@ def join(scene: Path, capture: Path, folder: Path, camera: SimpleNamespace) -> l
     shutil.copytree(capture, folder)
     cameras = json.loads((folder / "cameras.json").read_text())
     raw = json.loads((scene / "cameras.json").read_text())
-    for name in list(raw)[1:]:
+    for name in [other for other in raw if other != own]:
         R, t = np.array(raw[name]["R"]), np.array(raw[name]["t"])
         raw[name] |= {"R": (R @ A).tolist(), "t": ((R @ b + t) / s).tolist()}
         cameras[name] = raw[name]
         for kind in ("images", "masks"):
             (folder / kind / name).mkdir()
-            for number in frames:
-                shutil.copy(scene / kind / name / f"{number:06d}.png", folder / kind / name)
+            for path in sorted((scene / kind / name).iterdir()):
+                if int(path.stem) in frames:
+                    shutil.copy(path, folder / kind / name)
     (folder / "cameras.json").write_text(json.dumps(cameras))
-    held = json.loads((scene / "meta.json").read_text())["splits"]["test_frames"]
-    return sorted(set(held) & set(frames.tolist()))
+    return frames.tolist()
 
 
 def run(*words: str) -> None:
@@ -148,28 +152,42 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=168)
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--rays", type=int, default=4)
+    parser.add_argument("--video", type=Path)
+    parser.add_argument("--rig", type=Path)
     parser.add_argument("--folder", type=Path, required=True)
     given, overrides = parser.parse_known_args()
-    scene = ensure_scene(
-        avatar=given.avatar,
-        motion=given.motion,
-        size=given.size,
-        frames=given.frames,
-        test_frames=given.frames // 4,
-        train_cameras=2,
-        test_cameras=2,
-        rays_per_pixel=given.rays,
-    )
     folder, began = given.folder.resolve(), time.monotonic()
-    camera = film(scene, folder, given.landmarks)
+    folder.mkdir(parents=True, exist_ok=True)
+    if given.video:
+        scene, name, given.landmarks = given.rig, given.video.stem, "mediapipe"
+        camera = read_cameras(scene)[name]
+        width = cv2.VideoCapture(str(given.video)).get(cv2.CAP_PROP_FRAME_WIDTH)
+        camera.K[:2] *= width / json.loads((scene / "cameras.json").read_text())[name]["size"][0]
+        video = folder / f"{NAME}{given.video.suffix}"
+        shutil.copyfile(given.video, video)
+    else:
+        scene = ensure_scene(
+            avatar=given.avatar,
+            motion=given.motion,
+            size=given.size,
+            frames=given.frames,
+            test_frames=given.frames // 4,
+            train_cameras=2,
+            test_cameras=2,
+            rays_per_pixel=given.rays,
+        )
+        name = next(iter(read_cameras(scene)))
+        video, camera = folder / f"{NAME}.avi", film(scene, folder, given.landmarks)
     capture = folder / "capture"
     if not (capture / "prepare.json").is_file():
         own = [f"landmarks={folder}/landmarks", f"masks={folder}/masks", "hands=false"]
         noise = f"landmark_noise={0.001 if given.landmarks == 'exact' else NOISE}"
         detector = [*own, noise] if given.landmarks != "mediapipe" else ["setup=true"]
-        run("gsgan.prepare", f"source={folder}/{NAME}.avi", f"out={capture}", *detector)
+        run("gsgan.prepare", f"source={video}", f"out={capture}", *detector)
     prepared = time.monotonic()
-    held = join(scene, capture, folder / "joined", camera)
+    frames = join(scene, capture, folder / "joined", name, camera)
+    held = json.loads((scene / "meta.json").read_text()).get("splits", {}).get("test_frames")
+    held = [f for f in held if f in frames] if held else frames[2::4]
     others = list(read_cameras(folder / "joined"))[1:]
     splits = [f"data.train_cameras=[{NAME}]", f"data.test_cameras=[{','.join(others)}]"]
     splits.append(f"data.test_frames=[{','.join(map(str, held))}]")

@@ -22,7 +22,7 @@ from gsgan.prepare.camera_array import CameraArray
 from gsgan.prepare.cleanse import cleanse, smooth
 from gsgan.prepare.frames import SAMPLING, LeftOut, check_enough, left_out, look, sample
 from gsgan.prepare.mediapipe import find_people
-from gsgan.prepare.one_view import FEET, Seen, View, solve_view
+from gsgan.prepare.one_view import FEET, HEIGHT, Seen, View, solve_view
 from gsgan.prepare.options import Inputs, Options
 from gsgan.prepare.solve import Solution
 from gsgan.prepare.sources import Recording, stamp
@@ -180,7 +180,8 @@ def _solve(
         values[swapped] = values[swapped][:, mirror]
     u = np.nan_to_num(px - np.array(size[::-1]) / 2) / guess
     given = Seen(*(torch.from_numpy(x) for x in (u, conf, world, time)))
-    return solve_view(given, options.landmark_noise, options.focal is None)
+    height = options.height or HEIGHT
+    return solve_view(given, options.landmark_noise, options.focal is None, height)
 
 
 def natural_height(shape: BodyShape) -> float:
@@ -268,7 +269,7 @@ def _notes(found: Mapping[str, Any], options: Options, natural: float) -> list[s
         origin = f" from the {stated:g} mm that the file states" if stated else ""
         notes[0] += f", ± {found['focal_uncertainty']:.0%}, estimated{origin}; focal=<mm> sets it"
     if options.height is None:
-        notes.append(f"height {natural:.2f} m, as a usual body of this shape; height=<m> sets it")
+        notes.append(f"height {natural:.2f} m, as a usual person; height=<m> sets it")
     if found["left_out"]:
         reasons = ", ".join(f"{reason} {count}" for reason, count in found["left_out"].items())
         notes.append(f"left out of {found['sampled']} sampled images: {reasons}")

@@ -21,10 +21,10 @@ from gsgan.body.shape import BodyShape, free_space
 from gsgan.body.solve import FLOOR, Solver, below_least
 from gsgan.fit.shape import shape_of, shape_prior, without_surface
 from gsgan.skeleton import MEDIAPIPE33
-from gsgan.utils.arrays import evenly_spaced
+from gsgan.utils.arrays import Float, evenly_spaced
 
 KEYFRAMES = 50  # at most, for shape and focal length
-FOCAL_SPREAD = 0.07  # of the guess, as a logarithm: small, as frames are not independent
+FOCAL_SPREAD = 0.12  # of the guess, as a logarithm
 NOISE = 0.01  # of landmarks in the first steps, share of the person's size
 # Metres, standard deviation of the detector's own 3D landmarks, beside 2D landmarks of that noise:
 # the more exact these are, the more they say of depth themselves.
@@ -35,9 +35,13 @@ SLIDING, GROUND = 0.1, 0.02  # metres per second, metres: of a standing foot
 BALANCE = 0.08  # metres by which the trunk is not above standing feet
 STILL = 0.25  # metres per second: a slower foot stands
 OUTLIER = 3.0  # standard deviations at which a landmark counts half
+# Metres, and the standard deviation of the logarithm. Images do not tell the size, and errors of
+# speed, depth and sliding feet are in metres: without this a small person would fit best.
+HEIGHT, SIZE = 1.7, 0.003
 LIMBS = 0.05  # weight of the prior of arms and legs, which would make them shorter
 GAP = 0.5  # seconds: motion is not smooth over a longer gap
-ZOOMS = (-0.4, -0.2, 0.0, 0.2, 0.4)  # logarithms of focal lengths to start from
+ZOOMS = np.arange(-4, 5) / 10  # logarithms of focal lengths to try
+ZOOM_STEPS, NEAREST = 8, 2  # Gauss-Newton steps for each; neighbours of the best that tell the best
 STEPS, SETTLED = 20, 1e-4
 MIN_STANDING = 8  # landmarks of feet: fewer do not show the ground
 DAMPING, EASIER, HARDER = 1e-3, 0.3, 10.0
@@ -46,7 +50,7 @@ FEET = [29, 31, 30, 32]  # heels and toes
 LIMB = re.compile(r"arm_|elbow$|thigh_|knee$")
 # The residual of a landmark in two and in three dimensions, of the feet, and of balance.
 GROUPS = torch.arange(71).repeat_interleave(torch.tensor([2] * 33 + [3] * 33 + [1] * 4 + [2]))
-OWN = 4  # numbers of `State.common` before those of the shape
+OWN = 3  # numbers of `State.common` before those of the shape
 HIPS = list(MEDIAPIPE33.hips)
 TRUNK = list(MEDIAPIPE33.torso)
 
@@ -79,8 +83,8 @@ class Seen:
 
 @dataclass(frozen=True)
 class State:
-    """Unknowns: ``q [F, D]`` and ``root [F, 3, 3]`` of `Solver`, and ``common [4 + S]``: the
-    logarithm of the focal length over its guess; the ground ``y = a x + b z + c``; the shape."""
+    """Unknowns: ``q [F, D]`` and ``root [F, 3, 3]`` of `Solver`, and ``common [3 + S]``: the ground
+    ``y = a x + b z + c``; the shape."""
 
     q: Tensor
     root: Tensor
@@ -95,8 +99,8 @@ class Normal:
         cost: scalar.
         g, W: ``[F, N]`` half the gradient, and ``[F, N, N]``.
         near: ``[2, F, N]`` diagonals that couple a frame with those one and two later.
-        cross: ``[F, N, 4]`` between landmarks and the first of the common unknowns.
-        slope, common: ``[4]``, ``[4, 4]`` of the latter.
+        cross: ``[F, N, 3]`` between landmarks and the ground.
+        slope, common: ``[3]``, ``[3, 3]`` of the latter.
     """
 
     cost: Tensor
@@ -143,52 +147,54 @@ class View:
     standing: Tensor
 
 
-def solve_view(seen: Seen, noise: float, focal: bool = True) -> View:
+def solve_view(seen: Seen, noise: float, focal: bool = True, height: float = HEIGHT) -> View:
     """The person and the camera that fit what one camera saw.
 
-    The focal length starts from several values: landmarks of a body that bends freely fit almost
-    any of them, and wrong ones hide the right one. Keyframes determine it and the shape; then all
-    frames are solved together, smooth in time.
+    Keyframes determine the focal length and the shape; then all frames are solved together, smooth
+    in time. Landmarks of a body that bends freely fit almost any focal length: their cost is
+    compared from the longest to the shortest and back, each solution the start of the next, since
+    solutions from different starts differ by more than the focal lengths do.
 
     Args:
         seen: of all frames.
         noise: standard deviation of landmarks, share of the person's size in the image. A body that
             bends fits nearly all of it, so residuals do not tell it.
         focal: whether the focal length is unknown; else the guess is exact.
+        height: metres, of the person.
     """
     standing = Problem(seen).standing_feet()
     ground = bool(standing.sum() >= MIN_STANDING)
     at = torch.tensor(evenly_spaced(len(seen.u), KEYFRAMES, ends=True))
 
-    def problem(frames: Tensor, noise: float, **options: bool) -> Problem:
-        return Problem(seen[frames], noise, standing=standing[frames] * ground, **options)
+    def problem(frames: Tensor, noise: float, zoom: float, **options: bool) -> Problem:
+        feet = standing[frames] * ground
+        return Problem(seen[frames], noise, zoom, standing=feet, height=height, **options)
 
-    few, found = at[::2], []
-    for zoom in ZOOMS if focal else (0.0,):
-        state, _ = problem(few, NOISE, focal=False).minimise(problem(few, NOISE).start(zoom), 10)
-        _, cost = problem(few, noise, focal=False).minimise(state, 8)
-        found.append((cost, zoom))
-    keys = problem(at, NOISE, focal=False)
-    state, _ = keys.minimise(keys.start(min(found)[1]), 10)
-    keys = problem(at, noise, focal=focal)
-    state, _ = keys.minimise(state)
-    spread = keys.spread(state) if focal else 0.0
+    tried = np.concatenate([ZOOMS[::-1], ZOOMS]) if focal else np.zeros(1)
+    first = problem(at, NOISE, float(tried[0]))
+    states, costs = [first.minimise(first.start())[0]], []
+    for zoom in tried:
+        state, cost = problem(at, noise, float(zoom)).minimise(states[-1], ZOOM_STEPS)
+        states.append(state)
+        costs.append(cost)
+    zoom, spread = _best_zoom(np.array(costs)) if focal else (0.0, 0.0)
+    nearest = states[1:][-1 - int(np.argmin(np.abs(tried[::-1] - zoom)))]
+    state, _ = problem(at, noise, zoom).minimise(nearest)
 
     # all frames: first one by one, then as a motion
     every = torch.arange(len(seen.u))
-    own = {"focal": False, "shape": False}
-    begun = problem(every, noise, **own).start(float(state.common[0]))
-    begun, _ = problem(every, NOISE, **own).minimise(replace(begun, common=state.common), 6)
-    whole = problem(every, noise, smooth=True, **own)
+    alone = problem(every, NOISE, zoom, shape=False)
+    begun, _ = alone.minimise(replace(alone.start(), common=state.common), 6)
+    whole = problem(every, noise, zoom, smooth=True, shape=False)
     final, _ = whole.minimise(begun, 10)
     p, error = whole.errors(final)
     return View(
         p=p,
         error=error,
         shape=shape_of(whole.space, final.common[OWN:]),
-        focal=math.exp(float(final.common[0])),
+        focal=math.exp(zoom),
         spread=spread,
-        ground=final.common[1:OWN] if ground else None,
+        ground=final.common[:OWN] if ground else None,
         standing=standing,
     )
 
@@ -199,30 +205,36 @@ class Problem:
     Args:
         seen: of F frames.
         noise: of landmarks, share of the person's size.
-        focal, shape: whether the focal length and the body's shape are unknown.
+        zoom: logarithm of the focal length over its guess.
+        shape: whether the body's shape is unknown.
         smooth: whether the frames follow each other in time.
         standing: ``[F, 4]`` 1 where `FEET` stand.
+        height: metres, of the person.
     """
 
     def __init__(
         self,
         seen: Seen,
         noise: float = NOISE,
-        focal: bool = True,
+        zoom: float = 0.0,
         shape: bool = True,
         smooth: bool = False,
         standing: Tensor | None = None,
+        height: float = HEIGHT,
     ) -> None:
-        self.seen, self.smooth = seen, smooth
+        self.seen, self.zoom, self.smooth = seen, math.exp(zoom), smooth
         none = seen.weight.new_zeros(len(seen.weight), len(FEET))
         self.standing = none if standing is None else standing
         self.noise = (noise * seen.size)[:, None]
         self.depth = DEPTH * (NOISE / noise) ** 0.5
-        self.space = without_surface(free_space())
-        own = torch.tensor([FOCAL_SPREAD**-2.0, *[1e-3] * (OWN - 1)], dtype=torch.float64)
-        self.prior = torch.cat([own, shape_prior(self.space)])
+        space = free_space()
+        self.space = without_surface(space)
+        tall = float(space.body.vertices[:, 2].max() - space.body.vertices[:, 2].min())
+        self.size = _log_size(self.space.body.landmarks) + math.log(height / tall)
+        ground = torch.full((OWN,), 1e-3, dtype=torch.float64)
+        self.prior = torch.cat([ground, shape_prior(self.space)])
         self.free = torch.full_like(self.prior, shape, dtype=torch.bool)
-        self.free[0], self.free[1:OWN] = focal, bool(self.standing.any())
+        self.free[:OWN] = bool(self.standing.any())
         w = seen.weight.unsqueeze(-1)
         middle = (w * seen.u.nan_to_num()).sum(1) / w.sum(1).clamp_min(1e-9)
         rays = torch.cat([middle, torch.ones_like(middle[:, :1])], dim=1)  # to the seen landmarks
@@ -238,12 +250,11 @@ class Problem:
         solver.prior = solver.prior * torch.outer(weight, weight)
         return solver
 
-    def start(self, zoom: float = 0.0) -> State:
+    def start(self) -> State:
         """The detector's own 3D landmarks where they fit those in 2D best, and a usual shape."""
         common = torch.zeros_like(self.prior)
-        common[0] = zoom
         solver = self.solver(common)
-        u, w = self.seen.u.nan_to_num() / math.exp(zoom), self.seen.weight
+        u, w = self.seen.u.nan_to_num() / self.zoom, self.seen.weight
         # least squares of  x + tx = u (z + tz)
         A = torch.zeros(*u.shape, 3, dtype=u.dtype)
         A[..., 0, 0] = A[..., 1, 1] = 1
@@ -259,6 +270,11 @@ class Problem:
             common[OWN - 1] = p[:, FEET, 1].median()
         return State(q, root, common)
 
+    def too_large(self, x: Tensor) -> Tensor:
+        """By how many standard deviations a body of the shape ``x [S]`` is too large."""
+        body = self.space.shaped(shape_of(self.space, x))
+        return (_log_size(body.landmarks) - self.size) / SIZE
+
     def landmarks(self, at: State, solver: Solver) -> Tensor:
         """``[F, 33, 3]``."""
         return solver.points(solver.transforms(at.q, at.root, solver.joints), solver.landmarks)
@@ -266,12 +282,12 @@ class Problem:
     def residuals(self, x: Tensor, own: Tensor, *of_frame: Tensor) -> Tensor:
         """``[R]`` of one frame's landmarks ``x [33, 3]``, in standard deviations: see `GROUPS`."""
         u, world, noise = of_frame
-        shown = own[0].exp() * x[:, :2] / x[:, 2:].clamp_min(NEAR)
+        shown = self.zoom * x[:, :2] / x[:, 2:].clamp_min(NEAR)
         hang = x - x[HIPS].mean(0) - world
         feet = x[FEET]
-        height = feet[:, 1] - own[1] * feet[:, 0] - own[2] * feet[:, 2] - own[3]
+        height = feet[:, 1] - own[0] * feet[:, 0] - own[1] * feet[:, 2] - own[2]
         trunk = x[TRUNK].mean(0) - feet.mean(0)  # above the feet: what tells the ground's slope
-        aside = torch.stack([trunk[0] + own[1] * trunk[1], trunk[2] + own[2] * trunk[1]])
+        aside = torch.stack([trunk[0] + own[0] * trunk[1], trunk[2] + own[1] * trunk[1]])
         parts = ((shown - u) / noise, hang / self.depth, height / GROUND, aside / BALANCE)
         return torch.cat([part.flatten() for part in parts])
 
@@ -280,7 +296,7 @@ class Problem:
         seen, F = self.seen, len(X)
         hung = X - X[:, HIPS].mean(1, keepdim=True)
         w = seen.weight.unsqueeze(-1)  # the detector's own 3D landmarks are of any scale
-        scale = (w * hung * self.world).sum() / (w * self.world.square()).sum()
+        scale = ((w * hung.square()).sum() / (w * self.world.square()).sum()).sqrt()
         data = (seen.u, scale * self.world, self.noise)
         every = (0, None, 0, 0, 0)
         r = torch.vmap(self.residuals, every)(X, own, *data)
@@ -322,10 +338,11 @@ class Problem:
         found = self.terms(self.landmarks(at, solver), at.common[:OWN], linear=False)
         stop, amount = below_least(at.q, solver.least)
         pull = ((at.q @ solver.prior) * at.q).sum() + (stop * amount.square()).sum()
+        pull = pull + self.too_large(at.common[OWN:]).square()
         return found.cost + (pull + (self.prior * at.common.square()).sum())
 
-    def step(self, at: State, damping: float) -> tuple[State, Tensor]:
-        """One step, and the inverse of the common unknowns' covariance."""
+    def step(self, at: State, damping: float) -> State:
+        """One step."""
         solver = self.solver(at.common)
         linear = solver.linear(at.q, at.root, torch.zeros_like(self.seen.world))
         found = self.terms(linear.residual, at.common[:OWN])
@@ -353,6 +370,9 @@ class Problem:
         common[:OWN, :OWN] += found.common
         slope = torch.einsum("fni,fn->i", G, found.g) + self.prior * at.common
         slope[:OWN] += found.slope
+        size = torch.func.jacfwd(self.too_large)(at.common[OWN:])
+        common[OWN:, OWN:] += torch.outer(size, size)
+        slope[OWN:] += size * self.too_large(at.common[OWN:])
         cross[..., ~self.free] = 0
         common[~self.free], common[:, ~self.free] = 0, 0
         common += torch.diag((~self.free).to(J))
@@ -367,7 +387,7 @@ class Problem:
         dq = -(inner[:, -1] + inner[:, :-1] @ c).view(F, D)
         q, root = at.q + dq, axis_angle_to_matrix(dq[:, :3]) @ at.root
         q[:, :3] = 0
-        return State(q, root, at.common + c), S
+        return State(q, root, at.common + c)
 
     def _by_shape(self, at: State, solver: Solver) -> Tensor:
         """``[F, 33, 3, S]``: a landmark moves by its own move and those of the joints before it."""
@@ -387,7 +407,7 @@ class Problem:
         """The solution, and its cost."""
         best, damping = self.cost(at), DAMPING
         for _ in range(steps):
-            new, _ = self.step(at, damping)
+            new = self.step(at, damping)
             cost = self.cost(new)
             gain = float((best - cost) / best)
             if gain > 0:
@@ -397,10 +417,6 @@ class Problem:
             if abs(gain) < SETTLED or damping > 1e6:
                 break
         return at, float(best)
-
-    def spread(self, at: State) -> float:
-        """Standard deviation of the focal length's logarithm."""
-        return float(torch.linalg.inv(self.step(at, 0.0)[1])[0, 0].clamp_min(0).sqrt())
 
     def standing_feet(self) -> Tensor:
         """``[F, 4]`` 1 where `FEET` hardly move across the image: they stand."""
@@ -416,9 +432,24 @@ class Problem:
     def errors(self, at: State) -> tuple[Tensor, Tensor]:
         """Landmarks ``[F, 33, 3]`` and their reprojection errors ``[F, 33]``, NaN = not seen."""
         X = self.landmarks(at, self.solver(at.common))
-        shown = at.common[0].exp() * X[..., :2] / X[..., 2:].clamp_min(NEAR)
+        shown = self.zoom * X[..., :2] / X[..., 2:].clamp_min(NEAR)
         off = (shown - self.seen.u).norm(dim=-1)
         return X, torch.where(self.seen.weight > 0, off, torch.nan)
+
+
+def _best_zoom(costs: Float) -> tuple[float, float]:
+    """The best of `ZOOMS` and its standard deviation, by a parabola through the costs of both ways
+    near the least."""
+    cost = np.minimum(costs[: len(ZOOMS)][::-1], costs[len(ZOOMS) :]) + (ZOOMS / FOCAL_SPREAD) ** 2
+    best = int(np.clip(cost.argmin(), NEAREST, len(ZOOMS) - 1 - NEAREST))
+    near = slice(best - NEAREST, best + NEAREST + 1)
+    a, b, _ = np.polyfit(ZOOMS[near], cost[near], 2)
+    return float(np.clip(-b / (2 * a), ZOOMS[0], ZOOMS[-1])), float(max(a, 1.0) ** -0.5)
+
+
+def _log_size(p: Tensor) -> Tensor:
+    """The logarithm of the distance of landmarks ``[33, 3]`` from their middle."""
+    return (p - p.nanmean(0)).square().nanmean().log() / 2
 
 
 def _blocks(H: Tensor, right: Tensor) -> Tensor:
