@@ -230,9 +230,9 @@ def bare(capture, shared, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def on_body(capture, shared):
-    """``on_body()``: a tiny run whose Gaussians are on the body's surface."""
-    on = "effects.body_points=on"
-    return lambda: shared("on_body", lambda folder: trained(capture, folder, on))
+    """``on_body()``: a tiny run with a page, whose Gaussians are on the body's surface."""
+    on = ("effects.body_points=on", "page=true")
+    return lambda: shared("on_body", lambda folder: trained(capture, folder, *on))
 
 
 @pytest.fixture(scope="session")

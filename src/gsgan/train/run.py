@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from signal import SIGTERM
-from typing import Any
+from typing import Any, cast
 
 import gsgan.utils.compat  # noqa: F401  (must come before lightning)
 
@@ -29,6 +29,7 @@ from gsgan.evaluate.files import NAMES
 from gsgan.evaluate.origin import trained, training_code
 from gsgan.evaluate.run import evaluate_method
 from gsgan.evaluate.scores import painter
+from gsgan.export.run import export_config
 from gsgan.fit.run import fit_before_training
 from gsgan.metrics.lpips import check_lpips
 from gsgan.model.assemble import build_avatar, build_data, naming_group
@@ -36,10 +37,12 @@ from gsgan.model.avatar import Avatar
 from gsgan.model.harmonic import Harmonic, distilled
 from gsgan.model.runs import load
 from gsgan.model.stored import CHECKPOINT, read_checkpoint, record
+from gsgan.motion.clip import FPS
 from gsgan.splat import resolve_backend
 from gsgan.train.callbacks import AtomicCheckpoints, ImageGrid, ProgressLines, StopOnSignal
 from gsgan.train.module import AvatarTraining
 from gsgan.utils.checks import whole
+from gsgan.utils.config import defaults_of
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.sweeps import STOPPED
@@ -48,6 +51,7 @@ from gsgan.utils.sweeps import STOPPED
 # 512² with VGG-16 and the discriminator. With small ones at 128² it was 3.4.
 STEP_PER_RENDERING = 10
 DISCRIMINATOR_SALT = 1000
+PAGE = "avatar.html"
 
 
 def run_training(config: DictConfig) -> None:
@@ -72,7 +76,10 @@ def run_training(config: DictConfig) -> None:
         remove_old_results(folder)
         if config.distil is not None:
             start_from(module.avatar, data, Path(config.distil).expanduser())
-    elif done >= module.schedule.total and (not config.evaluate or _is_scored(folder, resume)):
+    elif done >= module.schedule.total and all(
+        not wanted or _is_written(folder / name, resume)
+        for name, wanted in (("metrics.json", config.evaluate), (PAGE, config.page))
+    ):
         console.print(
             f"{folder}: trained and scored before; nothing to do (gsgan.evaluate scores it again)",
             soft_wrap=True,
@@ -96,6 +103,8 @@ def run_training(config: DictConfig) -> None:
     if trainer.is_global_zero:
         if config.evaluate:
             _evaluate(trainer, module, data, config, folder, console)
+        if config.page:
+            _write_page(folder, data)
         console.print(f"run folder: {folder}", soft_wrap=True)
 
 
@@ -149,10 +158,16 @@ def device_of(config: DictConfig) -> torch.device:
     return torch.device("cuda", chosen[0] if OmegaConf.is_list(chosen) else 0)
 
 
-def _is_scored(folder: Path, checkpoint: Path) -> bool:
-    """Whether a run folder has scores that are newer than its checkpoint."""
-    scores = folder / "metrics.json"
-    return scores.is_file() and scores.stat().st_mtime >= checkpoint.stat().st_mtime
+def _is_written(path: Path, checkpoint: Path) -> bool:
+    """Whether a result is newer than the checkpoint."""
+    return path.is_file() and path.stat().st_mtime >= checkpoint.stat().st_mtime
+
+
+def _write_page(folder: Path, data: GsganData) -> None:
+    """Writes the web page, with the training poses as its motion."""
+    given = {"run": str(folder), "format": "html", "out": str(folder / PAGE), "overwrite": True}
+    given |= {"motion": "train", "fps": data.layout.meta.fps or FPS}
+    export_config(cast(DictConfig, OmegaConf.merge(defaults_of("export"), given)))
 
 
 def _fit(
@@ -274,7 +289,7 @@ def refuse_long_cpu_run(
 
 def remove_old_results(folder: Path) -> None:
     """Removes the results of an earlier run from a folder that starts over."""
-    for name in (*NAMES, CHECKPOINT):
+    for name in (*NAMES, CHECKPOINT, PAGE):
         (folder / name).unlink(missing_ok=True)
     for scores in folder.glob("on_*/*"):  # on another background
         if scores.name in NAMES:
