@@ -123,3 +123,29 @@ def test_the_step_scales_offsets_up_to_the_same_bound(densify):
         moved = (run(slow, densify, p).means - at_rest).norm(dim=-1)
         reach = 3**0.5 * slow.mean_bound * slow.body_height * math.tanh(expected)
         torch.testing.assert_close(moved, torch.full_like(moved, reach), rtol=1e-4, atol=0)
+
+
+def test_a_pose_far_from_training_counts_as_the_nearest_that_psi_learnt(densify):
+    psi, p, pelvis = small(densify, pose_limit=1.5), rest(), torch.eye(3)[None]
+    psi.head.weight.data.normal_(0, 0.3)
+    points = densify(p)
+    axes = torch.linalg.qr(torch.randn(99, 4))[0]
+    codes = torch.randn(400, 4) @ torch.diag(torch.tensor([4.0, 3.0, 2.0, 1.0])) @ axes.T
+
+    def sh(code):
+        return psi.residuals(points, code, torch.zeros(1, 3), pelvis).sh
+
+    aside, within = torch.randn(1, 99), codes[:1] / 10
+    aside = aside - aside @ axes @ axes.T
+    raw = sh(within), sh(within + aside)
+    psi.eval()
+    torch.testing.assert_close((sh(within), sh(within + aside)), raw)  # no poses are known
+    psi.remember(codes)
+    torch.testing.assert_close((sh(within), sh(within + aside)), (raw[0], raw[0]))
+    limits = [sh(codes.mean(0) + far * psi.pose_axes[:, :4].mT.sum(0)[None]) for far in (9, 90)]
+    torch.testing.assert_close(*limits)
+    assert (limits[1] - raw[0]).abs().max() > 0.1
+    psi.train()
+    torch.testing.assert_close((sh(within), sh(within + aside)), raw)
+    old = {name: x for name, x in psi.state_dict().items() if not name.startswith("pose_")}
+    small(densify).load_state_dict(old)

@@ -13,7 +13,7 @@ from gsgan.data.training_poses import TrainingPoses
 from gsgan.effects import Effects
 from gsgan.model.body_points import BodyPoints
 from gsgan.model.colour import ColourCorrection
-from gsgan.model.deformation import ResidualGaussians, Residuals, bounded
+from gsgan.model.deformation import Deformation, ResidualGaussians, Residuals, bounded
 from gsgan.model.generator import Generator
 from gsgan.model.pose_graph import pose_inputs
 from gsgan.model.rendering import Rendering
@@ -368,10 +368,20 @@ class Avatar(nn.Module):
         """G in pose and Ψ's ΔG without noise; arguments as for `splat`."""
         assert self.deformation is not None
         frames = bone_frames(p, valid, self.template)
-        points, root, pelvis = self.points(p, valid, frames, body), root_of(p), frames.hubs[:, 0]
+        points, pelvis = self.points(p, valid, frames, body), frames.hubs[:, 0]
+        code = self._code(p, frames)
+        return points, self.deformation.residuals(points, code, root_of(p), pelvis)
+
+    def _code(self, p: Tensor, frames: BoneFrames) -> Tensor:
+        """``[B, 3 J]`` Ψ's code of a pose, without noise."""
+        assert self.deformation is not None
         face = face_code(p, frames.head, self.template)
-        code = self.deformation.pose_code(p, root, pelvis, None, face)
-        return points, self.deformation.residuals(points, code, root, pelvis)
+        return self.deformation.pose_code(p, root_of(p), frames.hubs[:, 0], None, face)
+
+    def remember(self, p: Tensor) -> None:
+        """Tells Ψ the training poses ``[F, J, 3]``, completed, metres."""
+        if isinstance(self.deformation, Deformation):
+            self.deformation.remember(self._code(p, bone_frames(p, None, self.template)))
 
     def _rasterised(self, gaussians: Gaussians, camera: Camera, supersample: bool) -> Raster:
         """F."""

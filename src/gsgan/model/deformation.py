@@ -17,6 +17,8 @@ from gsgan.splat.sh import sh_to_colour
 from gsgan.utils.checks import between, one_of, whole
 from gsgan.utils.tensors import constant, derived
 
+POSE_AXES = 20  # principal directions of the training poses' codes
+POSES = ("pose_mean", "pose_axes", "pose_spread")
 QUAT_FLOOR = 1e-12  # inside the root that normalises a quaternion: q0 + δq ≈ 0 stays finite
 
 
@@ -199,6 +201,9 @@ class Deformation(ResidualGaussians):
     """
 
     rest_code: Tensor
+    pose_mean: Tensor  # [3 J] of training poses' codes
+    pose_axes: Tensor  # [3 J, K] directions
+    pose_spread: Tensor  # [K] standard deviations; infinite: not known
 
     def __init__(
         self,
@@ -214,6 +219,7 @@ class Deformation(ResidualGaussians):
         normals: bool = False,
         free_table: bool = True,
         pose_frame: str = "world",
+        pose_limit: float | None = 2.0,
         **settings: Any,
     ) -> None:
         super().__init__(body_height, **settings)
@@ -221,6 +227,14 @@ class Deformation(ResidualGaussians):
         between("model.deformation: layers", whole("model.deformation: layers", layers, 2), 2, 1000)
         points = rest_points.shape[0]
         self.position_octaves, self.pose_frame = position_octaves, pose_frame
+        self.pose_limit, size = pose_limit, 3 * joints
+        unknown = (
+            torch.zeros(size),
+            torch.zeros(size, POSE_AXES),
+            torch.full((POSE_AXES,), math.inf),
+        )
+        for name, values in zip(POSES, unknown, strict=True):
+            self.register_buffer(name, values)
         self.register_buffer("rest_code", positional_encoding(rest_points.float(), rest_octaves))
         self.embedding = nn.Parameter(0.1 * torch.randn(points, embedding))
         point_size = encoded_size(3, rest_octaves) + embedding
@@ -234,8 +248,34 @@ class Deformation(ResidualGaussians):
         nn.init.zeros_(self.head.bias)
         self.table = nn.Parameter(torch.zeros(points, sum(self.parts))) if free_table else None
 
+    def remember(self, codes: Tensor) -> None:
+        """Stores the spread of the training poses' codes ``[F, 3 J]``, see `_within`."""
+        self.pose_mean.copy_(codes.mean(0))
+        _, spread, axes = torch.linalg.svd(codes - self.pose_mean, full_matrices=False)
+        known = min(POSE_AXES, len(spread))
+        self.pose_axes[:, :known] = axes[:known].mT
+        self.pose_spread.zero_()[:known] = spread[:known] / len(codes) ** 0.5
+
+    def _within(self, code: Tensor) -> Tensor:
+        """The code nearest to ``[B, 3 J]`` among those that vary as the training poses' do, by
+        ``pose_limit`` standard deviations at most: Ψ is not asked for what it did not learn.
+
+        Source: AnimatableGaussians, Sec. 3.4.
+        """
+        assert self.pose_limit is not None
+        far, axes = self.pose_limit * self.pose_spread, self.pose_axes
+        along = ((code - self.pose_mean) @ axes).clamp(-far, far)
+        return torch.where(far.isfinite().all(), self.pose_mean + along @ axes.mT, code)
+
+    def _load_from_state_dict(self, state: dict[str, Tensor], prefix: str, *rest: Any) -> None:
+        for name in POSES:  # runs of before 2026-11-25 have none
+            state.setdefault(prefix + name, getattr(self, name))
+        super()._load_from_state_dict(state, prefix, *rest)
+
     def residuals(self, points: Points, pose: Tensor, root: Tensor, pelvis: Tensor) -> Residuals:
         """See `ResidualGaussians.residuals`."""
+        if self.pose_limit is not None and not self.training:
+            pose = self._within(pose)
         # Only a skeleton's gradient passes through Ψ's inputs, not one of skinning weights.
         means = points.means if root.requires_grad else points.means.detach()
         position = (means - root[:, None]) / self.body_height

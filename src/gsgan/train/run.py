@@ -119,6 +119,8 @@ def build_training(config: DictConfig) -> tuple[GsganData, AvatarTraining]:
     if data.lacks_body:
         data = fit_before_training(data, config.fit, device_of(config))
     avatar = build_avatar(config, data.info, data.labelled("train"))
+    frames = data.splits.items["train"].frames
+    avatar.remember(data.dataset("train").skeletons.joints(frames)[0].float())
     torch.manual_seed(config.seed + DISCRIMINATOR_SALT)  # the same start beside every avatar
     with naming_group("training"):
         return data, instantiate(config.training)(
