@@ -75,6 +75,13 @@ def test_what_is_off_builds_no_parameter(build, model, absent):
     assert avatar.segmentation_why == "the model leaves it out"
 
 
+def test_one_camera_gives_psi_no_normals(build):
+    one = "data.train_cameras=[cam00]"
+    assert build("model=splat_only")[1].deformation.from_normal is not None
+    assert build("model=splat_only", one)[1].deformation.from_normal is None
+    build("model=harmonic", one, "effects.body_points=on")
+
+
 def test_data_without_body_pose_builds_no_segmentation(build, tmp_path):
     from make import write_tiny_capture
 

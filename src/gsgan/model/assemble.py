@@ -179,8 +179,10 @@ def _assembled(
     deformation = surface = None
     if parts.deformation and (points := body_points or parts.densify):
         rest, joints = points.rest_points, len(template.names)
-        step = {"mean_step": body_points.mean_step} if body_points else {}
-        deformation = parts.deformation(rest_points=rest, joints=joints, **sizes, **step)
+        own: dict[str, Any] = {"mean_step": body_points.mean_step} if body_points else {}
+        if getattr(parts.deformation, "keywords", {}).get("normals", False) is None:
+            own["normals"] = scene.n_train_cameras > 1
+        deformation = parts.deformation(rest_points=rest, joints=joints, **sizes, **own)
     if parts.surface:
         surface = parts.surface(body=_required_body(scene, "model.surface"), **sizes)
     segmentation = None

@@ -348,8 +348,9 @@ def describe(
         f"{len(data.dataset('train'))} training images: {info.n_train_cameras} cameras, "
         f"{info.frames} frames; held out: {held_out}",
     )
+    plain = getattr(avatar.deformation, "from_normal", avatar) is None
     parts = {
-        "Ψ": avatar.deformation,
+        "Ψ, without normals" if plain else "Ψ": avatar.deformation,
         "surface": avatar.surface,
         "colour correction": avatar.colour,
         "pose encoder": avatar.pose_encoder,
