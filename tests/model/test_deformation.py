@@ -140,11 +140,15 @@ def test_a_pose_far_from_training_counts_as_the_nearest_that_psi_learnt(densify)
     raw = sh(within), sh(within + aside)
     psi.eval()
     torch.testing.assert_close((sh(within), sh(within + aside)), raw)  # no poses are known
-    psi.remember(codes)
+    means = points.means + torch.tensor([-0.1, 0.1])[:, None, None]
+    psi.remember(codes, means, torch.zeros(2, 3), pelvis)
     torch.testing.assert_close((sh(within), sh(within + aside)), (raw[0], raw[0]))
     limits = [sh(codes.mean(0) + far * psi.pose_axes[:, :4].mT.sum(0)[None]) for far in (9, 90)]
     torch.testing.assert_close(*limits)
     assert (limits[1] - raw[0]).abs().max() > 0.1
+    away = [replace(points, means=points.means + 9 * far) for far in (1, 10)]
+    found = [psi.residuals(x, within, torch.zeros(1, 3), pelvis).sh for x in away]
+    torch.testing.assert_close(*found)
     psi.train()
     torch.testing.assert_close((sh(within), sh(within + aside)), raw)
     old = {name: x for name, x in psi.state_dict().items() if not name.startswith("pose_")}

@@ -378,10 +378,13 @@ class Avatar(nn.Module):
         face = face_code(p, frames.head, self.template)
         return self.deformation.pose_code(p, root_of(p), frames.hubs[:, 0], None, face)
 
-    def remember(self, p: Tensor) -> None:
-        """Tells Ψ the training poses ``[F, J, 3]``, completed, metres."""
+    @torch.no_grad()
+    def remember(self, p: Tensor, valid: Tensor, body: BodyPose | None) -> None:
+        """Tells Ψ the training poses ``[F, J, 3]``, completed, metres; arguments as for `splat`."""
         if isinstance(self.deformation, Deformation):
-            self.deformation.remember(self._code(p, bone_frames(p, None, self.template)))
+            frames = bone_frames(p, valid, self.template)
+            means, pelvis = self.points(p, valid, frames, body).means, frames.hubs[:, 0]
+            self.deformation.remember(self._code(p, frames), means, root_of(p), pelvis)
 
     def _rasterised(self, gaussians: Gaussians, camera: Camera, supersample: bool) -> Raster:
         """F."""

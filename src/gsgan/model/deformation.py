@@ -18,7 +18,7 @@ from gsgan.utils.checks import between, one_of, whole
 from gsgan.utils.tensors import constant, derived
 
 POSE_AXES = 20  # principal directions of the training poses' codes
-POSES = ("pose_mean", "pose_axes", "pose_spread")
+POSES = ("pose_mean", "pose_axes", "pose_spread", "place_mean", "place_spread")
 QUAT_FLOOR = 1e-12  # inside the root that normalises a quaternion: q0 + δq ≈ 0 stays finite
 
 
@@ -204,6 +204,8 @@ class Deformation(ResidualGaussians):
     pose_mean: Tensor  # [3 J] of training poses' codes
     pose_axes: Tensor  # [3 J, K] directions
     pose_spread: Tensor  # [K] standard deviations; infinite: not known
+    place_mean: Tensor  # [N, 3] of points in training poses, about the root, in body heights
+    place_spread: Tensor  # [N, 3] standard deviations; infinite: not known
 
     def __init__(
         self,
@@ -228,13 +230,10 @@ class Deformation(ResidualGaussians):
         points = rest_points.shape[0]
         self.position_octaves, self.pose_frame = position_octaves, pose_frame
         self.pose_limit, size = pose_limit, 3 * joints
-        unknown = (
-            torch.zeros(size),
-            torch.zeros(size, POSE_AXES),
-            torch.full((POSE_AXES,), math.inf),
-        )
-        for name, values in zip(POSES, unknown, strict=True):
-            self.register_buffer(name, values)
+        shapes = (size,), (size, POSE_AXES), (POSE_AXES,), (points, 3), (points, 3)
+        for name, shape in zip(POSES, shapes, strict=True):
+            value = math.inf if name.endswith("spread") else 0.0
+            self.register_buffer(name, torch.full(shape, value))
         self.register_buffer("rest_code", positional_encoding(rest_points.float(), rest_octaves))
         self.embedding = nn.Parameter(0.1 * torch.randn(points, embedding))
         point_size = encoded_size(3, rest_octaves) + embedding
@@ -248,22 +247,30 @@ class Deformation(ResidualGaussians):
         nn.init.zeros_(self.head.bias)
         self.table = nn.Parameter(torch.zeros(points, sum(self.parts))) if free_table else None
 
-    def remember(self, codes: Tensor) -> None:
-        """Stores the spread of the training poses' codes ``[F, 3 J]``, see `_within`."""
+    def remember(self, codes: Tensor, means: Tensor, root: Tensor, pelvis: Tensor) -> None:
+        """Stores the spread of the training poses' codes ``[F, 3 J]``, see `_within`, and of the
+        places of their points ``[F, N, 3]``; root and pelvis as for `residuals`."""
         self.pose_mean.copy_(codes.mean(0))
         _, spread, axes = torch.linalg.svd(codes - self.pose_mean, full_matrices=False)
         known = min(POSE_AXES, len(spread))
         self.pose_axes[:, :known] = axes[:known].mT
         self.pose_spread.zero_()[:known] = spread[:known] / len(codes) ** 0.5
+        places = self._places(means, root, pelvis)
+        self.place_mean.copy_(places.mean(0))
+        self.place_spread.copy_(places.std(0, correction=0))
 
-    def _within(self, code: Tensor) -> Tensor:
+    def _places(self, means: Tensor, root: Tensor, pelvis: Tensor) -> Tensor:
+        """Means ``[B, N, 3]`` about the root, in body heights."""
+        places = (means - root[:, None]) / self.body_height
+        return places @ pelvis if self.pose_frame == "pelvis" else places
+
+    def _within(self, code: Tensor, limit: float) -> Tensor:
         """The code nearest to ``[B, 3 J]`` among those that vary as the training poses' do, by
-        ``pose_limit`` standard deviations at most: Ψ is not asked for what it did not learn.
+        ``limit`` standard deviations at most: Ψ is not asked for what it did not learn.
 
         Source: AnimatableGaussians, Sec. 3.4.
         """
-        assert self.pose_limit is not None
-        far, axes = self.pose_limit * self.pose_spread, self.pose_axes
+        far, axes = limit * self.pose_spread, self.pose_axes
         along = ((code - self.pose_mean) @ axes).clamp(-far, far)
         return torch.where(far.isfinite().all(), self.pose_mean + along @ axes.mT, code)
 
@@ -274,14 +281,17 @@ class Deformation(ResidualGaussians):
 
     def residuals(self, points: Points, pose: Tensor, root: Tensor, pelvis: Tensor) -> Residuals:
         """See `ResidualGaussians.residuals`."""
-        if self.pose_limit is not None and not self.training:
-            pose = self._within(pose)
+        limit = None if self.training else self.pose_limit
+        if limit is not None:
+            pose = self._within(pose, limit)
         # Only a skeleton's gradient passes through Ψ's inputs, not one of skinning weights.
         means = points.means if root.requires_grad else points.means.detach()
-        position = (means - root[:, None]) / self.body_height
-        normals = points.normals
+        position, normals = self._places(means, root, pelvis), points.normals
+        if limit is not None:
+            far = limit * self.place_spread
+            position = self.place_mean + (position - self.place_mean).clamp(-far, far)
         if self.pose_frame == "pelvis":
-            position, normals = position @ pelvis, normals @ pelvis
+            normals = normals @ pelvis
         code = positional_encoding(position, self.position_octaves)
         if torch.is_grad_enabled() and not (code.requires_grad or normals.requires_grad):
             x = self._trained(code, normals, pose)

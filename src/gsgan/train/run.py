@@ -14,6 +14,7 @@ from typing import Any, cast
 import gsgan.utils.compat  # noqa: F401  (must come before lightning)
 
 # isort: split
+import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
@@ -38,9 +39,11 @@ from gsgan.model.harmonic import Harmonic, distilled
 from gsgan.model.runs import load
 from gsgan.model.stored import CHECKPOINT, read_checkpoint, record
 from gsgan.motion.clip import FPS
+from gsgan.scene import BodyPose
 from gsgan.splat import resolve_backend
 from gsgan.train.callbacks import AtomicCheckpoints, ImageGrid, ProgressLines, StopOnSignal
 from gsgan.train.module import AvatarTraining
+from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import whole
 from gsgan.utils.config import defaults_of
 from gsgan.utils.console import make_console
@@ -52,6 +55,7 @@ from gsgan.utils.sweeps import STOPPED
 STEP_PER_RENDERING = 10
 DISCRIMINATOR_SALT = 1000
 PAGE = "avatar.html"
+POSES = 500  # at most, whose spread Ψ is told
 
 
 def run_training(config: DictConfig) -> None:
@@ -119,8 +123,7 @@ def build_training(config: DictConfig) -> tuple[GsganData, AvatarTraining]:
     if data.lacks_body:
         data = fit_before_training(data, config.fit, device_of(config))
     avatar = build_avatar(config, data.info, data.labelled("train"))
-    frames = data.splits.items["train"].frames
-    avatar.remember(data.dataset("train").skeletons.joints(frames)[0].float())
+    _show_poses(avatar, data)
     torch.manual_seed(config.seed + DISCRIMINATOR_SALT)  # the same start beside every avatar
     with naming_group("training"):
         return data, instantiate(config.training)(
@@ -128,6 +131,18 @@ def build_training(config: DictConfig) -> tuple[GsganData, AvatarTraining]:
             record=training_record(config, data),
             scene=json.loads(json.dumps(asdict(data.info))),
         )
+
+
+def _show_poses(avatar: Avatar, data: GsganData) -> None:
+    """Tells the avatar the training poses, or `POSES` of them."""
+    frames = data.splits.items["train"].frames
+    frames = [frames[i] for i in evenly_spaced(len(frames), POSES)]
+    p, valid = data.dataset("train").skeletons.joints(frames)
+    poses, body = data.layout.poses, None
+    if poses is not None:
+        parts = (np.stack([part[f] for f in frames]) for part in (poses.theta, poses.transl))
+        body = BodyPose(*(torch.from_numpy(x).float() for x in parts))
+    avatar.remember(p.float(), valid, body)
 
 
 def start_from(avatar: Avatar, data: GsganData, run: Path) -> None:
