@@ -141,7 +141,7 @@ def test_a_pose_far_from_training_counts_as_the_nearest_that_psi_learnt(densify)
     psi.eval()
     torch.testing.assert_close((sh(within), sh(within + aside)), raw)  # no poses are known
     means = points.means + torch.tensor([-0.1, 0.1])[:, None, None]
-    psi.remember(codes, means, torch.zeros(2, 3), pelvis)
+    psi.store_poses(codes, means, torch.zeros(2, 3), pelvis)
     torch.testing.assert_close((sh(within), sh(within + aside)), (raw[0], raw[0]))
     limits = [sh(codes.mean(0) + far * psi.pose_axes[:, :4].mT.sum(0)[None]) for far in (9, 90)]
     torch.testing.assert_close(*limits)

@@ -379,12 +379,12 @@ class Avatar(nn.Module):
         return self.deformation.pose_code(p, root_of(p), frames.hubs[:, 0], None, face)
 
     @torch.no_grad()
-    def remember(self, p: Tensor, valid: Tensor, body: BodyPose | None) -> None:
-        """Tells Ψ the training poses ``[F, J, 3]``, completed, metres; arguments as for `splat`."""
+    def store_poses(self, p: Tensor, valid: Tensor, body: BodyPose | None) -> None:
+        """Stores the spread of training poses ``[F, J, 3]`` in Ψ; arguments as for `splat`."""
         if isinstance(self.deformation, Deformation):
             frames = bone_frames(p, valid, self.template)
             means, pelvis = self.points(p, valid, frames, body).means, frames.hubs[:, 0]
-            self.deformation.remember(self._code(p, frames), means, root_of(p), pelvis)
+            self.deformation.store_poses(self._code(p, frames), means, root_of(p), pelvis)
 
     def _rasterised(self, gaussians: Gaussians, camera: Camera, supersample: bool) -> Raster:
         """F."""

@@ -247,7 +247,7 @@ class Deformation(ResidualGaussians):
         nn.init.zeros_(self.head.bias)
         self.table = nn.Parameter(torch.zeros(points, sum(self.parts))) if free_table else None
 
-    def remember(self, codes: Tensor, means: Tensor, root: Tensor, pelvis: Tensor) -> None:
+    def store_poses(self, codes: Tensor, means: Tensor, root: Tensor, pelvis: Tensor) -> None:
         """Stores the spread of the training poses' codes ``[F, 3 J]``, see `_within`, and of the
         places of their points ``[F, N, 3]``; root and pelvis as for `residuals`."""
         self.pose_mean.copy_(codes.mean(0))
@@ -266,7 +266,7 @@ class Deformation(ResidualGaussians):
 
     def _within(self, code: Tensor, limit: float) -> Tensor:
         """The code nearest to ``[B, 3 J]`` among those that vary as the training poses' do, by
-        ``limit`` standard deviations at most: Ψ is not asked for what it did not learn.
+        ``limit`` standard deviations at most: beyond them Ψ extrapolates.
 
         Source: AnimatableGaussians, Sec. 3.4.
         """

@@ -55,7 +55,7 @@ from gsgan.utils.sweeps import STOPPED
 STEP_PER_RENDERING = 10
 DISCRIMINATOR_SALT = 1000
 PAGE = "avatar.html"
-POSES = 500  # at most, whose spread Ψ is told
+POSES = 500  # at most, whose spread is stored
 
 
 def run_training(config: DictConfig) -> None:
@@ -123,7 +123,7 @@ def build_training(config: DictConfig) -> tuple[GsganData, AvatarTraining]:
     if data.lacks_body:
         data = fit_before_training(data, config.fit, device_of(config))
     avatar = build_avatar(config, data.info, data.labelled("train"))
-    _show_poses(avatar, data)
+    _store_poses(avatar, data)
     torch.manual_seed(config.seed + DISCRIMINATOR_SALT)  # the same start beside every avatar
     with naming_group("training"):
         return data, instantiate(config.training)(
@@ -133,8 +133,8 @@ def build_training(config: DictConfig) -> tuple[GsganData, AvatarTraining]:
         )
 
 
-def _show_poses(avatar: Avatar, data: GsganData) -> None:
-    """Tells the avatar the training poses, or `POSES` of them."""
+def _store_poses(avatar: Avatar, data: GsganData) -> None:
+    """Stores the spread of the training poses, or of `POSES` of them, in the avatar."""
     frames = data.splits.items["train"].frames
     frames = [frames[i] for i in evenly_spaced(len(frames), POSES)]
     p, valid = data.dataset("train").skeletons.joints(frames)
@@ -142,7 +142,7 @@ def _show_poses(avatar: Avatar, data: GsganData) -> None:
     if poses is not None:
         parts = (np.stack([part[f] for f in frames]) for part in (poses.theta, poses.transl))
         body = BodyPose(*(torch.from_numpy(x).float() for x in parts))
-    avatar.remember(p.float(), valid, body)
+    avatar.store_poses(p.float(), valid, body)
 
 
 def start_from(avatar: Avatar, data: GsganData, run: Path) -> None:
