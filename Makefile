@@ -25,7 +25,8 @@ train: $(STAMP) ## train an avatar of the default person, then score it (minutes
 	$(BIN)/python -m gsgan.train experiment=demo $(ARGS)
 
 test: $(STAMP) ## run the tests with coverage, one process per core (ARGS: one process, no coverage)
-	$(BIN)/python $(if $(ARGS),-m pytest $(ARGS),-m slipcover -m pytest -n auto --dist worksteal)
+	$(BIN)/python $(if $(ARGS),-m pytest $(ARGS),-m slipcover --json --out .coverage.json -m pytest -n auto --dist worksteal)
+	$(if $(ARGS),,$(BIN)/python -m slipcover --fail-under 93 --skip-covered --merge .coverage.json --out .coverage.json)
 
 test-slow: $(STAMP) ## run the tests that take minutes, and all examples of the property tests
 	$(BIN)/python -m pytest -m 'slow or hypothesis' --hypothesis-profile=all $(ARGS)
