@@ -268,7 +268,7 @@ class Deformation(ResidualGaussians):
         """The code nearest to ``[B, 3 J]`` among those that vary as the training poses' do, by
         ``limit`` standard deviations at most: beyond them Ψ extrapolates.
 
-        Source: AnimatableGaussians, Sec. 3.4.
+        Source: the projection of poses of AnimatableGaussians.
         """
         far, axes = limit * self.pose_spread, self.pose_axes
         along = ((code - self.pose_mean) @ axes).clamp(-far, far)

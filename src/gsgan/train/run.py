@@ -55,7 +55,7 @@ from gsgan.utils.sweeps import STOPPED
 STEP_PER_RENDERING = 10
 DISCRIMINATOR_SALT = 1000
 PAGE = "avatar.html"
-POSES = 500  # at most, whose spread is stored
+POSES = 100  # at most, whose spread is stored: all are posed at once
 
 
 def run_training(config: DictConfig) -> None:
