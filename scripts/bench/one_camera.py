@@ -10,8 +10,9 @@ of landmarks and 3 % of frames missing) with a detector's depth, both with true 
 ``mediapipe``'s with its masks. The other cameras are moved into the estimated world by a similarity
 and join the capture, on which an avatar is trained from the video alone. With ``--video`` the
 truth is a capture of several real cameras instead, one of which, of the video's name, took the
-video; landmarks and masks are MediaPipe's. Further words are overrides of `gsgan.train`. Finished
-steps are kept: the same command continues.
+video; landmarks and masks are MediaPipe's. Scores are given twice: with the skeletons that were
+estimated from the video, and with the true ones, moved into the estimated world. Further words
+are overrides of `gsgan.train`. Finished steps are kept: the same command continues.
 """
 
 from __future__ import annotations
@@ -108,15 +109,17 @@ def similarity(p, truth, scaled: bool):
 
 
 def join(scene: Path, capture: Path, folder: Path, own: str, camera: SimpleNamespace) -> list[int]:
-    """The capture with the scene's cameras but the video's in its world; returns its frames."""
-    found, truth = np.load(capture / "landmarks3d.npz"), np.load(scene / "landmarks3d.npz")["p"]
+    """The capture with the scene's cameras but the video's in its world; returns its frames.
+
+    A second one beside it, ``true``, has the scene's landmarks.
+    """
+    found = dict(np.load(capture / "landmarks3d.npz"))
     frames = found["frame_id"]
-    p, truth = found["p"][:, :33], truth[frames, :33]
+    p, truth = found["p"][:, :33], np.load(scene / "landmarks3d.npz")["p"][frames, :33]
     seen = np.isfinite(p + truth).all(-1)
-    p, truth = p[seen], truth[seen]
     for scaled in (False, True):
-        s, A, b = similarity(p, truth, scaled)
-        error = 1000 * np.linalg.norm(s * p @ A.T + b - truth, axis=-1)
+        s, A, b = similarity(p[seen], truth[seen], scaled)
+        error = 1000 * np.linalg.norm(s * p[seen] @ A.T + b - truth[seen], axis=-1)
         print(f"landmarks, {'with scale' if scaled else 'rigid'}: {np.median(error):.1f} mm")
     focal = read_cameras(capture)[NAME].K[0, 0] / camera.K[0, 0]
     print(f"focal length: {100 * (focal - 1):+.1f} %; {len(frames)} frames; scale {s:.3f}")
@@ -135,7 +138,20 @@ def join(scene: Path, capture: Path, folder: Path, own: str, camera: SimpleNames
                 if int(path.stem) in frames:
                     shutil.copy(path, folder / kind / name)
     (folder / "cameras.json").write_text(json.dumps(cameras))
+    true = folder.with_name("true")
+    shutil.copytree(folder, true, dirs_exist_ok=True)
+    found["p"][:, :33] = (truth - b) @ A / s
+    np.savez(true / "landmarks3d.npz", **found)
     return frames.tolist()
+
+
+def show(metrics: Path, how: str) -> None:
+    """Prints a run's dB, in images and in the box."""
+    for split, variants in json.loads(metrics.read_text()).items():
+        for variant, scores in variants.items() if isinstance(variants, dict) else ():
+            if isinstance(scores, dict) and scores.get("psnr_person"):
+                dB = f"{scores['psnr']:.2f} dB, box {scores['psnr_person']:.2f}"
+                print(f"{split} {variant}, {how}: {dB}")
 
 
 def run(*words: str) -> None:
@@ -193,12 +209,9 @@ def main() -> None:
     splits.append(f"data.test_frames=[{','.join(map(str, held))}]")
     where = [f"data.root={folder}/joined", f"hydra.run.dir={folder}/run"]
     run("gsgan.train", "experiment=one_camera", *where, *splits, *overrides)
-    for split, variants in json.loads((folder / "run" / "metrics.json").read_text()).items():
-        for variant, scores in variants.items() if isinstance(variants, dict) else ():
-            if isinstance(scores, dict) and "psnr_person" in scores:
-                print(
-                    f"{split} {variant}: {scores['psnr']:.2f} dB, box {scores['psnr_person']:.2f}"
-                )
+    run("gsgan.evaluate", f"run={folder}/run", f"on.root={folder}/true")
+    show(folder / "run" / "metrics.json", "estimated skeletons")
+    show(folder / "run" / "on" / "true" / "metrics.json", "true skeletons")
     print(
         f"prepare {(prepared - began) / 60:.1f} min, train and score "
         f"{(time.monotonic() - prepared) / 60:.1f} min"
