@@ -1,8 +1,9 @@
 """One motion as BVH files in the conventions of many tools."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -27,7 +28,7 @@ def write_bvh(
     axes: np.ndarray | None = None,
     scale: float = 1.0,
     order: str = "ZXY",
-    own: np.ndarray | None = None,
+    zero: Callable[[Character, np.ndarray], np.ndarray] | None = None,
     everywhere: bool = False,
     roots: Sequence[str] = (),
     ends: bool = True,
@@ -43,14 +44,14 @@ def write_bvh(
         axes: rows are the file's axes.
         scale: the file's units in a metre.
         order: of the Euler angles.
-        own: ``[J, 3, 3]`` takes each joint's axes in the file to the character's at rest; by
-            default the zero pose is the rest pose.
+        zero: of the character and the file's axes: ``[J, 3, 3]`` takes each joint's axes in the
+            file to the character's at rest; by default the zero pose is the rest pose.
         everywhere: position channels on every joint.
         roots: names of joints above the first bone, at the origin.
         ends: end sites; otherwise joints of their own, as some tools write.
     """
     B = np.eye(3) if axes is None else axes
-    Z = np.tile(B.T, (len(character.bones), 1, 1)) if own is None else own
+    Z = zero(character, B) if zero else np.tile(B.T, (len(character.bones), 1, 1))
     bones = [*roots, *character.bones]
     parents = [*range(-1, len(roots) - 1), *(int(p) + len(roots) for p in character.parents)]
     frames = len(motion.joints)
@@ -151,7 +152,7 @@ def recorded(path: Path, every: int) -> tuple[Bones, Animation]:
     return Bones(tuple(map(bone, kept)), np.array(parents), rest), moved
 
 
-# -- zero poses: `own` of `write_bvh`
+# -- zero poses: `zero` of `write_bvh`
 
 
 def turned(character: Character, axes: np.ndarray, turns: dict[str, np.ndarray]) -> np.ndarray:
@@ -255,50 +256,28 @@ NAMES = {
 }
 
 
-@dataclass(frozen=True)
-class Convention:
-    """How a tool writes; `zero` gives `own` of `write_bvh` for a character."""
-
-    names: str = "mixamo"
-    axes: np.ndarray = field(default_factory=lambda: Y_UP)
-    scale: float = 100.0
-    order: str = "ZXY"
-    zero: Callable[[Character, np.ndarray], np.ndarray] = lambda c, a: turned(c, a, {})
-    everywhere: bool = False
-    roots: tuple[str, ...] = ()
-    ends: bool = True
-
-    def write(self, path: Path, character: Character, motion: Animation, step: float) -> Path:
-        """The motion as a file."""
-        return write_bvh(
-            path,
-            character,
-            motion,
-            step,
-            name=NAMES[self.names],
-            axes=self.axes,
-            scale=self.scale,
-            order=self.order,
-            own=self.zero(character, self.axes),
-            everywhere=self.everywhere,
-            roots=self.roots,
-            ends=self.ends,
-        )
+def convention(names: str = "mixamo", **options: Any) -> dict[str, Any]:
+    """How a tool writes: options of `write_bvh`; centimetres and y up if not given."""
+    return {"name": NAMES[names], "axes": Y_UP, "scale": 100.0} | options
 
 
 CONVENTIONS = {
-    "t_pose": Convention(),
-    "a_pose_inches": Convention("cmu", scale=39.37, zero=lambda c, a: lowered(c, a, 45)),
-    "n_pose_metres": Convention("unreal", np.eye(3), 1.0, "XYZ", lambda c, a: lowered(c, a, 85)),
-    "bones_along_x": Convention(
-        "bandai_namco", Y_UP, 100.0, "ZXY", lambda c, a: along(c, 0), True, ("joint_Root",)
+    "t_pose": convention(),
+    "a_pose_inches": convention("cmu", scale=39.37, zero=lambda c, a: lowered(c, a, 45)),
+    "n_pose_metres": convention(
+        "unreal", axes=np.eye(3), scale=1.0, order="XYZ", zero=lambda c, a: lowered(c, a, 85)
     ),
-    "bones_along_y": Convention("blender", np.eye(3), 1.0, "YZX", lambda c, a: along(c, 1)),
-    "joint_orients": Convention("rokoko", order="XZY", zero=lambda c, a: random(c)),
-    "x_forward": Convention("vrm", X_FORWARD, 1.0, "YXZ", everywhere=True),
-    "turned_by_the_root": Convention(
+    "bones_along_x": convention(
+        "bandai_namco", zero=lambda c, a: along(c, 0), everywhere=True, roots=("joint_Root",)
+    ),
+    "bones_along_y": convention(
+        "blender", axes=np.eye(3), scale=1.0, order="YZX", zero=lambda c, a: along(c, 1)
+    ),
+    "joint_orients": convention("rokoko", order="XZY", zero=lambda c, a: random(c)),
+    "x_forward": convention("vrm", axes=X_FORWARD, scale=1.0, order="YXZ", everywhere=True),
+    "turned_by_the_root": convention(
         "xsens", order="ZYX", zero=lambda c, a: turned(c, np.eye(3), {})
     ),
-    "seated": Convention("prefixed", zero=seated, everywhere=True),
-    "extra_roots_and_ends": Convention("unreal", roots=("World", "Armature"), ends=False),
+    "seated": convention("prefixed", zero=seated, everywhere=True),
+    "extra_roots_and_ends": convention("unreal", roots=("World", "Armature"), ends=False),
 }

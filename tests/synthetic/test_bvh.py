@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conventions import write_bvh
+from conventions import Y_UP, write_bvh
 from mannequin import mannequin
 
 from gsgan.motion.character import Animation
@@ -16,7 +16,6 @@ from gsgan.synthetic.recorded_motion import RecordedMotion
 from gsgan.utils.errors import DataError
 
 STEP = 1 / 30
-Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 LIMB_NAMES = {
     "UpLeg": "UpLeg LThigh upperleg thigh hip",
     "Leg": "LoLeg LShin lowerleg calf knee",
