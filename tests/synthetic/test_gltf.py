@@ -8,6 +8,7 @@ import numpy as np
 import pygltflib
 import pytest
 from PIL import Image
+from scipy.spatial import cKDTree
 from tiny_glb import BONES, TinyGlb
 
 from gsgan.body.free import free_body
@@ -28,6 +29,13 @@ VRM = {
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory):
     return read_character(TinyGlb().write(tmp_path_factory.mktemp("glb") / "tiny.glb"))
+
+
+@pytest.fixture(scope="module")
+def original():
+    """The file that the avatar "polo" was baked from."""
+    source = VALID / "White_M_1_Casual.glb"
+    return source if source.is_file() else pytest.skip(f"no original avatar at {source}")
 
 
 @pytest.fixture(scope="module", params=AVATARS)
@@ -199,9 +207,7 @@ def a_nan(glb: TinyGlb) -> None:
 LEFT_HAND = list(BONES).index("LeftHand")
 BAD = {
     "no skin": no_skin,
-    "do not include LeftHand": lambda glb: setattr(
-        glb.doc.nodes[list(BONES).index("LeftHand")], "name", "Paw"
-    ),
+    "do not include LeftHand": lambda glb: setattr(glb.doc.nodes[LEFT_HAND], "name", "Paw"),
     "no triangles": lambda glb: setattr(glb.doc.meshes[0].primitives[0], "mode", 1),
     "separate file": lambda glb: glb.doc.images.__setitem__(0, pygltflib.Image(uri="skin.png")),
     "draco": lambda glb: glb.doc.extensionsRequired.append("KHR_draco_mesh_compression"),
@@ -279,31 +285,23 @@ def test_face_landmarks_of_avatars_lie_on_the_face(avatar):
     assert landmark(avatar, "nose")[1] < ring[:, 1].min()
 
 
-def test_avatars_are_their_originals():
+def test_avatars_are_their_originals(original):
     """The bake moved no vertex by more than its quantisation, and kept landmarks and labels."""
     pytest.importorskip("meshoptimizer")
-    source = VALID / "White_M_1_Casual.glb"
-    if not source.is_file():
-        pytest.skip(f"no original avatar at {source}")
-    original, baked = read_character(source), read_character(AVATARS["polo"])
-    from scipy.spatial import cKDTree
-
-    distance, _ = cKDTree(original.vertices).query(baked.vertices)
+    both = whole, baked = read_character(original), read_character(AVATARS["polo"])
+    distance, _ = cKDTree(whole.vertices).query(baked.vertices)
     assert distance.max() < 5e-5
-    before, after = (c.landmarks(c.vertices, c.joints) for c in (original, baked))
+    before, after = (c.landmarks(c.vertices, c.joints) for c in both)
     assert np.linalg.norm(before - after, axis=1).max() < 0.003
     body = [3, 4, 5, 6, 7, 8, 11, 12]
-    counts = [np.bincount(c.labels, minlength=13)[body] for c in (original, baked)]
+    counts = [np.bincount(c.labels, minlength=13)[body] for c in both]
     np.testing.assert_allclose(*counts, rtol=0.02)
 
 
-def test_compressed_files_without_the_decoder_name_the_extra(monkeypatch):
-    source = VALID / "White_M_1_Casual.glb"
-    if not source.is_file():
-        pytest.skip(f"no original avatar at {source}")
+def test_compressed_files_without_the_decoder_name_the_extra(original, monkeypatch):
     monkeypatch.setitem(sys.modules, "meshoptimizer", None)
     with pytest.raises(DataError, match=re.escape("pip install 'gsgan[gltf]'")):
-        read_character(source)
+        read_character(original)
 
 
 def test_normal_maps_of_avatars_have_y_up(avatar):
