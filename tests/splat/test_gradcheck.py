@@ -4,14 +4,13 @@ from dataclasses import replace
 
 import pytest
 import torch
-from splat_scenes import BACKENDS, camera, cloud, needs_native, turned, with_covariances
+from splat_scenes import camera, cloud, every_backend, needs_native, turned, with_covariances
 
 from gsgan.splat import ACCURACY, native_project, project, rasterise, sh_to_colour
 
 EXACT = ACCURACY["exact"]
 DRAWN = ("means", "factors", "opacities", "depths")
 
-every_backend = pytest.mark.parametrize("backend", BACKENDS)
 every_shape = pytest.mark.parametrize("shape", ["quats", "covariances"])
 
 

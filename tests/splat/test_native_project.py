@@ -7,6 +7,7 @@ import pytest
 import torch
 from splat_scenes import camera, cloud, join, leaves, one, turned, with_covariances
 
+from gsgan.body import compiled
 from gsgan.scene import Camera, Gaussians
 from gsgan.splat import ACCURACY, Accuracy, build, native, native_project, project
 from gsgan.splat.project import Projected
@@ -91,10 +92,10 @@ def test_no_gaussians():
     assert not cam.K.grad.any()
 
 
-@pytest.mark.parametrize("module", [native, native_project])
-def test_the_job_has_the_layout_that_the_library_expects(module):
-    library, _ = build.library()
-    name = "gsgan_job_size" if module is native else "gsgan_project_job_size"
-    size = getattr(library, name)
+@pytest.mark.parametrize(
+    ("module", "name"), [(native, ""), (native_project, "project_"), (compiled, "solve_")]
+)
+def test_the_job_has_the_layout_that_the_library_expects(module, name):
+    size = getattr(build.library()[0], f"gsgan_{name}job_size")
     size.restype = ctypes.c_int64
     assert size() == ctypes.sizeof(module._Job)
