@@ -19,4 +19,4 @@ def poses():
     from gsgan.synthetic.posing import Choreography
 
     motion = Choreography(free_character(), seed=11)
-    return free_pose(motion.at(np.arange(0.4, motion.duration, 1.0)))
+    return free_pose(motion.at(np.arange(0.4, motion.duration, 0.5)))

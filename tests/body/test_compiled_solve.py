@@ -1,6 +1,5 @@
 """The compiled solve against the one by tensor operations, which defines it."""
 
-import ctypes
 import math
 import os
 from pathlib import Path
@@ -17,12 +16,11 @@ from gsgan.body.skinned import MarkedBody
 from gsgan.body.smpl import read_smpl
 from gsgan.body.solve import Solver
 from gsgan.scene import BodyPose
-from gsgan.splat import build, native
+from gsgan.splat import native
 from gsgan.synthetic.free_subject import free_character, free_pose
 from gsgan.synthetic.recorded_motion import RecordedMotion
 
 pytestmark = pytest.mark.skipif(not native.available(), reason=native.why_not())
-torch.set_num_threads(1)
 CMU = Path(
     os.environ.get("GSGAN_CMU", Path(__file__).parents[3] / "shared" / "data" / "motion" / "cmu")
 )
@@ -142,9 +140,3 @@ def test_poses_with_gradients_are_solved_by_tensor_operations(solver, poses, mon
     assert solver.solve(p.requires_grad_(), seen).theta.requires_grad
     with torch.no_grad(), pytest.raises(TypeError):
         solver.solve(p, seen)
-
-
-def test_the_job_has_the_layout_that_the_library_expects():
-    size = build.library()[0].gsgan_solve_job_size
-    size.restype = ctypes.c_int64
-    assert size() == ctypes.sizeof(compiled._Job)

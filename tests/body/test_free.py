@@ -9,8 +9,6 @@ from gsgan.body.skinned import carry
 from gsgan.scene import BodyPose
 from gsgan.utils.errors import DataError
 
-torch.set_num_threads(1)
-
 
 def poses(n: int, scale: float = 0.5) -> BodyPose:
     generator = torch.Generator().manual_seed(1)

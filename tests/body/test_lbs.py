@@ -20,7 +20,6 @@ from gsgan.body.lbs import (
 from gsgan.body.skinned import SkinnedBody, stretch_terms
 from gsgan.scene import BodyPose
 
-torch.set_num_threads(1)
 D = torch.float64
 
 

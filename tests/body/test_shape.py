@@ -23,7 +23,6 @@ from gsgan.fit.shape import fit_shape
 from gsgan.scene import BodyPose
 from gsgan.utils.errors import DataError
 
-torch.set_num_threads(1)
 K = 10
 
 

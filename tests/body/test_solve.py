@@ -14,25 +14,14 @@ from writers.smpl import write_smpl
 
 from gsgan.body import free_body, solve
 from gsgan.body.rig import LEAST, TRUNK, build_rig, trunk_covariance
-from gsgan.body.shape import BodyShape, free_space, shaped_body
 from gsgan.body.smpl import read_smpl
 from gsgan.body.solve import Solver
 from gsgan.scene import BodyPose
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.skeleton.sides import refuse_swapped
-from gsgan.synthetic.free_subject import free_character, free_pose
-from gsgan.synthetic.posing import Choreography
 
-torch.set_num_threads(1)
 SEEN = torch.ones(1, 33)
 shown = partial(solved.shown, joints=33)
-
-
-@pytest.fixture(scope="module")
-def poses() -> BodyPose:
-    """Every half second of a motion that no setting was tuned on."""
-    motion = Choreography(free_character(), seed=11)
-    return free_pose(motion.at(np.arange(0.4, motion.duration, 0.5)))
 
 
 def surface_error(got: BodyPose, truth: BodyPose) -> Tensor:
@@ -151,15 +140,6 @@ def test_gradients_are_those_of_the_solution(monkeypatch, poses):
             ahead, back = (fine.solve(p + s * step, seen).theta for s in (1, -1))
         found = ((ahead - back) * goal).sum() / 2e-3
         assert slope[0, joint, axis] == pytest.approx(float(found), rel=0.1, abs=0.1)
-
-
-def test_gradients_reach_the_shape(poses):
-    K = free_space().coefficients
-    shape = BodyShape(torch.zeros(K, requires_grad=True), torch.ones(8, requires_grad=True))
-    pose = Solver(shaped_body(shape)).solve(*shown(poses[:1]))
-    pose.theta.square().sum().backward()
-    assert shape.coefficients.grad.abs().sum() > 0
-    assert shape.stretch.grad.abs().sum() > 0
 
 
 # -- damage
