@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from tiny_characters import TINY
 
 from gsgan.body import open_body
 from gsgan.data.datamodule import GsganData
@@ -13,17 +14,8 @@ from gsgan.synthetic.scene_setup import Scene, SceneSettings
 from gsgan.synthetic.trace import Tracer
 
 SIZE = 128
-SCENE = {
-    "avatar": "free_body",
-    "secondary": False,
-    "motion": "signs",
-    "size": SIZE,
-    "train_cameras": 2,
-    "test_cameras": 0,
-    "frames": 24,
-    "test_frames": 0,
-    "rays_per_pixel": 1,
-}
+SCENE = TINY | {"motion": "signs", "size": SIZE, "frames": 24, "test_frames": 0}
+SCENE |= {"train_cameras": 2, "test_cameras": 0}
 
 
 def overlaps(scene: Scene, camera: str, frame: int) -> torch.Tensor:

@@ -1,7 +1,6 @@
 """A small rig in a T pose for motion tests, points inside meshes."""
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
@@ -83,13 +82,6 @@ def mannequin(without: Callable[[str], bool] = lambda bone: False) -> Character:
         anchor_joint=none,
         anchor_vertex=none,
     )
-
-
-def reposed(character: Character, motion: Animation, frame: int) -> Character:
-    """The character with one pose of a motion as its rest pose."""
-    R, joints = motion.rotations[frame], motion.joints[frame]
-    vertices, normals = character.skinned(R, joints)
-    return replace(character, vertices=vertices, normals=normals, joints=joints)
 
 
 def inside(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

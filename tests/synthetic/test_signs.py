@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from mannequin import assert_limits, inside, mannequin
 from scipy.spatial import cKDTree
+from tiny_characters import TINY
 
 from gsgan.motion.rig import SIDES
 from gsgan.motion.rotations import axis_angle
@@ -24,15 +25,6 @@ TOGETHER = {
     "cancel": (0.55, 0.06),
     "hug": (1.1, 0.005),
     "peek": (0.7, 0.005),
-}
-TINY = {
-    "avatar": "free_body",
-    "secondary": False,
-    "size": 48,
-    "frames": 12,
-    "test_frames": 3,
-    "rays_per_pixel": 1,
-    "motion": "signs",
 }
 
 
@@ -110,7 +102,9 @@ def test_hands_touch_and_do_not_pass_through_each_other(polo):
 
 
 def test_a_scene_of_signs_is_split_by_sign_before_frontal_cameras():
-    scene = Scene(SceneSettings(**TINY))
+    given = {"motion": "signs", "size": 48, "frames": 12, "test_frames": 3}
+    given |= {"train_cameras": 6, "test_cameras": 2}
+    scene = Scene(SceneSettings(**TINY | given))
     names = np.array(scene.motion.passages)
     assert set(names[scene.test_frames]) <= set(HELD_OUT)
     assert not set(names[scene.train_frames]) & set(HELD_OUT)

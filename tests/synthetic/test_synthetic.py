@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from tiny_characters import TINY
 
 from gsgan.body.free import free_body
 from gsgan.data.datamodule import GsganData
@@ -21,18 +22,7 @@ from gsgan.synthetic.trace import PosedCharacter
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import cache_root
 
-torch.set_num_threads(1)
 EACH_AVATAR = ("polo", pytest.param("blouse", marks=pytest.mark.slow))
-TINY = {
-    "avatar": "free_body",  # without textures: made in a second
-    "secondary": False,
-    "size": 32,
-    "train_cameras": 1,
-    "test_cameras": 1,
-    "frames": 3,
-    "test_frames": 1,
-    "rays_per_pixel": 1,
-}
 
 
 def tiny(cache, **parameters):
@@ -270,12 +260,6 @@ def test_key_depends_on_every_parameter():
     assert base == dataset_key(SceneSettings())
 
 
-@pytest.mark.parametrize("parameters", [{"avatar": "mine.glb"}, {"motion": "mine.bvh"}])
-def test_a_missing_file_is_named(parameters, tmp_path):
-    with pytest.raises(DataError, match=r"data.source.*mine.* does not exist"):
-        tiny(tmp_path, **parameters)
-
-
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
@@ -296,9 +280,12 @@ def test_a_missing_file_is_named(parameters, tmp_path):
             "motion must be choreography, signs, far or the path of a .bvh or .amc",
         ),
         ({"secondary": "some"}, "secondary must be one of True, False"),
+        ({"avatar": "mine.glb"}, r"data.source.*mine.* does not exist"),
+        ({"motion": "mine.bvh"}, r"data.source.*mine.* does not exist"),
     ],
 )
 def test_parameters_out_of_range_are_refused(parameters, message, tmp_path):
-    with pytest.raises(ConfigError, match=message):
+    error = DataError if "not exist" in message else ConfigError
+    with pytest.raises(error, match=message):
         ensure_scene(cache=tmp_path, **parameters)
     assert not list(tmp_path.iterdir())

@@ -5,6 +5,7 @@ import json
 import cv2
 import numpy as np
 import pytest
+import tiny_characters
 
 from gsgan.data.crop import distort, undistort
 from gsgan.data.datamodule import GsganData
@@ -14,16 +15,7 @@ from gsgan.utils.errors import ConfigError
 
 LENS = (-0.28, 0.09, 0.001, -0.0008, -0.01)
 # Three cameras: the tints of two would be each other's inverse, as their mean is none.
-TINY = {
-    "avatar": "free_body",
-    "secondary": False,
-    "size": 48,
-    "train_cameras": 3,
-    "test_cameras": 1,
-    "frames": 3,
-    "test_frames": 1,
-    "rays_per_pixel": 2,
-}
+TINY = tiny_characters.TINY | {"size": 48, "train_cameras": 3, "rays_per_pixel": 2}
 
 
 @pytest.fixture(scope="module")

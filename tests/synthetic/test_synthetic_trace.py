@@ -238,19 +238,15 @@ def test_masks_and_labels_agree_with_a_z_buffer(view):
     assert np.array_equal(labels[pure], blocks[pure][:, 0])
 
 
-def test_every_touched_pixel_is_found(monkeypatch):
-    moment, view = posed(lumpy(3)), from_front(48, 3.0, 40.0)
-    found = moment.render(view, 9)
-    monkeypatch.setattr(PosedCharacter, "_touched", lambda self, v: np.ones(v.size, bool))
-    for some, all_of_it in zip(found, moment.render(view, 9), strict=True):
-        assert np.array_equal(some, all_of_it)
-
-
-def test_rendering_is_deterministic_and_the_same_in_any_blocks(monkeypatch):
-    view = from_front(48)
-    whole = posed(lumpy()).render(view, 5)
-    monkeypatch.setattr(trace, "BLOCK", 100)
-    for a, b in zip(whole, posed(lumpy()).render(view, 5), strict=True):
+@pytest.mark.parametrize(
+    ("where", "name", "value"),
+    [(PosedCharacter, "_touched", lambda self, v: np.ones(v.size, bool)), (trace, "BLOCK", 100)],
+)
+def test_every_touched_pixel_is_found_and_the_same_in_any_blocks(monkeypatch, where, name, value):
+    view = from_front(48, 3.0, 40.0)
+    found = posed(lumpy(3)).render(view, 9)
+    monkeypatch.setattr(where, name, value)
+    for a, b in zip(found, posed(lumpy(3)).render(view, 9), strict=True):
         assert np.array_equal(a, b)
 
 

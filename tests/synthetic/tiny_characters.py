@@ -1,4 +1,4 @@
-"""Small characters of a few faces, and cameras that look at them."""
+"""Small characters of a few faces, cameras that look at them, the settings of a small scene."""
 
 import numpy as np
 
@@ -6,6 +6,16 @@ from gsgan.motion.character import Character, Surface
 from gsgan.synthetic.camera import SceneCamera
 
 LABELS = ("background", "hair", "upper_clothes", "face_neck")
+TINY = {
+    "avatar": "free_body",  # without textures: made in a second
+    "secondary": False,
+    "size": 32,
+    "train_cameras": 1,
+    "test_cameras": 1,
+    "frames": 3,
+    "test_frames": 1,
+    "rays_per_pixel": 1,
+}
 
 
 def plain(rgb=(128, 128, 128), **surface):
