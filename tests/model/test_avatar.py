@@ -4,8 +4,12 @@ import dataclasses
 
 import pytest
 import torch
+from make import write_tiny_capture
+from test_freeze import left_of_zero
+from writers.smpl import write_smpl
 
 from gsgan.model.assemble import build_avatar, naming_group
+from gsgan.scene import cat
 from gsgan.utils.errors import ConfigError
 
 
@@ -41,10 +45,7 @@ def test_the_window_changes_nothing_about_step_one(build):
 
 def test_gradients_reach_every_trained_part(build):
     _, avatar, frame = build("size.rgb_skip=false")
-    with torch.no_grad():  # leave the zero starts, behind which gradients cannot pass
-        for parameter in avatar.parameters():
-            parameter.add_(0.02 * torch.randn_like(parameter))
-    avatar(*frame.inputs).image.square().sum().backward()
+    left_of_zero(avatar).train()(*frame.inputs).image.square().sum().backward()
     for part in ("deformation", "pose_encoder", "generator"):
         grads = [p.grad for p in getattr(avatar, part).parameters()]
         assert any(g is not None and float(g.abs().max()) > 0 for g in grads), part
@@ -83,8 +84,6 @@ def test_one_camera_gives_psi_no_normals(build):
 
 
 def test_data_without_body_pose_builds_no_segmentation(build, tmp_path):
-    from make import write_tiny_capture
-
     root = write_tiny_capture(tmp_path / "bare", cameras=2, frames=4, size=(48, 48))
     _, avatar, frame = build(f"data.root={root}")
     assert avatar.segmentation is None
@@ -93,8 +92,6 @@ def test_data_without_body_pose_builds_no_segmentation(build, tmp_path):
 
 
 def test_segmentation_of_a_model_file(build, tiny, tmp_path):
-    from writers.smpl import write_smpl
-
     write_smpl(tmp_path / "smpl.pkl", vertices=500)
     data, _, frame = build()
     bare = {"body": "smpl", "label_names": (), "n_labels": 0, "has_labels": False}
@@ -112,13 +109,10 @@ def test_segmentation_of_a_model_file(build, tiny, tmp_path):
 
 
 def test_batches_are_independent(build):
-    from gsgan.scene import cat
-
     data, avatar, frame = build()
     other = data.dataset("train")[5]
+    left_of_zero(avatar)
     with torch.no_grad():
-        for parameter in avatar.parameters():
-            parameter.add_(0.02 * torch.randn_like(parameter))
         avatar.window_margin = None
         both = avatar(*cat([frame, other]).inputs).image
         torch.testing.assert_close(both[1:], avatar(*other.inputs).image, atol=2e-4, rtol=1e-4)

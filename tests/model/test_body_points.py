@@ -4,14 +4,18 @@ from dataclasses import replace
 
 import pytest
 import torch
+from hydra.errors import ConfigCompositionException
+from tiny_characters import TINY
 
 from gsgan.body import open_body
 from gsgan.body.skinned import vertex_normals
+from gsgan.data.datamodule import GsganData
 from gsgan.data.surface_colours import body_inside
 from gsgan.model.body_points import BodyPoints, moved_normals
 from gsgan.model.runs import load_avatar
 from gsgan.model.stored import CHECKPOINT
 from gsgan.scene import BodyPose
+from gsgan.synthetic.scenes import ensure_scene
 from gsgan.train.run import build_training
 from gsgan.utils.errors import DataError
 
@@ -172,7 +176,6 @@ def stored(module, folder):
     module.on_save_checkpoint(checkpoint)
     (folder / CHECKPOINT).parent.mkdir()
     torch.save(checkpoint, folder / CHECKPOINT)
-    return checkpoint
 
 
 @pytest.mark.parametrize(
@@ -199,7 +202,9 @@ def test_a_trained_avatar_without_its_body_is_refused_in_one_sentence(
 
 
 def test_a_fitting_body_lies_in_its_mask_and_a_shifted_one_leaves_it(body):
-    frame = synthetic_frame()
+    given = TINY | {"size": 64, "train_cameras": 2, "test_cameras": 0, "frames": 2}
+    root = ensure_scene(**given | {"test_frames": 0}, workers=1, progress=False)
+    frame = GsganData(root=root, size=64).dataset("train")[0]
     exact = body_inside(frame, body)
     pose = frame.body
     away = replace(frame, body=replace(pose, transl=pose.transl + torch.tensor([0.3, 0.3, 0])))
@@ -213,18 +218,6 @@ def test_a_fitting_body_lies_in_its_mask_and_a_shifted_one_leaves_it(body):
     assert body_inside(behind, body) == exact  # whatever the joints say
 
 
-def synthetic_frame():
-    from gsgan.data.datamodule import GsganData
-    from gsgan.synthetic.scenes import ensure_scene
-
-    root = ensure_scene(
-        avatar="free_body", size=64, train_cameras=2, test_cameras=0, frames=2, test_frames=0,
-        rays_per_pixel=1, workers=1, progress=False,
-    )  # fmt: skip
-    data = GsganData(root=root, size=64)
-    return data.dataset("train")[0]
-
-
 def test_low_pass_is_the_models_for_F_and_S_whatever_the_accuracy(build):
     _, avatar, _ = build("accuracy=draft")
     assert avatar.accuracy.low_pass == avatar.segmentation.accuracy.low_pass == 0.0833
@@ -236,8 +229,6 @@ def test_low_pass_is_the_models_for_F_and_S_whatever_the_accuracy(build):
 @pytest.mark.parametrize("key", ["low_pass", "supersample"])
 def test_what_is_the_models_is_not_the_accuracys_too(tiny, key):
     """A word that would change nothing is an error."""
-    from hydra.errors import ConfigCompositionException
-
     tiny(f"model.{key}=1")
     with pytest.raises(ConfigCompositionException, match=rf"accuracy\.{key}"):
         tiny(f"accuracy.{key}=1")

@@ -1,10 +1,10 @@
 """A bound that a parameter can come back from."""
 
 import torch
+from test_harmonic import points_of
 
 from gsgan.model.colour import ColourCorrection
 from gsgan.model.deformation import Deformation, bounded
-from gsgan.skeleton import Points
 
 X = torch.tensor([-3.0, -1.0, 0.0, 1.0, 3.0])
 
@@ -28,15 +28,7 @@ def test_stability_an_opacity_and_a_scale_beyond_their_bounds_come_back():
     """Of Ψ: raw residuals far outside, a loss that wants them inside."""
     torch.manual_seed(0)
     net = Deformation(torch.zeros(4, 3), 1.7, free_table=True, embedding=0, width=8, layers=2)
-    points = Points(
-        means=torch.zeros(1, 4, 3),
-        rotations=torch.eye(3).expand(1, 1, 3, 3),
-        origins=torch.zeros(1, 1, 3),
-        scales=torch.full((1, 4), 0.02),
-        valid=torch.ones(1, 4, dtype=torch.bool),
-        part_id=torch.zeros(4, dtype=torch.long),
-        normals=torch.zeros(1, 4, 3),
-    )
+    points = points_of(torch.zeros(4, 3), torch.eye(3))
     sizes = net.parts
     at = sum(sizes[:3])
     with torch.no_grad():

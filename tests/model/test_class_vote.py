@@ -9,13 +9,17 @@ import numpy as np
 import pytest
 import torch
 from frames import frame_of
+from test_body_points import stored
 
 from gsgan.body import SkinnedBody, free_body, open_body
 from gsgan.body.shape import BodyShape
 from gsgan.body.smpl_names import CIHP
+from gsgan.model.assemble import build_avatar, build_data
 from gsgan.model.body_points import neighbour_distance
 from gsgan.model.class_vote import class_vote, seen
+from gsgan.model.runs import load_avatar
 from gsgan.scene import BodyPose, Camera, Frame
+from gsgan.train.run import build_training
 from gsgan.utils.errors import DataError
 
 FOCAL, SIZE = 40.0, 32
@@ -221,24 +225,15 @@ def test_a_fitted_body_gets_the_persons_clothes(capture, tmp_path, build, few):
 def test_votes_are_kept_in_the_checkpoint_and_not_held_again(
     foreign, tiny, tmp_path, monkeypatch, few
 ):
-    from gsgan.model.runs import load_avatar
-    from gsgan.model.stored import CHECKPOINT
-    from gsgan.train.run import build_training
-
     config = tiny(f"data.root={foreign}")
     data, module = build_training(config)
     avatar = module.avatar
     assert "class vote over 2 images" in avatar.segmentation_why
     assert avatar.segmentation.map.names[0] == "cloth 0"
     assert avatar.segmentation.classes > 2
-    path = tmp_path / "run" / CHECKPOINT
-    path.parent.mkdir(parents=True)
-    checkpoint = {"state_dict": module.state_dict()}
-    module.on_save_checkpoint(checkpoint)
-    torch.save(checkpoint, path)
-
+    stored(module, tmp_path)
     monkeypatch.setattr("gsgan.model.class_vote.class_vote", no_vote)
-    loaded, _ = load_avatar(tmp_path / "run", config, data)
+    loaded, _ = load_avatar(tmp_path, config, data)
     frame = data.dataset("train")[0]
     with torch.no_grad():
         S, again = (a.segmentation(frame.body, frame.camera) for a in (avatar, loaded))
@@ -253,8 +248,6 @@ def test_votes_are_kept_in_the_checkpoint_and_not_held_again(
     ],
 )
 def test_votes_of_another_body_and_no_votes_are_refused(foreign, tiny, votes, words):
-    from gsgan.model.assemble import build_avatar, build_data
-
     config = tiny(f"data.root={foreign}")
     with pytest.raises(DataError, match=words):
         build_avatar(config, build_data(config).info, vertex_labels=votes)

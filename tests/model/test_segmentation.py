@@ -145,18 +145,12 @@ def test_stability_silhouette_loss_where_alpha_is_0_or_1(value, truth):
 # --- classes -------------------------------------------------------------------------------------
 
 
-def crossed(**options):
-    """(S, all-parts S, names of all parts) of the rest pose seen from the front."""
-    body = free_body()
-    all_parts, some = Segmentation(body, points=1500), Segmentation(body, points=1500, **options)
-    with torch.no_grad():
-        return some(rest_pose(), facing_camera()), all_parts(rest_pose(), facing_camera()), some
-
-
 def test_hands_only_are_two_classes_and_all_else_background_that_hides():
-    S, whole, segmentation = crossed(mode="hands")
     names = free_body().label_names
-    assert segmentation.map.names == ("background", "left_hand", "right_hand")
+    some, all_parts = (Segmentation(free_body(), points=1500, mode=m) for m in ("hands", "body"))
+    with torch.no_grad():
+        S, whole = (x(rest_pose(), facing_camera()) for x in (some, all_parts))
+    assert some.map.names == ("background", "left_hand", "right_hand")
     hands = [names.index("left_hand"), names.index("right_hand")]
     torch.testing.assert_close(S[:, 1:], whole[:, hands], atol=1e-5, rtol=0)  # as hidden as before
     torch.testing.assert_close(S.sum(1), torch.ones(1, SIZE, SIZE), atol=1e-4, rtol=0)
@@ -226,20 +220,9 @@ def test_hands_mode_from_the_config_paints(build):
 # --- labels that come and go
 
 
-def capture_without_labels(capture, folder, frames=None):
-    """The capture without label images, of all frames or of some."""
-    root = shutil.copytree(capture, folder)
-    if frames is None:
-        shutil.rmtree(root / "labels")
-    else:
-        for path in (root / "labels").rglob("*.png"):
-            if int(path.stem) in frames:
-                path.unlink()
-    return root
-
-
 def test_a_trained_S_is_loaded_whether_or_not_labels_are_at_hand(run, capture, tmp_path):
-    bare = capture_without_labels(capture, tmp_path / "bare")
+    bare = shutil.copytree(capture, tmp_path / "bare")
+    shutil.rmtree(bare / "labels")
     config = load_config(run, DataPaths(str(bare)))
     data = build_data(config)
     assert not data.info.has_labels
@@ -248,7 +231,10 @@ def test_a_trained_S_is_loaded_whether_or_not_labels_are_at_hand(run, capture, t
 
 
 def test_labels_of_held_out_images_alone_teach_nothing(build, capture, tmp_path):
-    some = capture_without_labels(capture, tmp_path / "some", frames=range(4))  # those that train
+    some = shutil.copytree(capture, tmp_path / "some")
+    for path in (some / "labels").rglob("*.png"):
+        if int(path.stem) < 4:  # those that train
+            path.unlink()
     data, avatar, _ = build(f"data.root={some}")
     assert data.layout.labels
     assert not data.info.has_labels
