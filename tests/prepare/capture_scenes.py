@@ -1,5 +1,6 @@
 """Rigs, motions and files with known ground truth for the tests of `gsgan.prepare`."""
 
+import io
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,9 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 from make import distorted_pixels, ring_camera, skeletons, write_tiny_capture
+from rich.console import Console
 
 from gsgan.data.cameras import CameraEntry, make_camera
 from gsgan.prepare.camera_array import CameraArray
+from gsgan.prepare.options import Options
+from gsgan.prepare.solve import SolveSettings
 
 ANGLES = (0.0, 1.3, 2.7, 4.2)
 LENS = (-0.05, 0.14, 0.0006, -0.0007, 0.01)
@@ -27,12 +31,15 @@ def ring(angles: Sequence[float] = ANGLES, size=(1080, 1920), dist=(0,) * 5) -> 
 
 
 def seen(
-    cameras: Sequence[CameraEntry], frames: int = 12, noise: float = 0.0, seed: int = 0
+    cameras: Sequence[CameraEntry],
+    frames: int = 12,
+    noise: float = 0.0,
+    p: np.ndarray | None = None,
 ) -> tuple[CameraArray, np.ndarray, np.ndarray, np.ndarray]:
-    """A rig, the true ``p [F, 33, 3]``, what it sees ``uv [C, F, 33, 2]``, and confidence 1."""
-    rig, p = CameraArray.of(cameras), skeletons(frames)
-    uv = rig.project(p.reshape(-1, 3))[0].reshape(len(rig), frames, 33, 2)
-    uv = uv + noise * np.random.default_rng(seed).standard_normal(uv.shape)
+    """A rig, the true ``p [F, J, 3]``, what it sees ``uv [C, F, J, 2]``, and confidence 1."""
+    rig, p = CameraArray.of(cameras), skeletons(frames) if p is None else p
+    uv = rig.project(p.reshape(-1, 3))[0].reshape(len(rig), *p.shape[:2], 2)
+    uv = uv + noise * np.random.default_rng(0).standard_normal(uv.shape)
     return rig, p, uv, np.ones(uv.shape[:3])
 
 
@@ -84,6 +91,22 @@ def write_own(path: Path, cameras: Sequence[CameraEntry]) -> Path:
     }
     path.write_text(json.dumps(content))
     return path
+
+
+def options(project: Path, **more) -> Options:
+    """Quick settings; the stages themselves are tested in test_prepare_solve.py."""
+    given = {
+        "solve": SolveSettings(refinements=0),
+        "source": str(project),
+        "out": str(project.parent / "out"),
+        "landmarks": str(project / "pose"),
+        "masks": str(project / "masks"),
+    }
+    return Options(**(given | more))
+
+
+def quiet() -> Console:
+    return Console(file=io.StringIO())
 
 
 def write_project(

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from capture_scenes import ring
+from capture_scenes import ring, seen
 from make import skeletons
 
-from gsgan.data.joints import ALL, BODY, FACE, HAND_PAIRS, HANDS, LEFT, RIGHT
+from gsgan.data.joints import BODY, FACE, HAND_PAIRS, HANDS, LEFT, RIGHT
 from gsgan.prepare.camera_array import CameraArray
 from gsgan.prepare.cleanse import cleanse
 from gsgan.prepare.solve import Solution, SolveSettings, solve
@@ -34,14 +34,6 @@ def person(frames: int = FRAMES) -> np.ndarray:
     return np.concatenate([body, *hands, body[:, :1] + face], axis=1)
 
 
-def seen(noise: float = 1.0) -> tuple[CameraArray, np.ndarray, np.ndarray, np.ndarray]:
-    """A rig, the truth, its detections ``[C, F, 105, 2]`` and their confidence."""
-    rig, p = CameraArray.of(ring()), person()
-    uv = rig.project(p.reshape(-1, 3))[0].reshape(len(rig), FRAMES, ALL, 2)
-    uv = uv + noise * np.random.default_rng(0).standard_normal(uv.shape)
-    return rig, p, uv, np.ones(uv.shape[:3])
-
-
 def solved(rig: CameraArray, uv: np.ndarray, conf: np.ndarray) -> Solution:
     conf = np.where(np.isfinite(uv).all(-1), conf, 0.0)
     settings = SolveSettings(refinements=0)
@@ -58,7 +50,7 @@ def off(found: Solution, p: np.ndarray, part: slice) -> float:
 
 
 def test_hands_that_agree_are_left_alone():
-    rig, p, uv, conf = seen(noise=2.0)
+    rig, p, uv, conf = seen(ring(), noise=2.0, p=person())
     found = solved(rig, uv, conf)
     assert not found.swapped_hands.any()
     assert not found.left_out.any()
@@ -69,7 +61,7 @@ def test_hands_that_agree_are_left_alone():
 @pytest.mark.parametrize("cameras", [[1], [0, 3], [0, 1, 2, 3]])
 def test_swapped_hands_are_put_right(cameras):
     """In one camera, in half of them, and in all, where only the wrists show it."""
-    rig, p, uv, conf = seen()
+    rig, p, uv, conf = seen(ring(), noise=1.0, p=person())
     swapped = np.zeros(conf.shape[:2], bool)
     swapped[cameras, 2:5] = True
     found = solved(rig, swap(uv, swapped), conf)
@@ -79,7 +71,7 @@ def test_swapped_hands_are_put_right(cameras):
 
 
 def test_a_single_hand_in_the_wrong_place_is_moved():
-    rig, p, uv, conf = seen()
+    rig, p, uv, conf = seen(ring(), noise=1.0, p=person())
     uv[2, 3, RIGHT] = uv[2, 3, LEFT]
     uv[2, 3, LEFT] = np.nan
     found = solved(rig, uv, conf)
@@ -89,7 +81,7 @@ def test_a_single_hand_in_the_wrong_place_is_moved():
 
 
 def test_a_hand_detected_twice_and_a_strange_one_are_left_out():
-    rig, p, uv, conf = seen()
+    rig, p, uv, conf = seen(ring(), noise=1.0, p=person())
     uv[0, 4, RIGHT] = uv[0, 4, LEFT]
     uv[1, 6, LEFT] += 150
     found = solved(rig, uv, conf)
@@ -99,7 +91,7 @@ def test_a_hand_detected_twice_and_a_strange_one_are_left_out():
 
 
 def test_a_missing_hand_is_missing_and_never_zero():
-    rig, p, uv, conf = seen()
+    rig, p, uv, conf = seen(ring(), noise=1.0, p=person())
     uv[1:, 2:4, LEFT] = np.nan  # one camera is not enough
     uv[:, 5, RIGHT] = np.nan
     found = solved(rig, uv, conf)

@@ -1,6 +1,5 @@
 """A process killed (SIGKILL) at any stage: the next run makes the same dataset."""
 
-import io
 import os
 import signal
 import time
@@ -9,13 +8,10 @@ from pathlib import Path
 
 import cv2
 import pytest
-from capture_scenes import write_project
-from rich.console import Console
+from capture_scenes import options, quiet, write_project
 
 from gsgan.data.formats.capture import read_capture
-from gsgan.prepare.options import Options
 from gsgan.prepare.run import prepare
-from gsgan.prepare.solve import SolveSettings
 from gsgan.prepare.stages import each_camera
 
 LIMIT = 120  # seconds after which the child counts as hanging
@@ -25,20 +21,6 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork, no chi
 @pytest.fixture(scope="module")
 def project(tmp_path_factory):
     return write_project(tmp_path_factory.mktemp("killed") / "project", 3, 4, (64, 48))
-
-
-def options(project: Path, out: Path, **more) -> Options:
-    given = {
-        "landmarks": str(project / "pose"),
-        "masks": str(project / "masks"),
-        "workers": 1,
-        "solve": SolveSettings(refinements=0),
-    }
-    return Options(source=str(project), out=str(out), **(given | more))
-
-
-def quiet() -> Console:
-    return Console(file=io.StringIO())
 
 
 def killed(run: Callable[[], object], stop: Callable[[Path, int], bool]) -> bool:
@@ -90,13 +72,14 @@ STAGES: dict[str, Callable[[Path, int], bool]] = {
 @pytest.fixture(scope="module")
 def whole(project):
     """The images of an undisturbed run."""
-    return images(prepare(options(project, project.parent / "undisturbed"), quiet()))
+    given = options(project, out=str(project.parent / "undisturbed"), workers=1)
+    return images(prepare(given, quiet()))
 
 
 @pytest.mark.parametrize("stage", STAGES)
 def test_a_killed_process_leaves_nothing_incomplete_and_is_resumed(project, whole, tmp_path, stage):
     out = tmp_path / "out"
-    given = options(project, out)
+    given = options(project, out=str(out), workers=1)
     assert killed(lambda: prepare(given, quiet()), STAGES[stage])
     assert not out.exists()
     assert prepare(given, quiet()) == out
@@ -107,8 +90,8 @@ def test_a_killed_process_leaves_nothing_incomplete_and_is_resumed(project, whol
 
 def test_an_earlier_dataset_outlives_a_kill(project, whole, tmp_path):
     out = tmp_path / "out"
-    prepare(options(project, out, frames="0-2"), quiet())
-    again = options(project, out, overwrite=True)
+    prepare(options(project, out=str(out), workers=1, frames="0-2"), quiet())
+    again = options(project, out=str(out), workers=1, overwrite=True)
     assert killed(lambda: prepare(again, quiet()), STAGES["the numbers"])
     assert len(read_capture(out).frames) == 3  # the earlier one is still there
     assert killed(lambda: prepare(again, quiet()), lambda place, _: place == out)

@@ -2,12 +2,14 @@
 
 import io
 import json
+import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from capture_scenes import write_project
+from capture_scenes import options, quiet, write_project
+from hydra.utils import instantiate
 from make import edit_npz, skeletons
 from rich.console import Console
 
@@ -26,22 +28,6 @@ CAMERAS, FRAMES, SIZE = 3, 6, (96, 80)
 def project(tmp_path):
     """A project folder: videos, calibration, 2D landmarks and masks of a known person."""
     return write_project(tmp_path / "project", CAMERAS, FRAMES, SIZE)
-
-
-def options(project: Path, **more) -> Options:
-    """Quick settings; the stages themselves are tested in test_prepare_solve.py."""
-    given = {
-        "solve": SolveSettings(refinements=0),
-        "source": str(project),
-        "out": str(project.parent / "out"),
-        "landmarks": str(project / "pose"),
-        "masks": str(project / "masks"),
-    }
-    return Options(**(given | more))
-
-
-def quiet() -> Console:
-    return Console(file=io.StringIO())
 
 
 def test_videos_become_a_capture_that_training_reads(project):
@@ -199,18 +185,10 @@ def test_every_key_of_the_config_is_understood(project, compose, capsys):
     )
     command(config)
     assert "is ready" in capsys.readouterr().out
-    assert plain(Options(**_defaults(compose))) == plain(Options("a", "b"))
-
-
-def plain(given: Options) -> dict:
-    """The settings without the difference between tuples and lists."""
-    return json.loads(json.dumps(given.record()))
-
-
-def _defaults(compose) -> dict:
-    from hydra.utils import instantiate
-
-    return instantiate(compose("prepare", "source=a", "out=b"), _convert_="all")
+    defaults = instantiate(compose("prepare", "source=a", "out=b"), _convert_="all")
+    records = (given.record() for given in (Options(**defaults), Options("a", "b")))
+    ours, plain = (json.loads(json.dumps(x)) for x in records)  # as JSON: tuples are lists
+    assert ours == plain
 
 
 # ------------------------------------------------ the MediaPipe tool, without MediaPipe
@@ -232,15 +210,10 @@ shutil.copy(root / "pose" / (name + ".npz"), given.out)
 
 
 def with_stub(project: Path, monkeypatch, bad: str = "") -> Options:
-    import sys
-
     environment = project.parent / "environment"
-    (environment / "bin").mkdir(parents=True, exist_ok=True)
+    (environment / "bin").mkdir(parents=True)
     (environment / tool.READY).touch()
-    python = environment / "bin" / "python"
-    if not python.exists():
-        python.write_text(f'#!/bin/sh\nexec {sys.executable} "$@"\n')
-        python.chmod(0o755)
+    (environment / "bin" / "python").symlink_to(sys.executable)
     script = project.parent / f"stub{bad}.py"
     script.write_text(STUB.format(root=str(project), bad=bad))
     monkeypatch.setattr(tool, "SCRIPT", script)
