@@ -1,10 +1,8 @@
 """OpenCV's YAML: what OpenCV wrote is read as OpenCV reads it; what is damaged is one sentence."""
 
-from pathlib import Path
-
-import cv2
 import numpy as np
 import pytest
+from writers.easymocap import write_opencv
 
 from gsgan.data.calibration import MAX_YAML_BYTES, read_opencv_yaml
 from gsgan.utils.errors import DataError
@@ -14,22 +12,10 @@ MATRIX = "M: !!opencv-matrix\n   rows: 2\n   cols: 1\n   dt: d\n   data: [ 1., -
 
 
 def test_opencvs_files_are_read_as_opencv_reads_them(tmp_path):
-    path, names, rng = (
-        str(tmp_path / "rig.yml"),
-        ["01", "cam a", "1e3", "ü"],
-        np.random.default_rng(0),
-    )
+    names, rng = ["01", "cam a", "1e3", "ü"], np.random.default_rng(0)
     matrices = {f"M_{i}": rng.standard_normal(rng.integers(1, 15, 2)) for i in range(5)}
-    storage = cv2.FileStorage(path, cv2.FILE_STORAGE_WRITE)
-    for key, matrix in matrices.items():
-        storage.write(key, matrix)
-    storage.write("H_1", 1920)
-    storage.startWriteStruct("names", cv2.FILE_NODE_SEQ)
-    for name in names:
-        storage.write("", name)
-    storage.endWriteStruct()
-    storage.release()
-    found = read_opencv_yaml(Path(path))
+    write_opencv(tmp_path / "rig.yml", names, {**matrices, "H_1": 1920})
+    found = read_opencv_yaml(tmp_path / "rig.yml")
     for key, matrix in matrices.items():
         np.testing.assert_array_equal(found[key], matrix)
     assert found["names"] == names

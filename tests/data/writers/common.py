@@ -35,7 +35,7 @@ class Subject:
     """What was written, for comparison with what is read.
 
     ``poses [F, 72]`` axis-angle, root zero; ``joints [F, 24, 3]``, ``vertices [F, 6890, 3]`` in
-    metres, world; ``joints_before`` without Rh and Th; ``images``, ``labels``: ``[F][C]``, CIHP.
+    metres, world; ``images``, ``labels``: ``[F][C]``, CIHP.
     """
 
     model: SkinnedModel
@@ -47,8 +47,6 @@ class Subject:
     Th: np.ndarray
     joints: np.ndarray
     vertices: np.ndarray
-    joints_before: np.ndarray
-    rest: np.ndarray
     images: list[list[np.ndarray]]
     labels: list[list[np.ndarray]]
 
@@ -88,8 +86,6 @@ def make_subject(
         Th=Th,
         joints=joints,
         vertices=vertices,
-        joints_before=j.numpy(),
-        rest=model.rest_joints(torch.from_numpy(shapes[None]))[0].numpy(),
         images=[[image for image, _ in row] for row in drawn],
         labels=[[labels for _, labels in row] for row in drawn],
     )

@@ -31,38 +31,34 @@ def write_calibration(
 ) -> None:
     """intri.yml and extri.yml by OpenCV, names in another order and with a "none" among them."""
     root.mkdir(parents=True, exist_ok=True)
-    cameras = dict(zip(NAMES, subject.cameras, strict=True))
-    intri = cv2.FileStorage(str(root / "intri.yml"), cv2.FILE_STORAGE_WRITE)
-    extri = cv2.FileStorage(str(root / "extri.yml"), cv2.FILE_STORAGE_WRITE)
-    _names(intri, [*NAMES, "none"])
-    _names(extri, ["none", *reversed(NAMES)])
-    for name, camera in cameras.items():
-        intri.write(f"K_{name}", camera.K)
-        intri.write(f"{lens}_{name}", camera.dist[None])
+    intri: dict[str, Any] = {}
+    extri: dict[str, Any] = {}
+    for name, camera in zip(NAMES, subject.cameras, strict=True):
+        intri |= {f"K_{name}": camera.K, f"{lens}_{name}": camera.dist[None]}
         if sizes:
-            intri.write(f"W_{name}", camera.size[0])
-            intri.write(f"H_{name}", camera.size[1])
-    for name, camera in reversed(cameras.items()):
-        extri.write(f"R_{name}", cv2.Rodrigues(camera.R)[0])
-        if both:
-            extri.write(f"Rot_{name}", camera.R)
-        extri.write(f"T_{name}", camera.t[:, None])
-    intri.release()
-    extri.release()
+            intri |= {f"W_{name}": camera.size[0], f"H_{name}": camera.size[1]}
+        places = {f"R_{name}": cv2.Rodrigues(camera.R)[0], f"T_{name}": camera.t[:, None]}
+        extri = places | ({f"Rot_{name}": camera.R} if both else {}) | extri
+    write_opencv(root / "intri.yml", [*NAMES, "none"], intri)
+    write_opencv(root / "extri.yml", ["none", *reversed(NAMES)], extri)
 
 
-def _names(storage: Any, names: list[str]) -> None:
+def write_opencv(path: Path, names: list[str], values: dict[str, Any]) -> None:
+    """A YAML file by OpenCV's own writer: a list of names, then numbers and matrices by key."""
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     storage.startWriteStruct("names", cv2.FILE_NODE_SEQ)
     for name in names:
         storage.write("", name)
     storage.endWriteStruct()
+    for key, value in values.items():
+        storage.write(key, value)
+    storage.release()
 
 
 def write_easymocap(
     root: Path,
     subject: Subject,
     *,
-    kinds: tuple[str, ...] = ("keypoints3d", "smpl"),
     output: str = "",
     person: int = 0,
     pid: bool = False,
@@ -76,21 +72,19 @@ def write_easymocap(
             tail = f"_{person}" if pid else ""
             write_picture(root / f"images/{name}/{frame:06d}.jpg", subject.images[i][c])
             write_picture(root / f"mask/{name}/{frame:06d}{tail}.png", person_mask)
-        if "keypoints3d" in kinds:
-            joints = body_25(subject, i)
-            if hands:
-                joints = np.concatenate([joints, hand_joints(subject, i)])
-            entry = {"id": person, "keypoints3d": joints.tolist()}
-            write_people(root / f"{output}keypoints3d/{frame:06d}.json", [entry])
-        if "smpl" in kinds:
-            entry = {
-                "id": person,
-                "Rh": subject.Rh[i][None].tolist(),
-                "Th": subject.Th[i][None].tolist(),
-                "poses": subject.poses[i][None].tolist(),
-                "shapes": subject.shapes[None].tolist(),
-            }
-            write_people(root / f"{output}smpl/{frame:06d}.json", [entry])
+        joints = body_25(subject, i)
+        if hands:
+            joints = np.concatenate([joints, hand_joints(subject, i)])
+        rows = {"Rh": subject.Rh[i], "Th": subject.Th[i], "poses": subject.poses[i]}
+        rows |= {"shapes": subject.shapes}
+        entries = {
+            "keypoints3d": {"keypoints3d": joints.tolist()},
+            "smpl": {key: row[None].tolist() for key, row in rows.items()},
+        }
+        for kind, entry in entries.items():  # each a list of people
+            path = root / f"{output}{kind}/{frame:06d}.json"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(json.dumps([{"id": person, **entry}]))
     return root
 
 
@@ -100,9 +94,3 @@ def hand_joints(subject: Subject, frame: int) -> np.ndarray:
     steps = 0.005 * np.arange(21)[:, None] * [1, 0, 0]
     points = (wrists[:, None] + steps).reshape(42, 3)
     return np.concatenate([points, np.full((42, 1), 0.8)], axis=1)
-
-
-def write_people(path: Path, people: list[dict[str, Any]]) -> None:
-    """One frame's people as EasyMocap writes them: a list."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(people))
