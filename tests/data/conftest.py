@@ -24,6 +24,15 @@ def real_capture():
 
 
 @pytest.fixture(scope="session")
+def ten_frames(tmp_path_factory):
+    """Three cameras, ten frames, labels and poses; do not write into it."""
+    from make import write_tiny_capture
+
+    root = tmp_path_factory.mktemp("data") / "capture"
+    return write_tiny_capture(root, cameras=3, frames=10, labels=True, body_pose=True)
+
+
+@pytest.fixture(scope="session")
 def smpl_file(tmp_path_factory):
     """A file like SMPL's, of the default person."""
     from writers.smpl import write_smpl

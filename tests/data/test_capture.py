@@ -241,14 +241,3 @@ def test_loose_calibration_habits_are_accepted(tmp_path):
     layout = read_capture(root)
     assert np.allclose(layout.cameras["cam00"].t, t)
     assert not layout.cameras["cam00"].distorted
-
-
-# --- the real capture ---------------------------------------------------------------------------
-
-
-def test_real_capture_is_read_whole(real_capture):
-    layout = read_capture(real_capture)
-    assert layout.camera_names == ("cam01", "cam02", "cam03", "cam04")
-    assert layout.frames == tuple(range(70))
-    assert all(len(files) == 70 for files in layout.images.values())
-    assert layout.notes == ()

@@ -4,14 +4,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import ten_frames
 from hydra import compose, initialize_config_dir
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 
 from gsgan.utils.errors import ConfigError
-
-capture = ten_frames.capture
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 
@@ -32,18 +29,18 @@ def test_a_dataset_without_root_says_so(name):
     assert str(cause).startswith("data.root is not set: give the folder of a")
 
 
-def test_capture_config_builds_and_reads(capture):
-    data = instantiate(conf("capture", f"root={capture}", "size=20", "train_frames=0-3"))
+def test_capture_config_builds_and_reads(ten_frames):
+    data = instantiate(conf("capture", f"root={ten_frames}", "size=20", "train_frames=0-3"))
     assert len(data.dataset("train")) == 12
     assert data.dataset("train")[0].image.shape == (1, 3, 20, 20)
     assert data.crop.margin == conf("capture").crop.margin
-    wide = instantiate(conf("capture", f"root={capture}", "crop.margin=0.5"))
+    wide = instantiate(conf("capture", f"root={ten_frames}", "crop.margin=0.5"))
     assert wide.crop.margin == 0.5
-    assert instantiate(conf("capture", f"root={capture}", "crop=null")).crop is None
-    assert instantiate(conf("capture", f"root={capture}", "crop=person")).crop is not None
+    assert instantiate(conf("capture", f"root={ten_frames}", "crop=null")).crop is None
+    assert instantiate(conf("capture", f"root={ten_frames}", "crop=person")).crop is not None
 
 
-def test_synthetic_config_reads_what_the_generator_would_make(capture):
+def test_synthetic_config_reads_what_the_generator_would_make(ten_frames):
     """The generator is not run here: its parameters are checked, its folder replaced."""
     from gsgan.synthetic.scene_setup import SceneSettings
 
@@ -52,7 +49,7 @@ def test_synthetic_config_reads_what_the_generator_would_make(capture):
     given = dict(data.source.keywords)
     assert given.pop("workers") == 2
     assert SceneSettings(**given) == SceneSettings(size=48, frames=12, test_frames=3)
-    made = instantiate(conf("synthetic", f"root={capture}", "skeleton=mediapipe33"))
+    made = instantiate(conf("synthetic", f"root={ten_frames}", "skeleton=mediapipe33"))
     assert made.dataset("train")[0].image.shape[-2:] == (128, 128)
 
 

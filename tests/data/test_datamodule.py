@@ -12,10 +12,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-import ten_frames
 import torch
 from commands import quiet_trainer
-from make import skeletons, write_tiny_capture
+from make import edit_json, skeletons, write_tiny_capture
 
 from gsgan.data.datamodule import GsganData, StepSampler, count_labels, pass_order
 from gsgan.data.formats.capture import read_capture
@@ -26,9 +25,6 @@ from gsgan.utils.errors import ConfigError, DataError
 # isort: split
 import lightning
 from torch import nn
-
-capture = ten_frames.capture
-
 
 # --- order --------------------------------------------------------------------------------------
 
@@ -85,8 +81,8 @@ class Recorder(lightning.LightningModule):
         return torch.optim.SGD(self.parameters(), lr=0.1)
 
 
-def fit(capture: Path, folder: Path, epochs: int, ckpt: Path | None = None) -> Recorder:
-    data = GsganData(str(capture), batch_size=2, steps_per_epoch=3, seed=5, test_cameras=["cam01"])
+def fit(root: Path, folder: Path, epochs: int, ckpt: Path | None = None) -> Recorder:
+    data = GsganData(str(root), batch_size=2, steps_per_epoch=3, seed=5, test_cameras=["cam01"])
     model = Recorder()
     trainer = quiet_trainer(folder, max_epochs=epochs)
     trainer.fit(model, datamodule=data, ckpt_path=ckpt)
@@ -94,21 +90,21 @@ def fit(capture: Path, folder: Path, epochs: int, ckpt: Path | None = None) -> R
     return model
 
 
-def test_lightning_trains_validates_and_resumes_in_order(capture, tmp_path):
-    whole = fit(capture, tmp_path / "whole", 4)
+def test_lightning_trains_validates_and_resumes_in_order(ten_frames, tmp_path):
+    whole = fit(ten_frames, tmp_path / "whole", 4)
     assert len(whole.seen) == 4 * 3 * 2
     assert len(whole.validated) == 4 * 2  # 4 held-out pictures in twos, every epoch
     assert len(set(whole.seen[:16])) == 16  # 2 cameras × 8 frames, one pass
-    first = fit(capture, tmp_path / "part", 2)
-    second = fit(capture, tmp_path / "part", 4, ckpt=tmp_path / "part" / "last.ckpt")
+    first = fit(ten_frames, tmp_path / "part", 2)
+    second = fit(ten_frames, tmp_path / "part", 4, ckpt=tmp_path / "part" / "last.ckpt")
     assert first.seen + second.seen == whole.seen
 
 
 # --- the module ---------------------------------------------------------------------------------
 
 
-def test_loaders_and_datasets(capture):
-    data = GsganData(str(capture), size=16, batch_size=2, test_cameras=["cam02"], crop="person")
+def test_loaders_and_datasets(ten_frames):
+    data = GsganData(str(ten_frames), size=16, batch_size=2, test_cameras=["cam02"], crop="person")
     batch = next(iter(data.train_dataloader()))
     assert isinstance(batch, Frame)
     assert batch.image.shape == (2, 3, 16, 16)
@@ -120,6 +116,9 @@ def test_loaders_and_datasets(capture):
     assert [frame for _, frame in poses.items] == [8, 9, 8, 9]
     with pytest.raises(ValueError, match="split must be one of train, novel_view, novel_pose"):
         data.dataset("test")
+    all_trained = GsganData(str(ten_frames), test_share=0)
+    assert all_trained.eval_names == ()
+    assert set(all_trained.reasons) == {"novel_view", "novel_pose"}
 
 
 def test_batches_travel_as_bytes_and_become_the_datasets_numbers(tmp_path):
@@ -138,8 +137,8 @@ def test_batches_travel_as_bytes_and_become_the_datasets_numbers(tmp_path):
             assert torch.equal(getattr(on_device, name)[i : i + 1], getattr(one, name))
 
 
-def test_on_a_gpu_batches_are_pinned_and_copied_while_the_host_goes_on(capture, monkeypatch):
-    data = GsganData(str(capture), size=16)
+def test_on_a_gpu_batches_are_pinned_and_copied_while_the_host_goes_on(ten_frames, monkeypatch):
+    data = GsganData(str(ten_frames), size=16)
     assert not data.train_dataloader().pin_memory
     data.trainer = SimpleNamespace(
         strategy=SimpleNamespace(root_device=torch.device("cuda", 1)),
@@ -160,39 +159,33 @@ def test_on_a_gpu_batches_are_pinned_and_copied_while_the_host_goes_on(capture, 
     assert moved[: len(pinned)] == [{"non_blocking": True}] * len(pinned)
 
 
-def test_empty_split_has_a_reason(capture):
-    data = GsganData(str(capture), test_share=0)
-    assert data.eval_names == ()
-    assert set(data.reasons) == {"novel_view", "novel_pose"}
-
-
 def watched(**keys: Any) -> list[tuple[int, int]]:
     frames = list(GsganData(**keys).val_dataloader())
     return [(int(f.camera_index), int(f.frame_id)) for f in frames]
 
 
-def test_pictures_watched_while_training_are_spread_over_held_out_poses(capture):
-    keys = {"root": str(capture), "test_frames": "5-9"}
+def test_pictures_watched_while_training_are_spread_over_held_out_poses(ten_frames):
+    keys = {"root": str(ten_frames), "test_frames": "5-9"}
     assert watched(**keys, val_images=99) == [(c, f) for c in range(3) for f in range(5, 10)]
     assert watched(**keys, val_images=3) == [(0, 7), (1, 7), (2, 7)]
     # without held-out poses: held-out cameras, and without those: training
-    none = {"root": str(capture), "test_share": 0, "val_images": 2}
+    none = {"root": str(ten_frames), "test_share": 0, "val_images": 2}
     assert {c for c, _ in watched(**none, test_cameras=["cam01"])} == {1}
     assert len(watched(**none)) == 2
 
 
-def test_the_source_is_called_when_data_is_needed_only(capture):
+def test_the_source_is_called_when_data_is_needed_only(ten_frames):
     calls = []
 
     def make(root: Path) -> Path:
         calls.append(root)
         return root
 
-    data = GsganData(source=functools.partial(make, capture))
+    data = GsganData(source=functools.partial(make, ten_frames))
     assert calls == []
     data.prepare_data()
-    assert calls == [capture]
-    assert data.layout.root == capture
+    assert calls == [ten_frames]
+    assert data.layout.root == ten_frames
 
 
 def test_notes_reach_the_log(tmp_path, caplog):
@@ -203,8 +196,8 @@ def test_notes_reach_the_log(tmp_path, caplog):
     assert "1 frames of the splits are not usable or do not exist: 77" in caplog.text
 
 
-def test_scene_info(capture):
-    info = GsganData(str(capture), size=24, test_cameras=["cam02"]).info
+def test_scene_info(ten_frames):
+    info = GsganData(str(ten_frames), size=24, test_cameras=["cam02"]).info
     assert info.camera_names == ("cam00", "cam01", "cam02")
     assert info.n_train_cameras == 2
     assert not info.has_distortion
@@ -223,9 +216,7 @@ def test_scene_info(capture):
 
 def test_scene_info_sees_the_lens_of_training_cameras_only(tmp_path):
     root = write_tiny_capture(tmp_path, meta={"body": "free"})
-    rig = json.loads((root / "cameras.json").read_text())
-    rig["cam01"]["dist"] = [0.1, 0, 0, 0]
-    (root / "cameras.json").write_text(json.dumps(rig))
+    edit_json(root / "cameras.json", lambda rig: rig["cam01"].update(dist=[0.1, 0, 0, 0]))
     assert GsganData(str(root)).info.has_distortion
     info = GsganData(str(root), test_cameras=["cam01"]).info
     assert not info.has_distortion
@@ -269,22 +260,25 @@ def test_labels_are_counted_without_the_ignore_value(tmp_path):
         ({"root": None}, "data.root is not set: give the folder of a capture"),
     ],
 )
-def test_config_values_out_of_range(capture, keys, message):
+def test_config_values_out_of_range(ten_frames, keys, message):
     with pytest.raises(ConfigError, match=message):
-        GsganData(**({"root": str(capture)} | keys))
+        GsganData(**({"root": str(ten_frames)} | keys))
 
 
-def test_batches_need_one_size(capture):
-    GsganData(str(capture), batch_size=2).setup()
+def test_batches_need_one_size(ten_frames):
+    GsganData(str(ten_frames), batch_size=2).setup()
     with pytest.raises(ConfigError, match=r"data.size is not set and images differ in size"):
-        GsganData(str(capture), batch_size=2, crop="person").setup()
+        GsganData(str(ten_frames), batch_size=2, crop="person").setup()
 
 
 # --- the real capture ---------------------------------------------------------------------------
 
 
-def test_real_capture_splits_and_scene(real_capture):
+def test_the_real_capture_is_read_whole(real_capture):
     data = GsganData(str(real_capture), size=128, crop="person", info_samples=4)
+    assert data.layout.camera_names == ("cam01", "cam02", "cam03", "cam04")
+    assert all(list(files) == list(range(70)) for files in data.layout.images.values())
+    assert data.layout.notes == ()
     assert len(data.dataset("train")) == 4 * 56
     assert data.splits.test_frames == tuple(range(56, 70))
     assert set(data.reasons) == {"novel_view"}

@@ -1,7 +1,6 @@
 """Which frames and cameras are trained on, and which are held out."""
 
 import pytest
-import ten_frames
 from make import write_tiny_capture
 from omegaconf import OmegaConf
 
@@ -9,12 +8,10 @@ from gsgan.data.formats.capture import read_capture
 from gsgan.data.splits import make_splits, parse_frames, parse_names
 from gsgan.utils.errors import ConfigError, DataError
 
-capture = ten_frames.capture
-
 
 @pytest.fixture(scope="module")
-def layout(capture):
-    return read_capture(capture)
+def layout(ten_frames):
+    return read_capture(ten_frames)
 
 
 def test_default_splits_hold_out_the_last_frames(layout):
