@@ -43,15 +43,3 @@ def test_the_list_of_missing_files_is_optional_and_names_serials(root, smplx_fil
     layout = read(root, smplx_file)
     assert list(layout.images[SERIALS[1]]) == [0, 1, 3]
     assert list(layout.images[SERIALS[0]]) == [1, 2, 3]
-
-
-def test_the_config_reads_it(root, smplx_file, compose):
-    from hydra.utils import instantiate
-
-    config = compose(
-        "train", "data=avatarrex", f"data.root={root}", f"data.smpl={smplx_file}", "data.size=16",
-        "data.test_cameras=[22010708]",
-    )  # fmt: skip
-    data = instantiate(config.data)
-    assert data.dataset("novel_view")[0].camera_index.item() == 1
-    assert data.dataset("train")[0].image.shape == (1, 3, 16, 16)

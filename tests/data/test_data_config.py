@@ -7,6 +7,9 @@ import pytest
 from hydra import compose, initialize_config_dir
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
+from writers.avatarrex import write_avatarrex
+from writers.easymocap import write_easymocap
+from writers.thuman4 import write_thuman4
 
 from gsgan.utils.errors import ConfigError
 
@@ -38,6 +41,33 @@ def test_capture_config_builds_and_reads(ten_frames):
     assert wide.crop.margin == 0.5
     assert instantiate(conf("capture", f"root={ten_frames}", "crop=null")).crop is None
     assert instantiate(conf("capture", f"root={ten_frames}", "crop=person")).crop is not None
+
+
+@pytest.mark.usefixtures("model_once")
+@pytest.mark.parametrize(
+    ("name", "write", "body", "camera", "skeleton"),
+    [
+        ("thuman4", write_thuman4, "smplx", "cam02", "smplx -> mediapipe33"),
+        ("avatarrex", write_avatarrex, "smplx", "22010708", "smplx -> mediapipe33"),
+        ("easymocap", write_easymocap, "smpl", "10", "smpl24 -> mediapipe33"),
+    ],
+)
+def test_configs_of_published_formats_read_them_in_worker_processes(
+    request, tmp_path, name, write, body, camera, skeleton
+):
+    subject = request.getfixturevalue("subject" if body == "smpl" else "smplx_subject")
+    words = [f"root={write(tmp_path / name, subject)}", "size=16", "workers=1", "test_frames=3"]
+    words += [f"smpl={request.getfixturevalue(f'{body}_file')}", f"test_cameras=[{camera}]"]
+    words += ["reader.ignore_alpha=[5,250]"] if body == "smplx" else []
+    data = instantiate(conf(name, *words))
+    batch = next(iter(data.train_dataloader()))
+    assert batch.image.shape == (1, 3, 16, 16)
+    assert (batch.unsure is None) == (body == "smpl")
+    assert data.layout.meta.skeleton_source == skeleton
+    assert (data.info.body, data.info.frames) == (body, 3)
+    assert data.eval_names == ("novel_view", "novel_pose")
+    place = data.layout.camera_names.index(camera)
+    assert data.dataset("novel_view")[0].camera_index.item() == place
 
 
 def test_synthetic_config_reads_what_the_generator_would_make(ten_frames):

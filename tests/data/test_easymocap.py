@@ -48,9 +48,10 @@ def refused(root: Path, *parts: str, smpl: Path | None = None, **settings: Any) 
         assert part in str(caught.value), caught.value
 
 
-def test_cameras_are_paired_by_name(written, subject):
+def test_cameras_are_paired_by_name_and_have_their_images(written, subject):
     """extri.yml lists them the other way round, and a "none" stands in both."""
     layout = read(written)
+    check_images(layout, subject)
     assert layout.camera_names == NAMES  # "1", "2", "10": in natural order
     check_cameras(layout, subject.cameras)
     assert layout.frames == (0, 1, 2, 3)
@@ -109,23 +110,6 @@ def test_which_skeleton_is_taken(root, smpl_file):
     assert source(smpl_file) == "smpl24 -> mediapipe33"
     shutil.rmtree(root / "smpl")
     refused(root, "has no skeletons; expected keypoints3d/ or smpl/")
-
-
-def test_pictures_and_masks_are_those_that_were_written(written, subject):
-    check_images(read(written), subject)
-
-
-def test_the_config_reads_it_in_worker_processes(written, smpl_file, compose):
-    from hydra.utils import instantiate
-
-    config = compose(
-        "train", "data=easymocap", f"data.root={written}", f"data.smpl={smpl_file}",
-        "data.size=16", "data.workers=1", "data.test_cameras=[10]", "data.test_frames=3",
-    )  # fmt: skip
-    data = instantiate(config.data)
-    assert next(iter(data.train_dataloader())).image.shape == (1, 3, 16, 16)
-    assert data.layout.meta.skeleton_source == "smpl24 -> mediapipe33"
-    assert data.splits.test_cameras == ("10",)
 
 
 def test_omissions_are_noted(root, subject):

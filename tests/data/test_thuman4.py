@@ -36,21 +36,18 @@ def written(tmp_path_factory, smplx_subject):
     return write_thuman4(tmp_path_factory.mktemp("thuman4") / "subject00", smplx_subject)
 
 
-def test_cameras_are_those_that_were_written(written, smplx_subject, smplx_file):
-    layout = read(written, smplx_file)
+def test_read_equals_written(written, smplx_subject, smplx_file):
+    layout, s = read(written, smplx_file), smplx_subject
     assert layout.camera_names == ("cam00", "cam01", "cam02")
     assert layout.frames == (0, 1, 2, 3)
     assert layout.cameras["cam00"].size == (44, 52)  # imgSize is [52, 44]
-    check_cameras(layout, smplx_subject.cameras)
+    check_cameras(layout, s.cameras)
     assert not any(camera.distorted for camera in layout.cameras.values())
-    assert layout.notes == ("0 images named in " + str(written / "missing_img_files.txt") + (
-        " are left out, 0 of them with a file"
-    ),)  # fmt: skip
-
-
-def test_skeletons_and_poses_are_those_that_were_written(written, smplx_subject, smplx_file):
-    layout = read(written, smplx_file)
-    s = smplx_subject
+    (note,) = layout.notes
+    assert note.startswith(
+        f"0 images named in {written / 'missing_img_files.txt'} are left out, 0 "
+    )
+    check_images(layout, s)
     check_skeletons(layout, s, "smplx")
     for i, frame in enumerate(s.frames):
         face = s.params["expression"][i : i + 1].astype(np.float64)
@@ -61,10 +58,6 @@ def test_skeletons_and_poses_are_those_that_were_written(written, smplx_subject,
     assert (meta.skeleton_source, meta.up_axis, meta.fps) == ("smplx -> mediapipe33", "-z", 30)
     assert (meta.body.kind, meta.body.file) == ("smplx", str(smplx_file))
     assert np.allclose(meta.body.betas, s.params["betas"][0])
-
-
-def test_pictures_and_masks_are_those_that_were_written(written, smplx_subject, smplx_file):
-    check_images(read(written, smplx_file), smplx_subject)
 
 
 def test_hands_move_their_landmarks(root, smplx_file):
@@ -123,23 +116,6 @@ def test_frames_without_finite_parameters_are_dropped_and_named(root, smplx_file
     assert layout.frames == (0, 2)
     assert any("NaN or infinity at frames 1" in note for note in layout.notes)
     assert any("without a row in smpl_params.npz: 1, 3" in note for note in layout.notes)
-
-
-def test_the_config_reads_it_in_worker_processes(written, smplx_file, compose):
-    from hydra.utils import instantiate
-
-    config = compose(
-        "train", "data=thuman4", f"data.root={written}", f"data.smpl={smplx_file}",
-        "data.size=16", "data.workers=1", "data.test_cameras=[cam02]", "data.test_frames=3",
-        "data.reader.ignore_alpha=[5,250]",
-    )  # fmt: skip
-    data = instantiate(config.data)
-    batch = next(iter(data.train_dataloader()))
-    assert batch.image.shape == (1, 3, 16, 16)
-    assert batch.unsure is not None
-    assert data.layout.meta.skeleton_source == "smplx -> mediapipe33"
-    assert (data.info.body, data.info.frames) == ("smplx", 3)
-    assert data.eval_names == ("novel_view", "novel_pose")
 
 
 # --- masks --------------------------------------------------------------------------------------
