@@ -122,13 +122,13 @@ def test_head_falls_back_to_eyes_then_chest():
 
 def test_a_line_along_the_spine_is_replaced_by_the_other():
     R = rotation(4)
-    f = bone_frames(DEGENERATE["collinear_shoulders"] @ R.mT)
+    f = bone_frames(DEGENERATE["shoulders in line with the spine"] @ R.mT)
     torch.testing.assert_close(f.hubs[0, CHEST], R, atol=1e-9, rtol=0)
     torch.testing.assert_close(f.hubs[0, PELVIS], R, atol=1e-9, rtol=0)
 
 
 def test_zero_length_bone_keeps_its_parents_frame():
-    f = bone_frames(DEGENERATE["zero_length"])
+    f = bone_frames(DEGENERATE["limb of zero length"])
     eye = torch.eye(3, dtype=torch.float64)
     torch.testing.assert_close(f.local[0, LIMB[(13, 15)]], eye, atol=1e-12, rtol=0)
     assert f.lengths[0, LIMB[(13, 15)]] == pytest.approx(1e-3)

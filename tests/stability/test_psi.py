@@ -15,7 +15,7 @@ VALUES = st.one_of(st.floats(-1e3, 1e3, width=32), st.sampled_from([0.0, -1.0, 1
 
 def test_a_vanishing_limb_starts_at_the_least_scale():
     """The one way in which step 0 is not densify's: a Gaussian thinner than Ψ allows."""
-    p = DEGENERATE["zero_length"].float()
+    p = DEGENERATE["limb of zero length"].float()
     psi, points = small_psi(*FLOAT32), some_points(*FLOAT32)(p)
     with torch.no_grad():
         made = psi(p, points, torch.tensor([[0.0, 1, 4]]), torch.eye(3).unsqueeze(0))

@@ -72,28 +72,30 @@ def _collinear_head() -> Tensor:
 
 
 _SPINE = {11: (0.0, 1.5, 0.0), 12: (0.0, 1.3, 0.0)}  # the shoulder line runs along it
-_ALONG_X = ((11, 0.5), (12, 0.4), (23, 0.1), (24, 0.0))
 
 DEGENERATE: dict[str, Tensor] = {
-    "rest": rest(),
-    "straight": _bent(1.0),
-    "folded": _bent(-0.9),
-    "nearly_folded": _nearly_folded(),
-    "antipodal": _antipodal(),
-    "zero_length": _placed({15: REST[13], 25: REST[23]}),
-    "tenth_of_a_millimetre": _placed({15: REST[13] + torch.tensor([0.0, 6e-5, 8e-5])}),
-    "all_coincident": _placed(dict.fromkeys(range(33), REST[0])),
-    "hand_collapsed": _placed(dict.fromkeys((17, 19, 21), REST[15])),
-    "collinear_shoulders": _placed(_SPINE),
-    # Half a millimetre off the spine, where the hips' line takes over.
-    "nearly_collinear_shoulders": _placed({11: (0.0, 1.5, 2.5e-4), 12: (0.0, 1.3, -2.5e-4)}),
-    "collinear_trunk": _placed({**_SPINE, 23: (0.0, 1.0, 0.0), 24: (0.0, 0.8, 0.0)}),
-    # A trunk without width that lies along the world's x axis.
-    "collinear_along_x": _placed({k: (x, 0.0, 0.0) for k, x in _ALONG_X}),
-    "collinear_head": _collinear_head(),
-    "swapped": rest()[:, list(MEDIAPIPE33.mirror)],
-    # Shoulders turned half round over the hips: the two lines cancel.
-    "back_to_front": _placed(
+    "an ordinary pose": rest(),
+    "limb of zero length": _placed({15: REST[13], 25: REST[23]}),
+    "limb of a tenth of a millimetre": _placed({15: REST[13] + torch.tensor([0.0, 6e-5, 8e-5])}),
+    "hand collapsed to a point": _placed(dict.fromkeys((17, 19, 21), REST[15])),
+    "all joints coincide": _placed(dict.fromkeys(range(33), REST[0])),
+    "arms and legs straight": _bent(1.0),
+    "arms and legs folded back on themselves": _bent(-0.9),
+    "folded back but for two degrees": _nearly_folded(),
+    "upper arms and thighs opposite to their rest directions": _antipodal(),
+    "shoulders in line with the spine": _placed(_SPINE),
+    "shoulders half a millimetre off the spine": _placed(
+        {11: (0.0, 1.5, 2.5e-4), 12: (0.0, 1.3, -2.5e-4)}
+    ),
+    "shoulders and hips in line with the spine": _placed(
+        {**_SPINE, 23: (0.0, 1.0, 0.0), 24: (0.0, 0.8, 0.0)}
+    ),
+    "trunk without width along the world's x axis": _placed(
+        {11: (0.5, 0.0, 0.0), 12: (0.4, 0.0, 0.0), 23: (0.1, 0.0, 0.0), 24: (0.0, 0.0, 0.0)}
+    ),
+    "nose, ears and eyes in line": _collinear_head(),
+    "left and right swapped": rest()[:, list(MEDIAPIPE33.mirror)],
+    "shoulders turned back to front over the hips": _placed(
         {k: torch.cat([REST.new_tensor([x]), REST[k, 1:]]) for k, x in ((11, -0.175), (12, 0.175))}
     ),
 }

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterator
 from functools import lru_cache, partial
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,66 +17,42 @@ from stability.cases.raster import Size, pinhole, raster_case, rendered
 
 _case = partial(Case, "skeleton")
 
-# The case's name, the pose in DEGENERATE, and the note.
-POSES = (
-    ("an ordinary pose", "rest", ""),
-    (
-        "limb of zero length",
-        "zero_length",
-        "It keeps its parent's frame; its slope is that of a bone of min_length, 1 mm.",
+NOTES = {
+    "limb of zero length": (
+        "It keeps its parent's frame; its slope is that of a bone of min_length, 1 mm."
     ),
-    ("limb of a tenth of a millimetre", "tenth_of_a_millimetre", ""),
-    ("hand collapsed to a point", "hand_collapsed", "Four bones without a length at one joint."),
-    (
-        "all joints coincide",
-        "all_coincident",
-        "Every frame is a stand-in: the world's axes, and the rest directions in them.",
+    "hand collapsed to a point": "Four bones without a length at one joint.",
+    "all joints coincide": (
+        "Every frame is a stand-in: the world's axes, and the rest directions in them."
     ),
-    ("arms and legs straight", "straight", ""),
-    (
-        "arms and legs folded back on themselves",
-        "folded",
-        "The bone's direction is exact; its roll is arbitrary but fixed.",
+    "arms and legs folded back on themselves": (
+        "The bone's direction is exact; its roll is arbitrary but fixed."
     ),
-    (
-        "folded back but for two degrees",
-        "nearly_folded",
-        "The roll is a direction of 0.035 of the bone: rounding counts 30 times.",
+    "folded back but for two degrees": (
+        "The roll is a direction of 0.035 of the bone: rounding counts 30 times."
     ),
-    ("upper arms and thighs opposite to their rest directions", "antipodal", ""),
-    (
-        "shoulders in line with the spine",
-        "collinear_shoulders",
-        "The hips decide which side is left.",
+    "shoulders in line with the spine": "The hips decide which side is left.",
+    "shoulders and hips in line with the spine": (
+        "Nothing distinguishes left from right: the world's x axis decides."
     ),
-    ("shoulders half a millimetre off the spine", "nearly_collinear_shoulders", ""),
-    (
-        "shoulders and hips in line with the spine",
-        "collinear_trunk",
-        "Nothing distinguishes left from right: the world's x axis decides.",
+    "trunk without width along the world's x axis": (
+        "The axis least along the spine decides which side is left."
     ),
-    (
-        "trunk without width along the world's x axis",
-        "collinear_along_x",
-        "The axis least along the spine decides which side is left.",
+    "nose, ears and eyes in line": "The head takes the chest's frame.",
+    "left and right swapped": "Frames keep det +1: the person is turned.",
+    "shoulders turned back to front over the hips": (
+        "The two lines cancel: the trunk's box takes the hips'."
     ),
-    ("nose, ears and eyes in line", "collinear_head", "The head takes the chest's frame."),
-    ("left and right swapped", "swapped", "Frames keep det +1: the person is turned."),
-    (
-        "shoulders turned back to front over the hips",
-        "back_to_front",
-        "The two lines cancel: the trunk's box takes the hips'.",
-    ),
-)
+}
+"""Of the poses in `DEGENERATE`, by name."""
 
 
 def cases() -> Iterator[Case]:
     """All of them."""
-    for name, pose, note in POSES:
-        options: dict[str, Any] = {"note": note}
-        if pose == "nearly_folded":
-            options["tolerance"] = Tolerance(1e-4, 1e-4)
-        yield _case(name, partial(_posed, pose), frames_and_points, **options)
+    for name, p in DEGENERATE.items():
+        within = Tolerance(1e-4 if name == "folded back but for two degrees" else 1e-5)
+        make, note = partial(dict, p=p), NOTES.get(name, "")
+        yield _case(name, make, frames_and_points, tolerance=within, note=note)
     yield from _lost()
     yield raster_case(
         "skeleton",
@@ -125,10 +100,6 @@ def _sanitised(inputs: Inputs) -> dict[str, Tensor]:
     """The same after ``sanitise``."""
     p, valid = sanitise(inputs["p"], inputs.get("visibility"))
     return {"joints": p, **frames_and_points({"p": p, "valid": valid})}
-
-
-def _posed(pose: str) -> Inputs:
-    return {"p": DEGENERATE[pose]}
 
 
 def _along(path: Path) -> Inputs:
