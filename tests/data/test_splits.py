@@ -58,7 +58,6 @@ def test_frames_that_are_not_there_are_noted(layout):
     ("keys", "error", "message"),
     [
         ({"train_cameras": ["cam9"]}, DataError, "has no camera cam9; it has cam00, cam01, cam02"),
-        ({"test_cameras": "cam9"}, DataError, "has no camera cam9; it has cam00, cam01, cam02"),
         ({"train_frames": "50-60"}, DataError, "nothing to train on .* 0 train frames; .* 0-9"),
         ({"train_cameras": []}, DataError, "nothing to train on with cameras none"),
         (
@@ -68,7 +67,6 @@ def test_frames_that_are_not_there_are_noted(layout):
         ),
         ({"train_frames": "0-5", "test_frames": "5-9"}, ConfigError, "share 5"),
         ({"train_frames": "5-0"}, ConfigError, "data.train_frames must be frame numbers .*'5-0'"),
-        ({"train_frames": "all"}, ConfigError, "data.train_frames must be frame numbers .*'all'"),
         ({"test_frames": 0.5}, ConfigError, "data.test_frames must be frame numbers .* 0.5"),
         ({"train_cameras": 1.5}, ConfigError, "data.train_cameras must be a list of camera names"),
         ({"test_share": 1.0}, ConfigError, r"data.test_share must be in \[0, 1\)"),
