@@ -373,15 +373,11 @@ def test_model_files_that_do_not_fit(written, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"drop_frames": "a-b"}, "data.reader.drop_frames must be frame numbers"),
-        ({"drop_frames": "0-9"}, "leaves no frame"),
-    ],
+    ("frames", "message"), [("a-b", "must be frame numbers"), ("0-9", "leaves no frame")]
 )
-def test_settings_that_cannot_be(written, settings, message):
-    with pytest.raises(ConfigError, match=message):
-        zju(written["zju"], SMPL["smpl"], **settings)
+def test_frames_to_drop_that_cannot_be(written, frames, message):
+    with pytest.raises(ConfigError, match=f"data.reader.drop_frames.*{message}"):
+        zju(written["zju"], SMPL["smpl"], drop_frames=frames)
 
 
 def test_wrong_folders_and_frame_numbers(tmp_path):
