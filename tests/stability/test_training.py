@@ -1,6 +1,7 @@
 """Training survives: bad gradients move nothing and are counted; hard skeletons stay finite."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -24,21 +25,14 @@ def make(tiny, tmp_path):
     def run(phases: tuple[int, int, int], *overrides: str):
         names = ("segmentation", "step_one", "step_two")
         schedule = [f"training.schedule.{k}={n}" for k, n in zip(names, phases, strict=True)]
-        data, module = build_training(
-            tiny(
-                *schedule,
-                "training.schedule.discriminator_start=0",
-                "size.rgb_skip=false",
-                *overrides,
-            )
-        )
+        always = ("training.schedule.discriminator_start=0", "size.rgb_skip=false")
+        data, module = build_training(tiny(*schedule, *always, *overrides))
         trainer = quiet_trainer(tmp_path, max_epochs=1)
-        frame = data.dataset("train")[0]
-        return (
-            module,
-            frame,
-            lambda frames: trainer.fit(module, DataLoader(frames, batch_size=None)),
-        )
+
+        def fit(frames: list[Frame]) -> None:
+            trainer.fit(module, DataLoader(frames, batch_size=None))
+
+        return module, data.dataset("train")[0], fit
 
     return run
 
@@ -47,13 +41,24 @@ def with_pose(frame: Frame, name: str) -> Frame:
     return replace(frame, skeleton=DEGENERATE[name].float() @ TO_WORLD.mT)
 
 
-def assert_finite(module: AvatarTraining) -> None:
+def assert_finite(module: AvatarTraining, steps: int) -> None:
+    """After so many iterations, none of which was skipped."""
+    assert module.step == steps
     assert not module.skipped.steps
     for name, value in module.state_dict().items():
         assert value.isfinite().all(), name
     for optimiser in module.trainer.optimizers:
         for state in optimiser.state.values():
             assert all(torch.as_tensor(v).isfinite().all() for v in state.values())
+
+
+def assert_psi_learns(module: AvatarTraining, fit: Callable, frame: Frame) -> None:
+    """In five iterations on a frame, after which everything is finite."""
+    before = [p.detach().clone() for p in module.avatar.deformation.parameters()]
+    fit([frame] * 5)
+    assert_finite(module, 5)
+    after = module.avatar.deformation.parameters()
+    assert not all(torch.equal(a, b) for a, b in zip(before, after, strict=True))
 
 
 PARTS = {
@@ -95,12 +100,11 @@ def test_a_gradient_that_is_not_finite_skips_its_step_and_is_counted(make, part,
 
     module.training_step = watched
     fit([frame] * 3)
-    assert module.step == 3
     assert list(module.skipped.steps) == [1]
     assert torch.equal(seen[0], seen[1])
     assert not torch.equal(seen[1], seen[2])
     module.skipped.steps.clear()
-    assert_finite(module)
+    assert_finite(module, 3)
 
 
 def test_training_on_an_image_without_a_person_stays_finite(make):
@@ -109,20 +113,14 @@ def test_training_on_an_image_without_a_person_stays_finite(make):
     labels = torch.full_like(frame.labels, 255)
     empty = replace(frame, image=frame.image * 0, mask=frame.mask * 0, labels=labels)
     fit([empty] * 6)
-    assert module.step == 6
-    assert_finite(module)
+    assert_finite(module, 6)
 
 
 def test_a_few_steps_from_all_hard_skeletons_stay_finite(make):
     """All of them as one batch, through every phase."""
     module, frame, fit = make((1, 2, 2), "training.rollback.collapse=0")
     batch = cat([with_pose(frame, name) for name in DEGENERATE])
-    before = [p.detach().clone() for p in module.avatar.deformation.parameters()]
-    fit([batch] * 5)
-    assert module.step == 5
-    assert_finite(module)
-    after = module.avatar.deformation.parameters()
-    assert not all(torch.equal(a, b) for a, b in zip(before, after, strict=True))
+    assert_psi_learns(module, fit, batch)
 
 
 @pytest.mark.parametrize("turn", [2.6, pytest.param(torch.pi, marks=pytest.mark.slow)])
@@ -135,12 +133,7 @@ def test_a_few_steps_from_points_on_a_folded_body_stay_finite(make, turn):
     folded = replace(frame, body=replace(frame.body, theta=theta))
     A, _ = module.avatar.body_points.points.blend(folded.body)
     assert torch.linalg.svdvals(A)[..., -1].min() < 0.3
-    before = [p.detach().clone() for p in module.avatar.deformation.parameters()]
-    fit([folded] * 5)
-    assert module.step == 5
-    assert_finite(module)
-    after = module.avatar.deformation.parameters()
-    assert not all(torch.equal(a, b) for a, b in zip(before, after, strict=True))
+    assert_psi_learns(module, fit, folded)
 
 
 @pytest.mark.slow
@@ -148,8 +141,7 @@ def test_a_few_steps_from_points_on_a_folded_body_stay_finite(make, turn):
 def test_a_hundred_steps_from_each_hard_skeleton_stay_finite(make, name):
     module, frame, fit = make((10, 50, 40), "training.rollback.collapse=0")
     fit([with_pose(frame, name)] * 100)
-    assert module.step == 100
-    assert_finite(module)
+    assert_finite(module, 100)
     with torch.no_grad():
         painting = module.avatar(*with_pose(frame, name).inputs)
     assert painting.image.isfinite().all()
