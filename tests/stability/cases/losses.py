@@ -55,7 +55,10 @@ def cases() -> Iterator[Case]:
     """All of them."""
     for name, (image, target) in PAIRS.items():
         pair = partial(dict, image=image, target=target)
-        for what, run in (("D-SSIM", _d_ssim), ("L1, L2 and D-SSIM", _photometric)):
+        for what, run in (
+            ("D-SSIM", lambda x: {"D-SSIM": d_ssim(**x)}),
+            ("L1, L2 and D-SSIM", lambda x: {"loss": photometric(**x, l1=0.8, l2=1.0, ssim=0.2)}),
+        ):
             title, note = f"{what} of {name}", NOTES.get(name, "")
             yield _case(title, pair, run, tolerance=Tolerance(1e-6, 5e-4), note=note)
         note = "PSNR is infinite: reported as such, counted, and kept out of means."
@@ -86,14 +89,6 @@ def cases() -> Iterator[Case]:
         yield _case(f"segmentation loss, {name}", inputs, _segmentation, note=note)
     for name, alpha in (("nothing painted", 0.0), ("something painted", 0.3)):
         yield _case(f"empty mask, {name}", partial(_empty, alpha), _step_one)
-
-
-def _d_ssim(inputs: Inputs) -> Outputs:
-    return {"D-SSIM": d_ssim(inputs["image"], inputs["target"])}
-
-
-def _photometric(inputs: Inputs) -> Outputs:
-    return {"loss": photometric(inputs["image"], inputs["target"], l1=0.8, l2=1.0, ssim=0.2)}
 
 
 def _segmentation(inputs: Inputs) -> Outputs:
