@@ -209,7 +209,8 @@ def main() -> None:
     splits.append(f"data.test_frames=[{','.join(map(str, held))}]")
     where = [f"data.root={folder}/joined", f"hydra.run.dir={folder}/run"]
     run("gsgan.train", "experiment=one_camera", *where, *splits, *overrides)
-    run("gsgan.evaluate", f"run={folder}/run", f"on.root={folder}/true")
+    same = [word.replace("data.", "on.") for word in splits]
+    run("gsgan.evaluate", f"run={folder}/run", f"on.root={folder}/true", *same)
     show(folder / "run" / "metrics.json", "estimated skeletons")
     show(folder / "run" / "on" / "true" / "metrics.json", "true skeletons")
     print(
