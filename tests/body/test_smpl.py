@@ -13,7 +13,8 @@ from gsgan.body import free_body, open_body, skin
 from gsgan.body.skinned import carry
 from gsgan.body.smpl import SkinnedModel, from_zju, read_smpl
 from gsgan.body.smpl_names import CIHP, CLOTHES, SMPL_JOINTS, SMPLX_JOINTS
-from gsgan.scene import BodyPose
+from gsgan.model.segmentation import Segmentation
+from gsgan.scene import BodyPose, Camera
 from gsgan.utils.errors import DataError
 
 D = torch.float64
@@ -215,7 +216,7 @@ def test_zju_convention(small):
     assert np.abs(transl - Th).max() > 0.01  # skipping it would be seen
 
 
-# --- as a body of labelled parts ---------------------------------------------------------------
+# --- as a body for segmentation ----------------------------------------------------------------
 
 
 def test_as_body_labels_by_the_first_largest_weight(small):
@@ -252,12 +253,32 @@ def test_as_body_moves_as_the_model_without_blend_shapes(small):
     torch.testing.assert_close(skin(body.vertices, A, t), body.posed_vertices(pose))
 
 
+def test_segmentation_is_built_from_a_model_file(tmp_path):
+    write_smpl(tmp_path / "m.pkl", vertices=2000)
+    body = open_body("smpl", str(tmp_path / "m.pkl"), (0.1, 0.2), CIHP)
+    assert body.label_names == CIHP
+    K = torch.tensor([[[35.0, 0, 16], [0, 35, 16], [0, 0, 1]]])
+    R = torch.tensor([[[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]])  # in front of it, Y up
+    camera = Camera(K, R, -(R @ torch.tensor([[[0.0], [0.85], [3.0]]])).squeeze(-1), (32, 32))
+    with torch.no_grad():
+        segmentation = Segmentation(body)
+        S = segmentation(BodyPose(torch.zeros(1, 24, 3), torch.zeros(1, 3)), camera)
+    names = segmentation.map.names
+    assert S.shape == (1, len(names), 32, 32)
+    assert "hat" in segmentation.map.absent  # no joint wears one: no channel
+    columns = torch.arange(32.0)
+    left, right = (
+        float((S[0, names.index(name)].sum(0) * columns).sum() / S[0, names.index(name)].sum())
+        for name in ("left_arm", "right_arm")
+    )
+    assert left > 16 > right  # it faces the camera
+
+
 def test_open_body_chooses_parts_by_the_labels_names(tmp_path):
     path = str(tmp_path / "m.pkl")
     write_smpl(tmp_path / "m.pkl", vertices=SMALL)
     assert open_body("smpl", path).label_names == CLOTHES
     assert open_body("smpl", path, (), CLOTHES).label_names == CLOTHES
-    assert open_body("smpl", path, (0.1, 0.2), CIHP).label_names == CIHP
     joints = ("background", *SMPL_JOINTS)
     assert open_body("smpl", path, (), joints).label_names == joints
     assert open_body("free") is free_body()

@@ -102,6 +102,12 @@ def test_protocols_that_do_not_fit(layout, changes, error, message):
     ("name", "value", "message"),
     [
         *((name, "x", "must be .* or .*; got 'x'") for name in CHOICES),
+        ("background", "grey", "must be black or white; got 'grey'"),
+        ("psnr_pooling", "split", "must be image or channels"),
+        ("eight_bits", True, "must be none or rounded or cut; got True"),
+        ("truth_outline", 0.5, "must be soft or hard; got 0.5"),
+        ("ssim_window", 7, "must be gaussian or uniform; got 7"),
+        ("lpips_channels", "RGB", "must be rgb or bgr; got 'RGB'"),
         ("region", "mask", "must be full or body_box_cleared or body_box; got 'mask'"),
         ("lpips_region", None, "must be full or mask_crop_512; got None"),
         ("lpips_range", [0, 255], r"must be \[-1.0, 1.0\] or \[0.0, 1.0\]; got \(0, 255\)"),

@@ -167,6 +167,7 @@ def test_forced_values_win_over_the_scene():
     assert found.degree == 3
     assert on(found) == {"view_dependence", "antialias"}
     assert decide(scene(), EffectSettings(view_dependence="on")).degree == 2
+    assert on(decide(scene(), EffectSettings(only=["antialias"]))) == {"antialias"}
 
 
 def test_a_run_is_not_resumed_with_other_effects():
