@@ -123,8 +123,9 @@ def join(scene: Path, capture: Path, folder: Path, own: str, camera: SimpleNames
         print(f"landmarks, {'with scale' if scaled else 'rigid'}: {np.median(error):.1f} mm")
     focal = read_cameras(capture)[NAME].K[0, 0] / camera.K[0, 0]
     print(f"focal length: {100 * (focal - 1):+.1f} %; {len(frames)} frames; scale {s:.3f}")
-    if folder.exists():
-        shutil.rmtree(folder)
+    true = folder.with_name("true")
+    for old in (folder, true):
+        shutil.rmtree(old, ignore_errors=True)
     shutil.copytree(capture, folder)
     cameras = json.loads((folder / "cameras.json").read_text())
     raw = json.loads((scene / "cameras.json").read_text())
@@ -138,8 +139,7 @@ def join(scene: Path, capture: Path, folder: Path, own: str, camera: SimpleNames
                 if int(path.stem) in frames:
                     shutil.copy(path, folder / kind / name)
     (folder / "cameras.json").write_text(json.dumps(cameras))
-    true = folder.with_name("true")
-    shutil.copytree(folder, true, dirs_exist_ok=True)
+    shutil.copytree(folder, true)
     found["p"][:, :33] = (truth - b) @ A / s
     np.savez(true / "landmarks3d.npz", **found)
     return frames.tolist()
