@@ -115,3 +115,28 @@ def test_a_failed_training_is_reported_with_its_last_line(script, tmp_path):
     with pytest.raises(GsganError, match=r"^training one failed: .* \(see .*one\.log\)$"):
         bench_common.train(["size=nosuch"], tmp_path / "runs" / "one")
     assert "nosuch" in (tmp_path / "runs" / "one.log").read_text()
+
+
+def test_faults_are_found_in_a_capture(script, monkeypatch, capture):
+    faults = __import__("faults")
+    kept = [row for row in faults.FAULTS if row[0] == "`t` in mm" or row[0].startswith("K of")][:3]
+    monkeypatch.setattr(faults, "FAULTS", [*kept, ("nothing", lambda _: {}, "one")])
+    assert faults.column(capture) == ["error", "refused", "error", "**not found**"]
+
+
+def test_a_two_alternative_test_counts_what_was_chosen(tmp_path, run, monkeypatch, capsys):
+    def call(*words: str) -> None:
+        monkeypatch.setattr(sys, "argv", ["two_alternatives", str(tmp_path), *words])
+        runpy.run_path(str(SCRIPTS / "two_alternatives.py"), run_name="__main__")
+
+    call(str(run), "--pairs", "2")
+    assert (tmp_path / "page_01.png").is_file()
+    order = json.loads((tmp_path / "order.json").read_text())["left"]
+    answers = tmp_path / "answers.txt"
+    first_wins = ["left" if left == 0 else "right" for left in order]
+    answers.write_text("\n".join(f"{i} {side}" for i, side in enumerate(first_wins, 1)))
+    call("--answers", str(answers))
+    assert f"{run}: {len(order)} of {len(order)}" in capsys.readouterr().out
+    answers.write_text("1 left\n")
+    with pytest.raises(SystemExit, match="expected lines '1 left'"):
+        call("--answers", str(answers))
