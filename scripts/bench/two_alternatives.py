@@ -30,9 +30,9 @@ from gsgan.report.figures.subjects import Shot, Subject, choose_items, make_shot
 
 MARGIN = 0.1  # metres beyond the joints that the images show
 SHARE = 0.3  # of their sides that a crop shows
-HEIGHT = 288  # pixels of a magnified crop
+HEIGHT = 480  # pixels of a magnified crop
 GAP = 8  # pixels between crops
-ROWS = 4  # pairs per page
+ROWS = 3  # pairs per page
 NAMES = ("left", "right", "equal")
 
 
