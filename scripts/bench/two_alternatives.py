@@ -4,11 +4,12 @@
     python scripts/bench/two_alternatives.py build/test runs/study/<a run>
     python scripts/bench/two_alternatives.py build/test --answers answers.txt
 
-Draws pages of crops of held-out images: the truth in the middle, the two runs left and right in
-random order, magnified. Of a single run its image is compared with its own Step I's colour. A crop
-is where the two differ most, chosen without the truth. ``order.json`` holds the order: do not read
-it before judging. ``answers.txt`` has a line per pair, in order: its number and left, right or
-equal.
+Draws pages of crops of held-out images, magnified: the truth in the middle, the two runs left and
+right. Of a single run its image is compared with its own Step I's colour. A crop is where the two
+differ most, chosen without the truth. Every pair comes twice, sides exchanged, in random order, and
+counts only where both answers name the same run: who prefers a side chooses nothing.
+``order.json`` holds the order: do not read it before judging. ``answers.txt`` has a line per row:
+its number and left, right or equal.
 """
 
 from __future__ import annotations
@@ -66,11 +67,11 @@ def draw(folder: Path, runs: list[Path], pairs: int, split: str, seed: int) -> N
     subjects = open_subjects(runs, DataPaths(), "cpu")
     first, second = subjects[0], subjects[-1]
     items = choose_items(first.data, split, frames=None, camera=None, count=pairs)
-    swapped = np.random.default_rng(seed).random(len(items)) < 0.5
+    shots = make_shots(first.data, split, items, MARGIN)
+    shown = np.random.default_rng(seed).permutation(2 * len(shots)).tolist()
     rows = []
-    for number, (shot, swap) in enumerate(
-        zip(make_shots(first.data, split, items, MARGIN), swapped, strict=True), 1
-    ):
+    for number, place in enumerate(shown, 1):
+        shot, swap = shots[place // 2], place % 2
         a = first.image(shot)
         b = step_one(first, shot) if len(runs) == 1 else second.image(shot)
         box = most_disputed(torch.cat([a, b]), SHARE)
@@ -83,22 +84,25 @@ def draw(folder: Path, runs: list[Path], pairs: int, split: str, seed: int) -> N
         name = folder / f"page_{page // ROWS + 1:02d}.png"
         Image.fromarray(np.vstack(rows[page : page + ROWS])).save(name)
     names = [str(runs[0]), str(runs[1]) if len(runs) == 2 else "its Step I's colour"]
-    order = {"runs": names, "left": [int(swap) for swap in swapped]}
-    (folder / "order.json").write_text(json.dumps(order))
+    (folder / "order.json").write_text(json.dumps({"runs": names, "rows": shown}))
 
 
 def count(folder: Path, answers: Path) -> None:
-    """Prints how often each was taken as nearer, and the chance of that if they were equal."""
+    """Prints how often each was chosen twice, and the chance of that if they were equal."""
     order = json.loads((folder / "order.json").read_text())
     lines = dict(line.split() for line in answers.read_text().splitlines() if line.strip())
-    expected = {str(i) for i in range(1, len(order["left"]) + 1)}
-    if set(lines) != expected or not set(lines.values()) <= set(NAMES):
-        raise SystemExit(f"{answers}: expected lines '1 left' to '{len(expected)} equal'")
-    sides = [(NAMES.index(lines[str(i)]), left) for i, left in enumerate(order["left"], 1)]
-    wins = [sum(side != 2 and (left ^ side) == run for side, left in sides) for run in (0, 1)]
+    rows = {str(i): place for i, place in enumerate(order["rows"], 1)}
+    if set(lines) != set(rows) or not set(lines.values()) <= set(NAMES):
+        raise SystemExit(f"{answers}: expected lines '1 left' to '{len(rows)} equal'")
+    chosen: dict[int, set[int | None]] = {}
+    for number, place in rows.items():
+        side = NAMES.index(lines[number])
+        chosen.setdefault(place // 2, set()).add(None if side == 2 else side ^ place % 2)
+    wins = [sum(found == {run} for found in chosen.values()) for run in (0, 1)]
     for name, won in zip(order["runs"], wins, strict=True):
-        print(f"{name}: {won} of {len(sides)}")
-    print(f"equal: {len(sides) - sum(wins)}; p = {binomtest(wins[0], sum(wins) or 1).pvalue:.2g}")
+        print(f"{name}: {won} of {len(chosen)}")
+    undecided = len(chosen) - sum(wins)
+    print(f"undecided: {undecided}; p = {binomtest(wins[0], sum(wins) or 1).pvalue:.2g}")
 
 
 if __name__ == "__main__":

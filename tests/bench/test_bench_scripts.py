@@ -131,12 +131,13 @@ def test_a_two_alternative_test_counts_what_was_chosen(tmp_path, run, monkeypatc
 
     call(str(run), "--pairs", "2")
     assert (tmp_path / "page_01.png").is_file()
-    order = json.loads((tmp_path / "order.json").read_text())["left"]
+    rows = json.loads((tmp_path / "order.json").read_text())["rows"]
     answers = tmp_path / "answers.txt"
-    first_wins = ["left" if left == 0 else "right" for left in order]
-    answers.write_text("\n".join(f"{i} {side}" for i, side in enumerate(first_wins, 1)))
-    call("--answers", str(answers))
-    assert f"{run}: {len(order)} of {len(order)}" in capsys.readouterr().out
+    first_wins = ["right" if place % 2 else "left" for place in rows]
+    for sides, won in ((first_wins, len(rows) // 2), (["left"] * len(rows), 0)):
+        answers.write_text("\n".join(f"{i} {side}" for i, side in enumerate(sides, 1)))
+        call("--answers", str(answers))
+        assert f"{run}: {won} of {len(rows) // 2}" in capsys.readouterr().out
     answers.write_text("1 left\n")
     with pytest.raises(SystemExit, match="expected lines '1 left'"):
         call("--answers", str(answers))
