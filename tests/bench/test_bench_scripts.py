@@ -117,11 +117,13 @@ def test_a_failed_training_is_reported_with_its_last_line(script, tmp_path):
     assert "nosuch" in (tmp_path / "runs" / "one.log").read_text()
 
 
-def test_faults_are_found_in_a_capture(script, monkeypatch, capture):
+def test_faults_are_found_in_a_capture(script, monkeypatch, capture, capsys):
     faults = __import__("faults")
     kept = [row for row in faults.FAULTS if row[0] == "`t` in mm" or row[0].startswith("K of")][:3]
     monkeypatch.setattr(faults, "FAULTS", [*kept, ("nothing", lambda _: {}, "one")])
-    assert faults.column(capture) == ["error", "refused", "error", "**not found**"]
+    faults.main([capture])
+    rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines()[2:]]
+    assert [row[2].strip("| ") for row in rows] == ["error", "refused", "error", "**not found**"]
 
 
 def test_a_two_alternative_test_counts_what_was_chosen(tmp_path, run, monkeypatch, capsys):
