@@ -5,6 +5,7 @@
 Prints a row per fault and a column per capture: *refused* (the dataset cannot be opened), *error*
 or *warning* (new findings, of which one names the changed camera), *unnamed* (none does), or *not
 found*. A fault of one camera is put into the second; those of a pair into the first and third.
+A capture needs three cameras.
 """
 
 from __future__ import annotations
@@ -194,4 +195,4 @@ def main(captures: list[Path]) -> None:
 
 
 if __name__ == "__main__":
-    main([Path(path) for path in sys.argv[1:]])
+    main([Path(path) for path in sys.argv[1:]] or sys.exit(__doc__))

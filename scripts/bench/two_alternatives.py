@@ -33,7 +33,7 @@ MARGIN = 0.1  # metres beyond the joints that the images show
 SHARE = 0.3  # of their sides that a crop shows
 HEIGHT = 480  # pixels of a magnified crop
 GAP = 8  # pixels between crops
-ROWS = 3  # pairs per page
+ROWS = 3  # per page
 NAMES = ("left", "right", "equal")
 
 
