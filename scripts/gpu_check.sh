@@ -85,9 +85,9 @@ if ((${count:-1} > 1)); then
   step ddp_2 120 "$python" -m gsgan.train experiment=smoke "${ddp[@]}" trainer.devices=2 \
     evaluate=false resume=false hydra.run.dir="$out/ddp_2"
 fi
-# the lines of a run have its iterations a second; the stand-in is a smaller network than VGG-16
+# the lines of a run have its iterations a second
 step paper 300 "$python" -m gsgan.train experiment=paper trainer=$trainer \
-  trainer.precision=bf16-mixed "${data[@]}" training.perceptual.weights=auto "${paper[@]}" \
+  trainer.precision=bf16-mixed "${data[@]}" "${paper[@]}" \
   trainer.check_val_every_n_epoch=1 data.val_images=2 evaluate=false resume=false \
   hydra.run.dir="$out/paper"
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 TINY = ["size=tiny", "training=smoke", "data=capture", "data.size=32", "data.crop=null"]
+TINY += ["lpips.nets=[]"]  # the networks take longer than the training
 
 
 # One thread: sums are rounded in another order with another number of threads.

@@ -118,6 +118,17 @@ def entry_module(command: str) -> str:
 
 
 TINY = ("size=tiny", "training=smoke", "data=capture", "data.size=32", "data.crop=null")
+TINY += ("lpips.nets=[]",)
+
+
+@pytest.fixture(scope="session")
+def weights():
+    """Whether pretrained networks are here; in CI they must be."""
+    from gsgan.weights.files import NETWORKS, find
+
+    missing = [net for net in NETWORKS if find(net) is None]
+    if missing:
+        (pytest.fail if "CI" in os.environ else pytest.skip)(f"no weights of {missing}")
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import pytest
 import torch
 from commands import ENVIRONMENT, arguments, refused
 
-METRICS = {"psnr", "ssim", "lpips", "edge_f1", "miou"}
+METRICS = {"psnr", "ssim", "lpips_vgg", "lpips_alex", "edge_f1", "miou"}
 
 
 def test_a_run_leaves_metrics_pictures_config_log_and_checkpoint(run):
@@ -35,7 +35,7 @@ def test_a_run_leaves_metrics_pictures_config_log_and_checkpoint(run):
 def test_the_checkpoint_loads_without_pickle(run):
     checkpoint = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
     assert checkpoint["gsgan"]["step"] == 16
-    assert not any("perceptual.stages" in key for key in checkpoint["state_dict"])
+    assert not any("perceptual.network" in key for key in checkpoint["state_dict"])
 
 
 def test_evaluate_gives_the_same_numbers_again(run, tmp_path, inside):
@@ -190,7 +190,7 @@ def test_an_image_that_cannot_be_read_ends_in_one_sentence(capture, tmp_path, in
     ("argument", "words"),
     [
         ("trainer.precision=3-bits", ("3-bits",)),
-        ("lpips.net=squeeze", ("lpips.net", "vgg or alex")),
+        ("lpips.nets=[squeeze]", ("lpips.nets", "vgg, alex")),
         ("training.step_two.gan=wgan", ("training.step_two.gan", "logistic")),
         ("model.deformation.width=abc", ("model:", "str")),
         ("seed=-1", ("seed", "-1")),

@@ -13,7 +13,7 @@ from commands import refused
 
 from gsgan.utils.errors import GsganError
 
-DATA = ("data=capture", "data.size=32", "data.crop=null", "size=tiny", "lpips.path=null")
+DATA = ("data=capture", "data.size=32", "data.crop=null", "size=tiny", "lpips.nets=[]")
 PROTOCOL = (
     *("protocol=paper_thuman4", "protocol.train_cameras=[cam00,cam01]", "data.size=32"),
     *("protocol.test_cameras=[cam02]", "protocol.train_frames=0-3", "protocol.test_frames=0-3"),

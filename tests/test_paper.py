@@ -115,7 +115,12 @@ UNLISTED = (
         "training.schedule.stretch",
         "training.schedule.coarse",
     ),
-    *("model.segmentation.hands_face", "training.perceptual.width", "training.recipes.psi.span"),
+    *(
+        "model.segmentation.hands_face",
+        "training.perceptual.width",
+        "training.perceptual.weights",
+        "training.recipes.psi.span",
+    ),
     *("model.backend", "model.window_multiple", "model.window_least"),
     *("training.seed", "training.log_every", "training.max_skipped", "training.skip_window"),
     *("training.rollback", "training.average_every", "training.perceptual.path"),

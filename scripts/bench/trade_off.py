@@ -18,6 +18,7 @@ from typing import Any
 import bench_common
 import numpy as np
 import pandas as pd
+import torch
 from omegaconf import DictConfig, OmegaConf
 from timing import interleaved
 from torch import Tensor
@@ -36,7 +37,6 @@ from gsgan.bench.speed import (
 )
 from gsgan.data.datamodule import GsganData
 from gsgan.metrics.image import edge_f1, psnr, ssim
-from gsgan.metrics.lpips import lpips
 from gsgan.model.assemble import build_data
 from gsgan.model.avatar import Avatar
 from gsgan.model.runs import load_avatar
@@ -45,6 +45,7 @@ from gsgan.scene import Frame
 from gsgan.splat import BACKENDS, Accuracy
 from gsgan.utils.checks import above, between, one_of
 from gsgan.utils.errors import ConfigError, DataError
+from gsgan.weights.networks import Lpips
 
 BASE = "base"
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h")
@@ -149,7 +150,9 @@ def run(config: DictConfig, folder: Path) -> None:
     one_of("split", config.split, ("novel_pose", "novel_view"))
     one_of("quality", config.quality, QUALITIES)
     bench = bench_common.Bench.start("trade_off", config, folder)
-    perceptual, _ = lpips(config.lpips.net, config.lpips.path)
+    perceptual = None
+    if config.lpips.net is not None:
+        perceptual = Lpips(config.lpips.net, config.lpips.path).eval().to(bench.device)
     runs = trained(config, bench)
     subject = standard_run(runs).folder
     points = [*runs, *ways(subject, config.settings)]
@@ -321,7 +324,8 @@ def quality(
         ``{metric: value or NaN, "left_out": scores, "memory_mb": value or None}``.
     """
     metrics: dict[str, Score] = {"psnr": psnr, "ssim": ssim, "edge_f1": edge_f1}
-    metrics |= {} if perceptual is None else {"lpips": perceptual}
+    if perceptual is not None:
+        metrics["lpips"] = torch.no_grad()(perceptual)
     rows = []
     for frame in frames:
         image = painter(frame).clamp(0, 1)
@@ -384,7 +388,7 @@ def text(
     """The block of the page, less its plot: the machine, the table of ``make_rows``, the notes."""
     notes = list(marks)
     if frame.lpips.isna().all():
-        notes.append("LPIPS n/a: the backbone's weights are not available")
+        notes.append("LPIPS n/a: left out by lpips.net")
     if frame.left_out.any():
         notes.append(f"{frame.left_out.sum()} scores were not finite and are not in the means")
     heading = (

@@ -10,6 +10,7 @@ COMMANDS = {
     "gsgan.view": "look at an avatar in the browser, drag its joints: run=<folder>",
     "gsgan.export": "write .ply, glTF, ONNX, torch.export, safetensors: run=<folder> out=<file>",
     "gsgan.report": "tables of scored runs, runs=[<folder>,…], and figures of a run, run=<folder>",
+    "gsgan.weights": "find or download the networks of the perceptual loss and of LPIPS",
     "gsgan.bench": "measure milliseconds from skeleton to image: speed",
 }
 

@@ -136,14 +136,14 @@ def test_frames_by_subject():
 
 def test_departures_are_said():
     same = replace(ONE, scale=0.5)
-    assert list(same.departures(lpips_net="vgg", scale=0.5)) == []
+    assert list(same.departures(lpips_nets=["vgg"], scale=0.5)) == []
     other = replace(ONE, measures=MetricVariants(background="white", lpips_range=(0, 1)))
-    said = list(other.departures(lpips_net="alex", scale=0.25))
+    said = list(other.departures(lpips_nets=["alex"], scale=0.25))
     assert said == [  # what the measures ask for is done
-        "LPIPS backbone is alex, requested: vgg",
+        "LPIPS is not computed with vgg, as requested (lpips.nets)",
         "images are scored at scale 0.25, requested: 1 (data.size)",
     ]
-    assert "cut round the person" in next(ONE.departures(lpips_net="vgg", scale=None))
+    assert "cut round the person" in next(ONE.departures(lpips_nets=["vgg"], scale=None))
     assert set(CHOICES) == set(ONE.record()["measures"])
 
 
@@ -151,15 +151,15 @@ def test_the_data_follows_the_protocol_and_records_it(root):
     data = GsganData(str(root), size=16, protocol=replace(ONE, scale=0.5))
     assert len(data.dataset("train")) == 6
     assert data.eval_names == ("novel_view", "novel_pose")
-    record = data.protocol_record("vgg")
+    record = data.protocol_record(["vgg"])
     assert json.loads(json.dumps(record)) == record  # plain values
     assert record["name"] == "one"
     (padded,) = record["departures"]  # 16 of 32 pixels, but the pictures are 32 x 24
     assert padded.startswith("images are padded to squares with black")
-    whole = GsganData(str(root), protocol=ONE).protocol_record("vgg")
+    whole = GsganData(str(root), protocol=ONE).protocol_record(["vgg"])
     assert whole["departures"] == []
-    assert GsganData(str(root)).protocol_record("vgg") is None
-    cut = GsganData(str(root), size=16, crop="person", protocol=ONE).protocol_record("vgg")
+    assert GsganData(str(root)).protocol_record(["vgg"]) is None
+    cut = GsganData(str(root), size=16, crop="person", protocol=ONE).protocol_record(["vgg"])
     assert len(cut["departures"]) == 1
 
 

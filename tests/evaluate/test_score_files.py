@@ -15,7 +15,7 @@ def variant() -> dict:
     return no_scores(METRICS, "none") | {
         "images": 1,
         "marks": [],
-        "lpips_name": None,
+        "lpips_input": None,
         "cameras": {},
         "protocol": None,
     }
@@ -28,7 +28,7 @@ def scored(split: str) -> Scored:
         "version": "1",
     }  # fmt: skip
     row = {"split": split, "variant": "full", "camera": "001", "frame": 3}
-    row |= {"psnr": 1 / 3, "ssim": math.inf, "lpips": 1e-05, "miou": math.nan}
+    row |= {"psnr": 1 / 3, "ssim": math.inf, "lpips_alex": 1e-05, "miou": math.nan}
     rows = pd.DataFrame([row], columns=HEADER)
     return Scored({split: {"full": variant()}}, rows, facts)
 
@@ -40,7 +40,7 @@ def test_the_csv_keeps_every_digit(tmp_path):
         (line,) = csv.DictReader(stream)
     assert tuple(line) == HEADER
     assert float(line["psnr"]) == 1 / 3
-    assert (line["ssim"], line["miou"], line["lpips"]) == ("inf", "", "1e-05")
+    assert (line["ssim"], line["miou"], line["lpips_alex"]) == ("inf", "", "1e-05")
     assert (line["split"], line["camera"], line["frame"]) == ("novel_pose", "001", "3")
 
 

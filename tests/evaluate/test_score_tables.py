@@ -32,8 +32,10 @@ def results(marks=("perceptual loss: stand-in",), boxes=None):
     scores = {
         "psnr": 30.123, "psnr_person": 28.0, "psnr_inside": 31.0, "ssim": 0.98,
         "high_frequencies": 0.9, "ssim_person": 0.9, "flicker": 0.01,
-        "lpips": None, "lpips_reason": "no weights", "lpips_name": None,
-        "lpips_person": None, "lpips_person_reason": "no weights", "edge_f1_person": 0.5,
+        "lpips_input": "[-1,1]", "lpips_alex": 0.01, "lpips_alex_person": 0.02,
+        "lpips_vgg": None, "lpips_vgg_reason": "left out by lpips.nets",
+        "lpips_vgg_person": None, "lpips_vgg_person_reason": "left out by lpips.nets",
+        "edge_f1_person": 0.5,
         "edge_ratio_person": 1.2, "edge_f1": 0.5, "edge_ratio": 1.25, "miou": 0.9,
         "miou_with_background": 0.95,
         "images": 3, "marks": list(marks), "boxes": boxes,
@@ -42,7 +44,7 @@ def results(marks=("perceptual loss: stand-in",), boxes=None):
     scores |= held if boxes else no_scores(BOX_METRICS, "no hands")
     scores["cameras"] = {"cam07": dict.fromkeys(METRICS) | {"psnr": 29.5}}
     split = {"full": dict(scores), "splat": dict(scores), "floor": dict(scores)}
-    scorer = Scorer(Preparation(MetricVariants(), None), None, "no weights", "LPIPS", list(marks))
+    scorer = Scorer(Preparation(MetricVariants(), None), marks=list(marks))
     unscored = {name: empty("no camera is held out", scorer) for name in split}
     return {"novel_view": unscored, "novel_pose": split}
 
@@ -53,7 +55,8 @@ def test_every_table_shows_floor_mark_reason_and_what_was_scored():
     for text in (console.export_text(), markdown(results(), FACTS)):
         assert "floor" in text
         assert "marked: perceptual loss: stand-in" in text
-        assert "lpips, lpips_person n/a: no weights" in text
+        assert "lpips_vgg, lpips_vgg_person n/a: left out by lpips.nets" in text
+        assert "LPIPS' networks get [-1,1]" in text
         assert "psnr_mouth, ssim_mouth n/a: no hands" in text
         assert "novel_view: no camera is held out" in text
         assert "30.12" in text
@@ -97,7 +100,7 @@ def test_metrics_json_has_the_promised_shape(tmp_path):
 
 def test_notes_say_each_thing_once():
     said = notes(results())
-    assert len(said) == len(set(said)) == 4
+    assert len(said) == len(set(said)) == 5
 
 
 def test_a_caption_names_what_is_not_known():

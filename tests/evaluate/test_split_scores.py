@@ -26,17 +26,16 @@ def person(size: int = 24) -> Frame:
 
 
 def scorer(measures: MetricVariants | None = None) -> Scorer:
-    return Scorer(
-        Preparation(measures or MetricVariants(), None), None, "no weights", "LPIPS-VGG [-1,1]"
-    )
+    return Scorer(Preparation(measures or MetricVariants(), None))
 
 
 def test_equal_images_are_kept_out_of_the_mean():
     rows = [{"psnr": score} for score in (math.inf, 30.0, 20.0, math.nan)]
     found = means(rows)
     assert (found["psnr"], found["psnr_left_out"]) == (25.0, 2)
-    assert found["lpips"] is None
-    assert "lpips_left_out" not in found
+    assert found["lpips_vgg"] is None
+    assert found["lpips_vgg_reason"] == "left out by lpips.nets"
+    assert "lpips_vgg_left_out" not in found
 
 
 def test_means_by_camera_and_over_all():
@@ -177,22 +176,3 @@ def test_miou_of_a_split_without_parts_is_none():
     )
     assert found.variants[FULL]["miou"] is None
     assert found.variants[FULL]["miou_reason"] == "the ground truth has no part"
-
-
-def test_lpips_in_the_persons_box_sees_that_box_alone():
-    seen = []
-
-    def spy(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-        seen.append(tuple(image.shape))
-        return (image - target).abs().flatten(1).mean(dim=1)
-
-    target, mask = torch.zeros(1, 3, 100, 120), torch.zeros(1, 1, 100, 120)
-    mask[..., 10:90, 20:50] = 1
-    image = target.clone()
-    image[:, :, :, 90:] = 1.0  # wrong, but far from the person
-    nobody = torch.zeros_like(mask)
-    result = means([image_scores(image, target, m, lpips=spy) for m in (mask, nobody)])
-    assert set(seen) == {(1, 3, 100, 120), (1, 3, 80, 64)}  # 30 columns, widened to 64
-    assert result["lpips"] == pytest.approx(0.25)
-    assert result["lpips_person"] == 0.0
-    assert result["lpips_person_left_out"] == 1

@@ -131,7 +131,7 @@ def test_a_lens_moves_the_boxes_with_the_landmarks():
 
 
 def scored(predicted: torch.Tensor, *frames: Frame, skeleton: str = NAME) -> dict:
-    scorer = Scorer(Preparation(MetricVariants(), None, skeleton), None, "no weights", "LPIPS")
+    scorer = Scorer(Preparation(MetricVariants(), None, skeleton))
     items = [(("a", i), f) for i, f in enumerate(frames)]
     return score_split(items, lambda *_: Prediction({FULL: predicted}, {}), scorer).variants[FULL]
 

@@ -26,7 +26,7 @@ def test_mean_spread_seeds_and_floor(tmp_path):
     (grid,) = report.grids
     full = row(grid, "full")
     assert texts(full) == ["31.00 ± 1.00", "n/a"]
-    assert full.cells[1].notes == ("n/a: weights are not available",)
+    assert full.cells[1].notes == ("n/a: left out by lpips.nets",)
     assert (full.cells[0].mean, full.cells[0].spread) == (31.0, 1.0)  # divided by n - 1
     assert full.origin == ("3", "synthetic, person", "none", "abc123")
     floor = row(grid, "all background (floor)")
@@ -35,11 +35,11 @@ def test_mean_spread_seeds_and_floor(tmp_path):
 
 
 def test_a_value_that_some_seeds_lack_is_counted_and_explained(tmp_path):
-    runs = [*seeds(tmp_path, values=(30.0, 31.0), lpips=0.1)]
+    runs = [*seeds(tmp_path, values=(30.0, 31.0), lpips_vgg=0.1)]
     runs.append(write_run(tmp_path / "x", "full", 2, psnr=32.0))
     full = row(report_of(table(), *runs).grids[0], "full")
     assert texts(full) == ["31.00 ± 1.00", "0.1000 ± 0.0000"]
-    assert full.cells[1].notes == ("seed 2: weights are not available",)
+    assert full.cells[1].notes == ("seed 2: left out by lpips.nets",)
 
 
 def test_marks_departures_and_left_out_images_are_noted(tmp_path):
@@ -57,12 +57,14 @@ def test_marks_departures_and_left_out_images_are_noted(tmp_path):
 
 
 def test_the_best_of_several_rows_is_emphasised(tmp_path):
-    lower = {"lpips": 0.1, "lpips_name": "LPIPS-VGG", "edge_ratio": 1.2}
+    lower = {"lpips_vgg": 0.1, "lpips_input": "[-1,1]", "edge_ratio": 1.2}
     runs = [
         write_run(tmp_path / "a", "a", psnr=30.0, **lower),
-        write_run(tmp_path / "b", "b", psnr=31.0, **(lower | {"lpips": 0.2, "edge_ratio": 0.9})),
+        write_run(
+            tmp_path / "b", "b", psnr=31.0, **(lower | {"lpips_vgg": 0.2, "edge_ratio": 0.9})
+        ),
     ]
-    (grid,) = report_of(table(metrics=["psnr", "lpips", "edge_ratio"]), *runs).grids
+    (grid,) = report_of(table(metrics=["psnr", "lpips_vgg", "edge_ratio"]), *runs).grids
     found = {r.label: [cell.best for cell in r.cells] for r in grid.rows}
     assert found == {
         "a": [False, True, False],
@@ -110,13 +112,13 @@ MIXTURES = {
     "other images": ({"floor": {"psnr": 15.6}}, "all-background image: 15.5 and 15.6"),
     "fewer images": ({"images": 2}, "images scored: 3 and 2"),
     "changed code": ({"facts": {"dirty": True}}, "uncommitted changes"),
-    "another LPIPS": ({"lpips": 0.1, "lpips_name": "LPIPS-Alex"}, "LPIPS-VGG and LPIPS-Alex"),
+    "another LPIPS": ({"lpips_vgg": 0.1, "lpips_input": "[0,1]"}, r"\[-1,1\] and \[0,1\]"),
 }
 
 
 @pytest.mark.parametrize(("held", "message"), MIXTURES.values(), ids=MIXTURES)
 def test_runs_that_do_not_belong_in_one_column_are_refused_by_name(tmp_path, held, message):
-    first = write_run(tmp_path / "first", psnr=30.0, lpips=0.2, lpips_name="LPIPS-VGG")
+    first = write_run(tmp_path / "first", psnr=30.0, lpips_vgg=0.2, lpips_input="[-1,1]")
     other = write_run(tmp_path / "other", "wo_seg", psnr=29.0, **held)
     with pytest.raises(ConfigError, match=message) as caught:
         report_of(table(), first, other)

@@ -30,7 +30,9 @@ def test_step_two_compares_on_white_by_alpha_and_mask():
 
     def terms(loss: StepTwoLoss) -> dict[str, torch.Tensor]:
         painting = Rendering(image, alpha)
-        return loss.terms(painting, frame, anchor=None, perceptual=None, maps=None, step=0)
+        return loss.terms(
+            painting, frame, anchor=None, perceptual=None, draws=None, maps=None, step=0
+        )
 
     found = terms(weights)
     off = ((image + 1 - alpha) - (frame.image + 1 - frame.mask)).detach() * (frame.unsure == 0)

@@ -119,7 +119,9 @@ def test_bugs_keep_their_traceback_and_mistakes_get_a_sentence():
         ("training.schedule.step_two=-1", "schedule.step_two must be a number of at least 0"),
         ("+model.densify.colour=1", "unexpected keyword argument 'colour'"),
         ("+model.generator.colour=1", "unexpected keyword argument 'colour'"),
-        ("training.perceptual.weights=resnet", "vgg16, auto or random"),
+        ("training.perceptual.weights=resnet", "pretrained, random"),
+        ("training.perceptual.net=resnet", "vgg, alex"),
+        ("training.perceptual.crop=8", "training.perceptual.crop must be"),
         ("data.crop=car", "data.crop must be null or person"),
     ],
 )

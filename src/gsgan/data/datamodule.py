@@ -259,11 +259,11 @@ class GsganData(LightningDataModule):
         assert self.source is not None  # checked in __init__
         return self.source()
 
-    def protocol_record(self, lpips_net: str) -> dict[str, Any] | None:
+    def protocol_record(self, lpips_nets: Sequence[str]) -> dict[str, Any] | None:
         """The record beside every score: the protocol and where this run departs from it.
 
         Args:
-            lpips_net: LPIPS's backbone.
+            lpips_nets: the networks that LPIPS is computed with.
         """
         if self.protocol is None:
             return None
@@ -271,7 +271,7 @@ class GsganData(LightningDataModule):
         scale = None if self.crop is not None else (self.size or sides[0]) / sides[0]
         oblong = any(c.size[0] != c.size[1] for c in self.layout.cameras.values())
         padded = self.crop is None and self.size is not None and oblong
-        departures = self.protocol.departures(lpips_net=lpips_net, scale=scale, padded=padded)
+        departures = self.protocol.departures(lpips_nets=lpips_nets, scale=scale, padded=padded)
         return self.protocol.record() | {"departures": list(departures)}
 
     @property

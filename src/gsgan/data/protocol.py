@@ -28,7 +28,7 @@ class Protocol:
         test_frames: the same.
         measures: the scored region of the images, and the variants of the metrics.
         scale: images are scored at this fraction of their stored size.
-        lpips_net: backbone.
+        lpips_net: the network of its LPIPS.
         source: of this definition.
         note: further remarks for readers of the numbers.
         subject: selects the frames, where they differ by subject.
@@ -79,18 +79,18 @@ class Protocol:
         return plain
 
     def departures(
-        self, *, lpips_net: str, scale: float | None, padded: bool = False
+        self, *, lpips_nets: Sequence[str], scale: float | None, padded: bool = False
     ) -> Iterator[str]:
         """Departures of images and backbone from the protocol, one sentence each.
 
         Args:
-            lpips_net: the backbone in use.
+            lpips_nets: the networks that LPIPS is computed with.
             scale: fraction of the stored size at which images are scored; None when they are cut
                 round the person.
             padded: whole images are padded with black to squares.
         """
-        if lpips_net != self.lpips_net:
-            yield f"LPIPS backbone is {lpips_net}, requested: {self.lpips_net}"
+        if self.lpips_net not in lpips_nets:
+            yield f"LPIPS is not computed with {self.lpips_net}, as requested (lpips.nets)"
         if scale is None:
             yield "images are cut round the person, requested: whole images (data.crop=null)"
         elif abs(scale - self.scale) > 1e-3:

@@ -23,10 +23,10 @@ HEADER = ("split", "variant", "camera", "frame", *METRICS)
 Results = dict[str, dict[str, dict[str, Any]]]
 TITLE = "Held-out cameras (novel_view) and poses (novel_pose)"
 IN_TERMINAL = (  # narrow; metrics.md has all metrics
-    *("psnr", "psnr_person", "ssim", "lpips", "edge_f1", "edge_ratio", "high_frequencies", "miou"),
+    *("psnr", "psnr_person", "ssim", "lpips_vgg", "lpips_alex", "high_frequencies", "miou"),
 )
 WITH_HANDS = (  # where hands are scored, theirs in place of edges
-    *("psnr", "psnr_person", "psnr_hands", "psnr_mouth", "ssim", "lpips", "high_frequencies"),
+    *("psnr", "psnr_person", "psnr_hands", "psnr_mouth", "ssim", "lpips_alex", "high_frequencies"),
     "miou",
 )
 VARIANTS = {"full": "final image", "splat": "Step I's colour", "floor": "floor: background"}
@@ -82,8 +82,8 @@ def notes(results: Results) -> list[str]:
     found: dict[str, None] = {}
     for split, variants in results.items():
         scores = variants["full"]
-        if name := scores.get("lpips_name"):
-            found[f"LPIPS is {name}"] = None
+        if described := scores.get("lpips_input"):
+            found[f"LPIPS' networks get {described}"] = None
         if boxes := scores.get("boxes"):
             found[f"boxes: {boxes}"] = None
         for mark in scores["marks"]:

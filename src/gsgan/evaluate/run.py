@@ -25,7 +25,7 @@ from gsgan.evaluate.grids import write_grid
 from gsgan.evaluate.origin import Method, origin, trained
 from gsgan.evaluate.predictions import FLOOR, FULL, BodyBoxes, Preparation, read_folder
 from gsgan.evaluate.scores import Predict, Scorer, SplitScores, empty, painter, score_split
-from gsgan.metrics.lpips import lpips
+from gsgan.metrics.lpips import LPIPS_NETS, build_lpips
 from gsgan.metrics.regions import BACKGROUNDS
 from gsgan.model.assemble import build_data
 from gsgan.model.runs import avatar_of, load_avatar
@@ -36,7 +36,7 @@ from gsgan.utils.files import write_atomically
 from gsgan.utils.tensors import pick_device
 
 CSV, PNG = "distance.csv", "distance.png"
-COLUMNS = ("psnr_person", "ssim_person", "lpips_person", "flicker")
+COLUMNS = ("psnr_person", "ssim_person", "lpips_vgg_person", "lpips_alex_person", "flicker")
 BINS = (0, 1, 2, 3, 4, 6, 8, 12, np.inf)  # distances
 
 
@@ -140,6 +140,8 @@ def evaluate_folder(config: DictConfig, console: Console, device: torch.device) 
     """Loads the avatar of ``config.run`` and scores it."""
     folder, other = Path(config.run).expanduser(), config.get("on") is not None
     out, stored = folder, read_config(folder)
+    if config.lpips.nets is None:
+        config.lpips.nets = OmegaConf.select(stored, "lpips.nets", default=list(LPIPS_NETS))
     checkpoint = read_checkpoint(folder / CHECKPOINT)
     state = checkpoint["gsgan"]
     if other:
@@ -201,6 +203,8 @@ def evaluate_predictions(config: DictConfig, console: Console, device: torch.dev
         raise ConfigError("data is not set: give that of the predictions with data= and data.root=")
     root = Path(config.predictions).expanduser()
     name = config.method or root.resolve().name
+    if config.lpips.nets is None:
+        config.lpips.nets = list(LPIPS_NETS)
     data = build_data(config)
     out = _out(config, root.resolve(), name)
     datasets = {split: data.dataset(split) for split in config.splits}
@@ -316,8 +320,8 @@ def make_scorer(config: DictConfig, data: GsganData, marks: Sequence[str]) -> Sc
     """How the images of a dataset are scored: by its protocol, on the config's background.
 
     Raises:
-        ConfigError: on an unknown LPIPS backbone.
-        DataError: when a given weight file or body model cannot be read.
+        ConfigError: on an unknown network of LPIPS.
+        DataError: if LPIPS' weights or a body model cannot be read.
     """
     measures, background = _measures(data), config.get("background")
     if background not in (None, measures.background):
@@ -326,27 +330,20 @@ def make_scorer(config: DictConfig, data: GsganData, marks: Sequence[str]) -> Sc
     if frames := data.registered_held_out:
         marks = [*marks, f"body poses of {len(frames)} held-out frames fitted to their own masks"]
     boxes = BodyBoxes(data) if measures.needs_body_box else None
-    record = data.protocol_record(config.lpips.net)
+    record = data.protocol_record(config.lpips.nets)
     if record is not None:
         asked = record["measures"]["background"]
         if asked != measures.background:
             different = f"background is {measures.background}, asked for: {asked}"
             record["departures"].append(different)
         record["departures"] += [] if boxes is None else boxes.departures
-    score, reason = lpips(config.lpips.net, config.lpips.path, measures.lpips_range)
-    name = lpips_name(config.lpips.net, measures)
-    prepare = Preparation(measures, boxes, data.skeleton)
-    return Scorer(prepare, score, reason, name, list(marks), record)
+    return Scorer(
+        prepare=Preparation(measures, boxes, data.skeleton),
+        lpips=build_lpips(config.lpips.nets, config.lpips.path),
+        marks=list(marks),
+        protocol=record,
+    )
 
 
 def _measures(data: GsganData) -> MetricVariants:
     return MetricVariants() if data.protocol is None else data.protocol.measures
-
-
-def lpips_name(net: str, measures: MetricVariants) -> str:
-    """The name of an LPIPS: backbone, input range, and order of channels and region where those are
-    not the defaults."""
-    low, high = measures.lpips_range
-    order = "" if measures.lpips_channels == "rgb" else " BGR"
-    region = "" if measures.lpips_region == "full" else " mask crop 512"
-    return f"LPIPS-{'VGG' if net == 'vgg' else 'Alex'} [{low:g},{high:g}]{order}{region}"

@@ -26,16 +26,18 @@ from gsgan.metrics.image import (
     ssim_uniform,
     ssim_where,
 )
+from gsgan.metrics.lpips import LpipsAgainst, LpipsScores
 from gsgan.metrics.names import BOX_METRICS, IMAGE_METRICS, METRICS, PART_METRICS
-from gsgan.metrics.regions import BACKGROUNDS, cleared, describe_boxes, mask_crop, rectangle
+from gsgan.metrics.regions import BACKGROUNDS, cleared, describe_boxes, rectangle
 from gsgan.metrics.segmentation import confusion, miou
 from gsgan.model.avatar import Avatar
 from gsgan.model.rendering import Rendering
 from gsgan.scene import Frame
 from gsgan.utils.errors import GsganError
+from gsgan.weights.networks import Lpips
 
-LPIPS_LEAST = 64  # pixels: AlexNet's last map is empty below
 NO_PAIR = "no two images are of consecutive frames, in one window of one camera"
+NO_LPIPS = "left out by lpips.nets"
 NO_LABELS = "the data has no part labels"
 NO_PARTS_OF_SPLAT = "Step I's colour is not a segmentation"
 NO_PARTS_OF_FLOOR = "an all-background image is not a segmentation"
@@ -51,7 +53,7 @@ def image_scores(
     *,
     regions: Mapping[str, Tensor] | None = None,
     measures: MetricVariants | None = None,
-    lpips: Score | None = None,
+    lpips: LpipsScores | None = None,
 ) -> dict[str, float]:
     """The scores of one image, clamped to [0, 1].
 
@@ -61,7 +63,7 @@ def image_scores(
         box: ``[1, 1, H, W]`` bool, the body's projected box; required where the measures use it.
         regions: of hands and mouth, from `gsgan.metrics.regions.hands_and_mouth`.
         measures: regions and ranges; None takes the defaults.
-        lpips: from `gsgan.metrics.lpips.lpips`.
+        lpips: against this ground truth, a `gsgan.metrics.lpips.LpipsAgainst`.
 
     Returns:
         ``{metric: score}``; a metric that was not computed is absent, an undefined one NaN.
@@ -90,27 +92,17 @@ def image_scores(
         scores[f"psnr_{name}"] = psnr_where(image, target, region)
         scores[f"ssim_{name}"] = mean
     if lpips is not None:
-        if measures.lpips_channels == "bgr":
-            image, target = image.flip(1), target.flip(1)
-        if mask is not None:
-            scores["lpips_person"] = _inside(person, lpips, image, target, LPIPS_LEAST)
-        if measures.lpips_region == "full":
-            scores["lpips"] = lpips(image, target)
-        else:
-            assert mask is not None
-            crops = [mask_crop(x[0], mask[0], background) for x in (image, target)]
-            found = [crop[None] for crop in crops if crop is not None]
-            scores["lpips"] = lpips(*found) if len(found) == 2 else math.nan
+        scores |= lpips(image)
     return {metric: float(scores[metric]) for metric in IMAGE_METRICS if metric in scores}
 
 
-def _inside(box: Tensor, score: Score, a: Tensor, b: Tensor, least: int = 1) -> Tensor | float:
-    """The score of a box's rectangle, at least ``least`` pixels wide; NaN for an empty box."""
-    part = rectangle(box[0], least)
+def _inside(box: Tensor, score: Score, a: Tensor, b: Tensor) -> Tensor | float:
+    """The score of a box's rectangle; NaN for an empty box."""
+    part = rectangle(box[0])
     return math.nan if part is None else score(*(x[:, :, part[0], part[1]] for x in (a, b)))
 
 
-def means(rows: Sequence[Mapping[str, Any]], lpips_reason: str = "") -> dict[str, Any]:
+def means(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """``{metric: mean or None, metric_left_out: number, metric_reason: why None}`` of images.
 
     Scores that are not finite are left out of the mean.
@@ -124,7 +116,7 @@ def means(rows: Sequence[Mapping[str, Any]], lpips_reason: str = "") -> dict[str
             result[f"{metric}_left_out"] = left_out
         if not finite:
             no_score = "no image has a finite score" if left_out else "no image"
-            missing = lpips_reason if metric.startswith("lpips") else ""
+            missing = NO_LPIPS if metric.startswith("lpips") else ""
             missing = NO_PAIR if metric == "flicker" else missing
             result[f"{metric}_reason"] = missing or no_score
     return result
@@ -139,16 +131,13 @@ class Scorer:
 
     Args:
         prepare: applied to them first.
-        lpips, lpips_reason: from `gsgan.metrics.lpips.lpips`.
-        lpips_name: backbone, range and region of LPIPS.
+        lpips: networks by name, from `gsgan.metrics.lpips.build_lpips`.
         marks: notes that every table must carry.
         protocol: its record with every departure, or None.
     """
 
     prepare: Preparation
-    lpips: Score | None
-    lpips_reason: str
-    lpips_name: str
+    lpips: Mapping[str, Lpips] = field(default_factory=dict)
     marks: list[str] = field(default_factory=list)
     protocol: dict[str, Any] | None = None
 
@@ -252,6 +241,9 @@ class _Tally:
             painting = Rendering(images[FULL], corrected=images.get(SPLAT), segmentation=parts)
             self.grid += grid_rows(replace(frame, image=target), painting)
         images[FLOOR] = torch.full_like(frame.image, prepare.background)
+        lpips = None
+        if self.scorer.lpips:
+            lpips = LpipsAgainst(target, frame.mask, self.scorer.lpips, prepare.measures)
         follows = self.last is not None and _follows(item, frame, *self.last[:2])
         for name, image in images.items():
             own = image_scores(
@@ -261,7 +253,7 @@ class _Tally:
                 box,
                 regions=regions,
                 measures=prepare.measures,
-                lpips=self.scorer.lpips,
+                lpips=lpips,
             )
             if follows and self.last is not None:
                 last = self.before[name], self.last[2], self.last[1].mask
@@ -302,7 +294,7 @@ def _variant(
     rows: Sequence[Row], matrices: dict[str, Tensor], no_parts: str, scorer: Scorer
 ) -> dict[str, Any]:
     """One variant as in metrics.json."""
-    result = means(rows, scorer.lpips_reason)
+    result = means(rows)
     if describe_boxes(scorer.prepare.skeleton) is None:
         result |= no_scores(BOX_METRICS, f"the skeleton {scorer.prepare.skeleton} has no hands")
     if matrices:
@@ -326,9 +318,20 @@ def empty(reason: str, scorer: Scorer) -> dict[str, Any]:
 
 
 def _common(scorer: Scorer, images: int) -> dict[str, Any]:
-    name = scorer.lpips_name if scorer.lpips is not None else None
-    boxes = describe_boxes(scorer.prepare.skeleton)
-    return {"images": images, "marks": list(scorer.marks), "lpips_name": name, "boxes": boxes}
+    return {
+        "images": images,
+        "marks": list(scorer.marks),
+        "lpips_input": lpips_input(scorer.prepare.measures) if scorer.lpips else None,
+        "boxes": describe_boxes(scorer.prepare.skeleton),
+    }
+
+
+def lpips_input(measures: MetricVariants) -> str:
+    """What LPIPS' networks get: the range, and order of channels and region if not the defaults."""
+    low, high = measures.lpips_range
+    order = "" if measures.lpips_channels == "rgb" else " BGR"
+    region = "" if measures.lpips_region == "full" else " mask crop 512"
+    return f"[{low:g},{high:g}]{order}{region}"
 
 
 def no_scores(metrics: Iterable[str], reason: str) -> dict[str, Any]:

@@ -42,7 +42,13 @@ HOLDS = {
     "safetensors": "The weights, with the config as metadata: "
     "`gsgan.export.weights.load_weights(file)` gives the avatar.",
 }
-SCORES = {"psnr": "PSNR ↑", "ssim": "SSIM ↑", "lpips": "LPIPS ↓", "edge_f1": "edge F1 ↑"}
+SCORES = {
+    "psnr": "PSNR ↑",
+    "ssim": "SSIM ↑",
+    "lpips_vgg": "LPIPS-VGG ↓",
+    "lpips_alex": "LPIPS-Alex ↓",
+    "edge_f1": "edge F1 ↑",
+}
 VARIANTS = {"full": "final image", "splat": "Step I's colour"}
 USE = """\
 Images of this one person in new poses and from new cameras, with the person's consent: sign

@@ -1,82 +1,111 @@
-"""L_perc: distance between features of a pretrained VGG-16, or of a marked random network."""
+"""L_perc: distance between features of a pretrained network, in the whole image or in crops."""
 
+from collections.abc import Sequence
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, distributed, nn
 from torch.nn import functional
 
-from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.checks import one_of, whole
+from gsgan.weights.files import NETWORKS
+from gsgan.weights.networks import FeatureNetwork, Lpips, pretrained
 
-IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-FILES = {"vgg16": "vgg16-397923af.pth", "alexnet": "alexnet-owt-7be5be79.pth"}
-VGG_TAPS = (3, 8, 15, 22)  # relu1_2, relu2_2, relu3_3, relu4_3 in torchvision's vgg16.features
+FEATURES, LPIPS = FORMS = ("features", "lpips")
+PRETRAINED, RANDOM = SOURCES = ("pretrained", "random")
+VGG_LAYERS = 4  # relu1_2, relu2_2, relu3_3, relu4_3, as Johnson et al.
+LEAST_CROP = 32  # pixels: AlexNet's last map is empty below
+ANYWHERE = 1e-6  # weight of a pixel off the person, so that a crop exists without a person
 
 
 class Perceptual(nn.Module):
-    """Squared feature distance, the layers weighted by the inverse of their first losses.
+    """Perceptual distance of two images, in the whole image or in crops of the person.
 
-    No weights are published for these layers, so they are measured: each layer's weight is the
-    inverse of its mean loss over the first ``warmup`` calls of all processes (weights sum to 1),
-    then frozen and stored in the checkpoint.
+    The form ``features`` is the squared distance of the features, each layer weighted by the
+    inverse of its first losses. The paper does not give the weights of the layers, so they are
+    measured: each is the inverse of the layer's mean loss over the first ``warmup`` calls of all
+    processes (the weights sum to 1), then it is frozen and stored in the checkpoint. The form
+    ``lpips`` is LPIPS, whose weights of the layers were learnt from people's judgements.
 
     Args:
-        weights: ``vgg16`` (its file must exist), ``auto`` (vgg16 if its file exists, else a small
-            network with fixed random weights, marked as such), or ``random``.
-        path: the weight file or its folder; None looks in the torch cache.
-        warmup: number of calls over which layer weights are measured.
+        weights: ``pretrained``, or ``random``, a small network with fixed random weights, for tests
+            that need no weights; tables mark it.
+        net: ``vgg`` or ``alex``, the pretrained network.
+        form: ``features`` or ``lpips``.
+        path: of the pretrained weights, see `gsgan.weights.files.find`.
+        crop: side of the compared squares in pixels, around random pixels of the person; None
+            compares the whole image.
+        crops: number of squares of each image.
+        warmup: number of calls over which the layers' weights are measured.
         width: channels of the random network's first layer.
 
     Raises:
-        ConfigError: on an unknown ``weights``.
-        DataError: when ``vgg16`` was requested and its file does not exist.
+        ConfigError: on a value that is not one of the above.
+        DataError: if pretrained weights are not found and cannot be downloaded.
 
-    Source: paper Sec. 3.5.
+    Source: paper Sec. 3.5, without crops and the form ``lpips``.
     """
 
-    mean: Tensor
-    std: Tensor
     layer_loss: Tensor
     calls: Tensor
 
     def __init__(
-        self, weights: str = "auto", path: str | None = None, *, warmup: int = 50, width: int = 16
+        self,
+        weights: str = PRETRAINED,
+        *,
+        net: str = "vgg",
+        form: str = FEATURES,
+        path: str | None = None,
+        crop: int | None = None,
+        crops: int = 1,
+        warmup: int = 50,
+        width: int = 16,
     ) -> None:
         super().__init__()
-        if weights not in ("vgg16", "auto", "random"):
-            raise ConfigError(f"perceptual.weights must be vgg16, auto or random; got {weights!r}")
-        found = None if weights == "random" else find_weights("vgg16", path)
-        if weights == "vgg16" and found is None:
-            raise DataError(f"VGG-16's weights were not found: {how_to_get('vgg16')}")
-        self.stages = _vgg_stages(found) if found else _random_stages(width)
-        self.mark = None if found else "perceptual loss: fixed random network, not VGG-16"
-        self.requires_grad_(False)
-        # Fixed weights, restored from a file or a seed, are not stored in checkpoints.
-        self.stages.register_state_dict_post_hook(_leave_out)
-        self.register_load_state_dict_pre_hook(_put_back)
+        key = "training.perceptual"
+        one_of(f"{key}.weights", weights, SOURCES)
+        one_of(f"{key}.net", net, ("vgg", "alex"))
+        one_of(f"{key}.form", form, FORMS)
+        self.crop = None if crop is None else whole(f"{key}.crop", crop, LEAST_CROP)
+        self.crops = whole(f"{key}.crops", crops, 1)
         self.warmup = warmup
-        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1))
-        self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1))
-        self.register_buffer("layer_loss", torch.zeros(len(self.stages)))
+        self.mark = None
+        self.description = f"{NETWORKS[net].title}, {form}"
+
+        self.network: FeatureNetwork | Lpips
+        if weights == RANDOM:
+            self.network = FeatureNetwork(_random_stages(width))
+            self.mark = "perceptual loss: fixed random network, not VGG-16"
+            self.description = "a fixed random network"
+        elif form == LPIPS:
+            self.network = Lpips(net, path)
+        else:
+            self.network = pretrained(net, path)
+            if net == "vgg":
+                self.network.stages = self.network.stages[:VGG_LAYERS]
+        if self.crop is not None:
+            self.description += f", {self.crops} of {self.crop}² around the person in each image"
+        layers = len(self.network.stages) if isinstance(self.network, FeatureNetwork) else 1
+        self.register_buffer("layer_loss", torch.zeros(layers))
         self.register_buffer("calls", torch.zeros((), dtype=torch.long))
 
-    def features(self, image: Tensor) -> list[Tensor]:
-        """Feature maps of images ``[B, 3, H, W]`` in [0, 1]."""
-        x, maps = (image - self.mean) / self.std, []
-        for stage in self.stages:
-            x = stage(x)
-            maps.append(x)
-        return maps
+        # Fixed weights, restored from a file or a seed, are not stored in checkpoints.
+        self.network.register_state_dict_post_hook(_leave_out)
+        self.register_load_state_dict_pre_hook(_put_back)
 
     def forward(self, image: Tensor, target: Tensor) -> Tensor:
-        """The weighted distance; the target's features take no gradient."""
+        """The distance of ``image`` and ``target``, both ``[B, 3, H, W]``, RGB in [0, 1]; the
+        target's features take no gradient."""
+        if isinstance(self.network, Lpips):
+            with torch.no_grad():
+                truth = self.network.features(target)
+            return self.network.distance(self.network.features(image), truth).mean()
+
         with torch.no_grad():
-            truth = self.features(target)
-        losses = torch.stack(
-            [functional.mse_loss(a, b) for a, b in zip(self.features(image), truth, strict=True)]
-        )
+            truth = self.network(target)
+        pairs = zip(self.network(image), truth, strict=True)
+        losses = torch.stack([functional.mse_loss(ours, theirs) for ours, theirs in pairs])
         if self.training:  # without reading `calls`, for which the host would wait
             warm = self.calls < self.warmup
             self.calls += warm
@@ -84,6 +113,44 @@ class Perceptual(nn.Module):
             self.layer_loss += torch.where(warm, step, 0.0)
         inverse = 1 / self.layer_loss.clamp_min(1e-12)
         return (losses * inverse / inverse.sum()).sum()
+
+
+def crop_person(images: Sequence[Tensor], mask: Tensor, draws: Tensor, size: int) -> list[Tensor]:
+    """Cuts the same squares around random pixels of the person out of several images.
+
+    Convention: a square that would leave the image is moved inside; an image smaller than the
+    square gives all of its rows or columns; without a person the squares are anywhere. No host
+    waits for the device.
+
+    Args:
+        images: each ``[B, C, H, W]``.
+        mask: ``[B, 1, H, W]``, the probability of each pixel is proportional to it.
+        draws: ``[B, N]`` uniform random numbers in [0, 1).
+        size: side in pixels.
+
+    Returns:
+        Each image's squares, ``[B * N, C, size, size]``.
+    """
+    height, width = mask.shape[-2:]
+    rows, columns = min(size, height), min(size, width)
+
+    # The pixel at which the cumulative mask reaches the random share of its total.
+    cumulative = (mask.flatten(1).double() + ANYWHERE).cumsum(dim=1)
+    shares = draws.to(cumulative) * cumulative[:, -1:]
+    centre = torch.searchsorted(cumulative, shares, right=True).clamp(max=height * width - 1)
+
+    # The corner of the square around it, moved inside of the image.
+    top = (centre // width - rows // 2).clamp(0, height - rows)
+    left = (centre % width - columns // 2).clamp(0, width - columns)
+    y = top[..., None] + torch.arange(rows, device=mask.device)
+    x = left[..., None] + torch.arange(columns, device=mask.device)
+
+    batch = torch.arange(len(mask), device=mask.device)[:, None, None, None]
+    cut = []
+    for image in images:
+        squares = image.movedim(1, -1)[batch, y[..., :, None], x[..., None, :]]
+        cut.append(squares.flatten(0, 1).movedim(-1, 1))
+    return cut
 
 
 def _over_processes(value: Tensor) -> Tensor:
@@ -101,80 +168,19 @@ def _leave_out(module: nn.Module, state: dict[str, Any], prefix: str, _: Any) ->
 
 
 def _put_back(module: nn.Module, state: dict[str, Any], prefix: str, *_: Any) -> None:
-    for key, value in nn.Module.named_parameters(module.stages):  # type: ignore[arg-type]
-        state.setdefault(f"{prefix}stages.{key}", value.detach())
-
-
-def _vgg_stages(path: Path) -> nn.ModuleList:
-    from torchvision.models.vgg import cfgs, make_layers  # heavy: only where it is used
-
-    layers = make_layers(cfgs["D"])  # without the classifier, nine tenths of the weights
-    found = {k[9:]: v for k, v in load_weights(path).items() if k.startswith("features.")}
-    try:
-        layers.load_state_dict(found)
-    except RuntimeError as error:
-        raise DataError(f"{path}: these are not torchvision's VGG-16 weights") from error
-    for layer in layers:
-        if isinstance(layer, nn.ReLU):
-            layer.inplace = False
-    bounds = [0, *(tap + 1 for tap in VGG_TAPS)]
-    return nn.ModuleList(nn.Sequential(*layers[a:b]) for a, b in pairwise(bounds))
+    network = module.get_submodule("network")
+    for key, value in [*network.named_parameters(), *network.named_buffers()]:
+        state.setdefault(f"{prefix}network.{key}", value.detach())
 
 
 def _random_stages(width: int) -> nn.ModuleList:
     """Three small stages with fixed weights, independent of the run's seed."""
     generator = torch.Generator().manual_seed(20250717)
     stages, channels = [], [3, width, 2 * width, 4 * width]
-    for i, (a, b) in enumerate(pairwise(channels)):
-        conv = nn.Conv2d(a, b, 3, stride=1 if i == 0 else 2, padding=1)
+    for i, (inputs, outputs) in enumerate(pairwise(channels)):
+        conv = nn.Conv2d(inputs, outputs, 3, stride=1 if i == 0 else 2, padding=1)
         with torch.no_grad():
-            conv.weight.normal_(0, (2 / (9 * a)) ** 0.5, generator=generator)
+            conv.weight.normal_(0, (2 / (9 * inputs)) ** 0.5, generator=generator)
             conv.bias.zero_()  # type: ignore[union-attr]
         stages.append(nn.Sequential(conv, nn.LeakyReLU(0.2)))
     return nn.ModuleList(stages)
-
-
-# -- pretrained torchvision weights; nothing is downloaded
-
-
-def find_weights(name: str, path: str | Path | None = None) -> Path | None:
-    """The weight file of torchvision's ``vgg16`` or ``alexnet``, or None if there is none.
-
-    Args:
-        name: of the network.
-        path: the file or its folder; None looks in the torch cache.
-
-    Raises:
-        DataError: when a path was given and the file does not exist.
-    """
-    if path is None:
-        cached = Path(torch.hub.get_dir()) / "checkpoints" / FILES[name]
-        return cached if cached.is_file() else None
-    given = Path(path).expanduser()
-    found = given / FILES[name] if given.is_dir() else given
-    if not found.is_file():
-        raise DataError(f"{found}: no such file; expected torchvision's {name} weights there")
-    return found
-
-
-def how_to_get(name: str) -> str:
-    """How to install the weights, as a clause of a message."""
-    return (
-        f"put torchvision's {FILES[name]} into $TORCH_HOME/hub/checkpoints "
-        "(~/.cache/torch/hub/checkpoints unless set) or give its path"
-    )
-
-
-def load_weights(path: Path) -> dict[str, torch.Tensor]:
-    """Reads a state dict without unrestricted pickle.
-
-    Raises:
-        DataError: when the file is not a plain state dict.
-    """
-    try:
-        return dict(torch.load(path, map_location="cpu", weights_only=True))
-    except Exception as error:
-        raise DataError(
-            f"{path}: not a readable torchvision weight file ({type(error).__name__}); "
-            "download it again"
-        ) from error

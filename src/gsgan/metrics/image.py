@@ -1,4 +1,4 @@
-"""Scores of images against the ground truth: PSNR, SSIM, fine detail, edges.
+"""Scores of images against the ground truth: PSNR, SSIM, high-frequency energy, edges.
 
 Convention: images ``[B, 3, H, W]``, RGB in [0, 1]; every function returns one score per image,
 ``[B]``, because papers report the mean over images, not the score of pooled errors.
@@ -125,7 +125,7 @@ def ssim_uniform(image: Tensor, target: Tensor, *, value_range: float = 1.0) -> 
 
 
 def high_frequencies(image: Tensor, target: Tensor, *, above: float = 0.25) -> Tensor:
-    """Energy of fine detail relative to the ground truth's: 1 is as sharp, below 1 is blurred.
+    """High-frequency energy relative to the ground truth's: below 1 is blurred, noise raises it.
 
     Args:
         image, target: images; their grey values are compared.

@@ -1,75 +1,109 @@
-"""LPIPS with pretrained weights, or the reason why there is none."""
+"""LPIPS of images against one ground truth, by several pretrained networks."""
 
-import tempfile
-from pathlib import Path
+import math
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from torch import Tensor
 
-from gsgan.losses.perceptual import FILES, find_weights, how_to_get, load_weights
-from gsgan.metrics.image import Score
-from gsgan.utils.errors import ConfigError
+from gsgan.data.metric_variants import MetricVariants
+from gsgan.metrics.image import person_box
+from gsgan.metrics.regions import BACKGROUNDS, mask_crop, rectangle
+from gsgan.utils.checks import one_of
+from gsgan.weights.networks import Lpips
 
-_BACKBONES = {"vgg": "vgg16", "alex": "alexnet"}
-
-
-def check_lpips(net: str, path: str | None) -> Path | None:
-    """The backbone's weight file, or None if there is none.
-
-    Raises:
-        ConfigError: on an unknown net.
-        DataError: when a given path has no weights.
-    """
-    if net not in _BACKBONES:
-        raise ConfigError(f"lpips.net must be vgg or alex; got {net!r}")
-    return find_weights(_BACKBONES[net], path)
+LPIPS_NETS = ("vgg", "alex")
+LpipsScores = Callable[[Tensor], dict[str, float]]  # of an image, by metric
 
 
-def lpips(
-    net: str = "vgg", path: str | None = None, value_range: tuple[float, float] = (-1.0, 1.0)
-) -> tuple[Score | None, str]:
-    """LPIPS with pretrained weights, or None with the reason; weights are never random and never
-    downloaded.
+def build_lpips(nets: Sequence[str], path: str | None = None) -> dict[str, Lpips]:
+    """The networks of LPIPS, with weights that exist.
 
     Args:
-        net: backbone, ``vgg`` or ``alex``.
-        path: the backbone's torchvision weight file or its folder; None looks in the torch cache.
-        value_range: (-1, 1) scales images as the backbone expects; (0, 1) leaves them unscaled.
-
-    Returns:
-        (score, "") or (None, reason). The score clamps images to [0, 1].
+        nets: any of ``vgg`` and ``alex``; none of them leaves LPIPS out.
+        path: of the weights, see `gsgan.weights.files.find`; None looks everywhere, or downloads.
 
     Raises:
-        ConfigError: on an unknown net.
-        DataError: when a given path has no weights.
+        ConfigError: on an unknown network.
+        DataError: if weights are not found and cannot be downloaded, or cannot be used.
     """
-    found = check_lpips(net, path)
-    if found is None:
-        backbone = _BACKBONES[net]
-        return None, f"{backbone} weights are not available: {how_to_get(backbone)}"
-    load_weights(found)  # refuses anything but a plain state dict before torchvision reads it
-    metric = _build_lpips(net, found, scale=tuple(value_range) == (-1.0, 1.0))
-
-    def score(image: Tensor, target: Tensor) -> Tensor:
-        metric.to(image.device)
-        pairs = zip(image.clamp(0, 1).split(1), target.clamp(0, 1).split(1), strict=True)
-        with torch.no_grad():
-            return torch.stack([metric(a, b) for a, b in pairs])
-
-    return score, ""
+    for net in nets:
+        one_of("an entry of lpips.nets", net, LPIPS_NETS)
+    return {net: Lpips(net, path).eval() for net in nets}
 
 
-def _build_lpips(net: str, weights: Path, scale: bool) -> torch.nn.Module:
-    """torchmetrics' LPIPS, which reads only from the torch cache, with the backbone ``weights``."""
-    from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+class LpipsAgainst:
+    """LPIPS against one ground truth, whose features are computed once for all images.
 
-    before = torch.hub.get_dir()
-    with tempfile.TemporaryDirectory() as folder:
-        cache = Path(folder) / "checkpoints"
-        cache.mkdir()
-        (cache / FILES[_BACKBONES[net]]).symlink_to(weights.resolve())
-        torch.hub.set_dir(folder)
-        try:
-            return LearnedPerceptualImagePatchSimilarity(net, normalize=scale).eval()  # type: ignore[arg-type]
-        finally:
-            torch.hub.set_dir(before)
+    Args:
+        target: ``[1, 3, H, W]``, prepared, in [0, 1].
+        mask: ``[1, 1, H, W]`` of the person; None leaves the scores in the person's box out.
+        networks: by name, from `build_lpips`.
+        measures: range, channels and region; None takes the defaults.
+    """
+
+    @torch.no_grad()
+    def __init__(
+        self,
+        target: Tensor,
+        mask: Tensor | None,
+        networks: Mapping[str, Lpips],
+        measures: MetricVariants | None = None,
+    ) -> None:
+        self.networks = networks
+        self.measures = measures or MetricVariants()
+        self.mask = mask
+        self.box = None if mask is None else rectangle(person_box(mask)[0])
+        self.size = (target.shape[-2], target.shape[-1])
+
+        whole, square = self._seen(target), self._square(target)
+        self.truth = {}
+        self.square_truth = {}
+        for net, network in networks.items():
+            network.to(target.device)
+            self.truth[net] = network.features(whole)
+            if square is not None:
+                self.square_truth[net] = network.features(square)
+
+    @torch.no_grad()
+    def __call__(self, image: Tensor) -> dict[str, float]:
+        """The scores of an image like the ground truth, NaN without a region.
+
+        Returns:
+            ``{"lpips_<net>": score, "lpips_<net>_person": score}``; the latter is the mean of the
+            distance's map in the person's box, with receptive fields that reach beyond it.
+        """
+        whole, square = self._seen(image), self._square(image)
+        scores = {}
+        for net, network in self.networks.items():
+            truth, features = self.truth[net], network.features(whole)
+            if self.measures.lpips_region == "full":
+                scores[f"lpips_{net}"] = float(network.distance(features, truth))
+            elif square is None:
+                scores[f"lpips_{net}"] = math.nan
+            else:
+                distance = network.distance(network.features(square), self.square_truth[net])
+                scores[f"lpips_{net}"] = float(distance)
+            if self.mask is not None:
+                inside = math.nan
+                if self.box is not None:
+                    rows, columns = self.box
+                    distances = network.distance_map(features, truth, self.size)
+                    inside = float(distances[:, :, rows, columns].mean())
+                scores[f"lpips_{net}_person"] = inside
+        return scores
+
+    def _seen(self, image: Tensor) -> Tensor:
+        """The image as the networks get it."""
+        if self.measures.lpips_channels == "bgr":
+            image = image.flip(1)
+        unscaled = self.measures.lpips_range == (0.0, 1.0)
+        return (image + 1) / 2 if unscaled else image  # the network maps [0, 1] to [-1, 1]
+
+    def _square(self, image: Tensor) -> Tensor | None:
+        """The crop round the person as the networks get it; None without, or without a person."""
+        if self.measures.lpips_region == "full":
+            return None
+        assert self.mask is not None
+        square = mask_crop(image[0], self.mask[0], BACKGROUNDS[self.measures.background])
+        return None if square is None else self._seen(square[None])

@@ -14,9 +14,13 @@ PAINTED, SPLAT, FLOOR = "full", "splat", "floor"  # variants in metrics.json
 MEAN = "mean"  # the column over subjects
 
 
-def written(metric: str, value: float) -> str:
-    """A value with the metric's digits and a typographic minus; zero has no sign."""
-    text = f"{value:.{METRICS[metric].digits}f}"
+def written(metric: str, value: float, *, times_1000: bool = False) -> str:
+    """A value with the metric's digits and a typographic minus; zero has no sign.
+
+    A value that was multiplied by 1000 has two digits fewer.
+    """
+    digits = METRICS[metric].digits - (2 if times_1000 else 0)
+    text = f"{value:.{digits}f}"
     return text.lstrip("-") if float(text) == 0 else text.replace("-", "−")
 
 
@@ -48,6 +52,7 @@ class TableSpec:
     subjects: Sequence[str] | None = None
     data: str | None = None
     paper: str | None = None
+    times_1000: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         rows: Any = self.rows
@@ -62,8 +67,9 @@ class TableSpec:
             ("metrics", METRICS, self.metrics),
             ("splits", SPLITS, self.splits),
             ("variants", (PAINTED, SPLAT), variants),
+            ("times_1000", METRICS, self.times_1000),
         ):
-            if not values:
+            if not values and key != "times_1000":
                 raise ConfigError(f"table.{key} must be a list of at least one")
             for value in values:
                 one_of(f"table.{key}", value, known)

@@ -71,9 +71,18 @@ class Part:
         return dict.fromkeys([*(self.spec.subjects or ()), MEAN], self.metric)
 
     def heading(self, metric: str) -> str:
-        """Of a metric; LPIPS with its backbone and region, where runs have it."""
-        named = join_unique(_lpips(run, self.split) or "" for run in self.runs)
-        return f"{named} ↓" if metric == "lpips" and named else METRICS[metric].heading
+        """Of a metric; LPIPS with what its network gets, if runs have it."""
+        name = METRICS[metric].name
+        described = join_unique(_lpips(run, self.split) or "" for run in self.runs)
+        if metric.startswith("lpips") and described:
+            name = f"{name} {described}"
+        if metric in self.spec.times_1000:
+            name = f"{name} ×1000"
+        return f"{name} {METRICS[metric].better}"
+
+    def written(self, metric: str, value: float) -> str:
+        """A value of this table, with the metric's digits."""
+        return written(metric, value, times_1000=metric in self.spec.times_1000)
 
     def of(self, name: str | None, column: str = MEAN) -> list[Run]:
         """The runs of a model or method (None: of all) that a column shows."""
@@ -111,6 +120,8 @@ class Part:
         ]
         names = ["name", "variant", "column", "seed", "value", "note"]
         frame = pd.DataFrame(rows, columns=names)
+        shown_larger = frame.column.map(self.columns).isin(self.spec.times_1000)
+        frame.loc[shown_larger, "value"] *= 1000
         frame.loc[frame.variant == FLOOR, ["name", "seed"]] = "", NO_SEED
         frame = frame.sort_values("value", kind="stable", na_position="last")
         frame = frame.drop_duplicates(names[:4]).sort_index()
@@ -137,7 +148,9 @@ class Part:
             notes = [f"{NOT_HAD}: {note}" for note in notes or ["no scored run"]]
             return Cell(NOT_HAD, notes=tuple(notes))
         mean, spread = float(values.mean()), float(values.std()) if len(values) > 1 else None
-        text = written(metric, mean) + ("" if spread is None else f" ± {written(metric, spread)}")
+        text = self.written(metric, mean)
+        if spread is not None:
+            text += f" ± {self.written(metric, spread)}"
         return Cell(text, mean, spread, tuple(notes))
 
     def check(self, allow_dirty: bool) -> None:
@@ -337,7 +350,7 @@ def _with_best(rows: Sequence[Row], part: Part) -> list[Row]:
         best = min(means, key=lambda mean: abs(mean - 1) if sign is None else sign * mean)
         for cells in found:
             mean = cells[i].mean
-            equal = mean is not None and written(metric, mean) == written(metric, best)
+            equal = mean is not None and part.written(metric, mean) == part.written(metric, best)
             cells[i] = replace(cells[i], best=equal)
     return [replace(row, cells=cells) for row, cells in zip(rows, found, strict=True)]
 
@@ -361,9 +374,9 @@ def _marks(runs: Sequence[Run], split: str) -> Iterator[str]:
 
 
 def _lpips(run: Run, split: str) -> str | None:
-    """Backbone and range of a run's LPIPS, where it has one."""
+    """What the networks of a run's LPIPS get, if it has one."""
     scores = run.scores.get(split, {}).values()
-    return next((s.get("lpips_name") for s in scores if s.get("lpips") is not None), None)
+    return next((s["lpips_input"] for s in scores if s.get("lpips_input")), None)
 
 
 def _boxes(run: Run, part: Part) -> str | None:

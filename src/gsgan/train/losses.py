@@ -14,7 +14,7 @@ from gsgan.losses.adversarial import (
     feature_matching,
     generator_loss,
 )
-from gsgan.losses.perceptual import Perceptual
+from gsgan.losses.perceptual import Perceptual, crop_person
 from gsgan.losses.photometric import photometric, without_unsure
 from gsgan.model.discriminator import Discriminator
 from gsgan.model.rendering import Rendering
@@ -180,6 +180,7 @@ class StepTwoLoss:
         *,
         anchor: Tensor | None,
         perceptual: Perceptual | None,
+        draws: Tensor | None,
         maps: DiscriminatorMaps | None,
         step: int,
     ) -> dict[str, Tensor]:
@@ -190,6 +191,7 @@ class StepTwoLoss:
             frame: the ground truth.
             anchor: L_Ψ of the same rendering; None leaves it out.
             perceptual: L_perc; None leaves it out.
+            draws: ``[B, N]`` uniform random numbers in [0, 1) that place its crops; None without.
             maps: the discriminator's maps; None before the GAN starts.
             step: the iteration, for ``perceptual_every``.
         """
@@ -205,7 +207,11 @@ class StepTwoLoss:
             terms["anchor"] = self.anchor * anchor
         if perceptual is not None and step % self.perceptual_every == 0:
             scale = self.perceptual * self.perceptual_every
-            terms["perceptual"] = scale * perceptual(image, target)
+            compared = [image, target]
+            if perceptual.crop is not None:
+                assert draws is not None
+                compared = crop_person(compared, frame.mask, draws, perceptual.crop)
+            terms["perceptual"] = scale * perceptual(*compared)
         if maps is not None:
             terms |= maps.terms(self.adversarial, self.feature_matching)
         return terms

@@ -38,7 +38,7 @@ class AvatarTraining(LightningModule):
     Args:
         avatar: to be trained.
         discriminator: None, or no adversarial weight, leaves the GAN out.
-        perceptual: L_perc; None leaves it out.
+        perceptual: builds L_perc, where the schedule and the weights have it; None leaves it out.
         schedule: iterations of each phase, see `Schedule.fitted`.
         recipes: optimisers by name: segmentation, psi, colour, generator, discriminator.
         step_one, step_two: loss weights.
@@ -58,7 +58,7 @@ class AvatarTraining(LightningModule):
         self,
         avatar: Avatar,
         discriminator: Discriminator | None,
-        perceptual: Perceptual | None,
+        perceptual: Callable[[], Perceptual] | None,
         schedule: Schedule,
         recipes: dict[str, Recipe],
         step_one: StepOneLoss,
@@ -81,7 +81,8 @@ class AvatarTraining(LightningModule):
         self.avatar, S = avatar, avatar.segmentation
         generates = avatar.generator is not None
         self.discriminator = discriminator if generates and step_two.adversarial_terms else None
-        self.perceptual = perceptual if generates and step_two.perceptual else None
+        needed = generates and bool(step_two.perceptual) and perceptual is not None
+        self.perceptual = perceptual() if needed else None  # type: ignore[misc]
         self.extra_losses = nn.ModuleDict(extra_losses or {})
         self.schedule = schedule.fitted(
             segmentation=S is not None,
@@ -222,6 +223,7 @@ class AvatarTraining(LightningModule):
             frame,
             anchor=self.step_one_loss(rendering, frame) if anchored else None,
             perceptual=self.perceptual,
+            draws=self._crop_draws(len(frame)),
             maps=maps,
             step=self.step,
         )
@@ -352,6 +354,12 @@ class AvatarTraining(LightningModule):
         if not self.pose_noise:
             return None
         return self.pose_noise * self._random(torch.randn, 1, *skeleton.shape).to(skeleton)
+
+    def _crop_draws(self, images: int) -> Tensor | None:
+        """Random numbers that place the perceptual loss's crops; None without crops."""
+        if self.perceptual is None or self.perceptual.crop is None:
+            return None
+        return self._random(torch.rand, 2, images, self.perceptual.crops)
 
     # -- validation, logs and checkpoints
 

@@ -32,7 +32,7 @@ from gsgan.evaluate.run import evaluate_method
 from gsgan.evaluate.scores import painter
 from gsgan.export.run import export_config
 from gsgan.fit.run import fit_before_training
-from gsgan.metrics.lpips import check_lpips
+from gsgan.metrics.lpips import build_lpips
 from gsgan.model.assemble import build_avatar, build_data, naming_group
 from gsgan.model.avatar import Avatar
 from gsgan.model.harmonic import Harmonic, distilled
@@ -70,7 +70,8 @@ def run_training(config: DictConfig) -> None:
     _quiet_lightning()
     stop = StopOnSignal()
     torch.set_flush_denormal(True)  # black background decays into denormals: slow on CPUs
-    check_lpips(config.lpips.net, config.lpips.path)  # now, not after hours of training
+    if config.evaluate:
+        build_lpips(config.lpips.nets, config.lpips.path)  # fails now, not after hours of training
 
     data, module = build_training(config)
     seed_everything(config.seed, workers=True, verbose=False)
@@ -376,6 +377,10 @@ def describe(
     for name, part in parts.items():
         if part is not None:
             table.add_row(name, f"{sum(p.numel() for p in part.parameters()):,} parameters")
+    if module.perceptual is not None:
+        every = module.step_two.perceptual_every
+        when = "every iteration" if every == 1 else f"every {every} iterations"
+        table.add_row("perceptual loss", f"{module.perceptual.description}; {when} of Step II")
     if avatar.segmentation is None:
         table.add_row("segmentation S", f"not built: {avatar.segmentation_why}")
     else:

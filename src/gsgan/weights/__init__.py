@@ -1,0 +1,1 @@
+"""Pretrained networks: where their weights are found, their features, and LPIPS."""

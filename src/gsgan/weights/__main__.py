@@ -1,0 +1,45 @@
+"""``python -m gsgan.weights``: list the pretrained weights, and get those that are missing."""
+
+from omegaconf import DictConfig
+
+from gsgan.utils.config import entry
+
+
+def list_weights(config: DictConfig) -> None:
+    """Prints where each network's weights are found, and downloads those that are missing.
+
+    Raises:
+        ConfigError: on an unknown network.
+        DataError: if weights cannot be used or got; the other networks are listed first.
+    """
+    from gsgan.utils.console import make_console
+    from gsgan.utils.errors import DataError
+    from gsgan.weights import files
+    from gsgan.weights.networks import pretrained
+
+    console = make_console()
+    problems = []
+    for net in config.nets:
+        title = files.network_of(net).title
+        try:
+            found = files.find(net, config.path)
+            if found is None and config.download:
+                found = files.get(net)
+            if found is None:
+                raise DataError(f"{title} is not on this machine: {files.how_to_get(net)}")
+            pretrained(net, found.path)  # refuses a wrong or damaged file
+        except DataError as error:
+            problems.append(str(error))
+            console.print(f"{title}: missing", highlight=False)
+        else:
+            line = f"{title}: from {found.source}, {found.path}"
+            console.print(line, highlight=False, markup=False, soft_wrap=True)
+    console.print("LPIPS' heads: from torchmetrics", highlight=False)
+    if problems:
+        raise DataError("; ".join(problems))
+
+
+main = entry("weights", list_weights)
+
+if __name__ == "__main__":
+    main()

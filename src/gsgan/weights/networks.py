@@ -1,0 +1,136 @@
+"""Pretrained networks as feature extractors, and LPIPS."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from gsgan.utils.errors import DataError
+from gsgan.weights.files import NETWORKS, empty_layers, get, read_convolutions, state_of_heads
+
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+# Layers of torchvision's `features` after which LPIPS compares: every ReLU before a pooling
+# (VGG-16: relu1_2, relu2_2, relu3_3, relu4_3, relu5_3), and every ReLU (AlexNet).
+TAPS = {"vgg": (3, 8, 15, 22, 29), "alex": (1, 4, 7, 9, 11)}
+EPSILON = 1e-8  # of the features' norm, as in torchmetrics: the gradient is finite at zero
+
+
+class FeatureNetwork(nn.Module):
+    """Feature maps of a network with frozen weights, one map after each stage.
+
+    Images are ``[B, 3, H, W]``, RGB in [0, 1]; they are normalised as ImageNet's.
+
+    Args:
+        stages: applied in turn, each to the map of the one before.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, stages: nn.ModuleList) -> None:
+        super().__init__()
+        self.stages = stages.requires_grad_(False)
+        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1))
+        self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1))
+
+    def forward(self, image: Tensor) -> list[Tensor]:
+        """The maps ``[B, C, h, w]``, from the finest to the coarsest."""
+        maps = []
+        features = (image - self.mean) / self.std
+        for stage in self.stages:
+            features = stage(features)
+            maps.append(features)
+        return maps
+
+
+def pretrained(net: str, path: str | Path | None = None) -> FeatureNetwork:
+    """A pretrained network with the five stages that LPIPS compares.
+
+    Args:
+        net: ``vgg`` or ``alex``.
+        path: see `gsgan.weights.files.find`.
+
+    Raises:
+        ConfigError: on an unknown network.
+        DataError: if the weights are not found and cannot be downloaded, or belong to another
+            network.
+    """
+    found = get(net, path)
+    network = NETWORKS[net]
+    layers = empty_layers(network)
+    try:
+        layers.load_state_dict(read_convolutions(net, found.path), assign=True)
+    except (RuntimeError, AttributeError) as error:  # AttributeError: a value is no tensor
+        raise DataError(
+            f"{found.path}: these are not torchvision's weights of {network.title}"
+        ) from error
+    for layer in layers:
+        if isinstance(layer, nn.ReLU):
+            layer.inplace = False  # the maps before it are kept
+    bounds = [0, *(tap + 1 for tap in TAPS[net])]
+    return FeatureNetwork(nn.ModuleList(layers[start:end] for start, end in pairwise(bounds)))
+
+
+class Lpips(nn.Module):
+    """LPIPS 0.1: the distance of unit-length features, weighted by channel.
+
+    The distance of two images is the sum over the layers l of
+    mean over pixels of ``Σ_c w_lc (â_lc - b̂_lc)²``, where â and b̂ are the features divided by their
+    norm over the channels.
+
+    Args:
+        net: ``vgg`` or ``alex``.
+        path: see `gsgan.weights.files.find`.
+
+    Raises:
+        ConfigError: on an unknown network.
+        DataError: if there are no usable weights.
+
+    Source: Zhang et al., The Unreasonable Effectiveness of Deep Features as a Perceptual Metric,
+    CVPR 2018; the heads of its package, version 0.1.
+    """
+
+    def __init__(self, net: str, path: str | Path | None = None) -> None:
+        super().__init__()
+        self.network = pretrained(net, path)
+        state = state_of_heads(net)
+        for layer in range(len(TAPS[net])):
+            self.register_buffer(f"head{layer}", state[f"lin{layer}.model.1.weight"])
+
+    def features(self, image: Tensor) -> list[Tensor]:
+        """Unit-length features of images ``[B, 3, H, W]`` in [0, 1]."""
+        maps = []
+        for features in self.network(image):
+            norm = (features.square().sum(dim=1, keepdim=True) + EPSILON).sqrt()
+            maps.append(features / norm)
+        return maps
+
+    def layers(self, features: Sequence[Tensor], others: Sequence[Tensor]) -> list[Tensor]:
+        """The distance of two images in each layer, as maps ``[B, 1, h, w]``."""
+        maps = []
+        for layer, (ours, theirs) in enumerate(zip(features, others, strict=True)):
+            head = self.get_buffer(f"head{layer}")
+            maps.append(functional.conv2d((ours - theirs).square(), head))
+        return maps
+
+    def distance(self, features: Sequence[Tensor], others: Sequence[Tensor]) -> Tensor:
+        """The distance ``[B]`` of two images, given their features."""
+        maps = self.layers(features, others)
+        return torch.stack([layer.mean(dim=(1, 2, 3)) for layer in maps]).sum(dim=0)
+
+    def distance_map(
+        self, features: Sequence[Tensor], others: Sequence[Tensor], size: tuple[int, int]
+    ) -> Tensor:
+        """The distance of each pixel, ``[B, 1, H, W]``: the layers' maps, enlarged to ``size``."""
+        total = features[0].new_zeros(())
+        for layer in self.layers(features, others):
+            total = total + functional.interpolate(layer, size, mode="bilinear")
+        return total
+
+    def forward(self, image: Tensor, target: Tensor) -> Tensor:
+        """The distance ``[B]`` of images ``[B, 3, H, W]`` in [0, 1]."""
+        return self.distance(self.features(image), self.features(target))
