@@ -335,7 +335,7 @@ BAD_WHEN_DECODED: dict[str, Damage] = {
     "masks/cam00/000001.png is damaged": cut("masks/cam00/000001.png", 0.6),
     "images/cam00/000001.jpg does not exist": remove("images/cam00/000001.jpg"),
     "is 16x12 pixels .*cam00 has 32x24": image("images/cam00/000001.jpg", GREY[::2, ::2]),
-    "000001.png holds 0 and 1; expected alpha": image("masks/cam00/000001.png", GREY + 1),
+    "000001.png holds 0 and 1 alone; expected alpha": image("masks/cam00/000001.png", GREY + 1),
     "000001.png holds the label 3; the dataset names 3": image("labels/cam00/000001.png", GREY + 3),
 }
 

@@ -11,6 +11,10 @@ SUBJECT = "speed"
 OTHERS = (
     "gsgan: the first word must be speed; the other benchmarks are in scripts/bench of a checkout"
 )
+HELP = """\
+python -m gsgan.bench speed [key=value]   milliseconds from skeleton to image, by stage
+python -m gsgan.bench speed --help        its options
+Other benchmarks are in scripts/bench of a checkout."""
 
 
 def bench(config: DictConfig) -> None:
@@ -24,6 +28,9 @@ def bench(config: DictConfig) -> None:
 
 def main() -> None:
     """Passes the command line, without its first word, to Hydra."""
+    if sys.argv[1:2] in (["--help"], ["-h"]):
+        print(HELP)
+        return
     if sys.argv[1:2] != [SUBJECT]:
         sys.exit(OTHERS)
     del sys.argv[1]

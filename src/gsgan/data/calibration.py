@@ -19,6 +19,7 @@ from gsgan.data.cameras import CameraEntry, make_camera, numbers
 from gsgan.data.files import read_json
 from gsgan.utils.arrays import Float, as_floats
 from gsgan.utils.errors import DataError
+from gsgan.utils.files import read_text
 
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 HEAD_BYTES = 65536  # enough to recognise the format
@@ -156,6 +157,10 @@ def read_cameras(
     """
     if not content:
         raise DataError(f"{path} lists no camera")
+    if "frames" in content and "transform_matrix" in str(content["frames"])[:10_000]:
+        raise DataError(
+            f"{path} is a scene of nerfstudio, which is not read yet; write its cameras as {KNOWN}"
+        )
     cameras = {}
     for name, entry in content.items():
         where = f"{path}, camera {name}"
@@ -203,7 +208,7 @@ def _read_toml(
     calibration board, often mm, without naming it: give it with ``unit``.
     """
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = tomllib.loads(read_text(path))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError, RecursionError) as error:
         raise DataError(f"{path} is not readable as TOML: {error}") from None
     cameras: dict[str, CameraEntry] = {}
@@ -275,7 +280,7 @@ def read_opencv_yaml(path: Path) -> dict[str, Any]:
         if path.stat().st_size > MAX_YAML_BYTES:
             raise ValueError(f"more than {MAX_YAML_BYTES} bytes")
         # The first line is %YAML:1.0, where YAML itself has a blank; its line number must stay.
-        text = re.sub(r"\A(\s*)%YAML.*", r"\1", path.read_text(encoding="utf-8-sig"))
+        text = re.sub(r"\A(\s*)%YAML.*", r"\1", read_text(path))
         values = yaml.load(text, _Loader)
         if isinstance(values, dict) and all(isinstance(key, str) for key in values):
             return values
@@ -340,7 +345,10 @@ def _read_yaml(
 Reader = Callable[[Path, float | None, float, list[str]], dict[str, CameraEntry]]
 """Cameras of a path, by metres in a unit (None: the format's own) and K's pixel centre; notes."""
 FORMATS: dict[str, tuple[Callable[[str], bool], Reader]] = {
-    "OpenCV YAML": (lambda head: head.lstrip().startswith("%YAML"), _read_yaml),
+    "OpenCV YAML": (
+        lambda head: head.lstrip().startswith(("%YAML", "---")) or "!!opencv-matrix" in head,
+        _read_yaml,
+    ),
     "cameras.json": (lambda head: head.lstrip().startswith("{"), _read_json),
     "TOML": (lambda head: "[" in head and "matrix" in head, _read_toml),
 }

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from gsgan.utils.errors import DataError
+from gsgan.utils.files import read_text
 from gsgan.utils.pickles import read_npz
 
 JPEG_SIGNATURE, JPEG_END, JPEG_SCAN = b"\xff\xd8", b"\xff\xd9", b"\xff\xda"
@@ -109,6 +110,18 @@ def read_with_alpha(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | 
     return rgb, np.ascontiguousarray(image[..., 3]) if image.shape[2] == 4 else None
 
 
+def read_alpha(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]] | None:
+    """``[H, W, 3]`` colours as stored and ``[H, W]`` alpha of an 8-bit file; None without alpha.
+
+    Raises:
+        DataError: when the file is missing, damaged or cut off.
+    """
+    if read_header(path)[2] not in ("LA", "RGBA"):
+        return None
+    image = _decode_8_bit(path)
+    return image[..., :3], np.ascontiguousarray(image[..., 3])
+
+
 def _decode_8_bit(path: Path) -> NDArray[np.uint8]:
     image = _decode(path, cv2.IMREAD_UNCHANGED)
     if image.dtype != np.uint8:
@@ -159,7 +172,7 @@ def read_json(path: Path) -> dict[str, Any]:
 def read_json_value(path: Path) -> Any:
     """The content of a JSON file, of any type; errors as `read_json`."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(read_text(path))
     except OSError as error:
         raise _unreadable(path, error) from None
     except (ValueError, RecursionError) as error:

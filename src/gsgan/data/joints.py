@@ -55,8 +55,12 @@ _WHOLE_BODY = {
     **dict(zip(_FEET, (19, 22, 17, 20), strict=True)),
     **{BODY + j: 91 + j for j in range(2 * HAND)},
 }
+_COCO_18 = dict(
+    zip(_SHARED, (0, 15, 14, 17, 16, 5, 2, 6, 3, 7, 4, 11, 8, 12, 9, 13, 10), strict=True)
+)
 SETS: dict[int, tuple[str, dict[int, int]]] = {
     17: ("COCO", _COCO),
+    18: ("OpenPose's COCO", _COCO_18),
     25: ("BODY_25", _BODY_25),
     26: ("HALPE_26", _HALPE_26),
     33: ("MediaPipe", {j: j for j in range(BODY)}),
@@ -76,6 +80,12 @@ FROM_HANDS = {
 def joint_names() -> tuple[str, ...]:
     """Names of all joints."""
     return (*MEDIAPIPE33.names, *hand_names(), *FACE_MESH)
+
+
+def zeros_as_missing(points: Float) -> Float:
+    """``points [..., D]`` with NaN for those whose coordinates are all exactly 0: many detectors
+    write a missing joint so."""
+    return np.where((points == 0).all(-1, keepdims=True), np.nan, points)
 
 
 def known(points: Float) -> Bool:

@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple
 import cv2
 import numpy as np
 
-from gsgan.data.files import read_grey, read_stored
+from gsgan.data.files import read_alpha, read_grey, read_stored
 from gsgan.utils.arrays import Bool, Bytes
 from gsgan.utils.errors import DataError
 
@@ -83,16 +83,32 @@ def read_mask(files: Sequence[tuple[str, Path]], rules: PixelRules) -> Bytes:
     return joined
 
 
+def read_mask_values(path: Path) -> Bytes:
+    """``[H, W]`` 0..255: a file's grey values, or its alpha if the colours are the same everywhere.
+
+    Raises:
+        DataError: if the file is missing, damaged or cut off.
+    """
+    alpha = read_alpha(path)
+    if alpha is not None:
+        colours, mask = alpha
+        if (colours == colours[0, 0]).all() and mask.min() < mask.max():
+            return mask
+    return read_grey(path)
+
+
 def _one_mask(rule: str, path: Path, rules: PixelRules) -> Bytes:
     if rule == "grey":
-        mask = read_grey(path)
-        if mask.max() == 1:
+        mask = read_mask_values(path)
+        highest = int(mask.max())
+        if 0 < highest <= 127 and np.isin(mask, (0, highest)).all():
             raise DataError(
-                f"{path} holds 0 and 1; expected alpha from 0 to 255 (multiply it by 255)"
+                f"{path} holds {0} and {highest} alone; expected alpha from 0 to 255, and a person "
+                "where it is at least 128 (multiply it)"
             )
         return mask
     if rule == "threshold":
-        values, least = read_grey(path), rules.threshold
+        values, least = read_mask_values(path), rules.threshold
     else:
         values, least = read_stored(path), 1
         if values.ndim == 3:
@@ -153,6 +169,6 @@ def read_unsure(files: Sequence[tuple[str, Path]], mask: Bytes, rules: PixelRule
     if rules.unsure_alpha is not None:
         low, high = rules.unsure_alpha
         for _, path in files:
-            alpha = read_grey(path)
+            alpha = read_mask_values(path)
             unsure |= (alpha > low) & (alpha < high)
     return np.where(unsure, np.uint8(255), np.uint8(0))

@@ -14,6 +14,7 @@ import numpy as np
 from gsgan.motion.rotations import Array, rotation
 from gsgan.motion.standard import RigMotion
 from gsgan.utils.errors import DataError
+from gsgan.utils.files import read_text
 
 INCH = 0.0254
 ROOT = "root"
@@ -61,7 +62,7 @@ def _reason(error: Exception) -> str:
 
 def _lines(path: Path) -> list[list[str]]:
     try:
-        text = path.read_text(errors="replace")
+        text = read_text(path, errors="replace")
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror}") from error
     lines = (line.split("#")[0].replace("(", " ").replace(")", " ") for line in text.splitlines())

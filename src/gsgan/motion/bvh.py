@@ -1,5 +1,6 @@
 """Reads motion capture in the BVH format."""
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -8,6 +9,10 @@ import numpy as np
 from gsgan.motion.rotations import Array, rotation
 from gsgan.motion.standard import RigMotion
 from gsgan.utils.errors import DataError
+from gsgan.utils.files import read_text
+
+SLOWEST = 1.0  # seconds between two frames
+STILL = 1e-3  # of the longest bone: joints that leave their places by less are at rest
 
 
 @dataclass
@@ -27,15 +32,17 @@ def read_bvh(path: Path) -> RigMotion:
         DataError: when it cannot be read, or is not a complete BVH file.
     """
     try:
-        words = path.read_text(errors="replace").split()
+        text = read_text(path, errors="replace")
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror}; give a .bvh file") from error
     try:
-        if words[:1] != ["HIERARCHY"] or "MOTION" not in words:
+        # Some programs end the file with control characters, as DOS did.
+        hierarchy, *motion = re.split(r"\bMOTION\b", text.rstrip("\x1a\0 \r\n\t"), maxsplit=1)
+        words = re.sub("([{}])", r" \1 ", hierarchy).split()
+        if words[:1] != ["HIERARCHY"] or not motion:
             raise ValueError("HIERARCHY and MOTION are expected")
-        split = words.index("MOTION")
-        joints = _read_hierarchy(words[1:split])
-        values, frame_time = _read_values(words[split + 1 :], sum(len(j.channels) for j in joints))
+        joints = _read_hierarchy(words[1:])
+        values, frame_time = _read_values(motion[0], sum(len(j.channels) for j in joints))
         return _rig_motion(joints, values, frame_time)
     except (ValueError, IndexError, StopIteration) as error:
         reason = error if isinstance(error, ValueError) else "it ends early"
@@ -65,17 +72,24 @@ def _read_hierarchy(words: list[str]) -> list[_Joint]:
     return joints
 
 
-def _read_values(words: list[str], columns: int) -> tuple[Array, float]:
-    """``[F, columns]`` numbers after MOTION, and the seconds between two frames."""
-    head, numbers = words[:5], words[5:]
-    if head[0] != "Frames:" or head[2:4] != ["Frame", "Time:"]:
+def _read_values(text: str, columns: int) -> tuple[Array, float]:
+    """``[F, columns]`` numbers after MOTION, and the seconds between two frames.
+
+    A "Frame Time" of a second or more is read as a rate: no motion has it, and some programs write
+    frames per second there.
+    """
+    head = re.match(r"\s*Frames\s*:\s*(\d+)\s+Frame\s+Time\s*:\s*(\S+)", text)
+    if head is None:
         raise ValueError("'Frames:' and 'Frame Time:' are expected after MOTION")
-    frames, frame_time = int(head[1]), float(head[4])
+    frames, frame_time = int(head[1]), float(head[2])
+    numbers = text[head.end() :].split()
     if frames < 1 or not frame_time > 0 or len(numbers) != frames * columns:
         raise ValueError(
             f"{frames} frames of {columns} numbers, {frame_time:g} s apart, are announced, "
             f"{len(numbers)} numbers found"
         )
+    if frame_time >= SLOWEST:
+        frame_time = 1 / frame_time
     return np.array(numbers, dtype=float).reshape(frames, columns), frame_time
 
 
@@ -90,18 +104,39 @@ def _rig_motion(joints: list[_Joint], values: Array, frame_time: float) -> RigMo
     columns = iter(values.T)
     for j, joint in enumerate(joints):
         R = np.eye(3) if joint.parent < 0 else rotations[:, joint.parent]
-        moves = np.zeros(len(values), bool)
+        given = local[:, j].copy()
         for channel in joint.channels:
             axis, column = "XYZ".index(channel[0].upper()), next(columns)
             if channel.lower().endswith("rotation"):
                 R = R @ rotation(np.radians(column[:, None]) * np.eye(3)[axis])
             else:
-                local[:, j, axis], moves = column, moves | (column != 0)
-        if joint.parent >= 0 and not moves.any():  # some programs count from the offset
-            local[:, j] = offsets[j]
+                given[:, axis] = column
+        if joint.parent >= 0 and _counts_from_offset(given, offsets[j]):
+            given = given + offsets[j]
+        local[:, j] = given
         rotations[:, j] = R
-    names, parents = zip(*((joint.name, joint.parent) for joint in joints), strict=True)
-    moving = parents.count(-1) > 1 or (local[:, 1:] != offsets[1:]).any()
+    names = tuple(joint.name for joint in joints)
+    parents = tuple(joint.parent for joint in joints)
+
+    # Bones move if there are several roots, or if a joint leaves the place that its OFFSET gives.
+    tolerance = STILL * np.abs(offsets).max()
+    leaves_offset = np.abs(local[:, 1:] - offsets[1:]) > tolerance
+    moving_bones = parents.count(-1) > 1 or bool(leaves_offset.any())
     return RigMotion(
-        *(names, parents, offsets, rotations, local[:, 0], frame_time), local if moving else None
+        names=names,
+        parents=parents,
+        offsets=offsets,
+        rotations=rotations,
+        root=local[:, 0],
+        frame_time=frame_time,
+        local=local if moving_bones else None,
     )
+
+
+def _counts_from_offset(given: Array, offset: Array) -> bool:
+    """Whether a joint's position channels ``[F, 3]`` are counted from its OFFSET, as some programs
+    write them, and not from the parent: the bone then keeps the length of OFFSET better."""
+    length = np.linalg.norm(offset)
+    from_parent = np.abs(np.linalg.norm(given, axis=1) - length)
+    from_offset = np.abs(np.linalg.norm(given + offset, axis=1) - length)
+    return bool(np.median(from_offset) < np.median(from_parent))

@@ -39,6 +39,8 @@ AXES = ("x", "y", "z", "-x", "-y", "-z")
 FPS = 30.0  # assumed where neither the file nor the user gives it
 OWN = 0.02  # largest relative difference of bone lengths at which a motion is the subject's own
 SELDOM = 0.2  # a joint seen in a smaller share of the frames counts as a false detection
+ROUNDED = 5e-4  # relative difference of a rate from a whole number
+JUST_BEYOND = 0.05  # of a frame
 GAP = 5  # frames: in a longer gap a hand or face is not seen
 PARENT = {b: a for a, b in MEDIAPIPE33.limbs if b not in TRUNK}
 
@@ -187,9 +189,11 @@ def resampled(p: Float, fps: float, wanted: float) -> Float:
 
 
 def frame_times(frames: int, fps: float, wanted: float) -> Float:
-    """Times of the frames at a new rate, in frames of the old rate; the last is not exceeded."""
-    count = int((frames - 1) * wanted / fps + 1e-6) + 1
-    return np.arange(count, dtype=np.float64) * fps / wanted
+    """Times of the frames at a new rate, in frames of the old rate; the last is not exceeded, and
+    one that would be just beyond it is the last."""
+    count = int((frames - 1) * wanted / fps + JUST_BEYOND) + 1
+    times = np.arange(count, dtype=np.float64) * fps / wanted
+    return np.minimum(times, frames - 1)
 
 
 def rate_of(path: Path, value: Any) -> float:
@@ -201,4 +205,11 @@ def rate_of(path: Path, value: Any) -> float:
     rate = float(np.asarray(value).reshape(-1)[0]) if np.asarray(value).dtype.kind in "iuf" else 0
     if not 0 < rate < 1e5:
         raise DataError(f"{path}: the frame rate is {value!r}; expected a number above 0")
-    return rate
+    return usual_rate(rate)
+
+
+def usual_rate(rate: float) -> float:
+    """A whole number of frames per second where a rate is one but for rounding: files hold the time
+    between frames with five to seven digits. Film's rates, such as 29.97, stay."""
+    whole = max(1.0, round(rate))
+    return whole if abs(rate / whole - 1) < ROUNDED else rate

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +16,12 @@ from gsgan.data.calibration import METRES
 from gsgan.data.files import read_arrays, read_json, read_json_value
 from gsgan.data.formats import smpl_motion
 from gsgan.data.formats.capture import SHAPE, read_shape
+from gsgan.data.joints import zeros_as_missing
 from gsgan.data.proportions import EXPRESSION, HIPS, SHOULDERS, Proportions
 from gsgan.data.skeletons import hips_below
 from gsgan.motion.asf import asf_of, read_amc
 from gsgan.motion.bvh import read_bvh
-from gsgan.motion.clip import Clip, rate_of
+from gsgan.motion.clip import Clip, rate_of, usual_rate
 from gsgan.motion.points import read_points3d
 from gsgan.motion.pose_files import read_pose
 from gsgan.motion.retarget import rig_landmarks
@@ -29,6 +30,7 @@ from gsgan.scene import BodyPose
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.utils.arrays import as_floats, expect_array
 from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.files import read_text
 from gsgan.utils.pickles import read_npy, read_pickle
 
 Float = NDArray[np.float64]
@@ -36,7 +38,7 @@ Float = NDArray[np.float64]
 JOINTS = len(MEDIAPIPE33.names)
 WORLD_KEYS = (
     *("pose_world_landmarks", "poseWorldLandmarks", "world_landmarks", "worldLandmarks"),
-    "POSE_WORLD_LANDMARKS",
+    *("POSE_WORLD_LANDMARKS", "keypoints3D"),  # the latter: TensorFlow.js, metres about the hips
 )
 # Keys of SMPL's parameters: AMASS, HuMMan, smplx, AIST++, ZJU-MoCap.
 POSE_KEYS = ("poses", "pose", "smpl_poses", "body_pose", "pose_body")
@@ -45,7 +47,6 @@ ROOT_KEYS = ("Rh", "root_orient", "global_orient")
 MOVE_KEYS = ("trans", "transl", "smpl_trans", "Th")
 SHAPE_KEYS = ("betas", "shapes")
 WITHOUT_ROOT = (63, 69, 153, 162)  # numbers of poses of SMPL-X's body, SMPL, SMPL-H, SMPL-X
-LANDMARK = ("x", "y", "z", "visibility")
 RATE_KEYS = ("fps", "mocap_framerate", "mocap_frame_rate")
 SCALE = "smpl_scaling"  # of AIST++: units of its translations in a metre
 ARRAYS = (
@@ -90,7 +91,16 @@ def read_motion(path: Path, source: Source) -> Clip:
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         raise DataError(f"{path} has an unknown format; expected one of {', '.join(READERS)}")
-    return reader(path, source)
+    return _with_missing(reader(path, source))
+
+
+def _with_missing(clip: Clip) -> Clip:
+    """The motion with one rule for missing joints, whatever the format: exact zeros are missing,
+    and a visibility of 0 for every joint of every frame means that none was given."""
+    p = zeros_as_missing(clip.p)
+    known = np.isfinite(p).all(-1)
+    visibility = clip.visibility if clip.visibility.any() else np.ones_like(clip.visibility)
+    return replace(clip, p=p, visibility=np.where(known, visibility, 0.0))
 
 
 # -- numpy's npz: landmarks, body poses, SMPL, MediaPipe
@@ -285,6 +295,8 @@ def read_mediapipe_json(path: Path, source: Source) -> Clip:
 
 def _landmark_row(where: str, frame: Any) -> Float:
     """``[33, 4]`` x, y, z, visibility of a frame; NaN and 0 where no person was detected."""
+    if isinstance(frame, list) and len(frame) == 1 and isinstance(frame[0], dict):
+        frame = frame[0]  # TensorFlow.js returns a list of people
     found = frame
     if isinstance(frame, dict):
         key = next((key for key in WORLD_KEYS if key in frame), None)
@@ -301,14 +313,21 @@ def _landmark_row(where: str, frame: Any) -> Float:
     if not found:
         return np.repeat([[np.nan, np.nan, np.nan, 0]], JOINTS, axis=0)
     try:
-        rows = [[p.get(k, 1.0 if k == "visibility" else None) for k in LANDMARK]
-                if isinstance(p, dict) else [*p, 1.0][:4] for p in found]  # fmt: skip
+        rows = [_numbers(point) for point in found]
     except TypeError:
         rows = []
     row = as_floats(rows)
     if row.shape != (JOINTS, 4) or np.isnan(row).any():
         raise DataError(f"{where}: expected {JOINTS} landmarks with x, y, z; found {len(rows)}")
     return row
+
+
+def _numbers(point: Any) -> list[Any]:
+    """x, y, z and visibility of a landmark; a missing visibility is 1."""
+    if not isinstance(point, dict):
+        return [*point, 1.0][:4]
+    visibility = point.get("visibility", point.get("score", 1.0))  # score: TensorFlow.js
+    return [point.get("x"), point.get("y"), point.get("z"), visibility]
 
 
 def _with_visibility(path: Path, points: NDArray[Any], visibility: Any) -> Float:
@@ -344,7 +363,8 @@ def _rig(path: Path, motion: RigMotion, metres: float | None, source: Source) ->
         unit = f"units of {100 * metres:.3g} cm"
     p = rig_landmarks(standard, source.subject)
     seen = np.asarray(np.isfinite(p).all(-1), np.float64)
-    return Clip(path, p, seen, 1 / motion.frame_time, "z", unit, standard.up)
+    fps = usual_rate(1 / motion.frame_time)
+    return Clip(path, p, seen, fps, "z", unit, standard.up)
 
 
 # -- triangulated and detected points
@@ -355,7 +375,7 @@ def read_trc(path: Path, source: Source) -> Clip:
     _, p, conf = read_points3d(path)
     fps = None
     with suppress(ValueError, IndexError):  # read_points3d has read the header
-        names, values = (line.split() for line in path.read_text().splitlines()[1:3])
+        names, values = (line.split() for line in read_text(path).splitlines()[1:3])
         fps = rate_of(path, float(values[names.index("DataRate")]))
     return Clip(path, p, conf, fps, None, "metres")
 

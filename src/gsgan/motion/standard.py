@@ -32,16 +32,19 @@ DRIFT_SECONDS = 0.5  # standard deviation of the smoothing that separates drift 
 # Names of joints without side, in lower case and letters only, first choices first.
 ALIASES = {
     "Hips": "hips hip pelvis root",
-    "UpLeg": "upleg upperleg thigh hip femur",
-    "Leg": "leg loleg lowerleg shin calf knee tibia",
+    "UpLeg": "upleg upperleg thigh thighbend hip femur",
+    "Leg": "leg loleg lowleg lowerleg shin calf knee tibia",
     "Foot": "ankle foot",
     "ToeBase": "toebase toe toes ball",
-    "Arm": "arm uparm upperarm humerus shldr shoulder",
-    "ForeArm": "forearm loarm lowerarm elbow radius",
+    "Arm": "arm uparm uarm upperarm humerus shldr shldrbend shoulder",
+    "ForeArm": "forearm forearmbend farm lowarm loarm lowerarm elbow radius",
     "Hand": "wrist hand",
     "Head": "head",
 }
-FINGER_ALIASES = {finger: finger.lower() for finger in FINGERS} | {"Pinky": "pinky|little"}
+FINGER_ALIASES = {finger: finger.lower() for finger in FINGERS} | {
+    "Middle": "middle|mid",
+    "Pinky": "pinky|little",
+}
 PARTS = {"metacarpal": 1, "proximal": 1, "intermediate": 2, "distal": 3}
 
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import Crop, resize, take, undistort_map
-from gsgan.data.files import frame_files, last_number, read_grey
+from gsgan.data.files import frame_files, last_number
+from gsgan.data.pixels import read_mask_values
 from gsgan.prepare.sources import IMAGE_SUFFIXES, Recording
 from gsgan.prepare.stages import Advance
 from gsgan.utils.arrays import Bytes
@@ -106,7 +107,7 @@ def write_images(
             continue
         written.append(frame)
         advance(len(written), len(frames))
-        mask = tidy(read_grey(masks[number]), levels)
+        mask = tidy(read_mask_values(masks[number]), levels)
         for pixels, folder, kind in ((image, images, suffix), (mask, alphas, "png")):
             if pixels.shape[:2] != camera.size:
                 where = masks[number] if pixels is mask else source.path

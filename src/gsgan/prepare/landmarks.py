@@ -123,6 +123,7 @@ def _read_frame(path: Path) -> tuple[Float, Float]:
         keys, people = EASYMOCAP_KEYS, content["annots"]
     else:
         raise DataError(f"{path} has neither 'people' (OpenPose) nor 'annots' (EasyMocap)")
+    people = [person for person in people if person is not None]  # nobody
     try:
         read = [_person(person, keys) for person in people]
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
@@ -144,8 +145,11 @@ def _person(person: Mapping[str, Any], keys: tuple[str, ...]) -> tuple[Float, Fl
         px[joints] = np.where(seen[:, None], triples[:, :2] + PIXEL_CENTRE, np.nan)
         conf[joints] = np.where(seen, triples[:, 2], 0.0)
 
-    # OpenPose writes triples flat, EasyMocap in rows.
-    body, *hands = (np.array(person.get(k) or [], np.float64).reshape(-1, 3) for k in keys)
+    # OpenPose writes triples flat, EasyMocap in rows; OpenPose of 2017 had names without _2d.
+    if not {keys[0], keys[0].removesuffix("_2d")} & person.keys():
+        raise KeyError(f"found {', '.join(person)}")
+    found = [person.get(key) or person.get(key.removesuffix("_2d")) or [] for key in keys]
+    body, *hands = (np.array(values, np.float64).reshape(-1, 3) for values in found)
     if len(body):
         numbers = SETS[len(body)][1]
         put(list(numbers), body[list(numbers.values())])

@@ -1,5 +1,6 @@
 """Files that are written completely or not at all, also by a run that is killed."""
 
+import codecs
 import contextlib
 import io
 import json
@@ -19,6 +20,22 @@ def cache_root() -> Path:
         return Path(os.environ["GSGAN_CACHE"]).expanduser()
     base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     return Path(base).expanduser() / "gsgan"
+
+
+def read_text(path: Path, errors: str = "strict") -> str:
+    """The text of a file: UTF-8 with or without a byte order mark, or UTF-16 with one.
+
+    Args:
+        path: the file.
+        errors: what happens to bytes that are no text, as for `bytes.decode`.
+
+    Raises:
+        OSError: if the file cannot be read.
+        UnicodeDecodeError: if it is no such text and ``errors`` is ``strict``.
+    """
+    content = path.read_bytes()
+    wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    return content.decode("utf-16" if wide else "utf-8-sig", errors)
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:

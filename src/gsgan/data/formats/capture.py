@@ -29,6 +29,7 @@ from gsgan.data.cameras import CameraEntry
 from gsgan.data.files import FrameFiles, frame_files, read_arrays, read_json
 from gsgan.data.formats.common import IMAGES, finish, one_mask_each
 from gsgan.data.formats.consistency import Consistency
+from gsgan.data.joints import zeros_as_missing
 from gsgan.data.layout import BodyModel, Found, Layout, Meta, dataset_folder
 from gsgan.data.pixels import PixelRules
 from gsgan.data.skeletons import SKELETONS, Landmarks, Poses, make_landmarks, whole_frame_ids
@@ -178,7 +179,8 @@ def _read_landmarks(
 ) -> Landmarks:
     """Skeletons, hands or faces of every frame."""
     arrays = read_arrays(path, ("p", "conf", "frame_id"))
-    p = expect_array(arrays, "p", (None, joints, 3), path).astype(np.float64) * conventions.scale
+    p = expect_array(arrays, "p", (None, joints, 3), path).astype(np.float64)
+    p = zeros_as_missing(p) * conventions.scale
     ids = whole_frame_ids(expect_array(arrays, "frame_id", (len(p),), path), str(path))
     conf = np.ones(p.shape[:2])
     if "conf" in arrays:

@@ -31,6 +31,7 @@ from gsgan.data.validation import Thresholds, spans
 from gsgan.utils.arrays import Float, as_floats
 from gsgan.utils.checks import whole
 from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.files import read_text
 from gsgan.utils.pickles import read_npz
 
 Files = dict[str, FrameFiles]
@@ -188,7 +189,7 @@ def read_missing(path: Path, cameras: Mapping[str, Any]) -> set[tuple[str, int]]
         DataError: on a line that names no image of a camera.
     """
     found = set()
-    for number, line in enumerate(path.read_text(errors="replace").splitlines(), 1):
+    for number, line in enumerate(read_text(path, errors="replace").splitlines(), 1):
         if not line.strip():
             continue
         parts = PurePosixPath(line.strip().replace("\\", "/"))

@@ -1,0 +1,132 @@
+"""Masks, calibrations and landmarks as other programs write them."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from make import write_tiny_capture
+
+from gsgan.data.calibration import read_calibration
+from gsgan.data.formats.capture import CaptureReader
+from gsgan.data.pixels import PixelRules, read_mask
+from gsgan.data.validation import Thresholds
+from gsgan.prepare.landmarks import read_detections
+from gsgan.utils.errors import DataError
+
+REPORTS = Path(__file__).parents[3] / "shared" / "data" / "reports"
+needs_reports = pytest.mark.skipif(not REPORTS.is_dir(), reason="the shared files are not here")
+SOFT = np.tile(np.arange(0, 256, 8, dtype=np.uint8), (24, 1))
+
+
+def mask_of(path: Path, rule: str = "grey") -> np.ndarray:
+    return read_mask([(rule, path)], PixelRules(composed=False))
+
+
+@pytest.mark.parametrize("colour", [0, 255])
+def test_a_mask_in_the_alpha_channel_is_read(tmp_path, colour):
+    image = np.full((*SOFT.shape, 4), colour, np.uint8)
+    image[..., 3] = SOFT
+    cv2.imwrite(str(tmp_path / "m.png"), image)
+    np.testing.assert_array_equal(mask_of(tmp_path / "m.png"), SOFT)
+
+
+def test_a_mask_in_the_colours_is_read_whatever_its_alpha(tmp_path):
+    image = np.dstack([SOFT, SOFT, SOFT, np.full_like(SOFT, 255)])
+    cv2.imwrite(str(tmp_path / "m.png"), image)
+    np.testing.assert_array_equal(mask_of(tmp_path / "m.png"), SOFT)
+
+
+@pytest.mark.parametrize("value", [1, 100, 127])
+def test_masks_that_never_reach_one_half_are_named(tmp_path, value):
+    cv2.imwrite(str(tmp_path / "m.png"), np.where(SOFT > 99, value, 0).astype(np.uint8))
+    with pytest.raises(DataError, match=rf"m\.png holds 0 and {value} alone"):
+        mask_of(tmp_path / "m.png")
+
+
+def test_an_empty_mask_and_a_faint_soft_one_are_masks(tmp_path):
+    for values in (np.zeros_like(SOFT), SOFT // 4):
+        cv2.imwrite(str(tmp_path / "m.png"), values)
+        np.testing.assert_array_equal(mask_of(tmp_path / "m.png"), values)
+
+
+@needs_reports
+def test_the_reported_masks():
+    white = next((REPORTS / "masks" / "white_alpha" / "masks").rglob("*.png"))
+    assert 0 < (mask_of(white) > 127).mean() < 0.9
+    half = next((REPORTS / "masks" / "bool_half" / "masks").rglob("*.png"))
+    with pytest.raises(DataError, match="holds 0 and 127 alone"):
+        mask_of(half)
+
+
+# -- calibrations
+
+
+@needs_reports
+def test_yaml_without_its_directive_is_read():
+    found = read_calibration(REPORTS / "calibration" / "no_directive" / "intri.yml")
+    assert list(found.cameras) == ["cam01", "cam02", "cam03"]
+
+
+@needs_reports
+def test_a_scene_of_nerfstudio_is_named():
+    with pytest.raises(DataError, match=r"transforms\.json is a scene of nerfstudio"):
+        read_calibration(REPORTS / "calibration" / "transforms.json")
+
+
+# -- landmarks
+
+
+def test_zeros_in_a_capture_are_missing(tmp_path):
+    root = write_tiny_capture(tmp_path)
+    path = root / "landmarks3d.npz"
+    arrays = dict(np.load(path))
+    arrays["p"][1, 13] = 0
+    np.savez(path, **arrays)
+    landmarks = CaptureReader()(root, Thresholds()).landmarks
+    frame = int(arrays["frame_id"][1])
+    assert float(landmarks.visibility[frame][13]) == 0
+
+
+def write_frames(folder: Path, people: list) -> Path:
+    folder.mkdir()
+    for i in range(2):
+        (folder / f"cam_{i:06d}_keypoints.json").write_text(json.dumps({"people": people}))
+    return folder
+
+
+def triples(count: int) -> list[float]:
+    return [x for joint in range(count) for x in (10.0 + joint, 20.0 + joint, 0.9)]
+
+
+def test_null_people_are_nobody(tmp_path):
+    person = {"pose_keypoints_2d": triples(25)}
+    alone = read_detections(write_frames(tmp_path / "alone", [None]))
+    assert (alone.conf == 0).all()
+    both = read_detections(write_frames(tmp_path / "both", [None, person]))
+    one = read_detections(write_frames(tmp_path / "one", [person]))
+    np.testing.assert_array_equal(both.px, one.px)
+
+
+def test_the_keys_of_2017_are_read_and_unknown_ones_named(tmp_path):
+    old = read_detections(write_frames(tmp_path / "old", [{"pose_keypoints": triples(25)}]))
+    new = read_detections(write_frames(tmp_path / "new", [{"pose_keypoints_2d": triples(25)}]))
+    np.testing.assert_array_equal(old.px, new.px)
+    with pytest.raises(DataError, match=r"keypoints\.json.*found joints2d"):
+        read_detections(write_frames(tmp_path / "other", [{"joints2d": triples(25)}]))
+
+
+def test_openposes_18_joints(tmp_path):
+    found = read_detections(write_frames(tmp_path / "coco", [{"pose_keypoints_2d": triples(18)}]))
+    # MediaPipe's nose, left shoulder, right wrist, left hip: OpenPose's 0, 5, 4, 11
+    for landmark, joint in ((0, 0), (11, 5), (16, 4), (23, 11)):
+        np.testing.assert_allclose(found.px[0, landmark], [10.5 + joint, 20.5 + joint])
+
+
+@needs_reports
+def test_the_reported_detections():
+    nobody = read_detections(REPORTS / "detections" / "null_person" / "cam01_json")
+    assert nobody.px.shape[0] > 0
+    old = read_detections(REPORTS / "prepare" / "landmarks" / "old_keys" / "cam01_json")
+    assert (old.conf[:, [11, 12, 23, 24]] > 0).all()

@@ -1,0 +1,247 @@
+"""Files after public bug reports: each kind is read right, also when written another way."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_motion_readers import directions, standard
+
+from gsgan.data.proportions import BONES
+from gsgan.motion.bvh import read_bvh
+from gsgan.motion.clip import frame_times, usual_rate
+from gsgan.motion.readers import Source, read_motion
+from gsgan.motion.standard import known_joints
+from gsgan.utils.errors import DataError
+
+REPORTS = Path(__file__).parents[3] / "shared" / "data" / "reports" / "motion"
+EXPECTED = sorted(REPORTS.glob("*.expected.npz"))
+
+
+def source_of(expected: Path) -> Path:
+    stem = expected.name.removesuffix(".expected.npz")
+    return next(p for p in expected.parent.iterdir() if p.stem == stem and p != expected)
+
+
+@pytest.mark.skipif(not EXPECTED, reason="the shared files are not here")
+@pytest.mark.parametrize("expected", EXPECTED, ids=lambda path: path.name)
+def test_the_reported_files_are_read_right(expected, proportions):
+    path = source_of(expected)
+    found, clip = standard(path, proportions)
+    truth = np.load(expected)["p"]
+    assert found.shape[0] == len(truth), clip.fps
+    if path.suffix == ".bvh":
+        assert clip.fps in (30, 50)
+    ours, theirs = in_body(found[:, :33]), in_body(truth[:, :33])
+    degrees = np.degrees(np.arccos(np.clip((ours * theirs).sum(-1), -1, 1)))
+    seen = [(clip.visibility[:, [a, b]] > 0).all() for a, b in BONES]
+    assert sum(seen) >= len(BONES) - 4
+    assert degrees[:, seen].max() < 15
+
+
+def in_body(p: np.ndarray) -> np.ndarray:
+    """Directions of limbs in the axes of the pelvis and trunk."""
+    hips, shoulders = p[:, [23, 24]], p[:, [11, 12]]
+    up = shoulders.mean(1) - hips.mean(1)
+    left = hips[:, 0] - hips[:, 1]
+    left -= up * (left * up).sum(-1, keepdims=True) / (up * up).sum(-1, keepdims=True)
+    axes = np.stack([left, np.cross(up, left), up], axis=1)
+    axes /= np.linalg.norm(axes, axis=-1, keepdims=True)
+    return np.einsum("fij,fbj->fbi", axes, directions(p))
+
+
+BVH = """HIERARCHY
+ROOT Hips
+{
+  OFFSET 0 0 0
+  CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+  JOINT Chest
+  {
+    OFFSET 0 10 0
+    CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+    End Site
+    {
+      OFFSET 0 10 0
+    }
+  }
+}
+MOTION
+Frames: 2
+Frame Time: 0.0333333
+0 90 0 0 0 0 {chest} 0 0 0
+0 91 0 0 0 0 {chest} 0 0 0
+"""
+
+
+def written(tmp_path: Path, text: str, encoding: str = "utf-8") -> Path:
+    path = tmp_path / "motion.bvh"
+    path.write_bytes(text.encode(encoding))
+    return path
+
+
+@pytest.mark.parametrize("chest", ["0 0 0", "2e-6 -1e-6 3e-6", "0 10 0", "0 10.000002 0"])
+def test_positions_are_counted_from_the_offset_or_the_parent(tmp_path, chest):
+    """With noise too; in all cases the bone is where OFFSET puts it."""
+    motion = read_bvh(written(tmp_path, BVH.replace("{chest}", chest)))
+    assert motion.local is None
+    np.testing.assert_allclose(motion.posed()[:, 1], [[0, 100, 0], [0, 101, 0]], atol=1e-4)
+
+
+@pytest.mark.parametrize("chest", ["0 12 0", "3 11 0"])
+def test_bones_that_do_stretch_keep_their_channels(tmp_path, chest):
+    motion = read_bvh(written(tmp_path, BVH.replace("{chest}", chest)))
+    assert motion.local is not None
+    given = [float(word) for word in chest.split()]
+    np.testing.assert_allclose(motion.posed()[0, 1], np.add(given, [0, 90, 0]))
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "encoding"),
+    [
+        ("", "", "utf-8-sig"),
+        ("", "", "utf-16"),
+        ("\n", "\n", "utf-8"),
+        ("\n", "\r\n", "utf-8"),
+        ("Frames: ", "Frames:", "utf-8"),
+        ("Frame Time: ", "Frame Time:\t", "utf-8"),
+        ("{\n", "{ ", "utf-8"),
+        ("Hips\n{", "Hips{", "utf-8"),
+    ],
+)
+def test_spaces_line_ends_and_marks_do_not_matter(tmp_path, before, after, encoding):
+    text = BVH.replace("{chest}", "0 0 0")
+    changed = text.replace(before, after) if before else text
+    motion = read_bvh(written(tmp_path, changed + "\x1a", encoding))
+    plain = read_bvh(written(tmp_path, text))
+    assert motion.names == plain.names
+    np.testing.assert_array_equal(motion.rotations, plain.rotations)
+    np.testing.assert_array_equal(motion.root, plain.root)
+
+
+def test_a_rate_in_place_of_the_time_is_a_rate(tmp_path):
+    text = BVH.replace("{chest}", "0 0 0").replace("0.0333333", "30")
+    assert read_bvh(written(tmp_path, text)).frame_time == pytest.approx(1 / 30)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "rate"),
+    [
+        *((0.0333333, 30), (0.033333, 30), (0.0083333, 120), (0.008333, 120), (0.0166667, 60)),
+        *((0.04, 25), (0.041667, 24), (0.02, 50), (1 / 29.97, 29.97), (1 / 23.976, 23.976)),
+    ],
+)
+def test_rates_lose_their_rounding_and_films_rates_stay(seconds, rate):
+    assert usual_rate(1 / seconds) == pytest.approx(rate, rel=1e-9)
+
+
+@pytest.mark.parametrize("frames", [1, 2, 13, 1000])
+@pytest.mark.parametrize("fps", [30.0, 30.0003, 29.9997])
+def test_no_frame_is_lost_by_rounding(frames, fps):
+    times = frame_times(frames, fps, 30.0)
+    assert abs(len(times) - frames) <= int(frames == 1000)
+    assert times[-1] <= frames - 1
+
+
+NAMES = {
+    "mocopi": "l_up_leg l_low_leg l_foot l_toes l_up_arm l_low_arm l_hand",
+    "Motive": "LThigh LShin LFoot LToe LUArm LFArm LHand",
+    "DAZ": "lThighBend lShin lFoot lToe lShldrBend lForearmBend lHand",
+    "Mixamo": "mixamorig:LeftUpLeg mixamorig:LeftLeg mixamorig:LeftFoot mixamorig:LeftToeBase "
+    "mixamorig:LeftArm mixamorig:LeftForeArm mixamorig:LeftHand",
+}
+LIMB = ["UpLeg", "Leg", "Foot", "ToeBase", "Arm", "ForeArm", "Hand"]
+
+
+@pytest.mark.parametrize("names", NAMES.values(), ids=NAMES)
+def test_joints_of_common_exporters_are_known(names):
+    known = known_joints(tuple(names.split()))
+    assert known == {f"Left{bone}": place for place, bone in enumerate(LIMB)}
+
+
+def test_daz_fingers_and_twists():
+    known = known_joints(("lMid1", "lMid2", "lPinky1", "lThumb1", "lForearmTwist", "lThighTwist"))
+    assert known == {
+        "LeftHandMiddle1": 0,
+        "LeftHandMiddle2": 1,
+        "LeftHandPinky1": 2,
+        "LeftHandThumb1": 3,
+    }
+
+
+# -- landmarks
+
+
+def test_zeros_are_missing_in_every_format(tmp_path, landmarks, proportions):
+    p = landmarks.copy()
+    p[3:6, 13] = 0  # a left elbow
+    np.savez(tmp_path / "p.npz", p=p)
+    np.save(tmp_path / "p.npy", {"p": p}, allow_pickle=True)
+    frames = [[{"x": x, "y": y, "z": z} for x, y, z in frame] for frame in p.tolist()]
+    (tmp_path / "p.json").write_text(json.dumps(frames))
+    for name in ("p.npz", "p.npy", "p.json"):
+        clip = read_motion(tmp_path / name, Source(proportions))
+        assert np.isnan(clip.p[3:6, 13]).all(), name
+        assert (clip.visibility[3:6, 13] == 0).all(), name
+        assert np.isfinite(clip.p[:, 11]).all(), name
+
+
+def test_a_visibility_of_zero_everywhere_is_none(tmp_path, landmarks, proportions):
+    def point(xyz: list[float], visibility: float) -> dict[str, float]:
+        return dict(zip(("x", "y", "z", "visibility"), [*xyz, visibility], strict=True))
+
+    frames = [[point(xyz, 0.0) for xyz in frame] for frame in landmarks.tolist()]
+    path = tmp_path / "p.json"
+    path.write_text(json.dumps(frames))
+    assert (read_motion(path, Source(proportions)).visibility == 1).all()
+    frames[0][0]["visibility"] = 0.5  # then the others are not seen
+    path.write_text(json.dumps(frames))
+    assert read_motion(path, Source(proportions)).visibility.sum() == 0.5
+
+
+def test_tensorflow_js_in_three_dimensions(tmp_path, landmarks, proportions):
+    def pose(frame: list[list[float]]) -> dict:
+        points = [{"x": x, "y": y, "z": z, "score": 0.9} for x, y, z in frame]
+        return {"keypoints": [{"x": 1, "y": 2, "score": 1}] * 33, "keypoints3D": points}
+
+    for name, wrap in (("flat", lambda one: one), ("people", lambda one: [one])):
+        path = tmp_path / f"{name}.json"
+        path.write_text(json.dumps([wrap(pose(frame)) for frame in landmarks.tolist()]))
+        clip = read_motion(path, Source(proportions))
+        np.testing.assert_allclose(clip.p, landmarks)
+        assert (clip.visibility == 0.9).all()
+
+
+TRC = "PathFileType\t4\t(X/Y/Z)\tm.trc\n{keys}\n{values}\nFrame#\tTime\t{markers}\n\t\t\n"
+MARKERS = {"LShoulder": 11, "RShoulder": 12, "LHip": 23, "RHip": 24, "LKnee": 25, "RKnee": 26}
+
+
+def write_trc(path: Path, p: np.ndarray, *, prefix: str = "", units: str | None = "m") -> Path:
+    scale = {"m": 1, "mm": 1000, "cm": 100, None: 1000}[units]
+    keys = ["DataRate", "CameraRate", "NumFrames", "NumMarkers"] + (["Units"] if units else [])
+    values = ["25", "25", str(len(p)), str(len(MARKERS))] + ([units] if units else [])
+    markers = "\t\t\t".join(prefix + name for name in MARKERS)
+    text = TRC.format(keys="\t".join(keys), values="\t".join(values), markers=markers)
+    for i, frame in enumerate(p):
+        row = [x for joint in MARKERS.values() for x in (frame[joint][[1, 2, 0]] * scale)]
+        text += "\t".join(map(str, [i + 1, i / 25, *row])) + "\n"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("prefix", ["", "Subject1:", "Skeleton 001:"])
+@pytest.mark.parametrize("units", ["m", "mm", None])
+def test_markers_with_a_prefix_and_files_without_units(
+    tmp_path, landmarks, proportions, prefix, units
+):
+    clip = read_motion(
+        write_trc(tmp_path / "m.trc", landmarks, prefix=prefix, units=units), Source(proportions)
+    )
+    np.testing.assert_allclose(clip.p[:, 23], landmarks[:, 23], atol=1e-9)
+    assert clip.fps == 25
+
+
+def test_markers_without_a_trunk_are_named(tmp_path, landmarks, proportions):
+    path = write_trc(tmp_path / "m.trc", landmarks)
+    path.write_text(path.read_text().replace("Shoulder", "Elbow").replace("Hip", "Wrist"))
+    with pytest.raises(DataError, match=r"LElbow.*RWrist"):
+        read_motion(path, Source(proportions))
