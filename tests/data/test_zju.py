@@ -30,8 +30,8 @@ def read(root: Path, smpl: Path | None, **settings: Any) -> Layout:
     return ZjuReader(**settings)(root, Thresholds(), None if smpl is None else str(smpl))
 
 
-def frame_of(layout: Layout, camera: int, frame: int) -> Frame:
-    return CaptureDataset(layout, [(layout.camera_names[camera], frame)])[0]
+def frame_of(layout: Layout, camera: int, frame: int, **given: Any) -> Frame:
+    return CaptureDataset(layout, [(layout.camera_names[camera], frame)], **given)[0]
 
 
 @pytest.fixture(scope="module")
@@ -56,12 +56,26 @@ def test_the_original_release_is_read_as_it_was_written(written, subject, smpl_f
     assert meta.label_names == CIHP
 
 
+def test_scores_have_the_labels_that_training_ignores(subject, smpl_file, tmp_path):
+    plain = replace(subject, cameras=[replace(c, dist=np.zeros(5)) for c in subject.cameras])
+    root = writers.write_original(tmp_path / "s", plain)
+    layout = read(root, smpl_file, ignore_band=5)
+    item = (layout.camera_names[0], layout.frames[0])
+    trained = CaptureDataset(layout, [item], ignore_band=True)[0].labels
+    scored = CaptureDataset(layout, [item])[0].labels
+    assert int((trained == 255).sum()) > 0
+    assert int((scored == 255).sum()) == 0
+    kept = trained != 255
+    assert torch.equal(trained[kept], scored[kept])
+
+
 def test_the_outline_of_the_labels_is_ignored_as_wide_as_asked(subject, smpl_file, tmp_path):
     plain = replace(subject, cameras=[replace(c, dist=np.zeros(5)) for c in subject.cameras])
     root = writers.write_original(tmp_path / "s", plain)
     found = {}
     for band in (0, 3, 5):
-        labels = frame_of(read(root, smpl_file, ignore_band=band), 0, 0).labels
+        layout = read(root, smpl_file, ignore_band=band)
+        labels = frame_of(layout, 0, 0, ignore_band=True).labels
         found[band] = int((labels == 255).sum())
         kept = labels[0].numpy() != 255
         assert np.array_equal(labels[0].numpy()[kept], subject.labels[0][0][kept])

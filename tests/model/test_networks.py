@@ -169,3 +169,16 @@ def test_a_generator_of_patches(times):
     torch.testing.assert_close(net._stem(given[0], [S, p2d], fine), plain, atol=1e-5, rtol=1e-5)
     with pytest.raises(ConfigError, match="patch must be one of 1, 2, 4"):
         generator(patch=3)
+
+
+@pytest.mark.parametrize("skip", [False, True])
+def test_the_image_has_all_its_digits_under_bf16(skip):
+    """The last layer in bfloat16 would round the image to 8 bits of mantissa."""
+    net = generator(rgb_skip=skip)
+    torch.nn.init.normal_(net.paint.weight, std=0.1)
+    F, S, p2d, g = inputs(16, 16)
+    alpha = torch.rand(2, 1, 16, 16)
+    with torch.autocast("cpu", torch.bfloat16):
+        image = net(F, S, p2d, g, alpha=alpha)
+    assert image.dtype == torch.float32
+    assert not torch.equal(image, image.bfloat16().float())

@@ -188,3 +188,25 @@ def test_two_runs_of_a_sweep_never_share_a_folder():
     for one, other in pairs:
         assert folder_name(one) != folder_name(other)
         assert max(map(len, map(folder_name, (one, other)))) <= LONGEST_NAME
+
+
+@pytest.mark.parametrize(
+    ("capability", "precision"),
+    [((7, 0), "32-true"), ((7, 5), "32-true"), ((8, 0), "bf16-mixed"), ((12, 0), "bf16-mixed")],
+)
+def test_bf16_only_on_gpus_that_have_it(monkeypatch, capability, precision):
+    from gsgan.utils.config import gpu_precision
+
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.setattr("torch.cuda.get_device_capability", lambda *_: capability)
+    assert gpu_precision() == precision
+
+
+def test_the_precision_of_an_old_gpu_is_explained(monkeypatch):
+    from gsgan.train.run import _precision
+
+    assert _precision("32-true") == "32-true"
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.setattr("torch.cuda.get_device_capability", lambda *_: (7, 5))
+    assert "7.5" in _precision("32-true")
+    assert _precision("bf16-mixed") == "bf16-mixed"

@@ -22,3 +22,21 @@ def test_freed_memory_is_not_mapped_again():
     keep_freed_memory()
     faults()
     assert faults() < 16_000  # a tenth of what is mapped otherwise; a heap in use needs some
+
+
+def test_full_precision_turns_autocast_and_tf32_off_and_restores_them():
+    from gsgan.utils.tensors import full_precision
+
+    before = torch.backends.cudnn.allow_tf32, torch.get_float32_matmul_precision()
+    torch.backends.cudnn.allow_tf32 = True
+    torch.set_float32_matmul_precision("medium")
+    try:
+        with torch.autocast("cpu", torch.bfloat16), full_precision(torch.device("cpu")):
+            assert not torch.backends.cudnn.allow_tf32
+            assert torch.get_float32_matmul_precision() == "highest"
+            assert not torch.is_autocast_enabled("cpu")
+        assert torch.backends.cudnn.allow_tf32
+        assert torch.get_float32_matmul_precision() == "medium"
+    finally:
+        torch.backends.cudnn.allow_tf32 = before[0]
+        torch.set_float32_matmul_precision(before[1])

@@ -248,7 +248,14 @@ class GsganData(LightningDataModule):
         )
         return {
             name: CaptureDataset(
-                layout, splits.items[name], self.size, self.crop, cache, self.lens, skeletons
+                layout,
+                splits.items[name],
+                self.size,
+                self.crop,
+                cache,
+                self.lens,
+                skeletons,
+                ignore_band=name == "train",
             )
             for name in SPLITS
         }

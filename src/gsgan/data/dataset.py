@@ -76,6 +76,8 @@ class CaptureDataset(Dataset[Frame]):
             hands.
         lens: ``undistort``; ``ignore`` treats images as a pinhole's; ``raw`` keeps the
             distortion, in ``camera.dist`` (five coefficients; lenses with more are undistorted).
+        ignore_band: whether labels near the mask's outline are 255, as the reader's rules say for
+            training. Scores have every label.
 
     Raises:
         ConfigError: when the size is not a whole number above 0.
@@ -92,8 +94,11 @@ class CaptureDataset(Dataset[Frame]):
         cache: ImageCache | None = None,
         lens: Lens = "undistort",
         skeletons: Landmarks | None = None,
+        *,
+        ignore_band: bool = False,
     ) -> None:
         self.layout = layout
+        self.ignore_band = ignore_band
         self.items = items
         self.size = None if size is None else whole("data.size", size, 1)
         self.crop = crop
@@ -201,7 +206,9 @@ class CaptureDataset(Dataset[Frame]):
         image = fit(cropping.black_out(image, mask, rules.composed), exact=False)
         labels = self._label_image(item)
         if labels is not None:
-            labels = fit(pixels.with_ignored_border(labels, mask, rules.ignore_band), exact=True)
+            if self.ignore_band:
+                labels = pixels.with_ignored_border(labels, mask, rules.ignore_band)
+            labels = fit(labels, exact=True)
         if unsure is not None:
             unsure = fit(unsure, exact=True)
         mask = fit(mask, exact=rules.mask_sampling == "nearest")

@@ -39,7 +39,7 @@ def d_ssim_map(image: Tensor, target: Tensor, *, k: tuple[float, float] = (0.01,
 
     Source: Wang et al. 2004.
     """
-    with full_precision(image):
+    with full_precision(image.device):
         wide = torch.promote_types(image.dtype, torch.float32)
         image, target = image.to(wide), target.to(wide)
         difference = image - target

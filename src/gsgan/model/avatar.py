@@ -264,7 +264,7 @@ class Avatar(nn.Module):
         """The body pose of skeletons ``[B, J, 3]``, see `Solver.solve`; None if none is needed."""
         if self.solver is None:
             return None
-        with self.stage("solve"), full_precision(skeleton):
+        with self.stage("solve"), full_precision(skeleton.device):
             return self.solver.solve(skeleton, visibility)
 
     def window(self, skeleton: Tensor, camera: Camera) -> Window | None:
@@ -273,7 +273,7 @@ class Avatar(nn.Module):
             return None
         sides = {"multiple": self.window_multiple, "least": self.window_least}
         margin, near = self.window_margin, self.accuracy.near
-        with self.stage("window"), full_precision(skeleton):
+        with self.stage("window"), full_precision(skeleton.device):
             return body_window(skeleton, camera, margin=margin, near=near, **sides)
 
     def _rendered(
@@ -289,7 +289,7 @@ class Avatar(nn.Module):
     ) -> Rendering:
         """What the cameras see (paper Fig. 3)."""
         raster = S = image = alpha = None
-        with full_precision(p):
+        with full_precision(p.device):
             with self.stage("skeleton"):
                 valid = visibility > 0
                 frames = bone_frames(p, valid, self.template)

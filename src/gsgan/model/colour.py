@@ -50,7 +50,7 @@ class ColourCorrection(nn.Module):
             alpha: ``[B, 1, H, W]``.
             camera_index: ``[B]`` int64.
         """
-        with full_precision(image):
+        with full_precision(image.device):
             affine = self.of_cameras(camera_index).to(image.dtype)
             mixed = torch.einsum("bij,bjhw->bihw", affine[..., :3], image)
             return mixed + affine[..., 3, None, None] * alpha

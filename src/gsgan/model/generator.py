@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from gsgan.utils.checks import one_of
-from gsgan.utils.tensors import derived
+from gsgan.utils.tensors import derived, full_precision
 
 NORM_FLOOR = 1e-6  # inside the root: an all-zero pixel (empty background) stays zero
 SLOPE = 0.2
@@ -203,7 +203,9 @@ class Generator(nn.Module):
             h = style(conv(h), styles[-1], g)
         for i, level in enumerate(self.up):
             h = level(h, skips[-2 - i], styles[-2 - i], g)
-        painted = functional.pixel_shuffle(self.paint(h), self.patch)[..., :height, :width]
+        with full_precision(h.device):  # bf16 would round the image to 8 bits
+            painted = self.paint(h.to(self.paint.weight.dtype))
+        painted = functional.pixel_shuffle(painted, self.patch)[..., :height, :width]
         if self.rgb_skip:
             if alpha is None:
                 raise ValueError("Generator: built with rgb_skip=True, so alpha must be given")

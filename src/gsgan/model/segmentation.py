@@ -115,7 +115,7 @@ class Segmentation(SkinnedGaussians):
 
     def raster(self, pose: BodyPose, camera: Camera) -> Raster:
         """The splatted body: features are its classes, alpha its silhouette."""
-        with full_precision(pose.theta):
+        with full_precision(pose.theta.device):
             return rasterise(
                 self.gaussians(pose), camera, settings=self.accuracy, backend=self.backend
             )

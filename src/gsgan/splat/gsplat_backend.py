@@ -15,8 +15,10 @@ Differences between gsplat and ``Accuracy``, which `given_up` describes:
 """
 
 import importlib
+import importlib.metadata
 import importlib.util
 import math
+import re
 from functools import lru_cache
 
 import torch
@@ -185,8 +187,26 @@ def _measured_cap(device: torch.device) -> tuple[float | None, str]:
             alpha = draw(gaussians, camera, _PROBE)[1]
         return float(alpha), ""
     except Exception as error:  # no compiler, unknown GPU, other version: torch is used
-        line = ": ".join([type(error).__name__, *str(error).strip().splitlines()[:1]])
-        return None, f"gsplat is installed but cannot draw here ({line})."
+        return None, (
+            f"gsplat {_version()} is installed but cannot draw here ({first_error(error)}); gsplat "
+            "1.5.3 or newer is needed, and 1.5.3 compiles with torch 2.8 for CUDA 12.8, not with "
+            "CUDA 13."
+        )
+
+
+def _version() -> str:
+    try:
+        return importlib.metadata.version("gsplat")
+    except importlib.metadata.PackageNotFoundError:
+        return "of an unknown version"
+
+
+def first_error(error: Exception) -> str:
+    """The type of an error and the line that tells its cause: of a failed build the compiler's
+    first error, which stands far below "Error building extension"."""
+    lines = str(error).strip().splitlines()
+    causes = [line for line in lines if re.search(r"\b(fatal )?error\b\s*:", line)]
+    return ": ".join([type(error).__name__, *(causes or lines)[:1]])
 
 
 _PROBE = Accuracy("probe", 1 / 255, 1e-4, "opacity", "float32")

@@ -11,7 +11,6 @@ backward pass. Neither takes a logarithm nor divides by ``1 - alpha``, so an opa
 import math
 from bisect import bisect_left
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from operator import neg
@@ -25,6 +24,7 @@ from torch.nn import functional
 from gsgan.splat.project import Projected
 from gsgan.splat.settings import Accuracy
 from gsgan.splat.tile_lists import TileLists, Tiling, tile_lists, with_empty_row
+from gsgan.utils.tensors import full_precision
 
 # u and v this large are far beyond every cut-off, and their squares do not overflow float32.
 U_MAX = 1e15
@@ -59,18 +59,6 @@ def composite(
     # Rounding may sum the weights to 1 + 1e-7; the gradient must not stop there.
     alpha = alpha - (alpha.detach() - 1).clamp_min(0)
     return blended[:, :C], alpha
-
-
-@contextmanager
-def full_precision(device: torch.device) -> Iterator[None]:
-    """Matrix products at the precision of their dtype: no autocast, TF32 or bfloat16."""
-    before = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("highest")
-    try:
-        with torch.autocast(device.type, enabled=False):
-            yield
-    finally:
-        torch.set_float32_matmul_precision(before)
 
 
 class _Composite(torch.autograd.Function):

@@ -44,7 +44,7 @@ class StepOneLoss:
     ) -> Tensor:
         """The loss of a rendering of ``frame`` over ``background [B, 3, 1, 1]``, None for black;
         ``head`` is the linear readout of F. In full precision, autocast or not."""
-        with full_precision(frame.image):
+        with full_precision(frame.image.device):
             assert rendering.features is not None and rendering.splat_alpha is not None  # noqa: PT018
             assert rendering.colour is not None
             target, behind = frame.image, frame.image.new_zeros(())
@@ -75,7 +75,7 @@ def discriminate(discriminator: Discriminator, image: Tensor, gan: str) -> list[
     images, since bf16 rounds away small differences."""
     if gan not in COMPARING:
         return discriminator(image)  # type: ignore[no-any-return]
-    with full_precision(image):
+    with full_precision(image.device):
         dtype = next(discriminator.parameters()).dtype
         return discriminator(image.to(dtype))  # type: ignore[no-any-return]
 

@@ -45,7 +45,7 @@ from gsgan.train.callbacks import AtomicCheckpoints, ImageGrid, ProgressLines, S
 from gsgan.train.module import AvatarTraining
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import whole
-from gsgan.utils.config import defaults_of
+from gsgan.utils.config import BFLOAT16_SINCE, defaults_of
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.sweeps import STOPPED
@@ -389,6 +389,7 @@ def describe(
     if avatar.splats is not None:
         backend = resolve_backend(avatar.backend, device_of(config), avatar.accuracy)[0]
         table.add_row("rasteriser", backend)
+    table.add_row("precision", _precision(str(config.trainer.precision)))
     s = module.schedule
     table.add_row(
         "schedule", f"segmentation {s.segmentation}, Step I {s.step_one}, Step II {s.step_two}"
@@ -397,6 +398,16 @@ def describe(
     for mark in module.marks:
         console.print(f"stand-in in use: {mark}", highlight=False)
     console.print(avatar.effects.table())
+
+
+def _precision(chosen: str) -> str:
+    """The trainer's precision, and why it is 32 bits on an old GPU."""
+    if chosen == "bf16-mixed" or not torch.cuda.is_available():
+        return chosen
+    capability = torch.cuda.get_device_capability()
+    if capability >= BFLOAT16_SINCE:
+        return chosen
+    return f"{chosen}: this GPU (compute capability {'.'.join(map(str, capability))}) has no bf16"
 
 
 def _quiet_lightning() -> None:

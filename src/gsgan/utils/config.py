@@ -21,8 +21,10 @@ from gsgan.utils.errors import GsganError
 from gsgan.utils.sweeps import note, run_job
 
 FAILED = 1
+BFLOAT16_SINCE = (8, 0)  # compute capability: before it bfloat16 is emulated or refused
 LONGEST_NAME = 200  # bytes of a sweep's folder; file systems take 255, files beside it need some
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+ASSIGNED = re.compile(r"\+{0,2}[A-Za-z_][\w./@]*")  # the key of an override
 EFFECTS_LIST = re.compile(r"effects=(\[[^\[\]]*\])")
 
 
@@ -69,6 +71,16 @@ def if_gpu(then: object, otherwise: object) -> object:
     return then if torch.cuda.is_available() else otherwise
 
 
+def gpu_precision() -> str:
+    """The trainer's precision: bf16-mixed on a GPU that computes with bfloat16, else 32-true."""
+    import torch  # here: importing an entry point stays fast
+
+    if not torch.cuda.is_available():
+        return "32-true"
+    capability = torch.cuda.get_device_capability()
+    return "bf16-mixed" if capability >= BFLOAT16_SINCE else "32-true"
+
+
 def by_name(name: str, choices: Mapping[str, str], default: str) -> str:
     """The choice listed for a name, else the default."""
     return choices.get(name, default)
@@ -76,6 +88,7 @@ def by_name(name: str, choices: Mapping[str, str], default: str) -> str:
 
 OmegaConf.register_new_resolver("by_name", by_name, replace=True)
 OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)
+OmegaConf.register_new_resolver("gpu_precision", gpu_precision, replace=True)
 OmegaConf.register_new_resolver("if_gpu", if_gpu, replace=True)
 
 
@@ -114,7 +127,7 @@ def entry(name: str, task: Callable[[DictConfig], object] | str) -> Callable[[],
     def main() -> None:
         import hydra  # here: importing an entry point stays fast
 
-        sys.argv[1:] = [spelled_out(argument, name) for argument in sys.argv[1:]]
+        sys.argv[1:] = [quoted(spelled_out(argument, name)) for argument in sys.argv[1:]]
         command = hydra.main(
             version_base="1.3", config_path=str(config_folder()), config_name=name
         )(run)
@@ -146,6 +159,25 @@ def spelled_out(argument: str, command: str) -> str:
         return f"++{argument}"
     found = EFFECTS_LIST.fullmatch(argument)
     return argument if found is None else f"effects.only={found[1]}"
+
+
+def quoted(argument: str) -> str:
+    """``key=value`` with the value in quotes if Hydra's grammar cannot read it as it is, such as a
+    path with brackets, blanks or a quote; and with the user's folder for a leading ``~/``, which a
+    shell does not expand there."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    key, sign, value = argument.partition("=")
+    if not sign or not ASSIGNED.fullmatch(key):
+        return argument
+    if value.startswith("~/"):
+        value = str(Path(value).expanduser())
+    try:
+        OverridesParser.create().parse_override(f"{key}={value}")
+    except (HydraException, OmegaConfBaseException):
+        mark = '"' if "'" in value and '"' not in value else "'"
+        value = mark + value.replace(mark, f"\\{mark}") + mark
+    return f"{key}={value}"
 
 
 def one_sentence(error: BaseException) -> str | None:

@@ -2,7 +2,8 @@
 
 import contextlib
 import ctypes
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any
 
@@ -37,9 +38,23 @@ def filled(values: Any, like: Tensor) -> Tensor:
     return like.new_full((), values)
 
 
-def full_precision(like: Tensor) -> torch.autocast:
-    """Disables autocast on the device of ``like``: bf16 projections are off by pixels."""
-    return torch.autocast(like.device.type, enabled=False)
+@contextmanager
+def full_precision(device: torch.device) -> Iterator[None]:
+    """Computes at the precision of the tensors' dtype: no autocast, TF32 or bfloat16 products.
+
+    bf16 projections are off by pixels, and TF32 keeps 10 bits. Gradients that are computed outside
+    have the precision that is set there.
+    """
+    tf32 = torch.backends.cudnn.allow_tf32
+    products = torch.get_float32_matmul_precision()
+    torch.backends.cudnn.allow_tf32 = False
+    torch.set_float32_matmul_precision("highest")
+    try:
+        with torch.autocast(device.type, enabled=False):
+            yield
+    finally:
+        torch.backends.cudnn.allow_tf32 = tf32
+        torch.set_float32_matmul_precision(products)
 
 
 def pick_device(name: str) -> torch.device:
