@@ -23,6 +23,7 @@ def test_large_captures_train_at_full_size_by_themselves(compose, data):
 )
 def test_the_accelerator_is_the_one_that_is_there(compose, monkeypatch, there, told):
     monkeypatch.setattr("torch.cuda.is_available", lambda: there)
+    monkeypatch.setattr("torch.cuda.get_device_capability", lambda *_: (8, 6))
     trainer = compose("train").trainer
     assert (trainer.accelerator, trainer.precision) == told
     assert compose("train", "trainer=cpu").trainer.accelerator == "cpu"

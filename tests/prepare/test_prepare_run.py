@@ -243,3 +243,17 @@ def test_the_environment_is_only_made_with_setup(project):
     with pytest.raises(ConfigError, match="add setup=true"):
         prepare(options(project, landmarks="mediapipe", mediapipe=missing), quiet())
     assert not (project / "nothing").exists()
+
+
+def test_errors_of_the_check_are_errors_of_the_command(project, monkeypatch):
+    finding = {"level": "error", "topic": "body", "sentence": "a person of 2.95 m"}
+
+    def found(_root: Path, page: Path, _console: Console) -> None:
+        page.with_suffix(".json").write_text(json.dumps({"findings": [finding]}))
+
+    monkeypatch.setattr("gsgan.prepare.run.check_capture", found)
+    console = Console(file=io.StringIO(), width=100)
+    for _ in range(2):  # the dataset that exists is not ready either
+        with pytest.raises(DataError, match=r"a person of 2\.95 m.*check\.html"):
+            prepare(options(project), console)
+    assert "is ready" not in console.file.getvalue()

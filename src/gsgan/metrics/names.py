@@ -43,7 +43,7 @@ IMAGE_METRICS = {
     "edge_f1_person": Metric("edge F1 in box", "edge F1 in box", 3, "↑"),
     "edge_ratio": Metric("edges", "edges", 3, "→1"),
     "edge_ratio_person": Metric("edges in box", "edges in box", 3, "→1"),
-    "high_frequencies": Metric("high-frequency energy", "HF energy", 3, "→1"),
+    "high_frequencies": Metric("HF energy", "HF energy", 3, "→1"),
     "flicker": Metric("flicker in box", "flicker", 4, "↓"),
     "psnr_hands": Metric("PSNR dB hands", "hands", 2, "↑"),
     "ssim_hands": Metric("SSIM hands", "SSIM hands", 4, "↑"),

@@ -11,6 +11,7 @@ from rich.console import Console
 
 from gsgan.check.report import Table
 from gsgan.check.run import check_capture
+from gsgan.data.files import read_json
 from gsgan.data.joints import BODY, FACE, HANDS, known
 from gsgan.data.splits import parse_frames
 from gsgan.data.validation import Thresholds, check_distance
@@ -119,7 +120,7 @@ def prepare(options: Options, console: Console) -> Path:
         Its folder.
 
     Raises:
-        GsganError: on anything the user can correct.
+        GsganError: on anything the user can correct, also what the check of the dataset finds.
     """
     out = options.folder("out")
     inputs = None if options.one_camera else read_inputs(options)
@@ -128,6 +129,7 @@ def prepare(options: Options, console: Console) -> Path:
         console.print(f"{out} exists already, made from the same images and settings")
         if not (out / "check.json").is_file():  # killed before its last file
             check_capture(out, out / "check.html", console)
+        _refuse_errors(out)
         return out
     stages = StageFolder(out.parent / f".{out.name}.prepare")
     extra: dict[str, object] = {}
@@ -153,6 +155,7 @@ def prepare(options: Options, console: Console) -> Path:
         shutil.rmtree(stages.folder, ignore_errors=True)
     check_capture(out, out / "check.html", console)
     print_summary(numbers, console)
+    _refuse_errors(out)
     lines = (
         f"{out} is ready; look at {out / 'check.html'}, then",
         f"python -m gsgan.fit data=capture data.root={out}",
@@ -160,6 +163,17 @@ def prepare(options: Options, console: Console) -> Path:
     )
     console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
     return out
+
+
+def _refuse_errors(out: Path) -> None:
+    """Raises a DataError if the check of the dataset, in its check.json, has found errors."""
+    findings = read_json(out / "check.json")["findings"]
+    errors = [finding["sentence"] for finding in findings if finding["level"] == "error"]
+    if errors:
+        raise DataError(
+            f"{out} was written, but its check has found errors: {'; '.join(errors)}; correct the "
+            f"input (see {out / 'check.html'}) and start again with overwrite=true"
+        )
 
 
 def _fingerprint(options: Options, inputs: Inputs | None) -> list[object]:
