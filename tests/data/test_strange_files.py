@@ -124,9 +124,32 @@ def test_openposes_18_joints(tmp_path):
         np.testing.assert_allclose(found.px[0, landmark], [10.5 + joint, 20.5 + joint])
 
 
+def body_25b() -> tuple[np.ndarray, list[float]]:
+    """COCO's 17 joints of a person, and the same in BODY_25B with a neck, a head and feet."""
+    rng = np.random.default_rng(0)
+    coco = np.array([[50, 10], [52, 8], [48, 8], [54, 9], [46, 9], [60, 25], [40, 25], [65, 40],
+                     [35, 40], [68, 55], [32, 55], [56, 60], [44, 60], [56, 80], [44, 80],
+                     [56, 98], [44, 98]]) + rng.uniform(0, 1, (17, 2))  # fmt: skip
+    rest = np.array([[50, 22], [50, 4], [58, 102], [60, 101], [55, 101], [42, 102], [40, 101],
+                     [45, 101]])  # fmt: skip
+    whole = np.concatenate([coco, rest])
+    return coco, [x for x, y in whole.tolist() for x in (x, y, 0.9)]
+
+
+def test_body_25b_is_told_from_body_25_by_the_middle_of_the_hips(tmp_path):
+    coco, person = body_25b()
+    found = read_detections(write_frames(tmp_path / "b", [{"pose_keypoints_2d": person}]))
+    for landmark, joint in ((0, 0), (11, 5), (16, 10), (23, 11), (28, 16)):
+        np.testing.assert_allclose(found.px[0, landmark], coco[joint] + 0.5)
+    np.testing.assert_allclose(found.px[0, 32], [42.5, 102.5])  # the right big toe
+
+
 @needs_reports
 def test_the_reported_detections():
     nobody = read_detections(REPORTS / "detections" / "null_person" / "cam01_json")
     assert nobody.px.shape[0] > 0
     old = read_detections(REPORTS / "prepare" / "landmarks" / "old_keys" / "cam01_json")
     assert (old.conf[:, [11, 12, 23, 24]] > 0).all()
+    other = read_detections(REPORTS / "prepare" / "landmarks" / "body_25b" / "cam01_json")
+    both = np.isfinite(old.px).all(-1) & np.isfinite(other.px).all(-1)
+    assert np.abs(old.px - other.px)[both].max() < 2  # the same person

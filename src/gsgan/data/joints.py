@@ -49,6 +49,7 @@ _BODY_25 = dict(
         strict=True,
     )
 )
+BODY_25B = _COCO | dict(zip(_FEET, (21, 24, 19, 22), strict=True))  # OpenPose's experimental one
 _HALPE_26 = _COCO | dict(zip(_FEET, (24, 25, 20, 21), strict=True))
 _WHOLE_BODY = {
     **_COCO,

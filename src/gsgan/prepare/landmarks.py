@@ -1,20 +1,32 @@
 """2D landmarks from the files of MediaPipe, OpenPose and EasyMocap."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from gsgan.data.files import read_arrays, read_json
-from gsgan.data.joints import ALL, BODY, FACE, FACE_MESH, FROM_HANDS, LEFT, RIGHT, SETS, known
+from gsgan.data.joints import (
+    ALL,
+    BODY,
+    BODY_25B,
+    FACE,
+    FACE_MESH,
+    FROM_HANDS,
+    LEFT,
+    RIGHT,
+    SETS,
+    known,
+)
 from gsgan.data.skeletons import whole_frame_ids
 from gsgan.motion.points import Numbered, json_files
 from gsgan.skeleton.hands import HAND
 from gsgan.utils.arrays import Float, Ints, expect_array
 from gsgan.utils.errors import DataError
 
+MIDDLE_OF_HIPS = 0.35  # of the trunk: farther from it joint 8 is another one
 MESH = 468  # landmarks of MediaPipe's face mesh
 PIXEL_CENTRE = 0.5  # added to detectors that count from the centre of the first pixel
 OPENPOSE_KEYS = ("pose_keypoints_2d", "hand_left_keypoints_2d", "hand_right_keypoints_2d")
@@ -57,7 +69,12 @@ def read_detections(path: Path) -> Detections:
     """
     if path.is_dir():
         files = json_files(path)
-        px, conf = map(np.array, zip(*map(_read_frame, files.values()), strict=True))
+        people = [_read_people(file) for file in files.values()]
+        best = [max(found, key=_seen, default=None) for found in people]  # the person seen best
+        bodies = [person.body for person in best if person is not None]
+        numbers = joint_numbers(bodies)
+        read = [_joints(person, numbers) for person in best]
+        px, conf = map(np.array, zip(*read, strict=True))
         frames = np.array(list(files))
     else:
         frames, px, conf = _read_npz(path)
@@ -115,7 +132,25 @@ def _read_npz(path: Path) -> Numbered:
     return frame_id, px, conf
 
 
-def _read_frame(path: Path) -> tuple[Float, Float]:
+class _Person(NamedTuple):
+    """What a file has of a person: rows of x, y, confidence; none where a part is missing."""
+
+    body: Float
+    left: Float
+    right: Float
+
+
+def _seen(person: _Person) -> float:
+    """By how much confidence a person is seen."""
+    return sum(float(part[:, 2].clip(0).sum()) for part in person)
+
+
+def _read_people(path: Path) -> list[_Person]:
+    """The people of a file of OpenPose or EasyMocap.
+
+    Raises:
+        DataError: if it is neither, or a person does not hold joints of a known set.
+    """
     content = read_json(path)
     if isinstance(content.get("people"), list):
         keys, people = OPENPOSE_KEYS, content["people"]
@@ -123,37 +158,66 @@ def _read_frame(path: Path) -> tuple[Float, Float]:
         keys, people = EASYMOCAP_KEYS, content["annots"]
     else:
         raise DataError(f"{path} has neither 'people' (OpenPose) nor 'annots' (EasyMocap)")
-    people = [person for person in people if person is not None]  # nobody
     try:
-        read = [_person(person, keys) for person in people]
+        return [_person(person, keys) for person in people if person is not None]
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         sets = ", ".join(f"{n} ({name})" for n, (name, _) in SETS.items())
         raise DataError(
             f"{path}: a person must hold '{keys[0]}' with x, y, confidence of {sets} joints "
             f"({error})"
         ) from None
-    if not read:
-        return np.full((ALL, 2), np.nan), np.zeros(ALL)
-    return max(read, key=lambda one: float(one[1].sum()))  # the person seen best
 
 
-def _person(person: Mapping[str, Any], keys: tuple[str, ...]) -> tuple[Float, Float]:
+def _person(person: Mapping[str, Any], keys: tuple[str, ...]) -> _Person:
+    # OpenPose of 2017 had names without _2d.
+    if not {keys[0], keys[0].removesuffix("_2d")} & person.keys():
+        raise KeyError(f"found {', '.join(person)}")
+    found = [person.get(key) or person.get(key.removesuffix("_2d")) or [] for key in keys]
+    # OpenPose writes triples flat, EasyMocap in rows.
+    parts = [np.array(values, np.float64).reshape(-1, 3) for values in found]
+    if len(parts[0]) and len(parts[0]) not in SETS:
+        raise LookupError(len(parts[0]))
+    return _Person(*parts)
+
+
+def joint_numbers(bodies: Sequence[Float]) -> dict[int, dict[int, int]]:
+    """The numbers of MediaPipe's joints in bodies of each count of joints.
+
+    Two sets have 25 joints. Joint 8 of BODY_25 is the middle of the hips, joints 9 and 12; of
+    BODY_25B it is an elbow.
+
+    Args:
+        bodies: ``[n, 3]`` x, y, confidence of a person, in all frames.
+    """
+    numbers = {count: joints for count, (_, joints) in SETS.items()}
+    distances = []
+    for body in bodies:
+        if len(body) == 25 and (body[[1, 8, 9, 12], 2] > 0).all():
+            neck, middle, right, left = body[[1, 8, 9, 12], :2]
+            trunk = np.linalg.norm(neck - (left + right) / 2)
+            distances.append(np.linalg.norm(middle - (left + right) / 2) / max(float(trunk), 1e-6))
+    if distances and np.median(distances) > MIDDLE_OF_HIPS:
+        numbers[25] = BODY_25B
+    return numbers
+
+
+def _joints(
+    person: _Person | None, numbers: Mapping[int, Mapping[int, int]]
+) -> tuple[Float, Float]:
+    """Pixels ``[J, 2]`` and confidence ``[J]`` of a person; NaN and 0 of nobody."""
     px, conf = np.full((ALL, 2), np.nan), np.zeros(ALL)
+    if person is None:
+        return px, conf
 
     def put(joints: list[int], triples: Float) -> None:
         seen = known(triples) & (triples[:, 2] > 0)
         px[joints] = np.where(seen[:, None], triples[:, :2] + PIXEL_CENTRE, np.nan)
         conf[joints] = np.where(seen, triples[:, 2], 0.0)
 
-    # OpenPose writes triples flat, EasyMocap in rows; OpenPose of 2017 had names without _2d.
-    if not {keys[0], keys[0].removesuffix("_2d")} & person.keys():
-        raise KeyError(f"found {', '.join(person)}")
-    found = [person.get(key) or person.get(key.removesuffix("_2d")) or [] for key in keys]
-    body, *hands = (np.array(values, np.float64).reshape(-1, 3) for values in found)
-    if len(body):
-        numbers = SETS[len(body)][1]
-        put(list(numbers), body[list(numbers.values())])
-    for hand, part in zip(hands, (LEFT, RIGHT), strict=True):
+    if len(person.body):
+        joints = numbers[len(person.body)]
+        put(list(joints), person.body[list(joints.values())])
+    for hand, part in ((person.left, LEFT), (person.right, RIGHT)):
         if len(hand) == HAND:
             put(list(range(part.start, part.stop)), hand)
     for target, origin in FROM_HANDS.items():
