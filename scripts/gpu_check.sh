@@ -3,6 +3,7 @@
 # A step that is done is not repeated: run it again after an interruption, or after
 # removing outputs/gpu_check/<step>.done.  PYTHON, OUT and PAGE replace the defaults below.
 # GPU_CHECK_DEVICE=cpu rehearses it on a CPU: the same steps, as small as they go.
+# --dry prints every step with its command and its limit, and runs none: no GPU is needed.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 export GPU_CHECK_DEVICE=${GPU_CHECK_DEVICE:-cuda}
@@ -12,12 +13,14 @@ folder=outputs/gpu_check result=docs/results/gpu.md
 python=${PYTHON:-.venv/bin/python} out=${OUT:-$folder} page=${PAGE:-$result}
 limit=1200 slack=1 # seconds of all steps together; factor on each step's
 [[ $device == cpu ]] && limit=3600 slack=5
-if [[ $device == cuda ]] &&
+dry=
+[[ ${1:-} == --dry ]] && dry=1
+if [[ ! $dry && $device == cuda ]] &&
   ! "$python" -c 'import sys, torch; sys.exit(not torch.cuda.is_available())'; then
   echo "gpu_check: torch finds no CUDA device on this machine, so nothing was checked."
   exit 1
 fi
-mkdir -p "$out"
+[[ $dry ]] || mkdir -p "$out"
 began=$SECONDS failed=0 steps=()
 
 # step NAME SECONDS COMMAND...: runs it once, for at most so long; its output goes to NAME.log
@@ -25,6 +28,10 @@ step() {
   local name=$1 most=$((slack * $2)) left=$((limit - SECONDS + began)) start=$SECONDS
   shift 2
   steps+=("$name")
+  if [[ $dry ]]; then
+    echo "$name, at most $most s: $*"
+    return
+  fi
   [[ -e $out/$name.done ]] && return
   if ((left <= 0)); then
     echo "not run: the time is up" >"$out/$name.failed"
@@ -91,6 +98,7 @@ step paper 300 "$python" -m gsgan.train experiment=paper trainer=$trainer \
   trainer.check_val_every_n_epoch=1 data.val_images=2 evaluate=false resume=false \
   hydra.run.dir="$out/paper"
 
+[[ $dry ]] && exit 0
 [[ $device == cuda ]] && title="On a GPU" || title="A rehearsal on a CPU"
 card=$(nvidia-smi --query-gpu=name,driver_version,memory.total --format=csv,noheader 2>/dev/null || echo unknown)
 {

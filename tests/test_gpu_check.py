@@ -40,6 +40,21 @@ def test_without_cuda_it_ends_with_one_sentence(tmp_path):
     assert not (tmp_path / "gpu.md").exists()
 
 
+def test_a_dry_run_walks_every_step_without_cuda_and_runs_none(tmp_path):
+    out = tmp_path / "out"
+    done = subprocess.run(
+        [str(SCRIPT), "--dry"],
+        env={**os.environ, "PYTHON": sys.executable, "OUT": str(out), "CUDA_VISIBLE_DEVICES": ""},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    names = [line.split(",")[0] for line in done.stdout.splitlines()]
+    steps = [line.split()[1] for line in SCRIPT.read_text().splitlines() if line[:5] == "step "]
+    assert names == [name for name in steps if name != "ddp_2"]
+    assert not out.exists()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("device", ["cuda", "cpu"])
 def test_each_step_runs_once_and_its_options_exist(tmp_path, compose, device):
