@@ -157,7 +157,7 @@ def read_cameras(
     """
     if not content:
         raise DataError(f"{path} lists no camera")
-    if "frames" in content and "transform_matrix" in str(content["frames"])[:10_000]:
+    if isinstance(content.get("frames"), list):  # a camera would be an object
         raise DataError(
             f"{path} is a scene of nerfstudio, which is not read yet; write its cameras as {KNOWN}"
         )

@@ -104,7 +104,7 @@ def _one_mask(rule: str, path: Path, rules: PixelRules) -> Bytes:
         two_values = highest <= 127 and mask.min() == 0 and np.isin(mask, (0, highest)).all()
         if highest == 1 or (highest > 0 and two_values):
             raise DataError(
-                f"{path} holds {0} and {highest} alone; expected alpha from 0 to 255, and a person "
+                f"{path} holds 0 and {highest} alone; expected alpha from 0 to 255, and a person "
                 "where it is at least 128 (multiply it)"
             )
         return mask

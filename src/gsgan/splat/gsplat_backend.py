@@ -189,8 +189,8 @@ def _measured_cap(device: torch.device) -> tuple[float | None, str]:
     except Exception as error:  # no compiler, unknown GPU, other version: torch is used
         return None, (
             f"gsplat {_version()} is installed but cannot draw here ({first_error(error)}); gsplat "
-            "1.5.3 or newer is needed, and 1.5.3 compiles with torch 2.8 for CUDA 12.8, not with "
-            "CUDA 13."
+            "1.5.3 or newer is needed, and 1.5.3 does not compile against CUDA 13: take torch 2.8 "
+            "for CUDA 12.8."
         )
 
 

@@ -297,9 +297,8 @@ class AvatarTraining(LightningModule):
         optimisers = {name: self._optimisers()[name] for name in names}
         for optimiser in optimisers.values():
             optimiser.zero_grad(set_to_none=True)
-        with full_precision(
-            loss.device
-        ):  # else gradients of what is computed in float32 are rounded too
+        # Else gradients of what is computed in float32 are rounded too.
+        with full_precision(loss.device):
             self.manual_backward(loss)
         norms = [
             clip(optimiser.optimizer, self.recipes[name].clip).to(loss.device)

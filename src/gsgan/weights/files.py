@@ -4,10 +4,8 @@ The sources in their order: a given path, torch's cache, an installed package `l
 files are read, and of which nothing is imported), and torchvision's server.
 """
 
-import contextlib
 import hashlib
 import importlib.util
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -198,8 +196,13 @@ def read_convolutions(net: str, path: Path) -> dict[str, Tensor]:
     network = network_of(net)
     if path.suffix == ".ckpt":
         return _read_packaged(network, path)
-    with _as_data_error(path):
+    try:
         state = dict(torch.load(path, map_location="cpu", weights_only=True))
+    except Exception as error:  # of many kinds
+        raise DataError(
+            f"{path}: not a readable file of torchvision's weights ({type(error).__name__}); "
+            "download it again"
+        ) from error
     prefix = "features."
     named = {str(key): value for key, value in state.items()}
     if any(key.startswith(prefix) for key in named):
@@ -235,17 +238,6 @@ def empty_layers(network: Network) -> torch.nn.Sequential:
 
     with torch.device("meta"):
         return getattr(models, network.model)(weights=None).features  # type: ignore[no-any-return]
-
-
-@contextlib.contextmanager
-def _as_data_error(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except Exception as error:
-        raise DataError(
-            f"{path}: not a readable file of torchvision's weights ({type(error).__name__}); "
-            "download it again"
-        ) from error
 
 
 def state_of_heads(net: str) -> dict[str, Any]:
