@@ -6,9 +6,11 @@ import pytest
 import torch
 from hydra.errors import ConfigCompositionException
 from tiny_characters import TINY
+from torch.nn import functional
 
 from gsgan.body import open_body
-from gsgan.body.skinned import vertex_normals
+from gsgan.body.lbs import stretched
+from gsgan.body.skinned import neighbours_on_surface, vertex_normals
 from gsgan.data.datamodule import GsganData
 from gsgan.data.surface_colours import body_inside
 from gsgan.model.body_points import BodyPoints, moved_normals
@@ -232,3 +234,66 @@ def test_what_is_the_models_is_not_the_accuracys_too(tiny, key):
     tiny(f"model.{key}=1")
     with pytest.raises(ConfigCompositionException, match=rf"accuracy\.{key}"):
         tiny(f"accuracy.{key}=1")
+
+
+@pytest.mark.parametrize(("amount", "most"), [(0.15, 1.0), (0.4, 2.5)], ids=["near", "far"])
+def test_normals_are_those_of_the_posed_mesh_part_by_part(body, amount, most):
+    """Mean angle to the posed mesh's own normals, degrees; A alone is several times as far off."""
+    torch.manual_seed(0)
+    pose = replace(rest(body, 4), theta=amount * torch.randn(4, len(body.joints), 3))
+    placed = BodyPoints(body, 1.7)
+    points = placed(pose)
+    plain = moved_normals(points.frames, placed.rest_normals)
+    truth = torch.stack([vertex_normals(means, body.faces) for means in points.means])
+
+    def angle(normals):
+        cosine = (functional.normalize(normals, dim=-1) * truth).sum(-1)
+        return torch.rad2deg(cosine.clamp(-1, 1).acos())
+
+    found, before = angle(points.normals), angle(plain)
+    for label in body.vertex_labels.unique():
+        part = body.vertex_labels == label
+        assert found[:, part].mean() < most, body.label_names[label]
+        assert found[:, part].mean() < 0.6 * before[:, part].mean(), body.label_names[label]
+
+
+def test_the_jacobian_is_that_of_the_learnt_weights(body):
+    """Finite differences along edges of the skinned surface, whose weights are not the body's."""
+    torch.manual_seed(0)
+    placed = BodyPoints(body, 1.7, controls=400)
+    with torch.no_grad():
+        placed.points.learnt.field.copy_(torch.randn_like(placed.points.learnt.field))
+        pose = replace(rest(body), theta=0.4 * torch.randn(1, len(body.joints), 3))
+        points = placed(pose)
+        bones = placed.points.with_bones(pose).bones
+        own = placed.own_columns, placed.own_factors
+        wrong = stretched(points.frames, bones, *own)
+    a, b = body.faces[:, 0], body.faces[:, 1]
+    edge = (body.vertices[b] - body.vertices[a]).float().unsqueeze(-1)
+    moved = points.means[0, b] - points.means[0, a]
+
+    def off(jacobian):
+        """Median relative error; the mean of both ends cancels the second order of the step."""
+        predicted = ((jacobian[0, a] + jacobian[0, b]) / 2 @ edge).squeeze(-1)
+        return ((predicted - moved).norm(dim=-1) / edge.norm(dim=1).squeeze()).median()
+
+    assert off(points.stretched) < 0.03
+    assert off(points.stretched) < 0.5 * off(wrong)
+
+
+def test_neighbours_of_a_subset_are_neighbours_on_the_surface(body):
+    """Points of two fingers or of two thighs may be near each other, but not along the skin."""
+    everything = torch.arange(len(body.vertices))
+    edges = torch.cat([body.faces[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
+    edges = torch.cat([edges, edges.flip(1)]).unique(dim=0)
+    assert torch.equal(neighbours_on_surface(body.vertices, body.faces, everything), edges)
+    few = BodyPoints(body, 1.7, points=2000).points.chosen
+    a, b = neighbours_on_surface(body.vertices, body.faces, few).T
+    assert a.unique().numel() >= 1990  # an eye may have one point
+    labels = [body.label_names[label] for label in body.vertex_labels]
+    sides = {
+        (labels[few[i]], labels[few[j]])
+        for i, j in zip(a.tolist(), b.tolist(), strict=True)
+        if labels[few[i]].startswith("left")
+    }
+    assert not any(second.startswith("right") for _, second in sides)

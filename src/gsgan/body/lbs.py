@@ -191,7 +191,7 @@ def stretched(A: Tensor, transforms: Tensor, columns: Tensor, factors: Tensor) -
     Args:
         A: ``[B, V, 3, 3]`` from :func:`blend_transforms`.
         transforms: ``[B, J, 4, 4]`` from :func:`forward_kinematics`.
-        columns, factors: from :func:`gsgan.body.skinned.stretch_terms`.
+        columns, factors: from :class:`gsgan.body.skinned.WeightGradients`.
 
     Returns:
         ``[B, V, 3, 3]``: ``A + Σ_b (ΔB_b x_c) ∇w_bᵀ``.

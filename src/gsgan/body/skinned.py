@@ -7,7 +7,10 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, Self
 
 import torch
-from torch import Tensor
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+from torch import Tensor, nn
+from torch.nn.functional import embedding_bag
 
 from gsgan.body.lbs import (
     axis_angle_to_matrix,
@@ -19,7 +22,6 @@ from gsgan.body.lbs import (
 from gsgan.scene import BodyPose
 
 KEPT = 4  # bones whose weights change most
-SMOOTHED = 3  # averages over a vertex's edges before its weights' gradients: weights have steps
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,44 +131,123 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     summed = torch.zeros_like(vertices)
     for corner in faces.unbind(1):
         summed.index_add_(0, corner, face)
-    return torch.nn.functional.normalize(summed, dim=-1, eps=1e-20)
+    return nn.functional.normalize(summed, dim=-1, eps=1e-20)
 
 
-def stretch_terms(body: SkinnedBody) -> tuple[Tensor, Tensor]:
-    """The terms of `gsgan.body.lbs.stretched`: how skinning weights change along the surface.
+class WeightGradients(nn.Module):
+    """How skinning weights change along a body's surface, for `gsgan.body.lbs.stretched`.
 
-    Their gradients follow in the least squares sense from the differences along a vertex's edges,
-    for the bones whose weights change most. They lie in the surface, and their sum is zero.
+    The gradients follow in the least squares sense from the differences between neighbours. They
+    lie in the surface.
 
-    Returns:
-        ``[3 V, 4 KEPT]``: of each vertex and axis, columns of the bones' transforms, int64
-        from 0 to 4 J, and their factors: products of the vertex's position and the gradients.
+    Args:
+        body: rest positions, faces and joints.
+        chosen: ``[N]`` int64, the vertices whose weights and gradients are used.
 
     Source: ours.
     """
-    x, faces = body.vertices.double(), body.faces
-    count, bones = len(x), len(body.joints)
-    dense = x.new_zeros(count, bones).scatter_add_(1, body.bone_index, body.bone_weight.double())
-    dense = dense / dense.sum(1, keepdim=True)
-    edges = torch.cat([faces[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
-    a, b = torch.cat([edges, edges.flip(1)]).unique(dim=0).T
-    step, normals = x[b] - x[a], vertex_normals(x, faces)
-    degree = torch.bincount(a, minlength=count).clamp_min(1).to(x).unsqueeze(1)
-    smooth = dense
-    for _ in range(SMOOTHED):
-        smooth = (smooth + torch.zeros_like(smooth).index_add_(0, a, smooth[b]) / degree) / 2
+
+    homogeneous: Tensor
+    rows: Tensor
+    columns: Tensor
+    values: Tensor
+
+    def __init__(self, body: SkinnedBody, chosen: Tensor) -> None:
+        super().__init__()
+        self.joints = len(body.joints)
+        operator = surface_gradient(body.vertices, body.faces, chosen)
+        places = body.vertices[chosen].float()
+        buffers = {
+            "homogeneous": torch.cat([places, torch.ones_like(places[:, :1])], dim=1),
+            "rows": torch.from_numpy(operator.indptr[:-1]).long(),
+            "columns": torch.from_numpy(operator.indices).long(),
+            "values": torch.from_numpy(operator.data).float(),
+        }
+        for name, value in buffers.items():
+            self.register_buffer(name, value, persistent=False)
+
+    @torch.no_grad()
+    def forward(self, index: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+        """The terms of `gsgan.body.lbs.stretched` for these skinning weights.
+
+        Only the KEPT bones of each vertex whose weights change most are used. The gradients of
+        their weights are shifted to sum to zero, as those of all bones do.
+
+        Args:
+            index, weight: ``[N, n]`` bones of each chosen vertex and their weights.
+
+        Returns:
+            ``[3 N, 4 KEPT]``: of each chosen vertex and axis, columns of the bones' transforms,
+            int64 from 0 to 4 J, and their factors: products of the vertex's position and the
+            gradients.
+        """
+        weight = (weight / weight.sum(dim=1, keepdim=True)).to(self.values)
+        dense = weight.new_zeros(len(weight), self.joints).scatter_add_(1, index, weight)
+        slopes = embedding_bag(
+            self.columns, dense, self.rows, mode="sum", per_sample_weights=self.values
+        )
+        slopes = slopes.unflatten(0, (-1, 3))  # [N, 3, J]
+        change = slopes.square().sum(dim=1)
+        bones = change.topk(min(KEPT, self.joints), dim=1).indices
+        slopes = slopes.gather(2, bones.unsqueeze(1).expand(-1, 3, -1))
+        slopes = slopes - slopes.mean(dim=2, keepdim=True)
+        factors = slopes.unsqueeze(-1) * self.homogeneous[:, None, None]  # [N, 3, KEPT, 4]
+        columns = 4 * bones.unsqueeze(-1) + torch.arange(4, device=bones.device)
+        columns = columns.unsqueeze(1).expand_as(factors)
+        return columns.flatten(2).flatten(0, 1), factors.flatten(2).flatten(0, 1)
+
+
+def surface_gradient(vertices: Tensor, faces: Tensor, chosen: Tensor) -> csr_array:
+    """The gradient along the surface of numbers that are known at some of its vertices.
+
+    Args:
+        vertices: ``[V, 3]`` metres.
+        faces: ``[F, 3]`` int64.
+        chosen: ``[N]`` int64, the vertices where the numbers are known.
+
+    Returns:
+        ``[3 N, N]``, times ``[N]`` numbers: their gradients at these vertices, axis by axis. A
+        vertex without a neighbour has the gradient zero.
+    """
+    x = vertices.double()
+    normals = vertex_normals(x, faces)[chosen]
+    a, b = neighbours_on_surface(x, faces, chosen).T
+    x, count = x[chosen], len(chosen)
+    step = x[b] - x[a]
+
+    # Least squares in the tangent plane: (Σ step stepᵀ) gradient = Σ step (difference).
     square = x.new_zeros(count, 3, 3).index_add_(0, a, step.unsqueeze(2) * step.unsqueeze(1))
-    size = square.diagonal(dim1=1, dim2=2).sum(1).clamp_min(1e-12)[:, None, None]
-    square = square + size * (
-        normals.unsqueeze(2) * normals.unsqueeze(1) + 1e-6 * torch.eye(3).to(x)
+    size = square.diagonal(dim1=1, dim2=2).sum(dim=1).clamp_min(1e-12)[:, None, None]
+    across = normals.unsqueeze(2) * normals.unsqueeze(1)
+    square = square + size * (across + 1e-6 * torch.eye(3).to(x))
+    share = torch.linalg.solve(square[a], step)  # [E, 3]
+    share = share - (share * normals[a]).sum(dim=-1, keepdim=True) * normals[a]
+
+    # A difference is the number at the edge's end less that at its start.
+    rows = (3 * a.unsqueeze(1) + torch.arange(3)).flatten().numpy()
+    ends, starts = (v.repeat_interleave(3).numpy() for v in (b, a))
+    values = share.flatten().numpy()
+    shape = (3 * count, count)
+    plus, minus = (csr_array((values, (rows, place)), shape) for place in (ends, starts))
+    return csr_array(plus - minus)
+
+
+def neighbours_on_surface(vertices: Tensor, faces: Tensor, chosen: Tensor) -> Tensor:
+    """``[E, 2]`` pairs of chosen vertices, in both orders, that are next to each other.
+
+    Each vertex belongs to the chosen one that is nearest along the edges; two chosen vertices are
+    neighbours if an edge joins what belongs to them. With all vertices chosen these are the edges.
+    """
+    edges = torch.cat([faces[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
+    length = (vertices[edges[:, 1]] - vertices[edges[:, 0]]).norm(dim=1).clamp_min(1e-9)
+    graph = csr_array((length.numpy(), tuple(edges.T.numpy())), (len(vertices), len(vertices)))
+    _, _, nearest = dijkstra(
+        graph, directed=False, indices=chosen.numpy(), min_only=True, return_predecessors=True
     )
-    moved = step.unsqueeze(2) * (smooth[b] - smooth[a]).unsqueeze(1)
-    slope = torch.linalg.solve(square, x.new_zeros(count, 3, bones).index_add_(0, a, moved)).mT
-    slope = slope - (slope @ normals.unsqueeze(-1)) * normals.unsqueeze(1)
-    index = slope.norm(dim=-1).topk(min(KEPT, bones), dim=1).indices
-    slope = slope.gather(1, index.unsqueeze(-1).expand(-1, -1, 3))
-    slope = slope - slope.mean(1, keepdim=True)
-    homogeneous = torch.cat([x, torch.ones_like(x[:, :1])], dim=1)
-    factors = slope.mT.unsqueeze(-1) * homogeneous[:, None, None]
-    columns = (4 * index.unsqueeze(-1) + torch.arange(4))[:, None].expand_as(factors)
-    return columns.flatten(2).flatten(0, 1), factors.flatten(2).flatten(0, 1).float()
+    nearest = torch.from_numpy(nearest).long()
+    place = torch.full((len(vertices),), -1).index_copy_(0, chosen, torch.arange(len(chosen)))
+    reached = nearest >= 0  # the others are on pieces of the mesh without a chosen vertex
+    edges = edges[reached[edges].all(dim=1)]
+    pairs = place[nearest[edges]]
+    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+    return torch.cat([pairs, pairs.flip(1)]).unique(dim=0)

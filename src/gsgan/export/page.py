@@ -191,13 +191,12 @@ def gaussians_of(avatar: Avatar) -> tuple[Plain, Arrays]:
 def slopes_of(on_body: BodyPoints) -> tuple[NDArray, NDArray]:
     """Bones ``[N, n]`` and the gradients ``[N, n, 3]`` of their weights, 1 / metre.
 
-    Source: `gsgan.body.skinned.stretch_terms`, whose factors are these times (x, 1).
+    Source: `gsgan.body.skinned.WeightGradients`, whose factors are these times (x, 1).
     """
     if not on_body.stretch:
         return np.zeros((on_body.n_points, 1), np.uint8), np.zeros((on_body.n_points, 1, 3))
     columns, factors = (
-        x.view(on_body.n_points, 3, -1, 4).numpy()
-        for x in (on_body.stretch_columns, on_body.stretch_factors)
+        term.view(on_body.n_points, 3, -1, 4).numpy() for term in on_body.stretch_terms()
     )
     return (columns[:, 0, :, 0] // 4).astype(np.uint8), factors[..., 3].swapaxes(1, 2)
 

@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from gsgan.body import SkinnedBody, axis_angle_to_matrix, blend_transforms, forward_kinematics, skin
 from gsgan.body.lbs import stretched
-from gsgan.body.skinned import stretch_terms, vertex_normals
+from gsgan.body.skinned import WeightGradients, vertex_normals
 from gsgan.scene import BodyPose, Gaussians
 from gsgan.skeleton import Points
 from gsgan.utils.checks import above, whole
@@ -188,7 +188,8 @@ class BodyPoints(nn.Module):
         points: vertices used, spread evenly over the surface; None for all.
         sigma: initial standard deviation, as a share of the distance to the nearest neighbour.
         mean_step: of Ψ: its means move by this share of what they would on a skeleton's points.
-        stretch: shapes also follow the stretch of the surface, see `gsgan.body.lbs.stretched`.
+        stretch: shapes and normals also follow the stretch of the surface, see
+            `gsgan.body.lbs.stretched`.
         controls: of `LearntWeights`; 0 keeps the body's skinning weights.
         rate: of these weights' learning, times that of Ψ.
     """
@@ -196,8 +197,8 @@ class BodyPoints(nn.Module):
     rest_points: Tensor
     rest_normals: Tensor
     part_id: Tensor
-    stretch_columns: Tensor
-    stretch_factors: Tensor
+    own_columns: Tensor
+    own_factors: Tensor
 
     def __init__(
         self,
@@ -224,23 +225,40 @@ class BodyPoints(nn.Module):
         self.register_buffer("part_id", torch.arange(len(self.points)), persistent=False)
         self.stretch = stretch
         if stretch:
-            terms = [x.unflatten(0, (-1, 3))[self.points.chosen] for x in stretch_terms(body)]
-            for name, x in zip(("columns", "factors"), terms, strict=True):
-                self.register_buffer(f"stretch_{name}", x.flatten(0, 1), persistent=False)
+            own = self.points.bone_index, self.points.bone_weight
+            self.gradients = WeightGradients(body, self.points.chosen)
+            columns, factors = self.gradients(*own)
+            self.register_buffer("own_columns", columns, persistent=False)
+            self.register_buffer("own_factors", factors, persistent=False)
 
     @property
     def n_points(self) -> int:
         """N."""
         return len(self.points)
 
+    def stretch_terms(self) -> tuple[Tensor, Tensor]:
+        """Columns and factors of `gsgan.body.lbs.stretched`, of the weights that move the means."""
+        learnt = self.points.learnt
+        if learnt is None:
+            return self.own_columns, self.own_factors
+
+        def make() -> tuple[Tensor, Tensor]:
+            return self.gradients(*self.points.weights)
+
+        return derived(self, "terms", make, learnt.field)
+
     def forward(self, pose: BodyPose) -> Points:
-        """G in pose; each point is its own part, its frame the linear part of its skinning."""
+        """G in pose; each point is its own part, its frame the linear part of its skinning.
+
+        Normals, and shapes if ``stretch`` is set, are moved by the Jacobian of the skinning.
+        """
         pose = self.points.with_bones(pose)
         assert pose.bones is not None
         A, t = self.points.blend(pose)
         means = skin(self.points.means, A, t)
         if not pose.bones.requires_grad:  # only the means give the weights a gradient
             A, t = A.detach(), t.detach()
+        jacobian = stretched(A, pose.bones, *self.stretch_terms()) if self.stretch else None
         scales = (self.sigma * self.points.spacing).expand(len(A), -1)
         return Points(
             means=means,
@@ -249,10 +267,8 @@ class BodyPoints(nn.Module):
             scales=scales,
             valid=torch.ones_like(scales, dtype=torch.bool),
             part_id=self.part_id,
-            normals=moved_normals(A, self.rest_normals),
-            stretched=stretched(A, pose.bones, self.stretch_columns, self.stretch_factors)
-            if self.stretch
-            else None,
+            normals=moved_normals(A if jacobian is None else jacobian, self.rest_normals),
+            stretched=jacobian,
         )
 
 

@@ -5,13 +5,14 @@ import ctypes
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from gsgan.utils.errors import ConfigError
 
+T = TypeVar("T")
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's mallopt
 KEPT = 1 << 30  # bytes of freed memory that the process keeps
 LARGEST = 1 << 25  # bytes; glibc takes larger blocks from the system in any case
@@ -86,10 +87,10 @@ def keep_freed_memory() -> None:
         mallopt(M_MMAP_THRESHOLD, LARGEST)
 
 
-def derived(module: nn.Module, name: str, make: Callable[[], Tensor], *weights: Tensor) -> Tensor:
+def derived(module: nn.Module, name: str, make: Callable[[], T], *weights: Tensor) -> T:
     """``make()``, a function of these weights alone. In a frozen module (one with a dictionary
     ``derived``) it is kept until a weight changes or moves."""
-    kept: dict[str, tuple[Any, Tensor]] | None = getattr(module, "derived", None)
+    kept: dict[str, tuple[Any, T]] | None = getattr(module, "derived", None)
     if kept is None:
         return make()
     state = [(x.data_ptr(), x._version, x.dtype) for x in weights]

@@ -94,11 +94,14 @@ export class Gaussians {
       }
       A[0] = a, A[1] = d, A[2] = g, A[3] = j, A[4] = e, A[5] = o, A[6] = p, A[7] = q, A[8] = r;
       turn.set(A, 9 * i);
-      // the normal, by the cofactors of A
+      this.stretch(i, A, bones);
+      // the normal, by the cofactors of the stretched A
       const nx = normal[3 * i]!, ny = normal[3 * i + 1]!, nz = normal[3 * i + 2]!;
-      let x = (e * r - o * q) * nx + (o * p - j * r) * ny + (j * q - e * p) * nz;
-      let y = (g * q - d * r) * nx + (a * r - g * p) * ny + (d * p - a * q) * nz;
-      let z = (d * o - g * e) * nx + (g * j - a * o) * ny + (a * e - d * j) * nz;
+      const m0 = A[0]!, m1 = A[1]!, m2 = A[2]!, m3 = A[3]!, m4 = A[4]!, m5 = A[5]!;
+      const m6 = A[6]!, m7 = A[7]!, m8 = A[8]!;
+      let x = (m4 * m8 - m5 * m7) * nx + (m5 * m6 - m3 * m8) * ny + (m3 * m7 - m4 * m6) * nz;
+      let y = (m2 * m7 - m1 * m8) * nx + (m0 * m8 - m2 * m6) * ny + (m1 * m6 - m0 * m7) * nz;
+      let z = (m1 * m5 - m2 * m4) * nx + (m2 * m3 - m0 * m5) * ny + (m0 * m4 - m1 * m3) * nz;
       const length = 1 / Math.sqrt(x * x + y * y + z * z + NORMAL_FLOOR ** 2);
       x *= length, y *= length, z *= length;
       b[0] = -s3 * y, b[1] = s3 * z, b[2] = -s3 * x;
@@ -117,7 +120,6 @@ export class Gaussians {
       mean[3 * i + 1] = j * u + e * v + o * w + ty;
       mean[3 * i + 2] = p * u + q * v + r * w + tz;
       if (shapes) this.shape(i, raw);
-      this.stretch(i, A, bones);
       this.spread(i, A);
       this.opacity[i] = 1 / (1 + Math.exp(-clamp(raw[10]!, -h.logit, h.logit)));
       this.colour.set(raw.subarray(BEFORE_COLOUR), i * (numbers - BEFORE_COLOUR));
