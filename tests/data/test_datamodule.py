@@ -18,6 +18,7 @@ from make import edit_json, skeletons, write_tiny_capture
 
 from gsgan.data.datamodule import GsganData, StepSampler, count_labels, pass_order
 from gsgan.data.formats.capture import read_capture
+from gsgan.effects import EffectSettings, decide
 from gsgan.scene import Frame
 from gsgan.utils.config import one_sentence
 from gsgan.utils.errors import ConfigError, DataError
@@ -224,6 +225,26 @@ def test_scene_info_sees_the_lens_of_training_cameras_only(tmp_path):
     assert not info.has_body_pose
     assert info.n_labels == 0
     assert info.body == "free"
+
+
+def test_the_held_out_split_decides_no_effect(tmp_path):
+    """Held-out cameras move nearer, held-out frames change: every decision stays the same."""
+    root = write_tiny_capture(tmp_path, cameras=3, frames=10)
+
+    def decisions():
+        data = GsganData(str(root), test_cameras=["cam02"], test_share=0.2)
+        return asdict(data.info), decide(data.info, EffectSettings())
+
+    before = decisions()
+
+    def nearer(rig):
+        rig["cam02"]["K"][0][0] *= 1.5
+        rig["cam02"]["K"][1][1] *= 1.5
+
+    edit_json(root / "cameras.json", nearer)
+    for image in (*root.glob("images/cam02/*"), *root.glob("images/*/0000[89]*")):
+        cv2.imwrite(str(image), 255 - cv2.imread(str(image)))
+    assert decisions() == before
 
 
 def test_a_capture_may_be_posed_by_the_users_own_smpl_file(tmp_path):

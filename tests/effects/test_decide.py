@@ -21,7 +21,7 @@ def scene(**changes) -> SceneInfo:
         camera_names=(*CAMERAS, "held_out"), n_train_cameras=6, train_cameras=CAMERAS,
         has_distortion=False, has_labels=False, n_labels=0, label_names=(), has_body_pose=True,
         body="free", skeleton="mediapipe33", body_height=4.0, centre=(0.0, 0.0, 1.0), frames=10,
-        scale_train=(50.0, 60.0), scale_test=(51.0, 59.0), surface=ALIKE, darkest=0.1,
+        scale_train=(50.0, 60.0), surface=ALIKE, darkest=0.1,
     )  # fmt: skip
     return replace(plain, **changes)
 
@@ -40,8 +40,7 @@ def test_a_plain_scene_calls_for_what_it_always_had():
         ({"surface": GLOSSY}, "view_dependence", 2),
         ({"surface": replace(ALIKE, difference=0.07)}, "colour_correction", "on"),
         ({"has_distortion": True}, "distortion", "undistort"),
-        ({"scale_test": (25.0, 60.0)}, "antialias", "on"),  # half the scale
-        ({"scale_test": (50.0, 120.0)}, "antialias", "on"),  # double
+        ({"scale_train": (40.0, 60.0)}, "antialias", "on"),
         ({"body_inside": 1.0}, "body_points", "on"),
         ({"darkest": 0.4}, "random_background", "off"),
     ],
@@ -60,11 +59,25 @@ def test_each_call_turns_on_its_own_effect_and_no_other(change, effect, value):
         ({"surface": None}, "colour_correction"),
         ({"surface": None}, "view_dependence"),
         ({"surface": GLOSSY, "n_train_cameras": 1}, "view_dependence"),
-        ({"scale_test": None}, "antialias"),
+        ({"scale_train": (47.0, 60.0)}, "antialias"),
     ],
 )
 def test_what_could_be_taken_for_a_call_is_none(change, effect):
     assert not getattr(decide(scene(**change), EffectSettings()), effect).on
+
+
+@pytest.mark.parametrize("scales", [(0.5, 1), (1, 2), (2, 3), (0.5, 0.9)])
+def test_scales_that_are_to_be_rendered_call_for_antialias(scales):
+    assert not decide(scene(), EffectSettings()).antialias.on
+    found = decide(scene(), EffectSettings(rendered_scales=scales)).antialias
+    assert found.on
+    assert "differ by" in found.why
+
+
+@pytest.mark.parametrize("scales", [(1,), (2, 1), (0, 1), ("a", 1), (1, float("nan"))])
+def test_rendered_scales_are_two_rising_numbers(scales):
+    with pytest.raises(ConfigError, match="rendered_scales"):
+        EffectSettings(rendered_scales=scales)
 
 
 @pytest.mark.parametrize(("cameras", "degree"), [(2, 1), (3, 1), (4, 2), (7, 2), (8, 3), (30, 3)])
@@ -118,7 +131,7 @@ def test_a_list_leaves_lenses_to_their_own_word(word):
     ],
 )
 def test_an_effect_that_the_model_lacks_is_off_or_refused(model, effect, why):
-    auto = decide(scene(body_inside=1.0, scale_test=(51.0, 590.0)), EffectSettings(), model)
+    auto = decide(scene(body_inside=1.0, scale_train=(51.0, 590.0)), EffectSettings(), model)
     assert why in getattr(auto, effect).why
     assert not getattr(auto, effect).on
     forced = EffectSettings(**{effect: "on"})

@@ -289,8 +289,9 @@ class GsganData(LightningDataModule):
     @cached_property
     def info(self) -> SceneInfo:
         """Facts about the scene from the training split, computed on first use."""
-        train, *held_out = (self.dataset(name) for name in SPLITS)
-        found = scene_info(self.layout, self.splits, train, self.info_samples, held_out)
+        tested = [name for split in SPLITS[1:] for name in self.splits.items[split].cameras]
+        train = self.dataset("train")
+        found = scene_info(self.layout, self.splits, train, self.info_samples, tested)
         return replace(found, face=self.face)
 
     @property

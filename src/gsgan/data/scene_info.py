@@ -1,6 +1,6 @@
 """Properties of the scene, computed from the training split."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -51,7 +51,6 @@ class SceneInfo:
         has_rational_lens: a lens has coefficients beyond the fifth (k4, k5, k6).
         scale_train: pixels per metre at the person, smallest and largest of the training
             cameras' medians.
-        scale_test: the same for held-out images; None without any.
         surface: colour differences between training cameras on the same surface, or None if
             they share too little.
         darkest: brightness in [0, 1] of the person's darkest percent.
@@ -81,7 +80,6 @@ class SceneInfo:
     held_out_distortion: bool = False
     has_rational_lens: bool = False
     scale_train: tuple[float, float] = (1.0, 1.0)
-    scale_test: tuple[float, float] | None = None
     surface: SurfaceColours | None = None
     darkest: float = 0.0
     body_inside: float | None = None
@@ -104,7 +102,7 @@ def scene_info(
     splits: Splits,
     dataset: CaptureDataset,
     samples: int,
-    held_out: Sequence[CaptureDataset] = (),
+    tested: Collection[str] = (),
 ) -> SceneInfo:
     """Computes the properties of the scene from the training split.
 
@@ -113,7 +111,8 @@ def scene_info(
         splits: of the capture.
         dataset: of the training items; its cache keeps the decoded images.
         samples: images per camera to take colours from, evenly spaced.
-        held_out: datasets of the held-out items; their images are not read.
+        tested: names of the held-out cameras. Only their lenses are looked at, since a lens
+            decides what can be rendered.
     """
     items, body = splits.items["train"], layout.meta.body
     frames, skeletons = items.frames, dataset.skeletons.p
@@ -126,7 +125,6 @@ def scene_info(
     x, y, z = middles.median(0).values.tolist()
     cameras = set(items.cameras)
     names = tuple(name for name in layout.cameras if name in cameras)
-    scales = [_scale(data, samples) for data in held_out if data.items]
     return SceneInfo(
         camera_names=layout.camera_names,
         n_train_cameras=len(cameras),
@@ -146,10 +144,9 @@ def scene_info(
         darkest=_darkest(dataset, samples),
         body_inside=_body_inside(layout, dataset, samples),
         scale_train=_scale(dataset, samples),
-        scale_test=(min(s[0] for s in scales), max(s[1] for s in scales)) if scales else None,
         poses=training_poses(torch.from_numpy(np.stack([skeletons[f] for f in frames]))),
         proportions=measure_proportions(*whole.joints(frames), layout.meta.up_axis),
-        **_lenses(layout, cameras, held_out),
+        **_lenses(layout, cameras, set(tested) - cameras),
     )
 
 
@@ -170,11 +167,8 @@ def count_labels(layout: Layout, items: Sequence[Item]) -> int:
     return highest + 1
 
 
-def _lenses(
-    layout: Layout, cameras: set[str], held_out: Sequence[CaptureDataset]
-) -> dict[str, Any]:
+def _lenses(layout: Layout, cameras: set[str], tested: set[str]) -> dict[str, Any]:
     """The fields about distortion."""
-    tested = {camera for data in held_out for camera, _ in data.items} - cameras
     entries = layout.cameras
     return {
         "has_distortion": any(entries[name].distorted for name in cameras),

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from gsgan.effects.record import OFF, Effect, Effects
-from gsgan.utils.checks import one_of
+from gsgan.utils.checks import is_number, one_of
 from gsgan.utils.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -51,6 +51,7 @@ class EffectSettings:
     only: Sequence[str] | None = None
     impossible: str | bool = "error"
     view_residual: float = 0.09
+    rendered_scales: Sequence[float] = (1.0, 1.0)
     degree_cameras: Sequence[int] = (2, 4, 8)
     colour_difference: float = 0.03
     colour_share: float = 0.5
@@ -70,6 +71,11 @@ class EffectSettings:
         counts = list(self.degree_cameras)
         if len(counts) != 3 or counts != sorted(counts):
             raise ConfigError(f"effects.degree_cameras must be three rising numbers, got {counts}")
+        scales = list(self.rendered_scales)
+        if len(scales) != 2 or not all(map(is_number, scales)) or not 0 < scales[0] <= scales[1]:
+            raise ConfigError(
+                f"effects.rendered_scales must be two rising positive numbers, got {scales}"
+            )
         listed = [self.only] if isinstance(self.only, str) else list(self.only or ())
         if isinstance(self.only, str) or set(listed) - set(CHOICES):
             raise ConfigError(f"effects.only must list some of {', '.join(CHOICES)}; got {listed}")
@@ -183,14 +189,13 @@ def _distortion(info: SceneInfo, settings: EffectSettings) -> Effect:
 
 
 def _antialias(info: SceneInfo, settings: EffectSettings) -> Effect:
-    if info.scale_test is None:
-        return Effect(OFF, "there are no held-out images that could differ in scale")
-    (low, high), (least, most) = info.scale_train, info.scale_test
-    ratio = max(most / high, low / least)
-    measured = f"held-out images have {ratio:.2f} times the scale of training images"
+    low, high = info.scale_train
+    smallest, largest = (float(factor) for factor in settings.rendered_scales)
+    ratio = max(high * largest, high) / min(low * smallest, low)
+    measured = f"training and rendered images differ by {ratio:.2f} times in scale"
     if ratio < settings.scale_ratio:
         return Effect(OFF, f"{measured} at most (limit {settings.scale_ratio:g})")
-    return Effect("on", f"{measured} or its inverse (limit {settings.scale_ratio:g})")
+    return Effect("on", f"{measured} (limit {settings.scale_ratio:g})")
 
 
 def _colour_correction(info: SceneInfo, settings: EffectSettings) -> Effect:
