@@ -1,6 +1,10 @@
-"""What a run does to its folder before it trains."""
+"""What a run does before it trains: its folder, its device."""
 
-from gsgan.train.run import remove_old_results
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from gsgan.train.run import device_of, remove_old_results
 
 
 def test_starting_over_removes_an_earlier_runs_results_and_logs(tmp_path):
@@ -11,3 +15,18 @@ def test_starting_over_removes_an_earlier_runs_results_and_logs(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     remove_old_results(tmp_path)
     assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["notes.txt"]
+
+
+@pytest.mark.parametrize("launcher", ["LOCAL_RANK", "SLURM_LOCALID"])
+@pytest.mark.parametrize(("devices", "expected"), [("auto", 2), ([4, 5, 7], 7)])
+def test_every_process_probes_and_fits_on_its_own_gpu(monkeypatch, launcher, devices, expected):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    for name in ("LOCAL_RANK", "SLURM_LOCALID"):
+        monkeypatch.delenv(name, raising=False)
+    config = OmegaConf.create({"trainer": {"accelerator": "auto", "devices": devices}})
+    first = 0 if devices == "auto" else devices[0]
+    assert device_of(config) == torch.device("cuda", first)
+    monkeypatch.setenv(launcher, "2")
+    assert device_of(config) == torch.device("cuda", expected)
+    config.trainer.accelerator = "cpu"
+    assert device_of(config) == torch.device("cpu")

@@ -231,6 +231,14 @@ class GsganData(LightningDataModule):
         frames = {*items["novel_pose"].frames} - {*self.trained}
         return tuple(sorted(frames & (poses.registered if poses else frozenset())))
 
+    @property
+    def loading_processes(self) -> int:
+        """Processes that decode images; each has its own share of the cache.
+
+        Training and validation start their own workers, and the main process decodes too.
+        """
+        return 2 * self.workers + 1
+
     @cached_property
     def _datasets(self) -> dict[str, CaptureDataset]:
         layout, splits = self.layout, self.splits
@@ -240,8 +248,7 @@ class GsganData(LightningDataModule):
                 "data.size is not set and images differ in size, so batches of "
                 f"{self.batch_size} cannot be made; set data.size (e.g. 512) or data.batch_size=1"
             )
-        # every process has its own, and training and validation start their own workers
-        cache = ImageCache(int(self.cache_mb * 2**20) // (2 * self.workers + 1))
+        cache = ImageCache(int(self.cache_mb * 2**20) // self.loading_processes)
         template = template_of(self.skeleton, self.face)
         skeletons = complete_skeletons(
             layout.landmarks, layout.frames, self.trained, template, layout.hands, layout.face

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import os
 import sys
 import time
 import warnings
@@ -55,6 +56,7 @@ from gsgan.utils.sweeps import STOPPED
 STEP_PER_RENDERING = 10
 DISCRIMINATOR_SALT = 1000
 PAGE = "avatar.html"
+LOCAL_RANKS = ("LOCAL_RANK", "SLURM_LOCALID")  # what launchers call a process' rank on its machine
 POSES = 100  # at most, whose spread is stored: all are posed at once
 
 
@@ -172,8 +174,10 @@ def device_of(config: DictConfig) -> torch.device:
     """Where Lightning will put the model of a process."""
     if config.trainer.accelerator == "cpu" or not torch.cuda.is_available():
         return torch.device("cpu")
+    ranks = (os.environ.get(name) for name in LOCAL_RANKS)
+    rank = int(next(filter(None, ranks), 0))
     chosen = config.trainer.devices
-    return torch.device("cuda", chosen[0] if OmegaConf.is_list(chosen) else 0)
+    return torch.device("cuda", chosen[rank] if OmegaConf.is_list(chosen) else rank)
 
 
 def _is_written(path: Path, checkpoint: Path) -> bool:
@@ -364,6 +368,9 @@ def describe(
         f"{len(data.dataset('train'))} training images: {info.n_train_cameras} cameras, "
         f"{info.frames} frames; held out: {held_out}",
     )
+    processes, megabytes = data.loading_processes, data.cache_mb / data.loading_processes
+    each = "" if processes == 1 else f" in each of {processes} loading processes"
+    table.add_row("cache of images", f"{megabytes:,.0f} MB{each} (data.cache_mb)")
     plain = getattr(avatar.deformation, "from_normal", avatar) is None
     parts = {
         "Ψ, without normals" if plain else "Ψ": avatar.deformation,
