@@ -37,7 +37,9 @@ class Writer:
     def __init__(self) -> None:
         self.doc, self.blob = pygltflib.GLTF2(), bytearray()
 
-    def view(self, data: bytes, stride: int | None = None, target: int | None = None) -> int:
+    def view(
+        self, data: bytes, stride: int | None = None, target: int | None = None
+    ) -> int:
         self.blob.extend(bytes(-len(self.blob) % 4))
         self.doc.bufferViews.append(
             pygltflib.BufferView(
@@ -53,7 +55,14 @@ class Writer:
 
     def accessor(self, values: np.ndarray, kind: str, **more: object) -> int:
         """Rows padded to four bytes, as vertex attributes must be."""
-        component = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}
+        component = {
+            "i1": 5120,
+            "u1": 5121,
+            "i2": 5122,
+            "u2": 5123,
+            "u4": 5125,
+            "f4": 5126,
+        }
         size = values.dtype.itemsize * values.shape[1]
         rows = np.zeros((len(values), size + -size % 4), np.uint8)
         rows[:, :size] = np.ascontiguousarray(values).view(np.uint8)
@@ -70,7 +79,9 @@ class Writer:
         )
         return len(self.doc.accessors) - 1
 
-    def packed(self, values: np.ndarray, component: int, kind: str, target: int | None) -> int:
+    def packed(
+        self, values: np.ndarray, component: int, kind: str, target: int | None
+    ) -> int:
         """Rows without padding: indices and matrices."""
         view = self.view(values.tobytes(), None, target)
         self.doc.accessors.append(
@@ -96,7 +107,9 @@ class Writer:
                     indices=pygltflib.AccessorSparseIndices(
                         bufferView=self.view(at.tobytes()), componentType=5123
                     ),
-                    values=pygltflib.AccessorSparseValues(bufferView=self.view(rows.tobytes())),
+                    values=pygltflib.AccessorSparseValues(
+                        bufferView=self.view(rows.tobytes())
+                    ),
                 ),
             )
         )
@@ -108,7 +121,9 @@ def simpler_mouth(c: Character) -> np.ndarray:
     _, place = np.unique(np.round(c.vertices, 5), axis=0, return_inverse=True)
     edges = place.reshape(-1)[np.concatenate([c.faces[:, :2], c.faces[:, 1:]])]
     graph = coo_array((np.ones(len(edges)), edges.T), shape=(place.max() + 1,) * 2)
-    part = connected_components(graph, directed=False)[1][place.reshape(-1)[c.faces[:, 0]]]
+    part = connected_components(graph, directed=False)[1][
+        place.reshape(-1)[c.faces[:, 0]]
+    ]
     corner = c.faces[:, 0]
     bone = c.bone_index[corner, c.bone_weight[corner].argmax(1)]
     mouth = (part != np.bincount(part).argmax()) & (bone == c.bones.index("Head"))
@@ -121,7 +136,9 @@ def simpler_mouth(c: Character) -> np.ndarray:
         target_index_count=int(len(inside) * MOUTH_SHARE) // 3 * 3,
         target_error=1.0,
     )
-    return np.concatenate([c.faces[~mouth], fewer[:count].reshape(-1, 3).astype(np.int64)])
+    return np.concatenate(
+        [c.faces[~mouth], fewer[:count].reshape(-1, 3).astype(np.int64)]
+    )
 
 
 def bones_of(c: Character, writer: Writer) -> tuple[np.ndarray, np.ndarray]:
@@ -133,7 +150,9 @@ def bones_of(c: Character, writer: Writer) -> tuple[np.ndarray, np.ndarray]:
     for k in kept:
         up = c.parents[k]
         step = joints[k] - (joints[up] if up >= 0 else 0)
-        writer.doc.nodes.append(pygltflib.Node(name=c.bones[k], translation=step.tolist()))
+        writer.doc.nodes.append(
+            pygltflib.Node(name=c.bones[k], translation=step.tolist())
+        )
         if up >= 0:
             writer.doc.nodes[number[up]].children.append(int(number[k]))
     return number, joints[kept]
@@ -162,30 +181,44 @@ def write(c: Character, source: Path, out: Path) -> None:
     weight = np.rint(c.bone_weight[used] * 255).astype(np.uint8)
     index = np.where(weight > 0, number[c.bone_index[used]], 0).astype(np.uint8)
     attributes = pygltflib.Attributes(
-        POSITION=writer.accessor(np.rint((positions - low) / scale).astype(np.uint16), "VEC3"),
+        POSITION=writer.accessor(
+            np.rint((positions - low) / scale).astype(np.uint16), "VEC3"
+        ),
         NORMAL=writer.accessor(
-            np.rint(c.normals[used] @ Y_UP.T * 127).astype(np.int8), "VEC3", normalized=True
+            np.rint(c.normals[used] @ Y_UP.T * 127).astype(np.int8),
+            "VEC3",
+            normalized=True,
         ),
         TEXCOORD_0=writer.accessor(
-            np.rint(np.clip(c.uv[used], 0, 1) * 65535).astype(np.uint16), "VEC2", normalized=True
+            np.rint(np.clip(c.uv[used], 0, 1) * 65535).astype(np.uint16),
+            "VEC2",
+            normalized=True,
         ),
         JOINTS_0=writer.accessor(index, "VEC4"),
         WEIGHTS_0=writer.accessor(weight, "VEC4", normalized=True),
     )
-    targets = [{"POSITION": writer.sparse(v[used] @ Y_UP.T / scale)} for v in c.shapes.values()]
+    targets = [
+        {"POSITION": writer.sparse(v[used] @ Y_UP.T / scale)} for v in c.shapes.values()
+    ]
     doc = writer.doc
     primitive = pygltflib.Primitive(
         attributes=attributes,
-        indices=writer.packed(faces.ravel().astype(np.uint16), 5123, "SCALAR", ELEMENTS),
+        indices=writer.packed(
+            faces.ravel().astype(np.uint16), 5123, "SCALAR", ELEMENTS
+        ),
         material=0,
         targets=targets,
     )
-    mesh = pygltflib.Mesh(primitives=[primitive], extras={"targetNames": list(c.shapes)})
+    mesh = pygltflib.Mesh(
+        primitives=[primitive], extras={"targetNames": list(c.shapes)}
+    )
     doc.meshes.append(mesh)
     matrices = bind.transpose(0, 2, 1).astype(np.float32)
     inverse_bind = writer.packed(matrices, 5126, "MAT4", None)
     doc.skins.append(
-        pygltflib.Skin(inverseBindMatrices=inverse_bind, joints=list(range(len(joints))))
+        pygltflib.Skin(
+            inverseBindMatrices=inverse_bind, joints=list(range(len(joints)))
+        )
     )
     doc.nodes.append(pygltflib.Node(name="person", mesh=0, skin=0))
     doc.scenes.append(pygltflib.Scene(nodes=[0, len(joints)]))
@@ -197,19 +230,28 @@ def write(c: Character, source: Path, out: Path) -> None:
             data = upwards(data)
         image = pygltflib.Image(bufferView=writer.view(data), mimeType="image/webp")
         doc.images.append(image)
-        doc.textures.append(pygltflib.Texture(extensions={"EXT_texture_webp": {"source": texture}}))
+        doc.textures.append(
+            pygltflib.Texture(extensions={"EXT_texture_webp": {"source": texture}})
+        )
     shader = pygltflib.PbrMetallicRoughness(
-        baseColorTexture=pygltflib.TextureInfo(index=0), metallicFactor=0.0, roughnessFactor=0.5
+        baseColorTexture=pygltflib.TextureInfo(index=0),
+        metallicFactor=0.0,
+        roughnessFactor=0.5,
     )
     bump = pygltflib.NormalMaterialTexture(index=1)
     doc.materials.append(
-        pygltflib.Material(pbrMetallicRoughness=shader, normalTexture=bump, doubleSided=True)
+        pygltflib.Material(
+            pbrMetallicRoughness=shader, normalTexture=bump, doubleSided=True
+        )
     )
     doc.asset = pygltflib.Asset(
         generator="gsgan scripts/bake_avatars.py",
         copyright=f"VALID avatar library, University of Central Florida and Google; {source.stem}",
     )
-    doc.extensionsUsed = doc.extensionsRequired = ["KHR_mesh_quantization", "EXT_texture_webp"]
+    doc.extensionsUsed = doc.extensionsRequired = [
+        "KHR_mesh_quantization",
+        "EXT_texture_webp",
+    ]
     doc.buffers.append(pygltflib.Buffer(byteLength=len(writer.blob)))
     doc.set_binary_blob(bytes(writer.blob))
     doc.save_binary(out)

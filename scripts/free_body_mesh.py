@@ -66,7 +66,9 @@ def load_source(cache: Path) -> Source:
     weights = np.zeros((len(vertices), len(heads)))
     index = model.vertex_bone_indices.numpy()
     np.add.at(
-        weights, (np.arange(len(vertices))[:, None], index), model.vertex_bone_weights.numpy()
+        weights,
+        (np.arange(len(vertices))[:, None], index),
+        model.vertex_bone_weights.numpy(),
     )
     names, parents = list(model.bone_labels), [int(p) for p in model.bone_parents]
     return Source(vertices, heads, weights, names, parents, groups)
@@ -79,7 +81,9 @@ def rest_points(
     import torch
 
     with torch.no_grad():
-        out = model(phenotype_kwargs={k: torch.tensor([v]) for k, v in phenotype.items()})
+        out = model(
+            phenotype_kwargs={k: torch.tensor([v]) for k, v in phenotype.items()}
+        )
     vertices = out["rest_vertices"][0].double().numpy()
     floor = np.array([0.0, 0.0, vertices[np.unique(groups["body"])][:, 2].min()])
     return vertices - floor, out["rest_bone_heads"][0].double().numpy() - floor
@@ -111,7 +115,9 @@ def kept_bone(name: str) -> str:
         return "wrist" + side
     if stem.startswith("finger") and stem.endswith("-3"):
         return stem[:-1] + "2" + side
-    return {"eye": "head", "neck03": "neck02", "spine04": "spine05"}.get(stem, stem + side)
+    return {"eye": "head", "neck03": "neck02", "spine04": "spine05"}.get(
+        stem, stem + side
+    )
 
 
 def reduce_bones(source: Source) -> Source:
@@ -203,7 +209,9 @@ def subdivide(vertices: Array, weights: Array, quads: Array) -> Mesh:
 
 def smooth(mesh: Mesh, steps: int, strength: Array | float = 0.5) -> Mesh:
     """Moves each vertex towards its neighbours' mean; the rim moves along the rim only."""
-    ends = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
+    ends = np.concatenate(
+        [mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]
+    )
     edges, count = np.unique(np.sort(ends, axis=1), axis=0, return_counts=True)
     rim = np.zeros(len(mesh.vertices), bool)
     rim[edges[count == 1].reshape(-1)] = True
@@ -284,7 +292,9 @@ def along(points: Array, start: Array, end: Array) -> Array:
 def limb(mesh: Mesh, source: Source, start: str, end: str) -> Array:
     """:func:`along` the left bone for points of the left half, the right bone for the others."""
     x = mesh.vertices
-    left, right = (along(x, source.head(f"{start}.{s}"), source.head(f"{end}.{s}")) for s in "LR")
+    left, right = (
+        along(x, source.head(f"{start}.{s}"), source.head(f"{end}.{s}")) for s in "LR"
+    )
     return np.where(x[:, 0] > 0, left, right)
 
 

@@ -87,7 +87,9 @@ def seeds(home: Path, run: Path) -> dict[str, list[tuple[Path, Reader]]]:
     from gsgan.synthetic.posing import Choreography
 
     p = skeletons(8)
-    source = Source(measure_proportions(torch.from_numpy(p), torch.ones(p.shape[:2]).bool(), "z"))
+    source = Source(
+        measure_proportions(torch.from_numpy(p), torch.ones(p.shape[:2]).bool(), "z")
+    )
     found: dict[str, list[tuple[Path, Reader]]] = {}
 
     def folder(name: str) -> Path:
@@ -100,7 +102,9 @@ def seeds(home: Path, run: Path) -> dict[str, list[tuple[Path, Reader]]]:
     def move(path: Path) -> object:
         return read_motion(path, source)
 
-    capture = write_tiny_capture(folder("capture"), body_pose=True, meta={"body": "free"})
+    capture = write_tiny_capture(
+        folder("capture"), body_pose=True, meta={"body": "free"}
+    )
     write_hands(capture, 4)
     write_face(capture, 4)
     names = ("landmarks3d", "hands3d", "face3d", "body_pose")
@@ -118,7 +122,9 @@ def seeds(home: Path, run: Path) -> dict[str, list[tuple[Path, Reader]]]:
         (home / name).write_bytes(pickle.dumps({"poses": Hostile()}, 2))
         add("pkl", home / name, read_smpl if name == "body.pkl" else move)
     person = mannequin()
-    move_file = write_bvh(home / "a.bvh", person, Choreography(person).at(np.ones(4)), 1 / 30)
+    move_file = write_bvh(
+        home / "a.bvh", person, Choreography(person).at(np.ones(4)), 1 / 30
+    )
     add("bvh", move_file, move)
     amc = write_amc(folder("amc"))
     add("amc", amc, move)
@@ -136,7 +142,9 @@ def seeds(home: Path, run: Path) -> dict[str, list[tuple[Path, Reader]]]:
     own = Path(shutil.copytree(run, home / "run"))
     checkpoint = own / CHECKPOINT
     weights = home / "a.safetensors"
-    weights.write_bytes(weights_bytes(own, load(own), read_checkpoint(checkpoint)["gsgan"]))
+    weights.write_bytes(
+        weights_bytes(own, load(own), read_checkpoint(checkpoint)["gsgan"])
+    )
     add("ckpt", checkpoint, lambda path: load(path.parents[1]))
     torch.save({"gsgan": Hostile()}, home / "hostile.ckpt")
     add("ckpt", home / "hostile.ckpt", read_checkpoint)
@@ -170,7 +178,11 @@ def damaged(data: bytes, rng: np.random.Generator) -> bytes:
         if numbers:
             spot = numbers[rng.integers(len(numbers))]
             values = (b"-1", b"0", b"1e308", b"nan", b"99999999999", b"2147483648", b"")
-            return data[: spot.start()] + values[rng.integers(len(values))] + data[spot.end() :]
+            return (
+                data[: spot.start()]
+                + values[rng.integers(len(values))]
+                + data[spot.end() :]
+            )
     changed = bytearray(data)
     for _ in range(int(rng.integers(1, 9)) if data else 0):
         at = rng.integers(min(size, 512) if rng.random() < 0.5 else size)
@@ -206,10 +218,15 @@ def forbid(home: Path) -> None:
 
     def hook(event: str, arguments: tuple[Any, ...]) -> None:
         writes = (
-            event == "open" and isinstance(arguments[1], str) and set(arguments[1]) & set("wax+")
+            event == "open"
+            and isinstance(arguments[1], str)
+            and set(arguments[1]) & set("wax+")
         )
-        inside = not writes or isinstance(arguments[0], int)  # a file that is open already
-        if FORBIDDEN.match(event) or not (inside or str(arguments[0]).startswith(allowed)):
+        # a file that is open already
+        inside = not writes or isinstance(arguments[0], int)
+        if FORBIDDEN.match(event) or not (
+            inside or str(arguments[0]).startswith(allowed)
+        ):
             os.write(2, f"\n{event} {str(arguments)[:200]}\n".encode())
             os._exit(CODE)
 
@@ -217,7 +234,10 @@ def forbid(home: Path) -> None:
 
 
 def limit() -> None:
-    used = int(re.search(r"VmSize:\s+(\d+)", Path("/proc/self/status").read_text())[1]) << 10
+    used = (
+        int(re.search(r"VmSize:\s+(\d+)", Path("/proc/self/status").read_text())[1])
+        << 10
+    )
     resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY,) * 2)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
@@ -230,7 +250,9 @@ def answer(path: Path, reader: Reader) -> str:
     try:
         reader(path)
     except GsganError as error:
-        return "refused" if "\n" not in str(error).strip() else "traceback several lines"
+        return (
+            "refused" if "\n" not in str(error).strip() else "traceback several lines"
+        )
     except MemoryError:
         return "memory"
     except Exception as error:
@@ -282,7 +304,13 @@ def batch(
             start += 1
             stopped = os.WTERMSIG(status) if os.WIFSIGNALED(status) else 0
             coded = os.WIFEXITED(status) and os.WEXITSTATUS(status) == CODE
-            yield "code" if coded else "hang" if stopped == signal.SIGPROF else f"killed {stopped}"
+            yield (
+                "code"
+                if coded
+                else "hang"
+                if stopped == signal.SIGPROF
+                else f"killed {stopped}"
+            )
 
 
 def fuzz(
@@ -303,7 +331,8 @@ def fuzz(
         table, wrong = {}, []
         chosen = [kind for kind in known if only is None or kind in only]
         for i, kind in enumerate(chosen):
-            for path, reader in known[kind]:  # imports, caches; hostile ones are refused
+            # imports, caches; hostile ones are refused
+            for path, reader in known[kind]:
                 if "hostile" not in path.name and "objects" not in path.name:
                     first = answer(path, reader)
                     assert path.suffix == ".pkl" or first == "read", f"{path}: {first}"
@@ -311,7 +340,9 @@ def fuzz(
             table[kind] = Counter()
             for start in range(0, share, BATCH):
                 end = min(start + BATCH, share)
-                for number, outcome in enumerate(batch(home, known[kind], kind, start, end), start):
+                for number, outcome in enumerate(
+                    batch(home, known[kind], kind, start, end), start
+                ):
                     table[kind][outcome.split()[0]] += 1
                     if outcome not in GOOD:
                         file = known[kind][number % len(known[kind])][0].name
@@ -323,7 +354,9 @@ def fuzz(
 
 def page(table: dict[str, Counter[str]], seconds: float) -> str:
     command = ["git", "describe", "--always", "--dirty"]
-    commit = subprocess.run(command, cwd=ROOT, capture_output=True, text=True).stdout.strip()
+    commit = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True
+    ).stdout.strip()
     lines = [
         "# Damaged files",
         "",
@@ -351,10 +384,22 @@ def tiny_run() -> Path:
     place = Path(tempfile.mkdtemp())
     write_tiny_capture(place / "capture", cameras=3, frames=6, size=(48, 48), labels=True,
                        body_pose=True, meta={"body": "free"})  # fmt: skip
-    given = ["size=tiny", "training=smoke", "data=capture", "data.size=32", "data.crop=null"]
-    given += [f"data.root={place / 'capture'}", f"hydra.run.dir={place / 'run'}", "evaluate=false"]
+    given = [
+        "size=tiny",
+        "training=smoke",
+        "data=capture",
+        "data.size=32",
+        "data.crop=null",
+    ]
+    given += [
+        f"data.root={place / 'capture'}",
+        f"hydra.run.dir={place / 'run'}",
+        "evaluate=false",
+    ]
     subprocess.run(
-        [sys.executable, "-m", "gsgan.train", *given], check=True, stdout=subprocess.DEVNULL
+        [sys.executable, "-m", "gsgan.train", *given],
+        check=True,
+        stdout=subprocess.DEVNULL,
     )
     return place / "run"
 

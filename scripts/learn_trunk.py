@@ -25,7 +25,8 @@ from gsgan.synthetic.recorded_motion import RecordedMotion
 
 RATE = 15  # frames per second
 COLLARS = 0.18  # share of the arm's turn: CMU's collarbones do not move
-FLOOR = np.radians(2.5)  # standard deviation that is added: of what a clip's skeleton cannot show
+# standard deviation that is added: of what a clip's skeleton cannot show
+FLOOR = np.radians(2.5)
 
 
 def numbers(clip: Path) -> Tensor:
@@ -63,10 +64,16 @@ if __name__ == "__main__":
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     ask.add_argument("clips", type=Path, nargs="+", help="AMC files")
-    asset = Path(__file__).parents[1] / "src" / "gsgan" / "body" / "assets" / "trunk.json"
+    asset = (
+        Path(__file__).parents[1] / "src" / "gsgan" / "body" / "assets" / "trunk.json"
+    )
     ask.add_argument("--out", type=Path, default=asset)
     given = ask.parse_args()
     rows = [[round(x, 6) for x in row] for row in covariance(given.clips).tolist()]
-    content = {"numbers": TRUNK, "clips": [clip.stem for clip in given.clips], "covariance": rows}
+    content = {
+        "numbers": TRUNK,
+        "clips": [clip.stem for clip in given.clips],
+        "covariance": rows,
+    }
     lines = json.dumps(content, indent=1).replace("\n   ", " ").replace("\n  ]", "]")
     given.out.write_text(lines + "\n")

@@ -32,16 +32,22 @@ def make_templates() -> dict[str, np.ndarray]:
 
 
 def _named(name: str, points: np.ndarray, normals: np.ndarray) -> dict[str, np.ndarray]:
-    return {name: points.astype(np.float32), f"{name}_normals": normals.astype(np.float32)}
+    return {
+        name: points.astype(np.float32),
+        f"{name}_normals": normals.astype(np.float32),
+    }
 
 
 def _cylinder(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     mesh = trimesh.creation.cylinder(radius=1.0, height=1.0, sections=64)
     # a limb's caps are inside its neighbours: sample the lateral faces only
     lateral = np.abs(mesh.face_normals[:, 2]) < 0.5
-    points, _ = sample_surface(mesh, n, face_weight=mesh.area_faces * lateral, seed=seed)
+    points, _ = sample_surface(
+        mesh, n, face_weight=mesh.area_faces * lateral, seed=seed
+    )
     normals = points * [1.0, 1.0, 0.0]
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)  # off the facets, onto the cylinder
+    # off the facets, onto the cylinder
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     return normals + np.outer(points[:, 2] + 0.5, [0.0, 0.0, 1.0]), normals
 
 
@@ -51,7 +57,9 @@ def _sphere(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return points, points
 
 
-def _box(n: int, extents: tuple[float, float, float], seed: int) -> tuple[np.ndarray, np.ndarray]:
+def _box(
+    n: int, extents: tuple[float, float, float], seed: int
+) -> tuple[np.ndarray, np.ndarray]:
     mesh = trimesh.creation.box(extents=extents)
     points, faces = sample_surface(mesh, n, seed=seed)
     return points / extents, mesh.face_normals[faces]

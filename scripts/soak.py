@@ -33,8 +33,16 @@ TINY = [
     *("training.log_every=20", "training.schedule.epoch=100"),
     *("training.schedule.step_two=100000000", "trainer.check_val_every_n_epoch=10"),
     *("data.source.avatar=free_body", "data.source.size=32", "data.source.frames=8"),
-    *("data.source.test_frames=2", "data.source.train_cameras=3", "data.source.test_cameras=1"),
-    *("data.source.rays_per_pixel=1", "data.source.workers=1", "data.source.secondary=false"),
+    *(
+        "data.source.test_frames=2",
+        "data.source.train_cameras=3",
+        "data.source.test_cameras=1",
+    ),
+    *(
+        "data.source.rays_per_pixel=1",
+        "data.source.workers=1",
+        "data.source.secondary=false",
+    ),
 ]
 JOINING = threading.Lock()
 EVERY, ALLOWED, CLIENTS = 2.0, 0.02, 3  # seconds; growth; browsers
@@ -101,7 +109,9 @@ def train(folder: Path, curve: Curve, minutes: float) -> str:
 def images(run: Path, curve: Curve, count: int, out: Path) -> str:
     """Renders images along an orbit."""
     began = time.monotonic()
-    process = gsgan("render", f"run={run}", "motion=rest", f"frames={count}", f"out={out}")
+    process = gsgan(
+        "render", f"run={run}", "motion=rest", f"frames={count}", f"out={out}"
+    )
     with curve.of("images", process.pid):
         process.wait()
     made = len(list(out.glob("[0-9]*.png")))
@@ -172,7 +182,13 @@ def _browse(viewer: Any, count: int, rng: random.Random) -> None:
         look()
         session = viewer.sessions[wait(lambda: set(viewer.sessions) - known).pop()]
     with socket:
-        controls = (session.slider, session.layer, session.bones, session.mesh, session.splats)
+        controls = (
+            session.slider,
+            session.layer,
+            session.bones,
+            session.mesh,
+            session.splats,
+        )
         for _ in range(count):
             before = session.started
             control = rng.choice([None, *controls])
@@ -184,7 +200,11 @@ def _browse(viewer: Any, count: int, rng: random.Random) -> None:
                 else:
                     choices = getattr(control, "options", (False, True))
                 value = rng.choice([x for x in choices if x != control.value])
-                send("GuiUpdateMessage", uuid=control._impl.uuid, updates={"value": value})
+                send(
+                    "GuiUpdateMessage",
+                    uuid=control._impl.uuid,
+                    updates={"value": value},
+                )
             wait(partial(_answered, session, before))
 
 
@@ -216,7 +236,9 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=60)
     parser.add_argument("--images", type=int, default=10_000)
     parser.add_argument("--interactions", type=int, default=1000)
-    parser.add_argument("--run", type=Path, help="of the images and the viewer; else it is made")
+    parser.add_argument(
+        "--run", type=Path, help="of the images and the viewer; else it is made"
+    )
     parser.add_argument("--out", type=Path, default=Path("outputs/soak"))
     given = parser.parse_args()
     curve, lines = Curve(), dict[str, str]()
@@ -226,18 +248,29 @@ def main() -> None:
         if "train" in given.parts:
             lines["training"] = train(Path(folder) / "long", curve, given.minutes)
         if given.run is None:
-            short = ("training.schedule.step_two=100", "evaluate=false", f"hydra.run.dir={run}")
+            short = (
+                "training.schedule.step_two=100",
+                "evaluate=false",
+                f"hydra.run.dir={run}",
+            )
             assert gsgan("train", *TINY, *short).wait() == 0
         if "images" in given.parts:
             lines["images"] = images(run, curve, given.images, Path(folder) / "images")
         if "viewer" in given.parts:
             lines["viewer"] = viewer(run, curve, given.interactions)
     table = curve.table()
-    table.round(1).to_csv(given.out / f"memory_{'_'.join(given.parts)}.csv", index=False)
+    table.round(1).to_csv(
+        given.out / f"memory_{'_'.join(given.parts)}.csv", index=False
+    )
     grew = []
     for part, what in lines.items():
-        early, share = growth(table.loc[table["part"] == part, "megabytes"].reset_index(drop=True))
-        print(f"{part}: {what}; {early:.0f} MB, at the end {share:.1%} of that", flush=True)
+        early, share = growth(
+            table.loc[table["part"] == part, "megabytes"].reset_index(drop=True)
+        )
+        print(
+            f"{part}: {what}; {early:.0f} MB, at the end {share:.1%} of that",
+            flush=True,
+        )
         grew += [part] if share > 1 + ALLOWED else []
     if grew:
         sys.exit(f"memory grew by more than {ALLOWED:.0%}: {', '.join(grew)}")

@@ -37,7 +37,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--page", type=Path, help="a page of the docs to write")
     parser.add_argument("--out", type=Path, default=Path("outputs/bench/stability"))
-    parser.add_argument("--device", default="auto", help="auto takes CUDA where there is one")
+    parser.add_argument(
+        "--device", default="auto", help="auto takes CUDA where there is one"
+    )
     given = parser.parse_args()
     try:
         run(given.page, given.out, given.device)
@@ -60,7 +62,9 @@ def run(page: Path | None, folder: Path, device: str = "auto") -> None:
     config = OmegaConf.create({"device": device, "threads": None, "docs": None})
     bench = Bench.start("stability", config, folder)
     rows = compare_all(bench.device)
-    frame = pd.DataFrame(list(track(rows, "comparing", console=bench.console, transient=True)))
+    frame = pd.DataFrame(
+        list(track(rows, "comparing", console=bench.console, transient=True))
+    )
     bench.write(
         "Hard cases: float32 against float64",
         f"{sentence(bench.where)}.\n\n{table(frame)}",
@@ -82,7 +86,9 @@ def run(page: Path | None, folder: Path, device: str = "auto") -> None:
 
 def table(frame: pd.DataFrame) -> str:
     """Every case on every backend, Markdown."""
-    shown = frame.drop(columns="expected").rename(columns=lambda name: name.replace("_", " "))
+    shown = frame.drop(columns="expected").rename(
+        columns=lambda name: name.replace("_", " ")
+    )
     for name in ("value error", "gradient error"):
         shown[name] = [number(error, 2) for error in shown[name]]
     return markdown(shown)
@@ -91,7 +97,9 @@ def table(frame: pd.DataFrame) -> str:
 def whole_page(frame: pd.DataFrame, where: Mapping[str, Any]) -> str:
     """One line per case, the worst of its backends, a table per subject; Markdown."""
     describe = ["git", "describe", "--always", "--exclude=*", "--dirty= with changes"]
-    commit = subprocess.run(describe, cwd=ROOT, check=False, capture_output=True, text=True).stdout
+    commit = subprocess.run(
+        describe, cwd=ROOT, check=False, capture_output=True, text=True
+    ).stdout
     parts = [
         "# Results: numerically hard cases",
         f"Commit: {commit.strip() or 'not recorded'}; machine and date: {sentence(where)}. "
@@ -99,8 +107,13 @@ def whole_page(frame: pd.DataFrame, where: Mapping[str, Any]) -> str:
         "[what it means](../rasteriser.md#hard-cases).",
     ]
     for subject, cases in frame.groupby("subject", sort=False):
-        lines = [_by_case(name, rows) for name, rows in cases.groupby("case", sort=False)]
-        parts += [f"## {subject[:1].upper()}{subject[1:]}", markdown(pd.DataFrame(lines))]
+        lines = [
+            _by_case(name, rows) for name, rows in cases.groupby("case", sort=False)
+        ]
+        parts += [
+            f"## {subject[:1].upper()}{subject[1:]}",
+            markdown(pd.DataFrame(lines)),
+        ]
     return "\n\n".join(parts) + "\n"
 
 

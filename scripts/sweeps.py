@@ -28,7 +28,9 @@ def options(launcher: str, at_once: int) -> list[str]:
     if launcher == "joblib":
         return [chosen, f"hydra.launcher.n_jobs={at_once}"]
     return (
-        [chosen, f"+hydra.launcher.ray.init.num_cpus={at_once}"] if launcher == "ray" else [chosen]
+        [chosen, f"+hydra.launcher.ray.init.num_cpus={at_once}"]
+        if launcher == "ray"
+        else [chosen]
     )
 
 
@@ -44,7 +46,9 @@ def job(folder: Path) -> int | None:
     return None
 
 
-def sweep(folder: Path, runs: int, given: list[str], seeds: set[int]) -> tuple[int, str, list[str]]:
+def sweep(
+    folder: Path, runs: int, given: list[str], seeds: set[int]
+) -> tuple[int, str, list[str]]:
     """Exit status, output, and the names of the jobs of these seeds, killed as they appear."""
     every = ",".join(map(str, range(runs)))
     command = [sys.executable, "-m", "gsgan.train", "-m", *TINY, f"seed={every}"]
@@ -84,7 +88,9 @@ def attempt(launcher: str, runs: int, kills: int, at_once: int) -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder, given = Path(temporary) / "sweep", options(launcher, at_once)
         began = time.monotonic()
-        status, text, killed = sweep(folder, runs, given, {3 + 4 * k for k in range(kills)})
+        status, text, killed = sweep(
+            folder, runs, given, {3 + 4 * k for k in range(kills)}
+        )
         first, minutes = scores(folder), (time.monotonic() - began) / 60
         print(f"{launcher}: {len(first)} of {runs} scored in {minutes:.1f} min")
         hold(status == 1 and len(first) == runs - kills == runs - len(killed), text)
@@ -94,10 +100,14 @@ def attempt(launcher: str, runs: int, kills: int, at_once: int) -> None:
         )
         for output in (text, report.stdout + report.stderr):
             hold(all(name in output.replace("\n", "") for name in killed), output)
-        print(f"{launcher}: the {kills} killed are named by the sweep and by the report")
+        print(
+            f"{launcher}: the {kills} killed are named by the sweep and by the report"
+        )
         status, text, _ = sweep(folder, runs, given, set())
         again = scores(folder)
-        hold(status == 0 and len(again) == runs and first.items() <= again.items(), text)
+        hold(
+            status == 0 and len(again) == runs and first.items() <= again.items(), text
+        )
         print(f"{launcher}: started again, {len(again)} scored, none written again")
 
 

@@ -14,7 +14,13 @@ TINY += ["lpips.nets=[]"]  # the networks take longer than the training
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "120"}
 
 
-def gsgan(command: str, *args: str, cwd: Path, timeout: int = 300, environment: dict = ENVIRONMENT):
+def gsgan(
+    command: str,
+    *args: str,
+    cwd: Path,
+    timeout: int = 300,
+    environment: dict = ENVIRONMENT,
+):
     """Runs ``python -m gsgan.<command>`` from another directory, as an installed user would."""
     return subprocess.run(
         [sys.executable, "-m", f"gsgan.{command}", *args],
@@ -44,6 +50,13 @@ def quiet_trainer(folder: Path, **options):
     """A trainer on the CPU that writes and shows nothing."""
     from lightning import Trainer
 
-    off = ("logger", "enable_checkpointing", "enable_progress_bar", "enable_model_summary")
-    given = {"accelerator": "cpu", "num_sanity_val_steps": 0} | dict.fromkeys(off, False)
+    off = (
+        "logger",
+        "enable_checkpointing",
+        "enable_progress_bar",
+        "enable_model_summary",
+    )
+    given = {"accelerator": "cpu", "num_sanity_val_steps": 0} | dict.fromkeys(
+        off, False
+    )
     return Trainer(default_root_dir=folder, **(given | options))

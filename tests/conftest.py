@@ -23,17 +23,21 @@ from gsgan.body import free_body
 from gsgan.data.proportions import measure_proportions
 from gsgan.scene import BodyPose
 
-for folder in ("data", "prepare", "synthetic"):  # what tests of other folders share with them
+# what tests of other folders share with them
+for folder in ("data", "prepare", "synthetic"):
     sys.path.insert(0, str(Path(__file__).parent / folder))
 torch.set_num_threads(1)  # tensors here are tiny: more threads only wait for each other
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # nor do those of the commands that tests start
+# nor do those of the commands that tests start
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 # Property tests: a few examples, the same ones every time; `make test-slow` searches with many.
 hypothesis.settings.register_profile(
     "ci", max_examples=6, deadline=None, derandomize=True, database=None,
     suppress_health_check=[hypothesis.HealthCheck.too_slow],
 )  # fmt: skip
-hypothesis.settings.register_profile("all", hypothesis.settings.get_profile("ci"), max_examples=60)
+hypothesis.settings.register_profile(
+    "all", hypothesis.settings.get_profile("ci"), max_examples=60
+)
 hypothesis.settings.load_profile("ci")
 
 
@@ -114,7 +118,11 @@ def entry_module(command: str) -> str:
     """The module that ``python -m gsgan.<command>`` runs."""
     name = f"gsgan.{command}"
     spec = importlib.util.find_spec(name)
-    return name if spec is None or spec.submodule_search_locations is None else f"{name}.__main__"
+    return (
+        name
+        if spec is None or spec.submodule_search_locations is None
+        else f"{name}.__main__"
+    )
 
 
 TINY = ("size=tiny", "training=smoke", "data=capture", "data.size=32", "data.crop=null")
@@ -175,7 +183,9 @@ def forked(command: list[str]) -> int:
         GlobalHydra.instance().clear()  # the sweep's
         sys.argv, code = [command[2], *command[3:]], 1
         try:
-            importlib.import_module(entry_module(command[2].removeprefix("gsgan."))).main()
+            importlib.import_module(
+                entry_module(command[2].removeprefix("gsgan."))
+            ).main()
             code = 0
         except SystemExit as end:
             code = end.code if isinstance(end.code, int) else int(end.code is not None)
@@ -280,16 +290,22 @@ def signing(dance):
 
 @pytest.fixture(scope="session")
 def signer(signing):
-    return measure_proportions(torch.from_numpy(signing), torch.ones(signing.shape[:2]).bool(), "z")
+    return measure_proportions(
+        torch.from_numpy(signing), torch.ones(signing.shape[:2]).bool(), "z"
+    )
 
 
 @pytest.fixture(scope="module")
 def chromium():
     """A browser without a screen; in CI there must be one."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    playwright = pytest.importorskip(
+        "playwright.sync_api", reason="playwright is not installed"
+    )
     found = shutil.which("chromium") or shutil.which("google-chrome")
     if found is None:
-        (pytest.fail if "CI" in os.environ else pytest.skip)("chromium is not installed")
+        (pytest.fail if "CI" in os.environ else pytest.skip)(
+            "chromium is not installed"
+        )
     flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
     with playwright.sync_playwright() as tool:
         browser = tool.chromium.launch(executable_path=found, args=flags)

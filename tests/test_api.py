@@ -38,11 +38,17 @@ def test_a_loaded_avatar_renders_what_evaluation_paints(run, scored, tmp_path):
     assert not avatar.training
     image = avatar.render(frame.skeleton[0], frame.camera, body=frame.body)
     assert torch.equal(image, painting.image.clamp(0, 1))
-    on_white = avatar.render(frame.skeleton, frame.camera, body=frame.body, background=1.0)
-    expected = on_background(painting.image.clamp(0, 1), painting.alpha.clamp(0, 1), 1.0)
+    on_white = avatar.render(
+        frame.skeleton, frame.camera, body=frame.body, background=1.0
+    )
+    expected = on_background(
+        painting.image.clamp(0, 1), painting.alpha.clamp(0, 1), 1.0
+    )
     assert torch.equal(on_white, expected.clamp(0, 1))
     with pytest.raises(ValueError, match="expected 1 or 3 cameras, got 2"):
-        avatar.render(frame.skeleton.repeat(3, 1, 1), cat([frame.camera] * 2), body=frame.body)
+        avatar.render(
+            frame.skeleton.repeat(3, 1, 1), cat([frame.camera] * 2), body=frame.body
+        )
 
 
 def test_one_camera_serves_many_poses_and_lost_joints_are_replaced(run, scored):
@@ -51,7 +57,9 @@ def test_one_camera_serves_many_poses_and_lost_joints_are_replaced(run, scored):
     skeletons = frame.skeleton.repeat(2, 1, 1)
     skeletons[1, 15] = float("nan")
     body = cat([frame.body, frame.body])
-    images = avatar.render(skeletons, frame.camera, body=body, background=(1.0, 0.0, 0.0))
+    images = avatar.render(
+        skeletons, frame.camera, body=body, background=(1.0, 0.0, 0.0)
+    )
     assert images.shape == (2, *frame.image.shape[1:])
     assert torch.isfinite(images).all()
 
@@ -82,8 +90,12 @@ def test_a_folder_without_a_run_or_a_checkpoint_is_one_sentence(run, tmp_path):
     [("gsgan", "torch"), ("gsgan.scene", "lightning kornia torchmetrics cv2 hydra")],
 )
 def test_importing_is_light(module, heavy):
-    code = f"import sys, {module}; print([m for m in {heavy.split()} if m in sys.modules])"
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    code = (
+        f"import sys, {module}; print([m for m in {heavy.split()} if m in sys.modules])"
+    )
+    out = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
     assert out.stdout.strip() == "[]"
 
 

@@ -13,7 +13,9 @@ def test_large_captures_train_at_full_size_by_themselves(compose, data):
     large = data in ("thuman4", "zju_mocap", "avatarrex")
     assert config.size.image == (512 if large else 256 if data == "synthetic" else 128)
     default = data == "synthetic"  # at 256² iterations take longer
-    assert config.training.schedule.step_two == (250_000 if large else 3000 if default else 3200)
+    assert config.training.schedule.step_two == (
+        250_000 if large else 3000 if default else 3200
+    )
     small = compose("train", f"data={data}", "size=small", "training=demo")
     assert (small.size.image, small.training.schedule.step_two) == (128, 3200)
 
@@ -35,7 +37,13 @@ def test_a_long_run_without_a_gpu_is_refused_with_its_price_until_it_is_asked_fo
 ):
     """Tiny, with a budget to match."""
     few = [
-        *("data=capture", f"data.root={capture}", "size=tiny", "training=smoke", "data.crop=null"),
+        *(
+            "data=capture",
+            f"data.root={capture}",
+            "size=tiny",
+            "training=smoke",
+            "data.crop=null",
+        ),
         *("evaluate=false", f"hydra.run.dir={tmp_path / 'run'}"),
     ]
     refused = inside("train", *few, "cpu_hours=1e-9")
@@ -50,9 +58,14 @@ def test_a_long_run_without_a_gpu_is_refused_with_its_price_until_it_is_asked_fo
 # --- factors that make baselines train equally long
 
 
-@pytest.mark.parametrize("model", ["splat_only", "harmonic", "lbs_splat", "image_to_image"])
+@pytest.mark.parametrize(
+    "model", ["splat_only", "harmonic", "lbs_splat", "image_to_image"]
+)
 def test_a_baseline_is_stretched_by_an_experiment_only(compose, model):
-    assert compose("train", f"model={model}", "training=paper").training.schedule.stretch == 1
+    assert (
+        compose("train", f"model={model}", "training=paper").training.schedule.stretch
+        == 1
+    )
     study = compose("train", "experiment=study", f"model={model}")
     assert study.training.schedule.stretch == study.equal_time[model] > 1
     assert compose("train", "experiment=study").training.schedule.stretch == 1

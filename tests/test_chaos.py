@@ -7,7 +7,9 @@ import shutil
 import pytest
 from commands import ROOT
 
-pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork, no child to kill")
+pytestmark = pytest.mark.skipif(
+    not hasattr(os, "fork"), reason="no fork, no child to kill"
+)
 TOOLS = runpy.run_path(str(ROOT / "scripts" / "chaos.py"))
 WAYS = ("operation", "no space", "SIGKILL", "SIGTERM", "SIGINT")
 
@@ -37,6 +39,8 @@ def test_a_command_that_is_killed_finishes_when_it_is_started_again(chaos, stage
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stage", ["train", *(n for n in TOOLS["STAGES"] if n != "train")])
+@pytest.mark.parametrize(
+    "stage", ["train", *(n for n in TOOLS["STAGES"] if n != "train")]
+)
 def test_every_command_does(chaos, stage):
     survives(chaos, stage)

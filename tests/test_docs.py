@@ -27,7 +27,10 @@ def anchors(page: Path) -> set[str]:
     """As GitHub and mkdocs make them of headings."""
     text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
     titles = re.findall(r"^#+ (.+)$", text, flags=re.M)
-    return {re.sub(r"[^\w -]", "", title.lower()).strip().replace(" ", "-") for title in titles}
+    return {
+        re.sub(r"[^\w -]", "", title.lower()).strip().replace(" ", "-")
+        for title in titles
+    }
 
 
 @pytest.mark.parametrize("page", PAGES, ids=names(PAGES))
@@ -38,22 +41,59 @@ def test_links_and_images_exist(page):
             continue
         linked = page.parent / target if target else page
         assert linked.exists(), f"{page.name}: {target}"
-        assert not anchor or anchor in anchors(linked), f"{page.name}: {target}#{anchor}"
+        assert not anchor or anchor in anchors(linked), (
+            f"{page.name}: {target}#{anchor}"
+        )
 
 
 def test_pages_named_in_the_code_exist():
     for folder in ("src", "conf", "scripts"):
-        for path in (p for p in (ROOT / folder).rglob("*") if p.suffix in (".py", ".yaml", ".sh")):
+        for path in (
+            p for p in (ROOT / folder).rglob("*") if p.suffix in (".py", ".yaml", ".sh")
+        ):
             for page in re.findall(r"docs/[a-z_/]+\.md", path.read_text()):
-                assert (ROOT / page).exists() or page == "docs/results/gpu.md", f"{path}: {page}"
+                assert (ROOT / page).exists() or page == "docs/results/gpu.md", (
+                    f"{path}: {page}"
+                )
 
 
 @pytest.mark.parametrize("page", RESULTS, ids=names(RESULTS))
 def test_results_name_commit_machine_and_date(page):
     text = page.read_text()
     assert re.search(r"[Cc]ommits?[: ]", text), "no commit (or: not recorded)"
-    assert re.search(r"[Mm]achine|\(cpu\)|\(cuda\)", text), "no machine (or: not recorded)"
-    assert re.search(r"20\d\d-\d\d-\d\d|date: not recorded", text), "no date (or: not recorded)"
+    assert re.search(r"[Mm]achine|\(cpu\)|\(cuda\)", text), (
+        "no machine (or: not recorded)"
+    )
+    assert re.search(r"20\d\d-\d\d-\d\d|date: not recorded", text), (
+        "no date (or: not recorded)"
+    )
+
+
+NUMBER = re.compile(
+    r"(?<![\w.])\d+\.\d+(?!\.?\d)|(?<![\w.])\d+(?= (?:dB|%|ms|s|MB|GB|images a second)(?!\w))"
+)
+NOT_MEASURED = re.compile(r"<!-- not measured: ([^>]*) -->")
+
+
+def unproven(text: str, results: str) -> list[str]:
+    """Measured numbers of a text, commands left out, that stand in no page of results."""
+    exceptions = NOT_MEASURED.findall(text)
+    prose = re.sub(r"```.*?```|`[^`]*`|\]\([^)]*\)|<!--.*?-->", "", text, flags=re.S)
+    found = set(NUMBER.findall(prose))
+    return sorted(
+        number for number in found if number not in results and number not in exceptions
+    )
+
+
+def test_every_measured_number_of_the_readme_stands_in_a_page_of_results():
+    """One that does not is marked beside it: <!-- not measured: 12 -->."""
+    results = "\n".join(page.read_text() for page in RESULTS)
+    assert not unproven((ROOT / "README.md").read_text(), results)
+
+
+def test_a_number_without_a_result_is_found():
+    text = "It has 39.17 dB and 12 % more, `x=0.5`, v1.2.3. <!-- not measured: 7.5 --> 7.5 s"
+    assert unproven(text, "39.17 dB") == ["12"]
 
 
 def test_every_page_is_in_the_website():
@@ -63,8 +103,19 @@ def test_every_page_is_in_the_website():
 
 
 def test_the_reference_lists_modules_that_exist():
-    listed = re.findall(r"^::: ([\w.]+)$", (DOCS / "reference.md").read_text(), flags=re.M)
-    for part in ("scene", "skeleton", "splat", "body", "losses", "metrics", "model", "data"):
+    listed = re.findall(
+        r"^::: ([\w.]+)$", (DOCS / "reference.md").read_text(), flags=re.M
+    )
+    for part in (
+        "scene",
+        "skeleton",
+        "splat",
+        "body",
+        "losses",
+        "metrics",
+        "model",
+        "data",
+    ):
         assert any(name.startswith(f"gsgan.{part}") for name in listed), part
     for name in listed:
         assert find_spec(name) is not None, name
@@ -72,10 +123,22 @@ def test_the_reference_lists_modules_that_exist():
 
 @pytest.mark.slow
 def test_the_website_builds_without_a_warning(tmp_path):
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
-    done = subprocess.run(command, cwd=ROOT, check=False, capture_output=True, text=True)
+    command = [
+        sys.executable,
+        "-m",
+        "mkdocs",
+        "build",
+        "--strict",
+        "--site-dir",
+        str(tmp_path),
+    ]
+    done = subprocess.run(
+        command, cwd=ROOT, check=False, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
-    assert 'id="gsgan.scene.Camera"' in (tmp_path / "reference" / "index.html").read_text()
+    assert (
+        'id="gsgan.scene.Camera"' in (tmp_path / "reference" / "index.html").read_text()
+    )
 
 
 def keys(path: Path) -> list[tuple[str, int]]:
@@ -99,7 +162,9 @@ def keys(path: Path) -> list[tuple[str, int]]:
 def has_comment(lines: list[str], number: int) -> bool:
     """On its line, or above it in its block, which ends at an empty line."""
     above = takewhile(str.strip, reversed(lines[:number]))
-    return bool(COMMENT.search(lines[number])) or any(x.strip().startswith("#") for x in above)
+    return bool(COMMENT.search(lines[number])) or any(
+        x.strip().startswith("#") for x in above
+    )
 
 
 def test_every_key_of_conf_has_a_comment():
@@ -124,9 +189,13 @@ def test_the_architecture_page_maps_every_package_of_the_code():
 
 
 def test_make_targets_of_the_docs_exist():
-    targets = set(re.findall(r"^([a-z-]+):.*##", (ROOT / "Makefile").read_text(), flags=re.M))
+    targets = set(
+        re.findall(r"^([a-z-]+):.*##", (ROOT / "Makefile").read_text(), flags=re.M)
+    )
     for page in PAGES:
-        used = re.findall(r"^make ([a-z-]+)|`make ([a-z-]+)", page.read_text(), flags=re.M)
+        used = re.findall(
+            r"^make ([a-z-]+)|`make ([a-z-]+)", page.read_text(), flags=re.M
+        )
         assert {first or second for first, second in used} <= targets, page.name
 
 

@@ -21,31 +21,61 @@ from commands import ROOT, TINY
 # Settings of a GPU or of several processes: one kind of machine, and one process, runs the tests.
 ELSEWHERE = ("trainer=gpu", "trainer=ddp", "trainer=ddp_cpu")
 SMALL_BENCH = {
-    "speed": ["size=tiny", "frames=2", "warmup=1", "poses=2", "data.root=/path/to/capture"],
+    "speed": [
+        "size=tiny",
+        "frames=2",
+        "warmup=1",
+        "poses=2",
+        "data.root=/path/to/capture",
+    ],
     "trade_off": [
-        *("settings.accuracies=[draft]", "settings.scales=[0.5]", "settings.backends=[]"),
+        *(
+            "settings.accuracies=[draft]",
+            "settings.scales=[0.5]",
+            "settings.backends=[]",
+        ),
         *("settings.precisions=[]", "settings.windows=[]", "repeats=1", "images=1"),
     ],
     "raster": [
-        *("repeats=1", "gaussians=[300]", "channels=[3]", "sizes=[32]", "windows=1", "window=16")
+        *(
+            "repeats=1",
+            "gaussians=[300]",
+            "channels=[3]",
+            "sizes=[32]",
+            "windows=1",
+            "window=16",
+        )
     ],
 }
 
 
 # These need hands, or a face too.
 SIGNING = ("skeleton=holistic", "33_hands", "sign_demo", "paper_slp", "data=synthetic")
-FEW = {"segmentation": 2, "step_one": 2, "step_two": 4, "discriminator_start": 1, "epoch": 4}
+FEW = {
+    "segmentation": 2,
+    "step_one": 2,
+    "step_two": 4,
+    "discriminator_start": 1,
+    "epoch": 4,
+}
 
 
-FIRST = [ROOT / "README.md", *(ROOT / f"docs/{n}.md" for n in ("quickstart", "data", "train"))]
+FIRST = [
+    ROOT / "README.md",
+    *(ROOT / f"docs/{n}.md" for n in ("quickstart", "data", "train")),
+]
 
 
 def documented(pages: list[Path]) -> list[str]:
     """Every ``python -m gsgan.…`` and ``python scripts/…`` of the pages, once."""
     text = "\n".join(page.read_text() for page in pages)
     blocks = re.findall(r"```bash\n(.*?)```", text, flags=re.DOTALL)
-    lines = [line.split("#")[0].strip() for block in blocks for line in block.splitlines()]
-    return sorted({x for x in lines if x.startswith(("python -m gsgan.", "python scripts/"))})
+    lines = [
+        line.split("#")[0].strip() for block in blocks for line in block.splitlines()
+    ]
+    return sorted(
+        {x for x in lines if x.startswith(("python -m gsgan.", "python scripts/"))}
+    )
 
 
 def is_part(line: str, lines: list[str]) -> bool:
@@ -76,7 +106,9 @@ def place(capture, run, bare, on_body, model_file, tmp_path_factory):
         from writers import zju
         from writers.common import make_subject
 
-        return zju.write_original(folder() / "CoreView_377", make_subject(model_file("smpl")))
+        return zju.write_original(
+            folder() / "CoreView_377", make_subject(model_file("smpl"))
+        )
 
     def rig(name: str) -> Path:
         from writers.avatarrex import write_avatarrex
@@ -113,7 +145,9 @@ def place(capture, run, bare, on_body, model_file, tmp_path_factory):
             for i, (camera, frame) in enumerate(dataset.items):
                 path = root / split / camera / f"{frame:06d}.png"
                 path.parent.mkdir(parents=True, exist_ok=True)
-                picture = (dataset[i].image[0] * 255).round().byte().permute(1, 2, 0).numpy()
+                picture = (
+                    (dataset[i].image[0] * 255).round().byte().permute(1, 2, 0).numpy()
+                )
                 cv2.imwrite(str(path), picture[..., ::-1])
         return root
 
@@ -127,7 +161,9 @@ def place(capture, run, bare, on_body, model_file, tmp_path_factory):
         from gsgan.synthetic.posing import Choreography
 
         person = mannequin()
-        return write_bvh(folder() / name, person, Choreography(person).at(np.ones(2)), 1 / 30)
+        return write_bvh(
+            folder() / name, person, Choreography(person).at(np.ones(2)), 1 / 30
+        )
 
     def rendered() -> Path:
         from PIL import Image
@@ -142,7 +178,11 @@ def place(capture, run, bare, on_body, model_file, tmp_path_factory):
         import pose_format
         from make import skeletons
         from pose_format.numpy import NumPyPoseBody
-        from pose_format.pose_header import PoseHeader, PoseHeaderComponent, PoseHeaderDimensions
+        from pose_format.pose_header import (
+            PoseHeader,
+            PoseHeaderComponent,
+            PoseHeaderDimensions,
+        )
 
         from gsgan.skeleton import MEDIAPIPE33
 
@@ -161,7 +201,10 @@ def place(capture, run, bare, on_body, model_file, tmp_path_factory):
         "run=<run folder> format=html": lambda: f"run={on_body()} format=html",
         "/path/to/dance.bvh": lambda: moving("dance.bvh"),
         "/path/to/walk.bvh": lambda: moving("walk.bvh"),
-        **{f"/path/to/sign_{i}.pose": partial(sign, f"sign_{i}.pose") for i in (1, 2, 3)},
+        **{
+            f"/path/to/sign_{i}.pose": partial(sign, f"sign_{i}.pose")
+            for i in (1, 2, 3)
+        },
         "/path/to/000000.png": rendered,
         "/path/to/run_wo_gcn": lambda: another_run("run_wo_gcn"),
         "/path/to/run_wo_seg": lambda: another_run("run_wo_seg"),
@@ -194,13 +237,15 @@ def place(capture, run, bare, on_body, model_file, tmp_path_factory):
 
 def tiny_training(arguments: list[str], capture: Path) -> list[str]:
     given = [a for a in arguments if a != "experiment=demo" and a not in ELSEWHERE]
-    given = [a for a in given if not a.startswith("data.source.")]  # the tiny capture has a pose
+    # the tiny capture has a pose
+    given = [a for a in given if not a.startswith("data.source.")]
     if not any(a.startswith("data=") for a in given):
         given.append("data=capture")
     given += [t for t in TINY if not t.startswith("data=") and not fixed(given, t)]
     if not any(a.startswith("data.root=") for a in given):
         given.append(f"data.root={capture}")
-    if {"experiment=paper", "data=thuman4"} <= set(given):  # three cameras stand in for 24
+    # three cameras stand in for 24
+    if {"experiment=paper", "data=thuman4"} <= set(given):
         given += ["protocol.test_cameras=[cam02]", "protocol.test_frames=2-3"]
         given += ["protocol.train_frames=0-1"]
     return given + [f"training.schedule.{name}={value}" for name, value in FEW.items()]
@@ -209,7 +254,11 @@ def tiny_training(arguments: list[str], capture: Path) -> list[str]:
 def shorter_sweep(arguments: list[str], folder: Path) -> list[str]:
     """The last of the values that it varies."""
     given = [re.sub(r"=.*,", "=", a) if "=[" not in a else a for a in arguments]
-    return [*given, f"hydra.sweep.dir={folder / 'sweep'}", "hydra.sweep.subdir=${hydra.job.num}"]
+    return [
+        *given,
+        f"hydra.sweep.dir={folder / 'sweep'}",
+        "hydra.sweep.subdir=${hydra.job.num}",
+    ]
 
 
 def fixed(given: list[str], option: str) -> bool:
@@ -268,9 +317,12 @@ def test_a_documented_command_composes(line, execute):
 
 
 @pytest.mark.parametrize(
-    "line", [x if x in QUICK else pytest.param(x, marks=pytest.mark.slow) for x in WHOLE]
+    "line",
+    [x if x in QUICK else pytest.param(x, marks=pytest.mark.slow) for x in WHOLE],
 )
-def test_every_documented_command_runs(line, place, capture, execute, tmp_path, monkeypatch):
+def test_every_documented_command_runs(
+    line, place, capture, execute, tmp_path, monkeypatch
+):
     if any(word in line for word in SIGNING):
         from make import write_face, write_hands
 
@@ -292,7 +344,9 @@ def test_every_documented_command_runs(line, place, capture, execute, tmp_path, 
         arguments += ["size.image=32", "fit.points=200", "fit.surface_steps=2"]
         arguments += ["fit.sweeps=1", f"out={tmp_path / 'fit'}"]
     if name == "gsgan.prepare":  # MediaPipe is not at hand: its output is given
-        source = next(a for a in arguments if a.startswith("source=")).removeprefix("source=")
+        source = next(a for a in arguments if a.startswith("source=")).removeprefix(
+            "source="
+        )
         arguments = [a for a in arguments if a != "setup=true"]
         if source.endswith(".avi"):
             arguments += [f"landmarks={Path(source).parent}/landmarks", "hands=false"]

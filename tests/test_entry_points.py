@@ -55,7 +55,8 @@ def test_evaluate_finds_a_dataset_that_moved(run, capture, tmp_path, inside):
     result = inside("evaluate", *given)
     assert result.returncode == 0, result.stderr
     kept, found = (
-        json.loads((folder / "metrics.json").read_text()) for folder in (copy, copy / "novel_pose")
+        json.loads((folder / "metrics.json").read_text())
+        for folder in (copy, copy / "novel_pose")
     )
     assert found == {"novel_pose": kept["novel_pose"]}  # the scores of both splits stay
 
@@ -69,15 +70,20 @@ def test_a_model_file_is_refused_for_a_run_that_read_none(command, run, inside):
 
 def test_a_dataset_that_is_gone_is_asked_for(run, tmp_path, inside):
     result = inside("evaluate", f"run={run}", f"data_root={tmp_path / 'away'}")
-    refused(result, str(tmp_path / "away"), "does not exist", "data_root=<where it is now>")
+    refused(
+        result, str(tmp_path / "away"), "does not exist", "data_root=<where it is now>"
+    )
 
 
 def test_nothing_has_moved_where_there_is_no_run(inside):
-    refused(inside("bench", "speed", "data_root=/x"), "data_root and data_smpl require run=")
+    refused(
+        inside("bench", "speed", "data_root=/x"), "data_root and data_smpl require run="
+    )
 
 
 @pytest.mark.parametrize(
-    ("file", "text"), [("config.yaml", "data: {"), ("config.yaml", ""), ("hydra.yaml", "a: [")]
+    ("file", "text"),
+    [("config.yaml", "data: {"), ("config.yaml", ""), ("hydra.yaml", "a: [")],
 )
 def test_a_damaged_run_folder_is_one_sentence(file, text, run, tmp_path, inside):
     copy = shutil.copytree(run, tmp_path / "copy")
@@ -89,7 +95,9 @@ def test_evaluate_refuses_what_is_no_run(run, tmp_path, inside):
     refused(inside("evaluate"), "give either run=")
     refused(inside("evaluate", f"run={tmp_path}"), "not a run folder")
     refused(inside("evaluate", f"run={run}", "device=abacus"), "device=abacus")
-    refused(inside("evaluate", f"run={run}", "splits=[training]"), "splits", "novel_pose")
+    refused(
+        inside("evaluate", f"run={run}", "splits=[training]"), "splits", "novel_pose"
+    )
     broken = shutil.copytree(run, tmp_path / "broken")
     checkpoint = broken / "checkpoints" / "last.ckpt"
     checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
@@ -100,14 +108,20 @@ def test_evaluate_refuses_what_is_no_run(run, tmp_path, inside):
 
 def test_the_list_of_commands(tmp_path):
     result = subprocess.run(
-        [sys.executable, "-m", "gsgan"], cwd=tmp_path, capture_output=True, text=True, check=True
+        [sys.executable, "-m", "gsgan"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert "gsgan.train" in result.stdout
     assert "gsgan.evaluate" in result.stdout
 
 
 def weights(run: Path) -> dict[str, torch.Tensor]:
-    return torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
+    return torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)[
+        "state_dict"
+    ]
 
 
 def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
@@ -128,7 +142,9 @@ main()
 """
 
 
-def test_killed_half_way_and_resumed_ends_with_the_same_weights(run, capture, tmp_path, inside):
+def test_killed_half_way_and_resumed_ends_with_the_same_weights(
+    run, capture, tmp_path, inside
+):
     """So the same seed gives the same numbers: `run` was trained in another process."""
     folder = tmp_path / "killed"
     given = [*arguments(capture, folder), "evaluate=false"]
@@ -138,7 +154,12 @@ def test_killed_half_way_and_resumed_ends_with_the_same_weights(run, capture, tm
     )  # fmt: skip
     assert killed.returncode == -9
     assert not (folder / "metrics.json").exists()
-    assert torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)["gsgan"]["step"] == 8
+    assert (
+        torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)["gsgan"][
+            "step"
+        ]
+        == 8
+    )
     resumed = inside("train", *given)
     assert resumed.returncode == 0, resumed.stderr
     assert "resuming from" in resumed.stdout
@@ -173,7 +194,9 @@ def test_bad_data_ends_in_one_sentence_and_leaves_nothing(capture, tmp_path, ins
     cameras = json.loads((root / "cameras.json").read_text())
     del cameras["cam01"]
     (root / "cameras.json").write_text(json.dumps(cameras))
-    refused(inside("train", *arguments(root, tmp_path / "run")), "cam01", "cameras.json")
+    refused(
+        inside("train", *arguments(root, tmp_path / "run")), "cam01", "cameras.json"
+    )
     assert not (tmp_path / "run").exists()
 
 
@@ -200,7 +223,9 @@ def test_a_wrong_value_ends_in_one_sentence(capture, tmp_path, inside, argument,
     refused(inside("train", *arguments(capture, tmp_path / "run"), argument), *words)
 
 
-def test_a_name_that_hydra_does_not_know_ends_in_a_sentence(capture, tmp_path, inside, monkeypatch):
+def test_a_name_that_hydra_does_not_know_ends_in_a_sentence(
+    capture, tmp_path, inside, monkeypatch
+):
     """Under a tracer, as for coverage, Hydra would print its developers' view."""
     monkeypatch.setattr("hydra._internal.utils.is_under_debugger", lambda: False)
     for argument, word in (

@@ -16,7 +16,11 @@ from gsgan.utils.errors import GsganError
 DATA = ("data=capture", "data.size=32", "data.crop=null", "size=tiny", "lpips.nets=[]")
 PROTOCOL = (
     *("protocol=paper_thuman4", "protocol.train_cameras=[cam00,cam01]", "data.size=32"),
-    *("protocol.test_cameras=[cam02]", "protocol.train_frames=0-3", "protocol.test_frames=0-3"),
+    *(
+        "protocol.test_cameras=[cam02]",
+        "protocol.train_frames=0-3",
+        "protocol.test_frames=0-3",
+    ),
 )
 
 
@@ -68,7 +72,10 @@ def test_images_of_a_run_score_as_the_run_does(run, painted, given, inside):
         for metric in ("psnr", "psnr_person", "ssim", "ssim_person"):
             a, b = (x[split]["full"][metric] for x in (own, others))
             assert a == pytest.approx(b, abs=0.05)
-        assert variants["full"]["miou_reason"] == "predictions are images, not a segmentation"
+        assert (
+            variants["full"]["miou_reason"]
+            == "predictions are images, not a segmentation"
+        )
         assert variants["full"]["images"] == own[split]["full"]["images"]
     facts, runs = (json.loads((f / "facts.json").read_text()) for f in (out, run))
     for key in ("name", "fingerprint"):  # where it lies may have been another folder
@@ -77,13 +84,19 @@ def test_images_of_a_run_score_as_the_run_does(run, painted, given, inside):
     assert (runs["method"], runs["model"], runs["seed"]) == ("gsgan", "full", 0)
     assert runs["iterations"] == 16
     assert 0 < runs["train_seconds"] < 600
-    stored = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)["gsgan"]["code"]
+    stored = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)["gsgan"][
+        "code"
+    ]
     assert runs["trained_by"] == stored
     assert facts["trained_by"] is None
-    if runs["commit"] is not None:  # a checkout: the run was trained and scored by the same code
+    # a checkout: the run was trained and scored by the same code
+    if runs["commit"] is not None:
         assert [code.removesuffix("+changes") for code in stored] == [runs["commit"]]
     assert "other" in result.stdout
-    assert {p.name for p in (out / "grids").iterdir()} == {"novel_view.png", "novel_pose.png"}
+    assert {p.name for p in (out / "grids").iterdir()} == {
+        "novel_view.png",
+        "novel_pose.png",
+    }
 
 
 def test_the_csv_holds_every_image_and_its_mean_is_the_score(run):
@@ -122,13 +135,16 @@ def test_a_run_is_scored_on_another_capture_against_the_distance_from_training(
     for split in found:
         assert solved[split]["full"]["marks"][-1] == "driven by skeletons alone"
         assert solved[split]["full"]["psnr"] != scores(own)[split]["full"]["psnr"]
-        assert found[split]["full"]["psnr"] == pytest.approx(solved[split]["full"]["psnr"])
+        assert found[split]["full"]["psnr"] == pytest.approx(
+            solved[split]["full"]["psnr"]
+        )
         assert found[split]["full"]["flicker"] > 0
     with (folder / "distance.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) == sum(variants["full"]["images"] for variants in found.values())
     assert len({row["distance"] for row in rows}) > 2
-    assert len({(row["frame"], row["distance"]) for row in rows}) == 6  # of the pose alone
+    # of the pose alone
+    assert len({(row["frame"], row["distance"]) for row in rows}) == 6
     assert cv2.imread(str(folder / "distance.png")) is not None
     assert "by distance from the training poses" in result.stdout
     for arguments, named in (
@@ -150,16 +166,27 @@ def test_the_ground_truth_as_prediction_on_white(capture, given, inside, tmp_pat
             for i, (camera, frame) in enumerate(dataset.items):
                 f = dataset[i]
                 cover = f.mask.clamp_min(1e-6)
-                colour = f.image / cover if kind == "alpha" else on_background(f.image, f.mask, 1.0)
+                colour = (
+                    f.image / cover
+                    if kind == "alpha"
+                    else on_background(f.image, f.mask, 1.0)
+                )
                 planes = [colour[0], f.mask[0]] if kind == "alpha" else [colour[0]]
-                pixels = (torch.cat(planes).clamp(0, 1) * 255).round().byte().permute(1, 2, 0)
+                pixels = (
+                    (torch.cat(planes).clamp(0, 1) * 255)
+                    .round()
+                    .byte()
+                    .permute(1, 2, 0)
+                )
                 path = tmp_path / kind / f"{camera}_{frame}.png"
                 path.parent.mkdir(exist_ok=True)
                 order = [2, 1, 0, 3] if kind == "alpha" else [2, 1, 0]
                 cv2.imwrite(str(path), np.ascontiguousarray(pixels.numpy()[..., order]))
     named = "predictions_pattern='{camera}_{frame}.png'"
     for kind in ("opaque", "alpha"):
-        result = inside("evaluate", f"predictions={tmp_path / kind}", named, *given, *PROTOCOL)
+        result = inside(
+            "evaluate", f"predictions={tmp_path / kind}", named, *given, *PROTOCOL
+        )
         assert result.returncode == 0, result.stderr
         found = scores(tmp_path / f"{kind}_scores")["novel_view"]
         psnr = found["full"]["psnr"]
@@ -187,7 +214,8 @@ def test_a_run_is_scored_on_white_by_request(run, inside, tmp_path):
     assert scores(copy) == scores(run)  # its own stay
     shown = cv2.imread(str(on_white / "grids" / "novel_pose.png"))
     assert (shown[-1, 0] == 255).all()  # the truth's corner
-    assert (shown[-1, 3 * shown.shape[1] // 5 + 1] > 128).all()  # and the painted one, fourth
+    # and the painted one, fourth
+    assert (shown[-1, 3 * shown.shape[1] // 5 + 1] > 128).all()
     black, white = scores(run), scores(on_white)
     data = build_data(load_config(run))
     avatar, _ = load_avatar(run, load_config(run), data)
@@ -203,9 +231,13 @@ def test_a_run_is_scored_on_white_by_request(run, inside, tmp_path):
                 ("splat", (painting.colour.clamp(0, 1), painting.splat_alpha)),
                 ("floor", (torch.zeros_like(truth), torch.zeros_like(frame.mask))),
             ):
-                found[name].append(float(psnr(on_background(*picture, 1.0).clamp(0, 1), truth)))
+                found[name].append(
+                    float(psnr(on_background(*picture, 1.0).clamp(0, 1), truth))
+                )
         for name, values in variants.items():
-            assert values["psnr"] == pytest.approx(sum(found[name]) / len(found[name]), abs=1e-3)
+            assert values["psnr"] == pytest.approx(
+                sum(found[name]) / len(found[name]), abs=1e-3
+            )
             assert abs(values["psnr"] - black[split][name]["psnr"]) > 0.1
             assert "scored on white" in values["marks"]
             assert "scored on white" not in black[split][name]["marks"]
@@ -223,7 +255,10 @@ def test_another_background_departs_from_the_protocol(copy, given, inside):
     assert full["marks"] == ["scored on black"]
     departure = "background is black, asked for: white"
     assert departure in full["protocol"]["departures"]
-    assert "departs from paper_thuman4: " + departure in (folder / "metrics.md").read_text()
+    assert (
+        "departs from paper_thuman4: " + departure
+        in (folder / "metrics.md").read_text()
+    )
 
 
 def resize(path: Path) -> None:
@@ -240,7 +275,9 @@ def resize(path: Path) -> None:
         (lambda path: path.write_bytes(b""), ("cam01/0005.png",)),
     ],
 )
-def test_one_wrong_image_is_named_and_nothing_is_written(copy, given, inside, damage, words):
+def test_one_wrong_image_is_named_and_nothing_is_written(
+    copy, given, inside, damage, words
+):
     damage(copy / "novel_pose" / "cam01" / "0005.png")
     refused(inside("evaluate", f"predictions={copy}", *given), *words)
     assert not copy.with_name("other_scores").exists()
@@ -256,13 +293,31 @@ def test_arguments_that_do_not_fit_together_are_refused(run, copy, given, compos
         ([here], ("data is not set", "data.root")),
         ([f"run={run}", *given], ("data= cannot be given with run=",)),
         ([f"run={run}", "method=x"], ("method= cannot be given with run=",)),
-        ([here, *given, "data_root=/x"], ("data_root= cannot be given with predictions=",)),
-        ([here, *given, "drive=skeleton"], ("drive= cannot be given with predictions=",)),
+        (
+            [here, *given, "data_root=/x"],
+            ("data_root= cannot be given with predictions=",),
+        ),
+        (
+            [here, *given, "drive=skeleton"],
+            ("drive= cannot be given with predictions=",),
+        ),
         ([f"run={run}", "drive=body"], ("drive must be skeleton or null",)),
-        ([here, *given, "splits=[]"], ("splits must be a list of novel_view and novel_pose",)),
-        ([here, *given, "predictions_pattern=x.png"], ("must have {frame} and {camera}",)),
-        ([here, *given, "background=grey"], ("background must be black, white or null",)),
-        ([f"run={run}", "background=grey"], ("background must be black, white or null", "'grey'")),
+        (
+            [here, *given, "splits=[]"],
+            ("splits must be a list of novel_view and novel_pose",),
+        ),
+        (
+            [here, *given, "predictions_pattern=x.png"],
+            ("must have {frame} and {camera}",),
+        ),
+        (
+            [here, *given, "background=grey"],
+            ("background must be black, white or null",),
+        ),
+        (
+            [f"run={run}", "background=grey"],
+            ("background must be black, white or null", "'grey'"),
+        ),
         ([here, *given, f"out={copy}/scores"], ("is inside the predictions",)),
         ([here, *given, f"out={run}"], ("a run folder",)),
         ([f"predictions={copy}/no", *given], ("other/no is not a folder",)),
@@ -277,7 +332,10 @@ def test_another_methods_scores_are_not_overwritten(copy, given, inside):
     arguments = [f"predictions={copy}", "splits=[novel_pose]", *given]
     out = copy.parent / "kept"
     assert inside("evaluate", *arguments, "method=one", f"out={out}").returncode == 0
-    refused(inside("evaluate", *arguments, "method=two", f"out={out}"), "scores of one, not of two")
+    refused(
+        inside("evaluate", *arguments, "method=two", f"out={out}"),
+        "scores of one, not of two",
+    )
     (copy / "novel_pose" / "notes.txt").write_text("mine")  # other files are ignored
     assert inside("evaluate", *arguments, "method=one", f"out={out}").returncode == 0
 

@@ -28,11 +28,14 @@ def script(inside, monkeypatch):
 
     def example(name: str) -> ModuleType:
         module = importlib.import_module(name)
-        monkeypatch.setattr(module, "subprocess", SimpleNamespace(run=run), raising=False)
+        monkeypatch.setattr(
+            module, "subprocess", SimpleNamespace(run=run), raising=False
+        )
         return module
 
     monkeypatch.syspath_prepend(str(FOLDER))
-    monkeypatch.setenv("PYTHONPATH", str(FOLDER), prepend=os.pathsep)  # of a sweep's jobs
+    # of a sweep's jobs
+    monkeypatch.setenv("PYTHONPATH", str(FOLDER), prepend=os.pathsep)
     return example
 
 
@@ -47,7 +50,10 @@ def test_your_own_cameras_then_live(script, tmp_path, capfd):
     landmarks = tmp_path / "capture" / "landmarks3d.npz"
     live.main(tmp_path / "run", landmarks, tmp_path / "live", 64)
     assert f"{own.FRAMES} images" in capfd.readouterr().out
-    frames = [np.asarray(Image.open(path)) for path in sorted((tmp_path / "live").glob("*.png"))]
+    frames = [
+        np.asarray(Image.open(path))
+        for path in sorted((tmp_path / "live").glob("*.png"))
+    ]
     assert len(frames) == own.FRAMES
     assert (frames[0] != frames[3]).any()
 
@@ -65,4 +71,6 @@ def test_a_loss_and_an_ablation_of_your_own(script, capture, tmp_path):
 def test_the_page_lists_the_scripts():
     page = (FOLDER / "README.md").read_text()
     for path in FOLDER.glob("*.py"):
-        assert re.search(rf"^python docs/examples/{path.name}", page, flags=re.M), path.name
+        assert re.search(rf"^python docs/examples/{path.name}", page, flags=re.M), (
+            path.name
+        )

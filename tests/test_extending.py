@@ -49,7 +49,9 @@ class NpzReader(FolderReader):
             images=images,
             masks=one_mask_each(masks, "grey"),
             mask_folder="{camera}_mask",
-            landmarks=make_landmarks(ids, p, np.ones(p.shape[:2]), limits.max_reach, []),
+            landmarks=make_landmarks(
+                ids, p, np.ones(p.shape[:2]), limits.max_reach, []
+            ),
             calibration=file,
             unit_hint="lengths must be in metres",
         )
@@ -84,7 +86,9 @@ class Blobs(nn.Module):
 
     features = 0  # channels of F besides the three of colour
 
-    def __init__(self, body, body_height: float, sh_degree: int, count: int = 50) -> None:
+    def __init__(
+        self, body, body_height: float, sh_degree: int, count: int = 50
+    ) -> None:
         super().__init__()
         self.points, self.size = SkinnedPoints(body, count), 0.03 * body_height
         self.sh_degree = self.active_degree = sh_degree
@@ -99,7 +103,11 @@ class Blobs(nn.Module):
         quats = means.new_tensor([1.0, 0, 0, 0]).expand(*means.shape[:2], 4)
         features = self.colour.expand(len(means), -1, -1)
         return Gaussians(
-            means, quats, torch.full_like(means, self.size), features[..., 0] * 0 + 0.9, features
+            means,
+            quats,
+            torch.full_like(means, self.size),
+            features[..., 0] * 0 + 0.9,
+            features,
         )
 
 
@@ -116,7 +124,9 @@ def test_a_dataset_format(tiny, capture, tmp_path):
         shutil.copytree(capture / "images" / name, tmp_path / name)
         shutil.copytree(capture / "masks" / name, tmp_path / f"{name}_mask")
     reader = ("~data.reader", f"+data.reader={{_target_: {HERE}.NpzReader}}")
-    here = build_data(tiny(*reader, f"data.root={tmp_path}", "data.test_cameras=[cam02]"))
+    here = build_data(
+        tiny(*reader, f"data.root={tmp_path}", "data.test_cameras=[cam02]")
+    )
     there = build_data(tiny("data.test_cameras=[cam02]"))
     mine, theirs = here.dataset("train")[0], there.dataset("train")[0]
     assert torch.equal(mine.image, theirs.image)
@@ -137,14 +147,23 @@ def test_a_loss_term(tiny):
 def test_a_generator(build):
     keys = ("base", "multipliers", "style_share", "rgb_skip", "feature_bound", "patch")
     _, avatar, frame = build(
-        f"model.generator._target_={HERE}.OneLayer", *(f"~model.generator.{key}" for key in keys)
+        f"model.generator._target_={HERE}.OneLayer",
+        *(f"~model.generator.{key}" for key in keys),
     )
     assert isinstance(avatar.generator, OneLayer)
     assert avatar(*frame.inputs).image.shape == frame.image.shape
 
 
 def test_a_splatting_baseline(tiny):
-    keys = ("opacity", "scale", "mean_bound", "scale_min", "scale_max", "logit_bound", "points")
+    keys = (
+        "opacity",
+        "scale",
+        "mean_bound",
+        "scale_min",
+        "scale_max",
+        "logit_bound",
+        "points",
+    )
     config = tiny(
         "model=lbs_splat",
         f"model.surface._target_={HERE}.Blobs",

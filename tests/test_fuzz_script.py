@@ -23,8 +23,13 @@ def test_the_hook_sees_a_program_and_a_file(tmp_path):
     script = runpy.run_path(str(SCRIPT))
     whole = tmp_path / "a"
     whole.write_bytes(b"1")
-    for action in ("__import__('os').system('true')", f"open({str(tmp_path.parent / 'b')!r}, 'w')"):
-        found = script["batch"](tmp_path, [(whole, lambda _, a=action: eval(a))], "a", 0, 1)
+    for action in (
+        "__import__('os').system('true')",
+        f"open({str(tmp_path.parent / 'b')!r}, 'w')",
+    ):
+        found = script["batch"](
+            tmp_path, [(whole, lambda _, a=action: eval(a))], "a", 0, 1
+        )
         assert list(found) == ["code"]
     greedy = [(whole, lambda _: bytearray(3 << 30)), (whole, lambda _: b"1")]
     assert list(script["batch"](tmp_path, greedy, "a", 0, 2)) == ["memory", "read"]

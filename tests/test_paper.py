@@ -50,7 +50,9 @@ def test_the_preset_leaves_out_what_is_ours_on_every_data(settings, data):
     assert {key: found[key] for key in OURS} == OURS
 
 
-@pytest.mark.parametrize(("data", "protocol"), [("thuman4", "thuman4"), ("zju_mocap", "zju")])
+@pytest.mark.parametrize(
+    ("data", "protocol"), [("thuman4", "thuman4"), ("zju_mocap", "zju")]
+)
 def test_it_brings_the_papers_protocol(compose, data, protocol):
     config = compose("train", "experiment=paper", f"data={data}")
     assert config.protocol.name == f"paper_{protocol}"
@@ -59,11 +61,21 @@ def test_it_brings_the_papers_protocol(compose, data, protocol):
 
 
 @pytest.mark.parametrize("model", ["lbs_splat", "image_to_image"])
-def test_baselines_that_are_not_the_papers_are_refused_in_one_sentence(inside, capture, model):
-    given = ("experiment=paper", f"model={model}", "data=capture", f"data.root={capture}")
+def test_baselines_that_are_not_the_papers_are_refused_in_one_sentence(
+    inside, capture, model
+):
+    given = (
+        "experiment=paper",
+        f"model={model}",
+        "data=capture",
+        f"data.root={capture}",
+    )
     result = inside("train", *given, "size=tiny", "training=smoke")
     assert result.returncode == 1
-    assert "it goes with model=full, wo_feat, wo_seg, wo_gcn or splat_only" in result.stderr
+    assert (
+        "it goes with model=full, wo_feat, wo_seg, wo_gcn or splat_only"
+        in result.stderr
+    )
     assert result.stderr.count("\n") == 1
 
 
@@ -89,7 +101,9 @@ def test_the_page_lists_keys_that_exist_and_values_of_the_preset(compose):
     page = (config_folder().parent / "docs" / "paper.md").read_text()
     config = compose("train", "experiment=paper")
     groups = ("model", "training", "effects", "size", "data", "trainer")
-    known = dict(flat({g: OmegaConf.to_container(config[g], resolve=True) for g in groups}))
+    known = dict(
+        flat({g: OmegaConf.to_container(config[g], resolve=True) for g in groups})
+    )
     groups = {key.rpartition(".")[0] for key in known} | set(known)
     parents = {".".join(key.split(".")[:n]) for key in known for n in range(1, 6)}
     for row in (line for line in page.splitlines() if line.startswith("|")):
@@ -122,7 +136,12 @@ UNLISTED = (
         "training.recipes.psi.span",
     ),
     *("model.backend", "model.window_multiple", "model.window_least"),
-    *("training.seed", "training.log_every", "training.max_skipped", "training.skip_window"),
+    *(
+        "training.seed",
+        "training.log_every",
+        "training.max_skipped",
+        "training.skip_window",
+    ),
     *("training.rollback", "training.average_every", "training.perceptual.path"),
     *("training.schedule.epoch", "effects.impossible"),
 )
@@ -133,10 +152,14 @@ def test_the_page_lists_every_number_of_the_preset(compose):
     page = (config_folder().parent / "docs" / "paper.md").read_text()
     config = compose("train", "experiment=paper")
     for group in ("model", "training"):
-        for key, _ in flat({group: OmegaConf.to_container(config[group], resolve=True)}):
+        for key, _ in flat(
+            {group: OmegaConf.to_container(config[group], resolve=True)}
+        ):
             words = key.split(".")
             parts = [".".join(words[:n]) for n in range(3, len(words) + 1)]
             parts += [f"{group}.accuracy"] * ("accuracy" in words) + [key]
-            listed = f"`{words[-1]}`" in page or any(f"`{part}`" in page for part in parts)
+            listed = f"`{words[-1]}`" in page or any(
+                f"`{part}`" in page for part in parts
+            )
             idle = any(key.startswith(part) for part in UNLISTED)
             assert listed or idle or words[-1].startswith("_"), key

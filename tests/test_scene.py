@@ -19,7 +19,9 @@ def camera(batch: int = 1, **changes) -> Camera:
 
 
 def test_projection_closed_form():
-    pixels, depth = camera().project(torch.tensor([[[0.2, -0.1, 2.0], [0.0, 0.0, -1.0]]]))
+    pixels, depth = camera().project(
+        torch.tensor([[[0.2, -0.1, 2.0], [0.0, 0.0, -1.0]]])
+    )
     torch.testing.assert_close(pixels[0, 0], torch.tensor([25.0, 13.0]))
     assert depth.tolist() == [[2.0, -1.0]]
     assert torch.isfinite(pixels).all()
@@ -33,9 +35,13 @@ def test_tensors_are_tensors():
 def test_crop_and_resize_see_the_same_point():
     point = torch.tensor([[[0.2, -0.1, 2.0]]])
     cropped = camera().crop(5, 8, (20, 24))
-    torch.testing.assert_close(cropped.project(point)[0][0, 0], torch.tensor([17.0, 8.0]))
+    torch.testing.assert_close(
+        cropped.project(point)[0][0, 0], torch.tensor([17.0, 8.0])
+    )
     resized = camera().resize((60, 20))
-    torch.testing.assert_close(resized.project(point)[0][0, 0], torch.tensor([12.5, 26.0]))
+    torch.testing.assert_close(
+        resized.project(point)[0][0, 0], torch.tensor([12.5, 26.0])
+    )
     assert resized.size == (60, 20)
 
 

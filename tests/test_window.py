@@ -10,13 +10,19 @@ HEIGHT, WIDTH = 60, 100
 
 
 def camera(batch: int = 1) -> Camera:
-    K = torch.tensor([[50.0, 0, WIDTH / 2], [0, 50, HEIGHT / 2], [0, 0, 1]]).expand(batch, 3, 3)
-    return Camera(K, torch.eye(3).expand(batch, 3, 3), torch.zeros(batch, 3), (HEIGHT, WIDTH))
+    K = torch.tensor([[50.0, 0, WIDTH / 2], [0, 50, HEIGHT / 2], [0, 0, 1]]).expand(
+        batch, 3, 3
+    )
+    return Camera(
+        K, torch.eye(3).expand(batch, 3, 3), torch.zeros(batch, 3), (HEIGHT, WIDTH)
+    )
 
 
 def window(points, batch: int = 1, margin: float = 0.1, multiple: int = 8) -> Window:
     p = torch.tensor(points).expand(batch, -1, -1)
-    return body_window(p, camera(batch), margin=margin, multiple=multiple, least=8, near=0.01)
+    return body_window(
+        p, camera(batch), margin=margin, multiple=multiple, least=8, near=0.01
+    )
 
 
 def test_closed_form():
@@ -53,7 +59,12 @@ def test_boxes_of_a_batch_share_one_size():
     p = torch.tensor([[[0.0, 0.0, 2.0]] * 2, [[-0.5, 0.0, 2.0], [0.5, 0.0, 2.0]]])
     found = body_window(p, camera(2), margin=0.1, multiple=8, least=8, near=0.01)
     assert len(found.corners) == 2
-    picture = torch.arange(HEIGHT * WIDTH).view(1, 1, HEIGHT, WIDTH).float().expand(2, -1, -1, -1)
+    picture = (
+        torch.arange(HEIGHT * WIDTH)
+        .view(1, 1, HEIGHT, WIDTH)
+        .float()
+        .expand(2, -1, -1, -1)
+    )
     back = found.paste(found.cut(picture))
     inside = found.paste(torch.ones(2, 1, *found.size)) > 0
     assert torch.equal(back[inside], picture[inside])
@@ -66,7 +77,8 @@ def test_the_boxs_camera_sees_the_same_point():
     (top, left) = found.corners[0]
     whole = camera().project(point)[0][0, 0]
     torch.testing.assert_close(
-        found.camera(camera()).project(point)[0][0, 0], whole - torch.tensor([left, top])
+        found.camera(camera()).project(point)[0][0, 0],
+        whole - torch.tensor([left, top]),
     )
 
 

@@ -25,7 +25,13 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+)
 
 from gsgan.bench.common import check_whole, environment, sentence
 from gsgan.scene import Frame
@@ -61,7 +67,10 @@ class Bench:
         if config.threads is not None:
             check_whole(config, threads=1)
             torch.set_num_threads(config.threads)
-        device, page = pick_device(config.get("device", "cpu")), config.docs and Path(config.docs)
+        device, page = (
+            pick_device(config.get("device", "cpu")),
+            config.docs and Path(config.docs),
+        )
         bench = cls(name, folder, make_console(), device, environment(device), page)
         if page is not None:  # before anything is measured
             check_block(page, *bench.markers)
@@ -76,7 +85,9 @@ class Bench:
     def progress(self) -> Progress:
         """A progress bar with a description."""
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-        return Progress(*columns, TimeElapsedColumn(), console=self.console, transient=True)
+        return Progress(
+            *columns, TimeElapsedColumn(), console=self.console, transient=True
+        )
 
     def write(
         self,
@@ -95,18 +106,24 @@ class Bench:
             images: PNG bytes by name; for the page they go into ``images/`` beside it.
         """
         self.console.print(text, markup=False, highlight=False, soft_wrap=True)
-        write_atomically(self.folder / f"{self.name}.md", f"# {title}\n\n{text.strip()}\n")
+        write_atomically(
+            self.folder / f"{self.name}.md", f"# {title}\n\n{text.strip()}\n"
+        )
         content = json.dumps({"where": self.where, **record}, indent=1)
         write_atomically(self.folder / f"{self.name}.json", content)
         if frame is not None:
-            write_atomically(self.folder / f"{self.name}.csv", frame.to_csv(index=False))
+            write_atomically(
+                self.folder / f"{self.name}.csv", frame.to_csv(index=False)
+            )
         for name, png in (images or {}).items():
             write_atomically(self.folder / name, png)
             if self.page is not None:
                 write_atomically(self.page.parent / "images" / name, png)
         if self.page is not None:
             fill_block(self.page, *self.markers, docs or text)
-        self.console.print(f"tables and raw numbers: {self.folder}", markup=False, highlight=False)
+        self.console.print(
+            f"tables and raw numbers: {self.folder}", markup=False, highlight=False
+        )
 
 
 def fill_block(page: Path, start: str, end: str, text: str) -> None:
@@ -138,19 +155,25 @@ def _around(page: Path, start: str, end: str) -> tuple[str, str]:
     try:
         text = page.read_text()
     except FileNotFoundError:
-        raise ConfigError(f"docs={page}: no such page; give a Markdown file or docs=null") from None
+        raise ConfigError(
+            f"docs={page}: no such page; give a Markdown file or docs=null"
+        ) from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"docs={page} cannot be read as a page: {error}") from None
     head, found, rest = text.partition(start)
     _, closed, tail = rest.partition(end)
     if not found or not closed:
-        raise ConfigError(f"docs={page}: expected a block {start} … {end}, found none; add one")
+        raise ConfigError(
+            f"docs={page}: expected a block {start} … {end}, found none; add one"
+        )
     return head + start, end + tail
 
 
 def records(frame: pd.DataFrame) -> list[dict[str, Any]]:
     """The rows as JSON values, with null for NaN and infinity."""
-    rows: list[dict[str, Any]] = json.loads(frame.to_json(orient="records", double_precision=15))
+    rows: list[dict[str, Any]] = json.loads(
+        frame.to_json(orient="records", double_precision=15)
+    )
     return rows
 
 
@@ -200,10 +223,18 @@ def train(overrides: Sequence[str], run: Path) -> None:
     quoted = str(run).replace("\\", "\\\\").replace("'", "\\'")
     log = run.with_name(f"{run.name}.log")
     log.parent.mkdir(parents=True, exist_ok=True)
-    command = [sys.executable, "-m", "gsgan.train", *overrides, f"hydra.run.dir='{quoted}'"]
+    command = [
+        sys.executable,
+        "-m",
+        "gsgan.train",
+        *overrides,
+        f"hydra.run.dir='{quoted}'",
+    ]
     with log.open("w") as stream:
         wide = {**os.environ, "COLUMNS": "1000"}  # one line per message
-        process = subprocess.Popen(command, stdout=stream, stderr=subprocess.STDOUT, env=wide)
+        process = subprocess.Popen(
+            command, stdout=stream, stderr=subprocess.STDOUT, env=wide
+        )
         try:
             code = process.wait()
         except BaseException:  # Ctrl-C reaches it as well: it saves a checkpoint
@@ -212,9 +243,13 @@ def train(overrides: Sequence[str], run: Path) -> None:
             process.kill()
             raise
     if code:
-        lines = [x.strip() for x in log.read_text(errors="replace").splitlines() if x.strip()]
+        lines = [
+            x.strip() for x in log.read_text(errors="replace").splitlines() if x.strip()
+        ]
         last = lines[-1] if lines else f"it ended with {code}"
-        raise GsganError(f"training {run.name} failed: {last.removeprefix('gsgan: ')} (see {log})")
+        raise GsganError(
+            f"training {run.name} failed: {last.removeprefix('gsgan: ')} (see {log})"
+        )
 
 
 def panels(count: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
@@ -241,10 +276,14 @@ def png(figure: Figure) -> bytes:
     return stream.getvalue()
 
 
-def painting_memory(paint: Callable[[Frame], object], frames: Sequence[Frame]) -> float | None:
+def painting_memory(
+    paint: Callable[[Frame], object], frames: Sequence[Frame]
+) -> float | None:
     """Megabytes that painting takes on top of the avatar and its inputs; None where unavailable."""
     few = frames[:MEMORY_FRAMES]
-    return peak_memory(lambda: [paint(frame) for frame in few], frames[0].skeleton.device)
+    return peak_memory(
+        lambda: [paint(frame) for frame in few], frames[0].skeleton.device
+    )
 
 
 def peak_memory(action: Callable[[], object], device: torch.device) -> float | None:
@@ -259,7 +298,8 @@ def peak_memory(action: Callable[[], object], device: torch.device) -> float | N
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
     else:
-        with contextlib.suppress(OSError, AttributeError):  # glibc keeps what was freed for reuse
+        # glibc keeps what was freed for reuse
+        with contextlib.suppress(OSError, AttributeError):
             ctypes.CDLL(None).malloc_trim(0)
         with contextlib.suppress(OSError), open("/proc/self/clear_refs", "w") as stream:
             stream.write("5")
@@ -273,7 +313,10 @@ def _peak(device: torch.device) -> float | None:
     """The peak since the reset, in bytes."""
     if device.type == "cuda":
         return float(torch.cuda.max_memory_allocated(device))
-    with contextlib.suppress(OSError, StopIteration), open("/proc/self/status") as stream:
+    with (
+        contextlib.suppress(OSError, StopIteration),
+        open("/proc/self/status") as stream,
+    ):
         line = next(line for line in stream if line.startswith("VmHWM:"))
         return 1024.0 * int(line.split()[1])
     return None

@@ -41,7 +41,8 @@ class Row:
     scene: str  # whose images were trained on
     called: bool  # whether the scene calls for it
     split: str  # whose images were scored
-    overrides: list[str] = field(default_factory=list)  # of `gsgan.train` that make the scene
+    # of `gsgan.train` that make the scene
+    overrides: list[str] = field(default_factory=list)
     # Overrides by the name of the run, off first, then on; empty if nothing is trained.
     runs: dict[str, list[str]] = field(default_factory=dict)
     auto: bool = False  # whether `auto` turned it on
@@ -84,7 +85,9 @@ def run(config: DictConfig, folder: Path) -> None:
         for name, words in trainings.items():
             progress.update(task, description=f"training {name}")
             bench_common.train(words, folder / "runs" / name)
-            metrics[name] = json.loads((folder / "runs" / name / "metrics.json").read_text())
+            metrics[name] = json.loads(
+                (folder / "runs" / name / "metrics.json").read_text()
+            )
             progress.advance(task)
         for row in rows:
             progress.update(task, description=f"timing {row.effect} in {row.scene}")
@@ -94,7 +97,9 @@ def run(config: DictConfig, folder: Path) -> None:
             progress.advance(task)
     record = {
         "settings": OmegaConf.to_container(config),
-        "rows": [asdict(row) | {"gain_db": {v: row.gain(v) for v in SHOWN}} for row in rows],
+        "rows": [
+            asdict(row) | {"gain_db": {v: row.gain(v) for v in SHOWN}} for row in rows
+        ],
         "failures": failures(rows),
     }
     bench.write("What effects gain and cost", page(rows, bench.where), record)
@@ -108,7 +113,9 @@ def check(config: DictConfig) -> None:
     only = config.only
     listed = OmegaConf.is_list(only) and only and set(only) <= set(config.cases)
     if only is not None and not listed:
-        raise ConfigError(f"only must list some of {', '.join(config.cases)}; got {only!r}")
+        raise ConfigError(
+            f"only must list some of {', '.join(config.cases)}; got {only!r}"
+        )
     for name, case in config.cases.items():
         one_of(f"cases.{name}.split", case.split, SPLITS)
 
@@ -120,11 +127,19 @@ def rows_of(config: DictConfig) -> Iterator[Row]:
         turn_on, scene = f"effects.{effect}={case.word}", list(case.scene)
         if scene:
             off = [*base, *scene]
-            runs = {f"{effect}-off": off, f"{effect}-on": [*off, turn_on]} if config.train else {}
+            runs = (
+                {f"{effect}-off": off, f"{effect}-on": [*off, turn_on]}
+                if config.train
+                else {}
+            )
             yield Row(effect, effect, True, case.split, scene, runs)
         row = Row(effect, DEFAULT, not scene, case.split)
-        if config.train and not scene:  # the default person calls for it: the base has it
-            row.runs = {f"{effect}-off": [*base, f"effects.{effect}=off"], "default": base}
+        # the default person calls for it: the base has it
+        if config.train and not scene:
+            row.runs = {
+                f"{effect}-off": [*base, f"effects.{effect}=off"],
+                "default": base,
+            }
         elif config.train and config.default and case.get("elsewhere", True):
             row.runs = {"default": base, f"default-{effect}": [*base, turn_on]}
         yield row
@@ -163,13 +178,17 @@ def measure(row: Row, folder: Path, frames: int, repeats: int) -> None:
         dataset = data.dataset(row.split)
         chosen = evenly_spaced(len(dataset), frames)
         count, shown = len(chosen), [dataset[i] for i in chosen]
-        paint[state] = lambda a=avatar, shown=shown: [a(*frame.inputs).image for frame in shown]
+        paint[state] = lambda a=avatar, shown=shown: [
+            a(*frame.inputs).image for frame in shown
+        ]
         read[state] = lambda d=dataset, chosen=chosen: [d[i] for i in chosen]
         row.parameters[state] = sum(p.numel() for p in avatar.parameters())
     with torch.no_grad():
         for actions, found in ((paint, row.paint_ms), (read, row.read_ms)):
             samples = interleaved(actions, repeats)
-            found |= {state: (median(ms) or 0.0) / count for state, ms in samples.items()}
+            found |= {
+                state: (median(ms) or 0.0) / count for state, ms in samples.items()
+            }
 
 
 def failures(rows: Sequence[Row]) -> list[str]:
@@ -178,7 +197,9 @@ def failures(rows: Sequence[Row]) -> list[str]:
     for row in rows:
         name, gain = f"{row.effect} in the scene {row.scene}", row.gain("full")
         if row.auto != row.called:
-            found.append(f"auto leaves {name} {'on' if row.auto else 'off'} ({row.why})")
+            found.append(
+                f"auto leaves {name} {'on' if row.auto else 'off'} ({row.why})"
+            )
         if row.called and gain is not None and gain <= 0:
             found.append(f"{name} gains {gain:+.2f} dB although it is called for")
     return found
@@ -217,7 +238,9 @@ def _gain(row: Row, variant: str) -> str:
     gain = row.gain(variant)
     if gain is None:
         return NOTHING
-    return f"{gain:+.2f} ({_change({s: row.scores[s][variant] for s in ('off', 'on')})})"
+    return (
+        f"{gain:+.2f} ({_change({s: row.scores[s][variant] for s in ('off', 'on')})})"
+    )
 
 
 def _change(values: Mapping[str, float]) -> str:

@@ -29,7 +29,11 @@ from gsgan.data.formats.capture import CaptureReader
 
 IMAGES = 80
 LEVELS = ("error", "warning")
-UPRIGHT, LEVEL, SIGHT = np.array([0.0, 1, 0]), np.array([1.0, 0, 0]), np.array([0.0, 0, 1])
+UPRIGHT, LEVEL, SIGHT = (
+    np.array([0.0, 1, 0]),
+    np.array([1.0, 0, 0]),
+    np.array([0.0, 0, 1]),
+)
 
 Camera = dict[str, Any]  # an entry of cameras.json, its lists as arrays
 
@@ -37,7 +41,10 @@ Camera = dict[str, Any]  # an entry of cameras.json, its lists as arrays
 def turned(axis: np.ndarray, degrees: float, *, about_centre: bool = True) -> Callable:
     """Turned about its own axis; with t kept it moves along its circle about the world's origin."""
     turn = cv2.Rodrigues(np.radians(degrees) * axis)[0]
-    return lambda c: {"R": turn @ c["R"], **({"t": turn @ c["t"]} if about_centre else {})}
+    return lambda c: {
+        "R": turn @ c["R"],
+        **({"t": turn @ c["t"]} if about_centre else {}),
+    }
 
 
 def moved(metres: float) -> Callable:
@@ -101,7 +108,10 @@ FAULTS: list[tuple[str, Callable | None, str]] = [
     ("turned by 5° about its line of sight", turned(SIGHT, 5), "one"),
     ("turned by 2° about its line of sight", turned(SIGHT, 2), "one"),
     ("turned by 5° with `t` kept", turned(UPRIGHT, 5, about_centre=False), "one"),
-    *((f"moved sideways by {100 * d:.0f} cm", moved(d), "one") for d in (0.2, 0.1, 0.05)),
+    *(
+        (f"moved sideways by {100 * d:.0f} cm", moved(d), "one")
+        for d in (0.2, 0.1, 0.05)
+    ),
     *(
         (f"`t` in {unit}", scaled(factor), which)
         for unit, factor in (("mm", 1000), ("cm", 100), ("inches", 1 / 0.0254))
@@ -126,7 +136,9 @@ FAULTS: list[tuple[str, Callable | None, str]] = [
 ]
 
 
-def damaged(cameras: dict[str, Camera], change: Callable | None, which: str) -> set[str]:
+def damaged(
+    cameras: dict[str, Camera], change: Callable | None, which: str
+) -> set[str]:
     """Introduces a fault in place and returns the names of the cameras that have it."""
     names = sorted(cameras)
     if change is None:
@@ -157,7 +169,9 @@ def verdict(root: Path, known: set[Finding], names: set[str], *, every: bool) ->
     level = next((x for x in LEVELS if any(f.level == x for f in new)), None)
     if level is None:
         return "**not found**"
-    named = every or any(name in f.sentence for f in new if f.level == level for name in names)
+    named = every or any(
+        name in f.sentence for f in new if f.level == level for name in names
+    )
     return level if named else f"{level}, unnamed"
 
 
@@ -171,7 +185,9 @@ def column(capture: Path) -> list[str]:
         root = Path(shutil.copytree(capture, Path(folder) / capture.name))
 
         def write(cameras: dict[str, Camera]) -> None:
-            entries = {n: {k: v.tolist() for k, v in c.items()} for n, c in cameras.items()}
+            entries = {
+                n: {k: v.tolist() for k, v in c.items()} for n, c in cameras.items()
+            }
             (root / "cameras.json").write_text(json.dumps(entries))
 
         write(rig)
@@ -191,7 +207,9 @@ def main(captures: list[Path]) -> None:
     print("|---" * (2 + len(captures)) + "|")
     columns = [column(path) for path in captures]
     for (fault, change, which), *cells in zip(FAULTS, *columns, strict=True):
-        print(f"| {fault} | {'a pair' if change is None else which} | {' | '.join(cells)} |")
+        print(
+            f"| {fault} | {'a pair' if change is None else which} | {' | '.join(cells)} |"
+        )
 
 
 if __name__ == "__main__":

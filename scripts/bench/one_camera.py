@@ -94,7 +94,13 @@ def film(scene: Path, folder: Path, landmarks: str) -> SimpleNamespace:
         (folder / "landmarks").mkdir(exist_ok=True)
         number, world = np.arange(len(px)), world_landmarks(own)
         faces = np.ones(len(px), int)
-        arrays = {"px": px, "conf": conf, "frame_id": number, "world": world, "faces": faces}
+        arrays = {
+            "px": px,
+            "conf": conf,
+            "frame_id": number,
+            "world": world,
+            "faces": faces,
+        }
         np.savez(folder / "landmarks" / f"{NAME}.npz", **arrays)
     return camera
 
@@ -108,7 +114,9 @@ def similarity(p, truth, scaled: bool):
     return s, A, truth.mean(0) - s * A @ p.mean(0)
 
 
-def join(scene: Path, capture: Path, folder: Path, own: str, camera: SimpleNamespace) -> list[int]:
+def join(
+    scene: Path, capture: Path, folder: Path, own: str, camera: SimpleNamespace
+) -> list[int]:
     """The capture with the scene's cameras but the video's in its world; returns its frames.
 
     A second one beside it, ``true``, has the scene's landmarks.
@@ -120,9 +128,13 @@ def join(scene: Path, capture: Path, folder: Path, own: str, camera: SimpleNames
     for scaled in (False, True):
         s, A, b = similarity(p[seen], truth[seen], scaled)
         error = 1000 * np.linalg.norm(s * p[seen] @ A.T + b - truth[seen], axis=-1)
-        print(f"landmarks, {'with scale' if scaled else 'rigid'}: {np.median(error):.1f} mm")
+        print(
+            f"landmarks, {'with scale' if scaled else 'rigid'}: {np.median(error):.1f} mm"
+        )
     focal = read_cameras(capture)[NAME].K[0, 0] / camera.K[0, 0]
-    print(f"focal length: {100 * (focal - 1):+.1f} %; {len(frames)} frames; scale {s:.3f}")
+    print(
+        f"focal length: {100 * (focal - 1):+.1f} %; {len(frames)} frames; scale {s:.3f}"
+    )
     true = folder.with_name("true")
     for old in (folder, true):
         shutil.rmtree(old, ignore_errors=True)
@@ -164,7 +176,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--avatar", default="polo")
     parser.add_argument("--motion", default="choreography")
-    parser.add_argument("--landmarks", default="exact", choices=("exact", "noise", "mediapipe"))
+    parser.add_argument(
+        "--landmarks", default="exact", choices=("exact", "noise", "mediapipe")
+    )
     parser.add_argument("--frames", type=int, default=168)
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--rays", type=int, default=4)
@@ -178,7 +192,9 @@ def main() -> None:
         scene, name, given.landmarks = given.rig, given.video.stem, "mediapipe"
         camera = read_cameras(scene)[name]
         width = cv2.VideoCapture(str(given.video)).get(cv2.CAP_PROP_FRAME_WIDTH)
-        camera.K[:2] *= width / json.loads((scene / "cameras.json").read_text())[name]["size"][0]
+        camera.K[:2] *= (
+            width / json.loads((scene / "cameras.json").read_text())[name]["size"][0]
+        )
         video = folder / f"{NAME}{given.video.suffix}"
         shutil.copyfile(given.video, video)
     else:
@@ -202,7 +218,11 @@ def main() -> None:
         run("gsgan.prepare", f"source={video}", f"out={capture}", *detector)
     prepared = time.monotonic()
     frames = join(scene, capture, folder / "joined", name, camera)
-    held = json.loads((scene / "meta.json").read_text()).get("splits", {}).get("test_frames")
+    held = (
+        json.loads((scene / "meta.json").read_text())
+        .get("splits", {})
+        .get("test_frames")
+    )
     held = [f for f in held if f in frames] if held else frames[2::4]
     others = list(read_cameras(folder / "joined"))[1:]
     splits = [f"data.train_cameras=[{NAME}]", f"data.test_cameras=[{','.join(others)}]"]

@@ -25,7 +25,14 @@ from gsgan.bench.common import NOTHING, check_whole, markdown, number, sentence
 from gsgan.body.free import free_body
 from gsgan.scene import Camera, Gaussians, Raster
 from gsgan.skeleton import MEDIAPIPE33, Densify
-from gsgan.splat import BACKENDS, Accuracy, project, rasterise, reference, resolve_backend
+from gsgan.splat import (
+    BACKENDS,
+    Accuracy,
+    project,
+    rasterise,
+    reference,
+    resolve_backend,
+)
 from gsgan.synthetic.camera import look_at
 
 # The reference holds every Gaussian at every pixel: others are compared with it, it is not timed.
@@ -71,11 +78,17 @@ def run(config: DictConfig, folder: Path) -> None:
             progress.update(task, description=f"N={n} C={channels} {size}²")
             found = variants(config, settings, n, bench.device)
             cell = {"gaussians": n, "channels": channels, "size": size}
-            rows += [cell | row for row in measure(config, n, channels, size, found, bench.device)]
+            rows += [
+                cell | row
+                for row in measure(config, n, channels, size, found, bench.device)
+            ]
             progress.advance(task)
     frame = pd.DataFrame(rows)
     text = f"{sentence(bench.where)}. Medians of interleaved runs.\n\n{table(frame)}"
-    record = {"bench": OmegaConf.to_container(config), "rows": bench_common.records(frame)}
+    record = {
+        "bench": OmegaConf.to_container(config),
+        "rows": bench_common.records(frame),
+    }
     bench.write("What accuracy costs in time", text, record, frame)
 
 
@@ -101,31 +114,48 @@ def measure(
     device: torch.device,
 ) -> list[dict[str, Any]]:
     """A row per variant in one scene: medians of milliseconds, and errors for few Gaussians."""
-    gaussians, camera = human_cloud(n, channels, config.seed).to(device), make_camera(size)
+    gaussians, camera = (
+        human_cloud(n, channels, config.seed).to(device),
+        make_camera(size),
+    )
     camera, inputs = camera.to(device), leaves(gaussians)
     actions: dict[tuple[int, str], Callable[[], object]] = {}
     for i, variant in enumerate(found):
-        actions[i, "forward"] = partial(torch.no_grad()(draw), gaussians, camera, variant)
+        actions[i, "forward"] = partial(
+            torch.no_grad()(draw), gaussians, camera, variant
+        )
         actions[i, "both"] = partial(draw_both, inputs, camera, variant)
-    samples = interleaved(actions, config.repeats, patience=config.patience, device=device)
+    samples = interleaved(
+        actions, config.repeats, patience=config.patience, device=device
+    )
     rows: list[dict[str, Any]] = [
         {"backend": backend, "setting": setting.name}
         | {f"{kind}_ms": median(samples[i, kind]) for kind in ("forward", "both")}
         for i, (backend, setting) in enumerate(found)
     ]
     if n <= config.compare_upto:
-        corners = choose_windows(gaussians, camera, config.windows, config.window, config.seed)
+        corners = choose_windows(
+            gaussians, camera, config.windows, config.window, config.seed
+        )
         exact = partial(draw_windows, corners=corners, side=config.window)
-        truth = values_and_gradients(gaussians.to(torch.float64), camera, exact, config.seed)
+        truth = values_and_gradients(
+            gaussians.to(torch.float64), camera, exact, config.seed
+        )
         for row, variant in zip(rows, found, strict=True):
 
-            def cut(g: Gaussians, c: Camera, variant: Variant = variant) -> list[Tensor]:
+            def cut(
+                g: Gaussians, c: Camera, variant: Variant = variant
+            ) -> list[Tensor]:
                 raster = draw(g, c, variant)
                 image = torch.cat([raster.features, raster.alpha], dim=1)[0]
                 side = config.window
-                return [image[:, t : t + side, left : left + side] for t, left in corners]
+                return [
+                    image[:, t : t + side, left : left + side] for t, left in corners
+                ]
 
-            row |= errors(truth, values_and_gradients(gaussians, camera, cut, config.seed))
+            row |= errors(
+                truth, values_and_gradients(gaussians, camera, cut, config.seed)
+            )
     return rows
 
 
@@ -158,7 +188,9 @@ def choose_windows(
     pairs = zip(y[seen].tolist(), x[seen].tolist(), strict=True)
     cells = sorted({(int(row // side), int(column // side)) for row, column in pairs})
     order = torch.randperm(len(cells), generator=torch.Generator().manual_seed(seed))
-    return sorted((cells[i][0] * side, cells[i][1] * side) for i in order[:count].tolist())
+    return sorted(
+        (cells[i][0] * side, cells[i][1] * side) for i in order[:count].tolist()
+    )
 
 
 def draw_windows(
@@ -169,7 +201,9 @@ def draw_windows(
     projected = project(gaussians, camera.to(torch.float64), settings)
     images = []
     for top, left in corners:
-        moved = replace(projected, means=projected.means - projected.means.new_tensor([left, top]))
+        moved = replace(
+            projected, means=projected.means - projected.means.new_tensor([left, top])
+        )
         features, alpha = reference.composite(moved, (side, side), settings)
         images.append(torch.cat([features, alpha], dim=1)[0])
     return images
@@ -200,7 +234,11 @@ def errors(
         float((got[1][name] - g).norm() / g.norm().clamp_min(1e-300))
         for name, g in truth[1].items()
     ]
-    return {"value_max": float(off.max()), "value_mean": float(off.mean()), "gradient": max(norms)}
+    return {
+        "value_max": float(off.max()),
+        "value_mean": float(off.mean()),
+        "gradient": max(norms),
+    }
 
 
 def table(frame: pd.DataFrame) -> str:
@@ -210,7 +248,9 @@ def table(frame: pd.DataFrame) -> str:
     shown = shown.join(frame[["backend", "setting"]])
     for column, (heading, digits) in NUMBERS.items():
         known = column in frame
-        shown[heading] = [number(v, digits) for v in frame[column]] if known else NOTHING
+        shown[heading] = (
+            [number(v, digits) for v in frame[column]] if known else NOTHING
+        )
     return markdown(shown)
 
 

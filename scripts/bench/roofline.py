@@ -20,7 +20,14 @@ from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import flop_registry
 
 from gsgan.bench.common import NOTHING, check_whole, markdown, number, sentence
-from gsgan.bench.speed import REST, TOTAL, load_subject, make_painter, measure, without_denormals
+from gsgan.bench.speed import (
+    REST,
+    TOTAL,
+    load_subject,
+    make_painter,
+    measure,
+    without_denormals,
+)
 from gsgan.model.avatar import Avatar, unwatched
 from gsgan.scene import Camera, Frame, Gaussians
 from gsgan.splat import Accuracy
@@ -51,7 +58,9 @@ def run(config: DictConfig, folder: Path) -> None:
         avatar, frames, _, _ = load_subject(speed, bench.device)
         with without_denormals():
             painter = make_painter(avatar)
-            times = measure(avatar, painter, frames, count=config.frames, warmup=config.warmup)
+            times = measure(
+                avatar, painter, frames, count=config.frames, warmup=config.warmup
+            )
             work = [stage_work(avatar, frame) for frame in frames]
         mean = pd.concat(work).groupby(level=0, sort=False).mean()
         tables.append(against(mean, times["median"].drop(REST), peak).assign(size=size))
@@ -66,7 +75,9 @@ def peaks(device: torch.device) -> dict[str, float]:
     source = torch.rand(COPIED // 4, device=device)
     copy = torch.empty_like(source)
     actions = {"GFLOP/s": lambda: a @ b, "GB/s": lambda: copy.copy_(source)}
-    best = {name: min(ms) for name, ms in interleaved(actions, 10, device=device).items()}
+    best = {
+        name: min(ms) for name, ms in interleaved(actions, 10, device=device).items()
+    }
     work = {"GFLOP/s": 2 * SIDE**3, "GB/s": 2 * COPIED}
     return {name: work[name] / best[name] / 1e6 for name in work}
 
@@ -81,7 +92,9 @@ class Work(TorchDispatchMode):
         super().__init__()
         self.flop = self.bytes = 0.0
 
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
         out = func(*args, **(kwargs or {}))
         if (count := flop_registry.get(func.overloadpacket)) is not None:
             self.flop += count(*args, **(kwargs or {}), out_val=out)
@@ -109,7 +122,10 @@ def stage_work(avatar: Avatar, frame: Frame) -> pd.DataFrame:
             before = work.flop, work.bytes
             yield
             row = found.setdefault(name, [0.0, 0.0])
-            row[0], row[1] = row[0] + work.flop - before[0], row[1] + work.bytes - before[1]
+            row[0], row[1] = (
+                row[0] + work.flop - before[0],
+                row[1] + work.bytes - before[1],
+            )
 
         avatar.stage = stage  # type: ignore[method-assign]
         try:
@@ -130,7 +146,9 @@ def stage_work(avatar: Avatar, frame: Frame) -> pd.DataFrame:
     return pd.DataFrame.from_dict(found, orient="index", columns=["flop", "bytes"])
 
 
-def composited(gaussians: Gaussians, camera: Camera, accuracy: Accuracy) -> tuple[float, float]:
+def composited(
+    gaussians: Gaussians, camera: Camera, accuracy: Accuracy
+) -> tuple[float, float]:
     """Operations and bytes of compositing: every pixel of every visible ellipse, Gaussians read
     once, images written once. Pixels that fill up early make it an upper bound."""
     k, C = accuracy.supersample, gaussians.features.shape[-1]
@@ -139,7 +157,9 @@ def composited(gaussians: Gaussians, camera: Camera, accuracy: Accuracy) -> tupl
     reach = 2 * (p.opacities / max(accuracy.alpha_min, 1e-6)).clamp_min(1).log()
     area = math.pi * reach / (p.factors[..., 0] * p.factors[..., 2])
     pairs = float((area.clamp_max(size[0] * size[1]) * p.visible).sum())
-    moved = 4 * (C + 10) * p.opacities.numel() + 4 * (C + 1) * size[0] * size[1] * len(camera)
+    moved = 4 * (C + 10) * p.opacities.numel() + 4 * (C + 1) * size[0] * size[1] * len(
+        camera
+    )
     return pairs * (PER_PAIR + 2 * C), float(moved)
 
 

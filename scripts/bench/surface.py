@@ -59,7 +59,9 @@ def animation(character: Character, clip: str) -> Animation:
     return source.at(np.linspace(float(first), float(last), int(frames)))
 
 
-def truth(character: Character, clips: list[str], chosen: NDArray[np.int64]) -> tuple[Tensor, ...]:
+def truth(
+    character: Character, clips: list[str], chosen: NDArray[np.int64]
+) -> tuple[Tensor, ...]:
     """Landmarks ``[F, 75, 3]`` and chosen vertices ``[F, N, 3]`` of clips, metres."""
     marks, points = [], []
     for clip in clips:
@@ -85,7 +87,9 @@ class Bound:
         )
         self.nearest = apart.argmin(1)
         A, t = A[:, self.nearest], t[:, self.nearest]
-        self.rest = torch.linalg.solve(A, (points - t).unsqueeze(-1)).squeeze(-1).mean(0)
+        self.rest = (
+            torch.linalg.solve(A, (points - t).unsqueeze(-1)).squeeze(-1).mean(0)
+        )
 
     def error(self, pose: BodyPose, points: Tensor) -> Tensor:
         """``[F, N, 3]`` metres."""
@@ -97,7 +101,10 @@ class Bound:
 def parts(character: Character, chosen: NDArray[np.int64]) -> dict[str, Tensor]:
     """Which of the chosen vertices are of each part."""
     names = [character.bones[j] for j in character.dominant_bones()[chosen]]
-    of = [next((p for p, rule in PARTS.items() if re.fullmatch(rule, n)), "") for n in names]
+    of = [
+        next((p for p, rule in PARTS.items() if re.fullmatch(rule, n)), "")
+        for n in names
+    ]
     return {part: torch.tensor([o == part for o in of]) for part in PARTS if part in of}
 
 
@@ -117,7 +124,9 @@ def errors(
     shape = fit_hands(shape, Solver(shaped_body(shape)).solve(marks, seen), marks, seen)
     body = shaped_body(shape)
     solver = Solver(body)
-    pose = {name: solver.solve(p, torch.ones(p.shape[:2])) for name, (p, _) in found.items()}
+    pose = {
+        name: solver.solve(p, torch.ones(p.shape[:2])) for name, (p, _) in found.items()
+    }
     bound, table = Bound(body, pose["training"], points), {}
     for name, (p, x) in found.items():
         error = bound.error(pose[name], x)
@@ -135,7 +144,9 @@ def errors(
 def run(options: DictConfig, out: Path) -> None:
     torch.set_num_threads(1)
     character = load_character(options.avatar)
-    chosen = np.arange(0, len(character.vertices), -(-len(character.vertices) // options.points))
+    chosen = np.arange(
+        0, len(character.vertices), -(-len(character.vertices) // options.points)
+    )
     sets: dict[str, list[str]] = {"training": list(options.train)}
     for name, clip in (word.split("@") for word in options.test):
         sets.setdefault(name, []).append(clip)
@@ -143,7 +154,9 @@ def run(options: DictConfig, out: Path) -> None:
     table = errors(found, parts(character, chosen))
     rows = [f"| part | {' | '.join(table)} |", "|---" * (len(table) + 1) + "|"]
     for part in table["training"]:
-        rows.append(f"| {part} | {' | '.join(f'{t[part]:.1f}' for t in table.values())} |")
+        rows.append(
+            f"| {part} | {' | '.join(f'{t[part]:.1f}' for t in table.values())} |"
+        )
     print("\n".join(rows))
     out.mkdir(parents=True, exist_ok=True)
     (out / "surface.md").write_text("\n".join(rows) + "\n")

@@ -27,7 +27,9 @@ def regressed(X, Y, train, test) -> float:
     mean, Z = Y[train].mean(0), (X - X[train].mean(0)) / X[train].std(0).mean()
     K, errors = Z[train] @ Z[train].T, []
     for ridge in RIDGES:
-        W = np.linalg.solve(K + ridge * len(train) * np.eye(len(train)), Y[train] - mean)
+        W = np.linalg.solve(
+            K + ridge * len(train) * np.eye(len(train)), Y[train] - mean
+        )
         errors.append(rms(Y[test] - mean - Z[test] @ Z[train].T @ W))
     return min(errors)
 
@@ -36,7 +38,9 @@ def by_own_path(d, off, train, test) -> float:
     """The error where each point's sway is linear in its own moves ``d [F, N, 3, K]``."""
     left = []
     for i in range(off.shape[1]):
-        A = np.concatenate([d[:, i], np.tile(0.01 * np.eye(3), (len(d), 1, 1))], axis=-1)
+        A = np.concatenate(
+            [d[:, i], np.tile(0.01 * np.eye(3), (len(d), 1, 1))], axis=-1
+        )
         a, b = A[train].reshape(-1, A.shape[-1]), off[train, i].ravel()
         w = np.linalg.solve(a.T @ a + 1e-6 * np.eye(a.shape[1]), a.T @ b)
         left.append(A[test] @ w - off[test, i])
@@ -56,7 +60,9 @@ def main() -> None:
     points, off = [], []
     for f in range(len(t)):
         v, normals = scene._skinned(f)
-        moved, _, _ = scene.secondary(float(t[f]), scene.motion.rotations[f], v, normals)
+        moved, _, _ = scene.secondary(
+            float(t[f]), scene.motion.rotations[f], v, normals
+        )
         points.append(v)
         off.append(moved - v)
     loose = scene.secondary._loose[scene.secondary._weld]
@@ -87,7 +93,9 @@ def main() -> None:
         ]
         found = regressed(np.concatenate([pose, *steps], axis=1), Y, train, test)
         own = np.stack([surface(b) - points for b in past], axis=-1)
-        print(f"{name}: joints {found:.2f}, own path {by_own_path(own, sway, train, test):.2f}")
+        print(
+            f"{name}: joints {found:.2f}, own path {by_own_path(own, sway, train, test):.2f}"
+        )
 
 
 if __name__ == "__main__":

@@ -54,17 +54,34 @@ SCORES = "metrics.json"  # what a finished run has, beside its checkpoint
 SEED = "seed"
 IGNORED = re.compile(r"^(data\.(source\.)?workers|hydra\..*|trainer(\..*)?|grid_rows)$")
 # Of a run's data: how it is read and sampled, not what is in it.
-SAMPLING = ("seed", "steps_per_epoch", "workers", "cache_mb", "batch_size", "val_images")
+SAMPLING = (
+    "seed",
+    "steps_per_epoch",
+    "workers",
+    "cache_mb",
+    "batch_size",
+    "val_images",
+)
 # Metric: heading, digits, and 1 where more is better, -1 where less is.
 QUALITIES = {
     "psnr": ("PSNR dB", 2, 1),
     "ssim": ("SSIM", 4, 1),
     "edge_f1": ("edge F1", 3, 1),
     "lpips": ("LPIPS", 4, -1),
-    "far": ("far PSNR dB", 2, 1),  # of another capture of the person, where one is given
+    # of another capture of the person, where one is given
+    "far": ("far PSNR dB", 2, 1),
 }
 # The base point's first, then Okabe and Ito's, which are distinct with any colour vision.
-ORDER = ("#000000", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#777777")
+ORDER = (
+    "#000000",
+    "#0072b2",
+    "#d55e00",
+    "#009e73",
+    "#cc79a7",
+    "#e69f00",
+    "#56b4e9",
+    "#777777",
+)
 
 Score = Callable[[Tensor, Tensor], Tensor]
 
@@ -98,14 +115,21 @@ class Painter:
         """``[B, 3, H, W]`` I_pred in the frame's own size, float32."""
         way, size = self.way, frame.camera.size
         if way.scale != 1:
-            side = (max(1, round(size[0] * way.scale)), max(1, round(size[1] * way.scale)))
+            side = (
+                max(1, round(size[0] * way.scale)),
+                max(1, round(size[1] * way.scale)),
+            )
             frame = replace(frame, camera=frame.camera.resize(side))
         with changed(self.avatar, way):
             image = make_painter(self.avatar, way.precision, way.backend)(frame)
         if way.scale == 1:
             return image
         return functional.interpolate(
-            image, size=size, mode="bicubic", antialias=way.scale > 1, align_corners=False
+            image,
+            size=size,
+            mode="bicubic",
+            antialias=way.scale > 1,
+            align_corners=False,
         )
 
 
@@ -113,8 +137,11 @@ class Painter:
 def changed(avatar: Avatar, way: Way) -> Iterator[None]:
     """Gives the avatar the accuracy and window of a way, and restores its own afterwards."""
     before = avatar.accuracy, avatar.window_margin
-    if way.accuracy is not None:  # how pixels are formed belongs to the model, not to the preset
-        formed = {k: getattr(before[0], k) for k in ("low_pass", "supersample", "antialias")}
+    # how pixels are formed belongs to the model, not to the preset
+    if way.accuracy is not None:
+        formed = {
+            k: getattr(before[0], k) for k in ("low_pass", "supersample", "antialias")
+        }
         avatar.accuracy = replace(way.accuracy, **formed)
     avatar.window_margin = None if way.whole else avatar.window_margin
     try:
@@ -159,7 +186,9 @@ def run(config: DictConfig, folder: Path) -> None:
     painters, frames, far, marks = load(points, config, bench)
     found, samples = measure(points, painters, frames, far, perceptual, config, bench)
     checkpoints = {p.folder: read_checkpoint(p.folder / CHECKPOINT) for p in runs}
-    seconds = {folder: held["gsgan"]["train_seconds"] for folder, held in checkpoints.items()}
+    seconds = {
+        folder: held["gsgan"]["train_seconds"] for folder, held in checkpoints.items()
+    }
     frame = make_rows(points, found, samples, seconds)
     about = {"split": config.split, "images": len(frames), "subject": subject.name}
     page = text(frame, config.quality, about, bench.where, marks)
@@ -178,14 +207,18 @@ def run(config: DictConfig, folder: Path) -> None:
 def trained(config: DictConfig, bench: bench_common.Bench) -> list[Point]:
     """The runs to compare: those of ``runs``, or the one of ``run``."""
     if (config.run is None) == (config.runs is None):
-        raise ConfigError("give either run=<a trained run> or runs=<the folder of a multirun>")
+        raise ConfigError(
+            "give either run=<a trained run> or runs=<the folder of a multirun>"
+        )
     for key in ("run", "runs"):
         if not isinstance(config[key], str | None):
             raise ConfigError(f"{key} must be one folder, got {config[key]!r}")
     if config.runs is not None:
         finished, unfinished = runs_in(Path(config.runs).expanduser())
         for name in unfinished:
-            bench.console.print(f"left out, not finished: {name}", markup=False, highlight=False)
+            bench.console.print(
+                f"left out, not finished: {name}", markup=False, highlight=False
+            )
         return finished
     return [Point(BASE, "as trained", Path(config.run).expanduser())]
 
@@ -193,7 +226,8 @@ def trained(config: DictConfig, bench: bench_common.Bench) -> list[Point]:
 def runs_in(folder: Path) -> tuple[list[Point], list[str]]:
     """The finished runs of a multirun, named by the overrides that differ; names of the others."""
     runs = sorted(path.parents[1] for path in folder.glob(f"*/{CHECKPOINT}"))
-    finished = [run for run in runs if (run / SCORES).is_file()]  # else still training, or cut off
+    # else still training, or cut off
+    finished = [run for run in runs if (run / SCORES).is_file()]
     if not finished:
         raise DataError(
             f"runs={folder}: no finished run in it (*/{CHECKPOINT} with {SCORES} beside); give the "
@@ -225,13 +259,19 @@ def standard_run(runs: Sequence[Point]) -> Point:
 def ways(folder: Path, settings: Mapping[str, Any]) -> list[Point]:
     """One avatar in every other way that the settings list, one change at a time."""
     make: dict[str, Callable[[Any], tuple[str, str, Way]]] = {
-        "accuracies": lambda name: ("accuracy", name, Way(accuracy=bench_common.preset(name))),
+        "accuracies": lambda name: (
+            "accuracy",
+            name,
+            Way(accuracy=bench_common.preset(name)),
+        ),
         "precisions": lambda name: ("precision", name, Way(precision=name)),
         "scales": lambda scale: ("image size", f"× {scale}", Way(scale=scale)),
         "backends": lambda name: ("backend", name, Way(backend=name)),
         "windows": lambda _: ("window", "whole image", Way(whole=True)),
     }
-    found = [one(value) for name, one in make.items() for value in settings.get(name, ())]
+    found = [
+        one(value) for name, one in make.items() for value in settings.get(name, ())
+    ]
     return [Point(factor, label, folder, way) for factor, label, way in found]
 
 
@@ -261,7 +301,10 @@ def load(
         marks |= dict.fromkeys(found)
 
     def shown(data: GsganData) -> list[Frame]:
-        return [frame.to(bench.device) for frame in spread(data, config.images, config.split)]
+        return [
+            frame.to(bench.device)
+            for frame in spread(data, config.images, config.split)
+        ]
 
     elsewhere = DataPaths(config.far_root, config.data_smpl)
     far = shown(build_data(load_config(first, elsewhere))) if config.far_root else []
@@ -316,7 +359,9 @@ def measure(
 
 
 def quality(
-    painter: Callable[[Frame], Tensor], frames: Sequence[Frame], perceptual: Score | None
+    painter: Callable[[Frame], Tensor],
+    frames: Sequence[Frame],
+    perceptual: Score | None,
 ) -> dict[str, Any]:
     """Mean scores over images, those without a finite score left out and counted; peak memory.
 
@@ -329,10 +374,23 @@ def quality(
     rows = []
     for frame in frames:
         image = painter(frame).clamp(0, 1)
-        rows.append({name: float(metric(image, frame.image)) for name, metric in metrics.items()})
+        rows.append(
+            {
+                name: float(metric(image, frame.image))
+                for name, metric in metrics.items()
+            }
+        )
     scores = pd.DataFrame(rows).replace([math.inf, -math.inf], math.nan)
-    memory = bench_common.painting_memory(painter, frames) if isinstance(painter, Painter) else None
-    return {**scores.mean(), "left_out": int(scores.isna().sum().sum()), "memory_mb": memory}
+    memory = (
+        bench_common.painting_memory(painter, frames)
+        if isinstance(painter, Painter)
+        else None
+    )
+    return {
+        **scores.mean(),
+        "left_out": int(scores.isna().sum().sum()),
+        "memory_mb": memory,
+    }
 
 
 def make_rows(
@@ -390,7 +448,9 @@ def text(
     if frame.lpips.isna().all():
         notes.append("LPIPS n/a: left out by lpips.net")
     if frame.left_out.any():
-        notes.append(f"{frame.left_out.sum()} scores were not finite and are not in the means")
+        notes.append(
+            f"{frame.left_out.sum()} scores were not finite and are not in the means"
+        )
     heading = (
         f"{about['images']} images of {about['split']}; settings changed on {about['subject']}; "
         f"one image at a time. Front: nothing is as fast and scores as much "
@@ -406,7 +466,9 @@ def table(frame: pd.DataFrame, metric: str) -> str:
     shown = pd.DataFrame({"changed": frame.factor, "to": frame.label + seeds})
     for name, (heading, digits, _) in QUALITIES.items():
         if frame[name].notna().any():
-            shown[heading] = [NOTHING if pd.isna(v) else f"{v:.{digits}f}" for v in frame[name]]
+            shown[heading] = [
+                NOTHING if pd.isna(v) else f"{v:.{digits}f}" for v in frame[name]
+            ]
     shown["ms per frame"] = frame.ms.map(number)
     shown["10–90 %"] = frame.p10.map(number) + "–" + frame.p90.map(number)
     shown["peak MB"] = frame.memory_mb.map(number)
@@ -440,12 +502,29 @@ def plot(frame: pd.DataFrame, metrics: Sequence[str]) -> bytes:
         heading, _, sign = QUALITIES[metric]
         ahead = frame.iloc[front(frame, metric)]
         label = "front: nothing beats these"
-        axes.step(ahead.ms, ahead[metric], "#999999", where="post", lw=1.2, zorder=1, label=label)
+        axes.step(
+            ahead.ms,
+            ahead[metric],
+            "#999999",
+            where="post",
+            lw=1.2,
+            zorder=1,
+            label=label,
+        )
         for i, (factor, own) in enumerate(frame.groupby("factor", sort=False)):
             whiskers = [own.ms - own.p10, own.p90 - own.ms]
-            mark, colour = MARKERS[i % len(MARKERS)] if i else "*", ORDER[i % len(ORDER)]
+            mark, colour = (
+                MARKERS[i % len(MARKERS)] if i else "*",
+                ORDER[i % len(ORDER)],
+            )
             axes.errorbar(
-                own.ms, own[metric], xerr=whiskers, fmt=mark, color=colour, label=factor, ms=8
+                own.ms,
+                own[metric],
+                xerr=whiskers,
+                fmt=mark,
+                color=colour,
+                label=factor,
+                ms=8,
             )
         axes.set(xscale="log", xlabel="milliseconds per frame (whiskers: deciles)")
         axes.set_ylabel(f"{heading}, {'higher' if sign > 0 else 'lower'} is better")
@@ -456,7 +535,9 @@ def plot(frame: pd.DataFrame, metrics: Sequence[str]) -> bytes:
         for i, (ms, score, label) in enumerate(labels(frame, metric)):
             blank = "\n" * (1 + i // 2 % 2)  # neighbours are written at four heights
             va = ("bottom", "top")[i % 2]
-            axes.text(ms, score, f"{blank}{label}{blank}", ha="center", va=va, fontsize=7.5)
+            axes.text(
+                ms, score, f"{blank}{label}{blank}", ha="center", va=va, fontsize=7.5
+            )
     shown = all_axes[0].get_legend_handles_labels()
     figure.legend(*shown, loc="outside lower center", ncols=6, frameon=False)
     return bench_common.png(figure)

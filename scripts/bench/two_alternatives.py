@@ -27,7 +27,13 @@ from torch.nn import functional
 
 from gsgan.model.stored import DataPaths
 from gsgan.report.figures.run import most_disputed
-from gsgan.report.figures.subjects import Shot, Subject, choose_items, make_shots, open_subjects
+from gsgan.report.figures.subjects import (
+    Shot,
+    Subject,
+    choose_items,
+    make_shots,
+    open_subjects,
+)
 
 MARGIN = 0.1  # metres beyond the joints that the images show
 SHARE = 0.3  # of their sides that a crop shows
@@ -57,8 +63,12 @@ def row(number: int, images: list[np.ndarray]) -> np.ndarray:
     """Crops side by side with the pair's number."""
     gap = np.full((HEIGHT, GAP, 3), 255, np.uint8)
     strip = np.hstack([x for image in images for x in (gap, image)])
-    page = Image.fromarray(np.vstack([np.full((20, strip.shape[1], 3), 255, np.uint8), strip]))
-    ImageDraw.Draw(page).text((GAP, 4), f"{number}      left | truth | right", fill=(0, 0, 0))
+    page = Image.fromarray(
+        np.vstack([np.full((20, strip.shape[1], 3), 255, np.uint8), strip])
+    )
+    ImageDraw.Draw(page).text(
+        (GAP, 4), f"{number}      left | truth | right", fill=(0, 0, 0)
+    )
     return np.asarray(page)
 
 
@@ -76,10 +86,15 @@ def draw(folder: Path, runs: list[Path], pairs: int, split: str, seed: int) -> N
         b = step_one(first, shot) if len(runs) == 1 else second.image(shot)
         box = most_disputed(torch.cat([a, b]), SHARE)
         left, right = (b, a) if swap else (a, b)
-        rows.append(row(number, [magnified(x[..., *box]) for x in (left, shot.truth, right)]))
+        rows.append(
+            row(number, [magnified(x[..., *box]) for x in (left, shot.truth, right)])
+        )
     folder.mkdir(parents=True, exist_ok=True)
     width = max(x.shape[1] for x in rows)
-    rows = [np.pad(x, ((0, 0), (0, width - x.shape[1]), (0, 0)), constant_values=255) for x in rows]
+    rows = [
+        np.pad(x, ((0, 0), (0, width - x.shape[1]), (0, 0)), constant_values=255)
+        for x in rows
+    ]
     for page in range(0, len(rows), ROWS):
         name = folder / f"page_{page // ROWS + 1:02d}.png"
         Image.fromarray(np.vstack(rows[page : page + ROWS])).save(name)
@@ -90,19 +105,25 @@ def draw(folder: Path, runs: list[Path], pairs: int, split: str, seed: int) -> N
 def count(folder: Path, answers: Path) -> None:
     """Prints how often each was chosen twice, and the chance of that if they were equal."""
     order = json.loads((folder / "order.json").read_text())
-    lines = dict(line.split() for line in answers.read_text().splitlines() if line.strip())
+    lines = dict(
+        line.split() for line in answers.read_text().splitlines() if line.strip()
+    )
     rows = {str(i): place for i, place in enumerate(order["rows"], 1)}
     if set(lines) != set(rows) or not set(lines.values()) <= set(NAMES):
         raise SystemExit(f"{answers}: expected lines '1 left' to '{len(rows)} equal'")
     chosen: dict[int, set[int | None]] = {}
     for number, place in rows.items():
         side = NAMES.index(lines[number])
-        chosen.setdefault(place // 2, set()).add(None if side == 2 else side ^ place % 2)
+        chosen.setdefault(place // 2, set()).add(
+            None if side == 2 else side ^ place % 2
+        )
     wins = [sum(found == {run} for found in chosen.values()) for run in (0, 1)]
     for name, won in zip(order["runs"], wins, strict=True):
         print(f"{name}: {won} of {len(chosen)}")
     undecided = len(chosen) - sum(wins)
-    print(f"undecided: {undecided}; p = {binomtest(wins[0], sum(wins) or 1).pvalue:.2g}")
+    print(
+        f"undecided: {undecided}; p = {binomtest(wins[0], sum(wins) or 1).pvalue:.2g}"
+    )
 
 
 if __name__ == "__main__":

@@ -36,10 +36,16 @@ RIM = 0.999  # share of a lens's fold radius: points beyond it are shown there
 
 def _check(owner: str, name: str, value: Tensor, *shape: int | None) -> None:
     if not isinstance(value, Tensor):
-        raise ValueError(f"{owner}: {name} must be a tensor, got {type(value).__name__}")
-    expected = [("B", "N", "C")[i] if size is None else str(size) for i, size in enumerate(shape)]
+        raise ValueError(
+            f"{owner}: {name} must be a tensor, got {type(value).__name__}"
+        )
+    expected = [
+        ("B", "N", "C")[i] if size is None else str(size)
+        for i, size in enumerate(shape)
+    ]
     if value.ndim != len(shape) or any(
-        size is not None and size != got for size, got in zip(shape, value.shape, strict=True)
+        size is not None and size != got
+        for size, got in zip(shape, value.shape, strict=True)
     ):
         raise ValueError(
             f"{owner}: {name} must have shape [{', '.join(expected)}], got {list(value.shape)}"
@@ -75,7 +81,9 @@ class Camera(TensorRecord):
         _check("Camera", "t", self.t, None, 3)
         if self.dist is not None:
             _check("Camera", "dist", self.dist, None, 5)
-        batches = {v.shape[0] for v in (self.K, self.R, self.t, self.dist) if v is not None}
+        batches = {
+            v.shape[0] for v in (self.K, self.R, self.t, self.dist) if v is not None
+        }
         if len(batches) != 1:
             raise ValueError(
                 f"Camera: K, R, t and dist must share one batch size, got {len(self.K)}, "
@@ -110,14 +118,19 @@ class Camera(TensorRecord):
         x_cam = self.to_camera(points)
         depth = x_cam[..., 2]
         xy1 = x_cam / depth.clamp_min(near).unsqueeze(-1)
-        xy = xy1[..., :2] if self.dist is None else distort_within(xy1[..., :2], self.dist)
+        xy = (
+            xy1[..., :2]
+            if self.dist is None
+            else distort_within(xy1[..., :2], self.dist)
+        )
         xy1 = torch.cat([xy, torch.ones_like(xy[..., :1])], dim=-1)
         return (xy1 @ self.K.mT)[..., :2], depth
 
     def crop(self, top: int, left: int, size: tuple[int, int]) -> Camera:
         """The camera of a window ``size = (H, W)`` whose corner is pixel (top, left)."""
         shift = torch.zeros_like(self.K)
-        shift[:, 0, 2], shift[:, 1, 2] = left, top
+        shift[:, 0, 2] = left
+        shift[:, 1, 2] = top
         return replace(self, K=self.K - shift, size=size)
 
     def resize(self, size: tuple[int, int]) -> Camera:
@@ -158,7 +171,9 @@ class Gaussians(TensorRecord):
         if self.covariances is not None:
             _check("Gaussians", "covariances", self.covariances, B, N, 3, 3)
         elif self.quats is None or self.scales is None:
-            raise ValueError("Gaussians: give quats and scales, or covariances; got neither whole")
+            raise ValueError(
+                "Gaussians: give quats and scales, or covariances; got neither whole"
+            )
         if self.quats is not None:
             _check("Gaussians", "quats", self.quats, B, N, 4)
         if self.scales is not None:
@@ -166,7 +181,9 @@ class Gaussians(TensorRecord):
         _check("Gaussians", "opacities", self.opacities, B, N)
         _check("Gaussians", "features", self.features, B, N, None)
         if self.features.shape[-1] < 1:
-            raise ValueError("Gaussians: features must have at least one channel, got 0")
+            raise ValueError(
+                "Gaussians: features must have at least one channel, got 0"
+            )
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -276,8 +293,11 @@ class Window:
         """The cameras of the boxes."""
         shift = torch.zeros_like(camera.K)
         for i, (top, left) in enumerate(self.corners):
-            shift[i, 0, 2], shift[i, 1, 2] = left, top
-        return replace(camera, K=camera.K - shift, size=self.size, whole_height=self.whole[0])
+            shift[i, 0, 2] = left
+            shift[i, 1, 2] = top
+        return replace(
+            camera, K=camera.K - shift, size=self.size, whole_height=self.whole[0]
+        )
 
     def cut(self, images: Tensor) -> Tensor:
         """``[B, ..., H, W]`` reduced to the boxes."""
@@ -336,13 +356,22 @@ def body_window(
     high = (pixels + reach).amax(dim=1).ceil()
     everywhere = constant((width, height), low)
     behind = (depth < near).any(dim=1, keepdim=True)
-    low = torch.where(behind, torch.zeros_like(low), low).clamp_min(0).minimum(everywhere - 1)
-    high = torch.where(behind, everywhere.expand_as(high), high).clamp_min(1).minimum(everywhere)
+    low = (
+        torch.where(behind, torch.zeros_like(low), low)
+        .clamp_min(0)
+        .minimum(everywhere - 1)
+    )
+    high = (
+        torch.where(behind, everywhere.expand_as(high), high)
+        .clamp_min(1)
+        .minimum(everywhere)
+    )
     bounds = torch.cat([low, high], dim=-1).long().tolist()
     w = _side(max(least, *(x1 - x0 for x0, _, x1, _ in bounds)), multiple, width)
     h = _side(max(least, *(y1 - y0 for _, y0, _, y1 in bounds)), multiple, height)
     corners = tuple(
-        (_start(y0, y1, h, height), _start(x0, x1, w, width)) for x0, y0, x1, y1 in bounds
+        (_start(y0, y1, h, height), _start(x0, x1, w, width))
+        for x0, y0, x1, y1 in bounds
     )
     return Window(corners, (h, w), (height, width))
 
@@ -400,7 +429,8 @@ def fold_radius(dist: Tensor) -> Tensor:
     if dist.requires_grad or torch.compiler.is_compiling():
         return _fold_radius(dist)
     if (found := _folds.get(dist)) is None:
-        with torch.inference_mode(False), torch.no_grad():  # else of no use in training later
+        # else of no use in training later
+        with torch.inference_mode(False), torch.no_grad():
             found = _folds[dist] = _fold_radius(dist)
     return found
 

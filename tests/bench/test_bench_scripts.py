@@ -15,8 +15,17 @@ from gsgan.utils.errors import GsganError
 
 SCRIPTS = ROOT / "scripts" / "bench"
 SCENE = [
-    *("size=tiny", "data.source.frames=2", "data.source.test_frames=1", "data.body=none"),
-    *("data.source.train_cameras=2", "data.source.test_cameras=1", "data.source.rays_per_pixel=1"),
+    *(
+        "size=tiny",
+        "data.source.frames=2",
+        "data.source.test_frames=1",
+        "data.body=none",
+    ),
+    *(
+        "data.source.train_cameras=2",
+        "data.source.test_cameras=1",
+        "data.source.rays_per_pixel=1",
+    ),
 ]
 
 
@@ -45,7 +54,13 @@ def read(folder: Path, name: str) -> dict:
 def test_raster_measures_time_and_error(script, tmp_path):
     page = tmp_path / "page.md"
     page.write_text("<!-- bench:raster -->\nold\n<!-- end -->\n")
-    grid = ["gaussians=[300]", "channels=[3]", "sizes=[64]", "exact_upto.torch=300", "repeats=1"]
+    grid = [
+        "gaussians=[300]",
+        "channels=[3]",
+        "sizes=[64]",
+        "exact_upto.torch=300",
+        "repeats=1",
+    ]
     assert not script("raster", *grid, "windows=2", "window=16", f"docs={page}")
     rows = pd.DataFrame(read(tmp_path, "raster")["rows"]).query("backend == 'torch'")
     worst = rows.set_index("setting").value_max
@@ -76,14 +91,30 @@ def test_trade_off_compares_a_multirun(script, tmp_path, run, capture):
         shutil.copytree(run, tmp_path / "sweep" / name)
     words = tmp_path / "sweep" / "two" / ".hydra" / "overrides.yaml"
     words.write_text(words.read_text() + "- twist=odd\n")
-    given = [f"runs={tmp_path / 'sweep'}", "repeats=1", "images=1", "settings.scales=[0.5]"]
+    given = [
+        f"runs={tmp_path / 'sweep'}",
+        "repeats=1",
+        "images=1",
+        "settings.scales=[0.5]",
+    ]
     given.append(f"far_root={capture}")
-    given += ["settings.accuracies=[draft]", "settings.backends=[]", "settings.precisions=[]"]
+    given += [
+        "settings.accuracies=[draft]",
+        "settings.backends=[]",
+        "settings.precisions=[]",
+    ]
     assert not script("trade_off", *given)
     found = read(tmp_path, "trade_off")["rows"]
-    assert [row["label"] for row in found] == ["base", "odd", "draft", "× 0.5", "whole image"]
+    assert [row["label"] for row in found] == [
+        "base",
+        "odd",
+        "draft",
+        "× 0.5",
+        "whole image",
+    ]
     assert all(row["psnr"] > 5 and row["ms"] > 0 for row in found)
-    assert all(row["far"] == pytest.approx(row["psnr"]) for row in found)  # the same capture
+    # the same capture
+    assert all(row["far"] == pytest.approx(row["psnr"]) for row in found)
     assert (tmp_path / "out" / "trade_off.png").is_file()
     assert "give either run=" in script("trade_off")
     assert "is not in struct" in script("trade_off", "colour=1")
@@ -112,21 +143,34 @@ def test_a_failed_training_is_reported_with_its_last_line(script, tmp_path):
     assert script("raster", "repeats=0")
     import bench_common
 
-    with pytest.raises(GsganError, match=r"^training one failed: .* \(see .*one\.log\)$"):
+    with pytest.raises(
+        GsganError, match=r"^training one failed: .* \(see .*one\.log\)$"
+    ):
         bench_common.train(["size=nosuch"], tmp_path / "runs" / "one")
     assert "nosuch" in (tmp_path / "runs" / "one.log").read_text()
 
 
 def test_faults_are_found_in_a_capture(script, monkeypatch, capture, capsys):
     faults = __import__("faults")
-    kept = [row for row in faults.FAULTS if row[0] == "`t` in mm" or row[0].startswith("K of")][:3]
+    kept = [
+        row
+        for row in faults.FAULTS
+        if row[0] == "`t` in mm" or row[0].startswith("K of")
+    ][:3]
     monkeypatch.setattr(faults, "FAULTS", [*kept, ("nothing", lambda _: {}, "one")])
     faults.main([capture])
     rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines()[2:]]
-    assert [row[2].strip("| ") for row in rows] == ["error", "refused", "error", "**not found**"]
+    assert [row[2].strip("| ") for row in rows] == [
+        "error",
+        "refused",
+        "error",
+        "**not found**",
+    ]
 
 
-def test_a_two_alternative_test_counts_what_was_chosen(tmp_path, run, monkeypatch, capsys):
+def test_a_two_alternative_test_counts_what_was_chosen(
+    tmp_path, run, monkeypatch, capsys
+):
     def call(*words: str) -> None:
         monkeypatch.setattr(sys, "argv", ["two_alternatives", str(tmp_path), *words])
         runpy.run_path(str(SCRIPTS / "two_alternatives.py"), run_name="__main__")

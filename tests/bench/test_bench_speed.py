@@ -23,7 +23,9 @@ def small(build):
     data, avatar, frame = build()
     with torch.no_grad():  # a trained one: where the UNet paints and Gaussians differ
         for parameter in avatar.parameters():
-            parameter += 0.05 * torch.randn(parameter.shape, generator=torch.manual_seed(1))
+            parameter += 0.05 * torch.randn(
+                parameter.shape, generator=torch.manual_seed(1)
+            )
     return data, avatar.eval(), frame
 
 
@@ -36,7 +38,9 @@ def test_every_stage_is_timed_and_the_avatar_is_left_unwatched(small):
     _, avatar, frame = small
     ticks = []
     painter = make_painter(avatar)
-    times = measure(avatar, painter, [frame], count=3, warmup=2, tick=lambda: ticks.append(1))
+    times = measure(
+        avatar, painter, [frame], count=3, warmup=2, tick=lambda: ticks.append(1)
+    )
     assert list(times.index) == [*ALL, "between stages", "end to end"]
     assert len(ticks) == 5
     stages = times.loc[ALL]
@@ -71,7 +75,9 @@ def test_what_a_model_lacks_has_no_stage(build, model, absent, there):
 def test_batches_are_timed_per_image(small):
     *_, frame = small
     sizes = []
-    times = in_batches(lambda batch: sizes.append(len(batch)), [frame, frame], None, 3, 7)
+    times = in_batches(
+        lambda batch: sizes.append(len(batch)), [frame, frame], None, 3, 7
+    )
     assert sizes == [3, 3, 3]
     assert 0 < times["least"] <= times["median"]
 
@@ -127,7 +133,9 @@ def test_the_table_adds_up():
     }
     times = pd.DataFrame(rows, index=["median", "p10", "p90", "least"]).T
     settings = {"avatar": "untrained avatar", "image": "512 x 512"}
-    page = text(times, environment(torch.device("cpu")), settings, ["untrained weights"])
+    page = text(
+        times, environment(torch.device("cpu")), settings, ["untrained weights"]
+    )
     assert "| F | 6.00 | 5.00 | 7.00 | 4.00 | 60% |" in page
     assert "| **end to end** | 10.0 | 9.00 | 12.0 | 8.00 | 100.0 frames/s |" in page
     assert "- untrained weights" in page
@@ -144,16 +152,27 @@ def test_the_command_times_a_run(run, tmp_path, inside):
     assert found["settings"]["avatar"] == f"trained run {run.name}"
     assert found["settings"]["precision"] == "32-true"
     assert found["where"]["threads"] >= 1
-    assert 0 < found["times_ms"]["batches"]["least"] <= found["times_ms"]["batches"]["median"]
+    assert (
+        0
+        < found["times_ms"]["batches"]["least"]
+        <= found["times_ms"]["batches"]["median"]
+    )
     page = (out / "speed.md").read_text()
     assert "- in batches of 8: " in page
     assert "| UNet |" in page
-    assert torch.tensor([1e-310], dtype=torch.float64) * 1 > 0  # denormals are there again
+    # denormals are there again
+    assert torch.tensor([1e-310], dtype=torch.float64) * 1 > 0
 
 
 def test_the_command_times_an_untrained_avatar_at_its_size(capture, tmp_path, inside):
     out = tmp_path / "out"
-    given = ["size=tiny", "size.image=64", f"data.root={capture}", "frames=1", "warmup=0"]
+    given = [
+        "size=tiny",
+        "size.image=64",
+        f"data.root={capture}",
+        "frames=1",
+        "warmup=0",
+    ]
     done = inside("bench", "speed", *given, "model=splat_only", f"hydra.run.dir={out}")
     assert done.returncode == 0, done.stderr
     found = json.loads((out / "speed.json").read_text())

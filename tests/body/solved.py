@@ -9,10 +9,14 @@ from gsgan.body import free_body
 from gsgan.scene import BodyPose
 
 
-def shown(truth: BodyPose, noise: float = 0.0, joints: int = 75) -> tuple[Tensor, Tensor]:
+def shown(
+    truth: BodyPose, noise: float = 0.0, joints: int = 75
+) -> tuple[Tensor, Tensor]:
     """``[B, joints, 3]`` and their visibility."""
     body = free_body()
-    p = torch.cat([body.posed_landmarks(truth), body.posed_hands(truth)], dim=1)[:, :joints]
+    p = torch.cat([body.posed_landmarks(truth), body.posed_hands(truth)], dim=1)[
+        :, :joints
+    ]
     p = p + noise * torch.randn(p.shape, generator=torch.Generator().manual_seed(0))
     return p, torch.ones(p.shape[:2])
 

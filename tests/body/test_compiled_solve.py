@@ -22,7 +22,9 @@ from gsgan.synthetic.recorded_motion import RecordedMotion
 
 pytestmark = pytest.mark.skipif(not native.available(), reason=native.why_not())
 CMU = Path(
-    os.environ.get("GSGAN_CMU", Path(__file__).parents[3] / "shared" / "data" / "motion" / "cmu")
+    os.environ.get(
+        "GSGAN_CMU", Path(__file__).parents[3] / "shared" / "data" / "motion" / "cmu"
+    )
 )
 SAME = 1e-4  # metres, the surface's: float32 against float64
 
@@ -77,11 +79,20 @@ def test_hidden_landmarks_give_the_same_poses(solver, poses, both, joints):
 
 def test_landmarks_that_are_seen_weakly_weigh_the_same(solver, poses, both):
     p, seen = shown(poses, 0.02)
-    seen = torch.rand(seen.shape, generator=torch.Generator().manual_seed(4)) * 1.5 + 0.01
+    seen = (
+        torch.rand(seen.shape, generator=torch.Generator().manual_seed(4)) * 1.5 + 0.01
+    )
     assert apart(both(solver, p, seen)).max() < SAME
 
 
-ALIKE = ("straight legs", "no arm", "NaN", "NaN visibility", "infinite", "only the trunk")
+ALIKE = (
+    "straight legs",
+    "no arm",
+    "NaN",
+    "NaN visibility",
+    "infinite",
+    "only the trunk",
+)
 ALIKE = (*ALIKE, "estimated hips", "lost fingers", "lying on the side", "upside down")
 
 
@@ -90,7 +101,9 @@ def test_damaged_skeletons_have_the_same_poses(solver, both, kind):
     assert apart(both(solver, *damaged(kind))).max() < SAME
 
 
-@pytest.mark.parametrize("kind", ["one point", "folded limbs", "far", "hands of one point"])
+@pytest.mark.parametrize(
+    "kind", ["one point", "folded limbs", "far", "hands of one point"]
+)
 def test_skeletons_without_one_answer_have_finite_poses(solver, kind):
     """Half turns about any axis, or coordinates that float32 rounds to millimetres."""
     pose = solver.solve(*damaged(kind))
@@ -98,7 +111,9 @@ def test_skeletons_without_one_answer_have_finite_poses(solver, kind):
     assert pose.transl.isfinite().all()
 
 
-def test_a_frame_is_the_same_to_the_bit_in_any_batch_and_with_any_threads(solver, poses):
+def test_a_frame_is_the_same_to_the_bit_in_any_batch_and_with_any_threads(
+    solver, poses
+):
     p, seen = shown(poses, 0.01)
     together = solver.solve(p, seen)
     try:
@@ -113,7 +128,11 @@ def test_a_frame_is_the_same_to_the_bit_in_any_batch_and_with_any_threads(solver
 
 
 def test_no_frames(solver):
-    assert solver.solve(torch.zeros(0, 75, 3), torch.zeros(0, 75)).theta.shape == (0, 56, 3)
+    assert solver.solve(torch.zeros(0, 75, 3), torch.zeros(0, 75)).theta.shape == (
+        0,
+        56,
+        3,
+    )
 
 
 @pytest.mark.parametrize("kind", ["smpl", "smplx"])
@@ -121,7 +140,9 @@ def test_bodies_of_the_users_files_have_the_same_poses(tmp_path, both, kind):
     """They lack landmarks of the mouth, and hands."""
     write_smpl(tmp_path / "model.npz", kind=kind)
     body = read_smpl(tmp_path / "model.npz").as_body()
-    theta = 0.1 * torch.randn(4, len(body.parents), 3, generator=torch.Generator().manual_seed(2))
+    theta = 0.1 * torch.randn(
+        4, len(body.parents), 3, generator=torch.Generator().manual_seed(2)
+    )
     p = body.posed_landmarks(BodyPose(theta, torch.ones(4, 3)))
     pair = both(Solver(body), p, p.isfinite().all(-1).float())
     assert apart(pair, body).max() < SAME
@@ -134,7 +155,9 @@ def test_double_precision_stays(poses, both):
     torch.testing.assert_close(fast.transl, slow.transl, atol=1e-9, rtol=0)
 
 
-def test_poses_with_gradients_are_solved_by_tensor_operations(solver, poses, monkeypatch):
+def test_poses_with_gradients_are_solved_by_tensor_operations(
+    solver, poses, monkeypatch
+):
     monkeypatch.setattr(compiled, "solve", None)
     p, seen = shown(poses[:1])
     assert solver.solve(p.requires_grad_(), seen).theta.requires_grad

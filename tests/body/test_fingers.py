@@ -19,7 +19,9 @@ from gsgan.scene import BodyPose
 from gsgan.skeleton.hands import FINGERS, HAND
 
 LEFT, RIGHT = slice(33, 33 + HAND), slice(33 + HAND, 33 + 2 * HAND)
-JOINTS = [i for i, name in enumerate(free_body().joint_names) if name.startswith("finger")]
+JOINTS = [
+    i for i, name in enumerate(free_body().joint_names) if name.startswith("finger")
+]
 
 
 def degrees_off(got: Tensor, truth: Tensor) -> Tensor:
@@ -69,7 +71,9 @@ def test_a_hand_is_where_its_own_landmarks_are(solver, poses):
     wrong = p.clone()
     wrong[:, [15, 17, 19, 21]] += torch.tensor([0.015, -0.01, 0.0])
     off, before = (
-        (free_body().posed_hands(solver.solve(wrong[:, :n], seen[:, :n])) - p[:, 33:]).norm(dim=-1)
+        (
+            free_body().posed_hands(solver.solve(wrong[:, :n], seen[:, :n])) - p[:, 33:]
+        ).norm(dim=-1)
         for n in (75, 33)
     )
     assert off.median() < 0.003
@@ -88,14 +92,22 @@ def test_hands_that_close_and_spread(solver):
         knuckles = -side * torch.nn.functional.normalize(index - pinky, dim=0)
         out = torch.linalg.cross((index + pinky) / 2 - wrist, index - pinky)
         for finger in range(2, 6):
-            bends = torch.rand(2, 40, 1, generator=random) * torch.tensor([1.4, 1.8]).view(2, 1, 1)
+            bends = torch.rand(2, 40, 1, generator=random) * torch.tensor(
+                [1.4, 1.8]
+            ).view(2, 1, 1)
             apart = 0.15 * torch.randn(40, 1, generator=random) * out / out.norm()
-            for joint, turn in enumerate((bends[0] * knuckles + apart, bends[1] * knuckles), 1):
-                theta[:, body.joint_names.index(f"finger{finger}-{joint}.{letter}")] = turn
+            for joint, turn in enumerate(
+                (bends[0] * knuckles + apart, bends[1] * knuckles), 1
+            ):
+                theta[:, body.joint_names.index(f"finger{finger}-{joint}.{letter}")] = (
+                    turn
+                )
     truth = BodyPose(theta, torch.zeros(40, 3))
     pose = solver.solve(*shown(truth))
     hands = torch.isin(body.vertex_labels, torch.tensor([7, 8]))
-    away = (body.posed_vertices(pose) - body.posed_vertices(truth))[:, hands].norm(dim=-1)
+    away = (body.posed_vertices(pose) - body.posed_vertices(truth))[:, hands].norm(
+        dim=-1
+    )
     assert away.median() < 0.003
     assert np.quantile(away.numpy(), 0.9) < 0.01
 
@@ -104,14 +116,17 @@ def test_a_persons_proportions_and_place_do_not_matter(poses):
     p, seen = shown(poses[:6])
     fingers = Fingers(free_body())
     expected = fingers(p[:, 33:], seen[:, 33:] > 0).turns
-    R = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(3)))[0]
+    R = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(3)))[
+        0
+    ]
     moved = 1.3 * p[:, 33:] @ (R * torch.det(R)).mT + 2.0
     tip = moved.clone()
     for start in (0, HAND):  # longer last bones
         for *_, before, last in (tuple(start + j for j in f) for f in FINGERS):
             tip[:, last] += 0.5 * (tip[:, last] - tip[:, before])
     found = fingers(tip, seen[:, 33:] > 0).turns
-    assert degrees_off(found, expected).max() < 0.5  # longer bones place the hand elsewhere
+    # longer bones place the hand elsewhere
+    assert degrees_off(found, expected).max() < 0.5
 
 
 def test_noise_stays_within_anatomical_limits(solver, poses):
@@ -120,7 +135,9 @@ def test_noise_stays_within_anatomical_limits(solver, poses):
     turns = fingers(p[:, 33:], seen[:, 33:] > 0).turns
     first, second = turns.unflatten(1, (2, 10)).unsqueeze(2).unbind(1)
     axes = fingers.axes.transpose(0, 1)  # [5, 10, 3], each number's
-    numbers = torch.cat([(axes[:3] * first).sum(-1), (axes[3:] * second).sum(-1)], dim=1).mT
+    numbers = torch.cat(
+        [(axes[:3] * first).sum(-1), (axes[3:] * second).sum(-1)], dim=1
+    ).mT
     assert (numbers >= fingers.least - 1e-3).all()
     assert (numbers <= fingers.most + 1e-3).all()
     assert ((fingers.most - fingers.least)[:, [0, 3]] < math.pi).all()
@@ -185,7 +202,9 @@ def test_gradients_are_those_of_finite_differences(poses):
     fingers = Fingers(free_body().to(torch.float64))
     p, seen = (x[:3] for x in shown(poses))
     hands, seen = p[:, 33:].double().requires_grad_(), seen[:, 33:] > 0
-    goal = torch.randn(20, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    goal = torch.randn(
+        20, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64
+    )
     (slope,) = torch.autograd.grad((fingers(hands, seen)[0] * goal).sum(), hands)
     for joint, axis in ((0, 0), (6, 1), (8, 2), (HAND + 3, 0), (HAND + 17, 1)):
         step = torch.zeros_like(hands)
@@ -193,19 +212,25 @@ def test_gradients_are_those_of_finite_differences(poses):
         with torch.no_grad():
             ahead, back = (fingers(hands + s * step, seen)[0] for s in (1, -1))
         found = ((ahead - back) * goal).sum() / 2e-5
-        assert slope[:, joint, axis].sum() == pytest.approx(float(found), rel=1e-3, abs=1e-4)
+        assert slope[:, joint, axis].sum() == pytest.approx(
+            float(found), rel=1e-3, abs=1e-4
+        )
 
 
 def test_gradients_reach_landmarks_and_shape(poses):
     K = free_space().coefficients
-    shape = BodyShape(torch.zeros(K, requires_grad=True), torch.ones(8, requires_grad=True))
+    shape = BodyShape(
+        torch.zeros(K, requires_grad=True), torch.ones(8, requires_grad=True)
+    )
     p, seen = shown(poses[3:4])
     p.requires_grad_()
     theta = Solver(shaped_body(shape)).solve(p, seen).theta
     others = [i for i in range(theta.shape[1]) if i not in JOINTS]
     of = shape.coefficients, shape.stretch, p
     for joints, shown_by in ((JOINTS, LEFT), (others, slice(33))):
-        slopes = torch.autograd.grad(theta[:, joints].square().sum(), of, retain_graph=True)
+        slopes = torch.autograd.grad(
+            theta[:, joints].square().sum(), of, retain_graph=True
+        )
         assert all(slope.abs().sum() > 0 for slope in (*slopes, slopes[2][:, shown_by]))
 
 
@@ -216,7 +241,9 @@ def test_a_mirrored_person_has_mirrored_fingers(poses):
     mirrored = (p[:, 33:] * torch.tensor([-1.0, 1, 1])).unflatten(1, (2, HAND)).flip(1)
     own = fingers(p[:, 33:], seen[:, 33:] > 0).turns
     other = fingers(mirrored.flatten(1, 2), seen[:, 33:] > 0).turns
-    other = other.unflatten(1, (2, 2, 5)).flip(2).flatten(1, 3) * torch.tensor([1.0, -1, -1])
+    other = other.unflatten(1, (2, 2, 5)).flip(2).flatten(1, 3) * torch.tensor(
+        [1.0, -1, -1]
+    )
     assert degrees_off(own, other).median() < 2
 
 
@@ -240,7 +267,9 @@ def test_a_person_whose_hands_are_larger_and_elsewhere_on_the_arms(poses):
         [[[1.0, 1, 1]], [[-1.0, 1, 1]]]
     )
     stretch = torch.tensor([1.0] * 4 + [1.2] + [1.0] * 3)
-    person = shaped_body(replace(own, stretch=stretch, offsets=torch.zeros(33, 3), hands=moves))
+    person = shaped_body(
+        replace(own, stretch=stretch, offsets=torch.zeros(33, 3), hands=moves)
+    )
     p = torch.cat([person.posed_landmarks(truth), person.posed_hands(truth)], dim=1)
     seen = torch.ones(p.shape[:2])
     seen[0, LEFT] = 0
@@ -251,7 +280,9 @@ def test_a_person_whose_hands_are_larger_and_elsewhere_on_the_arms(poses):
     np.testing.assert_allclose(found.stretch[hand], 1.2, atol=0.005)
     np.testing.assert_allclose(found.hands, moves, atol=0.006)
     assert fit_hands(shape, truth, p, 0 * seen).hands is None
-    one = fit_hands(shape, truth, p, torch.cat([seen[:, :54], 0 * seen[:, RIGHT]], 1)).hands
+    one = fit_hands(
+        shape, truth, p, torch.cat([seen[:, :54], 0 * seen[:, RIGHT]], 1)
+    ).hands
     np.testing.assert_allclose(one[0], moves[0], atol=0.006)
     assert not one[1].any()
     few = seen.clone()

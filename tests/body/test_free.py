@@ -77,21 +77,39 @@ def test_faces_point_outwards():
 def test_rest_pose_moves_nothing():
     body = free_body()
     rest = BodyPose(torch.zeros(1, 56, 3), torch.zeros(1, 3))
-    torch.testing.assert_close(body.posed_vertices(rest)[0], body.vertices, atol=1e-6, rtol=0)
-    torch.testing.assert_close(body.posed_landmarks(rest)[0], body.landmarks, atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        body.posed_vertices(rest)[0], body.vertices, atol=1e-6, rtol=0
+    )
+    torch.testing.assert_close(
+        body.posed_landmarks(rest)[0], body.landmarks, atol=1e-6, rtol=0
+    )
 
 
 def test_turning_the_root_turns_everything_rigidly():
     body = free_body().to(torch.float64)
     theta = torch.zeros(1, 56, 3, dtype=torch.float64)
     theta[0, 0, 2] = torch.pi / 2
-    turned = body.posed_vertices(BodyPose(theta, torch.zeros(1, 3, dtype=torch.float64)))[0]
+    turned = body.posed_vertices(
+        BodyPose(theta, torch.zeros(1, 3, dtype=torch.float64))
+    )[0]
     root = body.joints[0]
     x, y, z = (body.vertices - root).unbind(-1)
-    torch.testing.assert_close(turned, root + torch.stack([-y, x, z], -1), atol=1e-9, rtol=0)
+    torch.testing.assert_close(
+        turned, root + torch.stack([-y, x, z], -1), atol=1e-9, rtol=0
+    )
 
 
-BONES = [(11, 13), (13, 15), (23, 25), (25, 27), (12, 14), (14, 16), (24, 26), (26, 28), (0, 7)]
+BONES = [
+    (11, 13),
+    (13, 15),
+    (23, 25),
+    (25, 27),
+    (12, 14),
+    (14, 16),
+    (24, 26),
+    (26, 28),
+    (0, 7),
+]
 
 
 def test_bones_keep_their_lengths_in_any_pose():
@@ -118,10 +136,16 @@ def test_landmarks_are_at_the_joints_of_the_same_name():
     body = free_body().to(torch.float64)
     pose = poses(3)
     p, joints = body.posed_landmarks(pose), carry(body.transforms(pose), body.joints)
-    for landmark, joint in ((13, "lowerarm01.L"), (26, "lowerleg01.R"), (15, "wrist.L")):
+    for landmark, joint in (
+        (13, "lowerarm01.L"),
+        (26, "lowerleg01.R"),
+        (15, "wrist.L"),
+    ):
         at = joints[:, body.joint_names.index(joint)]
         torch.testing.assert_close(p[:, landmark], at, atol=1e-6, rtol=0)
-    torch.testing.assert_close(body.posed_hands(pose)[:, 0], p[:, 15], atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        body.posed_hands(pose)[:, 0], p[:, 15], atol=1e-6, rtol=0
+    )
 
 
 def test_majority_label_and_its_tie():

@@ -58,7 +58,9 @@ def test_rest_pose_is_the_identity():
 def test_weights_are_renormalised():
     T = torch.eye(4, dtype=D).repeat(1, 2, 1, 1)
     T[0, 1, 0, 3] = 4
-    _, t = blend_transforms(T, torch.tensor([[0, 1]]), torch.tensor([[30, 90]], dtype=torch.uint8))
+    _, t = blend_transforms(
+        T, torch.tensor([[0, 1]]), torch.tensor([[30, 90]], dtype=torch.uint8)
+    )
     assert t[0, 0, 0] == 3
 
 
@@ -85,12 +87,16 @@ def test_blends_never_stretch_and_slopes_are_finite(turns, share):
     """A mean of rotations has no singular value above 1."""
     theta = torch.tensor(turns, dtype=D).view(1, 3, 3).requires_grad_()
     joints = torch.tensor([[0.0, 0, 0], [0.3, 0, 0], [0.6, 0, 0]], dtype=D)
-    bones = forward_kinematics(joints, (-1, 0, 1), axis_angle_to_matrix(theta), joints[:1])
+    bones = forward_kinematics(
+        joints, (-1, 0, 1), axis_angle_to_matrix(theta), joints[:1]
+    )
     pairs = torch.tensor([[0, 1], [1, 2], [0, 2], [2, 2]])
     weights = torch.tensor([share, 1 - share], dtype=D).expand(4, 2)
     A, t = blend_transforms(bones, pairs, weights)
     assert float(torch.linalg.svdvals(A.detach()).max()) <= 1 + 1e-9
-    skin(torch.tensor([[0.7, 0.03, 0.02]], dtype=D).expand(4, 3), A, t).square().sum().backward()
+    skin(
+        torch.tensor([[0.7, 0.03, 0.02]], dtype=D).expand(4, 3), A, t
+    ).square().sum().backward()
     assert theta.grad is not None
     assert theta.grad.isfinite().all()
 
@@ -99,7 +105,9 @@ def test_levels_put_parents_first():
     assert kinematic_levels((-1, 0, 0, 1, 3)) == [[0], [1, 2], [3], [4]]
 
 
-@pytest.mark.parametrize("wrong", [[0.0, 0.0], [1.5, -0.5], [math.nan, 1.0], [math.inf, 1.0]])
+@pytest.mark.parametrize(
+    "wrong", [[0.0, 0.0], [1.5, -0.5], [math.nan, 1.0], [math.inf, 1.0]]
+)
 def test_a_body_refuses_vertices_without_weight_when_it_is_made(wrong):
     body = free_body()
     weight = body.bone_weight.float().clone()
@@ -113,13 +121,20 @@ def test_a_body_refuses_vertices_without_weight_when_it_is_made(wrong):
 def bent_tube():
     """A tube along x, a hinge in its middle, weights that change smoothly over 0.4 m."""
     x, angle = torch.meshgrid(
-        torch.linspace(0, 1, 81, dtype=D), torch.arange(24, dtype=D) * math.pi / 12, indexing="ij"
+        torch.linspace(0, 1, 81, dtype=D),
+        torch.arange(24, dtype=D) * math.pi / 12,
+        indexing="ij",
     )
-    vertices = torch.stack([x, 0.1 * angle.cos(), 0.1 * angle.sin()], dim=-1).reshape(-1, 3)
+    vertices = torch.stack([x, 0.1 * angle.cos(), 0.1 * angle.sin()], dim=-1).reshape(
+        -1, 3
+    )
     a = torch.arange(80 * 24)
     right = a // 24 * 24 + (a + 1) % 24
     faces = torch.cat(
-        [torch.stack([a, right, a + 24], 1), torch.stack([right, right + 24, a + 24], 1)]
+        [
+            torch.stack([a, right, a + 24], 1),
+            torch.stack([right, right + 24, a + 24], 1),
+        ]
     )
     share = ((vertices[:, 0] - 0.3) / 0.4).clamp(0, 1)
     share = share * share * (3 - 2 * share)
@@ -147,17 +162,24 @@ def test_the_jacobian_predicts_where_neighbours_go(bent_tube, turn):
     """Without the gradients of the weights the same prediction is several times as far off."""
     theta = torch.zeros(1, 2, 3, dtype=D)
     theta[0, 1, 2] = turn
-    bones = bent_tube.transforms(BodyPose(theta=theta, transl=torch.zeros(1, 3, dtype=D)))
+    bones = bent_tube.transforms(
+        BodyPose(theta=theta, transl=torch.zeros(1, 3, dtype=D))
+    )
     A, t = blend_transforms(bones, bent_tube.bone_index, bent_tube.bone_weight)
     J = stretched(A, bones, *stretch_terms(bent_tube))
     posed = skin(bent_tube.vertices, A, t)[0]
     inner = torch.arange(24 * 30, 24 * 50)
-    step = (bent_tube.vertices[inner + 48] - bent_tube.vertices[inner]).unsqueeze(-1)  # 2.5 cm
+    # 2.5 cm
+    step = (bent_tube.vertices[inner + 48] - bent_tube.vertices[inner]).unsqueeze(-1)
     moved = posed[inner + 48] - posed[inner]
-    off, off_plain = (((M[0, inner] @ step).squeeze(-1) - moved).norm(dim=-1).max() for M in (J, A))
+    off, off_plain = (
+        ((M[0, inner] @ step).squeeze(-1) - moved).norm(dim=-1).max() for M in (J, A)
+    )
     assert off <= 0.005
     if turn == 0:
-        torch.testing.assert_close(J[0], torch.eye(3, dtype=D).expand_as(J[0]), atol=1e-6, rtol=0)
+        torch.testing.assert_close(
+            J[0], torch.eye(3, dtype=D).expand_as(J[0]), atol=1e-6, rtol=0
+        )
     else:
         assert off < 0.4 * off_plain
 

@@ -39,7 +39,13 @@ def other(seed: int, size: float = 0.6) -> BodyShape:
 def moving(body, frames: int = 20) -> BodyPose:
     random = torch.Generator().manual_seed(5)
     theta = torch.zeros(frames, 56, 3)
-    for joint in ("upperarm01.L", "upperarm01.R", "upperleg01.L", "upperleg01.R", "spine03"):
+    for joint in (
+        "upperarm01.L",
+        "upperarm01.R",
+        "upperleg01.L",
+        "upperleg01.R",
+        "spine03",
+    ):
         at = body.joint_names.index(joint)
         theta[:, at] = 0.3 * torch.randn(frames, 3, generator=random)
     return BodyPose(theta, torch.randn(frames, 3, generator=random))
@@ -49,7 +55,9 @@ def test_the_asset_is_small_and_its_origin_is_the_free_body():
     assert free_body_path().with_name("body_space.npz").stat().st_size < 1_000_000
     own, body = free_body(), free_space().shaped(free_space().neutral())
     for name in ("vertices", "joints", "landmarks", "hand_landmarks"):
-        torch.testing.assert_close(getattr(body, name), getattr(own, name), atol=1e-6, rtol=0)
+        torch.testing.assert_close(
+            getattr(body, name), getattr(own, name), atol=1e-6, rtol=0
+        )
     assert body.joint_names == own.joint_names
     assert torch.equal(body.faces, own.faces)
 
@@ -71,7 +79,9 @@ def test_a_stretch_scales_its_part_alone():
     own, names = free_body(), free_body().landmark_names
 
     def length(body, a: str, b: str) -> float:
-        return float((body.landmarks[names.index(a)] - body.landmarks[names.index(b)]).norm())
+        return float(
+            (body.landmarks[names.index(a)] - body.landmarks[names.index(b)]).norm()
+        )
 
     pairs = {
         "upper_arm": ("left_shoulder", "left_elbow"),
@@ -90,7 +100,9 @@ def test_a_stretch_scales_its_part_alone():
         body = shaped_body(BodyShape(torch.zeros(K), stretch))
         for name, pair in pairs.items():
             expected = 1.2 if name == group else 1.0
-            assert length(body, *pair) / length(own, *pair) == pytest.approx(expected, abs=2e-3)
+            assert length(body, *pair) / length(own, *pair) == pytest.approx(
+                expected, abs=2e-3
+            )
 
 
 def test_limbs_keep_their_girth():
@@ -180,7 +192,9 @@ def test_an_upper_body_has_a_shape():
 def test_the_depth_of_the_spine_is_found_where_the_trunk_bends():
     found = []
     for depth in (0.0, 0.07):
-        body = shaped_body(BodyShape(torch.zeros(K), torch.ones(8), spine=torch.tensor([depth])))
+        body = shaped_body(
+            BodyShape(torch.zeros(K), torch.ones(8), spine=torch.tensor([depth]))
+        )
         pose = moving(body)
         bends = 0.4 * torch.rand(20, generator=torch.Generator().manual_seed(1))
         for joint in ("spine05", "spine03"):

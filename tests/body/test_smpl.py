@@ -25,7 +25,9 @@ SMALL = 120
 def small(tmp_path):
     """Writes a small model file and reads it."""
 
-    def build(name: str = "model.pkl", **options) -> tuple[SkinnedModel, dict[str, np.ndarray]]:
+    def build(
+        name: str = "model.pkl", **options
+    ) -> tuple[SkinnedModel, dict[str, np.ndarray]]:
         written = write_smpl(tmp_path / name, vertices=SMALL, **options)
         return read_smpl(tmp_path / name), written
 
@@ -51,7 +53,9 @@ def test_every_kind_of_file_is_read_back(small, kind, name, options):
     assert model.kind == kind
     assert model.parents == PARENTS[kind]
     for key in ("v_template", "posedirs", "J_regressor", "weights"):
-        np.testing.assert_allclose(getattr(model, key).numpy(), written[key], atol=1e-15)
+        np.testing.assert_allclose(
+            getattr(model, key).numpy(), written[key], atol=1e-15
+        )
     both = torch.cat([model.shapedirs, model.expression_dirs], dim=-1)
     np.testing.assert_array_equal(both.numpy(), written["shapedirs"])
     assert model.shapedirs.shape[-1] == 10
@@ -106,7 +110,9 @@ def test_a_quarter_turn_of_one_joint(small):
     theta = torch.zeros(1, 24, 3, dtype=D)
     elbow = SMPL_JOINTS.index("left_elbow")
     theta[0, elbow, 2] = math.pi / 2
-    _, joints = model.pose(theta, torch.zeros(1, 10), torch.zeros(1, 3), pose_blend=False)
+    _, joints = model.pose(
+        theta, torch.zeros(1, 10), torch.zeros(1, 3), pose_blend=False
+    )
     rest = written["J_regressor"] @ written["v_template"]
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     expected = rest.copy()
@@ -125,7 +131,9 @@ def test_vertices_follow_their_weights(small):
     model, _ = small(replace={"weights": weights})
     theta = torch.zeros(1, 24, 3, dtype=D)
     theta[0, 4, 0] = math.pi
-    vertices, _ = model.pose(theta, torch.zeros(1, 10), torch.zeros(1, 3), pose_blend=False)
+    vertices, _ = model.pose(
+        theta, torch.zeros(1, 10), torch.zeros(1, 3), pose_blend=False
+    )
     rest = arrays["v_template"]
     knee = (arrays["J_regressor"] @ rest)[4]
     turned = knee + (rest[7] - knee) * [1, -1, -1]
@@ -152,7 +160,9 @@ def test_pose_blend_shapes_by_hand(small):
     np.testing.assert_allclose(moved, expected, atol=1e-12)
     theta[0, 0] = torch.tensor([0.3, 0.2, 0.1])  # the root's own rotation adds nothing
     theta[0, knee] = 0
-    torch.testing.assert_close(model.pose(*args)[0], model.pose(*args, pose_blend=False)[0])
+    torch.testing.assert_close(
+        model.pose(*args)[0], model.pose(*args, pose_blend=False)[0]
+    )
     assert not np.allclose(written["v_template"], model.pose(*args)[0][0].numpy())
 
 
@@ -164,7 +174,9 @@ def test_the_root_turns_about_its_own_joint_and_expression_moves_the_face(small)
     vertices, joints = model.pose(theta, betas, torch.zeros(2, 3), face.expand(2, -1))
     torch.testing.assert_close(joints[0, 0], joints[1, 0])
     np.testing.assert_allclose(
-        vertices[0].numpy(), written["v_template"] + 2 * written["shapedirs"][..., 11], atol=1e-12
+        vertices[0].numpy(),
+        written["v_template"] + 2 * written["shapedirs"][..., 11],
+        atol=1e-12,
     )
 
 
@@ -178,7 +190,9 @@ def test_gradients_at_rest_are_finite_and_correct(small):
         vertices, joints = model.pose(*inputs)
         return vertices[:, ::40], joints[:, -1]
 
-    assert torch.autograd.gradcheck(some, (theta, betas, transl), atol=1e-6, fast_mode=True)
+    assert torch.autograd.gradcheck(
+        some, (theta, betas, transl), atol=1e-6, fast_mode=True
+    )
 
 
 def test_wrong_shapes_name_the_argument(small):
@@ -189,7 +203,12 @@ def test_wrong_shapes_name_the_argument(small):
         "transl": torch.zeros(2, 3),
         "expression": None,
     }
-    wrong = {"theta": (2, 55, 3), "betas": (2, 11), "transl": (1, 3), "expression": (2, 1)}
+    wrong = {
+        "theta": (2, 55, 3),
+        "betas": (2, 11),
+        "transl": (1, 3),
+        "expression": (2, 1),
+    }
     for name, shape in wrong.items():
         with pytest.raises(ValueError, match="rotations" if name == "theta" else name):
             model.pose(**(good | {name: torch.zeros(shape)}))
@@ -246,7 +265,9 @@ def test_as_body_moves_as_the_model_without_blend_shapes(small):
     transl = torch.tensor([[0.0, 1, 2], [3, 4, 5]])
     vertices, joints = model.pose(theta, betas, transl, pose_blend=False)
     pose = BodyPose(theta, transl)
-    torch.testing.assert_close(body.posed_vertices(pose).double(), vertices, atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        body.posed_vertices(pose).double(), vertices, atol=1e-5, rtol=0
+    )
     own = carry(body.transforms(pose), body.joints)
     torch.testing.assert_close(own.double(), joints, atol=1e-5, rtol=0)
     A, t = body.pose(pose)
@@ -259,7 +280,9 @@ def test_segmentation_is_built_from_a_model_file(tmp_path):
     assert body.label_names == CIHP
     K = torch.tensor([[[35.0, 0, 16], [0, 35, 16], [0, 0, 1]]])
     R = torch.tensor([[[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]])  # in front of it, Y up
-    camera = Camera(K, R, -(R @ torch.tensor([[[0.0], [0.85], [3.0]]])).squeeze(-1), (32, 32))
+    camera = Camera(
+        K, R, -(R @ torch.tensor([[[0.0], [0.85], [3.0]]])).squeeze(-1), (32, 32)
+    )
     with torch.no_grad():
         segmentation = Segmentation(body)
         S = segmentation(BodyPose(torch.zeros(1, 24, 3), torch.zeros(1, 3)), camera)
@@ -268,7 +291,10 @@ def test_segmentation_is_built_from_a_model_file(tmp_path):
     assert "hat" in segmentation.map.absent  # no joint wears one: no channel
     columns = torch.arange(32.0)
     left, right = (
-        float((S[0, names.index(name)].sum(0) * columns).sum() / S[0, names.index(name)].sum())
+        float(
+            (S[0, names.index(name)].sum(0) * columns).sum()
+            / S[0, names.index(name)].sum()
+        )
         for name in ("left_arm", "right_arm")
     )
     assert left > 16 > right  # it faces the camera
@@ -286,9 +312,12 @@ def test_open_body_chooses_parts_by_the_labels_names(tmp_path):
     assert open_body(None) is None
     assert open_body("smpl", path, (), joints).shares_labels(joints)
     assert free_body().shares_labels(CLOTHES[:5])
-    for names in (CLOTHES, CIHP, ("background", "hat")):  # clothes on a model file are a guess
+    # clothes on a model file are a guess
+    for names in (CLOTHES, CIHP, ("background", "hat")):
         assert not open_body("smpl", path, (), names).shares_labels(names)
-    with pytest.raises(DataError, match=r"kind smpl \(24 joints\), but the data's poses are of sm"):
+    with pytest.raises(
+        DataError, match=r"kind smpl \(24 joints\), but the data's poses are of sm"
+    ):
         open_body("smplx", path)
     with pytest.raises(DataError, match="10 shape coefficients, the data gives 11"):
         open_body("smpl", path, (0.0,) * 11)
@@ -299,22 +328,35 @@ def test_open_body_chooses_parts_by_the_labels_names(tmp_path):
 NAN = np.full((SMALL, 3), np.nan)
 WRONG = {
     "key": ({"drop": ("posedirs", "f")}, "no array posedirs, f"),
-    "template": ({"replace": {"v_template": np.zeros((SMALL, 2))}}, r"found \(120, 2\)"),
+    "template": (
+        {"replace": {"v_template": np.zeros((SMALL, 2))}},
+        r"found \(120, 2\)",
+    ),
     "nan": ({"replace": {"v_template": NAN}}, "'v_template' must hold finite"),
     "posedirs": (
         {"replace": {"posedirs": np.zeros((SMALL, 3, 135))}},
         r"'posedirs' must have shape \(120, 3, 207\), found \(120, 3, 135\)",
     ),
-    "vertices": ({"replace": {"weights": np.ones((7, 24))}}, r"\(120, 24\), found \(7, 24\)"),
+    "vertices": (
+        {"replace": {"weights": np.ones((7, 24))}},
+        r"\(120, 24\), found \(7, 24\)",
+    ),
     "weights": ({"replace": {"weights": np.ones((SMALL, 24))}}, "vertex 0 sum to 24"),
-    "faces": ({"replace": {"f": np.array([[0, 1, SMALL]])}}, "below 120, found 0 to 120"),
+    "faces": (
+        {"replace": {"f": np.array([[0, 1, SMALL]])}},
+        "below 120, found 0 to 120",
+    ),
     "text": ({"replace": {"f": np.array([["a", "b", "c"]])}}, "must hold numbers"),
     "tree": (
         {"replace": {"kintree_table": np.zeros((2, 24), int)}},
         "found 1 joints in 24 columns",
     ),
     "order": (
-        {"replace": {"kintree_table": np.stack([np.arange(1, 25) % 24, np.arange(24)])}},
+        {
+            "replace": {
+                "kintree_table": np.stack([np.arange(1, 25) % 24, np.arange(24)])
+            }
+        },
         "no earlier parent for joint 1",
     ),
     "regressor": (

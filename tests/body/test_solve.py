@@ -30,7 +30,9 @@ def surface_error(got: BodyPose, truth: BodyPose) -> Tensor:
     return (body.posed_vertices(got) - body.posed_vertices(truth)).norm(dim=-1)
 
 
-@pytest.mark.parametrize(("noise", "median", "most"), [(0.0, 0.0045, 0.015), (0.01, 0.012, 0.03)])
+@pytest.mark.parametrize(
+    ("noise", "median", "most"), [(0.0, 0.0045, 0.015), (0.01, 0.012, 0.03)]
+)
 def test_the_solved_surface_is_near_the_true_one(solver, poses, noise, median, most):
     off = surface_error(solver.solve(*shown(poses, noise)), poses)
     assert off.median() < median
@@ -47,7 +49,9 @@ def test_a_frame_does_not_depend_on_the_others_and_repeats_to_the_bit(solver, po
 
 def test_a_pose_moves_and_turns_with_the_skeleton(solver, poses):
     p, seen = shown(poses[:4])
-    R = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(3)))[0]
+    R = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(3)))[
+        0
+    ]
     R = R * torch.det(R)
     far = p @ R.mT + torch.tensor([40.0, -7.0, 3.0])
     moved, here = solver.solve(far, seen), solver.solve(p, seen)
@@ -68,7 +72,9 @@ def test_knees_and_elbows_are_hinges_and_ankles_hardly_turn(solver, poses):
             turn = theta[:, names.index(joint.format(letter))]
             assert (turn @ axis).min() > LEAST[name] - 0.25
             if name == "knee":
-                assert (turn - (turn @ axis).unsqueeze(1) * axis).norm(dim=-1).median() < 0.1
+                assert (turn - (turn @ axis).unsqueeze(1) * axis).norm(
+                    dim=-1
+                ).median() < 0.1
     yaw = torch.stack([theta[:, names.index(f"foot.{s}")][:, 2] for s in "LR"])
     assert yaw.abs().median() < 0.15
 
@@ -77,7 +83,9 @@ def test_twist_spreads_along_the_forearm_and_the_upper_arm(solver):
     """A turned palm with a bent elbow: the wrist does not turn alone."""
     body, names = free_body(), free_body().joint_names
     truth = BodyPose(torch.zeros(1, 56, 3), torch.zeros(1, 3))
-    along = body.joints[names.index("wrist.L")] - body.joints[names.index("lowerarm01.L")]
+    along = (
+        body.joints[names.index("wrist.L")] - body.joints[names.index("lowerarm01.L")]
+    )
     truth.theta[0, names.index("lowerarm02.L")] = 1.0 * along / along.norm()
     theta = solver.solve(*shown(truth)).theta[0]
     turns = [
@@ -105,7 +113,9 @@ def test_the_trunk_bends_as_people_bend_it(solver):
         theta[:, joint] += value.unsqueeze(1) * rig.entry_axis[entry]
     truth = BodyPose(theta, torch.zeros(2, 3))
     got = solver.solve(*shown(truth))
-    main = body.bone_index.gather(1, body.bone_weight.argmax(1, keepdim=True)).squeeze(1)
+    main = body.bone_index.gather(1, body.bone_weight.argmax(1, keepdim=True)).squeeze(
+        1
+    )
     spine = [i for i, n in enumerate(body.joint_names) if n.startswith("spine")]
     off = surface_error(got, truth)[:, torch.isin(main, torch.tensor([0, *spine]))]
     assert off.square().mean(1).sqrt().max() < 0.013
@@ -131,7 +141,9 @@ def test_gradients_are_those_of_the_solution(monkeypatch, poses):
     fine = Solver(free_body().to(torch.float64))
     p, seen = (x[:1].double() for x in shown(poses[3:4]))
     p = p.clone().requires_grad_()
-    goal = torch.randn(1, 56, 3, generator=torch.Generator().manual_seed(1), dtype=p.dtype)
+    goal = torch.randn(
+        1, 56, 3, generator=torch.Generator().manual_seed(1), dtype=p.dtype
+    )
     (slope,) = torch.autograd.grad((fine.solve(p, seen).theta * goal).sum(), p)
     for joint, axis in ((15, 0), (25, 1), (11, 2)):
         step = torch.zeros_like(p)
@@ -145,7 +157,15 @@ def test_gradients_are_those_of_the_solution(monkeypatch, poses):
 # -- damage
 
 
-KINDS = ("straight legs", "one point", "no arm", "NaN", "infinite", "folded limbs", "far")
+KINDS = (
+    "straight legs",
+    "one point",
+    "no arm",
+    "NaN",
+    "infinite",
+    "folded limbs",
+    "far",
+)
 
 
 @pytest.mark.parametrize("kind", [*KINDS, "only the trunk"])
@@ -171,7 +191,10 @@ def test_limbs_that_are_not_seen_stay_at_rest_and_are_marked(solver, poses):
         joint = names.index(name)
         assert theta[:, joint].abs().max() < 1e-5
         assert rest[:, joint].all(), name
-    moved = [names.index(n) for n in ("root", "spine05", "upperarm01.R", "lowerleg01.L", "head")]
+    moved = [
+        names.index(n)
+        for n in ("root", "spine05", "upperarm01.R", "lowerleg01.L", "head")
+    ]
     assert not rest[:, moved].any()
     elsewhere = surface_error(BodyPose(theta, solver.solve(p, seen).transl), poses[:3])
     whole = free_body().vertex_labels == free_body().label_names.index("left_leg")
@@ -232,12 +255,21 @@ def test_bodies_of_the_users_files_follow_their_landmarks(tmp_path, kind):
     names, random = body.joint_names, torch.Generator().manual_seed(2)
     theta = torch.zeros(6, len(names), 3)
     theta[:, 0] = torch.randn(6, 3, generator=random)
-    for joint in ("left_shoulder", "right_shoulder", "left_hip", "spine2", "neck", "left_collar"):
+    for joint in (
+        "left_shoulder",
+        "right_shoulder",
+        "left_hip",
+        "spine2",
+        "neck",
+        "left_collar",
+    ):
         theta[:, names.index(joint)] = 0.15 * torch.randn(6, 3, generator=random)
     truth = BodyPose(theta, torch.randn(6, 3, generator=random))
     p = body.posed_landmarks(truth)
     known = p.isfinite().all(-1)
-    assert known[0].tolist() == [n not in ("mouth_left", "mouth_right") for n in MEDIAPIPE33.names]
+    assert known[0].tolist() == [
+        n not in ("mouth_left", "mouth_right") for n in MEDIAPIPE33.names
+    ]
     pose = Solver(body).solve(p, known.float())
     off = (body.posed_landmarks(pose) - p).norm(dim=-1)[known]
     assert off.median() < 0.003

@@ -16,7 +16,11 @@ def good(tmp_path_factory):
     from make import write_landmarks, write_tiny_capture
 
     root = write_tiny_capture(
-        tmp_path_factory.mktemp("good"), cameras=4, frames=12, size=(64, 96), labels=True
+        tmp_path_factory.mktemp("good"),
+        cameras=4,
+        frames=12,
+        size=(64, 96),
+        labels=True,
     )
     with np.load(root / "landmarks3d.npz") as held:
         p, ids = held["p"], held["frame_id"]

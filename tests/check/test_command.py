@@ -111,15 +111,20 @@ def test_a_report_that_cannot_be_written_is_reported(good, command, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not (REAL / "cameras.json").is_file(), reason=f"no real capture at {REAL}")
+@pytest.mark.skipif(
+    not (REAL / "cameras.json").is_file(), reason=f"no real capture at {REAL}"
+)
 def test_the_real_capture_has_what_is_known_of_it(command, tmp_path):
-    code, output, _ = command(f"data.root={REAL}", "sampling.images=40", "sampling.shown=1")
+    code, output, _ = command(
+        f"data.root={REAL}", "sampling.images=40", "sampling.shown=1"
+    )
     assert code == 0
     assert "0 errors, 1 warning" in output
     numbers = json.loads((tmp_path / "work" / "check.json").read_text())
     found = {finding["topic"]: finding["sentence"] for finding in numbers["findings"]}
     assert "far from their 2D detections" in found["frames"]
-    assert set(numbers["doubtful_frames"]) == {"64", "65"}  # the right foot, found flipped
+    # the right foot, found flipped
+    assert set(numbers["doubtful_frames"]) == {"64", "65"}
     for camera in numbers["cameras"].values():
         assert camera["inside"] > 0.98
         assert camera["overlap"] > max(camera["rivals"].values()) + 0.2

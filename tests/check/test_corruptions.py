@@ -133,16 +133,18 @@ def test_wrong_landmarks_are_named_with_their_frames(copy, check, change, level,
     report = check(copy)
     assert report.errors == 0 or level == "error" or change is shrink
     found = [f.sentence for f in report.findings if f.level == level]
-    assert [bool(re.search(named or "were seen", text)) for text in found].count(True) == (
-        named is not None
-    )
+    assert [bool(re.search(named or "were seen", text)) for text in found].count(
+        True
+    ) == (named is not None)
 
 
 @pytest.mark.parametrize(("cameras", "frames"), [(1, 1), (2, 3)])
 def test_the_smallest_captures_can_be_checked(tmp_path, check, cameras, frames):
     from make import write_tiny_capture
 
-    root = write_tiny_capture(tmp_path / "tiny", cameras=cameras, frames=frames, size=(48, 64))
+    root = write_tiny_capture(
+        tmp_path / "tiny", cameras=cameras, frames=frames, size=(48, 64)
+    )
     report = check(root)
     assert report.errors == 0
     assert report.numbers["cameras"]["cam00"]["outside"] == 0
@@ -160,7 +162,10 @@ def turn(root: Path, axis: tuple[float, float, float], degrees: float) -> None:
     def change(cameras):
         r = cv2.Rodrigues(np.radians(degrees) * np.array(axis))[0]
         camera = cameras["cam01"]
-        camera["R"], camera["t"] = (r @ camera["R"]).tolist(), (r @ camera["t"]).tolist()
+        camera["R"], camera["t"] = (
+            (r @ camera["R"]).tolist(),
+            (r @ camera["t"]).tolist(),
+        )
 
     edit_json(root / "cameras.json", change)
 
@@ -178,7 +183,9 @@ def scale_focal(root: Path, factor: float, *names: str, centre: bool = False) ->
 
 def test_a_camera_that_is_nearly_right_is_named(copy, check):
     turn(copy, (0, 0, 1), 12)
-    sentences = [f.sentence for f in check(copy, consistency={"min_inside": 0.71}).findings]
+    sentences = [
+        f.sentence for f in check(copy, consistency={"min_inside": 0.71}).findings
+    ]
     assert any(s.startswith("camera cam01: joints lie") for s in sentences)
     assert not any("camera cam00" in s or "camera cam02" in s for s in sentences)
 

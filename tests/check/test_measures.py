@@ -19,7 +19,9 @@ SAMPLING = Sampling(images=8)
 
 def test_images_are_the_same_moments_in_every_camera(subject):
     items = sampled_items(subject, 12)
-    frames = {camera: [f for c, f in items if c == camera] for camera in subject.cameras}
+    frames = {
+        camera: [f for c, f in items if c == camera] for camera in subject.cameras
+    }
     assert set(map(tuple, frames.values())) == {(0, 6, 11)}
 
 
@@ -27,7 +29,9 @@ def test_joints_below_the_image_are_not_outside_its_mask(copy):
     """A camera that sees the upper body: images are padded to squares, which hold no mask."""
     for path in copy.glob("*/cam00/*.png"):
         cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[:48])
-    edit_json(copy / "cameras.json", lambda content: content["cam00"].update(size=[64, 48]))
+    edit_json(
+        copy / "cameras.json", lambda content: content["cam00"].update(size=[64, 48])
+    )
     subject = subject_of(GsganData(root=str(copy)))
     views = measure(subject, [("cam00", 3)], SAMPLING)[0]
     assert np.isnan(views[0].outside[25:]).all()
@@ -51,7 +55,9 @@ def test_joints_far_from_their_detections_are_named(copy):
 
 def test_units_of_a_good_capture(subject):
     found = geometry_of(subject)
-    assert found.distances == pytest.approx(dict.fromkeys(subject.cameras, 3.0), abs=0.15)
+    assert found.distances == pytest.approx(
+        dict.fromkeys(subject.cameras, 3.0), abs=0.15
+    )
     assert found.stature == pytest.approx(1.6, abs=0.2)
     assert found.lean < 5
     assert geometry_findings(subject, found) == []
@@ -113,4 +119,6 @@ def test_every_setting_is_read():
     code = "\n".join(p.read_text() for p in folder.glob("*.py") if p.stem != "settings")
     for group in (Sampling, Limits):
         for field in fields(group):
-            assert re.search(rf"\b{group.__name__.lower()}\.{field.name}\b", code), field.name
+            assert re.search(rf"\b{group.__name__.lower()}\.{field.name}\b", code), (
+                field.name
+            )

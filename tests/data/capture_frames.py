@@ -34,7 +34,12 @@ def every_frame(
 
 def png(width: int, height: int, depth: int, kind: int, row: bytes) -> bytes:
     def chunk(name: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", crc(name + data))
+        return (
+            struct.pack(">I", len(data))
+            + name
+            + data
+            + struct.pack(">I", crc(name + data))
+        )
 
     crc = zlib.crc32
     head = struct.pack(">IIBBBBB", width, height, depth, kind, 0, 0, 0)
@@ -47,7 +52,9 @@ def png(width: int, height: int, depth: int, kind: int, row: bytes) -> bytes:
 def check_cameras(layout: Layout, cameras: list) -> None:
     """Cameras are read as they were written, but for pixel centres, which are ours at +0.5."""
     for entry, camera in zip(layout.cameras.values(), cameras, strict=True):
-        assert np.allclose(entry.K - camera.K, [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], atol=1e-6)
+        assert np.allclose(
+            entry.K - camera.K, [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], atol=1e-6
+        )
         assert np.allclose(entry.R, camera.R, atol=1e-6)
         assert np.allclose(entry.t, camera.t, atol=1e-6)
         assert np.allclose(entry.dist[:5], camera.dist, atol=1e-6)
@@ -60,7 +67,9 @@ def check_poses(layout: Layout, subject: Any, blend: bool = True) -> None:
     theta, transl = (np.stack([of[f] for f in subject.frames]) for of in held)
     betas = np.repeat(subject.shapes[None], len(theta), 0)
     motion = SmplMotion(np.array(subject.frames), theta, transl, betas)
-    assert np.allclose(posed(subject.model, motion, blend)[0], subject.vertices, atol=1e-6)
+    assert np.allclose(
+        posed(subject.model, motion, blend)[0], subject.vertices, atol=1e-6
+    )
 
 
 def check_skeletons(layout: Layout, subject: Any, kind: str = "smpl") -> None:
@@ -82,7 +91,8 @@ def check_images(layout: Layout, subject: Any) -> None:
             assert np.array_equal(mask[clear], np.where(cover > 127, 255, 0)[clear])
             assert set(np.unique(mask)) <= {0, 255}
             image = read_colour(layout.image_path(name, frame)).astype(int)
-            assert np.abs(image - subject.images[i][c]).mean() < 12  # chroma of a small JPEG
+            # chroma of a small JPEG
+            assert np.abs(image - subject.images[i][c]).mean() < 12
             if layout.labels:
                 found = read_labels(layout.label_path(name, frame), layout.pixels, CIHP)
                 assert np.array_equal(found, subject.labels[i][c])

@@ -24,8 +24,10 @@ def root(tmp_path, smplx_subject):
 
 def test_read_equals_written(root, smplx_subject, smplx_file):
     layout = read(root, smplx_file)
-    assert layout.notes == ()  # a lens of zeros and a list that is not there need no note
-    assert layout.camera_names == SERIALS  # the calibration's order, which indices count
+    # a lens of zeros and a list that is not there need no note
+    assert layout.notes == ()
+    # the calibration's order, which indices count
+    assert layout.camera_names == SERIALS
     s = smplx_subject
     check_cameras(layout, s.cameras)
     for name in SERIALS:

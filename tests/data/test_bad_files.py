@@ -74,11 +74,15 @@ def cut(name: str, keep: float) -> Damage:
 
 
 def image(pattern: str, array: np.ndarray) -> Damage:
-    return lambda root: [cv2.imwrite(str(path), array) for path in sorted(root.glob(pattern))]
+    return lambda root: [
+        cv2.imwrite(str(path), array) for path in sorted(root.glob(pattern))
+    ]
 
 
 def replaced(name: str, old: str, new: str) -> Damage:
-    return lambda root: (root / name).write_text((root / name).read_text().replace(old, new))
+    return lambda root: (root / name).write_text(
+        (root / name).read_text().replace(old, new)
+    )
 
 
 def edited(name: str, change: Callable[[Any], object]) -> Damage:
@@ -124,7 +128,11 @@ def landmarks(**changed: object) -> Damage:
 
 
 def poses(**changed: object) -> Damage:
-    held = {"theta": np.zeros((4, 56, 3)), "transl": np.zeros((4, 3)), "frame_id": np.arange(4)}
+    held = {
+        "theta": np.zeros((4, 56, 3)),
+        "transl": np.zeros((4, 3)),
+        "frame_id": np.arange(4),
+    }
     return lambda root: np.savez(root / "body_pose.npz", **(held | changed))
 
 
@@ -155,7 +163,9 @@ CAPTURE: dict[str, Damage] = {
     "lists no camera": write("cameras.json", b"{}"),
     "cam00: expected an object with K, R, t": write("cameras.json", b'{"cam00": 3}'),
     r"images/cam01 does not exist; there are cam00": remove("images/cam01"),
-    "has the camera cam07, which .*lists cam00, cam01": write("images/cam07/000000.png", b""),
+    "has the camera cam07, which .*lists cam00, cam01": write(
+        "images/cam07/000000.png", b""
+    ),
     "images does not exist": remove("images"),
     "images/cam00 holds no frames": empty("images/cam00"),
     r"'K' must hold finite numbers of shape \(3, 3\)": camera(K=[[1], [2, 3]]),
@@ -174,16 +184,26 @@ CAPTURE: dict[str, Damage] = {
     "'fps' is 0; expected a number above 0": meta(fps=0),
     "'splits' must be an object": meta(splits=[1]),
     "'label_names' must list": meta(label_names="a"),
-    "landmarks3d.npz is not a valid npz": write("landmarks3d.npz", b"PK\x03\x04" + bytes(40)),
-    "asks for pickled Python objects.*nothing was run": landmarks(p=np.array([[Evil()]])),
+    "landmarks3d.npz is not a valid npz": write(
+        "landmarks3d.npz", b"PK\x03\x04" + bytes(40)
+    ),
+    "asks for pickled Python objects.*nothing was run": landmarks(
+        p=np.array([[Evil()]])
+    ),
     r"'p' must have shape \(any, 33, 3\)": landmarks(p=np.zeros((4, 25, 3))),
     "'p' must hold numbers, found <U1": landmarks(p=np.full((4, 33, 3), "a")),
     "frame_id 1 appears more than once": landmarks(frame_id=np.array([0, 1, 1, 2])),
     "'frame_id' must hold whole numbers": landmarks(frame_id=np.arange(4) + 0.5),
     "frame_id .* is a time stamp": landmarks(frame_id=np.arange(4) + 1_700_000_000_123),
-    "has no array 'frame_id'": lambda root: np.savez(root / "landmarks3d.npz", p=skeletons(4)),
-    "no usable frame: 4 with fewer than 12 joints": landmarks(p=np.full((4, 33, 3), np.nan)),
-    "no usable frame: 4 without a row in landmarks3d": landmarks(frame_id=np.arange(100, 104)),
+    "has no array 'frame_id'": lambda root: np.savez(
+        root / "landmarks3d.npz", p=skeletons(4)
+    ),
+    "no usable frame: 4 with fewer than 12 joints": landmarks(
+        p=np.full((4, 33, 3), np.nan)
+    ),
+    "no usable frame: 4 without a row in landmarks3d": landmarks(
+        frame_id=np.arange(100, 104)
+    ),
     r"hands3d.npz: .*'p' must have shape \(any, 42, 3\)": hands(p=np.zeros((4, 21, 3))),
     r"hands3d.npz: .*'conf' must have shape \(4, 42\)": hands(conf=np.ones((4, 33))),
     "hands3d.npz: .*frame_id 0 appears more than once": hands(frame_id=np.zeros(4)),
@@ -191,14 +211,24 @@ CAPTURE: dict[str, Damage] = {
     "'names' must be those .*from mouth_outer_0 to": face(names=np.array(["lip"] * 30)),
     r"'theta' must have shape \(4, any, 3\)": poses(theta=np.zeros((4, 168))),
     "masks/cam00/000000.png shows no person, nor": image("masks/*/*.png", GREY),
-    "000001.png has 16 bits a channel": image("masks/cam00/000001.png", GREY.astype(np.uint16)),
-    "123456.png has no frame number up to": write("images/cam00/20240131120000123456.png", b""),
-    "000002.png does not exist; every image needs a mask": remove("masks/cam01/000002.png"),
-    "000001.png is 16x12 pixels .*the image": image("masks/cam01/000001.png", GREY[::2, ::2]),
+    "000001.png has 16 bits a channel": image(
+        "masks/cam00/000001.png", GREY.astype(np.uint16)
+    ),
+    "123456.png has no frame number up to": write(
+        "images/cam00/20240131120000123456.png", b""
+    ),
+    "000002.png does not exist; every image needs a mask": remove(
+        "masks/cam01/000002.png"
+    ),
+    "000001.png is 16x12 pixels .*the image": image(
+        "masks/cam01/000001.png", GREY[::2, ::2]
+    ),
     "000001.png is not a valid PNG or JPEG": write("images/cam00/000001.png", b""),
     "000000.jpg is a CMYK JPEG": cmyk,
     "is a palette PNG": write("masks/cam00/000001.png", png(32, 24, 8, 3, bytes(32))),
-    "frame 1 is there twice, as 000001.png and 0001.png": write("images/cam00/0001.png", b""),
+    "frame 1 is there twice, as 000001.png and 0001.png": write(
+        "images/cam00/0001.png", b""
+    ),
 }
 
 
@@ -214,7 +244,9 @@ def params(**values: Any) -> Damage:
 
 
 def T_times(factor: float) -> Damage:
-    return annots(lambda c: c["cams"].update(T=[factor * np.array(T) for T in c["cams"]["T"]]))
+    return annots(
+        lambda c: c["cams"].update(T=[factor * np.array(T) for T in c["cams"]["T"]])
+    )
 
 
 def out_of_the_folder(content: Any) -> None:
@@ -234,10 +266,13 @@ ZJU: dict[str, Damage] = {
     r"annots.npy: T is 0.00\d+ m long .*expected 0.05-20 m": T_times(1e-3),
     "has no SMPL parameters; expected one of .*new_params/": remove("new_params"),
     "new_params has no parameters of any frame": lambda root: [
-        path.rename(path.with_name(f"9{path.name}")) for path in (root / "new_params").iterdir()
+        path.rename(path.with_name(f"9{path.name}"))
+        for path in (root / "new_params").iterdir()
     ],
     "2.npy: 'poses' must hold 72 or 69 numbers": params(poses=np.zeros((1, 66))),
-    "2.npy: the first 3 numbers of 'poses' must be 0": params(poses=np.full((1, 72), 0.1)),
+    "2.npy: the first 3 numbers of 'poses' must be 0": params(
+        poses=np.full((1, 72), 0.1)
+    ),
     "'Rh' must hold finite numbers": params(Rh=np.full((1, 3), np.nan)),
     "2.npy has no 'Rh'": objects("new_params/2.npy", lambda c: c.pop("Rh")),
     "joints lie outside the masks .*check that cameras": objects(
@@ -261,11 +296,15 @@ EASYMOCAP: dict[str, Damage] = {
     "images holds no folder of a camera.*extract the frames": remove("images"),
     "images/2 holds no images": empty("images/2"),
     "images/2/000000.jpg is 40x40.*80x40": replaced("intri.yml", "W_2: 40", "W_2: 80"),
-    "person 0: 'keypoints3d' must have shape": people(lambda p: p[0].pop("keypoints3d")),
+    "person 0: 'keypoints3d' must have shape": people(
+        lambda p: p[0].pop("keypoints3d")
+    ),
     "needs a whole 'id' that no other has, found 0": people(lambda p: p.append(p[0])),
     "must hold a list of people": people(lambda p: p.append(3)),
     "000001.json is not valid JSON": write("keypoints3d/000001.json", b"[" * 5000),
-    "joints lie outside.*one person": image("mask/*/*.png", np.eye(40, dtype=np.uint8) * 255),
+    "joints lie outside.*one person": image(
+        "mask/*/*.png", np.eye(40, dtype=np.uint8) * 255
+    ),
     "mask/1/000000.png does not exist; every image needs a mask": remove("mask"),
 }
 
@@ -282,18 +321,26 @@ THUMAN4: dict[str, Damage] = {
         "missing_img_files.txt", b"".join(b"cam01/%08d.jpg\n" % i for i in range(4))
     ),
     "images/cam01 holds no images": remove("images/cam01"),
-    "calibration.json does not exist; a folder of THuman4.0 holds": remove("calibration.json"),
-    "camera cam02: expected K, R and T": edited("calibration.json", lambda c: c["cam02"].pop("R")),
+    "calibration.json does not exist; a folder of THuman4.0 holds": remove(
+        "calibration.json"
+    ),
+    "camera cam02: expected K, R and T": edited(
+        "calibration.json", lambda c: c["cam02"].pop("R")
+    ),
     r"cam02: 'K' must hold finite numbers of shape \(9,\)": edited(
         "calibration.json", lambda c: c["cam02"].update(K=[1, 2])
     ),
     r"shape \(4, 63\), found \(4, 69\)": fitted(body_pose=np.zeros((4, 69))),
     r"\(4, 45\), found .*without PCA": fitted(left_hand_pose=np.zeros((4, 12))),
-    "smpl_params.npz has no array transl": arrays("smpl_params.npz", lambda a: a.pop("transl")),
+    "smpl_params.npz has no array transl": arrays(
+        "smpl_params.npz", lambda a: a.pop("transl")
+    ),
     "has 30 coefficients, the model file 10": fitted(betas=np.ones((1, 30))),
     "'betas' must hold finite numbers": fitted(betas=np.full((1, 10), np.nan)),
     "no finite one of a frame that has images": fitted(transl=np.full((4, 3), np.inf)),
-    "smpl_params.npz asks for .*system.*nothing was run": fitted(betas=np.array(Evil())),
+    "smpl_params.npz asks for .*system.*nothing was run": fitted(
+        betas=np.array(Evil())
+    ),
 }
 
 
@@ -301,7 +348,10 @@ FORMATS: dict[str, tuple[dict[str, Damage], Callable[[Path], object]]] = {
     "capture": (CAPTURE, read_capture),
     "zju": (ZJU, lambda root: ZjuReader()(root, Thresholds(), str(SMPL["smpl"]))),
     "easymocap": (EASYMOCAP, lambda root: EasymocapReader()(root, Thresholds())),
-    "thuman4": (THUMAN4, lambda root: Thuman4Reader()(root, Thresholds(), str(smplx_once()))),
+    "thuman4": (
+        THUMAN4,
+        lambda root: Thuman4Reader()(root, Thresholds(), str(smplx_once())),
+    ),
 }
 SMPL: dict[str, Path] = {}
 
@@ -318,7 +368,8 @@ def written(tmp_path_factory, subject, smpl_file):
 
 
 @pytest.mark.parametrize(
-    ("kind", "message"), [(kind, message) for kind, (bad, _) in FORMATS.items() for message in bad]
+    ("kind", "message"),
+    [(kind, message) for kind, (bad, _) in FORMATS.items() for message in bad],
 )
 def test_damage_is_refused_in_one_sentence(written, tmp_path, kind, message):
     root = Path(shutil.copytree(written[kind], tmp_path / kind))
@@ -334,16 +385,24 @@ BAD_WHEN_DECODED: dict[str, Damage] = {
     "images/cam00/000001.jpg is damaged": cut("images/cam00/000001.jpg", 0.995),
     "masks/cam00/000001.png is damaged": cut("masks/cam00/000001.png", 0.6),
     "images/cam00/000001.jpg does not exist": remove("images/cam00/000001.jpg"),
-    "is 16x12 pixels .*cam00 has 32x24": image("images/cam00/000001.jpg", GREY[::2, ::2]),
-    "000001.png holds 0 and 1 alone; expected alpha": image("masks/cam00/000001.png", GREY + 1),
-    "000001.png holds the label 3; the dataset names 3": image("labels/cam00/000001.png", GREY + 3),
+    "is 16x12 pixels .*cam00 has 32x24": image(
+        "images/cam00/000001.jpg", GREY[::2, ::2]
+    ),
+    "000001.png holds 0 and 1 alone; expected alpha": image(
+        "masks/cam00/000001.png", GREY + 1
+    ),
+    "000001.png holds the label 3; the dataset names 3": image(
+        "labels/cam00/000001.png", GREY + 3
+    ),
 }
 
 
 @pytest.mark.parametrize("message", BAD_WHEN_DECODED)
 def test_a_damaged_image_is_refused_when_it_is_read(tmp_path, message):
     names = {"label_names": ["background", "upper", "lower"]}
-    layout = read_capture(write_tiny_capture(tmp_path, suffix="jpg", labels=True, meta=names))
+    layout = read_capture(
+        write_tiny_capture(tmp_path, suffix="jpg", labels=True, meta=names)
+    )
     dataset = CaptureDataset(layout, items(layout))
     BAD_WHEN_DECODED[message](tmp_path)
     assert dataset[0].frame_id == 0
@@ -356,24 +415,33 @@ def test_a_damaged_image_is_refused_when_it_is_read(tmp_path, message):
 
 
 def zju(root: Path, smpl: Path | None, **settings: Any) -> Layout:
-    return ZjuReader(**settings)(root, Thresholds(), None if smpl is None else str(smpl))
+    return ZjuReader(**settings)(
+        root, Thresholds(), None if smpl is None else str(smpl)
+    )
 
 
 def test_model_files_that_do_not_fit(written, tmp_path):
-    with pytest.raises(DataError, match=r"SMPL parameters but no joints.*data.smpl=/path"):
+    with pytest.raises(
+        DataError, match=r"SMPL parameters but no joints.*data.smpl=/path"
+    ):
         zju(written["zju"], None)
     with pytest.raises(ConfigError, match=r"data.smpl=.*none.pkl does not exist"):
         zju(written["zju"], tmp_path / "none.pkl")
     write_smpl(tmp_path / "x.npz", "smplx", vertices=60)
-    with pytest.raises(DataError, match=r"x.npz is a model of 55 joints.*SMPL \(24 joints\)"):
+    with pytest.raises(
+        DataError, match=r"x.npz is a model of 55 joints.*SMPL \(24 joints\)"
+    ):
         zju(written["zju"], tmp_path / "x.npz")
     write_smpl(tmp_path / "small.pkl", vertices=60)
-    with pytest.raises(DataError, match=r"small.pkl has 60 vertices; expected the 6890 of SMPL"):
+    with pytest.raises(
+        DataError, match=r"small.pkl has 60 vertices; expected the 6890 of SMPL"
+    ):
         zju(written["zju"], tmp_path / "small.pkl")
 
 
 @pytest.mark.parametrize(
-    ("frames", "message"), [("a-b", "must be frame numbers"), ("0-9", "leaves no frame")]
+    ("frames", "message"),
+    [("a-b", "must be frame numbers"), ("0-9", "leaves no frame")],
 )
 def test_frames_to_drop_that_cannot_be(written, frames, message):
     with pytest.raises(ConfigError, match=f"data.reader.drop_frames.*{message}"):

@@ -46,7 +46,8 @@ def test_colours_are_rgb_and_the_background_is_black(tmp_path):
     person = (frame.mask[0, 0] == 1) & (frame.image[0, 0] > 0.5)
     assert person.sum() > 10
     red, green, blue = frame.image[0][:, person]
-    assert torch.allclose(red, torch.full_like(red, 200 / 255))  # drawn as RGB (200, 40.., 60)
+    # drawn as RGB (200, 40.., 60)
+    assert torch.allclose(red, torch.full_like(red, 200 / 255))
     assert torch.allclose(blue, torch.full_like(blue, 60 / 255))
     assert (green <= 200 / 255).all()
     assert (frame.image[0][:, frame.mask[0, 0] == 0] == 0).all()  # the wall was grey
@@ -54,12 +55,18 @@ def test_colours_are_rgb_and_the_background_is_black(tmp_path):
 
 def test_soft_masks_mix_with_black_once(tmp_path):
     root = write_tiny_capture(tmp_path, cameras=1, frames=1)
-    cv2.imwrite(str(root / "images/cam00/000000.png"), np.full((24, 32, 3), 100, np.uint8))
+    cv2.imwrite(
+        str(root / "images/cam00/000000.png"), np.full((24, 32, 3), 100, np.uint8)
+    )
     cv2.imwrite(str(root / "masks/cam00/000000.png"), np.full((24, 32), 51, np.uint8))
     consistency = Consistency(frames=0)  # no pixel of such a mask counts as the person
-    assert torch.allclose(every_frame(root, consistency)[0].image, torch.tensor(20 / 255))
+    assert torch.allclose(
+        every_frame(root, consistency)[0].image, torch.tensor(20 / 255)
+    )
     edit_json(root / "meta.json", lambda meta: meta.update(background="black"))
-    assert torch.allclose(every_frame(root, consistency)[0].image, torch.tensor(100 / 255))
+    assert torch.allclose(
+        every_frame(root, consistency)[0].image, torch.tensor(100 / 255)
+    )
 
 
 def test_millimetres_become_metres_and_it_is_said(tmp_path):
@@ -132,9 +139,16 @@ def test_frames_with_too_few_joints_are_dropped_and_counted(tmp_path):
     write_landmarks(root, p=p, frame_id=np.arange(4))
     layout = read_capture(root)
     assert layout.frames == (0, 3)
-    assert any("1 of 4 frames dropped, with fewer than 12 joints" in n for n in layout.notes)
+    assert any(
+        "1 of 4 frames dropped, with fewer than 12 joints" in n for n in layout.notes
+    )
     assert any("fewer than 3 of the shoulders and hips: 2" in n for n in layout.notes)
-    assert read_capture(root, Thresholds(min_joints=5, min_hubs=0)).frames == (0, 1, 2, 3)
+    assert read_capture(root, Thresholds(min_joints=5, min_hubs=0)).frames == (
+        0,
+        1,
+        2,
+        3,
+    )
 
 
 def test_an_upper_body_without_hips_is_read(tmp_path):
@@ -151,7 +165,9 @@ def test_an_upper_body_without_hips_is_read(tmp_path):
     np.testing.assert_allclose(hips, truth[:, [23, 24]], atol=0.07)  # size by the arms
     down = hips.mean(1) - truth[:, [11, 12]].mean(1)
     np.testing.assert_allclose(down, down[:1].repeat(4, axis=0), atol=1e-9)
-    assert (np.stack([layout.landmarks.visibility[f][23:] for f in range(4)]) == 0).all()
+    assert (
+        np.stack([layout.landmarks.visibility[f][23:] for f in range(4)]) == 0
+    ).all()
     p[2] = truth[2]  # one frame shows them: its trunk is the others'
     write_landmarks(root, p=p, frame_id=np.arange(4))
     landmarks = read_capture(root).landmarks
@@ -179,7 +195,9 @@ def test_a_picture_without_labels_counts_as_ignore(tmp_path):
 
 def test_bilevel_and_grey_files_are_read(tmp_path):
     root = write_tiny_capture(tmp_path, cameras=1, frames=1)
-    (root / "masks/cam00/000000.png").write_bytes(png(32, 24, depth=1, kind=0, row=b"\xff" * 4))
+    (root / "masks/cam00/000000.png").write_bytes(
+        png(32, 24, depth=1, kind=0, row=b"\xff" * 4)
+    )
     cv2.imwrite(str(root / "images/cam00/000000.png"), np.full((24, 32), 51, np.uint8))
     (frame,) = every_frame(root)
     assert (frame.mask == 1).all()
@@ -204,7 +222,9 @@ def test_an_exif_rotation_is_not_applied(tmp_path):
     tiff = b"MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
     block = b"Exif\0\0" + tiff
     data = path.read_bytes()
-    path.write_bytes(data[:2] + b"\xff\xe1" + struct.pack(">H", len(block) + 2) + block + data[2:])
+    path.write_bytes(
+        data[:2] + b"\xff\xe1" + struct.pack(">H", len(block) + 2) + block + data[2:]
+    )
     assert cv2.imread(str(path)).shape == (32, 24, 3)
     assert torch.equal(every_frame(root)[0].image, plain)
 
@@ -228,7 +248,9 @@ def test_loose_calibration_habits_are_accepted(tmp_path):
     """A column for t and no dist at all mean what they look like."""
     root = write_tiny_capture(tmp_path)
     t = ring_camera(0.0, (32, 24))["t"]
-    edit_json(root / "cameras.json", lambda rig: rig["cam00"].update(t=[[x] for x in t]))
+    edit_json(
+        root / "cameras.json", lambda rig: rig["cam00"].update(t=[[x] for x in t])
+    )
     edit_json(root / "cameras.json", lambda rig: rig["cam00"].pop("dist"))
     layout = read_capture(root)
     assert np.allclose(layout.cameras["cam00"].t, t)

@@ -21,22 +21,31 @@ RATIONAL = (0.1, 0.02, 0.001, 0.002, 0.01, 0.3, 0.05, 0.01)
 SPOT = np.array([0.9, -0.1, 1.7])  # metres, where `spot_capture` puts a white spot
 
 
-def spot_capture(root: Path, size: tuple[int, int], dist: tuple[float, ...], skew: float) -> Path:
+def spot_capture(
+    root: Path, size: tuple[int, int], dist: tuple[float, ...], skew: float
+) -> Path:
     """One camera whose picture shows nothing but a soft white spot at `SPOT`."""
     write_tiny_capture(root, cameras=1, frames=1, size=size, dist=dist or (0,) * 5)
-    edit_json(root / "cameras.json", lambda rig: rig["cam00"]["K"][0].__setitem__(1, skew))
+    edit_json(
+        root / "cameras.json", lambda rig: rig["cam00"]["K"][0].__setitem__(1, skew)
+    )
     camera = json.loads((root / "cameras.json").read_text())["cam00"]
     x, y, z = np.array(camera["R"]) @ SPOT + camera["t"]
     ray, zero = np.array([[x / z, y / z, 1.0]]), np.zeros(3)
-    bent = cv2.projectPoints(ray, zero, zero, np.eye(3), np.array(camera["dist"], float))[0]
-    u, v = (np.array(camera["K"]) @ [*bent.ravel(), 1])[:2]  # OpenCV would ignore the skew
+    bent = cv2.projectPoints(
+        ray, zero, zero, np.eye(3), np.array(camera["dist"], float)
+    )[0]
+    # OpenCV would ignore the skew
+    u, v = (np.array(camera["K"]) @ [*bent.ravel(), 1])[:2]
     rows, columns = np.mgrid[0 : size[1], 0 : size[0]] + 0.5
     spot = 255 * np.exp(-((columns - u) ** 2 + (rows - v) ** 2) / (2 * 1.5**2))
     cv2.imwrite(
         str(root / "images/cam00/000000.png"),
         np.repeat(spot.round().astype(np.uint8)[..., None], 3, -1),
     )
-    cv2.imwrite(str(root / "masks/cam00/000000.png"), np.full(size[::-1], 255, np.uint8))
+    cv2.imwrite(
+        str(root / "masks/cam00/000000.png"), np.full(size[::-1], 255, np.uint8)
+    )
     return root
 
 
@@ -57,14 +66,19 @@ def centroid(image: torch.Tensor) -> torch.Tensor:
 @pytest.mark.parametrize("size", [None, 60, 300])
 def test_a_point_in_space_stays_on_its_spot(tmp_path, lens, skew, crop, size):
     """K, R and t of the frame put a 3D point where the picture shows it, whatever was done."""
-    (frame,) = every_frame(spot_capture(tmp_path, (160, 120), lens, skew), crop=crop, size=size)
+    (frame,) = every_frame(
+        spot_capture(tmp_path, (160, 120), lens, skew), crop=crop, size=size
+    )
     expected, _ = frame.camera.project(torch.from_numpy(SPOT).float()[None, None])
     assert frame.image.shape[-2:] == frame.camera.size
     assert torch.allclose(centroid(frame.image[0]), expected[0, 0], atol=0.1)
 
 
 def test_lens_folding_back_shows_nothing(tmp_path):
-    K, dist = np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]), np.array([-0.3, *[0.0] * 7])
+    K, dist = (
+        np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]),
+        np.array([-0.3, *[0.0] * 7]),
+    )
     mapping = undistort_map(K, dist, Crop(0, -150, (100, 400)))
     # r (1 - 0.3 r²) rises up to r = 1.054: column 250 is at r = 2
     assert (mapping[50, -1] < -1000).all()
@@ -83,7 +97,9 @@ def test_labels_are_never_mixed(tmp_path):
 def test_the_crop_comes_from_skeleton_and_camera_alone(tmp_path):
     root = write_tiny_capture(tmp_path)
     before = read_capture(root)
-    windows = [CaptureDataset(before, [i], crop=PersonCrop()).window(i) for i in items(before)]
+    windows = [
+        CaptureDataset(before, [i], crop=PersonCrop()).window(i) for i in items(before)
+    ]
     for path in (root / "masks").rglob("*.png"):
         cv2.imwrite(str(path), np.zeros((24, 32), np.uint8))
     after = read_capture(root, consistency=Consistency(frames=0))
@@ -93,7 +109,9 @@ def test_the_crop_comes_from_skeleton_and_camera_alone(tmp_path):
 
 
 def test_crop_is_square_and_has_the_margin_in_metres(tmp_path):
-    layout = read_capture(write_tiny_capture(tmp_path, cameras=1, frames=1, size=(400, 400)))
+    layout = read_capture(
+        write_tiny_capture(tmp_path, cameras=1, frames=1, size=(400, 400))
+    )
     view = layout.cameras["cam00"]
     joints, usable = np.tile([0.0, 0.0, 0.9], (33, 1)), np.ones(33, bool)
     joints[0, 2] = 1.5
@@ -105,7 +123,9 @@ def test_crop_is_square_and_has_the_margin_in_metres(tmp_path):
 
 
 def test_crop_beyond_the_border_is_black_and_follows_only_what_is_in_view(tmp_path):
-    layout = read_capture(write_tiny_capture(tmp_path, cameras=1, frames=1, size=(400, 400)))
+    layout = read_capture(
+        write_tiny_capture(tmp_path, cameras=1, frames=1, size=(400, 400))
+    )
     view = layout.cameras["cam00"]
     joints, usable = np.tile([-1.2, 0.0, 0.9], (33, 1)), np.ones(33, bool)
     joints[1] = [-9.0, 0.0, 0.9]  # far out to the left
@@ -115,7 +135,9 @@ def test_crop_beyond_the_border_is_black_and_follows_only_what_is_in_view(tmp_pa
     piece = cut(np.full((400, 400, 3), 9, np.uint8), window)
     assert (piece[:, : -window.left] == 0).all()
     assert (piece[:, -window.left :] == 9).all()
-    assert (cut(np.ones((4, 4), np.uint8), Crop(50, 50, (3, 2))) == np.zeros((3, 2))).all()
+    assert (
+        cut(np.ones((4, 4), np.uint8), Crop(50, 50, (3, 2))) == np.zeros((3, 2))
+    ).all()
 
 
 def test_crop_without_joints_in_front_is_the_whole_picture(tmp_path):
@@ -143,7 +165,8 @@ def test_real_joints_lie_on_the_person_in_the_crop(real_capture):
         assert (depth > 0.5).all()
         assert ((pixels > 0) & (pixels < 128)).all()
         u, v = pixels[0].long().unbind(-1)
-        near = torch.nn.functional.max_pool2d(frame.mask, 3, 1, 1)[0, 0]  # landmarks: ~11 mm noise
+        # landmarks: ~11 mm noise
+        near = torch.nn.functional.max_pool2d(frame.mask, 3, 1, 1)[0, 0]
         hits, total = hits + int((near[v, u] > 0.5).sum()), total + len(u)
         mask = cv2.imread(str(layout.mask_path(*item)), cv2.IMREAD_GRAYSCALE)
         kept = cut(mask, dataset.window(item)).sum() / mask.sum()

@@ -47,7 +47,10 @@ def in_mm(rig: dict) -> None:
     ("change", "message"),
     [
         (scale_K(0.5), r"inside: .*cam02 \d%, .*gsgan.check finds"),
-        (in_mm, r"camera cam02 stands 3\.13e\+03 m from the person, the median camera 3 m"),
+        (
+            in_mm,
+            r"camera cam02 stands 3\.13e\+03 m from the person, the median camera 3 m",
+        ),
     ],
 )
 def test_a_camera_that_is_wholly_wrong_is_refused(root, change, message):
@@ -89,7 +92,9 @@ def test_joint_distance_in_metres():
     mask = np.zeros((40, 60), bool)
     mask[10:20, 20:40] = True
     distance = mask_distance(mask)
-    pixels = np.array([[30.5, 15.5], [44.5, 15.5], [30.5, 29.5], [-5, 15], [np.nan, 3], [45, 15]])
+    pixels = np.array(
+        [[30.5, 15.5], [44.5, 15.5], [30.5, 29.5], [-5, 15], [np.nan, 3], [45, 15]]
+    )
     depth = np.array([2.0, 2.0, 4.0, 2.0, 2.0, -1.0])
     seen = np.ones(6, bool)
     metres = joint_distance(distance, pixels, depth, seen, focal=100.0)
@@ -101,4 +106,6 @@ def test_far_cameras_are_those_beyond_the_factor():
     metres = {"a": 3.0, "b": 3.2, "c": 31.0, "d": 0.2, "e": 2.9}
     found = far_cameras(metres, 10.0)
     assert list(found) == ["c", "d"]
-    assert found["c"].startswith("camera c stands 31 m from the person, the median camera 3 m")
+    assert found["c"].startswith(
+        "camera c stands 31 m from the person, the median camera 3 m"
+    )

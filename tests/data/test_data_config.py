@@ -19,11 +19,16 @@ CONF = Path(__file__).resolve().parents[2] / "conf"
 def conf(name: str, *overrides: str) -> Any:
     """The data group as the entry points compose it, keys of the group itself overridden."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        chosen = [f"+data={name}", *(o if o[0] == "+" else f"data.{o}" for o in overrides)]
+        chosen = [
+            f"+data={name}",
+            *(o if o[0] == "+" else f"data.{o}" for o in overrides),
+        ]
         return compose(overrides=chosen).data
 
 
-@pytest.mark.parametrize("name", ["capture", "zju_mocap", "thuman4", "avatarrex", "easymocap"])
+@pytest.mark.parametrize(
+    "name", ["capture", "zju_mocap", "thuman4", "avatarrex", "easymocap"]
+)
 def test_a_dataset_without_root_says_so(name):
     with pytest.raises(InstantiationException) as caught:
         instantiate(conf(name))
@@ -33,14 +38,19 @@ def test_a_dataset_without_root_says_so(name):
 
 
 def test_capture_config_builds_and_reads(ten_frames):
-    data = instantiate(conf("capture", f"root={ten_frames}", "size=20", "train_frames=0-3"))
+    data = instantiate(
+        conf("capture", f"root={ten_frames}", "size=20", "train_frames=0-3")
+    )
     assert len(data.dataset("train")) == 12
     assert data.dataset("train")[0].image.shape == (1, 3, 20, 20)
     assert data.crop.margin == conf("capture").crop.margin
     wide = instantiate(conf("capture", f"root={ten_frames}", "crop.margin=0.5"))
     assert wide.crop.margin == 0.5
     assert instantiate(conf("capture", f"root={ten_frames}", "crop=null")).crop is None
-    assert instantiate(conf("capture", f"root={ten_frames}", "crop=person")).crop is not None
+    assert (
+        instantiate(conf("capture", f"root={ten_frames}", "crop=person")).crop
+        is not None
+    )
 
 
 @pytest.mark.usefixtures("model_once")
@@ -56,8 +66,16 @@ def test_configs_of_published_formats_read_them_in_worker_processes(
     request, tmp_path, name, write, body, camera, skeleton
 ):
     subject = request.getfixturevalue("subject" if body == "smpl" else "smplx_subject")
-    words = [f"root={write(tmp_path / name, subject)}", "size=16", "workers=1", "test_frames=3"]
-    words += [f"smpl={request.getfixturevalue(f'{body}_file')}", f"test_cameras=[{camera}]"]
+    words = [
+        f"root={write(tmp_path / name, subject)}",
+        "size=16",
+        "workers=1",
+        "test_frames=3",
+    ]
+    words += [
+        f"smpl={request.getfixturevalue(f'{body}_file')}",
+        f"test_cameras=[{camera}]",
+    ]
     words += ["reader.ignore_alpha=[5,250]"] if body == "smplx" else []
     data = instantiate(conf(name, *words))
     batch = next(iter(data.train_dataloader()))
@@ -74,7 +92,9 @@ def test_synthetic_config_reads_what_the_generator_would_make(ten_frames):
     """The generator is not run here: its parameters are checked, its folder replaced."""
     from gsgan.synthetic.scene_setup import SceneSettings
 
-    data = instantiate(conf("synthetic", "size=48", "source.frames=12", "source.test_frames=3"))
+    data = instantiate(
+        conf("synthetic", "size=48", "source.frames=12", "source.test_frames=3")
+    )
     assert data.source.func.__name__ == "ensure_scene"
     given = dict(data.source.keywords)
     assert given.pop("workers") == 2

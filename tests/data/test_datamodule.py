@@ -56,7 +56,10 @@ def test_a_resumed_run_sees_the_order_of_an_unbroken_one():
 
 def test_processes_share_the_draws_of_a_step():
     alone = draws(StepSampler(11, 4, 6, seed=0), range(2))
-    pair = [draws(StepSampler(11, 2, 6, seed=0, replicas=2, rank=r), range(2)) for r in (0, 1)]
+    pair = [
+        draws(StepSampler(11, 2, 6, seed=0, replicas=2, rank=r), range(2))
+        for r in (0, 1)
+    ]
     joined = [pair[r][2 * s + i] for s in range(12) for r in (0, 1) for i in (0, 1)]
     assert joined == alone
 
@@ -72,10 +75,14 @@ class Recorder(lightning.LightningModule):
 
     def training_step(self, batch: Frame, index: int) -> torch.Tensor:
         assert isinstance(batch, Frame)
-        self.seen += zip(batch.camera_index.tolist(), batch.frame_id.tolist(), strict=True)
+        self.seen += zip(
+            batch.camera_index.tolist(), batch.frame_id.tolist(), strict=True
+        )
         return self.weight * batch.image.mean()
 
-    def validation_step(self, batch: Frame, index: int, dataloader_idx: int = 0) -> None:
+    def validation_step(
+        self, batch: Frame, index: int, dataloader_idx: int = 0
+    ) -> None:
         self.validated.append(dataloader_idx)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
@@ -83,7 +90,9 @@ class Recorder(lightning.LightningModule):
 
 
 def fit(root: Path, folder: Path, epochs: int, ckpt: Path | None = None) -> Recorder:
-    data = GsganData(str(root), batch_size=2, steps_per_epoch=3, seed=5, test_cameras=["cam01"])
+    data = GsganData(
+        str(root), batch_size=2, steps_per_epoch=3, seed=5, test_cameras=["cam01"]
+    )
     model = Recorder()
     trainer = quiet_trainer(folder, max_epochs=epochs)
     trainer.fit(model, datamodule=data, ckpt_path=ckpt)
@@ -105,7 +114,9 @@ def test_lightning_trains_validates_and_resumes_in_order(ten_frames, tmp_path):
 
 
 def test_loaders_and_datasets(ten_frames):
-    data = GsganData(str(ten_frames), size=16, batch_size=2, test_cameras=["cam02"], crop="person")
+    data = GsganData(
+        str(ten_frames), size=16, batch_size=2, test_cameras=["cam02"], crop="person"
+    )
     batch = next(iter(data.train_dataloader()))
     assert isinstance(batch, Frame)
     assert batch.image.shape == (2, 3, 16, 16)
@@ -115,7 +126,9 @@ def test_loaders_and_datasets(ten_frames):
     views, poses = (data.dataset(name) for name in data.eval_names)
     assert {camera for camera, _ in views.items} == {"cam02"}
     assert [frame for _, frame in poses.items] == [8, 9, 8, 9]
-    with pytest.raises(ValueError, match="split must be one of train, novel_view, novel_pose"):
+    with pytest.raises(
+        ValueError, match="split must be one of train, novel_view, novel_pose"
+    ):
         data.dataset("test")
     all_trained = GsganData(str(ten_frames), test_share=0)
     assert all_trained.eval_names == ()
@@ -138,7 +151,9 @@ def test_batches_travel_as_bytes_and_become_the_datasets_numbers(tmp_path):
             assert torch.equal(getattr(on_device, name)[i : i + 1], getattr(one, name))
 
 
-def test_on_a_gpu_batches_are_pinned_and_copied_while_the_host_goes_on(ten_frames, monkeypatch):
+def test_on_a_gpu_batches_are_pinned_and_copied_while_the_host_goes_on(
+    ten_frames, monkeypatch
+):
     data = GsganData(str(ten_frames), size=16)
     assert not data.train_dataloader().pin_memory
     data.trainer = SimpleNamespace(
@@ -151,7 +166,9 @@ def test_on_a_gpu_batches_are_pinned_and_copied_while_the_host_goes_on(ten_frame
     frame, moved, pinned, plain = data.dataset("train")[0], [], [], torch.Tensor.to
     monkeypatch.setattr(torch.Tensor, "pin_memory", lambda x: pinned.append(x) or x)
     monkeypatch.setattr(
-        torch.Tensor, "to", lambda x, *to, **how: moved.append(how) or plain(x, *to, **how)
+        torch.Tensor,
+        "to",
+        lambda x, *to, **how: moved.append(how) or plain(x, *to, **how),
     )
     frame = frame.pin_memory()
     assert any(x is frame.image for x in pinned)
@@ -167,7 +184,9 @@ def watched(**keys: Any) -> list[tuple[int, int]]:
 
 def test_pictures_watched_while_training_are_spread_over_held_out_poses(ten_frames):
     keys = {"root": str(ten_frames), "test_frames": "5-9"}
-    assert watched(**keys, val_images=99) == [(c, f) for c in range(3) for f in range(5, 10)]
+    assert watched(**keys, val_images=99) == [
+        (c, f) for c in range(3) for f in range(5, 10)
+    ]
     assert watched(**keys, val_images=3) == [(0, 7), (1, 7), (2, 7)]
     # without held-out poses: held-out cameras, and without those: training
     none = {"root": str(ten_frames), "test_share": 0, "val_images": 2}
@@ -217,7 +236,9 @@ def test_scene_info(ten_frames):
 
 def test_scene_info_sees_the_lens_of_training_cameras_only(tmp_path):
     root = write_tiny_capture(tmp_path, meta={"body": "free"})
-    edit_json(root / "cameras.json", lambda rig: rig["cam01"].update(dist=[0.1, 0, 0, 0]))
+    edit_json(
+        root / "cameras.json", lambda rig: rig["cam01"].update(dist=[0.1, 0, 0, 0])
+    )
     assert GsganData(str(root)).info.has_distortion
     info = GsganData(str(root), test_cameras=["cam01"]).info
     assert not info.has_distortion
@@ -249,10 +270,18 @@ def test_the_held_out_split_decides_no_effect(tmp_path):
 
 def test_a_capture_may_be_posed_by_the_users_own_smpl_file(tmp_path):
     root = write_tiny_capture(tmp_path, frames=4, meta={"body": "smpl"})
-    poses = {"theta": np.zeros((4, 24, 3)), "transl": np.zeros((4, 3)), "frame_id": np.arange(4)}
+    poses = {
+        "theta": np.zeros((4, 24, 3)),
+        "transl": np.zeros((4, 3)),
+        "frame_id": np.arange(4),
+    }
     np.savez(root / "body_pose.npz", **poses, betas=np.array([0.5, -1.0]))
     info = GsganData(str(root), smpl="SMPL_NEUTRAL.pkl").info
-    assert (info.body, info.body_file, info.betas) == ("smpl", "SMPL_NEUTRAL.pkl", (0.5, -1.0))
+    assert (info.body, info.body_file, info.betas) == (
+        "smpl",
+        "SMPL_NEUTRAL.pkl",
+        (0.5, -1.0),
+    )
     assert GsganData(str(root)).info.body_file is None
     np.savez(root / "body_pose.npz", **poses, betas=np.array([np.nan]))
     with pytest.raises(DataError, match="'betas' must hold finite numbers"):
@@ -265,18 +294,29 @@ def test_labels_are_counted_without_the_ignore_value(tmp_path):
     layout = read_capture(root)
     assert count_labels(layout, (("cam00", 0), ("cam00", 1))) == 3
     assert count_labels(layout, (("cam00", 1),)) == 1
-    names = write_tiny_capture(tmp_path / "n", labels=True, meta={"label_names": list("abcde")})
+    names = write_tiny_capture(
+        tmp_path / "n", labels=True, meta={"label_names": list("abcde")}
+    )
     assert count_labels(read_capture(names), ()) == 5
 
 
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ({"batch_size": 0}, "data.batch_size must be a whole number of at least 1, got 0"),
-        ({"steps_per_epoch": 0}, "data.steps_per_epoch must be a whole number of at least 1"),
+        (
+            {"batch_size": 0},
+            "data.batch_size must be a whole number of at least 1, got 0",
+        ),
+        (
+            {"steps_per_epoch": 0},
+            "data.steps_per_epoch must be a whole number of at least 1",
+        ),
         ({"workers": -1}, "data.workers must be a whole number of at least 0"),
         ({"seed": -1}, "data.seed must be a whole number of at least 0"),
-        ({"cache_mb": "much"}, "data.cache_mb must be a number of at least 0, got 'much'"),
+        (
+            {"cache_mb": "much"},
+            "data.cache_mb must be a number of at least 0, got 'much'",
+        ),
         ({"crop": "face"}, "data.crop must be null or person, got 'face'"),
         ({"root": None}, "data.root is not set: give the folder of a capture"),
     ],
@@ -288,7 +328,9 @@ def test_config_values_out_of_range(ten_frames, keys, message):
 
 def test_batches_need_one_size(ten_frames):
     GsganData(str(ten_frames), batch_size=2).setup()
-    with pytest.raises(ConfigError, match=r"data.size is not set and images differ in size"):
+    with pytest.raises(
+        ConfigError, match=r"data.size is not set and images differ in size"
+    ):
         GsganData(str(ten_frames), batch_size=2, crop="person").setup()
 
 
@@ -306,7 +348,8 @@ def test_the_real_capture_is_read_whole(real_capture):
     assert len(data.dataset("novel_pose")) == 4 * 14
     assert data.info.n_train_cameras == 4
     assert 3.4 < data.info.body_height < 4.8  # 2.4 times the stature, about
-    assert data.info.surface.difference > 0.03  # white balance differs between the cameras
+    # white balance differs between the cameras
+    assert data.info.surface.difference > 0.03
 
 
 def test_a_picture_damaged_under_a_worker_process_is_one_sentence(tmp_path):
@@ -315,9 +358,13 @@ def test_a_picture_damaged_under_a_worker_process_is_one_sentence(tmp_path):
     data.setup()
     for picture in (root / "images").rglob("*.png"):
         picture.write_bytes(picture.read_bytes()[:60])
-    with pytest.raises(DataError, match=r"^Caught DataError in DataLoader worker") as caught:
+    with pytest.raises(
+        DataError, match=r"^Caught DataError in DataLoader worker"
+    ) as caught:
         next(iter(data.val_dataloader()))
     said = one_sentence(caught.value) or ""
     assert said.startswith(str(root / "images"))
-    assert said.endswith("is damaged or cut off after 60 bytes; copy or export it again")
+    assert said.endswith(
+        "is damaged or cut off after 60 bytes; copy or export it again"
+    )
     assert "\n" not in said

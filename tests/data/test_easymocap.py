@@ -10,7 +10,13 @@ import pytest
 from capture_frames import check_cameras, check_images, check_poses, check_skeletons
 from make import edit_json
 from writers.common import write_picture
-from writers.easymocap import NAMES, body_25, hand_joints, write_calibration, write_easymocap
+from writers.easymocap import (
+    NAMES,
+    body_25,
+    hand_joints,
+    write_calibration,
+    write_easymocap,
+)
 
 from gsgan.data.formats.easymocap import EasymocapReader
 from gsgan.data.layout import Layout
@@ -27,7 +33,9 @@ LANDMARKS = {
 
 
 def read(root: Path, smpl: Path | None = None, **settings: Any) -> Layout:
-    return EasymocapReader(**settings)(root, Thresholds(), None if smpl is None else str(smpl))
+    return EasymocapReader(**settings)(
+        root, Thresholds(), None if smpl is None else str(smpl)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +44,9 @@ def written(tmp_path_factory, subject):
     return write_easymocap(tmp_path_factory.mktemp("easymocap") / "take", subject)
 
 
-def edit_people(root: Path, change: Callable[[list[Any]], object], frame: int = 1) -> None:
+def edit_people(
+    root: Path, change: Callable[[list[Any]], object], frame: int = 1
+) -> None:
     edit_json(root / f"keypoints3d/{frame:06d}.json", change)
 
 
@@ -73,7 +83,9 @@ def test_keypoints_are_the_landmarks_that_body_25_knows(written, subject):
         for landmark, joint in LANDMARKS.items():
             expected[landmark] = joints[joint, 3]
             if joints[joint, 3] > 0:
-                assert np.allclose(layout.landmarks.p[frame][landmark], joints[joint, :3])
+                assert np.allclose(
+                    layout.landmarks.p[frame][landmark], joints[joint, :3]
+                )
         assert np.allclose(conf, expected)
         unknown = layout.landmarks.p[frame][conf == 0]
         assert np.linalg.norm(unknown, axis=-1).min() > 0.5  # stand-ins are never zero
@@ -133,7 +145,9 @@ def test_omissions_are_noted(root, subject):
         "without a row in keypoints3d/: 1-2",
     ):
         assert any(note in held for held in layout.notes), note
-    refused(root, "has no person 7 in the 3 of its 3 files", "(found: 0, 1, 5)", person=7)
+    refused(
+        root, "has no person 7 in the 3 of its 3 files", "(found: 0, 1, 5)", person=7
+    )
 
 
 def test_joints_without_confidence_are_unknown(root):

@@ -28,7 +28,8 @@ from gsgan.utils.errors import GsganError
 
 pytestmark = [
     pytest.mark.usefixtures("model_once"),
-    pytest.mark.filterwarnings("ignore::RuntimeWarning"),  # absurd numbers overflow, then fail
+    # absurd numbers overflow, then fail
+    pytest.mark.filterwarnings("ignore::RuntimeWarning"),
 ]
 
 ROUNDS = 16  # damaged copies per format
@@ -67,7 +68,9 @@ def swap(files: list[Path], rng: np.random.Generator) -> str:
 
 
 def _capture(root: Path, _: object) -> None:
-    write_tiny_capture(root, labels=True, body_pose=True, meta={"body": "free"}, suffix="jpg")
+    write_tiny_capture(
+        root, labels=True, body_pose=True, meta={"body": "free"}, suffix="jpg"
+    )
 
 
 def _thuman4(root: Path, _: object) -> None:
@@ -89,7 +92,8 @@ FORMATS = {
     "easymocap": (write_easymocap, EasymocapReader(), None),
     "easymocap_smpl": (write_easymocap, EasymocapReader(), "smpl"),
 }
-COMMON = ("capture", "zju_original", "thuman4", "easymocap")  # the others share most code with one
+# the others share most code with one
+COMMON = ("capture", "zju_original", "thuman4", "easymocap")
 
 
 def read_all(root: Path, reader: Any, model: str | None) -> None:
@@ -104,7 +108,10 @@ def read_all(root: Path, reader: Any, model: str | None) -> None:
 
 @pytest.mark.parametrize(
     "kind",
-    [name if name in COMMON else pytest.param(name, marks=pytest.mark.slow) for name in FORMATS],
+    [
+        name if name in COMMON else pytest.param(name, marks=pytest.mark.slow)
+        for name in FORMATS
+    ],
 )
 def test_damage_ends_in_a_good_read_or_in_one_sentence(
     kind, subject, smpl_file, smplx_file, tmp_path
@@ -121,7 +128,9 @@ def test_damage_ends_in_a_good_read_or_in_one_sentence(
         files = sorted(path for path in root.rglob("*") if path.is_file())
         # pictures are many: the few other files get every second blow
         small = [path for path in files if path.suffix not in (".jpg", ".png")]
-        done = (swap if number // 2 % 3 == 2 else spoil)(small if number % 2 else files, rng)
+        done = (swap if number // 2 % 3 == 2 else spoil)(
+            small if number % 2 else files, rng
+        )
         try:
             with watched():
                 read_all(root, reader, model)
@@ -130,8 +139,12 @@ def test_damage_ends_in_a_good_read_or_in_one_sentence(
             sentence = str(error)
             refused += 1
         except Exception as error:
-            raise AssertionError(f"{type(error).__name__} after {done}: {error}") from error
+            raise AssertionError(
+                f"{type(error).__name__} after {done}: {error}"
+            ) from error
         assert sentence, done
         assert "\n" not in sentence, done
         shutil.rmtree(root)
-    assert refused > ROUNDS // 5, "hardly anything was refused: is the damage still any?"
+    assert refused > ROUNDS // 5, (
+        "hardly anything was refused: is the damage still any?"
+    )

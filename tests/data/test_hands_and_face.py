@@ -33,10 +33,16 @@ def test_skeletons_have_33_or_75_or_105_joints_in_metres(tmp_path, unit, per_met
     extra = write_hands(root, 4, per_metre), write_face(root, 4, per_metre)
     joints = np.concatenate([skeletons(4), *extra], axis=1)
     heights = set()
-    for skeleton, count in (("mediapipe33", 33), ("mediapipe33_hands", 75), ("holistic", 105)):
+    for skeleton, count in (
+        ("mediapipe33", 33),
+        ("mediapipe33_hands", 75),
+        ("holistic", 105),
+    ):
         settings = HANDS | {"skeleton": skeleton}
         for number, frame in zip((0, 2), two_frames(root, settings), strict=True):
-            np.testing.assert_allclose(frame.skeleton[0], joints[number, :count], atol=1e-6)
+            np.testing.assert_allclose(
+                frame.skeleton[0], joints[number, :count], atol=1e-6
+            )
             assert frame.visibility.tolist() == [[1.0] * count]
         info = GsganData(str(root), **settings).info
         assert info.skeleton == skeleton
@@ -84,7 +90,9 @@ def test_the_face_at_rest_is_the_median_of_the_training_frames(root):
     face = np.array(GsganData(str(root), **WHOLE).info.face)
     eyes, nose = [2, 5], 0
     middle = skeletons(4)[0, [7, 8, *eyes, nose]].mean(0)
-    np.testing.assert_allclose(np.ptp(face, axis=0), np.ptp(p[0], axis=0)[[0, 2, 1]], atol=0.012)
+    np.testing.assert_allclose(
+        np.ptp(face, axis=0), np.ptp(p[0], axis=0)[[0, 2, 1]], atol=0.012
+    )
     assert np.linalg.norm(face, axis=-1) == pytest.approx(
         np.linalg.norm(p[0] - middle, axis=-1), abs=1e-5
     )
@@ -98,7 +106,9 @@ def test_the_face_at_rest_is_the_median_of_the_training_frames(root):
         (WHOLE, "face3d.npz", "mediapipe33_hands"),
     ],
 )
-def test_captures_without_hands_or_a_face_are_refused_by_name(root, settings, file, instead):
+def test_captures_without_hands_or_a_face_are_refused_by_name(
+    root, settings, file, instead
+):
     write_hands(root, 4)
     write_face(root, 4)
     (root / file).unlink()
@@ -109,17 +119,30 @@ def test_captures_without_hands_or_a_face_are_refused_by_name(root, settings, fi
 
 def test_fitted_poses_have_their_fingers_with_hands_alone(root):
     write_hands(root, 4)
-    shape = {"coefficients": np.zeros(10), "stretch": np.ones(8), "offsets": np.zeros((33, 3))}
+    shape = {
+        "coefficients": np.zeros(10),
+        "stretch": np.ones(8),
+        "offsets": np.zeros((33, 3)),
+    }
     np.savez(root / "body_shape.npz", **shape)
-    poses = {"theta": np.zeros((4, 56, 3)), "transl": np.zeros((4, 3)), "frame_id": np.arange(4)}
+    poses = {
+        "theta": np.zeros((4, 56, 3)),
+        "transl": np.zeros((4, 3)),
+        "frame_id": np.arange(4),
+    }
     np.savez(root / "body_pose.npz", **poses)
-    with pytest.raises(ConfigError, match=r"made body_pose.npz without hands; run it again"):
+    with pytest.raises(
+        ConfigError, match=r"made body_pose.npz without hands; run it again"
+    ):
         assert GsganData(str(root), size=32, skeleton="mediapipe33_hands").layout
     assert GsganData(str(root), **HANDS).layout.poses is None  # to fit anew
     poses["transl"][:, 0] = 2.0
     with_hands = {"theta_hands": np.ones((4, 56, 3)), "transl_hands": np.ones((4, 3))}
     np.savez(root / "body_pose.npz", **poses, **with_hands)
-    for skeleton, value, x in (("mediapipe33", 0.0, 2.0), ("mediapipe33_hands", 1.0, 1.0)):
+    for skeleton, value, x in (
+        ("mediapipe33", 0.0, 2.0),
+        ("mediapipe33_hands", 1.0, 1.0),
+    ):
         body = GsganData(str(root), size=32, skeleton=skeleton).dataset("train")[0].body
         assert body.theta.unique().tolist() == [value]
         assert body.transl[0, 0] == x

@@ -18,12 +18,16 @@ def test_files_by_frame_are_a_mapping():
     assert list(files) == [3, 7, 12]
     assert 4 not in files
     assert 13 not in files
-    assert dict(files.without([7, 99])) == {f: f"images/cam/{names[f]}" for f in (3, 12)}
+    assert dict(files.without([7, 99])) == {
+        f: f"images/cam/{names[f]}" for f in (3, 12)
+    }
     assert not FrameFiles("images/cam", {})
 
 
 def test_items_are_a_sequence():
-    items = Items({"b": np.array([2, 5]), "none": np.array([], int), "a": np.array([5])})
+    items = Items(
+        {"b": np.array([2, 5]), "none": np.array([], int), "a": np.array([5])}
+    )
     pairs = [("b", 2), ("b", 5), ("a", 5)]
     assert list(items) == pairs
     assert [items[i] for i in (0, 1, 2, -1)] == [*pairs, pairs[-1]]
@@ -43,13 +47,17 @@ def test_headers_of_large_captures_are_checked_in_steps(tmp_path, monkeypatch):
     check = validation.check_image
     monkeypatch.setattr(validation, "MOST_HEADERS", 5)
     monkeypatch.setattr(
-        validation, "check_image", lambda path, *rest: (read.append(path), check(path, *rest))
+        validation,
+        "check_image",
+        lambda path, *rest: (read.append(path), check(path, *rest)),
     )
     read_capture(root)
     assert len([path for path in read if "images" in path.parts]) == 6  # every fourth
 
 
-@pytest.mark.parametrize("place", ["images/cam00/000001.png", "images/cam00", "landmarks3d.npz"])
+@pytest.mark.parametrize(
+    "place", ["images/cam00/000001.png", "images/cam00", "landmarks3d.npz"]
+)
 def test_links_out_of_a_dataset_are_refused(tmp_path, place):
     root = write_tiny_capture(tmp_path / "c")
     (root / place).rename(tmp_path / "elsewhere")

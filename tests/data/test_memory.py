@@ -13,8 +13,10 @@ from gsgan.data.formats.capture import read_capture
 from gsgan.data.layout import Layout
 
 MIB = 2**20
-STATM = Path("/proc/self/statm")  # Linux; elsewhere what Python itself allocates is measured
-WARM, READ = 24, 192  # pictures, before the first look at the memory and between the two
+# Linux; elsewhere what Python itself allocates is measured
+STATM = Path("/proc/self/statm")
+# pictures, before the first look at the memory and between the two
+WARM, READ = 24, 192
 CACHE = 2 * MIB
 
 

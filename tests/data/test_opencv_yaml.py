@@ -8,7 +8,9 @@ from gsgan.data.calibration import MAX_YAML_BYTES, read_opencv_yaml
 from gsgan.utils.errors import DataError
 
 HEAD = "%YAML:1.0\n---\n"
-MATRIX = "M: !!opencv-matrix\n   rows: 2\n   cols: 1\n   dt: d\n   data: [ 1., -2.5e-3 ]\n"
+MATRIX = (
+    "M: !!opencv-matrix\n   rows: 2\n   cols: 1\n   dt: d\n   data: [ 1., -2.5e-3 ]\n"
+)
 
 
 def test_opencvs_files_are_read_as_opencv_reads_them(tmp_path):
@@ -22,9 +24,13 @@ def test_opencvs_files_are_read_as_opencv_reads_them(tmp_path):
     assert found["H_1"] == "1920"
 
 
-@pytest.mark.parametrize("head", ["%YAML:1.0\r\n---\r\n", "%YAML 1.2\n---\n", "\ufeff%YAML:1.0\n"])
+@pytest.mark.parametrize(
+    "head", ["%YAML:1.0\r\n---\r\n", "%YAML 1.2\n---\n", "\ufeff%YAML:1.0\n"]
+)
 def test_heads(tmp_path, head):
-    (tmp_path / "a.yml").write_bytes((head + "names:\n- 002\n" + MATRIX + "...\n").encode())
+    (tmp_path / "a.yml").write_bytes(
+        (head + "names:\n- 002\n" + MATRIX + "...\n").encode()
+    )
     found = read_opencv_yaml(tmp_path / "a.yml")
     assert found["names"] == ["002"]  # unquoted numbers stay the names they are
     np.testing.assert_array_equal(found["M"], [[1], [-0.0025]])

@@ -77,7 +77,9 @@ def test_labels_go_through_their_table(grey):
     table[0], table[1], table[200] = 0, 2, 1
     labels = read_labels(grey, PixelRules(label_table=tuple(table)), ["none", "a", "b"])
     assert np.array_equal(labels, [[0, 2, 255], [255, 1, 255]])
-    with pytest.raises(DataError, match=r"grey.png holds the label 200; the dataset names 2 "):
+    with pytest.raises(
+        DataError, match=r"grey.png holds the label 200; the dataset names 2 "
+    ):
         read_labels(grey, RULES, ["none", "a"])
 
 

@@ -14,10 +14,14 @@ from gsgan.data.splits import parse_frames, protocol_splits
 from gsgan.utils.config import config_folder
 from gsgan.utils.errors import ConfigError, DataError
 
-NAMES = sorted({p.stem for p in (config_folder() / "protocol").glob("*.yaml")} - {"none"})
+NAMES = sorted(
+    {p.stem for p in (config_folder() / "protocol").glob("*.yaml")} - {"none"}
+)
 SCORED = {"zju_humannerf": 16, "paper_zju": 16, "zju_gauhuman": 17}  # frames a camera
 SCORED |= {"thuman4_posevocab": 500, "paper_thuman4": 500}
-ONE = Protocol("one", train_cameras=[0], test_cameras=None, train_frames="0-5", test_frames="0-9:4")
+ONE = Protocol(
+    "one", train_cameras=[0], test_cameras=None, train_frames="0-5", test_frames="0-9:4"
+)
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +61,9 @@ def test_one_camera_trains_and_the_others_test_every_fourth_frame(layout):
     assert tuple(splits.items["novel_view"]) == tuple(
         (f"cam0{c}", f) for c in (1, 2, 3) for f in (0, 4)
     )
-    assert tuple(splits.items["novel_pose"]) == tuple((f"cam0{c}", 8) for c in (1, 2, 3))
+    assert tuple(splits.items["novel_pose"]) == tuple(
+        (f"cam0{c}", 8) for c in (1, 2, 3)
+    )
     assert splits.reasons == {}
 
 
@@ -70,9 +76,15 @@ def test_new_poses_seen_by_a_camera_that_trains(layout):
         test_frames="7-99",
     )
     splits = protocol_splits(layout, protocol)
-    assert tuple(splits.items["novel_pose"]) == (("cam02", 7), ("cam02", 8), ("cam02", 9))
+    assert tuple(splits.items["novel_pose"]) == (
+        ("cam02", 7),
+        ("cam02", 8),
+        ("cam02", 9),
+    )
     assert splits.reasons == {"novel_view": "protocol poses has none"}
-    assert "90 frames of protocol poses are not usable or do not exist: 10-99" in (splits.notes)
+    assert "90 frames of protocol poses are not usable or do not exist: 10-99" in (
+        splits.notes
+    )
 
 
 @pytest.mark.parametrize(
@@ -84,11 +96,31 @@ def test_new_poses_seen_by_a_camera_that_trains(layout):
             "protocol one requests camera 21; the capture has 4: cam00, cam01",
         ),
         ({"train_cameras": [-1]}, DataError, "requests camera -1"),
-        ({"test_cameras": ["cam9"]}, DataError, "requests camera cam9; the capture has 4: cam00"),
-        ({"test_cameras": [0]}, ConfigError, "frame 0 of camera cam00 is in both splits"),
-        ({"train_frames": "50-60"}, DataError, "nothing to train on with cameras cam00"),
-        ({"train_frames": {"377": "0-3"}}, ConfigError, "protocol.subject is None: the frames"),
-        ({"test_frames": "x"}, ConfigError, "protocol.test_frames must be frame numbers"),
+        (
+            {"test_cameras": ["cam9"]},
+            DataError,
+            "requests camera cam9; the capture has 4: cam00",
+        ),
+        (
+            {"test_cameras": [0]},
+            ConfigError,
+            "frame 0 of camera cam00 is in both splits",
+        ),
+        (
+            {"train_frames": "50-60"},
+            DataError,
+            "nothing to train on with cameras cam00",
+        ),
+        (
+            {"train_frames": {"377": "0-3"}},
+            ConfigError,
+            "protocol.subject is None: the frames",
+        ),
+        (
+            {"test_frames": "x"},
+            ConfigError,
+            "protocol.test_frames must be frame numbers",
+        ),
         ({"scale": 0}, ConfigError, "protocol.scale must be a number"),
         ({"train_cameras": None}, ConfigError, "both null; name one of them"),
     ],
@@ -110,7 +142,11 @@ def test_protocols_that_do_not_fit(layout, changes, error, message):
         ("lpips_channels", "RGB", "must be rgb or bgr; got 'RGB'"),
         ("region", "mask", "must be full or body_box_cleared or body_box; got 'mask'"),
         ("lpips_region", None, "must be full or mask_crop_512; got None"),
-        ("lpips_range", [0, 255], r"must be \[-1.0, 1.0\] or \[0.0, 1.0\]; got \(0, 255\)"),
+        (
+            "lpips_range",
+            [0, 255],
+            r"must be \[-1.0, 1.0\] or \[0.0, 1.0\]; got \(0, 255\)",
+        ),
         ("ssim_range", True, "must be 1.0 or 2.0; got True"),
     ],
 )
@@ -123,7 +159,10 @@ def test_measures_take_what_yaml_gives():
     assert MetricVariants(lpips_range=[0, 1]).lpips_range == (0.0, 1.0)
     assert MetricVariants(ssim_range=2).ssim_range == 2
     assert not MetricVariants().needs_body_box
-    assert all(getattr(MetricVariants(), name) == choices[0] for name, choices in CHOICES.items())
+    assert all(
+        getattr(MetricVariants(), name) == choices[0]
+        for name, choices in CHOICES.items()
+    )
 
 
 def test_frames_by_subject():
@@ -137,13 +176,17 @@ def test_frames_by_subject():
 def test_departures_are_said():
     same = replace(ONE, scale=0.5)
     assert list(same.departures(lpips_nets=["vgg"], scale=0.5)) == []
-    other = replace(ONE, measures=MetricVariants(background="white", lpips_range=(0, 1)))
+    other = replace(
+        ONE, measures=MetricVariants(background="white", lpips_range=(0, 1))
+    )
     said = list(other.departures(lpips_nets=["alex"], scale=0.25))
     assert said == [  # what the measures ask for is done
         "LPIPS is not computed with vgg, as requested (lpips.nets)",
         "images are scored at scale 0.25, requested: 1 (data.size)",
     ]
-    assert "cut round the person" in next(ONE.departures(lpips_nets=["vgg"], scale=None))
+    assert "cut round the person" in next(
+        ONE.departures(lpips_nets=["vgg"], scale=None)
+    )
     assert set(CHOICES) == set(ONE.record()["measures"])
 
 
@@ -159,7 +202,9 @@ def test_the_data_follows_the_protocol_and_records_it(root):
     whole = GsganData(str(root), protocol=ONE).protocol_record(["vgg"])
     assert whole["departures"] == []
     assert GsganData(str(root)).protocol_record(["vgg"]) is None
-    cut = GsganData(str(root), size=16, crop="person", protocol=ONE).protocol_record(["vgg"])
+    cut = GsganData(str(root), size=16, crop="person", protocol=ONE).protocol_record(
+        ["vgg"]
+    )
     assert len(cut["departures"]) == 1
 
 
@@ -184,5 +229,7 @@ def test_every_protocol_composes_and_is_whole(compose, name):
 def test_the_frames_of_zju_are_those_that_were_scored(compose):
     """ceil(n / 30) pictures a camera: the published counts."""
     config = compose("train", "data=capture", "protocol=zju_humannerf")
-    counts = {k: len(parse_frames(v, k)) for k, v in config.protocol.test_frames.items()}
+    counts = {
+        k: len(parse_frames(v, k)) for k, v in config.protocol.test_frames.items()
+    }
     assert counts == {377: 19, 386: 18, 387: 18, 392: 19, 393: 22, 394: 16}

@@ -22,8 +22,12 @@ def test_default_splits_hold_out_the_last_frames(layout):
     assert len(splits.items["train"]) == 24
     assert not splits.items["novel_view"]
     assert splits.reasons == {"novel_view": "no camera is held out (data.test_cameras)"}
-    assert set(splits.items["novel_pose"]) == {(c, f) for c in layout.cameras for f in (8, 9)}
-    assert make_splits(layout, test_share=0).reasons["novel_pose"].startswith("no frame")
+    assert set(splits.items["novel_pose"]) == {
+        (c, f) for c in layout.cameras for f in (8, 9)
+    }
+    assert (
+        make_splits(layout, test_share=0).reasons["novel_pose"].startswith("no frame")
+    )
 
 
 def test_splits_of_the_config_with_ranges_and_the_rest(layout):
@@ -33,8 +37,20 @@ def test_splits_of_the_config_with_ranges_and_the_rest(layout):
     assert set(splits.items["novel_view"]) == {("cam01", f) for f in (0, 1, 2, 5)}
     assert {f for _, f in splits.items["novel_pose"]} == {3, 4, 6, 7, 8, 9}
     assert splits.reasons == {}
-    assert make_splits(layout, train_cameras=["cam02"]).test_cameras == ("cam00", "cam01")
-    assert make_splits(layout, test_frames="4-5").train_frames == (0, 1, 2, 3, 6, 7, 8, 9)
+    assert make_splits(layout, train_cameras=["cam02"]).test_cameras == (
+        "cam00",
+        "cam01",
+    )
+    assert make_splits(layout, test_frames="4-5").train_frames == (
+        0,
+        1,
+        2,
+        3,
+        6,
+        7,
+        8,
+        9,
+    )
 
 
 def test_splits_of_meta_json_give_way_to_the_config(tmp_path):
@@ -51,14 +67,24 @@ def test_splits_of_meta_json_give_way_to_the_config(tmp_path):
 def test_frames_that_are_not_there_are_noted(layout):
     splits = make_splits(layout, train_frames="5-20", test_frames=[0, 99])
     assert (splits.train_frames, splits.test_frames) == ((5, 6, 7, 8, 9), (0,))
-    assert splits.notes == ("12 frames of the splits are not usable or do not exist: 10-20, 99",)
+    assert splits.notes == (
+        "12 frames of the splits are not usable or do not exist: 10-20, 99",
+    )
 
 
 @pytest.mark.parametrize(
     ("keys", "error", "message"),
     [
-        ({"train_cameras": ["cam9"]}, DataError, "has no camera cam9; it has cam00, cam01, cam02"),
-        ({"train_frames": "50-60"}, DataError, "nothing to train on .* 0 train frames; .* 0-9"),
+        (
+            {"train_cameras": ["cam9"]},
+            DataError,
+            "has no camera cam9; it has cam00, cam01, cam02",
+        ),
+        (
+            {"train_frames": "50-60"},
+            DataError,
+            "nothing to train on .* 0 train frames; .* 0-9",
+        ),
         ({"train_cameras": []}, DataError, "nothing to train on with cameras none"),
         (
             {"train_cameras": ["cam00"], "test_cameras": ["cam00"]},
@@ -66,9 +92,21 @@ def test_frames_that_are_not_there_are_noted(layout):
             "data.train_cameras and data.test_cameras share cam00",
         ),
         ({"train_frames": "0-5", "test_frames": "5-9"}, ConfigError, "share 5"),
-        ({"train_frames": "5-0"}, ConfigError, "data.train_frames must be frame numbers .*'5-0'"),
-        ({"test_frames": 0.5}, ConfigError, "data.test_frames must be frame numbers .* 0.5"),
-        ({"train_cameras": 1.5}, ConfigError, "data.train_cameras must be a list of camera names"),
+        (
+            {"train_frames": "5-0"},
+            ConfigError,
+            "data.train_frames must be frame numbers .*'5-0'",
+        ),
+        (
+            {"test_frames": 0.5},
+            ConfigError,
+            "data.test_frames must be frame numbers .* 0.5",
+        ),
+        (
+            {"train_cameras": 1.5},
+            ConfigError,
+            "data.train_cameras must be a list of camera names",
+        ),
         ({"test_share": 1.0}, ConfigError, r"data.test_share must be in \[0, 1\)"),
     ],
 )

@@ -31,7 +31,9 @@ def without_mouth(capture, tmp_path):
     return root
 
 
-def test_painting_takes_as_many_operators_without_a_mouth_as_with_one(build, without_mouth):
+def test_painting_takes_as_many_operators_without_a_mouth_as_with_one(
+    build, without_mouth
+):
     counts = []
     for overrides in ((), (f"data.root={without_mouth}",)):
         _, avatar, frame = build("effects=none", *overrides)
@@ -64,10 +66,13 @@ def test_looking_a_scene_over_holds_few_images_at_once(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("gpus", "processors", "expected"), [(0, 16, 0), (1, 16, 8), (1, 4, 3), (4, 16, 3), (2, 2, 0)]
+    ("gpus", "processors", "expected"),
+    [(0, 16, 0), (1, 16, 8), (1, 4, 3), (4, 16, 3), (2, 2, 0)],
 )
 def test_loading_processes_by_default(monkeypatch, gpus, processors, expected):
     monkeypatch.setattr("torch.cuda.is_available", lambda: gpus > 0)
     monkeypatch.setattr("torch.cuda.device_count", lambda: gpus)
-    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(processors)), raising=False)
+    monkeypatch.setattr(
+        "os.sched_getaffinity", lambda _: set(range(processors)), raising=False
+    )
     assert default_workers() == expected

@@ -16,7 +16,9 @@ from gsgan.prepare.landmarks import read_detections
 from gsgan.utils.errors import DataError
 
 REPORTS = Path(__file__).parents[3] / "shared" / "data" / "reports"
-needs_reports = pytest.mark.skipif(not REPORTS.is_dir(), reason="the shared files are not here")
+needs_reports = pytest.mark.skipif(
+    not REPORTS.is_dir(), reason="the shared files are not here"
+)
 SOFT = np.tile(np.arange(0, 256, 8, dtype=np.uint8), (24, 1))
 
 
@@ -92,7 +94,9 @@ def test_zeros_in_a_capture_are_missing(tmp_path):
 def write_frames(folder: Path, people: list) -> Path:
     folder.mkdir()
     for i in range(2):
-        (folder / f"cam_{i:06d}_keypoints.json").write_text(json.dumps({"people": people}))
+        (folder / f"cam_{i:06d}_keypoints.json").write_text(
+            json.dumps({"people": people})
+        )
     return folder
 
 
@@ -110,15 +114,21 @@ def test_null_people_are_nobody(tmp_path):
 
 
 def test_the_keys_of_2017_are_read_and_unknown_ones_named(tmp_path):
-    old = read_detections(write_frames(tmp_path / "old", [{"pose_keypoints": triples(25)}]))
-    new = read_detections(write_frames(tmp_path / "new", [{"pose_keypoints_2d": triples(25)}]))
+    old = read_detections(
+        write_frames(tmp_path / "old", [{"pose_keypoints": triples(25)}])
+    )
+    new = read_detections(
+        write_frames(tmp_path / "new", [{"pose_keypoints_2d": triples(25)}])
+    )
     np.testing.assert_array_equal(old.px, new.px)
     with pytest.raises(DataError, match=r"keypoints\.json.*found joints2d"):
         read_detections(write_frames(tmp_path / "other", [{"joints2d": triples(25)}]))
 
 
 def test_openposes_18_joints(tmp_path):
-    found = read_detections(write_frames(tmp_path / "coco", [{"pose_keypoints_2d": triples(18)}]))
+    found = read_detections(
+        write_frames(tmp_path / "coco", [{"pose_keypoints_2d": triples(18)}])
+    )
     # MediaPipe's nose, left shoulder, right wrist, left hip: OpenPose's 0, 5, 4, 11
     for landmark, joint in ((0, 0), (11, 5), (16, 4), (23, 11)):
         np.testing.assert_allclose(found.px[0, landmark], [10.5 + joint, 20.5 + joint])
@@ -138,7 +148,9 @@ def body_25b() -> tuple[np.ndarray, list[float]]:
 
 def test_body_25b_is_told_from_body_25_by_the_middle_of_the_hips(tmp_path):
     coco, person = body_25b()
-    found = read_detections(write_frames(tmp_path / "b", [{"pose_keypoints_2d": person}]))
+    found = read_detections(
+        write_frames(tmp_path / "b", [{"pose_keypoints_2d": person}])
+    )
     for landmark, joint in ((0, 0), (11, 5), (16, 10), (23, 11), (28, 16)):
         np.testing.assert_allclose(found.px[0, landmark], coco[joint] + 0.5)
     np.testing.assert_allclose(found.px[0, 32], [42.5, 102.5])  # the right big toe
@@ -150,6 +162,8 @@ def test_the_reported_detections():
     assert nobody.px.shape[0] > 0
     old = read_detections(REPORTS / "prepare" / "landmarks" / "old_keys" / "cam01_json")
     assert (old.conf[:, [11, 12, 23, 24]] > 0).all()
-    other = read_detections(REPORTS / "prepare" / "landmarks" / "body_25b" / "cam01_json")
+    other = read_detections(
+        REPORTS / "prepare" / "landmarks" / "body_25b" / "cam01_json"
+    )
     both = np.isfinite(old.px).all(-1) & np.isfinite(other.px).all(-1)
     assert np.abs(old.px - other.px)[both].max() < 2  # the same person

@@ -27,13 +27,17 @@ NO_LOOK = Consistency(frames=0)
 
 
 def read(root: Path, smplx: Path | None, **settings: Any) -> Layout:
-    return Thuman4Reader(**settings)(root, Thresholds(), None if smplx is None else str(smplx))
+    return Thuman4Reader(**settings)(
+        root, Thresholds(), None if smplx is None else str(smplx)
+    )
 
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory, smplx_subject):
     """A subject with nothing missing; do not write into it."""
-    return write_thuman4(tmp_path_factory.mktemp("thuman4") / "subject00", smplx_subject)
+    return write_thuman4(
+        tmp_path_factory.mktemp("thuman4") / "subject00", smplx_subject
+    )
 
 
 def test_read_equals_written(written, smplx_subject, smplx_file):
@@ -51,11 +55,20 @@ def test_read_equals_written(written, smplx_subject, smplx_file):
     check_skeletons(layout, s, "smplx")
     for i, frame in enumerate(s.frames):
         face = s.params["expression"][i : i + 1].astype(np.float64)
-        theta, transl = layout.poses.theta[frame][None], layout.poses.transl[frame][None]
-        motion = SmplMotion(np.array([frame]), theta, transl, s.params["betas"].astype(float), face)
+        theta, transl = (
+            layout.poses.theta[frame][None],
+            layout.poses.transl[frame][None],
+        )
+        motion = SmplMotion(
+            np.array([frame]), theta, transl, s.params["betas"].astype(float), face
+        )
         assert np.allclose(posed(s.model, motion)[0][0], s.vertices[i], atol=1e-6)
     meta = layout.meta
-    assert (meta.skeleton_source, meta.up_axis, meta.fps) == ("smplx -> mediapipe33", "-z", 30)
+    assert (meta.skeleton_source, meta.up_axis, meta.fps) == (
+        "smplx -> mediapipe33",
+        "-z",
+        30,
+    )
     assert (meta.body.kind, meta.body.file) == ("smplx", str(smplx_file))
     assert np.allclose(meta.body.betas, s.params["betas"][0])
 
@@ -68,7 +81,9 @@ def test_hands_move_their_landmarks(root, smplx_file):
         lambda arrays: [arrays.pop(f"{s}_hand_pose") for s in ("left", "right")],
     )
     flat = read(root, smplx_file)
-    assert any("has no left_hand_pose and right_hand_pose" in note for note in flat.notes)
+    assert any(
+        "has no left_hand_pose and right_hand_pose" in note for note in flat.notes
+    )
     moved = np.linalg.norm(bent.landmarks.p[3] - flat.landmarks.p[3], axis=-1)
     moved[bent.landmarks.visibility[3] == 0] = 0  # stand-ins
     assert np.flatnonzero(moved > 2e-3).tolist() == [21, 22]
@@ -87,7 +102,12 @@ def test_only_the_first_row_of_betas_counts(root, smplx_subject, smplx_file):
 
 
 def test_listed_files_are_left_out(tmp_path, smplx_subject, smplx_file):
-    listed = ("images\\cam01\\00000002.jpg", "./cam02/00000003.jpg", "", "cam00/00000099.jpg")
+    listed = (
+        "images\\cam01\\00000002.jpg",
+        "./cam02/00000003.jpg",
+        "",
+        "cam00/00000099.jpg",
+    )
     root = write_thuman4(tmp_path / "s", smplx_subject, listed)
     layout = read(root, smplx_file)
     named = read_missing(root / "missing_img_files.txt", layout.cameras)
@@ -115,7 +135,9 @@ def test_frames_without_finite_parameters_are_dropped_and_named(root, smplx_file
     layout = read(root, smplx_file)
     assert layout.frames == (0, 2)
     assert any("NaN or infinity at frames 1" in note for note in layout.notes)
-    assert any("without a row in smpl_params.npz: 1, 3" in note for note in layout.notes)
+    assert any(
+        "without a row in smpl_params.npz: 1, 3" in note for note in layout.notes
+    )
 
 
 # --- masks --------------------------------------------------------------------------------------
@@ -126,7 +148,9 @@ def test_an_alpha_of_exactly_the_threshold_is_the_person(root, smplx_file):
     for value, expected in ((127, 0), (128, 255)):
         write_picture(path, np.full((44, 52), value, np.uint8))
         layout = read(root, smplx_file, consistency=NO_LOOK)
-        assert (read_mask(layout.mask_files("cam00", 0), layout.pixels) == expected).all()
+        assert (
+            read_mask(layout.mask_files("cam00", 0), layout.pixels) == expected
+        ).all()
 
 
 def test_the_unsure_band_is_an_option(root, smplx_file):
@@ -151,7 +175,9 @@ def test_the_unsure_band_is_an_option(root, smplx_file):
 
 
 def test_settings_out_of_range():
-    with pytest.raises(ConfigError, match="ignore_band must be a whole number of at least 0"):
+    with pytest.raises(
+        ConfigError, match="ignore_band must be a whole number of at least 0"
+    ):
         Thuman4Reader(ignore_band=-1)
     with pytest.raises(ConfigError, match="two rising alphas"):
         Thuman4Reader(ignore_alpha=(250, 5))

@@ -28,7 +28,8 @@ def poses():
 def test_the_training_poses_are_one_deviation_away_and_the_distance_is_linear(poses):
     steps = torch.tensor([0.0, 0.2, 0.4, 1.0]).double()
     found = poses.distance(moved(WRIST, steps))
-    torch.testing.assert_close(found, steps / 0.2 / 2**0.5)  # in one of the two directions
+    # in one of the two directions
+    torch.testing.assert_close(found, steps / 0.2 / 2**0.5)
 
 
 def test_a_direction_that_never_varied_counts_as_varying_by_the_noise(poses):

@@ -27,7 +27,9 @@ pytestmark = pytest.mark.usefixtures("model_once")
 
 
 def read(root: Path, smpl: Path | None, **settings: Any) -> Layout:
-    return ZjuReader(**settings)(root, Thresholds(), None if smpl is None else str(smpl))
+    return ZjuReader(**settings)(
+        root, Thresholds(), None if smpl is None else str(smpl)
+    )
 
 
 def frame_of(layout: Layout, camera: int, frame: int, **given: Any) -> Frame:
@@ -37,7 +39,9 @@ def frame_of(layout: Layout, camera: int, frame: int, **given: Any) -> Frame:
 @pytest.fixture(scope="module")
 def written(tmp_path_factory, subject):
     """The original release; do not write into it."""
-    return writers.write_original(tmp_path_factory.mktemp("zju") / "CoreView_377", subject)
+    return writers.write_original(
+        tmp_path_factory.mktemp("zju") / "CoreView_377", subject
+    )
 
 
 def test_the_original_release_is_read_as_it_was_written(written, subject, smpl_file):
@@ -57,7 +61,9 @@ def test_the_original_release_is_read_as_it_was_written(written, subject, smpl_f
 
 
 def test_scores_have_the_labels_that_training_ignores(subject, smpl_file, tmp_path):
-    plain = replace(subject, cameras=[replace(c, dist=np.zeros(5)) for c in subject.cameras])
+    plain = replace(
+        subject, cameras=[replace(c, dist=np.zeros(5)) for c in subject.cameras]
+    )
     root = writers.write_original(tmp_path / "s", plain)
     layout = read(root, smpl_file, ignore_band=5)
     item = (layout.camera_names[0], layout.frames[0])
@@ -69,8 +75,12 @@ def test_scores_have_the_labels_that_training_ignores(subject, smpl_file, tmp_pa
     assert torch.equal(trained[kept], scored[kept])
 
 
-def test_the_outline_of_the_labels_is_ignored_as_wide_as_asked(subject, smpl_file, tmp_path):
-    plain = replace(subject, cameras=[replace(c, dist=np.zeros(5)) for c in subject.cameras])
+def test_the_outline_of_the_labels_is_ignored_as_wide_as_asked(
+    subject, smpl_file, tmp_path
+):
+    plain = replace(
+        subject, cameras=[replace(c, dist=np.zeros(5)) for c in subject.cameras]
+    )
     root = writers.write_original(tmp_path / "s", plain)
     found = {}
     for band in (0, 3, 5):
@@ -97,7 +107,9 @@ def test_masks_are_joined_and_small_labels_are_not_thresholded(root, smpl_file):
     one[3, 4], other = 7, empty.copy()
     other[8, 9] = 1
     write_picture(root / "mask_cihp/Camera_B1/000002.png", one)
-    write_picture(root / "mask/Camera_B1/000002.png", np.repeat(other[..., None], 3, -1))
+    write_picture(
+        root / "mask/Camera_B1/000002.png", np.repeat(other[..., None], 3, -1)
+    )
     layout = read(root, smpl_file)
     mask = read_mask(layout.mask_files("Camera_B1", 2), layout.pixels)
     assert (mask == 255).sum() == 2
@@ -177,7 +189,9 @@ def test_labels_beyond_cihp_are_ignored(root, smpl_file):
 # -- runs
 
 
-def test_the_config_trains_with_segmentation_on_cihp_labels(compose, written, smpl_file):
+def test_the_config_trains_with_segmentation_on_cihp_labels(
+    compose, written, smpl_file
+):
     from gsgan.model.runs import build_avatar, build_data
 
     config = compose(
@@ -203,7 +217,9 @@ def test_the_config_trains_with_segmentation_on_cihp_labels(compose, written, sm
 
 
 @pytest.mark.slow
-def test_a_run_is_scored_with_its_model_file_elsewhere(written, smpl_file, tmp_path, inside):
+def test_a_run_is_scored_with_its_model_file_elsewhere(
+    written, smpl_file, tmp_path, inside
+):
     first, now, run = (
         tmp_path / smpl_file.name,
         tmp_path / "moved" / smpl_file.name,
@@ -220,7 +236,9 @@ def test_a_run_is_scored_with_its_model_file_elsewhere(written, smpl_file, tmp_p
     first.rename(now)
     gone = inside("evaluate", f"run={run}")
     assert gone.returncode != 0
-    assert f"{first} does not exist, the body model file of" in " ".join(gone.stderr.split())
+    assert f"{first} does not exist, the body model file of" in " ".join(
+        gone.stderr.split()
+    )
     assert "data_smpl=<where it is now>" in " ".join(gone.stderr.split())
     (run / "metrics.json").unlink()
     found = inside("evaluate", f"run={run}", f"data_smpl={now}")

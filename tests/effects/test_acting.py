@@ -32,7 +32,11 @@ def parameters(avatar) -> int:
 
 @pytest.mark.parametrize(
     ("effect", "word", "adds"),
-    [("view_dependence", "1", True), ("antialias", "on", False), ("colour_correction", "on", True)],
+    [
+        ("view_dependence", "1", True),
+        ("antialias", "on", False),
+        ("colour_correction", "on", True),
+    ],
 )
 def test_off_builds_no_parameter_and_calls_no_operator(build, effect, word, adds):
     _, off, frame = build(NONE)
@@ -60,12 +64,14 @@ def test_the_mean_of_all_maps_is_the_identity_and_unseen_cameras_keep_theirs():
 def test_images_are_mapped_and_the_background_stays_black():
     colour = ColourCorrection(["a", "b"], ["a", "b"])
     with torch.no_grad():
-        colour.offsets[0, 0, 0], colour.offsets[0, 1, 3] = 0.4, 0.2  # red gain, green offset
+        # red gain, green offset
+        colour.offsets[0, 0, 0], colour.offsets[0, 1, 3] = 0.4, 0.2
     image, alpha = torch.zeros(2, 3, 4, 4), torch.zeros(2, 1, 4, 4)
     image[..., :2], alpha[..., :2] = 0.5, 1.0
     mapped = colour(image, alpha, torch.tensor([0, 1]))
     assert torch.equal(mapped[..., 2:], image[..., 2:])
-    assert mapped[0, :, 0, 0].tolist() == pytest.approx([0.6, 0.6, 0.5])  # halves: the mean stays
+    # halves: the mean stays
+    assert mapped[0, :, 0, 0].tolist() == pytest.approx([0.6, 0.6, 0.5])
 
 
 def test_correction_acts_on_both_pictures_and_leaves_f_alone(build):
@@ -78,7 +84,8 @@ def test_correction_acts_on_both_pictures_and_leaves_f_alone(build):
     assert torch.equal(after.features, before.features)
     torch.testing.assert_close(after.colour[:, 0], 1.25 * before.features[:, 0])
     torch.testing.assert_close(after.image[:, 0], 1.25 * before.image[:, 0])
-    unseen = avatar(*replace(frame, camera_index=torch.tensor([2])).inputs)  # cam02 is held out
+    # cam02 is held out
+    unseen = avatar(*replace(frame, camera_index=torch.tensor([2])).inputs)
     torch.testing.assert_close(unseen.image, before.image)
 
 
@@ -110,7 +117,8 @@ def test_decisions_are_stored_and_taken_up_again(capture, inside, tmp_path):
     assert re.search(r"colour_correction .*on", result.stdout)
     assert re.search(r"view_dependence .*1", result.stdout)
     checkpoint = read_checkpoint(folder / "checkpoints" / "last.ckpt")
-    assert checkpoint["state_dict"]["avatar.colour.offsets"].any()  # the maps were trained
+    # the maps were trained
+    assert checkpoint["state_dict"]["avatar.colour.offsets"].any()
     stored = checkpoint["gsgan"]["effects"]
     assert stored["view_dependence"]["value"] == 1
     assert stored["cameras"] == ["cam00", "cam01"]
@@ -151,11 +159,15 @@ def test_paintings_follow_the_lens_with_every_map(build, tmp_path):
     frame = data.dataset("novel_view")[0]
     with torch.no_grad():
         painting = avatar(*frame.inputs)
-        pinhole = avatar(*replace(frame, camera=replace(frame.camera, dist=None)).inputs)
+        pinhole = avatar(
+            *replace(frame, camera=replace(frame.camera, dist=None)).inputs
+        )
     for name in ("image", "features", "alpha", "splat_alpha"):
         assert getattr(painting, name).shape[-2:] == frame.image.shape[-2:]
         assert torch.isfinite(getattr(painting, name)).all()
-    assert 0 <= float(painting.splat_alpha.min()) <= float(painting.splat_alpha.max()) <= 1
+    assert (
+        0 <= float(painting.splat_alpha.min()) <= float(painting.splat_alpha.max()) <= 1
+    )
 
     def overlap(alpha: torch.Tensor) -> float:
         person, truth = alpha > 0.3, frame.mask > 0.5

@@ -46,16 +46,24 @@ def test_a_plain_scene_calls_for_what_it_always_had():
     ],
 )
 def test_each_call_turns_on_its_own_effect_and_no_other(change, effect, value):
-    before, after = decide(scene(), EffectSettings()), decide(scene(**change), EffectSettings())
+    before, after = (
+        decide(scene(), EffectSettings()),
+        decide(scene(**change), EffectSettings()),
+    )
     assert getattr(after, effect).value == value
-    assert {n for n in NAMES if getattr(before, n).value != getattr(after, n).value} == {effect}
+    assert {
+        n for n in NAMES if getattr(before, n).value != getattr(after, n).value
+    } == {effect}
 
 
 @pytest.mark.parametrize(
     ("change", "effect"),
     [
         # medians move with highlights: half of what is left explains as much
-        ({"surface": replace(ALIKE, difference=0.05, residual=0.12)}, "colour_correction"),
+        (
+            {"surface": replace(ALIKE, difference=0.05, residual=0.12)},
+            "colour_correction",
+        ),
         ({"surface": None}, "colour_correction"),
         ({"surface": None}, "view_dependence"),
         ({"surface": GLOSSY, "n_train_cameras": 1}, "view_dependence"),
@@ -80,7 +88,9 @@ def test_rendered_scales_are_two_rising_numbers(scales):
         EffectSettings(rendered_scales=scales)
 
 
-@pytest.mark.parametrize(("cameras", "degree"), [(2, 1), (3, 1), (4, 2), (7, 2), (8, 3), (30, 3)])
+@pytest.mark.parametrize(
+    ("cameras", "degree"), [(2, 1), (3, 1), (4, 2), (7, 2), (8, 3), (30, 3)]
+)
 def test_the_degree_follows_the_number_of_cameras(cameras, degree):
     glossy = scene(n_train_cameras=cameras, surface=GLOSSY)
     assert decide(glossy, EffectSettings()).degree == degree
@@ -89,7 +99,11 @@ def test_the_degree_follows_the_number_of_cameras(cameras, degree):
 @pytest.mark.parametrize(
     ("setting", "change", "why"),
     [
-        ({"distortion": "undistort"}, {}, "no camera of this data has a lens coefficient"),
+        (
+            {"distortion": "undistort"},
+            {},
+            "no camera of this data has a lens coefficient",
+        ),
         ({"colour_correction": "on"}, {"n_train_cameras": 1}, "one training camera"),
         ({"body_points": "on"}, {"has_body_pose": False}, "no body pose"),
         ({"body_points": "on"}, {"body": "smpl"}, "no model file"),
@@ -106,7 +120,9 @@ def test_forcing_the_impossible_is_one_sentence_or_left_out(setting, change, why
 
 def test_a_lens_that_painting_does_not_know_is_refused_or_undistorted():
     rational = scene(has_distortion=True, has_rational_lens=True)
-    with pytest.raises(ConfigError, match=r"distortion=project is not possible: .*k4, k5, k6"):
+    with pytest.raises(
+        ConfigError, match=r"distortion=project is not possible: .*k4, k5, k6"
+    ):
         decide(rational, EffectSettings(distortion="project"))
     lenient = decide(rational, EffectSettings(distortion="project", impossible="off"))
     assert lenient.distortion.value == "undistort"
@@ -131,13 +147,19 @@ def test_a_list_leaves_lenses_to_their_own_word(word):
     ],
 )
 def test_an_effect_that_the_model_lacks_is_off_or_refused(model, effect, why):
-    auto = decide(scene(body_inside=1.0, scale_train=(51.0, 590.0)), EffectSettings(), model)
+    auto = decide(
+        scene(body_inside=1.0, scale_train=(51.0, 590.0)), EffectSettings(), model
+    )
     assert why in getattr(auto, effect).why
     assert not getattr(auto, effect).on
     forced = EffectSettings(**{effect: "on"})
-    with pytest.raises(ConfigError, match=rf"effects\.{effect}=on is not possible: .*{why}"):
+    with pytest.raises(
+        ConfigError, match=rf"effects\.{effect}=on is not possible: .*{why}"
+    ):
         decide(scene(), forced, model)
-    assert not getattr(decide(scene(), replace(forced, impossible="off"), model), effect).on
+    assert not getattr(
+        decide(scene(), replace(forced, impossible="off"), model), effect
+    ).on
 
 
 @pytest.mark.parametrize(
@@ -160,13 +182,15 @@ def test_configs_say_what_their_names_say(compose):
     from hydra.utils import instantiate
 
     auto, none, every = (
-        instantiate(compose("train", f"effects={name}").effects) for name in ("auto", "none", "all")
+        instantiate(compose("train", f"effects={name}").effects)
+        for name in ("auto", "none", "all")
     )
     assert auto == EffectSettings(
         degree_cameras=auto.degree_cameras
     )  # same values in code and yaml
     assert on(decide(scene(), none)) == set()
-    assert on(decide(scene(has_distortion=True), none)) == {"distortion"}  # the camera's own
+    # the camera's own
+    assert on(decide(scene(has_distortion=True), none)) == {"distortion"}
     found = on(decide(scene(has_distortion=True), every))
     assert found == set(CHOICES)
     assert on(decide(scene(), every)) == set(CHOICES) - {"distortion"}
@@ -175,7 +199,9 @@ def test_configs_say_what_their_names_say(compose):
 
 
 def test_forced_values_win_over_the_scene():
-    settings = EffectSettings(view_dependence=3, antialias=True, random_background=False)
+    settings = EffectSettings(
+        view_dependence=3, antialias=True, random_background=False
+    )
     found = decide(scene(), settings)
     assert found.degree == 3
     assert on(found) == {"view_dependence", "antialias"}
@@ -184,7 +210,12 @@ def test_forced_values_win_over_the_scene():
 
 
 def test_a_run_is_not_resumed_with_other_effects():
-    before, now = decide(scene(), EffectSettings()), decide(scene(darkest=1.0), EffectSettings())
+    before, now = (
+        decide(scene(), EffectSettings()),
+        decide(scene(darkest=1.0), EffectSettings()),
+    )
     before.check_same(before.plain())
-    with pytest.raises(ConfigError, match=r"effects\.random_background: the run began with on"):
+    with pytest.raises(
+        ConfigError, match=r"effects\.random_background: the run began with on"
+    ):
         now.check_same(before.plain())

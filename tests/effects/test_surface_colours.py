@@ -10,7 +10,9 @@ from gsgan.scene import Camera, Frame
 SIZE, RADIUS = 96, 0.5
 
 
-def ball(angle: float, moment: int, *, gain=(1.0, 1.0, 1.0), gloss: float = 0.0) -> Frame:
+def ball(
+    angle: float, moment: int, *, gain=(1.0, 1.0, 1.0), gloss: float = 0.0
+) -> Frame:
     """A ball of half a metre, lit from +x and textured, seen from 2.5 m away.
 
     gloss: brightness of a highlight round the direction to the camera (a light beside it).
@@ -21,18 +23,26 @@ def ball(angle: float, moment: int, *, gain=(1.0, 1.0, 1.0), gloss: float = 0.0)
     centre = -2.5 * forward
     K = np.array([[160.0, 0, SIZE / 2], [0, 160.0, SIZE / 2], [0, 0, 1]])
     v, u = np.mgrid[:SIZE, :SIZE] + 0.5
-    rays = np.stack([(u - SIZE / 2) / 160, (v - SIZE / 2) / 160, np.ones_like(u)], -1) @ R
+    rays = (
+        np.stack([(u - SIZE / 2) / 160, (v - SIZE / 2) / 160, np.ones_like(u)], -1) @ R
+    )
     a, b = (rays**2).sum(-1), rays @ centre
     root = b**2 - a * (centre @ centre - RADIUS**2)
     hit = root > 0
-    normal = (centre + rays * ((-b - np.sqrt(np.maximum(root, 0))) / a)[..., None]) / RADIUS
+    normal = (
+        centre + rays * ((-b - np.sqrt(np.maximum(root, 0))) / a)[..., None]
+    ) / RADIUS
     light = 0.3 + 0.4 * np.clip(normal[..., 0], 0, 1)
     texture = 1 + 0.1 * np.sin(4 * normal[..., 2] + moment)
     colour = (light * texture)[..., None] * np.array([1.0, 0.8, 0.7]) * np.array(gain)
     towards = np.clip(-(normal @ forward), 0, 1)
     colour += gloss * (towards[..., None] ** 30)
     image = np.where(hit[..., None], colour, 0).clip(0, 1)
-    joints = RADIUS * 0.5 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, -1]])
+    joints = (
+        RADIUS
+        * 0.5
+        * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, -1]])
+    )
     tensor = {
         name: torch.tensor(value, dtype=torch.float32)[None]
         for name, value in {"K": K, "R": R, "t": -R @ centre, "p": joints}.items()
@@ -48,7 +58,9 @@ def ball(angle: float, moment: int, *, gain=(1.0, 1.0, 1.0), gloss: float = 0.0)
     )
 
 
-def moments(angles=(0.0, 0.8, 1.6), count: int = 3, tint=None, **options) -> list[list[Frame]]:
+def moments(
+    angles=(0.0, 0.8, 1.6), count: int = 3, tint=None, **options
+) -> list[list[Frame]]:
     gains = tint or [(1.0, 1.0, 1.0)] * len(angles)
     return [
         [ball(a, m, gain=g, **options) for a, g in zip(angles, gains, strict=True)]
@@ -77,20 +89,26 @@ def test_highlights_are_what_is_left():
     assert glossy.residual > 2 * matt.residual
 
 
-@pytest.mark.parametrize("damage", ["far apart", "coarse", "few moments", "empty masks", "astray"])
+@pytest.mark.parametrize(
+    "damage", ["far apart", "coarse", "few moments", "empty masks", "astray"]
+)
 def test_without_shared_surface_nothing_is_claimed(damage):
     from dataclasses import replace
 
     frames = moments(angles=(0.0, np.pi)) if damage == "far apart" else moments()
     if damage == "coarse":
         frames = [
-            [replace(f, camera=replace(f.camera, K=f.camera.K * 0.3)) for f in m] for m in frames
+            [replace(f, camera=replace(f.camera, K=f.camera.K * 0.3)) for f in m]
+            for m in frames
         ]
     if damage == "few moments":
         frames = frames[:2]
     if damage == "empty masks":
-        frames = [[replace(f, mask=f.mask * 0, image=f.image * 0) for f in m] for m in frames]
-    if damage == "astray":  # a joint 1 km off: carving so wide a box would take all memory
+        frames = [
+            [replace(f, mask=f.mask * 0, image=f.image * 0) for f in m] for m in frames
+        ]
+    # a joint 1 km off: carving so wide a box would take all memory
+    if damage == "astray":
         joints = frames[0][0].skeleton.clone()
         joints[0, 0, 0] = 1000.0
         frames = [[replace(f, skeleton=joints) for f in m] for m in frames]

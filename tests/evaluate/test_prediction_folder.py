@@ -118,9 +118,13 @@ def person(value: int = 128, behind: int = 0) -> np.ndarray:
 def test_images_are_rgb_and_keep_their_alpha(tmp_path):
     found = one(tmp_path, person()).predict(frame(), ("cam", 3))
     assert not found.alphas
-    assert (found.images["full"][0, :, 2, 2] * 255).tolist() == pytest.approx([128, 20, 10])
+    assert (found.images["full"][0, :, 2, 2] * 255).tolist() == pytest.approx(
+        [128, 20, 10]
+    )
     alpha = np.full((*SIZE, 1), 51, np.uint8)
-    found = one(tmp_path, np.concatenate([person(), alpha], -1)).predict(frame(), ("cam", 3))
+    found = one(tmp_path, np.concatenate([person(), alpha], -1)).predict(
+        frame(), ("cam", 3)
+    )
     assert found.alphas["full"].aminmax() == pytest.approx((0.2, 0.2))
     assert float(found.images["full"][0, 0, 2, 2]) == pytest.approx(0.2 * 128 / 255)
 
@@ -130,23 +134,28 @@ def test_images_are_rgb_and_keep_their_alpha(tmp_path):
     [
         (person().astype(np.uint16) * 257, "16 bits"),
         (person()[..., 0], "grey"),
-        (person()[:5], r"is 8x5 pixels .* truth of camera cam, frame 3, as scored, has 8x6"),
+        (
+            person()[:5],
+            r"is 8x5 pixels .* truth of camera cam, frame 3, as scored, has 8x6",
+        ),
     ],
 )
 def test_images_of_another_kind_are_refused(tmp_path, pixels, message):
     one(tmp_path, pixels, "cam_3.png")
     expected = {"novel_pose": {("cam", 3): SIZE}}
     with pytest.raises(DataError, match=message):
-        read_folder(tmp_path, "{camera}_{frame}.png", expected, ["cam"], "black").predict(
-            frame(), ("cam", 3)
-        )
+        read_folder(
+            tmp_path, "{camera}_{frame}.png", expected, ["cam"], "black"
+        ).predict(frame(), ("cam", 3))
 
 
 @pytest.mark.parametrize("kept", [0, 20, 60, -20])
 @pytest.mark.parametrize("suffix", ["png", "jpg"])
 def test_truncated_files_are_refused(tmp_path, kept, suffix):
     name = f"3.{suffix}"
-    folder = one(tmp_path, np.random.default_rng(0).integers(0, 255, (*SIZE, 3), np.uint8), name)
+    folder = one(
+        tmp_path, np.random.default_rng(0).integers(0, 255, (*SIZE, 3), np.uint8), name
+    )
     path = tmp_path / name
     path.write_bytes(path.read_bytes()[:kept])
     with pytest.raises(DataError, match=name):
@@ -164,4 +173,5 @@ def test_an_unexpected_background_is_refused(tmp_path):
     with pytest.raises(DataError, match=r"has a black background, expected white"):
         one(tmp_path, person(), background="white").predict(frame(), ("cam", 3))
     one(tmp_path, person(behind=255), background="white").predict(frame(), ("cam", 3))
-    one(tmp_path, person(behind=90)).predict(frame(), ("cam", 3))  # bad, but not the other one
+    # bad, but not the other one
+    one(tmp_path, person(behind=90)).predict(frame(), ("cam", 3))

@@ -30,7 +30,9 @@ def test_the_box_is_round_the_posed_vertices_where_there_is_a_mesh(data):
     assert boxes.departures == []
     vertices = free_body().posed_vertices(frame.body)[0]
     assert torch.equal(boxes.corners(frame, 0), box_corners(vertices, VERTEX_MARGIN))
-    assert torch.equal(boxes.masks(frame)[0], box_mask(boxes.corners(frame, 0), frame.camera))
+    assert torch.equal(
+        boxes.masks(frame)[0], box_mask(boxes.corners(frame, 0), frame.camera)
+    )
 
 
 def test_else_it_is_round_the_seen_joints_with_a_larger_margin_and_says_so(data):
@@ -54,7 +56,8 @@ def test_else_it_is_round_the_seen_joints_with_a_larger_margin_and_says_so(data)
 @pytest.mark.parametrize("background", ["black", "white"])
 def test_what_is_painted_outside_the_box_is_cleared_and_only_there(data, background):
     prepare = Preparation(
-        MetricVariants(region="body_box_cleared", background=background), BodyBoxes(data)
+        MetricVariants(region="body_box_cleared", background=background),
+        BodyBoxes(data),
     )
     frame = data.dataset("train")[0]
     box = prepare.box(frame)
@@ -75,7 +78,9 @@ def test_the_truth_is_outlined_as_the_protocol_says(data):
     frame = GsganData(str(data.layout.root), size=20).dataset("train")[0]
     edge = (frame.mask > 0.05) & (frame.mask < 0.95)
     assert bool(edge.any())  # the outline of this data is soft
-    hard = Preparation(MetricVariants(truth_outline="hard", background="white"), None).target(frame)
+    hard = Preparation(
+        MetricVariants(truth_outline="hard", background="white"), None
+    ).target(frame)
     outside = (frame.mask < 0.5).expand_as(hard)
     assert bool((hard[outside] == 1).all())
     taken = (frame.image / frame.mask.clamp_min(1e-6)).clamp(0, 1)

@@ -40,7 +40,12 @@ def results(marks=("perceptual loss: stand-in",), boxes=None):
         "miou_with_background": 0.95,
         "images": 3, "marks": list(marks), "boxes": boxes,
     }  # fmt: skip
-    held = {"psnr_hands": 24.5, "ssim_hands": 0.9, "psnr_mouth": 26.25, "ssim_mouth": 0.92}
+    held = {
+        "psnr_hands": 24.5,
+        "ssim_hands": 0.9,
+        "psnr_mouth": 26.25,
+        "ssim_mouth": 0.92,
+    }
     scores |= held if boxes else no_scores(BOX_METRICS, "no hands")
     scores["cameras"] = {"cam07": dict.fromkeys(METRICS) | {"psnr": 29.5}}
     split = {"full": dict(scores), "splat": dict(scores), "floor": dict(scores)}
@@ -60,7 +65,12 @@ def test_every_table_shows_floor_mark_reason_and_what_was_scored():
         assert "psnr_mouth, ssim_mouth n/a: no hands" in text
         assert "novel_view: no camera is held out" in text
         assert "30.12" in text
-        for said in ("protocol zju_gauhuman", "my_377, 0123456789ab", "seed 3", "commit abc"):
+        for said in (
+            "protocol zju_gauhuman",
+            "my_377, 0123456789ab",
+            "seed 3",
+            "commit abc",
+        ):
             assert said in text
         assert "changed since" in text
 
@@ -72,7 +82,13 @@ def test_the_table_fits_a_hundred_columns(boxes):
     text = console.export_text()
     assert "…" not in text
     assert text.count("mIoU") == 1
-    for said in ("hands ↑", "mouth ↑", "24.50", "26.25", "boxes: hands: their landmarks"):
+    for said in (
+        "hands ↑",
+        "mouth ↑",
+        "24.50",
+        "26.25",
+        "boxes: hands: their landmarks",
+    ):
         assert (said in text) == (boxes is not None)
 
 
@@ -106,7 +122,13 @@ def test_notes_say_each_thing_once():
 def test_a_caption_names_what_is_not_known():
     from gsgan.evaluate.origin import caption
 
-    unknown = FACTS | {"model": None, "protocol": None, "seed": None, "commit": None, "dirty": None}
+    unknown = FACTS | {
+        "model": None,
+        "protocol": None,
+        "seed": None,
+        "commit": None,
+        "dirty": None,
+    }
     said = caption(unknown)
     assert "protocol none" in said
     assert "seed unknown" in said

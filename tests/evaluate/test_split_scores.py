@@ -11,7 +11,15 @@ from torchmetrics.classification import MulticlassJaccardIndex
 
 from gsgan.data.metric_variants import MetricVariants
 from gsgan.evaluate.predictions import FLOOR, FULL, SPLAT, Prediction, Preparation
-from gsgan.evaluate.scores import Scorer, confusion, image_scores, means, miou, painter, score_split
+from gsgan.evaluate.scores import (
+    Scorer,
+    confusion,
+    image_scores,
+    means,
+    miou,
+    painter,
+    score_split,
+)
 from gsgan.metrics.image import psnr, ssim, ssim_uniform
 from gsgan.model.rendering import Rendering
 from gsgan.scene import Frame
@@ -45,7 +53,9 @@ def test_means_by_camera_and_over_all():
     def predict(f: Frame, item: tuple[str, int]) -> Prediction:
         return Prediction({FULL: f.image + errors[item]}, {})
 
-    scores = score_split([(item, f) for item in errors], predict, scorer()).variants[FULL]
+    scores = score_split([(item, f) for item in errors], predict, scorer()).variants[
+        FULL
+    ]
     assert scores["psnr"] == pytest.approx(40.0, abs=1e-3)
     assert scores["images"] == 3
     cameras = scores["cameras"]
@@ -60,8 +70,12 @@ def test_only_the_inside_of_the_box_counts_where_a_protocol_says_so():
     measures = MetricVariants(region="body_box")
     result = image_scores(image, target, box=box, measures=measures)
     part = (..., slice(4, 14), slice(6, 20))
-    assert result["psnr"] == pytest.approx(float(psnr(image[part], target[part])), abs=1e-5)
-    assert result["ssim"] == pytest.approx(float(ssim(image[part], target[part])), abs=1e-6)
+    assert result["psnr"] == pytest.approx(
+        float(psnr(image[part], target[part])), abs=1e-5
+    )
+    assert result["ssim"] == pytest.approx(
+        float(ssim(image[part], target[part])), abs=1e-6
+    )
     unseen = image_scores(image, target, box=torch.zeros_like(box), measures=measures)
     both = means([result, unseen])  # unseen: counted, not averaged
     assert both["psnr_left_out"] == both["ssim_left_out"] == 1
@@ -94,14 +108,17 @@ def test_the_floor_of_a_split_is_the_background_and_its_psnr_is_known():
         assert found.variants[FLOOR]["psnr"] == pytest.approx(
             -10 * math.log10(power / 576), abs=1e-4
         )
-        assert found.variants[FULL]["psnr"] is None  # equal: its own alpha puts it on white too
+        # equal: its own alpha puts it on white too
+        assert found.variants[FULL]["psnr"] is None
         assert found.rows[FULL][0]["psnr"] == math.inf
 
 
 def test_each_image_of_an_avatar_is_put_on_white_by_its_own_alpha():
     """I_pred is the truth; Step I's colour is it at half the alpha: 0.3 off, 0.15 at the edge."""
     f = person()
-    rendering = Rendering(f.image, f.mask, features=0.5 * f.image, splat_alpha=0.5 * f.mask)
+    rendering = Rendering(
+        f.image, f.mask, features=0.5 * f.image, splat_alpha=0.5 * f.mask
+    )
     avatar = Mock(return_value=rendering, segmentation=None)
     white = scorer(MetricVariants(background="white"))
     found = score_split([(("a", 0), f)], painter(avatar), white)
@@ -114,13 +131,30 @@ def test_each_image_of_an_avatar_is_put_on_white_by_its_own_alpha():
 def test_flicker_needs_consecutive_frames_of_one_camera_and_window():
     f, noise = person(), 0.1 * torch.ones(1, 3, 24, 24)
     moved = replace(f, camera=replace(f.camera, K=2 * f.camera.K))
-    items = [(("a", 0), f), (("a", 1), f), (("a", 3), f), (("b", 4), f), (("b", 5), moved)]
-    predict = Mock(side_effect=[Prediction({FULL: f.image + i % 2 * noise}, {}) for i in range(5)])
+    items = [
+        (("a", 0), f),
+        (("a", 1), f),
+        (("a", 3), f),
+        (("b", 4), f),
+        (("b", 5), moved),
+    ]
+    predict = Mock(
+        side_effect=[Prediction({FULL: f.image + i % 2 * noise}, {}) for i in range(5)]
+    )
     found = score_split(items, predict, scorer())
-    assert ["flicker" in row for row in found.rows[FULL]] == [False, True, False, False, False]
-    assert found.variants[FULL]["flicker"] == pytest.approx(0.1, abs=1e-2)  # rounded to 8 bits
+    assert ["flicker" in row for row in found.rows[FULL]] == [
+        False,
+        True,
+        False,
+        False,
+        False,
+    ]
+    # rounded to 8 bits
+    assert found.variants[FULL]["flicker"] == pytest.approx(0.1, abs=1e-2)
     assert found.variants[FLOOR]["flicker"] == 0  # the ground truth stands still
-    alone = score_split(items[:1], lambda f, _: Prediction({FULL: f.image}, {}), scorer())
+    alone = score_split(
+        items[:1], lambda f, _: Prediction({FULL: f.image}, {}), scorer()
+    )
     assert "consecutive" in alone.variants[FULL]["flicker_reason"]
 
 
@@ -129,7 +163,9 @@ def test_an_image_that_is_not_finite_is_an_error_that_names_it():
     broken = f.image.clone()
     broken[0, 0, 3, 3] = torch.nan
     with pytest.raises(GsganError, match=r"camera a, frame 0: 1 values .* not finite"):
-        score_split([(("a", 0), f)], lambda f, _: Prediction({FULL: broken}, {}), scorer())
+        score_split(
+            [(("a", 0), f)], lambda f, _: Prediction({FULL: broken}, {}), scorer()
+        )
 
 
 def segmentation(predicted: torch.Tensor, classes: int) -> torch.Tensor:
@@ -146,14 +182,20 @@ def test_miou_counts_classes_of_the_truth_only():
 
 def test_miou_is_torchmetrics_jaccard_index_over_the_split():
     generator = torch.Generator().manual_seed(0)
-    predicted, labels = (torch.randint(0, 4, (3, 9, 9), generator=generator) for _ in range(2))
+    predicted, labels = (
+        torch.randint(0, 4, (3, 9, 9), generator=generator) for _ in range(2)
+    )
     labels[:, 0] = 255
     maps = segmentation(predicted, 4)
     f = frame_of(torch.zeros(1, 3, 9, 9), torch.zeros(1, 1, 9, 9))
-    frames = [(("ab"[i > 0], i), replace(f, labels=labels[i : i + 1])) for i in range(3)]
+    frames = [
+        (("ab"[i > 0], i), replace(f, labels=labels[i : i + 1])) for i in range(3)
+    ]
     found = score_split(
         frames,
-        lambda f, item: Prediction({FULL: f.image}, {}, segmentation=maps[item[1]][None]),
+        lambda f, item: Prediction(
+            {FULL: f.image}, {}, segmentation=maps[item[1]][None]
+        ),
         scorer(),
     )
     whole = found.variants[FULL]
@@ -163,7 +205,9 @@ def test_miou_is_torchmetrics_jaccard_index_over_the_split():
         return each(predicted[images], labels[images])
 
     assert whole["miou"] == pytest.approx(float(jaccard(slice(3))[1:].mean()), abs=1e-6)
-    assert whole["miou_with_background"] == pytest.approx(float(jaccard(slice(3)).mean()), abs=1e-6)
+    assert whole["miou_with_background"] == pytest.approx(
+        float(jaccard(slice(3)).mean()), abs=1e-6
+    )
     first = pytest.approx(float(jaccard(slice(1))[1:].mean()), abs=1e-6)
     assert whole["cameras"]["a"]["miou"] == found.rows[FULL][0]["miou"] == first
 
@@ -172,7 +216,9 @@ def test_miou_of_a_split_without_parts_is_none():
     f = replace(person(), labels=torch.zeros(1, 24, 24, dtype=torch.long))
     parts = segmentation(f.labels, 3)
     found = score_split(
-        [(("a", 0), f)], lambda f, _: Prediction({FULL: f.image}, {}, segmentation=parts), scorer()
+        [(("a", 0), f)],
+        lambda f, _: Prediction({FULL: f.image}, {}, segmentation=parts),
+        scorer(),
     )
     assert found.variants[FULL]["miou"] is None
     assert found.variants[FULL]["miou_reason"] == "the ground truth has no part"

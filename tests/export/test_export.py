@@ -19,12 +19,20 @@ def test_a_sequence_of_ply_files_and_its_card(bare, tmp_path, inside):
     assert first[:3] == b"ply"
     assert first != second
     card = (out / "MODEL_CARD.md").read_text()
-    for part in ("Effects", "Scores on held-out images", "Intended use", "Licence", "Apache-2.0"):
+    for part in (
+        "Effects",
+        "Scores on held-out images",
+        "Intended use",
+        "Licence",
+        "Apache-2.0",
+    ):
         assert part in card
     assert "license: other" in card
     refused(inside("export", *given), "exists", "overwrite=true")
     (out / "notes.ply").write_text("mine")
-    again = inside("export", *given, "overwrite=true", "licence=cc-by-nc-4.0", "frames=1")
+    again = inside(
+        "export", *given, "overwrite=true", "licence=cc-by-nc-4.0", "frames=1"
+    )
     assert again.returncode == 0, again.stderr
     assert sorted(p.name for p in out.glob("*.ply")) == ["000004.ply", "notes.ply"]
     assert "license: cc-by-nc-4.0" in (out / "MODEL_CARD.md").read_text()
@@ -33,7 +41,11 @@ def test_a_sequence_of_ply_files_and_its_card(bare, tmp_path, inside):
 def test_a_file_in_place_of_a_folder_and_the_reverse(bare, tmp_path, inside):
     (tmp_path / "poses").write_text("mine")
     (tmp_path / "a.ply").mkdir()
-    cases = (("poses", "is a file"), ("a.ply", "is a folder"), ("poses/a.ply", "cannot be written"))
+    cases = (
+        ("poses", "is a file"),
+        ("a.ply", "is a folder"),
+        ("poses/a.ply", "cannot be written"),
+    )
     for name, words in cases:
         given = (f"run={bare}", f"out={tmp_path / name}", "overwrite=true")
         refused(inside("export", *given), words)
@@ -66,7 +78,11 @@ def test_safetensors_name_no_class_but_gsgans_own(run, tmp_path):
     path.write_bytes(content)
     assert load_weights(path).splats is not None
     target = b"gsgan.model.deformation.Deformation"
-    for other in (b"os.system", b"${oc.env:HOME}", b"gsgan.utils.files.write_atomically"):
+    for other in (
+        b"os.system",
+        b"${oc.env:HOME}",
+        b"gsgan.utils.files.write_atomically",
+    ):
         path.write_bytes(content.replace(target, other.ljust(len(target))))
         with pytest.raises(DataError, match="not a class of gsgan"):
             load_weights(path)
@@ -81,7 +97,11 @@ def test_verify_reads_a_file(tmp_path, inside):
     result = inside("export", f"verify={path}")
     assert result.returncode == 0, result.stderr
     assert "trainedAlgorithmicMedia" in result.stdout
-    refused(inside("export", f"verify={tmp_path / 'none.png'}"), "none.png", "cannot be read")
+    refused(
+        inside("export", f"verify={tmp_path / 'none.png'}"),
+        "none.png",
+        "cannot be read",
+    )
 
 
 @pytest.mark.parametrize(

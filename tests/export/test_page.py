@@ -41,10 +41,15 @@ PIXELS = """(camera) => {
 @pytest.fixture
 def avatar(build, tmp_path, dance, landmarks):
     """The folder of a page of random residuals that moves as ``dance``, and its run."""
-    data, avatar, _ = build("model=harmonic", "effects.body_points=on", "effects.view_dependence=1")
+    data, avatar, _ = build(
+        "model=harmonic", "effects.body_points=on", "effects.view_dependence=1"
+    )
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
-        for numbers in (*avatar.deformation.parameters(), *avatar.body_points.parameters()):
+        for numbers in (
+            *avatar.deformation.parameters(),
+            *avatar.body_points.parameters(),
+        ):
             numbers += 0.3 * torch.randn(numbers.shape, generator=generator)
     avatar.deformation.active_degree, avatar.window_margin = 1, None
     run = Run(tmp_path, None, {"scene": asdict(data.info)}, avatar.freeze())
@@ -66,8 +71,12 @@ def opened(chromium, avatar):
         made = chromium.new_page(viewport={"width": 400, "height": 400})
         pages.append(made)
         made.on("pageerror", lambda error: problems.append(str(error)))
-        made.on("console", lambda m: problems.append(m.text) if m.type == "error" else None)
-        made.on("request", lambda r: problems.append(r.url) if r.url != address else None)
+        made.on(
+            "console", lambda m: problems.append(m.text) if m.type == "error" else None
+        )
+        made.on(
+            "request", lambda r: problems.append(r.url) if r.url != address else None
+        )
         made.goto(address)
         until(made, "window.gsgan")
         made.evaluate("gsgan.run(false), gsgan.show(0)")
@@ -96,7 +105,9 @@ def cameras(centre: np.ndarray) -> list[Camera]:
         ahead = (centre - eye) / np.linalg.norm(centre - eye)
         right = np.cross(ahead, [0, 0, 1]) / np.linalg.norm(np.cross(ahead, [0, 0, 1]))
         R = np.stack([right, np.cross(ahead, right), ahead])
-        K = np.array([[1.2 * SIDE, 2, SIDE / 2 + 3], [0, 1.3 * SIDE, SIDE / 2], [0, 0, 1]])
+        K = np.array(
+            [[1.2 * SIDE, 2, SIDE / 2 + 3], [0, 1.3 * SIDE, SIDE / 2], [0, 0, 1]]
+        )
         given = (torch.from_numpy(x)[None].float() for x in (K, R, -R @ eye))
         found.append(Camera(*given, (SIDE, SIDE)))
     return found
@@ -105,7 +116,9 @@ def cameras(centre: np.ndarray) -> list[Camera]:
 def drawn(browser_page, camera: Camera) -> np.ndarray:
     """``[H, W, 3]``: what the page draws of its pose."""
     height, width = camera.size
-    plain = {name: getattr(camera, name)[0].flatten().tolist() for name in ("K", "R", "t")}
+    plain = {
+        name: getattr(camera, name)[0].flatten().tolist() for name in ("K", "R", "t")
+    }
     data = browser_page.evaluate(PIXELS, plain | {"width": width, "height": height})
     pixels = np.frombuffer(base64.b64decode(data), np.uint8)
     return pixels.reshape(height, width, 4)[::-1, :, :3] / 255
@@ -134,12 +147,15 @@ def test_poses_of_landmarks_are_the_solvers(opened, avatar, signing):
     made, run = opened(), avatar[1]
     for p in (signing[3], signing[3, :33], signing[8]):
         found = made.evaluate(
-            "p => gsgan.avatar.pose(p) && Array.from(gsgan.avatar.landmarks)", p.tolist()
+            "p => gsgan.avatar.pose(p) && Array.from(gsgan.avatar.landmarks)",
+            p.tolist(),
         )
         given = torch.from_numpy(p)[None].float()
         pose = run.avatar.body_pose(given, torch.ones(given.shape[:2]))
         body = run.body
-        truth = torch.cat([body.posed_landmarks(pose), body.posed_hands(pose)], dim=1)[0]
+        truth = torch.cat([body.posed_landmarks(pose), body.posed_hands(pose)], dim=1)[
+            0
+        ]
         np.testing.assert_allclose(np.array(found), truth, atol=1e-4)
     unseen = signing[3].copy()
     unseen[11] = np.nan
@@ -162,7 +178,9 @@ def test_a_dragged_hand_moves_as_in_the_viewer(opened, avatar):
     assert np.linalg.norm(after[15] - before[15]) > 0.1
     hand.press("ArrowUp")
     made.get_by_text("undo dragging").click()
-    np.testing.assert_allclose(made.evaluate("gsgan.avatar.landmarks"), before, atol=1e-6)
+    np.testing.assert_allclose(
+        made.evaluate("gsgan.avatar.landmarks"), before, atol=1e-6
+    )
     for name in ("right wrist", "left ankle", "head", "body"):
         made.evaluate("gsgan.show(0)")
         target = position(before, name) + np.array([0.1, -0.05, 0.12])
@@ -221,7 +239,9 @@ def served(avatar):
     """The address of the page's folder, with the library and the examples beside it."""
     for path in (WEB / "gsgan.js", EXAMPLES / "webcam.html"):
         shutil.copy(path, avatar[0])
-    handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=avatar[0])
+    handler = functools.partial(
+        http.server.SimpleHTTPRequestHandler, directory=avatar[0]
+    )
     handler.log_message = lambda *_: None
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
@@ -230,11 +250,15 @@ def served(avatar):
 
 
 @pytest.mark.parametrize("source", ["avatar.html", "avatar.bin"])
-def test_the_webcam_example_by_recorded_landmarks(chromium, served, avatar, landmarks, source):
+def test_the_webcam_example_by_recorded_landmarks(
+    chromium, served, avatar, landmarks, source
+):
     p = landmarks[7] - landmarks[7, 23:25].mean(0)
     as_mediapipe = 1.1 * np.stack([p[:, 0], -p[:, 2], p[:, 1]], axis=-1)
     frame = [dict(zip("xyz", x, strict=True)) for x in as_mediapipe.tolist()]
-    (avatar[0] / "landmarks.json").write_text(json.dumps({"fps": 30, "frames": [frame]}))
+    (avatar[0] / "landmarks.json").write_text(
+        json.dumps({"fps": 30, "frames": [frame]})
+    )
     made, problems = chromium.new_page(viewport={"width": 200, "height": 200}), []
     made.on("pageerror", lambda error: problems.append(str(error)))
     made.on("console", lambda m: problems.append(m.text) if m.type == "error" else None)
@@ -253,11 +277,17 @@ def test_the_script_is_built_from_its_sources(tmp_path):
     sources = [*sorted(WEB.glob("*.ts")), WEB / "solve.wasm"]
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
     built = (WEB / "gsgan.js").read_text()
-    assert built.startswith(f"// {digest}\n"), "run npm ci and npm run build in export/web"
+    assert built.startswith(f"// {digest}\n"), (
+        "run npm ci and npm run build in export/web"
+    )
     if ESBUILD.exists():
         command = json.loads((WEB / "package.json").read_text())["scripts"]["build"]
-        command = command.replace("outfile=gsgan.js", f"outfile={tmp_path / 'gsgan.js'}")
-        done = subprocess.run(f"{ESBUILD.parent}/{command}", shell=True, cwd=WEB, check=False)
+        command = command.replace(
+            "outfile=gsgan.js", f"outfile={tmp_path / 'gsgan.js'}"
+        )
+        done = subprocess.run(
+            f"{ESBUILD.parent}/{command}", shell=True, cwd=WEB, check=False
+        )
         assert done.returncode == 0
         assert (tmp_path / "gsgan.js").read_text() == built
 
@@ -279,7 +309,12 @@ def test_training_writes_the_page(on_body, tmp_path, inside):
     text = (on_body() / "avatar.html").read_text()
     assert "trainedAlgorithmicMedia" in text
     assert (on_body() / "avatar.MODEL_CARD.md").exists()
-    given = (f"run={on_body()}", "format=bin", "motion=[novel_pose,train]", "out=avatar.gsgan.bin")
+    given = (
+        f"run={on_body()}",
+        "format=bin",
+        "motion=[novel_pose,train]",
+        "out=avatar.gsgan.bin",
+    )
     result = inside("export", *given)
     assert result.returncode == 0, result.stderr
     assert (tmp_path / "avatar.gsgan.bin").stat().st_size < len(text)

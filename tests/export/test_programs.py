@@ -8,7 +8,12 @@ import torch
 from safetensors.torch import save_file
 
 import gsgan
-from gsgan.export.programs import PoseAndGenerator, onnx_program, torch_program, unfrozen
+from gsgan.export.programs import (
+    PoseAndGenerator,
+    onnx_program,
+    torch_program,
+    unfrozen,
+)
 from gsgan.export.weights import load_weights, weights_bytes
 from gsgan.model.stored import read_checkpoint
 from gsgan.utils.errors import ConfigError, DataError
@@ -26,7 +31,10 @@ MODELS = {
 
 def one_is_fast(*names: str) -> list:
     """The first; the others with the slow tests, for exporters take seconds."""
-    return [names[0], *(pytest.param(name, marks=pytest.mark.slow) for name in names[1:])]
+    return [
+        names[0],
+        *(pytest.param(name, marks=pytest.mark.slow) for name in names[1:]),
+    ]
 
 
 @pytest.fixture
@@ -52,7 +60,12 @@ def unet_inputs(avatar, frame) -> tuple[dict[str, torch.Tensor], list[torch.Tens
         found.update(zip(("omega", "joints"), given, strict=True))
 
     def unet(_, __, given):
-        names = {"F": "features", "S": "segmentation", "p2d": "skeleton", "alpha": "splat_alpha"}
+        names = {
+            "F": "features",
+            "S": "segmentation",
+            "p2d": "skeleton",
+            "alpha": "splat_alpha",
+        }
         if avatar.splat_channels == 0:
             names = {"F": "skeleton", "S": "segmentation"}
         found.update({names.get(name, name): value for name, value in given.items()})
@@ -63,7 +76,9 @@ def unet_inputs(avatar, frame) -> tuple[dict[str, torch.Tensor], list[torch.Tens
         painting = avatar(frame.skeleton, frame.visibility, frame.camera, frame.body)
     for hook in hooks:
         hook.remove()
-    given = {k: v.contiguous() for k, v in found.items() if k is not None and v is not None}
+    given = {
+        k: v.contiguous() for k, v in found.items() if k is not None and v is not None
+    }
     return given, [painting.image.clamp(0, 1), painting.alpha.clamp(0, 1)]
 
 
@@ -86,10 +101,14 @@ def test_onnx_paints_what_the_avatar_paints(model, painted):
     assert np.abs(got[0] - want[0].numpy()).max() < PARITY
 
 
-@pytest.mark.parametrize("model", one_is_fast("full", "supersampled", "image_to_image", "lbs"))
+@pytest.mark.parametrize(
+    "model", one_is_fast("full", "supersampled", "image_to_image", "lbs")
+)
 def test_torch_export_paints_what_the_avatar_paints(model, painted):
     avatar, frame = painted(*MODELS[model])
-    program = torch.export.load(io.BytesIO(torch_program(avatar, frame.camera.size))).module()
+    program = torch.export.load(
+        io.BytesIO(torch_program(avatar, frame.camera.size))
+    ).module()
     camera = frame.camera
     body = (frame.body.theta, frame.body.transl) if avatar.needs_body else ()
     with torch.no_grad():

@@ -45,10 +45,15 @@ def splats_and_truth(avatar, frame) -> tuple[Splats, Gaussians]:
 
 def read_ply(content: bytes) -> Gaussians:
     """As 3D Gaussian splatting's own reader: sigmoid, exp, harmonics channel by channel."""
-    raw = trimesh.load(io.BytesIO(content), "ply", process=False).metadata["_ply_raw"]["vertex"]
+    raw = trimesh.load(io.BytesIO(content), "ply", process=False).metadata["_ply_raw"][
+        "vertex"
+    ]
     assert raw["length"] == len(raw["data"]["x"])
     assert list(raw["properties"]) == NAMES
-    column = {name: torch.from_numpy(np.array(raw["data"][name]).reshape(-1)) for name in NAMES}
+    column = {
+        name: torch.from_numpy(np.array(raw["data"][name]).reshape(-1))
+        for name in NAMES
+    }
 
     def rows(*names: str) -> torch.Tensor:
         return torch.stack([column[name] for name in names], dim=-1)
@@ -88,7 +93,9 @@ def test_a_ply_read_back_is_the_gaussians(case, posed):
     known = truth.covariances[0].numpy()
     largest = np.abs(known).max(axis=(1, 2), keepdims=True)
     assert (np.abs(covariances(read) - known) / largest).max() < 2e-6
-    view = torch.nn.functional.normalize(truth.means - frame.camera.centre[:, None], dim=-1)
+    view = torch.nn.functional.normalize(
+        truth.means - frame.camera.centre[:, None], dim=-1
+    )
     colour = sh_to_colour(read.features.unflatten(-1, (16, 3)), view).clamp_min(0)
     # frames of a skinned body shear: their harmonics are fitted
     tolerance = 0.02 if case == "lbs" else 2e-5
@@ -116,7 +123,9 @@ def test_harmonics_turn_with_their_part():
     turns = torch.from_numpy(Rotation.random(5, random_state=0).as_matrix())[None]
     view = torch.randn(1, 5, 3, generator=generator, dtype=torch.float64)
     own = (turns.mT @ view[..., None])[..., 0]
-    torch.testing.assert_close(sh_to_colour(in_world(sh, turns), view), sh_to_colour(sh, own))
+    torch.testing.assert_close(
+        sh_to_colour(in_world(sh, turns), view), sh_to_colour(sh, own)
+    )
 
 
 def test_what_is_not_drawn_has_finite_numbers():
@@ -144,9 +153,9 @@ def test_a_glb_holds_the_same_gaussians(posed):
         accessor = gltf.accessors[at]
         view = gltf.bufferViews[accessor.bufferView]
         raw = gltf.binary_blob()[view.byteOffset : view.byteOffset + view.byteLength]
-        read[name.removeprefix("KHR_gaussian_splatting:")] = np.frombuffer(raw, "<f4").reshape(
-            accessor.count, -1
-        )
+        read[name.removeprefix("KHR_gaussian_splatting:")] = np.frombuffer(
+            raw, "<f4"
+        ).reshape(accessor.count, -1)
     harmonics = [f"SH_DEGREE_{l}_COEF_{m}" for l in range(3) for m in range(2 * l + 1)]
     assert set(read) == {"POSITION", "ROTATION", "SCALE", "OPACITY", *harmonics}
     np.testing.assert_array_equal(np.stack([read[n] for n in harmonics], 1), splats.sh)
@@ -155,6 +164,8 @@ def test_a_glb_holds_the_same_gaussians(posed):
     turn = Rotation.from_quat(read["ROTATION"]).as_matrix()  # x y z w, as glTF has it
     axes = turn * read["SCALE"][:, None]
     known = truth.covariances[0].numpy()
-    np.testing.assert_allclose(axes @ axes.transpose(0, 2, 1), known, atol=2e-6 * known.max())
+    np.testing.assert_allclose(
+        axes @ axes.transpose(0, 2, 1), known, atol=2e-6 * known.max()
+    )
     up = Rotation.from_quat(gltf.nodes[0].rotation).apply([0, -1, 0])
     np.testing.assert_allclose(up, [0, 1, 0], atol=1e-9)

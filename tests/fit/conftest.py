@@ -27,7 +27,9 @@ def people(tmp_path_factory):
     """Four cameras around a person, one held out, five frames, two held out, in centimetres; read
     only."""
     root = tmp_path_factory.mktemp("people")
-    return write_tiny_capture(root, cameras=4, frames=5, size=(96, 96), unit="cm", splits=SPLITS)
+    return write_tiny_capture(
+        root, cameras=4, frames=5, size=(96, 96), unit="cm", splits=SPLITS
+    )
 
 
 @pytest.fixture(scope="session")

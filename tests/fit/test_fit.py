@@ -39,12 +39,17 @@ def with_landmarks(people: Path, to: Path, change) -> Path:
 def ready(people: Path, compose, *overrides: str, turn: float = 0.0) -> Fitter:
     """A fitter of the training frames, whose solved poses are turned by noise (radians)."""
     config = compose("fit", f"data.root={people}", *QUICK, *overrides)
-    frames = MaskedFrames(instantiate(config.data, _convert_="all"), torch.device("cpu"))
+    frames = MaskedFrames(
+        instantiate(config.data, _convert_="all"), torch.device("cpu")
+    )
     body = shaped_body(fit_shape(frames.skeletons, frames.visibility))
     pose = Solver(body).solve(frames.skeletons, frames.visibility)
     noise = torch.randn(pose.theta.shape, generator=torch.Generator().manual_seed(0))
     return Fitter(
-        instantiate(config.fit), frames, body, BodyPose(pose.theta + turn * noise, pose.transl)
+        instantiate(config.fit),
+        frames,
+        body,
+        BodyPose(pose.theta + turn * noise, pose.transl),
     )
 
 
@@ -67,7 +72,10 @@ def test_held_out_frames_are_solved_by_their_skeleton(fitted, fit, people):
     assert np.abs(again["theta"][:3] - found["theta"][:3]).max() > 1e-3
     assert found["frame_id"].tolist() == [0, 1, 2, 3, 4]
     data = GsganData(str(fitted), size=48)
-    shape = {name: torch.from_numpy(x) for name, x in np.load(fitted / "body_shape.npz").items()}
+    shape = {
+        name: torch.from_numpy(x)
+        for name, x in np.load(fitted / "body_shape.npz").items()
+    }
     landmarks = data.layout.landmarks
     p = torch.from_numpy(np.stack([landmarks.p[f] for f in (3, 4)])).float()
     solved = Solver(shaped_body(BodyShape(**shape))).solve(p, torch.ones(2, 33))
@@ -83,14 +91,24 @@ def test_fingers_follow_the_hands_of_every_frame(people, fit, tmp_path):
     p = write_hands(root, 5, per_metre=100)
     p[4] = np.nan
     write_hands(root, 5, p=100 * p)
-    found = fit("data.skeleton=mediapipe33_hands", "fit.sweeps=1", root=root, keep=False)
+    found = fit(
+        "data.skeleton=mediapipe33_hands", "fit.sweeps=1", root=root, keep=False
+    )
     plain = fit("fit.sweeps=1", root=root, name="plain", keep=False)
     with np.load(tmp_path / "out" / "body_shape.npz") as shape:
         assert shape["hands"].shape == (2, 2, 3)
         assert (np.linalg.norm(shape["hands"], axis=-1) > 0).any()
     names = shaped_body(free_space().neutral()).joint_names
-    fingers = [i for i, name in enumerate(names) if name.startswith("finger") and "1-1" not in name]
-    trunk = [i for i, n in enumerate(names) if n.startswith(("root", "spine", "neck", "upperleg"))]
+    fingers = [
+        i
+        for i, name in enumerate(names)
+        if name.startswith("finger") and "1-1" not in name
+    ]
+    trunk = [
+        i
+        for i, n in enumerate(names)
+        if n.startswith(("root", "spine", "neck", "upperleg"))
+    ]
     for one in (found, plain):  # a file serves both skeletons
         bent = np.linalg.norm(one["theta_hands"][:, fingers], axis=-1).max(-1)
         assert (bent[:4] > 0.05).all()  # held-out frames too
@@ -107,9 +125,13 @@ def test_what_is_written_is_read(fitted, people, compose):
     poses, stored = data.layout.poses, np.load(fitted / "body_pose.npz")
     assert poses.fitted
     np.testing.assert_allclose(frame.body.theta[0], stored["theta"][0], atol=1e-6)
-    np.testing.assert_allclose(frame.body.transl[0], 0.01 * stored["transl"][0], atol=1e-6)
+    np.testing.assert_allclose(
+        frame.body.transl[0], 0.01 * stored["transl"][0], atol=1e-6
+    )
     shape = BodyShape.of_flat(torch.tensor(data.info.betas))
-    np.testing.assert_allclose(shape.stretch, np.load(fitted / "body_shape.npz")["stretch"])
+    np.testing.assert_allclose(
+        shape.stretch, np.load(fitted / "body_shape.npz")["stretch"]
+    )
     assert fingerprint(plain) != fingerprint(data)
     report = json.loads((fitted / "body_fit.json").read_text())
     assert set(report["frames"]) == {"0", "1", "2"}
@@ -119,13 +141,18 @@ def test_what_is_written_is_read(fitted, people, compose):
     assert "fitted poses" not in training_record(config, plain)
 
 
-def test_scores_say_that_held_out_frames_were_registered(fitted, fit, people, compose, tmp_path):
+def test_scores_say_that_held_out_frames_were_registered(
+    fitted, fit, people, compose, tmp_path
+):
     config = compose("train", "data=capture", f"data.root={fitted}")
     assert not any(
-        "fitted" in mark for mark in make_scorer(config, GsganData(str(fitted)), []).marks
+        "fitted" in mark
+        for mark in make_scorer(config, GsganData(str(fitted)), []).marks
     )
     root = shutil.copytree(people, tmp_path / "both")
-    run_fit(compose("fit", f"data.root={root}", *QUICK, "fit.held_out=true", "fit.sweeps=1"))
+    run_fit(
+        compose("fit", f"data.root={root}", *QUICK, "fit.held_out=true", "fit.sweeps=1")
+    )
     marks = make_scorer(config, GsganData(str(root)), []).marks
     assert "body poses of 2 held-out frames fitted to their own masks" in marks
     other = GsganData(str(fitted), train_frames="0-1", test_frames="2-4")
@@ -147,7 +174,9 @@ def test_unseen_joints(fit, people, tmp_path):
     assert np.isfinite(found["theta"]).all()
 
 
-def test_a_fit_before_training_returns_the_data_with_its_poses(people, compose, tmp_path):
+def test_a_fit_before_training_returns_the_data_with_its_poses(
+    people, compose, tmp_path
+):
     data = GsganData(str(shutil.copytree(people, tmp_path / "plain")), size=48)
     assert data.lacks_body
     settings = compose("fit", *QUICK, "fit.sweeps=1").fit
@@ -160,7 +189,12 @@ def test_a_fit_before_training_reads_the_data_as_the_run_does(
     people, compose, tmp_path, monkeypatch
 ):
     given, fitted = [], {}
-    keys = {"cache_mb": 7, "min_joints": 20, "distortion": "project", "train_frames": "0-1"}
+    keys = {
+        "cache_mb": 7,
+        "min_joints": 20,
+        "distortion": "project",
+        "train_frames": "0-1",
+    }
     data = GsganData(str(shutil.copytree(people, tmp_path / "plain")), size=48, **keys)
 
     def fit_body(seen, settings, device):
@@ -181,7 +215,11 @@ def test_a_fit_before_training_reads_the_data_as_the_run_does(
 
 def test_of_two_processes_one_fits(people, fitted, compose, tmp_path, monkeypatch):
     """The second finds the poses that the first wrote while it waited."""
-    root, fits, waits = shutil.copytree(people, tmp_path / "both"), [], threading.Event()
+    root, fits, waits = (
+        shutil.copytree(people, tmp_path / "both"),
+        [],
+        threading.Event(),
+    )
     settings, device = compose("fit").fit, torch.device("cpu")
     datas = [GsganData(str(root), size=48) for _ in range(2)]
     assert all(data.lacks_body for data in datas)
@@ -228,7 +266,9 @@ def test_colours_are_not_used(fit, fitted, people, tmp_path):
 @pytest.mark.parametrize(
     "hole", ["no mask of a moment", "a bystander in a moment", "a crumb in one mask"]
 )
-def test_an_empty_mask_does_not_affect_other_frames(fit, people, tmp_path, capsys, hole):
+def test_an_empty_mask_does_not_affect_other_frames(
+    fit, people, tmp_path, capsys, hole
+):
     holed = shutil.copytree(people, tmp_path / "holed")
     whole = "moment" in hole
     for camera in ("cam00", "cam01", "cam02")[: 3 if whole else 1]:
@@ -281,7 +321,9 @@ def test_the_rims_of_an_undistorted_image_are_unsure(tmp_path):
     bent = write_tiny_capture(
         tmp_path / "bent", cameras=2, frames=2, size=(96, 96), dist=(0.3, 0, 0, 0, 0)
     )
-    frame = MaskedFrames(GsganData(str(bent), size=48), torch.device("cpu")).images(0)[0]
+    frame = MaskedFrames(GsganData(str(bent), size=48), torch.device("cpu")).images(0)[
+        0
+    ]
     assert float(frame.unsure[0, 0, 0, 0]) == 1
     assert float(frame.unsure[0, 0, 24, 24]) == 0
 
@@ -315,7 +357,11 @@ def test_poses_of_another_source_are_never_replaced(compose, capture):
 
 def test_other_formats_are_refused(compose, people, tmp_path):
     with pytest.raises(ConfigError, match="data=capture"):
-        run_fit(compose("fit", "data=zju_mocap", f"data.root={people}", f"out={tmp_path / 'a'}"))
+        run_fit(
+            compose(
+                "fit", "data=zju_mocap", f"data.root={people}", f"out={tmp_path / 'a'}"
+            )
+        )
 
 
 def test_a_truncated_shape_is_named(fitted, tmp_path):

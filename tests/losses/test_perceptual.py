@@ -72,7 +72,9 @@ def test_the_form_lpips_is_lpips():
 
     loss = Perceptual(net="alex", form="lpips")
     expected = build_lpips(["alex"])["alex"](picture(0), picture(1))
-    assert math.isclose(float(loss(picture(0), picture(1))), float(expected), rel_tol=1e-6)
+    assert math.isclose(
+        float(loss(picture(0), picture(1))), float(expected), rel_tol=1e-6
+    )
 
 
 @pytest.mark.parametrize(
@@ -113,7 +115,9 @@ def test_crops_are_whole_squares_around_pixels_of_the_person():
     assert cut[:, 2].unique().tolist() == [0, 1]
     top, left = cut[:, 0, 0, 0], cut[:, 1, 0, 0]
     steps = torch.arange(32.0)
-    assert torch.equal(cut[:, 0], (top[:, None, None] + steps[:, None]).expand(10, 32, 32))
+    assert torch.equal(
+        cut[:, 0], (top[:, None, None] + steps[:, None]).expand(10, 32, 32)
+    )
     assert torch.equal(cut[:, 1], (left[:, None, None] + steps).expand(10, 32, 32))
     assert ((top[:5] >= 40 - 16) & (top[:5] < 44 - 16)).all()
     assert (top[5:] == 0).all()
@@ -132,9 +136,13 @@ def test_each_pixel_of_the_person_is_drawn_alike():
 @pytest.mark.parametrize("draw", [0.0, 0.5, 1 - 1e-7])
 def test_small_images_and_images_without_a_person_are_cropped_too(draw):
     draws = torch.full((1, 1), draw)
-    small = crop_person([coordinates(1, 20, 100)], torch.ones(1, 1, 20, 100), draws, 32)[0]
+    small = crop_person(
+        [coordinates(1, 20, 100)], torch.ones(1, 1, 20, 100), draws, 32
+    )[0]
     assert small.shape == (1, 3, 20, 32)
-    nobody = crop_person([coordinates(1, 64, 64)], torch.zeros(1, 1, 64, 64), draws, 32)[0]
+    nobody = crop_person(
+        [coordinates(1, 64, 64)], torch.zeros(1, 1, 64, 64), draws, 32
+    )[0]
     assert nobody.shape == (1, 3, 32, 32)
 
 

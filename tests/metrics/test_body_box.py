@@ -67,7 +67,8 @@ def test_a_lens_bends_the_box_with_the_image():
     nothing = replace(pinhole, dist=torch.zeros(1, 5))
     assert torch.equal(box_mask(corners, nothing), box_mask(corners, pinhole))
     shown = distort(torch.tensor([[[0.8, 0.0], [0.8, 0.8]]]), lens)[0][0] * 100 + 100
-    assert seen[100].nonzero().amax() == int(shown[0, 0] - 0.5)  # last centre left of the side
+    # last centre left of the side
+    assert seen[100].nonzero().amax() == int(shown[0, 0] - 0.5)
     diagonal = seen.diagonal().nonzero().amax()
     assert diagonal == int(shown[1, 0] - 0.5)
     assert diagonal < seen[100].nonzero().amax()  # a barrel: corners are drawn in

@@ -26,7 +26,9 @@ def unprojected(pixels: torch.Tensor, depth: float = DEPTH) -> torch.Tensor:
     return torch.cat([xy, torch.full_like(xy[:, :1], depth)], dim=-1)
 
 
-def spread(u: tuple[float, float], v: tuple[float, float], count: int = 21) -> torch.Tensor:
+def spread(
+    u: tuple[float, float], v: tuple[float, float], count: int = 21
+) -> torch.Tensor:
     """Pixels on the diagonal of a rectangle."""
     share = torch.linspace(0, 1, count)[:, None]
     low, high = torch.tensor([u[0], v[0]]), torch.tensor([u[1], v[1]])
@@ -84,8 +86,11 @@ def test_an_unseen_hand_has_no_box_and_its_estimate_is_not_used():
     f = moved(unseen(signer(), RIGHT), RIGHT, -30)
     assert torch.equal(hands_and_mouth(f, TEMPLATE)[HANDS], LEFT_BOX)
     assert not hands_and_mouth(unseen(f, LEFT), TEMPLATE)[HANDS].any()
-    some = unseen(signer(), RIGHT, slice(LEFT.start + 15, LEFT.stop))  # 14 x 7 pixels are left
-    assert torch.equal(hands_and_mouth(some, TEMPLATE)[HANDS], rectangle((28, 39), (18, 36)))
+    # 14 x 7 pixels are left
+    some = unseen(signer(), RIGHT, slice(LEFT.start + 15, LEFT.stop))
+    assert torch.equal(
+        hands_and_mouth(some, TEMPLATE)[HANDS], rectangle((28, 39), (18, 36))
+    )
 
 
 def test_a_box_is_clipped_at_the_border_and_gone_beyond_it():
@@ -104,8 +109,12 @@ def test_no_mouth_from_behind_and_the_same_size_from_the_side():
     p[0, EARS] -= torch.tensor([0.0, 0.0, 0.3])
     assert not hands_and_mouth(replace(f, skeleton=p), TEMPLATE)[MOUTH].any()
     p = f.skeleton.clone()
-    p[0, CORNERS] = p[0, CORNERS].mean(dim=0) + torch.tensor([[0, 0, -0.1], [0, 0, 0.1]])
-    assert torch.equal(hands_and_mouth(replace(f, skeleton=p), TEMPLATE)[MOUTH], MOUTH_BOX)
+    p[0, CORNERS] = p[0, CORNERS].mean(dim=0) + torch.tensor(
+        [[0, 0, -0.1], [0, 0, 0.1]]
+    )
+    assert torch.equal(
+        hands_and_mouth(replace(f, skeleton=p), TEMPLATE)[MOUTH], MOUTH_BOX
+    )
 
 
 def test_lips_take_the_place_of_the_mouths_corners():
@@ -113,7 +122,8 @@ def test_lips_take_the_place_of_the_mouths_corners():
     lips = replace(TEMPLATE, names=(*TEMPLATE.names, "mouth_outer_0", "mouth_outer_6"))
     f.skeleton[0, 75:] = unprojected(spread((50, 62), (20, 28), 2))
     boxes = hands_and_mouth(f, lips)
-    assert torch.equal(boxes[MOUTH], rectangle((17, 31), (47, 65)))  # 25 % of 12 pixels: 3
+    # 25 % of 12 pixels: 3
+    assert torch.equal(boxes[MOUTH], rectangle((17, 31), (47, 65)))
     assert not hands_and_mouth(unseen(f, slice(75, 77)), lips)[MOUTH].any()
 
 
@@ -122,7 +132,10 @@ def test_a_lens_moves_the_boxes_with_the_landmarks():
     bent = replace(f.camera, dist=torch.tensor([[-0.3, 0.0, 0.0, 0.0, 0.0]]))
     boxes = hands_and_mouth(replace(f, camera=bent), TEMPLATE)
     pixels = bent.project(f.skeleton)[0][0, LEFT]
-    assert float((pixels - f.camera.project(f.skeleton)[0][0, LEFT]).norm(dim=-1).max()) > 1.5
+    assert (
+        float((pixels - f.camera.project(f.skeleton)[0][0, LEFT]).norm(dim=-1).max())
+        > 1.5
+    )
     low, high = pixels.amin(dim=0), pixels.amax(dim=0)
     margin = 0.15 * (high - low).max()
     (x0, y0), (x1, y1) = ((v - 0.5).tolist() for v in (low - margin, high + margin))
@@ -133,7 +146,9 @@ def test_a_lens_moves_the_boxes_with_the_landmarks():
 def scored(predicted: torch.Tensor, *frames: Frame, skeleton: str = NAME) -> dict:
     scorer = Scorer(Preparation(MetricVariants(), None, skeleton))
     items = [(("a", i), f) for i, f in enumerate(frames)]
-    return score_split(items, lambda *_: Prediction({FULL: predicted}, {}), scorer).variants[FULL]
+    return score_split(
+        items, lambda *_: Prediction({FULL: predicted}, {}), scorer
+    ).variants[FULL]
 
 
 def test_an_error_in_a_hands_box_counts_there_alone():

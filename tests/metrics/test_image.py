@@ -34,7 +34,9 @@ def pair(count: int = 3, size: int = 32) -> tuple[torch.Tensor, torch.Tensor]:
     shape = (count, 3, size, size + 5)
     target = torch.rand(shape, generator=generator, dtype=torch.float64)
     noise = torch.randn(shape, generator=generator, dtype=torch.float64)
-    scale = torch.tensor([0.02, 0.1, 0.5], dtype=torch.float64)[:count].view(-1, 1, 1, 1)
+    scale = torch.tensor([0.02, 0.1, 0.5], dtype=torch.float64)[:count].view(
+        -1, 1, 1, 1
+    )
     return (target + scale * noise).clamp(0, 1), target
 
 
@@ -46,10 +48,14 @@ def test_psnr_closed_form_and_one_score_per_image():
 
 def test_psnr_pooled_by_channel_is_the_mean_of_their_psnrs():
     image = (
-        torch.tensor([0.1, 0.01, 0.001], dtype=torch.float64).view(1, 3, 1, 1).expand(1, 3, 8, 8)
+        torch.tensor([0.1, 0.01, 0.001], dtype=torch.float64)
+        .view(1, 3, 1, 1)
+        .expand(1, 3, 8, 8)
     )
     target = torch.zeros_like(image)
-    assert float(psnr(image, target, pooling="channels")) == pytest.approx(40.0, abs=1e-9)
+    assert float(psnr(image, target, pooling="channels")) == pytest.approx(
+        40.0, abs=1e-9
+    )
     together = -10 * math.log10((1e-2 + 1e-4 + 1e-6) / 3)
     assert float(psnr(image, target)) == pytest.approx(together, abs=1e-9)
 
@@ -92,7 +98,9 @@ def test_uniform_ssim_is_its_definition_window_by_window(value_range):
             x, y = (v[c, i : i + 7, j : j + 7].ravel() for v in (a, b))
             (xx, xy), (_, yy) = np.cov(x, y)  # divides by 48
             top = (2 * x.mean() * y.mean() + c1) * (2 * xy + c2)
-            windows.append(top / ((x.mean() ** 2 + y.mean() ** 2 + c1) * (xx + yy + c2)))
+            windows.append(
+                top / ((x.mean() ** 2 + y.mean() ** 2 + c1) * (xx + yy + c2))
+            )
         scores.append(np.mean(windows))
     found = ssim_uniform(image, target, value_range=value_range)
     assert found.tolist() == pytest.approx(scores, abs=1e-9)
@@ -105,7 +113,8 @@ def test_the_persons_box_leaves_the_background_out():
     image[..., 5:15, 8:12] = 0.1
     box = person_box(mask)
     torch.testing.assert_close(psnr_where(image, target, box), torch.tensor([20.0]))
-    assert float(psnr(image, target)) == pytest.approx(20 + 10 * math.log10(10))  # 40 of 400 pixels
+    # 40 of 400 pixels
+    assert float(psnr(image, target)) == pytest.approx(20 + 10 * math.log10(10))
 
 
 def test_the_outline_is_left_out():
@@ -115,7 +124,9 @@ def test_the_outline_is_left_out():
     image[..., 5:7, :] = 0.5  # within two pixels of the outline
     image[..., 8:14, 8:14] = 0.1  # not
     error = 0.1**2 * 36 / 64  # 8 × 8 pixels of the box are left
-    assert float(psnr_inside(image, target, mask)[0]) == pytest.approx(-10 * math.log10(error))
+    assert float(psnr_inside(image, target, mask)[0]) == pytest.approx(
+        -10 * math.log10(error)
+    )
     assert math.isnan(float(psnr_inside(image, target, mask)[1]))
 
 
@@ -131,9 +142,9 @@ def test_ssim_of_chosen_pixels_is_its_map_there():
     image, target = pair(1)
     where = torch.zeros(1, 1, *image.shape[-2:], dtype=torch.bool)
     where[..., 8:20, 10:22] = True
-    _, full = StructuralSimilarityIndexMeasure(data_range=1.0, return_full_image=True).double()(
-        image, target
-    )
+    _, full = StructuralSimilarityIndexMeasure(
+        data_range=1.0, return_full_image=True
+    ).double()(image, target)
     expected = float(full[..., 8:20, 10:22].mean())
     inside, nowhere = ssim_where(image, target, where, torch.zeros_like(where))
     assert float(inside) == pytest.approx(expected, abs=1e-6)
@@ -149,7 +160,9 @@ def test_high_frequencies_of_known_waves():
 
     share = high_frequencies(picture(1.0, 0.5), picture(0.3, 1.0))  # energies 0.25 of 1
     torch.testing.assert_close(share, torch.tensor([0.25], dtype=torch.float64))
-    assert float(high_frequencies(picture(2.0, 1.0), picture(1.0, 1.0))) == pytest.approx(1.0)
+    assert float(
+        high_frequencies(picture(2.0, 1.0), picture(1.0, 1.0))
+    ) == pytest.approx(1.0)
     assert math.isnan(float(high_frequencies(picture(0, 0), picture(0, 0))))
 
 
@@ -171,11 +184,15 @@ def test_edge_ratio_counts_opencvs_edge_pixels():
     assert math.isnan(float(edge_scores(truth, torch.zeros_like(truth))[1]))
     image, target = (x.float() for x in pair(1))
     grey = [
-        cv2.cvtColor((x[0] * 255).round().byte().permute(1, 2, 0).numpy(), cv2.COLOR_RGB2GRAY)
+        cv2.cvtColor(
+            (x[0] * 255).round().byte().permute(1, 2, 0).numpy(), cv2.COLOR_RGB2GRAY
+        )
         for x in (image, target)
     ]
     counts = [int(np.count_nonzero(cv2.Canny(g, 100, 200))) for g in grey]
-    assert float(edge_scores(image, target)[1]) == pytest.approx(counts[0] / counts[1], abs=1e-9)
+    assert float(edge_scores(image, target)[1]) == pytest.approx(
+        counts[0] / counts[1], abs=1e-9
+    )
 
 
 def test_edges_in_the_persons_box_leave_out_those_elsewhere():
@@ -203,9 +220,13 @@ def test_flicker_is_the_change_of_the_error_in_the_box_of_both_frames():
     mask, later = (square(at)[:, :1] for at in (8, 12))
     truth = square(8), square(12)
     shifted = truth[0] + 0.1, truth[1] + 0.1  # an error that stays does not flicker
-    assert float(flicker(shifted[1], truth[1], later, (shifted[0], truth[0], mask))) < 1e-6
+    assert (
+        float(flicker(shifted[1], truth[1], later, (shifted[0], truth[0], mask))) < 1e-6
+    )
     image = truth[1] + 0.2 * mask * later  # in 8 x 8 of the 16 x 16 pixels round both
     found = float(flicker(image, truth[1], later, (truth[0], truth[0], mask)))
     assert found == pytest.approx(0.2 * 64 / 256, abs=1e-6)
     empty = torch.zeros_like(mask)
-    assert math.isnan(float(flicker(image, truth[1], empty, (truth[0], truth[0], empty))))
+    assert math.isnan(
+        float(flicker(image, truth[1], empty, (truth[0], truth[0], empty)))
+    )

@@ -63,13 +63,17 @@ def test_torchmetrics_distance_of_the_same_networks(networks):
 
     theirs = _LPIPS(net="alex", pnet_rand=True).eval()
     convolutions = [m for m in theirs.net.modules() if isinstance(m, torch.nn.Conv2d)]
-    ours = [m for m in networks["alex"].network.modules() if isinstance(m, torch.nn.Conv2d)]
+    ours = [
+        m for m in networks["alex"].network.modules() if isinstance(m, torch.nn.Conv2d)
+    ]
     for mine, other in zip(ours, convolutions, strict=True):
         other.load_state_dict(mine.state_dict())
     a, b = torch.rand(2, 3, 64, 72), torch.rand(2, 3, 64, 72)
     with torch.no_grad():
         expected = theirs(a, b, normalize=True).flatten()
-        torch.testing.assert_close(networks["alex"](a, b), expected, rtol=1e-5, atol=1e-7)
+        torch.testing.assert_close(
+            networks["alex"](a, b), expected, rtol=1e-5, atol=1e-7
+        )
 
 
 def test_equal_images_have_no_distance_and_a_black_one_is_finite(networks):
@@ -98,7 +102,9 @@ def test_the_persons_box_has_the_errors_near_it_alone(networks):
     assert scores(near)["lpips_alex_person"] > 10 * scores(far)["lpips_alex_person"]
     assert scores(near)["lpips_alex_person"] > 2 * scores(near)["lpips_alex"]
     assert scores(far)["lpips_alex"] > 0.005
-    nobody = LpipsAgainst(target, torch.zeros_like(mask), {"alex": networks["alex"]})(near)
+    nobody = LpipsAgainst(target, torch.zeros_like(mask), {"alex": networks["alex"]})(
+        near
+    )
     assert math.isnan(nobody["lpips_alex_person"])
     assert math.isfinite(nobody["lpips_alex"])
 
@@ -109,7 +115,9 @@ def test_a_box_as_large_as_the_image_has_nearly_its_score(networks):
     whole = torch.ones(1, 1, 96, 128)
     scores = LpipsAgainst(image, whole, networks)(changed(image)["blur"])
     for net in networks:
-        assert scores[f"lpips_{net}_person"] == pytest.approx(scores[f"lpips_{net}"], rel=1e-3)
+        assert scores[f"lpips_{net}_person"] == pytest.approx(
+            scores[f"lpips_{net}"], rel=1e-3
+        )
 
 
 def test_the_crop_is_what_the_network_sees(networks):
@@ -142,7 +150,9 @@ def test_channels_are_fed_in_the_requested_order(networks):
     found = {}
     for order in ("rgb", "bgr"):
         measures = MetricVariants(lpips_channels=order)
-        found[order] = LpipsAgainst(target, None, networks, measures)(image)["lpips_alex"]
+        found[order] = LpipsAgainst(target, None, networks, measures)(image)[
+            "lpips_alex"
+        ]
     with torch.no_grad():
         swapped = float(networks["alex"](image.flip(1), target.flip(1)))
     assert found["bgr"] == pytest.approx(swapped, abs=1e-6)

@@ -18,14 +18,18 @@ from gsgan.metrics.regions import (
 def test_a_premultiplied_image_lets_the_background_through():
     image = torch.tensor([0.3, 0.0, 0.0]).view(1, 1, 1, 3).expand(1, 3, 1, 3)
     alpha = torch.tensor([1.0, 0.5, 0.0]).view(1, 1, 1, 3)
-    assert on_background(image, alpha, 1.0)[0, 0, 0].tolist() == pytest.approx([0.3, 0.5, 1.0])
+    assert on_background(image, alpha, 1.0)[0, 0, 0].tolist() == pytest.approx(
+        [0.3, 0.5, 1.0]
+    )
     assert torch.equal(on_background(image, alpha, 0.0), image)
 
 
 def test_eight_bits():
     image = torch.tensor([0.0, 0.9 / 255, 1.2 / 255, 1.0]).view(1, 1, 1, 4)
     assert torch.equal(eight_bits(image, "none"), image)
-    rounded, cut = ((eight_bits(image, how) * 255).flatten().tolist() for how in ("rounded", "cut"))
+    rounded, cut = (
+        (eight_bits(image, how) * 255).flatten().tolist() for how in ("rounded", "cut")
+    )
     assert rounded == pytest.approx([0, 1, 1, 255])
     assert cut == pytest.approx([0, 0, 1, 255])
 
@@ -48,7 +52,10 @@ def test_a_hard_outline_is_the_image_as_it_was_taken():
     mask = torch.tensor([1.0, 0.5, 0.49, 0.0]).view(1, 1, 1, 4)
     found = hard_outline(taken * mask, mask)
     assert found[0, 0, 0].tolist() == pytest.approx([0.8, 0.8, 0.0, 0.0])
-    assert float(hard_outline(torch.ones(1, 3, 1, 1), torch.full((1, 1, 1, 1), 0.6)).max()) == 1.0
+    assert (
+        float(hard_outline(torch.ones(1, 3, 1, 1), torch.full((1, 1, 1, 1), 0.6)).max())
+        == 1.0
+    )
 
 
 def test_rectangle():
@@ -90,7 +97,9 @@ def test_the_crop_shrinks_as_opencv_interpolates():
     mask[0, 10:31, 12:33] = 1
     square = mask_crop(picture, mask, 1.0, margin=4, size=16)
     part = picture[:, 6:34, 8:36].permute(1, 2, 0).numpy()
-    expected = cv2.resize(np.ascontiguousarray(part), (16, 16), interpolation=cv2.INTER_LINEAR)
+    expected = cv2.resize(
+        np.ascontiguousarray(part), (16, 16), interpolation=cv2.INTER_LINEAR
+    )
     assert np.abs(square.permute(1, 2, 0).numpy() - expected).max() < 1e-5
 
 
@@ -100,7 +109,8 @@ def test_the_crop_shrinks_as_opencv_interpolates():
         ((10, 14, 20, 30), 1, (slice(10, 14), slice(20, 30))),
         ((10, 14, 20, 30), 16, (slice(4, 20), slice(17, 33))),
         ((0, 4, 36, 40), 16, (slice(0, 16), slice(24, 40))),  # pushed in at the border
-        ((10, 14, 20, 30), 64, (slice(0, 40), slice(0, 40))),  # as far as the picture reaches
+        # as far as the picture reaches
+        ((10, 14, 20, 30), 64, (slice(0, 40), slice(0, 40))),
     ],
 )
 def test_a_rectangle_is_widened_as_asked(box, least, expected):

@@ -49,13 +49,16 @@ def test_gradients_reach_every_trained_part(build):
     for part in ("deformation", "pose_encoder", "generator"):
         grads = [p.grad for p in getattr(avatar, part).parameters()]
         assert any(g is not None and float(g.abs().max()) > 0 for g in grads), part
-    assert all(p.grad is None for p in avatar.segmentation.parameters())  # trained on its own
+    # trained on its own
+    assert all(p.grad is None for p in avatar.segmentation.parameters())
 
 
 def test_a_missing_body_pose_is_solved_from_the_skeleton(build):
     _, avatar, frame = build()
     solved = avatar.body_pose(frame.skeleton, frame.visibility)
-    given, bare = (avatar(*dataclasses.replace(frame, body=b).inputs) for b in (solved, None))
+    given, bare = (
+        avatar(*dataclasses.replace(frame, body=b).inputs) for b in (solved, None)
+    )
     assert avatar.needs_body
     assert torch.equal(bare.segmentation, given.segmentation)
     assert (bare.segmentation != avatar(*frame.inputs).segmentation).any()
@@ -63,7 +66,10 @@ def test_a_missing_body_pose_is_solved_from_the_skeleton(build):
 
 @pytest.mark.parametrize(
     ("model", "absent"),
-    [("wo_seg", ["segmentation"]), ("splat_only", ["segmentation", "pose_encoder", "generator"])],
+    [
+        ("wo_seg", ["segmentation"]),
+        ("splat_only", ["segmentation", "pose_encoder", "generator"]),
+    ],
 )
 def test_what_is_off_builds_no_parameter(build, model, absent):
     _, avatar, frame = build(f"model={model}")
@@ -98,12 +104,15 @@ def test_segmentation_of_a_model_file(build, tiny, tmp_path):
     scene = dataclasses.replace(data.info, **bare, body_file=str(tmp_path / "smpl.pkl"))
     avatar = build_avatar(tiny(), scene)
     assert avatar.segmentation_why == "parts by the body's joints"
-    assert avatar.segmentation.common is not None  # this data has no labels to learn from
+    # this data has no labels to learn from
+    assert avatar.segmentation.common is not None
     pose = dataclasses.replace(frame.body, theta=torch.zeros(1, 24, 3))
     painting = avatar(*dataclasses.replace(frame, body=pose).inputs)
     assert painting.segmentation.shape[1] == 12  # no joint has hair
     assert avatar.segmentation.map.absent == ("hair",)
-    without = build_avatar(tiny("effects.body_points=off"), dataclasses.replace(data.info, **bare))
+    without = build_avatar(
+        tiny("effects.body_points=off"), dataclasses.replace(data.info, **bare)
+    )
     assert without.segmentation is None
     assert "no model file" in without.segmentation_why
 
@@ -115,7 +124,9 @@ def test_batches_are_independent(build):
     with torch.no_grad():
         avatar.window_margin = None
         both = avatar(*cat([frame, other]).inputs).image
-        torch.testing.assert_close(both[1:], avatar(*other.inputs).image, atol=2e-4, rtol=1e-4)
+        torch.testing.assert_close(
+            both[1:], avatar(*other.inputs).image, atol=2e-4, rtol=1e-4
+        )
 
 
 def test_the_deformation_follows_the_pose(build):
@@ -125,13 +136,20 @@ def test_the_deformation_follows_the_pose(build):
     assert not torch.equal(other.skeleton, frame.skeleton)
     moved = dataclasses.replace(frame, skeleton=other.skeleton, body=other.body)
     assert (
-        float((avatar(*frame.inputs).image - avatar(*moved.inputs).image).abs().max().detach())
+        float(
+            (avatar(*frame.inputs).image - avatar(*moved.inputs).image)
+            .abs()
+            .max()
+            .detach()
+        )
         > 0.01
     )
 
 
 def test_stability_overflowing_features_are_bounded(build):
-    _, avatar, frame = build("model.generator.feature_bound=10.0", "size.rgb_skip=false")
+    _, avatar, frame = build(
+        "model.generator.feature_bound=10.0", "size.rgb_skip=false"
+    )
     with torch.no_grad():
         avatar.deformation.table.fill_(1e30)
         painting = avatar(*frame.inputs)

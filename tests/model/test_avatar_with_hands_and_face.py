@@ -35,18 +35,26 @@ def signing(capture, tmp_path_factory):
 
 @pytest.fixture
 def made(build, signing):
-    return lambda *given: build(f"data.root={signing}", "data.skeleton=holistic", *given)
+    return lambda *given: build(
+        f"data.root={signing}", "data.skeleton=holistic", *given
+    )
 
 
 @pytest.fixture
 def handed(build, signing):
-    return lambda *given: build(f"data.root={signing}", "data.skeleton=mediapipe33_hands", *given)
+    return lambda *given: build(
+        f"data.root={signing}", "data.skeleton=mediapipe33_hands", *given
+    )
 
 
 @pytest.mark.parametrize("skeleton", ["holistic", "mediapipe33_hands"])
-@pytest.mark.parametrize("model", ["full", "wo_gcn", "splat_only", "image_to_image", "lbs_splat"])
+@pytest.mark.parametrize(
+    "model", ["full", "wo_gcn", "splat_only", "image_to_image", "lbs_splat"]
+)
 def test_every_model_takes_hands_and_a_face(build, signing, model, skeleton):
-    _, avatar, frame = build(f"data.root={signing}", f"data.skeleton={skeleton}", f"model={model}")
+    _, avatar, frame = build(
+        f"data.root={signing}", f"data.skeleton={skeleton}", f"model={model}"
+    )
     assert avatar.template.names == TEMPLATES[skeleton].names
     assert frame.skeleton.shape == (1, len(avatar.template.names), 3)
     with torch.no_grad():
@@ -61,7 +69,9 @@ def test_lips_that_move_by_5_mm_move_the_pose_codes_by_order_1(made, body_points
     _, avatar, frame = made(f"effects.body_points={body_points}")
     psi, valid = avatar.deformation, frame.visibility > 0
     taken = []
-    psi.from_pose.register_forward_pre_hook(lambda _, inputs: taken.append(inputs[0].detach()))
+    psi.from_pose.register_forward_pre_hook(
+        lambda _, inputs: taken.append(inputs[0].detach())
+    )
     inputs = []
     for lift in (0.0, 1.0):
         p = frame.skeleton.clone()
@@ -77,14 +87,23 @@ def test_lips_that_move_by_5_mm_move_the_pose_codes_by_order_1(made, body_points
     changes = [taken[1] - taken[0], *(b - a for a, b in zip(*inputs, strict=True))]
     for change in changes:
         change = change.reshape(105, -1)
-        torch.testing.assert_close(change[75:87].norm(dim=-1), torch.ones(12), atol=1e-3, rtol=0)
+        torch.testing.assert_close(
+            change[75:87].norm(dim=-1), torch.ones(12), atol=1e-3, rtol=0
+        )
         assert change[:75].abs().max() < 1e-5
 
 
-def test_a_run_with_a_face_is_trained_loaded_and_driven_without(inside, signing, tmp_path):
+def test_a_run_with_a_face_is_trained_loaded_and_driven_without(
+    inside, signing, tmp_path
+):
     """The face at rest is the person's own, from the checkpoint."""
     folder = tmp_path / "run"
-    given = (f"data.root={signing}", "data.skeleton=holistic", "evaluate=false", "model=wo_seg")
+    given = (
+        f"data.root={signing}",
+        "data.skeleton=holistic",
+        "evaluate=false",
+        "model=wo_seg",
+    )
     result = inside("train", *TINY, *given, f"hydra.run.dir={folder}")
     assert result.returncode == 0, result.stderr
     avatar = gsgan.load(folder, device="cpu")
@@ -92,7 +111,9 @@ def test_a_run_with_a_face_is_trained_loaded_and_driven_without(inside, signing,
     frame = data.dataset("train")[0]
     p, camera = frame.skeleton, frame.camera
     rest = torch.tensor(avatar.template.rest_positions)[FACE]
-    torch.testing.assert_close(_centred(rest), _centred(p[0, FACE])[:, [0, 2, 1]] * AXES)
+    torch.testing.assert_close(
+        _centred(rest), _centred(p[0, FACE])[:, [0, 2, 1]] * AXES
+    )
     lost = p.clone()
     lost[:, FACE] = torch.nan
     whole, bare = avatar.render(p, camera), avatar.render(lost, camera)
@@ -116,9 +137,12 @@ def test_fingers_move_what_is_on_the_body(handed):
     assert isinstance(avatar.body_points, BodyPoints)
     p, seen = frame.skeleton, frame.visibility
     with_hands = avatar.body_pose(p, seen).theta
-    without = avatar.body_pose(p, torch.cat([seen[:, :33], 0 * seen[:, HANDS]], 1)).theta
+    without = avatar.body_pose(
+        p, torch.cat([seen[:, :33], 0 * seen[:, HANDS]], 1)
+    ).theta
     off = (with_hands - without).norm(dim=-1)[0]
-    assert off.max() > 3 * off[free_body().joint_names.index("root")]  # the trunk leans little
+    # the trunk leans little
+    assert off.max() > 3 * off[free_body().joint_names.index("root")]
     moved = off > 0.15  # radians
     fingers = set(avatar.solver.fingers.joints.tolist())
     moved = set(moved.nonzero().flatten().tolist())

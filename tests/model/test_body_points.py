@@ -58,9 +58,13 @@ def test_a_turned_body_turns_points_and_frames(body):
 
 
 def test_a_shapes_last_bits_choose_no_other_points(body):
-    noise = 1 + 2e-7 * torch.randn(body.vertices.shape, generator=torch.Generator().manual_seed(0))
+    noise = 1 + 2e-7 * torch.randn(
+        body.vertices.shape, generator=torch.Generator().manual_seed(0)
+    )
     noisy = replace(body, vertices=body.vertices * noise)
-    points, same = (BodyPoints(b, 1.7, points=2000, controls=50).points for b in (body, noisy))
+    points, same = (
+        BodyPoints(b, 1.7, points=2000, controls=50).points for b in (body, noisy)
+    )
     chosen = points.chosen
     assert torch.equal(same.chosen, chosen)
     assert torch.equal(same.learnt.near, points.learnt.near)
@@ -103,14 +107,20 @@ def test_in_a_high_kick_stretched_shapes_reach_their_neighbours(body):
     kick.theta[0, body.joint_names.index("upperleg01.L"), 0] = -2.6
     points = placed(kick)
     assert torch.equal(points.means, BodyPoints(body, 1.7, stretch=False)(kick).means)
-    torch.testing.assert_close(placed(rest(body)).shapes, points.shapes * 0 + torch.eye(3))
+    torch.testing.assert_close(
+        placed(rest(body)).shapes, points.shapes * 0 + torch.eye(3)
+    )
     a, b = body.faces[:, 0], body.faces[:, 1]
     edge = (body.vertices[b] - body.vertices[a]).unsqueeze(-1)
     posed = (points.means[0, b] - points.means[0, a]).norm(dim=-1)
     pulled = posed > 1.5 * edge.norm(dim=1).squeeze()
     assert pulled.sum() > 100
-    reach = (points.shapes[0, a] @ edge).squeeze(-1).norm(dim=-1)[pulled] / posed[pulled]
-    plain = (points.frames[0, a] @ edge).squeeze(-1).norm(dim=-1)[pulled] / posed[pulled]
+    reach = (points.shapes[0, a] @ edge).squeeze(-1).norm(dim=-1)[pulled] / posed[
+        pulled
+    ]
+    plain = (points.frames[0, a] @ edge).squeeze(-1).norm(dim=-1)[pulled] / posed[
+        pulled
+    ]
     assert plain.median() < 0.6
     assert 0.85 < reach.median() < 1.15
 
@@ -134,16 +144,26 @@ def test_normals_point_out_of_the_posed_body(body):
     ("name", "A", "expected"),
     [
         ("sheared", [[1.0, 0, 0.7], [0, 1, 0], [0, 0, 1]], [0.0, 0, 1]),
-        ("flattened onto its tangent plane", [[1.0, 0, 0], [0, 1, 0], [0, 0, 0]], [0.0, 0, 1]),
+        (
+            "flattened onto its tangent plane",
+            [[1.0, 0, 0], [0, 1, 0], [0, 0, 0]],
+            [0.0, 0, 1],
+        ),
         ("flattened to a line", [[1.0, 0, 0], [0, 0, 0], [0, 0, 0]], [0.0, 0, 0]),
         ("shrunk to nothing", [[0.0, 0, 0], [0, 0, 0], [0, 0, 0]], [0.0, 0, 0]),
-        ("shrunk to a tenth", [[0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]], [0.0, 0, 0.7071]),
+        (
+            "shrunk to a tenth",
+            [[0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]],
+            [0.0, 0, 0.7071],
+        ),
     ],
 )
 def test_stability_normals_of_a_skin_that_is(name, A, expected):
     A = torch.tensor([[A]], requires_grad=True)
     normal = moved_normals(A, torch.tensor([[0.0, 0.0, 1.0]]))
-    torch.testing.assert_close(normal[0, 0].detach(), torch.tensor(expected), atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        normal[0, 0].detach(), torch.tensor(expected), atol=1e-4, rtol=0
+    )
     normal.sum().backward()
     assert torch.isfinite(A.grad).all()
 
@@ -183,7 +203,11 @@ def stored(module, folder):
 @pytest.mark.parametrize(
     ("part", "words", "said"),
     [
-        ("body_points", (ON, "effects.impossible=off", "model=wo_seg"), r"effects\.body_points=on"),
+        (
+            "body_points",
+            (ON, "effects.impossible=off", "model=wo_seg"),
+            r"effects\.body_points=on",
+        ),
         ("segmentation", ("effects.body_points=off",), "S"),
     ],
 )
@@ -209,13 +233,18 @@ def test_a_fitting_body_lies_in_its_mask_and_a_shifted_one_leaves_it(body):
     frame = GsganData(root=root, size=64).dataset("train")[0]
     exact = body_inside(frame, body)
     pose = frame.body
-    away = replace(frame, body=replace(pose, transl=pose.transl + torch.tensor([0.3, 0.3, 0])))
-    gone = replace(frame, body=replace(pose, transl=pose.transl + torch.tensor([0, 0, 50.0])))
+    away = replace(
+        frame, body=replace(pose, transl=pose.transl + torch.tensor([0.3, 0.3, 0]))
+    )
+    gone = replace(
+        frame, body=replace(pose, transl=pose.transl + torch.tensor([0, 0, 50.0]))
+    )
     assert exact > 0.99
     assert body_inside(away, body) < 0.8
     assert body_inside(gone, body) is None
     nobody = replace(frame, mask=torch.zeros_like(frame.mask))
-    assert body_inside(nobody, body) is None  # a mask that failed tells nothing of the pose
+    # a mask that failed tells nothing of the pose
+    assert body_inside(nobody, body) is None
     behind = replace(frame, skeleton=2 * frame.camera.centre[:, None] - frame.skeleton)
     assert body_inside(behind, body) == exact  # whatever the joints say
 
@@ -236,7 +265,9 @@ def test_what_is_the_models_is_not_the_accuracys_too(tiny, key):
         tiny(f"accuracy.{key}=1")
 
 
-@pytest.mark.parametrize(("amount", "most"), [(0.15, 1.0), (0.4, 2.5)], ids=["near", "far"])
+@pytest.mark.parametrize(
+    ("amount", "most"), [(0.15, 1.0), (0.4, 2.5)], ids=["near", "far"]
+)
 def test_normals_are_those_of_the_posed_mesh_part_by_part(body, amount, most):
     """Mean angle to the posed mesh's own normals, degrees; A alone is several times as far off."""
     torch.manual_seed(0)
@@ -254,7 +285,9 @@ def test_normals_are_those_of_the_posed_mesh_part_by_part(body, amount, most):
     for label in body.vertex_labels.unique():
         part = body.vertex_labels == label
         assert found[:, part].mean() < most, body.label_names[label]
-        assert found[:, part].mean() < 0.6 * before[:, part].mean(), body.label_names[label]
+        assert found[:, part].mean() < 0.6 * before[:, part].mean(), body.label_names[
+            label
+        ]
 
 
 def test_the_jacobian_is_that_of_the_learnt_weights(body):
@@ -286,7 +319,9 @@ def test_neighbours_of_a_subset_are_neighbours_on_the_surface(body):
     everything = torch.arange(len(body.vertices))
     edges = torch.cat([body.faces[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
     edges = torch.cat([edges, edges.flip(1)]).unique(dim=0)
-    assert torch.equal(neighbours_on_surface(body.vertices, body.faces, everything), edges)
+    assert torch.equal(
+        neighbours_on_surface(body.vertices, body.faces, everything), edges
+    )
     few = BodyPoints(body, 1.7, points=2000).points.chosen
     a, b = neighbours_on_surface(body.vertices, body.faces, few).T
     assert a.unique().numel() >= 1990  # an eye may have one point

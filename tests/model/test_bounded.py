@@ -20,14 +20,17 @@ def test_values_are_a_clamps():
 
 
 def test_beyond_a_bound_the_gradient_leads_back_and_never_further_out():
-    assert slopes(1.0) == [0, 1, 1, 1, 1]  # a step against it lowers x: from above, back in
+    # a step against it lowers x: from above, back in
+    assert slopes(1.0) == [0, 1, 1, 1, 1]
     assert slopes(-1.0) == [-1, -1, -1, -1, 0]
 
 
 def test_stability_an_opacity_and_a_scale_beyond_their_bounds_come_back():
     """Of Ψ: raw residuals far outside, a loss that wants them inside."""
     torch.manual_seed(0)
-    net = Deformation(torch.zeros(4, 3), 1.7, free_table=True, embedding=0, width=8, layers=2)
+    net = Deformation(
+        torch.zeros(4, 3), 1.7, free_table=True, embedding=0, width=8, layers=2
+    )
     points = points_of(torch.zeros(4, 3), torch.eye(3))
     sizes = net.parts
     at = sum(sizes[:3])
@@ -38,7 +41,10 @@ def test_stability_an_opacity_and_a_scale_beyond_their_bounds_come_back():
     gaussians = net.compose(
         points, net.residuals(points, pose, root, torch.eye(3)[None]), torch.ones(1, 3)
     )
-    (gaussians.opacities.sum() + gaussians.covariances.diagonal(dim1=-2, dim2=-1).sum()).backward()
+    (
+        gaussians.opacities.sum()
+        + gaussians.covariances.diagonal(dim1=-2, dim2=-1).sum()
+    ).backward()
     assert torch.isfinite(net.table.grad).all()
     assert (net.table.grad[:, 7:10] > 0).all()
     assert (net.table.grad[:, at] > 0).all()

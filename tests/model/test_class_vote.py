@@ -35,7 +35,9 @@ def plate(depth: float, half: float = 0.4, step: float = 0.05) -> torch.Tensor:
     """Points of a square that faces the camera."""
     line = torch.arange(-half, half + 1e-6, step)
     x, y = torch.meshgrid(line, line, indexing="xy")
-    return torch.stack([x.flatten(), y.flatten(), torch.full((x.numel(),), depth)], dim=-1)
+    return torch.stack(
+        [x.flatten(), y.flatten(), torch.full((x.numel(),), depth)], dim=-1
+    )
 
 
 def rigid(vertices: torch.Tensor) -> SkinnedBody:
@@ -51,7 +53,10 @@ def rigid(vertices: torch.Tensor) -> SkinnedBody:
 
 def picture(labels: torch.Tensor) -> Frame:
     """A frame of the rest pose with these labels ``[H, W]``."""
-    blank, body = torch.zeros(1, 3, SIZE, SIZE), BodyPose(torch.zeros(1, 1, 3), torch.zeros(1, 3))
+    blank, body = (
+        torch.zeros(1, 3, SIZE, SIZE),
+        BodyPose(torch.zeros(1, 1, 3), torch.zeros(1, 3)),
+    )
     labels = labels[None].long()
     return frame_of(blank, 1 + blank[:, :1], camera=camera(), body=body, labels=labels)
 
@@ -104,22 +109,27 @@ def test_majority_ties_and_the_unseen():
     other = torch.full((SIZE, SIZE), 3)
     vote = class_vote(body, [picture(left), picture(left), picture(other)], 4)
     x = body.vertices[:, 0]
-    assert (vote.labels[x < -0.01] == 1).all()  # the hidden plate follows the one before it
+    # the hidden plate follows the one before it
+    assert (vote.labels[x < -0.01] == 1).all()
     assert (vote.labels[x > 0.01] == 2).all()
     assert vote.images == 3
     assert vote.decided == pytest.approx(17 * 17 / len(body.vertices))
     tied = class_vote(body, [picture(left), picture(other)], 4)
-    assert tied.labels.unique().tolist() == [1, 2]  # the first of equals, where none has won
+    # the first of equals, where none has won
+    assert tied.labels.unique().tolist() == [1, 2]
     right_only = torch.where(left == 2, 2, 255)
     few = class_vote(body, [picture(left), picture(other), picture(right_only)], 4)
-    assert (few.labels == 2).all()  # the left is tied throughout: its nearest neighbours decide
+    # the left is tied throughout: its nearest neighbours decide
+    assert (few.labels == 2).all()
 
 
 def test_background_ignored_and_unknown_pixels_have_no_vote():
     body = rigid(plate(2.0))
     labels = torch.zeros(SIZE, SIZE)
     labels[:, ::3], labels[:, 1::3] = 255, 9
-    with pytest.raises(DataError, match=r"in none of 1 images .* or choose model=wo_seg"):
+    with pytest.raises(
+        DataError, match=r"in none of 1 images .* or choose model=wo_seg"
+    ):
         class_vote(body, [picture(labels)], 4)
     labels[SIZE // 2] = 3
     assert (class_vote(body, [picture(labels)] * 2, 4).labels == 3).all()
@@ -139,10 +149,16 @@ def zju(tmp_path_factory):
     smpl = root / "SMPL_NEUTRAL.pkl"
     write_smpl(smpl)
     subject = make_subject(smpl, frames=3, size=(80, 80))
-    x, y = subject.model.rest_vertices(torch.from_numpy(subject.shapes[None]))[0].numpy().T[:2]
+    x, y = (
+        subject.model.rest_vertices(torch.from_numpy(subject.shapes[None]))[0]
+        .numpy()
+        .T[:2]
+    )
     body = np.where(x > 0, CIHP.index("coat"), CIHP.index("dress"))
     legs = np.where(y > 0.5, CIHP.index("pants"), CIHP.index("skirt"))
-    parts = np.where(y > 1.45, CIHP.index("hat"), np.where(y > 1.0, body, legs)).astype(np.uint8)
+    parts = np.where(y > 1.45, CIHP.index("hat"), np.where(y > 1.0, body, legs)).astype(
+        np.uint8
+    )
     labels = [[draw(c, v, parts)[1] for c in subject.cameras] for v in subject.vertices]
     write_original(root / "CoreView_377", dataclasses.replace(subject, labels=labels))
     return root / "CoreView_377", smpl, torch.from_numpy(parts).long()

@@ -10,11 +10,15 @@ from gsgan.model.deformation import Deformation, Residuals
 from gsgan.skeleton.densify import Points
 from gsgan.splat import native
 
-pytestmark = pytest.mark.skipif(not native.available(), reason=native.why_not() or "available")
+pytestmark = pytest.mark.skipif(
+    not native.available(), reason=native.why_not() or "available"
+)
 CLOSE = {"rtol": 1e-10, "atol": 1e-13}
 
 
-def both(monkeypatch, module: object, name: str, run) -> tuple[list[Tensor], list[Tensor]]:
+def both(
+    monkeypatch, module: object, name: str, run
+) -> tuple[list[Tensor], list[Tensor]]:
     """What ``run`` returns with the compiled operation, and without."""
     fast = run()
     monkeypatch.setattr(module, name, lambda *_: False)
@@ -34,7 +38,9 @@ def test_photometric(monkeypatch, shape, near):
         loss = photometric.photometric(image, target, l1=0.8, l2=2.0, ssim=0.2)
         return [loss.detach(), *torch.autograd.grad(loss, image)]
 
-    torch.testing.assert_close(*both(monkeypatch, photometric, "_compiled", run), **CLOSE)
+    torch.testing.assert_close(
+        *both(monkeypatch, photometric, "_compiled", run), **CLOSE
+    )
 
 
 @pytest.mark.parametrize("bound", [0.25, None])
@@ -42,7 +48,9 @@ def test_geometry(monkeypatch, bound):
     torch.manual_seed(0)
     B, N = 2, 50
     wide = {"dtype": torch.float64}
-    psi = Deformation(torch.randn(N, 3), 1.7, width=8, layers=2, sh_degree=0, mean_bound=bound)
+    psi = Deformation(
+        torch.randn(N, 3), 1.7, width=8, layers=2, sh_degree=0, mean_bound=bound
+    )
     frames = torch.randn(B, N, 3, 3, **wide)  # skinned frames shear
     means = torch.randn(B, N, 3, **wide, requires_grad=True)
     points = Points(
@@ -57,22 +65,31 @@ def test_geometry(monkeypatch, bound):
     )
     quats = torch.randn(B, N, 4, **wide)
     quats[0, 0] = torch.tensor([-1.0, 0, 0, 0])  # turns nothing
-    beyond = 4 * torch.randn(B, N, 3, **wide), 9 * torch.randn(B, N, **wide)  # the bounds
+    # the bounds
+    beyond = 4 * torch.randn(B, N, 3, **wide), 9 * torch.randn(B, N, **wide)
     raw = [torch.randn(B, N, 3, **wide), quats, *beyond]
     raw = [x.requires_grad_() for x in raw]
     rest = torch.zeros(B, N, 1, 3, **wide), torch.zeros(B, N, 29, **wide)
-    weights = [torch.randn(*shape, **wide) for shape in ((B, N, 3), (B, N, 3, 3), (B, N))]
+    weights = [
+        torch.randn(*shape, **wide) for shape in ((B, N, 3), (B, N, 3, 3), (B, N))
+    ]
 
     def run():
         made = psi.compose(points, Residuals(*raw, *rest), torch.ones(B, 3, **wide))
         found = [made.means, made.covariances, made.opacities]
         loss = sum((x * w).sum() for x, w in zip(found, weights, strict=True))
-        return [x.detach() for x in found] + list(torch.autograd.grad(loss, [means, *raw]))
+        return [x.detach() for x in found] + list(
+            torch.autograd.grad(loss, [means, *raw])
+        )
 
-    torch.testing.assert_close(*both(monkeypatch, compiled, "has_geometry", run), **CLOSE)
+    torch.testing.assert_close(
+        *both(monkeypatch, compiled, "has_geometry", run), **CLOSE
+    )
 
 
-@pytest.mark.parametrize(("batch", "embedding", "normals"), [(1, 4, True), (3, 0, False)])
+@pytest.mark.parametrize(
+    ("batch", "embedding", "normals"), [(1, 4, True), (3, 0, False)]
+)
 def test_psi_in_training_is_psi(batch, embedding, normals):
     """Its layers as one operation, and one by one where an input needs a gradient."""
     torch.manual_seed(0)

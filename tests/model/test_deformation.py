@@ -23,7 +23,13 @@ def rest(batch: int = 1) -> torch.Tensor:
 
 
 def small(densify: Densify, **options) -> Deformation:
-    settings = {"width": 16, "layers": 2, "embedding": 4, "features": 2, "sh_degree": 0} | options
+    settings = {
+        "width": 16,
+        "layers": 2,
+        "embedding": 4,
+        "features": 2,
+        "sh_degree": 0,
+    } | options
     return Deformation(densify.rest_points, HEIGHT, **settings)
 
 
@@ -40,8 +46,12 @@ def test_step_zero_is_exactly_the_initial_gaussians(densify):
     gaussians = run(small(densify, sh_degree=1), densify, p)
     torch.testing.assert_close(gaussians.means, points.means, rtol=0, atol=0)
     variances = torch.diagonal(gaussians.covariances, dim1=-2, dim2=-1)
-    torch.testing.assert_close(variances, points.scales.square()[..., None].expand(-1, -1, 3))
-    torch.testing.assert_close(gaussians.opacities, torch.full_like(gaussians.opacities, 0.5))
+    torch.testing.assert_close(
+        variances, points.scales.square()[..., None].expand(-1, -1, 3)
+    )
+    torch.testing.assert_close(
+        gaussians.opacities, torch.full_like(gaussians.opacities, 0.5)
+    )
     torch.testing.assert_close(
         gaussians.features[..., :3], torch.full((1, densify.n_points, 3), 0.5)
     )
@@ -74,14 +84,16 @@ def test_psi_is_told_where_the_surface_looks_unless_it_shall_not_be(densify):
     turned = replace(points, normals=-points.normals)
     pose, root = torch.zeros(1, 99), torch.zeros(1, 3)
     told, other = (
-        psi.residuals(given, pose, root, torch.eye(3)[None]).sh for given in (points, turned)
+        psi.residuals(given, pose, root, torch.eye(3)[None]).sh
+        for given in (points, turned)
     )
     assert (told - other).abs().max() > 1e-3
     blind = small(densify)
     assert "from_normal.weight" not in blind.state_dict()
     blind.head.weight.data.copy_(psi.head.weight.data)
     one, two = (
-        blind.residuals(given, pose, root, torch.eye(3)[None]).sh for given in (points, turned)
+        blind.residuals(given, pose, root, torch.eye(3)[None]).sh
+        for given in (points, turned)
     )
     torch.testing.assert_close(one, two)
 
@@ -90,10 +102,14 @@ def test_noise_reaches_only_the_pose_code(densify):
     psi = small(densify)
     p = rest()
     noise = torch.randn(1, 33, 3)
-    torch.testing.assert_close(run(psi, densify, p, noise).means, run(psi, densify, p).means)
+    torch.testing.assert_close(
+        run(psi, densify, p, noise).means, run(psi, densify, p).means
+    )
     with torch.no_grad():
         psi.head.weight.normal_(0, 0.1)
-    assert not torch.equal(run(psi, densify, p, noise).means, run(psi, densify, p).means)
+    assert not torch.equal(
+        run(psi, densify, p, noise).means, run(psi, densify, p).means
+    )
 
 
 def test_residuals_in_the_pelvis_frame_do_not_know_the_heading(densify):
@@ -108,7 +124,9 @@ def test_residuals_in_the_pelvis_frame_do_not_know_the_heading(densify):
     for R, move in ((torch.eye(3), 0.0), (turn, 1.0)):
         q = p @ R.T + move
         pelvis = bone_frames(q, torch.ones(1, 33, dtype=torch.bool)).hubs[:, 0]
-        moved = replace(points, means=points.means @ R.T + move, normals=points.normals @ R.T)
+        moved = replace(
+            points, means=points.means @ R.T + move, normals=points.normals @ R.T
+        )
         root = q[:, 23:25].mean(1)
         code = psi.pose_code(q, root, pelvis, None)
         found.append(psi.residuals(moved, code, root, pelvis).sh)
@@ -122,7 +140,9 @@ def test_the_step_scales_offsets_up_to_the_same_bound(densify):
         slow.head.bias.data[:3] = value
         moved = (run(slow, densify, p).means - at_rest).norm(dim=-1)
         reach = 3**0.5 * slow.mean_bound * slow.body_height * math.tanh(expected)
-        torch.testing.assert_close(moved, torch.full_like(moved, reach), rtol=1e-4, atol=0)
+        torch.testing.assert_close(
+            moved, torch.full_like(moved, reach), rtol=1e-4, atol=0
+        )
 
 
 def test_a_pose_far_from_training_counts_as_the_nearest_that_psi_learnt(densify):
@@ -130,7 +150,9 @@ def test_a_pose_far_from_training_counts_as_the_nearest_that_psi_learnt(densify)
     psi.head.weight.data.normal_(0, 0.3)
     points = densify(p)
     axes = torch.linalg.qr(torch.randn(99, 4))[0]
-    codes = torch.randn(400, 4) @ torch.diag(torch.tensor([4.0, 3.0, 2.0, 1.0])) @ axes.T
+    codes = (
+        torch.randn(400, 4) @ torch.diag(torch.tensor([4.0, 3.0, 2.0, 1.0])) @ axes.T
+    )
 
     def sh(code):
         return psi.residuals(points, code, torch.zeros(1, 3), pelvis).sh
@@ -139,11 +161,15 @@ def test_a_pose_far_from_training_counts_as_the_nearest_that_psi_learnt(densify)
     aside = aside - aside @ axes @ axes.T
     raw = sh(within), sh(within + aside)
     psi.eval()
-    torch.testing.assert_close((sh(within), sh(within + aside)), raw)  # no poses are known
+    # no poses are known
+    torch.testing.assert_close((sh(within), sh(within + aside)), raw)
     means = points.means + torch.tensor([-0.1, 0.1])[:, None, None]
     psi.store_poses(codes, means, torch.zeros(2, 3), pelvis)
     torch.testing.assert_close((sh(within), sh(within + aside)), (raw[0], raw[0]))
-    limits = [sh(codes.mean(0) + far * psi.pose_axes[:, :4].mT.sum(0)[None]) for far in (9, 90)]
+    limits = [
+        sh(codes.mean(0) + far * psi.pose_axes[:, :4].mT.sum(0)[None])
+        for far in (9, 90)
+    ]
     torch.testing.assert_close(*limits)
     assert (limits[1] - raw[0]).abs().max() > 0.1
     away = [replace(points, means=points.means + 9 * far) for far in (1, 10)]
@@ -151,5 +177,7 @@ def test_a_pose_far_from_training_counts_as_the_nearest_that_psi_learnt(densify)
     torch.testing.assert_close(*found)
     psi.train()
     torch.testing.assert_close((sh(within), sh(within + aside)), raw)
-    old = {name: x for name, x in psi.state_dict().items() if not name.startswith("pose_")}
+    old = {
+        name: x for name, x in psi.state_dict().items() if not name.startswith("pose_")
+    }
     small(densify).load_state_dict(old)

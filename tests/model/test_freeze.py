@@ -7,7 +7,10 @@ import torch
 
 MODELS = [
     *((model, "none") for model in ("full", "wo_gcn", "lbs_splat", "image_to_image")),
-    *((model, "all") for model in ("full", "wo_seg", "lbs_splat", "splat_only", "harmonic")),
+    *(
+        (model, "all")
+        for model in ("full", "wo_seg", "lbs_splat", "splat_only", "harmonic")
+    ),
 ]
 
 
@@ -21,7 +24,9 @@ def left_of_zero(avatar):
 
 
 def psnr(a, b) -> float:
-    return float(-10 * (a.double() - b.double()).square().mean().clamp_min(1e-30).log10())
+    return float(
+        -10 * (a.double() - b.double()).square().mean().clamp_min(1e-30).log10()
+    )
 
 
 @pytest.mark.parametrize(("model", "effects"), MODELS)

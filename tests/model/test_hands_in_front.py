@@ -22,7 +22,10 @@ def overlaps(scene: Scene, camera: str, frame: int) -> torch.Tensor:
     """``[1, H, W]`` bool: pixels whose ray meets both hands, whatever else is in the way."""
     y, x = np.mgrid[:SIZE, :SIZE]
     eye, rays = pixel_rays(scene.views[camera], x.ravel(), y.ravel(), 1)
-    starts, rays = np.tile(eye, (len(rays), 1)).astype(np.float32), rays.astype(np.float32)
+    starts, rays = (
+        np.tile(eye, (len(rays), 1)).astype(np.float32),
+        rays.astype(np.float32),
+    )
     character, both = scene.character, np.ones(SIZE * SIZE, bool)
     for name in HANDS:
         faces = character.faces[character.labels == character.label_names.index(name)]

@@ -50,7 +50,9 @@ STRETCHED = {
 @pytest.mark.parametrize("frames", STRETCHED.values(), ids=STRETCHED)
 def test_degenerate_normals_and_frames_give_finite_gaussians_and_gradients(frames):
     torch.manual_seed(0)
-    normals = torch.stack([torch.zeros(3), torch.full((3,), math.nan), torch.tensor([0, 0.6, 0.8])])
+    normals = torch.stack(
+        [torch.zeros(3), torch.full((3,), math.nan), torch.tensor([0, 0.6, 0.8])]
+    )
     model = Harmonic(torch.zeros(3, 3), 1.7, features=2, sh_degree=1)
     for raw in model.parameters():
         torch.nn.init.normal_(raw)
@@ -96,7 +98,8 @@ def test_the_regression_finds_linear_maps_and_prefers_the_mean():
     stiff, _ = ridge_regression(pairs, 1e9)
     torch.testing.assert_close(stiff[:, 0], mean, atol=1e-4, rtol=0)
     assert float(stiff[:, 1:].abs().max()) < 1e-6
-    assert ridge_regression(pairs[:1], 0.1)[0].isfinite().all()  # one pose, nine unknowns
+    # one pose, nine unknowns
+    assert ridge_regression(pairs[:1], 0.1)[0].isfinite().all()
 
 
 def test_an_avatar_without_psi_is_refused(build):

@@ -16,7 +16,14 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from gsgan.splat import gsplat_backend, native
 
 META = torch.device("meta")
-READS = ("_local_scalar_dense", "nonzero", "masked_select", "unique", "is_nonzero", "equal")
+READS = (
+    "_local_scalar_dense",
+    "nonzero",
+    "masked_select",
+    "unique",
+    "is_nonzero",
+    "equal",
+)
 
 
 class Reads(TorchDispatchMode):
@@ -79,7 +86,9 @@ def copies(monkeypatch):
 def drawn(gaussians, camera, settings):
     """What gsplat would return, empty."""
     batch, (height, width) = len(camera), camera.size
-    features = gaussians.features.new_zeros(batch, gaussians.features.shape[-1], height, width)
+    features = gaussians.features.new_zeros(
+        batch, gaussians.features.shape[-1], height, width
+    )
     return features, features[:, :1]
 
 
@@ -87,7 +96,8 @@ def on_meta(avatar, monkeypatch):
     """The avatar as on a GPU, whose rasteriser is stood in for."""
     monkeypatch.setattr(gsplat_backend, "why_not", lambda settings, device: "")
     monkeypatch.setattr(gsplat_backend, "draw", drawn)
-    monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())  # knows no meta device
+    # knows no meta device
+    monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())
     avatar = avatar.to(META).eval()
     avatar.backend = "gsplat"
     if avatar.segmentation is not None:
@@ -143,7 +153,8 @@ def test_a_bare_skeleton_is_solved_on_the_host_and_reads_nothing_back(
     assert avatar.needs_body
     skeleton = frame.skeleton[0]
     with torch.no_grad():
-        avatar.solver.solve(frame.skeleton, frame.visibility)  # its constants lie on the host
+        # its constants lie on the host
+        avatar.solver.solve(frame.skeleton, frame.visibility)
     avatar = on_meta(avatar, monkeypatch)
     avatar.render(skeleton, frame.camera)
     copies.clear()

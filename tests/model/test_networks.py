@@ -54,7 +54,9 @@ def test_a_transposed_convolution_is_a_convolution_after_upsampling():
     plain = functional.conv2d(
         functional.interpolate(h, scale_factor=2.0, mode="nearest"), weight, padding=1
     )
-    quick = functional.conv_transpose2d(h, upsampled_kernel(weight), stride=2, padding=1)
+    quick = functional.conv_transpose2d(
+        h, upsampled_kernel(weight), stride=2, padding=1
+    )
     torch.testing.assert_close(quick, plain, atol=1e-5, rtol=1e-5)
 
 
@@ -63,7 +65,9 @@ def test_generator_refuses_a_fine_F_it_was_not_built_for():
     net = Generator(5, 4, 8, 35, 2, base=4)
     with pytest.raises(ValueError, match=r"fine must be \(32, 24\) pixels, got None"):
         net(F, S, p2d, g)
-    with pytest.raises(ValueError, match=r"fine must be \(32, 24\) pixels, got \(48, 36\)"):
+    with pytest.raises(
+        ValueError, match=r"fine must be \(32, 24\) pixels, got \(48, 36\)"
+    ):
         net(F, S, p2d, g, torch.zeros(2, 5, 48, 36))
     with pytest.raises(ValueError, match=r"fine must be None pixels, got \(32, 24\)"):
         generator()(F, S, p2d, g, torch.zeros(2, 5, 32, 24))
@@ -95,8 +99,12 @@ def test_style_starts_as_plain_normalisation():
     h = torch.randn(1, 6, 4, 4)
     out = style(h, torch.randn(1, 3, 4, 4), torch.randn(1, 35))
     plain = torch.where(out < 0, out / 0.2, out)  # before the activation
-    torch.testing.assert_close(plain.square().mean(1), torch.ones(1, 4, 4), atol=1e-4, rtol=0)
-    assert torch.isfinite(style(h * 0, torch.randn(1, 3, 4, 4), torch.randn(1, 35))).all()
+    torch.testing.assert_close(
+        plain.square().mean(1), torch.ones(1, 4, 4), atol=1e-4, rtol=0
+    )
+    assert torch.isfinite(
+        style(h * 0, torch.randn(1, 3, 4, 4), torch.randn(1, 35))
+    ).all()
 
 
 def test_discriminator_judges_every_scale():
@@ -115,7 +123,8 @@ def test_discriminator_refuses_pictures_that_normalisation_would_erase():
 def test_a_judge_without_normalisation_sees_contrast():
     """Instance normalisation hides it: what a judge of nearly right pictures needs."""
     torch.manual_seed(0)
-    image = 100 * torch.randn(1, 3, 32, 32)  # so that normalisation's own epsilon does not show
+    # so that normalisation's own epsilon does not show
+    image = 100 * torch.randn(1, 3, 32, 32)
     for norm, sees in (("none", True), ("instance", False)):
         judge = Discriminator(scales=1, base=4, layers=3, norm=norm)
         sharp, soft = judge(image)[0][-1], judge(0.5 * image)[0][-1]
@@ -149,7 +158,9 @@ def test_positional_encoding_values():
     x = torch.tensor([[0.25, -0.5]])
     code = positional_encoding(x, 2)
     assert code.shape[-1] == encoded_size(2, 2)
-    expected = torch.tensor([0.25 * torch.pi, 0.5 * torch.pi, -0.5 * torch.pi, -torch.pi]).sin()
+    expected = torch.tensor(
+        [0.25 * torch.pi, 0.5 * torch.pi, -0.5 * torch.pi, -torch.pi]
+    ).sin()
     torch.testing.assert_close(code[0, 2:6], expected)
     assert positional_encoding(x, 0) is x
 
@@ -166,7 +177,9 @@ def test_a_generator_of_patches(times):
     if fine is not None:
         given.append(functional.pixel_unshuffle(net._padded(fine, times), times))
     plain = net.content.stem(torch.cat(given, dim=1))
-    torch.testing.assert_close(net._stem(given[0], [S, p2d], fine), plain, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(
+        net._stem(given[0], [S, p2d], fine), plain, atol=1e-5, rtol=1e-5
+    )
     with pytest.raises(ConfigError, match="patch must be one of 1, 2, 4"):
         generator(patch=3)
 

@@ -68,11 +68,15 @@ def without_labels(**options) -> Segmentation:
 @cache
 def body_mask() -> torch.Tensor:
     with torch.no_grad():
-        raster = Segmentation(free_body(), points=2000).raster(rest_pose(), facing_camera())
+        raster = Segmentation(free_body(), points=2000).raster(
+            rest_pose(), facing_camera()
+        )
     return (raster.alpha > 0.5).float()
 
 
-def fit_to(segmentation: Segmentation, mask: torch.Tensor, steps: int = 15) -> list[float]:
+def fit_to(
+    segmentation: Segmentation, mask: torch.Tensor, steps: int = 15
+) -> list[float]:
     """The loss of each step of its own optimiser groups."""
     groups = [
         {"params": parameters, "lr": 1e-2 * factor}
@@ -95,7 +99,9 @@ def test_without_labels_two_numbers_learn_from_masks_and_nothing_else_moves():
     before = {name: value.clone() for name, value in segmentation.state_dict().items()}
     losses = fit_to(segmentation, body_mask())
     assert losses[-1] < 0.8 * losses[0]
-    moved = {k for k, v in segmentation.state_dict().items() if not torch.equal(v, before[k])}
+    moved = {
+        k for k, v in segmentation.state_dict().items() if not torch.equal(v, before[k])
+    }
     assert moved == {"common"}
     assert bool((segmentation.common != 0).all())
     assert segmentation.common[0] > 0  # too small shapes grew
@@ -110,7 +116,9 @@ def test_common_is_added_to_all_log_scales_and_all_logits():
         a, b = one.gaussians(rest_pose()), other.gaussians(rest_pose())
     torch.testing.assert_close(a.covariances, b.covariances)
     torch.testing.assert_close(a.opacities, b.opacities)
-    assert not torch.allclose(a.opacities, without_labels().gaussians(rest_pose()).opacities)
+    assert not torch.allclose(
+        a.opacities, without_labels().gaussians(rest_pose()).opacities
+    )
 
 
 def test_silhouette_loss_is_binary_cross_entropy_of_the_sure_pixels():
@@ -126,7 +134,8 @@ def test_silhouette_loss_is_binary_cross_entropy_of_the_sure_pixels():
     loss.backward()
     assert bool((alpha.grad[~sure] == 0).all())
     assert bool((alpha.grad[sure] != 0).all())
-    assert float(silhouette_loss(alpha, mask, torch.ones_like(mask)).detach()) == 0  # none is sure
+    # none is sure
+    assert float(silhouette_loss(alpha, mask, torch.ones_like(mask)).detach()) == 0
 
 
 @pytest.mark.parametrize("truth", [0.0, 1.0])
@@ -147,12 +156,15 @@ def test_stability_silhouette_loss_where_alpha_is_0_or_1(value, truth):
 
 def test_hands_only_are_two_classes_and_all_else_background_that_hides():
     names = free_body().label_names
-    some, all_parts = (Segmentation(free_body(), points=1500, mode=m) for m in ("hands", "body"))
+    some, all_parts = (
+        Segmentation(free_body(), points=1500, mode=m) for m in ("hands", "body")
+    )
     with torch.no_grad():
         S, whole = (x(rest_pose(), facing_camera()) for x in (some, all_parts))
     assert some.map.names == ("background", "left_hand", "right_hand")
     hands = [names.index("left_hand"), names.index("right_hand")]
-    torch.testing.assert_close(S[:, 1:], whole[:, hands], atol=1e-5, rtol=0)  # as hidden as before
+    # as hidden as before
+    torch.testing.assert_close(S[:, 1:], whole[:, hands], atol=1e-5, rtol=0)
     torch.testing.assert_close(S.sum(1), torch.ones(1, SIZE, SIZE), atol=1e-4, rtol=0)
     trunk = whole[:, names.index("upper_clothes")] > 0.9
     assert trunk.any()
@@ -208,7 +220,9 @@ def test_a_class_without_a_vertex_is_not_learned_and_scored_as_missed():
 
 
 def test_hands_mode_from_the_config_paints(build):
-    _, avatar, frame = build("model.segmentation.mode=hands", "model.segmentation.hands_face=true")
+    _, avatar, frame = build(
+        "model.segmentation.mode=hands", "model.segmentation.hands_face=true"
+    )
     painting = avatar(*frame.inputs)
     assert painting.segmentation.shape[1] == 4
     assert avatar.segmentation.map.names[-1] == "face_neck"
@@ -220,7 +234,9 @@ def test_hands_mode_from_the_config_paints(build):
 # --- labels that come and go
 
 
-def test_a_trained_S_is_loaded_whether_or_not_labels_are_at_hand(run, capture, tmp_path):
+def test_a_trained_S_is_loaded_whether_or_not_labels_are_at_hand(
+    run, capture, tmp_path
+):
     bare = shutil.copytree(capture, tmp_path / "bare")
     shutil.rmtree(bare / "labels")
     config = load_config(run, DataPaths(str(bare)))

@@ -52,7 +52,9 @@ def moves():
 def talking(signing, rest, moves):
     """``[12, 105, 3]`` another person with that face, whose head turns by itself."""
     heads, centre = head_of(signing)
-    head = heads @ np.stack([rotation(np.array([0, a, 0])) for a in np.linspace(-0.6, 0.6, 12)])
+    head = heads @ np.stack(
+        [rotation(np.array([0, a, 0])) for a in np.linspace(-0.6, 0.6, 12)]
+    )
     face = centre + BIGGER * (rest + moves) @ head.mT
     return np.concatenate([signing, face], axis=1)
 
@@ -66,7 +68,9 @@ def head_of(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def offsets_of(q: np.ndarray, rest: np.ndarray) -> np.ndarray:
     """``[F, 30, 3]`` metres, in the axes of each frame's head."""
     face, body = torch.from_numpy(q[:, EXPRESSION]), torch.from_numpy(q[:, :33])
-    return in_head(face, body, bone_frames(body).hubs[:, HEAD], MEDIAPIPE33).numpy() - rest
+    return (
+        in_head(face, body, bone_frames(body).hubs[:, HEAD], MEDIAPIPE33).numpy() - rest
+    )
 
 
 def write_face(path, p: np.ndarray, kept: tuple[int, ...] = tuple(range(30))):
@@ -134,7 +138,11 @@ def test_missing_faces_rest_and_short_gaps_are_bridged(tmp_path, talking, signer
     np.testing.assert_allclose(code[5:11], 0, atol=1e-3)
     assert code[3:5, LOWER, 1].max() * OFFSET < -0.010
     for template in TEMPLATES.values():  # the smaller ones leave the face out
-        assert complete_skeleton(torch.from_numpy(q), None, template, height)[0].isfinite().all()
+        assert (
+            complete_skeleton(torch.from_numpy(q), None, template, height)[0]
+            .isfinite()
+            .all()
+        )
 
 
 @pytest.mark.parametrize("seen", [0, 1, 2])

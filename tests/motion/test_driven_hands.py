@@ -13,12 +13,18 @@ from gsgan.skeleton import HOLISTIC, MEDIAPIPE33, complete_skeleton, limb_length
 from gsgan.skeleton.hands import FINGER_BONES, HAND_NAMES
 
 LEFT, RIGHT = HAND_JOINTS.values()
-POINTS = [n.upper().replace("_", "_FINGER_") if n[0] in "imr" else n.upper() for n in HAND_NAMES]
+POINTS = [
+    n.upper().replace("_", "_FINGER_") if n[0] in "imr" else n.upper()
+    for n in HAND_NAMES
+]
 
 
 def fingers(p: np.ndarray) -> np.ndarray:
     """``[F, 2, 15, 3]`` the bones of both hands."""
-    bones = [[p[:, at][:, b] - p[:, at][:, a] for a, b in FINGER_BONES] for at in (LEFT, RIGHT)]
+    bones = [
+        [p[:, at][:, b] - p[:, at][:, a] for a, b in FINGER_BONES]
+        for at in (LEFT, RIGHT)
+    ]
     return np.stack([np.stack(hand, axis=1) for hand in bones], axis=1)
 
 
@@ -52,7 +58,9 @@ def driven(path, signer) -> np.ndarray:
 def test_the_figure_has_the_lengths_of_finger_bones(signing, signer, proportions):
     rest = signer.rest_with_hands
     true = np.linalg.norm(fingers(signing), axis=-1)[0]
-    np.testing.assert_allclose(np.linalg.norm(fingers(rest[None]), axis=-1)[0], true, rtol=1e-4)
+    np.testing.assert_allclose(
+        np.linalg.norm(fingers(rest[None]), axis=-1)[0], true, rtol=1e-4
+    )
     palms = hand_frame(np.stack([rest[LEFT], rest[RIGHT]]), *PALM)
     np.testing.assert_allclose(palms[0], np.eye(3), atol=1e-9)  # along +X, palm down
     np.testing.assert_allclose(palms[1], np.diag([-1.0, 1, -1]), atol=1e-9)
@@ -77,14 +85,18 @@ def test_fingers_of_a_pose_file_keep_their_directions(tmp_path, signing, signer)
     assert q.shape == signing.shape
     assert angles(fingers(q), fingers(signing)).max() < 1
     lengths = np.linalg.norm(fingers(signer.rest_with_hands[None]), axis=-1)
-    np.testing.assert_allclose(np.linalg.norm(fingers(q), axis=-1), lengths.repeat(12, 0))
+    np.testing.assert_allclose(
+        np.linalg.norm(fingers(q), axis=-1), lengths.repeat(12, 0)
+    )
     for wrist, at in HAND_JOINTS.items():
         palms = [hand_frame(x[:, at], *PALM) for x in (q, signing)]
         assert angles(palms[0].mT, palms[1].mT).max() < 1
         np.testing.assert_allclose(q[:, at][:, 0], q[:, wrist], atol=0.01)
 
 
-def test_missing_hands_are_not_seen_and_short_gaps_are_bridged(tmp_path, signing, signer):
+def test_missing_hands_are_not_seen_and_short_gaps_are_bridged(
+    tmp_path, signing, signer
+):
     p = signing.copy()
     p[:, LEFT] = np.nan
     p[3:6, RIGHT] = np.nan

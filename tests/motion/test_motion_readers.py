@@ -23,8 +23,22 @@ from gsgan.utils.errors import DataError
 
 REAL = Path(__file__).parents[3] / "shared" / "data" / "motion"
 # Landmarks and the joints of the SMPL family that lie there.
-SMPL_AT = {11: 16, 13: 18, 15: 20, 12: 17, 14: 19, 16: 21, 23: 1, 25: 4, 27: 7, 24: 2, 26: 5, 28: 8}
-Y_DOWN = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # of Z up: MediaPipe's image axes
+SMPL_AT = {
+    11: 16,
+    13: 18,
+    15: 20,
+    12: 17,
+    14: 19,
+    16: 21,
+    23: 1,
+    25: 4,
+    27: 7,
+    24: 2,
+    26: 5,
+    28: 8,
+}
+# of Z up: MediaPipe's image axes
+Y_DOWN = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
 def directions(p: np.ndarray) -> np.ndarray:
@@ -47,7 +61,11 @@ def write_pose(
     """A .pose file of parts: names of points, and points ``[F, n, 3]`` with NaN where not seen."""
     pose_format = pytest.importorskip("pose_format")
     from pose_format.numpy import NumPyPoseBody
-    from pose_format.pose_header import PoseHeader, PoseHeaderComponent, PoseHeaderDimensions
+    from pose_format.pose_header import (
+        PoseHeader,
+        PoseHeaderComponent,
+        PoseHeaderDimensions,
+    )
 
     components = [
         PoseHeaderComponent(name, points, [(0, 1)], [(255, 0, 0)], layout)
@@ -77,7 +95,9 @@ def test_landmarks(tmp_path, landmarks, proportions):
 def test_body_poses_of_the_free_body(tmp_path, dance, landmarks, proportions):
     path = tmp_path / "a.npz"
     theta = dance.theta.numpy().copy()
-    np.savez(path, theta=theta, transl=dance.transl.numpy(), frame_id=np.arange(len(theta)))
+    np.savez(
+        path, theta=theta, transl=dance.transl.numpy(), frame_id=np.arange(len(theta))
+    )
     p, motion = standard(path, proportions)
     np.testing.assert_allclose(p, landmarks, atol=1e-5)
     theta[3, 0, 0] = np.nan
@@ -117,7 +137,13 @@ def test_smpl_and_amass(tmp_path, shared, proportions, kind, numbers):
     model = shared(f"{kind}.{end}", lambda path: write_smpl(path, kind=kind))
     path, poses = tmp_path / "a.npz", np.zeros((5, numbers))
     poses[:, 3 * 18 + 2] = 1.5  # the left elbow
-    np.savez(path, poses=poses, trans=np.zeros((5, 3)), betas=np.zeros(16), mocap_framerate=120.0)
+    np.savez(
+        path,
+        poses=poses,
+        trans=np.zeros((5, 3)),
+        betas=np.zeros(16),
+        mocap_framerate=120.0,
+    )
     with pytest.raises(DataError, match=r"SMPL parameters.* give smpl="):
         standard(path, proportions)
     p, motion = standard(path, proportions, smpl=model)
@@ -128,7 +154,9 @@ def test_smpl_and_amass(tmp_path, shared, proportions, kind, numbers):
     shape = body.v_template.new_zeros(1, 1)
     joints = body.pose(theta, shape, shape.new_zeros(1, 3))[1][0].numpy()
     truth = np.zeros((1, 33, 3))
-    truth[0, list(SMPL_AT)] = joints[list(SMPL_AT.values())] @ upright(up_axis(motion)).T
+    truth[0, list(SMPL_AT)] = (
+        joints[list(SMPL_AT.values())] @ upright(up_axis(motion)).T
+    )
     np.testing.assert_allclose(directions(p)[:1], directions(truth), atol=1e-6)
     np.savez(path, poses=poses[:, :50])
     with pytest.raises(DataError, match="50 numbers per frame"):
@@ -138,7 +166,10 @@ def test_smpl_and_amass(tmp_path, shared, proportions, kind, numbers):
 @pytest.mark.parametrize("style", ["python", "tasks", "bare", "lists", "npz"])
 def test_mediapipe(tmp_path, landmarks, proportions, style):
     q = landmarks @ Y_DOWN.T
-    frames = [[{"x": x, "y": y, "z": z, "visibility": 0.9} for x, y, z in p] for p in q.tolist()]
+    frames = [
+        [{"x": x, "y": y, "z": z, "visibility": 0.9} for x, y, z in p]
+        for p in q.tolist()
+    ]
     content = {
         "python": {
             "fps": 25,
@@ -151,7 +182,11 @@ def test_mediapipe(tmp_path, landmarks, proportions, style):
     path = tmp_path / "a.json"
     if style == "npz":
         path = tmp_path / "a.npz"
-        np.savez(path, pose_world_landmarks=np.concatenate([q, np.ones((12, 33, 1))], -1), fps=25)
+        np.savez(
+            path,
+            pose_world_landmarks=np.concatenate([q, np.ones((12, 33, 1))], -1),
+            fps=25,
+        )
     else:
         path.write_text(json.dumps(content[style]))
     p, motion = standard(path, proportions)
@@ -166,7 +201,10 @@ def test_mediapipe(tmp_path, landmarks, proportions, style):
         ([], "holds no frames"),
         ([{"pose_landmarks": []}], "frame 0: no pose_world_landmarks"),
         ([{"pose_world_landmarks": [{"x": 1}] * 33}], "frame 0: expected 33 landmarks"),
-        ([{"pose_world_landmarks": [[0, 0, 0]] * 17}], "frame 0: expected 33 landmarks"),
+        (
+            [{"pose_world_landmarks": [[0, 0, 0]] * 17}],
+            "frame 0: expected 33 landmarks",
+        ),
         ([{"pose_world_landmarks": None}], "none of 1 frames has shoulders and hips"),
     ],
 )
@@ -198,18 +236,23 @@ def test_pose_files_with_axes_of_unknown_scale(tmp_path, landmarks, proportions)
         standard(path, proportions)
 
 
-def test_people_filmed_from_the_waist_up_stand_upright(tmp_path, landmarks, proportions):
+def test_people_filmed_from_the_waist_up_stand_upright(
+    tmp_path, landmarks, proportions
+):
     names, q = [n.upper() for n in MEDIAPIPE33.names], landmarks @ Y_DOWN.T
     world = ("POSE_WORLD_LANDMARKS", (names, q[::-1]))
     q[:, 23:25, 2] -= 0.5  # MediaPipe's guess
     parts = {"POSE_LANDMARKS": (names, q * (640, 640, 1)), world[0]: world[1]}
-    p, _ = standard(write_pose(tmp_path / "a.pose", parts, unsure=(23, 24)), proportions)
+    p, _ = standard(
+        write_pose(tmp_path / "a.pose", parts, unsure=(23, 24)), proportions
+    )
     spine = p[:, 11:13].mean(1) - p[:, 23:25].mean(1)
     np.testing.assert_allclose(spine[:, :2], 0, atol=1e-9)
     assert (spine[:, 2] > 0.4).all()
     across = [x[:, 11] - x[:, 12] for x in (p @ (upright("-y") @ Y_DOWN), landmarks)]
     across = [x / np.linalg.norm(x, axis=-1, keepdims=True) for x in across]
-    assert (across[0] * across[1]).sum(-1).min() > 0.9  # image landmarks, not the world's
+    # image landmarks, not the world's
+    assert (across[0] * across[1]).sum(-1).min() > 0.9
 
 
 def test_bvh(tmp_path, proportions):
@@ -262,7 +305,14 @@ BONES_OF_ASF = [  # name, parent, direction, length, dof
 
 def write_amc(folder: Path) -> Path:
     """A T pose, then the left upper arm turned down; its elbow's axis is the file's z."""
-    lines = [":version 1.10", ":name VICON", ":units", "  mass 1.0", "  length 0.45", "  angle deg"]
+    lines = [
+        ":version 1.10",
+        ":name VICON",
+        ":units",
+        "  mass 1.0",
+        "  length 0.45",
+        "  angle deg",
+    ]
     lines += [":root", "  order TX TY TZ RX RY RZ", "  axis XYZ", "  position 0 0 0"]
     lines += ["  orientation 0 0 0", ":bonedata"]
     for name, _, way, length, dof in BONES_OF_ASF:
@@ -275,11 +325,16 @@ def write_amc(folder: Path) -> Path:
         ]
         lines += [f"    length {length}", f"    axis {axis} XYZ"]
         if dof:
-            lines += [f"    dof {dof}", *(["    limits (-90 90)"] + ["           (-90 90)"] * 2)]
+            lines += [
+                f"    dof {dof}",
+                *(["    limits (-90 90)"] + ["           (-90 90)"] * 2),
+            ]
         lines.append("  end")
     lines += [":hierarchy", "  begin", "    root lhipjoint rhipjoint thorax"]
     for parent in dict.fromkeys(b[1] for b in BONES_OF_ASF if b[1] != "root"):
-        lines.append("    " + " ".join([parent, *(b[0] for b in BONES_OF_ASF if b[1] == parent)]))
+        lines.append(
+            "    " + " ".join([parent, *(b[0] for b in BONES_OF_ASF if b[1] == parent)])
+        )
     (folder / "07.asf").write_text("\n".join([*lines, "  end"]))
     frames = [":FULLY-SPECIFIED", ":DEGREES"]
     for number in (1, 2):
@@ -311,7 +366,9 @@ def test_amc(tmp_path, proportions):
     along = directions(p)
     np.testing.assert_allclose(along[0, :2], [[1, 0, 0]] * 2, atol=1e-9)
     np.testing.assert_allclose(along[1, :2], [[0, 0, -1], [-1, 0, 0]], atol=1e-9)
-    np.testing.assert_allclose(along[:, 4:], np.tile([0, 0, -1.0], (2, 4, 1)), atol=1e-9)
+    np.testing.assert_allclose(
+        along[:, 4:], np.tile([0, 0, -1.0], (2, 4, 1)), atol=1e-9
+    )
 
 
 @pytest.mark.parametrize(
@@ -322,7 +379,11 @@ def test_amc(tmp_path, proportions):
         ("07_01.amc", lambda t: "", "is empty"),
         ("07_01.amc", lambda t: t.replace("17", "nan"), "not finite"),
         ("07.asf", lambda t: t[: len(t) // 2], "not a complete (ASF skeleton|AMC)"),
-        ("07.asf", lambda t: t.replace("name lhand", "nome lhand"), "'name' is missing"),
+        (
+            "07.asf",
+            lambda t: t.replace("name lhand", "nome lhand"),
+            "'name' is missing",
+        ),
     ],
 )
 def test_damaged_amc(tmp_path, proportions, file, damage, message):
@@ -395,8 +456,12 @@ def test_landmarks_from_the_waist_up(tmp_path, landmarks, proportions):
     whole, motion = standard(tmp_path / "a.npz", proportions)
     assert motion.filled == 0
     assert np.isfinite(whole).all()
-    spine = np.linalg.norm(whole[:, [23, 24]].mean(1) - whole[:, [11, 12]].mean(1), axis=-1)
-    own = np.linalg.norm(proportions.rest[[23, 24]].mean(0) - proportions.rest[[11, 12]].mean(0))
+    spine = np.linalg.norm(
+        whole[:, [23, 24]].mean(1) - whole[:, [11, 12]].mean(1), axis=-1
+    )
+    own = np.linalg.norm(
+        proportions.rest[[23, 24]].mean(0) - proportions.rest[[11, 12]].mean(0)
+    )
     np.testing.assert_allclose(spine, own, rtol=0.3)
 
 
@@ -428,13 +493,19 @@ def test_real_files(proportions):
             q = retargeted(p, proportions)
             assert np.isfinite(q[:, :33]).all(), path
             own = torch.from_numpy(q)
-            again = measure_proportions(own, torch.ones(own.shape[:2], dtype=torch.bool), "z")
-            lengths = [np.linalg.norm(f.rest[13] - f.rest[11]) for f in (again, proportions)]
+            again = measure_proportions(
+                own, torch.ones(own.shape[:2], dtype=torch.bool), "z"
+            )
+            lengths = [
+                np.linalg.norm(f.rest[13] - f.rest[11]) for f in (again, proportions)
+            ]
             assert lengths[0] == pytest.approx(lengths[1], rel=1e-5), path
             assert (q[:, 23:25, 2].mean(1) > q[:, 29:33, 2].min(1)).all(), path
 
 
-def published(root: np.ndarray, body: np.ndarray, moves: np.ndarray) -> dict[str, dict[str, Any]]:
+def published(
+    root: np.ndarray, body: np.ndarray, moves: np.ndarray
+) -> dict[str, dict[str, Any]]:
     """Arrays with published keys and shapes; ``body [F, 63]`` is of SMPL-H's 21 joints."""
     F = len(root)
     zeros = {n: np.zeros((F, n)) for n in (3, 6, 90)}
@@ -455,13 +526,17 @@ def published(root: np.ndarray, body: np.ndarray, moves: np.ndarray) -> dict[str
         "parts_only": {k: v for k, v in smplx.items() if k != "poses"},
         "humman": {"betas": np.zeros((F, 10)), "body_pose": smpl}
         | {"global_orient": root, "transl": moves},
-        "aist": {"smpl_poses": np.concatenate([root, smpl], axis=1), "smpl_trans": 95 * moves}
+        "aist": {
+            "smpl_poses": np.concatenate([root, smpl], axis=1),
+            "smpl_trans": 95 * moves,
+        }
         | {"smpl_scaling": np.array([95.0]), "smpl_loss": np.array([0.1])},
     }
 
 
 @pytest.mark.parametrize(
-    "name", ["amass_smplh", "amass_smplx", "stage_two", "parts_only", "humman", "aist", "zju"]
+    "name",
+    ["amass_smplh", "amass_smplx", "stage_two", "parts_only", "humman", "aist", "zju"],
 )
 def test_published_keys_of_the_smpl_family(tmp_path, shared, proportions, name):
     from writers.smpl import write_smpl
@@ -487,8 +562,12 @@ def test_published_keys_of_the_smpl_family(tmp_path, shared, proportions, name):
         np.savez(path, **files[name])
     motion = read_motion(path, Source(proportions, model))
     theta = torch.zeros(4, len(skinned.parents), 3, dtype=torch.float64)
-    theta[:, :22] = torch.from_numpy(np.concatenate([root, body], axis=1)).reshape(4, 22, 3)
-    joints = skinned.pose(theta, theta.new_zeros(1, 1), torch.from_numpy(moves))[1].numpy()
+    theta[:, :22] = torch.from_numpy(np.concatenate([root, body], axis=1)).reshape(
+        4, 22, 3
+    )
+    joints = skinned.pose(theta, theta.new_zeros(1, 1), torch.from_numpy(moves))[
+        1
+    ].numpy()
     np.testing.assert_allclose(
         motion.p[:, list(SMPL_AT)], joints[:, list(SMPL_AT.values())], atol=1e-6
     )

@@ -20,7 +20,9 @@ EXPECTED = sorted(REPORTS.glob("*.expected.npz"))
 
 def source_of(expected: Path) -> Path:
     stem = expected.name.removesuffix(".expected.npz")
-    return next(p for p in expected.parent.iterdir() if p.stem == stem and p != expected)
+    return next(
+        p for p in expected.parent.iterdir() if p.stem == stem and p != expected
+    )
 
 
 @pytest.mark.skipif(not EXPECTED, reason="the shared files are not here")
@@ -79,12 +81,16 @@ def written(tmp_path: Path, text: str, encoding: str = "utf-8") -> Path:
     return path
 
 
-@pytest.mark.parametrize("chest", ["0 0 0", "2e-6 -1e-6 3e-6", "0 10 0", "0 10.000002 0"])
+@pytest.mark.parametrize(
+    "chest", ["0 0 0", "2e-6 -1e-6 3e-6", "0 10 0", "0 10.000002 0"]
+)
 def test_positions_are_counted_from_the_offset_or_the_parent(tmp_path, chest):
     """With noise too; in all cases the bone is where OFFSET puts it."""
     motion = read_bvh(written(tmp_path, BVH.replace("{chest}", chest)))
     assert motion.local is None
-    np.testing.assert_allclose(motion.posed()[:, 1], [[0, 100, 0], [0, 101, 0]], atol=1e-4)
+    np.testing.assert_allclose(
+        motion.posed()[:, 1], [[0, 100, 0], [0, 101, 0]], atol=1e-4
+    )
 
 
 @pytest.mark.parametrize("chest", ["0 12 0", "3 11 0"])
@@ -126,8 +132,20 @@ def test_a_rate_in_place_of_the_time_is_a_rate(tmp_path):
 @pytest.mark.parametrize(
     ("seconds", "rate"),
     [
-        *((0.0333333, 30), (0.033333, 30), (0.0083333, 120), (0.008333, 120), (0.0166667, 60)),
-        *((0.04, 25), (0.041667, 24), (0.02, 50), (1 / 29.97, 29.97), (1 / 23.976, 23.976)),
+        *(
+            (0.0333333, 30),
+            (0.033333, 30),
+            (0.0083333, 120),
+            (0.008333, 120),
+            (0.0166667, 60),
+        ),
+        *(
+            (0.04, 25),
+            (0.041667, 24),
+            (0.02, 50),
+            (1 / 29.97, 29.97),
+            (1 / 23.976, 23.976),
+        ),
     ],
 )
 def test_rates_lose_their_rounding_and_films_rates_stay(seconds, rate):
@@ -159,7 +177,9 @@ def test_joints_of_common_exporters_are_known(names):
 
 
 def test_daz_fingers_and_twists():
-    known = known_joints(("lMid1", "lMid2", "lPinky1", "lThumb1", "lForearmTwist", "lThighTwist"))
+    known = known_joints(
+        ("lMid1", "lMid2", "lPinky1", "lThumb1", "lForearmTwist", "lThighTwist")
+    )
     assert known == {
         "LeftHandMiddle1": 0,
         "LeftHandMiddle2": 1,
@@ -211,18 +231,33 @@ def test_tensorflow_js_in_three_dimensions(tmp_path, landmarks, proportions):
         assert (clip.visibility == 0.9).all()
 
 
-TRC = "PathFileType\t4\t(X/Y/Z)\tm.trc\n{keys}\n{values}\nFrame#\tTime\t{markers}\n\t\t\n"
-MARKERS = {"LShoulder": 11, "RShoulder": 12, "LHip": 23, "RHip": 24, "LKnee": 25, "RKnee": 26}
+TRC = (
+    "PathFileType\t4\t(X/Y/Z)\tm.trc\n{keys}\n{values}\nFrame#\tTime\t{markers}\n\t\t\n"
+)
+MARKERS = {
+    "LShoulder": 11,
+    "RShoulder": 12,
+    "LHip": 23,
+    "RHip": 24,
+    "LKnee": 25,
+    "RKnee": 26,
+}
 
 
-def write_trc(path: Path, p: np.ndarray, *, prefix: str = "", units: str | None = "m") -> Path:
+def write_trc(
+    path: Path, p: np.ndarray, *, prefix: str = "", units: str | None = "m"
+) -> Path:
     scale = {"m": 1, "mm": 1000, "cm": 100, None: 1000}[units]
-    keys = ["DataRate", "CameraRate", "NumFrames", "NumMarkers"] + (["Units"] if units else [])
+    keys = ["DataRate", "CameraRate", "NumFrames", "NumMarkers"] + (
+        ["Units"] if units else []
+    )
     values = ["25", "25", str(len(p)), str(len(MARKERS))] + ([units] if units else [])
     markers = "\t\t\t".join(prefix + name for name in MARKERS)
     text = TRC.format(keys="\t".join(keys), values="\t".join(values), markers=markers)
     for i, frame in enumerate(p):
-        row = [x for joint in MARKERS.values() for x in (frame[joint][[1, 2, 0]] * scale)]
+        row = [
+            x for joint in MARKERS.values() for x in (frame[joint][[1, 2, 0]] * scale)
+        ]
         text += "\t".join(map(str, [i + 1, i / 25, *row])) + "\n"
     path.write_text(text)
     return path
@@ -234,7 +269,8 @@ def test_markers_with_a_prefix_and_files_without_units(
     tmp_path, landmarks, proportions, prefix, units
 ):
     clip = read_motion(
-        write_trc(tmp_path / "m.trc", landmarks, prefix=prefix, units=units), Source(proportions)
+        write_trc(tmp_path / "m.trc", landmarks, prefix=prefix, units=units),
+        Source(proportions),
     )
     np.testing.assert_allclose(clip.p[:, 23], landmarks[:, 23], atol=1e-9)
     assert clip.fps == 25
@@ -242,6 +278,8 @@ def test_markers_with_a_prefix_and_files_without_units(
 
 def test_markers_without_a_trunk_are_named(tmp_path, landmarks, proportions):
     path = write_trc(tmp_path / "m.trc", landmarks)
-    path.write_text(path.read_text().replace("Shoulder", "Elbow").replace("Hip", "Wrist"))
+    path.write_text(
+        path.read_text().replace("Shoulder", "Elbow").replace("Hip", "Wrist")
+    )
     with pytest.raises(DataError, match=r"LElbow.*RWrist"):
         read_motion(path, Source(proportions))

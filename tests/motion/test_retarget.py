@@ -54,9 +54,9 @@ def test_another_person_keeps_directions_and_gets_the_lengths(landmarks, proport
     )
     way = middle(q, HIPS)[-1] - middle(q, HIPS)[0]
     theirs = middle(stretched(landmarks), HIPS)
-    assert np.linalg.norm(way) / np.linalg.norm(theirs[-1] - theirs[0]) == pytest.approx(
-        1 / (1.2 * 0.7), rel=0.02
-    )
+    assert np.linalg.norm(way) / np.linalg.norm(
+        theirs[-1] - theirs[0]
+    ) == pytest.approx(1 / (1.2 * 0.7), rel=0.02)
 
 
 def test_joined_clips_keep_their_frames_their_speed_and_the_bones(proportions):
@@ -95,7 +95,9 @@ def test_worlds_with_any_axis_up(landmarks, proportions, up):
     assert np.linalg.det(R) == pytest.approx(1)
     axis = np.eye(3)["xyz".index(up[-1])] * (-1 if up[0] == "-" else 1)
     np.testing.assert_allclose(R @ axis, [0, 0, 1])
-    turned = measure_proportions(torch.from_numpy(landmarks @ R), ALL.expand(12, 33), up)
+    turned = measure_proportions(
+        torch.from_numpy(landmarks @ R), ALL.expand(12, 33), up
+    )
     np.testing.assert_allclose(turned.rest, proportions.rest, atol=1e-6)
     assert turned.ground == pytest.approx(proportions.ground, abs=1e-6)
 
@@ -109,10 +111,14 @@ def test_feet_on_the_ground_and_a_walker_on_a_treadmill(proportions):
     centre = np.array([1.0, 2.0, 3.0])
     on = placed(walk, proportions, centre, 30, ground=True, stay=True)
     assert heading(on[0]) == pytest.approx(proportions.facing)
-    np.testing.assert_allclose(on[:, HEELS_AND_TOES, 2].min(1), proportions.ground, atol=0.07)
+    np.testing.assert_allclose(
+        on[:, HEELS_AND_TOES, 2].min(1), proportions.ground, atol=0.07
+    )
     assert np.abs(middle(on, HIPS)[:, :2] - centre[:2]).max() < 0.3
     free = placed(walk, proportions, centre, 30, ground=False, stay=False)
     np.testing.assert_allclose(middle(free, HIPS)[0, :2], centre[:2], atol=1e-9)
-    assert np.linalg.norm(np.ptp(middle(free, HIPS)[:, :2], axis=0)) == pytest.approx(4, abs=1e-6)
+    assert np.linalg.norm(np.ptp(middle(free, HIPS)[:, :2], axis=0)) == pytest.approx(
+        4, abs=1e-6
+    )
     assert np.ptp(free[:, HEELS_AND_TOES, 2].min(1)) == pytest.approx(0.5)
     assert free[:, HEELS_AND_TOES, 2].min() == pytest.approx(proportions.ground)

@@ -19,7 +19,9 @@ ANGLES = (0.0, 1.3, 2.7, 4.2)
 LENS = (-0.05, 0.14, 0.0006, -0.0007, 0.01)
 
 
-def ring(angles: Sequence[float] = ANGLES, size=(1080, 1920), dist=(0,) * 5) -> list[CameraEntry]:
+def ring(
+    angles: Sequence[float] = ANGLES, size=(1080, 1920), dist=(0,) * 5
+) -> list[CameraEntry]:
     """Cameras around the person, metres, pixel centres at +0.5; ``size`` is (w, h)."""
     cameras = []
     for i, angle in enumerate(angles):
@@ -43,7 +45,9 @@ def seen(
     return rig, p, uv, np.ones(uv.shape[:3])
 
 
-def turned(cameras: CameraArray, camera: int, degrees: float, metres: float) -> CameraArray:
+def turned(
+    cameras: CameraArray, camera: int, degrees: float, metres: float
+) -> CameraArray:
     """The cameras with one of them turned about its vertical axis and moved sideways."""
     turn = cv2.Rodrigues(np.radians([0.0, degrees, 0.0]))[0]
     R, t = cameras.R.copy(), cameras.t.copy()
@@ -72,7 +76,9 @@ def write_toml(
         text += f"size = [{float(c.size[1])}, {float(c.size[0])}]\nmatrix = {K}\n"
         text += f"distortions = {c.dist[:lens].tolist()}\n"
         text += f"rotation = {cv2.Rodrigues(c.R)[0].ravel().tolist()}\n"
-        text += f"translation = {(c.t * unit).tolist()}\n" + ("fisheye = false\n" * (lens == 4))
+        text += f"translation = {(c.t * unit).tolist()}\n" + (
+            "fisheye = false\n" * (lens == 4)
+        )
     path.write_text(text + "[metadata]\nadjusted = false\nerror = 0.0\n")
     return path
 
@@ -114,14 +120,21 @@ def write_project(
 ) -> Path:
     """A folder with videos, calibration, 2D landmarks (pose/) and masks of a known person."""
     write_tiny_capture(
-        root, cameras=cameras, frames=frames, size=size, dist=[-0.1, 0.05, 0.001, -0.001, 0.0]
+        root,
+        cameras=cameras,
+        frames=frames,
+        size=size,
+        dist=[-0.1, 0.05, 0.001, -0.001, 0.0],
     )
     truth, rig = skeletons(frames), json.loads((root / "cameras.json").read_text())
     (root / "videos").mkdir()
     (root / "pose").mkdir()
     for name, camera in rig.items():
         video = cv2.VideoWriter(
-            str(root / "videos" / f"{name}.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 30, size
+            str(root / "videos" / f"{name}.avi"),
+            cv2.VideoWriter_fourcc(*"MJPG"),
+            30,
+            size,
         )
         for path in sorted((root / "images" / name).iterdir()):
             video.write(cv2.imread(str(path)))

@@ -32,7 +32,9 @@ def turning(frames: int) -> np.ndarray:
         ):
             q[:, solver.rig.names.index(f"{side}_{number}")] = torch.from_numpy(values)
     root = axis_angle_to_matrix(torch.from_numpy(angle))
-    p = solver.points(solver.transforms(q, root, solver.joints), solver.landmarks).numpy()
+    p = solver.points(
+        solver.transforms(q, root, solver.joints), solver.landmarks
+    ).numpy()
     p[..., 2] -= p[..., 2].min()
     s, c = np.sin(PITCH), np.cos(PITCH)
     R = np.array([[1, 0, 0], [0, -s, -c], [0, c, -s]])
@@ -42,7 +44,9 @@ def turning(frames: int) -> np.ndarray:
 def world_landmarks(p: np.ndarray, seed: int = 0) -> np.ndarray:
     """As a detector guesses them: too small, and 5 cm off in depth."""
     own = p - p[:, [23, 24]].mean(1, keepdims=True)
-    return 0.93 * own + np.random.default_rng(seed).normal(0, [0.01, 0.01, 0.05], own.shape)
+    return 0.93 * own + np.random.default_rng(seed).normal(
+        0, [0.01, 0.01, 0.05], own.shape
+    )
 
 
 def film(folder: Path, frames: int = 18, size=(360, 640), focal: float = 520.0) -> Path:
@@ -51,8 +55,12 @@ def film(folder: Path, frames: int = 18, size=(360, 640), focal: float = 520.0) 
     px = focal * p[..., :2] / p[..., 2:] + np.array(size) / 2
     for name in ("landmarks", "masks/me"):
         (folder / name).mkdir(parents=True)
-    video = cv2.VideoWriter(str(folder / "me.avi"), cv2.VideoWriter_fourcc(*"MJPG"), RATE, size)
-    wall = np.random.default_rng(0).integers(0, 255, (size[1] // 8, size[0] // 8, 3), np.uint8)
+    video = cv2.VideoWriter(
+        str(folder / "me.avi"), cv2.VideoWriter_fourcc(*"MJPG"), RATE, size
+    )
+    wall = np.random.default_rng(0).integers(
+        0, 255, (size[1] // 8, size[0] // 8, 3), np.uint8
+    )
     wall = cv2.resize(wall, size, interpolation=cv2.INTER_NEAREST)
     for f in range(frames):
         mask = np.zeros(size[::-1], np.uint8)

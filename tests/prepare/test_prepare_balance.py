@@ -36,18 +36,27 @@ def toml_of(qca: Path, out: Path) -> Path:
             {key: float(value) for key, value in camera.find(tag).attrib.items()}
             for tag in ("fov_video", "transform", "intrinsic")
         )
-        R = np.diag([1, -1, -1]) @ [[pose[f"r{i}{j}"] for j in (1, 2, 3)] for i in (1, 2, 3)]
+        R = np.diag([1, -1, -1]) @ [
+            [pose[f"r{i}{j}"] for j in (1, 2, 3)] for i in (1, 2, 3)
+        ]
         t = -R @ [pose[axis] / 1000 for axis in "xyz"]
         f_u, f_v, c_u, c_v = (
-            lens[f"{kind}{axis}"] / 64 for kind in ("focalLength", "centerPoint") for axis in "UV"
+            lens[f"{kind}{axis}"] / 64
+            for kind in ("focalLength", "centerPoint")
+            for axis in "UV"
         )
         names = ("radialDistortion1", "radialDistortion2", "tangentalDistortion1")
-        dist = [lens[name] for name in (*names, "tangentalDistortion2", "radialDistortion3")]
+        dist = [
+            lens[name] for name in (*names, "tangentalDistortion2", "radialDistortion3")
+        ]
+        text += f"[{camera.get('serial')}]\n"
+        text += f"size = [{window['right'] + 1}, {window['bottom'] + 1}]\n"
         text += (
-            f"[{camera.get('serial')}]\nsize = [{window['right'] + 1}, {window['bottom'] + 1}]\n"
+            f"matrix = [[{f_u}, 0.0, {c_u}], [0.0, {f_v}, {c_v}], [0.0, 0.0, 1.0]]\n"
         )
-        text += f"matrix = [[{f_u}, 0.0, {c_u}], [0.0, {f_v}, {c_v}], [0.0, 0.0, 1.0]]\n"
-        text += f"distortions = {dist}\nrotation = {cv2.Rodrigues(R)[0].ravel().tolist()}\n"
+        text += (
+            f"distortions = {dist}\nrotation = {cv2.Rodrigues(R)[0].ravel().tolist()}\n"
+        )
         text += f"translation = {t.tolist()}\n"
     out.write_text(text)
     return out
@@ -65,7 +74,10 @@ def test_real_videos_become_a_capture_that_trains(tmp_path, check):
     assert error["plain"] > 12
     assert error["plain"] > error["robust"] > error["flips"] > error["refined"]
     assert error["smoothed"] < 6
-    assert max(camera["error_px"]["smoothed"] for camera in numbers["cameras"].values()) < 9
+    assert (
+        max(camera["error_px"]["smoothed"] for camera in numbers["cameras"].values())
+        < 9
+    )
     assert numbers["frames_dropped"] == []
     assert min(camera["frames_written"] for camera in numbers["cameras"].values()) == 70
     assert check(out, tmp_path / "check.html", Console(file=io.StringIO())).errors == 0

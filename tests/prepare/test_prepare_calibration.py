@@ -22,7 +22,9 @@ def equal(found, expected, lens: int = 5) -> None:
 
 def test_pose2sim_toml(tmp_path):
     cameras = ring(dist=(*LENS[:4], 0))
-    equal(read_calibration(write_toml(tmp_path / "Calib.toml", cameras)).cameras, cameras)
+    equal(
+        read_calibration(write_toml(tmp_path / "Calib.toml", cameras)).cameras, cameras
+    )
 
 
 def test_aniposelib_toml_in_millimetres(tmp_path):
@@ -47,7 +49,10 @@ rotation = {rotation}
 
 def test_caliscope(tmp_path):
     """A quarter turn about y as a vector and as a matrix; ignored and uncalibrated cameras."""
-    vector, matrix = [0.0, np.pi / 2, 0.0], [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]
+    vector, matrix = (
+        [0.0, np.pi / 2, 0.0],
+        [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]],
+    )
     path = tmp_path / "camera_array.toml"
     path.write_text(
         CALISCOPE.format(number=0, rotation=vector, ignore="false")
@@ -57,13 +62,18 @@ def test_caliscope(tmp_path):
     calibration = read_calibration(find_calibration(tmp_path))
     assert list(calibration.cameras) == ["0", "3"]
     for camera in calibration.cameras.values():
-        np.testing.assert_allclose(camera.K, [[900, 0, 618.75], [0, 910, 395], [0, 0, 1]])
+        np.testing.assert_allclose(
+            camera.K, [[900, 0, 618.75], [0, 910, 395], [0, 0, 1]]
+        )
         np.testing.assert_allclose(camera.R, matrix, atol=1e-12)
         np.testing.assert_allclose(camera.t, [0.125, -0.25, 1.5])
         np.testing.assert_allclose(camera.dist[:5], [-0.3, 0.05, -0.004, 0.002, 0.06])
         assert camera.size == (720, 1280)
     videos = ["cam_0", "cam_3"]
-    assert pair_cameras(videos, list(calibration.cameras), {}) == {"cam_0": "0", "cam_3": "3"}
+    assert pair_cameras(videos, list(calibration.cameras), {}) == {
+        "cam_0": "0",
+        "cam_3": "3",
+    }
     path.write_text(path.read_text().replace("ignore = true", "ignore = false"))
     with pytest.raises(DataError, match=r"\[5\] lacks 'matrix'"):
         read_calibration(path)
@@ -78,7 +88,9 @@ def test_fisheye_is_refused(tmp_path):
 
 def test_own_json_has_its_unit(tmp_path):
     cameras = ring(dist=LENS)
-    equal(read_calibration(write_own(tmp_path / "cameras.json", cameras)).cameras, cameras)
+    equal(
+        read_calibration(write_own(tmp_path / "cameras.json", cameras)).cameras, cameras
+    )
     (tmp_path / "meta.json").write_text('{"unit": "mm"}')
     found = read_calibration(tmp_path / "cameras.json").cameras
     np.testing.assert_allclose(found["cam1"].t, cameras[1].t / 1000)

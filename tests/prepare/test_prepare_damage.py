@@ -93,7 +93,10 @@ def test_results_with_other_keys_are_removed_by_stage(tmp_path):
     kept = stages.path("tool-a", 2)
     stages.remove_others()
     left = {p.name for p in tmp_path.iterdir() if p.name.startswith("tool-a-")}
-    assert {name for name in left if "tool-a-b-" not in name} == {kept.name, f"{kept.name}.npz"}
+    assert {name for name in left if "tool-a-b-" not in name} == {
+        kept.name,
+        f"{kept.name}.npz",
+    }
     assert len(list(tmp_path.iterdir())) == 10  # stages that the run did not use stay
 
 
@@ -116,7 +119,13 @@ def test_an_old_dataset_stays_when_the_new_one_cannot_be_moved(tmp_path, monkeyp
 
 
 @pytest.mark.parametrize(
-    "more", [{"fps": "abc"}, {"workers": "x"}, {"offsets": {"a": "b"}}, {"mask_levels": (0.8, 0.3)}]
+    "more",
+    [
+        {"fps": "abc"},
+        {"workers": "x"},
+        {"offsets": {"a": "b"}},
+        {"mask_levels": (0.8, 0.3)},
+    ],
 )
 def test_options_of_the_wrong_kind(more):
     with pytest.raises(ConfigError, match=next(iter(more))):
@@ -128,14 +137,18 @@ def test_strong_lenses_are_undistorted_to_the_corners():
     h, w = camera.size
     straight = np.array([[0, 0], [w, 0], [0, h], [w, h], [w / 3, h / 4]], np.float64)
     rays = np.c_[straight, np.ones(5)] @ np.linalg.inv(camera.K).T
-    bent = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), camera.K, camera.dist)[0][:, 0]
+    bent = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), camera.K, camera.dist)[0][
+        :, 0
+    ]
     assert np.abs(bent - straight)[:4].max() > 20
     np.testing.assert_allclose(undistort_points(camera, bent), straight, atol=1e-3)
 
 
 def person(tmp_path: Path) -> Path:
     path = tmp_path / "0.json"
-    path.write_text(json.dumps({"people": [{"pose_keypoints_2d": [3.5, 4.0, 0.9] * 25}]}))
+    path.write_text(
+        json.dumps({"people": [{"pose_keypoints_2d": [3.5, 4.0, 0.9] * 25}]})
+    )
     return path
 
 
@@ -154,7 +167,10 @@ READERS = {
     "intri": (read_calibration, lambda p: opencv_yaml(p, "intri.yml")),
     "extri": (read_calibration, lambda p: opencv_yaml(p, "extri.yml")),
     "toml": (read_calibration, lambda p: write_toml(p / "Calib.toml", ring(dist=LENS))),
-    "json": (read_calibration, lambda p: write_own(p / "cameras.json", ring(dist=LENS))),
+    "json": (
+        read_calibration,
+        lambda p: write_own(p / "cameras.json", ring(dist=LENS)),
+    ),
     "openpose": (lambda p: read_detections(p.parent), person),
     "npz": (read_detections, tool_npz),
     "trc": (read_points3d, lambda p: write_trc(p / "a.trc", skeletons(2))),

@@ -26,7 +26,10 @@ def hand(turn: float) -> np.ndarray:
 
 def person(frames: int = FRAMES) -> np.ndarray:
     """``[F, 105, 3]`` metres: a moving body with turning hands and a face."""
-    body, face = skeletons(frames), np.random.default_rng(1).uniform(-0.05, 0.05, (30, 3))
+    body, face = (
+        skeletons(frames),
+        np.random.default_rng(1).uniform(-0.05, 0.05, (30, 3)),
+    )
     hands = [
         np.stack([body[f, wrist] + hand(0.1 * f + wrist) for f in range(frames)])
         for wrist in (15, 16)
@@ -46,7 +49,9 @@ def swap(uv: np.ndarray, swapped: np.ndarray) -> np.ndarray:
 
 def off(found: Solution, p: np.ndarray, part: slice) -> float:
     """Metres, the worst joint; NaN counts as infinite."""
-    return float(np.nan_to_num(np.linalg.norm(found.p - p, axis=-1), nan=np.inf)[:, part].max())
+    return float(
+        np.nan_to_num(np.linalg.norm(found.p - p, axis=-1), nan=np.inf)[:, part].max()
+    )
 
 
 def test_hands_that_agree_are_left_alone():

@@ -13,7 +13,9 @@ from gsgan.prepare.sources import Recording, find_sources, recording_notes
 from gsgan.utils.errors import DataError
 
 
-def source(name: str, fps: float = 30.0, count: int = 100, turned: int = 0) -> Recording:
+def source(
+    name: str, fps: float = 30.0, count: int = 100, turned: int = 0
+) -> Recording:
     return Recording(name, Path(name), (10, 10), fps, {}, count, turned)
 
 

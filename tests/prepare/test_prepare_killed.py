@@ -15,7 +15,9 @@ from gsgan.prepare.run import prepare
 from gsgan.prepare.stages import each_camera
 
 LIMIT = 120  # seconds after which the child counts as hanging
-pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork, no child to kill")
+pytestmark = pytest.mark.skipif(
+    not hasattr(os, "fork"), reason="no fork, no child to kill"
+)
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +79,9 @@ def whole(project):
 
 
 @pytest.mark.parametrize("stage", STAGES)
-def test_a_killed_process_leaves_nothing_incomplete_and_is_resumed(project, whole, tmp_path, stage):
+def test_a_killed_process_leaves_nothing_incomplete_and_is_resumed(
+    project, whole, tmp_path, stage
+):
     out = tmp_path / "out"
     given = options(project, out=str(out), workers=1)
     assert killed(lambda: prepare(given, quiet()), STAGES[stage])

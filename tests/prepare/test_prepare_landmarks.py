@@ -19,7 +19,9 @@ def triples(count: int, first: float = 0.0) -> list[float]:
 
 def write_people(folder: Path, frame: int, *people: dict) -> None:
     folder.mkdir(exist_ok=True)
-    (folder / f"cam_{frame:012d}_keypoints.json").write_text(json.dumps({"people": people}))
+    (folder / f"cam_{frame:012d}_keypoints.json").write_text(
+        json.dumps({"people": people})
+    )
 
 
 def test_openpose_body_25_keeps_the_persons_sides(tmp_path):
@@ -27,7 +29,8 @@ def test_openpose_body_25_keeps_the_persons_sides(tmp_path):
     found = read_detections(tmp_path / "a_json")
     assert found.frame_id.tolist() == [7]
     left_wrist, right_heel = 15, 30
-    np.testing.assert_allclose(found.px[0, left_wrist], [70.5, 71.5])  # OpenPose's 7, + 0.5
+    # OpenPose's 7, + 0.5
+    np.testing.assert_allclose(found.px[0, left_wrist], [70.5, 71.5])
     np.testing.assert_allclose(found.px[0, right_heel], [240.5, 241.5])
     assert found.conf[0, 1] == 0  # the inner eye: OpenPose does not have it
     assert np.isnan(found.px[0, 1]).all()
@@ -82,7 +85,9 @@ def test_face_of_the_tool(tmp_path):
     assert (found.conf[1, FACE] == 1).all()
     assert (found.conf[0, FACE] == 0).all()
     np.savez(tmp_path / "b.npz", **given, face=mesh[:, :68])
-    with pytest.raises(DataError, match=r"b\.npz: 'face' must have shape \(2, 468, 2\)"):
+    with pytest.raises(
+        DataError, match=r"b\.npz: 'face' must have shape \(2, 468, 2\)"
+    ):
         read_detections(tmp_path / "b.npz")
 
 
@@ -114,10 +119,13 @@ def test_damaged_json_names_the_file(tmp_path, content, what):
 def test_cameras_meet_by_number_and_offset(tmp_path):
     for name, ids in (("a", [0, 1, 2]), ("b", [3, 4])):
         px = np.zeros((len(ids), BODY, 2)) + np.array(ids)[:, None, None]
-        np.savez(tmp_path / f"{name}.npz", px=px, conf=np.ones(px.shape[:2]), frame_id=ids)
+        np.savez(
+            tmp_path / f"{name}.npz", px=px, conf=np.ones(px.shape[:2]), frame_id=ids
+        )
     cameras = {n: read_detections(tmp_path / f"{n}.npz") for n in "ab"}
     frames, px, conf = gather(cameras, {"b": -2})
     assert frames.tolist() == [0, 1, 2]
     assert conf[1, :, 0].tolist() == [0, 1, 1]
     assert px[1, 1, 0].tolist() == [3, 3]
-    assert gather(cameras, {"a": -1})[0].tolist() == [0, 1, 3, 4]  # nothing before frame 0
+    # nothing before frame 0
+    assert gather(cameras, {"a": -1})[0].tolist() == [0, 1, 3, 4]

@@ -54,7 +54,10 @@ def test_focal_length_and_landmarks_are_found(guess):
     truth = turning(48)
     u = truth[..., :2] / truth[..., 2:] / guess
     seen = Seen(
-        *map(torch.tensor, (u, np.ones(u.shape[:2]), world_landmarks(truth), np.arange(48) / 10))
+        *map(
+            torch.tensor,
+            (u, np.ones(u.shape[:2]), world_landmarks(truth), np.arange(48) / 10),
+        )
     )
     found = solve_view(seen, noise=0.001, height=TALL)
     error = np.linalg.norm(aligned(found.p.numpy(), truth) - truth, axis=-1)
@@ -70,7 +73,8 @@ def test_a_video_becomes_a_capture_that_training_reads(filmed, tmp_path):
     p, truth = found["p"], turning(18)[found["frame_id"]]
     assert len(p) >= 16
     assert np.median(np.linalg.norm(aligned(p, truth) - truth, axis=-1)) < 0.03
-    assert np.abs(np.percentile(p[:, 29:33, 2], 50)) < 0.06  # feet on the ground, z upwards
+    # feet on the ground, z upwards
+    assert np.abs(np.percentile(p[:, 29:33, 2], 50)) < 0.06
     notes = " ".join(numbers["notes"])
     assert "3.4 seconds are short" in notes
     assert "focal" in notes
@@ -107,7 +111,9 @@ def hips_cut_off(arrays):
         (hips_cut_off, "shoulders or hips cut off: "),
     ],
 )
-def test_videos_without_a_whole_person_end_in_one_sentence(filmed, tmp_path, change, message):
+def test_videos_without_a_whole_person_end_in_one_sentence(
+    filmed, tmp_path, change, message
+):
     with pytest.raises(DataError, match=message):
         prepare(options(spoiled(filmed, tmp_path, change)), Console(quiet=True))
 
@@ -134,8 +140,11 @@ def test_vertical_phone_videos_are_turned_as_their_metadata_say(tmp_path):
         video.write(stored)
     video.release()
     content = bytearray(path.read_bytes())
-    at = content.find(b"tkhd") + 44  # of the track's matrix: version and times are before it
-    content[at : at + 36] = struct.pack(">9i", 0, 1 << 16, 0, -(1 << 16), 0, 0, 0, 0, 1 << 30)
+    # of the track's matrix: version and times are before it
+    at = content.find(b"tkhd") + 44
+    content[at : at + 36] = struct.pack(
+        ">9i", 0, 1 << 16, 0, -(1 << 16), 0, 0, 0, 0, 1 << 30
+    )
     path.write_bytes(content)
     recording, _ = sample(path, tmp_path / "frames")
     image = cv2.imread(str(recording.files[0]), cv2.IMREAD_GRAYSCALE)
@@ -144,7 +153,9 @@ def test_vertical_phone_videos_are_turned_as_their_metadata_say(tmp_path):
     assert image[40:].mean() < 50
 
 
-@pytest.mark.parametrize(("stated", "found"), [("26", 26), ("26.500000", 26.5), ("", None)])
+@pytest.mark.parametrize(
+    ("stated", "found"), [("26", 26), ("26.500000", 26.5), ("", None)]
+)
 def test_the_focal_length_that_a_phone_states(tmp_path, stated, found):
     av, path = pytest.importorskip("av"), tmp_path / "phone.mov"
     with av.open(str(path), "w", options={"movflags": "use_metadata_tags"}) as file:
@@ -152,7 +163,9 @@ def test_the_focal_length_that_a_phone_states(tmp_path, stated, found):
             file.metadata[FOCAL] = stated
         stream = file.add_stream("mpeg4", rate=10)
         stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
-        file.mux(stream.encode(av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8))))
+        file.mux(
+            stream.encode(av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8)))
+        )
         file.mux(stream.encode())
     assert stated_focal(path) == found
 
@@ -163,6 +176,8 @@ def test_a_moving_camera_is_measured(tmp_path):
     paths = [tmp_path / f"{f}.png" for f in range(10)]
     for f, path in enumerate(paths):
         cv2.imwrite(str(path), wall[:480, 8 * f : 8 * f + 640])
-    px = np.full((10, 33, 2), 320.0) + np.random.default_rng(1).uniform(-60, 60, (10, 33, 2))
+    px = np.full((10, 33, 2), 320.0) + np.random.default_rng(1).uniform(
+        -60, 60, (10, 33, 2)
+    )
     assert look(paths, px)[1] == pytest.approx(72 / 800, rel=0.1)
     assert look([paths[0]] * 10, px)[1] < 0.002

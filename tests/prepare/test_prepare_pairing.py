@@ -14,11 +14,15 @@ def test_same_names_whatever_their_order():
 
 
 def test_a_serial_number_inside_the_name():
-    assert pair_cameras(["Miqus_5_21474"], ["21474", "2147"], {}) == {"Miqus_5_21474": "21474"}
+    assert pair_cameras(["Miqus_5_21474"], ["21474", "2147"], {}) == {
+        "Miqus_5_21474": "21474"
+    }
 
 
 def test_given_names_win_and_may_be_numbers():
-    assert pair_cameras(["cam01"], ["21474", "cam01"], {"cam01": 21474}) == {"cam01": "21474"}
+    assert pair_cameras(["cam01"], ["21474", "cam01"], {"cam01": 21474}) == {
+        "cam01": "21474"
+    }
 
 
 @pytest.mark.parametrize(

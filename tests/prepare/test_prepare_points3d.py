@@ -39,9 +39,13 @@ def write_trc(path: Path, p: np.ndarray, unit: str = "m") -> Path:
         "\t\t" + "\t".join(f"X{i}\tY{i}\tZ{i}" for i in range(len(names))),
     ]
     for f, frame in enumerate(p):
-        row = np.vstack([frame[list(MARKERS.values())], [[9, 9, 9]]])[:, [1, 2, 0]] * scale
+        row = (
+            np.vstack([frame[list(MARKERS.values())], [[9, 9, 9]]])[:, [1, 2, 0]]
+            * scale
+        )
         cells = [
-            "" if np.isnan(v) else repr(float(v)) for v in np.where(row == 0, 0.0, row).ravel()
+            "" if np.isnan(v) else repr(float(v))
+            for v in np.where(row == 0, 0.0, row).ravel()
         ]
         lines.append("\t".join([str(f), str(f / 60), *cells]))
     path.write_text("\n".join(lines) + "\n")
@@ -68,7 +72,10 @@ def test_trc_units_axes_and_names_are_converted(tmp_path, proportions, unit):
         (lambda text: "hello", "cannot be read as a .trc file"),
         (lambda text: text.replace("\tm\n", "\tfeet\n"), "Units is 'feet'"),
         (lambda text: text.replace("1.58", "x.yz"), "cannot be read as a .trc file"),
-        (lambda text: text.replace("Shoulder", "Sh").replace("Hip", "H"), "no shoulders and hips"),
+        (
+            lambda text: text.replace("Shoulder", "Sh").replace("Hip", "H"),
+            "no shoulders and hips",
+        ),
     ],
 )
 def test_damaged_trc(tmp_path, change, what):

@@ -49,14 +49,22 @@ def test_videos_become_a_capture_that_training_reads(project):
     assert (hands["conf"] == 0).all()
 
 
-def test_the_numbers_have_every_stage_and_the_dataset_is_checked(project, monkeypatch, check):
+def test_the_numbers_have_every_stage_and_the_dataset_is_checked(
+    project, monkeypatch, check
+):
     monkeypatch.setattr("gsgan.prepare.run.check_capture", check)
     console = Console(file=io.StringIO(), width=100)
     out = prepare(options(project), console)
     assert "check.html" in console.file.getvalue()
     assert "smoothed" in console.file.getvalue()
     numbers = json.loads((out / "prepare.json").read_text())
-    assert list(numbers["error_px"]) == ["plain", "robust", "flips", "refined", "smoothed"]
+    assert list(numbers["error_px"]) == [
+        "plain",
+        "robust",
+        "flips",
+        "refined",
+        "smoothed",
+    ]
     assert numbers["cameras"]["cam02"]["frames_written"] == FRAMES
     assert numbers["settings"]["solve"]["smoothing"] == 0.02
     assert (out / "check.html").read_text().count("data:image/jpeg;base64,") >= CAMERAS
@@ -150,14 +158,34 @@ def no_detections(project: Path) -> None:
 @pytest.mark.parametrize(
     ("break_it", "more", "what"),
     [
-        (lambda p: None, {"unit": "mm"}, r"cameras\.json: cameras stand 0\.003 m .* unit=mm"),
-        (in_centimetres, {}, r"cameras\.json: cameras stand 3\d\d m .* unit=mm, cm or m"),
+        (
+            lambda p: None,
+            {"unit": "mm"},
+            r"cameras\.json: cameras stand 0\.003 m .* unit=mm",
+        ),
+        (
+            in_centimetres,
+            {},
+            r"cameras\.json: cameras stand 3\d\d m .* unit=mm, cm or m",
+        ),
         (lambda p: None, {"source": "nowhere"}, "nowhere does not exist"),
         (lambda p: (p / "cameras.json").unlink(), {}, "holds no calibration"),
-        (lambda p: (p / "pose" / "cam01.npz").unlink(), {}, "no landmarks of the camera cam01"),
+        (
+            lambda p: (p / "pose" / "cam01.npz").unlink(),
+            {},
+            "no landmarks of the camera cam01",
+        ),
         (lambda p: (p / "pose" / "cam01.npz").write_bytes(b"PK"), {}, r"cam01\.npz"),
-        (lambda p: (p / "videos" / "cam01.avi").write_bytes(b"RIFF"), {}, r"cam01\.avi"),
-        (lambda p: (p / "masks" / "cam00" / "000001.png").write_bytes(b"x"), {}, r"000001\.png"),
+        (
+            lambda p: (p / "videos" / "cam01.avi").write_bytes(b"RIFF"),
+            {},
+            r"cam01\.avi",
+        ),
+        (
+            lambda p: (p / "masks" / "cam00" / "000001.png").write_bytes(b"x"),
+            {},
+            r"000001\.png",
+        ),
         (no_detections, {}, "no body joint of any frame came out in 3D"),
         (lambda p: None, {"frames": "90-99"}, "frames=90-99 leaves no frame"),
         (lambda p: None, {"cameras": {"cam00": "cam01"}}, "more than one video"),
@@ -187,7 +215,8 @@ def test_every_key_of_the_config_is_understood(project, compose, capsys):
     assert "is ready" in capsys.readouterr().out
     defaults = instantiate(compose("prepare", "source=a", "out=b"), _convert_="all")
     records = (given.record() for given in (Options(**defaults), Options("a", "b")))
-    ours, plain = (json.loads(json.dumps(x)) for x in records)  # as JSON: tuples are lists
+    # as JSON: tuples are lists
+    ours, plain = (json.loads(json.dumps(x)) for x in records)
     assert ours == plain
 
 
@@ -218,7 +247,9 @@ def with_stub(project: Path, monkeypatch, bad: str = "") -> Options:
     script.write_text(STUB.format(root=str(project), bad=bad))
     monkeypatch.setattr(tool, "SCRIPT", script)
     mediapipe = MediaPipe(folder=str(environment))
-    return options(project, landmarks="mediapipe", masks="mediapipe", mediapipe=mediapipe)
+    return options(
+        project, landmarks="mediapipe", masks="mediapipe", mediapipe=mediapipe
+    )
 
 
 def test_the_tool_runs_once_per_camera(project, monkeypatch):
@@ -226,14 +257,18 @@ def test_the_tool_runs_once_per_camera(project, monkeypatch):
     out = prepare(given, quiet())
     assert len(read_capture(out).frames) == FRAMES
     calls = []
-    monkeypatch.setattr("gsgan.prepare.mediapipe._detect", lambda *a, **k: calls.append(a))
+    monkeypatch.setattr(
+        "gsgan.prepare.mediapipe._detect", lambda *a, **k: calls.append(a)
+    )
     smoother = {"scale": 0.5, "overwrite": True}
     prepare(Options(**(vars(given) | smoother)), quiet())
     assert calls == []
 
 
 def test_the_message_of_a_failing_tool_is_its_last_line(project, monkeypatch):
-    with pytest.raises(DataError, match=r"cam01\.avi: the MediaPipe tool failed: the stub refuses"):
+    with pytest.raises(
+        DataError, match=r"cam01\.avi: the MediaPipe tool failed: the stub refuses"
+    ):
         prepare(with_stub(project, monkeypatch, bad="cam01"), quiet())
     assert not (project.parent / "out").exists()
 

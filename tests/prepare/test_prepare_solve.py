@@ -7,7 +7,12 @@ from make import distorted_pixels, skeletons
 
 from gsgan.data.joints import FLIP_GROUPS as GROUPS
 from gsgan.prepare import triangulate
-from gsgan.prepare.camera_array import CameraArray, camera_moves, refine_cameras, undistort_points
+from gsgan.prepare.camera_array import (
+    CameraArray,
+    camera_moves,
+    refine_cameras,
+    undistort_points,
+)
 from gsgan.prepare.cleanse import cleanse, smooth
 from gsgan.prepare.solve import SolveSettings, clock_errors, median, solve
 from gsgan.prepare.triangulate import apply_flips, find_flips, plain, robust
@@ -43,7 +48,9 @@ def test_one_outlier_is_rejected():
     rig, p, uv, conf = seen(ring(), noise=1.0)
     uv[2, :, 15] += [300, -200]  # one camera detects the left wrist elsewhere
     found = plain(rig, flat(uv), flat(conf)), robust(rig, flat(uv), flat(conf)).p
-    off = [np.linalg.norm(one.reshape(p.shape) - p, axis=-1)[:, 15].max() for one in found]
+    off = [
+        np.linalg.norm(one.reshape(p.shape) - p, axis=-1)[:, 15].max() for one in found
+    ]
     assert off[0] > 0.1
     assert off[1] < 0.01
 
@@ -96,7 +103,9 @@ def test_refinement_recovers_a_camera_that_was_bumped():
     # The world may move a little as a whole, the cameras not against each other.
     angles, _ = camera_moves(relative(rig), relative(found))
     assert angles.max() < 0.1
-    distances = np.linalg.norm(after.p[11] - after.p[24]) / np.linalg.norm(p[0, 11] - p[0, 24])
+    distances = np.linalg.norm(after.p[11] - after.p[24]) / np.linalg.norm(
+        p[0, 11] - p[0, 24]
+    )
     assert distances == pytest.approx(1, abs=0.02)
 
 
@@ -187,7 +196,9 @@ def test_all_stages_together_end_near_the_truth():
 
 def test_nobody_seen_ends_without_joints_or_warnings():
     rig, _, uv, conf = seen(ring(), frames=3)
-    found = solve(rig, np.arange(3.0), np.full_like(uv, np.nan), 0 * conf, SolveSettings())
+    found = solve(
+        rig, np.arange(3.0), np.full_like(uv, np.nan), 0 * conf, SolveSettings()
+    )
     assert np.isnan(found.p).all()
     assert (found.conf == 0).all()
     np.testing.assert_allclose(found.cameras.R, rig.R)

@@ -9,7 +9,14 @@ from PIL import Image
 
 from gsgan.render.output import encoded
 from gsgan.utils.errors import ConfigError, DataError
-from gsgan.utils.provenance import SOURCE_TYPE, Signer, marked_mp4, png_bytes, signed, verify
+from gsgan.utils.provenance import (
+    SOURCE_TYPE,
+    Signer,
+    marked_mp4,
+    png_bytes,
+    signed,
+    verify,
+)
 
 PIXELS = np.arange(16 * 16 * 3, dtype=np.uint8).reshape(16, 16, 3)
 
@@ -112,19 +119,27 @@ def signer(tmp_path_factory):
             .serial_number(x509.random_serial_number())
             .not_valid_before(now - datetime.timedelta(days=1))
             .not_valid_after(now + datetime.timedelta(days=30))
-            .add_extension(x509.BasicConstraints(ca=root, path_length=None), critical=True)
+            .add_extension(
+                x509.BasicConstraints(ca=root, path_length=None), critical=True
+            )
             .add_extension(
                 x509.KeyUsage(
-                    digital_signature=not root, key_cert_sign=root, crl_sign=root, **usage
+                    digital_signature=not root,
+                    key_cert_sign=root,
+                    crl_sign=root,
+                    **usage,
                 ),
                 critical=True,
             )
             .add_extension(
-                x509.AuthorityKeyIdentifier.from_issuer_public_key(keys[1].public_key()),
+                x509.AuthorityKeyIdentifier.from_issuer_public_key(
+                    keys[1].public_key()
+                ),
                 critical=False,
             )
             .add_extension(
-                x509.SubjectKeyIdentifier.from_public_key(keys[k].public_key()), critical=False
+                x509.SubjectKeyIdentifier.from_public_key(keys[k].public_key()),
+                critical=False,
             )
         )
         if not root:
@@ -135,7 +150,9 @@ def signer(tmp_path_factory):
     pem = serialization.Encoding.PEM
     (folder / "chain.pem").write_bytes(b"".join(c.public_bytes(pem) for c in chain))
     (folder / "key.pem").write_bytes(
-        keys[0].private_bytes(pem, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+        keys[0].private_bytes(
+            pem, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+        )
     )
     return Signer(folder / "chain.pem", folder / "key.pem")
 

@@ -109,18 +109,27 @@ def test_held_out_frames_are_the_scored_images(
         result = inside("render", *given, f"background={background}", f"drive={drive}")
         assert result.returncode == 0, result.stderr
         frames = {frame for c, frame in scored if c == camera}
-        assert {p.name for p in out.glob("*.png")} == {f"{frame:06d}.png" for frame in frames}
+        assert {p.name for p in out.glob("*.png")} == {
+            f"{frame:06d}.png" for frame in frames
+        }
         for frame in frames:
-            np.testing.assert_array_equal(read(out / f"{frame:06d}.png"), scored[camera, frame])
+            np.testing.assert_array_equal(
+                read(out / f"{frame:06d}.png"), scored[camera, frame]
+            )
     if name == "fitted":  # the data's poses give other images
         given = expected(folder, split, background, solve=False)
         assert all((given[item] != scored[item]).any() for item in scored)
 
 
 def test_a_motion_of_another_person(render, motion, tmp_path):
-    result = render(f"motion={motion}", "out=frames", "fps=15", "start=1", "frames=4", "pixels=40")
+    result = render(
+        f"motion={motion}", "out=frames", "fps=15", "start=1", "frames=4", "pixels=40"
+    )
     assert result.returncode == 0, result.stderr
-    assert "a.npz: 12 frames at 30 per second, metres, Z up -> 6 frames at 15" in result.stdout
+    assert (
+        "a.npz: 12 frames at 30 per second, metres, Z up -> 6 frames at 15"
+        in result.stdout
+    )
     assert "distance from the training poses, in deviations: " in result.stdout
     assert "on the subject's bones" in result.stdout
     files = sorted((tmp_path / "frames").glob("*.png"))
@@ -132,16 +141,23 @@ def test_a_motion_of_another_person(render, motion, tmp_path):
 
 def test_clips_become_one_motion(render, motion, landmarks, tmp_path):
     other = tmp_path / "b.npz"
-    p = np.full((len(landmarks), 105, 3), np.nan)  # with a face, which this avatar has not
+    # with a face, which this avatar has not
+    p = np.full((len(landmarks), 105, 3), np.nan)
     p[:, :33], p[:, 75:] = landmarks[::-1], landmarks[:, :30]
     np.savez(other, p=0.9 * p, fps=30)
-    result = render(f"motion=[{motion},{other}]", "transition=0.2", "out=frames", "pixels=32")
+    result = render(
+        f"motion=[{motion},{other}]", "transition=0.2", "out=frames", "pixels=32"
+    )
     assert result.returncode == 0, result.stderr
     assert f"face in {len(p)}; 0.2 s from each to the next" in result.stdout
     between = 5  # frames at 30 per second
-    assert len(list((tmp_path / "frames").glob("*.png"))) == 2 * len(landmarks) + between
+    assert (
+        len(list((tmp_path / "frames").glob("*.png"))) == 2 * len(landmarks) + between
+    )
     refused(render("motion=[]", "out=none"), "names no file")
-    refused(render(f"motion=[{motion},gone.pose]", "out=none"), "gone.pose does not exist")
+    refused(
+        render(f"motion=[{motion},gone.pose]", "out=none"), "gone.pose does not exist"
+    )
 
 
 def test_a_run_without_its_dataset(render, bare, motion, tmp_path):
@@ -159,7 +175,9 @@ def test_the_subjects_own_motion_is_left_alone(render, capture, tmp_path):
     result = render(f"motion={path}", "camera=cam00", "out=a")
     assert "bones as they are" in result.stdout, result.stderr
     assert render("motion=train", "camera=cam00", "out=b").returncode == 0
-    np.testing.assert_array_equal(read(tmp_path / "a/000002.png"), read(tmp_path / "b/000002.png"))
+    np.testing.assert_array_equal(
+        read(tmp_path / "a/000002.png"), read(tmp_path / "b/000002.png")
+    )
     again = render(f"motion={path}", "out=c", "retarget=true", "frames=1")
     assert "on the subject's bones" in again.stdout, again.stderr
 
@@ -181,14 +199,21 @@ def test_the_up_axis_of_a_rig_can_be_given(render, tmp_path):
 
 def test_a_body_pose_drives_an_avatar_with_a_body(inside, run, capture, tmp_path):
     motion = f"motion={capture / 'body_pose.npz'}"
-    result = inside("render", f"run={run}", motion, "retarget=false", "out=a", "frames=2")
+    result = inside(
+        "render", f"run={run}", motion, "retarget=false", "out=a", "frames=2"
+    )
     assert result.returncode == 0, result.stderr
 
 
 def test_residuals_can_be_distilled(inside, on_body, tmp_path):
     images = []
     for value in ("false", "true"):
-        given = ["motion=train", "frames=1", f"distilled={value}", f"out={tmp_path / value}"]
+        given = [
+            "motion=train",
+            "frames=1",
+            f"distilled={value}",
+            f"out={tmp_path / value}",
+        ]
         result = inside("render", f"run={on_body()}", *given)
         assert result.returncode == 0, result.stderr
         images.append(read(next((tmp_path / value).glob("*.png"))) / 255)
@@ -206,7 +231,9 @@ def test_a_video(render, tmp_path):
     assert [f.shape for f in frames] == [(32, 32, 3)] * 2
     assert verify(tmp_path / "a.mp4").synthetic
     refused(render("out=a.mp4"), "exists; give overwrite=true")
-    assert render("out=a.mp4", "overwrite=true", "frames=2", "pixels=33").returncode == 0
+    assert (
+        render("out=a.mp4", "overwrite=true", "frames=2", "pixels=33").returncode == 0
+    )
     with av.open(str(tmp_path / "a.mp4")) as container:
         assert container.streams.video[0].width == 34  # H.264 has even sides
 
@@ -221,18 +248,27 @@ def test_frames_of_two_renders_are_never_mixed(render, motion, tmp_path):
 
 
 def test_backgrounds(render, tmp_path):
-    cv2.imwrite(str(tmp_path / "wall.png"), np.full((20, 50, 3), (30, 20, 10), np.uint8))
+    cv2.imwrite(
+        str(tmp_path / "wall.png"), np.full((20, 50, 3), (30, 20, 10), np.uint8)
+    )
     for name, colour in (
         ("red", (255, 0, 0)),
         ("#0a141e", (10, 20, 30)),
         ("wall.png", (10, 20, 30)),
     ):
-        result = render("motion=novel_pose", f"background='{name}'", f"out={name.strip('#')}.d/x")
+        result = render(
+            "motion=novel_pose", f"background='{name}'", f"out={name.strip('#')}.d/x"
+        )
         assert result.returncode == 0, result.stderr
-        assert tuple(read(tmp_path / f"{name.strip('#')}.d" / "x" / "000004.png")[0, 0]) == colour
+        assert (
+            tuple(read(tmp_path / f"{name.strip('#')}.d" / "x" / "000004.png")[0, 0])
+            == colour
+        )
     assert render("motion=novel_pose", "background=alpha", "out=clear").returncode == 0
     assert render("motion=novel_pose", "out=black").returncode == 0
-    clear, black = (read(tmp_path / x / "000004.png").astype(float) for x in ("clear", "black"))
+    clear, black = (
+        read(tmp_path / x / "000004.png").astype(float) for x in ("clear", "black")
+    )
     assert clear.shape == (32, 32, 4)
     assert clear[0, 0, 3] == 0
     np.testing.assert_allclose(clear[..., :3] * clear[..., 3:] / 255, black, atol=1.5)
@@ -251,13 +287,25 @@ def test_cameras(render, bare, capture, motion, tmp_path):
     calibration = json.loads((capture / "cameras.json").read_text())
     one = tmp_path / "one.json"
     one.write_text(json.dumps({"cam00": calibration["cam00"]}))
-    assert render(f"motion={motion}", f"camera={one}", "out=a", "frames=1").returncode == 0
-    assert render(f"motion={motion}", "camera=cam00", "out=b", "frames=1").returncode == 0
-    np.testing.assert_array_equal(read(tmp_path / "a/000000.png"), read(tmp_path / "b/000000.png"))
+    assert (
+        render(f"motion={motion}", f"camera={one}", "out=a", "frames=1").returncode == 0
+    )
+    assert (
+        render(f"motion={motion}", "camera=cam00", "out=b", "frames=1").returncode == 0
+    )
+    np.testing.assert_array_equal(
+        read(tmp_path / "a/000000.png"), read(tmp_path / "b/000000.png")
+    )
     path = tmp_path / "path.json"
     path.write_text(json.dumps(calibration))
-    assert render(f"motion={motion}", f"camera={path}", "out=c", "frames=3").returncode == 0
-    refused(render(f"motion={motion}", f"camera={path}", "out=d"), "3 cameras; expected 1, or 12")
+    assert (
+        render(f"motion={motion}", f"camera={path}", "out=c", "frames=3").returncode
+        == 0
+    )
+    refused(
+        render(f"motion={motion}", f"camera={path}", "out=d"),
+        "3 cameras; expected 1, or 12",
+    )
     refused(
         render(f"motion={motion}", "camera=cam77", "out=d"),
         "neither a camera",
@@ -277,7 +325,10 @@ def test_cameras(render, bare, capture, motion, tmp_path):
         (("out=a", "c2pa.key=k.pem"), "go together"),
         (("out=a", "retarget=maybe"), "retarget must be one of auto"),
         (("out=a", "drive=body"), "drive must be one of None, skeleton"),
-        (("out=a", "motion=[a.npz,b.npz]", "retarget=false"), "is not supported for a list"),
+        (
+            ("out=a", "motion=[a.npz,b.npz]", "retarget=false"),
+            "is not supported for a list",
+        ),
         (("out=a", "camera=0"), "camera=0 is neither a camera"),
         (("out=a.npz/frames",), "a.npz/frames cannot be written (Not a directory)"),
         (("out=a.npz/a.mp4",), "a.npz/a.mp4 cannot be written (File exists)"),
@@ -310,7 +361,9 @@ def test_the_picture_of_the_avatar(bare, landmarks):
 
 
 @pytest.mark.parametrize(("out", "left"), [("a", 3), ("a.mp4", 0)])
-def test_what_is_left_when_a_later_frame_fails(render, motion, tmp_path, monkeypatch, out, left):
+def test_what_is_left_when_a_later_frame_fails(
+    render, motion, tmp_path, monkeypatch, out, left
+):
     painted, eight_bits = [], render_run.eight_bits
 
     def failing(*given):
@@ -326,10 +379,16 @@ def test_what_is_left_when_a_later_frame_fails(render, motion, tmp_path, monkeyp
     assert not (tmp_path / "a.mp4").exists()
 
 
-def test_a_swapped_motion_is_refused_and_an_extreme_frame_is_not(render, landmarks, tmp_path):
+def test_a_swapped_motion_is_refused_and_an_extreme_frame_is_not(
+    render, landmarks, tmp_path
+):
     swapped = 1.1 * landmarks[:, list(MEDIAPIPE33.mirror)]
     np.savez(tmp_path / "a.npz", p=swapped, fps=30)
-    refused(render(f"motion={tmp_path / 'a.npz'}", "out=a"), "a.npz", "left and right are swapped")
+    refused(
+        render(f"motion={tmp_path / 'a.npz'}", "out=a"),
+        "a.npz",
+        "left and right are swapped",
+    )
     mixed = np.concatenate([1.1 * landmarks, swapped[:2]])
     np.savez(tmp_path / "b.npz", p=mixed, fps=30)
     result = render(f"motion={tmp_path / 'b.npz'}", "out=b", "start=11")

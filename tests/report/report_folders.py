@@ -11,14 +11,23 @@ from gsgan.report.spec import TableSpec
 from gsgan.report.table import build
 from gsgan.report.write import Grid, Report, Row
 
-FLOOR = {"psnr": 15.5, "ssim": 0.8, "miou_reason": "an all-background image has no parts"}
+FLOOR = {
+    "psnr": 15.5,
+    "ssim": 0.8,
+    "miou_reason": "an all-background image has no parts",
+}
 NO_LPIPS = "left out by lpips.nets"
 
 
 def variant(images: int = 3, **held: Any) -> dict[str, Any]:
     """Scores of one variant; a metric that is not given is null."""
     scores: dict[str, Any] = dict.fromkeys(METRICS)
-    scores |= {"lpips_vgg_reason": NO_LPIPS, "images": images, "marks": [], "cameras": {}}
+    scores |= {
+        "lpips_vgg_reason": NO_LPIPS,
+        "images": images,
+        "marks": [],
+        "cameras": {},
+    }
     return scores | held
 
 
@@ -62,7 +71,11 @@ def write_run(
 
 def zju(subject: int) -> dict[str, Any]:
     """Data facts of a subject of ZJU-MoCap."""
-    return {"name": "zju_mocap", "root": f"CoreView_{subject}", "fingerprint": f"f{subject}"}
+    return {
+        "name": "zju_mocap",
+        "root": f"CoreView_{subject}",
+        "fingerprint": f"f{subject}",
+    }
 
 
 def report_of(spec: TableSpec, *folders: Path, allow_dirty: bool = False) -> Report:
@@ -74,7 +87,12 @@ def report_of(spec: TableSpec, *folders: Path, allow_dirty: bool = False) -> Rep
 
 def table(**held: Any) -> TableSpec:
     """A small table: PSNR and LPIPS on held-out poses."""
-    given = {"name": "t", "title": "T", "metrics": ["psnr", "lpips_vgg"], "splits": ["novel_pose"]}
+    given = {
+        "name": "t",
+        "title": "T",
+        "metrics": ["psnr", "lpips_vgg"],
+        "splits": ["novel_pose"],
+    }
     return TableSpec(**(given | held))
 
 

@@ -5,7 +5,14 @@ import pytest
 import torch
 from matplotlib import rc_context
 
-from gsgan.report.figures.layout import COLUMN, STYLE, TALLEST, Panel, draw_panels, written
+from gsgan.report.figures.layout import (
+    COLUMN,
+    STYLE,
+    TALLEST,
+    Panel,
+    draw_panels,
+    written,
+)
 from gsgan.report.figures.run import most_disputed
 from gsgan.report.figures.subjects import choose_items, make_shots, measure
 from gsgan.utils.errors import ConfigError, DataError
@@ -75,7 +82,9 @@ def test_shots_are_spread_over_frames_and_cameras(data):
     assert choose(one_camera=True) == [("cam00", 4), ("cam00", 5)]
     with pytest.raises(ConfigError, match=r"lacks 99; it has 4-5"):
         choose(frames=[4, 99])
-    with pytest.raises(ConfigError, match="cam02 is not in split novel_pose, which has cam00"):
+    with pytest.raises(
+        ConfigError, match="cam02 is not in split novel_pose, which has cam00"
+    ):
         choose(camera="cam02")
     with pytest.raises(ConfigError, match="split must be one of"):
         choose_items(data, "test", frames=None, camera=None, count=1)

@@ -35,10 +35,14 @@ def edit(run: Path, **values) -> None:
     OmegaConf.save(config, path)
 
 
-def test_every_figure_is_made_with_numbers_of_the_images_shown(run, twin, tmp_path, inside):
+def test_every_figure_is_made_with_numbers_of_the_images_shown(
+    run, twin, tmp_path, inside
+):
     out = tmp_path / "out"
     whole = "margin=9"  # metres: the window is the image
-    result = inside("report", f"run={run}", f"compare=[{twin}]", f"out={out}", whole, *FEW)
+    result = inside(
+        "report", f"run={run}", f"compare=[{twin}]", f"out={out}", whole, *FEW
+    )
     assert result.returncode == 0, result.stdout + result.stderr
     record = json.loads((out / "figures.json").read_text())["figures"]
     assert list(record) == list(FIGURES)
@@ -88,7 +92,9 @@ def expected(run: Path, found: dict) -> dict:
 )
 def test_runs_on_other_data_are_refused(run, twin, tmp_path, inside, change, words):
     edit(twin, **change)
-    result = inside("report", f"run={run}", f"compare=[{twin}]", f"out={tmp_path / 'out'}", *FEW)
+    result = inside(
+        "report", f"run={run}", f"compare=[{twin}]", f"out={tmp_path / 'out'}", *FEW
+    )
     refused(result, str(run), str(twin), *words)
     assert not list((tmp_path / "out").glob("*.p*"))
 
@@ -113,7 +119,9 @@ def test_a_collapsed_run_is_not_drawn(twin, tmp_path, inside):
         if "generator" in key and value.is_floating_point():
             value.fill_(float("nan"))
     torch.save(checkpoint, path)
-    result = inside("report", f"run={twin}", f"out={tmp_path / 'out'}", "figures=strip", *FEW)
+    result = inside(
+        "report", f"run={twin}", f"out={tmp_path / 'out'}", "figures=strip", *FEW
+    )
     refused(result, str(twin), "not finite")
 
 

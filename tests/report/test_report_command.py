@@ -40,12 +40,16 @@ def test_it_writes_all_files_and_names_what_it_left_out(sweep, tmp_path, inside)
     assert not (tmp_path / "outputs").exists()  # Hydra left nothing
 
 
-def test_a_wrong_value_ends_in_one_message_before_anything_is_written(sweep, tmp_path, inside):
+def test_a_wrong_value_ends_in_one_message_before_anything_is_written(
+    sweep, tmp_path, inside
+):
     runs = f"runs=[{sweep}]"
     refused(inside("report"), "runs and run are not set")
     refused(inside("report", "runs=[]"), "runs and run are not set")
     refused(inside("report", f"runs=[{tmp_path}/gone]"), "gone' contains no run folder")
-    refused(inside("report", runs, "out=a", "table=zju"), "is of zju_mocap", "table=plain")
+    refused(
+        inside("report", runs, "out=a", "table=zju"), "is of zju_mocap", "table=plain"
+    )
     refused(inside("report", runs, "out=a", "table.metrics=[fid]"), "fid", "psnr")
     refused(inside("report", runs, "out=a", "table.rows=[{model: full}]"), "model")
     page = tmp_path / "page.md"
@@ -54,7 +58,9 @@ def test_a_wrong_value_ends_in_one_message_before_anything_is_written(sweep, tmp
     refused(inside("report", runs, f"out={page}/x"), "cannot be written")
 
 
-@pytest.mark.parametrize("name", sorted(p.stem for p in (config_folder() / "table").glob("*")))
+@pytest.mark.parametrize(
+    "name", sorted(p.stem for p in (config_folder() / "table").glob("*"))
+)
 def test_every_table_composes_and_its_keys_are_read(compose, name):
     config = compose("report", f"table={name}")
     assert instantiate(config.table).name == name

@@ -26,7 +26,9 @@ def test_an_entry_without_a_run_is_refused(tmp_path, monkeypatch, entry):
     write_run(tmp_path / "a")
     (tmp_path / "empty").mkdir()
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ConfigError, match=f"runs: '{re.escape(entry)}' contains no run folder"):
+    with pytest.raises(
+        ConfigError, match=f"runs: '{re.escape(entry)}' contains no run folder"
+    ):
         find_runs([entry])
 
 
@@ -46,7 +48,9 @@ def trained(folder, config, **facts):
 
 
 def test_settings_are_without_the_seed(tmp_path, tiny):
-    runs = [read_run(trained(tmp_path / str(seed), tiny(f"seed={seed}"))) for seed in (4, 5)]
+    runs = [
+        read_run(trained(tmp_path / str(seed), tiny(f"seed={seed}"))) for seed in (4, 5)
+    ]
     assert runs[0].settings == runs[1].settings
     other = read_run(trained(tmp_path / "other", tiny("training.pose_noise=0.5")))
     assert other.settings != runs[0].settings

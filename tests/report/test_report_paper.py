@@ -13,7 +13,11 @@ VIEW = {"splits": ["novel_view"], "metrics": ["psnr"]}
 
 
 def paper_run(folder, **held):
-    given = {"data": zju(377), "record": protocol("paper_zju"), "splits": ("novel_view",)}
+    given = {
+        "data": zju(377),
+        "record": protocol("paper_zju"),
+        "splits": ("novel_view",),
+    }
     return write_run(folder, psnr=30.0, **(given | held))
 
 
@@ -30,17 +34,30 @@ def test_beside_the_same_data_subject_protocol_and_split(tmp_path):
 
 
 APART = {
-    "synthetic": ({"data": None, "record": None}, "of synthetic, the paper's of zju_mocap"),
+    "synthetic": (
+        {"data": None, "record": None},
+        "of synthetic, the paper's of zju_mocap",
+    ),
     "another subject": ({"data": zju(386)}, "CoreView_386, the paper's of subject 377"),
     "no protocol": ({"record": None}, "of protocol none"),
-    "another protocol": ({"record": protocol("zju_gauhuman")}, "of protocol zju_gauhuman"),
-    "a departure": ({"record": protocol("paper_zju", departures=["at scale 1"])}, "at scale 1"),
+    "another protocol": (
+        {"record": protocol("zju_gauhuman")},
+        "of protocol zju_gauhuman",
+    ),
+    "a departure": (
+        {"record": protocol("paper_zju", departures=["at scale 1"])},
+        "at scale 1",
+    ),
 }
 
 
 @pytest.mark.parametrize(("held", "message"), APART.values(), ids=APART)
-def test_otherwise_they_have_a_table_of_their_own_with_the_reason(tmp_path, held, message):
-    ours, paper = report_of(table(**ABLATION, **VIEW), paper_run(tmp_path / "a", **held)).grids
+def test_otherwise_they_have_a_table_of_their_own_with_the_reason(
+    tmp_path, held, message
+):
+    ours, paper = report_of(
+        table(**ABLATION, **VIEW), paper_run(tmp_path / "a", **held)
+    ).grids
     assert all(r.kind != "paper" for r in ours.rows)
     assert all(r.kind == "paper" and "(as printed)" in r.label for r in paper.rows)
     assert message in paper.remarks[0]
@@ -84,7 +101,10 @@ def test_only_runs_of_experiment_paper_have_the_papers_name(
 def test_another_split_is_not_the_papers(tmp_path):
     run = paper_run(tmp_path / "a", splits=("novel_pose",))
     spec = table(**(ABLATION | VIEW | {"splits": ["novel_pose"]}))
-    assert "of novel_pose, the paper's of novel_view" in report_of(spec, run).grids[-1].remarks[0]
+    assert (
+        "of novel_pose, the paper's of novel_view"
+        in report_of(spec, run).grids[-1].remarks[0]
+    )
 
 
 def test_the_six_subjects_beside_ours(tmp_path):

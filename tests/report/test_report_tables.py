@@ -5,7 +5,16 @@ import json
 import pytest
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
-from report_folders import protocol, report_of, row, table, texts, variant, write_run, zju
+from report_folders import (
+    protocol,
+    report_of,
+    row,
+    table,
+    texts,
+    variant,
+    write_run,
+    zju,
+)
 
 from gsgan.report.spec import written
 from gsgan.utils.config import config_folder
@@ -43,17 +52,27 @@ def test_a_value_that_some_seeds_lack_is_counted_and_explained(tmp_path):
 
 
 def test_marks_departures_and_left_out_images_are_noted(tmp_path):
-    record = protocol("zju_humannerf", departures=["background is black, asked for: white"])
+    record = protocol(
+        "zju_humannerf", departures=["background is black, asked for: white"]
+    )
     report = report_of(
         table(),
-        write_run(tmp_path / "a", psnr=30.0, psnr_left_out=2, marks=["stand-in"], record=record),
+        write_run(
+            tmp_path / "a",
+            psnr=30.0,
+            psnr_left_out=2,
+            marks=["stand-in"],
+            record=record,
+        ),
     )
     full = row(report.grids[0], "full")
     assert full.notes == (
         "marked: stand-in",
         "departs from zju_humannerf: background is black, asked for: white",
     )
-    assert full.cells[0].notes == ("2 images without a finite score are not in the mean",)
+    assert full.cells[0].notes == (
+        "2 images without a finite score are not in the mean",
+    )
 
 
 def test_the_best_of_several_rows_is_emphasised(tmp_path):
@@ -61,7 +80,10 @@ def test_the_best_of_several_rows_is_emphasised(tmp_path):
     runs = [
         write_run(tmp_path / "a", "a", psnr=30.0, **lower),
         write_run(
-            tmp_path / "b", "b", psnr=31.0, **(lower | {"lpips_vgg": 0.2, "edge_ratio": 0.9})
+            tmp_path / "b",
+            "b",
+            psnr=31.0,
+            **(lower | {"lpips_vgg": 0.2, "edge_ratio": 0.9}),
         ),
     ]
     (grid,) = report_of(table(metrics=["psnr", "lpips_vgg", "edge_ratio"]), *runs).grids
@@ -87,15 +109,22 @@ def test_the_table_of_signs_has_boxes_of_one_kind(tmp_path):
     boxes = "skeleton holistic; hands: their landmarks"
     runs = [
         write_run(tmp_path / model, model, psnr=psnr, psnr_hands=psnr - 6, boxes=boxes)
-        for model, psnr in (("full", 33.0), ("image_to_image", 29.0), ("splat_only", 32.0))
+        for model, psnr in (
+            ("full", 33.0),
+            ("image_to_image", 29.0),
+            ("splat_only", 32.0),
+        )
     ]
     ours, paper = report_of(spec, *runs).grids
-    models = ["full", "image_to_image", "splat_only"]  # no empty row for a model without a run
+    # no empty row for a model without a run
+    models = ["full", "image_to_image", "splat_only"]
     assert [r.label for r in ours.rows] == [*models, "all background (floor)"]
     assert texts(row(ours, "full"))[:2] == ["33.00", "27.00"]
     assert ours.remarks[1] == f"Boxes: {boxes}."
     assert "the paper's capture is private" in paper.remarks[0]
-    other = write_run(tmp_path / "x", "lbs_splat", psnr=30.0, boxes=boxes.replace("ho", "o"))
+    other = write_run(
+        tmp_path / "x", "lbs_splat", psnr=30.0, boxes=boxes.replace("ho", "o")
+    )
     with pytest.raises(ConfigError, match="differ in boxes of hands and mouth"):
         report_of(spec, *runs, other)
     (grid,) = report_of(table(), *runs, other).grids  # which shows no score of boxes
@@ -108,17 +137,27 @@ MIXTURES = {
         {"data": {"name": "synthetic", "root": "person", "fingerprint": "beef"}},
         "differ in data .*: f00d and beef",
     ),
-    "a protocol": ({"record": protocol("paper_zju")}, "differ in protocol: none and paper_zju"),
+    "a protocol": (
+        {"record": protocol("paper_zju")},
+        "differ in protocol: none and paper_zju",
+    ),
     "other images": ({"floor": {"psnr": 15.6}}, "all-background image: 15.5 and 15.6"),
     "fewer images": ({"images": 2}, "images scored: 3 and 2"),
     "changed code": ({"facts": {"dirty": True}}, "uncommitted changes"),
-    "another LPIPS": ({"lpips_vgg": 0.1, "lpips_input": "[0,1]"}, r"\[-1,1\] and \[0,1\]"),
+    "another LPIPS": (
+        {"lpips_vgg": 0.1, "lpips_input": "[0,1]"},
+        r"\[-1,1\] and \[0,1\]",
+    ),
 }
 
 
 @pytest.mark.parametrize(("held", "message"), MIXTURES.values(), ids=MIXTURES)
-def test_runs_that_do_not_belong_in_one_column_are_refused_by_name(tmp_path, held, message):
-    first = write_run(tmp_path / "first", psnr=30.0, lpips_vgg=0.2, lpips_input="[-1,1]")
+def test_runs_that_do_not_belong_in_one_column_are_refused_by_name(
+    tmp_path, held, message
+):
+    first = write_run(
+        tmp_path / "first", psnr=30.0, lpips_vgg=0.2, lpips_input="[-1,1]"
+    )
     other = write_run(tmp_path / "other", "wo_seg", psnr=29.0, **held)
     with pytest.raises(ConfigError, match=message) as caught:
         report_of(table(), first, other)
@@ -130,7 +169,10 @@ def test_runs_that_do_not_belong_in_one_column_are_refused_by_name(tmp_path, hel
     ("held", "message"),
     [
         ({"marks": ["stand-in"]}, "differ in marks: none and stand-in"),
-        ({"record": protocol("p", scale=1.0)}, "differ in values of the protocol: scale"),
+        (
+            {"record": protocol("p", scale=1.0)},
+            "differ in values of the protocol: scale",
+        ),
     ],
 )
 def test_seeds_of_one_row_must_match(tmp_path, held, message):
@@ -144,7 +186,9 @@ def test_seeds_of_one_row_must_match(tmp_path, held, message):
 def test_every_pair_of_seeds_is_compared(tmp_path):
     """One that does not tell its iterations must not hide that two others differ."""
     runs = [
-        write_run(tmp_path / str(seed), seed=seed, psnr=30.0, facts={"iterations": done})
+        write_run(
+            tmp_path / str(seed), seed=seed, psnr=30.0, facts={"iterations": done}
+        )
         for seed, done in enumerate((7000, None, 10))
     ]
     with pytest.raises(ConfigError, match="differ in iterations: 7000 and 10"):
@@ -155,23 +199,31 @@ def test_a_method_of_a_models_name_is_not_pooled_with_it(tmp_path):
     model = write_run(tmp_path / "a", psnr=30.0)
     facts = {"method": "full", "iterations": None}
     method = write_run(tmp_path / "b", None, None, psnr=20.0, facts=facts)
-    with pytest.raises(ConfigError, match="differ in kind: a model trained here and predictions"):
+    with pytest.raises(
+        ConfigError, match="differ in kind: a model trained here and predictions"
+    ):
         report_of(table(), model, method)
 
 
 def test_one_seed_twice_is_refused(tmp_path):
     runs = [write_run(tmp_path / name, psnr=30.0) for name in ("a", "again")]
     with pytest.raises(
-        ConfigError, match=r"a \(full, seed 0\) and .*again \(full, seed 0\) have the same row"
+        ConfigError,
+        match=r"a \(full, seed 0\) and .*again \(full, seed 0\) have the same row",
     ):
         report_of(table(), *runs)
 
 
 @pytest.mark.parametrize(
     ("facts", "commits"),
-    [({"commit": "def456"}, "abc123, def456"), ({"dirty": True}, "abc123, abc123 + changes")],
+    [
+        ({"commit": "def456"}, "abc123, def456"),
+        ({"dirty": True}, "abc123, abc123 + changes"),
+    ],
 )
-def test_several_commits_stand_together_and_changed_code_where_allowed(tmp_path, facts, commits):
+def test_several_commits_stand_together_and_changed_code_where_allowed(
+    tmp_path, facts, commits
+):
     runs = [write_run(tmp_path / "a", psnr=30.0)]
     runs.append(write_run(tmp_path / "b", seed=1, psnr=30.0, facts=facts))
     report = report_of(table(), *runs, allow_dirty=True)
@@ -180,15 +232,24 @@ def test_several_commits_stand_together_and_changed_code_where_allowed(tmp_path,
 
 def test_one_grid_takes_runs_that_scored_other_splits(tmp_path):
     both = write_run(tmp_path / "a", psnr=30.0, record=protocol("p"), splits=SPLITS)
-    one = write_run(tmp_path / "b", "wo_seg", psnr=29.0, record=protocol("p"), splits=SPLITS[:1])
+    one = write_run(
+        tmp_path / "b", "wo_seg", psnr=29.0, record=protocol("p"), splits=SPLITS[:1]
+    )
     grids = report_of(table(splits=SPLITS), both, one).grids
     assert len(grids) == 2
-    assert [r.label for r in grids[0].rows] == ["full", "wo_seg", "all background (floor)"]
+    assert [r.label for r in grids[0].rows] == [
+        "full",
+        "wo_seg",
+        "all background (floor)",
+    ]
     assert [r.label for r in grids[1].rows] == ["full", "all background (floor)"]
 
 
 def test_runs_of_other_rows_are_named_and_left_out(tmp_path):
-    runs = [write_run(tmp_path / "a", psnr=30.0), write_run(tmp_path / "b", "mine", psnr=30.0)]
+    runs = [
+        write_run(tmp_path / "a", psnr=30.0),
+        write_run(tmp_path / "b", "mine", psnr=30.0),
+    ]
     report = report_of(table(rows=[{"run": "full"}]), *runs)
     assert report.left_out == {"b": "table t has no row for mine"}
     with pytest.raises(ConfigError, match=r"no run is left.*no row for mine"):
@@ -210,7 +271,13 @@ SUBJECTS = {"subjects": ["377", "386"], "metrics": ["psnr"], "data": "zju_mocap"
 
 def test_subjects_are_columns_with_a_mean_over_them_by_seed(tmp_path):
     runs = [
-        write_run(tmp_path / f"{s}_{seed}", "full", seed, data=zju(s), psnr=30.0 + k + 2 * seed)
+        write_run(
+            tmp_path / f"{s}_{seed}",
+            "full",
+            seed,
+            data=zju(s),
+            psnr=30.0 + k + 2 * seed,
+        )
         for k, s in enumerate((377, 386))
         for seed in (0, 1)
     ]
@@ -226,7 +293,10 @@ def test_subjects_of_other_seeds_have_no_mean(tmp_path):
     for subject, seeds in ((377, (0, 1)), (386, (0,))):
         for seed in seeds:
             write_run(
-                tmp_path / f"{subject}_{seed}", seed=seed, data=zju(subject), psnr=30.0 + 2 * seed
+                tmp_path / f"{subject}_{seed}",
+                seed=seed,
+                data=zju(subject),
+                psnr=30.0 + 2 * seed,
             )
     full = row(report_of(table(**SUBJECTS), tmp_path).grids[0], "full")
     assert texts(full) == ["31.00 ± 1.41", "30.00", "n/a"]
@@ -239,21 +309,30 @@ def test_other_subjects_are_left_out_and_other_data_refused(tmp_path):
     other = write_run(tmp_path / "b", data=zju(313), psnr=30.0)
     assert report_of(table(**SUBJECTS), one, other).left_out.keys() == {"b"}
     synthetic = write_run(tmp_path / "c", psnr=30.0)
-    with pytest.raises(ConfigError, match=r"of zju_mocap, but .*c \(full, seed 0\) is of synth"):
+    with pytest.raises(
+        ConfigError, match=r"of zju_mocap, but .*c \(full, seed 0\) is of synth"
+    ):
         report_of(table(**SUBJECTS), one, synthetic)
 
 
 def test_a_mean_over_subjects_refuses_other_protocols(tmp_path):
-    one = write_run(tmp_path / "a", data=zju(377), psnr=30.0, record=protocol("p", subject=377))
-    two = write_run(tmp_path / "b", data=zju(386), psnr=30.0, record=protocol("p", subject=386))
+    one = write_run(
+        tmp_path / "a", data=zju(377), psnr=30.0, record=protocol("p", subject=377)
+    )
+    two = write_run(
+        tmp_path / "b", data=zju(386), psnr=30.0, record=protocol("p", subject=386)
+    )
     report_of(table(**SUBJECTS), one, two)  # the subject is theirs to differ in
-    three = write_run(tmp_path / "c", data=zju(386), seed=1, psnr=30.0, record=protocol("q"))
+    three = write_run(
+        tmp_path / "c", data=zju(386), seed=1, psnr=30.0, record=protocol("q")
+    )
     with pytest.raises(ConfigError, match="protocol: p and q"):
         report_of(table(**SUBJECTS), one, three)
 
 
 @pytest.mark.parametrize(
-    ("value", "text"), [(1.006, "1.01"), (-1.5, "−1.50"), (-0.001, "0.00"), (2.0, "2.00")]
+    ("value", "text"),
+    [(1.006, "1.01"), (-1.5, "−1.50"), (-0.001, "0.00"), (2.0, "2.00")],
 )
 def test_signs_and_digits(value, text):
     assert written("psnr", value) == text

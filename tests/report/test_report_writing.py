@@ -22,10 +22,16 @@ def report():
         Row(NASTY, [best, Cell("n/a", notes=(NASTY,))], ORIGIN),
         Row("GAN (paper)", [Cell("34.16"), Cell("n/a")], ("n/a",) * 4, "paper"),
         Row(
-            "floor", [Cell("15.00"), Cell("n/a", notes=("no parts",))], ORIGIN, "floor", ("a note",)
+            "floor",
+            [Cell("15.00"), Cell("n/a", notes=("no parts",))],
+            ORIGIN,
+            "floor",
+            ("a note",),
         ),
     ]
-    grid = Grid("novel_pose: 100% [f00d]", ["PSNR ↑", "mIoU [a] ↑"], rows, ("Row − full.",))
+    grid = Grid(
+        "novel_pose: 100% [f00d]", ["PSNR ↑", "mIoU [a] ↑"], rows, ("Row − full.",)
+    )
     return Report("A & B", [grid], {"bad_run": "damaged <x>"})
 
 

@@ -23,10 +23,14 @@ def rotation(seed: int) -> Tensor:
 def camera(size: tuple[int, int], batch: int = 1, focal: float = 1.2) -> Camera:
     """Looks at the rest pose from 2.6 m in front, the whole person in view."""
     h, w = size
-    K = torch.tensor([[focal * h, 0, w / 2], [0, focal * h, h / 2], [0, 0, 1]], dtype=torch.float64)
+    K = torch.tensor(
+        [[focal * h, 0, w / 2], [0, focal * h, h / 2], [0, 0, 1]], dtype=torch.float64
+    )
     R = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
     t = torch.tensor([0.0, 0.85, 2.6], dtype=torch.float64)
-    return Camera(K.expand(batch, 3, 3), R.expand(batch, 3, 3), t.expand(batch, 3), size)
+    return Camera(
+        K.expand(batch, 3, 3), R.expand(batch, 3, 3), t.expand(batch, 3), size
+    )
 
 
 def assert_rotation(R: Tensor, tolerance: float = 1e-10) -> None:

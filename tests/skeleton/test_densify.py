@@ -33,7 +33,12 @@ def test_counts_and_layout():
     assert points.rotations.shape == (2, 24, 3, 3)
     assert points.scales.shape == points.valid.shape == (2, 5400)
     assert bool(points.valid.all())
-    assert sorted(d.state_dict()) == ["normals", "part_id", "rest_points", "template_points"]
+    assert sorted(d.state_dict()) == [
+        "normals",
+        "part_id",
+        "rest_points",
+        "template_points",
+    ]
 
 
 @pytest.mark.parametrize("sampler", SAMPLERS)
@@ -75,14 +80,20 @@ def test_torso_points_lie_on_the_box(sampler):
     p = rest()
     points = densify(sampler=sampler)(p).means[0, 4900:]
     centre = REST[list(MEDIAPIPE33.torso)].mean(0)
-    edges = torch.tensor([0.35, 0.47, 0.175], dtype=F64)  # shoulder width, spine, half the width
+    # shoulder width, spine, half the width
+    edges = torch.tensor([0.35, 0.47, 0.175], dtype=F64)
     local = ((points - centre) / edges * 2).abs()
-    torch.testing.assert_close(local.max(-1).values, torch.ones(500, dtype=F64), atol=2e-5, rtol=0)
+    torch.testing.assert_close(
+        local.max(-1).values, torch.ones(500, dtype=F64), atol=2e-5, rtol=0
+    )
     # points per face in proportion to its area
     share = torch.bincount(local.argmax(-1), minlength=3) / 500
     areas = edges.prod() / edges
     torch.testing.assert_close(
-        share.double(), areas / areas.sum(), atol=0.004 if sampler == "even" else 0.06, rtol=0
+        share.double(),
+        areas / areas.sum(),
+        atol=0.004 if sampler == "even" else 0.06,
+        rtol=0,
     )
 
 
@@ -169,7 +180,8 @@ def test_rest_points_are_the_rest_pose_in_body_heights():
 def test_unseen_joints_mark_their_points():
     valid = torch.ones(4, 33, dtype=torch.bool)
     valid[3, 1:11] = False  # the nose is enough to place the head
-    valid[0, 15] = False  # left wrist: forearm and the three bones of the hand that start there
+    # left wrist: forearm and the three bones of the hand that start there
+    valid[0, 15] = False
     valid[1, :11] = False
     valid[2, [11, 12]] = False
     d = densify()
@@ -198,8 +210,12 @@ def test_batch_items_do_not_mix():
     together = d(p)
     for b in range(3):
         alone = d(p[b : b + 1])
-        torch.testing.assert_close(together.means[b : b + 1], alone.means, atol=1e-12, rtol=0)
-        torch.testing.assert_close(together.scales[b : b + 1], alone.scales, atol=1e-12, rtol=0)
+        torch.testing.assert_close(
+            together.means[b : b + 1], alone.means, atol=1e-12, rtol=0
+        )
+        torch.testing.assert_close(
+            together.scales[b : b + 1], alone.scales, atol=1e-12, rtol=0
+        )
 
 
 def test_even_samplers_cover_evenly():
@@ -210,14 +226,20 @@ def test_even_samplers_cover_evenly():
     probe /= np.linalg.norm(probe, axis=1, keepdims=True)
 
     def emptiest(points: np.ndarray) -> float:
-        return float(np.linalg.norm(probe[:, None] - points[None], axis=-1).min(1).max())
+        return float(
+            np.linalg.norm(probe[:, None] - points[None], axis=-1).min(1).max()
+        )
 
     assert emptiest(even_sphere(500)[0]) < 0.55 * emptiest(random)
 
 
 @pytest.mark.parametrize("n", [1, 7, 500])
 def test_even_samplers_return_the_requested_number(n):
-    for points, normals in (even_cylinder(n), even_sphere(n), even_box(n, (1.0, 2.0, 0.5))):
+    for points, normals in (
+        even_cylinder(n),
+        even_sphere(n),
+        even_box(n, (1.0, 2.0, 0.5)),
+    ):
         assert points.shape == normals.shape == (n, 3)
         np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
 
@@ -230,7 +252,12 @@ def test_shipped_templates_can_be_made_again():
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     made = module.make_templates()
-    for shape, n in (("cylinder", 200), ("sphere", 500), ("box", 500), ("box_fit", 500)):
+    for shape, n in (
+        ("cylinder", 200),
+        ("sphere", 500),
+        ("box", 500),
+        ("box_fit", 500),
+    ):
         points, normals = shipped(shape, n)
         np.testing.assert_allclose(points, made[shape], atol=1e-6)
         np.testing.assert_allclose(normals, made[f"{shape}_normals"], atol=1e-6)

@@ -22,7 +22,12 @@ def slow_drawing(p: Tensor, valid: Tensor, cam: Any, sigma: float) -> Tensor:
     image = torch.zeros(8, H, W, dtype=torch.float64)
     for group, (_, segments) in enumerate(MEDIAPIPE33.draw_groups):
         for i, j in segments:
-            if not (valid[0, i] and valid[0, j] and depth[0, i] > 0.01 and depth[0, j] > 0.01):
+            if not (
+                valid[0, i]
+                and valid[0, j]
+                and depth[0, i] > 0.01
+                and depth[0, j] > 0.01
+            ):
                 continue
             a, d = px[i], px[j] - px[i]
             for y in range(H):
@@ -40,7 +45,9 @@ def test_against_the_slow_reference():
     valid = torch.ones(1, 33, dtype=torch.bool)
     valid[0, [15, 30]] = False
     fast = draw_skeleton(p, valid, cam)[0]
-    torch.testing.assert_close(fast, slow_drawing(p, valid, cam, 0.8), atol=1e-9, rtol=0)
+    torch.testing.assert_close(
+        fast, slow_drawing(p, valid, cam, 0.8), atol=1e-9, rtol=0
+    )
 
 
 def test_shape_range_and_groups():
@@ -53,7 +60,10 @@ def test_shape_range_and_groups():
     columns = torch.arange(48, dtype=torch.float64)
     mean_x = (image[0].sum(1) * columns).sum(-1) / image[0].sum((1, 2))
     for part in ("arm", "hand", "leg"):
-        assert mean_x[GROUPS.index(f"left_{part}")] > mean_x[GROUPS.index(f"right_{part}")] + 1
+        assert (
+            mean_x[GROUPS.index(f"left_{part}")]
+            > mean_x[GROUPS.index(f"right_{part}")] + 1
+        )
 
 
 @pytest.mark.parametrize(("height", "sigma"), [(512, 2.5), (256, 1.25), (64, 0.8)])
@@ -68,7 +78,9 @@ def test_line_width_scales_with_the_image(height, sigma):
     column = int(a[0] + (row - a[1]) / (b[1] - a[1]) * (b[0] - a[0])) + 2
     pixel = torch.tensor([column + 0.5, row + 0.5], dtype=torch.float64)
     distance = float((pixel - a) @ normal)
-    assert float(image[row, column]) == pytest.approx(math.exp(-(distance**2) / 2 / sigma**2))
+    assert float(image[row, column]) == pytest.approx(
+        math.exp(-(distance**2) / 2 / sigma**2)
+    )
 
 
 def test_far_pixels_are_exact_zeros():
@@ -83,7 +95,9 @@ def test_unseen_joints_and_joints_behind_the_camera_are_not_drawn():
     p, cam = rest(), camera((32, 32))
     valid = torch.ones(1, 33, dtype=torch.bool)
     valid[0, [13, 15, 19]] = False
-    empty = (draw_skeleton(p, valid, cam)[0].amax((1, 2)) == 0).nonzero().flatten().tolist()
+    empty = (
+        (draw_skeleton(p, valid, cam)[0].amax((1, 2)) == 0).nonzero().flatten().tolist()
+    )
     assert [GROUPS[g] for g in empty] == ["left_arm", "left_hand"]
 
     behind = dataclasses.replace(cam, t=cam.t - torch.tensor([0.0, 0.0, 5.0]).to(cam.t))
@@ -99,7 +113,8 @@ def test_a_limb_through_the_camera_is_not_drawn_and_has_finite_gradients():
     image.sum().backward()
     assert image.isfinite().all()
     assert p.grad.isfinite().all()
-    assert image[0, GROUPS.index("left_arm")].max() > 0.5  # the upper arm is still there
+    # the upper arm is still there
+    assert image[0, GROUPS.index("left_arm")].max() > 0.5
     assert (p.grad[0, [15, 16]] == 0).all()
 
 
@@ -135,14 +150,17 @@ def test_gradcheck():
     def values(p: Tensor, t: Tensor) -> Tensor:
         return draw_skeleton(p, None, dataclasses.replace(cam, t=t))
 
-    assert torch.autograd.gradcheck(values, (p, cam.t.clone().requires_grad_()), fast_mode=True)
+    assert torch.autograd.gradcheck(
+        values, (p, cam.t.clone().requires_grad_()), fast_mode=True
+    )
 
 
 def test_a_crop_equals_the_window_of_the_image():
     p, cam = rest(), camera((64, 64))
     whole = draw_skeleton(p, None, cam)
     window = draw_skeleton(p, None, cam.crop(10, 20, (40, 30)))
-    torch.testing.assert_close(window, whole[:, :, 10:50, 20:50])  # both at the floor of sigma
+    # both at the floor of sigma
+    torch.testing.assert_close(window, whole[:, :, 10:50, 20:50])
 
 
 def test_misuse_is_named():

@@ -42,10 +42,14 @@ def test_local_rotation_is_relative_to_the_parent():
 
 def test_swing_is_the_shortest_rotation():
     """Against Rodrigues: I + [v]x + [v]x² / (1 + c)."""
-    a = torch.nn.functional.normalize(torch.tensor([[0.6, -0.6, 0.5]], dtype=torch.float64))
+    a = torch.nn.functional.normalize(
+        torch.tensor([[0.6, -0.6, 0.5]], dtype=torch.float64)
+    )
     b = (rotation(3) @ a.mT).mT
     v = torch.linalg.cross(a, b)[0]
-    K = torch.stack([torch.linalg.cross(v, e) for e in torch.eye(3, dtype=torch.float64)], dim=-1)
+    K = torch.stack(
+        [torch.linalg.cross(v, e) for e in torch.eye(3, dtype=torch.float64)], dim=-1
+    )
     expected = torch.eye(3, dtype=torch.float64) + K + K @ K / (1 + (a * b).sum())
     torch.testing.assert_close(Swing.of(a).to(b.unsqueeze(0))[0, 0], expected)
 
@@ -70,7 +74,9 @@ def test_only_the_hubs_of_omega_depend_on_rigid_motions():
     torch.testing.assert_close(a[:, others], b[:, others], atol=1e-9, rtol=0)
     assert (a - b)[:, hubs].abs().amax(-1).min() > 0.1
     # a camera that turns with the body sees the same code
-    torch.testing.assert_close(omega(p @ R.mT, None, R_cam @ R.mT), a, atol=1e-9, rtol=0)
+    torch.testing.assert_close(
+        omega(p @ R.mT, None, R_cam @ R.mT), a, atol=1e-9, rtol=0
+    )
 
 
 def test_omega_layout():
@@ -177,5 +183,7 @@ def test_misuse_is_named(change, message):
 
 
 def test_omega_misuse_is_named():
-    with pytest.raises(ValueError, match=r"R_cam must have shape \[1, 3, 3\], got \[3, 3\]"):
+    with pytest.raises(
+        ValueError, match=r"R_cam must have shape \[1, 3, 3\], got \[3, 3\]"
+    ):
         omega(rest(), None, EYE[0])

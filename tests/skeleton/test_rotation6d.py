@@ -16,7 +16,9 @@ def test_order_of_the_columns():
 def test_round_trip(dtype):
     R = torch.stack([rotation(seed) for seed in range(20)]).to(dtype)
     tolerance = 100 * torch.finfo(dtype).eps
-    torch.testing.assert_close(rotation_from_6d(rotation_to_6d(R)), R, atol=tolerance, rtol=0)
+    torch.testing.assert_close(
+        rotation_from_6d(rotation_to_6d(R)), R, atol=tolerance, rtol=0
+    )
 
 
 def test_lengths_and_the_shared_part_do_not_matter():
@@ -26,10 +28,14 @@ def test_lengths_and_the_shared_part_do_not_matter():
 
 
 def test_gradcheck():
-    x = torch.randn(4, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    x = torch.randn(
+        4, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
+    )
     assert torch.autograd.gradcheck(rotation_from_6d, (x.requires_grad_(),))
 
 
 def test_wrong_width_is_named():
-    with pytest.raises(ValueError, match=r"rotation_from_6d: x .*\[\.\.\., 6\].*\[2, 9\]"):
+    with pytest.raises(
+        ValueError, match=r"rotation_from_6d: x .*\[\.\.\., 6\].*\[2, 9\]"
+    ):
         rotation_from_6d(torch.zeros(2, 9))

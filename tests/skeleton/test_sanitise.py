@@ -100,10 +100,14 @@ def test_gradcheck():
     keep = [j for j in range(33) if j not in gone]
 
     def values(seen: torch.Tensor) -> torch.Tensor:
-        p = torch.full((1, 33, 3), NAN, dtype=torch.float64).index_copy(1, torch.tensor(keep), seen)
+        p = torch.full((1, 33, 3), NAN, dtype=torch.float64).index_copy(
+            1, torch.tensor(keep), seen
+        )
         return sanitise(p)[0]
 
-    assert torch.autograd.gradcheck(values, (noisy(3)[:, keep].requires_grad_(),), fast_mode=True)
+    assert torch.autograd.gradcheck(
+        values, (noisy(3)[:, keep].requires_grad_(),), fast_mode=True
+    )
 
 
 def test_far_from_the_origin_in_float32():
@@ -132,14 +136,17 @@ def test_estimated_hips_hold_a_trunk_of_which_only_the_shoulders_are_seen():
     assert (q[0, [25, 26], 1] < q[0, [23, 24], 1]).all()
     with pytest.raises(ValueError, match="left_hip, right_hip"):
         sanitise(lose(p, legs))
-    with pytest.raises(ValueError, match="left_hip, right_hip"):  # zeros are no estimate
+    # zeros are no estimate
+    with pytest.raises(ValueError, match="left_hip, right_hip"):
         sanitise(lose(p, legs, 0.0), visibility)
 
 
 def test_misuse_is_named():
     with pytest.raises(ValueError, match=r"sanitise: p must .*\[B, 33, 3\]"):
         sanitise(torch.zeros(1, 24, 3))
-    with pytest.raises(ValueError, match=r"visibility must have shape \[1, 33\], got \[33\]"):
+    with pytest.raises(
+        ValueError, match=r"visibility must have shape \[1, 33\], got \[33\]"
+    ):
         sanitise(noisy(0), torch.ones(33))
 
 

@@ -19,7 +19,10 @@ def free_landmarks() -> np.ndarray:
 
 
 def confidences(conf: np.ndarray) -> dict[float, set[str]]:
-    return {c: {n for n, own in zip(NAMES, conf, strict=True) if own == c} for c in (0.0, 0.5, 1.0)}
+    return {
+        c: {n for n, own in zip(NAMES, conf, strict=True) if own == c}
+        for c in (0.0, 0.5, 1.0)
+    }
 
 
 def both(*names: str) -> set[str]:
@@ -34,10 +37,19 @@ def test_joints_alone():
     assert found[0.5] == both("foot_index", "index")
     assert np.isnan(p[conf == 0]).all()
     assert np.isfinite(p[conf > 0]).all()
-    numbers = {"shoulder": 16, "elbow": 18, "wrist": 20, "hip": 1, "knee": 4, "ankle": 7}
+    numbers = {
+        "shoulder": 16,
+        "elbow": 18,
+        "wrist": 20,
+        "hip": 1,
+        "knee": 4,
+        "ankle": 7,
+    }
     for name, joint in (numbers | {"foot_index": 10, "index": 22}).items():
         np.testing.assert_array_equal(p[NAMES.index(f"left_{name}")], joints[joint])
-        np.testing.assert_array_equal(p[NAMES.index(f"right_{name}")], joints[joint + 1])
+        np.testing.assert_array_equal(
+            p[NAMES.index(f"right_{name}")], joints[joint + 1]
+        )
 
 
 def test_vertices_add_face_heels_and_hands():
@@ -48,10 +60,14 @@ def test_vertices_add_face_heels_and_hands():
     assert found[0.5] == both("eye_inner", "eye_outer", "index", "pinky", "thumb")
     difference = np.linalg.norm(p - free_landmarks(), axis=1)
     same = [NAMES.index(name) for name in found[1.0]]
-    assert difference[same].max() < 1e-6  # the writer put them on the free body's landmarks
+    # the writer put them on the free body's landmarks
+    assert difference[same].max() < 1e-6
     hands = [NAMES.index(name) for name in both("index", "pinky", "thumb")]
-    assert difference[hands].max() < 0.05  # halfway to the finger tip is about the knuckle
-    np.testing.assert_array_equal(p[NAMES.index("left_eye_inner")], p[NAMES.index("left_eye")])
+    # halfway to the finger tip is about the knuckle
+    assert difference[hands].max() < 0.05
+    np.testing.assert_array_equal(
+        p[NAMES.index("left_eye_inner")], p[NAMES.index("left_eye")]
+    )
 
 
 def test_smplx_has_real_knuckles():
@@ -92,7 +108,9 @@ def test_missing_landmarks_are_filled_in_later():
 def test_wrong_shapes_name_the_argument():
     with pytest.raises(ValueError, match="kind"):
         to_mediapipe33(np.zeros((24, 3)), kind="smplh")
-    with pytest.raises(ValueError, match=r"joints must have shape \[..., 55, 3\], got \[24, 3\]"):
+    with pytest.raises(
+        ValueError, match=r"joints must have shape \[..., 55, 3\], got \[24, 3\]"
+    ):
         to_mediapipe33(np.zeros((24, 3)), kind="smplx")
     with pytest.raises(ValueError, match="vertices"):
         to_mediapipe33(np.zeros((24, 3)), np.zeros((100, 3)))

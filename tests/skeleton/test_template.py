@@ -84,7 +84,9 @@ def test_mirror_swaps_sides_of_the_rest_pose(t):
     np.testing.assert_allclose(rest[mirror] * [-1, 1, 1], rest)
     assert [mirror[m] for m in mirror] == list(range(len(t.names)))
     assert [t.names[mirror[7]], mirror[0]] == ["right_ear", 0]
-    left = np.array([name.startswith("left") or name.endswith("left") for name in t.names])
+    left = np.array(
+        [name.startswith("left") or name.endswith("left") for name in t.names]
+    )
     assert (rest[left, 0] > 0).all()
 
 

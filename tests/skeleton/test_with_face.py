@@ -56,11 +56,20 @@ def test_counts():
 
 def test_the_face_continues_the_poses_own():
     """Corners of lids and lips are those of eyes and mouth; lips, nose, lids, brows follow."""
-    for own, pose in (("left_lid_inner", "left_eye_inner"), ("mouth_outer_6", "mouth_right")):
+    for own, pose in (
+        ("left_lid_inner", "left_eye_inner"),
+        ("mouth_outer_6", "mouth_right"),
+    ):
         a, b = (T.rest_positions[T.names.index(name)] for name in (own, pose))
         assert a == b
     y = dict(zip(T.names, np.asarray(T.rest_positions)[:, 1], strict=True))
-    below = ("mouth_outer_9", "mouth_outer_3", "nose", "left_lid_lower", "left_lid_upper")
+    below = (
+        "mouth_outer_9",
+        "mouth_outer_3",
+        "nose",
+        "left_lid_lower",
+        "left_lid_upper",
+    )
     heights = [y[name] for name in (*below, "left_brow_2")]
     assert heights == sorted(heights)
     hub = bone_frames(REST, None, T).hubs[0, HEAD]
@@ -69,7 +78,9 @@ def test_the_face_continues_the_poses_own():
 
 def test_a_face_at_rest_has_the_code_zero_however_the_head_is_turned():
     p = head_turned(REST) @ rotation(2).mT + 3.0
-    torch.testing.assert_close(code_of(p), torch.zeros(1, 30, 3, dtype=F64), atol=1e-10, rtol=0)
+    torch.testing.assert_close(
+        code_of(p), torch.zeros(1, 30, 3, dtype=F64), atol=1e-10, rtol=0
+    )
     assert face_code(p[:, :33], bone_frames(p[:, :33]).head, MEDIAPIPE33) is None
 
 
@@ -94,7 +105,9 @@ def test_codes_of_the_other_joints_are_those_without_a_face():
     assert torch.equal(ours[:, :75], omega(p[:, :75], None, R, MEDIAPIPE33_HANDS))
 
 
-@pytest.mark.parametrize("lost", [[LIP], [*T.expression], [*T.expression, 9, 10], [*range(11)]])
+@pytest.mark.parametrize(
+    "lost", [[LIP], [*T.expression], [*T.expression, 9, 10], [*range(11)]]
+)
 def test_a_missing_face_rests_on_the_turned_head(lost):
     turned = head_turned(REST, 5)
     p = turned.clone()
@@ -105,7 +118,9 @@ def test_a_missing_face_rests_on_the_turned_head(lost):
         assert torch.equal(q[:, FACE], turned[:, FACE])
         return
     torch.testing.assert_close(q, turned, atol=1e-9, rtol=0)
-    torch.testing.assert_close(code_of(q), torch.zeros(1, 30, 3, dtype=F64), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        code_of(q), torch.zeros(1, 30, 3, dtype=F64), atol=1e-6, rtol=0
+    )
 
 
 def test_a_missing_face_moves_no_further_than_the_head():
@@ -153,7 +168,9 @@ def test_skeletons_with_and_without_a_face_drive_each_others_templates():
 def test_brows_eyes_and_lips_are_drawn_in_channels_of_their_own():
     view = camera((256, 256))
     image = draw_skeleton(REST, None, view, T)
-    assert torch.equal(image[:, :18], draw_skeleton(REST[:, :75], None, view, MEDIAPIPE33_HANDS))
+    assert torch.equal(
+        image[:, :18], draw_skeleton(REST[:, :75], None, view, MEDIAPIPE33_HANDS)
+    )
     rows = (image[0, 18:].amax(-1) > 0.6).float()  # brows over eyes over lips
     heights = (rows * torch.arange(256)).sum(-1) / rows.sum(-1)
     assert heights[0] < heights[1] < heights[2]

@@ -43,7 +43,9 @@ def test_counts():
     assert len(T.draw_groups) == 18  # eight of the body, ten fingers
     assert sorted(set(range(75)) - set(T.incoming)) == [*range(13), 23, 24]
     assert named_template("mediapipe33_hands") is T
-    with pytest.raises(ConfigError, match=r"data.skeleton must be one of .*got 'hands'"):
+    with pytest.raises(
+        ConfigError, match=r"data.skeleton must be one of .*got 'hands'"
+    ):
         named_template("hands")
 
 
@@ -52,7 +54,9 @@ def test_the_rest_pose_has_hands():
     for hand, (wrist, index, pinky, thumb) in zip(
         HANDS, ((15, 19, 17, 21), (16, 20, 18, 22)), strict=True
     ):  # the pose's own landmarks of the hand are those of the hand
-        np.testing.assert_allclose(rest[hand][[0, 5, 17, 2]], rest[[wrist, index, pinky, thumb]])
+        np.testing.assert_allclose(
+            rest[hand][[0, 5, 17, 2]], rest[[wrist, index, pinky, thumb]]
+        )
         tips = np.linalg.norm(rest[hand][[8, 12, 16, 20]] - rest[wrist], axis=-1)
         assert (tips > 0.13).all()
         assert (tips < 0.22).all()
@@ -81,7 +85,9 @@ def test_frames_are_rotations_that_turn_with_the_skeleton():
     assert_rotation(frames.limbs[0])
     assert_rotation(frames.hubs[0])
     torch.testing.assert_close(turned.limbs[:, 4:], R @ frames.limbs[:, 4:])
-    torch.testing.assert_close(turned.local[:, list(T.fingers)], frames.local[:, list(T.fingers)])
+    torch.testing.assert_close(
+        turned.local[:, list(T.fingers)], frames.local[:, list(T.fingers)]
+    )
 
 
 def test_a_turned_forearm_turns_the_fingers_frames():
@@ -108,7 +114,14 @@ def test_a_palm_that_vanishes_has_finite_frames_and_slopes():
 
 
 @pytest.mark.parametrize(
-    "gone", [[33 + 8], [*range(33, 75)], [33 + 5, 33 + 6], [15, *range(33, 54)], [*range(54, 75)]]
+    "gone",
+    [
+        [33 + 8],
+        [*range(33, 75)],
+        [33 + 5, 33 + 6],
+        [15, *range(33, 54)],
+        [*range(54, 75)],
+    ],
 )
 def test_missing_joints_are_placed_at_rest_in_the_subjects_size(gone):
     R = rotation(3)
@@ -142,7 +155,9 @@ def test_points_lie_on_thin_cylinders_along_the_fingers():
         assert len(offset) == 60
         height = offset @ axis
         radius = (offset - height[:, None] * axis).norm(dim=-1)
-        torch.testing.assert_close(radius, (0.25 * lengths[limb]).expand(60), atol=1e-12, rtol=0)
+        torch.testing.assert_close(
+            radius, (0.25 * lengths[limb]).expand(60), atol=1e-12, rtol=0
+        )
     body = Densify(dtype=F64)(p[:, :33])
     torch.testing.assert_close(points.means[:, :4400], body.means[:, :4400])
     torch.testing.assert_close(points.means[:, -1000:], body.means[:, -1000:])

@@ -27,7 +27,9 @@ def camera(
     H, W = size
     K = torch.tensor([[focal, 0, W / 2], [0, focal, H / 2], [0, 0, 1]], dtype=dtype)
     R, t = torch.eye(3, dtype=dtype), torch.zeros(3, dtype=dtype)
-    return Camera(K.repeat(batch, 1, 1), R.repeat(batch, 1, 1), t.repeat(batch, 1), size)
+    return Camera(
+        K.repeat(batch, 1, 1), R.repeat(batch, 1, 1), t.repeat(batch, 1), size
+    )
 
 
 def cloud(
@@ -77,7 +79,9 @@ def leaves(record):
     return replace(
         record,
         **{
-            k: v.detach().clone().requires_grad_() for k, v in tensors.items() if torch.is_tensor(v)
+            k: v.detach().clone().requires_grad_()
+            for k, v in tensors.items()
+            if torch.is_tensor(v)
         },
     )
 
@@ -86,7 +90,9 @@ def loss(raster: Raster) -> Tensor:
     """A fixed random weighting of all outputs."""
     g = torch.Generator().manual_seed(7)
     outputs = raster.features, raster.alpha
-    weights = [torch.randn(x.shape, generator=g, dtype=torch.float64).to(x) for x in outputs]
+    weights = [
+        torch.randn(x.shape, generator=g, dtype=torch.float64).to(x) for x in outputs
+    ]
     return sum((x * w).sum() for x, w in zip(outputs, weights, strict=True))
 
 
@@ -106,7 +112,9 @@ def error(a: Tensor, b: Tensor) -> float:
     return float((a - b).abs().max() / b.abs().max().clamp_min(1.0))
 
 
-def naive(gaussians: Gaussians, cam: Camera, low_pass: float = 0.3) -> tuple[Tensor, Tensor]:
+def naive(
+    gaussians: Gaussians, cam: Camera, low_pass: float = 0.3
+) -> tuple[Tensor, Tensor]:
     """The paper's formulas with loops and a matrix inverse: independent of gsgan.splat.
 
     For Gaussians inside the field of view and in front of the camera.
@@ -114,7 +122,8 @@ def naive(gaussians: Gaussians, cam: Camera, low_pass: float = 0.3) -> tuple[Ten
     H, W = cam.size
     K, R, t = cam.K[0], cam.R[0], cam.t[0]
     order = sorted(
-        range(gaussians.means.shape[1]), key=lambda i: float(R[2] @ gaussians.means[0, i] + t[2])
+        range(gaussians.means.shape[1]),
+        key=lambda i: float(R[2] @ gaussians.means[0, i] + t[2]),
     )
     image = torch.zeros(gaussians.features.shape[-1], H, W, dtype=torch.float64)
     left = torch.ones(H, W, dtype=torch.float64)
@@ -127,7 +136,9 @@ def naive(gaussians: Gaussians, cam: Camera, low_pass: float = 0.3) -> tuple[Ten
         J = torch.tensor([[1, 0, -x_z], [0, 1, -y_z]], dtype=torch.float64) / z
         J = K[:2, :2] @ J @ R
         if gaussians.covariances is None:
-            w, qx, qy, qz = (gaussians.quats[0, i] / gaussians.quats[0, i].norm()).tolist()
+            w, qx, qy, qz = (
+                gaussians.quats[0, i] / gaussians.quats[0, i].norm()
+            ).tolist()
             angle = 2 * math.atan2(math.hypot(qx, qy, qz), w)
             n = math.hypot(qx, qy, qz) or 1.0
             skew = [[0, -qz, qy], [qz, 0, -qx], [-qy, qx, 0]]
@@ -150,7 +161,9 @@ DENSE = replace(ACCURACY["exact"], name="dense")
 CUT = replace(ACCURACY["standard"], name="cut", dtype="float64")
 
 every_backend = pytest.mark.parametrize("backend", BACKENDS)
-fast_backend = pytest.mark.parametrize("backend", [b for b in BACKENDS if b != "reference"])
+fast_backend = pytest.mark.parametrize(
+    "backend", [b for b in BACKENDS if b != "reference"]
+)
 every_setting = pytest.mark.parametrize("settings", list(ACCURACY))
 
 
@@ -177,8 +190,12 @@ def assert_like_reference(
 
 def turned(cam: Camera, skew: float = 3.0, offset: float = 2.5) -> Camera:
     """Rotated, shifted, with skew, an off-centre principal point and non-square pixels."""
-    axis = torch.tensor([[0, -0.1, 0.05], [0.1, 0, 0.2], [-0.05, -0.2, 0]], dtype=cam.K.dtype)
+    axis = torch.tensor(
+        [[0, -0.1, 0.05], [0.1, 0, 0.2], [-0.05, -0.2, 0]], dtype=cam.K.dtype
+    )
     K = cam.K.clone()
     K[:, 0, 1], K[:, 0, 2], K[:, 1, 1] = skew, K[:, 0, 2] + offset, K[:, 1, 1] * 0.8
     R = torch.matrix_exp(axis).expand_as(cam.R).clone()
-    return replace(cam, K=K, R=R, t=cam.t + torch.tensor([0.1, -0.05, 0.3], dtype=cam.t.dtype))
+    return replace(
+        cam, K=K, R=R, t=cam.t + torch.tensor([0.1, -0.05, 0.3], dtype=cam.t.dtype)
+    )

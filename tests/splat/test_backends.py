@@ -36,10 +36,14 @@ from gsgan.splat import ACCURACY, rasterise
 def test_one_gaussian_matches_the_closed_form(backend, settings):
     scale, opacity, features = 0.1, 0.8, (1.0, 0.5, 0.25)
     cam = camera((9, 11), focal=20.0)
-    gaussians = one((0.0, 0.0, 2.0), scale=(scale,) * 3, opacity=opacity, features=features)
+    gaussians = one(
+        (0.0, 0.0, 2.0), scale=(scale,) * 3, opacity=opacity, features=features
+    )
     raster = rasterise(gaussians, cam, settings=settings, backend=backend)
     variance = (20.0 * scale / 2) ** 2 + 0.3
-    y, x = torch.meshgrid(torch.arange(9) + 0.5 - 4.5, torch.arange(11) + 0.5 - 5.5, indexing="ij")
+    y, x = torch.meshgrid(
+        torch.arange(9) + 0.5 - 4.5, torch.arange(11) + 0.5 - 5.5, indexing="ij"
+    )
     alpha = opacity * torch.exp(-0.5 * (x * x + y * y).double() / variance)
     alpha[alpha < ACCURACY[settings].alpha_min] = 0
     torch.testing.assert_close(raster.alpha[0, 0], alpha, rtol=1e-6, atol=1e-7)
@@ -52,7 +56,9 @@ def test_two_layers_blend_front_to_back(backend):
     far = one((0, 0, 3.0), scale=(50.0,) * 3, opacity=0.5, features=(0.0, 1.0))
     near = one((0, 0, 2.0), scale=(50.0,) * 3, opacity=0.25, features=(1.0, 0.0))
     raster = rasterise(join(far, near), camera((1, 1)), settings=DENSE, backend=backend)
-    torch.testing.assert_close(raster.features.flatten(), torch.tensor([0.25, 0.375]).double())
+    torch.testing.assert_close(
+        raster.features.flatten(), torch.tensor([0.25, 0.375]).double()
+    )
     assert raster.alpha.item() == pytest.approx(1 - 0.75 * 0.5)
 
 
@@ -72,8 +78,12 @@ def test_equals_naive_loops(backend, shape):
 
 @fast_backend
 @pytest.mark.parametrize("settings", [DENSE, CUT], ids=["dense", "cut"])
-@pytest.mark.parametrize(("n", "channels", "size"), [(60, 3, (24, 32)), (200, 1, (33, 17))])
-def test_equals_the_reference_with_the_same_settings(backend, settings, n, channels, size):
+@pytest.mark.parametrize(
+    ("n", "channels", "size"), [(60, 3, (24, 32)), (200, 1, (33, 17))]
+)
+def test_equals_the_reference_with_the_same_settings(
+    backend, settings, n, channels, size
+):
     assert_like_reference(cloud(n, channels), turned(camera(size)), settings, backend)
 
 
@@ -82,8 +92,12 @@ def test_equals_the_reference_with_the_same_settings(backend, settings, n, chann
 def test_float32_is_near_the_reference_in_float64(backend, settings):
     gaussians, cam = cloud(150), turned(camera())
     setting = ACCURACY[settings]
-    got, got_grads = draw(gaussians.to(torch.float32), cam.to(torch.float32), setting, backend)
-    want, want_grads = draw(gaussians, cam, replace(setting, dtype="float64"), "reference")
+    got, got_grads = draw(
+        gaussians.to(torch.float32), cam.to(torch.float32), setting, backend
+    )
+    want, want_grads = draw(
+        gaussians, cam, replace(setting, dtype="float64"), "reference"
+    )
     assert got.features.dtype == torch.float32
     # An alpha that rounding moves across alpha_min changes the pixel by at most alpha_min.
     assert error(got.features, want.features) < 5e-6 + setting.alpha_min
@@ -117,7 +131,9 @@ def test_gradients_only_where_requested(backend):
     # The sum of an image is linear in the features.
     total = (gaussians.features.grad * gaussians.features.detach()).sum()
     torch.testing.assert_close(total, raster.features.detach().sum())
-    assert not rasterise(cloud(10), camera(), settings=CUT, backend=backend).alpha.requires_grad
+    assert not rasterise(
+        cloud(10), camera(), settings=CUT, backend=backend
+    ).alpha.requires_grad
 
 
 # --- accuracy settings -------------------------------------------------------------------------
@@ -128,7 +144,11 @@ def test_finer_settings_are_more_accurate(backend):
     gaussians, cam = cloud(300), camera()
     want = rasterise(gaussians, cam, settings="exact").features
     errors = [
-        float((rasterise(gaussians, cam, settings=s, backend=backend).features - want).abs().max())
+        float(
+            (rasterise(gaussians, cam, settings=s, backend=backend).features - want)
+            .abs()
+            .max()
+        )
         for s in ("high", "standard", "draft")
     ]
     assert errors[0] < 1e-4 < 1e-3 < errors[1] < errors[2] < 0.1
@@ -169,12 +189,19 @@ def test_a_batch_equals_its_items(backend):
         assert torch.equal(single.alpha, both.alpha[i : i + 1])
         weights = torch.Generator().manual_seed(7)
         total = 0.0
-        for whole, part in ((both.features, single.features), (both.alpha, single.alpha)):
-            w = torch.randn(whole.shape, generator=weights, dtype=torch.float64)[i : i + 1]
+        for whole, part in (
+            (both.features, single.features),
+            (both.alpha, single.alpha),
+        ):
+            w = torch.randn(whole.shape, generator=weights, dtype=torch.float64)[
+                i : i + 1
+            ]
             total = total + (part * w).sum()
         total.backward()
         for name, grad in gradients(g, c).items():
-            torch.testing.assert_close(grad, both_grads[name][i : i + 1], rtol=1e-9, atol=1e-12)
+            torch.testing.assert_close(
+                grad, both_grads[name][i : i + 1], rtol=1e-9, atol=1e-12
+            )
 
 
 @every_backend

@@ -11,7 +11,9 @@ import pytest
 
 from gsgan.splat import build, native
 
-needs_kernel = pytest.mark.skipif(not native.available(), reason=native.why_not() or "available")
+needs_kernel = pytest.mark.skipif(
+    not native.available(), reason=native.why_not() or "available"
+)
 
 REPORT = "from gsgan.splat import native; print(native.available(), native.why_not(), sep='|')"
 
@@ -20,7 +22,12 @@ def report(cache: Path, **environment: str) -> tuple[bool, str]:
     """available() and why_not() of a fresh process."""
     done = subprocess.run(
         [sys.executable, "-c", REPORT],
-        env={**os.environ, "GSGAN_CACHE": str(cache), "OMP_NUM_THREADS": "1", **environment},
+        env={
+            **os.environ,
+            "GSGAN_CACHE": str(cache),
+            "OMP_NUM_THREADS": "1",
+            **environment,
+        },
         capture_output=True,
         text=True,
         timeout=300,
@@ -97,7 +104,13 @@ def test_builds_without_openmp(tmp_path, quick_compiler, load_afresh):
 @pytest.mark.slow
 @needs_kernel
 def test_one_thread_without_openmp(tmp_path):
-    command = [*build.compiler(), *build.BASE_FLAGS, str(build.SOURCE), "-o", f"{tmp_path}/x.so"]
+    command = [
+        *build.compiler(),
+        *build.BASE_FLAGS,
+        str(build.SOURCE),
+        "-o",
+        f"{tmp_path}/x.so",
+    ]
     assert subprocess.run(command, check=False).returncode == 0
     library = build.open_library(tmp_path / "x.so")
     assert library is not None

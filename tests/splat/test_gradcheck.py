@@ -4,7 +4,14 @@ from dataclasses import replace
 
 import pytest
 import torch
-from splat_scenes import camera, cloud, every_backend, needs_native, turned, with_covariances
+from splat_scenes import (
+    camera,
+    cloud,
+    every_backend,
+    needs_native,
+    turned,
+    with_covariances,
+)
 
 from gsgan.splat import ACCURACY, native_project, project, rasterise, sh_to_colour
 
@@ -19,7 +26,11 @@ def scene(shape: str, n: int = 3, batch: int = 1):
     gaussians = cloud(n, 2, scale=0.15, batch=batch)
     gaussians = with_covariances(gaussians) if shape == "covariances" else gaussians
     names = [name for name, value in vars(gaussians).items() if value is not None]
-    return gaussians, turned(camera((3, 4), focal=4.0, batch=batch), skew=0.7, offset=0.5), names
+    return (
+        gaussians,
+        turned(camera((3, 4), focal=4.0, batch=batch), skew=0.7, offset=0.5),
+        names,
+    )
 
 
 def checked(function, *tensors) -> bool:
@@ -65,7 +76,9 @@ def test_antialiased_batches(backend, shape):
         raster = rasterise(given, seen_by, settings=settings, backend=backend)
         return raster.features, raster.alpha
 
-    assert checked(image, *(getattr(gaussians, name) for name in names), cam.K, cam.R, cam.t)
+    assert checked(
+        image, *(getattr(gaussians, name) for name in names), cam.K, cam.R, cam.t
+    )
 
 
 @pytest.mark.parametrize(
@@ -86,4 +99,6 @@ def test_projection_alone(projection, shape, antialias):
         projected = projection(given, replace(cam, K=K, R=R, t=t), settings)
         return tuple(getattr(projected, name) for name in DRAWN)
 
-    assert checked(ellipses, *(getattr(gaussians, name) for name in names), cam.K, cam.R, cam.t)
+    assert checked(
+        ellipses, *(getattr(gaussians, name) for name in names), cam.K, cam.R, cam.t
+    )

@@ -28,7 +28,14 @@ from splat_scenes import (
 from stability.cases.case import drawing_backends
 
 from gsgan.scene import Camera, Gaussians
-from gsgan.splat import ACCURACY, gsplat_backend, project, rasterise, reference, resolve_backend
+from gsgan.splat import (
+    ACCURACY,
+    gsplat_backend,
+    project,
+    rasterise,
+    reference,
+    resolve_backend,
+)
 
 CPU, CUDA = torch.device("cpu"), torch.device("cuda")
 STANDARD = ACCURACY["standard"]
@@ -63,14 +70,18 @@ class StandIn:
         rasterize_mode="classic",
         covars=None,
     ):
-        self.calls.append(SimpleNamespace(**{k: v for k, v in locals().items() if k != "self"}))
+        self.calls.append(
+            SimpleNamespace(**{k: v for k, v in locals().items() if k != "self"})
+        )
         B, N = opacities.shape
         assert means.shape == (B, N, 3)
         assert viewmats.shape == (B, 1, 4, 4)
         assert Ks.shape == (B, 1, 3, 3)
         tensors = (means, quats, scales, covars, opacities, colors, viewmats, Ks)
         assert all(x.dtype == torch.float32 for x in tensors if x is not None)
-        assert torch.equal(viewmats[..., 3, :], torch.tensor([0.0, 0, 0, 1]).expand(B, 1, 4))
+        assert torch.equal(
+            viewmats[..., 3, :], torch.tensor([0.0, 0, 0, 1]).expand(B, 1, 4)
+        )
         assert (sh_degree, backgrounds, radius_clip, tile_size) == (None, None, 0.0, 16)
         assert far_plane >= 1e10
         K = Ks[:, 0].detach() * torch.tensor([[1.0, 0, 1], [0, 1, 1], [0, 0, 1]])
@@ -111,7 +122,9 @@ def mock(monkeypatch):
     gsplat_backend._measured_cap.cache_clear()
 
 
-def scene(shape: str = "quats", channels: int = 3, batch: int = 2) -> tuple[Gaussians, Camera]:
+def scene(
+    shape: str = "quats", channels: int = 3, batch: int = 2
+) -> tuple[Gaussians, Camera]:
     gaussians = cloud(30, channels, batch=batch)
     if shape == "covariances":
         gaussians = with_covariances(gaussians)
@@ -155,7 +168,9 @@ def test_values_and_gradients_are_those_of_the_reference(mock, shape, channels):
     assert (mock.calls[-1].quats is None) == (shape == "covariances")
 
 
-@pytest.mark.parametrize("changes", [{"antialias": True}, {"low_pass": 1.0}, {"near": 2.0}])
+@pytest.mark.parametrize(
+    "changes", [{"antialias": True}, {"low_pass": 1.0}, {"near": 2.0}]
+)
 def test_the_settings_that_gsplat_takes_are_passed_on(mock, changes):
     gaussians, cam = scene()
     settings = replace(STANDARD, **changes)
@@ -200,7 +215,9 @@ def test_unusable_quaternions_are_the_identity_and_length_does_not_matter(mock):
     ],
 )
 @pytest.mark.parametrize("backend", ["auto", "gsplat"])
-def test_it_draws_with_any_settings_and_reports_the_differences(mock, backend, changes, message):
+def test_it_draws_with_any_settings_and_reports_the_differences(
+    mock, backend, changes, message
+):
     name, reason = resolve_backend(backend, CPU, replace(STANDARD, **changes))
     assert name == "gsplat"
     assert message in reason
@@ -209,7 +226,9 @@ def test_it_draws_with_any_settings_and_reports_the_differences(mock, backend, c
     assert reason.count(". ") == 0  # one sentence
 
 
-def test_auto_uses_it_with_the_default_accuracy_and_logs_once(mock, caplog, monkeypatch):
+def test_auto_uses_it_with_the_default_accuracy_and_logs_once(
+    mock, caplog, monkeypatch
+):
     monkeypatch.setattr(sys.modules["gsgan.splat.rasterise"], "_logged", set())
     gaussians, cam = scene()
     with caplog.at_level(logging.WARNING):
@@ -271,7 +290,9 @@ class Newer(StandIn):
     def __init__(self) -> None:
         super().__init__(cap=0.99)
 
-    def rasterization(self, *args, with_ut=False, with_eval3d=False, global_z_order=True, **given):
+    def rasterization(
+        self, *args, with_ut=False, with_eval3d=False, global_z_order=True, **given
+    ):
         return super().rasterization(*args, **given)
 
 
@@ -279,16 +300,31 @@ class Newer(StandIn):
     ("module", "device", "dtype", "messages"),
     [
         (StandIn(), "cpu", "float64", [WIDE]),
-        (StandIn(), "cuda", "float32", ["gsplat runs on CUDA only, the Gaussians are on cpu"]),
+        (
+            StandIn(),
+            "cuda",
+            "float32",
+            ["gsplat runs on CUDA only, the Gaussians are on cpu"],
+        ),
         # what sys.modules does with None
-        (None, "cpu", "float32", [BROKEN, "ModuleNotFoundError: import of gsplat halted"]),
+        (
+            None,
+            "cpu",
+            "float32",
+            [BROKEN, "ModuleNotFoundError: import of gsplat halted"],
+        ),
         (
             broken(RuntimeError("no kernel image\nfor this device")),
             *("cpu", "float32", [BROKEN, "(RuntimeError: no kernel image)"]),
         ),
         (broken(AssertionError()), "cpu", "float32", [BROKEN, "(AssertionError)"]),
         (Older(), "cpu", "float32", [BROKEN, "1.5.3 or newer is needed"]),
-        (broken(RuntimeError(BUILD)), "cpu", "float32", [BROKEN, 'no member "Sum"', "CUDA 12.8"]),
+        (
+            broken(RuntimeError(BUILD)),
+            "cpu",
+            "float32",
+            [BROKEN, 'no member "Sum"', "CUDA 12.8"],
+        ),
     ],
 )
 def test_where_it_cannot_draw_torch_does(monkeypatch, module, device, dtype, messages):
@@ -305,7 +341,10 @@ def unsuited_cases():
     return {
         "Gaussians are float64": wide,
         "zero Gaussians": (none, cam),
-        "no gradient for Camera.K": (gaussians, replace(cam, K=cam.K.clone().requires_grad_())),
+        "no gradient for Camera.K": (
+            gaussians,
+            replace(cam, K=cam.K.clone().requires_grad_()),
+        ),
     }
 
 
@@ -360,7 +399,11 @@ def test_the_extra_admits_no_version_without_batches():
 
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
     (requirement,) = project["project"]["optional-dependencies"]["gsplat"]
-    specifier = importlib.import_module("packaging.requirements").Requirement(requirement).specifier
+    specifier = (
+        importlib.import_module("packaging.requirements")
+        .Requirement(requirement)
+        .specifier
+    )
     assert [version for version in ("1.5.0", "1.5.2") if version in specifier] == []
     assert "1.5.3" in specifier
 
@@ -370,7 +413,9 @@ def test_a_newer_version_draws_too(monkeypatch):
     assert resolve_backend("gsplat", CPU, STANDARD)[0] == "gsplat"
     gaussians, cam = scene()
     settings = replace(STANDARD, alpha_max=0.99)
-    got = gsplat_backend.draw(gaussians.to(torch.float32), cam.to(torch.float32), settings)[0]
+    got = gsplat_backend.draw(
+        gaussians.to(torch.float32), cam.to(torch.float32), settings
+    )[0]
     want = rasterise(gaussians, cam, settings=settings, backend="torch").features
     assert error(got, want) < 1e-4
     gsplat_backend._measured_cap.cache_clear()

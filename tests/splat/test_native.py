@@ -11,7 +11,9 @@ from gsgan.splat import native
 from gsgan.splat.project import Projected
 from gsgan.splat.settings import ACCURACY
 
-pytestmark = pytest.mark.skipif(not native.available(), reason=native.why_not() or "available")
+pytestmark = pytest.mark.skipif(
+    not native.available(), reason=native.why_not() or "available"
+)
 
 
 EXACT, HIGH = ACCURACY["exact"], ACCURACY["high"]
@@ -40,7 +42,11 @@ def scene(
 
     means = (rand(B, N, 2) * 1.4 - 0.2) * torch.tensor([size[1], size[0]])
     low, high = sigmas
-    s, t, angle = low + (high - low) * rand(B, N), low + (high - low) * rand(B, N), 3.2 * rand(B, N)
+    s, t, angle = (
+        low + (high - low) * rand(B, N),
+        low + (high - low) * rand(B, N),
+        3.2 * rand(B, N),
+    )
     cos, sin = angle.cos(), angle.sin()
     a = (cos * s) ** 2 + (sin * t) ** 2
     b = cos * sin * (s**2 - t**2)
@@ -51,7 +57,9 @@ def scene(
     extents = 40 * torch.stack([a, c], dim=-1).sqrt()
     visible = rand(B, N) > 0.1
     depths = 1 + (8 * rand(B, N)).floor() / 8
-    return Projected(means, factors, opacities, rand(B, N, 3) - 0.3, depths, extents, visible)
+    return Projected(
+        means, factors, opacities, rand(B, N, 3) - 0.3, depths, extents, visible
+    )
 
 
 def one(
@@ -65,7 +73,9 @@ def one(
     ones = torch.ones(1, n, dtype=dtype)
     return Projected(
         means=torch.tensor(mean, dtype=torch.float64).expand(1, n, 2),
-        factors=torch.tensor([1 / sigma, 0, 1 / sigma], dtype=torch.float64).expand(1, n, 3),
+        factors=torch.tensor([1 / sigma, 0, 1 / sigma], dtype=torch.float64).expand(
+            1, n, 3
+        ),
         opacities=opacity * ones,
         features=ones.unsqueeze(-1),
         depths=ones.double(),

@@ -12,7 +12,9 @@ from gsgan.scene import Camera, Gaussians
 from gsgan.splat import ACCURACY, Accuracy, build, native, native_project, project
 from gsgan.splat.project import Projected
 
-pytestmark = pytest.mark.skipif(not native.available(), reason=native.why_not() or "available")
+pytestmark = pytest.mark.skipif(
+    not native.available(), reason=native.why_not() or "available"
+)
 
 DRAWN = ("means", "factors", "opacities", "depths")
 WIDE = {name: replace(setting, dtype="float64") for name, setting in ACCURACY.items()}
@@ -31,10 +33,17 @@ def scene(shape: str) -> tuple[Gaussians, Camera]:
         one((0.1, 0.2, 2.0), opacity=0.0),
     ]
     gaussians = join(*odd, cloud(300, 1))
-    gaussians = Gaussians(*(torch.cat([x, x.flip(1)]) for x in list(vars(gaussians).values())[:5]))
+    gaussians = Gaussians(
+        *(torch.cat([x, x.flip(1)]) for x in list(vars(gaussians).values())[:5])
+    )
     if shape == "covariances":
         gaussians = with_covariances(gaussians)
-        skew = 0.01 * torch.randn(2, 308, 3, 3, generator=torch.Generator().manual_seed(0)).double()
+        skew = (
+            0.01
+            * torch.randn(
+                2, 308, 3, 3, generator=torch.Generator().manual_seed(0)
+            ).double()
+        )
         # Not symmetric, and some not positive definite: a caller may pass these.
         gaussians = replace(gaussians, covariances=gaussians.covariances + 0.1 * skew)
     return gaussians, turned(camera(batch=2))
@@ -53,7 +62,9 @@ def with_gradients(run, gaussians: Gaussians, cam: Camera, settings: Accuracy):
         total = total + torch.where(seen, value * weight, 0.0).sum()
     total.backward()
     tensors = {**vars(gaussians), **vars(cam)}
-    return p, {k: v.grad for k, v in tensors.items() if torch.is_tensor(v) and k != "features"}
+    return p, {
+        k: v.grad for k, v in tensors.items() if torch.is_tensor(v) and k != "features"
+    }
 
 
 @pytest.mark.parametrize("name", list(ACCURACY))
@@ -76,7 +87,9 @@ def test_equals_the_portable_projection(name, antialias, shape):
 def test_float32_is_rounded_once():
     gaussians, cam = (x.to(torch.float32) for x in scene("quats"))
     got = native_project.project(gaussians, cam, ACCURACY["high"])
-    wide = native_project.project(gaussians.to(torch.float64), cam.to(torch.float64), WIDE["high"])
+    wide = native_project.project(
+        gaussians.to(torch.float64), cam.to(torch.float64), WIDE["high"]
+    )
     assert torch.equal(got.means[got.visible], wide.means[got.visible])
     assert torch.equal(got.factors[got.visible], wide.factors[got.visible])
     assert torch.equal(got.opacities, wide.opacities.float())
@@ -93,7 +106,8 @@ def test_no_gaussians():
 
 
 @pytest.mark.parametrize(
-    ("module", "name"), [(native, ""), (native_project, "project_"), (compiled, "solve_")]
+    ("module", "name"),
+    [(native, ""), (native_project, "project_"), (compiled, "solve_")],
 )
 def test_the_job_has_the_layout_that_the_library_expects(module, name):
     size = getattr(build.library()[0], f"gsgan_{name}job_size")

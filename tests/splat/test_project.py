@@ -71,22 +71,27 @@ def test_opacity_aware_extent_is_the_box_of_the_ellipse():
     level = 2 * math.log(0.7 * 255)
     want = (level * covariance(p)[0, 0].diagonal()).sqrt()
     torch.testing.assert_close(p.extents[0, 0].double(), want, rtol=3e-3, atol=0)
-    assert (p.extents[0, 0].double() >= want).all()  # rounded up: it may not lose a pixel
+    # rounded up: it may not lose a pixel
+    assert (p.extents[0, 0].double() >= want).all()
 
 
 def test_extents_by_setting():
     gaussians = one(scale=(0.1, 0.1, 0.1), opacity=0.5)
     sigma = math.sqrt(1.5**2 + 0.3)
     sizes = {
-        n: project(gaussians, camera(), s).extents[0, 0, 0].item() for n, s in ACCURACY.items()
+        n: project(gaussians, camera(), s).extents[0, 0, 0].item()
+        for n, s in ACCURACY.items()
     }
     assert sizes["draft"] == pytest.approx(3 * sigma, rel=1e-6)
-    assert sizes["standard"] == pytest.approx(math.sqrt(2 * math.log(127.5)) * sigma, rel=3e-3)
+    assert sizes["standard"] == pytest.approx(
+        math.sqrt(2 * math.log(127.5)) * sigma, rel=3e-3
+    )
     assert math.exp(-0.5 * (sizes["exact"] / sigma) ** 2) == 0.0
 
 
 @pytest.mark.parametrize(
-    ("opacity", "visible"), [(1 / 256, False), (1 / 254, True), (0.0, False), (1.0, True)]
+    ("opacity", "visible"),
+    [(1 / 256, False), (1 / 254, True), (0.0, False), (1.0, True)],
 )
 def test_an_opacity_below_alpha_min_has_no_extent(opacity, visible):
     p = project(one((1 / 30, 1 / 30, 2.0), opacity=opacity), camera(), STANDARD)
@@ -94,7 +99,9 @@ def test_an_opacity_below_alpha_min_has_no_extent(opacity, visible):
     assert bool(p.extents.any()) is visible
 
 
-@pytest.mark.parametrize(("x", "visible"), [(0.0, True), (1.2, True), (1.8, False), (-1.8, False)])
+@pytest.mark.parametrize(
+    ("x", "visible"), [(0.0, True), (1.2, True), (1.8, False), (-1.8, False)]
+)
 def test_visible_where_the_footprint_overlaps_the_image(x, visible):
     # Half the image is 16 px at 15 px/m: 1.067 m; the footprint of 0.1 m reaches 5.1 px.
     assert project(one((x, 0.0, 2.0)), camera(), STANDARD).visible.item() is visible
@@ -102,7 +109,9 @@ def test_visible_where_the_footprint_overlaps_the_image(x, visible):
 
 def test_extents_and_visibility_have_no_gradient():
     gaussians = cloud(5)
-    p = project(replace(gaussians, means=gaussians.means.requires_grad_()), camera(), HIGH)
+    p = project(
+        replace(gaussians, means=gaussians.means.requires_grad_()), camera(), HIGH
+    )
     assert p.means.requires_grad
     assert not p.extents.requires_grad
     assert not p.visible.requires_grad

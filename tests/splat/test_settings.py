@@ -19,14 +19,19 @@ def test_every_preset_is_a_config_and_every_config_a_preset():
 
 
 def test_values_of_the_presets():
-    table = {name: (s.alpha_min, s.transmittance_min, s.extent) for name, s in ACCURACY.items()}
+    table = {
+        name: (s.alpha_min, s.transmittance_min, s.extent)
+        for name, s in ACCURACY.items()
+    }
     assert table == {
         "exact": (0, 0, "all"),
         "high": (1e-5, 1e-5, "opacity"),
         "standard": (1 / 255, 1e-4, "opacity"),
         "draft": (1 / 64, 1e-2, "sigma"),
     }
-    assert [s.torch_dtype for s in ACCURACY.values()] == [torch.float64] + [torch.float32] * 3
+    assert [s.torch_dtype for s in ACCURACY.values()] == [torch.float64] + [
+        torch.float32
+    ] * 3
     assert {s.near for s in ACCURACY.values()} == {0.01}
 
 
@@ -52,7 +57,9 @@ def test_values_out_of_range_are_refused(field, value):
 
 
 def test_unknown_names_are_refused():
-    with pytest.raises(ValueError, match="expected one of exact, high, standard, draft"):
+    with pytest.raises(
+        ValueError, match="expected one of exact, high, standard, draft"
+    ):
         accuracy("best")
     with pytest.raises(ValueError, match="backend must be one of auto"):
         resolve_backend("gpu", CPU, ACCURACY["high"])
@@ -78,7 +85,9 @@ def test_a_missing_kernel_falls_back_and_logs_once(monkeypatch, caplog):
     from gsgan.splat import native
 
     monkeypatch.setattr(native, "available", lambda: False)
-    monkeypatch.setattr(native, "why_not", lambda: "there is no compiler for test 4711.")
+    monkeypatch.setattr(
+        native, "why_not", lambda: "there is no compiler for test 4711."
+    )
     name, reason = resolve_backend("auto", CPU, ACCURACY["high"])
     assert name == "torch"
     assert reason.endswith("there is no compiler for test 4711.")
@@ -99,5 +108,7 @@ def test_output_has_the_dtype_of_the_input(name, dtype):
 def test_exact_computes_float32_inputs_in_float64():
     gaussians, cam = cloud(200, dtype=torch.float32), camera(dtype=torch.float32)
     got = rasterise(gaussians, cam, settings="exact").features
-    want = rasterise(gaussians.to(torch.float64), cam.to(torch.float64), settings="exact").features
+    want = rasterise(
+        gaussians.to(torch.float64), cam.to(torch.float64), settings="exact"
+    ).features
     assert torch.equal(got, want.float())

@@ -16,7 +16,9 @@ def sphere(n: int = 24) -> tuple[torch.Tensor, torch.Tensor]:
     z, phi = (x.ravel() for x in np.meshgrid(z, phi, indexing="ij"))
     r = np.sqrt(1 - z * z)
     weights = np.repeat(wz, 2 * n) * math.pi / n
-    return torch.tensor(np.stack([r * np.cos(phi), r * np.sin(phi), z], -1)), torch.tensor(weights)
+    return torch.tensor(
+        np.stack([r * np.cos(phi), r * np.sin(phi), z], -1)
+    ), torch.tensor(weights)
 
 
 def test_the_basis_is_orthonormal():

@@ -33,7 +33,9 @@ def spoilt(field, value, index=(0, 2)):
 )
 def test_invalid_gaussians_are_refused(field, value, expected):
     gaussians = spoilt(field, value)
-    with pytest.raises(ValueError, match=rf"Gaussians.{field} must be {expected} at item 0, Gauss"):
+    with pytest.raises(
+        ValueError, match=rf"Gaussians.{field} must be {expected} at item 0, Gauss"
+    ):
         rasterise(gaussians, camera())
 
 
@@ -65,15 +67,31 @@ def test_unused_tensors_may_have_any_values():
         ("means", (1, 5, 2), r"means must have shape \[B, N, 3\], got \[1, 5, 2\]"),
         ("quats", (2, 5, 4), r"quats must have shape \[1, 5, 4\], got \[2, 5, 4\]"),
         ("scales", (1, 5), r"scales must have shape \[1, 5, 3\], got \[1, 5\]"),
-        ("opacities", (1, 5, 1), r"opacities must have shape \[1, 5\], got \[1, 5, 1\]"),
-        ("features", (1, 4, 3), r"features must have shape \[1, 5, C\], got \[1, 4, 3\]"),
+        (
+            "opacities",
+            (1, 5, 1),
+            r"opacities must have shape \[1, 5\], got \[1, 5, 1\]",
+        ),
+        (
+            "features",
+            (1, 4, 3),
+            r"features must have shape \[1, 5, C\], got \[1, 4, 3\]",
+        ),
         ("features", (1, 5, 0), r"features must have at least one channel, got 0"),
-        ("covariances", (1, 5, 6), r"covariances must have shape \[1, 5, 3, 3\], got \[1, 5, 6\]"),
+        (
+            "covariances",
+            (1, 5, 6),
+            r"covariances must have shape \[1, 5, 3, 3\], got \[1, 5, 6\]",
+        ),
         ("K", (1, 4, 4), r"Camera: K must have shape \[B, 3, 3\], got \[1, 4, 4\]"),
         ("R", (1, 4), r"Camera: R must have shape \[B, 3, 3\], got \[1, 4\]"),
         ("dist", (1, 4), "dist must have shape"),
         ("t", (1, 3, 1), r"Camera: t must have shape \[B, 3\], got \[1, 3, 1\]"),
-        ("t", (2, 3), r"Camera: K, R, t and dist must share one batch size, got 1, 1, 2"),
+        (
+            "t",
+            (2, 3),
+            r"Camera: K, R, t and dist must share one batch size, got 1, 1, 2",
+        ),
     ],
 )
 def test_wrong_shapes_are_refused(field, shape, message):
@@ -84,7 +102,9 @@ def test_wrong_shapes_are_refused(field, shape, message):
 
 @pytest.mark.parametrize("size", [(0, 32), (24, 0), (-1, 4), (2.5, 4), (24,)])
 def test_images_without_pixels_are_refused(size):
-    with pytest.raises(ValueError, match=r"size must be \(H, W\) with both at least 1, got \("):
+    with pytest.raises(
+        ValueError, match=r"size must be \(H, W\) with both at least 1, got \("
+    ):
         replace(camera(), size=size)
 
 
@@ -96,7 +116,10 @@ def test_quats_without_scales_are_refused():
 @pytest.mark.parametrize("field", ["quats", "opacities", "K", "t"])
 @pytest.mark.parametrize(
     ("to", "what"),
-    [("meta", "device of Gaussians.means, cpu, got meta"), (torch.float32, "dtype of .*float32")],
+    [
+        ("meta", "device of Gaussians.means, cpu, got meta"),
+        (torch.float32, "dtype of .*float32"),
+    ],
 )
 def test_mixed_devices_and_dtypes_are_refused(field, to, what):
     records = {"Gaussians": cloud(5), "Camera": camera()}
@@ -109,7 +132,9 @@ def test_mixed_devices_and_dtypes_are_refused(field, to, what):
 
 def test_integer_tensors_are_refused():
     whole = {k: v.long() for k, v in vars(cloud(5)).items() if v is not None}
-    with pytest.raises(ValueError, match=r"means must be floating point, got torch.int64"):
+    with pytest.raises(
+        ValueError, match=r"means must be floating point, got torch.int64"
+    ):
         rasterise(Gaussians(**whole), camera())
 
 
@@ -125,15 +150,33 @@ def cam_with(**changes):
 @pytest.mark.parametrize(
     ("cam", "message"),
     [
-        (cam_with(K=((0, 0, 0), 0.0)), r"Camera.K of item 0 must be of fx, fy > 0, got \[\[0.0"),
-        (cam_with(K=((0, 1, 1), -3.0)), r"Camera.K of item 0 must be of fx, fy > 0, got \[\[30.0"),
-        (cam_with(K=((0, 2, 2), 2.0)), r"Camera.K of item 0 must be \[fx s cx; 0 fy cy; 0 0 1\]"),
-        (cam_with(K=((0, 1, 0), 2.0)), r"Camera.K of item 0 must be \[fx s cx; 0 fy cy; 0 0 1\]"),
-        (cam_with(R=((0, 0, 0), -1.0)), r"Camera.R of item 0 must be a rotation: it mirrors"),
+        (
+            cam_with(K=((0, 0, 0), 0.0)),
+            r"Camera.K of item 0 must be of fx, fy > 0, got \[\[0.0",
+        ),
+        (
+            cam_with(K=((0, 1, 1), -3.0)),
+            r"Camera.K of item 0 must be of fx, fy > 0, got \[\[30.0",
+        ),
+        (
+            cam_with(K=((0, 2, 2), 2.0)),
+            r"Camera.K of item 0 must be \[fx s cx; 0 fy cy; 0 0 1\]",
+        ),
+        (
+            cam_with(K=((0, 1, 0), 2.0)),
+            r"Camera.K of item 0 must be \[fx s cx; 0 fy cy; 0 0 1\]",
+        ),
+        (
+            cam_with(R=((0, 0, 0), -1.0)),
+            r"Camera.R of item 0 must be a rotation: it mirrors",
+        ),
         (cam_with(R=((0, 0, 1), 0.1)), r"Camera.R of item 0 must be a rotation"),
         (cam_with(t=((0, 0), float("nan"))), r"Camera.t of item 0 must be finite"),
         (camera(batch=2), r"camera must have the batch size of gaussians, 1, got 2"),
-        (camera(dtype=torch.float32), r"Camera.K must have the dtype of Gaussians.means"),
+        (
+            camera(dtype=torch.float32),
+            r"Camera.K must have the dtype of Gaussians.means",
+        ),
     ],
 )
 def test_bad_cameras_are_refused(cam, message):
@@ -148,7 +191,8 @@ def test_autocast_changes_nothing(backend):
     want = rasterise(plain, cam, backend=backend)
     with torch.autocast("cpu", dtype=torch.bfloat16):
         got = rasterise(cast, cam, backend=backend)
-        if backend != "reference":  # plain autograd: its backward runs in the caller's autocast
+        # plain autograd: its backward runs in the caller's autocast
+        if backend != "reference":
             got.features.sum().backward()
     if backend == "reference":
         got.features.sum().backward()

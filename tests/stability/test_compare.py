@@ -53,16 +53,46 @@ def warning(inputs, factor=1.0):
     ("run", "status", "values", "gradients", "worst", "note"),
     [
         (lambda i: {"z": i["x"].exp() * i["y"]}, "right", 0, 0, None, ""),
-        (lambda i: {"z": i["y"], "w": off(i["x"], 1.1)}, "finite only", 0.1, 0.1, "x", ""),
-        (lambda i: {"z": i["x"] * spoiled(i["y"], 1.5)}, "finite only", 0, 0.5, "y", ""),
-        (lambda i: {"z": spoiled(i["x"], math.nan)}, "not finite", 0, math.inf, "x", ""),
-        (lambda i: {"z": off(math.inf * i["x"], -1)}, "finite only", math.inf, math.nan, "x", ""),
+        (
+            lambda i: {"z": i["y"], "w": off(i["x"], 1.1)},
+            "finite only",
+            0.1,
+            0.1,
+            "x",
+            "",
+        ),
+        (
+            lambda i: {"z": i["x"] * spoiled(i["y"], 1.5)},
+            "finite only",
+            0,
+            0.5,
+            "y",
+            "",
+        ),
+        (
+            lambda i: {"z": spoiled(i["x"], math.nan)},
+            "not finite",
+            0,
+            math.inf,
+            "x",
+            "",
+        ),
+        (
+            lambda i: {"z": off(math.inf * i["x"], -1)},
+            "finite only",
+            math.inf,
+            math.nan,
+            "x",
+            "",
+        ),
         (refusing, "refused", math.nan, math.nan, "", "Message: x must be nicer"),
         (warning, "warned", 0, 0, None, "Message: x is odd"),
         (lambda i: warning(i, 1.1), "finite only", 0.1, 0.1, "x", "Message: x is odd"),
     ],
 )
-def test_status_errors_worst_input_and_message(run, status, values, gradients, worst, note):
+def test_status_errors_worst_input_and_message(
+    run, status, values, gradients, worst, note
+):
     row = compared(run)
     assert row.status == status
     assert row.value_error == pytest.approx(values, rel=1e-5, abs=1e-6, nan_ok=True)
@@ -83,7 +113,11 @@ def test_a_gradient_where_there_is_none_is_infinitely_wrong_but_for_a_floor():
         return {"z": inputs["x"] + leak * inputs["y"]}
 
     row = compared(leaky)
-    assert (row.status, row.gradient_error, row.worst_input) == ("finite only", math.inf, "y")
+    assert (row.status, row.gradient_error, row.worst_input) == (
+        "finite only",
+        math.inf,
+        "y",
+    )
     assert compared(leaky, gradient_floor={"y": 1e-6}).status == "right"
 
 

@@ -19,7 +19,9 @@ def test_the_usual_forms_float32_slope_is_wrong_on_nearly_flat_images():
 
     def off(loss):
         exact = slope(loss, torch.float64)
-        return float((slope(loss, torch.float32) - exact).abs().max() / exact.abs().max())
+        return float(
+            (slope(loss, torch.float32) - exact).abs().max() / exact.abs().max()
+        )
 
     assert off(lambda a, b: 2 * ssim_loss(a, b, 11)) > 0.05
     assert off(d_ssim) < 1e-5

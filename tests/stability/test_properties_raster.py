@@ -27,7 +27,9 @@ every_backend = pytest.mark.parametrize("backend", drawing_backends())
 
 
 @st.composite
-def scenes(draw: st.DrawFn, log_scale: tuple[float, float] = (-6, 3)) -> tuple[Inputs, Size]:
+def scenes(
+    draw: st.DrawFn, log_scale: tuple[float, float] = (-6, 3)
+) -> tuple[Inputs, Size]:
     """Gaussians in front of, beside and behind a camera anywhere, and the image's size: sizes,
     opacities, poses and cameras from one extreme to another."""
     size = draw(st.tuples(st.integers(1, 20), st.integers(1, 20)))
@@ -76,7 +78,10 @@ def test_values_and_gradients_are_finite_and_alpha_in_0_to_1(backend, drawn):
     generator = torch.Generator().manual_seed(3)
     weighted = (x * torch.randn(x.shape, generator=generator) for x in outputs.values())
     torch.stack([x.sum() for x in weighted]).sum().backward()
-    for name, value in {**outputs, **{k: leaf.grad for k, leaf in leaves.items()}}.items():
+    for name, value in {
+        **outputs,
+        **{k: leaf.grad for k, leaf in leaves.items()},
+    }.items():
         assert value.isfinite().all(), name
     assert outputs["alpha"].min() >= 0
     assert outputs["alpha"].max() <= 1
@@ -104,8 +109,12 @@ def test_values_and_gradients_are_right(backend, accuracy, drawn):
 
 
 @every_backend
-@given(scenes(), st.tuples(*[st.floats(-3, 3)] * 3), st.tuples(*[st.floats(-10, 10)] * 3))
-def test_moving_world_and_camera_together_changes_nothing(backend, drawn, axis_angle, shift):
+@given(
+    scenes(), st.tuples(*[st.floats(-3, 3)] * 3), st.tuples(*[st.floats(-10, 10)] * 3)
+)
+def test_moving_world_and_camera_together_changes_nothing(
+    backend, drawn, axis_angle, shift
+):
     scene, size = drawn
     Q, shift = rotation(axis_angle), torch.tensor(shift, dtype=torch.float64)
     M = rotations(scene["quats"]) * scene["scales"].unsqueeze(-2)
@@ -134,7 +143,10 @@ def test_the_order_of_the_list_and_an_opacity_of_0_change_nothing(backend, drawn
     n = scene["means"].shape[1]
     lists = [k for k, v in scene.items() if k not in "KRt" and v.shape[1] == n]
     kept = {**scene, "opacities": 0.5 * scene["opacities"]}
-    more = {**kept, **{k: torch.cat([kept[k].flip(1), kept[k][:, :1]], dim=1) for k in lists}}
+    more = {
+        **kept,
+        **{k: torch.cat([kept[k].flip(1), kept[k][:, :1]], dim=1) for k in lists},
+    }
     opacity = torch.zeros(1, dtype=torch.float64, requires_grad=True)
     more["opacities"] = torch.cat([more["opacities"][:, :n], opacity[None]], dim=1)
     if len(torch.unique(scene["means"], dim=1)[0]) < n:
@@ -145,7 +157,10 @@ def test_the_order_of_the_list_and_an_opacity_of_0_change_nothing(backend, drawn
         torch.testing.assert_close(got[name].detach(), value, atol=limit, rtol=0)
     got["features"].sum().backward()
     with torch.no_grad():
-        half = {**more, "opacities": more["opacities"] + 0.5 * (torch.arange(n + 1) == n)}
+        half = {
+            **more,
+            "opacities": more["opacities"] + 0.5 * (torch.arange(n + 1) == n),
+        }
         slope = 2 * (draw(half)["features"].sum() - want["features"].sum())
     limit = 1e-9 * max(1.0, float(slope.abs()))
     torch.testing.assert_close(opacity.grad[0], slope, atol=limit, rtol=0)

@@ -5,12 +5,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stability.cases.poses import DEGENERATE
-from stability.cases.psi import NAMES, composed, ordinary_residuals, small_psi, some_points
+from stability.cases.psi import (
+    NAMES,
+    composed,
+    ordinary_residuals,
+    small_psi,
+    some_points,
+)
 from stability.cases.raster import rotation
 
 FLOAT32 = torch.float32, torch.device("cpu")
 XYZ = st.tuples(*[st.floats(-3.1, 3.1)] * 3)
-VALUES = st.one_of(st.floats(-1e3, 1e3, width=32), st.sampled_from([0.0, -1.0, 1e3, -1e3]))
+VALUES = st.one_of(
+    st.floats(-1e3, 1e3, width=32), st.sampled_from([0.0, -1.0, 1e3, -1e3])
+)
 
 
 def test_a_vanishing_limb_starts_at_the_least_scale():
@@ -35,7 +43,8 @@ def test_any_residuals_make_gaussians_within_bounds_with_finite_slopes(values, s
     assert ((made["opacities"] > 0) & (made["opacities"] < 1)).all()
     low, high = (bound * psi.body_height for bound in psi.scale_range)
     sigma2 = torch.linalg.eigvalsh(made["covariances"].double() / 1e4)
-    rounding = 1e-6 * sigma2[..., -1:]  # float32 holds the least to a part of the largest
+    # float32 holds the least to a part of the largest
+    rounding = 1e-6 * sigma2[..., -1:]
     assert (sigma2 >= low**2 * 0.999 - rounding).all()
     assert (sigma2 <= high**2 * 1.001).all()
     sum(x.sum() for x in made.values()).backward()
@@ -49,7 +58,9 @@ def test_gaussians_turn_and_move_with_the_skeleton_and_the_eye(values, angles, m
     here, R = composed(inputs), rotation(angles)
     shift = torch.tensor(metres, dtype=torch.float64)
     there = composed({**inputs, **{k: inputs[k] @ R.mT + shift for k in ("p", "eye")}})
-    torch.testing.assert_close(there["means"], here["means"] @ R.mT + shift, atol=1e-9, rtol=0)
+    torch.testing.assert_close(
+        there["means"], here["means"] @ R.mT + shift, atol=1e-9, rtol=0
+    )
     expected = R @ here["covariances"] @ R.mT
     torch.testing.assert_close(there["covariances"], expected, atol=1e-6, rtol=1e-9)
     for name in ("opacities", "features"):

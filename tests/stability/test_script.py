@@ -13,9 +13,39 @@ from stability.cases.case import Row
 SCRIPT = Path(__file__).parents[2] / "scripts" / "stability.py"
 ROWS = [
     Row("needle", "scenes", "torch", 1e-6, 2e-6, "means", "right", "right", ""),
-    Row("needle", "scenes", "native", 3e-2, 6e-2, "means", "finite only", "finite only", ""),
-    Row("needle", "scenes", "reference", math.inf, math.inf, "means", "right", "right", ""),
-    Row("mirror", "scenes", "-", math.nan, math.nan, "means", "refused", "refused", "det -1"),
+    Row(
+        "needle",
+        "scenes",
+        "native",
+        3e-2,
+        6e-2,
+        "means",
+        "finite only",
+        "finite only",
+        "",
+    ),
+    Row(
+        "needle",
+        "scenes",
+        "reference",
+        math.inf,
+        math.inf,
+        "means",
+        "right",
+        "right",
+        "",
+    ),
+    Row(
+        "mirror",
+        "scenes",
+        "-",
+        math.nan,
+        math.nan,
+        "means",
+        "refused",
+        "refused",
+        "det -1",
+    ),
 ]
 
 
@@ -39,9 +69,13 @@ def test_every_row_is_in_the_table_and_every_case_on_the_page(run, tmp_path, cap
     page = tmp_path / "page.md"
     run(ROWS, "--page", str(page))
     records = json.loads((tmp_path / "stability.json").read_text())["rows"]
-    assert [r["value_error"] for r in records] == [1e-6, 3e-2, None, None]  # JSON has no NaN
+    # JSON has no NaN
+    assert [r["value_error"] for r in records] == [1e-6, 3e-2, None, None]
     for text in ((tmp_path / "stability.md").read_text(), capsys.readouterr().out):
-        assert "| needle | scenes | native | 0.030 | 0.060 | means | finite only |  |" in text
+        assert (
+            "| needle | scenes | native | 0.030 | 0.060 | means | finite only |  |"
+            in text
+        )
         assert "| needle | scenes | reference | ∞ | ∞ | means | right |  |" in text
         assert "| mirror | scenes | - | – | – | means | refused | det -1 |" in text
     text = page.read_text()
@@ -53,6 +87,8 @@ def test_every_row_is_in_the_table_and_every_case_on_the_page(run, tmp_path, cap
 
 def test_an_unexpected_status_is_written_and_ends_in_an_error(run, tmp_path):
     bad = ROWS[0]._replace(status="not finite")
-    with pytest.raises(SystemExit, match=r"1 of 5 cases .* needle \(torch\): expected right"):
+    with pytest.raises(
+        SystemExit, match=r"1 of 5 cases .* needle \(torch\): expected right"
+    ):
         run([*ROWS, bad])
     assert (tmp_path / "stability.md").is_file()

@@ -50,18 +50,24 @@ def skeletons(draw: st.DrawFn, trunk: bool = False) -> Tensor:
     """``[1, 33, 3]`` float64: noisy, with joints that coincide or bones in line; with ``trunk`` the
     trunk may collapse too, or the skeleton be one of the hard ones."""
     joints = st.sampled_from(list(range(33)) if trunk else EASY_JOINTS)
-    p = noisy(draw(st.integers(0, 2**16)), sigma=draw(st.sampled_from([0.0, 1e-4, 0.05, 0.3])))
+    p = noisy(
+        draw(st.integers(0, 2**16)), sigma=draw(st.sampled_from([0.0, 1e-4, 0.05, 0.3]))
+    )
     if trunk and draw(st.booleans()):
         p = DEGENERATE[draw(st.sampled_from(sorted(DEGENERATE)))].clone()
     for a, b in draw(st.lists(st.tuples(joints, joints), max_size=4)):
         p[:, a] = p[:, b]  # coincident
     for a, b, c in draw(st.lists(st.tuples(joints, joints, joints), max_size=2)):
-        p[:, a] = p[:, b] + draw(st.sampled_from([-1.0, 0.5, 1.0, 2.0])) * (p[:, c] - p[:, b])
+        p[:, a] = p[:, b] + draw(st.sampled_from([-1.0, 0.5, 1.0, 2.0])) * (
+            p[:, c] - p[:, b]
+        )
     return p
 
 
 def all_frames(frames: BoneFrames) -> Tensor:
-    return torch.cat([frames.hubs, frames.limbs, frames.local, frames.torso[:, None]], dim=1)
+    return torch.cat(
+        [frames.hubs, frames.limbs, frames.local, frames.torso[:, None]], dim=1
+    )
 
 
 def along(crossing: str, steps: int) -> Tensor:
@@ -85,7 +91,9 @@ def test_frames_turn_by_bounded_steps_through_a_singularity(crossing):
         assert int(over.sum()) <= jumps
 
 
-@pytest.mark.parametrize("crossing", [name for name, (_, jumps) in BOUNDS.items() if jumps])
+@pytest.mark.parametrize(
+    "crossing", [name for name, (_, jumps) in BOUNDS.items() if jumps]
+)
 def test_forced_jumps_are_there_and_keep_the_bones_directions(crossing):
     """What the note says: some frame jumps, by at most half a turn, and no bone leaves its line."""
     largest = float(turns(crossing, 4000).max())
@@ -103,7 +111,9 @@ def test_a_fold_jumps_on_a_hair_only():
     over = (turns("a forearm through its fold", 4000) > 1).nonzero().flatten()
     angle = 0.1 * (2 * over / 3999 - 1).abs()
     assert len(over) == 2
-    torch.testing.assert_close(angle, torch.full_like(angle, 0.01414), atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        angle, torch.full_like(angle, 0.01414), atol=1e-4, rtol=0
+    )
 
 
 @given(skeletons(trunk=True))

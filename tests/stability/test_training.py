@@ -24,7 +24,9 @@ def make(tiny, tmp_path):
 
     def run(phases: tuple[int, int, int], *overrides: str):
         names = ("segmentation", "step_one", "step_two")
-        schedule = [f"training.schedule.{k}={n}" for k, n in zip(names, phases, strict=True)]
+        schedule = [
+            f"training.schedule.{k}={n}" for k, n in zip(names, phases, strict=True)
+        ]
         always = ("training.schedule.discriminator_start=0", "size.rgb_skip=false")
         data, module = build_training(tiny(*schedule, *always, *overrides))
         trainer = quiet_trainer(tmp_path, max_epochs=1)
@@ -69,7 +71,9 @@ PARTS = {
 }
 
 
-def poison(module: AvatarTraining, name: str, steps: set[int], value: float) -> torch.Tensor:
+def poison(
+    module: AvatarTraining, name: str, steps: set[int], value: float
+) -> torch.Tensor:
     """Makes one number of a parameter's gradient ``value`` at these iterations; the parameter."""
     parameter = dict(module.named_parameters())[name]
 
@@ -84,7 +88,8 @@ def poison(module: AvatarTraining, name: str, steps: set[int], value: float) -> 
 
 
 @pytest.mark.parametrize(
-    ("part", "value"), [(part, math.inf if part == "psi" else math.nan) for part in PARTS]
+    ("part", "value"),
+    [(part, math.inf if part == "psi" else math.nan) for part in PARTS],
 )
 def test_a_gradient_that_is_not_finite_skips_its_step_and_is_counted(make, part, value):
     """The second of three iterations is spoiled: the part rests there, and learns after it."""

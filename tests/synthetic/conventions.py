@@ -53,7 +53,10 @@ def write_bvh(
     B = np.eye(3) if axes is None else axes
     Z = zero(character, B) if zero else np.tile(B.T, (len(character.bones), 1, 1))
     bones = [*roots, *character.bones]
-    parents = [*range(-1, len(roots) - 1), *(int(p) + len(roots) for p in character.parents)]
+    parents = [
+        *range(-1, len(roots) - 1),
+        *(int(p) + len(roots) for p in character.parents),
+    ]
     frames = len(motion.joints)
     extra = np.broadcast_to(np.eye(3), (frames, len(roots), 3, 3))
     world = np.concatenate([extra, B @ motion.rotations @ Z], axis=1)
@@ -81,12 +84,21 @@ def write_bvh(
             write(k, depth + 1)
         if not children and ends:
             lines.extend(
-                [pad + "\tEnd Site", pad + "\t{", pad + "\t\tOFFSET 0 0 0.01", pad + "\t}"]
+                [
+                    pad + "\tEnd Site",
+                    pad + "\t{",
+                    pad + "\t\tOFFSET 0 0 0.01",
+                    pad + "\t}",
+                ]
             )
         elif not children:
             columns.append((None, False))
-            lines.extend([f"{pad}\tJOINT {label}_tip", pad + "\t{", pad + "\t\tOFFSET 0 0 0.01"])
-            lines.extend([pad + "\t\tCHANNELS 3 Zrotation Xrotation Yrotation", pad + "\t}"])
+            lines.extend(
+                [f"{pad}\tJOINT {label}_tip", pad + "\t{", pad + "\t\tOFFSET 0 0 0.01"]
+            )
+            lines.extend(
+                [pad + "\t\tCHANNELS 3 Zrotation Xrotation Yrotation", pad + "\t}"]
+            )
         lines.append(pad + "}")
 
     write(0, 0)
@@ -155,25 +167,37 @@ def recorded(path: Path, every: int) -> tuple[Bones, Animation]:
 # -- zero poses: `zero` of `write_bvh`
 
 
-def turned(character: Character, axes: np.ndarray, turns: dict[str, np.ndarray]) -> np.ndarray:
+def turned(
+    character: Character, axes: np.ndarray, turns: dict[str, np.ndarray]
+) -> np.ndarray:
     """The zero pose with bones turned by ``[3, 3]`` from the rest pose, and all below them."""
     A = np.tile(np.eye(3), (len(character.bones), 1, 1))
-    for j, (bone, parent) in enumerate(zip(character.bones, character.parents, strict=True)):
+    for j, (bone, parent) in enumerate(
+        zip(character.bones, character.parents, strict=True)
+    ):
         A[j] = turns.get(bone, np.eye(3)) @ (A[parent] if parent >= 0 else np.eye(3))
     return np.swapaxes(A, 1, 2) @ axes.T
 
 
 def lowered(character: Character, axes: np.ndarray, degrees: float) -> np.ndarray:
     """The arms ``degrees`` below the horizontal."""
-    turn = {"Left": np.radians([0.0, degrees, 0]), "Right": np.radians([0.0, -degrees, 0])}
+    turn = {
+        "Left": np.radians([0.0, degrees, 0]),
+        "Right": np.radians([0.0, -degrees, 0]),
+    }
     return turned(character, axes, {f"{s}Arm": rotation(x) for s, x in turn.items()})
 
 
 def seated(character: Character, axes: np.ndarray) -> np.ndarray:
     """Thighs forward, shins down: a zero pose that does not stand."""
-    forward, back = rotation(np.radians([-90.0, 0, 0])), rotation(np.radians([90.0, 0, 0]))
+    forward, back = (
+        rotation(np.radians([-90.0, 0, 0])),
+        rotation(np.radians([90.0, 0, 0])),
+    )
     turns = {f"{side}UpLeg": forward for side in ("Left", "Right")}
-    return turned(character, axes, turns | {f"{side}Leg": back for side in ("Left", "Right")})
+    return turned(
+        character, axes, turns | {f"{side}Leg": back for side in ("Left", "Right")}
+    )
 
 
 def along(character: Character, axis: int) -> np.ndarray:
@@ -240,7 +264,10 @@ NAMES = {
     ),
     "vrm": _named(
         "UpperLeg LowerLeg Foot ToeBase Shoulder UpperArm LowerArm Hand",
-        {k: f"J_Bip_C_{v}" for k, v in _trunk("Hips Spine Chest UpperChest Neck Head").items()},
+        {
+            k: f"J_Bip_C_{v}"
+            for k, v in _trunk("Hips Spine Chest UpperChest Neck Head").items()
+        },
         lambda side, part: f"J_Bip_{side[0]}_{part}",
     ),
     "unreal": _named(
@@ -263,21 +290,34 @@ def convention(names: str = "mixamo", **options: Any) -> dict[str, Any]:
 
 CONVENTIONS = {
     "t_pose": convention(),
-    "a_pose_inches": convention("cmu", scale=39.37, zero=lambda c, a: lowered(c, a, 45)),
+    "a_pose_inches": convention(
+        "cmu", scale=39.37, zero=lambda c, a: lowered(c, a, 45)
+    ),
     "n_pose_metres": convention(
-        "unreal", axes=np.eye(3), scale=1.0, order="XYZ", zero=lambda c, a: lowered(c, a, 85)
+        "unreal",
+        axes=np.eye(3),
+        scale=1.0,
+        order="XYZ",
+        zero=lambda c, a: lowered(c, a, 85),
     ),
     "bones_along_x": convention(
-        "bandai_namco", zero=lambda c, a: along(c, 0), everywhere=True, roots=("joint_Root",)
+        "bandai_namco",
+        zero=lambda c, a: along(c, 0),
+        everywhere=True,
+        roots=("joint_Root",),
     ),
     "bones_along_y": convention(
         "blender", axes=np.eye(3), scale=1.0, order="YZX", zero=lambda c, a: along(c, 1)
     ),
     "joint_orients": convention("rokoko", order="XZY", zero=lambda c, a: random(c)),
-    "x_forward": convention("vrm", axes=X_FORWARD, scale=1.0, order="YXZ", everywhere=True),
+    "x_forward": convention(
+        "vrm", axes=X_FORWARD, scale=1.0, order="YXZ", everywhere=True
+    ),
     "turned_by_the_root": convention(
         "xsens", order="ZYX", zero=lambda c, a: turned(c, np.eye(3), {})
     ),
     "seated": convention("prefixed", zero=seated, everywhere=True),
-    "extra_roots_and_ends": convention("unreal", roots=("World", "Armature"), ends=False),
+    "extra_roots_and_ends": convention(
+        "unreal", roots=("World", "Armature"), ends=False
+    ),
 }

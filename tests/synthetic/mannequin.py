@@ -32,7 +32,10 @@ for finger, y in ROWS.items():
     for k in range(1, 5):
         x = 0.69 + 0.02 * k if finger == "Thumb" else 0.73 + 0.03 * k
         above = "Hand" if k == 1 else f"Hand{finger}{k - 1}"
-        LIMBS[f"Hand{finger}{k}"] = (above, (x, y - 0.01 * k * (finger == "Thumb"), 1.405))
+        LIMBS[f"Hand{finger}{k}"] = (
+            above,
+            (x, y - 0.01 * k * (finger == "Thumb"), 1.405),
+        )
 SHAPES = ("blink_left", "blink_right", "mouth_open", "smile_left", "brow_up_left")
 
 
@@ -106,14 +109,25 @@ def inside(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.nd
 def local(person: Character, motion: Animation, name: str) -> np.ndarray:
     """Rotations ``[F, 3, 3]`` of a bone against its parent, from the T pose."""
     j = person.bones.index(name)
-    return np.swapaxes(motion.rotations[:, person.parents[j]], -1, -2) @ motion.rotations[:, j]
+    return (
+        np.swapaxes(motion.rotations[:, person.parents[j]], -1, -2)
+        @ motion.rotations[:, j]
+    )
 
 
-def assert_limits(person: Character, motion: Animation, limits: dict, twisted: float) -> None:
+def assert_limits(
+    person: Character, motion: Animation, limits: dict, twisted: float
+) -> None:
     """Bones rotate at most so many degrees; forearms and hands, which wring skin, twist less."""
     for bone, limit in limits.items():
-        for name in (bone,) if bone in person.bones else ("Left" + bone, "Right" + bone):
-            angle = np.degrees(np.linalg.norm(axis_angle(local(person, motion, name)), axis=-1))
+        for name in (
+            (bone,) if bone in person.bones else ("Left" + bone, "Right" + bone)
+        ):
+            angle = np.degrees(
+                np.linalg.norm(axis_angle(local(person, motion, name)), axis=-1)
+            )
             assert angle.max() <= limit, (name, motion.passages[angle.argmax()])
     for name in ("LeftForeArm", "LeftHand", "RightForeArm", "RightHand"):
-        assert np.abs(np.degrees(twist(local(person, motion, name), 0))).max() < twisted, name
+        assert (
+            np.abs(np.degrees(twist(local(person, motion, name), 0))).max() < twisted
+        ), name

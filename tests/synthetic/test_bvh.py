@@ -40,7 +40,9 @@ def signing(person):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory, person, signing):
     """The text of a file without damage."""
-    return write_bvh(tmp_path_factory.mktemp("bvh") / "a.bvh", person, signing, STEP).read_text()
+    return write_bvh(
+        tmp_path_factory.mktemp("bvh") / "a.bvh", person, signing, STEP
+    ).read_text()
 
 
 def travelling(person, metres: float) -> Animation:
@@ -72,9 +74,18 @@ def makehuman(bone: str) -> str:
     ],
     ids=["mixamo", "y_up_cm", "makehuman"],
 )
-def test_a_written_motion_is_read_back(tmp_path, person, signing, name, axes, scale, order):
+def test_a_written_motion_is_read_back(
+    tmp_path, person, signing, name, axes, scale, order
+):
     path = write_bvh(
-        tmp_path / "a.bvh", person, signing, STEP, name=name, axes=axes, scale=scale, order=order
+        tmp_path / "a.bvh",
+        person,
+        signing,
+        STEP,
+        name=name,
+        axes=axes,
+        scale=scale,
+        order=order,
     )
     motion = RecordedMotion(person, path)
     assert motion.duration == pytest.approx(60 * STEP)
@@ -97,31 +108,45 @@ def test_every_style_of_names_is_known():
                 stem = names.split()[style]
                 written = {
                     0: f"{stem}_{letter}",
-                    1: letter.lower() + stem[1:] if stem[0] == "L" else f"{letter}{stem}",
+                    1: letter.lower() + stem[1:]
+                    if stem[0] == "L"
+                    else f"{letter}{stem}",
                     2: f"J_Bip_{letter}_{stem.title()}",
                     3: f"{stem}_{letter.lower()}",
                     4: f"{side.lower()}_{stem}",
                 }[style]
                 assert known_joints((written,)) == {side + bone: 0}, written
-    assert known_joints(("hip", "Head", "LHipJoint", "__UpLeg_L")) == {"Hips": 0, "Head": 1}
+    assert known_joints(("hip", "Head", "LHipJoint", "__UpLeg_L")) == {
+        "Hips": 0,
+        "Head": 1,
+    }
     assert known_joints(("LeftShoulder", "LeftArm")) == {"LeftArm": 1}
-    assert known_joints(("index_02_l", "LThumb")) == {"LeftHandIndex2": 0, "LeftHandThumb1": 1}
+    assert known_joints(("index_02_l", "LThumb")) == {
+        "LeftHandIndex2": 0,
+        "LeftHandThumb1": 1,
+    }
 
 
 def test_other_proportions_and_missing_bones(tmp_path, person, signing):
     path = write_bvh(tmp_path / "a.bvh", person, signing, STEP)
     plain = mannequin(
-        lambda bone: ("Hand" in bone[5:] and len(bone) > 9) or bone in ("Neck", "Spine2")
+        lambda bone: (
+            ("Hand" in bone[5:] and len(bone) > 9) or bone in ("Neck", "Spine2")
+        )
     )
     motion = RecordedMotion(plain, path).at(np.array([0.5]))
     assert motion.rotations.shape == (1, len(plain.bones), 3, 3)
-    few = write_bvh(tmp_path / "b.bvh", plain, Choreography(plain).at(np.array([22.0])), STEP)
+    few = write_bvh(
+        tmp_path / "b.bvh", plain, Choreography(plain).at(np.array([22.0])), STEP
+    )
     read = RecordedMotion(person, few).at(np.array([0.0, 1.0]))  # a single frame stays
     np.testing.assert_array_equal(read.joints[0], read.joints[1])
 
 
 def test_any_times_are_interpolated_and_named(tmp_path, person, signing):
-    motion = RecordedMotion(person, write_bvh(tmp_path / "clip.bvh", person, signing, STEP))
+    motion = RecordedMotion(
+        person, write_bvh(tmp_path / "clip.bvh", person, signing, STEP)
+    )
     near = motion.at(np.array([10.5 * STEP]))
     apart = angles(*motion.at(np.array([10, 11]) * STEP).rotations)
     half = angles(motion.at(np.array([10 * STEP])).rotations, near.rotations)[0]
@@ -168,7 +193,14 @@ def two_people(text: str) -> str:
     tree, motion = text.removeprefix("HIERARCHY").split("MOTION")
     *head, step = motion.strip().splitlines()[:2]
     rows = motion.strip().splitlines()[2:]
-    lines = ["HIERARCHY", tree, tree.replace("ROOT Hips", "ROOT Hips2"), "MOTION", *head, step]
+    lines = [
+        "HIERARCHY",
+        tree,
+        tree.replace("ROOT Hips", "ROOT Hips2"),
+        "MOTION",
+        *head,
+        step,
+    ]
     return "\n".join([*lines, *(f"{row} {row}" for row in rows)])
 
 
@@ -178,11 +210,23 @@ def two_people(text: str) -> str:
         (lambda text: text[: len(text) // 2], "numbers found"),
         (lambda text: text[:300], "HIERARCHY and MOTION"),
         (lambda text: text.replace("Frames: 60", "Frames: 61"), "61 frames"),
-        (lambda text: text.replace("Frame Time: 0.0", "Frame Time: nan 0.0"), "numbers found"),
-        (lambda text: text[:-30] + " nan" + text[-20:], "numbers found|not finite|could not"),
+        (
+            lambda text: text.replace("Frame Time: 0.0", "Frame Time: nan 0.0"),
+            "numbers found",
+        ),
+        (
+            lambda text: text[:-30] + " nan" + text[-20:],
+            "numbers found|not finite|could not",
+        ),
         (lambda text: text.replace("OFFSET 0.00000000", "OFFSET nan", 1), "not finite"),
-        (lambda text: text.replace("CHANNELS 3", "CHANNELS 99", 1), "is not a complete BVH file"),
-        (lambda text: text.replace("Zrotation", "Wrotation", 1), "is not a complete BVH file"),
+        (
+            lambda text: text.replace("CHANNELS 3", "CHANNELS 99", 1),
+            "is not a complete BVH file",
+        ),
+        (
+            lambda text: text.replace("Zrotation", "Wrotation", 1),
+            "is not a complete BVH file",
+        ),
         (lambda text: "", "HIERARCHY"),
         (lambda text: text.replace("ROOT", "JOINT", 1), "JOINT Hips is out of place"),
         (two_people, "more than one person"),

@@ -58,7 +58,9 @@ def test_landmarks_agree_and_the_subject_moves_alike(
     p, expected = (read_motion(file, source).p for file in (path, as_t_pose))
     assert np.abs(p - expected).max() < 1e-3
     times = np.arange(len(acted.joints)) * STEP
-    read, expected = (RecordedMotion(person, file).at(times) for file in (path, as_t_pose))
+    read, expected = (
+        RecordedMotion(person, file).at(times) for file in (path, as_t_pose)
+    )
     away = np.linalg.norm(axis_angle(expected.rotations.mT @ read.rotations), axis=-1)
     assert np.degrees(away).max() < 2.5  # arms lowered by 85 degrees: 2.0, of twist
     assert np.abs(read.joints - expected.joints).max() < 1e-3
@@ -67,7 +69,10 @@ def test_landmarks_agree_and_the_subject_moves_alike(
 @pytest.mark.skipif(not CMU.is_dir(), reason="no motion files here")
 @pytest.mark.parametrize(
     "clip",  # running, climbing, uneven ground
-    ["02_03", *(pytest.param(clip, marks=pytest.mark.slow) for clip in ("01_14", "03_01"))],
+    [
+        "02_03",
+        *(pytest.param(clip, marks=pytest.mark.slow) for clip in ("01_14", "03_01")),
+    ],
 )
 def test_recorded_motions_agree(tmp_path, source, clip):
     """Joints of the limbs do, whatever is known of the zero pose; other landmarks are near."""
@@ -87,7 +92,9 @@ def test_one_frame_of_a_run(tmp_path, source):
     rig, motion = recorded(CMU / "02_03.amc", 12)
     one = Animation(motion.rotations[:1], motion.joints[:1], {}, ())
     p, expected = (
-        read_motion(write_bvh(tmp_path / "a.bvh", rig, one, 0.1, **CONVENTIONS[name]), source).p
+        read_motion(
+            write_bvh(tmp_path / "a.bvh", rig, one, 0.1, **CONVENTIONS[name]), source
+        ).p
         for name in ("bones_along_x", "t_pose")
     )
     away = np.linalg.norm(p - expected, axis=-1)
@@ -111,13 +118,18 @@ def draw(person, acted, tmp_path_factory):
     appearance = Appearance(character)
 
     def images(name: str) -> np.ndarray:
-        path = write_bvh(folder / f"{name}.bvh", person, acted, STEP, **CONVENTIONS[name])
+        path = write_bvh(
+            folder / f"{name}.bvh", person, acted, STEP, **CONVENTIONS[name]
+        )
         poses = RecordedMotion(character, path).at(np.array([20.0, 50.0]) * STEP)
         pairs = zip(poses.rotations, poses.joints, strict=True)
         skinned = [character.skinned(*pose) for pose in pairs]
         view = from_front(64, focal=80, height=0.9)
         return np.stack(
-            [PosedCharacter(appearance, *s, Light()).render(view, 2)[0] for s in skinned]
+            [
+                PosedCharacter(appearance, *s, Light()).render(view, 2)[0]
+                for s in skinned
+            ]
         )
 
     return images

@@ -13,7 +13,14 @@ from gsgan.synthetic.posing import Choreography
 from gsgan.synthetic.scene_setup import SceneSettings, extent, load_character, ring
 
 # Degrees since a T pose; a squat's hip and a kneeling foot are near what people can do.
-LIMITS = {"Spine": 25, "Spine1": 25, "Spine2": 25, "Neck": 30, "Head": 30, "Shoulder": 30}
+LIMITS = {
+    "Spine": 25,
+    "Spine1": 25,
+    "Spine2": 25,
+    "Neck": 30,
+    "Head": 30,
+    "Shoulder": 30,
+}
 LIMITS |= {"Arm": 125, "ForeArm": 150, "Hand": 95, "UpLeg": 140, "Leg": 150, "Foot": 65}
 LIMITS |= {"ToeBase": 60}
 
@@ -35,7 +42,8 @@ def test_joints_stay_within_their_limits(seed):
     moves = Choreography(person, seed, FAR).at(frame_times(420, FAR.duration))
     assert_limits(person, moves, LIMITS, twisted=60)
     for side in SIDES:
-        assert axis_angle(local(person, moves, side + "Leg"))[:, 0].min() > 0.1  # forwards
+        # forwards
+        assert axis_angle(local(person, moves, side + "Leg"))[:, 0].min() > 0.1
 
 
 def test_the_person_is_on_the_floor_and_not_in_it(polo, moves):
@@ -51,7 +59,9 @@ def test_hands_and_knees_rest_where_the_key_poses_place_them(polo, moves):
     begin = FAR.ends[-2]
     still = np.abs(times - begin - 0.25 * (FAR.ends[-1] - begin)).argmin()
     assert motion.passages[still] == "crawl"
-    height = {bone: motion.joints[still, polo.bones.index(bone), 2] for bone in polo.bones}
+    height = {
+        bone: motion.joints[still, polo.bones.index(bone), 2] for bone in polo.bones
+    }
     for side in SIDES:
         assert height[side + "Hand"] == pytest.approx(0.08, abs=0.02)
         assert height[side + "Leg"] < 0.12

@@ -35,7 +35,9 @@ def tiny(tmp_path_factory):
 def original():
     """The file that the avatar "polo" was baked from."""
     source = VALID / "White_M_1_Casual.glb"
-    return source if source.is_file() else pytest.skip(f"no original avatar at {source}")
+    return (
+        source if source.is_file() else pytest.skip(f"no original avatar at {source}")
+    )
 
 
 @pytest.fixture(scope="module", params=AVATARS)
@@ -60,7 +62,8 @@ def test_geometry_is_metric_upright_and_faces_minus_y(tiny):
     assert tiny.parents[0] == -1
     assert (tiny.parents < np.arange(len(tiny.bones))).all()
     np.testing.assert_allclose(tiny.bone_weight.sum(1), 1)
-    np.testing.assert_allclose(np.linalg.norm(tiny.normals, axis=1), 1)  # made: the file has none
+    # made: the file has none
+    np.testing.assert_allclose(np.linalg.norm(tiny.normals, axis=1), 1)
 
 
 def test_a_sparse_morph_moves_only_its_vertices(tiny):
@@ -101,7 +104,9 @@ def test_quantised_positions_are_those_of_floats(tmp_path, tiny):
     bind = np.tile(np.eye(4), (len(BONES), 1, 1))
     bind[:, :3, :3] *= 2
     bind[:, 3, :3] = [-np.array(at) for _, at in BONES.values()]
-    glb.doc.skins[0].inverseBindMatrices = glb.accessor(bind.reshape(-1, 16).astype("f4"), "MAT4")
+    glb.doc.skins[0].inverseBindMatrices = glb.accessor(
+        bind.reshape(-1, 16).astype("f4"), "MAT4"
+    )
     other = read_character(glb.write(tmp_path / "a.glb"))
     np.testing.assert_allclose(other.vertices, tiny.vertices, atol=1e-4)
 
@@ -120,7 +125,9 @@ def test_the_four_largest_of_eight_weights_are_kept(tmp_path):
     character = read_character(glb.write(tmp_path / "a.glb"))
     kept = {character.bones[k] for k in character.bone_index[0]}
     assert kept == {list(BONES)[k] for k in (1, 3, 5, 7)}
-    np.testing.assert_allclose(character.bone_weight[0], np.array([0.35, 0.3, 0.2, 0.1]) / 0.95)
+    np.testing.assert_allclose(
+        character.bone_weight[0], np.array([0.35, 0.3, 0.2, 0.1]) / 0.95
+    )
 
 
 def test_textures_factors_and_coverage(tmp_path):
@@ -135,7 +142,8 @@ def test_textures_factors_and_coverage(tmp_path):
     material.pbrMetallicRoughness.baseColorFactor = [0.5, 1, 1, 0.5]
     masked = read_character(glb.write(tmp_path / "masked.glb")).surfaces[0]
     assert masked.cutoff == 0.3
-    np.testing.assert_allclose(masked.colour[0, 0], [132, 180, 180, 50], atol=1)  # linear halved
+    # linear halved
+    np.testing.assert_allclose(masked.colour[0, 0], [132, 180, 180, 50], atol=1)
 
 
 @pytest.mark.parametrize("version", [0, 1])
@@ -151,7 +159,9 @@ def test_vrm_maps_bones(tmp_path, version, tiny):
         glb.doc.extensions["VRMC_vrm"] = {"humanoid": {"humanBones": named}}
     character = read_character(glb.write(tmp_path / "a.glb"))
     assert set(character.bones) == set(BONES)
-    np.testing.assert_allclose(character.shapes["mouth_open"], tiny.shapes["mouth_open"])
+    np.testing.assert_allclose(
+        character.shapes["mouth_open"], tiny.shapes["mouth_open"]
+    )
 
 
 @pytest.mark.parametrize(("name", "bone"), [
@@ -187,7 +197,10 @@ def test_names_of_materials_decide_labels(tmp_path):
     glb = TinyGlb()
     glb.doc.materials[0].name = "Wolf3D_Outfit_Footwear"
     character = read_character(glb.write(tmp_path / "a.glb"))
-    assert set(np.array(character.label_names)[character.labels]) == {"left_shoe", "right_shoe"}
+    assert set(np.array(character.label_names)[character.labels]) == {
+        "left_shoe",
+        "right_shoe",
+    }
 
 
 def no_skin(glb: TinyGlb) -> None:
@@ -207,10 +220,16 @@ def a_nan(glb: TinyGlb) -> None:
 LEFT_HAND = list(BONES).index("LeftHand")
 BAD = {
     "no skin": no_skin,
-    "do not include LeftHand": lambda glb: setattr(glb.doc.nodes[LEFT_HAND], "name", "Paw"),
+    "do not include LeftHand": lambda glb: setattr(
+        glb.doc.nodes[LEFT_HAND], "name", "Paw"
+    ),
     "no triangles": lambda glb: setattr(glb.doc.meshes[0].primitives[0], "mode", 1),
-    "separate file": lambda glb: glb.doc.images.__setitem__(0, pygltflib.Image(uri="skin.png")),
-    "draco": lambda glb: glb.doc.extensionsRequired.append("KHR_draco_mesh_compression"),
+    "separate file": lambda glb: glb.doc.images.__setitem__(
+        0, pygltflib.Image(uri="skin.png")
+    ),
+    "draco": lambda glb: glb.doc.extensionsRequired.append(
+        "KHR_draco_mesh_compression"
+    ),
     "a face names a vertex": a_face_too_many,
     "not numbers": a_nan,
     "circle": lambda glb: setattr(glb.doc.nodes[3], "children", [0]),
@@ -248,7 +267,11 @@ def test_avatars_are_whole(avatar):
     assert 1.6 < np.ptp(avatar.vertices[:, 2]) < 1.9
     assert (avatar.labels >= 1).all()
     parts = set(np.array(avatar.label_names)[avatar.labels])
-    assert parts >= set(avatar.label_names[1:5]) | {"left_arm", "right_hand", "left_shoe"}
+    assert parts >= set(avatar.label_names[1:5]) | {
+        "left_arm",
+        "right_hand",
+        "left_shoe",
+    }
     assert avatar.surfaces[0].normal is not None
     shapes = {"mouth_open", *(f"{k}_{s}" for k in ("smile", "blink", "brow_up", "brow_down")
                               for s in ("left", "right"))}  # fmt: skip
@@ -273,7 +296,8 @@ def test_face_landmarks_of_avatars_lie_on_the_face(avatar):
         assert np.linalg.norm((seen - eye)[[0, 2]]) < 0.006
         assert seen[1] < eye[1]
         lids = {
-            k: landmark(avatar, f"{side}_lid_{k}") for k in ("upper", "lower", "inner", "outer")
+            k: landmark(avatar, f"{side}_lid_{k}")
+            for k in ("upper", "lower", "inner", "outer")
         }
         assert 0.004 < lids["upper"][2] - lids["lower"][2] < 0.02
         assert 0.02 < abs(lids["outer"][0] - lids["inner"][0]) < 0.04

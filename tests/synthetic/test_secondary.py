@@ -17,11 +17,16 @@ TIMES = np.linspace(0, 4, 25)
 def leg(label=2):
     """A trouser leg down to z = 0.05 that hangs on a chain of bones; rows 2.5 cm apart."""
     heights, around = np.linspace(0.98, 0.05, 38), np.arange(16) * 2 * np.pi / 16
-    z, angle = (x.ravel() for x in np.meshgrid(heights, np.append(around, 0), indexing="ij"))
+    z, angle = (
+        x.ravel() for x in np.meshgrid(heights, np.append(around, 0), indexing="ij")
+    )
     v = np.stack([0.08 * np.cos(angle), 0.08 * np.sin(angle), z], axis=1)
     i, j = (x.ravel() for x in np.meshgrid(np.arange(37), np.arange(16), indexing="ij"))
-    a, b = 17 * i + j, 17 * i + j + 1  # the last column is the first again, as at a uv seam
-    faces = np.concatenate([np.stack([a, a + 17, b], 1), np.stack([b, a + 17, b + 17], 1)])
+    # the last column is the first again, as at a uv seam
+    a, b = 17 * i + j, 17 * i + j + 1
+    faces = np.concatenate(
+        [np.stack([a, a + 17, b], 1), np.stack([b, a + 17, b + 17], 1)]
+    )
     c = character([(v, faces, np.zeros((len(v), 2)))], bones=BONES, joints=JOINTS)
     below = np.clip((0.53 - z) / 0.06, 0, 1)
     index, weight = np.zeros((len(v), 4), int), np.zeros((len(v), 4))
@@ -49,14 +54,18 @@ class Swing:
         F, turn = len(times), 2 * np.pi * np.asarray(times)
         R = np.tile(np.eye(3), (F, len(BONES), 1, 1))
         angle = self.bend * (1 + np.sin(turn))
-        R[:, 2:] = Rotation.from_rotvec(angle[:, None] * [1.0, 0, 0]).as_matrix()[:, None]
+        R[:, 2:] = Rotation.from_rotvec(angle[:, None] * [1.0, 0, 0]).as_matrix()[
+            :, None
+        ]
         joints = np.zeros((F, len(BONES), 3))
         joints[:, 0] = JOINTS[0]
         joints[:, 0, 1] += self.reach * np.sin(turn) + self.drift * times
         rest = np.array(JOINTS)
         for child in range(1, len(BONES)):
             up = R[:, child - 1]
-            joints[:, child] = joints[:, child - 1] + up @ (rest[child] - rest[child - 1])
+            joints[:, child] = joints[:, child - 1] + up @ (
+                rest[child] - rest[child - 1]
+            )
         return Animation(R, joints, {}, ("swing",) * F)
 
 
@@ -70,7 +79,9 @@ def frame(c, secondary, motion, time):
 def test_hems_sway_and_the_waist_does_not():
     c, motion = leg(), Swing(reach=0.15)
     secondary = Secondary(c, motion)
-    offset = np.array([y - x for x, _, y, _, _ in (frame(c, secondary, motion, t) for t in TIMES)])
+    offset = np.array(
+        [y - x for x, _, y, _, _ in (frame(c, secondary, motion, t) for t in TIMES)]
+    )
     size = np.linalg.norm(offset, axis=-1)
     z = c.vertices[:, 2]
     assert size[:, z > 0.85].max() < 1e-3
@@ -88,7 +99,8 @@ def test_steady_motion_does_not_sway():
         x, _, y, _, _ = frame(c, moving, Swing(drift=1.0), t)
         rest, _, at_rest, _, _ = frame(c, still, Swing(), t)
         np.testing.assert_allclose(y - x, at_rest - rest, atol=1e-5)
-        assert np.abs(y - x).max() < 1e-5  # a vertical leg does not hang off its bone either
+        # a vertical leg does not hang off its bone either
+        assert np.abs(y - x).max() < 1e-5
 
 
 def test_a_moment_does_not_depend_on_what_else_is_asked():
@@ -140,7 +152,9 @@ def test_wrinkles_deepen_as_a_joint_bends():
     # the shank moves towards +y as the leg turns about +x: folds are deepest behind the knee
     knee = np.abs(z - 0.5) < 0.05
     y = c.vertices[:, 1]
-    assert slopes[2][knee & (y > 0.05)].mean() > 1.3 * slopes[2][knee & (y < -0.05)].mean()
+    assert (
+        slopes[2][knee & (y > 0.05)].mean() > 1.3 * slopes[2][knee & (y < -0.05)].mean()
+    )
 
 
 def test_skin_neither_sways_nor_wrinkles():

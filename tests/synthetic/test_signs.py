@@ -50,7 +50,9 @@ def test_signs_are_short_and_some_are_held_out_whole():
     assert len(seconds) == 12
     assert all(1.5 <= duration <= 2.5 for duration in seconds.values())
     assert set(HELD_OUT) < set(seconds)
-    moves = Choreography(mannequin(), programme=SIGNS).at(frame_times(120, SIGNS.duration))
+    moves = Choreography(mannequin(), programme=SIGNS).at(
+        frame_times(120, SIGNS.duration)
+    )
     names = moves.passages
     train, test = split_signs(names, 30)
     assert len(test) == 30
@@ -60,7 +62,9 @@ def test_signs_are_short_and_some_are_held_out_whole():
     assert few_train == train  # the other frames of unseen signs do not train either
     assert set(few) < set(test)
     assert split_signs(names, 0) == (list(range(120)), [])
-    with pytest.raises(ConfigError, match=r"roof, cancel, peek, which have 30 of 120 frames"):
+    with pytest.raises(
+        ConfigError, match=r"roof, cancel, peek, which have 30 of 120 frames"
+    ):
         split_signs(names, 31)
 
 
@@ -77,7 +81,13 @@ def test_motion_is_smooth(polo):
     assert all((w >= 0).all() and (w <= 1).all() for w in moves.shapes.values())
     feet = [polo.bones.index(f"{side}ToeBase") for side in SIDES]
     assert np.ptp(moves.joints[:, feet], axis=0).max() < 1e-3  # the person stands still
-    for shape in ("mouth_open", "mouth_round", "mouth_wide", "smile_left", "brow_up_left"):
+    for shape in (
+        "mouth_open",
+        "mouth_round",
+        "mouth_wide",
+        "smile_left",
+        "brow_up_left",
+    ):
         assert moves.shapes[shape].max() > 0.5
 
 
@@ -110,7 +120,9 @@ def test_a_scene_of_signs_is_split_by_sign_before_frontal_cameras():
     assert not set(names[scene.train_frames]) & set(HELD_OUT)
     centres = np.array([view.centre for view in scene.views.values()])
     vertices = scene.mesh(5)[0]
-    around = np.degrees(np.arctan2(*(centres[:, :2] - vertices[:, :2].mean(0)).T * [[1], [-1]]))
+    around = np.degrees(
+        np.arctan2(*(centres[:, :2] - vertices[:, :2].mean(0)).T * [[1], [-1]])
+    )
     assert np.abs(around).max() < 75
     assert all(around[:6].min() < angle < around[:6].max() for angle in around[6:])
     assert np.diff(np.sort(around)).min() > 5

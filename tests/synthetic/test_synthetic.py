@@ -26,7 +26,9 @@ EACH_AVATAR = ("polo", pytest.param("blouse", marks=pytest.mark.slow))
 
 
 def tiny(cache, **parameters):
-    return ensure_scene(cache=cache, progress=False, **{"workers": 1, **TINY, **parameters})
+    return ensure_scene(
+        cache=cache, progress=False, **{"workers": 1, **TINY, **parameters}
+    )
 
 
 @pytest.fixture(scope="module")
@@ -111,20 +113,31 @@ def test_the_baked_avatars_have_landmarks_labels_and_no_body_pose(avatar, tmp_pa
 @pytest.mark.parametrize("avatar", EACH_AVATAR)
 def test_landmarks_of_the_baked_avatars_lie_on_their_parts(avatar):
     """Both eyes and the mouth on the face, wrists on arms or hands, toes on shoes."""
-    scene = Scene(SceneSettings(**TINY | {"avatar": avatar, "size": 160, "train_cameras": 2}))
+    scene = Scene(
+        SceneSettings(**TINY | {"avatar": avatar, "size": 160, "train_cameras": 2})
+    )
     names, points = scene.landmarks()
-    expected = {"left_eye": "face", "mouth_left": "face", "nose": "face", "left_thumb": "hand"}
+    expected = {
+        "left_eye": "face",
+        "mouth_left": "face",
+        "nose": "face",
+        "left_thumb": "hand",
+    }
     expected |= {"right_index": "hand", "left_foot_index": "shoe", "right_heel": "shoe"}
     labels = scene.posed(1).render(scene.views["cam00"], 4)[2]  # from before the person
     for name, part in expected.items():
-        u, v = np.floor(scene.views["cam00"].project(points[1, [names.index(name)]])[0]).astype(int)
+        u, v = np.floor(
+            scene.views["cam00"].project(points[1, [names.index(name)]])[0]
+        ).astype(int)
         near = labels[v - 2 : v + 3, u - 2 : u + 3]
         found = {scene.character.label_names[i] for i in np.unique(near)}
         assert any(part in label for label in found), (name, found)
 
 
 def test_person_is_in_view_and_fills_it():
-    scene = Scene(SceneSettings(avatar="free_body", secondary=False, frames=24, test_frames=6))
+    scene = Scene(
+        SceneSettings(avatar="free_body", secondary=False, frames=24, test_frames=6)
+    )
     top, bottom = [], []
     for frame in range(24):
         vertices = scene.mesh(frame)[0]
@@ -138,13 +151,17 @@ def test_person_is_in_view_and_fills_it():
 
 
 def test_test_cameras_are_between_training_cameras():
-    scene = Scene(SceneSettings(avatar="free_body", secondary=False, frames=2, test_frames=1))
+    scene = Scene(
+        SceneSettings(avatar="free_body", secondary=False, frames=2, test_frames=1)
+    )
     angle = {
-        name: math.atan2(view.centre[0], -view.centre[1]) for name, view in scene.views.items()
+        name: math.atan2(view.centre[0], -view.centre[1])
+        for name, view in scene.views.items()
     }
     for test in scene.test_cameras:
         gaps = sorted(
-            abs(math.remainder(angle[test] - angle[c], 2 * math.pi)) for c in scene.train_cameras
+            abs(math.remainder(angle[test] - angle[c], 2 * math.pi))
+            for c in scene.train_cameras
         )
         assert math.degrees(gaps[0]) == pytest.approx(30, abs=4)
         assert math.degrees(gaps[1]) == pytest.approx(30, abs=4)
@@ -157,7 +174,9 @@ def test_bytes_do_not_depend_on_workers(dataset, tmp_path):
 
 
 def test_without_secondary_motion_the_mesh_is_skinned_and_landmarks_stay():
-    still, moving = (Scene(SceneSettings(**TINY | {"secondary": on})) for on in (False, True))
+    still, moving = (
+        Scene(SceneSettings(**TINY | {"secondary": on})) for on in (False, True)
+    )
     vertices, _, wrinkles = still.mesh(1)
     assert wrinkles is None
     exact = free_body().posed_vertices(free_pose(still.motion))[1].numpy()
@@ -167,7 +186,10 @@ def test_without_secondary_motion_the_mesh_is_skinned_and_landmarks_stay():
 
 
 def test_the_free_bodys_pose_puts_its_landmarks_where_the_file_has_them(dataset):
-    pose, p = np.load(dataset / "body_pose.npz"), np.load(dataset / "landmarks3d.npz")["p"]
+    pose, p = (
+        np.load(dataset / "body_pose.npz"),
+        np.load(dataset / "landmarks3d.npz")["p"],
+    )
     pose = BodyPose(torch.from_numpy(pose["theta"]), torch.from_numpy(pose["transl"]))
     np.testing.assert_allclose(free_body().posed_landmarks(pose).numpy(), p, atol=1e-6)
 
@@ -225,7 +247,9 @@ def test_two_processes_at_once(tmp_path):
         f" **{TINY!r}))"
     )
     processes = [
-        subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+        subprocess.Popen(
+            [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True
+        )
         for _ in range(2)
     ]
     printed = {p.communicate()[0].strip() for p in processes}
@@ -249,8 +273,17 @@ def test_key_depends_on_every_parameter():
         SceneSettings(**{name: value})
         for name, value in (
             *(("size", 64), ("train_cameras", 5), ("test_cameras", 1), ("frames", 61)),
-            *(("test_frames", 14), ("rays_per_pixel", 5), ("seed", 1), ("avatar", "free_body")),
-            *(("secondary", False), ("lens", (0.1, 0, 0, 0)), ("lens", (0.1, 0, 0, 0, 0))),
+            *(
+                ("test_frames", 14),
+                ("rays_per_pixel", 5),
+                ("seed", 1),
+                ("avatar", "free_body"),
+            ),
+            *(
+                ("secondary", False),
+                ("lens", (0.1, 0, 0, 0)),
+                ("lens", (0.1, 0, 0, 0, 0)),
+            ),
             *(("tint", 0.1), ("tint", 0.2), ("gloss", 0.1), ("test_scale", (2.0,))),
         )
     ]

@@ -18,9 +18,18 @@ from gsgan.synthetic.signs import SIGNS
 
 # Largest rotation of a bone against its parent since a T pose, degrees. Arms and legs reach
 # across 120°, knees and elbows bend by 150°.
-LIMITS = {"Spine": 25, "Spine1": 25, "Spine2": 25, "Neck": 30, "Head": 30, "Shoulder": 30}
+LIMITS = {
+    "Spine": 25,
+    "Spine1": 25,
+    "Spine2": 25,
+    "Neck": 30,
+    "Head": 30,
+    "Shoulder": 30,
+}
 LIMITS |= {"Arm": 125, "ForeArm": 150, "Hand": 60, "UpLeg": 125, "Leg": 150, "Foot": 50}
-LIMITS |= {"ToeBase": 35} | {f"Hand{finger}1": 95 for finger in ("Index", "Middle", "Pinky")}
+LIMITS |= {"ToeBase": 35} | {
+    f"Hand{finger}1": 95 for finger in ("Index", "Middle", "Pinky")
+}
 LIMITS |= {f"Hand{finger}2": 110 for finger in ("Thumb", "Index", "Middle", "Pinky")}
 
 
@@ -65,10 +74,13 @@ def test_motion_is_smooth_and_repeatable(person, dense):
     times, moves = dense
     assert np.linalg.norm(np.diff(moves.joints[:, 0], axis=0), axis=1).max() < 0.04
     turned = np.swapaxes(moves.rotations[:-1], -1, -2) @ moves.rotations[1:]
-    assert np.linalg.norm(axis_angle(turned), axis=-1).max() < 0.5  # fingers, in a 50th second
+    # fingers, in a 50th second
+    assert np.linalg.norm(axis_angle(turned), axis=-1).max() < 0.5
     some = Choreography(person).at(times[[700, 3]])
     np.testing.assert_allclose(some.joints, moves.joints[[700, 3]], atol=1e-12)
-    np.testing.assert_array_equal(some.shapes["blink_left"], moves.shapes["blink_left"][[700, 3]])
+    np.testing.assert_array_equal(
+        some.shapes["blink_left"], moves.shapes["blink_left"][[700, 3]]
+    )
     other = Choreography(person, seed=1).at(times[::50])
     assert np.abs(other.joints - moves.joints[::50]).max() > 0.1
 
@@ -83,10 +95,17 @@ def test_bones_keep_their_lengths(person, dense):
 @pytest.mark.parametrize("seed", [0, 1])
 def test_standing_feet_do_not_slide(person, seed):
     times = np.arange(0, EVERYDAY.duration, 0.02)
-    moves, steps, walked = Choreography(person, seed).at(times), Footsteps(seed, EVERYDAY), 0
+    moves, steps, walked = (
+        Choreography(person, seed).at(times),
+        Footsteps(seed, EVERYDAY),
+        0,
+    )
     for foot, side in enumerate(SIDES):
         _, height, pitch, _ = steps.at(times, foot)
-        toe, ankle = joint(person, moves, side + "ToeBase"), joint(person, moves, side + "Foot")
+        toe, ankle = (
+            joint(person, moves, side + "ToeBase"),
+            joint(person, moves, side + "Foot"),
+        )
         edges = np.flatnonzero(np.diff(np.concatenate([[0], height < 1e-9, [0]])))
         for begin, end in edges.reshape(-1, 2):
             assert np.ptp(toe[begin:end], axis=0).max() < 1e-3
@@ -108,9 +127,17 @@ def arms_in_trunk(body, moves) -> np.ndarray:
     names = np.array(body.bones)[
         body.bone_index[np.arange(len(body.vertices)), body.bone_weight.argmax(axis=1)]
     ]
-    of_trunk = np.isin(names, ["Hips", "Spine", "Spine1", "Spine2", "spine02", "Neck", "Head"])
-    arms = [name.startswith(SIDES) and ("Hand" in name or "ForeArm" in name) for name in names]
-    trunk, arms = body.faces[of_trunk[body.faces].all(axis=1)], np.flatnonzero(arms)[::5]
+    of_trunk = np.isin(
+        names, ["Hips", "Spine", "Spine1", "Spine2", "spine02", "Neck", "Head"]
+    )
+    arms = [
+        name.startswith(SIDES) and ("Hand" in name or "ForeArm" in name)
+        for name in names
+    ]
+    trunk, arms = (
+        body.faces[of_trunk[body.faces].all(axis=1)],
+        np.flatnonzero(arms)[::5],
+    )
     shares = []
     for R, joints in zip(moves.rotations, moves.joints, strict=True):
         vertices, _ = body.skinned(R, joints)
@@ -124,7 +151,9 @@ def test_arms_do_not_pass_through_the_trunk(free):
     signs = Choreography(free, programme=SIGNS).at(frame_times(40, SIGNS.duration))
     assert arms_in_trunk(free, signs).max() < 0.02
     # the measure sees hands in the belly
-    pushed = replace(moves, rotations=moves.rotations[:1], joints=moves.joints[:1].copy())
+    pushed = replace(
+        moves, rotations=moves.rotations[:1], joints=moves.joints[:1].copy()
+    )
     for side, sign in (("Left", -1), ("Right", 1)):
         for j, name in enumerate(free.bones):
             if name.startswith(side) and ("Hand" in name or "ForeArm" in name):
@@ -135,9 +164,12 @@ def test_arms_do_not_pass_through_the_trunk(free):
 def test_rest_poses_do_not_matter(person):
     """An A pose, or any other, leads to the poses that the T pose leads to."""
     choreography = Choreography(person)
-    standing = choreography.at(EVERYDAY.duration - np.array([1e-3]))  # arms down, knees bent
+    # arms down, knees bent
+    standing = choreography.at(EVERYDAY.duration - np.array([1e-3]))
     vertices, normals = person.skinned(standing.rotations[0], standing.joints[0])
-    down = replace(person, vertices=vertices, normals=normals, joints=standing.joints[0])
+    down = replace(
+        person, vertices=vertices, normals=normals, joints=standing.joints[0]
+    )
     times = frame_times(40, EVERYDAY.duration)
     moves = choreography.at(times), Choreography(down).at(times)
     for name in ("LeftForeArm", "RightHand", "LeftLeg", "RightFoot", "Head"):
@@ -151,12 +183,17 @@ def test_fingers_curl_towards_the_palm(person):
         pose = Pose(rig, person.joints[:1])
         pose.world["Hips"] = np.eye(3)[None]
         for bone, _, _, hinge, _, _ in rig.fingers[side]:
-            pose.world[bone] = pose.rotation(pose.parent(bone)) @ rotation(0.7 * hinge)[None]
+            pose.world[bone] = (
+                pose.rotation(pose.parent(bone)) @ rotation(0.7 * hinge)[None]
+            )
         for finger in ("Index", "Middle", "Ring", "Pinky"):
             base, tip = (pose.position(f"{side}Hand{finger}{k}")[0] for k in (1, 4))
             assert tip[2] < base[2] - 0.03  # palms look down in a T pose
         little = person.joints[person.bones.index(f"{side}HandPinky1")]
-        tip, rest = pose.position(side + "HandThumb4")[0], rig.joint[side + "HandThumb4"]
+        tip, rest = (
+            pose.position(side + "HandThumb4")[0],
+            rig.joint[side + "HandThumb4"],
+        )
         assert np.linalg.norm(tip - little) < np.linalg.norm(rest - little) - 0.02
         assert sign * tip[0] > 0
 
@@ -179,7 +216,15 @@ def test_fingers_and_face_move_while_signing(person, dense):
 
 @pytest.mark.parametrize(
     "missing",
-    ["ToeBase", "Shoulder", "HandPinky", "Hand(?=[A-Z])", "Neck", "Spine1|Spine2", "Head"],
+    [
+        "ToeBase",
+        "Shoulder",
+        "HandPinky",
+        "Hand(?=[A-Z])",
+        "Neck",
+        "Spine1|Spine2",
+        "Head",
+    ],
 )
 def test_rigs_without_some_bones(missing):
     plain = mannequin(lambda bone: re.search(missing, bone) is not None)
@@ -195,7 +240,8 @@ def test_held_out_frames_are_blocks_and_one_whole_passage():
     combination = [i for i, n in enumerate(names) if n == COMBINATION]
     assert set(combination) <= set(test)
     rest = [i for i in test if i not in combination]
-    assert all(i - 1 in rest or i + 1 in rest for i in rest)  # blocks, not single frames
+    # blocks, not single frames
+    assert all(i - 1 in rest or i + 1 in rest for i in rest)
     assert {names[i] for i in range(84) if i not in test} == set(names) - {COMBINATION}
     assert set(names) == {passage[0] for passage in PASSAGES}
 
@@ -203,6 +249,8 @@ def test_held_out_frames_are_blocks_and_one_whole_passage():
 @pytest.mark.parametrize("frames", [1, 2, 7, 30])
 def test_held_out_count_is_exact(frames):
     for count in range(frames):
-        test = held_out(passages_at(frame_times(frames, EVERYDAY.duration), EVERYDAY), count)
+        test = held_out(
+            passages_at(frame_times(frames, EVERYDAY.duration), EVERYDAY), count
+        )
         assert len(set(test)) == count
         assert set(test) < set(range(frames))

@@ -9,7 +9,13 @@ import tiny_characters
 
 from gsgan.data.crop import distort, undistort
 from gsgan.data.datamodule import GsganData
-from gsgan.synthetic.scene_setup import Scene, SceneSettings, Tint, dataset_key, make_tints
+from gsgan.synthetic.scene_setup import (
+    Scene,
+    SceneSettings,
+    Tint,
+    dataset_key,
+    make_tints,
+)
 from gsgan.synthetic.scenes import ensure_scene
 from gsgan.utils.errors import ConfigError
 
@@ -36,7 +42,9 @@ def stage():
 
 def images(root, kind, camera):
     paths = sorted((root / kind / camera).glob("*.png"))
-    return np.stack([cv2.imread(str(p), cv2.IMREAD_UNCHANGED) for p in paths]).astype(float)
+    return np.stack([cv2.imread(str(p), cv2.IMREAD_UNCHANGED) for p in paths]).astype(
+        float
+    )
 
 
 # ---------------------------------------------------------------- the default person
@@ -74,7 +82,9 @@ def test_the_ray_of_a_points_pixel_hits_the_point(stage):
     views = Scene(SceneSettings(**TINY, lens=LENS)).views
     points = stage.mesh(0)[0][::700]
     for view in views.values():
-        pixel = np.concatenate([view.project(points), np.ones((len(points), 1))], axis=1)
+        pixel = np.concatenate(
+            [view.project(points), np.ones((len(points), 1))], axis=1
+        )
         pinhole = pixel @ np.linalg.inv(view.K).T @ view.R
         rays = view.bend(pinhole / np.linalg.norm(pinhole, axis=1, keepdims=True))
         off = np.linalg.norm(np.cross(points - view.centre, rays), axis=1)
@@ -132,7 +142,9 @@ def test_each_training_camera_keeps_its_tint_over_all_frames(scene):
             strict=True,
         ):  # fmt: skip
             sure = (mask == 255) & (after.max(axis=-1) < 255) & (after.min(axis=-1) > 0)
-            rgb = np.concatenate([before[sure][:, ::-1] / 255, np.ones((sure.sum(), 1))], axis=1)
+            rgb = np.concatenate(
+                [before[sure][:, ::-1] / 255, np.ones((sure.sum(), 1))], axis=1
+            )
             found = np.linalg.lstsq(rgb, after[sure][:, ::-1] / 255, rcond=None)[0].T
             np.testing.assert_allclose(found[:, :3], tint.A, atol=0.03)
             np.testing.assert_allclose(found[:, 3], tint.b, atol=0.01)
@@ -167,7 +179,9 @@ def test_scaled_test_cameras_see_the_person_at_their_scale(scene, stage):
     area = {c: images(root, "masks", c).sum() for c in splits["test_cameras"]}
     assert area["cam03_x0.5"] == pytest.approx(area["cam03"] / 4, rel=0.05)
     small = images(root, "images", "cam03_x0.5")[0]
-    shrunk = cv2.resize(images(root, "images", "cam03")[0], (24, 24), interpolation=cv2.INTER_AREA)
+    shrunk = cv2.resize(
+        images(root, "images", "cam03")[0], (24, 24), interpolation=cv2.INTER_AREA
+    )
     assert np.abs(small[12:36, 12:36] - shrunk).mean() < 6
     for camera in ("cam00", "cam03"):
         assert np.array_equal(*(images(r, "images", camera) for r in (scene(), root)))

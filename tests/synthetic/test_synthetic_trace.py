@@ -86,10 +86,13 @@ def test_the_sky_is_darker_under_cover():
 def test_a_coarse_sphere_has_no_facets_in_its_shadow():
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
     c = character([(ball.vertices, ball.faces, np.zeros((len(ball.vertices), 2)))])
-    dark = replace(MATT, direction=(1, 0, 0), sun=(1, 1, 1), sky=(0,) * 3, ground=(0,) * 3)
+    dark = replace(
+        MATT, direction=(1, 0, 0), sun=(1, 1, 1), sky=(0,) * 3, ground=(0,) * 3
+    )
     view = from_front()
     image, _, _ = posed(c, dark).render(view, 1)
-    for angle in (0.15, 0.3, 0.6, 0.9):  # from the terminator, the middle of the disc, to the sun
+    # from the terminator, the middle of the disc, to the sun
+    for angle in (0.15, 0.3, 0.6, 0.9):
         point = 0.5 * np.array([np.sin(angle), -np.cos(angle), 0])
         expected = encode(GREY * np.array([np.sin(angle)]))
         np.testing.assert_allclose(at(view, image, point)[0], expected, atol=0.05)
@@ -101,7 +104,8 @@ def test_texture_is_upright():
     colours[32:, :32], colours[32:, 32:] = (0, 0, 255, 255), (255, 255, 255, 255)
     c = character([square(1.0, 0.5)], [Surface("four", colours)])
     image, _, _ = posed(c).render(from_above(), 1)
-    assert image[7, 7].argmax() == 0  # top left is red: v runs down, +y is up in the image
+    # top left is red: v runs down, +y is up in the image
+    assert image[7, 7].argmax() == 0
     assert image[7, 12].argmax() == 1
     assert image[12, 7].argmax() == 2
     assert image[12, 12].min() > 0.3
@@ -113,20 +117,25 @@ def test_fine_texture_is_averaged_as_light():
     c = character([square(1.0, 0.5)], [Surface("checks", colours)])
     image, _, _ = posed(c).render(from_above(), 1)
     expected = encode(0.5 * (0.8 * np.array(MATT.sun) + 0.3))
-    np.testing.assert_allclose(image[6:14, 6:14], np.tile(expected, (8, 8, 1)), rtol=0.01)
+    np.testing.assert_allclose(
+        image[6:14, 6:14], np.tile(expected, (8, 8, 1)), rtol=0.01
+    )
 
 
 def test_textures_are_bilinear_and_repeat():
     colours = np.zeros((1, 2, 4), np.uint8)
     colours[0, 1] = 255
     textures = Textures((Surface("two", colours), plain()))
-    uv = np.array([[0.25, 0.5], [0.75, 0.3], [0.5, 0.5], [1.25, 7.0], [-0.25, 0.5]], np.float32)
+    uv = np.array(
+        [[0.25, 0.5], [0.75, 0.3], [0.5, 0.5], [1.25, 7.0], [-0.25, 0.5]], np.float32
+    )
     zero = np.zeros(5, int)
     rgb, coverage, normal = textures(zero, uv, zero)
     np.testing.assert_allclose(rgb[:, 0], [0, 1, 0.5, 0, 1], atol=1e-6)
     np.testing.assert_allclose(coverage, rgb[:, 0])
     np.testing.assert_allclose(normal, np.tile([0, 0, 1], (5, 1)))
-    rgb, _, _ = textures(np.array([0, 1]), uv[:2], np.array([9, 9]))  # past the last level
+    # past the last level
+    rgb, _, _ = textures(np.array([0, 1]), uv[:2], np.array([9, 9]))
     np.testing.assert_allclose(rgb[:, 0], [0.5, GREY], rtol=1e-3)
 
 
@@ -143,7 +152,9 @@ def test_rays_and_sun_pass_through_cut_outs():
     assert alpha[30, 30] == 1
     hole, shaded = at(view, image, (-0.1, 0, 0)), at(view, image, (-0.66, 0, 0))
     assert np.all(hole > 1.2 * shaded)  # the sun shines through the hole, 0.2 m to -x
-    opaque = character([square(0.5, 0.5), square(0.0, 1.0)], [replace(holey, cutoff=0), dark])
+    opaque = character(
+        [square(0.5, 0.5), square(0.0, 1.0)], [replace(holey, cutoff=0), dark]
+    )
     assert posed(opaque).render(view, 1)[2][30, 30] == 1
 
 
@@ -155,10 +166,13 @@ def test_normal_map_tilts_towards_its_axes():
         for d in ((0.6, 0, 0.8), (-0.6, 0, 0.8), (0, 0.6, 0.8))
     ]
     assert bright[0] > bright[2] > bright[1]
-    up = np.array([[[128, 128 + 76, 128 + 102]]], np.uint8)  # +y of the map is up in the texture
+    # +y of the map is up in the texture
+    up = np.array([[[128, 128 + 76, 128 + 102]]], np.uint8)
     c = character([square(1.0, 0.5)], [plain(normal=up)])
     bright = [
-        posed(c, replace(MATT, direction=(0, y, 0.8))).render(from_above(), 1)[0][10, 10, 0]
+        posed(c, replace(MATT, direction=(0, y, 0.8))).render(from_above(), 1)[0][
+            10, 10, 0
+        ]
         for y in (0.6, -0.6)
     ]
     assert bright[0] > bright[1]
@@ -169,9 +183,13 @@ def test_wrinkles_tilt_normals():
     phase = (20 * c.vertices[:, 0]).astype(np.float32)
     across = np.tile(np.float32([1, 0, 0]), (4, 1))
     light = replace(MATT, direction=(1, 0, 1))
-    smooth, _, _ = posed(c, light, Wrinkles(phase, 0 * phase, across)).render(from_above(), 1)
+    smooth, _, _ = posed(c, light, Wrinkles(phase, 0 * phase, across)).render(
+        from_above(), 1
+    )
     assert np.array_equal(smooth, posed(c, light).render(from_above(), 1)[0])
-    folded, _, _ = posed(c, light, Wrinkles(phase, 0 * phase + 0.5, across)).render(from_above(), 1)
+    folded, _, _ = posed(c, light, Wrinkles(phase, 0 * phase + 0.5, across)).render(
+        from_above(), 1
+    )
     assert np.ptp(folded[10, 5:15, 0]) > 0.05
     np.testing.assert_allclose(folded[6, 5:15], folded[13, 5:15], atol=1e-5)
 
@@ -192,7 +210,9 @@ def test_no_light_is_clipped():
     assert np.all(np.diff(shown) > 0)
     assert shown[-1] < 1
     exact = light[light < 0.5]
-    np.testing.assert_allclose(linear(encode(exact).astype(np.float32)), exact, atol=1e-5)
+    np.testing.assert_allclose(
+        linear(encode(exact).astype(np.float32)), exact, atol=1e-5
+    )
 
 
 def z_buffer(c, view, fine):
@@ -217,12 +237,16 @@ def z_buffer(c, view, fine):
     return labels
 
 
-@pytest.mark.parametrize("view", [from_front(128, 3.0, 160.0), from_front(160, 2.5, 180.0, 0.4)])
+@pytest.mark.parametrize(
+    "view", [from_front(128, 3.0, 160.0), from_front(160, 2.5, 180.0, 0.4)]
+)
 def test_masks_and_labels_agree_with_a_z_buffer(view):
     c, fine = lumpy(), 6
     _, centre, at_centre = posed(c).render(view, 1)
     expected = z_buffer(c, view, 1)  # with the same samples: the same picture
-    assert ((centre > 0) & (expected > 0)).sum() >= 0.999 * ((centre > 0) | (expected > 0)).sum()
+    assert ((centre > 0) & (expected > 0)).sum() >= 0.999 * (
+        (centre > 0) | (expected > 0)
+    ).sum()
     assert (at_centre == expected).mean() >= 0.9995
     _, alpha, labels = posed(c).render(view, 16)
     expected = z_buffer(c, view, fine)
@@ -240,9 +264,14 @@ def test_masks_and_labels_agree_with_a_z_buffer(view):
 
 @pytest.mark.parametrize(
     ("where", "name", "value"),
-    [(PosedCharacter, "_touched", lambda self, v: np.ones(v.size, bool)), (trace, "BLOCK", 100)],
+    [
+        (PosedCharacter, "_touched", lambda self, v: np.ones(v.size, bool)),
+        (trace, "BLOCK", 100),
+    ],
 )
-def test_every_touched_pixel_is_found_and_the_same_in_any_blocks(monkeypatch, where, name, value):
+def test_every_touched_pixel_is_found_and_the_same_in_any_blocks(
+    monkeypatch, where, name, value
+):
     view = from_front(48, 3.0, 40.0)
     found = posed(lumpy(3)).render(view, 9)
     monkeypatch.setattr(where, name, value)
@@ -264,7 +293,9 @@ def test_a_camera_that_sees_nothing():
     moment, view = posed(lumpy()), from_front(16)
     aside = view.K.copy()
     aside[0, 2] = 900
-    away = replace(view, R=np.diag([-1, 1, -1]) @ view.R, t=np.diag([-1, 1, -1]) @ view.t)
+    away = replace(
+        view, R=np.diag([-1, 1, -1]) @ view.R, t=np.diag([-1, 1, -1]) @ view.t
+    )
     for v in (away, replace(view, K=aside)):
         for out in moment.render(v, 4):
             assert not out.any()

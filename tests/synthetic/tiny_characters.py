@@ -25,15 +25,21 @@ def plain(rgb=(128, 128, 128), **surface):
 
 def square(z, half, uv=((0, 1), (1, 1), (1, 0), (0, 0))):
     """Vertices, faces and uv of two triangles facing up at a height; +y is up in its texture."""
-    v = np.array([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]], float)
+    v = np.array(
+        [[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]], float
+    )
     return v, np.array([[0, 1, 2], [0, 2, 3]]), np.array(uv, float)
 
 
-def character(parts, surfaces=None, labels=None, bones=("Hips",), joints=None, weights=None):
+def character(
+    parts, surfaces=None, labels=None, bones=("Hips",), joints=None, weights=None
+):
     """A character of parts ``(vertices, faces, uv)``, each with its own surface and label."""
     count = np.cumsum([0, *(len(p[0]) for p in parts)])
     v = np.concatenate([p[0] for p in parts])
-    faces = np.concatenate([p[1] + start for p, start in zip(parts, count, strict=False)])
+    faces = np.concatenate(
+        [p[1] + start for p, start in zip(parts, count, strict=False)]
+    )
     number = np.repeat(np.arange(len(parts)), [len(p[1]) for p in parts])
     surfaces = surfaces or (plain(),) * len(parts)
     index = np.zeros((len(v), 4), int)
@@ -74,7 +80,9 @@ def smooth_normals(v, faces):
 def from_above(size=20, height=3.0, focal=20.0):
     """A camera that looks straight down: +x is right, +y is up in its image."""
     K = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
-    return SceneCamera(K, np.diag([1.0, -1.0, -1.0]), np.array([0, 0, height]), (size, size))
+    return SceneCamera(
+        K, np.diag([1.0, -1.0, -1.0]), np.array([0, 0, height]), (size, size)
+    )
 
 
 def from_front(size=64, distance=3.0, focal=64.0, height=0.0):

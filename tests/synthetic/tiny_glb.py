@@ -45,7 +45,10 @@ class TinyGlb:
     """Builds the document; change ``doc`` before `write`."""
 
     def __init__(
-        self, prefix: str = "mixamorig:", unit: float = 1.0, names: dict[str, str] | None = None
+        self,
+        prefix: str = "mixamorig:",
+        unit: float = 1.0,
+        names: dict[str, str] | None = None,
     ) -> None:
         self.doc, self.blob = pygltflib.GLTF2(), bytearray()
         joints = {bone: unit * np.array(at) for bone, (_, at) in BONES.items()}
@@ -56,13 +59,16 @@ class TinyGlb:
             self.doc.nodes.append(pygltflib.Node(name=name, translation=step.tolist()))
             if parent:
                 self.doc.nodes[order.index(parent)].children.append(order.index(bone))
-        x = np.concatenate([unit * (np.array(c) + CORNERS * h) for c, h in BOXES.values()])
+        x = np.concatenate(
+            [unit * (np.array(c) + CORNERS * h) for c, h in BOXES.values()]
+        )
         first = 8 * np.arange(len(BOXES))[:, None, None]
         quads = (first + SIDES).reshape(-1, 4)
         faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
         owner = np.repeat([order.index(bone) for bone in BOXES], 8)
         index = np.stack([owner, 0 * owner, 0 * owner, 0 * owner], 1).astype(np.uint8)
-        weight = np.tile(np.array([128, 0, 0, 0], np.uint8), (len(x), 1))  # sums to a half
+        # sums to a half
+        weight = np.tile(np.array([128, 0, 0, 0], np.uint8), (len(x), 1))
         bind = np.tile(np.eye(4), (len(order), 1, 1))
         bind[:, 3, :3] = [-joints[bone] for bone in order]  # columns first
         attributes = pygltflib.Attributes(
@@ -91,12 +97,16 @@ class TinyGlb:
         colour = Image.fromarray(np.full((4, 6, 4), (200, 150, 120, 128), np.uint8))
         info = pygltflib.TextureInfo(index=self.texture(colour, "PNG"))
         shader = pygltflib.PbrMetallicRoughness(baseColorTexture=info)
-        self.doc.materials.append(pygltflib.Material(name="all", pbrMetallicRoughness=shader))
+        self.doc.materials.append(
+            pygltflib.Material(name="all", pbrMetallicRoughness=shader)
+        )
 
     def texture(self, image: Image.Image, kind: str) -> int:
         data = io.BytesIO()
         image.save(data, kind, lossless=True)
-        source = pygltflib.Image(bufferView=self.view(data.getvalue()), mimeType=f"image/{kind}")
+        source = pygltflib.Image(
+            bufferView=self.view(data.getvalue()), mimeType=f"image/{kind}"
+        )
         self.doc.images.append(source)
         number = len(self.doc.images) - 1
         texture = pygltflib.Texture(source=None if kind == "WEBP" else number)
@@ -107,7 +117,9 @@ class TinyGlb:
 
     def view(self, data: bytes) -> int:
         self.blob.extend(bytes(-len(self.blob) % 4))
-        view = pygltflib.BufferView(buffer=0, byteOffset=len(self.blob), byteLength=len(data))
+        view = pygltflib.BufferView(
+            buffer=0, byteOffset=len(self.blob), byteLength=len(data)
+        )
         self.doc.bufferViews.append(view)
         self.blob.extend(data)
         return len(self.doc.bufferViews) - 1
@@ -130,7 +142,9 @@ class TinyGlb:
         )
         rows = pygltflib.AccessorSparseValues(bufferView=self.view(values.tobytes()))
         sparse = pygltflib.Sparse(count=len(at), indices=indices, values=rows)
-        accessor = pygltflib.Accessor(componentType=5126, count=count, type="VEC3", sparse=sparse)
+        accessor = pygltflib.Accessor(
+            componentType=5126, count=count, type="VEC3", sparse=sparse
+        )
         self.doc.accessors.append(accessor)
         return len(self.doc.accessors) - 1
 

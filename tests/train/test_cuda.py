@@ -22,7 +22,9 @@ def test_the_rasteriser_draws_the_same_and_has_the_same_gradients(name):
         scene, cam = cloud(200), camera((40, 56))
         means = scene.means.detach().to(device).requires_grad_()
         scene = replace(scene.to(device), means=means)
-        image = rasterise(scene, cam.to(device), settings=ACCURACY[name], backend="torch").features
+        image = rasterise(
+            scene, cam.to(device), settings=ACCURACY[name], backend="torch"
+        ).features
         image.square().sum().backward()
         found.append((image.detach().cpu(), means.grad.cpu()))
     (image, slopes), (on_cuda, slopes_on_cuda) = found

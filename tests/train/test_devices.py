@@ -45,7 +45,9 @@ def place(request, monkeypatch):
         if isinstance(x, torch.nn.Module):
             return x._apply(fake)
         parts = {f.name: getattr(x, f.name) for f in fields(x)}
-        return replace(x, **{k: fake(v) for k, v in parts.items() if isinstance(v, HELD)})
+        return replace(
+            x, **{k: fake(v) for k, v in parts.items() if isinstance(v, HELD)}
+        )
 
     def move(x):
         stack.close()
@@ -56,7 +58,8 @@ def place(request, monkeypatch):
         monkeypatch.setattr(gsplat_backend, "why_not", lambda settings, device: "")
         monkeypatch.setattr(gsplat_backend, "given_up", lambda settings, device: "")
         monkeypatch.setattr(gsplat_backend, "draw", drawn)
-        monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())  # knows no meta
+        # knows no meta
+        monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())
         monkeypatch.setattr(torch.Tensor, "numpy", no_values)
         stack.enter_context(mode)
         return moved
@@ -72,7 +75,12 @@ HELD = (torch.Tensor, TensorRecord)
 
 def drawn(gaussians, camera, settings):
     """In place of gsplat: images of the right size, with a gradient for everything given."""
-    parts = (gaussians.means, gaussians.covariances, gaussians.opacities, gaussians.features)
+    parts = (
+        gaussians.means,
+        gaussians.covariances,
+        gaussians.opacities,
+        gaussians.features,
+    )
     one = sum(x.sum() for x in (*parts, camera.K, camera.R, camera.t))
     features = one.expand(len(camera), gaussians.features.shape[-1], *camera.size)
     return features, features[:, :1]

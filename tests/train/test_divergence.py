@@ -36,14 +36,42 @@ def weights(part: str, value: float):
 
 
 CASES = {
-    "image": (5, lambda _, batch: batch.image.fill_(NAN), "image of the data is not finite"),
-    "skeleton": (5, lambda _, batch: batch.skeleton.fill_(NAN), "skeleton of the data is not"),
-    "camera": (5, lambda _, batch: batch.camera.K.fill_(NAN), r"camera.K of the data is not"),
-    "body": (8, lambda _, batch: batch.body.theta.fill_(NAN), r"body.theta of the data is not"),
+    "image": (
+        5,
+        lambda _, batch: batch.image.fill_(NAN),
+        "image of the data is not finite",
+    ),
+    "skeleton": (
+        5,
+        lambda _, batch: batch.skeleton.fill_(NAN),
+        "skeleton of the data is not",
+    ),
+    "camera": (
+        5,
+        lambda _, batch: batch.camera.K.fill_(NAN),
+        r"camera.K of the data is not",
+    ),
+    "body": (
+        8,
+        lambda _, batch: batch.body.theta.fill_(NAN),
+        r"body.theta of the data is not",
+    ),
     "psi": (9, weights("avatar.deformation", 1e20), "weights of psi have exploded"),
-    "segmentation": (1, weights("avatar.segmentation", NAN), "weights of segmentation have"),
-    "generator": (9, weights("avatar.generator", NAN), "weights of generator have exploded"),
-    "discriminator": (11, weights("discriminator", NAN), "weights of discriminator have"),
+    "segmentation": (
+        1,
+        weights("avatar.segmentation", NAN),
+        "weights of segmentation have",
+    ),
+    "generator": (
+        9,
+        weights("avatar.generator", NAN),
+        "weights of generator have exploded",
+    ),
+    "discriminator": (
+        11,
+        weights("discriminator", NAN),
+        "weights of discriminator have",
+    ),
 }
 
 
@@ -54,10 +82,14 @@ def test_what_is_not_finite_is_skipped_and_stops_the_run_when_it_recurs(
     first, change, cause = CASES[case]
     spoil = Spoil(change, first)
     module, trainer, data = make("training.max_skipped=2", callbacks=[spoil])
-    with pytest.raises(GsganError, match=f"stopped at iteration {first + 1}: 2 of.*{cause}"):
+    with pytest.raises(
+        GsganError, match=f"stopped at iteration {first + 1}: 2 of.*{cause}"
+    ):
         trainer.fit(module, data)
     assert list(module.skipped.steps) == [first, first + 1]
-    assert re.search(rf"iteration {first}: skipped \(1 of.*{cause}", capsys.readouterr().out)
+    assert re.search(
+        rf"iteration {first}: skipped \(1 of.*{cause}", capsys.readouterr().out
+    )
     kept = torch.load(tmp_path / "stopped_0.pt", weights_only=True)
     assert kept["step"] == first + 1
     fields = {field.name for field in dataclasses.fields(module._frame)}
@@ -67,7 +99,9 @@ def test_what_is_not_finite_is_skipped_and_stops_the_run_when_it_recurs(
 def test_a_loss_that_is_not_finite_is_named(make):
     module, trainer, data = make("training.max_skipped=1")
     terms = module.step_two_terms
-    module.step_two_terms = lambda r, *given: terms(r, *given) | {"own": NAN * r.image.mean()}
+    module.step_two_terms = lambda r, *given: (
+        terms(r, *given) | {"own": NAN * r.image.mean()}
+    )
     with pytest.raises(GsganError, match="the loss step_two/own is not finite"):
         trainer.fit(module, data)
 
@@ -84,7 +118,9 @@ def test_exploding_colours_are_undone(make, capsys):
     assert module.step == module.schedule.total
 
 
-def test_a_collapsed_discriminator_is_undone_and_stops_the_run_when_it_recurs(make, capsys):
+def test_a_collapsed_discriminator_is_undone_and_stops_the_run_when_it_recurs(
+    make, capsys
+):
     spoil = Spoil(weights("discriminator", 0.0), 26)
     words = ("training.rollback.most=1", "training.schedule.step_two=20")
     module, trainer, data = make(*LONGER, *words, callbacks=[spoil])

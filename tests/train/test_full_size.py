@@ -15,14 +15,34 @@ GIGABYTES = 4.0  # the most that the process held; 2.3 were measured
 
 
 @pytest.mark.slow  # 200 iterations: four minutes of one core
-def test_200_iterations_learn_within_memory_and_do_not_collapse(compose, tmp_path, monkeypatch):
+def test_200_iterations_learn_within_memory_and_do_not_collapse(
+    compose, tmp_path, monkeypatch
+):
     # the default person, traced at 128² and enlarged: tracing 512² would take longer than training
     config = compose(
         "train",
-        *("size=full", "training=demo", "data=synthetic", "data.source.size=128", "data.size=512"),
-        *("data.source.train_cameras=2", "data.source.test_cameras=1", "data.source.frames=6"),
-        *("data.source.test_frames=1", "data.source.rays_per_pixel=4", "data.body=none"),
-        *("effects.body_points=off", "model.segmentation=null", "training.average=null"),
+        *(
+            "size=full",
+            "training=demo",
+            "data=synthetic",
+            "data.source.size=128",
+            "data.size=512",
+        ),
+        *(
+            "data.source.train_cameras=2",
+            "data.source.test_cameras=1",
+            "data.source.frames=6",
+        ),
+        *(
+            "data.source.test_frames=1",
+            "data.source.rays_per_pixel=4",
+            "data.body=none",
+        ),
+        *(
+            "effects.body_points=off",
+            "model.segmentation=null",
+            "training.average=null",
+        ),
         f"training.schedule.step_one={STEP_ONE}",
         f"training.schedule.step_two={BEFORE_GAN + GAN}",
         f"training.schedule.discriminator_start={BEFORE_GAN}",
@@ -46,7 +66,9 @@ def test_200_iterations_learn_within_memory_and_do_not_collapse(compose, tmp_pat
     assert module.rollback.problem() == ""
     fallen = {name: _fallen(values) for name, values in logged.items()}
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
-    print(f"\n{memory:.1f} GB at most; last tenth of each loss over its first: {fallen}")
+    print(
+        f"\n{memory:.1f} GB at most; last tenth of each loss over its first: {fallen}"
+    )
     assert fallen["step_one/loss"] < 0.5
     assert fallen["step_two/photometric"] < 1.0
     assert memory < GIGABYTES

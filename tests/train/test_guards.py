@@ -34,7 +34,9 @@ def test_a_resumed_run_starts_counting_anew_and_may_change_the_limit(make, tiny)
     again = skipping(make, "training.max_skipped=20")
     again.on_load_checkpoint(checkpoint)
     again.skipped.add(0)  # no twentieth
-    assert record(tiny("training.max_skipped=3")) == record(tiny("training.max_skipped=300"))
+    assert record(tiny("training.max_skipped=3")) == record(
+        tiny("training.max_skipped=300")
+    )
 
 
 # --- the way back from a collapse, by all ranks together
@@ -67,7 +69,8 @@ def test_training_asks_all_ranks(make, monkeypatch):
     monkeypatch.setattr(trainer.strategy, "reduce", reduce)
     trainer.fit(module, data)
     assert (
-        asked.count("mean") == math.ceil(module.schedule.total / module.schedule.epoch) - 1
+        asked.count("mean")
+        == math.ceil(module.schedule.total / module.schedule.epoch) - 1
     )  # the first one trains S alone
 
 
@@ -104,5 +107,7 @@ def test_a_span_that_is_not_read_is_refused(make):
 
 
 def test_a_span_is_both_steps_or_the_first():
-    with pytest.raises(ConfigError, match="span must be one of both, step_one, got 'all'"):
+    with pytest.raises(
+        ConfigError, match="span must be one of both, step_one, got 'all'"
+    ):
         Recipe(Rate(1e-3), span="all")

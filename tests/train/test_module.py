@@ -7,7 +7,12 @@ import torch
 from lightning import Trainer
 from torch.utils.data import DataLoader
 
-from gsgan.losses.adversarial import FORMS, discriminator_loss, feature_matching, generator_loss
+from gsgan.losses.adversarial import (
+    FORMS,
+    discriminator_loss,
+    feature_matching,
+    generator_loss,
+)
 from gsgan.model.discriminator import Discriminator
 from gsgan.train.losses import DiscriminatorMaps, discriminate
 from gsgan.utils.errors import ConfigError
@@ -20,7 +25,9 @@ def snapshot(module: torch.nn.Module) -> dict[str, torch.Tensor]:
 def moved(before: dict[str, torch.Tensor], module: torch.nn.Module, part: str) -> bool:
     after = module.state_dict()
     return any(
-        not torch.equal(before[name], after[name]) for name in before if name.startswith(part)
+        not torch.equal(before[name], after[name])
+        for name in before
+        if name.startswith(part)
     )
 
 
@@ -50,7 +57,9 @@ def test_each_phase_moves_its_own_parts_only(make, schedule, learning):
     )  # fmt: skip
     before = snapshot(module)
     trainer.fit(module, data)
-    assert {name for name, part in PARTS.items() if moved(before, module, part)} == learning
+    assert {
+        name for name, part in PARTS.items() if moved(before, module, part)
+    } == learning
     assert module.step == sum(schedule)
 
 
@@ -109,7 +118,11 @@ def unlabelled(tmp_path):
     from make import write_tiny_capture
 
     return write_tiny_capture(
-        tmp_path / "unlabelled", frames=3, size=(48, 48), body_pose=True, meta={"body": "free"}
+        tmp_path / "unlabelled",
+        frames=3,
+        size=(48, 48),
+        body_pose=True,
+        meta={"body": "free"},
     )
 
 
@@ -131,9 +144,13 @@ def test_feature_head_commutes_with_blending(make):
     frame = data.dataset("train")[0]
     torch.nn.init.ones_(module.feature_head.bias)
     painting = module.avatar(*frame.inputs)
-    empty = replace(painting, features=painting.features * 0, splat_alpha=painting.splat_alpha * 0)
+    empty = replace(
+        painting, features=painting.features * 0, splat_alpha=painting.splat_alpha * 0
+    )
     blank = replace(frame, image=frame.image * 0, mask=frame.mask * 0)
-    assert float(module.step_one_loss(empty, blank).detach()) == pytest.approx(0, abs=1e-5)
+    assert float(module.step_one_loss(empty, blank).detach()) == pytest.approx(
+        0, abs=1e-5
+    )
 
 
 def push_opacities_down(module, until: int) -> None:
@@ -145,7 +162,8 @@ def push_opacities_down(module, until: int) -> None:
 
     def push(gradient: torch.Tensor) -> torch.Tensor:
         pushed = torch.zeros_like(gradient)
-        pushed[:, 10] = float(module.rollback.done < until)  # after means 3, quats 4, scales 3
+        # after means 3, quats 4, scales 3
+        pushed[:, 10] = float(module.rollback.done < until)
         return pushed
 
     deformation.table.register_hook(push)
@@ -161,7 +179,9 @@ LONGER = (
 
 def alpha_share(module, frame) -> float:
     with torch.no_grad():
-        return float(module.avatar(*frame.inputs).splat_alpha.mean() / frame.mask.mean())
+        return float(
+            module.avatar(*frame.inputs).splat_alpha.mean() / frame.mask.mean()
+        )
 
 
 def test_a_run_driven_into_the_collapse_is_caught_and_brought_back(make, capsys):
@@ -205,7 +225,10 @@ def test_bf16_leaves_the_gradients_of_step_one_alone(make, model):
     for precision in ("32-true", "bf16-mixed"):
         short = ("training.schedule.segmentation=2", "training.schedule.step_one=4")
         module, trainer, data = make(
-            f"model={model}", *short, "training.schedule.step_two=0", precision=precision
+            f"model={model}",
+            *short,
+            "training.schedule.step_two=0",
+            precision=precision,
         )
         trainer.fit(module, data)
         found.append(snapshot(module.avatar))
@@ -235,14 +258,18 @@ def test_float16_is_refused_before_anything_trains(make, monkeypatch):
     for precision in ("16-mixed", "16-true"):
         module.trainer = Trainer(accelerator="cpu", logger=False)
         monkeypatch.setattr(Trainer, "precision", precision)
-        with pytest.raises(ConfigError, match=f"precision={precision}: .* choose bf16-mixed"):
+        with pytest.raises(
+            ConfigError, match=f"precision={precision}: .* choose bf16-mixed"
+        ):
             module.on_fit_start()
     monkeypatch.setattr(Trainer, "precision", "bf16-mixed")
     module.on_fit_start()
 
 
 def test_the_discriminators_rate_spans_the_gan_alone(make):
-    module, _, _ = make("training.schedule.step_two=40", "training.schedule.discriminator_start=20")
+    module, _, _ = make(
+        "training.schedule.step_two=40", "training.schedule.discriminator_start=20"
+    )
     start, end = module.schedule.adversarial_span
     recipe = module.recipes["discriminator"].rate
     rates = []
@@ -253,7 +280,10 @@ def test_the_discriminators_rate_spans_the_gan_alone(make):
 
 
 def test_a_comparing_gan_runs_the_discriminator_in_full_precision():
-    critic, image = Discriminator(scales=1, base=4, layers=2, norm="none"), torch.rand(1, 3, 16, 16)
+    critic, image = (
+        Discriminator(scales=1, base=4, layers=2, norm="none"),
+        torch.rand(1, 3, 16, 16),
+    )
     with torch.autocast("cpu", dtype=torch.bfloat16):
         kinds = {gan: discriminate(critic, image, gan)[0][-1].dtype for gan in FORMS}
     assert kinds.pop("relativistic") == torch.float32
@@ -280,4 +310,6 @@ def test_maps_shared_by_both_losses_give_the_gradients_of_two_passes(gan):
     torch.testing.assert_close(sum(terms.values()), expected)
     torch.testing.assert_close(found, torch.autograd.grad(expected, image)[0])
     apart = discriminator_loss(critic(target), critic(image.detach()), gan)
-    torch.testing.assert_close(of_critic, list(torch.autograd.grad(apart, critic.parameters())))
+    torch.testing.assert_close(
+        of_critic, list(torch.autograd.grad(apart, critic.parameters()))
+    )

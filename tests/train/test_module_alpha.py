@@ -13,14 +13,19 @@ from gsgan.train.losses import StepOneLoss, StepTwoLoss
 def leaves(*channels: int, size: int = 16) -> list[torch.Tensor]:
     """Random pictures that take a gradient."""
     generator = torch.Generator().manual_seed(0)
-    return [torch.rand(1, n, size, size, generator=generator).requires_grad_() for n in channels]
+    return [
+        torch.rand(1, n, size, size, generator=generator).requires_grad_()
+        for n in channels
+    ]
 
 
 def seen_person(size: int = 16) -> SimpleNamespace:
     """A person in the middle, unsure at the right side."""
     mask, unsure = torch.zeros(1, 1, size, size), torch.zeros(1, 1, size, size)
     mask[..., 4:12, 4:12], unsure[..., 13:] = 1.0, 1.0
-    return SimpleNamespace(image=0.4 * mask.expand(1, 3, -1, -1), mask=mask, unsure=unsure)
+    return SimpleNamespace(
+        image=0.4 * mask.expand(1, 3, -1, -1), mask=mask, unsure=unsure
+    )
 
 
 def test_step_two_compares_on_white_by_alpha_and_mask():
@@ -35,19 +40,25 @@ def test_step_two_compares_on_white_by_alpha_and_mask():
         )
 
     found = terms(weights)
-    off = ((image + 1 - alpha) - (frame.image + 1 - frame.mask)).detach() * (frame.unsure == 0)
+    off = ((image + 1 - alpha) - (frame.image + 1 - frame.mask)).detach() * (
+        frame.unsure == 0
+    )
     assert float(found["alpha"].detach()) == pytest.approx(
         2 * float(0.5 * off.abs().mean() + 3 * off.square().mean()), rel=1e-5
     )
     (slope,) = torch.autograd.grad(found["alpha"], alpha)
     expected = -2 * (0.5 * off.sign() + 6 * off).sum(1, keepdim=True) / off.numel()
     torch.testing.assert_close(slope, expected)
-    assert torch.autograd.grad(found["photometric"], alpha, allow_unused=True) == (None,)
+    assert torch.autograd.grad(found["photometric"], alpha, allow_unused=True) == (
+        None,
+    )
     assert set(terms(replace(weights, alpha=0.0))) == {"photometric"}
 
 
 def test_the_generators_fourth_channel_learns_from_alpha_alone(make):
-    module, _, data = make("size.rgb_skip=false", "training.step_two.perceptual_every=1")
+    module, _, data = make(
+        "size.rgb_skip=false", "training.step_two.perceptual_every=1"
+    )
     frame = data.dataset("train")[0]
     last = module.avatar.generator.paint.weight
     painting = module.avatar(*frame.inputs)
@@ -77,7 +88,9 @@ def test_on_black_step_one_compares_the_splats_alpha_with_the_mask():
     torch.testing.assert_close(slope, 0.3 * off.sign() / off.numel())
     black = without(painting, frame, None, None)
     assert torch.autograd.grad(black, alpha, allow_unused=True) == (None,)
-    assert float((on_black - black).detach()) == pytest.approx(0.3 * float(off.abs().mean()))
+    assert float((on_black - black).detach()) == pytest.approx(
+        0.3 * float(off.abs().mean())
+    )
     # a colour behind her teaches alpha by itself
     over = with_alpha(painting, frame, colour, None)
     assert torch.equal(over, without(painting, frame, colour, None))

@@ -22,7 +22,9 @@ def test_the_average_is_scored_and_comes_back_from_a_checkpoint(make, tmp_path, 
     }
     assert any(name.startswith("generator") for name in moving)
     assert all(not p.requires_grad for p in averaged.values())
-    trainer.save_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt", weights_only=False)
+    trainer.save_checkpoint(
+        tmp_path / "run" / "checkpoints" / "last.ckpt", weights_only=False
+    )
     config = tiny("training.average=0.9", "training.schedule.step_one=0")
     loaded, _ = load_avatar(tmp_path / "run", config, data)
     with torch.no_grad():
@@ -47,9 +49,15 @@ def test_the_average_follows_its_formula():
 
 
 def test_the_average_is_updated_when_the_config_says(make):
-    module, trainer, data = make("training.average_every=5", "training.schedule.step_one=0")
+    module, trainer, data = make(
+        "training.average_every=5", "training.schedule.step_one=0"
+    )
     trainer.fit(module, data)
-    steps = range(module.schedule.total - module.schedule.step_two, module.schedule.total)
+    steps = range(
+        module.schedule.total - module.schedule.step_two, module.schedule.total
+    )
     assert int(module.average.copy.n_averaged) == sum(step % 5 == 0 for step in steps)
-    with pytest.raises(ConfigError, match="average_every must be a number of at least 1"):
+    with pytest.raises(
+        ConfigError, match="average_every must be a number of at least 1"
+    ):
         make("training.average_every=0")

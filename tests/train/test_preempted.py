@@ -18,7 +18,9 @@ SLURM = {"SLURM_JOB_ID": "7", "SLURM_NTASKS": "1", "SLURM_NTASKS_PER_NODE": "1",
 @pytest.fixture
 def asked_at(monkeypatch):
     """``asked_at(5)``: SIGUSR1 in that iteration; afterwards the handlers are as before."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGUSR1, signal.SIGUSR2)}
+    before = {
+        number: signal.getsignal(number) for number in (signal.SIGUSR1, signal.SIGUSR2)
+    }
     step, handlers = AvatarTraining.training_step, []
 
     def run(number: int):
@@ -36,9 +38,16 @@ def asked_at(monkeypatch):
         signal.signal(number, handler)
 
 
-def test_a_preempted_run_ends_with_the_same_weights(capture, tmp_path, inside, asked_at):
+def test_a_preempted_run_ends_with_the_same_weights(
+    capture, tmp_path, inside, asked_at
+):
     def train(name: str):
-        given = ("model=splat_only", "evaluate=false", "trainer=cpu", f"data.root={capture}")
+        given = (
+            "model=splat_only",
+            "evaluate=false",
+            "trainer=cpu",
+            f"data.root={capture}",
+        )
         result = inside("train", *TINY, *given, f"hydra.run.dir={tmp_path / name}")
         path = tmp_path / name / "checkpoints" / "last.ckpt"
         return result, torch.load(path, weights_only=True)
@@ -51,7 +60,8 @@ def test_a_preempted_run_ends_with_the_same_weights(capture, tmp_path, inside, a
         handlers = asked_at(5)
         stopped, state = train("stopped")
     assert stopped.returncode == STOPPED, stopped.stderr
-    assert "stopped by a signal at iteration 8" in stopped.stdout  # the end of its epoch
+    # the end of its epoch
+    assert "stopped by a signal at iteration 8" in stopped.stdout
     assert state["gsgan"]["step"] == 8
     assert "StopOnSignal" in str(handlers[0])  # Lightning's requeueing left it in place
     resumed, found = train("stopped")

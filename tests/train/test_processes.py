@@ -51,7 +51,10 @@ class SpoilOne(Callback):
 
 def test_processes_skip_together_and_stop_together(make):
     module, trainer, data = make(
-        "training.max_skipped=3", callbacks=[SpoilOne()], use_distributed_sampler=False, **TWO
+        "training.max_skipped=3",
+        callbacks=[SpoilOne()],
+        use_distributed_sampler=False,
+        **TWO,
     )
     with pytest.raises(Exception, match="stopped at iteration 7: 3 of the last"):
         trainer.fit(module, data)

@@ -68,7 +68,9 @@ def waits(tiny, tmp_path):
 
     def run(phase: str, change=lambda module: None):
         phases = ("segmentation", "step_one", "step_two")
-        schedule = [f"training.schedule.{name}={3 * (name == phase)}" for name in phases]
+        schedule = [
+            f"training.schedule.{name}={3 * (name == phase)}" for name in phases
+        ]
         always = ("training.schedule.discriminator_start=0", "model.backend=native")
         data, module = build_training(tiny(*schedule, *always))
         change(module)
@@ -105,7 +107,10 @@ def test_a_read_that_is_added_is_counted(waits):
 
         module.training_step = with_a_read
 
-    plain, added = Counter(waits("step_one")[-1]), Counter(waits("step_one", change)[-1])
+    plain, added = (
+        Counter(waits("step_one")[-1]),
+        Counter(waits("step_one", change)[-1]),
+    )
     assert added - plain == Counter(["test_reads: __float__"])
 
 

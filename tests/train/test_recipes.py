@@ -26,10 +26,13 @@ def recipe(starter: str) -> list[str]:
 
 
 @pytest.mark.parametrize("starter", STARTERS)
-def test_a_recipe_makes_one_training_of_all_its_processes(starter, compose, monkeypatch):
+def test_a_recipe_makes_one_training_of_all_its_processes(
+    starter, compose, monkeypatch
+):
     words = recipe(starter)
     arguments = words[words.index("gsgan.train") + 1 :]
-    assert any(word.startswith("hydra.run.dir=") for word in arguments)  # else one by process
+    # else one by process
+    assert any(word.startswith("hydra.run.dir=") for word in arguments)
     for variable in STARTERS[starter].split():
         monkeypatch.setenv(*variable.split("="))
     given = [a for a in arguments if not a.startswith("hydra.")]

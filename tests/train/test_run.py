@@ -10,16 +10,22 @@ from gsgan.train.run import device_of, remove_old_results
 def test_starting_over_removes_an_earlier_runs_results_and_logs(tmp_path):
     for name in ("logs", "logs_000150"):
         (tmp_path / name).mkdir()
-        (tmp_path / name / "metrics.csv").write_text("step,val/psnr,val/seconds\n1,20,3\n")
+        (tmp_path / name / "metrics.csv").write_text(
+            "step,val/psnr,val/seconds\n1,20,3\n"
+        )
     (tmp_path / "metrics.json").write_text("{}")
     (tmp_path / "notes.txt").write_text("mine")
     remove_old_results(tmp_path)
-    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["notes.txt"]
+    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == [
+        "notes.txt"
+    ]
 
 
 @pytest.mark.parametrize("launcher", ["LOCAL_RANK", "SLURM_LOCALID"])
 @pytest.mark.parametrize(("devices", "expected"), [("auto", 2), ([4, 5, 7], 7)])
-def test_every_process_probes_and_fits_on_its_own_gpu(monkeypatch, launcher, devices, expected):
+def test_every_process_probes_and_fits_on_its_own_gpu(
+    monkeypatch, launcher, devices, expected
+):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     for name in ("LOCAL_RANK", "SLURM_LOCALID"):
         monkeypatch.delenv(name, raising=False)

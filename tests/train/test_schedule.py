@@ -10,7 +10,9 @@ from gsgan.utils.errors import ConfigError
 
 def test_phases_follow_each_other():
     s = Schedule(segmentation=2, step_one=3, step_two=4, discriminator_start=1, epoch=4)
-    assert [s.phase(i) for i in range(9)] == [SEGMENTATION] * 2 + [STEP_ONE] * 3 + [STEP_TWO] * 4
+    assert [s.phase(i) for i in range(9)] == [SEGMENTATION] * 2 + [STEP_ONE] * 3 + [
+        STEP_TWO
+    ] * 4
     assert s.total == 9
     assert [s.adversarial(i) for i in range(9)] == [False] * 6 + [True] * 3
     assert s.bounds(STEP_TWO) == (5, 9)
@@ -21,7 +23,12 @@ def test_phases_follow_each_other():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"segmentation": -1}, {"epoch": 0}, {"segmentation": 0, "step_one": 0, "step_two": 0}]
+    "wrong",
+    [
+        {"segmentation": -1},
+        {"epoch": 0},
+        {"segmentation": 0, "step_one": 0, "step_two": 0},
+    ],
 )
 def test_impossible_schedules_are_refused(wrong):
     with pytest.raises(ConfigError, match="schedule"):
@@ -57,7 +64,15 @@ def test_rate_warms_up():
 
 def test_the_degree_is_raised_by_the_schedule():
     schedule = Schedule(10, 30, 30, degree_every=20)
-    assert [schedule.degree(s, 3) for s in (0, 9, 29, 30, 49, 50, 69)] == [0, 0, 0, 1, 1, 2, 2]
+    assert [schedule.degree(s, 3) for s in (0, 9, 29, 30, 49, 50, 69)] == [
+        0,
+        0,
+        0,
+        1,
+        1,
+        2,
+        2,
+    ]
     assert schedule.degree(69, 1) == 1
     assert Schedule(10, 30, 30).degree(0, 3) == 3  # 0: all at once
     with pytest.raises(ConfigError, match="degree_every"):
@@ -65,8 +80,12 @@ def test_the_degree_is_raised_by_the_schedule():
 
 
 def test_f_is_supersampled_after_the_coarse_iterations_of_step_one():
-    schedule = Schedule(segmentation=10, step_one=30, step_two=30, coarse=20, stretch=0.5)
-    fitted = schedule.fitted(segmentation=True, from_masks=False, splats=True, generator=True)
+    schedule = Schedule(
+        segmentation=10, step_one=30, step_two=30, coarse=20, stretch=0.5
+    )
+    fitted = schedule.fitted(
+        segmentation=True, from_masks=False, splats=True, generator=True
+    )
     assert [fitted.fine(step) for step in (9, 10, 19, 20, 25, 39)] == [
         True,
         False,

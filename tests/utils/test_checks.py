@@ -17,7 +17,10 @@ def test_good_values_come_back():
 @pytest.mark.parametrize(
     ("check", "message"),
     [
-        (lambda: at_least("data.seed", -1, 0), "data.seed must be a number of at least 0, got -1"),
+        (
+            lambda: at_least("data.seed", -1, 0),
+            "data.seed must be a number of at least 0, got -1",
+        ),
         (lambda: at_least("a", True, 0), "a must be a number of at least 0, got True"),
         (lambda: at_least("a", float("nan"), 0), "got nan"),
         (lambda: at_least("a", "1", 0), "got '1'"),

@@ -9,7 +9,13 @@ import torch
 from omegaconf import OmegaConf
 
 from gsgan.scene import Camera
-from gsgan.utils.config import LONGEST_NAME, config_folder, folder_name, one_sentence, spelled_out
+from gsgan.utils.config import (
+    LONGEST_NAME,
+    config_folder,
+    folder_name,
+    one_sentence,
+    spelled_out,
+)
 from gsgan.utils.errors import ConfigError, DataError
 
 SRC = Path(__file__).parents[2] / "src" / "gsgan"
@@ -19,7 +25,16 @@ def options(group: str) -> list[str]:
     return sorted(path.stem for path in (config_folder() / group).glob("[!_]*.yaml"))
 
 
-GROUPS = ("model", "data", "effects", "trainer", "logger", "size", "training", "accuracy")
+GROUPS = (
+    "model",
+    "data",
+    "effects",
+    "trainer",
+    "logger",
+    "size",
+    "training",
+    "accuracy",
+)
 
 
 def test_every_option_composes(compose):
@@ -42,7 +57,11 @@ def test_every_option_composes(compose):
 def differences(a, b, at: str = "") -> set[str]:
     if isinstance(a, dict) and isinstance(b, dict):
         keys = set(a) | set(b)
-        return {x for k in keys for x in differences(a.get(k), b.get(k), f"{at}.{k}".strip("."))}
+        return {
+            x
+            for k in keys
+            for x in differences(a.get(k), b.get(k), f"{at}.{k}".strip("."))
+        }
     return set() if a == b else {at}
 
 
@@ -62,7 +81,9 @@ def differences(a, b, at: str = "") -> set[str]:
         ),
     ],
 )
-def test_an_ablation_changes_what_it_says_and_nothing_else(compose, model, changed, experiment):
+def test_an_ablation_changes_what_it_says_and_nothing_else(
+    compose, model, changed, experiment
+):
     chosen = [] if experiment is None else [f"experiment={experiment}"]
     full = OmegaConf.to_container(compose("train", *chosen))
     other = OmegaConf.to_container(compose("train", *chosen, f"model={model}"))
@@ -80,7 +101,9 @@ def test_every_top_level_key_is_read_by_code(compose):
     for name in ("train", "evaluate"):
         for key in compose(name):
             named = rf'(config|stored)\.({key}\b|get\("{key}"\))'
-            read = re.search(named, code) or re.search(rf"\$\{{(oc\.select:)?{key}\b", yaml)
+            read = re.search(named, code) or re.search(
+                rf"\$\{{(oc\.select:)?{key}\b", yaml
+            )
             assert read, f"conf/{name}.yaml: {key} is read by nothing"
 
 
@@ -88,7 +111,9 @@ def test_every_size_key_is_used(compose):
     yaml = "\n".join(path.read_text() for path in config_folder().rglob("*.yaml"))
     keys = set(compose("train").size)
     for key in keys:
-        assert re.search(rf"\$\{{.*\bsize\.{key}\b", yaml), f"size.{key} is read by nothing"
+        assert re.search(rf"\$\{{.*\bsize\.{key}\b", yaml), (
+            f"size.{key} is read by nothing"
+        )
     for size in options("size"):
         assert set(compose("train", f"size={size}").size) == keys, size
 
@@ -116,7 +141,10 @@ def test_bugs_keep_their_traceback_and_mistakes_get_a_sentence():
     [
         ("effects.view_dependence=7", "effects.view_dependence must be one of"),
         ("model.generator.patch=3", "patch must be one of 1, 2, 4"),
-        ("training.schedule.step_two=-1", "schedule.step_two must be a number of at least 0"),
+        (
+            "training.schedule.step_two=-1",
+            "schedule.step_two must be a number of at least 0",
+        ),
         ("+model.densify.colour=1", "unexpected keyword argument 'colour'"),
         ("+model.generator.colour=1", "unexpected keyword argument 'colour'"),
         ("training.perceptual.weights=resnet", "pretrained, random"),
@@ -140,7 +168,8 @@ def test_unknown_values_become_one_sentence(tiny, override, named):
         ("effects=[body_points,antialias]", "effects.only=[body_points,antialias]"),
         ("effects=[]", "effects.only=[]"),
         ("effects=none", "effects=none"),
-        ("effects=[body_points],[antialias]", "effects=[body_points],[antialias]"),  # Hydra's sweep
+        # Hydra's sweep
+        ("effects=[body_points],[antialias]", "effects=[body_points],[antialias]"),
         ("data.train_cameras=[cam00]", "data.train_cameras=[cam00]"),
     ],
 )
@@ -154,22 +183,34 @@ def test_keys_of_another_capture_are_those_of_a_runs_data():
     assert spelled_out("on.source.motion=far", "render") == "on.source.motion=far"
 
 
-MANY = [f"training.recipes.psi.rate.{key}=0.{i}" for i, key in enumerate(("hold", "final"))] + [
-    f"training.step_two.{key}=0.25" for key in ("l1", "l2", "ssim", "perceptual", "anchor")
+MANY = [
+    f"training.recipes.psi.rate.{key}=0.{i}" for i, key in enumerate(("hold", "final"))
+] + [
+    f"training.step_two.{key}=0.25"
+    for key in ("l1", "l2", "ssim", "perceptual", "anchor")
 ]
 
 
-@pytest.mark.parametrize("experiment", [[], ["experiment=study"], ["experiment=ablation_capture"]])
+@pytest.mark.parametrize(
+    "experiment", [[], ["experiment=study"], ["experiment=ablation_capture"]]
+)
 def test_a_sweep_folder_has_a_name_that_file_systems_take(experiment, tmp_path):
     from hydra import compose, initialize_config_dir
     from omegaconf import open_dict
 
-    given = [*experiment, *MANY, "data.val_images=3", "effects.only=[a,b]", "logger=csv"]
+    given = [
+        *experiment,
+        *MANY,
+        "data.val_images=3",
+        "effects.only=[a,b]",
+        "logger=csv",
+    ]
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         config = compose("train", overrides=given, return_hydra_config=True)
     with open_dict(config):
         config.hydra.job.num = 7
-    assert Path(config.hydra.sweep.dir).parts[0] == "runs"  # without Hydra's own resolver
+    # without Hydra's own resolver
+    assert Path(config.hydra.sweep.dir).parts[0] == "runs"
     name = config.hydra.sweep.subdir
     assert len(name.encode()) <= LONGEST_NAME + 2
     assert not set(name) & set("[],=/ ")
@@ -192,7 +233,12 @@ def test_two_runs_of_a_sweep_never_share_a_folder():
 
 @pytest.mark.parametrize(
     ("capability", "precision"),
-    [((7, 0), "32-true"), ((7, 5), "32-true"), ((8, 0), "bf16-mixed"), ((12, 0), "bf16-mixed")],
+    [
+        ((7, 0), "32-true"),
+        ((7, 5), "32-true"),
+        ((8, 0), "bf16-mixed"),
+        ((12, 0), "bf16-mixed"),
+    ],
 )
 def test_bf16_only_on_gpus_that_have_it(monkeypatch, capability, precision):
     from gsgan.utils.config import gpu_precision

@@ -53,7 +53,9 @@ def test_what_hydra_reads_stays(argument, value):
     assert OmegaConf.create({"v": found}).v == value or str(found) == value
 
 
-@pytest.mark.parametrize("argument", ["--help", "-m", "hydra/launcher=joblib", "~model", "key"])
+@pytest.mark.parametrize(
+    "argument", ["--help", "-m", "hydra/launcher=joblib", "~model", "key"]
+)
 def test_flags_and_groups_are_left_alone(argument):
     assert quoted(argument) == argument
 

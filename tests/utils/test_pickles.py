@@ -90,7 +90,9 @@ def test_plain_npy_and_npz(tmp_path):
     found = read_npy(tmp_path / "plain.npy")
     np.testing.assert_array_equal(found, np.arange(6.0).reshape(2, 3).T)
     found[0, 0] = 1  # the caller's own
-    np.savez_compressed(tmp_path / "a.npz", poses=np.ones(3), extra=np.array({"a": 1}, object))
+    np.savez_compressed(
+        tmp_path / "a.npz", poses=np.ones(3), extra=np.array({"a": 1}, object)
+    )
     assert read_npz(tmp_path / "a.npz")["extra"] == {"a": 1}
     assert list(read_npz(tmp_path / "a.npz", ["poses", "absent"])) == ["poses"]
 
@@ -117,7 +119,10 @@ def attacks(marker: Path) -> dict[str, tuple[bytes, str]]:
     python = f"open({str(marker)!r}, 'w')"
     arguments = _text(command)
     found = {
-        f"reduce {p}": (pickle.dumps(Reduced(os.system, command), p), r"(posix|nt)\.system")
+        f"reduce {p}": (
+            pickle.dumps(Reduced(os.system, command), p),
+            r"(posix|nt)\.system",
+        )
         for p in range(6)
     }
     state = pickle.dumps(Reduced(eval, python), 2)[2:-1]
@@ -169,7 +174,9 @@ ARRAY = b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(I0\ntS'b'\ntR
 
 
 def dtype(spec: bytes) -> bytes:
-    return b"cnumpy\ndtype\n(S'" + spec + b"'\nI0\nI1\ntR(I3\nS'<'\nNNNI-1\nI-1\nI63\ntb"
+    return (
+        b"cnumpy\ndtype\n(S'" + spec + b"'\nI0\nI1\ntR(I3\nS'<'\nNNNI-1\nI-1\nI63\ntb"
+    )
 
 
 def array(shape: bytes, kind: bytes, content: bytes) -> bytes:
@@ -183,28 +190,45 @@ def sparse(**state: object) -> bytes:
 CHUMPY, ENCODE = b"cchumpy.ch\nCh\n", b"c_codecs\nencode\n"
 NONE = np.zeros(0, int)
 MISUSES = {
-    "a shape without its bytes": (array(b"I1000000000000\n", dtype(b"f8"), b"S''\n"), "other con"),
+    "a shape without its bytes": (
+        array(b"I1000000000000\n", dtype(b"f8"), b"S''\n"),
+        "other con",
+    ),
     "one object for many": (array(b"I9\n", dtype(b"O8"), b"(lNa"), "other content"),
-    "bytes as objects": (array(b"I1\n", dtype(b"O8"), b"S'12345678'\n"), "no list of them"),
-    "a negative shape": (array(b"I-1\nI-1\n", dtype(b"f8"), b"S'12345678'\n"), "other content"),
+    "bytes as objects": (
+        array(b"I1\n", dtype(b"O8"), b"S'12345678'\n"),
+        "no list of them",
+    ),
+    "a negative shape": (
+        array(b"I-1\nI-1\n", dtype(b"f8"), b"S'12345678'\n"),
+        "other content",
+    ),
     "a record type": (array(b"I1\n", dtype(b"V8"), b"S'12345678'\n"), "type 'V8'"),
     "several types in one": (dtype(b"f8,O") + b".", "type 'f8,O'"),
     "a new array outright": (b"cnumpy\nndarray\n(I9\ntR.", "not callable"),
     "code for a function": (ENCODE + b"(N(dS'__code__'\nNstb.", "__code__ must be set"),
-    "a state for a stand-in class": (CHUMPY + b"(N(dS'array'\nNstb.", "missing 1 required"),
+    "a state for a stand-in class": (
+        CHUMPY + b"(N(dS'array'\nNstb.",
+        "missing 1 required",
+    ),
     "a stand-in without its array": (
         python2.dumps(python2.Instance("chumpy.ch", "Ch", {"y": 1})),
         "valid pickle .'x'",
     ),
     "a sparse row out of bounds": (
-        sparse(_shape=(2, 1), data=np.ones(1), indices=NONE + 7, indptr=np.array([0, 1])),
+        sparse(
+            _shape=(2, 1), data=np.ones(1), indices=NONE + 7, indptr=np.array([0, 1])
+        ),
         "ind",
     ),
     "a sparse matrix of a petabyte": (
         sparse(_shape=(10**8, 10**7), data=np.ones(0), indices=NONE, indptr=NONE),
         "sparse matrix of shape",
     ),
-    "bytes that are not there": (b"\x8e" + struct.pack("<Q", 10**12) + b"x.", "EOFError"),
+    "bytes that are not there": (
+        b"\x8e" + struct.pack("<Q", 10**12) + b"x.",
+        "EOFError",
+    ),
     "nothing": (b"", "valid pickle"),
     "a web page": (b"<!DOCTYPE html><html>not found</html>", "valid pickle"),
 }
@@ -226,7 +250,9 @@ def test_a_missing_file_and_a_folder(tmp_path, read):
         read(tmp_path)
 
 
-@pytest.mark.parametrize("kind", ["protocol 0", "protocol 2", "protocol 4", "npy", "npz"])
+@pytest.mark.parametrize(
+    "kind", ["protocol 0", "protocol 2", "protocol 4", "npy", "npz"]
+)
 def test_damage_is_read_or_refused_and_nothing_else(tmp_path, kind):
     smpl_like = {
         "v": np.arange(6.0),

@@ -21,7 +21,9 @@ def hydra_config(*overrides: str):
     from hydra import compose, initialize_config_dir
 
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
-        return compose("train", overrides=list(overrides), return_hydra_config=True).hydra
+        return compose(
+            "train", overrides=list(overrides), return_hydra_config=True
+        ).hydra
 
 
 def plugin(name: str):
@@ -94,16 +96,25 @@ def test_a_job_is_the_same_command_in_the_same_folder(tmp_path, monkeypatch):
     (tmp_path / "it's").mkdir()
     monkeypatch.setattr(sweeps.HydraConfig, "get", lambda: settings)
     commands = []
-    monkeypatch.setattr(sweeps, "_status", lambda command: commands.append(command) or 0)
+    monkeypatch.setattr(
+        sweeps, "_status", lambda command: commands.append(command) or 0
+    )
     sweeps.run_job("train", None)
-    own = ["hydra.mode=RUN", f"hydra.run.dir='{tmp_path}/it\\'s'", "--config-dir", "/own"]
+    own = [
+        "hydra.mode=RUN",
+        f"hydra.run.dir='{tmp_path}/it\\'s'",
+        "--config-dir",
+        "/own",
+    ]
     given = ["seed=1", "logger=csv", "hydra.verbose=true", *own]
     assert commands == [[sys.executable, "-m", "gsgan.train", *given]]
 
 
 def test_a_signal_reaches_the_job_first_then_the_launcher(tmp_path):
     order = tmp_path / "order"
-    before = signal.signal(signal.SIGUSR2, lambda *_: order.open("a").write("launcher\n"))
+    before = signal.signal(
+        signal.SIGUSR2, lambda *_: order.open("a").write("launcher\n")
+    )
     asks = f"sleep 0.5; kill -USR2 {os.getpid()}; sleep 5 & wait"
     try:
         line = f"trap 'echo job >> {order}; exit 75' USR2; {asks}"
@@ -120,14 +131,23 @@ def test_a_signal_reaches_the_job_first_then_the_launcher(tmp_path):
 def test_slurm_gets_one_task_per_device():
     given = ("trainer=ddp", "trainer.devices=4", "trainer.num_nodes=2")
     launcher = hydra_config("hydra/launcher=slurm", *given).launcher
-    assert (launcher.tasks_per_node, launcher.gpus_per_node, launcher.nodes) == (4, 4, 2)
+    assert (launcher.tasks_per_node, launcher.gpus_per_node, launcher.nodes) == (
+        4,
+        4,
+        2,
+    )
     assert launcher.max_num_timeout > 0
-    assert hydra_config("hydra/launcher=slurm", "trainer=gpu").launcher.tasks_per_node == 1
+    assert (
+        hydra_config("hydra/launcher=slurm", "trainer=gpu").launcher.tasks_per_node == 1
+    )
 
 
 def sweep(folder: Path, capture: Path, *given: str) -> subprocess.CompletedProcess[str]:
     fixed = [*TINY, f"data.root={capture}", f"hydra.sweep.dir={folder}", "trainer=cpu"]
-    fixed += [f"training.schedule.{name}=1" for name in ("step_one", "step_two", "segmentation")]
+    fixed += [
+        f"training.schedule.{name}=1"
+        for name in ("step_one", "step_two", "segmentation")
+    ]
     command = [sys.executable, "-m", "gsgan.train", "-m", *fixed, *given]
     return subprocess.run(command, check=False, capture_output=True, text=True)
 
@@ -136,7 +156,8 @@ def sweep(folder: Path, capture: Path, *given: str) -> subprocess.CompletedProce
     "launcher",
     [
         pytest.param(
-            ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2"), marks=plugin("joblib_launcher")
+            ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2"),
+            marks=plugin("joblib_launcher"),
         ),
         pytest.param(
             ("hydra/launcher=ray", "+hydra.launcher.ray.init.num_cpus=2"),
@@ -159,11 +180,20 @@ def test_a_failed_job_is_named_and_ends_no_other(capture, tmp_path, launcher):
 @pytest.mark.slow
 @plugin("optuna_sweeper")
 def test_a_search_that_is_started_again_repeats_nothing(capture, tmp_path):
-    given = ("experiment=search", "hydra.sweeper.n_trials=2", "objective=novel_pose.full.psnr")
+    given = (
+        "experiment=search",
+        "hydra.sweeper.n_trials=2",
+        "objective=novel_pose.full.psnr",
+    )
     first = sweep(tmp_path / "sweep", capture, *given, "hydra.sweeper.n_jobs=1")
     assert first.returncode == 0, first.stdout + first.stderr
-    found = {path: path.stat().st_mtime_ns for path in (tmp_path / "sweep").rglob("metrics.json")}
+    found = {
+        path: path.stat().st_mtime_ns
+        for path in (tmp_path / "sweep").rglob("metrics.json")
+    }
     assert len(found) == 2
     again = sweep(tmp_path / "sweep", capture, *given, "hydra.sweeper.n_jobs=1")
     assert again.stdout.count("trained and scored before") == 2
-    assert found == {p: p.stat().st_mtime_ns for p in (tmp_path / "sweep").rglob("metrics.json")}
+    assert found == {
+        p: p.stat().st_mtime_ns for p in (tmp_path / "sweep").rglob("metrics.json")
+    }

@@ -21,7 +21,8 @@ def test_freed_memory_is_not_mapped_again():
 
     keep_freed_memory()
     faults()
-    assert faults() < 16_000  # a tenth of what is mapped otherwise; a heap in use needs some
+    # a tenth of what is mapped otherwise; a heap in use needs some
+    assert faults() < 16_000
 
 
 def test_full_precision_turns_autocast_and_tf32_off_and_restores_them():

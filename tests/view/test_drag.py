@@ -35,7 +35,9 @@ def test_a_joint_goes_to_the_pointer_where_bones_reach(name):
     elif name == BODY:
         target = start + np.array([1.0, 2.0, 3.0])
     else:  # on the sphere about the joint before it
-        pivot = (REST[11] + REST[12]) / 2 if name == HEAD else REST[HANDLES[name].chain[0]]
+        pivot = (
+            (REST[11] + REST[12]) / 2 if name == HEAD else REST[HANDLES[name].chain[0]]
+        )
         side = start - pivot
         target = pivot + np.linalg.norm(side) * np.array([0.0, 0.6, 0.8])
     moved = dragged(REST, name, target)
@@ -54,7 +56,9 @@ def test_a_straight_limb_bends():
 def test_out_of_reach_is_straight():
     far = dragged(REST, "left wrist", np.array([9.0, 1.4, 0.0]))
     upper, lower = far[13] - far[11], far[15] - far[13]
-    assert upper @ lower / np.linalg.norm(upper) / np.linalg.norm(lower) == pytest.approx(1)
+    assert upper @ lower / np.linalg.norm(upper) / np.linalg.norm(
+        lower
+    ) == pytest.approx(1)
 
 
 @pytest.mark.parametrize(
@@ -67,7 +71,9 @@ def test_hands_and_face_go_along(name, joints):
     target = position(rest, name) + np.array([0.1, 0.2, 0.1])
     moved = dragged(rest, name, target)
     assert np.linalg.norm(moved[joints] - rest[joints], axis=-1).min() > 0.02
-    before, after = (np.linalg.norm(p[joints] - p[joints[0]], axis=-1) for p in (rest, moved))
+    before, after = (
+        np.linalg.norm(p[joints] - p[joints[0]], axis=-1) for p in (rest, moved)
+    )
     np.testing.assert_allclose(after, before, atol=1e-9)
     np.testing.assert_array_equal(moved[54:75], rest[54:75])
     np.testing.assert_array_equal(moved[:33], dragged(rest[:33], name, target))

@@ -48,7 +48,9 @@ def test_visers_server_refuses_them():
     try:
         address = f"127.0.0.1:{server.get_port()}"
         version = [f"viser-v{viser.__version__}"]
-        with connect(f"ws://{address}", origin=f"http://{address}", subprotocols=version):
+        with connect(
+            f"ws://{address}", origin=f"http://{address}", subprotocols=version
+        ):
             pass
         for origin in ("http://evil.example", "null"):
             with pytest.raises(InvalidStatus, match="403"):

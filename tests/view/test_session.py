@@ -39,7 +39,9 @@ class Page:
             numbers = [x for x in given[1:] if isinstance(x, int)]
             self.added.append((name, given))
             options = given[1] if name == "add_dropdown" else ()
-            return Control(value=numbers[-1] if numbers else value, options=options, content="")
+            return Control(
+                value=numbers[-1] if numbers else value, options=options, content=""
+            )
 
         return add
 
@@ -59,7 +61,10 @@ def test_every_layer_is_rendered_from_a_bare_skeleton(run, compose):
         on_update=lambda _: None,
     )  # fmt: skip
     client = SimpleNamespace(
-        gui=Page(), scene=Page(), camera=camera, add_notification=lambda *given, **_: given
+        gui=Page(),
+        scene=Page(),
+        camera=camera,
+        add_notification=lambda *given, **_: given,
     )
     session = Session(client, show, lambda: None)
     session.camera = lambda share: view[:1]

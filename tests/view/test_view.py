@@ -42,7 +42,9 @@ def open_page(viewer, chromium):
         pages.append(page)
         page.on("pageerror", lambda error: problems.append(str(error)))
         page.on("console", lambda m: problems.append(m.text) if is_problem(m) else None)
-        page.goto(f"http://127.0.0.1:{viewer.server.get_port()}", timeout=1000 * PATIENCE)
+        page.goto(
+            f"http://127.0.0.1:{viewer.server.get_port()}", timeout=1000 * PATIENCE
+        )
         until(lambda: set(viewer.sessions) - known, page)
         session = viewer.sessions[(set(viewer.sessions) - known).pop()]
         until(lambda: session.full, page)
@@ -80,7 +82,9 @@ def changed(session, page, action) -> bool:
     action()
     with contextlib.suppress(AssertionError):
         until(lambda: session.started > since and session.full, page)
-    return before.shape != session.image.shape or not np.array_equal(before, session.image)
+    return before.shape != session.image.shape or not np.array_equal(
+        before, session.image
+    )
 
 
 def test_the_image_arrives_and_follows_slider_camera_and_joint(open_page):
@@ -201,7 +205,9 @@ def test_the_image_is_saved(open_page):
     with page.expect_download() as got:
         page.get_by_text("save the image").click()
     content = got.value.path().read_bytes()
-    np.testing.assert_array_equal(np.asarray(Image.open(BytesIO(content))), session.image)
+    np.testing.assert_array_equal(
+        np.asarray(Image.open(BytesIO(content))), session.image
+    )
     assert b"trainedAlgorithmicMedia" in content
 
 
@@ -218,7 +224,9 @@ def test_an_ipv6_address(bare, compose):
         socket.create_server(("::1", 0), family=socket.AF_INET6).close()
     except OSError:
         pytest.skip("no IPv6 here")
-    viewer = Viewer(compose("view", f"run={bare}", "host='::1'", "port=0", "motion=rest"))
+    viewer = Viewer(
+        compose("view", f"run={bare}", "host='::1'", "port=0", "motion=rest")
+    )
     try:
         assert viewer.address == f"http://[::1]:{viewer.server.get_port()}"
         assert urlopen(viewer.address).status == 200
@@ -227,10 +235,15 @@ def test_an_ipv6_address(bare, compose):
 
 
 def test_another_machines_address_is_refused(bare, inside):
-    refused(inside("view", f"run={bare}", "host=203.0.113.1", "motion=rest"), "host=203.0.113.1")
+    refused(
+        inside("view", f"run={bare}", "host=203.0.113.1", "motion=rest"),
+        "host=203.0.113.1",
+    )
     refused(inside("view", f"run={bare}", "port=70000", "motion=rest"), "port must be")
     refused(inside("view"), "run is not set")
-    refused(inside("view", f"run={bare}", "motion=none.bvh"), "none.bvh", "does not exist")
+    refused(
+        inside("view", f"run={bare}", "motion=none.bvh"), "none.bvh", "does not exist"
+    )
 
 
 def test_a_pose_that_cannot_be_rendered_is_reported(open_page):

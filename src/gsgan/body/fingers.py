@@ -21,7 +21,8 @@ SPREAD = ((0.7, 0.5, 0.4, 0.8, 0.15), (0.8, 0.2, 0.2, 1.0, 0.03))
 LEAST = ((-0.8, -0.8, -0.8, -0.6, -0.3), (-0.6, -0.45, -0.4, -0.2, -0.1))
 MOST = ((1.2, 0.8, 0.8, 2.0, 0.3), (1.75, 0.45, 0.4, 2.6, 0.1))
 NOISE = 0.004  # metres, standard deviation of a landmark
-ROUNDS = (1, 2)  # Gauss-Newton steps of the fingers per round; each round then places the hand
+# Gauss-Newton steps of the fingers per round; each round then places the hand
+ROUNDS = (1, 2)
 PLACING = 3  # Gauss-Newton steps of a hand's rotation
 TRACE = 1e-4  # of a bone at rest, added to the observed one: a bone of no length rests
 
@@ -58,8 +59,10 @@ class Fingers(nn.Module):
         body: with hand landmarks, in the subject's shape.
     """
 
-    chains: Tensor  # [10, 4] landmarks of each finger, base to tip, the left hand's first
-    joints: Tensor  # [20] of the body: each finger's first joint, then each one's second
+    # [10, 4] landmarks of each finger, base to tip, the left hand's first
+    chains: Tensor
+    # [20] of the body: each finger's first joint, then each one's second
+    joints: Tensor
     rest: Tensor  # [42, 3] landmarks
     palms: Tensor  # [2, 3, 3]
     bones: Tensor  # [10, 3, 3] at rest: base to middle; middle to both landmarks beyond
@@ -71,14 +74,19 @@ class Fingers(nn.Module):
     def __init__(self, body: Body) -> None:
         super().__init__()
         rest = body.hand_landmarks
-        chains = torch.tensor([[start + j for j in f] for start in (0, HAND) for f in FINGERS])
-        palms, bones = palm_frames(rest.unflatten(0, (2, HAND))[:, PALM]), _bones(rest, chains)
+        chains = torch.tensor(
+            [[start + j for j in f] for start in (0, HAND) for f in FINGERS]
+        )
+        palms = palm_frames(rest.unflatten(0, (2, HAND))[:, PALM])
+        bones = _bones(rest, chains)
         thumb = chains[:, 0] % HAND == FINGERS[0][0]
         with torch.no_grad():
             pinky = rest[[PINKY, HAND + PINKY]]
             axes, bend = _axes(bones, palms, pinky, rest[chains[:, :2]], thumb)
         row = (~thumb).long()
-        spread, least, most = (rest.new_tensor(table)[row] for table in (SPREAD, LEAST, MOST))
+        spread = rest.new_tensor(SPREAD)[row]
+        least = rest.new_tensor(LEAST)[row]
+        most = rest.new_tensor(MOST)[row]
         held = {
             "chains": chains,
             "joints": body.hand_bone[chains[:, :2]].mT.flatten(),
@@ -110,22 +118,29 @@ class Fingers(nn.Module):
     def _turned(self, R: Tensor, hands: Tensor, seen: Tensor, steps: int) -> Tensor:
         """Turns ``[B, 20, 3]`` on hands that are turned by ``R [B, 2, 3, 3]`` since rest."""
         R = R.repeat_interleave(len(FINGERS), dim=1)
-        bones = _bones(hands, self.chains) @ R + TRACE * self.bones  # with the palms as they rest
+        # with the palms as they rest
+        bones = _bones(hands, self.chains) @ R + TRACE * self.bones
         lengths = self.bones.norm(dim=-1, keepdim=True)
         bones = lengths * normalize(bones, dim=-1, eps=1e-9)
         weight = seen[:, self.chains[:, 1:]].to(bones) / NOISE**2
         numbers = self._start(bones, weight)
         for _ in range(steps):
-            numbers = (numbers - self._step(numbers, bones, weight)).clamp(self.least, self.most)
+            numbers = (numbers - self._step(numbers, bones, weight)).clamp(
+                self.least, self.most
+            )
         return torch.cat(self._turns(numbers), dim=1)
 
     def _posed(self, turns: Tensor) -> Tensor:
         """``[B, 42, 3]`` landmarks of hands at rest with turned fingers."""
         first, second = axis_angle_to_matrix(turns).chunk(2, dim=1)
-        middle = self.rest[self.chains[:, 0]] + (first @ self.bones[:, 0].unsqueeze(-1)).squeeze(-1)
+        middle = self.rest[self.chains[:, 0]] + (
+            first @ self.bones[:, 0].unsqueeze(-1)
+        ).squeeze(-1)
         beyond = middle.unsqueeze(2) + self.bones[:, 1:] @ (first @ second).mT
         x = torch.cat([middle.unsqueeze(2), beyond], dim=2).flatten(1, 2)
-        return self.rest.expand(len(turns), -1, -1).index_copy(1, self.chains[:, 1:].flatten(), x)
+        return self.rest.expand(len(turns), -1, -1).index_copy(
+            1, self.chains[:, 1:].flatten(), x
+        )
 
     @staticmethod
     def placed(seen: Tensor) -> Tensor:
@@ -150,8 +165,11 @@ class Fingers(nn.Module):
             [(x * seen)[:, :, part].sum(2) for part in (slice(0, 1), slice(1, None))]
             for x in (self.bones, bones)
         )
-        before, parts = torch.eye(3, dtype=bones.dtype, device=bones.device), []
-        for axes, rest, now in zip(self.axes.split([3, 2], dim=1), rests, nows, strict=True):
+        before = torch.eye(3, dtype=bones.dtype, device=bones.device)
+        parts = []
+        for axes, rest, now in zip(
+            self.axes.split([3, 2], dim=1), rests, nows, strict=True
+        ):
             now = (now.unsqueeze(-2) @ before).squeeze(-2)
             turn = shortest_turn(*(normalize(x, dim=-1, eps=1e-9) for x in (rest, now)))
             parts.append((axes @ turn.unsqueeze(-1)).squeeze(-1))
@@ -171,9 +189,14 @@ class Fingers(nn.Module):
         # derivatives by the five numbers
         arms = x, torch.cat([torch.zeros_like(middle), beyond], dim=2)
         own, others = self.axes.split([3, 2], dim=1)
-        axes = own @ left_jacobian(turns[0]).mT, others @ (first @ left_jacobian(turns[1])).mT
+        axes = (
+            own @ left_jacobian(turns[0]).mT,
+            others @ (first @ left_jacobian(turns[1])).mT,
+        )
         moved = [
-            torch.linalg.cross(*torch.broadcast_tensors(axis.unsqueeze(3), arm.unsqueeze(2)))
+            torch.linalg.cross(
+                *torch.broadcast_tensors(axis.unsqueeze(3), arm.unsqueeze(2))
+            )
             for axis, arm in zip(axes, arms, strict=True)
         ]
         J = torch.cat(moved, dim=2)  # [B, 10, 5, 3, 3]
@@ -186,17 +209,23 @@ class Fingers(nn.Module):
 
 def _palms(hands: Tensor) -> Tensor:
     """The palms' landmarks ``[B, 2, 3, ...]`` of ``hands [B, 42, ...]``."""
-    return hands.unflatten(1, (2, HAND)).index_select(2, constant(PALM, hands, torch.int64))
+    return hands.unflatten(1, (2, HAND)).index_select(
+        2, constant(PALM, hands, torch.int64)
+    )
 
 
 def _placed(x: Tensor, hands: Tensor, seen: Tensor, R: Tensor) -> tuple[Tensor, Tensor]:
     """Rotations ``[B, 2, 3, 3]`` and shifts ``[B, 2, 3]`` that move ``x [B, 42, 3]`` nearest to the
     landmarks seen, by Gauss-Newton steps from ``R``. Their gradients are always finite, unlike
     those of an SVD."""
-    x, y, w = (v.unflatten(1, (2, HAND)) for v in (x, hands, seen.to(hands).unsqueeze(-1)))
+    x = x.unflatten(1, (2, HAND))
+    y = hands.unflatten(1, (2, HAND))
+    w = seen.to(hands).unsqueeze(-1).unflatten(1, (2, HAND))
     share = w / w.sum(2, keepdim=True).clamp_min(1)
-    centre, goal = ((share * v).sum(2) for v in (x, y))
-    away, towards = x - centre.unsqueeze(2), y - goal.unsqueeze(2)
+    centre = (share * x).sum(2)
+    goal = (share * y).sum(2)
+    away = x - centre.unsqueeze(2)
+    towards = y - goal.unsqueeze(2)
     eye = torch.eye(3, dtype=x.dtype, device=x.device)
     for _ in range(PLACING):
         now = away @ R.mT
@@ -225,17 +254,20 @@ def _axes(
         places: ``[10, 2, 3]`` of the joints.
         thumb: ``[10]`` bool.
     """
-    along = normalize(torch.stack([bones[:, 0], bones[:, 1:].sum(1)], dim=1), dim=-1)  # [10, 2, 3]
+    # [10, 2, 3]
+    along = normalize(torch.stack([bones[:, 0], bones[:, 1:].sum(1)], dim=1), dim=-1)
     out = palms[..., 2] * palms.new_tensor([[1.0], [-1.0]])
-    out, pinky, straight = (
-        x.repeat_interleave(len(FINGERS), dim=0).unsqueeze(1) for x in (out, pinky, palms[..., 0])
-    )
+    out = out.repeat_interleave(len(FINGERS), dim=0).unsqueeze(1)
+    pinky = pinky.repeat_interleave(len(FINGERS), dim=0).unsqueeze(1)
+    straight = palms[..., 0].repeat_interleave(len(FINGERS), dim=0).unsqueeze(1)
     aim = torch.where(thumb[:, None, None], pinky - places, out)
     flexion = normalize(torch.linalg.cross(along, aim), dim=-1)
     side = torch.linalg.cross(along, flexion)
     before = torch.cat([straight, along[:, :1]], dim=1)
     bend = (torch.linalg.cross(before, along) * flexion).sum(-1)
     bend = torch.where(thumb[:, None], 0.0, torch.atan2(bend, (before * along).sum(-1)))
-    axes = torch.stack([flexion[:, 0], side[:, 0], along[:, 0], flexion[:, 1], side[:, 1]], dim=1)
+    axes = torch.stack(
+        [flexion[:, 0], side[:, 0], along[:, 0], flexion[:, 1], side[:, 1]], dim=1
+    )
     nothing = torch.zeros_like(bend[:, 0])
     return axes, torch.stack([bend[:, 0], nothing, nothing, bend[:, 1], nothing], dim=1)

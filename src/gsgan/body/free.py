@@ -27,7 +27,8 @@ class Body(MarkedBody):
     then the right hand's.
     """
 
-    face_labels: Tensor  # [F] int64 part of each face, see label_names; 0 is the background
+    # [F] int64 part of each face, see label_names; 0 is the background
+    face_labels: Tensor
     face_surface: Tensor  # [F] int64 material of each face, see surface_names
     surface_names: tuple[str, ...]  # skin, hair, eye and the garments
     landmark_names: tuple[str, ...]
@@ -91,8 +92,16 @@ def _body(arrays: dict[str, np.ndarray]) -> Body:
         return tuple(str(n) for n in arrays[name])
 
     weight = torch.from_numpy(arrays["bone_weight"].astype(np.float32))
-    faces, face_labels = tensor("faces"), tensor("face_labels")
-    stored = ("vertices", "bone_index", "joints", "face_surface", "landmarks", "landmark_bone")
+    faces = tensor("faces")
+    face_labels = tensor("face_labels")
+    stored = (
+        "vertices",
+        "bone_index",
+        "joints",
+        "face_surface",
+        "landmarks",
+        "landmark_bone",
+    )
     named = ("joint", "label", "surface", "landmark", "hand")
     fields: dict[str, Any] = {
         **{name: tensor(name) for name in (*stored, "hand_landmarks", "hand_bone")},
@@ -103,7 +112,9 @@ def _body(arrays: dict[str, np.ndarray]) -> Body:
         bone_weight=weight / weight.sum(dim=1, keepdim=True),
         parents=tuple(int(p) for p in arrays["parents"]),
         face_labels=face_labels,
-        vertex_labels=majority_vertex_labels(faces, face_labels, len(arrays["vertices"])),
+        vertex_labels=majority_vertex_labels(
+            faces, face_labels, len(arrays["vertices"])
+        ),
         template=fields["vertices"],
         **fields,
     )

@@ -38,7 +38,9 @@ def shortest_turn(a: Tensor, b: Tensor) -> Tensor:
     """Axis-angle ``[..., 3]`` of the shortest rotations from unit ``a`` to ``b [..., 3]``."""
     axis = torch.linalg.cross(a, b)
     sine = axis.norm(dim=-1, keepdim=True)
-    return axis * torch.atan2(sine, (a * b).sum(-1, keepdim=True)) / sine.clamp_min(1e-6)
+    return (
+        axis * torch.atan2(sine, (a * b).sum(-1, keepdim=True)) / sine.clamp_min(1e-6)
+    )
 
 
 def left_jacobian(v: Tensor) -> Tensor:
@@ -48,7 +50,9 @@ def left_jacobian(v: Tensor) -> Tensor:
     safe = torch.where(small, torch.ones_like(squared), squared)
     angle = safe.sqrt()
     a = torch.where(small, 0.5 - squared / 24, (1 - angle.cos()) / safe)
-    b = torch.where(small, 1 / 6 - squared / 120, (angle - angle.sin()) / (safe * angle))
+    b = torch.where(
+        small, 1 / 6 - squared / 120, (angle - angle.sin()) / (safe * angle)
+    )
     K = _cross_matrix(v)
     return torch.eye(3, dtype=v.dtype, device=v.device) + a * K + b * (K @ K)
 
@@ -56,7 +60,9 @@ def left_jacobian(v: Tensor) -> Tensor:
 def _cross_matrix(v: Tensor) -> Tensor:
     x, y, z = v.unbind(-1)
     zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(
+        -1, (3, 3)
+    )
 
 
 def kinematic_levels(parents: Sequence[int]) -> list[list[int]]:
@@ -64,7 +70,10 @@ def kinematic_levels(parents: Sequence[int]) -> list[list[int]]:
     depth: list[int] = []
     for parent in parents:
         depth.append(0 if parent < 0 else depth[parent] + 1)
-    return [[j for j, d in enumerate(depth) if d == level] for level in range(max(depth) + 1)]
+    return [
+        [j for j, d in enumerate(depth) if d == level]
+        for level in range(max(depth) + 1)
+    ]
 
 
 def forward_kinematics(
@@ -117,7 +126,8 @@ def _accumulate(
     roots = rest[..., : sizes[0], :].expand(len(rotations), -1, -1)
     p = [(roots + transl.unsqueeze(1)).unsqueeze(-1)]
     for level, index in enumerate(above, start=1):
-        parent_R, parent_p = taken(R[level - 1], index, 1), taken(p[-1], index, 1)
+        parent_R = taken(R[level - 1], index, 1)
+        parent_p = taken(p[-1], index, 1)
         p.append(parent_p + parent_R @ offsets[level])
         R[level] = parent_R @ R[level]
     return taken(torch.cat(R, dim=1), back, 1), taken(torch.cat(p, dim=1), back, 1)
@@ -131,7 +141,8 @@ def _plan(parents: tuple[int, ...]) -> tuple[Any, ...]:
     order = tuple(joint for level in levels for joint in level)
     before = tuple(j if parents[j] < 0 else parents[j] for j in order)
     above = tuple(
-        tuple(upper.index(parents[j]) for j in level) for upper, level in pairwise(levels)
+        tuple(upper.index(parents[j]) for j in level)
+        for upper, level in pairwise(levels)
     )
     back = tuple(order.index(j) for j in range(len(parents)))
     return [len(level) for level in levels], order, before, above, back
@@ -182,7 +193,9 @@ def blend_transforms(
     return affine[..., :3], affine[..., 3]
 
 
-def stretched(A: Tensor, transforms: Tensor, columns: Tensor, factors: Tensor) -> Tensor:
+def stretched(
+    A: Tensor, transforms: Tensor, columns: Tensor, factors: Tensor
+) -> Tensor:
     """The Jacobian of skinning at each vertex: how the surface about it turns and stretches.
 
     ``A`` is that of constant weights. Where weights change along the surface, skinning also pulls
@@ -200,7 +213,11 @@ def stretched(A: Tensor, transforms: Tensor, columns: Tensor, factors: Tensor) -
     """
     turns, places = transforms[:, :, :3].split((3, 1), dim=-1)
     # Gradients sum to zero: less the root's place, numbers are as small as distances of bones.
-    table = torch.cat([turns, places - places[:, :1]], dim=-1).permute(1, 3, 0, 2).flatten(2)
+    table = (
+        torch.cat([turns, places - places[:, :1]], dim=-1)
+        .permute(1, 3, 0, 2)
+        .flatten(2)
+    )
     terms = embedding_bag(
         columns, table.flatten(0, 1), per_sample_weights=factors.to(table), mode="sum"
     )

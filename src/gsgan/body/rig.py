@@ -19,8 +19,10 @@ from gsgan.body.skinned import MarkedBody
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.skeleton.template import CHEST, PELVIS
 
-Chain = tuple[tuple[str, float], ...]  # joints, and the share of a number that each one takes
-Axes = tuple[Tensor, Tensor, Tensor]  # along a limb's upper bone, across it, along its lower
+# joints, and the share of a number that each one takes
+Chain = tuple[tuple[str, float], ...]
+# along a limb's upper bone, across it, along its lower
+Axes = tuple[Tensor, Tensor, Tensor]
 # Per role. A limb's twist is smaller near the trunk than at its far end; the forearm's ends at the
 # wrist.
 FREE: dict[str, Chain] = {
@@ -70,7 +72,8 @@ SPREAD = {
     "foot_z": 0.2,
     "toe": 0.2,
 }
-LEAST = {"knee": -0.1, "elbow": -0.7}  # a hinge does not bend backwards; elbows are bent at rest
+# a hinge does not bend backwards; elbows are bent at rest
+LEAST = {"knee": -0.1, "elbow": -0.7}
 SIDES = {"left": "L", "right": "R"}
 SPINE = ("spine1", "spine2", "spine3")  # from the pelvis to the chest
 TRUNK = (
@@ -135,18 +138,28 @@ class Rig:
 class _Turns(list[tuple[int, dict[str, Tensor]]]):
     """Turns in order: joint, and axis by number; shared numbers appear in several."""
 
-    def __init__(self, body: MarkedBody, chains: dict[str, Chain], side: str = "") -> None:
-        self.body, self.chains, self.side = body, chains, side
+    def __init__(
+        self, body: MarkedBody, chains: dict[str, Chain], side: str = ""
+    ) -> None:
+        self.body = body
+        self.chains = chains
+        self.side = side
 
     def joint(self, role: str, k: int = 0) -> int | None:
         name = self.chains[role][k][0].format(self.side)
-        return self.body.joint_names.index(name) if name in self.body.joint_names else None
+        return (
+            self.body.joint_names.index(name) if name in self.body.joint_names else None
+        )
 
-    def put(self, role: str, axes: dict[str, Tensor], joints: slice = slice(None)) -> None:
+    def put(
+        self, role: str, axes: dict[str, Tensor], joints: slice = slice(None)
+    ) -> None:
         """One turn for each of a chain's joints that the body has."""
         for k, (_, share) in list(enumerate(self.chains[role]))[joints]:
             if (joint := self.joint(role, k)) is not None:
-                self.append((joint, {name: share * axis for name, axis in axes.items()}))
+                self.append(
+                    (joint, {name: share * axis for name, axis in axes.items()})
+                )
 
 
 def build_rig(body: MarkedBody) -> Rig:
@@ -155,7 +168,9 @@ def build_rig(body: MarkedBody) -> Rig:
     Raises:
         ValueError: when the joints are named as in neither.
     """
-    chains = next((c for c in (FREE, SMPL) if c["spine"][0][0] in body.joint_names), None)
+    chains = next(
+        (c for c in (FREE, SMPL) if c["spine"][0][0] in body.joint_names), None
+    )
     if chains is None:
         raise ValueError(
             f"build_rig: the joints must be the free body's, SMPL's or SMPL-X's, got "
@@ -163,9 +178,13 @@ def build_rig(body: MarkedBody) -> Rig:
         )
     axes = dict(zip(XYZ, rest_axes(body), strict=True))
     turns = _Turns(body, chains)
-    turns.append((0, {f"root_{k}": axis for k, axis in zip(XYZ, torch.eye(3), strict=True)}))
+    turns.append(
+        (0, {f"root_{k}": axis for k, axis in zip(XYZ, torch.eye(3), strict=True)})
+    )
     for k, joint in enumerate(SPINE):
-        turns.put("spine", {f"{joint}_{i}": axis for i, axis in axes.items()}, slice(k, k + 1))
+        turns.put(
+            "spine", {f"{joint}_{i}": axis for i, axis in axes.items()}, slice(k, k + 1)
+        )
     turns.put("neck", {f"neck_{k}": axis for k, axis in axes.items()})
     limbs: dict[str, Axes] = {}
     for side, letter in SIDES.items():
@@ -177,15 +196,22 @@ def build_rig(body: MarkedBody) -> Rig:
 
 def _arm(turns: _Turns, side: str, axes: dict[str, Tensor]) -> dict[str, Axes]:
     along = limb_axes(turns.body)
-    upper, lower = (along[turns.joint(role)] for role in ("arm", "forearm"))
+    upper = along[turns.joint("arm")]
+    lower = along[turns.joint("forearm")]
     hinge = torch.linalg.cross(upper, lower)
     if hinge.norm() < BENT:
         hinge = torch.linalg.cross(lower, axes["z"])
     hinge = normalize(hinge, dim=0)
-    flat, across = _across(hinge, upper), torch.linalg.cross(lower, hinge)
-    first, named = slice(0, 1), f"{side}_arm"
+    flat = _across(hinge, upper)
+    across = torch.linalg.cross(lower, hinge)
+    first = slice(0, 1)
+    named = f"{side}_arm"
     turns.put("collar", {f"{side}_collar_{k}": axes[k] for k in "yz"})
-    turns.put("arm", {f"{named}_a": flat, f"{named}_b": torch.linalg.cross(upper, flat)}, first)
+    turns.put(
+        "arm",
+        {f"{named}_a": flat, f"{named}_b": torch.linalg.cross(upper, flat)},
+        first,
+    )
     turns.put("arm", {f"{named}_twist": upper})
     turns.put("forearm", {f"{side}_elbow": hinge}, first)
     turns.put("forearm", {f"{side}_elbow_side": across}, first)
@@ -197,10 +223,17 @@ def _arm(turns: _Turns, side: str, axes: dict[str, Tensor]) -> dict[str, Axes]:
 
 def _leg(turns: _Turns, side: str, axes: dict[str, Tensor]) -> dict[str, Axes]:
     along = limb_axes(turns.body)
-    thigh, shank = (along[turns.joint(role)] for role in ("thigh", "shank"))
-    flat, knee = _across(axes["x"], thigh), _across(axes["x"], shank)
-    first, named = slice(0, 1), f"{side}_thigh"
-    turns.put("thigh", {f"{named}_a": flat, f"{named}_b": torch.linalg.cross(thigh, flat)}, first)
+    thigh = along[turns.joint("thigh")]
+    shank = along[turns.joint("shank")]
+    flat = _across(axes["x"], thigh)
+    knee = _across(axes["x"], shank)
+    first = slice(0, 1)
+    named = f"{side}_thigh"
+    turns.put(
+        "thigh",
+        {f"{named}_a": flat, f"{named}_b": torch.linalg.cross(thigh, flat)},
+        first,
+    )
     turns.put("thigh", {f"{named}_twist": thigh})
     turns.put("shank", {f"{side}_knee": knee})
     tilt = torch.linalg.cross(shank, knee)
@@ -229,7 +262,8 @@ def _rig(body: MarkedBody, turns: _Turns, limbs: dict[str, Axes]) -> Rig:
     depth = [0]
     for parent in body.parents[1:]:
         depth.append(depth[parent] + 1)
-    ordered = sorted(turns, key=lambda turn: depth[turn[0]])  # stable: a joint's keep their order
+    # stable: a joint's keep their order
+    ordered = sorted(turns, key=lambda turn: depth[turn[0]])
     found = list(dict.fromkeys(name for _, axes in ordered for name in axes))
     names = (*found[:3], *(f"transl_{k}" for k in XYZ), *found[3:])
     last = {joint: i for i, (joint, _) in enumerate(ordered)}
@@ -244,7 +278,9 @@ def _rig(body: MarkedBody, turns: _Turns, limbs: dict[str, Axes]) -> Rig:
         same = ordered[i - 1][0] == joint
         parents.append(i - 1 if same else carrier(body.parents[joint]))
     entries = [
-        (i, names.index(n), axis) for i, (_, axes) in enumerate(ordered) for n, axis in axes.items()
+        (i, names.index(n), axis)
+        for i, (_, axes) in enumerate(ordered)
+        for n, axis in axes.items()
     ]
     turn, number, axis = (list(column) for column in zip(*entries, strict=True))
     joints = torch.tensor([joint for joint, _ in ordered])
@@ -271,10 +307,13 @@ def _rig(body: MarkedBody, turns: _Turns, limbs: dict[str, Axes]) -> Rig:
 def prior(rig: Rig) -> tuple[Tensor, Tensor]:
     """``[D, D]`` the precision matrix of the numbers about the rest pose, 0 for the root's; and
     ``[D]`` the least value of each."""
-    spread, least = [torch.inf] * 6, [-torch.inf] * 6
+    spread = [torch.inf] * 6
+    least = [-torch.inf] * 6
     for name in rig.names[6:]:
         key = name.removeprefix("left_").removeprefix("right_")
-        known = torch.inf if name in TRUNK else SPREAD.get(key) or SPREAD[key.split("_")[0]]
+        known = (
+            torch.inf if name in TRUNK else SPREAD.get(key) or SPREAD[key.split("_")[0]]
+        )
         spread.append(known)
         least.append(LEAST.get(key, -torch.inf))
     precision = torch.tensor(spread).square().reciprocal().diag()
@@ -299,8 +338,12 @@ def trunk_covariance() -> Tensor:
 def _limb(names: tuple[str, ...], words: str, axes: Axes) -> Limb:
     side, limb, *joints = words.split()
     along, flat, lower = axes
-    first, middle, end = (MEDIAPIPE33.names.index(f"{side}_{joint}") for joint in joints)
-    numbers = [f"{side}_{limb}_{k}" for k in ("a", "b", "twist")] + [f"{side}_{joints[1]}"]
+    first, middle, end = (
+        MEDIAPIPE33.names.index(f"{side}_{joint}") for joint in joints
+    )
+    numbers = [f"{side}_{limb}_{k}" for k in ("a", "b", "twist")] + [
+        f"{side}_{joints[1]}"
+    ]
     a, b, twist, hinge = map(names.index, numbers)
     bend = torch.atan2(torch.linalg.cross(along, lower).norm(), along @ lower)
     frame = torch.stack([flat, torch.linalg.cross(along, flat), along])

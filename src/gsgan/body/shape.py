@@ -30,7 +30,8 @@ from gsgan.utils.errors import DataError
 # axis, other parts in all directions.
 LIMBS = ("upper_arm", "forearm", "thigh", "shank")
 STRETCHED = (*LIMBS, "hand", "foot", "head", "trunk")
-GROUPS = {  # by the joint's name in the free body | in SMPL's family; the others are the trunk's
+# by the joint's name in the free body | in SMPL's family; the others are the trunk's
+GROUPS = {
     "upper_arm": r"upperarm.*|.*_shoulder",
     "forearm": r"lowerarm.*|.*_elbow",
     "thigh": r"upperleg.*|.*_hip",
@@ -41,7 +42,8 @@ GROUPS = {  # by the joint's name in the free body | in SMPL's family; the other
 }
 WRISTS = ("wrist.L", "wrist.R")
 BACK = (0.0, 1.0, 0.0)  # of the free body
-LANDMARKS, HANDS_SHAPE = (len(MEDIAPIPE33.names), 3), (2, 2, 3)
+LANDMARKS = (len(MEDIAPIPE33.names), 3)
+HANDS_SHAPE = (2, 2, 3)
 
 B = TypeVar("B", bound=MarkedBody)
 
@@ -84,11 +86,15 @@ class BodyShape:
 
     def arrays(self) -> dict[str, NDArray[np.float32]]:
         """The tensors by name, to store in body_shape.npz."""
-        return {name: x.detach().numpy() for name, x in vars(self).items() if x is not None}
+        return {
+            name: x.detach().numpy() for name, x in vars(self).items() if x is not None
+        }
 
     def flat(self) -> Tensor:
         """``[K + 8 + 99]`` all numbers, to store; 12 more of hands, 1 of a spine; see `of_flat`."""
-        off = self.stretch.new_zeros(LANDMARKS) if self.offsets is None else self.offsets
+        off = (
+            self.stretch.new_zeros(LANDMARKS) if self.offsets is None else self.offsets
+        )
         more = [x.flatten() for x in (self.hands, self.spine) if x is not None]
         return torch.cat([self.coefficients, self.stretch, off.flatten(), *more])
 
@@ -104,7 +110,9 @@ class BodyShape:
         counts = [sum(sizes) + more for more in (0, 1, hands, hands + 1)]
         if values.ndim != 1 or len(values) not in counts:
             known = " or ".join(map(str, counts))
-            raise ValueError(f"BodyShape: expected {known} numbers, got {list(values.shape)}")
+            raise ValueError(
+                f"BodyShape: expected {known} numbers, got {list(values.shape)}"
+            )
         K, stretch, off, more = values.split([*sizes, len(values) - sum(sizes)])
         return cls(
             K,
@@ -157,19 +165,24 @@ class ShapeSpace(Generic[B]):
             body = replace(body, landmarks=body.landmarks + shape.offsets)
         if shape.spine is not None:
             spine = [name.startswith("spine") for name in body.joint_names]
-            back = shape.spine * torch.outer(given.new_tensor(spine), given.new_tensor(BACK))
+            back = shape.spine * torch.outer(
+                given.new_tensor(spine), given.new_tensor(BACK)
+            )
             body = replace(body, joints=body.joints + back)
         return body if shape.hands is None else _with_hands(body, shape.hands)
 
 
 def group_of(joint: str) -> str:
     """The group whose stretch scales what a joint of that name moves."""
-    return next((g for g, names in GROUPS.items() if re.fullmatch(names, joint)), "trunk")
+    return next(
+        (g for g, names in GROUPS.items() if re.fullmatch(names, joint)), "trunk"
+    )
 
 
 def limb_axes(body: MarkedBody) -> Tensor:
     """``[J, 3]`` unit direction of the limb that a joint belongs to, zero outside limbs."""
-    groups, axes = [group_of(name) for name in body.joint_names], torch.zeros_like(body.joints)
+    groups = [group_of(name) for name in body.joint_names]
+    axes = torch.zeros_like(body.joints)
     for joint, group in enumerate(groups):
         if group not in LIMBS:
             continue
@@ -190,33 +203,43 @@ def _stretched(body: B, stretch: Tensor) -> B:
     axes = limb_axes(body)
     along = axes.unsqueeze(-1) * axes.unsqueeze(-2)
     eye = torch.eye(3).to(joints)
-    S = eye + (factor - 1)[:, None, None] * torch.where(along.any(-1, keepdim=True), along, eye)
+    S = eye + (factor - 1)[:, None, None] * torch.where(
+        along.any(-1, keepdim=True), along, eye
+    )
     places = [joints[0]]
     for joint, parent in enumerate(body.parents[1:], start=1):
         places.append(places[parent] + S[parent] @ (joints[joint] - joints[parent]))
     moved = torch.stack(places)
     shift = moved - (S @ joints.unsqueeze(-1)).squeeze(-1)
     # As lbs.blend_transforms, which has no forward-mode derivative.
-    maps, weight = torch.cat([S, shift.unsqueeze(-1)], dim=-1).flatten(1), body.bone_weight.to(S)
+    maps = torch.cat([S, shift.unsqueeze(-1)], dim=-1).flatten(1)
+    weight = body.bone_weight.to(S)
     weight = weight / weight.sum(-1, keepdim=True)
     blended = sum(
-        w.unsqueeze(-1) * maps[b] for b, w in zip(body.bone_index.T, weight.T, strict=True)
+        w.unsqueeze(-1) * maps[b]
+        for b, w in zip(body.bone_index.T, weight.T, strict=True)
     )
     A, t = blended.unflatten(-1, (3, 4)).split((3, 1), dim=-1)
     points = {"landmarks": body.landmark_bone}
     if isinstance(body, Body):
         points["hand_landmarks"] = body.hand_bone
     carried = {
-        n: (S[b] @ getattr(body, n).unsqueeze(-1)).squeeze(-1) + shift[b] for n, b in points.items()
+        n: (S[b] @ getattr(body, n).unsqueeze(-1)).squeeze(-1) + shift[b]
+        for n, b in points.items()
     }
-    return replace(body, vertices=skin(body.vertices, A, t.squeeze(-1)), joints=moved, **carried)
+    return replace(
+        body, vertices=skin(body.vertices, A, t.squeeze(-1)), joints=moved, **carried
+    )
 
 
 def _with_hands(body: B, hands: Tensor) -> B:
     """The body with wrists and hands moved by ``hands [2, 2, 3]``, see `BodyShape`."""
     names = body.joint_names  # 1: of the left hand, 2: of the right hand, 0: others
-    sides = torch.tensor([".LR".index(n[-1]) if group_of(n) == "hand" else 0 for n in names])
-    moves = torch.cat([torch.zeros_like(hands[:1, 1]), hands[:, 1]])  # [3, 3], none first
+    sides = torch.tensor(
+        [".LR".index(n[-1]) if group_of(n) == "hand" else 0 for n in names]
+    )
+    # [3, 3], none first
+    moves = torch.cat([torch.zeros_like(hands[:1, 1]), hands[:, 1]])
     weight = body.bone_weight.unsqueeze(-1)
     out: dict[str, Any] = {
         "vertices": body.vertices + (weight * moves[sides[body.bone_index]]).sum(1),
@@ -227,7 +250,9 @@ def _with_hands(body: B, hands: Tensor) -> B:
     out["joints"] = (body.joints + moves[sides]).index_copy(0, torch.tensor(wrists), at)
     if isinstance(body, Body):
         own = body.hand_landmarks + moves[sides[body.hand_bone]]
-        out["hand_landmarks"] = own.index_copy(0, torch.tensor([WRIST, HAND + WRIST]), at)
+        out["hand_landmarks"] = own.index_copy(
+            0, torch.tensor([WRIST, HAND + WRIST]), at
+        )
     return replace(body, **out)
 
 
@@ -247,8 +272,13 @@ def free_space() -> ShapeSpace[Body]:
     body = free_body()
     try:
         with np.load(path, allow_pickle=False) as archive:
-            directions = {n: torch.from_numpy(archive[n].astype(np.float32)) for n in archive.files}
-        return ShapeSpace(body, {n: d.permute(1, 2, 0).contiguous() for n, d in directions.items()})
+            directions = {
+                n: torch.from_numpy(archive[n].astype(np.float32))
+                for n in archive.files
+            }
+        return ShapeSpace(
+            body, {n: d.permute(1, 2, 0).contiguous() for n, d in directions.items()}
+        )
     except Exception as error:
         raise DataError(
             f"{path} is missing or cannot be read ({error}): reinstall gsgan, or bake it with "
@@ -284,7 +314,11 @@ def open_body(
         DataError: when the file cannot be read or is of another body.
     """
     if kind == "free":
-        return shaped_body(BodyShape.of_flat(torch.tensor(betas))) if betas else free_body()
+        return (
+            shaped_body(BodyShape.of_flat(torch.tensor(betas)))
+            if betas
+            else free_body()
+        )
     if kind is None or file is None:
         return None
     model = read_smpl(file)

@@ -66,7 +66,10 @@ class SkinnedBody:
 
     def shares_labels(self, names: Sequence[str]) -> bool:
         """Whether these names of labels are the body's own parts."""
-        return self.label_source == "own" and tuple(names) == self.label_names[: len(names)]
+        return (
+            self.label_source == "own"
+            and tuple(names) == self.label_names[: len(names)]
+        )
 
     def voted(self, vertex_labels: Tensor, label_names: Sequence[str]) -> Self:
         """The body with the data's labels on its vertices ``[V]``.
@@ -74,7 +77,9 @@ class SkinnedBody:
         Raises:
             ValueError: when there is not one label per vertex, or a label has no name.
         """
-        shape, least, most = vertex_labels.shape, vertex_labels.min(), vertex_labels.max()
+        shape = vertex_labels.shape
+        least = vertex_labels.min()
+        most = vertex_labels.max()
         if shape != self.vertex_labels.shape or least < 0 or most >= len(label_names):
             raise ValueError(
                 f"{type(self).__name__}.voted: vertex_labels must be {len(self.vertex_labels)} "
@@ -83,7 +88,9 @@ class SkinnedBody:
             )
         labels = vertex_labels.to(self.vertex_labels)
         names = tuple(label_names)
-        return replace(self, vertex_labels=labels, label_names=names, label_source="vote")
+        return replace(
+            self, vertex_labels=labels, label_names=names, label_source="vote"
+        )
 
     def transforms(self, pose: BodyPose) -> Tensor:
         """``[B, J, 4, 4]`` world transform of each bone relative to rest.
@@ -93,12 +100,17 @@ class SkinnedBody:
         """
         rotations = axis_angle_to_matrix(pose.theta)
         return forward_kinematics(
-            self.joints.to(rotations), self.parents, rotations, pose.transl.to(rotations)
+            self.joints.to(rotations),
+            self.parents,
+            rotations,
+            pose.transl.to(rotations),
         )
 
     def pose(self, pose: BodyPose) -> tuple[Tensor, Tensor]:
         """Affine map of each vertex, ``A [B, V, 3, 3]`` and ``t [B, V, 3]`` (paper Sec. 3.4)."""
-        return blend_transforms(self.transforms(pose), self.bone_index, self.bone_weight)
+        return blend_transforms(
+            self.transforms(pose), self.bone_index, self.bone_weight
+        )
 
     def posed_vertices(self, pose: BodyPose) -> Tensor:
         """``[B, V, 3]`` metres, world frame."""
@@ -182,7 +194,9 @@ class WeightGradients(nn.Module):
             gradients.
         """
         weight = (weight / weight.sum(dim=1, keepdim=True)).to(self.values)
-        dense = weight.new_zeros(len(weight), self.joints).scatter_add_(1, index, weight)
+        dense = weight.new_zeros(len(weight), self.joints).scatter_add_(
+            1, index, weight
+        )
         slopes = embedding_bag(
             self.columns, dense, self.rows, mode="sum", per_sample_weights=self.values
         )
@@ -191,7 +205,8 @@ class WeightGradients(nn.Module):
         bones = change.topk(min(KEPT, self.joints), dim=1).indices
         slopes = slopes.gather(2, bones.unsqueeze(1).expand(-1, 3, -1))
         slopes = slopes - slopes.mean(dim=2, keepdim=True)
-        factors = slopes.unsqueeze(-1) * self.homogeneous[:, None, None]  # [N, 3, KEPT, 4]
+        # [N, 3, KEPT, 4]
+        factors = slopes.unsqueeze(-1) * self.homogeneous[:, None, None]
         columns = 4 * bones.unsqueeze(-1) + torch.arange(4, device=bones.device)
         columns = columns.unsqueeze(1).expand_as(factors)
         return columns.flatten(2).flatten(0, 1), factors.flatten(2).flatten(0, 1)
@@ -212,11 +227,14 @@ def surface_gradient(vertices: Tensor, faces: Tensor, chosen: Tensor) -> csr_arr
     x = vertices.double()
     normals = vertex_normals(x, faces)[chosen]
     a, b = neighbours_on_surface(x, faces, chosen).T
-    x, count = x[chosen], len(chosen)
+    x = x[chosen]
+    count = len(chosen)
     step = x[b] - x[a]
 
     # Least squares in the tangent plane: (Σ step stepᵀ) gradient = Σ step (difference).
-    square = x.new_zeros(count, 3, 3).index_add_(0, a, step.unsqueeze(2) * step.unsqueeze(1))
+    square = x.new_zeros(count, 3, 3).index_add_(
+        0, a, step.unsqueeze(2) * step.unsqueeze(1)
+    )
     size = square.diagonal(dim1=1, dim2=2).sum(dim=1).clamp_min(1e-12)[:, None, None]
     across = normals.unsqueeze(2) * normals.unsqueeze(1)
     square = square + size * (across + 1e-6 * torch.eye(3).to(x))
@@ -225,10 +243,12 @@ def surface_gradient(vertices: Tensor, faces: Tensor, chosen: Tensor) -> csr_arr
 
     # A difference is the number at the edge's end less that at its start.
     rows = (3 * a.unsqueeze(1) + torch.arange(3)).flatten().numpy()
-    ends, starts = (v.repeat_interleave(3).numpy() for v in (b, a))
+    ends = b.repeat_interleave(3).numpy()
+    starts = a.repeat_interleave(3).numpy()
     values = share.flatten().numpy()
     shape = (3 * count, count)
-    plus, minus = (csr_array((values, (rows, place)), shape) for place in (ends, starts))
+    plus = csr_array((values, (rows, ends)), shape)
+    minus = csr_array((values, (rows, starts)), shape)
     return csr_array(plus - minus)
 
 
@@ -240,13 +260,22 @@ def neighbours_on_surface(vertices: Tensor, faces: Tensor, chosen: Tensor) -> Te
     """
     edges = torch.cat([faces[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
     length = (vertices[edges[:, 1]] - vertices[edges[:, 0]]).norm(dim=1).clamp_min(1e-9)
-    graph = csr_array((length.numpy(), tuple(edges.T.numpy())), (len(vertices), len(vertices)))
+    graph = csr_array(
+        (length.numpy(), tuple(edges.T.numpy())), (len(vertices), len(vertices))
+    )
     _, _, nearest = dijkstra(
-        graph, directed=False, indices=chosen.numpy(), min_only=True, return_predecessors=True
+        graph,
+        directed=False,
+        indices=chosen.numpy(),
+        min_only=True,
+        return_predecessors=True,
     )
     nearest = torch.from_numpy(nearest).long()
-    place = torch.full((len(vertices),), -1).index_copy_(0, chosen, torch.arange(len(chosen)))
-    reached = nearest >= 0  # the others are on pieces of the mesh without a chosen vertex
+    place = torch.full((len(vertices),), -1).index_copy_(
+        0, chosen, torch.arange(len(chosen))
+    )
+    # the others are on pieces of the mesh without a chosen vertex
+    reached = nearest >= 0
     edges = edges[reached[edges].all(dim=1)]
     pairs = place[nearest[edges]]
     pairs = pairs[pairs[:, 0] != pairs[:, 1]]

@@ -19,7 +19,12 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from gsgan.body.lbs import axis_angle_to_matrix, blend_transforms, forward_kinematics, skin
+from gsgan.body.lbs import (
+    axis_angle_to_matrix,
+    blend_transforms,
+    forward_kinematics,
+    skin,
+)
 from gsgan.body.skinned import MarkedBody, carry
 from gsgan.body.smpl_names import JOINT_NAMES, Parts, part_names, part_of_joint
 from gsgan.skeleton import MEDIAPIPE33
@@ -28,7 +33,15 @@ from gsgan.utils.arrays import expect_array
 from gsgan.utils.errors import DataError
 from gsgan.utils.pickles import read_npz, read_pickle
 
-KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f")
+KEYS = (
+    "v_template",
+    "shapedirs",
+    "posedirs",
+    "J_regressor",
+    "weights",
+    "kintree_table",
+    "f",
+)
 SMPLX_JOINT_COUNT = 55
 WEIGHT_TOLERANCE = 1e-3  # of the sum of a vertex's weights, and of negative weights
 
@@ -75,7 +88,9 @@ def read_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], tuple[int, ...]]:
 def _raw(path: Path) -> dict[str, Any]:
     content = read_npz(path, KEYS) if zipfile.is_zipfile(path) else read_pickle(path)
     if not isinstance(content, dict):
-        raise DataError(f"{path} holds a {type(content).__name__}; expected an SMPL model, a dict")
+        raise DataError(
+            f"{path} holds a {type(content).__name__}; expected an SMPL model, a dict"
+        )
     missing = [key for key in KEYS if not isinstance(content.get(key), np.ndarray)]
     if missing:
         raise DataError(
@@ -104,7 +119,9 @@ def _parents(table: NDArray[Any], path: Path) -> tuple[int, ...]:
 def _finite(array: NDArray[Any], name: str, path: Path) -> Floats:
     values = np.ascontiguousarray(array, np.float64)
     if not np.isfinite(values).all():
-        raise DataError(f"{path}: '{name}' must hold finite numbers, found NaN or infinity")
+        raise DataError(
+            f"{path}: '{name}' must hold finite numbers, found NaN or infinity"
+        )
     return values
 
 
@@ -162,9 +179,14 @@ class SkinnedModel:
     @cached_property
     def joint_shapes(self) -> tuple[Tensor, Tensor, Tensor]:
         """The joints of the mean shape ``[J, 3]``, and their shape and expression directions."""
-        mean, shape, face = (
-            (self.J_regressor @ of_vertices.flatten(1)).unflatten(1, of_vertices.shape[1:])
-            for of_vertices in (self.v_template, self.shapedirs, self.expression_dirs)
+        mean = (self.J_regressor @ self.v_template.flatten(1)).unflatten(
+            1, self.v_template.shape[1:]
+        )
+        shape = (self.J_regressor @ self.shapedirs.flatten(1)).unflatten(
+            1, self.shapedirs.shape[1:]
+        )
+        face = (self.J_regressor @ self.expression_dirs.flatten(1)).unflatten(
+            1, self.expression_dirs.shape[1:]
         )
         return mean, shape, face
 
@@ -218,7 +240,9 @@ class SkinnedModel:
             eye = torch.eye(3, dtype=rotations.dtype)
             feature = (rotations[:, 1:] - eye).flatten(1)
             vertices = _add("theta", vertices, self.posedirs, feature)
-        return skin(vertices, *blend_transforms(transforms, *self.bones)), carry(transforms, rest)
+        return skin(vertices, *blend_transforms(transforms, *self.bones)), carry(
+            transforms, rest
+        )
 
     def as_body(self, betas: ArrayLike = (), parts: Parts = "clothes") -> MarkedBody:
         """The shaped body as a `MarkedBody`: float32, one part per vertex, no blend shapes.
@@ -244,9 +268,11 @@ class SkinnedModel:
         shape = torch.from_numpy(np.atleast_2d(np.asarray(betas, np.float64)))
         names = part_names(parts, self.joint_names)
         own = [names.index(part_of_joint(parts, joint)) for joint in self.joint_names]
-        first = torch.from_numpy(self.weights.numpy().argmax(axis=1))  # the first of equals
+        # the first of equals
+        first = torch.from_numpy(self.weights.numpy().argmax(axis=1))
         index, weight = self.bones
-        vertices, joints = self.rest_vertices(shape)[0], self.rest_joints(shape)[0]
+        vertices = self.rest_vertices(shape)[0]
+        joints = self.rest_joints(shape)[0]
         landmarks, bones = self.landmarks(vertices, joints)
         return MarkedBody(
             vertices=vertices.float(),
@@ -271,7 +297,9 @@ class SkinnedModel:
         SMPL's or SMPL-X's own vertices also face, heels and most of the hands.
         """
         if self.kind not in TABLES:
-            return joints.new_full((len(MEDIAPIPE33.names), 3), torch.nan), torch.zeros(33).long()
+            return joints.new_full((len(MEDIAPIPE33.names), 3), torch.nan), torch.zeros(
+                33
+            ).long()
         table = TABLES[self.kind]
         whole = len(vertices) == table.counts[1]
         p, _ = to_mediapipe33(
@@ -288,7 +316,9 @@ class SkinnedModel:
         return torch.from_numpy(p), bones
 
 
-def _add(name: str, base: Tensor, directions: Tensor, coefficients: Tensor | None) -> Tensor:
+def _add(
+    name: str, base: Tensor, directions: Tensor, coefficients: Tensor | None
+) -> Tensor:
     """``base [N, 3]`` plus directions ``[N, 3, n]`` times coefficients ``[B, n]`` or fewer."""
     if coefficients is None:
         return base
@@ -333,6 +363,7 @@ def from_zju(Rh: ArrayLike, Th: ArrayLike, J0: ArrayLike) -> tuple[Floats, Float
 
     Source: the release's loaders.
     """
-    orient, root = np.asarray(Rh, np.float64), np.asarray(J0, np.float64)
+    orient = np.asarray(Rh, np.float64)
+    root = np.asarray(J0, np.float64)
     R = axis_angle_to_matrix(torch.from_numpy(orient)).numpy()
     return orient, np.asarray(Th, np.float64) + (R @ root[..., None])[..., 0] - root

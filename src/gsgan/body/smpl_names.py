@@ -13,7 +13,8 @@ _BODY = (
     *("left_collar", "right_collar", "head", "left_shoulder", "right_shoulder"),
     *("left_elbow", "right_elbow", "left_wrist", "right_wrist"),
 )
-_FINGERS = ("index", "middle", "pinky", "ring", "thumb")  # SMPL-X's order, not MediaPipe's
+# SMPL-X's order, not MediaPipe's
+_FINGERS = ("index", "middle", "pinky", "ring", "thumb")
 _HANDS = tuple(
     f"{side}_{finger}{joint}"
     for side in ("left", "right")
@@ -33,8 +34,26 @@ CLOTHES = (
 """The parts of the free body, in the same order."""
 
 CIHP = (
-    *("background", "hat", "hair", "glove", "sunglasses", "upper_clothes", "dress", "coat"),
-    *("socks", "pants", "torso_skin", "scarf", "skirt", "face", "left_arm", "right_arm"),
+    *(
+        "background",
+        "hat",
+        "hair",
+        "glove",
+        "sunglasses",
+        "upper_clothes",
+        "dress",
+        "coat",
+    ),
+    *(
+        "socks",
+        "pants",
+        "torso_skin",
+        "scarf",
+        "skirt",
+        "face",
+        "left_arm",
+        "right_arm",
+    ),
     *("left_leg", "right_leg", "left_shoe", "right_shoe"),
 )
 """ZJU-MoCap's ``mask_cihp``, ids 0 to 19; it has no hands."""
@@ -50,7 +69,8 @@ def part_names(parts: Parts, joint_names: tuple[str, ...]) -> tuple[str, ...]:
 def fitting_parts(label_names: tuple[str, ...], joint_names: tuple[str, ...]) -> Parts:
     """The set of parts with these names; the free body's where there is none."""
     return next(
-        (p for p in get_args(Parts) if part_names(p, joint_names) == label_names), "clothes"
+        (p for p in get_args(Parts) if part_names(p, joint_names) == label_names),
+        "clothes",
     )
 
 

@@ -8,7 +8,10 @@ from functools import cached_property
 from typing import NamedTuple
 
 import torch
-from kornia.geometry.conversions import quaternion_to_axis_angle, rotation_matrix_to_quaternion
+from kornia.geometry.conversions import (
+    quaternion_to_axis_angle,
+    rotation_matrix_to_quaternion,
+)
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
@@ -19,26 +22,41 @@ from gsgan.body.lbs import axis_angle_to_matrix, left_jacobian, shortest_turn
 from gsgan.body.rig import SPINE, ancestors, build_rig, prior
 from gsgan.body.skinned import MarkedBody
 from gsgan.scene import BodyPose
-from gsgan.skeleton import MEDIAPIPE33, MEDIAPIPE33_HANDS, TEMPLATES, bone_frames, sanitise
+from gsgan.skeleton import (
+    MEDIAPIPE33,
+    MEDIAPIPE33_HANDS,
+    TEMPLATES,
+    bone_frames,
+    sanitise,
+)
 from gsgan.skeleton.hands import HAND, PALM
 from gsgan.skeleton.tensors import constants
 from gsgan.utils.tensors import constant
 
-BODY, ALL = len(MEDIAPIPE33.names), len(MEDIAPIPE33_HANDS.names)
+BODY = len(MEDIAPIPE33.names)
+ALL = len(MEDIAPIPE33_HANDS.names)
 SIZES = [len(template.names) for template in TEMPLATES.values()]
 BEYOND = 0.05  # standard deviation of a number below its least value
 # Metres, standard deviations of landmarks: detectors locate those of face and palm less well.
-NOISE, FACE_NOISE, KNUCKLE_NOISE = 0.004, 0.008, 0.007
+NOISE = 0.004
+FACE_NOISE = 0.008
+KNUCKLE_NOISE = 0.007
 KNUCKLES = slice(17, 23)  # of 33 landmarks: pinky, index and thumb of both hands
 ON_HANDS = ((17, 19, 21), (18, 20, 22))  # the 33 landmarks that hand landmarks replace
 HELD = 0.05  # the same of estimated hips: nothing else keeps the trunk from tilting
 ROBUST = 5.0  # standard deviations at which the loss of a landmark becomes linear
-STEPS, CONVERGED = 10, 1e-3  # of the cost
+# of the cost
+STEPS = 10
+CONVERGED = 1e-3
 GRADIENT_STEPS = 8  # error of gradients: a few percent where a landmark hardly matters
-DAMPING, EASIER, HARDER = 1e-3, 0.2, 20.0
+DAMPING = 1e-3
+EASIER = 0.2
+HARDER = 20.0
 FLOOR = 1e-3  # on the diagonal: the root has no prior
 CHUNK = 64  # frames at a time: their matrices fit into a processor's cache
-STRAIGHT, SHARP = 0.1, 0.4  # radians: between these bends the twist's weight rises from 0 to 1
+# radians: between these bends the twist's weight rises from 0 to 1
+STRAIGHT = 0.1
+SHARP = 0.4
 
 
 class Linear(NamedTuple):
@@ -67,7 +85,8 @@ class Solver(nn.Module):
     """
 
     joints: Tensor  # [J, 3] rest
-    landmarks: Tensor  # [N, 3] rest, 0 where not known: 33, and 3 of each hand of the free body
+    # [N, 3] rest, 0 where not known: 33, and 3 of each hand of the free body
+    landmarks: Tensor
     known: Tensor  # [N] bool
     replaced: Tensor  # [2, 33] bool, `ON_HANDS`
     precision: Tensor  # [33] of the body's own landmarks
@@ -110,12 +129,16 @@ class Solver(nn.Module):
                 "prior": precision,
                 "least": least,
                 "matrix": matrix.flatten(1),
-                "follows": ancestors(rig.parent)[rig.carrier].mT[rig.entry_turn, :, None],
+                "follows": ancestors(rig.parent)[rig.carrier].mT[
+                    rig.entry_turn, :, None
+                ],
                 "jumps": _jumps(rig.parent),
                 "before": torch.where(rig.parent < 0, len(rig.parent), rig.parent),
                 "rest_hubs": bone_frames(rest).hubs[0],
                 "rest_hips": rest[0, MEDIAPIPE33.hips].mean(0),
-                "replaced": torch.tensor([[i in hand for i in range(BODY)] for hand in ON_HANDS]),
+                "replaced": torch.tensor(
+                    [[i in hand for i in range(BODY)] for hand in ON_HANDS]
+                ),
                 "known": body.landmarks.isfinite().all(-1),
                 **{k: v for k, v in vars(rig).items() if isinstance(v, Tensor)},
             }
@@ -147,38 +170,53 @@ class Solver(nn.Module):
             )
         if not self._live(skeleton) and compiled.available(skeleton):
             return self._compiled(skeleton, visibility)
-        skeleton, visibility = (x.to(self.joints.device) for x in (skeleton, visibility))
+        skeleton = skeleton.to(self.joints.device)
+        visibility = visibility.to(self.joints.device)
         # the 33 landmarks, about the middle of the hips
-        hands, seen = skeleton[:, BODY:ALL], visibility[:, BODY:ALL]
-        skeleton, visibility = skeleton[:, :BODY], visibility[:, :BODY]
+        hands = skeleton[:, BODY:ALL]
+        seen = visibility[:, BODY:ALL]
+        skeleton = skeleton[:, :BODY]
+        visibility = visibility[:, :BODY]
         p, valid = sanitise(skeleton, visibility)
         shift = p[:, MEDIAPIPE33.hips].mean(1, keepdim=True)
-        weight = (self.weights(valid) * torch.where(valid, visibility, 1).clamp(0, 1)).to(p)
-        p, found = p - shift, None
+        weight = (
+            self.weights(valid) * torch.where(valid, visibility, 1).clamp(0, 1)
+        ).to(p)
+        p = p - shift
+        found = None
         # hands: their fingers, and three more landmarks each where the hand is placed
         if self.fingers is not None and hands.shape[1]:
             seen = (seen > 0) & hands.isfinite().all(-1)
-            found = self.fingers(torch.where(seen.unsqueeze(-1), hands - shift, 0.0), seen)
+            found = self.fingers(
+                torch.where(seen.unsqueeze(-1), hands - shift, 0.0), seen
+            )
             replaced = (found.placed.unsqueeze(-1) & self.replaced).any(1)
-            held = found.placed.repeat_interleave(len(PALM), dim=1).to(weight) / NOISE**2
+            held = (
+                found.placed.repeat_interleave(len(PALM), dim=1).to(weight) / NOISE**2
+            )
             weight = torch.cat([weight.masked_fill(replaced, 0), held], dim=1)
             own = self.landmarks[BODY:].unflatten(0, (2, -1))
             at = own @ found.rotations.mT + found.shifts.unsqueeze(-2)
             p = torch.cat([p, at.flatten(1, 2)], dim=1)
         solved = [
             self._solve(near, w)
-            for near, w in zip(p.split(CHUNK), weight.detach().split(CHUNK), strict=True)
+            for near, w in zip(
+                p.split(CHUNK), weight.detach().split(CHUNK), strict=True
+            )
         ]
         theta, transl = (torch.cat(parts) for parts in zip(*solved, strict=True))
         if self.fingers is not None and found is not None:
             joints = self.fingers.joints
-            turns = torch.where(found.shown.unsqueeze(-1), found.turns, theta[:, joints])
+            turns = torch.where(
+                found.shown.unsqueeze(-1), found.turns, theta[:, joints]
+            )
             theta = theta.index_copy(1, joints, turns)
         return BodyPose(theta, transl + shift[:, 0])
 
     def _compiled(self, skeleton: Tensor, visibility: Tensor) -> BodyPose:
         """`solve` by compiled code."""
-        p, shown = skeleton.cpu(), visibility.to("cpu", skeleton.dtype)
+        p = skeleton.cpu()
+        shown = visibility.to("cpu", skeleton.dtype)
         body, valid = sanitise(p[:, :BODY], shown[:, :BODY])
         hands = None
         if self.fingers is not None and p.shape[1] > BODY:
@@ -196,7 +234,14 @@ class Solver(nn.Module):
         """Those of `compiled.COUNTS`."""
         rig = self.rig
         sizes = (self.parents, len(rig.joint), len(rig.names), len(rig.entry_turn))
-        more = (len(self.landmarks), 1 + len(SPINE), len(rig.limbs), STEPS, len(ROUNDS), PLACING)
+        more = (
+            len(self.landmarks),
+            1 + len(SPINE),
+            len(rig.limbs),
+            STEPS,
+            len(ROUNDS),
+            PLACING,
+        )
         return dict(zip(compiled.COUNTS, (*sizes, *more), strict=True))
 
     @cached_property
@@ -206,26 +251,41 @@ class Solver(nn.Module):
             template = constants(MEDIAPIPE33, self.joints.device, self.joints.dtype)
             bends = [(name, 0, len(SPINE)) for name in SPINE] + [("neck", 1, 1)]
             own = {
-                **{name: getattr(self, name) for name in compiled.RIG if hasattr(self, name)},
+                **{
+                    name: getattr(self, name)
+                    for name in compiled.RIG
+                    if hasattr(self, name)
+                },
                 "parent": self.rig.parent,
                 "head_from_eyes": template.head_from_eyes,
                 "torso": template.torso,
                 "head": template.head_points,
-                "bend_numbers": torch.tensor([self.rig.numbers(name) for name, _, _ in bends]),
+                "bend_numbers": torch.tensor(
+                    [self.rig.numbers(name) for name, _, _ in bends]
+                ),
                 "bend_hub": torch.tensor([hub for _, hub, _ in bends]),
-                "bend_axes": torch.stack([self._axes(name) / n for name, _, n in bends]),
+                "bend_axes": torch.stack(
+                    [self._axes(name) / n for name, _, n in bends]
+                ),
             }
             for name in ("hub", "points", "numbers", "axes", "bend"):
-                values = [torch.as_tensor(getattr(limb, name)) for limb in self.rig.limbs]
+                values = [
+                    torch.as_tensor(getattr(limb, name)) for limb in self.rig.limbs
+                ]
                 own[f"limb_{name}"] = torch.stack(values)
             if self.fingers is not None:
-                buffers = {**dict(self.fingers.named_buffers()), "rounds": torch.tensor(ROUNDS)}
+                buffers = {
+                    **dict(self.fingers.named_buffers()),
+                    "rounds": torch.tensor(ROUNDS),
+                }
                 own |= {f"finger_{name}": buffers[name] for name in compiled.FINGERS}
             return compiled.held(own)
 
     def _axes(self, name: str) -> Tensor:
         """``[3, 3]`` unit axes, by rows, of the numbers of a chain."""
-        return normalize(self.matrix[self.rig.numbers(name)].unflatten(1, (-1, 3)).sum(1))
+        return normalize(
+            self.matrix[self.rig.numbers(name)].unflatten(1, (-1, 3)).sum(1)
+        )
 
     def weights(self, valid: Tensor) -> Tensor:
         """``[B, 33]`` precisions of landmarks, 0 where not ``valid [B, 33]``, bool.
@@ -240,7 +300,8 @@ class Solver(nn.Module):
     def at_rest(self, visibility: Tensor) -> Tensor:
         """``[B, joints]`` bool: joints that no visible landmark determines, which `solve` leaves at
         rest."""
-        seen, hands = visibility[:, :BODY] > 0, visibility[:, BODY:ALL] > 0
+        seen = visibility[:, :BODY] > 0
+        hands = visibility[:, BODY:ALL] > 0
         if self.fingers is not None and hands.shape[1]:
             placed = self.fingers.placed(hands)
             seen = seen & ~(placed.unsqueeze(-1) & self.replaced).any(1)
@@ -285,7 +346,9 @@ class Solver(nn.Module):
                 q[:, numbers] = log_of(R) @ self._axes(name).mT / len(names)
         for limb in self.rig.limbs:
             first, middle, end = (p[:, i] for i in limb.points)
-            bones = torch.stack([middle - first, end - middle], dim=1) @ hubs[:, limb.hub]
+            bones = (
+                torch.stack([middle - first, end - middle], dim=1) @ hubs[:, limb.hub]
+            )
             upper, lower = normalize(bones, dim=-1, eps=1e-6).unbind(1)
             axes = limb.axes.to(p)
             flat, _, along = axes
@@ -310,7 +373,8 @@ class Solver(nn.Module):
 
     def transforms(self, q: Tensor, root: Tensor, joints: Tensor) -> Tensor:
         """``[B, T + 1, 4, 4]`` world transforms since rest after each turn; last the identity."""
-        R, o = self.rotations(q, root), joints[self.joint]
+        R = self.rotations(q, root)
+        o = joints[self.joint]
         shift = o - (R @ o.unsqueeze(-1)).squeeze(-1)
         shift = torch.cat([shift[:, :1] + q[:, None, 3:6], shift[:, 1:]], dim=1)
         bottom = constant((0.0, 0.0, 0.0, 1.0), R).expand(*R.shape[:2], 1, 4)
@@ -329,13 +393,20 @@ class Solver(nn.Module):
         """Residuals to ``p [B, N, 3]`` and their derivatives, the root's about its rotation."""
         T = self.transforms(q, root, self.joints)
         n = p.shape[1]
-        x, before = self.points(T, self.landmarks[:n]), T[:, self.before]
-        origin = (before[..., :3, :3] @ self.joints[self.joint].unsqueeze(-1)).squeeze(-1)
+        x = self.points(T, self.landmarks[:n])
+        before = T[:, self.before]
+        origin = (before[..., :3, :3] @ self.joints[self.joint].unsqueeze(-1)).squeeze(
+            -1
+        )
         origin = origin + before[..., :3, 3]
         origin = torch.cat([origin[:, :1] + q[:, None, 3:6], origin[:, 1:]], dim=1)
-        turned = before[..., :3, :3] @ left_jacobian((q @ self.matrix).unflatten(1, (-1, 3)))
+        turned = before[..., :3, :3] @ left_jacobian(
+            (q @ self.matrix).unflatten(1, (-1, 3))
+        )
         axes = (turned[:, self.entry_turn] @ self.entry_axis.unsqueeze(-1)).squeeze(-1)
-        arms = (x.unsqueeze(1) - origin[:, self.entry_turn].unsqueeze(2)) * self.follows[:, :n]
+        arms = (
+            x.unsqueeze(1) - origin[:, self.entry_turn].unsqueeze(2)
+        ) * self.follows[:, :n]
         moved = torch.linalg.cross(axes.unsqueeze(2).expand_as(arms), arms)
         J = x.new_zeros(len(x), len(self.prior), *x.shape[1:])
         J.index_add_(1, self.entry_number, moved)
@@ -373,7 +444,8 @@ class Solver(nn.Module):
             q, root, cost, g, H = best
             scaled = H + torch.diag_embed(damping * torch.diagonal(H, dim1=-2, dim2=-1))
             q = q + _solved(scaled, -g)
-            root = axis_angle_to_matrix(q[:, :3]) @ root  # the next step starts from no turn
+            # the next step starts from no turn
+            root = axis_angle_to_matrix(q[:, :3]) @ root
             q = torch.cat([torch.zeros_like(q[:, :3]), q[:, 3:]], dim=1)
             new = (q, root, *self.normal(q, self.linear(q, root, p), weight)[:3])
             better = (new[2] < cost) & ~done
@@ -401,7 +473,19 @@ class Solver(nn.Module):
 def _settings() -> dict[str, float]:
     """The numbers of `compiled.NUMBERS`."""
     values = (
-        *(CONVERGED, DAMPING, EASIER, HARDER, FLOOR, ROBUST, BEYOND, HELD, NOISE, STRAIGHT, SHARP),
+        *(
+            CONVERGED,
+            DAMPING,
+            EASIER,
+            HARDER,
+            FLOOR,
+            ROBUST,
+            BEYOND,
+            HELD,
+            NOISE,
+            STRAIGHT,
+            SHARP,
+        ),
         *(fingers.NOISE, fingers.TRACE),
     )
     return dict(zip(compiled.NUMBERS, values, strict=True))
@@ -410,7 +494,8 @@ def _settings() -> dict[str, float]:
 def _noise() -> Tensor:
     """``[33]`` metres."""
     noise = torch.full((len(MEDIAPIPE33.names),), NOISE)
-    noise[list(MEDIAPIPE33.face)], noise[KNUCKLES] = FACE_NOISE, KNUCKLE_NOISE
+    noise[list(MEDIAPIPE33.face)] = FACE_NOISE
+    noise[KNUCKLES] = KNUCKLE_NOISE
     return noise
 
 

@@ -16,8 +16,10 @@ TOPIC = "calibration"
 MIRRORED = "mirrored images"
 TRIED = 8  # images per camera on which calibrations are tried, at most
 CREDIBLE_OVERLAP = 0.35  # the right calibration has 0.6 to 0.7, with slim masks 0.4
-SHARE_OF_ANY_CAMERA = 0.5  # of a standing person's joints lie in the mask from any camera
-OUTSIDE_RATIO = 3.0  # times the other cameras' distance: noisy landmarks are off in all of them
+# of a standing person's joints lie in the mask from any camera
+SHARE_OF_ANY_CAMERA = 0.5
+# times the other cameras' distance: noisy landmarks are off in all of them
+OUTSIDE_RATIO = 3.0
 OUTSIDE_ALL = 2.0  # times the limit of one camera, where all are off
 
 
@@ -69,7 +71,8 @@ def score_cameras(subject: CheckedData, views: Sequence[MaskView]) -> list[Camer
     """Scores every camera of which an image could be read."""
     scores = []
     for name, own in grouped(views).items():
-        chosen, camera = spread(own, TRIED), subject.cameras[name]
+        chosen = spread(own, TRIED)
+        camera = subject.cameras[name]
         rivals = dict[str, float]()
         for rival, other in calibrations(camera, subject.cameras):
             rivals[rival] = max(rivals.get(rival, 0.0), _fit(subject, chosen, other))
@@ -109,7 +112,9 @@ def _fit(subject: CheckedData, views: Sequence[MaskView], camera: CameraEntry) -
     for view in views:
         row = subject.rows[view.frame]
         skeleton = subject.p[row], subject.visible[row], subject.template
-        overlaps.append(overlap(view.mask, body_silhouette(view.small(camera), *skeleton)))
+        overlaps.append(
+            overlap(view.mask, body_silhouette(view.small(camera), *skeleton))
+        )
     return float(np.mean(overlaps))
 
 
@@ -120,10 +125,14 @@ def known_mean(values: Iterable[float]) -> float:
 
 
 def calibration_findings(
-    scores: Sequence[CameraScore], limits: Limits, min_inside: float, named: Iterable[str] = ()
+    scores: Sequence[CameraScore],
+    limits: Limits,
+    min_inside: float,
+    named: Iterable[str] = (),
 ) -> list[Finding]:
     """Which camera is wrong, and the usual causes; other findings name ``named`` already."""
-    found, named = list[Finding](), set(named)
+    found = list[Finding]()
+    named = set(named)
     if big := [s for s in scores if s.oversized(limits) and s.name not in named]:
         sizes = listed(f"{s.name} {s.fullness:.1f}" for s in big)
         text = (
@@ -135,7 +144,9 @@ def calibration_findings(
         scores = [s for s in scores if s not in big]
     beaten = [s for s in scores if s.beaten(limits)]
     for one, other in combinations(beaten, 2):
-        close = other.name in one.close_rivals(limits) and one.name in other.close_rivals(limits)
+        close = other.name in one.close_rivals(
+            limits
+        ) and one.name in other.close_rivals(limits)
         if close and not {one.name, other.name} & named:
             text = (
                 f"cameras {one.name} and {other.name} look exchanged: the R and t of the other "
@@ -156,7 +167,9 @@ def calibration_findings(
         wrong = any(s.wrong(limits) for s in scores)
         return [Finding("error" if wrong else "warning", TOPIC, text)]
     for score in scores:
-        if score.name not in named and (finding := _of_one(score, scores, limits, min_inside)):
+        if score.name not in named and (
+            finding := _of_one(score, scores, limits, min_inside)
+        ):
             found.append(finding)
             named.add(score.name)
     return found + small_errors([s for s in scores if s.name not in named], limits)
@@ -172,11 +185,16 @@ def _of_one(
         seen += f", {others:.0%} in the other cameras"
     error = not score.inside >= limits.inside_error
     if score.beaten(limits):
-        error, rivals = True, score.close_rivals(limits)
-        names = " or ".join(n if n == MIRRORED else f"the calibration of {n}" for n in rivals)
+        error = True
+        rivals = score.close_rivals(limits)
+        names = " or ".join(
+            n if n == MIRRORED else f"the calibration of {n}" for n in rivals
+        )
         advice = "check its R, t and folder name"
         if MIRRORED in rivals:
-            advice = "mirror its images and masks back" + (f", or {advice}" if rivals[1:] else "")
+            advice = "mirror its images and masks back" + (
+                f", or {advice}" if rivals[1:] else ""
+            )
         text = (
             f"{names} would fit its masks better (overlap {score.best_rival:.2f}) than its own "
             f"calibration ({score.overlap:.2f}); {seen}; {advice}"
@@ -191,7 +209,9 @@ def _of_one(
         )
     else:
         return None
-    return Finding("error" if error else "warning", TOPIC, f"camera {score.name}: {text}")
+    return Finding(
+        "error" if error else "warning", TOPIC, f"camera {score.name}: {text}"
+    )
 
 
 def small_errors(scores: Sequence[CameraScore], limits: Limits) -> list[Finding]:

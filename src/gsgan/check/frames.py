@@ -27,8 +27,10 @@ KINDS = {
     "unseen": "few joints were seen",
     "detections": "joints lie far from their 2D detections",
 }
-JUMP_RATIO = 4.0  # a jump exceeds the upper quartile of all by this: low frame rates pass
-LIMB_METRES = 0.06  # that a limb must be off as well: noise moves the ends of short bones
+# a jump exceeds the upper quartile of all by this: low frame rates pass
+JUMP_RATIO = 4.0
+# that a limb must be off as well: noise moves the ends of short bones
+LIMB_METRES = 0.06
 MIRRORED = 0.5  # share of frames facing backwards: then all of them are exchanged
 
 
@@ -43,13 +45,19 @@ class Doubt:
 
 def skeleton_doubts(subject: CheckedData, limits: Limits) -> list[Doubt]:
     """Reasons to doubt the skeletons of all frames; no image is needed."""
-    p, template = subject.seen_p, subject.template
-    names, found = template.names, list[Doubt]()
+    p = subject.seen_p
+    template = subject.template
+    names = template.names
+    found = list[Doubt]()
 
-    def doubt(kind: str, what: str, flags: Bool, text: Callable[[int, int], str]) -> None:
+    def doubt(
+        kind: str, what: str, flags: Bool, text: Callable[[int, int], str]
+    ) -> None:
         """Adds the frames in which any of the flags ``[F, N]`` holds."""
         for row in np.flatnonzero(flags.any(1)).tolist():
-            texts = listed([text(row, i) for i in np.flatnonzero(flags[row]).tolist()], 3)
+            texts = listed(
+                [text(row, i) for i in np.flatnonzero(flags[row]).tolist()], 3
+            )
             found.append(Doubt(int(subject.frames[row]), kind, f"{what}{texts}"))
 
     jump = jump_distance(p)
@@ -64,7 +72,12 @@ def skeleton_doubts(subject: CheckedData, limits: Limits) -> list[Doubt]:
     change = np.abs(lengths - typical) / np.maximum(typical, 1e-6)
     bones = [f"{names[a]} to {names[b]}" for a, b in template.limbs]
     odd = (change > limits.limb_share) & (change * typical > LIMB_METRES)
-    doubt("limb", "length off its median: ", odd, lambda f, i: f"{bones[i]} {change[f, i]:.0%}")
+    doubt(
+        "limb",
+        "length off its median: ",
+        odd,
+        lambda f, i: f"{bones[i]} {change[f, i]:.0%}",
+    )
 
     backwards = facing(p, template)[:, None] < 0
     doubt("backwards", "", backwards, lambda *_: "nose or toes point backwards")
@@ -93,7 +106,9 @@ def reprojection_errors(subject: CheckedData) -> Float:
     arrays = read_arrays(path, ("reproj_px", "frame_id")) if path.is_file() else {}
     if "reproj_px" in arrays:
         ids = expect_array(arrays, "frame_id", (None,), path)
-        stored = expect_array(arrays, "reproj_px", (len(ids), len(subject.template.names)), path)
+        stored = expect_array(
+            arrays, "reproj_px", (len(ids), len(subject.template.names)), path
+        )
         for number, row in zip(ids.tolist(), stored, strict=True):
             if number in subject.rows:
                 result[subject.rows[number]] = row
@@ -108,7 +123,8 @@ def mask_doubts(
         full = [view.fullness for view in own if view.mask.any()]
         usual = float(np.median(full)) if full else 0.0
         for view in own if name not in unfit else ():
-            known, out = int(view.known.sum()), int(view.beyond.sum())
+            known = int(view.known.sum())
+            out = int(view.beyond.sum())
             if not view.mask.any():
                 yield Doubt(view.frame, "mask", f"{name}: the mask is empty")
                 continue
@@ -117,14 +133,20 @@ def mask_doubts(
                 yield Doubt(view.frame, "outside", text)
             change = view.fullness / usual - 1 if usual else 0.0
             # With few joints the estimated silhouette is too incomplete to compare the mask with.
-            if known >= limits.seen_share * len(view.known) and abs(change) > limits.area_jump:
+            if (
+                known >= limits.seen_share * len(view.known)
+                and abs(change) > limits.area_jump
+            ):
                 text = f"{name}: mask area {change:+.0%} off the usual for the pose"
                 yield Doubt(view.frame, "mask", text)
 
 
-def frame_findings(subject: CheckedData, found: Sequence[Doubt], limits: Limits) -> list[Finding]:
+def frame_findings(
+    subject: CheckedData, found: Sequence[Doubt], limits: Limits
+) -> list[Finding]:
     """One finding per kind of doubt; an error when left and right, or most frames, are wrong."""
-    findings, count = [], len(subject.frames)
+    findings = []
+    count = len(subject.frames)
     backwards = sum(doubt.kind == "backwards" for doubt in found) / count
     mirrored = backwards > MIRRORED
     if mirrored:
@@ -171,7 +193,9 @@ def jumped(distance: Float, limit: float) -> Bool:
     A stray frame also moves its neighbours' midpoints, by half as much; only the peak counts.
     """
     known = np.pad(np.nan_to_num(distance), ((1, 1), (0, 0)))
-    before, here, after = known[:-2], known[1:-1], known[2:]
+    before = known[:-2]
+    here = known[1:-1]
+    after = known[2:]
     return np.asarray((here > limit) & (here >= before) & (here >= after))
 
 
@@ -185,7 +209,9 @@ def facing(p: Float, template: SkeletonTemplate) -> Float:
     front = np.cross(l_sh - r_sh, l_sh + r_sh - l_hip - r_hip)
     index = template.names.index
     ends = [(list(template.ears), template.nose)]
-    ends += [([index(f"{s}_ankle")], index(f"{s}_foot_index")) for s in ("left", "right")]
+    ends += [
+        ([index(f"{s}_ankle")], index(f"{s}_foot_index")) for s in ("left", "right")
+    ]
     ahead = np.stack([p[:, tip] - p[:, behind].mean(1) for behind, tip in ends])
     votes = np.sign((ahead * front).sum(-1))
     known = np.isfinite(votes)

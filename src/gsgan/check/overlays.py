@@ -18,8 +18,13 @@ from gsgan.utils.images import caption, encode
 HEIGHT = 360  # pixels of a tile
 ASPECT = 0.75  # width to height of a tile: a standing person
 MARGIN = 0.08  # of the box about person and skeleton, on each side
-LEFT, RIGHT, MIDDLE = (60, 150, 255), (255, 140, 40), (240, 240, 240)  # RGB, the person's sides
-OUTLINE, OUTSIDE, NEUTRAL = (70, 255, 90), (255, 40, 60), (70, 70, 70)
+# RGB, the person's sides
+LEFT = (60, 150, 255)
+RIGHT = (255, 140, 40)
+MIDDLE = (240, 240, 240)
+OUTLINE = (70, 255, 90)
+OUTSIDE = (255, 40, 60)
+NEUTRAL = (70, 70, 70)
 GAP = 4  # pixels between tiles
 LEGEND = (
     "Green: the mask's outline. Blue: the person's left, orange: the right, white: the middle; "
@@ -28,11 +33,14 @@ LEGEND = (
 )
 
 
-def strip(subject: CheckedData, views: Sequence[MaskView], doubtful: Collection[int] = ()) -> bytes:
+def strip(
+    subject: CheckedData, views: Sequence[MaskView], doubtful: Collection[int] = ()
+) -> bytes:
     """A row of at least one tile as a JPEG; captions of ``doubtful`` frames are red."""
     tiles = []
     for view in views:
-        known, out = int(view.known.sum()), int(view.beyond.sum())
+        known = int(view.known.sum())
+        out = int(view.beyond.sum())
         text = f"{view.frame}   {known - out}/{known} inside"
         colour = OUTSIDE if view.frame in doubtful else NEUTRAL
         captioned = caption(tile(subject, view), text, colour)
@@ -42,34 +50,48 @@ def strip(subject: CheckedData, views: Sequence[MaskView], doubtful: Collection[
 
 def tile(subject: CheckedData, view: MaskView) -> Bytes:
     """``[HEIGHT, 0.75 HEIGHT, 3]`` RGB: the image about the person, with overlays."""
-    camera, row = subject.cameras[view.camera], subject.rows[view.frame]
+    camera = subject.cameras[view.camera]
+    row = subject.rows[view.frame]
     joints, depth = project(camera, subject.p[row])
     drawn = subject.visible[row] & (depth > NEAR)
     window = person_window(view, joints[drawn], camera.size)
     distorted = camera.distorted
     mapping = undistort_map(camera.K, camera.dist, window) if distorted else None
-    item, size = (view.camera, view.frame), (HEIGHT, round(HEIGHT * ASPECT))
-    image, mask = (
-        resize(take(whole, window, mapping, False), size, False)
-        for whole in (
-            read_colour(subject.layout.image_path(*item)),
+    item = (view.camera, view.frame)
+    size = (HEIGHT, round(HEIGHT * ASPECT))
+    image = resize(
+        take(read_colour(subject.layout.image_path(*item)), window, mapping, False),
+        size,
+        False,
+    )
+    mask = resize(
+        take(
             read_mask(subject.layout.mask_files(*item), subject.layout.pixels),
-        )
+            window,
+            mapping,
+            False,
+        ),
+        size,
+        False,
     )
     scale = np.array(size[::-1]) / np.array(window.size[::-1])
 
     def placed(pixels: Float) -> NDArray[np.int32]:
-        at = (np.clip(pixels, -FAR_PIXELS, FAR_PIXELS) - (window.left, window.top)) * scale
+        at = (
+            np.clip(pixels, -FAR_PIXELS, FAR_PIXELS) - (window.left, window.top)
+        ) * scale
         return np.round(at - 0.5).astype(np.int32)
 
     canvas = np.ascontiguousarray(image)
     person = (mask > 127).astype(np.uint8)
     contours = cv2.findContours(person, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
     cv2.drawContours(canvas, contours, -1, OUTLINE, 1, cv2.LINE_AA)
-    at, names = placed(joints), subject.template.names
+    at = placed(joints)
+    names = subject.template.names
     for a, b in subject.template.edges:
         if drawn[a] and drawn[b]:
-            ends, colour = (at[a].tolist(), at[b].tolist()), _side(names[a], names[b])
+            ends = (at[a].tolist(), at[b].tolist())
+            colour = _side(names[a], names[b])
             cv2.line(canvas, *ends, (0, 0, 0), 3, cv2.LINE_AA)
             cv2.line(canvas, *ends, colour, 1, cv2.LINE_AA)
     for joint in np.flatnonzero(drawn).tolist():
@@ -83,10 +105,13 @@ def tile(subject: CheckedData, view: MaskView) -> Bytes:
     return canvas
 
 
-def _hands_and_face(subject: CheckedData, frame: int) -> list[tuple[Float, tuple[int, int, int]]]:
+def _hands_and_face(
+    subject: CheckedData, frame: int
+) -> list[tuple[Float, tuple[int, int, int]]]:
     """The landmarks seen ``[N, 3]`` of the left hand, the right hand and the face, with colours."""
     found = []
-    hands, face = subject.layout.hands, subject.layout.face
+    hands = subject.layout.hands
+    face = subject.layout.face
     if hands is not None and frame in hands.p:
         seen = hands.visibility[frame] > 0
         for part, colour in ((slice(HAND), LEFT), (slice(HAND, None), RIGHT)):
@@ -101,12 +126,15 @@ def person_window(view: MaskView, joints: Float, size: tuple[int, int]) -> Crop:
     points = [np.clip(joints, 0, np.array(size[::-1]))]
     rows, columns = np.nonzero(view.mask)
     if len(rows):
-        small = np.array([[columns.min(), rows.min()], [columns.max() + 1, rows.max() + 1]])
+        small = np.array(
+            [[columns.min(), rows.min()], [columns.max() + 1, rows.max() + 1]]
+        )
         points.append((small - view.to_small[:2, 2]) / np.diag(view.to_small)[:2])
     box = np.concatenate(points)
     if len(box) == 0:
         box = np.array([[0, 0], size[::-1]])
-    low, high = box.min(0), box.max(0)
+    low = box.min(0)
+    high = box.max(0)
     span = np.maximum((high - low) * (1 + 2 * MARGIN), 8)
     height = max(span[1], span[0] / ASPECT)
     width = height * ASPECT

@@ -47,10 +47,14 @@ def check_data(
         ConfigError: when the data's config is wrong.
     """
     try:
-        measured = Measurements(data, sampling, limits, effects or EffectSettings(), console)
+        measured = Measurements(
+            data, sampling, limits, effects or EffectSettings(), console
+        )
     except DataError as error:
         return unreadable(data.root, error)
-    return Report(str(measured.subject.layout.root), sections(measured), measured.numbers())
+    return Report(
+        str(measured.subject.layout.root), sections(measured), measured.numbers()
+    )
 
 
 def unreadable(root: str | None, error: DataError) -> Report:
@@ -81,14 +85,19 @@ def run_check(config: DictConfig) -> Report:
         ConfigError: on a config value that does not fit.
     """
     if not config.report:
-        raise ConfigError("report is not set: give the HTML file to write, e.g. report=check.html")
+        raise ConfigError(
+            "report is not set: give the HTML file to write, e.g. report=check.html"
+        )
     # The reader's notes are part of the report.
     logging.getLogger("gsgan.data").setLevel(logging.ERROR)
     console = make_console()
-    sampling, limits = instantiate(config.sampling), instantiate(config.limits)
+    sampling = instantiate(config.sampling)
+    limits = instantiate(config.limits)
     effects = instantiate(config.effects)
     try:
-        report = check_data(instantiate(config.data), sampling, limits, effects, console)
+        report = check_data(
+            instantiate(config.data), sampling, limits, effects, console
+        )
     except InstantiationException as error:
         if not isinstance(error.__cause__, DataError):
             raise

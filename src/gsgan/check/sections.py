@@ -25,7 +25,8 @@ from gsgan.utils.errors import DataError
 
 POSSIBLE = (0.4, 3.0)  # metres of person: outside, units are wrong
 PLAUSIBLE = (1.2, 2.1)  # metres: smaller is a child or a wrong unit, taller is rare
-LEAN = 50.0  # degrees from trunk to up axis, median over frames: nobody stands like that
+# degrees from trunk to up axis, median over frames: nobody stands like that
+LEAN = 50.0
 
 
 @dataclass(frozen=True)
@@ -53,22 +54,30 @@ class Geometry:
 
 def geometry_of(subject: CheckedData) -> Geometry:
     """Measures the cameras and the person."""
-    template, p = subject.template, subject.seen_p
-    sums = limb_length_sum(torch.from_numpy(subject.p), torch.from_numpy(subject.visible), template)
-    shoulders, hips = (p[:, list(j)].mean(1) for j in (template.shoulders, template.hips))
+    template = subject.template
+    p = subject.seen_p
+    sums = limb_length_sum(
+        torch.from_numpy(subject.p), torch.from_numpy(subject.visible), template
+    )
+    shoulders = p[:, list(template.shoulders)].mean(1)
+    hips = p[:, list(template.hips)].mean(1)
     trunk = shoulders - hips
     axis = nanmedian(trunk / np.linalg.norm(trunk, axis=-1, keepdims=True))
     axis = axis if np.isfinite(axis).all() else subject.up
     cosine = axis @ subject.up / np.linalg.norm(axis)
     centre = np.median(subject.p[subject.visible], axis=0)
-    distances = {n: float(np.linalg.norm(c.centre - centre)) for n, c in subject.cameras.items()}
+    distances = {
+        n: float(np.linalg.norm(c.centre - centre)) for n, c in subject.cameras.items()
+    }
     return Geometry(
         distances=distances,
         stature=float(sums.nanmedian()) / template.limb_length_sum * template.stature,
         up=axis,
         lean=float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))),
         # Of two cameras neither is the median one.
-        far=far_cameras(distances, subject.consistency.far_camera) if len(distances) > 2 else {},
+        far=far_cameras(distances, subject.consistency.far_camera)
+        if len(distances) > 2
+        else {},
     )
 
 
@@ -81,7 +90,8 @@ def geometry_findings(subject: CheckedData, geometry: Geometry) -> list[Finding]
         possible = POSSIBLE[0] <= stature <= POSSIBLE[1]
         found.append(Finding("warning" if possible else "error", "units", text))
     if geometry.lean > LEAN:
-        way, axis = axis_name(geometry.up), subject.layout.meta.up_axis
+        way = axis_name(geometry.up)
+        axis = subject.layout.meta.up_axis
         text = f"the trunk points along {way}, {geometry.lean:.0f} degrees from the up axis {axis}"
         found.append(Finding("warning", "units", text))
     return found
@@ -89,11 +99,16 @@ def geometry_findings(subject: CheckedData, geometry: Geometry) -> list[Finding]
 
 def geometry_table(subject: CheckedData, geometry: Geometry) -> Table:
     """Units and sizes."""
-    meta, distances = subject.layout.meta, geometry.distances.values()
-    near, far = min(distances), max(distances)
+    meta = subject.layout.meta
+    distances = geometry.distances.values()
+    near = min(distances)
+    far = max(distances)
     rows = (
         ("unit of the files", meta.unit),
-        ("camera to person", f"{geometry.distance:.2f} m (median; {near:.2f} to {far:.2f})"),
+        (
+            "camera to person",
+            f"{geometry.distance:.2f} m (median; {near:.2f} to {far:.2f})",
+        ),
         ("person's height", f"{geometry.stature:.2f} m, from limb lengths"),
         ("up axis", f"{meta.up_axis}; the trunk leans {geometry.lean:.0f}° from it"),
         ("frames per second", "not given" if meta.fps is None else f"{meta.fps:g}"),
@@ -106,18 +121,26 @@ def lens_table(subject: CheckedData, geometry: Geometry) -> Table:
     rows = []
     for name, camera in subject.cameras.items():
         (height, width), K = camera.size, camera.K
-        rows.append((
-            name,
-            f"{width}×{height}",
-            f"{K[0, 0]:.0f}, {K[1, 1]:.0f}",
-            f"{K[0, 2] / width:.2f}, {K[1, 2] / height:.2f}",
-            " ".join(f"{c:.3g}" for c in np.trim_zeros(camera.dist, "b")) or "none",
-            f"{geometry.distances[name]:.2f}",
-            str(len(subject.pairs[name])),
-        ))  # fmt: skip
+        rows.append(
+            (
+                name,
+                f"{width}×{height}",
+                f"{K[0, 0]:.0f}, {K[1, 1]:.0f}",
+                f"{K[0, 2] / width:.2f}, {K[1, 2] / height:.2f}",
+                " ".join(f"{c:.3g}" for c in np.trim_zeros(camera.dist, "b")) or "none",
+                f"{geometry.distances[name]:.2f}",
+                str(len(subject.pairs[name])),
+            )
+        )
     headers = (
-        "camera", "pixels", "focal fx, fy", "centre (share)", "distortion", "distance m", "images",
-    )  # fmt: skip
+        "camera",
+        "pixels",
+        "focal fx, fy",
+        "centre (share)",
+        "distortion",
+        "distance m",
+        "images",
+    )
     return Table(headers, tuple(rows))
 
 
@@ -149,7 +172,10 @@ class Measurements:
         effects: EffectSettings,
         console: Console | None,
     ) -> None:
-        self.data, self.sampling, self.limits, self.effects = data, sampling, limits, effects
+        self.data = data
+        self.sampling = sampling
+        self.limits = limits
+        self.effects = effects
         self.subject = subject = views.subject_of(data)
         items = views.sampled_items(subject, sampling.images)
         items += views.cut_items(subject, sampling.images)
@@ -159,8 +185,12 @@ class Measurements:
         self.broken = [Finding("error", "files", text) for text in broken]
         self.geometry = geometry_of(subject)
         self.cameras = score_cameras(subject, self.views)
-        self.wrong = {*self.geometry.far, *(s.name for s in self.cameras if s.wrong(limits))}
-        self.info, self.no_info = None, ""
+        self.wrong = {
+            *self.geometry.far,
+            *(s.name for s in self.cameras if s.wrong(limits)),
+        }
+        self.info = None
+        self.no_info = ""
         try:
             self.info = data.info
         except DataError as error:  # named among the findings
@@ -182,7 +212,9 @@ class Measurements:
             },
             "camera_distance": self.geometry.distance,
             "stature": self.geometry.stature,
-            "doubtful_frames": {str(frame): text for frame, text in self.reasons.items()},
+            "doubtful_frames": {
+                str(frame): text for frame, text in self.reasons.items()
+            },
             "settings": {
                 "sampling": asdict(self.sampling),
                 "limits": asdict(self.limits),
@@ -196,7 +228,8 @@ def sections(m: Measurements) -> tuple[Section, ...]:
     units = (geometry_table(m.subject, m.geometry), lens_table(m.subject, m.geometry))
     strips = [
         Figure(
-            f"camera {name}", overlays.strip(m.subject, spread(own, m.sampling.shown), m.reasons)
+            f"camera {name}",
+            overlays.strip(m.subject, spread(own, m.sampling.shown), m.reasons),
         )
         for name, own in views.grouped(m.views).items()
     ]
@@ -213,47 +246,66 @@ def sections(m: Measurements) -> tuple[Section, ...]:
 
 def _contents(m: Measurements) -> Section:
     """Counts, splits, missing and damaged images."""
-    data, subject, names = m.data, m.subject, m.subject.template.names
-    layout, splits = data.layout, data.splits
+    data = m.data
+    subject = m.subject
+    names = m.subject.template.names
+    layout = data.layout
+    splits = data.splits
     frames = [int(f) for f in subject.frames]
     images = sum(len(files) for files in subject.pairs.values())
     labels = sum(len(files) for files in layout.labels.values())
-    unseen = [n for n, seen in zip(names, subject.visible.sum(0), strict=True) if not seen]
-    skeleton = (
-        f"{len(names)} joints, {layout.meta.skeleton_source}; {subject.visible.mean():.1%} seen"
-    )
+    unseen = [
+        n for n, seen in zip(names, subject.visible.sum(0), strict=True) if not seen
+    ]
+    share_seen = f"{subject.visible.mean():.1%} seen"
+    skeleton = f"{len(names)} joints, {layout.meta.skeleton_source}; {share_seen}"
     if unseen:
         skeleton += f"; never seen: {', '.join(unseen)}"
     contents = [
         ("layout", layout.meta.layout),
         ("cameras", f"{len(subject.cameras)}: {', '.join(subject.cameras)}"),
         ("frames", f"{len(frames)}: {shortened(frames)}"),
-        ("images", f"{images} of {len(frames) * len(subject.cameras)} (all with a mask)"),
+        (
+            "images",
+            f"{images} of {len(frames) * len(subject.cameras)} (all with a mask)",
+        ),
         ("part labels", f"{labels} images" if labels else "none"),
-        ("body poses", "none" if layout.poses is None else f"{len(layout.poses.theta)} frames"),
+        (
+            "body poses",
+            "none" if layout.poses is None else f"{len(layout.poses.theta)} frames",
+        ),
         ("skeleton", skeleton),
     ]
     for part, landmarks in (("hands", layout.hands), ("face", layout.face)):
         if landmarks is not None:
-            seen = sum(bool(v.any()) for f, v in landmarks.visibility.items() if f in subject.rows)
+            seen = sum(
+                bool(v.any())
+                for f, v in landmarks.visibility.items()
+                if f in subject.rows
+            )
             contents.append((part, f"in {seen} of {len(frames)} frames"))
     contents += [(f"split {name}", _split(data, name)) for name in splits.items]
     if data.protocol is not None:
         contents.append(("protocol", data.protocol.name))
-    contents += [("note of the reader", note) for note in (*layout.notes, *splits.notes)]
+    contents += [
+        ("note of the reader", note) for note in (*layout.notes, *splits.notes)
+    ]
     found = [*m.broken]
     for name, files in subject.pairs.items():
         if lacking := sorted(set(frames) - set(files)):
             text = f"{len(lacking)} of the {len(frames)} frames: {shortened(lacking)}"
             found.append(Finding("warning", "files", f"camera {name} lacks {text}"))
-    return Section("Contents", (Table(("what", "how much"), tuple(contents)),), tuple(found))
+    return Section(
+        "Contents", (Table(("what", "how much"), tuple(contents)),), tuple(found)
+    )
 
 
 def _split(data: GsganData, name: str) -> str:
     items = data.splits.items[name]
     if not items:
         return f"empty: {data.splits.reasons.get(name, '')}"
-    cameras, frames = {camera for camera, _ in items}, {frame for _, frame in items}
+    cameras = {camera for camera, _ in items}
+    frames = {frame for _, frame in items}
     count = f"{counted(len(items), 'image')}: {counted(len(cameras), 'camera')}"
     return f"{count}, frames {shortened(sorted(frames))}"
 
@@ -271,12 +323,19 @@ def _agreement(m: Measurements) -> Section:
         for s in m.cameras
     )
     headers = (
-        "camera", "joints inside mask", "outside by cm", "overlap", "best other", "mask / body",
-    )  # fmt: skip
+        "camera",
+        "joints inside mask",
+        "outside by cm",
+        "overlap",
+        "best other",
+        "mask / body",
+    )
     min_inside = m.subject.consistency.min_inside
     found = calibration_findings(m.cameras, m.limits, min_inside, m.geometry.far)
     table = Table(headers, rows)
-    return Section("Skeleton, masks and cameras", (table,), tuple(found), text=AGREEMENT)
+    return Section(
+        "Skeleton, masks and cameras", (table,), tuple(found), text=AGREEMENT
+    )
 
 
 def _frames(m: Measurements) -> Section:

@@ -40,7 +40,8 @@ from gsgan.utils.errors import DataError
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
 
-FAR = 0.3  # metres: distances of joints from the mask are clipped to this before they are averaged
+# metres: distances of joints from the mask are clipped to this before they are averaged
+FAR = 0.3
 SMALL = 128  # pixels, longest side of the masks that calibrations are tried on
 TAIL = 64  # bytes: some writers append a few after the end mark
 END_MARKS = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8": b"\xff\xd9"}  # by first bytes
@@ -87,7 +88,9 @@ class CheckedData:
     @cached_property
     def step(self) -> int:
         """Frame numbers from one frame to the next: the median gap."""
-        return max(1, int(np.median(np.diff(self.frames)))) if len(self.frames) > 1 else 1
+        return (
+            max(1, int(np.median(np.diff(self.frames)))) if len(self.frames) > 1 else 1
+        )
 
 
 def subject_of(data: GsganData) -> CheckedData:
@@ -109,7 +112,9 @@ def subject_of(data: GsganData) -> CheckedData:
         layout=layout,
         consistency=consistency,
         frames=frames,
-        pairs={name: tuple(sorted(layout.images[name])) for name in layout.camera_names},
+        pairs={
+            name: tuple(sorted(layout.images[name])) for name in layout.camera_names
+        },
         p=np.stack([layout.landmarks.p[int(f)] for f in frames]),
         visible=np.stack([layout.landmarks.visibility[int(f)] for f in frames]) > 0,
         up=np.eye(3)["xyz".index(axis[-1])] * (-1.0 if axis.startswith("-") else 1.0),
@@ -208,7 +213,10 @@ def complete(path: Path) -> bool:
 
 
 def measure(
-    subject: CheckedData, items: Sequence[Item], sampling: Sampling, console: Console | None = None
+    subject: CheckedData,
+    items: Sequence[Item],
+    sampling: Sampling,
+    console: Console | None = None,
 ) -> tuple[list[MaskView], list[str]]:
     """Decodes and measures images, each once; the messages of those that cannot be read."""
 
@@ -221,7 +229,9 @@ def measure(
     bar = progress(console or Console(), disable=console is None)
     with ThreadPoolExecutor(sampling.workers) as pool, bar:
         unique = tuple(dict.fromkeys(items))
-        found = bar.track(pool.map(one, unique), len(unique), description="checking images")
+        found = bar.track(
+            pool.map(one, unique), len(unique), description="checking images"
+        )
         results = list(found)
     views = [result for result in results if isinstance(result, MaskView)]
     return views, [result for result in results if isinstance(result, str)]
@@ -229,18 +239,29 @@ def measure(
 
 def _view(subject: CheckedData, item: Item, sampling: Sampling) -> MaskView:
     name, number = item
-    entry, row = subject.cameras[name], subject.rows[number]
-    frame = CaptureDataset(subject.layout, [item], min(sampling.size, max(entry.size)))[0]
-    camera = replace(entry, K=frame.camera.K[0].double().numpy(), size=frame.camera.size)
-    focal, soft = float(camera.K[0, 0]), frame.mask[0, 0].numpy()
-    mask, visible = np.asarray(soft > 0.5), subject.visible[row]
+    entry = subject.cameras[name]
+    row = subject.rows[number]
+    frame = CaptureDataset(subject.layout, [item], min(sampling.size, max(entry.size)))[
+        0
+    ]
+    camera = replace(
+        entry, K=frame.camera.K[0].double().numpy(), size=frame.camera.size
+    )
+    focal = float(camera.K[0, 0])
+    soft = frame.mask[0, 0].numpy()
+    mask = np.asarray(soft > 0.5)
+    visible = subject.visible[row]
     body = body_silhouette(camera, subject.p[row], visible, subject.template)
     pixels, depth = project(camera, subject.p[row])
     metre = float(np.median(depth[visible])) / focal  # per pixel
     seen = visible & inside(entry, subject.p[row])  # not in the padding
     factor = min(1.0, SMALL / max(mask.shape))
     small = [max(1, round(side * factor)) for side in mask.shape[::-1]]
-    to_small = np.diag([*np.array(small) / mask.shape[::-1], 1]) @ camera.K @ np.linalg.inv(entry.K)
+    to_small = (
+        np.diag([*np.array(small) / mask.shape[::-1], 1])
+        @ camera.K
+        @ np.linalg.inv(entry.K)
+    )
     return MaskView(
         camera=name,
         frame=number,
@@ -263,10 +284,15 @@ def body_silhouette(
     pixels, depth = project(camera, p)
     canvas = np.zeros(size, np.uint8)
     drawn = visible & (depth > NEAR)
-    at = np.round(np.clip(np.nan_to_num(pixels), -FAR_PIXELS, FAR_PIXELS) - 0.5).astype(np.int32)
+    at = np.round(np.clip(np.nan_to_num(pixels), -FAR_PIXELS, FAR_PIXELS) - 0.5).astype(
+        np.int32
+    )
     metre = abs(camera.K[0, 0]) / np.maximum(depth, NEAR)  # pixels
     trunk = template.torso
-    edges = [*template.limbs, *zip(trunk, (trunk[1], trunk[3], trunk[0], trunk[2]), strict=True)]
+    edges = [
+        *template.limbs,
+        *zip(trunk, (trunk[1], trunk[3], trunk[0], trunk[2]), strict=True),
+    ]
     for a, b in edges:
         if drawn[a] and drawn[b]:
             width = thickness(2 * FLESH * min(metre[a], metre[b]), size)

@@ -71,12 +71,19 @@ def find_calibration(folder: Path) -> Path:
     Raises:
         DataError: when there is none, or more than one.
     """
-    places = [folder, *(p for p in folder.glob("*") if p.is_dir() and "calib" in p.name.lower())]
-    found = sorted({p for place in places for pattern in PATTERNS for p in place.glob(pattern)})
+    places = [
+        folder,
+        *(p for p in folder.glob("*") if p.is_dir() and "calib" in p.name.lower()),
+    ]
+    found = sorted(
+        {p for place in places for pattern in PATTERNS for p in place.glob(pattern)}
+    )
     # Other .toml files are configs.
     found = [p for p in found if p.suffix != ".toml" or b"matrix" in p.read_bytes()]
     if not found:
-        raise DataError(f"{folder} holds no calibration; give calibration=<file>: {KNOWN}")
+        raise DataError(
+            f"{folder} holds no calibration; give calibration=<file>: {KNOWN}"
+        )
     if len(found) > 1:
         names = ", ".join(str(p.relative_to(folder)) for p in found)
         raise DataError(
@@ -128,12 +135,17 @@ def read_conventions(path: Path, content: Mapping[str, Any]) -> Conventions:
     return Conventions(
         scale=METRES[choose(path, content, "unit", None, tuple(METRES))],
         pixel_centre=choose(path, content, "pixel_centre", 0.5, (0, 0.5)),
-        composed=choose(path, content, "background", "scene", ("scene", "black")) == "black",
+        composed=choose(path, content, "background", "scene", ("scene", "black"))
+        == "black",
     )
 
 
 def choose(
-    path: Path, content: Mapping[str, Any], key: str, default: Any, allowed: tuple[Any, ...]
+    path: Path,
+    content: Mapping[str, Any],
+    key: str,
+    default: Any,
+    allowed: tuple[Any, ...],
 ) -> Any:
     """The value of a key, which must be one of those allowed.
 
@@ -164,7 +176,9 @@ def read_cameras(
     cameras = {}
     for name, entry in content.items():
         where = f"{path}, camera {name}"
-        if not isinstance(entry, dict) or any(key not in entry for key in ("K", "R", "t", "size")):
+        if not isinstance(entry, dict) or any(
+            key not in entry for key in ("K", "R", "t", "size")
+        ):
             raise DataError(f"{where}: expected an object with K, R, t, dist and size")
         width, height = numbers(where, entry["size"], "size", (2,))
         if width < 1 or height < 1 or width % 1 or height % 1:
@@ -191,7 +205,9 @@ def _read_json(
     """A meta.json beside the file gives its unit and pixel centre."""
     meta = path.with_name("meta.json")
     found = read_conventions(meta, read_json(meta)) if meta.is_file() else Conventions()
-    return read_cameras(path, read_json(path), replace(found, scale=scale or found.scale))
+    return read_cameras(
+        path, read_json(path), replace(found, scale=scale or found.scale)
+    )
 
 
 # -- TOML of Pose2Sim, aniposelib and caliscope
@@ -209,17 +225,28 @@ def _read_toml(
     """
     try:
         content = tomllib.loads(read_text(path))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError, RecursionError) as error:
+    except (
+        tomllib.TOMLDecodeError,
+        UnicodeDecodeError,
+        OSError,
+        RecursionError,
+    ) as error:
         raise DataError(f"{path} is not readable as TOML: {error}") from None
     cameras: dict[str, CameraEntry] = {}
     inner = content.get("cameras")
     for table, entry in (inner if isinstance(inner, dict) else content).items():
-        if table in TOML_OTHER_TABLES or not isinstance(entry, dict) or entry.get("ignore"):
+        if (
+            table in TOML_OTHER_TABLES
+            or not isinstance(entry, dict)
+            or entry.get("ignore")
+        ):
             continue
         name = str(entry.get("name", table))
         if name in cameras:
             raise DataError(f"{path} names two cameras {name}; give each its own name")
-        cameras[name] = _toml_camera(f"{path}, [{table}]", name, entry, scale or 1.0, pixel_centre)
+        cameras[name] = _toml_camera(
+            f"{path}, [{table}]", name, entry, scale or 1.0, pixel_centre
+        )
     return cameras
 
 
@@ -227,7 +254,9 @@ def _toml_camera(
     where: str, name: str, entry: dict[str, Any], scale: float, pixel_centre: float
 ) -> CameraEntry:
     if missing := [key for key in TOML_KEYS if key not in entry]:
-        raise DataError(f"{where} lacks '{missing[0]}'; expected {', '.join(TOML_KEYS)}")
+        raise DataError(
+            f"{where} lacks '{missing[0]}'; expected {', '.join(TOML_KEYS)}"
+        )
     if entry.get("fisheye"):
         raise DataError(
             f"{where} is a fisheye camera, which is not supported; undistort its video and "
@@ -284,8 +313,15 @@ def read_opencv_yaml(path: Path) -> dict[str, Any]:
         values = yaml.load(text, _Loader)
         if isinstance(values, dict) and all(isinstance(key, str) for key in values):
             return values
-    except (OSError, yaml.YAMLError, ArithmeticError, LookupError, RecursionError, TypeError,
-            ValueError) as error:  # fmt: skip
+    except (
+        OSError,
+        yaml.YAMLError,
+        ArithmeticError,
+        LookupError,
+        RecursionError,
+        TypeError,
+        ValueError,
+    ) as error:
         reason = " ".join(str(error).split())[:120]
     raise DataError(
         f"{path} is not readable as OpenCV YAML ({reason}); it may be cut off: export it again"
@@ -300,12 +336,19 @@ def _read_yaml(
     Convention: metres; world to camera. The two files list names in different orders and with
     "none" entries, so cameras are paired by name alone. Without H and W the size is (0, 0).
     """
-    files = [path.with_name(re.sub("intri|extri", name, path.name)) for name in ("intri", "extri")]
+    files = [
+        path.with_name(re.sub("intri|extri", name, path.name))
+        for name in ("intri", "extri")
+    ]
     if files[0] == files[1]:
-        raise DataError(f"{path}: expected OpenCV YAML named intri.yml beside extri.yml")
+        raise DataError(
+            f"{path}: expected OpenCV YAML named intri.yml beside extri.yml"
+        )
     for file in files:
         if not file.is_file():
-            raise DataError(f"{file} does not exist; intri.yml and extri.yml belong together")
+            raise DataError(
+                f"{file} does not exist; intri.yml and extri.yml belong together"
+            )
     intri, extri = map(read_opencv_yaml, files)
     names = intri.get("names")
     if not isinstance(names, list):
@@ -325,8 +368,12 @@ def _read_yaml(
             )
         dist = intri.get(f"dist_{name}", intri.get(f"D_{name}"))
         if dist is None:
-            notes.append(f"{files[0]} gives no lens distortion for {name}: taken as none")
-        sides = (numbers(where, intri.get(f"{side}_{name}", 0), side, ()) for side in "HW")
+            notes.append(
+                f"{files[0]} gives no lens distortion for {name}: taken as none"
+            )
+        sides = (
+            numbers(where, intri.get(f"{side}_{name}", 0), side, ()) for side in "HW"
+        )
         height, width = (max(0, int(side)) for side in sides)
         cameras[name] = make_camera(
             where,
@@ -346,7 +393,9 @@ Reader = Callable[[Path, float | None, float, list[str]], dict[str, CameraEntry]
 """Cameras of a path, by metres in a unit (None: the format's own) and K's pixel centre; notes."""
 FORMATS: dict[str, tuple[Callable[[str], bool], Reader]] = {
     "OpenCV YAML": (
-        lambda head: head.lstrip().startswith(("%YAML", "---")) or "!!opencv-matrix" in head,
+        lambda head: (
+            head.lstrip().startswith(("%YAML", "---")) or "!!opencv-matrix" in head
+        ),
         _read_yaml,
     ),
     "cameras.json": (lambda head: head.lstrip().startswith("{"), _read_json),

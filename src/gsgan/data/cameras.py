@@ -73,9 +73,15 @@ class CameraEntry:
             size: ``(H, W)`` that the window is scaled to; None leaves it as it is.
             lens: keep the distortion where `keeps_lens`; otherwise the camera is a pinhole.
         """
-        K, R, t = (torch.from_numpy(x)[None] for x in (self.K, self.R, self.t))
-        dist = torch.from_numpy(self.dist[None, :5]) if lens and self.keeps_lens else None
-        camera = Camera(K, R, t, self.size, dist).crop(window.top, window.left, window.size)
+        K = torch.from_numpy(self.K)[None]
+        R = torch.from_numpy(self.R)[None]
+        t = torch.from_numpy(self.t)[None]
+        dist = (
+            torch.from_numpy(self.dist[None, :5]) if lens and self.keeps_lens else None
+        )
+        camera = Camera(K, R, t, self.size, dist).crop(
+            window.top, window.left, window.size
+        )
         return (camera if size is None else camera.resize(size)).to(torch.float32)
 
 
@@ -125,8 +131,12 @@ def make_camera(
             f"(allowed {ROTATION_TOLERANCE:g})"
         )
     if np.linalg.det(R) < 0:
-        raise DataError(f"{where}: R mirrors; expected a rotation, world to OpenCV camera axes")
-    return CameraEntry(name, K, R, numbers(where, t, "t", (3,)) * scale, _lens(where, dist), size)
+        raise DataError(
+            f"{where}: R mirrors; expected a rotation, world to OpenCV camera axes"
+        )
+    return CameraEntry(
+        name, K, R, numbers(where, t, "t", (3,)) * scale, _lens(where, dist), size
+    )
 
 
 def numbers(where: str, raw: Any, key: str, shape: tuple[int, ...]) -> Float:
@@ -146,7 +156,10 @@ def numbers(where: str, raw: Any, key: str, shape: tuple[int, ...]) -> Float:
 
 
 SHORT = reprlib.Repr()  # deeply or endlessly nested values are not printed in full
-SHORT.maxlevel, SHORT.maxlist, SHORT.maxtuple, SHORT.maxother = 4, 16, 16, 400
+SHORT.maxlevel = 4
+SHORT.maxlist = 16
+SHORT.maxtuple = 16
+SHORT.maxother = 400
 
 
 def _short(raw: Any, limit: int = 120) -> str:

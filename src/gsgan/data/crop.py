@@ -36,9 +36,16 @@ def project(view: CameraEntry, points: Float) -> tuple[Float, Float]:
 
 def inside(view: CameraEntry, points: Float) -> NDArray[np.bool_]:
     """``[...]`` whether world points ``[..., 3]`` project into the image; False for NaN."""
-    uvw = np.tensordot(points, (view.K @ view.R).T, 1) + view.K @ view.t  # not divided: it is slow
+    # not divided: it is slow
+    uvw = np.tensordot(points, (view.K @ view.R).T, 1) + view.K @ view.t
     (u, v, depth), (height, width) = np.moveaxis(uvw, -1, 0), view.size
-    return (depth > NEAR) & (u >= 0) & (u < width * depth) & (v >= 0) & (v < height * depth)
+    return (
+        (depth > NEAR)
+        & (u >= 0)
+        & (u < width * depth)
+        & (v >= 0)
+        & (v < height * depth)
+    )
 
 
 @dataclass(frozen=True)
@@ -56,7 +63,11 @@ class PersonCrop:
         above("data.crop.margin", self.margin)
 
     def window(
-        self, view: CameraEntry, joints: Float, usable: NDArray[np.bool_], dist: Float | None = None
+        self,
+        view: CameraEntry,
+        joints: Float,
+        usable: NDArray[np.bool_],
+        dist: Float | None = None,
     ) -> Crop:
         """The crop round the usable joints, clipped to the image, then made square.
 
@@ -96,8 +107,10 @@ def cut(image: Bytes, crop: Crop) -> Bytes:
     height, width = image.shape[:2]
     h, w = crop.size
     result = np.zeros((h, w, *image.shape[2:]), image.dtype)
-    top, left = max(crop.top, 0), max(crop.left, 0)
-    bottom, right = min(crop.top + h, height), min(crop.left + w, width)
+    top = max(crop.top, 0)
+    left = max(crop.left, 0)
+    bottom = min(crop.top + h, height)
+    right = min(crop.left + w, width)
     if bottom > top and right > left:
         rows = slice(top - crop.top, bottom - crop.top)
         columns = slice(left - crop.left, right - crop.left)
@@ -123,7 +136,9 @@ def undistort_map(K: Float, dist: Float, crop: Crop) -> NDArray[np.float32]:
         seen = stored.copy()
         seen[:2, 2] -= (crop.left, crop.top)
         size = crop.size[::-1]
-        maps = cv2.initUndistortRectifyMap(stored, dist, np.eye(3), seen, size, cv2.CV_32FC1)
+        maps = cv2.initUndistortRectifyMap(
+            stored, dist, np.eye(3), seen, size, cv2.CV_32FC1
+        )
         pixels = np.stack(maps, axis=-1)
     else:
         pixels = (through_lens(K, dist, *_grid(crop)) - 0.5).astype(np.float32)
@@ -143,7 +158,9 @@ def distort(points: Float, dist: Float) -> Float:
     """
     if points.size == 0:
         return points
-    rays = np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1).reshape(-1, 3)
+    rays = np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1).reshape(
+        -1, 3
+    )
     nothing = np.zeros(3)
     shown = cv2.projectPoints(rays, nothing, nothing, np.eye(3), dist)[0]
     return np.asarray(shown, np.float64).reshape(points.shape)
@@ -186,8 +203,11 @@ def fold_radius(K: Float, dist: Float, crop: Crop, samples: int = 256) -> float 
         samples: radii tested, from the centre to the crop's furthest corner.
     """
     h, w = crop.size
-    top, left = crop.top, crop.left
-    corners = np.array([(left + x, top + y) for x in (0.5, w - 0.5) for y in (0.5, h - 0.5)])
+    top = crop.top
+    left = crop.left
+    corners = np.array(
+        [(left + x, top + y) for x in (0.5, w - 0.5) for y in (0.5, h - 0.5)]
+    )
     radii = np.linspace(0, np.hypot(*_unproject(K, *corners.T)).max(), samples)
     radial = np.where(np.isin(np.arange(8), (2, 3)), 0, dist)  # without p1 and p2
     shown = distort(np.stack([radii, np.zeros(samples)], axis=-1), radial)[:, 0]
@@ -195,7 +215,9 @@ def fold_radius(K: Float, dist: Float, crop: Crop, samples: int = 256) -> float 
     return float(radii[folded[0]]) if len(folded) else None
 
 
-def take(image: Bytes, crop: Crop, mapping: NDArray[np.float32] | None, exact: bool) -> Bytes:
+def take(
+    image: Bytes, crop: Crop, mapping: NDArray[np.float32] | None, exact: bool
+) -> Bytes:
     """A crop of an image, undistorted where a mapping is given, zero beyond the border.
 
     Args:
@@ -240,4 +262,6 @@ def black_out(image: Bytes, mask: Bytes, composed: bool) -> Bytes:
     """
     if composed:
         return image * (mask > 0)[..., None]
-    return np.asarray(cv2.multiply(image, cv2.merge([mask] * 3), scale=1 / 255), np.uint8)
+    return np.asarray(
+        cv2.multiply(image, cv2.merge([mask] * 3), scale=1 / 255), np.uint8
+    )

@@ -35,7 +35,14 @@ from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import at_least, one_of, whole
 from gsgan.utils.errors import ConfigError
 
-__all__ = ["GsganData", "SceneInfo", "StepSampler", "count_labels", "pass_order", "scene_info"]
+__all__ = [
+    "GsganData",
+    "SceneInfo",
+    "StepSampler",
+    "count_labels",
+    "pass_order",
+    "scene_info",
+]
 
 log = logging.getLogger(__name__)
 
@@ -54,7 +61,8 @@ Reader = Callable[[str | Path, Thresholds, str | None], Layout]
 
 
 def _quiet_worker(_: int) -> None:
-    cv2.setNumThreads(0)  # one thread per worker process; OpenCV's pool does not survive a fork
+    # one thread per worker process; OpenCV's pool does not survive a fork
+    cv2.setNumThreads(0)
 
 
 class GsganData(LightningDataModule):
@@ -109,7 +117,8 @@ class GsganData(LightningDataModule):
         **split_keys: Any,
     ) -> None:
         super().__init__()
-        inspect.signature(make_splits).bind_partial(**split_keys)  # an unknown key is an error
+        # an unknown key is an error
+        inspect.signature(make_splits).bind_partial(**split_keys)
         if root is None and source is None:
             raise ConfigError(
                 f"data.root is not set: give the folder of {wanted}, e.g. "
@@ -117,22 +126,30 @@ class GsganData(LightningDataModule):
             )
         if not (crop in (None, "person") or isinstance(crop, PersonCrop)):
             raise ConfigError(f"data.crop must be null or person, got {crop!r}")
-        self.root, self.source, self.smpl = root, source, smpl
+        self.root = root
+        self.source = source
+        self.smpl = smpl
         self.reader = CaptureReader() if reader is None else reader
         self.body = one_of("data.body", body, BODY)
         self.skeleton = one_of("data.skeleton", skeleton, TEMPLATES)
-        self.protocol, self.split_keys = protocol, split_keys
-        self.size, self.crop = size, PersonCrop() if isinstance(crop, str) else crop
+        self.protocol = protocol
+        self.split_keys = split_keys
+        self.size = size
+        self.crop = PersonCrop() if isinstance(crop, str) else crop
         self.batch_size = whole("data.batch_size", batch_size, 1)
         if steps_per_epoch is not None:
             whole("data.steps_per_epoch", steps_per_epoch, 1)
         self.steps_per_epoch = steps_per_epoch
         self.val_images = whole("data.val_images", val_images, 1)
-        self.workers = default_workers() if workers is None else whole("data.workers", workers, 0)
+        self.workers = (
+            default_workers() if workers is None else whole("data.workers", workers, 0)
+        )
         self.seed = whole("data.seed", seed, 0)
         self.cache_mb = at_least("data.cache_mb", cache_mb, 0)
         self.info_samples = whole("data.info_samples", info_samples, 1)
-        self.limits = replace(Thresholds(), min_joints=whole("data.min_joints", min_joints, 1))
+        self.limits = replace(
+            Thresholds(), min_joints=whole("data.min_joints", min_joints, 1)
+        )
         self.lens = LENSES[one_of("effects.distortion", distortion, LENSES)]
 
     def prepare_data(self) -> None:
@@ -194,7 +211,11 @@ class GsganData(LightningDataModule):
         if self.protocol is None:
             splits = make_splits(self.layout, **self.split_keys)
         else:
-            given = [k for k, v in self.split_keys.items() if k != "test_share" and v is not None]
+            given = [
+                k
+                for k, v in self.split_keys.items()
+                if k != "test_share" and v is not None
+            ]
             if given:
                 raise ConfigError(
                     f"data.{given[0]} is set, but protocol {self.protocol.name} sets the splits; "
@@ -227,7 +248,8 @@ class GsganData(LightningDataModule):
     @property
     def registered_held_out(self) -> tuple[int, ...]:
         """Frames of held-out poses whose body `gsgan.fit` registered to their own masks."""
-        poses, items = self.layout.poses, self.splits.items
+        poses = self.layout.poses
+        items = self.splits.items
         frames = {*items["novel_pose"].frames} - {*self.trained}
         return tuple(sorted(frames & (poses.registered if poses else frozenset())))
 
@@ -241,7 +263,8 @@ class GsganData(LightningDataModule):
 
     @cached_property
     def _datasets(self) -> dict[str, CaptureDataset]:
-        layout, splits = self.layout, self.splits
+        layout = self.layout
+        splits = self.splits
         sizes = {camera.size for camera in layout.cameras.values()}
         if self.size is None and self.batch_size > 1 and (self.crop or len(sizes) > 1):
             raise ConfigError(
@@ -251,7 +274,12 @@ class GsganData(LightningDataModule):
         cache = ImageCache(int(self.cache_mb * 2**20) // self.loading_processes)
         template = template_of(self.skeleton, self.face)
         skeletons = complete_skeletons(
-            layout.landmarks, layout.frames, self.trained, template, layout.hands, layout.face
+            layout.landmarks,
+            layout.frames,
+            self.trained,
+            template,
+            layout.hands,
+            layout.face,
         )
         return {
             name: CaptureDataset(
@@ -285,7 +313,9 @@ class GsganData(LightningDataModule):
         scale = None if self.crop is not None else (self.size or sides[0]) / sides[0]
         oblong = any(c.size[0] != c.size[1] for c in self.layout.cameras.values())
         padded = self.crop is None and self.size is not None and oblong
-        departures = self.protocol.departures(lpips_nets=lpips_nets, scale=scale, padded=padded)
+        departures = self.protocol.departures(
+            lpips_nets=lpips_nets, scale=scale, padded=padded
+        )
         return self.protocol.record() | {"departures": list(departures)}
 
     @property
@@ -296,7 +326,9 @@ class GsganData(LightningDataModule):
     @cached_property
     def info(self) -> SceneInfo:
         """Facts about the scene from the training split, computed on first use."""
-        tested = [name for split in SPLITS[1:] for name in self.splits.items[split].cameras]
+        tested = [
+            name for split in SPLITS[1:] for name in self.splits.items[split].cameras
+        ]
         train = self.dataset("train")
         found = scene_info(self.layout, self.splits, train, self.info_samples, tested)
         return replace(found, face=self.face)
@@ -313,7 +345,9 @@ class GsganData(LightningDataModule):
             ValueError: for another name.
         """
         if split not in SPLITS:
-            raise ValueError(f"dataset: split must be one of {', '.join(SPLITS)}, got {split!r}")
+            raise ValueError(
+                f"dataset: split must be one of {', '.join(SPLITS)}, got {split!r}"
+            )
         self.setup()
         return self._datasets[split]
 
@@ -327,12 +361,18 @@ class GsganData(LightningDataModule):
     def train_dataloader(self) -> DataLoader[Frame]:
         """Batches of `Frame` in `StepSampler` order."""
         dataset = self.dataset("train")
-        replicas, rank, epoch = 1, 0, 0
+        replicas = 1
+        rank = 0
+        epoch = 0
         if (on := self.trainer) is not None:
-            replicas, rank, epoch = on.world_size, on.global_rank, on.current_epoch
+            replicas = on.world_size
+            rank = on.global_rank
+            epoch = on.current_epoch
         per_pass = math.ceil(len(dataset) / (self.batch_size * replicas))
         steps = self.steps_per_epoch or per_pass
-        sampler = StepSampler(len(dataset), self.batch_size, steps, self.seed, replicas, rank)
+        sampler = StepSampler(
+            len(dataset), self.batch_size, steps, self.seed, replicas, rank
+        )
         sampler.set_epoch(epoch)
         return self._loader(dataset, sampler=sampler)
 
@@ -342,7 +382,9 @@ class GsganData(LightningDataModule):
 
         The split is novel_pose, else novel_view, else train.
         """
-        name = next((n for n in ("novel_pose", "novel_view") if self.splits.items[n]), "train")
+        name = next(
+            (n for n in ("novel_pose", "novel_view") if self.splits.items[n]), "train"
+        )
         return name, evenly_spaced(len(self.dataset(name)), self.val_images)
 
     def val_dataloader(self) -> DataLoader[Frame]:
@@ -365,7 +407,10 @@ class GsganData(LightningDataModule):
         """Batches of `Frame` whose pixels are bytes, as `transfer_batch_to_device` takes them."""
         packed = copy(dataset)
         packed.packed = True
-        on_gpu = self.trainer is not None and self.trainer.strategy.root_device.type == "cuda"
+        on_gpu = (
+            self.trainer is not None
+            and self.trainer.strategy.root_device.type == "cuda"
+        )
         return DataLoader(
             packed if places is None else Subset(packed, places),
             batch_size=self.batch_size,

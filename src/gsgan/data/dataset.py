@@ -122,11 +122,14 @@ class CaptureDataset(Dataset[Frame]):
             decoded = self._load(item)
             if self.cache.getsizeof(decoded) <= self.cache.maxsize:
                 self.cache[item] = decoded
-        labels, unsure = (
-            None if x is None else torch.from_numpy(x)[None]
-            for x in (decoded.labels, decoded.unsure)
+        labels = (
+            None if decoded.labels is None else torch.from_numpy(decoded.labels)[None]
         )
-        body, poses = None, self.layout.poses
+        unsure = (
+            None if decoded.unsure is None else torch.from_numpy(decoded.unsure)[None]
+        )
+        body = None
+        poses = self.layout.poses
         if poses is not None:
             body = BodyPose(_float(poses.theta[frame]), _float(poses.transl[frame]))
         found = Frame(
@@ -149,9 +152,12 @@ class CaptureDataset(Dataset[Frame]):
         Windows reach beyond borders, and undistorted images have empty rims.
         """
         item = self.items[index]
-        camera, window = self.layout.cameras[item[0]], self.window(item)
+        camera = self.layout.cameras[item[0]]
+        window = self.window(item)
         mapping = self._mapping(camera, window)
-        taken = cropping.take(np.full(camera.size, 255, np.uint8), window, mapping, exact=True)
+        taken = cropping.take(
+            np.full(camera.size, 255, np.uint8), window, mapping, exact=True
+        )
         taken = cropping.resize(taken, self._target(window), exact=True)
         return None if taken.all() else unit(torch.from_numpy(taken))[None, None]
 
@@ -188,13 +194,16 @@ class CaptureDataset(Dataset[Frame]):
         return cropping.undistort_map(camera.K, camera.dist, window)
 
     def _load(self, item: Item) -> DecodedImage:
-        camera, window = self.layout.cameras[item[0]], self.window(item)
+        camera = self.layout.cameras[item[0]]
+        window = self.window(item)
         rules = self.layout.pixels
         mapping = self._mapping(camera, window)
         size = self._target(window)
 
         def fit(image: Bytes, exact: bool) -> Bytes:
-            return cropping.resize(cropping.take(image, window, mapping, exact), size, exact)
+            return cropping.resize(
+                cropping.take(image, window, mapping, exact), size, exact
+            )
 
         mask_files = self.layout.mask_files(*item)
         mask = pixels.read_mask(mask_files, rules)
@@ -212,7 +221,9 @@ class CaptureDataset(Dataset[Frame]):
         if unsure is not None:
             unsure = fit(unsure, exact=True)
         mask = fit(mask, exact=rules.mask_sampling == "nearest")
-        return DecodedImage(np.ascontiguousarray(image.transpose(2, 0, 1)), mask, labels, unsure)
+        return DecodedImage(
+            np.ascontiguousarray(image.transpose(2, 0, 1)), mask, labels, unsure
+        )
 
     @staticmethod
     def _check_size(path: Path, image: Bytes, camera: CameraEntry) -> None:
@@ -227,10 +238,12 @@ class CaptureDataset(Dataset[Frame]):
     def _label_image(self, item: Item) -> Bytes | None:
         if not self.layout.labels:
             return None
-        path, camera = self.layout.label_path(*item), self.layout.cameras[item[0]]
+        path = self.layout.label_path(*item)
+        camera = self.layout.cameras[item[0]]
         if path is None:
             return np.full(camera.size, IGNORE_LABEL, np.uint8)
-        meta, rules = self.layout.meta, self.layout.pixels
+        meta = self.layout.meta
+        rules = self.layout.pixels
         labels = pixels.read_labels(path, rules, meta.label_names)
         self._check_size(path, labels, camera)
         return labels
@@ -258,18 +271,29 @@ class StepSampler(DistributedSampler[int]):
     """
 
     def __init__(
-        self, items: int, batch_size: int, steps: int, seed: int, replicas: int = 1, rank: int = 0
+        self,
+        items: int,
+        batch_size: int,
+        steps: int,
+        seed: int,
+        replicas: int = 1,
+        rank: int = 0,
     ) -> None:
         # Of its dataset, the base class needs the length alone.
         length: Any = range(items)
-        super().__init__(length, num_replicas=replicas, rank=rank, shuffle=True, seed=seed)
-        self.items, self.batch_size, self.steps = items, batch_size, steps
+        super().__init__(
+            length, num_replicas=replicas, rank=rank, shuffle=True, seed=seed
+        )
+        self.items = items
+        self.batch_size = batch_size
+        self.steps = steps
 
     def __len__(self) -> int:
         return self.steps * self.batch_size
 
     def __iter__(self) -> Iterator[int]:
-        order, shuffled = torch.empty(0), -1
+        order = torch.empty(0)
+        shuffled = -1
         for step in range(self.epoch * self.steps, (self.epoch + 1) * self.steps):
             first = (step * self.num_replicas + self.rank) * self.batch_size
             for draw in range(first, first + self.batch_size):

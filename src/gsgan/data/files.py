@@ -23,7 +23,9 @@ from gsgan.utils.errors import DataError
 from gsgan.utils.files import read_text
 from gsgan.utils.pickles import read_npz
 
-JPEG_SIGNATURE, JPEG_END, JPEG_SCAN = b"\xff\xd8", b"\xff\xd9", b"\xff\xda"
+JPEG_SIGNATURE = b"\xff\xd8"
+JPEG_END = b"\xff\xd9"
+JPEG_SCAN = b"\xff\xda"
 LAST_DIGITS = re.compile(r"([0-9]+)[^0-9]*$")
 LARGEST_FRAME = 10**9  # frame numbers beyond it are dates or damage
 
@@ -67,9 +69,13 @@ def check_image(path: Path, kind: str, size: tuple[int, int], expected_by: str) 
             f"{expected_by} has {size[1]}x{size[0]}; scale one of them so that they agree"
         )
     if depth > 8 or (kind == "labels" and depth != 8):
-        raise DataError(f"{path} has {depth} bits a channel; expected 8 (save it as 8-bit)")
+        raise DataError(
+            f"{path} has {depth} bits a channel; expected 8 (save it as 8-bit)"
+        )
     if mode == "CMYK":
-        raise DataError(f"{path} is a CMYK JPEG; expected RGB or grey (convert it to RGB)")
+        raise DataError(
+            f"{path} is a CMYK JPEG; expected RGB or grey (convert it to RGB)"
+        )
     if (mode == "P" and kind != "image") or (kind == "labels" and mode != "L"):
         raise DataError(
             f"{path} is a palette PNG or has colours; expected 8-bit grey values for a {kind} file"
@@ -125,7 +131,9 @@ def read_alpha(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]] | None
 def _decode_8_bit(path: Path) -> NDArray[np.uint8]:
     image = _decode(path, cv2.IMREAD_UNCHANGED)
     if image.dtype != np.uint8:
-        raise DataError(f"{path} holds {image.dtype} values; expected 8 bits (save it as 8-bit)")
+        raise DataError(
+            f"{path} holds {image.dtype} values; expected 8 bits (save it as 8-bit)"
+        )
     return image
 
 
@@ -153,7 +161,9 @@ def cut_off(data: bytes) -> bool:
 
 def _unreadable(path: Path, error: OSError) -> DataError:
     if isinstance(error, FileNotFoundError):
-        return DataError(f"{path} does not exist; docs/data.md lists the files of each format")
+        return DataError(
+            f"{path} does not exist; docs/data.md lists the files of each format"
+        )
     return DataError(f"{path} cannot be read: {error.strerror or error}")
 
 
@@ -165,7 +175,9 @@ def read_json(path: Path) -> dict[str, Any]:
     """
     content = read_json_value(path)
     if not isinstance(content, dict):
-        raise DataError(f"{path} must hold a JSON object, found {type(content).__name__}")
+        raise DataError(
+            f"{path} must hold a JSON object, found {type(content).__name__}"
+        )
     return content
 
 
@@ -200,7 +212,8 @@ class FrameFiles(Mapping[int, str]):
     """
 
     def __init__(self, folder: str, names: Mapping[int, str]) -> None:
-        self.folder, self.frames = folder, np.array(sorted(names), np.int64)
+        self.folder = folder
+        self.frames = np.array(sorted(names), np.int64)
         held = [names[f] for f in self.frames.tolist()]
         self._names = np.array(os.fsencode("/".join(held)).split(b"/")[: len(held)])
 
@@ -220,7 +233,8 @@ class FrameFiles(Mapping[int, str]):
         """Those of the other frames."""
         keep = np.isin(self.frames, np.fromiter(frames, np.int64), invert=True)
         found = copy(self)
-        found.frames, found._names = self.frames[keep], self._names[keep]
+        found.frames = self.frames[keep]
+        found._names = self._names[keep]
         return found
 
 
@@ -253,7 +267,9 @@ def frame_files(
 
 @lru_cache(maxsize=1)  # cameras mostly have files of the same names
 def _by_frame(
-    names: frozenset[str], suffixes: tuple[str, ...], number: Callable[[str], int | None]
+    names: frozenset[str],
+    suffixes: tuple[str, ...],
+    number: Callable[[str], int | None],
 ) -> FrameFiles:
     found = dict[int, str]()
     for name in sorted(names):
@@ -302,7 +318,8 @@ def last_number(stem: str) -> int | None:
 def frame_of(digits: str) -> int | None:
     """The frame number in a group of digits; None above `LARGEST_FRAME`."""
     digits = digits.lstrip("0") or "0"
-    if len(digits) > len(str(LARGEST_FRAME)):  # before int(), which refuses very long ones
+    # before int(), which refuses very long ones
+    if len(digits) > len(str(LARGEST_FRAME)):
         return None
     return number if (number := int(digits)) <= LARGEST_FRAME else None
 
@@ -310,4 +327,6 @@ def frame_of(digits: str) -> int | None:
 def natural_order(name: str) -> tuple[tuple[int, str | int], ...]:
     """Sort key by which ``Camera_B2`` comes before ``Camera_B10``."""
     parts = re.split(r"([0-9]+)", name)
-    return tuple((1, int(part)) if part.isdigit() else (0, part) for part in parts if part)
+    return tuple(
+        (1, int(part)) if part.isdigit() else (0, part) for part in parts if part
+    )

@@ -8,7 +8,8 @@ from gsgan.skeleton.template import MEDIAPIPE33
 from gsgan.utils.arrays import Bool, Float
 
 BODY = len(MEDIAPIPE33.names)
-LEFT, RIGHT = slice(BODY, BODY + HAND), slice(BODY + HAND, BODY + 2 * HAND)
+LEFT = slice(BODY, BODY + HAND)
+RIGHT = slice(BODY + HAND, BODY + 2 * HAND)
 HANDS = slice(BODY, BODY + 2 * HAND)
 # Landmarks of the face by name, and their numbers among the 468 of MediaPipe's face mesh: the outer
 # lip; the upper edges of left and right brow; inner, upper, outer and lower lid of both eyes.
@@ -35,11 +36,13 @@ LEG_PAIRS = tuple((j, j + 1) for j in range(23, 33, 2))
 HAND_PAIRS = tuple((BODY + j, BODY + HAND + j) for j in range(HAND))
 
 
-FLIP_GROUPS = (HEAD_PAIRS, ARM_PAIRS, LEG_PAIRS)  # (left, right) joints swapped together
+# (left, right) joints swapped together
+FLIP_GROUPS = (HEAD_PAIRS, ARM_PAIRS, LEG_PAIRS)
 
 
 # Other detectors' joint numbers by MediaPipe's, for those that both have.
-_SHARED = (0, 2, 5, 7, 8, *range(11, 17), *range(23, 29))  # nose, eyes, ears, arms, legs
+# nose, eyes, ears, arms, legs
+_SHARED = (0, 2, 5, 7, 8, *range(11, 17), *range(23, 29))
 _FEET = (29, 30, 31, 32)  # heels, then toes; the left one first
 _COCO = {landmark: joint for joint, landmark in enumerate(_SHARED)}
 _BODY_25 = dict(
@@ -49,7 +52,8 @@ _BODY_25 = dict(
         strict=True,
     )
 )
-BODY_25B = _COCO | dict(zip(_FEET, (21, 24, 19, 22), strict=True))  # OpenPose's experimental one
+# OpenPose's experimental one
+BODY_25B = _COCO | dict(zip(_FEET, (21, 24, 19, 22), strict=True))
 _HALPE_26 = _COCO | dict(zip(_FEET, (24, 25, 20, 21), strict=True))
 _WHOLE_BODY = {
     **_COCO,
@@ -57,7 +61,11 @@ _WHOLE_BODY = {
     **{BODY + j: 91 + j for j in range(2 * HAND)},
 }
 _COCO_18 = dict(
-    zip(_SHARED, (0, 15, 14, 17, 16, 5, 2, 6, 3, 7, 4, 11, 8, 12, 9, 13, 10), strict=True)
+    zip(
+        _SHARED,
+        (0, 15, 14, 17, 16, 5, 2, 6, 3, 7, 4, 11, 8, 12, 9, 13, 10),
+        strict=True,
+    )
 )
 SETS: dict[int, tuple[str, dict[int, int]]] = {
     17: ("COCO", _COCO),

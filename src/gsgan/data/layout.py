@@ -143,7 +143,9 @@ class Layout(_Contents):
 
     def mask_files(self, camera: str, frame: int) -> list[tuple[str, Path]]:
         """All masks of a camera and frame with their rules, for `gsgan.data.pixels.read_mask`."""
-        return [(mask.rule, self.root / mask.path) for mask in self.masks[camera][frame]]
+        return [
+            (mask.rule, self.root / mask.path) for mask in self.masks[camera][frame]
+        ]
 
     def label_path(self, camera: str, frame: int) -> Path | None:
         """The part labels of a camera and frame, or None without labels."""
@@ -160,7 +162,9 @@ def dataset_folder(root: str | Path, expected: str) -> Path:
     folder = Path(root).expanduser()
     if not folder.is_dir():
         problem = "is a file, not a folder" if folder.exists() else "does not exist"
-        raise DataError(f"data.root={root} {problem}; expected the folder that holds {expected}")
+        raise DataError(
+            f"data.root={root} {problem}; expected the folder that holds {expected}"
+        )
     own_entries(folder, folder)
     return folder
 
@@ -171,7 +175,10 @@ def assemble(found: Found, limits: Thresholds) -> Layout:
     Raises:
         DataError: for whatever is missing or contradictory, naming the file.
     """
-    root, cameras, marks, notes = found.root, found.cameras, found.landmarks, list(found.notes)
+    root = found.root
+    cameras = found.cameras
+    marks = found.landmarks
+    notes = list(found.notes)
     calibration = found.calibration
     images = drop_frames(root, found.images, marks, found.poses, limits, notes)
     check_geometry(root, cameras, images, marks, limits, calibration, found.unit_hint)
@@ -183,7 +190,9 @@ def assemble(found: Found, limits: Thresholds) -> Layout:
         for c, files in images.items()
     }
     labels = labels if any(labels.values()) else {}
-    check_images(root, cameras, images, found.masks, labels, limits.header_stride, calibration)
+    check_images(
+        root, cameras, images, found.masks, labels, limits.header_stride, calibration
+    )
     kept = {one.name: getattr(found, one.name) for one in fields(_Contents)}
     kept |= {"images": images, "labels": labels, "notes": tuple(notes)}
     return Layout(**kept, frames=tuple(sorted(set[int]().union(*images.values()))))

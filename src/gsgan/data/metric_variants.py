@@ -66,7 +66,9 @@ class MetricVariants:
         for name, choices in CHOICES.items():
             value = getattr(self, name)
             if isinstance(value, bool) or value not in choices:
-                listed = (str(list(c)) if isinstance(c, tuple) else str(c) for c in choices)
+                listed = (
+                    str(list(c)) if isinstance(c, tuple) else str(c) for c in choices
+                )
                 raise ConfigError(
                     f"protocol.measures.{name} must be {' or '.join(listed)}; got {value!r}"
                 )

@@ -36,7 +36,9 @@ class MaskFile(NamedTuple):
 
 def mask_file(path: str) -> MaskFile:
     """A mask of the rule "nonzero"; a JPEG's is "threshold", as compression rings round edges."""
-    return MaskFile("threshold" if path.lower().endswith((".jpg", ".jpeg")) else "nonzero", path)
+    return MaskFile(
+        "threshold" if path.lower().endswith((".jpg", ".jpeg")) else "nonzero", path
+    )
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,9 @@ def read_mask(files: Sequence[tuple[str, Path]], rules: PixelRules) -> Bytes:
     for rule, path in files[1:]:
         mask = _one_mask(rule, path, rules)
         if mask.shape != joined.shape:
-            raise DataError(f"{path} and {files[0][1]}, masks of one image, differ in size")
+            raise DataError(
+                f"{path} and {files[0][1]}, masks of one image, differ in size"
+            )
         joined = np.maximum(joined, mask)
     return joined
 
@@ -101,7 +105,9 @@ def _one_mask(rule: str, path: Path, rules: PixelRules) -> Bytes:
     if rule == "grey":
         mask = read_mask_values(path)
         highest = int(mask.max())
-        two_values = highest <= 127 and mask.min() == 0 and np.isin(mask, (0, highest)).all()
+        two_values = (
+            highest <= 127 and mask.min() == 0 and np.isin(mask, (0, highest)).all()
+        )
         if highest == 1 or (highest > 0 and two_values):
             raise DataError(
                 f"{path} holds 0 and {highest} alone; expected alpha from 0 to 255, and a person "
@@ -109,12 +115,16 @@ def _one_mask(rule: str, path: Path, rules: PixelRules) -> Bytes:
             )
         return mask
     if rule == "threshold":
-        values, least = read_mask_values(path), rules.threshold
+        values = read_mask_values(path)
+        least = rules.threshold
     else:
-        values, least = read_stored(path), 1
+        values = read_stored(path)
+        least = 1
         if values.ndim == 3:
             values = values[..., 0] | values[..., 1] | values[..., 2]
-    return np.asarray(cv2.threshold(values, least - 1, 255, cv2.THRESH_BINARY)[1], np.uint8)
+    return np.asarray(
+        cv2.threshold(values, least - 1, 255, cv2.THRESH_BINARY)[1], np.uint8
+    )
 
 
 def read_labels(path: Path, rules: PixelRules, names: Sequence[str] | None) -> Bytes:
@@ -130,7 +140,9 @@ def read_labels(path: Path, rules: PixelRules, names: Sequence[str] | None) -> B
     """
     labels = read_grey(path)
     if rules.label_table is not None:
-        labels = np.asarray(cv2.LUT(labels, np.array(rules.label_table, np.uint8)), np.uint8)
+        labels = np.asarray(
+            cv2.LUT(labels, np.array(rules.label_table, np.uint8)), np.uint8
+        )
     if names is not None:
         highest = int(labels.max(where=labels != IGNORE_LABEL, initial=0))
         if highest >= len(names):
@@ -152,11 +164,14 @@ def outline(mask: Bytes, band: int) -> Bool:
     """``[H, W]`` where the mask dilated and eroded by a square of this side differ; 0: nowhere."""
     if band == 0:
         return np.zeros(mask.shape, np.bool_)
-    person, kernel = (mask > 127).astype(np.uint8), np.ones((band, band), np.uint8)
+    person = (mask > 127).astype(np.uint8)
+    kernel = np.ones((band, band), np.uint8)
     return np.asarray(cv2.dilate(person, kernel) != cv2.erode(person, kernel))
 
 
-def read_unsure(files: Sequence[tuple[str, Path]], mask: Bytes, rules: PixelRules) -> Bytes | None:
+def read_unsure(
+    files: Sequence[tuple[str, Path]], mask: Bytes, rules: PixelRules
+) -> Bytes | None:
     """``[H, W]`` 255 at pixels that are left out of the loss, or None without such a rule.
 
     Args:

@@ -18,7 +18,9 @@ from gsgan.skeleton.template import CHEST, HEAD, PELVIS
 from gsgan.utils.arrays import Bool, Float
 from gsgan.utils.errors import DataError
 
-SHOULDERS, EARS, HIPS = (11, 12), (7, 8), (23, 24)
+SHOULDERS = (11, 12)
+EARS = (7, 8)
+HIPS = (23, 24)
 ARMS = ((11, 13), (13, 15)), ((12, 14), (14, 16))
 LEGS = ((23, 25), (25, 27)), ((24, 26), (26, 28))
 BONES = (*ARMS[0], *ARMS[1], *LEGS[0], *LEGS[1])  # parents first
@@ -26,7 +28,8 @@ BONES = (*ARMS[0], *ARMS[1], *LEGS[0], *LEGS[1])  # parents first
 HAND_LANDMARKS = {15: (17, 19, 21), 16: (18, 20, 22)}
 FEET = {27: (29, 31), 28: (30, 32)}
 BODY = len(MEDIAPIPE33.names)
-HAND_JOINTS = {15: slice(BODY, BODY + HAND), 16: slice(BODY + HAND, BODY + 2 * HAND)}  # by wrist
+# by wrist
+HAND_JOINTS = {15: slice(BODY, BODY + HAND), 16: slice(BODY + HAND, BODY + 2 * HAND)}
 EXPRESSION = slice(BODY + 2 * HAND, BODY + 2 * HAND + FACE)  # lips, brows and lids
 SIDES = {15: 1.0, 16: -1.0}  # of the standard pose's x
 HEELS_AND_TOES = (29, 30, 31, 32)
@@ -69,8 +72,13 @@ class Proportions:
             return np.concatenate([rest, self.hands])
         template = np.array(HOLISTIC.rest_positions)
         pinky, index, _ = HAND_LANDMARKS[15]
-        hands = {w: _hand(template[None, at], template[None, w]) for w, at in HAND_JOINTS.items()}
-        sizes = [np.linalg.norm(middle(p, (pinky, index)) - p[15]) for p in (rest, template)]
+        hands = {
+            w: _hand(template[None, at], template[None, w])
+            for w, at in HAND_JOINTS.items()
+        }
+        sizes = [
+            np.linalg.norm(middle(p, (pinky, index)) - p[15]) for p in (rest, template)
+        ]
         hands = {wrist: hand * sizes[0] / sizes[1] for wrist, hand in hands.items()}
         return np.concatenate([rest, _standing_hands(rest, hands)])
 
@@ -122,7 +130,10 @@ def _place_limbs(rest: Float, q: Float) -> None:
     for pair, height in ((HIPS, 0.0), (SHOULDERS, trunk)):
         half = median_length(q[:, pair[0]], q[:, pair[1]]) / 2
         rest[list(pair)] = [half, 0, height], [-half, 0, height]
-    for limbs, ways in ((ARMS, ((1, 0, 0), (-1, 0, 0))), (LEGS, ((0, 0, -1), (0, 0, -1)))):
+    for limbs, ways in (
+        (ARMS, ((1, 0, 0), (-1, 0, 0))),
+        (LEGS, ((0, 0, -1), (0, 0, -1))),
+    ):
         for limb, way in zip(limbs, ways, strict=True):
             for a, b in limb:
                 rest[b] = rest[a] + median_length(q[:, a], q[:, b]) * np.array(way)
@@ -138,17 +149,25 @@ def _place_feet(rest: Float, q: Float) -> None:
         back = -ahead / np.maximum(np.linalg.norm(ahead, axis=-1, keepdims=True), 1e-9)
         above = np.broadcast_to([0.0, 0, 1], back.shape)
         axes = np.stack([np.cross(back, above), back, above], axis=-1)
-        rest[foot] = rest[ankle] + _local(axes, stands[:, foot] - stands[:, ankle, None])
+        rest[foot] = rest[ankle] + _local(
+            axes, stands[:, foot] - stands[:, ankle, None]
+        )
 
 
 def _place_head(rest: Float, q: Float, hubs: Float) -> None:
     """Face and ears of the standard pose, the gaze level, above its shoulders."""
     ears = middle(q, EARS)
-    neck = _local(hubs[:, CHEST], (ears - middle(q, SHOULDERS))[:, None]) @ TO_STANDARD.T
+    neck = (
+        _local(hubs[:, CHEST], (ears - middle(q, SHOULDERS))[:, None]) @ TO_STANDARD.T
+    )
     # A level gaze turns the head's axes by this pitch: the nose lies below the ears.
     pitch = float(np.median(np.arcsin(np.clip(hubs[:, HEAD, 2, 2], -1, 1))))
     level = np.array(
-        [[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]]
+        [
+            [1, 0, 0],
+            [0, np.cos(pitch), -np.sin(pitch)],
+            [0, np.sin(pitch), np.cos(pitch)],
+        ]
     )
     face = _local(hubs[:, HEAD], q[:, HEAD_LANDMARKS] - ears[:, None]) @ TO_STANDARD.T
     rest[list(HEAD_LANDMARKS)] = middle(rest, SHOULDERS) + neck + face @ level
@@ -195,7 +214,10 @@ def _hand(p: Float, wrist: Float) -> Float:
 def _standing_hands(rest: Float, hands: Mapping[int, Float]) -> Float:
     """``[42, 3]`` the hands of `_hands` at the wrists of a standard pose ``[33, 3]``."""
     return np.concatenate(
-        [rest[wrist] + hand * (SIDES[wrist], 1.0, SIDES[wrist]) for wrist, hand in hands.items()]
+        [
+            rest[wrist] + hand * (SIDES[wrist], 1.0, SIDES[wrist])
+            for wrist, hand in hands.items()
+        ]
     )
 
 

@@ -72,7 +72,8 @@ class Protocol:
     def record(self) -> dict[str, Any]:
         """All of it as plain values, frames as they are for the subject."""
         plain = asdict(self)
-        plain["train_frames"], plain["test_frames"] = self.frames("train"), self.frames("test")
+        plain["train_frames"] = self.frames("train")
+        plain["test_frames"] = self.frames("test")
         plain["measures"]["lpips_range"] = list(self.measures.lpips_range)
         for side in ("train_cameras", "test_cameras"):
             plain[side] = None if plain[side] is None else list(plain[side])

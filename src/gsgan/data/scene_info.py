@@ -24,7 +24,8 @@ from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.errors import DataError
 
 SOLID = 0.9  # of the mask: pixels at the outline are darkened by the black behind them
-MOST_BODY_IMAGES = 2  # images per requested sample on which the posed body is compared with masks
+# images per requested sample on which the posed body is compared with masks
+MOST_BODY_IMAGES = 2
 
 
 @dataclass(frozen=True)
@@ -114,8 +115,10 @@ def scene_info(
         tested: names of the held-out cameras. Only their lenses are looked at, since a lens
             decides what can be rendered.
     """
-    items, body = splits.items["train"], layout.meta.body
-    frames, skeletons = items.frames, dataset.skeletons.p
+    items = splits.items["train"]
+    body = layout.meta.body
+    frames = items.frames
+    skeletons = dataset.skeletons.p
     p, valid = layout.landmarks.joints(frames)
     refuse_swapped_sides(layout, frames)
     whole = layout.landmarks
@@ -128,7 +131,8 @@ def scene_info(
     return SceneInfo(
         camera_names=layout.camera_names,
         n_train_cameras=len(cameras),
-        has_labels=bool(layout.labels) and any(layout.label_path(*item) for item in items),
+        has_labels=bool(layout.labels)
+        and any(layout.label_path(*item) for item in items),
         has_body_pose=layout.poses is not None,
         body=None if body is None else body.kind,
         skeleton=layout.meta.skeleton,
@@ -144,7 +148,9 @@ def scene_info(
         darkest=_darkest(dataset, samples),
         body_inside=_body_inside(layout, dataset, samples),
         scale_train=_scale(dataset, samples),
-        poses=training_poses(torch.from_numpy(np.stack([skeletons[f] for f in frames]))),
+        poses=training_poses(
+            torch.from_numpy(np.stack([skeletons[f] for f in frames]))
+        ),
         proportions=measure_proportions(*whole.joints(frames), layout.meta.up_axis),
         **_lenses(layout, cameras, set(tested) - cameras),
     )
@@ -163,7 +169,9 @@ def count_labels(layout: Layout, items: Sequence[Item]) -> int:
     for item in items:
         if path := layout.label_path(*item):
             labels = read_labels(path, layout.pixels, None)
-            highest = max(highest, int(labels.max(where=labels != IGNORE_LABEL, initial=0)))
+            highest = max(
+                highest, int(labels.max(where=labels != IGNORE_LABEL, initial=0))
+            )
     return highest + 1
 
 
@@ -173,7 +181,9 @@ def _lenses(layout: Layout, cameras: set[str], tested: set[str]) -> dict[str, An
     return {
         "has_distortion": any(entries[name].distorted for name in cameras),
         "held_out_distortion": any(entries[name].distorted for name in tested),
-        "has_rational_lens": any((entries[n].dist[5:] != 0).any() for n in cameras | tested),
+        "has_rational_lens": any(
+            (entries[n].dist[5:] != 0).any() for n in cameras | tested
+        ),
     }
 
 
@@ -184,7 +194,9 @@ def _scale(dataset: CaptureDataset, samples: int) -> tuple[float, float]:
         each = []
         for item in (dataset.items[i] for i in indices):
             camera = dataset.camera(item)
-            joints = torch.from_numpy(dataset.layout.landmarks.p[item[1]])[None].to(camera.K)
+            joints = torch.from_numpy(dataset.layout.landmarks.p[item[1]])[None].to(
+                camera.K
+            )
             depth = float(camera.to_camera(joints)[..., 2].median())
             each.append(float(camera.K[0, 0, 0]) / max(depth, 1e-2))
         medians.append(float(np.median(each)))
@@ -196,7 +208,10 @@ def _sampled(dataset: CaptureDataset, samples: int) -> list[list[int]]:
     found: dict[str, list[int]] = {}
     for index, (camera, _) in enumerate(dataset.items):
         found.setdefault(camera, []).append(index)
-    return [[own[i] for i in evenly_spaced(len(own), samples, ends=True)] for own in found.values()]
+    return [
+        [own[i] for i in evenly_spaced(len(own), samples, ends=True)]
+        for own in found.values()
+    ]
 
 
 def _darkest(dataset: CaptureDataset, samples: int) -> float:
@@ -211,7 +226,8 @@ def _darkest(dataset: CaptureDataset, samples: int) -> float:
 
 def _body_inside(layout: Layout, dataset: CaptureDataset, samples: int) -> float | None:
     """Mean share of the posed body inside the masks of some training images."""
-    body, mesh = layout.meta.body, None
+    body = layout.meta.body
+    mesh = None
     if body is not None and layout.poses is not None:
         with suppress(DataError):  # no model file
             mesh = open_body(body.kind, body.file, body.betas)
@@ -231,7 +247,8 @@ def _shared_surface(
     frames: dict[str, set[int]] = {}
     for camera, frame in dataset.items:
         frames.setdefault(camera, set()).add(frame)
-    shared, place = sorted(set.intersection(*frames.values())), dataset.items.index
+    shared = sorted(set.intersection(*frames.values()))
+    place = dataset.items.index
     chosen = [shared[i] for i in evenly_spaced(len(shared), samples, ends=True)]
     # Subsets read a frame when it is needed: all of them at full size take gigabytes.
     moments = [Subset(dataset, [place((c, f)) for c in cameras]) for f in chosen]

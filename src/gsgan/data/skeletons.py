@@ -30,7 +30,8 @@ from gsgan.utils.arrays import Bool, Float, nanmedian
 from gsgan.utils.errors import DataError
 
 SKELETONS = {"mediapipe33": 33}
-HUBS = (11, 12, 23, 24)  # shoulders and hips: the bone frames of the whole body depend on them
+# shoulders and hips: the bone frames of the whole body depend on them
+HUBS = (11, 12, 23, 24)
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,9 @@ class Landmarks:
 
     def joints(self, frames: Sequence[int]) -> tuple[Tensor, Tensor]:
         """Joints ``[F, J, 3]`` metres, and which of them were seen ``[F, J]`` bool."""
-        p, visibility = (np.stack([part[f] for f in frames]) for part in (self.p, self.visibility))
+        p, visibility = (
+            np.stack([part[f] for f in frames]) for part in (self.p, self.visibility)
+        )
         return torch.from_numpy(p), torch.from_numpy(visibility) > 0
 
     def with_hands(self, hands: Landmarks) -> Landmarks:
@@ -63,7 +66,8 @@ class Landmarks:
         return self._beside(face, FACE)
 
     def _beside(self, part: Landmarks, joints: int) -> Landmarks:
-        nothing, unseen = np.zeros((joints, 3)), np.zeros(joints)
+        nothing = np.zeros((joints, 3))
+        unseen = np.zeros(joints)
         return Landmarks(
             {f: np.concatenate([p, part.p.get(f, nothing)]) for f, p in self.p.items()},
             {
@@ -123,7 +127,9 @@ def make_landmarks(
     valid = visibility > 0
     centre = np.nan_to_num(nanmedian(np.where(valid[..., None], p, np.nan), 1))[:, None]
     with np.errstate(over="ignore"):  # absurdly far is far
-        distance = np.linalg.norm(np.nan_to_num(p, posinf=0, neginf=0) - centre, axis=-1)
+        distance = np.linalg.norm(
+            np.nan_to_num(p, posinf=0, neginf=0) - centre, axis=-1
+        )
     far = valid & (distance > max_reach)
     if far.any():
         visibility[far] = 0
@@ -132,13 +138,17 @@ def make_landmarks(
             "as missing"
         )
     order = np.argsort(ids)
-    p, visibility, ids = p[order], visibility[order], ids[order]
+    p = p[order]
+    visibility = visibility[order]
+    ids = ids[order]
     p = fill_missing(p, visibility > 0, ids)
     if p.shape[1] == len(MEDIAPIPE33.names):
         p = hips_below(p, visibility > 0)
     frames = [int(i) for i in ids]
     return Landmarks(
-        dict(zip(frames, p, strict=True)), dict(zip(frames, visibility, strict=True)), source
+        dict(zip(frames, p, strict=True)),
+        dict(zip(frames, visibility, strict=True)),
+        source,
     )
 
 
@@ -159,7 +169,9 @@ def whole_frame_ids(raw: NDArray[Any], where: str) -> NDArray[np.int64]:
         )
     values, counts = np.unique(ids, return_counts=True)
     if len(values) != len(ids):
-        raise DataError(f"{where}: frame_id {values[counts > 1][0]} appears more than once")
+        raise DataError(
+            f"{where}: frame_id {values[counts > 1][0]} appears more than once"
+        )
     return ids
 
 
@@ -200,12 +212,16 @@ def hips_below(p: Float, valid: Bool) -> Float:
     nod with the head: the median of the frames that show the whole trunk; without any, along the
     median direction from ears to shoulders, as far as in the template. Metres.
     """
-    shoulders, hips, ears = (list(x) for x in (HUBS[:2], HUBS[2:], MEDIAPIPE33.ears))
+    shoulders = list(HUBS[:2])
+    hips = list(HUBS[2:])
+    ears = list(MEDIAPIPE33.ears)
     hung = valid[:, shoulders].all(1) & ~valid[:, hips].any(1)
-    whole, headed = valid[:, HUBS].all(1), valid[:, shoulders + ears].all(1)
+    whole = valid[:, HUBS].all(1)
+    headed = valid[:, shoulders + ears].all(1)
     if not (hung.any() and (whole | headed).any()):
         return p
-    rest, top = np.array(MEDIAPIPE33.rest_positions), p[:, shoulders].mean(1)
+    rest = np.array(MEDIAPIPE33.rest_positions)
+    top = p[:, shoulders].mean(1)
     if whole.any():
         down = np.median((p[:, hips].mean(1) - top)[whole], axis=0)
     else:
@@ -219,7 +235,8 @@ def hips_below(p: Float, valid: Bool) -> Float:
     wide, narrow = (np.linalg.norm(rest[a] - rest[b]) for a, b in (shoulders, hips))
     half = line * (narrow / wide / 2)
     out = p.copy()
-    out[hung, hips[0]], out[hung, hips[1]] = (top + down + half)[hung], (top + down - half)[hung]
+    out[hung, hips[0]] = (top + down + half)[hung]
+    out[hung, hips[1]] = (top + down - half)[hung]
     return out
 
 
@@ -249,10 +266,14 @@ def face_at_rest(
     p, seen = landmarks.with_face(face).joints(trained)
     own = slice(len(MEDIAPIPE33.names), None)
     body, valid = sanitise(p[:, : own.start], seen[:, : own.start])
-    local = in_head(p[:, own], body, bone_frames(body, valid).hubs[:, HEAD], MEDIAPIPE33)
+    local = in_head(
+        p[:, own], body, bone_frames(body, valid).hubs[:, HEAD], MEDIAPIPE33
+    )
     found = local.masked_fill(~seen[:, own, None], torch.nan).nanmedian(0).values
     usual = constants(HOLISTIC, found.device, found.dtype).face_rest
-    return tuple((x, y, z) for x, y, z in torch.where(found.isnan(), usual, found).tolist())
+    return tuple(
+        (x, y, z) for x, y, z in torch.where(found.isnan(), usual, found).tolist()
+    )
 
 
 def complete_skeletons(

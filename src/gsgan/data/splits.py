@@ -18,7 +18,9 @@ from gsgan.utils.errors import ConfigError, DataError
 
 T = TypeVar("T", int, str)
 
-FRAME_RANGE = re.compile(r"\s*(\d{1,18})\s*(?:-\s*(\d{1,18})\s*)?(?::\s*(\d{1,18})\s*)?")
+FRAME_RANGE = re.compile(
+    r"\s*(\d{1,18})\s*(?:-\s*(\d{1,18})\s*)?(?::\s*(\d{1,18})\s*)?"
+)
 MOST_FRAMES = 10**7  # bounds the memory that a range from a file can ask for
 SPLITS = ("train", "novel_view", "novel_pose")
 SIDES: tuple[Literal["train", "test"], ...] = ("train", "test")
@@ -44,7 +46,9 @@ class Items(Sequence[Item]):
     @property
     def frames(self) -> list[int]:
         """The frame numbers, rising, each once."""
-        return np.unique(np.concatenate([*self._of.values(), np.empty(0, np.int64)])).tolist()
+        return np.unique(
+            np.concatenate([*self._of.values(), np.empty(0, np.int64)])
+        ).tolist()
 
     def __len__(self) -> int:
         return int(self._ends[-1])
@@ -115,14 +119,20 @@ def make_splits(
     """
     if not 0 <= test_share < 1:
         raise ConfigError(f"data.test_share must be in [0, 1), got {test_share}")
-    given = {"cameras": (train_cameras, test_cameras), "frames": (train_frames, test_frames)}
+    given = {
+        "cameras": (train_cameras, test_cameras),
+        "frames": (train_frames, test_frames),
+    }
     cut = len(layout.frames) - int(len(layout.frames) * test_share)
-    everyone, default = layout.camera_names, (layout.frames[:cut], layout.frames[cut:])
+    everyone = layout.camera_names
+    default = (layout.frames[:cut], layout.frames[cut:])
     cameras = _pair(layout, "cameras", given, everyone, (everyone, ()), parse_names)
     frames = _pair(layout, "frames", given, layout.frames, default, parse_frames)
     for camera in (*cameras[0], *cameras[1]):
         if camera not in layout.cameras:
-            raise DataError(f"{layout.root} has no camera {camera}; it has {', '.join(everyone)}")
+            raise DataError(
+                f"{layout.root} has no camera {camera}; it has {', '.join(everyone)}"
+            )
     train, test, notes = _usable(layout, frames, "of the splits")
     items = {
         "train": _items(layout, cameras[0], train),
@@ -170,7 +180,9 @@ def _splits(
 
 def _items(layout: Layout, cameras: Sequence[str], frames: Sequence[int]) -> Items:
     some = np.array(frames, np.int64)
-    return Items({c: np.intersect1d(some, layout.images[c].frames, True) for c in cameras})
+    return Items(
+        {c: np.intersect1d(some, layout.images[c].frames, True) for c in cameras}
+    )
 
 
 def protocol_splits(layout: Layout, protocol: Protocol) -> Splits:
@@ -188,11 +200,15 @@ def protocol_splits(layout: Layout, protocol: Protocol) -> Splits:
         ConfigError: when an image is in both splits, or a value is malformed.
     """
     sides = (
-        None if side is None else tuple(camera_name(layout, c, protocol.name) for c in side)
+        None
+        if side is None
+        else tuple(camera_name(layout, c, protocol.name) for c in side)
         for side in (protocol.train_cameras, protocol.test_cameras)
     )
     train_cameras, test_cameras = _complete(layout.camera_names, *sides)
-    frames = [parse_frames(protocol.frames(side), f"protocol.{side}_frames") for side in SIDES]
+    frames = [
+        parse_frames(protocol.frames(side), f"protocol.{side}_frames") for side in SIDES
+    ]
     train, test, notes = _usable(layout, frames, f"of protocol {protocol.name}")
     trained = set(train)
     both = set(train_cameras) & set(test_cameras)
@@ -204,7 +220,9 @@ def protocol_splits(layout: Layout, protocol: Protocol) -> Splits:
     items = {
         "train": _items(layout, train_cameras, train),
         "novel_view": _items(layout, test_cameras, [f for f in test if f in trained]),
-        "novel_pose": _items(layout, test_cameras, [f for f in test if f not in trained]),
+        "novel_pose": _items(
+            layout, test_cameras, [f for f in test if f not in trained]
+        ),
     }
     reasons = dict.fromkeys(SPLITS[1:], f"protocol {protocol.name} has none")
     cameras = train_cameras, test_cameras
@@ -289,10 +307,14 @@ def parse_frames(value: Any, where: str) -> tuple[int, ...]:
     frames: set[int] = set()
     for part in parts if isinstance(parts, Iterable) else (parts,):
         match = FRAME_RANGE.fullmatch(str(part))
-        first, last, step = (match[1], match[2] or match[1], match[3] or 1) if match else (1, 0, 1)
+        first, last, step = (
+            (match[1], match[2] or match[1], match[3] or 1) if match else (1, 0, 1)
+        )
         some = range(int(first), int(last) + 1, int(step) or 1)
         if not some or int(step) < 1:
-            raise ConfigError(f"{where} must be frame numbers or ranges such as 0-55, got {part!r}")
+            raise ConfigError(
+                f"{where} must be frame numbers or ranges such as 0-55, got {part!r}"
+            )
         if len(some) + len(frames) > MOST_FRAMES:
             raise ConfigError(f"{where} names more than {MOST_FRAMES} frames")
         if some[-1] > LARGEST_FRAME:

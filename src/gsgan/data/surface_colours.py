@@ -26,13 +26,16 @@ if TYPE_CHECKING:
 
 VOXEL = 0.025  # metres, of the hull and of the occlusion test
 AIR = 0.3  # metres of space around the joints that is carved
-WIDEST = 4.0  # metres: a wider skeleton has a stray joint, and its box would not fit into memory
+# metres: a wider skeleton has a stray joint, and its box would not fit into memory
+WIDEST = 4.0
 BLUR = 0.03  # metres: accuracy of the surface, over which colours are averaged
 WHOLE = 0.95  # share of the blur in the mask: outlines mix with the background
-LEAST_POINTS = 30  # that two cameras share in a frame: fewer lie at outlines, at grazing angles
+# that two cameras share in a frame: fewer lie at outlines, at grazing angles
+LEAST_POINTS = 30
 LEAST_FRAMES = 3
 COARSEST = 0.03  # metres per pixel: in coarser images every colour is a mixture
-SLACK = 0.03  # metres by which a body may leave the mask: masks cut off feet and hair that far
+# metres by which a body may leave the mask: masks cut off feet and hair that far
+SLACK = 0.03
 RESIDUAL = 0.95  # the quantile: highlights cover little of a person
 
 
@@ -60,7 +63,8 @@ def surface_colours(moments: Sequence[Sequence[Frame]]) -> SurfaceColours | None
         None where no two cameras share enough surface, or images are too coarse.
     """
     if not moments or any(
-        float(f.camera.to_camera(f.skeleton)[..., 2].median()) / float(f.camera.K[0, 0, 0])
+        float(f.camera.to_camera(f.skeleton)[..., 2].median())
+        / float(f.camera.K[0, 0, 0])
         > COARSEST  # metres per pixel at the person
         for f in moments[0]
     ):
@@ -73,14 +77,17 @@ def surface_colours(moments: Sequence[Sequence[Frame]]) -> SurfaceColours | None
             both = ~np.isnan(seen[i][:, 0] + seen[j][:, 0])
             if np.count_nonzero(both) >= LEAST_POINTS:
                 found.setdefault((i, j), []).append(seen[i][both] - seen[j][both])
-    pairs = [np.concatenate(pair) for pair in found.values() if len(pair) >= LEAST_FRAMES]
+    pairs = [
+        np.concatenate(pair) for pair in found.values() if len(pair) >= LEAST_FRAMES
+    ]
     if not pairs:
         return None
     medians = [np.median(pair, axis=0) for pair in pairs]
     left = [pair - median for pair, median in zip(pairs, medians, strict=True)]
     brightness = np.abs(np.concatenate(left).mean(axis=1))
     return SurfaceColours(
-        difference=float(np.abs(medians).max()), residual=float(np.quantile(brightness, RESIDUAL))
+        difference=float(np.abs(medians).max()),
+        residual=float(np.quantile(brightness, RESIDUAL)),
     )
 
 
@@ -97,7 +104,9 @@ def body_inside(frame: Frame, body: SkinnedBody) -> float | None:
     if not inside.any() or empty.all():
         return None
     # depth of the body: where body and joints disagree, the joints may lie behind the camera
-    reach = np.ceil(SLACK * float(frame.camera.K[0, 0, 0]) / float(np.median(depth[inside])))
+    reach = np.ceil(
+        SLACK * float(frame.camera.K[0, 0, 0]) / float(np.median(depth[inside]))
+    )
     distance = cv2.distanceTransform(empty, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return float((distance[pixels[inside, 1], pixels[inside, 0]] <= reach).mean())
 
@@ -107,7 +116,8 @@ def _hull(frames: Sequence[Frame]) -> Float:
     joints = frames[0].skeleton[0][frames[0].visibility[0] > 0].double().numpy()
     if len(joints) == 0 or np.ptp(joints, axis=0).max() > WIDEST:
         return np.zeros((0, 3))
-    low, high = joints.min(0) - AIR, joints.max(0) + AIR
+    low = joints.min(0) - AIR
+    high = joints.max(0) + AIR
     axes = [np.arange(a, b, VOXEL) for a, b in zip(low, high, strict=True)]
     voxels = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     for frame in frames:
@@ -136,7 +146,8 @@ def _colours(frame: Frame, points: Float) -> Float:
     if not inside.any():
         return result
     height, width = frame.camera.size
-    metre = float(frame.camera.K[0, 0, 0]) / float(np.median(depth[inside]))  # in pixels
+    # in pixels
+    metre = float(frame.camera.K[0, 0, 0]) / float(np.median(depth[inside]))
     # Hidden points: points are sparser than pixels, so depths are compared on a grid of their
     # spacing.
     cell = max(1, int(np.ceil(1.5 * VOXEL * metre)))
@@ -148,11 +159,17 @@ def _colours(frame: Frame, points: Float) -> Float:
     # Colours: means over the mask, without points near its outline.
     sigma = max(0.5, BLUR * metre)
     side = 2 * int(2 * sigma) + 1
-    soft, image = (
-        np.asarray(cv2.GaussianBlur(x, (side, side), sigma), np.float32)
-        for x in (frame.mask[0, 0].numpy(), frame.image[0].permute(1, 2, 0).contiguous().numpy())
+    soft = np.asarray(
+        cv2.GaussianBlur(frame.mask[0, 0].numpy(), (side, side), sigma), np.float32
     )
-    rows, columns = pixels[front, 1], pixels[front, 0]
+    image = np.asarray(
+        cv2.GaussianBlur(
+            frame.image[0].permute(1, 2, 0).contiguous().numpy(), (side, side), sigma
+        ),
+        np.float32,
+    )
+    rows = pixels[front, 1]
+    columns = pixels[front, 0]
     weight = soft[rows, columns]
     colours = image[rows, columns] / np.maximum(weight, WHOLE)[:, None]
     colours[weight < WHOLE] = np.nan

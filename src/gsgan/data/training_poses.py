@@ -12,7 +12,8 @@ from torch import Tensor
 from gsgan.data.proportions import BODY
 from gsgan.skeleton import bone_frames, root_of
 
-NOISE = 0.03  # metres: a direction that varied less in training counts as varying by this
+# metres: a direction that varied less in training counts as varying by this
+NOISE = 0.03
 
 
 @dataclass(frozen=True)
@@ -35,8 +36,12 @@ class TrainingPoses:
 
     def distance(self, p: Tensor) -> Tensor:
         """``[B]`` the distance of completed skeletons ``[B, J, 3]``, metres, world frame."""
-        x = pose_in_pelvis(p.double().cpu()) - torch.tensor(self.mean, dtype=torch.float64)
-        along = x @ torch.tensor(self.axes, dtype=torch.float64).reshape(-1, x.shape[1]).T
+        x = pose_in_pelvis(p.double().cpu()) - torch.tensor(
+            self.mean, dtype=torch.float64
+        )
+        along = (
+            x @ torch.tensor(self.axes, dtype=torch.float64).reshape(-1, x.shape[1]).T
+        )
         return ((x**2).sum(1) - (along**2).sum(1)).clamp_min(0).sqrt() / self.scale
 
 

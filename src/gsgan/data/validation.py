@@ -20,7 +20,8 @@ Index = Mapping[str, Mapping[int, str]]
 """Paths relative to the root, by camera name and frame number."""
 
 
-MOST_HEADERS = 10_000  # read on opening, in even steps; every image is checked again when decoded
+# read on opening, in even steps; every image is checked again when decoded
+MOST_HEADERS = 10_000
 MOST_FRAMES = 10_000  # on which the cameras are checked, in even steps
 
 
@@ -30,11 +31,14 @@ class Thresholds:
 
     min_joints: int = 12  # a frame with fewer usable joints is dropped
     min_hubs: int = 3  # the same of shoulders and hips; both shoulders are enough
-    min_joints_in_view: int = 4  # a camera that sees fewer joints of a frame does not use it
-    max_reach: float = 3.0  # metres from the median joint; one further out counts as missing
+    # a camera that sees fewer joints of a frame does not use it
+    min_joints_in_view: int = 4
+    # metres from the median joint; one further out counts as missing
+    max_reach: float = 3.0
     # metres, minimum and maximum median distance from the cameras to the person
     distance: tuple[float, float] = (0.3, 30.0)
-    max_behind: float = 0.05  # share of joints behind a camera above which its pose is wrong
+    # share of joints behind a camera above which its pose is wrong
+    max_behind: float = 0.05
     max_missing_masks: float = 0.0  # largest share of images without a mask
     header_stride: int = 1  # of images whose header is read on opening, 0.1 ms each
 
@@ -58,7 +62,9 @@ def drop_frames(
         if reason := _unusable(frame, landmarks, poses, limits):
             dropped.setdefault(reason, []).append(frame)
     for reason, ids in dropped.items():
-        notes.append(f"{len(ids)} of {len(frames)} frames dropped, {reason}: {spans(ids)}")
+        notes.append(
+            f"{len(ids)} of {len(frames)} frames dropped, {reason}: {spans(ids)}"
+        )
     gone = [frame for ids in dropped.values() for frame in ids]
     if len(gone) == len(frames):
         raise DataError(
@@ -78,7 +84,8 @@ def _unusable(
         return f"with fewer than {limits.min_joints} joints (NaN or confidence 0)"
     trunk = valid[list(HUBS)]
     left, right = landmarks.p[frame][list(HUBS[2:])]
-    estimated = trunk[:2].all() and (left != right).any()  # see `gsgan.data.skeletons.hips_below`
+    # see `gsgan.data.skeletons.hips_below`
+    estimated = trunk[:2].all() and (left != right).any()
     if trunk.sum() < limits.min_hubs and not estimated:
         return f"with fewer than {limits.min_hubs} of the shoulders and hips"
     if poses is not None and frame not in poses.theta:
@@ -89,7 +96,11 @@ def _unusable(
 def spans(ids: list[int]) -> str:
     """Numbers as ranges: [1, 2, 3, 7] is "1-3, 7"."""
     numbers = np.array(sorted(ids), int)
-    runs = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1) if len(numbers) else []
+    runs = (
+        np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)
+        if len(numbers)
+        else []
+    )
     return ", ".join(f"{r[0]}" if len(r) == 1 else f"{r[0]}-{r[-1]}" for r in runs)
 
 
@@ -109,8 +120,11 @@ def check_geometry(
     """
     frames, joints, valid = _seen(images, landmarks)
     some = slice(None, None, -(-len(frames) // MOST_FRAMES))
-    joints, valid = joints[some], valid[some]
-    check_distance(root, list(cameras.values()), joints[valid], limits.distance, unit_hint)
+    joints = joints[some]
+    valid = valid[some]
+    check_distance(
+        root, list(cameras.values()), joints[valid], limits.distance, unit_hint
+    )
     for camera in cameras.values():
         depth = project(camera, joints)[1][valid]
         behind = float((depth <= NEAR).mean())
@@ -121,7 +135,9 @@ def check_geometry(
             )
 
 
-def _seen(images: Images, landmarks: Landmarks) -> tuple[list[int], NDArray[Any], NDArray[Any]]:
+def _seen(
+    images: Images, landmarks: Landmarks
+) -> tuple[list[int], NDArray[Any], NDArray[Any]]:
     """The frames of any camera ``[F]``, rising, their joints ``[F, J, 3]``, and which are seen."""
     frames = sorted(set[int]().union(*images.values()))
     visibility = np.stack([landmarks.visibility[f] for f in frames])
@@ -197,7 +213,9 @@ def drop_unmasked(
     Raises:
         DataError: when more are missing than allowed, naming one in the ``expected`` folders.
     """
-    lost = [(c, f) for c, files in images.items() for f in sorted({*files} - {*masks[c]})]
+    lost = [
+        (c, f) for c, files in images.items() for f in sorted({*files} - {*masks[c]})
+    ]
     if not lost:
         return images
     (camera, frame), count = lost[0], sum(len(files) for files in images.values())
@@ -213,7 +231,9 @@ def drop_unmasked(
         f"{len(lost)} of {count} images have no mask and are left out "
         f"(first: camera {camera}, frame {frame})"
     )
-    return {c: files.without(f for d, f in lost if d == c) for c, files in images.items()}
+    return {
+        c: files.without(f for d, f in lost if d == c) for c, files in images.items()
+    }
 
 
 def check_images(

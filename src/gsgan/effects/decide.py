@@ -24,7 +24,9 @@ CHOICES: dict[str, tuple[str | int, ...]] = {
     "random_background": ON_OFF,
 }
 FORCED = "set in the config"
-TOO_LITTLE = "the cameras share too little surface, or images are too coarse, to compare colours"
+TOO_LITTLE = (
+    "the cameras share too little surface, or images are too coarse, to compare colours"
+)
 RATIONAL = (
     "a lens has coefficients beyond the fifth (k4, k5, k6), which rendering does not support; "
     "choose effects.distortion=undistort"
@@ -64,28 +66,39 @@ class EffectSettings:
             value = getattr(self, name)
             if isinstance(value, bool):
                 value = "on" if value else "off"
-            object.__setattr__(self, name, one_of(f"effects.{name}", value, CHOICES[name]))
+            object.__setattr__(
+                self, name, one_of(f"effects.{name}", value, CHOICES[name])
+            )
         if self.impossible is False:  # YAML's off
             object.__setattr__(self, "impossible", "off")
         one_of("effects.impossible", self.impossible, ("error", "off"))
         counts = list(self.degree_cameras)
         if len(counts) != 3 or counts != sorted(counts):
-            raise ConfigError(f"effects.degree_cameras must be three rising numbers, got {counts}")
+            raise ConfigError(
+                f"effects.degree_cameras must be three rising numbers, got {counts}"
+            )
         scales = list(self.rendered_scales)
-        if len(scales) != 2 or not all(map(is_number, scales)) or not 0 < scales[0] <= scales[1]:
+        if (
+            len(scales) != 2
+            or not all(map(is_number, scales))
+            or not 0 < scales[0] <= scales[1]
+        ):
             raise ConfigError(
                 f"effects.rendered_scales must be two rising positive numbers, got {scales}"
             )
         listed = [self.only] if isinstance(self.only, str) else list(self.only or ())
         if isinstance(self.only, str) or set(listed) - set(CHOICES):
-            raise ConfigError(f"effects.only must list some of {', '.join(CHOICES)}; got {listed}")
+            raise ConfigError(
+                f"effects.only must list some of {', '.join(CHOICES)}; got {listed}"
+            )
 
     def requested(self, name: str) -> str | int:
         """The value requested for an effect, with ``only`` taken into account."""
         value: str | int = getattr(self, name)
         if self.only is None:
             return value
-        if name not in self.only:  # distortion is a property of the camera, not an option
+        # distortion is a property of the camera, not an option
+        if name not in self.only:
             return value if name == "distortion" else "off"
         return "on" if value in (AUTO, "off", 0) else value
 
@@ -115,7 +128,9 @@ class ModelParts:
         return None if self.splats else "this model has no Gaussians"
 
 
-def decide(info: SceneInfo, settings: EffectSettings, model: ModelParts | None = None) -> Effects:
+def decide(
+    info: SceneInfo, settings: EffectSettings, model: ModelParts | None = None
+) -> Effects:
     """The effects of a run, decided once from the training split.
 
     Args:
@@ -132,7 +147,9 @@ def decide(info: SceneInfo, settings: EffectSettings, model: ModelParts | None =
     return Effects(**found, cameras=cameras)
 
 
-def _one(name: str, info: SceneInfo, settings: EffectSettings, model: ModelParts) -> Effect:
+def _one(
+    name: str, info: SceneInfo, settings: EffectSettings, model: ModelParts
+) -> Effect:
     requested = settings.requested(name)
     off: str | int = 0 if name == "view_dependence" else OFF
     if requested in (OFF, 0):
@@ -167,12 +184,16 @@ def _impossible(name: str, info: SceneInfo, requested: str | int) -> str | None:
 
 
 def _view_dependence(info: SceneInfo, settings: EffectSettings) -> Effect:
-    cameras, degree = info.n_train_cameras, most_degree(info, settings)
+    cameras = info.n_train_cameras
+    degree = most_degree(info, settings)
     if degree == 0:
-        return Effect(0, f"{cameras} training camera sees each moment from one side only")
+        return Effect(
+            0, f"{cameras} training camera sees each moment from one side only"
+        )
     if info.surface is None:
         return Effect(0, TOO_LITTLE)
-    left, limit = info.surface.residual, settings.view_residual
+    left = info.surface.residual
+    limit = settings.view_residual
     if left < limit:
         return Effect(0, f"shared surface differs by only {left:.3f} (limit {limit:g})")
     why = f"shared surface differs by {left:.3f} (limit {limit:g}); {cameras} cameras"
@@ -185,7 +206,9 @@ def most_degree(info: SceneInfo, settings: EffectSettings) -> int:
 
 
 def _distortion(info: SceneInfo, settings: EffectSettings) -> Effect:
-    return Effect("undistort", "a lens coefficient is not zero: images are undistorted when read")
+    return Effect(
+        "undistort", "a lens coefficient is not zero: images are undistorted when read"
+    )
 
 
 def _antialias(info: SceneInfo, settings: EffectSettings) -> Effect:
@@ -207,8 +230,12 @@ def _colour_correction(info: SceneInfo, settings: EffectSettings) -> Effect:
     if seen.difference < settings.colour_difference:
         return Effect(OFF, f"{measured} at most (limit {settings.colour_difference:g})")
     if seen.difference < highlights:
-        return Effect(OFF, f"{measured}, which highlights can cause (limit {highlights:.3f})")
-    return Effect("on", f"{measured} (limit {max(highlights, settings.colour_difference):.3f})")
+        return Effect(
+            OFF, f"{measured}, which highlights can cause (limit {highlights:.3f})"
+        )
+    return Effect(
+        "on", f"{measured} (limit {max(highlights, settings.colour_difference):.3f})"
+    )
 
 
 def _body_points(info: SceneInfo, settings: EffectSettings) -> Effect:

@@ -70,7 +70,9 @@ class Effects:
 
     def rows(self) -> list[tuple[str, str, str]]:
         """One row per effect: name, value, why."""
-        return [(name, str(one.value) if one.on else OFF, one.why) for name, one in self]
+        return [
+            (name, str(one.value) if one.on else OFF, one.why) for name, one in self
+        ]
 
     def table(self) -> Table:
         """The rows for a terminal."""
@@ -83,7 +85,9 @@ class Effects:
 
     def plain(self) -> dict[str, Any]:
         """Plain values, as a checkpoint holds them."""
-        return {name: asdict(effect) for name, effect in self} | {"cameras": list(self.cameras)}
+        return {name: asdict(effect) for name, effect in self} | {
+            "cameras": list(self.cameras)
+        }
 
     @classmethod
     def from_plain(cls, values: Mapping[str, Any]) -> Effects:

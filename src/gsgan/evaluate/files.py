@@ -23,12 +23,24 @@ HEADER = ("split", "variant", "camera", "frame", *METRICS)
 Results = dict[str, dict[str, dict[str, Any]]]
 TITLE = "Held-out cameras (novel_view) and poses (novel_pose)"
 IN_TERMINAL = (  # narrow; metrics.md has all metrics
-    *("psnr", "psnr_person", "ssim", "lpips_vgg", "lpips_alex", "high_frequencies", "miou"),
+    *(
+        "psnr",
+        "psnr_person",
+        "ssim",
+        "lpips_vgg",
+        "lpips_alex",
+        "high_frequencies",
+        "miou",
+    ),
 )
 WITH_HANDS = (  # where hands are scored, theirs in place of edges
     *("psnr", "psnr_person", "psnr_hands", "psnr_mouth", "ssim", "lpips_alex", "miou"),
 )
-VARIANTS = {"full": "final image", "splat": "Step I's colour", "floor": "floor: background"}
+VARIANTS = {
+    "full": "final image",
+    "splat": "Step I's colour",
+    "floor": "floor: background",
+}
 
 
 @dataclass(frozen=True)
@@ -67,7 +79,9 @@ def rows(
 
     def formatted(values: dict[str, Any]) -> list[str]:
         held = [(values[m], METRICS[m].digits) for m in metrics]
-        return ["n/a" if value is None else f"{value:.{digits}f}" for value, digits in held]
+        return [
+            "n/a" if value is None else f"{value:.{digits}f}" for value, digits in held
+        ]
 
     for split, variants in results.items():
         for variant, scores in variants.items():
@@ -125,10 +139,14 @@ def print_table(results: Results, origin: dict[str, Any], console: Console) -> N
 
 def markdown(results: Results, origin: dict[str, Any]) -> str:
     """The table in Markdown with its caption and every metric, and again by camera."""
-    header = ["split", "variant", "images", *(METRICS[m].short_heading for m in METRICS)]
-    by_split, by_camera = (
-        pages.markdown(header, list(rows(results, cameras=each))) for each in (False, True)
-    )
+    header = [
+        "split",
+        "variant",
+        "images",
+        *(METRICS[m].short_heading for m in METRICS),
+    ]
+    by_split = pages.markdown(header, list(rows(results, cameras=False)))
+    by_camera = pages.markdown(header, list(rows(results, cameras=True)))
     listed = "\n".join(f"- {note}" for note in notes(results))
     parts = (f"# {TITLE}", caption(origin), by_split, listed, "## By camera", by_camera)
     return "\n\n".join(filter(None, parts)) + "\n"

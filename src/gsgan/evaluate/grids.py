@@ -23,7 +23,9 @@ def error_heat(image: Tensor, target: Tensor) -> Tensor:
     """Mean absolute error per pixel as a heat map ``[B, 3, H, W]``; black is none."""
     error = ((image - target).abs().mean(dim=1) * ERROR_GAIN).clamp(0, 1)
     heat = [
-        cv2.applyColorMap((e * 255).byte().cpu().numpy(), cv2.COLORMAP_INFERNO)[..., ::-1].copy()
+        cv2.applyColorMap((e * 255).byte().cpu().numpy(), cv2.COLORMAP_INFERNO)[
+            ..., ::-1
+        ].copy()
         for e in error
     ]
     return torch.from_numpy(np.stack(heat)).permute(0, 3, 1, 2).to(image) / 255
@@ -32,7 +34,9 @@ def error_heat(image: Tensor, target: Tensor) -> Tensor:
 def grid_rows(frame: Frame, painting: Rendering) -> list[dict[str, Tensor]]:
     """One row per batch item: images ``[3, H, W]`` by caption; what was not rendered is absent."""
     assert painting.image is not None
-    image, colour, parts = painting.image.clamp(0, 1), painting.colour, painting.segmentation
+    image = painting.image.clamp(0, 1)
+    colour = painting.colour
+    parts = painting.segmentation
     columns = {
         "truth": frame.image,
         "Step I colour": None if colour is None else colour.clamp(0, 1),
@@ -40,8 +44,14 @@ def grid_rows(frame: Frame, painting: Rendering) -> list[dict[str, Tensor]]:
         "I_pred": image,
         f"error x{ERROR_GAIN:g}": error_heat(image, frame.image),
     }
-    shown = {name: column.detach().cpu() for name, column in columns.items() if column is not None}
-    return [{name: column[i] for name, column in shown.items()} for i in range(len(frame))]
+    shown = {
+        name: column.detach().cpu()
+        for name, column in columns.items()
+        if column is not None
+    }
+    return [
+        {name: column[i] for name, column in shown.items()} for i in range(len(frame))
+    ]
 
 
 def write_grid(rows: Sequence[dict[str, Tensor]], path: Path, least: int = 160) -> None:
@@ -57,7 +67,8 @@ def write_grid(rows: Sequence[dict[str, Tensor]], path: Path, least: int = 160) 
     images = [list(row.values()) for row in rows]
     height, width = (max(x.shape[d] for row in images for x in row) for d in (-2, -1))
     padded = [
-        [pad(x, (0, width - x.shape[-1], 0, height - x.shape[-2])) for x in row] for row in images
+        [pad(x, (0, width - x.shape[-1], 0, height - x.shape[-2])) for x in row]
+        for row in images
     ]
     body = torch.cat([torch.cat(row, dim=-1) for row in padded], dim=-2)
     scale = max(1, -(-least // width))
@@ -66,6 +77,15 @@ def write_grid(rows: Sequence[dict[str, Tensor]], path: Path, least: int = 160) 
     header = np.full((CAPTION_HEIGHT, pixels.shape[1], 3), 255, np.uint8)
     for i, caption in enumerate(rows[0]):
         at = (i * scale * width + 4, CAPTION_HEIGHT - 7)
-        cv2.putText(header, caption, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
+        cv2.putText(
+            header,
+            caption,
+            at,
+            cv2.FONT_HERSHEY_SIMPLEX,
+            0.45,
+            (0, 0, 0),
+            1,
+            cv2.LINE_AA,
+        )
     encoded = cv2.imencode(".png", np.concatenate([header, pixels])[..., ::-1])[1]
     write_atomically(path, encoded.tobytes())

@@ -45,7 +45,9 @@ class Method:
 def trained(folder: Path, **training: Any) -> Method:
     """The method of a run folder, with the fields of ``training``."""
     chosen = choices(folder)
-    return Method("gsgan", model=chosen.get("model"), data=chosen.get("data"), **training)
+    return Method(
+        "gsgan", model=chosen.get("model"), data=chosen.get("data"), **training
+    )
 
 
 def origin(method: Method, data: GsganData, device: torch.device) -> dict[str, Any]:
@@ -77,7 +79,9 @@ def fingerprint(data: GsganData) -> str:
     content: dict[str, Any] = {
         "cameras": {name: list(camera.size) for name, camera in layout.cameras.items()},
         "frames": list(layout.frames),
-        "splits": {k: [list(item) for item in items] for k, items in data.splits.items.items()},
+        "splits": {
+            k: [list(item) for item in items] for k, items in data.splits.items.items()
+        },
         "size": data.size,
         "crop": None if data.crop is None else asdict(data.crop),
     }
@@ -102,7 +106,9 @@ def _commit() -> tuple[str | None, bool | None]:
     options = ("--always", "--tags", "--abbrev=12", f"--dirty={DIRTY}")
     command = ["git", "-C", str(root), "describe", *options]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=30)
+        done = subprocess.run(
+            command, capture_output=True, text=True, check=True, timeout=30
+        )
     except (OSError, subprocess.SubprocessError):
         return None, None
     found = done.stdout.strip()
@@ -111,13 +117,15 @@ def _commit() -> tuple[str | None, bool | None]:
 
 def caption(origin: dict[str, Any]) -> str:
     """One line under a table: method, protocol, data, number of seeds, commit."""
-    data, seed = origin["data"], origin["seed"]
+    data = origin["data"]
+    seed = origin["seed"]
     return " · ".join(
         [
             " ".join(filter(None, (origin["method"], origin["model"]))),
             f"protocol {origin['protocol'] or 'none'}",
             f"data {data['name'] or 'unknown'} ({data['root']}, {data['fingerprint']})",
             "seed unknown" if seed is None else f"seed {seed}",
-            f"commit {origin['commit'] or 'unknown'}" + (", changed since" * bool(origin["dirty"])),
+            f"commit {origin['commit'] or 'unknown'}"
+            + (", changed since" * bool(origin["dirty"])),
         ]
     )

@@ -33,12 +33,18 @@ from gsgan.utils.errors import ConfigError, DataError
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
 
-VERTEX_MARGIN = 0.05  # metres around the body's vertices, as in published scoring scripts
-JOINT_MARGIN = 0.2  # metres around joints, which are inside the body; as in `PersonCrop`
-FULL, SPLAT, FLOOR = "full", "splat", "floor"  # the floor is the all-background image
+# metres around the body's vertices, as in published scoring scripts
+VERTEX_MARGIN = 0.05
+# metres around joints, which are inside the body; as in `PersonCrop`
+JOINT_MARGIN = 0.2
+# the floor is the all-background image
+FULL = "full"
+SPLAT = "splat"
+FLOOR = "floor"
 FIELDS = ("split", "camera", "camera_index", "frame")
 FIELD = re.compile(r"\{(.*?)\}")
-WRONG_BACKGROUND = 0.5  # share of the background's pixels that have the other background's colour
+# share of the background's pixels that have the other background's colour
+WRONG_BACKGROUND = 0.5
 CLOSE = 0.05  # of the range: below it a pixel counts as black, within it of 1 as white
 
 
@@ -88,12 +94,16 @@ class BodyBoxes:
         if self.body is not None and frame.body is not None:
             vertices = self.body.to(frame.skeleton.device).posed_vertices(frame.body)
             return box_corners(vertices[index], VERTEX_MARGIN)
-        return box_corners(frame.skeleton[index][frame.visibility[index] > 0], JOINT_MARGIN)
+        return box_corners(
+            frame.skeleton[index][frame.visibility[index] > 0], JOINT_MARGIN
+        )
 
     def masks(self, frame: Frame) -> Tensor:
         """``[B, 1, H, W]`` bool: the pixels that see it."""
         cameras = (frame.camera[i : i + 1] for i in range(len(frame)))
-        return torch.stack([box_mask(self.corners(frame, i), c) for i, c in enumerate(cameras)])
+        return torch.stack(
+            [box_mask(self.corners(frame, i), c) for i, c in enumerate(cameras)]
+        )
 
 
 @dataclass(frozen=True)
@@ -117,9 +127,11 @@ class Preparation:
 
     def target(self, frame: Frame) -> Tensor:
         """``[B, 3, H, W]`` the ground truth, which is on black in the data."""
-        image, mask = frame.image, frame.mask
+        image = frame.image
+        mask = frame.mask
         if self.measures.truth_outline == "hard":
-            image, mask = hard_outline(image, mask), (mask >= 0.5).to(mask)
+            image = hard_outline(image, mask)
+            mask = (mask >= 0.5).to(mask)
         return on_background(image, mask, self.background)
 
     def image(self, prediction: Prediction, variant: str, box: Tensor | None) -> Tensor:
@@ -168,7 +180,9 @@ class PredictionFolder:
         """
         path = self.root / self.files[item]
         rgb, alpha = read_with_alpha(path)
-        image = (torch.from_numpy(rgb).float() / 255).permute(2, 0, 1)[None].to(frame.image)
+        image = (
+            (torch.from_numpy(rgb).float() / 255).permute(2, 0, 1)[None].to(frame.image)
+        )
         if alpha is not None:
             cover = (torch.from_numpy(alpha).float() / 255)[None, None].to(frame.image)
             return Prediction({FULL: image * cover}, {FULL: cover})
@@ -177,8 +191,11 @@ class PredictionFolder:
 
     def _check_background(self, path: Path, image: Tensor, mask: Tensor) -> None:
         behind = image.permute(0, 2, 3, 1)[mask[:, 0] == 0]
-        black, white = (behind < CLOSE).all(-1), (behind > 1 - CLOSE).all(-1)
-        other, name = (white, "white") if self.background == "black" else (black, "black")
+        black = (behind < CLOSE).all(-1)
+        white = (behind > 1 - CLOSE).all(-1)
+        other, name = (
+            (white, "white") if self.background == "black" else (black, "black")
+        )
         if float(other.float().mean()) > WRONG_BACKGROUND:  # NaN without background
             raise DataError(
                 f"{path} has a {name} background, expected {self.background}; give "
@@ -215,11 +232,14 @@ def read_folder(
             "{camera_index}, may have {split}, and no other field"
         )
     if not root.is_dir():
-        raise DataError(f"predictions={root} is not a folder; give that of a method's images")
+        raise DataError(
+            f"predictions={root} is not a folder; give that of a method's images"
+        )
     stored: dict[str, list[str]] = {}
     for name in sorted(glob("**", root_dir=root, recursive=True)):
         stored.setdefault(_unpadded(name), []).append(name)
-    files, missing = {}, []
+    files = {}
+    missing = []
     for split, sizes in expected.items():
         for (camera, frame), size in sizes.items():
             what = f"camera {camera}, frame {frame}"
@@ -234,7 +254,12 @@ def read_folder(
                     f"{root} has {what} twice, as {found[0]} and {found[1]}; keep one of them"
                 )
             files[camera, frame] = found[0]
-            check_image(root / found[0], "image", size, f"the ground truth of {what}, as scored,")
+            check_image(
+                root / found[0],
+                "image",
+                size,
+                f"the ground truth of {what}, as scored,",
+            )
     if missing:
         raise DataError(
             f"{root} lacks {len(missing)} of {len(missing) + len(files)} images; the first is "

@@ -20,23 +20,50 @@ from rich.progress import track
 from gsgan.data.datamodule import GsganData
 from gsgan.data.metric_variants import MetricVariants
 from gsgan.data.training_poses import TrainingPoses
-from gsgan.evaluate.files import FACTS_FILE, HEADER, Results, Scored, print_table, write_scored
+from gsgan.evaluate.files import (
+    FACTS_FILE,
+    HEADER,
+    Results,
+    Scored,
+    print_table,
+    write_scored,
+)
 from gsgan.evaluate.grids import write_grid
 from gsgan.evaluate.origin import Method, origin, trained
 from gsgan.evaluate.predictions import FLOOR, FULL, BodyBoxes, Preparation, read_folder
-from gsgan.evaluate.scores import Predict, Scorer, SplitScores, empty, painter, score_split
+from gsgan.evaluate.scores import (
+    Predict,
+    Scorer,
+    SplitScores,
+    empty,
+    painter,
+    score_split,
+)
 from gsgan.metrics.lpips import LPIPS_NETS, build_lpips
 from gsgan.metrics.regions import BACKGROUNDS
 from gsgan.model.assemble import build_data
 from gsgan.model.runs import avatar_of, load_avatar
-from gsgan.model.stored import CHECKPOINT, DataPaths, load_config, read_checkpoint, read_config
+from gsgan.model.stored import (
+    CHECKPOINT,
+    DataPaths,
+    load_config,
+    read_checkpoint,
+    read_config,
+)
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.files import write_atomically
 from gsgan.utils.tensors import pick_device
 
-CSV, PNG = "distance.csv", "distance.png"
-COLUMNS = ("psnr_person", "ssim_person", "lpips_vgg_person", "lpips_alex_person", "flicker")
+CSV = "distance.csv"
+PNG = "distance.png"
+COLUMNS = (
+    "psnr_person",
+    "ssim_person",
+    "lpips_vgg_person",
+    "lpips_alex_person",
+    "flicker",
+)
 BINS = (0, 1, 2, 3, 4, 6, 8, 12, np.inf)  # distances
 
 
@@ -61,7 +88,9 @@ def write_distances(
     table = rows.loc[rows["variant"] == FULL, ["split", "camera", "frame", *COLUMNS]]
     frames, places = np.unique(table["frame"], return_inverse=True)
     skeletons = data.dataset("train").skeletons.p
-    distances = poses.distance(torch.from_numpy(np.stack([skeletons[f] for f in frames.tolist()])))
+    distances = poses.distance(
+        torch.from_numpy(np.stack([skeletons[f] for f in frames.tolist()]))
+    )
     table.insert(3, "distance", distances.numpy()[places].round(3))
     write_atomically(folder / CSV, table.to_csv(index=False, lineterminator="\n"))
     curves = {"scored here": table}
@@ -69,7 +98,8 @@ def write_distances(
         curves["held out of the training's capture"] = pd.read_csv(beside / CSV)
     write_atomically(folder / PNG, _plot(curves))
     means = "; ".join(
-        f"{low:g} to {high:g}: {db:.2f} dB ({count:g})" for low, high, _, db, count in _means(table)
+        f"{low:g} to {high:g}: {db:.2f} dB ({count:g})"
+        for low, high, _, db, count in _means(table)
     )
     text = f"PSNR in box by distance from the training poses, in deviations (images): {means}"
     console.print(text, markup=False, highlight=False, soft_wrap=True)
@@ -80,7 +110,12 @@ def _means(table: pd.DataFrame) -> list[tuple[float, ...]]:
     table = table[np.isfinite(table["psnr_person"])]
     groups = table.groupby(pd.cut(table["distance"], BINS, right=False, labels=False))
     return [
-        (*BINS[int(k) : int(k) + 2], own["distance"].mean(), own["psnr_person"].mean(), len(own))
+        (
+            *BINS[int(k) : int(k) + 2],
+            own["distance"].mean(),
+            own["psnr_person"].mean(),
+            len(own),
+        )
         for k, own in groups
     ]
 
@@ -118,45 +153,61 @@ def evaluate_config(config: DictConfig) -> Results:
             "give either run=<the folder that gsgan.train printed>, or predictions=<folder of "
             "images> with data= and data.root="
         )
-    kind, others = "run", ["data", "protocol", "out", "method"]
+    kind = "run"
+    others = ["data", "protocol", "out", "method"]
     if config.run is None:
-        kind, others = "predictions", ["data_root", "data_smpl", "drive", "on"]
+        kind = "predictions"
+        others = ["data_root", "data_smpl", "drive", "on"]
     for key in others:
         if config.get(key) is not None:
             raise ConfigError(f"{key}= cannot be given with {kind}=; leave it out")
     if config.get("on") is not None and config.data_root is not None:
         raise ConfigError("data_root= cannot be given with on=; leave it out")
     if config.background not in (None, *BACKGROUNDS):
-        raise ConfigError(f"background must be black, white or null; got {config.background!r}")
+        raise ConfigError(
+            f"background must be black, white or null; got {config.background!r}"
+        )
     if config.get("drive") not in (None, "skeleton"):
         raise ConfigError(f"drive must be skeleton or null; got {config.drive!r}")
     if not config.splits or not set(config.splits) <= set(SPLITS):
-        raise ConfigError(f"splits must be a list of {' and '.join(SPLITS)}; got {config.splits}")
+        raise ConfigError(
+            f"splits must be a list of {' and '.join(SPLITS)}; got {config.splits}"
+        )
     score = evaluate_predictions if config.run is None else evaluate_folder
     return score(config, make_console(), pick_device(config.device))
 
 
-def evaluate_folder(config: DictConfig, console: Console, device: torch.device) -> Results:
+def evaluate_folder(
+    config: DictConfig, console: Console, device: torch.device
+) -> Results:
     """Loads the avatar of ``config.run`` and scores it."""
-    folder, other = Path(config.run).expanduser(), config.get("on") is not None
-    out, stored = folder, read_config(folder)
+    folder = Path(config.run).expanduser()
+    other = config.get("on") is not None
+    out = folder
+    stored = read_config(folder)
     if config.lpips.nets is None:
-        config.lpips.nets = OmegaConf.select(stored, "lpips.nets", default=list(LPIPS_NETS))
+        config.lpips.nets = OmegaConf.select(
+            stored, "lpips.nets", default=list(LPIPS_NETS)
+        )
     checkpoint = read_checkpoint(folder / CHECKPOINT)
     state = checkpoint["gsgan"]
     if other:
-        avatar, marks = avatar_of(folder, stored, checkpoint, config.data_smpl), [*state["marks"]]
+        avatar = avatar_of(folder, stored, checkpoint, config.data_smpl)
+        marks = [*state["marks"]]
         data = build_data(other_capture(stored, config.on))
         name = Path(data.layout.root).resolve().name
-        out, marks = folder / "on" / name, [*marks, f"on another capture: {name}", BY_SKELETON]
+        out = folder / "on" / name
+        marks = [*marks, f"on another capture: {name}", BY_SKELETON]
     else:
         stored = load_config(folder, DataPaths.from_config(config))
         data = build_data(stored)
         avatar, marks = load_avatar(folder, stored, data)
-    if config.background not in (None, _measures(data).background):  # the protocol's scores stay
+    # the protocol's scores stay
+    if config.background not in (None, _measures(data).background):
         out = out / f"on_{config.background}"
     if config.drive is not None and not other:
-        out, marks = out / "by_skeleton", [*marks, BY_SKELETON]
+        out = out / "by_skeleton"
+        marks = [*marks, BY_SKELETON]
     if len({*config.splits}) < len(SPLITS):  # the scores of both splits stay
         out = out / config.splits[0]
     method = trained(
@@ -193,14 +244,20 @@ def other_capture(stored: DictConfig, on: str | DictConfig) -> DictConfig:
     try:
         config.data.merge_with({"root": on} if isinstance(on, str) else on)
     except ConfigKeyError as error:
-        raise ConfigError(f"on: {str(error).splitlines()[0]} of the run's data") from None
+        raise ConfigError(
+            f"on: {str(error).splitlines()[0]} of the run's data"
+        ) from None
     return config
 
 
-def evaluate_predictions(config: DictConfig, console: Console, device: torch.device) -> Results:
+def evaluate_predictions(
+    config: DictConfig, console: Console, device: torch.device
+) -> Results:
     """Scores the folder ``config.predictions`` on the config's data."""
     if config.get("data") is None:
-        raise ConfigError("data is not set: give that of the predictions with data= and data.root=")
+        raise ConfigError(
+            "data is not set: give that of the predictions with data= and data.root="
+        )
     root = Path(config.predictions).expanduser()
     name = config.method or root.resolve().name
     if config.lpips.nets is None:
@@ -211,13 +268,18 @@ def evaluate_predictions(config: DictConfig, console: Console, device: torch.dev
     folder = read_folder(
         root,
         config.predictions_pattern,
-        {k: {item: own.camera(item).size for item in own.items} for k, own in datasets.items()},
+        {
+            k: {item: own.camera(item).size for item in own.items}
+            for k, own in datasets.items()
+        },
         data.layout.camera_names,
         config.background or _measures(data).background,
     )
     chosen = HydraConfig.get().runtime.choices if HydraConfig.initialized() else {}
     method = Method(name, data=chosen.get("data"))
-    return evaluate_method(out, config, console, data, folder.predict, method=method, device=device)
+    return evaluate_method(
+        out, config, console, data, folder.predict, method=method, device=device
+    )
 
 
 def _out(config: DictConfig, root: Path, method: str) -> Path:
@@ -233,7 +295,9 @@ def _out(config: DictConfig, root: Path, method: str) -> Path:
     try:
         found = json.loads(held.read_text())["method"] if held.is_file() else method
     except (ValueError, KeyError, TypeError):
-        raise ConfigError(f"{held} is damaged; choose another folder with out=") from None
+        raise ConfigError(
+            f"{held} is damaged; choose another folder with out="
+        ) from None
     if found != method:
         raise ConfigError(
             f"out={out} holds scores of {found}, not of {method}; choose another folder"
@@ -277,7 +341,8 @@ def evaluate_method(
     scores: dict[str, SplitScores] = {}
     for split in config.get("splits") or SPLITS:
         dataset = data.dataset(split)
-        count, rows = len(dataset), min(grid_rows, len(dataset))
+        count = len(dataset)
+        rows = min(grid_rows, len(dataset))
         order = track(range(count), f"scoring {split}", console=console, transient=True)
         frames = ((dataset.items[i], dataset[i].to(device)) for i in order)
         shown = {round((i + 0.5) * count / rows - 0.5) for i in range(rows)}
@@ -296,7 +361,10 @@ def evaluate_method(
 
 
 def _joined_splits(
-    scores: dict[str, SplitScores], scorer: Scorer, data: GsganData, origin: dict[str, Any]
+    scores: dict[str, SplitScores],
+    scorer: Scorer,
+    data: GsganData,
+    origin: dict[str, Any],
 ) -> Scored:
     """The scores of all splits, with the protocol's record and reasons for empty splits."""
     variants = next((s.variants for s in scores.values() if s.variants), (FULL, FLOOR))
@@ -305,7 +373,8 @@ def _joined_splits(
         reason = data.reasons.get(split, "no frames")
         held = found.variants or {name: empty(reason, scorer) for name in variants}
         results[split] = {
-            name: values | {"protocol": scorer.protocol} for name, values in held.items()
+            name: values | {"protocol": scorer.protocol}
+            for name, values in held.items()
         }
     table = (
         {"split": split, "variant": variant, **row}
@@ -323,12 +392,16 @@ def make_scorer(config: DictConfig, data: GsganData, marks: Sequence[str]) -> Sc
         ConfigError: on an unknown network of LPIPS.
         DataError: if LPIPS' weights or a body model cannot be read.
     """
-    measures, background = _measures(data), config.get("background")
+    measures = _measures(data)
+    background = config.get("background")
     if background not in (None, measures.background):
         measures = replace(measures, background=background)
         marks = [*marks, f"scored on {background}"]
     if frames := data.registered_held_out:
-        marks = [*marks, f"body poses of {len(frames)} held-out frames fitted to their own masks"]
+        marks = [
+            *marks,
+            f"body poses of {len(frames)} held-out frames fitted to their own masks",
+        ]
     boxes = BodyBoxes(data) if measures.needs_body_box else None
     record = data.protocol_record(config.lpips.nets)
     if record is not None:

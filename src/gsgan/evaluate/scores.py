@@ -68,15 +68,18 @@ def image_scores(
     Returns:
         ``{metric: score}``; a metric that was not computed is absent, an undefined one NaN.
     """
-    measures, image = measures or MetricVariants(), image.clamp(0, 1)
-    pooling, background = measures.psnr_pooling, BACKGROUNDS[measures.background]
+    measures = measures or MetricVariants()
+    image = image.clamp(0, 1)
+    pooling = measures.psnr_pooling
+    background = BACKGROUNDS[measures.background]
     window = ssim_uniform if measures.ssim_window == "uniform" else ssim
     similarity = partial(window, value_range=measures.ssim_range)
     scores: dict[str, Any] = {"high_frequencies": high_frequencies(image, target)}
     if measures.region == "body_box":
         assert box is not None
         scores["psnr"] = psnr_where(image, target, box, pooling=pooling)
-        a, b = (cleared(x, box, background) for x in (image, target))
+        a = cleared(image, box, background)
+        b = cleared(target, box, background)
         scores["ssim"] = _inside(box, similarity, a, b)
     else:
         scores["psnr"] = psnr(image, target, pooling=pooling)
@@ -86,20 +89,28 @@ def image_scores(
     if mask is not None:
         regions["person"] = person = person_box(mask)
         scores["psnr_inside"] = psnr_inside(image, target, mask)
-        scores["edge_f1_person"], scores["edge_ratio_person"] = edge_scores(image, target, person)
+        scores["edge_f1_person"], scores["edge_ratio_person"] = edge_scores(
+            image, target, person
+        )
     similar = ssim_where(image, target, *regions.values()) if regions else []
     for (name, region), mean in zip(regions.items(), similar, strict=True):
         scores[f"psnr_{name}"] = psnr_where(image, target, region)
         scores[f"ssim_{name}"] = mean
     if lpips is not None:
         scores |= lpips(image)
-    return {metric: float(scores[metric]) for metric in IMAGE_METRICS if metric in scores}
+    return {
+        metric: float(scores[metric]) for metric in IMAGE_METRICS if metric in scores
+    }
 
 
 def _inside(box: Tensor, score: Score, a: Tensor, b: Tensor) -> Tensor | float:
     """The score of a box's rectangle; NaN for an empty box."""
     part = rectangle(box[0])
-    return math.nan if part is None else score(*(x[:, :, part[0], part[1]] for x in (a, b)))
+    return (
+        math.nan
+        if part is None
+        else score(*(x[:, :, part[0], part[1]] for x in (a, b)))
+    )
 
 
 def means(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -172,10 +183,13 @@ def painter(avatar: Avatar, *, solve: bool = False, colours: bool = True) -> Pre
         with torch.no_grad():
             painting = avatar(*inputs, camera_index if colours else None)
         assert painting.image is not None
-        images, alphas = {FULL: painting.image}, {FULL: painting.alpha}
+        images = {FULL: painting.image}
+        alphas = {FULL: painting.alpha}
         if painting.colour is not None:
-            images[SPLAT], alphas[SPLAT] = painting.colour, painting.splat_alpha
-        parts, labels = painting.segmentation, frame.labels
+            images[SPLAT] = painting.colour
+            alphas[SPLAT] = painting.splat_alpha
+        parts = painting.segmentation
+        labels = frame.labels
         if avatar.segmentation is not None and parts is not None and labels is not None:
             parts, labels = avatar.segmentation.to_score(parts, labels)
         return Prediction(
@@ -221,13 +235,19 @@ class _Tally:
     grid: list[dict[str, Tensor]] = field(default_factory=list)
     matrices: dict[str, Tensor] = field(default_factory=dict)  # by camera
     no_parts: str = ""
-    before: dict[str, Tensor] = field(default_factory=dict)  # the last images by variant
-    last: tuple[Item, Frame, Tensor] | None = None  # of which item, and its ground truth
+    # the last images by variant
+    before: dict[str, Tensor] = field(default_factory=dict)
+    # of which item, and its ground truth
+    last: tuple[Item, Frame, Tensor] | None = None
 
-    def add(self, item: Item, frame: Frame, prediction: Prediction, *, show: bool) -> None:
+    def add(
+        self, item: Item, frame: Frame, prediction: Prediction, *, show: bool
+    ) -> None:
         """Scores one frame."""
         prepare, (camera, number) = self.scorer.prepare, item
-        target, box, regions = prepare.target(frame), prepare.box(frame), prepare.regions(frame)
+        target = prepare.target(frame)
+        box = prepare.box(frame)
+        regions = prepare.regions(frame)
         images = {}
         for name, image in prediction.images.items():
             if bad := int((~torch.isfinite(image)).sum()):
@@ -238,12 +258,16 @@ class _Tally:
             images[name] = prepare.image(prediction, name, box)
         if show:
             parts = prediction.segmentation
-            painting = Rendering(images[FULL], corrected=images.get(SPLAT), segmentation=parts)
+            painting = Rendering(
+                images[FULL], corrected=images.get(SPLAT), segmentation=parts
+            )
             self.grid += grid_rows(replace(frame, image=target), painting)
         images[FLOOR] = torch.full_like(frame.image, prepare.background)
         lpips = None
         if self.scorer.lpips:
-            lpips = LpipsAgainst(target, frame.mask, self.scorer.lpips, prepare.measures)
+            lpips = LpipsAgainst(
+                target, frame.mask, self.scorer.lpips, prepare.measures
+            )
         follows = self.last is not None and _follows(item, frame, *self.last[:2])
         for name, image in images.items():
             own = image_scores(
@@ -258,8 +282,11 @@ class _Tally:
             if follows and self.last is not None:
                 last = self.before[name], self.last[2], self.last[1].mask
                 own["flicker"] = float(flicker(image, target, frame.mask, last))
-            self.rows.setdefault(name, []).append({"camera": camera, "frame": number, **own})
-        self.before, self.last = images, (item, frame, target)
+            self.rows.setdefault(name, []).append(
+                {"camera": camera, "frame": number, **own}
+            )
+        self.before = images
+        self.last = (item, frame, target)
         self._add_parts(camera, frame, prediction)
 
     def _add_parts(self, camera: str, frame: Frame, prediction: Prediction) -> None:
@@ -270,14 +297,22 @@ class _Tally:
             return
         labels = frame.labels if prediction.labels is None else prediction.labels
         matrix = confusion(parts, labels)
-        self.matrices[camera] = self.matrices.get(camera, torch.zeros_like(matrix)) + matrix
+        self.matrices[camera] = (
+            self.matrices.get(camera, torch.zeros_like(matrix)) + matrix
+        )
         self.rows[FULL][-1] |= miou(matrix)
 
     def result(self) -> SplitScores:
         """The scores of the split."""
-        reasons = {FULL: self.no_parts, SPLAT: NO_PARTS_OF_SPLAT, FLOOR: NO_PARTS_OF_FLOOR}
+        reasons = {
+            FULL: self.no_parts,
+            SPLAT: NO_PARTS_OF_SPLAT,
+            FLOOR: NO_PARTS_OF_FLOOR,
+        }
         variants = {
-            name: _variant(own, self.matrices if name == FULL else {}, reasons[name], self.scorer)
+            name: _variant(
+                own, self.matrices if name == FULL else {}, reasons[name], self.scorer
+            )
             for name, own in self.rows.items()
         }
         return SplitScores(variants, self.rows, self.grid)
@@ -285,8 +320,11 @@ class _Tally:
 
 def _follows(item: Item, frame: Frame, before: Item, last: Frame) -> bool:
     """Whether an item is of the next frame, its pixels seen through the same window."""
-    now, then = frame.camera, last.camera
-    same = now.size == then.size and all(map(torch.equal, (now.K, now.R), (then.K, then.R)))
+    now = frame.camera
+    then = last.camera
+    same = now.size == then.size and all(
+        map(torch.equal, (now.K, now.R), (then.K, then.R))
+    )
     return same and item == (before[0], before[1] + 1)
 
 
@@ -296,11 +334,17 @@ def _variant(
     """One variant as in metrics.json."""
     result = means(rows)
     if describe_boxes(scorer.prepare.skeleton) is None:
-        result |= no_scores(BOX_METRICS, f"the skeleton {scorer.prepare.skeleton} has no hands")
+        result |= no_scores(
+            BOX_METRICS, f"the skeleton {scorer.prepare.skeleton} has no hands"
+        )
     if matrices:
         parts = miou(torch.stack(list(matrices.values())).sum(0))
         result |= parts
-        result |= {f"{m}_reason": "the ground truth has no part" for m in parts if parts[m] is None}
+        result |= {
+            f"{m}_reason": "the ground truth has no part"
+            for m in parts
+            if parts[m] is None
+        }
     else:
         result |= no_scores(PART_METRICS, no_parts)
     cameras = {}
@@ -336,4 +380,8 @@ def lpips_input(measures: MetricVariants) -> str:
 
 def no_scores(metrics: Iterable[str], reason: str) -> dict[str, Any]:
     """Each metric None, with the reason."""
-    return {k: v for metric in metrics for k, v in ((metric, None), (f"{metric}_reason", reason))}
+    return {
+        k: v
+        for metric in metrics
+        for k, v in ((metric, None), (f"{metric}_reason", reason))
+    }

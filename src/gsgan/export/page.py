@@ -36,7 +36,8 @@ VERSION = 2  # of the block
 ALPHA_MIN = 1 / 255  # of the page, where the avatar's own is less
 KINDS = {"i1": "int8", "u1": "uint8", "i2": "int16", "u2": "uint16", "f4": "float32"}
 BEFORE_COLOUR = (
-    11  # numbers of a Gaussian before its colour: mean 3, quaternion 4, scale 3, opacity
+    # numbers of a Gaussian before its colour: mean 3, quaternion 4, scale 3, opacity
+    11
 )
 
 Arrays = dict[str, NDArray]
@@ -49,7 +50,11 @@ def refuse_unsuitable(avatar: Avatar) -> None:
     Raises:
         ConfigError: naming the reason.
     """
-    if avatar.body_points is None or avatar.deformation is None or avatar.solver is None:
+    if (
+        avatar.body_points is None
+        or avatar.deformation is None
+        or avatar.solver is None
+    ):
         raise ConfigError(
             "a page needs Gaussians on a skinned body and residuals of Ψ: an avatar with "
             "effects.body_points, not model=lbs_splat or image_to_image"
@@ -63,7 +68,8 @@ def refuse_unsuitable(avatar: Avatar) -> None:
 
 def page(content: bytes, name: str) -> str:
     """The text of a page that shows the `block`'s avatar; the name is its title."""
-    style, script = ((WEB / file).read_text() for file in ("page.css", "gsgan.js"))
+    style = (WEB / "page.css").read_text()
+    script = (WEB / "gsgan.js").read_text()
     text = (WEB / "page.html").read_text()
     for key, value in {
         "script_hash": _hash(script),
@@ -84,7 +90,9 @@ def _hash(text: str) -> str:
     return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
 
 
-def block(run: Run, avatar: Avatar, motions: Mapping[str, tuple[Drive, float]], name: str) -> bytes:
+def block(
+    run: Run, avatar: Avatar, motions: Mapping[str, tuple[Drive, float]], name: str
+) -> bytes:
     """The avatar's header and arrays, deflated; see web/content.ts.
 
     Args:
@@ -103,9 +111,12 @@ def block(run: Run, avatar: Avatar, motions: Mapping[str, tuple[Drive, float]], 
         theta, transl = poses_of(avatar, drive)
         arrays[f"theta{i}"], step = quantised(theta, 32767)
         arrays[f"transl{i}"] = transl
-        listed.append({"name": title, "fps": fps, "frames": len(theta), "step": float(step)})
+        listed.append(
+            {"name": title, "fps": fps, "frames": len(theta), "step": float(step)}
+        )
     header["motions"] = listed
-    places, data = {}, b""
+    places = {}
+    data = b""
     for key, array in arrays.items():
         kind = next(kind for kind, dtype in KINDS.items() if array.dtype == dtype)
         places[key] = (kind, len(data), array.size)
@@ -121,7 +132,9 @@ def _padded(data: bytes) -> bytes:
 
 def quantised(values: NDArray, most: int) -> tuple[NDArray, NDArray]:
     """Whole numbers within ± ``most`` and their step; of a matrix one step a row."""
-    largest = np.abs(values).max(axis=-1 if values.ndim == 2 else None, keepdims=values.ndim == 2)
+    largest = np.abs(values).max(
+        axis=-1 if values.ndim == 2 else None, keepdims=values.ndim == 2
+    )
     step = np.maximum(largest, 1e-12) / most
     kind = np.int8 if most < 128 else np.int16
     return np.rint(values / step).astype(kind), np.asarray(step, np.float32)
@@ -133,10 +146,12 @@ def gaussians_of(avatar: Avatar) -> tuple[Plain, Arrays]:
     Convention: what `gsgan.model.deformation` adds to residuals before it bounds them is added to
     the first coefficient.
     """
-    on_body, linear = avatar.body_points, avatar.deformation
+    on_body = avatar.body_points
+    linear = avatar.deformation
     assert on_body is not None
     assert isinstance(linear, Harmonic)
-    points, degree = on_body.points, linear.active_degree
+    points = on_body.points
+    degree = linear.active_degree
     numbers = BEFORE_COLOUR + 3 * (degree + 1) ** 2
     table = linear.coefficients.detach().double()[..., :numbers].clone()
     table[..., :3] *= linear.mean_step
@@ -147,7 +162,8 @@ def gaussians_of(avatar: Avatar) -> tuple[Plain, Arrays]:
     follow = np.flatnonzero(rows[:, 1:].any((1, 2)))
     first, first_step = quantised(rows[:, 0], 32767)
     others, steps = quantised(rows[follow, 1:].reshape(-1, len(table)), 127)
-    means, bones = points.means.numpy(), points.weights[0].numpy()
+    means = points.means.numpy()
+    bones = points.weights[0].numpy()
     weight = points.weights[1].detach().double().numpy()
     low = float(means.min())
     step = float(means.max() - low) / 65535
@@ -165,7 +181,9 @@ def gaussians_of(avatar: Avatar) -> tuple[Plain, Arrays]:
         "range": (low, step),
         "bound": (linear.mean_bound or 0) * linear.body_height,
         "height": linear.body_height,
-        "scales": [math.log(limit * linear.body_height) for limit in linear.scale_range],
+        "scales": [
+            math.log(limit * linear.body_height) for limit in linear.scale_range
+        ],
         "logit": linear.logit_bound,
         "lowPass": settings.low_pass,
         "alphaMin": max(settings.alpha_min, ALPHA_MIN),
@@ -194,21 +212,27 @@ def slopes_of(on_body: BodyPoints) -> tuple[NDArray, NDArray]:
     Source: `gsgan.body.skinned.WeightGradients`, whose factors are these times (x, 1).
     """
     if not on_body.stretch:
-        return np.zeros((on_body.n_points, 1), np.uint8), np.zeros((on_body.n_points, 1, 3))
+        return np.zeros((on_body.n_points, 1), np.uint8), np.zeros(
+            (on_body.n_points, 1, 3)
+        )
     columns, factors = (
-        term.view(on_body.n_points, 3, -1, 4).numpy() for term in on_body.stretch_terms()
+        term.view(on_body.n_points, 3, -1, 4).numpy()
+        for term in on_body.stretch_terms()
     )
     return (columns[:, 0, :, 0] // 4).astype(np.uint8), factors[..., 3].swapaxes(1, 2)
 
 
 def body_of(run: Run) -> tuple[Plain, Arrays]:
     """The body's landmarks and solver, the subject's proportions and the world's axes."""
-    body, subject = run.body, run.proportions
+    body = run.body
+    subject = run.proportions
     assert isinstance(body, Body)
     assert run.avatar.solver is not None
     header: Plain = {
         "bones": len(body.parents),
-        "axes": (upright(subject.up).T @ rotation(np.array([0, 0, subject.facing]))).tolist(),
+        "axes": (
+            upright(subject.up).T @ rotation(np.array([0, 0, subject.facing]))
+        ).tolist(),
         "ground": subject.ground,
         "centre": list(run.scene.centre),
         "rest": subject.rest.tolist(),
@@ -226,12 +250,16 @@ def body_of(run: Run) -> tuple[Plain, Arrays]:
 def solver_block(solver: Solver, parents: tuple[int, ...]) -> bytes:
     """``struct Body`` of web/solve.cpp for 32-bit addresses, which count from its start."""
     constants, counts, numbers = solver.job()
-    integers = np.array([1, 1, *(counts[name] for name in compiled.COUNTS)], "<i8").tobytes()
+    integers = np.array(
+        [1, 1, *(counts[name] for name in compiled.COUNTS)], "<i8"
+    ).tobytes()
     head = integers + np.array([numbers[n] for n in compiled.NUMBERS], "<f8").tobytes()
     given = [constants[name].numpy() for name in compiled.CONSTANTS]
     slots = len(given) + len(compiled.FRAMES)
     slots += slots % 2  # structures are multiples of eight bytes
-    start, addresses, data = len(head) + 4 * (slots + 2), np.zeros(slots + 2, "<u4"), b""
+    start = len(head) + 4 * (slots + 2)
+    addresses = np.zeros(slots + 2, "<u4")
+    data = b""
     for slot, array in (*enumerate(given), (slots, np.array(parents))):
         addresses[slot] = start + len(data)
         data += array.astype(f"<{array.dtype.kind}8").tobytes()
@@ -243,7 +271,8 @@ def poses_of(avatar: Avatar, drive: Drive) -> tuple[NDArray, NDArray]:
     """``theta [F, J, 3]`` and ``transl [F, 3]`` of a drive: its own, else solved."""
     body = drive.body
     if body is None:
-        p, seen = (torch.from_numpy(x) for x in (drive.p, drive.visibility))
+        p = torch.from_numpy(drive.p)
+        seen = torch.from_numpy(drive.visibility)
         body = avatar.body_pose(
             *complete_skeleton(p, seen, avatar.template, avatar.limb_length_sum)
         )

@@ -33,7 +33,8 @@ class Whole(nn.Module):
 
     def __init__(self, avatar: Avatar, size: tuple[int, int]) -> None:
         super().__init__()
-        self.avatar, self.size = avatar, size
+        self.avatar = avatar
+        self.size = size
         avatar.window_margin = None
 
     def forward(
@@ -68,8 +69,11 @@ def torch_program(avatar: Avatar, size: tuple[int, int]) -> bytes:
     imports `gsgan.splat` first.
     """
     p = torch.tensor(avatar.template.rest_positions)[None]
-    K = torch.tensor([[[float(size[1]), 0, size[1] / 2], [0, size[1], size[0] / 2], [0, 0, 1]]])
-    R, t = torch.tensor([[[-1.0, 0, 0], [0, -1, 0], [0, 0, 1]]]), torch.tensor([[0.0, 0.9, 3.0]])
+    K = torch.tensor(
+        [[[float(size[1]), 0, size[1] / 2], [0, size[1], size[0] / 2], [0, 0, 1]]]
+    )
+    R = torch.tensor([[[-1.0, 0, 0], [0, -1, 0], [0, 0, 1]]])
+    t = torch.tensor([[0.0, 0.9, 3.0]])
     given = [p, torch.ones(p.shape[:2]), K, R, t]
     if avatar.needs_body:
         part = avatar.body_points or avatar.surface or avatar.segmentation
@@ -79,7 +83,9 @@ def torch_program(avatar: Avatar, size: tuple[int, int]) -> bytes:
     stream = io.BytesIO()
     with torch.no_grad(), catch_warnings(action="ignore"):  # about its own internals
         program(*given)  # constants are made once, outside of the recording
-        torch.export.save(torch.export.export(program, tuple(given), strict=False), stream)
+        torch.export.save(
+            torch.export.export(program, tuple(given), strict=False), stream
+        )
     return stream.getvalue()
 
 
@@ -101,8 +107,10 @@ class PoseAndGenerator(nn.Module):
             raise ConfigError(
                 "this avatar has no generator to export: its image is Step I's colour"
             )
-        self.splats, self.template = avatar.splat_channels > 0, avatar.template
-        self.pose_encoder, self.generator = avatar.pose_encoder, avatar.generator
+        self.splats = avatar.splat_channels > 0
+        self.template = avatar.template
+        self.pose_encoder = avatar.pose_encoder
+        self.generator = avatar.generator
         classes = 0 if avatar.segmentation is None else avatar.segmentation.classes
         self.channels = {"features": avatar.splat_channels, "segmentation": classes}
 
@@ -110,10 +118,19 @@ class PoseAndGenerator(nn.Module):
         """Examples by name, for the exporter; of images, the pixels per pixel of the output."""
         k = self.generator.supersample
         channels = self.channels | {"skeleton": len(self.template.draw_groups)}
-        channels |= {"splat_alpha": int(self.splats), "fine": (k > 1) * channels["features"]}
-        times = {name: k if name == "fine" else 1 for name, count in channels.items() if count}
+        channels |= {
+            "splat_alpha": int(self.splats),
+            "fine": (k > 1) * channels["features"],
+        }
+        times = {
+            name: k if name == "fine" else 1
+            for name, count in channels.items()
+            if count
+        }
         side = 4 * self.generator.stride
-        images = {n: torch.rand(1, channels[n], f * side, f * side) for n, f in times.items()}
+        images = {
+            n: torch.rand(1, channels[n], f * side, f * side) for n, f in times.items()
+        }
         J = len(self.template.names)
         joints = {"omega": torch.rand(1, J, 6), "joints": torch.rand(1, J, 3)}
         return images | joints, times
@@ -134,7 +151,9 @@ class PoseAndGenerator(nn.Module):
         if features is None:  # image_to_image: the drawing stands in F's place
             made = self.generator(skeleton, segmentation, None, g)
         else:
-            made = self.generator(features, segmentation, skeleton, g, fine, splat_alpha)
+            made = self.generator(
+                features, segmentation, skeleton, g, fine, splat_alpha
+            )
         made = made.clamp(0, 1)
         return made[:, :3], made[:, 3:]
 
@@ -154,7 +173,9 @@ def onnx_program(avatar: Avatar) -> bytes:
     (given, times), stride = networks.inputs(), networks.generator.stride
     sides = [stride * Dim(name, min=1, max=LARGEST // stride) for name in ("h", "w")]
     shapes = {
-        name: {2 + i: times[name] * side for i, side in enumerate(sides)} if name in times else None
+        name: {2 + i: times[name] * side for i, side in enumerate(sides)}
+        if name in times
+        else None
         for name in given
     }
     with torch.no_grad(), catch_warnings(action="ignore"):  # about its own internals

@@ -74,7 +74,9 @@ def card(run: Run, kind: str, name: str, licence: str | None) -> str:
     head = {"license": licence or "other", "library_name": "gsgan"}
     head["tags"] = ["gaussian-splatting", "human-avatar", "synthetic-media"]  # type: ignore[assignment]
     about = {
-        "data": " ".join(str(data[k]) for k in ("name", "root", "fingerprint") if data.get(k)),
+        "data": " ".join(
+            str(data[k]) for k in ("name", "root", "fingerprint") if data.get(k)
+        ),
         "training cameras": scene.n_train_cameras,
         "image size": run.stored.data.size,
         "protocol": facts.get("protocol") or "none",
@@ -84,7 +86,9 @@ def card(run: Run, kind: str, name: str, licence: str | None) -> str:
         "gsgan": facts.get("version", __version__),
         "commit": facts.get("commit"),
     }
-    known = [(key, str(value)) for key, value in about.items() if value not in (None, "")]
+    known = [
+        (key, str(value)) for key, value in about.items() if value not in (None, "")
+    ]
     marks = [f"- marked: {mark}" for mark in run.checkpoint.get("marks", [])]
     parts = [
         f"---\n{yaml.safe_dump(head, sort_keys=False)}---",
@@ -219,11 +223,15 @@ def _place(config: DictConfig, kind: str) -> Path:
     return out
 
 
-def _block(config: DictConfig, run: Run, name: str, tell: Callable[[str], None]) -> bytes:
+def _block(
+    config: DictConfig, run: Run, name: str, tell: Callable[[str], None]
+) -> bytes:
     """The content of a .bin file, and of a page; each motion is one of its own."""
     refuse_unsuitable(run.avatar)
     motions = {}
-    for motion in [config.motion] if isinstance(config.motion, str) else config.motion or ():
+    for motion in (
+        [config.motion] if isinstance(config.motion, str) else config.motion or ()
+    ):
         drive = _poses(_with_motion(config, str(motion)), run)
         tell(drive.text)
         motions[Path(motion).stem] = drive, float(config.fps)

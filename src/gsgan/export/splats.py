@@ -24,11 +24,15 @@ from gsgan.utils.errors import ConfigError
 Float = NDArray[np.float32]
 
 DIRECTIONS = 64  # over which harmonics are fitted; 16 would do for rotations
-THINNEST = 1e-7  # metres: covariances are rounded to float32, and eigenvalues may be below 0
+# metres: covariances are rounded to float32, and eigenvalues may be below 0
+THINNEST = 1e-7
 FAINTEST = 1e-30  # opacity of Gaussians that are not drawn, for a finite logit
 EXTENSION = "KHR_gaussian_splatting"
 GENERATOR = f"gsgan {__version__}"
-FLOAT, POINTS, ARRAY_BUFFER = 5126, 0, 34962  # glTF's numbers
+# glTF's numbers
+FLOAT = 5126
+POINTS = 0
+ARRAY_BUFFER = 34962
 
 
 @dataclass(frozen=True)
@@ -50,7 +54,9 @@ class Splats:
     sh: Float
 
 
-def splats_of(avatar: Avatar, p: Tensor, valid: Tensor, body: BodyPose | None) -> Splats:
+def splats_of(
+    avatar: Avatar, p: Tensor, valid: Tensor, body: BodyPose | None
+) -> Splats:
     """Ĝ of a pose: Step I's Gaussians, in Step I's colours.
 
     Convention: Ψ's harmonics turn with the body part. Here they are in world axes, so that other
@@ -69,7 +75,8 @@ def splats_of(avatar: Avatar, p: Tensor, valid: Tensor, body: BodyPose | None) -
     gaussians, sh, frames = _posed(avatar, p, valid, body)
     assert gaussians.covariances is not None
     values, axes = torch.linalg.eigh(gaussians.covariances[0].double())
-    axes = axes * torch.linalg.det(axes).sign()[:, None, None]  # eigenvectors may be mirrored
+    # eigenvectors may be mirrored
+    axes = axes * torch.linalg.det(axes).sign()[:, None, None]
     given = (
         gaussians.means[0],
         values.clamp_min(THINNEST**2).sqrt(),
@@ -91,7 +98,9 @@ def _posed(
         return avatar.surface(body, eye), avatar.surface.sh[None], A
     psi = avatar.deformation
     if psi is None:
-        raise ConfigError("this avatar has no Gaussians (model=image_to_image) to export")
+        raise ConfigError(
+            "this avatar has no Gaussians (model=image_to_image) to export"
+        )
     points, residuals = avatar.residuals(p, valid, body)
     return psi.compose(points, residuals, eye), residuals.sh, points.frames
 
@@ -153,20 +162,34 @@ def glb_bytes(splats: Splats, up: str) -> bytes:
     for l in range(degree + 1):
         for m in range(2 * l + 1):
             arrays[f"{EXTENSION}:SH_DEGREE_{l}_COEF_{m}"] = splats.sh[:, l * l + m]
-    data, views, accessors = b"", [], []
+    data = b""
+    views = []
+    accessors = []
     for i, array in enumerate(arrays.values()):
         raw = np.ascontiguousarray(array, "<f4").tobytes()
         view = {"buffer": 0, "byteOffset": len(data), "byteLength": len(raw)}
         views.append(view | {"target": ARRAY_BUFFER})
         kind = "SCALAR" if array.shape[1] == 1 else f"VEC{array.shape[1]}"
-        accessor = {"bufferView": i, "componentType": FLOAT, "count": len(array), "type": kind}
-        accessors.append(accessor | {"min": array.min(0).tolist(), "max": array.max(0).tolist()})
+        accessor = {
+            "bufferView": i,
+            "componentType": FLOAT,
+            "count": len(array),
+            "type": kind,
+        }
+        accessors.append(
+            accessor | {"min": array.min(0).tolist(), "max": array.max(0).tolist()}
+        )
         data += raw
     kernel = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
-    primitive = {"mode": POINTS, "attributes": {name: i for i, name in enumerate(arrays)}}
+    primitive = {
+        "mode": POINTS,
+        "attributes": {name: i for i, name in enumerate(arrays)},
+    }
     primitive["extensions"] = {EXTENSION: kernel}
     to_gltf = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]) @ upright(up)
-    w, x, y, z = rotation_matrix_to_quaternion(torch.from_numpy(to_gltf)[None])[0].tolist()
+    w, x, y, z = rotation_matrix_to_quaternion(torch.from_numpy(to_gltf)[None])[
+        0
+    ].tolist()
     content = {
         "asset": {"version": "2.0", "generator": GENERATOR},
         "extensionsUsed": [EXTENSION],

@@ -68,7 +68,9 @@ def load_weights(path: str | Path, *, device: str = "auto") -> Avatar:
     except (OSError, SafetensorError) as error:
         raise DataError(f"{path}: not a readable safetensors file ({error})") from None
     if not {"config", "gsgan"} <= metadata.keys():
-        raise DataError(f"{path}: not written by gsgan.export (its metadata has no config)")
+        raise DataError(
+            f"{path}: not written by gsgan.export (its metadata has no config)"
+        )
     try:
         config = OmegaConf.create(json.loads(metadata["config"]))
         _refuse_other_classes(path, config)
@@ -76,7 +78,9 @@ def load_weights(path: str | Path, *, device: str = "auto") -> Avatar:
         avatar = avatar_of(path, config, checkpoint)
     except DAMAGED as error:
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
-        raise DataError(f"{path}: its metadata is damaged ({reason}); export it again") from None
+        raise DataError(
+            f"{path}: its metadata is damaged ({reason}); export it again"
+        ) from None
     return avatar.to(pick_device(device))
 
 

@@ -21,7 +21,9 @@ FINAL_RATE = 0.02  # of the learning rates, in the last sweep
 CONTROLS = 200  # points whose distances from the body the surface interpolates
 REACH = 0.06  # metres: the surface stays this close to the body
 SPREAD = 1.5  # of the controls' influence, in distances between them
-SIGMA, OPACITY = 0.7, 0.95  # standard deviation as a share of the points' spacing
+# standard deviation as a share of the points' spacing
+SIGMA = 0.7
+OPACITY = 0.95
 LOOSE = 0.25  # weight of landmarks of face and palm, whose definitions differ
 LOOSE_LANDMARKS = (*range(11), *range(17, 23))
 ANGLE = 0.1  # radians of a joint's turn that cost as much as a landmark `noise` away
@@ -49,10 +51,23 @@ class Fit:
 
     def __post_init__(self) -> None:
         if self.accuracy is None:
-            raise ConfigError("fit.accuracy cannot be null; conf/fit/standard.yaml has it")
-        for name, least in (("surface_steps", 0), ("sweeps", 1), ("cameras", 1), ("points", 1)):
+            raise ConfigError(
+                "fit.accuracy cannot be null; conf/fit/standard.yaml has it"
+            )
+        for name, least in (
+            ("surface_steps", 0),
+            ("sweeps", 1),
+            ("cameras", 1),
+            ("points", 1),
+        ):
             whole(f"fit.{name}", getattr(self, name), least)
-        for name in ("least_mask", "noise", "angle_rate", "transl_rate", "surface_rate"):
+        for name in (
+            "least_mask",
+            "noise",
+            "angle_rate",
+            "transl_rate",
+            "surface_rate",
+        ):
             above(f"fit.{name}", getattr(self, name))
         for name in ("prior", "landmarks"):
             at_least(f"fit.{name}", getattr(self, name), 0)
@@ -76,11 +91,14 @@ class Surface(nn.Module):
 
     def __init__(self, body: Body, points: int, accuracy: Accuracy) -> None:
         super().__init__()
-        self.body, self.accuracy = body, accuracy
+        self.body = body
+        self.accuracy = accuracy
         self.points = SkinnedPoints(body, points)
         means = self.points.means
         normals = vertex_normals(body.vertices.float(), body.faces)[self.points.chosen]
-        distance = torch.cdist(means, means[farthest_points(means, min(CONTROLS, len(means)))])
+        distance = torch.cdist(
+            means, means[farthest_points(means, min(CONTROLS, len(means)))]
+        )
         spread = SPREAD * distance.topk(2, largest=False).values[:, 1].median()
         self.register_buffer("normals", normals, persistent=False)
         basis = torch.softmax(-(distance / spread).square(), dim=1)
@@ -90,13 +108,16 @@ class Surface(nn.Module):
 
     def posed(self, pose: BodyPose) -> tuple[Gaussians, Tensor]:
         """The Gaussians of a pose, and its landmarks ``[B, 33, 3]`` metres."""
-        bones, points = self.body.transforms(pose), self.points
+        bones = self.body.transforms(pose)
+        points = self.points
         A, t = blend_transforms(bones, points.bone_index, points.bone_weight)
         out = self.basis @ (REACH * torch.tanh(self.offsets / REACH))
         means = skin(points.means + out.unsqueeze(-1) * self.normals, A, t)
         axes = A * (SIGMA * points.spacing * self.log_scale.exp())[:, None, None]
         opacities = means.new_full(means.shape[:2], OPACITY)
-        person = Gaussians(means, None, None, opacities, opacities[..., None], axes @ axes.mT)
+        person = Gaussians(
+            means, None, None, opacities, opacities[..., None], axes @ axes.mT
+        )
         return person, carry(bones, self.body.landmarks, self.body.landmark_bone)
 
     def alpha(self, person: Gaussians, camera: Camera) -> Tensor:
@@ -120,19 +141,32 @@ class Fitter:
     """
 
     def __init__(
-        self, settings: Fit, frames: MaskedFrames, body: Body, start: BodyPose, seed: int = 0
+        self,
+        settings: Fit,
+        frames: MaskedFrames,
+        body: Body,
+        start: BodyPose,
+        seed: int = 0,
     ) -> None:
-        self.settings, self.frames, self.seed = settings, frames, seed
+        self.settings = settings
+        self.frames = frames
+        self.seed = seed
         device = frames.device
-        self.surface = Surface(body.to(device), settings.points, settings.accuracy).to(device)
+        self.surface = Surface(body.to(device), settings.points, settings.accuracy).to(
+            device
+        )
         self.start = start.to(device)
         self.bones = start.theta.shape[1]
-        self.moves = nn.Embedding(len(start.theta), 3 * self.bones + 3, sparse=True).to(device)
+        self.moves = nn.Embedding(len(start.theta), 3 * self.bones + 3, sparse=True).to(
+            device
+        )
         nn.init.zeros_(self.moves.weight)
         # translations have a smaller rate than angles: one rate for both, and a scale
         scale = torch.ones(self.bones + 1, 1, device=device)
         scale[-1] = settings.transl_rate / settings.angle_rate
-        fixed = [i for i, n in enumerate(body.joint_names) if n.startswith(("finger", "toe"))]
+        fixed = [
+            i for i, n in enumerate(body.joint_names) if n.startswith(("finger", "toe"))
+        ]
         scale[fixed] = 0
         self.scale = scale
         self.weight = frames.visibility.clone()
@@ -143,7 +177,8 @@ class Fitter:
         self.pose_optimiser = torch.optim.SparseAdam(
             self.moves.parameters(), settings.angle_rate, BETAS
         )
-        self.shaped, self.swept = 0, 0
+        self.shaped = 0
+        self.swept = 0
 
     def pose(self, rows: Tensor | None = None) -> BodyPose:
         """The current poses of these rows, or of all."""
@@ -168,7 +203,8 @@ class Fitter:
 
     def sweep(self) -> None:
         """One step on every frame, in random order."""
-        settings, chance = self.settings, random.Random(f"{self.seed} sweep {self.swept}")
+        settings = self.settings
+        chance = random.Random(f"{self.seed} sweep {self.swept}")
         self._set_rates()
         order = list(range(len(self.start.theta)))
         chance.shuffle(order)
@@ -196,19 +232,24 @@ class Fitter:
         all images are empty."""
         by_frame = []
         for i in range(len(poses.theta)):
-            person, _ = self.surface.posed(BodyPose(poses.theta[i][None], poses.transl[i][None]))
+            person, _ = self.surface.posed(
+                BodyPose(poses.theta[i][None], poses.transl[i][None])
+            )
             ious = []
             for frame in self._windows(i):
                 sure = True if frame.unsure is None else frame.unsure < 0.5
                 inside = self.surface.alpha(person, frame.camera) > 0.5
-                filled, mask = inside & sure, (frame.mask > 0.5) & sure
+                filled = inside & sure
+                mask = (frame.mask > 0.5) & sure
                 either = (filled | mask).sum().item()
                 if either:
                     ious.append((filled & mask).sum().item() / either)
             by_frame.append(sum(ious) / len(ious) if ious else math.nan)
         return torch.tensor(by_frame)
 
-    def _share(self, i: int, pose: BodyPose, chance: random.Random) -> tuple[Tensor, Tensor]:
+    def _share(
+        self, i: int, pose: BodyPose, chance: random.Random
+    ) -> tuple[Tensor, Tensor]:
         """Wrong alpha as a share of the masks, and the posed landmarks."""
         frames = self._windows(i)
         if len(frames) > self.settings.cameras:
@@ -219,14 +260,18 @@ class Fitter:
         return torch.stack(wrong).sum() / area.clamp_min(1.0), landmarks
 
     def _windows(self, i: int) -> list[Frame]:
-        return [around(self.frames.skeletons[i], frame) for frame in self.frames.images(i)]
+        return [
+            around(self.frames.skeletons[i], frame) for frame in self.frames.images(i)
+        ]
 
     def _set_rates(self) -> None:
         held = self.settings.hold * self.settings.sweeps
         rest = max(self.settings.sweeps - held, 1e-9)
         fallen = min(max(self.swept - held, 0) / rest, 1)
         factor = FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * fallen))
-        self.surface_optimiser.param_groups[0]["lr"] = self.settings.surface_rate * factor
+        self.surface_optimiser.param_groups[0]["lr"] = (
+            self.settings.surface_rate * factor
+        )
         self.pose_optimiser.param_groups[0]["lr"] = self.settings.angle_rate * factor
 
 

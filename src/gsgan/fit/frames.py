@@ -14,8 +14,10 @@ from gsgan.scene import Frame, body_window
 from gsgan.utils.errors import DataError
 
 NEAR = 0.01  # metres: nearer joints are not projected
-MARGIN = 0.25  # metres around the joints, as in the avatar's windows: a wider margin costs time
-USUAL = 0.75  # quantile of the masks' areas that counts as usual: most masks may be nearly empty
+# metres around the joints, as in the avatar's windows: a wider margin costs time
+MARGIN = 0.25
+# quantile of the masks' areas that counts as usual: most masks may be nearly empty
+USUAL = 0.75
 
 
 class MaskedFrames:
@@ -35,9 +37,14 @@ class MaskedFrames:
     """
 
     def __init__(
-        self, data: GsganData, device: torch.device, least_mask: float = 0.1, held_out: bool = False
+        self,
+        data: GsganData,
+        device: torch.device,
+        least_mask: float = 0.1,
+        held_out: bool = False,
     ) -> None:
-        layout, cameras = data.layout, data.splits.train_cameras
+        layout = data.layout
+        cameras = data.splits.train_cameras
         trained = data.trained
         items = [
             (camera, frame)
@@ -46,12 +53,17 @@ class MaskedFrames:
             if frame in layout.images[camera]
         ]
         cache = ImageCache(int(data.cache_mb * 2**20))
-        self.dataset = CaptureDataset(layout, items, data.size, data.crop, cache, data.lens)
-        self.cameras, self.device = cameras, device
+        self.dataset = CaptureDataset(
+            layout, items, data.size, data.crop, cache, data.lens
+        )
+        self.cameras = cameras
+        self.device = device
         self._unseen: dict[int, Tensor] = {}
         places = self._usable(least_mask)
         if not places:
-            raise DataError(f"{layout.root}: the masks of {', '.join(cameras)} hold no person")
+            raise DataError(
+                f"{layout.root}: the masks of {', '.join(cameras)} hold no person"
+            )
         self.left_out = len(items) - len(places)
         self.frames = tuple(sorted({items[place][1] for place in places}))
         self._places: dict[int, list[int]] = {frame: [] for frame in self.frames}
@@ -65,7 +77,8 @@ class MaskedFrames:
         return [self._image(place) for place in self._places[self.frames[i]]]
 
     def _image(self, place: int) -> Frame:
-        frame, unseen = self.dataset[place], self._unseen.get(place)
+        frame = self.dataset[place]
+        unseen = self._unseen.get(place)
         if unseen is not None:
             unsure = unseen.to(frame.mask.dtype)
             if frame.unsure is not None:

@@ -41,7 +41,9 @@ WORST = 5  # joints and frames named in the summary
 
 
 @torch.no_grad()
-def fit_report(fitter: Fitter, body: Body, driven: BodyPose, found: BodyPose) -> dict[str, Any]:
+def fit_report(
+    fitter: Fitter, body: Body, driven: BodyPose, found: BodyPose
+) -> dict[str, Any]:
     """Distances of landmarks from the skeletons in mm, and overlaps with the masks, of three sets
     of poses.
 
@@ -53,11 +55,17 @@ def fit_report(fitter: Fitter, body: Body, driven: BodyPose, found: BodyPose) ->
         driven: the poses that were solved again, on ``body``, as held-out frames are.
         found: the registered poses.
     """
-    masked, before = fitter.frames, fitter.surface.body
+    masked = fitter.frames
+    before = fitter.surface.body
     seen = masked.visibility > 0
     report: dict[str, Any] = {"frames": {}, "joints": {}}
-    off, iou = {}, {}
-    for name, pose in (("solved", fitter.start), ("registered", found), ("driven", driven)):
+    off = {}
+    iou = {}
+    for name, pose in (
+        ("solved", fitter.start),
+        ("registered", found),
+        ("driven", driven),
+    ):
         posed = (body if name == "driven" else before).posed_landmarks(pose)
         apart = (posed - masked.skeletons).norm(dim=-1)
         off[name] = torch.where(seen, 1000 * apart, torch.nan)
@@ -67,7 +75,9 @@ def fit_report(fitter: Fitter, body: Body, driven: BodyPose, found: BodyPose) ->
             "iou": float(iou[name].nanmean()),
         }
     for j, joint in enumerate(MEDIAPIPE33.names):
-        report["joints"][joint] = {n: float(x[:, j].nanmedian()) for n, x in off.items()}
+        report["joints"][joint] = {
+            n: float(x[:, j].nanmedian()) for n, x in off.items()
+        }
     for i, frame in enumerate(masked.frames):
         residual = {n: float(x[i].nanmedian()) for n, x in off.items()}
         overlap = {n: float(x[i]) for n, x in iou.items()}
@@ -79,8 +89,11 @@ def fit_report(fitter: Fitter, body: Body, driven: BodyPose, found: BodyPose) ->
 
 def summary(report: dict[str, Any], folder: Path, masked: MaskedFrames) -> list[str]:
     """The lines that the command prints."""
-    before, after = report["solved"], report["registered"]
-    joints = sorted(report["joints"].items(), key=lambda x: -np.nan_to_num(x[1]["registered"]))
+    before = report["solved"]
+    after = report["registered"]
+    joints = sorted(
+        report["joints"].items(), key=lambda x: -np.nan_to_num(x[1]["registered"])
+    )
     frames = sorted(
         report["frames"].items(), key=lambda x: np.nan_to_num(x[1]["iou"]["registered"])
     )
@@ -96,7 +109,9 @@ def summary(report: dict[str, Any], folder: Path, masked: MaskedFrames) -> list[
     ]
 
 
-SIZE, MARGIN = 128, 0.2  # pixels; metres around the person
+# pixels; metres around the person
+SIZE = 128
+MARGIN = 0.2
 LOCK = ".body_fit.lock"
 
 
@@ -111,11 +126,14 @@ def run_fit(config: DictConfig) -> Path:
     """
     settings: Fit = instantiate(config.fit)
     data: GsganData = instantiate(config.data, _convert_="all")
-    device, out = pick_device(config.device), None if config.out is None else str(config.out)
+    device = pick_device(config.device)
+    out = None if config.out is None else str(config.out)
     return fit_body(data, settings, out, config.seed, device, config.overwrite)
 
 
-def fit_before_training(data: GsganData, settings: DictConfig, device: torch.device) -> GsganData:
+def fit_before_training(
+    data: GsganData, settings: DictConfig, device: torch.device
+) -> GsganData:
     """Fits the body of a capture that has no body poses.
 
     Convention: of the processes of a run one fits, and the others wait for its files.
@@ -131,8 +149,10 @@ def fit_before_training(data: GsganData, settings: DictConfig, device: torch.dev
     Raises:
         DataError: when the masks hold no person, or the folder is read-only.
     """
-    root, seen = data.layout.root, copy(data)
-    seen.size, seen.crop = SIZE, PersonCrop(margin=MARGIN)
+    root = data.layout.root
+    seen = copy(data)
+    seen.size = SIZE
+    seen.crop = PersonCrop(margin=MARGIN)
     with ExitStack() as stack:
         with writing(root):
             stack.enter_context(locked(root / LOCK))
@@ -169,15 +189,20 @@ def fit_body(
     Returns:
         The folder.
     """
-    console, device = make_console(), device or torch.device("cpu")
+    console = make_console()
+    device = device or torch.device("cpu")
     if not isinstance(data.reader, CaptureReader):
-        raise ConfigError("gsgan.fit supports captures in the bring-your-own layout: data=capture")
+        raise ConfigError(
+            "gsgan.fit supports captures in the bring-your-own layout: data=capture"
+        )
     layout = data.layout
     folder = _folder(layout.root if out is None else Path(out).expanduser(), overwrite)
     with console.status("reading masks"):
         frames = MaskedFrames(data, device, settings.least_mask, settings.held_out)
     if frames.left_out:
-        console.print(f"{frames.left_out} images with empty masks, or nearly so, are left out")
+        console.print(
+            f"{frames.left_out} images with empty masks, or nearly so, are left out"
+        )
     rows = torch.tensor([layout.frames.index(frame) for frame in frames.frames])
 
     with console.status("solving poses"):
@@ -225,7 +250,9 @@ def _folder(out: Path, overwrite: bool) -> Path:
                 f"{out / POSES} holds poses that gsgan.fit did not make; give another folder, out="
             )
         if not overwrite:
-            raise ConfigError(f"{out / POSES} exists already; overwrite=true replaces it")
+            raise ConfigError(
+                f"{out / POSES} exists already; overwrite=true replaces it"
+            )
     return out
 
 
@@ -244,15 +271,22 @@ def _write_body(
     where the masks have them.
     """
     arrays: dict[str, NDArray[Any]] = {}
-    fingers, unit = _fingers(shape), METRES[data.layout.meta.unit]
+    fingers = _fingers(shape)
+    unit = METRES[data.layout.meta.unit]
     for hands, solved in poses.items():
-        theta, transl = solved.theta.clone(), solved.transl.clone()
+        theta = solved.theta.clone()
+        transl = solved.transl.clone()
         if kept is not None:
-            theta[rows], transl[rows] = kept.theta, kept.transl
+            theta[rows] = kept.theta
+            transl[rows] = kept.transl
             theta[:, fingers] = solved.theta[:, fingers]
         name = "_hands" if hands else ""
-        arrays |= {f"theta{name}": theta.numpy(), f"transl{name}": transl.numpy() / unit}
-    with writing(folder / POSES):  # if killed here, the fit leaves no poses of another shape
+        arrays |= {
+            f"theta{name}": theta.numpy(),
+            f"transl{name}": transl.numpy() / unit,
+        }
+    # if killed here, the fit leaves no poses of another shape
+    with writing(folder / POSES):
         (folder / POSES).unlink(missing_ok=True)
     write_npz(folder / SHAPE, **shape.arrays())
     write_npz(
@@ -264,7 +298,9 @@ def _write_body(
     )
 
 
-def _joints(data: GsganData, frames: Sequence[int], hands: bool = False) -> tuple[Tensor, Tensor]:
+def _joints(
+    data: GsganData, frames: Sequence[int], hands: bool = False
+) -> tuple[Tensor, Tensor]:
     """Joints ``[F, 33, 3]`` metres and their visibility; 75 with hands, where the data has some."""
     landmarks = data.layout.landmarks
     if hands and data.layout.hands is not None:
@@ -303,7 +339,11 @@ def _by_hands(data: GsganData) -> bool:
 
 
 def _fingers(shape: BodyShape) -> list[int]:
-    return [i for i, n in enumerate(shaped_body(shape).joint_names) if n.startswith("finger")]
+    return [
+        i
+        for i, n in enumerate(shaped_body(shape).joint_names)
+        if n.startswith("finger")
+    ]
 
 
 def _refined(
@@ -320,7 +360,12 @@ def _refined(
     p, seen = _joints(data, frames, hands=True)
     shape = fit_hands(shape, _solve(data, shape, frames), p, seen)
     by_hands = _solve(data, shape, frames, hands=True)
-    used = torch.zeros(len(p), len(offsets))  # of the 33 landmarks, those on placed hands
+    # of the 33 landmarks, those on placed hands
+    used = torch.zeros(len(p), len(offsets))
     for side, rows in enumerate(ON_HANDS):
-        used[:, rows] = seen[:, rows] * Fingers.placed(seen[:, len(offsets) :] > 0)[:, [side]]
-    return replace(shape, offsets=fit_offsets(shape, by_hands, p[:, : len(offsets)], used))
+        used[:, rows] = (
+            seen[:, rows] * Fingers.placed(seen[:, len(offsets) :] > 0)[:, [side]]
+        )
+    return replace(
+        shape, offsets=fit_offsets(shape, by_hands, p[:, : len(offsets)], used)
+    )

@@ -8,7 +8,15 @@ from torch import Tensor
 
 from gsgan.body.fingers import Fingers
 from gsgan.body.rig import rest_axes
-from gsgan.body.shape import STRETCHED, WRISTS, B, BodyShape, ShapeSpace, free_space, shaped_body
+from gsgan.body.shape import (
+    STRETCHED,
+    WRISTS,
+    B,
+    BodyShape,
+    ShapeSpace,
+    free_space,
+    shaped_body,
+)
 from gsgan.body.skinned import MarkedBody
 from gsgan.body.solve import BODY, Solver
 from gsgan.scene import BodyPose
@@ -18,10 +26,13 @@ from gsgan.utils.errors import DataError
 
 FRAMES = 24  # at most: every frame shows the same lengths
 # Standard deviations of the prior: coefficients have 1.
-STRETCH, OFFSET = 0.1, 0.015  # of a stretch's logarithm; metres
+# of a stretch's logarithm; metres
+STRETCH = 0.1
+OFFSET = 0.015
 # Metres by which the spine's joints are behind the body's: the bodies of vertebrae are behind the
 # line from hips to shoulders; mean and standard deviation.
-BEHIND, DEPTH = 0.04, 0.02
+BEHIND = 0.04
+DEPTH = 0.02
 # Pairs of landmarks whose distance hardly depends on the pose, and pairs whose distance does; and
 # the standard deviations of the distance's logarithm in the first guess.
 RIGID = (
@@ -30,12 +41,17 @@ RIGID = (
 )
 LOOSE = "shoulder hip, ear shoulder"
 ACROSS = "shoulder, hip, ear, eye, mouth"
-SURE, UNSURE = 0.04, 0.1
+SURE = 0.04
+UNSURE = 0.1
 # Effective number of independent frames: systematic errors are the same in all of them.
 INDEPENDENT = 4.0
 FOREARMS = [[13, 15], [14, 16]]  # elbow and wrist
-SIZES, FARTHEST = (0.75, 1.35), 0.05  # a hand's, as a share of the body's; metres
-LENGTH_STEPS, STEPS, POSE_STEPS = 10, 8, 4
+# a hand's, as a share of the body's; metres
+SIZES = (0.75, 1.35)
+FARTHEST = 0.05
+LENGTH_STEPS = 10
+STEPS = 8
+POSE_STEPS = 4
 
 
 def fit_shape(skeletons: Tensor, visibility: Tensor) -> BodyShape:
@@ -77,39 +93,47 @@ def fit_hands(
         body's where no frame shows the hand with its forearm, or where they would move by more than
         `FARTHEST`.
     """
-    shape, hands = replace(shape, hands=None), skeletons[:, BODY:]
+    shape = replace(shape, hands=None)
+    hands = skeletons[:, BODY:]
     seen = (visibility[:, BODY:] > 0) & hands.isfinite().all(-1)
     # Without the wrist, whose definitions differ most.
     bones = torch.tensor([edge for edge in HAND_EDGES if WRIST not in edge])
     first, last = torch.cat([bones, bones + HAND]).mT
     length = (hands[:, last] - hands[:, first]).norm(dim=-1)
-    length = length.where(seen[:, last] & seen[:, first], torch.nan).nanmedian(dim=0).values
+    length = (
+        length.where(seen[:, last] & seen[:, first], torch.nan).nanmedian(dim=0).values
+    )
     if not (known := length.isfinite()).any():
         return shape
     own = shaped_body(shape).hand_landmarks
     own = (own[last] - own[first]).norm(dim=-1)
     stretch = shape.stretch.clone()
-    stretch[STRETCHED.index("hand")] *= (length[known].sum() / own[known].sum()).clamp(*SIZES)
+    stretch[STRETCHED.index("hand")] *= (length[known].sum() / own[known].sum()).clamp(
+        *SIZES
+    )
     shape = replace(shape, stretch=stretch)
 
-    body, wrists = shaped_body(shape), [WRIST, HAND + WRIST]
-    fingers, beyond = Fingers(body), seen.clone()
+    body = shaped_body(shape)
+    wrists = [WRIST, HAND + WRIST]
+    fingers = Fingers(body)
+    beyond = seen.clone()
     beyond[:, wrists] = False
     found = fingers(hands.where(seen.unsqueeze(-1), 0.0), beyond)
     forearms = body.transforms(poses)[:, body.hand_bone[wrists]]
     on_arm = _at_rest(forearms[..., :3, :3], forearms[..., :3, 3], hands[:, wrists])
     in_hand = _at_rest(found.rotations, found.shifts, hands[:, wrists])
     usable = fingers.placed(seen) & (visibility[:, FOREARMS] > 0).all(-1)
-    on_arm, in_hand = (
-        x.where(usable.unsqueeze(-1), torch.nan).nanmedian(dim=0).values for x in (on_arm, in_hand)
-    )
+    on_arm = on_arm.where(usable.unsqueeze(-1), torch.nan).nanmedian(dim=0).values
+    in_hand = in_hand.where(usable.unsqueeze(-1), torch.nan).nanmedian(dim=0).values
     joints = body.joints[[body.joint_names.index(name) for name in WRISTS]]
     moves = torch.stack([on_arm - joints, on_arm - in_hand], dim=1)
     near = (moves.norm(dim=-1) <= FARTHEST).all(-1)
     return replace(shape, hands=moves.where(near[:, None, None], 0.0))
 
 
-def fit_offsets(shape: BodyShape, poses: BodyPose, skeletons: Tensor, visibility: Tensor) -> Tensor:
+def fit_offsets(
+    shape: BodyShape, poses: BodyPose, skeletons: Tensor, visibility: Tensor
+) -> Tensor:
     """``[33, 3]`` metres: offsets that give a body in these poses the person's landmarks.
 
     Convention: medians over frames; landmarks that no frame shows keep the shape's offsets.
@@ -123,8 +147,12 @@ def fit_offsets(shape: BodyShape, poses: BodyPose, skeletons: Tensor, visibility
     body = shaped_body(shape)
     bones = body.transforms(poses)[:, body.landmark_bone]
     moved = _at_rest(bones[..., :3, :3], bones[..., :3, 3], skeletons) - body.landmarks
-    moved = moved.where((visibility > 0).unsqueeze(-1), torch.nan).nanmedian(dim=0).values
-    before = torch.zeros_like(body.landmarks) if shape.offsets is None else shape.offsets
+    moved = (
+        moved.where((visibility > 0).unsqueeze(-1), torch.nan).nanmedian(dim=0).values
+    )
+    before = (
+        torch.zeros_like(body.landmarks) if shape.offsets is None else shape.offsets
+    )
     return before + moved.nan_to_num(0.0)
 
 
@@ -155,16 +183,23 @@ def shape_of(space: ShapeSpace[B], x: Tensor) -> BodyShape:
 
 def _offsets(space: ShapeSpace[B], values: Tensor) -> Tensor:
     """``[33, 3]`` from 99 numbers: the mean of both sides."""
-    offsets, across = values.view(-1, 3), rest_axes(space.body)[0]
+    offsets = values.view(-1, 3)
+    across = rest_axes(space.body)[0]
     mirrored = offsets[list(MEDIAPIPE33.mirror)]
     return (offsets + mirrored) / 2 - (mirrored @ across).unsqueeze(-1) * across
 
 
 def shape_prior(space: ShapeSpace[MarkedBody]) -> Tensor:
     """``[S]`` precisions of all numbers."""
-    parts = ((space.coefficients, 1.0), (len(STRETCHED), STRETCH), (1, DEPTH),
-             (99, OFFSET * 2**0.5))  # fmt: skip
-    return torch.cat([torch.full((n,), 1 / sigma**2, dtype=torch.float64) for n, sigma in parts])
+    parts = (
+        (space.coefficients, 1.0),
+        (len(STRETCHED), STRETCH),
+        (1, DEPTH),
+        (99, OFFSET * 2**0.5),
+    )
+    return torch.cat(
+        [torch.full((n,), 1 / sigma**2, dtype=torch.float64) for n, sigma in parts]
+    )
 
 
 # -- lengths
@@ -175,15 +210,22 @@ def _pairs() -> tuple[Tensor, Tensor, Tensor]:
     names = MEDIAPIPE33.names
     rows = []
     for side in ("left", "right"):
-        own = {n: (n.replace("left", side)) for n in names if "left" in n} | {"nose": "nose"}
-        at = {n.replace("left_", "").replace("_left", ""): names.index(m) for n, m in own.items()}
+        own = {n: (n.replace("left", side)) for n in names if "left" in n} | {
+            "nose": "nose"
+        }
+        at = {
+            n.replace("left_", "").replace("_left", ""): names.index(m)
+            for n, m in own.items()
+        }
         rows += [
             (at[a], at[b], s)
             for s, text in ((SURE, RIGID), (UNSURE, LOOSE))
             for a, b in (pair.split() for pair in text.split(", "))
         ]
         if side == "left":
-            rows += [(at[a], MEDIAPIPE33.mirror[at[a]], SURE) for a in ACROSS.split(", ")]
+            rows += [
+                (at[a], MEDIAPIPE33.mirror[at[a]], SURE) for a in ACROSS.split(", ")
+            ]
     a, b, sigma = zip(*rows, strict=True)
     return torch.tensor(a), torch.tensor(b), torch.tensor(sigma, dtype=torch.float64)
 
@@ -191,13 +233,20 @@ def _pairs() -> tuple[Tensor, Tensor, Tensor]:
 def _fit_lengths(space: ShapeSpace[MarkedBody], p: Tensor, seen: Tensor) -> Tensor:
     """Numbers whose distances between landmarks are the medians over the frames."""
     a, b, sigma = _pairs()
-    length = torch.where(seen[:, a] & seen[:, b], (p[:, a] - p[:, b]).norm(dim=-1), torch.nan)
+    length = torch.where(
+        seen[:, a] & seen[:, b], (p[:, a] - p[:, b]).norm(dim=-1), torch.nan
+    )
     target = length.nanmedian(dim=0).values.log()
     own = space.body.landmarks
     used = target.isfinite() & (own[a] - own[b]).isfinite().all(-1)
-    a, b, sigma, target = a[used], b[used], sigma[used], target[used]
+    a = a[used]
+    b = b[used]
+    sigma = sigma[used]
+    target = target[used]
     if not len(a):
-        raise DataError("fit_shape: no frame shows a limb of which the body has both ends")
+        raise DataError(
+            "fit_shape: no frame shows a limb of which the body has both ends"
+        )
 
     def off(x: Tensor) -> Tensor:
         at = space.shaped(shape_of(space, x)).landmarks
@@ -210,12 +259,16 @@ def _fit_lengths(space: ShapeSpace[MarkedBody], p: Tensor, seen: Tensor) -> Tens
     def cost(x: Tensor) -> Tensor:
         return 2 * ((1 + off(x).square()).sqrt() - 1).sum() + (prior * x.square()).sum()
 
-    damping, best = 1e-2, cost(x)
+    damping = 1e-2
+    best = cost(x)
     for _ in range(LENGTH_STEPS):
-        r, J = off(x), torch.func.jacfwd(off)(x)
+        r = off(x)
+        J = torch.func.jacfwd(off)(x)
         w = (1 + r.square()).rsqrt()
         H = J.mT @ (w.unsqueeze(-1) * J) + prior.diag()
-        move = torch.linalg.solve(H + damping * H.diag().diag(), J.mT @ (w * r) + prior * x)
+        move = torch.linalg.solve(
+            H + damping * H.diag().diag(), J.mT @ (w * r) + prior * x
+        )
         new = cost(x - move)
         better = bool(new < best)
         x, best = (x - move, new) if better else (x, best)
@@ -226,11 +279,14 @@ def _fit_lengths(space: ShapeSpace[MarkedBody], p: Tensor, seen: Tensor) -> Tens
 # -- landmarks
 
 
-def _fit_landmarks(space: ShapeSpace[MarkedBody], x: Tensor, p: Tensor, seen: Tensor) -> BodyShape:
+def _fit_landmarks(
+    space: ShapeSpace[MarkedBody], x: Tensor, p: Tensor, seen: Tensor
+) -> BodyShape:
     """Fits shape and poses together; the poses are eliminated from the normal equations."""
     shift = p[:, MEDIAPIPE33.hips].mean(1, keepdim=True)
     p = p - shift
-    prior, share = shape_prior(space), min(1.0, INDEPENDENT / len(p))
+    prior = shape_prior(space)
+    share = min(1.0, INDEPENDENT / len(p))
     own = len(x) - 99
     symmetric = torch.func.jacfwd(partial(_offsets, space))(x[own:])
     held: tuple[Tensor, Tensor] | None = None
@@ -249,7 +305,8 @@ def _fit_landmarks(space: ShapeSpace[MarkedBody], x: Tensor, p: Tensor, seen: Te
         posed = partial(_posed, space, solver, q, root)
         by_body = torch.func.jacfwd(posed)(x[:own], x[own:])
         turned = solver.transforms(q, root, solver.joints)[:, solver.carrier, :3, :3]
-        by_shape = torch.cat([by_body, turned @ symmetric], dim=-1).flatten(1, 2)  # [F, 99, S]
+        # [F, 99, S]
+        by_shape = torch.cat([by_body, turned @ symmetric], dim=-1).flatten(1, 2)
         # the shape's normal equations after eliminating every pose
         w3 = w.repeat_interleave(3, dim=1).unsqueeze(-1)
         J = at.by_number.flatten(2).mT
@@ -258,17 +315,26 @@ def _fit_landmarks(space: ShapeSpace[MarkedBody], x: Tensor, p: Tensor, seen: Te
         slope = (by_shape.mT @ (w3 * at.residual.flatten(1).unsqueeze(-1))).squeeze(-1)
         inner = torch.linalg.solve(H, torch.cat([cross, g.unsqueeze(-1)], dim=-1))
         A = (direct - cross.mT @ inner[..., :-1]).sum(0) * share + prior.diag()
-        c = (slope - (cross.mT @ inner[..., -1:]).squeeze(-1)).sum(0) * share + prior * x
+        c = (slope - (cross.mT @ inner[..., -1:]).squeeze(-1)).sum(
+            0
+        ) * share + prior * x
         x = x - torch.linalg.solve(A, c)
     return shape_of(space, x)
 
 
 def _posed(
-    space: ShapeSpace[B], solver: Solver, q: Tensor, root: Tensor, own: Tensor, offsets: Tensor
+    space: ShapeSpace[B],
+    solver: Solver,
+    q: Tensor,
+    root: Tensor,
+    own: Tensor,
+    offsets: Tensor,
 ) -> Tensor:
     """``[F, 33, 3]`` the landmarks of a shape in poses."""
     body = space.shaped(shape_of(space, torch.cat([own, offsets])))
-    return solver.points(solver.transforms(q, root, body.joints), body.landmarks.nan_to_num())
+    return solver.points(
+        solver.transforms(q, root, body.joints), body.landmarks.nan_to_num()
+    )
 
 
 def without_surface(space: ShapeSpace[B]) -> ShapeSpace[MarkedBody]:
@@ -288,4 +354,6 @@ def without_surface(space: ShapeSpace[B]) -> ShapeSpace[MarkedBody]:
         landmark_bone=body.landmark_bone,
     ).to(torch.float64)
     kept = {"vertices": slice(0, 1), "joints": slice(None), "landmarks": slice(None)}
-    return ShapeSpace(small, {n: space.directions[n][s].double() for n, s in kept.items()})
+    return ShapeSpace(
+        small, {n: space.directions[n][s].double() for n, s in kept.items()}
+    )

@@ -8,13 +8,17 @@ from torch.nn import functional
 
 Maps = Sequence[Sequence[Tensor]]  # per scale: feature maps, the logits last
 Term = Callable[[Tensor, Tensor], Tensor]
-softplus, relu = functional.softplus, functional.relu
+softplus = functional.softplus
+relu = functional.relu
 
 # name: (discriminator's loss, generator's loss) of (real, fake) logits
 _FORMS: dict[str, tuple[Term, Term]] = {
     "logistic": (lambda r, f: softplus(-r) + softplus(f), lambda _, f: softplus(-f)),
     "hinge": (lambda r, f: relu(1 - r) + relu(1 + f), lambda _, f: -f),
-    "lsgan": (lambda r, f: (r - 1).square() + f.square(), lambda _, f: (f - 1).square()),
+    "lsgan": (
+        lambda r, f: (r - 1).square() + f.square(),
+        lambda _, f: (f - 1).square(),
+    ),
     "relativistic": (lambda r, f: softplus(f - r), lambda r, f: softplus(r - f)),
 }
 FORMS = tuple(_FORMS)
@@ -22,8 +26,11 @@ COMPARING = ("relativistic",)  # forms whose generator loss depends on the real 
 
 
 def _loss(form: str, which: int, real: Maps, fake: Maps) -> Tensor:
-    term, scales = _FORMS[form][which], zip(real, fake, strict=True)
-    return torch.stack([term(r[-1].float(), f[-1].float()).mean() for r, f in scales]).sum()
+    term = _FORMS[form][which]
+    scales = zip(real, fake, strict=True)
+    return torch.stack(
+        [term(r[-1].float(), f[-1].float()).mean() for r, f in scales]
+    ).sum()
 
 
 def discriminator_loss(real: Maps, fake: Maps, form: str = "logistic") -> Tensor:

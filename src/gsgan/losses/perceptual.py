@@ -16,7 +16,8 @@ FEATURES, LPIPS = FORMS = ("features", "lpips")
 PRETRAINED, RANDOM = SOURCES = ("pretrained", "random")
 VGG_LAYERS = 4  # relu1_2, relu2_2, relu3_3, relu4_3, as Johnson et al.
 LEAST_CROP = 32  # pixels: AlexNet's last map is empty below
-ANYWHERE = 1e-6  # weight of a pixel off the person, so that a crop exists without a person
+# weight of a pixel off the person, so that a crop exists without a person
+ANYWHERE = 1e-6
 
 
 class Perceptual(nn.Module):
@@ -85,8 +86,12 @@ class Perceptual(nn.Module):
             if net == "vgg":
                 self.network.stages = self.network.stages[:VGG_LAYERS]
         if self.crop is not None:
-            self.description += f", {self.crops} of {self.crop}² around the person in each image"
-        layers = len(self.network.stages) if isinstance(self.network, FeatureNetwork) else 1
+            self.description += (
+                f", {self.crops} of {self.crop}² around the person in each image"
+            )
+        layers = (
+            len(self.network.stages) if isinstance(self.network, FeatureNetwork) else 1
+        )
         self.register_buffer("layer_loss", torch.zeros(layers))
         self.register_buffer("calls", torch.zeros((), dtype=torch.long))
 
@@ -105,7 +110,9 @@ class Perceptual(nn.Module):
         with torch.no_grad():
             truth = self.network(target)
         pairs = zip(self.network(image), truth, strict=True)
-        losses = torch.stack([functional.mse_loss(ours, theirs) for ours, theirs in pairs])
+        losses = torch.stack(
+            [functional.mse_loss(ours, theirs) for ours, theirs in pairs]
+        )
         if self.training:  # without reading `calls`, for which the host would wait
             warm = self.calls < self.warmup
             self.calls += warm
@@ -115,7 +122,9 @@ class Perceptual(nn.Module):
         return (losses * inverse / inverse.sum()).sum()
 
 
-def crop_person(images: Sequence[Tensor], mask: Tensor, draws: Tensor, size: int) -> list[Tensor]:
+def crop_person(
+    images: Sequence[Tensor], mask: Tensor, draws: Tensor, size: int
+) -> list[Tensor]:
     """Cuts the same squares around random pixels of the person out of several images.
 
     Convention: a square that would leave the image is moved inside; an image smaller than the
@@ -132,12 +141,15 @@ def crop_person(images: Sequence[Tensor], mask: Tensor, draws: Tensor, size: int
         Each image's squares, ``[B * N, C, size, size]``.
     """
     height, width = mask.shape[-2:]
-    rows, columns = min(size, height), min(size, width)
+    rows = min(size, height)
+    columns = min(size, width)
 
     # The pixel at which the cumulative mask reaches the random share of its total.
     cumulative = (mask.flatten(1).double() + ANYWHERE).cumsum(dim=1)
     shares = draws.to(cumulative) * cumulative[:, -1:]
-    centre = torch.searchsorted(cumulative, shares, right=True).clamp(max=height * width - 1)
+    centre = torch.searchsorted(cumulative, shares, right=True).clamp(
+        max=height * width - 1
+    )
 
     # The corner of the square around it, moved inside of the image.
     top = (centre // width - rows // 2).clamp(0, height - rows)
@@ -176,7 +188,8 @@ def _put_back(module: nn.Module, state: dict[str, Any], prefix: str, *_: Any) ->
 def _random_stages(width: int) -> nn.ModuleList:
     """Three small stages with fixed weights, independent of the run's seed."""
     generator = torch.Generator().manual_seed(20250717)
-    stages, channels = [], [3, width, 2 * width, 4 * width]
+    stages = []
+    channels = [3, width, 2 * width, 4 * width]
     for i, (inputs, outputs) in enumerate(pairwise(channels)):
         conv = nn.Conv2d(inputs, outputs, 3, stride=1 if i == 0 else 2, padding=1)
         with torch.no_grad():

@@ -10,7 +10,9 @@ from torch import Tensor
 from gsgan.splat import build, native
 from gsgan.utils.tensors import full_precision
 
-HALF_WINDOW, SIGMA = 5, 1.5  # pixels, of the Gaussian; shorter sides cannot be reflected
+# pixels, of the Gaussian; shorter sides cannot be reflected
+HALF_WINDOW = 5
+SIGMA = 1.5
 
 
 def d_ssim(image: Tensor, target: Tensor) -> Tensor:
@@ -21,7 +23,9 @@ def d_ssim(image: Tensor, target: Tensor) -> Tensor:
     return d_ssim_map(image, target).mean()
 
 
-def d_ssim_map(image: Tensor, target: Tensor, *, k: tuple[float, float] = (0.01, 0.03)) -> Tensor:
+def d_ssim_map(
+    image: Tensor, target: Tensor, *, k: tuple[float, float] = (0.01, 0.03)
+) -> Tensor:
     """1 - SSIM at every pixel, accurate in float32 for flat and nearly equal images too.
 
     Convention: computed in float32 at least, autocast has no effect; borders are reflected. SSIM's
@@ -41,16 +45,25 @@ def d_ssim_map(image: Tensor, target: Tensor, *, k: tuple[float, float] = (0.01,
     """
     with full_precision(image.device):
         wide = torch.promote_types(image.dtype, torch.float32)
-        image, target = image.to(wide), target.to(wide)
+        image = image.to(wide)
+        target = target.to(wide)
         difference = image - target
-        middle, shift = (v.detach().mean((-2, -1), keepdim=True) for v in (image, difference))
-        x, y, d = image - middle, target - (middle - shift), difference - shift
+        middle = image.detach().mean((-2, -1), keepdim=True)
+        shift = difference.detach().mean((-2, -1), keepdim=True)
+        x = image - middle
+        y = target - (middle - shift)
+        d = difference - shift
         moments = torch.cat([x, d, x.square() + y.square(), d.square()], dim=1)
-        kernel = get_gaussian_kernel1d(2 * HALF_WINDOW + 1, SIGMA, device=x.device, dtype=wide)
-        mean, gap, power, gap_power = filter2d_separable(moments, kernel, kernel).chunk(4, dim=1)
+        kernel = get_gaussian_kernel1d(
+            2 * HALF_WINDOW + 1, SIGMA, device=x.device, dtype=wide
+        )
+        mean, gap, power, gap_power = filter2d_separable(moments, kernel, kernel).chunk(
+            4, dim=1
+        )
         variances = power - mean.square() - (mean - gap).square()
         structure = (gap_power - gap.square()) / (variances + k[1] ** 2)
-        mean, gap = mean + middle, gap + shift
+        mean = mean + middle
+        gap = gap + shift
         luminance = gap.square() / (mean.square() + (mean - gap).square() + k[0] ** 2)
         return luminance + structure - luminance * structure
 
@@ -99,7 +112,9 @@ def _compiled(image: Tensor, target: Tensor) -> bool:
 
 
 _Job = build.job_type(
-    ("planes", "H", "W", "threads"), ("l1", "l2", "ssim"), ("image", "target", "d_image", "totals")
+    ("planes", "H", "W", "threads"),
+    ("l1", "l2", "ssim"),
+    ("image", "target", "d_image", "totals"),
 )  # struct PhotometricJob of splat/kernels/photometric.h
 
 
@@ -116,7 +131,9 @@ class _Photometric(torch.autograd.Function):
         planes, (height, width) = held[0].shape[:-2].numel(), held[0].shape[-2:]
         totals = torch.empty(planes, dtype=torch.float64)
         job = _Job(planes, height, width, build.threads(), l1, l2, ssim)
-        build.point(job, ("image", "target", "d_image", "totals"), [*held, gradient, totals])
+        build.point(
+            job, ("image", "target", "d_image", "totals"), [*held, gradient, totals]
+        )
         if build.function("photometric", image.dtype)(ctypes.byref(job)):
             raise MemoryError("photometric: out of memory")
         ctx.gradient = gradient

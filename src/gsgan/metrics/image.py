@@ -35,7 +35,9 @@ def psnr(image: Tensor, target: Tensor, pooling: str = "image") -> Tensor:
     return (-10 * error.log10()).mean(dim=1)
 
 
-def psnr_where(image: Tensor, target: Tensor, where: Tensor, pooling: str = "image") -> Tensor:
+def psnr_where(
+    image: Tensor, target: Tensor, where: Tensor, pooling: str = "image"
+) -> Tensor:
     """PSNR of the pixels ``where [B, 1, H, W]`` in dB; NaN without any."""
     scores = [
         psnr(a[None, :, m, None], b[None, :, m, None], pooling)[0]
@@ -48,9 +50,12 @@ def person_box(mask: Tensor) -> Tensor:
     """``[B, 1, H, W]`` bool: the smallest box around the mask's pixels of at least one half."""
     person = mask >= 0.5
     box = torch.ones_like(person)
-    for along, across in ((-1, -2), (-2, -1)):  # rows, columns from the first to the last
+    # rows, columns from the first to the last
+    for along, across in ((-1, -2), (-2, -1)):
         held = person.any(dim=along, keepdim=True).long()
-        box &= (held.cumsum(across) > 0) & (held.flip(across).cumsum(across).flip(across) > 0)
+        box &= (held.cumsum(across) > 0) & (
+            held.flip(across).cumsum(across).flip(across) > 0
+        )
     return box
 
 
@@ -65,7 +70,9 @@ def flicker(
         mask: ``[1, 1, H, W]`` of the person.
         before: the same three of the frame before, seen by the same camera.
     """
-    change = ((image - before[0]) - (target - before[1])).abs().mean(dim=1, keepdim=True)
+    change = (
+        ((image - before[0]) - (target - before[1])).abs().mean(dim=1, keepdim=True)
+    )
     return change[person_box(torch.maximum(mask, before[2]))].mean()
 
 
@@ -74,7 +81,9 @@ def psnr_inside(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
     error is due to the mask where masks are uneven; NaN where the mask is empty."""
     person = (mask >= 0.5).to(mask)
     side = 2 * OUTLINE + 1
-    dilated, shrunk = (s * functional.max_pool2d(s * person, side, 1, OUTLINE) for s in (1, -1))
+    dilated, shrunk = (
+        s * functional.max_pool2d(s * person, side, 1, OUTLINE) for s in (1, -1)
+    )
     return psnr_where(image, target, person_box(mask) & (dilated == shrunk))
 
 
@@ -82,7 +91,9 @@ def ssim_where(image: Tensor, target: Tensor, *regions: Tensor) -> list[Tensor]:
     """SSIM's mean over each region ``[B, 1, H, W]``, with windows that reach beyond it; NaN for an
     empty region."""
     similar = (1 - d_ssim_map(image, target)).mean(dim=1, keepdim=True)
-    return [(similar * r).flatten(1).sum(dim=1) / r.flatten(1).sum(dim=1) for r in regions]
+    return [
+        (similar * r).flatten(1).sum(dim=1) / r.flatten(1).sum(dim=1) for r in regions
+    ]
 
 
 def ssim(image: Tensor, target: Tensor, *, value_range: float = 1.0) -> Tensor:
@@ -112,14 +123,19 @@ def ssim_uniform(image: Tensor, target: Tensor, *, value_range: float = 1.0) -> 
     window = UNIFORM_WINDOW
     if min(image.shape[-2:]) < window:
         return image.new_full((len(image),), torch.nan)
-    x, y = image.double(), target.double()
+    x = image.double()
+    y = target.double()
     moments = torch.cat([x, y, x * x, y * y, x * y], dim=1)
-    mean_x, mean_y, xx, yy, xy = functional.avg_pool2d(moments, window, 1).chunk(5, dim=1)
+    mean_x, mean_y, xx, yy, xy = functional.avg_pool2d(moments, window, 1).chunk(
+        5, dim=1
+    )
     sample = window**2 / (window**2 - 1)
     both = sample * (xy - mean_x * mean_y)
     spread = sample * (xx - mean_x.square() + yy - mean_y.square())
     first, second = ((k * value_range) ** 2 for k in SSIM_CONSTANTS)
-    luminance = (2 * mean_x * mean_y + first) / (mean_x.square() + mean_y.square() + first)
+    luminance = (2 * mean_x * mean_y + first) / (
+        mean_x.square() + mean_y.square() + first
+    )
     similar = luminance * (2 * both + second) / (spread + second)
     return similar.flatten(1).mean(dim=1).to(image.dtype)
 
@@ -172,21 +188,26 @@ def edge_scores(
     Returns:
         Two float64 ``[B]``; NaN where the ground truth has no edge.
     """
-    scores, kernel = [], np.ones((2 * tolerance + 1, 2 * tolerance + 1), np.uint8)
+    scores = []
+    kernel = np.ones((2 * tolerance + 1, 2 * tolerance + 1), np.uint8)
     for i, pair in enumerate(zip(image, target, strict=True)):
         grey = (cv2.cvtColor(to_bytes(x), cv2.COLOR_RGB2GRAY) for x in pair)
         edges, truth = (cv2.Canny(x, low, high) > 0 for x in grey)
         near = [cv2.dilate(x.astype(np.uint8), kernel) > 0 for x in (edges, truth)]
         if where is not None:
             inside = where[i, 0].cpu().numpy()
-            edges, truth = edges & inside, truth & inside
-        count, expected = edges.sum(), truth.sum()
+            edges = edges & inside
+            truth = truth & inside
+        count = edges.sum()
+        expected = truth.sum()
         if not expected:
             scores.append((np.nan, np.nan))
             continue
         precision = (edges & near[1]).sum() / max(count, 1)
         recall = (truth & near[0]).sum() / expected
         total = precision + recall
-        scores.append((2 * precision * recall / total if total else 0.0, count / expected))
+        scores.append(
+            (2 * precision * recall / total if total else 0.0, count / expected)
+        )
     f1, ratio = torch.tensor(scores, dtype=torch.float64).unbind(1)
     return f1, ratio

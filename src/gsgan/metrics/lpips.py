@@ -56,7 +56,8 @@ class LpipsAgainst:
         self.box = None if mask is None else rectangle(person_box(mask)[0])
         self.size = (target.shape[-2], target.shape[-1])
 
-        whole, square = self._seen(target), self._square(target)
+        whole = self._seen(target)
+        square = self._square(target)
         self.truth = {}
         self.square_truth = {}
         for net, network in networks.items():
@@ -73,16 +74,20 @@ class LpipsAgainst:
             ``{"lpips_<net>": score, "lpips_<net>_person": score}``; the latter is the mean of the
             distance's map in the person's box, with receptive fields that reach beyond it.
         """
-        whole, square = self._seen(image), self._square(image)
+        whole = self._seen(image)
+        square = self._square(image)
         scores = {}
         for net, network in self.networks.items():
-            truth, features = self.truth[net], network.features(whole)
+            truth = self.truth[net]
+            features = network.features(whole)
             if self.measures.lpips_region == "full":
                 scores[f"lpips_{net}"] = float(network.distance(features, truth))
             elif square is None:
                 scores[f"lpips_{net}"] = math.nan
             else:
-                distance = network.distance(network.features(square), self.square_truth[net])
+                distance = network.distance(
+                    network.features(square), self.square_truth[net]
+                )
                 scores[f"lpips_{net}"] = float(distance)
             if self.mask is not None:
                 inside = math.nan
@@ -98,12 +103,15 @@ class LpipsAgainst:
         if self.measures.lpips_channels == "bgr":
             image = image.flip(1)
         unscaled = self.measures.lpips_range == (0.0, 1.0)
-        return (image + 1) / 2 if unscaled else image  # the network maps [0, 1] to [-1, 1]
+        # the network maps [0, 1] to [-1, 1]
+        return (image + 1) / 2 if unscaled else image
 
     def _square(self, image: Tensor) -> Tensor | None:
         """The crop round the person as the networks get it; None without, or without a person."""
         if self.measures.lpips_region == "full":
             return None
         assert self.mask is not None
-        square = mask_crop(image[0], self.mask[0], BACKGROUNDS[self.measures.background])
+        square = mask_crop(
+            image[0], self.mask[0], BACKGROUNDS[self.measures.background]
+        )
         return None if square is None else self._seen(square[None])

@@ -26,10 +26,13 @@ BACKGROUNDS = {"black": 0.0, "white": 1.0}
 CUT_SLACK = 1e-3  # of 1/255: values that are 8-bit already must not drop by one
 NEAR = 1e-2  # metres; nearer parts of the body's box are cut off
 PAIRS = torch.combinations(torch.arange(8))
-HANDS, MOUTH = "hands", "mouth"
+HANDS = "hands"
+MOUTH = "mouth"
 # On every side, relative to the longer side of the box around the projected landmarks.
-HAND_MARGIN, LIP_MARGIN = 0.15, 0.25
-MOUTH_SIDE = 1.5  # of the mouth's box without lip landmarks, relative to the mouth's width
+HAND_MARGIN = 0.15
+LIP_MARGIN = 0.25
+# of the mouth's box without lip landmarks, relative to the mouth's width
+MOUTH_SIDE = 1.5
 LEAST_BOX = 11  # pixels: SSIM's window
 
 
@@ -41,7 +44,9 @@ def on_background(image: Tensor, alpha: Tensor, background: float) -> Tensor:
 def hard_outline(image: Tensor, mask: Tensor) -> Tensor:
     """Divides an image on black by its mask where that is at least one half; black elsewhere."""
     inside = mask >= 0.5
-    return torch.where(inside, (image / mask.clamp_min(0.5)).clamp(0, 1), torch.zeros_like(image))
+    return torch.where(
+        inside, (image / mask.clamp_min(0.5)).clamp(0, 1), torch.zeros_like(image)
+    )
 
 
 def eight_bits(image: Tensor, how: Literal["none", "rounded", "cut"]) -> Tensor:
@@ -100,11 +105,14 @@ def mask_crop(
     part = image[:, rows, columns]
     height, width = part.shape[-2:]
     side = max(height, width)
-    top, left = (side - height) // 2, (side - width) // 2
+    top = (side - height) // 2
+    left = (side - width) // 2
     border = (left, side - width - left, top, side - height - top)
     square = functional.pad(part, border, value=background)[None]
     if side != size:
-        square = functional.interpolate(square, (size, size), mode="bilinear", align_corners=False)
+        square = functional.interpolate(
+            square, (size, size), mode="bilinear", align_corners=False
+        )
     return square[0]
 
 
@@ -113,7 +121,8 @@ def mask_crop(
 
 def box_corners(points: Tensor, margin: float) -> Tensor:
     """``[8, 3]`` corners of the box around points ``[M, 3]``, metres, world axes."""
-    low, high = points.amin(0) - margin, points.amax(0) + margin
+    low = points.amin(0) - margin
+    high = points.amax(0) + margin
     choice = torch.cartesian_prod(*[torch.arange(2, device=points.device)] * 3)
     return torch.where(choice == 1, high, low)
 
@@ -136,7 +145,9 @@ def box_mask(corners: Tensor, camera: Camera) -> Tensor:
         return torch.zeros(1, *camera.size, dtype=torch.bool, device=corners.device)
     pixels = (seen / seen[:, 2:]) @ camera.K[0].double().T
     hull = cv2.convexHull(pixels[:, :2].float().cpu().numpy())[:, 0].astype(np.float64)
-    shown = np.stack(np.meshgrid(*(np.arange(n) + 0.5 for n in camera.size[::-1])), axis=-1)
+    shown = np.stack(
+        np.meshgrid(*(np.arange(n) + 0.5 for n in camera.size[::-1])), axis=-1
+    )
     if camera.dist is not None:
         K = camera.K[0].double().cpu().numpy()
         rays = (shown - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T
@@ -147,9 +158,11 @@ def box_mask(corners: Tensor, camera: Camera) -> Tensor:
 
 def in_front(x_cam: Tensor) -> Tensor:
     """``[M, 3]`` points whose hull is the box with corners ``[8, 3]`` clipped at the near plane."""
-    a, b = x_cam[PAIRS[:, 0]], x_cam[PAIRS[:, 1]]
+    a = x_cam[PAIRS[:, 0]]
+    b = x_cam[PAIRS[:, 1]]
     crosses = (a[:, 2] > NEAR) != (b[:, 2] > NEAR)
-    a, b = a[crosses], b[crosses]
+    a = a[crosses]
+    b = b[crosses]
     share = (NEAR - a[:, 2:]) / (b[:, 2:] - a[:, 2:])
     return torch.cat([x_cam[x_cam[:, 2] > NEAR], a + share * (b - a)])
 
@@ -186,20 +199,26 @@ def hands_and_mouth(frame: Frame, template: SkeletonTemplate) -> dict[str, Tenso
     if not template.palms:
         return {}
     pixels, depth = frame.camera.project(frame.skeleton, NEAR)
-    seen, size = (frame.visibility > 0) & (depth > NEAR), frame.camera.size
+    seen = (frame.visibility > 0) & (depth > NEAR)
+    size = frame.camera.size
     hands = [slice(wrist, wrist + HAND) for wrist, *_ in template.palms]
     boxes = [landmark_box(pixels[:, h], seen[:, h], size, HAND_MARGIN) for h in hands]
     corners = [template.names.index(f"mouth_{side}") for side in ("left", "right")]
     lips = lip_landmarks(template)
     distance = frame.camera.to_camera(frame.skeleton).norm(dim=-1)
-    ahead = distance[:, corners].mean(dim=1) < distance[:, list(template.ears)].mean(dim=1)
+    ahead = distance[:, corners].mean(dim=1) < distance[:, list(template.ears)].mean(
+        dim=1
+    )
     if lips:
         mouth = landmark_box(pixels[:, lips], seen[:, lips], size, LIP_MARGIN)
     else:
         around = mouth_square(frame.skeleton[:, corners], frame.camera)
         known = seen[:, corners].all(dim=1, keepdim=True).expand(-1, around.shape[1])
         mouth = landmark_box(around, known, size, 0.0)
-    return {HANDS: torch.stack(boxes).any(dim=0), MOUTH: mouth & ahead[:, None, None, None]}
+    return {
+        HANDS: torch.stack(boxes).any(dim=0),
+        MOUTH: mouth & ahead[:, None, None, None],
+    }
 
 
 def describe_boxes(skeleton: str) -> str | None:
@@ -218,7 +237,9 @@ def describe_boxes(skeleton: str) -> str | None:
 
 def lip_landmarks(template: SkeletonTemplate) -> list[int]:
     """The joints around the lips; none where the skeleton has no face landmarks."""
-    return [i for i, name in enumerate(template.names) if name.startswith("mouth_outer")]
+    return [
+        i for i, name in enumerate(template.names) if name.startswith("mouth_outer")
+    ]
 
 
 def mouth_square(corners: Tensor, camera: Camera) -> Tensor:
@@ -233,7 +254,9 @@ def mouth_square(corners: Tensor, camera: Camera) -> Tensor:
     return camera.project(torch.cat([middle - half, middle + half], dim=1), NEAR)[0]
 
 
-def landmark_box(pixels: Tensor, seen: Tensor, size: tuple[int, int], margin: float) -> Tensor:
+def landmark_box(
+    pixels: Tensor, seen: Tensor, size: tuple[int, int], margin: float
+) -> Tensor:
     """The pixels whose centre is in the box around landmarks.
 
     Args:
@@ -245,15 +268,21 @@ def landmark_box(pixels: Tensor, seen: Tensor, size: tuple[int, int], margin: fl
     Returns:
         ``[B, 1, H, W]`` bool; all false without a landmark in the image.
     """
-    inside = ((pixels >= 0) & (pixels < constant((size[1], size[0]), pixels))).all(dim=-1)
+    inside = ((pixels >= 0) & (pixels < constant((size[1], size[0]), pixels))).all(
+        dim=-1
+    )
     low = torch.where(seen.unsqueeze(-1), pixels, torch.inf).amin(dim=1)
     high = torch.where(seen.unsqueeze(-1), pixels, -torch.inf).amax(dim=1)
-    extent, middle = high - low, (low + high) / 2
+    extent = high - low
+    middle = (low + high) / 2
     half = extent / 2 + margin * extent.amax(dim=1, keepdim=True)
     half = half.clamp_min(LEAST_BOX / 2)
     across, along = (
-        (torch.arange(n, device=pixels.device) + 0.5 - middle[:, i, None]).abs() <= half[:, i, None]
+        (torch.arange(n, device=pixels.device) + 0.5 - middle[:, i, None]).abs()
+        <= half[:, i, None]
         for i, n in enumerate(reversed(size))
     )
     shown = (seen & inside).any(dim=1)
-    return (along.unsqueeze(-1) & across.unsqueeze(-2) & shown[:, None, None]).unsqueeze(1)
+    return (
+        along.unsqueeze(-1) & across.unsqueeze(-2) & shown[:, None, None]
+    ).unsqueeze(1)

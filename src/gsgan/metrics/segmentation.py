@@ -9,17 +9,30 @@ from gsgan.data.pixels import IGNORE_LABEL
 # Background, then twelve body parts; further classes repeat them.
 PALETTE = torch.tensor(
     [
-        [0, 0, 0], [110, 70, 40], [240, 200, 170], [60, 120, 220], [50, 60, 110],
-        [230, 120, 60], [250, 190, 60], [200, 50, 80], [250, 110, 150], [60, 160, 90],
-        [140, 210, 110], [120, 80, 170], [190, 150, 230],
+        [0, 0, 0],
+        [110, 70, 40],
+        [240, 200, 170],
+        [60, 120, 220],
+        [50, 60, 110],
+        [230, 120, 60],
+        [250, 190, 60],
+        [200, 50, 80],
+        [250, 110, 150],
+        [60, 160, 90],
+        [140, 210, 110],
+        [120, 80, 170],
+        [190, 150, 230],
     ]
-)  # fmt: skip
+)
 
 
 def confusion(segmentation: Tensor, labels: Tensor) -> Tensor:
     """``[classes, classes]`` pixels of S ``[B, classes, H, W]``, rows by labels ``[B, H, W]``."""
     return multiclass_confusion_matrix(
-        segmentation.argmax(dim=1), labels, segmentation.shape[1], ignore_index=IGNORE_LABEL
+        segmentation.argmax(dim=1),
+        labels,
+        segmentation.shape[1],
+        ignore_index=IGNORE_LABEL,
     ).cpu()
 
 
@@ -30,7 +43,8 @@ def miou(matrix: Tensor) -> dict[str, float | None]:
         matrix: from `confusion`; background is class 0.
     """
     matrix = matrix.double()
-    truth, union = matrix.sum(1), matrix.sum(0) + matrix.sum(1) - matrix.diag()
+    truth = matrix.sum(1)
+    union = matrix.sum(0) + matrix.sum(1) - matrix.diag()
     present = truth > 0
     iou = torch.where(present, matrix.diag() / union.clamp_min(1), torch.nan)
     return {

@@ -41,7 +41,9 @@ OPTIONS = ("backend", "window_margin", "window_multiple", "window_least")  # of 
 
 def build_data(config: DictConfig) -> GsganData:
     """The data module of a config, its dataset made if need be, read and checked."""
-    data: GsganData = instantiate(config.data, distortion=_effect_settings(config).distortion)
+    data: GsganData = instantiate(
+        config.data, distortion=_effect_settings(config).distortion
+    )
     data.prepare_data()
     data.setup()
     return data
@@ -69,7 +71,10 @@ def build_avatar(
             on a key that is not read.
         DataError: when the data lacks the body that the model needs.
     """
-    if config.model.get("densify") is not None and "_target_" not in config.model.densify:
+    if (
+        config.model.get("densify") is not None
+        and "_target_" not in config.model.densify
+    ):
         raise ConfigError(
             "experiment=paper changes parts that this model does not have; it goes with "
             "model=full, wo_feat, wo_seg, wo_gcn or splat_only"
@@ -134,7 +139,10 @@ class AvatarParts:
                 (self.generator is None) != (self.pose_encoder is None),
                 "generator and pose_encoder go together",
             ),
-            (self.deformation and self.surface, "give a deformation or a surface, got both"),
+            (
+                self.deformation and self.surface,
+                "give a deformation or a surface, got both",
+            ),
             (
                 not (self.deformation or self.surface or self.generator),
                 "nothing paints; give a deformation, a surface or a generator",
@@ -168,7 +176,10 @@ def _assembled(
     template = template_of(scene.skeleton, scene.face)
     # The stature follows from limb lengths, which no pose changes.
     body_height = float(scene.body_height) * template.stature / template.limb_length_sum
-    formation: dict[str, Any] = {"low_pass": parts.low_pass, "antialias": effects.antialias.on}
+    formation: dict[str, Any] = {
+        "low_pass": parts.low_pass,
+        "antialias": effects.antialias.on,
+    }
 
     torch.manual_seed(seed + 1)
     body_points = None
@@ -178,8 +189,11 @@ def _assembled(
     sizes = {"body_height": body_height, "sh_degree": effects.degree}
     deformation = surface = None
     if parts.deformation and (points := body_points or parts.densify):
-        rest, joints = points.rest_points, len(template.names)
-        own: dict[str, Any] = {"mean_step": body_points.mean_step} if body_points else {}
+        rest = points.rest_points
+        joints = len(template.names)
+        own: dict[str, Any] = (
+            {"mean_step": body_points.mean_step} if body_points else {}
+        )
         if getattr(parts.deformation, "keywords", {}).get("normals", False) is None:
             own["normals"] = scene.n_train_cameras > 1
         deformation = parts.deformation(rest_points=rest, joints=joints, **sizes, **own)
@@ -208,7 +222,9 @@ def _assembled(
         segmentation_why=labelled[1],
         pose_encoder=parts.pose_encoder,
         generator=_generator(parts, template, deformation or surface, segmentation),
-        colour=ColourCorrection(effects.cameras, scene.camera_names) if colours else None,
+        colour=ColourCorrection(effects.cameras, scene.camera_names)
+        if colours
+        else None,
         poses=scene.poses,
         solver=Solver(_required_body(scene, "the model")) if on_a_body else None,
         **{name: getattr(parts, name) for name in OPTIONS},

@@ -36,7 +36,8 @@ from gsgan.splat import Accuracy, rasterise
 from gsgan.utils.tensors import filled, full_precision
 
 LINE_WIDTH = 2.5  # sigma of p₂D's lines, pixels in an image 512 high
-UNWATCHED: AbstractContextManager[None] = nullcontext()  # entering it costs next to nothing
+# entering it costs next to nothing
+UNWATCHED: AbstractContextManager[None] = nullcontext()
 
 
 def unwatched(stage: str) -> AbstractContextManager[None]:
@@ -99,16 +100,26 @@ class Avatar(nn.Module):
         window_least: int = 32,
     ) -> None:
         super().__init__()
-        self.effects, self.accuracy, self.backend = effects, accuracy, backend
-        self.limb_length_sum, self.body_height = limb_length_sum, body_height
+        self.effects = effects
+        self.accuracy = accuracy
+        self.backend = backend
+        self.limb_length_sum = limb_length_sum
+        self.body_height = body_height
         self.template = template
         self.window_margin = window_margin
-        self.window_multiple, self.window_least = window_multiple, window_least
-        self.deformation, self.densify, self.body_points = deformation, densify, body_points
+        self.window_multiple = window_multiple
+        self.window_least = window_least
+        self.deformation = deformation
+        self.densify = densify
+        self.body_points = body_points
         self.surface = surface
-        self.segmentation, self.segmentation_why = segmentation, segmentation_why
-        self.pose_encoder, self.generator, self.colour = pose_encoder, generator, colour
-        self.solver, self.poses = solver, poses
+        self.segmentation = segmentation
+        self.segmentation_why = segmentation_why
+        self.pose_encoder = pose_encoder
+        self.generator = generator
+        self.colour = colour
+        self.solver = solver
+        self.poses = poses
 
     @property
     def splats(self) -> ResidualGaussians | SurfaceGaussians | None:
@@ -174,7 +185,9 @@ class Avatar(nn.Module):
         height = self.limb_length_sum
         p, seen = complete_skeleton(skeleton.cpu(), visibility, self.template, height)
         if len(camera) not in (1, len(p)):
-            raise ValueError(f"render: expected 1 or {len(p)} cameras, got {len(camera)}")
+            raise ValueError(
+                f"render: expected 1 or {len(p)} cameras, got {len(camera)}"
+            )
         cameras = camera if len(camera) == len(p) else cat([camera] * len(p))
         rendering = self.rendered(p, seen, cameras.to("cpu"), body, maps=False)
         assert rendering.image is not None
@@ -272,7 +285,8 @@ class Avatar(nn.Module):
         if self.window_margin is None or camera.whole_height is not None:
             return None
         sides = {"multiple": self.window_multiple, "least": self.window_least}
-        margin, near = self.window_margin, self.accuracy.near
+        margin = self.window_margin
+        near = self.accuracy.near
         with self.stage("window"), full_precision(skeleton.device):
             return body_window(skeleton, camera, margin=margin, near=near, **sides)
 
@@ -302,27 +316,38 @@ class Avatar(nn.Module):
                 raster = self._rasterised(gaussians, camera, supersample)
             if generate and self.generator is not None:
                 if self.segmentation is not None:
-                    with self.stage("S"), torch.no_grad():  # trained on its own, then frozen
+                    # trained on its own, then frozen
+                    with self.stage("S"), torch.no_grad():
                         S = self.segmentation(body, camera)  # Sec. 3.4
                 with self.stage("p₂D"):
                     width = line_width(camera)
                     drawn = draw_skeleton(p, valid, camera, self.template, width)
                 with self.stage("Ω"):
-                    pose = pose_inputs(p, valid, frames, camera, self.template, self.body_height)
-        if generate and self.generator is not None and self.pose_encoder is not None:  # Sec. 3.5
+                    pose = pose_inputs(
+                        p, valid, frames, camera, self.template, self.body_height
+                    )
+        # Sec. 3.5
+        if generate and self.generator is not None and self.pose_encoder is not None:
             with self.stage("pose encoder"):
                 g = self.pose_encoder(*pose)
             with self.stage("UNet"):
-                maps = {"F": drawn, "p2d": None}  # image_to_image: the drawing stands in F's place
+                # image_to_image: the drawing stands in F's place
+                maps = {"F": drawn, "p2d": None}
                 if raster is not None:
-                    maps = {"F": raster.features, "fine": raster.fine, "alpha": raster.alpha}
+                    maps = {
+                        "F": raster.features,
+                        "fine": raster.fine,
+                        "alpha": raster.alpha,
+                    }
                     maps["p2d"] = drawn
                 generated = self.generator(S=S, g=g, **maps).to(p.dtype)
-            image, alpha = generated[:, :3], generated[:, 3:]
+            image = generated[:, :3]
+            alpha = generated[:, 3:]
         if raster is None:
             return Rendering(image, alpha, segmentation=S)
         if self.generator is None:
-            image, alpha = raster.features[:, :3], raster.alpha
+            image = raster.features[:, :3]
+            alpha = raster.alpha
         return Rendering(image, alpha, raster.features, raster.alpha, S, gaussians)
 
     def splat(
@@ -346,7 +371,9 @@ class Avatar(nn.Module):
             with self.stage("Ψ"):  # Sec. 3.3: Ĝ = G + Ψ(p)
                 face = face_code(p, frames.head, self.template)
                 pelvis = frames.hubs[:, 0]
-                gaussians = self.deformation(p, points, camera.centre, pelvis, pose_noise, face)
+                gaussians = self.deformation(
+                    p, points, camera.centre, pelvis, pose_noise, face
+                )
         else:
             return None
         bound = getattr(self.generator, "feature_bound", None)
@@ -354,7 +381,9 @@ class Avatar(nn.Module):
             return gaussians  # type: ignore[no-any-return]
         return replace(gaussians, features=bounded(gaussians.features, -bound, bound))
 
-    def points(self, p: Tensor, valid: Tensor, frames: BoneFrames, body: BodyPose | None) -> Points:
+    def points(
+        self, p: Tensor, valid: Tensor, frames: BoneFrames, body: BodyPose | None
+    ) -> Points:
         """G: Alg. 1's points, or points on the body's surface where that effect is on."""
         with self.stage("densify"):
             if self.body_points is not None:
@@ -368,7 +397,8 @@ class Avatar(nn.Module):
         """G in pose and Ψ's ΔG without noise; arguments as for `splat`."""
         assert self.deformation is not None
         frames = bone_frames(p, valid, self.template)
-        points, pelvis = self.points(p, valid, frames, body), frames.hubs[:, 0]
+        points = self.points(p, valid, frames, body)
+        pelvis = frames.hubs[:, 0]
         code = self._code(p, frames)
         return points, self.deformation.residuals(points, code, root_of(p), pelvis)
 
@@ -383,24 +413,37 @@ class Avatar(nn.Module):
         """Stores the spread of training poses ``[F, J, 3]`` in Ψ; arguments as for `splat`."""
         if isinstance(self.deformation, Deformation):
             frames = bone_frames(p, valid, self.template)
-            means, pelvis = self.points(p, valid, frames, body).means, frames.hubs[:, 0]
-            self.deformation.store_poses(self._code(p, frames), means, root_of(p), pelvis)
+            means = self.points(p, valid, frames, body).means
+            pelvis = frames.hubs[:, 0]
+            self.deformation.store_poses(
+                self._code(p, frames), means, root_of(p), pelvis
+            )
 
-    def _rasterised(self, gaussians: Gaussians, camera: Camera, supersample: bool) -> Raster:
+    def _rasterised(
+        self, gaussians: Gaussians, camera: Camera, supersample: bool
+    ) -> Raster:
         """F."""
         with self.stage("F"):
             return rasterise(
                 gaussians,
                 camera,
-                settings=self.accuracy if supersample else replace(self.accuracy, supersample=1),
+                settings=self.accuracy
+                if supersample
+                else replace(self.accuracy, supersample=1),
                 backend=self.backend,
             )
 
     def _corrected(self, rendering: Rendering, camera_index: Tensor) -> Rendering:
         """The rendering in the colours of its cameras."""
-        if self.colour is None or rendering.features is None or rendering.splat_alpha is None:
+        if (
+            self.colour is None
+            or rendering.features is None
+            or rendering.splat_alpha is None
+        ):
             return rendering
-        colour = self.colour(rendering.features[:, :3], rendering.splat_alpha, camera_index)
+        colour = self.colour(
+            rendering.features[:, :3], rendering.splat_alpha, camera_index
+        )
         image = rendering.image
         if self.generator is None:
             image = colour

@@ -9,7 +9,13 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor, nn
 from torch.nn import functional
 
-from gsgan.body import SkinnedBody, axis_angle_to_matrix, blend_transforms, forward_kinematics, skin
+from gsgan.body import (
+    SkinnedBody,
+    axis_angle_to_matrix,
+    blend_transforms,
+    forward_kinematics,
+    skin,
+)
 from gsgan.body.lbs import stretched
 from gsgan.body.skinned import WeightGradients, vertex_normals
 from gsgan.scene import BodyPose, Gaussians
@@ -17,9 +23,12 @@ from gsgan.skeleton import Points
 from gsgan.utils.checks import above, whole
 from gsgan.utils.tensors import derived
 
-NORMAL_FLOOR = 1e-2  # share of the area at rest, below which rounding errors dominate a normal
+# share of the area at rest, below which rounding errors dominate a normal
+NORMAL_FLOOR = 1e-2
 ROWS = 1024  # points compared with all others at a time
-NEAREST, BONES = 4, 6  # controls that correct a point; bones that it may follow
+# controls that correct a point; bones that it may follow
+NEAREST = 4
+BONES = 6
 LEAST = 1e-3  # a possible weight below it starts there, so that it can grow
 
 
@@ -45,22 +54,37 @@ class LearntWeights(nn.Module):
     share: Tensor
 
     def __init__(
-        self, places: Tensor, bone_index: Tensor, bone_weight: Tensor, joints: int, controls: int
+        self,
+        places: Tensor,
+        bone_index: Tensor,
+        bone_weight: Tensor,
+        joints: int,
+        controls: int,
     ) -> None:
         super().__init__()
         count = min(controls, len(places))
         at = places[farthest_points(places, count)]
-        distance, near = torch.cdist(places, at).topk(min(NEAREST, count), largest=False)
+        distance, near = torch.cdist(places, at).topk(
+            min(NEAREST, count), largest=False
+        )
         share = functional.softmax(-2 * (distance / distance.mean()).square(), dim=1)
         own = bone_weight / bone_weight.sum(1, keepdim=True)
         dense = places.new_zeros(len(places), joints).scatter_add_(1, bone_index, own)
         interpolate = places.new_zeros(len(places), count).scatter_add_(1, near, share)
         total = interpolate.sum(0).clamp_min(1e-6).unsqueeze(1)
-        around = interpolate @ (interpolate.mT @ dense / total)  # weights of the neighbourhood
+        # weights of the neighbourhood
+        around = interpolate @ (interpolate.mT @ dense / total)
         index = ((dense > LEAST) + around).topk(min(BONES, joints), dim=1).indices
         possible = (dense + around).gather(1, index) > LEAST
-        start = dense.gather(1, index).clamp_min(LEAST).log().masked_fill(~possible, -30.0)
-        for name, value in {"index": index, "start": start, "near": near, "share": share}.items():
+        start = (
+            dense.gather(1, index).clamp_min(LEAST).log().masked_fill(~possible, -30.0)
+        )
+        for name, value in {
+            "index": index,
+            "start": start,
+            "near": near,
+            "share": share,
+        }.items():
             self.register_buffer(name, value, persistent=False)
         self.field = nn.Parameter(places.new_zeros(count, joints))
 
@@ -92,14 +116,18 @@ class SkinnedPoints(nn.Module):
     chosen: Tensor
     spacing: Tensor
 
-    def __init__(self, body: SkinnedBody, count: int | None = None, controls: int = 0) -> None:
+    def __init__(
+        self, body: SkinnedBody, count: int | None = None, controls: int = 0
+    ) -> None:
         super().__init__()
         if count is not None:
             whole("points", count, 1)
         vertices = body.vertices.float()
         template = vertices if body.template is None else body.template.float()
         every = len(vertices)
-        chosen = farthest_points(template, every if count is None else min(count, every))
+        chosen = farthest_points(
+            template, every if count is None else min(count, every)
+        )
         self.parents = body.parents
         means = vertices[chosen]
         for name, value in {
@@ -152,7 +180,9 @@ class SkinnedGaussians(nn.Module):
         scale: initial standard deviation, as a share of the distance to the nearest neighbour.
     """
 
-    def __init__(self, body: SkinnedBody, points: int | None, opacity: float, scale: float) -> None:
+    def __init__(
+        self, body: SkinnedBody, points: int | None, opacity: float, scale: float
+    ) -> None:
         super().__init__()
         self.points = SkinnedPoints(body, points)
         count = len(self.points)
@@ -163,7 +193,12 @@ class SkinnedGaussians(nn.Module):
         self.logit_opacities = nn.Parameter(torch.full((count,), logit))
 
     def deformed(
-        self, A: Tensor, means: Tensor, log_scales: Tensor, logits: Tensor, features: Tensor
+        self,
+        A: Tensor,
+        means: Tensor,
+        log_scales: Tensor,
+        logits: Tensor,
+        features: Tensor,
     ) -> Gaussians:
         """Gaussians at ``means [B, N, 3]``, their shapes transformed by ``A [B, N, 3, 3]``."""
 
@@ -173,7 +208,9 @@ class SkinnedGaussians(nn.Module):
 
         axes = A @ derived(self, "axes", make, *self.parameters(recurse=False))
         opacities = torch.sigmoid(logits).expand(len(A), -1)
-        return Gaussians(means, None, None, opacities, features, covariances=axes @ axes.mT)
+        return Gaussians(
+            means, None, None, opacities, features, covariances=axes @ axes.mT
+        )
 
 
 class BodyPoints(nn.Module):
@@ -215,14 +252,19 @@ class BodyPoints(nn.Module):
         super().__init__()
         above("model.body_points.sigma", sigma)
         above("model.body_points.mean_step", mean_step)
-        self.points = SkinnedPoints(body, points, whole("model.body_points.controls", controls, 0))
-        self.sigma, self.mean_step = sigma, mean_step
+        self.points = SkinnedPoints(
+            body, points, whole("model.body_points.controls", controls, 0)
+        )
+        self.sigma = sigma
+        self.mean_step = mean_step
         self.rate = above("model.body_points.rate", rate)
         rest = (self.points.means - self.points.means.mean(dim=0)) / body_height
         self.register_buffer("rest_points", rest, persistent=False)
         normals = vertex_normals(body.vertices.float(), body.faces)[self.points.chosen]
         self.register_buffer("rest_normals", normals, persistent=False)
-        self.register_buffer("part_id", torch.arange(len(self.points)), persistent=False)
+        self.register_buffer(
+            "part_id", torch.arange(len(self.points)), persistent=False
+        )
         self.stretch = stretch
         if stretch:
             own = self.points.bone_index, self.points.bone_weight
@@ -257,8 +299,11 @@ class BodyPoints(nn.Module):
         A, t = self.points.blend(pose)
         means = skin(self.points.means, A, t)
         if not pose.bones.requires_grad:  # only the means give the weights a gradient
-            A, t = A.detach(), t.detach()
-        jacobian = stretched(A, pose.bones, *self.stretch_terms()) if self.stretch else None
+            A = A.detach()
+            t = t.detach()
+        jacobian = (
+            stretched(A, pose.bones, *self.stretch_terms()) if self.stretch else None
+        )
         scales = (self.sigma * self.points.spacing).expand(len(A), -1)
         return Points(
             means=means,
@@ -267,7 +312,9 @@ class BodyPoints(nn.Module):
             scales=scales,
             valid=torch.ones_like(scales, dtype=torch.bool),
             part_id=self.part_id,
-            normals=moved_normals(A if jacobian is None else jacobian, self.rest_normals),
+            normals=moved_normals(
+                A if jacobian is None else jacobian, self.rest_normals
+            ),
             stretched=jacobian,
         )
 
@@ -292,7 +339,8 @@ def farthest_points(vertices: Tensor, count: int) -> Tensor:
     """
     if count == len(vertices):
         return torch.arange(count)
-    axes = np.ascontiguousarray(vertices.numpy().T)  # numpy: a third of torch's time at this size
+    # numpy: a third of torch's time at this size
+    axes = np.ascontiguousarray(vertices.numpy().T)
     chosen = np.zeros(count, np.int64)
     nearest = np.full(len(vertices), np.inf, axes.dtype)
     for i in range(1, count):
@@ -304,7 +352,8 @@ def farthest_points(vertices: Tensor, count: int) -> Tensor:
 
 def neighbour_distance(points: Tensor, k: int = 1) -> Tensor:
     """``[V]`` metres from each point to its k-th nearest other point, or to the farthest one."""
-    k, found = min(k, max(1, len(points) - 1)), []
+    k = min(k, max(1, len(points) - 1))
+    found = []
     for start in range(0, len(points), ROWS):
         distance = torch.cdist(points[start : start + ROWS], points)
         rows = torch.arange(len(distance))

@@ -17,17 +17,21 @@ from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.errors import DataError
 
 VOTE_FRAMES = 100  # images, at most
-NEIGHBOUR = 4  # within the distance to this neighbour a vertex hides what is behind it: no gaps
+# within the distance to this neighbour a vertex hides what is behind it: no gaps
+NEIGHBOUR = 4
 # Metres behind the nearest surface that still count as seen: more than between neighbours on a
 # slanted surface, less than a limb's thickness.
 DEPTH_TOLERANCE = 0.03
 CELLS = 2.0  # cells of the depth map per median occluder radius
-WIDEST = 8  # cells, the largest occluder radius: a disc close to the camera would fill the map
+# cells, the largest occluder radius: a disc close to the camera would fill the map
+WIDEST = 8
 MOST_CELLS = 2048  # along a side of the depth map
 
 
 def labelled_body(
-    scene: SceneInfo, images: Subset[Frame] | None = None, vertex_labels: Tensor | None = None
+    scene: SceneInfo,
+    images: Subset[Frame] | None = None,
+    vertex_labels: Tensor | None = None,
 ) -> tuple[SkinnedBody | None, str]:
     """The body, and a clause on where its labels come from, or why there is no body.
 
@@ -47,7 +51,10 @@ def labelled_body(
         )
     if not scene.has_labels:
         guess = body.label_source == "guess"
-        return body, "parts by the body's joints" if guess else "parts are the body's own"
+        return (
+            body,
+            "parts by the body's joints" if guess else "parts are the body's own",
+        )
     fitted = bool(scene.betas) and scene.body == "free"  # to a person in other clothes
     if not fitted and body.shares_labels(scene.label_names):
         if scene.n_labels > len(body.label_names):
@@ -59,7 +66,9 @@ def labelled_body(
     numbered = ("background", *(f"part {i}" for i in range(1, scene.n_labels)))
     names = scene.label_names or numbered
     if vertex_labels is not None:
-        if len(vertex_labels) != len(body.vertices) or int(vertex_labels.max()) >= len(names):
+        if len(vertex_labels) != len(body.vertices) or int(vertex_labels.max()) >= len(
+            names
+        ):
             raise DataError(
                 f"the checkpoint's labels of {len(vertex_labels)} vertices do not fit this "
                 f"{scene.body} body or its data; give the model file and the data of the training"
@@ -83,7 +92,8 @@ class Votes(NamedTuple):
     """The result of a vote."""
 
     labels: Tensor  # [V] int64, the data's label of each vertex, never 0
-    decided: float  # share of the vertices with a majority; the others took the nearest one's
+    # share of the vertices with a majority; the others took the nearest one's
+    decided: float
     images: int  # number of images used
 
 
@@ -111,7 +121,8 @@ def class_vote(body: SkinnedBody, images: Subset[Frame], n_labels: int) -> Votes
             "check that labels, cameras and body poses belong together, or choose model=wo_seg"
         )
     labels, decided = _majority(votes)
-    decided = decided if decided.any() else votes.any(dim=1)  # ties alone: the first label
+    # ties alone: the first label
+    decided = decided if decided.any() else votes.any(dim=1)
     labels = _from_the_nearest(body.vertices.float(), labels, decided)
     return Votes(labels, float(decided.double().mean()), len(chosen))
 
@@ -156,7 +167,8 @@ def seen(points: Tensor, reach: Tensor, camera: Camera, tolerance: float) -> Ten
     ahead &= ((pixel >= -WIDEST * cell) & (pixel <= size + WIDEST * cell)).all(-1)
     if not bool(ahead.any()):
         return visible
-    radius, extent = radius[ahead], pixel[ahead].amax(0) - pixel[ahead].amin(0)
+    radius = radius[ahead]
+    extent = pixel[ahead].amax(0) - pixel[ahead].amin(0)
     cell = torch.maximum(cell, extent.max() / MOST_CELLS).clamp_min(1e-6)
     at = (pixel[ahead] / cell).floor().long()
     at = at - at.amin(0) + WIDEST
@@ -172,7 +184,9 @@ def _depth_map(at: Tensor, depth: Tensor, radius: Tensor) -> Tensor:
     `WIDEST`, the latter at most.
     """
     width, height = (at.amax(0) + 1 + WIDEST).tolist()
-    flat = torch.full((height * width,), torch.inf, dtype=depth.dtype, device=depth.device)
+    flat = torch.full(
+        (height * width,), torch.inf, dtype=depth.dtype, device=depth.device
+    )
     widest = int(radius.max())
     for dy in range(-widest, widest + 1):
         for dx in range(-widest, widest + 1):

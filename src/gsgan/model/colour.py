@@ -26,7 +26,9 @@ class ColourCorrection(nn.Module):
     def __init__(self, trained: Sequence[str], cameras: Sequence[str]) -> None:
         super().__init__()
         self.offsets = nn.Parameter(torch.zeros(len(trained), 3, 4))
-        rows = [trained.index(name) if name in trained else len(trained) for name in cameras]
+        rows = [
+            trained.index(name) if name in trained else len(trained) for name in cameras
+        ]
         # by name, not number: other data may order cameras differently
         self.register_buffer("rows", torch.tensor(rows), persistent=False)
 

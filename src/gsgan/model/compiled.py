@@ -18,7 +18,12 @@ INPUTS = ("raw", "means", "frames", "shapes", "scales", "valid")
 _Job = build.job_type(
     ("count", "threads", "stride"),
     ("mean_bound", "unit", "scale_low", "scale_high", "logit", "logit_bound"),
-    (*INPUTS, *(f"out_{name}" for name in OUTPUTS), *(f"g_{name}" for name in OUTPUTS), "d_raw"),
+    (
+        *INPUTS,
+        *(f"out_{name}" for name in OUTPUTS),
+        *(f"g_{name}" for name in OUTPUTS),
+        "d_raw",
+    ),
 )
 
 
@@ -28,7 +33,9 @@ def has_geometry(raw: Tensor, means: Tensor, *fixed: Tensor) -> bool:
         raw.device.type == "cpu"
         and raw.dtype in build.DTYPES
         and means.dtype == raw.dtype
-        and not any(x.requires_grad or x.dtype not in (raw.dtype, torch.bool) for x in fixed)
+        and not any(
+            x.requires_grad or x.dtype not in (raw.dtype, torch.bool) for x in fixed
+        )
         and native.available()
     )
 
@@ -78,9 +85,12 @@ class _Geometry(torch.autograd.Function):
         job, _held = _job(raw, fixed, ctx.numbers)
         incoming = [None if g is None else g.contiguous() for g in grads]
         d_raw = raw.new_empty(*raw.shape[:2], RESIDUALS)
-        build.point(job, [*(f"g_{name}" for name in OUTPUTS), "d_raw"], [*incoming, d_raw])
+        build.point(
+            job, [*(f"g_{name}" for name in OUTPUTS), "d_raw"], [*incoming, d_raw]
+        )
         build.function("compose_backward", raw.dtype)(ctypes.byref(job))
-        return d_raw, grads[0], *[None] * 5  # an output's mean is the given one and an offset
+        # an output's mean is the given one and an offset
+        return d_raw, grads[0], *[None] * 5
 
 
 def _job(

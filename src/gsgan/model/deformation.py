@@ -19,7 +19,8 @@ from gsgan.utils.tensors import constant, derived
 
 POSE_AXES = 20  # principal directions of the training poses' codes
 POSES = ("pose_mean", "pose_axes", "pose_spread", "place_mean", "place_spread")
-QUAT_FLOOR = 1e-12  # inside the root that normalises a quaternion: q0 + δq ≈ 0 stays finite
+# inside the root that normalises a quaternion: q0 + δq ≈ 0 stays finite
+QUAT_FLOOR = 1e-12
 
 
 @dataclass(frozen=True)
@@ -69,9 +70,14 @@ class ResidualGaussians(nn.Module):
     ) -> None:
         super().__init__()
         one_of("model.deformation: sh_degree", sh_degree, range(4))
-        self.body_height, self.features, self.sh_degree = float(body_height), features, sh_degree
-        self.active_degree = sh_degree  # raised during training; higher degrees are not computed
-        self.opacity, self.mean_bound, self.logit_bound = opacity, mean_bound, logit_bound
+        self.body_height = float(body_height)
+        self.features = features
+        self.sh_degree = sh_degree
+        # raised during training; higher degrees are not computed
+        self.active_degree = sh_degree
+        self.opacity = opacity
+        self.mean_bound = mean_bound
+        self.logit_bound = logit_bound
         self.mean_step = mean_step
         self.scale_range = (scale_min, scale_max)
         self.parts = (3, 4, 3, 1, 3 * (sh_degree + 1) ** 2, features)
@@ -80,7 +86,9 @@ class ResidualGaussians(nn.Module):
         """(parameters, multiplier of the learning rate)."""
         return [(list(self.parameters()), 1.0)]
 
-    def residuals(self, points: Points, pose: Tensor, root: Tensor, pelvis: Tensor) -> Residuals:
+    def residuals(
+        self, points: Points, pose: Tensor, root: Tensor, pelvis: Tensor
+    ) -> Residuals:
         """ΔG of posed points, from the `pose_code` and the pelvis: ``root [B, 3]`` (metres) and
         axes ``[B, 3, 3]`` (columns)."""
         raise NotImplementedError
@@ -90,7 +98,8 @@ class ResidualGaussians(nn.Module):
         start at zero and get no gradient until they are active."""
         if self.active_degree >= self.sh_degree:
             return values
-        first, last = sum(self.parts[:4]), sum(self.parts[:5])
+        first = sum(self.parts[:4])
+        last = sum(self.parts[:5])
         active = values[..., : first + 3 * (self.active_degree + 1) ** 2]
         return torch.cat([active, values[..., last:]], dim=-1)
 
@@ -98,7 +107,8 @@ class ResidualGaussians(nn.Module):
         """The residuals of raw numbers ``[B, N, ...]``, those of `_active`."""
         sizes = (*self.parts[:4], 3 * (self.active_degree + 1) ** 2, self.features)
         means, quats, scales, opacities, sh, features = raw.split(sizes, dim=-1)
-        sh, opacities = sh.unflatten(-1, (-1, 3)), opacities[..., 0]
+        sh = sh.unflatten(-1, (-1, 3))
+        opacities = opacities[..., 0]
         return Residuals(self.mean_step * means, quats, scales, opacities, sh, features)
 
     def compose(self, points: Points, residuals: Residuals, eye: Tensor) -> Gaussians:
@@ -123,21 +133,37 @@ class ResidualGaussians(nn.Module):
         self, points: Points, frames: Tensor, residuals: Residuals
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Means, covariances and opacities; in compiled code where that is possible."""
-        bound, height = self.mean_bound, self.body_height
+        bound = self.mean_bound
+        height = self.body_height
         low, high = (math.log(limit * height) for limit in self.scale_range)
         logit = math.log(self.opacity / (1 - self.opacity))
         parts = (residuals.means, residuals.quats, residuals.scales)
         raw = torch.cat([*parts, residuals.opacities.unsqueeze(-1)], dim=-1)
         fixed = (points.means, frames, points.shapes, points.scales, points.valid)
         if compiled.has_geometry(raw, *fixed):
-            numbers = ((bound or 0.0) * height, height, low, high, logit, self.logit_bound)
+            numbers = (
+                (bound or 0.0) * height,
+                height,
+                low,
+                high,
+                logit,
+                self.logit_bound,
+            )
             return compiled.geometry(raw, *fixed, numbers)
-        offset = residuals.means if bound is None else bound * torch.tanh(residuals.means)
+        offset = (
+            residuals.means if bound is None else bound * torch.tanh(residuals.means)
+        )
         means = points.means + (frames @ (offset * height).unsqueeze(-1)).squeeze(-1)
-        scales = bounded(points.scales.log().unsqueeze(-1) + residuals.scales, low, high).exp()
-        axes = points.shapes @ quaternion_to_rotation_matrix(_unit_quat(residuals.quats))
+        scales = bounded(
+            points.scales.log().unsqueeze(-1) + residuals.scales, low, high
+        ).exp()
+        axes = points.shapes @ quaternion_to_rotation_matrix(
+            _unit_quat(residuals.quats)
+        )
         axes = axes * scales.unsqueeze(-2)
-        logits = bounded(logit + residuals.opacities, -self.logit_bound, self.logit_bound)
+        logits = bounded(
+            logit + residuals.opacities, -self.logit_bound, self.logit_bound
+        )
         opacities = torch.sigmoid(logits) * points.valid.to(logits.dtype)
         return means, axes @ axes.mT, opacities
 
@@ -204,7 +230,8 @@ class Deformation(ResidualGaussians):
     pose_mean: Tensor  # [3 J] of training poses' codes
     pose_axes: Tensor  # [3 J, K] directions
     pose_spread: Tensor  # [K] standard deviations; infinite: not known
-    place_mean: Tensor  # [N, 3] of points in training poses, about the root, in body heights
+    # [N, 3] of points in training poses, about the root, in body heights
+    place_mean: Tensor
     place_spread: Tensor  # [N, 3] standard deviations; infinite: not known
 
     def __init__(
@@ -226,28 +253,43 @@ class Deformation(ResidualGaussians):
     ) -> None:
         super().__init__(body_height, **settings)
         one_of("model.deformation.pose_frame", pose_frame, ("world", "pelvis"))
-        between("model.deformation: layers", whole("model.deformation: layers", layers, 2), 2, 1000)
+        between(
+            "model.deformation: layers",
+            whole("model.deformation: layers", layers, 2),
+            2,
+            1000,
+        )
         points = rest_points.shape[0]
-        self.position_octaves, self.pose_frame = position_octaves, pose_frame
-        self.pose_limit, size = pose_limit, 3 * joints
+        self.position_octaves = position_octaves
+        self.pose_frame = pose_frame
+        self.pose_limit = pose_limit
+        size = 3 * joints
         shapes = (size,), (size, POSE_AXES), (POSE_AXES,), (points, 3), (points, 3)
         for name, shape in zip(POSES, shapes, strict=True):
             value = math.inf if name.endswith("spread") else 0.0
             self.register_buffer(name, torch.full(shape, value))
-        self.register_buffer("rest_code", positional_encoding(rest_points.float(), rest_octaves))
+        self.register_buffer(
+            "rest_code", positional_encoding(rest_points.float(), rest_octaves)
+        )
         self.embedding = nn.Parameter(0.1 * torch.randn(points, embedding))
         point_size = encoded_size(3, rest_octaves) + embedding
         self.from_point = nn.Linear(point_size, width)
-        self.from_position = nn.Linear(encoded_size(3, position_octaves), width, bias=False)
+        self.from_position = nn.Linear(
+            encoded_size(3, position_octaves), width, bias=False
+        )
         self.from_pose = nn.Linear(3 * joints, width, bias=False)
         self.from_normal = nn.Linear(3, width, bias=False) if normals else None
         self.trunk = nn.ModuleList(nn.Linear(width, width) for _ in range(layers - 1))
         self.head = nn.Linear(width, sum(self.parts))
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias)
-        self.table = nn.Parameter(torch.zeros(points, sum(self.parts))) if free_table else None
+        self.table = (
+            nn.Parameter(torch.zeros(points, sum(self.parts))) if free_table else None
+        )
 
-    def store_poses(self, codes: Tensor, means: Tensor, root: Tensor, pelvis: Tensor) -> None:
+    def store_poses(
+        self, codes: Tensor, means: Tensor, root: Tensor, pelvis: Tensor
+    ) -> None:
         """Stores the spread of the training poses' codes ``[F, 3 J]``, see `_within`, and of the
         places of their points ``[F, N, 3]``; root and pelvis as for `residuals`."""
         self.pose_mean.copy_(codes.mean(0))
@@ -270,30 +312,38 @@ class Deformation(ResidualGaussians):
 
         Source: the projection of poses of AnimatableGaussians.
         """
-        far, axes = limit * self.pose_spread, self.pose_axes
+        far = limit * self.pose_spread
+        axes = self.pose_axes
         along = ((code - self.pose_mean) @ axes).clamp(-far, far)
         return torch.where(far.isfinite().all(), self.pose_mean + along @ axes.mT, code)
 
-    def _load_from_state_dict(self, state: dict[str, Tensor], prefix: str, *rest: Any) -> None:
+    def _load_from_state_dict(
+        self, state: dict[str, Tensor], prefix: str, *rest: Any
+    ) -> None:
         for name in POSES:  # runs of before 2026-11-25 have none
             state.setdefault(prefix + name, getattr(self, name))
         super()._load_from_state_dict(state, prefix, *rest)
 
-    def residuals(self, points: Points, pose: Tensor, root: Tensor, pelvis: Tensor) -> Residuals:
+    def residuals(
+        self, points: Points, pose: Tensor, root: Tensor, pelvis: Tensor
+    ) -> Residuals:
         """See `ResidualGaussians.residuals`."""
         limit = None if self.training else self.pose_limit
         if limit is not None:
             pose = self._within(pose, limit)
         # Only a skeleton's gradient passes through Ψ's inputs, not one of skinning weights.
         means = points.means if root.requires_grad else points.means.detach()
-        position, normals = self._places(means, root, pelvis), points.normals
+        position = self._places(means, root, pelvis)
+        normals = points.normals
         if limit is not None:
             far = limit * self.place_spread
             position = self.place_mean + (position - self.place_mean).clamp(-far, far)
         if self.pose_frame == "pelvis":
             normals = normals @ pelvis
         code = positional_encoding(position, self.position_octaves)
-        if torch.is_grad_enabled() and not (code.requires_grad or normals.requires_grad):
+        if torch.is_grad_enabled() and not (
+            code.requires_grad or normals.requires_grad
+        ):
             x = self._trained(code, normals, pose)
         else:
             weight = self.from_position.weight
@@ -305,23 +355,30 @@ class Deformation(ResidualGaussians):
             x = functional.relu(x, inplace=True)
             for layer in self.trunk:
                 x = functional.relu(layer(x), inplace=True)
-        weight, bias = self._active(self.head.weight.mT).mT, self._active(self.head.bias)
+        weight = self._active(self.head.weight.mT).mT
+        bias = self._active(self.head.bias)
         raw = functional.linear(x, weight, bias)
-        return self._parted(raw if self.table is None else raw + self._active(self.table))
+        return self._parted(
+            raw if self.table is None else raw + self._active(self.table)
+        )
 
     def _point_part(self) -> Tensor:
         """``[N, width]``: the part of the first layer that depends on the point alone."""
-        layer, own = self.from_point, self.embedding
+        layer = self.from_point
+        own = self.embedding
 
         def make() -> Tensor:
             found: Tensor = layer(torch.cat([self.rest_code, own], dim=-1))
             return found
 
-        return derived(self, "point part", make, layer.weight, layer.bias, own, self.rest_code)
+        return derived(
+            self, "point part", make, layer.weight, layer.bias, own, self.rest_code
+        )
 
     def _trained(self, code: Tensor, normals: Tensor, pose: Tensor) -> Tensor:
         """The trunk's output; its layers are one operation, which computes no unused gradient."""
-        given, weights = [self.rest_code, code], [self.from_position.weight]
+        given = [self.rest_code, code]
+        weights = [self.from_position.weight]
         from_rest, from_embedding = self.from_point.weight.split(
             [self.rest_code.shape[-1], self.embedding.shape[-1]], dim=-1
         )
@@ -333,7 +390,9 @@ class Deformation(ResidualGaussians):
         weight = torch.cat([from_rest, *weights, from_embedding], dim=-1)
         bias = self.from_point.bias + self.from_pose(pose)
         layers = [x for layer in self.trunk for x in (layer.weight, layer.bias)]
-        x: Tensor = _Trunk.apply(known, self.embedding.expand(*size, -1), weight, bias, *layers)
+        x: Tensor = _Trunk.apply(
+            known, self.embedding.expand(*size, -1), weight, bias, *layers
+        )
         return x
 
 
@@ -353,7 +412,8 @@ def colour_from(eye: Tensor, means: Tensor, frames: Tensor, sh: Tensor) -> Tenso
     if sh.shape[-2] > 1:
         view = functional.normalize(means - eye[:, None], dim=-1, eps=1e-6)
         view = (frames.mT @ view.unsqueeze(-1)).squeeze(-1)
-        view = functional.normalize(view, dim=-1, eps=1e-6)  # frames of a skinned body shear
+        # frames of a skinned body shear
+        view = functional.normalize(view, dim=-1, eps=1e-6)
     return functional.relu(sh_to_colour(sh, view))
 
 
@@ -386,11 +446,22 @@ class _Trunk(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, known: Tensor, learned: Tensor, weight: Tensor, bias: Tensor, *layers: Tensor
+        ctx: Any,
+        known: Tensor,
+        learned: Tensor,
+        weight: Tensor,
+        bias: Tensor,
+        *layers: Tensor,
     ) -> Tensor:
         B, N, _ = known.shape
         inputs = torch.cat([known, learned], dim=-1).flatten(0, 1)
-        x = (inputs @ weight.mT).view(B, N, -1).add_(bias[:, None]).relu_().flatten(0, 1)
+        x = (
+            (inputs @ weight.mT)
+            .view(B, N, -1)
+            .add_(bias[:, None])
+            .relu_()
+            .flatten(0, 1)
+        )
         outputs = [x]
         for w, b in zip(layers[::2], layers[1::2], strict=True):
             outputs.append(torch.addmm(b, outputs[-1], w.mT).relu_())
@@ -404,7 +475,8 @@ class _Trunk(torch.autograd.Function):
         inputs, weight, *rest = ctx.saved_tensors
         B, N, learned = ctx.size
         count = len(rest) // 2
-        weights, outputs = rest[:count], rest[count:]
+        weights = rest[:count]
+        outputs = rest[count:]
         through = torch.ops.aten.threshold_backward  # ReLU's gradient
         g = through(grad.reshape(B * N, -1), outputs[-1], 0)
         found: list[Tensor | None] = []
@@ -413,7 +485,13 @@ class _Trunk(torch.autograd.Function):
             g = g @ w
             through.grad_input(g, x, 0, grad_input=g)
         d_learned = g @ weight[:, weight.shape[1] - learned :]
-        return None, d_learned.view(B, N, learned), g.mT @ inputs, g.view(B, N, -1).sum(1), *found
+        return (
+            None,
+            d_learned.view(B, N, learned),
+            g.mT @ inputs,
+            g.view(B, N, -1).sum(1),
+            *found,
+        )
 
 
 class _Bounded(torch.autograd.Function):

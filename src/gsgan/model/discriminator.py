@@ -30,16 +30,23 @@ class PatchDiscriminator(nn.Module):
         previous = 3
         for i, channels in enumerate(widths):
             stride = 2 if i < layers - 1 else 1
-            conv = nn.Conv2d(previous, channels, 4, stride=stride, padding=2 if stride == 1 else 1)
-            between: list[nn.Module] = [nn.InstanceNorm2d(channels)] if normal and i > 0 else []
+            conv = nn.Conv2d(
+                previous, channels, 4, stride=stride, padding=2 if stride == 1 else 1
+            )
+            between: list[nn.Module] = (
+                [nn.InstanceNorm2d(channels)] if normal and i > 0 else []
+            )
             blocks.append(nn.Sequential(conv, *between, nn.LeakyReLU(SLOPE)))
             previous = channels
         self.blocks = nn.ModuleList(blocks)
         self.logits = nn.Conv2d(previous, 1, 4, padding=2)
-        for conv in (module for module in self.modules() if isinstance(module, nn.Conv2d)):
+        for conv in (
+            module for module in self.modules() if isinstance(module, nn.Conv2d)
+        ):
             if normal:
                 nn.init.normal_(conv.weight, 0.0, 0.02)
-            else:  # He et al. 2015: without normalisation the signal would vanish under 0.02
+            # He et al. 2015: without normalisation the signal would vanish under 0.02
+            else:
                 nn.init.kaiming_normal_(conv.weight, a=SLOPE, nonlinearity="leaky_relu")
             nn.init.zeros_(conv.bias)  # type: ignore[arg-type]
 
@@ -62,11 +69,18 @@ class Discriminator(nn.Module):
     """
 
     def __init__(
-        self, *, scales: int = 2, base: int = 64, layers: int = 4, norm: str = "instance"
+        self,
+        *,
+        scales: int = 2,
+        base: int = 64,
+        layers: int = 4,
+        norm: str = "instance",
     ) -> None:
         super().__init__()
         # the name is kept for checkpoints
-        self.judges = nn.ModuleList(PatchDiscriminator(base, layers, norm) for _ in range(scales))
+        self.judges = nn.ModuleList(
+            PatchDiscriminator(base, layers, norm) for _ in range(scales)
+        )
         self.stride = 2 ** (layers - 1 + scales - 1)
 
     def forward(self, image: Tensor) -> list[list[Tensor]]:
@@ -83,5 +97,7 @@ class Discriminator(nn.Module):
         results = []
         for patches in self.judges:
             results.append(patches(image))
-            image = functional.avg_pool2d(image, 3, stride=2, padding=1, count_include_pad=False)
+            image = functional.avg_pool2d(
+                image, 3, stride=2, padding=1, count_include_pad=False
+            )
         return results

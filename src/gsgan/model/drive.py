@@ -74,14 +74,17 @@ class Drive:
     def rows(self, chosen: NDArray[np.int64]) -> Drive:
         """The frames at some indices, numbered from 0 if an index repeats."""
         own = len(set(chosen.tolist())) == len(chosen)
-        at, camera = torch.from_numpy(chosen), self.camera
+        at = torch.from_numpy(chosen)
+        camera = self.camera
         index = chosen.tolist()
         return replace(
             self,
             p=self.p[chosen],
             visibility=self.visibility[chosen],
             body=None if self.body is None else self.body[at],
-            numbers=[self.numbers[i] for i in index] if own else list(range(len(index))),
+            numbers=[self.numbers[i] for i in index]
+            if own
+            else list(range(len(index))),
             camera=None if camera is None else (camera[0][at], camera[1][at]),
         )
 
@@ -115,7 +118,9 @@ def _chosen(config: DictConfig, run: Run, fps: float) -> Drive:
         if config.retarget is False:
             raise ConfigError("retarget=false is not supported for a list of motions")
         clips = [_from_file(config, run, str(path), fps) for path in config.motion]
-        return _joined(clips, run.proportions, float(above("transition", config.transition)), fps)
+        return _joined(
+            clips, run.proportions, float(above("transition", config.transition)), fps
+        )
     if config.motion == REST:
         return rest_pose(run.proportions)
     if config.motion in SPLITS:
@@ -127,16 +132,22 @@ def _held_out(config: DictConfig, run: Run, split: str) -> Drive:
     """Frames of a split, seen by one camera."""
     dataset = run.data.dataset(split)
     if not dataset.items:
-        raise DataError(f"motion={split}: the run has no such frames ({run.data.reasons[split]})")
+        raise DataError(
+            f"motion={split}: the run has no such frames ({run.data.reasons[split]})"
+        )
     names = list(dict.fromkeys(camera for camera, _ in dataset.items))
-    camera = names[0] if config.camera is None else str(config.camera)  # "7" is parsed as a number
+    # "7" is parsed as a number
+    camera = names[0] if config.camera is None else str(config.camera)
     own = camera in names
     items = [item for item in dataset.items if item[0] == (camera if own else names[0])]
     frames = [frame for _, frame in items]
-    layout, poses = dataset.layout, dataset.layout.poses
+    layout = dataset.layout
+    poses = dataset.layout.poses
     body = None
     if poses is not None and run.avatar.needs_body:
-        stacked = (np.stack([part[f] for f in frames]) for part in (poses.theta, poses.transl))
+        stacked = (
+            np.stack([part[f] for f in frames]) for part in (poses.theta, poses.transl)
+        )
         body = BodyPose(*(torch.from_numpy(x).float() for x in stacked))
     index = torch.tensor([layout.camera_names.index(items[0][0])] * len(items))
     seen = (cat([dataset.camera(item) for item in items]), index) if own else None
@@ -150,7 +161,9 @@ def _held_out(config: DictConfig, run: Run, split: str) -> Drive:
     )
 
 
-def _joined(clips: list[Drive], proportions: Proportions, seconds: float, fps: float) -> Drive:
+def _joined(
+    clips: list[Drive], proportions: Proportions, seconds: float, fps: float
+) -> Drive:
     """Clips one after the other, with transitions of ``seconds``."""
     if not clips:
         raise ConfigError("motion=[] names no file; expected motion=[a.pose,b.pose]")
@@ -160,9 +173,15 @@ def _joined(clips: list[Drive], proportions: Proportions, seconds: float, fps: f
     parts = []
     for clip in clips:  # some may lack hands or a face
         lacking = (0, joints - clip.p.shape[1])
-        parts.append(np.pad(clip.p, ((0, 0), lacking, (0, 0)), constant_values=np.nan) @ standard.T)
+        parts.append(
+            np.pad(clip.p, ((0, 0), lacking, (0, 0)), constant_values=np.nan)
+            @ standard.T
+        )
     p = joined(parts, proportions, between) @ standard
-    text = "; ".join(clip.text for clip in clips) + f"; {seconds:g} s from each to the next"
+    text = (
+        "; ".join(clip.text for clip in clips)
+        + f"; {seconds:g} s from each to the next"
+    )
     return Drive(p, _shown(p, proportions), None, list(range(len(p))), text)
 
 
@@ -176,8 +195,10 @@ def _shown(p: Float, proportions: Proportions) -> Float:
 
 def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
     proportions = run.proportions
-    smpl, skeleton = config.smpl or run.body_file, config.skeleton
-    model, asf = (None if x is None else Path(x).expanduser() for x in (smpl, skeleton))
+    smpl = config.smpl or run.body_file
+    skeleton = config.skeleton
+    model = None if smpl is None else Path(smpl).expanduser()
+    asf = None if skeleton is None else Path(skeleton).expanduser()
     up = None if config.up is None else one_of("up", config.up, AXES)
     source = Source(proportions, model, asf, up)
     motion = read_motion(Path(path).expanduser(), source)
@@ -189,12 +210,15 @@ def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
     choice = one_of("retarget", config.retarget, ("auto", True, False))
     own = is_own(motion, proportions) if choice == "auto" else not choice
     if choice is False and motion.detached:
-        raise ConfigError(f"retarget=false is not supported for {motion.path}: leave retarget out")
+        raise ConfigError(
+            f"retarget=false is not supported for {motion.path}: leave retarget out"
+        )
     # a list of motions is retargeted, because transitions need every joint
     own = own and not motion.detached and not OmegaConf.is_list(config.motion)
     times = frame_times(len(motion), rate, fps)
     nearest = np.rint(times).astype(int)
-    visibility, body = motion.visibility[nearest], None
+    visibility = motion.visibility[nearest]
+    body = None
     if own:
         p = resampled(motion.p, rate, fps)
         if motion.body is not None and run.avatar.needs_body:
@@ -207,11 +231,22 @@ def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
             p = p if motion.detached else face_in_head(p)
             p[:, EXPRESSION] = expressed(p[:, EXPRESSION], run.face)
         p = retargeted(resampled(p, rate, fps), proportions)
-        p = placed(p, proportions, centre, fps, ground=config.ground, stay=config.stay) @ standard
+        p = (
+            placed(p, proportions, centre, fps, ground=config.ground, stay=config.stay)
+            @ standard
+        )
         visibility = _shown(p, proportions)
-    filled = f", {_frames(motion.filled)} without shoulders or hips filled" if motion.filled else ""
+    filled = (
+        f", {_frames(motion.filled)} without shoulders or hips filled"
+        if motion.filled
+        else ""
+    )
     seen = [np.isfinite(p[:, hand]).all((1, 2)).sum() for hand in HAND_JOINTS.values()]
-    hands = f", left hand in {seen[0]} frames, right hand in {seen[1]}" if p.shape[1] > BODY else ""
+    hands = (
+        f", left hand in {seen[0]} frames, right hand in {seen[1]}"
+        if p.shape[1] > BODY
+        else ""
+    )
     if p.shape[1] > EXPRESSION.start:
         hands += f", face in {np.isfinite(p[:, EXPRESSION]).any((1, 2)).sum()}"
     assumed = "" if config.motion_fps or motion.fps else " (assumed: give motion_fps)"
@@ -226,7 +261,8 @@ def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
 
 
 def _refuse_swapped(clip: Clip) -> None:
-    p, visibility = (torch.from_numpy(x[:, :BODY]) for x in (clip.p, clip.visibility))
+    p = torch.from_numpy(clip.p[:, :BODY])
+    visibility = torch.from_numpy(clip.visibility[:, :BODY])
     try:
         refuse_swapped(*sanitise(p, visibility))
     except ValueError as error:
@@ -239,9 +275,15 @@ def _frames(count: int) -> str:
 
 def rest_pose(proportions: Proportions) -> Drive:
     """The subject standing in a T-pose at the world's origin, feet at height 0."""
-    standing = proportions.rest - [0, 0, proportions.rest[list(HEELS_AND_TOES), 2].min()]
+    standing = proportions.rest - [
+        0,
+        0,
+        proportions.rest[list(HEELS_AND_TOES), 2].min(),
+    ]
     p = (standing @ upright(proportions.up))[None]
-    return Drive(p, np.array(proportions.seen, np.float64)[None], None, [0], "the rest pose")
+    return Drive(
+        p, np.array(proportions.seen, np.float64)[None], None, [0], "the rest pose"
+    )
 
 
 def joints_of(avatar: Avatar, drive: Drive, i: int) -> tuple[Tensor, Tensor]:
@@ -251,11 +293,14 @@ def joints_of(avatar: Avatar, drive: Drive, i: int) -> tuple[Tensor, Tensor]:
     Raises:
         ValueError: when fewer than three of shoulders and hips are known.
     """
-    p, seen = (torch.from_numpy(x[i : i + 1]) for x in (drive.p, drive.visibility))
+    p = torch.from_numpy(drive.p[i : i + 1])
+    seen = torch.from_numpy(drive.visibility[i : i + 1])
     return complete_skeleton(p, seen, avatar.template, avatar.limb_length_sum)
 
 
-def inputs_of(avatar: Avatar, drive: Drive, i: int) -> tuple[Tensor, Tensor, BodyPose | None]:
+def inputs_of(
+    avatar: Avatar, drive: Drive, i: int
+) -> tuple[Tensor, Tensor, BodyPose | None]:
     """`joints_of`, and the body pose where the avatar needs one: the drive's, else solved.
 
     Raises:
@@ -272,6 +317,8 @@ def distilled_of(config: DictConfig, run: Run) -> Avatar:
     `gsgan.model.harmonic.distilled`."""
     if isinstance(run.avatar.deformation, Harmonic):
         return run.avatar
-    drive = drive_of(cast(DictConfig, OmegaConf.merge(config, {"motion": "train"})), run, 1.0)
+    drive = drive_of(
+        cast(DictConfig, OmegaConf.merge(config, {"motion": "train"})), run, 1.0
+    )
     chosen = evenly_spaced(len(drive.p), DISTILLED, ends=True)
     return distilled(run.avatar, (inputs_of(run.avatar, drive, i) for i in chosen))

@@ -23,7 +23,8 @@ class Encoder(nn.Module):
 
     def __init__(self, inputs: int, channels: Sequence[int], patch: int = 1) -> None:
         super().__init__()
-        first, kernel = channels[0], {"kernel_size": 3, "padding": 1}
+        first = channels[0]
+        kernel = {"kernel_size": 3, "padding": 1}
         stem = kernel if patch == 1 else {"kernel_size": patch, "stride": patch}
         self.stem = nn.Conv2d(inputs, first, **stem)  # type: ignore[arg-type]
         self.after = nn.Conv2d(first, first, **kernel) if patch > 1 else None  # type: ignore[arg-type]
@@ -63,7 +64,8 @@ class Style(nn.Module):
     def forward(self, h: Tensor, style: Tensor, g: Tensor) -> Tensor:
         """``h`` ``[B, C, h, w]``, styled by ``style`` ``[B, Cs, h, w]`` and ``g`` ``[B, 35]`` and
         activated."""
-        rows = h.permute(0, 2, 3, 1)  # channels last in memory: channels of a pixel are a row
+        # channels last in memory: channels of a pixel are a row
+        rows = h.permute(0, 2, 3, 1)
         modulation = self.from_pose(g).unsqueeze(1)
         weight = self.from_map.weight.flatten(1).mT.expand(len(h), -1, -1)
         styles = style.permute(0, 2, 3, 1).flatten(1, 2)
@@ -79,13 +81,18 @@ class Style(nn.Module):
 class DecoderLevel(nn.Module):
     """Reduce, upsample, join the skip, then two styled convolutions."""
 
-    def __init__(self, inputs: int, channels: int, style_channels: int, pose: int) -> None:
+    def __init__(
+        self, inputs: int, channels: int, style_channels: int, pose: int
+    ) -> None:
         super().__init__()
-        self.reduce = nn.Conv2d(inputs, channels, 1)  # at low resolution, where it is cheap
+        # at low resolution, where it is cheap
+        self.reduce = nn.Conv2d(inputs, channels, 1)
         self.convs = nn.ModuleList(
             nn.Conv2d(c, channels, 3, padding=1) for c in (2 * channels, channels)
         )
-        self.styles = nn.ModuleList(Style(channels, style_channels, pose) for _ in range(2))
+        self.styles = nn.ModuleList(
+            Style(channels, style_channels, pose) for _ in range(2)
+        )
 
     def forward(self, h: Tensor, skip: Tensor, style: Tensor, g: Tensor) -> Tensor:
         first, second = self.convs
@@ -147,18 +154,24 @@ class Generator(nn.Module):
     ) -> None:
         super().__init__()
         one_of("model.generator.patch", patch, [2**i for i in range(len(multipliers))])
-        self.patch, self.stride = patch, 2 ** (len(multipliers) - 1)
+        self.patch = patch
+        self.stride = 2 ** (len(multipliers) - 1)
         channels = [base * m for m in multipliers][patch.bit_length() - 1 :]
         widths = [max(1, round(style_share * c)) for c in channels]
         inputs = feature_channels + segmentation_channels + skeleton_channels
         self.supersample = supersample
         if supersample > 1:
             inputs += feature_channels * supersample**2
-        self.rgb_skip, self.feature_bound = rgb_skip, feature_bound
+        self.rgb_skip = rgb_skip
+        self.feature_bound = feature_bound
         self.content = Encoder(inputs, channels, patch)
         self.style = Encoder(feature_channels, widths, patch)
-        self.mid = nn.ModuleList(nn.Conv2d(channels[-1], channels[-1], 3, padding=1) for _ in "ab")
-        self.mid_style = nn.ModuleList(Style(channels[-1], widths[-1], pose_channels) for _ in "ab")
+        self.mid = nn.ModuleList(
+            nn.Conv2d(channels[-1], channels[-1], 3, padding=1) for _ in "ab"
+        )
+        self.mid_style = nn.ModuleList(
+            Style(channels[-1], widths[-1], pose_channels) for _ in "ab"
+        )
         self.up = nn.ModuleList(
             DecoderLevel(channels[i + 1], channels[i], widths[i], pose_channels)
             for i in reversed(range(len(channels) - 1))
@@ -190,7 +203,8 @@ class Generator(nn.Module):
             ValueError: when ``fine`` or alpha is missing, or ``fine`` is of another size.
         """
         height, width = F.shape[-2:]
-        k, given = self.supersample, None if fine is None else tuple(fine.shape[-2:])
+        k = self.supersample
+        given = None if fine is None else tuple(fine.shape[-2:])
         expected = None if k == 1 else (k * height, k * width)
         if given != expected:
             raise ValueError(f"Generator: fine must be {expected} pixels, got {given}")
@@ -208,20 +222,29 @@ class Generator(nn.Module):
         painted = functional.pixel_shuffle(painted, self.patch)[..., :height, :width]
         if self.rgb_skip:
             if alpha is None:
-                raise ValueError("Generator: built with rgb_skip=True, so alpha must be given")
+                raise ValueError(
+                    "Generator: built with rgb_skip=True, so alpha must be given"
+                )
             return torch.cat([F[:, :3], alpha], dim=1) + painted
         return painted
 
-    def _stem(self, features: Tensor, others: list[Tensor], fine: Tensor | None) -> Tensor:
+    def _stem(
+        self, features: Tensor, others: list[Tensor], fine: Tensor | None
+    ) -> Tensor:
         """E_c's stem on F, S, p₂D and F's fine pixels, without forming them as channels."""
-        stem, k, C = self.content.stem, self.supersample, features.shape[1]
+        stem = self.content.stem
+        k = self.supersample
+        C = features.shape[1]
         if fine is None:
             padded = [self._padded(x) for x in others]
             return stem(torch.cat([features, *padded], dim=1))  # type: ignore[no-any-return]
-        stride, padding = self.patch, int(self.patch == 1)
+        stride = self.patch
+        padding = int(self.patch == 1)
         weight = stem.weight
         kernel = derived(self, "fine", lambda: fine_kernel(weight, C, k), weight)
-        rest = derived(self, "rest", lambda: channels_last(weight[:, C : -C * k * k]), weight)
+        rest = derived(
+            self, "rest", lambda: channels_last(weight[:, C : -C * k * k]), weight
+        )
         fine = self._padded(fine, k)
         h = functional.conv2d(fine, kernel, stem.bias, k * stride, k * padding)
         if others:

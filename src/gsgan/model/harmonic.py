@@ -22,9 +22,17 @@ RIDGE = 0.02
 SLOPE_RATE = 0.1  # times the constant's: else slopes overfit the training poses
 FOLLOW = ("means", "sh", "features")
 # Multipliers of the learning rate: bare parameters need higher rates than an MLP's weights.
-RATES = {"means": 1.0, "quats": 1.0, "scales": 5.0, "opacities": 25.0, "sh": 10.0, "features": 10.0}
+RATES = {
+    "means": 1.0,
+    "quats": 1.0,
+    "scales": 5.0,
+    "opacities": 25.0,
+    "sh": 10.0,
+    "features": 10.0,
+}
 UNIT = math.sqrt(4 * math.pi)  # makes the first harmonic 1, and the mean square of each
-Pose = tuple[Tensor, Tensor, BodyPose | None]  # joints, visibility, body: `gsgan.model.drive`
+# joints, visibility, body: `gsgan.model.drive`
+Pose = tuple[Tensor, Tensor, BodyPose | None]
 
 
 def harmonics(normals: Tensor) -> Tensor:
@@ -68,17 +76,26 @@ class Harmonic(ResidualGaussians):
         super().__init__(body_height, **settings)
         for name in follow:
             one_of("model.deformation.follow", name, tuple(RATES))
-        count, sizes = len(rest_points), dict(zip(RATES, self.parts, strict=True))
+        count = len(rest_points)
+        sizes = dict(zip(RATES, self.parts, strict=True))
         # lists of pairs, since dictionaries would be sorted
-        self.constants = nn.ParameterDict([(x, torch.zeros(count, n)) for x, n in sizes.items()])
+        self.constants = nn.ParameterDict(
+            [(x, torch.zeros(count, n)) for x, n in sizes.items()]
+        )
         self.slopes = nn.ParameterDict(
-            [(x, torch.zeros(count, HARMONICS - 1, n)) for x, n in sizes.items() if x in follow]
+            [
+                (x, torch.zeros(count, HARMONICS - 1, n))
+                for x, n in sizes.items()
+                if x in follow
+            ]
         )
 
     def parameter_groups(self) -> list[tuple[list[nn.Parameter], float]]:
         """(parameters, multiplier of the learning rate)."""
         constants = [([x], RATES[name]) for name, x in self.constants.items()]
-        return constants + [([x], SLOPE_RATE * RATES[name]) for name, x in self.slopes.items()]
+        return constants + [
+            ([x], SLOPE_RATE * RATES[name]) for name, x in self.slopes.items()
+        ]
 
     @property
     def coefficients(self) -> Tensor:
@@ -92,9 +109,12 @@ class Harmonic(ResidualGaussians):
             found.append(torch.cat([constant.unsqueeze(1), slopes], dim=1))
         return torch.cat(found, dim=-1)
 
-    def residuals(self, points: Points, pose: Tensor, root: Tensor, pelvis: Tensor) -> Residuals:
+    def residuals(
+        self, points: Points, pose: Tensor, root: Tensor, pelvis: Tensor
+    ) -> Residuals:
         """ΔG of posed points; pose, root and pelvis are not used."""
-        given, parts = list(self.slopes.values()), {}
+        given = list(self.slopes.values())
+        parts = {}
         if given:
             slopes = derived(self, "slopes", lambda: torch.cat(given, dim=-1), *given)
             # a product with N small matrices takes longer
@@ -103,7 +123,11 @@ class Harmonic(ResidualGaussians):
             parts = dict(zip(self.slopes, moved.split(sizes, dim=-1), strict=True))
         found = []
         for name, constant in self.constants.items():
-            used = 3 * (self.active_degree + 1) ** 2 if name == "sh" else constant.shape[-1]
+            used = (
+                3 * (self.active_degree + 1) ** 2
+                if name == "sh"
+                else constant.shape[-1]
+            )
             values = constant.expand(len(points.means), -1, -1)[..., :used]
             found.append(values + parts[name][..., :used] if name in parts else values)
         return self._parted(torch.cat(found, dim=-1))
@@ -111,7 +135,11 @@ class Harmonic(ResidualGaussians):
 
 @torch.no_grad()
 def distilled(
-    avatar: Avatar, poses: Iterable[Pose], *, follow: Sequence[str] = FOLLOW, ridge: float = RIDGE
+    avatar: Avatar,
+    poses: Iterable[Pose],
+    *,
+    follow: Sequence[str] = FOLLOW,
+    ridge: float = RIDGE,
 ) -> Avatar:
     """A frozen copy of an avatar with `Harmonic` residuals in Ψ's place: the least-squares fit to
     Ψ's over poses. An avatar that has such residuals already is copied.
@@ -127,12 +155,22 @@ def distilled(
     Raises:
         ConfigError: when the avatar has no Ψ.
     """
-    found, psi = deepcopy(avatar), avatar.deformation
+    found = deepcopy(avatar)
+    psi = avatar.deformation
     if psi is None:
-        raise ConfigError("only avatars with Ψ have residuals to distil (model=full, splat_only)")
+        raise ConfigError(
+            "only avatars with Ψ have residuals to distil (model=full, splat_only)"
+        )
     if isinstance(psi, Harmonic):
         return found
-    same = ("features", "sh_degree", "opacity", "mean_bound", "mean_step", "logit_bound")
+    same = (
+        "features",
+        "sh_degree",
+        "opacity",
+        "mean_bound",
+        "mean_step",
+        "logit_bound",
+    )
     settings: dict[str, Any] = {name: getattr(psi, name) for name in same}
     settings["scale_min"], settings["scale_max"] = psi.scale_range
     fitted = Harmonic(avatar.rest_points, psi.body_height, follow=follow, **settings)
@@ -153,7 +191,10 @@ def _samples(avatar: Avatar, poses: Iterable[Pose]) -> Iterator[tuple[Tensor, Te
     for p, visibility, given in poses:
         body = avatar.body_pose(p, visibility) if given is None else given
         points, residuals = avatar.residuals(p, visibility > 0, body)
-        values = [getattr(residuals, name).reshape(points.scales.numel(), -1) for name in RATES]
+        values = [
+            getattr(residuals, name).reshape(points.scales.numel(), -1)
+            for name in RATES
+        ]
         yield harmonics(points.normals[0]), torch.cat(values, dim=-1)
 
 
@@ -169,11 +210,17 @@ def ridge_regression(
     Returns:
         ``[N, K, C]`` and ``[N, C]``, float64.
     """
-    count, gram, moment = 0, torch.zeros(()), torch.zeros(())
+    count = 0
+    gram = torch.zeros(())
+    moment = torch.zeros(())
     for inputs, outputs in samples:
-        x, y = inputs.double().unsqueeze(-1), outputs.double().unsqueeze(-2)
-        count, gram, moment = count + 1, gram + x @ x.mT, moment + x @ y
+        x = inputs.double().unsqueeze(-1)
+        y = outputs.double().unsqueeze(-2)
+        count = count + 1
+        gram = gram + x @ x.mT
+        moment = moment + x @ y
     penalty = torch.full_like(gram[0, 0], ridge)
     penalty[0] = 0
-    gram, moment = gram / count, moment / count
+    gram = gram / count
+    moment = moment / count
     return torch.linalg.solve(gram + torch.diag(penalty), moment), moment[:, 0]

@@ -90,7 +90,9 @@ class PoseGraph(nn.Module):
                 GraphLayer(alone, width, joint_channels),
             ]
         )
-        self.register_buffer("edges", torch.tensor(template.edges).long(), persistent=False)
+        self.register_buffer(
+            "edges", torch.tensor(template.edges).long(), persistent=False
+        )
         self.channels = len(template.edges)
         inputs = 2 * joint_channels
         start = torch.randn(self.channels, inputs) * (READOUT_START / math.sqrt(inputs))

@@ -48,11 +48,22 @@ class Rendering:
 
     def pasted(self, window: Window) -> Rendering:
         """The same in the whole image, background outside the window."""
-        names = ("image", "alpha", "features", "splat_alpha", "segmentation", "corrected")
-        held = {name: value for name in names if (value := getattr(self, name)) is not None}
+        names = (
+            "image",
+            "alpha",
+            "features",
+            "splat_alpha",
+            "segmentation",
+            "corrected",
+        )
+        held = {
+            name: value for name in names if (value := getattr(self, name)) is not None
+        }
         whole = {name: window.paste(value) for name, value in held.items()}
         if self.segmentation is not None:
             inside = window.paste(torch.ones_like(self.segmentation[:, :1]))
             parts = whole["segmentation"]
-            whole["segmentation"] = torch.cat([parts[:, :1] + (1 - inside), parts[:, 1:]], dim=1)
+            whole["segmentation"] = torch.cat(
+                [parts[:, :1] + (1 - inside), parts[:, 1:]], dim=1
+            )
         return replace(self, **whole)  # type: ignore[arg-type]

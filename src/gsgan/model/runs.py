@@ -40,7 +40,9 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 
 
-def load(run: str | Path, *, smpl: str | Path | None = None, device: str = "auto") -> Avatar:
+def load(
+    run: str | Path, *, smpl: str | Path | None = None, device: str = "auto"
+) -> Avatar:
     """The trained, frozen avatar of a run folder, to `render`; the dataset is not needed.
 
     Args:
@@ -53,11 +55,14 @@ def load(run: str | Path, *, smpl: str | Path | None = None, device: str = "auto
             model file is missing.
     """
     folder = Path(run).expanduser()
-    config, checkpoint = read_config(folder), read_checkpoint(folder / CHECKPOINT)
+    config = read_config(folder)
+    checkpoint = read_checkpoint(folder / CHECKPOINT)
     return avatar_of(folder, config, checkpoint, smpl).to(pick_device(device))
 
 
-def load_avatar(folder: Path, config: DictConfig, data: GsganData) -> tuple[Avatar, list[str]]:
+def load_avatar(
+    folder: Path, config: DictConfig, data: GsganData
+) -> tuple[Avatar, list[str]]:
     """The trained, frozen avatar of a run folder, to render its data, and the marks of its tables.
 
     Args:
@@ -65,17 +70,23 @@ def load_avatar(folder: Path, config: DictConfig, data: GsganData) -> tuple[Avat
         config: of the run.
         data: its dataset, from which the body model file and the order of the cameras are taken.
     """
-    checkpoint, info = read_checkpoint(folder / CHECKPOINT), data.info
+    checkpoint = read_checkpoint(folder / CHECKPOINT)
+    info = data.info
     scene = replace(
         stored_scene(checkpoint["gsgan"]["scene"]),
         body_file=info.body_file,
         camera_names=info.camera_names,
     )
-    return _trained(folder, config, checkpoint, scene), list(checkpoint["gsgan"]["marks"])
+    return _trained(folder, config, checkpoint, scene), list(
+        checkpoint["gsgan"]["marks"]
+    )
 
 
 def avatar_of(
-    folder: Path, config: DictConfig, checkpoint: dict[str, Any], smpl: str | Path | None = None
+    folder: Path,
+    config: DictConfig,
+    checkpoint: dict[str, Any],
+    smpl: str | Path | None = None,
 ) -> Avatar:
     """The trained, frozen avatar of a checkpoint.
 
@@ -106,7 +117,9 @@ def _trained(
         avatar = build_avatar(config, scene, effects=effects, vertex_labels=labels)
     except (TypeError, ValueError, OverflowError) as error:
         reason = str(error).split("\n")[0]
-        raise DataError(f"{folder / CONFIG}: no avatar can be built from it: {reason}") from error
+        raise DataError(
+            f"{folder / CONFIG}: no avatar can be built from it: {reason}"
+        ) from error
     if "segmentation.quats" in state and avatar.segmentation is None:
         raise DataError(
             f"{folder}: trained with S, which cannot be built now: {avatar.segmentation_why}; set "
@@ -148,10 +161,16 @@ class Run:
             DataError: when the folder holds no run, or a damaged one.
         """
         if config.run is None:
-            raise ConfigError("run is not set: give run=<the folder that gsgan.train printed>")
-        folder, paths = Path(config.run).expanduser(), DataPaths.from_config(config)
-        stored, checkpoint = read_config(folder), read_checkpoint(folder / CHECKPOINT)
-        avatar = avatar_of(folder, stored, checkpoint, paths.smpl).to(pick_device(config.device))
+            raise ConfigError(
+                "run is not set: give run=<the folder that gsgan.train printed>"
+            )
+        folder = Path(config.run).expanduser()
+        paths = DataPaths.from_config(config)
+        stored = read_config(folder)
+        checkpoint = read_checkpoint(folder / CHECKPOINT)
+        avatar = avatar_of(folder, stored, checkpoint, paths.smpl).to(
+            pick_device(config.device)
+        )
         return cls(folder, stored, checkpoint["gsgan"], avatar, paths)
 
     @cached_property

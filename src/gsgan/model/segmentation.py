@@ -73,13 +73,18 @@ class Segmentation(SkinnedGaussians):
         self.common: nn.Parameter | None = None
         if not labelled:
             self.requires_grad_(False)
-            self.common = nn.Parameter(torch.zeros(2))  # added to all log scales, and all logits
+            # added to all log scales, and all logits
+            self.common = nn.Parameter(torch.zeros(2))
 
     def parameter_groups(self) -> list[tuple[list[nn.Parameter], float]]:
         """(parameters, multiplier of the learning rate); the multipliers are ours."""
         if self.common is not None:
             return [([self.common], 10.0)]
-        return [([self.quats], 1.0), ([self.log_scales], 5.0), ([self.logit_opacities], 50.0)]
+        return [
+            ([self.quats], 1.0),
+            ([self.log_scales], 5.0),
+            ([self.logit_opacities], 50.0),
+        ]
 
     @property
     def classes(self) -> int:
@@ -109,21 +114,30 @@ class Segmentation(SkinnedGaussians):
         log_scales: Tensor = self.log_scales
         logits: Tensor = self.logit_opacities
         if self.common is not None:
-            log_scales, logits = log_scales + self.common[0], logits + self.common[1]
-        means, features = skin(self.points.means, A, t), self.one_hot.expand(len(A), -1, -1)
+            log_scales = log_scales + self.common[0]
+            logits = logits + self.common[1]
+        means = skin(self.points.means, A, t)
+        features = self.one_hot.expand(len(A), -1, -1)
         return self.deformed(A, means, log_scales, logits, features)
 
     def raster(self, pose: BodyPose, camera: Camera) -> Raster:
         """The splatted body: features are its classes, alpha its silhouette."""
         with full_precision(pose.theta.device):
             return rasterise(
-                self.gaussians(pose), camera, settings=self.accuracy, backend=self.backend
+                self.gaussians(pose),
+                camera,
+                settings=self.accuracy,
+                backend=self.backend,
             )
 
     def forward(self, pose: BodyPose, camera: Camera) -> Tensor:
         """S ``[B, classes, H, W]``: probabilities; channel 0 is the rest."""
         raster = self.raster(pose, camera)
-        covered = raster.alpha if self.all_classed else raster.features.sum(dim=1, keepdim=True)
+        covered = (
+            raster.alpha
+            if self.all_classed
+            else raster.features.sum(dim=1, keepdim=True)
+        )
         return torch.cat([(1 - covered).clamp_min(0), raster.features], dim=1)
 
     def loss(self, frame: Frame) -> Tensor:
@@ -160,7 +174,9 @@ def segmentation_loss(segmentation: Tensor, labels: Tensor) -> Tensor:
     return total / (labels != IGNORE).sum().clamp_min(1)
 
 
-def silhouette_loss(alpha: Tensor, mask: Tensor, unsure: Tensor | None = None) -> Tensor:
+def silhouette_loss(
+    alpha: Tensor, mask: Tensor, unsure: Tensor | None = None
+) -> Tensor:
     """Binary cross-entropy of the splatted body's silhouette, for data without part labels.
 
     Args:
@@ -199,7 +215,10 @@ class ClassMap:
 
 
 def class_map(
-    label_names: Sequence[str], vertex_labels: Tensor, mode: str = "body", face: bool = False
+    label_names: Sequence[str],
+    vertex_labels: Tensor,
+    mode: str = "body",
+    face: bool = False,
 ) -> ClassMap:
     """The classes of a mode.
 

@@ -25,7 +25,12 @@ FREE_KEYS = (
     *("trainer", "logger", "resume", "evaluate", "grid_rows", "lpips", "cpu_hours"),
     *("objective", "page"),
     *("data.root", "data.smpl", "data.workers", "data.cache_mb", "data.val_images"),
-    *("data.source.workers", "training.max_skipped", "training.skip_window", "model.backend"),
+    *(
+        "data.source.workers",
+        "training.max_skipped",
+        "training.skip_window",
+        "model.backend",
+    ),
 )
 
 
@@ -79,7 +84,8 @@ def _read_yaml(path: Path) -> DictConfig:
 
 def load_config(folder: Path, paths: DataPaths | None = None) -> DictConfig:
     """`read_config` with absolute paths of dataset and body model file, which must exist."""
-    config, paths = read_config(folder), paths or DataPaths()
+    config = read_config(folder)
+    paths = paths or DataPaths()
     if paths.smpl is not None and OmegaConf.select(config, "data.smpl") is None:
         # skeletons from SMPL fits are others: the scores would be of another model
         raise ConfigError(f"data_smpl: {folder} was trained without a body model file")
@@ -148,18 +154,27 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
-        raise DataError(f"{path}: no such file; the run has no checkpoint yet") from error
+        raise DataError(
+            f"{path}: no such file; the run has no checkpoint yet"
+        ) from error
     except Exception as error:
-        raise DataError(f"{path}: not a readable checkpoint; remove it to start over") from error
-    if not (isinstance(checkpoint, dict) and {"gsgan", "state_dict"} <= checkpoint.keys()):
-        raise DataError(f"{path}: not a checkpoint of gsgan (no entries 'gsgan' and 'state_dict')")
+        raise DataError(
+            f"{path}: not a readable checkpoint; remove it to start over"
+        ) from error
+    if not (
+        isinstance(checkpoint, dict) and {"gsgan", "state_dict"} <= checkpoint.keys()
+    ):
+        raise DataError(
+            f"{path}: not a checkpoint of gsgan (no entries 'gsgan' and 'state_dict')"
+        )
     return checkpoint
 
 
 def stored_scene(plain: Mapping[str, Any]) -> SceneInfo:
     """The facts about a scene that a checkpoint holds as plain values."""
     values: dict[str, Any] = {
-        key: tuple(value) if isinstance(value, list) else value for key, value in plain.items()
+        key: tuple(value) if isinstance(value, list) else value
+        for key, value in plain.items()
     }
     for key, kind in (
         ("surface", SurfaceColours),

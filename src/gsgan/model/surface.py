@@ -48,9 +48,13 @@ class SurfaceGaussians(SkinnedGaussians):
         super().__init__(body, points, opacity, scale)
         one_of("model.surface: sh_degree", sh_degree, range(4))
         count = len(self.points)
-        self.features, self.sh_degree, self.body_height = 0, sh_degree, float(body_height)
-        self.active_degree = sh_degree  # raised during training; higher degrees are not computed
-        self.mean_bound, self.logit_bound = mean_bound, logit_bound
+        self.features = 0
+        self.sh_degree = sh_degree
+        self.body_height = float(body_height)
+        # raised during training; higher degrees are not computed
+        self.active_degree = sh_degree
+        self.mean_bound = mean_bound
+        self.logit_bound = logit_bound
         self.scale_range = (scale_min, scale_max)
         self.offsets = nn.Parameter(torch.zeros(count, 3))
         self.sh = nn.Parameter(torch.zeros(count, (sh_degree + 1) ** 2, 3))

@@ -47,7 +47,9 @@ def read_amc(amc: Path, asf: Path) -> tuple[RigMotion, float]:
     try:
         bones, parents, scale, radians = _skeleton(asf)
     except (ValueError, KeyError, IndexError, ArithmeticError) as error:
-        raise DataError(f"{asf} is not a complete ASF skeleton ({_reason(error)})") from error
+        raise DataError(
+            f"{asf} is not a complete ASF skeleton ({_reason(error)})"
+        ) from error
     try:
         return _motion(amc, bones, parents, radians), scale
     except (ValueError, KeyError, IndexError) as error:
@@ -65,7 +67,10 @@ def _lines(path: Path) -> list[list[str]]:
         text = read_text(path, errors="replace")
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror}") from error
-    lines = (line.split("#")[0].replace("(", " ").replace(")", " ") for line in text.splitlines())
+    lines = (
+        line.split("#")[0].replace("(", " ").replace(")", " ")
+        for line in text.splitlines()
+    )
     return [words for line in lines if (words := line.split())]
 
 
@@ -76,9 +81,15 @@ class _Bone:
         direction = np.array(words.get("direction", ["0", "0", "0"]), dtype=float)
         self.end = direction * float(words.get("length", ["0"])[0])
         self.dof = [name.upper() for name in words.get("dof", words.get("order", []))]
-        axis = words["axis"] if len(words["axis"]) > 3 else [*words["orientation"], *words["axis"]]
+        axis = (
+            words["axis"]
+            if len(words["axis"]) > 3
+            else [*words["orientation"], *words["axis"]]
+        )
         order = axis[3]
-        self.C = _turn(np.array(axis[:3], dtype=float) * radians, [f"R{x}" for x in order.upper()])
+        self.C = _turn(
+            np.array(axis[:3], dtype=float) * radians, [f"R{x}" for x in order.upper()]
+        )
 
 
 def _turn(angles: Array, names: list[str]) -> Array:
@@ -92,7 +103,9 @@ def _turn(angles: Array, names: list[str]) -> Array:
 
 def _skeleton(path: Path) -> tuple[dict[str, _Bone], dict[str, str], float, float]:
     """Bones and parents by name, metres in a unit, radians in an angle."""
-    section, bones, parents = "", {}, {}
+    section = ""
+    bones = {}
+    parents = {}
     units: dict[str, list[str]] = {"length": ["1"], "angle": ["deg"]}
     root: dict[str, list[str]] = {}
     bone: dict[str, list[str]] = {}
@@ -117,8 +130,43 @@ def _skeleton(path: Path) -> tuple[dict[str, _Bone], dict[str, str], float, floa
     bones = {ROOT: _Bone(root, radians)}
     bones |= {bone["name"][0]: _Bone(bone, radians) for bone in raw}
     if lost := [name for name in bones if name != ROOT and name not in parents]:
-        raise ValueError(f"the hierarchy lacks {', '.join(lost[:3])}; is the file cut off?")
+        raise ValueError(
+            f"the hierarchy lacks {', '.join(lost[:3])}; is the file cut off?"
+        )
     return bones, parents, INCH / float(units["length"][0]), radians
+
+
+def _read_frames(
+    path: Path, bones: dict[str, _Bone], names: list[str]
+) -> dict[str, Array]:
+    """``[F, n]`` numbers of each bone that moves, in the order of its degrees of freedom."""
+    frames: list[dict[str, list[float]]] = []
+    for words in _lines(path):
+        if len(words) == 1 and words[0].isdigit():
+            frames.append({})
+        elif frames:
+            if words[0] not in bones:
+                raise ValueError(
+                    f"it moves a bone {words[0]}, which the skeleton lacks"
+                )
+            frames[-1][words[0]] = [float(x) for x in words[1:]]
+    if not frames:
+        raise ValueError("it has no frames")
+
+    moving = [name for name in names if bones[name].dof]
+    for number, frame in enumerate(frames):
+        for name in moving:
+            given = len(frame.get(name, ()))
+            expected = len(bones[name].dof)
+            if given != expected:
+                raise ValueError(
+                    f"frame {number} gives {given} of {expected} numbers for {name}"
+                )
+
+    values = {name: np.array([frame[name] for frame in frames]) for name in moving}
+    if not all(np.isfinite(v).all() for v in values.values()):
+        raise ValueError("a number is not finite")
+    return values
 
 
 def _motion(
@@ -126,36 +174,26 @@ def _motion(
 ) -> RigMotion:
     names = [ROOT]  # parents first
     while len(names) < len(bones):
-        more = [n for n, parent in parents.items() if parent in names and n not in names]
+        more = [
+            n for n, parent in parents.items() if parent in names and n not in names
+        ]
         if not more:
-            raise ValueError("its hierarchy has bones that are not connected to the root")
+            raise ValueError(
+                "its hierarchy has bones that are not connected to the root"
+            )
         names += more
-    frames: list[dict[str, list[float]]] = []
-    for words in _lines(path):
-        if len(words) == 1 and words[0].isdigit():
-            frames.append({})
-        elif frames:
-            if words[0] not in bones:
-                raise ValueError(f"it moves a bone {words[0]}, which the skeleton lacks")
-            frames[-1][words[0]] = [float(x) for x in words[1:]]
-    moving = [name for name in names if bones[name].dof]
-    for number, frame in enumerate(frames):
-        for name in moving:
-            if len(frame.get(name, ())) != len(bones[name].dof):
-                raise ValueError(
-                    f"frame {number} gives {len(frame.get(name, ()))} of {len(bones[name].dof)} "
-                    f"numbers for {name}"
-                )
-    if not frames:
-        raise ValueError("it has no frames")
-    values = {name: np.array([frame[name] for frame in frames]) for name in moving}
-    if not all(np.isfinite(v).all() for v in values.values()):
-        raise ValueError("a number is not finite")
+    values = _read_frames(path, bones, names)
+    frames = len(values[ROOT])
     index = {name: j for j, name in enumerate(names)}
-    rotations = np.empty((len(frames), len(names), 3, 3))
+    rotations = np.empty((frames, len(names), 3, 3))
     for name in names:
-        C, j = bones[name].C, index[name]
-        local = C @ _turn(values[name] * radians, bones[name].dof) @ C.T if name in values else None
+        C = bones[name].C
+        j = index[name]
+        local = (
+            C @ _turn(values[name] * radians, bones[name].dof) @ C.T
+            if name in values
+            else None
+        )
         up = rotations[:, index[parents[name]]] if name != ROOT else np.eye(3)
         rotations[:, j] = up if local is None else up @ local
     place = [bones[ROOT].dof.index(axis) for axis in ("TX", "TY", "TZ")]
@@ -165,9 +203,15 @@ def _motion(
     ends = [name for name in names if name not in parents.values()]
     return RigMotion(
         names=(*plain, *(f"{name} end" for name in ends)),
-        parents=(-1, *(index[parents[name]] for name in names[1:]), *(index[n] for n in ends)),
+        parents=(
+            -1,
+            *(index[parents[name]] for name in names[1:]),
+            *(index[n] for n in ends),
+        ),
         offsets=np.concatenate([offsets, [bones[name].end for name in ends]]),
-        rotations=np.concatenate([rotations, rotations[:, [index[n] for n in ends]]], axis=1),
+        rotations=np.concatenate(
+            [rotations, rotations[:, [index[n] for n in ends]]], axis=1
+        ),
         root=values[ROOT][:, place],
         frame_time=1 / FPS,
     )

@@ -34,19 +34,27 @@ def read_bvh(path: Path) -> RigMotion:
     try:
         text = read_text(path, errors="replace")
     except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror}; give a .bvh file") from error
+        raise DataError(
+            f"{path} cannot be read: {error.strerror}; give a .bvh file"
+        ) from error
     try:
         # Some programs end the file with control characters, as DOS did.
-        hierarchy, *motion = re.split(r"\bMOTION\b", text.rstrip("\x1a\0 \r\n\t"), maxsplit=1)
+        hierarchy, *motion = re.split(
+            r"\bMOTION\b", text.rstrip("\x1a\0 \r\n\t"), maxsplit=1
+        )
         words = re.sub("([{}])", r" \1 ", hierarchy).split()
         if words[:1] != ["HIERARCHY"] or not motion:
             raise ValueError("HIERARCHY and MOTION are expected")
         joints = _read_hierarchy(words[1:])
-        values, frame_time = _read_values(motion[0], sum(len(j.channels) for j in joints))
+        values, frame_time = _read_values(
+            motion[0], sum(len(j.channels) for j in joints)
+        )
         return _rig_motion(joints, values, frame_time)
     except (ValueError, IndexError, StopIteration) as error:
         reason = error if isinstance(error, ValueError) else "it ends early"
-        raise DataError(f"{path} is not a complete BVH file ({reason}): export it again") from error
+        raise DataError(
+            f"{path} is not a complete BVH file ({reason}): export it again"
+        ) from error
 
 
 def _read_hierarchy(words: list[str]) -> list[_Joint]:
@@ -58,7 +66,9 @@ def _read_hierarchy(words: list[str]) -> list[_Joint]:
         if word in ("ROOT", "JOINT", "End"):
             if (word == "ROOT") == bool(above):
                 raise ValueError(f"the {word} {next(rest)} is out of place")
-            joint = _Joint(next(rest) + " end" * (word == "End"), above[-1] if above else -1)
+            joint = _Joint(
+                next(rest) + " end" * (word == "End"), above[-1] if above else -1
+            )
             while (word := next(rest)) != "{":
                 joint.name += " " + word
             above.append(len(joints))
@@ -81,7 +91,8 @@ def _read_values(text: str, columns: int) -> tuple[Array, float]:
     head = re.match(r"\s*Frames\s*:\s*(\d+)\s+Frame\s+Time\s*:\s*(\S+)", text)
     if head is None:
         raise ValueError("'Frames:' and 'Frame Time:' are expected after MOTION")
-    frames, frame_time = int(head[1]), float(head[2])
+    frames = int(head[1])
+    frame_time = float(head[2])
     numbers = text[head.end() :].split()
     if frames < 1 or not frame_time > 0 or len(numbers) != frames * columns:
         raise ValueError(
@@ -106,7 +117,8 @@ def _rig_motion(joints: list[_Joint], values: Array, frame_time: float) -> RigMo
         R = np.eye(3) if joint.parent < 0 else rotations[:, joint.parent]
         given = local[:, j].copy()
         for channel in joint.channels:
-            axis, column = "XYZ".index(channel[0].upper()), next(columns)
+            axis = "XYZ".index(channel[0].upper())
+            column = next(columns)
             if channel.lower().endswith("rotation"):
                 R = R @ rotation(np.radians(column[:, None]) * np.eye(3)[axis])
             else:

@@ -38,13 +38,15 @@ class Character:
     labels: Ints  # [F] part of each face, index into label_names, at least 1
     label_names: tuple[str, ...]  # background first; the names of the free body
     surfaces: tuple[Surface, ...]
-    bones: tuple[str, ...]  # parents first; Mixamo's names without prefix: Hips, LeftUpLeg, …
+    # parents first; Mixamo's names without prefix: Hips, LeftUpLeg, …
+    bones: tuple[str, ...]
     parents: Ints  # [J], -1 for the root
     joints: Array  # [J, 3] rest positions
     bone_index: Ints  # [V, 4]
     bone_weight: Array  # [V, 4], sums to 1
     shapes: dict[str, Array]  # face shape name → [V, 3] offsets at weight 1
-    anchor_names: tuple[str, ...]  # landmarks: 33 MediaPipe, then 42 of the hands, then the face's
+    # landmarks: 33 MediaPipe, then 42 of the hands, then the face's
+    anchor_names: tuple[str, ...]
     anchor_joint: Ints  # [L] the bone whose joint is the landmark, -1 for vertices
     anchor_vertex: Ints  # [L] the vertex that is the landmark, -1 for joints
 
@@ -59,17 +61,22 @@ class Character:
             offsets: ``[V, 3]`` metres to add at rest, such as weighted face shapes.
         """
         rest = self.vertices if offsets is None else self.vertices + offsets
-        vertices, normals = np.zeros_like(rest), np.zeros_like(rest)
+        vertices = np.zeros_like(rest)
+        normals = np.zeros_like(rest)
         for index, weight in zip(self.bone_index.T, self.bone_weight.T, strict=True):
             R = rotations[index]
-            local = np.einsum("vij,vj->vi", R, rest - self.joints[index]) + joints[index]
+            local = (
+                np.einsum("vij,vj->vi", R, rest - self.joints[index]) + joints[index]
+            )
             vertices += weight[:, None] * local
             normals += weight[:, None] * np.einsum("vij,vj->vi", R, self.normals)
         return vertices, unit(normals)
 
     def dominant_bones(self) -> Ints:
         """``[V]`` the bone of the largest weight of each vertex."""
-        return self.bone_index[np.arange(len(self.vertices)), self.bone_weight.argmax(axis=1)]
+        return self.bone_index[
+            np.arange(len(self.vertices)), self.bone_weight.argmax(axis=1)
+        ]
 
     def with_descendants(self, bone: int) -> list[int]:
         """A bone and all bones below it."""
@@ -82,7 +89,9 @@ class Character:
     def landmarks(self, vertices: Array, joints: Array) -> Array:
         """``[L, 3]`` landmarks of a posed mesh, in the order of ``anchor_names``."""
         of_joint = self.anchor_joint[:, None] >= 0
-        return np.where(of_joint, joints[self.anchor_joint], vertices[self.anchor_vertex])
+        return np.where(
+            of_joint, joints[self.anchor_joint], vertices[self.anchor_vertex]
+        )
 
 
 @dataclass(frozen=True)

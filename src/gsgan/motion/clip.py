@@ -37,8 +37,10 @@ Bool = NDArray[np.bool_]
 TRUNK = (*SHOULDERS, *HIPS)
 AXES = ("x", "y", "z", "-x", "-y", "-z")
 FPS = 30.0  # assumed where neither the file nor the user gives it
-OWN = 0.02  # largest relative difference of bone lengths at which a motion is the subject's own
-SELDOM = 0.2  # a joint seen in a smaller share of the frames counts as a false detection
+# largest relative difference of bone lengths at which a motion is the subject's own
+OWN = 0.02
+# a joint seen in a smaller share of the frames counts as a false detection
+SELDOM = 0.2
 ROUNDED = 5e-4  # relative difference of a rate from a whole number
 JUST_BEYOND = 0.05  # of a frame
 GAP = 5  # frames: in a longer gap a hand or face is not seen
@@ -92,7 +94,9 @@ def checked(motion: Clip, least_visibility: float) -> Clip:
     """
     if not len(motion):
         raise DataError(f"{motion.path} has no frames; expected a motion")
-    known: Bool = np.isfinite(motion.p).all(-1) & (motion.visibility >= least_visibility)
+    known: Bool = np.isfinite(motion.p).all(-1) & (
+        motion.visibility >= least_visibility
+    )
     known[:, list(TRUNK)] = np.isfinite(motion.p[:, list(TRUNK)]).all(-1) & (
         motion.visibility[:, TRUNK] > 0
     )
@@ -102,21 +106,26 @@ def checked(motion: Clip, least_visibility: float) -> Clip:
             f"{motion.path}: none of {len(motion)} frames has shoulders and hips (NaN, or not seen)"
         )
     p = np.where(known[..., None], motion.p, np.nan)
-    visibility, body = np.where(known, motion.visibility, 0.0), motion.body
+    visibility = np.where(known, motion.visibility, 0.0)
+    body = motion.body
     before, after, share = neighbours(good)
     nearest = np.where(share > 0.5, after, before)
     if body is not None:
-        share, body = np.rint(share), body[torch.from_numpy(nearest)]
-    q, shown = mixed(p[before], p[after], share), visibility[nearest]
+        share = np.rint(share)
+        body = body[torch.from_numpy(nearest)]
+    q = mixed(p[before], p[after], share)
+    shown = visibility[nearest]
     q = np.where(np.isfinite(q), q, p[nearest])
-    q[:, BODY:], shown[:, BODY:] = p[:, BODY:], visibility[:, BODY:]
+    q[:, BODY:] = p[:, BODY:]
+    shown[:, BODY:] = visibility[:, BODY:]
     return replace(motion, p=q, visibility=shown, body=body, filled=int((~good).sum()))
 
 
 def neighbours(known: Bool) -> tuple[NDArray[np.int64], NDArray[np.int64], Float]:
     """Per frame of ``known [F]``, the nearest known frames before and after it (itself if known;
     the same one twice where there is none on a side), and the share of the latter in [0, 1]."""
-    at, times = np.flatnonzero(known), np.arange(len(known))
+    at = np.flatnonzero(known)
+    times = np.arange(len(known))
     after = at[np.searchsorted(at, times).clip(max=len(at) - 1)]
     before = at[(np.searchsorted(at, times, side="right") - 1).clip(min=0)]
     return before, after, ((times - before) / np.maximum(after - before, 1)).clip(0, 1)
@@ -132,8 +141,11 @@ def is_own(motion: Clip, subject: Proportions) -> bool:
     """Whether the motion's bones are as long as the subject's: it needs no retargeting."""
     with np.errstate(invalid="ignore"):
         found = bone_lengths(motion.p, BONES).T
-    seen = [(np.median(x[np.isfinite(x)]), bone) for x, bone in zip(found, BONES, strict=True)
-            if np.isfinite(x).any()]  # fmt: skip
+    seen = [
+        (np.median(x[np.isfinite(x)]), bone)
+        for x, bone in zip(found, BONES, strict=True)
+        if np.isfinite(x).any()
+    ]
     rest = subject.rest
     return bool(seen) and all(abs(x / length(rest, b) - 1) <= OWN for x, b in seen)
 
@@ -157,11 +169,14 @@ def completed(motion: Clip, up: str) -> Float:
     known: Bool = np.asarray(np.isfinite(p).all(-1))
     times = np.arange(len(p))
     for joint, parent in PARENT.items():
-        offset, seen = p[:, joint] - p[:, parent], known[:, joint] & known[:, parent]
+        offset = p[:, joint] - p[:, parent]
+        seen = known[:, joint] & known[:, parent]
         if seen.mean() < SELDOM:
             known[:, joint] = False
         elif not seen.all():
-            between = np.stack([np.interp(times, times[seen], x[seen]) for x in offset.T], axis=1)
+            between = np.stack(
+                [np.interp(times, times[seen], x[seen]) for x in offset.T], axis=1
+            )
             p[:, joint] = np.where(seen[:, None], p[:, joint], p[:, parent] + between)
             known[:, joint] = known[:, parent]
     whole, _ = sanitise(torch.from_numpy(p), torch.from_numpy(known))
@@ -202,9 +217,15 @@ def rate_of(path: Path, value: Any) -> float:
     Raises:
         DataError: when it is not a number above 0.
     """
-    rate = float(np.asarray(value).reshape(-1)[0]) if np.asarray(value).dtype.kind in "iuf" else 0
+    rate = (
+        float(np.asarray(value).reshape(-1)[0])
+        if np.asarray(value).dtype.kind in "iuf"
+        else 0
+    )
     if not 0 < rate < 1e5:
-        raise DataError(f"{path}: the frame rate is {value!r}; expected a number above 0")
+        raise DataError(
+            f"{path}: the frame rate is {value!r}; expected a number above 0"
+        )
     return usual_rate(rate)
 
 

@@ -49,13 +49,16 @@ class Orbit:
         """
         to_world = upright(subject.up).T
         p = np.where(np.isfinite(p), p, np.nanmean(p, axis=1, keepdims=True))
-        low, high = (f((p @ to_world).reshape(-1, 3), axis=0) for f in (np.min, np.max))
+        low = np.min((p @ to_world).reshape(-1, 3), axis=0)
+        high = np.max((p @ to_world).reshape(-1, 3), axis=0)
         middle = (low + high) / 2
         focal = size / 2 / np.tan(np.radians(self.fov) / 2)
         shown = sum(scene.scale_train) / 2 * size / trained  # pixels per metre
         distance = self.distance or focal / shown
         share = np.arange(len(p)) / max(len(p), 1)
-        azimuth = heading(p[0] @ to_world) + np.radians(self.start + 360 * self.turns * share)
+        azimuth = heading(p[0] @ to_world) + np.radians(
+            self.start + 360 * self.turns * share
+        )
         tilt = np.radians(self.elevation)
         away = np.stack(
             [
@@ -66,7 +69,9 @@ class Orbit:
             axis=1,
         )
         right = np.stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth], axis=1)
-        R = np.stack([right, np.cross(-away, right), -away], axis=1) @ upright(subject.up)
+        R = np.stack([right, np.cross(-away, right), -away], axis=1) @ upright(
+            subject.up
+        )
         centres = (middle + distance * away) @ upright(subject.up)
         K = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
         t = -(R @ centres[..., None])[..., 0]

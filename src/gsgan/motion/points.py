@@ -51,9 +51,11 @@ def read_points3d(path: Path) -> Numbered:
 def _read_trc(path: Path) -> Numbered:
     try:
         lines = read_text(path).splitlines()
-        names, values = lines[1].split(), lines[2].split()
+        names = lines[1].split()
+        values = lines[2].split()
         markers = [name for name in lines[3].split("\t")[2:] if name]
-        count = 2 + 3 * len(markers)  # frame, time and the coordinates; an empty cell is missing
+        # frame, time and the coordinates; an empty cell is missing
+        count = 2 + 3 * len(markers)
         rows = [
             [
                 float(cell) if cell.strip() else np.nan
@@ -65,9 +67,12 @@ def _read_trc(path: Path) -> Numbered:
         unit = dict(zip(names, values, strict=False)).get("Units")
     except (OSError, ValueError, IndexError) as error:
         raise DataError(f"{path} cannot be read as a .trc file ({error})") from None
-    given = unit is not None and not re.fullmatch(r"[\d.]+", unit)  # a number: Units is left out
+    # a number: Units is left out
+    given = unit is not None and not re.fullmatch(r"[\d.]+", unit)
     if given and unit not in UNITS:
-        raise DataError(f"{path}: Units is {unit!r}; expected one of {', '.join(UNITS)}")
+        raise DataError(
+            f"{path}: Units is {unit!r}; expected one of {', '.join(UNITS)}"
+        )
     table = np.array(rows).reshape(-1, count)
     read = table[:, 2:].reshape(len(table), len(markers), 3)[..., TRC_AXES]
     p = np.full((len(table), BODY, 3), np.nan)
@@ -87,12 +92,16 @@ def _read_trc(path: Path) -> Numbered:
 def _metres(p: Float) -> float:
     """Metres in the unit of joints ``[F, 33, 3]``: the trunk then has nearly its usual length."""
     trunk = np.nanmedian(np.linalg.norm(p[:, [11, 12]] - p[:, [23, 24]], axis=-1))
-    return min(UNITS.values(), key=lambda scale: abs(np.log(scale * trunk / TRUNK_LENGTH)))
+    return min(
+        UNITS.values(), key=lambda scale: abs(np.log(scale * trunk / TRUNK_LENGTH))
+    )
 
 
 def _joint(name: str) -> int | None:
     """The MediaPipe joint of a marker: LShoulder, left_shoulder, Lknee, LBigToe, Nose."""
-    word = re.sub(r"[^a-z]", "", name.split(":")[-1].lower()).replace("bigtoe", "footindex")
+    word = re.sub(r"[^a-z]", "", name.split(":")[-1].lower()).replace(
+        "bigtoe", "footindex"
+    )
     word = re.sub("^l(?!eft)", "left", re.sub("^r(?!ight)", "right", word))
     plain = [name.replace("_", "") for name in MEDIAPIPE33.names]
     return plain.index(word) if word in plain else None

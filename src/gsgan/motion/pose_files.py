@@ -10,7 +10,15 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from gsgan.data.joints import FACE_MESH
-from gsgan.data.proportions import BONES, EARS, HAND_JOINTS, HIPS, SHOULDERS, Proportions, length
+from gsgan.data.proportions import (
+    BONES,
+    EARS,
+    HAND_JOINTS,
+    HIPS,
+    SHOULDERS,
+    Proportions,
+    length,
+)
 from gsgan.motion.clip import Clip, rate_of
 from gsgan.motion.retarget import steadied
 from gsgan.skeleton import MEDIAPIPE33
@@ -21,8 +29,11 @@ from gsgan.utils.errors import DataError
 Float = NDArray[np.float64]
 
 GUESSED = 0.5  # visibility below which MediaPipe's hips are guesses
-IMAGE, WORLD = "POSE_LANDMARKS", "POSE_WORLD_LANDMARKS"  # in files of pose-format
-HAND_PARTS, MESH = ("LEFT_HAND_LANDMARKS", "RIGHT_HAND_LANDMARKS"), "FACE_LANDMARKS"
+# in files of pose-format
+IMAGE = "POSE_LANDMARKS"
+WORLD = "POSE_WORLD_LANDMARKS"
+HAND_PARTS = ("LEFT_HAND_LANDMARKS", "RIGHT_HAND_LANDMARKS")
+MESH = "FACE_LANDMARKS"
 MESH_SIZE = 478
 # Without the thumb: hands differ most in where its base is.
 HAND_LENGTHS = tuple(bone for f in FINGERS[1:] for bone in pairwise((WRIST, *f)))
@@ -30,9 +41,12 @@ AVERAGE_FACE = np.full((MESH_SIZE, 3), np.nan)
 AVERAGE_FACE[list(FACE_MESH.values())] = rest_face()
 # Pairs of landmarks that are further apart than an expression moves them, by far.
 FACE_LENGTHS = tuple(
-    pair for pair in combinations(FACE_MESH.values(), 2) if length(AVERAGE_FACE, pair) > 0.05
+    pair
+    for pair in combinations(FACE_MESH.values(), 2)
+    if length(AVERAGE_FACE, pair) > 0.05
 )
-LENGTHS = (*BONES, SHOULDERS, HIPS, EARS, (11, 23), (12, 24))  # rigid, for the scale of axes
+# rigid, for the scale of axes
+LENGTHS = (*BONES, SHOULDERS, HIPS, EARS, (11, 23), (12, 24))
 
 
 def read_pose(path: Path, subject: Proportions) -> Clip:
@@ -96,10 +110,14 @@ class _PoseFile:
             self.data = np.ma.getdata(pose.body.data).astype(np.float64)
             self.confidence = np.asarray(pose.body.confidence, np.float64)
         except Exception as error:  # its parser raises many kinds
-            raise DataError(f"{path} is not a valid .pose file ({type(error).__name__})") from error
+            raise DataError(
+                f"{path} is not a valid .pose file ({type(error).__name__})"
+            ) from error
         if self.data.ndim != 4 or 0 in self.data.shape[:2]:
             raise DataError(f"{path} has no frames with a person; expected a motion")
-        self.fps, self.parts, start = pose.body.fps, dict[str, Any](), 0
+        self.fps = pose.body.fps
+        self.parts = dict[str, Any]()
+        start = 0
         for part in pose.header.components:
             columns = slice(start, start := start + len(part.points))
             self.parts[part.name] = columns, part.points, part.format
@@ -107,7 +125,8 @@ class _PoseFile:
     def landmarks(self, part: str, names: tuple[str, ...]) -> tuple[Float, Float]:
         """``[F, n, 3]`` the points of a part by name, NaN where absent; confidence ``[F, n]``."""
         shape = len(self.data), len(names)
-        p, seen = np.full((*shape, 3), np.nan), np.zeros(shape)
+        p = np.full((*shape, 3), np.nan)
+        seen = np.zeros(shape)
         columns, points, layout = self.parts.get(part, (slice(0), [], ""))
         for k, point in enumerate(points if "Z" in layout else ()):
             if (known := point.lower().replace("_finger", "")) in names:
@@ -128,11 +147,15 @@ def _to_metres(
     """
     rows = []
     for a, b in LENGTHS:
-        seen = (visibility[:, (a, b)] > 0.2).all(1) & np.isfinite(p[:, (a, b)]).all((1, 2))
+        seen = (visibility[:, (a, b)] > 0.2).all(1) & np.isfinite(p[:, (a, b)]).all(
+            (1, 2)
+        )
         rows.append((p[seen, b] - p[seen, a]) ** 2 / length(subject.rest, (a, b)) ** 2)
     table = np.concatenate(rows)
     if not len(table):
-        raise DataError(f"{path}: no frame shows two joints of a limb; expected a person")
+        raise DataError(
+            f"{path}: no frame shows two joints of a limb; expected a person"
+        )
     scales = np.sqrt(nnls(table, np.ones(len(table)))[0])
     if pixels:
         scales[:2] = scales[:2].mean()
@@ -140,14 +163,17 @@ def _to_metres(
 
 
 def _parts_to_metres(
-    parts: Sequence[tuple[Float, Float]], rest: Sequence[Float], lengths: Sequence[tuple[int, int]]
+    parts: Sequence[tuple[Float, Float]],
+    rest: Sequence[Float],
+    lengths: Sequence[tuple[int, int]],
 ) -> list[Float]:
     """Both hands, or the face, ``[F, n, 3]``, of points and confidences.
 
     The scale of x and y, and that of z, solve `_to_metres`' equations for pairs of all parts that
     are as long as in ``rest [n, 3]``.
     """
-    rows, found = [], []
+    rows = []
+    found = []
     for (p, seen), at_rest in zip(parts, rest, strict=True):
         p = np.where(seen[..., None] > 0, p, np.nan)
         for a, b in lengths:

@@ -37,8 +37,14 @@ Float = NDArray[np.float64]
 
 JOINTS = len(MEDIAPIPE33.names)
 WORLD_KEYS = (
-    *("pose_world_landmarks", "poseWorldLandmarks", "world_landmarks", "worldLandmarks"),
-    *("POSE_WORLD_LANDMARKS", "keypoints3D"),  # the latter: TensorFlow.js, metres about the hips
+    *(
+        "pose_world_landmarks",
+        "poseWorldLandmarks",
+        "world_landmarks",
+        "worldLandmarks",
+    ),
+    # the latter: TensorFlow.js, metres about the hips
+    *("POSE_WORLD_LANDMARKS", "keypoints3D"),
 )
 # Keys of SMPL's parameters: AMASS, HuMMan, smplx, AIST++, ZJU-MoCap.
 POSE_KEYS = ("poses", "pose", "smpl_poses", "body_pose", "pose_body")
@@ -46,11 +52,22 @@ PART_KEYS = ("pose_jaw", "pose_eye", "pose_hand")  # of SMPL-X, after the body
 ROOT_KEYS = ("Rh", "root_orient", "global_orient")
 MOVE_KEYS = ("trans", "transl", "smpl_trans", "Th")
 SHAPE_KEYS = ("betas", "shapes")
-WITHOUT_ROOT = (63, 69, 153, 162)  # numbers of poses of SMPL-X's body, SMPL, SMPL-H, SMPL-X
+# numbers of poses of SMPL-X's body, SMPL, SMPL-H, SMPL-X
+WITHOUT_ROOT = (63, 69, 153, 162)
 RATE_KEYS = ("fps", "mocap_framerate", "mocap_frame_rate")
 SCALE = "smpl_scaling"  # of AIST++: units of its translations in a metre
 ARRAYS = (
-    *("p", "conf", "theta", "visibility", SCALE, *WORLD_KEYS, *POSE_KEYS, *PART_KEYS, *ROOT_KEYS),
+    *(
+        "p",
+        "conf",
+        "theta",
+        "visibility",
+        SCALE,
+        *WORLD_KEYS,
+        *POSE_KEYS,
+        *PART_KEYS,
+        *ROOT_KEYS,
+    ),
     *(*MOVE_KEYS, *SHAPE_KEYS, *RATE_KEYS),
 )
 SMPL_BODY = 22  # joints that SMPL, SMPL-H and SMPL-X share
@@ -90,7 +107,9 @@ def read_motion(path: Path, source: Source) -> Clip:
         raise DataError(f"{path} is empty; expected a motion")
     reader = READERS.get(path.suffix.lower())
     if reader is None:
-        raise DataError(f"{path} has an unknown format; expected one of {', '.join(READERS)}")
+        raise DataError(
+            f"{path} has an unknown format; expected one of {', '.join(READERS)}"
+        )
     return _with_missing(reader(path, source))
 
 
@@ -99,7 +118,9 @@ def _with_missing(clip: Clip) -> Clip:
     and a visibility of 0 for every joint of every frame means that none was given."""
     p = zeros_as_missing(clip.p)
     known = np.isfinite(p).all(-1)
-    visibility = clip.visibility if clip.visibility.any() else np.ones_like(clip.visibility)
+    visibility = (
+        clip.visibility if clip.visibility.any() else np.ones_like(clip.visibility)
+    )
     return replace(clip, p=p, visibility=np.where(known, visibility, 0.0))
 
 
@@ -115,7 +136,9 @@ def read_dictionary(path: Path, source: Source) -> Clip:
     """A pickled dictionary of arrays, as of AIST++ (.pkl) or a frame of ZJU-MoCap (.npy)."""
     content = (read_npy if path.suffix.lower() == ".npy" else read_pickle)(path)
     if not isinstance(content, dict):
-        raise DataError(f"{path} holds no dictionary; expected one of arrays, such as 'poses'")
+        raise DataError(
+            f"{path} holds no dictionary; expected one of arrays, such as 'poses'"
+        )
     arrays = {key: as_floats(content[key]) for key in ARRAYS if key in content}
     if empty := [key for key, values in arrays.items() if not values.size]:
         raise DataError(f"{path}: {empty[0]!r} must be an array of numbers")
@@ -142,7 +165,9 @@ def _by_names(path: Path, arrays: dict[str, NDArray[Any]], source: Source) -> Cl
     )
 
 
-def _first(arrays: dict[str, NDArray[Any]], keys: tuple[str, ...], default: Any = None) -> Any:
+def _first(
+    arrays: dict[str, NDArray[Any]], keys: tuple[str, ...], default: Any = None
+) -> Any:
     return next((arrays[key] for key in keys if key in arrays), default)
 
 
@@ -154,7 +179,8 @@ def _beside(path: Path) -> dict[str, Any]:
 
 def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Clip:
     meta = _beside(path)
-    hands, face = EXPRESSION.start, EXPRESSION.stop
+    hands = EXPRESSION.start
+    face = EXPRESSION.stop
     if arrays["p"].shape[1:] not in ((JOINTS, 3), (hands, 3), (face, 3)):
         raise DataError(
             f"{path}: 'p' must have shape [F, {JOINTS}, 3], with hands [F, {hands}, 3], or with "
@@ -165,37 +191,52 @@ def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Clip:
     if "conf" in arrays:
         conf = expect_array(arrays, "conf", p.shape[:2], path).astype(np.float64)
     conf = np.where(np.isfinite(p).all(-1), np.nan_to_num(conf), 0.0)
-    shown, body = conf[:, :JOINTS] > 0, np.nan_to_num(p[:, :JOINTS])
-    hung = shown[:, SHOULDERS].all(1) & ~shown[:, HIPS].any(1)  # people filmed from the waist up
+    shown = conf[:, :JOINTS] > 0
+    body = np.nan_to_num(p[:, :JOINTS])
+    # people filmed from the waist up
+    hung = shown[:, SHOULDERS].all(1) & ~shown[:, HIPS].any(1)
     if hung.any() and ((placed := hips_below(body, shown)) != body).any():
         p[hung, :JOINTS] = np.where(shown[hung, :, None], p[hung, :JOINTS], np.nan)
         for hip, shoulder in zip(HIPS, SHOULDERS, strict=True):
-            p[hung, hip], conf[hung, hip] = placed[hung, hip], conf[hung, shoulder]
+            p[hung, hip] = placed[hung, hip]
+            conf[hung, hip] = conf[hung, shoulder]
     scale = METRES.get(meta.get("unit", "m"), 1.0)
-    rate, up = fps or meta.get("fps"), meta.get("up_axis")
+    rate = fps or meta.get("fps")
+    up = meta.get("up_axis")
     return Clip(path, p * scale, conf, rate, up, "metres")
 
 
-def _body_pose(path: Path, arrays: dict[str, Any], fps: float | None, source: Source) -> Clip:
+def _body_pose(
+    path: Path, arrays: dict[str, Any], fps: float | None, source: Source
+) -> Clip:
     theta = expect_array(arrays, "theta", (None, None, 3), path)
-    arrays = arrays | {k: arrays[name] for k, name in (("transl", "trans"),) if name in arrays}
+    arrays = arrays | {
+        k: arrays[name] for k, name in (("transl", "trans"),) if name in arrays
+    }
     meta = _beside(path)
     scale = METRES.get(meta.get("unit", "m"), 1.0)
     transl = scale * expect_array(arrays, "transl", (len(theta), 3), path)
-    fps, up = fps or meta.get("fps"), meta.get("up_axis")
+    fps = fps or meta.get("fps")
+    up = meta.get("up_axis")
     if theta.shape[1] != len(free_body().parents):
         flat = {"poses": theta.reshape(len(theta), -1), "trans": transl}
-        return _smpl(path, flat | {k: arrays[k] for k in ("betas",) if k in arrays}, fps, source)
+        return _smpl(
+            path, flat | {k: arrays[k] for k in ("betas",) if k in arrays}, fps, source
+        )
     shape = path.with_name(SHAPE)  # by gsgan.fit
     subject = open_body("free", betas=read_shape(shape) if shape.is_file() else ())
     assert subject is not None
-    body = BodyPose(*(torch.from_numpy(np.nan_to_num(x)).float() for x in (theta, transl)))
+    body = BodyPose(
+        *(torch.from_numpy(np.nan_to_num(x)).float() for x in (theta, transl))
+    )
     p = subject.posed_landmarks(body).double().numpy()
     p[~np.isfinite(theta).all((1, 2)) | ~np.isfinite(transl).all(1)] = np.nan
     return Clip(path, p, np.ones(p.shape[:2]), fps, up or "z", "metres", body=body)
 
 
-def _smpl(path: Path, arrays: dict[str, Any], fps: float | None, source: Source) -> Clip:
+def _smpl(
+    path: Path, arrays: dict[str, Any], fps: float | None, source: Source
+) -> Clip:
     if source.smpl is None:
         raise DataError(
             f"{path} holds SMPL parameters, which give joints only together with the body model: "
@@ -203,13 +244,20 @@ def _smpl(path: Path, arrays: dict[str, Any], fps: float | None, source: Source)
             "model's own site, not part of gsgan)"
         )
     if not source.smpl.is_file():
-        raise ConfigError(f"smpl={source.smpl} does not exist; expected a .pkl or .npz file")
-    model, poses = read_smpl(source.smpl), _smpl_poses(path, arrays)
+        raise ConfigError(
+            f"smpl={source.smpl} does not exist; expected a .pkl or .npz file"
+        )
+    model = read_smpl(source.smpl)
+    poses = _smpl_poses(path, arrays)
     moves = _first(arrays, MOVE_KEYS)
-    moves = np.zeros((len(poses), 3)) if moves is None else np.asarray(moves, np.float64)
+    moves = (
+        np.zeros((len(poses), 3)) if moves is None else np.asarray(moves, np.float64)
+    )
     moves = moves.reshape(len(poses), 3) / arrays.get(SCALE, 1.0)
     betas = np.asarray(_first(arrays, SHAPE_KEYS, np.zeros(10)), np.float64)
-    betas = np.median(betas.reshape(-1, betas.shape[-1]), axis=0)[: model.shapedirs.shape[-1]]
+    betas = np.median(betas.reshape(-1, betas.shape[-1]), axis=0)[
+        : model.shapedirs.shape[-1]
+    ]
     good = np.isfinite(poses).all(1) & np.isfinite(moves).all(1)
     theta = _for_model(np.nan_to_num(poses).reshape(len(poses), -1, 3), model)
     moves = np.nan_to_num(moves)
@@ -240,9 +288,13 @@ def _smpl_poses(path: Path, arrays: dict[str, Any]) -> Float:
                 f"{', '.join(ROOT_KEYS)} beside them"
             )
         root = np.asarray(root, np.float64).reshape(len(poses), 3)
-        parts = [np.asarray(arrays[key], np.float64) for key in PART_KEYS if key in arrays]
+        parts = [
+            np.asarray(arrays[key], np.float64) for key in PART_KEYS if key in arrays
+        ]
         parts = parts if poses.shape[1] == WITHOUT_ROOT[0] and len(parts) == 3 else []
-        poses = np.concatenate([root, poses, *(x.reshape(len(poses), -1) for x in parts)], axis=1)
+        poses = np.concatenate(
+            [root, poses, *(x.reshape(len(poses), -1) for x in parts)], axis=1
+        )
     elif "Rh" in arrays:
         poses = np.concatenate(
             [np.asarray(arrays["Rh"], np.float64).reshape(-1, 3), poses[:, 3:]], 1
@@ -260,7 +312,8 @@ def _for_model(theta: Float, model: SkinnedModel) -> Float:
 
     The 22 joints of the body are common to all; SMPL-X's fingers are SMPL-H's, after jaw and eyes.
     """
-    count, found = len(model.parents), theta.shape[1]
+    count = len(model.parents)
+    found = theta.shape[1]
     out = np.zeros((len(theta), count, 3))
     out[:, :SMPL_BODY] = theta[:, :SMPL_BODY]
     if found == count:
@@ -279,16 +332,21 @@ def read_mediapipe_json(path: Path, source: Source) -> Clip:
     A frame is an object with one of `WORLD_KEYS`, or the 33 landmarks themselves; a landmark is
     ``{x, y, z, visibility}`` or a list of these numbers.
     """
-    frames, fps = read_json_value(path), None
+    frames = read_json_value(path)
+    fps = None
     if isinstance(frames, dict):
         fps = frames.get("fps")
-        frames = next((frames[key] for key in ("frames", *WORLD_KEYS) if key in frames), None)
+        frames = next(
+            (frames[key] for key in ("frames", *WORLD_KEYS) if key in frames), None
+        )
     if not isinstance(frames, list) or not frames:
         raise DataError(
             f"{path} holds no frames; expected a list, or an object with 'frames', of MediaPipe's "
             "pose_world_landmarks"
         )
-    p = np.stack([_landmark_row(f"{path}, frame {i}", frame) for i, frame in enumerate(frames)])
+    p = np.stack(
+        [_landmark_row(f"{path}, frame {i}", frame) for i, frame in enumerate(frames)]
+    )
     rate = None if fps is None else rate_of(path, fps)
     return Clip(path, p[..., :3], p[..., 3], rate, None, "metres")
 
@@ -318,7 +376,9 @@ def _landmark_row(where: str, frame: Any) -> Float:
         rows = []
     row = as_floats(rows)
     if row.shape != (JOINTS, 4) or np.isnan(row).any():
-        raise DataError(f"{where}: expected {JOINTS} landmarks with x, y, z; found {len(rows)}")
+        raise DataError(
+            f"{where}: expected {JOINTS} landmarks with x, y, z; found {len(rows)}"
+        )
     return row
 
 
@@ -326,7 +386,8 @@ def _numbers(point: Any) -> list[Any]:
     """x, y, z and visibility of a landmark; a missing visibility is 1."""
     if not isinstance(point, dict):
         return [*point, 1.0][:4]
-    visibility = point.get("visibility", point.get("score", 1.0))  # score: TensorFlow.js
+    # score: TensorFlow.js
+    visibility = point.get("visibility", point.get("score", 1.0))
     return [point.get("x"), point.get("y"), point.get("z"), visibility]
 
 
@@ -338,10 +399,14 @@ def _with_visibility(path: Path, points: NDArray[Any], visibility: Any) -> Float
             f"{points.shape}"
         )
     if visibility is None:
-        visibility = points[..., 3] if points.shape[2] > 3 else np.ones(points.shape[:2])
+        visibility = (
+            points[..., 3] if points.shape[2] > 3 else np.ones(points.shape[:2])
+        )
     if visibility.shape != points.shape[:2]:
         raise DataError(f"{path}: 'visibility' must have shape {points.shape[:2]}")
-    return np.concatenate([points[..., :3], visibility[..., None]], axis=-1).astype(np.float64)
+    return np.concatenate([points[..., :3], visibility[..., None]], axis=-1).astype(
+        np.float64
+    )
 
 
 # -- rigs
@@ -350,9 +415,12 @@ def _with_visibility(path: Path, points: NDArray[Any], visibility: Any) -> Float
 def _rig(path: Path, motion: RigMotion, metres: float | None, source: Source) -> Clip:
     try:
         standard = standard_motion(motion, path, source.up)
-    except (ValueError, ArithmeticError) as error:  # of numbers that are finite, but absurd
+    # of numbers that are finite, but absurd
+    except (ValueError, ArithmeticError) as error:
         reason = str(error).splitlines()[0]
-        raise DataError(f"{path} is no motion of a person ({reason}); export it again") from error
+        raise DataError(
+            f"{path} is no motion of a person ({reason}); export it again"
+        ) from error
     if metres is None:
         ratios = {
             unit: abs(np.log(standard.leg * x / source.subject.leg))
@@ -385,7 +453,8 @@ READERS: dict[str, Callable[[Path, Source], Clip]] = {
     ".pkl": read_dictionary,
     ".npy": read_dictionary,
     ".json": read_mediapipe_json,
-    ".bvh": lambda path, source: _rig(path, read_bvh(path), None, source),  # a length by the legs
+    # a length by the legs
+    ".bvh": lambda path, source: _rig(path, read_bvh(path), None, source),
     ".amc": lambda path, source: _rig(
         path, *read_amc(path, source.skeleton or asf_of(path)), source
     ),

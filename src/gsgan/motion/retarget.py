@@ -43,7 +43,8 @@ Float = NDArray[np.float64]
 PALM = (WRIST, PINKY, INDEX)  # landmarks of a hand that give its axes
 STILL = 0.001  # metres: landmarks of a face that move less count fully in its alignment
 ROUNDS = 10  # of the alignment
-NECK = 0.45  # radians, the largest bend of the neck: detectors place faces too far forward
+# radians, the largest bend of the neck: detectors place faces too far forward
+NECK = 0.45
 
 
 def retargeted(p: Float, subject: Proportions, scale: float | None = None) -> Float:
@@ -63,15 +64,19 @@ def retargeted(p: Float, subject: Proportions, scale: float | None = None) -> Fl
         scale: of the path, in place of that ratio.
     """
     whole, given, p = np.full_like(p, np.nan), p, p[:, :BODY]
-    rest, q = subject.rest, whole[:, :BODY]
+    rest = subject.rest
+    q = whole[:, :BODY]
     if scale is None:
-        legs = [np.linalg.norm(p[:, b] - p[:, a], axis=-1) for limb in LEGS for a, b in limb]
+        legs = [
+            np.linalg.norm(p[:, b] - p[:, a], axis=-1) for limb in LEGS for a, b in limb
+        ]
         scale = 2 * subject.leg / float(np.median(legs, axis=1).sum())
     hips = middle(p, HIPS) * scale
     chest = hips + unit(middle(p, SHOULDERS) - middle(p, HIPS)) * rest[SHOULDERS[0], 2]
     for pair, centre in ((HIPS, hips), (SHOULDERS, chest)):
         half = unit(p[:, pair[0]] - p[:, pair[1]]) * length(rest, pair) / 2
-        q[:, pair[0]], q[:, pair[1]] = centre + half, centre - half
+        q[:, pair[0]] = centre + half
+        q[:, pair[1]] = centre - half
     for a, b in BONES:
         q[:, b] = q[:, a] + unit(p[:, b] - p[:, a]) * length(rest, (a, b))
     for wrist, ends in HAND_LANDMARKS.items():
@@ -85,7 +90,9 @@ def retargeted(p: Float, subject: Proportions, scale: float | None = None) -> Fl
         turn = _foot_frame(p, ankle) @ _foot_frame(rest, ankle).T
         q[:, feet] = q[:, ankle, None] + (rest[list(feet)] - rest[ankle]) @ turn.mT
     neck = middle(rest, EARS) - middle(rest, SHOULDERS)
-    level = bone_frames(torch.from_numpy(p)).hubs[:, CHEST].numpy() @ (TO_STANDARD.T @ neck)
+    level = bone_frames(torch.from_numpy(p)).hubs[:, CHEST].numpy() @ (
+        TO_STANDARD.T @ neck
+    )
     bend = axis_angle(between(level, middle(p, EARS) - middle(p, SHOULDERS)))
     most = NECK / np.maximum(np.linalg.norm(bend, axis=-1, keepdims=True), NECK)
     ears = chest + (rotation(bend * most) @ level[..., None])[..., 0]
@@ -112,9 +119,12 @@ def expressed(p: Float, rest: Float) -> Float:
     Returns:
         Metres; NaN where not seen.
     """
-    given, own = torch.from_numpy(p), torch.from_numpy(rest)
+    given = torch.from_numpy(p)
+    own = torch.from_numpy(rest)
     seen = given.isfinite().all(-1).double().reshape(1, -1, 1)
-    found = _aligned(given.reshape(1, -1, 3), own.repeat(len(given), 1), seen).reshape(p.shape)
+    found = _aligned(given.reshape(1, -1, 3), own.repeat(len(given), 1), seen).reshape(
+        p.shape
+    )
     return (own + found - found.nanmedian(0).values).numpy()
 
 
@@ -141,7 +151,8 @@ def _aligned(p: Tensor, onto: Tensor, weight: Tensor) -> Tensor:
     ``onto [n, 3]``, by weights ``[F, n, 1]``, 0 for NaN (Umeyama 1991)."""
     weight = weight / weight.sum(1, keepdim=True).clamp_min(1e-9)
     centre = (weight * p.nan_to_num()).sum(1, keepdim=True)
-    a, to = p - centre, (weight * onto).sum(1, keepdim=True)
+    a = p - centre
+    to = (weight * onto).sum(1, keepdim=True)
     flat = weight * a.nan_to_num()
     U, S, Vh = torch.linalg.svd(flat.mT @ (onto - to))
     S[:, 2] *= torch.linalg.det(U @ Vh)
@@ -163,7 +174,9 @@ def _posed_hand(p: Float, subject: Proportions, wrist: int) -> tuple[Float, Floa
 
 def _foot_frame(p: Float, ankle: int) -> Float:
     heel, toe = FEET[ankle]
-    return part_frame(p[..., toe, :] - p[..., heel, :], p[..., ankle, :] - p[..., heel, :])
+    return part_frame(
+        p[..., toe, :] - p[..., heel, :], p[..., ankle, :] - p[..., heel, :]
+    )
 
 
 def _head_frame(p: Float) -> Float:
@@ -176,15 +189,19 @@ def rig_landmarks(standard: StandardMotion, subject: Proportions) -> Float:
     Shoulders, elbows, wrists, hips, knees and ankles are the rig's joints. Rigs have no landmarks
     of hands, feet and face: the subject's own are rotated as the rig's hands, feet and head.
     """
-    rest, scale = subject.rest, subject.leg / standard.leg
+    rest = subject.rest
+    scale = subject.leg / standard.leg
     p = np.full((len(standard.joints["Hips"]), *rest.shape), np.nan)
     for i, side in enumerate(("Left", "Right")):
         names = ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot")
         for bone, landmark in zip(names, (11, 13, 15, 23, 25, 27), strict=True):
             p[:, landmark + i] = standard.joints[side + bone] * scale
         for bone, start, ends in (("Hand", 15, HAND_LANDMARKS), ("Foot", 27, FEET)):
-            points, turn = rest[list(ends[start + i])], standard.turns[side + bone]
-            p[:, ends[start + i]] = p[:, start + i, None] + (points - rest[start + i]) @ turn.mT
+            points = rest[list(ends[start + i])]
+            turn = standard.turns[side + bone]
+            p[:, ends[start + i]] = (
+                p[:, start + i, None] + (points - rest[start + i]) @ turn.mT
+            )
     if "Head" in standard.turns:
         neck = middle(rest, EARS) - middle(rest, SHOULDERS)
         ears = middle(p, SHOULDERS) + (standard.turns["Neck"] @ neck)
@@ -200,10 +217,15 @@ def joined(clips: Sequence[Float], subject: Proportions, n: int) -> Float:
     without a hand or face that either end lacks (NaN).
     """
     parts = [clips[0]]
-    for (a, b), after in zip(pairwise(map(face_in_head, clips)), clips[1:], strict=True):
+    for (a, b), after in zip(
+        pairwise(map(face_in_head, clips)), clips[1:], strict=True
+    ):
         speeds = [x[-1] - x[-2] if len(x) > 1 else 0 * x[0] for x in (a, b[1::-1])]
-        ends, speed = np.stack([a[-1], b[0]]), np.stack([speeds[0], -speeds[1]])
-        path = CubicHermiteSpline([0, n + 1], *(np.nan_to_num(x) for x in (ends, speed)))
+        ends = np.stack([a[-1], b[0]])
+        speed = np.stack([speeds[0], -speeds[1]])
+        path = CubicHermiteSpline(
+            [0, n + 1], *(np.nan_to_num(x) for x in (ends, speed))
+        )
         known = np.isfinite(ends).all((0, 2))[:, None]
         between = np.where(known, path(np.arange(1, n + 1)), np.nan)
         parts += [retargeted(between, subject, scale=1.0), after]
@@ -212,7 +234,8 @@ def joined(clips: Sequence[Float], subject: Proportions, n: int) -> Float:
 
 def face_in_head(p: Float) -> Float:
     """Landmarks ``[F, J, 3]`` with those of the face as `retargeted` takes them."""
-    body, face = torch.from_numpy(p[:, :BODY]), torch.from_numpy(p[:, EXPRESSION])
+    body = torch.from_numpy(p[:, :BODY])
+    face = torch.from_numpy(p[:, EXPRESSION])
     local = in_head(face, body, bone_frames(body).hubs[:, HEAD], MEDIAPIPE33)
     return np.concatenate([p[:, : EXPRESSION.start], local.numpy()], axis=1)
 
@@ -224,7 +247,13 @@ def heading(p: Float) -> float:
 
 
 def placed(
-    p: Float, subject: Proportions, centre: Float, fps: float, *, ground: bool, stay: bool
+    p: Float,
+    subject: Proportions,
+    centre: Float,
+    fps: float,
+    *,
+    ground: bool,
+    stay: bool,
 ) -> Float:
     """Landmarks ``[F, J, 3]`` moved to where the subject was captured.
 
@@ -242,7 +271,11 @@ def placed(
     q = p @ rotation(np.array([0, 0, subject.facing - heading(p[0])])).T
     path = middle(q, HIPS)[:, :2]
     lowest = q[:, HEELS_AND_TOES, 2].min(axis=1)
-    floor = floor_under(lowest, subject.leg, 1 / fps) if ground else np.full(len(q), lowest.min())
+    floor = (
+        floor_under(lowest, subject.leg, 1 / fps)
+        if ground
+        else np.full(len(q), lowest.min())
+    )
     gone = drift(path, 1 / fps) if stay else path[:1]
     q[..., :2] += centre[:2] - np.broadcast_to(gone, path.shape)[:, None]
     q[..., 2] += (subject.ground - floor)[:, None]

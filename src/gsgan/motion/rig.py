@@ -18,12 +18,17 @@ SIDES = ("Left", "Right")
 FINGERS = ("Thumb", "Index", "Middle", "Ring", "Pinky")
 SIGN = {"Left": 1.0, "Right": -1.0}
 SPINE = ("Spine", "Spine1", "Spine2")
-ARM, LEG = ("Arm", "ForeArm", "Hand"), ("UpLeg", "Leg", "Foot")
+ARM = ("Arm", "ForeArm", "Hand")
+LEG = ("UpLeg", "Leg", "Foot")
 REQUIRED = ("Hips", *(side + bone for side in SIDES for bone in LEG + ARM))
-FOREARM_TWIST = 0.55  # the forearm's share of the hand's twist: without twist bones, half each
-SPLAYED = 0.17  # sine of the angle of legs apart from which feet may be tilted with them
-REACH = 0.998  # longest reach of a limb in full lengths: below 1, so that it always bends
-SOLE = 0.02  # metres above the floor up to which a vertex of the resting foot is its sole
+# the forearm's share of the hand's twist: without twist bones, half each
+FOREARM_TWIST = 0.55
+# sine of the angle of legs apart from which feet may be tilted with them
+SPLAYED = 0.17
+# longest reach of a limb in full lengths: below 1, so that it always bends
+REACH = 0.998
+# metres above the floor up to which a vertex of the resting foot is its sole
+SOLE = 0.02
 
 
 def limb_axes(part: tuple[str, ...], side: str) -> tuple[Array, Array]:
@@ -35,7 +40,9 @@ def limb_axes(part: tuple[str, ...], side: str) -> tuple[Array, Array]:
 
 def hand_axes(joint: Mapping[str, Array], side: str) -> Array:
     """``[3, 3]`` columns: along the hand, towards the little finger, and their cross product."""
-    base = {finger: joint[f"{side}Hand{finger}1"] for finger in ("Index", "Middle", "Pinky")}
+    base = {
+        finger: joint[f"{side}Hand{finger}1"] for finger in ("Index", "Middle", "Pinky")
+    }
     along = unit(base["Middle"] - joint[side + "Hand"])
     across = base["Pinky"] - base["Index"]
     across = unit(across - (across @ along) * along)
@@ -52,7 +59,9 @@ def rest_turns(joint: Mapping[str, Array]) -> dict[str, Array]:
     turns = {}
     for side in SIDES:
         shin = unit(joint[side + "Foot"] - joint[side + "Leg"])
-        toe = unit(joint.get(side + "ToeBase", joint[side + "Foot"]) - joint[side + "Foot"])
+        toe = unit(
+            joint.get(side + "ToeBase", joint[side + "Foot"]) - joint[side + "Foot"]
+        )
         tilt = between(np.array([0.0, 0, -1]), shin * (1, 0, 1))
         if abs(shin[0]) > SPLAYED and abs(tilt[:, 0] @ toe) < abs(toe[0]):
             turns[side + "Foot"] = turns[side + "ToeBase"] = tilt
@@ -62,7 +71,9 @@ def rest_turns(joint: Mapping[str, Array]) -> dict[str, Array]:
             turns[side + part[0]] = upper
             turns[side + part[1]] = between(middle - first, end - middle) @ upper
         turns[side + "Hand"] = hand = turns[side + "ForeArm"]
-        if {f"{side}Hand{finger}1" for finger in ("Index", "Middle", "Pinky")} <= joint.keys():
+        if {
+            f"{side}Hand{finger}1" for finger in ("Index", "Middle", "Pinky")
+        } <= joint.keys():
             standard = np.diag([SIGN[side], 1.0, SIGN[side]])
             turns[side + "Hand"] = hand = hand_axes(joint, side) @ standard
         for finger in FINGERS:
@@ -72,10 +83,14 @@ def rest_turns(joint: Mapping[str, Array]) -> dict[str, Array]:
     return turns
 
 
-def phalanges(joint: Mapping[str, Array], side: str, finger: str) -> list[tuple[str, str]]:
+def phalanges(
+    joint: Mapping[str, Array], side: str, finger: str
+) -> list[tuple[str, str]]:
     """A finger's bones that have a following joint, with the name of that joint."""
     names = [f"{side}Hand{finger}{k}" for k in (1, 2, 3, 4)]
-    return [(bone, end) for bone, end in pairwise(names) if bone in joint and end in joint]
+    return [
+        (bone, end) for bone, end in pairwise(names) if bone in joint and end in joint
+    ]
 
 
 def finger_hinges(
@@ -92,8 +107,10 @@ def finger_hinges(
     if side + "HandPinky1" not in joint or side + "HandMiddle1" not in joint:
         return rows
     hand = turns[side + "Hand"]
-    along, palm = hand[:, 0] * SIGN[side], -hand[:, 2]
-    opposite = joint[side + "HandPinky1"] + 0.03 * palm  # to which the thumb's tip bends
+    along = hand[:, 0] * SIGN[side]
+    palm = -hand[:, 2]
+    # to which the thumb's tip bends
+    opposite = joint[side + "HandPinky1"] + 0.03 * palm
     for finger in FINGERS:
         before = along
         for k, (bone, end) in enumerate(phalanges(joint, side, finger)[:3]):
@@ -101,9 +118,12 @@ def finger_hinges(
             aim = unit(opposite - joint[bone]) if finger == "Thumb" else palm
             hinge = unit(np.cross(here, aim))
             if finger == "Thumb":
-                straight, across = 0.0, np.zeros(3)
+                straight = 0.0
+                across = np.zeros(3)
             else:
-                straight = float(np.arctan2(np.cross(before, here) @ hinge, before @ here))
+                straight = float(
+                    np.arctan2(np.cross(before, here) @ hinge, before @ here)
+                )
                 gap = float(np.arcsin(np.cross(here, along) @ palm))
                 across = 0.8 * gap * palm * (k == 0)
             rows.append((bone, finger, k, hinge, straight, across))
@@ -120,22 +140,31 @@ class Rig:
         self.joint = {name: character.joints[j] for name, j in self.index.items()}
         self.turns = rest_turns(self.joint)
         self.leg, self.arm = (
-            sum(self.length("Left" + a, "Left" + b) for a, b in ((p[0], p[1]), (p[1], p[2])))
+            sum(
+                self.length("Left" + a, "Left" + b)
+                for a, b in ((p[0], p[1]), (p[1], p[2]))
+            )
             for p in (LEG, ARM)
         )
         self.chest = max(
             (b for b in ("Hips", *SPINE) if b in self.index), key=self.index.__getitem__
         )
-        self.fingers = {side: finger_hinges(self.joint, self.turns, side) for side in SIDES}
+        self.fingers = {
+            side: finger_hinges(self.joint, self.turns, side) for side in SIDES
+        }
         main = character.dominant_bones()
         self.soles: dict[str, Array] = {}
         for side in SIDES:
             parts = [
-                character.with_descendants(self.index[bone]) if bone in self.index else []
+                character.with_descendants(self.index[bone])
+                if bone in self.index
+                else []
                 for bone in (side + "Foot", side + "ToeBase")
             ]
             parts[0] = [j for j in parts[0] if j not in parts[1]]
-            for bone, part in zip((side + "Foot", side + "ToeBase"), parts, strict=True):
+            for bone, part in zip(
+                (side + "Foot", side + "ToeBase"), parts, strict=True
+            ):
                 of_bone = np.isin(main, part)
                 points = character.vertices[of_bone & (character.vertices[:, 2] < SOLE)]
                 self.soles[bone] = points[:: max(1, len(points) // 300)]
@@ -149,8 +178,11 @@ class Pose:
     """Poses at F moments under construction; bones that are not set follow their parents."""
 
     def __init__(self, rig: Rig, hips: Array) -> None:
-        self.rig, self.hips = rig, hips  # [F, 3] position of the Hips joint
-        self.world: dict[str, Array] = {}  # bone → [F, 3, 3] world rotation since the rest pose
+        # [F, 3] position of the Hips joint
+        self.rig = rig
+        self.hips = hips
+        # bone → [F, 3, 3] world rotation since the rest pose
+        self.world: dict[str, Array] = {}
 
     def set_turn(self, bone: str, turn: Array) -> None:
         """Sets a bone by its turn ``[F, 3, 3]``, where the character has this bone."""
@@ -161,7 +193,9 @@ class Pose:
         """Distributes an axis-angle ``[F, 3]``, in standard axes, over a chain of bones."""
         bones = tuple(bone for bone in bones if bone in self.rig.index)
         for bone in bones:
-            self.set_turn(bone, self.turn(self.parent(bone)) @ rotation(axis_angle / len(bones)))
+            self.set_turn(
+                bone, self.turn(self.parent(bone)) @ rotation(axis_angle / len(bones))
+            )
 
     def turn(self, bone: str) -> Array:
         """A bone's turn ``[F, 3, 3]``."""
@@ -187,7 +221,9 @@ class Pose:
         offset = self.rig.joint[bone] - self.rig.joint[parent]
         return self.position(parent) + self.rotation(parent) @ offset
 
-    def reach(self, side: str, part: tuple[str, str, str], target: Array, pole: Array) -> None:
+    def reach(
+        self, side: str, part: tuple[str, str, str], target: Array, pole: Array
+    ) -> None:
         """Turns a limb so that its end comes to ``target``, the middle bent towards ``pole``.
 
         Args:
@@ -210,19 +246,25 @@ class Pose:
 
     def lower_hips(self, ankles: list[Array]) -> None:
         """Lowers the hips to where both legs reach their ankles ``[F, 3]``."""
-        longest, drop = 0.995 * REACH * self.rig.leg, np.zeros(len(self.hips))
+        longest = 0.995 * REACH * self.rig.leg
+        drop = np.zeros(len(self.hips))
         for side, ankle in zip(SIDES, ankles, strict=True):
             gap = self.position(side + "UpLeg") - ankle
             flat = (gap[:, :2] ** 2).sum(axis=1)
-            drop = np.maximum(drop, gap[:, 2] - np.sqrt(np.maximum(longest**2 - flat, 0)))
+            drop = np.maximum(
+                drop, gap[:, 2] - np.sqrt(np.maximum(longest**2 - flat, 0))
+            )
         self.hips = self.hips - drop[:, None] * (0, 0, 1)
 
     def set_hand(self, side: str, turn: Array) -> None:
         """Sets a hand's turn ``[F, 3, 3]``; the forearm takes a share of its twist."""
-        upper, lower = self.turn(side + "Arm"), self.turn(side + "ForeArm")
+        upper = self.turn(side + "Arm")
+        lower = self.turn(side + "ForeArm")
         neutral = between(upper[..., 0], lower[..., 0]) @ upper
         angle = FOREARM_TWIST * twist(np.swapaxes(neutral, -1, -2) @ turn, axis=0)
-        self.set_turn(side + "ForeArm", neutral @ rotation(angle[:, None] * np.eye(3)[0]))
+        self.set_turn(
+            side + "ForeArm", neutral @ rotation(angle[:, None] * np.eye(3)[0])
+        )
         self.set_turn(side + "Hand", turn)
 
     def lowest(self, side: str) -> Array:
@@ -235,16 +277,22 @@ class Pose:
                 heights.append(self.position(bone)[:, 2] + up.min(axis=-1))
         return np.min(heights, axis=0)
 
-    def motion(self, shapes: Mapping[str, Array], passages: tuple[str, ...]) -> Animation:
+    def motion(
+        self, shapes: Mapping[str, Array], passages: tuple[str, ...]
+    ) -> Animation:
         """The finished poses, with the face shapes that the character has."""
         character = self.rig.character
         rotations = np.stack([self.rotation(bone) for bone in character.bones], axis=1)
         joints = np.stack([self.position(bone) for bone in character.bones], axis=1)
-        known = {name: weight for name, weight in shapes.items() if name in character.shapes}
+        known = {
+            name: weight for name, weight in shapes.items() if name in character.shapes
+        }
         return Animation(rotations, joints, known, passages)
 
 
-def two_bone(target: Array, pole: Array, upper: float, lower: float) -> tuple[Array, Array, Array]:
+def two_bone(
+    target: Array, pole: Array, upper: float, lower: float
+) -> tuple[Array, Array, Array]:
     """Directions of two bones from the origin to a target, and their hinge; the law of cosines.
 
     Args:
@@ -256,7 +304,9 @@ def two_bone(target: Array, pole: Array, upper: float, lower: float) -> tuple[Ar
         Unit vectors ``[F, 3]``: upper bone, lower bone, the axis that flexes the lower one.
     """
     nearest = abs(upper - lower) + 0.05 * min(upper, lower)
-    d = np.linalg.norm(target, axis=-1, keepdims=True).clip(nearest, REACH * (upper + lower))
+    d = np.linalg.norm(target, axis=-1, keepdims=True).clip(
+        nearest, REACH * (upper + lower)
+    )
     along = unit(target)
     side = unit(pole - (pole * along).sum(-1, keepdims=True) * along)
     cosine = (upper**2 + d**2 - lower**2) / (2 * upper * d)

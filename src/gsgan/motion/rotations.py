@@ -20,7 +20,9 @@ def rotation(axis_angle: Array) -> Array:
 
 def axis_angle(R: Array) -> Array:
     """Axis-angle vectors ``[..., 3]`` of rotation matrices ``[..., 3, 3]``, radians."""
-    return Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(*R.shape[:-2], 3)
+    return (
+        Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(*R.shape[:-2], 3)
+    )
 
 
 def between(a: Array, b: Array) -> Array:

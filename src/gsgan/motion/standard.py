@@ -13,22 +13,38 @@ from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 from scipy.spatial.transform import Rotation
 
 from gsgan.data.proportions import axis_name
-from gsgan.motion.rig import ARM, FINGERS, LEG, REQUIRED, SIDES, SPINE, limb_axes, rest_turns
+from gsgan.motion.rig import (
+    ARM,
+    FINGERS,
+    LEG,
+    REQUIRED,
+    SIDES,
+    SPINE,
+    limb_axes,
+    rest_turns,
+)
 from gsgan.motion.rotations import Array, between, blend, rotation, unit
 from gsgan.utils.errors import DataError
 
-STANDING = np.radians(40)  # largest tilt of trunk and legs in a zero pose that is a standing person
-NEUTRAL = np.radians(10)  # the same, in a frame that stands so well that it serves as a zero pose
+# largest tilt of trunk and legs in a zero pose that is a standing person
+STANDING = np.radians(40)
+# the same, in a frame that stands so well that it serves as a zero pose
+NEUTRAL = np.radians(10)
 UPRIGHT = np.radians(30)  # largest tilt of the trunk in frames that may serve otherwise
 SELDOM = 0.1  # share of frames in which a person stands, in motions on the floor
 SAME = np.radians(1)  # frames that stand as well as the best one
 MOST = 100  # frames that calibrate
-BACKWARDS = 0.8  # share of knees and toes behind the body from which names are of the other side
-STEEPEST = -0.7  # sine of the slope from ankle to toes of a flat foot: steeper ones are in the air
+# share of knees and toes behind the body from which names are of the other side
+BACKWARDS = 0.8
+# sine of the slope from ankle to toes of a flat foot: steeper ones are in the air
+STEEPEST = -0.7
 BENT = 0.15  # mean sine of the bend from which a limb's plane is known
-HOVER = 0.06  # legs: feet this high above the lowest of a second stand on the floor; no jump
-ROOM = 0.6  # metres from the origin that a motion may reach before its drift is subtracted
-DRIFT_SECONDS = 0.5  # standard deviation of the smoothing that separates drift from sway
+# legs: feet this high above the lowest of a second stand on the floor; no jump
+HOVER = 0.06
+# metres from the origin that a motion may reach before its drift is subtracted
+ROOM = 0.6
+# standard deviation of the smoothing that separates drift from sway
+DRIFT_SECONDS = 0.5
 # Names of joints without side, in lower case and letters only, first choices first.
 ALIASES = {
     "Hips": "hips hip pelvis root",
@@ -55,7 +71,8 @@ def known_joints(names: tuple[str, ...]) -> dict[str, int]:
     """
     found: dict[str, tuple[int, int]] = {}
     for j, name in enumerate(names):
-        if name.startswith("__") or name.endswith(" end"):  # MakeHuman's helpers; end sites
+        # MakeHuman's helpers; end sites
+        if name.startswith("__") or name.endswith(" end"):
             continue
         bone, rank = _bone(name)
         if bone and rank < found.get(bone, (99, 0))[0]:
@@ -70,11 +87,15 @@ def _bone(name: str) -> tuple[str, int]:
     sided = [w for w in words if w in ("l", "r", "left", "right")]
     stem = "".join(w for w in words if w not in sided[:1])
     if not sided and (match := re.match(r"(left|right|l|r)(.+)", stem)):
-        sided, rest = [match[1]], match[2]
+        sided = [match[1]]
+        rest = match[2]
         if not _stem(rest, True)[0]:
-            sided, rest = [], stem
+            sided = []
+            rest = stem
         stem = rest
-    bone, rank = _stem(re.sub(r"^(mixamorig|j?bip)\d*(c(?=hips|head))?", "", stem), bool(sided))
+    bone, rank = _stem(
+        re.sub(r"^(mixamorig|j?bip)\d*(c(?=hips|head))?", "", stem), bool(sided)
+    )
     side = {"l": "Left", "r": "Right"}[sided[0][0]] if sided else ""
     return side + bone if bone else "", rank
 
@@ -85,7 +106,9 @@ def _stem(stem: str, sided: bool) -> tuple[str, int]:
         if plain in aliases.split() and sided != (bone in ("Hips", "Head")):
             return bone, aliases.split().index(plain)
     for finger, alias in FINGER_ALIASES.items():
-        match = re.fullmatch(rf"(?:hand|f)?(?:{alias})(?:finger)?0?(\d?)({'|'.join(PARTS)})?", stem)
+        match = re.fullmatch(
+            rf"(?:hand|f)?(?:{alias})(?:finger)?0?(\d?)({'|'.join(PARTS)})?", stem
+        )
         if match and sided:
             return f"Hand{finger}{match[1] or PARTS.get(match[2], 1)}", 0
     return "", 0
@@ -131,7 +154,10 @@ class RigMotion:
             if parent < 0:
                 p[:, j] = offset
             else:
-                p[:, j] = p[:, parent] + (self.rotations[:, parent] @ offset[..., None])[..., 0]
+                p[:, j] = (
+                    p[:, parent]
+                    + (self.rotations[:, parent] @ offset[..., None])[..., 0]
+                )
         return p
 
 
@@ -165,7 +191,9 @@ class Reference:
     neutral: bool
 
 
-def standard_motion(rig: RigMotion, path: Path, up: str | None = None) -> StandardMotion:
+def standard_motion(
+    rig: RigMotion, path: Path, up: str | None = None
+) -> StandardMotion:
     """The motion of a tree of joints on the bones that people have.
 
     Args:
@@ -182,7 +210,8 @@ def standard_motion(rig: RigMotion, path: Path, up: str | None = None) -> Standa
     """
     known = body_joints(rig, path)
     posed = rig.posed()
-    zero, axis = rig.zero_pose()[None], np.zeros(3)
+    zero = rig.zero_pose()[None]
+    axis = np.zeros(3)
     at_zero = _upward(zero, known)
     own = at_zero if tilts(zero, known, at_zero).max() < STANDING else None
     if up is None:
@@ -191,7 +220,8 @@ def standard_motion(rig: RigMotion, path: Path, up: str | None = None) -> Standa
         axis["xyz".index(up[-1])] = -1.0 if up.startswith("-") else 1.0
     known = _by_side(posed, known, axis)
     reference = _reference(rig, posed, known, axis, own)
-    axes = person_axes(posed[:1], known, axis)[0]  # by positions: whatever the zero pose is
+    # by positions: whatever the zero pose is
+    axes = person_axes(posed[:1], known, axis)[0]
     R, turns = _turns(rig, axes, known, reference)
     joints = {bone: posed[:, j] @ axes.T for bone, j in known.items()}
     if not reference.zero:
@@ -201,7 +231,8 @@ def standard_motion(rig: RigMotion, path: Path, up: str | None = None) -> Standa
             _flatten_feet(turns, joints)
     turns |= _trunk(rig, known, R)
     hip, knee, ankle = (joints["Left" + bone] for bone in LEG)
-    thigh, shin = (np.linalg.norm(a - b, axis=1) for a, b in ((hip, knee), (knee, ankle)))
+    thigh = np.linalg.norm(hip - knee, axis=1)
+    shin = np.linalg.norm(knee - ankle, axis=1)
     leg = float(np.median(thigh) + np.median(shin))
     return StandardMotion(turns, joints, leg, axis_name(axis))
 
@@ -223,7 +254,8 @@ def body_joints(rig: RigMotion, path: Path) -> dict[str, int]:
     shared = [j for j in lines[0] if j in lines[1]]
     if (
         not shared
-        or min(_count(rig, side + bone) for side in SIDES for bone in ("UpLeg", "Arm")) > 1
+        or min(_count(rig, side + bone) for side in SIDES for bone in ("UpLeg", "Arm"))
+        > 1
     ):
         raise DataError(f"{path} holds more than one person; give a file of one")
     known.setdefault("Hips", shared[-1])
@@ -257,15 +289,20 @@ def _upward(p: Array, known: dict[str, int], usual: Array | None = None) -> Arra
     """``[3]`` the coordinate axis that points up: along it, the shoulders are above the hips and
     these above the feet in the largest share of the poses ``[F, J, 3]``; or the ``usual`` one, if
     the person stands along it in some poses and lies in the others."""
-    chest, hips, feet = (_middle(p, known, bone) for bone in ("Arm", "UpLeg", "Foot"))
-    trunk, legs = unit(chest - hips), unit(hips - feet)
+    chest = _middle(p, known, "Arm")
+    hips = _middle(p, known, "UpLeg")
+    feet = _middle(p, known, "Foot")
+    trunk = unit(chest - hips)
+    legs = unit(hips - feet)
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     least = np.minimum(trunk @ axes.T, legs @ axes.T)
     standing = (least > np.cos(UPRIGHT)).mean(axis=0)
     if usual is not None and standing[(axes @ usual).argmax()] > SELDOM:
         return usual
     above = (least > 0.5).mean(axis=0)
-    return np.asarray(axes[(above + 1e-3 * (trunk + legs).mean(axis=0) @ axes.T).argmax()])
+    return np.asarray(
+        axes[(above + 1e-3 * (trunk + legs).mean(axis=0) @ axes.T).argmax()]
+    )
 
 
 def person_axes(p: Array, known: dict[str, int], up: Array) -> Array:
@@ -288,7 +325,9 @@ def _by_side(p: Array, known: dict[str, int], up: Array) -> dict[str, int]:
     if np.mean(np.stack(votes) > 0) < BACKWARDS:
         return known
     other = {"Left": "Right", "Right": "Left"}
-    return {re.sub("^(Left|Right)", lambda m: other[m[1]], b): j for b, j in known.items()}
+    return {
+        re.sub("^(Left|Right)", lambda m: other[m[1]], b): j for b, j in known.items()
+    }
 
 
 def tilts(p: Array, known: dict[str, int], up: Array) -> Array:
@@ -321,10 +360,14 @@ def _reference(
     if neutral:
         chosen = np.flatnonzero(score < best + SAME)
     else:
-        chosen = np.flatnonzero(tilt[:, 0] < max(UPRIGHT, float(tilt[:, 0].min()) + SAME))
+        chosen = np.flatnonzero(
+            tilt[:, 0] < max(UPRIGHT, float(tilt[:, 0].min()) + SAME)
+        )
     chosen = chosen[:: max(1, len(chosen) // MOST)]
     p = posed[chosen]
-    return Reference(rig.rotations[chosen], person_axes(p, known, up), p, False, neutral)
+    return Reference(
+        rig.rotations[chosen], person_axes(p, known, up), p, False, neutral
+    )
 
 
 def _turns(
@@ -374,19 +417,23 @@ def _bend_in_plane(turns: dict[str, Array], joints: dict[str, Array]) -> None:
             along, hinge = limb_axes(part, side)
             lower = unit(joints[end] - joints[second])
             local = (np.swapaxes(turns[first], -1, -2) @ lower[..., None])[..., 0]
-            away, forth = local @ hinge, local @ np.cross(hinge, along)
+            away = local @ hinge
+            forth = local @ np.cross(hinge, along)
             mean = ((forth + 1j * away) * np.hypot(forth, away)).mean()
             if abs(mean) > BENT**2:
                 twisted = rotation(along * float(np.angle(mean)))
-                turns[first], turns[second] = turns[first] @ twisted, turns[second] @ twisted
-                if part == ARM and f"{side}HandMiddle1" not in joints:  # its palm is not known
+                turns[first] = turns[first] @ twisted
+                turns[second] = turns[second] @ twisted
+                # its palm is not known
+                if part == ARM and f"{side}HandMiddle1" not in joints:
                     turns[end] = turns[end] @ twisted
 
 
 def _point_hands(turns: dict[str, Array], joints: dict[str, Array]) -> None:
     """Points hands without a whole palm along their middle finger, thumbs to the front."""
     for side in SIDES:
-        hand, middle = side + "Hand", f"{side}HandMiddle1"
+        hand = side + "Hand"
+        middle = f"{side}HandMiddle1"
         if middle not in joints or f"{side}HandPinky1" in joints:
             continue
         along, _ = limb_axes(ARM, side)
@@ -403,7 +450,8 @@ def _point_hands(turns: dict[str, Array], joints: dict[str, Array]) -> None:
 def _flatten_feet(turns: dict[str, Array], joints: dict[str, Array]) -> None:
     """Pitches the feet so that they are flat, on average, in the frames in which they rest."""
     for side in SIDES:
-        foot, toe = side + "Foot", side + "ToeBase"
+        foot = side + "Foot"
+        toe = side + "ToeBase"
         if toe not in joints:
             continue
         ahead = unit(joints[toe] - joints[foot])
@@ -417,7 +465,9 @@ def _flatten_feet(turns: dict[str, Array], joints: dict[str, Array]) -> None:
         turns[toe] = turns[toe] @ _mean(turns[toe][rests].mT @ turns[foot][rests])
 
 
-def _local(turns: dict[str, Array], joints: dict[str, Array], bone: str, end: str) -> Array:
+def _local(
+    turns: dict[str, Array], joints: dict[str, Array], bone: str, end: str
+) -> Array:
     """``[3]`` direction from a bone's joint to another, in the bone's axes, mean over frames."""
     away = unit(joints[end] - joints[bone])[..., None]
     return unit((turns[bone].mT @ away)[..., 0].mean(axis=0))
@@ -425,7 +475,9 @@ def _local(turns: dict[str, Array], joints: dict[str, Array], bone: str, end: st
 
 def _mean(R: Array) -> Array:
     """The mean ``[3, 3]`` of rotations ``[N, 3, 3]``."""
-    return np.asarray(R[0] if len(R) == 1 else Rotation.from_matrix(R).mean().as_matrix())
+    return np.asarray(
+        R[0] if len(R) == 1 else Rotation.from_matrix(R).mean().as_matrix()
+    )
 
 
 def floor_under(lowest: Array, leg: float, step: float) -> Array:
@@ -452,16 +504,21 @@ def drift(path: Array, step: float) -> Array:
 def _trunk(rig: RigMotion, known: dict[str, int], R: Array) -> dict[str, Array]:
     """Turns of spine, neck and collarbones, whatever their number, by their place in the tree."""
 
-    left, right, legs = (_line(rig, known[b]) for b in ("LeftArm", "RightArm", "LeftUpLeg"))
+    left = _line(rig, known["LeftArm"])
+    right = _line(rig, known["RightArm"])
+    legs = _line(rig, known["LeftUpLeg"])
     spine = [j for j in left if j in right and j not in (*legs, known["Hips"])]
-    chain, turns = [R[:, j] for j in (known["Hips"], *spine)], {}
+    chain = [R[:, j] for j in (known["Hips"], *spine)]
+    turns = {}
     for k, bone in enumerate(SPINE, 1):
         at = k * len(spine) / len(SPINE)
         low = int(at)
         turns[bone] = blend(chain[low], chain[min(low + 1, len(spine))], at - low)
     if "Head" in known:
         neck = [j for j in _line(rig, known["Head"]) if j not in left]
-        turns["Neck"] = R[:, neck[0]] if neck else blend(chain[-1], R[:, known["Head"]], 0.5)
+        turns["Neck"] = (
+            R[:, neck[0]] if neck else blend(chain[-1], R[:, known["Head"]], 0.5)
+        )
     for side, line, other in (("Left", left, right), ("Right", right, left)):
         if collar := [j for j in line if j not in other]:
             turns[side + "Shoulder"] = R[:, collar[-1]]

@@ -20,7 +20,8 @@ FOCAL = 1000.0  # pixels; errors are then thousandths of the focal length
 STEPS = 30  # of the optimiser
 SCALE = 5.0  # error at which a detection counts half, thousandths of the focal length
 SETTLED = 1e-7  # relative change of the cost at which the refinement ends
-LEAST_SQUARE = 1e-12  # square pixels: keeps the residual's scaling finite at an error of 0
+# square pixels: keeps the residual's scaling finite at an error of 0
+LEAST_SQUARE = 1e-12
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,9 @@ class CameraArray:
     @classmethod
     def of(cls, cameras: Sequence[CameraEntry]) -> CameraArray:
         """The arrays of some cameras, in their order."""
-        return cls(*(np.stack([getattr(c, key) for c in cameras]) for key in ("K", "R", "t")))
+        return cls(
+            *(np.stack([getattr(c, key) for c in cameras]) for key in ("K", "R", "t"))
+        )
 
     def __len__(self) -> int:
         return len(self.K)
@@ -83,7 +86,9 @@ class CameraArray:
         """
         pixels, depth = self.project(p)
         error = np.linalg.norm(pixels - uv, axis=-1)
-        return np.where(depth <= NEAR, np.where(np.isfinite(error), np.inf, np.nan), error)
+        return np.where(
+            depth <= NEAR, np.where(np.isfinite(error), np.inf, np.nan), error
+        )
 
 
 def undistort_points(camera: CameraEntry, px: Float) -> Float:
@@ -93,7 +98,9 @@ def undistort_points(camera: CameraEntry, px: Float) -> Float:
         return np.asarray(px, np.float64)
     out = np.full(px.shape, np.nan)
     rays = np.c_[px[seen], np.ones(seen.sum())] @ np.linalg.inv(camera.K).T
-    out[seen] = undistort(rays[:, :2], camera.dist) @ camera.K[:2, :2].T + camera.K[:2, 2]
+    out[seen] = (
+        undistort(rays[:, :2], camera.dist) @ camera.K[:2, :2].T + camera.K[:2, 2]
+    )
     return out
 
 
@@ -121,14 +128,20 @@ def refine_cameras(
     """
     weight = np.where(known(uv), weight, 0.0)
     use = known(p) & ((weight > 0).sum(0) >= MIN_VIEWS)
-    p, uv, weight = p[use], uv[:, use], weight[:, use]
+    p = p[use]
+    uv = uv[:, use]
+    weight = weight[:, use]
     camera, point = np.nonzero(weight)
-    uv, weight, square = uv[camera, point], weight[camera, point], SCALE**2
+    uv = uv[camera, point]
+    weight = weight[camera, point]
+    square = SCALE**2
     poses = 6 * len(start)
 
     def cameras_at(x: Float) -> CameraArray:
         turn, move = np.moveaxis(x[:poses].reshape(-1, 2, 3), 1, 0)
-        return replace(start, R=Rotation.from_rotvec(turn).as_matrix() @ start.R, t=start.t + move)
+        return replace(
+            start, R=Rotation.from_rotvec(turn).as_matrix() @ start.R, t=start.t + move
+        )
 
     def priors(cameras: CameraArray) -> Float:
         turned = _turns(given, cameras) / np.radians(rotation_prior)
@@ -151,24 +164,31 @@ def refine_cameras(
     )
     # Detections do not see a similarity of the whole world, so that search hardly moves along it.
     cameras = cameras_at(found.x)
-    return _similar(cameras, least_squares(lambda x: priors(_similar(cameras, x)), np.zeros(7)).x)
+    return _similar(
+        cameras, least_squares(lambda x: priors(_similar(cameras, x)), np.zeros(7)).x
+    )
 
 
 def _similar(cameras: CameraArray, x: Float) -> CameraArray:
     """The cameras in a world turned by ``x[:3]``, moved by ``x[3:6]``, scaled by exp ``x[6]``."""
     turn = Rotation.from_rotvec(x[:3]).as_matrix()
-    R, centres = cameras.R @ turn, np.exp(x[6]) * cameras.centres @ turn + x[3:6]
+    R = cameras.R @ turn
+    centres = np.exp(x[6]) * cameras.centres @ turn + x[3:6]
     return replace(cameras, R=R, t=-np.einsum("cij,cj->ci", R, centres))
 
 
-def _sparsity(camera: Ints, point: Ints, cameras: int, points: int) -> sparse.csr_matrix:
+def _sparsity(
+    camera: Ints, point: Ints, cameras: int, points: int
+) -> sparse.csr_matrix:
     """Which parameters each residual depends on: its camera's 6 and its point's 3."""
     at_camera = 6 * camera[:, None] + np.arange(6)
     at_point = 6 * cameras + 3 * point[:, None] + np.arange(3)
     columns = np.c_[at_camera, at_point].repeat(2, axis=0)  # u and v
     rows = np.arange(len(columns)).repeat(9)
     shape = len(columns), 6 * cameras + 3 * points
-    detections = sparse.coo_matrix((np.ones(columns.size), (rows, columns.ravel())), shape)
+    detections = sparse.coo_matrix(
+        (np.ones(columns.size), (rows, columns.ravel())), shape
+    )
     priors = sparse.kron(np.eye(cameras), np.ones((6, 6)), format="coo")
     priors.resize(6 * cameras, shape[1])
     return sparse.vstack([detections, priors]).tocsr()
@@ -182,4 +202,6 @@ def camera_moves(before: CameraArray, after: CameraArray) -> tuple[Float, Float]
 
 def _turns(before: CameraArray, after: CameraArray) -> Float:
     """``[C, 3]`` rotation vectors from the orientations before to those after."""
-    return np.asarray(Rotation.from_matrix(after.R @ before.R.transpose(0, 2, 1)).as_rotvec())
+    return np.asarray(
+        Rotation.from_matrix(after.R @ before.R.transpose(0, 2, 1)).as_rotvec()
+    )

@@ -9,13 +9,19 @@ from gsgan.utils.arrays import Bool, Float, nanmedian
 
 Bones = tuple[tuple[int, int], ...]
 # Bones of constant length, as (inner, outer) joint: the outer one is removed when it differs.
-BODY_BONES = (*((11, 13), (13, 15), (12, 14), (14, 16)), *((23, 25), (25, 27), (24, 26), (26, 28)))
+BODY_BONES = (
+    *((11, 13), (13, 15), (12, 14), (14, 16)),
+    *((23, 25), (25, 27), (24, 26), (26, 28)),
+)
 HAND_ROOTS = [BODY, BODY + HAND]
 HAND_BONES = tuple((start, start + knuckle) for start in HAND_ROOTS for knuckle in PALM)
 FINGERS = tuple((start + a, start + b) for start in HAND_ROOTS for a, b in FINGER_BONES)
 FINGER_NOISE = 0.02  # metres by which noise alone changes the length of a finger's bone
 MAX_REACH = 1.5  # metres from the median joint of the frame
-BONE, HAND_BONE, FINGER_BONE = 0.3, 0.3, 0.5  # shares by which a length may differ from its median
+# shares by which a length may differ from its median
+BONE = 0.3
+HAND_BONE = 0.3
+FINGER_BONE = 0.5
 WRIST = 0.1  # metres from the pose's wrist to the hand's, at most
 FACE_RADIUS = 0.15  # metres from the middle of the face, at most
 DEGREE = 2  # of the polynomial that smooths
@@ -35,7 +41,9 @@ def cleanse(p: Float) -> tuple[Float, dict[str, int]]:
         gap = np.linalg.norm(p[:, HAND_ROOTS] - p[:, WRISTS], axis=-1)
         far[:, HANDS] |= (gap > WRIST).repeat(HAND, axis=1)
         face = p[:, FACE]
-        far[:, FACE] |= np.linalg.norm(face - nanmedian(face, 1)[:, None], axis=-1) > FACE_RADIUS
+        far[:, FACE] |= (
+            np.linalg.norm(face - nanmedian(face, 1)[:, None], axis=-1) > FACE_RADIUS
+        )
     far &= seen
     p[far] = np.nan
     wrong = np.zeros(far.shape, bool)
@@ -77,7 +85,8 @@ def smooth(p: Float, weight: Float, time: Float, seconds: float) -> Float:
         seconds: standard deviation of the Gaussian neighbourhood.
     """
     usable = known(p) & (weight > 0)
-    filled, weight = np.where(usable[..., None], p, 0.0), np.where(usable, weight, 0.0)
+    filled = np.where(usable[..., None], p, 0.0)
+    weight = np.where(usable, weight, 0.0)
     out = np.where(usable[..., None], p, np.nan)
     if seconds == 0:
         return out

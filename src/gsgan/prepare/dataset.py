@@ -45,7 +45,9 @@ class Outcome:
 
 def write_files(root: Path, outcome: Outcome, key: str) -> None:
     """Writes cameras, landmarks and metadata, in metres and pixels."""
-    solution, frames, p = outcome.solution, outcome.frames, outcome.solution.p
+    solution = outcome.solution
+    frames = outcome.frames
+    p = outcome.solution.p
     write_json(
         root / "cameras.json",
         {
@@ -94,7 +96,9 @@ def standing_axis(p: Float) -> str:
     """
     legs = np.concatenate([p[:, 0] - (p[:, 27] + p[:, 28]) / 2, (p[:, 11] - p[:, 23])])
     head = p[:, [7, 8]].mean(1) - p[:, [11, 12]].mean(1)
-    above = next((a for a in (legs[known(legs)], head[known(head)]) if len(a)), legs[:0])
+    above = next(
+        (a for a in (legs[known(legs)], head[known(head)]) if len(a)), legs[:0]
+    )
     return axis_name(np.median(above, axis=0)) if len(above) else "z"
 
 
@@ -125,7 +129,9 @@ def publish(root: Path, out: Path) -> None:
     try:
         read_capture(root)
     except DataError as error:
-        raise DataError(f"nothing was made, because training could not read it: {error}") from None
+        raise DataError(
+            f"nothing was made, because training could not read it: {error}"
+        ) from None
     old = out.with_name(f".{out.name}.old")
     with writing(out):
         if out.exists():

@@ -18,16 +18,22 @@ from gsgan.utils.errors import DataError
 from gsgan.utils.files import write_npz, writing
 
 RATE = 12.0  # images per second, unless that makes fewer than FEW or more than MOST
-FEW, MOST = 60, 400
+FEW = 60
+MOST = 400
 LEAST = 12  # images of use, without which there is no solution
 LONGEST = 1920  # pixels of the longer side: larger images are reduced
-SAMPLING = [RATE, FEW, MOST, LONGEST]  # what the sampled images depend on beside the video
+# what the sampled images depend on beside the video
+SAMPLING = [RATE, FEW, MOST, LONGEST]
 TIMES = "times.npz"  # written last
-LEAST_JOINTS, CONFIDENT = 16, 0.5  # of 33: fewer are not a whole person
+# of 33: fewer are not a whole person
+LEAST_JOINTS = 16
+CONFIDENT = 0.5
 BLURRED = 0.3  # share of the usual sharpness
 JUMP = 0.5  # of the person's size from image to image: the detector found somebody else
 SHARP_SIZE = 256  # pixels: sharpness is measured on the person at this height
-CORNERS, FEW_CORNERS = 200, 20  # of the background, that show a moving camera: most, least
+# of the background, that show a moving camera: most, least
+CORNERS = 200
+FEW_CORNERS = 20
 
 LeftOut = dict[str, Bool]
 """``[F]`` which frames are left out, by reason."""
@@ -50,7 +56,9 @@ def sample(video: Path, folder: Path) -> tuple[Recording, Float]:
     arrays = read_arrays(folder / TIMES, ("number", "time"))
     files = {n: folder / f"{n:06d}.jpg" for n in arrays["number"].tolist()}
     size = read_grey(next(iter(files.values()))).shape
-    recording = Recording(video.stem, folder, (size[0], size[1]), None, files, len(files))
+    recording = Recording(
+        video.stem, folder, (size[0], size[1]), None, files, len(files)
+    )
     return recording, np.asarray(arrays["time"], np.float64)
 
 
@@ -59,7 +67,10 @@ def _extract(source: Recording, folder: Path) -> None:
     seconds = source.count / rate
     every = max(min(1 / RATE, seconds / FEW), seconds / MOST)
     shrink = min(1.0, LONGEST / max(source.size))
-    video, number, numbers, times = opened(source.path, True), -1, list[int](), list[float]()
+    video = opened(source.path, True)
+    number = -1
+    numbers = list[int]()
+    times = list[float]()
     while video.grab() and len(times) < 2 * MOST:  # the header's length may be wrong
         number += 1
         now = video.get(cv2.CAP_PROP_POS_MSEC) / 1000
@@ -70,7 +81,9 @@ def _extract(source: Recording, folder: Path) -> None:
         if not done:
             break
         if shrink < 1:
-            image = cv2.resize(image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+            image = cv2.resize(
+                image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA
+            )
         encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
         with writing(folder):
             (folder / f"{number:06d}.jpg").write_bytes(encoded.tobytes())
@@ -93,9 +106,11 @@ def left_out(px: Float, conf: Float, sharp: Float) -> LeftOut:
         "nobody, or too little of a person": np.asarray(sure.sum(1) < LEAST_JOINTS)
     }
     found["shoulders or hips cut off"] = np.asarray((conf[:, HUBS] <= 0).any(1))
-    middle, size = px[:, HUBS].mean(1), extents(px)
+    middle = px[:, HUBS].mean(1)
+    size = extents(px)
     good = np.asarray(~np.logical_or.reduce(list(found.values())))
-    same, before = good.copy(), -1
+    same = good.copy()
+    before = -1
     for f in np.flatnonzero(good):
         reach = JUMP * (f - before) * size[f]
         same[f] = before < 0 or np.linalg.norm(middle[f] - middle[before]) < reach
@@ -113,7 +128,8 @@ def left_out(px: Float, conf: Float, sharp: Float) -> LeftOut:
 def extents(px: Float) -> Float:
     """``[F]`` the diagonal of the box round the seen landmarks ``[F, 33, 2]``; NaN without any."""
     seen = known(px)
-    low, high = (np.where(seen[..., None], px, s) for s in (np.inf, -np.inf))
+    low = np.where(seen[..., None], px, np.inf)
+    high = np.where(seen[..., None], px, (-np.inf))
     size = np.linalg.norm(high.max(1) - low.min(1), axis=-1)
     return np.where(seen.any(1), size, np.nan)
 
@@ -123,17 +139,24 @@ def look(files: Sequence[Path], px: Float) -> tuple[Float, float]:
 
     Sharpness is the variance of the Laplacian in the box round ``px [F, 33, 2]``.
     """
-    sharp, moves = np.zeros(len(files)), [np.zeros(2)]
+    sharp = np.zeros(len(files))
+    moves = [np.zeros(2)]
     before: Bytes | None = None
     for f, path in enumerate(files):
         image = read_grey(path)
         seen = px[f][known(px[f])]
-        box = np.r_[seen.min(0), seen.max(0)].astype(np.int64) if len(seen) else np.zeros(4, int)
+        box = (
+            np.r_[seen.min(0), seen.max(0)].astype(np.int64)
+            if len(seen)
+            else np.zeros(4, int)
+        )
         left, top, right, bottom = box.clip(0).tolist()
         crop = image[top : bottom + 1, left : right + 1]
         if len(seen) > 1 and min(crop.shape) > 1:
             share = SHARP_SIZE / crop.shape[0]
-            sized = cv2.resize(crop, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
+            sized = cv2.resize(
+                crop, None, fx=share, fy=share, interpolation=cv2.INTER_AREA
+            )
             sharp[f] = cv2.Laplacian(sized, cv2.CV_64F).var()
         small = np.asarray(cv2.resize(image, None, fx=0.25, fy=0.25), np.uint8)
         if before is not None:
@@ -149,7 +172,9 @@ def _flow(before: Bytes, after: Bytes, box: Ints) -> Float:
     mask = np.full(before.shape, 255, np.uint8)
     left, top, right, bottom = box.tolist()
     margin = (bottom - top) // 8
-    mask[max(top - margin, 0) : bottom + margin, max(left - margin, 0) : right + margin] = 0
+    mask[
+        max(top - margin, 0) : bottom + margin, max(left - margin, 0) : right + margin
+    ] = 0
     points = cv2.goodFeaturesToTrack(before, CORNERS, 0.01, 8, mask=mask)
     if points is None or len(points) < FEW_CORNERS:
         return np.zeros(2)
@@ -168,7 +193,9 @@ def check_enough(video: Path, frames: int, left: LeftOut) -> None:
     used = frames - sum(int(one.sum()) for one in left.values())
     if used >= LEAST:
         return
-    why = ", ".join(f"{reason}: {int(one.sum())}" for reason, one in left.items() if one.any())
+    why = ", ".join(
+        f"{reason}: {int(one.sum())}" for reason, one in left.items() if one.any()
+    )
     raise DataError(
         f"{video}: only {used} of {frames} sampled images show one whole person sharply"
         f"{f' ({why})' if why else ''}; film one person as docs/one_camera.md shows"

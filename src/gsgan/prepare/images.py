@@ -42,11 +42,17 @@ def find_masks(folder: Path, names: Iterable[str]) -> dict[str, dict[int, Path]]
     for name in names:
         place = folder / name
         stems = [p.stem for p in place.glob("*") if p.suffix.lower() in IMAGE_SUFFIXES]
-        of_persons = bool(stems) and all(re.fullmatch(r"\d+_\d+", stem) for stem in stems)
-        number = (lambda stem: int(stem.partition("_")[0])) if of_persons else last_number
+        of_persons = bool(stems) and all(
+            re.fullmatch(r"\d+_\d+", stem) for stem in stems
+        )
+        number = (
+            (lambda stem: int(stem.partition("_")[0])) if of_persons else last_number
+        )
         files = frame_files(folder, name, IMAGE_SUFFIXES, number)
         if not files:
-            raise DataError(f"{place} holds no masks; expected {name}/000000.png and so on")
+            raise DataError(
+                f"{place} holds no masks; expected {name}/000000.png and so on"
+            )
         found[name] = {number: folder / path for number, path in files.items()}
     return found
 
@@ -92,13 +98,16 @@ def write_images(
     Raises:
         DataError: when an image or mask is damaged or of the wrong size, or the disk is full.
     """
-    images, alphas = root / "images" / camera.name, root / "masks" / camera.name
+    images = root / "images" / camera.name
+    alphas = root / "masks" / camera.name
     for folder in (images, alphas):
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
-    window, size = Crop(0, 0, camera.size), scaled(camera, scale).size
+    window = Crop(0, 0, camera.size)
+    size = scaled(camera, scale).size
     mapping = undistort_map(camera.K, camera.dist, window) if camera.distorted else None
-    written, last = list[int](), max(frames, default=-1)
+    written = list[int]()
+    last = max(frames, default=-1)
     for number, image in source.images():
         frame = number + offset
         if frame > last:
@@ -115,7 +124,9 @@ def write_images(
                     f"{where}: frame {number} is {pixels.shape[1]}x{pixels.shape[0]} pixels, "
                     f"expected {camera.size[1]}x{camera.size[0]}"
                 )
-            straight = resize(take(pixels, window, mapping, exact=False), size, exact=False)
+            straight = resize(
+                take(pixels, window, mapping, exact=False), size, exact=False
+            )
             _write(folder / f"{frame:06d}.{kind}", straight)
     return written
 

@@ -29,7 +29,11 @@ from gsgan.utils.errors import DataError
 MIDDLE_OF_HIPS = 0.35  # of the trunk: farther from it joint 8 is another one
 MESH = 468  # landmarks of MediaPipe's face mesh
 PIXEL_CENTRE = 0.5  # added to detectors that count from the centre of the first pixel
-OPENPOSE_KEYS = ("pose_keypoints_2d", "hand_left_keypoints_2d", "hand_right_keypoints_2d")
+OPENPOSE_KEYS = (
+    "pose_keypoints_2d",
+    "hand_left_keypoints_2d",
+    "hand_right_keypoints_2d",
+)
 EASYMOCAP_KEYS = ("keypoints", "handl2d", "handr2d")
 
 
@@ -38,7 +42,8 @@ class Detections:
     """One camera's detections of the J joints: 33 body, 21 left hand, 21 right hand, 30 face."""
 
     frame_id: Ints  # [F] rising
-    px: Float  # [F, J, 2] pixels of the image as stored, pixel centres at +0.5; NaN = not seen
+    # [F, J, 2] pixels of the image as stored, pixel centres at +0.5; NaN = not seen
+    px: Float
     conf: Float  # [F, J] in [0, 1], 0 = not seen
 
 
@@ -51,7 +56,9 @@ def find_landmarks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
     there = sorted(p.name for p in folder.iterdir()) if folder.is_dir() else []
     found = {}
     for name in names:
-        existing = [end for end in (f"{name}.npz", f"{name}_json", name) if end in there]
+        existing = [
+            end for end in (f"{name}.npz", f"{name}_json", name) if end in there
+        ]
         if not existing:
             raise DataError(
                 f"{folder} has no landmarks of the camera {name}, such as {name}.npz or "
@@ -70,7 +77,8 @@ def read_detections(path: Path) -> Detections:
     if path.is_dir():
         files = json_files(path)
         people = [_read_people(file) for file in files.values()]
-        best = [max(found, key=_seen, default=None) for found in people]  # the person seen best
+        # the person seen best
+        best = [max(found, key=_seen, default=None) for found in people]
         bodies = [person.body for person in best if person is not None]
         numbers = joint_numbers(bodies)
         read = [_joints(person, numbers) for person in best]
@@ -101,7 +109,8 @@ def gather(
     conf = np.zeros(px.shape[:3])
     for c, (own, seen) in enumerate(zip(ids, detections.values(), strict=True)):
         at = np.searchsorted(frames, own[own >= 0])
-        px[c, at], conf[c, at] = seen.px[own >= 0], seen.conf[own >= 0]
+        px[c, at] = seen.px[own >= 0]
+        conf[c, at] = seen.conf[own >= 0]
     return frames, px, conf
 
 
@@ -120,15 +129,19 @@ def _read_npz(path: Path) -> Numbered:
     body = expect_array(arrays, "px", (None, BODY, 2), path).astype(np.float64)
     F = len(body)
     frame_id = whole_frame_ids(expect_array(arrays, "frame_id", (F,), path), str(path))
-    px, conf = np.full((F, ALL, 2), np.nan), np.zeros((F, ALL))
-    px[:, :BODY], conf[:, :BODY] = body, expect_array(arrays, "conf", (F, BODY), path)
+    px = np.full((F, ALL, 2), np.nan)
+    conf = np.zeros((F, ALL))
+    px[:, :BODY] = body
+    conf[:, :BODY] = expect_array(arrays, "conf", (F, BODY), path)
     for name, part in (("left", LEFT), ("right", RIGHT)):
         if name in arrays:
             px[:, part] = expect_array(arrays, name, (F, HAND, 2), path)
-            conf[:, part] = 1.0  # MediaPipe has no confidence per landmark of hands and face
+            # MediaPipe has no confidence per landmark of hands and face
+            conf[:, part] = 1.0
     if "face" in arrays:
         mesh = expect_array(arrays, "face", (F, MESH, 2), path)
-        px[:, FACE], conf[:, FACE] = mesh[:, list(FACE_MESH.values())], 1.0
+        px[:, FACE] = mesh[:, list(FACE_MESH.values())]
+        conf[:, FACE] = 1.0
     return frame_id, px, conf
 
 
@@ -153,14 +166,24 @@ def _read_people(path: Path) -> list[_Person]:
     """
     content = read_json(path)
     if isinstance(content.get("people"), list):
-        keys, people = OPENPOSE_KEYS, content["people"]
+        keys = OPENPOSE_KEYS
+        people = content["people"]
     elif isinstance(content.get("annots"), list):
-        keys, people = EASYMOCAP_KEYS, content["annots"]
+        keys = EASYMOCAP_KEYS
+        people = content["annots"]
     else:
-        raise DataError(f"{path} has neither 'people' (OpenPose) nor 'annots' (EasyMocap)")
+        raise DataError(
+            f"{path} has neither 'people' (OpenPose) nor 'annots' (EasyMocap)"
+        )
     try:
         return [_person(person, keys) for person in people if person is not None]
-    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+    except (
+        ArithmeticError,
+        AttributeError,
+        LookupError,
+        TypeError,
+        ValueError,
+    ) as error:
         sets = ", ".join(f"{n} ({name})" for n, (name, _) in SETS.items())
         raise DataError(
             f"{path}: a person must hold '{keys[0]}' with x, y, confidence of {sets} joints "
@@ -172,7 +195,9 @@ def _person(person: Mapping[str, Any], keys: tuple[str, ...]) -> _Person:
     # OpenPose of 2017 had names without _2d.
     if not {keys[0], keys[0].removesuffix("_2d")} & person.keys():
         raise KeyError(f"found {', '.join(person)}")
-    found = [person.get(key) or person.get(key.removesuffix("_2d")) or [] for key in keys]
+    found = [
+        person.get(key) or person.get(key.removesuffix("_2d")) or [] for key in keys
+    ]
     # OpenPose writes triples flat, EasyMocap in rows.
     parts = [np.array(values, np.float64).reshape(-1, 3) for values in found]
     if len(parts[0]) and len(parts[0]) not in SETS:
@@ -195,7 +220,9 @@ def joint_numbers(bodies: Sequence[Float]) -> dict[int, dict[int, int]]:
         if len(body) == 25 and (body[[1, 8, 9, 12], 2] > 0).all():
             neck, middle, right, left = body[[1, 8, 9, 12], :2]
             trunk = np.linalg.norm(neck - (left + right) / 2)
-            distances.append(np.linalg.norm(middle - (left + right) / 2) / max(float(trunk), 1e-6))
+            distances.append(
+                np.linalg.norm(middle - (left + right) / 2) / max(float(trunk), 1e-6)
+            )
     if distances and np.median(distances) > MIDDLE_OF_HIPS:
         numbers[25] = BODY_25B
     return numbers
@@ -205,7 +232,8 @@ def _joints(
     person: _Person | None, numbers: Mapping[int, Mapping[int, int]]
 ) -> tuple[Float, Float]:
     """Pixels ``[J, 2]`` and confidence ``[J]`` of a person; NaN and 0 of nobody."""
-    px, conf = np.full((ALL, 2), np.nan), np.zeros(ALL)
+    px = np.full((ALL, 2), np.nan)
+    conf = np.zeros(ALL)
     if person is None:
         return px, conf
 
@@ -222,5 +250,6 @@ def _joints(
             put(list(range(part.start, part.stop)), hand)
     for target, origin in FROM_HANDS.items():
         if conf[target] == 0:
-            px[target], conf[target] = px[origin], conf[origin]
+            px[target] = px[origin]
+            conf[target] = conf[origin]
     return px, conf

@@ -17,15 +17,19 @@ from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import cache_root, writing
 
 TOOL = Path(__file__).parent / "mediapipe_tool"
-SCRIPT, REQUIREMENTS = TOOL / "detect.py", TOOL / "requirements.txt"
+SCRIPT = TOOL / "detect.py"
+REQUIREMENTS = TOOL / "requirements.txt"
 NEWEST = (3, 12)  # the pinned MediaPipe has no build for later Pythons
-MARKER = ".gsgan-mediapipe"  # written first: a folder with it was made here and may be replaced
+# written first: a folder with it was made here and may be replaced
+MARKER = ".gsgan-mediapipe"
 READY = ".ready"  # written last: an environment without it is incomplete
 
 
 def environment_of(tool: MediaPipe) -> Path:
     """The environment's folder, which need not exist."""
-    return Path(tool.folder or cache_root() / "tools" / "mediapipe-0.10.21").expanduser()
+    return Path(
+        tool.folder or cache_root() / "tools" / "mediapipe-0.10.21"
+    ).expanduser()
 
 
 def tool_key() -> list[str]:
@@ -40,7 +44,9 @@ def find_people(
     say: Callable[[str], None],
 ) -> tuple[dict[str, Path], dict[str, dict[int, Path]]]:
     """Landmark files by source, and its masks by frame number: given ones, or those of the tool."""
-    found, masks = run_tool(options, sources, stages, say) if options.needs_tool else ({}, {})
+    found, masks = (
+        run_tool(options, sources, stages, say) if options.needs_tool else ({}, {})
+    )
     if options.masks != MEDIAPIPE:
         masks = find_masks(options.folder("masks"), sources)
     if options.landmarks != MEDIAPIPE:
@@ -60,9 +66,11 @@ def run_tool(
         ConfigError: when the environment is missing and may not be created.
         DataError: when the tool fails or finds nobody in a source.
     """
-    tool, masks = options.mediapipe, options.masks == MEDIAPIPE
+    tool = options.mediapipe
+    masks = options.masks == MEDIAPIPE
     parts = {"hands": options.hands, "face": options.face}
-    results, folders = {}, {}
+    results = {}
+    folders = {}
     for name, source in sources.items():
         key = [source.fingerprint(), source.rotate, tool_key(), parts, masks]
         folders[name] = stages.path(f"mediapipe-{name}", key)
@@ -91,14 +99,18 @@ def run_tool(
         for name, folder in folders.items()
     }
     if masks and (empty := [name for name, files in found.items() if not files]):
-        raise DataError(f"MediaPipe found nobody in {empty[0]}; show a person, or leave it out")
+        raise DataError(
+            f"MediaPipe found nobody in {empty[0]}; show a person, or leave it out"
+        )
     return results, found
 
 
 def _detect(command: list[str], source: Path, advance: Advance) -> None:
     with (
         tempfile.TemporaryFile("w+") as errors,
-        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True) as process,
+        subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=errors, text=True
+        ) as process,
     ):
         try:
             assert process.stdout is not None
@@ -111,10 +123,14 @@ def _detect(command: list[str], source: Path, advance: Advance) -> None:
             raise
         if process.wait():
             errors.seek(0)
-            raise DataError(f"{source}: the MediaPipe tool failed: {_last_line(errors.read())}")
+            raise DataError(
+                f"{source}: the MediaPipe tool failed: {_last_line(errors.read())}"
+            )
 
 
-def ensure_environment(tool: MediaPipe, setup: bool, say: Callable[[str], None]) -> Path:
+def ensure_environment(
+    tool: MediaPipe, setup: bool, say: Callable[[str], None]
+) -> Path:
     """The environment's Python; a missing environment is created if ``setup`` allows it.
 
     Raises:
@@ -131,13 +147,19 @@ def ensure_environment(tool: MediaPipe, setup: bool, say: Callable[[str], None])
             "it (some 400 MB), or give landmarks=<folder> and masks=<folder>"
         )
     pythons = [tool.python, sys.executable if sys.version_info[:2] <= NEWEST else None]
-    base = next(filter(None, (*pythons, *map(shutil.which, ("python3.12", "python3.11")))), None)
+    base = next(
+        filter(None, (*pythons, *map(shutil.which, ("python3.12", "python3.11")))), None
+    )
     if base is None:
-        raise ConfigError("MediaPipe needs Python 3.11 or 3.12: set mediapipe.python=<path>")
+        raise ConfigError(
+            "MediaPipe needs Python 3.11 or 3.12: set mediapipe.python=<path>"
+        )
     with writing(place):
         if place.exists():
             if any(place.iterdir()) and not (place / MARKER).is_file():
-                raise ConfigError(f"mediapipe.folder={place} holds something else; give a new one")
+                raise ConfigError(
+                    f"mediapipe.folder={place} holds something else; give a new one"
+                )
             shutil.rmtree(place)
         place.mkdir(parents=True)
         (place / MARKER).touch()
@@ -156,7 +178,9 @@ def _run(command: list[str], what: str) -> None:
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
     except OSError as error:
-        raise DataError(f"{what}: {command[0]} cannot be started ({error.strerror})") from None
+        raise DataError(
+            f"{what}: {command[0]} cannot be started ({error.strerror})"
+        ) from None
     if done.returncode:
         raise DataError(f"{what}: {_last_line(done.stderr or done.stdout)}")
 

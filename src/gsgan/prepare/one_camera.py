@@ -16,7 +16,16 @@ from gsgan.body.shape import BodyShape, shaped_body
 from gsgan.data.calibration import Calibration
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.files import read_arrays
-from gsgan.data.joints import ALL, ARM_PAIRS, BODY, FLIP_GROUPS, HANDS, LEFT, LEG_PAIRS, RIGHT
+from gsgan.data.joints import (
+    ALL,
+    ARM_PAIRS,
+    BODY,
+    FLIP_GROUPS,
+    HANDS,
+    LEFT,
+    LEG_PAIRS,
+    RIGHT,
+)
 from gsgan.prepare import landmarks
 from gsgan.prepare.camera_array import CameraArray
 from gsgan.prepare.cleanse import cleanse, smooth
@@ -33,14 +42,22 @@ from gsgan.skeleton.hands import HAND
 from gsgan.utils.arrays import Bool, Float, Ints, expect_array
 from gsgan.utils.errors import DataError
 
-FILM = np.hypot(36.0, 24.0)  # millimetres, the diagonal that equivalent focal lengths refer to
-USUAL = 30.0  # millimetres: phones' main cameras have 24 to 28 and record a part of their image
+# millimetres, the diagonal that equivalent focal lengths refer to
+FILM = np.hypot(36.0, 24.0)
+# millimetres: phones' main cameras have 24 to 28 and record a part of their image
+USUAL = 30.0
 # How Apple's phones state it, in millimetres; not which part of the image was recorded.
 FOCAL = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
-OVERCONFIDENT = 3.0  # errors of focal lengths over the solution's own estimate, on synthetic scenes
+# errors of focal lengths over the solution's own estimate, on synthetic scenes
+OVERCONFIDENT = 3.0
 DOUBTFUL = 3.0  # times the usual error of a frame
-SHORT, TURN = 8.0, 300  # seconds, degrees: less is in doubt
-MOVED, OTHERS, FEET_SEEN = 0.03, 0.2, 0.5  # shares: more, more, less is in doubt
+# seconds, degrees: less is in doubt
+SHORT = 8.0
+TURN = 300
+# shares: more, more, less is in doubt
+MOVED = 0.03
+OTHERS = 0.2
+FEET_SEEN = 0.5
 DIRECTIONS = 12
 SWAPPED = [j for pair in (*ARM_PAIRS[:3], *LEG_PAIRS[:3]) for j in pair]
 
@@ -86,7 +103,9 @@ def solve_video(options: Options, stages: StageFolder, console: Console) -> Film
     there &= np.isin(numbers, list(masks[source.name]))
     with console.status("choosing frames"):
         sharp, moved = look(list(source.files.values()), detected.px[:, :BODY])
-    left = left_out(detected.px[:, :BODY], detected.conf[:, :BODY] * there[:, None], sharp)
+    left = left_out(
+        detected.px[:, :BODY], detected.conf[:, :BODY] * there[:, None], sharp
+    )
     check_enough(video, len(numbers), left)
     use = ~np.logical_or.reduce(list(left.values()))
     with console.status("solving for the camera, the body and its poses"):
@@ -100,7 +119,8 @@ def solve_video(options: Options, stages: StageFolder, console: Console) -> Film
     left["doubtful pose"][np.flatnonzero(use)[doubtful]] = True
     camera, p = _in_world(source, view, guess, options.height)
     kept = np.flatnonzero(use)[~doubtful]
-    p, seen = p[~doubtful], detected[np.isin(np.arange(len(use)), kept)]
+    p = p[~doubtful]
+    seen = detected[np.isin(np.arange(len(use)), kept)]
     joints, removed = _with_hands(p, seen, camera, time[kept], options)
     error = np.full((1, len(kept), joints.shape[1]), np.nan)
     error[0, :, :BODY] = view.error.numpy()[~doubtful] * guess
@@ -117,7 +137,9 @@ def solve_video(options: Options, stages: StageFolder, console: Console) -> Film
         stages={"fitted": error[:, :, :BODY]},
         removed=removed,
     )
-    measured = _measured(view, camera, p, time[kept], seen, left) | {"background_moved": moved}
+    measured = _measured(view, camera, p, time[kept], seen, left) | {
+        "background_moved": moved
+    }
     calibration = Calibration(video, "estimated from the person", {camera.name: camera})
     fps = round(1 / float(np.median(np.diff(time))), 3)
     measured |= {"focal_stated": stated}
@@ -136,17 +158,25 @@ def _read(path: Path, numbers: Ints, size: tuple[int, int]) -> tuple[Detected, B
             f"{path}: one camera needs the array world (F,33,3) of MediaPipe's world landmarks; "
             "give landmarks=mediapipe, or videos of two calibrated cameras"
         )
-    F, own = len(found.frame_id), read_arrays(path, ("frame_id",))["frame_id"]
+    F = len(found.frame_id)
+    own = read_arrays(path, ("frame_id",))["frame_id"]
     order = np.argsort(own)
     at = np.searchsorted(found.frame_id, numbers).clip(max=F - 1)
     there = found.frame_id[at] == numbers
-    px, conf = landmarks.inside(found.px[None], found.conf[None], np.array([size[::-1]]))
+    px, conf = landmarks.inside(
+        found.px[None], found.conf[None], np.array([size[::-1]])
+    )
     rest = {
-        name: np.asarray(expect_array(arrays, name, (F, *shape), path), np.float64)[order][at]
+        name: np.asarray(expect_array(arrays, name, (F, *shape), path), np.float64)[
+            order
+        ][at]
         for name, shape in depth.items()
         if name in arrays
     }
-    hand_z = [rest.get(name, np.full((len(at), HAND), np.nan)) for name in ("left_z", "right_z")]
+    hand_z = [
+        rest.get(name, np.full((len(at), HAND), np.nan))
+        for name in ("left_z", "right_z")
+    ]
     detected = Detected(
         px=px[0, at],
         conf=conf[0, at] * (there & np.isfinite(rest["world"]).all((1, 2)))[:, None],
@@ -173,9 +203,12 @@ def _solve(
     options: Options, seen: Detected, time: Float, size: tuple[int, int], guess: float
 ) -> View:
     """The solution, which starts from a focal length of so many pixels."""
-    px, conf, world = seen.px[:, :BODY].copy(), seen.conf[:, :BODY].copy(), seen.world.copy()
+    px = seen.px[:, :BODY].copy()
+    conf = seen.conf[:, :BODY].copy()
+    world = seen.world.copy()
     conf[conf <= options.solve.min_confidence] = 0
-    swapped, mirror = exchanged(world[:, SWAPPED]), list(MEDIAPIPE33.mirror)
+    swapped = exchanged(world[:, SWAPPED])
+    mirror = list(MEDIAPIPE33.mirror)
     for values in (px, conf, world):
         values[swapped] = values[swapped][:, mirror]
     u = np.nan_to_num(px - np.array(size[::-1]) / 2) / guess
@@ -186,7 +219,9 @@ def _solve(
 
 def natural_height(shape: BodyShape) -> float:
     """Metres from the soles to the top of the head."""
-    x = shaped_body(BodyShape(shape.coefficients.float(), shape.stretch.float())).vertices[:, 2]
+    x = shaped_body(
+        BodyShape(shape.coefficients.float(), shape.stretch.float())
+    ).vertices[:, 2]
     return float(x.max() - x.min())
 
 
@@ -198,10 +233,12 @@ def _in_world(
     p = view.p.numpy()
     trunk = p[:, [11, 12]].mean(1) - p[:, [23, 24]].mean(1)
     if view.ground is None:
-        up, below = trunk.mean(0), np.percentile(p[:, FEET].reshape(-1, 3), 98, axis=0)
+        up = trunk.mean(0)
+        below = np.percentile(p[:, FEET].reshape(-1, 3), 98, axis=0)
     else:
         a, b, c = view.ground.tolist()
-        up, below = np.array([a, -1.0, b]), np.array([0, c, 0])
+        up = np.array([a, -1.0, b])
+        below = np.array([0, c, 0])
     up = up / np.linalg.norm(up)
     across = np.cross([0.0, 0.0, 1.0], up)  # the camera looks along +y
     across /= np.linalg.norm(across)
@@ -210,7 +247,9 @@ def _in_world(
     origin = middle - ((middle - below) @ up) * up
     scale = 1.0 if height is None else height / natural_height(view.shape)
     focal = guess * view.focal
-    K = np.array([[focal, 0, source.size[1] / 2], [0, focal, source.size[0] / 2], [0, 0, 1]])
+    K = np.array(
+        [[focal, 0, source.size[1] / 2], [0, focal, source.size[0] / 2], [0, 0, 1]]
+    )
     camera = CameraEntry(source.name, K, R, scale * origin, np.zeros(8), source.size)
     return camera, scale * (p - origin) @ R
 
@@ -232,14 +271,21 @@ def _with_hands(
         joints[:, part] += p[:, [wrist]] - joints[:, part][:, :1]
     joints, removed = cleanse(joints)
     weight = np.isfinite(joints).all(-1).astype(float)
-    hands = smooth(joints[:, HANDS], weight[:, HANDS], time, 2 * options.solve.smoothing)
+    hands = smooth(
+        joints[:, HANDS], weight[:, HANDS], time, 2 * options.solve.smoothing
+    )
     joints[:, HANDS] = hands
     joints[:, :BODY] = p
     return joints, removed
 
 
 def _measured(
-    view: View, camera: CameraEntry, p: Float, time: Float, detected: Detected, left: LeftOut
+    view: View,
+    camera: CameraEntry,
+    p: Float,
+    time: Float,
+    detected: Detected,
+    left: LeftOut,
 ) -> dict[str, Any]:
     """The numbers of prepare.json that only a video of one camera has."""
     focal = float(camera.K[0, 0])
@@ -254,7 +300,9 @@ def _measured(
         "degrees_seen": 360 // DIRECTIONS * len(directions),
         "seconds": float(np.ptp(time)),
         "sampled": len(next(iter(left.values()))),
-        "left_out": {reason: int(one.sum()) for reason, one in left.items() if one.any()},
+        "left_out": {
+            reason: int(one.sum()) for reason, one in left.items() if one.any()
+        },
         "several_faces": float((detected.faces > 1).mean()),
         "feet_seen": float((detected.conf[:, FEET] > 0).any(1).mean()),
         "standing": view.ground is not None,
@@ -263,26 +311,42 @@ def _measured(
 
 def _notes(found: Mapping[str, Any], options: Options, natural: float) -> list[str]:
     """Sentences on what was estimated, and on what is in doubt."""
-    notes = [f"focal length {found['focal_px']:.0f} pixels, {found['focal_mm']:.0f} mm on film"]
+    notes = [
+        f"focal length {found['focal_px']:.0f} pixels, {found['focal_mm']:.0f} mm on film"
+    ]
     if options.focal is None:
         stated = found["focal_stated"]
         origin = f" from the {stated:g} mm that the file states" if stated else ""
-        notes[0] += f", ± {found['focal_uncertainty']:.0%}, estimated{origin}; focal=<mm> sets it"
+        notes[0] += (
+            f", ± {found['focal_uncertainty']:.0%}, estimated{origin}; focal=<mm> sets it"
+        )
     if options.height is None:
         notes.append(f"height {natural:.2f} m, as a usual person; height=<m> sets it")
     if found["left_out"]:
-        reasons = ", ".join(f"{reason} {count}" for reason, count in found["left_out"].items())
+        reasons = ", ".join(
+            f"{reason} {count}" for reason, count in found["left_out"].items()
+        )
         notes.append(f"left out of {found['sampled']} sampled images: {reasons}")
-    few, turned, moved, others, feet = (
-        found[name]
-        for name in ("seconds", "degrees_seen", "background_moved", "several_faces", "feet_seen")
-    )
+    few = found["seconds"]
+    turned = found["degrees_seen"]
+    moved = found["background_moved"]
+    others = found["several_faces"]
+    feet = found["feet_seen"]
     doubts = (
         (few < SHORT, f"{few:.1f} seconds are short, 20 to 40 are better"),
-        (turned < TURN, f"only {turned} of 360 degrees were filmed; training guesses the rest"),
-        (moved > MOVED, f"the background moved by {moved:.0%} of the image; it counts as still"),
+        (
+            turned < TURN,
+            f"only {turned} of 360 degrees were filmed; training guesses the rest",
+        ),
+        (
+            moved > MOVED,
+            f"the background moved by {moved:.0%} of the image; it counts as still",
+        ),
         (others > OTHERS, f"{others:.0%} of the images show more than one face"),
-        (feet < FEET_SEEN, f"feet are in {feet:.0%} of the images; legs and distance are guesses"),
+        (
+            feet < FEET_SEEN,
+            f"feet are in {feet:.0%} of the images; legs and distance are guesses",
+        ),
         (not found["standing"], "no foot stood still, so the ground is a guess"),
     )
     return notes + [f"doubtful: {text}" for wrong, text in doubts if wrong]

@@ -31,25 +31,35 @@ NOISE = 0.01  # of landmarks in the first steps, share of the person's size
 DEPTH = 0.08
 ACCELERATION = 8.0  # metres per square second, standard deviation
 ACCELERATIONS = 10.0  # independent ones per second
-SLIDING, GROUND = 0.1, 0.02  # metres per second, metres: of a standing foot
+# metres per second, metres: of a standing foot
+SLIDING = 0.1
+GROUND = 0.02
 BALANCE = 0.08  # metres by which the trunk is not above standing feet
 STILL = 0.25  # metres per second: a slower foot stands
 OUTLIER = 3.0  # standard deviations at which a landmark counts half
 # Metres, and the standard deviation of the logarithm. Images do not tell the size, and errors of
 # speed, depth and sliding feet are in metres: without this a small person would fit best.
-HEIGHT, SIZE = 1.7, 0.003
+HEIGHT = 1.7
+SIZE = 0.003
 LIMBS = 0.05  # weight of the prior of arms and legs, which would make them shorter
 GAP = 0.5  # seconds: motion is not smooth over a longer gap
 ZOOMS = np.arange(-4, 5) / 10  # logarithms of focal lengths to try
-ZOOM_STEPS, NEAREST = 8, 2  # Gauss-Newton steps for each; neighbours of the best that tell the best
-STEPS, SETTLED = 20, 1e-4
+# Gauss-Newton steps for each; neighbours of the best that tell the best
+ZOOM_STEPS = 8
+NEAREST = 2
+STEPS = 20
+SETTLED = 1e-4
 MIN_STANDING = 8  # landmarks of feet: fewer do not show the ground
-DAMPING, EASIER, HARDER = 1e-3, 0.3, 10.0
+DAMPING = 1e-3
+EASIER = 0.3
+HARDER = 10.0
 NEAR = 0.2  # metres before the camera
 FEET = [29, 31, 30, 32]  # heels and toes
 LIMB = re.compile(r"arm_|elbow$|thigh_|knee$")
 # The residual of a landmark in two and in three dimensions, of the feet, and of balance.
-GROUPS = torch.arange(71).repeat_interleave(torch.tensor([2] * 33 + [3] * 33 + [1] * 4 + [2]))
+GROUPS = torch.arange(71).repeat_interleave(
+    torch.tensor([2] * 33 + [3] * 33 + [1] * 4 + [2])
+)
 OWN = 3  # numbers of `State.common` before those of the shape
 HIPS = list(MEDIAPIPE33.hips)
 TRUNK = list(MEDIAPIPE33.torso)
@@ -77,7 +87,8 @@ class Seen:
     @property
     def size(self) -> Tensor:
         """``[F]`` the person's size in the image: the diagonal of the landmarks' box."""
-        low, high = (torch.where(self.weight[..., None] > 0, self.u, s) for s in (9e9, -9e9))
+        low = torch.where(self.weight[..., None] > 0, self.u, 9e9)
+        high = torch.where(self.weight[..., None] > 0, self.u, (-9e9))
         return (high.amax(1) - low.amin(1)).norm(dim=-1)
 
 
@@ -114,7 +125,9 @@ class Normal:
     def add_motion(self, X: Tensor, c: Tensor, weight: Tensor) -> None:
         """Adds squares of ``c[0] X[f] + c[1] X[f + 1] + …``: ``c [K, n]``, ``weight [n, 33]``."""
         n = c.shape[1]
-        r = torch.stack([a[:, None, None] * X[k : k + n] for k, a in enumerate(c)]).sum(0)
+        r = torch.stack([a[:, None, None] * X[k : k + n] for k, a in enumerate(c)]).sum(
+            0
+        )
         square = r.square().sum(-1) / OUTLIER**2
         self.cost = self.cost + (weight * OUTLIER**2 * square.log1p()).sum()
         w = (weight / (1 + square)).repeat_interleave(3, dim=1)
@@ -147,7 +160,9 @@ class View:
     standing: Tensor
 
 
-def solve_view(seen: Seen, noise: float, focal: bool = True, height: float = HEIGHT) -> View:
+def solve_view(
+    seen: Seen, noise: float, focal: bool = True, height: float = HEIGHT
+) -> View:
     """The person and the camera that fit what one camera saw.
 
     Keyframes determine the focal length and the shape; then all frames are solved together, smooth
@@ -168,11 +183,14 @@ def solve_view(seen: Seen, noise: float, focal: bool = True, height: float = HEI
 
     def problem(frames: Tensor, noise: float, zoom: float, **options: bool) -> Problem:
         feet = standing[frames] * ground
-        return Problem(seen[frames], noise, zoom, standing=feet, height=height, **options)
+        return Problem(
+            seen[frames], noise, zoom, standing=feet, height=height, **options
+        )
 
     tried = np.concatenate([ZOOMS[::-1], ZOOMS]) if focal else np.zeros(1)
     first = problem(at, NOISE, float(tried[0]))
-    states, costs = [first.minimise(first.start())[0]], []
+    states = [first.minimise(first.start())[0]]
+    costs = []
     for zoom in tried:
         state, cost = problem(at, noise, float(zoom)).minimise(states[-1], ZOOM_STEPS)
         states.append(state)
@@ -222,7 +240,9 @@ class Problem:
         standing: Tensor | None = None,
         height: float = HEIGHT,
     ) -> None:
-        self.seen, self.zoom, self.smooth = seen, math.exp(zoom), smooth
+        self.seen = seen
+        self.zoom = math.exp(zoom)
+        self.smooth = smooth
         none = seen.weight.new_zeros(len(seen.weight), len(FEET))
         self.standing = none if standing is None else standing
         self.noise = (noise * seen.size)[:, None]
@@ -237,15 +257,20 @@ class Problem:
         self.free[:OWN] = bool(self.standing.any())
         w = seen.weight.unsqueeze(-1)
         middle = (w * seen.u.nan_to_num()).sum(1) / w.sum(1).clamp_min(1e-9)
-        rays = torch.cat([middle, torch.ones_like(middle[:, :1])], dim=1)  # to the seen landmarks
+        # to the seen landmarks
+        rays = torch.cat([middle, torch.ones_like(middle[:, :1])], dim=1)
         rays = rays / rays.norm(dim=1, keepdim=True)
         turn = shortest_turn(rays.new_tensor([0.0, 0, 1]).expand_as(rays), rays)
-        self.world = (axis_angle_to_matrix(turn).unsqueeze(1) @ seen.world.unsqueeze(-1))[..., 0]
+        self.world = (
+            axis_angle_to_matrix(turn).unsqueeze(1) @ seen.world.unsqueeze(-1)
+        )[..., 0]
 
     def solver(self, common: Tensor) -> Solver:
         """Of the body with a shape."""
         solver = Solver(self.space.shaped(shape_of(self.space, common[OWN:])))
-        loose = torch.tensor([LIMB.search(name) is not None for name in solver.rig.names])
+        loose = torch.tensor(
+            [LIMB.search(name) is not None for name in solver.rig.names]
+        )
         weight = torch.where(loose, LIMBS**0.5, 1.0).to(solver.prior)
         solver.prior = solver.prior * torch.outer(weight, weight)
         return solver
@@ -254,7 +279,8 @@ class Problem:
         """The detector's own 3D landmarks where they fit those in 2D best, and a usual shape."""
         common = torch.zeros_like(self.prior)
         solver = self.solver(common)
-        u, w = self.seen.u.nan_to_num() / self.zoom, self.seen.weight
+        u = self.seen.u.nan_to_num() / self.zoom
+        w = self.seen.weight
         # least squares of  x + tx = u (z + tz)
         A = torch.zeros(*u.shape, 3, dtype=u.dtype)
         A[..., 0, 0] = A[..., 1, 1] = 1
@@ -277,7 +303,9 @@ class Problem:
 
     def landmarks(self, at: State, solver: Solver) -> Tensor:
         """``[F, 33, 3]``."""
-        return solver.points(solver.transforms(at.q, at.root, solver.joints), solver.landmarks)
+        return solver.points(
+            solver.transforms(at.q, at.root, solver.joints), solver.landmarks
+        )
 
     def residuals(self, x: Tensor, own: Tensor, *of_frame: Tensor) -> Tensor:
         """``[R]`` of one frame's landmarks ``x [33, 3]``, in standard deviations: see `GROUPS`."""
@@ -286,16 +314,26 @@ class Problem:
         hang = x - x[HIPS].mean(0) - world
         feet = x[FEET]
         height = feet[:, 1] - own[0] * feet[:, 0] - own[1] * feet[:, 2] - own[2]
-        trunk = x[TRUNK].mean(0) - feet.mean(0)  # above the feet: what tells the ground's slope
-        aside = torch.stack([trunk[0] + own[0] * trunk[1], trunk[2] + own[1] * trunk[1]])
-        parts = ((shown - u) / noise, hang / self.depth, height / GROUND, aside / BALANCE)
+        # above the feet: what tells the ground's slope
+        trunk = x[TRUNK].mean(0) - feet.mean(0)
+        aside = torch.stack(
+            [trunk[0] + own[0] * trunk[1], trunk[2] + own[1] * trunk[1]]
+        )
+        parts = (
+            (shown - u) / noise,
+            hang / self.depth,
+            height / GROUND,
+            aside / BALANCE,
+        )
         return torch.cat([part.flatten() for part in parts])
 
     def terms(self, X: Tensor, own: Tensor, linear: bool = True) -> Normal:
         """The cost of landmarks ``X [F, 33, 3]``, and with ``linear`` its derivatives."""
-        seen, F = self.seen, len(X)
+        seen = self.seen
+        F = len(X)
         hung = X - X[:, HIPS].mean(1, keepdim=True)
-        w = seen.weight.unsqueeze(-1)  # the detector's own 3D landmarks are of any scale
+        # the detector's own 3D landmarks are of any scale
+        w = seen.weight.unsqueeze(-1)
         scale = ((w * hung.square()).sum() / (w * self.world.square()).sum()).sqrt()
         data = (seen.u, scale * self.world, self.noise)
         every = (0, None, 0, 0, 0)
@@ -304,14 +342,21 @@ class Problem:
             1, keepdim=True
         )
         weight = torch.cat([seen.weight, seen.weight, self.standing, both], dim=1)
-        square = r.new_zeros(weight.shape).index_add_(1, GROUPS, r.square()) / OUTLIER**2
+        square = (
+            r.new_zeros(weight.shape).index_add_(1, GROUPS, r.square()) / OUTLIER**2
+        )
         cost = (weight * OUTLIER**2 * square.log1p()).sum()
         w = (weight / (1 + square))[:, GROUPS]
-        A, C = r.new_zeros(F, r.shape[1], X[0].numel()), r.new_zeros(F, r.shape[1], OWN)
+        A = r.new_zeros(F, r.shape[1], X[0].numel())
+        C = r.new_zeros(F, r.shape[1], OWN)
         if linear:
-            A, C = torch.vmap(torch.func.jacfwd(self.residuals, (0, 1)), every)(X, own, *data)
+            A, C = torch.vmap(torch.func.jacfwd(self.residuals, (0, 1)), every)(
+                X, own, *data
+            )
             A = A.flatten(2)
-        wA, wC, wr = w[..., None] * A, w[..., None] * C, (w * r)[..., None]
+        wA = w[..., None] * A
+        wC = w[..., None] * C
+        wr = (w * r)[..., None]
         found = Normal(
             cost=cost,
             g=(A.mT @ wr)[..., 0],
@@ -323,10 +368,13 @@ class Problem:
         )
         if self.smooth:
             step = seen.time.diff()
-            before, after = step[:-1], step[1:]
+            before = step[:-1]
+            after = step[1:]
             c = torch.stack([1 / before, -1 / before - 1 / after, 1 / after])
             w = (before + after < GAP) * (before + after) * ACCELERATIONS
-            found.add_motion(X, c * 2 / (before + after) / ACCELERATION, w[:, None].expand(-1, 33))
+            found.add_motion(
+                X, c * 2 / (before + after) / ACCELERATION, w[:, None].expand(-1, 33)
+            )
             w = torch.zeros_like(seen.weight[1:])
             w[:, FEET] = self.standing[:-1] * self.standing[1:] * (step < GAP)[:, None]
             found.add_motion(X, torch.stack([-1 / step, 1 / step]) / SLIDING, w)
@@ -356,7 +404,9 @@ class Problem:
         H = J.mT @ (found.W @ J) + solver.prior + torch.diag_embed(stop + FLOOR)
         g = (J.mT @ found.g[..., None])[..., 0] + at.q @ solver.prior + stop * amount
         near = found.near.unsqueeze(-1)
-        beside = [J[k + 1 :].mT @ (near[k, : F - k - 1] * J[: F - k - 1]) for k in (0, 1)]
+        beside = [
+            J[k + 1 :].mT @ (near[k, : F - k - 1] * J[: F - k - 1]) for k in (0, 1)
+        ]
         WG = found.W @ G
         for k in (1, 2):
             WG[: F - k] += near[k - 1, : F - k] * G[k:]
@@ -374,7 +424,8 @@ class Problem:
         common[OWN:, OWN:] += torch.outer(size, size)
         slope[OWN:] += size * self.too_large(at.common[OWN:])
         cross[..., ~self.free] = 0
-        common[~self.free], common[:, ~self.free] = 0, 0
+        common[~self.free] = 0
+        common[:, ~self.free] = 0
         common += torch.diag((~self.free).to(J))
         slope[~self.free] = 0
         # elimination of the poses
@@ -383,9 +434,12 @@ class Problem:
         inner = _banded(H, beside, right) if self.smooth else _blocks(H, right)
         flat = right[:, :-1].mT
         S = common - flat @ inner[:, :-1]
-        c = torch.linalg.solve(S + damping * common.diag().diag(), flat @ inner[:, -1] - slope)
+        c = torch.linalg.solve(
+            S + damping * common.diag().diag(), flat @ inner[:, -1] - slope
+        )
         dq = -(inner[:, -1] + inner[:, :-1] @ c).view(F, D)
-        q, root = at.q + dq, axis_angle_to_matrix(dq[:, :3]) @ at.root
+        q = at.q + dq
+        root = axis_angle_to_matrix(dq[:, :3]) @ at.root
         q[:, :3] = 0
         return State(q, root, at.common + c)
 
@@ -401,17 +455,23 @@ class Problem:
         T = len(solver.joint)
         before = (R[:, solver.before] - R[:, :T]) @ moves[:T]  # [F, T, 3, S]
         follows = ancestors(solver.rig.parent)[solver.carrier].to(R)
-        return torch.einsum("nt,ftis->fnis", follows, before) + R[:, solver.carrier] @ moves[T:]
+        return (
+            torch.einsum("nt,ftis->fnis", follows, before)
+            + R[:, solver.carrier] @ moves[T:]
+        )
 
     def minimise(self, at: State, steps: int = STEPS) -> tuple[State, float]:
         """The solution, and its cost."""
-        best, damping = self.cost(at), DAMPING
+        best = self.cost(at)
+        damping = DAMPING
         for _ in range(steps):
             new = self.step(at, damping)
             cost = self.cost(new)
             gain = float((best - cost) / best)
             if gain > 0:
-                at, best, damping = new, cost, damping * EASIER
+                at = new
+                best = cost
+                damping = damping * EASIER
             else:
                 damping *= HARDER
             if abs(gain) < SETTLED or damping > 1e6:
@@ -421,7 +481,9 @@ class Problem:
     def standing_feet(self) -> Tensor:
         """``[F, 4]`` 1 where `FEET` hardly move across the image: they stand."""
         state = self.start()
-        depth = self.landmarks(state, self.solver(state.common))[:, FEET, 2].clamp_min(NEAR)
+        depth = self.landmarks(state, self.solver(state.common))[:, FEET, 2].clamp_min(
+            NEAR
+        )
         step = self.seen.time.diff()[:, None]
         speed = self.seen.u[:, FEET].diff(dim=0).norm(dim=-1) * depth[1:] / step
         slow = (speed < STILL) & (step < GAP)
@@ -440,7 +502,10 @@ class Problem:
 def _best_zoom(costs: Float) -> tuple[float, float]:
     """The best of `ZOOMS` and its standard deviation, by a parabola through the costs of both ways
     near the least."""
-    cost = np.minimum(costs[: len(ZOOMS)][::-1], costs[len(ZOOMS) :]) + (ZOOMS / FOCAL_SPREAD) ** 2
+    cost = (
+        np.minimum(costs[: len(ZOOMS)][::-1], costs[len(ZOOMS) :])
+        + (ZOOMS / FOCAL_SPREAD) ** 2
+    )
     best = int(np.clip(cost.argmin(), NEAREST, len(ZOOMS) - 1 - NEAREST))
     near = slice(best - NEAREST, best + NEAREST + 1)
     a, b, _ = np.polyfit(ZOOMS[near], cost[near], 2)
@@ -455,7 +520,9 @@ def _log_size(p: Tensor) -> Tensor:
 def _blocks(H: Tensor, right: Tensor) -> Tensor:
     """Solves the equations with diagonal blocks ``H [F, D, D]``."""
     F, D, _ = H.shape
-    return torch.cholesky_solve(right.view(F, D, -1), torch.linalg.cholesky(H)).reshape(F * D, -1)
+    return torch.cholesky_solve(right.view(F, D, -1), torch.linalg.cholesky(H)).reshape(
+        F * D, -1
+    )
 
 
 def _banded(H: Tensor, beside: list[Tensor], right: Tensor) -> Tensor:
@@ -464,7 +531,8 @@ def _banded(H: Tensor, beside: list[Tensor], right: Tensor) -> Tensor:
     band = np.zeros((3 * D, F * D))
     a, b = (x.ravel() for x in np.meshgrid(np.arange(D), np.arange(D), indexing="ij"))
     for k, block in enumerate([H, *beside]):
-        row, values = k * D + a - b, block.reshape(len(block), -1).numpy()
+        row = k * D + a - b
+        values = block.reshape(len(block), -1).numpy()
         for f in range(len(block)):
             band[row[row >= 0], (f * D + b)[row >= 0]] = values[f][row >= 0]
     return torch.from_numpy(solveh_banded(band, right.numpy(), lower=True))

@@ -10,13 +10,20 @@ from gsgan.data.cameras import CameraEntry
 from gsgan.motion.points import UNITS
 from gsgan.prepare.camera_array import MIN_VIEWS
 from gsgan.prepare.solve import SolveSettings
-from gsgan.prepare.sources import Recording, find_sources, fit_size, pair_cameras, recording_notes
+from gsgan.prepare.sources import (
+    Recording,
+    find_sources,
+    fit_size,
+    pair_cameras,
+    recording_notes,
+)
 from gsgan.utils.checks import above, between, one_of, whole
 from gsgan.utils.errors import ConfigError, DataError
 
 MEDIAPIPE = "mediapipe"
 AXES = ("x", "y", "z", "-x", "-y", "-z")
-FREE = ("out", "setup", "workers", "overwrite", "keep_work")  # do not change the dataset
+# do not change the dataset
+FREE = ("out", "setup", "workers", "overwrite", "keep_work")
 
 
 @dataclass(frozen=True)
@@ -76,7 +83,9 @@ class Options:
             if getattr(self, name) is not None:
                 one_of(name, getattr(self, name), choices)
         if self.pixel_centre not in (0, 0.5):
-            raise ConfigError(f"pixel_centre must be 0 or 0.5, got {self.pixel_centre!r}")
+            raise ConfigError(
+                f"pixel_centre must be 0 or 0.5, got {self.pixel_centre!r}"
+            )
         for name in ("fps", "height", "focal"):
             if getattr(self, name) is not None:
                 above(name, getattr(self, name))
@@ -84,15 +93,27 @@ class Options:
         whole("workers", self.workers, 1)
         above("scale", between("scale", self.scale, 0, 1))
         one_of("format", self.format, ("jpg", "png"))
-        if len(self.mask_levels) != 2 or not 0 <= self.mask_levels[0] < self.mask_levels[1] <= 1:
-            raise ConfigError(f"mask_levels must rise within 0..1, got {self.mask_levels}")
+        if (
+            len(self.mask_levels) != 2
+            or not 0 <= self.mask_levels[0] < self.mask_levels[1] <= 1
+        ):
+            raise ConfigError(
+                f"mask_levels must rise within 0..1, got {self.mask_levels}"
+            )
+        self._check_mappings()
+
+    def _check_mappings(self) -> None:
         for name in ("cameras", "offsets"):
             given = getattr(self, name)
             if given is not None and not isinstance(given, Mapping):
-                raise ConfigError(f"{name} must be {{video name: value}}, got {given!r}")
+                raise ConfigError(
+                    f"{name} must be {{video name: value}}, got {given!r}"
+                )
         for camera, frames in (self.offsets or {}).items():
             if not isinstance(frames, int):
-                raise ConfigError(f"offsets: {camera} must be a whole number, got {frames!r}")
+                raise ConfigError(
+                    f"offsets: {camera} must be a whole number, got {frames!r}"
+                )
 
     @property
     def needs_tool(self) -> bool:
@@ -119,7 +140,8 @@ class Inputs:
 
     sources: Mapping[str, Recording]
     calibration: Calibration
-    cameras: tuple[CameraEntry, ...]  # in the order of the sources, with their names and sizes
+    # in the order of the sources, with their names and sizes
+    cameras: tuple[CameraEntry, ...]
     notes: tuple[str, ...]  # one sentence for each thing that was converted or left out
     fps: float
 
@@ -134,18 +156,24 @@ def read_inputs(options: Options) -> Inputs:
     folder = options.folder("source")
     sources = find_sources(folder, options.apply_rotation)
     if unknown := sorted(set(options.offsets or {}) - set(sources)):
-        raise ConfigError(f"offsets name {unknown[0]}, but the videos are {', '.join(sources)}")
+        raise ConfigError(
+            f"offsets name {unknown[0]}, but the videos are {', '.join(sources)}"
+        )
     path = folder if options.calibration is None else options.folder("calibration")
     if path.is_dir():
         path = find_calibration(path)
-    scale = None if options.unit is None else UNITS[options.unit]  # None: the format's own
+    # None: the format's own
+    scale = None if options.unit is None else UNITS[options.unit]
     calibration = read_calibration(path, scale, options.pixel_centre)
-    notes, cameras = list(calibration.notes), []
+    notes = list(calibration.notes)
+    cameras = []
     if len(sources) < MIN_VIEWS:
         raise DataError(
             f"{folder} holds only the camera {next(iter(sources), 'none')}; 3D needs two"
         )
-    pairs = pair_cameras(list(sources), list(calibration.cameras), options.cameras or {})
+    pairs = pair_cameras(
+        list(sources), list(calibration.cameras), options.cameras or {}
+    )
     for name, source in sources.items():
         camera = calibration.cameras[pairs[name]]
         fitted, note = fit_size(camera, name, source.size, options.crop_px, path)

@@ -32,16 +32,21 @@ from gsgan.utils.arrays import Float, Ints
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import write_json
 
-DELAY, DELAY_GAIN = 0.5, 0.05  # frames, and share of the error that correcting them must remove
+# frames, and share of the error that correcting them must remove
+DELAY = 0.5
+DELAY_GAIN = 0.05
 
 
 def summarise(outcome: Outcome) -> dict[str, Any]:
     """The content of prepare.json; errors are medians, in pixels of the full-size image."""
-    inputs, solution = outcome.inputs, outcome.solution
+    inputs = outcome.inputs
+    solution = outcome.solution
     turned, moved = camera_moves(CameraArray.of(inputs.cameras), solution.cameras)
     cameras = {
         name: {
-            "error_px": {stage: median(error[c]) for stage, error in solution.stages.items()},
+            "error_px": {
+                stage: median(error[c]) for stage, error in solution.stages.items()
+            },
             "turned_degrees": float(turned[c]),
             "moved_mm": float(moved[c]),
             "flipped_share": float(solution.swapped[c].mean()),
@@ -62,9 +67,14 @@ def summarise(outcome: Outcome) -> dict[str, Any]:
         "joints_found": dict(zip(MEDIAPIPE33.names, found.tolist(), strict=True)),
         "joints_removed": solution.removed,
         "frames": len(outcome.frames),
-        "frames_dropped": [frame for frame in outcome.frames.tolist() if frame not in kept],
+        "frames_dropped": [
+            frame for frame in outcome.frames.tolist() if frame not in kept
+        ],
         "fps": inputs.fps,
-        "calibration": {"file": inputs.calibration.path.name, "format": inputs.calibration.format},
+        "calibration": {
+            "file": inputs.calibration.path.name,
+            "format": inputs.calibration.format,
+        },
         "notes": [*inputs.notes, *_late_clocks(outcome.solution, inputs.sources)],
         "settings": outcome.options.record(),
     }
@@ -81,7 +91,8 @@ def _late_clocks(solution: Solution, names: Iterable[str]) -> list[str]:
 
 def print_summary(numbers: Mapping[str, Any], console: Console) -> None:
     """Prints the numbers of the cameras and the notes."""
-    stages, cameras = numbers["error_px"], numbers["cameras"]
+    stages = numbers["error_px"]
+    cameras = numbers["cameras"]
     rows = [
         (
             name,
@@ -97,10 +108,14 @@ def print_summary(numbers: Mapping[str, Any], console: Console) -> None:
     rows.append(("all", *(_number(error, ".2f") for error in stages.values())))
     headers = ("camera", *stages, "turned", "moved", "swapped", "late", "images")
     title = (
-        "Median error in pixels by stage; refinement, swapped sides, frames that clocks are late"
+        "Median error in pixels by stage; refinement, swapped sides, frames that clocks "
+        "are late"
     )
     console.print(Table(headers, tuple(rows)).for_terminal(title))
-    notes = [*numbers["notes"], f"{numbers['frames']} frames at {numbers['fps']:g} per second"]
+    notes = [
+        *numbers["notes"],
+        f"{numbers['frames']} frames at {numbers['fps']:g} per second",
+    ]
     if dropped := numbers["frames_dropped"]:
         notes.append(f"{len(dropped)} frames were dropped: no skeleton or no mask")
     console.print("\n".join(notes), markup=False, highlight=False)
@@ -135,8 +150,11 @@ def prepare(options: Options, console: Console) -> Path:
     extra: dict[str, object] = {}
     if inputs is None:
         filmed = solve_video(options, stages, console)
-        inputs, masks, frames = filmed.inputs, filmed.masks, filmed.frames
-        solution, extra = filmed.solution, {"one_camera": filmed.numbers}
+        inputs = filmed.inputs
+        masks = filmed.masks
+        frames = filmed.frames
+        solution = filmed.solution
+        extra = {"one_camera": filmed.numbers}
         options = replace(options, face=False)
     else:
         found, masks = find_people(options, inputs.sources, stages, console.print)
@@ -168,7 +186,9 @@ def prepare(options: Options, console: Console) -> Path:
 def _refuse_errors(out: Path) -> None:
     """Raises a DataError if the check of the dataset, in its check.json, has found errors."""
     findings = read_json(out / "check.json")["findings"]
-    errors = [finding["sentence"] for finding in findings if finding["level"] == "error"]
+    errors = [
+        finding["sentence"] for finding in findings if finding["level"] == "error"
+    ]
     if errors:
         raise DataError(
             f"{out} was written, but its check has found errors: {'; '.join(errors)}; correct the "
@@ -185,12 +205,17 @@ def _fingerprint(options: Options, inputs: Inputs | None) -> list[object]:
     for name in ("landmarks", "masks"):
         if getattr(options, name) != MEDIAPIPE:
             place = options.folder(name)
-            parts += [stamp(p) for p in sorted((place, *place.rglob("*"))) if p.is_file()]
+            parts += [
+                stamp(p) for p in sorted((place, *place.rglob("*"))) if p.is_file()
+            ]
     return [*parts, tool_key() if options.needs_tool else None]
 
 
 def _solved(
-    options: Options, inputs: Inputs, detections: Mapping[str, Detections], console: Console
+    options: Options,
+    inputs: Inputs,
+    detections: Mapping[str, Detections],
+    console: Console,
 ) -> tuple[Ints, Solution]:
     """The joints and cameras that fit the 2D landmarks of the chosen frames."""
     frames, px, conf = landmarks.gather(detections, options.offsets or {})
@@ -198,14 +223,22 @@ def _solved(
     if options.frames is not None:
         chosen = np.isin(frames, parse_frames(options.frames, "frames"))
     if not chosen.any():
-        raise DataError(f"{options.folder('source')}: frames={options.frames} leaves no frame")
+        raise DataError(
+            f"{options.folder('source')}: frames={options.frames} leaves no frame"
+        )
     joints = slice(None if options.hands or options.face else BODY)
-    frames, px, conf = frames[chosen], px[:, chosen, joints], conf[:, chosen, joints]
+    frames = frames[chosen]
+    px = px[:, chosen, joints]
+    conf = conf[:, chosen, joints]
     for part, wanted in ((HANDS, options.hands), (FACE, options.face)):
         conf[:, :, part] *= wanted
-    px, conf = landmarks.inside(px, conf, np.array([c.size[::-1] for c in inputs.cameras]))
+    px, conf = landmarks.inside(
+        px, conf, np.array([c.size[::-1] for c in inputs.cameras])
+    )
     cameras = CameraArray.of(inputs.cameras)
-    uv = np.stack([undistort_points(c, p) for c, p in zip(inputs.cameras, px, strict=True)])
+    uv = np.stack(
+        [undistort_points(c, p) for c, p in zip(inputs.cameras, px, strict=True)]
+    )
     flat = uv.reshape(len(cameras), -1, 2), conf.reshape(len(cameras), -1)
     _check_distance(inputs, plain(cameras, *flat))
     with console.status("finding 3D joints and refining the cameras"):
@@ -214,9 +247,12 @@ def _solved(
 
 def _check_distance(inputs: Inputs, p: Float) -> None:
     """Refuses a capture whose cameras are implausibly near or far; NaN in ``p [N, 3]``: missing."""
-    where, seen = inputs.calibration.path, p[known(p)]
+    where = inputs.calibration.path
+    seen = p[known(p)]
     if not len(seen):
-        raise DataError(f"{where}: no joint was seen by two cameras; do frame numbers agree?")
+        raise DataError(
+            f"{where}: no joint was seen by two cameras; do frame numbers agree?"
+        )
     hint = "is the calibration in another unit? Set unit=mm, cm or m"
     check_distance(where, inputs.cameras, seen, Thresholds.distance, hint)
 
@@ -236,10 +272,17 @@ def _write_images(
             f"{options.landmarks}: no body joint of any frame came out in "
             "3D; two cameras must see it at the same frame number"
         )
-    cameras, offsets = {camera.name: camera for camera in inputs.cameras}, options.offsets or {}
+    cameras = {camera.name: camera for camera in inputs.cameras}
+    offsets = options.offsets or {}
 
     def one(name: str, advance: Advance) -> list[int]:
-        given = cameras[name], inputs.sources[name], masks[name], posed, offsets.get(name, 0)
+        given = (
+            cameras[name],
+            inputs.sources[name],
+            masks[name],
+            posed,
+            offsets.get(name, 0),
+        )
         return write_images(
             root, *given, options.scale, options.format, options.mask_levels, advance
         )

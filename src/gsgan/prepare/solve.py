@@ -41,15 +41,19 @@ def match_hands(cameras: CameraArray, uv: Float, weight: Float, wrists: Float) -
             their confidence.
         wrists: ``[C, F, 2, 2]`` where the pose's wrists are in each view; NaN = unknown.
     """
-    roots, certain = (v.reshape(*v.shape[:2], 2, HAND, -1)[:, :, :, 0] for v in (uv, weight))
-    off = np.linalg.norm(roots[:, :, :, None] - wrists[:, :, None], axis=-1)  # [C, F, hand, wrist]
+    roots = uv.reshape(*uv.shape[:2], 2, HAND, -1)[:, :, :, 0]
+    certain = weight.reshape(*weight.shape[:2], 2, HAND, -1)[:, :, :, 0]
+    # [C, F, hand, wrist]
+    off = np.linalg.norm(roots[:, :, :, None] - wrists[:, :, None], axis=-1)
     # A hand is left out where one wrist is unknown: its distances cannot be compared.
     known = np.isfinite(off).all(-1, keepdims=True)
     loss = np.where(known, HAND * certain * np.log1p((off / WRIST) ** 2), 0.0)
-    kept, swapped = loss[..., 0, 0] + loss[..., 1, 1], loss[..., 0, 1] + loss[..., 1, 0]
+    kept = loss[..., 0, 0] + loss[..., 1, 1]
+    swapped = loss[..., 0, 1] + loss[..., 1, 0]
 
     def cost_of(flips: Bool, at: Ints) -> Float:
-        sided, seen = (apply_flips(v[:, at], flips[..., None], [OWN_PAIRS]) for v in (uv, weight))
+        sided = apply_flips(uv[:, at], flips[..., None], [OWN_PAIRS])
+        seen = apply_flips(weight[:, at], flips[..., None], [OWN_PAIRS])
         far = np.where(flips, swapped[:, at], kept[:, at]).sum(0)
         return np.asarray(points_and_cost(cameras, sided, seen)[1] + far)
 
@@ -93,9 +97,11 @@ class Solution:
 
     cameras: CameraArray  # refined
     p: Float  # [F, J, 3] metres
-    conf: Float  # [F, J] mean confidence of the cameras that see the joint, 0 where missing
+    # [F, J] mean confidence of the cameras that see the joint, 0 where missing
+    conf: Float
     error: Float  # [C, F, J] final reprojection error, full-size undistorted pixels
-    flips: Bool  # [C, F, G] where left and right were swapped: `FLIP_GROUPS`, then the hands
+    # [C, F, G] where left and right were swapped: `FLIP_GROUPS`, then the hands
+    flips: Bool
     left_out: Bool  # [C, F, 2] detected hands that are not the person's, or are repeats
     delay: Float  # [C] of each camera's clock, see `clock_errors`
     gain: Float  # [C] the same
@@ -160,7 +166,9 @@ def solve(
     error = cameras.errors(p.reshape(-1, 3), _flat(found.uv)).reshape(conf.shape)
     stages["smoothed"] = error = np.where(found.weight > 0, error, np.nan)
 
-    delay, gain = clock_errors(cameras, found.uv[:, :, :BODY], found.weight[:, :, :BODY])
+    delay, gain = clock_errors(
+        cameras, found.uv[:, :, :BODY], found.weight[:, :, :BODY]
+    )
     return Solution(
         cameras=CameraArray(given.K, cameras.R, cameras.t),
         p=p,
@@ -171,14 +179,19 @@ def solve(
         delay=delay,
         gain=gain,
         stages={
-            name: one.reshape(conf.shape)[:, :, :BODY] * to_pixels for name, one in stages.items()
+            name: one.reshape(conf.shape)[:, :, :BODY] * to_pixels
+            for name, one in stages.items()
         },
         removed=removed,
     )
 
 
 def _refined(
-    start: CameraArray, uv: Float, weight: Float, found: Corrected, settings: SolveSettings
+    start: CameraArray,
+    uv: Float,
+    weight: Float,
+    found: Corrected,
+    settings: SolveSettings,
 ) -> tuple[CameraArray, Corrected]:
     """Refines the cameras and triangulates again, in turn."""
     cameras, (F, J) = start, weight.shape[1:]
@@ -199,7 +212,8 @@ def correct(cameras: CameraArray, uv: Float, conf: Float) -> Corrected:
     joint is not seen.
     """
     flips = find_flips(cameras, uv, conf, FLIP_GROUPS)
-    sided, weight = (apply_flips(v, flips, FLIP_GROUPS) for v in (uv, conf))
+    sided = apply_flips(uv, flips, FLIP_GROUPS)
+    weight = apply_flips(conf, flips, FLIP_GROUPS)
     left_out = np.zeros((*conf.shape[:2], 2), bool)
     if uv.shape[2] != ALL:
         points = robust(cameras, _flat(sided), _flat(weight))
@@ -208,16 +222,21 @@ def correct(cameras: CameraArray, uv: Float, conf: Float) -> Corrected:
     # Where a camera does not see a wrist, the other cameras show where it is.
     own = np.where(weight[..., WRISTS, None] > 0, sided[:, :, WRISTS], np.nan)
     arms = robust(cameras, _flat(own), _flat(weight[:, :, WRISTS]))
-    wrists = np.where(np.isfinite(own), own, cameras.project(arms.p)[0].reshape(own.shape))
+    wrists = np.where(
+        np.isfinite(own), own, cameras.project(arms.p)[0].reshape(own.shape)
+    )
 
     hands = sided[:, :, HANDS], weight[:, :, HANDS], wrists
     swapped = match_hands(cameras, *hands)
-    sided, weight = (apply_flips(v, swapped[..., None], [HAND_PAIRS]) for v in (sided, weight))
+    sided = apply_flips(sided, swapped[..., None], [HAND_PAIRS])
+    weight = apply_flips(weight, swapped[..., None], [HAND_PAIRS])
     points = robust(cameras, _flat(sided), _flat(weight))
     left_out = misfits(points.error.reshape(conf.shape)[:, :, HANDS])
     weight[:, :, HANDS] *= ~left_out.repeat(HAND, axis=-1)
     points = robust(cameras, _flat(sided), _flat(weight))
-    return Corrected(sided, weight, np.dstack([flips, swapped[..., None]]), left_out, points)
+    return Corrected(
+        sided, weight, np.dstack([flips, swapped[..., None]]), left_out, points
+    )
 
 
 def _flat(values: Float) -> Float:
@@ -245,7 +264,9 @@ def clock_errors(cameras: CameraArray, uv: Float, weight: Float) -> tuple[Float,
         ``delay [C]`` and ``gain [C]``, the share by which the median error falls.
     """
     C, F, _ = weight.shape
-    delay, gain, lag = np.full(C, np.nan), np.full(C, np.nan), min(LAG, F - 1)
+    delay = np.full(C, np.nan)
+    gain = np.full(C, np.nan)
+    lag = min(LAG, F - 1)
     cameras, uv = cameras.normalised(uv)
     if C <= MIN_VIEWS or lag < 1:
         return delay, gain
@@ -255,8 +276,10 @@ def clock_errors(cameras: CameraArray, uv: Float, weight: Float) -> tuple[Float,
         expected = cameras.project(p)[0][c].reshape(uv.shape[1:])
         seen = np.where((weight[c] > 0)[..., None], uv[c], np.nan)
         errors = []
-        for s in range(-lag, lag + 1):  # the camera's frame f against the others' frame f - s
-            ours, theirs = seen[max(s, 0) : F + min(s, 0)], expected[max(-s, 0) : F - max(s, 0)]
+        # the camera's frame f against the others' frame f - s
+        for s in range(-lag, lag + 1):
+            ours = seen[max(s, 0) : F + min(s, 0)]
+            theirs = expected[max(-s, 0) : F - max(s, 0)]
             errors.append(median(np.linalg.norm(ours - theirs, axis=-1)))
         if np.isfinite(errors[lag]):
             best = int(np.nanargmin(errors))

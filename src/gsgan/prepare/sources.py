@@ -13,7 +13,17 @@ from gsgan.data.files import frame_files, natural_order, read_colour, read_heade
 from gsgan.utils.arrays import Bytes
 from gsgan.utils.errors import DataError
 
-VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mts", ".mpg", ".mpeg")
+VIDEO_SUFFIXES = (
+    ".mp4",
+    ".avi",
+    ".mov",
+    ".mkv",
+    ".m4v",
+    ".webm",
+    ".mts",
+    ".mpg",
+    ".mpeg",
+)
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 INSIDE = ("videos", "images")  # where EasyMocap and Pose2Sim projects keep them
 
@@ -38,7 +48,12 @@ class Recording:
         if not self.files:
             yield from enumerate(_decoded(opened(self.path, self.rotate)))
         for number, path in self.files.items():
-            yield number, np.asarray(cv2.cvtColor(read_colour(path), cv2.COLOR_RGB2BGR), np.uint8)
+            yield (
+                number,
+                np.asarray(
+                    cv2.cvtColor(read_colour(path), cv2.COLOR_RGB2BGR), np.uint8
+                ),
+            )
 
     def fingerprint(self) -> list[str | int]:
         """Names, sizes and times of the files: changes when the images do."""
@@ -84,7 +99,9 @@ def _sources_in(folder: Path, rotate: bool) -> dict[str, Recording]:
         else:
             continue
         if source.name in sources:
-            raise DataError(f"{folder} holds the camera {source.name} twice; remove {path.name}")
+            raise DataError(
+                f"{folder} holds the camera {source.name} twice; remove {path.name}"
+            )
         sources[source.name] = source
     return sources
 
@@ -101,9 +118,13 @@ def video_recording(path: Path, rotate: bool) -> Recording:
     count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
     first = next(_decoded(video), None)  # the header's size may differ from the images'
     if first is None:
-        raise DataError(f"{path} holds no image that can be decoded; convert it to H.264 MP4")
+        raise DataError(
+            f"{path} holds no image that can be decoded; convert it to H.264 MP4"
+        )
     rate = fps if np.isfinite(fps) and fps > 0 else None
-    return Recording(path.stem, path, (len(first), len(first[0])), rate, {}, count, turned, rotate)
+    return Recording(
+        path.stem, path, (len(first), len(first[0])), rate, {}, count, turned, rotate
+    )
 
 
 def opened(path: Path, rotate: bool) -> cv2.VideoCapture:
@@ -148,12 +169,18 @@ def pair_cameras(
             )
     pairs = dict[str, str]()
     for source in sources:
-        matching = [named[source]] if source in named else matching_cameras(source, cameras)
+        matching = (
+            [named[source]] if source in named else matching_cameras(source, cameras)
+        )
         if len(matching) != 1 or matching[0] in pairs.values():
             problem = "no one camera of the calibration matches"
             if len(matching) == 1:
-                problem = f"the camera {matching[0]} matches more than one video, among them"
-            raise DataError(f"{problem} {source} ({both}); set cameras={{video: calibration name}}")
+                problem = (
+                    f"the camera {matching[0]} matches more than one video, among them"
+                )
+            raise DataError(
+                f"{problem} {source} ({both}); set cameras={{video: calibration name}}"
+            )
         pairs[source] = matching[0]
     return pairs
 

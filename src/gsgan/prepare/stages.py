@@ -27,7 +27,8 @@ def each_camera(
     The first failure or an interrupt is raised; tasks that have not started are cancelled, and
     running ones are stopped at their next ``advance``, as a thread cannot be ended from outside.
     """
-    stop, console = threading.Event(), Console(stderr=True)
+    stop = threading.Event()
+    console = Console(stderr=True)
     bars = progress(console, disable=not console.is_terminal)
 
     def run(name: str) -> T:

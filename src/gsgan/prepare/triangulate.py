@@ -14,14 +14,19 @@ from gsgan.utils.arrays import Bool, Float, Ints, nanmedian
 # Errors are in thousandths of the focal length: pixels, at a focal length of 1000 pixels.
 SCALE = 3.5  # error at which a detection counts half (Cauchy's weight)
 MAX_ERROR = 35.0  # median error beyond which detections contradict each other
-MAX_ELONGATION = 20.0  # a point's uncertainty along over across the rays; more: too parallel
-FLIP_GAIN = 0.15  # mean loss per detection that a swap must save; an error of SCALE costs 0.7
+# a point's uncertainty along over across the rays; more: too parallel
+MAX_ELONGATION = 20.0
+# mean loss per detection that a swap must save; an error of SCALE costs 0.7
+FLIP_GAIN = 0.15
 FAR = 1e6  # pixels: stands for an infinite error
 FLAT = 1e-15  # determinant over trace³: below it the equations are singular in float64
-ITERATIONS, QUICK_ITERATIONS = 10, 3  # of reweighting; the search for swapped sides needs fewer
+# of reweighting; the search for swapped sides needs fewer
+ITERATIONS = 10
+QUICK_ITERATIONS = 3
 CHUNK = 100_000  # points processed at once: bounds the memory, changes nothing else
 MAX_PAIRS = 60  # of cameras, tried as a start; of more, a spread-out part
-LEAST_JOINTS = 3  # of a group: hips at the border of an image do not tell left from right
+# of a group: hips at the border of an image do not tell left from right
+LEAST_JOINTS = 3
 PROGRESSION = 7919  # a prime: spreads the chosen camera pairs when there are too many
 
 Pairs = tuple[tuple[int, int], ...]
@@ -33,7 +38,8 @@ class Triangulated:
 
     p: Float  # [N, 3] metres, NaN where missing
     weight: Float  # [C, N] final weight of each detection, 0 where it was not used
-    error: Float  # [C, N] reprojection error in undistorted pixels, NaN where nothing was seen
+    # [C, N] reprojection error in undistorted pixels, NaN where nothing was seen
+    error: Float
 
 
 def plain(cameras: CameraArray, uv: Float, weight: Float) -> Float:
@@ -62,7 +68,10 @@ def robust(
     each other (``max_error``). Arguments as for `plain`; ``iterations`` of reweighting.
     """
     chunks = [slice(at, at + CHUNK) for at in range(0, max(uv.shape[1], 1), CHUNK)]
-    parts = [_robust(cameras, uv[:, at], weight[:, at], iterations, max_error) for at in chunks]
+    parts = [
+        _robust(cameras, uv[:, at], weight[:, at], iterations, max_error)
+        for at in chunks
+    ]
     return Triangulated(
         p=np.concatenate([part.p for part in parts]),
         weight=np.concatenate([part.weight for part in parts], axis=1),
@@ -75,7 +84,8 @@ def _robust(
 ) -> Triangulated:
     weight = np.where(known(uv), weight, 0.0)
     a, b = _rows(cameras, uv, weight)
-    p, reweighted = _best_pair(cameras, uv, weight, a, b), weight
+    p = _best_pair(cameras, uv, weight, a, b)
+    reweighted = weight
     information = np.zeros((p.shape[0], 3, 3))
     for _ in range(iterations):
         loss = 1 / (1 + (cameras.errors(p, uv) / SCALE) ** 2)
@@ -91,7 +101,9 @@ def _robust(
     missing |= nanmedian(used) > max_error
     missing |= (weight > 0).sum(0) < MIN_VIEWS
     p = np.where(missing[:, None], np.nan, p)
-    return Triangulated(p, np.where(missing, 0.0, reweighted), np.where(missing, np.nan, error))
+    return Triangulated(
+        p, np.where(missing, 0.0, reweighted), np.where(missing, np.nan, error)
+    )
 
 
 def robust_cost(error: Float, weight: Float) -> Float:
@@ -106,7 +118,8 @@ def robust_cost(error: Float, weight: Float) -> Float:
 def _rows(cameras: CameraArray, uv: Float, weight: Float) -> tuple[Float, Float]:
     """``a [C, N, 2, 3]``, ``b [C, N, 2]``: ``a·X - b`` is depth times the error in pixels."""
     uv = np.where((weight > 0)[..., None], uv, 0.0)
-    KR, Kt = cameras.K @ cameras.R, np.einsum("cij,cj->ci", cameras.K, cameras.t)
+    KR = cameras.K @ cameras.R
+    Kt = np.einsum("cij,cj->ci", cameras.K, cameras.t)
     a = uv[..., None] * KR[:, None, 2:] - KR[:, None, :2]
     return a, Kt[:, None, :2] - uv * Kt[:, None, 2:]
 
@@ -124,7 +137,9 @@ def _solve(a: Float, b: Float, weight: Float) -> tuple[Float, Float]:
     return np.where(enough[:, None], p, np.nan), information
 
 
-def _best_pair(cameras: CameraArray, uv: Float, weight: Float, a: Float, b: Float) -> Float:
+def _best_pair(
+    cameras: CameraArray, uv: Float, weight: Float, a: Float, b: Float
+) -> Float:
     """``[N, 3]`` of all pairs' points and the linear one, that with the smallest robust cost."""
     best = _solve(a, b, weight)[0]
     cost = robust_cost(cameras.errors(best, uv), weight)
@@ -135,11 +150,14 @@ def _best_pair(cameras: CameraArray, uv: Float, weight: Float, a: Float, b: Floa
         p = _solve(a[pair], b[pair], weight[pair])[0]
         new = robust_cost(cameras.errors(p, uv), weight)
         better = (new < cost) & np.isfinite(p).all(-1)
-        best, cost = np.where(better[:, None], p, best), np.where(better, new, cost)
+        best = np.where(better[:, None], p, best)
+        cost = np.where(better, new, cost)
     return best
 
 
-def find_flips(cameras: CameraArray, uv: Float, weight: Float, groups: Sequence[Pairs]) -> Bool:
+def find_flips(
+    cameras: CameraArray, uv: Float, weight: Float, groups: Sequence[Pairs]
+) -> Bool:
     """``[C, F, G]`` which camera swapped which group of joints in which frame.
 
     Detectors confuse left and right, mostly when a person is seen from behind. Per frame, one
@@ -152,7 +170,9 @@ def find_flips(cameras: CameraArray, uv: Float, weight: Float, groups: Sequence[
         uv, weight: ``[C, F, J, 2]`` undistorted pixels and their confidence.
         groups: ``G`` tuples of (left, right) joints that swap together.
     """
-    return np.stack([_group_flips(cameras, uv, weight, pairs) for pairs in groups], axis=-1)
+    return np.stack(
+        [_group_flips(cameras, uv, weight, pairs) for pairs in groups], axis=-1
+    )
 
 
 def apply_flips(values: Float, flips: Bool, groups: Sequence[Pairs]) -> Float:
@@ -166,7 +186,9 @@ def apply_flips(values: Float, flips: Bool, groups: Sequence[Pairs]) -> Float:
     return out
 
 
-def points_and_cost(cameras: CameraArray, uv: Float, weight: Float) -> tuple[Float, Float]:
+def points_and_cost(
+    cameras: CameraArray, uv: Float, weight: Float
+) -> tuple[Float, Float]:
     """``p [F, J, 3]`` of ``uv [C, F, J, 2]`` and ``weight [C, F, J]``, and its cost ``[F]``."""
     C, F, J = weight.shape
     flat = weight.reshape(C, -1)
@@ -180,23 +202,29 @@ def _group_flips(cameras: CameraArray, uv: Float, weight: Float, pairs: Pairs) -
     """``[C, F]`` for one group."""
     joints = [j for pair in pairs for j in pair]  # pairs are then adjacent: j and j ^ 1
     local = [tuple((2 * i, 2 * i + 1) for i in range(len(pairs)))]
-    uv, weight = uv[:, :, joints], weight[:, :, joints]
+    uv = uv[:, :, joints]
+    weight = weight[:, :, joints]
     C, F, _ = weight.shape
     everywhere = np.arange(F)
 
     def points(flips: Bool, frames: Ints) -> tuple[Float, Float]:
-        sided, seen = (apply_flips(v[:, frames], flips[..., None], local) for v in (uv, weight))
+        sided = apply_flips(uv[:, frames], flips[..., None], local)
+        seen = apply_flips(weight[:, frames], flips[..., None], local)
         return points_and_cost(cameras, sided, seen)
 
     few = (weight > 0).sum(-1) < LEAST_JOINTS
     price = np.where(few, np.inf, FLIP_GAIN * weight.sum(-1))
-    flips = cheapest_flips(lambda f, at: points(f, at)[1], np.zeros((C, F), bool), price)
+    flips = cheapest_flips(
+        lambda f, at: points(f, at)[1], np.zeros((C, F), bool), price
+    )
     flips = flips ^ exchanged(points(flips, everywhere)[0])
     votes = weight.sum(-1)
     return ~flips if (votes * flips).sum() > votes.sum() / 2 else flips
 
 
-def cheapest_flips(cost_of: Callable[[Bool, Ints], Float], flips: Bool, price: Float) -> Bool:
+def cheapest_flips(
+    cost_of: Callable[[Bool, Ints], Float], flips: Bool, price: Float
+) -> Bool:
     """``flips [C, F]``, one camera at a time changed as long as that saves more than its price.
 
     Args:
@@ -205,13 +233,17 @@ def cheapest_flips(cost_of: Callable[[Bool, Ints], Float], flips: Bool, price: F
         price: ``[C, F]`` that a change must save.
     """
     C, F = flips.shape
-    flips, active, toggles = flips.copy(), np.arange(F), np.eye(C, dtype=bool)[:, :, None]
+    flips = flips.copy()
+    active = np.arange(F)
+    toggles = np.eye(C, dtype=bool)[:, :, None]
     cost = cost_of(flips, active)
     for _ in range(C):
         trials = np.stack([cost_of(flips[:, active] ^ one, active) for one in toggles])
         saved = cost[active] - trials - price[:, active]
-        best, better = saved.argmax(0), saved.max(0) > 0
-        active, best = active[better], best[better]
+        best = saved.argmax(0)
+        better = saved.max(0) > 0
+        active = active[better]
+        best = best[better]
         if not len(active):
             break
         flips[best, active] ^= True
@@ -222,7 +254,8 @@ def cheapest_flips(cost_of: Callable[[Bool, Ints], Float], flips: Bool, price: F
 def exchanged(p: Float) -> Bool:
     """``[F]`` frames whose sides ``p [F, J, 3]`` are exchanged against the first frame's."""
     state = np.zeros(len(p), bool)
-    last, before = p[0], known(p[0])
+    last = p[0]
+    before = known(p[0])
     swap = [j ^ 1 for j in range(p.shape[1])]
     for f in range(1, len(p)):
         now = known(p[f])
@@ -231,5 +264,6 @@ def exchanged(p: Float) -> Bool:
         crossed = np.linalg.norm(p[f][swap] - last, axis=-1)[both].sum()
         state[f] = crossed < straight if both.any() else state[f - 1]
         settled, seen = (p[f][swap], now[swap]) if state[f] else (p[f], now)
-        last, before = np.where(seen[:, None], settled, last), before | seen
+        last = np.where(seen[:, None], settled, last)
+        before = before | seen
     return state

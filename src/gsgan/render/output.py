@@ -24,7 +24,9 @@ Bytes = NDArray[np.uint8]
 RECORD = "render.json"
 VIDEO = ".mp4"
 QUALITY = "16"  # x264's constant rate factor: visually lossless
-BT601, STUDIO_RANGE = 6, 1  # ffmpeg's codes for the result of its RGB conversion
+# ffmpeg's codes for the result of its RGB conversion
+BT601 = 6
+STUDIO_RANGE = 1
 
 
 @dataclass(frozen=True)
@@ -61,8 +63,11 @@ class Output:
         if self.video:
             _av()
             if self.out.exists() and not overwrite:
-                raise ConfigError(f"out={self.out} exists; give overwrite=true or another name")
-            self.out.parent.mkdir(parents=True, exist_ok=True)  # else found when all is painted
+                raise ConfigError(
+                    f"out={self.out} exists; give overwrite=true or another name"
+                )
+            # else found when all is painted
+            self.out.parent.mkdir(parents=True, exist_ok=True)
             return
         if self.out.exists() and (not self.out.is_dir() or any(self.out.glob("[!.]*"))):
             if not (self.out / RECORD).is_file():
@@ -108,7 +113,9 @@ def _av() -> Any:
 
 def encoded(images: Iterable[Bytes], fps: float) -> bytes:
     """An MP4 file of images ``[H, W, 3]``, H.264; odd sides repeat their last row or column."""
-    av, stream, out = _av(), None, io.BytesIO()
+    av = _av()
+    stream = None
+    out = io.BytesIO()
     with av.open(out, "w", format="mp4") as container:
         for image in images:
             if stream is None:
@@ -123,10 +130,13 @@ def encoded(images: Iterable[Bytes], fps: float) -> bytes:
                 stream.height, stream.width = (n + n % 2 for n in image.shape[:2])
                 stream.pix_fmt = "yuv420p"
                 context = stream.codec_context
-                context.colorspace, context.color_range = BT601, STUDIO_RANGE
+                context.colorspace = BT601
+                context.color_range = STUDIO_RANGE
             sides = ((0, image.shape[0] % 2), (0, image.shape[1] % 2), (0, 0))
             padded = np.ascontiguousarray(np.pad(image, sides, mode="edge"))
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(padded, format="rgb24")))
+            container.mux(
+                stream.encode(av.VideoFrame.from_ndarray(padded, format="rgb24"))
+            )
         if stream is not None:
             container.mux(stream.encode())
     return out.getvalue()

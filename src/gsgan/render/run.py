@@ -48,7 +48,11 @@ def render_config(config: DictConfig) -> None:
     drive = _chosen(drive_of(config, run, fps), config, fps)
     console.print(drive.text, markup=False, highlight=False, soft_wrap=True)
     cameras, index = _cameras(config, run, drive)
-    record = {"run": str(run.folder.resolve()), "drive": drive.text, "frames": drive.numbers}
+    record = {
+        "run": str(run.folder.resolve()),
+        "drive": drive.text,
+        "frames": drive.numbers,
+    }
     painted = track(
         _images(run, drive, cameras, index, paint_on),
         "rendering",
@@ -61,10 +65,14 @@ def render_config(config: DictConfig) -> None:
         output.write(drive.numbers, painted)
     if run.avatar.poses is not None:
         _print_distances(run.avatar.poses, run.avatar, drive, console)
-    console.print(f"rendered: {output.out}", markup=False, highlight=False, soft_wrap=True)
+    console.print(
+        f"rendered: {output.out}", markup=False, highlight=False, soft_wrap=True
+    )
 
 
-def _print_distances(poses: TrainingPoses, avatar: Avatar, drive: Drive, console: Console) -> None:
+def _print_distances(
+    poses: TrainingPoses, avatar: Avatar, drive: Drive, console: Console
+) -> None:
     """How far the motion is from the training poses: its median and farthest frame."""
     p = torch.cat([joints_of(avatar, drive, i)[0] for i in range(len(drive.p))])
     far = poses.distance(p)
@@ -79,7 +87,9 @@ def _print_distances(poses: TrainingPoses, avatar: Avatar, drive: Drive, console
 
 def _output(config: DictConfig) -> Output:
     if config.out is None:
-        raise ConfigError("out is not set: give out=<video.mp4>, or out=<folder> for PNG files")
+        raise ConfigError(
+            "out is not set: give out=<video.mp4>, or out=<folder> for PNG files"
+        )
     given = config.c2pa.certificate, config.c2pa.key
     if (given[0] is None) != (given[1] is None):
         raise ConfigError("c2pa.certificate and c2pa.key go together: give both")
@@ -95,9 +105,12 @@ def _output(config: DictConfig) -> Output:
 
 def _chosen(drive: Drive, config: DictConfig, fps: float) -> Drive:
     """``frames`` frames from ``start`` on; a single pose is held."""
-    start, total = whole("start", config.start, 0), len(drive.p)
+    start = whole("start", config.start, 0)
+    total = len(drive.p)
     if start >= total:
-        raise ConfigError(f"start={start}: the motion has {total} frames at {fps:g} per second")
+        raise ConfigError(
+            f"start={start}: the motion has {total} frames at {fps:g} per second"
+        )
     still = total == 1 and drive.camera is None
     count = round(STILL_SECONDS * fps) if still else total - start
     if config.frames is not None:
@@ -111,7 +124,9 @@ def _chosen(drive: Drive, config: DictConfig, fps: float) -> Drive:
 # -- cameras
 
 
-def _cameras(config: DictConfig, run: Run, drive: Drive) -> tuple[Camera, Tensor | None]:
+def _cameras(
+    config: DictConfig, run: Run, drive: Drive
+) -> tuple[Camera, Tensor | None]:
     """One camera, or one per frame; and their indices, if images are to have their colours."""
     trained = run.stored.data.size
     if drive.camera is not None:
@@ -123,7 +138,9 @@ def _cameras(config: DictConfig, run: Run, drive: Drive) -> tuple[Camera, Tensor
     name = "orbit" if config.camera is None else str(config.camera)
     if name == "orbit":
         orbit = Orbit(**OmegaConf.to_container(config.orbit))  # type: ignore[arg-type]
-        return orbit.cameras(drive.p, run.proportions, run.scene, size, trained or size), None
+        return orbit.cameras(
+            drive.p, run.proportions, run.scene, size, trained or size
+        ), None
     if (path := Path(name).expanduser()).is_file():
         return from_file(path, drive.p, size), None
     if name not in (entries := run.data.layout.cameras):
@@ -131,12 +148,17 @@ def _cameras(config: DictConfig, run: Run, drive: Drive) -> tuple[Camera, Tensor
             f"camera={name} is neither a camera of the run's data nor a file; choose orbit or one "
             f"of {', '.join(entries)}"
         )
-    crop, lens = run.data.crop, run.stored.data.get("lens") == "project"
+    crop = run.data.crop
+    lens = run.stored.data.get("lens") == "project"
     return of_entry(entries[name], drive.p, size, crop, lens), None
 
 
 def of_entry(
-    entry: CameraEntry, p: NDArray[np.float64], size: int, crop: PersonCrop | None, lens: bool
+    entry: CameraEntry,
+    p: NDArray[np.float64],
+    size: int,
+    crop: PersonCrop | None,
+    lens: bool,
 ) -> Camera:
     """A calibrated camera with square images, cropped to the whole motion if training cropped.
 
@@ -188,13 +210,18 @@ def _images(
     """
     for i, number in enumerate(drive.numbers):
         at = slice(i, i + 1) if len(cameras) > 1 else slice(0, 1)
-        camera, colours = cameras[at], None if index is None else index[at]
+        camera = cameras[at]
+        colours = None if index is None else index[at]
         try:
             with torch.no_grad():
                 p, visibility, body = inputs_of(run.avatar, drive, i)
-                found = run.avatar.rendered(p, visibility, camera, body, colours, maps=False)
+                found = run.avatar.rendered(
+                    p, visibility, camera, body, colours, maps=False
+                )
             assert found.image is not None
             assert found.alpha is not None
-            yield eight_bits(found.image[0].cpu(), found.alpha[0].cpu(), paint_on(camera.size))
+            yield eight_bits(
+                found.image[0].cpu(), found.alpha[0].cpu(), paint_on(camera.size)
+            )
         except ValueError as error:
             raise DataError(f"frame {number} cannot be rendered ({error})") from error

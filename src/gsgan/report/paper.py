@@ -43,7 +43,10 @@ class PaperTable:
             ):
                 if mine != printed:
                     return f"runs here are {mine}, the paper's {printed}"
-            if self.subject and subject_of(run.data.get("root"), [self.subject]) is None:
+            if (
+                self.subject
+                and subject_of(run.data.get("root"), [self.subject]) is None
+            ):
                 return f"runs here are of {run.data_name}, the paper's of subject {self.subject}"
             if record.get("departures"):
                 return f"runs here depart from {self.protocol}: {'; '.join(record['departures'])}"
@@ -55,22 +58,31 @@ class PaperTable:
         found: dict[str, list[Row]] = {}
         for held in self.rows:
             values = held["values"]
-            texts = [values.get(s or self.subject, {}).get(metric) for s, metric in columns]
+            texts = [
+                values.get(s or self.subject, {}).get(metric) for s, metric in columns
+            ]
             row = self._row(held["label"], texts, (note,))
             found.setdefault(held.get("beside") or held["label"], []).append(row)
         return found
 
     def grid(self, why: str) -> Grid:
         """The whole printed table: a row for each of its rows and subjects."""
-        cells = [(row["label"], s, v) for row in self.rows for s, v in row["values"].items()]
+        cells = [
+            (row["label"], s, v) for row in self.rows for s, v in row["values"].items()
+        ]
         shown = [m for m in METRICS if any(m in values for *_, values in cells)]
-        rows = [self._row(f"{label}, {s}", [v.get(m) for m in shown]) for label, s, v in cells]
+        rows = [
+            self._row(f"{label}, {s}", [v.get(m) for m in shown])
+            for label, s, v in cells
+        ]
         remarks = [f"Not beside the scores above: {why}."]
         remarks += [f"{self.note[:1].upper()}{self.note[1:]}."] if self.note else []
         title = f"As printed, not measured here: {self.title}"
         return Grid(title, [METRICS[m].heading for m in shown], rows, remarks)
 
-    def _row(self, label: str, texts: Sequence[str | None], notes: tuple[str, ...] = ()) -> Row:
+    def _row(
+        self, label: str, texts: Sequence[str | None], notes: tuple[str, ...] = ()
+    ) -> Row:
         cells = [Cell(NOT_HAD) if t is None else Cell(t) for t in texts]
         read = f", read as {self.protocol}" if self.protocol else ""
         origin = (NOT_HAD, self.data, f"the paper's{read}", NOT_HAD)

@@ -18,15 +18,19 @@ from gsgan.model.stored import hydra_record, record
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.sweeps import unfinished
 
-METRICS_FILE, FACTS_FILE = "metrics.json", "facts.json"
+METRICS_FILE = "metrics.json"
+FACTS_FILE = "facts.json"
 CONFIG = Path(".hydra") / "config.yaml"
 DATA = "data (cameras, frames, split, image size, crop or fitted poses)"
 TOLERANCE = 1e-3  # between equal floats, for rounding
 NAME = "GaussianGAN (paper)"
 PAPER = ("paper", "paper_slp")  # experiments that set the paper's method
 # Overrides that change the method; the model is one of the paper's ablations.
-METHOD = re.compile(r"[+~]*(?!model=)(model|training|effects|accuracy|size|segments)[.@=]")
-IDLE = ("model.backend", "training.log_every", "training.perceptual.path")  # change no result
+METHOD = re.compile(
+    r"[+~]*(?!model=)(model|training|effects|accuracy|size|segments)[.@=]"
+)
+# change no result
+IDLE = ("model.backend", "training.log_every", "training.perceptual.path")
 
 
 @dataclass(frozen=True)
@@ -64,17 +68,25 @@ class Run:
 
     def images(self, split: str) -> int:
         """How many images of a split were scored."""
-        return max((int(v["images"]) for v in self.scores.get(split, {}).values()), default=0)
+        return max(
+            (int(v["images"]) for v in self.scores.get(split, {}).values()), default=0
+        )
 
     def protocol(self, *splits: str) -> dict[str, Any]:
         """The record of the published protocol in the scores of some or all splits."""
-        held = [v for s in splits or self.scores for v in self.scores.get(s, {}).values()]
-        return next((v["protocol"] for v in held if v.get("protocol")), {"name": "none"})
+        held = [
+            v for s in splits or self.scores for v in self.scores.get(s, {}).values()
+        ]
+        return next(
+            (v["protocol"] for v in held if v.get("protocol")), {"name": "none"}
+        )
 
     @property
     def data_name(self) -> str:
         """The dataset, and its folder where known."""
-        return ", ".join(str(self.data[key]) for key in ("name", "root") if self.data.get(key))
+        return ", ".join(
+            str(self.data[key]) for key in ("name", "root") if self.data.get(key)
+        )
 
     @property
     def commit(self) -> str:
@@ -86,14 +98,17 @@ class Run:
     def planned(self, *, segmentation: bool) -> int:
         """Iterations of the whole schedule, 0 where there is none; ``segmentation`` adds the phase
         of its own, which not every scene has."""
-        start, settings = "training.schedule.", self.settings or {}
+        start = "training.schedule."
+        settings = self.settings or {}
         stretch = settings.get(f"{start}stretch", 1)
         steps = [settings.get(start + phase, 0) for phase in ("step_one", "step_two")]
         own = settings.get(f"{start}segmentation", 0) if segmentation else 0
         return sum(round(step * stretch) for step in steps) + own
 
 
-def check_same(where: str, runs: Sequence[Run], facts: Sequence[Mapping[str, Any]]) -> None:
+def check_same(
+    where: str, runs: Sequence[Run], facts: Sequence[Mapping[str, Any]]
+) -> None:
     """Runs must not differ in ``facts``, one mapping per run.
 
     None is not compared; within a dict, null is as good as no key.
@@ -110,7 +125,9 @@ def check_same(where: str, runs: Sequence[Run], facts: Sequence[Mapping[str, Any
             text = f"{expected} and {value}"
             if isinstance(value, dict):
                 keys = value.keys() | expected.keys()
-                text = ", ".join(sorted(k for k in keys if value.get(k) != expected.get(k)))
+                text = ", ".join(
+                    sorted(k for k in keys if value.get(k) != expected.get(k))
+                )
                 same = not text
             elif isinstance(value, float):
                 same = math.isclose(value, expected, rel_tol=0, abs_tol=TOLERANCE)
@@ -131,7 +148,11 @@ def find_runs(given: Sequence[str]) -> list[Path]:
     found: dict[Path, None] = {}
     for entry in given:
         path = Path(entry).expanduser()
-        places = sorted(glob.glob(str(path), recursive=True)) if glob.has_magic(entry) else [path]
+        places = (
+            sorted(glob.glob(str(path), recursive=True))
+            if glob.has_magic(entry)
+            else [path]
+        )
         runs = [run for place in places for run in _runs_inside(Path(place).resolve())]
         if not entry.strip() or not runs:
             raise ConfigError(
@@ -153,7 +174,8 @@ def _runs_inside(folder: Path) -> Iterator[Path]:
 
 def read_runs(folders: Sequence[Path]) -> tuple[list[Run], dict[Path, str]]:
     """The runs that can be read, and why the others cannot."""
-    runs, left_out = [], {}
+    runs = []
+    left_out = {}
     for folder in folders:
         try:
             runs.append(read_run(folder))
@@ -177,18 +199,35 @@ def read_run(folder: Path, *, scored: bool = True) -> Run:
         scores = json.loads((folder / METRICS_FILE).read_text()) if scored else {}
         found = folder / FACTS_FILE
         facts = json.loads(found.read_text()) if found.is_file() else {}
-        settings, hydra = _read_settings(folder), hydra_record(folder)
+        settings = _read_settings(folder)
+        hydra = hydra_record(folder)
         chosen = OmegaConf.select(hydra, "hydra.runtime.choices") or {}
-        name = facts.get("model") or facts.get("method") or chosen.get("model") or folder.name
+        name = (
+            facts.get("model")
+            or facts.get("method")
+            or chosen.get("model")
+            or folder.name
+        )
         data = dict(facts.get("data", {"name": chosen.get("data")}))
-    except (OSError, ValueError, TypeError, yaml.YAMLError, OmegaConfBaseException) as error:
+    except (
+        OSError,
+        ValueError,
+        TypeError,
+        yaml.YAMLError,
+        OmegaConfBaseException,
+    ) as error:
         reason = str(error).splitlines()[0]
         raise DataError(f"{folder}: damaged ({reason}); score the run again") from None
     departed = _departures(hydra, chosen)
-    run = Run(folder, str(name), data, facts.get("seed"), scores, settings, departed, facts)
-    done, planned = facts.get("iterations"), run.planned(segmentation=False)
+    run = Run(
+        folder, str(name), data, facts.get("seed"), scores, settings, departed, facts
+    )
+    done = facts.get("iterations")
+    planned = run.planned(segmentation=False)
     if scored and done is not None and done < planned:
-        raise DataError(f"{folder}: scored after {done} of at least {planned} iterations")
+        raise DataError(
+            f"{folder}: scored after {done} of at least {planned} iterations"
+        )
     return run
 
 
@@ -219,7 +258,11 @@ def _departures(hydra: DictConfig, chosen: Mapping[str, Any]) -> list[str] | Non
     if chosen.get("experiment") not in PAPER:
         return [f"experiment={chosen.get('experiment')}"]
     given = OmegaConf.select(hydra, "hydra.overrides.task") or ()
-    return [text for text in given if METHOD.match(text) and text.partition("=")[0] not in IDLE]
+    return [
+        text
+        for text in given
+        if METHOD.match(text) and text.partition("=")[0] not in IDLE
+    ]
 
 
 def by_settings(run: Run, keys: Sequence[str]) -> Run:
@@ -231,6 +274,8 @@ def by_settings(run: Run, keys: Sequence[str]) -> Run:
     parts = [run.name]
     for key in map(str, keys):
         if run.settings is None or key not in run.settings or key == "seed":
-            raise ConfigError(f"table.by: {run} has no setting {key} (a row is over all seeds)")
+            raise ConfigError(
+                f"table.by: {run} has no setting {key} (a row is over all seeds)"
+            )
         parts.append(f"{key.rpartition('.')[2].replace('_', ' ')} {run.settings[key]}")
     return replace(run, name=", ".join(parts))

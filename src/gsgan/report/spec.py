@@ -10,7 +10,10 @@ from gsgan.metrics.names import METRICS
 from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError
 
-PAINTED, SPLAT, FLOOR = "full", "splat", "floor"  # variants in metrics.json
+# variants in metrics.json
+PAINTED = "full"
+SPLAT = "splat"
+FLOOR = "floor"
 MEAN = "mean"  # the column over subjects
 
 
@@ -59,9 +62,13 @@ class TableSpec:
         if rows is not None:
             object.__setattr__(self, "rows", [RowSpec(**row) for row in rows])
         if self.subjects is not None:
-            object.__setattr__(self, "subjects", [str(subject) for subject in self.subjects])
+            object.__setattr__(
+                self, "subjects", [str(subject) for subject in self.subjects]
+            )
         if self.by and rows is not None:
-            raise ConfigError("table.by makes rows of its own, so table.rows must be null")
+            raise ConfigError(
+                "table.by makes rows of its own, so table.rows must be null"
+            )
         variants = [*self.variants, *(row.variant for row in self.rows or ())]
         for key, known, values in (
             ("metrics", METRICS, self.metrics),

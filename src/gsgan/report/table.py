@@ -15,7 +15,15 @@ from rich.markdown import Markdown
 
 from gsgan.metrics.names import BOX_METRICS, METRICS
 from gsgan.report.paper import PaperTable, read_paper
-from gsgan.report.runs import DATA, NAME, Run, by_settings, check_same, find_runs, read_runs
+from gsgan.report.runs import (
+    DATA,
+    NAME,
+    Run,
+    by_settings,
+    check_same,
+    find_runs,
+    read_runs,
+)
 from gsgan.report.spec import (
     FLOOR,
     MEAN,
@@ -48,7 +56,8 @@ SPREAD = (
     "no spread."
 )
 SPLIT_TITLES = {"novel_view": " (held-out cameras)", "novel_pose": " (held-out poses)"}
-PER_SUBJECT = ("subject", "train_frames", "test_frames")  # of a protocol, differ by subject
+# of a protocol, differ by subject
+PER_SUBJECT = ("subject", "train_frames", "test_frames")
 DIRTY = "uncommitted changes of the code (allow_dirty=true allows them)"
 NO_SEED = "None"  # of predictions and of the all-background image
 NO_MEAN = "no mean over subjects: not all have scores of these seeds"
@@ -86,7 +95,11 @@ class Part:
 
     def of(self, name: str | None, column: str = MEAN) -> list[Run]:
         """The runs of a model or method (None: of all) that a column shows."""
-        shown = self.runs if name is None else [run for run in self.runs if run.name == name]
+        shown = (
+            self.runs
+            if name is None
+            else [run for run in self.runs if run.name == name]
+        )
         if self.metric is None or column == MEAN:
             return list(shown)
         return [run for run in shown if subject_of(run.data.get("root"), [column])]
@@ -98,7 +111,9 @@ class Part:
             return list(self.spec.rows)
         names = {run.name for run in self.runs}
         return [
-            RowSpec(name, f"{name}: Step I's colour" if variant == SPLAT else None, variant)
+            RowSpec(
+                name, f"{name}: Step I's colour" if variant == SPLAT else None, variant
+            )
             for name in sorted(names, key=lambda name: (name != "full", natural(name)))
             for variant in self.spec.variants
             if any(run.of(self.split, variant) for run in self.of(name))
@@ -112,7 +127,13 @@ class Part:
         column, without a name.
         """
         rows = [
-            (run.name, variant, column, str(run.seed), *_value(run, self.split, variant, metric))
+            (
+                run.name,
+                variant,
+                column,
+                str(run.seed),
+                *_value(run, self.split, variant, metric),
+            )
             for column, metric in self.columns.items()
             if column != MEAN
             for run in self.of(None, column)
@@ -137,7 +158,8 @@ class Part:
 
     def cell(self, name: str, variant: str, column: str) -> Cell:
         """Mean ± sample standard deviation (n - 1) over seeds; one seed has no spread."""
-        at, metric = self.scores, self.columns[column]
+        at = self.scores
+        metric = self.columns[column]
         own = at[(at["name"] == name) & (at.variant == variant) & (at.column == column)]
         notes = [
             note if len(few) == len(own) else f"seed {', '.join(few.seed)}: {note}"
@@ -147,7 +169,8 @@ class Part:
         if values.empty:
             notes = [f"{NOT_HAD}: {note}" for note in notes or ["no scored run"]]
             return Cell(NOT_HAD, notes=tuple(notes))
-        mean, spread = float(values.mean()), float(values.std()) if len(values) > 1 else None
+        mean = float(values.mean())
+        spread = float(values.std()) if len(values) > 1 else None
         text = self.written(metric, mean)
         if spread is not None:
             text += f" ± {self.written(metric, spread)}"
@@ -165,7 +188,9 @@ class Part:
                 row = self.of(name, column)
                 if len({run.seed for run in row}) < len(row):
                     names = " and ".join(map(str, row))
-                    raise ConfigError(f"{where}: {names} have the same row and seed; leave one out")
+                    raise ConfigError(
+                        f"{where}: {names} have the same row and seed; leave one out"
+                    )
                 check_same(where, row, [_row_facts(run, self.split) for run in row])
 
 
@@ -179,7 +204,9 @@ def _row_facts(run: Run, split: str) -> dict[str, Any]:
     }
 
 
-def _column_facts(run: Run, part: Part, mean: bool, allow_dirty: bool) -> dict[str, Any]:
+def _column_facts(
+    run: Run, part: Part, mean: bool, allow_dirty: bool
+) -> dict[str, Any]:
     """Properties that must be equal in one column; data may differ for a mean over subjects."""
     split = part.split
     record = run.protocol(split)
@@ -223,7 +250,9 @@ def make_tables(config: DictConfig) -> None:
         raise ConfigError(f"{where} cannot be written: {error.strerror}") from None
     console = make_console()
     console.print(Markdown(TERMINAL.body(report)))
-    console.print(f"tables: {folder}/{{{','.join(files)}}}", markup=False, soft_wrap=True)
+    console.print(
+        f"tables: {folder}/{{{','.join(files)}}}", markup=False, soft_wrap=True
+    )
 
 
 def build(
@@ -249,7 +278,9 @@ def build(
         if any(run.images(split) for run in taken)
     ]
     if not parts:
-        reasons = "; ".join(f"{folder}: {reason}" for folder, reason in left_out.items())
+        reasons = "; ".join(
+            f"{folder}: {reason}" for folder, reason in left_out.items()
+        )
         raise ConfigError(
             f"table {spec.name}: no run is left that has scored an image of "
             f"{' or '.join(spec.splits)} ({reasons or 'none left out'})"
@@ -267,7 +298,9 @@ def _no_place(spec: TableSpec, run: Run) -> str | None:
     """Why the table has no row for a run; raises ConfigError for another data set."""
     if spec.data not in (None, run.data.get("name")):
         what = f"is of {spec.data}, but {run} is of {run.data_name}"
-        raise ConfigError(f"table {spec.name} {what}; leave it out of runs, or use table=plain")
+        raise ConfigError(
+            f"table {spec.name} {what}; leave it out of runs, or use table=plain"
+        )
     if spec.subjects and subject_of(run.data.get("root"), spec.subjects) is None:
         return f"its subject is none of {', '.join(spec.subjects)} ({run.data_name})"
     if spec.rows is not None and run.name not in {row.run for row in spec.rows}:
@@ -298,7 +331,9 @@ def _grid(part: Part, paper: PaperTable | None) -> Grid:
         rows.append(_row(part, spec, beside_paper=paper is not None))
         if spec.variant == PAINTED:
             rows += printed.pop(spec.run, [])
-    rows = _with_best([*rows, *(row for left in printed.values() for row in left)], part)
+    rows = _with_best(
+        [*rows, *(row for left in printed.values() for row in left)], part
+    )
     floor = [part.cell("", FLOOR, c) for c in columns]
     rows.append(Row(FLOOR_LABEL, floor, (NOT_HAD, *_origin(part.runs)), "floor"))
     title = f"{part.split}{SPLIT_TITLES.get(part.split, '')}"
@@ -310,10 +345,14 @@ def _grid(part: Part, paper: PaperTable | None) -> Grid:
 
 
 def _row(part: Part, spec: RowSpec, *, beside_paper: bool) -> Row:
-    runs, label, shown = part.of(spec.run), spec.label or spec.run, (spec.run, spec.variant)
+    runs = part.of(spec.run)
+    label = spec.label or spec.run
+    shown = (spec.run, spec.variant)
     if not runs:
         cells = [Cell(NO_RUN) for _ in part.columns]
-        return Row(label, cells, ("0", NO_RUN, NO_RUN, NO_RUN), notes=("no scored run",))
+        return Row(
+            label, cells, ("0", NO_RUN, NO_RUN, NO_RUN), notes=("no scored run",)
+        )
     notes = list(dict.fromkeys(_marks(runs, part.split)))
     if beside_paper:  # named as the paper's method where all runs are
         if any(run.departures is None for run in runs):
@@ -322,20 +361,28 @@ def _row(part: Part, spec: RowSpec, *, beside_paper: bool) -> Row:
             notes.append(f"differs from experiment=paper: {', '.join(found)}")
         else:
             label = NAME if shown == ("full", PAINTED) else f"{NAME}, {label}"
-    counts = [len(part.of(spec.run, column)) for column in part.columns if column != MEAN]
+    counts = [
+        len(part.of(spec.run, column)) for column in part.columns if column != MEAN
+    ]
     seeds = " to ".join(map(str, dict.fromkeys((min(counts), max(counts)))))
     cells = [part.cell(*shown, c) for c in part.columns]
     return Row(label, cells, (seeds, *_origin(runs)), notes=tuple(notes))
 
 
-def _value(run: Run, split: str, variant: str, metric: str) -> tuple[float | None, str | None]:
+def _value(
+    run: Run, split: str, variant: str, metric: str
+) -> tuple[float | None, str | None]:
     """A score, and why it is missing or incomplete."""
     held = run.of(split, variant)
     if held.get(metric) is None:
         why = "not scored" if held else f"no {variant} image of {split} was scored"
         return None, str(held.get(f"{metric}_reason", why))
     left_out = held.get(f"{metric}_left_out")
-    note = f"{left_out} images without a finite score are not in the mean" if left_out else None
+    note = (
+        f"{left_out} images without a finite score are not in the mean"
+        if left_out
+        else None
+    )
     return float(held[metric]), note
 
 
@@ -347,10 +394,14 @@ def _with_best(rows: Sequence[Row], part: Part) -> list[Row]:
         means = [mean for cells in found if (mean := cells[i].mean) is not None]
         if len(means) < 2:
             continue
-        best = min(means, key=lambda mean: abs(mean - 1) if sign is None else sign * mean)
+        best = min(
+            means, key=lambda mean: abs(mean - 1) if sign is None else sign * mean
+        )
         for cells in found:
             mean = cells[i].mean
-            equal = mean is not None and part.written(metric, mean) == part.written(metric, best)
+            equal = mean is not None and part.written(metric, mean) == part.written(
+                metric, best
+            )
             cells[i] = replace(cells[i], best=equal)
     return [replace(row, cells=cells) for row, cells in zip(rows, found, strict=True)]
 
@@ -360,7 +411,8 @@ def _origin(runs: Sequence[Run]) -> tuple[str, ...]:
     data = join_unique(run.data_name for run in runs)
     if len(roots := {run.data.get("root") for run in runs}) > 1:
         data = f"{runs[0].data['name']}, {len(roots)} subjects"
-    protocols, commits = [run.protocol()["name"] for run in runs], [run.commit for run in runs]
+    protocols = [run.protocol()["name"] for run in runs]
+    commits = [run.commit for run in runs]
     return data, join_unique(protocols), join_unique(commits)
 
 
@@ -370,7 +422,9 @@ def _marks(runs: Sequence[Run], split: str) -> Iterator[str]:
         for held in run.scores.get(split, {}).values():
             yield from (f"marked: {mark}" for mark in held.get("marks", []))
         record = run.protocol(split)
-        yield from (f"departs from {record['name']}: {d}" for d in record.get("departures", []))
+        yield from (
+            f"departs from {record['name']}: {d}" for d in record.get("departures", [])
+        )
 
 
 def _lpips(run: Run, split: str) -> str | None:

@@ -63,7 +63,11 @@ class Report:
     def notes(self) -> dict[str, str]:
         """A number for every note, in the order of appearance."""
         rows = [row for grid in self.grids for row in grid.rows]
-        notes = (n for row in rows for n in (*row.notes, *(n for c in row.cells for n in c.notes)))
+        notes = (
+            n
+            for row in rows
+            for n in (*row.notes, *(n for c in row.cells for n in c.notes))
+        )
         return {note: str(i) for i, note in enumerate(dict.fromkeys(notes), start=1)}
 
     def frame(self) -> pd.DataFrame:
@@ -74,7 +78,9 @@ class Report:
             for row in grid.rows
             for column, cell in zip(grid.columns, row.cells, strict=True)
         ]
-        return pd.DataFrame(values, columns=["table", "row", "column", "text", "mean", "spread"])
+        return pd.DataFrame(
+            values, columns=["table", "row", "column", "text", "mean", "spread"]
+        )
 
 
 def join_unique(texts: Iterable[str]) -> str:
@@ -98,19 +104,28 @@ class Format:
         """One table with its remarks."""
 
         def cell(text: str, marks: Sequence[str], pattern: str) -> str:
-            raised = self.raised.format(" ".join(notes[mark] for mark in marks)) if marks else ""
+            raised = (
+                self.raised.format(" ".join(notes[mark] for mark in marks))
+                if marks
+                else ""
+            )
             return pattern.format(self.escape(text)) + raised
 
         origin = ORIGIN if self.origin and any(row.origin for row in grid.rows) else ()
         rows = [
             [
                 cell(row.label, row.notes, "{}" if row.kind == "run" else self.italic),
-                *(cell(c.text, c.notes, self.bold if c.best else "{}") for c in row.cells),
+                *(
+                    cell(c.text, c.notes, self.bold if c.best else "{}")
+                    for c in row.cells
+                ),
                 *(self.escape(text) for text in row.origin if origin),
             ]
             for row in grid.rows
         ]
-        frame = pd.DataFrame(rows, columns=[*map(self.escape, ("", *grid.columns, *origin))])
+        frame = pd.DataFrame(
+            rows, columns=[*map(self.escape, ("", *grid.columns, *origin))]
+        )
         table = self.table(self.escape(grid.title), frame)
         return "\n\n".join([table, *map(self.escape, grid.remarks)])
 
@@ -118,7 +133,10 @@ class Format:
         """All but the title."""
         notes = report.notes()
         below = [f"{number}: {note}" for note, number in notes.items()]
-        below += [f"Left out: {folder}: {reason}" for folder, reason in report.left_out.items()]
+        below += [
+            f"Left out: {folder}: {reason}"
+            for folder, reason in report.left_out.items()
+        ]
         tables = (self.grid(grid, notes) for grid in report.grids)
         return "\n\n".join([*tables, *map(self.escape, below)])
 
@@ -129,7 +147,9 @@ def _escape_markdown(text: str) -> str:
 
 
 def _markdown_table(title: str, frame: pd.DataFrame) -> str:
-    return f"**{title}**\n\n" + markdown_table(list(frame.columns), frame.to_numpy().tolist())
+    return f"**{title}**\n\n" + markdown_table(
+        list(frame.columns), frame.to_numpy().tolist()
+    )
 
 
 LATEX_LETTERS = str.maketrans(
@@ -150,7 +170,9 @@ def _escape_latex(text: str) -> str:
 
 def _latex_table(title: str, frame: pd.DataFrame) -> str:
     """A ``table`` that is no wider than the text."""
-    tabular = frame.to_latex(index=False, escape=False, column_format="l" + "r" * len(frame.T[1:]))
+    tabular = frame.to_latex(
+        index=False, escape=False, column_format="l" + "r" * len(frame.T[1:])
+    )
     return (
         f"\\begin{{table}}\n\\centering\n\\caption{{{title}}}\n"
         "\\resizebox{\\ifdim\\width>\\linewidth\\linewidth\\else\\width\\fi}{!}{%\n"
@@ -159,15 +181,23 @@ def _latex_table(title: str, frame: pd.DataFrame) -> str:
 
 
 MARKDOWN = Format(_escape_markdown, _markdown_table, "*{}*", "**{}**", "<sup>{}</sup>")
-TERMINAL = Format(_escape_markdown, _markdown_table, "*{}*", "**{}**", " ({})", origin=False)
+TERMINAL = Format(
+    _escape_markdown, _markdown_table, "*{}*", "**{}**", " ({})", origin=False
+)
 LATEX = Format(
-    _escape_latex, _latex_table, r"\textit{{{}}}", r"\textbf{{{}}}", r"\textsuperscript{{{}}}"
+    _escape_latex,
+    _latex_table,
+    r"\textit{{{}}}",
+    r"\textbf{{{}}}",
+    r"\textsuperscript{{{}}}",
 )
 
 
 def files_of(report: Report) -> dict[str, str]:
     """The files of a report by name; LaTeX has a ``table`` per grid, for ``\\input``."""
-    packages = "% needs \\usepackage{booktabs} and, for wide tables, \\usepackage{graphicx}"
+    packages = (
+        "% needs \\usepackage{booktabs} and, for wide tables, \\usepackage{graphicx}"
+    )
     return {
         "report.md": f"# {MARKDOWN.escape(report.title)}\n\n{MARKDOWN.body(report)}\n",
         "report.tex": f"{packages}\n\n{LATEX.body(report)}\n",

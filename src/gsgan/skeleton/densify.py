@@ -24,7 +24,8 @@ Samples = tuple[NDArray[np.float64], NDArray[np.float64]]
 GOLDEN = (5**0.5 - 1) / 2
 PLASTIC = 1.32471795724474602596  # root of x³ = x + 1, the two-dimensional golden ratio
 COUNTS = ("points_per_limb", "face_points", "torso_points", "points_per_finger_bone")
-TORSO_RANGE = (0.25, 4.0)  # of the box's edges (``fit``), in multiples of the rest pose's
+# of the box's edges (``fit``), in multiples of the rest pose's
+TORSO_RANGE = (0.25, 4.0)
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,8 @@ class Points:
     valid: Tensor  # [B, N] bool, False on parts whose joints are unseen
     part_id: Tensor  # [N] int64 into the parts
     normals: Tensor  # [B, N, 3] outward, world frame, unit length
-    stretched: Tensor | None = None  # [B, N, 3, 3] what moves shapes, where frames do not
+    # [B, N, 3, 3] what moves shapes, where frames do not
+    stretched: Tensor | None = None
 
     @property
     def frames(self) -> Tensor:
@@ -130,9 +132,12 @@ class Densify(nn.Module):
         counts = (points_per_limb, face_points, torso_points, points_per_finger_bone)
         for name, count in zip(COUNTS, counts, strict=True):
             whole(f"Densify: {name}", count, 1)
-        self.template, self.counts = named_template(template), counts
+        self.template = named_template(template)
+        self.counts = counts
         self.radius_ratio = above("Densify: radius_ratio", radius_ratio)
-        self.finger_radius_ratio = above("Densify: finger_radius_ratio", finger_radius_ratio)
+        self.finger_radius_ratio = above(
+            "Densify: finger_radius_ratio", finger_radius_ratio
+        )
         self.face_radius_scale = above("Densify: face_radius_scale", face_radius_scale)
         self.torso = one_of("Densify: torso", torso, get_args(Torso))
         self.sigma = above("Densify: sigma", sigma)
@@ -148,15 +153,20 @@ class Densify(nn.Module):
         torso_rest = t.rest_torso
         if sampler == "trimesh":
             fit = "box" if self.torso == "cube" else "box_fit"
-            cylinder, sphere = shipped("cylinder", n_limb), shipped("sphere", n_face)
+            cylinder = shipped("cylinder", n_limb)
+            sphere = shipped("sphere", n_face)
             box = shipped(fit, n_torso)
         else:
             extents = (1.0, 1.0, 1.0) if self.torso == "cube" else torso_rest
-            cylinder, sphere = even_cylinder(n_limb), even_sphere(n_face)
+            cylinder = even_cylinder(n_limb)
+            sphere = even_sphere(n_face)
             box = even_box(n_torso, extents)
         along = _limb_axes(t).mT.numpy()
         (limb_points, limb_normals), (bone_points, bone_normals) = (
-            ((points * [radius, radius, 1.0]) @ along[list(limbs)], normals @ along[list(limbs)])
+            (
+                (points * [radius, radius, 1.0]) @ along[list(limbs)],
+                normals @ along[list(limbs)],
+            )
             for limbs, radius, (points, normals) in (
                 (t.measured, self.radius_ratio, cylinder),
                 (t.fingers, self.finger_radius_ratio, even_cylinder(n_bone)),
@@ -172,10 +182,17 @@ class Densify(nn.Module):
             )
 
         face = len(t.limbs)
-        counts = [n_limb] * len(t.measured) + [n_bone] * len(t.fingers) + [n_face, n_torso]
+        counts = (
+            [n_limb] * len(t.measured) + [n_bone] * len(t.fingers) + [n_face, n_torso]
+        )
         buffer("part_id", np.repeat([*t.measured, *t.fingers, face, face + 1], counts))
-        buffer("template_points", np.concatenate([*limb_points, *bone_points, sphere[0], box[0]]))
-        buffer("normals", np.concatenate([*limb_normals, *bone_normals, sphere[1], box[1]]))
+        buffer(
+            "template_points",
+            np.concatenate([*limb_points, *bone_points, sphere[0], box[0]]),
+        )
+        buffer(
+            "normals", np.concatenate([*limb_normals, *bone_normals, sphere[1], box[1]])
+        )
         buffer("_limb_points", limb_points)
         buffer("_bone_points", bone_points)
         buffer("_limb_sigma", self._sigma_by_limb())
@@ -217,8 +234,10 @@ class Densify(nn.Module):
             frames = bone_frames(p, valid, self.template)
         root = p[:, self.template.hips[0], None].detach()
         q = p - root
-        face, torso = q.index_select(1, self._face), q.index_select(1, c.torso)
-        head_R, trunk_R = frames.head, frames.torso
+        face = q.index_select(1, self._face)
+        torso = q.index_select(1, c.torso)
+        head_R = frames.head
+        trunk_R = frames.torso
         centres = torch.stack([face.mean(1), torso.mean(1)], dim=1)
         origins = torch.cat([q.index_select(1, c.starts), centres], dim=1)
         radius = self._longest(q, self._face_pairs) * self.face_radius_scale
@@ -226,18 +245,31 @@ class Densify(nn.Module):
 
         axes = (frames.limbs * frames.lengths[..., None, None]).mT
         cylinders = [
-            (points @ axes.index_select(1, chosen) + origins.index_select(1, chosen).unsqueeze(2))
-            for points, chosen in ((self._limb_points, c.measured), (self._bone_points, c.fingers))
+            (
+                points @ axes.index_select(1, chosen)
+                + origins.index_select(1, chosen).unsqueeze(2)
+            )
+            for points, chosen in (
+                (self._limb_points, c.measured),
+                (self._bone_points, c.fingers),
+            )
             if len(chosen)
         ]
-        head = self._face_points @ (head_R * radius[:, None, None]).mT + origins[:, -2:-1]
+        head = (
+            self._face_points @ (head_R * radius[:, None, None]).mT + origins[:, -2:-1]
+        )
         trunk = self._torso_points @ (trunk_R * edges.unsqueeze(1)).mT + origins[:, -1:]
-        spread = torch.cat([frames.lengths * self._limb_sigma, self._hub_sigma(radius, edges)], 1)
-        rotations = torch.cat([frames.limbs, head_R.unsqueeze(1), trunk_R.unsqueeze(1)], dim=1)
+        spread = torch.cat(
+            [frames.lengths * self._limb_sigma, self._hub_sigma(radius, edges)], 1
+        )
+        rotations = torch.cat(
+            [frames.limbs, head_R.unsqueeze(1), trunk_R.unsqueeze(1)], dim=1
+        )
         # Stretching a cylinder or a box along its axes does not change its normals.
         turned = rotations.index_select(1, self.part_id) @ self.normals.unsqueeze(-1)
         return Points(
-            means=torch.cat([*(x.flatten(1, 2) for x in cylinders), head, trunk], dim=1) + root,
+            means=torch.cat([*(x.flatten(1, 2) for x in cylinders), head, trunk], dim=1)
+            + root,
             rotations=rotations,
             origins=origins + root,
             scales=spread.index_select(1, self.part_id),
@@ -263,21 +295,23 @@ class Densify(nn.Module):
         if self.torso == "cube":
             return self._longest(q, self._torso_pairs).unsqueeze(1).expand(-1, 3)
         l_sh, r_sh, l_hip, r_hip = torso.unbind(1)
-        lines = torch.stack([l_sh - r_sh, l_hip - r_hip, (l_sh + r_sh - l_hip - r_hip) * 0.5], 1)
+        lines = torch.stack(
+            [l_sh - r_sh, l_hip - r_hip, (l_sh + r_sh - l_hip - r_hip) * 0.5], 1
+        )
         lengths = (lines.square().sum(-1) + MIN_LENGTH**2).sqrt()
-        width, height = lengths[:, :2].amax(1), lengths[:, 2]
+        width = lengths[:, :2].amax(1)
+        height = lengths[:, 2]
         low, high = TORSO_RANGE
         edges = torch.stack([width, height, 0.5 * width], dim=1)
         return edges.clamp(self._torso_rest * low, self._torso_rest * high)
 
     def _sigma_by_limb(self) -> list[float]:
         """Per metre of limb: ``sigma sqrt(area / n)`` with lateral area ``2 pi r h²``."""
-        limb, finger = (
-            float(self.sigma * (2 * np.pi * radius / count) ** 0.5)
-            for radius, count in (
-                (self.radius_ratio, self.counts[0]),
-                (self.finger_radius_ratio, self.counts[3]),
-            )
+        limb = float(
+            self.sigma * (2 * np.pi * self.radius_ratio / self.counts[0]) ** 0.5
+        )
+        finger = float(
+            self.sigma * (2 * np.pi * self.finger_radius_ratio / self.counts[3]) ** 0.5
         )
         thin = set(self.template.fingers)
         return [finger if i in thin else limb for i in range(len(self.template.limbs))]
@@ -328,10 +362,14 @@ def even_box(n: int, extents: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> S
     """
     x, y, z = extents
     areas = np.array([y * z, y * z, z * x, z * x, x * y, x * y])
-    counts = np.diff(np.round(np.cumsum(np.append(0.0, areas)) / areas.sum() * n).astype(int))
-    points, normals = [], []
+    counts = np.diff(
+        np.round(np.cumsum(np.append(0.0, areas)) / areas.sum() * n).astype(int)
+    )
+    points = []
+    normals = []
     for face, count in enumerate(counts):
-        axis, sign = face // 2, 1.0 - 2.0 * (face % 2)
+        axis = face // 2
+        sign = 1.0 - 2.0 * (face % 2)
         k = np.arange(count)[:, None] + 1
         flat = np.modf(0.5 + k / PLASTIC ** np.array([1, 2]))[0] - 0.5
         points.append(np.insert(flat, axis, 0.5 * sign, axis=1))
@@ -350,7 +388,8 @@ def shipped(shape: str, n: int) -> Samples:
     """
     with (files("gsgan.skeleton") / "templates.npz").open("rb") as file:
         stored = np.load(file, allow_pickle=False)
-        points, normals = stored[shape].astype(np.float64), stored[f"{shape}_normals"]
+        points = stored[shape].astype(np.float64)
+        normals = stored[f"{shape}_normals"]
     if len(points) != n:
         raise ConfigError(
             f"Densify: sampler 'trimesh' has {len(points)} {shape} points, {n} were requested; "

@@ -54,18 +54,25 @@ def draw_skeleton(
     """
     valid = check_skeleton("draw_skeleton", p, valid, template)
     if len(camera) != len(p):
-        raise ValueError(f"draw_skeleton: camera must hold {len(p)} cameras, got {len(camera)}")
+        raise ValueError(
+            f"draw_skeleton: camera must hold {len(p)} cameras, got {len(camera)}"
+        )
     sigma = max(sigma_px * camera.size[0] / 512, MIN_SIGMA)
 
     # the ends of the segments that are drawn
     pixels, depth = camera.project(p, near)
     drawn = valid & (depth > near)
     ends = _segment_ends(template, p.device)
-    shown = (drawn.index_select(1, ends[0]) & drawn.index_select(1, ends[1])).unsqueeze(-1)
+    shown = (drawn.index_select(1, ends[0]) & drawn.index_select(1, ends[1])).unsqueeze(
+        -1
+    )
     a, b = (pixels.index_select(1, end) for end in ends)
     # masked before the arithmetic: pixels of unseen joints are arbitrary
-    a, b = torch.where(shown, a, 0.0), torch.where(shown, b, 0.0)
-    distance2 = _distance2(a, b, shown, camera.size, [len(g) for _, g in template.draw_groups])
+    a = torch.where(shown, a, 0.0)
+    b = torch.where(shown, b, 0.0)
+    distance2 = _distance2(
+        a, b, shown, camera.size, [len(g) for _, g in template.draw_groups]
+    )
     # zero below the bound: denormal numbers would slow down all later operations
     exponent = (distance2 * (-0.5 / sigma**2)).clamp_min(MIN_EXPONENT)
     return exponent.exp() - math.exp(MIN_EXPONENT)
@@ -99,7 +106,8 @@ def _distance2(
 
     x = torch.arange(w, device=a.device, dtype=a.dtype) + 0.5 - a[..., :1]  # [B, S, w]
     y = torch.arange(h, device=a.device, dtype=a.dtype) + 0.5 - a[..., 1:]  # [B, S, h]
-    forward, sideways = d / length2, d * length2.rsqrt()
+    forward = d / length2
+    sideways = d * length2.rsqrt()
     along = (x * forward[..., :1] - 0.5, y * forward[..., 1:])
     across = (x * sideways[..., 1:] + away, y * -sideways[..., :1])
 
@@ -108,7 +116,11 @@ def _distance2(
     terms = (along_x, along_y, across_x, across_y, length2.sqrt().unsqueeze(-1))
     # per group: the [B, segments, h, w] temporaries fit into the cache
     return torch.stack(
-        [_nearest(*group) for group in zip(*(t.split(counts, 1) for t in terms), strict=True)], 1
+        [
+            _nearest(*group)
+            for group in zip(*(t.split(counts, 1) for t in terms), strict=True)
+        ],
+        1,
     )
 
 

@@ -74,11 +74,17 @@ def face_groups(start: int) -> tuple[tuple[str, tuple[Edge, ...]], ...]:
     """Connections, by the names of the drawn channels: lips and lids are rings, brows chains."""
 
     def joined(*chains: tuple[str, ...]) -> tuple[Edge, ...]:
-        numbers = ([start + FACE_NAMES.index(name) for name in chain] for chain in chains)
+        numbers = (
+            [start + FACE_NAMES.index(name) for name in chain] for chain in chains
+        )
         return tuple(pair for chain in numbers for pair in pairwise(chain))
 
     rings = [(*ring, ring[0]) for ring in (LIPS, *LIDS)]
-    return ("brows", joined(*BROWS)), ("eyes", joined(*rings[1:])), ("lips", joined(rings[0]))
+    return (
+        ("brows", joined(*BROWS)),
+        ("eyes", joined(*rings[1:])),
+        ("lips", joined(rings[0])),
+    )
 
 
 def face_links(start: int) -> tuple[Edge, ...]:
@@ -91,7 +97,9 @@ def face_links(start: int) -> tuple[Edge, ...]:
     return tuple((names.index(a), start + FACE_NAMES.index(b)) for a, b in ends.items())
 
 
-def in_head(points: Tensor, p: Tensor, head: Tensor, template: SkeletonTemplate) -> Tensor:
+def in_head(
+    points: Tensor, p: Tensor, head: Tensor, template: SkeletonTemplate
+) -> Tensor:
     """``[B, N, 3]`` metres: points in the head's axes, from the middle of ears, eyes and nose.
 
     Args:

@@ -22,7 +22,8 @@ from gsgan.skeleton.tensors import FOLDED, Constants, Level, check_skeleton, con
 
 MIN_LENGTH = 1e-3
 """Metres: a shorter bone or baseline has no direction (1 mm, below any landmark's accuracy)."""
-WHOLE = 2.99  # summed squares of a rotation's entries are 3, those of a palm that shrinks are less
+# summed squares of a rotation's entries are 3, those of a palm that shrinks are less
+WHOLE = 2.99
 
 
 @dataclass(frozen=True)
@@ -151,7 +152,8 @@ def _head(q: Tensor, valid: Tensor, chest: Tensor, c: Constants) -> Tensor:
     """
     points = q.index_select(1, c.head_points)
     seen = valid.index_select(1, c.head_points)
-    pairs, nose = points[:, :4].unflatten(1, (2, 2)), points[:, 4:]
+    pairs = points[:, :4].unflatten(1, (2, 2))
+    nose = points[:, 4:]
     seen_pair = seen[:, :4].unflatten(1, (2, 2)).all(-1) & seen[:, 4:]
 
     left, wide = _shortened(pairs[:, :, 0] - pairs[:, :, 1])
@@ -191,7 +193,10 @@ def _faded(v: Tensor, fallback: Tensor) -> Tensor:
 def _shortened(v: Tensor) -> tuple[Tensor, Tensor]:
     """v divided by the larger of its length and `MIN_LENGTH`, and the squared result's length."""
     length2 = v.square().sum(-1, keepdim=True)
-    return (v * length2.clamp_min(MIN_LENGTH**2).rsqrt(), (length2 / MIN_LENGTH**2).clamp_max(1))
+    return (
+        v * length2.clamp_min(MIN_LENGTH**2).rsqrt(),
+        (length2 / MIN_LENGTH**2).clamp_max(1),
+    )
 
 
 def omega(
@@ -227,15 +232,23 @@ def omega(
     """
     valid = check_skeleton("omega", p, valid, template)
     if R_cam.shape != (len(p), 3, 3):
-        raise ValueError(f"omega: R_cam must have shape [{len(p)}, 3, 3], got {list(R_cam.shape)}")
+        raise ValueError(
+            f"omega: R_cam must have shape [{len(p)}, 3, 3], got {list(R_cam.shape)}"
+        )
     f = frames or bone_frames(p, valid, template)
     c = constants(template, p.device, p.dtype)
-    pelvis_chest, chest, head = R_cam.unsqueeze(1) @ f.hubs[:, :HEAD], f.hubs[:, CHEST], f.head
+    pelvis_chest = R_cam.unsqueeze(1) @ f.hubs[:, :HEAD]
+    chest = f.hubs[:, CHEST]
+    head = f.head
     ears = p.index_select(1, c.head_points[:2])
-    d = (p.index_select(1, c.face_turned) - ears[:, :1]) - (ears[:, 1:] - ears[:, :1]) * 0.5
+    d = (p.index_select(1, c.face_turned) - ears[:, :1]) - (
+        ears[:, 1:] - ears[:, :1]
+    ) * 0.5
     d = d * d.square().sum(-1, keepdim=True).clamp_min(MIN_LENGTH**2).rsqrt()
     face = c.face_swing.to(d @ head)
-    rotations = torch.cat([pelvis_chest, (chest.mT @ head).unsqueeze(1), face, f.local], dim=1)
+    rotations = torch.cat(
+        [pelvis_chest, (chest.mT @ head).unsqueeze(1), face, f.local], dim=1
+    )
     code = rotation_to_6d(rotations.index_select(1, c.omega_order))
     offsets = face_code(p, head, template)
     return code if offsets is None else torch.cat([code, pad(offsets, (0, 3))], dim=1)

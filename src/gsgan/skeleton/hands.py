@@ -10,12 +10,19 @@ FINGER_NAMES = ("thumb", "index", "middle", "ring", "pinky")
 HAND_NAMES = (
     "wrist",
     *(f"thumb_{part}" for part in ("cmc", "mcp", "ip", "tip")),
-    *(f"{finger}_{part}" for finger in FINGER_NAMES[1:] for part in ("mcp", "pip", "dip", "tip")),
+    *(
+        f"{finger}_{part}"
+        for finger in FINGER_NAMES[1:]
+        for part in ("mcp", "pip", "dip", "tip")
+    ),
 )
 HAND = len(HAND_NAMES)
-FINGERS = tuple(tuple(range(1 + 4 * k, 5 + 4 * k)) for k in range(5))  # base to tip, thumb first
+# base to tip, thumb first
+FINGERS = tuple(tuple(range(1 + 4 * k, 5 + 4 * k)) for k in range(5))
 FINGER_BONES = tuple(bone for finger in FINGERS for bone in pairwise(finger))
-WRIST, INDEX, PINKY = 0, 5, 17
+WRIST = 0
+INDEX = 5
+PINKY = 17
 PALM = (WRIST, INDEX, PINKY)  # points that span it
 SHORT = 1e-3  # metres: a palm that vanishes has no frame
 HAND_EDGES = (

@@ -9,7 +9,14 @@ from itertools import pairwise
 
 import numpy as np
 
-from gsgan.skeleton.face import FACE, FACE_NAMES, face_groups, face_links, face_mirror, rest_face
+from gsgan.skeleton.face import (
+    FACE,
+    FACE_NAMES,
+    face_groups,
+    face_links,
+    face_mirror,
+    rest_face,
+)
 from gsgan.skeleton.hands import (
     FINGER_NAMES,
     FINGERS,
@@ -45,15 +52,22 @@ def _chains(start: int) -> tuple[tuple[int, ...], ...]:
 
 def _limbs(side: int) -> tuple[Edge, ...]:
     """The forearm to the hand's own wrist, the palm's bones, and the fingers' from base to tip."""
-    wrist, chains = STARTS[side], _chains(STARTS[side])
+    wrist = STARTS[side]
+    chains = _chains(STARTS[side])
     palm = tuple((wrist, base) for base, *_ in chains)
-    return ((ARMS[side][1], wrist), *palm, *(pair for chain in chains for pair in pairwise(chain)))
+    return (
+        (ARMS[side][1], wrist),
+        *palm,
+        *(pair for chain in chains for pair in pairwise(chain)),
+    )
 
 
 def _hand_at_rest() -> np.ndarray:
     """``[21, 3]`` a flat left hand that continues the pose's wrist and knuckles."""
     rest = dict(zip(POSE.names, np.asarray(POSE.rest_positions), strict=True))
-    wrist, index, pinky, thumb = (rest[f"left_{n}"] for n in ("wrist", "index", "pinky", "thumb"))
+    wrist, index, pinky, thumb = (
+        rest[f"left_{n}"] for n in ("wrist", "index", "pinky", "thumb")
+    )
     along = (index + pinky) / 2 - wrist
     along = along / np.linalg.norm(along)
     p = np.zeros((HAND, 3))
@@ -66,7 +80,8 @@ def _hand_at_rest() -> np.ndarray:
         for joint, at in zip(chain[1:], np.cumsum(bones), strict=True):
             p[joint] = p[chain[0]] + at * along
     base, knuckle, *tips = FINGERS[0]
-    p[base], p[knuckle] = wrist + 0.45 * (thumb - wrist), thumb
+    p[base] = wrist + 0.45 * (thumb - wrist)
+    p[knuckle] = thumb
     outwards = (thumb - p[base]) / np.linalg.norm(thumb - p[base])
     for joint, at in zip(tips, np.cumsum(THUMB), strict=True):
         p[joint] = thumb + at * outwards
@@ -75,7 +90,9 @@ def _hand_at_rest() -> np.ndarray:
 
 
 def _with_hands() -> SkeletonTemplate:
-    limbs, parents, directions = list(POSE.limbs), [], list(POSE.rest_directions)
+    limbs = list(POSE.limbs)
+    parents = []
+    directions = list(POSE.rest_directions)
     parents = [p if p < N_HUBS else p + len(STARTS) for p in POSE.limb_parents]
     groups = []
     for side, start in enumerate(STARTS):
@@ -100,7 +117,10 @@ def _with_hands() -> SkeletonTemplate:
     swapped = tuple(start + j for start in reversed(STARTS) for j in range(HAND))
     return replace(
         POSE,
-        names=(*POSE.names, *(name.replace("wrist", "hand_wrist") for name in hand_names())),
+        names=(
+            *POSE.names,
+            *(name.replace("wrist", "hand_wrist") for name in hand_names()),
+        ),
         edges=(*POSE.edges, *edges),
         limbs=tuple(limbs),
         limb_parents=tuple(parents),
@@ -109,7 +129,9 @@ def _with_hands() -> SkeletonTemplate:
         mirror=(*POSE.mirror, *swapped),
         draw_groups=(*POSE.draw_groups, *groups),
         gnn_edges=(*POSE.gnn_edges, *edges, *wrists),
-        palms=tuple((start + PALM[0], start + PALM[1], start + PALM[2]) for start in STARTS),
+        palms=tuple(
+            (start + PALM[0], start + PALM[1], start + PALM[2]) for start in STARTS
+        ),
         fingers=tuple(i for i in range(len(POSE.limbs), len(limbs)) if i not in bare),
         bare=bare,
     )

@@ -37,8 +37,11 @@ def rotation_from_6d(x: Tensor, eps: float = 1e-5) -> Tensor:
         ValueError: when the last dimension is not 6.
     """
     if x.shape[-1] != 6:
-        raise ValueError(f"rotation_from_6d: x must have shape [..., 6], got {list(x.shape)}")
-    a, b = x[..., :3], x[..., 3:]
+        raise ValueError(
+            f"rotation_from_6d: x must have shape [..., 6], got {list(x.shape)}"
+        )
+    a = x[..., :3]
+    b = x[..., 3:]
     x_axis = torch.eye(3, dtype=x.dtype, device=x.device)[0].expand_as(a)
     a = torch.where((a.square().sum(-1, keepdim=True) < eps**2), x_axis, a)
     first = unit(a)

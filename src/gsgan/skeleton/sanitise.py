@@ -42,7 +42,8 @@ def limb_length_sum(
     """
     valid = check_skeleton("limb_length_sum", p, valid, template)
     c = constants(template, p.device, p.dtype)
-    starts, ends = c.starts[c.measured], c.ends[c.measured]
+    starts = c.starts[c.measured]
+    ends = c.ends[c.measured]
     seen = valid.index_select(1, starts) & valid.index_select(1, ends)
     bones = p.index_select(1, ends) - p.index_select(1, starts)
     lengths = torch.where(seen.unsqueeze(-1), bones, 0.0).norm(dim=-1).sum(-1)
@@ -98,7 +99,10 @@ def sanitise(
 
 
 def complete_skeleton(
-    skeleton: Tensor, visibility: Tensor | None, template: SkeletonTemplate, body_height: float
+    skeleton: Tensor,
+    visibility: Tensor | None,
+    template: SkeletonTemplate,
+    body_height: float,
 ) -> tuple[Tensor, Tensor]:
     """Joints ``[B, J, 3]`` of a template, finite, and their visibility ``[B, J]``, 0 for stand-ins.
 
@@ -128,7 +132,8 @@ def complete_skeleton(
 def _estimated_hips(p: Tensor, valid: Tensor, template: SkeletonTemplate) -> Tensor:
     """``[B, J]`` bool: both hips of skeletons that show both shoulders and no hip, if finite
     and apart: zeros are no estimate."""
-    hips, shoulders = list(template.hips), list(template.shoulders)
+    hips = list(template.hips)
+    shoulders = list(template.shoulders)
     seen = valid[:, shoulders].all(1) & ~valid[:, hips].any(1)
     estimated = torch.zeros_like(valid)
     apart = (p[:, hips[0]] != p[:, hips[1]]).any(1)
@@ -141,9 +146,12 @@ def _refuse_without_trunk(valid: Tensor, template: SkeletonTemplate) -> None:
     bad = (trunk.sum(-1) < MIN_TRUNK_JOINTS).nonzero().flatten().tolist()
     if bad:
         names = (
-            ", ".join(template.names[j] for j in template.torso if not valid[b, j]) for b in bad
+            ", ".join(template.names[j] for j in template.torso if not valid[b, j])
+            for b in bad
         )
-        lost = "; ".join(f"item {b}: {missing}" for b, missing in zip(bad, names, strict=True))
+        lost = "; ".join(
+            f"item {b}: {missing}" for b, missing in zip(bad, names, strict=True)
+        )
         raise ValueError(
             f"sanitise: p needs {MIN_TRUNK_JOINTS} of the four shoulders and hips, but in "
             f"{len(bad)} of {len(valid)} skeletons too many are NaN or invisible "
@@ -152,7 +160,10 @@ def _refuse_without_trunk(valid: Tensor, template: SkeletonTemplate) -> None:
 
 
 def _filled(
-    p: Tensor, valid: Tensor, template: SkeletonTemplate, body_height: Tensor | float | None
+    p: Tensor,
+    valid: Tensor,
+    template: SkeletonTemplate,
+    body_height: Tensor | float | None,
 ) -> Tensor:
     c = constants(template, p.device, p.dtype)
     # the origin of the completion: a seen hip or shoulder
@@ -185,7 +196,8 @@ def _filled(
         if level is c.levels[-1]:
             break
         parent = known.index_select(1, level.parents)
-        starts, ends = c.starts[level.limbs], c.ends[level.limbs]
+        starts = c.starts[level.limbs]
+        ends = c.ends[level.limbs]
         found = q.index_select(1, ends) - q.index_select(1, starts)
         known = torch.cat([known, parent @ swings(found, parent, level)], dim=1)
     return torch.where(valid.unsqueeze(-1), p, q + root)
@@ -213,38 +225,49 @@ def _bones(
         c = constants(template, device, dtype)
         at_rest = bone_frames(c.rest.unsqueeze(0), None, template)
         frames = torch.cat([at_rest.hubs, at_rest.limbs], dim=1)[0]
-        tree, found = set(template.incoming.values()), []
+        tree = set(template.incoming.values())
+        found = []
         for level, tensors in zip(template.levels, c.levels, strict=True):
             placed = [k for k, limb in enumerate(level) if limb in tree]
             limbs = tensors.limbs[placed]
-            starts, ends = c.starts[limbs], c.ends[limbs]
+            starts = c.starts[limbs]
+            ends = c.ends[limbs]
             hung = frames[[template.limb_parents[level[k]] for k in placed]]
             rest = (hung.mT @ (c.rest[ends] - c.rest[starts]).unsqueeze(-1)).squeeze(-1)
             bare = [limb for limb in level if limb in tree and limb in template.bare]
             same = [template.limbs[_same_bone(template, limb)][1] for limb in bare]
             bare = [template.limbs[limb][1] for limb in bare]
             of_parents = tensors.parents[placed]
-            found.append(_Bones(of_parents, starts, ends, rest, index(bare), index(same)))
+            found.append(
+                _Bones(of_parents, starts, ends, rest, index(bare), index(same))
+            )
         return tuple(found)
 
 
 def _same_bone(template: SkeletonTemplate, bare: int) -> int:
     start = template.limbs[bare][0]
-    return next(i for i, (a, _) in enumerate(template.limbs) if a == start and i != bare)
+    return next(
+        i for i, (a, _) in enumerate(template.limbs) if a == start and i != bare
+    )
 
 
 def _put(q: Tensor, valid: Tensor, joints: Tensor, where_to: Tensor) -> Tensor:
     """``q`` with the unseen ones of ``joints`` at ``where_to [B, len(joints), 3]``."""
     seen = valid.index_select(1, joints).unsqueeze(-1)
-    return q.index_copy(1, joints, torch.where(seen, q.index_select(1, joints), where_to))
+    return q.index_copy(
+        1, joints, torch.where(seen, q.index_select(1, joints), where_to)
+    )
 
 
-def _complete_trunk(q: Tensor, valid: Tensor, template: SkeletonTemplate, c: Constants) -> Tensor:
+def _complete_trunk(
+    q: Tensor, valid: Tensor, template: SkeletonTemplate, c: Constants
+) -> Tensor:
     """One missing corner: its partner plus the other line, scaled by the rest skeleton's ratio."""
     l_sh, r_sh, l_hip, r_hip = c.rest.index_select(0, c.torso)
     ratio = (l_sh - r_sh).norm() / (l_hip - r_hip).norm()
     l_sh, r_sh, l_hip, r_hip = q.index_select(1, c.torso).unbind(1)
-    hips, shoulders = (l_hip - r_hip) * ratio, (l_sh - r_sh) / ratio
+    hips = (l_hip - r_hip) * ratio
+    shoulders = (l_sh - r_sh) / ratio
     corners = (r_sh + hips, l_sh - hips, r_hip + shoulders, l_hip - shoulders)
     return _put(q, valid, c.torso, torch.stack(corners, dim=1))
 
@@ -260,15 +283,20 @@ def _complete_face(
     c = constants(template, q.device, q.dtype)
     face = constant(template.face, q, torch.int64)
     shoulders = c.torso[:2]
-    joints, rest = q.index_select(1, face), c.rest.index_select(0, face)
+    joints = q.index_select(1, face)
+    rest = c.rest.index_select(0, face)
     seen = valid.index_select(1, face).to(q.dtype).unsqueeze(-1)
     anchored = seen.any(1)  # [B, 1]
     weight = seen / seen.sum(1, keepdim=True).clamp_min(1.0)
-    below, rest_below = (x.index_select(-2, shoulders).mean(-2) for x in (q, c.rest))
+    below = q.index_select(-2, shoulders).mean(-2)
+    rest_below = c.rest.index_select(-2, shoulders).mean(-2)
     now = torch.where(anchored, (joints * weight).sum(1), below)
     at_rest = torch.where(anchored, (rest * weight).sum(1), rest_below)
-    chest, head = hubs[:, CHEST], hubs[:, HEAD]
-    offset = (rest - at_rest.unsqueeze(1)) @ torch.where(anchored.unsqueeze(-1), head, chest).mT
+    chest = hubs[:, CHEST]
+    head = hubs[:, HEAD]
+    offset = (rest - at_rest.unsqueeze(1)) @ torch.where(
+        anchored.unsqueeze(-1), head, chest
+    ).mT
     q = _put(q, valid, face, now.unsqueeze(1) + offset * scale[:, None, None])
     if not template.expression:
         return q

@@ -5,9 +5,12 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 # Cosines: a pair's line against the other pairs', and all lines against the left by feet and head.
-APART, OPPOSED = -0.3, -0.6
+APART = -0.3
+OPPOSED = -0.6
 PAIRS = {"hips": (23, 24), "shoulders": (11, 12), "ears": (7, 8), "eyes": (2, 5)}
-NOSE, LEGS = 0, ((25, 27, 29, 31), (26, 28, 30, 32))  # knee, ankle, heel, toes
+# knee, ankle, heel, toes
+NOSE = 0
+LEGS = ((25, 27, 29, 31), (26, 28, 30, 32))
 
 
 def refuse_swapped(p: Tensor, valid: Tensor) -> None:
@@ -36,10 +39,13 @@ def refuse_swapped(p: Tensor, valid: Tensor) -> None:
     for knee, ankle, heel, toes in LEGS:
         left = torch.linalg.cross(p[:, knee] - p[:, ankle], p[:, toes] - p[:, heel])
         by_feet = by_feet + seen(left, (knee, ankle, heel, toes))
-    ears, eyes = (p[:, PAIRS[name]].mean(1) for name in ("ears", "eyes"))
+    ears = p[:, PAIRS["ears"]].mean(1)
+    eyes = p[:, PAIRS["eyes"]].mean(1)
     by_head = torch.linalg.cross(eyes - p[:, NOSE], p[:, NOSE] - ears)
     by_head = seen(by_head, (NOSE, *PAIRS["ears"], *PAIRS["eyes"]))
-    lines = torch.stack([seen(p[:, a] - p[:, b], (a, b)) for a, b in PAIRS.values()], dim=1)
+    lines = torch.stack(
+        [seen(p[:, a] - p[:, b], (a, b)) for a, b in PAIRS.values()], dim=1
+    )
     lines = normalize(lines, dim=-1)
     others = normalize(lines.sum(1, keepdim=True) - lines, dim=-1)
     apart = (lines * others).sum(-1) < APART
@@ -48,7 +54,9 @@ def refuse_swapped(p: Tensor, valid: Tensor) -> None:
     opposed = (whole * left).sum(-1, keepdim=True) < OPPOSED
     shown = (lines != 0).any(-1)
     wrong = ((apart ^ opposed) & shown).sum(0) > 0.5 * shown.sum(0)
-    swapped = [name for name, is_wrong in zip(PAIRS, wrong.tolist(), strict=True) if is_wrong]
+    swapped = [
+        name for name, is_wrong in zip(PAIRS, wrong.tolist(), strict=True) if is_wrong
+    ]
     if swapped:
         raise ValueError(
             f"left and right are swapped: by the direction of nose and toes, the left of "

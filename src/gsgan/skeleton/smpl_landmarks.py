@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from gsgan.skeleton.template import MEDIAPIPE33
 
-SAME, NEAR = 1.0, 0.5
+SAME = 1.0
+NEAR = 0.5
 Floats = NDArray[np.float64]
 
 
@@ -27,10 +28,13 @@ class Table:
     counts: tuple[int, int]  # number of joints, number of vertices
     joints: dict[str, tuple[int, float]]  # landmark to (joint, confidence)
     vertices: dict[str, tuple[int, float]]  # landmark to (vertex, confidence)
-    midpoints: dict[str, tuple[int, int]]  # landmark to (joint, vertex), about halfway between
+    # landmark to (joint, vertex), about halfway between
+    midpoints: dict[str, tuple[int, int]]
 
 
-def _sides(names: dict[str, tuple[int, int]], confidence: float) -> dict[str, tuple[int, float]]:
+def _sides(
+    names: dict[str, tuple[int, int]], confidence: float
+) -> dict[str, tuple[int, float]]:
     """Left and right landmark from one name: ``{"hip": (1, 2)}``."""
     return {
         f"{side}_{name}": (number, confidence)
@@ -77,7 +81,10 @@ TABLES = {
         vertices={
             "nose": (9120, SAME),
             **_eyes(9448, 9929),
-            **_sides({"ear": (6, 616), "heel": (8846, 8635), "foot_index": (5770, 8463)}, SAME),
+            **_sides(
+                {"ear": (6, 616), "heel": (8846, 8635), "foot_index": (5770, 8463)},
+                SAME,
+            ),
         },
         midpoints={},
     ),
@@ -85,7 +92,9 @@ TABLES = {
 
 
 def to_mediapipe33(
-    joints: ArrayLike, vertices: ArrayLike | None = None, kind: Literal["smpl", "smplx"] = "smpl"
+    joints: ArrayLike,
+    vertices: ArrayLike | None = None,
+    kind: Literal["smpl", "smplx"] = "smpl",
 ) -> tuple[Floats, Floats]:
     """MediaPipe's 33 landmarks of posed SMPL or SMPL-X bodies.
 
@@ -103,7 +112,9 @@ def to_mediapipe33(
         ValueError: on a wrong shape or kind, naming the argument.
     """
     if kind not in TABLES:
-        raise ValueError(f"to_mediapipe33: kind must be one of {list(TABLES)}, got {kind!r}")
+        raise ValueError(
+            f"to_mediapipe33: kind must be one of {list(TABLES)}, got {kind!r}"
+        )
     table = TABLES[kind]
     j = _points("joints", joints, table.counts[0])
     p = np.full((*j.shape[:-2], len(MEDIAPIPE33.names), 3), np.nan)
@@ -111,7 +122,8 @@ def to_mediapipe33(
 
     def put(name: str, position: Floats, confidence: float) -> None:
         landmark = MEDIAPIPE33.names.index(name)
-        p[..., landmark, :], conf[..., landmark] = position, confidence
+        p[..., landmark, :] = position
+        conf[..., landmark] = confidence
 
     for name, (joint, confidence) in table.joints.items():
         put(name, j[..., joint, :], confidence)

@@ -14,7 +14,9 @@ import numpy as np
 Vector = tuple[float, float, float]
 Edge = tuple[int, int]
 
-PELVIS, CHEST, HEAD = 0, 1, 2
+PELVIS = 0
+CHEST = 1
+HEAD = 2
 """Positions of the hub frames; those of palms follow, then those of limbs, see `n_hubs`."""
 N_HUBS = 3
 
@@ -47,12 +49,16 @@ class SkeletonTemplate:
     nose: int
     face: tuple[int, ...]  # joints inside the head's sphere
     mirror: tuple[int, ...]  # per joint, its counterpart (itself on the midline)
-    draw_groups: tuple[tuple[str, tuple[Edge, ...]], ...]  # (name, segments) of drawn channels
-    gnn_edges: tuple[Edge, ...]  # the edges connected to one component, for message passing
-    palms: tuple[tuple[int, int, int], ...] = ()  # wrist, index's and little finger's knuckles
+    # (name, segments) of drawn channels
+    draw_groups: tuple[tuple[str, tuple[Edge, ...]], ...]
+    # the edges connected to one component, for message passing
+    gnn_edges: tuple[Edge, ...]
+    # wrist, index's and little finger's knuckles
+    palms: tuple[tuple[int, int, int], ...] = ()
     fingers: tuple[int, ...] = ()  # limbs that are bones of hands
     bare: tuple[int, ...] = ()  # limbs without a cylinder: another limb lies there
-    expression: tuple[int, ...] = ()  # the last joints: landmarks of a face, which rest on the head
+    # the last joints: landmarks of a face, which rest on the head
+    expression: tuple[int, ...] = ()
 
     @property
     def torso(self) -> tuple[int, int, int, int]:
@@ -102,7 +108,8 @@ class SkeletonTemplate:
     @property
     def limb_length_sum(self) -> float:
         """Metres: the sum of limb lengths of the rest pose, the counterpart of ``h_body``."""
-        rest, limbs = np.asarray(self.rest_positions), [self.limbs[i] for i in self.measured]
+        rest = np.asarray(self.rest_positions)
+        limbs = [self.limbs[i] for i in self.measured]
         return float(sum(np.linalg.norm(rest[j] - rest[i]) for i, j in limbs))
 
     @property
@@ -110,14 +117,20 @@ class SkeletonTemplate:
         """Metres: edges (left-right, up, front) of the trunk's box in the rest pose."""
         l_sh, r_sh, l_hip, r_hip = np.asarray(self.rest_positions)[list(self.torso)]
         width = float(max(np.linalg.norm(l_sh - r_sh), np.linalg.norm(l_hip - r_hip)))
-        return width, float(np.linalg.norm((l_sh + r_sh - l_hip - r_hip) / 2)), width / 2
+        return (
+            width,
+            float(np.linalg.norm((l_sh + r_sh - l_hip - r_hip) / 2)),
+            width / 2,
+        )
 
     def with_face(self, at_rest: Sequence[Vector]) -> SkeletonTemplate:
         """The same skeleton with another person's face at rest, as of `gsgan.skeleton.in_head`."""
         rest = np.asarray(self.rest_positions)
         moved = np.asarray(at_rest) + rest[list(self.head)].mean(0)
         kept = self.rest_positions[: -len(self.expression)]
-        return replace(self, rest_positions=(*kept, *((x, y, z) for x, y, z in moved.tolist())))
+        return replace(
+            self, rest_positions=(*kept, *((x, y, z) for x, y, z in moved.tolist()))
+        )
 
 
 def _unit(x: float, y: float, z: float) -> Vector:
@@ -140,20 +153,35 @@ _NAMES = (
     *("left_eye_inner", "left_eye", "left_eye_outer"),
     *("right_eye_inner", "right_eye", "right_eye_outer"),
     *("left_ear", "right_ear", "mouth_left", "mouth_right"),
-    *("left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist"),
-    *("left_pinky", "right_pinky", "left_index", "right_index", "left_thumb", "right_thumb"),
+    *(
+        "left_shoulder",
+        "right_shoulder",
+        "left_elbow",
+        "right_elbow",
+        "left_wrist",
+        "right_wrist",
+    ),
+    *(
+        "left_pinky",
+        "right_pinky",
+        "left_index",
+        "right_index",
+        "left_thumb",
+        "right_thumb",
+    ),
     *("left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle"),
     *("left_heel", "right_heel", "left_foot_index", "right_foot_index"),
 )
 _FACE_EDGES = ((0, 1), (1, 2), (2, 3), (3, 7), (0, 4), (4, 5), (5, 6), (6, 8), (9, 10))
 _TORSO_EDGES = ((11, 12), (11, 23), (12, 24), (23, 24))
-_L_ARM, _R_ARM = ((11, 13), (13, 15)), ((12, 14), (14, 16))
-_L_HAND, _R_HAND = (
-    ((15, 17), (15, 19), (15, 21), (17, 19)),
-    ((16, 18), (16, 20), (16, 22), (18, 20)),
-)
-_L_LEG, _R_LEG = ((23, 25), (25, 27)), ((24, 26), (26, 28))
-_L_FOOT, _R_FOOT = ((27, 29), (27, 31), (29, 31)), ((28, 30), (28, 32), (30, 32))
+_L_ARM = ((11, 13), (13, 15))
+_R_ARM = ((12, 14), (14, 16))
+_L_HAND = ((15, 17), (15, 19), (15, 21), (17, 19))
+_R_HAND = ((16, 18), (16, 20), (16, 22), (18, 20))
+_L_LEG = ((23, 25), (25, 27))
+_R_LEG = ((24, 26), (26, 28))
+_L_FOOT = ((27, 29), (27, 31), (29, 31))
+_R_FOOT = ((28, 30), (28, 32), (30, 32))
 _LIMBS = _L_ARM + _R_ARM + _L_HAND + _R_HAND + _L_LEG + _R_LEG + _L_FOOT + _R_FOOT
 _EDGES = (
     *_FACE_EDGES[:8],
@@ -195,7 +223,8 @@ def _twin(name: str) -> str:
 
 def _rest_positions() -> tuple[Vector, ...]:
     return tuple(
-        _LEFT_REST[n] if n in _LEFT_REST else _mirrored(_LEFT_REST[_twin(n)]) for n in _NAMES
+        _LEFT_REST[n] if n in _LEFT_REST else _mirrored(_LEFT_REST[_twin(n)])
+        for n in _NAMES
     )
 
 
@@ -220,7 +249,8 @@ def _rest_directions() -> dict[Edge, Vector]:
         return _about_x(_unit(*offset), cos=-leg[1], sin=-leg[2])
 
     left: dict[Edge, Vector] = dict.fromkeys((*_L_ARM, *_L_HAND[:3]), arm)
-    left[(17, 19)] = _across((0.0, 0.0, 1.0), arm)  # thumb side forward, halfway through pronation
+    # thumb side forward, halfway through pronation
+    left[(17, 19)] = _across((0.0, 0.0, 1.0), arm)
     left |= dict.fromkeys(_L_LEG, leg)
     left[(27, 29)] = neutral("left_ankle", "left_heel")
     left[(27, 31)] = neutral("left_ankle", "left_foot_index")
@@ -257,7 +287,9 @@ def _mediapipe33() -> SkeletonTemplate:
         eyes=(2, 5),
         nose=0,
         face=tuple(range(11)),
-        mirror=tuple(_NAMES.index(_twin(n)) if _twin(n) in _NAMES else 0 for n in _NAMES),
+        mirror=tuple(
+            _NAMES.index(_twin(n)) if _twin(n) in _NAMES else 0 for n in _NAMES
+        ),
         draw_groups=(
             ("head", (*_FACE_EDGES, (7, 8))),
             ("torso", _TORSO_EDGES),

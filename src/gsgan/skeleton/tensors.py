@@ -25,7 +25,9 @@ class Swing(NamedTuple):
     @classmethod
     def of(cls, rest: Tensor) -> Swing:
         half_turn_rest = _half_turn(rest)
-        return cls(rest, half_turn_rest, half_turn_rest @ _half_turn(orthogonal_to(rest)))
+        return cls(
+            rest, half_turn_rest, half_turn_rest @ _half_turn(orthogonal_to(rest))
+        )
 
     def to(self, d: Tensor) -> Tensor:
         """``[B, M, 3, 3]`` rotations from ``rest`` to the directions ``d [B, M, 3]``.
@@ -82,14 +84,18 @@ class Constants(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def constants(template: SkeletonTemplate, device: torch.device, dtype: torch.dtype) -> Constants:
+def constants(
+    template: SkeletonTemplate, device: torch.device, dtype: torch.dtype
+) -> Constants:
     """The template's tensors on a device, cached."""
     # tensors created in inference mode cannot be used for training later
     with torch.inference_mode(False), torch.no_grad():
         return _constants(template, device, dtype)
 
 
-def _constants(t: SkeletonTemplate, device: torch.device, dtype: torch.dtype) -> Constants:
+def _constants(
+    t: SkeletonTemplate, device: torch.device, dtype: torch.dtype
+) -> Constants:
     def index(values: object) -> Tensor:
         return torch.tensor(values, dtype=torch.int64, device=device)
 
@@ -121,7 +127,11 @@ def _constants(t: SkeletonTemplate, device: torch.device, dtype: torch.dtype) ->
     from_ears = rest[turned] - rest[list(t.ears)].mean(0)
 
     # Where omega finds each joint's rotation: among pelvis, chest, head, face and limbs.
-    place = dict.fromkeys(t.hips, PELVIS) | dict.fromkeys(t.shoulders, CHEST) | {t.nose: HEAD}
+    place = (
+        dict.fromkeys(t.hips, PELVIS)
+        | dict.fromkeys(t.shoulders, CHEST)
+        | {t.nose: HEAD}
+    )
     place |= {joint: N_HUBS + k for k, joint in enumerate(turned)}
     place |= {joint: N_HUBS + len(turned) + limb for joint, limb in t.incoming.items()}
 
@@ -141,7 +151,9 @@ def _constants(t: SkeletonTemplate, device: torch.device, dtype: torch.dtype) ->
         face_swing=swing(from_ears / from_ears.norm(dim=-1, keepdim=True)),
         expression=index(t.expression),
         face_rest=cast(rest[list(t.expression)] - rest[list(t.head)].mean(0)),
-        omega_order=index([place[j] for j in range(len(t.names)) if j not in t.expression]),
+        omega_order=index(
+            [place[j] for j in range(len(t.names)) if j not in t.expression]
+        ),
         axes=cast(torch.eye(3, dtype=torch.float64)),
     )
 
@@ -151,7 +163,9 @@ def _eye_frame(t: SkeletonTemplate, rest: Tensor) -> Tensor:
     left, right = t.eyes
     across_eyes = unit(rest[left] - rest[right])
     front = unit(across(across_eyes, rest[t.nose] - (rest[left] + rest[right]) / 2))
-    return torch.stack([across_eyes, torch.linalg.cross(front, across_eyes), front], dim=-1)
+    return torch.stack(
+        [across_eyes, torch.linalg.cross(front, across_eyes), front], dim=-1
+    )
 
 
 def check_skeleton(

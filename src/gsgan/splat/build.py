@@ -88,7 +88,9 @@ def job_type(
     return type("Job", (ctypes.Structure,), {"_fields_": fields})
 
 
-def point(job: ctypes.Structure, names: Sequence[str], tensors: Sequence[Tensor | None]) -> None:
+def point(
+    job: ctypes.Structure, names: Sequence[str], tensors: Sequence[Tensor | None]
+) -> None:
     """Sets fields of a job to tensors' addresses; the caller keeps the tensors alive."""
     for name, tensor in zip(names, tensors, strict=False):
         setattr(job, name, None if tensor is None else tensor.data_ptr())
@@ -117,7 +119,9 @@ def _load_once() -> tuple[ctypes.CDLL | None, str]:
         command = compiler()
         # all that a compiled kernel depends on
         parts = (_source(), repr(BASE_FLAGS), repr(_flags()), repr(command))
-        key = hashlib.sha256("\0".join((*parts, _version(command), _cpu())).encode()).hexdigest()
+        key = hashlib.sha256(
+            "\0".join((*parts, _version(command), _cpu())).encode()
+        ).hexdigest()
         folder = _cache_folder()
         path = folder / f"{key[:24]}.so"
         if path.is_file() and (loaded := open_library(path)) is not None:
@@ -164,13 +168,19 @@ def _cache_folder() -> Path:
 def _flags() -> tuple[tuple[str, ...], ...]:
     """Sets of flags to try, best first."""
     march = os.environ.get("GSGAN_MARCH")
-    return ((f"-march={march}", "-fopenmp"), (f"-march={march}",)) if march else _NATIVE_FLAGS
+    return (
+        ((f"-march={march}", "-fopenmp"), (f"-march={march}",))
+        if march
+        else _NATIVE_FLAGS
+    )
 
 
 def _source() -> str:
     headers = sorted(HEADERS.glob("*.h"))
     if not SOURCE.is_file() or not headers:
-        raise Unavailable(f"The kernel's source {SOURCE} or {HEADERS} is missing; reinstall gsgan.")
+        raise Unavailable(
+            f"The kernel's source {SOURCE} or {HEADERS} is missing; reinstall gsgan."
+        )
     return "\0".join(path.read_text(encoding="utf-8") for path in (SOURCE, *headers))
 
 
@@ -188,7 +198,11 @@ def _cpu() -> str:
     if info.is_file():
         fields = ("model name", "flags", "CPU implementer", "CPU part", "Features")
         lines += sorted(
-            {x for x in info.read_text(errors="replace").splitlines() if x.startswith(fields)}
+            {
+                x
+                for x in info.read_text(errors="replace").splitlines()
+                if x.startswith(fields)
+            }
         )
     return "\n".join(lines)
 
@@ -207,15 +221,25 @@ def _build(command: list[str], library: Path) -> None:
             if done.returncode == 0 and target.is_file():
                 os.replace(target, library)
                 return
-            wrong = [line for line in done.stderr.splitlines() if "error" in line.lower()]
-            message = message or "".join(f": {line.strip().rstrip('.')}" for line in wrong[:1])
-    raise Unavailable(f"The compiler {shlex.join(command)!r} failed on the native kernel{message}.")
+            wrong = [
+                line for line in done.stderr.splitlines() if "error" in line.lower()
+            ]
+            message = message or "".join(
+                f": {line.strip().rstrip('.')}" for line in wrong[:1]
+            )
+    raise Unavailable(
+        f"The compiler {shlex.join(command)!r} failed on the native kernel{message}."
+    )
 
 
 def _run(command: list[str]) -> subprocess.CompletedProcess[str]:
     try:
         return subprocess.run(
-            command, capture_output=True, text=True, timeout=COMPILE_SECONDS, check=False
+            command,
+            capture_output=True,
+            text=True,
+            timeout=COMPILE_SECONDS,
+            check=False,
         )
     except subprocess.TimeoutExpired as error:
         raise Unavailable(

@@ -36,7 +36,9 @@ def _check_types(gaussians: Gaussians, camera: Camera) -> None:
         )
     means = gaussians.means
     if not means.is_floating_point():
-        raise ValueError(f"rasterise: Gaussians.means must be floating point, got {means.dtype}")
+        raise ValueError(
+            f"rasterise: Gaussians.means must be floating point, got {means.dtype}"
+        )
     for name, value in {**_tensors(gaussians), **_tensors(camera)}.items():
         for what, have, want in (
             ("device", value.device, means.device),
@@ -50,7 +52,9 @@ def _check_types(gaussians: Gaussians, camera: Camera) -> None:
 
 def _check_camera(camera: Camera) -> None:
     """K is a pinhole's, R a rotation."""
-    K, R, t = (x.detach().double() for x in (camera.K, camera.R, camera.t))
+    K = camera.K.detach().double()
+    R = camera.R.detach().double()
+    t = camera.t.detach().double()
     identity = torch.eye(3, dtype=R.dtype)
     off = (R @ R.mT - identity).abs().amax((-2, -1))
     rules = (
@@ -58,9 +62,17 @@ def _check_camera(camera: Camera) -> None:
         ("R", R.isfinite().all((-2, -1)), "finite"),
         ("t", t.isfinite().all(-1), "finite"),
         ("K", (K[:, 0, 0] > 0) & (K[:, 1, 1] > 0), "of fx, fy > 0"),
-        ("K", (K[:, 2] == identity[2]).all(-1) & (K[:, 1, 0] == 0), "[fx s cx; 0 fy cy; 0 0 1]"),
+        (
+            "K",
+            (K[:, 2] == identity[2]).all(-1) & (K[:, 1, 0] == 0),
+            "[fx s cx; 0 fy cy; 0 0 1]",
+        ),
         ("R", off <= ROTATION, f"a rotation, R Rᵀ the identity to {ROTATION:g}"),
-        ("R", torch.linalg.det(R) > 0, "a rotation: it mirrors; flip one axis of R and t"),
+        (
+            "R",
+            torch.linalg.det(R) > 0,
+            "a rotation: it mirrors; flip one axis of R and t",
+        ),
     )
     for name, good, expected in rules:
         if not good.all():
@@ -78,11 +90,14 @@ def _check_gaussians(gaussians: Gaussians) -> None:
         return
     for name, value in _shape_tensors(gaussians).items():
         value = value.detach().reshape(B, N, -1)
-        good, expected = value.isfinite(), "finite"
+        good = value.isfinite()
+        expected = "finite"
         if name == "Gaussians.scales":
-            good, expected = good & (value > 0), "finite and > 0"
+            good = good & (value > 0)
+            expected = "finite and > 0"
         if name == "Gaussians.opacities":
-            good, expected = good & (value >= 0) & (value <= 1), "in [0, 1]"
+            good = good & (value >= 0) & (value <= 1)
+            expected = "in [0, 1]"
         if not good.all():
             b, n, k = (~good).nonzero()[0].tolist()
             raise ValueError(
@@ -95,14 +110,19 @@ def _shape_tensors(gaussians: Gaussians) -> dict[str, Tensor]:
     """The tensors that are used: with covariances, quats and scales are not."""
     found = _tensors(gaussians)
     if gaussians.covariances is not None:
-        found = {k: v for k, v in found.items() if k not in ("Gaussians.quats", "Gaussians.scales")}
+        found = {
+            k: v
+            for k, v in found.items()
+            if k not in ("Gaussians.quats", "Gaussians.scales")
+        }
     return found
 
 
 def _all_valid(gaussians: Gaussians) -> bool:
     """A sum is finite only where all its terms are: one pass."""
     used = {name: value.detach() for name, value in _shape_tensors(gaussians).items()}
-    scales, opacities = used.get("Gaussians.scales"), used["Gaussians.opacities"]
+    scales = used.get("Gaussians.scales")
+    opacities = used["Gaussians.opacities"]
     total = sum(float(value.sum(dtype=torch.float64)) for value in used.values())
     low, high = torch.aminmax(opacities)
     positive = scales is None or float(scales.amin()) > 0

@@ -62,7 +62,10 @@ def differences(settings: Accuracy, device: torch.device) -> list[str]:
         for name, value in have.items()
         if not (
             (want := getattr(settings, name)) == value
-            or (isinstance(value, float) and math.isclose(want, value, rel_tol=TOLERANCE))
+            or (
+                isinstance(value, float)
+                and math.isclose(want, value, rel_tol=TOLERANCE)
+            )
         )
     ]
 
@@ -91,7 +94,9 @@ def unsuited(gaussians: Gaussians, camera: Camera) -> str:
     return ""
 
 
-def draw(gaussians: Gaussians, camera: Camera, settings: Accuracy) -> tuple[Tensor, Tensor]:
+def draw(
+    gaussians: Gaussians, camera: Camera, settings: Accuracy
+) -> tuple[Tensor, Tensor]:
     """Projects and blends.
 
     Convention: as ``gsgan.splat.rasterise``, for inputs for which ``why_not`` and ``unsuited`` are
@@ -134,10 +139,17 @@ def _shapes(gaussians: Gaussians) -> dict[str, Tensor | None]:
     if gaussians.covariances is not None:
         # gsplat reads the upper triangle; the other backends use the symmetric part.
         covariances = gaussians.covariances.float()
-        return {"quats": None, "scales": None, "covars": (covariances + covariances.mT) / 2}
+        return {
+            "quats": None,
+            "scales": None,
+            "covars": (covariances + covariances.mT) / 2,
+        }
     assert gaussians.quats is not None
     assert gaussians.scales is not None
-    return {"quats": _usable(gaussians.quats.float()), "scales": gaussians.scales.float()}
+    return {
+        "quats": _usable(gaussians.quats.float()),
+        "scales": gaussians.scales.float(),
+    }
 
 
 def _usable(quats: Tensor) -> Tensor:
@@ -180,8 +192,12 @@ def _measured_cap(device: torch.device) -> tuple[float | None, str]:
         opacities=torch.ones(1, 1, device=device),
         features=torch.ones(1, 1, 1, device=device),
     )
-    K = torch.tensor([[[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]]], device=device)
-    camera = Camera(K, torch.eye(3, device=device)[None], torch.zeros(1, 3, device=device), (1, 1))
+    K = torch.tensor(
+        [[[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]]], device=device
+    )
+    camera = Camera(
+        K, torch.eye(3, device=device)[None], torch.zeros(1, 3, device=device), (1, 1)
+    )
     try:
         with torch.no_grad():
             alpha = draw(gaussians, camera, _PROBE)[1]

@@ -13,7 +13,9 @@ from gsgan.splat.project import rotations
 from gsgan.utils.tensors import constant
 
 
-def as_pinhole_sees(gaussians: Gaussians, camera: Camera, near: float) -> tuple[Gaussians, Camera]:
+def as_pinhole_sees(
+    gaussians: Gaussians, camera: Camera, near: float
+) -> tuple[Gaussians, Camera]:
     """Gaussians moved so that a pinhole shows them as the cameras' lenses show the given ones.
 
     Each mean moves to where the lens shows it, at its own depth, and its covariance follows by the
@@ -72,7 +74,10 @@ def bend(x_cam: Tensor, dist: Tensor, near: float) -> tuple[Tensor, Tensor, Tens
     z = x_cam[..., 2:]
     ahead = (z > near) & torch.isfinite(x_cam).all(dim=-1, keepdim=True)
     n = torch.where(ahead, x_cam[..., :2], 0.0) / torch.where(ahead, z, 1.0)
-    beyond = n.norm(dim=-1, keepdim=True) >= RIM * fold_radius(dist).to(n.dtype)[:, None, None]
+    beyond = (
+        n.norm(dim=-1, keepdim=True)
+        >= RIM * fold_radius(dist).to(n.dtype)[:, None, None]
+    )
     moves = ahead & ~beyond
     n = torch.where(moves, n, 0.0)
     shown, slope = distort(n, dist)

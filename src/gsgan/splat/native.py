@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 # Memory of the backward pass for gradients per (tile, Gaussian) before they are summed.
 SLOT_BYTES = 1 << 28
 
-_OUT_OF_MEMORY, _NOT_FINITE = 1, 2
+_OUT_OF_MEMORY = 1
+_NOT_FINITE = 2
 
 _INPUTS = ("means", "factors", "opacities", "features", "depths", "extents")
 _OUTPUTS = ("out_features", "out_alpha", "out_average")
@@ -144,7 +145,10 @@ class _Composite(torch.autograd.Function):
         _raise_for(run(ctypes.byref(job), ctypes.byref(plan.pointer)), job)
         if job.keep:
             ctx.save_for_backward(*tensors, visible)
-            ctx.plan, ctx.size, ctx.settings, ctx.times = plan, size, settings, times
+            ctx.plan = plan
+            ctx.size = size
+            ctx.settings = settings
+            ctx.times = times
             ctx.set_materialize_grads(False)
         return tuple(outputs)  # type: ignore[return-value]
 
@@ -164,13 +168,18 @@ class _Composite(torch.autograd.Function):
         run = build.function("backward", inputs[3].dtype)
         _raise_for(run(ctypes.byref(job), ctx.plan.pointer), job)
         needed = [
-            g if need else None for g, need in zip(outgoing, ctx.needs_input_grad, strict=False)
+            g if need else None
+            for g, need in zip(outgoing, ctx.needs_input_grad, strict=False)
         ]
         return (*needed, *[None] * (len(ctx.needs_input_grad) - len(needed)))
 
 
 def _job(
-    size: tuple[int, int], settings: Accuracy, inputs: list[Tensor], visible: Tensor, times: int
+    size: tuple[int, int],
+    settings: Accuracy,
+    inputs: list[Tensor],
+    visible: Tensor,
+    times: int,
 ) -> Any:
     sizes = (
         *inputs[3].shape,
@@ -181,7 +190,9 @@ def _job(
         SLOT_BYTES,
         times,
     )
-    job = _Job(*sizes, settings.alpha_min, settings.transmittance_min, settings.alpha_max)
+    job = _Job(
+        *sizes, settings.alpha_min, settings.transmittance_min, settings.alpha_max
+    )
     build.point(job, (*_INPUTS, "visible"), [*inputs, visible])
     return job
 
@@ -196,7 +207,9 @@ def _raise_for(status: int, job: Any) -> None:
             f"factors, opacity, depth or extent of Gaussian {n} of batch item {b}"
         )
     if status == _OUT_OF_MEMORY:
-        raise MemoryError("composite: out of memory; use a smaller image, batch or extent")
+        raise MemoryError(
+            "composite: out of memory; use a smaller image, batch or extent"
+        )
     raise ValueError(
         f"composite: {job.B} images of {job.H} x {job.W} with {job.N} Gaussians give more than "
         "2^32 pairs of tile and Gaussian; use a smaller image, batch or extent"

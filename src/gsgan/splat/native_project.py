@@ -13,7 +13,13 @@ from torch import Tensor
 
 from gsgan.scene import Camera, Gaussians
 from gsgan.splat import build
-from gsgan.splat.project import EXP_UNDERFLOW, EXTENT_MARGIN, QUAT_MIN, Projected, field_of_view
+from gsgan.splat.project import (
+    EXP_UNDERFLOW,
+    EXTENT_MARGIN,
+    QUAT_MIN,
+    Projected,
+    field_of_view,
+)
 from gsgan.splat.settings import Accuracy
 
 _INPUTS = ("means", "quats", "scales", "covariances", "opacities")
@@ -24,7 +30,12 @@ _Job = build.job_type(
     ("B", "N", "H", "W", "threads", "antialias"),
     ("near", "low_pass", "alpha_min", "reach", "extent_margin", "quat_min"),
     (
-        *(*_INPUTS, *_CAMERA, *(f"out_{name}" for name in (*_OUTPUTS, "extents")), "visible"),
+        *(
+            *_INPUTS,
+            *_CAMERA,
+            *(f"out_{name}" for name in (*_OUTPUTS, "extents")),
+            "visible",
+        ),
         *(f"g_{name}" for name in _OUTPUTS),
         *(f"d_{name}" for name in (*_INPUTS, *_CAMERA)),
     ),
@@ -39,8 +50,12 @@ def project(gaussians: Gaussians, camera: Camera, settings: Accuracy) -> Project
     Source: gradients derived in kernels/ewa.h.
     """
     dtype = torch.promote_types(gaussians.means.dtype, settings.torch_dtype)
-    K, R, t = (x.to(torch.float64) for x in (camera.K, camera.R, camera.t))
-    limits = torch.cat(field_of_view(K, camera.size, settings.fov_clamp), dim=1).squeeze(-1)
+    K = camera.K.to(torch.float64)
+    R = camera.R.to(torch.float64)
+    t = camera.t.to(torch.float64)
+    limits = torch.cat(
+        field_of_view(K, camera.size, settings.fov_clamp), dim=1
+    ).squeeze(-1)
     shape: tuple[Tensor | None, ...] = (gaussians.quats, gaussians.scales, None)
     if gaussians.covariances is not None:
         shape = (None, None, gaussians.covariances)
@@ -59,7 +74,8 @@ class _Project(torch.autograd.Function):
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
         *tensors, size, settings = arguments
         job, held = _job(tensors, size, settings)
-        means, opacities = held[0], held[4]
+        means = held[0]
+        opacities = held[4]
         assert means is not None
         assert opacities is not None
         B, N = opacities.shape
@@ -70,11 +86,14 @@ class _Project(torch.autograd.Function):
             means.new_empty(B, N, 2),
         ]
         visible = torch.empty(B, N, dtype=torch.bool)
-        build.point(job, tuple(f"out_{name}" for name in (*_OUTPUTS, "extents")), outputs)
+        build.point(
+            job, tuple(f"out_{name}" for name in (*_OUTPUTS, "extents")), outputs
+        )
         build.point(job, ("visible",), [visible])
         build.function("project", means.dtype)(ctypes.byref(job))
         ctx.save_for_backward(*tensors)
-        ctx.size, ctx.settings = size, settings
+        ctx.size = size
+        ctx.settings = settings
         ctx.mark_non_differentiable(outputs[-1], visible)
         ctx.set_materialize_grads(False)
         return (*outputs, visible)
@@ -83,19 +102,25 @@ class _Project(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         job, held = _job(ctx.saved_tensors, ctx.size, ctx.settings)
-        incoming = [None if g is None else g.contiguous() for g in grads[: len(_OUTPUTS)]]
+        incoming = [
+            None if g is None else g.contiguous() for g in grads[: len(_OUTPUTS)]
+        ]
         build.point(job, tuple(f"g_{name}" for name in _OUTPUTS), incoming)
         needed = ctx.needs_input_grad
         # The camera's gradients are few numbers: always computed, returned where needed.
         outgoing = [
-            None if x is None or not (need or i >= len(_INPUTS)) else torch.zeros_like(x)
+            None
+            if x is None or not (need or i >= len(_INPUTS))
+            else torch.zeros_like(x)
             for i, (x, need) in enumerate(zip(held, needed, strict=False))
         ]
         build.point(job, tuple(f"d_{name}" for name in (*_INPUTS, *_CAMERA)), outgoing)
         assert held[0] is not None
         if build.function("project_backward", held[0].dtype)(ctypes.byref(job)):
             raise MemoryError("project: out of memory")
-        grads_in = [g if need else None for g, need in zip(outgoing, needed, strict=False)]
+        grads_in = [
+            g if need else None for g, need in zip(outgoing, needed, strict=False)
+        ]
         return (*grads_in, *[None] * (len(needed) - len(grads_in)))
 
 
@@ -109,7 +134,14 @@ def _job(
     reach, margin = _reach(settings)
     job = _Job(
         *(*opacities.shape, *size, build.threads(), settings.antialias),
-        *(settings.near, settings.low_pass, settings.alpha_min, reach, margin, QUAT_MIN),
+        *(
+            settings.near,
+            settings.low_pass,
+            settings.alpha_min,
+            reach,
+            margin,
+            QUAT_MIN,
+        ),
     )
     build.point(job, (*_INPUTS, *_CAMERA), held)
     return job, held

@@ -38,7 +38,8 @@ class Projected:
     opacities: Tensor  # [B, N], including anti-aliasing
     features: Tensor  # [B, N, C]
     depths: Tensor  # [B, N] metres along the viewing axis
-    extents: Tensor  # [B, N, 2] pixels, half-sizes of the footprint, 0 if invisible; no gradient
+    # [B, N, 2] pixels, half-sizes of the footprint, 0 if invisible; no gradient
+    extents: Tensor
     visible: Tensor  # [B, N] bool
 
 
@@ -64,18 +65,25 @@ def project(gaussians: Gaussians, camera: Camera, settings: Accuracy) -> Project
     dtype = torch.promote_types(gaussians.means.dtype, settings.torch_dtype)
     wide = torch.float64 if gaussians.means.device.type != "mps" else dtype
     # The N Gaussians are the last dimension here: contiguous vectors, few large operations.
-    K, R, t = camera.K.to(wide), camera.R.to(wide), camera.t.to(wide)
+    K = camera.K.to(wide)
+    R = camera.R.to(wide)
+    t = camera.t.to(wide)
     x_cam = R @ gaussians.means.to(wide).mT + t.unsqueeze(-1)
     in_front = x_cam.detach()[:, 2] > settings.near
-    x_cam = torch.where(in_front.unsqueeze(1), x_cam, constant(((0.0,), (0.0,), (1.0,)), x_cam))
+    x_cam = torch.where(
+        in_front.unsqueeze(1), x_cam, constant(((0.0,), (0.0,), (1.0,)), x_cam)
+    )
     depths = x_cam[:, 2]
     ratios = x_cam[:, :2] / depths.unsqueeze(1)
     means = K[:, :2, :2] @ ratios + K[:, :2, 2:]
     limits = field_of_view(K, camera.size, settings.fov_clamp)
-    a, b, c, det_before = _covariance_2d(gaussians, _jacobian(K, R, ratios, depths, limits))
+    a, b, c, det_before = _covariance_2d(
+        gaussians, _jacobian(K, R, ratios, depths, limits)
+    )
     low = settings.low_pass
     det = det_before + low * (a + c) + low * low
-    a, c = a + low, c + low
+    a = a + low
+    c = c + low
     # With Σ = [a b; b c]: Σ⁻¹ = [c -b; -b a] / det, whose factor has no cancellation.
     factors = torch.stack([(c / det).sqrt(), -b / c, c.rsqrt()], dim=-1)
     opacities = gaussians.opacities.to(wide)
@@ -85,7 +93,9 @@ def project(gaussians: Gaussians, camera: Camera, settings: Accuracy) -> Project
         # The same variance, unless a given covariance is not positive definite: then that of the
         # factors.
         a = (b * b + det) / c
-        extents, visible = _footprint(means, a, c, opacities, in_front, camera.size, settings)
+        extents, visible = _footprint(
+            means, a, c, opacities, in_front, camera.size, settings
+        )
     return Projected(
         means.mT,
         factors,
@@ -114,10 +124,20 @@ def _rotation_entries(quats: Tensor, dim: int) -> list[Tensor]:
     usable = largest > QUAT_MIN
     w, x, y, z = (quats / torch.where(usable, largest, 1.0)).unbind(dim)
     noise = ~usable.squeeze(dim)
-    w, x, y, z = w.masked_fill(noise, 1.0), *(i.masked_fill(noise, 0.0) for i in (x, y, z))
-    xx, yy, zz = x * x, y * y, z * z
+    w, x, y, z = (
+        w.masked_fill(noise, 1.0),
+        *(i.masked_fill(noise, 0.0) for i in (x, y, z)),
+    )
+    xx = x * x
+    yy = y * y
+    zz = z * z
     two = 2 / (w * w + xx + yy + zz)
-    xy, xz, yz, wx, wy, wz = x * y, x * z, y * z, w * x, w * y, w * z
+    xy = x * y
+    xz = x * z
+    yz = y * z
+    wx = w * x
+    wy = w * y
+    wz = w * z
     return [
         *(1 - two * (yy + zz), two * (xy - wz), two * (xz + wy)),
         *(two * (xy + wz), 1 - two * (xx + zz), two * (yz - wx)),
@@ -125,13 +145,16 @@ def _rotation_entries(quats: Tensor, dim: int) -> list[Tensor]:
     ]
 
 
-def _covariance_2d(gaussians: Gaussians, JW: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _covariance_2d(
+    gaussians: Gaussians, JW: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Entries a, b, c of ``J W Σ Wᵀ Jᵀ`` (square pixels) and its determinant, each ``[B, N]``."""
     wide = JW.dtype
     if gaussians.covariances is None:
         assert gaussians.quats is not None
         assert gaussians.scales is not None
-        quats, scales = gaussians.quats.to(wide).mT.contiguous(), gaussians.scales.to(wide).mT
+        quats = gaussians.quats.to(wide).mT.contiguous()
+        scales = gaussians.scales.to(wide).mT
         R = torch.stack(_rotation_entries(quats, 1), dim=1).unflatten(1, (3, 3))
         u, v = (_row_times_matrix(JW[:, i], R) * scales for i in range(2))
         # The determinant of M Mᵀ is |u x v|²: a sum of squares, where a c - b² cancels.
@@ -140,7 +163,8 @@ def _covariance_2d(gaussians: Gaussians, JW: Tensor) -> tuple[Tensor, Tensor, Te
         return (u * u).sum(1), (u * v).sum(1), (v * v).sum(1), det
     covariances = gaussians.covariances.to(wide).movedim(1, -1).contiguous()
     u, v = (_row_times_matrix(JW[:, i], covariances) for i in range(2))
-    a, c = (u * JW[:, 0]).sum(1).clamp_min(0), (v * JW[:, 1]).sum(1).clamp_min(0)
+    a = (u * JW[:, 0]).sum(1).clamp_min(0)
+    c = (v * JW[:, 1]).sum(1).clamp_min(0)
     b = 0.5 * ((u * JW[:, 1]).sum(1) + (v * JW[:, 0]).sum(1))
     return a, b, c, (a * c - b * b).clamp_min(0)
 
@@ -154,14 +178,17 @@ def _jacobian(
     K: Tensor, R: Tensor, ratios: Tensor, depths: Tensor, limits: tuple[Tensor, Tensor]
 ) -> Tensor:
     """``[B, 2, 3, N]`` pixels per metre of world: the projection's Jacobian times R."""
-    A, clamped = K[:, :2, :2], torch.minimum(torch.maximum(ratios, limits[0]), limits[1])
+    A = K[:, :2, :2]
+    clamped = torch.minimum(torch.maximum(ratios, limits[0]), limits[1])
     # J = A [1/z 0 -x/z²; 0 1/z -y/z²], multiplied out so that no small matrices are batched.
     towards = (A @ R[:, :2]).unsqueeze(-1)
     away = (A @ clamped).unsqueeze(2) * R[:, None, 2, :, None]
     return (towards - away) / depths[:, None, None]
 
 
-def field_of_view(K: Tensor, size: tuple[int, int], widen: float) -> tuple[Tensor, Tensor]:
+def field_of_view(
+    K: Tensor, size: tuple[int, int], widen: float
+) -> tuple[Tensor, Tensor]:
     """Least and greatest x/z and y/z, each ``[B, 2, 1]``, of the image enlarged about its middle.
 
     The corners of the image bound them, which holds with skew and an off-centre principal point.
@@ -170,8 +197,10 @@ def field_of_view(K: Tensor, size: tuple[int, int], widen: float) -> tuple[Tenso
     corners = filled(((0, W, 0, W), (0, 0, H, H)), K) - K[:, :2, 2:]
     # not linalg.inv: the host would wait for its check of the result
     ratios = torch.linalg.inv_ex(K[:, :2, :2]).inverse @ corners
-    low, high = ratios.amin(-1, keepdim=True), ratios.amax(-1, keepdim=True)
-    middle, half = (low + high) / 2, (high - low) / 2
+    low = ratios.amin(-1, keepdim=True)
+    high = ratios.amax(-1, keepdim=True)
+    middle = (low + high) / 2
+    half = (high - low) / 2
     return middle - widen * half, middle + widen * half
 
 

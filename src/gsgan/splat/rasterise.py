@@ -59,11 +59,13 @@ def rasterise(
         gaussians, camera = as_pinhole_sees(gaussians, camera, settings.near)
     name, reason = resolve_backend(backend, gaussians.means.device, settings)
     if name == "gsplat" and (why_not := gsplat_backend.unsuited(gaussians, camera)):
-        name, reason = "torch", f"Drawing with the torch backend: {why_not}"
+        name = "torch"
+        reason = f"Drawing with the torch backend: {why_not}"
     if reason:
         _warn_once(reason)
     out = gaussians.means.dtype
-    times, fine = settings.supersample, None
+    times = settings.supersample
+    fine = None
     drawn = camera
     if times > 1:
         drawn = camera.resize((camera.size[0] * times, camera.size[1] * times))
@@ -72,12 +74,15 @@ def rasterise(
         if times > 1:
             fine = features.to(out)
             if average is None:
-                average, alpha = avg_pool2d(features, times), avg_pool2d(alpha, times)
+                average = avg_pool2d(features, times)
+                alpha = avg_pool2d(alpha, times)
             features = average
     return Raster(features.to(out), alpha.to(out), fine)
 
 
-def resolve_backend(name: str, device: torch.device, settings: Accuracy) -> tuple[str, str]:
+def resolve_backend(
+    name: str, device: torch.device, settings: Accuracy
+) -> tuple[str, str]:
     """The backend that is used, and why when it is not the requested or the fastest one.
 
     Args:
@@ -92,7 +97,9 @@ def resolve_backend(name: str, device: torch.device, settings: Accuracy) -> tupl
         ValueError: on an unknown name.
     """
     if name not in BACKENDS:
-        raise ValueError(f"rasterise: backend must be one of {', '.join(BACKENDS)}, got {name!r}")
+        raise ValueError(
+            f"rasterise: backend must be one of {', '.join(BACKENDS)}, got {name!r}"
+        )
     if name in ("reference", "torch"):
         return name, ""
     if name == "auto" and settings.is_dense:
@@ -102,7 +109,9 @@ def resolve_backend(name: str, device: torch.device, settings: Accuracy) -> tupl
             return "torch", f"Drawing with the torch backend: {why_not}"
         return "gsplat", gsplat_backend.given_up(settings, device)
     if device.type != "cpu":
-        message = f"The native backend runs on CPU only; drawing with torch on {device}."
+        message = (
+            f"The native backend runs on CPU only; drawing with torch on {device}."
+        )
         return "torch", message if name == "native" else ""
     if why_not := native.why_not():
         return "torch", f"Drawing with the torch backend, which is slower: {why_not}"
@@ -134,11 +143,18 @@ def _warn_once(message: str) -> None:
 # -- what torch.export records
 
 
-def _recorded(gaussians: Gaussians, camera: Camera, settings: Accuracy, backend: str) -> Raster:
+def _recorded(
+    gaussians: Gaussians, camera: Camera, settings: Accuracy, backend: str
+) -> Raster:
     """The operator that ``torch.export`` records in place of `rasterise`, without gradient."""
     assert gaussians.covariances is not None  # as avatars splat
     features, alpha, fine = _rasterise(
-        *(gaussians.means, gaussians.covariances, gaussians.opacities, gaussians.features),
+        *(
+            gaussians.means,
+            gaussians.covariances,
+            gaussians.opacities,
+            gaussians.features,
+        ),
         *(camera.K, camera.R, camera.t, camera.dist, *camera.size),
         json.dumps(asdict(settings)),
         backend,

@@ -49,7 +49,12 @@ def _pixel_chunks(projected: Projected, size: tuple[int, int]) -> tuple[Tensor, 
     H, W = size
     y, x = torch.meshgrid(torch.arange(H) + 0.5, torch.arange(W) + 0.5, indexing="ij")
     per_chunk = max(1, CHUNK_ELEMENTS // max(1, projected.depths.numel()))
-    return torch.stack([x, y], dim=-1).to(projected.features).reshape(-1, 2).split(per_chunk)
+    return (
+        torch.stack([x, y], dim=-1)
+        .to(projected.features)
+        .reshape(-1, 2)
+        .split(per_chunk)
+    )
 
 
 def _alphas(projected: Projected, pixels: Tensor, settings: Accuracy) -> Tensor:
@@ -63,7 +68,9 @@ def _alphas(projected: Projected, pixels: Tensor, settings: Accuracy) -> Tensor:
     if settings.extent == "sigma":
         drawn = drawn & (d.detach().abs() <= projected.extents.unsqueeze(1)).all(-1)
     q = torch.where(drawn, q, 0.0)
-    alpha = torch.where(drawn, projected.opacities.unsqueeze(1), 0.0) * torch.exp(-0.5 * q)
+    alpha = torch.where(drawn, projected.opacities.unsqueeze(1), 0.0) * torch.exp(
+        -0.5 * q
+    )
     alpha = torch.where(alpha >= settings.alpha_min, alpha, 0.0)
     return alpha.clamp(max=settings.alpha_max)
 
@@ -79,4 +86,6 @@ def _blend(alpha: Tensor, settings: Accuracy) -> tuple[Tensor, Tensor]:
 
 def _transmittances(alpha: Tensor) -> Tensor:
     """``[B, P, N + 1]``: before each layer, and after the last."""
-    return torch.cat([torch.ones_like(alpha[..., :1]), 1 - alpha], dim=-1).cumprod(dim=-1)
+    return torch.cat([torch.ones_like(alpha[..., :1]), 1 - alpha], dim=-1).cumprod(
+        dim=-1
+    )

@@ -43,25 +43,36 @@ class Accuracy:
     low_pass: float = 0.3  # square pixels, added to the diagonal of every 2D covariance
     # half fields of view, to which x/z and y/z are clamped in the projection's Jacobian, >= 1
     fov_clamp: float = 1.3
-    antialias: bool = False  # multiply opacities by sqrt(det before / det after) of the low-pass
+    # multiply opacities by sqrt(det before / det after) of the low-pass
+    antialias: bool = False
     supersample: int = 1  # draw this many times larger, low-pass included, then average
 
     def __post_init__(self) -> None:
         self._require("alpha_min", 0 <= self.alpha_min < 1, "in [0, 1)")
         self._require("transmittance_min", 0 <= self.transmittance_min < 1, "in [0, 1)")
-        self._require("extent", self.extent in _EXTENTS, f"one of {', '.join(_EXTENTS)}")
+        self._require(
+            "extent", self.extent in _EXTENTS, f"one of {', '.join(_EXTENTS)}"
+        )
         self._require("dtype", self.dtype in _DTYPES, f"one of {', '.join(_DTYPES)}")
         self._require("radius_sigmas", self.radius_sigmas > 0, "> 0")
         self._require("near", self.near > 0, "> 0 metres")
-        self._require("alpha_max", self.alpha_min < self.alpha_max <= 1, "in (alpha_min, 1]")
+        self._require(
+            "alpha_max", self.alpha_min < self.alpha_max <= 1, "in (alpha_min, 1]"
+        )
         self._require("low_pass", self.low_pass > 0, "> 0 square pixels")
         self._require("fov_clamp", self.fov_clamp >= 1, ">= 1")
-        whole = isinstance(self.supersample, int) and not isinstance(self.supersample, bool)
-        self._require("supersample", whole and self.supersample >= 1, "a whole number >= 1")
+        whole = isinstance(self.supersample, int) and not isinstance(
+            self.supersample, bool
+        )
+        self._require(
+            "supersample", whole and self.supersample >= 1, "a whole number >= 1"
+        )
 
     def _require(self, field: str, holds: bool, expected: str) -> None:
         if not holds:
-            raise ValueError(f"Accuracy: {field} must be {expected}, got {getattr(self, field)!r}")
+            raise ValueError(
+                f"Accuracy: {field} must be {expected}, got {getattr(self, field)!r}"
+            )
 
     @property
     def torch_dtype(self) -> torch.dtype:
@@ -80,7 +91,9 @@ def _preset(name: str) -> Accuracy:
     return Accuracy(**preset)
 
 
-ACCURACY: dict[str, Accuracy] = {n: _preset(n) for n in ("exact", "high", "standard", "draft")}
+ACCURACY: dict[str, Accuracy] = {
+    n: _preset(n) for n in ("exact", "high", "standard", "draft")
+}
 """The presets of conf/accuracy."""
 
 
@@ -91,5 +104,7 @@ def accuracy(name: str) -> Accuracy:
         ValueError: on an unknown name.
     """
     if name not in ACCURACY:
-        raise ValueError(f"accuracy: expected one of {', '.join(ACCURACY)}, got {name!r}")
+        raise ValueError(
+            f"accuracy: expected one of {', '.join(ACCURACY)}, got {name!r}"
+        )
     return ACCURACY[name]

@@ -10,7 +10,9 @@ from torch import Tensor
 _C0 = math.sqrt(1 / (4 * math.pi))
 _C1 = math.sqrt(3 / (4 * math.pi))
 _C2 = tuple(math.sqrt(k / math.pi) for k in (15 / 4, 5 / 16, 15 / 16))
-_C3 = tuple(math.sqrt(k / math.pi) for k in (35 / 32, 105 / 4, 21 / 32, 7 / 16, 105 / 16))
+_C3 = tuple(
+    math.sqrt(k / math.pi) for k in (35 / 32, 105 / 4, 21 / 32, 7 / 16, 105 / 16)
+)
 
 MAX_DEGREE = 3
 
@@ -39,11 +41,18 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
         basis += [-_C1 * y, _C1 * z, -_C1 * x]
     if degree >= 2:
         k0, k1, k2 = _C2
-        basis += [k0 * x * y, -k0 * y * z, k1 * (2 * z * z - x * x - y * y), -k0 * x * z]
+        basis += [
+            k0 * x * y,
+            -k0 * y * z,
+            k1 * (2 * z * z - x * x - y * y),
+            -k0 * x * z,
+        ]
         basis.append(k2 * (x * x - y * y))
     if degree >= 3:
         k0, k1, k2, k3, k4 = _C3
-        xx, yy, zz = x * x, y * y, z * z
+        xx = x * x
+        yy = y * y
+        zz = z * z
         basis += [
             -k0 * y * (3 * xx - yy),
             k1 * x * y * z,

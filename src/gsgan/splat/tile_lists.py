@@ -69,16 +69,25 @@ def tile_lists(
     order = projected.depths.argsort(dim=1, stable=True)
     order = (order + N * torch.arange(B, device=order.device).unsqueeze(1)).flatten()
     first, last = _pixel_box(projected, size, order)
-    first, last = first // side, last // side
-    spans = (last - first + 1).clamp_min(0) * projected.visible.flatten()[order].unsqueeze(-1)
+    first = first // side
+    last = last // side
+    spans = (last - first + 1).clamp_min(0) * projected.visible.flatten()[
+        order
+    ].unsqueeze(-1)
     rows, tile_xy = _pairs(order, first, spans)
     tiles = B * grid[0] * grid[1]
     tile = (rows // max(N, 1) * grid[0] + tile_xy[:, 1]) * grid[1] + tile_xy[:, 0]
-    if settings.alpha_min > 0:  # pairs that do not intersect are sorted behind the last tile
-        tile = torch.where(_reaches(projected, rows, tile_xy, settings, tiling), tile, tiles)
+    # pairs that do not intersect are sorted behind the last tile
+    if settings.alpha_min > 0:
+        tile = torch.where(
+            _reaches(projected, rows, tile_xy, settings, tiling), tile, tiles
+        )
     tile, by_tile = tile.to(torch.int32).sort(stable=True)
-    ends = torch.searchsorted(tile, torch.arange(tiles + 1, device=tile.device, dtype=tile.dtype))
-    starts, counts = ends[:-1], ends.diff()
+    ends = torch.searchsorted(
+        tile, torch.arange(tiles + 1, device=tile.device, dtype=tile.dtype)
+    )
+    starts = ends[:-1]
+    counts = ends.diff()
     counts, deepest = counts.sort(descending=True, stable=True)
     depths = counts.tolist()
     listed = len(depths) - depths.count(0)
@@ -94,7 +103,9 @@ def tile_lists(
     )
 
 
-def _pixel_box(projected: Projected, size: tuple[int, int], rows: Tensor) -> tuple[Tensor, Tensor]:
+def _pixel_box(
+    projected: Projected, size: tuple[int, int], rows: Tensor
+) -> tuple[Tensor, Tensor]:
     """First and last pixel (x, y) whose centre is in the footprint, each ``[M, 2]`` int64."""
     means = projected.means.flatten(0, 1)[rows]
     extents = projected.extents.flatten(0, 1)[rows].to(means)
@@ -115,11 +126,17 @@ def _pairs(rows: Tensor, first: Tensor, spans: Tensor) -> tuple[Tensor, Tensor]:
     which = which.repeat_interleave(counts, output_size=total)
     step = torch.arange(total, device=rows.device) - (ends - counts)[which]
     width = spans[:, 0][which]
-    return rows[which], first[which] + torch.stack([step % width, step // width], dim=-1)
+    return rows[which], first[which] + torch.stack(
+        [step % width, step // width], dim=-1
+    )
 
 
 def _reaches(
-    projected: Projected, rows: Tensor, tile_xy: Tensor, settings: Accuracy, tiling: Tiling
+    projected: Projected,
+    rows: Tensor,
+    tile_xy: Tensor,
+    settings: Accuracy,
+    tiling: Tiling,
 ) -> Tensor:
     """Whether the ellipse ``alpha >= alpha_min`` reaches the pixel centres of the tile.
 
@@ -130,7 +147,8 @@ def _reaches(
     low = tile_xy * tiling.tile + 0.5 - projected.means.flatten(0, 1)[rows]
     high = low + (tiling.tile - 1)
     (x0, y0), (x1, y1) = low.unbind(-1), high.unbind(-1)
-    x, y = torch.zeros_like(x0).clamp(x0, x1), torch.zeros_like(y0).clamp(y0, y1)
+    x = torch.zeros_like(x0).clamp(x0, x1)
+    y = torch.zeros_like(y0).clamp(y0, y1)
     w = p * k
     y_at_x = (-p * w * x / (w * w + r * r)).clamp(y0, y1)
     x_at_y = (-k * y).clamp(x0, x1)

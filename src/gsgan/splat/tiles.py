@@ -53,7 +53,12 @@ def composite(
     with torch.no_grad():
         lists = tile_lists(projected, size, settings, tiling)
     blended = _Composite.apply(
-        geometry, projected.opacities, torch.cat(values, dim=-1), lists, settings, tiling
+        geometry,
+        projected.opacities,
+        torch.cat(values, dim=-1),
+        lists,
+        settings,
+        tiling,
     )
     alpha = blended[:, C : C + 1]
     # Rounding may sum the weights to 1 + 1e-7; the gradient must not stop there.
@@ -84,7 +89,10 @@ class _Composite(torch.autograd.Function):
             canvas[lists.tiles[chunk]] = sums
             saved.append(blocks)
         ctx.save_for_backward(geometry, opacities, values)
-        ctx.saved, ctx.lists, ctx.settings, ctx.tiling = saved, lists, settings, tiling
+        ctx.saved = saved
+        ctx.lists = lists
+        ctx.settings = settings
+        ctx.tiling = tiling
         return _from_tiles(canvas, B, lists, tiling)
 
     @staticmethod
@@ -130,10 +138,16 @@ class _Walk:
         self.geometry = with_empty_row(geometry)
         self.opacities = with_empty_row(opacities.unsqueeze(-1)).squeeze(-1)
         self.values = with_empty_row(values)
-        self.lists, self.settings, self.tiling = lists, settings, tiling
+        self.lists = lists
+        self.settings = settings
+        self.tiling = tiling
         self.pixels = tiling.tile**2
-        dtype, device = values.dtype, values.device
-        axis = torch.arange(tiling.tile, dtype=dtype, device=device) - (tiling.tile - 1) / 2
+        dtype = values.dtype
+        device = values.device
+        axis = (
+            torch.arange(tiling.tile, dtype=dtype, device=device)
+            - (tiling.tile - 1) / 2
+        )
         y, x = (axis_.flatten() for axis_ in torch.meshgrid(axis, axis, indexing="ij"))
         self.xy = torch.stack([x, y])
         # u and v are linear in the pixel's position in the tile: a small matrix product gives each.
@@ -155,7 +169,8 @@ class _Walk:
 
     def gradients(self) -> tuple[Tensor, Tensor, Tensor]:
         """Of geometry ``[B, N, 5]``, opacities ``[B, N]`` and values ``[B, N, V]``."""
-        sums, opacities = self.sums[:-1].to(self.geometry), self.opacities[:-1].to(self.geometry)
+        sums = self.sums[:-1].to(self.geometry)
+        opacities = self.opacities[:-1].to(self.geometry)
         geometry = _geometry_gradient(self.geometry[:-1], opacities, sums)
         grads = (geometry, self.sums[:-1, 0], self.values_grad[:-1])
         return tuple(grad.unflatten(0, self.shape) for grad in grads)  # type: ignore[return-value]
@@ -166,9 +181,12 @@ class _Walk:
         for start in range(0, len(self.lists.tiles), tiles):
             yield slice(start, min(start + tiles, len(self.lists.tiles)))
 
-    def forward(self, chunk: slice, save: bool) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
+    def forward(
+        self, chunk: slice, save: bool
+    ) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
         """Blended values ``[T, V, P]``, and for each block its tiles and incoming transmittance."""
-        starts, counts = self.lists.starts[chunk], self.lists.counts[chunk]
+        starts = self.lists.starts[chunk]
+        counts = self.lists.counts[chunk]
         depths = self.lists.depths[chunk]
         sums = self.values.new_zeros(len(starts), self.values.shape[-1], self.pixels)
         before = self.values.new_ones(len(starts), self.pixels)
@@ -178,12 +196,15 @@ class _Walk:
             if self.stops:
                 going = counts[rows] > offset
                 going &= before.amax(-1) >= self.settings.transmittance_min
-                rows, before = rows[going], before[going]
+                rows = rows[going]
+                before = before[going]
                 if not len(rows):
                     break
-            else:  # most layers first: the tiles that have layers left are the first ones
+            # most layers first: the tiles that have layers left are the first ones
+            else:
                 left = bisect_left(depths, -offset, key=neg)
-                rows, before = rows[:left], before[:left]
+                rows = rows[:left]
+                before = before[:left]
             if save:
                 blocks.append((rows, before))
             ids = self._ids(starts[rows], counts[rows], offset)
@@ -193,9 +214,12 @@ class _Walk:
             sums.index_add_(0, rows, self.values[ids].mT @ weights)
         return sums, blocks
 
-    def backward(self, chunk: slice, blocks: list[tuple[Tensor, Tensor]], grad: Tensor) -> None:
+    def backward(
+        self, chunk: slice, blocks: list[tuple[Tensor, Tensor]], grad: Tensor
+    ) -> None:
         """Adds a chunk's part of the gradients; ``grad [T, V, P]`` is that of its sums."""
-        starts, counts = self.lists.starts[chunk], self.lists.counts[chunk]
+        starts = self.lists.starts[chunk]
+        counts = self.lists.counts[chunk]
         # Blocks are processed from back to front: the values behind them, times the gradient.
         behind = torch.zeros_like(grad[:, 0])
         for number, (rows, before) in reversed(list(enumerate(blocks))):
@@ -204,7 +228,8 @@ class _Walk:
             exponential, u, v = self._exponential(ids, place, rows, chunk)
             alpha, passes = self._alpha(exponential, ids, want_mask=True)
             assert passes is not None
-            values, grad_here = self.values[ids], grad[rows]
+            values = self.values[ids]
+            grad_here = grad[rows]
             transmittance = self._transmittances(alpha, before)[0]
             if self.settings.transmittance_min > 0:
                 keep = _indicator(transmittance, self.settings.transmittance_min)
@@ -215,7 +240,11 @@ class _Walk:
             # d image / d alpha = T (value of the layer - values behind it).
             d_alpha = seen.sub_(hidden).mul_(transmittance).mul_(passes)
             self._add(self.values_grad, ids, alpha.mul_(transmittance) @ grad_here.mT)
-            self._add(self.sums, ids, self._whitened_sums(place, d_alpha.mul_(exponential), u, v))
+            self._add(
+                self.sums,
+                ids,
+                self._whitened_sums(place, d_alpha.mul_(exponential), u, v),
+            )
 
     def _ids(self, starts: Tensor, counts: Tensor, offset: int) -> Tensor:
         """``[T, K]`` rows of the ellipses of one block; the empty row past the end of a list."""
@@ -227,8 +256,10 @@ class _Walk:
     def _place(self, ids: Tensor, rows: Tensor, chunk: slice) -> _Place:
         x, y, p, k, r = self.geometry[ids].unbind(-1)
         centre_x, centre_y = self.centres[chunk][rows].unsqueeze(1).unbind(-1)
-        dx, dy = centre_x - x, centre_y - y
-        u, v = (p * (dx + k * dy)).clamp_(-U_MAX, U_MAX), (r * dy).clamp_(-U_MAX, U_MAX)
+        dx = centre_x - x
+        dy = centre_y - y
+        u = (p * (dx + k * dy)).clamp_(-U_MAX, U_MAX)
+        v = (r * dy).clamp_(-U_MAX, U_MAX)
         return _Place(*(i.to(self.values.dtype) for i in (u, v, p, p * k, r)))
 
     def _exponential(
@@ -236,11 +267,15 @@ class _Walk:
     ) -> tuple[Tensor, Tensor, Tensor]:
         """``exp(-q / 2)``, and u and v, whose squares q is the sum of; each ``[T, K, P]``."""
         u = torch.stack([place.u, place.p, place.w], dim=-1) @ self.basis
-        v = torch.stack([place.v, torch.zeros_like(place.v), place.r], dim=-1) @ self.basis
+        v = (
+            torch.stack([place.v, torch.zeros_like(place.v), place.r], dim=-1)
+            @ self.basis
+        )
         q = (u * u).addcmul_(v, v)
         exponential = q.mul_(-0.5).clamp_(min=self.least_exponent).exp_()
         if self.lists.box is not None:
-            box, means = self.lists.box[ids], self.geometry[ids][..., :2]
+            box = self.lists.box[ids]
+            means = self.geometry[ids][..., :2]
             place_of_mean = (means - self.centres[chunk][rows].unsqueeze(1)).to(box)
             for axis in range(2):
                 distance = self.xy[axis] - place_of_mean[..., axis, None]
@@ -256,7 +291,11 @@ class _Walk:
         if want_mask:
             passes = _indicator(alpha, self.settings.alpha_min)
             if self.settings.alpha_max < 1:
-                passes.mul_(torch.le(alpha, self.settings.alpha_max, out=torch.empty_like(alpha)))
+                passes.mul_(
+                    torch.le(
+                        alpha, self.settings.alpha_max, out=torch.empty_like(alpha)
+                    )
+                )
         if self.settings.alpha_min > 0:
             alpha = functional.threshold(alpha, self.below_alpha_min, 0.0, inplace=True)
         return alpha.clamp_(max=self.settings.alpha_max), passes
@@ -270,7 +309,8 @@ class _Walk:
 
     def _transmittances(self, alpha: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
         """Before each layer ``[T, K, P]``, and after the last ``[T, P]``; without cut-off."""
-        through, layers = 1 - alpha, torch.empty_like(alpha)
+        through = 1 - alpha
+        layers = torch.empty_like(alpha)
         layers[:, 0] = before
         for k in range(1, alpha.shape[1]):
             torch.mul(layers[:, k - 1], through[:, k - 1], out=layers[:, k])
@@ -303,7 +343,9 @@ def _geometry_gradient(geometry: Tensor, opacities: Tensor, sums: Tensor) -> Ten
     """Gradients of (x, y, p, k, r), ``[M, 5]``, from the sums over all pixels, ``[M, 6]``."""
     _, _, p, k, r = geometry.unbind(-1)
     _, u, v, uu, uv, vv = (sums * opacities.unsqueeze(-1)).unbind(-1)
-    return torch.stack([p * u, p * k * u + r * v, -uu / p, -uv * p / r, -vv / r], dim=-1)
+    return torch.stack(
+        [p * u, p * k * u + r * v, -uu / p, -uv * p / r, -vv / r], dim=-1
+    )
 
 
 @lru_cache(maxsize=16)
@@ -322,7 +364,12 @@ def _from_tiles(canvas: Tensor, B: int, lists: TileLists, tiling: Tiling) -> Ten
     """``[B * rows * columns, V, P]`` → ``[B, V, H, W]``."""
     (H, W), side = lists.size, tiling.tile
     tiles = canvas.view(B, *lists.grid, -1, side, side)
-    return tiles.permute(0, 3, 1, 4, 2, 5).flatten(4, 5).flatten(2, 3)[..., :H, :W].contiguous()
+    return (
+        tiles.permute(0, 3, 1, 4, 2, 5)
+        .flatten(4, 5)
+        .flatten(2, 3)[..., :H, :W]
+        .contiguous()
+    )
 
 
 def _to_tiles(image: Tensor, lists: TileLists, tiling: Tiling) -> Tensor:

@@ -50,7 +50,9 @@ class SceneCamera:
             return directions
         rays = directions @ self.R.T
         straight = undistort(rays[:, :2] / rays[:, 2:], self.dist)
-        return unit(np.concatenate([straight, np.ones((len(rays), 1))], axis=1) @ self.R)
+        return unit(
+            np.concatenate([straight, np.ones((len(rays), 1))], axis=1) @ self.R
+        )
 
 
 def pixel_offsets(rays: int) -> Array:
@@ -72,7 +74,9 @@ def pixel_rays(view: SceneCamera, x: Ints, y: Ints, rays: int) -> tuple[Array, A
     return view.centre, unit(directions)
 
 
-def look_at(azimuth: float, height: float, middle: Array, points: Array, size: int) -> SceneCamera:
+def look_at(
+    azimuth: float, height: float, middle: Array, points: Array, size: int
+) -> SceneCamera:
     """A camera at an azimuth: 0 in front of the person, growing towards the person's left."""
     offset = np.array([math.sin(azimuth), -math.cos(azimuth), 0.0]) * RADIUS
     centre = np.array([middle[0], middle[1], height]) + offset
@@ -84,7 +88,8 @@ def look_at(azimuth: float, height: float, middle: Array, points: Array, size: i
     t = -R @ centre
     x = points @ R.T + t
     rays = x[:, :2] / x[:, 2:]
-    low, high = rays.min(axis=0), rays.max(axis=0)
+    low = rays.min(axis=0)
+    high = rays.max(axis=0)
     focal = (1 - 2 * MARGIN) * size / (high - low).max()
     principal = size / 2 - focal * (low + high) / 2
     K = np.array([[focal, 0, principal[0]], [0, focal, principal[1]], [0, 0, 1]])

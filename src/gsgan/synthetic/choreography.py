@@ -28,7 +28,9 @@ def walk(c: Controls, s: Array, style: Style) -> None:
     a = TAU * _ease(s)
     c.path[:, 0] = 0.2 * (1 - np.cos(a))
     c.path[:, 1] = -0.3 * np.sin(a)
-    cosine, sine = np.cos(a), np.sin(a)  # heading along the oval, without jumps of a full turn
+    # heading along the oval, without jumps of a full turn
+    cosine = np.cos(a)
+    sine = np.sin(a)
     c.path[:, 2] = a - np.arctan2(0.1 * sine * cosine, 0.3 * cosine**2 + 0.2 * sine**2)
     c.swing[:] = style.amplitude
     c.head[:, 2] = 0.25 * np.sin(a)
@@ -134,7 +136,8 @@ def twist(c: Controls, s: Array, style: Style) -> None:
 def reach(c: Controls, s: Array, style: Style) -> None:
     """One hand reaches high to its side, then low across the body; the gaze follows."""
     low = smoothstep((s - 0.35) / 0.3)
-    high, side = 1 - low, style.lead
+    high = 1 - low
+    side = style.lead
     sign = 1.0 if side == 0 else -1.0
     c.wrist[:, side, 0] = 0.3 * high - 0.06 * low
     c.wrist[:, side, 1] = -0.2 * high - 0.42 * low
@@ -169,7 +172,9 @@ def _sign_arms(c: Controls, s: Array, style: Style) -> None:
         c.palm[:, i] = 0.1 + 0.7 * np.sin(2 * a + 0.5)
         c.flex[:, i] = 0.25 * np.sin(3 * a + 2)
         for finger in range(5):
-            c.curl[:, i, finger] = 0.45 + 0.45 * np.sin((2 + finger % 3) * a + 1.7 * finger)
+            c.curl[:, i, finger] = 0.45 + 0.45 * np.sin(
+                (2 + finger % 3) * a + 1.7 * finger
+            )
     c.mouth[:] = 0.3 + 0.45 * _wander(s, 9, style.phase)
     c.smile[:] = 0.3 * _wander(s, 2, style.phase).clip(0)
     c.brows[:] = 0.9 * _wander(s, 3, style.phase + 1)
@@ -210,7 +215,8 @@ def freestyle(c: Controls, s: Array, style: Style) -> None:
     """
     for i, shift in enumerate((0.0, 2.6)):
         a = style.phase + shift
-        rise = 1.25 + 1.1 * style.amplitude * _wander(s, 2.5, a)  # 0: down, half a turn: up
+        # 0: down, half a turn: up
+        rise = 1.25 + 1.1 * style.amplitude * _wander(s, 2.5, a)
         around = 0.75 + 0.7 * _wander(s, 3.2, a + 1)  # 0: in front, a quarter: sideways
         reach = 0.42 + 0.09 * _wander(s, 3.7, a + 2)
         c.wrist[:, i, 0] = 0.06 + reach * np.sin(rise) * np.sin(around)
@@ -223,7 +229,9 @@ def freestyle(c: Controls, s: Array, style: Style) -> None:
             c.curl[:, i, finger] = 0.45 + 0.4 * _wander(s, 4, a + 5 + 0.9 * finger)
         c.foot[:, i, 0] = 0.04 + 0.04 * _wander(s, 1.9, a + 0.7)
         c.foot[:, i, 1] = 0.18 * _wander(s, 2.2, a + 2.2)
-    _squat_legs(c, 0.6 * (0.5 + 0.5 * _wander(s, 2, style.phase + 6)) ** 2, style.amplitude)
+    _squat_legs(
+        c, 0.6 * (0.5 + 0.5 * _wander(s, 2, style.phase + 6)) ** 2, style.amplitude
+    )
     c.spine[:, 2] += 0.6 * _wander(s, 2.1, style.phase + 1.5)
     c.spine[:, 1] += 0.3 * _wander(s, 2.6, style.phase + 2.5)
     c.spine[:, 0] += 0.2 * _wander(s, 2.3, style.phase + 3.5)
@@ -238,7 +246,8 @@ def freestyle(c: Controls, s: Array, style: Style) -> None:
 def _wander(s: Array, cycles: float, phase: float) -> Array:
     """Smooth, in [-1, 1], without period within a passage."""
     golden = (1 + math.sqrt(5)) / 2
-    slow, fast = TAU * cycles * s + phase, TAU * cycles * golden * s + 2.4 * phase + 1
+    slow = TAU * cycles * s + phase
+    fast = TAU * cycles * golden * s + 2.4 * phase + 1
     return 0.5 * (np.sin(slow) + np.sin(fast))
 
 
@@ -277,7 +286,8 @@ def held_out(names: Sequence[str], test_frames: int, block: int = 3) -> list[int
     order = sorted(others.values(), key=len, reverse=True)
     while len(chosen) < test_frames:
         before = len(chosen)
-        for run in order:  # one frame of each passage stays in training as long as possible
+        # one frame of each passage stays in training as long as possible
+        for run in order:
             free = [i for i in run if i not in chosen]
             size = max(min(block, test_frames - len(chosen), len(free) - 1), 0)
             begin = (len(free) - size + 1) // 2

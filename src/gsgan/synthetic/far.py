@@ -9,7 +9,14 @@ from typing import Any
 import numpy as np
 import yaml
 
-from gsgan.synthetic.controls import Array, Controls, Passage, Programme, Style, smoothstep
+from gsgan.synthetic.controls import (
+    Array,
+    Controls,
+    Passage,
+    Programme,
+    Style,
+    smoothstep,
+)
 
 ARC = 0.08  # height of a free foot on its way, in shares of the way
 ASIDE = np.array([0.85, -0.5, 0.1])  # the way of wrists round their shoulders
@@ -19,14 +26,20 @@ MIRROR = dict.fromkeys(("lean", "spine", "head"), (1, -1, -1)) | {"pelvis": (-1,
 def keyed(keys: dict[float, dict[str, Any]]) -> Passage:
     """A passage from rest through key poses, values by control, at shares of its time, to rest."""
     times = np.array([0.0, *keys, 1.0])
-    poses = [{}, *({"hold": float("grip" in pose)} | pose for pose in keys.values()), {}]
+    poses = [
+        {},
+        *({"hold": float("grip" in pose)} | pose for pose in keys.values()),
+        {},
+    ]
 
     def passage(c: Controls, s: Array, style: Style) -> None:
         i = (np.searchsorted(times, s, side="right") - 1).clip(0, len(times) - 2)
         u = smoothstep((s - times[i]) / (times[i + 1] - times[i]))
         for name in sorted({name for pose in poses for name in pose}):
             rest = getattr(Controls(1), name)[0]
-            values = [np.broadcast_to(pose.get(name, rest), rest.shape) for pose in poses]
+            values = [
+                np.broadcast_to(pose.get(name, rest), rest.shape) for pose in poses
+            ]
             ends = np.array(values, dtype=float)
             if style.lead:
                 ends = ends * MIRROR[name] if name in MIRROR else ends[:, ::-1]
@@ -52,7 +65,11 @@ def _programme(path: Path) -> Programme:
     for name, keys in data["passages"].items():
         seconds = float(keys.pop("seconds"))
         poses = {
-            share: {control: value for pose in names for control, value in data[pose].items()}
+            share: {
+                control: value
+                for pose in names
+                for control, value in data[pose].items()
+            }
             for share, names in keys.items()
         }
         passages.append((name, keyed(poses), seconds))

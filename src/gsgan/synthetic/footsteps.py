@@ -9,8 +9,12 @@ import numpy as np
 
 from gsgan.synthetic.controls import STANCE, Array, Programme, controls_at, smoothstep
 
-PERIOD, SWING, STAND = 1.0, 0.42, 0.58  # seconds: from step to step of a foot, its two parts
-SHORTEST = (0.03, 0.12)  # metres and radians: a standing foot this near to its goal stays
+# seconds: from step to step of a foot, its two parts
+PERIOD = 1.0
+SWING = 0.42
+STAND = 0.58
+# metres and radians: a standing foot this near to its goal stays
+SHORTEST = (0.03, 0.12)
 
 
 class Footsteps:
@@ -28,7 +32,9 @@ class Footsteps:
         for foot in range(2):
             start = turns + foot * PERIOD / 2
             goals, march = _standing(start + SWING + STAND / 2, seed, foot, programme)
-            place, shift, height = np.array([(1 - 2 * foot) * STANCE, 0, 0]), [], []
+            place = np.array([(1 - 2 * foot) * STANCE, 0, 0])
+            shift = []
+            height = []
             for goal, least in zip(goals, march, strict=True):
                 move = goal - place
                 far = np.linalg.norm(move[:2])
@@ -48,7 +54,10 @@ class Footsteps:
         """
         t = times[:, None] - self.start[foot]
         stride = np.linalg.norm(self.shift[foot][:, :2], axis=1)
-        place = np.array([(1 - 2 * foot) * STANCE, 0, 0]) + smoothstep(t / SWING) @ self.shift[foot]
+        place = (
+            np.array([(1 - 2 * foot) * STANCE, 0, 0])
+            + smoothstep(t / SWING) @ self.shift[foot]
+        )
         height = _bump(t / SWING) @ self.height[foot]
         pitch = _bump((t + 0.12) / 0.45) @ np.minimum(1.6 * stride, 0.45)
         load = _bump((t + 0.15) / (SWING + 0.3)) @ (self.height[foot] > 0)
@@ -59,12 +68,17 @@ def _bump(u: Array) -> Array:
     return np.sin(math.pi * u.clip(0, 1)) ** 2
 
 
-def _standing(times: Array, seed: int, foot: int, programme: Programme) -> tuple[Array, Array]:
+def _standing(
+    times: Array, seed: int, foot: int, programme: Programme
+) -> tuple[Array, Array]:
     """Where a foot should stand ``[F, 3]`` (x, y, heading), and the march's height ``[F]``."""
     times = times.clip(max=programme.duration - 1e-6)
-    c, sign = controls_at(times, seed, programme), 1 - 2 * foot
+    c = controls_at(times, seed, programme)
+    sign = 1 - 2 * foot
     heading = c.path[:, 2]
-    x, y = sign * (STANCE + c.foot[:, foot, 0]), c.foot[:, foot, 1]
-    cosine, sine = np.cos(heading), np.sin(heading)
+    x = sign * (STANCE + c.foot[:, foot, 0])
+    y = c.foot[:, foot, 1]
+    cosine = np.cos(heading)
+    sine = np.sin(heading)
     turned = np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=1)
     return np.column_stack([c.path[:, :2] + turned, heading]), c.march

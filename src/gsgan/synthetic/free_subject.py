@@ -18,8 +18,18 @@ from gsgan.scene import BodyPose
 # Mixamo's names of the free body's joints; other joints keep their names and follow their parents.
 TRUNK = {"root": "Hips", "spine05": "Spine", "spine03": "Spine1", "spine01": "Spine2"}
 TRUNK |= {"neck01": "Neck", "head": "Head"}
-LIMBS = {"clavicle": "Shoulder", "upperarm01": "Arm", "lowerarm01": "ForeArm", "wrist": "Hand"}
-LIMBS |= {"upperleg01": "UpLeg", "lowerleg01": "Leg", "foot": "Foot", "toe1-1": "ToeBase"}
+LIMBS = {
+    "clavicle": "Shoulder",
+    "upperarm01": "Arm",
+    "lowerarm01": "ForeArm",
+    "wrist": "Hand",
+}
+LIMBS |= {
+    "upperleg01": "UpLeg",
+    "lowerleg01": "Leg",
+    "foot": "Foot",
+    "toe1-1": "ToeBase",
+}
 # sRGB of skin, hair, eyes, shirt, trousers and shoes
 COLOURS = (
     (214, 160, 128),
@@ -47,7 +57,8 @@ def mixamo_name(joint: str) -> str:
 def free_character() -> Character:
     """The free body with one colour per material."""
     body = free_body()
-    faces, vertices = body.faces.numpy(), body.vertices.double().numpy()
+    faces = body.faces.numpy()
+    vertices = body.vertices.double().numpy()
     none = np.zeros(0, dtype=np.int64)
     colours = np.full((len(COLOURS), 1, 1, 4), 255, np.uint8)
     colours[:, 0, 0, :3] = COLOURS
@@ -76,8 +87,13 @@ def free_character() -> Character:
 
 def free_pose(motion: Animation) -> BodyPose:
     """The free body's pose in every frame of the animation of `free_character`."""
-    body, R = free_body(), motion.rotations
+    body = free_body()
+    R = motion.rotations
     parents = np.array(body.parents)
-    local = np.where((parents < 0)[:, None, None], R, np.swapaxes(R[:, parents], -1, -2) @ R)
+    local = np.where(
+        (parents < 0)[:, None, None], R, np.swapaxes(R[:, parents], -1, -2) @ R
+    )
     transl = motion.joints[:, 0] - body.joints[0].double().numpy()
-    return BodyPose(torch.from_numpy(axis_angle(local)).float(), torch.from_numpy(transl).float())
+    return BodyPose(
+        torch.from_numpy(axis_angle(local)).float(), torch.from_numpy(transl).float()
+    )

@@ -15,7 +15,11 @@ from gsgan.utils.errors import DataError
 KINDS = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5125: "u4", 5126: "f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 # Required by a file, these would change what is read here; all others concern looks only.
-UNSUPPORTED = ("KHR_draco_mesh_compression", "KHR_texture_basisu", "KHR_meshopt_compression")
+UNSUPPORTED = (
+    "KHR_draco_mesh_compression",
+    "KHR_texture_basisu",
+    "KHR_meshopt_compression",
+)
 LARGEST_IMAGE = 2048  # pixels a side
 
 
@@ -29,8 +33,11 @@ class Glb:
     def __init__(self, path: Path) -> None:
         data = path.read_bytes()
         if data[:4] != b"glTF":
-            raise DataError(f"{path}: not a binary glTF file; export the character as .glb")
-        self.path, self.doc = path, pygltflib.GLTF2.load_from_bytes(data)
+            raise DataError(
+                f"{path}: not a binary glTF file; export the character as .glb"
+            )
+        self.path = path
+        self.doc = pygltflib.GLTF2.load_from_bytes(data)
         for name in self.doc.extensionsRequired or ():
             if name in UNSUPPORTED:
                 raise DataError(f"{path}: {name} is not supported; export it without")
@@ -40,13 +47,15 @@ class Glb:
     def accessor(self, index: int) -> Array:
         """``[count, width]`` float64 values of an accessor; normalised integers are scaled."""
         a = self.doc.accessors[index]
-        kind, width = np.dtype(KINDS[a.componentType]), WIDTHS[a.type]
+        kind = np.dtype(KINDS[a.componentType])
+        width = WIDTHS[a.type]
         if a.bufferView is None:
             values = np.zeros((a.count, width), kind)
         else:
             values = self._rows(a.bufferView, a.byteOffset, a.count, kind, width).copy()
         if a.sparse is not None:
-            at, new = a.sparse.indices, a.sparse.values
+            at = a.sparse.indices
+            new = a.sparse.values
             integer = np.dtype(KINDS[at.componentType])
             rows = self._rows(at.bufferView, at.byteOffset, a.sparse.count, integer, 1)
             values[rows[:, 0]] = self._rows(
@@ -65,7 +74,11 @@ class Glb:
     def image_bytes(self, texture: int) -> bytes:
         """The encoded image of a texture."""
         entry = self.doc.textures[texture]
-        source = (entry.extensions or {}).get("EXT_texture_webp", {}).get("source", entry.source)
+        source = (
+            (entry.extensions or {})
+            .get("EXT_texture_webp", {})
+            .get("source", entry.source)
+        )
         view = self.doc.images[source].bufferView
         if view is None:
             raise DataError(
@@ -88,7 +101,10 @@ class Glb:
             start = (packed or vars(view)).get("byteOffset") or 0
             data = self._blob[start : start + (packed or vars(view))["byteLength"]]
             stride = (packed or vars(view)).get("byteStride") or 0
-            self._views[index] = (self._decompressed(data, packed) if packed else data, stride)
+            self._views[index] = (
+                self._decompressed(data, packed) if packed else data,
+                stride,
+            )
         return self._views[index]
 
     def _decompressed(self, data: bytes, packed: dict[str, Any]) -> Bytes:
@@ -99,12 +115,21 @@ class Glb:
             raise DataError(
                 f"{self.path} is compressed (EXT_meshopt_compression): pip install 'gsgan[gltf]'"
             ) from None
-        count, stride, mode = packed["count"], packed["byteStride"], packed["mode"]
+        count = packed["count"]
+        stride = packed["byteStride"]
+        mode = packed["mode"]
         if mode != "ATTRIBUTES":
-            name = "decode_index_buffer" if mode == "TRIANGLES" else "decode_index_sequence"
+            name = (
+                "decode_index_buffer"
+                if mode == "TRIANGLES"
+                else "decode_index_sequence"
+            )
             decoded = getattr(decoder, name)(count, stride, data).view(np.uint8)
-            return cast(Bytes, decoded[: count * stride])  # short integers, packed at its start
-        decoded = decoder.decode_vertex_buffer(count, stride, data).view(np.uint8).ravel()
+            # short integers, packed at its start
+            return cast(Bytes, decoded[: count * stride])
+        decoded = (
+            decoder.decode_vertex_buffer(count, stride, data).view(np.uint8).ravel()
+        )
         filters = {"OCTAHEDRAL": "oct", "QUATERNION": "quat", "EXPONENTIAL": "exp"}
         if packed.get("filter", "NONE") != "NONE":
             name = f"decode_filter_{filters[packed['filter']]}"

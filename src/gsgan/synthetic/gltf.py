@@ -14,19 +14,38 @@ from gsgan.motion.character import Character, Ints, Surface
 from gsgan.motion.rotations import Array
 from gsgan.synthetic.anchors import with_anchors
 from gsgan.synthetic.glb import Glb
-from gsgan.synthetic.humanoid import REQUIRED, WANTED, canonical_shapes, humanoid_bones, plain_shape
+from gsgan.synthetic.humanoid import (
+    REQUIRED,
+    WANTED,
+    canonical_shapes,
+    humanoid_bones,
+    plain_shape,
+)
 from gsgan.synthetic.parts import LABEL_NAMES, face_labels
 from gsgan.synthetic.textures import linear, srgb
 from gsgan.utils.errors import DataError
 
-Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # glTF is y up
+# glTF is y up
+Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 HEIGHTS = (1.2, 2.3)  # metres: heights that are taken as they are
 UNITS = (1.0, 0.01, 0.001, 0.0254)  # metres per unit of a file, likeliest first
 TRIANGLES = 4
-DAMAGED = (ArithmeticError, AttributeError, AssertionError, LookupError, OSError, RuntimeError,
-           TypeError, ValueError, struct.error)  # fmt: skip
+DAMAGED = (
+    ArithmeticError,
+    AttributeError,
+    AssertionError,
+    LookupError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+    struct.error,
+)
 
-AVATARS = {path.stem: path for path in sorted(Path(__file__).with_name("avatars").glob("*.glb"))}
+AVATARS = {
+    path.stem: path
+    for path in sorted(Path(__file__).with_name("avatars").glob("*.glb"))
+}
 """Files of the avatars that come with gsgan, by name."""
 
 
@@ -53,22 +72,30 @@ def read_character(path: Path) -> Character:
         return _character(glb, _Rig(glb))
     except DAMAGED as error:
         reason = str(error).split("\n")[0] or type(error).__name__
-        raise DataError(f"{path}: damaged ({reason}); export the character again") from error
+        raise DataError(
+            f"{path}: damaged ({reason}); export the character again"
+        ) from error
 
 
 class _Rig:
     """The bones of a file: its joints and the nodes that humanoid bones are mapped to."""
 
     def __init__(self, glb: Glb) -> None:
-        nodes, skins = glb.doc.nodes, glb.doc.skins
+        nodes = glb.doc.nodes
+        skins = glb.doc.skins
         if not skins:
-            raise DataError(f"{glb.path}: no skin; expected a rigged character, export its bones")
+            raise DataError(
+                f"{glb.path}: no skin; expected a rigged character, export its bones"
+            )
         self.nodes = nodes
         self._worlds: dict[int, Array] = {}
-        self.above = {child: i for i, node in enumerate(nodes) for child in node.children or ()}
+        self.above = {
+            child: i for i, node in enumerate(nodes) for child in node.children or ()
+        }
         named = humanoid_bones([node.name for node in nodes], glb.doc.extensions or {})
         used = {joint for skin in skins for joint in skin.joints} | named.keys()
-        self.ids = sorted(used, key=lambda i: (len(self.ancestors(i)), i))  # parents first
+        # parents first
+        self.ids = sorted(used, key=lambda i: (len(self.ancestors(i)), i))
         self.number = {node: k for k, node in enumerate(self.ids)}
         self.bones = self._names(named)
         missing = [bone for bone in REQUIRED if bone not in self.bones]
@@ -78,7 +105,9 @@ class _Rig:
                 f"include {', '.join(missing[:6])}{', …' * (len(missing) > 6)}; name them as "
                 "Mixamo or VRM does"
             )
-        self.parents = np.array([self.bone_above(self.above.get(i, -1)) for i in self.ids])
+        self.parents = np.array(
+            [self.bone_above(self.above.get(i, -1)) for i in self.ids]
+        )
         self.joints = np.array([self.world(i)[:3, 3] for i in self.ids])
 
     def ancestors(self, node: int) -> list[int]:
@@ -161,7 +190,9 @@ def _part(glb: Glb, rig: _Rig, number: int, primitive: Any) -> _Part:
         normals = np.einsum("vij,vj->vi", upright, glb.accessor(attributes["NORMAL"]))
     shapes: dict[str, Array] = {}
     names = (mesh.extras or primitive.extras or {}).get("targetNames", ())
-    for name, target in zip(map(plain_shape, names), primitive.targets or (), strict=False):
+    for name, target in zip(
+        map(plain_shape, names), primitive.targets or (), strict=False
+    ):
         entry = target if isinstance(target, dict) else vars(target)
         if name in WANTED and entry.get("POSITION") is not None:
             offsets = np.einsum("vij,vj->vi", linear, glb.accessor(entry["POSITION"]))
@@ -192,7 +223,8 @@ def _bound(
     """Bones and weights ``[V, 4]``, and matrices ``[V, 4, 4]`` to world axes."""
     node = rig.nodes[number]
     if node.skin is None:
-        index, weight = np.full((count, 4), rig.bone_above(number)), np.zeros((count, 4))
+        index = np.full((count, 4), rig.bone_above(number))
+        weight = np.zeros((count, 4))
         weight[:, 0] = 1
         return index, weight, np.broadcast_to(rig.world(number), (count, 4, 4))
     skin = glb.doc.skins[node.skin]
@@ -219,14 +251,17 @@ def _four_largest(glb: Glb, attributes: dict[str, int]) -> tuple[Ints, Array]:
 
 def _base_texture(glb: Glb, material: int | None) -> Any:
     """The base colour's texture info, None without a texture."""
-    shader = None if material is None else glb.doc.materials[material].pbrMetallicRoughness
+    shader = (
+        None if material is None else glb.doc.materials[material].pbrMetallicRoughness
+    )
     return shader and shader.baseColorTexture
 
 
 def _surface(glb: Glb, material: int) -> Surface:
     if material < 0:
         return Surface("", np.full((1, 1, 4), 255, np.uint8))
-    entry, base = glb.doc.materials[material], _base_texture(glb, material)
+    entry = glb.doc.materials[material]
+    base = _base_texture(glb, material)
     shader = entry.pbrMetallicRoughness
     factor = np.array((shader and shader.baseColorFactor) or (1, 1, 1, 1), np.float64)
     colour = glb.image(base.index) if base else np.full((1, 1, 4), 255, np.uint8)
@@ -238,13 +273,17 @@ def _surface(glb: Glb, material: int) -> Surface:
         colour = np.stack([curve[colour[..., k], k] for k in range(4)], -1)
     opaque = (entry.alphaMode or "OPAQUE") == "OPAQUE"
     if opaque:
-        colour = np.concatenate([colour[..., :3], np.full_like(colour[..., 3:], 255)], -1)
+        colour = np.concatenate(
+            [colour[..., :3], np.full_like(colour[..., 3:], 255)], -1
+        )
     bump = entry.normalTexture
     return Surface(
         name=entry.name or "",
         colour=colour,
         normal=None if bump is None else glb.image(bump.index)[..., :3],
-        cutoff=0.0 if opaque else (0.5 if entry.alphaCutoff is None else entry.alphaCutoff),
+        cutoff=0.0
+        if opaque
+        else (0.5 if entry.alphaCutoff is None else entry.alphaCutoff),
     )
 
 
@@ -275,12 +314,17 @@ def _unit_normals(normals: Array, vertices: Array, faces: Ints) -> Array:
 def _character(glb: Glb, rig: _Rig) -> Character:
     parts = [part for part in _parts(glb, rig) if len(part.faces)]
     if not parts:
-        raise DataError(f"{glb.path}: no triangles on its bones; export the character's meshes")
+        raise DataError(
+            f"{glb.path}: no triangles on its bones; export the character's meshes"
+        )
     first = np.cumsum([0, *(len(part.vertices) for part in parts)]).tolist()
-    faces = np.concatenate([i + part.faces for i, part in zip(first, parts, strict=False)])
+    faces = np.concatenate(
+        [i + part.faces for i, part in zip(first, parts, strict=False)]
+    )
     vertices = np.concatenate([part.vertices for part in parts])
     turn, scale, origin = _standing(rig, vertices)
-    vertices, joints = (scale * x @ turn.T - origin for x in (vertices, rig.joints))
+    vertices = scale * vertices @ turn.T - origin
+    joints = scale * rig.joints @ turn.T - origin
     shapes: dict[str, Array] = {}
     for start, part in zip(first, parts, strict=False):
         for name, offsets in part.shapes.items():

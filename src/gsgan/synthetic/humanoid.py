@@ -14,15 +14,34 @@ REQUIRED = ("Hips", "Spine", "Head", *(side + limb for side in SIDES for limb in
 BONES = (
     *REQUIRED,
     *("Spine1", "Spine2", "Neck", "Jaw"),
-    *(side + name for side in SIDES for name in ("Shoulder", "ToeBase", "ToeEnd", "Eye")),
-    *(f"{side}Hand{finger}{k}" for side in SIDES for finger in FINGERS for k in (1, 2, 3, 4)),
+    *(
+        side + name
+        for side in SIDES
+        for name in ("Shoulder", "ToeBase", "ToeEnd", "Eye")
+    ),
+    *(
+        f"{side}Hand{finger}{k}"
+        for side in SIDES
+        for finger in FINGERS
+        for k in (1, 2, 3, 4)
+    ),
 )
 CANONICAL = {bone.lower(): bone for bone in BONES}
 
-VRM_LIMBS = {"shoulder": "Shoulder", "upperArm": "Arm", "lowerArm": "ForeArm", "hand": "Hand"}
+VRM_LIMBS = {
+    "shoulder": "Shoulder",
+    "upperArm": "Arm",
+    "lowerArm": "ForeArm",
+    "hand": "Hand",
+}
 VRM_LIMBS |= {"upperLeg": "UpLeg", "lowerLeg": "Leg", "foot": "Foot", "toes": "ToeBase"}
 VRM_LIMBS |= {"eye": "Eye"}
-VRM_BONES = {"hips": "Hips", "spine": "Spine", "chest": "Spine1", "upperChest": "Spine2"}
+VRM_BONES = {
+    "hips": "Hips",
+    "spine": "Spine",
+    "chest": "Spine1",
+    "upperChest": "Spine2",
+}
 VRM_BONES |= {"neck": "Neck", "head": "Head", "jaw": "Jaw"}
 
 
@@ -49,7 +68,9 @@ def mixamo_bone(name: str) -> str | None:
     return CANONICAL.get(re.sub(r"^mixamorig\d*", "", plain).lower())
 
 
-def humanoid_bones(names: Iterable[str | None], extensions: Mapping[str, Any]) -> dict[int, str]:
+def humanoid_bones(
+    names: Iterable[str | None], extensions: Mapping[str, Any]
+) -> dict[int, str]:
     """Node number → Mixamo's bone name, of a document's node names and extensions."""
     if "VRMC_vrm" in extensions:
         bones = extensions["VRMC_vrm"]["humanoid"]["humanBones"]
@@ -79,7 +100,9 @@ def _choices(table: str) -> dict[str, tuple[dict[str, float], ...]]:
             sums = [{plain_shape(whole): 1.0}]
             for choice in names.format(S=side[:1], side=side).split(","):
                 terms = [term.strip().split("*") for term in choice.split("+")]
-                sums.append({term[-1]: float(term[0]) if term[1:] else 1.0 for term in terms})
+                sums.append(
+                    {term[-1]: float(term[0]) if term[1:] else 1.0 for term in terms}
+                )
             shapes[whole] = tuple(sums)
     return shapes
 
@@ -115,7 +138,9 @@ def canonical_shapes(found: Mapping[str, Array]) -> dict[str, Array]:
     for shape, choices in SHAPES.items():
         for choice in choices:
             if all(name in found for name in choice):
-                total = np.sum([weight * found[name] for name, weight in choice.items()], 0)
+                total = np.sum(
+                    [weight * found[name] for name, weight in choice.items()], 0
+                )
                 if np.abs(total).max() > 0:
                     shapes[shape] = total
                 break

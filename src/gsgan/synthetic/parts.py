@@ -12,9 +12,21 @@ from trimesh.graph import connected_component_labels
 from gsgan.motion.character import Character, Ints
 from gsgan.motion.rotations import Array
 
-LABEL_NAMES = ("background", "hair", "face_neck", "upper_clothes", "lower_clothes", "left_arm",
-               "right_arm", "left_hand", "right_hand", "left_leg", "right_leg", "left_shoe",
-               "right_shoe")  # fmt: skip
+LABEL_NAMES = (
+    "background",
+    "hair",
+    "face_neck",
+    "upper_clothes",
+    "lower_clothes",
+    "left_arm",
+    "right_arm",
+    "left_hand",
+    "right_hand",
+    "left_leg",
+    "right_leg",
+    "left_shoe",
+    "right_shoe",
+)
 LABEL = {name: k for k, name in enumerate(LABEL_NAMES)}
 HAIR, FACE, UPPER, LOWER = (LABEL[k] for k in LABEL_NAMES[1:5])
 SHOES = LABEL["left_shoe"], LABEL["right_shoe"]
@@ -38,7 +50,8 @@ WORDS = {
     "upper_clothes": "shirt tshirt top jacket coat hoodie sweater blouse dress onepiece vest",
     "skin": "skin",
 }
-SKIN_DISTANCE = 22.0  # CIELAB, lightness counted half: below it a face has the skin's colour
+# CIELAB, lightness counted half: below it a face has the skin's colour
+SKIN_DISTANCE = 22.0
 HAIR_DISTANCE = 12.0  # a crown nearer to the skin's colour is a bald one
 GARMENT_DISTANCE = 8.0  # garments nearer in colour are told apart by bones
 TRUNK = ("Spine1", "Spine2", "LeftArm", "RightArm")
@@ -64,22 +77,27 @@ def face_labels(character: Character, names: np.ndarray) -> Ints:
     cloth, skin, root = (rows[bone] for rows in _bone_labels(c))
     lab = _lab(c)
     corners = c.vertices[c.faces]
-    centre, area = corners.mean(1), trimesh.triangles.area(corners)
+    centre = corners.mean(1)
+    area = trimesh.triangles.area(corners)
     shoulders = c.joints[_numbers(c, ("LeftArm", "RightArm")), 2].min()
     low = (skin == FACE) & (root == "Spine") & (centre[:, 2] < shoulders - CHEST)
     skin = np.where(low, UPPER, skin)
 
-    head, neck = root == "Head", c.joints[c.bones.index("Head"), 2]
+    head = root == "Head"
+    neck = c.joints[c.bones.index("Head"), 2]
     cheeks = float(neck + 0.35 * (c.vertices[:, 2].max() - neck))
-    front = head & (c.normals[corner, 1] < -0.6) & (np.abs(centre[:, 2] - cheeks) < 0.05)
+    front = (
+        head & (c.normals[corner, 1] < -0.6) & (np.abs(centre[:, 2] - cheeks) < 0.05)
+    )
     tone = np.median(lab[front] if front.any() else lab, 0)
     bare = _voted(c, np.linalg.norm(lab - tone, axis=1) < SKIN_DISTANCE)
     labels = np.where(bare, skin, cloth)
-    upper, lower = (
-        _tone(lab, ~bare & np.isin(bone, _numbers(c, bones)), tone) for bones in (TRUNK, SHANKS)
-    )
+    upper = _tone(lab, ~bare & np.isin(bone, _numbers(c, TRUNK)), tone)
+    lower = _tone(lab, ~bare & np.isin(bone, _numbers(c, SHANKS)), tone)
     if np.linalg.norm(upper - lower) > GARMENT_DISTANCE:
-        nearer = np.linalg.norm(lab - upper, axis=1) < np.linalg.norm(lab - lower, axis=1)
+        nearer = np.linalg.norm(lab - upper, axis=1) < np.linalg.norm(
+            lab - lower, axis=1
+        )
         between = ~bare & np.isin(bone, _numbers(c, BETWEEN))
         labels = np.where(between, np.where(_voted(c, nearer), UPPER, LOWER), labels)
 
@@ -90,7 +108,9 @@ def face_labels(character: Character, names: np.ndarray) -> Ints:
     labels = np.select(choices, [shoes, named, skin], labels)
     if not (named == HAIR).any():
         near = (head | (root == "Neck")) & (named == 0)
-        labels = np.where(_hair(c, lab, np.array([tone, upper]), near, centre), HAIR, labels)
+        labels = np.where(
+            _hair(c, lab, np.array([tone, upper]), near, centre), HAIR, labels
+        )
     return _whole_garments(c, labels, shoes, named == 0, area)
 
 
@@ -172,7 +192,9 @@ def _voted(c: Character, flag: np.ndarray, rounds: int = 4) -> np.ndarray:
     return flag
 
 
-def _hair(c: Character, lab: Array, others: Array, near: np.ndarray, centre: Array) -> np.ndarray:
+def _hair(
+    c: Character, lab: Array, others: Array, near: np.ndarray, centre: Array
+) -> np.ndarray:
     """Faces of the scalp's hair: nearer to the crown's colours than to others, connected."""
     head = c.joints[c.bones.index("Head"), 2]
     crown = near & (centre[:, 2] > head + 0.8 * (c.vertices[:, 2].max() - head))
@@ -195,15 +217,21 @@ def _hair(c: Character, lab: Array, others: Array, near: np.ndarray, centre: Arr
     return hair | (~hair & np.isin(rest, small) & near)
 
 
-def _whole_garments(c: Character, labels: Ints, shoes: Ints, free: np.ndarray, area: Array) -> Ints:
+def _whole_garments(
+    c: Character, labels: Ints, shoes: Ints, free: np.ndarray, area: Array
+) -> Ints:
     """Each piece of cloth gets the label of most of its area."""
     edges = np.concatenate([c.faces[:, [0, 1]], c.faces[:, [1, 2]]])
     piece = connected_component_labels(edges, len(c.vertices))[c.faces[:, 0]]
-    kind = np.select([labels == UPPER, labels == LOWER, np.isin(labels, SHOES)], [0, 1, 2], -1)
+    kind = np.select(
+        [labels == UPPER, labels == LOWER, np.isin(labels, SHOES)], [0, 1, 2], -1
+    )
     cloth = (kind >= 0) & free
     total = np.zeros((piece.max() + 1, 3))
     np.add.at(total, (piece[cloth], kind[cloth]), area[cloth])
     share = total / np.maximum(total.sum(1, keepdims=True), 1e-12)
     winner = np.where(share.max(1) > 0.85, share.argmax(1), -1)[piece]
     changed = cloth & (winner >= 0) & (winner != kind)
-    return np.where(changed, np.choose(np.maximum(winner, 0), [UPPER, LOWER, shoes]), labels)
+    return np.where(
+        changed, np.choose(np.maximum(winner, 0), [UPPER, LOWER, shoes]), labels
+    )

@@ -12,7 +12,13 @@ from gsgan.motion.rig import ARM, FINGERS, LEG, SIDES, SIGN, SPINE, Pose, Rig, f
 from gsgan.motion.rotations import Array, blend, rotation, unit
 from gsgan.synthetic import controls
 from gsgan.synthetic.choreography import EVERYDAY
-from gsgan.synthetic.controls import Controls, Programme, controls_at, passages_at, smoothstep
+from gsgan.synthetic.controls import (
+    Controls,
+    Programme,
+    controls_at,
+    passages_at,
+    smoothstep,
+)
 from gsgan.synthetic.footsteps import Footsteps
 
 X, Y, Z = np.eye(3)
@@ -20,7 +26,9 @@ X, Y, Z = np.eye(3)
 FLEXION = {"Thumb": (0.5, 0.6, 0.9)} | dict.fromkeys(FINGERS[1:], (1.4, 1.7, 1.1))
 FAN = (0, 1.5, 0.5, -0.5, -1.5)  # a finger's place, in spreads towards the thumb
 KNUCKLE = 0.1  # metres from the wrist, of hands without fingers
-PRONATION, SUPINATION = -1.3, 1.3  # the forearm's range, radians from mid-way
+# the forearm's range, radians from mid-way
+PRONATION = -1.3
+SUPINATION = 1.3
 
 Placed = tuple[Array, Array]  # a wrist's position [F, 3] and its hand's turn [F, 3, 3]
 
@@ -39,7 +47,9 @@ class Choreography:
     def __init__(
         self, character: Character, seed: int = 0, programme: Programme = EVERYDAY
     ) -> None:
-        self.rig, self.seed, self.programme = Rig(character), seed, programme
+        self.rig = Rig(character)
+        self.seed = seed
+        self.programme = programme
         self.duration = programme.duration
         self.steps = Footsteps(seed, programme)
 
@@ -48,7 +58,8 @@ class Choreography:
         c = controls_at(times, self.seed, self.programme)
         feet = [self.steps.at(times, foot) for foot in range(2)]
         _follow_feet(c, feet)
-        heading, scale = rotation(c.path[:, 2:] * Z), self.rig.leg / controls.LEG
+        heading = rotation(c.path[:, 2:] * Z)
+        scale = self.rig.leg / controls.LEG
         hips = self.rig.joint["Hips"] + scale * c.pelvis
         hips = scale * c.path * (1, 1, 0) + (heading @ hips[..., None])[..., 0]
         pose = Pose(self.rig, hips)
@@ -56,7 +67,8 @@ class Choreography:
         pose.bend(SPINE, c.spine)
         pose.bend(("Neck", "Head"), c.head)
         ankles = [
-            self._foot(pose, side, *_freed(c, i, *feet[i][:3])) for i, side in enumerate(SIDES)
+            self._foot(pose, side, *_freed(c, i, *feet[i][:3]))
+            for i, side in enumerate(SIDES)
         ]
         pose.lower_hips(ankles)
         for i, side in enumerate(SIDES):
@@ -64,16 +76,27 @@ class Choreography:
             pole = rotation(middle * Z) @ (0.1 * SIGN[side], -1.0, 0.0)
             freed = (heading @ (c.knee[:, i] * (SIGN[side], 1, 1))[..., None])[..., 0]
             pose.reach(side, LEG, ankles[i], pole + c.free[:, i, None] * (freed - pole))
-            placed = None if np.isnan(c.knuckle[:, i]).any() else self._placed(pose, c, i, side)
+            placed = (
+                None
+                if np.isnan(c.knuckle[:, i]).any()
+                else self._placed(pose, c, i, side)
+            )
             self._arm(pose, c, i, side, placed)
             self._hand(pose, c, i, side, placed)
         return pose.motion(self._face(c, times), passages_at(times, self.programme))
 
     def _foot(
-        self, pose: Pose, side: str, place: Array, height: Array, pitch: Array, toes: Array
+        self,
+        pose: Pose,
+        side: str,
+        place: Array,
+        height: Array,
+        pitch: Array,
+        toes: Array,
     ) -> Array:
         """Turns a foot, its toes flat while they stand; returns the ankle's position ``[F, 3]``."""
-        joint, scale = self.rig.joint, self.rig.leg / controls.LEG
+        joint = self.rig.joint
+        scale = self.rig.leg / controls.LEG
         ankle = joint[side + "Foot"]
         toe = joint.get(side + "ToeBase", ankle + scale * np.array([0, -0.14, -0.06]))
         heading = rotation(place[:, 2:] * Z)
@@ -86,8 +109,11 @@ class Choreography:
 
     def _placed(self, pose: Pose, c: Controls, i: int, side: str) -> Placed:
         """Where the wrist has to be for the knuckle to be at its place, and the hand's turn."""
-        joint, chest, sign = self.rig.joint, self.rig.chest, SIGN[side]
-        scale, mirror = self.rig.arm / controls.ARM, np.array([sign, 1, 1])
+        joint = self.rig.joint
+        chest = self.rig.chest
+        sign = SIGN[side]
+        scale = self.rig.arm / controls.ARM
+        mirror = np.array([sign, 1, 1])
         turn = pose.turn(chest) @ _hand_turn(c, i, side)
         middle = (joint["LeftArm"] + joint["RightArm"]) / 2
         origin = pose.position(chest) + pose.rotation(chest) @ (middle - joint[chest])
@@ -101,21 +127,27 @@ class Choreography:
 
     def _gripping(self, c: Controls, i: int, side: str) -> Placed:
         """Where `Controls.grip` places the wrist, and the hand's turn."""
-        scale, mirror = self.rig.leg / controls.LEG, np.array([SIGN[side], 1, 1])
+        scale = self.rig.leg / controls.LEG
+        mirror = np.array([SIGN[side], 1, 1])
         heading = rotation(c.path[:, 2:] * Z)
-        wrist = c.path * (1, 1, 0) + (heading @ (c.grip[:, i] * mirror)[..., None])[..., 0]
+        wrist = (
+            c.path * (1, 1, 0) + (heading @ (c.grip[:, i] * mirror)[..., None])[..., 0]
+        )
         return scale * wrist, heading @ _hand_turn(c, i, side)
 
     def _arm(
         self, pose: Pose, c: Controls, i: int, side: str, placed: Placed | None = None
     ) -> None:
         """Turns collarbone, upper arm and forearm so that the wrist comes to its target."""
-        scale, mirror = self.rig.arm / controls.ARM, np.array([SIGN[side], 1, 1])
-        chest, wrist = pose.turn(self.rig.chest), c.wrist[:, i]
+        scale = self.rig.arm / controls.ARM
+        mirror = np.array([SIGN[side], 1, 1])
+        chest = pose.turn(self.rig.chest)
+        wrist = c.wrist[:, i]
         if placed is not None:
             away = (placed[0] - pose.position(side + "Arm")) / scale
             wrist = (np.swapaxes(chest, -1, -2) @ away[..., None])[..., 0] * mirror
-        hold, grip = c.hold[:, i, None], self._gripping(c, i, side)[0]
+        hold = c.hold[:, i, None]
+        grip = self._gripping(c, i, side)[0]
         away = (grip - pose.position(side + "Arm")) / scale
         held = (np.swapaxes(chest, -1, -2) @ away[..., None])[..., 0] * mirror
         wrist = wrist + hold * (held - wrist)
@@ -125,9 +157,14 @@ class Choreography:
         collar = side + "Shoulder"
         if collar in self.rig.index:
             pose.bend((collar,), raised)
-        target = pose.position(side + "Arm") + scale * (chest @ (wrist * mirror)[..., None])[..., 0]
+        target = (
+            pose.position(side + "Arm")
+            + scale * (chest @ (wrist * mirror)[..., None])[..., 0]
+        )
         target = target + hold * (grip - target) if placed is None else placed[0]
-        pose.reach(side, ARM, target, (chest @ (c.elbow[:, i] * mirror)[..., None])[..., 0])
+        pose.reach(
+            side, ARM, target, (chest @ (c.elbow[:, i] * mirror)[..., None])[..., 0]
+        )
 
     def _hand(
         self, pose: Pose, c: Controls, i: int, side: str, placed: Placed | None = None
@@ -136,20 +173,30 @@ class Choreography:
         roll = c.palm[:, i].clip(PRONATION, SUPINATION)[:, None]
         bend = rotation(-roll * X) @ rotation(c.flex[:, i, None] * SIGN[side] * Y)
         turn = pose.turn(side + "ForeArm") @ bend if placed is None else placed[1]
-        pose.set_hand(side, blend(turn, self._gripping(c, i, side)[1], c.hold[:, i, None]))
+        pose.set_hand(
+            side, blend(turn, self._gripping(c, i, side)[1], c.hold[:, i, None])
+        )
         thumbwards = -SIGN[side] * self.rig.turns[side + "Hand"][:, 2]
         for bone, finger, joint, hinge, straight, across in self.rig.fingers[side]:
             k = FINGERS.index(finger)
-            curl, base = c.curl[:, i, k, None], float(joint == 0)
+            curl = c.curl[:, i, k, None]
+            base = float(joint == 0)
             aside = base * FAN[k] * c.spread[:, i, None] * thumbwards
-            flexed = FLEXION[finger][joint] * (curl + base * c.bend[:, i, k, None]) - straight
+            flexed = (
+                FLEXION[finger][joint] * (curl + base * c.bend[:, i, k, None])
+                - straight
+            )
             turn = rotation(flexed * hinge + curl * across + aside)
             pose.world[bone] = pose.rotation(pose.parent(bone)) @ turn
 
     def _face(self, c: Controls, times: Array) -> dict[str, Array]:
         shapes = blinks(times, self.duration, self.seed)
-        mouth, vowel = c.mouth.clip(0, 1), 0.5 + 0.5 * np.sin(9 * times)
-        shapes |= {"mouth_open": 0.7 * mouth, "mouth_round": 0.5 * mouth * vowel + c.round}
+        mouth = c.mouth.clip(0, 1)
+        vowel = 0.5 + 0.5 * np.sin(9 * times)
+        shapes |= {
+            "mouth_open": 0.7 * mouth,
+            "mouth_round": 0.5 * mouth * vowel + c.round,
+        }
         shapes["mouth_wide"] = 0.5 * mouth * (1 - vowel) + c.wide
         for side in ("left", "right"):
             shapes[f"smile_{side}"] = 0.8 * c.smile.clip(0, 1)
@@ -161,17 +208,25 @@ class Choreography:
 def _hand_turn(c: Controls, i: int, side: str) -> Array:
     """``[F, 3, 3]`` the hand's turn in the axes of its `pointing` and `facing`."""
     mirror = np.array([SIGN[side], 1, 1])
-    along, palm = unit(c.pointing[:, i] * mirror), c.facing[:, i] * mirror
+    along = unit(c.pointing[:, i] * mirror)
+    palm = c.facing[:, i] * mirror
     palm = unit(palm - (palm * along).sum(-1, keepdims=True) * along)
     return frame(along, palm) @ frame(SIGN[side] * X, -Z).T
 
 
-def _freed(c: Controls, i: int, place: Array, height: Array, pitch: Array) -> tuple[Array, ...]:
+def _freed(
+    c: Controls, i: int, place: Array, height: Array, pitch: Array
+) -> tuple[Array, ...]:
     """A foot's place, height, pitch and toes: of its steps, or, as far as it is free, its own."""
     x, y, out, *rest = c.step[:, i].T
-    sign, heading = 1 - 2 * i, c.path[:, 2]
-    cosine, sine = np.cos(heading), np.sin(heading)
-    x, y = c.path[:, 0] + cosine * sign * x - sine * y, c.path[:, 1] + sine * sign * x + cosine * y
+    sign = 1 - 2 * i
+    heading = c.path[:, 2]
+    cosine = np.cos(heading)
+    sine = np.sin(heading)
+    x, y = (
+        c.path[:, 0] + cosine * sign * x - sine * y,
+        c.path[:, 1] + sine * sign * x + cosine * y,
+    )
     own = np.column_stack([x, y, heading + sign * out, *rest])
     stepped = np.column_stack([place, height, pitch, 0 * pitch])
     found = stepped + c.free[:, i, None] * (own - stepped)
@@ -191,7 +246,8 @@ def _follow_feet(c: Controls, feet: Sequence[tuple[Array, ...]]) -> None:
     (left, *_, left_load), (right, *_, right_load) = feet
     c.pelvis[:, 0] += 0.03 * (right_load - left_load)
     forward = np.stack([np.sin(c.path[:, 2]), -np.cos(c.path[:, 2])], axis=1)
-    ahead = c.swing * ((left - right)[:, :2] * forward).sum(axis=1)  # metres, of the left foot
+    # metres, of the left foot
+    ahead = c.swing * ((left - right)[:, :2] * forward).sum(axis=1)
     c.wrist[:, 0, 1] += ahead
     c.wrist[:, 1, 1] -= ahead
     c.wrist[:, :, 2] += 0.03 * c.swing[:, None]

@@ -16,7 +16,8 @@ from gsgan.synthetic.posing import blinks
 
 RECORDED = (".bvh", ".amc")  # suffixes
 # A foot stands where it is this low and slow, legs and legs per second.
-CONTACT_HEIGHT, CONTACT_SPEED = 0.04, 0.3
+CONTACT_HEIGHT = 0.04
+CONTACT_SPEED = 0.3
 SECTION = 2.5  # seconds that share a passage's name
 
 
@@ -42,37 +43,58 @@ class RecordedMotion:
     """
 
     def __init__(
-        self, character: Character, path: Path, seed: int = 0, collars: float | None = None
+        self,
+        character: Character,
+        path: Path,
+        seed: int = 0,
+        collars: float | None = None,
     ) -> None:
-        self.rig, self.seed, self.name = Rig(character), seed, path.stem
-        read = read_bvh(path) if path.suffix == ".bvh" else read_amc(path, asf_of(path))[0]
+        self.rig = Rig(character)
+        self.seed = seed
+        self.name = path.stem
+        read = (
+            read_bvh(path) if path.suffix == ".bvh" else read_amc(path, asf_of(path))[0]
+        )
         self.duration = len(read.root) * read.frame_time
         self._times = np.arange(len(read.root), dtype=np.float64) * read.frame_time
         standard = standard_motion(read, path)
-        self._turns, joint = standard.turns, self.rig.joint
+        self._turns = standard.turns
+        joint = self.rig.joint
         if collars is not None:
             chest = self._turns["Spine2"]
             for side in SIDES:
-                self._turns[side + "Shoulder"] = blend(chest, self._turns[side + "Arm"], collars)
+                self._turns[side + "Shoulder"] = blend(
+                    chest, self._turns[side + "Arm"], collars
+                )
         offset = (joint["LeftUpLeg"] + joint["RightUpLeg"]) / 2 - joint["Hips"]
         thighs = (standard.joints["LeftUpLeg"] + standard.joints["RightUpLeg"]) / 2
         self._hips = thighs * self.rig.leg / standard.leg - self._turns["Hips"] @ offset
         across = standard.joints["LeftUpLeg"] - standard.joints["RightUpLeg"]
-        width = float(np.median(np.linalg.norm(across, axis=1))) * self.rig.leg / standard.leg
+        width = (
+            float(np.median(np.linalg.norm(across, axis=1)))
+            * self.rig.leg
+            / standard.leg
+        )
         # Legs that go straight down from wider hips would cross below narrow ones.
         self._apart = max(0.0, width - self.rig.length("LeftUpLeg", "RightUpLeg")) / 2
         self._settle(read.frame_time)
 
     def _settle(self, step: float) -> None:
         """Moves the hips near the origin and to the floor, and finds the ankles' targets."""
-        hips, leg = self._hips, self.rig.leg
+        hips = self._hips
+        leg = self.rig.leg
         pose = self._pose(self._turns, hips)
         lows = [pose.lowest(side) for side in SIDES]
         floor = floor_under(np.minimum(*lows), leg, step)
         shift = np.column_stack([-drift(hips[:, :2], step), -floor])
-        self._hips, self._ankles = hips + shift, []
+        self._hips = hips + shift
+        self._ankles = []
         for side, low in zip(SIDES, lows, strict=True):
-            toe = side + "ToeBase" if side + "ToeBase" in self.rig.index else side + "Foot"
+            toe = (
+                side + "ToeBase"
+                if side + "ToeBase" in self.rig.index
+                else side + "Foot"
+            )
             ball = (pose.position(toe) + shift)[:, :2]
             ankle = pose.position(side + "Foot") + shift
             ankle += SIGN[side] * self._apart * self._turns["Hips"][:, :, 0]
@@ -93,10 +115,13 @@ class RecordedMotion:
         times = times.clip(0, self._times[-1])
 
         def between_frames(values: Array) -> Array:
-            return np.stack([np.interp(times, self._times, x) for x in values.T], axis=1)
+            return np.stack(
+                [np.interp(times, self._times, x) for x in values.T], axis=1
+            )
 
         turns = {
-            bone: _interpolated(turn, self._times, times) for bone, turn in self._turns.items()
+            bone: _interpolated(turn, self._times, times)
+            for bone, turn in self._turns.items()
         }
         pose = self._pose(turns, between_frames(self._hips))
         ankles = [between_frames(ankle) for ankle in self._ankles]
@@ -117,15 +142,19 @@ def _held(ball: Array, low: NDArray[np.bool_], leg: float, step: float) -> Array
     """``[F, 2]`` what keeps a foot in place while it rests, and fades between such times."""
     if len(ball) < 2:
         return np.zeros_like(ball)
-    resting = low & (np.linalg.norm(np.gradient(ball, step, axis=0), axis=1) < CONTACT_SPEED * leg)
+    resting = low & (
+        np.linalg.norm(np.gradient(ball, step, axis=0), axis=1) < CONTACT_SPEED * leg
+    )
     edges = np.flatnonzero(np.diff(np.concatenate([[0], resting, [0]])))
-    frames, shift = [np.zeros(0, dtype=int)], [np.zeros((0, 2))]
+    frames = [np.zeros(0, dtype=int)]
+    shift = [np.zeros((0, 2))]
     for begin, end in edges.reshape(-1, 2):
         run = ball[begin:end]
         if np.linalg.norm(np.ptp(run, axis=0)) < CONTACT_HEIGHT * 2 * leg:
             frames.append(np.arange(begin, end))
             shift.append(run.mean(axis=0) - run)
-    at, values = np.concatenate(frames), np.concatenate(shift)
+    at = np.concatenate(frames)
+    values = np.concatenate(shift)
     if not len(at):
         return np.zeros_like(ball)
     return np.stack([np.interp(np.arange(len(ball)), at, v) for v in values.T], axis=1)

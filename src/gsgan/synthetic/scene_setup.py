@@ -57,14 +57,17 @@ def make_tints(strength: float, cameras: int, seed: int) -> list[Tint]:
     Their mean is the identity, so a single camera has none.
     """
     rng = np.random.default_rng([TINT_STREAM, seed])
-    gain, leak, offset = (rng.uniform(-1, 1, (cameras, n)) for n in (3, 9, 3))
+    gain = rng.uniform(-1, 1, (cameras, 3))
+    leak = rng.uniform(-1, 1, (cameras, 9))
+    offset = rng.uniform(-1, 1, (cameras, 3))
     leak = leak.reshape(-1, 3, 3) * (1 - np.eye(3))
     # a leak is subtracted from the channel itself, so that grey stays grey but for the gains
     leak -= leak.sum(axis=2, keepdims=True) * np.eye(3)
     change = _centred(gain)[:, :, None] * np.eye(3) + CROSSTALK * _centred(leak)
     shift = OFFSET * _centred(offset)
     return [
-        Tint(np.eye(3) + strength * a, strength * b) for a, b in zip(change, shift, strict=True)
+        Tint(np.eye(3) + strength * a, strength * b)
+        for a, b in zip(change, shift, strict=True)
     ]
 
 
@@ -126,10 +129,14 @@ class SceneSettings:
             values = as_floats([] if raw is None else raw)
             _require(
                 (raw is None or (isinstance(raw, Sequence) and len(values) == len(raw)))
-                and bool((np.isfinite(values) & (values >= low) & (values <= high)).all()),
+                and bool(
+                    (np.isfinite(values) & (values >= low) & (values <= high)).all()
+                ),
                 f"{name} must be a list of numbers in [{low:g}, {high:g}], got {raw!r}",
             )
-            object.__setattr__(self, name, tuple(values.tolist()) if values.any() else None)
+            object.__setattr__(
+                self, name, tuple(values.tolist()) if values.any() else None
+            )
         named = (*AVATARS, FREE_BODY)
         _require(
             self.avatar in named or str(self.avatar).endswith(".glb"),
@@ -183,8 +190,14 @@ def dataset_key(settings: SceneSettings) -> str:
             parameters[name] = hashlib.sha256(path.read_bytes()).hexdigest()
     content = repr((VERSION, sorted(parameters.items())))
     digest = hashlib.sha256(content.encode()).hexdigest()[:12]
-    effects = [name for name in ("lens", "tint", "gloss", "test_scale") if getattr(settings, name)]
-    return "-".join([f"{Path(settings.avatar).stem}-{settings.size}-{digest}", *effects])
+    effects = [
+        name
+        for name in ("lens", "tint", "gloss", "test_scale")
+        if getattr(settings, name)
+    ]
+    return "-".join(
+        [f"{Path(settings.avatar).stem}-{settings.size}-{digest}", *effects]
+    )
 
 
 def load_character(avatar: str) -> Character:
@@ -213,25 +226,37 @@ class Scene:
     """
 
     def __init__(self, settings: SceneSettings) -> None:
-        self.settings, self.light = settings, Light(gloss=settings.gloss or 0.0)
+        self.settings = settings
+        self.light = Light(gloss=settings.gloss or 0.0)
         self.character = character = load_character(settings.avatar)
         self.appearance = Appearance(character)
         self.source: Moving = (
             Choreography(character, settings.seed, PROGRAMMES[settings.motion])
             if settings.motion in PROGRAMMES
-            else RecordedMotion(character, Path(settings.motion).expanduser(), settings.seed)
+            else RecordedMotion(
+                character, Path(settings.motion).expanduser(), settings.seed
+            )
         )
         times = frame_times(settings.frames, self.source.duration)
         self.motion = self.source.at(times)
-        self.secondary = Secondary(character, self.source) if settings.secondary else None
+        self.secondary = (
+            Secondary(character, self.source) if settings.secondary else None
+        )
         self.times = times
-        passages, signing = self.motion.passages, settings.motion == SIGNING
+        passages = self.motion.passages
+        signing = settings.motion == SIGNING
         if signing:
-            self.train_frames, self.test_frames = split_signs(passages, settings.test_frames)
+            self.train_frames, self.test_frames = split_signs(
+                passages, settings.test_frames
+            )
         else:
             self.test_frames = held_out(passages, settings.test_frames)
-            self.train_frames = [i for i in range(settings.frames) if i not in self.test_frames]
-        names = [f"cam{i:02d}" for i in range(settings.train_cameras + settings.test_cameras)]
+            self.train_frames = [
+                i for i in range(settings.frames) if i not in self.test_frames
+            ]
+        names = [
+            f"cam{i:02d}" for i in range(settings.train_cameras + settings.test_cameras)
+        ]
         self.train_cameras = names[: settings.train_cameras]
         points = extent(character, self.source, upper=signing)
         views = (front if signing else ring)(settings, points)
@@ -244,7 +269,9 @@ class Scene:
             dist = np.array(settings.lens)
             self.views = {name: through_lens(v, dist) for name, v in self.views.items()}
         tints = make_tints(settings.tint or 0.0, settings.train_cameras, settings.seed)
-        self.tints = dict(zip(self.train_cameras, tints, strict=True)) if settings.tint else {}
+        self.tints = (
+            dict(zip(self.train_cameras, tints, strict=True)) if settings.tint else {}
+        )
 
     def mesh(self, frame: int) -> tuple[Array, Array, Wrinkles | None]:
         """Vertices (metres) and unit normals ``[V, 3]`` of a frame, and the wrinkles of cloth."""
@@ -265,15 +292,22 @@ class Scene:
         They are where skinning puts them: sway and wrinkles do not move a skeleton.
         """
         if self.settings.avatar == FREE_BODY:
-            body, pose = free_body(), free_pose(self.motion)
-            points = torch.cat([body.posed_landmarks(pose), body.posed_hands(pose)], dim=1)
+            body = free_body()
+            pose = free_pose(self.motion)
+            points = torch.cat(
+                [body.posed_landmarks(pose), body.posed_hands(pose)], dim=1
+            )
             return (*body.landmark_names, *body.hand_names), points.double().numpy()
-        character, joints = self.character, self.motion.joints
-        posed = [character.landmarks(self._skinned(f)[0], p) for f, p in enumerate(joints)]
+        character = self.character
+        joints = self.motion.joints
+        posed = [
+            character.landmarks(self._skinned(f)[0], p) for f, p in enumerate(joints)
+        ]
         return character.anchor_names, np.stack(posed)
 
     def _skinned(self, frame: int) -> tuple[Array, Array]:
-        character, motion = self.character, self.motion
+        character = self.character
+        motion = self.motion
         offsets = sum(
             (
                 motion.shapes[name][frame] * shape
@@ -286,7 +320,11 @@ class Scene:
 
 
 def extent(
-    character: Character, source: Moving, samples: int = 160, stride: int = 24, upper: bool = False
+    character: Character,
+    source: Moving,
+    samples: int = 160,
+    stride: int = 24,
+    upper: bool = False,
 ) -> Array:
     """``[N, 3]`` points that a motion reaches, metres; with ``upper`` from the waist upwards.
 
@@ -312,21 +350,31 @@ def extent(
 
 def ring(settings: SceneSettings, points: Array) -> list[SceneCamera]:
     """Cameras around the person, training cameras first, zoomed to keep ``points`` in view."""
-    n, low, high = settings.train_cameras, points.min(axis=0), points.max(axis=0)
+    n = settings.train_cameras
+    low = points.min(axis=0)
+    high = points.max(axis=0)
     middle = (low + high) / 2
     step = 2 * math.pi / n
     # starting at 0.3, so that no camera looks exactly along the person's axis
     train = [(0.3 + i * step, (1.35, 0.95, 1.75)[i % 3]) for i in range(n)]
-    gaps = [(i * n) // max(settings.test_cameras, 1) for i in range(settings.test_cameras)]
+    gaps = [
+        (i * n) // max(settings.test_cameras, 1) for i in range(settings.test_cameras)
+    ]
     test = [(0.3 + (i + 0.5) * step, (1.15, 1.55)[k % 2]) for k, i in enumerate(gaps)]
     return [look_at(a, h, middle, points, settings.size) for a, h in train + test]
 
 
 def front(settings: SceneSettings, points: Array) -> list[SceneCamera]:
     """Cameras on an arc before the person, training cameras first, zoomed to ``points``."""
-    n, middle = settings.train_cameras, (points.min(axis=0) + points.max(axis=0)) / 2
+    n = settings.train_cameras
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
     step = ARC / n
     train = [((i + 0.5) * step - ARC / 2, (1.35, 1.55, 1.2)[i % 3]) for i in range(n)]
-    gaps = [int((k + 0.5) * (n - 1) / settings.test_cameras) for k in range(settings.test_cameras)]
-    test = [((gap + 1) * step - ARC / 2, (1.45, 1.3)[k % 2]) for k, gap in enumerate(gaps)]
+    gaps = [
+        int((k + 0.5) * (n - 1) / settings.test_cameras)
+        for k in range(settings.test_cameras)
+    ]
+    test = [
+        ((gap + 1) * step - ARC / 2, (1.45, 1.3)[k % 2]) for k, gap in enumerate(gaps)
+    ]
     return [look_at(a, h, middle, points, settings.size) for a, h in train + test]

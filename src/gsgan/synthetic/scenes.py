@@ -40,7 +40,11 @@ WORKER = "from gsgan.synthetic.scenes import trace_share; trace_share()"
 
 
 def ensure_scene(
-    *, cache: Path | None = None, workers: int = 2, progress: bool = True, **parameters: Any
+    *,
+    cache: Path | None = None,
+    workers: int = 2,
+    progress: bool = True,
+    **parameters: Any,
 ) -> Path:
     """The synthetic dataset with these parameters: found in the cache, or made there.
 
@@ -89,9 +93,13 @@ def _write(root: Path, settings: SceneSettings, workers: int, progress: bool) ->
     from rich.progress import Progress
 
     scene = Scene(settings)
-    with Progress(console=Console(stderr=True), disable=not progress, transient=True) as bar:
+    with Progress(
+        console=Console(stderr=True), disable=not progress, transient=True
+    ) as bar:
         count = f"{settings.frames} frames, {len(scene.views)} cameras"
-        task = bar.add_task(f"tracing the synthetic person ({count})", total=settings.frames)
+        task = bar.add_task(
+            f"tracing the synthetic person ({count})", total=settings.frames
+        )
         if workers <= 1 or settings.frames == 1:
             for frame in range(settings.frames):
                 trace_frames(root, scene, [frame])
@@ -106,7 +114,9 @@ def _write(root: Path, settings: SceneSettings, workers: int, progress: bool) ->
     write_atomically(root / "meta.json", json.dumps(_meta(scene), indent=1) + "\n")
 
 
-def _trace_in_processes(root: Path, settings: SceneSettings, workers: int) -> Iterator[None]:
+def _trace_in_processes(
+    root: Path, settings: SceneSettings, workers: int
+) -> Iterator[None]:
     """Divides the frames among processes; yields from time to time until all are done.
 
     Raises:
@@ -124,7 +134,9 @@ def _trace_in_processes(root: Path, settings: SceneSettings, workers: int) -> It
             stack.callback(process.wait)
             stack.callback(process.kill)
             running.append(process)
-        while None in (codes := [process.poll() for process in running]) and not any(codes):
+        while None in (codes := [process.poll() for process in running]) and not any(
+            codes
+        ):
             yield
             time.sleep(POLL_SECONDS)
         if any(codes):
@@ -144,7 +156,9 @@ def trace_share() -> None:
     cv2.setNumThreads(1)
     root, parameters, first, step = sys.argv[1:]
     settings = SceneSettings(**json.loads(parameters))
-    trace_frames(Path(root), Scene(settings), range(int(first), settings.frames, int(step)))
+    trace_frames(
+        Path(root), Scene(settings), range(int(first), settings.frames, int(step))
+    )
 
 
 def trace_frames(root: Path, scene: Scene, frames: Iterable[int]) -> None:
@@ -181,7 +195,8 @@ def _calibration(view: SceneCamera) -> dict[str, Any]:
 
 def _write_skeletons(root: Path, scene: Scene) -> None:
     names, points = scene.landmarks()
-    p, ids = points.astype(np.float32), np.arange(len(points))
+    p = points.astype(np.float32)
+    ids = np.arange(len(points))
     shape = (len(p), BODY)
     np.savez(
         root / "landmarks3d.npz",
@@ -195,7 +210,12 @@ def _write_skeletons(root: Path, scene: Scene) -> None:
     )
     for name, part in (("hands3d", HANDS), ("face3d", FACE)):
         if names[part]:
-            np.savez(root / f"{name}.npz", p=p[:, part], frame_id=ids, names=np.array(names[part]))
+            np.savez(
+                root / f"{name}.npz",
+                p=p[:, part],
+                frame_id=ids,
+                names=np.array(names[part]),
+            )
     if scene.settings.avatar == FREE_BODY:
         pose = free_pose(scene.motion)
         np.savez(
@@ -208,7 +228,11 @@ def _write_skeletons(root: Path, scene: Scene) -> None:
 
 
 def _meta(scene: Scene) -> dict[str, Any]:
-    chosen = {name: value for name, value in asdict(scene.settings).items() if value is not None}
+    chosen = {
+        name: value
+        for name, value in asdict(scene.settings).items()
+        if value is not None
+    }
     splits = ("train_cameras", "test_cameras", "train_frames", "test_frames")
     return {
         "fps": scene.settings.frames / scene.source.duration,
@@ -216,7 +240,8 @@ def _meta(scene: Scene) -> dict[str, Any]:
         "up_axis": "z",
         "skeleton": "mediapipe33",
         "pixel_centre": 0.5,
-        "background": "black",  # images are premultiplied: blending them again darkens edges
+        # images are premultiplied: blending them again darkens edges
+        "background": "black",
         **({"body": "free"} if scene.settings.avatar == FREE_BODY else {}),
         "label_names": list(scene.character.label_names),
         "splits": {name: getattr(scene, name) for name in splits},

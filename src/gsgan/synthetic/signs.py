@@ -23,7 +23,9 @@ INDEX: Shape = ((0.8, 0.0, 0.95, 1.0, 1.0), STRAIGHT, 0.0)
 TWO: Shape = ((0.8, 0.0, 0.0, 0.95, 1.0), STRAIGHT, 0.12)
 OPEN: Shape = (STRAIGHT, (-1.0, 0, 0, 0, 0), 0.2)
 CLASP: Shape = ((0.0, 0.45, 0.45, 0.45, 0.45), (-1.0, 0.03, 0.03, 0.03, 0.03), 0.28)
-BOTH, LEFT, RIGHT = (0, 1), (0,), (1,)
+BOTH = (0, 1)
+LEFT = (0,)
+RIGHT = (1,)
 
 
 def at_ease(frames: int) -> Controls:
@@ -50,7 +52,9 @@ def _place(
             c.facing[:, side, axis] = facing[axis]
 
 
-def _shape(c: Controls, sides: Sequence[int], shape: Shape, share: Array | float = 1.0) -> None:
+def _shape(
+    c: Controls, sides: Sequence[int], shape: Shape, share: Array | float = 1.0
+) -> None:
     """Turns the fingers of hands to a shape, or by a share ``[F]`` of the way to it."""
     curl, bend, spread = shape
     w = np.broadcast_to(share, len(c.path))[:, None]
@@ -74,23 +78,34 @@ def hello(c: Controls, s: Array, style: Style) -> None:
     """A flat hand from the temple outwards; the other one rests."""
     out = _there(s)
     knuckle = _mix(out, (0.13, -0.21, 0.26), (0.33, -0.3, 0.24))
-    _place(c, RIGHT, knuckle, _mix(out, (-0.5, 0.1, 0.85), (0.25, -0.2, 1)), (-0.1, -1, 0))
+    _place(
+        c, RIGHT, knuckle, _mix(out, (-0.5, 0.1, 0.85), (0.25, -0.2, 1)), (-0.1, -1, 0)
+    )
     _shape(c, RIGHT, FLAT)
     c.elbow[:, 1] = (1.0, 0.3, -0.9)
-    c.smile[:], c.brows[:] = 1, 0.7
-    c.wide[:], c.round[:] = 0.6 * (1 - out), 0.7 * out
+    c.smile[:] = 1
+    c.brows[:] = 0.7
+    c.wide[:] = 0.6 * (1 - out)
+    c.round[:] = 0.7 * out
 
 
 def mask(c: Controls, s: Array, style: Style) -> None:
     """An open hand passes before eyes and mouth, its fingers moving."""
     down = _there(s, 0.25, 0.8)
-    _place(c, RIGHT, _mix(down, (0.03, -0.28, 0.25), (0.02, -0.27, 0.1)), (-1, 0.1, 0.3), (0, 1, 0))
+    _place(
+        c,
+        RIGHT,
+        _mix(down, (0.03, -0.28, 0.25), (0.02, -0.27, 0.1)),
+        (-1, 0.1, 0.3),
+        (0, 1, 0),
+    )
     _shape(c, RIGHT, FAN)
     for finger in range(1, 5):
         ripple = np.sin(TAU * 2 * s + style.phase + finger)
         c.bend[:, 1, finger] += 0.12 * ripple
     c.elbow[:, 1] = (0.5, 0.2, -1.0)
-    c.brows[:], c.mouth[:] = 1, 0.8
+    c.brows[:] = 1
+    c.mouth[:] = 0.8
 
 
 def interlace(c: Controls, s: Array, style: Style) -> None:
@@ -100,12 +115,17 @@ def interlace(c: Controls, s: Array, style: Style) -> None:
     sway = 0.03 * style.amplitude * np.sin(TAU * s)
     for side, sign in zip(BOTH, (1, -1), strict=True):
         # half a finger's width apart, so that fingers pass between fingers
-        knuckle = (0.09 - 0.052 * near + sign * sway, -0.33 - 0.008 * sign, -0.1 - 0.005 * sign)
+        knuckle = (
+            0.09 - 0.052 * near + sign * sway,
+            -0.33 - 0.008 * sign,
+            -0.1 - 0.005 * sign,
+        )
         _place(c, (side,), knuckle, (0, -0.5, 0.85), (-1, 0, 0))
     _shape(c, BOTH, OPEN)
     _shape(c, BOTH, CLASP, closed)
     c.elbow[...] = (1.0, 0.2, -0.8)
-    c.round[:], c.brows[:] = 0.9, 0.4
+    c.round[:] = 0.9
+    c.brows[:] = 0.4
     c.head[:, 0] = 0.1 * closed
 
 
@@ -117,7 +137,9 @@ def palms(c: Controls, s: Array, style: Style) -> None:
         _place(c, (side,), knuckle, (-0.07, -0.6, 0.8), (-1, 0, 0))
     _shape(c, BOTH, FLAT)
     c.elbow[...] = (1.0, 0.2, -0.8)
-    c.round[:], c.mouth[:], c.brows[:] = 0.5, 0.3, -0.7
+    c.round[:] = 0.5
+    c.mouth[:] = 0.3
+    c.brows[:] = -0.7
 
 
 def support(c: Controls, s: Array, style: Style) -> None:
@@ -127,7 +149,9 @@ def support(c: Controls, s: Array, style: Style) -> None:
     _place(c, RIGHT, (-0.02, -0.33, rise + 0.1), (-0.8, -0.6, 0), (-0.6, 0.8, 0))
     _shape(c, LEFT, FLAT)
     _shape(c, RIGHT, FIST)
-    c.wide[:], c.mouth[:], c.brows[:] = 0.5, 0.3, 0.5
+    c.wide[:] = 0.5
+    c.mouth[:] = 0.3
+    c.brows[:] = 0.5
 
 
 def point(c: Controls, s: Array, style: Style) -> None:
@@ -138,7 +162,8 @@ def point(c: Controls, s: Array, style: Style) -> None:
     _shape(c, LEFT, FLAT)
     _shape(c, RIGHT, INDEX)
     c.elbow[:, 1] = (1.0, 0.1, -0.6)
-    c.wide[:], c.brows[:] = 0.8, -1
+    c.wide[:] = 0.8
+    c.brows[:] = -1
 
 
 def hug(c: Controls, s: Array, style: Style) -> None:
@@ -149,7 +174,8 @@ def hug(c: Controls, s: Array, style: Style) -> None:
     _place(c, RIGHT, (x - rock, -0.34, -0.02), (-0.8, 0.05, 0.6), (0, 1, 0))
     _shape(c, BOTH, FIST)
     c.elbow[...] = (0.8, -0.2, -1.0)
-    c.smile[:], c.mouth[:] = 1, 0.2
+    c.smile[:] = 1
+    c.mouth[:] = 0.2
     c.head[:, 1] = 0.15 * np.sin(TAU * s)
 
 
@@ -169,9 +195,16 @@ def look(c: Controls, s: Array, style: Style) -> None:
     """Two fingers go from before the eyes forwards."""
     out = _there(s)
     knuckle = _mix(out, (0.06, -0.3, 0.2), (0.02, -0.45, 0.08))
-    _place(c, RIGHT, knuckle, _mix(out, (-0.4, -0.3, 0.9), (-0.25, -0.8, 0.45)), (-0.2, -0.8, -0.6))
+    _place(
+        c,
+        RIGHT,
+        knuckle,
+        _mix(out, (-0.4, -0.3, 0.9), (-0.25, -0.8, 0.45)),
+        (-0.2, -0.8, -0.6),
+    )
     _shape(c, RIGHT, TWO)
-    c.brows[:], c.round[:] = -0.9, 0.6
+    c.brows[:] = -0.9
+    c.round[:] = 0.6
     c.head[:, 0] = 0.1 * out
 
 
@@ -183,7 +216,9 @@ def roof(c: Controls, s: Array, style: Style) -> None:
     _place(c, BOTH, knuckle, pointing, _mix(down, (-0.7, 0, -0.7), (-1, 0, 0)))
     _shape(c, BOTH, FLAT)
     c.elbow[...] = (1.0, 0.2, -0.8)
-    c.mouth[:], c.round[:], c.brows[:] = 0.4, 0.4 * down, 0.6
+    c.mouth[:] = 0.4
+    c.round[:] = 0.4 * down
+    c.brows[:] = 0.6
 
 
 def cancel(c: Controls, s: Array, style: Style) -> None:
@@ -192,7 +227,8 @@ def cancel(c: Controls, s: Array, style: Style) -> None:
     _place(c, LEFT, (x, -0.41, -0.07), (-0.5, -0.2, 0.8), (-0.7, -0.7, 0))
     _place(c, RIGHT, (x, -0.31, -0.01), (-0.5, -0.2, 0.8), (-0.7, -0.7, 0))
     _shape(c, BOTH, OPEN)
-    c.wide[:], c.brows[:] = 0.9, -0.8
+    c.wide[:] = 0.9
+    c.brows[:] = -0.8
     c.head[:, 2] = 0.25 * np.sin(TAU * 2 * s)
 
 
@@ -204,10 +240,13 @@ def peek(c: Controls, s: Array, style: Style) -> None:
     _shape(c, BOTH, FLAT)
     _shape(c, BOTH, FAN, open_)
     c.elbow[...] = (1.0, -0.1, -0.9)
-    c.smile[:], c.mouth[:], c.brows[:] = open_, 0.7 * open_, 2 * open_ - 1
+    c.smile[:] = open_
+    c.mouth[:] = 0.7 * open_
+    c.brows[:] = 2 * open_ - 1
 
 
-HELD_OUT = ("roof", "cancel", "peek")  # a contact, a crossing, and hands before the face
+# a contact, a crossing, and hands before the face
+HELD_OUT = ("roof", "cancel", "peek")
 SIGNS = Programme(
     (
         ("hello", hello, 1.6),

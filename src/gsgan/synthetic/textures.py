@@ -15,7 +15,8 @@ from gsgan.motion.character import Surface
 Floats = NDArray[np.floating[Any]]  # float32
 Ints = NDArray[np.int64]
 
-LARGEST = 1024  # texels along a side, about 2 mm on a person; larger textures are reduced
+# texels along a side, about 2 mm on a person; larger textures are reduced
+LARGEST = 1024
 FLAT = (0.0, 0.0, 1.0)  # a normal map's neutral value
 
 
@@ -38,19 +39,25 @@ class Textures:
         pyramids = [list(_pyramid(surface)) for surface in surfaces]
         self.levels = np.array([len(levels) for levels in pyramids])
         shape = (len(pyramids), self.levels.max())
-        self._start, self._size = np.zeros(shape, np.int64), np.ones((*shape, 2), np.int64)
+        self._start = np.zeros(shape, np.int64)
+        self._size = np.ones((*shape, 2), np.int64)
         count = 0
         for m, levels in enumerate(pyramids):
             for k, texels in enumerate(levels):
-                self._start[m, k], self._size[m, k] = count, texels.shape[1::-1]
+                self._start[m, k] = count
+                self._size[m, k] = texels.shape[1::-1]
                 count += texels.shape[0] * texels.shape[1]
-        self._texels = np.concatenate([t.reshape(-1, 8) for levels in pyramids for t in levels])
+        self._texels = np.concatenate(
+            [t.reshape(-1, 8) for levels in pyramids for t in levels]
+        )
 
     def size(self, surface: Ints) -> Ints:
         """``[N, 2]`` width and height in texels of surfaces ``[N]``."""
         return self._size[surface, 0]
 
-    def __call__(self, surface: Ints, uv: Floats, level: Ints) -> tuple[Floats, Floats, Floats]:
+    def __call__(
+        self, surface: Ints, uv: Floats, level: Ints
+    ) -> tuple[Floats, Floats, Floats]:
         """Linear RGB ``[N, 3]``, coverage ``[N]`` and tangent-space normals ``[N, 3]``, bilinear.
 
         Args:
@@ -59,14 +66,19 @@ class Textures:
             level: ``[N]`` mip level, clamped to those that exist.
         """
         level = np.clip(level, 0, self.levels[surface] - 1)
-        start, size = self._start[surface, level], self._size[surface, level]
+        start = self._start[surface, level]
+        size = self._size[surface, level]
         at = (uv - np.floor(uv)) * size.astype(np.float32) - np.float32(0.5)
         corner = np.floor(at)
         share = at - corner
-        low, high = corner.astype(np.int64), corner.astype(np.int64) + 1
-        low, high = np.where(low < 0, size - 1, low), np.where(high >= size, 0, high)
-        top, bottom = start + low[:, 1] * size[:, 0], start + high[:, 1] * size[:, 0]
-        x, y = share[:, :1], share[:, 1:]
+        low = corner.astype(np.int64)
+        high = corner.astype(np.int64) + 1
+        low = np.where(low < 0, size - 1, low)
+        high = np.where(high >= size, 0, high)
+        top = start + low[:, 1] * size[:, 0]
+        bottom = start + high[:, 1] * size[:, 0]
+        x = share[:, :1]
+        y = share[:, 1:]
         out = self._texels[top + low[:, 0]] * ((1 - x) * (1 - y))
         out += self._texels[top + high[:, 0]] * (x * (1 - y))
         out += self._texels[bottom + low[:, 0]] * ((1 - x) * y)
@@ -81,7 +93,8 @@ def _pyramid(surface: Surface) -> Iterator[Floats]:
     """
     h, w = surface.colour.shape[:2]
     shrink = max(1.0, max(h, w) / LARGEST)
-    h, w = max(1, round(h / shrink)), max(1, round(w / shrink))
+    h = max(1, round(h / shrink))
+    w = max(1, round(w / shrink))
     texels = np.zeros((h, w, 8), np.float32)
     colour = surface.colour.astype(np.float32) / 255
     colour[..., :3] = linear(colour[..., :3])
@@ -92,7 +105,8 @@ def _pyramid(surface: Surface) -> Iterator[Floats]:
         texels[..., 4:7] = cv2.resize(normal, (w, h), interpolation=cv2.INTER_AREA)
     yield texels
     while h > 1 or w > 1:
-        h, w = max(1, h // 2), max(1, w // 2)
+        h = max(1, h // 2)
+        w = max(1, w // 2)
         halves = [
             cv2.resize(texels[..., c : c + 4], (w, h), interpolation=cv2.INTER_AREA)
             for c in (0, 4)  # OpenCV resizes at most four channels

@@ -24,7 +24,8 @@ Bools = NDArray[np.bool_]
 Colour = tuple[float, float, float]
 
 BLOCK = 1 << 15  # rays traced at once: their arrays stay in the processor's cache
-SHININESS = 12.0  # exponent of the highlight's lobe: falls to half within about 19 degrees
+# exponent of the highlight's lobe: falls to half within about 19 degrees
+SHININESS = 12.0
 CLOTHES = ("upper_clothes", "lower_clothes", "left_shoe", "right_shoe")
 SKY_RAYS = 48  # directions in which each vertex looks for the sky
 SKY_OFFSET = 3e-3  # metres from the surface to sky rays
@@ -37,7 +38,8 @@ SHOULDER = 0.5  # linear light from which the tone curve is compressed
 class Light:
     """A sun and a sky, in linear light."""
 
-    direction: tuple[float, float, float] = (0.5, -0.75, 0.9)  # towards the sun, any length
+    # towards the sun, any length
+    direction: tuple[float, float, float] = (0.5, -0.75, 0.9)
     sun: Colour = (0.88, 0.83, 0.76)
     sky: Colour = (0.58, 0.62, 0.68)  # from straight above
     ground: Colour = (0.38, 0.35, 0.32)  # from straight below
@@ -60,7 +62,9 @@ class Wrinkles:
 
 def wave(phase: Floats) -> Floats:
     """The slope of folds in [-1, 1]: two waves without a common period."""
-    return np.float32(0.65) * np.cos(phase) + np.float32(0.35) * np.cos(1.618 * phase + 1)
+    return np.float32(0.65) * np.cos(phase) + np.float32(0.35) * np.cos(
+        1.618 * phase + 1
+    )
 
 
 def encode(light: Array) -> Array:
@@ -83,16 +87,21 @@ class Appearance:
         self.bumpy = any(s.normal is not None for s in character.surfaces)
         clothes = [name in CLOTHES for name in character.label_names]
         self.glossy = np.array(clothes, np.float32)[character.labels]
-        corners, uv = character.vertices[self.faces], character.uv[self.faces]
-        self.du, self.dv = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+        corners = character.vertices[self.faces]
+        uv = character.uv[self.faces]
+        self.du = uv[:, 1] - uv[:, 0]
+        self.dv = uv[:, 2] - uv[:, 0]
         twice_uv = self.du[:, 0] * self.dv[:, 1] - self.du[:, 1] * self.dv[:, 0]
         self.mirrored = np.where(twice_uv < 0, -1, 1).astype(np.float32)
         twice_area = np.linalg.norm(
-            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]),
+            axis=1,
         )
         texels = np.abs(twice_uv) * self.textures.size(character.material).prod(axis=1)
         # log2 of texels per metre, along one side
-        self.density = 0.5 * np.log2(np.maximum(texels, 1e-9) / np.maximum(twice_area, 1e-12))
+        self.density = 0.5 * np.log2(
+            np.maximum(texels, 1e-9) / np.maximum(twice_area, 1e-12)
+        )
 
     def coverage(self, face: Ints, bary: Floats) -> Bools:
         """Whether points of faces are on the surface, rather than cut out of it."""
@@ -126,15 +135,19 @@ class Tracer:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
 
-        self._scene, self._solid = EmbreeScene(), solid
-        self._mesh = TriangleMesh(self._scene, vertices.astype(np.float32), faces.astype(np.int32))
+        self._scene = EmbreeScene()
+        self._solid = solid
+        self._mesh = TriangleMesh(
+            self._scene, vertices.astype(np.float32), faces.astype(np.int32)
+        )
 
     def first(self, origins: Floats, directions: Floats) -> tuple[Ints, Floats]:
         """Face index ``[N]``, -1 for a miss, and barycentric weights ``[N, 3]``."""
         face, bary, distance = self._run(origins, directions)
         if self._solid is None:
             return face, bary
-        travelled, going = np.zeros(len(face), np.float32), np.arange(len(face))
+        travelled = np.zeros(len(face), np.float32)
+        going = np.arange(len(face))
         for _ in range(LAYERS):
             going = going[face[going] >= 0]
             going = going[~self._solid(face[going], bary[going])]
@@ -142,7 +155,9 @@ class Tracer:
                 break
             travelled[going] += distance[going] + np.float32(1e-5)
             start = origins[going] + travelled[going, None] * directions[going]
-            face[going], bary[going], distance[going] = self._run(start, directions[going])
+            face[going], bary[going], distance[going] = self._run(
+                start, directions[going]
+            )
         return face, bary
 
     def blocked(self, origins: Floats, directions: Floats) -> Bools:
@@ -154,8 +169,13 @@ class Tracer:
 
     def _run(self, origins: Floats, directions: Floats) -> tuple[Ints, Floats, Floats]:
         hit = self._scene.run(origins, directions, query="INTERSECT", output=1)
-        u, v = hit["u"], hit["v"]
-        return hit["primID"].astype(np.int64), np.stack([1 - u - v, u, v], axis=1), hit["tfar"]
+        u = hit["u"]
+        v = hit["v"]
+        return (
+            hit["primID"].astype(np.int64),
+            np.stack([1 - u - v, u, v], axis=1),
+            hit["tfar"],
+        )
 
 
 class PosedCharacter:
@@ -177,20 +197,31 @@ class PosedCharacter:
         light: Light,
         wrinkles: Wrinkles | None = None,
     ) -> None:
-        self.appearance, self.light, self.wrinkles = appearance, light, wrinkles
-        self.vertices, faces = vertices, appearance.faces
+        self.appearance = appearance
+        self.light = light
+        self.wrinkles = wrinkles
+        self.vertices = vertices
+        faces = appearance.faces
         solid = appearance.coverage if (appearance.cutoff > 0).any() else None
         self.tracer = Tracer(vertices, faces, solid)
-        X, N = vertices.astype(np.float32), normals.astype(np.float32)
-        a, b = X[faces[:, 1]] - X[faces[:, 0]], X[faces[:, 2]] - X[faces[:, 0]]
+        X = vertices.astype(np.float32)
+        N = normals.astype(np.float32)
+        a = X[faces[:, 1]] - X[faces[:, 0]]
+        b = X[faces[:, 2]] - X[faces[:, 0]]
         flat = _unit(np.cross(a, b))
         outwards = (flat * N[faces].sum(axis=1)).sum(axis=1, keepdims=True)
         self.flat = np.where(outwards < 0, -flat, flat)
         along_u = a * appearance.dv[:, 1:] - b * appearance.du[:, 1:]
         self.tangent = _unit(along_u * appearance.mirrored[:, None]).astype(np.float32)
         sky = self._sky(X, N)
-        waves = [] if wrinkles is None else [wrinkles.phase, wrinkles.slope, wrinkles.across]
-        self.attributes = np.column_stack([X, N, sky, appearance.uv, *waves]).astype(np.float32)
+        waves = (
+            []
+            if wrinkles is None
+            else [wrinkles.phase, wrinkles.slope, wrinkles.across]
+        )
+        self.attributes = np.column_stack([X, N, sky, appearance.uv, *waves]).astype(
+            np.float32
+        )
 
     def render(self, view: SceneCamera, rays: int) -> tuple[Array, Array, Ints]:
         """Image ``[H,W,3]``, alpha ``[H,W]`` and labels ``[H,W]`` seen by a camera.
@@ -200,7 +231,8 @@ class PosedCharacter:
         the mean light of the rays that hit, encoded as sRGB, times alpha.
         """
         H, W = view.size
-        image, alpha = np.zeros((H, W, 3)), np.zeros((H, W))
+        image = np.zeros((H, W, 3))
+        alpha = np.zeros((H, W))
         labels = np.zeros((H, W), dtype=np.int64)
         touched = np.argwhere(self._touched(view))
         step = max(1, BLOCK // rays)
@@ -210,24 +242,33 @@ class PosedCharacter:
             face, light = self._shoot(view, origin, view.bend(directions), rays)
             hits = (face >= 0).reshape(-1, rays)
             count = hits.sum(axis=1)
-            mean = light.reshape(-1, rays, 3).sum(axis=1) / np.maximum(count, 1)[:, None]
+            mean = (
+                light.reshape(-1, rays, 3).sum(axis=1) / np.maximum(count, 1)[:, None]
+            )
             alpha[y, x] = count / rays
             image[y, x] = encode(mean) * alpha[y, x, None]
-            part = np.where(hits, self.appearance.character.labels[face].reshape(-1, rays), 0)
+            part = np.where(
+                hits, self.appearance.character.labels[face].reshape(-1, rays), 0
+            )
             labels[y, x] = majority(part, len(self.appearance.character.label_names))
         return image, alpha, labels
 
     def _touched(self, view: SceneCamera) -> Bools:
         """Pixels ``[H, W]`` that the person may touch: faces' edges and what is between them."""
         H, W = view.size
-        if (self.vertices @ view.R[2] + view.t[2]).min() <= 0:  # partly behind the camera
+        # partly behind the camera
+        if (self.vertices @ view.R[2] + view.t[2]).min() <= 0:
             return np.ones((H, W), dtype=bool)
-        pixels = np.clip(np.floor(view.project(self.vertices)), -9999, 9999).astype(np.int32)
+        pixels = np.clip(np.floor(view.project(self.vertices)), -9999, 9999).astype(
+            np.int32
+        )
         edges = np.zeros((H, W), np.uint8)
         inside = ((pixels >= 0) & (pixels < [W, H])).all(axis=1)
         edges[pixels[inside, 1], pixels[inside, 0]] = 1
         corners = pixels[self.appearance.faces]
-        a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+        a = corners[:, 0]
+        b = corners[:, 1]
+        c = corners[:, 2]
         size = np.maximum(np.maximum(a, b), c) - np.minimum(np.minimum(a, b), c)
         long = (size > 1).any(axis=1)  # others are within a pixel of their corners
         cv2.polylines(edges, list(corners[long]), True, 1)
@@ -255,13 +296,22 @@ class PosedCharacter:
         return face, light
 
     def _shade(
-        self, eye: Floats, ray: Floats, face: Ints, bary: Floats, disc: Floats, spacing: float
+        self,
+        eye: Floats,
+        ray: Floats,
+        face: Ints,
+        bary: Floats,
+        disc: Floats,
+        spacing: float,
     ) -> Floats:
         """Linear light of surface points: sun with cast shadow, sky and ground, highlight."""
-        looks, light = self.appearance, self.light
+        looks = self.appearance
+        light = self.light
         corners = self.attributes[looks.faces[face]]
         here = _blend(bary, corners)
-        point, normal, uv = here[:, :3], _unit(here[:, 3:6]), here[:, 8:10]
+        point = here[:, :3]
+        normal = _unit(here[:, 3:6])
+        uv = here[:, 8:10]
         # from the flat face to the smooth surface (Hanika 2021): no facets in shadows
         depth = ((point[:, None] - corners[:, :, :3]) * corners[:, :, 3:6]).sum(axis=2)
         lifted = point - _blend(bary * np.minimum(depth, 0), corners[:, :, 3:6])
@@ -279,37 +329,53 @@ class PosedCharacter:
         flat = self.flat[face]
         inside = _dot(flat, ray)[:, 0] > 0  # the back of cloth is lit on its own side
         side = np.where(inside, np.float32(-1), np.float32(1))[:, None]
-        normal, flat = normal * side, flat * side
+        normal = normal * side
+        flat = flat * side
         lifted = np.where(inside[:, None], point, lifted)
-        sun, sky, ground = (np.array(c, np.float32) for c in (light.sun, light.sky, light.ground))
+        sun = np.array(light.sun, np.float32)
+        sky = np.array(light.sky, np.float32)
+        ground = np.array(light.ground, np.float32)
         up = 0.5 + 0.5 * normal[:, 2:]
         seen = np.where(inside, here[:, 7], here[:, 6])[:, None]
         out = colour * (seen * (ground + (sky - ground) * up))
         towards = _unit(np.array([light.direction], np.float32))
-        across = _unit(np.cross(towards, np.eye(3, dtype=np.float32)[np.abs(towards).argmin()]))
-        d = _unit(towards + disc[:, :1] * across + disc[:, 1:] * np.cross(towards, across))
+        across = _unit(
+            np.cross(towards, np.eye(3, dtype=np.float32)[np.abs(towards).argmin()])
+        )
+        d = _unit(
+            towards + disc[:, :1] * across + disc[:, 1:] * np.cross(towards, across)
+        )
         facing = _dot(normal, d)[:, 0]
         k = np.flatnonzero(facing > 0)
         start = lifted[k] + np.float32(SHADOW_OFFSET) * flat[k]
         k = k[~self.tracer.blocked(start, d[k])]
         shine = light.shine + light.gloss * looks.glossy[face[k], None]
-        lobe = np.maximum(_dot(normal[k], _unit(d[k] - ray[k])), 0) ** np.float32(SHININESS)
+        lobe = np.maximum(_dot(normal[k], _unit(d[k] - ray[k])), 0) ** np.float32(
+            SHININESS
+        )
         out[k] += (colour[k] + shine * lobe) * facing[k, None] * sun
         return out
 
     def _sky(self, X: Floats, N: Floats) -> Floats:
         """``[V, 2]`` share of the sky's and ground's light that arrives, outside and inside."""
-        i = np.arange(SKY_RAYS) + 0.5  # a Fibonacci sphere, always the same: nothing flickers
-        z, turn = 1 - 2 * i / SKY_RAYS, np.pi * (1 + 5**0.5) * i
+        # a Fibonacci sphere, always the same: nothing flickers
+        i = np.arange(SKY_RAYS) + 0.5
+        z = 1 - 2 * i / SKY_RAYS
+        turn = np.pi * (1 + 5**0.5) * i
         ring = np.sqrt(1 - z * z)
-        sphere = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1).astype(np.float32)
-        sky, ground = np.mean(self.light.sky), np.mean(self.light.ground)
+        sphere = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1).astype(
+            np.float32
+        )
+        sky = np.mean(self.light.sky)
+        ground = np.mean(self.light.ground)
         arrived, all_of_it = np.zeros((2, len(X), 2), np.float32)
         rows = np.arange(len(X))
         for d in sphere:
             cosine = N @ d
             inside = (cosine < 0).astype(np.int64)
-            weight = np.abs(cosine) * np.float32(ground + (sky - ground) * (0.5 + 0.5 * d[2]))
+            weight = np.abs(cosine) * np.float32(
+                ground + (sky - ground) * (0.5 + 0.5 * d[2])
+            )
             start = X + np.float32(SKY_OFFSET) * np.sign(cosine)[:, None] * N
             free = ~self.tracer.blocked(start, np.tile(d, (len(X), 1)))
             all_of_it[rows, inside] += weight
@@ -321,7 +387,9 @@ class PosedCharacter:
 def majority(part: Ints, classes: int) -> Ints:
     """``[n]`` most frequent part of ``[n, rays]``; 0 where more than half the rays miss."""
     slot = np.arange(len(part))[:, None] * classes + part
-    votes = np.bincount(slot.ravel(), minlength=len(part) * classes).reshape(-1, classes)
+    votes = np.bincount(slot.ravel(), minlength=len(part) * classes).reshape(
+        -1, classes
+    )
     solid = 2 * votes[:, 0] <= part.shape[1]
     return np.where(solid, votes[:, 1:].argmax(axis=1) + 1, 0)
 

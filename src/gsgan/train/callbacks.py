@@ -31,10 +31,13 @@ class ImageGrid(Callback):
     ``folder/step_000000.png`` with ``rows`` images spread over the validation frames."""
 
     def __init__(self, folder: Path, rows: int = 4) -> None:
-        self.folder, self.rows = folder, rows
+        self.folder = folder
+        self.rows = rows
         self._collected: list[dict[str, Tensor]] = []
 
-    def on_validation_epoch_start(self, trainer: Trainer, module: LightningModule) -> None:
+    def on_validation_epoch_start(
+        self, trainer: Trainer, module: LightningModule
+    ) -> None:
         self._collected = []
 
     def on_validation_batch_end(
@@ -47,12 +50,20 @@ class ImageGrid(Callback):
         dataloader_idx: int = 0,
     ) -> None:
         stride = max(1, int(sum(trainer.num_val_batches)) // max(1, self.rows))
-        if trainer.is_global_zero and batch_idx % stride == 0 and len(self._collected) < self.rows:
+        if (
+            trainer.is_global_zero
+            and batch_idx % stride == 0
+            and len(self._collected) < self.rows
+        ):
             self._collected += grid_rows(batch, outputs)[:1]
 
-    def on_validation_epoch_end(self, trainer: Trainer, module: LightningModule) -> None:
+    def on_validation_epoch_end(
+        self, trainer: Trainer, module: LightningModule
+    ) -> None:
         if self._collected:
-            write_grid(self._collected, self.folder / f"step_{_training(module).step:06d}.png")
+            write_grid(
+                self._collected, self.folder / f"step_{_training(module).step:06d}.png"
+            )
 
 
 class ProgressLines(Callback):
@@ -64,13 +75,15 @@ class ProgressLines(Callback):
         self._first = 0
 
     def on_train_start(self, trainer: Trainer, module: LightningModule) -> None:
-        self._clock, self._first = time.monotonic(), _training(module).step
+        self._clock = time.monotonic()
+        self._first = _training(module).step
 
     def on_validation_end(self, trainer: Trainer, module: LightningModule) -> None:
         if not trainer.is_global_zero:
             return
         module = _training(module)
-        step, total = module.step, module.schedule.total
+        step = module.step
+        total = module.schedule.total
         scores = trainer.callback_metrics
         line = f"{step:>6}/{total} {module.schedule.phase(max(0, step - 1)):<12}"
         line += f" held-out PSNR {float(scores['val/psnr']):5.2f} dB"

@@ -40,19 +40,26 @@ class StepOneLoss:
     alpha: float = 0.1
 
     def __call__(
-        self, rendering: Rendering, frame: Frame, background: Tensor | None, head: nn.Conv2d | None
+        self,
+        rendering: Rendering,
+        frame: Frame,
+        background: Tensor | None,
+        head: nn.Conv2d | None,
     ) -> Tensor:
         """The loss of a rendering of ``frame`` over ``background [B, 3, 1, 1]``, None for black;
         ``head`` is the linear readout of F. In full precision, autocast or not."""
         with full_precision(frame.image.device):
             assert rendering.features is not None and rendering.splat_alpha is not None  # noqa: PT018
             assert rendering.colour is not None
-            target, behind = frame.image, frame.image.new_zeros(())
+            target = frame.image
+            behind = frame.image.new_zeros(())
             if background is not None:
                 target = frame.image + (1 - frame.mask) * background
                 behind = (1 - rendering.splat_alpha) * background
             pixels = {"l1": self.l1, "ssim": self.ssim}
-            loss = photometric(rendering.colour + behind, target, unsure=frame.unsure, **pixels)
+            loss = photometric(
+                rendering.colour + behind, target, unsure=frame.unsure, **pixels
+            )
             if head is not None:
                 # The bias is weighted by alpha, so that the readout commutes with blending. One
                 # product, because a convolution with few channels is slower on a CPU.
@@ -64,13 +71,19 @@ class StepOneLoss:
                 )
             if background is None and self.alpha:
                 matte = photometric(
-                    rendering.splat_alpha, frame.mask, l1=1.0, ssim=0.0, unsure=frame.unsure
+                    rendering.splat_alpha,
+                    frame.mask,
+                    l1=1.0,
+                    ssim=0.0,
+                    unsure=frame.unsure,
                 )
                 loss = loss + self.alpha * matte
             return loss
 
 
-def discriminate(discriminator: Discriminator, image: Tensor, gan: str) -> list[list[Tensor]]:
+def discriminate(
+    discriminator: Discriminator, image: Tensor, gan: str
+) -> list[list[Tensor]]:
     """The discriminator's maps of an image; in full precision where the GAN's form compares two
     images, since bf16 rounds away small differences."""
     if gan not in COMPARING:
@@ -93,7 +106,8 @@ class DiscriminatorMaps:
     def __init__(
         self, discriminator: Discriminator, image: Tensor, target: Tensor, gan: str
     ) -> None:
-        self.image, self.gan = image, gan
+        self.image = image
+        self.gan = gan
         # a leaf, so that neither loss reaches the other's parameters
         self.copy = image.detach().requires_grad_(image.requires_grad)
         with torch.enable_grad():
@@ -104,9 +118,13 @@ class DiscriminatorMaps:
         """The generator's terms by name, weighted; a term of weight 0 is left out."""
         terms = {}
         if adversarial:
-            terms["adversarial"] = adversarial * generator_loss(self.real, self.fake, self.gan)
+            terms["adversarial"] = adversarial * generator_loss(
+                self.real, self.fake, self.gan
+            )
         if matching:
-            terms["feature_matching"] = matching * feature_matching(self.real, self.fake)
+            terms["feature_matching"] = matching * feature_matching(
+                self.real, self.fake
+            )
         found = _Through.apply(self.image, (self.copy, list(terms.values())))
         return dict(zip(terms, found, strict=True))
 
@@ -125,7 +143,9 @@ class _Through(torch.autograd.Function):
     """Terms of a copy of an image as terms of the image; parameters on the way get no gradient."""
 
     @staticmethod
-    def forward(ctx: Any, image: Tensor, path: tuple[Tensor, list[Tensor]]) -> tuple[Tensor, ...]:
+    def forward(
+        ctx: Any, image: Tensor, path: tuple[Tensor, list[Tensor]]
+    ) -> tuple[Tensor, ...]:
         # in a tuple, which hides them from autograd: it would follow them as well
         ctx.copy, ctx.terms = path
         terms = ctx.terms
@@ -195,13 +215,15 @@ class StepTwoLoss:
             maps: the discriminator's maps; None before the GAN starts.
             step: the iteration, for ``perceptual_every``.
         """
-        image, alpha = rendering.image, rendering.alpha
+        image = rendering.image
+        alpha = rendering.alpha
         assert image is not None and alpha is not None  # noqa: PT018
         target = without_unsure(frame.image, image, frame.unsure)
         by_pixel = partial(photometric, l1=self.l1, l2=self.l2, ssim=self.ssim)
         terms = {"photometric": by_pixel(image, target)}
         if self.alpha:
-            white, truth = image + 1 - alpha, frame.image + 1 - frame.mask
+            white = image + 1 - alpha
+            truth = frame.image + 1 - frame.mask
             terms["alpha"] = self.alpha * by_pixel(white, truth, unsure=frame.unsure)
         if anchor is not None:
             terms["anchor"] = self.anchor * anchor

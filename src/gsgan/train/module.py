@@ -20,7 +20,13 @@ from gsgan.model.discriminator import Discriminator
 from gsgan.model.rendering import Rendering
 from gsgan.scene import Frame
 from gsgan.train.losses import DiscriminatorMaps, StepOneLoss, StepTwoLoss
-from gsgan.train.optimisers import MovingAverage, Recipe, check_recipes, clip, parameter_groups
+from gsgan.train.optimisers import (
+    MovingAverage,
+    Recipe,
+    check_recipes,
+    clip,
+    parameter_groups,
+)
 from gsgan.train.rollback import Rollback, SkippedSteps, likely_cause, save_batch
 from gsgan.train.schedule import SEGMENTATION, SPLATTING, STEP_ONE, Schedule
 from gsgan.utils.checks import at_least
@@ -78,9 +84,12 @@ class AvatarTraining(LightningModule):
     ) -> None:
         super().__init__()
         self.automatic_optimization = False
-        self.avatar, S = avatar, avatar.segmentation
+        self.avatar = avatar
+        S = avatar.segmentation
         generates = avatar.generator is not None
-        self.discriminator = discriminator if generates and step_two.adversarial_terms else None
+        self.discriminator = (
+            discriminator if generates and step_two.adversarial_terms else None
+        )
         needed = generates and bool(step_two.perceptual) and perceptual is not None
         self.perceptual = perceptual() if needed else None  # type: ignore[misc]
         self.extra_losses = nn.ModuleDict(extra_losses or {})
@@ -90,19 +99,27 @@ class AvatarTraining(LightningModule):
             splats=avatar.splats is not None,
             generator=generates,
         )
-        self.recipes, self.step_one, self.step_two = recipes, step_one, step_two
-        self.pose_noise, self.seed = pose_noise, seed
+        self.recipes = recipes
+        self.step_one = step_one
+        self.step_two = step_two
+        self.pose_noise = pose_noise
+        self.seed = seed
         self.log_every = at_least("training.log_every", log_every, 1)
         self.skipped = SkippedSteps(max_skipped, skip_window)
         self.rollback = rollback or Rollback()
-        self.record, self.scene = record or {}, scene
-        self.average = None if average is None else MovingAverage(avatar, average, average_every)
+        self.record = record or {}
+        self.scene = scene
+        self.average = (
+            None if average is None else MovingAverage(avatar, average, average_every)
+        )
         # Step I over a random colour, so that black clothes do not become transparent.
         self.random_background = avatar.effects.random_background.on
         reads = step_one.feature_head and avatar.splat_channels > 3
         self.feature_head = nn.Conv2d(avatar.splat_channels, 3, 1) if reads else None
-        self.step = 0  # iterations done: Lightning's global_step counts every optimiser's steps
-        self.code: list[str] = []  # commits of the code, several where a run was resumed
+        # iterations done: Lightning's global_step counts every optimiser's steps
+        self.step = 0
+        # commits of the code, several where a run was resumed
+        self.code: list[str] = []
         self.seconds_before = 0.0  # of earlier parts of the run
         self._began: float | None = None
 
@@ -142,7 +159,8 @@ class AvatarTraining(LightningModule):
         self._began = time.monotonic()
 
     def on_train_end(self) -> None:
-        self.seconds_before, self._began = self.train_seconds, None
+        self.seconds_before = self.train_seconds
+        self._began = None
 
     # -- one iteration
 
@@ -155,7 +173,8 @@ class AvatarTraining(LightningModule):
             )
         window = self.avatar.window(frame.skeleton, frame.camera)
         frame = frame if window is None else window.frame(frame)
-        phase, self._frame = self.schedule.phase(self.step), frame
+        phase = self.schedule.phase(self.step)
+        self._frame = frame
         if phase == SEGMENTATION:
             self._train_segmentation(frame)
         elif phase == STEP_ONE:
@@ -176,7 +195,8 @@ class AvatarTraining(LightningModule):
             return
         loss = self.step_one_loss(rendering, frame)
         self._descend({"step_one/loss": loss}, *self._splatting())
-        if self.average is not None and self.avatar.generator is None:  # this is its last step
+        # this is its last step
+        if self.average is not None and self.avatar.generator is None:
             self.average.update(self.avatar, self.step)
 
     def _train_step_two(self, frame: Frame) -> None:
@@ -185,7 +205,9 @@ class AvatarTraining(LightningModule):
             return
         maps = None
         if self.discriminator is not None and self.schedule.adversarial(self.step):
-            maps = self.step_two.discriminator_maps(self.discriminator, rendering, frame)
+            maps = self.step_two.discriminator_maps(
+                self.discriminator, rendering, frame
+            )
             self.rollback.watch(logits=maps.difference)
         terms = self.step_two_terms(rendering, frame, maps)
         losses = {f"step_two/{name}": term for name, term in terms.items()}
@@ -203,7 +225,10 @@ class AvatarTraining(LightningModule):
             supersample=self.schedule.fine(self.step),
         )
         if rendering.splat_alpha is not None and rendering.colour is not None:
-            seen = {"alpha": rendering.splat_alpha, "colour": rendering.colour.detach().abs()}
+            seen = {
+                "alpha": rendering.splat_alpha,
+                "colour": rendering.colour.detach().abs(),
+            }
             self.rollback.watch(**seen, mask=frame.mask)
         return rendering
 
@@ -211,7 +236,9 @@ class AvatarTraining(LightningModule):
 
     def step_one_loss(self, rendering: Rendering, frame: Frame) -> Tensor:
         """L_Ψ of Step I's colour, and of the linear readout of F."""
-        return self.step_one(rendering, frame, self._background(frame), self.feature_head)
+        return self.step_one(
+            rendering, frame, self._background(frame), self.feature_head
+        )
 
     def step_two_terms(
         self, rendering: Rendering, frame: Frame, maps: DiscriminatorMaps | None
@@ -227,7 +254,9 @@ class AvatarTraining(LightningModule):
             maps=maps,
             step=self.step,
         )
-        return terms | {name: loss(rendering, frame) for name, loss in self.extra_losses.items()}
+        return terms | {
+            name: loss(rendering, frame) for name, loss in self.extra_losses.items()
+        }
 
     # -- optimisers
 
@@ -239,7 +268,9 @@ class AvatarTraining(LightningModule):
 
     def _optimisers(self) -> dict[str, Any]:
         found = self.optimizers()
-        return dict(zip(self._names, found if isinstance(found, list) else [found], strict=True))
+        return dict(
+            zip(self._names, found if isinstance(found, list) else [found], strict=True)
+        )
 
     def _splatting(self) -> list[str]:
         """The optimisers of the parts that make Step I's image."""
@@ -248,7 +279,8 @@ class AvatarTraining(LightningModule):
     def _computed(self, compute: Callable[[], T]) -> T | None:
         """The result, or None in every process where one cannot compute it: where data or weights
         are not finite, or far away, the rasteriser refuses them with a ValueError."""
-        found, problem = None, ""
+        found = None
+        problem = ""
         try:
             found = compute()
         except ValueError as error:
@@ -269,7 +301,8 @@ class AvatarTraining(LightningModule):
             name: [p for group in optimiser.param_groups for p in group["params"]]
             for name, optimiser in self._optimisers().items()
         }
-        cause, count = likely_cause(self._frame, held, losses, problem), self.skipped.count
+        cause = likely_cause(self._frame, held, losses, problem)
+        count = self.skipped.count
         if stop:
             raise self._stopped(
                 f"{count} were skipped; likely cause: {cause}; correct it, or go on with a larger "
@@ -281,7 +314,10 @@ class AvatarTraining(LightningModule):
 
     def _stopped(self, why: str) -> GsganError:
         """The error that ends a run, with the batch saved."""
-        path = Path(self.trainer.default_root_dir) / f"stopped_{self.trainer.global_rank}.pt"
+        path = (
+            Path(self.trainer.default_root_dir)
+            / f"stopped_{self.trainer.global_rank}.pt"
+        )
         save_batch(path, self.step, self._frame, why)
         return GsganError(
             f"training stopped at iteration {self.step}: {why} (its batch: {path}; the last good "
@@ -320,7 +356,9 @@ class AvatarTraining(LightningModule):
     def on_train_epoch_end(self) -> None:
         """Restores the last good state when the person has vanished, before it is saved."""
         # over all processes, so that they decide alike
-        what = self.rollback.problem(partial(self.trainer.strategy.reduce, reduce_op="mean"))
+        what = self.rollback.problem(
+            partial(self.trainer.strategy.reduce, reduce_op="mean")
+        )
         if not what:
             if what is not None:
                 self.rollback.keep(self)
@@ -338,13 +376,18 @@ class AvatarTraining(LightningModule):
 
     # -- randomness: from (seed, iteration), so that resuming changes nothing
 
-    def _random(self, draw: Callable[..., Tensor], salt: int, size: int, *shape: int) -> Tensor:
+    def _random(
+        self, draw: Callable[..., Tensor], salt: int, size: int, *shape: int
+    ) -> Tensor:
         """``[size, *shape]`` this process's rows of numbers drawn for the batches of all processes,
         so that several processes draw what one with the whole batch would."""
         state = (self.seed * SEED_STRIDE + self.step) * 64 + salt
-        ranks, rank = self.processes, 0 if self._trainer is None else self.trainer.global_rank
+        ranks = self.processes
+        rank = 0 if self._trainer is None else self.trainer.global_rank
         generator = torch.Generator().manual_seed(state % (2**63))
-        return draw((ranks * size, *shape), generator=generator)[rank * size : (rank + 1) * size]
+        return draw((ranks * size, *shape), generator=generator)[
+            rank * size : (rank + 1) * size
+        ]
 
     def _background(self, frame: Frame) -> Tensor | None:
         if not self.random_background:
@@ -354,7 +397,9 @@ class AvatarTraining(LightningModule):
     def _pose_noise(self, skeleton: Tensor) -> Tensor | None:
         if not self.pose_noise:
             return None
-        return self.pose_noise * self._random(torch.randn, 1, *skeleton.shape).to(skeleton)
+        return self.pose_noise * self._random(torch.randn, 1, *skeleton.shape).to(
+            skeleton
+        )
 
     def _crop_draws(self, images: int) -> Tensor | None:
         """Random numbers that place the perceptual loss's crops; None without crops."""
@@ -368,7 +413,10 @@ class AvatarTraining(LightningModule):
         self, frame: Frame, batch_idx: int
     ) -> Rendering:
         rendering: Rendering = self.shown(*frame.inputs)
-        for name, image in (("psnr", rendering.image), ("psnr_splat", rendering.colour)):
+        for name, image in (
+            ("psnr", rendering.image),
+            ("psnr_splat", rendering.colour),
+        ):
             if image is not None:
                 score = psnr(image.clamp(0, 1), frame.image).clamp_max(PSNR_CAP).mean()
                 self.log(f"val/{name}", score, batch_size=len(frame), sync_dist=True)

@@ -37,10 +37,16 @@ class Recipe:
     def __post_init__(self) -> None:
         one_of("training.recipes: span", self.span, ("both", "step_one"))
 
-    def build(self, groups: Iterable[tuple[list[nn.Parameter], float]]) -> torch.optim.Adam:
+    def build(
+        self, groups: Iterable[tuple[list[nn.Parameter], float]]
+    ) -> torch.optim.Adam:
         """Adam over groups of (parameters, rate multiplier)."""
         return torch.optim.Adam(
-            [{"params": p, "lr": self.rate.peak * k, "multiplier": k} for p, k in groups if p],
+            [
+                {"params": p, "lr": self.rate.peak * k, "multiplier": k}
+                for p, k in groups
+                if p
+            ],
             betas=tuple(self.betas),  # type: ignore[arg-type]
             eps=self.eps,
             fused=True,
@@ -75,13 +81,17 @@ def check_recipes(recipes: dict[str, Recipe], names: Iterable[str]) -> None:
         if name not in recipes:
             raise ConfigError(f"training.recipes lacks {name}")
         if name not in SPLATTING and recipes[name].span != "both":
-            raise ConfigError(f"training.recipes.{name}.span is read for psi and colour only")
+            raise ConfigError(
+                f"training.recipes.{name}.span is read for psi and colour only"
+            )
 
 
 def clip(optimiser: torch.optim.Optimizer, largest: float | None) -> Tensor:
     """Clips all gradients together and returns their norm before clipping."""
     parameters = [p for group in optimiser.param_groups for p in group["params"]]
-    return nn.utils.clip_grad_norm_(parameters, float("inf") if largest is None else largest)
+    return nn.utils.clip_grad_norm_(
+        parameters, float("inf") if largest is None else largest
+    )
 
 
 class MovingAverage(nn.Module):
@@ -96,7 +106,8 @@ class MovingAverage(nn.Module):
         super().__init__()
         between("training.average", decay, 0, 1)
         at_least("training.average_every", every, 1)
-        self.decay, self.every = decay**every, every
+        self.decay = decay**every
+        self.every = every
         self.copy = AveragedModel(module, multi_avg_fn=self._blend)
         self.copy.requires_grad_(False)
 

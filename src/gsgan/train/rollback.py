@@ -16,7 +16,8 @@ from gsgan.utils.files import write_atomically, writing
 
 FARTHEST = 1e6  # a weight beyond it has exploded
 BRIGHTEST = 10.0  # mean of an image whose ground truth is within 0 and 1, likewise
-SAME = 1e-7  # mean difference of a discriminator's logits that no longer follow the image
+# mean difference of a discriminator's logits that no longer follow the image
+SAME = 1e-7
 
 
 @dataclass
@@ -64,7 +65,9 @@ class Rollback:
             # non-finite values are left to the gradients' check
             self.means[name] = torch.where(torch.isfinite(now), mixed, before)
 
-    def problem(self, over_ranks: Callable[[Tensor], Tensor] = lambda value: value) -> str | None:
+    def problem(
+        self, over_ranks: Callable[[Tensor], Tensor] = lambda value: value
+    ) -> str | None:
         """What has collapsed, by means over all ranks: "" for nothing; None for a state that is not
         good enough to be kept."""
         if not self.means:
@@ -74,7 +77,9 @@ class Rollback:
         means = dict(zip(names, over_ranks(held).tolist(), strict=True))
         share = means["alpha"] / means["mask"] if means.get("mask") else float("inf")
         if share < self.collapse:
-            return f"the rendered person has vanished (alpha is {share:.1%} of the masks')"
+            return (
+                f"the rendered person has vanished (alpha is {share:.1%} of the masks')"
+            )
         if (mean := means.get("colour", 0.0)) > BRIGHTEST:
             return f"Ψ has exploded (its colours are {mean:.3g} in the mean, images within 0 and 1)"
         if means.get("logits", 1.0) < SAME:
@@ -85,7 +90,9 @@ class Rollback:
         """Keeps a copy of the state."""
         self._state = {k: v.detach().clone() for k, v in module.state_dict().items()}
 
-    def restore(self, module: nn.Module, optimisers: Sequence[torch.optim.Optimizer]) -> bool:
+    def restore(
+        self, module: nn.Module, optimisers: Sequence[torch.optim.Optimizer]
+    ) -> bool:
         """Restores the last good state; False where there is none, or after too many times."""
         if self._state is None or self.done >= self.most:
             return False
@@ -101,7 +108,8 @@ class SkippedSteps:
     """Counts skipped iterations; ``most`` within ``window`` are too many."""
 
     def __init__(self, most: int, window: int) -> None:
-        self.most, self.window = most, window
+        self.most = most
+        self.window = window
         self.steps: deque[int] = deque()  # within the window
 
     def add(self, step: int) -> bool:
@@ -136,7 +144,9 @@ def likely_cause(
     if bad := _not_finite(asdict(frame)):
         return f"{', '.join(bad)} of the data is not finite ({items}, counted from 0)"
     for name, held in parameters.items():
-        largest = max((float(p.detach().abs().max()) for p in held if p.numel()), key=_or_infinite)
+        largest = max(
+            (float(p.detach().abs().max()) for p in held if p.numel()), key=_or_infinite
+        )
         if not _or_infinite(largest) <= FARTHEST:
             return (
                 f"the weights of {name} have exploded (up to {largest:.3g}): resume from the last "

@@ -42,7 +42,12 @@ from gsgan.model.stored import CHECKPOINT, read_checkpoint, record
 from gsgan.motion.clip import FPS
 from gsgan.scene import BodyPose
 from gsgan.splat import resolve_backend
-from gsgan.train.callbacks import AtomicCheckpoints, ImageGrid, ProgressLines, StopOnSignal
+from gsgan.train.callbacks import (
+    AtomicCheckpoints,
+    ImageGrid,
+    ProgressLines,
+    StopOnSignal,
+)
 from gsgan.train.module import AvatarTraining
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import whole
@@ -56,7 +61,8 @@ from gsgan.utils.sweeps import STOPPED
 STEP_PER_RENDERING = 10
 DISCRIMINATOR_SALT = 1000
 PAGE = "avatar.html"
-LOCAL_RANKS = ("LOCAL_RANK", "SLURM_LOCALID")  # what launchers call a process' rank on its machine
+# what launchers call a process' rank on its machine
+LOCAL_RANKS = ("LOCAL_RANK", "SLURM_LOCALID")
 POSES = 100  # at most, whose spread is stored: all are posed at once
 
 
@@ -71,13 +77,19 @@ def run_training(config: DictConfig) -> None:
     folder = Path(HydraConfig.get().runtime.output_dir)
     _quiet_lightning()
     stop = StopOnSignal()
-    torch.set_flush_denormal(True)  # black background decays into denormals: slow on CPUs
+    # black background decays into denormals: slow on CPUs
+    torch.set_flush_denormal(True)
     if config.evaluate:
-        build_lpips(config.lpips.nets, config.lpips.path)  # fails now, not after hours of training
+        # fails now, not after hours of training
+        build_lpips(config.lpips.nets, config.lpips.path)
 
     data, module = build_training(config)
     seed_everything(config.seed, workers=True, verbose=False)
-    resume = checkpoint_to_resume(folder, module.record, module.marks) if config.resume else None
+    resume = (
+        checkpoint_to_resume(folder, module.record, module.marks)
+        if config.resume
+        else None
+    )
     done = 0 if resume is None else int(read_checkpoint(resume)["gsgan"]["step"])
     if resume is None:
         remove_old_results(folder)
@@ -127,7 +139,8 @@ def build_training(config: DictConfig) -> tuple[GsganData, AvatarTraining]:
         data = fit_before_training(data, config.fit, device_of(config))
     avatar = build_avatar(config, data.info, data.labelled("train"))
     _store_poses(avatar, data)
-    torch.manual_seed(config.seed + DISCRIMINATOR_SALT)  # the same start beside every avatar
+    # the same start beside every avatar
+    torch.manual_seed(config.seed + DISCRIMINATOR_SALT)
     with naming_group("training"):
         return data, instantiate(config.training)(
             avatar,
@@ -141,9 +154,12 @@ def _store_poses(avatar: Avatar, data: GsganData) -> None:
     frames = data.splits.items["train"].frames
     frames = [frames[i] for i in evenly_spaced(len(frames), POSES)]
     p, valid = data.dataset("train").skeletons.joints(frames)
-    poses, body = data.layout.poses, None
+    poses = data.layout.poses
+    body = None
     if poses is not None:
-        parts = (np.stack([part[f] for f in frames]) for part in (poses.theta, poses.transl))
+        parts = (
+            np.stack([part[f] for f in frames]) for part in (poses.theta, poses.transl)
+        )
         body = BodyPose(*(torch.from_numpy(x).float() for x in parts))
     avatar.store_poses(p.float(), valid, body)
 
@@ -157,16 +173,26 @@ def start_from(avatar: Avatar, data: GsganData, run: Path) -> None:
         DataError: when the folder holds no run.
     """
     if not isinstance(avatar.deformation, Harmonic):
-        raise ConfigError("distil: only residuals without Ψ start from a run; add model=harmonic")
-    trained, frames = load(run, device="cpu"), data.dataset("train")
-    once = {frame: i for i, (_, frame) in enumerate(frames.items)}.values()  # by one camera each
+        raise ConfigError(
+            "distil: only residuals without Ψ start from a run; add model=harmonic"
+        )
+    trained = load(run, device="cpu")
+    frames = data.dataset("train")
+    # by one camera each
+    once = {frame: i for i, (_, frame) in enumerate(frames.items)}.values()
     poses = (frames[i].inputs for i in once)
     fitted = distilled(trained, ((p, seen, body) for p, seen, _, body, _ in poses))
-    state, own = {"rest_points": fitted.rest_points, **fitted.state_dict()}, avatar.state_dict()
+    state = {"rest_points": fitted.rest_points, **fitted.state_dict()}
+    own = avatar.state_dict()
     own["rest_points"] = avatar.rest_points
     alike = all(x.shape == own[name].shape for name, x in state.items() if name in own)
-    if not (alike and torch.allclose(state.pop("rest_points"), avatar.rest_points, atol=1e-3)):
-        raise ConfigError(f"distil: {run} has other Gaussians; give its data, size and effects")
+    if not (
+        alike
+        and torch.allclose(state.pop("rest_points"), avatar.rest_points, atol=1e-3)
+    ):
+        raise ConfigError(
+            f"distil: {run} has other Gaussians; give its data, size and effects"
+        )
     avatar.load_state_dict(state, strict=False)
 
 
@@ -187,7 +213,12 @@ def _is_written(path: Path, checkpoint: Path) -> bool:
 
 def _write_page(folder: Path, data: GsganData) -> None:
     """Writes the web page, with the training poses as its motion."""
-    given = {"run": str(folder), "format": "html", "out": str(folder / PAGE), "overwrite": True}
+    given = {
+        "run": str(folder),
+        "format": "html",
+        "out": str(folder / PAGE),
+        "overwrite": True,
+    }
     given |= {"motion": "train", "fps": data.layout.meta.fps or FPS}
     export_config(cast(DictConfig, OmegaConf.merge(defaults_of("export"), given)))
 
@@ -213,7 +244,8 @@ def _fit(
             f"hydra.run.dir={folder} resumes from its last checkpoint",
             soft_wrap=True,
         )
-        raise SystemExit(error.code or 128 + SIGTERM) from None  # Lightning ends a SIGTERM with 0
+        # Lightning ends a SIGTERM with 0
+        raise SystemExit(error.code or 128 + SIGTERM) from None
 
 
 def _evaluate(
@@ -247,13 +279,16 @@ def _evaluate(
 def training_record(config: DictConfig, data: GsganData) -> dict[str, Any]:
     """What must not change when a run is resumed: the settings, and the poses that `gsgan.fit`
     made, whose file may be overwritten under the same name."""
-    settings, poses = record(config), data.layout.poses
+    settings = record(config)
+    poses = data.layout.poses
     if poses is not None and poses.fitted:
         settings["fitted poses"] = poses.digest(data.layout.frames)
     return settings
 
 
-def checkpoint_to_resume(folder: Path, now: Mapping[str, Any], marks: list[str]) -> Path | None:
+def checkpoint_to_resume(
+    folder: Path, now: Mapping[str, Any], marks: list[str]
+) -> Path | None:
     """The checkpoint of an earlier part of this run, or None, given its `training_record` now.
 
     Raises:
@@ -283,7 +318,11 @@ def _differences(before: Any, now: Any, at: str = "") -> list[str]:
     if isinstance(before, dict) and isinstance(now, dict):
         keys = sorted(before.keys() | now.keys(), key=str)
         pairs = [(k, before.get(k), now.get(k)) for k in keys]
-        return [d for k, a, b in pairs for d in _differences(a, b, f"{at}.{k}" if at else str(k))]
+        return [
+            d
+            for k, a, b in pairs
+            for d in _differences(a, b, f"{at}.{k}" if at else str(k))
+        ]
     return [] if before == now else [at]
 
 
@@ -316,7 +355,8 @@ def remove_old_results(folder: Path) -> None:
     for scores in folder.glob("on_*/*"):  # on another background
         if scores.name in NAMES:
             scores.unlink()
-    for logs in ("logs", "logs_[0-9]*"):  # else their curves would be shown as the new run's
+    # else their curves would be shown as the new run's
+    for logs in ("logs", "logs_[0-9]*"):
         for log in folder.glob(f"{logs}/metrics.csv"):
             log.unlink()
 
@@ -357,18 +397,26 @@ def build_trainer(
 
 
 def describe(
-    console: Console, folder: Path, config: DictConfig, data: GsganData, module: AvatarTraining
+    console: Console,
+    folder: Path,
+    config: DictConfig,
+    data: GsganData,
+    module: AvatarTraining,
 ) -> None:
     """Prints the data, the parts with their sizes, the effects and the stand-ins in use."""
-    info, avatar = data.info, module.avatar
-    held_out = ", ".join(f"{len(data.dataset(name))} {name}" for name in data.eval_names)
+    info = data.info
+    avatar = module.avatar
+    held_out = ", ".join(
+        f"{len(data.dataset(name))} {name}" for name in data.eval_names
+    )
     table = Table(title=f"gsgan: {folder}", show_header=False)
     table.add_row(
         "data",
         f"{len(data.dataset('train'))} training images: {info.n_train_cameras} cameras, "
         f"{info.frames} frames; held out: {held_out}",
     )
-    processes, megabytes = data.loading_processes, data.cache_mb / data.loading_processes
+    processes = data.loading_processes
+    megabytes = data.cache_mb / data.loading_processes
     each = "" if processes == 1 else f" in each of {processes} loading processes"
     table.add_row("cache of images", f"{megabytes:,.0f} MB{each} (data.cache_mb)")
     plain = getattr(avatar.deformation, "from_normal", avatar) is None
@@ -383,15 +431,21 @@ def describe(
     }
     for name, part in parts.items():
         if part is not None:
-            table.add_row(name, f"{sum(p.numel() for p in part.parameters()):,} parameters")
+            table.add_row(
+                name, f"{sum(p.numel() for p in part.parameters()):,} parameters"
+            )
     if module.perceptual is not None:
         every = module.step_two.perceptual_every
         when = "every iteration" if every == 1 else f"every {every} iterations"
-        table.add_row("perceptual loss", f"{module.perceptual.description}; {when} of Step II")
+        table.add_row(
+            "perceptual loss", f"{module.perceptual.description}; {when} of Step II"
+        )
     if avatar.segmentation is None:
         table.add_row("segmentation S", f"not built: {avatar.segmentation_why}")
     else:
-        source = "part labels" if info.has_labels else "masks: the data has no part labels"
+        source = (
+            "part labels" if info.has_labels else "masks: the data has no part labels"
+        )
         table.add_row("", f"{avatar.segmentation_why}; S learns from {source}")
     if avatar.splats is not None:
         backend = resolve_backend(avatar.backend, device_of(config), avatar.accuracy)[0]
@@ -399,7 +453,8 @@ def describe(
     table.add_row("precision", _precision(str(config.trainer.precision)))
     s = module.schedule
     table.add_row(
-        "schedule", f"segmentation {s.segmentation}, Step I {s.step_one}, Step II {s.step_two}"
+        "schedule",
+        f"segmentation {s.segmentation}, Step I {s.step_one}, Step II {s.step_two}",
     )
     console.print(table)
     for mark in module.marks:
@@ -423,5 +478,7 @@ def _quiet_lightning() -> None:
         logging.getLogger(name).setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", message=".*does not have many workers.*")
     warnings.filterwarnings("ignore", message=".*Checkpoint directory .* exists.*")
-    warnings.filterwarnings("ignore", message=".*is smaller than the logging interval.*")
+    warnings.filterwarnings(
+        "ignore", message=".*is smaller than the logging interval.*"
+    )
     warnings.filterwarnings("ignore", message=".*isinstance.treespec, LeafSpec.*")

@@ -8,10 +8,13 @@ from dataclasses import dataclass, replace
 from gsgan.utils.checks import above, at_least, between, one_of
 from gsgan.utils.errors import ConfigError
 
-SEGMENTATION, STEP_ONE, STEP_TWO = "segmentation", "step I", "step II"
+SEGMENTATION = "segmentation"
+STEP_ONE = "step I"
+STEP_TWO = "step II"
 STRETCHED = ("step_one", "step_two", "discriminator_start", "degree_every", "coarse")
 SPLATTING = ("psi", "colour")  # optimisers of the parts that make Step I's image
-FROM_MASKS = 800  # iterations of S, at most, where two numbers learn from masks (docs/effects.md)
+# iterations of S, at most, where two numbers learn from masks (docs/effects.md)
+FROM_MASKS = 800
 
 
 @dataclass(frozen=True)
@@ -36,7 +39,9 @@ class Schedule:
             at_least(f"training.schedule.{name}", getattr(self, name), 0)
         at_least("training.schedule.epoch", self.epoch, 1)
         if self.total == 0:
-            raise ConfigError("training.schedule: every phase has 0 iterations; nothing to do")
+            raise ConfigError(
+                "training.schedule: every phase has 0 iterations; nothing to do"
+            )
 
     def fitted(
         self, *, segmentation: bool, from_masks: bool, splats: bool, generator: bool
@@ -47,10 +52,14 @@ class Schedule:
         without splats the other way round, so that every variant trains equally long. S learns only
         two numbers from masks, which needs fewer iterations.
         """
-        numbers = {name: round(getattr(self, name) * self.stretch) for name in STRETCHED}
-        one, two = numbers["step_one"], numbers["step_two"]
+        numbers = {
+            name: round(getattr(self, name) * self.stretch) for name in STRETCHED
+        }
+        one = numbers["step_one"]
+        two = numbers["step_two"]
         if not generator:
-            one, two = one + two, 0
+            one = one + two
+            two = 0
         if not splats:
             one, two = 0, one + two
         most = FROM_MASKS if from_masks else self.segmentation
@@ -79,7 +88,9 @@ class Schedule:
 
     def fine(self, step: int) -> bool:
         """Whether F is supersampled at an iteration: not in the first ``coarse`` of Step I."""
-        return not (self.phase(step) == STEP_ONE and step - self.segmentation < self.coarse)
+        return not (
+            self.phase(step) == STEP_ONE and step - self.segmentation < self.coarse
+        )
 
     def bounds(self, phase: str) -> tuple[int, int]:
         """First iteration of a phase, and the first after it."""
@@ -99,7 +110,8 @@ class Schedule:
         start, end = self.bounds(STEP_TWO)
         if optimiser not in SPLATTING:
             return start, end
-        first, end_one = self.bounds(STEP_ONE)  # restarting the rate in Step II costs quality
+        # restarting the rate in Step II costs quality
+        first, end_one = self.bounds(STEP_ONE)
         return first, end_one if recipe_span == "step_one" else end
 
     @property

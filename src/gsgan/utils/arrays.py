@@ -16,7 +16,10 @@ Ints = NDArray[np.int64]
 
 
 def expect_array(
-    arrays: dict[str, NDArray[Any]], name: str, shape: tuple[int | None, ...], path: Path
+    arrays: dict[str, NDArray[Any]],
+    name: str,
+    shape: tuple[int | None, ...],
+    path: Path,
 ) -> NDArray[Any]:
     """One numeric array of the given shape, None standing for any length.
 
@@ -25,12 +28,17 @@ def expect_array(
     """
     expected = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
     if name not in arrays:
-        raise DataError(f"{path} has no array '{name}'; expected one of shape {expected}")
+        raise DataError(
+            f"{path} has no array '{name}'; expected one of shape {expected}"
+        )
     array = arrays[name]
     if array.ndim != len(shape) or any(
-        due is not None and due != found for due, found in zip(shape, array.shape, strict=True)
+        due is not None and due != found
+        for due, found in zip(shape, array.shape, strict=True)
     ):
-        raise DataError(f"{path}: '{name}' must have shape {expected}, found {array.shape}")
+        raise DataError(
+            f"{path}: '{name}' must have shape {expected}, found {array.shape}"
+        )
     if array.dtype.kind not in "iuf":
         raise DataError(f"{path}: '{name}' must hold numbers, found {array.dtype}")
     return array

@@ -15,7 +15,8 @@ _SCHEMAS = (
     "nms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor",
     "qnms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor",
 )
-_LIBRARIES: list[torch.library.Library] = []  # kept alive: collecting one removes its operators
+# kept alive: collecting one removes its operators
+_LIBRARIES: list[torch.library.Library] = []
 
 
 def declare_torchvision_operators() -> None:

@@ -22,7 +22,8 @@ from gsgan.utils.sweeps import note, run_job
 
 FAILED = 1
 BFLOAT16_SINCE = (8, 0)  # compute capability: before it bfloat16 is emulated or refused
-LONGEST_NAME = 200  # bytes of a sweep's folder; file systems take 255, files beside it need some
+# bytes of a sweep's folder; file systems take 255, files beside it need some
+LONGEST_NAME = 200
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 ASSIGNED = re.compile(r"\+{0,2}[A-Za-z_][\w./@]*")  # the key of an override
 EFFECTS_LIST = re.compile(r"effects=(\[[^\[\]]*\])")
@@ -38,7 +39,9 @@ def config_folder() -> Path:
     for folder in (package / "conf", package.parents[1] / "conf"):
         if (folder / "train.yaml").is_file():
             return folder
-    raise GsganError(f"{package / 'conf'}: the config folder is missing; install gsgan again")
+    raise GsganError(
+        f"{package / 'conf'}: the config folder is missing; install gsgan again"
+    )
 
 
 def defaults_of(command: str) -> DictConfig:
@@ -127,7 +130,9 @@ def entry(name: str, task: Callable[[DictConfig], object] | str) -> Callable[[],
     def main() -> None:
         import hydra  # here: importing an entry point stays fast
 
-        sys.argv[1:] = [quoted(spelled_out(argument, name)) for argument in sys.argv[1:]]
+        sys.argv[1:] = [
+            quoted(spelled_out(argument, name)) for argument in sys.argv[1:]
+        ]
         command = hydra.main(
             version_base="1.3", config_path=str(config_folder()), config_name=name
         )(run)
@@ -227,7 +232,10 @@ def _remove_unused_folder() -> None:
     if subfolder is None:  # the command has no run folder
         return
     folder = Path(settings.runtime.output_dir)
-    if {path.name for path in folder.iterdir()} <= {subfolder, f"{settings.job.name}.log"}:
+    if {path.name for path in folder.iterdir()} <= {
+        subfolder,
+        f"{settings.job.name}.log",
+    }:
         shutil.rmtree(folder)
 
 

@@ -62,7 +62,9 @@ def writing(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise DataError(f"{path} cannot be written ({error.strerror or error})") from None
+        raise DataError(
+            f"{path} cannot be written ({error.strerror or error})"
+        ) from None
 
 
 @contextlib.contextmanager

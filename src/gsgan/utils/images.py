@@ -30,7 +30,9 @@ def background(name: str, video: bool) -> Callable[[tuple[int, int]], Background
     """
     if name == "alpha":
         if video:
-            raise ConfigError("background=alpha needs PNG files: H.264 has no alpha; give a folder")
+            raise ConfigError(
+                "background=alpha needs PNG files: H.264 has no alpha; give a folder"
+            )
         return lambda size: None
     path = Path(name).expanduser()
     if path.is_file():
@@ -38,7 +40,9 @@ def background(name: str, video: bool) -> Callable[[tuple[int, int]], Background
             with Image.open(path) as opened:
                 image = opened.convert("RGB")
         except OSError as error:
-            raise ConfigError(f"background={name} cannot be read as an image ({error})") from None
+            raise ConfigError(
+                f"background={name} cannot be read as an image ({error})"
+            ) from None
         return lambda size: _unit(np.asarray(ImageOps.fit(image, size[::-1])))
     try:
         colour = torch.tensor(ImageColor.getrgb(name)[:3]).float() / 255
@@ -57,9 +61,11 @@ def _unit(image: Bytes) -> Tensor:
 def eight_bits(image: Tensor, alpha: Tensor, behind: Background) -> Bytes:
     """An image ``[3, H, W]`` on black, composited over a background: ``[H, W, 3]``; without a
     background, with straight alpha: ``[H, W, 4]``."""
-    image, alpha = image.clamp(0, 1), alpha.clamp(0, 1)
+    image = image.clamp(0, 1)
+    alpha = alpha.clamp(0, 1)
     if behind is None:
-        shown = alpha >= 0.5 / 255  # elsewhere 8-bit alpha is 0, and colours would be noise
+        # elsewhere 8-bit alpha is 0, and colours would be noise
+        shown = alpha >= 0.5 / 255
         straight = torch.where(shown, image / alpha.clamp_min(1e-6), 0.0).clamp(0, 1)
         image = torch.cat([straight, alpha])
     else:
@@ -69,18 +75,29 @@ def eight_bits(image: Tensor, alpha: Tensor, behind: Background) -> Bytes:
 
 def to_bytes(image: Tensor) -> Bytes:
     """``[H, W, C]`` of an image ``[C, H, W]``, clamped to [0, 1] and rounded to 8 bits."""
-    return (image.detach().cpu().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()
+    return (
+        (image.detach().cpu().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()
+    )
 
 
 def caption(image: Bytes, text: str, colour: tuple[int, int, int]) -> Bytes:
     """The image under a bar of the colour with white text."""
     bar = np.full((BAR, image.shape[1], 3), colour, np.uint8)
     cv2.putText(
-        bar, text, (5, BAR - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (255, 255, 255), 1, cv2.LINE_AA
+        bar,
+        text,
+        (5, BAR - 5),
+        cv2.FONT_HERSHEY_SIMPLEX,
+        0.42,
+        (255, 255, 255),
+        1,
+        cv2.LINE_AA,
     )
     return np.concatenate([bar, image])
 
 
 def encode(image: Bytes) -> bytes:
     """A JPEG of an RGB image."""
-    return cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
+    return cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[
+        1
+    ].tobytes()

@@ -50,7 +50,10 @@ class _Array(np.ndarray):
         shape, dtype, fortran, content = state[-4:]
         objects = dtype.value.hasobject
         content = content if objects else _bytes(content)
-        _expect(isinstance(content, list) or not objects, "an array of objects has no list of them")
+        _expect(
+            isinstance(content, list) or not objects,
+            "an array of objects has no list of them",
+        )
         count = math.prod(shape) * (1 if objects else dtype.value.itemsize)
         _expect(
             min(shape, default=0) >= 0 and len(content) == count,
@@ -63,7 +66,8 @@ class _Array(np.ndarray):
 
 
 def _bytes(content: Any) -> bytes:
-    return content.encode("latin1") if isinstance(content, str) else bytes(content)  # str: Python 2
+    # str: Python 2
+    return content.encode("latin1") if isinstance(content, str) else bytes(content)
 
 
 def _reconstruct(*_class_shape_and_code: Any) -> NDArray[Any]:
@@ -98,7 +102,9 @@ class _Sparse(_Chumpy):
         import scipy.sparse  # here: the import takes long, and few files need it
 
         shape = self.state.get("_shape") or self.state["shape"]
-        _expect(math.prod(shape) * 8 <= LARGEST_ARRAY, f"a sparse matrix of shape {shape}")
+        _expect(
+            math.prod(shape) * 8 <= LARGEST_ARRAY, f"a sparse matrix of shape {shape}"
+        )
         parts = tuple(_array(self.state[key]) for key in ("data", "indices", "indptr"))
         matrix = scipy.sparse.csc_matrix(parts, shape)
         matrix.check_format(full_check=True)
@@ -149,7 +155,9 @@ class _Unpickler(pickle._Unpickler):
 def _load(stream: BinaryIO) -> Any:
     content = _Unpickler(stream, encoding="latin1").load()
     if isinstance(content, dict):
-        return {k: v.array() if isinstance(v, _Chumpy) else v for k, v in content.items()}
+        return {
+            k: v.array() if isinstance(v, _Chumpy) else v for k, v in content.items()
+        }
     return _array(content) if isinstance(content, _Chumpy) else content
 
 
@@ -163,14 +171,17 @@ def _as_data_error(path: Path, what: str) -> Iterator[None]:
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror or error}") from None
     except _Refused as error:
-        name = " ".join(str(error).split())  # of a damaged file: it may have line breaks
+        # of a damaged file: it may have line breaks
+        name = " ".join(str(error).split())
         raise DataError(
             f"{path} asks for {name}, which is not allowed, since a pickle can run code; nothing "
             "was run: save its content as plain arrays with numpy.savez"
         ) from None
     except Exception as error:
         reason = " ".join(str(error).split())[:160] or type(error).__name__
-        raise DataError(f"{path} is not a valid {what} ({reason}); export it again") from None
+        raise DataError(
+            f"{path} is not a valid {what} ({reason}); export it again"
+        ) from None
 
 
 def read_pickle(path: Path) -> Any:
@@ -207,7 +218,9 @@ def read_npz(
             `LARGEST_ARRAY` bytes, or names a class that is not allowed.
     """
     with _as_data_error(path, "npz file"), zipfile.ZipFile(path) as archive:
-        members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+        members = {
+            info.filename.removesuffix(".npy"): info for info in archive.infolist()
+        }
         found = {}
         for name in members if names is None else members.keys() & set(names):
             size = members[name].file_size
@@ -225,4 +238,8 @@ def _read_array(stream: BinaryIO, objects: bool = True) -> Any:
     if not objects:
         raise _Refused("pickled Python objects")
     content = _load(io.BytesIO(stream.read()))  # the header has been read
-    return content.item() if isinstance(content, np.ndarray) and content.ndim == 0 else content
+    return (
+        content.item()
+        if isinstance(content, np.ndarray) and content.ndim == 0
+        else content
+    )

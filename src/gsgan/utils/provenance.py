@@ -24,7 +24,12 @@ SOURCE_TYPE = "http://cv.iptc.org/newscodes/digitalsourcetype/trainedAlgorithmic
 SOFTWARE = f"gsgan {__version__}"
 PNG_KEY = "XML:com.adobe.xmp"
 MP4_UUID = bytes.fromhex("be7acfcb97a942e89c71999491e3afac")
-MIMES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".mp4": "video/mp4"}
+MIMES = {
+    ".png": "image/png",
+    ".jpg": "image/jpeg",
+    ".jpeg": "image/jpeg",
+    ".mp4": "video/mp4",
+}
 XMP = (
     '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>'
     '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF '
@@ -58,7 +63,10 @@ class Provenance:
     def synthetic(self) -> bool:
         """Whether metadata or an intact manifest says that a trained model made it."""
         signed = self.credentials or {}
-        intact = signed.get("state") != "Invalid" and signed.get("source_type") == SOURCE_TYPE
+        intact = (
+            signed.get("state") != "Invalid"
+            and signed.get("source_type") == SOURCE_TYPE
+        )
         return self.source_type == SOURCE_TYPE or intact
 
     def lines(self) -> list[str]:
@@ -89,7 +97,8 @@ class Signer:
 
 def png_bytes(image: Image.Image, marked: bool = True) -> bytes:
     """The image as a PNG file, marked as synthetic."""
-    info, stream = PngInfo(), io.BytesIO()
+    info = PngInfo()
+    stream = io.BytesIO()
     if marked:
         info.add_itxt(PNG_KEY, XMP)
     image.save(stream, "PNG", pnginfo=info)
@@ -125,11 +134,17 @@ def signed(data: bytes, suffix: str, signer: Signer) -> bytes:
         "assertions": [{"label": "c2pa.actions", "data": {"actions": [made]}}],
     }
     try:
-        chain, key = signer.certificate.read_bytes(), signer.key.read_bytes()
+        chain = signer.certificate.read_bytes()
+        key = signer.key.read_bytes()
         algorithm = signer.algorithm.encode()
-        info = c2pa.C2paSignerInfo(alg=algorithm, sign_cert=chain, private_key=key, ta_url=None)
+        info = c2pa.C2paSignerInfo(
+            alg=algorithm, sign_cert=chain, private_key=key, ta_url=None
+        )
         out = io.BytesIO()
-        with c2pa.Signer.from_info(info) as own, c2pa.Builder(json.dumps(manifest)) as builder:
+        with (
+            c2pa.Signer.from_info(info) as own,
+            c2pa.Builder(json.dumps(manifest)) as builder,
+        ):
             builder.sign(own, MIMES[suffix], io.BytesIO(data), out)
     except (OSError, ValueError, c2pa.C2paError) as error:
         raise ConfigError(
@@ -150,7 +165,9 @@ def verify(path: Path) -> Provenance:
     """
     mime = MIMES.get(path.suffix.lower())
     if mime is None:
-        raise DataError(f"{path} is of no format that carries its origin: {', '.join(MIMES)}")
+        raise DataError(
+            f"{path} is of no format that carries its origin: {', '.join(MIMES)}"
+        )
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -160,13 +177,16 @@ def verify(path: Path) -> Provenance:
     except (OSError, ValueError, struct.error, SyntaxError):
         raise DataError(f"{path} is damaged or no {mime} file") from None
     credentials, unread = _credentials(data, mime)
-    kind, tool = _property(xmp, "DigitalSourceType"), _property(xmp, "CreatorTool")
+    kind = _property(xmp, "DigitalSourceType")
+    tool = _property(xmp, "CreatorTool")
     return Provenance(kind, tool, credentials, unread)
 
 
 def _property(xmp: str, name: str) -> str | None:
     """A property's text, written as an attribute or an element of any namespace prefix."""
-    found = re.search(rf"""[\w.-]+:{name}(?:\s*=\s*["']([^"']*)["']|[^>]*>([^<]*)<)""", xmp)
+    found = re.search(
+        rf"""[\w.-]+:{name}(?:\s*=\s*["']([^"']*)["']|[^>]*>([^<]*)<)""", xmp
+    )
     return (found[1] or found[2]) if found else None
 
 
@@ -184,7 +204,8 @@ def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
         size, kind = struct.unpack_from(">I4s", data, at)
         header = 8
         if size == 1:
-            size, header = struct.unpack_from(">Q", data, at + 8)[0], 16
+            size = struct.unpack_from(">Q", data, at + 8)[0]
+            header = 16
         size = size or len(data) - at
         if size < header or at + size > len(data):
             raise ValueError("a box ends beyond the file")
@@ -230,5 +251,8 @@ def _credentials(data: bytes, mime: str) -> tuple[dict[str, Any] | None, str | N
         "source_type": next(
             (a["digitalSourceType"] for a in actions if "digitalSourceType" in a), None
         ),
-        "problems": [s.get("explanation") or s["code"] for s in store.get("validation_status", [])],
+        "problems": [
+            s.get("explanation") or s["code"]
+            for s in store.get("validation_status", [])
+        ],
     }, None

@@ -35,7 +35,9 @@ class TensorRecord:
     def __getitem__(self: S, index: slice | Tensor) -> S:
         """The batch items of a slice or at indices ``[n]``; the batch dimension stays."""
         if isinstance(index, int):
-            raise TypeError(f"{type(self).__name__} takes a slice of the batch, got {index!r}")
+            raise TypeError(
+                f"{type(self).__name__} takes a slice of the batch, got {index!r}"
+            )
         changes: dict[str, Any] = {}
         for field in fields(self):
             value = getattr(self, field.name)
@@ -60,7 +62,8 @@ def cat(records: Sequence[S]) -> S:
     """
     if not records:
         raise ValueError("cat: expected at least one record, got none")
-    first, changes = records[0], {}
+    first = records[0]
+    changes = {}
     for field in fields(first):
         values = [getattr(record, field.name) for record in records]
         if len({value is None for value in values}) == 2:

@@ -58,7 +58,11 @@ def run_job(command: str, objective: str | None) -> float | None:
     status = _status([sys.executable, "-m", f"gsgan.{command}", *arguments, *own])
     if status == 0:
         try:
-            score = None if objective is None else _score(folder / "metrics.json", objective)
+            score = (
+                None
+                if objective is None
+                else _score(folder / "metrics.json", objective)
+            )
         except ConfigError as error:
             mark.write_text(str(error))
         else:
@@ -101,7 +105,9 @@ def _score(path: Path, name: str) -> float:
     for key in name.split("."):
         found = found.get(key) if isinstance(found, dict) else None
     if not isinstance(found, (int, float)):
-        raise ConfigError(f"objective={name}: {path} has no such score; name split.variant.metric")
+        raise ConfigError(
+            f"objective={name}: {path} has no such score; name split.variant.metric"
+        )
     return float(found)
 
 
@@ -122,10 +128,16 @@ class NameUnfinished(Callback):
 
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
         """Called by Hydra."""
-        folders = sorted(mark.parent for mark in Path(config.hydra.sweep.dir).rglob(MARK))
+        folders = sorted(
+            mark.parent for mark in Path(config.hydra.sweep.dir).rglob(MARK)
+        )
         if folders:
             console = make_console()
-            console.print(f"{len(folders)} jobs are unfinished; the same command continues them:")
+            console.print(
+                f"{len(folders)} jobs are unfinished; the same command continues them:"
+            )
             for folder in folders:
-                console.print(f"{folder}: {unfinished(folder)}", soft_wrap=True, highlight=False)
+                console.print(
+                    f"{folder}: {unfinished(folder)}", soft_wrap=True, highlight=False
+                )
             sys.exit(1)

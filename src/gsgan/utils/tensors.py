@@ -13,7 +13,9 @@ from torch import Tensor, nn
 from gsgan.utils.errors import ConfigError
 
 T = TypeVar("T")
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's mallopt
+# of glibc's mallopt
+M_TRIM_THRESHOLD = -1
+M_MMAP_THRESHOLD = -3
 KEPT = 1 << 30  # bytes of freed memory that the process keeps
 LARGEST = 1 << 25  # bytes; glibc takes larger blocks from the system in any case
 
@@ -28,7 +30,8 @@ def constant(values: Any, like: Tensor, dtype: torch.dtype | None = None) -> Ten
 
 @lru_cache(maxsize=1024)
 def _constant(values: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
-    with torch.inference_mode(False):  # an inference tensor could not be used in training later
+    # an inference tensor could not be used in training later
+    with torch.inference_mode(False):
         return torch.tensor(values, dtype=dtype, device=device)
 
 

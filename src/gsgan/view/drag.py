@@ -6,7 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsgan.data.joints import LEFT, RIGHT
-from gsgan.data.proportions import FEET, HAND_LANDMARKS, HEAD_LANDMARKS, HIPS, SHOULDERS, middle
+from gsgan.data.proportions import (
+    FEET,
+    HAND_LANDMARKS,
+    HEAD_LANDMARKS,
+    HIPS,
+    SHOULDERS,
+    middle,
+)
 from gsgan.motion.rotations import between, unit
 from gsgan.skeleton import HOLISTIC
 
@@ -39,13 +46,19 @@ HANDLES = {
     f"{side} {name}": handle
     for side, shoulder, elbow, wrist, hip, knee, ankle, hand in SIDES
     for name, handle in {
-        "wrist": Handle((shoulder, elbow, wrist), turned=(*HAND_LANDMARKS[wrist], *hand)),
-        "elbow": Handle((shoulder, elbow), moved=(wrist, *HAND_LANDMARKS[wrist], *hand)),
+        "wrist": Handle(
+            (shoulder, elbow, wrist), turned=(*HAND_LANDMARKS[wrist], *hand)
+        ),
+        "elbow": Handle(
+            (shoulder, elbow), moved=(wrist, *HAND_LANDMARKS[wrist], *hand)
+        ),
         "ankle": Handle((hip, knee, ankle), turned=FEET[ankle]),
         "knee": Handle((hip, knee), moved=(ankle, *FEET[ankle])),
     }.items()
 }
-NOSE, HEAD, BODY = 0, "head", "body"
+NOSE = 0
+HEAD = "head"
+BODY = "body"
 NAMES = (*HANDLES, HEAD, BODY)
 
 
@@ -88,7 +101,8 @@ def dragged(p: Float, name: str, target: Float) -> Float:
     q[chain] = fabrik(p[chain], target)
     before, end = chain[-2:]
     turn = between(p[end] - p[before], q[end] - q[before])
-    turned, moved = _of(p, handle.turned), _of(p, handle.moved)
+    turned = _of(p, handle.turned)
+    moved = _of(p, handle.moved)
     q[turned] = q[end] + (p[turned] - p[end]) @ turn.T
     q[moved] += q[end] - p[end]
     return q
@@ -97,7 +111,9 @@ def dragged(p: Float, name: str, target: Float) -> Float:
 def fabrik(chain: Float, target: Float) -> Float:
     """Joints ``[n, 3]`` with the first fixed and the last at ``target``, or as near as possible."""
     lengths = np.linalg.norm(np.diff(chain, axis=0), axis=1)
-    q, root, reach = chain.copy(), chain[0], lengths.sum()
+    q = chain.copy()
+    root = chain[0]
+    reach = lengths.sum()
     along = target - root
     if np.linalg.norm(along) >= reach:
         steps = np.concatenate([[0.0], np.cumsum(lengths)])

@@ -42,12 +42,19 @@ def guarded(served: str) -> Iterator[None]:
     from websockets.asyncio import server  # viser's
 
     def check(inner: Any, connection: Any, request: Any) -> Any:
-        host, origin = (request.headers.get(name) for name in ("Host", "Origin"))
+        host = request.headers.get("Host")
+        origin = request.headers.get("Origin")
         why = refusal(host, origin, served)
-        return inner(connection, request) if why is None else connection.respond(403, f"{why}\n")
+        return (
+            inner(connection, request)
+            if why is None
+            else connection.respond(403, f"{why}\n")
+        )
 
     def serve(*args: Any, process_request: Any, **options: Any) -> Any:
-        return original(*args, process_request=partial(check, process_request), **options)
+        return original(
+            *args, process_request=partial(check, process_request), **options
+        )
 
     original = server.serve
     server.serve = serve  # type: ignore[assignment,misc]

@@ -36,7 +36,9 @@ def view_config(config: DictConfig) -> None:
     viewer = Viewer(config)
     console = make_console()
     console.print(viewer.show.drive.text, markup=False, highlight=False)
-    console.print(f"open {viewer.address} in a browser; stop with Ctrl+C", highlight=False)
+    console.print(
+        f"open {viewer.address} in a browser; stop with Ctrl+C", highlight=False
+    )
     try:
         viewer.serve()
     finally:
@@ -52,7 +54,8 @@ class Viewer:
 
     def __init__(self, config: DictConfig) -> None:
         viser = import_viser()
-        self.run, fps = Run.load(config), float(above("fps", config.fps))
+        self.run = Run.load(config)
+        fps = float(above("fps", config.fps))
         if config.distilled:
             self.run.avatar = distilled_of(config, self.run)
 
@@ -63,13 +66,18 @@ class Viewer:
         size = whole("pixels", config.pixels or self.run.stored.data.size or 512, 16)
         behind: Any = background(str(config.background), video=True)
         rate = float(above("rate", config.rate))
-        self.show = Show(self.run.avatar, self.run.body, drive, read, behind, size, fps, rate)
-        host, port = str(config.host), between("port", whole("port", config.port, 0), 0, 65535)
+        self.show = Show(
+            self.run.avatar, self.run.body, drive, read, behind, size, fps, rate
+        )
+        host = str(config.host)
+        port = between("port", whole("port", config.port, 0), 0, 65535)
         try:  # viser itself would never return
             family = socket.AF_INET6 if ":" in host else socket.AF_INET
             socket.create_server((host, 0), family=family).close()
         except OSError as error:
-            raise ConfigError(f"host={host} is not an address of this machine ({error})") from None
+            raise ConfigError(
+                f"host={host} is not an address of this machine ({error})"
+            ) from None
         logging.getLogger("websockets").setLevel(logging.WARNING)
         # without viser's own banner
         with contextlib.redirect_stdout(io.StringIO()), guarded(host):
@@ -80,10 +88,15 @@ class Viewer:
         self._camera(size)
         limit = int(above("max_upload", config.max_upload) * MEGABYTE)
         self.sessions: dict[int, Session] = {}
-        self._wake, self._ended = threading.Event(), False
+        self._wake = threading.Event()
+        self._ended = False
         self.server.on_client_connect(lambda client: self._join(client, limit))
-        self.server.on_client_disconnect(lambda client: self.sessions.pop(client.client_id, None))
-        self._renderer = threading.Thread(target=self._render, daemon=True, name="rendering")
+        self.server.on_client_disconnect(
+            lambda client: self.sessions.pop(client.client_id, None)
+        )
+        self._renderer = threading.Thread(
+            target=self._render, daemon=True, name="rendering"
+        )
         self._renderer.start()
 
     @property
@@ -108,7 +121,9 @@ class Viewer:
     def _camera(self, size: int) -> None:
         """Sets the first view of new browsers: the first pose from the front, as large as in
         training images."""
-        drive, scene, proportions = self.show.drive, self.run.scene, self.run.proportions
+        drive = self.show.drive
+        scene = self.run.scene
+        proportions = self.run.proportions
         trained = self.run.stored.data.size or size
         camera = Orbit().cameras(drive.p[:1], proportions, scene, size, trained)
         up = upright(proportions.up)[2]
@@ -141,7 +156,9 @@ def import_viser() -> Any:
     try:
         import viser
     except ImportError:
-        raise ConfigError("the viewer needs the package viser: pip install 'gsgan[view]'") from None
+        raise ConfigError(
+            "the viewer needs the package viser: pip install 'gsgan[view]'"
+        ) from None
     return viser
 
 

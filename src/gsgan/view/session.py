@@ -33,8 +33,13 @@ RESTS = 0.3  # seconds without movement after which the full-size image is rende
 SMALLEST = 0.25  # least scale of the images while something moves
 WIDEST = 3.0  # bound on the aspect ratio, since a browser window can have any
 SPEED_OVER = 2.0  # seconds over which the displayed rate is averaged
-YELLOW, GREY = (255, 200, 0), (160, 165, 175)
-IMAGE, COLOUR, PARTS, ALPHA = "image", "Step I's colour", "segmentation S", "alpha"  # layers
+YELLOW = (255, 200, 0)
+GREY = (160, 165, 175)
+# layers
+IMAGE = "image"
+COLOUR = "Step I's colour"
+PARTS = "segmentation S"
+ALPHA = "alpha"
 
 
 @dataclass
@@ -66,8 +71,11 @@ class Session:
     """One client of the server; only the rendering thread calls `step`."""
 
     def __init__(self, client: Any, show: Show, wake: Callable[[], None]) -> None:
-        self.client, self.show, self._wake = client, show, wake
-        self.drive, self.frame = show.drive, 0
+        self.client = client
+        self.show = show
+        self._wake = wake
+        self.drive = show.drive
+        self.frame = 0
         self.pose: Float | None = None  # dragged
         self.changed = self.moved = time.monotonic()
         self.started = 0.0  # when rendering of the current image began
@@ -84,13 +92,20 @@ class Session:
     # -- the page
 
     def _controls(self) -> None:
-        gui, client = self.client.gui, self.client
+        gui = self.client.gui
+        client = self.client
         self.status = gui.add_text("images per second", "", disabled=True)
         known = self.show.avatar.poses is not None
-        self.far = gui.add_text("deviations from training", "", disabled=True, visible=known)
-        self.layer = gui.add_dropdown("layer", layers(self.show.avatar), initial_value=IMAGE)
+        self.far = gui.add_text(
+            "deviations from training", "", disabled=True, visible=known
+        )
+        self.layer = gui.add_dropdown(
+            "layer", layers(self.show.avatar), initial_value=IMAGE
+        )
         with gui.add_folder("motion"):
-            self.slider = gui.add_slider("frame", 0, max(1, len(self.drive.p) - 1), 1, 0)
+            self.slider = gui.add_slider(
+                "frame", 0, max(1, len(self.drive.p) - 1), 1, 0
+            )
             self.play = gui.add_checkbox("play", False)
             upload = gui.add_upload_button("load a motion file")
             self.description = gui.add_markdown(self.drive.text)
@@ -98,7 +113,9 @@ class Session:
             self.handles = gui.add_checkbox("drag joints", False)
             reset = gui.add_button("undo dragging")
             self.bones = gui.add_checkbox("skeleton", False)
-            self.mesh = gui.add_checkbox("body", False, visible=self.show.body is not None)
+            self.mesh = gui.add_checkbox(
+                "body", False, visible=self.show.body is not None
+            )
             self.splats = gui.add_checkbox("Gaussians", False)
         save = gui.add_button("save the image")
         for control in (self.layer, self.bones, self.mesh, self.splats):
@@ -127,7 +144,8 @@ class Session:
             self._scrub(int(self.slider.value))
 
     def _scrub(self, frame: int) -> None:
-        self.frame, self.pose = min(frame, len(self.drive.p) - 1), None
+        self.frame = min(frame, len(self.drive.p) - 1)
+        self.pose = None
         self.touch()
 
     def _load(self, file: Any) -> None:
@@ -138,9 +156,12 @@ class Session:
                 path.write_bytes(file.content)
                 drive = self.show.read(str(path))
         except Exception as error:  # whatever the file is, the server must keep running
-            self._warn("This motion cannot be used", _message(error).replace(folder + "/", ""))
+            self._warn(
+                "This motion cannot be used", _message(error).replace(folder + "/", "")
+            )
             return
-        self.drive, self.description.content = drive, drive.text
+        self.drive = drive
+        self.description.content = drive.text
         self.slider.max = max(1, len(drive.p) - 1)
         self.slider.value = 0
         self._scrub(0)
@@ -165,10 +186,15 @@ class Session:
             gizmos = {}
             for name in NAMES:
                 gizmo = self.client.scene.add_transform_controls(
-                    f"/drag/{name}", scale=0.12, disable_rotations=True, depth_test=False,
+                    f"/drag/{name}",
+                    scale=0.12,
+                    disable_rotations=True,
+                    depth_test=False,
                     position=position(self.joints(), name),
-                )  # fmt: skip
-                gizmo.on_update(lambda event, name=name: self.drag(name, event.target.position))
+                )
+                gizmo.on_update(
+                    lambda event, name=name: self.drag(name, event.target.position)
+                )
                 gizmos[name] = gizmo
             self._gizmos = gizmos  # at once: the rendering thread iterates over them
         self.touch(moving=False)
@@ -192,11 +218,15 @@ class Session:
 
     def _current(self) -> Drive:
         """The current pose, as a motion of one frame."""
-        drive, pose = self.drive, self.pose  # another thread may load a shorter motion
+        # another thread may load a shorter motion
+        drive = self.drive
+        pose = self.pose
         drive = drive.rows(np.array([self.frame % len(drive.p)]))
         if pose is None:
             return drive
-        return replace(drive, p=pose[None], visibility=drive.visibility[:, : len(pose)], body=None)
+        return replace(
+            drive, p=pose[None], visibility=drive.visibility[:, : len(pose)], body=None
+        )
 
     # -- rendering
 
@@ -206,8 +236,13 @@ class Session:
         if self.play.value and len(self.drive.p) > 1:
             if (early := self.started + 1 / self.show.fps - now) > 0:
                 return early
-            passed = max(1, round((now - self.started) * self.show.fps)) if self.started else 1
-            self.frame, self.pose = (self.frame + passed) % len(self.drive.p), None
+            passed = (
+                max(1, round((now - self.started) * self.show.fps))
+                if self.started
+                else 1
+            )
+            self.frame = (self.frame + passed) % len(self.drive.p)
+            self.pose = None
             self.slider.value = self.frame
             self.changed = self.moved = now
         moving = now - self.moved < RESTS
@@ -216,14 +251,17 @@ class Session:
         share = 1.0
         if moving and self.seconds:
             share = min(1.0, max(SMALLEST, (1 / self.show.rate / self.seconds) ** 0.5))
-        self.started, self.full = now, False
+        self.started = now
+        self.full = False
         try:
             self._render(share)
-        except Exception as error:  # whatever the pose is, the thread renders for all browsers
+        # whatever the pose is, the thread renders for all browsers
+        except Exception as error:
             if self._problem != _message(error):  # once, not for every image
                 self._problem = _message(error)
                 self._warn("This pose cannot be rendered", self._problem)
-            self.play.value, self.full = False, True
+            self.play.value = False
+            self.full = True
             return IDLE
         self._problem = ""
         self.full = share == 1
@@ -243,11 +281,14 @@ class Session:
         R = Rotation.from_quat([x, y, z, w]).as_matrix().T
         K = [[focal, 0, size[1] / 2], [0, focal, size[0] / 2], [0, 0, 1]]
         t = -R @ view.position
-        world = [torch.tensor(np.array(a), dtype=torch.float32)[None] for a in (K, R, t)]
+        world = [
+            torch.tensor(np.array(a), dtype=torch.float32)[None] for a in (K, R, t)
+        ]
         return Camera(world[0], world[1], world[2], size)
 
     def _render(self, share: float) -> None:
-        avatar, layer = self.show.avatar, self.layer.value
+        avatar = self.show.avatar
+        layer = self.layer.value
         current = self._current()
         camera = self.camera(share)
         p, visibility, body = inputs_of(avatar, current, 0)
@@ -258,10 +299,13 @@ class Session:
             self.far.value = f"{float(avatar.poses.distance(p)):.1f}"
         behind = self.show.behind(camera.size)
         self.image = drawn = shown(layer, rendering, behind)
-        if self.splats.value and rendering.gaussians is not None:  # the browser draws these instead
+        # the browser draws these instead
+        if self.splats.value and rendering.gaussians is not None:
             drawn = eight_bits(behind, torch.ones(1), behind)
         self.client.scene.set_background_image(drawn, "jpeg", jpeg_quality=90)
-        self._place(rendering.gaussians, np.asarray(p[0].cpu().numpy(), np.float64), body)
+        self._place(
+            rendering.gaussians, np.asarray(p[0].cpu().numpy(), np.float64), body
+        )
         self.times.append(time.monotonic())
         recent = [x for x in self.times if x > self.times[-1] - SPEED_OVER]
         rate = (len(recent) - 1) / max(recent[-1] - recent[0], 1e-6)
@@ -271,9 +315,17 @@ class Session:
 
     def _place(self, splats: Gaussians | None, p: Float, pose: BodyPose | None) -> None:
         """Draws skeleton, body and Gaussians, and moves the handles that are not being dragged."""
-        scene, avatar, body = self.client.scene, self.show.avatar, self.show.body
+        scene = self.client.scene
+        avatar = self.show.avatar
+        body = self.show.body
         splats = splats if self.splats.value else None
-        drawn = (p.tobytes(), self.bones.value, self.mesh.value, splats is not None, avatar)
+        drawn = (
+            p.tobytes(),
+            self.bones.value,
+            self.mesh.value,
+            splats is not None,
+            avatar,
+        )
         if drawn == self._drawn:
             return
         self._drawn = drawn
@@ -282,7 +334,9 @@ class Session:
         self._nodes = []
         if self.bones.value:
             bones = p[np.array(avatar.template.edges)]
-            lines = scene.add_line_segments("/skeleton", bones, colors=YELLOW, line_width=3.0)
+            lines = scene.add_line_segments(
+                "/skeleton", bones, colors=YELLOW, line_width=3.0
+            )
             self._nodes.append(lines)
         if self.mesh.value and body is not None and pose is not None:
             vertices = body.posed_vertices(pose.to("cpu"))[0]
@@ -321,15 +375,22 @@ def shown(layer: str, rendering: Rendering, behind: torch.Tensor) -> Bytes:
         behind: ``[3, H, W]`` the background.
     """
     assert rendering.image is not None and rendering.alpha is not None  # noqa: PT018
-    image, alpha = rendering.image[0].cpu(), rendering.alpha[0].cpu()
+    image = rendering.image[0].cpu()
+    alpha = rendering.alpha[0].cpu()
     if layer == ALPHA:
         grey = (alpha[0].clamp(0, 1) * 255).byte().numpy()
         return np.repeat(grey[..., None], 3, axis=2)
     if layer == PARTS and rendering.segmentation is not None:
         colours = colour_labels(rendering.segmentation.argmax(dim=1))[0]
         return np.asarray((colours.permute(1, 2, 0) * 255).byte().cpu().numpy())
-    if layer == COLOUR and rendering.features is not None and rendering.splat_alpha is not None:
-        return eight_bits(rendering.features[0, :3].cpu(), rendering.splat_alpha[0].cpu(), behind)
+    if (
+        layer == COLOUR
+        and rendering.features is not None
+        and rendering.splat_alpha is not None
+    ):
+        return eight_bits(
+            rendering.features[0, :3].cpu(), rendering.splat_alpha[0].cpu(), behind
+        )
     return eight_bits(image, alpha, behind)
 
 

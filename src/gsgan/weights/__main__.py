@@ -26,7 +26,9 @@ def list_weights(config: DictConfig) -> None:
             if found is None and config.download:
                 found = files.get(net)
             if found is None:
-                raise DataError(f"{title} is not on this machine: {files.how_to_get(net)}")
+                raise DataError(
+                    f"{title} is not on this machine: {files.how_to_get(net)}"
+                )
             pretrained(net, found.path)  # refuses a wrong or damaged file
         except DataError as error:
             problems.append(str(error))

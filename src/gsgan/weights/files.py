@@ -149,7 +149,9 @@ def download(net: str) -> Path:
     with locked(folder / f"{network.file}.lock"):  # one of several processes downloads
         if not target.is_file():
             try:
-                torch.hub.download_url_to_file(network.url, str(target), hash_prefix=digits)
+                torch.hub.download_url_to_file(
+                    network.url, str(target), hash_prefix=digits
+                )
             except (OSError, RuntimeError) as error:  # RuntimeError: another hash
                 raise DataError(
                     f"the weights of {network.title} are not on this machine, and they could not "
@@ -206,7 +208,9 @@ def read_convolutions(net: str, path: Path) -> dict[str, Tensor]:
     prefix = "features."
     named = {str(key): value for key, value in state.items()}
     if any(key.startswith(prefix) for key in named):
-        return {k.removeprefix(prefix): v for k, v in named.items() if k.startswith(prefix)}
+        return {
+            k.removeprefix(prefix): v for k, v in named.items() if k.startswith(prefix)
+        }
     return named
 
 
@@ -222,14 +226,20 @@ def _read_packaged(network: Network, path: Path) -> dict[str, Tensor]:
     state = {}
     for number, name in enumerate(_convolution_names(network)):
         layer = layers[f"Conv_{number}"]
-        state[f"{name}.weight"] = torch.from_numpy(layer["kernel"].transpose(3, 2, 0, 1).copy())
+        state[f"{name}.weight"] = torch.from_numpy(
+            layer["kernel"].transpose(3, 2, 0, 1).copy()
+        )
         state[f"{name}.bias"] = torch.from_numpy(layer["bias"].copy())
     return state
 
 
 def _convolution_names(network: Network) -> list[str]:
     layers = empty_layers(network)
-    return [name for name, layer in layers.named_children() if isinstance(layer, torch.nn.Conv2d)]
+    return [
+        name
+        for name, layer in layers.named_children()
+        if isinstance(layer, torch.nn.Conv2d)
+    ]
 
 
 def empty_layers(network: Network) -> torch.nn.Sequential:
@@ -246,4 +256,6 @@ def state_of_heads(net: str) -> dict[str, Any]:
     assert spec is not None  # a dependency
     assert spec.origin is not None
     folder = Path(spec.origin).parent / "functional" / "image" / "lpips_models"
-    return dict(torch.load(folder / f"{net}.pth", map_location="cpu", weights_only=True))
+    return dict(
+        torch.load(folder / f"{net}.pth", map_location="cpu", weights_only=True)
+    )

@@ -9,14 +9,21 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from gsgan.utils.errors import DataError
-from gsgan.weights.files import NETWORKS, empty_layers, get, read_convolutions, state_of_heads
+from gsgan.weights.files import (
+    NETWORKS,
+    empty_layers,
+    get,
+    read_convolutions,
+    state_of_heads,
+)
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 # Layers of torchvision's `features` after which LPIPS compares: every ReLU before a pooling
 # (VGG-16: relu1_2, relu2_2, relu3_3, relu4_3, relu5_3), and every ReLU (AlexNet).
 TAPS = {"vgg": (3, 8, 15, 22, 29), "alex": (1, 4, 7, 9, 11)}
-EPSILON = 1e-8  # of the features' norm, as in torchmetrics: the gradient is finite at zero
+# of the features' norm, as in torchmetrics: the gradient is finite at zero
+EPSILON = 1e-8
 
 
 class FeatureNetwork(nn.Module):
@@ -64,7 +71,8 @@ def pretrained(net: str, path: str | Path | None = None) -> FeatureNetwork:
     layers = empty_layers(network)
     try:
         layers.load_state_dict(read_convolutions(net, found.path), assign=True)
-    except (RuntimeError, AttributeError) as error:  # AttributeError: a value is no tensor
+    # AttributeError: a value is no tensor
+    except (RuntimeError, AttributeError) as error:
         raise DataError(
             f"{found.path}: these are not torchvision's weights of {network.title}"
         ) from error
@@ -72,7 +80,9 @@ def pretrained(net: str, path: str | Path | None = None) -> FeatureNetwork:
         if isinstance(layer, nn.ReLU):
             layer.inplace = False  # the maps before it are kept
     bounds = [0, *(tap + 1 for tap in TAPS[net])]
-    return FeatureNetwork(nn.ModuleList(layers[start:end] for start, end in pairwise(bounds)))
+    return FeatureNetwork(
+        nn.ModuleList(layers[start:end] for start, end in pairwise(bounds))
+    )
 
 
 class Lpips(nn.Module):
@@ -109,7 +119,9 @@ class Lpips(nn.Module):
             maps.append(features / norm)
         return maps
 
-    def layers(self, features: Sequence[Tensor], others: Sequence[Tensor]) -> list[Tensor]:
+    def layers(
+        self, features: Sequence[Tensor], others: Sequence[Tensor]
+    ) -> list[Tensor]:
         """The distance of two images in each layer, as maps ``[B, 1, h, w]``."""
         maps = []
         for layer, (ours, theirs) in enumerate(zip(features, others, strict=True)):
@@ -123,7 +135,10 @@ class Lpips(nn.Module):
         return torch.stack([layer.mean(dim=(1, 2, 3)) for layer in maps]).sum(dim=0)
 
     def distance_map(
-        self, features: Sequence[Tensor], others: Sequence[Tensor], size: tuple[int, int]
+        self,
+        features: Sequence[Tensor],
+        others: Sequence[Tensor],
+        size: tuple[int, int],
     ) -> Tensor:
         """The distance of each pixel, ``[B, 1, H, W]``: the layers' maps, enlarged to ``size``."""
         total = features[0].new_zeros(())

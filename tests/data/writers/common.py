@@ -73,7 +73,9 @@ def make_subject(
     )
     R = np.stack([cv2.Rodrigues(r)[0] for r in Rh])
     vertices, joints = (x.numpy() @ R.transpose(0, 2, 1) + Th[:, None] for x in (v, j))
-    rig = [ring_camera(2 * np.pi * i / cameras + 0.1, size, dist) for i in range(cameras)]
+    rig = [
+        ring_camera(2 * np.pi * i / cameras + 0.1, size, dist) for i in range(cameras)
+    ]
     parts = _vertex_parts(model)
     drawn = [[draw(camera, body, parts) for camera in rig] for body in vertices]
     return Subject(
@@ -100,7 +102,9 @@ def _motion(frames: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     upright = cv2.Rodrigues(np.array([-np.pi / 2, 0, 0]))[0]  # y up becomes -z up
     Rh = np.stack(
         [
-            cv2.Rodrigues(cv2.Rodrigues(np.array([0, 0, 0.3 + 0.5 * t]))[0] @ upright)[0][:, 0]
+            cv2.Rodrigues(cv2.Rodrigues(np.array([0, 0, 0.3 + 0.5 * t]))[0] @ upright)[
+                0
+            ][:, 0]
             for t in time
         ]
     )
@@ -123,11 +127,15 @@ def ring_camera(angle: float, size: tuple[int, int], dist: tuple[float, ...]) ->
 def _vertex_parts(model: SkinnedModel) -> np.ndarray:
     """``[V]`` CIHP numbers."""
     joints = model.weights.numpy().argmax(axis=1)
-    own = np.array([CIHP.index(part_of_joint("cihp", name)) for name in model.joint_names])
+    own = np.array(
+        [CIHP.index(part_of_joint("cihp", name)) for name in model.joint_names]
+    )
     return own[joints]
 
 
-def draw(camera: Camera, body: np.ndarray, parts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def draw(
+    camera: Camera, body: np.ndarray, parts: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """RGB picture before a grey wall, and CIHP numbers."""
     w, h = camera.size
     depth = (body @ camera.R.T + camera.t)[:, 2]

@@ -13,7 +13,15 @@ SMPL_TO_BODY_25 = {  # joints that are the same point in both, or near enough
     1: 12, 2: 17, 3: 19, 4: 21, 5: 16, 6: 18, 7: 20, 8: 0, 9: 2, 10: 5, 11: 8, 12: 1, 13: 4, 14: 7,
     19: 10, 22: 11,
 }  # fmt: skip
-SMPL_VERTICES_TO_BODY_25 = {0: 332, 15: 6260, 16: 2800, 17: 4071, 18: 583, 21: 3387, 24: 6787}
+SMPL_VERTICES_TO_BODY_25 = {
+    0: 332,
+    15: 6260,
+    16: 2800,
+    17: 4071,
+    18: 583,
+    21: 3387,
+    24: 6787,
+}
 
 
 def body_25(subject: Subject, frame: int) -> np.ndarray:
@@ -27,7 +35,11 @@ def body_25(subject: Subject, frame: int) -> np.ndarray:
 
 
 def write_calibration(
-    root: Path, subject: Subject, sizes: bool = True, lens: str = "dist", both: bool = True
+    root: Path,
+    subject: Subject,
+    sizes: bool = True,
+    lens: str = "dist",
+    both: bool = True,
 ) -> None:
     """intri.yml and extri.yml by OpenCV, names in another order and with a "none" among them."""
     root.mkdir(parents=True, exist_ok=True)
@@ -37,7 +49,10 @@ def write_calibration(
         intri |= {f"K_{name}": camera.K, f"{lens}_{name}": camera.dist[None]}
         if sizes:
             intri |= {f"W_{name}": camera.size[0], f"H_{name}": camera.size[1]}
-        places = {f"R_{name}": cv2.Rodrigues(camera.R)[0], f"T_{name}": camera.t[:, None]}
+        places = {
+            f"R_{name}": cv2.Rodrigues(camera.R)[0],
+            f"T_{name}": camera.t[:, None],
+        }
         extri = places | ({f"Rot_{name}": camera.R} if both else {}) | extri
     write_opencv(root / "intri.yml", [*NAMES, "none"], intri)
     write_opencv(root / "extri.yml", ["none", *reversed(NAMES)], extri)

@@ -22,7 +22,9 @@ class Instance:
 
 def chumpy(values: np.ndarray) -> Instance:
     """``chumpy.ch.Ch`` round an array."""
-    return Instance("chumpy.ch", "Ch", {"x": values, "_dirty_vars": set(), "_itr": None})
+    return Instance(
+        "chumpy.ch", "Ch", {"x": values, "_dirty_vars": set(), "_itr": None}
+    )
 
 
 def chumpy_select(values: np.ndarray, shape: tuple[int, ...]) -> Instance:
@@ -63,7 +65,9 @@ def _write(value: Any, protocol: int) -> bytes:
         items = b"".join(_write(v, protocol) + b"a" for v in value)
         return b"c__builtin__\nset\n((l" + items + b"tR"
     if isinstance(value, dict):
-        items = (_write(k, protocol) + _write(v, protocol) + b"s" for k, v in value.items())
+        items = (
+            _write(k, protocol) + _write(v, protocol) + b"s" for k, v in value.items()
+        )
         return b"(d" + b"".join(items)
     if isinstance(value, Instance):
         return _instance(value, protocol)
@@ -89,7 +93,10 @@ def _instance(value: Instance, protocol: int) -> bytes:
 def _array(array: np.ndarray, protocol: int) -> bytes:
     spec = array.dtype.str[1:]
     dtype = b"cnumpy\ndtype\n(" + _string(spec.encode(), protocol) + b"I0\nI1\ntR(I3\n"
-    dtype += _string(b"<" if array.dtype.itemsize > 1 else b"|", protocol) + b"NNNI-1\nI-1\nI0\ntb"
+    dtype += (
+        _string(b"<" if array.dtype.itemsize > 1 else b"|", protocol)
+        + b"NNNI-1\nI-1\nI0\ntb"
+    )
     start = b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(I0\nt"
     start += _string(b"b", protocol) + b"tR"
     shape = _write(tuple(array.shape), protocol)

@@ -21,10 +21,36 @@ from gsgan.skeleton.smpl_landmarks import TABLES
 from gsgan.utils.files import write_atomically
 
 Kind = Literal["smpl", "smplx"]
-BODY_PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19)
+BODY_PARENTS = (
+    -1,
+    0,
+    0,
+    0,
+    1,
+    2,
+    3,
+    4,
+    5,
+    6,
+    7,
+    8,
+    9,
+    9,
+    9,
+    12,
+    13,
+    14,
+    16,
+    17,
+    18,
+    19,
+)
 FINGER_PARENTS = [w if j == 0 else 24 + 15 * h + 3 * f + j for h, w in ((0, 20), (1, 21))
                   for f in range(5) for j in range(3)]  # fmt: skip
-PARENTS = {"smpl": (*BODY_PARENTS, 20, 21), "smplx": (*BODY_PARENTS, 15, 15, 15, *FINGER_PARENTS)}
+PARENTS = {
+    "smpl": (*BODY_PARENTS, 20, 21),
+    "smplx": (*BODY_PARENTS, 15, 15, 15, *FINGER_PARENTS),
+}
 FREE_BONES = {  # SMPL's joint to the free body's bone that starts there; {} is the side
     "pelvis": "root", "spine1": "spine03", "spine2": "spine02", "spine3": "spine01",
     "neck": "neck01", "head": "head", "hip": "upperleg01.{}", "knee": "lowerleg01.{}",
@@ -76,7 +102,8 @@ def dumps(content: dict[str, Any], protocol: int) -> bytes:
         return python2.dumps(content, protocol)
     with _stub_modules():
         made = {
-            k: _instance(v) if isinstance(v, python2.Instance) else v for k, v in content.items()
+            k: _instance(v) if isinstance(v, python2.Instance) else v
+            for k, v in content.items()
         }
         return pickle.dumps(made, protocol)
 
@@ -118,11 +145,17 @@ def smpl_arrays(kind: Kind, vertices: int | None = None) -> dict[str, np.ndarray
     points = _y_up(body.vertices.double().numpy())[chosen]
     weights = np.zeros((V, len(JOINT_NAMES[kind])))
     bones = bone_to_joint(kind)
-    index, weight = body.bone_index.numpy()[chosen], body.bone_weight.double().numpy()[chosen]
+    index, weight = (
+        body.bone_index.numpy()[chosen],
+        body.bone_weight.double().numpy()[chosen],
+    )
     np.add.at(weights, (np.arange(V)[:, None], bones[index]), weight)
     for vertex, (position, bone) in special_vertices(kind).items():
         if vertex < V:
-            points[vertex], weights[vertex] = position, np.eye(len(JOINT_NAMES[kind]))[bones[bone]]
+            points[vertex], weights[vertex] = (
+                position,
+                np.eye(len(JOINT_NAMES[kind]))[bones[bone]],
+            )
     joints = joint_positions(kind)
     J = len(joints)
     parents = np.array(PARENTS[kind])
@@ -147,7 +180,9 @@ def joint_positions(kind: Kind) -> np.ndarray:
         side, _, limb = joint.partition("_")
         if limb[:-1] in FINGERS:
             knuckle = KNUCKLES.get(limb[:-1], ("mcp", "pip", "dip"))[int(limb[-1]) - 1]
-            return body.hand_landmarks[hands.index(f"{side}_{limb[:-1]}_{knuckle}")].numpy()
+            return body.hand_landmarks[
+                hands.index(f"{side}_{limb[:-1]}_{knuckle}")
+            ].numpy()
         if limb == "eye":
             return body.landmarks[landmarks.index(joint)].numpy()
         if joint == "jaw":
@@ -155,7 +190,9 @@ def joint_positions(kind: Kind) -> np.ndarray:
         name = FREE_BONES.get(joint) or FREE_BONES[limb].format(side[0].upper())
         return body.joints[bones.index(name)].numpy()
 
-    return _y_up(np.stack([position(joint) for joint in JOINT_NAMES[kind]]).astype(np.float64))
+    return _y_up(
+        np.stack([position(joint) for joint in JOINT_NAMES[kind]]).astype(np.float64)
+    )
 
 
 def bone_to_joint(kind: Kind) -> np.ndarray:
@@ -171,7 +208,9 @@ def bone_to_joint(kind: Kind) -> np.ndarray:
     found: list[int] = []
     for bone, parent in zip(body.joint_names, body.parents, strict=True):
         if kind == "smpl" and bone.startswith("finger"):
-            found.append(names.index("left_hand" if bone.endswith("L") else "right_hand"))
+            found.append(
+                names.index("left_hand" if bone.endswith("L") else "right_hand")
+            )
         else:
             found.append(own[bone] if bone in own else found[parent])
     return np.array(found)
@@ -220,7 +259,9 @@ def _faces(chosen: np.ndarray) -> np.ndarray:
     return kept if len(kept) else np.array([[0, 1, 2]])
 
 
-def posed(model: SkinnedModel, motion: SmplMotion, pose_blend: bool = True) -> list[np.ndarray]:
+def posed(
+    model: SkinnedModel, motion: SmplMotion, pose_blend: bool = True
+) -> list[np.ndarray]:
     """Vertices ``[F, V, 3]`` and joints ``[F, J, 3]`` of a reader's motion, metres."""
     face = None if motion.expression is None else torch.from_numpy(motion.expression)
     given = (torch.from_numpy(x) for x in (motion.theta, motion.betas, motion.transl))

@@ -62,7 +62,10 @@ def smplx_subject(smplx: Path, cameras: int = 3, frames: int = 4) -> SmplxSubjec
     model = read_smpl(smplx)
     params = smplx_params(model, frames)
     vertices, joints = _posed(model, params)
-    rig = [ring_camera(2 * np.pi * i / cameras + 0.1, SIZE, STRAIGHT) for i in range(cameras)]
+    rig = [
+        ring_camera(2 * np.pi * i / cameras + 0.1, SIZE, STRAIGHT)
+        for i in range(cameras)
+    ]
     ones = np.full(len(model.v_template), 5)
     drawn = [[draw(camera, body, ones) for camera in rig] for body in vertices]
     return SmplxSubject(
@@ -98,7 +101,10 @@ def smplx_params(model: SkinnedModel, frames: int) -> dict[str, np.ndarray]:
     arrays = {
         "betas": betas,
         "global_orient": np.stack([cv2.Rodrigues(R)[0][:, 0] for R in turns]),
-        "transl": np.stack([0.2 * time, 0.1 - 0.1 * time, np.full(frames, -MIDDLE)], axis=1) - J0,
+        "transl": np.stack(
+            [0.2 * time, 0.1 - 0.1 * time, np.full(frames, -MIDDLE)], axis=1
+        )
+        - J0,
         "body_pose": body.reshape(frames, 63),
         "jaw_pose": np.stack([0.2 * time, 0 * time, 0 * time], axis=1),
         "expression": np.stack([time] + [0 * time] * 9, axis=1),
@@ -108,18 +114,33 @@ def smplx_params(model: SkinnedModel, frames: int) -> dict[str, np.ndarray]:
     return {key: value.astype(np.float32) for key, value in arrays.items()}
 
 
-def _posed(model: SkinnedModel, params: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def _posed(
+    model: SkinnedModel, params: dict[str, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and joints, the root turned here."""
-    p = {key: torch.from_numpy(value.astype(np.float64)) for key, value in params.items()}
+    p = {
+        key: torch.from_numpy(value.astype(np.float64)) for key, value in params.items()
+    }
     count = len(p["transl"])
     still, eyes = torch.zeros(count, 3).double(), torch.zeros(count, 6).double()
-    parts = [still, p["body_pose"], p["jaw_pose"], eyes, p["left_hand_pose"], p["right_hand_pose"]]
+    parts = [
+        still,
+        p["body_pose"],
+        p["jaw_pose"],
+        eyes,
+        p["left_hand_pose"],
+        p["right_hand_pose"],
+    ]
     theta = torch.cat(parts, dim=1).reshape(count, 55, 3)
     face = p["expression"]
     points = [x.numpy() for x in model.pose(theta, p["betas"], still, face)]
     pelvis = model.rest_joints(p["betas"].expand(count, -1), face)[:, :1].numpy()
-    R = np.stack([cv2.Rodrigues(r)[0] for r in p["global_orient"].numpy()]).transpose(0, 2, 1)
-    vertices, joints = ((x - pelvis) @ R + pelvis + p["transl"].numpy()[:, None] for x in points)
+    R = np.stack([cv2.Rodrigues(r)[0] for r in p["global_orient"].numpy()]).transpose(
+        0, 2, 1
+    )
+    vertices, joints = (
+        (x - pelvis) @ R + pelvis + p["transl"].numpy()[:, None] for x in points
+    )
     return vertices, joints
 
 

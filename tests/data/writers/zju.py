@@ -67,11 +67,21 @@ def write_313(
     ``Camera (1)/0001.jpg``."""
     ims = []
     for i, frame in enumerate(subject.frames):
-        stems = [f"{frame:04d}" if renamed else OLD_NAME.format(n, frame) for n in numbers]
-        ims.append({"ims": [f"Camera ({n})/{s}.jpg" for n, s in zip(numbers, stems, strict=True)]})
+        stems = [
+            f"{frame:04d}" if renamed else OLD_NAME.format(n, frame) for n in numbers
+        ]
+        ims.append(
+            {
+                "ims": [
+                    f"Camera ({n})/{s}.jpg" for n, s in zip(numbers, stems, strict=True)
+                ]
+            }
+        )
         for c, (n, stem) in enumerate(zip(numbers, stems, strict=True)):
             write_picture(root / f"Camera ({n})" / f"{stem}.jpg", subject.images[i][c])
-            write_picture(root / f"mask_cihp/Camera ({n})" / f"{stem}.png", subject.labels[i][c])
+            write_picture(
+                root / f"mask_cihp/Camera ({n})" / f"{stem}.png", subject.labels[i][c]
+            )
     write_object(root / "annots.npy", {"cams": _cams(subject, nested=True), "ims": ims})
     _params(root, "params", subject)
     return root
@@ -84,12 +94,20 @@ def write_refined(root: Path, subject: Subject, listed: str = "backslash") -> Pa
     ims = []
     for i, frame in enumerate(subject.frames):
         paths = [f"images/{name}/{frame:06d}.jpg" for name in names]
-        ims.append({"ims": [p.replace("/", "\\") if listed == "backslash" else p for p in paths]})
+        ims.append(
+            {
+                "ims": [
+                    p.replace("/", "\\") if listed == "backslash" else p for p in paths
+                ]
+            }
+        )
         for c, name in enumerate(names):
             write_picture(root / paths[c], subject.images[i][c])
             person = (subject.labels[i][c] > 0).astype(np.uint8) * 255
             write_picture(root / f"mask/{name}/{frame:06d}.png", person)
     file = "annots_new.npy" if listed == "none" else "annots.npy"
-    write_object(root / file, {"cams": _cams(subject), "ims": [] if listed == "none" else ims})
+    write_object(
+        root / file, {"cams": _cams(subject), "ims": [] if listed == "none" else ims}
+    )
     _params(root, "smpl_params", subject)
     return root

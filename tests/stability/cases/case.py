@@ -25,20 +25,33 @@ FINITE_ONLY = "finite only"
 NOT_FINITE = "not finite"
 STATUSES = (RIGHT, WARNED, REFUSED, FINITE_ONLY, NOT_FINITE)
 # Modules of cases, in the order of the table; each has ``cases()``.
-MODULES = ("gaussians", "scenes", "skeleton", "rotations", "lbs", "psi", "losses", "generator")
+MODULES = (
+    "gaussians",
+    "scenes",
+    "skeleton",
+    "rotations",
+    "lbs",
+    "psi",
+    "losses",
+    "generator",
+)
 
 
 @dataclass(frozen=True)
 class Tolerance:
     """How far float32 may be from float64."""
 
-    values: float = 1e-5  # difference of an output, relative to its largest entry where that is > 1
-    gradients: float = 1e-4  # difference of an input's gradient, relative to its largest entry
+    # difference of an output, relative to its largest entry where that is > 1
+    values: float = 1e-5
+    # difference of an input's gradient, relative to its largest entry
+    gradients: float = 1e-4
 
     def at(self, dtype: torch.dtype) -> Tolerance:
         """The same number of another type's roundings, but no less than float64 can reach."""
         part = torch.finfo(dtype).eps / torch.finfo(torch.float32).eps
-        return Tolerance(max(self.values * part, 1e-10), max(self.gradients * part, 1e-9))
+        return Tolerance(
+            max(self.values * part, 1e-10), max(self.gradients * part, 1e-9)
+        )
 
 
 @dataclass(frozen=True)
@@ -77,7 +90,11 @@ class Case:
 
     def backends(self, device: torch.device | str = "cpu") -> tuple[str, ...]:
         """The backends to compare one by one; ``("-",)`` where nothing is rasterised."""
-        return (NO_BACKEND,) if self.settings is None else drawing_backends(device, self.settings)
+        return (
+            (NO_BACKEND,)
+            if self.settings is None
+            else drawing_backends(device, self.settings)
+        )
 
     def outputs(self, inputs: Inputs, backend: str = "reference") -> Outputs:
         """Runs the case; the default is what others are compared with."""
@@ -90,7 +107,9 @@ def drawing_backends(
     """The backends that keep to these settings on this device."""
     device = torch.device(device)
     names = (name for name in BACKENDS if name != "auto")
-    found = [name for name in names if resolve_backend(name, device, settings)[0] == name]
+    found = [
+        name for name in names if resolve_backend(name, device, settings)[0] == name
+    ]
     if "gsplat" in found and gsplat_backend.differences(settings, device):
         found.remove("gsplat")
     return tuple(found)
@@ -118,7 +137,8 @@ class Row(NamedTuple):
     backend: str
     value_error: float  # as in ``Tolerance``; NaN where nothing could be compared
     gradient_error: float
-    worst_input: str  # the one with that gradient error; empty where all gradients are exact
+    # the one with that gradient error; empty where all gradients are exact
+    worst_input: str
     status: str
     expected: str
     note: str
@@ -148,8 +168,13 @@ def compare(
     else:
         exact_outputs, exact_slopes, _ = _run(case, exact, "reference")
         floors, tolerance = case.gradient_floor or {}, case.tolerance.at(dtype)
-        value_error = max((_error(outputs[k], v, least=1.0) for k, v in exact_outputs.items()))
-        errors = {k: _error(slopes[k], v, floor=floors.get(k, 0)) for k, v in exact_slopes.items()}
+        value_error = max(
+            (_error(outputs[k], v, least=1.0) for k, v in exact_outputs.items())
+        )
+        errors = {
+            k: _error(slopes[k], v, floor=floors.get(k, 0))
+            for k, v in exact_slopes.items()
+        }
         worst = max(errors, key=errors.__getitem__)
         gradient_error = errors[worst]
         worst = worst if gradient_error > 0 else ""
@@ -161,7 +186,9 @@ def compare(
             status = WARNED if message else RIGHT
         else:
             status = FINITE_ONLY
-    note = " ".join(x for x in (case.note, f"Message: {message}" if message else "") if x)
+    note = " ".join(
+        x for x in (case.note, f"Message: {message}" if message else "") if x
+    )
     return Row(
         *(case.name, case.subject, backend, value_error, gradient_error, worst),
         *(status, case.expect, note),
@@ -184,7 +211,9 @@ def assert_as_expected(
 
 def _run(case: Case, inputs: Inputs, backend: str) -> tuple[Inputs, Inputs, str]:
     """Outputs, gradients by input, and the text of warnings."""
-    leaves = {k: v.clone().requires_grad_(v.is_floating_point()) for k, v in inputs.items()}
+    leaves = {
+        k: v.clone().requires_grad_(v.is_floating_point()) for k, v in inputs.items()
+    }
     generator = torch.Generator().manual_seed(0)
     total = torch.zeros((), dtype=torch.float64)
     with warnings.catch_warnings(record=True) as caught:
@@ -194,7 +223,9 @@ def _run(case: Case, inputs: Inputs, backend: str) -> tuple[Inputs, Inputs, str]
             # Drawn for every output, so that weights do not depend on which ones carry a graph.
             weights = torch.randn(value.shape, generator=generator).to(value.device)
             if value.requires_grad:
-                total = total.to(value.device) + (value.double() * weights.double()).sum()
+                total = (
+                    total.to(value.device) + (value.double() * weights.double()).sum()
+                )
         if total.requires_grad:
             total.backward()
     gradients = {
@@ -202,11 +233,15 @@ def _run(case: Case, inputs: Inputs, backend: str) -> tuple[Inputs, Inputs, str]
         for name, leaf in leaves.items()
         if leaf.is_floating_point()
     }
-    message = " ".join(str(w.message) for w in caught if issubclass(w.category, UserWarning))
+    message = " ".join(
+        str(w.message) for w in caught if issubclass(w.category, UserWarning)
+    )
     return {k: v.detach() for k, v in outputs.items()}, gradients, message
 
 
-def _error(got: Tensor, want: Tensor, *, least: float = 0.0, floor: float = 0.0) -> float:
+def _error(
+    got: Tensor, want: Tensor, *, least: float = 0.0, floor: float = 0.0
+) -> float:
     """Largest difference relative to ``max(least, |want|)``; equal infinities and NaNs differ by 0.
 
     A difference where both are below ``floor`` is none.
@@ -215,7 +250,8 @@ def _error(got: Tensor, want: Tensor, *, least: float = 0.0, floor: float = 0.0)
     same = (got == want) | (got.isnan() & want.isnan())
     difference = (got - want).abs().nan_to_num(nan=math.inf, posinf=math.inf)[~same]
     largest = [
-        float(x[x.isfinite()].abs().amax()) if x.isfinite().any() else 0 for x in (got, want)
+        float(x[x.isfinite()].abs().amax()) if x.isfinite().any() else 0
+        for x in (got, want)
     ]
     if not difference.numel() or max(largest) < floor:
         return 0.0

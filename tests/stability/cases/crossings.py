@@ -47,7 +47,9 @@ def _shrinking_forearm(s: Tensor) -> Tensor:
     return p
 
 
-def _bending_arm(s: Tensor, around: float = 0.0, across: float = 0.0, reach: float = 0.1) -> Tensor:
+def _bending_arm(
+    s: Tensor, around: float = 0.0, across: float = 0.0, reach: float = 0.1
+) -> Tensor:
     """The forearm turns ``reach`` radians to either side of ``around`` radians off straight.
 
     It bends about the elbow's hinge, forwards where positive, and passes ``around`` at a distance
@@ -65,7 +67,9 @@ def _bending_arm(s: Tensor, around: float = 0.0, across: float = 0.0, reach: flo
     return p
 
 
-def _shoulders_through_the_spine(s: Tensor, direction: tuple[float, float, float]) -> Tensor:
+def _shoulders_through_the_spine(
+    s: Tensor, direction: tuple[float, float, float]
+) -> Tensor:
     """The shoulder line, along the spine but for a part that passes zero."""
     p = rest(len(s))
     _line(p, (11, 12), _vector(0, 0.15, 0) + _through(s, 2, *direction))

@@ -53,15 +53,21 @@ def cases() -> Iterator[Case]:
     for channels in (1, 64):
         yield _case(f"C = {channels}", partial(_thirty, channels=channels))
     for size in ((1, 1), (1, 40), (31, 2), (17, 33)):
-        yield _case(f"an image of {size[0]} x {size[1]}", partial(_thirty, size=size), size=size)
+        yield _case(
+            f"an image of {size[0]} x {size[1]}", partial(_thirty, size=size), size=size
+        )
     yield from _layers()
     yield from _orders()
 
 
-def _alone(name: str, mean: Numbers = ON_PIXEL, options: Any = None, **shape: Any) -> Case:
+def _alone(
+    name: str, mean: Numbers = ON_PIXEL, options: Any = None, **shape: Any
+) -> Case:
     """One hard Gaussian among a dozen ordinary ones."""
     return _case(
-        name, lambda: {**among(cloud(), gaussians([mean], **shape)), **pinhole()}, **(options or {})
+        name,
+        lambda: {**among(cloud(), gaussians([mean], **shape)), **pinhole()},
+        **(options or {}),
     )
 
 
@@ -82,7 +88,9 @@ def _opacities() -> Iterator[Case]:
         "note": "Nearer to 1 than the presets' cap: float32 keeps three digits of what is behind.",
     }
     front, wide = (0.0, 0.0, 0.5), (5.0, 6.0, 7.0)
-    yield _alone("opacity 1 in front of everything", front, options, scales=wide, opacity=1.0)
+    yield _alone(
+        "opacity 1 in front of everything", front, options, scales=wide, opacity=1.0
+    )
 
 
 def _sizes() -> Iterator[Case]:
@@ -101,7 +109,9 @@ def _sizes() -> Iterator[Case]:
         "settings": replace(uncut(HIGH), antialias=True),
         "note": "Nothing is skipped: what is left of its opacity is far below any cut-off.",
     }
-    yield _alone("1e-6 m, anti-aliased", options=options, scales=(1e-6, 2e-6, 3e-6), quat=TILTED)
+    yield _alone(
+        "1e-6 m, anti-aliased", options=options, scales=(1e-6, 2e-6, 3e-6), quat=TILTED
+    )
 
 
 def _sparse(
@@ -110,7 +120,9 @@ def _sparse(
     """One hard Gaussian among small ordinary ones, through a long lens."""
     others = cloud(8, scale=0.006, extent=(0.1, 0.08, 0.1), middle=(0.0, 0.0, 2.1))
     hard = gaussians([mean], scales=scales, quat=quat)
-    return _case(name, lambda: {**among(others, hard), **pinhole(focal=600.0)}, **options)
+    return _case(
+        name, lambda: {**among(others, hard), **pinhole(focal=600.0)}, **options
+    )
 
 
 def _turned(degrees: float) -> Numbers:
@@ -137,16 +149,30 @@ def _needles() -> Iterator[Case]:
     yield _sparse(long, (20.0, 2e-3, 2e-3), _turned(45), note=note)
     yield _sparse("needle towards the camera", (1e-4, 1e-4, 1.0), (1.0, 0.0, 0.0, 0.0))
     settings = replace(HIGH, antialias=True)
-    yield _sparse("needle, anti-aliased", NEEDLE, _turned(45), settings=settings, note=note)
-    for name, turn in (("seen flat", 0.0), ("seen edge on", math.pi / 4), ("tilted", 0.6)):
+    yield _sparse(
+        "needle, anti-aliased", NEEDLE, _turned(45), settings=settings, note=note
+    )
+    for name, turn in (
+        ("seen flat", 0.0),
+        ("seen edge on", math.pi / 4),
+        ("tilted", 0.6),
+    ):
         quat = (math.cos(turn), 0.0, math.sin(turn), 0.0)
         yield _sparse(f"pancake 1e4:1 {name}", PANCAKE, quat)
 
 
 def _low_passes() -> Iterator[Case]:
     """What is thinner than a pixel, at the low-pass of conf/model: a quarter of the usual one."""
-    settings, name = replace(HIGH, name="of the model", low_pass=0.0833), "low-pass of 1/12, "
-    for degrees, antialias in ((0.0, False), (45.0, False), (37.3, False), (45.0, True)):
+    settings, name = (
+        replace(HIGH, name="of the model", low_pass=0.0833),
+        "low-pass of 1/12, ",
+    )
+    for degrees, antialias in (
+        (0.0, False),
+        (45.0, False),
+        (37.3, False),
+        (45.0, True),
+    ):
         yield _sparse(
             f"{name}needle at {degrees:g} degrees{', anti-aliased' if antialias else ''}",
             NEEDLE,
@@ -179,7 +205,10 @@ FLAT = (("of rank 1", (0.04, 0.0, 0.0)), ("zero", (0.0, 0.0, 0.0)))
 
 
 def _with_covariance(diagonal: Numbers) -> Inputs:
-    scene = {**among(_as_covariances(cloud()), _as_covariances(gaussians([ON_PIXEL]))), **pinhole()}
+    scene = {
+        **among(_as_covariances(cloud()), _as_covariances(gaussians([ON_PIXEL]))),
+        **pinhole(),
+    }
     R = rotation((0.8, 0.4, 0.3))
     flat = R @ torch.diag(torch.tensor(diagonal, dtype=torch.float64)) @ R.mT
     return {**scene, "covariances": flat.expand(1, 1, 3, 3)}
@@ -196,7 +225,9 @@ def _quaternions() -> Iterator[Case]:
     for name, length in (("tiny", 1e-15), ("huge", 1e15), ("of length 3", 3.0)):
         direction = torch.tensor([0.8, 0.4, 0.3, 0.2]) / math.sqrt(0.93) * length
         yield _alone(f"quaternion {name}", scales=shape, quat=direction.tolist())
-    options = {"note": "Noise, not a direction: drawn as the identity, and it gets no gradient."}
+    options = {
+        "note": "Noise, not a direction: drawn as the identity, and it gets no gradient."
+    }
     for name, length in (("zero", 0.0), ("1e-30", 1e-30)):
         quat = (0.0, length, 0.0, 0.0)
         yield _alone(f"quaternion {name}", options=options, scales=shape, quat=quat)
@@ -276,7 +307,9 @@ def _orders() -> Iterator[Case]:
         note="Depths differ by rounding only: they must be told apart in float64.",
     )
     # A world whose origin is at the Gaussians: float32 holds 1e-8 m there, not at 2 m.
-    close = gaussians([(0.0, 0.0, 1e-8 * (5 - i)) for i in range(6)], scales=(0.2, 0.3, 0.1))
+    close = gaussians(
+        [(0.0, 0.0, 1e-8 * (5 - i)) for i in range(6)], scales=(0.2, 0.3, 0.1)
+    )
     yield _case(
         "depths nearer than float32 resolves",
         lambda: {**close, **pinhole(t=(0.0, 0.0, 2.0))},
@@ -292,13 +325,17 @@ def _plane(n: int, camera: Inputs) -> Inputs:
     return {**scene, "means": means.float().double()}
 
 
-def _two_views(inputs: Inputs, backend: str, *, size: Size, settings: Accuracy) -> Outputs:
+def _two_views(
+    inputs: Inputs, backend: str, *, size: Size, settings: Accuracy
+) -> Outputs:
     """The image, and how it changes when the camera moves a micrometre."""
     still = render(inputs, backend, size=size, settings=settings)
     change = {}
     for axis, name in enumerate("xyz"):
         step = torch.zeros_like(inputs["t"])
         step[:, axis] = 1e-6
-        moved = render({**inputs, "t": inputs["t"] + step}, backend, size=size, settings=settings)
+        moved = render(
+            {**inputs, "t": inputs["t"] + step}, backend, size=size, settings=settings
+        )
         change[f"change along {name}"] = moved["features"] - still["features"]
     return {**still, **change}

@@ -35,7 +35,10 @@ def cases() -> Iterator[Case]:
     ):
         yield Case("generator", name, make, run, note=note)
     note = "The image only: half precision's gradients belong to a network whose activations near "
-    for half, dtype, within in (("bf16", torch.bfloat16, 0.05), ("fp16", torch.float16, 0.02)):
+    for half, dtype, within in (
+        ("bf16", torch.bfloat16, 0.05),
+        ("fp16", torch.float16, 0.02),
+    ):
         for name, make in (
             ("an ordinary image", _inputs),
             ("half of the pixels all zero", half_empty),
@@ -87,7 +90,8 @@ def _inputs(scale: float = 1.0, shift: float = 0.0, person: float = 1.0) -> Inpu
 def _painted(inputs: Inputs, biased: bool = True) -> Outputs:
     F, S, p2d, g, fine = (inputs[name] for name in ("F", "S", "p2d", "g", "fine"))
     generator = _generator(F.dtype, F.device, biased)
-    bound = generator.feature_bound  # the avatar bounds what is splatted, see Avatar.bounded
+    # the avatar bounds what is splatted, see Avatar.bounded
+    bound = generator.feature_bound
     F, fine = F.clamp(-bound, bound), fine.clamp(-bound, bound)
     return {"image": generator(F, S, p2d, g, fine)}
 

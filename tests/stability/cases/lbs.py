@@ -25,7 +25,9 @@ PARENTS = (-1, 0, 1)
 """Shoulder, elbow, wrist: an arm along x, 0.3 m each."""
 BONES = torch.tensor([[0, 1], [1, 2], [0, 1], [2, 2]])
 """Of four points: two that bones share half and half, one nearly rigid, one rigid."""
-WEIGHTS = torch.tensor([[0.5, 0.5], [0.5, 0.5], [0.99, 0.01], [1.0, 0.0]], dtype=torch.float64)
+WEIGHTS = torch.tensor(
+    [[0.5, 0.5], [0.5, 0.5], [0.99, 0.01], [1.0, 0.0]], dtype=torch.float64
+)
 
 
 def cases() -> Iterator[Case]:
@@ -34,7 +36,10 @@ def cases() -> Iterator[Case]:
     for name, factor in (("two", 2.0), ("a half", 0.5), ("a millionth", 1e-6)):
         note = {"note": "They are divided by their sum."}
         yield _case(f"weights that sum to {name}", note, weights=WEIGHTS * factor)
-    for name, row in (("a vertex without weight", [0.0, 0.0]), ("a negative weight", [1.5, -0.5])):
+    for name, row in (
+        ("a vertex without weight", [0.0, 0.0]),
+        ("a negative weight", [1.5, -0.5]),
+    ):
         weights = torch.cat([WEIGHTS.new_tensor([row]), WEIGHTS[1:]])
         yield _case(name, {"expect": REFUSED}, weights=weights)
     yield from _turns()
@@ -45,7 +50,12 @@ def _arm(**changes: Any) -> Inputs:
     made = {
         "theta": [[0.1, -0.2, 0.3], [0.0, 0.4, 0.2], [-0.3, 0.1, 0.2]],
         "weights": WEIGHTS,
-        "points": [[0.3, 0.04, 0.0], [0.6, 0.0, 0.04], [0.15, 0.03, 0.02], [0.7, 0.01, 0.02]],
+        "points": [
+            [0.3, 0.04, 0.0],
+            [0.6, 0.0, 0.04],
+            [0.15, 0.03, 0.02],
+            [0.7, 0.01, 0.02],
+        ],
         "joints": [[0.0, 0, 0], [0.3, 0, 0], [0.6, 0, 0]],
     } | changes
     inputs = {k: torch.as_tensor(v, dtype=torch.float64) for k, v in made.items()}
@@ -61,7 +71,9 @@ def _skinned(inputs: Inputs) -> dict[str, Tensor]:
     """Points, covariances and normals ``[1, 4, ...]`` of the posed, perhaps scaled arm."""
     check_weights(inputs["weights"].detach())  # as every body does when it is made
     R = axis_angle_to_matrix(inputs["theta"])
-    bones = forward_kinematics(inputs["joints"], PARENTS, R, torch.zeros_like(R[:, 0, 0]))
+    bones = forward_kinematics(
+        inputs["joints"], PARENTS, R, torch.zeros_like(R[:, 0, 0])
+    )
     if "bone scale" in inputs:
         size = inputs["bone scale"][:, None, None]
         last = bones.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(1, 3, 1, 4)
@@ -73,7 +85,9 @@ def _skinned(inputs: Inputs) -> dict[str, Tensor]:
     return {**posed, "normals": moved_normals(A, up)}
 
 
-def _rendered(inputs: Inputs, backend: str, *, size: Size, settings: Accuracy) -> dict[str, Tensor]:
+def _rendered(
+    inputs: Inputs, backend: str, *, size: Size, settings: Accuracy
+) -> dict[str, Tensor]:
     """The skinned Gaussians, and their image."""
     posed = _skinned(inputs)
     gaussians = Gaussians(
@@ -110,12 +124,19 @@ def _images() -> Iterator[Case]:
     camera = pinhole(focal=40.0, t=(-0.35, 0.02, 1.0))
     twisted = [[0.0, 0, 0], [math.pi, 0, 0], [0.0, 0, 0]]
     folded = [[0.0, 0, 0], [0, 0, math.pi], [0.0, 0, 0]]
-    flat = "Half and half of two opposite bones is flat: the covariance has rank 1 or 2."
+    flat = (
+        "Half and half of two opposite bones is flat: the covariance has rank 1 or 2."
+    )
     for name, key, value, note in (
         ("elbow collapsed by twisting half a turn", "theta", twisted, flat),
         ("elbow collapsed by folding half a turn", "theta", folded, flat),
         ("bone scale 0", "bone scale", [1.0, 0.0, 1.0], "Gaussians shrink to a point."),
-        ("all bones of scale 0", "bone scale", [0.0, 0.0, 0.0], "All Gaussians are points."),
+        (
+            "all bones of scale 0",
+            "bone scale",
+            [0.0, 0.0, 0.0],
+            "All Gaussians are points.",
+        ),
     ):
         arm = {**_arm(**{key: value}), **camera}
         yield raster_case("LBS", name, lambda arm=arm: arm, draw=_rendered, note=note)

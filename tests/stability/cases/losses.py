@@ -6,7 +6,12 @@ from functools import lru_cache, partial
 import torch
 from torch import Tensor
 
-from gsgan.losses.adversarial import FORMS, discriminator_loss, feature_matching, generator_loss
+from gsgan.losses.adversarial import (
+    FORMS,
+    discriminator_loss,
+    feature_matching,
+    generator_loss,
+)
 from gsgan.losses.perceptual import Perceptual
 from gsgan.losses.photometric import d_ssim, photometric
 from gsgan.metrics.image import psnr, ssim
@@ -57,28 +62,49 @@ def cases() -> Iterator[Case]:
         pair = partial(dict, image=image, target=target)
         for what, run in (
             ("D-SSIM", lambda x: {"D-SSIM": d_ssim(**x)}),
-            ("L1, L2 and D-SSIM", lambda x: {"loss": photometric(**x, l1=0.8, l2=1.0, ssim=0.2)}),
+            (
+                "L1, L2 and D-SSIM",
+                lambda x: {"loss": photometric(**x, l1=0.8, l2=1.0, ssim=0.2)},
+            ),
         ):
             title, note = f"{what} of {name}", NOTES.get(name, "")
             yield _case(title, pair, run, tolerance=Tolerance(1e-6, 5e-4), note=note)
         note = "PSNR is infinite: reported as such, counted, and kept out of means."
         note = note if torch.equal(image, target) else ""
         yield _case(f"PSNR and SSIM of {name}", pair, _scores, note=note)
-        if name not in ("ordinary images", "equal images", "all background", "two greys"):
+        if name not in (
+            "ordinary images",
+            "equal images",
+            "all background",
+            "two greys",
+        ):
             continue
         for what, run in (
             ("perceptual loss", _perceptual),
-            ("discriminator's losses", partial(_adversarial, norm="instance", form="logistic")),
-            ("comparing discriminator's", partial(_adversarial, norm="none", form="relativistic")),
+            (
+                "discriminator's losses",
+                partial(_adversarial, norm="instance", form="logistic"),
+            ),
+            (
+                "comparing discriminator's",
+                partial(_adversarial, norm="none", form="relativistic"),
+            ),
         ):
             yield _case(f"{what} of {name}", pair, run, tolerance=Tolerance(1e-5, 1e-3))
     # Discriminators that are certain, of the truth and of its opposite.
     logits = torch.tensor([[1e4, -1e4, 90.0, -90.0, 0.0, 1.0]], dtype=torch.float64)
     for form in FORMS:
         inputs = partial(dict, real=logits, fake=logits.flip(-1))
-        yield _case(f"{form} GAN with logits of ± 1e4", inputs, partial(_gan, form=form))
+        yield _case(
+            f"{form} GAN with logits of ± 1e4", inputs, partial(_gan, form=form)
+        )
     for name, probability, label, note in (
-        ("class of probability 0", 0.0, 1, "log(P + 1e-6): a slope of 1e6 leads out of zero."),
+        (
+            "class of probability 0",
+            0.0,
+            1,
+            "log(P + 1e-6): a slope of 1e6 leads out of zero.",
+        ),
         ("class of probability 1e-30", 1e-30, 1, ""),
         ("class of probability 1", 0.0, 0, ""),
         ("no pixel with a label", 0.3, IGNORE, "The loss is 0, not 0 / 0."),
@@ -107,7 +133,9 @@ def _perceptual_loss(dtype: torch.dtype, device: torch.device) -> Perceptual:
 
 
 @lru_cache(maxsize=8)
-def _discriminator(dtype: torch.dtype, device: torch.device, norm: str) -> Discriminator:
+def _discriminator(
+    dtype: torch.dtype, device: torch.device, norm: str
+) -> Discriminator:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         made = Discriminator(scales=2, base=4, layers=3, norm=norm)

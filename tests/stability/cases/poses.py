@@ -24,10 +24,14 @@ def rest(batch: int = 1) -> Tensor:
 def noisy(seed: int, batch: int = 1, sigma: float = 0.03) -> Tensor:
     """The rest pose with every joint moved: no symmetry, no ties."""
     generator = torch.Generator().manual_seed(seed)
-    return rest(batch) + sigma * torch.randn(batch, 33, 3, generator=generator, dtype=torch.float64)
+    return rest(batch) + sigma * torch.randn(
+        batch, 33, 3, generator=generator, dtype=torch.float64
+    )
 
 
-def _placed(joints: Mapping[int, Tensor | tuple[float, ...]], base: Tensor = REST) -> Tensor:
+def _placed(
+    joints: Mapping[int, Tensor | tuple[float, ...]], base: Tensor = REST
+) -> Tensor:
     p = base.expand(1, -1, -1).clone()
     for joint, xyz in joints.items():
         p[:, joint] = torch.as_tensor(xyz)
@@ -65,7 +69,10 @@ def _antipodal() -> Tensor:
 
 def _collinear_head() -> Tensor:
     """Nose on the line of the ears and of the eyes; no two distances in the face are equal."""
-    line = {k: (x, 1.55, 0.0) for k, x in ((7, 0.07), (8, -0.08), (2, 0.03), (5, -0.03), (0, 0.0))}
+    line = {
+        k: (x, 1.55, 0.0)
+        for k, x in ((7, 0.07), (8, -0.08), (2, 0.03), (5, -0.03), (0, 0.0))
+    }
     face = REST.clone()
     face[:11] += 0.01 * (noisy(0, sigma=1.0) - REST)[0, :11]
     return _placed(line, face)
@@ -76,7 +83,9 @@ _SPINE = {11: (0.0, 1.5, 0.0), 12: (0.0, 1.3, 0.0)}  # the shoulder line runs al
 DEGENERATE: dict[str, Tensor] = {
     "an ordinary pose": rest(),
     "limb of zero length": _placed({15: REST[13], 25: REST[23]}),
-    "limb of a tenth of a millimetre": _placed({15: REST[13] + torch.tensor([0.0, 6e-5, 8e-5])}),
+    "limb of a tenth of a millimetre": _placed(
+        {15: REST[13] + torch.tensor([0.0, 6e-5, 8e-5])}
+    ),
     "hand collapsed to a point": _placed(dict.fromkeys((17, 19, 21), REST[15])),
     "all joints coincide": _placed(dict.fromkeys(range(33), REST[0])),
     "arms and legs straight": _bent(1.0),
@@ -91,12 +100,20 @@ DEGENERATE: dict[str, Tensor] = {
         {**_SPINE, 23: (0.0, 1.0, 0.0), 24: (0.0, 0.8, 0.0)}
     ),
     "trunk without width along the world's x axis": _placed(
-        {11: (0.5, 0.0, 0.0), 12: (0.4, 0.0, 0.0), 23: (0.1, 0.0, 0.0), 24: (0.0, 0.0, 0.0)}
+        {
+            11: (0.5, 0.0, 0.0),
+            12: (0.4, 0.0, 0.0),
+            23: (0.1, 0.0, 0.0),
+            24: (0.0, 0.0, 0.0),
+        }
     ),
     "nose, ears and eyes in line": _collinear_head(),
     "left and right swapped": rest()[:, list(MEDIAPIPE33.mirror)],
     "shoulders turned back to front over the hips": _placed(
-        {k: torch.cat([REST.new_tensor([x]), REST[k, 1:]]) for k, x in ((11, -0.175), (12, 0.175))}
+        {
+            k: torch.cat([REST.new_tensor([x]), REST[k, 1:]])
+            for k, x in ((11, -0.175), (12, 0.175))
+        }
     ),
 }
 """``[1, 33, 3]`` by name."""

@@ -24,7 +24,9 @@ NAMES = tuple(field.name for field in fields(Residuals))
 @lru_cache(maxsize=8)
 def some_points(dtype: torch.dtype, device: torch.device) -> Densify:
     """Densify with so many points that none starts wider than Ψ allows."""
-    return Densify(points_per_limb=40, face_points=60, torso_points=80, dtype=dtype).to(device)
+    return Densify(points_per_limb=40, face_points=60, torso_points=80, dtype=dtype).to(
+        device
+    )
 
 
 @lru_cache(maxsize=8)
@@ -53,10 +55,15 @@ def ordinary_residuals(seed: int = 0, sigma: float = 0.3) -> Inputs:
     sh = ((SH_DEGREE + 1) ** 2, 3)
     shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh": sh}
     made = {
-        name: sigma * torch.randn(1, n, *shape, generator=generator, dtype=torch.float64)
+        name: sigma
+        * torch.randn(1, n, *shape, generator=generator, dtype=torch.float64)
         for name, shape in {**shapes, "features": (FEATURES,)}.items()
     }
-    return {**made, "p": noisy(1), "eye": torch.tensor([[0.1, 1.0, 4.0]], dtype=torch.float64)}
+    return {
+        **made,
+        "p": noisy(1),
+        "eye": torch.tensor([[0.1, 1.0, 4.0]], dtype=torch.float64),
+    }
 
 
 def composed(inputs: Inputs, frame: Numbers | None = None) -> dict[str, Tensor]:
@@ -81,14 +88,22 @@ def _changed(**changes: float | Tensor) -> Inputs:
     """Ordinary residuals but for the given ones."""
     made = ordinary_residuals()
     for key, value in changes.items():
-        made[key] = torch.as_tensor(value, dtype=torch.float64).expand_as(made[key]).clone()
+        made[key] = (
+            torch.as_tensor(value, dtype=torch.float64).expand_as(made[key]).clone()
+        )
     return made
 
 
 def cases() -> Iterator[Case]:
     """All of them."""
-    for name, note, options, changes in (*_residuals(), *_quaternions(), _close_camera()):
-        yield Case("Ψ", name, partial(_changed, **changes), composed, note=note, **options)
+    for name, note, options, changes in (
+        *_residuals(),
+        *_quaternions(),
+        _close_camera(),
+    ):
+        yield Case(
+            "Ψ", name, partial(_changed, **changes), composed, note=note, **options
+        )
     for name, (frame, note) in FRAMES.items():
         run = partial(composed, frame=frame)
         yield Case("Ψ", f"frames of {name}", ordinary_residuals, run, note=note)
@@ -102,11 +117,15 @@ def cases() -> Iterator[Case]:
         )
 
 
-Row = tuple[str, str, dict[str, Any], dict[str, Any]]  # name, note, options of the case, changes
+# name, note, options of the case, changes
+Row = tuple[str, str, dict[str, Any], dict[str, Any]]
 
 
 def _residuals() -> Iterator[Row]:
-    round_ones = {"gradient_floor": {"quats": 1e-3}, "tolerance": Tolerance(gradients=1e-3)}
+    round_ones = {
+        "gradient_floor": {"quats": 1e-3},
+        "tolerance": Tolerance(gradients=1e-3),
+    }
     same = "The Gaussians are round, so turning them makes no difference."
     yield "ordinary residuals", "", {}, {}
     yield "means' tanh at 4", "Its slope is 1e-3.", {}, {"means": 4.0}
@@ -115,12 +134,26 @@ def _residuals() -> Iterator[Row]:
     for value in (1e3, -1e3):
         note = "The mean stays a quarter of a body height away; the slope is 0."
         yield f"means' tanh saturated at {value:g}", note, {}, {"means": value}
-        note = f"Clamped before the exponential: nothing overflows, the slope is 0. {same}"
+        note = (
+            f"Clamped before the exponential: nothing overflows, the slope is 0. {same}"
+        )
         yield f"scales' exponent at {value:g}", note, round_ones, {"scales": value}
-        note = "Clamped to ± 8, where the sigmoid is off 0 and 1; the slope beyond is 0."
+        note = (
+            "Clamped to ± 8, where the sigmoid is off 0 and 1; the slope beyond is 0."
+        )
         yield f"opacity's logit at {value:g}", note, {}, {"opacities": value}
-        yield f"colour at {value:g}", "At least 0, not bounded above.", {}, {"sh": value}
-        yield f"every residual at {value:g}", same, round_ones, dict.fromkeys(NAMES, value)
+        yield (
+            f"colour at {value:g}",
+            "At least 0, not bounded above.",
+            {},
+            {"sh": value},
+        )
+        yield (
+            f"every residual at {value:g}",
+            same,
+            round_ones,
+            dict.fromkeys(NAMES, value),
+        )
 
 
 def _quaternions() -> Iterator[Row]:

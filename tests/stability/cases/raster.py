@@ -49,7 +49,9 @@ def raster_case(
     return Case(subject, name, scene, run, settings, **options)
 
 
-def render(inputs: Inputs, backend: str, *, size: Size, settings: Accuracy) -> dict[str, Tensor]:
+def render(
+    inputs: Inputs, backend: str, *, size: Size, settings: Accuracy
+) -> dict[str, Tensor]:
     """Features, alpha and depth of a scene; depths are drawn as one more channel."""
     gaussians, camera = records(inputs, size)
     # in float64, as the rasteriser computes geometry
@@ -90,7 +92,9 @@ def among(others: Inputs, hard: Inputs) -> Inputs:
 
 def uncut(settings: Accuracy) -> Accuracy:
     """The same settings without a cut-off."""
-    return replace(settings, name="uncut", alpha_min=0.0, transmittance_min=0.0, extent="all")
+    return replace(
+        settings, name="uncut", alpha_min=0.0, transmittance_min=0.0, extent="all"
+    )
 
 
 def pinhole(

@@ -25,7 +25,12 @@ COLUMNS = (
     ("columns of a billionth", (1e-9, 0, 0), (0, 1e-9, 0), _STAND_IN),
     ("columns of a million", (1e6, 2e6, -1e6), (3e5, 1e6, 1e6), ""),
     ("columns of a thousandth", (1e-3, 2e-3, -1e-3), (3e-4, 1e-3, 1e-3), ""),
-    ("columns a thousandth off parallel", (0.317, 1.013, 0.211), (0.571, 1.823, 0.383), _ANGLE),
+    (
+        "columns a thousandth off parallel",
+        (0.317, 1.013, 0.211),
+        (0.571, 1.823, 0.383),
+        _ANGLE,
+    ),
 )
 
 
@@ -48,7 +53,12 @@ def cases() -> Iterator[Case]:
 
 def _rotations() -> Tensor:
     """``[4, 3, 3]``: none, ordinary, half a turn, and a turn of a millionth."""
-    turns = ((0.0, 0.0, 0.0), (0.4, -1.1, 0.7), (0.0, 3.14159265358979, 0.0), (1e-6, 0.0, -1e-6))
+    turns = (
+        (0.0, 0.0, 0.0),
+        (0.4, -1.1, 0.7),
+        (0.0, 3.14159265358979, 0.0),
+        (1e-6, 0.0, -1e-6),
+    )
     return torch.stack([rotation(turn) for turn in turns])
 
 

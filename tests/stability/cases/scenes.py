@@ -30,7 +30,9 @@ def _far() -> Inputs:
 def _recentred() -> Inputs:
     """The far scene moved to the origin, in float64: to where a joint of the person may be."""
     scene = _far()
-    origin = scene["means"][:, 0] + torch.tensor([0.095, 0.92, 0.0], dtype=torch.float64)
+    origin = scene["means"][:, 0] + torch.tensor(
+        [0.095, 0.92, 0.0], dtype=torch.float64
+    )
     moved = scene["t"] + (scene["R"] @ origin.unsqueeze(-1)).squeeze(-1)
     return {**scene, "means": scene["means"] - origin.unsqueeze(1), "t": moved}
 
@@ -38,9 +40,16 @@ def _recentred() -> Inputs:
 CAMERAS: dict[str, dict[str, Any]] = {
     "K with skew": {"skew": 4.0},
     "principal point off centre": {"centre": (26.3, 5.1)},
-    "principal point outside the image": {"centre": (40.0, -6.0), "t": (-1.9, 1.3, 2.5)},
+    "principal point outside the image": {
+        "centre": (40.0, -6.0),
+        "t": (-1.9, 1.3, 2.5),
+    },
     "pixels that are not square": {"aspect": 0.6},
-    "skew, off centre and not square": {"skew": -5.0, "centre": (11.0, 16.7), "aspect": 1.4},
+    "skew, off centre and not square": {
+        "skew": -5.0,
+        "centre": (11.0, 16.7),
+        "aspect": 1.4,
+    },
     "field of view of 160 degrees": {"focal": SIZE[1] / 11.3},
     "long lens, 3 km away": {"focal": 4e4, "t": (0.1, -0.2, 3e3)},
 }
@@ -74,7 +83,12 @@ def cases() -> Iterator[Case]:
             1e-4,
             "The same image; a capture like this is refused where it is read.",
         ),
-        ("Gaussians in millimetres, cameras in metres", ("means", "scales"), 1e-4, other),
+        (
+            "Gaussians in millimetres, cameras in metres",
+            ("means", "scales"),
+            1e-4,
+            other,
+        ),
         ("Gaussians in metres, cameras in millimetres", ("t",), 5e-4, other),
     ):
         scene = partial(_times, dict.fromkeys(parts, 1e3))

@@ -75,7 +75,9 @@ def cases() -> Iterator[Case]:
 @lru_cache(maxsize=8)
 def few_points(dtype: torch.dtype, device: torch.device) -> Densify:
     """Densify with a handful of points per part."""
-    return Densify(points_per_limb=3, face_points=5, torso_points=6, dtype=dtype).to(device)
+    return Densify(points_per_limb=3, face_points=5, torso_points=6, dtype=dtype).to(
+        device
+    )
 
 
 def frames_and_points(inputs: Inputs) -> dict[str, Tensor]:
@@ -122,7 +124,9 @@ def _lost() -> Iterator[Case]:
     many = [0, 7, 13, 16, 17, 24, 27, 28]
     note = "Stand-ins hang on what was seen; a lost joint's own gradient is 0."
     for name, value in (("NaN", math.nan), ("infinite", math.inf)):
-        yield _case(f"eight joints {name}", partial(_losing, many, value), _sanitised, note=note)
+        yield _case(
+            f"eight joints {name}", partial(_losing, many, value), _sanitised, note=note
+        )
     yield _case("all joints but the trunk's unseen", _only_trunk, _sanitised, note=note)
     two = partial(_losing, [11, 24], math.nan)
     yield _case("two joints of the trunk lost", two, _sanitised, expect=REFUSED)

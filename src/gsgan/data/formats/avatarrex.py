@@ -16,7 +16,9 @@ from gsgan.data.formats.smplx_rig import SmplxRigReader
 class AvatarrexReader(SmplxRigReader):
     """Reads a subject of AvatarReX; settings as `SmplxRigReader`."""
 
-    contents: ClassVar[str] = "calibration_full.json, smpl_params.npz and a folder for each camera"
+    contents: ClassVar[str] = (
+        "calibration_full.json, smpl_params.npz and a folder for each camera"
+    )
     layout: ClassVar[str] = "AvatarReX"
     calibration: ClassVar[str] = "calibration_full.json"
     images: ClassVar[str] = "{camera}"

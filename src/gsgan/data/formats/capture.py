@@ -24,7 +24,13 @@ import numpy as np
 
 from gsgan.body.shape import HANDS_SHAPE, STRETCHED, free_space
 from gsgan.body.shape import LANDMARKS as LANDMARKS_SHAPE
-from gsgan.data.calibration import METRES, Conventions, choose, read_cameras, read_conventions
+from gsgan.data.calibration import (
+    METRES,
+    Conventions,
+    choose,
+    read_cameras,
+    read_conventions,
+)
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.files import FrameFiles, frame_files, read_arrays, read_json
 from gsgan.data.formats.common import IMAGES, finish, one_mask_each
@@ -32,7 +38,13 @@ from gsgan.data.formats.consistency import Consistency
 from gsgan.data.joints import zeros_as_missing
 from gsgan.data.layout import BodyModel, Found, Layout, Meta, dataset_folder
 from gsgan.data.pixels import PixelRules
-from gsgan.data.skeletons import SKELETONS, Landmarks, Poses, make_landmarks, whole_frame_ids
+from gsgan.data.skeletons import (
+    SKELETONS,
+    Landmarks,
+    Poses,
+    make_landmarks,
+    whole_frame_ids,
+)
 from gsgan.data.validation import Thresholds
 from gsgan.skeleton.face import FACE, FACE_NAMES
 from gsgan.skeleton.hands import HAND
@@ -40,8 +52,11 @@ from gsgan.utils.arrays import expect_array
 from gsgan.utils.checks import is_number, whole
 from gsgan.utils.errors import DataError
 
-LANDMARKS, HANDS_FILE, FACE_FILE = "landmarks3d.npz", "hands3d.npz", "face3d.npz"
-POSES, SHAPE = "body_pose.npz", "body_shape.npz"
+LANDMARKS = "landmarks3d.npz"
+HANDS_FILE = "hands3d.npz"
+FACE_FILE = "face3d.npz"
+POSES = "body_pose.npz"
+SHAPE = "body_shape.npz"
 MASKS = (".png",)
 BODY_BONES = {"free": 56, "smpl": 24, "smplx": 55}
 SKELETON_LIMITS = Consistency(least_inside=0.2)
@@ -59,7 +74,9 @@ class CaptureReader:
     def __post_init__(self) -> None:
         whole("data.reader.ignore_band", self.ignore_band, 0)
 
-    def __call__(self, root: str | Path, limits: Thresholds, smpl: str | None = None) -> Layout:
+    def __call__(
+        self, root: str | Path, limits: Thresholds, smpl: str | None = None
+    ) -> Layout:
         """Reads and checks everything except most images' pixels.
 
         Args:
@@ -70,7 +87,9 @@ class CaptureReader:
         Raises:
             DataError: for whatever is missing, damaged or contradictory, naming the file.
         """
-        found = _find(dataset_folder(root, "cameras.json, images/ and masks/"), limits, smpl, self)
+        found = _find(
+            dataset_folder(root, "cameras.json, images/ and masks/"), limits, smpl, self
+        )
         hint = "check that cameras, landmarks and masks belong together"
         return finish(found, limits, self.consistency, hint, self.drop_frames)
 
@@ -86,7 +105,9 @@ def read_capture(
     return CaptureReader(drop_frames, consistency)(root, limits or Thresholds(), smpl)
 
 
-def _find(root: Path, limits: Thresholds, smpl: str | None, reader: CaptureReader) -> Found:
+def _find(
+    root: Path, limits: Thresholds, smpl: str | None, reader: CaptureReader
+) -> Found:
     notes: list[str] = []
     cameras_json = read_json(root / "cameras.json")
     meta_path = root / "meta.json"
@@ -114,14 +135,18 @@ def _find(root: Path, limits: Thresholds, smpl: str | None, reader: CaptureReade
         meta=meta,
         cameras=cameras,
         images=images,
-        masks=one_mask_each({c: frame_files(root, f"masks/{c}", MASKS) for c in cameras}, "grey"),
+        masks=one_mask_each(
+            {c: frame_files(root, f"masks/{c}", MASKS) for c in cameras}, "grey"
+        ),
         mask_folder="masks/{camera}",
         labels={c: frame_files(root, f"labels/{c}", MASKS) for c in cameras},
         landmarks=skeletons,
         hands=hands,
         face=face,
         poses=poses,
-        pixels=PixelRules(composed=conventions.composed, unsure_band=reader.ignore_band),
+        pixels=PixelRules(
+            composed=conventions.composed, unsure_band=reader.ignore_band
+        ),
         calibration=root / "cameras.json",
         unit_hint=(
             "check 'unit' in meta.json and that cameras.json and landmarks3d.npz use the same one"
@@ -132,32 +157,48 @@ def _find(root: Path, limits: Thresholds, smpl: str | None, reader: CaptureReade
 
 def _read_meta(path: Path, content: Mapping[str, Any], smpl: str | None) -> Meta:
     """Facts about the capture from the content of meta.json, where only ``unit`` is required."""
-    fps, names, body = (content.get(key) for key in ("fps", "label_names", "body"))
+    fps = content.get("fps")
+    names = content.get("label_names")
+    body = content.get("body")
     if fps is not None and not (is_number(fps) and fps > 0):
         raise DataError(f"{path}: 'fps' is {fps!r}; expected a number above 0")
     if names is not None and not (isinstance(names, list) and len(names) > 1):
-        raise DataError(f"{path}: 'label_names' must list the background and every part by name")
+        raise DataError(
+            f"{path}: 'label_names' must list the background and every part by name"
+        )
     splits = content.get("splits") or {}
     if not isinstance(splits, dict):
-        raise DataError(f"{path}: 'splits' must be an object with train_cameras, test_frames, ...")
+        raise DataError(
+            f"{path}: 'splits' must be an object with train_cameras, test_frames, ..."
+        )
     if body is not None:
         choose(path, content, "body", None, tuple(BODY_BONES))
     return Meta(
         unit=choose(path, content, "unit", None, tuple(METRES)),
         fps=None if fps is None else float(fps),
-        up_axis=choose(path, content, "up_axis", "z", ("x", "y", "z", "-x", "-y", "-z")),
+        up_axis=choose(
+            path, content, "up_axis", "z", ("x", "y", "z", "-x", "-y", "-z")
+        ),
         skeleton=choose(path, content, "skeleton", "mediapipe33", tuple(SKELETONS)),
-        body=None if body is None else BodyModel(body, smpl if body != "free" else None),
+        body=None
+        if body is None
+        else BodyModel(body, smpl if body != "free" else None),
         label_names=None if names is None else tuple(map(str, names)),
         splits=splits,
     )
 
 
-def _index_images(root: Path, cameras: Mapping[str, CameraEntry]) -> dict[str, FrameFiles]:
+def _index_images(
+    root: Path, cameras: Mapping[str, CameraEntry]
+) -> dict[str, FrameFiles]:
     folder = root / "images"
     if not folder.is_dir():
-        raise DataError(f"{folder} does not exist; expected images/<camera>/000000.jpg and so on")
-    found = {p.name for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".")}
+        raise DataError(
+            f"{folder} does not exist; expected images/<camera>/000000.jpg and so on"
+        )
+    found = {
+        p.name for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".")
+    }
     if unknown := sorted(found - set(cameras)):
         raise DataError(
             f"{folder} has the camera {unknown[0]}, which {root / 'cameras.json'} does not list; "
@@ -170,12 +211,18 @@ def _index_images(root: Path, cameras: Mapping[str, CameraEntry]) -> dict[str, F
         )
     images = {name: frame_files(root, f"images/{name}", IMAGES) for name in cameras}
     if empty := [name for name, files in images.items() if not files]:
-        raise DataError(f"{folder / empty[0]} holds no frames; expected .jpg or .png images")
+        raise DataError(
+            f"{folder / empty[0]} holds no frames; expected .jpg or .png images"
+        )
     return images
 
 
 def _read_landmarks(
-    path: Path, joints: int, conventions: Conventions, limits: Thresholds, notes: list[str]
+    path: Path,
+    joints: int,
+    conventions: Conventions,
+    limits: Thresholds,
+    notes: list[str],
 ) -> Landmarks:
     """Skeletons, hands or faces of every frame."""
     arrays = read_arrays(path, ("p", "conf", "frame_id"))
@@ -200,7 +247,8 @@ def _refuse_other_names(path: Path) -> None:
 
 def _read_poses(root: Path, meta: Meta, conventions: Conventions) -> tuple[Poses, Meta]:
     """Poses of frames whose numbers are finite, and ``meta`` with the body and its shape."""
-    path, fitted = root / POSES, (root / SHAPE).exists()
+    path = root / POSES
+    fitted = (root / SHAPE).exists()
     names = ("theta", "transl", "frame_id", "betas", "registered", "fitted_to")
     arrays = read_arrays(path, (*names, "theta_hands", "transl_hands"))
     if fitted:  # by gsgan.fit: the free body in the person's shape
@@ -218,12 +266,15 @@ def _read_poses(root: Path, meta: Meta, conventions: Conventions) -> tuple[Poses
     values = [
         tuple(
             expect_array(arrays, name, shape, path).astype(np.float64)
-            for name, shape in zip(pair, ((len(ids), bones, 3), (len(ids), 3)), strict=True)
+            for name, shape in zip(
+                pair, ((len(ids), bones, 3), (len(ids), 3)), strict=True
+            )
         )
         for pair in parts
     ]
     finite = np.all(
-        [np.isfinite(x).reshape(len(ids), -1).all(1) for pair in values for x in pair], axis=0
+        [np.isfinite(x).reshape(len(ids), -1).all(1) for pair in values for x in pair],
+        axis=0,
     )
     rows = {int(ids[i]): int(i) for i in np.flatnonzero(finite)}
     poses, *with_hands = (
@@ -253,10 +304,16 @@ def read_shape(path: Path) -> tuple[float, ...]:
         DataError: when the file is damaged or lacks an array.
     """
     K = free_space().coefficients
-    names = {"coefficients": (K,), "stretch": (len(STRETCHED),), "offsets": LANDMARKS_SHAPE}
+    names = {
+        "coefficients": (K,),
+        "stretch": (len(STRETCHED),),
+        "offsets": LANDMARKS_SHAPE,
+    }
     arrays = read_arrays(path, (*names, "hands", "spine"))
     for name, size in (("hands", HANDS_SHAPE), ("spine", (1,))):
         if name in arrays:
             names[name] = size
-    parts = [expect_array(arrays, name, shape, path).ravel() for name, shape in names.items()]
+    parts = [
+        expect_array(arrays, name, shape, path).ravel() for name, shape in names.items()
+    ]
     return tuple(np.concatenate(parts).astype(np.float64).tolist())

@@ -20,7 +20,10 @@ from gsgan.skeleton.smpl_landmarks import TABLES
 from gsgan.utils.errors import ConfigError, DataError
 
 IMAGES = (".jpg", ".jpeg", ".png")
-MODELS = {"smpl": ("SMPL", "SMPL_NEUTRAL.pkl"), "smplx": ("SMPL-X", "SMPLX_NEUTRAL.npz")}
+MODELS = {
+    "smpl": ("SMPL", "SMPL_NEUTRAL.pkl"),
+    "smplx": ("SMPL-X", "SMPLX_NEUTRAL.npz"),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +44,9 @@ class FolderReader:
     hint: ClassVar[str]
     """What to check when body and masks do not agree."""
 
-    def __call__(self, root: str | Path, limits: Thresholds, smpl: str | None = None) -> Layout:
+    def __call__(
+        self, root: str | Path, limits: Thresholds, smpl: str | None = None
+    ) -> Layout:
         """Reads and checks everything except most images' pixels.
 
         Args:
@@ -72,7 +77,11 @@ class FolderReader:
 
 
 def finish(
-    found: Found, limits: Thresholds, consistency: Consistency, hint: str, drop_frames: Any = None
+    found: Found,
+    limits: Thresholds,
+    consistency: Consistency,
+    hint: str,
+    drop_frames: Any = None,
 ) -> Layout:
     """Checks the files against each other and a few masks against the joints.
 
@@ -122,7 +131,8 @@ def body_model(root: Path, smpl: str | None, kind: str) -> tuple[Path, SkinnedMo
         raise ConfigError(
             f"data.smpl={smpl} does not exist; expected an SMPL or SMPL-X .pkl or .npz"
         )
-    model, counts = read_smpl(path), TABLES[kind].counts
+    model = read_smpl(path)
+    counts = TABLES[kind].counts
     if model.kind != kind:
         raise DataError(
             f"{path} is a model of {len(model.parents)} joints; this dataset's parameters are of "
@@ -154,7 +164,8 @@ class _Masks(Mapping[int, tuple[MaskFile, ...]]):
     """Files as masks, one per image, all of one rule; made when they are asked for."""
 
     def __init__(self, files: Mapping[int, str], rule: str) -> None:
-        self.files, self.rule = files, rule
+        self.files = files
+        self.rule = rule
 
     def __getitem__(self, frame: int) -> tuple[MaskFile, ...]:
         return (MaskFile(self.rule, self.files[frame]),)

@@ -23,7 +23,8 @@ T = TypeVar("T")
 
 LONGEST = 512  # pixels, longest side of a mask that joints are compared with
 TOLERANCE = 1.5  # pixels of that mask that a joint may always lie outside
-FAR_PIXELS = 1e4  # drawing coordinates are clipped to this: OpenCV's are 16 bit when shifted
+# drawing coordinates are clipped to this: OpenCV's are 16 bit when shifted
+FAR_PIXELS = 1e4
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,9 @@ def check_consistency(layout: Layout, limits: Consistency, hint: str) -> None:
             are all empty.
     """
     frames = spread(list(layout.frames), limits.frames)
-    shares, masks, empty = dict[str, list[float]](), list[Path](), True
+    shares = dict[str, list[float]]()
+    masks = list[Path]()
+    empty = True
     for name, camera in layout.cameras.items():
         for frame in (f for f in frames if f in layout.images[name]):
             mask = read_mask(layout.mask_files(name, frame), layout.pixels)
@@ -66,7 +69,9 @@ def check_consistency(layout: Layout, limits: Consistency, hint: str) -> None:
     if not masks:
         return
     person = np.median(layout.landmarks.seen(frames[0]), axis=0)
-    metres = {n: float(np.linalg.norm(c.centre - person)) for n, c in layout.cameras.items()}
+    metres = {
+        n: float(np.linalg.norm(c.centre - person)) for n, c in layout.cameras.items()
+    }
     if far := far_cameras(metres, limits.far_camera):
         raise DataError(f"{layout.root}: {next(iter(far.values()))}")
     if empty:
@@ -99,7 +104,9 @@ def mask_distance(mask: Bool) -> Float:
     if not mask.any():
         return np.full(mask.shape, np.inf)
     outside = (~mask).astype(np.uint8)
-    return cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE).astype(np.float64)
+    return cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE).astype(
+        np.float64
+    )
 
 
 def joint_distance(
@@ -124,7 +131,9 @@ def joint_distance(
     return metres
 
 
-def inside_share(mask: Bytes, camera: CameraEntry, joints: Float, tolerance: float) -> float:
+def inside_share(
+    mask: Bytes, camera: CameraEntry, joints: Float, tolerance: float
+) -> float:
     """Share of world points ``[N, 3]`` in view that lie inside a stored mask ``[H, W]``.
 
     They may lie ``tolerance`` metres outside; NaN of no points, or of an empty mask.
@@ -132,7 +141,8 @@ def inside_share(mask: Bytes, camera: CameraEntry, joints: Float, tolerance: flo
     if not mask.any():
         return np.nan
     step = max(1, -(-max(mask.shape) // LONGEST))
-    small, focal = mask[::step, ::step] > 127, float(camera.K[0, 0]) / step
+    small = mask[::step, ::step] > 127
+    focal = float(camera.K[0, 0]) / step
     straight, depth = project(camera, joints)
     pixels = through_lens(camera.K, camera.dist, *straight.T) / step
     everyone = np.ones(len(joints), bool)

@@ -19,7 +19,13 @@ import numpy as np
 from gsgan.data.calibration import read_calibration
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.files import frame_files, natural_order, read_json_value
-from gsgan.data.formats.common import IMAGES, FolderReader, body_model, image_size, up_axis
+from gsgan.data.formats.common import (
+    IMAGES,
+    FolderReader,
+    body_model,
+    image_size,
+    up_axis,
+)
 from gsgan.data.formats.smpl_motion import landmarks_of, zju_motion
 from gsgan.data.joints import BODY, FROM_HANDS, SETS
 from gsgan.data.layout import BodyModel, Found, Meta
@@ -39,7 +45,9 @@ BODY_25 = 25
 WITH_HANDS = BODY_25 + 2 * HAND
 COUNTS = (BODY_25, WITH_HANDS, WITH_HANDS + 51)  # body; and hands, left first; and face
 BODY_25_TO_33 = SETS[BODY_25][1]
-HANDS_TO_33 = {landmark: BODY_25 + joint - BODY for landmark, joint in FROM_HANDS.items()}
+HANDS_TO_33 = {
+    landmark: BODY_25 + joint - BODY for landmark, joint in FROM_HANDS.items()
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +58,9 @@ class EasymocapReader(FolderReader):
     distance: tuple[float, float] = (0.3, 30.0)
     fps: float | None = None
 
-    contents: ClassVar[str] = "intri.yml, extri.yml, images/, mask/, and keypoints3d/ or smpl/"
+    contents: ClassVar[str] = (
+        "intri.yml, extri.yml, images/, mask/, and keypoints3d/ or smpl/"
+    )
     hint: ClassVar[str] = (
         "check that calibration, skeleton and masks are of one recording and one person "
         "(data.reader.person)"
@@ -62,7 +72,9 @@ class EasymocapReader(FolderReader):
         names = _camera_folders(root, self.contents)
         images = {name: frame_files(root, f"images/{name}", IMAGES) for name in names}
         if empty := [name for name, files in images.items() if not files]:
-            raise DataError(f"{root / 'images' / empty[0]} holds no images; expected 000000.jpg")
+            raise DataError(
+                f"{root / 'images' / empty[0]} holds no images; expected 000000.jpg"
+            )
         cameras = self._cameras(root, images, notes)
         frames = {f for files in images.values() for f in files}
         kind, place = _source(root, smpl)
@@ -88,7 +100,9 @@ class EasymocapReader(FolderReader):
             images=images,
             masks=_masks(root, names, self.person),
             mask_folder="mask/{camera}",
-            landmarks=make_landmarks(ids, p, conf, limits.max_reach, notes, source=f"{place}/"),
+            landmarks=make_landmarks(
+                ids, p, conf, limits.max_reach, notes, source=f"{place}/"
+            ),
             poses=None if motion is None else motion.poses(f"{place}/"),
             calibration=root / "intri.yml and extri.yml",
             unit_hint=f"T in {root / 'extri.yml'} and {root / place} must be in metres",
@@ -109,7 +123,9 @@ class EasymocapReader(FolderReader):
                 f"{', '.join(known)}; cameras are paired by name: rename the folder or calibrate it"
             )
         if idle := [name for name in known if name not in images]:
-            notes.append(f"{path} lists cameras without images, left out: {', '.join(idle)}")
+            notes.append(
+                f"{path} lists cameras without images, left out: {', '.join(idle)}"
+            )
         return {
             name: known[name]
             if min(known[name].size) > 0
@@ -120,14 +136,18 @@ class EasymocapReader(FolderReader):
 
 def _source(root: Path, smpl: str | None) -> tuple[str, str]:
     """The kind of skeletons to use, fits where the user has the model, and their folder."""
-    places = [(kind, pattern.format(kind=kind)) for kind in SKELETONS for pattern in RESULTS]
+    places = [
+        (kind, pattern.format(kind=kind)) for kind in SKELETONS for pattern in RESULTS
+    ]
     places = [(kind, place) for kind, place in places if (root / place).is_dir()]
     if not places:
         raise DataError(
             f"{root} has no skeletons; expected keypoints3d/ or smpl/ in it, or in output/: run "
             "EasyMocap's reconstruction first"
         )
-    usable = [(kind, place) for kind, place in places if kind != "smpl" or smpl is not None]
+    usable = [
+        (kind, place) for kind, place in places if kind != "smpl" or smpl is not None
+    ]
     return (usable or places)[0]
 
 
@@ -151,9 +171,13 @@ def _camera_folders(root: Path, contents: str) -> list[str]:
     """Names of the cameras that have a folder of images, in natural order."""
     for name in ("intri.yml", "extri.yml"):
         if not (root / name).is_file():
-            raise DataError(f"{root / name} does not exist; a folder of EasyMocap holds {contents}")
+            raise DataError(
+                f"{root / name} does not exist; a folder of EasyMocap holds {contents}"
+            )
     place = root / "images"
-    names = [p.name for p in place.glob("*") if p.is_dir() and not p.name.startswith(".")]
+    names = [
+        p.name for p in place.glob("*") if p.is_dir() and not p.name.startswith(".")
+    ]
     if not names:
         raise DataError(
             f"{place} holds no folder of a camera; a folder of EasyMocap holds {contents}: extract "
@@ -175,7 +199,8 @@ def _read_people(
 ) -> dict[int, tuple[str, Mapping[str, Any]]]:
     """The person's entry, with the file's name for messages, by frame that has images."""
     files = frame_files(root, folder, (".json",))
-    found, seen = {}, set[int]()
+    found = {}
+    seen = set[int]()
     there = sorted(set(frames) & set(files))
     for frame in there:
         people = _people(root / files[frame])
@@ -198,7 +223,9 @@ def _people(path: Path) -> dict[int, Mapping[str, Any]]:
     content = read_json_value(path)
     if isinstance(content, Mapping):
         content = next((content[key] for key in PEOPLE_KEYS if key in content), None)
-    if not isinstance(content, list) or not all(isinstance(p, Mapping) for p in content):
+    if not isinstance(content, list) or not all(
+        isinstance(p, Mapping) for p in content
+    ):
         raise DataError(f"{path} must hold a list of people, each an object with 'id'")
     numbers = [entry.get("id") for entry in content]
     for i, number in enumerate(numbers):
@@ -220,14 +247,16 @@ def _read_keypoints(
     Returns:
         ``ids [F]`` rising, ``p [F, 33, 3]`` metres and ``conf [F, 33]``.
     """
-    p, conf = np.full((len(people), BODY, 3), np.nan), np.zeros((len(people), BODY))
+    p = np.full((len(people), BODY, 3), np.nan)
+    conf = np.zeros((len(people), BODY))
     for row, (where, entry) in enumerate(people.values()):
         joints = _joints(where, entry.get("keypoints3d"))
         table = BODY_25_TO_33 | (HANDS_TO_33 if len(joints) > BODY_25 else {})
         taken = joints[list(table.values())]
         seen = np.isfinite(taken).all(axis=1) & (taken[:, 3] > 0)
         to = np.array(list(table))[seen]
-        p[row, to], conf[row, to] = taken[seen, :3], taken[seen, 3]
+        p[row, to] = taken[seen, :3]
+        conf[row, to] = taken[seen, 3]
     return np.array(list(people), np.int64), p, conf
 
 

@@ -57,20 +57,25 @@ def landmarks_of(
     own = {vertex for vertex, _ in table.vertices.values()}
     vertices = sorted(own | {vertex for _, vertex in table.midpoints.values()})
     small = _only(model, vertices)
-    p, conf = [], []
+    p = []
+    conf = []
     for first in range(0, len(motion.ids), CHUNK):
         part = slice(first, first + CHUNK)
         found, joints = small.pose(
             torch.from_numpy(motion.theta[part]),
             torch.from_numpy(motion.betas[part]),
             torch.from_numpy(motion.transl[part]),
-            None if motion.expression is None else torch.from_numpy(motion.expression[part]),
+            None
+            if motion.expression is None
+            else torch.from_numpy(motion.expression[part]),
             pose_blend=pose_blend,
         )
         for v, j in zip(found.numpy(), joints.numpy(), strict=True):
             full = np.full((len(model.v_template), 3), np.nan)
             full[vertices] = v[: len(vertices)]
-            one_p, one_conf = to_mediapipe33(j, full, cast(Literal["smpl", "smplx"], model.kind))
+            one_p, one_conf = to_mediapipe33(
+                j, full, cast(Literal["smpl", "smplx"], model.kind)
+            )
             p.append(one_p)
             conf.append(one_conf)
     return np.stack(p), np.stack(conf)
@@ -81,7 +86,9 @@ def _only(model: SkinnedModel, vertices: list[int]) -> SkinnedModel:
     eye = torch.eye(len(model.parents), dtype=torch.float64)
 
     def with_joints(values: torch.Tensor) -> torch.Tensor:
-        at_joints = (model.J_regressor @ values.flatten(1)).unflatten(1, values.shape[1:])
+        at_joints = (model.J_regressor @ values.flatten(1)).unflatten(
+            1, values.shape[1:]
+        )
         return torch.cat([values[vertices], at_joints])
 
     still = model.posedirs.new_zeros((len(eye), *model.posedirs.shape[1:]))
@@ -96,7 +103,9 @@ def _only(model: SkinnedModel, vertices: list[int]) -> SkinnedModel:
     )
 
 
-def zju_motion(entries: Mapping[int, tuple[str, Any]], model: SkinnedModel) -> SmplMotion:
+def zju_motion(
+    entries: Mapping[int, tuple[str, Any]], model: SkinnedModel
+) -> SmplMotion:
     """A motion from ZJU-MoCap's parameters, which EasyMocap writes too.
 
     Convention: the files' pose is ``R(Rh) x + Th`` of the body with an unrotated root, about the
@@ -112,7 +121,9 @@ def zju_motion(entries: Mapping[int, tuple[str, Any]], model: SkinnedModel) -> S
     """
     rows = []
     for where, content in entries.values():
-        row = [_parameter(content, key, sizes, where) for key, sizes in ZJU_SIZES.items()]
+        row = [
+            _parameter(content, key, sizes, where) for key, sizes in ZJU_SIZES.items()
+        ]
         row[0] = np.concatenate([np.zeros(ZJU_SIZES["poses"][0] - len(row[0])), row[0]])
         turn = float(np.abs(row[0][:3]).max())
         if turn > ROOT_TOLERANCE:
@@ -140,5 +151,7 @@ def _parameter(content: Any, key: str, sizes: tuple[int, ...], where: str) -> Fl
         found = getattr(content[key], "shape", type(content[key]).__name__)
         raise DataError(f"{where}: '{key}' must hold {expected} numbers, found {found}")
     if not np.isfinite(values).all():
-        raise DataError(f"{where}: '{key}' must hold finite numbers, found NaN or infinity")
+        raise DataError(
+            f"{where}: '{key}' must hold finite numbers, found NaN or infinity"
+        )
     return values

@@ -77,7 +77,9 @@ class SmplxRigReader(FolderReader):
     def __post_init__(self) -> None:
         alpha = self.ignore_alpha
         whole("data.reader.ignore_band", self.ignore_band, 0)
-        if alpha is not None and not (len(alpha) == 2 and 0 <= alpha[0] < alpha[1] <= 255):
+        if alpha is not None and not (
+            len(alpha) == 2 and 0 <= alpha[0] < alpha[1] <= 255
+        ):
             raise ConfigError(
                 "data.reader.ignore_alpha must be null or two rising alphas of 0 to 255 such as "
                 f"[5, 250], got {list(alpha)}"
@@ -85,7 +87,8 @@ class SmplxRigReader(FolderReader):
 
     def find(self, root: Path, limits: Thresholds, smpl: str | None) -> Found:
         """See `FolderReader.find`."""
-        alpha, notes = self.ignore_alpha, list[str]()
+        alpha = self.ignore_alpha
+        notes = list[str]()
         for name in (self.calibration, PARAMETERS):
             if not (root / name).is_file():
                 raise DataError(
@@ -114,7 +117,9 @@ class SmplxRigReader(FolderReader):
             images=images,
             masks=one_mask_each(masks, "threshold"),
             mask_folder=self.masks,
-            landmarks=make_landmarks(motion.ids, p, conf, limits.max_reach, notes, PARAMETERS),
+            landmarks=make_landmarks(
+                motion.ids, p, conf, limits.max_reach, notes, PARAMETERS
+            ),
             poses=motion.poses(PARAMETERS),
             pixels=PixelRules(
                 threshold=self.threshold,
@@ -127,14 +132,23 @@ class SmplxRigReader(FolderReader):
         )
 
     def _cameras(
-        self, root: Path, path: Path, entries: Mapping[str, Any], images: Files, notes: list[str]
+        self,
+        root: Path,
+        path: Path,
+        entries: Mapping[str, Any],
+        images: Files,
+        notes: list[str],
     ) -> dict[str, CameraEntry]:
         """The cameras in the calibration's order."""
         cameras = {}
         for name, entry in entries.items():
             where = f"{path}, camera {name}"
             if not isinstance(entry, dict) or any(key not in entry for key in "KRT"):
-                held = ", ".join(entry) if isinstance(entry, dict) else type(entry).__name__
+                held = (
+                    ", ".join(entry)
+                    if isinstance(entry, dict)
+                    else type(entry).__name__
+                )
                 raise DataError(f"{where}: expected K, R and T, found {held}")
             cameras[name] = make_camera(
                 where,
@@ -148,7 +162,9 @@ class SmplxRigReader(FolderReader):
             )
         bent = [name for name, camera in cameras.items() if camera.distorted]
         if bent and not self.undistort:
-            cameras = {name: replace(c, dist=np.zeros(8)) for name, c in cameras.items()}
+            cameras = {
+                name: replace(c, dist=np.zeros(8)) for name, c in cameras.items()
+            }
             notes.append(
                 f"{path} gives {len(bent)} cameras lens distortion ({bent[0]}, ...), which is not "
                 "applied, since the released images are rectified; if yours are not, set "
@@ -164,7 +180,9 @@ def _index(root: Path, cameras: Mapping[str, Any], place: str, kind: str) -> Fil
         folder = place.format(camera=name)
         found[name] = frame_files(root, folder, IMAGES)
         if not found[name]:
-            raise DataError(f"{root / folder} holds no {kind}; expected 00000000.jpg and so on")
+            raise DataError(
+                f"{root / folder} holds no {kind}; expected 00000000.jpg and so on"
+            )
     return found
 
 
@@ -177,7 +195,9 @@ def _leave_out(images: Files, path: Path, notes: list[str]) -> None:
     for camera, files in images.items():
         images[camera] = files.without(frame for name, frame in named if name == camera)
         gone += len(files) - len(images[camera])
-    notes.append(f"{len(named)} images named in {path} are left out, {gone} of them with a file")
+    notes.append(
+        f"{len(named)} images named in {path} are left out, {gone} of them with a file"
+    )
     if empty := [name for name, files in images.items() if not files]:
         raise DataError(f"{path} leaves no image of camera {empty[0]}")
 
@@ -193,7 +213,9 @@ def read_missing(path: Path, cameras: Mapping[str, Any]) -> set[tuple[str, int]]
         if not line.strip():
             continue
         parts = PurePosixPath(line.strip().replace("\\", "/"))
-        camera = next((part for part in reversed(parts.parts[:-1]) if part in cameras), None)
+        camera = next(
+            (part for part in reversed(parts.parts[:-1]) if part in cameras), None
+        )
         frame = last_number(parts.stem)
         if camera is None or frame is None:
             raise DataError(
@@ -220,12 +242,16 @@ def read_motion(
     """
     arrays = read_npz(path, (*POSES, "transl", "betas", "expression"))
     if missing := [key for key in NEEDED if key not in arrays]:
-        raise DataError(f"{path} has no array {', '.join(missing)}; expected SMPL-X parameters")
+        raise DataError(
+            f"{path} has no array {', '.join(missing)}; expected SMPL-X parameters"
+        )
     transl = _rows(arrays, "transl", 3, path)
     count = len(transl)
     theta = np.concatenate(
         [
-            _rows(arrays, key, width, path, count) if key in arrays else np.zeros((count, width))
+            _rows(arrays, key, width, path, count)
+            if key in arrays
+            else np.zeros((count, width))
             for key, width in POSES.items()
         ],
         axis=1,
@@ -234,10 +260,14 @@ def read_motion(
         notes.append(f"{path} has no {' and '.join(absent)}: taken as flat hands")
     betas = _coefficients(arrays, "betas", model.shapedirs.shape[-1], path)[0]
     if not np.isfinite(betas).all():
-        raise DataError(f"{path}: 'betas' must hold finite numbers, found NaN or infinity")
+        raise DataError(
+            f"{path}: 'betas' must hold finite numbers, found NaN or infinity"
+        )
     face = np.zeros((count, 0))
     if "expression" in arrays:
-        face = _coefficients(arrays, "expression", model.expression_dirs.shape[-1], path, count)
+        face = _coefficients(
+            arrays, "expression", model.expression_dirs.shape[-1], path, count
+        )
     finite = np.isfinite(np.concatenate([theta, transl, face], axis=1)).all(1)
     there = [f for f in sorted(frames) if f < count]
     ids = np.array([f for f in there if finite[f]], np.int64)
@@ -258,7 +288,11 @@ def read_motion(
 
 
 def _rows(
-    arrays: dict[str, Any], key: str, width: int | None, path: Path, count: int | None = None
+    arrays: dict[str, Any],
+    key: str,
+    width: int | None,
+    path: Path,
+    count: int | None = None,
 ) -> Float:
     """``[N, width]`` of an array ``[N, ...]``; N is ``count`` where that is given."""
     values = as_floats(arrays[key])

@@ -23,7 +23,13 @@ from gsgan.body.smpl import SkinnedModel
 from gsgan.body.smpl_names import CIHP
 from gsgan.data.cameras import CameraEntry, make_camera
 from gsgan.data.files import FrameFiles, frame_files, frame_of, last_number
-from gsgan.data.formats.common import IMAGES, FolderReader, body_model, image_size, up_axis
+from gsgan.data.formats.common import (
+    IMAGES,
+    FolderReader,
+    body_model,
+    image_size,
+    up_axis,
+)
 from gsgan.data.formats.smpl_motion import SmplMotion, landmarks_of, zju_motion
 from gsgan.data.layout import BodyModel, Found, Meta
 from gsgan.data.pixels import IGNORE_LABEL, MaskFile, PixelRules, mask_file
@@ -38,7 +44,8 @@ Files = Mapping[str, Mapping[int, str]]
 ANNOTS = ("annots.npy", "annots_new.npy")
 MILLIMETRES = 1e-3
 TRANSLATION = (0.05, 20.0)  # metres: plausible lengths of the cameras' T
-NAMED_FRAME = re.compile(r"\)_(\d+)")  # CoreView_313_Camera_(1)_0001_2019-08-23_16-08-50.592
+# CoreView_313_Camera_(1)_0001_2019-08-23_16-08-50.592
+NAMED_FRAME = re.compile(r"\)_(\d+)")
 MASKS = ("mask_cihp", "mask")
 # Files may hold stray numbers beyond CIHP's.
 CIHP_TABLE = tuple(i if i < len(CIHP) else IGNORE_LABEL for i in range(256))
@@ -67,10 +74,14 @@ class ZjuReader(FolderReader):
         folders = camera_folders(root, annots)
         images = _index_images(root, folders)
         cameras = self._cameras(root, annots, images)
-        fit = next(((name, at) for name, at in FITS.items() if (root / at).is_dir()), None)
+        fit = next(
+            ((name, at) for name, at in FITS.items() if (root / at).is_dir()), None
+        )
         if fit is None:
             looked = ", ".join(f"{folder}/" for folder in FITS.values())
-            raise DataError(f"{root} has no SMPL parameters; expected one of the folders {looked}")
+            raise DataError(
+                f"{root} has no SMPL parameters; expected one of the folders {looked}"
+            )
         kind, params = fit
         frames = {f for files in images.values() for f in files}
         motion = _read_motion(root, params, frames, model)
@@ -90,17 +101,23 @@ class ZjuReader(FolderReader):
             images=images,
             masks=masks,
             labels=labels,
-            landmarks=make_landmarks(motion.ids, p, conf, limits.max_reach, notes, f"{params}/"),
+            landmarks=make_landmarks(
+                motion.ids, p, conf, limits.max_reach, notes, f"{params}/"
+            ),
             poses=motion.poses(f"{params}/"),
             pixels=PixelRules(
-                mask_sampling="nearest", label_table=CIHP_TABLE, ignore_band=self.ignore_band
+                mask_sampling="nearest",
+                label_table=CIHP_TABLE,
+                ignore_band=self.ignore_band,
             ),
             calibration=annots.path,
             unit_hint=f"T in {annots.path} must be in millimetres, Th in {root / params} in metres",
             notes=tuple(notes),
         )
 
-    def _cameras(self, root: Path, annots: Annots, images: Files) -> dict[str, CameraEntry]:
+    def _cameras(
+        self, root: Path, annots: Annots, images: Files
+    ) -> dict[str, CameraEntry]:
         """By name, in the order of annots.npy."""
         some = next(files for files in images.values() if files)
         cameras = {}
@@ -116,7 +133,9 @@ class ZjuReader(FolderReader):
                 scale=MILLIMETRES,
                 pixel_centre=self.pixel_centre,
             )
-        length = float(np.median([np.linalg.norm(camera.t) for camera in cameras.values()]))
+        length = float(
+            np.median([np.linalg.norm(camera.t) for camera in cameras.values()])
+        )
         low, high = TRANSLATION
         if not low <= length <= high:
             raise DataError(
@@ -155,9 +174,13 @@ def read_annots(root: Path) -> Annots:
         raise DataError(f"{path} has no 'cams'; expected a dict with cams and ims")
     ims = _entries(content.get("ims"))
     names = _entries(ims[0].get("ims")) if ims and isinstance(ims[0], Mapping) else []
-    folders = [str(PurePosixPath(str(name).replace("\\", "/")).parent) for name in names]
+    folders = [
+        str(PurePosixPath(str(name).replace("\\", "/")).parent) for name in names
+    ]
     if not ims:
-        folders = [f"images/{p.name}" for p in sorted(root.glob("images/*")) if p.is_dir()]
+        folders = [
+            f"images/{p.name}" for p in sorted(root.glob("images/*")) if p.is_dir()
+        ]
     lists = [*(_entries(cams.get(key)) for key in "KRTD"), folders]
     if len({len(entries) for entries in lists}) != 1 or not folders:
         counts = zip(lists, (*"KRTD", "image folders"), strict=True)
@@ -183,7 +206,9 @@ def camera_folders(root: Path, annots: Annots) -> dict[str, str]:
     places = [_place(root, folder) for folder in annots.folders]
     named = {PurePosixPath(place).name: place for place in places}
     if len(named) != len(places):
-        raise DataError(f"{annots.path}: two cameras share an image folder: {', '.join(places)}")
+        raise DataError(
+            f"{annots.path}: two cameras share an image folder: {', '.join(places)}"
+        )
     return named
 
 
@@ -191,7 +216,9 @@ def _place(root: Path, folder: str) -> str:
     """The place of a folder that annots.npy names; copies are often rearranged."""
     parts = PurePosixPath(folder).parts
     if not parts or ".." in parts or PurePosixPath(folder).is_absolute():
-        raise DataError(f"{root}: annots lists images in {folder!r}, which is not a folder in it")
+        raise DataError(
+            f"{root}: annots lists images in {folder!r}, which is not a folder in it"
+        )
     places = (folder, parts[-1], f"images/{parts[-1]}")
     return next((place for place in places if (root / place).is_dir()), folder)
 
@@ -205,7 +232,8 @@ def frame_number(stem: str) -> int | None:
 def _index_images(root: Path, folders: Mapping[str, str]) -> dict[str, FrameFiles]:
     """The images of each camera by frame number."""
     images = {
-        name: frame_files(root, folder, IMAGES, frame_number) for name, folder in folders.items()
+        name: frame_files(root, folder, IMAGES, frame_number)
+        for name, folder in folders.items()
     }
     if not any(images.values()):
         raise DataError(
@@ -228,14 +256,22 @@ def _index_masks(
             place = next((p for p in places if (root / p).is_dir()), places[0])
             files = frame_files(root, place, (".png", ".jpg"), frame_number)
             if kind == "mask_cihp":
-                labels[name] = {f: path for f, path in files.items() if path.endswith(".png")}
+                labels[name] = {
+                    f: path for f, path in files.items() if path.endswith(".png")
+                }
             for frame, path in files.items():
-                mask = MaskFile("nonzero", path) if kind == "mask_cihp" else mask_file(path)
+                mask = (
+                    MaskFile("nonzero", path)
+                    if kind == "mask_cihp"
+                    else mask_file(path)
+                )
                 masks[name][frame] = (*masks[name].get(frame, ()), mask)
     return masks, labels if any(labels.values()) else {}
 
 
-def _read_motion(root: Path, folder: str, frames: Iterable[int], model: SkinnedModel) -> SmplMotion:
+def _read_motion(
+    root: Path, folder: str, frames: Iterable[int], model: SkinnedModel
+) -> SmplMotion:
     """The parameters of the frames that have any, in the model's own convention."""
     files = frame_files(root, folder, (".npy",))
     ids = sorted(set(frames) & set(files))

@@ -32,7 +32,9 @@ import mediapipe as mp
 import numpy as np
 
 SUFFIXES = (".jpg", ".jpeg", ".png")
-JOINTS, HAND, FACE = 33, 21, 468
+JOINTS = 33
+HAND = 21
+FACE = 468
 MARGIN = 0.15  # of the mask's crop beyond the joints, share of the person's height
 
 
@@ -63,7 +65,9 @@ def main() -> None:
     out = Path(options.out)
     part = out.with_name(f".{out.name}")
     with part.open("wb") as stream:
-        arrays: dict[str, Any] = {name: np.array(values) for name, values in found.items()}
+        arrays: dict[str, Any] = {
+            name: np.array(values) for name, values in found.items()
+        }
         np.savez(stream, **arrays)
     part.replace(out)
 
@@ -76,7 +80,9 @@ def open_source(path: Path, rotate: int) -> tuple[int, Iterator[tuple[int, Any]]
             for p in path.iterdir()
             if p.suffix.lower() in SUFFIXES and not p.name.startswith(".")
         }
-        return len(files), ((frame, read_image(files[frame])) for frame in sorted(files))
+        return len(files), (
+            (frame, read_image(files[frame])) for frame in sorted(files)
+        )
     video = cv2.VideoCapture(str(path))
     video.set(cv2.CAP_PROP_ORIENTATION_AUTO, int(rotate))
     return int(video.get(cv2.CAP_PROP_FRAME_COUNT)), enumerate(read_video(video))
@@ -105,7 +111,9 @@ class Detector:
         kind = solutions.holistic.Holistic if holistic else solutions.pose.Pose
         self.body = kind(smooth_landmarks=False)
         self.faces = solutions.face_detection.FaceDetection(model_selection=1)
-        self.segmenter = solutions.pose.Pose(static_image_mode=True, enable_segmentation=True)
+        self.segmenter = solutions.pose.Pose(
+            static_image_mode=True, enable_segmentation=True
+        )
 
     def landmarks(self, image: Any) -> dict[str, Any]:
         rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
@@ -113,7 +121,10 @@ class Detector:
         size = image.shape[1], image.shape[0]
         pose = found.pose_landmarks
         visibility = [p.visibility for p in pose.landmark] if pose else [0.0] * JOINTS
-        hands = {side: getattr(found, f"{side}_hand_landmarks", None) for side in ("left", "right")}
+        hands = {
+            side: getattr(found, f"{side}_hand_landmarks", None)
+            for side in ("left", "right")
+        }
         return {
             "px": pixels(pose, size, JOINTS),
             "conf": np.array(visibility, np.float32),
@@ -129,7 +140,8 @@ class Detector:
         if not np.isfinite(px).all():
             return None
         height, width = image.shape[:2]
-        low, high = px.min(0), px.max(0)
+        low = px.min(0)
+        high = px.max(0)
         reach = MARGIN * (high - low).max()
         left, top = np.clip(low - reach, 0, [width - 1, height - 1]).astype(int)
         right, bottom = np.clip(high + reach, 1, [width, height]).astype(int)
@@ -148,7 +160,9 @@ def pixels(landmarks: Any, size: tuple[int, int], count: int) -> Any:
     """``[count, 2]``; MediaPipe's numbers are shares of the image's width and height."""
     if landmarks is None:
         return np.full((count, 2), np.nan, np.float32)
-    return np.array([(p.x * size[0], p.y * size[1]) for p in landmarks.landmark], np.float32)
+    return np.array(
+        [(p.x * size[0], p.y * size[1]) for p in landmarks.landmark], np.float32
+    )
 
 
 def depth(landmarks: Any, size: tuple[int, int], count: int) -> Any:

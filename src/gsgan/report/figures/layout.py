@@ -10,15 +10,22 @@ from torch import Tensor
 
 from gsgan.utils.images import to_bytes
 
-COLUMN, PAGE = 3.5, 7.16  # inches, width of a figure in one column and across the page
+# inches, width of a figure in one column and across the page
+COLUMN = 3.5
+PAGE = 7.16
 TALLEST = 1.9  # inches, maximum height of a row of images, without its text
-FONT, SMALL = 8.0, 7.0  # points
+# points
+FONT = 8.0
+SMALL = 7.0
 LINE = 1.4 / 72  # inches per line and point of font size
 # Text in the PDF stays text (TrueType).
 STYLE: dict[Any, Any] = {
-    "font.family": "DejaVu Sans", "font.size": FONT, "pdf.fonttype": 42, "axes.linewidth": 0.5,
+    "font.family": "DejaVu Sans",
+    "font.size": FONT,
+    "pdf.fonttype": 42,
+    "axes.linewidth": 0.5,
     "savefig.dpi": 300,
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True)
@@ -40,7 +47,10 @@ class Panel:
 
 
 def draw_panels(
-    panels: Sequence[Sequence[Panel]], *, titles: Sequence[str] = (), names: Sequence[str] = ()
+    panels: Sequence[Sequence[Panel]],
+    *,
+    titles: Sequence[str] = (),
+    names: Sequence[str] = (),
 ) -> tuple[Figure, np.ndarray]:
     """Equal panels by row, with titles above the columns and names left of the rows.
 
@@ -52,13 +62,20 @@ def draw_panels(
     """
     shown = [[to_bytes(panel.image[0]) for panel in row] for row in panels]
     aspect = max(image.shape[0] / image.shape[1] for row in shown for image in row)
-    rows, columns = len(panels), len(panels[0])
+    rows = len(panels)
+    columns = len(panels[0])
     width = COLUMN if columns <= 3 else PAGE
-    notes = max(1 + panel.note.count("\n") if panel.note else 0 for row in panels for panel in row)
+    notes = max(
+        1 + panel.note.count("\n") if panel.note else 0
+        for row in panels
+        for panel in row
+    )
     tall = min(width / columns * aspect, TALLEST) + notes * FONT * LINE
     height = rows * tall + (FONT * LINE if titles else 0)
     figure = Figure(figsize=(width, height))
-    figure.set_layout_engine("compressed", w_pad=0.01, h_pad=0.01, wspace=0.01, hspace=0.01)
+    figure.set_layout_engine(
+        "compressed", w_pad=0.01, h_pad=0.01, wspace=0.01, hspace=0.01
+    )
     axes = figure.subplots(rows, columns, squeeze=False)
     for i, row in enumerate(panels):
         for one, panel, image in zip(axes[i], row, shown[i], strict=True):

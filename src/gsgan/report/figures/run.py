@@ -47,8 +47,11 @@ def strip(subjects: Sequence[Subject], shots: Sequence[Shot]) -> Drawing:
     panels = [[Panel(shot.truth) for shot in shots]]
     for name in images[0]:
         notes = [_decibels(numbers[shot.name][name]) for shot in shots]
-        panels.append([Panel(x[name], note) for x, note in zip(images, notes, strict=True)])
-    titles, names = [f"frame {shot.item[1]}" for shot in shots], ["truth", *images[0]]
+        panels.append(
+            [Panel(x[name], note) for x, note in zip(images, notes, strict=True)]
+        )
+    titles = [f"frame {shot.item[1]}" for shot in shots]
+    names = ["truth", *images[0]]
     figure, _ = draw_panels(panels, titles=titles, names=names)
     caption = "One camera over time: the ground truth and each run's images, with PSNR."
     return Drawing(figure, caption, numbers)
@@ -67,22 +70,33 @@ def comparison(
     panels: list[list[Panel]] = []
     boxes = [most_disputed(torch.cat(list(held.values())), DETAIL) for held in images]
     for shot, held, box in zip(shots, images, boxes, strict=True):
-        above, below = [Panel(shot.truth)], [Panel(shot.truth[..., *box])]
+        above = [Panel(shot.truth)]
+        below = [Panel(shot.truth[..., *box])]
         for name, image in held.items():
             found = numbers[shot.name][name]
-            above.append(Panel(image, f"{_decibels(found)}\nF1 {written(found['edge_f1'], 3)}"))
+            above.append(
+                Panel(image, f"{_decibels(found)}\nF1 {written(found['edge_f1'], 3)}")
+            )
             if detail:
-                found["psnr_detail"] = finite(psnr(image[..., *box], shot.truth[..., *box]))
-                below.append(Panel(image[..., *box], written(found["psnr_detail"], 2, " dB")))
+                found["psnr_detail"] = finite(
+                    psnr(image[..., *box], shot.truth[..., *box])
+                )
+                below.append(
+                    Panel(image[..., *box], written(found["psnr_detail"], 2, " dB"))
+                )
         panels += [above, below] if detail else [above]
     figure, axes = draw_panels(panels, titles=["truth", *images[0]])
-    caption = "The ground truth and each run's image, with PSNR and the F1 of Canny edges"
+    caption = (
+        "The ground truth and each run's image, with PSNR and the F1 of Canny edges"
+    )
     if not detail:
         return Drawing(figure, f"{caption}.", numbers)
     for i, (rows, columns) in enumerate(boxes):
         size = columns.stop - columns.start, rows.stop - rows.start
         for entire, magnified in zip(axes[2 * i], axes[2 * i + 1], strict=True):
-            frame = Rectangle((columns.start, rows.start), *size, fill=False, ec=VERMILLION, lw=0.8)
+            frame = Rectangle(
+                (columns.start, rows.start), *size, fill=False, ec=VERMILLION, lw=0.8
+            )
             entire.add_patch(frame)
             magnified.spines[:].set(visible=True, color=VERMILLION, linewidth=1.6)
     caption += (
@@ -108,7 +122,9 @@ def _measured(
     subjects: Sequence[Subject], shots: Sequence[Shot]
 ) -> tuple[Images, dict[str, dict[str, Numbers]]]:
     """Images of each shot by run, and their scores."""
-    images = [{subject.name: subject.image(shot) for subject in subjects} for shot in shots]
+    images = [
+        {subject.name: subject.image(shot) for subject in subjects} for shot in shots
+    ]
     return images, {
         shot.name: {name: measure(image, shot.truth) for name, image in held.items()}
         for shot, held in zip(shots, images, strict=True)
@@ -119,8 +135,10 @@ def _decibels(found: Numbers) -> str:
     return written(found["psnr"], 2, " dB")
 
 
-RECORD, CAPTIONS = "figures.json", "captions.md"
-METADATA: dict[str, dict[str, Any]] = {  # no dates: the same figure gives the same bytes
+RECORD = "figures.json"
+CAPTIONS = "captions.md"
+# no dates: the same figure gives the same bytes
+METADATA: dict[str, dict[str, Any]] = {
     "png": {"Software": ""},
     "pdf": {"CreationDate": None},
 }
@@ -151,23 +169,33 @@ def make_figures(config: DictConfig) -> None:
             "compare=[<folder>,…]"
         )
     at_least("margin", config.margin, 0)
-    out = folders[0] / "figures" if config.out is None else Path(config.out).expanduser()
+    out = (
+        folders[0] / "figures" if config.out is None else Path(config.out).expanduser()
+    )
     moved = DataPaths.from_config(config)
     for folder in folders:
         load_config(folder, moved)  # refuses other folders before anything is written
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ConfigError(f"out={out}: cannot be written to ({error.strerror})") from error
-    logging.getLogger("fontTools").setLevel(logging.WARNING)  # it logs every glyph of a PDF
+        raise ConfigError(
+            f"out={out}: cannot be written to ({error.strerror})"
+        ) from error
+    # it logs every glyph of a PDF
+    logging.getLogger("fontTools").setLevel(logging.WARNING)
     subjects = open_subjects(folders, moved, pick_device(config.device))
-    console, made = make_console(), dict[str, Drawing]()
+    console = make_console()
+    made = dict[str, Drawing]()
     with matplotlib.rc_context(STYLE):
-        for name in track(list(dict.fromkeys(names)), "drawing", console=console, transient=True):
+        for name in track(
+            list(dict.fromkeys(names)), "drawing", console=console, transient=True
+        ):
             made[name] = _draw(name, subjects, config)
             for kind, metadata in METADATA.items():
                 stream = io.BytesIO()
-                made[name].figure.savefig(stream, format=kind, metadata=metadata, **TRIMMED)
+                made[name].figure.savefig(
+                    stream, format=kind, metadata=metadata, **TRIMMED
+                )
                 write_atomically(out / f"{name}.{kind}", stream.getvalue())
     marks = sorted({mark for subject in subjects for mark in subject.marks})
     _write_record(out, made, subjects, marks)
@@ -180,8 +208,11 @@ def make_figures(config: DictConfig) -> None:
 
 def _draw(name: str, subjects: Sequence[Subject], config: DictConfig) -> Drawing:
     """One figure with its whole caption."""
-    data, split = subjects[0].data, config.split
-    frames = [whole("frames", frame, 0) for frame in dict.fromkeys(_list(config.frames))]
+    data = subjects[0].data
+    split = config.split
+    frames = [
+        whole("frames", frame, 0) for frame in dict.fromkeys(_list(config.frames))
+    ]
     items = choose_items(
         data,
         split,
@@ -207,14 +238,22 @@ def _list(value: Any) -> list[Any]:
 
 
 def _write_record(
-    out: Path, made: dict[str, Drawing], subjects: Sequence[Subject], marks: Sequence[str]
+    out: Path,
+    made: dict[str, Drawing],
+    subjects: Sequence[Subject],
+    marks: Sequence[str],
 ) -> None:
     """Numbers as JSON and captions as Markdown."""
     runs = {subject.name: str(subject.run.folder) for subject in subjects}
-    figures = {name: {"caption": d.caption, "numbers": d.numbers} for name, d in made.items()}
+    figures = {
+        name: {"caption": d.caption, "numbers": d.numbers} for name, d in made.items()
+    }
     record = {"runs": runs, "marks": marks, "figures": figures}
     write_atomically(out / RECORD, json.dumps(record, indent=1, allow_nan=False) + "\n")
     parts = ["# Captions", *(f"## {name}\n\n{d.caption}" for name, d in made.items())]
-    parts += ["## Runs\n\n" + "\n".join(f"- {name}: `{folder}`" for name, folder in runs.items())]
+    parts += [
+        "## Runs\n\n"
+        + "\n".join(f"- {name}: `{folder}`" for name, folder in runs.items())
+    ]
     parts += [f"Marked: {'; '.join(marks)}."] if marks else []
     write_atomically(out / CAPTIONS, "\n\n".join(parts) + "\n")

@@ -23,12 +23,18 @@ from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError, DataError
 
-NEAR = 0.01  # metres: with a joint nearer to the camera than this, the whole image is shown
+# metres: with a joint nearer to the camera than this, the whole image is shown
+NEAR = 0.01
 LEAST = 16  # pixels, the shortest side of a window
 TITLES = {  # of models, in print
-    "full": "gsgan", "wo_seg": "w/o S", "wo_gcn": "w/o GCN", "wo_feat": "w/o L_feat",
-    "splat_only": "splat only", "lbs_splat": "LBS splat", "image_to_image": "image to image",
-}  # fmt: skip
+    "full": "gsgan",
+    "wo_seg": "w/o S",
+    "wo_gcn": "w/o GCN",
+    "wo_feat": "w/o L_feat",
+    "splat_only": "splat only",
+    "lbs_splat": "LBS splat",
+    "image_to_image": "image to image",
+}
 Numbers = dict[str, float | None]
 
 
@@ -71,8 +77,12 @@ def choose_items(
     """
     items = data.splits.items[one_of("split", split, SPLITS)]
     if not items:
-        others = ", ".join(f"split={name}" for name in SPLITS if data.splits.items[name])
-        raise DataError(f"split {split} has no images: {data.reasons[split]}; use {others}")
+        others = ", ".join(
+            f"split={name}" for name in SPLITS if data.splits.items[name]
+        )
+        raise DataError(
+            f"split {split} has no images: {data.reasons[split]}; use {others}"
+        )
     cameras = list(dict.fromkeys(name for name, _ in items))
     if camera is not None and camera not in cameras:
         names = ", ".join(cameras)
@@ -93,7 +103,9 @@ def choose_items(
     return chosen
 
 
-def make_shots(data: GsganData, split: str, items: Sequence[Item], margin: float) -> list[Shot]:
+def make_shots(
+    data: GsganData, split: str, items: Sequence[Item], margin: float
+) -> list[Shot]:
     """Images of a split in windows that reach ``margin`` metres beyond the joints, all of one size
     where the images are."""
     dataset = data.dataset(split)
@@ -101,8 +113,11 @@ def make_shots(data: GsganData, split: str, items: Sequence[Item], margin: float
     one_size = len({frame.camera.size for frame in frames}) == 1
     shots: list[Shot] = []
     for batch in [frames] if one_size else [[frame] for frame in frames]:
-        p, camera = torch.cat([f.skeleton for f in batch]), cat([f.camera for f in batch])
-        boxes = body_window(p, camera, margin=margin, multiple=1, least=LEAST, near=NEAR)
+        p = torch.cat([f.skeleton for f in batch])
+        camera = cat([f.camera for f in batch])
+        boxes = body_window(
+            p, camera, margin=margin, multiple=1, least=LEAST, near=NEAR
+        )
         for corner, frame in zip(boxes.corners, batch, strict=True):
             window = Window((corner,), boxes.size, boxes.whole)
             shots.append(Shot(items[len(shots)], frame, window))
@@ -149,7 +164,9 @@ def open_subjects(
         DataError: when a run cannot be read.
     """
     if len({folder.resolve() for folder in folders}) < len(folders):
-        raise ConfigError("a run is given twice; every run in run and compare must differ")
+        raise ConfigError(
+            "a run is given twice; every run in run and compare must differ"
+        )
     subjects = [_open(folder, moved, device) for folder in folders]
     runs = [subject.run for subject in subjects]
     check_same("figures", runs, [{DATA: run.data["fingerprint"]} for run in runs])
@@ -165,7 +182,9 @@ def _open(folder: Path, moved: DataPaths, device: torch.device | str) -> Subject
     data = build_data(config)
     avatar, marks = load_avatar(folder, config, data)
     run = read_run(folder, scored=False)
-    run = replace(run, seed=config.seed, data=run.data | {"fingerprint": fingerprint(data)})
+    run = replace(
+        run, seed=config.seed, data=run.data | {"fingerprint": fingerprint(data)}
+    )
     name = TITLES.get(run.name, run.name)
     if run.name == "full" and run.departures == []:
         name = NAME
@@ -179,7 +198,10 @@ def _open(folder: Path, moved: DataPaths, device: torch.device | str) -> Subject
 def measure(image: Tensor, truth: Tensor) -> Numbers:
     """PSNR in dB and edge F1 of one image ``[1, 3, h, w]`` as it is shown; None where not defined:
     equal images, or a ground truth without edges."""
-    return {"psnr": finite(psnr(image, truth)), "edge_f1": finite(edge_f1(image, truth))}
+    return {
+        "psnr": finite(psnr(image, truth)),
+        "edge_f1": finite(edge_f1(image, truth)),
+    }
 
 
 def finite(score: Tensor) -> float | None:
