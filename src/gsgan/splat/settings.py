@@ -3,9 +3,6 @@
 from dataclasses import dataclass
 
 import torch
-import yaml
-
-from gsgan.utils.config import config_folder
 
 _EXTENTS = ("all", "opacity", "sigma")
 _DTYPES = {"float32": torch.float32, "float64": torch.float64}
@@ -85,16 +82,38 @@ class Accuracy:
         return self.extent == "all" and self.alpha_min == self.transmittance_min == 0
 
 
-def _preset(name: str) -> Accuracy:
-    preset = yaml.safe_load((config_folder() / "accuracy" / f"{name}.yaml").read_text())
-    del preset["_target_"]
-    return Accuracy(**preset)
-
-
-ACCURACY: dict[str, Accuracy] = {
-    n: _preset(n) for n in ("exact", "high", "standard", "draft")
+ACCURACY = {
+    "exact": Accuracy(
+        name="exact",
+        alpha_min=0.0,
+        transmittance_min=0.0,
+        extent="all",
+        dtype="float64",
+        alpha_max=1.0,
+    ),
+    "high": Accuracy(
+        name="high",
+        alpha_min=1e-5,
+        transmittance_min=1e-5,
+        extent="opacity",
+        dtype="float32",
+    ),
+    "standard": Accuracy(
+        name="standard",
+        alpha_min=1 / 255,
+        transmittance_min=1e-4,
+        extent="opacity",
+        dtype="float32",
+    ),
+    "draft": Accuracy(
+        name="draft",
+        alpha_min=1 / 64,
+        transmittance_min=1e-2,
+        extent="sigma",
+        dtype="float32",
+    ),
 }
-"""The presets of conf/accuracy."""
+"""The presets, as in conf/accuracy."""
 
 
 def accuracy(name: str) -> Accuracy:
