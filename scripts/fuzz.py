@@ -79,9 +79,9 @@ def seeds(home: Path, run: Path) -> dict[str, list[tuple[Path, Reader]]]:
     from gsgan.data.formats.capture import read_capture
     from gsgan.data.proportions import measure_proportions
     from gsgan.export.weights import load_weights, weights_bytes
-    from gsgan.model.runs import load
-    from gsgan.model.stored import CHECKPOINT, read_checkpoint
     from gsgan.motion.readers import Source, read_motion
+    from gsgan.run.runs import load
+    from gsgan.run.stored import CHECKPOINT, read_checkpoint
     from gsgan.skeleton import MEDIAPIPE33
     from gsgan.synthetic.gltf import read_character
     from gsgan.synthetic.posing import Choreography

@@ -9,9 +9,9 @@ import torch
 
 import gsgan
 from gsgan.metrics.regions import on_background
-from gsgan.model.assemble import build_data
-from gsgan.model.runs import load_avatar
-from gsgan.model.stored import CONFIG, load_config
+from gsgan.run.assemble import build_data
+from gsgan.run.runs import load_avatar
+from gsgan.run.stored import CONFIG, load_config
 from gsgan.scene import cat
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.utils.errors import DataError

@@ -32,9 +32,9 @@ def given(capture: Path) -> list[str]:
 @pytest.fixture(scope="session")
 def painted(run: Path, capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The images of the tiny run as another method would leave them: 8-bit PNGs."""
-    from gsgan.model.assemble import build_data
-    from gsgan.model.runs import load_avatar
-    from gsgan.model.stored import load_config
+    from gsgan.run.assemble import build_data
+    from gsgan.run.runs import load_avatar
+    from gsgan.run.stored import load_config
 
     root = tmp_path_factory.mktemp("others") / "other"
     data = build_data(load_config(run))
@@ -201,9 +201,9 @@ def test_a_run_is_scored_on_white_by_request(run, inside, tmp_path):
     """By the alpha that each of its pictures has; the table is marked."""
     from gsgan.metrics.image import psnr
     from gsgan.metrics.regions import on_background
-    from gsgan.model.assemble import build_data
-    from gsgan.model.runs import load_avatar
-    from gsgan.model.stored import load_config
+    from gsgan.run.assemble import build_data
+    from gsgan.run.runs import load_avatar
+    from gsgan.run.stored import load_config
 
     copy = shutil.copytree(run, tmp_path / "copy")
     result = inside("evaluate", f"run={copy}", "background=white", "grid_rows=1")

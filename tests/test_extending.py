@@ -12,9 +12,9 @@ from gsgan.data.files import frame_files
 from gsgan.data.formats.common import FolderReader, image_size, one_mask_each
 from gsgan.data.layout import Found, Meta
 from gsgan.data.skeletons import make_landmarks
-from gsgan.model.assemble import build_data
 from gsgan.model.body_points import SkinnedPoints
 from gsgan.model.rendering import Rendering
+from gsgan.run.assemble import build_data
 from gsgan.scene import BodyPose, Frame, Gaussians
 from gsgan.train.run import build_training
 

@@ -5,8 +5,8 @@ import re
 import pytest
 from omegaconf import OmegaConf
 
-from gsgan.model.stored import record
 from gsgan.report.runs import flat
+from gsgan.run.stored import record
 from gsgan.utils.config import config_folder
 
 DATA = sorted(path.stem for path in (config_folder() / "data").glob("[!_]*.yaml"))

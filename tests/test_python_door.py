@@ -8,9 +8,9 @@ from pathlib import Path
 import matplotlib
 import pytest
 import yaml
+from commands import ROOT
 
 import gsgan
-from commands import ROOT
 from gsgan.splat import ACCURACY, Accuracy
 
 PAGE = (ROOT / "docs" / "python.md").read_text()

@@ -19,9 +19,9 @@ from timing import interleaved, median
 from gsgan.bench.common import NOTHING, check_whole, markdown, sentence
 from gsgan.effects import decide as decide_effects
 from gsgan.fit.run import fit_before_training
-from gsgan.model.assemble import build_data
-from gsgan.model.runs import load_avatar
-from gsgan.model.stored import load_config
+from gsgan.run.assemble import build_data
+from gsgan.run.runs import load_avatar
+from gsgan.run.stored import load_config
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import one_of
 from gsgan.utils.config import config_folder

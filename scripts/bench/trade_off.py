@@ -37,10 +37,10 @@ from gsgan.bench.speed import (
 )
 from gsgan.data.datamodule import GsganData
 from gsgan.metrics.image import edge_f1, psnr, ssim
-from gsgan.model.assemble import build_data
 from gsgan.model.avatar import Avatar
-from gsgan.model.runs import load_avatar
-from gsgan.model.stored import CHECKPOINT, DataPaths, load_config, read_checkpoint
+from gsgan.run.assemble import build_data
+from gsgan.run.runs import load_avatar
+from gsgan.run.stored import CHECKPOINT, DataPaths, load_config, read_checkpoint
 from gsgan.scene import Frame
 from gsgan.splat import BACKENDS, Accuracy
 from gsgan.utils.checks import above, between, one_of

@@ -25,7 +25,6 @@ from scipy.stats import binomtest
 from torch import Tensor
 from torch.nn import functional
 
-from gsgan.model.stored import DataPaths
 from gsgan.report.figures.run import most_disputed
 from gsgan.report.figures.subjects import (
     Shot,
@@ -34,6 +33,7 @@ from gsgan.report.figures.subjects import (
     make_shots,
     open_subjects,
 )
+from gsgan.run.stored import DataPaths
 
 MARGIN = 0.1  # metres beyond the joints that the images show
 SHARE = 0.3  # of their sides that a crop shows

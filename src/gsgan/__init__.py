@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from gsgan.model.avatar import Avatar as Avatar
     from gsgan.model.deformation import Deformation as Deformation
     from gsgan.model.generator import Generator as Generator
-    from gsgan.model.runs import load as load
     from gsgan.model.segmentation import Segmentation as Segmentation
+    from gsgan.run.runs import load as load
     from gsgan.scene import BodyPose as BodyPose
     from gsgan.scene import Camera as Camera
     from gsgan.scene import Gaussians as Gaussians
@@ -30,10 +30,10 @@ _MODULES = {
     "Gaussians": "gsgan.scene",
     "Generator": "gsgan.model.generator",
     "Segmentation": "gsgan.model.segmentation",
-    "load": "gsgan.model.runs",
+    "load": "gsgan.run.runs",
     "rasterise": "gsgan.splat",
 }
-__all__ = list(_MODULES)  # noqa: PLE0604
+__all__ = list(_MODULES)
 
 
 def __getattr__(name: str) -> Any:

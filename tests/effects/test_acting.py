@@ -11,10 +11,10 @@ from make import write_tiny_capture
 from omegaconf import OmegaConf
 from operators import Calls
 
-from gsgan.model.assemble import build_data
 from gsgan.model.colour import ColourCorrection
-from gsgan.model.runs import load_avatar
-from gsgan.model.stored import load_config, read_checkpoint
+from gsgan.run.assemble import build_data
+from gsgan.run.runs import load_avatar
+from gsgan.run.stored import load_config, read_checkpoint
 
 NONE = "effects=none"
 

@@ -70,8 +70,8 @@ def test_a_trained_run_as_safetensors_with_its_scores(run, tmp_path, inside):
 
 def test_safetensors_name_no_class_but_gsgans_own(run, tmp_path):
     from gsgan.export.weights import load_weights, weights_bytes
-    from gsgan.model.runs import load
-    from gsgan.model.stored import CHECKPOINT, read_checkpoint
+    from gsgan.run.runs import load
+    from gsgan.run.stored import CHECKPOINT, read_checkpoint
 
     facts = read_checkpoint(run / CHECKPOINT)["gsgan"]
     content, path = weights_bytes(run, load(run), facts), tmp_path / "a.safetensors"

@@ -19,8 +19,8 @@ from commands import refused
 from PIL import Image
 
 from gsgan.export.page import WEB, block, page, quantised
-from gsgan.model.drive import Drive
-from gsgan.model.runs import Run
+from gsgan.run.drive import Drive
+from gsgan.run.runs import Run
 from gsgan.scene import Camera
 from gsgan.utils.provenance import verify
 from gsgan.view.drag import dragged, position

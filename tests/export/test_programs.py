@@ -15,7 +15,7 @@ from gsgan.export.programs import (
     unfrozen,
 )
 from gsgan.export.weights import load_weights, weights_bytes
-from gsgan.model.stored import read_checkpoint
+from gsgan.run.stored import read_checkpoint
 from gsgan.utils.errors import ConfigError, DataError
 
 PARITY = 1e-3

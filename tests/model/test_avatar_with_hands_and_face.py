@@ -12,11 +12,11 @@ from make import write_face, write_hands
 import gsgan
 from gsgan.body import free_body
 from gsgan.export.splats import splats_of
-from gsgan.model.assemble import build_data
 from gsgan.model.body_points import BodyPoints
-from gsgan.model.drive import Drive, inputs_of, rest_pose
 from gsgan.model.pose_graph import pose_inputs
-from gsgan.model.stored import load_config
+from gsgan.run.assemble import build_data
+from gsgan.run.drive import Drive, inputs_of, rest_pose
+from gsgan.run.stored import load_config
 from gsgan.skeleton import TEMPLATES, bone_frames, face_code
 
 FACE, HANDS = slice(75, 105), slice(33, 75)

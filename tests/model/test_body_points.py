@@ -14,8 +14,8 @@ from gsgan.body.skinned import neighbours_on_surface, vertex_normals
 from gsgan.data.datamodule import GsganData
 from gsgan.data.surface_colours import body_inside
 from gsgan.model.body_points import BodyPoints, moved_normals
-from gsgan.model.runs import load_avatar
-from gsgan.model.stored import CHECKPOINT
+from gsgan.run.runs import load_avatar
+from gsgan.run.stored import CHECKPOINT
 from gsgan.scene import BodyPose
 from gsgan.synthetic.scenes import ensure_scene
 from gsgan.train.run import build_training
@@ -220,7 +220,7 @@ def test_a_trained_avatar_without_its_body_is_refused_in_one_sentence(
     avatar, _ = load_avatar(tmp_path, config, data)
     assert getattr(avatar, part) is not None
     for place in ("assemble", "class_vote"):
-        monkeypatch.setattr(f"gsgan.model.{place}.open_body", lambda *_: None)
+        monkeypatch.setattr(f"gsgan.run.{place}.open_body", lambda *_: None)
     with pytest.raises(
         DataError, match=rf"{said},? .*cannot be built.* no model file; set data\.smpl"
     ):

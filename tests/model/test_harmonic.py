@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gsgan.model.harmonic import Harmonic, distilled, harmonics, ridge_regression
-from gsgan.model.runs import load
+from gsgan.run.runs import load
 from gsgan.skeleton.densify import Points, even_sphere
 from gsgan.train.run import start_from
 from gsgan.utils.errors import ConfigError

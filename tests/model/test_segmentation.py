@@ -9,8 +9,6 @@ import torch
 
 from gsgan.body import free_body
 from gsgan.body.smpl_names import CIHP, CLOTHES
-from gsgan.model.assemble import build_data
-from gsgan.model.runs import load_avatar
 from gsgan.model.segmentation import (
     IGNORE,
     Segmentation,
@@ -18,7 +16,9 @@ from gsgan.model.segmentation import (
     segmentation_loss,
     silhouette_loss,
 )
-from gsgan.model.stored import DataPaths, load_config
+from gsgan.run.assemble import build_data
+from gsgan.run.runs import load_avatar
+from gsgan.run.stored import DataPaths, load_config
 from gsgan.scene import BodyPose, Camera
 from gsgan.utils.errors import ConfigError
 

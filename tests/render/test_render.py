@@ -17,10 +17,10 @@ from gsgan.body.shape import free_space
 from gsgan.data.metric_variants import MetricVariants
 from gsgan.evaluate.predictions import Preparation
 from gsgan.evaluate.scores import painter
-from gsgan.model.assemble import build_data
-from gsgan.model.runs import load, load_avatar
-from gsgan.model.stored import CHECKPOINT, CONFIG, load_config
 from gsgan.render import run as render_run
+from gsgan.run.assemble import build_data
+from gsgan.run.runs import load, load_avatar
+from gsgan.run.stored import CHECKPOINT, CONFIG, load_config
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.train.run import build_training
 from gsgan.utils.provenance import SOURCE_TYPE, verify

@@ -11,10 +11,10 @@ from commands import refused
 from omegaconf import OmegaConf
 
 from gsgan.metrics.image import edge_f1, psnr
-from gsgan.model.assemble import build_data
-from gsgan.model.runs import load_avatar
-from gsgan.model.stored import load_config
 from gsgan.report.figures.run import FIGURES
+from gsgan.run.assemble import build_data
+from gsgan.run.runs import load_avatar
+from gsgan.run.stored import load_config
 
 FEW = ("shots.strip=2",)
 

@@ -24,7 +24,7 @@ def test_non_finite_gradients_far_apart_never_stop_a_run(make):
 
 
 def test_a_resumed_run_starts_counting_anew_and_may_change_the_limit(make, tiny):
-    from gsgan.model.stored import record
+    from gsgan.run.stored import record
 
     module = skipping(make, "training.max_skipped=20")
     for step in range(19):

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gsgan.model.runs import load_avatar
+from gsgan.run.runs import load_avatar
 from gsgan.train.optimisers import MovingAverage
 from gsgan.utils.errors import ConfigError
 

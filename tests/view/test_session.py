@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 
-from gsgan.model.drive import drive_of
-from gsgan.model.runs import Run
+from gsgan.run.drive import drive_of
+from gsgan.run.runs import Run
 from gsgan.view.session import Session, Show
 
 DEVICE = os.environ.get("GPU_CHECK_DEVICE", "cpu")

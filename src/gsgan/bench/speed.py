@@ -16,10 +16,10 @@ from torch import Tensor
 
 from gsgan.bench.common import check_whole, environment, markdown, number, sentence
 from gsgan.data.datamodule import GsganData
-from gsgan.model.assemble import build_avatar, build_data
 from gsgan.model.avatar import Avatar, unwatched
-from gsgan.model.runs import load_avatar
-from gsgan.model.stored import DataPaths, load_config
+from gsgan.run.assemble import build_avatar, build_data
+from gsgan.run.runs import load_avatar
+from gsgan.run.stored import DataPaths, load_config
 from gsgan.scene import Frame, cat
 from gsgan.splat import BACKENDS, resolve_backend
 from gsgan.utils.arrays import evenly_spaced

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from gsgan import __version__
-from gsgan.model.stored import choices
+from gsgan.run.stored import choices
 
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData

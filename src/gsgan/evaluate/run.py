@@ -41,9 +41,9 @@ from gsgan.evaluate.scores import (
 )
 from gsgan.metrics.lpips import LPIPS_NETS, build_lpips
 from gsgan.metrics.regions import BACKGROUNDS
-from gsgan.model.assemble import build_data
-from gsgan.model.runs import avatar_of, load_avatar
-from gsgan.model.stored import (
+from gsgan.run.assemble import build_data
+from gsgan.run.runs import avatar_of, load_avatar
+from gsgan.run.stored import (
     CHECKPOINT,
     DataPaths,
     load_config,

@@ -23,10 +23,10 @@ from gsgan.body.solve import Solver
 from gsgan.data.proportions import upright
 from gsgan.model.avatar import Avatar
 from gsgan.model.body_points import BodyPoints
-from gsgan.model.drive import Drive, rest_pose
 from gsgan.model.harmonic import Harmonic
-from gsgan.model.runs import Run
 from gsgan.motion.rotations import rotation
+from gsgan.run.drive import Drive, rest_pose
+from gsgan.run.runs import Run
 from gsgan.skeleton import complete_skeleton
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.provenance import SOFTWARE, SOURCE_TYPE, XMP

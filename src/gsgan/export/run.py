@@ -15,8 +15,8 @@ from rich.progress import track
 from gsgan import __version__
 from gsgan.export.page import block, page, refuse_unsuitable
 from gsgan.export.splats import Splats, glb_bytes, ply_bytes, splats_of
-from gsgan.model.drive import REST, Drive, distilled_of, drive_of, inputs_of
-from gsgan.model.runs import Run
+from gsgan.run.drive import REST, Drive, distilled_of, drive_of, inputs_of
+from gsgan.run.runs import Run
 from gsgan.utils.checks import above, one_of, whole
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError

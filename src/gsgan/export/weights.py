@@ -9,8 +9,8 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gsgan.model.avatar import Avatar
-from gsgan.model.runs import avatar_of
-from gsgan.model.stored import read_config
+from gsgan.run.runs import avatar_of
+from gsgan.run.stored import read_config
 from gsgan.utils.config import config_folder
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.tensors import pick_device

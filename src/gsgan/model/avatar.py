@@ -48,7 +48,7 @@ def unwatched(stage: str) -> AbstractContextManager[None]:
 class Avatar(nn.Module):
     """One person: Gaussians, segmentation, pose code and generator.
 
-    `gsgan.model.assemble` builds the parts; `gsgan.load` loads a trained avatar. Call an avatar to
+    `gsgan.run.assemble` builds the parts; `gsgan.load` loads a trained avatar. Call an avatar to
     train or score it, and its `render` for an image.
 
     Args:

@@ -31,7 +31,7 @@ RATES = {
     "features": 10.0,
 }
 UNIT = math.sqrt(4 * math.pi)  # makes the first harmonic 1, and the mean square of each
-# joints, visibility, body: `gsgan.model.drive`
+# joints, visibility, body: `gsgan.run.drive`
 Pose = tuple[Tensor, Tensor, BodyPose | None]
 
 
@@ -147,7 +147,7 @@ def distilled(
     Args:
         avatar: trained, with Ψ.
         poses: joints ``[1, J, 3]``, visibility ``[1, J]`` and body pose of each (None: solved), as
-            `gsgan.model.drive.inputs_of` and `gsgan.scene.Frame.inputs` have them.
+            `gsgan.run.drive.inputs_of` and `gsgan.scene.Frame.inputs` have them.
         follow: see `Harmonic`; the others get their mean over the poses.
         ridge: penalty of each squared coefficient but the first, beside the mean over poses of the
             squared error.

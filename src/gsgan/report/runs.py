@@ -14,7 +14,7 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gsgan.model.stored import hydra_record, record
+from gsgan.run.stored import hydra_record, record
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.sweeps import unfinished
 

@@ -34,12 +34,12 @@ from gsgan.evaluate.scores import painter
 from gsgan.export.run import export_config
 from gsgan.fit.run import fit_before_training
 from gsgan.metrics.lpips import build_lpips
-from gsgan.model.assemble import build_avatar, build_data, naming_group
 from gsgan.model.avatar import Avatar
 from gsgan.model.harmonic import Harmonic, distilled
-from gsgan.model.runs import load
-from gsgan.model.stored import CHECKPOINT, read_checkpoint, record
 from gsgan.motion.clip import FPS
+from gsgan.run.assemble import build_avatar, build_data, naming_group
+from gsgan.run.runs import load
+from gsgan.run.stored import CHECKPOINT, read_checkpoint, record
 from gsgan.scene import BodyPose
 from gsgan.splat import resolve_backend
 from gsgan.train.callbacks import (

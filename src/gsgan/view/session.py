@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 from gsgan.body import SkinnedBody
 from gsgan.metrics.segmentation import colour_labels
 from gsgan.model.avatar import Avatar
-from gsgan.model.drive import Drive, inputs_of, joints_of
 from gsgan.model.rendering import Rendering
+from gsgan.run.drive import Drive, inputs_of, joints_of
 from gsgan.scene import BodyPose, Camera, Gaussians
 from gsgan.utils.errors import GsganError
 from gsgan.utils.images import eight_bits

@@ -18,7 +18,6 @@ from torch import Tensor
 from torch.nn import functional
 
 from gsgan.metrics.image import psnr
-from gsgan.model.stored import DataPaths, load_config
 from gsgan.report.figures.layout import STYLE, Drawing, Panel, draw_panels, written
 from gsgan.report.figures.subjects import (
     Numbers,
@@ -30,6 +29,7 @@ from gsgan.report.figures.subjects import (
     measure,
     open_subjects,
 )
+from gsgan.run.stored import DataPaths, load_config
 from gsgan.utils.checks import at_least, one_of, whole
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError

@@ -13,11 +13,11 @@ from gsgan.data.splits import SPLITS, Item
 from gsgan.data.validation import spans
 from gsgan.evaluate.origin import fingerprint
 from gsgan.metrics.image import edge_f1, psnr
-from gsgan.model.assemble import build_data
 from gsgan.model.avatar import Avatar
-from gsgan.model.runs import load_avatar
-from gsgan.model.stored import CHECKPOINT, DataPaths, load_config, read_checkpoint
 from gsgan.report.runs import DATA, NAME, Run, check_same, read_run
+from gsgan.run.assemble import build_data
+from gsgan.run.runs import load_avatar
+from gsgan.run.stored import CHECKPOINT, DataPaths, load_config, read_checkpoint
 from gsgan.scene import Frame, Window, body_window, cat
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import one_of

@@ -23,7 +23,6 @@ from gsgan.data.proportions import (
 from gsgan.data.splits import SPLITS
 from gsgan.model.avatar import Avatar
 from gsgan.model.harmonic import Harmonic, distilled
-from gsgan.model.runs import Run
 from gsgan.motion.clip import (
     AXES,
     FPS,
@@ -37,6 +36,7 @@ from gsgan.motion.clip import (
 )
 from gsgan.motion.readers import Source, read_motion
 from gsgan.motion.retarget import expressed, face_in_head, joined, placed, retargeted
+from gsgan.run.runs import Run
 from gsgan.scene import BodyPose, Camera, cat
 from gsgan.skeleton import complete_skeleton, sanitise
 from gsgan.skeleton.sides import refuse_swapped

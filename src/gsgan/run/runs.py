@@ -17,9 +17,9 @@ from gsgan.body.skinned import MarkedBody
 from gsgan.data.proportions import Proportions
 from gsgan.data.scene_info import SceneInfo
 from gsgan.effects import Effects
-from gsgan.model.assemble import build_avatar, build_data
 from gsgan.model.avatar import Avatar
-from gsgan.model.stored import (
+from gsgan.run.assemble import build_avatar, build_data
+from gsgan.run.stored import (
     CHECKPOINT,
     CONFIG,
     DataPaths,

@@ -19,6 +19,8 @@ from gsgan.data.training_poses import TrainingPoses
 from gsgan.utils.errors import ConfigError, DataError
 
 CHECKPOINT = Path("checkpoints") / "last.ckpt"
+# Classes that configs of runs before 2026-11-26 name by another module.
+MOVED = {"gsgan.model.assemble.": "gsgan.run.assemble."}
 CONFIG = Path(".hydra") / "config.yaml"
 # Keys that may differ between a run and its continuation: they do not change what it learns.
 FREE_KEYS = (
@@ -74,7 +76,10 @@ def read_config(folder: Path) -> DictConfig:
 
 def _read_yaml(path: Path) -> DictConfig:
     try:
-        config = OmegaConf.load(path)
+        text = path.read_text(encoding="utf-8")
+        for before, now in MOVED.items():
+            text = text.replace(before, now)
+        config = OmegaConf.create(text)
     except (UnicodeDecodeError, yaml.YAMLError, OmegaConfBaseException) as error:
         raise DataError(f"{path}: damaged ({str(error).splitlines()[0]})") from None
     if not isinstance(config, DictConfig):

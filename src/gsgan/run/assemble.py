@@ -20,12 +20,12 @@ from gsgan.data.scene_info import SceneInfo
 from gsgan.effects import Effects, EffectSettings, ModelParts, decide
 from gsgan.model.avatar import Avatar
 from gsgan.model.body_points import BodyPoints
-from gsgan.model.class_vote import labelled_body
 from gsgan.model.colour import ColourCorrection
 from gsgan.model.deformation import ResidualGaussians
 from gsgan.model.generator import Generator
 from gsgan.model.segmentation import Segmentation
 from gsgan.model.surface import SurfaceGaussians
+from gsgan.run.class_vote import labelled_body
 from gsgan.scene import Frame
 from gsgan.skeleton import Densify, SkeletonTemplate, template_of
 from gsgan.splat import BACKENDS, Accuracy

@@ -14,10 +14,10 @@ from test_body_points import stored
 from gsgan.body import SkinnedBody, free_body, open_body
 from gsgan.body.shape import BodyShape
 from gsgan.body.smpl_names import CIHP
-from gsgan.model.assemble import build_avatar, build_data
 from gsgan.model.body_points import neighbour_distance
-from gsgan.model.class_vote import class_vote, seen
-from gsgan.model.runs import load_avatar
+from gsgan.run.assemble import build_avatar, build_data
+from gsgan.run.class_vote import class_vote, seen
+from gsgan.run.runs import load_avatar
 from gsgan.scene import BodyPose, Camera, Frame
 from gsgan.train.run import build_training
 from gsgan.utils.errors import DataError
@@ -214,7 +214,7 @@ def foreign(capture, tmp_path):
 @pytest.fixture
 def few(monkeypatch):
     """Votes are held over two images."""
-    monkeypatch.setattr("gsgan.model.class_vote.VOTE_FRAMES", 2)
+    monkeypatch.setattr("gsgan.run.class_vote.VOTE_FRAMES", 2)
 
 
 def no_vote(*_):
@@ -222,7 +222,7 @@ def no_vote(*_):
 
 
 def test_labels_that_are_the_bodys_own_are_not_voted_on(build, monkeypatch):
-    monkeypatch.setattr("gsgan.model.class_vote.class_vote", no_vote)
+    monkeypatch.setattr("gsgan.run.class_vote.class_vote", no_vote)
     _, avatar, _ = build()
     assert avatar.segmentation is not None
     assert "no class vote" in avatar.segmentation_why
@@ -248,7 +248,7 @@ def test_votes_are_kept_in_the_checkpoint_and_not_held_again(
     assert avatar.segmentation.map.names[0] == "cloth 0"
     assert avatar.segmentation.classes > 2
     stored(module, tmp_path)
-    monkeypatch.setattr("gsgan.model.class_vote.class_vote", no_vote)
+    monkeypatch.setattr("gsgan.run.class_vote.class_vote", no_vote)
     loaded, _ = load_avatar(tmp_path, config, data)
     frame = data.dataset("train")[0]
     with torch.no_grad():
