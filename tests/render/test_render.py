@@ -322,7 +322,6 @@ def test_cameras(render, bare, capture, motion, tmp_path):
         (("out=a", "fps=0"), "fps must be a number above 0"),
         (("out=a", "motion=novel_pose", "start=9"), "start=9: the motion has 2 frames"),
         (("out=a", "orbit.elevation=90"), "orbit.elevation must be"),
-        (("out=a", "c2pa.key=k.pem"), "go together"),
         (("out=a", "retarget=maybe"), "retarget must be one of auto"),
         (("out=a", "drive=body"), "drive must be one of None, skeleton"),
         (

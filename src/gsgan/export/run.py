@@ -164,8 +164,8 @@ def export_config(config: DictConfig) -> None:
         path = Path(config.verify).expanduser()
         found = verify(path)
         state = "marked as synthetic" if found.synthetic else "not marked as synthetic"
-        for line in (f"{path.name}: {state}", *found.lines()):
-            tell(line)
+        tell(f"{path.name}: {state}")
+        tell(found.summary())
         return
     kind = one_of("format", config.format, tuple(ENDINGS))
     out = _place(config, kind)

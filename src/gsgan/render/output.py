@@ -17,7 +17,7 @@ from PIL import Image
 
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import write_atomically
-from gsgan.utils.provenance import Signer, marked_mp4, png_bytes, signed
+from gsgan.utils.provenance import marked_mp4, png_bytes
 
 Bytes = NDArray[np.uint8]
 
@@ -37,13 +37,11 @@ class Output:
         out: a .mp4 file or a folder.
         fps: of the video.
         marked: whether files say that they are synthetic.
-        signer: signs the final files; None leaves them unsigned.
     """
 
     out: Path
     fps: float
     marked: bool = True
-    signer: Signer | None = None
 
     @property
     def video(self) -> bool:
@@ -91,14 +89,11 @@ class Output:
         if self.video:
             data = encoded(images, self.fps)
             data = marked_mp4(data) if self.marked else data
-            write_atomically(self.out, self._signed(data, VIDEO))
+            write_atomically(self.out, data)
             return
         for number, image in zip(numbers, images, strict=True):
             data = png_bytes(Image.fromarray(image), self.marked)
-            write_atomically(self.out / f"{number:06d}.png", self._signed(data, ".png"))
-
-    def _signed(self, data: bytes, suffix: str) -> bytes:
-        return data if self.signer is None else signed(data, suffix, self.signer)
+            write_atomically(self.out / f"{number:06d}.png", data)
 
 
 def _av() -> Any:

@@ -26,7 +26,6 @@ from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import writing
 from gsgan.utils.images import Background, background, eight_bits
-from gsgan.utils.provenance import Signer
 
 STILL_SECONDS = 4.0
 
@@ -90,17 +89,10 @@ def _output(config: DictConfig) -> Output:
         raise ConfigError(
             "out is not set: give out=<video.mp4>, or out=<folder> for PNG files"
         )
-    given = config.c2pa.certificate, config.c2pa.key
-    if (given[0] is None) != (given[1] is None):
-        raise ConfigError("c2pa.certificate and c2pa.key go together: give both")
-    signer = None
-    if given[0] is not None:
-        chain, key = (Path(x).expanduser() for x in given)
-        signer = Signer(chain, key, config.c2pa.algorithm)
     out = Path(config.out).expanduser()
     if out.suffix and out.suffix.lower() != ".mp4" and not out.is_dir():
         raise ConfigError(f"out={out} must be a .mp4 file, or a folder for PNG files")
-    return Output(out, float(above("fps", config.fps)), bool(config.provenance), signer)
+    return Output(out, float(above("fps", config.fps)), bool(config.provenance))
 
 
 def _chosen(drive: Drive, config: DictConfig, fps: float) -> Drive:
