@@ -3,7 +3,6 @@
 import json
 import logging
 from dataclasses import asdict
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -29,9 +28,9 @@ def rasterise(
 ) -> Raster:
     """Draws Gaussians as a camera sees them.
 
-    Convention: features are premultiplied; the caller adds the background.
-    Differentiable in every tensor of ``gaussians`` and in the camera's K, R and t. Lens
-    distortion (``camera.dist``) is applied, see `gsgan.splat.lens`. Autocast has no effect.
+    Features are premultiplied by alpha; the caller adds the background. The result is
+    differentiable in every tensor of ``gaussians`` and in the camera's K, R and t. Lens distortion
+    (``camera.dist``) is applied, see `gsgan.splat.lens`. Autocast has no effect.
 
     Args:
         gaussians: N >= 0 Gaussians per batch item.
@@ -51,33 +50,42 @@ def rasterise(
 
     Source: paper Sec. 3.1.
     """
-    settings = accuracy(settings) if isinstance(settings, str) else settings
+    if isinstance(settings, str):
+        settings = accuracy(settings)
     if torch.compiler.is_compiling():
         return _recorded(gaussians, camera, settings, backend)
     checks.check(gaussians, camera)
+    dtype = gaussians.means.dtype
+    device = gaussians.means.device
+
+    # A lens is replaced by the pinhole that sees each Gaussian where the lens does.
     if camera.dist is not None:
         gaussians, camera = as_pinhole_sees(gaussians, camera, settings.near)
-    name, reason = resolve_backend(backend, gaussians.means.device, settings)
-    if name == "gsplat" and (why_not := gsplat_backend.unsuited(gaussians, camera)):
+
+    # The backend depends on the device, the settings and the input.
+    name, message = resolve_backend(backend, device, settings)
+    if name == "gsplat" and (reason := gsplat_backend.unsuited(gaussians, camera)):
         name = "torch"
-        reason = f"Drawing with the torch backend: {why_not}"
-    if reason:
-        _warn_once(reason)
-    out = gaussians.means.dtype
-    times = settings.supersample
-    fine = None
-    drawn = camera
-    if times > 1:
-        drawn = camera.resize((camera.size[0] * times, camera.size[1] * times))
-    with tiles.full_precision(gaussians.means.device):
-        features, alpha, average = _draw(name, gaussians, drawn, settings)
-        if times > 1:
-            fine = features.to(out)
-            if average is None:
-                average = avg_pool2d(features, times)
-                alpha = avg_pool2d(alpha, times)
-            features = average
-    return Raster(features.to(out), alpha.to(out), fine)
+        message = f"Drawing with the torch backend: {reason}"
+    if message:
+        _warn_once(message)
+
+    # Supersampling draws a larger image and averages its pixels.
+    factor = settings.supersample
+    if factor == 1:
+        with tiles.full_precision(device):
+            features, alpha, _ = _draw(name, gaussians, camera, settings)
+        return Raster(features.to(dtype), alpha.to(dtype), None)
+
+    height, width = camera.size
+    larger = camera.resize((height * factor, width * factor))
+    with tiles.full_precision(device):
+        features, alpha, average = _draw(name, gaussians, larger, settings)
+        fine = features.to(dtype)
+        if average is None:
+            average = avg_pool2d(features, factor)
+            alpha = avg_pool2d(alpha, factor)
+    return Raster(average.to(dtype), alpha.to(dtype), fine)
 
 
 def resolve_backend(
@@ -121,17 +129,25 @@ def resolve_backend(
 def _draw(
     name: str, gaussians: Gaussians, camera: Camera, settings: Accuracy
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Features and alpha by one backend; where it averages what is supersampled, alpha is averaged,
-    and averaged features follow."""
+    """Features and alpha by one backend, and averaged features or None.
+
+    If the backend averages supersampled pixels itself, alpha is averaged too, and the third value
+    holds the averaged features.
+    """
     if name == "gsplat":
-        return *gsplat_backend.draw(gaussians, camera, settings), None
+        features, alpha = gsplat_backend.draw(gaussians, camera, settings)
+        return features, alpha, None
     if name == "native":
         projected = native_project.project(gaussians, camera, settings)
-        times = settings.supersample if settings.supersample in native.AVERAGES else 1
-        return native.composite(projected, camera.size, settings, times)
+        factor = settings.supersample
+        averaged = factor if factor in native.AVERAGES else 1
+        return native.composite(projected, camera.size, settings, averaged)
     projected = project(gaussians, camera, settings)
-    composite = reference.composite if name == "reference" else tiles.composite
-    return *composite(projected, camera.size, settings), None
+    if name == "reference":
+        features, alpha = reference.composite(projected, camera.size, settings)
+    else:
+        features, alpha = tiles.composite(projected, camera.size, settings)
+    return features, alpha, None
 
 
 def _warn_once(message: str) -> None:
@@ -147,15 +163,19 @@ def _recorded(
     gaussians: Gaussians, camera: Camera, settings: Accuracy, backend: str
 ) -> Raster:
     """The operator that ``torch.export`` records in place of `rasterise`, without gradient."""
-    assert gaussians.covariances is not None  # as avatars splat
+    assert gaussians.covariances is not None  # avatars always give covariances
+    height, width = camera.size
     features, alpha, fine = _rasterise(
-        *(
-            gaussians.means,
-            gaussians.covariances,
-            gaussians.opacities,
-            gaussians.features,
-        ),
-        *(camera.K, camera.R, camera.t, camera.dist, *camera.size),
+        gaussians.means,
+        gaussians.covariances,
+        gaussians.opacities,
+        gaussians.features,
+        camera.K,
+        camera.R,
+        camera.t,
+        camera.dist,
+        height,
+        width,
         json.dumps(asdict(settings)),
         backend,
     )
@@ -177,21 +197,38 @@ def _rasterise(
     settings: str,
     backend: str,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    made = rasterise(
+    raster = rasterise(
         Gaussians(means, None, None, opacities, features, covariances),
         Camera(K, R, t, (height, width), dist),
         settings=Accuracy(**json.loads(settings)),
         backend=backend,
     )
-    fine = features.new_empty(0) if made.fine is None else made.fine
-    return tuple(x.contiguous() for x in (made.features, made.alpha, fine))  # type: ignore[return-value]
+    fine = features.new_empty(0) if raster.fine is None else raster.fine
+    return raster.features.contiguous(), raster.alpha.contiguous(), fine.contiguous()
 
 
 @_rasterise.register_fake
-def _shapes(*inputs: Any) -> tuple[Tensor, ...]:
-    features, (height, width, settings, _) = inputs[3], inputs[-4:]
-    B, _, C = features.shape
-    k = json.loads(settings)["supersample"]
-    fine = (B, C, k * height, k * width) if k > 1 else (0,)
-    sizes = ((B, C, height, width), (B, 1, height, width), fine)
-    return tuple(features.new_empty(size) for size in sizes)
+def _rasterise_shapes(
+    means: Tensor,
+    covariances: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    K: Tensor,
+    R: Tensor,
+    t: Tensor,
+    dist: Tensor | None,
+    height: int,
+    width: int,
+    settings: str,
+    backend: str,
+) -> tuple[Tensor, Tensor, Tensor]:
+    batch, _, channels = features.shape
+    factor = json.loads(settings)["supersample"]
+
+    image = features.new_empty(batch, channels, height, width)
+    alpha = features.new_empty(batch, 1, height, width)
+    if factor == 1:
+        fine = features.new_empty(0)
+    else:
+        fine = features.new_empty(batch, channels, factor * height, factor * width)
+    return image, alpha, fine
