@@ -112,7 +112,7 @@ def run_training(config: DictConfig) -> None:
     logs = "logs" if resume is None else f"logs_{done:06d}"
     trainer = build_trainer(config, folder, module, data, console, logs, stop)
     _fit(trainer, module, data, resume, folder, console)
-    if module.step < module.schedule.total:
+    if stop.asked and module.step < module.schedule.total:
         console.print(
             f"stopped by a signal at iteration {module.step}; the same command with "
             f"hydra.run.dir={folder} goes on",
@@ -371,8 +371,13 @@ def build_trainer(
     *callbacks: Callback,
 ) -> Trainer:
     """The Trainer of the config, as long as the schedule."""
+    # A logger overwrites its files: each part of a resumed run has a folder of its own.
+    version = {"version": logs} if "version" in config.logger else {}
+    logger = instantiate(config.logger, **version)
+    own = [instantiate(callback) for callback in (config.callbacks or {}).values()]
     used: list[Any] = [
         *callbacks,
+        *own,
         ImageGrid(folder / "grids", config.grid_rows),
         ProgressLines(console),
         ModelCheckpoint(
@@ -390,8 +395,7 @@ def build_trainer(
         callbacks=used,
         default_root_dir=folder,
         plugins=[AtomicCheckpoints()],
-        # a logger overwrites its files: each part of a resumed run has its own folder
-        logger=instantiate(config.logger, version=logs),
+        logger=logger,
         enable_progress_bar=console.is_terminal,
     )
 
