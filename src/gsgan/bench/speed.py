@@ -57,6 +57,7 @@ def run(config: DictConfig, folder: Path) -> None:
         ConfigError: on a value out of range.
         DataError: when the run or its data cannot be read.
     """
+    # Every value is checked before anything is loaded.
     check_whole(config, frames=1, warmup=0, poses=1, batch=1, seed=0)
     one_of("channels_last", config.channels_last, (True, False))
     one_of("precision", config.precision, PRECISIONS)
@@ -67,6 +68,8 @@ def run(config: DictConfig, folder: Path) -> None:
     console = make_console()
     device = pick_device(config.device)
     where = environment(device)
+
+    # The run is loaded once; the same painter is timed one by one and in batches.
     avatar, frames, name, marks = load_subject(config, device)
     painter = make_painter(avatar, config.precision, config.backend)
     with without_denormals(), progress(console) as bars:

@@ -94,6 +94,8 @@ def _body(arrays: dict[str, np.ndarray]) -> Body:
     weight = torch.from_numpy(arrays["bone_weight"].astype(np.float32))
     faces = tensor("faces")
     face_labels = tensor("face_labels")
+
+    # Fields that are stored under their own names.
     stored = (
         "vertices",
         "bone_index",
@@ -107,6 +109,8 @@ def _body(arrays: dict[str, np.ndarray]) -> Body:
         **{name: tensor(name) for name in (*stored, "hand_landmarks", "hand_bone")},
         **{f"{name}_names": names(f"{name}_names") for name in named},
     }
+
+    # Weights are stored as bytes; divided by their sum they are shares again.
     return Body(
         faces=faces,
         bone_weight=weight / weight.sum(dim=1, keepdim=True),

@@ -249,6 +249,8 @@ class Solver(nn.Module):
         """Those of `compiled.CONSTANTS`."""
         with torch.inference_mode(False), torch.no_grad():
             template = constants(MEDIAPIPE33, self.joints.device, self.joints.dtype)
+
+            # The numbers of each joint that bends trunk and neck, and its share of the bend.
             bends = [(name, 0, len(SPINE)) for name in SPINE] + [("neck", 1, 1)]
             own = {
                 **{
@@ -268,11 +270,15 @@ class Solver(nn.Module):
                     [self._axes(name) / n for name, _, n in bends]
                 ),
             }
+
+            # One row per limb.
             for name in ("hub", "points", "numbers", "axes", "bend"):
                 values = [
                     torch.as_tensor(getattr(limb, name)) for limb in self.rig.limbs
                 ]
                 own[f"limb_{name}"] = torch.stack(values)
+
+            # The finger solver's own constants, if the body has fingers.
             if self.fingers is not None:
                 buffers = {
                     **dict(self.fingers.named_buffers()),

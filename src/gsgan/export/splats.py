@@ -152,6 +152,7 @@ def glb_bytes(splats: Splats, up: str) -> bytes:
 
     Source: KHR_gaussian_splatting as ratified in 2026, kernel ``ellipse``.
     """
+    # One attribute per property, and one per spherical harmonic.
     degree = math.isqrt(splats.sh.shape[1]) - 1
     arrays = {
         "POSITION": splats.means,
@@ -162,6 +163,8 @@ def glb_bytes(splats: Splats, up: str) -> bytes:
     for l in range(degree + 1):
         for m in range(2 * l + 1):
             arrays[f"{EXTENSION}:SH_DEGREE_{l}_COEF_{m}"] = splats.sh[:, l * l + m]
+
+    # All attributes lie one after the other in a single buffer.
     data = b""
     views = []
     accessors = []
@@ -180,12 +183,16 @@ def glb_bytes(splats: Splats, up: str) -> bytes:
             accessor | {"min": array.min(0).tolist(), "max": array.max(0).tolist()}
         )
         data += raw
+
+    # The extension says how the points are drawn.
     kernel = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
     primitive = {
         "mode": POINTS,
         "attributes": {name: i for i, name in enumerate(arrays)},
     }
     primitive["extensions"] = {EXTENSION: kernel}
+
+    # A node turns the world to glTF's axes.
     to_gltf = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]) @ upright(up)
     w, x, y, z = rotation_matrix_to_quaternion(torch.from_numpy(to_gltf)[None])[
         0

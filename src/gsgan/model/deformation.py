@@ -137,6 +137,8 @@ class ResidualGaussians(nn.Module):
         height = self.body_height
         low, high = (math.log(limit * height) for limit in self.scale_range)
         logit = math.log(self.opacity / (1 - self.opacity))
+
+        # The compiled version has the same formulas; it is used if it supports the tensors.
         parts = (residuals.means, residuals.quats, residuals.scales)
         raw = torch.cat([*parts, residuals.opacities.unsqueeze(-1)], dim=-1)
         fixed = (points.means, frames, points.shapes, points.scales, points.valid)
@@ -150,10 +152,14 @@ class ResidualGaussians(nn.Module):
                 self.logit_bound,
             )
             return compiled.geometry(raw, *fixed, numbers)
+
+        # Means move in the frame of their body part, within the bound.
         offset = (
             residuals.means if bound is None else bound * torch.tanh(residuals.means)
         )
         means = points.means + (frames @ (offset * height).unsqueeze(-1)).squeeze(-1)
+
+        # Shapes: the point's own frame, turned by the quaternion and scaled.
         scales = bounded(
             points.scales.log().unsqueeze(-1) + residuals.scales, low, high
         ).exp()
@@ -161,6 +167,8 @@ class ResidualGaussians(nn.Module):
             _unit_quat(residuals.quats)
         )
         axes = axes * scales.unsqueeze(-2)
+
+        # Opacities start at `opacity`; points that are not valid are transparent.
         logits = bounded(
             logit + residuals.opacities, -self.logit_bound, self.logit_bound
         )
@@ -259,6 +267,8 @@ class Deformation(ResidualGaussians):
             2,
             1000,
         )
+
+        # The poses of the training data are stored later, by `Avatar.store_poses`.
         points = rest_points.shape[0]
         self.position_octaves = position_octaves
         self.pose_frame = pose_frame
@@ -268,17 +278,23 @@ class Deformation(ResidualGaussians):
         for name, shape in zip(POSES, shapes, strict=True):
             value = math.inf if name.endswith("spread") else 0.0
             self.register_buffer(name, torch.full(shape, value))
+
+        # What is known of a point: its place at rest, and numbers of its own.
         self.register_buffer(
             "rest_code", positional_encoding(rest_points.float(), rest_octaves)
         )
         self.embedding = nn.Parameter(0.1 * torch.randn(points, embedding))
         point_size = encoded_size(3, rest_octaves) + embedding
+
+        # The first layer has a part for each input, so that those of points are computed once.
         self.from_point = nn.Linear(point_size, width)
         self.from_position = nn.Linear(
             encoded_size(3, position_octaves), width, bias=False
         )
         self.from_pose = nn.Linear(3 * joints, width, bias=False)
         self.from_normal = nn.Linear(3, width, bias=False) if normals else None
+
+        # The last layer starts at zero: so do all residuals.
         self.trunk = nn.ModuleList(nn.Linear(width, width) for _ in range(layers - 1))
         self.head = nn.Linear(width, sum(self.parts))
         nn.init.zeros_(self.head.weight)

@@ -38,12 +38,16 @@ def render_config(config: DictConfig) -> None:
         DataError: when the run or the motion cannot be read.
     """
     console = make_console()
+
+    # Options are checked before the run is loaded.
     output = _output(config)
     paint_on = background(str(config.background), output.video)
     fps = float(above("fps", config.fps))
     run = Run.load(config)
     if config.distilled:
         run.avatar = distilled_of(config, run)
+
+    # The motion, and the camera of each frame.
     drive = _chosen(drive_of(config, run, fps), config, fps)
     console.print(drive.text, markup=False, highlight=False, soft_wrap=True)
     cameras, index = _cameras(config, run, drive)
@@ -52,6 +56,8 @@ def render_config(config: DictConfig) -> None:
         "drive": drive.text,
         "frames": drive.numbers,
     }
+
+    # Images are painted one at a time, as the output takes them.
     painted = track(
         _images(run, drive, cameras, index, paint_on),
         "rendering",

@@ -191,6 +191,7 @@ def read_run(folder: Path, *, scored: bool = True) -> Run:
     Raises:
         DataError: when a file is damaged, or the run is unfinished or not scored yet.
     """
+    # A run that trains still, or was never scored, is named as such.
     for name in (METRICS_FILE, FACTS_FILE) if scored else ():
         if not (folder / name).is_file():
             why = unfinished(folder) or "the run is not finished, or was not scored"
@@ -218,10 +219,12 @@ def read_run(folder: Path, *, scored: bool = True) -> Run:
     ) as error:
         reason = str(error).splitlines()[0]
         raise DataError(f"{folder}: damaged ({reason}); score the run again") from None
+
     departed = _departures(hydra, chosen)
     run = Run(
         folder, str(name), data, facts.get("seed"), scores, settings, departed, facts
     )
+    # A run may have been scored before its end.
     done = facts.get("iterations")
     planned = run.planned(segmentation=False)
     if scored and done is not None and done < planned:

@@ -151,6 +151,8 @@ class Densify(nn.Module):
     def _make_buffers(self, sampler: str, dtype: torch.dtype) -> None:
         t, (n_limb, n_face, n_torso, n_bone) = self.template, self.counts
         torso_rest = t.rest_torso
+
+        # Points and normals of the unit shapes.
         if sampler == "trimesh":
             fit = "box" if self.torso == "cube" else "box_fit"
             cylinder = shipped("cylinder", n_limb)
@@ -161,6 +163,8 @@ class Densify(nn.Module):
             cylinder = even_cylinder(n_limb)
             sphere = even_sphere(n_face)
             box = even_box(n_torso, extents)
+
+        # Each limb has a cylinder along its direction at rest.
         along = _limb_axes(t).mT.numpy()
         (limb_points, limb_normals), (bone_points, bone_normals) = (
             (
@@ -181,6 +185,7 @@ class Densify(nn.Module):
                 persistent=not name.startswith("_"),
             )
 
+        # The order of the points: limbs, bones of hands, face, torso.
         face = len(t.limbs)
         counts = (
             [n_limb] * len(t.measured) + [n_bone] * len(t.fingers) + [n_face, n_torso]
@@ -202,6 +207,8 @@ class Densify(nn.Module):
         buffer("_face", t.face)
         buffer("_face_pairs", np.array(list(combinations(t.face, 2))).T)
         buffer("_torso_pairs", np.array(list(combinations(t.torso, 2))).T)
+
+        # The points on the rest skeleton, in body heights about the root.
         rest = torch.tensor(t.rest_positions, dtype=dtype).unsqueeze(0)
         with torch.no_grad():
             means = self(rest).means[0]

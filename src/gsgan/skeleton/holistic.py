@@ -94,6 +94,8 @@ def _with_hands() -> SkeletonTemplate:
     parents = []
     directions = list(POSE.rest_directions)
     parents = [p if p < N_HUBS else p + len(STARTS) for p in POSE.limb_parents]
+
+    # Each hand adds its limbs: the palm follows the forearm, fingers follow the palm.
     groups = []
     for side, start in enumerate(STARTS):
         first = len(limbs)
@@ -108,10 +110,16 @@ def _with_hands() -> SkeletonTemplate:
             name = f"{('left', 'right')[side]}_{FINGER_NAMES[k]}"
             segments = zip((start, *chain), chain, strict=False)
             groups.append((name, tuple(segments)))
+
+    # The right hand at rest is the mirror image of the left one.
     left = _hand_at_rest()
     rest = np.concatenate([np.asarray(POSE.rest_positions), left, left * [-1, 1, 1]])
+
+    # Edges to draw and for the graph network, within hands and from wrist to hand.
     edges = tuple((start + a, start + b) for start in STARTS for a, b in HAND_EDGES)
     wrists = tuple((arm[-1], start) for arm, start in zip(ARMS, STARTS, strict=True))
+
+    # The palms' own limbs have no cylinder; left and right hands exchange in the mirror.
     own = len(_limbs(0))
     bare = tuple(len(POSE.limbs) + side * own for side in (0, 1))
     swapped = tuple(start + j for start in reversed(STARTS) for j in range(HAND))

@@ -35,23 +35,34 @@ def refuse_swapped(p: Tensor, valid: Tensor) -> None:
     def seen(v: Tensor, joints: tuple[int, ...]) -> Tensor:
         return v * valid[:, joints].all(1, keepdim=True)
 
+    # The left, as it follows from each foot: shank and foot span the sagittal plane.
     by_feet = torch.zeros_like(p[:, 0])
     for knee, ankle, heel, toes in LEGS:
         left = torch.linalg.cross(p[:, knee] - p[:, ankle], p[:, toes] - p[:, heel])
         by_feet = by_feet + seen(left, (knee, ankle, heel, toes))
+
+    # The left, as it follows from the head: the eyes are above the nose, the ears behind it.
     ears = p[:, PAIRS["ears"]].mean(1)
     eyes = p[:, PAIRS["eyes"]].mean(1)
     by_head = torch.linalg.cross(eyes - p[:, NOSE], p[:, NOSE] - ears)
     by_head = seen(by_head, (NOSE, *PAIRS["ears"], *PAIRS["eyes"]))
+
+    # The lines from right to left that the names of the landmarks state.
     lines = torch.stack(
         [seen(p[:, a] - p[:, b], (a, b)) for a, b in PAIRS.values()], dim=1
     )
     lines = normalize(lines, dim=-1)
+
+    # A line that opposes the sum of the others stands apart.
     others = normalize(lines.sum(1, keepdim=True) - lines, dim=-1)
     apart = (lines * others).sum(-1) < APART
+
+    # The remaining lines together may oppose feet and head.
     whole = normalize((lines * ~apart.unsqueeze(-1)).sum(1), dim=-1)
     left = normalize(by_feet, dim=-1) + normalize(by_head, dim=-1)
     opposed = (whole * left).sum(-1, keepdim=True) < OPPOSED
+
+    # A pair is swapped if it is so in most of the frames that show it.
     shown = (lines != 0).any(-1)
     wrong = ((apart ^ opposed) & shown).sum(0) > 0.5 * shown.sum(0)
     swapped = [

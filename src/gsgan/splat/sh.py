@@ -35,6 +35,8 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
     """
     if degree not in range(MAX_DEGREE + 1):
         raise ValueError(f"sh_basis: degree must be 0 to {MAX_DEGREE}, got {degree}")
+
+    # Each degree adds its harmonics from m = -degree to degree.
     x, y, z = directions.unbind(-1)
     basis = [torch.full_like(x, _C0)]
     if degree >= 1:

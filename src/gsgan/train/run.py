@@ -410,6 +410,8 @@ def describe(
     """Prints the data, the parts with their sizes, the effects and the stand-ins in use."""
     info = data.info
     avatar = module.avatar
+
+    # The data.
     held_out = ", ".join(
         f"{len(data.dataset(name))} {name}" for name in data.eval_names
     )
@@ -423,6 +425,8 @@ def describe(
     megabytes = data.cache_mb / data.loading_processes
     each = "" if processes == 1 else f" in each of {processes} loading processes"
     table.add_row("cache of images", f"{megabytes:,.0f} MB{each} (data.cache_mb)")
+
+    # The parts and their sizes.
     plain = getattr(avatar.deformation, "from_normal", avatar) is None
     parts = {
         "Ψ, without normals" if plain else "Ψ": avatar.deformation,
@@ -438,6 +442,8 @@ def describe(
             table.add_row(
                 name, f"{sum(p.numel() for p in part.parameters()):,} parameters"
             )
+
+    # The losses that need other networks or labels.
     if module.perceptual is not None:
         every = module.step_two.perceptual_every
         when = "every iteration" if every == 1 else f"every {every} iterations"
@@ -451,6 +457,8 @@ def describe(
             "part labels" if info.has_labels else "masks: the data has no part labels"
         )
         table.add_row("", f"{avatar.segmentation_why}; S learns from {source}")
+
+    # How it computes, and for how long.
     if avatar.splats is not None:
         backend = resolve_backend(avatar.backend, device_of(config), avatar.accuracy)[0]
         table.add_row("rasteriser", backend)

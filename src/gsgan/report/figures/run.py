@@ -66,6 +66,7 @@ def comparison(
     between their images is largest. The box is chosen without the ground truth, so it favours no
     run.
     """
+    # A row per shot: the truth, then every run with its scores.
     images, numbers = _measured(subjects, shots)
     panels: list[list[Panel]] = []
     boxes = [most_disputed(torch.cat(list(held.values())), DETAIL) for held in images]
@@ -91,6 +92,8 @@ def comparison(
     )
     if not detail:
         return Drawing(figure, f"{caption}.", numbers)
+
+    # The magnified box is framed in both rows.
     for i, (rows, columns) in enumerate(boxes):
         size = columns.stop - columns.start, rows.stop - rows.start
         for entire, magnified in zip(axes[2 * i], axes[2 * i + 1], strict=True):
