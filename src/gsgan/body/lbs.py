@@ -7,7 +7,7 @@ rest frame is aligned with the world's axes: zero rotations are the rest pose.
 from collections.abc import Sequence
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -115,37 +115,63 @@ def _accumulate(
     joints: Tensor, parents: Sequence[int], rotations: Tensor, transl: Tensor
 ) -> tuple[Tensor, Tensor]:
     """World rotations ``[B, J, 3, 3]`` and positions ``[B, J, 3, 1]``, one level at a time."""
-    sizes, order, before, above, back = _plan(tuple(parents))
+    plan = kinematic_plan(tuple(parents))
 
     def taken(x: Tensor, index: tuple[int, ...], dim: int) -> Tensor:
         return x.index_select(dim, constant(index, x, torch.int64))
 
-    rest = taken(joints, order, -2)
-    offsets = (rest - taken(joints, before, -2)).unsqueeze(-1).split(sizes, dim=-3)
-    R = list(taken(rotations, order, 1).split(sizes, dim=1))
-    roots = rest[..., : sizes[0], :].expand(len(rotations), -1, -1)
-    p = [(roots + transl.unsqueeze(1)).unsqueeze(-1)]
-    for level, index in enumerate(above, start=1):
-        parent_R = taken(R[level - 1], index, 1)
-        parent_p = taken(p[-1], index, 1)
-        p.append(parent_p + parent_R @ offsets[level])
-        R[level] = parent_R @ R[level]
-    return taken(torch.cat(R, dim=1), back, 1), taken(torch.cat(p, dim=1), back, 1)
+    # Joints in the order of their levels: offsets from the parent, and local rotations.
+    rest = taken(joints, plan.order, -2)
+    offsets = (rest - taken(joints, plan.parents, -2)).unsqueeze(-1)
+    offsets_by_level = offsets.split(plan.level_sizes, dim=-3)
+    rotations_by_level = list(
+        taken(rotations, plan.order, 1).split(plan.level_sizes, dim=1)
+    )
+
+    # Roots stand at their rest position, moved by the translation.
+    roots = rest[..., : plan.level_sizes[0], :].expand(len(rotations), -1, -1)
+    positions = [(roots + transl.unsqueeze(1)).unsqueeze(-1)]
+
+    # Each further level follows the level above it.
+    for level, places in enumerate(plan.parent_places, start=1):
+        parent_R = taken(rotations_by_level[level - 1], places, 1)
+        parent_position = taken(positions[-1], places, 1)
+        positions.append(parent_position + parent_R @ offsets_by_level[level])
+        rotations_by_level[level] = parent_R @ rotations_by_level[level]
+
+    # Back to the order of the joints.
+    R = taken(torch.cat(rotations_by_level, dim=1), plan.inverse, 1)
+    return R, taken(torch.cat(positions, dim=1), plan.inverse, 1)
+
+
+class KinematicPlan(NamedTuple):
+    """How the joints of a skeleton are visited, level by level from the roots."""
+
+    level_sizes: list[int]
+    order: tuple[int, ...]  # joints, level by level
+    parents: tuple[int, ...]  # of each joint in `order`; a root is its own parent
+    # by level, from the second: places of the parents in the level above
+    parent_places: tuple[tuple[int, ...], ...]
+    inverse: tuple[int, ...]  # place of each joint in `order`
 
 
 @lru_cache(maxsize=64)
-def _plan(parents: tuple[int, ...]) -> tuple[Any, ...]:
-    """The sizes of the levels; the joints by level; their parents, or a root itself; by level the
-    parents' places in the level before; and the place of each joint among those by level."""
+def kinematic_plan(parents: tuple[int, ...]) -> KinematicPlan:
+    """The plan of a skeleton with these parents, -1 for a root."""
     levels = kinematic_levels(parents)
     order = tuple(joint for level in levels for joint in level)
-    before = tuple(j if parents[j] < 0 else parents[j] for j in order)
-    above = tuple(
-        tuple(upper.index(parents[j]) for j in level)
-        for upper, level in pairwise(levels)
+    parent_places = []
+    for above, level in pairwise(levels):
+        parent_places.append(tuple(above.index(parents[joint]) for joint in level))
+    return KinematicPlan(
+        level_sizes=[len(level) for level in levels],
+        order=order,
+        parents=tuple(
+            joint if parents[joint] < 0 else parents[joint] for joint in order
+        ),
+        parent_places=tuple(parent_places),
+        inverse=tuple(order.index(joint) for joint in range(len(parents))),
     )
-    back = tuple(order.index(j) for j in range(len(parents)))
-    return [len(level) for level in levels], order, before, above, back
 
 
 def check_weights(bone_weight: Tensor) -> None:
