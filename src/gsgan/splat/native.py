@@ -89,7 +89,10 @@ def composite(
         projected.depths,
         projected.extents,
         projected.visible,
-        *(size, settings, times, torch.is_grad_enabled()),
+        size,
+        settings,
+        times,
+        torch.is_grad_enabled(),
     )
     return composed
 
@@ -128,18 +131,20 @@ class _Composite(torch.autograd.Function):
         B, _, C = features.shape
         dtype = features.dtype
         coarse = (size[0] // times, size[1] // times)
+
+        # Supersampled features are channels last: each pixel's channels are averaged together.
+        alpha = zeros((B, 1, *coarse), dtype)
+        average = None
         if times == 1:
             drawn = zeros((B, C, *size), dtype)
         else:
             drawn = zeros((B, *size, C), dtype).permute(0, 3, 1, 2)
-        outputs = [
-            drawn,
-            zeros((B, 1, *coarse), dtype),
-            zeros((B, C, *coarse), dtype) if times > 1 else None,
-        ]
+            average = zeros((B, C, *coarse), dtype)
+
+        # The kernel writes into the outputs and keeps its tile lists for the backward pass.
         job = _job(size, settings, inputs, shown, times)
         job.keep = grad_enabled and any(ctx.needs_input_grad)
-        build.point(job, _OUTPUTS, outputs)
+        build.point(job, _OUTPUTS, [drawn, alpha, average])
         plan = _Plan(dtype)
         run = build.function("forward", dtype)
         _raise_for(run(ctypes.byref(job), ctypes.byref(plan.pointer)), job)
@@ -150,7 +155,7 @@ class _Composite(torch.autograd.Function):
             ctx.settings = settings
             ctx.times = times
             ctx.set_materialize_grads(False)
-        return tuple(outputs)  # type: ignore[return-value]
+        return drawn, alpha, average
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -159,10 +164,14 @@ class _Composite(torch.autograd.Function):
         inputs = [x.detach().contiguous() for x in tensors]
         shown = visible.contiguous()
         job = _job(ctx.size, ctx.settings, inputs, shown, ctx.times)
+
+        # Gradients of the outputs, in the memory format of the outputs.
         incoming = [None if g is None else g.contiguous() for g in grads]
         if ctx.times > 1 and grads[0] is not None:
             incoming[0] = grads[0].contiguous(memory_format=torch.channels_last)
         build.point(job, _GRADS_OUT, incoming)
+
+        # The kernel adds the gradients of means, factors, opacities and features.
         outgoing = [torch.zeros_like(x) for x in inputs[: len(_GRADS_IN)]]
         build.point(job, _GRADS_IN, outgoing)
         run = build.function("backward", inputs[3].dtype)

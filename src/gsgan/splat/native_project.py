@@ -56,15 +56,27 @@ def project(gaussians: Gaussians, camera: Camera, settings: Accuracy) -> Project
     limits = torch.cat(
         field_of_view(K, camera.size, settings.fov_clamp), dim=1
     ).squeeze(-1)
-    shape: tuple[Tensor | None, ...] = (gaussians.quats, gaussians.scales, None)
+    quats = scales = covariances = None
     if gaussians.covariances is not None:
-        shape = (None, None, gaussians.covariances)
-    inputs = (gaussians.means, *shape, gaussians.opacities)
-    outputs = _Project.apply(
-        *(None if x is None else x.to(dtype) for x in inputs),
-        *(K, R, t, limits, camera.size, settings),
+        covariances = gaussians.covariances.to(dtype)
+    else:
+        assert gaussians.quats is not None
+        assert gaussians.scales is not None
+        quats = gaussians.quats.to(dtype)
+        scales = gaussians.scales.to(dtype)
+    means, factors, opacities, depths, extents, visible = _Project.apply(
+        gaussians.means.to(dtype),
+        quats,
+        scales,
+        covariances,
+        gaussians.opacities.to(dtype),
+        K,
+        R,
+        t,
+        limits,
+        camera.size,
+        settings,
     )
-    means, factors, opacities, depths, extents, visible = outputs
     features = gaussians.features.to(dtype)
     return Projected(means, factors, opacities, features, depths, extents, visible)
 
@@ -79,11 +91,14 @@ class _Project(torch.autograd.Function):
         assert means is not None
         assert opacities is not None
         B, N = opacities.shape
+
+        # Geometry is in float64, opacities and extents in the features' precision.
         outputs = [
-            *(means.new_empty(B, N, n, dtype=torch.float64) for n in (2, 3)),
-            means.new_empty(B, N),
-            means.new_empty(B, N, dtype=torch.float64),
-            means.new_empty(B, N, 2),
+            means.new_empty(B, N, 2, dtype=torch.float64),  # means
+            means.new_empty(B, N, 3, dtype=torch.float64),  # factors
+            means.new_empty(B, N),  # opacities
+            means.new_empty(B, N, dtype=torch.float64),  # depths
+            means.new_empty(B, N, 2),  # extents
         ]
         visible = torch.empty(B, N, dtype=torch.bool)
         build.point(
