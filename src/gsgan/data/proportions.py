@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsgan.skeleton import HOLISTIC, MEDIAPIPE33, bone_frames, sanitise
-from gsgan.skeleton.face import FACE
-from gsgan.skeleton.hands import FINGER_BONES, HAND, INDEX, PINKY, WRIST
+from gsgan.data import joints as numbers
+from gsgan.skeleton import HOLISTIC, bone_frames, sanitise
+from gsgan.skeleton.hands import FINGER_BONES, INDEX, PINKY, WRIST
 from gsgan.skeleton.template import CHEST, HEAD, PELVIS
 from gsgan.utils.arrays import Bool, Float
 from gsgan.utils.errors import DataError
@@ -23,20 +23,26 @@ EARS = (7, 8)
 HIPS = (23, 24)
 ARMS = ((11, 13), (13, 15)), ((12, 14), (14, 16))
 LEGS = ((23, 25), (25, 27)), ((24, 26), (26, 28))
-BONES = (*ARMS[0], *ARMS[1], *LEGS[0], *LEGS[1])  # parents first
+# parents first
+BONES = (*ARMS[0], *ARMS[1], *LEGS[0], *LEGS[1])
 # by wrist: base of the little finger, base of the index finger, thumb
 HAND_LANDMARKS = {15: (17, 19, 21), 16: (18, 20, 22)}
 # by ankle: heel, toes
 FEET = {27: (29, 31), 28: (30, 32)}
-BODY = len(MEDIAPIPE33.names)
+BODY = numbers.BODY
 # by wrist
-HAND_JOINTS = {15: slice(BODY, BODY + HAND), 16: slice(BODY + HAND, BODY + 2 * HAND)}
-EXPRESSION = slice(BODY + 2 * HAND, BODY + 2 * HAND + FACE)  # lips, brows and lids
-SIDES = {15: 1.0, 16: -1.0}  # of the standard pose's x
+HAND_JOINTS = {15: numbers.LEFT, 16: numbers.RIGHT}
+# lips, brows and lids
+EXPRESSION = numbers.FACE
+# sign of the standard pose's x, by wrist
+SIDES = {15: 1.0, 16: -1.0}
 HEELS_AND_TOES = (29, 30, 31, 32)
-HEAD_LANDMARKS = tuple(range(11))  # nose, eyes, ears, corners of the mouth
-STANDING = 10  # percentile of a foot's heights below which it counts as standing
-TO_STANDARD = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])  # of left, up, front
+# nose, eyes, ears, corners of the mouth
+HEAD_LANDMARKS = tuple(range(11))
+# percentile of a foot's heights below which it counts as standing
+STANDING = 10
+# rotation of the axes left, up, front
+TO_STANDARD = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 
 
 @dataclass(frozen=True)
