@@ -120,6 +120,7 @@ def _fit(subject: CheckedData, views: Sequence[MaskView], camera: CameraEntry) -
     """Mean overlap of the masks with the silhouettes estimated for a camera."""
     overlaps = []
     for view in views:
+        # The silhouette that this camera would see.
         row = subject.rows[view.frame]
         body = body_silhouette(
             view.small(camera), subject.p[row], subject.visible[row], subject.template
@@ -260,7 +261,7 @@ def small_errors(scores: Sequence[CameraScore], limits: Limits) -> list[Finding]
     found = []
     for name, own in metres.items():
         rest = [value for other, value in metres.items() if other != name]
-        others = float(np.median(rest)) if rest else np.inf
+        others = float(np.median(rest)) if rest else np.inf  # one camera has no others
         if own > max(limits.outside, OUTSIDE_RATIO * others):
             text = (
                 f"camera {name}: joints lie {100 * own:.1f} cm outside its masks on average, "

@@ -76,7 +76,7 @@ def skeleton_doubts(subject: CheckedData, limits: Limits) -> list[Doubt]:
     )
 
     # Limbs that change their length.
-    lengths = bone_lengths(p, template.limbs)
+    lengths = bone_lengths(p, template.limbs)  # [F, limbs]
     typical = nanmedian(lengths)
     change = np.abs(lengths - typical) / np.maximum(typical, 1e-6)
     bones = [f"{names[a]} to {names[b]}" for a, b in template.limbs]
@@ -88,7 +88,7 @@ def skeleton_doubts(subject: CheckedData, limits: Limits) -> list[Doubt]:
     )
 
     # Left and right exchanged.
-    backwards = facing(p, template)[:, None] < 0
+    backwards = facing(p, template)[:, None] < 0  # [F, 1]
     doubt("backwards", "", backwards, lambda *_: "nose or toes point backwards")
 
     # Few of the joints that are ever seen.
@@ -128,6 +128,7 @@ def reprojection_errors(subject: CheckedData) -> Float:
         shape = (len(ids), len(subject.template.names))
         stored = expect_array(arrays, "reproj_px", shape, path)
         for number, row in zip(ids.tolist(), stored, strict=True):
+            # The file also has frames that were dropped.
             if number in subject.rows:
                 result[subject.rows[number]] = row
     return np.where(subject.visible, result, np.nan)
@@ -168,9 +169,12 @@ def frame_findings(
     """One finding per kind of doubt; an error if left and right, or most frames, are wrong."""
     findings = []
     count = len(subject.frames)
+    by_kind: dict[str, list[Doubt]] = {}
+    for doubt in found:
+        by_kind.setdefault(doubt.kind, []).append(doubt)
 
     # Most frames face backwards: one error in place of many warnings.
-    backwards = sum(doubt.kind == "backwards" for doubt in found) / count
+    backwards = len(by_kind.get("backwards", [])) / count
     mirrored = backwards > MIRRORED
     if mirrored:
         text = (
@@ -181,7 +185,7 @@ def frame_findings(
 
     # A warning per kind, with the first frame's text.
     for kind, what in KINDS.items():
-        some = [doubt for doubt in found if doubt.kind == kind]
+        some = by_kind.get(kind)
         if some and not (mirrored and kind == "backwards"):
             frames = sorted({doubt.frame for doubt in some})
             text = (
@@ -199,6 +203,7 @@ def frame_findings(
 
 def shortened(frames: Sequence[int], most: int = 8) -> str:
     """Frame numbers as ranges, the rest of a long list left out."""
+    # Ranges count, not frames.
     ranges = spans(list(frames)).split(", ")
     text = ", ".join(ranges[:most])
     return f"{text} …" if len(ranges) > most else text
@@ -210,7 +215,7 @@ def jump_distance(p: Float) -> Float:
     A steady motion gives 0 at any speed; the first and last frame are unknown.
     """
     distance = np.full(p.shape[:2], np.nan)
-    midpoint = (p[:-2] + p[2:]) / 2
+    midpoint = (p[:-2] + p[2:]) / 2  # [F - 2, J, 3]
     distance[1:-1] = np.linalg.norm(p[1:-1] - midpoint, axis=-1)
     return distance
 
@@ -220,6 +225,7 @@ def jumped(distance: Float, limit: float) -> Bool:
 
     A stray frame also moves its neighbours' midpoints, by half as much; only the peak counts.
     """
+    # A row of zeros before and after: the first and last frame have one neighbour.
     known = np.pad(np.nan_to_num(distance), ((1, 1), (0, 0)))
     before = known[:-2]
     here = known[1:-1]
@@ -249,7 +255,7 @@ def facing(p: Float, template: SkeletonTemplate) -> Float:
         ahead.append(toe - p[:, index(f"{side}_ankle")])
 
     # The mean of the known votes.
-    votes = np.sign((np.stack(ahead) * front).sum(-1))
+    votes = np.sign((np.stack(ahead) * front).sum(-1))  # [3, F]
     known = np.isfinite(votes)
     votes = np.where(known, votes, 0.0).sum(0) / known.sum(0).clip(1)
     return np.where(known.any(0), votes, np.nan)

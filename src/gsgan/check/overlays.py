@@ -42,12 +42,15 @@ def strip(
     """A row of at least one tile as a JPEG; captions of ``doubtful`` frames are red."""
     tiles = []
     for view in views:
+        # The caption counts the joints inside the mask.
         known = int(view.known.sum())
         out = int(view.beyond.sum())
         text = f"{view.frame}   {known - out}/{known} inside"
         colour = OUTSIDE if view.frame in doubtful else NEUTRAL
         captioned = caption(tile(subject, view), text, colour)
         tiles += [captioned, np.full((len(captioned), GAP, 3), 255, np.uint8)]
+
+    # Without the gap after the last tile.
     return encode(np.concatenate(tiles[:-1], axis=1))
 
 
@@ -55,7 +58,7 @@ def tile(subject: CheckedData, view: MaskView) -> Bytes:
     """``[HEIGHT, 0.75 HEIGHT, 3]`` RGB: the image around the person, with overlays."""
     camera = subject.cameras[view.camera]
     row = subject.rows[view.frame]
-    joints, depth = project(camera, subject.p[row])
+    joints, depth = project(camera, subject.p[row])  # [J, 2], [J]
     drawn = subject.visible[row] & (depth > NEAR)
 
     # Image and mask, undistorted, in the window around the person.
@@ -101,6 +104,7 @@ def tile(subject: CheckedData, view: MaskView) -> Bytes:
         if view.beyond[joint]:
             cv2.circle(canvas, at[joint], 6, OUTSIDE, 2, cv2.LINE_AA)
 
+    # Hands and face as dots.
     for p, colour in _hands_and_face(subject, view.frame):
         pixels, depth = project(camera, p)
         for centre in placed(pixels[depth > NEAR]):
@@ -153,6 +157,7 @@ def person_window(view: MaskView, joints: Float, size: tuple[int, int]) -> Crop:
 def _side(*names: str) -> tuple[int, int, int]:
     """The colour of the person's side that all of these joints are on."""
     for side, colour in (("left", LEFT), ("right", RIGHT)):
+        # A bone between two sides, such as the shoulders, is in the middle.
         if all(side in name for name in names):
             return colour
     return MIDDLE

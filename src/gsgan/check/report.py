@@ -71,6 +71,7 @@ class Table:
 
     def for_terminal(self, title: str | None = None) -> RichTable:
         """The table as rich prints it."""
+        # Text() keeps brackets in names from being read as markup.
         drawn = RichTable(title=title, title_justify="left", title_style="bold")
         for header in self.headers:
             drawn.add_column(header, overflow="fold")
@@ -133,6 +134,7 @@ class Report:
     @property
     def verdict(self) -> str:
         """One line: the number of errors and warnings."""
+        # One sentence for the page and the terminal.
         if not self.findings:
             return "nothing wrong was found"
         return f"{counted(self.errors, 'error')}, {counted(self.warnings, 'warning')}"
@@ -155,6 +157,7 @@ def listed(names: Iterable[object], most: int = 6) -> str:
 
 def page(report: Report) -> str:
     """The report as one HTML file: no scripts, images embedded, nothing fetched."""
+    # Names from the dataset are escaped.
     environment = Environment(autoescape=True, trim_blocks=True)
     colour = "error" if report.errors else "warning" if report.warnings else "good"
     return environment.from_string(PAGE).render(report=report, colour=colour)
@@ -166,6 +169,8 @@ def print_report(report: Report, console: Console) -> None:
         # The first table of a section has its title.
         for i, table in enumerate(section.tables):
             console.print(table.for_terminal(None if i else section.title))
+
+    # The most severe findings come last, next to the prompt.
     for finding in reversed(report.findings):
         start = Text(f"{finding.level}, {finding.topic}: ", STYLES[finding.level])
         console.print(start.append(finding.sentence, "default not bold"))

@@ -84,6 +84,7 @@ def run_check(config: DictConfig) -> Report:
     Raises:
         ConfigError: on a config value that does not fit.
     """
+    # The report is the result of the command, so it must have a place.
     if not config.report:
         raise ConfigError(
             "report is not set: give the HTML file to write, e.g. report=check.html"
@@ -121,6 +122,8 @@ def write_report(report: Report, path: Path, console: Console) -> None:
         "findings": [asdict(finding) for finding in report.findings],
         **report.numbers,
     }
+
+    # The page, the numbers next to it, then the terminal.
     with writing(path):
         write_atomically(path, page(report))
     write_json(path.with_suffix(".json"), content)

@@ -69,7 +69,7 @@ def geometry_of(subject: CheckedData) -> Geometry:
     seen_p = subject.seen_p
     shoulders = seen_p[:, list(template.shoulders)].mean(1)
     hips = seen_p[:, list(template.hips)].mean(1)
-    trunk = shoulders - hips
+    trunk = shoulders - hips  # [F, 3]
     up = nanmedian(trunk / np.linalg.norm(trunk, axis=-1, keepdims=True))
     if not np.isfinite(up).all():
         up = subject.up
@@ -108,6 +108,7 @@ def geometry_findings(subject: CheckedData, geometry: Geometry) -> list[Finding]
 
 def geometry_table(subject: CheckedData, geometry: Geometry) -> Table:
     """A table of units and sizes."""
+    # The nearest and the farthest camera.
     meta = subject.layout.meta
     distances = geometry.distances.values()
     near = min(distances)
@@ -129,6 +130,7 @@ def lens_table(subject: CheckedData, geometry: Geometry) -> Table:
     """A table of sizes, lenses and places, one row per camera."""
     rows = []
     for name, camera in subject.cameras.items():
+        # Trailing zeros of the lens are not shown.
         height, width = camera.size
         K = camera.K
         lens = [f"{c:.3g}" for c in np.trim_zeros(camera.dist, "b")]
@@ -322,6 +324,7 @@ def _contents(m: Measurements) -> Section:
 
 def _skeleton(m: Measurements) -> str:
     """The number of joints, their origin, and those never seen."""
+    # Joints that no frame shows are named.
     names = m.subject.template.names
     visible = m.subject.visible
     source = m.data.layout.meta.skeleton_source
@@ -334,6 +337,7 @@ def _skeleton(m: Measurements) -> str:
 
 def _split(data: GsganData, name: str) -> str:
     """The numbers of images and cameras of a split and its frames, or why it is empty."""
+    # An empty split has a reason.
     items = data.splits.items[name]
     if not items:
         return f"empty: {data.splits.reasons.get(name, '')}"
@@ -347,6 +351,7 @@ def _agreement(m: Measurements) -> Section:
     """The section of how well skeleton, masks and cameras fit together."""
     rows = []
     for score in m.cameras:
+        # In centimetres.
         outside = "–" if np.isnan(score.outside) else f"{100 * score.outside:.1f}"
         rows.append(
             (
@@ -393,6 +398,7 @@ def _frames(m: Measurements) -> Section:
 
 def _effects(m: Measurements) -> Section:
     """The section of effects that training would turn on, by the same rules."""
+    # The effects need the facts about the scene.
     title = "Effects that the scene calls for"
     if m.info is None:
         return Section(title, text=f"Not decided: {m.no_info}")

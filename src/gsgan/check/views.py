@@ -190,6 +190,7 @@ def grouped(views: Sequence[MaskView]) -> dict[str, list[MaskView]]:
 
 def sampled_items(subject: CheckedData, images: int) -> tuple[Item, ...]:
     """At most ``images`` items, at least one per camera: the same moments, evenly spaced."""
+    # The same moments in all cameras, as many as the budget allows.
     each = max(1, images // len(subject.pairs))
     moments = set(spread(subject.frames.tolist(), each))
     items = []
@@ -219,6 +220,7 @@ def complete(path: Path) -> bool:
     """Whether a PNG or JPEG has its end mark; True for other files, False when unreadable."""
     try:
         with path.open("rb") as stream:
+            # The first bytes tell the format, the last ones whether it is complete.
             start = stream.read(4)
             stream.seek(max(0, os.fstat(stream.fileno()).st_size - TAIL))
             tail = stream.read()
@@ -276,7 +278,7 @@ def _view(subject: CheckedData, item: Item, sampling: Sampling) -> MaskView:
     frame = CaptureDataset(subject.layout, [item], size)[0]
     K = frame.camera.K[0].double().numpy()
     camera = replace(entry, K=K, size=frame.camera.size)
-    soft = frame.mask[0, 0].numpy()
+    soft = frame.mask[0, 0].numpy()  # [H, W]
     mask = np.asarray(soft > 0.5)
     body = body_silhouette(camera, p, visible, subject.template)
 
@@ -285,7 +287,7 @@ def _view(subject: CheckedData, item: Item, sampling: Sampling) -> MaskView:
     pixels, depth = project(camera, p)
     metre_per_pixel = float(np.median(depth[visible])) / focal
     seen = visible & inside(entry, p)
-    outside = joint_distance(mask_distance(mask), pixels, depth, seen, focal)
+    outside = joint_distance(mask_distance(mask), pixels, depth, seen, focal)  # [J]
 
     # A small mask, and the map from the whole image to it: by the camera's K, then the scale.
     height, width = mask.shape
@@ -352,5 +354,6 @@ def thickness(pixels: float, size: tuple[int, int]) -> int:
 
 def overlap(a: Bool, b: Bool) -> float:
     """Intersection over union; 0 when both are empty."""
+    # Two empty masks have no overlap to speak of.
     union = np.count_nonzero(a | b)
     return np.count_nonzero(a & b) / union if union else 0.0

@@ -148,6 +148,7 @@ def read_conventions(path: Path, content: Mapping[str, Any]) -> Conventions:
     Raises:
         DataError: on a missing unit or an unknown value.
     """
+    # Only the unit has no default.
     unit = choose(path, content, "unit", None, tuple(METRES))
     background = choose(path, content, "background", "scene", ("scene", "black"))
     return Conventions(
@@ -279,6 +280,8 @@ def _toml_camera(
     for key in TOML_KEYS:
         if key not in entry:
             raise DataError(f"{where} lacks '{key}'; expected {', '.join(TOML_KEYS)}")
+
+    # Fisheye lenses have another model of distortion.
     if entry.get("fisheye"):
         raise DataError(
             f"{where} is a fisheye camera, which is not supported; undistort its video and "
@@ -312,6 +315,7 @@ class _Loader(yaml.BaseLoader):
 
 def _matrix(loader: _Loader, node: yaml.MappingNode) -> Float:
     """``[rows, cols]`` of an ``!!opencv-matrix``."""
+    # rows, cols and the values row by row; their type does not matter.
     parts = loader.construct_mapping(node, deep=True)
     values = np.array(list(map(float, parts["data"])), np.float64)
     return values.reshape(int(parts["rows"]), int(parts["cols"]))

@@ -177,12 +177,14 @@ SHORT.maxother = 400
 
 def _short(raw: Any, limit: int = 120) -> str:
     """A value on one line, cut off after ``limit`` characters, for messages."""
+    # Line breaks become blanks.
     text = " ".join(SHORT.repr(raw).split())
     return text if len(text) <= limit else text[:limit] + "…"
 
 
 def _lens(where: str, raw: Any) -> Float:
     """``[8]`` OpenCV lens coefficients, zero-padded; None and an empty list mean none."""
+    # Absent coefficients are 0.
     padded = np.zeros(8)
     if raw is None or (isinstance(raw, (list, tuple)) and not raw):
         return padded

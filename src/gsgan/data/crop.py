@@ -31,7 +31,7 @@ def project(view: CameraEntry, points: Float) -> tuple[Float, Float]:
     finite, meaningless pixels: mask them by depth.
     """
     x_cam = np.tensordot(points, view.R.T, 1) + view.t
-    depth = x_cam[..., 2]
+    depth = x_cam[..., 2]  # [...]
     rays = x_cam / np.maximum(depth, NEAR)[..., None]
     uvw = np.tensordot(rays, view.K.T, 1)
     return uvw[..., :2], depth
@@ -90,7 +90,7 @@ class PersonCrop:
 
         # The margin in pixels at each joint's depth.
         focal = max(view.K[0, 0], view.K[1, 1])
-        reach = (self.margin * focal / depth[taken])[:, None]
+        reach = (self.margin * focal / depth[taken])[:, None]  # [n, 1]
 
         # The box around all joints and their margins, clipped to the image.
         limit = np.array(view.size[::-1], np.float64)
@@ -175,6 +175,8 @@ def distort(points: Float, dist: Float) -> Float:
         return points
     flat = points.reshape(-1, 2)
     rays = np.concatenate([flat, np.ones((len(flat), 1))], axis=-1)
+
+    # A camera at the origin with K = I: its pixels are x/z and y/z.
     nothing = np.zeros(3)
     shown = cv2.projectPoints(rays, nothing, nothing, np.eye(3), dist)[0]
     return np.asarray(shown, np.float64).reshape(points.shape)
@@ -229,12 +231,12 @@ def fold_radius(K: Float, dist: Float, crop: Crop, samples: int = 256) -> float 
     u = np.array([left, left, right, right])
     v = np.array([top, bottom, top, bottom])
     x, y = _unproject(K, u, v)
-    radii = np.linspace(0, np.hypot(x, y).max(), samples)
+    radii = np.linspace(0, np.hypot(x, y).max(), samples)  # [samples]
 
     # The lens model folds back where the distorted radius no longer grows.
     radial = np.where(np.isin(np.arange(8), (2, 3)), 0, dist)  # without p1 and p2
     along_x = np.stack([radii, np.zeros(samples)], axis=-1)
-    shown = distort(along_x, radial)[:, 0]
+    shown = distort(along_x, radial)[:, 0]  # [samples]
     folded = np.flatnonzero(np.diff(shown) <= 0)
     return float(radii[folded[0]]) if len(folded) else None
 
@@ -251,6 +253,8 @@ def take(
     """
     if mapping is None:
         return cut(image, crop)
+
+    # Labels must not be mixed.
     mode = cv2.INTER_NEAREST if exact else cv2.INTER_LINEAR
     # Pixels outside the image are 0: the default border.
     taken = cv2.remap(
@@ -286,5 +290,7 @@ def black_out(image: Bytes, mask: Bytes, composed: bool) -> Bytes:
     """
     if composed:
         return image * (mask > 0)[..., None]
+
+    # OpenCV rounds image * alpha / 255 to the nearest value.
     alpha = cv2.merge([mask, mask, mask])
     return np.asarray(cv2.multiply(image, alpha, scale=1 / 255), np.uint8)

@@ -47,7 +47,9 @@ __all__ = [
 log = logging.getLogger(__name__)
 
 MOST_WORKERS = 8
+# choices of data.body
 BODY = ("auto", "file", "fit", "none")
+# choices of effects.distortion, as the dataset calls them
 LENSES: dict[str, Lens] = {
     "auto": "undistort",
     "on": "undistort",
@@ -175,6 +177,7 @@ class GsganData(LightningDataModule):
     @cached_property
     def layout(self) -> Layout:
         """The capture, read on first use."""
+        # The reader checks files, frames and cameras.
         layout = self.reader(self._folder(), self.limits, self.smpl)
         skeleton = TEMPLATES[self.skeleton]
 
@@ -215,6 +218,7 @@ class GsganData(LightningDataModule):
     @property
     def lacks_body(self) -> bool:
         """Whether `gsgan.fit` is still to make the body poses."""
+        # gsgan.fit works on captures, not on published datasets.
         fits = self.body in ("auto", "fit") and isinstance(self.reader, CaptureReader)
         return fits and self.layout.poses is None
 
@@ -254,6 +258,8 @@ class GsganData(LightningDataModule):
         """The person's face at rest, see `face_at_rest`; None for skeletons without a face."""
         if not TEMPLATES[self.skeleton].expression:
             return None
+
+        # `layout` refuses a capture without a face.
         assert self.layout.face is not None
         return face_at_rest(self.layout.landmarks, self.layout.face, self.trained)
 
@@ -263,6 +269,8 @@ class GsganData(LightningDataModule):
         poses = self.layout.poses
         if poses is None:
             return ()
+
+        # A frame that some camera trains on is not held out.
         held_out = set(self.splits.items["novel_pose"].frames) - set(self.trained)
         return tuple(sorted(held_out & poses.registered))
 
@@ -277,6 +285,8 @@ class GsganData(LightningDataModule):
     @cached_property
     def _datasets(self) -> dict[str, CaptureDataset]:
         layout = self.layout
+
+        # A batch needs images of one size.
         sizes = {camera.size for camera in layout.cameras.values()}
         if self.size is None and self.batch_size > 1 and (self.crop or len(sizes) > 1):
             raise ConfigError(
@@ -323,6 +333,8 @@ class GsganData(LightningDataModule):
         """
         if self.protocol is None:
             return None
+
+        # Images that are not square may be padded to squares.
         sizes = [camera.size for camera in self.layout.cameras.values()]
         oblong = any(height != width for height, width in sizes)
 
@@ -347,6 +359,7 @@ class GsganData(LightningDataModule):
     @cached_property
     def info(self) -> SceneInfo:
         """Facts about the scene from the training split, computed on first use."""
+        # The lenses of held-out cameras count as well.
         tested: list[str] = []
         for split in SPLITS[1:]:
             tested += self.splits.items[split].cameras
@@ -375,6 +388,8 @@ class GsganData(LightningDataModule):
     def labelled(self, split: str) -> Subset[Frame]:
         """The items of a split whose images have part labels; may be empty."""
         dataset = self.dataset(split)
+
+        # The places of the items that have a label file.
         chosen = []
         if self.layout.labels:
             for place, (camera, frame) in enumerate(dataset.items):
@@ -412,6 +427,7 @@ class GsganData(LightningDataModule):
 
         The split is the first of novel_pose, novel_view and train that is not empty.
         """
+        # Poses are harder than views, so they are watched first.
         name = "train"
         for split in ("novel_view", "novel_pose"):
             if self.splits.items[split]:
@@ -436,6 +452,7 @@ class GsganData(LightningDataModule):
         sampler: StepSampler | None = None,
     ) -> DataLoader[Frame]:
         """Batches of `Frame` whose pixels are bytes, as `transfer_batch_to_device` takes them."""
+        # A copy: the dataset itself gives floats.
         packed = copy(dataset)
         packed.packed = True
 

@@ -106,6 +106,8 @@ class CaptureDataset(Dataset[Frame]):
         self.lens = lens
         self.cache = ImageCache(0) if cache is None else cache
         self.skeletons = layout.landmarks if skeletons is None else skeletons
+
+        # The numbers in `Frame.camera_index`.
         self._indices = {name: i for i, name in enumerate(layout.camera_names)}
 
     def __len__(self) -> int:
@@ -139,6 +141,7 @@ class CaptureDataset(Dataset[Frame]):
         if poses is not None:
             body = BodyPose(_float(poses.theta[frame]), _float(poses.transl[frame]))
 
+        # Every part has a batch dimension of 1; bytes become floats only on request.
         found = Frame(
             image=torch.from_numpy(decoded.image)[None],
             mask=torch.from_numpy(decoded.mask)[None, None],
@@ -187,6 +190,8 @@ class CaptureDataset(Dataset[Frame]):
             seen = landmarks.visibility[item[1]] > 0
             dist = camera.dist if self._raw(camera) else None
             return self.crop.window(camera, joints, seen, dist)
+
+        # A whole image is padded to a square.
         if self.size is not None:
             return cropping.square_window(camera.size)
         return Crop(0, 0, camera.size)
@@ -203,12 +208,15 @@ class CaptureDataset(Dataset[Frame]):
 
     def _mapping(self, camera: CameraEntry, window: Crop) -> NDArray[np.float32] | None:
         """Positions of the window's pixels in the stored image; None for a pinhole."""
+        # No mapping is needed if the image stays as it is.
         if not camera.distorted or self.lens == "ignore" or self._raw(camera):
             return None
         return cropping.undistort_map(camera.K, camera.dist, window)
 
     def _load(self, item: Item) -> DecodedImage:
         camera = self._entry(item)
+
+        # How this dataset stores masks, and the window of the item.
         rules = self.layout.pixels
         window = self.window(item)
         mapping = self._mapping(camera, window)

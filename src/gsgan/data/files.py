@@ -97,6 +97,7 @@ def read_colour(path: Path) -> NDArray[np.uint8]:
     Raises:
         DataError: when the file is missing, damaged or cut off.
     """
+    # OpenCV decodes to BGR.
     image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
@@ -239,6 +240,7 @@ class FrameFiles(Mapping[int, str]):
         self._names = np.array(os.fsencode("/".join(held)).split(b"/")[: len(held)])
 
     def __getitem__(self, frame: int) -> str:
+        # The frames are sorted, so that a binary search finds them.
         place = int(self.frames.searchsorted(frame))
         if place == len(self.frames) or self.frames[place] != frame:
             raise KeyError(frame)
@@ -252,6 +254,7 @@ class FrameFiles(Mapping[int, str]):
 
     def without(self, frames: Iterable[int]) -> Self:
         """The paths of all other frames."""
+        # The folder is shared, the arrays are cut.
         keep = np.isin(self.frames, np.fromiter(frames, np.int64), invert=True)
         found = copy(self)
         found.frames = self.frames[keep]
@@ -341,6 +344,7 @@ def own_entries(folder: Path, root: Path) -> list[str]:
 
 def last_number(stem: str) -> int | None:
     """The last group of digits in a file's stem; None above `LARGEST_FRAME`."""
+    # Names often have other numbers in front, such as a date.
     found = LAST_DIGITS.search(stem)
     return frame_of(found[1]) if found else None
 

@@ -25,6 +25,7 @@ from gsgan.data.validation import (
 )
 from gsgan.utils.errors import DataError
 
+# masks by camera and frame
 MaskIndex = Mapping[str, Mapping[int, tuple[MaskFile, ...]]]
 
 

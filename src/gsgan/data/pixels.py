@@ -37,6 +37,7 @@ class MaskFile(NamedTuple):
 
 def mask_file(path: str) -> MaskFile:
     """A mask of the rule "nonzero"; a JPEG's is "threshold", as compression rings around edges."""
+    # Compression leaves small values next to the outline.
     jpeg = path.lower().endswith((".jpg", ".jpeg"))
     return MaskFile("threshold" if jpeg else "nonzero", path)
 
@@ -168,6 +169,8 @@ def outline(mask: Bytes, band: int) -> Bool:
     dilated and the eroded mask differ, for a square of that side."""
     if band == 0:
         return np.zeros(mask.shape, np.bool_)
+
+    # The band lies on both sides of the outline.
     person = (mask > 127).astype(np.uint8)
     kernel = np.ones((band, band), np.uint8)
     return np.asarray(cv2.dilate(person, kernel) != cv2.erode(person, kernel))
@@ -183,6 +186,7 @@ def read_unsure(
         mask: ``[H, W]`` 0..255, the result of `read_mask`.
         rules: of the dataset.
     """
+    # Without a rule all pixels count.
     if rules.unsure_band == 0 and rules.unsure_alpha is None:
         return None
     # The band at the outline, and pixels of uncertain alpha.

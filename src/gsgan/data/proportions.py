@@ -107,23 +107,23 @@ def measure_proportions(p: Tensor, valid: Tensor, up: str) -> Proportions:
     # Positions in standard axes; sanitise() estimates the missing ones.
     to_standard = upright(up).T
     whole, _ = sanitise(p[:, :BODY].double(), valid[:, :BODY])
-    q = whole.numpy() @ to_standard
-    hubs = bone_frames(torch.from_numpy(q)).hubs.numpy()
+    q = whole.numpy() @ to_standard  # [F, 33, 3]
+    hubs = bone_frames(torch.from_numpy(q)).hubs.numpy()  # [F, hubs, 3, 3]
 
     # The standard pose, part by part. Hands follow the wrists, so limbs come first.
     rest = np.zeros((BODY, 3))
     _place_limbs(rest, q)
     for wrist, (pinky, index, thumb) in HAND_LANDMARKS.items():
         ends = [pinky, index, thumb]
-        frames = hand_frame(q, wrist, pinky, index)
-        held = _local(frames, q[:, ends] - q[:, wrist, None])
+        frames = hand_frame(q, wrist, pinky, index)  # [F, 3, 3]
+        held = _local(frames, q[:, ends] - q[:, wrist, None])  # [3, 3]
         rest[ends] = rest[wrist] + held * (SIDES[wrist], 1.0, SIDES[wrist])
     _place_feet(rest, q)
     _place_head(rest, q, hubs)
     hands = _hands(p.double().numpy() @ to_standard, valid.numpy())
 
     # The floor is where feet stand; the heading is that of the pelvis.
-    lowest = q[:, HEELS_AND_TOES, 2].min(axis=1)
+    lowest = q[:, HEELS_AND_TOES, 2].min(axis=1)  # [F]
     ahead = hubs[:, PELVIS, :, 2].mean(axis=0)
     share_seen = valid[:, :BODY].double().mean(0)
     return Proportions(
@@ -171,7 +171,7 @@ def _place_feet(rest: Float, q: Float) -> None:
         size = np.linalg.norm(ahead, axis=-1, keepdims=True)
         back = -ahead / np.maximum(size, 1e-9)
         above = np.broadcast_to([0.0, 0, 1], back.shape)
-        axes = np.stack([np.cross(back, above), back, above], axis=-1)
+        axes = np.stack([np.cross(back, above), back, above], axis=-1)  # [F, 3, 3]
 
         held = _local(axes, stands[:, foot] - stands[:, ankle, None])
         rest[foot] = rest[ankle] + held
@@ -226,7 +226,7 @@ def _hands(p: Float, seen: Bool) -> dict[int, Float]:
 def _hand(p: Float, wrist: Float) -> Float:
     """``[21, 3]`` medians of a hand ``[F, 21, 3]`` from the pose's wrist ``[F, 3]``, in the palm's
     axes; fingers have the median lengths of their bones."""
-    local = (p - wrist[:, None]) @ hand_frame(p, WRIST, PINKY, INDEX)
+    local = (p - wrist[:, None]) @ hand_frame(p, WRIST, PINKY, INDEX)  # [F, 21, 3]
     median = np.median(local, axis=0)
 
     # Medians of positions shorten bones, so each bone gets its median length, parents first.
@@ -264,6 +264,8 @@ def upright(up: str) -> Float:
     sign = -1 if up[:-1] else 1
     above = np.eye(3)[axis] * sign
     first = np.eye(3)[(axis + 1) % 3]
+
+    # Rows are the standard axes in the world.
     return np.stack([first, np.cross(above, first), above])
 
 

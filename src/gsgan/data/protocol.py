@@ -51,6 +51,7 @@ class Protocol:
     subject: str | int | None = None
 
     def __post_init__(self) -> None:
+        # Above 0 and at most 1.
         between("protocol.scale", above("protocol.scale", self.scale), 0, 1)
         if self.train_cameras is None and self.test_cameras is None:
             raise ConfigError(
@@ -94,6 +95,7 @@ class Protocol:
                 around the person.
             padded: whole images are padded with black to squares.
         """
+        # The backbone, then the size and form of the images.
         if self.lpips_net not in lpips_nets:
             yield f"LPIPS is not computed with {self.lpips_net}, as requested (lpips.nets)"
         if scale is None:

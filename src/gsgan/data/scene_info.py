@@ -92,6 +92,7 @@ class SceneInfo:
 
 def refuse_swapped_sides(layout: Layout, frames: Sequence[int]) -> None:
     """Refuses a capture whose left and right are swapped in most frames, with a DataError."""
+    # The check knows joints, but not the dataset that they come from.
     try:
         p, valid = layout.landmarks.joints(frames)
         refuse_swapped(p[:, :BODY], valid[:, :BODY])
@@ -132,7 +133,7 @@ def scene_info(
     if layout.hands is not None:
         whole = whole.with_hands(layout.hands)
     whole_p, whole_valid = whole.joints(frames)
-    completed = np.stack([dataset.skeletons.p[frame] for frame in frames])
+    completed = np.stack([dataset.skeletons.p[frame] for frame in frames])  # [F, J, 3]
 
     body = layout.meta.body
     return SceneInfo(
@@ -168,6 +169,8 @@ def count_labels(layout: Layout, items: Sequence[Item]) -> int:
     """
     if not layout.labels:
         return 0
+
+    # Without names, the labels themselves tell.
     if layout.meta.label_names is not None:
         return len(layout.meta.label_names)
 
@@ -183,6 +186,7 @@ def count_labels(layout: Layout, items: Sequence[Item]) -> int:
 
 def _lenses(layout: Layout, cameras: set[str], tested: set[str]) -> dict[str, Any]:
     """The fields of `SceneInfo` about distortion."""
+    # Held-out cameras are those that do not train.
     training = [layout.cameras[name] for name in cameras]
     held_out = [layout.cameras[name] for name in tested]
     lenses = [camera.dist for camera in training + held_out]
@@ -215,6 +219,7 @@ def _scale(dataset: CaptureDataset, samples: int) -> tuple[float, float]:
 
 def _sampled(dataset: CaptureDataset, samples: int) -> list[list[int]]:
     """Indices of at most ``samples`` evenly spaced items of each camera."""
+    # The indices of each camera's items.
     by_camera: dict[str, list[int]] = {}
     for index, (camera, _) in enumerate(dataset.items):
         by_camera.setdefault(camera, []).append(index)

@@ -66,6 +66,7 @@ class Landmarks:
 
     def _beside(self, part: Landmarks, joints: int) -> Landmarks:
         """Skeletons with the ``joints`` joints of a part appended."""
+        # A part that a frame lacks has visibility 0.
         nothing = np.zeros((joints, 3))
         unseen = np.zeros(joints)
         p = {}
@@ -97,6 +98,7 @@ class Poses:
 
     def digest(self, frames: Iterable[int]) -> str:
         """A hash of the poses of those frames."""
+        # The bytes of all rotations and translations, frame by frame.
         digest = hashlib.sha256()
         for frame in frames:
             digest.update(self.theta[frame].tobytes())
@@ -128,7 +130,7 @@ def make_landmarks(
     """
     # Missing joints have visibility 0.
     finite = np.isfinite(p).all(-1)
-    visibility = np.where(finite, np.nan_to_num(conf), 0.0).clip(0, 1)
+    visibility = np.where(finite, np.nan_to_num(conf), 0.0).clip(0, 1)  # [F, J]
     valid = visibility > 0
 
     # So do joints too far from the median of their frame's joints.
@@ -168,6 +170,8 @@ def whole_frame_ids(raw: NDArray[Any], where: str) -> NDArray[np.int64]:
     """
     with np.errstate(invalid="ignore"):
         ids = np.asarray(raw, np.int64)
+
+    # The conversion cuts off fractions, and makes other numbers of NaN.
     if not np.array_equal(ids, raw):
         raise DataError(f"{where}: 'frame_id' must hold whole numbers")
     if len(ids) and ids.max() > LARGEST_FRAME:
@@ -175,6 +179,8 @@ def whole_frame_ids(raw: NDArray[Any], where: str) -> NDArray[np.int64]:
             f"{where}: frame_id {ids.max()} is a time stamp, not a frame number up to "
             f"{LARGEST_FRAME}; number the frames 0, 1, 2 … alike in images and landmarks"
         )
+
+    # Each frame once.
     values, counts = np.unique(ids, return_counts=True)
     repeated = values[counts > 1]
     if len(repeated):
@@ -195,9 +201,12 @@ def fill_missing(p: Float, valid: Bool, ids: NDArray[np.int64]) -> Float:
         mean of the frame's valid joints, else 0.
     """
     filled = np.where(valid[..., None], p, 0.0)
+
+    # The means of the frames' valid joints, 0 without any.
     count = valid.sum(1, keepdims=True).clip(1)
-    means = filled.sum(1) / count
+    means = filled.sum(1) / count  # [F, 3]
     for joint in range(p.shape[1]):
+        # Rows of the frames that have this joint, and of those that lack it.
         known = np.flatnonzero(valid[:, joint])
         holes = np.flatnonzero(~valid[:, joint])
         if len(known) == 0:
@@ -237,9 +246,9 @@ def hips_below(p: Float, valid: Bool) -> Float:
         return p
 
     # From the middle of the shoulders to that of the hips.
-    top = p[:, shoulders].mean(1)
+    top = p[:, shoulders].mean(1)  # [F, 3]
     if whole.any():
-        trunks = p[:, hips].mean(1) - top
+        trunks = p[:, hips].mean(1) - top  # [F, 3]
         down = np.median(trunks[whole], axis=0)
     else:
         necks = top - p[:, ears].mean(1)
@@ -293,7 +302,7 @@ def face_at_rest(
     # Face landmarks in the head's axes.
     body, valid = sanitise(p[:, :first], seen[:, :first])
     head = bone_frames(body, valid).hubs[:, HEAD]
-    local = in_head(p[:, first:], body, head, MEDIAPIPE33)
+    local = in_head(p[:, first:], body, head, MEDIAPIPE33)  # [F, 30, 3]
 
     # Medians over the frames that show them.
     unseen = ~seen[:, first:, None]

@@ -24,6 +24,7 @@ FRAME_RANGE = re.compile(
 )
 # bounds the memory that a range from a file can ask for
 MOST_FRAMES = 10**7
+# training, held-out cameras, held-out frames
 SPLITS = ("train", "novel_view", "novel_pose")
 # camera name, frame number
 Item = tuple[str, int]
@@ -49,6 +50,7 @@ class Items(Sequence[Item]):
     @property
     def frames(self) -> list[int]:
         """The frame numbers, rising, each once."""
+        # The empty array is for a split without cameras.
         numbers = [np.empty(0, np.int64), *self._of.values()]
         return np.unique(np.concatenate(numbers)).tolist()
 
@@ -71,6 +73,8 @@ class Items(Sequence[Item]):
         """The place of an item; a ValueError if it is not in the split."""
         name, frame = item
         camera = self.cameras.index(name)
+
+        # The place among the camera's own items.
         found = np.flatnonzero(self._of[name] == frame)
         if not len(found):
             raise ValueError(f"{item} is not in the split")
@@ -179,6 +183,7 @@ def _usable(
     layout: Layout, frames: Sides[int], whose: str
 ) -> tuple[Sides[int], tuple[str, ...]]:
     """The train and test frames that the capture has, and a note on the others."""
+    # Frames that were dropped, or never existed.
     known = set(layout.frames)
     train = tuple(frame for frame in frames.train if frame in known)
     test = tuple(frame for frame in frames.test if frame in known)
@@ -218,6 +223,7 @@ def _splits(
 
 def _items(layout: Layout, cameras: Sequence[str], frames: Sequence[int]) -> Items:
     """The cameras' images of the frames, those that exist."""
+    # Both arrays are without repetitions.
     wanted = np.array(frames, np.int64)
     found = {}
     for camera in cameras:
@@ -294,6 +300,7 @@ def _complete(
 
 def camera_name(layout: Layout, camera: str | int, protocol: str) -> str:
     """The name of a camera given by name or by its index in `Layout.camera_names`."""
+    # An index, else a name; a name may be a number as well.
     names = layout.camera_names
     if isinstance(camera, int) and 0 <= camera < len(names):
         return names[camera]

@@ -47,7 +47,7 @@ class TrainingPoses:
         x = pose_in_pelvis(p.double().cpu()) - mean
 
         # With reshape, also without any axis.
-        along = x @ axes.reshape(-1, x.shape[1]).T
+        along = x @ axes.reshape(-1, x.shape[1]).T  # [B, K]
         squared = (x**2).sum(1) - (along**2).sum(1)
         return squared.clamp_min(0).sqrt() / self.scale
 
@@ -55,13 +55,15 @@ class TrainingPoses:
 def pose_in_pelvis(p: Tensor) -> Tensor:
     """``[B, 99]`` metres: the body's landmarks of ``[B, J, 3]`` in the pelvis's axes."""
     body = p[:, :BODY]
+
+    # The first hub is the pelvis; its columns are the axes.
     pelvis = bone_frames(body).hubs[:, 0]
     return ((body - root_of(body)[:, None]) @ pelvis).flatten(1)
 
 
 def training_poses(p: Tensor) -> TrainingPoses:
     """The spread of the training skeletons ``[F, J, 3]``, completed, metres."""
-    x = pose_in_pelvis(p.double())
+    x = pose_in_pelvis(p.double())  # [F, 99]
     mean = x.mean(0)
 
     # Principal axes, and the standard deviation along each.

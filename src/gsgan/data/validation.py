@@ -92,6 +92,8 @@ def _unusable(
     """The reason to drop a frame, for the notes; None to keep it."""
     if frame not in landmarks.visibility:
         return f"without a row in {landmarks.source}"
+
+    # Enough joints, and enough of the trunk.
     valid = landmarks.visibility[frame] > 0
     if valid.sum() < limits.min_joints:
         return f"with fewer than {limits.min_joints} joints (NaN or confidence 0)"
@@ -183,6 +185,7 @@ def check_distance(
     Raises:
         DataError: if it is outside the ``limits`` (metres); ``hint`` says what to check.
     """
+    # Medians are robust to stray joints and to one wrong camera.
     person = np.median(joints, axis=0)
     metres = [np.linalg.norm(camera.centre - person) for camera in cameras]
     distance = float(np.median(metres))
@@ -258,6 +261,7 @@ def drop_unmasked(
     camera = next(iter(lost))
     frame = lost[camera][0]
     if missing > limits.max_missing_masks * count:
+        # The file that the user may expect: named like the image, in the folder of masks.
         path = (expected[camera] / Path(images[camera][frame]).name).with_suffix(".png")
         raise DataError(
             f"{path} does not exist; every image needs a mask, and {len(lost[camera])} of the "

@@ -76,6 +76,8 @@ def write_scored(scored: Scored, folder: Path) -> None:
     write_atomically(folder / SCORES_FILE, table)
     write_atomically(folder / TABLE_FILE, markdown(scored.results, scored.origin))
     write_atomically(folder / FACTS_FILE, origin)
+
+    # The last file.
     results = json.dumps(scored.results, indent=2, allow_nan=False)
     write_atomically(folder / METRICS_FILE, results)
 
@@ -89,6 +91,7 @@ def rows(
     """One formatted row per split and variant, and per camera if ``cameras``; None is ``n/a``."""
 
     def formatted(values: dict[str, Any]) -> list[str]:
+        # Rounded to the digits of each metric.
         cells = []
         for metric in metrics:
             value = values[metric]
@@ -139,6 +142,7 @@ def notes(results: Results) -> list[str]:
 
 def _protocol_notes(protocol: dict[str, Any]) -> Iterator[str]:
     """The protocol, and the departures from it."""
+    # A remark of the protocol follows its source.
     note = f"; {protocol['note']}" if protocol.get("note") else ""
     yield f"protocol: {protocol['name']} ({protocol['source']}){note}"
     for departure in protocol["departures"]:
@@ -147,6 +151,7 @@ def _protocol_notes(protocol: dict[str, Any]) -> Iterator[str]:
 
 def print_table(results: Results, origin: dict[str, Any], console: Console) -> None:
     """Prints the table, its caption and its notes."""
+    # Columns of metrics; those of hands only if they were scored.
     table = Table(title=TITLE, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("variant", no_wrap=True)
     hands = any(scores["full"]["psnr_hands"] is not None for scores in results.values())
@@ -169,6 +174,7 @@ def print_table(results: Results, origin: dict[str, Any], console: Console) -> N
 
 def markdown(results: Results, origin: dict[str, Any]) -> str:
     """The table in Markdown with its caption and every metric, and again by camera."""
+    # Every metric is a column.
     header = ["split", "variant", "images"]
     for metric in METRICS.values():
         header.append(metric.short_heading)

@@ -23,6 +23,7 @@ ERROR_GAIN = 4.0
 
 def error_heat(image: Tensor, target: Tensor) -> Tensor:
     """Mean absolute error per pixel as a heat map ``[B, 3, H, W]``; black is none."""
+    # The mean over channels, as 8 bits.
     error = ((image - target).abs().mean(dim=1) * ERROR_GAIN).clamp(0, 1)
     levels = (error * 255).byte().cpu().numpy()
     heat = []

@@ -45,6 +45,7 @@ class Method:
 
 def trained(folder: Path, **training: Any) -> Method:
     """The method of a run folder, with the fields of ``training``."""
+    # The names in the run's config.
     chosen = choices(folder)
     return Method(
         "gsgan",
@@ -93,6 +94,8 @@ def fingerprint(data: GsganData) -> str:
     # Other fitted poses are other inputs.
     if layout.poses is not None and layout.poses.fitted:
         content["poses"] = layout.poses.digest(layout.frames)
+
+    # Sorted keys: the hash must not depend on their order.
     plain = json.dumps(content, sort_keys=True).encode()
     return hashlib.sha256(plain).hexdigest()[:12]
 
@@ -112,6 +115,8 @@ def _commit() -> tuple[str | None, bool | None]:
     root = Path(__file__).resolve().parents[3]
     if not (root / ".git").exists():
         return None, None
+
+    # Untracked files do not count as changes.
     options = ("--always", "--tags", "--abbrev=12", f"--dirty={DIRTY}")
     command = ["git", "-C", str(root), "describe", *options]
     try:
@@ -128,6 +133,7 @@ def _commit() -> tuple[str | None, bool | None]:
 
 def caption(origin: dict[str, Any]) -> str:
     """One line under a table: method, protocol, data, number of seeds, commit."""
+    # Runs of other tools have no seed, no commit or no name of the data.
     data = origin["data"]
     seed = origin["seed"]
     method = filter(None, (origin["method"], origin["model"]))

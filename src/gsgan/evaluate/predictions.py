@@ -76,6 +76,7 @@ class BodyBoxes:
     larger margin."""
 
     def __init__(self, data: GsganData) -> None:
+        # A capture may have poses without a body, and the reverse.
         found = data.layout.meta.body
         self.body: SkinnedBody | None = None
         if data.layout.poses is not None and found is not None:
@@ -93,6 +94,7 @@ class BodyBoxes:
 
     def corners(self, frame: Frame, index: int) -> Tensor:
         """``[8, 3]`` metres: the box of one item of a frame."""
+        # The vertices, else the visible joints with a larger margin.
         if self.body is not None and frame.body is not None:
             vertices = self.body.to(frame.skeleton.device).posed_vertices(frame.body)
             return box_corners(vertices[index], VERTEX_MARGIN)
@@ -201,6 +203,7 @@ class PredictionFolder:
 
     def _check_background(self, path: Path, image: Tensor, mask: Tensor) -> None:
         """Refuses an opaque image whose background has mostly the other colour."""
+        # [n, 3]: the pixels without any of the person.
         behind = image.permute(0, 2, 3, 1)[mask[:, 0] == 0]
         if self.background == "black":
             name = "white"
@@ -237,6 +240,7 @@ def read_folder(
         DataError: when the folder does not exist, or an image is missing, is there twice,
             or has another size or more than 8 bits per channel.
     """
+    # The pattern must name the frame and the camera.
     fields = set(FIELD.findall(pattern))
     if not ("frame" in fields <= set(FIELDS) and fields & {"camera", "camera_index"}):
         raise ConfigError(
@@ -294,4 +298,5 @@ def _filled(pattern: str, values: Mapping[str, str]) -> str:
 
 def _unpadded(name: str) -> str:
     """The name with every number stripped of leading zeros."""
+    # A number of zeros keeps one.
     return re.sub("[0-9]+", lambda digits: digits[0].lstrip("0") or "0", name)

@@ -55,6 +55,7 @@ from gsgan.utils.errors import ConfigError
 from gsgan.utils.files import write_atomically
 from gsgan.utils.tensors import pick_device
 
+# The distances as a table with the scores `COLUMNS`, and as a figure.
 CSV = "distance.csv"
 PNG = "distance.png"
 COLUMNS = (
@@ -111,6 +112,7 @@ def write_distances(
         curves["held out of the training's capture"] = pd.read_csv(beside / CSV)
     write_atomically(folder / PNG, _plot(curves))
 
+    # One sentence for the terminal.
     parts = []
     for own in _bins(table):
         parts.append(f"{own.low:g} to {own.high:g}: {own.psnr:.2f} dB ({own.images:g})")
@@ -121,7 +123,10 @@ def write_distances(
 
 def _bins(table: pd.DataFrame) -> list[Bin]:
     """The bins that hold images with a finite PSNR."""
+    # Images of equal pixels, or without a person, have no finite PSNR.
     table = table[np.isfinite(table["psnr_person"])]
+
+    # The number of each image's bin, which contains its lower edge.
     place = pd.cut(table["distance"], BINS, right=False, labels=False)
     bins = []
     for number, own in table.groupby(place):
@@ -146,6 +151,8 @@ def _plot(curves: dict[str, pd.DataFrame]) -> bytes:
         bins = _bins(table)
         x = [own.distance for own in bins]
         y = [own.psnr for own in bins]
+
+        # The line through the means, then the images in its colour.
         (drawn,) = axes.plot(x, y, "o-", label=label)
         axes.plot(
             table["distance"],
@@ -155,6 +162,7 @@ def _plot(curves: dict[str, pd.DataFrame]) -> bytes:
             alpha=0.25,
             markersize=3,
         )
+
     axes.set_xlabel("distance from the training poses, in their standard deviations")
     axes.set_ylabel("PSNR in the person's box, dB")
     axes.grid(alpha=0.3)
@@ -164,6 +172,7 @@ def _plot(curves: dict[str, pd.DataFrame]) -> bytes:
     return image.getvalue()
 
 
+# the splits that can be scored, and the mark of scores with drive=skeleton
 SPLITS = ("novel_view", "novel_pose")
 BY_SKELETON = "driven by skeletons alone"
 
@@ -219,6 +228,8 @@ def evaluate_folder(
         config.lpips.nets = OmegaConf.select(
             stored, "lpips.nets", default=list(LPIPS_NETS)
         )
+
+    # The weights, and the number of steps, the time and the code that made them.
     checkpoint = read_checkpoint(folder / CHECKPOINT)
     state = checkpoint["gsgan"]
 
@@ -245,6 +256,7 @@ def evaluate_folder(
     if len(set(config.splits)) < len(SPLITS):
         out = out / config.splits[0]
 
+    # What facts.json states about the run.
     method = trained(
         folder,
         seed=stored.seed,
@@ -252,6 +264,8 @@ def evaluate_folder(
         train_seconds=state.get("train_seconds"),
         trained_by=state.get("code"),
     )
+
+    # Poses are solved from skeletons on request; another capture has other cameras' colours.
     solve = config.drive is not None
     return evaluate_method(
         out,
@@ -306,6 +320,8 @@ def evaluate_predictions(
     name = config.method or root.resolve().name
     if config.lpips.nets is None:
         config.lpips.nets = list(LPIPS_NETS)
+
+    # The data, and a folder for the results that holds no others.
     data = build_data(config)
     out = _out(config, root.resolve(), name)
 
@@ -391,6 +407,7 @@ def evaluate_method(
     Raises:
         GsganError: when a prediction cannot be scored.
     """
+    # Settings that commands of other packages may lack have defaults.
     scorer = make_scorer(config, data, marks)
     grid_rows = 4 if config.get("grid_rows") is None else config.grid_rows
 
@@ -430,6 +447,8 @@ def _joined_splits(
     """The scores of all splits, with the protocol's record and reasons for empty splits."""
     # An empty split has the variants of the others.
     variants = next((s.variants for s in scores.values() if s.variants), (FULL, FLOOR))
+
+    # metrics.json by split, scores.csv by image.
     results = {}
     rows = []
     for split, found in scores.items():
@@ -455,6 +474,8 @@ def make_scorer(config: DictConfig, data: GsganData, marks: Sequence[str]) -> Sc
         DataError: if LPIPS' weights or a body model cannot be read.
     """
     marks = list(marks)
+
+    # A background other than the protocol's is marked, and departs from it.
     measures = _measures(data)
     background = config.get("background")
     if background not in (None, measures.background):

@@ -36,6 +36,7 @@ from gsgan.scene import Frame
 from gsgan.utils.errors import GsganError
 from gsgan.weights.networks import Lpips
 
+# reasons for missing scores
 NO_PAIR = "no two images are of consecutive frames, in one window of one camera"
 NO_LPIPS = "left out by lpips.nets"
 NO_LABELS = "the data has no part labels"
@@ -119,6 +120,7 @@ def image_scores(
 
 def _inside(box: Tensor, score: Score, a: Tensor, b: Tensor) -> Tensor | float:
     """The score of a box's rectangle; NaN for an empty box."""
+    # SSIM has windows, so the region must be a rectangle.
     part = rectangle(box[0])
     if part is None:
         return math.nan
@@ -133,6 +135,7 @@ def means(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """
     result: dict[str, Any] = {}
     for metric in IMAGE_METRICS:
+        # A metric that was not computed is absent, an undefined one is NaN.
         scores = [row[metric] for row in rows if metric in row]
         finite = list(filter(math.isfinite, scores))
         result[metric] = sum(finite) / len(finite) if finite else None
@@ -245,6 +248,7 @@ def score_split(
     Raises:
         GsganError: when a prediction is not finite, naming camera and frame.
     """
+    # Frames are predicted one by one, so that only one is in memory.
     tally = _Tally(scorer)
     for i, (item, frame) in enumerate(items):
         tally.add(item, frame, predict(frame, item), show=i in shown)
@@ -276,6 +280,7 @@ class _Tally:
         self, item: Item, frame: Frame, prediction: Prediction, *, show: bool
     ) -> None:
         """Scores one frame."""
+        # Ground truth and regions as the protocol defines them.
         camera, number = item
         prepare = self.scorer.prepare
         target = prepare.target(frame)
@@ -336,6 +341,8 @@ class _Tally:
         if parts is None or frame.labels is None:
             self.no_parts = NO_LABELS if parts is not None else prediction.no_parts
             return
+
+        # Sums of confusion matrices by camera, and the score of this image.
         labels = frame.labels if prediction.labels is None else prediction.labels
         matrix = confusion(parts, labels)
         held = self.matrices.get(camera, torch.zeros_like(matrix))
@@ -358,9 +365,12 @@ class _Tally:
 
 def _follows(item: Item, frame: Frame, before: Item, last: Frame) -> bool:
     """Whether an item is the next frame after another one, seen through the same window."""
+    # The next frame of the same camera.
     name, number = before
     if item != (name, number + 1):
         return False
+
+    # The window follows the person, so K and size may differ.
     now = frame.camera
     then = last.camera
     if now.size != then.size:
@@ -416,6 +426,7 @@ def _common(scorer: Scorer, images: int) -> dict[str, Any]:
 def lpips_input(measures: MetricVariants) -> str:
     """The input of LPIPS' networks in words: the range, and the order of channels and the region if
     they are not the defaults."""
+    # The range is always named, the rest only if it is unusual.
     low, high = measures.lpips_range
     order = "" if measures.lpips_channels == "rgb" else " BGR"
     region = "" if measures.lpips_region == "full" else " mask crop 512"

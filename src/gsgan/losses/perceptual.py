@@ -168,8 +168,8 @@ def crop_person(
     # The corner of the square around it, moved inside the image.
     top = (centre // width - rows // 2).clamp(0, height - rows)
     left = (centre % width - columns // 2).clamp(0, width - columns)
-    y = top[..., None] + torch.arange(rows, device=mask.device)
-    x = left[..., None] + torch.arange(columns, device=mask.device)
+    y = top[..., None] + torch.arange(rows, device=mask.device)  # [B, N, rows]
+    x = left[..., None] + torch.arange(columns, device=mask.device)  # [B, N, columns]
 
     # One gather per image: [B, N, rows, columns, C].
     batch = torch.arange(len(mask), device=mask.device)[:, None, None, None]
@@ -184,6 +184,8 @@ def _over_processes(value: Tensor) -> Tensor:
     """The mean over the processes of a training."""
     if not (distributed.is_available() and distributed.is_initialized()):
         return value
+
+    # The sum replaces its argument, so a copy is given.
     value = value.clone()
     distributed.all_reduce(value)
     return value / distributed.get_world_size()

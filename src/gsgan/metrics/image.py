@@ -57,7 +57,7 @@ def psnr_where(
 def person_box(mask: Tensor) -> Tensor:
     """``[B, 1, H, W]`` bool: the smallest box around the mask's pixels of at least one half."""
     person = mask >= 0.5
-    box = torch.ones_like(person)
+    box = torch.ones_like(person)  # [B, 1, H, W]
     for along, across in ((-1, -2), (-2, -1)):
         # Rows, then columns: those at or after the first one and at or before the last one.
         held = person.any(dim=along, keepdim=True).long()
@@ -99,7 +99,7 @@ def psnr_inside(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
 def ssim_where(image: Tensor, target: Tensor, *regions: Tensor) -> list[Tensor]:
     """SSIM's mean over each region ``[B, 1, H, W]``, with windows that reach beyond it; NaN for an
     empty region."""
-    similar = (1 - d_ssim_map(image, target)).mean(dim=1, keepdim=True)
+    similar = (1 - d_ssim_map(image, target)).mean(dim=1, keepdim=True)  # [B, 1, H, W]
     means = []
     for region in regions:
         total = (similar * region).flatten(1).sum(dim=1)
@@ -169,7 +169,7 @@ def high_frequencies(image: Tensor, target: Tensor, *, above: float = 0.25) -> T
     """
     # The frequencies of a real spectrum: half of the columns are enough.
     height, width = image.shape[-2:]
-    rows = torch.fft.fftfreq(height, device=image.device)[:, None]
+    rows = torch.fft.fftfreq(height, device=image.device)[:, None]  # cycles per pixel
     columns = torch.fft.rfftfreq(width, device=image.device)[None]
     high = (rows.square() + columns.square()).sqrt() > above
 

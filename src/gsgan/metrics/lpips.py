@@ -30,6 +30,8 @@ def build_lpips(nets: Sequence[str], path: str | None = None) -> dict[str, Lpips
     """
     for net in nets:
         one_of("an entry of lpips.nets", net, LPIPS_NETS)
+
+    # All names are checked before the first download.
     return {net: Lpips(net, path).eval() for net in nets}
 
 
@@ -118,6 +120,8 @@ class LpipsAgainst:
         if self.measures.lpips_region == "full":
             return None
         assert self.mask is not None
+
+        # The square is filled with the background.
         background = BACKGROUNDS[self.measures.background]
         square = mask_crop(image[0], self.mask[0], background)
         return None if square is None else self._seen(square[None])

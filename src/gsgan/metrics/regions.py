@@ -139,7 +139,7 @@ def box_corners(points: Tensor, margin: float) -> Tensor:
     low = points.amin(0) - margin
     high = points.amax(0) + margin
     ends = torch.arange(2, device=points.device)
-    choice = torch.cartesian_prod(ends, ends, ends)
+    choice = torch.cartesian_prod(ends, ends, ends)  # [8, 3]
     return torch.where(choice == 1, high, low)
 
 
@@ -163,12 +163,12 @@ def box_mask(corners: Tensor, camera: Camera) -> Tensor:
     # The outline of the box, without the lens.
     K = camera.K[0].double()
     pixels = (seen / seen[:, 2:]) @ K.T
-    hull = cv2.convexHull(pixels[:, :2].float().cpu().numpy())[:, 0]
+    hull = cv2.convexHull(pixels[:, :2].float().cpu().numpy())[:, 0]  # [n, 2]
 
     # The centre of each pixel, moved to where a pinhole shows it.
     height, width = camera.size
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    shown = np.stack([u, v], axis=-1)
+    shown = np.stack([u, v], axis=-1)  # [H, W, 2]
     if camera.dist is not None:
         focal = K[:2, :2].cpu().numpy()
         centre = K[:2, 2].cpu().numpy()
@@ -269,6 +269,7 @@ def hands_and_mouth(frame: Frame, template: SkeletonTemplate) -> dict[str, Tenso
 
 def describe_boxes(skeleton: str) -> str | None:
     """The contents of a named skeleton's boxes in words, for notes; None without hands."""
+    # The same rules as in `hands_and_mouth`.
     template = TEMPLATES[skeleton]
     if not template.palms:
         return None

@@ -89,6 +89,7 @@ class CaptureReader:
         Raises:
             DataError: for whatever is missing, damaged or contradictory, naming the file.
         """
+        # The folder, its files, then the checks that all formats share.
         folder = dataset_folder(root, "cameras.json, images/ and masks/")
         found = _find(folder, limits, smpl, self)
         hint = "check that cameras, landmarks and masks belong together"
@@ -168,6 +169,7 @@ def _find(
 
 def _read_meta(path: Path, content: Mapping[str, Any], smpl: str | None) -> Meta:
     """Facts about the capture from the content of meta.json, where only ``unit`` is required."""
+    # Optional facts, each checked before it is used.
     fps = content.get("fps")
     if fps is not None and not (is_number(fps) and fps > 0):
         raise DataError(f"{path}: 'fps' is {fps!r}; expected a number above 0")
@@ -217,6 +219,8 @@ def _index_images(
             found.add(path.name)
 
     unknown = sorted(found - set(cameras))
+
+    # A folder and a camera without each other are most likely misspelt.
     if unknown:
         raise DataError(
             f"{folder} has the camera {unknown[0]}, which {root / 'cameras.json'} does not list; "
@@ -262,6 +266,7 @@ def _read_landmarks(
 
 def _refuse_other_names(path: Path) -> None:
     """Refuses other landmarks of a face: of the hundreds that detectors have, 30 are used."""
+    # A file without names is taken to have these landmarks.
     names = read_arrays(path, ("names",)).get("names")
     if names is not None and tuple(map(str, names.tolist())) != FACE_NAMES:
         raise DataError(

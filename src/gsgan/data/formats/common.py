@@ -105,6 +105,8 @@ def finish(
         if not any(images.values()):
             raise ConfigError(f"data.reader.drop_frames={drop_frames} leaves no frame")
         found = replace(found, images=images)
+
+    # Files against each other, then a few masks against the joints.
     layout = assemble(found, limits)
     check_consistency(layout, consistency, hint)
     return layout
@@ -123,6 +125,8 @@ def body_model(root: Path, smpl: str | None, kind: str) -> tuple[Path, SkinnedMo
         DataError: when none is given, or it is damaged or of another kind.
     """
     name, example = MODELS[kind]
+
+    # The model has its own licence, so that the user must provide it.
     if smpl is None:
         raise DataError(
             f"{root} holds {name} parameters but no joints, and joints need the body model: give "

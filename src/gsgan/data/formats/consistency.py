@@ -100,6 +100,7 @@ def check_consistency(layout: Layout, limits: Consistency, hint: str) -> None:
 
 def far_cameras(metres: Mapping[str, float], factor: float) -> dict[str, str]:
     """A message for each camera that is ``factor`` times farther than the median one, or nearer."""
+    # The median camera is right if most of them are.
     median = float(np.median(list(metres.values())))
     messages = {}
     for name, distance in metres.items():
@@ -115,6 +116,8 @@ def mask_distance(mask: Bool) -> Float:
     """``[H, W]`` pixels from every pixel to the mask; 0 in it, infinite when it is empty."""
     if not mask.any():
         return np.full(mask.shape, np.inf)
+
+    # OpenCV measures the distance to the nearest zero.
     outside = (~mask).astype(np.uint8)
     distance = cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return distance.astype(np.float64)
@@ -164,8 +167,10 @@ def inside_share(
     straight, depth = project(camera, joints)
     shown = through_lens(camera.K, camera.dist, straight[:, 0], straight[:, 1])
     everyone = np.ones(len(joints), bool)
-    outside = joint_distance(mask_distance(small), shown / step, depth, everyone, focal)
+    distance = mask_distance(small)
+    outside = joint_distance(distance, shown / step, depth, everyone, focal)  # [N]
 
+    # The tolerance in metres, but at least some pixels of the small mask.
     known = ~np.isnan(outside)
     if not known.any():
         return np.nan

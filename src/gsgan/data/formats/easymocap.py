@@ -125,6 +125,7 @@ class EasymocapReader(FolderReader):
         self, root: Path, images: Mapping[str, Mapping[int, str]], notes: list[str]
     ) -> dict[str, CameraEntry]:
         """The cameras that have images, by name, in natural order."""
+        # Every folder of images needs a camera of the same name.
         path = root / "intri.yml"
         calibration = read_calibration(path, pixel_centre=self.pixel_centre)
         notes += calibration.notes
@@ -144,6 +145,7 @@ class EasymocapReader(FolderReader):
                 camera = replace(camera, size=image_size(root, files))
             cameras[name] = camera
 
+        # Cameras of the calibration that did not record this take.
         idle = [name for name in known if name not in images]
         if idle:
             notes.append(
@@ -179,6 +181,7 @@ def _masks(
     """The masks by camera and frame; only those of the person if their names hold an id."""
     found = {}
     for name in names:
+        # Keys hold the frame and the person.
         files = frame_files(root, f"mask/{name}", (".png", ".jpg"), _frame_and_person)
         own: dict[int, tuple[MaskFile, ...]] = {}
         # A mask without an id comes first, so that the person's own replaces it.
@@ -212,6 +215,7 @@ def _camera_folders(root: Path, contents: str) -> list[str]:
 
 def _frame_and_person(stem: str) -> int | None:
     """One number for frame and person: "000012_1" is frame 12 of person 1, "000012" has no id."""
+    # The frame, and optionally the person.
     match = re.fullmatch(r"(\d+)(?:_(\d{1,2}))?", stem)
     if match is None:
         return None
@@ -224,6 +228,7 @@ def _read_people(
     root: Path, folder: str, frames: Collection[int], person: int, notes: list[str]
 ) -> dict[int, tuple[str, Mapping[str, Any]]]:
     """The person's entry, with the file's name for messages, by frame that has images."""
+    # One file per frame, each with all people.
     files = frame_files(root, folder, (".json",))
     found = {}
     lacking = []
@@ -236,6 +241,8 @@ def _read_people(
             found[frame] = (f"{root / files[frame]}, person {person}", people[person])
         else:
             lacking.append(frame)
+
+    # The most likely cause is another number of the person.
     if not found:
         ids = ", ".join(map(str, sorted(seen))) or "nobody"
         raise DataError(
@@ -307,6 +314,8 @@ def _joints(where: str, raw: Any) -> Float:
             f"{where}: 'keypoints3d' must have shape (J, 4) with J one of {counts} (BODY_25, with "
             f"hands, with face), found {joints.shape if joints.size else type(raw).__name__}"
         )
+
+    # Some versions write no confidence.
     if joints.shape[1] == 3:
         joints = np.concatenate([joints, np.ones((len(joints), 1))], axis=1)
     return joints

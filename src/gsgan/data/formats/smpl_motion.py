@@ -41,7 +41,7 @@ class SmplMotion:
 
     def poses(self, source: str) -> Poses:
         """Body poses by frame."""
-        frames = [int(i) for i in self.ids]
+        frames = self.ids.tolist()
         return Poses(
             dict(zip(frames, self.theta, strict=True)),
             dict(zip(frames, self.transl, strict=True)),
@@ -96,6 +96,7 @@ def _only(model: SkinnedModel, vertices: list[int]) -> SkinnedModel:
     eye = torch.eye(joints, dtype=torch.float64)
 
     def with_joints(values: torch.Tensor) -> torch.Tensor:
+        # The regressor is linear, so it applies to blend shapes as well.
         flat = model.J_regressor @ values.flatten(1)
         at_joints = flat.unflatten(1, values.shape[1:])
         return torch.cat([values[vertices], at_joints])
@@ -168,6 +169,8 @@ def _parameter(content: Any, key: str, sizes: tuple[int, ...], where: str) -> Fl
     expected = " or ".join(map(str, sizes))
     if not isinstance(content, Mapping) or key not in content:
         raise DataError(f"{where} has no '{key}'; expected {expected} numbers")
+
+    # Files nest the numbers differently.
     values = as_floats(content[key]).reshape(-1)
     if len(values) not in sizes:
         found = getattr(content[key], "shape", type(content[key]).__name__)

@@ -90,6 +90,8 @@ class SmplxRigReader(FolderReader):
     def find(self, root: Path, limits: Thresholds, smpl: str | None) -> Found:
         """See `FolderReader.find`."""
         notes = list[str]()
+
+        # The two files without which nothing can be read.
         for name in (self.calibration, PARAMETERS):
             if not (root / name).is_file():
                 raise DataError(
@@ -202,6 +204,8 @@ def _leave_out(images: Files, path: Path, notes: list[str]) -> None:
     """Removes the images that a missing_img_files.txt names from the index."""
     if not path.is_file():
         return
+
+    # The release lists images that are missing or damaged.
     named = read_missing(path, images)
     gone = 0
     for camera, files in images.items():
@@ -319,11 +323,14 @@ def _rows(
     count: int | None = None,
 ) -> Float:
     """``[N, width]`` an array ``[N, ...]`` flattened; N must be ``count`` if that is given."""
+    # A scalar or an empty array has no rows.
     values = as_floats(arrays[key])
     if values.ndim > 1 and values.size:
         values = values.reshape(len(values), -1)
         if width in (None, values.shape[1]) and count in (None, len(values)):
             return values
+
+    # What was found instead, for the message.
     shape = getattr(arrays[key], "shape", type(arrays[key]).__name__)
     expected = f"({count or 'frames'}, {width or 'any'})"
     raise DataError(
@@ -336,6 +343,7 @@ def _coefficients(
     arrays: dict[str, Any], key: str, most: int, path: Path, count: int | None = None
 ) -> Float:
     """``[N, n]`` coefficients, at most as many as the model's; further ones must be 0."""
+    # A model file with fewer shapes than the fit would give another body.
     values = _rows(arrays, key, None, path, count)
     if np.any(values[:, most:] != 0):
         raise DataError(

@@ -211,6 +211,7 @@ def read_annots(root: Path) -> Annots:
 
 def _entries(value: Any) -> list[Any]:
     """The entries of a list or array, none for anything else."""
+    # Releases differ: arrays, or nested lists.
     array = isinstance(value, np.ndarray) and value.ndim > 0
     return list(value) if array or isinstance(value, (list, tuple)) else []
 
@@ -222,6 +223,8 @@ def camera_folders(root: Path, annots: Annots) -> dict[str, str]:
         DataError: when a folder is not one of the subject's, or two cameras share one.
     """
     places = [_place(root, folder) for folder in annots.folders]
+
+    # Masks are found by the folder's name, so it must be unique.
     named = {PurePosixPath(place).name: place for place in places}
     if len(named) != len(places):
         raise DataError(
@@ -233,6 +236,7 @@ def camera_folders(root: Path, annots: Annots) -> dict[str, str]:
 def _place(root: Path, folder: str) -> str:
     """The path of a folder that annots.npy names, relative to the root; copies are often
     rearranged."""
+    # A path from a file must not lead out of the dataset.
     parts = PurePosixPath(folder).parts
     if not parts or ".." in parts or PurePosixPath(folder).is_absolute():
         raise DataError(
@@ -246,6 +250,7 @@ def _place(root: Path, folder: str) -> str:
 
 def frame_number(stem: str) -> int | None:
     """The frame number in an image's name, 313's and 315's long names included."""
+    # The last number of a long name is a time.
     named = NAMED_FRAME.search(stem)
     return frame_of(named[1]) if named else last_number(stem)
 
