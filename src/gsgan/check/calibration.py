@@ -1,4 +1,4 @@
-"""How well each camera's calibration fits its masks, and whether another would fit better."""
+"""The fit of each camera's calibration to its masks, and whether another would fit better."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -41,7 +41,7 @@ TOML_OTHER_TABLES = ("metadata", "capture_volume", "charuco", "checkerboard")
 
 @dataclass(frozen=True)
 class Conventions:
-    """How the numbers of a capture are stored.
+    """Conventions by which the numbers of a capture are stored.
 
     Args:
         scale: metres in one unit of the files.

@@ -77,7 +77,7 @@ class _Contents:
 
     Args:
         root: the dataset's folder.
-        meta: about the whole.
+        meta: facts about the capture as a whole.
         cameras: by name, in the order of `camera_index`.
         images: by camera and frame.
         masks: by camera and frame, one or more per image, including those of images left out.

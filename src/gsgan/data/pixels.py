@@ -44,7 +44,7 @@ def mask_file(path: str) -> MaskFile:
 
 @dataclass(frozen=True)
 class PixelRules:
-    """How to decode a format's files.
+    """Rules for decoding a format's files.
 
     Args:
         composed: images are already composed on black by their mask.

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 
 class Metric(NamedTuple):
-    """How a metric is printed.
+    """The printed form of a metric.
 
     Args:
         name: in tables of several methods.

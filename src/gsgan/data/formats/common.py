@@ -43,7 +43,7 @@ class FolderReader:
     contents: ClassVar[str]
     """The folder's content, for messages."""
     hint: ClassVar[str]
-    """What to check when body and masks do not agree."""
+    """Advice for a message when body and masks do not agree."""
 
     def __call__(
         self, root: str | Path, limits: Thresholds, smpl: str | None = None
