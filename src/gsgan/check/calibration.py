@@ -1,4 +1,4 @@
-"""How well each camera's calibration fits its masks, and whether another would fit better."""
+"""The fit of each camera's calibration to its masks, and whether another would fit better."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,18 +14,21 @@ from gsgan.data.formats.consistency import spread
 
 TOPIC = "calibration"
 MIRRORED = "mirrored images"
-TRIED = 8  # images per camera on which calibrations are tried, at most
-CREDIBLE_OVERLAP = 0.35  # the right calibration has 0.6 to 0.7, with slim masks 0.4
+# maximum number of images per camera on which calibrations are tried
+TRIED = 8
+# the right calibration has 0.6 to 0.7, with slim masks 0.4
+CREDIBLE_OVERLAP = 0.35
 # of a standing person's joints lie in the mask from any camera
 SHARE_OF_ANY_CAMERA = 0.5
 # times the other cameras' distance: noisy landmarks are off in all of them
 OUTSIDE_RATIO = 3.0
-OUTSIDE_ALL = 2.0  # times the limit of one camera, where all are off
+# times the limit of one camera, if all are off
+OUTSIDE_ALL = 2.0
 
 
 @dataclass(frozen=True)
 class CameraScore:
-    """How well one camera's calibration fits its masks.
+    """The fit of one camera's calibration to its masks.
 
     Args:
         name, inside: the camera; mean share of joints inside the mask.
@@ -58,32 +61,38 @@ class CameraScore:
 
     def wrong(self, limits: Limits) -> bool:
         """Whether calibration or masks are wrong as a whole."""
+        # Without a known joint the share is NaN, which is wrong as well.
         outside = not self.inside >= limits.inside_error
         return outside or self.beaten(limits) or self.oversized(limits)
 
     def close_rivals(self, limits: Limits) -> list[str]:
         """The other calibrations that fit about as well as the best."""
-        least = self.best_rival - limits.better_fit
-        return [name for name, overlap in self.rivals.items() if overlap > least]
+        lowest = self.best_rival - limits.better_fit
+        return [name for name, overlap in self.rivals.items() if overlap > lowest]
 
 
 def score_cameras(subject: CheckedData, views: Sequence[MaskView]) -> list[CameraScore]:
     """Scores every camera of which an image could be read."""
     scores = []
     for name, own in grouped(views).items():
+        # Each rival's better variant, best rival first.
         chosen = spread(own, TRIED)
         camera = subject.cameras[name]
         rivals = dict[str, float]()
         for rival, other in calibrations(camera, subject.cameras):
             rivals[rival] = max(rivals.get(rival, 0.0), _fit(subject, chosen, other))
+        best_first = sorted(rivals.items(), key=lambda rival: -rival[1])
+
+        # Empty masks tell nothing about joints.
+        filled = [view for view in own if view.mask.any()]
         scores.append(
             CameraScore(
                 name,
-                known_mean(view.inside for view in own if view.mask.any()),
-                _fit(subject, chosen, camera),
-                float(np.median([view.fullness for view in own])),
-                dict(sorted(rivals.items(), key=lambda rival: -rival[1])),
-                known_mean(view.distance for view in own if view.mask.any()),
+                inside=known_mean(view.inside for view in filled),
+                overlap=_fit(subject, chosen, camera),
+                fullness=float(np.median([view.fullness for view in own])),
+                rivals=dict(best_first),
+                outside=known_mean(view.distance for view in filled),
             )
         )
     return scores
@@ -96,6 +105,7 @@ def calibrations(
 
     Of another camera either R and t are exchanged, or the whole calibration.
     """
+    # u becomes width - u.
     mirror = own.K.copy()
     mirror[0] = -mirror[0]
     mirror[0, 2] += own.size[1]
@@ -110,18 +120,19 @@ def _fit(subject: CheckedData, views: Sequence[MaskView], camera: CameraEntry) -
     """Mean overlap of the masks with the silhouettes estimated for a camera."""
     overlaps = []
     for view in views:
+        # The silhouette that this camera would see.
         row = subject.rows[view.frame]
-        skeleton = subject.p[row], subject.visible[row], subject.template
-        overlaps.append(
-            overlap(view.mask, body_silhouette(view.small(camera), *skeleton))
+        body = body_silhouette(
+            view.small(camera), subject.p[row], subject.visible[row], subject.template
         )
+        overlaps.append(overlap(view.mask, body))
     return float(np.mean(overlaps))
 
 
 def known_mean(values: Iterable[float]) -> float:
-    """Mean without NaN; NaN when nothing is left."""
-    kept = [v for v in values if not np.isnan(v)]
-    return float(np.mean(kept)) if kept else np.nan
+    """The mean of the values that are not NaN; NaN if there are none."""
+    known = [value for value in values if not np.isnan(value)]
+    return float(np.mean(known)) if known else np.nan
 
 
 def calibration_findings(
@@ -130,24 +141,28 @@ def calibration_findings(
     min_inside: float,
     named: Iterable[str] = (),
 ) -> list[Finding]:
-    """Which camera is wrong, and the usual causes; other findings name ``named`` already."""
+    """Findings on wrong cameras and the usual causes; other findings name ``named`` already."""
     found = list[Finding]()
     named = set(named)
-    if big := [s for s in scores if s.oversized(limits) and s.name not in named]:
-        sizes = listed(f"{s.name} {s.fullness:.1f}" for s in big)
+
+    # Masks far larger than the body: one finding for all of them, which then do not count.
+    big = [s for s in scores if s.oversized(limits) and s.name not in named]
+    if big:
+        sizes = listed(f"{score.name} {score.fullness:.1f}" for score in big)
         text = (
             f"masks are far larger than the body (times its area: {sizes}): a focal length that is "
             "too short, K of smaller images, a skeleton in another unit, or masks of more"
         )
         found.append(Finding("error", TOPIC, text))
-        named |= {s.name for s in big}
-        scores = [s for s in scores if s not in big]
-    beaten = [s for s in scores if s.beaten(limits)]
+        named.update(score.name for score in big)
+        scores = [score for score in scores if score not in big]
+
+    # Pairs that fit better with each other's calibration.
+    beaten = [score for score in scores if score.beaten(limits)]
     for one, other in combinations(beaten, 2):
-        close = other.name in one.close_rivals(
-            limits
-        ) and one.name in other.close_rivals(limits)
-        if close and not {one.name, other.name} & named:
+        if one.name in named or other.name in named:
+            continue
+        if _exchanged(one, other, limits):
             text = (
                 f"cameras {one.name} and {other.name} look exchanged: the R and t of the other "
                 f"would fit the masks better (overlap {one.rivals[other.name]:.2f} and "
@@ -155,49 +170,64 @@ def calibration_findings(
                 " exchange them in the calibration, or rename the folders"
             )
             found.append(Finding("error", TOPIC, text))
-            named |= {one.name, other.name}
-    off = [s for s in scores if not s.inside >= min_inside]
+            named.update((one.name, other.name))
+
+    # All cameras are off, so no single one is the cause.
+    off = [score for score in scores if not score.inside >= min_inside]
     if len(scores) > 1 and not beaten and not big and off == scores:
-        shares = listed(f"{s.name} {s.inside:.0%}" for s in scores)
+        shares = listed(f"{score.name} {score.inside:.0%}" for score in scores)
         text = (
             f"in every camera joints lie outside the masks (inside: {shares}): axes, unit, size or "
             "frame numbers of the skeleton are wrong, K does not follow a crop, or the masks "
             "belong to other images"
         )
-        wrong = any(s.wrong(limits) for s in scores)
+        wrong = any(score.wrong(limits) for score in scores)
         return [Finding("error" if wrong else "warning", TOPIC, text)]
+
+    # Cameras that are off by themselves, then those that are slightly off.
+    fine = []
     for score in scores:
-        if score.name not in named and (
-            finding := _of_one(score, scores, limits, min_inside)
-        ):
+        if score.name in named:
+            continue
+        finding = _of_one(score, scores, limits, min_inside)
+        if finding:
             found.append(finding)
-            named.add(score.name)
-    return found + small_errors([s for s in scores if s.name not in named], limits)
+        else:
+            fine.append(score)
+    return found + small_errors(fine, limits)
+
+
+def _exchanged(one: CameraScore, other: CameraScore, limits: Limits) -> bool:
+    """Whether each of two cameras is among those that fit the other's masks best."""
+    first = other.name in one.close_rivals(limits)
+    return first and one.name in other.close_rivals(limits)
 
 
 def _of_one(
     score: CameraScore, scores: Sequence[CameraScore], limits: Limits, min_inside: float
 ) -> Finding | None:
-    """What is wrong with one camera, if anything."""
+    """The finding on one camera; None if nothing is wrong."""
     seen = f"{score.inside:.0%} of the joints lie inside its masks"
     if len(scores) > 1:
         others = known_mean(s.inside for s in scores if s is not score)
         seen += f", {others:.0%} in the other cameras"
+
     error = not score.inside >= limits.inside_error
     if score.beaten(limits):
+        # Another calibration fits better: which, and what to do.
         error = True
-        rivals = score.close_rivals(limits)
-        names = " or ".join(
-            n if n == MIRRORED else f"the calibration of {n}" for n in rivals
-        )
+        names = []
         advice = "check its R, t and folder name"
+        rivals = score.close_rivals(limits)
+        for rival in rivals:
+            mirrored = rival == MIRRORED
+            names.append(rival if mirrored else f"the calibration of {rival}")
         if MIRRORED in rivals:
-            advice = "mirror its images and masks back" + (
-                f", or {advice}" if rivals[1:] else ""
-            )
+            other = f", or {advice}" if len(rivals) > 1 else ""
+            advice = f"mirror its images and masks back{other}"
         text = (
-            f"{names} would fit its masks better (overlap {score.best_rival:.2f}) than its own "
-            f"calibration ({score.overlap:.2f}); {seen}; {advice}"
+            f"{' or '.join(names)} would fit its masks better (overlap {score.best_rival:.2f}) "
+            f"than its own calibration ({score.overlap:.2f}); {seen}; {advice}"
         )
     elif np.isnan(score.inside):
         text = "its masks are empty, or no joint lies in its images; check both folders and K"
@@ -215,8 +245,10 @@ def _of_one(
 
 
 def small_errors(scores: Sequence[CameraScore], limits: Limits) -> list[Finding]:
-    """Cameras, of those without other findings, whose joints lie just outside the masks."""
+    """Findings on cameras, of those without other ones, whose joints lie just outside the masks."""
     metres = {s.name: s.outside for s in scores if np.isfinite(s.outside)}
+
+    # Most cameras are off: the cause is common to them.
     middle = float(np.median(list(metres.values()) or [0]))
     if middle > OUTSIDE_ALL * limits.outside:
         text = (
@@ -224,10 +256,12 @@ def small_errors(scores: Sequence[CameraScore], limits: Limits) -> list[Finding]
             "captures: 0.1): focal lengths or unit slightly off, tight masks, or noisy landmarks"
         )
         return [Finding("warning", TOPIC, text)]
+
+    # One camera is off much more than the others.
     found = []
     for name, own in metres.items():
         rest = [value for other, value in metres.items() if other != name]
-        others = float(np.median(rest)) if rest else np.inf
+        others = float(np.median(rest)) if rest else np.inf  # one camera has no others
         if own > max(limits.outside, OUTSIDE_RATIO * others):
             text = (
                 f"camera {name}: joints lie {100 * own:.1f} cm outside its masks on average, "

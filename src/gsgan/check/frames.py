@@ -1,6 +1,6 @@
 """Doubtful frames, and the reasons: the skeleton over time, and masks of single images.
 
-Convention: ``p [F, J, 3]`` metres, NaN where a joint is not visible, frames in rising order. What
+Skeletons are ``p [F, J, 3]`` metres, NaN where a joint is not visible, frames in rising order. What
 cannot be measured (too few neighbours, joints not visible) is not flagged.
 """
 
@@ -18,6 +18,7 @@ from gsgan.data.validation import spans
 from gsgan.skeleton.template import SkeletonTemplate
 from gsgan.utils.arrays import Bool, Float, expect_array, nanmedian
 
+# of doubts, with their text
 KINDS = {
     "outside": "joints lie outside the mask",
     "mask": "the mask is not of the body's size",
@@ -29,9 +30,10 @@ KINDS = {
 }
 # a jump exceeds the upper quartile of all by this: low frame rates pass
 JUMP_RATIO = 4.0
-# that a limb must be off as well: noise moves the ends of short bones
+# metres that a limb must be off as well: noise moves the ends of short bones
 LIMB_METRES = 0.06
-MIRRORED = 0.5  # share of frames facing backwards: then all of them are exchanged
+# share of frames facing backwards: then left and right of all of them are exchanged
+MIRRORED = 0.5
 
 
 @dataclass(frozen=True)
@@ -55,41 +57,56 @@ def skeleton_doubts(subject: CheckedData, limits: Limits) -> list[Doubt]:
     ) -> None:
         """Adds the frames in which any of the flags ``[F, N]`` holds."""
         for row in np.flatnonzero(flags.any(1)).tolist():
-            texts = listed(
-                [text(row, i) for i in np.flatnonzero(flags[row]).tolist()], 3
-            )
+            places = np.flatnonzero(flags[row]).tolist()
+            texts = listed([text(row, place) for place in places], 3)
             found.append(Doubt(int(subject.frames[row]), kind, f"{what}{texts}"))
 
+    # Jumps, unless neighbours in the list are not neighbours in time.
     jump = jump_distance(p)
     gap = np.diff(subject.frames) != subject.step
-    jump[1:][gap] = jump[:-1][gap] = np.nan  # neighbours in the list, not in time
+    jump[1:][gap] = np.nan
+    jump[:-1][gap] = np.nan
     usual = float(np.quantile(np.nan_to_num(jump), 0.75))
     jumps = jumped(jump, max(limits.joint_jump, JUMP_RATIO * usual))
-    doubt("jump", "jumps: ", jumps, lambda row, j: f"{names[j]} {jump[row, j]:.2f} m")
+    doubt(
+        "jump",
+        "jumps: ",
+        jumps,
+        lambda row, joint: f"{names[joint]} {jump[row, joint]:.2f} m",
+    )
 
-    lengths = bone_lengths(p, template.limbs)
+    # Limbs that change their length.
+    lengths = bone_lengths(p, template.limbs)  # [F, limbs]
     typical = nanmedian(lengths)
     change = np.abs(lengths - typical) / np.maximum(typical, 1e-6)
     bones = [f"{names[a]} to {names[b]}" for a, b in template.limbs]
-    odd = (change > limits.limb_share) & (change * typical > LIMB_METRES)
     doubt(
         "limb",
         "length off its median: ",
-        odd,
-        lambda f, i: f"{bones[i]} {change[f, i]:.0%}",
+        (change > limits.limb_share) & (change * typical > LIMB_METRES),
+        lambda row, bone: f"{bones[bone]} {change[row, bone]:.0%}",
     )
 
-    backwards = facing(p, template)[:, None] < 0
+    # Left and right exchanged.
+    backwards = facing(p, template)[:, None] < 0  # [F, 1]
     doubt("backwards", "", backwards, lambda *_: "nose or toes point backwards")
 
-    seen = subject.visible.sum(1) / max(int(subject.visible.any(0).sum()), 1)
+    # Few of the joints that are ever seen.
+    joints = int(subject.visible.any(0).sum())
+    seen = subject.visible.sum(1) / max(joints, 1)
     few = seen[:, None] < limits.seen_share
     doubt("unseen", "", few, lambda row, _: f"{seen[row]:.0%} of the joints seen")
+
+    # Joints far from 2D detections, as a share of the median focal length.
     pixels = reprojection_errors(subject)
-    focal = float(np.median([camera.K[0, 0] for camera in subject.cameras.values()]))
-    off = pixels > limits.reprojection * focal
+    focal = np.median([camera.K[0, 0] for camera in subject.cameras.values()])
     text = "{} {:.0f} px from 2D detections"
-    doubt("detections", "", off, lambda row, j: text.format(names[j], pixels[row, j]))
+    doubt(
+        "detections",
+        "",
+        pixels > limits.reprojection * float(focal),
+        lambda row, joint: text.format(names[joint], pixels[row, joint]),
+    )
     return found
 
 
@@ -99,17 +116,19 @@ def reprojection_errors(subject: CheckedData) -> Float:
     They are ``reproj_px`` of landmarks3d.npz, the mean over cameras, as `gsgan.prepare` writes it.
 
     Raises:
-        DataError: when it has another shape than the joints.
+        DataError: if the array has another shape than the joints.
     """
     result = np.full(subject.visible.shape, np.nan)
     path = subject.layout.root / "landmarks3d.npz"
-    arrays = read_arrays(path, ("reproj_px", "frame_id")) if path.is_file() else {}
+    if not path.is_file():
+        return result
+    arrays = read_arrays(path, ("reproj_px", "frame_id"))
     if "reproj_px" in arrays:
         ids = expect_array(arrays, "frame_id", (None,), path)
-        stored = expect_array(
-            arrays, "reproj_px", (len(ids), len(subject.template.names)), path
-        )
+        shape = (len(ids), len(subject.template.names))
+        stored = expect_array(arrays, "reproj_px", shape, path)
         for number, row in zip(ids.tolist(), stored, strict=True):
+            # The file also has frames that were dropped.
             if number in subject.rows:
                 result[subject.rows[number]] = row
     return np.where(subject.visible, result, np.nan)
@@ -118,25 +137,28 @@ def reprojection_errors(subject: CheckedData) -> Float:
 def mask_doubts(
     views: Sequence[MaskView], limits: Limits, unfit: Collection[str] = ()
 ) -> Iterable[Doubt]:
-    """Reasons to doubt masks; those of ``unfit`` cameras do not fit in any frame."""
+    """Reasons to doubt masks, without the cameras ``unfit``, whose masks fit in no frame."""
     for name, own in grouped(views).items():
-        full = [view.fullness for view in own if view.mask.any()]
-        usual = float(np.median(full)) if full else 0.0
-        for view in own if name not in unfit else ():
-            known = int(view.known.sum())
-            out = int(view.beyond.sum())
+        if name in unfit:
+            continue
+
+        # The usual area of this camera's masks, relative to the body's.
+        areas = [view.fullness for view in own if view.mask.any()]
+        usual = float(np.median(areas)) if areas else 0.0
+        for view in own:
             if not view.mask.any():
                 yield Doubt(view.frame, "mask", f"{name}: the mask is empty")
                 continue
+            known = int(view.known.sum())
+            out = int(view.beyond.sum())
             if known and out / known > limits.frame_outside:
                 text = f"{name}: {out} of {known} joints outside the mask"
                 yield Doubt(view.frame, "outside", text)
-            change = view.fullness / usual - 1 if usual else 0.0
+
             # With few joints the estimated silhouette is too incomplete to compare the mask with.
-            if (
-                known >= limits.seen_share * len(view.known)
-                and abs(change) > limits.area_jump
-            ):
+            change = view.fullness / usual - 1 if usual else 0.0
+            enough = known >= limits.seen_share * len(view.known)
+            if enough and abs(change) > limits.area_jump:
                 text = f"{name}: mask area {change:+.0%} off the usual for the pose"
                 yield Doubt(view.frame, "mask", text)
 
@@ -144,10 +166,15 @@ def mask_doubts(
 def frame_findings(
     subject: CheckedData, found: Sequence[Doubt], limits: Limits
 ) -> list[Finding]:
-    """One finding per kind of doubt; an error when left and right, or most frames, are wrong."""
+    """One finding per kind of doubt; an error if left and right, or most frames, are wrong."""
     findings = []
     count = len(subject.frames)
-    backwards = sum(doubt.kind == "backwards" for doubt in found) / count
+    by_kind: dict[str, list[Doubt]] = {}
+    for doubt in found:
+        by_kind.setdefault(doubt.kind, []).append(doubt)
+
+    # Most frames face backwards: one error in place of many warnings.
+    backwards = len(by_kind.get("backwards", [])) / count
     mirrored = backwards > MIRRORED
     if mirrored:
         text = (
@@ -155,8 +182,10 @@ def frame_findings(
             "and right are exchanged, or images were mirrored"
         )
         findings.append(Finding("error", "skeleton", text))
+
+    # A warning per kind, with the first frame's text.
     for kind, what in KINDS.items():
-        some = [doubt for doubt in found if doubt.kind == kind]
+        some = by_kind.get(kind)
         if some and not (mirrored and kind == "backwards"):
             frames = sorted({doubt.frame for doubt in some})
             text = (
@@ -164,6 +193,7 @@ def frame_findings(
                 f"(frame {some[0].frame}: {some[0].text})"
             )
             findings.append(Finding("warning", "frames", text))
+
     share = len({doubt.frame for doubt in found}) / count
     if share > limits.doubtful and not mirrored:
         text = f"{share:.0%} of the frames are doubtful; training on them is not worth its time"
@@ -173,8 +203,10 @@ def frame_findings(
 
 def shortened(frames: Sequence[int], most: int = 8) -> str:
     """Frame numbers as ranges, the rest of a long list left out."""
+    # Ranges count, not frames.
     ranges = spans(list(frames)).split(", ")
-    return ", ".join(ranges[:most]) + (" …" if len(ranges) > most else "")
+    text = ", ".join(ranges[:most])
+    return f"{text} …" if len(ranges) > most else text
 
 
 def jump_distance(p: Float) -> Float:
@@ -183,37 +215,47 @@ def jump_distance(p: Float) -> Float:
     A steady motion gives 0 at any speed; the first and last frame are unknown.
     """
     distance = np.full(p.shape[:2], np.nan)
-    distance[1:-1] = np.linalg.norm(p[1:-1] - (p[:-2] + p[2:]) / 2, axis=-1)
+    midpoint = (p[:-2] + p[2:]) / 2  # [F - 2, J, 3]
+    distance[1:-1] = np.linalg.norm(p[1:-1] - midpoint, axis=-1)
     return distance
 
 
 def jumped(distance: Float, limit: float) -> Bool:
-    """``[F, J]`` the peaks of `jump_distance` beyond the limit.
+    """``[F, J]`` whether `jump_distance` has a peak beyond the limit.
 
     A stray frame also moves its neighbours' midpoints, by half as much; only the peak counts.
     """
+    # A row of zeros before and after: the first and last frame have one neighbour.
     known = np.pad(np.nan_to_num(distance), ((1, 1), (0, 0)))
     before = known[:-2]
     here = known[1:-1]
     after = known[2:]
-    return np.asarray((here > limit) & (here >= before) & (here >= after))
+    peak = (here >= before) & (here >= after)
+    return np.asarray((here > limit) & peak)
 
 
 def facing(p: Float, template: SkeletonTemplate) -> Float:
     """``[F]`` positive where nose and toes lie before the trunk, negative behind; NaN unknown.
 
     The trunk's front follows from its left and right; nose against ears and toes against ankles
-    show the true one. All frames negative: left and right are exchanged throughout.
+    show the true front. If all frames are negative, left and right are exchanged throughout.
     """
-    l_sh, r_sh, l_hip, r_hip = (p[:, j] for j in template.torso)
-    front = np.cross(l_sh - r_sh, l_sh + r_sh - l_hip - r_hip)
+    # The trunk's front: from right to left, crossed with up.
+    left_shoulder, right_shoulder, left_hip, right_hip = template.torso
+    shoulders = p[:, left_shoulder] + p[:, right_shoulder]
+    across = p[:, left_shoulder] - p[:, right_shoulder]
+    front = np.cross(across, shoulders - p[:, left_hip] - p[:, right_hip])
+
+    # The directions of face and feet.
     index = template.names.index
-    ends = [(list(template.ears), template.nose)]
-    ends += [
-        ([index(f"{s}_ankle")], index(f"{s}_foot_index")) for s in ("left", "right")
-    ]
-    ahead = np.stack([p[:, tip] - p[:, behind].mean(1) for behind, tip in ends])
-    votes = np.sign((ahead * front).sum(-1))
+    ears = list(template.ears)
+    ahead = [p[:, template.nose] - p[:, ears].mean(1)]
+    for side in ("left", "right"):
+        toe = p[:, index(f"{side}_foot_index")]
+        ahead.append(toe - p[:, index(f"{side}_ankle")])
+
+    # The mean of the known votes.
+    votes = np.sign((np.stack(ahead) * front).sum(-1))  # [3, F]
     known = np.isfinite(votes)
     votes = np.where(known, votes, 0.0).sum(0) / known.sum(0).clip(1)
     return np.where(known.any(0), votes, np.nan)

@@ -4,7 +4,6 @@ from collections.abc import Collection, Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from gsgan.check.views import CheckedData, MaskView
 from gsgan.data.crop import NEAR, Crop, project, resize, take, undistort_map
@@ -15,9 +14,12 @@ from gsgan.skeleton.hands import HAND
 from gsgan.utils.arrays import Bytes, Float
 from gsgan.utils.images import caption, encode
 
-HEIGHT = 360  # pixels of a tile
-ASPECT = 0.75  # width to height of a tile: a standing person
-MARGIN = 0.08  # of the box about person and skeleton, on each side
+# pixels of a tile
+HEIGHT = 360
+# width to height of a tile: a standing person
+ASPECT = 0.75
+# of the box around person and skeleton, on each side
+MARGIN = 0.08
 # RGB, the person's sides
 LEFT = (60, 150, 255)
 RIGHT = (255, 140, 40)
@@ -25,7 +27,8 @@ MIDDLE = (240, 240, 240)
 OUTLINE = (70, 255, 90)
 OUTSIDE = (255, 40, 60)
 NEUTRAL = (70, 70, 70)
-GAP = 4  # pixels between tiles
+# pixels between tiles
+GAP = 4
 LEGEND = (
     "Green: the mask's outline. Blue: the person's left, orange: the right, white: the middle; "
     "red rings: joints outside the mask; small dots: hands and face. Images are cropped to the "
@@ -39,68 +42,72 @@ def strip(
     """A row of at least one tile as a JPEG; captions of ``doubtful`` frames are red."""
     tiles = []
     for view in views:
+        # The caption counts the joints inside the mask.
         known = int(view.known.sum())
         out = int(view.beyond.sum())
         text = f"{view.frame}   {known - out}/{known} inside"
         colour = OUTSIDE if view.frame in doubtful else NEUTRAL
         captioned = caption(tile(subject, view), text, colour)
         tiles += [captioned, np.full((len(captioned), GAP, 3), 255, np.uint8)]
+
+    # Without the gap after the last tile.
     return encode(np.concatenate(tiles[:-1], axis=1))
 
 
 def tile(subject: CheckedData, view: MaskView) -> Bytes:
-    """``[HEIGHT, 0.75 HEIGHT, 3]`` RGB: the image about the person, with overlays."""
+    """``[HEIGHT, 0.75 HEIGHT, 3]`` RGB: the image around the person, with overlays."""
     camera = subject.cameras[view.camera]
     row = subject.rows[view.frame]
-    joints, depth = project(camera, subject.p[row])
+    joints, depth = project(camera, subject.p[row])  # [J, 2], [J]
     drawn = subject.visible[row] & (depth > NEAR)
+
+    # Image and mask, undistorted, in the window around the person.
     window = person_window(view, joints[drawn], camera.size)
-    distorted = camera.distorted
-    mapping = undistort_map(camera.K, camera.dist, window) if distorted else None
-    item = (view.camera, view.frame)
+    mapping = None
+    if camera.distorted:
+        mapping = undistort_map(camera.K, camera.dist, window)
     size = (HEIGHT, round(HEIGHT * ASPECT))
-    image = resize(
-        take(read_colour(subject.layout.image_path(*item)), window, mapping, False),
-        size,
-        False,
-    )
-    mask = resize(
-        take(
-            read_mask(subject.layout.mask_files(*item), subject.layout.pixels),
-            window,
-            mapping,
-            False,
-        ),
-        size,
-        False,
-    )
+
+    def shown(image: Bytes) -> Bytes:
+        return resize(take(image, window, mapping, exact=False), size, exact=False)
+
+    layout = subject.layout
+    image = read_colour(layout.image_path(view.camera, view.frame))
+    canvas = np.ascontiguousarray(shown(image))
+    mask = read_mask(layout.mask_files(view.camera, view.frame), layout.pixels)
+    person = (shown(mask) > 127).astype(np.uint8)
+
+    # The mask's outline.
+    contours, _ = cv2.findContours(person, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(canvas, contours, -1, OUTLINE, 1, cv2.LINE_AA)
+
+    # Whole pixels of the tile, whose centres are whole numbers for OpenCV.
+    corner = (window.left, window.top)
     scale = np.array(size[::-1]) / np.array(window.size[::-1])
 
-    def placed(pixels: Float) -> NDArray[np.int32]:
-        at = (
-            np.clip(pixels, -FAR_PIXELS, FAR_PIXELS) - (window.left, window.top)
-        ) * scale
-        return np.round(at - 0.5).astype(np.int32)
+    def placed(pixels: Float) -> list[list[int]]:
+        at = (np.clip(pixels, -FAR_PIXELS, FAR_PIXELS) - corner) * scale
+        return np.round(at - 0.5).astype(np.int32).tolist()
 
-    canvas = np.ascontiguousarray(image)
-    person = (mask > 127).astype(np.uint8)
-    contours = cv2.findContours(person, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
-    cv2.drawContours(canvas, contours, -1, OUTLINE, 1, cv2.LINE_AA)
+    # Bones with a black rim, in the colour of their side.
     at = placed(joints)
     names = subject.template.names
     for a, b in subject.template.edges:
         if drawn[a] and drawn[b]:
-            ends = (at[a].tolist(), at[b].tolist())
+            cv2.line(canvas, at[a], at[b], (0, 0, 0), 3, cv2.LINE_AA)
             colour = _side(names[a], names[b])
-            cv2.line(canvas, *ends, (0, 0, 0), 3, cv2.LINE_AA)
-            cv2.line(canvas, *ends, colour, 1, cv2.LINE_AA)
+            cv2.line(canvas, at[a], at[b], colour, 1, cv2.LINE_AA)
+
+    # Joints, with a ring around those outside the mask.
     for joint in np.flatnonzero(drawn).tolist():
-        cv2.circle(canvas, at[joint].tolist(), 2, _side(names[joint]), -1, cv2.LINE_AA)
+        cv2.circle(canvas, at[joint], 2, _side(names[joint]), -1, cv2.LINE_AA)
         if view.beyond[joint]:
-            cv2.circle(canvas, at[joint].tolist(), 6, OUTSIDE, 2, cv2.LINE_AA)
+            cv2.circle(canvas, at[joint], 6, OUTSIDE, 2, cv2.LINE_AA)
+
+    # Hands and face as dots.
     for p, colour in _hands_and_face(subject, view.frame):
         pixels, depth = project(camera, p)
-        for centre in placed(pixels[depth > NEAR]).tolist():
+        for centre in placed(pixels[depth > NEAR]):
             cv2.circle(canvas, centre, 1, colour, -1, cv2.LINE_AA)
     return canvas
 
@@ -108,35 +115,40 @@ def tile(subject: CheckedData, view: MaskView) -> Bytes:
 def _hands_and_face(
     subject: CheckedData, frame: int
 ) -> list[tuple[Float, tuple[int, int, int]]]:
-    """The landmarks seen ``[N, 3]`` of the left hand, the right hand and the face, with colours."""
+    """The visible landmarks ``[N, 3]`` of left hand, right hand and face, with their colours."""
     found = []
     hands = subject.layout.hands
     face = subject.layout.face
     if hands is not None and frame in hands.p:
+        p = hands.p[frame]
         seen = hands.visibility[frame] > 0
-        for part, colour in ((slice(HAND), LEFT), (slice(HAND, None), RIGHT)):
-            found.append((hands.p[frame][part][seen[part]], colour))
+        found.append((p[:HAND][seen[:HAND]], LEFT))
+        found.append((p[HAND:][seen[HAND:]], RIGHT))
     if face is not None and frame in face.p:
         found.append((face.seen(frame), MIDDLE))
     return found
 
 
 def person_window(view: MaskView, joints: Float, size: tuple[int, int]) -> Crop:
-    """The window about mask and joints ``[M, 2]``, of the tiles' aspect."""
-    points = [np.clip(joints, 0, np.array(size[::-1]))]
+    """The window around mask and joints ``[M, 2]``, with the aspect of a tile."""
+    # The joints inside the image, and the corners of the mask's box in pixels of the whole image.
+    limit = np.array(size[::-1])
+    points = [np.clip(joints, 0, limit)]
     rows, columns = np.nonzero(view.mask)
     if len(rows):
-        small = np.array(
-            [[columns.min(), rows.min()], [columns.max() + 1, rows.max() + 1]]
-        )
+        first = (columns.min(), rows.min())
+        last = (columns.max() + 1, rows.max() + 1)
+        small = np.array([first, last])
         points.append((small - view.to_small[:2, 2]) / np.diag(view.to_small)[:2])
     box = np.concatenate(points)
     if len(box) == 0:
-        box = np.array([[0, 0], size[::-1]])
+        box = np.array([(0, 0), limit])
+
+    # Margins, then the longer side decides.
     low = box.min(0)
     high = box.max(0)
-    span = np.maximum((high - low) * (1 + 2 * MARGIN), 8)
-    height = max(span[1], span[0] / ASPECT)
+    across, along = np.maximum((high - low) * (1 + 2 * MARGIN), 8)
+    height = max(along, across / ASPECT)
     width = height * ASPECT
     left, top = (low + high) / 2 - (width / 2, height / 2)
     return Crop(int(np.floor(top)), int(np.floor(left)), (round(height), round(width)))
@@ -145,6 +157,7 @@ def person_window(view: MaskView, joints: Float, size: tuple[int, int]) -> Crop:
 def _side(*names: str) -> tuple[int, int, int]:
     """The colour of the person's side that all of these joints are on."""
     for side, colour in (("left", LEFT), ("right", RIGHT)):
+        # A bone between two sides, such as the shoulders, is in the middle.
         if all(side in name for name in names):
             return colour
     return MIDDLE

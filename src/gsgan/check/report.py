@@ -12,8 +12,10 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
+# rich's styles by level
 STYLES = {"error": "bold red", "warning": "yellow"}
 
+# Jinja's template of the page
 PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
@@ -69,6 +71,7 @@ class Table:
 
     def for_terminal(self, title: str | None = None) -> RichTable:
         """The table as rich prints it."""
+        # Text() keeps brackets in names from being read as markup.
         drawn = RichTable(title=title, title_justify="left", title_style="bold")
         for header in self.headers:
             drawn.add_column(header, overflow="fold")
@@ -103,7 +106,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Report:
-    """Everything that was found in a folder; ``numbers`` are the scores, plain values for JSON."""
+    """All findings on a folder; ``numbers`` are the scores, plain values for JSON."""
 
     root: str
     sections: tuple[Section, ...]
@@ -112,13 +115,16 @@ class Report:
     @property
     def findings(self) -> tuple[Finding, ...]:
         """All findings, errors first."""
-        found = [f for section in self.sections for f in section.findings]
-        return tuple(sorted(found, key=lambda f: f.level != "error"))
+        found: list[Finding] = []
+        for section in self.sections:
+            found += section.findings
+        # Sorting keeps the order of the sections within each level.
+        return tuple(sorted(found, key=lambda finding: finding.level != "error"))
 
     @property
     def errors(self) -> int:
         """Number of findings that are errors."""
-        return sum(f.level == "error" for f in self.findings)
+        return sum(finding.level == "error" for finding in self.findings)
 
     @property
     def warnings(self) -> int:
@@ -128,25 +134,30 @@ class Report:
     @property
     def verdict(self) -> str:
         """One line: the number of errors and warnings."""
+        # One sentence for the page and the terminal.
         if not self.findings:
             return "nothing wrong was found"
         return f"{counted(self.errors, 'error')}, {counted(self.warnings, 'warning')}"
 
 
 def counted(number: int, noun: str) -> str:
-    """ "1 error", "2 errors"."""
-    return f"{number} {noun}{'' if number == 1 else 's'}"
+    """A number and its noun: "1 error", "2 errors"."""
+    plural = "" if number == 1 else "s"
+    return f"{number} {noun}{plural}"
 
 
 def listed(names: Iterable[object], most: int = 6) -> str:
     """Names with commas, the rest of a long list counted."""
-    shown = [str(name) for name in names]
-    more = f" and {len(shown) - most} more" if len(shown) > most else ""
-    return ", ".join(shown[:most]) + more
+    shown = list(map(str, names))
+    text = ", ".join(shown[:most])
+    if len(shown) > most:
+        text += f" and {len(shown) - most} more"
+    return text
 
 
 def page(report: Report) -> str:
     """The report as one HTML file: no scripts, images embedded, nothing fetched."""
+    # Names from the dataset are escaped.
     environment = Environment(autoescape=True, trim_blocks=True)
     colour = "error" if report.errors else "warning" if report.warnings else "good"
     return environment.from_string(PAGE).render(report=report, colour=colour)
@@ -155,8 +166,11 @@ def page(report: Report) -> str:
 def print_report(report: Report, console: Console) -> None:
     """Prints the tables of every section, then the findings, errors last, near the prompt."""
     for section in report.sections:
+        # The first table of a section has its title.
         for i, table in enumerate(section.tables):
             console.print(table.for_terminal(None if i else section.title))
+
+    # The most severe findings come last, next to the prompt.
     for finding in reversed(report.findings):
         start = Text(f"{finding.level}, {finding.topic}: ", STYLES[finding.level])
         console.print(start.append(finding.sentence, "default not bold"))

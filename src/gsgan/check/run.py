@@ -41,7 +41,7 @@ def check_data(
         console: shows the progress.
 
     Returns:
-        The report; of a dataset that cannot be read it has the reader's message.
+        The report; if a dataset cannot be read, it has the reader's message.
 
     Raises:
         ConfigError: when the data's config is wrong.
@@ -58,7 +58,7 @@ def check_data(
 
 
 def unreadable(root: str | None, error: DataError) -> Report:
-    """Why the reader refuses a dataset."""
+    """The report of a dataset that the reader refuses, with the reason."""
     section = Section(
         "The dataset cannot be read",
         findings=(Finding("error", "reading", str(error)),),
@@ -84,6 +84,7 @@ def run_check(config: DictConfig) -> Report:
     Raises:
         ConfigError: on a config value that does not fit.
     """
+    # The report is the result of the command, so it must have a place.
     if not config.report:
         raise ConfigError(
             "report is not set: give the HTML file to write, e.g. report=check.html"
@@ -99,6 +100,7 @@ def run_check(config: DictConfig) -> Report:
             instantiate(config.data), sampling, limits, effects, console
         )
     except InstantiationException as error:
+        # Hydra wraps the error of a dataset that is made when it is instantiated.
         if not isinstance(error.__cause__, DataError):
             raise
         report = unreadable(config.data.get("root"), error.__cause__)
@@ -112,6 +114,7 @@ def write_report(report: Report, path: Path, console: Console) -> None:
     Raises:
         DataError: when a file cannot be written.
     """
+    # The content of the JSON file.
     content = {
         "root": report.root,
         "errors": report.errors,
@@ -119,6 +122,8 @@ def write_report(report: Report, path: Path, console: Console) -> None:
         "findings": [asdict(finding) for finding in report.findings],
         **report.numbers,
     }
+
+    # The page, the numbers next to it, then the terminal.
     with writing(path):
         write_atomically(path, page(report))
     write_json(path.with_suffix(".json"), content)

@@ -23,15 +23,17 @@ from gsgan.skeleton.sanitise import limb_length_sum
 from gsgan.utils.arrays import Float, nanmedian
 from gsgan.utils.errors import DataError
 
-POSSIBLE = (0.4, 3.0)  # metres of person: outside, units are wrong
-PLAUSIBLE = (1.2, 2.1)  # metres: smaller is a child or a wrong unit, taller is rare
+# metres of person: outside, units are wrong
+POSSIBLE = (0.4, 3.0)
+# metres: smaller is a child or a wrong unit, taller is rare
+PLAUSIBLE = (1.2, 2.1)
 # degrees from trunk to up axis, median over frames: nobody stands like that
 LEAN = 50.0
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """Where cameras and person are.
+    """Distances, sizes and directions of cameras and person.
 
     Args:
         distances: metres from the person, by camera.
@@ -49,46 +51,53 @@ class Geometry:
     @property
     def distance(self) -> float:
         """Metres, of the median camera."""
-        return float(np.median(list(self.distances.values())))
+        metres = list(self.distances.values())
+        return float(np.median(metres))
 
 
 def geometry_of(subject: CheckedData) -> Geometry:
     """Measures the cameras and the person."""
     template = subject.template
-    p = subject.seen_p
-    sums = limb_length_sum(
-        torch.from_numpy(subject.p), torch.from_numpy(subject.visible), template
-    )
-    shoulders = p[:, list(template.shoulders)].mean(1)
-    hips = p[:, list(template.hips)].mean(1)
-    trunk = shoulders - hips
-    axis = nanmedian(trunk / np.linalg.norm(trunk, axis=-1, keepdims=True))
-    axis = axis if np.isfinite(axis).all() else subject.up
-    cosine = axis @ subject.up / np.linalg.norm(axis)
+
+    # Height from the length of limbs, in the template's proportions.
+    p = torch.from_numpy(subject.p)
+    visible = torch.from_numpy(subject.visible)
+    limbs = float(limb_length_sum(p, visible, template).nanmedian())
+    stature = limbs / template.limb_length_sum * template.stature
+
+    # The median direction of the trunk, and its angle to the up axis.
+    seen_p = subject.seen_p
+    shoulders = seen_p[:, list(template.shoulders)].mean(1)
+    hips = seen_p[:, list(template.hips)].mean(1)
+    trunk = shoulders - hips  # [F, 3]
+    up = nanmedian(trunk / np.linalg.norm(trunk, axis=-1, keepdims=True))
+    if not np.isfinite(up).all():
+        up = subject.up
+    cosine = up @ subject.up / np.linalg.norm(up)
+    lean = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+
+    # Distances from the median joint. Of two cameras neither is the median one.
     centre = np.median(subject.p[subject.visible], axis=0)
-    distances = {
-        n: float(np.linalg.norm(c.centre - centre)) for n, c in subject.cameras.items()
-    }
-    return Geometry(
-        distances=distances,
-        stature=float(sums.nanmedian()) / template.limb_length_sum * template.stature,
-        up=axis,
-        lean=float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))),
-        # Of two cameras neither is the median one.
-        far=far_cameras(distances, subject.consistency.far_camera)
-        if len(distances) > 2
-        else {},
-    )
+    distances = {}
+    for name, camera in subject.cameras.items():
+        distances[name] = float(np.linalg.norm(camera.centre - centre))
+    far = {}
+    if len(distances) > 2:
+        far = far_cameras(distances, subject.consistency.far_camera)
+    return Geometry(distances, stature, up, float(lean), far)
 
 
 def geometry_findings(subject: CheckedData, geometry: Geometry) -> list[Finding]:
-    """Implausible units, a camera in another unit, an up axis that is not up."""
+    """Findings on implausible units, a camera in another unit, and an up axis that is not up."""
     found = [Finding("error", "units", text) for text in geometry.far.values()]
+
+    # A height that is impossible, or only unlikely.
     stature = geometry.stature
     if not PLAUSIBLE[0] <= stature <= PLAUSIBLE[1]:
         text = f"limb lengths suggest a person of {stature:.3g} m; check unit and joint order"
         possible = POSSIBLE[0] <= stature <= POSSIBLE[1]
         found.append(Finding("warning" if possible else "error", "units", text))
+
     if geometry.lean > LEAN:
         way = axis_name(geometry.up)
         axis = subject.layout.meta.up_axis
@@ -98,7 +107,8 @@ def geometry_findings(subject: CheckedData, geometry: Geometry) -> list[Finding]
 
 
 def geometry_table(subject: CheckedData, geometry: Geometry) -> Table:
-    """Units and sizes."""
+    """A table of units and sizes."""
+    # The nearest and the farthest camera.
     meta = subject.layout.meta
     distances = geometry.distances.values()
     near = min(distances)
@@ -117,17 +127,20 @@ def geometry_table(subject: CheckedData, geometry: Geometry) -> Table:
 
 
 def lens_table(subject: CheckedData, geometry: Geometry) -> Table:
-    """Size, lens and place, one row per camera."""
+    """A table of sizes, lenses and places, one row per camera."""
     rows = []
     for name, camera in subject.cameras.items():
-        (height, width), K = camera.size, camera.K
+        # Trailing zeros of the lens are not shown.
+        height, width = camera.size
+        K = camera.K
+        lens = [f"{c:.3g}" for c in np.trim_zeros(camera.dist, "b")]
         rows.append(
             (
                 name,
                 f"{width}×{height}",
                 f"{K[0, 0]:.0f}, {K[1, 1]:.0f}",
                 f"{K[0, 2] / width:.2f}, {K[1, 2] / height:.2f}",
-                " ".join(f"{c:.3g}" for c in np.trim_zeros(camera.dist, "b")) or "none",
+                " ".join(lens) or "none",
                 f"{geometry.distances[name]:.2f}",
                 str(len(subject.pairs[name])),
             )
@@ -147,8 +160,10 @@ def lens_table(subject: CheckedData, geometry: Geometry) -> Table:
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
 
+# damaged images listed
 LISTED_BROKEN = 6
-TABLE_FRAMES = 40  # doubtful frames listed
+# doubtful frames listed
+TABLE_FRAMES = 40
 AGREEMENT = (
     "Joints are compared with masks, undistorted. Overlap is that of the mask with the silhouette "
     "estimated from the skeleton (about 0.7 in a good capture); 'best other' is what the "
@@ -176,25 +191,34 @@ class Measurements:
         self.sampling = sampling
         self.limits = limits
         self.effects = effects
-        self.subject = subject = views.subject_of(data)
+        subject = views.subject_of(data)
+        self.subject = subject
+
+        # The sampled images, and those that were cut off; all are decoded once.
         items = views.sampled_items(subject, sampling.images)
         items += views.cut_items(subject, sampling.images)
         self.views, broken = views.measure(subject, items, sampling, console)
         if len(broken) > LISTED_BROKEN:
             broken[LISTED_BROKEN:] = [f"{len(broken)} sampled images cannot be read"]
         self.broken = [Finding("error", "files", text) for text in broken]
+
+        # Cameras, and the names of those that are wrong as a whole.
         self.geometry = geometry_of(subject)
         self.cameras = score_cameras(subject, self.views)
-        self.wrong = {
-            *self.geometry.far,
-            *(s.name for s in self.cameras if s.wrong(limits)),
-        }
+        self.wrong = set(self.geometry.far)
+        for score in self.cameras:
+            if score.wrong(limits):
+                self.wrong.add(score.name)
+
+        # The scene, for the effects; an error is among the findings already.
         self.info = None
         self.no_info = ""
         try:
             self.info = data.info
-        except DataError as error:  # named among the findings
+        except DataError as error:
             self.no_info = str(error)
+
+        # Doubtful frames with their reasons; masks of wrong cameras tell nothing.
         masks = mask_doubts(self.views, limits, self.wrong)
         doubts = [*skeleton_doubts(subject, limits), *masks]
         self.doubts = sorted(doubts, key=lambda doubt: doubt.frame)
@@ -204,12 +228,14 @@ class Measurements:
 
     def numbers(self) -> dict[str, object]:
         """The scores, for the JSON file."""
+        # Each camera with its three best rivals.
+        cameras = {}
+        for score in self.cameras:
+            best = list(score.rivals.items())[:3]
+            cameras[score.name] = asdict(score) | {"rivals": dict(best)}
         return {
             "readable": True,
-            "cameras": {
-                s.name: asdict(s) | {"rivals": dict(list(s.rivals.items())[:3])}
-                for s in self.cameras
-            },
+            "cameras": cameras,
             "camera_distance": self.geometry.distance,
             "stature": self.geometry.stature,
             "doubtful_frames": {
@@ -226,17 +252,17 @@ class Measurements:
 def sections(m: Measurements) -> tuple[Section, ...]:
     """Every section, in reading order."""
     units = (geometry_table(m.subject, m.geometry), lens_table(m.subject, m.geometry))
-    strips = [
-        Figure(
-            f"camera {name}",
-            overlays.strip(m.subject, spread(own, m.sampling.shown), m.reasons),
-        )
-        for name, own in views.grouped(m.views).items()
-    ]
-    found = tuple(geometry_findings(m.subject, m.geometry))
+    found = geometry_findings(m.subject, m.geometry)
+
+    # One strip of images per camera.
+    strips = []
+    for name, own in views.grouped(m.views).items():
+        shown = spread(own, m.sampling.shown)
+        image = overlays.strip(m.subject, shown, m.reasons)
+        strips.append(Figure(f"camera {name}", image))
     return (
         _contents(m),
-        Section("Units and cameras", units, found),
+        Section("Units and cameras", units, tuple(found)),
         _agreement(m),
         Section("Overlays", figures=tuple(strips), text=overlays.LEGEND),
         _frames(m),
@@ -245,22 +271,17 @@ def sections(m: Measurements) -> tuple[Section, ...]:
 
 
 def _contents(m: Measurements) -> Section:
-    """Counts, splits, missing and damaged images."""
+    """The section of counts, splits, missing and damaged images."""
     data = m.data
     subject = m.subject
-    names = m.subject.template.names
     layout = data.layout
     splits = data.splits
-    frames = [int(f) for f in subject.frames]
-    images = sum(len(files) for files in subject.pairs.values())
-    labels = sum(len(files) for files in layout.labels.values())
-    unseen = [
-        n for n, seen in zip(names, subject.visible.sum(0), strict=True) if not seen
-    ]
-    share_seen = f"{subject.visible.mean():.1%} seen"
-    skeleton = f"{len(names)} joints, {layout.meta.skeleton_source}; {share_seen}"
-    if unseen:
-        skeleton += f"; never seen: {', '.join(unseen)}"
+    frames = subject.frames.tolist()
+
+    # Cameras, frames and images.
+    images = sum(map(len, subject.pairs.values()))
+    labels = sum(map(len, layout.labels.values()))
+    poses = "none" if layout.poses is None else f"{len(layout.poses.theta)} frames"
     contents = [
         ("layout", layout.meta.layout),
         ("cameras", f"{len(subject.cameras)}: {', '.join(subject.cameras)}"),
@@ -270,58 +291,78 @@ def _contents(m: Measurements) -> Section:
             f"{images} of {len(frames) * len(subject.cameras)} (all with a mask)",
         ),
         ("part labels", f"{labels} images" if labels else "none"),
-        (
-            "body poses",
-            "none" if layout.poses is None else f"{len(layout.poses.theta)} frames",
-        ),
-        ("skeleton", skeleton),
+        ("body poses", poses),
+        ("skeleton", _skeleton(m)),
     ]
+
+    # The frames in which a hand or the face was seen.
     for part, landmarks in (("hands", layout.hands), ("face", layout.face)):
         if landmarks is not None:
-            seen = sum(
-                bool(v.any())
-                for f, v in landmarks.visibility.items()
-                if f in subject.rows
-            )
+            seen = 0
+            for frame, visibility in landmarks.visibility.items():
+                seen += frame in subject.rows and bool(visibility.any())
             contents.append((part, f"in {seen} of {len(frames)} frames"))
-    contents += [(f"split {name}", _split(data, name)) for name in splits.items]
+
+    # Splits, protocol and notes.
+    for name in splits.items:
+        contents.append((f"split {name}", _split(data, name)))
     if data.protocol is not None:
         contents.append(("protocol", data.protocol.name))
-    contents += [
-        ("note of the reader", note) for note in (*layout.notes, *splits.notes)
-    ]
+    for note in (*layout.notes, *splits.notes):
+        contents.append(("note of the reader", note))
+
+    # Damaged and missing images.
     found = [*m.broken]
     for name, files in subject.pairs.items():
-        if lacking := sorted(set(frames) - set(files)):
+        lacking = sorted(set(frames) - set(files))
+        if lacking:
             text = f"{len(lacking)} of the {len(frames)} frames: {shortened(lacking)}"
             found.append(Finding("warning", "files", f"camera {name} lacks {text}"))
-    return Section(
-        "Contents", (Table(("what", "how much"), tuple(contents)),), tuple(found)
-    )
+    table = Table(("what", "how much"), tuple(contents))
+    return Section("Contents", (table,), tuple(found))
+
+
+def _skeleton(m: Measurements) -> str:
+    """The number of joints, their origin, and those never seen."""
+    # Joints that no frame shows are named.
+    names = m.subject.template.names
+    visible = m.subject.visible
+    source = m.data.layout.meta.skeleton_source
+    text = f"{len(names)} joints, {source}; {visible.mean():.1%} seen"
+    unseen = np.array(names)[~visible.any(0)]
+    if len(unseen):
+        text += f"; never seen: {', '.join(unseen)}"
+    return text
 
 
 def _split(data: GsganData, name: str) -> str:
+    """The numbers of images and cameras of a split and its frames, or why it is empty."""
+    # An empty split has a reason.
     items = data.splits.items[name]
     if not items:
         return f"empty: {data.splits.reasons.get(name, '')}"
-    cameras = {camera for camera, _ in items}
-    frames = {frame for _, frame in items}
-    count = f"{counted(len(items), 'image')}: {counted(len(cameras), 'camera')}"
-    return f"{count}, frames {shortened(sorted(frames))}"
+    cameras = counted(len(items.cameras), "camera")
+    return (
+        f"{counted(len(items), 'image')}: {cameras}, frames {shortened(items.frames)}"
+    )
 
 
 def _agreement(m: Measurements) -> Section:
-    rows = tuple(
-        (
-            s.name,
-            f"{s.inside:.1%}",
-            "–" if np.isnan(s.outside) else f"{100 * s.outside:.1f}",
-            f"{s.overlap:.2f}",
-            f"{s.best_rival:.2f}",
-            f"{s.fullness:.2f}",
+    """The section of how well skeleton, masks and cameras fit together."""
+    rows = []
+    for score in m.cameras:
+        # In centimetres.
+        outside = "–" if np.isnan(score.outside) else f"{100 * score.outside:.1f}"
+        rows.append(
+            (
+                score.name,
+                f"{score.inside:.1%}",
+                outside,
+                f"{score.overlap:.2f}",
+                f"{score.best_rival:.2f}",
+                f"{score.fullness:.2f}",
+            )
         )
-        for s in m.cameras
-    )
     headers = (
         "camera",
         "joints inside mask",
@@ -330,31 +371,34 @@ def _agreement(m: Measurements) -> Section:
         "best other",
         "mask / body",
     )
+    table = Table(headers, tuple(rows))
     min_inside = m.subject.consistency.min_inside
     found = calibration_findings(m.cameras, m.limits, min_inside, m.geometry.far)
-    table = Table(headers, rows)
     return Section(
         "Skeleton, masks and cameras", (table,), tuple(found), text=AGREEMENT
     )
 
 
 def _frames(m: Measurements) -> Section:
-    table = tuple((str(frame), "; ".join(text)) for frame, text in m.reasons.items())
+    """The section of doubtful frames."""
+    rows = []
+    for frame, reasons in m.reasons.items():
+        rows.append((str(frame), "; ".join(reasons)))
+    tables: tuple[Table, ...] = ()
+    if rows:
+        tables = (Table(("frame", "why"), tuple(rows[:TABLE_FRAMES])),)
     text = (
-        f"{counted(len(table), 'frame')} of {len(m.subject.frames)}; skeletons were checked in all "
+        f"{counted(len(rows), 'frame')} of {len(m.subject.frames)}; skeletons were checked in all "
         f"frames, masks in {counted(len(m.views), 'image')}. At most {TABLE_FRAMES} are listed; "
         "the JSON file has all."
     )
-    return Section(
-        "Doubtful frames",
-        (Table(("frame", "why"), table[:TABLE_FRAMES]),) if table else (),
-        tuple(frame_findings(m.subject, m.doubts, m.limits)),
-        text=text,
-    )
+    findings = frame_findings(m.subject, m.doubts, m.limits)
+    return Section("Doubtful frames", tables, tuple(findings), text=text)
 
 
 def _effects(m: Measurements) -> Section:
-    """What training would turn on, by the same rules."""
+    """The section of effects that training would turn on, by the same rules."""
+    # The effects need the facts about the scene.
     title = "Effects that the scene calls for"
     if m.info is None:
         return Section(title, text=f"Not decided: {m.no_info}")

@@ -1,4 +1,4 @@
-"""How much is checked, and the thresholds; conf/check.yaml explains every field.
+"""The amount of data that is checked, and the thresholds; conf/check.yaml explains every field.
 
 Thresholds that a reader applies as well are those of `gsgan.data.formats.consistency.Consistency`.
 """
@@ -10,7 +10,7 @@ from gsgan.utils.checks import above
 
 @dataclass(frozen=True)
 class Sampling:
-    """How much of a dataset is checked: the cost.
+    """The amount of a dataset that is checked, which decides the cost.
 
     Raises:
         ConfigError: when a value is not a number above 0.

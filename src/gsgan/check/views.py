@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,20 +41,25 @@ if TYPE_CHECKING:
 
 # metres: distances of joints from the mask are clipped to this before they are averaged
 FAR = 0.3
-SMALL = 128  # pixels, longest side of the masks that calibrations are tried on
-TAIL = 64  # bytes: some writers append a few after the end mark
-END_MARKS = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8": b"\xff\xd9"}  # by first bytes
-FLESH = 0.07  # metres of body about every bone: between an arm and a thigh
-HEAD_RADIUS = 0.12  # metres about the middle of the face: half of a head's height
+# pixels, maximum side of the masks that calibrations are tried on
+SMALL = 128
+# bytes: some writers append a few after the end mark
+TAIL = 64
+# by the first bytes
+END_MARKS = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8": b"\xff\xd9"}
+# metres of body around every bone: between an arm and a thigh
+FLESH = 0.07
+# metres around the middle of the face: half of a head's height
+HEAD_RADIUS = 0.12
 
 
 @dataclass(frozen=True)
 class CheckedData:
-    """One dataset.
+    """The arrays of one dataset.
 
     Args:
         layout, consistency: the reader's index and thresholds.
-        frames, pairs: ``[F]`` rising frame numbers; those that exist, by camera.
+        frames, pairs: ``[F]`` rising frame numbers; the existing frames of each camera.
         p, visible: ``[F, J, 3]`` metres, finite; ``[F, J]``.
         up: ``[3]`` unit, the world's up axis.
         template: names of the joints and bones.
@@ -88,9 +92,9 @@ class CheckedData:
     @cached_property
     def step(self) -> int:
         """Frame numbers from one frame to the next: the median gap."""
-        return (
-            max(1, int(np.median(np.diff(self.frames)))) if len(self.frames) > 1 else 1
-        )
+        if len(self.frames) < 2:
+            return 1
+        return max(1, int(np.median(np.diff(self.frames))))
 
 
 def subject_of(data: GsganData) -> CheckedData:
@@ -101,29 +105,37 @@ def subject_of(data: GsganData) -> CheckedData:
     Raises:
         DataError: when it cannot be read.
     """
-    consistency = getattr(data.reader, "consistency", None) or Consistency()
-    if hasattr(data.reader, "consistency"):
-        reader: Any = data.reader  # one of the dataclasses of gsgan.data.formats
+    # One of the dataclasses of gsgan.data.formats, or a reader without such a comparison.
+    reader: Any = data.reader
+    consistency = Consistency()
+    if hasattr(reader, "consistency"):
+        consistency = reader.consistency
         data.reader = replace(reader, consistency=replace(consistency, frames=0))
+
     layout = data.layout
-    frames = np.array(layout.frames, np.int64)
+    pairs = {}
+    for name in layout.camera_names:
+        pairs[name] = tuple(sorted(layout.images[name]))
+    p = [layout.landmarks.p[frame] for frame in layout.frames]
+    visibility = [layout.landmarks.visibility[frame] for frame in layout.frames]
+
+    # The up axis is a name such as "-y".
     axis = layout.meta.up_axis
+    sign = -1.0 if axis.startswith("-") else 1.0
     return CheckedData(
         layout=layout,
         consistency=consistency,
-        frames=frames,
-        pairs={
-            name: tuple(sorted(layout.images[name])) for name in layout.camera_names
-        },
-        p=np.stack([layout.landmarks.p[int(f)] for f in frames]),
-        visible=np.stack([layout.landmarks.visibility[int(f)] for f in frames]) > 0,
-        up=np.eye(3)["xyz".index(axis[-1])] * (-1.0 if axis.startswith("-") else 1.0),
+        frames=np.array(layout.frames, np.int64),
+        pairs=pairs,
+        p=np.stack(p),
+        visible=np.stack(visibility) > 0,
+        up=np.eye(3)["xyz".index(axis[-1])] * sign,
     )
 
 
 @dataclass(frozen=True)
 class MaskView:
-    """What one image shows.
+    """The measures of one image.
 
     Args:
         camera, frame: of the image.
@@ -157,59 +169,67 @@ class MaskView:
 
     @property
     def distance(self) -> float:
-        """Metres, mean distance of the known joints from the mask; NaN of none."""
+        """Metres, mean distance of the known joints from the mask; NaN without any."""
         metres = np.minimum(self.outside[self.known], FAR)
         return float(metres.mean()) if len(metres) else np.nan
 
     @property
     def inside(self) -> float:
-        """Share of the known joints inside the mask, within the tolerance; NaN of none."""
-        return 1 - self.beyond.sum() / self.known.sum() if self.known.any() else np.nan
+        """Share of the known joints inside the mask, within the tolerance; NaN without any."""
+        known = self.known.sum()
+        return 1 - self.beyond.sum() / known if known else np.nan
 
 
 def grouped(views: Sequence[MaskView]) -> dict[str, list[MaskView]]:
     """The views by camera."""
-    return {
-        name: [v for v in views if v.camera == name]
-        for name in dict.fromkeys(v.camera for v in views)
-    }
+    groups: dict[str, list[MaskView]] = {}
+    for view in views:
+        groups.setdefault(view.camera, []).append(view)
+    return groups
 
 
 def sampled_items(subject: CheckedData, images: int) -> tuple[Item, ...]:
     """At most ``images`` items, at least one per camera: the same moments, evenly spaced."""
+    # The same moments in all cameras, as many as the budget allows.
     each = max(1, images // len(subject.pairs))
-    moments = set(spread([int(f) for f in subject.frames], each))
+    moments = set(spread(subject.frames.tolist(), each))
     items = []
     for name, files in subject.pairs.items():
-        chosen = [f for f in files if f in moments] or spread(files, each)
-        items += [(name, f) for f in chosen]
+        # A camera without these moments gives other ones.
+        chosen = [frame for frame in files if frame in moments] or spread(files, each)
+        for frame in chosen:
+            items.append((name, frame))
     return tuple(items)
 
 
 def cut_items(subject: CheckedData, most: int) -> tuple[Item, ...]:
     """At most ``most`` items with an image or mask file that was cut off; nothing is decoded."""
     layout = subject.layout
-    found = (
-        (name, frame)
-        for name, files in subject.pairs.items()
-        for frame in files
-        if not complete(layout.image_path(name, frame))
-        or not all(complete(path) for _, path in layout.mask_files(name, frame))
-    )
-    return tuple(islice(found, most))
+    found: list[Item] = []
+    for name, files in subject.pairs.items():
+        for frame in files:
+            if len(found) == most:
+                return tuple(found)
+            masks = [path for _, path in layout.mask_files(name, frame)]
+            if not all(map(complete, [layout.image_path(name, frame), *masks])):
+                found.append((name, frame))
+    return tuple(found)
 
 
 def complete(path: Path) -> bool:
     """Whether a PNG or JPEG has its end mark; True for other files, False when unreadable."""
     try:
         with path.open("rb") as stream:
+            # The first bytes tell the format, the last ones whether it is complete.
             start = stream.read(4)
             stream.seek(max(0, os.fstat(stream.fileno()).st_size - TAIL))
             tail = stream.read()
     except OSError:
         return False
-    marks = [end in tail for first, end in END_MARKS.items() if start.startswith(first)]
-    return all(marks) and len(start) > 0
+    for first, end in END_MARKS.items():
+        if start.startswith(first):
+            return end in tail
+    return len(start) > 0
 
 
 def measure(
@@ -218,7 +238,7 @@ def measure(
     sampling: Sampling,
     console: Console | None = None,
 ) -> tuple[list[MaskView], list[str]]:
-    """Decodes and measures images, each once; the messages of those that cannot be read."""
+    """Decodes and measures images, each once; a message for each that cannot be read."""
 
     def one(item: Item) -> MaskView | str:
         try:
@@ -226,50 +246,62 @@ def measure(
         except DataError as error:
             return str(error)
 
+    # Several threads: OpenCV decodes without Python's lock.
+    unique = tuple(dict.fromkeys(items))
     bar = progress(console or Console(), disable=console is None)
     with ThreadPoolExecutor(sampling.workers) as pool, bar:
-        unique = tuple(dict.fromkeys(items))
         found = bar.track(
             pool.map(one, unique), len(unique), description="checking images"
         )
         results = list(found)
-    views = [result for result in results if isinstance(result, MaskView)]
-    return views, [result for result in results if isinstance(result, str)]
+
+    views = []
+    broken = []
+    for result in results:
+        if isinstance(result, str):
+            broken.append(result)
+        else:
+            views.append(result)
+    return views, broken
 
 
 def _view(subject: CheckedData, item: Item, sampling: Sampling) -> MaskView:
+    """Decodes one image and measures it."""
     name, number = item
     entry = subject.cameras[name]
     row = subject.rows[number]
-    frame = CaptureDataset(subject.layout, [item], min(sampling.size, max(entry.size)))[
-        0
-    ]
-    camera = replace(
-        entry, K=frame.camera.K[0].double().numpy(), size=frame.camera.size
-    )
-    focal = float(camera.K[0, 0])
-    soft = frame.mask[0, 0].numpy()
-    mask = np.asarray(soft > 0.5)
+    p = subject.p[row]
     visible = subject.visible[row]
-    body = body_silhouette(camera, subject.p[row], visible, subject.template)
-    pixels, depth = project(camera, subject.p[row])
-    metre = float(np.median(depth[visible])) / focal  # per pixel
-    seen = visible & inside(entry, subject.p[row])  # not in the padding
-    factor = min(1.0, SMALL / max(mask.shape))
-    small = [max(1, round(side * factor)) for side in mask.shape[::-1]]
-    to_small = (
-        np.diag([*np.array(small) / mask.shape[::-1], 1])
-        @ camera.K
-        @ np.linalg.inv(entry.K)
-    )
+
+    # The mask as training sees it, and its camera.
+    size = min(sampling.size, max(entry.size))
+    frame = CaptureDataset(subject.layout, [item], size)[0]
+    K = frame.camera.K[0].double().numpy()
+    camera = replace(entry, K=K, size=frame.camera.size)
+    soft = frame.mask[0, 0].numpy()  # [H, W]
+    mask = np.asarray(soft > 0.5)
+    body = body_silhouette(camera, p, visible, subject.template)
+
+    # Joints outside the mask; those in the padding are not in the image.
+    focal = float(K[0, 0])
+    pixels, depth = project(camera, p)
+    metre_per_pixel = float(np.median(depth[visible])) / focal
+    seen = visible & inside(entry, p)
+    outside = joint_distance(mask_distance(mask), pixels, depth, seen, focal)  # [J]
+
+    # A small mask, and the map from the whole image to it: by the camera's K, then the scale.
+    height, width = mask.shape
+    factor = min(1.0, SMALL / max(height, width))
+    small = [max(1, round(width * factor)), max(1, round(height * factor))]
+    scale = np.diag([small[0] / width, small[1] / height, 1])
     return MaskView(
         camera=name,
         frame=number,
-        outside=joint_distance(mask_distance(mask), pixels, depth, seen, focal),
-        tolerance=max(subject.consistency.joint_tolerance, TOLERANCE * metre),
+        outside=outside,
+        tolerance=max(subject.consistency.joint_tolerance, TOLERANCE * metre_per_pixel),
         fullness=float(mask.sum() / max(1, int(body.sum()))),
         mask=cv2.resize(soft, small, interpolation=cv2.INTER_AREA) > 0.5,
-        to_small=to_small,
+        to_small=scale @ K @ np.linalg.inv(entry.K),
     )
 
 
@@ -282,25 +314,32 @@ def body_silhouette(
     """
     size = camera.size
     pixels, depth = project(camera, p)
-    canvas = np.zeros(size, np.uint8)
     drawn = visible & (depth > NEAR)
-    at = np.round(np.clip(np.nan_to_num(pixels), -FAR_PIXELS, FAR_PIXELS) - 0.5).astype(
-        np.int32
-    )
     metre = abs(camera.K[0, 0]) / np.maximum(depth, NEAR)  # pixels
-    trunk = template.torso
-    edges = [
-        *template.limbs,
-        *zip(trunk, (trunk[1], trunk[3], trunk[0], trunk[2]), strict=True),
+    clipped = np.clip(np.nan_to_num(pixels), -FAR_PIXELS, FAR_PIXELS)
+    at = np.round(clipped - 0.5).astype(np.int32)
+
+    # Limbs, and the outline of the trunk, as thick lines.
+    canvas = np.zeros(size, np.uint8)
+    left_shoulder, right_shoulder, left_hip, right_hip = template.torso
+    outline = [
+        (left_shoulder, right_shoulder),
+        (right_shoulder, right_hip),
+        (left_hip, left_shoulder),
+        (right_hip, left_hip),
     ]
-    for a, b in edges:
+    for a, b in [*template.limbs, *outline]:
         if drawn[a] and drawn[b]:
             width = thickness(2 * FLESH * min(metre[a], metre[b]), size)
             cv2.line(canvas, at[a].tolist(), at[b].tolist(), 1, width)
-    corners = [j for j in trunk if drawn[j]]
+
+    # The trunk is filled.
+    corners = [joint for joint in template.torso if drawn[joint]]
     if len(corners) > 2:
         cv2.fillConvexPoly(canvas, cv2.convexHull(at[corners]), 1)
-    face = [j for j in template.face if drawn[j]]
+
+    # A round head.
+    face = [joint for joint in template.face if drawn[joint]]
     if face:
         middle = at[face].mean(0).round().astype(int)
         radius = thickness(HEAD_RADIUS * float(metre[face].mean()), size)
@@ -315,5 +354,6 @@ def thickness(pixels: float, size: tuple[int, int]) -> int:
 
 def overlap(a: Bool, b: Bool) -> float:
     """Intersection over union; 0 when both are empty."""
+    # Two empty masks have no overlap to speak of.
     union = np.count_nonzero(a | b)
     return np.count_nonzero(a & b) / union if union else 0.0

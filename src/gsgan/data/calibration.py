@@ -21,21 +21,27 @@ from gsgan.utils.arrays import Float, as_floats
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import read_text
 
+# in one unit
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
-HEAD_BYTES = 65536  # enough to recognise the format
-MAX_YAML_BYTES = 2**20  # some 1000 cameras
+# enough to recognise the format
+HEAD_BYTES = 65536
+# some 1000 cameras
+MAX_YAML_BYTES = 2**20
+# names of calibration files
 PATTERNS = ("cameras.json", "intri.yml", "intri.yaml", "*.toml")
 KNOWN = (
     "OpenCV YAML (intri.yml beside extri.yml), TOML of Pose2Sim, aniposelib or caliscope, or "
     "cameras.json"
 )
+# of a camera's table in TOML
 TOML_KEYS = ("size", "matrix", "distortions", "rotation", "translation")
+# tables that are no cameras
 TOML_OTHER_TABLES = ("metadata", "capture_volume", "charuco", "checkerboard")
 
 
 @dataclass(frozen=True)
 class Conventions:
-    """How the numbers of a capture are stored.
+    """Conventions by which the numbers of a capture are stored.
 
     Args:
         scale: metres in one unit of the files.
@@ -71,21 +77,29 @@ def find_calibration(folder: Path) -> Path:
     Raises:
         DataError: when there is none, or more than one.
     """
-    places = [
-        folder,
-        *(p for p in folder.glob("*") if p.is_dir() and "calib" in p.name.lower()),
-    ]
-    found = sorted(
-        {p for place in places for pattern in PATTERNS for p in place.glob(pattern)}
-    )
+    # The folder itself, and subfolders such as "calibration" and "calib_test".
+    places = [folder]
+    for path in folder.glob("*"):
+        if path.is_dir() and "calib" in path.name.lower():
+            places.append(path)
+
+    files = set[Path]()
+    for place in places:
+        for pattern in PATTERNS:
+            files.update(place.glob(pattern))
+
     # Other .toml files are configs.
-    found = [p for p in found if p.suffix != ".toml" or b"matrix" in p.read_bytes()]
+    found = []
+    for path in sorted(files):
+        if path.suffix != ".toml" or b"matrix" in path.read_bytes():
+            found.append(path)
+
     if not found:
         raise DataError(
             f"{folder} holds no calibration; give calibration=<file>: {KNOWN}"
         )
     if len(found) > 1:
-        names = ", ".join(str(p.relative_to(folder)) for p in found)
+        names = ", ".join(str(path.relative_to(folder)) for path in found)
         raise DataError(
             f"{folder} holds more than one calibration ({names}); give calibration=<file>"
         )
@@ -99,8 +113,8 @@ def read_calibration(
 
     Args:
         path: the file; for OpenCV YAML either of the two.
-        unit_scale: metres in one unit of its lengths, None for the format's own (metres, or as
-            meta.json beside cameras.json says).
+        unit_scale: metres in one unit of its lengths; None for the format's own (metres, or the
+            unit in meta.json next to cameras.json).
         pixel_centre: where K puts the first pixel's centre, 0 or 0.5; not read for cameras.json.
 
     Raises:
@@ -113,6 +127,8 @@ def read_calibration(
         raise DataError(
             f"{path} cannot be read ({error.strerror or error}); give the calibration file"
         ) from None
+
+    # The first format whose test the head passes.
     for name, (fits, reader) in FORMATS.items():
         if fits(head):
             notes: list[str] = []
@@ -132,11 +148,13 @@ def read_conventions(path: Path, content: Mapping[str, Any]) -> Conventions:
     Raises:
         DataError: on a missing unit or an unknown value.
     """
+    # Only the unit has no default.
+    unit = choose(path, content, "unit", None, tuple(METRES))
+    background = choose(path, content, "background", "scene", ("scene", "black"))
     return Conventions(
-        scale=METRES[choose(path, content, "unit", None, tuple(METRES))],
+        scale=METRES[unit],
         pixel_centre=choose(path, content, "pixel_centre", 0.5, (0, 0.5)),
-        composed=choose(path, content, "background", "scene", ("scene", "black"))
-        == "black",
+        composed=background == "black",
     )
 
 
@@ -153,6 +171,7 @@ def choose(
         DataError: when it is not.
     """
     value = content.get(key, default)
+    # Lists and objects are refused first: they cannot be compared with every allowed value.
     if isinstance(value, (list, dict)) or value not in allowed:
         names = ", ".join(map(str, allowed))
         raise DataError(f"{path}: '{key}' is {value!r}; expected one of {names}")
@@ -176,10 +195,11 @@ def read_cameras(
     cameras = {}
     for name, entry in content.items():
         where = f"{path}, camera {name}"
-        if not isinstance(entry, dict) or any(
-            key not in entry for key in ("K", "R", "t", "size")
-        ):
+        # The lens may be missing: then it is a pinhole.
+        if not isinstance(entry, dict) or not {"K", "R", "t", "size"} <= set(entry):
             raise DataError(f"{where}: expected an object with K, R, t, dist and size")
+
+        # Stored as [width, height], while sizes are (H, W) everywhere else.
         width, height = numbers(where, entry["size"], "size", (2,))
         if width < 1 or height < 1 or width % 1 or height % 1:
             raise DataError(
@@ -202,12 +222,14 @@ def read_cameras(
 def _read_json(
     path: Path, scale: float | None, pixel_centre: float, notes: list[str]
 ) -> dict[str, CameraEntry]:
-    """A meta.json beside the file gives its unit and pixel centre."""
+    """The cameras of cameras.json; a meta.json next to it gives unit and pixel centre."""
     meta = path.with_name("meta.json")
-    found = read_conventions(meta, read_json(meta)) if meta.is_file() else Conventions()
-    return read_cameras(
-        path, read_json(path), replace(found, scale=scale or found.scale)
-    )
+    found = Conventions()
+    if meta.is_file():
+        found = read_conventions(meta, read_json(meta))
+    if scale:
+        found = replace(found, scale=scale)
+    return read_cameras(path, read_json(path), found)
 
 
 # -- TOML of Pose2Sim, aniposelib and caliscope
@@ -218,10 +240,10 @@ def _read_toml(
 ) -> dict[str, CameraEntry]:
     """Cameras by name: size [w, h], matrix, distortions, rotation, translation.
 
-    Convention: world to camera; the rotation is a Rodrigues vector, or a matrix; metres as Pose2Sim
-    and caliscope write them. caliscope has one table per camera in another, [cameras.0]: the number
-    is its name; a camera that it ignores is left out. aniposelib keeps the unit of its
-    calibration board, often mm, without naming it: give it with ``unit``.
+    R and t map world to camera; the rotation is a Rodrigues vector or a matrix; lengths are in
+    metres, as Pose2Sim and caliscope write them. caliscope has one table per camera inside another,
+    [cameras.0]: the number is its name; a camera that it ignores is left out. aniposelib keeps the
+    unit of its calibration board, often mm, without naming it: give it with ``unit``.
     """
     try:
         content = tomllib.loads(read_text(path))
@@ -232,14 +254,16 @@ def _read_toml(
         RecursionError,
     ) as error:
         raise DataError(f"{path} is not readable as TOML: {error}") from None
-    cameras: dict[str, CameraEntry] = {}
+
+    # The cameras of caliscope are tables inside another one.
     inner = content.get("cameras")
-    for table, entry in (inner if isinstance(inner, dict) else content).items():
-        if (
-            table in TOML_OTHER_TABLES
-            or not isinstance(entry, dict)
-            or entry.get("ignore")
-        ):
+    tables = inner if isinstance(inner, dict) else content
+
+    cameras: dict[str, CameraEntry] = {}
+    for table, entry in tables.items():
+        if table in TOML_OTHER_TABLES or not isinstance(entry, dict):
+            continue
+        if entry.get("ignore"):
             continue
         name = str(entry.get("name", table))
         if name in cameras:
@@ -253,16 +277,19 @@ def _read_toml(
 def _toml_camera(
     where: str, name: str, entry: dict[str, Any], scale: float, pixel_centre: float
 ) -> CameraEntry:
-    if missing := [key for key in TOML_KEYS if key not in entry]:
-        raise DataError(
-            f"{where} lacks '{missing[0]}'; expected {', '.join(TOML_KEYS)}"
-        )
+    for key in TOML_KEYS:
+        if key not in entry:
+            raise DataError(f"{where} lacks '{key}'; expected {', '.join(TOML_KEYS)}")
+
+    # Fisheye lenses have another model of distortion.
     if entry.get("fisheye"):
         raise DataError(
             f"{where} is a fisheye camera, which is not supported; undistort its video and "
             "calibrate it without distortion"
         )
     width, height = numbers(where, entry["size"], "size", (2,))
+
+    # A rotation that is no matrix is a Rodrigues vector.
     R = entry["rotation"]
     if as_floats(R).shape != (3, 3):
         R = cv2.Rodrigues(numbers(where, R, "rotation", (3,)))[0]
@@ -288,8 +315,9 @@ class _Loader(yaml.BaseLoader):
 
 def _matrix(loader: _Loader, node: yaml.MappingNode) -> Float:
     """``[rows, cols]`` of an ``!!opencv-matrix``."""
+    # rows, cols and the values row by row; their type does not matter.
     parts = loader.construct_mapping(node, deep=True)
-    values = np.array([float(text) for text in parts["data"]], np.float64)
+    values = np.array(list(map(float, parts["data"])), np.float64)
     return values.reshape(int(parts["rows"]), int(parts["cols"]))
 
 
@@ -333,48 +361,54 @@ def _read_yaml(
 ) -> dict[str, CameraEntry]:
     """Cameras by name: K, dist (or D), H, W from intri; Rot or R (Rodrigues), T from extri.
 
-    Convention: metres; world to camera. The two files list names in different orders and with
-    "none" entries, so cameras are paired by name alone. Without H and W the size is (0, 0).
+    Lengths are in metres; R and t map world to camera. The two files list names in different orders
+    and with "none" entries, so cameras are paired by name alone. Without H and W the size is
+    (0, 0).
     """
-    files = [
-        path.with_name(re.sub("intri|extri", name, path.name))
-        for name in ("intri", "extri")
-    ]
-    if files[0] == files[1]:
+    # The paths of both files, whichever of them was given.
+    intri_path = path.with_name(re.sub("intri|extri", "intri", path.name))
+    extri_path = path.with_name(re.sub("intri|extri", "extri", path.name))
+    if intri_path == extri_path:
         raise DataError(
             f"{path}: expected OpenCV YAML named intri.yml beside extri.yml"
         )
-    for file in files:
+    for file in (intri_path, extri_path):
         if not file.is_file():
             raise DataError(
                 f"{file} does not exist; intri.yml and extri.yml belong together"
             )
-    intri, extri = map(read_opencv_yaml, files)
+    intri = read_opencv_yaml(intri_path)
+    extri = read_opencv_yaml(extri_path)
+
+    # Each name once; without a list of names, those of the matrices K.
     names = intri.get("names")
     if not isinstance(names, list):
         names = [key[2:] for key in intri if key.startswith("K_")]
     cameras = {}
-    for name in (name for name in dict.fromkeys(map(str, names)) if name != "none"):
-        where = f"{files[0]}, camera {name}"
+    for name in dict.fromkeys(map(str, names)):
+        if name == "none":
+            continue
+        where = f"{intri_path}, camera {name}"
         if f"K_{name}" not in intri:
             raise DataError(f"{where} lacks K_{name}; export it again")
-        R = extri.get(f"Rot_{name}")
-        if R is None and f"R_{name}" in extri:
-            R = cv2.Rodrigues(numbers(where, extri[f"R_{name}"], f"R_{name}", (3,)))[0]
+
+        R = _opencv_rotation(where, name, extri)
         if R is None or f"T_{name}" not in extri:
             raise DataError(
-                f"{files[1]} lacks Rot_{name} (or R_{name}) and T_{name}, but {files[0]} lists the "
-                f"camera {name}; calibrate it, or take it out of both"
+                f"{extri_path} lacks Rot_{name} (or R_{name}) and T_{name}, but {intri_path} lists "
+                f"the camera {name}; calibrate it, or take it out of both"
             )
+
+        # Missing coefficients may be an oversight, so a note mentions them.
         dist = intri.get(f"dist_{name}", intri.get(f"D_{name}"))
         if dist is None:
             notes.append(
-                f"{files[0]} gives no lens distortion for {name}: taken as none"
+                f"{intri_path} gives no lens distortion for {name}: taken as none"
             )
-        sides = (
-            numbers(where, intri.get(f"{side}_{name}", 0), side, ()) for side in "HW"
-        )
-        height, width = (max(0, int(side)) for side in sides)
+
+        # A file without the size leaves it at (0, 0), for the reader to set from the images.
+        height = int(numbers(where, intri.get(f"H_{name}", 0), "H", ()))
+        width = int(numbers(where, intri.get(f"W_{name}", 0), "W", ()))
         cameras[name] = make_camera(
             where,
             name,
@@ -382,15 +416,24 @@ def _read_yaml(
             R=R,
             t=extri[f"T_{name}"],
             dist=dist,
-            size=(height, width),
+            size=(max(0, height), max(0, width)),
             scale=scale or 1.0,
             pixel_centre=pixel_centre,
         )
     return cameras
 
 
+def _opencv_rotation(where: str, name: str, extri: Mapping[str, Any]) -> Any:
+    """A camera's rotation: the matrix Rot, else from the Rodrigues vector R, else None."""
+    R = extri.get(f"Rot_{name}")
+    if R is None and f"R_{name}" in extri:
+        vector = numbers(where, extri[f"R_{name}"], f"R_{name}", (3,))
+        R = cv2.Rodrigues(vector)[0]
+    return R
+
+
 Reader = Callable[[Path, float | None, float, list[str]], dict[str, CameraEntry]]
-"""Cameras of a path, by metres in a unit (None: the format's own) and K's pixel centre; notes."""
+"""Cameras of a path, metres in a unit (None: the format's own), K's pixel centre; gains notes."""
 FORMATS: dict[str, tuple[Callable[[str], bool], Reader]] = {
     "OpenCV YAML": (
         lambda head: (

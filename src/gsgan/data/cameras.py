@@ -11,8 +11,10 @@ from gsgan.scene import Camera
 from gsgan.utils.arrays import Float, as_floats
 from gsgan.utils.errors import DataError
 
+# numbers of OpenCV's coefficients
 DISTORTION_LENGTHS = (4, 5, 8)
-ROTATION_TOLERANCE = 1e-3  # largest entry of R Rᵀ - I
+# maximum entry of R Rᵀ - I
+ROTATION_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,7 @@ class CameraEntry:
     @property
     def centre(self) -> Float:
         """``[3]`` metres: the position of the camera."""
+        # x_cam = R x + t is 0 at the centre.
         return -self.R.T @ self.t
 
     @property
@@ -71,18 +74,24 @@ class CameraEntry:
         Args:
             window: may reach beyond the image.
             size: ``(H, W)`` that the window is scaled to; None leaves it as it is.
-            lens: keep the distortion where `keeps_lens`; otherwise the camera is a pinhole.
+            lens: keep the distortion if `keeps_lens`; otherwise the camera is a pinhole.
         """
-        K = torch.from_numpy(self.K)[None]
-        R = torch.from_numpy(self.R)[None]
-        t = torch.from_numpy(self.t)[None]
-        dist = (
-            torch.from_numpy(self.dist[None, :5]) if lens and self.keeps_lens else None
+        dist = None
+        if lens and self.keeps_lens:
+            dist = torch.from_numpy(self.dist[None, :5])
+        camera = Camera(
+            K=torch.from_numpy(self.K)[None],
+            R=torch.from_numpy(self.R)[None],
+            t=torch.from_numpy(self.t)[None],
+            size=self.size,
+            dist=dist,
         )
-        camera = Camera(K, R, t, self.size, dist).crop(
-            window.top, window.left, window.size
-        )
-        return (camera if size is None else camera.resize(size)).to(torch.float32)
+
+        # Still in float64, so that K is rounded once.
+        camera = camera.crop(window.top, window.left, window.size)
+        if size is not None:
+            camera = camera.resize(size)
+        return camera.to(torch.float32)
 
 
 def make_camera(
@@ -113,6 +122,7 @@ def make_camera(
     Raises:
         DataError: naming the camera and the problem.
     """
+    # K is upper triangular, with the principal point moved to pixel centres at +0.5.
     K = numbers(where, K, "K", (3, 3))
     if K[0, 0] <= 0 or K[1, 1] <= 0:
         raise DataError(
@@ -123,6 +133,8 @@ def make_camera(
             f"{where}: K must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]], found {K.tolist()}"
         )
     K[:2, 2] += 0.5 - pixel_centre
+
+    # R is orthonormal and does not mirror.
     R = numbers(where, R, "R", (3, 3))
     error = np.abs(R @ R.T - np.eye(3)).max()
     if error > ROTATION_TOLERANCE:
@@ -134,9 +146,8 @@ def make_camera(
         raise DataError(
             f"{where}: R mirrors; expected a rotation, world to OpenCV camera axes"
         )
-    return CameraEntry(
-        name, K, R, numbers(where, t, "t", (3,)) * scale, _lens(where, dist), size
-    )
+    metres = numbers(where, t, "t", (3,)) * scale
+    return CameraEntry(name, K, R, metres, _lens(where, dist), size)
 
 
 def numbers(where: str, raw: Any, key: str, shape: tuple[int, ...]) -> Float:
@@ -146,8 +157,9 @@ def numbers(where: str, raw: Any, key: str, shape: tuple[int, ...]) -> Float:
         DataError: when they are something else.
     """
     array = as_floats(raw)
+    # A translation is often written as a column.
     if array.size == int(np.prod(shape)) and array.ndim > len(shape):
-        array = array.reshape(shape)  # a translation is often written as a column
+        array = array.reshape(shape)
     if array.shape != shape or not np.isfinite(array).all():
         raise DataError(
             f"{where}: '{key}' must hold finite numbers of shape {shape}, found {_short(raw)}"
@@ -155,7 +167,8 @@ def numbers(where: str, raw: Any, key: str, shape: tuple[int, ...]) -> Float:
     return array
 
 
-SHORT = reprlib.Repr()  # deeply or endlessly nested values are not printed in full
+# deeply or endlessly nested values are not printed in full
+SHORT = reprlib.Repr()
 SHORT.maxlevel = 4
 SHORT.maxlist = 16
 SHORT.maxtuple = 16
@@ -163,12 +176,15 @@ SHORT.maxother = 400
 
 
 def _short(raw: Any, limit: int = 120) -> str:
+    """A value on one line, cut off after ``limit`` characters, for messages."""
+    # Line breaks become blanks.
     text = " ".join(SHORT.repr(raw).split())
     return text if len(text) <= limit else text[:limit] + "…"
 
 
 def _lens(where: str, raw: Any) -> Float:
     """``[8]`` OpenCV lens coefficients, zero-padded; None and an empty list mean none."""
+    # Absent coefficients are 0.
     padded = np.zeros(8)
     if raw is None or (isinstance(raw, (list, tuple)) and not raw):
         return padded
@@ -178,5 +194,6 @@ def _lens(where: str, raw: Any) -> Float:
             f"{where}: dist must hold 4, 5 or 8 finite numbers (k1 k2 p1 p2 k3 ...), "
             f"found {_short(raw)}"
         )
+    # The order k1 k2 p1 p2 k3 k4 k5 k6 is the same for every length.
     padded[: len(dist)] = dist
     return padded

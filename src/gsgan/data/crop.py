@@ -1,4 +1,4 @@
-"""Crops of images round the person, undistorted and resampled.
+"""Crops of images around the person, undistorted and resampled.
 
 A crop follows from the skeleton and the camera alone, never from the image or its mask: at test
 time nothing else is known, and a box that follows the true mask would leak the answer.
@@ -14,8 +14,10 @@ from gsgan.data.cameras import CameraEntry, Crop
 from gsgan.utils.arrays import Bytes, Float
 from gsgan.utils.checks import above
 
-NEAR = 1e-2  # metres: points nearer than this are not seen
-FOUND = 1e-8  # of x/z: largest error of an undistorted point
+# metres: points nearer than this are not seen
+NEAR = 1e-2
+# of x/z: maximum error of an undistorted point
+FOUND = 1e-8
 # OpenCV's default of 5 iterations is pixels off in the corners of a strong lens.
 CONVERGED = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 400, 1e-12)
 # Only OpenCV 5 takes the criteria without "Iter".
@@ -25,35 +27,35 @@ _undistort = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
 def project(view: CameraEntry, points: Float) -> tuple[Float, Float]:
     """Pixels ``[..., 2]`` (centres at +0.5) and depths ``[...]`` of world points ``[..., 3]``.
 
-    Lens distortion is not applied. Points nearer than `NEAR` get finite, meaningless pixels: mask
-    them by depth.
+    The projection is ``K (R x + t)``, without lens distortion. Points nearer than `NEAR` get
+    finite, meaningless pixels: mask them by depth.
     """
     x_cam = np.tensordot(points, view.R.T, 1) + view.t
-    depth = x_cam[..., 2]
-    uvw = np.tensordot(x_cam / np.maximum(depth, NEAR)[..., None], view.K.T, 1)
+    depth = x_cam[..., 2]  # [...]
+    rays = x_cam / np.maximum(depth, NEAR)[..., None]
+    uvw = np.tensordot(rays, view.K.T, 1)
     return uvw[..., :2], depth
 
 
 def inside(view: CameraEntry, points: Float) -> NDArray[np.bool_]:
     """``[...]`` whether world points ``[..., 3]`` project into the image; False for NaN."""
-    # not divided: it is slow
+    # Not divided by the depth, which would be slow: u < width becomes u * depth < width * depth.
+    height, width = view.size
     uvw = np.tensordot(points, (view.K @ view.R).T, 1) + view.K @ view.t
-    (u, v, depth), (height, width) = np.moveaxis(uvw, -1, 0), view.size
-    return (
-        (depth > NEAR)
-        & (u >= 0)
-        & (u < width * depth)
-        & (v >= 0)
-        & (v < height * depth)
-    )
+    u = uvw[..., 0]
+    v = uvw[..., 1]
+    depth = uvw[..., 2]
+    across = (u >= 0) & (u < width * depth)
+    along = (v >= 0) & (v < height * depth)
+    return (depth > NEAR) & across & along
 
 
 @dataclass(frozen=True)
 class PersonCrop:
-    """A square crop round the projected joints.
+    """A square crop around the projected joints.
 
     Args:
-        margin: metres kept round every joint for flesh, hair and cloth, above 0: landmarks lie
+        margin: metres kept around every joint for flesh, hair and cloth, above 0: landmarks lie
             inside the body, and the crown is about 0.2 m above the ears.
     """
 
@@ -69,7 +71,7 @@ class PersonCrop:
         usable: NDArray[np.bool_],
         dist: Float | None = None,
     ) -> Crop:
-        """The crop round the usable joints, clipped to the image, then made square.
+        """The crop around the usable joints, clipped to the image, then made square.
 
         Joints outside the image do not widen it; the square may still reach beyond the border.
 
@@ -77,20 +79,25 @@ class PersonCrop:
             view: the camera.
             joints: ``[J, 3]`` metres, world frame, finite.
             usable: ``[J]`` which of them count; joints behind the camera never do.
-            dist: ``[8]`` the lens, where the image keeps its distortion; None: a pinhole's.
+            dist: ``[8]`` the lens if the image keeps its distortion; None for a pinhole.
         """
-        height, width = view.size
         pixels, depth = project(view, joints)
         if dist is not None:
-            pixels = through_lens(view.K, dist, *pixels.T)
+            pixels = through_lens(view.K, dist, pixels[:, 0], pixels[:, 1])
         taken = usable & (depth > NEAR)
         if not taken.any():
             return square_window(view.size)
+
+        # The margin in pixels at each joint's depth.
         focal = max(view.K[0, 0], view.K[1, 1])
-        reach = (self.margin * focal / depth[taken])[:, None]
-        limit = np.array([width, height], np.float64)
+        reach = (self.margin * focal / depth[taken])[:, None]  # [n, 1]
+
+        # The box around all joints and their margins, clipped to the image.
+        limit = np.array(view.size[::-1], np.float64)
         low = np.clip((pixels[taken] - reach).min(0), 0, limit)
         high = np.clip((pixels[taken] + reach).max(0), 0, limit)
+
+        # A square of whole pixels with the same centre.
         side = max(1, int(np.ceil((high - low).max())))
         left, top = np.floor((low + high - side) / 2).astype(int)
         return Crop(int(top), int(left), (side, side))
@@ -98,8 +105,9 @@ class PersonCrop:
 
 def square_window(size: tuple[int, int]) -> Crop:
     """The smallest centred square that holds a whole image of size ``(H, W)``."""
+    height, width = size
     side = max(size)
-    return Crop((size[0] - side) // 2, (size[1] - side) // 2, (side, side))
+    return Crop((height - side) // 2, (width - side) // 2, (side, side))
 
 
 def cut(image: Bytes, crop: Crop) -> Bytes:
@@ -107,10 +115,14 @@ def cut(image: Bytes, crop: Crop) -> Bytes:
     height, width = image.shape[:2]
     h, w = crop.size
     result = np.zeros((h, w, *image.shape[2:]), image.dtype)
+
+    # The part of the crop that lies in the image, in the image's pixels.
     top = max(crop.top, 0)
     left = max(crop.left, 0)
     bottom = min(crop.top + h, height)
     right = min(crop.left + w, width)
+
+    # The same part in the crop's pixels.
     if bottom > top and right > left:
         rows = slice(top - crop.top, bottom - crop.top)
         columns = slice(left - crop.left, right - crop.left)
@@ -130,21 +142,24 @@ def undistort_map(K: Float, dist: Float, crop: Crop) -> NDArray[np.float32]:
         dist: ``[8]`` OpenCV order k1 k2 p1 p2 k3 k4 k5 k6.
         crop: of the undistorted image.
     """
-    if K[0, 1] == 0:  # OpenCV's own is ten times as fast, but ignores skew
+    u, v = _grid(crop)
+    if K[0, 1] == 0:
+        # OpenCV's own function is ten times as fast, but ignores skew.
         stored = K.copy()
         stored[:2, 2] -= 0.5  # to OpenCV's pixel centres
         seen = stored.copy()
         seen[:2, 2] -= (crop.left, crop.top)
         size = crop.size[::-1]
-        maps = cv2.initUndistortRectifyMap(
-            stored, dist, np.eye(3), seen, size, cv2.CV_32FC1
-        )
+        eye = np.eye(3)
+        maps = cv2.initUndistortRectifyMap(stored, dist, eye, seen, size, cv2.CV_32FC1)
         pixels = np.stack(maps, axis=-1)
     else:
-        pixels = (through_lens(K, dist, *_grid(crop)) - 0.5).astype(np.float32)
+        pixels = (through_lens(K, dist, u, v) - 0.5).astype(np.float32)
+
+    # Beyond the fold the lens model shows points twice: those pixels stay empty.
     limit = fold_radius(K, dist, crop)
     if limit is not None:
-        x, y = _unproject(K, *_grid(crop))
+        x, y = _unproject(K, u, v)
         pixels[x * x + y * y > limit**2] = -1e4
     return np.asarray(pixels, np.float32)
 
@@ -158,35 +173,40 @@ def distort(points: Float, dist: Float) -> Float:
     """
     if points.size == 0:
         return points
-    rays = np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1).reshape(
-        -1, 3
-    )
+    flat = points.reshape(-1, 2)
+    rays = np.concatenate([flat, np.ones((len(flat), 1))], axis=-1)
+
+    # A camera at the origin with K = I: its pixels are x/z and y/z.
     nothing = np.zeros(3)
     shown = cv2.projectPoints(rays, nothing, nothing, np.eye(3), dist)[0]
     return np.asarray(shown, np.float64).reshape(points.shape)
 
 
 def undistort(points: Float, dist: Float) -> Float:
-    """``[N, 2]`` the inverse of `distort`, to `FOUND`; NaN where there is none: beyond the fold."""
+    """``[N, 2]`` the inverse of `distort`, accurate to `FOUND`; NaN beyond the fold."""
     if points.size == 0:
         return points
     eye = np.eye(3)
-    raw = _undistort(points[:, None], eye, dist, R=eye, P=eye, criteria=CONVERGED)[:, 0]
-    found = raw.astype(np.float64)
+    raw = _undistort(points[:, None], eye, dist, R=eye, P=eye, criteria=CONVERGED)
+    found = raw[:, 0].astype(np.float64)
+
+    # The iteration may end at a wrong point, so its result is distorted again and compared.
     error = np.abs(distort(found, dist) - points).max(axis=1, keepdims=True)
     return np.asarray(np.where(error < FOUND, found, np.nan))
 
 
 def through_lens(K: Float, dist: Float, u: Float, v: Float) -> Float:
     """``[..., 2]`` pixels where the lens shows what a pinhole shows at pixels u, v ``[...]``."""
-    shown = distort(np.stack(_unproject(K, u, v), axis=-1), dist)
+    x, y = _unproject(K, u, v)
+    shown = distort(np.stack([x, y], axis=-1), dist)
     return shown @ K[:2, :2].T + K[:2, 2]
 
 
 def _unproject(K: Float, u: Float, v: Float) -> tuple[Float, Float]:
-    """x/z and y/z of pixels."""
+    """x/z and y/z of pixels: the inverse of ``u = fx x + s y + cx``, ``v = fy y + cy``."""
     y = (v - K[1, 2]) / K[1, 1]
-    return (u - K[0, 2] - K[0, 1] * y) / K[0, 0], y
+    x = (u - K[0, 2] - K[0, 1] * y) / K[0, 0]
+    return x, y
 
 
 def _grid(crop: Crop) -> tuple[Float, Float]:
@@ -202,15 +222,21 @@ def fold_radius(K: Float, dist: Float, crop: Crop, samples: int = 256) -> float 
     Args:
         samples: radii tested, from the centre to the crop's furthest corner.
     """
+    # Radii from the centre to the crop's furthest corner.
     h, w = crop.size
-    top = crop.top
-    left = crop.left
-    corners = np.array(
-        [(left + x, top + y) for x in (0.5, w - 0.5) for y in (0.5, h - 0.5)]
-    )
-    radii = np.linspace(0, np.hypot(*_unproject(K, *corners.T)).max(), samples)
+    left = crop.left + 0.5
+    right = crop.left + w - 0.5
+    top = crop.top + 0.5
+    bottom = crop.top + h - 0.5
+    u = np.array([left, left, right, right])
+    v = np.array([top, bottom, top, bottom])
+    x, y = _unproject(K, u, v)
+    radii = np.linspace(0, np.hypot(x, y).max(), samples)  # [samples]
+
+    # The lens model folds back where the distorted radius no longer grows.
     radial = np.where(np.isin(np.arange(8), (2, 3)), 0, dist)  # without p1 and p2
-    shown = distort(np.stack([radii, np.zeros(samples)], axis=-1), radial)[:, 0]
+    along_x = np.stack([radii, np.zeros(samples)], axis=-1)
+    shown = distort(along_x, radial)[:, 0]  # [samples]
     folded = np.flatnonzero(np.diff(shown) <= 0)
     return float(radii[folded[0]]) if len(folded) else None
 
@@ -218,7 +244,7 @@ def fold_radius(K: Float, dist: Float, crop: Crop, samples: int = 256) -> float 
 def take(
     image: Bytes, crop: Crop, mapping: NDArray[np.float32] | None, exact: bool
 ) -> Bytes:
-    """A crop of an image, undistorted where a mapping is given, zero beyond the border.
+    """A crop of an image, undistorted if a mapping is given, zero beyond the border.
 
     Args:
         image: ``[H, W]`` or ``[H, W, C]``.
@@ -227,10 +253,12 @@ def take(
     """
     if mapping is None:
         return cut(image, crop)
+
+    # Labels must not be mixed.
     mode = cv2.INTER_NEAREST if exact else cv2.INTER_LINEAR
-    maps = (mapping[..., 0], mapping[..., 1])
+    # Pixels outside the image are 0: the default border.
     taken = cv2.remap(
-        image, *maps, interpolation=mode, borderMode=cv2.BORDER_CONSTANT, borderValue=0
+        image, mapping[..., 0], mapping[..., 1], mode, borderMode=cv2.BORDER_CONSTANT
     )
     return np.asarray(taken, np.uint8)
 
@@ -262,6 +290,7 @@ def black_out(image: Bytes, mask: Bytes, composed: bool) -> Bytes:
     """
     if composed:
         return image * (mask > 0)[..., None]
-    return np.asarray(
-        cv2.multiply(image, cv2.merge([mask] * 3), scale=1 / 255), np.uint8
-    )
+
+    # OpenCV rounds image * alpha / 255 to the nearest value.
+    alpha = cv2.merge([mask, mask, mask])
+    return np.asarray(cv2.multiply(image, alpha, scale=1 / 255), np.uint8)

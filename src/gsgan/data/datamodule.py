@@ -47,7 +47,9 @@ __all__ = [
 log = logging.getLogger(__name__)
 
 MOST_WORKERS = 8
+# choices of data.body
 BODY = ("auto", "file", "fit", "none")
+# choices of effects.distortion, as the dataset calls them
 LENSES: dict[str, Lens] = {
     "auto": "undistort",
     "on": "undistort",
@@ -61,7 +63,7 @@ Reader = Callable[[str | Path, Thresholds, str | None], Layout]
 
 
 def _quiet_worker(_: int) -> None:
-    # one thread per worker process; OpenCV's pool does not survive a fork
+    # One thread per worker process: OpenCV's pool does not survive a fork.
     cv2.setNumThreads(0)
 
 
@@ -71,11 +73,11 @@ class GsganData(LightningDataModule):
     conf/data/*.yaml explain the settings.
 
     Args:
-        root: the folder; or None when ``source`` makes it.
+        root: the folder; None if ``source`` makes it.
         source: called without arguments, makes the dataset if needed and returns its folder.
         reader: of the dataset's format (`gsgan.data.formats`); None is the bring-your-own layout.
         body: ``file``, the poses that the dataset has, if any; ``fit``, those of `gsgan.fit`, which
-            training runs where they are missing; ``auto``, the dataset's, else `gsgan.fit`'s;
+            training runs if they are missing; ``auto``, the dataset's, else `gsgan.fit`'s;
             ``none``, no poses.
         skeleton: ``mediapipe33``; ``mediapipe33_hands``, with the hands of hands3d.npz: 75 joints;
             or ``holistic``, also with the face of face3d.npz: 105 joints.
@@ -117,7 +119,7 @@ class GsganData(LightningDataModule):
         **split_keys: Any,
     ) -> None:
         super().__init__()
-        # an unknown key is an error
+        # An unknown key is an error.
         inspect.signature(make_splits).bind_partial(**split_keys)
         if root is None and source is None:
             raise ConfigError(
@@ -126,6 +128,8 @@ class GsganData(LightningDataModule):
             )
         if not (crop in (None, "person") or isinstance(crop, PersonCrop)):
             raise ConfigError(f"data.crop must be null or person, got {crop!r}")
+
+        # What is read: the folder, its format, the person and the splits.
         self.root = root
         self.source = source
         self.smpl = smpl
@@ -134,23 +138,26 @@ class GsganData(LightningDataModule):
         self.skeleton = one_of("data.skeleton", skeleton, TEMPLATES)
         self.protocol = protocol
         self.split_keys = split_keys
+        whole("data.min_joints", min_joints, 1)
+        self.limits = replace(Thresholds(), min_joints=min_joints)
+
+        # The form of images.
         self.size = size
         self.crop = PersonCrop() if isinstance(crop, str) else crop
+        self.lens = LENSES[one_of("effects.distortion", distortion, LENSES)]
+
+        # Batches, and the processes that load them.
         self.batch_size = whole("data.batch_size", batch_size, 1)
         if steps_per_epoch is not None:
             whole("data.steps_per_epoch", steps_per_epoch, 1)
         self.steps_per_epoch = steps_per_epoch
         self.val_images = whole("data.val_images", val_images, 1)
-        self.workers = (
-            default_workers() if workers is None else whole("data.workers", workers, 0)
-        )
+        if workers is None:
+            workers = default_workers()
+        self.workers = whole("data.workers", workers, 0)
         self.seed = whole("data.seed", seed, 0)
         self.cache_mb = at_least("data.cache_mb", cache_mb, 0)
         self.info_samples = whole("data.info_samples", info_samples, 1)
-        self.limits = replace(
-            Thresholds(), min_joints=whole("data.min_joints", min_joints, 1)
-        )
-        self.lens = LENSES[one_of("effects.distortion", distortion, LENSES)]
 
     def prepare_data(self) -> None:
         """Makes the dataset if it has a ``source``; one process per machine."""
@@ -170,27 +177,29 @@ class GsganData(LightningDataModule):
     @cached_property
     def layout(self) -> Layout:
         """The capture, read on first use."""
+        # The reader checks files, frames and cameras.
         layout = self.reader(self._folder(), self.limits, self.smpl)
         skeleton = TEMPLATES[self.skeleton]
-        for wanted, held, file, other in (
-            (skeleton.palms, layout.hands, HANDS_FILE, "mediapipe33"),
-            (skeleton.expression, layout.face, FACE_FILE, "mediapipe33_hands"),
-        ):
-            if wanted and held is None:
-                raise ConfigError(
-                    f"data.skeleton={self.skeleton} needs a capture's {file}, which {layout.root} "
-                    f"lacks; choose data.skeleton={other}"
-                )
+
+        # The capture must have the landmarks that the skeleton asks for.
+        if skeleton.palms and layout.hands is None:
+            raise self._lacks(HANDS_FILE, layout, "mediapipe33")
+        if skeleton.expression and layout.face is None:
+            raise self._lacks(FACE_FILE, layout, "mediapipe33_hands")
         if skeleton.palms:
             layout = replace(layout, meta=replace(layout.meta, skeleton=self.skeleton))
+
+        # Body poses, as `body` chooses them.
         poses = layout.poses
         if self.body == "none":
             return replace(layout, poses=None, meta=replace(layout.meta, body=None))
-        if self.body == "fit" and not (poses is None or poses.fitted):
+        if poses is None:
+            return layout
+        if self.body == "fit" and not poses.fitted:
             raise ConfigError(
                 f"data.body=fit, but {layout.root} has body poses of its own; choose data.body=file"
             )
-        if poses is not None and poses.fitted and skeleton.palms:
+        if poses.fitted and skeleton.palms:
             if poses.with_hands is None:
                 raise ConfigError(
                     f"{layout.root}: gsgan.fit made body_pose.npz without hands; run it again with "
@@ -199,9 +208,17 @@ class GsganData(LightningDataModule):
             layout = replace(layout, poses=poses.with_hands)
         return layout
 
+    def _lacks(self, file: str, layout: Layout, other: str) -> ConfigError:
+        """The error of a capture without the landmarks of the skeleton; ``other`` needs fewer."""
+        return ConfigError(
+            f"data.skeleton={self.skeleton} needs a capture's {file}, which {layout.root} "
+            f"lacks; choose data.skeleton={other}"
+        )
+
     @property
     def lacks_body(self) -> bool:
         """Whether `gsgan.fit` is still to make the body poses."""
+        # gsgan.fit works on captures, not on published datasets.
         fits = self.body in ("auto", "fit") and isinstance(self.reader, CaptureReader)
         return fits and self.layout.poses is None
 
@@ -211,25 +228,24 @@ class GsganData(LightningDataModule):
         if self.protocol is None:
             splits = make_splits(self.layout, **self.split_keys)
         else:
-            given = [
-                k
-                for k, v in self.split_keys.items()
-                if k != "test_share" and v is not None
-            ]
-            if given:
-                raise ConfigError(
-                    f"data.{given[0]} is set, but protocol {self.protocol.name} sets the splits; "
-                    "leave one of them out"
-                )
+            for key, value in self.split_keys.items():
+                if key != "test_share" and value is not None:
+                    raise ConfigError(
+                        f"data.{key} is set, but protocol {self.protocol.name} sets the splits; "
+                        "leave one of them out"
+                    )
             splits = protocol_splits(self.layout, self.protocol)
+
+        # Poses fitted to the masks of a held-out camera would leak the test images.
         held_out = set(splits.test_cameras) - set(splits.train_cameras)
         poses = self.layout.poses
-        if leaks := [c for c in (poses.fitted_to if poses else ()) if c in held_out]:
-            raise ConfigError(
-                f"{self.layout.root}: body poses were fitted to the masks of {leaks[0]}, which is "
-                "held out here; run gsgan.fit with the same data.train_cameras, data.test_cameras "
-                "or protocol, and overwrite=true"
-            )
+        for camera in () if poses is None else poses.fitted_to:
+            if camera in held_out:
+                raise ConfigError(
+                    f"{self.layout.root}: body poses were fitted to the masks of {camera}, which "
+                    "is held out here; run gsgan.fit with the same data.train_cameras, "
+                    "data.test_cameras or protocol, and overwrite=true"
+                )
         return splits
 
     @property
@@ -239,9 +255,11 @@ class GsganData(LightningDataModule):
 
     @cached_property
     def face(self) -> tuple[Vector, ...] | None:
-        """The person's face at rest, see `face_at_rest`; None for skeletons without."""
+        """The person's face at rest, see `face_at_rest`; None for skeletons without a face."""
         if not TEMPLATES[self.skeleton].expression:
             return None
+
+        # `layout` refuses a capture without a face.
         assert self.layout.face is not None
         return face_at_rest(self.layout.landmarks, self.layout.face, self.trained)
 
@@ -249,9 +267,12 @@ class GsganData(LightningDataModule):
     def registered_held_out(self) -> tuple[int, ...]:
         """Frames of held-out poses whose body `gsgan.fit` registered to their own masks."""
         poses = self.layout.poses
-        items = self.splits.items
-        frames = {*items["novel_pose"].frames} - {*self.trained}
-        return tuple(sorted(frames & (poses.registered if poses else frozenset())))
+        if poses is None:
+            return ()
+
+        # A frame that some camera trains on is not held out.
+        held_out = set(self.splits.items["novel_pose"].frames) - set(self.trained)
+        return tuple(sorted(held_out & poses.registered))
 
     @property
     def loading_processes(self) -> int:
@@ -264,36 +285,39 @@ class GsganData(LightningDataModule):
     @cached_property
     def _datasets(self) -> dict[str, CaptureDataset]:
         layout = self.layout
-        splits = self.splits
+
+        # A batch needs images of one size.
         sizes = {camera.size for camera in layout.cameras.values()}
         if self.size is None and self.batch_size > 1 and (self.crop or len(sizes) > 1):
             raise ConfigError(
                 "data.size is not set and images differ in size, so batches of "
                 f"{self.batch_size} cannot be made; set data.size (e.g. 512) or data.batch_size=1"
             )
+
+        # All splits share one cache and one set of completed skeletons.
         cache = ImageCache(int(self.cache_mb * 2**20) // self.loading_processes)
-        template = template_of(self.skeleton, self.face)
         skeletons = complete_skeletons(
             layout.landmarks,
             layout.frames,
             self.trained,
-            template,
-            layout.hands,
-            layout.face,
+            template=template_of(self.skeleton, self.face),
+            hands=layout.hands,
+            face=layout.face,
         )
-        return {
-            name: CaptureDataset(
+
+        datasets = {}
+        for name in SPLITS:
+            datasets[name] = CaptureDataset(
                 layout,
-                splits.items[name],
-                self.size,
-                self.crop,
-                cache,
-                self.lens,
-                skeletons,
+                self.splits.items[name],
+                size=self.size,
+                crop=self.crop,
+                cache=cache,
+                lens=self.lens,
+                skeletons=skeletons,
                 ignore_band=name == "train",
             )
-            for name in SPLITS
-        }
+        return datasets
 
     def _folder(self) -> str | Path:
         if self.root is not None:
@@ -302,33 +326,43 @@ class GsganData(LightningDataModule):
         return self.source()
 
     def protocol_record(self, lpips_nets: Sequence[str]) -> dict[str, Any] | None:
-        """The record beside every score: the protocol and where this run departs from it.
+        """The record next to every score: the protocol and this run's departures from it.
 
         Args:
             lpips_nets: the networks that LPIPS is computed with.
         """
         if self.protocol is None:
             return None
-        sides = [max(c.size) for c in self.layout.cameras.values()]
-        scale = None if self.crop is not None else (self.size or sides[0]) / sides[0]
-        oblong = any(c.size[0] != c.size[1] for c in self.layout.cameras.values())
-        padded = self.crop is None and self.size is not None and oblong
+
+        # Images that are not square may be padded to squares.
+        sizes = [camera.size for camera in self.layout.cameras.values()]
+        oblong = any(height != width for height, width in sizes)
+
+        # The images of the first camera decide the scale; cropped images have none.
+        scale = None
+        if self.crop is None:
+            side = max(sizes[0])
+            scale = (self.size or side) / side
+
         departures = self.protocol.departures(
-            lpips_nets=lpips_nets, scale=scale, padded=padded
+            lpips_nets=lpips_nets,
+            scale=scale,
+            padded=self.crop is None and self.size is not None and oblong,
         )
         return self.protocol.record() | {"departures": list(departures)}
 
     @property
     def reasons(self) -> dict[str, str]:
-        """Why a split is empty, for those that are."""
+        """The reasons why splits are empty, by the empty split."""
         return self.splits.reasons
 
     @cached_property
     def info(self) -> SceneInfo:
         """Facts about the scene from the training split, computed on first use."""
-        tested = [
-            name for split in SPLITS[1:] for name in self.splits.items[split].cameras
-        ]
+        # The lenses of held-out cameras count as well.
+        tested: list[str] = []
+        for split in SPLITS[1:]:
+            tested += self.splits.items[split].cameras
         train = self.dataset("train")
         found = scene_info(self.layout, self.splits, train, self.info_samples, tested)
         return replace(found, face=self.face)
@@ -354,8 +388,13 @@ class GsganData(LightningDataModule):
     def labelled(self, split: str) -> Subset[Frame]:
         """The items of a split whose images have part labels; may be empty."""
         dataset = self.dataset(split)
-        labelled = dataset.items if self.layout.labels else ()
-        chosen = [i for i, item in enumerate(labelled) if self.layout.label_path(*item)]
+
+        # The places of the items that have a label file.
+        chosen = []
+        if self.layout.labels:
+            for place, (camera, frame) in enumerate(dataset.items):
+                if self.layout.label_path(camera, frame):
+                    chosen.append(place)
         return Subset(dataset, chosen)
 
     def train_dataloader(self) -> DataLoader[Frame]:
@@ -364,14 +403,20 @@ class GsganData(LightningDataModule):
         replicas = 1
         rank = 0
         epoch = 0
-        if (on := self.trainer) is not None:
-            replicas = on.world_size
-            rank = on.global_rank
-            epoch = on.current_epoch
+        if self.trainer is not None:
+            replicas = self.trainer.world_size
+            rank = self.trainer.global_rank
+            epoch = self.trainer.current_epoch
+
+        # By default an epoch is one pass over all items.
         per_pass = math.ceil(len(dataset) / (self.batch_size * replicas))
-        steps = self.steps_per_epoch or per_pass
         sampler = StepSampler(
-            len(dataset), self.batch_size, steps, self.seed, replicas, rank
+            len(dataset),
+            self.batch_size,
+            steps=self.steps_per_epoch or per_pass,
+            seed=self.seed,
+            replicas=replicas,
+            rank=rank,
         )
         sampler.set_epoch(epoch)
         return self._loader(dataset, sampler=sampler)
@@ -380,11 +425,13 @@ class GsganData(LightningDataModule):
     def watched(self) -> tuple[str, list[int]]:
         """The split and indices of the images rendered while training, evenly spaced.
 
-        The split is novel_pose, else novel_view, else train.
+        The split is the first of novel_pose, novel_view and train that is not empty.
         """
-        name = next(
-            (n for n in ("novel_pose", "novel_view") if self.splits.items[n]), "train"
-        )
+        # Poses are harder than views, so they are watched first.
+        name = "train"
+        for split in ("novel_view", "novel_pose"):
+            if self.splits.items[split]:
+                name = split
         return name, evenly_spaced(len(self.dataset(name)), self.val_images)
 
     def val_dataloader(self) -> DataLoader[Frame]:
@@ -405,12 +452,15 @@ class GsganData(LightningDataModule):
         sampler: StepSampler | None = None,
     ) -> DataLoader[Frame]:
         """Batches of `Frame` whose pixels are bytes, as `transfer_batch_to_device` takes them."""
+        # A copy: the dataset itself gives floats.
         packed = copy(dataset)
         packed.packed = True
-        on_gpu = (
-            self.trainer is not None
-            and self.trainer.strategy.root_device.type == "cuda"
-        )
+
+        # Pinned memory is for copies to a GPU.
+        on_gpu = False
+        if self.trainer is not None:
+            on_gpu = self.trainer.strategy.root_device.type == "cuda"
+
         return DataLoader(
             packed if places is None else Subset(packed, places),
             batch_size=self.batch_size,
@@ -425,9 +475,13 @@ class GsganData(LightningDataModule):
 
 def default_workers() -> int:
     """Loading processes per training process, which keeps one processor for itself."""
-    gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    if not gpus:
+    if not torch.cuda.is_available():
         return 0
-    mine = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
-    processors = mine or os.cpu_count() or 1
-    return max(0, min(MOST_WORKERS, processors // gpus - 1))
+
+    # The processors that this process may use, which a container may restrict.
+    if hasattr(os, "sched_getaffinity"):
+        processors = len(os.sched_getaffinity(0))
+    else:
+        processors = os.cpu_count() or 1
+    per_gpu = processors // torch.cuda.device_count()
+    return max(0, min(MOST_WORKERS, per_gpu - 1))

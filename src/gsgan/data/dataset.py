@@ -48,12 +48,13 @@ class DecodedImage:
 
 
 class ImageCache(LRUCache[Item, DecodedImage]):
-    """The most recently used images, of at most so many bytes; 0 keeps nothing."""
+    """The most recently used images, up to a number of bytes; 0 keeps nothing."""
 
     @staticmethod
     def getsizeof(value: DecodedImage) -> int:
         """Bytes held."""
-        return sum(part.nbytes for part in vars(value).values() if part is not None)
+        parts = (value.image, value.mask, value.labels, value.unsure)
+        return sum(part.nbytes for part in parts if part is not None)
 
 
 class CaptureDataset(Dataset[Frame]):
@@ -68,9 +69,9 @@ class CaptureDataset(Dataset[Frame]):
     Args:
         layout: the capture.
         items: (camera, frame) pairs, as in `Splits.items`.
-        size: side of the square images in pixels, or None for the window as it is.
+        size: side of the square images in pixels; None keeps the window's size.
         crop: None for the full image, padded to a square when a size is given.
-        cache: shared between datasets of one layout, size and crop, without an item in two of them;
+        cache: shared between datasets of one layout, size and crop that have no item in common;
             None decodes every time.
         skeletons: without gaps, see `complete_skeletons`; None takes the capture's own, without
             hands.
@@ -105,6 +106,8 @@ class CaptureDataset(Dataset[Frame]):
         self.lens = lens
         self.cache = ImageCache(0) if cache is None else cache
         self.skeletons = layout.landmarks if skeletons is None else skeletons
+
+        # The numbers in `Frame.camera_index`.
         self._indices = {name: i for i, name in enumerate(layout.camera_names)}
 
     def __len__(self) -> int:
@@ -116,22 +119,29 @@ class CaptureDataset(Dataset[Frame]):
         Raises:
             DataError: when one of its files is damaged, naming the file.
         """
-        name, frame = item = self.items[index]
+        item = self.items[index]
+        name, frame = item
+
+        # Decoded now, or kept from an earlier call. An image larger than the cache is not kept.
         decoded = self.cache.get(item)
         if decoded is None:
             decoded = self._load(item)
             if self.cache.getsizeof(decoded) <= self.cache.maxsize:
                 self.cache[item] = decoded
-        labels = (
-            None if decoded.labels is None else torch.from_numpy(decoded.labels)[None]
-        )
-        unsure = (
-            None if decoded.unsure is None else torch.from_numpy(decoded.unsure)[None]
-        )
+
+        # Optional parts.
+        labels = None
+        if decoded.labels is not None:
+            labels = torch.from_numpy(decoded.labels)[None]
+        unsure = None
+        if decoded.unsure is not None:
+            unsure = torch.from_numpy(decoded.unsure)[None, None]
         body = None
         poses = self.layout.poses
         if poses is not None:
             body = BodyPose(_float(poses.theta[frame]), _float(poses.transl[frame]))
+
+        # Every part has a batch dimension of 1; bytes become floats only on request.
         found = Frame(
             image=torch.from_numpy(decoded.image)[None],
             mask=torch.from_numpy(decoded.mask)[None, None],
@@ -142,77 +152,92 @@ class CaptureDataset(Dataset[Frame]):
             camera_index=torch.tensor([self._indices[name]]),
             body=body,
             labels=labels,
-            unsure=None if unsure is None else unsure[None],
+            unsure=unsure,
         )
         return found if self.packed else found.unpacked()
 
     def inside(self, index: int) -> Tensor | None:
-        """``[1, 1, H, W]`` 1 where a pixel of the item lies in the stored image; None where all do.
+        """``[1, 1, H, W]`` 1 at pixels of the item that lie in the stored image; None if all do.
 
         Windows reach beyond borders, and undistorted images have empty rims.
         """
         item = self.items[index]
-        camera = self.layout.cameras[item[0]]
         window = self.window(item)
+        camera = self._entry(item)
+
+        # A white image, cropped and resized like the item's: what stays white is inside.
+        white = np.full(camera.size, 255, np.uint8)
         mapping = self._mapping(camera, window)
-        taken = cropping.take(
-            np.full(camera.size, 255, np.uint8), window, mapping, exact=True
-        )
+        taken = cropping.take(white, window, mapping, exact=True)
         taken = cropping.resize(taken, self._target(window), exact=True)
         return None if taken.all() else unit(torch.from_numpy(taken))[None, None]
 
+    def _entry(self, item: Item) -> CameraEntry:
+        """The calibrated camera of an item."""
+        return self.layout.cameras[item[0]]
+
     def _target(self, window: Crop) -> tuple[int, int]:
+        """``(H, W)`` of the item's image."""
         return window.size if self.size is None else (self.size, self.size)
 
     def window(self, item: Item) -> Crop:
-        """Which part of the (undistorted) image an item shows."""
-        camera = self.layout.cameras[item[0]]
+        """The part of the (undistorted) image that an item shows."""
+        camera = self._entry(item)
         if self.crop is not None:
-            joints = self.layout.landmarks.p[item[1]]
-            seen = self.layout.landmarks.visibility[item[1]] > 0
-            return self.crop.window(
-                camera, joints, seen, camera.dist if self._raw(camera) else None
-            )
+            # The crop follows the joints as the image shows them, through the lens if it is kept.
+            landmarks = self.layout.landmarks
+            joints = landmarks.p[item[1]]
+            seen = landmarks.visibility[item[1]] > 0
+            dist = camera.dist if self._raw(camera) else None
+            return self.crop.window(camera, joints, seen, dist)
+
+        # A whole image is padded to a square.
         if self.size is not None:
             return cropping.square_window(camera.size)
         return Crop(0, 0, camera.size)
 
     def camera(self, item: Item) -> Camera:
         """The camera of the item's image: window and scale are in its K."""
+        window = self.window(item)
         size = None if self.size is None else (self.size, self.size)
-        entry = self.layout.cameras[item[0]]
-        return entry.seen(self.window(item), size, lens=self.lens == "raw")
+        return self._entry(item).seen(window, size, lens=self.lens == "raw")
 
     def _raw(self, camera: CameraEntry) -> bool:
         """Whether the camera's images keep their distortion, with ``camera.dist`` set."""
         return self.lens == "raw" and camera.keeps_lens
 
     def _mapping(self, camera: CameraEntry, window: Crop) -> NDArray[np.float32] | None:
-        """Where the window's pixels lie in the stored image; None for a pinhole."""
+        """Positions of the window's pixels in the stored image; None for a pinhole."""
+        # No mapping is needed if the image stays as it is.
         if not camera.distorted or self.lens == "ignore" or self._raw(camera):
             return None
         return cropping.undistort_map(camera.K, camera.dist, window)
 
     def _load(self, item: Item) -> DecodedImage:
-        camera = self.layout.cameras[item[0]]
-        window = self.window(item)
+        camera = self._entry(item)
+
+        # How this dataset stores masks, and the window of the item.
         rules = self.layout.pixels
+        window = self.window(item)
         mapping = self._mapping(camera, window)
         size = self._target(window)
 
         def fit(image: Bytes, exact: bool) -> Bytes:
-            return cropping.resize(
-                cropping.take(image, window, mapping, exact), size, exact
-            )
+            taken = cropping.take(image, window, mapping, exact)
+            return cropping.resize(taken, size, exact)
 
+        # Mask and image as stored.
         mask_files = self.layout.mask_files(*item)
         mask = pixels.read_mask(mask_files, rules)
         unsure = pixels.read_unsure(mask_files, mask, rules)
         image = read_colour(self.layout.image_path(*item))
         self._check_size(self.layout.image_path(*item), image, camera)
         self._check_size(self.layout.mask_path(*item), mask, camera)
+
         # Blacked out before anything is interpolated, so that no background bleeds in.
         image = fit(cropping.black_out(image, mask, rules.composed), exact=False)
+
+        # Labels near the stored mask's outline, before the mask is resampled.
         labels = self._label_image(item)
         if labels is not None:
             if self.ignore_band:
@@ -221,13 +246,17 @@ class CaptureDataset(Dataset[Frame]):
         if unsure is not None:
             unsure = fit(unsure, exact=True)
         mask = fit(mask, exact=rules.mask_sampling == "nearest")
-        return DecodedImage(
-            np.ascontiguousarray(image.transpose(2, 0, 1)), mask, labels, unsure
-        )
+
+        # Channels first, as networks take them.
+        chw = np.ascontiguousarray(image.transpose(2, 0, 1))
+        return DecodedImage(chw, mask, labels, unsure)
 
     @staticmethod
     def _check_size(path: Path, image: Bytes, camera: CameraEntry) -> None:
-        """Only some headers are checked at the start, see `Thresholds.header_stride`."""
+        """Refuses an image of another size than the camera's.
+
+        Only some headers are checked at the start, see `Thresholds.header_stride`.
+        """
         if image.shape[:2] != camera.size:
             h, w = image.shape[:2]
             raise DataError(
@@ -236,20 +265,23 @@ class CaptureDataset(Dataset[Frame]):
             )
 
     def _label_image(self, item: Item) -> Bytes | None:
+        """``[H, W]`` the item's part numbers as stored; None for a capture without labels."""
         if not self.layout.labels:
             return None
+        camera = self._entry(item)
+
+        # An image without labels in a capture that has some is ignored everywhere.
         path = self.layout.label_path(*item)
-        camera = self.layout.cameras[item[0]]
         if path is None:
             return np.full(camera.size, IGNORE_LABEL, np.uint8)
-        meta = self.layout.meta
-        rules = self.layout.pixels
-        labels = pixels.read_labels(path, rules, meta.label_names)
+        names = self.layout.meta.label_names
+        labels = pixels.read_labels(path, self.layout.pixels, names)
         self._check_size(path, labels, camera)
         return labels
 
 
 def _float(array: NDArray[np.float64]) -> Tensor:
+    """A float32 tensor with a batch dimension in front."""
     return torch.from_numpy(array).to(torch.float32)[None]
 
 
@@ -279,7 +311,7 @@ class StepSampler(DistributedSampler[int]):
         replicas: int = 1,
         rank: int = 0,
     ) -> None:
-        # Of its dataset, the base class needs the length alone.
+        # The base class only needs the length of its dataset.
         length: Any = range(items)
         super().__init__(
             length, num_replicas=replicas, rank=rank, shuffle=True, seed=seed
@@ -294,17 +326,22 @@ class StepSampler(DistributedSampler[int]):
     def __iter__(self) -> Iterator[int]:
         order = torch.empty(0)
         shuffled = -1
-        for step in range(self.epoch * self.steps, (self.epoch + 1) * self.steps):
+        first_step = self.epoch * self.steps
+        for step in range(first_step, first_step + self.steps):
+            # The processes take consecutive batches of each step.
             first = (step * self.num_replicas + self.rank) * self.batch_size
             for draw in range(first, first + self.batch_size):
-                if draw // self.items != shuffled:
-                    shuffled = draw // self.items
-                    order = pass_order(self.items, self.seed, shuffled)
-                yield int(order[draw % self.items])
+                # The pass that this draw belongs to, shuffled when the first of its draws comes.
+                number, place = divmod(draw, self.items)
+                if number != shuffled:
+                    shuffled = number
+                    order = pass_order(self.items, self.seed, number)
+                yield int(order[place])
 
 
 def pass_order(items: int, seed: int, number: int) -> torch.Tensor:
     """``[items]`` the order of a shuffled pass, a pure function of its arguments."""
+    # A hash of seed and number, so that neighbouring seeds give unrelated orders.
     mixed = np.random.SeedSequence([seed, number]).generate_state(1, np.uint64)[0]
     generator = torch.Generator().manual_seed(int(mixed) >> 1)
     return torch.randperm(items, generator=generator)

@@ -26,8 +26,10 @@ from gsgan.utils.pickles import read_npz
 JPEG_SIGNATURE = b"\xff\xd8"
 JPEG_END = b"\xff\xd9"
 JPEG_SCAN = b"\xff\xda"
+# the last group of digits in a name
 LAST_DIGITS = re.compile(r"([0-9]+)[^0-9]*$")
-LARGEST_FRAME = 10**9  # frame numbers beyond it are dates or damage
+# frame numbers beyond it are dates or damage
+LARGEST_FRAME = 10**9
 
 
 def read_header(path: Path) -> tuple[tuple[int, int], int, str]:
@@ -38,8 +40,13 @@ def read_header(path: Path) -> tuple[tuple[int, int], int, str]:
     """
     try:
         with Image.open(path, formats=("PNG", "JPEG")) as image:
-            stored = re.search(r";(\d+)", str(image.tile[0][3]))  # e.g. RGB;16B, L;4
-            depth = int(stored[1]) if stored else 1 if image.mode == "1" else 8
+            # Pillow's raw mode names other depths than 8: RGB;16B, L;4.
+            depth = 8
+            stored = re.search(r";(\d+)", str(image.tile[0][3]))
+            if stored:
+                depth = int(stored[1])
+            elif image.mode == "1":
+                depth = 1
             return (image.height, image.width), depth, image.mode
     except UnidentifiedImageError:
         pass
@@ -63,6 +70,8 @@ def check_image(path: Path, kind: str, size: tuple[int, int], expected_by: str) 
         DataError: on a wrong size, bit depth, or channel layout.
     """
     found, depth, mode = read_header(path)
+
+    # Size, then depth, then channels.
     if found != size:
         raise DataError(
             f"{path} is {found[1]}x{found[0]} pixels (width x height), but "
@@ -88,6 +97,7 @@ def read_colour(path: Path) -> NDArray[np.uint8]:
     Raises:
         DataError: when the file is missing, damaged or cut off.
     """
+    # OpenCV decodes to BGR.
     image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
@@ -104,7 +114,7 @@ def read_stored(path: Path) -> NDArray[np.uint8]:
 
 
 def read_with_alpha(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
-    """``[H, W, 3]`` uint8 RGB as stored and ``[H, W]`` alpha, None where the file has none.
+    """``[H, W, 3]`` uint8 RGB as stored and ``[H, W]`` alpha, None if the file has none.
 
     Raises:
         DataError: when the file is missing, damaged, cut off, or is not an 8-bit colour image.
@@ -112,8 +122,12 @@ def read_with_alpha(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | 
     image = _decode_8_bit(path)
     if image.ndim != 3 or image.shape[2] not in (3, 4):
         raise DataError(f"{path} is a grey image; expected RGB, with or without alpha")
+    # OpenCV decodes to BGR, or BGRA.
     rgb = np.ascontiguousarray(image[..., 2::-1])
-    return rgb, np.ascontiguousarray(image[..., 3]) if image.shape[2] == 4 else None
+    alpha = None
+    if image.shape[2] == 4:
+        alpha = np.ascontiguousarray(image[..., 3])
+    return rgb, alpha
 
 
 def read_alpha(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]] | None:
@@ -129,6 +143,7 @@ def read_alpha(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]] | None
 
 
 def _decode_8_bit(path: Path) -> NDArray[np.uint8]:
+    """The channels of an 8-bit file as OpenCV orders them."""
     image = _decode(path, cv2.IMREAD_UNCHANGED)
     if image.dtype != np.uint8:
         raise DataError(
@@ -138,13 +153,16 @@ def _decode_8_bit(path: Path) -> NDArray[np.uint8]:
 
 
 def _decode(path: Path, flags: int) -> NDArray[Any]:
+    """The image of a whole, undamaged file, by OpenCV with its ``flags``."""
     try:
         data = path.read_bytes()
     except OSError as error:
         raise _unreadable(path, error) from None
+
+    # A damaged file decodes to None, or raises, e.g. on a header that claims 2³¹ pixels.
     image = None
     if data and not cut_off(data):
-        with contextlib.suppress(cv2.error):  # e.g. a header that claims 2³¹ pixels
+        with contextlib.suppress(cv2.error):
             image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if image is None:
         raise DataError(
@@ -155,8 +173,11 @@ def _decode(path: Path, flags: int) -> NDArray[Any]:
 
 def cut_off(data: bytes) -> bool:
     """Whether a JPEG lacks its end marker; some decoders silently fill the rest with grey."""
+    if not data.startswith(JPEG_SIGNATURE):
+        return False
+    # A thumbnail in the header has an end marker too, so only those after the last scan count.
     scan = data.rfind(JPEG_SCAN)
-    return data[:2] == JPEG_SIGNATURE and (scan < 0 or data.find(JPEG_END, scan) < 0)
+    return scan < 0 or data.find(JPEG_END, scan) < 0
 
 
 def _unreadable(path: Path, error: OSError) -> DataError:
@@ -203,8 +224,8 @@ def read_arrays(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
 class FrameFiles(Mapping[int, str]):
     """Paths of files by frame number, rising.
 
-    Convention: kept in two arrays. Of millions of paths as objects, every loading process would
-    soon have a copy, since Python writes to an object that is read.
+    Stored as two arrays: reading Python objects changes their reference counts, so copy-on-write
+    would soon duplicate millions of paths in every loading process.
 
     Args:
         folder: before every name.
@@ -214,10 +235,12 @@ class FrameFiles(Mapping[int, str]):
     def __init__(self, folder: str, names: Mapping[int, str]) -> None:
         self.folder = folder
         self.frames = np.array(sorted(names), np.int64)
-        held = [names[f] for f in self.frames.tolist()]
+        # Encoded together, which is faster; no name holds a slash.
+        held = [names[frame] for frame in self.frames.tolist()]
         self._names = np.array(os.fsencode("/".join(held)).split(b"/")[: len(held)])
 
     def __getitem__(self, frame: int) -> str:
+        # The frames are sorted, so that a binary search finds them.
         place = int(self.frames.searchsorted(frame))
         if place == len(self.frames) or self.frames[place] != frame:
             raise KeyError(frame)
@@ -230,7 +253,8 @@ class FrameFiles(Mapping[int, str]):
         return len(self.frames)
 
     def without(self, frames: Iterable[int]) -> Self:
-        """Those of the other frames."""
+        """The paths of all other frames."""
+        # The folder is shared, the arrays are cut.
         keep = np.isin(self.frames, np.fromiter(frames, np.int64), invert=True)
         found = copy(self)
         found.frames = self.frames[keep]
@@ -257,6 +281,7 @@ def frame_files(
     """
     place = root / folder
     names = frozenset(own_entries(place, root) if place.is_dir() else ())
+    # The index is cached without its folder, so this camera gets a copy with its own.
     try:
         found = copy(_by_frame(names, suffixes, number or last_number))
     except DataError as error:
@@ -271,8 +296,10 @@ def _by_frame(
     suffixes: tuple[str, ...],
     number: Callable[[str], int | None],
 ) -> FrameFiles:
+    """The files with one of the suffixes, by the number that each stem gives."""
     found = dict[int, str]()
     for name in sorted(names):
+        # Hidden files, such as those that macOS makes of every copied file, do not count.
         stem, _, suffix = name.rpartition(".")
         if f".{suffix.lower()}" not in suffixes or name.startswith("."):
             continue
@@ -294,13 +321,19 @@ def own_entries(folder: Path, root: Path) -> list[str]:
     """The names in a dataset's folder.
 
     Raises:
-        DataError: when one of them, or the folder, is a link to a place outside the dataset, which
-            then could have any file of this machine read.
+        DataError: if the folder or an entry is a link to a place outside the dataset: a downloaded
+            dataset could then read any file of this machine.
     """
     home = root.resolve()
     with os.scandir(folder) as found:
         entries = list(found)
-    for link in (folder, *(Path(entry) for entry in entries if entry.is_symlink())):
+
+    # Only links can lead out, so only those are resolved.
+    links = [folder]
+    for entry in entries:
+        if entry.is_symlink():
+            links.append(Path(entry))
+    for link in links:
         if not link.resolve().is_relative_to(home):
             raise DataError(
                 f"{link} is a link to {link.resolve()}, outside the dataset; copy the files into "
@@ -311,6 +344,7 @@ def own_entries(folder: Path, root: Path) -> list[str]:
 
 def last_number(stem: str) -> int | None:
     """The last group of digits in a file's stem; None above `LARGEST_FRAME`."""
+    # Names often have other numbers in front, such as a date.
     found = LAST_DIGITS.search(stem)
     return frame_of(found[1]) if found else None
 
@@ -318,15 +352,17 @@ def last_number(stem: str) -> int | None:
 def frame_of(digits: str) -> int | None:
     """The frame number in a group of digits; None above `LARGEST_FRAME`."""
     digits = digits.lstrip("0") or "0"
-    # before int(), which refuses very long ones
+    # int() refuses very long numbers.
     if len(digits) > len(str(LARGEST_FRAME)):
         return None
-    return number if (number := int(digits)) <= LARGEST_FRAME else None
+    number = int(digits)
+    return number if number <= LARGEST_FRAME else None
 
 
 def natural_order(name: str) -> tuple[tuple[int, str | int], ...]:
     """Sort key by which ``Camera_B2`` comes before ``Camera_B10``."""
-    parts = re.split(r"([0-9]+)", name)
-    return tuple(
-        (1, int(part)) if part.isdigit() else (0, part) for part in parts if part
-    )
+    key: list[tuple[int, str | int]] = []
+    for part in filter(None, re.split(r"([0-9]+)", name)):
+        # Numbers before text, so that unlike parts can be compared.
+        key.append((1, int(part)) if part.isdigit() else (0, part))
+    return tuple(key)

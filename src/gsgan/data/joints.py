@@ -11,24 +11,20 @@ BODY = len(MEDIAPIPE33.names)
 LEFT = slice(BODY, BODY + HAND)
 RIGHT = slice(BODY + HAND, BODY + 2 * HAND)
 HANDS = slice(BODY, BODY + 2 * HAND)
-# Landmarks of the face by name, and their numbers among the 468 of MediaPipe's face mesh: the outer
-# lip; the upper edges of left and right brow; inner, upper, outer and lower lid of both eyes.
-FACE_MESH = dict(
-    zip(
-        FACE_NAMES,
-        (
-            *(291, 270, 269, 0, 39, 40, 61, 91, 181, 17, 405, 321),
-            *(336, 296, 334, 293, 300, 107, 66, 105, 63, 70),
-            *(362, 386, 263, 374, 133, 159, 33, 145),
-        ),
-        strict=True,
-    )
-)
+# Landmarks of the face by name, and their numbers among the 468 of MediaPipe's face mesh.
+_LIPS = (291, 270, 269, 0, 39, 40, 61, 91, 181, 17, 405, 321)
+# upper edges, the left brow first
+_BROWS = (336, 296, 334, 293, 300, 107, 66, 105, 63, 70)
+# inner, upper, outer and lower lid, the left eye first
+_LIDS = (362, 386, 263, 374, 133, 159, 33, 145)
+FACE_MESH = dict(zip(FACE_NAMES, _LIPS + _BROWS + _LIDS, strict=True))
 FACE = slice(HANDS.stop, HANDS.stop + len(FACE_MESH))
 ALL = FACE.stop
 
-WRISTS = [15, 16]  # of the body
-PALM = (5, 9, 13, 17)  # knuckles: their bones from the wrist keep their length
+# of the body
+WRISTS = [15, 16]
+# knuckles: their bones from the wrist keep their length
+PALM = (5, 9, 13, 17)
 
 HEAD_PAIRS = ((1, 4), (2, 5), (3, 6), (7, 8), (9, 10))
 ARM_PAIRS = tuple((j, j + 1) for j in range(11, 23, 2))
@@ -40,10 +36,12 @@ HAND_PAIRS = tuple((BODY + j, BODY + HAND + j) for j in range(HAND))
 FLIP_GROUPS = (HEAD_PAIRS, ARM_PAIRS, LEG_PAIRS)
 
 
-# Other detectors' joint numbers by MediaPipe's, for those that both have.
+# Other detectors' joint numbers by MediaPipe's, for the joints that both have.
 # nose, eyes, ears, arms, legs
 _SHARED = (0, 2, 5, 7, 8, *range(11, 17), *range(23, 29))
-_FEET = (29, 30, 31, 32)  # heels, then toes; the left one first
+# heels, then toes; the left one first
+_FEET = (29, 30, 31, 32)
+# nose, eyes, ears, arms and legs, in COCO's order
 _COCO = {landmark: joint for joint, landmark in enumerate(_SHARED)}
 _BODY_25 = dict(
     zip(
@@ -67,6 +65,7 @@ _COCO_18 = dict(
         strict=True,
     )
 )
+# by number of joints: name of the set, and its joint numbers by MediaPipe's
 SETS: dict[int, tuple[str, dict[int, int]]] = {
     17: ("COCO", _COCO),
     18: ("OpenPose's COCO", _COCO_18),
@@ -92,8 +91,8 @@ def joint_names() -> tuple[str, ...]:
 
 
 def zeros_as_missing(points: Float) -> Float:
-    """``points [..., D]`` with NaN for those whose coordinates are all exactly 0: many detectors
-    write a missing joint so."""
+    """``points [..., D]`` with NaN for points whose coordinates are all exactly 0: many detectors
+    write missing joints so."""
     return np.where((points == 0).all(-1, keepdims=True), np.nan, points)
 
 

@@ -25,6 +25,7 @@ from gsgan.data.validation import (
 )
 from gsgan.utils.errors import DataError
 
+# masks by camera and frame
 MaskIndex = Mapping[str, Mapping[int, tuple[MaskFile, ...]]]
 
 
@@ -72,14 +73,14 @@ class Meta:
 
 @dataclass(frozen=True, kw_only=True)
 class _Contents:
-    """Paths are relative to the root.
+    """The parts that `Found` and `Layout` share. Paths are relative to the root.
 
     Args:
         root: the dataset's folder.
-        meta: about the whole.
+        meta: facts about the capture as a whole.
         cameras: by name, in the order of `camera_index`.
         images: by camera and frame.
-        masks: by camera and frame, one or more per image; also of images that are left out.
+        masks: by camera and frame, one or more per image, including those of images left out.
         labels: by camera and frame; empty without labels.
         landmarks: by frame.
         hands: 21 landmarks of the left hand and of the right one by frame, or None.
@@ -143,9 +144,10 @@ class Layout(_Contents):
 
     def mask_files(self, camera: str, frame: int) -> list[tuple[str, Path]]:
         """All masks of a camera and frame with their rules, for `gsgan.data.pixels.read_mask`."""
-        return [
-            (mask.rule, self.root / mask.path) for mask in self.masks[camera][frame]
-        ]
+        files = []
+        for mask in self.masks[camera][frame]:
+            files.append((mask.rule, self.root / mask.path))
+        return files
 
     def label_path(self, camera: str, frame: int) -> Path | None:
         """The part labels of a camera and frame, or None without labels."""
@@ -165,6 +167,7 @@ def dataset_folder(root: str | Path, expected: str) -> Path:
         raise DataError(
             f"data.root={root} {problem}; expected the folder that holds {expected}"
         )
+    # Refuses links that lead out.
     own_entries(folder, folder)
     return folder
 
@@ -177,22 +180,41 @@ def assemble(found: Found, limits: Thresholds) -> Layout:
     """
     root = found.root
     cameras = found.cameras
-    marks = found.landmarks
-    notes = list(found.notes)
+    landmarks = found.landmarks
     calibration = found.calibration
-    images = drop_frames(root, found.images, marks, found.poses, limits, notes)
-    check_geometry(root, cameras, images, marks, limits, calibration, found.unit_hint)
-    images = drop_unseen(cameras, images, marks, limits, calibration, notes)
-    folders = {name: root / found.mask_folder.format(camera=name) for name in cameras}
-    images = drop_unmasked(images, found.masks, folders, limits, notes)
-    labels = {
-        c: {f: p for f, p in found.labels.get(c, {}).items() if f in files}
-        for c, files in images.items()
-    }
-    labels = labels if any(labels.values()) else {}
-    check_images(
-        root, cameras, images, found.masks, labels, limits.header_stride, calibration
+    notes = list(found.notes)
+
+    # Frames need a skeleton, and cameras must fit the skeletons.
+    images = drop_frames(root, found.images, landmarks, found.poses, limits, notes)
+    check_geometry(
+        root, cameras, images, landmarks, limits, calibration, found.unit_hint
     )
+
+    # Images must show the person and have a mask.
+    images = drop_unseen(cameras, images, landmarks, limits, calibration, notes)
+    folders = {}
+    for name in cameras:
+        folders[name] = root / found.mask_folder.format(camera=name)
+    images = drop_unmasked(images, found.masks, folders, limits, notes)
+
+    # Labels of the images that are left; none at all is the same as a capture without labels.
+    labels = {}
+    for name, files in images.items():
+        stored = found.labels.get(name, {})
+        labels[name] = {f: path for f, path in stored.items() if f in files}
+    if not any(labels.values()):
+        labels = {}
+    check_images(
+        root,
+        cameras,
+        images,
+        found.masks,
+        labels,
+        stride=limits.header_stride,
+        calibration=calibration,
+    )
+
+    # All other fields stay as the reader found them.
     kept = {one.name: getattr(found, one.name) for one in fields(_Contents)}
     kept |= {"images": images, "labels": labels, "notes": tuple(notes)}
     return Layout(**kept, frames=tuple(sorted(set[int]().union(*images.values()))))

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from gsgan.utils.errors import ConfigError
 
+# allowed values of the fields below
 CHOICES: dict[str, tuple[Any, ...]] = {
     "region": ("full", "body_box_cleared", "body_box"),
     "background": ("black", "white"),
@@ -28,7 +29,7 @@ class MetricVariants:
     Args:
         region: "full" image; "body_box_cleared", the full image with the prediction cleared to
             the background outside the body's projected 3D box; "body_box", PSNR inside that box
-            only and SSIM on the rectangle round it, both images cleared outside.
+            only and SSIM on the rectangle around it, both images cleared outside.
         background: on which ground truth and prediction are compared.
         lpips_region: "full" image, or "mask_crop_512": the true mask and 50 px, in a square of
             the background, resized to 512.
@@ -61,14 +62,17 @@ class MetricVariants:
     truth_outline: Literal["soft", "hard"] = "soft"
 
     def __post_init__(self) -> None:
+        # A config gives a list, which would equal no tuple.
         if isinstance(self.lpips_range, (list, tuple)):
             object.__setattr__(self, "lpips_range", tuple(self.lpips_range))
         for name, choices in CHOICES.items():
+            # True and False equal 1 and 0, but are no choices.
             value = getattr(self, name)
             if isinstance(value, bool) or value not in choices:
-                listed = (
-                    str(list(c)) if isinstance(c, tuple) else str(c) for c in choices
-                )
+                listed = []
+                for choice in choices:
+                    shown = list(choice) if isinstance(choice, tuple) else choice
+                    listed.append(str(shown))
                 raise ConfigError(
                     f"protocol.measures.{name} must be {' or '.join(listed)}; got {value!r}"
                 )

@@ -1,6 +1,6 @@
 """Masks, part labels and uncertain pixels of a dataset: named rules, applied on reading.
 
-Convention: a mask rule defines the meaning of the numbers in a mask file; several masks of one
+A mask rule defines the meaning of the numbers in a mask file; several masks of one
 image are joined by their maximum. All results are uint8.
 """
 
@@ -18,6 +18,7 @@ from gsgan.data.files import read_alpha, read_grey, read_stored
 from gsgan.utils.arrays import Bool, Bytes
 from gsgan.utils.errors import DataError
 
+# part number of pixels without a known part
 IGNORE_LABEL = 255
 
 
@@ -35,15 +36,15 @@ class MaskFile(NamedTuple):
 
 
 def mask_file(path: str) -> MaskFile:
-    """A mask of the rule "nonzero"; a JPEG's is "threshold", as compression rings round edges."""
-    return MaskFile(
-        "threshold" if path.lower().endswith((".jpg", ".jpeg")) else "nonzero", path
-    )
+    """A mask of the rule "nonzero"; a JPEG's is "threshold", as compression rings around edges."""
+    # Compression leaves small values next to the outline.
+    jpeg = path.lower().endswith((".jpg", ".jpeg"))
+    return MaskFile("threshold" if jpeg else "nonzero", path)
 
 
 @dataclass(frozen=True)
 class PixelRules:
-    """How to decode a format's files.
+    """Rules for decoding a format's files.
 
     Args:
         composed: images are already composed on black by their mask.
@@ -76,13 +77,12 @@ def read_mask(files: Sequence[tuple[str, Path]], rules: PixelRules) -> Bytes:
     Raises:
         DataError: when a file is missing, damaged, does not fit its rule, or differs in size.
     """
-    joined = _one_mask(*files[0], rules)
+    first_rule, first = files[0]
+    joined = _one_mask(first_rule, first, rules)
     for rule, path in files[1:]:
         mask = _one_mask(rule, path, rules)
         if mask.shape != joined.shape:
-            raise DataError(
-                f"{path} and {files[0][1]}, masks of one image, differ in size"
-            )
+            raise DataError(f"{path} and {first}, masks of one image, differ in size")
         joined = np.maximum(joined, mask)
     return joined
 
@@ -95,6 +95,7 @@ def read_mask_values(path: Path) -> Bytes:
     """
     alpha = read_alpha(path)
     if alpha is not None:
+        # Colours that vary are an image, whose alpha is not the mask.
         colours, mask = alpha
         if (colours == colours[0, 0]).all() and mask.min() < mask.max():
             return mask
@@ -102,29 +103,31 @@ def read_mask_values(path: Path) -> Bytes:
 
 
 def _one_mask(rule: str, path: Path, rules: PixelRules) -> Bytes:
+    """``[H, W]`` 0..255: one mask file by its rule."""
     if rule == "grey":
         mask = read_mask_values(path)
+
+        # A mask of 0 and 1, or of 0 and another low value, was stored as numbers, not as alpha.
         highest = int(mask.max())
-        two_values = (
-            highest <= 127 and mask.min() == 0 and np.isin(mask, (0, highest)).all()
-        )
-        if highest == 1 or (highest > 0 and two_values):
+        two_values = mask.min() == 0 and np.isin(mask, (0, highest)).all()
+        if highest == 1 or (0 < highest <= 127 and two_values):
             raise DataError(
                 f"{path} holds 0 and {highest} alone; expected alpha from 0 to 255, and a person "
                 "where it is at least 128 (multiply it)"
             )
         return mask
+
+    # The lowest value of the person.
     if rule == "threshold":
         values = read_mask_values(path)
-        least = rules.threshold
+        lowest = rules.threshold
     else:
         values = read_stored(path)
-        least = 1
+        lowest = 1
         if values.ndim == 3:
-            values = values[..., 0] | values[..., 1] | values[..., 2]
-    return np.asarray(
-        cv2.threshold(values, least - 1, 255, cv2.THRESH_BINARY)[1], np.uint8
-    )
+            values = np.bitwise_or.reduce(values, axis=-1)
+    _, person = cv2.threshold(values, lowest - 1, 255, cv2.THRESH_BINARY)
+    return np.asarray(person, np.uint8)
 
 
 def read_labels(path: Path, rules: PixelRules, names: Sequence[str] | None) -> Bytes:
@@ -140,9 +143,10 @@ def read_labels(path: Path, rules: PixelRules, names: Sequence[str] | None) -> B
     """
     labels = read_grey(path)
     if rules.label_table is not None:
-        labels = np.asarray(
-            cv2.LUT(labels, np.array(rules.label_table, np.uint8)), np.uint8
-        )
+        table = np.array(rules.label_table, np.uint8)
+        labels = np.asarray(cv2.LUT(labels, table), np.uint8)
+
+    # Every part must have a name.
     if names is not None:
         highest = int(labels.max(where=labels != IGNORE_LABEL, initial=0))
         if highest >= len(names):
@@ -161,9 +165,12 @@ def with_ignored_border(labels: Bytes, mask: Bytes, band: int) -> Bytes:
 
 
 def outline(mask: Bytes, band: int) -> Bool:
-    """``[H, W]`` where the mask dilated and eroded by a square of this side differ; 0: nowhere."""
+    """``[H, W]`` the band around the mask's outline, none if ``band`` is 0: pixels in which the
+    dilated and the eroded mask differ, for a square of that side."""
     if band == 0:
         return np.zeros(mask.shape, np.bool_)
+
+    # The band lies on both sides of the outline.
     person = (mask > 127).astype(np.uint8)
     kernel = np.ones((band, band), np.uint8)
     return np.asarray(cv2.dilate(person, kernel) != cv2.erode(person, kernel))
@@ -179,8 +186,10 @@ def read_unsure(
         mask: ``[H, W]`` 0..255, the result of `read_mask`.
         rules: of the dataset.
     """
+    # Without a rule all pixels count.
     if rules.unsure_band == 0 and rules.unsure_alpha is None:
         return None
+    # The band at the outline, and pixels of uncertain alpha.
     unsure = outline(mask, rules.unsure_band)
     if rules.unsure_alpha is not None:
         low, high = rules.unsure_alpha

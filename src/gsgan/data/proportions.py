@@ -1,6 +1,6 @@
 """The subject's proportions, as a skeleton in a standard pose: the target of retargeting.
 
-Convention: metres; standard axes have Z up. The standard pose is an upright T: it faces -Y, the
+Lengths are in metres; standard axes have Z up. The standard pose is an upright T: it faces -Y, the
 person's left is +X, palms down, legs straight down, the middle of the hips at the origin.
 """
 
@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsgan.skeleton import HOLISTIC, MEDIAPIPE33, bone_frames, sanitise
-from gsgan.skeleton.face import FACE
-from gsgan.skeleton.hands import FINGER_BONES, HAND, INDEX, PINKY, WRIST
+from gsgan.data import joints as numbers
+from gsgan.skeleton import HOLISTIC, bone_frames, sanitise
+from gsgan.skeleton.hands import FINGER_BONES, INDEX, PINKY, WRIST
 from gsgan.skeleton.template import CHEST, HEAD, PELVIS
 from gsgan.utils.arrays import Bool, Float
 from gsgan.utils.errors import DataError
@@ -23,19 +23,26 @@ EARS = (7, 8)
 HIPS = (23, 24)
 ARMS = ((11, 13), (13, 15)), ((12, 14), (14, 16))
 LEGS = ((23, 25), (25, 27)), ((24, 26), (26, 28))
-BONES = (*ARMS[0], *ARMS[1], *LEGS[0], *LEGS[1])  # parents first
-# By wrist: base of the little finger, of the index finger, thumb; by ankle: heel, toes.
+# parents first
+BONES = (*ARMS[0], *ARMS[1], *LEGS[0], *LEGS[1])
+# by wrist: base of the little finger, base of the index finger, thumb
 HAND_LANDMARKS = {15: (17, 19, 21), 16: (18, 20, 22)}
+# by ankle: heel, toes
 FEET = {27: (29, 31), 28: (30, 32)}
-BODY = len(MEDIAPIPE33.names)
+BODY = numbers.BODY
 # by wrist
-HAND_JOINTS = {15: slice(BODY, BODY + HAND), 16: slice(BODY + HAND, BODY + 2 * HAND)}
-EXPRESSION = slice(BODY + 2 * HAND, BODY + 2 * HAND + FACE)  # lips, brows and lids
-SIDES = {15: 1.0, 16: -1.0}  # of the standard pose's x
+HAND_JOINTS = {15: numbers.LEFT, 16: numbers.RIGHT}
+# lips, brows and lids
+EXPRESSION = numbers.FACE
+# sign of the standard pose's x, by wrist
+SIDES = {15: 1.0, 16: -1.0}
 HEELS_AND_TOES = (29, 30, 31, 32)
-HEAD_LANDMARKS = tuple(range(11))  # nose, eyes, ears, corners of the mouth
-STANDING = 10  # percentile of a foot's heights below which it counts as standing
-TO_STANDARD = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])  # of left, up, front
+# nose, eyes, ears, corners of the mouth
+HEAD_LANDMARKS = tuple(range(11))
+# percentile of a foot's heights below which it counts as standing
+STANDING = 10
+# rotation of the axes left, up, front
+TO_STANDARD = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 
 
 @dataclass(frozen=True)
@@ -48,8 +55,8 @@ class Proportions:
         ground: metres along the world's up axis, of the lowest heel or toe of a standing person.
         facing: radians about the up axis, 0 towards -Y of the standard axes: the mean heading.
         up: the world's up axis, e.g. "z" or "-y".
-        hands: 42 hand landmarks in the standard pose, the left hand's first, of the training
-            frames' median proportions; None where no frame has a hand.
+        hands: 42 hand landmarks in the standard pose, the left hand's first, with the median
+            proportions of the training frames; None if no frame has a hand.
     """
 
     joints: tuple[tuple[float, float, float], ...]
@@ -70,22 +77,22 @@ class Proportions:
         rest = self.rest
         if self.hands is not None:
             return np.concatenate([rest, self.hands])
+
+        # The template's hands, scaled by the ratio of the lengths of the palms.
         template = np.array(HOLISTIC.rest_positions)
-        pinky, index, _ = HAND_LANDMARKS[15]
-        hands = {
-            w: _hand(template[None, at], template[None, w])
-            for w, at in HAND_JOINTS.items()
-        }
-        sizes = [
-            np.linalg.norm(middle(p, (pinky, index)) - p[15]) for p in (rest, template)
-        ]
-        hands = {wrist: hand * sizes[0] / sizes[1] for wrist, hand in hands.items()}
+        own_palm = _palm_length(rest)
+        template_palm = _palm_length(template)
+        hands = {}
+        for wrist, joints in HAND_JOINTS.items():
+            hand = _hand(template[None, joints], template[None, wrist])
+            hands[wrist] = hand * own_palm / template_palm
         return np.concatenate([rest, _standing_hands(rest, hands)])
 
     @property
     def leg(self) -> float:
         """Length of thigh and shin, metres."""
-        return float(sum(length(self.rest, bone) for bone in LEGS[0]))
+        thigh, shin = LEGS[0]
+        return length(self.rest, thigh) + length(self.rest, shin)
 
 
 def measure_proportions(p: Tensor, valid: Tensor, up: str) -> Proportions:
@@ -97,22 +104,31 @@ def measure_proportions(p: Tensor, valid: Tensor, up: str) -> Proportions:
         valid: ``[F, 33]`` or ``[F, 75]``.
         up: the world's up axis.
     """
+    # Positions in standard axes; sanitise() estimates the missing ones.
+    to_standard = upright(up).T
     whole, _ = sanitise(p[:, :BODY].double(), valid[:, :BODY])
-    q = whole.numpy() @ upright(up).T
-    hubs = bone_frames(torch.from_numpy(q)).hubs.numpy()
+    q = whole.numpy() @ to_standard  # [F, 33, 3]
+    hubs = bone_frames(torch.from_numpy(q)).hubs.numpy()  # [F, hubs, 3, 3]
+
+    # The standard pose, part by part. Hands follow the wrists, so limbs come first.
     rest = np.zeros((BODY, 3))
     _place_limbs(rest, q)
-    for wrist, ends in HAND_LANDMARKS.items():
-        held = _local(hand_frame(q, wrist, *ends[:2]), q[:, ends] - q[:, wrist, None])
-        rest[list(ends)] = rest[wrist] + held * (SIDES[wrist], 1.0, SIDES[wrist])
+    for wrist, (pinky, index, thumb) in HAND_LANDMARKS.items():
+        ends = [pinky, index, thumb]
+        frames = hand_frame(q, wrist, pinky, index)  # [F, 3, 3]
+        held = _local(frames, q[:, ends] - q[:, wrist, None])  # [3, 3]
+        rest[ends] = rest[wrist] + held * (SIDES[wrist], 1.0, SIDES[wrist])
     _place_feet(rest, q)
     _place_head(rest, q, hubs)
+    hands = _hands(p.double().numpy() @ to_standard, valid.numpy())
+
+    # The floor is where feet stand; the heading is that of the pelvis.
+    lowest = q[:, HEELS_AND_TOES, 2].min(axis=1)  # [F]
     ahead = hubs[:, PELVIS, :, 2].mean(axis=0)
-    lowest = q[:, HEELS_AND_TOES, 2].min(axis=1)
-    hands = _hands(p.double().numpy() @ upright(up).T, valid.numpy())
+    share_seen = valid[:, :BODY].double().mean(0)
     return Proportions(
         joints=_plain(rest),
-        seen=tuple((valid[:, :BODY].double().mean(0) > 0.5).tolist()),
+        seen=tuple((share_seen > 0.5).tolist()),
         ground=float(np.percentile(lowest, STANDING)),
         facing=float(np.arctan2(ahead[0], -ahead[1])),
         up=up,
@@ -126,50 +142,57 @@ def _place_limbs(rest: Float, q: Float) -> None:
     def median_length(a: Float, b: Float) -> float:
         return float(np.median(np.linalg.norm(a - b, axis=-1)))
 
+    # The trunk: hips at the origin, shoulders above them.
     trunk = median_length(middle(q, HIPS), middle(q, SHOULDERS))
-    for pair, height in ((HIPS, 0.0), (SHOULDERS, trunk)):
-        half = median_length(q[:, pair[0]], q[:, pair[1]]) / 2
-        rest[list(pair)] = [half, 0, height], [-half, 0, height]
-    for limbs, ways in (
-        (ARMS, ((1, 0, 0), (-1, 0, 0))),
-        (LEGS, ((0, 0, -1), (0, 0, -1))),
-    ):
-        for limb, way in zip(limbs, ways, strict=True):
-            for a, b in limb:
-                rest[b] = rest[a] + median_length(q[:, a], q[:, b]) * np.array(way)
+    for (left, right), height in ((HIPS, 0.0), (SHOULDERS, trunk)):
+        half = median_length(q[:, left], q[:, right]) / 2
+        rest[left] = (half, 0, height)
+        rest[right] = (-half, 0, height)
+
+    # Arms point to the sides, legs down; each bone starts where the one before it ends.
+    down = (0, 0, -1)
+    ways = {ARMS[0]: (1, 0, 0), ARMS[1]: (-1, 0, 0), LEGS[0]: down, LEGS[1]: down}
+    for limb, way in ways.items():
+        for a, b in limb:
+            rest[b] = rest[a] + median_length(q[:, a], q[:, b]) * np.array(way)
 
 
 def _place_feet(rest: Float, q: Float) -> None:
     """Heels and toes of the standard pose, as they stand on the floor in ``q [F, 33, 3]``."""
     for ankle, (heel, toe) in FEET.items():
         foot = [heel, toe]
-        low = q[:, foot, 2].max(axis=1)
-        stands = q[low <= np.percentile(low, STANDING)]
+
+        # Only the frames in which this foot stands: heel and toes are both low.
+        height = q[:, foot, 2].max(axis=1)
+        stands = q[height <= np.percentile(height, STANDING)]
+
+        # Axes of the standing foot: its side, its heel's direction on the floor, up.
         ahead = (stands[:, toe] - stands[:, heel]) * (1, 1, 0)
-        back = -ahead / np.maximum(np.linalg.norm(ahead, axis=-1, keepdims=True), 1e-9)
+        size = np.linalg.norm(ahead, axis=-1, keepdims=True)
+        back = -ahead / np.maximum(size, 1e-9)
         above = np.broadcast_to([0.0, 0, 1], back.shape)
-        axes = np.stack([np.cross(back, above), back, above], axis=-1)
-        rest[foot] = rest[ankle] + _local(
-            axes, stands[:, foot] - stands[:, ankle, None]
-        )
+        axes = np.stack([np.cross(back, above), back, above], axis=-1)  # [F, 3, 3]
+
+        held = _local(axes, stands[:, foot] - stands[:, ankle, None])
+        rest[foot] = rest[ankle] + held
 
 
 def _place_head(rest: Float, q: Float, hubs: Float) -> None:
     """Face and ears of the standard pose, the gaze level, above its shoulders."""
+    # From the middle of the shoulders to that of the ears, in the chest's axes.
     ears = middle(q, EARS)
-    neck = (
-        _local(hubs[:, CHEST], (ears - middle(q, SHOULDERS))[:, None]) @ TO_STANDARD.T
-    )
+    lift = (ears - middle(q, SHOULDERS))[:, None]
+    neck = _local(hubs[:, CHEST], lift) @ TO_STANDARD.T
+
     # A level gaze turns the head's axes by this pitch: the nose lies below the ears.
     pitch = float(np.median(np.arcsin(np.clip(hubs[:, HEAD, 2, 2], -1, 1))))
-    level = np.array(
-        [
-            [1, 0, 0],
-            [0, np.cos(pitch), -np.sin(pitch)],
-            [0, np.sin(pitch), np.cos(pitch)],
-        ]
-    )
-    face = _local(hubs[:, HEAD], q[:, HEAD_LANDMARKS] - ears[:, None]) @ TO_STANDARD.T
+    cos = np.cos(pitch)
+    sin = np.sin(pitch)
+    level = np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]])
+
+    # The face around the middle of the ears, in the head's axes.
+    features = q[:, HEAD_LANDMARKS] - ears[:, None]
+    face = _local(hubs[:, HEAD], features) @ TO_STANDARD.T
     rest[list(HEAD_LANDMARKS)] = middle(rest, SHOULDERS) + neck + face @ level
 
 
@@ -192,6 +215,8 @@ def _hands(p: Float, seen: Bool) -> dict[int, Float]:
         whole = seen[:, hand].all(1) & seen[:, wrist]
         if whole.any() and p.shape[1] > BODY:
             found[wrist] = _hand(p[whole, hand], p[whole, wrist])
+
+    # In the palm's axes, the third coordinate alone tells left from right.
     if len(found) == 1:
         (other,) = found.values()
         found = dict.fromkeys(HAND_JOINTS, other * (1, 1, -1)) | found
@@ -201,8 +226,10 @@ def _hands(p: Float, seen: Bool) -> dict[int, Float]:
 def _hand(p: Float, wrist: Float) -> Float:
     """``[21, 3]`` medians of a hand ``[F, 21, 3]`` from the pose's wrist ``[F, 3]``, in the palm's
     axes; fingers have the median lengths of their bones."""
-    local = (p - wrist[:, None]) @ hand_frame(p, WRIST, PINKY, INDEX)
+    local = (p - wrist[:, None]) @ hand_frame(p, WRIST, PINKY, INDEX)  # [F, 21, 3]
     median = np.median(local, axis=0)
+
+    # Medians of positions shorten bones, so each bone gets its median length, parents first.
     held = median.copy()
     for a, b in FINGER_BONES:
         bone = median[b] - median[a]
@@ -213,12 +240,16 @@ def _hand(p: Float, wrist: Float) -> Float:
 
 def _standing_hands(rest: Float, hands: Mapping[int, Float]) -> Float:
     """``[42, 3]`` the hands of `_hands` at the wrists of a standard pose ``[33, 3]``."""
-    return np.concatenate(
-        [
-            rest[wrist] + hand * (SIDES[wrist], 1.0, SIDES[wrist])
-            for wrist, hand in hands.items()
-        ]
-    )
+    placed = []
+    for wrist, hand in hands.items():
+        placed.append(rest[wrist] + hand * (SIDES[wrist], 1.0, SIDES[wrist]))
+    return np.concatenate(placed)
+
+
+def _palm_length(p: Float) -> float:
+    """Metres from the left wrist of ``[J, 3]`` to the middle of the finger bases."""
+    pinky, index, _ = HAND_LANDMARKS[15]
+    return float(np.linalg.norm(middle(p, (pinky, index)) - p[15]))
 
 
 def upright(up: str) -> Float:
@@ -230,8 +261,11 @@ def upright(up: str) -> Float:
     axis = "xyz".find(up[-1:])
     if axis < 0 or up[:-1] not in ("", "-"):
         raise DataError(f"up must be x, y, z, -x, -y or -z, got {up!r}")
-    above = np.eye(3)[axis] * (-1 if up[:-1] else 1)
+    sign = -1 if up[:-1] else 1
+    above = np.eye(3)[axis] * sign
     first = np.eye(3)[(axis + 1) % 3]
+
+    # Rows are the standard axes in the world.
     return np.stack([first, np.cross(above, first), above])
 
 
@@ -254,7 +288,7 @@ def length(rest: Float, bone: tuple[int, int]) -> float:
 def hand_frame(p: Float, wrist: int, pinky: int, index: int) -> Float:
     """``[..., 3, 3]`` axes of a hand, see `part_frame`: along it, towards the little finger.
 
-    Convention: the second axis is opposite to that of `gsgan.skeleton.hands.palm_frames`.
+    The second axis is opposite to that of `gsgan.skeleton.hands.palm_frames`.
 
     Args:
         p: ``[..., J, 3]`` landmarks.
@@ -266,7 +300,9 @@ def hand_frame(p: Float, wrist: int, pinky: int, index: int) -> Float:
 
 def part_frame(along: Float, across: Float) -> Float:
     """``[..., 3, 3]`` columns: a direction, another made orthogonal to it, their cross product."""
-    a = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-9)
-    b = across - (across * a).sum(-1, keepdims=True) * a
-    b = b / np.maximum(np.linalg.norm(b, axis=-1, keepdims=True), 1e-9)
-    return np.stack([a, b, np.cross(a, b)], axis=-1)
+    # Gram-Schmidt: each direction becomes a unit vector, zero vectors stay zero.
+    first = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-9)
+    second = across - (across * first).sum(-1, keepdims=True) * first
+    size = np.linalg.norm(second, axis=-1, keepdims=True)
+    second = second / np.maximum(size, 1e-9)
+    return np.stack([first, second, np.cross(first, second)], axis=-1)

@@ -22,16 +22,17 @@ class Protocol:
     Args:
         name: of the protocol.
         train_cameras: names, or indices into the dataset's cameras as its reader orders them;
-            None for all that do not test.
-        test_cameras: the same; None for all that do not train.
-        train_frames: "0-55", "0-495:5" (every fifth), lists of them; or such by subject.
-        test_frames: the same.
+            None for all cameras that are not for tests.
+        test_cameras: likewise; None for all cameras that are not for training.
+        train_frames: "0-55", "0-495:5" (every fifth) or lists of such ranges; or all this by
+            subject.
+        test_frames: likewise.
         measures: the scored region of the images, and the variants of the metrics.
         scale: images are scored at this fraction of their stored size.
         lpips_net: the network of its LPIPS.
         source: of this definition.
         note: further remarks for readers of the numbers.
-        subject: selects the frames, where they differ by subject.
+        subject: selects the frames, if they differ by subject.
 
     Raises:
         ConfigError: on a value out of range.
@@ -50,6 +51,7 @@ class Protocol:
     subject: str | int | None = None
 
     def __post_init__(self) -> None:
+        # Above 0 and at most 1.
         between("protocol.scale", above("protocol.scale", self.scale), 0, 1)
         if self.train_cameras is None and self.test_cameras is None:
             raise ConfigError(
@@ -57,10 +59,11 @@ class Protocol:
             )
 
     def frames(self, side: Literal["train", "test"]) -> Any:
-        """The frames of one side; where they differ by subject, the subject must be set."""
+        """The frames of one side; if they differ by subject, the subject must be set."""
         frames = self.train_frames if side == "train" else self.test_frames
         if not isinstance(frames, Mapping):
             return frames
+        # Keys of a config may be numbers.
         by_subject = {str(key): value for key, value in frames.items()}
         if str(self.subject) not in by_subject:
             raise ConfigError(
@@ -70,13 +73,15 @@ class Protocol:
         return by_subject[str(self.subject)]
 
     def record(self) -> dict[str, Any]:
-        """All of it as plain values, frames as they are for the subject."""
+        """The protocol as plain values, with the frames of the subject."""
         plain = asdict(self)
         plain["train_frames"] = self.frames("train")
         plain["test_frames"] = self.frames("test")
+        # Lists, as JSON returns them.
         plain["measures"]["lpips_range"] = list(self.measures.lpips_range)
         for side in ("train_cameras", "test_cameras"):
-            plain[side] = None if plain[side] is None else list(plain[side])
+            if plain[side] is not None:
+                plain[side] = list(plain[side])
         return plain
 
     def departures(
@@ -86,10 +91,11 @@ class Protocol:
 
         Args:
             lpips_nets: the networks that LPIPS is computed with.
-            scale: fraction of the stored size at which images are scored; None when they are cut
-                round the person.
+            scale: fraction of the stored size at which images are scored; None if they are cut
+                around the person.
             padded: whole images are padded with black to squares.
         """
+        # The backbone, then the size and form of the images.
         if self.lpips_net not in lpips_nets:
             yield f"LPIPS is not computed with {self.lpips_net}, as requested (lpips.nets)"
         if scale is None:

@@ -23,7 +23,8 @@ from gsgan.skeleton.template import Vector
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.errors import DataError
 
-SOLID = 0.9  # of the mask: pixels at the outline are darkened by the black behind them
+# mask value of solid pixels: those at the outline are darkened by the black behind them
+SOLID = 0.9
 # images per requested sample on which the posed body is compared with masks
 MOST_BODY_IMAGES = 2
 
@@ -91,6 +92,7 @@ class SceneInfo:
 
 def refuse_swapped_sides(layout: Layout, frames: Sequence[int]) -> None:
     """Refuses a capture whose left and right are swapped in most frames, with a DataError."""
+    # The check knows joints, but not the dataset that they come from.
     try:
         p, valid = layout.landmarks.joints(frames)
         refuse_swapped(p[:, :BODY], valid[:, :BODY])
@@ -116,18 +118,24 @@ def scene_info(
             decides what can be rendered.
     """
     items = splits.items["train"]
-    body = layout.meta.body
     frames = items.frames
-    skeletons = dataset.skeletons.p
-    p, valid = layout.landmarks.joints(frames)
+    cameras = set(items.cameras)
+    names = tuple(name for name in layout.cameras if name in cameras)
     refuse_swapped_sides(layout, frames)
+
+    # The centre of the volume: the median over frames of the middle of the visible joints.
+    p, valid = layout.landmarks.joints(frames)
+    middles = [joints[seen].mean(0) for joints, seen in zip(p, valid, strict=True)]
+    x, y, z = torch.stack(middles).median(0).values.tolist()
+
+    # Proportions of the body with hands; poses of the completed skeletons.
     whole = layout.landmarks
     if layout.hands is not None:
         whole = whole.with_hands(layout.hands)
-    middles = torch.stack([q[v].mean(0) for q, v in zip(p, valid, strict=True)])
-    x, y, z = middles.median(0).values.tolist()
-    cameras = set(items.cameras)
-    names = tuple(name for name in layout.cameras if name in cameras)
+    whole_p, whole_valid = whole.joints(frames)
+    completed = np.stack([dataset.skeletons.p[frame] for frame in frames])  # [F, J, 3]
+
+    body = layout.meta.body
     return SceneInfo(
         camera_names=layout.camera_names,
         n_train_cameras=len(cameras),
@@ -148,108 +156,131 @@ def scene_info(
         darkest=_darkest(dataset, samples),
         body_inside=_body_inside(layout, dataset, samples),
         scale_train=_scale(dataset, samples),
-        poses=training_poses(
-            torch.from_numpy(np.stack([skeletons[f] for f in frames]))
-        ),
-        proportions=measure_proportions(*whole.joints(frames), layout.meta.up_axis),
+        poses=training_poses(torch.from_numpy(completed)),
+        proportions=measure_proportions(whole_p, whole_valid, layout.meta.up_axis),
         **_lenses(layout, cameras, set(tested) - cameras),
     )
 
 
 def count_labels(layout: Layout, items: Sequence[Item]) -> int:
-    """Part labels, background included: as many as have names, else up to the highest one.
+    """Number of part labels, background included: that of the names, else up to the highest label.
 
     Without names every label image of the items is read once.
     """
     if not layout.labels:
         return 0
+
+    # Without names, the labels themselves tell.
     if layout.meta.label_names is not None:
         return len(layout.meta.label_names)
+
     highest = 0
     for item in items:
-        if path := layout.label_path(*item):
+        path = layout.label_path(*item)
+        if path:
             labels = read_labels(path, layout.pixels, None)
-            highest = max(
-                highest, int(labels.max(where=labels != IGNORE_LABEL, initial=0))
-            )
+            own = int(labels.max(where=labels != IGNORE_LABEL, initial=0))
+            highest = max(highest, own)
     return highest + 1
 
 
 def _lenses(layout: Layout, cameras: set[str], tested: set[str]) -> dict[str, Any]:
-    """The fields about distortion."""
-    entries = layout.cameras
+    """The fields of `SceneInfo` about distortion."""
+    # Held-out cameras are those that do not train.
+    training = [layout.cameras[name] for name in cameras]
+    held_out = [layout.cameras[name] for name in tested]
+    lenses = [camera.dist for camera in training + held_out]
     return {
-        "has_distortion": any(entries[name].distorted for name in cameras),
-        "held_out_distortion": any(entries[name].distorted for name in tested),
-        "has_rational_lens": any(
-            (entries[n].dist[5:] != 0).any() for n in cameras | tested
-        ),
+        "has_distortion": any(camera.distorted for camera in training),
+        "held_out_distortion": any(camera.distorted for camera in held_out),
+        # k4, k5 and k6
+        "has_rational_lens": bool(np.any([dist[5:] for dist in lenses])),
     }
 
 
 def _scale(dataset: CaptureDataset, samples: int) -> tuple[float, float]:
-    """Pixels per metre at the person: the smallest and the largest camera's median."""
+    """Pixels per metre at the person: minimum and maximum of the cameras' medians."""
     medians = []
     for indices in _sampled(dataset, samples):
-        each = []
-        for item in (dataset.items[i] for i in indices):
+        scales = []
+        for index in indices:
+            item = dataset.items[index]
             camera = dataset.camera(item)
-            joints = torch.from_numpy(dataset.layout.landmarks.p[item[1]])[None].to(
-                camera.K
-            )
-            depth = float(camera.to_camera(joints)[..., 2].median())
-            each.append(float(camera.K[0, 0, 0]) / max(depth, 1e-2))
-        medians.append(float(np.median(each)))
+
+            # Focal length over the median depth of the joints.
+            joints = torch.from_numpy(dataset.layout.landmarks.p[item[1]])[None]
+            x_cam = camera.to_camera(joints.to(camera.K))
+            depth = float(x_cam[..., 2].median())
+            focal = float(camera.K[0, 0, 0])
+            scales.append(focal / max(depth, 1e-2))
+        medians.append(float(np.median(scales)))
     return min(medians), max(medians)
 
 
 def _sampled(dataset: CaptureDataset, samples: int) -> list[list[int]]:
-    """Per camera, indices of at most so many items."""
-    found: dict[str, list[int]] = {}
+    """Indices of at most ``samples`` evenly spaced items of each camera."""
+    # The indices of each camera's items.
+    by_camera: dict[str, list[int]] = {}
     for index, (camera, _) in enumerate(dataset.items):
-        found.setdefault(camera, []).append(index)
-    return [
-        [own[i] for i in evenly_spaced(len(own), samples, ends=True)]
-        for own in found.values()
-    ]
+        by_camera.setdefault(camera, []).append(index)
+
+    sampled = []
+    for own in by_camera.values():
+        places = evenly_spaced(len(own), samples, ends=True)
+        sampled.append([own[place] for place in places])
+    return sampled
 
 
 def _darkest(dataset: CaptureDataset, samples: int) -> float:
-    """Brightness of the person's darkest percent."""
+    """The brightness in [0, 1] below which the darkest percent of the person's pixels lies."""
     brightness = []
-    for index in (i for indices in _sampled(dataset, samples) for i in indices):
-        frame = dataset[index]
-        brightness.append(frame.image.amax(1, keepdim=True)[frame.mask > SOLID])
+    for indices in _sampled(dataset, samples):
+        for index in indices:
+            frame = dataset[index]
+            brightest_channel = frame.image.amax(1, keepdim=True)
+            brightness.append(brightest_channel[frame.mask > SOLID])
     solid = torch.cat(brightness).numpy()
     return float(np.percentile(solid, 1)) if solid.size else 0.0
 
 
 def _body_inside(layout: Layout, dataset: CaptureDataset, samples: int) -> float | None:
     """Mean share of the posed body inside the masks of some training images."""
+    # The user's mesh, if the capture has poses and the model file is there.
     body = layout.meta.body
     mesh = None
     if body is not None and layout.poses is not None:
-        with suppress(DataError):  # no model file
+        with suppress(DataError):
             mesh = open_body(body.kind, body.file, body.betas)
     if mesh is None:
         return None
-    chosen = evenly_spaced(len(dataset.items), MOST_BODY_IMAGES * samples, ends=True)
-    shares = [body_inside(dataset[i], mesh) for i in chosen]
-    return float(np.mean([share for share in shares if share is not None] or [0.0]))
+
+    # Images that show nothing of the body, or whose mask is empty, do not count.
+    shares = []
+    for index in evenly_spaced(
+        len(dataset.items), MOST_BODY_IMAGES * samples, ends=True
+    ):
+        share = body_inside(dataset[index], mesh)
+        if share is not None:
+            shares.append(share)
+    return float(np.mean(shares or [0.0]))
 
 
 def _shared_surface(
     dataset: CaptureDataset, cameras: tuple[str, ...], samples: int
 ) -> SurfaceColours | None:
-    """Colours compared in frames that all training cameras have; None with a single camera."""
+    """Differences of colour in frames that all training cameras have; None for a single camera."""
     if len(cameras) < 2:
         return None
+
+    # Frames that every camera has, evenly spaced.
     frames: dict[str, set[int]] = {}
     for camera, frame in dataset.items:
         frames.setdefault(camera, set()).add(frame)
     shared = sorted(set.intersection(*frames.values()))
-    place = dataset.items.index
-    chosen = [shared[i] for i in evenly_spaced(len(shared), samples, ends=True)]
+
     # Subsets read a frame when it is needed: all of them at full size take gigabytes.
-    moments = [Subset(dataset, [place((c, f)) for c in cameras]) for f in chosen]
+    moments = []
+    for place in evenly_spaced(len(shared), samples, ends=True):
+        items = [(camera, shared[place]) for camera in cameras]
+        moments.append(Subset(dataset, list(map(dataset.items.index, items))))
     return surface_colours(moments)  # type: ignore[arg-type]

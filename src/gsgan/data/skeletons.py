@@ -36,7 +36,7 @@ HUBS = (11, 12, 23, 24)
 
 @dataclass(frozen=True)
 class Landmarks:
-    """Skeletons by frame: ``p [J, 3]`` metres, finite, ``visibility [J]`` in [0, 1].
+    """Skeletons by frame: ``p [J, 3]`` metres, finite, and ``visibility [J]`` in [0, 1].
 
     A joint of visibility 0 is an estimate. ``source`` names the file or folder of the landmarks,
     for messages.
@@ -47,14 +47,13 @@ class Landmarks:
     source: str = "landmarks3d.npz"
 
     def seen(self, frame: int) -> Float:
-        """``[N, 3]`` the joints of a frame that were seen."""
+        """``[N, 3]`` the visible joints of a frame."""
         return self.p[frame][self.visibility[frame] > 0]
 
     def joints(self, frames: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Joints ``[F, J, 3]`` metres, and which of them were seen ``[F, J]`` bool."""
-        p, visibility = (
-            np.stack([part[f] for f in frames]) for part in (self.p, self.visibility)
-        )
+        """Joints ``[F, J, 3]`` in metres, and ``[F, J]`` whether each of them is visible."""
+        p = np.stack([self.p[frame] for frame in frames])
+        visibility = np.stack([self.visibility[frame] for frame in frames])
         return torch.from_numpy(p), torch.from_numpy(visibility) > 0
 
     def with_hands(self, hands: Landmarks) -> Landmarks:
@@ -66,24 +65,26 @@ class Landmarks:
         return self._beside(face, FACE)
 
     def _beside(self, part: Landmarks, joints: int) -> Landmarks:
+        """Skeletons with the ``joints`` joints of a part appended."""
+        # A part that a frame lacks has visibility 0.
         nothing = np.zeros((joints, 3))
         unseen = np.zeros(joints)
-        return Landmarks(
-            {f: np.concatenate([p, part.p.get(f, nothing)]) for f, p in self.p.items()},
-            {
-                f: np.concatenate([seen, part.visibility.get(f, unseen)])
-                for f, seen in self.visibility.items()
-            },
-            self.source,
-        )
+        p = {}
+        visibility = {}
+        for frame, own in self.p.items():
+            added = part.p.get(frame, nothing)
+            p[frame] = np.concatenate([own, added])
+            seen = part.visibility.get(frame, unseen)
+            visibility[frame] = np.concatenate([self.visibility[frame], seen])
+        return Landmarks(p, visibility, self.source)
 
 
 @dataclass(frozen=True)
 class Poses:
     """Body poses by frame: ``theta [bones, 3]`` axis-angle, ``transl [3]`` metres.
 
-    ``fitted`` says that `gsgan.fit` made them: those of the frames ``registered`` by the masks of
-    the cameras ``fitted_to``, all others by their skeleton alone. ``with_hands`` are the poses that
+    ``fitted`` says that `gsgan.fit` made them: in the frames ``registered`` from the masks of the
+    cameras ``fitted_to``, in all others from the skeleton alone. ``with_hands`` are the poses that
     follow hand landmarks too, or None.
     """
 
@@ -97,8 +98,12 @@ class Poses:
 
     def digest(self, frames: Iterable[int]) -> str:
         """A hash of the poses of those frames."""
-        held = [part[f].tobytes() for f in frames for part in (self.theta, self.transl)]
-        return hashlib.sha256(b"".join(held)).hexdigest()
+        # The bytes of all rotations and translations, frame by frame.
+        digest = hashlib.sha256()
+        for frame in frames:
+            digest.update(self.theta[frame].tobytes())
+            digest.update(self.transl[frame].tobytes())
+        return digest.hexdigest()
 
 
 def make_landmarks(
@@ -111,9 +116,9 @@ def make_landmarks(
 ) -> Landmarks:
     """Skeletons of all frames, missing joints filled with estimates of visibility 0.
 
-    A joint is missing where it is not finite, its confidence is not above 0, or it lies further
-    than ``max_reach`` from the rest of the body. It takes its position in the nearest frame that
-    has it, or the mean of the frame's joints; hips as in `hips_below`.
+    A joint is missing if it is not finite, its confidence is not above 0, or it lies further than
+    ``max_reach`` from the rest of the body. It takes its position in the nearest frame that has it,
+    or the mean of the frame's joints; hips are placed as in `hips_below`.
 
     Args:
         ids: ``[F]`` frame numbers in any order, each once.
@@ -123,13 +128,16 @@ def make_landmarks(
         notes: gains a sentence when joints are too far.
         source: file or folder, for messages.
     """
-    visibility = np.where(np.isfinite(p).all(-1), np.nan_to_num(conf), 0.0).clip(0, 1)
+    # Missing joints have visibility 0.
+    finite = np.isfinite(p).all(-1)
+    visibility = np.where(finite, np.nan_to_num(conf), 0.0).clip(0, 1)  # [F, J]
     valid = visibility > 0
-    centre = np.nan_to_num(nanmedian(np.where(valid[..., None], p, np.nan), 1))[:, None]
-    with np.errstate(over="ignore"):  # absurdly far is far
-        distance = np.linalg.norm(
-            np.nan_to_num(p, posinf=0, neginf=0) - centre, axis=-1
-        )
+
+    # So do joints too far from the median of their frame's joints.
+    centre = np.nan_to_num(nanmedian(np.where(valid[..., None], p, np.nan), 1))
+    with np.errstate(over="ignore"):  # an infinite distance is too far as well
+        offset = np.nan_to_num(p, posinf=0, neginf=0) - centre[:, None]
+        distance = np.linalg.norm(offset, axis=-1)
     far = valid & (distance > max_reach)
     if far.any():
         visibility[far] = 0
@@ -137,14 +145,16 @@ def make_landmarks(
             f"{int(far.sum())} joints further than {max_reach:g} m from the body are taken "
             "as missing"
         )
+
+    # Frames in rising order, holes filled from the nearest ones.
     order = np.argsort(ids)
-    p = p[order]
-    visibility = visibility[order]
     ids = ids[order]
-    p = fill_missing(p, visibility > 0, ids)
+    visibility = visibility[order]
+    valid = visibility > 0
+    p = fill_missing(p[order], valid, ids)
     if p.shape[1] == len(MEDIAPIPE33.names):
-        p = hips_below(p, visibility > 0)
-    frames = [int(i) for i in ids]
+        p = hips_below(p, valid)
+    frames = ids.tolist()
     return Landmarks(
         dict(zip(frames, p, strict=True)),
         dict(zip(frames, visibility, strict=True)),
@@ -153,13 +163,15 @@ def make_landmarks(
 
 
 def whole_frame_ids(raw: NDArray[Any], where: str) -> NDArray[np.int64]:
-    """Frame numbers, whole and each once.
+    """Frame numbers, checked to be whole and unique.
 
     Raises:
-        DataError: when they are not.
+        DataError: if they are not.
     """
     with np.errstate(invalid="ignore"):
         ids = np.asarray(raw, np.int64)
+
+    # The conversion cuts off fractions, and makes other numbers of NaN.
     if not np.array_equal(ids, raw):
         raise DataError(f"{where}: 'frame_id' must hold whole numbers")
     if len(ids) and ids.max() > LARGEST_FRAME:
@@ -167,11 +179,12 @@ def whole_frame_ids(raw: NDArray[Any], where: str) -> NDArray[np.int64]:
             f"{where}: frame_id {ids.max()} is a time stamp, not a frame number up to "
             f"{LARGEST_FRAME}; number the frames 0, 1, 2 … alike in images and landmarks"
         )
+
+    # Each frame once.
     values, counts = np.unique(ids, return_counts=True)
-    if len(values) != len(ids):
-        raise DataError(
-            f"{where}: frame_id {values[counts > 1][0]} appears more than once"
-        )
+    repeated = values[counts > 1]
+    if len(repeated):
+        raise DataError(f"{where}: frame_id {repeated[0]} appears more than once")
     return ids
 
 
@@ -188,62 +201,81 @@ def fill_missing(p: Float, valid: Bool, ids: NDArray[np.int64]) -> Float:
         mean of the frame's valid joints, else 0.
     """
     filled = np.where(valid[..., None], p, 0.0)
+
+    # The means of the frames' valid joints, 0 without any.
     count = valid.sum(1, keepdims=True).clip(1)
-    means = filled.sum(1) / count
+    means = filled.sum(1) / count  # [F, 3]
     for joint in range(p.shape[1]):
+        # Rows of the frames that have this joint, and of those that lack it.
         known = np.flatnonzero(valid[:, joint])
         holes = np.flatnonzero(~valid[:, joint])
         if len(known) == 0:
             filled[:, joint] = means
             continue
-        after = np.searchsorted(known, holes).clip(0, len(known) - 1)
-        before = (np.searchsorted(known, holes) - 1).clip(0)
-        back = np.abs(ids[holes] - ids[known[before]])
-        ahead = np.abs(ids[known[after]] - ids[holes])
-        filled[holes, joint] = p[known[np.where(back <= ahead, before, after)], joint]
+
+        # The known frames before and after each hole, in rows.
+        place = np.searchsorted(known, holes)
+        after = known[place.clip(0, len(known) - 1)]
+        before = known[(place - 1).clip(0)]
+
+        # The nearer of the two, in frame numbers.
+        back = np.abs(ids[holes] - ids[before])
+        ahead = np.abs(ids[after] - ids[holes])
+        nearest = np.where(back <= ahead, before, after)
+        filled[holes, joint] = p[nearest, joint]
     return filled
 
 
 def hips_below(p: Float, valid: Bool) -> Float:
-    """Joints ``p [F, 33, 3]`` with hips placed below the shoulders where no frame shows them.
+    """Joints ``p [F, 33, 3]`` with hips placed below the shoulders in frames that show none.
 
-    Convention: only in frames that show (``valid [F, 33]``) both shoulders and no hip. The hips
-    follow the shoulders at the same distance and direction in the world, so that the trunk does not
-    nod with the head: the median of the frames that show the whole trunk; without any, along the
-    median direction from ears to shoulders, as far as in the template. Metres.
+    Only frames that show (``valid [F, 33]``) both shoulders and no hip change. The hips follow the
+    shoulders at the same distance and direction in the world, so that the trunk does not nod with
+    the head: the median of the frames that show the whole trunk; without any, along the median
+    direction from ears to shoulders, as far as in the template. Metres.
     """
     shoulders = list(HUBS[:2])
     hips = list(HUBS[2:])
     ears = list(MEDIAPIPE33.ears)
+
+    # Frames to repair, and frames to learn the trunk's direction from.
     hung = valid[:, shoulders].all(1) & ~valid[:, hips].any(1)
     whole = valid[:, HUBS].all(1)
     headed = valid[:, shoulders + ears].all(1)
     if not (hung.any() and (whole | headed).any()):
         return p
-    rest = np.array(MEDIAPIPE33.rest_positions)
-    top = p[:, shoulders].mean(1)
+
+    # From the middle of the shoulders to that of the hips.
+    top = p[:, shoulders].mean(1)  # [F, 3]
     if whole.any():
-        down = np.median((p[:, hips].mean(1) - top)[whole], axis=0)
+        trunks = p[:, hips].mean(1) - top  # [F, 3]
+        down = np.median(trunks[whole], axis=0)
     else:
-        down = np.median((top - p[:, ears].mean(1))[headed], axis=0)
+        necks = top - p[:, ears].mean(1)
+        down = np.median(necks[headed], axis=0)
         size = body_height(torch.from_numpy(p), torch.from_numpy(valid))
         reach = MEDIAPIPE33.rest_torso[1] * size / MEDIAPIPE33.limb_length_sum
         down *= reach / np.linalg.norm(down)
+
+    # The hips are parallel to the shoulders seen along the trunk, as narrow as in the template.
     axis = down / np.linalg.norm(down)
     line = p[:, shoulders[0]] - p[:, shoulders[1]]
     line -= (line @ axis)[:, None] * axis
-    wide, narrow = (np.linalg.norm(rest[a] - rest[b]) for a, b in (shoulders, hips))
+    rest = np.array(MEDIAPIPE33.rest_positions)
+    wide = np.linalg.norm(rest[shoulders[0]] - rest[shoulders[1]])
+    narrow = np.linalg.norm(rest[hips[0]] - rest[hips[1]])
     half = line * (narrow / wide / 2)
-    out = p.copy()
-    out[hung, hips[0]] = (top + down + half)[hung]
-    out[hung, hips[1]] = (top + down - half)[hung]
-    return out
+
+    result = p.copy()
+    result[hung, hips[0]] = (top + down + half)[hung]
+    result[hung, hips[1]] = (top + down - half)[hung]
+    return result
 
 
 def bone_lengths(p: Float, bones: Sequence[tuple[int, int]]) -> Float:
-    """``[..., B]`` distances between the ends of bones of ``p [..., J, 3]``; NaN where one is."""
-    a, b = np.array(bones).T
-    return np.asarray(np.linalg.norm(p[..., b, :] - p[..., a, :], axis=-1))
+    """``[..., B]`` lengths of bones of ``p [..., J, 3]``; NaN if an end is NaN."""
+    starts, ends = np.array(bones).T
+    return np.asarray(np.linalg.norm(p[..., ends, :] - p[..., starts, :], axis=-1))
 
 
 def body_height(p: Tensor, valid: Tensor) -> float:
@@ -256,7 +288,8 @@ def face_at_rest(
 ) -> tuple[Vector, ...]:
     """Metres: a person's face without expression, see `gsgan.skeleton.in_head`.
 
-    Convention: medians over the training frames; a landmark that none has takes the template's.
+    The positions are medians over the training frames; a landmark that none has takes the
+    template's.
 
     Args:
         landmarks: of the capture.
@@ -264,16 +297,19 @@ def face_at_rest(
         trained: training frames.
     """
     p, seen = landmarks.with_face(face).joints(trained)
-    own = slice(len(MEDIAPIPE33.names), None)
-    body, valid = sanitise(p[:, : own.start], seen[:, : own.start])
-    local = in_head(
-        p[:, own], body, bone_frames(body, valid).hubs[:, HEAD], MEDIAPIPE33
-    )
-    found = local.masked_fill(~seen[:, own, None], torch.nan).nanmedian(0).values
+    first = len(MEDIAPIPE33.names)
+
+    # Face landmarks in the head's axes.
+    body, valid = sanitise(p[:, :first], seen[:, :first])
+    head = bone_frames(body, valid).hubs[:, HEAD]
+    local = in_head(p[:, first:], body, head, MEDIAPIPE33)  # [F, 30, 3]
+
+    # Medians over the frames that show them.
+    unseen = ~seen[:, first:, None]
+    found = local.masked_fill(unseen, torch.nan).nanmedian(0).values
     usual = constants(HOLISTIC, found.device, found.dtype).face_rest
-    return tuple(
-        (x, y, z) for x, y, z in torch.where(found.isnan(), usual, found).tolist()
-    )
+    rest = torch.where(found.isnan(), usual, found)
+    return tuple((x, y, z) for x, y, z in rest.tolist())
 
 
 def complete_skeletons(
@@ -294,13 +330,17 @@ def complete_skeletons(
         frames: to complete.
         trained: frames that set the body's height, which gives the length of missing bones.
         template: of the skeletons.
-        hands, face: of the capture, where the template has them.
+        hands, face: of the capture, if the template has them.
     """
     height = body_height(*landmarks.joints(trained))
+
+    # The landmarks that the template asks for, in its order.
     whole = landmarks
     if template.palms and hands is not None:
         whole = whole.with_hands(hands)
     if template.expression and face is not None:
         whole = whole.with_face(face)
-    p, _ = sanitise(*whole.joints(frames), template, height)
-    return replace(whole, p=dict(zip(frames, p.numpy(), strict=True)))
+
+    p, visible = whole.joints(frames)
+    completed, _ = sanitise(p, visible, template, height)
+    return replace(whole, p=dict(zip(frames, completed.numpy(), strict=True)))

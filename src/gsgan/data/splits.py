@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -18,57 +18,74 @@ from gsgan.utils.errors import ConfigError, DataError
 
 T = TypeVar("T", int, str)
 
+# first, last and step: "12", "0-55" or "0-55:5"
 FRAME_RANGE = re.compile(
     r"\s*(\d{1,18})\s*(?:-\s*(\d{1,18})\s*)?(?::\s*(\d{1,18})\s*)?"
 )
-MOST_FRAMES = 10**7  # bounds the memory that a range from a file can ask for
+# bounds the memory that a range from a file can ask for
+MOST_FRAMES = 10**7
+# training, held-out cameras, held-out frames
 SPLITS = ("train", "novel_view", "novel_pose")
-SIDES: tuple[Literal["train", "test"], ...] = ("train", "test")
-Item = tuple[str, int]  # camera name, frame number
+# camera name, frame number
+Item = tuple[str, int]
 
 
 class Items(Sequence[Item]):
-    """(camera, frame) pairs, camera by camera; kept in arrays like `FrameFiles`.
+    """(camera, frame) pairs, camera by camera, stored as arrays like `FrameFiles`.
 
     Args:
-        frames: ``[N]`` of each camera.
+        frames: ``[N]`` frame numbers of each camera.
     """
 
     def __init__(self, frames: Mapping[str, Ints]) -> None:
         self._of = {name: numbers for name, numbers in frames.items() if len(numbers)}
+        # The places at which the cameras' items end, after a leading 0.
         self._ends = np.cumsum([0, *map(len, self._of.values())])
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Those with an item."""
+        """The cameras that have an item."""
         return tuple(self._of)
 
     @property
     def frames(self) -> list[int]:
         """The frame numbers, rising, each once."""
-        return np.unique(
-            np.concatenate([*self._of.values(), np.empty(0, np.int64)])
-        ).tolist()
+        # The empty array is for a split without cameras.
+        numbers = [np.empty(0, np.int64), *self._of.values()]
+        return np.unique(np.concatenate(numbers)).tolist()
 
     def __len__(self) -> int:
         return int(self._ends[-1])
 
     def __getitem__(self, index: int) -> Item:  # type: ignore[override]
-        place = range(len(self))[index]
+        place = range(len(self))[index]  # counts negative places from the end
         camera = int(self._ends.searchsorted(place, side="right")) - 1
         name = self.cameras[camera]
-        return name, int(self._of[name][place - self._ends[camera]])
+        number = self._of[name][place - self._ends[camera]]
+        return name, int(number)
 
     def __iter__(self) -> Iterator[Item]:
-        return ((name, f) for name, frames in self._of.items() for f in frames.tolist())
+        for name, numbers in self._of.items():
+            for frame in numbers.tolist():
+                yield name, frame
 
     def index(self, item: Item, *_: int) -> int:  # type: ignore[override]
-        """The place of an item; a ValueError where it is none."""
-        camera = self.cameras.index(item[0])
-        found = np.flatnonzero(self._of[item[0]] == item[1])
+        """The place of an item; a ValueError if it is not in the split."""
+        name, frame = item
+        camera = self.cameras.index(name)
+
+        # The place among the camera's own items.
+        found = np.flatnonzero(self._of[name] == frame)
         if not len(found):
             raise ValueError(f"{item} is not in the split")
         return int(self._ends[camera] + found[0])
+
+
+class Sides(NamedTuple, Generic[T]):
+    """The cameras or frames for training, and those for tests."""
+
+    train: tuple[T, ...]
+    test: tuple[T, ...]
 
 
 @dataclass(frozen=True)
@@ -79,8 +96,8 @@ class Splits:
     ``novel_pose`` train cameras × test frames.
 
     Args:
-        items: those that exist, by split.
-        reasons: why a split is empty, for those that are.
+        items: the existing items, by split.
+        reasons: why splits are empty, by the empty split.
         notes: requested frames that the capture lacks.
     """
 
@@ -104,8 +121,8 @@ def make_splits(
     """Splits a capture by cameras and by frames.
 
     For cameras, and likewise for frames: the config comes first, then meta.json; without both all
-    cameras are for training and the last ``test_share`` of the frames is held out. Where only one
-    side of a pair is given, the other takes the rest.
+    cameras are for training and the last ``test_share`` of the frames is held out. If only one side
+    of a pair is given, the other takes the rest.
 
     Args:
         layout: the capture.
@@ -119,77 +136,107 @@ def make_splits(
     """
     if not 0 <= test_share < 1:
         raise ConfigError(f"data.test_share must be in [0, 1), got {test_share}")
-    given = {
-        "cameras": (train_cameras, test_cameras),
-        "frames": (train_frames, test_frames),
-    }
-    cut = len(layout.frames) - int(len(layout.frames) * test_share)
+
+    # By default all cameras train, and the last frames are held out.
     everyone = layout.camera_names
-    default = (layout.frames[:cut], layout.frames[cut:])
-    cameras = _pair(layout, "cameras", given, everyone, (everyone, ()), parse_names)
-    frames = _pair(layout, "frames", given, layout.frames, default, parse_frames)
-    for camera in (*cameras[0], *cameras[1]):
+    frames = layout.frames
+    cut = len(frames) - int(len(frames) * test_share)
+
+    # The train and test side of both, from the config, meta.json or the default.
+    cameras = _sides(
+        layout,
+        "cameras",
+        given=(train_cameras, test_cameras),
+        everything=everyone,
+        default=(everyone, ()),
+        parse=parse_names,
+    )
+    wanted = _sides(
+        layout,
+        "frames",
+        given=(train_frames, test_frames),
+        everything=frames,
+        default=(frames[:cut], frames[cut:]),
+        parse=parse_frames,
+    )
+    for camera in (*cameras.train, *cameras.test):
         if camera not in layout.cameras:
             raise DataError(
                 f"{layout.root} has no camera {camera}; it has {', '.join(everyone)}"
             )
-    train, test, notes = _usable(layout, frames, "of the splits")
+
+    # Only items that exist.
+    usable, notes = _usable(layout, wanted, "of the splits")
     items = {
-        "train": _items(layout, cameras[0], train),
-        "novel_view": _items(layout, cameras[1], train),
-        "novel_pose": _items(layout, cameras[0], test),
+        "train": _items(layout, cameras.train, usable.train),
+        "novel_view": _items(layout, cameras.test, usable.train),
+        "novel_pose": _items(layout, cameras.train, usable.test),
     }
     reasons = {
         "novel_view": "no camera is held out (data.test_cameras)",
         "novel_pose": "no frame is held out (data.test_frames)",
     }
-    return _splits(layout, cameras, (train, test), items, reasons, notes)
+    return _splits(layout, cameras, usable, items, reasons, notes)
 
 
 def _usable(
-    layout: Layout, frames: Sequence[Sequence[int]], whose: str
-) -> tuple[tuple[int, ...], tuple[int, ...], tuple[str, ...]]:
+    layout: Layout, frames: Sides[int], whose: str
+) -> tuple[Sides[int], tuple[str, ...]]:
     """The train and test frames that the capture has, and a note on the others."""
+    # Frames that were dropped, or never existed.
     known = set(layout.frames)
-    train, test = (tuple(f for f in side if f in known) for side in frames)
-    missing = sorted({f for side in frames for f in side} - known)
+    train = tuple(frame for frame in frames.train if frame in known)
+    test = tuple(frame for frame in frames.test if frame in known)
+    usable = Sides(train, test)
+    missing = sorted({*frames.train, *frames.test} - known)
     if not missing:
-        return train, test, ()
+        return usable, ()
     note = f"{len(missing)} frames {whose} are not usable or do not exist: {spans(missing)}"
-    return train, test, (note,)
+    return usable, (note,)
 
 
 def _splits(
     layout: Layout,
-    cameras: tuple[tuple[str, ...], tuple[str, ...]],
-    frames: tuple[tuple[int, ...], tuple[int, ...]],
+    cameras: Sides[str],
+    frames: Sides[int],
     items: dict[str, Items],
     reasons: dict[str, str],
     notes: tuple[str, ...],
 ) -> Splits:
-    """The splits, with the reasons of those that are empty; training must not be."""
+    """The splits, with the reasons of the empty ones; the training split must not be empty."""
     if not items["train"]:
         raise DataError(
-            f"{layout.root}: nothing to train on with cameras {', '.join(cameras[0]) or 'none'} "
-            f"and {len(frames[0])} train frames; the capture has cameras "
+            f"{layout.root}: nothing to train on with cameras {', '.join(cameras.train) or 'none'} "
+            f"and {len(frames.train)} train frames; the capture has cameras "
             f"{', '.join(layout.camera_names)} and frames {spans(list(layout.frames))}"
         )
-    reasons = {name: why for name, why in reasons.items() if not items[name]}
-    return Splits(*cameras, *frames, items, reasons, notes)
+    return Splits(
+        train_cameras=cameras.train,
+        test_cameras=cameras.test,
+        train_frames=frames.train,
+        test_frames=frames.test,
+        items=items,
+        reasons={name: why for name, why in reasons.items() if not items[name]},
+        notes=notes,
+    )
 
 
 def _items(layout: Layout, cameras: Sequence[str], frames: Sequence[int]) -> Items:
-    some = np.array(frames, np.int64)
-    return Items(
-        {c: np.intersect1d(some, layout.images[c].frames, True) for c in cameras}
-    )
+    """The cameras' images of the frames, those that exist."""
+    # Both arrays are without repetitions.
+    wanted = np.array(frames, np.int64)
+    found = {}
+    for camera in cameras:
+        stored = layout.images[camera].frames
+        found[camera] = np.intersect1d(wanted, stored, assume_unique=True)
+    return Items(found)
 
 
 def protocol_splits(layout: Layout, protocol: Protocol) -> Splits:
     """Splits a capture as a published protocol does.
 
     Train cameras × train frames are for training; test cameras × test frames are held out: as
-    ``novel_view`` where the frame is also a training frame (of other cameras), else ``novel_pose``.
+    ``novel_view`` if the frame is also a training frame (of other cameras), else ``novel_pose``.
 
     Args:
         layout: the capture.
@@ -199,49 +246,61 @@ def protocol_splits(layout: Layout, protocol: Protocol) -> Splits:
         DataError: when a camera does not exist, or nothing is left to train on.
         ConfigError: when an image is in both splits, or a value is malformed.
     """
-    sides = (
-        None
-        if side is None
-        else tuple(camera_name(layout, c, protocol.name) for c in side)
-        for side in (protocol.train_cameras, protocol.test_cameras)
+    # Names of the cameras; a side that the protocol leaves out takes the rest.
+    train = _protocol_cameras(layout, protocol.train_cameras, protocol.name)
+    test = _protocol_cameras(layout, protocol.test_cameras, protocol.name)
+    cameras = _complete(layout.camera_names, train, test)
+
+    # Frames that the capture has.
+    wanted = Sides(
+        parse_frames(protocol.frames("train"), "protocol.train_frames"),
+        parse_frames(protocol.frames("test"), "protocol.test_frames"),
     )
-    train_cameras, test_cameras = _complete(layout.camera_names, *sides)
-    frames = [
-        parse_frames(protocol.frames(side), f"protocol.{side}_frames") for side in SIDES
-    ]
-    train, test, notes = _usable(layout, frames, f"of protocol {protocol.name}")
-    trained = set(train)
-    both = set(train_cameras) & set(test_cameras)
-    if both and trained & set(test):
+    frames, notes = _usable(layout, wanted, f"of protocol {protocol.name}")
+
+    # No image may be in both splits.
+    trained = set(frames.train)
+    seen = [frame for frame in frames.test if frame in trained]
+    shared = set(cameras.train) & set(cameras.test)
+    if shared and seen:
         raise ConfigError(
-            f"protocol {protocol.name}: frame {min(trained & set(test))} of camera {min(both)} is "
+            f"protocol {protocol.name}: frame {min(seen)} of camera {min(shared)} is "
             "in both splits; test images must not be used for training"
         )
+
+    new = [frame for frame in frames.test if frame not in trained]
     items = {
-        "train": _items(layout, train_cameras, train),
-        "novel_view": _items(layout, test_cameras, [f for f in test if f in trained]),
-        "novel_pose": _items(
-            layout, test_cameras, [f for f in test if f not in trained]
-        ),
+        "train": _items(layout, cameras.train, frames.train),
+        "novel_view": _items(layout, cameras.test, seen),
+        "novel_pose": _items(layout, cameras.test, new),
     }
     reasons = dict.fromkeys(SPLITS[1:], f"protocol {protocol.name} has none")
-    cameras = train_cameras, test_cameras
-    return _splits(layout, cameras, (train, test), items, reasons, notes)
+    return _splits(layout, cameras, frames, items, reasons, notes)
+
+
+def _protocol_cameras(
+    layout: Layout, cameras: Sequence[str | int] | None, protocol: str
+) -> tuple[str, ...] | None:
+    """The names of one side's cameras; None if the protocol leaves the side out."""
+    if cameras is None:
+        return None
+    return tuple(camera_name(layout, camera, protocol) for camera in cameras)
 
 
 def _complete(
     everything: tuple[T, ...], train: tuple[T, ...] | None, test: tuple[T, ...] | None
-) -> tuple[tuple[T, ...], tuple[T, ...]]:
-    """Both sides; one that is None takes everything outside the other."""
+) -> Sides[T]:
+    """Both sides; a side that is None takes everything outside the other."""
     if train is None:
         train = tuple(x for x in everything if x not in (test or ()))
     if test is None:
         test = tuple(x for x in everything if x not in train)
-    return train, test
+    return Sides(train, test)
 
 
 def camera_name(layout: Layout, camera: str | int, protocol: str) -> str:
     """The name of a camera given by name or by its index in `Layout.camera_names`."""
+    # An index, else a name; a name may be a number as well.
     names = layout.camera_names
     if isinstance(camera, int) and 0 <= camera < len(names):
         return names[camera]
@@ -253,31 +312,39 @@ def camera_name(layout: Layout, camera: str | int, protocol: str) -> str:
     )
 
 
-def _pair(
+def _sides(
     layout: Layout,
     name: str,
-    given: Mapping[str, tuple[Any, Any]],
+    given: tuple[Any, Any],
     everything: tuple[T, ...],
     default: tuple[tuple[T, ...], tuple[T, ...]],
     parse: Callable[[Any, str], tuple[T, ...]],
-) -> tuple[tuple[T, ...], tuple[T, ...]]:
-    """The train and test side of ``name``, cameras or frames, from the first source of both."""
-    meta = tuple(layout.meta.splits.get(f"{side}_{name}") for side in SIDES)
-    for values, where in ((given[name], "data."), (meta, "meta.json, splits.")):
-        train, test = (
-            None if value is None else parse(value, f"{where}{side}_{name}")
-            for value, side in zip(values, SIDES, strict=True)
-        )
-        if train is None and test is None:
+) -> Sides[T]:
+    """The train and test side of ``name``, cameras or frames, from the first source that has one:
+    the config's ``given`` values, meta.json, else the default."""
+    stored = layout.meta.splits
+    in_meta = (stored.get(f"train_{name}"), stored.get(f"test_{name}"))
+    for values, where in ((given, "data."), (in_meta, "meta.json, splits.")):
+        train_value, test_value = values
+        if train_value is None and test_value is None:
             continue
-        train, test = _complete(everything, train, test)
-        if both := sorted(set(train) & set(test)):
+
+        # The values as names or numbers; a missing side takes the rest.
+        train = test = None
+        if train_value is not None:
+            train = parse(train_value, f"{where}train_{name}")
+        if test_value is not None:
+            test = parse(test_value, f"{where}test_{name}")
+        sides = _complete(everything, train, test)
+
+        both = sorted(set(sides.train) & set(sides.test))
+        if both:
             raise ConfigError(
                 f"{where}train_{name} and {where}test_{name} share {both[0]}; test images must "
                 "not be used for training"
             )
-        return train, test
-    return default
+        return sides
+    return Sides(*default)
 
 
 def parse_names(value: Any, where: str) -> tuple[str, ...]:
@@ -287,12 +354,14 @@ def parse_names(value: Any, where: str) -> tuple[str, ...]:
         ConfigError: when it is neither.
     """
     if isinstance(value, str):
-        return tuple(name.strip() for name in value.split(",") if name.strip())
+        names = [name.strip() for name in value.split(",")]
+        return tuple(filter(None, names))
+    # A camera's name may be a number.
     if isinstance(value, int):
         return (str(value),)
     if not isinstance(value, Iterable):
         raise ConfigError(f"{where} must be a list of camera names, got {value!r}")
-    return tuple(dict.fromkeys(str(name) for name in value))
+    return tuple(dict.fromkeys(map(str, value)))
 
 
 def parse_frames(value: Any, where: str) -> tuple[int, ...]:
@@ -304,22 +373,30 @@ def parse_frames(value: Any, where: str) -> tuple[int, ...]:
         ConfigError: when a part is neither.
     """
     parts = value.split(",") if isinstance(value, str) else value
+    if not isinstance(parts, Iterable):
+        parts = (parts,)
+
     frames: set[int] = set()
-    for part in parts if isinstance(parts, Iterable) else (parts,):
+    for part in parts:
+        # A range such as "0-55:5"; a single number is a range of one frame.
         match = FRAME_RANGE.fullmatch(str(part))
-        first, last, step = (
-            (match[1], match[2] or match[1], match[3] or 1) if match else (1, 0, 1)
-        )
-        some = range(int(first), int(last) + 1, int(step) or 1)
-        if not some or int(step) < 1:
+        numbers = range(0)
+        if match:
+            first, last, step = match.groups()
+            step = int(step or 1)
+            if step > 0:
+                numbers = range(int(first), int(last or first) + 1, step)
+        if not numbers:
             raise ConfigError(
                 f"{where} must be frame numbers or ranges such as 0-55, got {part!r}"
             )
-        if len(some) + len(frames) > MOST_FRAMES:
+
+        # Bounds, checked before the numbers take memory.
+        if len(numbers) + len(frames) > MOST_FRAMES:
             raise ConfigError(f"{where} names more than {MOST_FRAMES} frames")
-        if some[-1] > LARGEST_FRAME:
+        if numbers[-1] > LARGEST_FRAME:
             raise ConfigError(
-                f"{where} names frame {some[-1]}; frame numbers end at {LARGEST_FRAME}"
+                f"{where} names frame {numbers[-1]}; frame numbers end at {LARGEST_FRAME}"
             )
-        frames.update(some)
+        frames.update(numbers)
     return tuple(sorted(frames))

@@ -24,27 +24,34 @@ if TYPE_CHECKING:
     from gsgan.body.skinned import SkinnedBody
 
 
-VOXEL = 0.025  # metres, of the hull and of the occlusion test
-AIR = 0.3  # metres of space around the joints that is carved
+# metres, of the hull and of the occlusion test
+VOXEL = 0.025
+# metres of space around the joints that is carved
+AIR = 0.3
 # metres: a wider skeleton has a stray joint, and its box would not fit into memory
 WIDEST = 4.0
-BLUR = 0.03  # metres: accuracy of the surface, over which colours are averaged
-WHOLE = 0.95  # share of the blur in the mask: outlines mix with the background
-# that two cameras share in a frame: fewer lie at outlines, at grazing angles
+# metres: accuracy of the surface, over which colours are averaged
+BLUR = 0.03
+# share of the blur in the mask: outlines mix with the background
+WHOLE = 0.95
+# minimum number that two cameras share in a frame: fewer lie at outlines, at grazing angles
 LEAST_POINTS = 30
+# minimum number of such frames
 LEAST_FRAMES = 3
-COARSEST = 0.03  # metres per pixel: in coarser images every colour is a mixture
+# metres per pixel: in coarser images every colour is a mixture
+COARSEST = 0.03
 # metres by which a body may leave the mask: masks cut off feet and hair that far
 SLACK = 0.03
-RESIDUAL = 0.95  # the quantile: highlights cover little of a person
+# the quantile: highlights cover little of a person
+RESIDUAL = 0.95
 
 
 @dataclass(frozen=True)
 class SurfaceColours:
-    """How much training cameras differ on shared surface; colours in [0, 1].
+    """Colour differences of training cameras on shared surface; colours in [0, 1].
 
     Args:
-        difference: the largest median difference of two cameras, in any channel.
+        difference: the maximum median difference of two cameras, in any channel.
         residual: 95th percentile of the difference in brightness about those medians.
     """
 
@@ -60,70 +67,88 @@ def surface_colours(moments: Sequence[Sequence[Frame]]) -> SurfaceColours | None
             read one at a time, so sequences that read from disk need little memory.
 
     Returns:
-        None where no two cameras share enough surface, or images are too coarse.
+        None if no two cameras share enough surface, or images are too coarse.
     """
-    if not moments or any(
-        float(f.camera.to_camera(f.skeleton)[..., 2].median())
-        / float(f.camera.K[0, 0, 0])
-        > COARSEST  # metres per pixel at the person
-        for f in moments[0]
-    ):
+    if not moments or any(_metres_per_pixel(frame) > COARSEST for frame in moments[0]):
         return None
+
+    # By pair of cameras: the differences of colour at points that both see, frame by frame.
     found: dict[tuple[int, int], list[Float]] = {}
     for frames in moments:
         points = _hull(frames)
-        seen = [_colours(frame, points) for frame in frames]
+        colours = [_colours(frame, points) for frame in frames]
         for i, j in combinations(range(len(frames)), 2):
-            both = ~np.isnan(seen[i][:, 0] + seen[j][:, 0])
-            if np.count_nonzero(both) >= LEAST_POINTS:
-                found.setdefault((i, j), []).append(seen[i][both] - seen[j][both])
-    pairs = [
-        np.concatenate(pair) for pair in found.values() if len(pair) >= LEAST_FRAMES
-    ]
-    if not pairs:
+            difference = colours[i] - colours[j]
+            both = difference[~np.isnan(difference[:, 0])]
+            if len(both) >= LEAST_POINTS:
+                found.setdefault((i, j), []).append(both)
+
+    # The median is due to the cameras, the residual to highlights and errors of the hull.
+    medians = []
+    residuals = []
+    for differences in found.values():
+        if len(differences) >= LEAST_FRAMES:
+            pair = np.concatenate(differences)
+            median = np.median(pair, axis=0)
+            medians.append(median)
+            residuals.append(pair - median)
+    if not medians:
         return None
-    medians = [np.median(pair, axis=0) for pair in pairs]
-    left = [pair - median for pair, median in zip(pairs, medians, strict=True)]
-    brightness = np.abs(np.concatenate(left).mean(axis=1))
+    brightness = np.abs(np.concatenate(residuals).mean(axis=1))
     return SurfaceColours(
         difference=float(np.abs(medians).max()),
         residual=float(np.quantile(brightness, RESIDUAL)),
     )
 
 
+def _metres_per_pixel(frame: Frame) -> float:
+    """The size of a pixel at the person's median depth."""
+    depth = float(frame.camera.to_camera(frame.skeleton)[..., 2].median())
+    return depth / float(frame.camera.K[0, 0, 0])
+
+
 def body_inside(frame: Frame, body: SkinnedBody) -> float | None:
     """Share of the posed body's vertices in the image that lie inside the mask, within 3 cm.
 
-    None where the image shows none of them, or its mask is empty.
+    None if the image shows none of them, or its mask is empty.
     """
     assert frame.body is not None
     with torch.no_grad():
-        vertices = body.to(torch.float32).posed_vertices(frame.body)[0].double().numpy()
-    pixels, inside, depth = _place(frame, vertices)
+        vertices = body.to(torch.float32).posed_vertices(frame.body)[0]
+    pixels, inside, depth = _place(frame, vertices.double().numpy())
     empty = (frame.mask[0, 0].numpy() <= 0.5).astype(np.uint8)
     if not inside.any() or empty.all():
         return None
-    # depth of the body: where body and joints disagree, the joints may lie behind the camera
-    reach = np.ceil(
-        SLACK * float(frame.camera.K[0, 0, 0]) / float(np.median(depth[inside]))
-    )
+
+    # The slack in pixels at the depth of the body: where body and joints disagree, the joints may
+    # lie behind the camera.
+    focal = float(frame.camera.K[0, 0, 0])
+    reach = np.ceil(SLACK * focal / float(np.median(depth[inside])))
+
     distance = cv2.distanceTransform(empty, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return float((distance[pixels[inside, 1], pixels[inside, 0]] <= reach).mean())
+    columns = pixels[inside, 0]
+    rows = pixels[inside, 1]
+    return float((distance[rows, columns] <= reach).mean())
 
 
 def _hull(frames: Sequence[Frame]) -> Float:
-    """``[V, 3]`` metres: voxels inside all masks; none where a joint is far astray."""
-    joints = frames[0].skeleton[0][frames[0].visibility[0] > 0].double().numpy()
+    """``[V, 3]`` metres: voxels inside all masks; none if a joint is far astray."""
+    seen = frames[0].visibility[0] > 0
+    joints = frames[0].skeleton[0][seen].double().numpy()
     if len(joints) == 0 or np.ptp(joints, axis=0).max() > WIDEST:
         return np.zeros((0, 3))
+
+    # A grid of voxels in the box around the joints.
     low = joints.min(0) - AIR
     high = joints.max(0) + AIR
     axes = [np.arange(a, b, VOXEL) for a, b in zip(low, high, strict=True)]
-    voxels = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    voxels = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)  # [V, 3]
+
+    # Each mask carves; voxels outside its image stay.
     for frame in frames:
         pixels, inside, _ = _place(frame, voxels)
         mask = frame.mask[0, 0].numpy() > 0.5
-        kept = ~inside  # voxels outside the image stay
+        kept = ~inside
         kept[inside] = mask[pixels[inside, 1], pixels[inside, 0]]
         voxels = voxels[kept]
     return voxels
@@ -132,7 +157,10 @@ def _hull(frames: Sequence[Frame]) -> Float:
 def _place(frame: Frame, points: Float) -> tuple[Ints, Bool, Float]:
     """Whole pixels ``[V, 2]``, whether they are in the image ``[V]``, depths ``[V]``."""
     height, width = frame.camera.size
-    at, depth = frame.camera.project(torch.from_numpy(points)[None].to(frame.camera.K))
+    world = torch.from_numpy(points)[None].to(frame.camera.K)
+    at, depth = frame.camera.project(world)
+
+    # Clipped before the conversion, since far pixels do not fit into integers.
     pixels = np.floor(at[0].numpy()).clip(-1, max(height, width)).astype(np.int64)
     inside = (depth[0].numpy() > VOXEL) & (pixels >= 0).all(1)
     inside &= (pixels[:, 0] < width) & (pixels[:, 1] < height)
@@ -145,33 +173,33 @@ def _colours(frame: Frame, points: Float) -> Float:
     pixels, inside, depth = _place(frame, points)
     if not inside.any():
         return result
+
+    # Pixels per metre at the person.
     height, width = frame.camera.size
-    # in pixels
-    metre = float(frame.camera.K[0, 0, 0]) / float(np.median(depth[inside]))
+    scale = float(frame.camera.K[0, 0, 0]) / float(np.median(depth[inside]))
+
     # Hidden points: points are sparser than pixels, so depths are compared on a grid of their
     # spacing.
-    cell = max(1, int(np.ceil(1.5 * VOXEL * metre)))
+    cell = max(1, int(np.ceil(1.5 * VOXEL * scale)))
     flat = (pixels[:, 1] // cell) * width + pixels[:, 0] // cell
     nearest = np.full(height * width, np.inf)
     np.minimum.at(nearest, flat[inside], depth[inside])
     front = inside.copy()
     front[inside] = depth[inside] < nearest[flat[inside]] + 1.5 * VOXEL
-    # Colours: means over the mask, without points near its outline.
-    sigma = max(0.5, BLUR * metre)
+
+    # Colours: blurred image over blurred mask.
+    sigma = max(0.5, BLUR * scale)
     side = 2 * int(2 * sigma) + 1
-    soft = np.asarray(
-        cv2.GaussianBlur(frame.mask[0, 0].numpy(), (side, side), sigma), np.float32
-    )
-    image = np.asarray(
-        cv2.GaussianBlur(
-            frame.image[0].permute(1, 2, 0).contiguous().numpy(), (side, side), sigma
-        ),
-        np.float32,
-    )
+    mask = frame.mask[0, 0].numpy()
+    rgb = frame.image[0].permute(1, 2, 0).contiguous().numpy()
+    soft = np.asarray(cv2.GaussianBlur(mask, (side, side), sigma), np.float32)
+    image = np.asarray(cv2.GaussianBlur(rgb, (side, side), sigma), np.float32)
     rows = pixels[front, 1]
     columns = pixels[front, 0]
     weight = soft[rows, columns]
     colours = image[rows, columns] / np.maximum(weight, WHOLE)[:, None]
+
+    # Points near the mask's outline do not count.
     colours[weight < WHOLE] = np.nan
     result[front] = colours
     return result

@@ -1,10 +1,10 @@
-"""How far a pose is from those of training.
+"""The distance of a pose from the training poses.
 
-Convention: a pose is where the body's 33 landmarks are in the pelvis's axes, metres: place and
-turn of the whole body, fingers and face do not count.
+A pose is the positions of the body's 33 landmarks in the pelvis's axes, metres: global position
+and orientation, fingers and face do not count.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -20,13 +20,19 @@ NOISE = 0.03
 class TrainingPoses:
     """The spread of the training poses, as plain values.
 
-    The distance is Mahalanobis's, with `NOISE` added to the covariance: it bounds the weight of
-    directions with little spread. It is scaled so that the training poses' root mean square is 1.
+    The distance is the Mahalanobis distance, with the variance n² of `NOISE` added to the
+    covariance, which bounds the weight of directions with little spread. In principal axes u_k with
+    spread s_k, n² times the squared distance of x is
+
+        Σ_k (u_k·x)² n² / (s_k² + n²) = |x|² - Σ_k (u_k·x)² (1 - n² / (s_k² + n²)),
+
+    so that directions without spread need not be stored. The result is scaled so that the root mean
+    square of the training poses is 1.
 
     Args:
         mean: ``[99]`` metres, the mean pose.
-        axes: ``[K][99]`` the directions in which training poses vary by more than `NOISE`, times
-            the root of the share by which they shorten a squared distance.
+        axes: ``[K][99]`` the axes u_k in which training poses vary by more than `NOISE`, times the
+            root of the last bracket above.
         scale: metres, by which a pose that leaves those directions has the distance 1.
     """
 
@@ -36,29 +42,37 @@ class TrainingPoses:
 
     def distance(self, p: Tensor) -> Tensor:
         """``[B]`` the distance of completed skeletons ``[B, J, 3]``, metres, world frame."""
-        x = pose_in_pelvis(p.double().cpu()) - torch.tensor(
-            self.mean, dtype=torch.float64
-        )
-        along = (
-            x @ torch.tensor(self.axes, dtype=torch.float64).reshape(-1, x.shape[1]).T
-        )
-        return ((x**2).sum(1) - (along**2).sum(1)).clamp_min(0).sqrt() / self.scale
+        mean = torch.tensor(self.mean, dtype=torch.float64)
+        axes = torch.tensor(self.axes, dtype=torch.float64)
+        x = pose_in_pelvis(p.double().cpu()) - mean
+
+        # With reshape, also without any axis.
+        along = x @ axes.reshape(-1, x.shape[1]).T  # [B, K]
+        squared = (x**2).sum(1) - (along**2).sum(1)
+        return squared.clamp_min(0).sqrt() / self.scale
 
 
 def pose_in_pelvis(p: Tensor) -> Tensor:
     """``[B, 99]`` metres: the body's landmarks of ``[B, J, 3]`` in the pelvis's axes."""
     body = p[:, :BODY]
-    return ((body - root_of(body)[:, None]) @ bone_frames(body).hubs[:, 0]).flatten(1)
+
+    # The first hub is the pelvis; its columns are the axes.
+    pelvis = bone_frames(body).hubs[:, 0]
+    return ((body - root_of(body)[:, None]) @ pelvis).flatten(1)
 
 
 def training_poses(p: Tensor) -> TrainingPoses:
     """The spread of the training skeletons ``[F, J, 3]``, completed, metres."""
-    x = pose_in_pelvis(p.double())
+    x = pose_in_pelvis(p.double())  # [F, 99]
     mean = x.mean(0)
+
+    # Principal axes, and the standard deviation along each.
     _, spread, axes = torch.linalg.svd((x - mean) / len(x) ** 0.5, full_matrices=False)
     varied = spread > NOISE
     share = 1 - NOISE**2 / (spread[varied] ** 2 + NOISE**2)
     rows = (share.sqrt()[:, None] * axes[varied]).tolist()
+
+    # The scale is the root mean square of the training poses' own distances.
     found = TrainingPoses(tuple(mean.tolist()), tuple(map(tuple, rows)), 1.0)
     typical = float(found.distance(p).square().mean().sqrt())
-    return TrainingPoses(found.mean, found.axes, max(typical, NOISE))
+    return replace(found, scale=max(typical, NOISE))

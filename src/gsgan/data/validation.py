@@ -1,4 +1,4 @@
-"""What a dataset must satisfy before it is used, in any format, with named thresholds."""
+"""Requirements that a dataset of any format must satisfy before it is used; named thresholds."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,17 +20,20 @@ Index = Mapping[str, Mapping[int, str]]
 """Paths relative to the root, by camera name and frame number."""
 
 
-# read on opening, in even steps; every image is checked again when decoded
+# headers read on opening, in even steps; every image is checked again when decoded
 MOST_HEADERS = 10_000
-MOST_FRAMES = 10_000  # on which the cameras are checked, in even steps
+# frames on which the cameras are checked, in even steps
+MOST_FRAMES = 10_000
 
 
 @dataclass(frozen=True)
 class Thresholds:
-    """What a dataset must satisfy; each threshold can be set."""
+    """Requirements on a dataset; each threshold can be set."""
 
-    min_joints: int = 12  # a frame with fewer usable joints is dropped
-    min_hubs: int = 3  # the same of shoulders and hips; both shoulders are enough
+    # a frame with fewer usable joints is dropped
+    min_joints: int = 12
+    # a frame with fewer shoulders and hips is dropped; both shoulders are enough
+    min_hubs: int = 3
     # a camera that sees fewer joints of a frame does not use it
     min_joints_in_view: int = 4
     # metres from the median joint; one further out counts as missing
@@ -39,8 +42,10 @@ class Thresholds:
     distance: tuple[float, float] = (0.3, 30.0)
     # share of joints behind a camera above which its pose is wrong
     max_behind: float = 0.05
-    max_missing_masks: float = 0.0  # largest share of images without a mask
-    header_stride: int = 1  # of images whose header is read on opening, 0.1 ms each
+    # maximum share of images without a mask
+    max_missing_masks: float = 0.0
+    # step between images whose header is read on opening, 0.1 ms each
+    header_stride: int = 1
 
 
 def drop_frames(
@@ -56,38 +61,52 @@ def drop_frames(
     Raises:
         DataError: when no frame is left.
     """
-    frames = sorted(set[int]().union(*images.values()))
+    # The frames that cannot be used, by reason.
+    frames = _frames(images)
     dropped: dict[str, list[int]] = {}
     for frame in frames:
-        if reason := _unusable(frame, landmarks, poses, limits):
+        reason = _unusable(frame, landmarks, poses, limits)
+        if reason:
             dropped.setdefault(reason, []).append(frame)
+
+    gone: list[int] = []
     for reason, ids in dropped.items():
+        gone += ids
         notes.append(
             f"{len(ids)} of {len(frames)} frames dropped, {reason}: {spans(ids)}"
         )
-    gone = [frame for ids in dropped.values() for frame in ids]
     if len(gone) == len(frames):
-        raise DataError(
-            f"{root} ({landmarks.source}) has no usable frame: "
-            + "; ".join(f"{len(ids)} {reason}" for reason, ids in dropped.items())
-        )
+        reasons = "; ".join(f"{len(ids)} {reason}" for reason, ids in dropped.items())
+        raise DataError(f"{root} ({landmarks.source}) has no usable frame: {reasons}")
     return {name: files.without(gone) for name, files in images.items()}
+
+
+def _frames(images: Images) -> list[int]:
+    """The frames of any camera, rising."""
+    return sorted(set[int]().union(*images.values()))
 
 
 def _unusable(
     frame: int, landmarks: Landmarks, poses: Poses | None, limits: Thresholds
 ) -> str | None:
+    """The reason to drop a frame, for the notes; None to keep it."""
     if frame not in landmarks.visibility:
         return f"without a row in {landmarks.source}"
+
+    # Enough joints, and enough of the trunk.
     valid = landmarks.visibility[frame] > 0
     if valid.sum() < limits.min_joints:
         return f"with fewer than {limits.min_joints} joints (NaN or confidence 0)"
-    trunk = valid[list(HUBS)]
-    left, right = landmarks.p[frame][list(HUBS[2:])]
-    # see `gsgan.data.skeletons.hips_below`
-    estimated = trunk[:2].all() and (left != right).any()
+
+    # Hips may be estimated from the shoulders, see `gsgan.data.skeletons.hips_below`: then they
+    # differ, while hips that were merely filled in are the same.
+    hubs = list(HUBS)
+    trunk = valid[hubs]
+    left_hip, right_hip = landmarks.p[frame][hubs[2:]]
+    estimated = trunk[:2].all() and (left_hip != right_hip).any()
     if trunk.sum() < limits.min_hubs and not estimated:
         return f"with fewer than {limits.min_hubs} of the shoulders and hips"
+
     if poses is not None and frame not in poses.theta:
         return f"without a finite row in {poses.source}"
     return None
@@ -95,13 +114,17 @@ def _unusable(
 
 def spans(ids: list[int]) -> str:
     """Numbers as ranges: [1, 2, 3, 7] is "1-3, 7"."""
+    if not ids:
+        return ""
+    # Runs of consecutive numbers: a run ends where the next number is not one more.
     numbers = np.array(sorted(ids), int)
-    runs = (
-        np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)
-        if len(numbers)
-        else []
-    )
-    return ", ".join(f"{r[0]}" if len(r) == 1 else f"{r[0]}-{r[-1]}" for r in runs)
+    gaps = np.flatnonzero(np.diff(numbers) != 1) + 1
+    texts = []
+    for run in np.split(numbers, gaps):
+        first = run[0]
+        last = run[-1]
+        texts.append(f"{first}" if first == last else f"{first}-{last}")
+    return ", ".join(texts)
 
 
 def check_geometry(
@@ -113,21 +136,25 @@ def check_geometry(
     calibration: Path,
     unit_hint: str,
 ) -> None:
-    """Cameras must be at a plausible distance and face the person.
+    """Refuses cameras at an implausible distance, or behind which the person stands.
 
     Raises:
         DataError: naming the ``calibration`` file and camera, or the distance and ``unit_hint``.
     """
     frames, joints, valid = _seen(images, landmarks)
+
+    # A long capture is checked on some of its frames.
     some = slice(None, None, -(-len(frames) // MOST_FRAMES))
     joints = joints[some]
     valid = valid[some]
     check_distance(
         root, list(cameras.values()), joints[valid], limits.distance, unit_hint
     )
+
+    # A camera whose pose is inverted has the joints behind it.
     for camera in cameras.values():
-        depth = project(camera, joints)[1][valid]
-        behind = float((depth <= NEAR).mean())
+        _, depth = project(camera, joints)
+        behind = float((depth[valid] <= NEAR).mean())
         if behind > limits.max_behind:
             raise DataError(
                 f"{calibration}, camera {camera.name}: {behind:.0%} of the joints lie "
@@ -138,10 +165,12 @@ def check_geometry(
 def _seen(
     images: Images, landmarks: Landmarks
 ) -> tuple[list[int], NDArray[Any], NDArray[Any]]:
-    """The frames of any camera ``[F]``, rising, their joints ``[F, J, 3]``, and which are seen."""
-    frames = sorted(set[int]().union(*images.values()))
-    visibility = np.stack([landmarks.visibility[f] for f in frames])
-    return frames, np.stack([landmarks.p[f] for f in frames]), visibility > 0
+    """The frames of any camera ``[F]``, rising, their joints ``[F, J, 3]``, and ``[F, J]`` whether
+    each is visible."""
+    frames = _frames(images)
+    joints = np.stack([landmarks.p[frame] for frame in frames])
+    visibility = np.stack([landmarks.visibility[frame] for frame in frames])
+    return frames, joints, visibility > 0
 
 
 def check_distance(
@@ -151,13 +180,15 @@ def check_distance(
     limits: tuple[float, float],
     hint: str,
 ) -> None:
-    """The median distance from the cameras to the median of ``joints [N, 3]`` must be plausible.
+    """Refuses an implausible median distance from the cameras to the median of ``joints [N, 3]``.
 
     Raises:
-        DataError: when it is outside the ``limits`` (metres); ``hint`` says what to check.
+        DataError: if it is outside the ``limits`` (metres); ``hint`` says what to check.
     """
+    # Medians are robust to stray joints and to one wrong camera.
     person = np.median(joints, axis=0)
-    distance = float(np.median([np.linalg.norm(c.centre - person) for c in cameras]))
+    metres = [np.linalg.norm(camera.centre - person) for camera in cameras]
+    distance = float(np.median(metres))
     low, high = limits
     if not low <= distance <= high:
         raise DataError(
@@ -179,11 +210,14 @@ def drop_unseen(
     Raises:
         DataError: when a camera never sees the person.
     """
-    kept, (known, joints, valid) = dict(images), _seen(images, landmarks)
+    kept = dict(images)
+    frames, joints, valid = _seen(images, landmarks)
     for name, files in images.items():
-        if not (frames := list(files)):
+        if not files:
             continue
-        rows = np.searchsorted(known, files.frames)
+
+        # Joints in view, in the frames of this camera.
+        rows = np.searchsorted(frames, files.frames)
         seen = inside(cameras[name], joints[rows]) & valid[rows]
         enough = seen.sum(1) >= limits.min_joints_in_view
         if not enough.any():
@@ -192,7 +226,7 @@ def drop_unseen(
                 "inside the image; check K, and that R and t map world to camera (x_cam = R x + t)"
             )
         if not enough.all():
-            lost = [f for f, ok in zip(frames, enough, strict=True) if not ok]
+            lost = files.frames[~enough].tolist()
             notes.append(
                 f"camera {name}: {len(lost)} frames dropped, fewer than "
                 f"{limits.min_joints_in_view} joints in view: {spans(lost)}"
@@ -213,27 +247,32 @@ def drop_unmasked(
     Raises:
         DataError: when more are missing than allowed, naming one in the ``expected`` folders.
     """
-    lost = [
-        (c, f) for c, files in images.items() for f in sorted({*files} - {*masks[c]})
-    ]
+    # Frames without a mask, of the cameras that have some.
+    lost: dict[str, list[int]] = {}
+    for name, files in images.items():
+        unmasked = sorted(set(files) - set(masks[name]))
+        if unmasked:
+            lost[name] = unmasked
     if not lost:
         return images
-    (camera, frame), count = lost[0], sum(len(files) for files in images.values())
-    if len(lost) > limits.max_missing_masks * count:
+
+    count = sum(map(len, images.values()))
+    missing = sum(map(len, lost.values()))
+    camera = next(iter(lost))
+    frame = lost[camera][0]
+    if missing > limits.max_missing_masks * count:
+        # The file that the user may expect: named like the image, in the folder of masks.
         path = (expected[camera] / Path(images[camera][frame]).name).with_suffix(".png")
-        here = sum(c == camera for c, _ in lost)
         raise DataError(
-            f"{path} does not exist; every image needs a mask, and {here} of the "
-            f"{len(images[camera])} of camera {camera} are missing: {len(lost) / count:.0%} of all "
+            f"{path} does not exist; every image needs a mask, and {len(lost[camera])} of the "
+            f"{len(images[camera])} of camera {camera} are missing: {missing / count:.0%} of all "
             f"{count} images have no mask, allowed are {limits.max_missing_masks:.0%}"
         )
     notes.append(
-        f"{len(lost)} of {count} images have no mask and are left out "
+        f"{missing} of {count} images have no mask and are left out "
         f"(first: camera {camera}, frame {frame})"
     )
-    return {
-        c: files.without(f for d, f in lost if d == c) for c, files in images.items()
-    }
+    return {name: files.without(lost.get(name, ())) for name, files in images.items()}
 
 
 def check_images(
@@ -245,19 +284,23 @@ def check_images(
     stride: int,
     calibration: Path,
 ) -> None:
-    """Checks sizes and channel layouts, from the headers alone, of `MOST_HEADERS` images at most.
+    """Checks sizes and channel layouts of at most `MOST_HEADERS` images, from the headers alone.
 
     Raises:
         DataError: on the first file that does not fit.
     """
-    stride = max(stride, -(-sum(map(len, images.values())) // MOST_HEADERS))
+    # Every `stride`-th image, fewer of a large capture.
+    count = sum(map(len, images.values()))
+    stride = max(stride, -(-count // MOST_HEADERS))
     for name, files in images.items():
         size = cameras[name].size
         for frame in list(files)[::stride]:
+            # The calibration decides the image's size, the image that of its masks and labels.
             image = root / files[frame]
             check_image(image, "image", size, str(calibration))
             by = f"the image {image}"
             for mask in masks[name][frame]:
                 check_image(root / mask.path, "mask", size, by)
-            if label := labels.get(name, {}).get(frame):
+            label = labels.get(name, {}).get(frame)
+            if label:
                 check_image(root / label, "labels", size, by)

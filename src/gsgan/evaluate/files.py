@@ -16,26 +16,37 @@ from gsgan.metrics.names import METRICS
 from gsgan.utils import pages
 from gsgan.utils.files import write_atomically
 
-METRICS_FILE, SCORES_FILE, FACTS_FILE, TABLE_FILE = NAMES = (
-    *("metrics.json", "scores.csv", "facts.json", "metrics.md"),
-)
+METRICS_FILE = "metrics.json"
+SCORES_FILE = "scores.csv"
+FACTS_FILE = "facts.json"
+TABLE_FILE = "metrics.md"
+NAMES = (METRICS_FILE, SCORES_FILE, FACTS_FILE, TABLE_FILE)
+# columns of scores.csv
 HEADER = ("split", "variant", "camera", "frame", *METRICS)
+# {split: {variant: {metric: value}}}
 Results = dict[str, dict[str, dict[str, Any]]]
 TITLE = "Held-out cameras (novel_view) and poses (novel_pose)"
-IN_TERMINAL = (  # narrow; metrics.md has all metrics
-    *(
-        "psnr",
-        "psnr_person",
-        "ssim",
-        "lpips_vgg",
-        "lpips_alex",
-        "high_frequencies",
-        "miou",
-    ),
+# A terminal is narrow; metrics.md has all metrics.
+IN_TERMINAL = (
+    "psnr",
+    "psnr_person",
+    "ssim",
+    "lpips_vgg",
+    "lpips_alex",
+    "high_frequencies",
+    "miou",
 )
-WITH_HANDS = (  # where hands are scored, theirs in place of edges
-    *("psnr", "psnr_person", "psnr_hands", "psnr_mouth", "ssim", "lpips_alex", "miou"),
+# the columns if hands are scored
+WITH_HANDS = (
+    "psnr",
+    "psnr_person",
+    "psnr_hands",
+    "psnr_mouth",
+    "ssim",
+    "lpips_alex",
+    "miou",
 )
+# names in tables
 VARIANTS = {
     "full": "final image",
     "splat": "Step I's colour",
@@ -65,6 +76,8 @@ def write_scored(scored: Scored, folder: Path) -> None:
     write_atomically(folder / SCORES_FILE, table)
     write_atomically(folder / TABLE_FILE, markdown(scored.results, scored.origin))
     write_atomically(folder / FACTS_FILE, origin)
+
+    # The last file.
     results = json.dumps(scored.results, indent=2, allow_nan=False)
     write_atomically(folder / METRICS_FILE, results)
 
@@ -78,56 +91,78 @@ def rows(
     """One formatted row per split and variant, and per camera if ``cameras``; None is ``n/a``."""
 
     def formatted(values: dict[str, Any]) -> list[str]:
-        held = [(values[m], METRICS[m].digits) for m in metrics]
-        return [
-            "n/a" if value is None else f"{value:.{digits}f}" for value, digits in held
-        ]
+        # Rounded to the digits of each metric.
+        cells = []
+        for metric in metrics:
+            value = values[metric]
+            digits = METRICS[metric].digits
+            cells.append("n/a" if value is None else f"{value:.{digits}f}")
+        return cells
 
     for split, variants in results.items():
         for variant, scores in variants.items():
             yield [split, VARIANTS[variant], str(scores["images"]), *formatted(scores)]
-            for camera, means in scores["cameras"].items() if cameras else ():
-                yield [split, f"  {camera}", "", *formatted(means)]
+            if cameras:
+                for camera, means in scores["cameras"].items():
+                    yield [split, f"  {camera}", "", *formatted(means)]
 
 
 def notes(results: Results) -> list[str]:
     """Every reason and mark of the table, once each."""
+    # Keys of a dictionary: each note once, in the order of the table.
     found: dict[str, None] = {}
     for split, variants in results.items():
         scores = variants["full"]
-        if described := scores.get("lpips_input"):
+
+        # The inputs of the metrics, and marks.
+        described = scores.get("lpips_input")
+        if described:
             found[f"LPIPS' networks get {described}"] = None
-        if boxes := scores.get("boxes"):
+        boxes = scores.get("boxes")
+        if boxes:
             found[f"boxes: {boxes}"] = None
         for mark in scores["marks"]:
             found[f"marked: {mark}"] = None
-        if protocol := scores.get("protocol"):
-            note = f"; {protocol['note']}" if protocol.get("note") else ""
-            found[f"protocol: {protocol['name']} ({protocol['source']}){note}"] = None
-            for departure in protocol["departures"]:
-                found[f"departs from {protocol['name']}: {departure}"] = None
+
+        if scores.get("protocol"):
+            found |= dict.fromkeys(_protocol_notes(scores["protocol"]))
+
+        # Why there is no score, by reason.
         if not scores["images"]:
             found[f"{split}: {scores['psnr_reason']}"] = None
             continue
         missing: dict[str, list[str]] = {}
-        for metric in (metric for metric in METRICS if scores[metric] is None):
-            missing.setdefault(scores[f"{metric}_reason"], []).append(metric)
+        for metric in METRICS:
+            if scores[metric] is None:
+                missing.setdefault(scores[f"{metric}_reason"], []).append(metric)
         for reason, metrics in missing.items():
             found[f"{', '.join(metrics)} n/a: {reason}"] = None
     return list(found)
 
 
+def _protocol_notes(protocol: dict[str, Any]) -> Iterator[str]:
+    """The protocol, and the departures from it."""
+    # A remark of the protocol follows its source.
+    note = f"; {protocol['note']}" if protocol.get("note") else ""
+    yield f"protocol: {protocol['name']} ({protocol['source']}){note}"
+    for departure in protocol["departures"]:
+        yield f"departs from {protocol['name']}: {departure}"
+
+
 def print_table(results: Results, origin: dict[str, Any], console: Console) -> None:
     """Prints the table, its caption and its notes."""
+    # Columns of metrics; those of hands only if they were scored.
     table = Table(title=TITLE, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("variant", no_wrap=True)
     hands = any(scores["full"]["psnr_hands"] is not None for scores in results.values())
     shown = WITH_HANDS if hands else IN_TERMINAL
     for metric in shown:
         table.add_column(METRICS[metric].short_heading, justify="right", no_wrap=True)
+
+    # The split is a row of its own: a column for it would not fit a narrow terminal.
     previous = None
     for split, variant, images, *scores in rows(results, shown):
-        if split != previous:  # a column for the split would not fit a narrow terminal
+        if split != previous:
             table.add_section()
             table.add_row(f"[bold]{split}[/bold], {images} images")
             previous = split
@@ -139,14 +174,14 @@ def print_table(results: Results, origin: dict[str, Any], console: Console) -> N
 
 def markdown(results: Results, origin: dict[str, Any]) -> str:
     """The table in Markdown with its caption and every metric, and again by camera."""
-    header = [
-        "split",
-        "variant",
-        "images",
-        *(METRICS[m].short_heading for m in METRICS),
-    ]
+    # Every metric is a column.
+    header = ["split", "variant", "images"]
+    for metric in METRICS.values():
+        header.append(metric.short_heading)
     by_split = pages.markdown(header, list(rows(results, cameras=False)))
     by_camera = pages.markdown(header, list(rows(results, cameras=True)))
     listed = "\n".join(f"- {note}" for note in notes(results))
+
+    # An empty list of notes takes no line.
     parts = (f"# {TITLE}", caption(origin), by_split, listed, "## By camera", by_camera)
     return "\n\n".join(filter(None, parts)) + "\n"

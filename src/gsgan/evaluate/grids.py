@@ -15,19 +15,22 @@ from gsgan.scene import Frame
 from gsgan.utils.files import write_atomically
 from gsgan.utils.images import to_bytes
 
+# pixels
 CAPTION_HEIGHT = 22
-ERROR_GAIN = 4.0  # errors are small: they are shown brighter by this factor
+# errors are small: they are shown brighter by this factor
+ERROR_GAIN = 4.0
 
 
 def error_heat(image: Tensor, target: Tensor) -> Tensor:
     """Mean absolute error per pixel as a heat map ``[B, 3, H, W]``; black is none."""
+    # The mean over channels, as 8 bits.
     error = ((image - target).abs().mean(dim=1) * ERROR_GAIN).clamp(0, 1)
-    heat = [
-        cv2.applyColorMap((e * 255).byte().cpu().numpy(), cv2.COLORMAP_INFERNO)[
-            ..., ::-1
-        ].copy()
-        for e in error
-    ]
+    levels = (error * 255).byte().cpu().numpy()
+    heat = []
+    for item in levels:
+        # OpenCV's colours are BGR.
+        bgr = cv2.applyColorMap(item, cv2.COLORMAP_INFERNO)
+        heat.append(bgr[..., ::-1].copy())
     return torch.from_numpy(np.stack(heat)).permute(0, 3, 1, 2).to(image) / 255
 
 
@@ -35,23 +38,22 @@ def grid_rows(frame: Frame, painting: Rendering) -> list[dict[str, Tensor]]:
     """One row per batch item: images ``[3, H, W]`` by caption; what was not rendered is absent."""
     assert painting.image is not None
     image = painting.image.clamp(0, 1)
-    colour = painting.colour
-    parts = painting.segmentation
-    columns = {
-        "truth": frame.image,
-        "Step I colour": None if colour is None else colour.clamp(0, 1),
-        "S": None if parts is None else colour_labels(parts.argmax(dim=1)),
-        "I_pred": image,
-        f"error x{ERROR_GAIN:g}": error_heat(image, frame.image),
-    }
-    shown = {
-        name: column.detach().cpu()
-        for name, column in columns.items()
-        if column is not None
-    }
-    return [
-        {name: column[i] for name, column in shown.items()} for i in range(len(frame))
-    ]
+
+    # The columns, without what was not rendered.
+    columns = {"truth": frame.image}
+    if painting.colour is not None:
+        columns["Step I colour"] = painting.colour.clamp(0, 1)
+    if painting.segmentation is not None:
+        columns["S"] = colour_labels(painting.segmentation.argmax(dim=1))
+    columns["I_pred"] = image
+    columns[f"error x{ERROR_GAIN:g}"] = error_heat(image, frame.image)
+
+    # One row per item.
+    shown = {name: column.detach().cpu() for name, column in columns.items()}
+    rows = []
+    for i in range(len(frame)):
+        rows.append({name: column[i] for name, column in shown.items()})
+    return rows
 
 
 def write_grid(rows: Sequence[dict[str, Tensor]], path: Path, least: int = 160) -> None:
@@ -64,28 +66,37 @@ def write_grid(rows: Sequence[dict[str, Tensor]], path: Path, least: int = 160) 
         path: of the PNG.
         least: pixels; smaller images are enlarged by a whole factor to at least this width.
     """
-    images = [list(row.values()) for row in rows]
-    height, width = (max(x.shape[d] for row in images for x in row) for d in (-2, -1))
-    padded = [
-        [pad(x, (0, width - x.shape[-1], 0, height - x.shape[-2])) for x in row]
-        for row in images
-    ]
-    body = torch.cat([torch.cat(row, dim=-1) for row in padded], dim=-2)
+    # All images in the size of the largest.
+    sizes = [image.shape[-2:] for row in rows for image in row.values()]
+    height = max(h for h, _ in sizes)
+    width = max(w for _, w in sizes)
+    lines = []
+    for row in rows:
+        padded = []
+        for image in row.values():
+            h, w = image.shape[-2:]
+            padded.append(pad(image, (0, width - w, 0, height - h)))
+        lines.append(torch.cat(padded, dim=-1))
+    body = torch.cat(lines, dim=-2)
+
+    # Enlarged by a whole factor.
     scale = max(1, -(-least // width))
     body = body.repeat_interleave(scale, -1).repeat_interleave(scale, -2)
     pixels = to_bytes(body)
+
+    # Captions above the columns.
     header = np.full((CAPTION_HEIGHT, pixels.shape[1], 3), 255, np.uint8)
     for i, caption in enumerate(rows[0]):
-        at = (i * scale * width + 4, CAPTION_HEIGHT - 7)
         cv2.putText(
             header,
             caption,
-            at,
-            cv2.FONT_HERSHEY_SIMPLEX,
-            0.45,
-            (0, 0, 0),
-            1,
-            cv2.LINE_AA,
+            org=(i * scale * width + 4, CAPTION_HEIGHT - 7),
+            fontFace=cv2.FONT_HERSHEY_SIMPLEX,
+            fontScale=0.45,
+            color=(0, 0, 0),
+            thickness=1,
+            lineType=cv2.LINE_AA,
         )
-    encoded = cv2.imencode(".png", np.concatenate([header, pixels])[..., ::-1])[1]
+    bgr = np.concatenate([header, pixels])[..., ::-1]
+    _, encoded = cv2.imencode(".png", bgr)
     write_atomically(path, encoded.tobytes())

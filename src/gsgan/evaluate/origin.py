@@ -18,12 +18,13 @@ from gsgan.run.stored import choices
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
 
+# the ending of a commit with local changes
 DIRTY = "+changes"
 
 
 @dataclass(frozen=True)
 class Method:
-    """A method that is scored; None where unknown.
+    """A method that is scored; a field is None if unknown.
 
     Args:
         name: of the method.
@@ -44,15 +45,20 @@ class Method:
 
 def trained(folder: Path, **training: Any) -> Method:
     """The method of a run folder, with the fields of ``training``."""
+    # The names in the run's config.
     chosen = choices(folder)
     return Method(
-        "gsgan", model=chosen.get("model"), data=chosen.get("data"), **training
+        "gsgan",
+        model=chosen.get("model"),
+        data=chosen.get("data"),
+        **training,
     )
 
 
 def origin(method: Method, data: GsganData, device: torch.device) -> dict[str, Any]:
     """The content of facts.json."""
     commit, dirty = _commit()
+    # The method's name and data go elsewhere; its other fields follow the protocol.
     trained = asdict(method)
     return {
         "version": __version__,
@@ -73,20 +79,23 @@ def origin(method: Method, data: GsganData, device: torch.device) -> dict[str, A
 
 
 def fingerprint(data: GsganData) -> str:
-    """A short hash of cameras, frames, splits, image size and fitted body poses, independent of the
-    contents of images and of where the files are."""
+    """A short hash of cameras, frames, splits, image size and fitted body poses. It does not depend
+    on the contents of images, nor on the place of the files."""
     layout = data.layout
+    cameras = {name: list(camera.size) for name, camera in layout.cameras.items()}
+    splits = {name: list(map(list, items)) for name, items in data.splits.items.items()}
     content: dict[str, Any] = {
-        "cameras": {name: list(camera.size) for name, camera in layout.cameras.items()},
+        "cameras": cameras,
         "frames": list(layout.frames),
-        "splits": {
-            k: [list(item) for item in items] for k, items in data.splits.items.items()
-        },
+        "splits": splits,
         "size": data.size,
         "crop": None if data.crop is None else asdict(data.crop),
     }
-    if layout.poses is not None and layout.poses.fitted:  # other poses are other inputs
+    # Other fitted poses are other inputs.
+    if layout.poses is not None and layout.poses.fitted:
         content["poses"] = layout.poses.digest(layout.frames)
+
+    # Sorted keys: the hash must not depend on their order.
     plain = json.dumps(content, sort_keys=True).encode()
     return hashlib.sha256(plain).hexdigest()[:12]
 
@@ -94,15 +103,20 @@ def fingerprint(data: GsganData) -> str:
 def training_code() -> list[str]:
     """The commit that a checkpoint records; empty if unknown."""
     commit, dirty = _commit()
-    return [] if commit is None else [commit + (DIRTY if dirty else "")]
+    if commit is None:
+        return []
+    return [commit + DIRTY if dirty else commit]
 
 
 def _commit() -> tuple[str | None, bool | None]:
     """``git describe`` of this checkout, and whether tracked files differ from it; (None, None)
     outside a checkout or without git."""
+    # The root of the checkout, above src/gsgan/evaluate; an installed package has none.
     root = Path(__file__).resolve().parents[3]
     if not (root / ".git").exists():
         return None, None
+
+    # Untracked files do not count as changes.
     options = ("--always", "--tags", "--abbrev=12", f"--dirty={DIRTY}")
     command = ["git", "-C", str(root), "describe", *options]
     try:
@@ -111,21 +125,26 @@ def _commit() -> tuple[str | None, bool | None]:
         )
     except (OSError, subprocess.SubprocessError):
         return None, None
+
+    # The description ends with the mark of local changes.
     found = done.stdout.strip()
     return found.removesuffix(DIRTY) or None, found.endswith(DIRTY)
 
 
 def caption(origin: dict[str, Any]) -> str:
     """One line under a table: method, protocol, data, number of seeds, commit."""
+    # Runs of other tools have no seed, no commit or no name of the data.
     data = origin["data"]
     seed = origin["seed"]
-    return " · ".join(
-        [
-            " ".join(filter(None, (origin["method"], origin["model"]))),
-            f"protocol {origin['protocol'] or 'none'}",
-            f"data {data['name'] or 'unknown'} ({data['root']}, {data['fingerprint']})",
-            "seed unknown" if seed is None else f"seed {seed}",
-            f"commit {origin['commit'] or 'unknown'}"
-            + (", changed since" * bool(origin["dirty"])),
-        ]
-    )
+    method = filter(None, (origin["method"], origin["model"]))
+    commit = f"commit {origin['commit'] or 'unknown'}"
+    if origin["dirty"]:
+        commit += ", changed since"
+    parts = [
+        " ".join(method),
+        f"protocol {origin['protocol'] or 'none'}",
+        f"data {data['name'] or 'unknown'} ({data['root']}, {data['fingerprint']})",
+        "seed unknown" if seed is None else f"seed {seed}",
+        commit,
+    ]
+    return " · ".join(parts)

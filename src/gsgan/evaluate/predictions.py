@@ -37,15 +37,17 @@ if TYPE_CHECKING:
 VERTEX_MARGIN = 0.05
 # metres around joints, which are inside the body; as in `PersonCrop`
 JOINT_MARGIN = 0.2
-# the floor is the all-background image
+# Variants: the final image, the colour of Step I, and the all-background image.
 FULL = "full"
 SPLAT = "splat"
 FLOOR = "floor"
+# of a pattern of file names
 FIELDS = ("split", "camera", "camera_index", "frame")
 FIELD = re.compile(r"\{(.*?)\}")
 # share of the background's pixels that have the other background's colour
 WRONG_BACKGROUND = 0.5
-CLOSE = 0.05  # of the range: below it a pixel counts as black, within it of 1 as white
+# of the range: below it a pixel counts as black, within it of 1 as white
+CLOSE = 0.05
 
 
 @dataclass(frozen=True)
@@ -57,9 +59,9 @@ class Prediction:
         alphas: by variant, ``[B, 1, H, W]`` of images on black, premultiplied; None or absent for
             opaque images, which are on the protocol's background.
         segmentation: ``[B, classes, H, W]``, or None.
-        labels: ``[B, H, W]`` ground truth in the classes of the segmentation; None where those are
-            the frame's labels.
-        no_parts: the reason given where there is no segmentation.
+        labels: ``[B, H, W]`` ground truth in the classes of the segmentation; None if those are the
+            frame's labels.
+        no_parts: the reason given if there is no segmentation.
     """
 
     images: dict[str, Tensor]
@@ -70,10 +72,11 @@ class Prediction:
 
 
 class BodyBoxes:
-    """The body's projected 3D box: around its vertices, or, without a mesh, around its joints with
-    a larger margin."""
+    """The body's projected 3D box: around its vertices or, without a mesh, around its joints with a
+    larger margin."""
 
     def __init__(self, data: GsganData) -> None:
+        # A capture may have poses without a body, and the reverse.
         found = data.layout.meta.body
         self.body: SkinnedBody | None = None
         if data.layout.poses is not None and found is not None:
@@ -91,19 +94,20 @@ class BodyBoxes:
 
     def corners(self, frame: Frame, index: int) -> Tensor:
         """``[8, 3]`` metres: the box of one item of a frame."""
+        # The vertices, else the visible joints with a larger margin.
         if self.body is not None and frame.body is not None:
             vertices = self.body.to(frame.skeleton.device).posed_vertices(frame.body)
             return box_corners(vertices[index], VERTEX_MARGIN)
-        return box_corners(
-            frame.skeleton[index][frame.visibility[index] > 0], JOINT_MARGIN
-        )
+        visible = frame.visibility[index] > 0
+        return box_corners(frame.skeleton[index][visible], JOINT_MARGIN)
 
     def masks(self, frame: Frame) -> Tensor:
-        """``[B, 1, H, W]`` bool: the pixels that see it."""
-        cameras = (frame.camera[i : i + 1] for i in range(len(frame)))
-        return torch.stack(
-            [box_mask(self.corners(frame, i), c) for i, c in enumerate(cameras)]
-        )
+        """``[B, 1, H, W]`` bool: the pixels inside the projected box."""
+        masks = []
+        for i in range(len(frame)):
+            corners = self.corners(frame, i)
+            masks.append(box_mask(corners, frame.camera[i : i + 1]))
+        return torch.stack(masks)
 
 
 @dataclass(frozen=True)
@@ -129,6 +133,7 @@ class Preparation:
         """``[B, 3, H, W]`` the ground truth, which is on black in the data."""
         image = frame.image
         mask = frame.mask
+        # A hard outline makes the mask binary.
         if self.measures.truth_outline == "hard":
             image = hard_outline(image, mask)
             mask = (mask >= 0.5).to(mask)
@@ -137,20 +142,25 @@ class Preparation:
     def image(self, prediction: Prediction, variant: str, box: Tensor | None) -> Tensor:
         """``[B, 3, H, W]`` a prediction on the protocol's background, by its alpha."""
         image = prediction.images[variant].clamp(0, 1)
+        background = self.background
+
+        # An image with alpha is on black, any other one on the protocol's background already.
         alpha = prediction.alphas.get(variant)
         if alpha is not None:
-            image = on_background(image, alpha.clamp(0, 1), self.background).clamp(0, 1)
+            image = on_background(image, alpha.clamp(0, 1), background).clamp(0, 1)
+
+        # Rounding, then clearing, as the scoring scripts do.
         image = eight_bits(image, self.measures.eight_bits)
         if box is not None and self.measures.region == "body_box_cleared":
-            image = cleared(image, box, self.background)
+            image = cleared(image, box, background)
         return image
 
     def box(self, frame: Frame) -> Tensor | None:
-        """``[B, 1, H, W]`` the body's projected box, or None where it is not needed."""
+        """``[B, 1, H, W]`` the body's projected box, or None if it is not needed."""
         return None if self.boxes is None else self.boxes.masks(frame)
 
     def regions(self, frame: Frame) -> dict[str, Tensor]:
-        """``[B, 1, H, W]`` each: the boxes of hands and mouth, where the skeleton has hands."""
+        """The boxes of hands and mouth, ``[B, 1, H, W]`` each, if the skeleton has hands."""
         return hands_and_mouth(frame, TEMPLATES[self.skeleton])
 
 
@@ -180,22 +190,27 @@ class PredictionFolder:
         """
         path = self.root / self.files[item]
         rgb, alpha = read_with_alpha(path)
-        image = (
-            (torch.from_numpy(rgb).float() / 255).permute(2, 0, 1)[None].to(frame.image)
-        )
+        colours = torch.from_numpy(rgb).float() / 255
+        image = colours.permute(2, 0, 1)[None].to(frame.image)
+
+        # Straight alpha becomes an image on black, premultiplied.
         if alpha is not None:
-            cover = (torch.from_numpy(alpha).float() / 255)[None, None].to(frame.image)
+            cover = torch.from_numpy(alpha).float() / 255
+            cover = cover[None, None].to(frame.image)
             return Prediction({FULL: image * cover}, {FULL: cover})
         self._check_background(path, image, frame.mask)
         return Prediction({FULL: image}, {})
 
     def _check_background(self, path: Path, image: Tensor, mask: Tensor) -> None:
+        """Refuses an opaque image whose background has mostly the other colour."""
+        # [n, 3]: the pixels without any of the person.
         behind = image.permute(0, 2, 3, 1)[mask[:, 0] == 0]
-        black = (behind < CLOSE).all(-1)
-        white = (behind > 1 - CLOSE).all(-1)
-        other, name = (
-            (white, "white") if self.background == "black" else (black, "black")
-        )
+        if self.background == "black":
+            name = "white"
+            other = (behind > 1 - CLOSE).all(-1)
+        else:
+            name = "black"
+            other = (behind < CLOSE).all(-1)
         if float(other.float().mean()) > WRONG_BACKGROUND:  # NaN without background
             raise DataError(
                 f"{path} has a {name} background, expected {self.background}; give "
@@ -225,6 +240,7 @@ def read_folder(
         DataError: when the folder does not exist, or an image is missing, is there twice,
             or has another size or more than 8 bits per channel.
     """
+    # The pattern must name the frame and the camera.
     fields = set(FIELD.findall(pattern))
     if not ("frame" in fields <= set(FIELDS) and fields & {"camera", "camera_index"}):
         raise ConfigError(
@@ -235,16 +251,25 @@ def read_folder(
         raise DataError(
             f"predictions={root} is not a folder; give that of a method's images"
         )
+
+    # All files by their names without leading zeros of numbers.
     stored: dict[str, list[str]] = {}
     for name in sorted(glob("**", root_dir=root, recursive=True)):
         stored.setdefault(_unpadded(name), []).append(name)
+
     files = {}
     missing = []
     for split, sizes in expected.items():
         for (camera, frame), size in sizes.items():
+            # The file of this image.
             what = f"camera {camera}, frame {frame}"
-            values = (split, camera, str(cameras.index(camera)), f"{frame:06d}")
-            name = _filled(pattern, dict(zip(FIELDS, values, strict=True)))
+            values = {
+                "split": split,
+                "camera": camera,
+                "camera_index": str(cameras.index(camera)),
+                "frame": f"{frame:06d}",
+            }
+            name = _filled(pattern, values)
             found = stored.get(_unpadded(name), [])
             if not found:
                 missing.append(f"{what}, expected as {name}")
@@ -253,13 +278,11 @@ def read_folder(
                 raise DataError(
                     f"{root} has {what} twice, as {found[0]} and {found[1]}; keep one of them"
                 )
+
+            # It must have the size of the ground truth.
             files[camera, frame] = found[0]
-            check_image(
-                root / found[0],
-                "image",
-                size,
-                f"the ground truth of {what}, as scored,",
-            )
+            truth = f"the ground truth of {what}, as scored,"
+            check_image(root / found[0], "image", size, truth)
     if missing:
         raise DataError(
             f"{root} lacks {len(missing)} of {len(missing) + len(files)} images; the first is "
@@ -269,9 +292,11 @@ def read_folder(
 
 
 def _filled(pattern: str, values: Mapping[str, str]) -> str:
+    """The pattern with every field replaced by its value."""
     return FIELD.sub(lambda field: values[field[1]], pattern)
 
 
 def _unpadded(name: str) -> str:
     """The name with every number stripped of leading zeros."""
+    # A number of zeros keeps one.
     return re.sub("[0-9]+", lambda digits: digits[0].lstrip("0") or "0", name)

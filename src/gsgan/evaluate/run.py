@@ -5,7 +5,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -55,6 +55,7 @@ from gsgan.utils.errors import ConfigError
 from gsgan.utils.files import write_atomically
 from gsgan.utils.tensors import pick_device
 
+# The distances as a table with the scores `COLUMNS`, and as a figure.
 CSV = "distance.csv"
 PNG = "distance.png"
 COLUMNS = (
@@ -64,7 +65,18 @@ COLUMNS = (
     "lpips_alex_person",
     "flicker",
 )
-BINS = (0, 1, 2, 3, 4, 6, 8, 12, np.inf)  # distances
+# edges of the bins of distances
+BINS = (0, 1, 2, 3, 4, 6, 8, 12, np.inf)
+
+
+class Bin(NamedTuple):
+    """A bin of distances from the training poses: its edges and the means of its images."""
+
+    low: float
+    high: float
+    distance: float
+    psnr: float  # dB
+    images: int
 
 
 def write_distances(
@@ -83,51 +95,74 @@ def write_distances(
         data: that was scored.
         poses: of the training.
         console: prints the means in the person's box.
-        beside: a folder of scores on the training's own capture, whose curve is drawn too.
+        beside: a folder of scores on the training's own capture, whose curve is drawn as well.
     """
+    # The distance of each frame's pose, by image.
     table = rows.loc[rows["variant"] == FULL, ["split", "camera", "frame", *COLUMNS]]
     frames, places = np.unique(table["frame"], return_inverse=True)
     skeletons = data.dataset("train").skeletons.p
-    distances = poses.distance(
-        torch.from_numpy(np.stack([skeletons[f] for f in frames.tolist()]))
-    )
+    p = np.stack([skeletons[frame] for frame in frames.tolist()])
+    distances = poses.distance(torch.from_numpy(p))
     table.insert(3, "distance", distances.numpy()[places].round(3))
     write_atomically(folder / CSV, table.to_csv(index=False, lineterminator="\n"))
+
+    # The curve, and the one of the training's own capture.
     curves = {"scored here": table}
     if beside is not None and (beside / CSV).is_file():
         curves["held out of the training's capture"] = pd.read_csv(beside / CSV)
     write_atomically(folder / PNG, _plot(curves))
-    means = "; ".join(
-        f"{low:g} to {high:g}: {db:.2f} dB ({count:g})"
-        for low, high, _, db, count in _means(table)
-    )
+
+    # One sentence for the terminal.
+    parts = []
+    for own in _bins(table):
+        parts.append(f"{own.low:g} to {own.high:g}: {own.psnr:.2f} dB ({own.images:g})")
+    means = "; ".join(parts)
     text = f"PSNR in box by distance from the training poses, in deviations (images): {means}"
     console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
-def _means(table: pd.DataFrame) -> list[tuple[float, ...]]:
-    """Of each bin: its borders, mean distance and mean PSNR in dB, and number of images."""
+def _bins(table: pd.DataFrame) -> list[Bin]:
+    """The bins that hold images with a finite PSNR."""
+    # Images of equal pixels, or without a person, have no finite PSNR.
     table = table[np.isfinite(table["psnr_person"])]
-    groups = table.groupby(pd.cut(table["distance"], BINS, right=False, labels=False))
-    return [
-        (
-            *BINS[int(k) : int(k) + 2],
-            own["distance"].mean(),
-            own["psnr_person"].mean(),
-            len(own),
+
+    # The number of each image's bin, which contains its lower edge.
+    place = pd.cut(table["distance"], BINS, right=False, labels=False)
+    bins = []
+    for number, own in table.groupby(place):
+        k = int(number)
+        bins.append(
+            Bin(
+                low=BINS[k],
+                high=BINS[k + 1],
+                distance=own["distance"].mean(),
+                psnr=own["psnr_person"].mean(),
+                images=len(own),
+            )
         )
-        for k, own in groups
-    ]
+    return bins
 
 
 def _plot(curves: dict[str, pd.DataFrame]) -> bytes:
+    """A PNG of PSNR over distance: a dot per image, a line through the means of the bins."""
     figure = Figure(figsize=(6, 3.6), layout="constrained")
     axes = figure.subplots()
     for label, table in curves.items():
-        line = [(distance, db) for *_, distance, db, _ in _means(table)]
-        (drawn,) = axes.plot(*np.array(line).reshape(-1, 2).T, "o-", label=label)
-        dots = (table["distance"], table["psnr_person"], ".")
-        axes.plot(*dots, color=drawn.get_color(), alpha=0.25, markersize=3)
+        bins = _bins(table)
+        x = [own.distance for own in bins]
+        y = [own.psnr for own in bins]
+
+        # The line through the means, then the images in its colour.
+        (drawn,) = axes.plot(x, y, "o-", label=label)
+        axes.plot(
+            table["distance"],
+            table["psnr_person"],
+            ".",
+            color=drawn.get_color(),
+            alpha=0.25,
+            markersize=3,
+        )
+
     axes.set_xlabel("distance from the training poses, in their standard deviations")
     axes.set_ylabel("PSNR in the person's box, dB")
     axes.grid(alpha=0.3)
@@ -137,6 +172,7 @@ def _plot(curves: dict[str, pd.DataFrame]) -> bytes:
     return image.getvalue()
 
 
+# the splits that can be scored, and the mark of scores with drive=skeleton
 SPLITS = ("novel_view", "novel_pose")
 BY_SKELETON = "driven by skeletons alone"
 
@@ -153,6 +189,8 @@ def evaluate_config(config: DictConfig) -> Results:
             "give either run=<the folder that gsgan.train printed>, or predictions=<folder of "
             "images> with data= and data.root="
         )
+
+    # Keys of the other kind of evaluation.
     kind = "run"
     others = ["data", "protocol", "out", "method"]
     if config.run is None:
@@ -163,6 +201,8 @@ def evaluate_config(config: DictConfig) -> Results:
             raise ConfigError(f"{key}= cannot be given with {kind}=; leave it out")
     if config.get("on") is not None and config.data_root is not None:
         raise ConfigError("data_root= cannot be given with on=; leave it out")
+
+    # Values.
     if config.background not in (None, *BACKGROUNDS):
         raise ConfigError(
             f"background must be black, white or null; got {config.background!r}"
@@ -173,6 +213,7 @@ def evaluate_config(config: DictConfig) -> Results:
         raise ConfigError(
             f"splits must be a list of {' and '.join(SPLITS)}; got {config.splits}"
         )
+
     score = evaluate_predictions if config.run is None else evaluate_folder
     return score(config, make_console(), pick_device(config.device))
 
@@ -182,34 +223,40 @@ def evaluate_folder(
 ) -> Results:
     """Loads the avatar of ``config.run`` and scores it."""
     folder = Path(config.run).expanduser()
-    other = config.get("on") is not None
-    out = folder
     stored = read_config(folder)
     if config.lpips.nets is None:
         config.lpips.nets = OmegaConf.select(
             stored, "lpips.nets", default=list(LPIPS_NETS)
         )
+
+    # The weights, and the number of steps, the time and the code that made them.
     checkpoint = read_checkpoint(folder / CHECKPOINT)
     state = checkpoint["gsgan"]
+
+    # The avatar, on its own data or on another capture, whose poses are of another body.
+    other = config.get("on") is not None
+    out = folder
     if other:
         avatar = avatar_of(folder, stored, checkpoint, config.data_smpl)
-        marks = [*state["marks"]]
         data = build_data(other_capture(stored, config.on))
         name = Path(data.layout.root).resolve().name
         out = folder / "on" / name
-        marks = [*marks, f"on another capture: {name}", BY_SKELETON]
+        marks = [*state["marks"], f"on another capture: {name}", BY_SKELETON]
     else:
         stored = load_config(folder, DataPaths.from_config(config))
         data = build_data(stored)
         avatar, marks = load_avatar(folder, stored, data)
-    # the protocol's scores stay
+
+    # Scores of other settings have folders of their own, so that the protocol's scores stay.
     if config.background not in (None, _measures(data).background):
         out = out / f"on_{config.background}"
     if config.drive is not None and not other:
         out = out / "by_skeleton"
         marks = [*marks, BY_SKELETON]
-    if len({*config.splits}) < len(SPLITS):  # the scores of both splits stay
+    if len(set(config.splits)) < len(SPLITS):
         out = out / config.splits[0]
+
+    # What facts.json states about the run.
     method = trained(
         folder,
         seed=stored.seed,
@@ -217,10 +264,15 @@ def evaluate_folder(
         train_seconds=state.get("train_seconds"),
         trained_by=state.get("code"),
     )
+
+    # Poses are solved from skeletons on request; another capture has other cameras' colours.
     solve = config.drive is not None
-    predict = painter(avatar.to(device), solve=solve, colours=not other)
     return evaluate_method(
-        *(out, config, console, data, predict),
+        out,
+        config,
+        console,
+        data,
+        predict=painter(avatar.to(device), solve=solve, colours=not other),
         method=method,
         device=device,
         marks=marks,
@@ -237,9 +289,13 @@ def other_capture(stored: DictConfig, on: str | DictConfig) -> DictConfig:
         ConfigError: on a key that the run's data lacks.
     """
     config = stored.copy()
+
+    # The run's own data, splits and protocol do not hold for another capture.
     splits = ("train_cameras", "test_cameras", "train_frames", "test_frames")
     own = dict.fromkeys(("root", "protocol", *splits)) | {"body": "none"}
     config.data.merge_with(own)
+
+    # Only keys that the data has can be changed.
     OmegaConf.set_struct(config, True)
     try:
         config.data.merge_with({"root": on} if isinstance(on, str) else on)
@@ -258,32 +314,43 @@ def evaluate_predictions(
         raise ConfigError(
             "data is not set: give that of the predictions with data= and data.root="
         )
+
+    # Without a name, the folder's name is that of the method.
     root = Path(config.predictions).expanduser()
     name = config.method or root.resolve().name
     if config.lpips.nets is None:
         config.lpips.nets = list(LPIPS_NETS)
+
+    # The data, and a folder for the results that holds no others.
     data = build_data(config)
     out = _out(config, root.resolve(), name)
-    datasets = {split: data.dataset(split) for split in config.splits}
+
+    # The images must have the size of the ground truth.
+    sizes = {}
+    for split in config.splits:
+        own = data.dataset(split)
+        sizes[split] = {item: own.camera(item).size for item in own.items}
     folder = read_folder(
         root,
         config.predictions_pattern,
-        {
-            k: {item: own.camera(item).size for item in own.items}
-            for k, own in datasets.items()
-        },
+        sizes,
         data.layout.camera_names,
         config.background or _measures(data).background,
     )
-    chosen = HydraConfig.get().runtime.choices if HydraConfig.initialized() else {}
-    method = Method(name, data=chosen.get("data"))
+
+    # The choice of the config group data, if a command made one.
+    method = Method(name)
+    if HydraConfig.initialized():
+        chosen = HydraConfig.get().runtime.choices
+        method = replace(method, data=chosen.get("data"))
     return evaluate_method(
         out, config, console, data, folder.predict, method=method, device=device
     )
 
 
 def _out(config: DictConfig, root: Path, method: str) -> Path:
-    """The folder for scores: not inside the predictions, no run, no other method's scores."""
+    """The folder for scores; refuses one inside the predictions, a run, or one with the scores of
+    another method."""
     out = root.with_name(f"{root.name}_scores")
     if config.out is not None:
         out = Path(config.out).expanduser().resolve()
@@ -291,13 +358,17 @@ def _out(config: DictConfig, root: Path, method: str) -> Path:
         raise ConfigError(
             f"out={out} is inside the predictions, a file or a run folder; choose another folder"
         )
+
+    # The method of the scores that the folder holds already.
     held = out / FACTS_FILE
-    try:
-        found = json.loads(held.read_text())["method"] if held.is_file() else method
-    except (ValueError, KeyError, TypeError):
-        raise ConfigError(
-            f"{held} is damaged; choose another folder with out="
-        ) from None
+    found = method
+    if held.is_file():
+        try:
+            found = json.loads(held.read_text())["method"]
+        except (ValueError, KeyError, TypeError):
+            raise ConfigError(
+                f"{held} is damaged; choose another folder with out="
+            ) from None
     if found != method:
         raise ConfigError(
             f"out={out} holds scores of {found}, not of {method}; choose another folder"
@@ -336,17 +407,22 @@ def evaluate_method(
     Raises:
         GsganError: when a prediction cannot be scored.
     """
+    # Settings that commands of other packages may lack have defaults.
     scorer = make_scorer(config, data, marks)
     grid_rows = 4 if config.get("grid_rows") is None else config.grid_rows
+
+    # Every split, with the images of the grid evenly spaced.
     scores: dict[str, SplitScores] = {}
     for split in config.get("splits") or SPLITS:
         dataset = data.dataset(split)
         count = len(dataset)
-        rows = min(grid_rows, len(dataset))
+        rows = min(grid_rows, count)
+        shown = {round((i + 0.5) * count / rows - 0.5) for i in range(rows)}
         order = track(range(count), f"scoring {split}", console=console, transient=True)
         frames = ((dataset.items[i], dataset[i].to(device)) for i in order)
-        shown = {round((i + 0.5) * count / rows - 0.5) for i in range(rows)}
         scores[split] = score_split(frames, predict, scorer, shown)
+
+    # Only now, as everything is scored, files are written.
     for split, found in scores.items():
         if found.grid:
             write_grid(found.grid, folder / "grids" / f"{split}.png")
@@ -355,7 +431,9 @@ def evaluate_method(
     if poses is not None:
         own = None if config.get("on") is None else Path(config.run).expanduser()
         write_distances(folder, whole.rows, data, poses, console, own)
-    write_scored(whole, folder)  # last: where metrics.json is new, everything is
+
+    # metrics.json is the last file: if it is new, all others are.
+    write_scored(whole, folder)
     console.print(f"scores: {folder}", markup=False, highlight=False, soft_wrap=True)
     return whole.results
 
@@ -367,41 +445,51 @@ def _joined_splits(
     origin: dict[str, Any],
 ) -> Scored:
     """The scores of all splits, with the protocol's record and reasons for empty splits."""
+    # An empty split has the variants of the others.
     variants = next((s.variants for s in scores.values() if s.variants), (FULL, FLOOR))
+
+    # metrics.json by split, scores.csv by image.
     results = {}
+    rows = []
     for split, found in scores.items():
-        reason = data.reasons.get(split, "no frames")
-        held = found.variants or {name: empty(reason, scorer) for name in variants}
+        held = found.variants
+        if not held:
+            reason = data.reasons.get(split, "no frames")
+            held = {name: empty(reason, scorer) for name in variants}
         results[split] = {
             name: values | {"protocol": scorer.protocol}
             for name, values in held.items()
         }
-    table = (
-        {"split": split, "variant": variant, **row}
-        for split, found in scores.items()
-        for variant, of_variant in found.rows.items()
-        for row in of_variant
-    )
-    return Scored(results, pd.DataFrame(table, columns=HEADER), origin)
+        for variant, of_variant in found.rows.items():
+            for row in of_variant:
+                rows.append({"split": split, "variant": variant, **row})
+    return Scored(results, pd.DataFrame(rows, columns=HEADER), origin)
 
 
 def make_scorer(config: DictConfig, data: GsganData, marks: Sequence[str]) -> Scorer:
-    """How the images of a dataset are scored: by its protocol, on the config's background.
+    """The scorer of a dataset: its protocol's measures, on the config's background.
 
     Raises:
         ConfigError: on an unknown network of LPIPS.
         DataError: if LPIPS' weights or a body model cannot be read.
     """
+    marks = list(marks)
+
+    # A background other than the protocol's is marked, and departs from it.
     measures = _measures(data)
     background = config.get("background")
     if background not in (None, measures.background):
         measures = replace(measures, background=background)
-        marks = [*marks, f"scored on {background}"]
-    if frames := data.registered_held_out:
-        marks = [
-            *marks,
-            f"body poses of {len(frames)} held-out frames fitted to their own masks",
-        ]
+        marks.append(f"scored on {background}")
+
+    # Fitted to held-out masks, poses are better than they would be at test time.
+    frames = data.registered_held_out
+    if frames:
+        marks.append(
+            f"body poses of {len(frames)} held-out frames fitted to their own masks"
+        )
+
+    # The protocol, and what departs from it.
     boxes = BodyBoxes(data) if measures.needs_body_box else None
     record = data.protocol_record(config.lpips.nets)
     if record is not None:
@@ -409,14 +497,16 @@ def make_scorer(config: DictConfig, data: GsganData, marks: Sequence[str]) -> Sc
         if asked != measures.background:
             different = f"background is {measures.background}, asked for: {asked}"
             record["departures"].append(different)
-        record["departures"] += [] if boxes is None else boxes.departures
+        if boxes is not None:
+            record["departures"] += boxes.departures
     return Scorer(
         prepare=Preparation(measures, boxes, data.skeleton),
         lpips=build_lpips(config.lpips.nets, config.lpips.path),
-        marks=list(marks),
+        marks=marks,
         protocol=record,
     )
 
 
 def _measures(data: GsganData) -> MetricVariants:
+    """The protocol's measures, or the defaults."""
     return MetricVariants() if data.protocol is None else data.protocol.measures

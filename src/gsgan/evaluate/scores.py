@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -36,13 +36,15 @@ from gsgan.scene import Frame
 from gsgan.utils.errors import GsganError
 from gsgan.weights.networks import Lpips
 
+# reasons for missing scores
 NO_PAIR = "no two images are of consecutive frames, in one window of one camera"
 NO_LPIPS = "left out by lpips.nets"
 NO_LABELS = "the data has no part labels"
 NO_PARTS_OF_SPLAT = "Step I's colour is not a segmentation"
 NO_PARTS_OF_FLOOR = "an all-background image is not a segmentation"
 Predict = Callable[[Frame, Item], Prediction]
-Row = dict[str, Any]  # "camera", "frame", and a score by metric
+# "camera", "frame", and a score by metric
+Row = dict[str, Any]
 
 
 def image_scores(
@@ -60,7 +62,7 @@ def image_scores(
     Args:
         image, target: ``[1, 3, H, W]``, prepared (`gsgan.evaluate.predictions.Preparation`).
         mask: ``[1, 1, H, W]`` of the person; required for the metrics of the person alone.
-        box: ``[1, 1, H, W]`` bool, the body's projected box; required where the measures use it.
+        box: ``[1, 1, H, W]`` bool, the body's projected box; required if the measures use it.
         regions: of hands and mouth, from `gsgan.metrics.regions.hands_and_mouth`.
         measures: regions and ranges; None takes the defaults.
         lpips: against this ground truth, a `gsgan.metrics.lpips.LpipsAgainst`.
@@ -70,34 +72,47 @@ def image_scores(
     """
     measures = measures or MetricVariants()
     image = image.clamp(0, 1)
+    scores: dict[str, Any] = {"high_frequencies": high_frequencies(image, target)}
+
+    # PSNR and SSIM in the region and the variant that the protocol asks for.
     pooling = measures.psnr_pooling
-    background = BACKGROUNDS[measures.background]
     window = ssim_uniform if measures.ssim_window == "uniform" else ssim
     similarity = partial(window, value_range=measures.ssim_range)
-    scores: dict[str, Any] = {"high_frequencies": high_frequencies(image, target)}
     if measures.region == "body_box":
         assert box is not None
+        background = BACKGROUNDS[measures.background]
         scores["psnr"] = psnr_where(image, target, box, pooling=pooling)
-        a = cleared(image, box, background)
-        b = cleared(target, box, background)
-        scores["ssim"] = _inside(box, similarity, a, b)
+        scores["ssim"] = _inside(
+            box,
+            similarity,
+            cleared(image, box, background),
+            cleared(target, box, background),
+        )
     else:
         scores["psnr"] = psnr(image, target, pooling=pooling)
         scores["ssim"] = similarity(image, target)
+
+    # Edges in the whole image and in the person's box.
     scores["edge_f1"], scores["edge_ratio"] = edge_scores(image, target)
     regions = dict(regions or {})
     if mask is not None:
-        regions["person"] = person = person_box(mask)
+        person = person_box(mask)
+        regions["person"] = person
         scores["psnr_inside"] = psnr_inside(image, target, mask)
-        scores["edge_f1_person"], scores["edge_ratio_person"] = edge_scores(
-            image, target, person
-        )
-    similar = ssim_where(image, target, *regions.values()) if regions else []
-    for (name, region), mean in zip(regions.items(), similar, strict=True):
-        scores[f"psnr_{name}"] = psnr_where(image, target, region)
-        scores[f"ssim_{name}"] = mean
+        f1, ratio = edge_scores(image, target, person)
+        scores["edge_f1_person"] = f1
+        scores["edge_ratio_person"] = ratio
+
+    # PSNR and SSIM of all regions, from one map of SSIM.
+    if regions:
+        similar = ssim_where(image, target, *regions.values())
+        for (name, region), mean in zip(regions.items(), similar, strict=True):
+            scores[f"psnr_{name}"] = psnr_where(image, target, region)
+            scores[f"ssim_{name}"] = mean
     if lpips is not None:
         scores |= lpips(image)
+
+    # In the order of the tables.
     return {
         metric: float(scores[metric]) for metric in IMAGE_METRICS if metric in scores
     }
@@ -105,12 +120,12 @@ def image_scores(
 
 def _inside(box: Tensor, score: Score, a: Tensor, b: Tensor) -> Tensor | float:
     """The score of a box's rectangle; NaN for an empty box."""
+    # SSIM has windows, so the region must be a rectangle.
     part = rectangle(box[0])
-    return (
-        math.nan
-        if part is None
-        else score(*(x[:, :, part[0], part[1]] for x in (a, b)))
-    )
+    if part is None:
+        return math.nan
+    rows, columns = part
+    return score(a[:, :, rows, columns], b[:, :, rows, columns])
 
 
 def means(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -120,16 +135,22 @@ def means(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """
     result: dict[str, Any] = {}
     for metric in IMAGE_METRICS:
+        # A metric that was not computed is absent, an undefined one is NaN.
         scores = [row[metric] for row in rows if metric in row]
-        finite = [score for score in scores if math.isfinite(score)]
+        finite = list(filter(math.isfinite, scores))
         result[metric] = sum(finite) / len(finite) if finite else None
-        if left_out := len(scores) - len(finite):
+        left_out = len(scores) - len(finite)
+        if left_out:
             result[f"{metric}_left_out"] = left_out
+
+        # Why there is no score.
         if not finite:
-            no_score = "no image has a finite score" if left_out else "no image"
-            missing = NO_LPIPS if metric.startswith("lpips") else ""
-            missing = NO_PAIR if metric == "flicker" else missing
-            result[f"{metric}_reason"] = missing or no_score
+            reason = "no image has a finite score" if left_out else "no image"
+            if metric == "flicker":
+                reason = NO_PAIR
+            elif metric.startswith("lpips"):
+                reason = NO_LPIPS
+            result[f"{metric}_reason"] = reason
     return result
 
 
@@ -138,13 +159,13 @@ def means(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Scorer:
-    """How images are scored.
+    """The settings by which images are scored.
 
     Args:
-        prepare: applied to them first.
+        prepare: applied to the images first.
         lpips: networks by name, from `gsgan.metrics.lpips.build_lpips`.
         marks: notes that every table must carry.
-        protocol: its record with every departure, or None.
+        protocol: the protocol's record with every departure, or None.
     """
 
     prepare: Preparation
@@ -175,19 +196,26 @@ def painter(avatar: Avatar, *, solve: bool = False, colours: bool = True) -> Pre
     Args:
         avatar: to evaluate.
         solve: solve every body pose from the skeleton, in place of the data's.
-        colours: correct for the cameras' colours; False where they are not those of training.
+        colours: correct for the cameras' colours; False if they are not the training cameras.
     """
 
     def predict(frame: Frame, item: Item) -> Prediction:
-        *inputs, camera_index = (replace(frame, body=None) if solve else frame).inputs
+        # Without a body pose, the avatar solves it from the skeleton.
+        if solve:
+            frame = replace(frame, body=None)
+        *inputs, camera_index = frame.inputs
         with torch.no_grad():
             painting = avatar(*inputs, camera_index if colours else None)
+
+        # The variants of the image.
         assert painting.image is not None
         images = {FULL: painting.image}
         alphas = {FULL: painting.alpha}
         if painting.colour is not None:
             images[SPLAT] = painting.colour
             alphas[SPLAT] = painting.splat_alpha
+
+        # Parts, in the classes that are scored.
         parts = painting.segmentation
         labels = frame.labels
         if avatar.segmentation is not None and parts is not None and labels is not None:
@@ -214,16 +242,26 @@ def score_split(
     Args:
         items: (camera and frame number, frame) pairs, on the device that predicts.
         predict: the method.
-        scorer: how to score.
+        scorer: the settings.
         shown: numbers of the frames that go into the grid, counted from 0.
 
     Raises:
         GsganError: when a prediction is not finite, naming camera and frame.
     """
+    # Frames are predicted one by one, so that only one is in memory.
     tally = _Tally(scorer)
     for i, (item, frame) in enumerate(items):
         tally.add(item, frame, predict(frame, item), show=i in shown)
     return tally.result()
+
+
+class _Last(NamedTuple):
+    """The frame before, to compare with: its item, ground truth and images by variant."""
+
+    item: Item
+    frame: Frame
+    target: Tensor
+    images: dict[str, Tensor]
 
 
 @dataclass
@@ -233,42 +271,52 @@ class _Tally:
     scorer: Scorer
     rows: dict[str, list[Row]] = field(default_factory=dict)
     grid: list[dict[str, Tensor]] = field(default_factory=list)
-    matrices: dict[str, Tensor] = field(default_factory=dict)  # by camera
+    # confusion matrices by camera
+    matrices: dict[str, Tensor] = field(default_factory=dict)
     no_parts: str = ""
-    # the last images by variant
-    before: dict[str, Tensor] = field(default_factory=dict)
-    # of which item, and its ground truth
-    last: tuple[Item, Frame, Tensor] | None = None
+    last: _Last | None = None
 
     def add(
         self, item: Item, frame: Frame, prediction: Prediction, *, show: bool
     ) -> None:
         """Scores one frame."""
-        prepare, (camera, number) = self.scorer.prepare, item
+        # Ground truth and regions as the protocol defines them.
+        camera, number = item
+        prepare = self.scorer.prepare
         target = prepare.target(frame)
         box = prepare.box(frame)
         regions = prepare.regions(frame)
+
+        # The images as the protocol scores them.
         images = {}
         for name, image in prediction.images.items():
-            if bad := int((~torch.isfinite(image)).sum()):
+            bad = int((~torch.isfinite(image)).sum())
+            if bad:
                 raise GsganError(
                     f"camera {camera}, frame {number}: {bad} values of the predicted image are not "
                     "finite; it cannot be scored"
                 )
             images[name] = prepare.image(prediction, name, box)
         if show:
-            parts = prediction.segmentation
             painting = Rendering(
-                images[FULL], corrected=images.get(SPLAT), segmentation=parts
+                images[FULL],
+                corrected=images.get(SPLAT),
+                segmentation=prediction.segmentation,
             )
             self.grid += grid_rows(replace(frame, image=target), painting)
         images[FLOOR] = torch.full_like(frame.image, prepare.background)
+
+        # Features of the ground truth, shared by all variants.
         lpips = None
         if self.scorer.lpips:
             lpips = LpipsAgainst(
                 target, frame.mask, self.scorer.lpips, prepare.measures
             )
-        follows = self.last is not None and _follows(item, frame, *self.last[:2])
+
+        # Flicker needs the frame before, seen by the same camera.
+        last = self.last
+        if last is not None and not _follows(item, frame, last.item, last.frame):
+            last = None
         for name, image in images.items():
             own = image_scores(
                 image,
@@ -279,53 +327,55 @@ class _Tally:
                 measures=prepare.measures,
                 lpips=lpips,
             )
-            if follows and self.last is not None:
-                last = self.before[name], self.last[2], self.last[1].mask
-                own["flicker"] = float(flicker(image, target, frame.mask, last))
-            self.rows.setdefault(name, []).append(
-                {"camera": camera, "frame": number, **own}
-            )
-        self.before = images
-        self.last = (item, frame, target)
+            if last is not None:
+                before = (last.images[name], last.target, last.frame.mask)
+                own["flicker"] = float(flicker(image, target, frame.mask, before))
+            row = {"camera": camera, "frame": number, **own}
+            self.rows.setdefault(name, []).append(row)
+        self.last = _Last(item, frame, target, images)
         self._add_parts(camera, frame, prediction)
 
     def _add_parts(self, camera: str, frame: Frame, prediction: Prediction) -> None:
-        """Counts the pixels of a segmentation, where there is one."""
+        """Counts the pixels of a segmentation, if there is one."""
         parts = prediction.segmentation
         if parts is None or frame.labels is None:
             self.no_parts = NO_LABELS if parts is not None else prediction.no_parts
             return
+
+        # Sums of confusion matrices by camera, and the score of this image.
         labels = frame.labels if prediction.labels is None else prediction.labels
         matrix = confusion(parts, labels)
-        self.matrices[camera] = (
-            self.matrices.get(camera, torch.zeros_like(matrix)) + matrix
-        )
+        held = self.matrices.get(camera, torch.zeros_like(matrix))
+        self.matrices[camera] = held + matrix
         self.rows[FULL][-1] |= miou(matrix)
 
     def result(self) -> SplitScores:
         """The scores of the split."""
-        reasons = {
-            FULL: self.no_parts,
-            SPLAT: NO_PARTS_OF_SPLAT,
-            FLOOR: NO_PARTS_OF_FLOOR,
-        }
-        variants = {
-            name: _variant(
-                own, self.matrices if name == FULL else {}, reasons[name], self.scorer
-            )
-            for name, own in self.rows.items()
-        }
+        # Only the final image has a segmentation.
+        no_parts = {SPLAT: NO_PARTS_OF_SPLAT, FLOOR: NO_PARTS_OF_FLOOR}
+        variants = {}
+        for name, own in self.rows.items():
+            if name == FULL:
+                found = _variant(own, self.matrices, self.no_parts, self.scorer)
+            else:
+                found = _variant(own, {}, no_parts[name], self.scorer)
+            variants[name] = found
         return SplitScores(variants, self.rows, self.grid)
 
 
 def _follows(item: Item, frame: Frame, before: Item, last: Frame) -> bool:
-    """Whether an item is of the next frame, its pixels seen through the same window."""
+    """Whether an item is the next frame after another one, seen through the same window."""
+    # The next frame of the same camera.
+    name, number = before
+    if item != (name, number + 1):
+        return False
+
+    # The window follows the person, so K and size may differ.
     now = frame.camera
     then = last.camera
-    same = now.size == then.size and all(
-        map(torch.equal, (now.K, now.R), (then.K, then.R))
-    )
-    return same and item == (before[0], before[1] + 1)
+    if now.size != then.size:
+        return False
+    return torch.equal(now.K, then.K) and torch.equal(now.R, then.R)
 
 
 def _variant(
@@ -333,20 +383,22 @@ def _variant(
 ) -> dict[str, Any]:
     """One variant as in metrics.json."""
     result = means(rows)
+
+    # Reasons for metrics that cannot be computed.
     if describe_boxes(scorer.prepare.skeleton) is None:
-        result |= no_scores(
-            BOX_METRICS, f"the skeleton {scorer.prepare.skeleton} has no hands"
-        )
+        reason = f"the skeleton {scorer.prepare.skeleton} has no hands"
+        result |= no_scores(BOX_METRICS, reason)
     if matrices:
+        # The parts of all cameras together.
         parts = miou(torch.stack(list(matrices.values())).sum(0))
         result |= parts
-        result |= {
-            f"{m}_reason": "the ground truth has no part"
-            for m in parts
-            if parts[m] is None
-        }
+        for metric, score in parts.items():
+            if score is None:
+                result[f"{metric}_reason"] = "the ground truth has no part"
     else:
         result |= no_scores(PART_METRICS, no_parts)
+
+    # The same by camera, without reasons.
     cameras = {}
     for camera in dict.fromkeys(row["camera"] for row in rows):
         found = means([row for row in rows if row["camera"] == camera])
@@ -362,6 +414,7 @@ def empty(reason: str, scorer: Scorer) -> dict[str, Any]:
 
 
 def _common(scorer: Scorer, images: int) -> dict[str, Any]:
+    """The entries of a variant that are no scores."""
     return {
         "images": images,
         "marks": list(scorer.marks),
@@ -371,7 +424,9 @@ def _common(scorer: Scorer, images: int) -> dict[str, Any]:
 
 
 def lpips_input(measures: MetricVariants) -> str:
-    """What LPIPS' networks get: the range, and order of channels and region if not the defaults."""
+    """The input of LPIPS' networks in words: the range, and the order of channels and the region if
+    they are not the defaults."""
+    # The range is always named, the rest only if it is unusual.
     low, high = measures.lpips_range
     order = "" if measures.lpips_channels == "rgb" else " BGR"
     region = "" if measures.lpips_region == "full" else " mask crop 512"
@@ -380,8 +435,8 @@ def lpips_input(measures: MetricVariants) -> str:
 
 def no_scores(metrics: Iterable[str], reason: str) -> dict[str, Any]:
     """Each metric None, with the reason."""
-    return {
-        k: v
-        for metric in metrics
-        for k, v in ((metric, None), (f"{metric}_reason", reason))
-    }
+    result: dict[str, Any] = {}
+    for metric in metrics:
+        result[metric] = None
+        result[f"{metric}_reason"] = reason
+    return result

@@ -1,36 +1,57 @@
 """Adversarial losses and feature matching (paper Sec. 3.5)."""
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-Maps = Sequence[Sequence[Tensor]]  # per scale: feature maps, the logits last
+# by scale: feature maps, the logits last
+Maps = Sequence[Sequence[Tensor]]
 Term = Callable[[Tensor, Tensor], Tensor]
 softplus = functional.softplus
 relu = functional.relu
 
-# name: (discriminator's loss, generator's loss) of (real, fake) logits
-_FORMS: dict[str, tuple[Term, Term]] = {
-    "logistic": (lambda r, f: softplus(-r) + softplus(f), lambda _, f: softplus(-f)),
-    "hinge": (lambda r, f: relu(1 - r) + relu(1 + f), lambda _, f: -f),
-    "lsgan": (
-        lambda r, f: (r - 1).square() + f.square(),
-        lambda _, f: (f - 1).square(),
+
+class Form(NamedTuple):
+    """The losses of both players at one position, of the real and the fake logit."""
+
+    discriminator: Term
+    generator: Term
+
+
+_FORMS = {
+    "logistic": Form(
+        discriminator=lambda real, fake: softplus(-real) + softplus(fake),
+        generator=lambda real, fake: softplus(-fake),
     ),
-    "relativistic": (lambda r, f: softplus(f - r), lambda r, f: softplus(r - f)),
+    "hinge": Form(
+        discriminator=lambda real, fake: relu(1 - real) + relu(1 + fake),
+        generator=lambda real, fake: -fake,
+    ),
+    "lsgan": Form(
+        discriminator=lambda real, fake: (real - 1).square() + fake.square(),
+        generator=lambda real, fake: (fake - 1).square(),
+    ),
+    "relativistic": Form(
+        discriminator=lambda real, fake: softplus(fake - real),
+        generator=lambda real, fake: softplus(real - fake),
+    ),
 }
 FORMS = tuple(_FORMS)
-COMPARING = ("relativistic",)  # forms whose generator loss depends on the real image
+# forms whose generator loss depends on the real image
+COMPARING = ("relativistic",)
 
 
-def _loss(form: str, which: int, real: Maps, fake: Maps) -> Tensor:
-    term = _FORMS[form][which]
-    scales = zip(real, fake, strict=True)
-    return torch.stack(
-        [term(r[-1].float(), f[-1].float()).mean() for r, f in scales]
-    ).sum()
+def _over_scales(term: Term, real: Maps, fake: Maps) -> Tensor:
+    """The sum over scales of a term's mean over positions, in float32."""
+    losses = []
+    for real_scale, fake_scale in zip(real, fake, strict=True):
+        # The last map holds the logits.
+        loss = term(real_scale[-1].float(), fake_scale[-1].float())
+        losses.append(loss.mean())
+    return torch.stack(losses).sum()
 
 
 def discriminator_loss(real: Maps, fake: Maps, form: str = "logistic") -> Tensor:
@@ -41,27 +62,30 @@ def discriminator_loss(real: Maps, fake: Maps, form: str = "logistic") -> Tensor
         form: ``logistic`` (non-saturating), ``hinge``, ``lsgan`` or ``relativistic``: compares
             the logits of the pair at each position (the paired form, RpGAN, of
             Jolicoeur-Martineau 2019; here both show the same frame). What both share
-            cancels, so use it where generated images are close to the ground truth.
+            cancels, so use it if generated images are close to the ground truth.
     """
-    return _loss(form, 0, real, fake)
+    return _over_scales(_FORMS[form].discriminator, real, fake)
 
 
 def generator_loss(real: Maps, fake: Maps, form: str = "logistic") -> Tensor:
-    """The generator's loss, same conventions; only `COMPARING` forms use ``real``, for others pass
-    ``fake`` twice."""
-    return _loss(form, 1, real, fake)
+    """The generator's loss, with the arguments of `discriminator_loss`; only `COMPARING` forms use
+    ``real``, for others pass ``fake`` twice."""
+    return _over_scales(_FORMS[form].generator, real, fake)
 
 
 def feature_matching(real: Maps, fake: Maps) -> Tensor:
     """L_feat: L1 between the discriminators' features (without logits), real ones detached.
 
-    Weighted as in pix2pixHD: 4 / (number of maps) per map, mean over scales.
+    The weights are those of pix2pixHD: 4 / (number of maps) per map, mean over scales.
 
     Source: paper Sec. 3.5.
     """
     loss = real[0][0].new_zeros(())
     for real_scale, fake_scale in zip(real, fake, strict=True):
+        # The logits are not among the features.
         weight = 4 / ((len(real_scale) - 1) * len(real))
-        for a, b in zip(real_scale[:-1], fake_scale[:-1], strict=True):
-            loss = loss + weight * functional.l1_loss(b, a.detach())
+        features = zip(real_scale[:-1], fake_scale[:-1], strict=True)
+        for truth, generated in features:
+            distance = functional.l1_loss(generated, truth.detach())
+            loss = loss + weight * distance
     return loss

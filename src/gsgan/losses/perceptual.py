@@ -12,10 +12,16 @@ from gsgan.utils.checks import one_of, whole
 from gsgan.weights.files import NETWORKS
 from gsgan.weights.networks import FeatureNetwork, Lpips, pretrained
 
-FEATURES, LPIPS = FORMS = ("features", "lpips")
-PRETRAINED, RANDOM = SOURCES = ("pretrained", "random")
-VGG_LAYERS = 4  # relu1_2, relu2_2, relu3_3, relu4_3, as Johnson et al.
-LEAST_CROP = 32  # pixels: AlexNet's last map is empty below
+FEATURES = "features"
+LPIPS = "lpips"
+FORMS = (FEATURES, LPIPS)
+PRETRAINED = "pretrained"
+RANDOM = "random"
+SOURCES = (PRETRAINED, RANDOM)
+# relu1_2, relu2_2, relu3_3, relu4_3, as Johnson et al.
+VGG_LAYERS = 4
+# pixels: AlexNet's last map is empty for smaller crops
+LEAST_CROP = 32
 # weight of a pixel off the person, so that a crop exists without a person
 ANYWHERE = 1e-6
 
@@ -68,13 +74,16 @@ class Perceptual(nn.Module):
         one_of(f"{key}.weights", weights, SOURCES)
         one_of(f"{key}.net", net, ("vgg", "alex"))
         one_of(f"{key}.form", form, FORMS)
-        self.crop = None if crop is None else whole(f"{key}.crop", crop, LEAST_CROP)
+        if crop is not None:
+            whole(f"{key}.crop", crop, LEAST_CROP)
+        self.crop = crop
         self.crops = whole(f"{key}.crops", crops, 1)
         self.warmup = warmup
+
+        # The network, its description, and a mark for tables if it is only for tests.
+        self.network: FeatureNetwork | Lpips
         self.mark = None
         self.description = f"{NETWORKS[net].title}, {form}"
-
-        self.network: FeatureNetwork | Lpips
         if weights == RANDOM:
             self.network = FeatureNetwork(_random_stages(width))
             self.mark = "perceptual loss: fixed random network, not VGG-16"
@@ -85,13 +94,13 @@ class Perceptual(nn.Module):
             self.network = pretrained(net, path)
             if net == "vgg":
                 self.network.stages = self.network.stages[:VGG_LAYERS]
-        if self.crop is not None:
-            self.description += (
-                f", {self.crops} of {self.crop}² around the person in each image"
-            )
-        layers = (
-            len(self.network.stages) if isinstance(self.network, FeatureNetwork) else 1
-        )
+        if crop is not None:
+            self.description += f", {crops} of {crop}² around the person in each image"
+
+        # The mean loss of each layer over the first calls; LPIPS is one number.
+        layers = 1
+        if isinstance(self.network, FeatureNetwork):
+            layers = len(self.network.stages)
         self.register_buffer("layer_loss", torch.zeros(layers))
         self.register_buffer("calls", torch.zeros((), dtype=torch.long))
 
@@ -107,19 +116,25 @@ class Perceptual(nn.Module):
                 truth = self.network.features(target)
             return self.network.distance(self.network.features(image), truth).mean()
 
+        # The squared distance of each layer's features.
         with torch.no_grad():
             truth = self.network(target)
-        pairs = zip(self.network(image), truth, strict=True)
-        losses = torch.stack(
-            [functional.mse_loss(ours, theirs) for ours, theirs in pairs]
-        )
-        if self.training:  # without reading `calls`, for which the host would wait
+        losses = []
+        for ours, theirs in zip(self.network(image), truth, strict=True):
+            losses.append(functional.mse_loss(ours, theirs))
+        loss = torch.stack(losses)
+
+        # The running mean of the layers' losses until warm-up ends: m += (loss - m) / calls. The
+        # host does not read `calls`, for which it would wait for the device.
+        if self.training:
             warm = self.calls < self.warmup
             self.calls += warm
-            step = (_over_processes(losses.detach()) - self.layer_loss) / self.calls
+            step = (_over_processes(loss.detach()) - self.layer_loss) / self.calls
             self.layer_loss += torch.where(warm, step, 0.0)
+
+        # Weights are the inverse means, scaled to a sum of 1.
         inverse = 1 / self.layer_loss.clamp_min(1e-12)
-        return (losses * inverse / inverse.sum()).sum()
+        return (loss * inverse / inverse.sum()).sum()
 
 
 def crop_person(
@@ -127,9 +142,9 @@ def crop_person(
 ) -> list[Tensor]:
     """Cuts the same squares around random pixels of the person out of several images.
 
-    Convention: a square that would leave the image is moved inside; an image smaller than the
-    square gives all of its rows or columns; without a person the squares are anywhere. No host
-    waits for the device.
+    A square that would leave the image is moved inside; an image smaller than the square gives all
+    of its rows or columns; without a person the squares are anywhere. The host does not wait for
+    the device.
 
     Args:
         images: each ``[B, C, H, W]``.
@@ -147,16 +162,16 @@ def crop_person(
     # The pixel at which the cumulative mask reaches the random share of its total.
     cumulative = (mask.flatten(1).double() + ANYWHERE).cumsum(dim=1)
     shares = draws.to(cumulative) * cumulative[:, -1:]
-    centre = torch.searchsorted(cumulative, shares, right=True).clamp(
-        max=height * width - 1
-    )
+    centre = torch.searchsorted(cumulative, shares, right=True)
+    centre = centre.clamp(max=height * width - 1)
 
-    # The corner of the square around it, moved inside of the image.
+    # The corner of the square around it, moved inside the image.
     top = (centre // width - rows // 2).clamp(0, height - rows)
     left = (centre % width - columns // 2).clamp(0, width - columns)
-    y = top[..., None] + torch.arange(rows, device=mask.device)
-    x = left[..., None] + torch.arange(columns, device=mask.device)
+    y = top[..., None] + torch.arange(rows, device=mask.device)  # [B, N, rows]
+    x = left[..., None] + torch.arange(columns, device=mask.device)  # [B, N, columns]
 
+    # One gather per image: [B, N, rows, columns, C].
     batch = torch.arange(len(mask), device=mask.device)[:, None, None, None]
     cut = []
     for image in images:
@@ -169,17 +184,22 @@ def _over_processes(value: Tensor) -> Tensor:
     """The mean over the processes of a training."""
     if not (distributed.is_available() and distributed.is_initialized()):
         return value
+
+    # The sum replaces its argument, so a copy is given.
     value = value.clone()
     distributed.all_reduce(value)
     return value / distributed.get_world_size()
 
 
 def _leave_out(module: nn.Module, state: dict[str, Any], prefix: str, _: Any) -> None:
-    for key in [key for key in state if key.startswith(prefix)]:
-        del state[key]
+    """Removes a module's weights from a state dict."""
+    for key in list(state):
+        if key.startswith(prefix):
+            del state[key]
 
 
 def _put_back(module: nn.Module, state: dict[str, Any], prefix: str, *_: Any) -> None:
+    """Adds the network's weights to a state dict that lacks them, as strict loading requires."""
     network = module.get_submodule("network")
     for key, value in [*network.named_parameters(), *network.named_buffers()]:
         state.setdefault(f"{prefix}network.{key}", value.detach())
@@ -189,9 +209,13 @@ def _random_stages(width: int) -> nn.ModuleList:
     """Three small stages with fixed weights, independent of the run's seed."""
     generator = torch.Generator().manual_seed(20250717)
     stages = []
-    channels = [3, width, 2 * width, 4 * width]
-    for i, (inputs, outputs) in enumerate(pairwise(channels)):
-        conv = nn.Conv2d(inputs, outputs, 3, stride=1 if i == 0 else 2, padding=1)
+    stride = 1
+    for inputs, outputs in pairwise([3, width, 2 * width, 4 * width]):
+        # Each stage but the first halves the image.
+        conv = nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1)
+        stride = 2
+
+        # He's initialisation, by a generator of its own.
         with torch.no_grad():
             conv.weight.normal_(0, (2 / (9 * inputs)) ** 0.5, generator=generator)
             conv.bias.zero_()  # type: ignore[union-attr]

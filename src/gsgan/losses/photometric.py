@@ -12,6 +12,7 @@ from gsgan.utils.tensors import full_precision
 
 # pixels, of the Gaussian; shorter sides cannot be reflected
 HALF_WINDOW = 5
+# pixels
 SIGMA = 1.5
 
 
@@ -28,11 +29,16 @@ def d_ssim_map(
 ) -> Tensor:
     """1 - SSIM at every pixel, accurate in float32 for flat and nearly equal images too.
 
-    Convention: computed in float32 at least, autocast has no effect; borders are reflected. SSIM's
-    factors are computed from the difference of the images, ``1 - (μx - μy)² / …`` and
-    ``1 - var(x - y) / …``, with variances about each image's mean. The usual form is equal in exact
-    arithmetic, but its covariance cancels where images are equal or flat, which leaves float32
-    gradients wrong by tens of per cent.
+    Computed in float32 at least, autocast has no effect; borders are reflected. SSIM is luminance
+    times structure, both of which follow from the difference of the images:
+
+        L = 1 - luminance = (μx - μy)² / (μx² + μy² + C1)
+        S = 1 - structure = var(x - y) / (var x + var y + C2)
+        1 - SSIM = L + S - L S
+
+    with means and variances over a Gaussian window. The usual form is equal in exact arithmetic,
+    but its covariance cancels where images are equal or flat, which leaves float32 gradients wrong
+    by tens of per cent.
 
     Args:
         image, target: ``[B, C, H, W]`` in [0, 1], both sides longer than `HALF_WINDOW`.
@@ -47,24 +53,34 @@ def d_ssim_map(
         wide = torch.promote_types(image.dtype, torch.float32)
         image = image.to(wide)
         target = target.to(wide)
+
+        # Both images and their difference d = x - y about their means: squares stay small.
         difference = image - target
         middle = image.detach().mean((-2, -1), keepdim=True)
         shift = difference.detach().mean((-2, -1), keepdim=True)
         x = image - middle
         y = target - (middle - shift)
         d = difference - shift
+
+        # Local means of x, d, x² + y² and d² in one convolution.
         moments = torch.cat([x, d, x.square() + y.square(), d.square()], dim=1)
         kernel = get_gaussian_kernel1d(
             2 * HALF_WINDOW + 1, SIGMA, device=x.device, dtype=wide
         )
-        mean, gap, power, gap_power = filter2d_separable(moments, kernel, kernel).chunk(
-            4, dim=1
-        )
-        variances = power - mean.square() - (mean - gap).square()
-        structure = (gap_power - gap.square()) / (variances + k[1] ** 2)
-        mean = mean + middle
-        gap = gap + shift
-        luminance = gap.square() / (mean.square() + (mean - gap).square() + k[0] ** 2)
+        local = filter2d_separable(moments, kernel, kernel)
+        mean_x, mean_d, power, power_d = local.chunk(4, dim=1)
+
+        # 1 - structure, with var x + var y and var d as mean square less squared mean.
+        c1 = k[0] ** 2
+        c2 = k[1] ** 2
+        variances = power - mean_x.square() - (mean_x - mean_d).square()
+        structure = (power_d - mean_d.square()) / (variances + c2)
+
+        # 1 - luminance, with the means shifted back.
+        mean_x = mean_x + middle
+        mean_d = mean_d + shift
+        mean_y = mean_x - mean_d
+        luminance = mean_d.square() / (mean_x.square() + mean_y.square() + c1)
         return luminance + structure - luminance * structure
 
 
@@ -85,8 +101,12 @@ def photometric(
         unsure: see `without_unsure`.
     """
     target = without_unsure(target, image, unsure)
+
+    # On a CPU, all terms in one pass.
     if _compiled(image, target):
         return _Photometric.apply(image, target, l1, l2, ssim)  # type: ignore[no-any-return]
+
+    # The sum of the terms, without those that have no weight.
     difference = image - target
     loss = difference.new_zeros(())
     if l1:
@@ -111,45 +131,55 @@ def _compiled(image: Tensor, target: Tensor) -> bool:
     )
 
 
+# struct PhotometricJob of splat/kernels/photometric.h
 _Job = build.job_type(
     ("planes", "H", "W", "threads"),
     ("l1", "l2", "ssim"),
     ("image", "target", "d_image", "totals"),
-)  # struct PhotometricJob of splat/kernels/photometric.h
+)
 
 
 class _Photometric(torch.autograd.Function):
-    """`photometric` in one pass: the many small operations take fifteen times as long. The result
-    is bit-identical for any number of threads."""
+    """`photometric` in one pass, fifteen times as fast as its many small operations. The result is
+    bit-identical for any number of threads."""
 
     @staticmethod
     def forward(
         ctx: Any, image: Tensor, target: Tensor, l1: float, l2: float, ssim: float
     ) -> Tensor:
-        held = [image.detach().contiguous(), target.detach().contiguous()]
-        gradient = torch.empty_like(held[0]) if ctx.needs_input_grad[0] else None
-        planes, (height, width) = held[0].shape[:-2].numel(), held[0].shape[-2:]
+        # The kernel reads planes of pixels; it writes each plane's loss and the gradient.
+        image = image.detach().contiguous()
+        target = target.detach().contiguous()
+        gradient = torch.empty_like(image) if ctx.needs_input_grad[0] else None
+        planes = image.shape[:-2].numel()
         totals = torch.empty(planes, dtype=torch.float64)
+
+        height, width = image.shape[-2:]
         job = _Job(planes, height, width, build.threads(), l1, l2, ssim)
         build.point(
-            job, ("image", "target", "d_image", "totals"), [*held, gradient, totals]
+            job,
+            ("image", "target", "d_image", "totals"),
+            [image, target, gradient, totals],
         )
         if build.function("photometric", image.dtype)(ctypes.byref(job)):
             raise MemoryError("photometric: out of memory")
+
+        # Totals are sums over pixels.
         ctx.gradient = gradient
-        return (totals.sum() / held[0].numel()).to(image.dtype)
+        return (totals.sum() / image.numel()).to(image.dtype)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        # The gradient was computed with the loss.
         return ctx.gradient * grad, None, None, None, None
 
 
 def without_unsure(target: Tensor, image: Tensor, unsure: Tensor | None) -> Tensor:
     """The target, with the image itself at pixels that must not contribute to a loss.
 
-    Convention: there a per-pixel loss and its gradient are exactly 0; losses over windows (SSIM,
-    networks) still see the neighbours.
+    A per-pixel loss and its gradient are exactly 0 there; losses over windows (SSIM, networks)
+    still see the neighbours.
 
     Args:
         target, image: ``[B, 3, H, W]``.

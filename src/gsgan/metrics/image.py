@@ -1,6 +1,6 @@
 """Scores of images against the ground truth: PSNR, SSIM, high-frequency energy, edges.
 
-Convention: images ``[B, 3, H, W]``, RGB in [0, 1]; every function returns one score per image,
+Images are ``[B, 3, H, W]``, RGB in [0, 1]; every function returns one score per image,
 ``[B]``, because papers report the mean over images, not the score of pooled errors.
 """
 
@@ -13,13 +13,18 @@ from torch import Tensor
 from torch.nn import functional
 
 from gsgan.losses.photometric import d_ssim_map
+from gsgan.utils.arrays import Bool
 from gsgan.utils.images import to_bytes
 
 Score = Callable[[Tensor, Tensor], Tensor]
+# K1 and K2 of Wang et al. 2004
 SSIM_CONSTANTS = (0.01, 0.03)
-LEAST_SIDE = 6  # pixels: smaller images cannot be reflected by half of SSIM's window
-OUTLINE = 2  # pixels
-UNIFORM_WINDOW = 7  # pixels, scikit-image's default
+# pixels: smaller images cannot be reflected by half of SSIM's window
+LEAST_SIDE = 6
+# pixels on each side of the mask's outline
+OUTLINE = 2
+# pixels, scikit-image's default
+UNIFORM_WINDOW = 7
 
 
 def psnr(image: Tensor, target: Tensor, pooling: str = "image") -> Tensor:
@@ -29,6 +34,7 @@ def psnr(image: Tensor, target: Tensor, pooling: str = "image") -> Tensor:
         image, target: images.
         pooling: "image", one error for all channels; "channels", the mean of their PSNRs.
     """
+    # PSNR is -10 log10 of the mean squared error, for a peak of 1.
     error = (image - target).square().flatten(2).mean(dim=2)
     if pooling == "image":
         error = error.mean(dim=1, keepdim=True)
@@ -39,61 +45,66 @@ def psnr_where(
     image: Tensor, target: Tensor, where: Tensor, pooling: str = "image"
 ) -> Tensor:
     """PSNR of the pixels ``where [B, 1, H, W]`` in dB; NaN without any."""
-    scores = [
-        psnr(a[None, :, m, None], b[None, :, m, None], pooling)[0]
-        for a, b, m in zip(image, target, where[:, 0], strict=True)
-    ]
+    scores = []
+    for own, truth, inside in zip(image, target, where[:, 0], strict=True):
+        # The pixels as an image of one column.
+        own_pixels = own[None, :, inside, None]
+        true_pixels = truth[None, :, inside, None]
+        scores.append(psnr(own_pixels, true_pixels, pooling)[0])
     return torch.stack(scores)
 
 
 def person_box(mask: Tensor) -> Tensor:
     """``[B, 1, H, W]`` bool: the smallest box around the mask's pixels of at least one half."""
     person = mask >= 0.5
-    box = torch.ones_like(person)
-    # rows, columns from the first to the last
+    box = torch.ones_like(person)  # [B, 1, H, W]
     for along, across in ((-1, -2), (-2, -1)):
+        # Rows, then columns: those at or after the first one and at or before the last one.
         held = person.any(dim=along, keepdim=True).long()
-        box &= (held.cumsum(across) > 0) & (
-            held.flip(across).cumsum(across).flip(across) > 0
-        )
+        started = held.cumsum(across) > 0
+        unfinished = held.flip(across).cumsum(across).flip(across) > 0
+        box &= started & unfinished
     return box
 
 
 def flicker(
     image: Tensor, target: Tensor, mask: Tensor, before: tuple[Tensor, Tensor, Tensor]
 ) -> Tensor:
-    """Mean |Δt image - Δt target| from the frame before to this one, in the box round the person
-    in both; NaN where both masks are empty.
+    """Mean |Δt image - Δt target| from the frame before to this one, in the box around the person
+    in both; NaN if both masks are empty.
 
     Args:
         image, target: ``[1, C, H, W]``.
         mask: ``[1, 1, H, W]`` of the person.
         before: the same three of the frame before, seen by the same camera.
     """
-    change = (
-        ((image - before[0]) - (target - before[1])).abs().mean(dim=1, keepdim=True)
-    )
-    return change[person_box(torch.maximum(mask, before[2]))].mean()
+    image_before, target_before, mask_before = before
+    change = (image - image_before) - (target - target_before)
+    change = change.abs().mean(dim=1, keepdim=True)
+    box = person_box(torch.maximum(mask, mask_before))
+    return change[box].mean()
 
 
 def psnr_inside(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
     """PSNR in the person's box without the pixels within `OUTLINE` of the mask's outline, whose
-    error is due to the mask where masks are uneven; NaN where the mask is empty."""
+    error is due to the mask if masks are uneven; NaN if the mask is empty."""
+    # The maximum filter dilates the mask; the minimum filter erodes it.
     person = (mask >= 0.5).to(mask)
     side = 2 * OUTLINE + 1
-    dilated, shrunk = (
-        s * functional.max_pool2d(s * person, side, 1, OUTLINE) for s in (1, -1)
-    )
-    return psnr_where(image, target, person_box(mask) & (dilated == shrunk))
+    dilated = functional.max_pool2d(person, side, 1, OUTLINE)
+    eroded = -functional.max_pool2d(-person, side, 1, OUTLINE)
+    return psnr_where(image, target, person_box(mask) & (dilated == eroded))
 
 
 def ssim_where(image: Tensor, target: Tensor, *regions: Tensor) -> list[Tensor]:
     """SSIM's mean over each region ``[B, 1, H, W]``, with windows that reach beyond it; NaN for an
     empty region."""
-    similar = (1 - d_ssim_map(image, target)).mean(dim=1, keepdim=True)
-    return [
-        (similar * r).flatten(1).sum(dim=1) / r.flatten(1).sum(dim=1) for r in regions
-    ]
+    similar = (1 - d_ssim_map(image, target)).mean(dim=1, keepdim=True)  # [B, 1, H, W]
+    means = []
+    for region in regions:
+        total = (similar * region).flatten(1).sum(dim=1)
+        means.append(total / region.flatten(1).sum(dim=1))
+    return means
 
 
 def ssim(image: Tensor, target: Tensor, *, value_range: float = 1.0) -> Tensor:
@@ -102,13 +113,13 @@ def ssim(image: Tensor, target: Tensor, *, value_range: float = 1.0) -> Tensor:
     The arithmetic differs: in float32 torchmetrics gives two equal grey images 0.9991.
 
     Args:
-        image, target: images; NaN where a side is shorter than `LEAST_SIDE`.
+        image, target: images; the score is NaN if a side is shorter than `LEAST_SIDE`.
         value_range: of the values; 1 is correct for [0, 1].
     """
     if min(image.shape[-2:]) < LEAST_SIDE:
         return image.new_full((len(image),), torch.nan)
-    first, second = SSIM_CONSTANTS
-    k = (first * value_range, second * value_range)
+    k1, k2 = SSIM_CONSTANTS
+    k = (k1 * value_range, k2 * value_range)
     return 1 - d_ssim_map(image, target, k=k).flatten(1).mean(dim=1)
 
 
@@ -117,26 +128,32 @@ def ssim_uniform(image: Tensor, target: Tensor, *, value_range: float = 1.0) -> 
     covariances, no windows across the border.
 
     Args:
-        image, target: images; NaN where a side is shorter than the window.
+        image, target: images; the score is NaN if a side is shorter than the window.
         value_range: of the values; 1 is correct for [0, 1].
     """
     window = UNIFORM_WINDOW
     if min(image.shape[-2:]) < window:
         return image.new_full((len(image),), torch.nan)
+
+    # Means over each window of x, y, x², y² and x y.
     x = image.double()
     y = target.double()
     moments = torch.cat([x, y, x * x, y * y, x * y], dim=1)
-    mean_x, mean_y, xx, yy, xy = functional.avg_pool2d(moments, window, 1).chunk(
-        5, dim=1
-    )
+    local = functional.avg_pool2d(moments, window, 1)
+    mean_x, mean_y, xx, yy, xy = local.chunk(5, dim=1)
+
+    # Sample covariance, and the sum of both sample variances.
     sample = window**2 / (window**2 - 1)
-    both = sample * (xy - mean_x * mean_y)
-    spread = sample * (xx - mean_x.square() + yy - mean_y.square())
-    first, second = ((k * value_range) ** 2 for k in SSIM_CONSTANTS)
-    luminance = (2 * mean_x * mean_y + first) / (
-        mean_x.square() + mean_y.square() + first
-    )
-    similar = luminance * (2 * both + second) / (spread + second)
+    covariance = sample * (xy - mean_x * mean_y)
+    variances = sample * (xx - mean_x.square() + yy - mean_y.square())
+
+    # (2 μx μy + C1) (2 cov + C2) / ((μx² + μy² + C1) (var x + var y + C2))
+    k1, k2 = SSIM_CONSTANTS
+    c1 = (k1 * value_range) ** 2
+    c2 = (k2 * value_range) ** 2
+    power = mean_x.square() + mean_y.square()
+    luminance = (2 * mean_x * mean_y + c1) / (power + c1)
+    similar = luminance * (2 * covariance + c2) / (variances + c2)
     return similar.flatten(1).mean(dim=1).to(image.dtype)
 
 
@@ -148,10 +165,11 @@ def high_frequencies(image: Tensor, target: Tensor, *, above: float = 0.25) -> T
         above: cycles per pixel above which a frequency counts as high (Nyquist is 0.5).
 
     Returns:
-        The ratio; NaN where the ground truth has no such detail.
+        The ratio; NaN if the ground truth has no such detail.
     """
+    # The frequencies of a real spectrum: half of the columns are enough.
     height, width = image.shape[-2:]
-    rows = torch.fft.fftfreq(height, device=image.device)[:, None]
+    rows = torch.fft.fftfreq(height, device=image.device)[:, None]  # cycles per pixel
     columns = torch.fft.rfftfreq(width, device=image.device)[None]
     high = (rows.square() + columns.square()).sqrt() > above
 
@@ -159,13 +177,15 @@ def high_frequencies(image: Tensor, target: Tensor, *, above: float = 0.25) -> T
         spectrum = torch.fft.rfft2(x.double().mean(dim=1))
         return (spectrum.abs().square() * high).sum(dim=(-2, -1))
 
+    # Energy is the sum of squared magnitudes at high frequencies.
     truth = energy(target)
     return torch.where(truth > 0, energy(image) / truth, torch.nan)
 
 
 def edge_f1(image: Tensor, target: Tensor) -> Tensor:
-    """The first of `edge_scores`."""
-    return edge_scores(image, target)[0]
+    """F1 of Canny edges, see `edge_scores`."""
+    f1, _ = edge_scores(image, target)
+    return f1
 
 
 def edge_scores(
@@ -186,28 +206,39 @@ def edge_scores(
         tolerance: pixels an edge may be off.
 
     Returns:
-        Two float64 ``[B]``; NaN where the ground truth has no edge.
+        Two float64 ``[B]``; NaN if the ground truth has no edge.
     """
     scores = []
     kernel = np.ones((2 * tolerance + 1, 2 * tolerance + 1), np.uint8)
-    for i, pair in enumerate(zip(image, target, strict=True)):
-        grey = (cv2.cvtColor(to_bytes(x), cv2.COLOR_RGB2GRAY) for x in pair)
-        edges, truth = (cv2.Canny(x, low, high) > 0 for x in grey)
-        near = [cv2.dilate(x.astype(np.uint8), kernel) > 0 for x in (edges, truth)]
+    for i, (own, true) in enumerate(zip(image, target, strict=True)):
+        edges = _canny(own, low, high)
+        truth = _canny(true, low, high)
+
+        # Pixels within the tolerance of an edge.
+        near_edges = cv2.dilate(edges.astype(np.uint8), kernel) > 0
+        near_truth = cv2.dilate(truth.astype(np.uint8), kernel) > 0
         if where is not None:
             inside = where[i, 0].cpu().numpy()
             edges = edges & inside
             truth = truth & inside
+
         count = edges.sum()
         expected = truth.sum()
         if not expected:
             scores.append((np.nan, np.nan))
             continue
-        precision = (edges & near[1]).sum() / max(count, 1)
-        recall = (truth & near[0]).sum() / expected
+
+        # F1 is the harmonic mean of precision and recall.
+        precision = (edges & near_truth).sum() / max(count, 1)
+        recall = (truth & near_edges).sum() / expected
         total = precision + recall
-        scores.append(
-            (2 * precision * recall / total if total else 0.0, count / expected)
-        )
-    f1, ratio = torch.tensor(scores, dtype=torch.float64).unbind(1)
-    return f1, ratio
+        f1 = 2 * precision * recall / total if total else 0.0
+        scores.append((f1, count / expected))
+    f1s, ratios = torch.tensor(scores, dtype=torch.float64).unbind(1)
+    return f1s, ratios
+
+
+def _canny(image: Tensor, low: float, high: float) -> Bool:
+    """``[H, W]`` the edges of an image ``[3, H, W]``, with Canny's two thresholds."""
+    grey = cv2.cvtColor(to_bytes(image), cv2.COLOR_RGB2GRAY)
+    return cv2.Canny(grey, low, high) > 0

@@ -13,7 +13,8 @@ from gsgan.utils.checks import one_of
 from gsgan.weights.networks import Lpips
 
 LPIPS_NETS = ("vgg", "alex")
-LpipsScores = Callable[[Tensor], dict[str, float]]  # of an image, by metric
+# the scores of an image by metric
+LpipsScores = Callable[[Tensor], dict[str, float]]
 
 
 def build_lpips(nets: Sequence[str], path: str | None = None) -> dict[str, Lpips]:
@@ -29,6 +30,8 @@ def build_lpips(nets: Sequence[str], path: str | None = None) -> dict[str, Lpips
     """
     for net in nets:
         one_of("an entry of lpips.nets", net, LPIPS_NETS)
+
+    # All names are checked before the first download.
     return {net: Lpips(net, path).eval() for net in nets}
 
 
@@ -56,6 +59,7 @@ class LpipsAgainst:
         self.box = None if mask is None else rectangle(person_box(mask)[0])
         self.size = (target.shape[-2], target.shape[-1])
 
+        # The ground truth's features, of the whole image and of the square.
         whole = self._seen(target)
         square = self._square(target)
         self.truth = {}
@@ -80,15 +84,18 @@ class LpipsAgainst:
         for net, network in self.networks.items():
             truth = self.truth[net]
             features = network.features(whole)
+
+            # The score of the region that the protocol asks for.
             if self.measures.lpips_region == "full":
                 scores[f"lpips_{net}"] = float(network.distance(features, truth))
             elif square is None:
                 scores[f"lpips_{net}"] = math.nan
             else:
-                distance = network.distance(
-                    network.features(square), self.square_truth[net]
-                )
+                own = network.features(square)
+                distance = network.distance(own, self.square_truth[net])
                 scores[f"lpips_{net}"] = float(distance)
+
+            # The score in the person's box, from the map of the whole image.
             if self.mask is not None:
                 inside = math.nan
                 if self.box is not None:
@@ -99,19 +106,22 @@ class LpipsAgainst:
         return scores
 
     def _seen(self, image: Tensor) -> Tensor:
-        """The image as the networks get it."""
+        """The image with the protocol's channels and range, as the networks get it."""
         if self.measures.lpips_channels == "bgr":
             image = image.flip(1)
-        unscaled = self.measures.lpips_range == (0.0, 1.0)
-        # the network maps [0, 1] to [-1, 1]
-        return (image + 1) / 2 if unscaled else image
+        # The network maps [0, 1] to [-1, 1]; an unscaled range reverses that.
+        if self.measures.lpips_range == (0.0, 1.0):
+            return (image + 1) / 2
+        return image
 
     def _square(self, image: Tensor) -> Tensor | None:
-        """The crop round the person as the networks get it; None without, or without a person."""
+        """The crop around the person as the networks get it; None if the region is the full image,
+        or there is no person."""
         if self.measures.lpips_region == "full":
             return None
         assert self.mask is not None
-        square = mask_crop(
-            image[0], self.mask[0], BACKGROUNDS[self.measures.background]
-        )
+
+        # The square is filled with the background.
+        background = BACKGROUNDS[self.measures.background]
+        square = mask_crop(image[0], self.mask[0], background)
         return None if square is None else self._seen(square[None])

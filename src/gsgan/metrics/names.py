@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 
 class Metric(NamedTuple):
-    """How a metric is printed.
+    """The printed form of a metric.
 
     Args:
         name: in tables of several methods.
@@ -25,11 +25,12 @@ class Metric(NamedTuple):
 
     @property
     def short_heading(self) -> str:
-        """The same, narrow."""
+        """A narrow column's heading with the direction that is better."""
         return f"{self.short} {self.better}"
 
 
 IMAGE_METRICS = {
+    # name, short name, digits, direction that is better
     "psnr": Metric("PSNR dB", "PSNR", 2, "↑"),
     "psnr_person": Metric("PSNR dB in box", "in box", 2, "↑"),
     "psnr_inside": Metric("PSNR dB in box off the outline", "off the outline", 2, "↑"),
@@ -39,18 +40,22 @@ IMAGE_METRICS = {
     "lpips_vgg_person": Metric("LPIPS-VGG in box", "VGG in box", 4, "↓"),
     "lpips_alex": Metric("LPIPS-Alex", "LPIPS-Alex", 4, "↓"),
     "lpips_alex_person": Metric("LPIPS-Alex in box", "Alex in box", 4, "↓"),
+    # edges and other detail
     "edge_f1": Metric("edge F1", "edge F1", 3, "↑"),
     "edge_f1_person": Metric("edge F1 in box", "edge F1 in box", 3, "↑"),
     "edge_ratio": Metric("edges", "edges", 3, "→1"),
     "edge_ratio_person": Metric("edges in box", "edges in box", 3, "→1"),
     "high_frequencies": Metric("HF energy", "HF energy", 3, "→1"),
     "flicker": Metric("flicker in box", "flicker", 4, "↓"),
+    # hands and mouth
     "psnr_hands": Metric("PSNR dB hands", "hands", 2, "↑"),
     "ssim_hands": Metric("SSIM hands", "SSIM hands", 4, "↑"),
     "psnr_mouth": Metric("PSNR dB mouth", "mouth", 2, "↑"),
     "ssim_mouth": Metric("SSIM mouth", "SSIM mouth", 4, "↑"),
 }
+# in the boxes of hands and mouth
 BOX_METRICS = ("psnr_hands", "ssim_hands", "psnr_mouth", "ssim_mouth")
+# of segmentations
 PART_METRICS = {
     "miou": Metric("mIoU", "mIoU", 4, "↑"),
     "miou_with_background": Metric("mIoU with background", "with background", 4, "↑"),

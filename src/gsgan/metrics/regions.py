@@ -1,7 +1,7 @@
 """Images as they are scored: background, 8 bits, regions, boxes of the body, hands and mouth.
 
-Convention: images ``[B, 3, H, W]`` RGB in [0, 1]; masks ``[B, 1, H, W]``; a background is a grey
-value, 0 for black or 1 for white.
+Images are ``[B, 3, H, W]`` RGB in [0, 1], masks ``[B, 1, H, W]``; a background is a grey value, 0
+for black or 1 for white.
 """
 
 from __future__ import annotations
@@ -23,8 +23,11 @@ from gsgan.utils.arrays import Bool, Float
 from gsgan.utils.tensors import constant
 
 BACKGROUNDS = {"black": 0.0, "white": 1.0}
-CUT_SLACK = 1e-3  # of 1/255: values that are 8-bit already must not drop by one
-NEAR = 1e-2  # metres; nearer parts of the body's box are cut off
+# of 1/255: values that are 8-bit already must not drop by one
+CUT_SLACK = 1e-3
+# metres; nearer parts of the body's box are cut off
+NEAR = 1e-2
+# of a box's corners
 PAIRS = torch.combinations(torch.arange(8))
 HANDS = "hands"
 MOUTH = "mouth"
@@ -33,7 +36,8 @@ HAND_MARGIN = 0.15
 LIP_MARGIN = 0.25
 # of the mouth's box without lip landmarks, relative to the mouth's width
 MOUTH_SIDE = 1.5
-LEAST_BOX = 11  # pixels: SSIM's window
+# pixels: SSIM's window
+LEAST_BOX = 11
 
 
 def on_background(image: Tensor, alpha: Tensor, background: float) -> Tensor:
@@ -42,11 +46,9 @@ def on_background(image: Tensor, alpha: Tensor, background: float) -> Tensor:
 
 
 def hard_outline(image: Tensor, mask: Tensor) -> Tensor:
-    """Divides an image on black by its mask where that is at least one half; black elsewhere."""
-    inside = mask >= 0.5
-    return torch.where(
-        inside, (image / mask.clamp_min(0.5)).clamp(0, 1), torch.zeros_like(image)
-    )
+    """An image on black divided by its mask where that is at least one half; black elsewhere."""
+    straight = (image / mask.clamp_min(0.5)).clamp(0, 1)
+    return torch.where(mask >= 0.5, straight, torch.zeros_like(image))
 
 
 def eight_bits(image: Tensor, how: Literal["none", "rounded", "cut"]) -> Tensor:
@@ -54,11 +56,12 @@ def eight_bits(image: Tensor, how: Literal["none", "rounded", "cut"]) -> Tensor:
     if how == "none":
         return image
     steps = image.clamp(0, 1) * 255
-    return (steps.round() if how == "rounded" else (steps + CUT_SLACK).floor()) / 255
+    whole = steps.round() if how == "rounded" else (steps + CUT_SLACK).floor()
+    return whole / 255
 
 
 def cleared(image: Tensor, keep: Tensor, background: float) -> Tensor:
-    """The background wherever ``keep`` is false."""
+    """An image with the background at pixels where ``keep`` is false."""
     return torch.where(keep, image, image.new_tensor(background))
 
 
@@ -71,14 +74,19 @@ def rectangle(where: Tensor, least: int = 1) -> tuple[slice, slice] | None:
     """
     sides = []
     for dim, size in enumerate(where.shape[-2:]):
+        # The first and the last row, or column, that holds a pixel.
         held = where[0].any(dim=1 - dim).nonzero().flatten().tolist()
         if not held:
             return None
-        extent = held[-1] + 1 - held[0]
+        first = held[0]
+        extent = held[-1] + 1 - first
+
+        # Extended equally to both sides, but not beyond the image.
         side = min(max(extent, least), size)
-        start = min(max(held[0] - (side - extent) // 2, 0), size - side)
+        start = min(max(first - (side - extent) // 2, 0), size - side)
         sides.append(slice(start, start + side))
-    return sides[0], sides[1]
+    rows, columns = sides
+    return rows, columns
 
 
 def mask_crop(
@@ -86,8 +94,8 @@ def mask_crop(
 ) -> Tensor | None:
     """The mask's box and a margin, centred in a square of the background, resized.
 
-    Convention: as in the script, the box ends one pixel early at the bottom and right, and resizing
-    is bilinear without antialiasing.
+    As in the script, the box ends one pixel early at the bottom and right, and resizing is bilinear
+    without antialiasing.
 
     Args:
         image: ``[3, H, W]``.
@@ -101,14 +109,21 @@ def mask_crop(
     box = rectangle(person_box(mask[None])[0])
     if box is None:
         return None
-    rows, columns = (slice(max(s.start - margin, 0), s.stop - 1 + margin) for s in box)
-    part = image[:, rows, columns]
+
+    # The box and its margin; a slice ends at the image's border by itself.
+    rows, columns = box
+    top = max(rows.start - margin, 0)
+    left = max(columns.start - margin, 0)
+    part = image[:, top : rows.stop - 1 + margin, left : columns.stop - 1 + margin]
+
+    # The square around it.
     height, width = part.shape[-2:]
     side = max(height, width)
-    top = (side - height) // 2
-    left = (side - width) // 2
-    border = (left, side - width - left, top, side - height - top)
+    above = (side - height) // 2
+    before = (side - width) // 2
+    border = (before, side - width - before, above, side - height - above)
     square = functional.pad(part, border, value=background)[None]
+
     if side != size:
         square = functional.interpolate(
             square, (size, size), mode="bilinear", align_corners=False
@@ -123,7 +138,8 @@ def box_corners(points: Tensor, margin: float) -> Tensor:
     """``[8, 3]`` corners of the box around points ``[M, 3]``, metres, world axes."""
     low = points.amin(0) - margin
     high = points.amax(0) + margin
-    choice = torch.cartesian_prod(*[torch.arange(2, device=points.device)] * 3)
+    ends = torch.arange(2, device=points.device)
+    choice = torch.cartesian_prod(ends, ends, ends)  # [8, 3]
     return torch.where(choice == 1, high, low)
 
 
@@ -138,33 +154,49 @@ def box_mask(corners: Tensor, camera: Camera) -> Tensor:
         camera: a single camera.
 
     Returns:
-        ``[1, H, W]`` bool; all false when the box is behind the camera.
+        ``[1, H, W]`` bool; all false if the box is behind the camera.
     """
     seen = in_front(camera.to_camera(corners.to(camera.K)[None])[0].double())
     if len(seen) == 0:
         return torch.zeros(1, *camera.size, dtype=torch.bool, device=corners.device)
-    pixels = (seen / seen[:, 2:]) @ camera.K[0].double().T
-    hull = cv2.convexHull(pixels[:, :2].float().cpu().numpy())[:, 0].astype(np.float64)
-    shown = np.stack(
-        np.meshgrid(*(np.arange(n) + 0.5 for n in camera.size[::-1])), axis=-1
-    )
+
+    # The outline of the box, without the lens.
+    K = camera.K[0].double()
+    pixels = (seen / seen[:, 2:]) @ K.T
+    hull = cv2.convexHull(pixels[:, :2].float().cpu().numpy())[:, 0]  # [n, 2]
+
+    # The centre of each pixel, moved to where a pinhole shows it.
+    height, width = camera.size
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    shown = np.stack([u, v], axis=-1)  # [H, W, 2]
     if camera.dist is not None:
-        K = camera.K[0].double().cpu().numpy()
-        rays = (shown - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T
-        straight = undistort(rays.reshape(-1, 2), camera.dist[0].double().cpu().numpy())
-        shown = (straight @ K[:2, :2].T + K[:2, 2]).reshape(shown.shape)
-    return torch.from_numpy(inside_hull(hull, shown))[None].to(corners.device)
+        focal = K[:2, :2].cpu().numpy()
+        centre = K[:2, 2].cpu().numpy()
+        rays = (shown - centre) @ np.linalg.inv(focal).T
+        dist = camera.dist[0].double().cpu().numpy()
+        straight = undistort(rays.reshape(-1, 2), dist)
+        shown = (straight @ focal.T + centre).reshape(shown.shape)
+
+    inside = inside_hull(hull.astype(np.float64), shown)
+    return torch.from_numpy(inside)[None].to(corners.device)
 
 
 def in_front(x_cam: Tensor) -> Tensor:
-    """``[M, 3]`` points whose hull is the box with corners ``[8, 3]`` clipped at the near plane."""
+    """``[M, 3]`` points whose hull is the box with corners ``[8, 3]`` clipped at the near plane.
+
+    Clipping keeps the corners beyond the plane, and adds the points in which lines between two
+    corners cross it. Lines inside the box do no harm.
+    """
     a = x_cam[PAIRS[:, 0]]
     b = x_cam[PAIRS[:, 1]]
     crosses = (a[:, 2] > NEAR) != (b[:, 2] > NEAR)
     a = a[crosses]
     b = b[crosses]
+
+    # a + share (b - a) has the depth NEAR.
     share = (NEAR - a[:, 2:]) / (b[:, 2:] - a[:, 2:])
-    return torch.cat([x_cam[x_cam[:, 2] > NEAR], a + share * (b - a)])
+    beyond = x_cam[x_cam[:, 2] > NEAR]
+    return torch.cat([beyond, a + share * (b - a)])
 
 
 def inside_hull(hull: Float, points: Float) -> Bool:
@@ -172,8 +204,12 @@ def inside_hull(hull: Float, points: Float) -> Bool:
     if len(hull) < 3:
         return np.zeros(points.shape[:-1], np.bool_)
     x, y = np.moveaxis(points, -1, 0)
-    ends = zip(hull, np.roll(hull, -1, axis=0), strict=True)
-    sides = [(b - a)[0] * (y - a[1]) - (b - a)[1] * (x - a[0]) for a, b in ends]
+
+    # The cross product of each edge with the vector to the point: all have one sign inside.
+    sides = []
+    for a, b in zip(hull, np.roll(hull, -1, axis=0), strict=True):
+        edge = b - a
+        sides.append(edge[0] * (y - a[1]) - edge[1] * (x - a[0]))
     side = np.stack(sides)
     return np.asarray((side >= 0).all(0) | (side <= 0).all(0))
 
@@ -184,10 +220,10 @@ def inside_hull(hull: Float, points: Float) -> Bool:
 def hands_and_mouth(frame: Frame, template: SkeletonTemplate) -> dict[str, Tensor]:
     """The pixels in the boxes of both hands, `HANDS`, and of the mouth, `MOUTH`.
 
-    Convention: a box surrounds the projected landmarks with a margin, at least `LEAST_BOX` pixels
-    wide and high, and clipped to the image. Landmarks of visibility 0 or behind the camera do not
-    count. A hand or mouth without a landmark in the image has no box, nor has the mouth of a head
-    that faces away from the camera; a hand hidden by the body has one.
+    A box surrounds the projected landmarks with a margin, is at least `LEAST_BOX` pixels wide and
+    high, and clipped to the image. Landmarks of visibility 0 or behind the camera do not count. A
+    hand or mouth without a landmark in the image has no box, nor has the mouth of a head that faces
+    away from the camera; a hand hidden by the body has one.
 
     Args:
         frame: B items, of which the images are not read.
@@ -198,31 +234,42 @@ def hands_and_mouth(frame: Frame, template: SkeletonTemplate) -> dict[str, Tenso
     """
     if not template.palms:
         return {}
-    pixels, depth = frame.camera.project(frame.skeleton, NEAR)
+    camera = frame.camera
+    pixels, depth = camera.project(frame.skeleton, NEAR)
     seen = (frame.visibility > 0) & (depth > NEAR)
-    size = frame.camera.size
-    hands = [slice(wrist, wrist + HAND) for wrist, *_ in template.palms]
-    boxes = [landmark_box(pixels[:, h], seen[:, h], size, HAND_MARGIN) for h in hands]
+
+    # Each hand's landmarks follow its wrist.
+    hands = []
+    for wrist, *_ in template.palms:
+        own = slice(wrist, wrist + HAND)
+        hands.append(
+            landmark_box(pixels[:, own], seen[:, own], camera.size, HAND_MARGIN)
+        )
+
+    # The mouth, of the lips if there are any, else a square.
     corners = [template.names.index(f"mouth_{side}") for side in ("left", "right")]
     lips = lip_landmarks(template)
-    distance = frame.camera.to_camera(frame.skeleton).norm(dim=-1)
-    ahead = distance[:, corners].mean(dim=1) < distance[:, list(template.ears)].mean(
-        dim=1
-    )
     if lips:
-        mouth = landmark_box(pixels[:, lips], seen[:, lips], size, LIP_MARGIN)
+        mouth = landmark_box(pixels[:, lips], seen[:, lips], camera.size, LIP_MARGIN)
     else:
-        around = mouth_square(frame.skeleton[:, corners], frame.camera)
+        around = mouth_square(frame.skeleton[:, corners], camera)
         known = seen[:, corners].all(dim=1, keepdim=True).expand(-1, around.shape[1])
-        mouth = landmark_box(around, known, size, 0.0)
+        mouth = landmark_box(around, known, camera.size, 0.0)
+
+    # A face turned to the camera has its mouth nearer than its ears.
+    distance = camera.to_camera(frame.skeleton).norm(dim=-1)
+    mouth_distance = distance[:, corners].mean(dim=1)
+    ear_distance = distance[:, list(template.ears)].mean(dim=1)
+    ahead = mouth_distance < ear_distance
     return {
-        HANDS: torch.stack(boxes).any(dim=0),
+        HANDS: torch.stack(hands).any(dim=0),
         MOUTH: mouth & ahead[:, None, None, None],
     }
 
 
 def describe_boxes(skeleton: str) -> str | None:
-    """What the boxes of a named skeleton contain, for notes; None for one without hands."""
+    """The contents of a named skeleton's boxes in words, for notes; None without hands."""
+    # The same rules as in `hands_and_mouth`.
     template = TEMPLATES[skeleton]
     if not template.palms:
         return None
@@ -236,10 +283,9 @@ def describe_boxes(skeleton: str) -> str | None:
 
 
 def lip_landmarks(template: SkeletonTemplate) -> list[int]:
-    """The joints around the lips; none where the skeleton has no face landmarks."""
-    return [
-        i for i, name in enumerate(template.names) if name.startswith("mouth_outer")
-    ]
+    """The joints around the lips; none if the skeleton has no face landmarks."""
+    names = enumerate(template.names)
+    return [i for i, name in names if name.startswith("mouth_outer")]
 
 
 def mouth_square(corners: Tensor, camera: Camera) -> Tensor:
@@ -249,9 +295,14 @@ def mouth_square(corners: Tensor, camera: Camera) -> Tensor:
     direction of the head.
     """
     left, right = corners.unbind(1)
-    half = MOUTH_SIDE / 2 * (left - right).norm(dim=-1)[:, None, None] * camera.R[:, :2]
+    width = (left - right).norm(dim=-1)[:, None, None]
+
+    # Half of the sides along the image's axes, in the world.
+    half = MOUTH_SIDE / 2 * width * camera.R[:, :2]
     middle = corners.mean(dim=1, keepdim=True)
-    return camera.project(torch.cat([middle - half, middle + half], dim=1), NEAR)[0]
+    ends = torch.cat([middle - half, middle + half], dim=1)
+    pixels, _ = camera.project(ends, NEAR)
+    return pixels
 
 
 def landmark_box(
@@ -268,21 +319,23 @@ def landmark_box(
     Returns:
         ``[B, 1, H, W]`` bool; all false without a landmark in the image.
     """
-    inside = ((pixels >= 0) & (pixels < constant((size[1], size[0]), pixels))).all(
-        dim=-1
-    )
+    height, width = size
+    limit = constant((width, height), pixels)
+    inside = ((pixels >= 0) & (pixels < limit)).all(dim=-1)
+    shown = (seen & inside).any(dim=1)
+
+    # The box around the landmarks that were seen, then its margin.
     low = torch.where(seen.unsqueeze(-1), pixels, torch.inf).amin(dim=1)
     high = torch.where(seen.unsqueeze(-1), pixels, -torch.inf).amax(dim=1)
     extent = high - low
     middle = (low + high) / 2
     half = extent / 2 + margin * extent.amax(dim=1, keepdim=True)
     half = half.clamp_min(LEAST_BOX / 2)
-    across, along = (
-        (torch.arange(n, device=pixels.device) + 0.5 - middle[:, i, None]).abs()
-        <= half[:, i, None]
-        for i, n in enumerate(reversed(size))
-    )
-    shown = (seen & inside).any(dim=1)
-    return (
-        along.unsqueeze(-1) & across.unsqueeze(-2) & shown[:, None, None]
-    ).unsqueeze(1)
+
+    # Columns and rows whose centres lie in it.
+    x = torch.arange(width, device=pixels.device) + 0.5
+    y = torch.arange(height, device=pixels.device) + 0.5
+    columns = (x - middle[:, 0, None]).abs() <= half[:, 0, None]
+    rows = (y - middle[:, 1, None]).abs() <= half[:, 1, None]
+    box = rows.unsqueeze(-1) & columns.unsqueeze(-2) & shown[:, None, None]
+    return box.unsqueeze(1)

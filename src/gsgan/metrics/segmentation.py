@@ -27,13 +27,16 @@ PALETTE = torch.tensor(
 
 
 def confusion(segmentation: Tensor, labels: Tensor) -> Tensor:
-    """``[classes, classes]`` pixels of S ``[B, classes, H, W]``, rows by labels ``[B, H, W]``."""
-    return multiclass_confusion_matrix(
+    """``[classes, classes]`` number of pixels by label ``[B, H, W]`` (rows) and by the class that S
+    ``[B, classes, H, W]`` predicts (columns)."""
+    classes = segmentation.shape[1]
+    matrix = multiclass_confusion_matrix(
         segmentation.argmax(dim=1),
         labels,
-        segmentation.shape[1],
+        classes,
         ignore_index=IGNORE_LABEL,
-    ).cpu()
+    )
+    return matrix.cpu()
 
 
 def miou(matrix: Tensor) -> dict[str, float | None]:
@@ -42,20 +45,28 @@ def miou(matrix: Tensor) -> dict[str, float | None]:
     Args:
         matrix: from `confusion`; background is class 0.
     """
+    # Intersection over union of each class that the ground truth has.
     matrix = matrix.double()
     truth = matrix.sum(1)
-    union = matrix.sum(0) + matrix.sum(1) - matrix.diag()
+    intersection = matrix.diag()
+    union = matrix.sum(0) + truth - intersection
     present = truth > 0
-    iou = torch.where(present, matrix.diag() / union.clamp_min(1), torch.nan)
+    iou = torch.where(present, intersection / union.clamp_min(1), torch.nan)
+
+    # Means without and with the background.
+    parts = iou[1:][present[1:]]
+    classes = iou[present]
     return {
-        "miou": float(iou[1:][present[1:]].mean()) if present[1:].any() else None,
-        "miou_with_background": float(iou[present].mean()) if present.any() else None,
+        "miou": float(parts.mean()) if len(parts) else None,
+        "miou_with_background": float(classes.mean()) if len(classes) else None,
     }
 
 
 def colour_labels(labels: Tensor) -> Tensor:
     """``[B, H, W]`` part labels as images ``[B, 3, H, W]``; unscored pixels are white."""
-    index = torch.where(labels == 0, 0, 1 + (labels - 1) % (len(PALETTE) - 1))
+    # Classes beyond the palette repeat its colours, but not the background's.
+    parts = len(PALETTE) - 1
+    index = torch.where(labels == 0, 0, 1 + (labels - 1) % parts)
     image = PALETTE.to(labels.device)[index].float() / 255
-    image = torch.where((labels == IGNORE_LABEL).unsqueeze(-1), 1.0, image)
-    return image.permute(0, 3, 1, 2)
+    unscored = (labels == IGNORE_LABEL).unsqueeze(-1)
+    return torch.where(unscored, 1.0, image).permute(0, 3, 1, 2)

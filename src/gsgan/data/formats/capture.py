@@ -57,7 +57,9 @@ HANDS_FILE = "hands3d.npz"
 FACE_FILE = "face3d.npz"
 POSES = "body_pose.npz"
 SHAPE = "body_shape.npz"
+# endings of masks and labels
 MASKS = (".png",)
+# by kind of body
 BODY_BONES = {"free": 56, "smpl": 24, "smplx": 55}
 SKELETON_LIMITS = Consistency(least_inside=0.2)
 """A capture's own landmarks are noisier than those of a fitted body."""
@@ -87,9 +89,9 @@ class CaptureReader:
         Raises:
             DataError: for whatever is missing, damaged or contradictory, naming the file.
         """
-        found = _find(
-            dataset_folder(root, "cameras.json, images/ and masks/"), limits, smpl, self
-        )
+        # The folder, its files, then the checks that all formats share.
+        folder = dataset_folder(root, "cameras.json, images/ and masks/")
+        found = _find(folder, limits, smpl, self)
         hint = "check that cameras, landmarks and masks belong together"
         return finish(found, limits, self.consistency, hint, self.drop_frames)
 
@@ -108,7 +110,10 @@ def read_capture(
 def _find(
     root: Path, limits: Thresholds, smpl: str | None, reader: CaptureReader
 ) -> Found:
+    """The files of a capture, each checked separately."""
     notes: list[str] = []
+
+    # Facts and cameras. The unit and the pixel centre of meta.json apply to all files.
     cameras_json = read_json(root / "cameras.json")
     meta_path = root / "meta.json"
     meta_json = read_json(meta_path)
@@ -117,7 +122,13 @@ def _find(
     if conventions.scale != 1.0:
         notes.append(f"lengths converted from {meta.unit} to metres")
     cameras = read_cameras(root / "cameras.json", cameras_json, conventions)
+
+    # Images, masks and labels.
     images = _index_images(root, cameras)
+    masks = {name: frame_files(root, f"masks/{name}", MASKS) for name in cameras}
+    labels = {name: frame_files(root, f"labels/{name}", MASKS) for name in cameras}
+
+    # Landmarks; hands and face are optional.
     joints = SKELETONS[meta.skeleton]
     skeletons = _read_landmarks(root / LANDMARKS, joints, conventions, limits, notes)
     hands = None
@@ -127,19 +138,20 @@ def _find(
     if (root / FACE_FILE).exists():
         face = _read_landmarks(root / FACE_FILE, FACE, conventions, limits, notes)
         _refuse_other_names(root / FACE_FILE)
+
+    # Body poses, which may also name the body.
     poses = None
     if (root / POSES).exists():
         poses, meta = _read_poses(root, meta, conventions)
+
     return Found(
         root=root,
         meta=meta,
         cameras=cameras,
         images=images,
-        masks=one_mask_each(
-            {c: frame_files(root, f"masks/{c}", MASKS) for c in cameras}, "grey"
-        ),
+        masks=one_mask_each(masks, "grey"),
         mask_folder="masks/{camera}",
-        labels={c: frame_files(root, f"labels/{c}", MASKS) for c in cameras},
+        labels=labels,
         landmarks=skeletons,
         hands=hands,
         face=face,
@@ -157,11 +169,11 @@ def _find(
 
 def _read_meta(path: Path, content: Mapping[str, Any], smpl: str | None) -> Meta:
     """Facts about the capture from the content of meta.json, where only ``unit`` is required."""
+    # Optional facts, each checked before it is used.
     fps = content.get("fps")
-    names = content.get("label_names")
-    body = content.get("body")
     if fps is not None and not (is_number(fps) and fps > 0):
         raise DataError(f"{path}: 'fps' is {fps!r}; expected a number above 0")
+    names = content.get("label_names")
     if names is not None and not (isinstance(names, list) and len(names) > 1):
         raise DataError(
             f"{path}: 'label_names' must list the background and every part by name"
@@ -171,18 +183,20 @@ def _read_meta(path: Path, content: Mapping[str, Any], smpl: str | None) -> Meta
         raise DataError(
             f"{path}: 'splits' must be an object with train_cameras, test_frames, ..."
         )
-    if body is not None:
-        choose(path, content, "body", None, tuple(BODY_BONES))
+
+    # Only SMPL and SMPL-X need the user's model file.
+    body = None
+    if content.get("body") is not None:
+        kind = choose(path, content, "body", None, tuple(BODY_BONES))
+        body = BodyModel(kind, smpl if kind != "free" else None)
+
+    axes = ("x", "y", "z", "-x", "-y", "-z")
     return Meta(
         unit=choose(path, content, "unit", None, tuple(METRES)),
         fps=None if fps is None else float(fps),
-        up_axis=choose(
-            path, content, "up_axis", "z", ("x", "y", "z", "-x", "-y", "-z")
-        ),
+        up_axis=choose(path, content, "up_axis", "z", axes),
         skeleton=choose(path, content, "skeleton", "mediapipe33", tuple(SKELETONS)),
-        body=None
-        if body is None
-        else BodyModel(body, smpl if body != "free" else None),
+        body=body,
         label_names=None if names is None else tuple(map(str, names)),
         splits=splits,
     )
@@ -191,29 +205,40 @@ def _read_meta(path: Path, content: Mapping[str, Any], smpl: str | None) -> Meta
 def _index_images(
     root: Path, cameras: Mapping[str, CameraEntry]
 ) -> dict[str, FrameFiles]:
+    """The images of each camera by frame; folders and cameras must be the same."""
     folder = root / "images"
     if not folder.is_dir():
         raise DataError(
             f"{folder} does not exist; expected images/<camera>/000000.jpg and so on"
         )
-    found = {
-        p.name for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".")
-    }
-    if unknown := sorted(found - set(cameras)):
+
+    # Hidden folders, such as those that file managers make, do not count.
+    found = set()
+    for path in folder.iterdir():
+        if path.is_dir() and not path.name.startswith("."):
+            found.add(path.name)
+
+    unknown = sorted(found - set(cameras))
+
+    # A folder and a camera without each other are most likely misspelt.
+    if unknown:
         raise DataError(
             f"{folder} has the camera {unknown[0]}, which {root / 'cameras.json'} does not list; "
             f"it lists {', '.join(cameras)}"
         )
-    if missing := [name for name in cameras if name not in found]:
-        raise DataError(
-            f"{root / 'cameras.json'} lists the camera {missing[0]}, but {folder / missing[0]} "
-            f"does not exist; there are {', '.join(sorted(found)) or 'none'}"
-        )
+    for name in cameras:
+        if name not in found:
+            raise DataError(
+                f"{root / 'cameras.json'} lists the camera {name}, but {folder / name} "
+                f"does not exist; there are {', '.join(sorted(found)) or 'none'}"
+            )
+
     images = {name: frame_files(root, f"images/{name}", IMAGES) for name in cameras}
-    if empty := [name for name, files in images.items() if not files]:
-        raise DataError(
-            f"{folder / empty[0]} holds no frames; expected .jpg or .png images"
-        )
+    for name, files in images.items():
+        if not files:
+            raise DataError(
+                f"{folder / name} holds no frames; expected .jpg or .png images"
+            )
     return images
 
 
@@ -226,9 +251,13 @@ def _read_landmarks(
 ) -> Landmarks:
     """Skeletons, hands or faces of every frame."""
     arrays = read_arrays(path, ("p", "conf", "frame_id"))
+
+    # Positions in metres; exact zeros are missing joints.
     p = expect_array(arrays, "p", (None, joints, 3), path).astype(np.float64)
     p = zeros_as_missing(p) * conventions.scale
     ids = whole_frame_ids(expect_array(arrays, "frame_id", (len(p),), path), str(path))
+
+    # Without confidences, every joint counts fully.
     conf = np.ones(p.shape[:2])
     if "conf" in arrays:
         conf = expect_array(arrays, "conf", p.shape[:2], path).astype(np.float64)
@@ -236,7 +265,8 @@ def _read_landmarks(
 
 
 def _refuse_other_names(path: Path) -> None:
-    """Detectors have hundreds of a face's landmarks: 30 others would be taken for these."""
+    """Refuses other landmarks of a face: of the hundreds that detectors have, 30 are used."""
+    # A file without names is taken to have these landmarks.
     names = read_arrays(path, ("names",)).get("names")
     if names is not None and tuple(map(str, names.tolist())) != FACE_NAMES:
         raise DataError(
@@ -246,55 +276,62 @@ def _refuse_other_names(path: Path) -> None:
 
 
 def _read_poses(root: Path, meta: Meta, conventions: Conventions) -> tuple[Poses, Meta]:
-    """Poses of frames whose numbers are finite, and ``meta`` with the body and its shape."""
+    """The poses of frames in which all numbers are finite, and ``meta`` with the body and its
+    shape."""
     path = root / POSES
-    fitted = (root / SHAPE).exists()
     names = ("theta", "transl", "frame_id", "betas", "registered", "fitted_to")
     arrays = read_arrays(path, (*names, "theta_hands", "transl_hands"))
-    if fitted:  # by gsgan.fit: the free body in the person's shape
+
+    # A shape file comes from gsgan.fit: then the body is the free one in the person's shape.
+    fitted = (root / SHAPE).exists()
+    if fitted:
         meta = replace(meta, body=BodyModel("free", betas=read_shape(root / SHAPE)))
     bones = None if meta.body is None else BODY_BONES[meta.body.kind]
+
+    # Frames, those that were registered to masks, and the cameras of those masks.
     ids = whole_frame_ids(expect_array(arrays, "frame_id", (None,), path), str(path))
     registered: frozenset[int] = frozenset()
     if "registered" in arrays:
         found = expect_array(arrays, "registered", (None,), path)
         registered = frozenset(whole_frame_ids(found, str(path)).tolist())
+    fitted_to = tuple(map(str, arrays.get("fitted_to", ())))
 
-    parts = [("theta", "transl")]
-    if "theta_hands" in arrays:
-        parts.append(("theta_hands", "transl_hands"))
-    values = [
-        tuple(
-            expect_array(arrays, name, shape, path).astype(np.float64)
-            for name, shape in zip(
-                pair, ((len(ids), bones, 3), (len(ids), 3)), strict=True
+    # The poses, and those that follow the hands too.
+    suffixes = ["", "_hands"] if "theta_hands" in arrays else [""]
+    rotations = []
+    moves = []
+    for suffix in suffixes:
+        theta = expect_array(arrays, f"theta{suffix}", (len(ids), bones, 3), path)
+        rotations.append(theta.astype(np.float64))
+        transl = expect_array(arrays, f"transl{suffix}", (len(ids), 3), path)
+        moves.append(transl.astype(np.float64))
+
+    # Only frames in which all of them are finite.
+    values = np.concatenate([*rotations, *(move[:, None] for move in moves)], axis=1)
+    rows = np.flatnonzero(np.isfinite(values).all((1, 2)))
+    frames = ids[rows].tolist()
+    poses = []
+    for theta, transl in zip(rotations, moves, strict=True):
+        poses.append(
+            Poses(
+                theta=dict(zip(frames, theta[rows], strict=True)),
+                transl=dict(zip(frames, conventions.scale * transl[rows], strict=True)),
+                fitted=fitted,
+                registered=registered,
+                fitted_to=fitted_to,
             )
         )
-        for pair in parts
-    ]
-    finite = np.all(
-        [np.isfinite(x).reshape(len(ids), -1).all(1) for pair in values for x in pair],
-        axis=0,
-    )
-    rows = {int(ids[i]): int(i) for i in np.flatnonzero(finite)}
-    poses, *with_hands = (
-        Poses(
-            {f: turns[i] for f, i in rows.items()},
-            {f: conventions.scale * moves[i] for f, i in rows.items()},
-            fitted=fitted,
-            registered=registered,
-            fitted_to=tuple(map(str, arrays.get("fitted_to", ()))),
-        )
-        for turns, moves in values
-    )
-    if with_hands:
-        poses = replace(poses, with_hands=with_hands[0])
+    own = poses[0]
+    if len(poses) > 1:
+        own = replace(own, with_hands=poses[1])
+
+    # The shape of an SMPL body.
     if meta.body is None or "betas" not in arrays:
-        return poses, meta
+        return own, meta
     betas = expect_array(arrays, "betas", (None,), path).astype(np.float64)
     if not np.isfinite(betas).all():
         raise DataError(f"{path}: 'betas' must hold finite numbers")
-    return poses, replace(meta, body=replace(meta.body, betas=tuple(betas.tolist())))
+    return own, replace(meta, body=replace(meta.body, betas=tuple(betas.tolist())))
 
 
 def read_shape(path: Path) -> tuple[float, ...]:
@@ -303,17 +340,19 @@ def read_shape(path: Path) -> tuple[float, ...]:
     Raises:
         DataError: when the file is damaged or lacks an array.
     """
-    K = free_space().coefficients
-    names = {
-        "coefficients": (K,),
+    shapes: dict[str, tuple[int, ...]] = {
+        "coefficients": (free_space().coefficients,),
         "stretch": (len(STRETCHED),),
         "offsets": LANDMARKS_SHAPE,
     }
-    arrays = read_arrays(path, (*names, "hands", "spine"))
-    for name, size in (("hands", HANDS_SHAPE), ("spine", (1,))):
+    optional = {"hands": HANDS_SHAPE, "spine": (1,)}
+    arrays = read_arrays(path, (*shapes, *optional))
+    for name, shape in optional.items():
         if name in arrays:
-            names[name] = size
-    parts = [
-        expect_array(arrays, name, shape, path).ravel() for name, shape in names.items()
-    ]
+            shapes[name] = shape
+
+    # One after another, in the order of `BodyShape.flat`.
+    parts = []
+    for name, shape in shapes.items():
+        parts.append(expect_array(arrays, name, shape, path).ravel())
     return tuple(np.concatenate(parts).astype(np.float64).tolist())

@@ -20,6 +20,7 @@ from gsgan.skeleton.smpl_landmarks import TABLES
 from gsgan.utils.errors import ConfigError, DataError
 
 IMAGES = (".jpg", ".jpeg", ".png")
+# by kind: name, and an example of a model's file
 MODELS = {
     "smpl": ("SMPL", "SMPL_NEUTRAL.pkl"),
     "smplx": ("SMPL-X", "SMPLX_NEUTRAL.npz"),
@@ -42,7 +43,7 @@ class FolderReader:
     contents: ClassVar[str]
     """The folder's content, for messages."""
     hint: ClassVar[str]
-    """What to check when body and masks do not agree."""
+    """Advice for a message when body and masks do not agree."""
 
     def __call__(
         self, root: str | Path, limits: Thresholds, smpl: str | None = None
@@ -58,6 +59,7 @@ class FolderReader:
             DataError: for whatever is missing, damaged or contradictory, naming the file.
         """
         folder = dataset_folder(root, self.contents)
+        # The images of a release are alike, so fewer headers are read.
         limits = replace(
             limits,
             distance=(self.distance[0], self.distance[1]),
@@ -88,7 +90,7 @@ def finish(
     Args:
         found: by a reader.
         limits: thresholds.
-        consistency: which images are compared.
+        consistency: number of compared images, and thresholds.
         hint: what to check when joints and masks do not agree.
         drop_frames: frames to leave out, or None.
 
@@ -96,12 +98,15 @@ def finish(
         DataError: for whatever is missing or contradictory, naming the file.
         ConfigError: when ``drop_frames`` is malformed or leaves no frame.
     """
+    # Frames that the user leaves out.
     if drop_frames is not None:
         gone = parse_frames(drop_frames, "data.reader.drop_frames")
         images = {name: files.without(gone) for name, files in found.images.items()}
         if not any(images.values()):
             raise ConfigError(f"data.reader.drop_frames={drop_frames} leaves no frame")
         found = replace(found, images=images)
+
+    # Files against each other, then a few masks against the joints.
     layout = assemble(found, limits)
     check_consistency(layout, consistency, hint)
     return layout
@@ -120,6 +125,8 @@ def body_model(root: Path, smpl: str | None, kind: str) -> tuple[Path, SkinnedMo
         DataError: when none is given, or it is damaged or of another kind.
     """
     name, example = MODELS[kind]
+
+    # The model has its own licence, so that the user must provide it.
     if smpl is None:
         raise DataError(
             f"{root} holds {name} parameters but no joints, and joints need the body model: give "
@@ -131,16 +138,18 @@ def body_model(root: Path, smpl: str | None, kind: str) -> tuple[Path, SkinnedMo
         raise ConfigError(
             f"data.smpl={smpl} does not exist; expected an SMPL or SMPL-X .pkl or .npz"
         )
+
+    # The right kind of body, with the vertices that the landmarks are defined on.
     model = read_smpl(path)
-    counts = TABLES[kind].counts
+    joints, vertices = TABLES[kind].counts
     if model.kind != kind:
         raise DataError(
             f"{path} is a model of {len(model.parents)} joints; this dataset's parameters are of "
-            f"{name} ({counts[0]} joints)"
+            f"{name} ({joints} joints)"
         )
-    if len(model.v_template) != counts[1]:
+    if len(model.v_template) != vertices:
         raise DataError(
-            f"{path} has {len(model.v_template)} vertices; expected the {counts[1]} of {name}, "
+            f"{path} has {len(model.v_template)} vertices; expected the {vertices} of {name}, "
             "whose numbers the landmarks use: get the model from its own site"
         )
     return path, model
@@ -148,7 +157,9 @@ def body_model(root: Path, smpl: str | None, kind: str) -> tuple[Path, SkinnedMo
 
 def up_axis(cameras: Iterable[CameraEntry]) -> str:
     """The world axis nearest to the mean of the cameras' upward directions, e.g. "-z"."""
-    return axis_name(np.mean([-camera.R[1] for camera in cameras], axis=0))
+    # Camera axes point right, down and forward.
+    upward = [-camera.R[1] for camera in cameras]
+    return axis_name(np.mean(upward, axis=0))
 
 
 def image_size(root: Path, files: Mapping[int, str]) -> tuple[int, int]:
@@ -157,7 +168,9 @@ def image_size(root: Path, files: Mapping[int, str]) -> tuple[int, int]:
     Raises:
         DataError: when it is damaged.
     """
-    return read_header(root / next(iter(files.values())))[0]
+    first = next(iter(files.values()))
+    size, _, _ = read_header(root / first)
+    return size
 
 
 class _Masks(Mapping[int, tuple[MaskFile, ...]]):

@@ -1,4 +1,4 @@
-"""Do cameras, joints and masks fit together? The rules, and the one set of thresholds.
+"""Rules and thresholds that tell whether cameras, joints and masks fit together.
 
 Readers apply them to a few images when a dataset is opened (`check_consistency`); `gsgan.check`
 applies the same measures and thresholds to many. Pixel centres lie at +0.5.
@@ -21,15 +21,17 @@ from gsgan.utils.errors import DataError
 
 T = TypeVar("T")
 
-LONGEST = 512  # pixels, longest side of a mask that joints are compared with
-TOLERANCE = 1.5  # pixels of that mask that a joint may always lie outside
+# pixels, maximum side of a mask that joints are compared with
+LONGEST = 512
+# pixels of that mask that a joint may always lie outside
+TOLERANCE = 1.5
 # drawing coordinates are clipped to this: OpenCV's are 16 bit when shifted
 FAR_PIXELS = 1e4
 
 
 @dataclass(frozen=True)
 class Consistency:
-    """How many images are compared when a dataset is opened, and the thresholds.
+    """Number of frames compared when a dataset is opened, and the thresholds.
 
     conf/data/capture.yaml explains every field.
     """
@@ -53,12 +55,15 @@ def check_consistency(layout: Layout, limits: Consistency, hint: str) -> None:
         DataError: naming the cameras with the share of joints inside, or the first of masks that
             are all empty.
     """
+    # The share of joints inside the mask, in some frames of every camera.
     frames = spread(list(layout.frames), limits.frames)
     shares = dict[str, list[float]]()
     masks = list[Path]()
     empty = True
     for name, camera in layout.cameras.items():
-        for frame in (f for f in frames if f in layout.images[name]):
+        for frame in frames:
+            if frame not in layout.images[name]:
+                continue
             mask = read_mask(layout.mask_files(name, frame), layout.pixels)
             masks.append(layout.mask_path(name, frame))
             empty = empty and not mask.any()
@@ -68,12 +73,17 @@ def check_consistency(layout: Layout, limits: Consistency, hint: str) -> None:
                 shares.setdefault(name, []).append(share)
     if not masks:
         return
+
+    # A camera in another unit.
     person = np.median(layout.landmarks.seen(frames[0]), axis=0)
-    metres = {
-        n: float(np.linalg.norm(c.centre - person)) for n, c in layout.cameras.items()
-    }
-    if far := far_cameras(metres, limits.far_camera):
+    metres = {}
+    for name, camera in layout.cameras.items():
+        metres[name] = float(np.linalg.norm(camera.centre - person))
+    far = far_cameras(metres, limits.far_camera)
+    if far:
         raise DataError(f"{layout.root}: {next(iter(far.values()))}")
+
+    # Masks of other values than expected, or of another recording.
     if empty:
         raise DataError(
             f"{masks[0]} shows no person, nor does any of the {len(masks)} masks compared; "
@@ -90,23 +100,27 @@ def check_consistency(layout: Layout, limits: Consistency, hint: str) -> None:
 
 def far_cameras(metres: Mapping[str, float], factor: float) -> dict[str, str]:
     """A message for each camera that is ``factor`` times farther than the median one, or nearer."""
+    # The median camera is right if most of them are.
     median = float(np.median(list(metres.values())))
-    return {
-        name: f"camera {name} stands {distance:.3g} m from the person, the median camera "
-        f"{median:.3g} m; its t is probably in another unit"
-        for name, distance in metres.items()
-        if not median / factor <= distance <= median * factor
-    }
+    messages = {}
+    for name, distance in metres.items():
+        if not median / factor <= distance <= median * factor:
+            messages[name] = (
+                f"camera {name} stands {distance:.3g} m from the person, the median camera "
+                f"{median:.3g} m; its t is probably in another unit"
+            )
+    return messages
 
 
 def mask_distance(mask: Bool) -> Float:
     """``[H, W]`` pixels from every pixel to the mask; 0 in it, infinite when it is empty."""
     if not mask.any():
         return np.full(mask.shape, np.inf)
+
+    # OpenCV measures the distance to the nearest zero.
     outside = (~mask).astype(np.uint8)
-    return cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE).astype(
-        np.float64
-    )
+    distance = cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return distance.astype(np.float64)
 
 
 def joint_distance(
@@ -121,11 +135,14 @@ def joint_distance(
         pixels, depth: ``[J, 2]`` and ``[J]`` (metres) of the joints in that image.
         focal: pixels, of that image.
     """
-    known = np.where(np.isfinite(pixels), pixels, -1.0).clip(-1, FAR_PIXELS)
-    column, row = np.floor(known.T).astype(int)
+    # The pixel that each joint falls into; clipped, since far values do not fit into integers.
+    finite = np.where(np.isfinite(pixels), pixels, -1.0).clip(-1, FAR_PIXELS)
+    column, row = np.floor(finite.T).astype(int)
     height, width = distance.shape
     usable = visible & (depth > NEAR)
     usable &= (column >= 0) & (column < width) & (row >= 0) & (row < height)
+
+    # A distance of d pixels is d * depth / focal metres at the joint.
     metres = np.full(len(pixels), np.nan)
     metres[usable] = distance[row[usable], column[usable]] * depth[usable] / focal
     return metres
@@ -136,20 +153,29 @@ def inside_share(
 ) -> float:
     """Share of world points ``[N, 3]`` in view that lie inside a stored mask ``[H, W]``.
 
-    They may lie ``tolerance`` metres outside; NaN of no points, or of an empty mask.
+    They may lie ``tolerance`` metres outside; NaN without points, or with an empty mask.
     """
     if not mask.any():
         return np.nan
+
+    # A smaller mask, every `step`-th pixel, which is fast to measure.
     step = max(1, -(-max(mask.shape) // LONGEST))
     small = mask[::step, ::step] > 127
     focal = float(camera.K[0, 0]) / step
+
+    # The points as the lens shows them, since stored masks are distorted.
     straight, depth = project(camera, joints)
-    pixels = through_lens(camera.K, camera.dist, *straight.T) / step
+    shown = through_lens(camera.K, camera.dist, straight[:, 0], straight[:, 1])
     everyone = np.ones(len(joints), bool)
-    outside = joint_distance(mask_distance(small), pixels, depth, everyone, focal)
+    distance = mask_distance(small)
+    outside = joint_distance(distance, shown / step, depth, everyone, focal)  # [N]
+
+    # The tolerance in metres, but at least some pixels of the small mask.
     known = ~np.isnan(outside)
+    if not known.any():
+        return np.nan
     allowed = np.maximum(tolerance, TOLERANCE * depth / focal)
-    return float((outside <= allowed)[known].mean()) if known.any() else np.nan
+    return float((outside <= allowed)[known].mean())
 
 
 def spread(values: Sequence[T], count: int) -> list[T]:

@@ -37,13 +37,18 @@ from gsgan.utils.arrays import Float, Ints, as_floats
 from gsgan.utils.errors import DataError
 
 SKELETONS = {"smpl": "smpl24 -> mediapipe33", "keypoints3d": "body25 -> mediapipe33"}
+# folders of EasyMocap's results
 RESULTS = ("{kind}", "output/{kind}", "output-{kind}/{kind}")
-PEOPLE = 1000  # bound on the person's number in a mask's name
+# bound on the person's number in a mask's name
+PEOPLE = 1000
+# keys of the list of people
 PEOPLE_KEYS = ("annots", "people")
 
 BODY_25 = 25
 WITH_HANDS = BODY_25 + 2 * HAND
-COUNTS = (BODY_25, WITH_HANDS, WITH_HANDS + 51)  # body; and hands, left first; and face
+# the body; with hands, left first; with hands and face
+COUNTS = (BODY_25, WITH_HANDS, WITH_HANDS + 51)
+# their numbers by MediaPipe's
 BODY_25_TO_33 = SETS[BODY_25][1]
 HANDS_TO_33 = {
     landmark: BODY_25 + joint - BODY for landmark, joint in FROM_HANDS.items()
@@ -68,25 +73,32 @@ class EasymocapReader(FolderReader):
 
     def find(self, root: Path, limits: Thresholds, smpl: str | None) -> Found:
         """See `FolderReader.find`."""
+        # Images of the cameras that have a folder, and their calibrations.
         notes: list[str] = []
         names = _camera_folders(root, self.contents)
         images = {name: frame_files(root, f"images/{name}", IMAGES) for name in names}
-        if empty := [name for name, files in images.items() if not files]:
-            raise DataError(
-                f"{root / 'images' / empty[0]} holds no images; expected 000000.jpg"
-            )
+        for name, files in images.items():
+            if not files:
+                raise DataError(
+                    f"{root / 'images' / name} holds no images; expected 000000.jpg"
+                )
         cameras = self._cameras(root, images, notes)
-        frames = {f for files in images.values() for f in files}
+
+        # The person's SMPL fits, if the user has the model, else the keypoints.
         kind, place = _source(root, smpl)
+        frames = set[int]().union(*images.values())
         people = _read_people(root, place, frames, self.person, notes)
-        motion = body = None
+        motion = None
+        body = None
         if kind == "smpl":
             file, model = body_model(root / place, smpl, "smpl")
             motion = zju_motion(people, model)
             body = BodyModel("smpl", str(file), tuple(motion.betas[0].tolist()))
-            ids, (p, conf) = motion.ids, landmarks_of(model, motion)
+            ids = motion.ids
+            p, conf = landmarks_of(model, motion)
         else:
             ids, p, conf = _read_keypoints(people)
+
         return Found(
             root=root,
             meta=Meta(
@@ -113,53 +125,67 @@ class EasymocapReader(FolderReader):
         self, root: Path, images: Mapping[str, Mapping[int, str]], notes: list[str]
     ) -> dict[str, CameraEntry]:
         """The cameras that have images, by name, in natural order."""
+        # Every folder of images needs a camera of the same name.
         path = root / "intri.yml"
         calibration = read_calibration(path, pixel_centre=self.pixel_centre)
         notes += calibration.notes
         known = calibration.cameras
-        if lacking := [name for name in images if name not in known]:
-            raise DataError(
-                f"{root / 'images' / lacking[0]} is not a camera of {path}, which lists "
-                f"{', '.join(known)}; cameras are paired by name: rename the folder or calibrate it"
-            )
-        if idle := [name for name in known if name not in images]:
+
+        cameras = {}
+        for name, files in images.items():
+            if name not in known:
+                raise DataError(
+                    f"{root / 'images' / name} is not a camera of {path}, which lists "
+                    f"{', '.join(known)}; cameras are paired by name: rename the folder or "
+                    "calibrate it"
+                )
+            # A calibration without sizes takes those of the images.
+            camera = known[name]
+            if min(camera.size) == 0:
+                camera = replace(camera, size=image_size(root, files))
+            cameras[name] = camera
+
+        # Cameras of the calibration that did not record this take.
+        idle = [name for name in known if name not in images]
+        if idle:
             notes.append(
                 f"{path} lists cameras without images, left out: {', '.join(idle)}"
             )
-        return {
-            name: known[name]
-            if min(known[name].size) > 0
-            else replace(known[name], size=image_size(root, images[name]))
-            for name in images
-        }
+        return cameras
 
 
 def _source(root: Path, smpl: str | None) -> tuple[str, str]:
-    """The kind of skeletons to use, fits where the user has the model, and their folder."""
-    places = [
-        (kind, pattern.format(kind=kind)) for kind in SKELETONS for pattern in RESULTS
-    ]
-    places = [(kind, place) for kind, place in places if (root / place).is_dir()]
+    """The kind of skeletons to use, fits if the user has the model, and their folder."""
+    places = []
+    for kind in SKELETONS:
+        for pattern in RESULTS:
+            place = pattern.format(kind=kind)
+            if (root / place).is_dir():
+                places.append((kind, place))
     if not places:
         raise DataError(
             f"{root} has no skeletons; expected keypoints3d/ or smpl/ in it, or in output/: run "
             "EasyMocap's reconstruction first"
         )
-    usable = [
-        (kind, place) for kind, place in places if kind != "smpl" or smpl is not None
-    ]
-    return (usable or places)[0]
+
+    # Fits need the model. If there is nothing else, reading them reports that it is missing.
+    for kind, place in places:
+        if kind != "smpl" or smpl is not None:
+            return kind, place
+    return places[0]
 
 
 def _masks(
     root: Path, names: Sequence[str], person: int
 ) -> dict[str, dict[int, tuple[MaskFile, ...]]]:
-    """By camera and frame; only the person's own where the names hold an id."""
+    """The masks by camera and frame; only those of the person if their names hold an id."""
     found = {}
     for name in names:
+        # Keys hold the frame and the person.
         files = frame_files(root, f"mask/{name}", (".png", ".jpg"), _frame_and_person)
         own: dict[int, tuple[MaskFile, ...]] = {}
-        for key, path in sorted(files.items()):  # a mask without an id comes first
+        # A mask without an id comes first, so that the person's own replaces it.
+        for key, path in sorted(files.items()):
             frame, number = divmod(key, PEOPLE)
             if number in (0, person + 1):
                 own[frame] = (mask_file(path),)
@@ -175,9 +201,10 @@ def _camera_folders(root: Path, contents: str) -> list[str]:
                 f"{root / name} does not exist; a folder of EasyMocap holds {contents}"
             )
     place = root / "images"
-    names = [
-        p.name for p in place.glob("*") if p.is_dir() and not p.name.startswith(".")
-    ]
+    names = []
+    for path in place.glob("*"):
+        if path.is_dir() and not path.name.startswith("."):
+            names.append(path.name)
     if not names:
         raise DataError(
             f"{place} holds no folder of a camera; a folder of EasyMocap holds {contents}: extract "
@@ -188,18 +215,23 @@ def _camera_folders(root: Path, contents: str) -> list[str]:
 
 def _frame_and_person(stem: str) -> int | None:
     """One number for frame and person: "000012_1" is frame 12 of person 1, "000012" has no id."""
+    # The frame, and optionally the person.
     match = re.fullmatch(r"(\d+)(?:_(\d{1,2}))?", stem)
     if match is None:
         return None
-    return int(match[1]) * PEOPLE + (int(match[2]) + 1 if match[2] else 0)
+    frame = int(match[1])
+    person = int(match[2]) + 1 if match[2] else 0
+    return frame * PEOPLE + person
 
 
 def _read_people(
     root: Path, folder: str, frames: Collection[int], person: int, notes: list[str]
 ) -> dict[int, tuple[str, Mapping[str, Any]]]:
     """The person's entry, with the file's name for messages, by frame that has images."""
+    # One file per frame, each with all people.
     files = frame_files(root, folder, (".json",))
     found = {}
+    lacking = []
     seen = set[int]()
     there = sorted(set(frames) & set(files))
     for frame in there:
@@ -207,13 +239,17 @@ def _read_people(
         seen |= set(people)
         if person in people:
             found[frame] = (f"{root / files[frame]}, person {person}", people[person])
+        else:
+            lacking.append(frame)
+
+    # The most likely cause is another number of the person.
     if not found:
         ids = ", ".join(map(str, sorted(seen))) or "nobody"
         raise DataError(
             f"{root / folder} has no person {person} in the {len(there)} of its {len(files)} files "
             f"that belong to images (found: {ids}); set data.reader.person"
         )
-    if lacking := [frame for frame in there if frame not in found]:
+    if lacking:
         notes.append(f"{folder} lacks person {person} at frames {spans(lacking)}")
     return found
 
@@ -221,27 +257,31 @@ def _read_people(
 def _people(path: Path) -> dict[int, Mapping[str, Any]]:
     """All people in a file by id."""
     content = read_json_value(path)
+    # Some versions wrap the list in an object.
     if isinstance(content, Mapping):
         content = next((content[key] for key in PEOPLE_KEYS if key in content), None)
     if not isinstance(content, list) or not all(
-        isinstance(p, Mapping) for p in content
+        isinstance(entry, Mapping) for entry in content
     ):
         raise DataError(f"{path} must hold a list of people, each an object with 'id'")
-    numbers = [entry.get("id") for entry in content]
-    for i, number in enumerate(numbers):
-        if type(number) is not int or number in numbers[:i]:
+
+    people: dict[int, Mapping[str, Any]] = {}
+    for entry in content:
+        number = entry.get("id")
+        if type(number) is not int or number in people:
             raise DataError(
                 f"{path}: each person needs a whole 'id' that no other has, found {number}"
             )
-    return dict(zip(numbers, content, strict=True))
+        people[number] = entry
+    return people
 
 
 def _read_keypoints(
     people: Mapping[int, tuple[str, Mapping[str, Any]]],
 ) -> tuple[Ints, Float, Float]:
-    """MediaPipe's 33 landmarks from BODY_25, with hands where they are there.
+    """MediaPipe's 33 landmarks from BODY_25, with hands if the file has them.
 
-    Convention: joints that BODY_25 lacks (corners of the eyes, mouth; without hands also fingers)
+    Joints that BODY_25 lacks (corners of the eyes, mouth; without hands also fingers)
     and joints that were not seen, for which EasyMocap writes zeros, are NaN with confidence 0.
 
     Returns:
@@ -250,18 +290,23 @@ def _read_keypoints(
     p = np.full((len(people), BODY, 3), np.nan)
     conf = np.zeros((len(people), BODY))
     for row, (where, entry) in enumerate(people.values()):
+        # The numbers of the joints in the file, by landmark.
         joints = _joints(where, entry.get("keypoints3d"))
-        table = BODY_25_TO_33 | (HANDS_TO_33 if len(joints) > BODY_25 else {})
+        table = BODY_25_TO_33
+        if len(joints) > BODY_25:
+            table = BODY_25_TO_33 | HANDS_TO_33
+
+        # Only joints that were seen.
         taken = joints[list(table.values())]
         seen = np.isfinite(taken).all(axis=1) & (taken[:, 3] > 0)
-        to = np.array(list(table))[seen]
-        p[row, to] = taken[seen, :3]
-        conf[row, to] = taken[seen, 3]
+        landmarks = np.array(list(table))[seen]
+        p[row, landmarks] = taken[seen, :3]
+        conf[row, landmarks] = taken[seen, 3]
     return np.array(list(people), np.int64), p, conf
 
 
 def _joints(where: str, raw: Any) -> Float:
-    """``[J, 4]`` x, y, z and confidence, which is 1 where the file has none."""
+    """``[J, 4]`` x, y, z and confidence, which is 1 if the file has none."""
     joints = as_floats(raw)
     if joints.ndim != 2 or len(joints) not in COUNTS or joints.shape[1] not in (3, 4):
         counts = ", ".join(map(str, COUNTS))
@@ -269,6 +314,8 @@ def _joints(where: str, raw: Any) -> Float:
             f"{where}: 'keypoints3d' must have shape (J, 4) with J one of {counts} (BODY_25, with "
             f"hands, with face), found {joints.shape if joints.size else type(raw).__name__}"
         )
+
+    # Some versions write no confidence.
     if joints.shape[1] == 3:
         joints = np.concatenate([joints, np.ones((len(joints), 1))], axis=1)
     return joints

@@ -13,9 +13,12 @@ from gsgan.skeleton.smpl_landmarks import TABLES, to_mediapipe33
 from gsgan.utils.arrays import Float, Ints, as_floats
 from gsgan.utils.errors import DataError
 
-CHUNK = 32  # frames posed at once: bounds memory, nothing else
-ROOT_TOLERANCE = 1e-6  # radians in poses[:3] that count as none
-ZJU_SIZES = {"poses": (72, 69), "shapes": (10,), "Rh": (3,), "Th": (3,)}  # 69: no root
+# frames posed at once: bounds memory, nothing else
+CHUNK = 32
+# radians in poses[:3] that count as none
+ROOT_TOLERANCE = 1e-6
+# allowed numbers of values; poses of 69 lack the root
+ZJU_SIZES = {"poses": (72, 69), "shapes": (10,), "Rh": (3,), "Th": (3,)}
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,7 @@ class SmplMotion:
 
     def poses(self, source: str) -> Poses:
         """Body poses by frame."""
-        frames = [int(i) for i in self.ids]
+        frames = self.ids.tolist()
         return Poses(
             dict(zip(frames, self.theta, strict=True)),
             dict(zip(frames, self.transl, strict=True)),
@@ -53,52 +56,60 @@ def landmarks_of(
 
     Only the vertices that landmarks lie on are posed: about 0.1 ms per frame instead of 10.
     """
+    # The vertices that landmarks lie on, or that they are the midpoint of with a joint.
     table = TABLES[model.kind]
-    own = {vertex for vertex, _ in table.vertices.values()}
-    vertices = sorted(own | {vertex for _, vertex in table.midpoints.values()})
+    used = {vertex for vertex, _ in table.vertices.values()}
+    used.update(vertex for _, vertex in table.midpoints.values())
+    vertices = sorted(used)
     small = _only(model, vertices)
+
+    kind = cast(Literal["smpl", "smplx"], model.kind)
     p = []
     conf = []
     for first in range(0, len(motion.ids), CHUNK):
         part = slice(first, first + CHUNK)
+        expression = None
+        if motion.expression is not None:
+            expression = torch.from_numpy(motion.expression[part])
         found, joints = small.pose(
             torch.from_numpy(motion.theta[part]),
             torch.from_numpy(motion.betas[part]),
             torch.from_numpy(motion.transl[part]),
-            None
-            if motion.expression is None
-            else torch.from_numpy(motion.expression[part]),
+            expression,
             pose_blend=pose_blend,
         )
+
+        # The landmarks of each frame, from vertices at their places in the whole body.
         for v, j in zip(found.numpy(), joints.numpy(), strict=True):
             full = np.full((len(model.v_template), 3), np.nan)
             full[vertices] = v[: len(vertices)]
-            one_p, one_conf = to_mediapipe33(
-                j, full, cast(Literal["smpl", "smplx"], model.kind)
-            )
+            one_p, one_conf = to_mediapipe33(j, full, kind)
             p.append(one_p)
             conf.append(one_conf)
     return np.stack(p), np.stack(conf)
 
 
 def _only(model: SkinnedModel, vertices: list[int]) -> SkinnedModel:
-    """The same skeleton with few vertices; each joint becomes a vertex too, that regresses it."""
-    eye = torch.eye(len(model.parents), dtype=torch.float64)
+    """A model with the same skeleton and few vertices; each joint becomes a vertex too, whose rest
+    position the joint regressor gives."""
+    joints = len(model.parents)
+    eye = torch.eye(joints, dtype=torch.float64)
 
     def with_joints(values: torch.Tensor) -> torch.Tensor:
-        at_joints = (model.J_regressor @ values.flatten(1)).unflatten(
-            1, values.shape[1:]
-        )
+        # The regressor is linear, so it applies to blend shapes as well.
+        flat = model.J_regressor @ values.flatten(1)
+        at_joints = flat.unflatten(1, values.shape[1:])
         return torch.cat([values[vertices], at_joints])
 
-    still = model.posedirs.new_zeros((len(eye), *model.posedirs.shape[1:]))
+    # Pose blend shapes do not move the joints, each of which follows its own bone alone.
+    still = model.posedirs.new_zeros((joints, *model.posedirs.shape[1:]))
     return replace(
         model,
         v_template=with_joints(model.v_template),
         shapedirs=with_joints(model.shapedirs),
         expression_dirs=with_joints(model.expression_dirs),
         posedirs=torch.cat([model.posedirs[vertices], still]),
-        J_regressor=torch.cat([eye.new_zeros(len(eye), len(vertices)), eye], dim=1),
+        J_regressor=torch.cat([eye.new_zeros(joints, len(vertices)), eye], dim=1),
         weights=torch.cat([model.weights[vertices], eye]),
     )
 
@@ -108,8 +119,8 @@ def zju_motion(
 ) -> SmplMotion:
     """A motion from ZJU-MoCap's parameters, which EasyMocap writes too.
 
-    Convention: the files' pose is ``R(Rh) x + Th`` of the body with an unrotated root, about the
-    model's origin (`gsgan.body.smpl.from_zju`); metres. The body's shape is the frames' median.
+    The files' pose is ``R(Rh) x + Th`` of the body with an unrotated root, about the model's origin
+    (`gsgan.body.smpl.from_zju`), in metres. The body's shape is the median over the frames.
 
     Args:
         entries: by frame, a name for messages and ``poses`` (72, or 69 without the root),
@@ -119,26 +130,38 @@ def zju_motion(
     Raises:
         DataError: when a parameter is missing, of another length, not finite, or the root turns.
     """
-    rows = []
+    columns: dict[str, list[Float]] = {key: [] for key in ZJU_SIZES}
     for where, content in entries.values():
-        row = [
-            _parameter(content, key, sizes, where) for key, sizes in ZJU_SIZES.items()
-        ]
-        row[0] = np.concatenate([np.zeros(ZJU_SIZES["poses"][0] - len(row[0])), row[0]])
-        turn = float(np.abs(row[0][:3]).max())
+        for key, sizes in ZJU_SIZES.items():
+            columns[key].append(_parameter(content, key, sizes, where))
+
+        # Poses without the root get an unrotated one.
+        pose = columns["poses"][-1]
+        pose = np.concatenate([np.zeros(ZJU_SIZES["poses"][0] - len(pose)), pose])
+        columns["poses"][-1] = pose
+        turn = float(np.abs(pose[:3]).max())
         if turn > ROOT_TOLERANCE:
             raise DataError(
                 f"{where}: the first 3 numbers of 'poses' must be 0, found up to {turn:.3g}; "
                 "the root's rotation belongs in Rh"
             )
-        rows.append(row)
-    poses, shapes, Rh, Th = (np.stack(column) for column in zip(*rows, strict=True))
-    shape = np.median(shapes, axis=0)[: model.shapedirs.shape[-1]]
-    J0 = model.rest_joints(torch.from_numpy(shape[None]))[0, 0].numpy()
-    theta = poses.reshape(len(rows), -1, 3)
-    theta[:, 0], transl = from_zju(Rh, Th, J0)
-    ids = np.array(list(entries), np.int64)
-    return SmplMotion(ids, theta, transl, np.repeat(shape[None], len(ids), axis=0))
+
+    # One shape for all frames, with as many coefficients as the model has.
+    shape = np.median(np.stack(columns["shapes"]), axis=0)
+    shape = shape[: model.shapedirs.shape[-1]]
+
+    # The root's rotation and translation in the model's own convention.
+    theta = np.stack(columns["poses"]).reshape(len(entries), -1, 3)
+    root_joint = model.rest_joints(torch.from_numpy(shape[None]))[0, 0].numpy()
+    theta[:, 0], transl = from_zju(
+        np.stack(columns["Rh"]), np.stack(columns["Th"]), root_joint
+    )
+    return SmplMotion(
+        ids=np.array(list(entries), np.int64),
+        theta=theta,
+        transl=transl,
+        betas=np.repeat(shape[None], len(entries), axis=0),
+    )
 
 
 def _parameter(content: Any, key: str, sizes: tuple[int, ...], where: str) -> Float:
@@ -146,6 +169,8 @@ def _parameter(content: Any, key: str, sizes: tuple[int, ...], where: str) -> Fl
     expected = " or ".join(map(str, sizes))
     if not isinstance(content, Mapping) or key not in content:
         raise DataError(f"{where} has no '{key}'; expected {expected} numbers")
+
+    # Files nest the numbers differently.
     values = as_floats(content[key]).reshape(-1)
     if len(values) not in sizes:
         found = getattr(content[key], "shape", type(content[key]).__name__)

@@ -1,8 +1,8 @@
 """One person before a rig of cameras: a JSON of cameras, images, matting alphas, SMPL-X fits.
 
-The shared reader of THuman4.0 and AvatarReX. Convention of the fits, one npz: metres, axis-angle;
-row i is frame i; the first row of betas is the subject's; hands are full rotations away from the
-flat hand (``use_pca=False, flat_hand_mean=True`` in smplx's terms).
+The shared reader of THuman4.0 and AvatarReX. The fits are one npz: metres, axis-angle; row i is
+frame i; the first row of betas is the subject's; hands are full rotations away from the flat hand
+(``use_pca=False, flat_hand_mean=True`` in smplx's terms).
 """
 
 from collections.abc import Collection, Mapping
@@ -39,7 +39,8 @@ Files = dict[str, FrameFiles]
 
 PARAMETERS = "smpl_params.npz"
 MISSING = "missing_img_files.txt"
-POSES = {  # in the order of SMPL-X's joints: numbers per frame of each
+# in the order of SMPL-X's joints: numbers per frame of each
+POSES = {
     "global_orient": 3,
     "body_pose": 63,
     "jaw_pose": 3,
@@ -48,6 +49,7 @@ POSES = {  # in the order of SMPL-X's joints: numbers per frame of each
     "left_hand_pose": 45,
     "right_hand_pose": 45,
 }
+# arrays that a file must have
 NEEDED = ("global_orient", "body_pose", "transl", "betas")
 HAND_POSES = ("left_hand_pose", "right_hand_pose")
 
@@ -75,11 +77,11 @@ class SmplxRigReader(FolderReader):
     )
 
     def __post_init__(self) -> None:
-        alpha = self.ignore_alpha
         whole("data.reader.ignore_band", self.ignore_band, 0)
-        if alpha is not None and not (
-            len(alpha) == 2 and 0 <= alpha[0] < alpha[1] <= 255
-        ):
+        alpha = self.ignore_alpha
+        if alpha is None:
+            return
+        if not (len(alpha) == 2 and 0 <= alpha[0] < alpha[1] <= 255):
             raise ConfigError(
                 "data.reader.ignore_alpha must be null or two rising alphas of 0 to 255 such as "
                 f"[5, 250], got {list(alpha)}"
@@ -87,23 +89,31 @@ class SmplxRigReader(FolderReader):
 
     def find(self, root: Path, limits: Thresholds, smpl: str | None) -> Found:
         """See `FolderReader.find`."""
-        alpha = self.ignore_alpha
         notes = list[str]()
+
+        # The two files without which nothing can be read.
         for name in (self.calibration, PARAMETERS):
             if not (root / name).is_file():
                 raise DataError(
                     f"{root / name} does not exist; a folder of {self.layout} holds {self.contents}"
                 )
         file, model = body_model(root, smpl, "smplx")
+
+        # Images, masks and cameras by the names in the calibration.
         path = root / self.calibration
         entries = read_json(path)
         images = _index(root, entries, self.images, "images")
         masks = _index(root, entries, self.masks, "masks")
         _leave_out(images, root / MISSING, notes)
         cameras = self._cameras(root, path, entries, images, notes)
-        frames = {f for files in images.values() for f in files}
+
+        # The fitted body, and the landmarks on it.
+        frames = set[int]().union(*images.values())
         motion = read_motion(root / PARAMETERS, frames, model, notes)
         p, conf = landmarks_of(model, motion)
+
+        # A pair: a config gives a list.
+        alpha = self.ignore_alpha
         return Found(
             root=root,
             meta=Meta(
@@ -143,13 +153,16 @@ class SmplxRigReader(FolderReader):
         cameras = {}
         for name, entry in entries.items():
             where = f"{path}, camera {name}"
-            if not isinstance(entry, dict) or any(key not in entry for key in "KRT"):
-                held = (
-                    ", ".join(entry)
-                    if isinstance(entry, dict)
-                    else type(entry).__name__
+            if not isinstance(entry, dict):
+                raise DataError(
+                    f"{where}: expected K, R and T, found {type(entry).__name__}"
                 )
-                raise DataError(f"{where}: expected K, R and T, found {held}")
+            if not set("KRT") <= set(entry):
+                raise DataError(
+                    f"{where}: expected K, R and T, found {', '.join(entry)}"
+                )
+
+            # Matrices are stored row by row.
             cameras[name] = make_camera(
                 where,
                 name,
@@ -160,11 +173,12 @@ class SmplxRigReader(FolderReader):
                 size=image_size(root, images[name]),
                 pixel_centre=self.pixel_centre,
             )
+
+        # The coefficients describe the cameras, but the released images are rectified.
         bent = [name for name, camera in cameras.items() if camera.distorted]
         if bent and not self.undistort:
-            cameras = {
-                name: replace(c, dist=np.zeros(8)) for name, c in cameras.items()
-            }
+            for name, camera in cameras.items():
+                cameras[name] = replace(camera, dist=np.zeros(8))
             notes.append(
                 f"{path} gives {len(bent)} cameras lens distortion ({bent[0]}, ...), which is not "
                 "applied, since the released images are rectified; if yours are not, set "
@@ -174,7 +188,7 @@ class SmplxRigReader(FolderReader):
 
 
 def _index(root: Path, cameras: Mapping[str, Any], place: str, kind: str) -> Files:
-    """Files by camera and frame; each camera has some."""
+    """The files by camera and frame; each camera must have some."""
     found = {}
     for name in cameras:
         folder = place.format(camera=name)
@@ -190,16 +204,20 @@ def _leave_out(images: Files, path: Path, notes: list[str]) -> None:
     """Removes the images that a missing_img_files.txt names from the index."""
     if not path.is_file():
         return
+
+    # The release lists images that are missing or damaged.
     named = read_missing(path, images)
     gone = 0
     for camera, files in images.items():
-        images[camera] = files.without(frame for name, frame in named if name == camera)
-        gone += len(files) - len(images[camera])
+        kept = files.without(frame for name, frame in named if name == camera)
+        gone += len(files) - len(kept)
+        images[camera] = kept
     notes.append(
         f"{len(named)} images named in {path} are left out, {gone} of them with a file"
     )
-    if empty := [name for name, files in images.items() if not files]:
-        raise DataError(f"{path} leaves no image of camera {empty[0]}")
+    for camera, files in images.items():
+        if not files:
+            raise DataError(f"{path} leaves no image of camera {camera}")
 
 
 def read_missing(path: Path, cameras: Mapping[str, Any]) -> set[tuple[str, int]]:
@@ -209,18 +227,23 @@ def read_missing(path: Path, cameras: Mapping[str, Any]) -> set[tuple[str, int]]
         DataError: on a line that names no image of a camera.
     """
     found = set()
-    for number, line in enumerate(read_text(path, errors="replace").splitlines(), 1):
-        if not line.strip():
+    lines = read_text(path, errors="replace").splitlines()
+    for number, raw in enumerate(lines, 1):
+        line = raw.strip()
+        if not line:
             continue
-        parts = PurePosixPath(line.strip().replace("\\", "/"))
-        camera = next(
-            (part for part in reversed(parts.parts[:-1]) if part in cameras), None
-        )
-        frame = last_number(parts.stem)
+
+        # The innermost folder that is a camera, and the number in the file's name.
+        image = PurePosixPath(line.replace("\\", "/"))
+        camera = None
+        for folder in image.parts[:-1]:
+            if folder in cameras:
+                camera = folder
+        frame = last_number(image.stem)
         if camera is None or frame is None:
             raise DataError(
                 f"{path}, line {number}: expected an image such as "
-                f"{next(iter(cameras))}/00000012.jpg, found {line.strip()[:80]!r}"
+                f"{next(iter(cameras))}/00000012.jpg, found {line[:80]!r}"
             )
         found.add((camera, frame))
     return found
@@ -238,26 +261,29 @@ def read_motion(
         notes: gains a sentence for each omission.
 
     Raises:
-        DataError: on a damaged file, a missing or misshapen array, or one of SMPL.
+        DataError: on a damaged file, or a missing or misshapen array, such as one of SMPL.
     """
     arrays = read_npz(path, (*POSES, "transl", "betas", "expression"))
-    if missing := [key for key in NEEDED if key not in arrays]:
+    missing = [key for key in NEEDED if key not in arrays]
+    if missing:
         raise DataError(
             f"{path} has no array {', '.join(missing)}; expected SMPL-X parameters"
         )
+
+    # The pose; joints without an array are not rotated.
     transl = _rows(arrays, "transl", 3, path)
     count = len(transl)
-    theta = np.concatenate(
-        [
-            _rows(arrays, key, width, path, count)
-            if key in arrays
-            else np.zeros((count, width))
-            for key, width in POSES.items()
-        ],
-        axis=1,
-    )
-    if absent := [key for key in HAND_POSES if key not in arrays]:
+    theta = np.zeros((count, sum(POSES.values())))
+    first = 0
+    for key, width in POSES.items():
+        if key in arrays:
+            theta[:, first : first + width] = _rows(arrays, key, width, path, count)
+        first += width
+    absent = [key for key in HAND_POSES if key not in arrays]
+    if absent:
         notes.append(f"{path} has no {' and '.join(absent)}: taken as flat hands")
+
+    # The shape and, if there is one, the expression.
     betas = _coefficients(arrays, "betas", model.shapedirs.shape[-1], path)[0]
     if not np.isfinite(betas).all():
         raise DataError(
@@ -265,18 +291,20 @@ def read_motion(
         )
     face = np.zeros((count, 0))
     if "expression" in arrays:
-        face = _coefficients(
-            arrays, "expression", model.expression_dirs.shape[-1], path, count
-        )
+        limit = model.expression_dirs.shape[-1]
+        face = _coefficients(arrays, "expression", limit, path, count)
+
+    # Only the frames that have images, and finite numbers.
     finite = np.isfinite(np.concatenate([theta, transl, face], axis=1)).all(1)
-    there = [f for f in sorted(frames) if f < count]
-    ids = np.array([f for f in there if finite[f]], np.int64)
+    there = np.array([f for f in sorted(frames) if f < count], np.int64)
+    ids = there[finite[there]]
     if not len(ids):
         raise DataError(
             f"{path} has {count} rows, but no finite one of a frame that has images; expected row "
             "i to be frame i"
         )
-    if lost := [f for f in there if not finite[f]]:
+    lost = there[~finite[there]].tolist()
+    if lost:
         notes.append(f"{path}: NaN or infinity at frames {spans(lost)}")
     return SmplMotion(
         ids=ids,
@@ -294,12 +322,15 @@ def _rows(
     path: Path,
     count: int | None = None,
 ) -> Float:
-    """``[N, width]`` of an array ``[N, ...]``; N is ``count`` where that is given."""
+    """``[N, width]`` an array ``[N, ...]`` flattened; N must be ``count`` if that is given."""
+    # A scalar or an empty array has no rows.
     values = as_floats(arrays[key])
     if values.ndim > 1 and values.size:
         values = values.reshape(len(values), -1)
         if width in (None, values.shape[1]) and count in (None, len(values)):
             return values
+
+    # What was found instead, for the message.
     shape = getattr(arrays[key], "shape", type(arrays[key]).__name__)
     expected = f"({count or 'frames'}, {width or 'any'})"
     raise DataError(
@@ -311,7 +342,8 @@ def _rows(
 def _coefficients(
     arrays: dict[str, Any], key: str, most: int, path: Path, count: int | None = None
 ) -> Float:
-    """``[N, n]``, n at most the model's number; further ones must be 0."""
+    """``[N, n]`` coefficients, at most as many as the model's; further ones must be 0."""
+    # A model file with fewer shapes than the fit would give another body.
     values = _rows(arrays, key, None, path, count)
     if np.any(values[:, most:] != 0):
         raise DataError(

@@ -43,14 +43,16 @@ Files = Mapping[str, Mapping[int, str]]
 
 ANNOTS = ("annots.npy", "annots_new.npy")
 MILLIMETRES = 1e-3
-TRANSLATION = (0.05, 20.0)  # metres: plausible lengths of the cameras' T
-# CoreView_313_Camera_(1)_0001_2019-08-23_16-08-50.592
+# metres: plausible lengths of the cameras' T
+TRANSLATION = (0.05, 20.0)
+# as in CoreView_313_Camera_(1)_0001_2019-08-23_16-08-50.592
 NAMED_FRAME = re.compile(r"\)_(\d+)")
-MASKS = ("mask_cihp", "mask")
-# Files may hold stray numbers beyond CIHP's.
+# part numbers by stored label: files may hold stray numbers beyond CIHP's
 CIHP_TABLE = tuple(i if i < len(CIHP) else IGNORE_LABEL for i in range(256))
+# folders of SMPL parameters, the best fit first
 FITS = {"refit": "new_params", "refined": "smpl_params", "first": "params"}
-UNBLENDED = "first"  # the fit whose body is posed without pose blend shapes
+# the fit whose body is posed without pose blend shapes
+UNBLENDED = "first"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,25 +70,27 @@ class ZjuReader(FolderReader):
 
     def find(self, root: Path, limits: Thresholds, smpl: str | None) -> Found:
         """See `FolderReader.find`."""
+        # Cameras, and the images in their folders.
         annots = read_annots(root)
         file, model = body_model(root, smpl, "smpl")
         notes = ["lengths of the cameras converted from mm to metres"]
         folders = camera_folders(root, annots)
         images = _index_images(root, folders)
         cameras = self._cameras(root, annots, images)
-        fit = next(
-            ((name, at) for name, at in FITS.items() if (root / at).is_dir()), None
-        )
-        if fit is None:
+
+        # The SMPL fit that the release has, the best first.
+        kind = next((name for name, at in FITS.items() if (root / at).is_dir()), None)
+        if kind is None:
             looked = ", ".join(f"{folder}/" for folder in FITS.values())
             raise DataError(
                 f"{root} has no SMPL parameters; expected one of the folders {looked}"
             )
-        kind, params = fit
-        frames = {f for files in images.values() for f in files}
+        params = FITS[kind]
+        frames = set[int]().union(*images.values())
         motion = _read_motion(root, params, frames, model)
+        p, conf = landmarks_of(model, motion, pose_blend=kind != UNBLENDED)
+
         masks, labels = _index_masks(root, folders)
-        p, conf = landmarks_of(model, motion, kind != UNBLENDED)
         return Found(
             root=root,
             meta=Meta(
@@ -118,7 +122,8 @@ class ZjuReader(FolderReader):
     def _cameras(
         self, root: Path, annots: Annots, images: Files
     ) -> dict[str, CameraEntry]:
-        """By name, in the order of annots.npy."""
+        """The cameras by name, in the order of annots.npy."""
+        # A camera without images takes the size of another one.
         some = next(files for files in images.values() if files)
         cameras = {}
         for i, (name, files) in enumerate(images.items()):
@@ -133,9 +138,10 @@ class ZjuReader(FolderReader):
                 scale=MILLIMETRES,
                 pixel_centre=self.pixel_centre,
             )
-        length = float(
-            np.median([np.linalg.norm(camera.t) for camera in cameras.values()])
-        )
+
+        # Implausible lengths of T mean another unit than millimetres.
+        lengths = [np.linalg.norm(camera.t) for camera in cameras.values()]
+        length = float(np.median(lengths))
         low, high = TRANSLATION
         if not low <= length <= high:
             raise DataError(
@@ -172,27 +178,40 @@ def read_annots(root: Path) -> Annots:
     cams = content.get("cams") if isinstance(content, dict) else None
     if not isinstance(cams, dict):
         raise DataError(f"{path} has no 'cams'; expected a dict with cams and ims")
-    ims = _entries(content.get("ims"))
-    names = _entries(ims[0].get("ims")) if ims and isinstance(ims[0], Mapping) else []
-    folders = [
-        str(PurePosixPath(str(name).replace("\\", "/")).parent) for name in names
-    ]
-    if not ims:
-        folders = [
-            f"images/{p.name}" for p in sorted(root.glob("images/*")) if p.is_dir()
-        ]
-    lists = [*(_entries(cams.get(key)) for key in "KRTD"), folders]
-    if len({len(entries) for entries in lists}) != 1 or not folders:
-        counts = zip(lists, (*"KRTD", "image folders"), strict=True)
-        found = ", ".join(f"{len(entries)} {key}" for entries, key in counts)
+
+    # The cameras' folders are those of the first frame's images; some copies list no images.
+    folders = []
+    frames = _entries(content.get("ims"))
+    if not frames:
+        for place in sorted(root.glob("images/*")):
+            if place.is_dir():
+                folders.append(f"images/{place.name}")
+    elif isinstance(frames[0], Mapping):
+        for name in _entries(frames[0].get("ims")):
+            image = PurePosixPath(str(name).replace("\\", "/"))
+            folders.append(str(image.parent))
+
+    annots = Annots(
+        path=path,
+        K=_entries(cams.get("K")),
+        R=_entries(cams.get("R")),
+        T=_entries(cams.get("T")),
+        D=_entries(cams.get("D")),
+        folders=folders,
+    )
+    counts = {key: len(getattr(annots, key)) for key in "KRTD"}
+    counts["image folders"] = len(folders)
+    if len(set(counts.values())) != 1 or not folders:
+        found = ", ".join(f"{count} {key}" for key, count in counts.items())
         raise DataError(
             f"{path} must hold one K, R, T, D and image folder per camera, found {found}"
         )
-    return Annots(path, *lists)
+    return annots
 
 
 def _entries(value: Any) -> list[Any]:
     """The entries of a list or array, none for anything else."""
+    # Releases differ: arrays, or nested lists.
     array = isinstance(value, np.ndarray) and value.ndim > 0
     return list(value) if array or isinstance(value, (list, tuple)) else []
 
@@ -204,6 +223,8 @@ def camera_folders(root: Path, annots: Annots) -> dict[str, str]:
         DataError: when a folder is not one of the subject's, or two cameras share one.
     """
     places = [_place(root, folder) for folder in annots.folders]
+
+    # Masks are found by the folder's name, so it must be unique.
     named = {PurePosixPath(place).name: place for place in places}
     if len(named) != len(places):
         raise DataError(
@@ -213,28 +234,32 @@ def camera_folders(root: Path, annots: Annots) -> dict[str, str]:
 
 
 def _place(root: Path, folder: str) -> str:
-    """The place of a folder that annots.npy names; copies are often rearranged."""
+    """The path of a folder that annots.npy names, relative to the root; copies are often
+    rearranged."""
+    # A path from a file must not lead out of the dataset.
     parts = PurePosixPath(folder).parts
     if not parts or ".." in parts or PurePosixPath(folder).is_absolute():
         raise DataError(
             f"{root}: annots lists images in {folder!r}, which is not a folder in it"
         )
-    places = (folder, parts[-1], f"images/{parts[-1]}")
-    return next((place for place in places if (root / place).is_dir()), folder)
+    for place in (folder, parts[-1], f"images/{parts[-1]}"):
+        if (root / place).is_dir():
+            return place
+    return folder
 
 
 def frame_number(stem: str) -> int | None:
     """The frame number in an image's name, 313's and 315's long names included."""
+    # The last number of a long name is a time.
     named = NAMED_FRAME.search(stem)
     return frame_of(named[1]) if named else last_number(stem)
 
 
 def _index_images(root: Path, folders: Mapping[str, str]) -> dict[str, FrameFiles]:
     """The images of each camera by frame number."""
-    images = {
-        name: frame_files(root, folder, IMAGES, frame_number)
-        for name, folder in folders.items()
-    }
+    images = {}
+    for name, folder in folders.items():
+        images[name] = frame_files(root, folder, IMAGES, frame_number)
     if not any(images.values()):
         raise DataError(
             f"{root}: no camera folder holds images; expected e.g. "
@@ -247,26 +272,30 @@ def _index_masks(
     root: Path, folders: Mapping[str, str]
 ) -> tuple[dict[str, dict[int, tuple[MaskFile, ...]]], Files]:
     """Masks and part labels by camera and frame."""
-    masks: dict[str, dict[int, tuple[MaskFile, ...]]] = {name: {} for name in folders}
-    labels: dict[str, dict[int, str]] = {name: {} for name in folders}
-    for kind in MASKS:
-        for name, folder in folders.items():
-            # mask/Camera_B1, or mask/images/00 as some copies have it
-            places = (f"{kind}/{name}", f"{kind}/{folder}")
-            place = next((p for p in places if (root / p).is_dir()), places[0])
-            files = frame_files(root, place, (".png", ".jpg"), frame_number)
-            if kind == "mask_cihp":
-                labels[name] = {
-                    f: path for f, path in files.items() if path.endswith(".png")
-                }
-            for frame, path in files.items():
-                mask = (
-                    MaskFile("nonzero", path)
-                    if kind == "mask_cihp"
-                    else mask_file(path)
-                )
-                masks[name][frame] = (*masks[name].get(frame, ()), mask)
+    masks: dict[str, dict[int, tuple[MaskFile, ...]]] = {}
+    labels: dict[str, dict[int, str]] = {}
+
+    # CIHP's part labels, which JPEG compression would damage; as masks, every part is the person.
+    for name, folder in folders.items():
+        parts = _mask_files(root, "mask_cihp", name, folder)
+        labels[name] = {f: path for f, path in parts.items() if path.endswith(".png")}
+        masks[name] = {f: (MaskFile("nonzero", path),) for f, path in parts.items()}
+
+    # The other masks of the same images are joined with them.
+    for name, folder in folders.items():
+        own = masks[name]
+        for frame, path in _mask_files(root, "mask", name, folder).items():
+            own[frame] = (*own.get(frame, ()), mask_file(path))
     return masks, labels if any(labels.values()) else {}
+
+
+def _mask_files(root: Path, kind: str, name: str, folder: str) -> FrameFiles:
+    """A camera's masks of one kind: in mask/Camera_B1, or mask/images/00 as some copies have it."""
+    place = f"{kind}/{name}"
+    other = f"{kind}/{folder}"
+    if not (root / place).is_dir() and (root / other).is_dir():
+        place = other
+    return frame_files(root, place, (".png", ".jpg"), frame_number)
 
 
 def _read_motion(
@@ -276,9 +305,15 @@ def _read_motion(
     files = frame_files(root, folder, (".npy",))
     ids = sorted(set(frames) & set(files))
     if not ids:
+        some = ", ".join(list(files.values())[:3])
         raise DataError(
             f"{root / folder} has no parameters of any frame that has images; it holds "
-            f"{len(files)} files ({', '.join(list(files.values())[:3]) or 'none'})"
+            f"{len(files)} files ({some or 'none'})"
         )
-    entries = {i: (str(root / files[i]), read_npy(root / files[i])) for i in ids}
+
+    # By frame: the file's name for messages, and its content.
+    entries = {}
+    for frame in ids:
+        path = root / files[frame]
+        entries[frame] = (str(path), read_npy(path))
     return zju_motion(entries, model)
