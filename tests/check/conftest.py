@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsgan.check.report import Report
+from gsgan.check.report import CheckReport
 from gsgan.check.settings import Limits, Sampling
 
 
@@ -50,7 +50,7 @@ def check(monkeypatch):
 
     def run(
         root: Path, images: int = 48, consistency: dict | None = None, **limits: float
-    ) -> Report:
+    ) -> CheckReport:
         sampling = Sampling(images=images, shown=1)
         reader = CaptureReader(
             consistency=Consistency(**({"least_inside": 0.2} | (consistency or {})))

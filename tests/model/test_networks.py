@@ -6,7 +6,7 @@ from torch.nn import functional
 
 from gsgan.model.deformation import encoded_size, positional_encoding
 from gsgan.model.discriminator import Discriminator
-from gsgan.model.generator import Generator, Style, upsampled_kernel
+from gsgan.model.generator import Generator, StyleModulation, upsampled_kernel
 from gsgan.model.pose_graph import PoseGraph, PoseLinear
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.utils.errors import ConfigError
@@ -86,7 +86,7 @@ def test_generator_uses_every_input():
     """Each of F, S, p2D and g moves the picture once the style has left its zero start."""
     torch.manual_seed(1)
     net = generator()
-    for style in [m for m in net.modules() if isinstance(m, Style)]:
+    for style in [m for m in net.modules() if isinstance(m, StyleModulation)]:
         torch.nn.init.normal_(style.from_pose.weight, std=0.1)
         torch.nn.init.normal_(style.from_map.weight, std=0.1)
     given = [x.requires_grad_() for x in inputs(16, 16)]
@@ -95,7 +95,7 @@ def test_generator_uses_every_input():
 
 
 def test_style_starts_as_plain_normalisation():
-    style = Style(6, 3, 35)
+    style = StyleModulation(6, 3, 35)
     h = torch.randn(1, 6, 4, 4)
     out = style(h, torch.randn(1, 3, 4, 4), torch.randn(1, 35))
     plain = torch.where(out < 0, out / 0.2, out)  # before the activation

@@ -106,7 +106,7 @@ class Limb:
 
 
 @dataclass(frozen=True)
-class Rig:
+class BodyRig:
     """T turns and D numbers of a body; one entry for every turn that a number moves.
 
     Args:
@@ -162,7 +162,7 @@ class _Turns(list[tuple[int, dict[str, Tensor]]]):
                 )
 
 
-def build_rig(body: MarkedBody) -> Rig:
+def build_rig(body: MarkedBody) -> BodyRig:
     """The rig of the free body or of a model of SMPL's family.
 
     Raises:
@@ -258,7 +258,7 @@ def _across(v: Tensor, along: Tensor) -> Tensor:
     return normalize(v - (v @ along) * along, dim=0)
 
 
-def _rig(body: MarkedBody, turns: _Turns, limbs: dict[str, Axes]) -> Rig:
+def _rig(body: MarkedBody, turns: _Turns, limbs: dict[str, Axes]) -> BodyRig:
     depth = [0]
     for parent in body.parents[1:]:
         depth.append(depth[parent] + 1)
@@ -291,7 +291,7 @@ def _rig(body: MarkedBody, turns: _Turns, limbs: dict[str, Axes]) -> Rig:
     reaches = torch.zeros(len(names), len(carriers), dtype=torch.bool)
     for i, d in zip(turn, number, strict=True):
         reaches[d] |= moved[i]
-    return Rig(
+    return BodyRig(
         names=names,
         joint=joints,
         parent=torch.tensor(parents),
@@ -304,7 +304,7 @@ def _rig(body: MarkedBody, turns: _Turns, limbs: dict[str, Axes]) -> Rig:
     )
 
 
-def prior(rig: Rig) -> tuple[Tensor, Tensor]:
+def prior(rig: BodyRig) -> tuple[Tensor, Tensor]:
     """``[D, D]`` the precision matrix of the numbers about the rest pose, 0 for the root's; and
     ``[D]`` the least value of each."""
     spread = [torch.inf] * 6

@@ -98,7 +98,7 @@ class Solver(nn.Module):
     before: Tensor  # [T]
     rest_hubs: Tensor  # [3, 3, 3]
     rest_hips: Tensor  # [3]
-    joint: Tensor  # of `Rig`, like the others
+    joint: Tensor  # of `BodyRig`, like the others
     entry_turn: Tensor
     entry_number: Tensor
     entry_axis: Tensor

@@ -105,7 +105,7 @@ class Section:
 
 
 @dataclass(frozen=True)
-class Report:
+class CheckReport:
     """All findings on a folder; ``numbers`` are the scores, plain values for JSON."""
 
     root: str
@@ -155,7 +155,7 @@ def listed(names: Iterable[object], most: int = 6) -> str:
     return text
 
 
-def page(report: Report) -> str:
+def page(report: CheckReport) -> str:
     """The report as one HTML file: no scripts, images embedded, nothing fetched."""
     # Names from the dataset are escaped.
     environment = Environment(autoescape=True, trim_blocks=True)
@@ -163,7 +163,7 @@ def page(report: Report) -> str:
     return environment.from_string(PAGE).render(report=report, colour=colour)
 
 
-def print_report(report: Report, console: Console) -> None:
+def print_report(report: CheckReport, console: Console) -> None:
     """Prints the tables of every section, then the findings, errors last, near the prompt."""
     for section in report.sections:
         # The first table of a section has its title.

