@@ -253,7 +253,7 @@ class Frame(TensorRecord):
 
     @property
     def inputs(self) -> tuple[Tensor, Tensor, Camera, BodyPose | None, Tensor]:
-        """What an avatar renders from: skeleton, visibility, camera, body pose, camera index."""
+        """The inputs of an avatar: skeleton, visibility, camera, body pose, camera index."""
         return self.skeleton, self.visibility, self.camera, self.body, self.camera_index
 
     def unpacked(self) -> Frame:

@@ -1,4 +1,4 @@
-"""What benchmarks share: a description of the machine, and tables."""
+"""A description of the machine, and tables, for all benchmarks."""
 
 from __future__ import annotations
 

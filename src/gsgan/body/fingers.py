@@ -28,7 +28,7 @@ TRACE = 1e-4  # of a bone at rest, added to the observed one: a bone of no lengt
 
 
 class Hands(NamedTuple):
-    """What the hand landmarks of B frames determine.
+    """Quantities of B frames that follow from the hands' landmarks.
 
     Args:
         turns: ``[B, 20, 3]`` of `Fingers.joints`.

@@ -231,7 +231,7 @@ class Solver(nn.Module):
         return self._constants, self._counts(), _settings()
 
     def _counts(self) -> dict[str, int]:
-        """Those of `compiled.COUNTS`."""
+        """The counts that `compiled.COUNTS` names."""
         rig = self.rig
         sizes = (self.parents, len(rig.joint), len(rig.names), len(rig.entry_turn))
         more = (
@@ -246,7 +246,7 @@ class Solver(nn.Module):
 
     @cached_property
     def _constants(self) -> dict[str, Tensor]:
-        """Those of `compiled.CONSTANTS`."""
+        """The tensors that `compiled.CONSTANTS` names."""
         with torch.inference_mode(False), torch.no_grad():
             template = constants(MEDIAPIPE33, self.joints.device, self.joints.dtype)
 

@@ -301,7 +301,7 @@ class Avatar(nn.Module):
         generate: bool,
         supersample: bool,
     ) -> Rendering:
-        """What the cameras see (paper Fig. 3)."""
+        """The drawings and images that the cameras see (paper Fig. 3)."""
         raster = S = image = alpha = None
         with full_precision(p.device):
             with self.stage("skeleton"):

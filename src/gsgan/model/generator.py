@@ -39,7 +39,7 @@ class Encoder(nn.Module):
         return self.levels(self.stem(x))
 
     def levels(self, stem: Tensor) -> list[Tensor]:
-        """The same from the stem's output, before its activation."""
+        """The features of every level from the stem's output, before its activation."""
         levels = [_activate(stem)]
         if self.after is not None:
             levels = [_activate(self.after(levels[0]))]
@@ -281,7 +281,7 @@ def upsampled_kernel(weight: Tensor) -> Tensor:
 
 
 def channels_last(x: Tensor) -> Tensor:
-    """The same, channels last in memory."""
+    """The tensor with channels last in memory."""
     return x.contiguous(memory_format=torch.channels_last)
 
 

@@ -47,7 +47,7 @@ class Rendering:
         return Rendering(self.image, self.alpha)
 
     def pasted(self, window: Window) -> Rendering:
-        """The same in the whole image, background outside the window."""
+        """The rendering in the whole image, with background outside the window."""
         names = (
             "image",
             "alpha",

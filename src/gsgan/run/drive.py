@@ -1,4 +1,4 @@
-"""What drives an avatar: frames of its run, a motion file, or the subject's rest pose."""
+"""The motion that drives an avatar: frames of its run, a motion file, or the rest pose."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run folder stores: its config and its checkpoint."""
+"""The files of a run folder: its config and its checkpoint."""
 
 from __future__ import annotations
 

@@ -124,7 +124,7 @@ class SkeletonTemplate:
         )
 
     def with_face(self, at_rest: Sequence[Vector]) -> SkeletonTemplate:
-        """The same skeleton with another person's face at rest, as of `gsgan.skeleton.in_head`."""
+        """A copy with another person's face at rest, as `gsgan.skeleton.in_head` gives it."""
         rest = np.asarray(self.rest_positions)
         moved = np.asarray(at_rest) + rest[list(self.head)].mean(0)
         kept = self.rest_positions[: -len(self.expression)]

@@ -192,7 +192,7 @@ def _version(command: list[str]) -> str:
 
 
 def _cpu() -> str:
-    """What -march=native depends on: different machines may share a home folder."""
+    """The processor, on which -march=native depends: machines may share a home folder."""
     lines = [platform.machine(), platform.processor()]
     info = Path("/proc/cpuinfo")
     if info.is_file():

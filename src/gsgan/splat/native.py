@@ -98,7 +98,7 @@ def composite(
 
 
 class _Plan:
-    """What the backward pass needs of the forward pass; owns memory of the library."""
+    """Tile lists of the forward pass, for the backward pass; owns memory of the library."""
 
     def __init__(self, dtype: torch.dtype) -> None:
         self.pointer = ctypes.c_void_p()

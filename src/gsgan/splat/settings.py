@@ -10,7 +10,7 @@ _DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 @dataclass(frozen=True)
 class Accuracy:
-    """What the rasteriser may skip.
+    """The contributions that the rasteriser may skip.
 
     Two rules hold in every backend. A contribution with ``alpha < alpha_min`` is skipped. A
     contribution whose incoming transmittance (the product of ``1 - alpha`` over the contributions

@@ -168,7 +168,7 @@ class _Walk:
         self.values_grad = torch.zeros_like(self.values)
 
     def gradients(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Of geometry ``[B, N, 5]``, opacities ``[B, N]`` and values ``[B, N, V]``."""
+        """The gradients of geometry ``[B, N, 5]``, opacities ``[B, N]``, values ``[B, N, V]``."""
         sums = self.sums[:-1].to(self.geometry)
         opacities = self.opacities[:-1].to(self.geometry)
         geometry = _geometry_gradient(self.geometry[:-1], opacities, sums)

@@ -131,7 +131,7 @@ class AvatarTraining(LightningModule):
 
     @property
     def processes(self) -> int:
-        """Of the training; each has its own batch."""
+        """The number of processes that train; each has its own batch."""
         return 1 if self._trainer is None else self.trainer.world_size
 
     @property

@@ -68,7 +68,7 @@ class Rollback:
     def problem(
         self, over_ranks: Callable[[Tensor], Tensor] = lambda value: value
     ) -> str | None:
-        """What has collapsed, by means over all ranks: "" for nothing; None for a state that is not
+        """A description of what has collapsed, by means over all ranks: "" for nothing; None for a state that is not
         good enough to be kept."""
         if not self.means:
             return ""

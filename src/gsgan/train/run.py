@@ -277,7 +277,7 @@ def _evaluate(
 
 
 def training_record(config: DictConfig, data: GsganData) -> dict[str, Any]:
-    """What must not change when a run is resumed: the settings, and the poses that `gsgan.fit`
+    """Settings that must not change when a run is resumed, and the poses that `gsgan.fit`
     made, whose file may be overwritten under the same name."""
     settings = record(config)
     poses = data.layout.poses

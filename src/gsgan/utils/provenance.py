@@ -82,7 +82,7 @@ def marked_mp4(video: bytes) -> bytes:
 
 
 def verify(path: Path) -> Provenance:
-    """What a PNG, JPEG or MP4 file says about its origin.
+    """The origin that a PNG, JPEG or MP4 file states.
 
     Raises:
         DataError: when it is missing, damaged or of another format.
