@@ -68,8 +68,10 @@ class Rollback:
     def problem(
         self, over_ranks: Callable[[Tensor], Tensor] = lambda value: value
     ) -> str | None:
-        """A description of what has collapsed, by means over all ranks: "" for nothing; None for a state that is not
-        good enough to be kept."""
+        """A description of what has collapsed, by means over all ranks.
+
+        It is "" for nothing, and None for a state that is not good enough to be kept.
+        """
         if not self.means:
             return ""
         names = sorted(self.means)
