@@ -104,11 +104,14 @@ class Surface(nn.Module):
 
     def posed(self, pose: BodyPose) -> tuple[Gaussians, Tensor]:
         """The Gaussians of a pose, and its landmarks ``[B, 33, 3]`` metres."""
+        # points at rest, moved along their normals by at most `REACH`, and then with the bones
         bones = self.body.transforms(pose)
         points = self.points
         A, t = blend_transforms(bones, points.bone_index, points.bone_weight)
         distance = self.basis @ (REACH * torch.tanh(self.offsets / REACH))
         means = skin(points.means + distance.unsqueeze(-1) * self.normals, A, t)
+
+        # round Gaussians, which turn and stretch with the skin
         sigma = SIGMA * points.spacing * self.log_scale.exp()
         axes = A * sigma[:, None, None]
         opacities = means.new_full(means.shape[:2], OPACITY)
@@ -173,6 +176,7 @@ class Fitter:
                 scale[bone] = 0
         self.scale = scale
 
+        # weights of the landmarks, and an optimiser each for surface and poses
         self.weight = frames.visibility.clone()
         self.weight[:, list(LOOSE_LANDMARKS)] *= LOOSE
         self.surface_optimiser = torch.optim.Adam(
@@ -217,6 +221,8 @@ class Fitter:
         for i in order:
             pose = self.pose(torch.tensor([i]))
             share, landmarks = self._share(i, pose, chance)
+
+            # the priors of landmarks (robust, linear far away) and of angles
             square = (landmarks[0] - self.frames.skeletons[i]).square().sum(-1)
             robust = (1 + square / settings.noise**2).sqrt() - 1
             turned = (pose.theta[0] - self.start.theta[i]) / ANGLE
@@ -242,6 +248,8 @@ class Fitter:
         for i in range(len(poses.theta)):
             pose = BodyPose(poses.theta[i][None], poses.transl[i][None])
             person, _ = self.surface.posed(pose)
+
+            # Unsure pixels do not count.
             ious = []
             for frame in self._windows(i):
                 filled = self.surface.alpha(person, frame.camera) > 0.5
@@ -260,6 +268,7 @@ class Fitter:
     ) -> tuple[Tensor, Tensor]:
         """Wrong alpha as a share of the masks, and the posed landmarks."""
         frames = self._windows(i)
+        # a few random cameras are enough for a step
         if len(frames) > self.settings.cameras:
             frames = chance.sample(frames, self.settings.cameras)
         person, landmarks = self.surface.posed(pose)
@@ -279,6 +288,7 @@ class Fitter:
 
     def _set_rates(self) -> None:
         """Learning rates of this sweep: held first, then a cosine down to `FINAL_RATE`."""
+        # `fallen` rises from 0 to 1 over the sweeps after the held ones
         held = self.settings.hold * self.settings.sweeps
         rest = max(self.settings.sweeps - held, 1e-9)
         fallen = min(max(self.swept - held, 0) / rest, 1)

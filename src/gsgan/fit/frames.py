@@ -46,6 +46,8 @@ class MaskedFrames:
     ) -> None:
         layout = data.layout
         cameras = data.splits.train_cameras
+
+        # all images of these frames by the training cameras
         used = layout.frames if held_out else data.trained
         items = []
         for frame in used:
@@ -82,6 +84,8 @@ class MaskedFrames:
 
     def _image(self, place: int) -> Frame:
         frame = self.dataset[place]
+
+        # Pixels outside the camera's image are unsure, as are those that the mask marks.
         unseen = self._unseen.get(place)
         if unseen is not None:
             unsure = unseen.to(frame.mask.dtype)
@@ -103,6 +107,8 @@ class MaskedFrames:
             inside = self.dataset.inside(place)
             if inside is not None:
                 self._unseen[place] = inside < 0.5
+
+            # the area of the compared part, in square metres
             image = self._image(place)
             seen = around(image.skeleton[0], image)
             mask = seen.mask

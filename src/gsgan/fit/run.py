@@ -57,6 +57,8 @@ def fit_report(
     masked = fitter.frames
     before = fitter.surface.body
     visible = masked.visibility > 0
+
+    # medians of each set of poses
     report: dict[str, Any] = {"frames": {}, "joints": {}}
     distance = {}
     overlap = {}
@@ -81,6 +83,8 @@ def fit_report(
             "residual_mm": _medians(distance, i),
             "iou": _medians(overlap, i),
         }
+
+    # the angles by which the masks turned the joints
     turned = (found.theta - fitter.start.theta).norm(dim=-1).rad2deg()
     report["turned_degrees"] = float(turned.quantile(0.95))
     return report
@@ -153,6 +157,7 @@ def fit_before_training(
         DataError: when the masks hold no person, or the folder is read-only.
     """
     root = data.layout.root
+    # small images around the person
     seen = copy(data)
     seen.size = SIZE
     seen.crop = PersonCrop(margin=MARGIN)
@@ -204,6 +209,8 @@ def fit_body(
     layout = data.layout
     folder = layout.root if out is None else Path(out).expanduser()
     _make_folder(folder, overwrite)
+
+    # the frames with a person in their masks
     with console.status("reading masks"):
         frames = MaskedFrames(data, device, settings.least_mask, settings.held_out)
     if frames.left_out:
@@ -267,6 +274,7 @@ def _make_folder(out: Path, overwrite: bool) -> None:
         out.mkdir(parents=True, exist_ok=True)
         write_atomically(attempt, b"")
         attempt.unlink(missing_ok=True)  # another fit may have removed it
+    # Poses are replaced only if a fit made them and overwrite is set.
     if (out / POSES).exists():
         if not (out / SHAPE).exists():
             raise ConfigError(
@@ -298,6 +306,7 @@ def _write_body(
     for hands, solved in poses.items():
         theta = solved.theta.clone()
         transl = solved.transl.clone()
+        # Registered poses replace solved ones, except for the fingers.
         if kept is not None:
             theta[rows] = kept.theta
             transl[rows] = kept.transl
@@ -376,6 +385,8 @@ def _refined(
     shape = replace(shape, offsets=fit_offsets(shape, registered, p, seen))
     if data.layout.hands is None:
         return shape
+
+    # the hands, and the poses with them
     p, seen = _joints(data, frames, hands=True)
     shape = fit_hands(shape, _solve(data, shape, frames), p, seen)
     by_hands = _solve(data, shape, frames, hands=True)

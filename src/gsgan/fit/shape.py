@@ -248,6 +248,7 @@ def _pairs() -> _Pairs:
                 plain = name.replace("left_", "").replace("_left", "")
                 own[plain] = name.replace("left", side)
 
+        # pairs on one side, and once those across
         for sigma, text in ((SURE, RIGID), (UNSURE, LOOSE)):
             for pair in text.split(", "):
                 a, b = pair.split()
@@ -268,6 +269,7 @@ def _fit_lengths(space: ShapeSpace[MarkedBody], p: Tensor, seen: Tensor) -> Tens
     With the residuals r and the prior's precisions Λ, the cost ``Σ 2 (√(1 + r²) - 1) + xᵀ Λ x`` is
     minimised by Levenberg-Marquardt steps, reweighted by ``w = 1 / √(1 + r²)``.
     """
+    # the median of each distance, if some frame and the body have both landmarks
     a, b, sigma = _pairs()
     lengths = (p[:, a] - p[:, b]).norm(dim=-1)
     target = _median(lengths, seen[:, a] & seen[:, b]).log()
@@ -297,12 +299,15 @@ def _fit_lengths(space: ShapeSpace[MarkedBody], p: Tensor, seen: Tensor) -> Tens
     damping = 1e-2
     best = cost(x)
     for _ in range(LENGTH_STEPS):
+        # the normal equations, and the step with damping
         r = residual(x)
         J = torch.func.jacfwd(residual)(x)
         w = (1 + r.square()).rsqrt()
         H = J.mT @ (w.unsqueeze(-1) * J) + prior.diag()
         g = J.mT @ (w * r) + prior * x
         new = x - torch.linalg.solve(H + damping * H.diag().diag(), g)
+
+        # A step that does not reduce the cost is repeated with more damping.
         new_cost = cost(new)
         if new_cost < best:
             x = new
@@ -327,6 +332,7 @@ def _fit_landmarks(
         H = Jᵀ w J + prior,   C = Jᵀ w G,
         A = Σ (Gᵀ w G - Cᵀ H⁻¹ C) + prior,   b = Σ (Gᵀ w r - Cᵀ H⁻¹ g) + prior x.
     """
+    # Offsets enter the landmarks linearly: their derivatives are the same in all steps.
     p = p - p[:, MEDIAPIPE33.hips].mean(1, keepdim=True)
     prior = shape_prior(space)
     share = min(1.0, INDEPENDENT / len(p))

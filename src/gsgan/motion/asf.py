@@ -113,6 +113,7 @@ class _Skeleton(NamedTuple):
 
 
 def _read_skeleton(path: Path) -> _Skeleton:
+    # the lines of each section, which begins with a line such as ":units"
     sections = defaultdict(list)
     section = ""
     for line in _lines(path):
@@ -121,11 +122,13 @@ def _read_skeleton(path: Path) -> _Skeleton:
         else:
             sections[section].append(line)
 
+    # units and the root, one value to a key
     units = {"length": ["1"], "angle": ["deg"]}
     units |= {key: values for key, *values in sections["units"]}
     radians = np.pi / 180 if units["angle"][0].startswith("deg") else 1.0
     root = {key: values for key, *values in sections["root"]}
 
+    # bones, of which the first value of each key counts
     described = []
     bone: dict[str, list[str]] = {}
     for key, *values in sections["bonedata"]:
@@ -140,6 +143,7 @@ def _read_skeleton(path: Path) -> _Skeleton:
         name = words["name"][0]
         bones[name] = _Bone(words, radians)
 
+    # the hierarchy: each line has a parent and its children
     parents: dict[str, str] = {}
     for parent, *children in sections["hierarchy"]:
         if parent not in ("begin", "end"):
@@ -156,6 +160,7 @@ def _read_frames(
     path: Path, bones: dict[str, _Bone], names: list[str]
 ) -> dict[str, Array]:
     """Numbers ``[F, n]`` of each bone that moves, in the order of its degrees of freedom."""
+    # A line with a number alone begins a frame; the other lines are bones.
     frames: list[dict[str, list[float]]] = []
     for key, *numbers in _lines(path):
         if not numbers and key.isdigit():
@@ -167,6 +172,7 @@ def _read_frames(
     if not frames:
         raise ValueError("it has no frames")
 
+    # Each frame must have all numbers of each bone that moves.
     moving = [name for name in names if bones[name].dof]
     for number, frame in enumerate(frames):
         for name in moving:

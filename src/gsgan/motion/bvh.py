@@ -41,6 +41,8 @@ def read_bvh(path: Path) -> RigMotion:
         # Some programs end the file with control characters, as DOS did.
         text = text.rstrip("\x1a\0 \r\n\t")
         hierarchy, *motion = re.split(r"\bMOTION\b", text, maxsplit=1)
+
+        # Braces may touch other words.
         words = re.sub("([{}])", r" \1 ", hierarchy).split()
         if words[:1] != ["HIERARCHY"] or not motion:
             raise ValueError("HIERARCHY and MOTION are expected")
@@ -57,6 +59,7 @@ def read_bvh(path: Path) -> RigMotion:
 
 def _read_hierarchy(words: list[str]) -> list[_Joint]:
     """The joints between HIERARCHY and MOTION, parents first; end sites are called "... end"."""
+    # `above` has the joints whose braces are open, the root first.
     joints: list[_Joint] = []
     above: list[int] = []
     rest = iter(words)

@@ -95,6 +95,7 @@ def checked(motion: Clip, least_visibility: float) -> Clip:
     if not len(motion):
         raise DataError(f"{motion.path} has no frames; expected a motion")
     trunk = list(TRUNK)
+    # shoulders and hips count at any visibility above 0
     finite: Bool = np.asarray(np.isfinite(motion.p).all(-1))
     known = finite & (motion.visibility >= least_visibility)
     known[:, trunk] = finite[:, trunk] & (motion.visibility[:, trunk] > 0)
@@ -159,6 +160,7 @@ def is_own(motion: Clip, subject: Proportions) -> bool:
     """Whether the motion's bones are as long as the subject's: it needs no retargeting."""
     with np.errstate(invalid="ignore"):
         lengths = bone_lengths(motion.p, BONES).T
+    # the relative difference of each bone's median length
     differences = []
     for values, bone in zip(lengths, BONES, strict=True):
         seen = values[np.isfinite(values)]
@@ -182,6 +184,7 @@ def completed(motion: Clip, up: str) -> Float:
     `SELDOM` of the frames show takes its place in the rest pose, relative to its parent. Gaps of a
     hand or the face of up to `GAP` frames are interpolated; in longer ones it is NaN.
     """
+    # Offsets of the body's joints from their parents are interpolated.
     whole = motion.p @ upright(up).T
     p = whole[:, :BODY]
     known: Bool = np.asarray(np.isfinite(p).all(-1))
@@ -198,8 +201,10 @@ def completed(motion: Clip, up: str) -> Float:
                 p[gaps, joint, axis] = p[gaps, parent, axis] + filled[gaps]
             known[:, joint] = known[:, parent]
 
-    # joints without an offset take their places in the rest pose
+    # Joints without an offset take their places in the rest pose.
     body, _ = sanitise(torch.from_numpy(p), torch.from_numpy(known))
+
+    # hands and the face
     parts = [body.numpy()]
     for part in (*HAND_JOINTS.values(), EXPRESSION):
         parts.append(_bridged(whole[:, part]))

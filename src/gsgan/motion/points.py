@@ -111,8 +111,11 @@ def _metres(p: Float) -> float:
 
 def _joint(name: str) -> int | None:
     """The MediaPipe joint of a marker: LShoulder, left_shoulder, Lknee, LBigToe, Nose."""
+    # the letters, without a prefix such as "person:"
     word = re.sub(r"[^a-z]", "", name.split(":")[-1].lower())
     word = word.replace("bigtoe", "footindex")
+
+    # "l" and "r" stand for "left" and "right"
     word = re.sub("^r(?!ight)", "right", word)
     word = re.sub("^l(?!eft)", "left", word)
     plain = [name.replace("_", "") for name in MEDIAPIPE33.names]

@@ -149,6 +149,8 @@ class _PoseFile:
         if self.data.ndim != 4 or 0 in self.data.shape[:2]:
             raise DataError(f"{path} has no frames with a person; expected a motion")
         self.fps = pose.body.fps
+
+        # The points of all parts are in one array, part by part.
         self.parts: dict[str, _Part] = {}
         start = 0
         for part in pose.header.components:
@@ -186,6 +188,7 @@ def _to_metres(
     non-negative least squares. Pixels are square: x and y then take their mean scale. One unknown
     for both would leave no depth to a person with longer arms, or narrower shoulders.
     """
+    # one row for each bone in each frame in which it is seen
     rows = []
     for a, b in LENGTHS:
         visible = (visibility[:, (a, b)] > 0.2).all(1)
@@ -214,6 +217,7 @@ def _parts_to_metres(
     The scale of x and y, and that of z, solve `_to_metres`' equations for pairs of all parts that
     are as long as in ``rest [n, 3]``.
     """
+    # one row for each pair in each frame: x and y together, then z
     rows = []
     points = []
     for part, at_rest in zip(parts, rest, strict=True):

@@ -246,6 +246,7 @@ def _body_pose(
     transl = scale * expect_array(arrays, "transl", (F, 3), path)
     fps = fps or meta.get("fps")
 
+    # another number of bones: SMPL
     if bones != len(free_body().parents):
         smpl = {"poses": theta.reshape(F, -1), "trans": transl}
         if "betas" in arrays:
@@ -287,6 +288,8 @@ def _smpl(
         raise ConfigError(
             f"smpl={source.smpl} does not exist; expected a .pkl or .npz file"
         )
+
+    # poses, moves in metres and the median shape
     model = read_smpl(source.smpl)
     poses = _smpl_poses(path, arrays)
     F = len(poses)
@@ -296,7 +299,7 @@ def _smpl(
     betas = np.median(betas.reshape(-1, betas.shape[-1]), axis=0)
     betas = betas[: model.shapedirs.shape[-1]]
 
-    # NaN frames are posed as zeros, and set to NaN again below
+    # Frames with NaN are posed as zeros, and set to NaN again below.
     known = np.isfinite(poses).all(1) & np.isfinite(moves).all(1)
     theta = _for_model(np.nan_to_num(poses).reshape(F, -1, 3), model)
     moves = np.nan_to_num(moves)
@@ -321,6 +324,7 @@ def _smpl_poses(path: Path, arrays: dict[str, Any]) -> Float:
     too; HuMMan holds ``global_orient`` and ``body_pose`` (69); ZJU-MoCap an empty root in ``poses``
     (72) and ``Rh``.
     """
+    # one row of numbers for each frame
     poses = np.asarray(_first(arrays, POSE_KEYS), np.float64)
     poses = poses.reshape(len(poses), -1)
     root = _first(arrays, ROOT_KEYS)
@@ -331,6 +335,8 @@ def _smpl_poses(path: Path, arrays: dict[str, Any]) -> Float:
                 f"{', '.join(ROOT_KEYS)} beside them"
             )
         root = np.asarray(root, np.float64).reshape(len(poses), 3)
+
+        # SMPL-X's jaw, eyes and hands follow the body.
         columns = [root, poses]
         smplx_body = poses.shape[1] == WITHOUT_ROOT[0]
         if smplx_body and all(key in arrays for key in PART_KEYS):
@@ -339,6 +345,7 @@ def _smpl_poses(path: Path, arrays: dict[str, Any]) -> Float:
                 columns.append(part.reshape(len(poses), -1))
         poses = np.concatenate(columns, axis=1)
     elif "Rh" in arrays:
+        # ZJU-MoCap: Rh replaces the empty root.
         root = np.asarray(arrays["Rh"], np.float64).reshape(-1, 3)
         poses = np.concatenate([root, poses[:, 3:]], axis=1)
     if poses.shape[1] % 3 or poses.shape[1] < 3 * SMPL_BODY:
@@ -418,6 +425,7 @@ def _landmark_row(where: str, frame: Any) -> Float:
     if not points:
         return np.repeat([[np.nan, np.nan, np.nan, 0]], JOINTS, axis=0)
 
+    # 33 landmarks of 4 numbers
     try:
         rows = [_numbers(point) for point in points]
     except TypeError:
@@ -475,6 +483,7 @@ def _rig(path: Path, motion: RigMotion, metres: float | None, source: Source) ->
         raise DataError(
             f"{path} is no motion of a person ({reason}); export it again"
         ) from error
+    # the unit with which the legs are about as long as the subject's
     if metres is None:
 
         def mismatch(unit: str) -> float:

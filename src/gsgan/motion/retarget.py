@@ -206,6 +206,7 @@ def _posed_hand(p: Float, subject: Proportions, wrist: int) -> tuple[Float, Floa
         the standard pose; NaN if the palm is unknown.
     """
     rest = subject.rest_with_hands[HAND_JOINTS[wrist]]
+    # the palm turns as a whole; fingers keep their own directions
     palm = hand_frame(p, *PALM) @ hand_frame(rest, *PALM).T
     q = (rest - subject.rest[wrist]) @ palm.mT
     for a, b in FINGER_BONES:
@@ -229,6 +230,7 @@ def rig_landmarks(standard: StandardMotion, subject: Proportions) -> Float:
     Shoulders, elbows, wrists, hips, knees and ankles are the rig's joints. Rigs have no landmarks
     of hands, feet and face: the subject's own are rotated as the rig's hands, feet and head.
     """
+    # joints, and with hands and feet the subject's landmarks
     rest = subject.rest
     scale = subject.leg / standard.leg
     p = np.full((len(standard.joints["Hips"]), *rest.shape), np.nan)
@@ -244,6 +246,7 @@ def rig_landmarks(standard: StandardMotion, subject: Proportions) -> Float:
             turned = (rest[list(ends)] - rest[joint]) @ standard.turns[side + bone].mT
             p[:, ends] = p[:, joint, None] + turned
 
+    # the head, at the end of the neck
     if "Head" in standard.turns:
         neck = middle(rest, EARS) - middle(rest, SHOULDERS)
         ears = middle(p, SHOULDERS) + (standard.turns["Neck"] @ neck)
@@ -262,6 +265,8 @@ def joined(clips: Sequence[Float], subject: Proportions, n: int) -> Float:
     for before, after in pairwise(clips):
         a = face_in_head(before)
         b = face_in_head(after)
+
+        # positions and speeds at both ends
         ends = np.stack([a[-1], b[0]])
         speeds = np.zeros_like(ends)
         if len(a) > 1:
@@ -271,6 +276,8 @@ def joined(clips: Sequence[Float], subject: Proportions, n: int) -> Float:
         path = CubicHermiteSpline(
             [0, n + 1], np.nan_to_num(ends), np.nan_to_num(speeds)
         )
+
+        # Landmarks that an end lacks are missing in between.
         known = np.isfinite(ends).all((0, 2))[:, None]
         transition = np.where(known, path(np.arange(1, n + 1)), np.nan)
         parts.append(retargeted(transition, subject, scale=1.0))
@@ -314,8 +321,11 @@ def placed(
             whole motion touches it.
         stay: subtract the path of a person who walks away, as on a treadmill.
     """
+    # the subject's heading
     turn = rotation(np.array([0, 0, subject.facing - heading(p[0])]))
     q = p @ turn.T
+
+    # the ground below the feet, and the path of the hips
     path = middle(q, HIPS)[:, :2]
     lowest = q[:, HEELS_AND_TOES, 2].min(axis=1)
     floor = np.full(len(q), lowest.min())

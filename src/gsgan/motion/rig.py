@@ -131,8 +131,10 @@ def finger_hinges(
             straight = 0.0
             across = np.zeros(3)
             if finger == "Thumb":
+                # The thumb bends towards the base of the little finger.
                 axis = unit(np.cross(along, unit(opposite - joint[bone])))
             else:
+                # Fingers bend towards the palm.
                 axis = unit(np.cross(along, palm))
                 sine = np.cross(before, along) @ axis
                 straight = float(np.arctan2(sine, before @ along))
@@ -159,6 +161,7 @@ class Rig:
         for side in SIDES:
             self.fingers[side] = finger_hinges(self.joint, self.turns, side)
 
+        # the lower sides of foot and toes
         self.soles: dict[str, Array] = {}
         for side in SIDES:
             toes = self._with_descendants(side + "ToeBase")
@@ -249,12 +252,15 @@ class Pose:
             pole: ``[F, 3]`` direction.
         """
         first, middle, end = [side + bone for bone in part]
+        # the directions of both bones in the world
         upper, lower, hinge = two_bone(
             target=target - self.position(first),
             pole=pole,
             upper=self.rig.length(first, middle),
             lower=self.rig.length(middle, end),
         )
+
+        # their turns, from the same axes in the standard pose
         along, axis = limb_axes(part, side)
         rest = frame(along, axis).T
         self.set_turn(first, frame(upper, hinge) @ rest)
@@ -265,6 +271,7 @@ class Pose:
         longest = 0.995 * REACH * self.rig.leg
         drop = np.zeros(len(self.hips))
         for side, ankle in zip(SIDES, ankles, strict=True):
+            # Pythagoras: the height of the hip joint at which the leg is fully stretched
             gap = self.position(side + "UpLeg") - ankle
             horizontal = (gap[:, :2] ** 2).sum(axis=1)
             vertical = np.sqrt(np.maximum(longest**2 - horizontal, 0))
@@ -275,6 +282,7 @@ class Pose:
         """Sets a hand's turn ``[F, 3, 3]``; the forearm takes a share of its twist."""
         upper = self.turn(side + "Arm")
         lower = self.turn(side + "ForeArm")
+        # the forearm without twist, and the hand's twist against it
         neutral = between(upper[..., 0], lower[..., 0]) @ upper
         angle = FOREARM_TWIST * twist(neutral.mT @ turn, axis=0)
         x_axis = np.eye(3)[0]

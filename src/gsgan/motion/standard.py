@@ -325,6 +325,8 @@ def _upward(p: Array, known: dict[str, int], usual: Array | None = None) -> Arra
     hips = _middle(p, known, "UpLeg")
     trunk = unit(_middle(p, known, "Arm") - hips)
     legs = unit(hips - _middle(p, known, "Foot"))
+
+    # the smaller cosine of trunk and legs with each axis
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     cosine = np.minimum(trunk @ axes.T, legs @ axes.T)
 
@@ -348,6 +350,7 @@ def person_axes(p: Array, known: dict[str, int], up: Array) -> Array:
 
 def _by_side(p: Array, known: dict[str, int], up: Array) -> dict[str, int]:
     """The joints; left and right are exchanged if knees and toes would point backwards."""
+    # Votes above 0 are behind the line from hip to ankle, or behind the ankle.
     back = person_axes(p, known, up)[:, 1]
     votes = []
     for side in SIDES:
@@ -468,8 +471,11 @@ def _follow_positions(
 ) -> None:
     """Adds the turns of the trunk and the feet of frames in which the person does not stand."""
     for turn, A, p in zip(at_rest, reference.axes, reference.joints, strict=True):
+        # the trunk, by the line from hips to shoulders
         trunk = A @ (_middle(p, known, "Arm") - _middle(p, known, "UpLeg"))
         turn["Hips"] = between(np.array([0.0, 0, 1]), trunk)
+
+        # feet, by their heading
         for side in SIDES:
             if side + "ToeBase" in known:
                 toe = A @ (p[known[side + "ToeBase"]] - p[known[side + "Foot"]])
@@ -537,6 +543,7 @@ def _flatten_feet(turns: dict[str, Array], joints: dict[str, Array]) -> None:
         speed = np.linalg.norm(np.diff(ends, axis=1, prepend=second), axis=-1)
         rests = np.argsort(speed.max(axis=0))[: 1 + len(joints[foot]) // 5]
 
+        # At rest the foot has the slope of a flat foot, and the toes do not bend.
         ahead = unit(joints[toe] - joints[foot])
         down = float(np.median(ahead[rests, 2]).clip(STEEPEST, 0))
         flat = np.array([0, -np.sqrt(1 - down**2), down])
@@ -564,6 +571,7 @@ def floor_under(lowest: Array, leg: float, step: float) -> Array:
 
     Jumps lose `HOVER`: a floor that follows the lowest of a second may be too low by that much.
     """
+    # the lowest of a second, smoothed
     window = max(1, round(1 / step))
     floor = gaussian_filter1d(minimum_filter1d(lowest, window), window / 4)
     return np.asarray(floor + np.minimum(lowest - floor, HOVER * leg))
@@ -574,6 +582,8 @@ def drift(path: Array, step: float) -> Array:
     middle = (path.min(axis=0) + path.max(axis=0)) / 2
     if np.linalg.norm(path - middle, axis=1).max() <= ROOM:
         return np.broadcast_to(middle, path.shape)
+
+    # Point reflections at both ends continue the path in the same direction.
     pad = len(path) - 1
     odd = np.pad(path, ((pad, pad), (0, 0)), mode="reflect", reflect_type="odd")
     smooth = gaussian_filter1d(odd, DRIFT_SECONDS / step, axis=0)

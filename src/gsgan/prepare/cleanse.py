@@ -87,6 +87,7 @@ def _misfit(p: Float, bones: Bones, share: float, noise: float = 0.0) -> Bool:
         share: of the median by which a length may differ.
         noise: metres by which it may differ too.
     """
+    # the median length of each bone; 1 if it is never known
     lengths = bone_lengths(p, bones)
     usual = np.ones(len(bones))
     for b, values in enumerate(lengths.T):
@@ -120,6 +121,7 @@ def smooth(p: Float, weight: Float, time: Float, seconds: float) -> Float:
 
     # normal equations of each frame's parabola, whose constant is the value at that frame
     for f, now in enumerate(time):
+        # a Gaussian neighbourhood, in units of its standard deviation
         near = np.abs(time - now) <= REACH * seconds
         s = (time[near] - now) / seconds
         basis = s[:, None] ** np.arange(DEGREE + 1)

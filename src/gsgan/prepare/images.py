@@ -43,6 +43,7 @@ def find_masks(folder: Path, names: Iterable[str]) -> dict[str, dict[int, Path]]
     found = {}
     for name in names:
         place = folder / name
+        # Names such as 000012_1.png have the number of a person after that of the frame.
         of_persons = []
         for path in place.glob("*"):
             if path.suffix.lower() in IMAGE_SUFFIXES:
@@ -63,6 +64,7 @@ def _first_number(stem: str) -> int:
 
 def tidy(mask: Bytes, levels: tuple[float, float]) -> Bytes:
     """A mask ``[H, W]`` 0..255 with its levels stretched and small pieces removed."""
+    # the levels, by a table of all values
     low = 255 * levels[0]
     high = 255 * levels[1]
     share = np.clip((np.arange(256) - low) / (high - low), 0, 1)
@@ -116,6 +118,7 @@ def write_images(
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
 
+    # images are straightened at the full size, then scaled
     window = Crop(0, 0, camera.size)
     size = scaled(camera, scale).size
     mapping = undistort_map(camera.K, camera.dist, window) if camera.distorted else None
@@ -129,6 +132,7 @@ def write_images(
         straight = take(pixels, window, mapping, exact=False)
         _write(path, resize(straight, size, exact=False))
 
+    # a video is read in order, up to the last frame
     written = list[int]()
     last = max(frames, default=-1)
     for number, image in source.images():

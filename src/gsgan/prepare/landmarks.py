@@ -100,6 +100,7 @@ def gather(
     frames = np.unique(np.concatenate(ids))
     frames = frames[frames >= 0]  # file names hold no negative numbers
 
+    # frames that a camera lacks stay NaN
     px = np.full((len(ids), len(frames), ALL, 2), np.nan)
     conf = np.zeros(px.shape[:3])
     for c, (own, found) in enumerate(zip(ids, detections.values(), strict=True)):
@@ -145,6 +146,8 @@ def _read_npz(path: Path) -> Detections:
     body = expect_array(arrays, "px", (None, BODY, 2), path).astype(np.float64)
     F = len(body)
     frame_id = whole_frame_ids(expect_array(arrays, "frame_id", (F,), path), str(path))
+
+    # the body, then hands and face if the file has them
     px = np.full((F, ALL, 2), np.nan)
     conf = np.zeros((F, ALL))
     px[:, :BODY] = body
@@ -251,6 +254,7 @@ def _joints(
     px = np.full((ALL, 2), np.nan)
     conf = np.zeros(ALL)
 
+    # joints of the body, then those of each whole hand
     def put(joints: list[int], triples: Float) -> None:
         seen = known(triples) & (triples[:, 2] > 0)
         px[joints] = np.where(seen[:, None], triples[:, :2] + PIXEL_CENTRE, np.nan)

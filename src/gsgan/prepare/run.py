@@ -94,6 +94,8 @@ def print_summary(numbers: Mapping[str, Any], console: Console) -> None:
     """Prints the numbers of the cameras and the notes."""
     stages = numbers["error_px"]
     cameras = numbers["cameras"]
+
+    # a row for each camera, and one for all
     rows: list[tuple[str, ...]] = []
     for name, camera in cameras.items():
         errors = [_number(error, ".2f") for error in camera["error_px"].values()]
@@ -116,6 +118,8 @@ def print_summary(numbers: Mapping[str, Any], console: Console) -> None:
         "are late"
     )
     console.print(Table(headers, tuple(rows)).for_terminal(title))
+
+    # the notes, a line each
     notes = [
         *numbers["notes"],
         f"{numbers['frames']} frames at {numbers['fps']:g} per second",
@@ -219,6 +223,8 @@ def _fingerprint(options: Options, inputs: Inputs | None) -> list[object]:
         parts = [source.fingerprint() for source in inputs.sources.values()]
         parts.append(inputs.calibration.path.name)
         parts += [str(camera) for camera in inputs.cameras]
+
+    # given files; the tool's results depend on the images and the tool
     for name in ("landmarks", "masks"):
         if getattr(options, name) != MEDIAPIPE:
             place = options.folder(name)
@@ -287,6 +293,7 @@ def _write_images(
     root: Path,
 ) -> dict[str, list[int]]:
     """Writes the images of every frame that has a skeleton."""
+    # Frames without a joint of the body are left out.
     posed = set(frames[known(solution.p[:, :BODY]).any(1)].tolist())
     if not posed:
         raise DataError(

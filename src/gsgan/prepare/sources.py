@@ -71,6 +71,7 @@ def find_sources(folder: Path, rotate: bool = False) -> dict[str, Recording]:
     Raises:
         DataError: when there are none, or two videos have the same stem.
     """
+    # The first folder with recordings counts.
     for place in [folder / name for name in INSIDE] + [folder]:
         sources = _sources_in(place, rotate) if place.is_dir() else {}
         if sources:
@@ -92,6 +93,8 @@ def _sources_in(folder: Path, rotate: bool) -> dict[str, Recording]:
             continue
         is_folder = path.is_dir()
         files = frame_files(folder, path.name, IMAGE_SUFFIXES) if is_folder else None
+
+        # a folder of images, or a video
         if files:
             paths = {number: folder / files[number] for number in sorted(files)}
             size = read_header(next(iter(paths.values())))[0]
@@ -185,6 +188,8 @@ def pair_cameras(
             raise DataError(
                 f"cameras={{{source}: {camera}}} names an unknown source or camera ({both})"
             )
+
+    # Each source needs exactly one camera, which no other source has.
     pairs = dict[str, str]()
     for source in sources:
         matching = matching_cameras(source, cameras)
@@ -207,6 +212,7 @@ def matching_cameras(source: str, cameras: Sequence[str]) -> list[str]:
     """The calibrated cameras that a source's name fits, see `pair_cameras`."""
     if source in cameras:
         return [source]
+    # the same name, or a word of the source's name
     words = re.split(r"[^0-9a-z]+", source.lower())
     same = [camera for camera in cameras if camera.lower() == source.lower()]
     return same or [camera for camera in cameras if camera.lower() in words]
@@ -247,6 +253,8 @@ def recording_notes(sources: Mapping[str, Recording]) -> list[str]:
         if values and max(values.values()) > (1 + DIFFERENT) * min(values.values()):
             text = ", ".join(f"{name} {value:g}" for name, value in values.items())
             notes.append(f"{what} differ ({text}); frames are paired by number")
+
+    # rotations that are not applied
     for name, source in sources.items():
         if source.turned and not source.rotate:
             notes.append(

@@ -144,6 +144,7 @@ def _rows(cameras: CameraArray, uv: Float, weight: Float) -> tuple[Float, Float]
 
 def _solve(a: Float, b: Float, weight: Float) -> tuple[Float, Float]:
     """Least squares ``[N, 3]``, NaN if views are too few, and its information ``[N, 3, 3]``."""
+    # normal equations, singular if the rays are parallel
     w = weight[..., None]
     information = np.einsum("cnki,cnkj->nij", a * w[..., None], a)
     right = np.einsum("cnki,cnk->ni", a, b * w)
@@ -164,6 +165,8 @@ def _best_pair(
     pairs = [list(pair) for pair in combinations(range(len(cameras)), 2)]
     if len(pairs) > MAX_PAIRS:
         pairs = [pairs[k * PROGRESSION % len(pairs)] for k in range(MAX_PAIRS)]
+
+    # Each pair's point replaces the best one so far if it fits all cameras better.
     for pair in pairs:
         p, _ = _solve(a[pair], b[pair], weight[pair])
         new = robust_cost(cameras.errors(p, uv), weight)
@@ -259,6 +262,7 @@ def cheapest_flips(
         flips: ``[C, F]`` initial values.
         price: ``[C, F]`` that a change must save.
     """
+    # `active` are the frames in which the last change still saved something
     C, F = flips.shape
     flips = flips.copy()
     active = np.arange(F)
