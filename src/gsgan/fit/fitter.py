@@ -21,7 +21,7 @@ FINAL_RATE = 0.02  # of the learning rates, in the last sweep
 CONTROLS = 200  # points whose distances from the body the surface interpolates
 REACH = 0.06  # metres: the surface stays this close to the body
 SPREAD = 1.5  # of the controls' influence, in distances between them
-# standard deviation as a share of the points' spacing
+# standard deviation of a Gaussian, as a share of the points' spacing
 SIGMA = 0.7
 OPACITY = 0.95
 LOOSE = 0.25  # weight of landmarks of face and palm, whose definitions differ
@@ -54,23 +54,17 @@ class Fit:
             raise ConfigError(
                 "fit.accuracy cannot be null; conf/fit/standard.yaml has it"
             )
-        for name, least in (
-            ("surface_steps", 0),
-            ("sweeps", 1),
-            ("cameras", 1),
-            ("points", 1),
-        ):
-            whole(f"fit.{name}", getattr(self, name), least)
-        for name in (
-            "least_mask",
-            "noise",
-            "angle_rate",
-            "transl_rate",
-            "surface_rate",
-        ):
-            above(f"fit.{name}", getattr(self, name))
-        for name in ("prior", "landmarks"):
-            at_least(f"fit.{name}", getattr(self, name), 0)
+        whole("fit.surface_steps", self.surface_steps, 0)
+        whole("fit.sweeps", self.sweeps, 1)
+        whole("fit.cameras", self.cameras, 1)
+        whole("fit.points", self.points, 1)
+        above("fit.least_mask", self.least_mask)
+        above("fit.noise", self.noise)
+        above("fit.angle_rate", self.angle_rate)
+        above("fit.transl_rate", self.transl_rate)
+        above("fit.surface_rate", self.surface_rate)
+        at_least("fit.prior", self.prior, 0)
+        at_least("fit.landmarks", self.landmarks, 0)
         between("fit.hold", self.hold, 0, 1)
 
 
@@ -78,11 +72,11 @@ class Surface(nn.Module):
     """Gaussians on a body's vertices, moved along the normals by the same distance in each frame.
 
     The distances represent clothes. Because all frames share them, they cannot absorb the error of
-    a pose: where the surface does not fill the masks, the pose is wrong.
+    a pose: if the surface does not fill a mask, the pose is wrong.
 
     Args:
         body: of the person.
-        points: vertices used.
+        points: number of vertices used.
         accuracy: the rasteriser's settings.
     """
 
@@ -94,13 +88,15 @@ class Surface(nn.Module):
         self.body = body
         self.accuracy = accuracy
         self.points = SkinnedPoints(body, points)
-        means = self.points.means
         normals = vertex_normals(body.vertices.float(), body.faces)[self.points.chosen]
-        distance = torch.cdist(
-            means, means[farthest_points(means, min(CONTROLS, len(means)))]
-        )
-        spread = SPREAD * distance.topk(2, largest=False).values[:, 1].median()
         self.register_buffer("normals", normals, persistent=False)
+
+        # The weights with which the controls move each point.
+        means = self.points.means
+        controls = farthest_points(means, min(CONTROLS, len(means)))
+        distance = torch.cdist(means, means[controls])
+        second = distance.topk(2, largest=False).values[:, 1]
+        spread = SPREAD * second.median()
         basis = torch.softmax(-(distance / spread).square(), dim=1)
         self.register_buffer("basis", basis, persistent=False)
         self.offsets = nn.Parameter(torch.zeros(basis.shape[1]))
@@ -108,20 +104,30 @@ class Surface(nn.Module):
 
     def posed(self, pose: BodyPose) -> tuple[Gaussians, Tensor]:
         """The Gaussians of a pose, and its landmarks ``[B, 33, 3]`` metres."""
+        # points at rest, moved along their normals by at most `REACH`, and then with the bones
         bones = self.body.transforms(pose)
         points = self.points
         A, t = blend_transforms(bones, points.bone_index, points.bone_weight)
-        out = self.basis @ (REACH * torch.tanh(self.offsets / REACH))
-        means = skin(points.means + out.unsqueeze(-1) * self.normals, A, t)
-        axes = A * (SIGMA * points.spacing * self.log_scale.exp())[:, None, None]
+        distance = self.basis @ (REACH * torch.tanh(self.offsets / REACH))
+        means = skin(points.means + distance.unsqueeze(-1) * self.normals, A, t)
+
+        # round Gaussians, which turn and stretch with the skin
+        sigma = SIGMA * points.spacing * self.log_scale.exp()
+        axes = A * sigma[:, None, None]
         opacities = means.new_full(means.shape[:2], OPACITY)
         person = Gaussians(
-            means, None, None, opacities, opacities[..., None], axes @ axes.mT
+            means,
+            None,
+            None,
+            opacities,
+            opacities[..., None],
+            axes @ axes.mT,
         )
-        return person, carry(bones, self.body.landmarks, self.body.landmark_bone)
+        landmarks = carry(bones, self.body.landmarks, self.body.landmark_bone)
+        return person, landmarks
 
     def alpha(self, person: Gaussians, camera: Camera) -> Tensor:
-        """``[B, 1, H, W]`` of the person."""
+        """The person's alpha ``[B, 1, H, W]``."""
         return rasterise(person, camera, settings=self.accuracy).alpha
 
 
@@ -152,23 +158,25 @@ class Fitter:
         self.frames = frames
         self.seed = seed
         device = frames.device
-        self.surface = Surface(body.to(device), settings.points, settings.accuracy).to(
-            device
-        )
+        surface = Surface(body.to(device), settings.points, settings.accuracy)
+        self.surface = surface.to(device)
+
+        # the change of each frame's angles and translation
         self.start = start.to(device)
-        self.bones = start.theta.shape[1]
-        self.moves = nn.Embedding(len(start.theta), 3 * self.bones + 3, sparse=True).to(
-            device
-        )
+        F, self.bones, _ = start.theta.shape
+        moves = nn.Embedding(F, 3 * self.bones + 3, sparse=True)
+        self.moves = moves.to(device)
         nn.init.zeros_(self.moves.weight)
-        # translations have a smaller rate than angles: one rate for both, and a scale
+
+        # Translations have a smaller rate than angles: one rate for both, and a scale.
         scale = torch.ones(self.bones + 1, 1, device=device)
         scale[-1] = settings.transl_rate / settings.angle_rate
-        fixed = [
-            i for i, n in enumerate(body.joint_names) if n.startswith(("finger", "toe"))
-        ]
-        scale[fixed] = 0
+        for bone, name in enumerate(body.joint_names):
+            if name.startswith(("finger", "toe")):
+                scale[bone] = 0
         self.scale = scale
+
+        # weights of the landmarks, and an optimiser each for surface and poses
         self.weight = frames.visibility.clone()
         self.weight[:, list(LOOSE_LANDMARKS)] *= LOOSE
         self.surface_optimiser = torch.optim.Adam(
@@ -182,11 +190,13 @@ class Fitter:
 
     def pose(self, rows: Tensor | None = None) -> BodyPose:
         """The current poses of these rows, or of all."""
-        rows = torch.arange(len(self.start.theta)) if rows is None else rows
+        if rows is None:
+            rows = torch.arange(len(self.start.theta))
         rows = rows.to(self.start.theta.device)
         move = self.moves(rows).view(len(rows), -1, 3) * self.scale
         return BodyPose(
-            self.start.theta[rows] + move[:, :-1], self.start.transl[rows] + move[:, -1]
+            theta=self.start.theta[rows] + move[:, :-1],
+            transl=self.start.transl[rows] + move[:, -1],
         )
 
     def surface_step(self) -> None:
@@ -211,8 +221,10 @@ class Fitter:
         for i in order:
             pose = self.pose(torch.tensor([i]))
             share, landmarks = self._share(i, pose, chance)
-            apart = (landmarks[0] - self.frames.skeletons[i]).square().sum(-1)
-            robust = (1 + apart / settings.noise**2).sqrt() - 1
+
+            # the priors of landmarks (robust, linear far away) and of angles
+            square = (landmarks[0] - self.frames.skeletons[i]).square().sum(-1)
+            robust = (1 + square / settings.noise**2).sqrt() - 1
             turned = (pose.theta[0] - self.start.theta[i]) / ANGLE
             loss = (
                 share
@@ -228,22 +240,26 @@ class Fitter:
 
     @torch.no_grad()
     def overlap(self, poses: BodyPose) -> Tensor:
-        """``[F]``: mean intersection over union of alpha and mask over a frame's images; NaN where
-        all images are empty."""
+        """Mean intersection over union ``[F]`` of alpha and mask over a frame's images.
+
+        NaN if all images of a frame are empty.
+        """
         by_frame = []
         for i in range(len(poses.theta)):
-            person, _ = self.surface.posed(
-                BodyPose(poses.theta[i][None], poses.transl[i][None])
-            )
+            pose = BodyPose(poses.theta[i][None], poses.transl[i][None])
+            person, _ = self.surface.posed(pose)
+
+            # Unsure pixels do not count.
             ious = []
             for frame in self._windows(i):
-                sure = True if frame.unsure is None else frame.unsure < 0.5
-                inside = self.surface.alpha(person, frame.camera) > 0.5
-                filled = inside & sure
-                mask = (frame.mask > 0.5) & sure
-                either = (filled | mask).sum().item()
-                if either:
-                    ious.append((filled & mask).sum().item() / either)
+                filled = self.surface.alpha(person, frame.camera) > 0.5
+                mask = frame.mask > 0.5
+                if frame.unsure is not None:
+                    filled &= frame.unsure < 0.5
+                    mask &= frame.unsure < 0.5
+                union = (filled | mask).sum().item()
+                if union:
+                    ious.append((filled & mask).sum().item() / union)
             by_frame.append(sum(ious) / len(ious) if ious else math.nan)
         return torch.tensor(by_frame)
 
@@ -252,30 +268,40 @@ class Fitter:
     ) -> tuple[Tensor, Tensor]:
         """Wrong alpha as a share of the masks, and the posed landmarks."""
         frames = self._windows(i)
+        # a few random cameras are enough for a step
         if len(frames) > self.settings.cameras:
             frames = chance.sample(frames, self.settings.cameras)
         person, landmarks = self.surface.posed(pose)
-        wrong = [_wrong(self.surface.alpha(person, f.camera), f).sum() for f in frames]
-        area = torch.stack([frame.mask.sum() for frame in frames]).sum()
-        return torch.stack(wrong).sum() / area.clamp_min(1.0), landmarks
+        wrong = []
+        areas = []
+        for frame in frames:
+            alpha = self.surface.alpha(person, frame.camera)
+            wrong.append(_wrong(alpha, frame).sum())
+            areas.append(frame.mask.sum())
+        area = torch.stack(areas).sum().clamp_min(1.0)
+        return torch.stack(wrong).sum() / area, landmarks
 
     def _windows(self, i: int) -> list[Frame]:
-        return [
-            around(self.frames.skeletons[i], frame) for frame in self.frames.images(i)
-        ]
+        """The compared parts of the i-th frame's images."""
+        skeleton = self.frames.skeletons[i]
+        return [around(skeleton, frame) for frame in self.frames.images(i)]
 
     def _set_rates(self) -> None:
+        """Learning rates of this sweep: held first, then a cosine down to `FINAL_RATE`."""
+        # `fallen` rises from 0 to 1 over the sweeps after the held ones
         held = self.settings.hold * self.settings.sweeps
         rest = max(self.settings.sweeps - held, 1e-9)
         fallen = min(max(self.swept - held, 0) / rest, 1)
         factor = FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * fallen))
-        self.surface_optimiser.param_groups[0]["lr"] = (
-            self.settings.surface_rate * factor
-        )
-        self.pose_optimiser.param_groups[0]["lr"] = self.settings.angle_rate * factor
+        surface_rate = self.settings.surface_rate * factor
+        angle_rate = self.settings.angle_rate * factor
+        self.surface_optimiser.param_groups[0]["lr"] = surface_rate
+        self.pose_optimiser.param_groups[0]["lr"] = angle_rate
 
 
 def _wrong(alpha: Tensor, frame: Frame) -> Tensor:
-    """How far alpha is from the mask; 0 where the image is unknown."""
-    off = (alpha - frame.mask).abs()
-    return off if frame.unsure is None else off * (1 - frame.unsure)
+    """The difference of alpha and mask; 0 where the image is unknown."""
+    difference = (alpha - frame.mask).abs()
+    if frame.unsure is None:
+        return difference
+    return difference * (1 - frame.unsure)

@@ -1,5 +1,6 @@
 """The frames of a capture that the fit uses, with their images."""
 
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -45,13 +46,14 @@ class MaskedFrames:
     ) -> None:
         layout = data.layout
         cameras = data.splits.train_cameras
-        trained = data.trained
-        items = [
-            (camera, frame)
-            for frame in (layout.frames if held_out else trained)
-            for camera in cameras
-            if frame in layout.images[camera]
-        ]
+
+        # all images of these frames by the training cameras
+        used = layout.frames if held_out else data.trained
+        items = []
+        for frame in used:
+            for camera in cameras:
+                if frame in layout.images[camera]:
+                    items.append((camera, frame))
         cache = ImageCache(int(data.cache_mb * 2**20))
         self.dataset = CaptureDataset(
             layout, items, data.size, data.crop, cache, data.lens
@@ -59,16 +61,20 @@ class MaskedFrames:
         self.cameras = cameras
         self.device = device
         self._unseen: dict[int, Tensor] = {}
+
+        # the images of each frame, as places in the data set
         places = self._usable(least_mask)
         if not places:
             raise DataError(
                 f"{layout.root}: the masks of {', '.join(cameras)} hold no person"
             )
         self.left_out = len(items) - len(places)
-        self.frames = tuple(sorted({items[place][1] for place in places}))
-        self._places: dict[int, list[int]] = {frame: [] for frame in self.frames}
+        by_frame: dict[int, list[int]] = defaultdict(list)
         for place in places:
-            self._places[items[place][1]].append(place)
+            _, frame = items[place]
+            by_frame[frame].append(place)
+        self.frames = tuple(sorted(by_frame))
+        self._places = by_frame
         self.skeletons = self._stacked(layout.landmarks.p)
         self.visibility = self._stacked(layout.landmarks.visibility)
 
@@ -78,6 +84,8 @@ class MaskedFrames:
 
     def _image(self, place: int) -> Frame:
         frame = self.dataset[place]
+
+        # Pixels outside the camera's image are unsure, as are those that the mask marks.
         unseen = self._unseen.get(place)
         if unseen is not None:
             unsure = unseen.to(frame.mask.dtype)
@@ -87,8 +95,9 @@ class MaskedFrames:
         return frame.to(self.device)
 
     def _usable(self, least: float) -> list[int]:
-        """Positions of the images whose masks hold enough of the person; also finds the pixels
-        outside the camera's image.
+        """Places of the images whose masks hold enough of the person.
+
+        Also finds the pixels outside the camera's image.
 
         Areas are of the part that is compared, in square metres at the person's depth: masks
         shrink with the distance, and the rest of an image may show other persons.
@@ -98,12 +107,17 @@ class MaskedFrames:
             inside = self.dataset.inside(place)
             if inside is not None:
                 self._unseen[place] = inside < 0.5
+
+            # the area of the compared part, in square metres
             image = self._image(place)
             seen = around(image.skeleton[0], image)
-            mask = seen.mask if seen.unsure is None else seen.mask * (1 - seen.unsure)
+            mask = seen.mask
+            if seen.unsure is not None:
+                mask = mask * (1 - seen.unsure)
             depth = seen.camera.to_camera(seen.skeleton)[0, :, 2].median()
             pixel = (depth / seen.camera.K[0, 0, 0]).square()
             areas.append(float(mask.sum() * pixel))
+
         known = [area for area in areas if area > 0]
         usual = float(np.quantile(known, USUAL)) if known else np.inf
         return [place for place, area in enumerate(areas) if area >= least * usual]

@@ -44,10 +44,9 @@ WORST = 5  # joints and frames named in the summary
 def fit_report(
     fitter: Fitter, body: Body, driven: BodyPose, found: BodyPose
 ) -> dict[str, Any]:
-    """Distances of landmarks from the skeletons in mm, and overlaps with the masks, of three sets
-    of poses.
+    """Distances of landmarks from the skeletons in mm, and overlaps with the masks.
 
-    Convention: all overlaps are of the registered surface.
+    They are of three sets of poses; all overlaps are of the registered surface.
 
     Args:
         fitter: after the fit; its poses at the start were solved from the skeletons.
@@ -57,48 +56,57 @@ def fit_report(
     """
     masked = fitter.frames
     before = fitter.surface.body
-    seen = masked.visibility > 0
+    visible = masked.visibility > 0
+
+    # medians of each set of poses
     report: dict[str, Any] = {"frames": {}, "joints": {}}
-    off = {}
-    iou = {}
-    for name, pose in (
-        ("solved", fitter.start),
-        ("registered", found),
-        ("driven", driven),
+    distance = {}
+    overlap = {}
+    for name, of_body, pose in (
+        ("solved", before, fitter.start),
+        ("registered", before, found),
+        ("driven", body, driven),
     ):
-        posed = (body if name == "driven" else before).posed_landmarks(pose)
-        apart = (posed - masked.skeletons).norm(dim=-1)
-        off[name] = torch.where(seen, 1000 * apart, torch.nan)
-        iou[name] = fitter.overlap(pose)
+        metres = (of_body.posed_landmarks(pose) - masked.skeletons).norm(dim=-1)
+        distance[name] = torch.where(visible, 1000 * metres, torch.nan)
+        overlap[name] = fitter.overlap(pose)
         report[name] = {
-            "residual_mm": float(off[name].nanmedian()),
-            "iou": float(iou[name].nanmean()),
+            "residual_mm": float(distance[name].nanmedian()),
+            "iou": float(overlap[name].nanmean()),
         }
+
+    # the same by joint and by frame
     for j, joint in enumerate(MEDIAPIPE33.names):
-        report["joints"][joint] = {
-            n: float(x[:, j].nanmedian()) for n, x in off.items()
-        }
+        report["joints"][joint] = _medians(distance, (slice(None), j))
     for i, frame in enumerate(masked.frames):
-        residual = {n: float(x[i].nanmedian()) for n, x in off.items()}
-        overlap = {n: float(x[i]) for n, x in iou.items()}
-        report["frames"][str(frame)] = {"residual_mm": residual, "iou": overlap}
+        report["frames"][str(frame)] = {
+            "residual_mm": _medians(distance, i),
+            "iou": _medians(overlap, i),
+        }
+
+    # the angles by which the masks turned the joints
     turned = (found.theta - fitter.start.theta).norm(dim=-1).rad2deg()
     report["turned_degrees"] = float(turned.quantile(0.95))
     return report
+
+
+def _medians(values: dict[str, Tensor], at: Any) -> dict[str, float]:
+    """The median of a part of each set's values."""
+    return {name: float(value[at].nanmedian()) for name, value in values.items()}
 
 
 def summary(report: dict[str, Any], folder: Path, masked: MaskedFrames) -> list[str]:
     """The lines that the command prints."""
     before = report["solved"]
     after = report["registered"]
-    joints = sorted(
-        report["joints"].items(), key=lambda x: -np.nan_to_num(x[1]["registered"])
-    )
-    frames = sorted(
-        report["frames"].items(), key=lambda x: np.nan_to_num(x[1]["iou"]["registered"])
-    )
-    worst = ", ".join(f"{n} {x['registered']:.0f}" for n, x in joints[:WORST])
-    least = ", ".join(f"{n} {x['iou']['registered']:.3f}" for n, x in frames[:WORST])
+
+    # the joints with the largest distances, and the frames with the smallest overlaps
+    distances = {joint: x["registered"] for joint, x in report["joints"].items()}
+    overlaps = {frame: x["iou"]["registered"] for frame, x in report["frames"].items()}
+    joints = sorted(distances, key=lambda joint: -np.nan_to_num(distances[joint]))
+    frames = sorted(overlaps, key=lambda frame: np.nan_to_num(overlaps[frame]))
+    worst = ", ".join(f"{joint} {distances[joint]:.0f}" for joint in joints[:WORST])
+    least = ", ".join(f"{frame} {overlaps[frame]:.3f}" for frame in frames[:WORST])
     return [
         f"{len(masked.frames)} frames, masks of {', '.join(masked.cameras)}: overlap (IoU) with "
         f"the body's surface {before['iou']:.3f} solved from the skeletons, {after['iou']:.3f} "
@@ -109,9 +117,8 @@ def summary(report: dict[str, Any], folder: Path, masked: MaskedFrames) -> list[
     ]
 
 
-# pixels; metres around the person
-SIZE = 128
-MARGIN = 0.2
+SIZE = 128  # pixels of the images that the fit before training uses
+MARGIN = 0.2  # metres around the person in these images
 LOCK = ".body_fit.lock"
 
 
@@ -136,7 +143,7 @@ def fit_before_training(
 ) -> GsganData:
     """Fits the body of a capture that has no body poses.
 
-    Convention: of the processes of a run one fits, and the others wait for its files.
+    One process of a run fits, and the others wait for its files.
 
     Args:
         data: the capture, read as the run reads it.
@@ -150,14 +157,18 @@ def fit_before_training(
         DataError: when the masks hold no person, or the folder is read-only.
     """
     root = data.layout.root
+    # small images around the person
     seen = copy(data)
     seen.size = SIZE
     seen.crop = PersonCrop(margin=MARGIN)
     with ExitStack() as stack:
         with writing(root):
             stack.enter_context(locked(root / LOCK))
-        if not (root / POSES).exists():  # else made while this process waited
+        # Another process may have made the poses while this one waited.
+        if not (root / POSES).exists():
             fit_body(seen, instantiate(settings), device=device)
+
+    # What the data has cached is read again.
     for name, attribute in vars(GsganData).items():
         if isinstance(attribute, cached_property):
             vars(data).pop(name, None)
@@ -196,7 +207,10 @@ def fit_body(
             "gsgan.fit supports captures in the bring-your-own layout: data=capture"
         )
     layout = data.layout
-    folder = _folder(layout.root if out is None else Path(out).expanduser(), overwrite)
+    folder = layout.root if out is None else Path(out).expanduser()
+    _make_folder(folder, overwrite)
+
+    # the frames with a person in their masks
     with console.status("reading masks"):
         frames = MaskedFrames(data, device, settings.least_mask, settings.held_out)
     if frames.left_out:
@@ -205,23 +219,38 @@ def fit_body(
         )
     rows = torch.tensor([layout.frames.index(frame) for frame in frames.frames])
 
+    # the shape and the poses by the skeletons
     with console.status("solving poses"):
         refuse_swapped_sides(layout, data.trained)
-        shape = fit_shape(*_joints(data, data.trained))
+        joints, visibility = _joints(data, data.trained)
+        shape = fit_shape(joints, visibility)
         start = _solve_with_fingers(data, shape)[rows]
+
+    # the poses by the masks, and with them the places of the landmarks
     fitter = Fitter(settings, frames, shaped_body(shape), start, seed)
     found = _registered(fitter, settings, console)
     with torch.no_grad():
         registered = found.to(torch.device("cpu"))
         shape = _refined(data, shape, frames.frames, registered)
+
+    # all poses by the skeletons again
     poses = {False: _solve(data, shape, layout.frames)}
     if layout.hands is not None:
         poses[True] = _solve(data, shape, layout.frames, hands=True)
     driven = poses[_by_hands(data)][rows].to(device)
     report = fit_report(fitter, shaped_body(shape).to(device), driven, found)
-    kept = registered if settings.held_out or settings.keep else None
+
+    keeps = settings.held_out or settings.keep
     write_json(folder / REPORT, report)
-    _write_body(folder, data, frames, shape, poses, rows, kept)
+    _write_body(
+        folder=folder,
+        data=data,
+        frames=frames,
+        shape=shape,
+        poses=poses,
+        rows=rows,
+        kept=registered if keeps else None,
+    )
     lines = summary(report, folder, frames)
     console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
     return folder
@@ -238,12 +267,14 @@ def _registered(fitter: Fitter, settings: Fit, console: Console) -> BodyPose:
         return fitter.pose()
 
 
-def _folder(out: Path, overwrite: bool) -> Path:
+def _make_folder(out: Path, overwrite: bool) -> None:
+    """Makes the folder; fails before minutes of work if it cannot be written."""
     attempt = out / ".body_fit.try"
-    with writing(out):  # fails before minutes of work, not after
+    with writing(out):
         out.mkdir(parents=True, exist_ok=True)
         write_atomically(attempt, b"")
         attempt.unlink(missing_ok=True)  # another fit may have removed it
+    # Poses are replaced only if a fit made them and overwrite is set.
     if (out / POSES).exists():
         if not (out / SHAPE).exists():
             raise ConfigError(
@@ -253,7 +284,6 @@ def _folder(out: Path, overwrite: bool) -> Path:
             raise ConfigError(
                 f"{out / POSES} exists already; overwrite=true replaces it"
             )
-    return out
 
 
 def _write_body(
@@ -265,10 +295,10 @@ def _write_body(
     rows: Tensor,
     kept: BodyPose | None,
 ) -> None:
-    """Writes the shape, and the poses by 33 landmarks and, where there are hands, by these too.
+    """Writes the shape, and the poses by 33 landmarks and, if there are hands, by these too.
 
     Registered poses ``kept`` replace those of ``rows``, except for the fingers: the hands are then
-    where the masks have them.
+    where they are in the masks.
     """
     arrays: dict[str, NDArray[Any]] = {}
     fingers = _fingers(shape)
@@ -276,16 +306,16 @@ def _write_body(
     for hands, solved in poses.items():
         theta = solved.theta.clone()
         transl = solved.transl.clone()
+        # Registered poses replace solved ones, except for the fingers.
         if kept is not None:
             theta[rows] = kept.theta
             transl[rows] = kept.transl
             theta[:, fingers] = solved.theta[:, fingers]
         name = "_hands" if hands else ""
-        arrays |= {
-            f"theta{name}": theta.numpy(),
-            f"transl{name}": transl.numpy() / unit,
-        }
-    # if killed here, the fit leaves no poses of another shape
+        arrays[f"theta{name}"] = theta.numpy()
+        arrays[f"transl{name}"] = transl.numpy() / unit
+
+    # The old poses are removed first: a fit that is killed here leaves no poses of another shape.
     with writing(folder / POSES):
         (folder / POSES).unlink(missing_ok=True)
     write_npz(folder / SHAPE, **shape.arrays())
@@ -301,15 +331,13 @@ def _write_body(
 def _joints(
     data: GsganData, frames: Sequence[int], hands: bool = False
 ) -> tuple[Tensor, Tensor]:
-    """Joints ``[F, 33, 3]`` metres and their visibility; 75 with hands, where the data has some."""
+    """Joints ``[F, 33, 3]`` metres and their visibility; 75 with hands, if the data has some."""
     landmarks = data.layout.landmarks
     if hands and data.layout.hands is not None:
         landmarks = landmarks.with_hands(data.layout.hands)
-    p, visibility = (
-        torch.from_numpy(np.stack([part[f] for f in frames])).float()
-        for part in (landmarks.p, landmarks.visibility)
-    )
-    return p, visibility
+    p = np.stack([landmarks.p[frame] for frame in frames])
+    visibility = np.stack([landmarks.visibility[frame] for frame in frames])
+    return torch.from_numpy(p).float(), torch.from_numpy(visibility).float()
 
 
 def _solve(
@@ -318,7 +346,8 @@ def _solve(
     """The poses of the frames, solved from skeletons with or without hands."""
     try:
         with torch.no_grad():
-            return Solver(shaped_body(shape)).solve(*_joints(data, frames, hands))
+            joints, visibility = _joints(data, frames, hands)
+            return Solver(shaped_body(shape)).solve(joints, visibility)
     except ValueError as error:
         names = f"items are the frames {spans(list(frames))} in order"
         raise DataError(f"{data.layout.root / LANDMARKS}: {error} ({names})") from None
@@ -335,15 +364,13 @@ def _solve_with_fingers(data: GsganData, shape: BodyShape) -> BodyPose:
 
 
 def _by_hands(data: GsganData) -> bool:
+    """Whether the skeleton has hands and the data their landmarks."""
     return data.layout.hands is not None and bool(TEMPLATES[data.skeleton].palms)
 
 
 def _fingers(shape: BodyShape) -> list[int]:
-    return [
-        i
-        for i, n in enumerate(shaped_body(shape).joint_names)
-        if n.startswith("finger")
-    ]
+    names = shaped_body(shape).joint_names
+    return [i for i, name in enumerate(names) if name.startswith("finger")]
 
 
 def _refined(
@@ -351,21 +378,24 @@ def _refined(
 ) -> BodyShape:
     """The shape with this person's landmarks in registered poses, and with the person's hands.
 
-    Poses solved with it approximate the registered ones, except for what varies between frames.
+    Poses solved with it approximate the registered ones, except for differences that vary between
+    frames.
     """
-    offsets = fit_offsets(shape, registered, *_joints(data, frames))
-    shape = replace(shape, offsets=offsets)
+    p, seen = _joints(data, frames)
+    shape = replace(shape, offsets=fit_offsets(shape, registered, p, seen))
     if data.layout.hands is None:
         return shape
+
+    # the hands, and the poses with them
     p, seen = _joints(data, frames, hands=True)
     shape = fit_hands(shape, _solve(data, shape, frames), p, seen)
     by_hands = _solve(data, shape, frames, hands=True)
-    # of the 33 landmarks, those on placed hands
-    used = torch.zeros(len(p), len(offsets))
+
+    # the offsets of those of the 33 landmarks that are on placed hands
+    body = len(MEDIAPIPE33.names)
+    placed = Fingers.placed(seen[:, body:] > 0)
+    used = torch.zeros(len(p), body)
     for side, rows in enumerate(ON_HANDS):
-        used[:, rows] = (
-            seen[:, rows] * Fingers.placed(seen[:, len(offsets) :] > 0)[:, [side]]
-        )
-    return replace(
-        shape, offsets=fit_offsets(shape, by_hands, p[:, : len(offsets)], used)
-    )
+        used[:, rows] = seen[:, rows] * placed[:, [side]]
+    offsets = fit_offsets(shape, by_hands, p[:, :body], used)
+    return replace(shape, offsets=offsets)

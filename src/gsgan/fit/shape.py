@@ -1,7 +1,9 @@
 """Fits a person's shape to skeletons, and its hands and landmarks to known poses."""
 
+import math
 from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -24,13 +26,12 @@ from gsgan.skeleton import MEDIAPIPE33, sanitise
 from gsgan.skeleton.hands import HAND, HAND_EDGES, WRIST
 from gsgan.utils.errors import DataError
 
-FRAMES = 24  # at most: every frame shows the same lengths
-# Standard deviations of the prior: coefficients have 1.
-# of a stretch's logarithm; metres
-STRETCH = 0.1
-OFFSET = 0.015
-# Metres by which the spine's joints are behind the body's: the bodies of vertebrae are behind the
-# line from hips to shoulders; mean and standard deviation.
+FRAMES = 24  # maximum number: every frame shows the same lengths
+# Standard deviations of the prior; that of coefficients is 1.
+STRETCH = 0.1  # of a stretch's logarithm
+OFFSET = 0.015  # metres
+# The spine's joints are this many metres behind the body's, since the bodies of vertebrae are
+# behind the line from hips to shoulders: mean and standard deviation.
 BEHIND = 0.04
 DEPTH = 0.02
 # Pairs of landmarks whose distance hardly depends on the pose, and pairs whose distance does; and
@@ -46,9 +47,9 @@ UNSURE = 0.1
 # Effective number of independent frames: systematic errors are the same in all of them.
 INDEPENDENT = 4.0
 FOREARMS = [[13, 15], [14, 16]]  # elbow and wrist
-# a hand's, as a share of the body's; metres
-SIZES = (0.75, 1.35)
-FARTHEST = 0.05
+SIZES = (0.75, 1.35)  # minimum and maximum size of a hand, as a share of the body's
+FARTHEST = 0.05  # maximum move of a hand, metres
+NUMBERS = 99  # of the offsets: x, y, z of 33 landmarks
 LENGTH_STEPS = 10
 STEPS = 8
 POSE_STEPS = 4
@@ -71,8 +72,12 @@ def fit_shape(skeletons: Tensor, visibility: Tensor) -> BodyShape:
     reduced = without_surface(free_space())
     p, seen = _usable(skeletons, visibility)
     x = _fit_lengths(reduced, p, seen)
-    found = vars(_fit_landmarks(reduced, x, p, seen))
-    return BodyShape(**{name: v.float() for name, v in found.items() if v is not None})
+    shape = _fit_landmarks(reduced, x, p, seen)
+    single = {}
+    for name, values in vars(shape).items():
+        if values is not None:
+            single[name] = values.float()
+    return BodyShape(**single)
 
 
 def fit_hands(
@@ -89,54 +94,62 @@ def fit_hands(
         visibility: ``[F, 75]``; landmarks at 0 are not used.
 
     Returns:
-        The shape, unchanged where no frame shows a hand. The wrist and place of a hand stay the
-        body's where no frame shows the hand with its forearm, or where they would move by more than
+        The shape, unchanged if no frame shows a hand. The wrist and place of a hand stay the
+        body's if no frame shows the hand with its forearm, or if they would move by more than
         `FARTHEST`.
     """
     shape = replace(shape, hands=None)
     hands = skeletons[:, BODY:]
     seen = (visibility[:, BODY:] > 0) & hands.isfinite().all(-1)
-    # Without the wrist, whose definitions differ most.
+
+    # The size, by the lengths of bones without the wrist, whose definitions differ most.
     bones = torch.tensor([edge for edge in HAND_EDGES if WRIST not in edge])
     first, last = torch.cat([bones, bones + HAND]).mT
-    length = (hands[:, last] - hands[:, first]).norm(dim=-1)
-    length = (
-        length.where(seen[:, last] & seen[:, first], torch.nan).nanmedian(dim=0).values
-    )
-    if not (known := length.isfinite()).any():
+    lengths = (hands[:, last] - hands[:, first]).norm(dim=-1)
+    length = _median(lengths, seen[:, last] & seen[:, first])
+    known = length.isfinite()
+    if not known.any():
         return shape
     own = shaped_body(shape).hand_landmarks
-    own = (own[last] - own[first]).norm(dim=-1)
+    own_length = (own[last] - own[first]).norm(dim=-1)
+    size = length[known].sum() / own_length[known].sum()
     stretch = shape.stretch.clone()
-    stretch[STRETCHED.index("hand")] *= (length[known].sum() / own[known].sum()).clamp(
-        *SIZES
-    )
+    stretch[STRETCHED.index("hand")] *= size.clamp(*SIZES)
     shape = replace(shape, stretch=stretch)
 
+    # the hands in each frame, by landmarks other than the wrists
     body = shaped_body(shape)
     wrists = [WRIST, HAND + WRIST]
     fingers = Fingers(body)
     beyond = seen.clone()
     beyond[:, wrists] = False
     found = fingers(hands.where(seen.unsqueeze(-1), 0.0), beyond)
+
+    # The wrist landmark at rest, as it moves with the forearm and as it moves with the hand: the
+    # wrist joint goes to the former, and the hand moves by the difference.
     forearms = body.transforms(poses)[:, body.hand_bone[wrists]]
     on_arm = _at_rest(forearms[..., :3, :3], forearms[..., :3, 3], hands[:, wrists])
     in_hand = _at_rest(found.rotations, found.shifts, hands[:, wrists])
     usable = fingers.placed(seen) & (visibility[:, FOREARMS] > 0).all(-1)
-    on_arm = on_arm.where(usable.unsqueeze(-1), torch.nan).nanmedian(dim=0).values
-    in_hand = in_hand.where(usable.unsqueeze(-1), torch.nan).nanmedian(dim=0).values
+    on_arm = _median(on_arm, usable.unsqueeze(-1))
+    in_hand = _median(in_hand, usable.unsqueeze(-1))
     joints = body.joints[[body.joint_names.index(name) for name in WRISTS]]
     moves = torch.stack([on_arm - joints, on_arm - in_hand], dim=1)
     near = (moves.norm(dim=-1) <= FARTHEST).all(-1)
     return replace(shape, hands=moves.where(near[:, None, None], 0.0))
 
 
+def _median(values: Tensor, seen: Tensor) -> Tensor:
+    """The median over frames, the first dimension, of the values that are seen."""
+    return values.where(seen, torch.nan).nanmedian(dim=0).values
+
+
 def fit_offsets(
     shape: BodyShape, poses: BodyPose, skeletons: Tensor, visibility: Tensor
 ) -> Tensor:
-    """``[33, 3]`` metres: offsets that give a body in these poses the person's landmarks.
+    """Offsets ``[33, 3]`` in metres that give a body in these poses the person's landmarks.
 
-    Convention: medians over frames; landmarks that no frame shows keep the shape's offsets.
+    They are medians over frames; landmarks that no frame shows keep the shape's offsets.
 
     Args:
         shape: of the person.
@@ -147,12 +160,10 @@ def fit_offsets(
     body = shaped_body(shape)
     bones = body.transforms(poses)[:, body.landmark_bone]
     moved = _at_rest(bones[..., :3, :3], bones[..., :3, 3], skeletons) - body.landmarks
-    moved = (
-        moved.where((visibility > 0).unsqueeze(-1), torch.nan).nanmedian(dim=0).values
-    )
-    before = (
-        torch.zeros_like(body.landmarks) if shape.offsets is None else shape.offsets
-    )
+    moved = _median(moved, (visibility > 0).unsqueeze(-1))
+    before = shape.offsets
+    if before is None:
+        before = torch.zeros_like(body.landmarks)
     return before + moved.nan_to_num(0.0)
 
 
@@ -162,27 +173,35 @@ def _at_rest(R: Tensor, t: Tensor, points: Tensor) -> Tensor:
 
 
 def _usable(skeletons: Tensor, visibility: Tensor) -> tuple[Tensor, Tensor]:
-    """Completed skeletons ``[f, 33, 3]`` and ``[f, 33]`` of evenly spaced frames that show the
-    trunk, or the shoulders if none does."""
+    """Completed skeletons ``[f, 33, 3]`` of evenly spaced frames, and their visibility ``[f, 33]``.
+
+    The frames show the whole trunk, or the shoulders if none does.
+    """
     seen = (visibility > 0) & skeletons.isfinite().all(-1)
-    for trunk in (MEDIAPIPE33.torso, MEDIAPIPE33.shoulders):
-        if frames := seen[:, trunk].all(-1).nonzero().flatten().tolist():
-            break
-    else:
+    frames = seen[:, MEDIAPIPE33.torso].all(-1).nonzero().flatten()
+    if not len(frames):
+        frames = seen[:, MEDIAPIPE33.shoulders].all(-1).nonzero().flatten()
+    if not len(frames):
         raise DataError("fit_shape: no frame has both shoulders")
-    chosen = frames[:: -(-len(frames) // FRAMES)]
+    chosen = frames[:: math.ceil(len(frames) / FRAMES)]
     p, valid = sanitise(skeletons[chosen].double(), seen[chosen].double())
     return p, valid
 
 
 def shape_of(space: ShapeSpace[B], x: Tensor) -> BodyShape:
     """The shape of the numbers: coefficients, logarithms of stretches, the spine, offsets."""
-    K, stretch, spine, offsets = x.split([space.coefficients, len(STRETCHED), 1, 99])
-    return BodyShape(K, stretch.exp(), _offsets(space, offsets), spine=BEHIND + spine)
+    sizes = [space.coefficients, len(STRETCHED), 1, NUMBERS]
+    coefficients, stretch, spine, offsets = x.split(sizes)
+    return BodyShape(
+        coefficients,
+        stretch.exp(),
+        _offsets(space, offsets),
+        spine=BEHIND + spine,
+    )
 
 
 def _offsets(space: ShapeSpace[B], values: Tensor) -> Tensor:
-    """``[33, 3]`` from 99 numbers: the mean of both sides."""
+    """Symmetric offsets ``[33, 3]`` from 99 numbers: the mean of both sides."""
     offsets = values.view(-1, 3)
     across = rest_axes(space.body)[0]
     mirrored = offsets[list(MEDIAPIPE33.mirror)]
@@ -190,53 +209,70 @@ def _offsets(space: ShapeSpace[B], values: Tensor) -> Tensor:
 
 
 def shape_prior(space: ShapeSpace[MarkedBody]) -> Tensor:
-    """``[S]`` precisions of all numbers."""
-    parts = (
-        (space.coefficients, 1.0),
-        (len(STRETCHED), STRETCH),
-        (1, DEPTH),
-        (99, OFFSET * 2**0.5),
-    )
-    return torch.cat(
-        [torch.full((n,), 1 / sigma**2, dtype=torch.float64) for n, sigma in parts]
-    )
+    """Precisions ``[S]`` of the numbers of `shape_of`."""
+    sigmas = [1.0] * space.coefficients
+    sigmas += [STRETCH] * len(STRETCHED)
+    sigmas += [DEPTH]
+    sigmas += [OFFSET * 2**0.5] * NUMBERS
+    precisions = [1 / sigma**2 for sigma in sigmas]
+    return torch.tensor(precisions, dtype=torch.float64)
 
 
 # -- lengths
 
 
-def _pairs() -> tuple[Tensor, Tensor, Tensor]:
-    """Landmarks ``[P]``, ``[P]``, and the standard deviation of the logarithm of their distance."""
+class _Pairs(NamedTuple):
+    """Pairs of landmarks whose distance is compared."""
+
+    first: Tensor  # [P]
+    second: Tensor  # [P]
+    sigma: Tensor  # [P] standard deviation of the logarithm of the distance
+
+
+def _pairs() -> _Pairs:
     names = MEDIAPIPE33.names
-    rows = []
+    first: list[int] = []
+    second: list[int] = []
+    sigmas: list[float] = []
+
+    def add(a: str, b: str, sigma: float) -> None:
+        first.append(names.index(a))
+        second.append(names.index(b))
+        sigmas.append(sigma)
+
     for side in ("left", "right"):
-        own = {n: (n.replace("left", side)) for n in names if "left" in n} | {
-            "nose": "nose"
-        }
-        at = {
-            n.replace("left_", "").replace("_left", ""): names.index(m)
-            for n, m in own.items()
-        }
-        rows += [
-            (at[a], at[b], s)
-            for s, text in ((SURE, RIGID), (UNSURE, LOOSE))
-            for a, b in (pair.split() for pair in text.split(", "))
-        ]
+        # the name of each landmark on this side, by its name without a side
+        own = {"nose": "nose"}
+        for name in names:
+            if "left" in name:
+                plain = name.replace("left_", "").replace("_left", "")
+                own[plain] = name.replace("left", side)
+
+        # pairs on one side, and once those across
+        for sigma, text in ((SURE, RIGID), (UNSURE, LOOSE)):
+            for pair in text.split(", "):
+                a, b = pair.split()
+                add(own[a], own[b], sigma)
         if side == "left":
-            rows += [
-                (at[a], MEDIAPIPE33.mirror[at[a]], SURE) for a in ACROSS.split(", ")
-            ]
-    a, b, sigma = zip(*rows, strict=True)
-    return torch.tensor(a), torch.tensor(b), torch.tensor(sigma, dtype=torch.float64)
+            for plain in ACROSS.split(", "):
+                add(own[plain], own[plain].replace("left", "right"), SURE)
+    return _Pairs(
+        first=torch.tensor(first),
+        second=torch.tensor(second),
+        sigma=torch.tensor(sigmas, dtype=torch.float64),
+    )
 
 
 def _fit_lengths(space: ShapeSpace[MarkedBody], p: Tensor, seen: Tensor) -> Tensor:
-    """Numbers whose distances between landmarks are the medians over the frames."""
+    """Numbers of the shape whose distances between landmarks are the medians over the frames.
+
+    With the residuals r and the prior's precisions Λ, the cost ``Σ 2 (√(1 + r²) - 1) + xᵀ Λ x`` is
+    minimised by Levenberg-Marquardt steps, reweighted by ``w = 1 / √(1 + r²)``.
+    """
+    # the median of each distance, if some frame and the body have both landmarks
     a, b, sigma = _pairs()
-    length = torch.where(
-        seen[:, a] & seen[:, b], (p[:, a] - p[:, b]).norm(dim=-1), torch.nan
-    )
-    target = length.nanmedian(dim=0).values.log()
+    lengths = (p[:, a] - p[:, b]).norm(dim=-1)
+    target = _median(lengths, seen[:, a] & seen[:, b]).log()
     own = space.body.landmarks
     used = target.isfinite() & (own[a] - own[b]).isfinite().all(-1)
     a = a[used]
@@ -248,31 +284,37 @@ def _fit_lengths(space: ShapeSpace[MarkedBody], p: Tensor, seen: Tensor) -> Tens
             "fit_shape: no frame shows a limb of which the body has both ends"
         )
 
-    def off(x: Tensor) -> Tensor:
-        at = space.shaped(shape_of(space, x)).landmarks
-        return ((at[a] - at[b]).norm(dim=-1).log() - target) / sigma
+    def residual(x: Tensor) -> Tensor:
+        q = space.shaped(shape_of(space, x)).landmarks
+        return ((q[a] - q[b]).norm(dim=-1).log() - target) / sigma
 
     prior = shape_prior(space)
-    prior[-99:] *= 100  # offsets
-    x = torch.zeros_like(prior)
+    prior[-NUMBERS:] *= 100  # the offsets hardly change here
 
     def cost(x: Tensor) -> Tensor:
-        return 2 * ((1 + off(x).square()).sqrt() - 1).sum() + (prior * x.square()).sum()
+        robust = 2 * ((1 + residual(x).square()).sqrt() - 1).sum()
+        return robust + (prior * x.square()).sum()
 
+    x = torch.zeros_like(prior)
     damping = 1e-2
     best = cost(x)
     for _ in range(LENGTH_STEPS):
-        r = off(x)
-        J = torch.func.jacfwd(off)(x)
+        # the normal equations, and the step with damping
+        r = residual(x)
+        J = torch.func.jacfwd(residual)(x)
         w = (1 + r.square()).rsqrt()
         H = J.mT @ (w.unsqueeze(-1) * J) + prior.diag()
-        move = torch.linalg.solve(
-            H + damping * H.diag().diag(), J.mT @ (w * r) + prior * x
-        )
-        new = cost(x - move)
-        better = bool(new < best)
-        x, best = (x - move, new) if better else (x, best)
-        damping *= 0.2 if better else 10
+        g = J.mT @ (w * r) + prior * x
+        new = x - torch.linalg.solve(H + damping * H.diag().diag(), g)
+
+        # A step that does not reduce the cost is repeated with more damping.
+        new_cost = cost(new)
+        if new_cost < best:
+            x = new
+            best = new_cost
+            damping *= 0.2
+        else:
+            damping *= 10
     return x
 
 
@@ -282,12 +324,19 @@ def _fit_lengths(space: ShapeSpace[MarkedBody], p: Tensor, seen: Tensor) -> Tens
 def _fit_landmarks(
     space: ShapeSpace[MarkedBody], x: Tensor, p: Tensor, seen: Tensor
 ) -> BodyShape:
-    """Fits shape and poses together; the poses are eliminated from the normal equations."""
-    shift = p[:, MEDIAPIPE33.hips].mean(1, keepdim=True)
-    p = p - shift
+    """Fits shape and poses together, by Gauss-Newton steps of the shape.
+
+    With derivatives J of the landmarks by a frame's pose and G by the shape, and weights w, the
+    poses are eliminated from the normal equations by the Schur complement:
+
+        H = Jᵀ w J + prior,   C = Jᵀ w G,
+        A = Σ (Gᵀ w G - Cᵀ H⁻¹ C) + prior,   b = Σ (Gᵀ w r - Cᵀ H⁻¹ g) + prior x.
+    """
+    # Offsets enter the landmarks linearly: their derivatives are the same in all steps.
+    p = p - p[:, MEDIAPIPE33.hips].mean(1, keepdim=True)
     prior = shape_prior(space)
     share = min(1.0, INDEPENDENT / len(p))
-    own = len(x) - 99
+    own = len(x) - NUMBERS
     symmetric = torch.func.jacfwd(partial(_offsets, space))(x[own:])
     held: tuple[Tensor, Tensor] | None = None
     for _ in range(STEPS):
@@ -295,30 +344,30 @@ def _fit_landmarks(
         with torch.no_grad():
             solver = Solver(space.shaped(shape_of(space, x)))
             weight = solver.weights(seen)
-            start = solver.guess(p) if held is None else held
-            q, root = solver.descend(*start, p, weight, POSE_STEPS if held else 10)
-            held = q, root
+            q, root = solver.guess(p) if held is None else held
+            q, root = solver.descend(q, root, p, weight, POSE_STEPS if held else 10)
+            held = (q, root)
             at = solver.linear(q, root, p)
             _, g, H, w = solver.normal(q, at, weight)
 
         # derivatives of the posed landmarks by the shape
         posed = partial(_posed, space, solver, q, root)
         by_body = torch.func.jacfwd(posed)(x[:own], x[own:])
-        turned = solver.transforms(q, root, solver.joints)[:, solver.carrier, :3, :3]
-        # [F, 99, S]
-        by_shape = torch.cat([by_body, turned @ symmetric], dim=-1).flatten(1, 2)
+        transforms = solver.transforms(q, root, solver.joints)
+        by_offsets = transforms[:, solver.carrier, :3, :3] @ symmetric
+        G = torch.cat([by_body, by_offsets], dim=-1).flatten(1, 2)  # [F, 99, S]
+
         # the shape's normal equations after eliminating every pose
-        w3 = w.repeat_interleave(3, dim=1).unsqueeze(-1)
+        w = w.repeat_interleave(3, dim=1).unsqueeze(-1)
         J = at.by_number.flatten(2).mT
-        cross = J.mT @ (w3 * by_shape)
-        direct = by_shape.mT @ (w3 * by_shape)
-        slope = (by_shape.mT @ (w3 * at.residual.flatten(1).unsqueeze(-1))).squeeze(-1)
-        inner = torch.linalg.solve(H, torch.cat([cross, g.unsqueeze(-1)], dim=-1))
-        A = (direct - cross.mT @ inner[..., :-1]).sum(0) * share + prior.diag()
-        c = (slope - (cross.mT @ inner[..., -1:]).squeeze(-1)).sum(
-            0
-        ) * share + prior * x
-        x = x - torch.linalg.solve(A, c)
+        C = J.mT @ (w * G)
+        direct = G.mT @ (w * G)
+        slope = (G.mT @ (w * at.residual.flatten(1).unsqueeze(-1))).squeeze(-1)
+        solved = torch.linalg.solve(H, torch.cat([C, g.unsqueeze(-1)], dim=-1))
+        A = (direct - C.mT @ solved[..., :-1]).sum(0) * share + prior.diag()
+        slope = slope - (C.mT @ solved[..., -1:]).squeeze(-1)
+        b = slope.sum(0) * share + prior * x
+        x = x - torch.linalg.solve(A, b)
     return shape_of(space, x)
 
 
@@ -330,15 +379,14 @@ def _posed(
     own: Tensor,
     offsets: Tensor,
 ) -> Tensor:
-    """``[F, 33, 3]`` the landmarks of a shape in poses."""
+    """The landmarks ``[F, 33, 3]`` of a shape in poses."""
     body = space.shaped(shape_of(space, torch.cat([own, offsets])))
-    return solver.points(
-        solver.transforms(q, root, body.joints), body.landmarks.nan_to_num()
-    )
+    transforms = solver.transforms(q, root, body.joints)
+    return solver.points(transforms, body.landmarks.nan_to_num())
 
 
 def without_surface(space: ShapeSpace[B]) -> ShapeSpace[MarkedBody]:
-    """The space in float64 with one vertex: landmarks are all that is compared."""
+    """The space in float64 with one vertex: only landmarks are compared."""
     body = space.body
     small = MarkedBody(
         vertices=body.vertices[:1],
@@ -353,7 +401,9 @@ def without_surface(space: ShapeSpace[B]) -> ShapeSpace[MarkedBody]:
         landmarks=body.landmarks,
         landmark_bone=body.landmark_bone,
     ).to(torch.float64)
-    kept = {"vertices": slice(0, 1), "joints": slice(None), "landmarks": slice(None)}
-    return ShapeSpace(
-        small, {n: space.directions[n][s].double() for n, s in kept.items()}
-    )
+    directions = {
+        "vertices": space.directions["vertices"][:1].double(),
+        "joints": space.directions["joints"].double(),
+        "landmarks": space.directions["landmarks"].double(),
+    }
+    return ShapeSpace(small, directions)

@@ -1,13 +1,15 @@
 """Motion capture in Acclaim's formats: ASF (skeleton) and AMC (motion).
 
-Convention: as `RigMotion`: a joint is the start of a bone. An ASF bone has axes
-of its own, C; the angles M of a frame turn it by ``C M C⁻¹`` relative to its parent.
+As in `RigMotion`, a joint is the start of a bone. An ASF bone has its own axes C; the angles M of a
+frame turn it by ``C M C⁻¹`` relative to its parent.
 
 Source: the description of the formats that the CMU motion capture database refers to.
 """
 
 import re
+from collections import defaultdict
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,14 +24,14 @@ FPS = 120.0  # of CMU's clips; the format does not store it
 
 
 def asf_of(amc: Path) -> Path:
-    """The skeleton file of a motion: ``01.asf`` beside ``01_14.amc``.
+    """The skeleton file of a motion: ``01.asf`` in the folder of ``01_14.amc``.
 
     Raises:
         DataError: when there is none, or more than one candidate.
     """
     stems = {amc.stem, amc.stem.split("_")[0]}
-    found = sorted(p for p in amc.parent.glob("*.asf"))
-    named = [p for p in found if p.stem in stems] or found
+    found = sorted(amc.parent.glob("*.asf"))
+    named = [path for path in found if path.stem in stems] or found
     if len(named) != 1:
         raise DataError(
             f"{amc} needs its skeleton, an .asf file: found {len(named)} beside it; give "
@@ -45,13 +47,13 @@ def read_amc(amc: Path, asf: Path) -> tuple[RigMotion, float]:
         DataError: when a file cannot be read or is cut off, or the two do not belong together.
     """
     try:
-        bones, parents, scale, radians = _skeleton(asf)
+        skeleton = _read_skeleton(asf)
     except (ValueError, KeyError, IndexError, ArithmeticError) as error:
         raise DataError(
             f"{asf} is not a complete ASF skeleton ({_reason(error)})"
         ) from error
     try:
-        return _motion(amc, bones, parents, radians), scale
+        return _motion(amc, skeleton), skeleton.metres
     except (ValueError, KeyError, IndexError) as error:
         raise DataError(
             f"{amc} is not a complete AMC motion of the skeleton {asf.name} ({_reason(error)})"
@@ -63,15 +65,17 @@ def _reason(error: Exception) -> str:
 
 
 def _lines(path: Path) -> list[list[str]]:
+    """The words of each line that has any, without comments and brackets."""
     try:
         text = read_text(path, errors="replace")
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror}") from error
-    lines = (
-        line.split("#")[0].replace("(", " ").replace(")", " ")
-        for line in text.splitlines()
-    )
-    return [words for line in lines if (words := line.split())]
+    lines = []
+    for line in text.splitlines():
+        words = re.sub("[()]", " ", line.split("#")[0]).split()
+        if words:
+            lines.append(words)
+    return lines
 
 
 class _Bone:
@@ -81,15 +85,13 @@ class _Bone:
         direction = np.array(words.get("direction", ["0", "0", "0"]), dtype=float)
         self.end = direction * float(words.get("length", ["0"])[0])
         self.dof = [name.upper() for name in words.get("dof", words.get("order", []))]
-        axis = (
-            words["axis"]
-            if len(words["axis"]) > 3
-            else [*words["orientation"], *words["axis"]]
-        )
-        order = axis[3]
-        self.C = _turn(
-            np.array(axis[:3], dtype=float) * radians, [f"R{x}" for x in order.upper()]
-        )
+
+        # The root has its angles in "orientation" and their order in "axis", bones both in "axis".
+        axis = words["axis"]
+        if len(axis) <= 3:
+            axis = words["orientation"] + axis
+        angles = np.array(axis[:3], dtype=float) * radians
+        self.C = _turn(angles, [f"R{letter}" for letter in axis[3].upper()])
 
 
 def _turn(angles: Array, names: list[str]) -> Array:
@@ -101,58 +103,76 @@ def _turn(angles: Array, names: list[str]) -> Array:
     return R
 
 
-def _skeleton(path: Path) -> tuple[dict[str, _Bone], dict[str, str], float, float]:
-    """Bones and parents by name, metres in a unit, radians in an angle."""
+class _Skeleton(NamedTuple):
+    """A skeleton as its file gives it."""
+
+    bones: dict[str, _Bone]
+    parents: dict[str, str]
+    metres: float  # in a unit of length
+    radians: float  # in an angle
+
+
+def _read_skeleton(path: Path) -> _Skeleton:
+    # the lines of each section, which begins with a line such as ":units"
+    sections = defaultdict(list)
     section = ""
-    bones = {}
-    parents = {}
-    units: dict[str, list[str]] = {"length": ["1"], "angle": ["deg"]}
-    root: dict[str, list[str]] = {}
-    bone: dict[str, list[str]] = {}
-    raw: list[dict[str, list[str]]] = []
-    for words in _lines(path):
-        if words[0].startswith(":"):
-            section = words[0][1:]
-        elif section == "units":
-            units[words[0]] = words[1:]
-        elif section == "root":
-            root[words[0]] = words[1:]
-        elif section == "bonedata":
-            if words[0] == "begin":
-                bone = {}
-            elif words[0] == "end":
-                raw.append(bone)
-            else:
-                bone.setdefault(words[0], words[1:])
-        elif section == "hierarchy" and words[0] not in ("begin", "end"):
-            parents.update(dict.fromkeys(words[1:], words[0]))
+    for line in _lines(path):
+        if line[0].startswith(":"):
+            section = line[0][1:]
+        else:
+            sections[section].append(line)
+
+    # units and the root, one value to a key
+    units = {"length": ["1"], "angle": ["deg"]}
+    units |= {key: values for key, *values in sections["units"]}
     radians = np.pi / 180 if units["angle"][0].startswith("deg") else 1.0
+    root = {key: values for key, *values in sections["root"]}
+
+    # bones, of which the first value of each key counts
+    described = []
+    bone: dict[str, list[str]] = {}
+    for key, *values in sections["bonedata"]:
+        if key == "begin":
+            bone = {}
+        elif key == "end":
+            described.append(bone)
+        else:
+            bone.setdefault(key, values)
     bones = {ROOT: _Bone(root, radians)}
-    bones |= {bone["name"][0]: _Bone(bone, radians) for bone in raw}
-    if lost := [name for name in bones if name != ROOT and name not in parents]:
+    for words in described:
+        name = words["name"][0]
+        bones[name] = _Bone(words, radians)
+
+    # the hierarchy: each line has a parent and its children
+    parents: dict[str, str] = {}
+    for parent, *children in sections["hierarchy"]:
+        if parent not in ("begin", "end"):
+            parents.update(dict.fromkeys(children, parent))
+    lost = [name for name in bones if name != ROOT and name not in parents]
+    if lost:
         raise ValueError(
             f"the hierarchy lacks {', '.join(lost[:3])}; is the file cut off?"
         )
-    return bones, parents, INCH / float(units["length"][0]), radians
+    return _Skeleton(bones, parents, INCH / float(units["length"][0]), radians)
 
 
 def _read_frames(
     path: Path, bones: dict[str, _Bone], names: list[str]
 ) -> dict[str, Array]:
-    """``[F, n]`` numbers of each bone that moves, in the order of its degrees of freedom."""
+    """Numbers ``[F, n]`` of each bone that moves, in the order of its degrees of freedom."""
+    # A line with a number alone begins a frame; the other lines are bones.
     frames: list[dict[str, list[float]]] = []
-    for words in _lines(path):
-        if len(words) == 1 and words[0].isdigit():
+    for key, *numbers in _lines(path):
+        if not numbers and key.isdigit():
             frames.append({})
         elif frames:
-            if words[0] not in bones:
-                raise ValueError(
-                    f"it moves a bone {words[0]}, which the skeleton lacks"
-                )
-            frames[-1][words[0]] = [float(x) for x in words[1:]]
+            if key not in bones:
+                raise ValueError(f"it moves a bone {key}, which the skeleton lacks")
+            frames[-1][key] = [float(number) for number in numbers]
     if not frames:
         raise ValueError("it has no frames")
 
+    # Each frame must have all numbers of each bone that moves.
     moving = [name for name in names if bones[name].dof]
     for number, frame in enumerate(frames):
         for name in moving:
@@ -164,54 +184,57 @@ def _read_frames(
                 )
 
     values = {name: np.array([frame[name] for frame in frames]) for name in moving}
-    if not all(np.isfinite(v).all() for v in values.values()):
+    if not all(np.isfinite(numbers).all() for numbers in values.values()):
         raise ValueError("a number is not finite")
     return values
 
 
-def _motion(
-    path: Path, bones: dict[str, _Bone], parents: dict[str, str], radians: float
-) -> RigMotion:
-    names = [ROOT]  # parents first
+def _motion(path: Path, skeleton: _Skeleton) -> RigMotion:
+    bones = skeleton.bones
+    parents = skeleton.parents
+
+    # the names, parents first
+    names = [ROOT]
     while len(names) < len(bones):
-        more = [
-            n for n, parent in parents.items() if parent in names and n not in names
-        ]
+        more = []
+        for name, parent in parents.items():
+            if parent in names and name not in names:
+                more.append(name)
         if not more:
             raise ValueError(
                 "its hierarchy has bones that are not connected to the root"
             )
         names += more
+
+    # world rotations
     values = _read_frames(path, bones, names)
-    frames = len(values[ROOT])
     index = {name: j for j, name in enumerate(names)}
-    rotations = np.empty((frames, len(names), 3, 3))
-    for name in names:
-        C = bones[name].C
-        j = index[name]
-        local = (
-            C @ _turn(values[name] * radians, bones[name].dof) @ C.T
-            if name in values
-            else None
-        )
-        up = rotations[:, index[parents[name]]] if name != ROOT else np.eye(3)
-        rotations[:, j] = up if local is None else up @ local
-    place = [bones[ROOT].dof.index(axis) for axis in ("TX", "TY", "TZ")]
-    offsets = np.array([np.zeros(3), *(bones[parents[name]].end for name in names[1:])])
+    rotations = np.empty((len(values[ROOT]), len(names), 3, 3))
+    for j, name in enumerate(names):
+        R = np.eye(3) if name == ROOT else rotations[:, index[parents[name]]]
+        if name in values:
+            C = bones[name].C
+            M = _turn(values[name] * skeleton.radians, bones[name].dof)
+            R = R @ (C @ M @ C.T)
+        rotations[:, j] = R
+
+    # A bone starts where its parent ends; bones without children get an end site.
+    starts = [np.zeros(3)]
+    starts += [bones[parents[name]].end for name in names[1:]]
+    above = [-1]
+    above += [index[parents[name]] for name in names[1:]]
+    last = [name for name in names if name not in parents.values()]
+    at_last = [index[name] for name in last]
+    ends = [bones[name].end for name in last]
+
     # CMU's wrist bone is the lower half of the forearm: the hand starts at the hand bone.
     plain = [re.sub("wrist$", "lowerforearmtwist", name) for name in names]
-    ends = [name for name in names if name not in parents.values()]
+    place = [bones[ROOT].dof.index(axis) for axis in ("TX", "TY", "TZ")]
     return RigMotion(
-        names=(*plain, *(f"{name} end" for name in ends)),
-        parents=(
-            -1,
-            *(index[parents[name]] for name in names[1:]),
-            *(index[n] for n in ends),
-        ),
-        offsets=np.concatenate([offsets, [bones[name].end for name in ends]]),
-        rotations=np.concatenate(
-            [rotations, rotations[:, [index[n] for n in ends]]], axis=1
-        ),
+        names=(*plain, *(f"{name} end" for name in last)),
+        parents=(*above, *at_last),
+        offsets=np.array(starts + ends),
+        rotations=np.concatenate([rotations, rotations[:, at_last]], axis=1),
         root=values[ROOT][:, place],
         frame_time=1 / FPS,
     )

@@ -11,8 +11,8 @@ from gsgan.motion.standard import RigMotion
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import read_text
 
-SLOWEST = 1.0  # seconds between two frames
-STILL = 1e-3  # of the longest bone: joints that leave their places by less are at rest
+SLOWEST = 1.0  # seconds between two frames from which the number is read as a rate
+STILL = 1e-3  # share of the longest bone: joints that leave their places by less are at rest
 
 
 @dataclass
@@ -39,16 +39,16 @@ def read_bvh(path: Path) -> RigMotion:
         ) from error
     try:
         # Some programs end the file with control characters, as DOS did.
-        hierarchy, *motion = re.split(
-            r"\bMOTION\b", text.rstrip("\x1a\0 \r\n\t"), maxsplit=1
-        )
+        text = text.rstrip("\x1a\0 \r\n\t")
+        hierarchy, *motion = re.split(r"\bMOTION\b", text, maxsplit=1)
+
+        # Braces may touch other words.
         words = re.sub("([{}])", r" \1 ", hierarchy).split()
         if words[:1] != ["HIERARCHY"] or not motion:
             raise ValueError("HIERARCHY and MOTION are expected")
         joints = _read_hierarchy(words[1:])
-        values, frame_time = _read_values(
-            motion[0], sum(len(j.channels) for j in joints)
-        )
+        columns = sum(len(joint.channels) for joint in joints)
+        values, frame_time = _read_values(motion[0], columns)
         return _rig_motion(joints, values, frame_time)
     except (ValueError, IndexError, StopIteration) as error:
         reason = error if isinstance(error, ValueError) else "it ends early"
@@ -59,6 +59,7 @@ def read_bvh(path: Path) -> RigMotion:
 
 def _read_hierarchy(words: list[str]) -> list[_Joint]:
     """The joints between HIERARCHY and MOTION, parents first; end sites are called "... end"."""
+    # `above` has the joints whose braces are open, the root first.
     joints: list[_Joint] = []
     above: list[int] = []
     rest = iter(words)
@@ -66,11 +67,11 @@ def _read_hierarchy(words: list[str]) -> list[_Joint]:
         if word in ("ROOT", "JOINT", "End"):
             if (word == "ROOT") == bool(above):
                 raise ValueError(f"the {word} {next(rest)} is out of place")
-            joint = _Joint(
-                next(rest) + " end" * (word == "End"), above[-1] if above else -1
-            )
-            while (word := next(rest)) != "{":
-                joint.name += " " + word
+            joint = _Joint(name=next(rest), parent=above[-1] if above else -1)
+            if word == "End":
+                joint.name += " end"
+            for part in iter(rest.__next__, "{"):  # names may have several words
+                joint.name += " " + part
             above.append(len(joints))
             joints.append(joint)
         elif word == "OFFSET":
@@ -83,7 +84,7 @@ def _read_hierarchy(words: list[str]) -> list[_Joint]:
 
 
 def _read_values(text: str, columns: int) -> tuple[Array, float]:
-    """``[F, columns]`` numbers after MOTION, and the seconds between two frames.
+    """Numbers ``[F, columns]`` after MOTION, and the seconds between two frames.
 
     A "Frame Time" of a second or more is read as a rate: no motion has it, and some programs write
     frames per second there.
@@ -109,6 +110,8 @@ def _rig_motion(joints: list[_Joint], values: Array, frame_time: float) -> RigMo
     offsets = np.array([joint.offset for joint in joints])
     if not (np.isfinite(values).all() and np.isfinite(offsets).all()):
         raise ValueError("a number is not finite")
+
+    # A joint's channels apply in the order of the file; its position channels replace the offset.
     rotations = np.empty((len(values), len(joints), 3, 3))
     local = np.broadcast_to(offsets, (len(values), *offsets.shape)).copy()
     local[:, 0] = 0.0
@@ -146,8 +149,11 @@ def _rig_motion(joints: list[_Joint], values: Array, frame_time: float) -> RigMo
 
 
 def _counts_from_offset(given: Array, offset: Array) -> bool:
-    """Whether a joint's position channels ``[F, 3]`` are counted from its OFFSET, as some programs
-    write them, and not from the parent: the bone then keeps the length of OFFSET better."""
+    """Whether a joint's position channels ``[F, 3]`` are relative to its OFFSET.
+
+    Some programs write them so, others relative to the parent. The bone keeps the length of OFFSET
+    better with the right one.
+    """
     length = np.linalg.norm(offset)
     from_parent = np.abs(np.linalg.norm(given, axis=1) - length)
     from_offset = np.abs(np.linalg.norm(given + offset, axis=1) - length)

@@ -1,7 +1,7 @@
 """A rigged, textured character: the subject of the synthetic dataset.
 
-Convention: metres; Z up, the rest pose stands on z = 0 and faces -Y, the person's left is +X; v of
-texture coordinates runs down.
+Units are metres. Z points up; the rest pose stands on z = 0 and faces -Y, the person's left is +X;
+v of texture coordinates runs down.
 """
 
 from dataclasses import dataclass
@@ -65,18 +65,15 @@ class Character:
         normals = np.zeros_like(rest)
         for index, weight in zip(self.bone_index.T, self.bone_weight.T, strict=True):
             R = rotations[index]
-            local = (
-                np.einsum("vij,vj->vi", R, rest - self.joints[index]) + joints[index]
-            )
-            vertices += weight[:, None] * local
+            turned = np.einsum("vij,vj->vi", R, rest - self.joints[index])
+            vertices += weight[:, None] * (turned + joints[index])
             normals += weight[:, None] * np.einsum("vij,vj->vi", R, self.normals)
         return vertices, unit(normals)
 
     def dominant_bones(self) -> Ints:
-        """``[V]`` the bone of the largest weight of each vertex."""
-        return self.bone_index[
-            np.arange(len(self.vertices)), self.bone_weight.argmax(axis=1)
-        ]
+        """The bone ``[V]`` with the largest weight of each vertex."""
+        heaviest = self.bone_weight.argmax(axis=1)
+        return self.bone_index[np.arange(len(self.vertices)), heaviest]
 
     def with_descendants(self, bone: int) -> list[int]:
         """A bone and all bones below it."""
@@ -87,11 +84,11 @@ class Character:
         return found
 
     def landmarks(self, vertices: Array, joints: Array) -> Array:
-        """``[L, 3]`` landmarks of a posed mesh, in the order of ``anchor_names``."""
-        of_joint = self.anchor_joint[:, None] >= 0
-        return np.where(
-            of_joint, joints[self.anchor_joint], vertices[self.anchor_vertex]
-        )
+        """Landmarks ``[L, 3]`` of a posed mesh, in the order of ``anchor_names``."""
+        at_joint = self.anchor_joint[:, None] >= 0
+        joints = joints[self.anchor_joint]
+        vertices = vertices[self.anchor_vertex]
+        return np.where(at_joint, joints, vertices)
 
 
 @dataclass(frozen=True)

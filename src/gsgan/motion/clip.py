@@ -1,12 +1,12 @@
 """Motions: what every reader returns, and the steps that follow for all formats.
 
-Convention: landmarks ``p [F, J, 3]`` in metres are MediaPipe's 33; or 75, with the 21 of the left
-hand and of the right one; or 105, also with the 30 of the face.
+Landmarks ``p [F, J, 3]`` in metres are MediaPipe's 33; or 75, with the 21 of the left hand and the
+21 of the right one; or 105, also with the 30 of the face.
 """
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -36,8 +36,8 @@ Bool = NDArray[np.bool_]
 
 TRUNK = (*SHOULDERS, *HIPS)
 AXES = ("x", "y", "z", "-x", "-y", "-z")
-FPS = 30.0  # assumed where neither the file nor the user gives it
-# largest relative difference of bone lengths at which a motion is the subject's own
+FPS = 30.0  # assumed if neither the file nor the user gives a rate
+# maximum relative difference of bone lengths at which a motion is the subject's own
 OWN = 0.02
 # a joint seen in a smaller share of the frames counts as a false detection
 SELDOM = 0.2
@@ -53,13 +53,13 @@ class Clip:
 
     Args:
         path: the file.
-        p: ``[F, J, 3]`` metres; NaN where a landmark is unknown. Where hands and face are on the
-            body is not known in all formats.
+        p: ``[F, J, 3]`` metres; NaN = unknown landmark. Not all formats tell where hands and face
+            are on the body.
         visibility: ``[F, J]`` in [0, 1].
         fps: frames per second, or None if unknown.
         up: the axis that points up, or None to infer it from the skeleton.
         unit: of the file's lengths, in words.
-        file_up: the file's own axis, where ``up`` is that of converted landmarks.
+        file_up: the up axis of the file, if ``up`` is that of converted landmarks.
         body: ``[F]`` poses of the subject's body that the landmarks come from, or None.
         filled: number of frames without shoulders and hips, see `checked`.
         detached: whether hands and face are not where they are on the body, so that the motion
@@ -94,60 +94,80 @@ def checked(motion: Clip, least_visibility: float) -> Clip:
     """
     if not len(motion):
         raise DataError(f"{motion.path} has no frames; expected a motion")
-    known: Bool = np.isfinite(motion.p).all(-1) & (
-        motion.visibility >= least_visibility
-    )
-    known[:, list(TRUNK)] = np.isfinite(motion.p[:, list(TRUNK)]).all(-1) & (
-        motion.visibility[:, TRUNK] > 0
-    )
-    good: Bool = known[:, TRUNK].sum(1) >= MIN_TRUNK_JOINTS
+    trunk = list(TRUNK)
+    # shoulders and hips count at any visibility above 0
+    finite: Bool = np.asarray(np.isfinite(motion.p).all(-1))
+    known = finite & (motion.visibility >= least_visibility)
+    known[:, trunk] = finite[:, trunk] & (motion.visibility[:, trunk] > 0)
+    good = known[:, trunk].sum(1) >= MIN_TRUNK_JOINTS
     if not good.any():
         raise DataError(
             f"{motion.path}: none of {len(motion)} frames has shoulders and hips (NaN, or not seen)"
         )
-    p = np.where(known[..., None], motion.p, np.nan)
-    visibility = np.where(known, motion.visibility, 0.0)
-    body = motion.body
+
+    # Frames without a trunk are between their neighbours; body poses cannot be mixed.
     before, after, share = neighbours(good)
     nearest = np.where(share > 0.5, after, before)
+    body = motion.body
     if body is not None:
         share = np.rint(share)
         body = body[torch.from_numpy(nearest)]
-    q = mixed(p[before], p[after], share)
+    p = np.where(known[..., None], motion.p, np.nan)
+    filled = mixed(p[before], p[after], share)
+    filled = np.where(np.isfinite(filled), filled, p[nearest])
+    visibility = np.where(known, motion.visibility, 0.0)
     shown = visibility[nearest]
-    q = np.where(np.isfinite(q), q, p[nearest])
-    q[:, BODY:] = p[:, BODY:]
+
+    # hands and face stay
+    filled[:, BODY:] = p[:, BODY:]
     shown[:, BODY:] = visibility[:, BODY:]
-    return replace(motion, p=q, visibility=shown, body=body, filled=int((~good).sum()))
+    return replace(
+        motion,
+        p=filled,
+        visibility=shown,
+        body=body,
+        filled=int((~good).sum()),
+    )
 
 
-def neighbours(known: Bool) -> tuple[NDArray[np.int64], NDArray[np.int64], Float]:
-    """Per frame of ``known [F]``, the nearest known frames before and after it (itself if known;
-    the same one twice where there is none on a side), and the share of the latter in [0, 1]."""
+class Neighbours(NamedTuple):
+    """The nearest known frames of each of F frames."""
+
+    before: NDArray[np.int64]  # [F]; a known frame is its own neighbour
+    after: NDArray[np.int64]  # [F]; the same as before if there is none on one side
+    share: Float  # [F] of the latter, in [0, 1]
+
+
+def neighbours(known: Bool) -> Neighbours:
+    """The nearest known frames before and after each frame of ``known [F]``."""
     at = np.flatnonzero(known)
     times = np.arange(len(known))
     after = at[np.searchsorted(at, times).clip(max=len(at) - 1)]
     before = at[(np.searchsorted(at, times, side="right") - 1).clip(min=0)]
-    return before, after, ((times - before) / np.maximum(after - before, 1)).clip(0, 1)
+    share = (times - before) / np.maximum(after - before, 1)
+    return Neighbours(before, after, share.clip(0, 1))
 
 
 def mixed(a: Float, b: Float, share: Float) -> Float:
-    """Landmarks ``[F, J, 3]`` between two; where a share ``[F]`` is 0 or 1, exactly one of them."""
-    s = share[:, None, None]
-    return np.where(s > 0, np.where(s < 1, (1 - s) * a + s * b, b), a)
+    """Landmarks ``[F, J, 3]`` between two; if a share ``[F]`` is 0 or 1, exactly one of them."""
+    share = share[:, None, None]
+    between = (1 - share) * a + share * b
+    between = np.where(share < 1, between, b)
+    return np.where(share > 0, between, a)
 
 
 def is_own(motion: Clip, subject: Proportions) -> bool:
     """Whether the motion's bones are as long as the subject's: it needs no retargeting."""
     with np.errstate(invalid="ignore"):
-        found = bone_lengths(motion.p, BONES).T
-    seen = [
-        (np.median(x[np.isfinite(x)]), bone)
-        for x, bone in zip(found, BONES, strict=True)
-        if np.isfinite(x).any()
-    ]
-    rest = subject.rest
-    return bool(seen) and all(abs(x / length(rest, b) - 1) <= OWN for x, b in seen)
+        lengths = bone_lengths(motion.p, BONES).T
+    # the relative difference of each bone's median length
+    differences = []
+    for values, bone in zip(lengths, BONES, strict=True):
+        seen = values[np.isfinite(values)]
+        if len(seen):
+            ratio = np.median(seen) / length(subject.rest, bone)
+            differences.append(abs(ratio - 1))
+    return bool(differences) and bool(np.max(differences) <= OWN)
 
 
 def up_axis(motion: Clip) -> str:
@@ -158,14 +178,15 @@ def up_axis(motion: Clip) -> str:
 
 
 def completed(motion: Clip, up: str) -> Float:
-    """``[F, J, 3]`` every landmark in standard axes, Z up.
+    """All landmarks ``[F, J, 3]`` in standard axes, Z up.
 
     Gaps of a joint are interpolated linearly, relative to its parent joint. A joint that fewer than
     `SELDOM` of the frames show takes its place in the rest pose, relative to its parent. Gaps of a
     hand or the face of up to `GAP` frames are interpolated; in longer ones it is NaN.
     """
-    both = motion.p @ upright(up).T
-    p = both[:, :BODY]
+    # Offsets of the body's joints from their parents are interpolated.
+    whole = motion.p @ upright(up).T
+    p = whole[:, :BODY]
     known: Bool = np.asarray(np.isfinite(p).all(-1))
     times = np.arange(len(p))
     for joint, parent in PARENT.items():
@@ -174,24 +195,31 @@ def completed(motion: Clip, up: str) -> Float:
         if seen.mean() < SELDOM:
             known[:, joint] = False
         elif not seen.all():
-            between = np.stack(
-                [np.interp(times, times[seen], x[seen]) for x in offset.T], axis=1
-            )
-            p[:, joint] = np.where(seen[:, None], p[:, joint], p[:, parent] + between)
+            gaps = ~seen
+            for axis in range(3):
+                filled = np.interp(times, times[seen], offset[seen, axis])
+                p[gaps, joint, axis] = p[gaps, parent, axis] + filled[gaps]
             known[:, joint] = known[:, parent]
-    whole, _ = sanitise(torch.from_numpy(p), torch.from_numpy(known))
-    parts = [_bridged(both[:, part]) for part in (*HAND_JOINTS.values(), EXPRESSION)]
-    return np.concatenate([whole.numpy(), *parts], axis=1)
+
+    # Joints without an offset take their places in the rest pose.
+    body, _ = sanitise(torch.from_numpy(p), torch.from_numpy(known))
+
+    # hands and the face
+    parts = [body.numpy()]
+    for part in (*HAND_JOINTS.values(), EXPRESSION):
+        parts.append(_bridged(whole[:, part]))
+    return np.concatenate(parts, axis=1)
 
 
 def _bridged(part: Float) -> Float:
-    """``[F, n, 3]`` a hand or face, gaps of up to `GAP` frames interpolated."""
+    """A hand or face ``[F, n, 3]``; gaps of up to `GAP` frames are interpolated."""
     known: Bool = np.asarray(np.isfinite(part).all((1, 2)))
     if not known.any():
         return part
     before, after, share = neighbours(known)
     short = ~known & (after - before - 1 <= GAP) & (after > before)
-    return np.where(short[:, None, None], mixed(part[before], part[after], share), part)
+    filled = mixed(part[before], part[after], share)
+    return np.where(short[:, None, None], filled, part)
 
 
 def resampled(p: Float, fps: float, wanted: float) -> Float:
@@ -204,8 +232,10 @@ def resampled(p: Float, fps: float, wanted: float) -> Float:
 
 
 def frame_times(frames: int, fps: float, wanted: float) -> Float:
-    """Times of the frames at a new rate, in frames of the old rate; the last is not exceeded, and
-    one that would be just beyond it is the last."""
+    """Times of the frames at a new rate, in frames of the old rate.
+
+    The last old frame is not exceeded; a time that would be just beyond it is moved to it.
+    """
     count = int((frames - 1) * wanted / fps + JUST_BEYOND) + 1
     times = np.arange(count, dtype=np.float64) * fps / wanted
     return np.minimum(times, frames - 1)
@@ -217,11 +247,9 @@ def rate_of(path: Path, value: Any) -> float:
     Raises:
         DataError: when it is not a number above 0.
     """
-    rate = (
-        float(np.asarray(value).reshape(-1)[0])
-        if np.asarray(value).dtype.kind in "iuf"
-        else 0
-    )
+    values = np.asarray(value)
+    is_number = values.dtype.kind in "iuf"
+    rate = float(values.reshape(-1)[0]) if is_number else 0.0
     if not 0 < rate < 1e5:
         raise DataError(
             f"{path}: the frame rate is {value!r}; expected a number above 0"
@@ -230,7 +258,9 @@ def rate_of(path: Path, value: Any) -> float:
 
 
 def usual_rate(rate: float) -> float:
-    """A whole number of frames per second where a rate is one but for rounding: files hold the time
-    between frames with five to seven digits. Film's rates, such as 29.97, stay."""
+    """The rate, or the whole number of frames per second that it is except for rounding.
+
+    Files hold the time between frames with five to seven digits. Film's rates, such as 29.97, stay.
+    """
     whole = max(1.0, round(rate))
     return whole if abs(rate / whole - 1) < ROUNDED else rate

@@ -1,4 +1,4 @@
-"""A camera on a circle round a moving person."""
+"""A camera on a circle around a moving person."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Orbit:
-    """A circle round the person; angles in degrees, metres; see conf/render.yaml."""
+    """A circle around the person; angles in degrees, metres; see conf/render.yaml."""
 
     turns: float = 1.0
     elevation: float = 10.0
@@ -38,42 +38,50 @@ class Orbit:
     def cameras(
         self, p: Float, subject: Proportions, scene: SceneInfo, size: int, trained: int
     ) -> Camera:
-        """One camera per skeleton ``[F, 33, 3]``, on a circle round the centre of the motion.
+        """One camera per skeleton ``[F, 33, 3]``, on a circle around the centre of the motion.
 
         Args:
-            p: metres, world frame; NaN where unknown.
+            p: metres, world frame; NaN = unknown.
             subject: the person's proportions.
             scene: sets the person's size, that of training images.
             size: pixels of the square images.
             trained: pixels of the training images.
         """
+        F = len(p)
         to_world = upright(subject.up).T
         p = np.where(np.isfinite(p), p, np.nanmean(p, axis=1, keepdims=True))
-        low = np.min((p @ to_world).reshape(-1, 3), axis=0)
-        high = np.max((p @ to_world).reshape(-1, 3), axis=0)
-        middle = (low + high) / 2
+        points = (p @ to_world).reshape(-1, 3)
+        middle = (np.min(points, axis=0) + np.max(points, axis=0)) / 2
+
+        # the distance at which the person is as large as in the training images
         focal = size / 2 / np.tan(np.radians(self.fov) / 2)
-        shown = sum(scene.scale_train) / 2 * size / trained  # pixels per metre
-        distance = self.distance or focal / shown
-        share = np.arange(len(p)) / max(len(p), 1)
-        azimuth = heading(p[0] @ to_world) + np.radians(
-            self.start + 360 * self.turns * share
-        )
-        tilt = np.radians(self.elevation)
+        pixels_per_metre = sum(scene.scale_train) / 2 * size / trained
+        distance = self.distance or focal / pixels_per_metre
+
+        # directions from the person to the camera
+        share = np.arange(F) / max(F, 1)
+        turned = np.radians(self.start + 360 * self.turns * share)
+        azimuth = heading(p[0] @ to_world) + turned
+        elevation = np.radians(self.elevation)
         away = np.stack(
             [
-                np.cos(tilt) * np.sin(azimuth),
-                -np.cos(tilt) * np.cos(azimuth),
-                np.full(len(p), np.sin(tilt)),
+                np.cos(elevation) * np.sin(azimuth),
+                -np.cos(elevation) * np.cos(azimuth),
+                np.full(F, np.sin(elevation)),
             ],
             axis=1,
         )
+
+        # extrinsics, in the axes of the world
         right = np.stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth], axis=1)
-        R = np.stack([right, np.cross(-away, right), -away], axis=1) @ upright(
-            subject.up
-        )
+        R = np.stack([right, np.cross(-away, right), -away], axis=1)
+        R = R @ upright(subject.up)
         centres = (middle + distance * away) @ upright(subject.up)
-        K = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
         t = -(R @ centres[..., None])[..., 0]
-        world = [torch.from_numpy(x).float() for x in (K, R, t)]
-        return Camera(world[0].expand(len(p), 3, 3), world[1], world[2], (size, size))
+        K = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
+        return Camera(
+            torch.from_numpy(K).float().expand(F, 3, 3),
+            torch.from_numpy(R).float(),
+            torch.from_numpy(t).float(),
+            (size, size),
+        )

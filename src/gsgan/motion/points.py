@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,88 +21,102 @@ TRUNK = [11, 12, 23, 24]  # shoulders and hips
 TRUNK_LENGTH = 0.5  # metres from shoulder to hip
 TRC_HEADER = 5  # lines before the first frame; markers are named in the fourth
 TRC_AXES = [2, 0, 1]  # Pose2Sim writes (y, z, x) so that y is up: columns of x, y, z
-Numbered = tuple[Ints, Float, Float]  # frame numbers, coordinates, confidence
+
+
+class Points3D(NamedTuple):
+    """3D joints of F numbered frames."""
+
+    frames: Ints  # [F] increasing
+    p: Float  # [F, 33, 3] metres, in the calibration's world; NaN = missing
+    conf: Float  # [F, 33] 0 = missing
 
 
 def json_files(path: Path) -> dict[int, Path]:
+    """A folder's JSON files by frame number, in increasing order."""
     files = frame_files(path.parent, path.name, (".json",))
     if not files:
         raise DataError(f"{path} holds no JSON files; expected one per frame, numbered")
     return {number: path.parent / files[number] for number in sorted(files)}
 
 
-def read_points3d(path: Path) -> Numbered:
-    """3D joints of a .trc file.
-
-    Returns:
-        ``frames [F]`` rising; ``p [F, 33, 3]`` metres, in the calibration's world, NaN = missing,
-        as exact zeros are; ``conf [F, 33]``, 0 = missing.
+def read_points3d(path: Path) -> Points3D:
+    """3D joints of a .trc file; exact zeros are missing.
 
     Raises:
         DataError: when it is damaged, or without shoulders and hips.
     """
-    frames, p, conf = _read_trc(path)
+    frames, p = _read_trc(path)
     order = np.argsort(frames)
     p = p[order]
-    conf = np.where(known(p), conf[order], 0.0)
-    p = np.where((conf > 0)[..., None], p, np.nan)
-    return frames[order], p, conf
+    seen = known(p)
+    p = np.where(seen[..., None], p, np.nan)
+    return Points3D(frames[order], p, seen.astype(np.float64))
 
 
-def _read_trc(path: Path) -> Numbered:
+def _read_trc(path: Path) -> tuple[Ints, Float]:
+    """Frame numbers ``[F]`` and joints ``[F, 33, 3]`` in metres, in the order of the file."""
     try:
         lines = read_text(path).splitlines()
-        names = lines[1].split()
-        values = lines[2].split()
+        header = dict(zip(lines[1].split(), lines[2].split(), strict=False))
         markers = [name for name in lines[3].split("\t")[2:] if name]
+
         # frame, time and the coordinates; an empty cell is missing
-        count = 2 + 3 * len(markers)
-        rows = [
-            [
-                float(cell) if cell.strip() else np.nan
-                for cell in (line.split("\t") + [""] * count)[:count]
-            ]
-            for line in lines[TRC_HEADER:]
-            if line.strip()
-        ]
-        unit = dict(zip(names, values, strict=False)).get("Units")
+        columns = 2 + 3 * len(markers)
+        rows = []
+        for line in lines[TRC_HEADER:]:
+            if line.strip():
+                cells = (line.split("\t") + [""] * columns)[:columns]
+                rows.append([float(x) if x.strip() else np.nan for x in cells])
     except (OSError, ValueError, IndexError) as error:
         raise DataError(f"{path} cannot be read as a .trc file ({error})") from None
-    # a number: Units is left out
-    given = unit is not None and not re.fullmatch(r"[\d.]+", unit)
-    if given and unit not in UNITS:
+
+    # The header's columns are shifted if it has a number there: Units is then left out.
+    unit = header.get("Units")
+    if unit is not None and re.fullmatch(r"[\d.]+", unit):
+        unit = None
+    if unit is not None and unit not in UNITS:
         raise DataError(
             f"{path}: Units is {unit!r}; expected one of {', '.join(UNITS)}"
         )
-    table = np.array(rows).reshape(-1, count)
-    read = table[:, 2:].reshape(len(table), len(markers), 3)[..., TRC_AXES]
-    p = np.full((len(table), BODY, 3), np.nan)
+
+    # the joints that MediaPipe has too
+    table = np.array(rows).reshape(-1, columns)
+    F = len(table)
+    coordinates = table[:, 2:].reshape(F, len(markers), 3)[..., TRC_AXES]
+    p = np.full((F, BODY, 3), np.nan)
     for marker, name in enumerate(markers):
-        if (joint := _joint(name)) is not None:
-            p[:, joint] = read[:, marker]
+        joint = _joint(name)
+        if joint is not None:
+            p[:, joint] = coordinates[:, marker]
     p = zeros_as_missing(p)
     if not np.isfinite(p[:, TRUNK]).any():
         raise DataError(
             f"{path} has no shoulders and hips; expected markers such as LShoulder and LHip, found "
             f"{', '.join(markers)}"
         )
-    p = p * (UNITS[str(unit)] if given else _metres(p))
-    return whole_frame_ids(table[:, 0], str(path)), p, np.ones(p.shape[:2])
+
+    scale = _metres(p) if unit is None else UNITS[unit]
+    return whole_frame_ids(table[:, 0], str(path)), p * scale
 
 
 def _metres(p: Float) -> float:
     """Metres in the unit of joints ``[F, 33, 3]``: the trunk then has nearly its usual length."""
     trunk = np.nanmedian(np.linalg.norm(p[:, [11, 12]] - p[:, [23, 24]], axis=-1))
-    return min(
-        UNITS.values(), key=lambda scale: abs(np.log(scale * trunk / TRUNK_LENGTH))
-    )
+
+    def mismatch(scale: float) -> float:
+        return float(abs(np.log(scale * trunk / TRUNK_LENGTH)))
+
+    return min(UNITS.values(), key=mismatch)
 
 
 def _joint(name: str) -> int | None:
     """The MediaPipe joint of a marker: LShoulder, left_shoulder, Lknee, LBigToe, Nose."""
-    word = re.sub(r"[^a-z]", "", name.split(":")[-1].lower()).replace(
-        "bigtoe", "footindex"
-    )
-    word = re.sub("^l(?!eft)", "left", re.sub("^r(?!ight)", "right", word))
+    # the letters, without a prefix such as "person:"
+    word = re.sub(r"[^a-z]", "", name.split(":")[-1].lower())
+    word = word.replace("bigtoe", "footindex")
+
+    # "l" and "r" stand for "left" and "right"
+    word = re.sub("^r(?!ight)", "right", word)
+    word = re.sub("^l(?!eft)", "left", word)
     plain = [name.replace("_", "") for name in MEDIAPIPE33.names]
     return plain.index(word) if word in plain else None

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from itertools import combinations, pairwise
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,17 +35,19 @@ WORLD = "POSE_WORLD_LANDMARKS"
 HAND_PARTS = ("LEFT_HAND_LANDMARKS", "RIGHT_HAND_LANDMARKS")
 MESH = "FACE_LANDMARKS"
 MESH_SIZE = 478
-# Without the thumb: hands differ most in where its base is.
-HAND_LENGTHS = tuple(bone for f in FINGERS[1:] for bone in pairwise((WRIST, *f)))
+# The bones of a hand without the thumb: hands differ most in where its base is.
+HAND_LENGTHS = tuple(
+    bone for finger in FINGERS[1:] for bone in pairwise((WRIST, *finger))
+)
 AVERAGE_FACE = np.full((MESH_SIZE, 3), np.nan)
 AVERAGE_FACE[list(FACE_MESH.values())] = rest_face()
-# Pairs of landmarks that are further apart than an expression moves them, by far.
+# Pairs of landmarks that are much further apart than an expression moves them.
 FACE_LENGTHS = tuple(
     pair
     for pair in combinations(FACE_MESH.values(), 2)
     if length(AVERAGE_FACE, pair) > 0.05
 )
-# rigid, for the scale of axes
+# Rigid lengths, which show the scale of the axes.
 LENGTHS = (*BONES, SHOULDERS, HIPS, EARS, (11, 23), (12, 24))
 
 
@@ -58,45 +60,76 @@ def read_pose(path: Path, subject: Proportions) -> Clip:
     Hands and the face have scales of their own. The face is in axes fixed to the head, by all
     landmarks of the mesh that the file has.
 
-    Hips that are hardly seen, as of people filmed from the waist up, are put upright below the
-    shoulders.
+    If the hips are hardly visible, as when people are filmed from the waist up, they are put
+    upright below the shoulders.
 
     Raises:
         DataError: when the package is missing, the file is damaged or has no depth.
     """
     file = _PoseFile(path)
-    name = next((n for n in (IMAGE, WORLD) if n in file.parts), None)
-    if name is None or "Z" not in file.parts[name][2]:
+    name = IMAGE if IMAGE in file.parts else WORLD
+    if name not in file.parts or "Z" not in file.parts[name].layout:
         raise DataError(
             f"{path} has {', '.join(file.parts)} without depth; expected MediaPipe's "
             f"{WORLD} or {IMAGE} in 3D"
         )
+
+    # the body
     p, visibility = file.landmarks(name, MEDIAPIPE33.names)
     person = visibility[:, SHOULDERS].all(1)
-    if hidden := person.any() and np.median(visibility[person][:, HIPS]) < GUESSED:
+    guessed_hips = person.any() and np.median(visibility[person][:, HIPS]) < GUESSED
+    if guessed_hips:
         visibility[:, HIPS] = 0
     p = _to_metres(path, p, visibility, subject, pixels=name == IMAGE)
-    if hidden:
+    if guessed_hips:
         p[:, HIPS] = p[:, SHOULDERS] + (0, length(subject.rest, (11, 23)), 0)
         visibility[:, HIPS] = visibility[:, SHOULDERS]
+
+    # hands and face, if there are any
     hands = [file.landmarks(hand, HAND_NAMES) for hand in HAND_PARTS]
-    face = file.landmarks(MESH, tuple(str(number) for number in range(MESH_SIZE)))
-    if any(seen.any() for _, seen in (*hands, face)):
-        whole = subject.rest_with_hands
-        rest = [whole[at] for at in HAND_JOINTS.values()]
-        p = np.concatenate([p, *_parts_to_metres(hands, rest, HAND_LENGTHS)], axis=1)
-        visibility = np.concatenate([visibility, *(seen for _, seen in hands)], axis=1)
-    if face[1].any():
+    mesh_names = tuple(str(number) for number in range(MESH_SIZE))
+    face = file.landmarks(MESH, mesh_names)
+    points = [p]
+    confidences = [visibility]
+    if any(part.confidence.any() for part in (*hands, face)):
+        rest = [subject.rest_with_hands[joints] for joints in HAND_JOINTS.values()]
+        points += _parts_to_metres(hands, rest, HAND_LENGTHS)
+        confidences += [hand.confidence for hand in hands]
+    if face.confidence.any():
         (mesh,) = _parts_to_metres([face], [AVERAGE_FACE], FACE_LENGTHS)
-        ours = list(FACE_MESH.values())
-        p = np.concatenate([p, steadied(mesh)[:, ours]], axis=1)
-        visibility = np.concatenate([visibility, face[1][:, ours]], axis=1)
+        chosen = list(FACE_MESH.values())
+        points.append(steadied(mesh)[:, chosen])
+        confidences.append(face.confidence[:, chosen])
+
     unit = f"{name.lower().replace('_', ' ')}, scaled to the subject"
-    return Clip(path, p, visibility, rate_of(path, file.fps), None, unit, detached=True)
+    return Clip(
+        path=path,
+        p=np.concatenate(points, axis=1),
+        visibility=np.concatenate(confidences, axis=1),
+        fps=rate_of(path, file.fps),
+        up=None,
+        unit=unit,
+        detached=True,
+    )
+
+
+class _Part(NamedTuple):
+    """A part of a .pose file, such as a hand."""
+
+    columns: slice
+    points: list[str]
+    layout: str  # axes, such as "XYZC"
+
+
+class _Landmarks(NamedTuple):
+    """Points in the file's units."""
+
+    p: Float  # [F, n, 3]; NaN = absent
+    confidence: Float  # [F, n]
 
 
 class _PoseFile:
-    """A .pose file: ``parts`` has the columns, points and layout of each part by name."""
+    """A .pose file and its parts by name."""
 
     def __init__(self, path: Path) -> None:
         try:
@@ -116,24 +149,34 @@ class _PoseFile:
         if self.data.ndim != 4 or 0 in self.data.shape[:2]:
             raise DataError(f"{path} has no frames with a person; expected a motion")
         self.fps = pose.body.fps
-        self.parts = dict[str, Any]()
+
+        # The points of all parts are in one array, part by part.
+        self.parts: dict[str, _Part] = {}
         start = 0
         for part in pose.header.components:
-            columns = slice(start, start := start + len(part.points))
-            self.parts[part.name] = columns, part.points, part.format
+            stop = start + len(part.points)
+            self.parts[part.name] = _Part(slice(start, stop), part.points, part.format)
+            start = stop
 
-    def landmarks(self, part: str, names: tuple[str, ...]) -> tuple[Float, Float]:
-        """``[F, n, 3]`` the points of a part by name, NaN where absent; confidence ``[F, n]``."""
-        shape = len(self.data), len(names)
+    def landmarks(self, name: str, points: tuple[str, ...]) -> _Landmarks:
+        """The n points of a part; a part without depth counts as absent."""
+        shape = (len(self.data), len(points))
         p = np.full((*shape, 3), np.nan)
-        seen = np.zeros(shape)
-        columns, points, layout = self.parts.get(part, (slice(0), [], ""))
-        for k, point in enumerate(points if "Z" in layout else ()):
-            if (known := point.lower().replace("_finger", "")) in names:
-                j = names.index(known)
-                p[:, j] = self.data[:, 0, columns][:, k]
-                seen[:, j] = self.confidence[:, 0, columns][:, k]
-        return p, seen
+        confidence = np.zeros(shape)
+        part = self.parts.get(name)
+        if part is None or "Z" not in part.layout:
+            return _Landmarks(p, confidence)
+
+        # the first person in each frame
+        data = self.data[:, 0, part.columns]
+        own_confidence = self.confidence[:, 0, part.columns]
+        for k, point in enumerate(part.points):
+            point = point.lower().replace("_finger", "")
+            if point in points:
+                j = points.index(point)
+                p[:, j] = data[:, k]
+                confidence[:, j] = own_confidence[:, k]
+        return _Landmarks(p, confidence)
 
 
 def _to_metres(
@@ -142,47 +185,52 @@ def _to_metres(
     """Scales each of the three axes so that bones get the subject's lengths.
 
     The squares of the scales solve ``Σ sᵢ² dᵢ² = length²`` over all seen bones and frames, by
-    non-negative least squares. Pixels are square: x and y then take the mean of theirs. One unknown
+    non-negative least squares. Pixels are square: x and y then take their mean scale. One unknown
     for both would leave no depth to a person with longer arms, or narrower shoulders.
     """
+    # one row for each bone in each frame in which it is seen
     rows = []
     for a, b in LENGTHS:
-        seen = (visibility[:, (a, b)] > 0.2).all(1) & np.isfinite(p[:, (a, b)]).all(
-            (1, 2)
-        )
-        rows.append((p[seen, b] - p[seen, a]) ** 2 / length(subject.rest, (a, b)) ** 2)
+        visible = (visibility[:, (a, b)] > 0.2).all(1)
+        seen = visible & np.isfinite(p[:, (a, b)]).all((1, 2))
+        squares = (p[seen, b] - p[seen, a]) ** 2
+        rows.append(squares / length(subject.rest, (a, b)) ** 2)
     table = np.concatenate(rows)
     if not len(table):
         raise DataError(
             f"{path}: no frame shows two joints of a limb; expected a person"
         )
-    scales = np.sqrt(nnls(table, np.ones(len(table)))[0])
+    squares, _ = nnls(table, np.ones(len(table)))
+    scales = np.sqrt(squares)
     if pixels:
         scales[:2] = scales[:2].mean()
-    return np.asarray(p * scales)
+    return p * scales
 
 
 def _parts_to_metres(
-    parts: Sequence[tuple[Float, Float]],
+    parts: Sequence[_Landmarks],
     rest: Sequence[Float],
     lengths: Sequence[tuple[int, int]],
 ) -> list[Float]:
-    """Both hands, or the face, ``[F, n, 3]``, of points and confidences.
+    """Both hands, or the face, ``[F, n, 3]`` in metres.
 
     The scale of x and y, and that of z, solve `_to_metres`' equations for pairs of all parts that
     are as long as in ``rest [n, 3]``.
     """
+    # one row for each pair in each frame: x and y together, then z
     rows = []
-    found = []
-    for (p, seen), at_rest in zip(parts, rest, strict=True):
-        p = np.where(seen[..., None] > 0, p, np.nan)
+    points = []
+    for part, at_rest in zip(parts, rest, strict=True):
+        p = np.where(part.confidence[..., None] > 0, part.p, np.nan)
         for a, b in lengths:
-            bone = (p[:, b] - p[:, a]) ** 2 / length(at_rest, (a, b)) ** 2
-            rows.append(np.stack([bone[:, 0] + bone[:, 1], bone[:, 2]], axis=1))
-        found.append(p)
+            squares = (p[:, b] - p[:, a]) ** 2 / length(at_rest, (a, b)) ** 2
+            row = np.stack([squares[:, 0] + squares[:, 1], squares[:, 2]], axis=1)
+            rows.append(row)
+        points.append(p)
     table = np.concatenate(rows)
     table = table[np.isfinite(table).all(1)]
     if not len(table):
-        return [np.full_like(p, np.nan) for p in found]
-    flat, deep = np.sqrt(nnls(table, np.ones(len(table)))[0])
-    return [p * (flat, flat, deep) for p in found]
+        return [np.full_like(p, np.nan) for p in points]
+    squares, _ = nnls(table, np.ones(len(table)))
+    flat, deep = np.sqrt(squares)
+    return [p * (flat, flat, deep) for p in points]

@@ -37,14 +37,12 @@ Float = NDArray[np.float64]
 
 JOINTS = len(MEDIAPIPE33.names)
 WORLD_KEYS = (
-    *(
-        "pose_world_landmarks",
-        "poseWorldLandmarks",
-        "world_landmarks",
-        "worldLandmarks",
-    ),
-    # the latter: TensorFlow.js, metres about the hips
-    *("POSE_WORLD_LANDMARKS", "keypoints3D"),
+    "pose_world_landmarks",
+    "poseWorldLandmarks",
+    "world_landmarks",
+    "worldLandmarks",
+    "POSE_WORLD_LANDMARKS",
+    "keypoints3D",  # TensorFlow.js, metres from the hips
 )
 # Keys of SMPL's parameters: AMASS, HuMMan, smplx, AIST++, ZJU-MoCap.
 POSE_KEYS = ("poses", "pose", "smpl_poses", "body_pose", "pose_body")
@@ -57,22 +55,28 @@ WITHOUT_ROOT = (63, 69, 153, 162)
 RATE_KEYS = ("fps", "mocap_framerate", "mocap_frame_rate")
 SCALE = "smpl_scaling"  # of AIST++: units of its translations in a metre
 ARRAYS = (
-    *(
-        "p",
-        "conf",
-        "theta",
-        "visibility",
-        SCALE,
-        *WORLD_KEYS,
-        *POSE_KEYS,
-        *PART_KEYS,
-        *ROOT_KEYS,
-    ),
-    *(*MOVE_KEYS, *SHAPE_KEYS, *RATE_KEYS),
+    "p",
+    "conf",
+    "theta",
+    "visibility",
+    SCALE,
+    *WORLD_KEYS,
+    *POSE_KEYS,
+    *PART_KEYS,
+    *ROOT_KEYS,
+    *MOVE_KEYS,
+    *SHAPE_KEYS,
+    *RATE_KEYS,
 )
 SMPL_BODY = 22  # joints that SMPL, SMPL-H and SMPL-X share
-LEG_UNITS = {"metres": 1.0, "decimetres": 0.1, "centimetres": 0.01, "inches": 0.0254}
-LEG_UNITS |= {"millimetres": 0.001, "CMU units (inches / 0.45)": 0.0254 / 0.45}
+LEG_UNITS = {
+    "metres": 1.0,
+    "decimetres": 0.1,
+    "centimetres": 0.01,
+    "inches": 0.0254,
+    "millimetres": 0.001,
+    "CMU units (inches / 0.45)": 0.0254 / 0.45,
+}
 
 
 @dataclass(frozen=True)
@@ -82,7 +86,7 @@ class Source:
     Args:
         subject: the subject's proportions, for formats without face, hands and scale.
         smpl: an SMPL or SMPL-X model file, or None.
-        skeleton: the ASF file of an AMC motion, or None for the one beside it.
+        skeleton: the ASF file of an AMC motion, or None for the one in the same folder.
         up: the axis of a rig's file that points up, or None to find it from the frames.
     """
 
@@ -114,13 +118,16 @@ def read_motion(path: Path, source: Source) -> Clip:
 
 
 def _with_missing(clip: Clip) -> Clip:
-    """The motion with one rule for missing joints, whatever the format: exact zeros are missing,
-    and a visibility of 0 for every joint of every frame means that none was given."""
+    """The motion with one rule for missing joints, whatever the format.
+
+    Exact zeros are missing, and a visibility of 0 for every joint of every frame means that none
+    was given.
+    """
     p = zeros_as_missing(clip.p)
+    visibility = clip.visibility
+    if not visibility.any():
+        visibility = np.ones_like(visibility)
     known = np.isfinite(p).all(-1)
-    visibility = (
-        clip.visibility if clip.visibility.any() else np.ones_like(clip.visibility)
-    )
     return replace(clip, p=p, visibility=np.where(known, visibility, 0.0))
 
 
@@ -134,14 +141,16 @@ def read_npz(path: Path, source: Source) -> Clip:
 
 def read_dictionary(path: Path, source: Source) -> Clip:
     """A pickled dictionary of arrays, as of AIST++ (.pkl) or a frame of ZJU-MoCap (.npy)."""
-    content = (read_npy if path.suffix.lower() == ".npy" else read_pickle)(path)
+    read = read_npy if path.suffix.lower() == ".npy" else read_pickle
+    content = read(path)
     if not isinstance(content, dict):
         raise DataError(
             f"{path} holds no dictionary; expected one of arrays, such as 'poses'"
         )
     arrays = {key: as_floats(content[key]) for key in ARRAYS if key in content}
-    if empty := [key for key, values in arrays.items() if not values.size]:
-        raise DataError(f"{path}: {empty[0]!r} must be an array of numbers")
+    for key, values in arrays.items():
+        if not values.size:
+            raise DataError(f"{path}: {key!r} must be an array of numbers")
     return _by_names(path, arrays, source)
 
 
@@ -152,10 +161,17 @@ def _by_names(path: Path, arrays: dict[str, NDArray[Any]], source: Source) -> Cl
         return _landmarks(path, arrays, fps)
     if "theta" in arrays:
         return _body_pose(path, arrays, fps, source)
-    for key in WORLD_KEYS:
-        if key in arrays:
-            p = _with_visibility(path, arrays[key], arrays.get("visibility"))
-            return Clip(path, p[..., :3], p[..., 3], fps, None, "metres")
+    world = _first(arrays, WORLD_KEYS)
+    if world is not None:
+        p = _with_visibility(path, world, arrays.get("visibility"))
+        return Clip(
+            path=path,
+            p=p[..., :3],
+            visibility=p[..., 3],
+            fps=fps,
+            up=None,
+            unit="metres",
+        )
     if _first(arrays, POSE_KEYS) is not None:
         return _smpl(path, arrays, fps, source)
     raise DataError(
@@ -168,17 +184,18 @@ def _by_names(path: Path, arrays: dict[str, NDArray[Any]], source: Source) -> Cl
 def _first(
     arrays: dict[str, NDArray[Any]], keys: tuple[str, ...], default: Any = None
 ) -> Any:
+    """The first array that there is."""
     return next((arrays[key] for key in keys if key in arrays), default)
 
 
-def _beside(path: Path) -> dict[str, Any]:
+def _meta(path: Path) -> dict[str, Any]:
     """The content of meta.json in the file's folder, if there is one."""
     meta = path.with_name("meta.json")
     return read_json(meta) if meta.is_file() else {}
 
 
 def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Clip:
-    meta = _beside(path)
+    """Landmarks as `gsgan.prepare` writes them."""
     hands = EXPRESSION.start
     face = EXPRESSION.stop
     if arrays["p"].shape[1:] not in ((JOINTS, 3), (hands, 3), (face, 3)):
@@ -191,52 +208,76 @@ def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Clip:
     if "conf" in arrays:
         conf = expect_array(arrays, "conf", p.shape[:2], path).astype(np.float64)
     conf = np.where(np.isfinite(p).all(-1), np.nan_to_num(conf), 0.0)
-    shown = conf[:, :JOINTS] > 0
+
+    # People filmed from the waist up get hips below their shoulders.
+    seen = conf[:, :JOINTS] > 0
+    no_hips = seen[:, SHOULDERS].all(1) & ~seen[:, HIPS].any(1)
     body = np.nan_to_num(p[:, :JOINTS])
-    # people filmed from the waist up
-    hung = shown[:, SHOULDERS].all(1) & ~shown[:, HIPS].any(1)
-    if hung.any() and ((placed := hips_below(body, shown)) != body).any():
-        p[hung, :JOINTS] = np.where(shown[hung, :, None], p[hung, :JOINTS], np.nan)
+    placed = hips_below(body, seen)
+    if no_hips.any() and (placed != body).any():
+        p[no_hips, :JOINTS] = np.where(
+            seen[no_hips, :, None], p[no_hips, :JOINTS], np.nan
+        )
         for hip, shoulder in zip(HIPS, SHOULDERS, strict=True):
-            p[hung, hip] = placed[hung, hip]
-            conf[hung, hip] = conf[hung, shoulder]
-    scale = METRES.get(meta.get("unit", "m"), 1.0)
-    rate = fps or meta.get("fps")
-    up = meta.get("up_axis")
-    return Clip(path, p * scale, conf, rate, up, "metres")
+            p[no_hips, hip] = placed[no_hips, hip]
+            conf[no_hips, hip] = conf[no_hips, shoulder]
+
+    meta = _meta(path)
+    return Clip(
+        path=path,
+        p=p * METRES.get(meta.get("unit", "m"), 1.0),
+        visibility=conf,
+        fps=fps or meta.get("fps"),
+        up=meta.get("up_axis"),
+        unit="metres",
+    )
 
 
 def _body_pose(
     path: Path, arrays: dict[str, Any], fps: float | None, source: Source
 ) -> Clip:
+    """Poses of the free body as `gsgan.fit` writes them, or of SMPL."""
     theta = expect_array(arrays, "theta", (None, None, 3), path)
-    arrays = arrays | {
-        k: arrays[name] for k, name in (("transl", "trans"),) if name in arrays
-    }
-    meta = _beside(path)
+    F, bones, _ = theta.shape
+    if "trans" in arrays:
+        arrays = {**arrays, "transl": arrays["trans"]}
+    meta = _meta(path)
     scale = METRES.get(meta.get("unit", "m"), 1.0)
-    transl = scale * expect_array(arrays, "transl", (len(theta), 3), path)
+    transl = scale * expect_array(arrays, "transl", (F, 3), path)
     fps = fps or meta.get("fps")
-    up = meta.get("up_axis")
-    if theta.shape[1] != len(free_body().parents):
-        flat = {"poses": theta.reshape(len(theta), -1), "trans": transl}
-        return _smpl(
-            path, flat | {k: arrays[k] for k in ("betas",) if k in arrays}, fps, source
-        )
+
+    # another number of bones: SMPL
+    if bones != len(free_body().parents):
+        smpl = {"poses": theta.reshape(F, -1), "trans": transl}
+        if "betas" in arrays:
+            smpl["betas"] = arrays["betas"]
+        return _smpl(path, smpl, fps, source)
+
     shape = path.with_name(SHAPE)  # by gsgan.fit
     subject = open_body("free", betas=read_shape(shape) if shape.is_file() else ())
     assert subject is not None
-    body = BodyPose(
-        *(torch.from_numpy(np.nan_to_num(x)).float() for x in (theta, transl))
+    poses = BodyPose(
+        theta=torch.from_numpy(np.nan_to_num(theta)).float(),
+        transl=torch.from_numpy(np.nan_to_num(transl)).float(),
     )
-    p = subject.posed_landmarks(body).double().numpy()
-    p[~np.isfinite(theta).all((1, 2)) | ~np.isfinite(transl).all(1)] = np.nan
-    return Clip(path, p, np.ones(p.shape[:2]), fps, up or "z", "metres", body=body)
+    p = subject.posed_landmarks(poses).double().numpy()
+    known = np.isfinite(theta).all((1, 2)) & np.isfinite(transl).all(1)
+    p[~known] = np.nan
+    return Clip(
+        path=path,
+        p=p,
+        visibility=np.ones(p.shape[:2]),
+        fps=fps,
+        up=meta.get("up_axis") or "z",
+        unit="metres",
+        body=poses,
+    )
 
 
 def _smpl(
     path: Path, arrays: dict[str, Any], fps: float | None, source: Source
 ) -> Clip:
+    """Parameters of the SMPL family."""
     if source.smpl is None:
         raise DataError(
             f"{path} holds SMPL parameters, which give joints only together with the body model: "
@@ -247,28 +288,33 @@ def _smpl(
         raise ConfigError(
             f"smpl={source.smpl} does not exist; expected a .pkl or .npz file"
         )
+
+    # poses, moves in metres and the median shape
     model = read_smpl(source.smpl)
     poses = _smpl_poses(path, arrays)
-    moves = _first(arrays, MOVE_KEYS)
-    moves = (
-        np.zeros((len(poses), 3)) if moves is None else np.asarray(moves, np.float64)
-    )
-    moves = moves.reshape(len(poses), 3) / arrays.get(SCALE, 1.0)
+    F = len(poses)
+    moves = np.asarray(_first(arrays, MOVE_KEYS, np.zeros((F, 3))), np.float64)
+    moves = moves.reshape(F, 3) / arrays.get(SCALE, 1.0)
     betas = np.asarray(_first(arrays, SHAPE_KEYS, np.zeros(10)), np.float64)
-    betas = np.median(betas.reshape(-1, betas.shape[-1]), axis=0)[
-        : model.shapedirs.shape[-1]
-    ]
-    good = np.isfinite(poses).all(1) & np.isfinite(moves).all(1)
-    theta = _for_model(np.nan_to_num(poses).reshape(len(poses), -1, 3), model)
+    betas = np.median(betas.reshape(-1, betas.shape[-1]), axis=0)
+    betas = betas[: model.shapedirs.shape[-1]]
+
+    # Frames with NaN are posed as zeros, and set to NaN again below.
+    known = np.isfinite(poses).all(1) & np.isfinite(moves).all(1)
+    theta = _for_model(np.nan_to_num(poses).reshape(F, -1, 3), model)
     moves = np.nan_to_num(moves)
+
+    # ZJU-MoCap turns the body about the origin, SMPL about the root joint.
     if "Rh" in arrays:
-        J0 = model.rest_joints(torch.from_numpy(betas[None]))[0, 0].numpy()
-        theta[:, 0], moves = from_zju(theta[:, 0], moves, J0)
-    shapes = np.repeat(betas[None], len(poses), axis=0)
-    motion = smpl_motion.SmplMotion(np.arange(len(poses)), theta, moves, shapes)
+        root = model.rest_joints(torch.from_numpy(betas[None]))[0, 0].numpy()
+        theta[:, 0], moves = from_zju(theta[:, 0], moves, root)
+
+    motion = smpl_motion.SmplMotion(
+        np.arange(F), theta, moves, np.repeat(betas[None], F, axis=0)
+    )
     p, conf = smpl_motion.landmarks_of(model, motion)
-    p[~good] = np.nan
-    return Clip(path, p, conf, fps, None, "metres")
+    p[~known] = np.nan
+    return Clip(path=path, p=p, visibility=conf, fps=fps, up=None, unit="metres")
 
 
 def _smpl_poses(path: Path, arrays: dict[str, Any]) -> Float:
@@ -278,6 +324,7 @@ def _smpl_poses(path: Path, arrays: dict[str, Any]) -> Float:
     too; HuMMan holds ``global_orient`` and ``body_pose`` (69); ZJU-MoCap an empty root in ``poses``
     (72) and ``Rh``.
     """
+    # one row of numbers for each frame
     poses = np.asarray(_first(arrays, POSE_KEYS), np.float64)
     poses = poses.reshape(len(poses), -1)
     root = _first(arrays, ROOT_KEYS)
@@ -288,17 +335,19 @@ def _smpl_poses(path: Path, arrays: dict[str, Any]) -> Float:
                 f"{', '.join(ROOT_KEYS)} beside them"
             )
         root = np.asarray(root, np.float64).reshape(len(poses), 3)
-        parts = [
-            np.asarray(arrays[key], np.float64) for key in PART_KEYS if key in arrays
-        ]
-        parts = parts if poses.shape[1] == WITHOUT_ROOT[0] and len(parts) == 3 else []
-        poses = np.concatenate(
-            [root, poses, *(x.reshape(len(poses), -1) for x in parts)], axis=1
-        )
+
+        # SMPL-X's jaw, eyes and hands follow the body.
+        columns = [root, poses]
+        smplx_body = poses.shape[1] == WITHOUT_ROOT[0]
+        if smplx_body and all(key in arrays for key in PART_KEYS):
+            for key in PART_KEYS:
+                part = np.asarray(arrays[key], np.float64)
+                columns.append(part.reshape(len(poses), -1))
+        poses = np.concatenate(columns, axis=1)
     elif "Rh" in arrays:
-        poses = np.concatenate(
-            [np.asarray(arrays["Rh"], np.float64).reshape(-1, 3), poses[:, 3:]], 1
-        )
+        # ZJU-MoCap: Rh replaces the empty root.
+        root = np.asarray(arrays["Rh"], np.float64).reshape(-1, 3)
+        poses = np.concatenate([root, poses[:, 3:]], axis=1)
     if poses.shape[1] % 3 or poses.shape[1] < 3 * SMPL_BODY:
         raise DataError(
             f"{path}: the poses have {poses.shape[1]} numbers per frame; expected 3 for each of 22 "
@@ -308,19 +357,19 @@ def _smpl_poses(path: Path, arrays: dict[str, Any]) -> Float:
 
 
 def _for_model(theta: Float, model: SkinnedModel) -> Float:
-    """Poses ``[F, n, 3]`` of SMPL, SMPL-H (52) or SMPL-X (55) as the model's joints.
+    """Poses ``[F, n, 3]`` of SMPL (24), SMPL-H (52) or SMPL-X (55) for the model's joints.
 
     The 22 joints of the body are common to all; SMPL-X's fingers are SMPL-H's, after jaw and eyes.
     """
-    count = len(model.parents)
-    found = theta.shape[1]
-    out = np.zeros((len(theta), count, 3))
-    out[:, :SMPL_BODY] = theta[:, :SMPL_BODY]
-    if found == count:
+    joints = len(model.parents)
+    given = theta.shape[1]
+    if given == joints:
         return theta
-    if count > 24 and found > 24:
-        out[:, -30:] = theta[:, -30:]
-    return out
+    result = np.zeros((len(theta), joints, 3))
+    result[:, :SMPL_BODY] = theta[:, :SMPL_BODY]
+    if joints > 24 and given > 24:
+        result[:, -30:] = theta[:, -30:]  # fingers
+    return result
 
 
 # -- MediaPipe's world landmarks as JSON
@@ -336,26 +385,31 @@ def read_mediapipe_json(path: Path, source: Source) -> Clip:
     fps = None
     if isinstance(frames, dict):
         fps = frames.get("fps")
-        frames = next(
-            (frames[key] for key in ("frames", *WORLD_KEYS) if key in frames), None
-        )
+        frames = _first(frames, ("frames", *WORLD_KEYS))
     if not isinstance(frames, list) or not frames:
         raise DataError(
             f"{path} holds no frames; expected a list, or an object with 'frames', of MediaPipe's "
             "pose_world_landmarks"
         )
-    p = np.stack(
-        [_landmark_row(f"{path}, frame {i}", frame) for i, frame in enumerate(frames)]
+    rows = []
+    for i, frame in enumerate(frames):
+        rows.append(_landmark_row(f"{path}, frame {i}", frame))
+    p = np.stack(rows)
+    return Clip(
+        path=path,
+        p=p[..., :3],
+        visibility=p[..., 3],
+        fps=None if fps is None else rate_of(path, fps),
+        up=None,
+        unit="metres",
     )
-    rate = None if fps is None else rate_of(path, fps)
-    return Clip(path, p[..., :3], p[..., 3], rate, None, "metres")
 
 
 def _landmark_row(where: str, frame: Any) -> Float:
-    """``[33, 4]`` x, y, z, visibility of a frame; NaN and 0 where no person was detected."""
+    """``[33, 4]`` x, y, z, visibility of a frame; NaN and 0 if no person was detected."""
     if isinstance(frame, list) and len(frame) == 1 and isinstance(frame[0], dict):
         frame = frame[0]  # TensorFlow.js returns a list of people
-    found = frame
+    points = frame
     if isinstance(frame, dict):
         key = next((key for key in WORLD_KEYS if key in frame), None)
         if key is None:
@@ -363,15 +417,17 @@ def _landmark_row(where: str, frame: Any) -> Float:
                 f"{where}: no pose_world_landmarks; MediaPipe's other landmarks are in image "
                 "coordinates, without metric depth"
             )
-        found = frame[key]
-    if isinstance(found, dict):
-        found = found.get("landmark", found.get("landmarks"))
-    if isinstance(found, list) and len(found) == 1:
-        found = found[0]  # the Tasks API returns a list of people
-    if not found:
+        points = frame[key]
+    if isinstance(points, dict):
+        points = points.get("landmark", points.get("landmarks"))
+    if isinstance(points, list) and len(points) == 1:
+        points = points[0]  # the Tasks API returns a list of people
+    if not points:
         return np.repeat([[np.nan, np.nan, np.nan, 0]], JOINTS, axis=0)
+
+    # 33 landmarks of 4 numbers
     try:
-        rows = [_numbers(point) for point in found]
+        rows = [_numbers(point) for point in points]
     except TypeError:
         rows = []
     row = as_floats(rows)
@@ -386,53 +442,77 @@ def _numbers(point: Any) -> list[Any]:
     """x, y, z and visibility of a landmark; a missing visibility is 1."""
     if not isinstance(point, dict):
         return [*point, 1.0][:4]
-    # score: TensorFlow.js
+    # TensorFlow.js calls the visibility score
     visibility = point.get("visibility", point.get("score", 1.0))
     return [point.get("x"), point.get("y"), point.get("z"), visibility]
 
 
 def _with_visibility(path: Path, points: NDArray[Any], visibility: Any) -> Float:
-    """``[F, 33, 4]`` from ``[F, 33, 3 or 4 or 5]`` and, in an array of its own, visibility."""
+    """Landmarks ``[F, 33, 4]`` with visibility.
+
+    Args:
+        path: of the file, for messages.
+        points: ``[F, 33, 3 or 4 or 5]``; the fourth number is the visibility.
+        visibility: ``[F, 33]``, or None.
+    """
     if points.ndim != 3 or points.shape[1] != JOINTS or points.shape[2] < 3:
         raise DataError(
             f"{path}: the world landmarks must have shape (any, {JOINTS}, 3 or 4), found "
             f"{points.shape}"
         )
-    if visibility is None:
-        visibility = (
-            points[..., 3] if points.shape[2] > 3 else np.ones(points.shape[:2])
-        )
+    if visibility is None and points.shape[2] > 3:
+        visibility = points[..., 3]
+    elif visibility is None:
+        visibility = np.ones(points.shape[:2])
     if visibility.shape != points.shape[:2]:
         raise DataError(f"{path}: 'visibility' must have shape {points.shape[:2]}")
-    return np.concatenate([points[..., :3], visibility[..., None]], axis=-1).astype(
-        np.float64
-    )
+    p = np.concatenate([points[..., :3], visibility[..., None]], axis=-1)
+    return p.astype(np.float64)
 
 
 # -- rigs
 
 
 def _rig(path: Path, motion: RigMotion, metres: float | None, source: Source) -> Clip:
+    """The motion of a rig; ``metres`` is its unit of length, or None to find it by the legs."""
     try:
         standard = standard_motion(motion, path, source.up)
-    # of numbers that are finite, but absurd
+    # Numbers that are finite but absurd cause such errors.
     except (ValueError, ArithmeticError) as error:
         reason = str(error).splitlines()[0]
         raise DataError(
             f"{path} is no motion of a person ({reason}); export it again"
         ) from error
+    # the unit with which the legs are about as long as the subject's
     if metres is None:
-        ratios = {
-            unit: abs(np.log(standard.leg * x / source.subject.leg))
-            for unit, x in LEG_UNITS.items()
-        }
-        unit = min(ratios, key=ratios.__getitem__)
+
+        def mismatch(unit: str) -> float:
+            leg = standard.leg * LEG_UNITS[unit]
+            return float(abs(np.log(leg / source.subject.leg)))
+
+        unit = min(LEG_UNITS, key=mismatch)
     else:
         unit = f"units of {100 * metres:.3g} cm"
+
     p = rig_landmarks(standard, source.subject)
-    seen = np.asarray(np.isfinite(p).all(-1), np.float64)
-    fps = usual_rate(1 / motion.frame_time)
-    return Clip(path, p, seen, fps, "z", unit, standard.up)
+    return Clip(
+        path=path,
+        p=p,
+        visibility=np.asarray(np.isfinite(p).all(-1), np.float64),
+        fps=usual_rate(1 / motion.frame_time),
+        up="z",
+        unit=unit,
+        file_up=standard.up,
+    )
+
+
+def _read_bvh(path: Path, source: Source) -> Clip:
+    return _rig(path, read_bvh(path), None, source)
+
+
+def _read_amc(path: Path, source: Source) -> Clip:
+    motion, metres = read_amc(path, source.skeleton or asf_of(path))
+    return _rig(path, motion, metres, source)
 
 
 # -- triangulated and detected points
@@ -443,9 +523,15 @@ def read_trc(path: Path, source: Source) -> Clip:
     _, p, conf = read_points3d(path)
     fps = None
     with suppress(ValueError, IndexError):  # read_points3d has read the header
-        names, values = (line.split() for line in read_text(path).splitlines()[1:3])
+        lines = read_text(path).splitlines()
+        names = lines[1].split()
+        values = lines[2].split()
         fps = rate_of(path, float(values[names.index("DataRate")]))
-    return Clip(path, p, conf, fps, None, "metres")
+    return Clip(path=path, p=p, visibility=conf, fps=fps, up=None, unit="metres")
+
+
+def _read_pose(path: Path, source: Source) -> Clip:
+    return read_pose(path, source.subject)
 
 
 READERS: dict[str, Callable[[Path, Source], Clip]] = {
@@ -453,11 +539,8 @@ READERS: dict[str, Callable[[Path, Source], Clip]] = {
     ".pkl": read_dictionary,
     ".npy": read_dictionary,
     ".json": read_mediapipe_json,
-    # a length by the legs
-    ".bvh": lambda path, source: _rig(path, read_bvh(path), None, source),
-    ".amc": lambda path, source: _rig(
-        path, *read_amc(path, source.skeleton or asf_of(path)), source
-    ),
+    ".bvh": _read_bvh,
+    ".amc": _read_amc,
     ".trc": read_trc,
-    ".pose": lambda path, source: read_pose(path, source.subject),
+    ".pose": _read_pose,
 }

@@ -1,10 +1,10 @@
 """Retargeting: a motion's directions with the subject's own bone lengths, hands, feet and face.
 
-Convention: standard axes (`gsgan.data.proportions`), Z up, metres.
+Axes are the standard ones (`gsgan.data.proportions`), Z up; units are metres.
 """
 
 from collections.abc import Sequence
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import numpy as np
 import torch
@@ -42,78 +42,105 @@ Float = NDArray[np.float64]
 
 PALM = (WRIST, PINKY, INDEX)  # landmarks of a hand that give its axes
 STILL = 0.001  # metres: landmarks of a face that move less count fully in its alignment
-ROUNDS = 10  # of the alignment
-# radians, the largest bend of the neck: detectors place faces too far forward
+ROUNDS = 10  # iterations of the alignment
+# maximum bend of the neck in radians: detectors place faces too far forward
 NECK = 0.45
+RIG_JOINTS = ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot")
+LEFT_LANDMARKS = (
+    11,
+    13,
+    15,
+    23,
+    25,
+    27,
+)  # of these joints; those of the right are one more
 
 
 def retargeted(p: Float, subject: Proportions, scale: float | None = None) -> Float:
-    """``[F, J, 3]`` the subject in the poses of another person's landmarks ``[F, J, 3]``, finite.
+    """The subject's landmarks ``[F, J, 3]`` in the poses of another person.
 
     Trunk and limbs keep their directions and get the subject's lengths; face, hands and feet are
     the subject's own, rotated as the source's. The path is scaled by the ratio of leg lengths.
 
     With hand landmarks, J = 75, palms are rotated as these show and fingers keep their directions;
-    where in the world they are does not matter. A hand with NaN stays NaN.
+    their place in the world does not matter. A hand with NaN stays NaN.
 
     A face, J = 105, is given as `expressed` returns it, and put on the head. NaN stays NaN.
 
     Args:
-        p: of the other person.
+        p: ``[F, J, 3]`` landmarks of the other person; those of the body are finite.
         subject: the subject's proportions.
         scale: of the path, in place of that ratio.
     """
-    whole, given, p = np.full_like(p, np.nan), p, p[:, :BODY]
+    given = p
+    p = given[:, :BODY]
     rest = subject.rest
-    q = whole[:, :BODY]
+    result = np.full_like(given, np.nan)
+    q = result[:, :BODY]
+
+    # the path
     if scale is None:
-        legs = [
-            np.linalg.norm(p[:, b] - p[:, a], axis=-1) for limb in LEGS for a, b in limb
-        ]
+        legs = []
+        for a, b in chain.from_iterable(LEGS):
+            legs.append(np.linalg.norm(p[:, b] - p[:, a], axis=-1))
         scale = 2 * subject.leg / float(np.median(legs, axis=1).sum())
     hips = middle(p, HIPS) * scale
-    chest = hips + unit(middle(p, SHOULDERS) - middle(p, HIPS)) * rest[SHOULDERS[0], 2]
+
+    # trunk, arms and legs
+    upward = unit(middle(p, SHOULDERS) - middle(p, HIPS))
+    chest = hips + upward * rest[SHOULDERS[0], 2]
     for pair, centre in ((HIPS, hips), (SHOULDERS, chest)):
-        half = unit(p[:, pair[0]] - p[:, pair[1]]) * length(rest, pair) / 2
-        q[:, pair[0]] = centre + half
-        q[:, pair[1]] = centre - half
+        left, right = pair
+        half = unit(p[:, left] - p[:, right]) * length(rest, pair) / 2
+        q[:, left] = centre + half
+        q[:, right] = centre - half
     for a, b in BONES:
         q[:, b] = q[:, a] + unit(p[:, b] - p[:, a]) * length(rest, (a, b))
+
+    # hands: turned as the palm's three landmarks of the pose, or better as the hand's own
     for wrist, ends in HAND_LANDMARKS.items():
-        turn = hand_frame(p, wrist, *ends[:2]) @ hand_frame(rest, wrist, *ends[:2]).T
+        first, second = ends[:2]
+        axes = hand_frame(p, wrist, first, second)
+        turn = axes @ hand_frame(rest, wrist, first, second).T
         if given.shape[1] > BODY:
-            at, palm = _posed_hand(given[:, HAND_JOINTS[wrist]], subject, wrist)
-            whole[:, HAND_JOINTS[wrist]] = q[:, wrist, None] + at
+            hand = HAND_JOINTS[wrist]
+            from_wrist, palm = _posed_hand(given[:, hand], subject, wrist)
+            result[:, hand] = q[:, wrist, None] + from_wrist
             turn = np.where(np.isfinite(palm), palm, turn)
         q[:, ends] = q[:, wrist, None] + (rest[list(ends)] - rest[wrist]) @ turn.mT
+
+    # feet
     for ankle, feet in FEET.items():
         turn = _foot_frame(p, ankle) @ _foot_frame(rest, ankle).T
         q[:, feet] = q[:, ankle, None] + (rest[list(feet)] - rest[ankle]) @ turn.mT
+
+    # the neck, bent from the chest's axes by at most `NECK`
     neck = middle(rest, EARS) - middle(rest, SHOULDERS)
-    level = bone_frames(torch.from_numpy(p)).hubs[:, CHEST].numpy() @ (
-        TO_STANDARD.T @ neck
-    )
-    bend = axis_angle(between(level, middle(p, EARS) - middle(p, SHOULDERS)))
-    most = NECK / np.maximum(np.linalg.norm(bend, axis=-1, keepdims=True), NECK)
-    ears = chest + (rotation(bend * most) @ level[..., None])[..., 0]
+    chest_axes = bone_frames(torch.from_numpy(p)).hubs[:, CHEST].numpy()
+    straight = chest_axes @ (TO_STANDARD.T @ neck)
+    bend = axis_angle(between(straight, middle(p, EARS) - middle(p, SHOULDERS)))
+    angle = np.linalg.norm(bend, axis=-1, keepdims=True)
+    bend = bend * (NECK / np.maximum(angle, NECK))
+    ears = chest + (rotation(bend) @ straight[..., None])[..., 0]
+
+    # the head, and the face on it
     turn = _head_frame(p) @ _head_frame(rest[None]).mT
-    q[:, HEAD_LANDMARKS] = (
-        ears[:, None] + (rest[list(HEAD_LANDMARKS)] - middle(rest, EARS)) @ turn.mT
-    )
+    from_ears = rest[list(HEAD_LANDMARKS)] - middle(rest, EARS)
+    q[:, HEAD_LANDMARKS] = ears[:, None] + from_ears @ turn.mT
     centre = q[:, MEDIAPIPE33.head].mean(1, keepdims=True)
-    whole[:, EXPRESSION] = centre + given[:, EXPRESSION] @ _head_frame(q).mT
-    return whole
+    result[:, EXPRESSION] = centre + given[:, EXPRESSION] @ _head_frame(q).mT
+    return result
 
 
 def expressed(p: Float, rest: Float) -> Float:
-    """``[F, 30, 3]`` the subject's face with another person's expressions, in the head's axes.
+    """The subject's face ``[F, 30, 3]`` with another person's expressions, in the head's axes.
 
     One similarity aligns all frames with the subject's face. Offsets from the median over the
     frames, the other person's face at rest, are added to the subject's face at rest.
 
     Args:
-        p: the other person's landmarks ``[F, 30, 3]`` in axes fixed to the head, of any place, turn
-            and unit; NaN where not seen.
+        p: the other person's landmarks ``[F, 30, 3]`` in axes fixed to the head, with any origin,
+            rotation and unit; NaN where not seen.
         rest: ``[30, 3]`` metres, the subject's, see `gsgan.skeleton.in_head`.
 
     Returns:
@@ -122,10 +149,10 @@ def expressed(p: Float, rest: Float) -> Float:
     given = torch.from_numpy(p)
     own = torch.from_numpy(rest)
     seen = given.isfinite().all(-1).double().reshape(1, -1, 1)
-    found = _aligned(given.reshape(1, -1, 3), own.repeat(len(given), 1), seen).reshape(
-        p.shape
-    )
-    return (own + found - found.nanmedian(0).values).numpy()
+    onto = own.repeat(len(given), 1)
+    found = _aligned(given.reshape(1, -1, 3), onto, seen).reshape(p.shape)
+    at_rest = found.nanmedian(0).values
+    return (own + found - at_rest).numpy()
 
 
 def steadied(p: Float) -> Float:
@@ -136,7 +163,7 @@ def steadied(p: Float) -> Float:
     """
     found = torch.from_numpy(p)
     seen = found.isfinite().all(-1, keepdim=True).double()
-    usual = found[seen.sum((1, 2)).argmax()]
+    usual = found[seen.sum((1, 2)).argmax()]  # the frame with most landmarks
     weight = seen * usual.isfinite()[:, :1]
     for _ in range(ROUNDS):
         found = _aligned(found, usual.nan_to_num(), weight)
@@ -147,24 +174,39 @@ def steadied(p: Float) -> Float:
 
 
 def _aligned(p: Tensor, onto: Tensor, weight: Tensor) -> Tensor:
-    """Points ``[F, n, 3]`` moved by the similarity of each frame that brings them nearest to
-    ``onto [n, 3]``, by weights ``[F, n, 1]``, 0 for NaN (Umeyama 1991)."""
+    """Points moved by the similarity of each frame that brings them nearest to others.
+
+    With centred points a and b and weights w, the rotation is ``U diag(1, 1, det) Vᵀ`` of the
+    singular value decomposition ``U S Vᵀ = Σ w a bᵀ`` (Umeyama 1991).
+
+    Args:
+        p: ``[F, n, 3]``.
+        onto: ``[n, 3]``.
+        weight: ``[F, n, 1]``, 0 for NaN.
+    """
     weight = weight / weight.sum(1, keepdim=True).clamp_min(1e-9)
-    centre = (weight * p.nan_to_num()).sum(1, keepdim=True)
-    a = p - centre
-    to = (weight * onto).sum(1, keepdim=True)
-    flat = weight * a.nan_to_num()
-    U, S, Vh = torch.linalg.svd(flat.mT @ (onto - to))
+    a = p - (weight * p.nan_to_num()).sum(1, keepdim=True)
+    centre = (weight * onto).sum(1, keepdim=True)
+    b = onto - centre
+    weighted = weight * a.nan_to_num()
+    U, S, Vh = torch.linalg.svd(weighted.mT @ b)
+
+    # A reflection becomes a rotation by the sign of the smallest singular value.
     S[:, 2] *= torch.linalg.det(U @ Vh)
     U[..., 2] *= torch.linalg.det(U @ Vh)[:, None]
-    size = S.sum(-1) / (flat * a.nan_to_num()).sum((1, 2))
-    return to + size[:, None, None] * a @ U @ Vh
+    scale = S.sum(-1) / (weighted * a.nan_to_num()).sum((1, 2))
+    return centre + scale[:, None, None] * a @ U @ Vh
 
 
 def _posed_hand(p: Float, subject: Proportions, wrist: int) -> tuple[Float, Float]:
-    """The subject's hand as landmarks ``[F, 21, 3]`` show it: ``[F, 21, 3]`` from the pose's wrist,
-    and the palm's rotation since the standard pose ``[F, 3, 3]``; NaN where the palm is unknown."""
+    """The subject's hand in the pose of landmarks ``[F, 21, 3]``.
+
+    Returns:
+        Landmarks ``[F, 21, 3]`` from the pose's wrist, and the palm's rotation ``[F, 3, 3]`` since
+        the standard pose; NaN if the palm is unknown.
+    """
     rest = subject.rest_with_hands[HAND_JOINTS[wrist]]
+    # the palm turns as a whole; fingers keep their own directions
     palm = hand_frame(p, *PALM) @ hand_frame(rest, *PALM).T
     q = (rest - subject.rest[wrist]) @ palm.mT
     for a, b in FINGER_BONES:
@@ -174,9 +216,8 @@ def _posed_hand(p: Float, subject: Proportions, wrist: int) -> tuple[Float, Floa
 
 def _foot_frame(p: Float, ankle: int) -> Float:
     heel, toe = FEET[ankle]
-    return part_frame(
-        p[..., toe, :] - p[..., heel, :], p[..., ankle, :] - p[..., heel, :]
-    )
+    origin = p[..., heel, :]
+    return part_frame(p[..., toe, :] - origin, p[..., ankle, :] - origin)
 
 
 def _head_frame(p: Float) -> Float:
@@ -184,24 +225,28 @@ def _head_frame(p: Float) -> Float:
 
 
 def rig_landmarks(standard: StandardMotion, subject: Proportions) -> Float:
-    """``[F, 33, 3]`` landmarks of a rig, in standard axes and the subject's size.
+    """Landmarks ``[F, 33, 3]`` of a rig, in standard axes and the subject's size.
 
     Shoulders, elbows, wrists, hips, knees and ankles are the rig's joints. Rigs have no landmarks
     of hands, feet and face: the subject's own are rotated as the rig's hands, feet and head.
     """
+    # joints, and with hands and feet the subject's landmarks
     rest = subject.rest
     scale = subject.leg / standard.leg
     p = np.full((len(standard.joints["Hips"]), *rest.shape), np.nan)
     for i, side in enumerate(("Left", "Right")):
-        names = ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot")
-        for bone, landmark in zip(names, (11, 13, 15, 23, 25, 27), strict=True):
+        for bone, landmark in zip(RIG_JOINTS, LEFT_LANDMARKS, strict=True):
             p[:, landmark + i] = standard.joints[side + bone] * scale
-        for bone, start, ends in (("Hand", 15, HAND_LANDMARKS), ("Foot", 27, FEET)):
-            points = rest[list(ends[start + i])]
-            turn = standard.turns[side + bone]
-            p[:, ends[start + i]] = (
-                p[:, start + i, None] + (points - rest[start + i]) @ turn.mT
-            )
+        for bone, start, landmarks in (
+            ("Hand", 15, HAND_LANDMARKS),
+            ("Foot", 27, FEET),
+        ):
+            joint = start + i
+            ends = landmarks[joint]
+            turned = (rest[list(ends)] - rest[joint]) @ standard.turns[side + bone].mT
+            p[:, ends] = p[:, joint, None] + turned
+
+    # the head, at the end of the neck
     if "Head" in standard.turns:
         neck = middle(rest, EARS) - middle(rest, SHOULDERS)
         ears = middle(p, SHOULDERS) + (standard.turns["Neck"] @ neck)
@@ -214,26 +259,34 @@ def joined(clips: Sequence[Float], subject: Proportions, n: int) -> Float:
     """Clips ``[F, J, 3]`` of the subject, one after the other, with transitions of n frames.
 
     A transition is a cubic that continues the joints' speeds at both ends, on the subject's bones;
-    without a hand or face that either end lacks (NaN).
+    hands and faces that either end lacks (NaN) are missing in it.
     """
     parts = [clips[0]]
-    for (a, b), after in zip(
-        pairwise(map(face_in_head, clips)), clips[1:], strict=True
-    ):
-        speeds = [x[-1] - x[-2] if len(x) > 1 else 0 * x[0] for x in (a, b[1::-1])]
+    for before, after in pairwise(clips):
+        a = face_in_head(before)
+        b = face_in_head(after)
+
+        # positions and speeds at both ends
         ends = np.stack([a[-1], b[0]])
-        speed = np.stack([speeds[0], -speeds[1]])
+        speeds = np.zeros_like(ends)
+        if len(a) > 1:
+            speeds[0] = a[-1] - a[-2]
+        if len(b) > 1:
+            speeds[1] = b[1] - b[0]
         path = CubicHermiteSpline(
-            [0, n + 1], *(np.nan_to_num(x) for x in (ends, speed))
+            [0, n + 1], np.nan_to_num(ends), np.nan_to_num(speeds)
         )
+
+        # Landmarks that an end lacks are missing in between.
         known = np.isfinite(ends).all((0, 2))[:, None]
-        between = np.where(known, path(np.arange(1, n + 1)), np.nan)
-        parts += [retargeted(between, subject, scale=1.0), after]
+        transition = np.where(known, path(np.arange(1, n + 1)), np.nan)
+        parts.append(retargeted(transition, subject, scale=1.0))
+        parts.append(after)
     return np.concatenate(parts)
 
 
 def face_in_head(p: Float) -> Float:
-    """Landmarks ``[F, J, 3]`` with those of the face as `retargeted` takes them."""
+    """Landmarks ``[F, J, 3]`` with the face in the head's axes, as `retargeted` takes it."""
     body = torch.from_numpy(p[:, :BODY])
     face = torch.from_numpy(p[:, EXPRESSION])
     local = in_head(face, body, bone_frames(body).hubs[:, HEAD], MEDIAPIPE33)
@@ -257,25 +310,27 @@ def placed(
 ) -> Float:
     """Landmarks ``[F, J, 3]`` moved to where the subject was captured.
 
-    Convention: the motion starts at the centre, with the subject's mean heading.
+    The motion starts at the centre, with the subject's mean heading.
 
     Args:
         p: standard axes.
         subject: the subject's proportions.
-        centre: ``[3]`` metres, standard axes: of the training frames; its height is not used.
+        centre: ``[3]`` of the training frames: metres, standard axes; its height is not used.
         fps: of the frames.
         ground: keep a foot on the ground except in jumps; otherwise only the lowest foot of the
             whole motion touches it.
         stay: subtract the path of a person who walks away, as on a treadmill.
     """
-    q = p @ rotation(np.array([0, 0, subject.facing - heading(p[0])])).T
+    # the subject's heading
+    turn = rotation(np.array([0, 0, subject.facing - heading(p[0])]))
+    q = p @ turn.T
+
+    # the ground below the feet, and the path of the hips
     path = middle(q, HIPS)[:, :2]
     lowest = q[:, HEELS_AND_TOES, 2].min(axis=1)
-    floor = (
-        floor_under(lowest, subject.leg, 1 / fps)
-        if ground
-        else np.full(len(q), lowest.min())
-    )
+    floor = np.full(len(q), lowest.min())
+    if ground:
+        floor = floor_under(lowest, subject.leg, 1 / fps)
     gone = drift(path, 1 / fps) if stay else path[:1]
     q[..., :2] += centre[:2] - np.broadcast_to(gone, path.shape)[:, None]
     q[..., 2] += (subject.ground - floor)[:, None]

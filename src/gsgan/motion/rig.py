@@ -1,13 +1,14 @@
 """Poses of any humanoid rig: world rotations since a standard pose, inverse kinematics, contact.
 
-Convention: metres, Z up. The standard pose is an upright T: it faces -Y, its left arm points to +X,
-palms down, legs straight down. A *turn* is a bone's world rotation since that pose: rigs whose rest
-poses differ share turns. Pairs are left, right; "mirrored" vectors have x pointing away from the
-middle of the body on both sides.
+Units are metres, Z points up. The standard pose is an upright T: it faces -Y, its left arm points
+to +X, palms down, legs straight down. A *turn* is a bone's world rotation since that pose: rigs
+whose rest poses differ share turns. Pairs are left, right; "mirrored" vectors have x pointing away
+from the middle of the body on both sides.
 """
 
 from collections.abc import Mapping
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,14 +19,15 @@ SIDES = ("Left", "Right")
 FINGERS = ("Thumb", "Index", "Middle", "Ring", "Pinky")
 SIGN = {"Left": 1.0, "Right": -1.0}
 SPINE = ("Spine", "Spine1", "Spine2")
+PALM = ("Index", "Middle", "Pinky")  # fingers whose bases give the hand's axes
 ARM = ("Arm", "ForeArm", "Hand")
 LEG = ("UpLeg", "Leg", "Foot")
 REQUIRED = ("Hips", *(side + bone for side in SIDES for bone in LEG + ARM))
-# the forearm's share of the hand's twist: without twist bones, half each
+# The forearm takes this share of the hand's twist: without twist bones, about half.
 FOREARM_TWIST = 0.55
-# sine of the angle of legs apart from which feet may be tilted with them
+# Feet may be tilted with legs that stand apart by more than the angle with this sine.
 SPLAYED = 0.17
-# longest reach of a limb in full lengths: below 1, so that it always bends
+# maximum reach of a limb in full lengths: below 1, so that it always bends
 REACH = 0.998
 # metres above the floor up to which a vertex of the resting foot is its sole
 SOLE = 0.02
@@ -40,11 +42,11 @@ def limb_axes(part: tuple[str, ...], side: str) -> tuple[Array, Array]:
 
 def hand_axes(joint: Mapping[str, Array], side: str) -> Array:
     """``[3, 3]`` columns: along the hand, towards the little finger, and their cross product."""
-    base = {
-        finger: joint[f"{side}Hand{finger}1"] for finger in ("Index", "Middle", "Pinky")
-    }
-    along = unit(base["Middle"] - joint[side + "Hand"])
-    across = base["Pinky"] - base["Index"]
+    index = joint[side + "HandIndex1"]
+    middle = joint[side + "HandMiddle1"]
+    pinky = joint[side + "HandPinky1"]
+    along = unit(middle - joint[side + "Hand"])
+    across = pinky - index
     across = unit(across - (across @ along) * along)
     return np.stack([along, across, np.cross(along, across)], axis=-1)
 
@@ -58,28 +60,34 @@ def rest_turns(joint: Mapping[str, Array]) -> dict[str, Array]:
     """
     turns = {}
     for side in SIDES:
-        shin = unit(joint[side + "Foot"] - joint[side + "Leg"])
-        toe = unit(
-            joint.get(side + "ToeBase", joint[side + "Foot"]) - joint[side + "Foot"]
-        )
+        # Feet are tilted with the legs if that makes their toes point less to the side.
+        foot = joint[side + "Foot"]
+        shin = unit(foot - joint[side + "Leg"])
+        toe = unit(joint.get(side + "ToeBase", foot) - foot)
         tilt = between(np.array([0.0, 0, -1]), shin * (1, 0, 1))
         if abs(shin[0]) > SPLAYED and abs(tilt[:, 0] @ toe) < abs(toe[0]):
-            turns[side + "Foot"] = turns[side + "ToeBase"] = tilt
+            turns[side + "Foot"] = tilt
+            turns[side + "ToeBase"] = tilt
+
+        # The upper bone of a limb turns by the smallest rotation, the lower one relative to it.
         for part in (LEG, ARM):
-            first, middle, end = (joint[side + bone] for bone in part)
-            upper = between(limb_axes(part, side)[0], middle - first)
+            first, middle, end = [joint[side + bone] for bone in part]
+            along, _ = limb_axes(part, side)
+            upper = between(along, middle - first)
             turns[side + part[0]] = upper
             turns[side + part[1]] = between(middle - first, end - middle) @ upper
-        turns[side + "Hand"] = hand = turns[side + "ForeArm"]
-        if {
-            f"{side}Hand{finger}1" for finger in ("Index", "Middle", "Pinky")
-        } <= joint.keys():
+
+        # The hand turns with its palm if that is known, else with the forearm.
+        hand = turns[side + "ForeArm"]
+        if all(f"{side}Hand{finger}1" in joint for finger in PALM):
             standard = np.diag([SIGN[side], 1.0, SIGN[side]])
-            turns[side + "Hand"] = hand = hand_axes(joint, side) @ standard
+            hand = hand_axes(joint, side) @ standard
+        turns[side + "Hand"] = hand
+
         for finger in FINGERS:
             for bone, following in phalanges(joint, side, finger):
-                here = joint[following] - joint[bone]
-                turns[bone] = between(hand[:, 0] * SIGN[side], here) @ hand
+                along = joint[following] - joint[bone]
+                turns[bone] = between(hand[:, 0] * SIGN[side], along) @ hand
     return turns
 
 
@@ -88,47 +96,53 @@ def phalanges(
 ) -> list[tuple[str, str]]:
     """A finger's bones that have a following joint, with the name of that joint."""
     names = [f"{side}Hand{finger}{k}" for k in (1, 2, 3, 4)]
-    return [
-        (bone, end) for bone, end in pairwise(names) if bone in joint and end in joint
-    ]
+    return [pair for pair in pairwise(names) if joint.keys() >= set(pair)]
+
+
+class FingerHinge(NamedTuple):
+    """A finger bone and the axis about which it bends."""
+
+    bone: str
+    finger: str
+    number: int  # from the finger's base
+    axis: Array  # [3] of flexion at rest
+    straight: float  # flexion of the rest pose, radians
+    # [3] axis-angle that closes the gap to the middle finger; zero except for bases
+    across: Array
 
 
 def finger_hinges(
     joint: Mapping[str, Array], turns: Mapping[str, Array], side: str
-) -> list[tuple[str, str, int, Array, float, Array]]:
-    """A hand's finger bones, bases first, with the axes about which they bend.
-
-    Returns:
-        Per bone: its name, finger, number from the base; the axis ``[3]`` of flexion at rest; the
-        rest pose's flexion (radians); the axis-angle ``[3]`` that closes the gap to the middle
-        finger, zero but for bases.
-    """
-    rows: list[tuple[str, str, int, Array, float, Array]] = []
+) -> list[FingerHinge]:
+    """The hinges of a hand's finger bones, bases first."""
+    hinges: list[FingerHinge] = []
     if side + "HandPinky1" not in joint or side + "HandMiddle1" not in joint:
-        return rows
+        return hinges
     hand = turns[side + "Hand"]
-    along = hand[:, 0] * SIGN[side]
+    forward = hand[:, 0] * SIGN[side]
     palm = -hand[:, 2]
-    # to which the thumb's tip bends
+    # the point to which the thumb's tip bends
     opposite = joint[side + "HandPinky1"] + 0.03 * palm
+
     for finger in FINGERS:
-        before = along
+        before = forward
         for k, (bone, end) in enumerate(phalanges(joint, side, finger)[:3]):
-            here = unit(joint[end] - joint[bone])
-            aim = unit(opposite - joint[bone]) if finger == "Thumb" else palm
-            hinge = unit(np.cross(here, aim))
+            along = unit(joint[end] - joint[bone])
+            straight = 0.0
+            across = np.zeros(3)
             if finger == "Thumb":
-                straight = 0.0
-                across = np.zeros(3)
+                # The thumb bends towards the base of the little finger.
+                axis = unit(np.cross(along, unit(opposite - joint[bone])))
             else:
-                straight = float(
-                    np.arctan2(np.cross(before, here) @ hinge, before @ here)
-                )
-                gap = float(np.arcsin(np.cross(here, along) @ palm))
+                # Fingers bend towards the palm.
+                axis = unit(np.cross(along, palm))
+                sine = np.cross(before, along) @ axis
+                straight = float(np.arctan2(sine, before @ along))
+                gap = float(np.arcsin(np.cross(along, forward) @ palm))
                 across = 0.8 * gap * palm * (k == 0)
-            rows.append((bone, finger, k, hinge, straight, across))
-            before = here
-    return rows
+            hinges.append(FingerHinge(bone, finger, k, axis, straight, across))
+            before = along
+    return hinges
 
 
 class Rig:
@@ -139,35 +153,37 @@ class Rig:
         self.index = {name: j for j, name in enumerate(character.bones)}
         self.joint = {name: character.joints[j] for name, j in self.index.items()}
         self.turns = rest_turns(self.joint)
-        self.leg, self.arm = (
-            sum(
-                self.length("Left" + a, "Left" + b)
-                for a, b in ((p[0], p[1]), (p[1], p[2]))
-            )
-            for p in (LEG, ARM)
-        )
-        self.chest = max(
-            (b for b in ("Hips", *SPINE) if b in self.index), key=self.index.__getitem__
-        )
-        self.fingers = {
-            side: finger_hinges(self.joint, self.turns, side) for side in SIDES
-        }
-        main = character.dominant_bones()
+        self.leg = self._limb_length(LEG)
+        self.arm = self._limb_length(ARM)
+        trunk = [bone for bone in ("Hips", *SPINE) if bone in self.index]
+        self.chest = max(trunk, key=self.index.__getitem__)
+        self.fingers = {}
+        for side in SIDES:
+            self.fingers[side] = finger_hinges(self.joint, self.turns, side)
+
+        # the lower sides of foot and toes
         self.soles: dict[str, Array] = {}
         for side in SIDES:
-            parts = [
-                character.with_descendants(self.index[bone])
-                if bone in self.index
-                else []
-                for bone in (side + "Foot", side + "ToeBase")
-            ]
-            parts[0] = [j for j in parts[0] if j not in parts[1]]
-            for bone, part in zip(
-                (side + "Foot", side + "ToeBase"), parts, strict=True
-            ):
-                of_bone = np.isin(main, part)
-                points = character.vertices[of_bone & (character.vertices[:, 2] < SOLE)]
-                self.soles[bone] = points[:: max(1, len(points) // 300)]
+            toes = self._with_descendants(side + "ToeBase")
+            foot = self._with_descendants(side + "Foot")
+            self.soles[side + "Foot"] = self._sole(set(foot) - set(toes))
+            self.soles[side + "ToeBase"] = self._sole(set(toes))
+
+    def _limb_length(self, part: tuple[str, ...]) -> float:
+        first, middle, end = ["Left" + bone for bone in part]
+        return self.length(first, middle) + self.length(middle, end)
+
+    def _with_descendants(self, bone: str) -> list[int]:
+        if bone not in self.index:
+            return []
+        return self.character.with_descendants(self.index[bone])
+
+    def _sole(self, bones: set[int]) -> Array:
+        """Vertices ``[n, 3]`` near the floor that follow these bones most, about 300 of them."""
+        character = self.character
+        of_bones = np.isin(character.dominant_bones(), list(bones))
+        points = character.vertices[of_bones & (character.vertices[:, 2] < SOLE)]
+        return points[:: max(1, len(points) // 300)]
 
     def length(self, start: str, end: str) -> float:
         """Distance between two joints of the rest pose, metres."""
@@ -178,24 +194,23 @@ class Pose:
     """Poses at F moments under construction; bones that are not set follow their parents."""
 
     def __init__(self, rig: Rig, hips: Array) -> None:
-        # [F, 3] position of the Hips joint
         self.rig = rig
-        self.hips = hips
+        self.hips = hips  # [F, 3] position of the Hips joint
         # bone → [F, 3, 3] world rotation since the rest pose
         self.world: dict[str, Array] = {}
 
     def set_turn(self, bone: str, turn: Array) -> None:
-        """Sets a bone by its turn ``[F, 3, 3]``, where the character has this bone."""
+        """Sets a bone by its turn ``[F, 3, 3]``, if the character has this bone."""
         if bone in self.rig.index:
-            self.world[bone] = turn @ self.rig.turns.get(bone, np.eye(3)).T
+            rest = self.rig.turns.get(bone, np.eye(3))
+            self.world[bone] = turn @ rest.T
 
     def bend(self, bones: tuple[str, ...], axis_angle: Array) -> None:
         """Distributes an axis-angle ``[F, 3]``, in standard axes, over a chain of bones."""
         bones = tuple(bone for bone in bones if bone in self.rig.index)
         for bone in bones:
-            self.set_turn(
-                bone, self.turn(self.parent(bone)) @ rotation(axis_angle / len(bones))
-            )
+            parent = self.turn(self.parent(bone))
+            self.set_turn(bone, parent @ rotation(axis_angle / len(bones)))
 
     def turn(self, bone: str) -> Array:
         """A bone's turn ``[F, 3, 3]``."""
@@ -204,20 +219,24 @@ class Pose:
     def rotation(self, bone: str) -> Array:
         """A bone's world rotation ``[F, 3, 3]`` since the rest pose."""
         while bone not in self.world:
-            top = self.rig.character.parents[self.rig.index[bone]] < 0
-            bone = "Hips" if top else self.parent(bone)
+            bone = self.parent_or_hips(bone)
         return self.world[bone]
 
     def parent(self, bone: str) -> str:
+        """The name of a bone's parent."""
         character = self.rig.character
         return character.bones[character.parents[self.rig.index[bone]]]
 
+    def parent_or_hips(self, bone: str) -> str:
+        """The name of a bone's parent, or the hips for a root."""
+        is_root = self.rig.character.parents[self.rig.index[bone]] < 0
+        return "Hips" if is_root else self.parent(bone)
+
     def position(self, bone: str) -> Array:
-        """A joint's position ``[F, 3]``, metres; what is not below the hips moves with them."""
+        """A joint's position ``[F, 3]`` in metres; joints not below the hips move with them."""
         if bone == "Hips":
             return self.hips
-        top = self.rig.character.parents[self.rig.index[bone]] < 0
-        parent = "Hips" if top else self.parent(bone)
+        parent = self.parent_or_hips(bone)
         offset = self.rig.joint[bone] - self.rig.joint[parent]
         return self.position(parent) + self.rotation(parent) @ offset
 
@@ -229,16 +248,19 @@ class Pose:
         Args:
             side: "Left" or "Right".
             part: `ARM` or `LEG`.
-            target: ``[F, 3]`` metres; where it is out of reach, the limb points to it.
+            target: ``[F, 3]`` metres; if it is out of reach, the limb points to it.
             pole: ``[F, 3]`` direction.
         """
-        first, middle, end = (side + bone for bone in part)
+        first, middle, end = [side + bone for bone in part]
+        # the directions of both bones in the world
         upper, lower, hinge = two_bone(
-            target - self.position(first),
-            pole,
-            self.rig.length(first, middle),
-            self.rig.length(middle, end),
+            target=target - self.position(first),
+            pole=pole,
+            upper=self.rig.length(first, middle),
+            lower=self.rig.length(middle, end),
         )
+
+        # their turns, from the same axes in the standard pose
         along, axis = limb_axes(part, side)
         rest = frame(along, axis).T
         self.set_turn(first, frame(upper, hinge) @ rest)
@@ -249,22 +271,22 @@ class Pose:
         longest = 0.995 * REACH * self.rig.leg
         drop = np.zeros(len(self.hips))
         for side, ankle in zip(SIDES, ankles, strict=True):
+            # Pythagoras: the height of the hip joint at which the leg is fully stretched
             gap = self.position(side + "UpLeg") - ankle
-            flat = (gap[:, :2] ** 2).sum(axis=1)
-            drop = np.maximum(
-                drop, gap[:, 2] - np.sqrt(np.maximum(longest**2 - flat, 0))
-            )
+            horizontal = (gap[:, :2] ** 2).sum(axis=1)
+            vertical = np.sqrt(np.maximum(longest**2 - horizontal, 0))
+            drop = np.maximum(drop, gap[:, 2] - vertical)
         self.hips = self.hips - drop[:, None] * (0, 0, 1)
 
     def set_hand(self, side: str, turn: Array) -> None:
         """Sets a hand's turn ``[F, 3, 3]``; the forearm takes a share of its twist."""
         upper = self.turn(side + "Arm")
         lower = self.turn(side + "ForeArm")
+        # the forearm without twist, and the hand's twist against it
         neutral = between(upper[..., 0], lower[..., 0]) @ upper
-        angle = FOREARM_TWIST * twist(np.swapaxes(neutral, -1, -2) @ turn, axis=0)
-        self.set_turn(
-            side + "ForeArm", neutral @ rotation(angle[:, None] * np.eye(3)[0])
-        )
+        angle = FOREARM_TWIST * twist(neutral.mT @ turn, axis=0)
+        x_axis = np.eye(3)[0]
+        self.set_turn(side + "ForeArm", neutral @ rotation(angle[:, None] * x_axis))
         self.set_turn(side + "Hand", turn)
 
     def lowest(self, side: str) -> Array:
@@ -284,9 +306,10 @@ class Pose:
         character = self.rig.character
         rotations = np.stack([self.rotation(bone) for bone in character.bones], axis=1)
         joints = np.stack([self.position(bone) for bone in character.bones], axis=1)
-        known = {
-            name: weight for name, weight in shapes.items() if name in character.shapes
-        }
+        known = {}
+        for name, weight in shapes.items():
+            if name in character.shapes:
+                known[name] = weight
         return Animation(rotations, joints, known, passages)
 
 
@@ -303,14 +326,17 @@ def two_bone(
     Returns:
         Unit vectors ``[F, 3]``: upper bone, lower bone, the axis that flexes the lower one.
     """
+    # the distance d of the target, within reach
     nearest = abs(upper - lower) + 0.05 * min(upper, lower)
-    d = np.linalg.norm(target, axis=-1, keepdims=True).clip(
-        nearest, REACH * (upper + lower)
-    )
+    farthest = REACH * (upper + lower)
+    d = np.linalg.norm(target, axis=-1, keepdims=True).clip(nearest, farthest)
+
+    # upper * cosine and upper * sine are the middle joint along and beside the way to the target
     along = unit(target)
     side = unit(pole - (pole * along).sum(-1, keepdims=True) * along)
     cosine = (upper**2 + d**2 - lower**2) / (2 * upper * d)
-    middle = upper * (cosine * along + np.sqrt(np.maximum(1 - cosine**2, 0)) * side)
+    sine = np.sqrt(np.maximum(1 - cosine**2, 0))
+    middle = upper * (cosine * along + sine * side)
     return unit(middle), unit(d * along - middle), np.cross(side, along)
 
 

@@ -20,26 +20,32 @@ def rotation(axis_angle: Array) -> Array:
 
 def axis_angle(R: Array) -> Array:
     """Axis-angle vectors ``[..., 3]`` of rotation matrices ``[..., 3, 3]``, radians."""
-    return (
-        Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(*R.shape[:-2], 3)
-    )
+    vectors = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec()
+    return vectors.reshape(*R.shape[:-2], 3)
 
 
 def between(a: Array, b: Array) -> Array:
     """Smallest rotations ``[..., 3, 3]`` that take directions ``a`` to directions ``b``."""
-    axis = np.cross(unit(a), unit(b))
+    a = unit(a)
+    b = unit(b)
+    axis = np.cross(a, b)
     sine = np.linalg.norm(axis, axis=-1)
-    angle = np.arctan2(sine, (unit(a) * unit(b)).sum(-1))
+    cosine = (a * b).sum(-1)
+    angle = np.arctan2(sine, cosine)
     return rotation(unit(axis) * angle[..., None])
 
 
 def blend(a: Array, b: Array, share: float | Array) -> Array:
     """Rotations on the shortest way from ``a`` to ``b``."""
-    return a @ rotation(share * axis_angle(np.swapaxes(a, -1, -2) @ b))
+    way = axis_angle(a.mT @ b)
+    return a @ rotation(share * way)
 
 
 def twist(R: Array, axis: int) -> Array:
-    """Angle ``[...]`` in [-π, π] of rotations about a coordinate axis, their swing left aside."""
-    q = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat().reshape(*R.shape[:-2], 4)
+    """Angle ``[...]`` in [-π, π] of rotations about a coordinate axis, without their swing."""
+    q = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat()
+    q = q.reshape(*R.shape[:-2], 4)
+
+    # q and -q are the same rotation; w >= 0 gives the smaller angle.
     q = q * np.where(q[..., 3:] < 0, -1, 1)
     return np.asarray(2 * np.arctan2(q[..., axis], q[..., 3]))

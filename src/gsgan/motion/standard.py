@@ -1,11 +1,12 @@
 """The motion of a rig from a file, in standard axes and on the bones that people have.
 
-Convention: that of :mod:`gsgan.motion.rig`. The up axis and the left side are found from the posed
-frames, lengths follow from the legs.
+Axes and turns are those of :mod:`gsgan.motion.rig`. The up axis and the left side are found from
+the posed frames; lengths are relative to the legs.
 """
 
 import re
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -26,20 +27,20 @@ from gsgan.motion.rig import (
 from gsgan.motion.rotations import Array, between, blend, rotation, unit
 from gsgan.utils.errors import DataError
 
-# largest tilt of trunk and legs in a zero pose that is a standing person
+# maximum tilt of trunk and legs in a zero pose that is a standing person
 STANDING = np.radians(40)
-# the same, in a frame that stands so well that it serves as a zero pose
+# the same, in a frame whose pose is upright enough to serve as a zero pose
 NEUTRAL = np.radians(10)
-UPRIGHT = np.radians(30)  # largest tilt of the trunk in frames that may serve otherwise
+UPRIGHT = np.radians(30)  # maximum tilt of the trunk in frames that may serve otherwise
 SELDOM = 0.1  # share of frames in which a person stands, in motions on the floor
-SAME = np.radians(1)  # frames that stand as well as the best one
-MOST = 100  # frames that calibrate
-# share of knees and toes behind the body from which names are of the other side
+SAME = np.radians(1)  # frames within this tilt of the best one are used too
+MOST = 100  # maximum number of frames for calibration
+# share of knees and toes behind the body above which left and right are exchanged
 BACKWARDS = 0.8
-# sine of the slope from ankle to toes of a flat foot: steeper ones are in the air
+# minimum sine of the slope from ankle to toes of a flat foot: steeper ones are in the air
 STEEPEST = -0.7
-BENT = 0.15  # mean sine of the bend from which a limb's plane is known
-# legs: feet this high above the lowest of a second stand on the floor; no jump
+BENT = 0.15  # minimum mean sine of the bend at which a limb's plane is known
+# Legs: feet up to this height above the lowest of a second stand on the floor and do not jump.
 HOVER = 0.06
 # metres from the origin that a motion may reach before its drift is subtracted
 ROOM = 0.6
@@ -62,6 +63,7 @@ FINGER_ALIASES = {finger: finger.lower() for finger in FINGERS} | {
     "Pinky": "pinky|little",
 }
 PARTS = {"metacarpal": 1, "proximal": 1, "intermediate": 2, "distal": 3}
+SIDE_WORDS = {"l": "Left", "r": "Right", "left": "Left", "right": "Right"}
 
 
 def known_joints(names: tuple[str, ...]) -> dict[str, int]:
@@ -69,64 +71,72 @@ def known_joints(names: tuple[str, ...]) -> dict[str, int]:
 
     Spine, neck and collarbones are not among them: they follow from the tree of joints.
     """
-    found: dict[str, tuple[int, int]] = {}
+    found: dict[str, int] = {}
+    ranks: dict[str, int] = {}
     for j, name in enumerate(names):
         # MakeHuman's helpers; end sites
         if name.startswith("__") or name.endswith(" end"):
             continue
         bone, rank = _bone(name)
-        if bone and rank < found.get(bone, (99, 0))[0]:
-            found[bone] = (rank, j)
-    return {bone: j for bone, (_, j) in found.items()}
+        if bone and rank < ranks.get(bone, 99):
+            found[bone] = j
+            ranks[bone] = rank
+    return found
 
 
 def _bone(name: str) -> tuple[str, int]:
     """The bone that a joint's name means, and the rank of this alias; ("", 0) for other names."""
     words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", name.split(":")[-1])
-    words = [w.lower() for w in words]
-    sided = [w for w in words if w in ("l", "r", "left", "right")]
-    stem = "".join(w for w in words if w not in sided[:1])
-    if not sided and (match := re.match(r"(left|right|l|r)(.+)", stem)):
-        sided = [match[1]]
-        rest = match[2]
-        if not _stem(rest, True)[0]:
-            sided = []
-            rest = stem
-        stem = rest
-    bone, rank = _stem(
-        re.sub(r"^(mixamorig|j?bip)\d*(c(?=hips|head))?", "", stem), bool(sided)
-    )
-    side = {"l": "Left", "r": "Right"}[sided[0][0]] if sided else ""
-    return side + bone if bone else "", rank
+    words = [word.lower() for word in words]
+
+    # the side is a word of its own, or the beginning of the first word
+    side = next((word for word in words if word in SIDE_WORDS), "")
+    stem = "".join(word for word in words if word != side)
+    match = re.match(r"(left|right|l|r)(.+)", stem)
+    if not side and match and _stem(match[2], sided=True)[0]:
+        side = match[1]
+        stem = match[2]
+
+    stem = re.sub(r"^(mixamorig|j?bip)\d*(c(?=hips|head))?", "", stem)
+    bone, rank = _stem(stem, sided=bool(side))
+    if bone and side:
+        bone = SIDE_WORDS[side] + bone
+    return bone, rank
 
 
 def _stem(stem: str, sided: bool) -> tuple[str, int]:
+    """The bone without its side, and the rank of the alias."""
     plain = stem.rstrip("0123456789")
     for bone, aliases in ALIASES.items():
-        if plain in aliases.split() and sided != (bone in ("Hips", "Head")):
-            return bone, aliases.split().index(plain)
+        ranked = aliases.split()
+        in_middle = bone in ("Hips", "Head")
+        if plain in ranked and sided != in_middle:
+            return bone, ranked.index(plain)
+
+    if not sided:
+        return "", 0
+    parts = "|".join(PARTS)
     for finger, alias in FINGER_ALIASES.items():
-        match = re.fullmatch(
-            rf"(?:hand|f)?(?:{alias})(?:finger)?0?(\d?)({'|'.join(PARTS)})?", stem
-        )
-        if match and sided:
-            return f"Hand{finger}{match[1] or PARTS.get(match[2], 1)}", 0
+        pattern = rf"(?:hand|f)?(?:{alias})(?:finger)?0?(\d?)({parts})?"
+        match = re.fullmatch(pattern, stem)
+        if match:
+            number = match[1] or PARTS.get(match[2], 1)
+            return f"Hand{finger}{number}", 0
     return "", 0
 
 
 @dataclass(frozen=True)
 class RigMotion:
-    """The motion of a rig as a file has it: joints, parents first, and their world rotations since
-    the zero pose.
+    """The motion of a rig in a file: joints and their world rotations since the zero pose.
 
     Args:
-        names: of the J joints; end sites are called "<joint> end".
+        names: of the J joints, parents first; end sites are called "<joint> end".
         parents: ``[J]``, -1 for roots.
         offsets: ``[J, 3]`` from the parent in the zero pose, units and axes of the file.
         rotations: ``[F, J, 3, 3]`` world, axes of the file.
         root: ``[F, 3]`` position of the first joint.
         frame_time: seconds.
-        local: ``[F, J, 3]`` positions in the parent's axes, in place of the offsets, or None where
+        local: ``[F, J, 3]`` positions in the parent's axes, in place of the offsets, or None if
             only the root has position channels.
     """
 
@@ -142,7 +152,9 @@ class RigMotion:
         """Joints ``[J, 3]`` without any rotation, the first one at the origin."""
         p = np.zeros((len(self.names), 3))
         for j, parent in enumerate(self.parents[1:], 1):
-            p[j] = p[parent] + self.offsets[j] if parent >= 0 else self.offsets[j]
+            p[j] = self.offsets[j]
+            if parent >= 0:
+                p[j] += p[parent]
         return p
 
     def posed(self) -> Array:
@@ -154,10 +166,8 @@ class RigMotion:
             if parent < 0:
                 p[:, j] = offset
             else:
-                p[:, j] = (
-                    p[:, parent]
-                    + (self.rotations[:, parent] @ offset[..., None])[..., 0]
-                )
+                turned = self.rotations[:, parent] @ offset[..., None]
+                p[:, j] = p[:, parent] + turned[..., 0]
         return p
 
 
@@ -167,7 +177,7 @@ class StandardMotion:
 
     turns: dict[str, Array]  # [F, 3, 3]
     joints: dict[str, Array]  # [F, 3] positions, units of the file
-    leg: float  # the legs' length, units of the file
+    leg: float  # length of a leg, units of the file
     up: str  # the axis of the file that points up, e.g. "y"
 
 
@@ -201,7 +211,7 @@ def standard_motion(
         path: of the file, for messages.
         up: the axis of the file that points up, e.g. "-y"; None finds it from the frames.
 
-    The joints' own axes are calibrated by the zero pose where that is a standing person, else by
+    The joints' own axes are calibrated by the zero pose if that is a standing person, else by
     frames in which the person stands, else by the average of the upright frames and, for limbs, by
     the planes in which they bend.
 
@@ -210,19 +220,25 @@ def standard_motion(
     """
     known = body_joints(rig, path)
     posed = rig.posed()
+
+    # the axis that points up, and left and right
     zero = rig.zero_pose()[None]
-    axis = np.zeros(3)
-    at_zero = _upward(zero, known)
-    own = at_zero if tilts(zero, known, at_zero).max() < STANDING else None
+    highest = _upward(zero, known)
+    stands = tilts(zero, known, highest).max() < STANDING
+    zero_axis = highest if stands else None
     if up is None:
-        axis = _upward(posed, known, usual=own)
+        axis = _upward(posed, known, usual=zero_axis)
     else:
+        axis = np.zeros(3)
         axis["xyz".index(up[-1])] = -1.0 if up.startswith("-") else 1.0
     known = _by_side(posed, known, axis)
-    reference = _reference(rig, posed, known, axis, own)
-    # by positions: whatever the zero pose is
+
+    # turns of limbs and fingers; axes by positions do not depend on the zero pose
+    reference = _reference(rig, posed, known, axis, zero_axis)
     axes = person_axes(posed[:1], known, axis)[0]
     R, turns = _turns(rig, axes, known, reference)
+
+    # corrections by positions, if no zero pose is known
     joints = {bone: posed[:, j] @ axes.T for bone, j in known.items()}
     if not reference.zero:
         _bend_in_plane(turns, joints)
@@ -230,9 +246,9 @@ def standard_motion(
         if not reference.neutral:
             _flatten_feet(turns, joints)
     turns |= _trunk(rig, known, R)
-    hip, knee, ankle = (joints["Left" + bone] for bone in LEG)
-    thigh = np.linalg.norm(hip - knee, axis=1)
-    shin = np.linalg.norm(knee - ankle, axis=1)
+
+    thigh = np.linalg.norm(joints["LeftUpLeg"] - joints["LeftLeg"], axis=1)
+    shin = np.linalg.norm(joints["LeftLeg"] - joints["LeftFoot"], axis=1)
     leg = float(np.median(thigh) + np.median(shin))
     return StandardMotion(turns, joints, leg, axis_name(axis))
 
@@ -244,129 +260,180 @@ def body_joints(rig: RigMotion, path: Path) -> dict[str, int]:
         DataError: when a joint of the limbs is not found, or the file holds two people.
     """
     known = known_joints(rig.names)
-    if missing := [bone for bone in REQUIRED if bone not in known and bone != "Hips"]:
+    missing = [bone for bone in REQUIRED if bone not in known and bone != "Hips"]
+    if missing:
         names = [name for name in rig.names if not name.endswith(" end")]
         raise DataError(
             f"{path}: no joint found for {', '.join(missing)} among {', '.join(names)}; name the "
             f"joints as Mixamo does (LeftUpLeg, LeftLeg, LeftFoot, LeftArm, LeftForeArm, …)"
         )
-    lines = [_line(rig, known[side + "UpLeg"]) for side in SIDES]
-    shared = [j for j in lines[0] if j in lines[1]]
-    if (
-        not shared
-        or min(_count(rig, side + bone) for side in SIDES for bone in ("UpLeg", "Arm"))
-        > 1
-    ):
+
+    # One person has a joint above both legs, and not each limb twice.
+    above_right = _line(rig, known["RightUpLeg"])
+    shared = [j for j in _line(rig, known["LeftUpLeg"]) if j in above_right]
+    counts = []
+    for side, bone in product(SIDES, ("UpLeg", "Arm")):
+        counts.append(_count(rig, side + bone))
+    if not shared or min(counts) > 1:
         raise DataError(f"{path} holds more than one person; give a file of one")
     known.setdefault("Hips", shared[-1])
+
+    # the joint after a finger's last bone
     for bone in list(known):
-        ends = [j for j, parent in enumerate(rig.parents) if parent == known[bone]]
-        if re.search(r"Hand\D+[23]$", bone) and ends:
-            known.setdefault(bone[:-1] + str(int(bone[-1]) + 1), ends[0])
+        if re.search(r"Hand\D+[23]$", bone) and known[bone] in rig.parents:
+            end = bone[:-1] + str(int(bone[-1]) + 1)
+            known.setdefault(end, rig.parents.index(known[bone]))
     return known
 
 
 def _count(rig: RigMotion, bone: str) -> int:
     """The number of joints that may be a bone, without the further segments below them."""
     found = [j for j, name in enumerate(rig.names) if _bone(name)[0] == bone]
-    return sum(not set(_line(rig, j)) & set(found) for j in found)
+    return sum(set(found).isdisjoint(_line(rig, j)) for j in found)
 
 
 def _line(rig: RigMotion, j: int) -> list[int]:
     """The joints above a joint, the root first."""
     line: list[int] = []
-    while (j := rig.parents[j]) >= 0:
+    while rig.parents[j] >= 0:
+        j = rig.parents[j]
         line.insert(0, j)
     return line
 
 
 def _middle(p: Array, known: dict[str, int], bone: str) -> Array:
-    """``[..., 3]`` the middle of a pair of joints of poses ``[..., J, 3]``."""
-    return (p[..., known["Left" + bone], :] + p[..., known["Right" + bone], :]) / 2
+    """The middle ``[..., 3]`` of a pair of joints of poses ``[..., J, 3]``."""
+    left = p[..., known["Left" + bone], :]
+    right = p[..., known["Right" + bone], :]
+    return (left + right) / 2
+
+
+def _across(p: Array, known: dict[str, int], bone: str) -> Array:
+    """The way ``[..., 3]`` from the right to the left joint of poses ``[..., J, 3]``."""
+    left = p[..., known["Left" + bone], :]
+    right = p[..., known["Right" + bone], :]
+    return left - right
 
 
 def _upward(p: Array, known: dict[str, int], usual: Array | None = None) -> Array:
-    """``[3]`` the coordinate axis that points up: along it, the shoulders are above the hips and
-    these above the feet in the largest share of the poses ``[F, J, 3]``; or the ``usual`` one, if
-    the person stands along it in some poses and lies in the others."""
-    chest = _middle(p, known, "Arm")
+    """The coordinate axis ``[3]`` that points up.
+
+    Along it, the shoulders are above the hips and these above the feet in the largest share of the
+    poses ``[F, J, 3]``. The ``usual`` axis is taken if the person stands along it in some poses and
+    lies in the others.
+    """
     hips = _middle(p, known, "UpLeg")
-    feet = _middle(p, known, "Foot")
-    trunk = unit(chest - hips)
-    legs = unit(hips - feet)
+    trunk = unit(_middle(p, known, "Arm") - hips)
+    legs = unit(hips - _middle(p, known, "Foot"))
+
+    # the smaller cosine of trunk and legs with each axis
     axes = np.concatenate([np.eye(3), -np.eye(3)])
-    least = np.minimum(trunk @ axes.T, legs @ axes.T)
-    standing = (least > np.cos(UPRIGHT)).mean(axis=0)
+    cosine = np.minimum(trunk @ axes.T, legs @ axes.T)
+
+    standing = (cosine > np.cos(UPRIGHT)).mean(axis=0)
     if usual is not None and standing[(axes @ usual).argmax()] > SELDOM:
         return usual
-    above = (least > 0.5).mean(axis=0)
-    return np.asarray(
-        axes[(above + 1e-3 * (trunk + legs).mean(axis=0) @ axes.T).argmax()]
-    )
+
+    # The mean direction decides between axes with the same share.
+    above = (cosine > 0.5).mean(axis=0)
+    score = above + 1e-3 * (trunk + legs).mean(axis=0) @ axes.T
+    return np.asarray(axes[score.argmax()])
 
 
 def person_axes(p: Array, known: dict[str, int], up: Array) -> Array:
     """``[..., 3, 3]`` rows left, back, up of poses ``[..., J, 3]``; ``up [..., 3]`` is kept."""
-    left = p[..., known["LeftUpLeg"], :] - p[..., known["RightUpLeg"], :]
+    left = _across(p, known, "UpLeg")
     left = unit(left - (left * up).sum(-1, keepdims=True) * up)
     up = np.broadcast_to(up, left.shape)
     return np.stack([left, np.cross(up, left), up], axis=-2)
 
 
 def _by_side(p: Array, known: dict[str, int], up: Array) -> dict[str, int]:
-    """The joints, left and right exchanged where knees and toes would point backwards."""
+    """The joints; left and right are exchanged if knees and toes would point backwards."""
+    # Votes above 0 are behind the line from hip to ankle, or behind the ankle.
     back = person_axes(p, known, up)[:, 1]
     votes = []
     for side in SIDES:
-        hip, knee, ankle = (p[:, known[side + bone]] for bone in LEG)
+        hip = p[:, known[side + "UpLeg"]]
+        knee = p[:, known[side + "Leg"]]
+        ankle = p[:, known[side + "Foot"]]
         votes.append(((knee - (hip + ankle) / 2) * back).sum(-1))
         if side + "ToeBase" in known:
-            votes.append(((p[:, known[side + "ToeBase"]] - ankle) * back).sum(-1))
+            toe = p[:, known[side + "ToeBase"]]
+            votes.append(((toe - ankle) * back).sum(-1))
     if np.mean(np.stack(votes) > 0) < BACKWARDS:
         return known
-    other = {"Left": "Right", "Right": "Left"}
-    return {
-        re.sub("^(Left|Right)", lambda m: other[m[1]], b): j for b, j in known.items()
-    }
+
+    exchanged = {}
+    for bone, j in known.items():
+        if bone.startswith("Left"):
+            bone = bone.replace("Left", "Right", 1)
+        elif bone.startswith("Right"):
+            bone = bone.replace("Right", "Left", 1)
+        exchanged[bone] = j
+    return exchanged
 
 
 def tilts(p: Array, known: dict[str, int], up: Array) -> Array:
-    """``[..., 7]`` radians by which trunk, thighs, shins, hips and shoulders of poses ``[..., J,
-    3]`` differ from those of a person who stands upright."""
+    """Angles ``[..., 7]`` between poses ``[..., J, 3]`` and a person who stands upright.
+
+    Radians, for the trunk, the left and right thigh and shin, hips and shoulders.
+    """
     axes = person_axes(p, known, up)
-    found = [(_middle(p, known, "Arm") - _middle(p, known, "UpLeg"), axes[..., 2, :])]
+    left = axes[..., 0, :]
+    up = axes[..., 2, :]
+
+    pairs = [(_middle(p, known, "Arm") - _middle(p, known, "UpLeg"), up)]
     for side in SIDES:
-        hip, knee, ankle = (p[..., known[side + bone], :] for bone in LEG)
-        found += [(knee - hip, -axes[..., 2, :]), (ankle - knee, -axes[..., 2, :])]
+        hip = p[..., known[side + "UpLeg"], :]
+        knee = p[..., known[side + "Leg"], :]
+        ankle = p[..., known[side + "Foot"], :]
+        pairs.append((knee - hip, -up))
+        pairs.append((ankle - knee, -up))
     for bone in ("UpLeg", "Arm"):
-        across = p[..., known["Left" + bone], :] - p[..., known["Right" + bone], :]
-        found.append((across, axes[..., 0, :]))
-    cosines = [(unit(v) * unit(w)).sum(-1) for v, w in found]
+        pairs.append((_across(p, known, bone), left))
+
+    cosines = []
+    for direction, standing in pairs:
+        cosines.append((unit(direction) * unit(standing)).sum(-1))
     return np.arccos(np.stack(cosines, axis=-1).clip(-1, 1))
 
 
 def _reference(
-    rig: RigMotion, posed: Array, known: dict[str, int], up: Array, own: Array | None
+    rig: RigMotion,
+    posed: Array,
+    known: dict[str, int],
+    up: Array,
+    zero_axis: Array | None,
 ) -> Reference:
-    """The zero pose, if that is a person who stands along the axis ``own``; else frames."""
-    if own is not None:
+    """The zero pose, if that is a person who stands along ``zero_axis``; else frames."""
+    if zero_axis is not None:
         zero = rig.zero_pose()[None]
-        eye = np.broadcast_to(np.eye(3), (1, *rig.rotations.shape[1:]))
-        return Reference(eye, person_axes(zero, known, own), zero, True, True)
+        return Reference(
+            rotations=np.broadcast_to(np.eye(3), (1, *rig.rotations.shape[1:])),
+            axes=person_axes(zero, known, zero_axis),
+            joints=zero,
+            zero=True,
+            neutral=True,
+        )
+
+    # the frames that stand as well as the best one, else all whose trunk is upright
     tilt = tilts(posed, known, up)
-    score = tilt.max(axis=-1)
-    best = float(score.min())
+    worst = tilt.max(axis=-1)
+    best = float(worst.min())
     neutral = best < NEUTRAL
     if neutral:
-        chosen = np.flatnonzero(score < best + SAME)
+        chosen = np.flatnonzero(worst < best + SAME)
     else:
-        chosen = np.flatnonzero(
-            tilt[:, 0] < max(UPRIGHT, float(tilt[:, 0].min()) + SAME)
-        )
+        trunk = tilt[:, 0]
+        chosen = np.flatnonzero(trunk < max(UPRIGHT, float(trunk.min()) + SAME))
     chosen = chosen[:: max(1, len(chosen) // MOST)]
-    p = posed[chosen]
     return Reference(
-        rig.rotations[chosen], person_axes(p, known, up), p, False, neutral
+        rotations=rig.rotations[chosen],
+        axes=person_axes(posed[chosen], known, up),
+        joints=posed[chosen],
+        zero=False,
+        neutral=neutral,
     )
 
 
@@ -374,25 +441,29 @@ def _turns(
     rig: RigMotion, axes: Array, known: dict[str, int], reference: Reference
 ) -> tuple[Array, dict[str, Array]]:
     """Turns ``[F, J, 3, 3]`` of all joints, and of the known bones with their turns at rest."""
-    back = reference.axes.mT
-    own = np.swapaxes(reference.rotations, -1, -2)  # [N, J, 3, 3]
-    at_rest = [
-        rest_turns({bone: A @ p[j] for bone, j in known.items()})
-        for A, p in zip(reference.axes, reference.joints, strict=True)
-    ]
+    # turns of the limbs in the reference poses, by joint positions
+    at_rest = []
+    for A, p in zip(reference.axes, reference.joints, strict=True):
+        at_rest.append(rest_turns({bone: A @ p[j] for bone, j in known.items()}))
     if not reference.neutral:
         _follow_positions(at_rest, known, reference)
+
+    # A joint's turn is R @ C: its world rotation R in the person's axes, times the constant C
+    # that gives the known turns in the reference poses.
+    to_rest = reference.rotations.mT @ reference.axes.mT[:, None]  # [N, J, 3, 3]
     R = axes @ rig.rotations
     turns = {}
     for bone, j in known.items():
         if bone.endswith("4"):  # a finger's tip follows its last bone
             continue
         hand = re.sub("(Hand).+", r"\1", bone)  # fingers of one joint rest as the hand
-        rest = np.stack([turn.get(bone, turn.get(hand, np.eye(3))) for turn in at_rest])
-        turns[bone] = R[:, j] @ _mean(own[:, j] @ back @ rest)
+        rest = [turn.get(bone, turn.get(hand, np.eye(3))) for turn in at_rest]
+        turns[bone] = R[:, j] @ _mean(to_rest[:, j] @ np.stack(rest))
+
+    # all joints as parts of the trunk
     trunk = np.stack([turn.get("Hips", np.eye(3)) for turn in at_rest])
-    free = np.stack([_mean(own[:, j] @ back @ trunk) for j in range(own.shape[1])])
-    return R @ free, turns
+    constants = [_mean(to_rest[:, j] @ trunk) for j in range(to_rest.shape[1])]
+    return R @ np.stack(constants), turns
 
 
 def _follow_positions(
@@ -400,33 +471,40 @@ def _follow_positions(
 ) -> None:
     """Adds the turns of the trunk and the feet of frames in which the person does not stand."""
     for turn, A, p in zip(at_rest, reference.axes, reference.joints, strict=True):
+        # the trunk, by the line from hips to shoulders
         trunk = A @ (_middle(p, known, "Arm") - _middle(p, known, "UpLeg"))
         turn["Hips"] = between(np.array([0.0, 0, 1]), trunk)
+
+        # feet, by their heading
         for side in SIDES:
             if side + "ToeBase" in known:
                 toe = A @ (p[known[side + "ToeBase"]] - p[known[side + "Foot"]])
-                turn[side + "Foot"] = between(np.array([0.0, -1, 0]), toe * (1, 1, 0))
-                turn[side + "ToeBase"] = turn[side + "Foot"]
+                foot = between(np.array([0.0, -1, 0]), toe * (1, 1, 0))
+                turn[side + "Foot"] = foot
+                turn[side + "ToeBase"] = foot
 
 
 def _bend_in_plane(turns: dict[str, Array], joints: dict[str, Array]) -> None:
     """Twists limbs about their length so that elbows and knees bend in their planes on average."""
-    for side in SIDES:
-        for part in (LEG, ARM):
-            first, second, end = (side + bone for bone in part)
-            along, hinge = limb_axes(part, side)
-            lower = unit(joints[end] - joints[second])
-            local = (np.swapaxes(turns[first], -1, -2) @ lower[..., None])[..., 0]
-            away = local @ hinge
-            forth = local @ np.cross(hinge, along)
-            mean = ((forth + 1j * away) * np.hypot(forth, away)).mean()
-            if abs(mean) > BENT**2:
-                twisted = rotation(along * float(np.angle(mean)))
-                turns[first] = turns[first] @ twisted
-                turns[second] = turns[second] @ twisted
-                # its palm is not known
-                if part == ARM and f"{side}HandMiddle1" not in joints:
-                    turns[end] = turns[end] @ twisted
+    for side, part in product(SIDES, (LEG, ARM)):
+        first, second, end = [side + bone for bone in part]
+        along, hinge = limb_axes(part, side)
+
+        # the direction of the bend about the limb's length: 1 is forwards, 1j away from its plane
+        lower = unit(joints[end] - joints[second])
+        local = (turns[first].mT @ lower[..., None])[..., 0]
+        away = local @ hinge
+        forward = local @ np.cross(hinge, along)
+        mean = ((forward + 1j * away) * np.hypot(forward, away)).mean()
+        if abs(mean) <= BENT**2:
+            continue
+
+        twisted = rotation(along * float(np.angle(mean)))
+        turns[first] = turns[first] @ twisted
+        turns[second] = turns[second] @ twisted
+        palm_known = f"{side}HandMiddle1" in joints
+        if part == ARM and not palm_known:
+            turns[end] = turns[end] @ twisted
 
 
 def _point_hands(turns: dict[str, Array], joints: dict[str, Array]) -> None:
@@ -438,10 +516,14 @@ def _point_hands(turns: dict[str, Array], joints: dict[str, Array]) -> None:
             continue
         along, _ = limb_axes(ARM, side)
         calibration = between(along, _local(turns, joints, hand, middle))
-        thumbs = [bone for k in (1, 2, 3) if (bone := f"{side}HandThumb{k}") in joints]
+
+        # the twist, by the last known joint of the thumb
+        thumbs = [f"{side}HandThumb{k}" for k in (1, 2, 3)]
+        thumbs = [bone for bone in thumbs if bone in joints]
         if thumbs:
             thumb = calibration.T @ _local(turns, joints, hand, thumbs[-1]) * (0, 1, 1)
             calibration = calibration @ between(np.array([0.0, -1, 0]), thumb)
+
         for bone in turns:
             if bone.startswith(hand):
                 turns[bone] = turns[bone] @ calibration
@@ -454,11 +536,15 @@ def _flatten_feet(turns: dict[str, Array], joints: dict[str, Array]) -> None:
         toe = side + "ToeBase"
         if toe not in joints:
             continue
-        ahead = unit(joints[toe] - joints[foot])
+
+        # A foot rests in the slowest fifth of the frames; the first frame's step is to the second.
         ends = np.stack([joints[foot], joints[toe]])
-        steps = np.diff(ends, axis=1, prepend=ends[:, :2][:, -1:])
-        speed = np.linalg.norm(steps, axis=-1)
-        rests = np.argsort(speed.max(axis=0))[: 1 + len(ahead) // 5]
+        second = ends[:, :2][:, -1:]
+        speed = np.linalg.norm(np.diff(ends, axis=1, prepend=second), axis=-1)
+        rests = np.argsort(speed.max(axis=0))[: 1 + len(joints[foot]) // 5]
+
+        # At rest the foot has the slope of a flat foot, and the toes do not bend.
+        ahead = unit(joints[toe] - joints[foot])
         down = float(np.median(ahead[rests, 2]).clip(STEEPEST, 0))
         flat = np.array([0, -np.sqrt(1 - down**2), down])
         turns[foot] = turns[foot] @ between(flat, _local(turns, joints, foot, toe))
@@ -468,33 +554,36 @@ def _flatten_feet(turns: dict[str, Array], joints: dict[str, Array]) -> None:
 def _local(
     turns: dict[str, Array], joints: dict[str, Array], bone: str, end: str
 ) -> Array:
-    """``[3]`` direction from a bone's joint to another, in the bone's axes, mean over frames."""
-    away = unit(joints[end] - joints[bone])[..., None]
-    return unit((turns[bone].mT @ away)[..., 0].mean(axis=0))
+    """The mean direction ``[3]`` from a bone's joint to another, in the bone's axes."""
+    direction = unit(joints[end] - joints[bone])[..., None]
+    return unit((turns[bone].mT @ direction)[..., 0].mean(axis=0))
 
 
 def _mean(R: Array) -> Array:
     """The mean ``[3, 3]`` of rotations ``[N, 3, 3]``."""
-    return np.asarray(
-        R[0] if len(R) == 1 else Rotation.from_matrix(R).mean().as_matrix()
-    )
+    if len(R) == 1:
+        return R[0]
+    return Rotation.from_matrix(R).mean().as_matrix()
 
 
 def floor_under(lowest: Array, leg: float, step: float) -> Array:
-    """``[F]`` the floor's height below feet at heights ``[F]``, one of which stands but in jumps.
+    """The floor's height ``[F]`` below feet at heights ``[F]``; one foot stands except in jumps.
 
     Jumps lose `HOVER`: a floor that follows the lowest of a second may be too low by that much.
     """
+    # the lowest of a second, smoothed
     window = max(1, round(1 / step))
     floor = gaussian_filter1d(minimum_filter1d(lowest, window), window / 4)
     return np.asarray(floor + np.minimum(lowest - floor, HOVER * leg))
 
 
 def drift(path: Array, step: float) -> Array:
-    """``[F, 2]`` what to subtract from a horizontal path so that it stays near the origin."""
+    """The drift ``[F, 2]`` of a horizontal path: subtracting it keeps the path near the origin."""
     middle = (path.min(axis=0) + path.max(axis=0)) / 2
     if np.linalg.norm(path - middle, axis=1).max() <= ROOM:
         return np.broadcast_to(middle, path.shape)
+
+    # Point reflections at both ends continue the path in the same direction.
     pad = len(path) - 1
     odd = np.pad(path, ((pad, pad), (0, 0)), mode="reflect", reflect_type="odd")
     smooth = gaussian_filter1d(odd, DRIFT_SECONDS / step, axis=0)
@@ -503,23 +592,31 @@ def drift(path: Array, step: float) -> Array:
 
 def _trunk(rig: RigMotion, known: dict[str, int], R: Array) -> dict[str, Array]:
     """Turns of spine, neck and collarbones, whatever their number, by their place in the tree."""
-
     left = _line(rig, known["LeftArm"])
     right = _line(rig, known["RightArm"])
-    legs = _line(rig, known["LeftUpLeg"])
-    spine = [j for j in left if j in right and j not in (*legs, known["Hips"])]
-    chain = [R[:, j] for j in (known["Hips"], *spine)]
     turns = {}
+
+    # The spine is above both arms but not above the legs; the file's bones are interpolated.
+    hips = [*_line(rig, known["LeftUpLeg"]), known["Hips"]]
+    spine = [j for j in left if j in right and j not in hips]
+    chain = [known["Hips"], *spine]
     for k, bone in enumerate(SPINE, 1):
         at = k * len(spine) / len(SPINE)
-        low = int(at)
-        turns[bone] = blend(chain[low], chain[min(low + 1, len(spine))], at - low)
+        lower = chain[int(at)]
+        upper = chain[min(int(at) + 1, len(spine))]
+        turns[bone] = blend(R[:, lower], R[:, upper], at - int(at))
+
     if "Head" in known:
-        neck = [j for j in _line(rig, known["Head"]) if j not in left]
-        turns["Neck"] = (
-            R[:, neck[0]] if neck else blend(chain[-1], R[:, known["Head"]], 0.5)
-        )
+        head = known["Head"]
+        neck = [j for j in _line(rig, head) if j not in left]
+        if neck:
+            turns["Neck"] = R[:, neck[0]]
+        else:
+            turns["Neck"] = blend(R[:, chain[-1]], R[:, head], 0.5)
+
+    # A collarbone is above one arm only; the last one carries the arm.
     for side, line, other in (("Left", left, right), ("Right", right, left)):
-        if collar := [j for j in line if j not in other]:
+        collar = [j for j in line if j not in other]
+        if collar:
             turns[side + "Shoulder"] = R[:, collar[-1]]
     return turns

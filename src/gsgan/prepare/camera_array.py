@@ -36,7 +36,9 @@ class CameraArray:
     def of(cls, cameras: Sequence[CameraEntry]) -> CameraArray:
         """The arrays of some cameras, in their order."""
         return cls(
-            *(np.stack([getattr(c, key) for c in cameras]) for key in ("K", "R", "t"))
+            K=np.stack([camera.K for camera in cameras]),
+            R=np.stack([camera.R for camera in cameras]),
+            t=np.stack([camera.t for camera in cameras]),
         )
 
     def __len__(self) -> int:
@@ -44,12 +46,12 @@ class CameraArray:
 
     @property
     def centres(self) -> Float:
-        """``[C, 3]`` metres: the cameras' positions."""
+        """The cameras' positions ``[C, 3]``, metres."""
         return -np.einsum("cji,cj->ci", self.R, self.t)
 
     @property
     def focal(self) -> Float:
-        """``[C]`` pixels: the mean of both focal lengths."""
+        """The mean of both focal lengths ``[C]``, pixels."""
         return (self.K[:, 0, 0] + self.K[:, 1, 1]) / 2
 
     def normalised(self, uv: Float) -> tuple[CameraArray, Float]:
@@ -61,14 +63,18 @@ class CameraArray:
         ratio = FOCAL / self.focal
         K = self.K.copy()
         K[:, :2] *= ratio[:, None, None]
-        return replace(self, K=K), uv * ratio.reshape(-1, *[1] * (uv.ndim - 1))
+        scale = np.expand_dims(ratio, tuple(range(1, uv.ndim)))
+        return replace(self, K=K), uv * scale
 
     def __getitem__(self, cameras: Bool | slice) -> CameraArray:
         return CameraArray(self.K[cameras], self.R[cameras], self.t[cameras])
 
     def entries(self, cameras: Sequence[CameraEntry]) -> list[CameraEntry]:
         """These cameras with the R and t of the arrays."""
-        return [replace(c, R=self.R[i], t=self.t[i]) for i, c in enumerate(cameras)]
+        entries = []
+        for camera, R, t in zip(cameras, self.R, self.t, strict=True):
+            entries.append(replace(camera, R=R, t=t))
+        return entries
 
     def project(self, p: Float) -> tuple[Float, Float]:
         """Undistorted pixels ``[C, N, 2]`` and depths ``[C, N]`` of world points ``[N, 3]``.
@@ -82,13 +88,12 @@ class CameraArray:
     def errors(self, p: Float, uv: Float) -> Float:
         """Reprojection errors ``[C, N]`` of ``p [N, 3]`` metres against pixels ``uv [C, N, 2]``.
 
-        Infinite behind a camera, NaN where unseen.
+        Infinite behind a camera, NaN = not seen.
         """
         pixels, depth = self.project(p)
         error = np.linalg.norm(pixels - uv, axis=-1)
-        return np.where(
-            depth <= NEAR, np.where(np.isfinite(error), np.inf, np.nan), error
-        )
+        behind = np.where(np.isfinite(error), np.inf, np.nan)
+        return np.where(depth <= NEAR, behind, error)
 
 
 def undistort_points(camera: CameraEntry, px: Float) -> Float:
@@ -96,12 +101,11 @@ def undistort_points(camera: CameraEntry, px: Float) -> Float:
     seen = known(px)
     if not camera.distorted or not seen.any():
         return np.asarray(px, np.float64)
-    out = np.full(px.shape, np.nan)
     rays = np.c_[px[seen], np.ones(seen.sum())] @ np.linalg.inv(camera.K).T
-    out[seen] = (
-        undistort(rays[:, :2], camera.dist) @ camera.K[:2, :2].T + camera.K[:2, 2]
-    )
-    return out
+    straight = undistort(rays[:, :2], camera.dist)
+    result = np.full(px.shape, np.nan)
+    result[seen] = straight @ camera.K[:2, :2].T + camera.K[:2, 2]
+    return result
 
 
 def refine_cameras(
@@ -115,17 +119,23 @@ def refine_cameras(
 ) -> CameraArray:
     """The cameras with the smallest reprojection error, near the given ones.
 
-    Convention: bundle adjustment of poses and points (`scipy.optimize.least_squares`); the loss is
-    Cauchy's; K is fixed. Points with fewer than two views are left out. Landmarks cannot determine
-    the world's origin, orientation or scale; the priors fix them by the least change of the given
+    Bundle adjustment of poses and points (`scipy.optimize.least_squares`); the loss is Cauchy's; K
+    is fixed. Points with fewer than two views are left out. Landmarks cannot determine the world's
+    origin, orientation or scale; the priors fix them by the smallest change of the given
     calibration.
 
+    The parameters are a rotation vector and a move of each camera, then a move of each point.
+
     Args:
-        given, start: centre of the priors, and the initial value.
-        p: ``[N, 3]`` metres, initial values, NaN where missing.
-        uv, weight: ``[C, N, 2]`` undistorted pixels; their confidence, 0 where unseen.
-        rotation_prior, position_prior: degrees and metres, standard deviations of ``given``.
+        given: centre of the priors.
+        start: initial value.
+        p: ``[N, 3]`` metres, initial values, NaN = missing.
+        uv: ``[C, N, 2]`` undistorted pixels.
+        weight: ``[C, N]`` their confidence, 0 = not seen.
+        rotation_prior: standard deviation of the orientations of ``given``, degrees.
+        position_prior: standard deviation of its positions, metres.
     """
+    # the points that are used, and their detections one by one
     weight = np.where(known(uv), weight, 0.0)
     use = known(p) & ((weight > 0).sum(0) >= MIN_VIEWS)
     p = p[use]
@@ -139,20 +149,23 @@ def refine_cameras(
 
     def cameras_at(x: Float) -> CameraArray:
         turn, move = np.moveaxis(x[:poses].reshape(-1, 2, 3), 1, 0)
-        return replace(
-            start, R=Rotation.from_rotvec(turn).as_matrix() @ start.R, t=start.t + move
-        )
+        R = Rotation.from_rotvec(turn).as_matrix() @ start.R
+        return replace(start, R=R, t=start.t + move)
 
     def priors(cameras: CameraArray) -> Float:
         turned = _turns(given, cameras) / np.radians(rotation_prior)
-        return np.c_[turned, (cameras.centres - given.centres) / position_prior].ravel()
+        moved = (cameras.centres - given.centres) / position_prior
+        return np.c_[turned, moved].ravel()
 
     def residuals(x: Float) -> Float:
         cameras = cameras_at(x)
-        off = cameras.project(p + x[poses:].reshape(-1, 3))[0][camera, point] - uv
-        error = (off**2).sum(1) + LEAST_SQUARE
-        off *= np.sqrt(weight * square * np.log1p(error / square) / error)[:, None]
-        return np.concatenate([off.ravel(), priors(cameras)])
+        projected, _ = cameras.project(p + x[poses:].reshape(-1, 3))
+        r = projected[camera, point] - uv
+
+        # scaled so that its square is Cauchy's loss
+        error = (r**2).sum(1) + LEAST_SQUARE
+        r *= np.sqrt(weight * square * np.log1p(error / square) / error)[:, None]
+        return np.concatenate([r.ravel(), priors(cameras)])
 
     found = least_squares(
         residuals,
@@ -162,11 +175,16 @@ def refine_cameras(
         ftol=SETTLED,
         max_nfev=STEPS,
     )
-    # Detections do not see a similarity of the whole world, so that search hardly moves along it.
+
+    # A similarity of the whole world does not change the projections, so that the search hardly
+    # moves along it: the priors decide it.
     cameras = cameras_at(found.x)
-    return _similar(
-        cameras, least_squares(lambda x: priors(_similar(cameras, x)), np.zeros(7)).x
-    )
+
+    def world_priors(x: Float) -> Float:
+        return priors(_similar(cameras, x))
+
+    world = least_squares(world_priors, np.zeros(7))
+    return _similar(cameras, world.x)
 
 
 def _similar(cameras: CameraArray, x: Float) -> CameraArray:
@@ -180,28 +198,28 @@ def _similar(cameras: CameraArray, x: Float) -> CameraArray:
 def _sparsity(
     camera: Ints, point: Ints, cameras: int, points: int
 ) -> sparse.csr_matrix:
-    """Which parameters each residual depends on: its camera's 6 and its point's 3."""
+    """The parameters that each residual depends on: its camera's 6 and its point's 3."""
     at_camera = 6 * camera[:, None] + np.arange(6)
     at_point = 6 * cameras + 3 * point[:, None] + np.arange(3)
     columns = np.c_[at_camera, at_point].repeat(2, axis=0)  # u and v
     rows = np.arange(len(columns)).repeat(9)
-    shape = len(columns), 6 * cameras + 3 * points
+    parameters = 6 * cameras + 3 * points
     detections = sparse.coo_matrix(
-        (np.ones(columns.size), (rows, columns.ravel())), shape
+        (np.ones(columns.size), (rows, columns.ravel())),
+        shape=(len(columns), parameters),
     )
     priors = sparse.kron(np.eye(cameras), np.ones((6, 6)), format="coo")
-    priors.resize(6 * cameras, shape[1])
+    priors.resize(6 * cameras, parameters)
     return sparse.vstack([detections, priors]).tocsr()
 
 
 def camera_moves(before: CameraArray, after: CameraArray) -> tuple[Float, Float]:
-    """How far each camera turned, ``[C]`` degrees, and moved, ``[C]`` millimetres."""
+    """Each camera's rotation ``[C]`` in degrees, and its move ``[C]`` in millimetres."""
+    turned = np.linalg.norm(_turns(before, after), axis=-1)
     moved = np.linalg.norm(after.centres - before.centres, axis=-1)
-    return np.degrees(np.linalg.norm(_turns(before, after), axis=-1)), 1000 * moved
+    return np.degrees(turned), 1000 * moved
 
 
 def _turns(before: CameraArray, after: CameraArray) -> Float:
-    """``[C, 3]`` rotation vectors from the orientations before to those after."""
-    return np.asarray(
-        Rotation.from_matrix(after.R @ before.R.transpose(0, 2, 1)).as_rotvec()
-    )
+    """Rotation vectors ``[C, 3]`` from the orientations before to those after."""
+    return Rotation.from_matrix(after.R @ before.R.mT).as_rotvec()

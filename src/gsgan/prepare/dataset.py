@@ -1,4 +1,4 @@
-"""The dataset's files beside the images, and its place on disk."""
+"""The dataset's files other than the images, and its place on disk."""
 
 import contextlib
 import json
@@ -28,13 +28,13 @@ GENERATOR = "gsgan.prepare"
 
 @dataclass(frozen=True)
 class Outcome:
-    """All that a preparation found: ``frames [F]`` numbers, of the images written by camera."""
+    """The results of a preparation."""
 
     options: Options
     inputs: Inputs
-    frames: Ints
+    frames: Ints  # [F] numbers
     solution: Solution
-    written: Mapping[str, list[int]]
+    written: Mapping[str, list[int]]  # numbers of the images by camera
 
     @property
     def cameras(self) -> list[CameraEntry]:
@@ -46,41 +46,45 @@ class Outcome:
 def write_files(root: Path, outcome: Outcome, key: str) -> None:
     """Writes cameras, landmarks and metadata, in metres and pixels."""
     solution = outcome.solution
-    frames = outcome.frames
-    p = outcome.solution.p
-    write_json(
-        root / "cameras.json",
-        {
-            camera.name: {key: getattr(camera, key).tolist() for key in ("K", "R", "t")}
-            | {"dist": [0.0] * 5, "size": list(camera.size[::-1])}
-            for camera in outcome.cameras
-        },
-    )
-    body, hands, face = (
-        {
+    options = outcome.options
+    p = solution.p
+    cameras = {}
+    for camera in outcome.cameras:
+        cameras[camera.name] = {
+            "K": camera.K.tolist(),
+            "R": camera.R.tolist(),
+            "t": camera.t.tolist(),
+            "dist": [0.0] * 5,
+            "size": list(camera.size[::-1]),
+        }
+    write_json(root / "cameras.json", cameras)
+
+    def landmarks(part: slice) -> dict[str, Any]:
+        return {
             "p": p[:, part].astype(np.float32),
             "conf": solution.conf[:, part].astype(np.float32),
-            "frame_id": frames,
+            "frame_id": outcome.frames,
             "names": np.array(joint_names()[part]),
         }
-        for part in (slice(BODY), HANDS, FACE)
-    )
-    error = solution.error[:, :, :BODY] * outcome.options.scale
+
+    # landmarks, with the mean error over the cameras that see them
+    error = solution.error[:, :, :BODY] * options.scale
     seen = np.isfinite(error)
     mean = np.where(seen, error, 0.0).sum(0) / np.maximum(seen.sum(0), 1)
     write_npz(
         root / "landmarks3d.npz",
-        **body,
+        **landmarks(slice(BODY)),
         reproj_px=np.where(seen.any(0), mean, np.nan).astype(np.float32),
     )
-    wanted = {"hands": outcome.options.hands, "face": outcome.options.face}
-    for name, part in (("hands", hands), ("face", face)):
-        if wanted[name] and p.shape[1] > BODY:
-            write_npz(root / f"{name}3d.npz", **part)
+    if options.hands and p.shape[1] > BODY:
+        write_npz(root / "hands3d.npz", **landmarks(HANDS))
+    if options.face and p.shape[1] > BODY:
+        write_npz(root / "face3d.npz", **landmarks(FACE))
+
     meta = {
         "fps": outcome.inputs.fps,
         "unit": "m",
-        "up_axis": outcome.options.up_axis or standing_axis(p),
+        "up_axis": options.up_axis or standing_axis(p),
         "skeleton": "mediapipe33",
         "pixel_centre": 0.5,
         "made_by": {"generator": GENERATOR, "version": gsgan.__version__, "key": key},
@@ -91,15 +95,17 @@ def write_files(root: Path, outcome: Outcome, key: str) -> None:
 def standing_axis(p: Float) -> str:
     """The world axis along which a person ``p [F, J, 3]`` stands: "z", "-y", ...; unknown is "z".
 
-    It is the direction from ankles to nose and from hips to shoulders; where these are never seen,
+    It is the direction from ankles to nose and from hips to shoulders; if these are never seen,
     from shoulders to ears. NaN = missing.
     """
-    legs = np.concatenate([p[:, 0] - (p[:, 27] + p[:, 28]) / 2, (p[:, 11] - p[:, 23])])
+    ankles = (p[:, 27] + p[:, 28]) / 2
+    body = np.concatenate([p[:, 0] - ankles, p[:, 11] - p[:, 23]])
     head = p[:, [7, 8]].mean(1) - p[:, [11, 12]].mean(1)
-    above = next(
-        (a for a in (legs[known(legs)], head[known(head)]) if len(a)), legs[:0]
-    )
-    return axis_name(np.median(above, axis=0)) if len(above) else "z"
+    for directions in (body, head):
+        seen = directions[known(directions)]
+        if len(seen):
+            return axis_name(np.median(seen, axis=0))
+    return "z"
 
 
 def exists(out: Path, key: str, overwrite: bool) -> bool:

@@ -18,17 +18,19 @@ from gsgan.utils.arrays import Bytes
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import writing
 
-LEAST_BLOB = 0.02  # smaller pieces of a mask are removed, share of the largest
+LEAST_BLOB = 0.02  # share of the largest piece of a mask: smaller ones are removed
 QUALITY = 95  # of jpg, 1 to 100
 PNG_COMPRESSION = 3  # 0..9; higher is smaller and slower
 
 
 def scaled(camera: CameraEntry, scale: float) -> CameraEntry:
     """The camera of the written images: no distortion, K at their size."""
-    h, w = (max(1, round(side * scale)) for side in camera.size)
+    H, W = camera.size
+    h = max(1, round(H * scale))
+    w = max(1, round(W * scale))
     K = camera.K.copy()
-    K[0] *= w / camera.size[1]
-    K[1] *= h / camera.size[0]
+    K[0] *= w / W
+    K[1] *= h / H
     return replace(camera, K=K, dist=np.zeros_like(camera.dist), size=(h, w))
 
 
@@ -41,13 +43,12 @@ def find_masks(folder: Path, names: Iterable[str]) -> dict[str, dict[int, Path]]
     found = {}
     for name in names:
         place = folder / name
-        stems = [p.stem for p in place.glob("*") if p.suffix.lower() in IMAGE_SUFFIXES]
-        of_persons = bool(stems) and all(
-            re.fullmatch(r"\d+_\d+", stem) for stem in stems
-        )
-        number = (
-            (lambda stem: int(stem.partition("_")[0])) if of_persons else last_number
-        )
+        # Names such as 000012_1.png have the number of a person after that of the frame.
+        of_persons = []
+        for path in place.glob("*"):
+            if path.suffix.lower() in IMAGE_SUFFIXES:
+                of_persons.append(re.fullmatch(r"\d+_\d+", path.stem) is not None)
+        number = _first_number if of_persons and all(of_persons) else last_number
         files = frame_files(folder, name, IMAGE_SUFFIXES, number)
         if not files:
             raise DataError(
@@ -57,15 +58,26 @@ def find_masks(folder: Path, names: Iterable[str]) -> dict[str, dict[int, Path]]
     return found
 
 
+def _first_number(stem: str) -> int:
+    return int(stem.partition("_")[0])
+
+
 def tidy(mask: Bytes, levels: tuple[float, float]) -> Bytes:
     """A mask ``[H, W]`` 0..255 with its levels stretched and small pieces removed."""
-    low, high = (255 * level for level in levels)
-    table = np.clip((np.arange(256) - low) / (high - low), 0, 1)
-    mask = np.asarray(cv2.LUT(mask, np.round(255 * table).astype(np.uint8)), np.uint8)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats((mask > 0).astype(np.uint8))
+    # the levels, by a table of all values
+    low = 255 * levels[0]
+    high = 255 * levels[1]
+    share = np.clip((np.arange(256) - low) / (high - low), 0, 1)
+    table = np.round(255 * share).astype(np.uint8)
+    mask = np.asarray(cv2.LUT(mask, table), np.uint8)
+
+    # pieces that are too small against the largest
+    covered = (mask > 0).astype(np.uint8)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(covered)
     areas = stats[:, cv2.CC_STAT_AREA].copy()
     areas[0] = 0  # the background
-    return np.asarray(mask * (areas >= LEAST_BLOB * areas.max())[labels], np.uint8)
+    large = areas >= LEAST_BLOB * areas.max()
+    return np.asarray(mask * large[labels], np.uint8)
 
 
 def write_images(
@@ -85,10 +97,12 @@ def write_images(
     Args:
         root: the dataset.
         camera: as calibrated, lens included.
-        source, masks: its images, and mask files by the source's own frame number.
+        source: its images.
+        masks: mask files by the source's own frame number.
         frames: common frame numbers to write; those without a mask are skipped.
         offset: added to a source's number to get the common one.
-        scale, suffix: of the images; masks are always png.
+        scale: of images and masks.
+        suffix: of the images; masks are always png.
         levels: alpha that becomes 0 and 1.
         advance: called for each frame.
 
@@ -103,9 +117,22 @@ def write_images(
     for folder in (images, alphas):
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
+
+    # images are straightened at the full size, then scaled
     window = Crop(0, 0, camera.size)
     size = scaled(camera, scale).size
     mapping = undistort_map(camera.K, camera.dist, window) if camera.distorted else None
+
+    def write(path: Path, pixels: Bytes, number: int, where: Path) -> None:
+        if pixels.shape[:2] != camera.size:
+            raise DataError(
+                f"{where}: frame {number} is {pixels.shape[1]}x{pixels.shape[0]} pixels, "
+                f"expected {camera.size[1]}x{camera.size[0]}"
+            )
+        straight = take(pixels, window, mapping, exact=False)
+        _write(path, resize(straight, size, exact=False))
+
+    # a video is read in order, up to the last frame
     written = list[int]()
     last = max(frames, default=-1)
     for number, image in source.images():
@@ -117,17 +144,8 @@ def write_images(
         written.append(frame)
         advance(len(written), len(frames))
         mask = tidy(read_mask_values(masks[number]), levels)
-        for pixels, folder, kind in ((image, images, suffix), (mask, alphas, "png")):
-            if pixels.shape[:2] != camera.size:
-                where = masks[number] if pixels is mask else source.path
-                raise DataError(
-                    f"{where}: frame {number} is {pixels.shape[1]}x{pixels.shape[0]} pixels, "
-                    f"expected {camera.size[1]}x{camera.size[0]}"
-                )
-            straight = resize(
-                take(pixels, window, mapping, exact=False), size, exact=False
-            )
-            _write(folder / f"{frame:06d}.{kind}", straight)
+        write(images / f"{frame:06d}.{suffix}", image, number, source.path)
+        write(alphas / f"{frame:06d}.png", mask, number, masks[number])
     return written
 
 
@@ -135,5 +153,6 @@ def _write(path: Path, pixels: Bytes) -> None:
     options = [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION]
     if path.suffix == ".jpg":
         options = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
+    _, encoded = cv2.imencode(path.suffix, pixels, options)
     with writing(path):  # in place: a run that was killed here writes all of them again
-        path.write_bytes(cv2.imencode(path.suffix, pixels, options)[1].tobytes())
+        path.write_bytes(encoded.tobytes())

@@ -21,12 +21,13 @@ from gsgan.data.joints import (
     known,
 )
 from gsgan.data.skeletons import whole_frame_ids
-from gsgan.motion.points import Numbered, json_files
+from gsgan.motion.points import json_files
 from gsgan.skeleton.hands import HAND
 from gsgan.utils.arrays import Float, Ints, expect_array
 from gsgan.utils.errors import DataError
 
-MIDDLE_OF_HIPS = 0.35  # of the trunk: farther from it joint 8 is another one
+# Joint 8 farther than this from the middle of the hips, as a share of the trunk, is another one.
+MIDDLE_OF_HIPS = 0.35
 MESH = 468  # landmarks of MediaPipe's face mesh
 PIXEL_CENTRE = 0.5  # added to detectors that count from the centre of the first pixel
 OPENPOSE_KEYS = (
@@ -41,7 +42,7 @@ EASYMOCAP_KEYS = ("keypoints", "handl2d", "handr2d")
 class Detections:
     """One camera's detections of the J joints: 33 body, 21 left hand, 21 right hand, 30 face."""
 
-    frame_id: Ints  # [F] rising
+    frame_id: Ints  # [F] increasing
     # [F, J, 2] pixels of the image as stored, pixel centres at +0.5; NaN = not seen
     px: Float
     conf: Float  # [F, J] in [0, 1], 0 = not seen
@@ -53,12 +54,11 @@ def find_landmarks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
     Raises:
         DataError: when a camera has none, listing those found.
     """
-    there = sorted(p.name for p in folder.iterdir()) if folder.is_dir() else []
+    there = sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
     found = {}
     for name in names:
-        existing = [
-            end for end in (f"{name}.npz", f"{name}_json", name) if end in there
-        ]
+        candidates = (f"{name}.npz", f"{name}_json", name)
+        existing = [entry for entry in candidates if entry in there]
         if not existing:
             raise DataError(
                 f"{folder} has no landmarks of the camera {name}, such as {name}.npz or "
@@ -74,61 +74,80 @@ def read_detections(path: Path) -> Detections:
     Raises:
         DataError: on a damaged file or an unknown set of joints.
     """
-    if path.is_dir():
-        files = json_files(path)
-        people = [_read_people(file) for file in files.values()]
-        # the person seen best
-        best = [max(found, key=_seen, default=None) for found in people]
-        bodies = [person.body for person in best if person is not None]
-        numbers = joint_numbers(bodies)
-        read = [_joints(person, numbers) for person in best]
-        px, conf = map(np.array, zip(*read, strict=True))
-        frames = np.array(list(files))
-    else:
-        frames, px, conf = _read_npz(path)
-    order = np.argsort(frames)
-    conf = np.where(known(px), np.nan_to_num(conf), 0.0)
+    found = _read_json(path) if path.is_dir() else _read_npz(path)
+    order = np.argsort(found.frame_id)
+    conf = np.where(known(found.px), np.nan_to_num(found.conf), 0.0)
     conf = np.clip(conf, 0.0, 1.0)[order]
-    px = np.where(conf[..., None] > 0, px[order], np.nan)
-    return Detections(frames[order], px, conf)
+    px = np.where(conf[..., None] > 0, found.px[order], np.nan)
+    return Detections(found.frame_id[order], px, conf)
+
+
+class Gathered(NamedTuple):
+    """Detections of C cameras in F frames."""
+
+    frames: Ints  # [F] increasing
+    px: Float  # [C, F, J, 2] NaN = not seen
+    conf: Float  # [C, F, J]
 
 
 def gather(
     detections: Mapping[str, Detections], offsets: Mapping[str, int]
-) -> tuple[Ints, Float, Float]:
-    """All cameras' detections by common frame numbers, a camera's own plus its offset.
-
-    Returns:
-        ``frames [F]`` rising, those of any camera; ``px [C, F, J, 2]`` NaN = not seen;
-        ``conf [C, F, J]``.
-    """
-    ids = [d.frame_id + int(offsets.get(name, 0)) for name, d in detections.items()]
+) -> Gathered:
+    """Detections of all cameras by common frame numbers: a camera's own plus its offset."""
+    ids = []
+    for name, found in detections.items():
+        ids.append(found.frame_id + int(offsets.get(name, 0)))
     frames = np.unique(np.concatenate(ids))
     frames = frames[frames >= 0]  # file names hold no negative numbers
+
+    # frames that a camera lacks stay NaN
     px = np.full((len(ids), len(frames), ALL, 2), np.nan)
     conf = np.zeros(px.shape[:3])
-    for c, (own, seen) in enumerate(zip(ids, detections.values(), strict=True)):
-        at = np.searchsorted(frames, own[own >= 0])
-        px[c, at] = seen.px[own >= 0]
-        conf[c, at] = seen.conf[own >= 0]
-    return frames, px, conf
+    for c, (own, found) in enumerate(zip(ids, detections.values(), strict=True)):
+        valid = own >= 0
+        at = np.searchsorted(frames, own[valid])
+        px[c, at] = found.px[valid]
+        conf[c, at] = found.conf[valid]
+    return Gathered(frames, px, conf)
 
 
 def inside(px: Float, conf: Float, sizes: Float) -> tuple[Float, Float]:
     """Detections without those outside their image: detectors guess where a cut-off body goes on.
 
-    ``px [C, F, J, 2]``, ``conf [C, F, J]`` and ``sizes [C, 2]``, width and height.
+    Args:
+        px: ``[C, F, J, 2]``.
+        conf: ``[C, F, J]``.
+        sizes: ``[C, 2]`` width and height.
     """
     with np.errstate(invalid="ignore"):
         seen = np.asarray(((px >= 0) & (px < sizes[:, None, None])).all(-1))
     return np.where(seen[..., None], px, np.nan), np.where(seen, conf, 0.0)
 
 
-def _read_npz(path: Path) -> Numbered:
+def _read_json(path: Path) -> Detections:
+    """Detections in a folder of JSON files; of several people, the one with most confidence."""
+    files = json_files(path)
+    best = []
+    for file in files.values():
+        best.append(max(_read_people(file), key=_confidence, default=None))
+    numbers = joint_numbers([person.body for person in best if person is not None])
+
+    px = np.full((len(files), ALL, 2), np.nan)
+    conf = np.zeros((len(files), ALL))
+    for f, person in enumerate(best):
+        if person is not None:
+            px[f], conf[f] = _joints(person, numbers)
+    return Detections(np.array(list(files)), px, conf)
+
+
+def _read_npz(path: Path) -> Detections:
+    """Detections in an npz file, as `gsgan.prepare` writes MediaPipe's."""
     arrays = read_arrays(path, ("px", "conf", "left", "right", "face", "frame_id"))
     body = expect_array(arrays, "px", (None, BODY, 2), path).astype(np.float64)
     F = len(body)
     frame_id = whole_frame_ids(expect_array(arrays, "frame_id", (F,), path), str(path))
+
+    # the body, then hands and face if the file has them
     px = np.full((F, ALL, 2), np.nan)
     conf = np.zeros((F, ALL))
     px[:, :BODY] = body
@@ -136,25 +155,25 @@ def _read_npz(path: Path) -> Numbered:
     for name, part in (("left", LEFT), ("right", RIGHT)):
         if name in arrays:
             px[:, part] = expect_array(arrays, name, (F, HAND, 2), path)
-            # MediaPipe has no confidence per landmark of hands and face
+            # MediaPipe has no confidence per landmark of hands and face.
             conf[:, part] = 1.0
     if "face" in arrays:
         mesh = expect_array(arrays, "face", (F, MESH, 2), path)
         px[:, FACE] = mesh[:, list(FACE_MESH.values())]
         conf[:, FACE] = 1.0
-    return frame_id, px, conf
+    return Detections(frame_id, px, conf)
 
 
 class _Person(NamedTuple):
-    """What a file has of a person: rows of x, y, confidence; none where a part is missing."""
+    """A person in a file: rows of x, y, confidence; a missing part has no rows."""
 
     body: Float
     left: Float
     right: Float
 
 
-def _seen(person: _Person) -> float:
-    """By how much confidence a person is seen."""
+def _confidence(person: _Person) -> float:
+    """The sum of a person's confidences."""
     return sum(float(part[:, 2].clip(0).sum()) for part in person)
 
 
@@ -195,14 +214,15 @@ def _person(person: Mapping[str, Any], keys: tuple[str, ...]) -> _Person:
     # OpenPose of 2017 had names without _2d.
     if not {keys[0], keys[0].removesuffix("_2d")} & person.keys():
         raise KeyError(f"found {', '.join(person)}")
-    found = [
-        person.get(key) or person.get(key.removesuffix("_2d")) or [] for key in keys
-    ]
-    # OpenPose writes triples flat, EasyMocap in rows.
-    parts = [np.array(values, np.float64).reshape(-1, 3) for values in found]
-    if len(parts[0]) and len(parts[0]) not in SETS:
-        raise LookupError(len(parts[0]))
-    return _Person(*parts)
+    parts = []
+    for key in keys:
+        values = person.get(key) or person.get(key.removesuffix("_2d")) or []
+        # OpenPose writes triples flat, EasyMocap in rows.
+        parts.append(np.array(values, np.float64).reshape(-1, 3))
+    body, left, right = parts
+    if len(body) and len(body) not in SETS:
+        raise LookupError(len(body))
+    return _Person(body, left, right)
 
 
 def joint_numbers(bodies: Sequence[Float]) -> dict[int, dict[int, int]]:
@@ -218,25 +238,23 @@ def joint_numbers(bodies: Sequence[Float]) -> dict[int, dict[int, int]]:
     distances = []
     for body in bodies:
         if len(body) == 25 and (body[[1, 8, 9, 12], 2] > 0).all():
-            neck, middle, right, left = body[[1, 8, 9, 12], :2]
-            trunk = np.linalg.norm(neck - (left + right) / 2)
-            distances.append(
-                np.linalg.norm(middle - (left + right) / 2) / max(float(trunk), 1e-6)
-            )
+            neck, eighth, right, left = body[[1, 8, 9, 12], :2]
+            hips = (left + right) / 2
+            trunk = max(float(np.linalg.norm(neck - hips)), 1e-6)
+            distances.append(np.linalg.norm(eighth - hips) / trunk)
     if distances and np.median(distances) > MIDDLE_OF_HIPS:
         numbers[25] = BODY_25B
     return numbers
 
 
 def _joints(
-    person: _Person | None, numbers: Mapping[int, Mapping[int, int]]
+    person: _Person, numbers: Mapping[int, Mapping[int, int]]
 ) -> tuple[Float, Float]:
-    """Pixels ``[J, 2]`` and confidence ``[J]`` of a person; NaN and 0 of nobody."""
+    """Pixels ``[J, 2]`` and confidence ``[J]`` of a person; NaN and 0 = not seen."""
     px = np.full((ALL, 2), np.nan)
     conf = np.zeros(ALL)
-    if person is None:
-        return px, conf
 
+    # joints of the body, then those of each whole hand
     def put(joints: list[int], triples: Float) -> None:
         seen = known(triples) & (triples[:, 2] > 0)
         px[joints] = np.where(seen[:, None], triples[:, :2] + PIXEL_CENTRE, np.nan)
@@ -248,6 +266,8 @@ def _joints(
     for hand, part in ((person.left, LEFT), (person.right, RIGHT)):
         if len(hand) == HAND:
             put(list(range(part.start, part.stop)), hand)
+
+    # joints of the body that only the hands have
     for target, origin in FROM_HANDS.items():
         if conf[target] == 0:
             px[target] = px[origin]

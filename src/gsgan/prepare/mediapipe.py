@@ -27,13 +27,12 @@ READY = ".ready"  # written last: an environment without it is incomplete
 
 def environment_of(tool: MediaPipe) -> Path:
     """The environment's folder, which need not exist."""
-    return Path(
-        tool.folder or cache_root() / "tools" / "mediapipe-0.10.21"
-    ).expanduser()
+    usual = cache_root() / "tools" / "mediapipe-0.10.21"
+    return Path(tool.folder or usual).expanduser()
 
 
 def tool_key() -> list[str]:
-    """What the detections depend on."""
+    """The files on which the detections depend."""
     return [SCRIPT.read_text(), REQUIREMENTS.read_text()]
 
 
@@ -44,9 +43,10 @@ def find_people(
     say: Callable[[str], None],
 ) -> tuple[dict[str, Path], dict[str, dict[int, Path]]]:
     """Landmark files by source, and its masks by frame number: given ones, or those of the tool."""
-    found, masks = (
-        run_tool(options, sources, stages, say) if options.needs_tool else ({}, {})
-    )
+    found: dict[str, Path] = {}
+    masks: dict[str, dict[int, Path]] = {}
+    if options.needs_tool:
+        found, masks = run_tool(options, sources, stages, say)
     if options.masks != MEDIAPIPE:
         masks = find_masks(options.folder("masks"), sources)
     if options.landmarks != MEDIAPIPE:
@@ -60,7 +60,9 @@ def run_tool(
     stages: StageFolder,
     say: Callable[[str], None],
 ) -> tuple[dict[str, Path], dict[str, dict[int, Path]]]:
-    """The npz of landmarks and the masks by frame number of each source; runs what is not stored.
+    """The npz of landmarks and the masks by frame number of each source.
+
+    The tool runs for sources whose results are not stored.
 
     Raises:
         ConfigError: when the environment is missing and may not be created.
@@ -75,7 +77,8 @@ def run_tool(
         key = [source.fingerprint(), source.rotate, tool_key(), parts, masks]
         folders[name] = stages.path(f"mediapipe-{name}", key)
         results[name] = folders[name].with_suffix(".npz")
-    # The npz is written last: where it exists, the masks are complete, too.
+
+    # The npz is written last: if it exists, the masks are complete too.
     missing = [name for name in sources if not results[name].is_file()]
     if missing:
         python = ensure_environment(tool, options.setup, say)
@@ -84,7 +87,7 @@ def run_tool(
             given = {
                 "source": str(sources[name].path),
                 "out": str(results[name]),
-                "masks": str(folders[name]) * masks,
+                "masks": str(folders[name]) if masks else "",
                 **parts,
                 "rotate": sources[name].rotate,
                 "slot": missing.index(name) % options.workers,
@@ -94,18 +97,19 @@ def run_tool(
             _detect(command, sources[name].path, advance)
 
         each_camera(one, "finding landmarks", missing, options.workers)
-    found = {
-        name: {int(path.stem): path for path in sorted(folder.glob("*.png"))}
-        for name, folder in folders.items()
-    }
-    if masks and (empty := [name for name, files in found.items() if not files]):
-        raise DataError(
-            f"MediaPipe found nobody in {empty[0]}; show a person, or leave it out"
-        )
+    found = {}
+    for name, folder in folders.items():
+        files = sorted(folder.glob("*.png"))
+        if masks and not files:
+            raise DataError(
+                f"MediaPipe found nobody in {name}; show a person, or leave it out"
+            )
+        found[name] = {int(path.stem): path for path in files}
     return results, found
 
 
 def _detect(command: list[str], source: Path, advance: Advance) -> None:
+    """Runs the tool, which prints lines "<done> <count>"."""
     with (
         tempfile.TemporaryFile("w+") as errors,
         subprocess.Popen(
@@ -146,14 +150,18 @@ def ensure_environment(
             f"landmarks=mediapipe needs its own environment at {place}: add setup=true to create "
             "it (some 400 MB), or give landmarks=<folder> and masks=<folder>"
         )
-    pythons = [tool.python, sys.executable if sys.version_info[:2] <= NEWEST else None]
-    base = next(
-        filter(None, (*pythons, *map(shutil.which, ("python3.12", "python3.11")))), None
-    )
+
+    # a Python that MediaPipe supports
+    base = tool.python
+    if not base and sys.version_info[:2] <= NEWEST:
+        base = sys.executable
+    base = base or shutil.which("python3.12") or shutil.which("python3.11")
     if base is None:
         raise ConfigError(
             "MediaPipe needs Python 3.11 or 3.12: set mediapipe.python=<path>"
         )
+
+    # the folder, marked as made here
     with writing(place):
         if place.exists():
             if any(place.iterdir()) and not (place / MARKER).is_file():
@@ -163,10 +171,21 @@ def ensure_environment(
             shutil.rmtree(place)
         place.mkdir(parents=True)
         (place / MARKER).touch()
+
+    # the environment, complete with its last file
     say(f"creating the MediaPipe environment at {place}, once")
     _run([base, "-m", "venv", str(place)], "the environment cannot be created")
-    install = [str(python), "-m", "pip", "install", "--quiet", "--no-deps"]
-    install += ["--disable-pip-version-check", "-r", str(REQUIREMENTS)]
+    install = [
+        str(python),
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--no-deps",
+        "--disable-pip-version-check",
+        "-r",
+        str(REQUIREMENTS),
+    ]
     _run(install, "pip cannot install MediaPipe")
     _run([str(python), "-c", "import mediapipe"], "MediaPipe does not start")
     with writing(place):

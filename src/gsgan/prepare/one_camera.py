@@ -42,29 +42,32 @@ from gsgan.skeleton.hands import HAND
 from gsgan.utils.arrays import Bool, Float, Ints, expect_array
 from gsgan.utils.errors import DataError
 
-# millimetres, the diagonal that equivalent focal lengths refer to
+# the diagonal of film in millimetres, to which equivalent focal lengths refer
 FILM = np.hypot(36.0, 24.0)
 # millimetres: phones' main cameras have 24 to 28 and record a part of their image
 USUAL = 30.0
-# How Apple's phones state it, in millimetres; not which part of the image was recorded.
+# Apple's phones state the focal length here, in millimetres; not the recorded part of the image.
 FOCAL = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
 # errors of focal lengths over the solution's own estimate, on synthetic scenes
 OVERCONFIDENT = 3.0
-DOUBTFUL = 3.0  # times the usual error of a frame
-# seconds, degrees: less is in doubt
-SHORT = 8.0
-TURN = 300
-# shares: more, more, less is in doubt
-MOVED = 0.03
-OTHERS = 0.2
-FEET_SEEN = 0.5
+DOUBTFUL = 3.0  # a frame with this many times the usual error is left out
+# The result is in doubt with a shorter video, a smaller turn, a background that moves more, more
+# images of several people, or fewer images of the feet.
+SHORT = 8.0  # seconds
+TURN = 300  # degrees
+MOVED = 0.03  # share of the image
+OTHERS = 0.2  # share of the images
+FEET_SEEN = 0.5  # share of the images
 DIRECTIONS = 12
+SHOULDERS = [11, 12]
+HIPS = [23, 24]
+WRISTS = [15, 16]
 SWAPPED = [j for pair in (*ARM_PAIRS[:3], *LEG_PAIRS[:3]) for j in pair]
 
 
 @dataclass(frozen=True)
 class Filmed:
-    """All that `gsgan.prepare` writes, from one video."""
+    """The results of one video that `gsgan.prepare` writes."""
 
     inputs: Inputs
     masks: dict[str, dict[int, Path]]
@@ -75,7 +78,7 @@ class Filmed:
 
 @dataclass(frozen=True)
 class Detected:
-    """What the landmark tool found in F frames: pixels, confidence, its own guesses in depth."""
+    """Detections of the landmark tool in F frames: pixels, confidence, its own guesses in depth."""
 
     px: Float  # [F, 105, 2]
     conf: Float  # [F, 105]
@@ -83,8 +86,14 @@ class Detected:
     hand_z: Float  # [F, 42] pixels from the wrist
     faces: Ints  # [F]
 
-    def __getitem__(self, frames: Bool) -> Detected:
-        return Detected(*(x[frames] for x in vars(self).values()))
+    def __getitem__(self, frames: Ints) -> Detected:
+        return Detected(
+            px=self.px[frames],
+            conf=self.conf[frames],
+            world=self.world[frames],
+            hand_z=self.hand_z[frames],
+            faces=self.faces[frames],
+        )
 
 
 def solve_video(options: Options, stages: StageFolder, console: Console) -> Filmed:
@@ -97,54 +106,64 @@ def solve_video(options: Options, stages: StageFolder, console: Console) -> Film
     with console.status("taking images from the video"):
         folder = stages.path("frames", [*stamp(video), SAMPLING])
         source, time = sample(video, folder)
-    found, masks = find_people(options, {source.name: source}, stages, console.print)
     numbers = np.array(list(source.files))
+    found, masks = find_people(options, {source.name: source}, stages, console.print)
     detected, there = _read(found[source.name], numbers, source.size)
     there &= np.isin(numbers, list(masks[source.name]))
+
     with console.status("choosing frames"):
-        sharp, moved = look(list(source.files.values()), detected.px[:, :BODY])
-    left = left_out(
-        detected.px[:, :BODY], detected.conf[:, :BODY] * there[:, None], sharp
-    )
+        px = detected.px[:, :BODY]
+        conf = detected.conf[:, :BODY] * there[:, None]
+        sharp, moved = look(list(source.files.values()), px)
+    left = left_out(px, conf, sharp)
     check_enough(video, len(numbers), left)
-    use = ~np.logical_or.reduce(list(left.values()))
+    used = np.flatnonzero(~np.logical_or.reduce(list(left.values())))
+
     with console.status("solving for the camera, the body and its poses"):
         stated = stated_focal(video)
         first = options.focal or stated or USUAL
         guess = float(np.hypot(*source.size) * first / FILM)
-        view = _solve(options, detected[use], time[use], source.size, guess)
+        view = _solve(options, detected[used], time[used], source.size, guess)
+
+    # frames that fit much worse than the others
     errors = np.nanmedian(view.error.numpy(), axis=1)
     doubtful = errors > DOUBTFUL * np.median(errors)
-    left["doubtful pose"] = np.zeros(len(use), bool)
-    left["doubtful pose"][np.flatnonzero(use)[doubtful]] = True
+    left["doubtful pose"] = np.zeros(len(numbers), bool)
+    left["doubtful pose"][used[doubtful]] = True
+    good = ~doubtful
+
+    # joints in the world, and their errors in pixels
     camera, p = _in_world(source, view, guess, options.height)
-    kept = np.flatnonzero(use)[~doubtful]
-    p = p[~doubtful]
-    seen = detected[np.isin(np.arange(len(use)), kept)]
+    p = p[good]
+    kept = used[good]
+    seen = detected[kept]
     joints, removed = _with_hands(p, seen, camera, time[kept], options)
-    error = np.full((1, len(kept), joints.shape[1]), np.nan)
-    error[0, :, :BODY] = view.error.numpy()[~doubtful] * guess
-    conf = np.where(np.isfinite(joints).all(-1), seen.conf[:, : joints.shape[1]], 0.0)
+    F, J, _ = joints.shape
+    error = np.full((1, F, J), np.nan)
+    error[0, :, :BODY] = view.error.numpy()[good] * guess
     solution = Solution(
         cameras=CameraArray.of([camera]),
         p=joints,
-        conf=conf,
+        conf=np.where(np.isfinite(joints).all(-1), seen.conf[:, :J], 0.0),
         error=error,
-        flips=np.zeros((1, len(kept), len(FLIP_GROUPS) + 1), bool),
-        left_out=np.zeros((1, len(kept), 2), bool),
+        flips=np.zeros((1, F, len(FLIP_GROUPS) + 1), bool),
+        left_out=np.zeros((1, F, 2), bool),
         delay=np.full(1, np.nan),
         gain=np.full(1, np.nan),
         stages={"fitted": error[:, :, :BODY]},
         removed=removed,
     )
-    measured = _measured(view, camera, p, time[kept], seen, left) | {
-        "background_moved": moved
-    }
-    calibration = Calibration(video, "estimated from the person", {camera.name: camera})
-    fps = round(1 / float(np.median(np.diff(time))), 3)
-    measured |= {"focal_stated": stated}
-    notes = tuple(_notes(measured, options, natural_height(view.shape)))
-    inputs = Inputs({source.name: source}, calibration, (camera,), notes, fps)
+
+    measured = _measured(view, camera, p, time[kept], seen, left)
+    measured["background_moved"] = moved
+    measured["focal_stated"] = stated
+    inputs = Inputs(
+        {source.name: source},
+        Calibration(video, "estimated from the person", {camera.name: camera}),
+        (camera,),
+        tuple(_notes(measured, options, natural_height(view.shape))),
+        round(1 / float(np.median(np.diff(time))), 3),
+    )
     return Filmed(inputs, masks, numbers[kept], solution, measured)
 
 
@@ -159,97 +178,121 @@ def _read(path: Path, numbers: Ints, size: tuple[int, int]) -> tuple[Detected, B
             "give landmarks=mediapipe, or videos of two calibrated cameras"
         )
     F = len(found.frame_id)
-    own = read_arrays(path, ("frame_id",))["frame_id"]
-    order = np.argsort(own)
-    at = np.searchsorted(found.frame_id, numbers).clip(max=F - 1)
-    there = found.frame_id[at] == numbers
     px, conf = landmarks.inside(
         found.px[None], found.conf[None], np.array([size[::-1]])
     )
-    rest = {
-        name: np.asarray(expect_array(arrays, name, (F, *shape), path), np.float64)[
-            order
-        ][at]
-        for name, shape in depth.items()
-        if name in arrays
-    }
-    hand_z = [
-        rest.get(name, np.full((len(at), HAND), np.nan))
-        for name in ("left_z", "right_z")
-    ]
+
+    # Rows of the file are in its own order, those of `found` by frame number.
+    at = np.searchsorted(found.frame_id, numbers).clip(max=F - 1)
+    there = found.frame_id[at] == numbers
+    order = np.argsort(read_arrays(path, ("frame_id",))["frame_id"])
+
+    def depths(name: str, default: float) -> Float:
+        shape = (F, *depth[name])
+        if name not in arrays:
+            return np.full((len(at), *depth[name]), default)
+        values = expect_array(arrays, name, shape, path)
+        return np.asarray(values, np.float64)[order][at]
+
+    world = depths("world", np.nan)
+    known = there & np.isfinite(world).all((1, 2))
+    hand_z = [depths("left_z", np.nan), depths("right_z", np.nan)]
     detected = Detected(
         px=px[0, at],
-        conf=conf[0, at] * (there & np.isfinite(rest["world"]).all((1, 2)))[:, None],
-        world=np.nan_to_num(rest["world"]),
+        conf=conf[0, at] * known[:, None],
+        world=np.nan_to_num(world),
         hand_z=np.concatenate(hand_z, axis=1),
-        faces=rest.get("faces", np.ones(len(at))).astype(np.int64),
+        faces=depths("faces", 1.0).astype(np.int64),
     )
     return detected, there
 
 
 def stated_focal(video: Path) -> float | None:
-    """The focal length in a video's metadata, in millimetres; None where they have none, or
-    without the extra ``render``."""
+    """The focal length in a video's metadata, in millimetres.
+
+    None if the metadata have none, or without the extra ``render``.
+    """
     try:
         import av
     except ImportError:
         return None
     with av.open(str(video)) as file:
         stated = re.match(r"[\d.]+", file.metadata.get(FOCAL, ""))
-    return float(stated[0]) or None if stated else None
+    if stated is None:
+        return None
+    return float(stated[0]) or None
 
 
 def _solve(
     options: Options, seen: Detected, time: Float, size: tuple[int, int], guess: float
 ) -> View:
-    """The solution, which starts from a focal length of so many pixels."""
+    """The solution, which starts from a focal length of ``guess`` pixels."""
     px = seen.px[:, :BODY].copy()
     conf = seen.conf[:, :BODY].copy()
     world = seen.world.copy()
     conf[conf <= options.solve.min_confidence] = 0
+
+    # Detectors confuse left and right in some frames.
     swapped = exchanged(world[:, SWAPPED])
     mirror = list(MEDIAPIPE33.mirror)
     for values in (px, conf, world):
         values[swapped] = values[swapped][:, mirror]
+
     u = np.nan_to_num(px - np.array(size[::-1]) / 2) / guess
-    given = Seen(*(torch.from_numpy(x) for x in (u, conf, world, time)))
-    height = options.height or HEIGHT
-    return solve_view(given, options.landmark_noise, options.focal is None, height)
+    given = Seen(
+        u=torch.from_numpy(u),
+        weight=torch.from_numpy(conf),
+        world=torch.from_numpy(world),
+        time=torch.from_numpy(time),
+    )
+    return solve_view(
+        given,
+        noise=options.landmark_noise,
+        focal=options.focal is None,
+        height=options.height or HEIGHT,
+    )
 
 
 def natural_height(shape: BodyShape) -> float:
     """Metres from the soles to the top of the head."""
-    x = shaped_body(
-        BodyShape(shape.coefficients.float(), shape.stretch.float())
-    ).vertices[:, 2]
-    return float(x.max() - x.min())
+    plain = BodyShape(shape.coefficients.float(), shape.stretch.float())
+    z = shaped_body(plain).vertices[:, 2]
+    return float(z.max() - z.min())
 
 
 def _in_world(
     source: Recording, view: View, guess: float, height: float | None
 ) -> tuple[CameraEntry, Float]:
-    """The camera and ``p [F, 33, 3]`` in a world with z upwards, the ground at 0 and the person's
-    height."""
+    """The camera and joints ``[F, 33, 3]`` in a world with z upwards.
+
+    The ground is at 0, and the person has the given height.
+    """
     p = view.p.numpy()
-    trunk = p[:, [11, 12]].mean(1) - p[:, [23, 24]].mean(1)
+    hips = p[:, HIPS].mean(1)
+
+    # the up direction and a point of the ground, in the axes of the camera
     if view.ground is None:
-        up = trunk.mean(0)
+        up = (p[:, SHOULDERS].mean(1) - hips).mean(0)
         below = np.percentile(p[:, FEET].reshape(-1, 3), 98, axis=0)
     else:
         a, b, c = view.ground.tolist()
         up = np.array([a, -1.0, b])
         below = np.array([0, c, 0])
     up = up / np.linalg.norm(up)
-    across = np.cross([0.0, 0.0, 1.0], up)  # the camera looks along +y
+
+    # the rotation from world to camera, which looks along +y
+    across = np.cross([0.0, 0.0, 1.0], up)
     across /= np.linalg.norm(across)
     R = np.stack([across, np.cross(up, across), up], axis=1)
-    middle = p[:, [23, 24]].mean((0, 1))
+
+    # the origin, on the ground below the mean of the hips
+    middle = p[:, HIPS].mean((0, 1))
     origin = middle - ((middle - below) @ up) * up
     scale = 1.0 if height is None else height / natural_height(view.shape)
+
     focal = guess * view.focal
-    K = np.array(
-        [[focal, 0, source.size[1] / 2], [0, focal, source.size[0] / 2], [0, 0, 1]]
-    )
+    h, w = source.size
+    K = np.array([[focal, 0, w / 2], [0, focal, h / 2], [0, 0, 1]])
     camera = CameraEntry(source.name, K, R, scale * origin, np.zeros(8), source.size)
     return camera, scale * (p - origin) @ R
 
@@ -257,24 +300,36 @@ def _in_world(
 def _with_hands(
     p: Float, seen: Detected, camera: CameraEntry, time: Float, options: Options
 ) -> tuple[Float, dict[str, int]]:
-    """``[F, 33 or 105, 3]``: hands hang on the wrists with the detector's own depth; no face."""
+    """Joints ``[F, 33 or 105, 3]``, and the number of removed ones by reason.
+
+    Hands hang on the wrists with the detector's own depth; there is no face.
+    """
     if not options.hands:
         return p, {}
     joints = np.full((len(p), ALL, 3), np.nan)
     joints[:, :BODY] = p
-    depth = (p @ camera.R.T + camera.t)[:, [15, 16], 2].repeat(HAND, axis=1)
-    ray = np.concatenate([seen.px[:, HANDS], np.ones_like(depth)[..., None]], axis=-1)
-    ray = ray @ np.linalg.inv(camera.K).T
-    x = ray * (depth * (1 + seen.hand_z / camera.K[0, 0]))[..., None]
-    joints[:, HANDS] = (x - camera.t) @ camera.R
-    for part, wrist in ((LEFT, 15), (RIGHT, 16)):  # the hand begins at the solved wrist
+
+    # the hands' depth: the wrist's, and the detector's own from there
+    in_camera = p @ camera.R.T + camera.t
+    depth = in_camera[:, WRISTS, 2].repeat(HAND, axis=1)
+    depth = depth * (1 + seen.hand_z / camera.K[0, 0])
+    ones = np.ones_like(depth)[..., None]
+    pixels = np.concatenate([seen.px[:, HANDS], ones], axis=-1)
+    rays = pixels @ np.linalg.inv(camera.K).T
+    joints[:, HANDS] = (rays * depth[..., None] - camera.t) @ camera.R
+
+    # the hand begins at the solved wrist
+    for part, wrist in zip((LEFT, RIGHT), WRISTS, strict=True):
         joints[:, part] += p[:, [wrist]] - joints[:, part][:, :1]
+
     joints, removed = cleanse(joints)
     weight = np.isfinite(joints).all(-1).astype(float)
-    hands = smooth(
-        joints[:, HANDS], weight[:, HANDS], time, 2 * options.solve.smoothing
+    joints[:, HANDS] = smooth(
+        joints[:, HANDS],
+        weight[:, HANDS],
+        time,
+        seconds=2 * options.solve.smoothing,
     )
-    joints[:, HANDS] = hands
     joints[:, :BODY] = p
     return joints, removed
 
@@ -289,20 +344,24 @@ def _measured(
 ) -> dict[str, Any]:
     """The numbers of prepare.json that only a video of one camera has."""
     focal = float(camera.K[0, 0])
-    side = p[:, 11, :2] - p[:, 12, :2]
-    toward = camera.centre[:2] - p[:, [23, 24], :2].mean(1)
-    turn = np.arctan2(*side.T) - np.arctan2(*toward.T)
+    diagonal = float(np.hypot(*camera.size))
+
+    # the directions from which the camera saw the person
+    left_shoulder, right_shoulder = SHOULDERS
+    side = p[:, left_shoulder, :2] - p[:, right_shoulder, :2]
+    toward = camera.centre[:2] - p[:, HIPS, :2].mean(1)
+    turn = np.arctan2(side[:, 0], side[:, 1]) - np.arctan2(toward[:, 0], toward[:, 1])
     directions = np.unique(np.floor(DIRECTIONS * (turn / (2 * np.pi) % 1)))
+
+    counts = {reason: int(frames.sum()) for reason, frames in left.items()}
     return {
         "focal_px": focal,
-        "focal_mm": focal / float(np.hypot(*camera.size)) * FILM,
+        "focal_mm": focal / diagonal * FILM,
         "focal_uncertainty": OVERCONFIDENT * view.spread,
         "degrees_seen": 360 // DIRECTIONS * len(directions),
         "seconds": float(np.ptp(time)),
         "sampled": len(next(iter(left.values()))),
-        "left_out": {
-            reason: int(one.sum()) for reason, one in left.items() if one.any()
-        },
+        "left_out": {reason: count for reason, count in counts.items() if count},
         "several_faces": float((detected.faces > 1).mean()),
         "feet_seen": float((detected.conf[:, FEET] > 0).any(1).mean()),
         "standing": view.ground is not None,
@@ -311,42 +370,44 @@ def _measured(
 
 def _notes(found: Mapping[str, Any], options: Options, natural: float) -> list[str]:
     """Sentences on what was estimated, and on what is in doubt."""
-    notes = [
-        f"focal length {found['focal_px']:.0f} pixels, {found['focal_mm']:.0f} mm on film"
-    ]
+    # estimates
+    focal = f"focal length {found['focal_px']:.0f} pixels, {found['focal_mm']:.0f} mm on film"
     if options.focal is None:
         stated = found["focal_stated"]
         origin = f" from the {stated:g} mm that the file states" if stated else ""
-        notes[0] += (
-            f", ± {found['focal_uncertainty']:.0%}, estimated{origin}; focal=<mm> sets it"
-        )
+        uncertainty = f"{found['focal_uncertainty']:.0%}"
+        focal += f", ± {uncertainty}, estimated{origin}; focal=<mm> sets it"
+    notes = [focal]
     if options.height is None:
         notes.append(f"height {natural:.2f} m, as a usual person; height=<m> sets it")
     if found["left_out"]:
-        reasons = ", ".join(
-            f"{reason} {count}" for reason, count in found["left_out"].items()
-        )
+        counts = [f"{reason} {count}" for reason, count in found["left_out"].items()]
+        reasons = ", ".join(counts)
         notes.append(f"left out of {found['sampled']} sampled images: {reasons}")
-    few = found["seconds"]
+
+    # doubts
+    seconds = found["seconds"]
     turned = found["degrees_seen"]
     moved = found["background_moved"]
     others = found["several_faces"]
     feet = found["feet_seen"]
-    doubts = (
-        (few < SHORT, f"{few:.1f} seconds are short, 20 to 40 are better"),
-        (
-            turned < TURN,
-            f"only {turned} of 360 degrees were filmed; training guesses the rest",
-        ),
-        (
-            moved > MOVED,
-            f"the background moved by {moved:.0%} of the image; it counts as still",
-        ),
-        (others > OTHERS, f"{others:.0%} of the images show more than one face"),
-        (
-            feet < FEET_SEEN,
-            f"feet are in {feet:.0%} of the images; legs and distance are guesses",
-        ),
-        (not found["standing"], "no foot stood still, so the ground is a guess"),
-    )
-    return notes + [f"doubtful: {text}" for wrong, text in doubts if wrong]
+    doubts = []
+    if seconds < SHORT:
+        doubts.append(f"{seconds:.1f} seconds are short, 20 to 40 are better")
+    if turned < TURN:
+        doubts.append(
+            f"only {turned} of 360 degrees were filmed; training guesses the rest"
+        )
+    if moved > MOVED:
+        doubts.append(
+            f"the background moved by {moved:.0%} of the image; it counts as still"
+        )
+    if others > OTHERS:
+        doubts.append(f"{others:.0%} of the images show more than one face")
+    if feet < FEET_SEEN:
+        doubts.append(
+            f"feet are in {feet:.0%} of the images; legs and distance are guesses"
+        )
+    if not found["standing"]:
+        doubts.append("no foot stood still, so the ground is a guess")
+    return notes + [f"doubtful: {doubt}" for doubt in doubts]

@@ -1,7 +1,28 @@
 """The body, its poses and the focal length from one camera's 2D landmarks.
 
-Convention: metres, seconds and radians, in the axes of the camera (x right, y down, z forward);
+Units are metres, seconds and radians, in the axes of the camera (x right, y down, z forward);
 offsets from the principal point are divided by a first guess of the focal length.
+
+The solver is Gauss-Newton with Cauchy weights. The unknowns are the pose ``q_f`` of each frame and
+the numbers ``s`` that all frames share: the ground and the shape. With the landmarks
+``X_f(q_f, s)`` of frame f, half the gradient ``g_f`` and the Hessian ``W_f`` of the cost by
+``X_f``, and
+
+    J_f = dX_f / dq_f,    G_f = dX_f / ds,
+
+the chain rule gives the blocks of the normal equations,
+
+    H_pose_pose     = Jᵀ W J    block diagonal; smooth motion adds two blocks below each
+    H_pose_shared   = Jᵀ W G
+    H_shared_shared = Gᵀ W G    summed over frames,
+
+and the priors add to the first and the last. The poses are eliminated by the Schur complement:
+
+    S ds = H_shared_pose H_pose_pose⁻¹ g_pose - g_shared,
+    S = H_shared_shared - H_shared_pose H_pose_pose⁻¹ H_pose_shared,
+    dq = -H_pose_pose⁻¹ (g_pose + H_pose_shared ds).
+
+The residuals depend on the ground directly too; these terms are added to the blocks of the ground.
 """
 
 from __future__ import annotations
@@ -9,6 +30,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -23,44 +45,45 @@ from gsgan.fit.shape import shape_of, shape_prior, without_surface
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.utils.arrays import Float, evenly_spaced
 
-KEYFRAMES = 50  # at most, for shape and focal length
-FOCAL_SPREAD = 0.12  # of the guess, as a logarithm
+KEYFRAMES = 50  # maximum number of frames for shape and focal length
+FOCAL_SPREAD = 0.12  # standard deviation of the guess's logarithm
 NOISE = 0.01  # of landmarks in the first steps, share of the person's size
-# Metres, standard deviation of the detector's own 3D landmarks, beside 2D landmarks of that noise:
-# the more exact these are, the more they say of depth themselves.
+# Standard deviation in metres of the detector's own 3D landmarks, given 2D landmarks with that
+# noise; more accurate 2D landmarks constrain depth more, so the 3D ones get less weight.
 DEPTH = 0.08
-ACCELERATION = 8.0  # metres per square second, standard deviation
-ACCELERATIONS = 10.0  # independent ones per second
-# metres per second, metres: of a standing foot
-SLIDING = 0.1
-GROUND = 0.02
-BALANCE = 0.08  # metres by which the trunk is not above standing feet
+ACCELERATION = 8.0  # standard deviation, metres per square second
+ACCELERATIONS = 10.0  # independent accelerations per second
+SLIDING = 0.1  # speed of a standing foot, metres per second
+GROUND = 0.02  # distance of a standing foot from the ground, metres
+BALANCE = 0.08  # horizontal distance from trunk to standing feet, metres
 STILL = 0.25  # metres per second: a slower foot stands
 OUTLIER = 3.0  # standard deviations at which a landmark counts half
-# Metres, and the standard deviation of the logarithm. Images do not tell the size, and errors of
-# speed, depth and sliding feet are in metres: without this a small person would fit best.
+# The person's height in metres, and the standard deviation of its logarithm. Images do not tell the
+# size, and errors of speed, depth and sliding feet are in metres: without this term a small person
+# would fit best.
 HEIGHT = 1.7
 SIZE = 0.003
 LIMBS = 0.05  # weight of the prior of arms and legs, which would make them shorter
 GAP = 0.5  # seconds: motion is not smooth over a longer gap
 ZOOMS = np.arange(-4, 5) / 10  # logarithms of focal lengths to try
-# Gauss-Newton steps for each; neighbours of the best that tell the best
-ZOOM_STEPS = 8
-NEAREST = 2
-STEPS = 20
-SETTLED = 1e-4
+ZOOM_STEPS = 8  # Gauss-Newton steps for each focal length
+NEAREST = 2  # neighbours on each side of the minimum in the parabola fit
+STEPS = 20  # maximum number of Gauss-Newton steps
+SETTLED = 1e-4  # relative change of the cost at which the solver stops
 MIN_STANDING = 8  # landmarks of feet: fewer do not show the ground
+# Levenberg-Marquardt damping, and its factors after a good and after a bad step.
 DAMPING = 1e-3
 EASIER = 0.3
 HARDER = 10.0
-NEAR = 0.2  # metres before the camera
+NEAR = 0.2  # minimum depth, metres
 FEET = [29, 31, 30, 32]  # heels and toes
 LIMB = re.compile(r"arm_|elbow$|thigh_|knee$")
-# The residual of a landmark in two and in three dimensions, of the feet, and of balance.
+# The group that each residual belongs to: each landmark in two and in three dimensions, each
+# landmark of the feet, and the balance.
 GROUPS = torch.arange(71).repeat_interleave(
     torch.tensor([2] * 33 + [3] * 33 + [1] * 4 + [2])
 )
-OWN = 3  # numbers of `State.common` before those of the shape
+PLANE = 3  # numbers of the ground, the first of `State.shared`
 HIPS = list(MEDIAPIPE33.hips)
 TRUNK = list(MEDIAPIPE33.torso)
 
@@ -72,8 +95,8 @@ class Seen:
     Args:
         u: ``[F, 33, 2]`` offsets from the principal point over the guessed focal length.
         weight: ``[F, 33]`` confidence, 0 = not seen.
-        world: ``[F, 33, 3]`` metres, the detector's own guess, from the middle of the hips.
-        time: ``[F]`` rising.
+        world: ``[F, 33, 3]`` the detector's own 3D landmarks, metres from the middle of the hips.
+        time: ``[F]`` seconds, increasing.
     """
 
     u: Tensor
@@ -82,24 +105,35 @@ class Seen:
     time: Tensor
 
     def __getitem__(self, frames: Tensor) -> Seen:
-        return Seen(*(x[frames] for x in vars(self).values()))
+        return Seen(
+            u=self.u[frames],
+            weight=self.weight[frames],
+            world=self.world[frames],
+            time=self.time[frames],
+        )
 
     @property
     def size(self) -> Tensor:
         """``[F]`` the person's size in the image: the diagonal of the landmarks' box."""
-        low = torch.where(self.weight[..., None] > 0, self.u, 9e9)
-        high = torch.where(self.weight[..., None] > 0, self.u, (-9e9))
-        return (high.amax(1) - low.amin(1)).norm(dim=-1)
+        visible = self.weight[..., None] > 0
+        lower = torch.where(visible, self.u, 9e9).amin(1)
+        upper = torch.where(visible, self.u, -9e9).amax(1)
+        return (upper - lower).norm(dim=-1)
 
 
 @dataclass(frozen=True)
 class State:
-    """Unknowns: ``q [F, D]`` and ``root [F, 3, 3]`` of `Solver`, and ``common [3 + S]``: the ground
-    ``y = a x + b z + c``; the shape."""
+    """The unknowns.
+
+    Args:
+        q: ``[F, D]`` the poses' numbers, of `Solver`.
+        root: ``[F, 3, 3]`` the root's rotations, of `Solver`.
+        shared: ``[3 + S]`` the ground ``y = a x + b z + c``, and the shape.
+    """
 
     q: Tensor
     root: Tensor
-    common: Tensor
+    shared: Tensor
 
 
 @dataclass
@@ -108,10 +142,12 @@ class Normal:
 
     Args:
         cost: scalar.
-        g, W: ``[F, N]`` half the gradient, and ``[F, N, N]``.
-        near: ``[2, F, N]`` diagonals that couple a frame with those one and two later.
-        cross: ``[F, N, 3]`` between landmarks and the ground.
-        slope, common: ``[3]``, ``[3, 3]`` of the latter.
+        g: ``[F, N]`` half the gradient.
+        W: ``[F, N, N]`` Hessian of each frame.
+        near: ``[2, F, N]`` diagonals that couple a frame with the first and second later frame.
+        cross: ``[F, N, 3]`` Hessian between landmarks and the ground.
+        g_ground: ``[3]`` half the gradient by the ground.
+        W_ground: ``[3, 3]`` Hessian by the ground.
     """
 
     cost: Tensor
@@ -119,23 +155,45 @@ class Normal:
     W: Tensor
     near: Tensor
     cross: Tensor
-    slope: Tensor
-    common: Tensor
+    g_ground: Tensor
+    W_ground: Tensor
 
-    def add_motion(self, X: Tensor, c: Tensor, weight: Tensor) -> None:
-        """Adds squares of ``c[0] X[f] + c[1] X[f + 1] + …``: ``c [K, n]``, ``weight [n, 33]``."""
-        n = c.shape[1]
-        r = torch.stack([a[:, None, None] * X[k : k + n] for k, a in enumerate(c)]).sum(
-            0
-        )
+    def add_motion(self, X: Tensor, stencil: Tensor, weight: Tensor) -> None:
+        """Adds squares of finite differences ``c[0] X[f] + c[1] X[f + 1] + …``.
+
+        Args:
+            X: ``[F, 33, 3]`` landmarks.
+            stencil: ``[K, n]`` coefficients c of each difference.
+            weight: ``[n, 33]``.
+        """
+        n = stencil.shape[1]
+        terms = []
+        for k, c in enumerate(stencil):
+            terms.append(c[:, None, None] * X[k : k + n])
+        r = torch.stack(terms).sum(0)
+
+        # Cauchy's cost, and the weights that make its squares
         square = r.square().sum(-1) / OUTLIER**2
         self.cost = self.cost + (weight * OUTLIER**2 * square.log1p()).sum()
         w = (weight / (1 + square)).repeat_interleave(3, dim=1)
-        for k, a in enumerate(c):
-            self.g[k : k + n] += w * a[:, None] * r.flatten(1)
-            self.W.diagonal(dim1=1, dim2=2)[k : k + n] += w * a[:, None].square()
-            for gap, b in enumerate(c[k + 1 :]):
-                self.near[gap, k : k + n] += w * (a * b)[:, None]
+
+        diagonal = self.W.diagonal(dim1=1, dim2=2)
+        for k, c in enumerate(stencil):
+            self.g[k : k + n] += w * c[:, None] * r.flatten(1)
+            diagonal[k : k + n] += w * c[:, None].square()
+            for gap, later in enumerate(stencil[k + 1 :]):
+                self.near[gap, k : k + n] += w * (c * later)[:, None]
+
+
+class Blocks(NamedTuple):
+    """Blocks of the normal equations by the unknowns: see the top of this module."""
+
+    pose_pose: Tensor  # [F, D, D]
+    below: list[Tensor]  # [F - 1, D, D], [F - 2, D, D]: one and two frames later
+    pose_shared: Tensor  # [F, D, 3 + S]
+    shared_shared: Tensor  # [3 + S, 3 + S]
+    g_pose: Tensor  # [F, D]
+    g_shared: Tensor  # [3 + S]
 
 
 @dataclass(frozen=True)
@@ -146,9 +204,10 @@ class View:
         p: ``[F, 33, 3]`` landmarks, metres, camera axes; the size is that of a usual person.
         error: ``[F, 33]`` of reprojection, in units of ``u``; NaN = not seen.
         shape: of the person.
-        focal: the focal length over its guess; ``spread``: standard deviation of its logarithm.
+        focal: the focal length over its guess.
+        spread: standard deviation of the focal length's logarithm.
         ground: ``[3]`` of the plane ``y = a x + b z + c`` under the feet; None: no foot stood.
-        standing: ``[F, 4]`` 1 where `FEET` stood.
+        standing: ``[F, 4]`` 1 for those of `FEET` that stood, else 0.
     """
 
     p: Tensor
@@ -178,41 +237,53 @@ def solve_view(
         height: metres, of the person.
     """
     standing = Problem(seen).standing_feet()
-    ground = bool(standing.sum() >= MIN_STANDING)
-    at = torch.tensor(evenly_spaced(len(seen.u), KEYFRAMES, ends=True))
+    has_ground = bool(standing.sum() >= MIN_STANDING)
+    keyframes = torch.tensor(evenly_spaced(len(seen.u), KEYFRAMES, ends=True))
 
     def problem(frames: Tensor, noise: float, zoom: float, **options: bool) -> Problem:
-        feet = standing[frames] * ground
         return Problem(
-            seen[frames], noise, zoom, standing=feet, height=height, **options
+            seen[frames],
+            noise,
+            zoom,
+            standing=standing[frames] * has_ground,
+            height=height,
+            **options,
         )
 
+    # the cost of each focal length, from the longest to the shortest and back
     tried = np.concatenate([ZOOMS[::-1], ZOOMS]) if focal else np.zeros(1)
-    first = problem(at, NOISE, float(tried[0]))
-    states = [first.minimise(first.start())[0]]
+    first = problem(keyframes, NOISE, float(tried[0]))
+    state, _ = first.minimise(first.start())
+    states = []
     costs = []
     for zoom in tried:
-        state, cost = problem(at, noise, float(zoom)).minimise(states[-1], ZOOM_STEPS)
+        candidate = problem(keyframes, noise, float(zoom))
+        state, cost = candidate.minimise(state, ZOOM_STEPS)
         states.append(state)
         costs.append(cost)
+
+    # the shape, from the solution of the way back whose focal length is nearest to the best one
     zoom, spread = _best_zoom(np.array(costs)) if focal else (0.0, 0.0)
-    nearest = states[1:][-1 - int(np.argmin(np.abs(tried[::-1] - zoom)))]
-    state, _ = problem(at, noise, zoom).minimise(nearest)
+    from_last = int(np.argmin(np.abs(tried[::-1] - zoom)))
+    nearest = states[-1 - from_last]
+    state, _ = problem(keyframes, noise, zoom).minimise(nearest)
 
     # all frames: first one by one, then as a motion
     every = torch.arange(len(seen.u))
     alone = problem(every, NOISE, zoom, shape=False)
-    begun, _ = alone.minimise(replace(alone.start(), common=state.common), 6)
+    start = replace(alone.start(), shared=state.shared)
+    begun, _ = alone.minimise(start, 6)
     whole = problem(every, noise, zoom, smooth=True, shape=False)
     final, _ = whole.minimise(begun, 10)
     p, error = whole.errors(final)
+
     return View(
         p=p,
         error=error,
-        shape=shape_of(whole.space, final.common[OWN:]),
+        shape=shape_of(whole.space, final.shared[PLANE:]),
         focal=math.exp(zoom),
         spread=spread,
-        ground=final.common[:OWN] if ground else None,
+        ground=final.shared[:PLANE] if has_ground else None,
         standing=standing,
     )
 
@@ -221,12 +292,12 @@ class Problem:
     """The squares to minimise.
 
     Args:
-        seen: of F frames.
+        seen: what the camera saw in F frames.
         noise: of landmarks, share of the person's size.
         zoom: logarithm of the focal length over its guess.
         shape: whether the body's shape is unknown.
         smooth: whether the frames follow each other in time.
-        standing: ``[F, 4]`` 1 where `FEET` stand.
+        standing: ``[F, 4]`` 1 for those of `FEET` that stand, else 0.
         height: metres, of the person.
     """
 
@@ -243,222 +314,294 @@ class Problem:
         self.seen = seen
         self.zoom = math.exp(zoom)
         self.smooth = smooth
-        none = seen.weight.new_zeros(len(seen.weight), len(FEET))
-        self.standing = none if standing is None else standing
+        if standing is None:
+            standing = seen.weight.new_zeros(len(seen.weight), len(FEET))
+        self.standing = standing
         self.noise = (noise * seen.size)[:, None]
         self.depth = DEPTH * (NOISE / noise) ** 0.5
+
+        # the priors of size and shape
         space = free_space()
         self.space = without_surface(space)
-        tall = float(space.body.vertices[:, 2].max() - space.body.vertices[:, 2].min())
-        self.size = _log_size(self.space.body.landmarks) + math.log(height / tall)
-        ground = torch.full((OWN,), 1e-3, dtype=torch.float64)
-        self.prior = torch.cat([ground, shape_prior(self.space)])
+        z = space.body.vertices[:, 2]
+        usual_height = float(z.max() - z.min())
+        usual_size = _log_size(self.space.body.landmarks)
+        self.size = usual_size + math.log(height / usual_height)
+        plane = torch.full((PLANE,), 1e-3, dtype=torch.float64)
+        self.prior = torch.cat([plane, shape_prior(self.space)])
         self.free = torch.full_like(self.prior, shape, dtype=torch.bool)
-        self.free[:OWN] = bool(self.standing.any())
+        self.free[:PLANE] = bool(self.standing.any())
+
+        # The detector assumes that the person is in the middle of the image: its landmarks are
+        # turned to the direction in which the camera sees the person.
         w = seen.weight.unsqueeze(-1)
         middle = (w * seen.u.nan_to_num()).sum(1) / w.sum(1).clamp_min(1e-9)
-        # to the seen landmarks
         rays = torch.cat([middle, torch.ones_like(middle[:, :1])], dim=1)
         rays = rays / rays.norm(dim=1, keepdim=True)
-        turn = shortest_turn(rays.new_tensor([0.0, 0, 1]).expand_as(rays), rays)
-        self.world = (
-            axis_angle_to_matrix(turn).unsqueeze(1) @ seen.world.unsqueeze(-1)
-        )[..., 0]
+        forward = rays.new_tensor([0.0, 0, 1]).expand_as(rays)
+        R = axis_angle_to_matrix(shortest_turn(forward, rays)).unsqueeze(1)
+        self.world = (R @ seen.world.unsqueeze(-1))[..., 0]
 
-    def solver(self, common: Tensor) -> Solver:
-        """Of the body with a shape."""
-        solver = Solver(self.space.shaped(shape_of(self.space, common[OWN:])))
-        loose = torch.tensor(
-            [LIMB.search(name) is not None for name in solver.rig.names]
-        )
-        weight = torch.where(loose, LIMBS**0.5, 1.0).to(solver.prior)
+    def solver(self, shared: Tensor) -> Solver:
+        """The solver for the body with this shape."""
+        solver = Solver(self.space.shaped(shape_of(self.space, shared[PLANE:])))
+        of_limb = [LIMB.search(name) is not None for name in solver.rig.names]
+        weight = torch.where(torch.tensor(of_limb), LIMBS**0.5, 1.0).to(solver.prior)
         solver.prior = solver.prior * torch.outer(weight, weight)
         return solver
 
     def start(self) -> State:
-        """The detector's own 3D landmarks where they fit those in 2D best, and a usual shape."""
-        common = torch.zeros_like(self.prior)
-        solver = self.solver(common)
+        """The detector's own 3D landmarks, placed to fit those in 2D best, and a usual shape."""
+        shared = torch.zeros_like(self.prior)
+        solver = self.solver(shared)
         u = self.seen.u.nan_to_num() / self.zoom
         w = self.seen.weight
-        # least squares of  x + tx = u (z + tz)
+
+        # translations t by least squares of  x + tx = u (z + tz),  y + ty = v (z + tz)
         A = torch.zeros(*u.shape, 3, dtype=u.dtype)
-        A[..., 0, 0] = A[..., 1, 1] = 1
+        A[..., 0, 0] = 1
+        A[..., 1, 1] = 1
         A[..., 2] = -u
         b = u * self.world[..., 2:] - self.world[..., :2]
         wA = w[..., None, None] * A
         H = torch.einsum("fjki,fjkl->fil", wA, A) + 1e-6 * torch.eye(3)
         t = torch.linalg.solve(H, torch.einsum("fjki,fjk->fi", wA, b))
         t[:, 2] = t[:, 2].clamp_min(1.0)
+
+        # the body in the pose of these landmarks
         p = self.world + t[:, None]
-        q, root = solver.descend(*solver.guess(p), p, solver.weights(w > 0))
+        q, root = solver.guess(p)
+        q, root = solver.descend(q, root, p, solver.weights(w > 0))
         if self.standing.any():
-            common[OWN - 1] = p[:, FEET, 1].median()
-        return State(q, root, common)
+            shared[PLANE - 1] = p[:, FEET, 1].median()
+        return State(q, root, shared)
 
     def too_large(self, x: Tensor) -> Tensor:
-        """By how many standard deviations a body of the shape ``x [S]`` is too large."""
+        """The number of standard deviations by which a body of the shape ``x [S]`` is too large."""
         body = self.space.shaped(shape_of(self.space, x))
         return (_log_size(body.landmarks) - self.size) / SIZE
 
     def landmarks(self, at: State, solver: Solver) -> Tensor:
-        """``[F, 33, 3]``."""
-        return solver.points(
-            solver.transforms(at.q, at.root, solver.joints), solver.landmarks
-        )
+        """The landmarks ``[F, 33, 3]`` of a state."""
+        transforms = solver.transforms(at.q, at.root, solver.joints)
+        return solver.points(transforms, solver.landmarks)
 
-    def residuals(self, x: Tensor, own: Tensor, *of_frame: Tensor) -> Tensor:
+    def residuals(
+        self, x: Tensor, ground: Tensor, u: Tensor, world: Tensor, noise: Tensor
+    ) -> Tensor:
         """``[R]`` of one frame's landmarks ``x [33, 3]``, in standard deviations: see `GROUPS`."""
-        u, world, noise = of_frame
-        shown = self.zoom * x[:, :2] / x[:, 2:].clamp_min(NEAR)
-        hang = x - x[HIPS].mean(0) - world
+        a, b, c = ground
+        projected = self.zoom * x[:, :2] / x[:, 2:].clamp_min(NEAR)
+        from_hips = x - x[HIPS].mean(0) - world
         feet = x[FEET]
-        height = feet[:, 1] - own[0] * feet[:, 0] - own[1] * feet[:, 2] - own[2]
-        # above the feet: what tells the ground's slope
+        height = feet[:, 1] - a * feet[:, 0] - b * feet[:, 2] - c
+
+        # A standing person's trunk is above the feet: this shows the ground's slope.
         trunk = x[TRUNK].mean(0) - feet.mean(0)
-        aside = torch.stack(
-            [trunk[0] + own[0] * trunk[1], trunk[2] + own[1] * trunk[1]]
-        )
-        parts = (
-            (shown - u) / noise,
-            hang / self.depth,
+        aside = torch.stack([trunk[0] + a * trunk[1], trunk[2] + b * trunk[1]])
+
+        parts = [
+            (projected - u) / noise,
+            from_hips / self.depth,
             height / GROUND,
             aside / BALANCE,
-        )
+        ]
         return torch.cat([part.flatten() for part in parts])
 
-    def terms(self, X: Tensor, own: Tensor, linear: bool = True) -> Normal:
+    def terms(self, X: Tensor, ground: Tensor, linear: bool = True) -> Normal:
         """The cost of landmarks ``X [F, 33, 3]``, and with ``linear`` its derivatives."""
         seen = self.seen
         F = len(X)
-        hung = X - X[:, HIPS].mean(1, keepdim=True)
-        # the detector's own 3D landmarks are of any scale
+
+        # The detector's own 3D landmarks have an arbitrary scale: the best one is used.
+        from_hips = X - X[:, HIPS].mean(1, keepdim=True)
         w = seen.weight.unsqueeze(-1)
-        scale = ((w * hung.square()).sum() / (w * self.world.square()).sum()).sqrt()
+        own_size = (w * from_hips.square()).sum()
+        scale = (own_size / (w * self.world.square()).sum()).sqrt()
+
+        # Cauchy's cost of each group of residuals, and the weights that make its squares
         data = (seen.u, scale * self.world, self.noise)
-        every = (0, None, 0, 0, 0)
-        r = torch.vmap(self.residuals, every)(X, own, *data)
-        both = self.standing[:, :2].amax(1, keepdim=True) * self.standing[:, 2:].amax(
-            1, keepdim=True
+        dims = (0, None, 0, 0, 0)
+        r = torch.vmap(self.residuals, dims)(X, ground, *data)
+        left = self.standing[:, :2].amax(1, keepdim=True)
+        right = self.standing[:, 2:].amax(1, keepdim=True)
+        weight = torch.cat(
+            [seen.weight, seen.weight, self.standing, left * right],
+            dim=1,
         )
-        weight = torch.cat([seen.weight, seen.weight, self.standing, both], dim=1)
-        square = (
-            r.new_zeros(weight.shape).index_add_(1, GROUPS, r.square()) / OUTLIER**2
-        )
-        cost = (weight * OUTLIER**2 * square.log1p()).sum()
-        w = (weight / (1 + square))[:, GROUPS]
+        squares = r.new_zeros(weight.shape).index_add_(1, GROUPS, r.square())
+        squares = squares / OUTLIER**2
+        cost = (weight * OUTLIER**2 * squares.log1p()).sum()
+        w = (weight / (1 + squares))[:, GROUPS]
+
+        # A = dr / dX, C = dr / dground
         A = r.new_zeros(F, r.shape[1], X[0].numel())
-        C = r.new_zeros(F, r.shape[1], OWN)
+        C = r.new_zeros(F, r.shape[1], PLANE)
         if linear:
-            A, C = torch.vmap(torch.func.jacfwd(self.residuals, (0, 1)), every)(
-                X, own, *data
-            )
+            derivatives = torch.func.jacfwd(self.residuals, (0, 1))
+            A, C = torch.vmap(derivatives, dims)(X, ground, *data)
             A = A.flatten(2)
         wA = w[..., None] * A
         wC = w[..., None] * C
         wr = (w * r)[..., None]
-        found = Normal(
+        result = Normal(
             cost=cost,
             g=(A.mT @ wr)[..., 0],
             W=A.mT @ wA,
             near=A.new_zeros(2, F, A.shape[-1]),
             cross=A.mT @ wC,
-            slope=(C.mT @ wr).sum(0)[..., 0],
-            common=(C.mT @ wC).sum(0),
+            g_ground=(C.mT @ wr).sum(0)[..., 0],
+            W_ground=(C.mT @ wC).sum(0),
         )
         if self.smooth:
-            step = seen.time.diff()
-            before = step[:-1]
-            after = step[1:]
-            c = torch.stack([1 / before, -1 / before - 1 / after, 1 / after])
-            w = (before + after < GAP) * (before + after) * ACCELERATIONS
-            found.add_motion(
-                X, c * 2 / (before + after) / ACCELERATION, w[:, None].expand(-1, 33)
-            )
-            w = torch.zeros_like(seen.weight[1:])
-            w[:, FEET] = self.standing[:-1] * self.standing[1:] * (step < GAP)[:, None]
-            found.add_motion(X, torch.stack([-1 / step, 1 / step]) / SLIDING, w)
-        return found
+            self._add_smoothness(result, X)
+        return result
+
+    def _add_smoothness(self, terms: Normal, X: Tensor) -> None:
+        """Adds accelerations of all landmarks, and speeds of standing feet."""
+        step = self.seen.time.diff()
+
+        # second differences over uneven steps
+        before = step[:-1]
+        after = step[1:]
+        both = before + after
+        stencil = torch.stack([1 / before, -1 / before - 1 / after, 1 / after])
+        weight = (both < GAP) * both * ACCELERATIONS
+        terms.add_motion(
+            X,
+            stencil * 2 / both / ACCELERATION,
+            weight[:, None].expand(-1, 33),
+        )
+
+        # first differences
+        stencil = torch.stack([-1 / step, 1 / step])
+        weight = torch.zeros_like(self.seen.weight[1:])
+        stays = self.standing[:-1] * self.standing[1:]
+        weight[:, FEET] = stays * (step < GAP)[:, None]
+        terms.add_motion(X, stencil / SLIDING, weight)
 
     def cost(self, at: State) -> Tensor:
         """The whole cost."""
-        solver = self.solver(at.common)
-        found = self.terms(self.landmarks(at, solver), at.common[:OWN], linear=False)
+        solver = self.solver(at.shared)
+        X = self.landmarks(at, solver)
+        found = self.terms(X, at.shared[:PLANE], linear=False)
         stop, amount = below_least(at.q, solver.least)
         pull = ((at.q @ solver.prior) * at.q).sum() + (stop * amount.square()).sum()
-        pull = pull + self.too_large(at.common[OWN:]).square()
-        return found.cost + (pull + (self.prior * at.common.square()).sum())
+        pull = pull + self.too_large(at.shared[PLANE:]).square()
+        return found.cost + (pull + (self.prior * at.shared.square()).sum())
 
     def step(self, at: State, damping: float) -> State:
-        """One step."""
-        solver = self.solver(at.common)
-        linear = solver.linear(at.q, at.root, torch.zeros_like(self.seen.world))
-        found = self.terms(linear.residual, at.common[:OWN])
-        J = linear.by_number.flatten(2).mT  # [F, 99, D]
-        F, N, D = J.shape
-        G = J.new_zeros(F, N, len(at.common))
-        if self.free[-1]:
-            G[..., OWN:] = self._by_shape(at, solver).flatten(1, 2)
-        # the chain rule
-        stop, amount = below_least(at.q, solver.least)
-        H = J.mT @ (found.W @ J) + solver.prior + torch.diag_embed(stop + FLOOR)
-        g = (J.mT @ found.g[..., None])[..., 0] + at.q @ solver.prior + stop * amount
-        near = found.near.unsqueeze(-1)
-        beside = [
-            J[k + 1 :].mT @ (near[k, : F - k - 1] * J[: F - k - 1]) for k in (0, 1)
-        ]
-        WG = found.W @ G
-        for k in (1, 2):
-            WG[: F - k] += near[k - 1, : F - k] * G[k:]
-            WG[k:] += near[k - 1, : F - k] * G[: F - k]
-        cross = J.mT @ WG
-        cross[..., :OWN] += J.mT @ found.cross
-        common = torch.einsum("fni,fnj->ij", G, WG) + self.prior.diag()
-        by_own = torch.einsum("fni,fnj->ij", G, found.cross)
-        common[:, :OWN] += by_own
-        common[:OWN] += by_own.mT
-        common[:OWN, :OWN] += found.common
-        slope = torch.einsum("fni,fn->i", G, found.g) + self.prior * at.common
-        slope[:OWN] += found.slope
-        size = torch.func.jacfwd(self.too_large)(at.common[OWN:])
-        common[OWN:, OWN:] += torch.outer(size, size)
-        slope[OWN:] += size * self.too_large(at.common[OWN:])
-        cross[..., ~self.free] = 0
-        common[~self.free] = 0
-        common[:, ~self.free] = 0
-        common += torch.diag((~self.free).to(J))
-        slope[~self.free] = 0
-        # elimination of the poses
+        """One damped Gauss-Newton step: see the top of this module."""
+        blocks = self._blocks(at)
+        F, D = blocks.g_pose.shape
+
+        # the inverse of H_pose_pose times [H_pose_shared, g_pose]
+        H = blocks.pose_pose
         H = H + torch.diag_embed(damping * torch.diagonal(H, dim1=-2, dim2=-1))
-        right = torch.cat([cross, g[..., None]], dim=-1).reshape(F * D, -1)
-        inner = _banded(H, beside, right) if self.smooth else _blocks(H, right)
-        flat = right[:, :-1].mT
-        S = common - flat @ inner[:, :-1]
-        c = torch.linalg.solve(
-            S + damping * common.diag().diag(), flat @ inner[:, -1] - slope
+        columns = torch.cat([blocks.pose_shared, blocks.g_pose[..., None]], dim=-1)
+        columns = columns.reshape(F * D, -1)
+        if self.smooth:
+            solved = _solve_banded(H, blocks.below, columns)
+        else:
+            solved = _solve_diagonal(H, columns)
+
+        # the numbers that all frames share, by the Schur complement
+        shared_pose = columns[:, :-1].mT
+        S = blocks.shared_shared - shared_pose @ solved[:, :-1]
+        ds = torch.linalg.solve(
+            S + damping * blocks.shared_shared.diag().diag(),
+            shared_pose @ solved[:, -1] - blocks.g_shared,
         )
-        dq = -(inner[:, -1] + inner[:, :-1] @ c).view(F, D)
+
+        # The poses; the root's rotation is a matrix that takes up the first three numbers.
+        dq = -(solved[:, -1] + solved[:, :-1] @ ds).view(F, D)
         q = at.q + dq
         root = axis_angle_to_matrix(dq[:, :3]) @ at.root
         q[:, :3] = 0
-        return State(q, root, at.common + c)
+        return State(q, root, at.shared + ds)
+
+    def _blocks(self, at: State) -> Blocks:
+        """The normal equations by poses and shared numbers, without damping."""
+        solver = self.solver(at.shared)
+        linear = solver.linear(at.q, at.root, torch.zeros_like(self.seen.world))
+        found = self.terms(linear.residual, at.shared[:PLANE])
+        J = linear.by_number.flatten(2).mT  # [F, 99, D]
+        F, N, _ = J.shape
+        G = J.new_zeros(F, N, len(at.shared))
+        if self.free[-1]:
+            G[..., PLANE:] = self._by_shape(at, solver).flatten(1, 2)
+
+        # poses: the landmarks by the chain rule, the prior and the joints' limits
+        stop, amount = below_least(at.q, solver.least)
+        pose_pose = J.mT @ (found.W @ J) + solver.prior
+        pose_pose = pose_pose + torch.diag_embed(stop + FLOOR)
+        g_pose = (J.mT @ found.g[..., None])[..., 0]
+        g_pose = g_pose + at.q @ solver.prior + stop * amount
+
+        # the coupling with the first and the second later frame
+        near = found.near.unsqueeze(-1)
+        WG = found.W @ G
+        below = []
+        for k in (1, 2):
+            coupling = near[k - 1, : F - k]
+            below.append(J[k:].mT @ (coupling * J[: F - k]))
+            WG[: F - k] += coupling * G[k:]
+            WG[k:] += coupling * G[: F - k]
+
+        # poses and shared numbers; the ground moves no landmark, but its residuals
+        pose_shared = J.mT @ WG
+        pose_shared[..., :PLANE] += J.mT @ found.cross
+
+        # shared numbers: by landmarks, by the ground, and by the person's size
+        shared_shared = torch.einsum("fni,fnj->ij", G, WG) + self.prior.diag()
+        by_ground = torch.einsum("fni,fnj->ij", G, found.cross)
+        shared_shared[:, :PLANE] += by_ground
+        shared_shared[:PLANE] += by_ground.mT
+        shared_shared[:PLANE, :PLANE] += found.W_ground
+        g_shared = torch.einsum("fni,fn->i", G, found.g) + self.prior * at.shared
+        g_shared[:PLANE] += found.g_ground
+        size = torch.func.jacfwd(self.too_large)(at.shared[PLANE:])
+        shared_shared[PLANE:, PLANE:] += torch.outer(size, size)
+        g_shared[PLANE:] += size * self.too_large(at.shared[PLANE:])
+
+        # numbers that are not free stay as they are
+        fixed = ~self.free
+        pose_shared[..., fixed] = 0
+        shared_shared[fixed] = 0
+        shared_shared[:, fixed] = 0
+        shared_shared += torch.diag(fixed.to(J))
+        g_shared[fixed] = 0
+
+        return Blocks(
+            pose_pose=pose_pose,
+            below=below,
+            pose_shared=pose_shared,
+            shared_shared=shared_shared,
+            g_pose=g_pose,
+            g_shared=g_shared,
+        )
 
     def _by_shape(self, at: State, solver: Solver) -> Tensor:
-        """``[F, 33, 3, S]``: a landmark moves by its own move and those of the joints before it."""
+        """Derivatives ``[F, 33, 3, S]`` of the landmarks by the shape.
+
+        A landmark moves by its own move at rest and by those of the joints before it.
+        """
 
         def rest(x: Tensor) -> Tensor:
             body = self.space.shaped(shape_of(self.space, x))
             return torch.cat([body.joints[solver.joint], body.landmarks.nan_to_num()])
 
-        moves = torch.func.jacfwd(rest)(at.common[OWN:])  # [T + 33, 3, S]
-        R = solver.transforms(at.q, at.root, solver.joints)[..., :3, :3]
+        moves = torch.func.jacfwd(rest)(at.shared[PLANE:])  # [T + 33, 3, S]
         T = len(solver.joint)
-        before = (R[:, solver.before] - R[:, :T]) @ moves[:T]  # [F, T, 3, S]
+        of_joints = moves[:T]
+        of_landmarks = moves[T:]
+
+        transforms = solver.transforms(at.q, at.root, solver.joints)
+        R = transforms[..., :3, :3]
+        before = (R[:, solver.before] - R[:, :T]) @ of_joints  # [F, T, 3, S]
         follows = ancestors(solver.rig.parent)[solver.carrier].to(R)
-        return (
-            torch.einsum("nt,ftis->fnis", follows, before)
-            + R[:, solver.carrier] @ moves[T:]
-        )
+        carried = torch.einsum("nt,ftis->fnis", follows, before)
+        return carried + R[:, solver.carrier] @ of_landmarks
 
     def minimise(self, at: State, steps: int = STEPS) -> tuple[State, float]:
         """The solution, and its cost."""
@@ -471,7 +614,7 @@ class Problem:
             if gain > 0:
                 at = new
                 best = cost
-                damping = damping * EASIER
+                damping *= EASIER
             else:
                 damping *= HARDER
             if abs(gain) < SETTLED or damping > 1e6:
@@ -479,37 +622,42 @@ class Problem:
         return at, float(best)
 
     def standing_feet(self) -> Tensor:
-        """``[F, 4]`` 1 where `FEET` hardly move across the image: they stand."""
+        """``[F, 4]`` 1 for those of `FEET` that stand: they hardly move across the image."""
         state = self.start()
-        depth = self.landmarks(state, self.solver(state.common))[:, FEET, 2].clamp_min(
-            NEAR
-        )
+        p = self.landmarks(state, self.solver(state.shared))
+        depth = p[:, FEET, 2].clamp_min(NEAR)
         step = self.seen.time.diff()[:, None]
-        speed = self.seen.u[:, FEET].diff(dim=0).norm(dim=-1) * depth[1:] / step
+        moved = self.seen.u[:, FEET].diff(dim=0).norm(dim=-1)
+        speed = moved * depth[1:] / step
+
+        # A foot stands if it is slow both before and after the frame.
         slow = (speed < STILL) & (step < GAP)
         none = torch.zeros_like(slow[:1])
         standing = torch.cat([slow, none]) & torch.cat([none, slow])
-        return (standing & (self.seen.weight[:, FEET] > 0)).to(depth)
+        visible = self.seen.weight[:, FEET] > 0
+        return (standing & visible).to(depth)
 
     def errors(self, at: State) -> tuple[Tensor, Tensor]:
         """Landmarks ``[F, 33, 3]`` and their reprojection errors ``[F, 33]``, NaN = not seen."""
-        X = self.landmarks(at, self.solver(at.common))
-        shown = self.zoom * X[..., :2] / X[..., 2:].clamp_min(NEAR)
-        off = (shown - self.seen.u).norm(dim=-1)
-        return X, torch.where(self.seen.weight > 0, off, torch.nan)
+        X = self.landmarks(at, self.solver(at.shared))
+        projected = self.zoom * X[..., :2] / X[..., 2:].clamp_min(NEAR)
+        error = (projected - self.seen.u).norm(dim=-1)
+        return X, torch.where(self.seen.weight > 0, error, torch.nan)
 
 
 def _best_zoom(costs: Float) -> tuple[float, float]:
-    """The best of `ZOOMS` and its standard deviation, by a parabola through the costs of both ways
-    near the least."""
-    cost = (
-        np.minimum(costs[: len(ZOOMS)][::-1], costs[len(ZOOMS) :])
-        + (ZOOMS / FOCAL_SPREAD) ** 2
-    )
+    """The best of `ZOOMS` and its standard deviation.
+
+    A parabola is fitted to the lower cost of both ways, near its minimum.
+    """
+    there = costs[: len(ZOOMS)][::-1]
+    back = costs[len(ZOOMS) :]
+    cost = np.minimum(there, back) + (ZOOMS / FOCAL_SPREAD) ** 2
     best = int(np.clip(cost.argmin(), NEAREST, len(ZOOMS) - 1 - NEAREST))
     near = slice(best - NEAREST, best + NEAREST + 1)
     a, b, _ = np.polyfit(ZOOMS[near], cost[near], 2)
-    return float(np.clip(-b / (2 * a), ZOOMS[0], ZOOMS[-1])), float(max(a, 1.0) ** -0.5)
+    zoom = float(np.clip(-b / (2 * a), ZOOMS[0], ZOOMS[-1]))
+    return zoom, float(max(a, 1.0) ** -0.5)
 
 
 def _log_size(p: Tensor) -> Tensor:
@@ -517,22 +665,23 @@ def _log_size(p: Tensor) -> Tensor:
     return (p - p.nanmean(0)).square().nanmean().log() / 2
 
 
-def _blocks(H: Tensor, right: Tensor) -> Tensor:
+def _solve_diagonal(H: Tensor, right: Tensor) -> Tensor:
     """Solves the equations with diagonal blocks ``H [F, D, D]``."""
     F, D, _ = H.shape
-    return torch.cholesky_solve(right.view(F, D, -1), torch.linalg.cholesky(H)).reshape(
-        F * D, -1
-    )
+    factor = torch.linalg.cholesky(H)
+    solution = torch.cholesky_solve(right.view(F, D, -1), factor)
+    return solution.reshape(F * D, -1)
 
 
-def _banded(H: Tensor, beside: list[Tensor], right: Tensor) -> Tensor:
-    """Solves the equations with diagonal blocks ``H [F, D, D]`` and those one and two below."""
+def _solve_banded(H: Tensor, below: list[Tensor], right: Tensor) -> Tensor:
+    """Solves the equations with diagonal blocks ``H [F, D, D]`` and the blocks below them."""
     F, D, _ = H.shape
+    row, column = np.indices((D, D)).reshape(2, -1)
     band = np.zeros((3 * D, F * D))
-    a, b = (x.ravel() for x in np.meshgrid(np.arange(D), np.arange(D), indexing="ij"))
-    for k, block in enumerate([H, *beside]):
-        row = k * D + a - b
-        values = block.reshape(len(block), -1).numpy()
-        for f in range(len(block)):
-            band[row[row >= 0], (f * D + b)[row >= 0]] = values[f][row >= 0]
+    for k, block in enumerate([H, *below]):
+        # Entry (i, j) of the lower triangle is at (i - j, j) of the band.
+        band_row = k * D + row - column
+        stored = band_row >= 0
+        for f, values in enumerate(block.flatten(1).numpy()):
+            band[band_row[stored], f * D + column[stored]] = values[stored]
     return torch.from_numpy(solveh_banded(band, right.numpy(), lower=True))

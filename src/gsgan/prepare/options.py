@@ -22,7 +22,7 @@ from gsgan.utils.errors import ConfigError, DataError
 
 MEDIAPIPE = "mediapipe"
 AXES = ("x", "y", "z", "-x", "-y", "-z")
-# do not change the dataset
+# options that do not change the dataset
 FREE = ("out", "setup", "workers", "overwrite", "keep_work")
 
 
@@ -73,12 +73,13 @@ class Options:
     format: str = "jpg"
 
     def __post_init__(self) -> None:
-        for name, what in (
-            ("source", "folder with the videos, or one video"),
-            ("out", "folder to make"),
-        ):
-            if not getattr(self, name):
-                raise ConfigError(f"give {name}=<{what}>")
+        # what must be given
+        if not self.source:
+            raise ConfigError("give source=<folder with the videos, or one video>")
+        if not self.out:
+            raise ConfigError("give out=<folder to make>")
+
+        # values of each key
         for name, choices in (("unit", UNITS), ("up_axis", AXES)):
             if getattr(self, name) is not None:
                 one_of(name, getattr(self, name), choices)
@@ -93,10 +94,8 @@ class Options:
         whole("workers", self.workers, 1)
         above("scale", between("scale", self.scale, 0, 1))
         one_of("format", self.format, ("jpg", "png"))
-        if (
-            len(self.mask_levels) != 2
-            or not 0 <= self.mask_levels[0] < self.mask_levels[1] <= 1
-        ):
+        levels = self.mask_levels
+        if len(levels) != 2 or not 0 <= levels[0] < levels[1] <= 1:
             raise ConfigError(
                 f"mask_levels must rise within 0..1, got {self.mask_levels}"
             )
@@ -130,7 +129,7 @@ class Options:
         return {key: value for key, value in asdict(self).items() if key not in FREE}
 
     def folder(self, name: str) -> Path:
-        """A key that holds a path."""
+        """The path that a key holds."""
         return Path(str(getattr(self, name))).expanduser().absolute()
 
 
@@ -155,33 +154,42 @@ def read_inputs(options: Options) -> Inputs:
     """
     folder = options.folder("source")
     sources = find_sources(folder, options.apply_rotation)
-    if unknown := sorted(set(options.offsets or {}) - set(sources)):
+    unknown = sorted(set(options.offsets or {}) - set(sources))
+    if unknown:
         raise ConfigError(
             f"offsets name {unknown[0]}, but the videos are {', '.join(sources)}"
         )
+
+    # the calibration, in a file that is given or found
     path = folder if options.calibration is None else options.folder("calibration")
     if path.is_dir():
         path = find_calibration(path)
-    # None: the format's own
+    # None stands for the format's own unit.
     scale = None if options.unit is None else UNITS[options.unit]
     calibration = read_calibration(path, scale, options.pixel_centre)
-    notes = list(calibration.notes)
-    cameras = []
     if len(sources) < MIN_VIEWS:
         raise DataError(
             f"{folder} holds only the camera {next(iter(sources), 'none')}; 3D needs two"
         )
+
+    # the cameras in the order of the sources, with a note on each difference
     pairs = pair_cameras(
         list(sources), list(calibration.cameras), options.cameras or {}
     )
+    notes = list(calibration.notes)
+    cameras = []
     for name, source in sources.items():
         camera = calibration.cameras[pairs[name]]
         fitted, note = fit_size(camera, name, source.size, options.crop_px, path)
         cameras.append(fitted)
-        notes += [] if note is None else [note]
-    if unused := sorted(set(calibration.cameras) - set(pairs.values())):
+        if note is not None:
+            notes.append(note)
+    unused = sorted(set(calibration.cameras) - set(pairs.values()))
+    if unused:
         notes.append(f"calibrated without a video, left out: {', '.join(unused)}")
     notes += recording_notes(sources)
+
+    # the median of the videos' rates, if none is given
     rates = sorted(source.fps for source in sources.values() if source.fps)
     if options.fps is None and not rates:
         raise ConfigError("images have no frame rate; give fps=<frames per second>")

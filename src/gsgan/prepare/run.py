@@ -32,9 +32,8 @@ from gsgan.utils.arrays import Float, Ints
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import write_json
 
-# frames, and share of the error that correcting them must remove
-DELAY = 0.5
-DELAY_GAIN = 0.05
+DELAY = 0.5  # frames: larger delays of a clock are noted
+DELAY_GAIN = 0.05  # share of the error that correcting a delay must remove
 
 
 def summarise(outcome: Outcome) -> dict[str, Any]:
@@ -42,86 +41,97 @@ def summarise(outcome: Outcome) -> dict[str, Any]:
     inputs = outcome.inputs
     solution = outcome.solution
     turned, moved = camera_moves(CameraArray.of(inputs.cameras), solution.cameras)
-    cameras = {
-        name: {
-            "error_px": {
-                stage: median(error[c]) for stage, error in solution.stages.items()
-            },
+    cameras = {}
+    for c, name in enumerate(inputs.sources):
+        error = solution.error[c]
+        by_stage = {stage: median(px[c]) for stage, px in solution.stages.items()}
+        cameras[name] = {
+            "error_px": by_stage,
             "turned_degrees": float(turned[c]),
             "moved_mm": float(moved[c]),
             "flipped_share": float(solution.swapped[c].mean()),
-            "hands_px": median(solution.error[c][:, HANDS]),
+            "hands_px": median(error[:, HANDS]),
             "hands_swapped": int(solution.swapped_hands[c].sum()),
-            "face_px": median(solution.error[c][:, FACE]),
+            "face_px": median(error[:, FACE]),
             "delay_frames": float(solution.delay[c]),
-            "frames_with_person": int(np.isfinite(solution.error[c]).any(-1).sum()),
+            "frames_with_person": int(np.isfinite(error).any(-1).sum()),
             "frames_written": len(outcome.written[name]),
         }
-        for c, name in enumerate(inputs.sources)
-    }
+
+    # frames without an image of any camera
+    kept = set().union(*outcome.written.values())
+    frames = outcome.frames.tolist()
+    dropped = [frame for frame in frames if frame not in kept]
+
     found = known(solution.p[:, :BODY]).mean(0)
-    kept = {frame for one in outcome.written.values() for frame in one}
     return {
-        "error_px": {stage: median(error) for stage, error in solution.stages.items()},
+        "error_px": {stage: median(px) for stage, px in solution.stages.items()},
         "cameras": cameras,
         "joints_found": dict(zip(MEDIAPIPE33.names, found.tolist(), strict=True)),
         "joints_removed": solution.removed,
-        "frames": len(outcome.frames),
-        "frames_dropped": [
-            frame for frame in outcome.frames.tolist() if frame not in kept
-        ],
+        "frames": len(frames),
+        "frames_dropped": dropped,
         "fps": inputs.fps,
         "calibration": {
             "file": inputs.calibration.path.name,
             "format": inputs.calibration.format,
         },
-        "notes": [*inputs.notes, *_late_clocks(outcome.solution, inputs.sources)],
+        "notes": [*inputs.notes, *_late_clocks(solution, inputs.sources)],
         "settings": outcome.options.record(),
     }
 
 
 def _late_clocks(solution: Solution, names: Iterable[str]) -> list[str]:
-    found = []
-    for c, name in enumerate(names):
-        if abs(delay := solution.delay[c]) > DELAY and solution.gain[c] > DELAY_GAIN:
+    notes = []
+    for name, delay, gain in zip(names, solution.delay, solution.gain, strict=True):
+        if abs(delay) > DELAY and gain > DELAY_GAIN:
             text = f"its clock seems {delay:+.1f} frames late; if so, set offsets="
-            found.append(f"{name}: {text}{{{name}: {round(delay)}}}")
-    return found
+            notes.append(f"{name}: {text}{{{name}: {round(delay)}}}")
+    return notes
 
 
 def print_summary(numbers: Mapping[str, Any], console: Console) -> None:
     """Prints the numbers of the cameras and the notes."""
     stages = numbers["error_px"]
     cameras = numbers["cameras"]
-    rows = [
-        (
-            name,
-            *(_number(error, ".2f") for error in one["error_px"].values()),
-            f"{one['turned_degrees']:.2f}°",
-            f"{one['moved_mm']:.0f} mm",
-            f"{one['flipped_share']:.0%}",
-            _number(one["delay_frames"], "+.2f"),
-            str(one["frames_written"]),
+
+    # a row for each camera, and one for all
+    rows: list[tuple[str, ...]] = []
+    for name, camera in cameras.items():
+        errors = [_number(error, ".2f") for error in camera["error_px"].values()]
+        rows.append(
+            (
+                name,
+                *errors,
+                f"{camera['turned_degrees']:.2f}°",
+                f"{camera['moved_mm']:.0f} mm",
+                f"{camera['flipped_share']:.0%}",
+                _number(camera["delay_frames"], "+.2f"),
+                str(camera["frames_written"]),
+            )
         )
-        for name, one in cameras.items()
-    ]
-    rows.append(("all", *(_number(error, ".2f") for error in stages.values())))
+    errors = [_number(error, ".2f") for error in stages.values()]
+    rows.append(("all", *errors))
     headers = ("camera", *stages, "turned", "moved", "swapped", "late", "images")
     title = (
         "Median error in pixels by stage; refinement, swapped sides, frames that clocks "
         "are late"
     )
     console.print(Table(headers, tuple(rows)).for_terminal(title))
+
+    # the notes, a line each
     notes = [
         *numbers["notes"],
         f"{numbers['frames']} frames at {numbers['fps']:g} per second",
     ]
-    if dropped := numbers["frames_dropped"]:
+    dropped = numbers["frames_dropped"]
+    if dropped:
         notes.append(f"{len(dropped)} frames were dropped: no skeleton or no mask")
     console.print("\n".join(notes), markup=False, highlight=False)
 
 
 def _number(value: float, form: str) -> str:
+    """The number as text; "-" for NaN."""
     return "-" if np.isnan(value) else format(value, form)
 
 
@@ -135,7 +145,8 @@ def prepare(options: Options, console: Console) -> Path:
         Its folder.
 
     Raises:
-        GsganError: on anything the user can correct, also what the check of the dataset finds.
+        GsganError: on anything the user can correct, also errors that the check of the dataset
+            finds.
     """
     out = options.folder("out")
     inputs = None if options.one_camera else read_inputs(options)
@@ -146,6 +157,8 @@ def prepare(options: Options, console: Console) -> Path:
             check_capture(out, out / "check.html", console)
         _refuse_errors(out)
         return out
+
+    # joints, cameras and masks, from one camera or from several
     stages = StageFolder(out.parent / f".{out.name}.prepare")
     extra: dict[str, object] = {}
     if inputs is None:
@@ -158,8 +171,12 @@ def prepare(options: Options, console: Console) -> Path:
         options = replace(options, face=False)
     else:
         found, masks = find_people(options, inputs.sources, stages, console.print)
-        detections = {n: landmarks.read_detections(found[n]) for n in inputs.sources}
+        detections = {}
+        for name in inputs.sources:
+            detections[name] = landmarks.read_detections(found[name])
         frames, solution = _solved(options, inputs, detections, console)
+
+    # the dataset, in a folder of its own until it is complete
     root = stages.path("dataset", key)
     shutil.rmtree(root, ignore_errors=True)  # of a run that was killed
     written = _write_images(options, inputs, masks, frames, solution, root)
@@ -171,6 +188,8 @@ def prepare(options: Options, console: Console) -> Path:
     stages.remove_others()
     if not options.keep_work:
         shutil.rmtree(stages.folder, ignore_errors=True)
+
+    # the check, and what to do next
     check_capture(out, out / "check.html", console)
     print_summary(numbers, console)
     _refuse_errors(out)
@@ -186,9 +205,10 @@ def prepare(options: Options, console: Console) -> Path:
 def _refuse_errors(out: Path) -> None:
     """Raises a DataError if the check of the dataset, in its check.json, has found errors."""
     findings = read_json(out / "check.json")["findings"]
-    errors = [
-        finding["sentence"] for finding in findings if finding["level"] == "error"
-    ]
+    errors = []
+    for finding in findings:
+        if finding["level"] == "error":
+            errors.append(finding["sentence"])
     if errors:
         raise DataError(
             f"{out} was written, but its check has found errors: {'; '.join(errors)}; correct the "
@@ -197,18 +217,21 @@ def _refuse_errors(out: Path) -> None:
 
 
 def _fingerprint(options: Options, inputs: Inputs | None) -> list[object]:
-    """Everything that is read: images, calibration, landmark and mask files, the tool."""
+    """The identity of all inputs: images, calibration, landmark and mask files, the tool."""
     parts: list[object] = [stamp(options.folder("source"))]
     if inputs is not None:
         parts = [source.fingerprint() for source in inputs.sources.values()]
-        parts += [inputs.calibration.path.name, *(str(c) for c in inputs.cameras)]
+        parts.append(inputs.calibration.path.name)
+        parts += [str(camera) for camera in inputs.cameras]
+
+    # given files; the tool's results depend on the images and the tool
     for name in ("landmarks", "masks"):
         if getattr(options, name) != MEDIAPIPE:
             place = options.folder(name)
-            parts += [
-                stamp(p) for p in sorted((place, *place.rglob("*"))) if p.is_file()
-            ]
-    return [*parts, tool_key() if options.needs_tool else None]
+            paths = sorted((place, *place.rglob("*")))
+            parts += [stamp(path) for path in paths if path.is_file()]
+    parts.append(tool_key() if options.needs_tool else None)
+    return parts
 
 
 def _solved(
@@ -218,6 +241,7 @@ def _solved(
     console: Console,
 ) -> tuple[Ints, Solution]:
     """The joints and cameras that fit the 2D landmarks of the chosen frames."""
+    # the detections of the chosen frames and joints, inside their images
     frames, px, conf = landmarks.gather(detections, options.offsets or {})
     chosen = np.ones(len(frames), bool)
     if options.frames is not None:
@@ -230,17 +254,20 @@ def _solved(
     frames = frames[chosen]
     px = px[:, chosen, joints]
     conf = conf[:, chosen, joints]
-    for part, wanted in ((HANDS, options.hands), (FACE, options.face)):
-        conf[:, :, part] *= wanted
-    px, conf = landmarks.inside(
-        px, conf, np.array([c.size[::-1] for c in inputs.cameras])
-    )
+    conf[:, :, HANDS] *= options.hands
+    conf[:, :, FACE] *= options.face
+    sizes = np.array([camera.size[::-1] for camera in inputs.cameras])
+    px, conf = landmarks.inside(px, conf, sizes)
+
+    # without lens distortion
+    uv = np.empty(px.shape)
+    for c, camera in enumerate(inputs.cameras):
+        uv[c] = undistort_points(camera, px[c])
+
     cameras = CameraArray.of(inputs.cameras)
-    uv = np.stack(
-        [undistort_points(c, p) for c, p in zip(inputs.cameras, px, strict=True)]
-    )
-    flat = uv.reshape(len(cameras), -1, 2), conf.reshape(len(cameras), -1)
-    _check_distance(inputs, plain(cameras, *flat))
+    C = len(cameras)
+    p = plain(cameras, uv.reshape(C, -1, 2), conf.reshape(C, -1))
+    _check_distance(inputs, p)
     with console.status("finding 3D joints and refining the cameras"):
         return frames, solve(cameras, frames / inputs.fps, uv, conf, options.solve)
 
@@ -266,6 +293,7 @@ def _write_images(
     root: Path,
 ) -> dict[str, list[int]]:
     """Writes the images of every frame that has a skeleton."""
+    # Frames without a joint of the body are left out.
     posed = set(frames[known(solution.p[:, :BODY]).any(1)].tolist())
     if not posed:
         raise DataError(
@@ -276,15 +304,17 @@ def _write_images(
     offsets = options.offsets or {}
 
     def one(name: str, advance: Advance) -> list[int]:
-        given = (
-            cameras[name],
-            inputs.sources[name],
-            masks[name],
-            posed,
-            offsets.get(name, 0),
-        )
         return write_images(
-            root, *given, options.scale, options.format, options.mask_levels, advance
+            root=root,
+            camera=cameras[name],
+            source=inputs.sources[name],
+            masks=masks[name],
+            frames=posed,
+            offset=offsets.get(name, 0),
+            scale=options.scale,
+            suffix=options.format,
+            levels=options.mask_levels,
+            advance=advance,
         )
 
     return each_camera(one, "writing images", list(cameras), options.workers)

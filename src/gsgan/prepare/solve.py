@@ -22,13 +22,15 @@ from gsgan.utils.arrays import Bool, Float, Ints, evenly_spaced, nanmedian
 from gsgan.utils.checks import above, at_least, whole
 
 # Errors and distances are in thousandths of the focal length.
-WRIST = 40.0  # distance from the pose's wrist at which it counts half
-MAX_ERROR = 20.0  # median error beyond which a detected hand is left out
+WRIST = 40.0  # distance from the pose's wrist at which a hand counts half
+MAX_ERROR = 20.0  # maximum median error of a detected hand
 OWN_PAIRS = tuple((j, j + HAND) for j in range(len(HAND_PAIRS)))
+REFINED = 200  # maximum number of frames that refine the cameras, evenly spaced
+LAG = 6  # frames by which clocks are compared, either way
 
 
 def match_hands(cameras: CameraArray, uv: Float, weight: Float, wrists: Float) -> Bool:
-    """``[C, F]`` in which camera and frame left and right hand are swapped.
+    """The cameras and frames ``[C, F]`` in which left and right hand are swapped.
 
     Each view starts with the assignment whose hands are nearer to the wrists of the pose; then one
     camera at a time is changed as long as distances to the wrists and errors of triangulated hands
@@ -37,46 +39,48 @@ def match_hands(cameras: CameraArray, uv: Float, weight: Float, wrists: Float) -
 
     Args:
         cameras: ``C`` cameras.
-        uv, weight: ``[C, F, 42, 2]`` undistorted pixels, the left hand's first, NaN = not seen, and
-            their confidence.
-        wrists: ``[C, F, 2, 2]`` where the pose's wrists are in each view; NaN = unknown.
+        cameras: ``C`` cameras.
+        uv: ``[C, F, 42, 2]`` undistorted pixels, the left hand's first, NaN = not seen.
+        weight: ``[C, F, 42]`` their confidence.
+        wrists: ``[C, F, 2, 2]`` the pose's wrists in each view; NaN = unknown.
     """
-    roots = uv.reshape(*uv.shape[:2], 2, HAND, -1)[:, :, :, 0]
-    certain = weight.reshape(*weight.shape[:2], 2, HAND, -1)[:, :, :, 0]
+    C, F, _ = weight.shape
+    roots = uv.reshape(C, F, 2, HAND, 2)[:, :, :, 0]
+    root_weight = weight.reshape(C, F, 2, HAND, 1)[:, :, :, 0]
     # [C, F, hand, wrist]
-    off = np.linalg.norm(roots[:, :, :, None] - wrists[:, :, None], axis=-1)
-    # A hand is left out where one wrist is unknown: its distances cannot be compared.
-    known = np.isfinite(off).all(-1, keepdims=True)
-    loss = np.where(known, HAND * certain * np.log1p((off / WRIST) ** 2), 0.0)
+    distance = np.linalg.norm(roots[:, :, :, None] - wrists[:, :, None], axis=-1)
+
+    # A hand is left out if one wrist is unknown: its distances cannot be compared.
+    known = np.isfinite(distance).all(-1, keepdims=True)
+    loss = HAND * root_weight * np.log1p((distance / WRIST) ** 2)
+    loss = np.where(known, loss, 0.0)
     kept = loss[..., 0, 0] + loss[..., 1, 1]
     swapped = loss[..., 0, 1] + loss[..., 1, 0]
 
     def cost_of(flips: Bool, at: Ints) -> Float:
         sided = apply_flips(uv[:, at], flips[..., None], [OWN_PAIRS])
         seen = apply_flips(weight[:, at], flips[..., None], [OWN_PAIRS])
-        far = np.where(flips, swapped[:, at], kept[:, at]).sum(0)
-        return np.asarray(points_and_cost(cameras, sided, seen)[1] + far)
+        from_wrists = np.where(flips, swapped[:, at], kept[:, at]).sum(0)
+        _, cost = points_and_cost(cameras, sided, seen)
+        return cost + from_wrists
 
     flips = cheapest_flips(cost_of, swapped < kept, FLIP_GAIN * weight.sum(-1))
-    everywhere = np.arange(flips.shape[1])
+    everywhere = np.arange(F)
     return flips ^ (cost_of(~flips, everywhere) < cost_of(flips, everywhere))
 
 
 def misfits(error: Float) -> Bool:
-    """``[C, F, 2]`` hands whose median of ``error [C, F, 42]`` is above `MAX_ERROR`.
+    """The hands ``[C, F, 2]`` whose median of ``error [C, F, 42]`` is above `MAX_ERROR`.
 
     They are another person's, something else, or the same hand detected twice.
     """
-    return nanmedian(error.reshape(*error.shape[:2], 2, HAND), -1) > MAX_ERROR
-
-
-REFINED = 200  # most frames that refine the cameras, evenly spaced
-LAG = 6  # frames by which clocks are compared, either way
+    by_hand = error.reshape(*error.shape[:2], 2, HAND)
+    return nanmedian(by_hand, -1) > MAX_ERROR
 
 
 @dataclass(frozen=True)
 class SolveSettings:
-    """What the solution depends on, see conf/prepare.yaml."""
+    """Settings of the solution, see conf/prepare.yaml."""
 
     min_confidence: float = 0.1
     refinements: int = 2
@@ -104,18 +108,18 @@ class Solution:
     flips: Bool
     left_out: Bool  # [C, F, 2] detected hands that are not the person's, or are repeats
     delay: Float  # [C] of each camera's clock, see `clock_errors`
-    gain: Float  # [C] the same
+    gain: Float  # [C] of correcting that clock
     stages: dict[str, Float]  # name of each stage and its body errors [C, F, 33]
     removed: dict[str, int]  # number of joints removed, by reason
 
     @property
     def swapped(self) -> Bool:
-        """``[C, F]`` where left and right of the body were swapped."""
+        """The frames ``[C, F]`` with left and right of the body swapped."""
         return np.asarray(self.flips[..., : len(FLIP_GROUPS)].any(-1))
 
     @property
     def swapped_hands(self) -> Bool:
-        """``[C, F]`` where the hands were swapped."""
+        """The frames ``[C, F]`` with the hands swapped."""
         return np.asarray(self.flips[..., len(FLIP_GROUPS) :].any(-1))
 
 
@@ -149,10 +153,12 @@ def solve(
     weight = np.where(conf > settings.min_confidence, conf, 0.0)
 
     # Triangulate as detected, then with left and right corrected.
-    detected = _flat(scaled), _flat(weight)
+    flat_uv = _flat(scaled)
+    flat_weight = _flat(weight)
+    linear = plain(cameras, flat_uv, flat_weight)
     stages = {
-        "plain": cameras.errors(plain(cameras, *detected), detected[0]),
-        "robust": robust(cameras, *detected).error,
+        "plain": cameras.errors(linear, flat_uv),
+        "robust": robust(cameras, flat_uv, flat_weight).error,
     }
     found = correct(cameras, scaled, weight)
     stages["flips"] = found.points.error
@@ -164,7 +170,14 @@ def solve(
     agreed = _mean_seen(found.points.weight.reshape(conf.shape), found.weight)
     p = smooth(p, agreed, time, settings.smoothing)
     error = cameras.errors(p.reshape(-1, 3), _flat(found.uv)).reshape(conf.shape)
-    stages["smoothed"] = error = np.where(found.weight > 0, error, np.nan)
+    error = np.where(found.weight > 0, error, np.nan)
+    stages["smoothed"] = error
+
+    # Errors by stage are those of the body, in pixels of each camera.
+    stages_in_pixels = {}
+    for name, values in stages.items():
+        of_body = values.reshape(conf.shape)[:, :, :BODY]
+        stages_in_pixels[name] = of_body * to_pixels
 
     delay, gain = clock_errors(
         cameras, found.uv[:, :, :BODY], found.weight[:, :, :BODY]
@@ -178,10 +191,7 @@ def solve(
         left_out=found.left_out,
         delay=delay,
         gain=gain,
-        stages={
-            name: one.reshape(conf.shape)[:, :, :BODY] * to_pixels
-            for name, one in stages.items()
-        },
+        stages=stages_in_pixels,
         removed=removed,
     )
 
@@ -194,13 +204,20 @@ def _refined(
     settings: SolveSettings,
 ) -> tuple[CameraArray, Corrected]:
     """Refines the cameras and triangulates again, in turn."""
-    cameras, (F, J) = start, weight.shape[1:]
+    cameras = start
+    F = weight.shape[1]
     at = np.array(evenly_spaced(F, REFINED, ends=True))
-    priors = settings.rotation_prior, settings.position_prior
     for _ in range(settings.refinements):
-        p = found.points.p.reshape(F, J, 3)[at].reshape(-1, 3)
-        some = _flat(found.uv[:, at]), _flat(found.weight[:, at])
-        cameras = refine_cameras(start, cameras, p, *some, *priors)
+        p = found.points.p.reshape(F, -1, 3)[at]
+        cameras = refine_cameras(
+            given=start,
+            start=cameras,
+            p=p.reshape(-1, 3),
+            uv=_flat(found.uv[:, at]),
+            weight=_flat(found.weight[:, at]),
+            rotation_prior=settings.rotation_prior,
+            position_prior=settings.position_prior,
+        )
         found = correct(cameras, uv, weight)
     return cameras, found
 
@@ -208,9 +225,12 @@ def _refined(
 def correct(cameras: CameraArray, uv: Float, conf: Float) -> Corrected:
     """Corrects swapped sides of body and hands, leaves strange hands out, and triangulates.
 
-    ``uv [C, F, J, 2]`` are in thousandths of the focal length, ``conf [C, F, J]`` is 0 where a
-    joint is not seen.
+    Args:
+        cameras: ``C`` cameras.
+        uv: ``[C, F, J, 2]`` thousandths of the focal length.
+        conf: ``[C, F, J]`` 0 = not seen.
     """
+    # the body
     flips = find_flips(cameras, uv, conf, FLIP_GROUPS)
     sided = apply_flips(uv, flips, FLIP_GROUPS)
     weight = apply_flips(conf, flips, FLIP_GROUPS)
@@ -219,46 +239,47 @@ def correct(cameras: CameraArray, uv: Float, conf: Float) -> Corrected:
         points = robust(cameras, _flat(sided), _flat(weight))
         return Corrected(sided, weight, flips, left_out, points)
 
-    # Where a camera does not see a wrist, the other cameras show where it is.
-    own = np.where(weight[..., WRISTS, None] > 0, sided[:, :, WRISTS], np.nan)
+    # If a camera does not see a wrist, the other cameras show where it is.
+    sees_wrist = weight[..., WRISTS, None] > 0
+    own = np.where(sees_wrist, sided[:, :, WRISTS], np.nan)
     arms = robust(cameras, _flat(own), _flat(weight[:, :, WRISTS]))
-    wrists = np.where(
-        np.isfinite(own), own, cameras.project(arms.p)[0].reshape(own.shape)
-    )
+    projected, _ = cameras.project(arms.p)
+    wrists = np.where(np.isfinite(own), own, projected.reshape(own.shape))
 
-    hands = sided[:, :, HANDS], weight[:, :, HANDS], wrists
-    swapped = match_hands(cameras, *hands)
-    sided = apply_flips(sided, swapped[..., None], [HAND_PAIRS])
-    weight = apply_flips(weight, swapped[..., None], [HAND_PAIRS])
+    # the hands: swapped sides, then hands that do not fit the others
+    swapped = match_hands(cameras, sided[:, :, HANDS], weight[:, :, HANDS], wrists)
+    swapped = swapped[..., None]
+    sided = apply_flips(sided, swapped, [HAND_PAIRS])
+    weight = apply_flips(weight, swapped, [HAND_PAIRS])
     points = robust(cameras, _flat(sided), _flat(weight))
     left_out = misfits(points.error.reshape(conf.shape)[:, :, HANDS])
     weight[:, :, HANDS] *= ~left_out.repeat(HAND, axis=-1)
     points = robust(cameras, _flat(sided), _flat(weight))
-    return Corrected(
-        sided, weight, np.dstack([flips, swapped[..., None]]), left_out, points
-    )
+    return Corrected(sided, weight, np.dstack([flips, swapped]), left_out, points)
 
 
 def _flat(values: Float) -> Float:
+    """Values ``[C, F, J, ...]`` as ``[C, F J, ...]``."""
     return values.reshape(values.shape[0], -1, *values.shape[3:])
 
 
 def _mean_seen(values: Float, weight: Float) -> Float:
-    """``[F, J]`` mean over the cameras that see a joint."""
+    """The mean ``[F, J]`` over the cameras that see a joint."""
     return np.asarray(values.sum(0) / np.maximum((weight > 0).sum(0), 1))
 
 
 def clock_errors(cameras: CameraArray, uv: Float, weight: Float) -> tuple[Float, Float]:
     """Each camera's delay against the others, and the gain of correcting it.
 
-    Convention: frames; with a positive delay the camera shows a later moment than the others at the
-    same number, so its numbers should grow by that much. Triangulated are triangulated without the
+    Delays are in frames; with a positive delay the camera shows a later moment than the others at
+    the same number, so its numbers should grow by that much. Joints are triangulated without the
     camera, so three cameras are needed; with two the delay is NaN. Between frames a parabola
     through the three best lags decides.
 
     Args:
         cameras: ``C`` cameras.
-        uv, weight: ``[C, F, J, 2]`` undistorted pixels and their confidence.
+        uv: ``[C, F, J, 2]`` undistorted pixels.
+        weight: ``[C, F, J]`` their confidence.
 
     Returns:
         ``delay [C]`` and ``gain [C]``, the share by which the median error falls.
@@ -272,11 +293,13 @@ def clock_errors(cameras: CameraArray, uv: Float, weight: Float) -> tuple[Float,
         return delay, gain
     for c in range(C):
         others = np.arange(C) != c
-        p = robust(cameras[others], _flat(uv[others]), _flat(weight[others])).p
-        expected = cameras.project(p)[0][c].reshape(uv.shape[1:])
+        points = robust(cameras[others], _flat(uv[others]), _flat(weight[others]))
+        projected, _ = cameras.project(points.p)
+        expected = projected[c].reshape(uv.shape[1:])
         seen = np.where((weight[c] > 0)[..., None], uv[c], np.nan)
-        errors = []
+
         # the camera's frame f against the others' frame f - s
+        errors = []
         for s in range(-lag, lag + 1):
             ours = seen[max(s, 0) : F + min(s, 0)]
             theirs = expected[max(-s, 0) : F - max(s, 0)]
@@ -289,10 +312,14 @@ def clock_errors(cameras: CameraArray, uv: Float, weight: Float) -> tuple[Float,
 
 
 def _vertex(values: list[float]) -> float:
-    """Where a parabola through values at -1, 0, 1 is lowest; 0 with fewer values or none lowest."""
-    if len(values) < 3 or not values[0] - 2 * values[1] + values[2] > 0:
+    """The minimum of a parabola through values at -1, 0, 1; 0 if there are fewer or no minimum."""
+    if len(values) < 3:
         return 0.0
-    return 0.5 * (values[0] - values[2]) / (values[0] - 2 * values[1] + values[2])
+    before, at, after = values
+    curvature = before - 2 * at + after
+    if not curvature > 0:
+        return 0.0
+    return 0.5 * (before - after) / curvature
 
 
 def median(values: Float) -> float:

@@ -48,22 +48,21 @@ class Recording:
         if not self.files:
             yield from enumerate(_decoded(opened(self.path, self.rotate)))
         for number, path in self.files.items():
-            yield (
-                number,
-                np.asarray(
-                    cv2.cvtColor(read_colour(path), cv2.COLOR_RGB2BGR), np.uint8
-                ),
-            )
+            image = cv2.cvtColor(read_colour(path), cv2.COLOR_RGB2BGR)
+            yield number, np.asarray(image, np.uint8)
 
     def fingerprint(self) -> list[str | int]:
         """Names, sizes and times of the files: changes when the images do."""
-        paths = self.files.values() or [self.path]
-        return [part for path in paths for part in stamp(path)]
+        parts: list[str | int] = []
+        for path in self.files.values() or [self.path]:
+            parts += stamp(path)
+        return parts
 
 
 def stamp(path: Path) -> tuple[str, int, int]:
     """Name, size and time of a file: changes when its content does."""
-    return path.name, path.stat().st_size, path.stat().st_mtime_ns
+    stat = path.stat()
+    return path.name, stat.st_size, stat.st_mtime_ns
 
 
 def find_sources(folder: Path, rotate: bool = False) -> dict[str, Recording]:
@@ -72,8 +71,10 @@ def find_sources(folder: Path, rotate: bool = False) -> dict[str, Recording]:
     Raises:
         DataError: when there are none, or two videos have the same stem.
     """
-    for place in (*(folder / name for name in INSIDE), folder):
-        if place.is_dir() and (sources := _sources_in(place, rotate)):
+    # The first folder with recordings counts.
+    for place in [folder / name for name in INSIDE] + [folder]:
+        sources = _sources_in(place, rotate) if place.is_dir() else {}
+        if sources:
             return sources
     if not folder.exists():
         raise DataError(
@@ -87,13 +88,24 @@ def find_sources(folder: Path, rotate: bool = False) -> dict[str, Recording]:
 
 def _sources_in(folder: Path, rotate: bool) -> dict[str, Recording]:
     sources: dict[str, Recording] = {}
-    for path in sorted(folder.iterdir(), key=lambda p: natural_order(p.name)):
+    for path in sorted(folder.iterdir(), key=lambda path: natural_order(path.name)):
         if path.name.startswith("."):
             continue
-        if path.is_dir() and (files := frame_files(folder, path.name, IMAGE_SUFFIXES)):
+        is_folder = path.is_dir()
+        files = frame_files(folder, path.name, IMAGE_SUFFIXES) if is_folder else None
+
+        # a folder of images, or a video
+        if files:
             paths = {number: folder / files[number] for number in sorted(files)}
             size = read_header(next(iter(paths.values())))[0]
-            source = Recording(path.name, path, size, None, paths, len(paths))
+            source = Recording(
+                name=path.name,
+                path=path,
+                size=size,
+                fps=None,
+                files=paths,
+                count=len(paths),
+            )
         elif path.suffix.lower() in VIDEO_SUFFIXES:
             source = video_recording(path, rotate)
         else:
@@ -121,9 +133,16 @@ def video_recording(path: Path, rotate: bool) -> Recording:
         raise DataError(
             f"{path} holds no image that can be decoded; convert it to H.264 MP4"
         )
-    rate = fps if np.isfinite(fps) and fps > 0 else None
+    h, w = first.shape[:2]
     return Recording(
-        path.stem, path, (len(first), len(first[0])), rate, {}, count, turned, rotate
+        name=path.stem,
+        path=path,
+        size=(h, w),
+        fps=fps if np.isfinite(fps) and fps > 0 else None,
+        files={},
+        count=count,
+        turned=turned,
+        rotate=rotate,
     )
 
 
@@ -143,8 +162,10 @@ def opened(path: Path, rotate: bool) -> cv2.VideoCapture:
 def _decoded(video: cv2.VideoCapture) -> Iterator[Bytes]:
     """The images of a video, which is closed at the end."""
     try:
-        while (read := video.read())[0]:
-            yield np.asarray(read[1], np.uint8)
+        done, image = video.read()
+        while done:
+            yield np.asarray(image, np.uint8)
+            done, image = video.read()
     finally:
         video.release()
 
@@ -154,8 +175,8 @@ def pair_cameras(
 ) -> dict[str, str]:
     """The calibrated camera of each source.
 
-    Convention: as ``given``; else the same name, ignoring case; else the one camera whose name
-    stands between separators in the source's name ("Miqus_5_21474": 21474). Never by position.
+    It is the ``given`` one; else the one with the same name, ignoring case; else the one whose name
+    is between separators in the source's name ("Miqus_5_21474": 21474). Positions do not count.
 
     Raises:
         DataError: when a source has no camera or two have the same, listing both sides.
@@ -167,11 +188,13 @@ def pair_cameras(
             raise DataError(
                 f"cameras={{{source}: {camera}}} names an unknown source or camera ({both})"
             )
+
+    # Each source needs exactly one camera, which no other source has.
     pairs = dict[str, str]()
     for source in sources:
-        matching = (
-            [named[source]] if source in named else matching_cameras(source, cameras)
-        )
+        matching = matching_cameras(source, cameras)
+        if source in named:
+            matching = [named[source]]
         if len(matching) != 1 or matching[0] in pairs.values():
             problem = "no one camera of the calibration matches"
             if len(matching) == 1:
@@ -189,6 +212,7 @@ def matching_cameras(source: str, cameras: Sequence[str]) -> list[str]:
     """The calibrated cameras that a source's name fits, see `pair_cameras`."""
     if source in cameras:
         return [source]
+    # the same name, or a word of the source's name
     words = re.split(r"[^0-9a-z]+", source.lower())
     same = [camera for camera in cameras if camera.lower() == source.lower()]
     return same or [camera for camera in cameras if camera.lower() in words]
@@ -199,8 +223,8 @@ def fit_size(
 ) -> tuple[CameraEntry, str | None]:
     """A camera with its source's name and image size, and a note when the sizes differ.
 
-    Convention: up to ``crop_px`` missing columns or rows were cut off at the right or bottom, where
-    codecs cut, so K stays. ``size`` is ``(H, W)``; a calibrated size of (0, 0) is unknown.
+    Up to ``crop_px`` missing columns or rows were cut off at the right or bottom, where codecs cut,
+    so K stays. ``size`` is ``(H, W)``; a calibrated size of (0, 0) is unknown.
 
     Raises:
         DataError: when the sizes differ by more: the calibration ``where`` is of another size.
@@ -208,7 +232,8 @@ def fit_size(
     fitted = replace(camera, name=name, size=size)
     if camera.size in (size, (0, 0)):
         return fitted, None
-    (h, w), (H, W) = size, camera.size
+    h, w = size
+    H, W = camera.size
     if max(abs(H - h), abs(W - w)) > crop_px:
         raise DataError(
             f"{where}: the camera {camera.name} is calibrated for {W}x{H} pixels, but the images "
@@ -221,17 +246,19 @@ def fit_size(
 
 def recording_notes(sources: Mapping[str, Recording]) -> list[str]:
     """Notes on frame rates and lengths that differ, and on rotation metadata."""
-    found = []
-    for what, values in (
-        ("frame rates", {name: s.fps for name, s in sources.items() if s.fps}),
-        ("numbers of frames", {name: s.count for name, s in sources.items()}),
-    ):
+    notes = []
+    rates = {name: source.fps for name, source in sources.items() if source.fps}
+    counts = {name: source.count for name, source in sources.items()}
+    for what, values in (("frame rates", rates), ("numbers of frames", counts)):
         if values and max(values.values()) > (1 + DIFFERENT) * min(values.values()):
             text = ", ".join(f"{name} {value:g}" for name, value in values.items())
-            found.append(f"{what} differ ({text}); frames are paired by number")
-    return found + [
-        f"{name}: its metadata rotate it by {source.turned} degrees, which is not applied; set "
-        "apply_rotation=true if it was calibrated that way"
-        for name, source in sources.items()
-        if source.turned and not source.rotate
-    ]
+            notes.append(f"{what} differ ({text}); frames are paired by number")
+
+    # rotations that are not applied
+    for name, source in sources.items():
+        if source.turned and not source.rotate:
+            notes.append(
+                f"{name}: its metadata rotate it by {source.turned} degrees, which is not applied; "
+                "set apply_rotation=true if it was calibrated that way"
+            )
+    return notes

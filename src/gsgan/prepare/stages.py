@@ -75,7 +75,8 @@ class StageFolder:
         """Removes results with other keys of the stages that this run used."""
         for left in list(self.folder.iterdir()):
             stem = left.name.removesuffix(".npz")
-            if self.used.get(stem[: -KEY_LENGTH - 1], stem) == stem:
+            stage = stem[: -KEY_LENGTH - 1]
+            if self.used.get(stage, stem) == stem:
                 continue
             if left.is_dir():
                 shutil.rmtree(left, ignore_errors=True)

@@ -14,18 +14,17 @@ from gsgan.utils.arrays import Bool, Float, Ints, nanmedian
 # Errors are in thousandths of the focal length: pixels, at a focal length of 1000 pixels.
 SCALE = 3.5  # error at which a detection counts half (Cauchy's weight)
 MAX_ERROR = 35.0  # median error beyond which detections contradict each other
-# a point's uncertainty along over across the rays; more: too parallel
+# maximum ratio of a point's uncertainty along the rays to that across: above, they are too parallel
 MAX_ELONGATION = 20.0
 # mean loss per detection that a swap must save; an error of SCALE costs 0.7
 FLIP_GAIN = 0.15
 FAR = 1e6  # pixels: stands for an infinite error
 FLAT = 1e-15  # determinant over trace³: below it the equations are singular in float64
-# of reweighting; the search for swapped sides needs fewer
-ITERATIONS = 10
-QUICK_ITERATIONS = 3
+ITERATIONS = 10  # of reweighting
+QUICK_ITERATIONS = 3  # of reweighting, in the search for swapped sides
 CHUNK = 100_000  # points processed at once: bounds the memory, changes nothing else
-MAX_PAIRS = 60  # of cameras, tried as a start; of more, a spread-out part
-# of a group: hips at the border of an image do not tell left from right
+MAX_PAIRS = 60  # pairs of cameras tried as a start; of more, a spread-out part
+# minimum number of a group: hips at the border of an image do not tell left from right
 LEAST_JOINTS = 3
 PROGRESSION = 7919  # a prime: spreads the chosen camera pairs when there are too many
 
@@ -36,21 +35,22 @@ Pairs = tuple[tuple[int, int], ...]
 class Triangulated:
     """Triangulated points."""
 
-    p: Float  # [N, 3] metres, NaN where missing
-    weight: Float  # [C, N] final weight of each detection, 0 where it was not used
-    # [C, N] reprojection error in undistorted pixels, NaN where nothing was seen
-    error: Float
+    p: Float  # [N, 3] metres, NaN = missing
+    weight: Float  # [C, N] final weight of each detection, 0 = not used
+    error: Float  # [C, N] reprojection error in undistorted pixels, NaN = not seen
 
 
 def plain(cameras: CameraArray, uv: Float, weight: Float) -> Float:
-    """``[N, 3]`` the weighted linear (DLT) solution, NaN with fewer than two weighted views.
+    """The weighted linear (DLT) solution ``[N, 3]``, NaN with fewer than two weighted views.
 
     Args:
         cameras: ``C`` cameras.
         uv: ``[C, N, 2]`` undistorted pixels, NaN allowed where the weight is 0.
-        weight: ``[C, N]`` confidence, at least 0.
+        weight: ``[C, N]`` confidence, minimum 0.
     """
-    return _solve(*_rows(cameras, uv, weight), weight)[0]
+    a, b = _rows(cameras, uv, weight)
+    p, _ = _solve(a, b, weight)
+    return p
 
 
 def robust(
@@ -60,18 +60,25 @@ def robust(
     iterations: int = ITERATIONS,
     max_error: float = MAX_ERROR,
 ) -> Triangulated:
-    """Triangulated that most detections agree on, by reweighting from the best pair of cameras.
+    """Robust triangulation: starts from the best camera pair, then reweights iteratively.
 
-    Convention: the loss is Cauchy's, ``log(1 + (r/SCALE)²)`` of the reprojection error r, times
-    the weight; errors are in thousandths of the focal length. A point is NaN with fewer than two
-    weighted views, with rays too parallel (`MAX_ELONGATION`), or when its detections contradict
-    each other (``max_error``). Arguments as for `plain`; ``iterations`` of reweighting.
+    The loss is Cauchy's, ``log(1 + (r/SCALE)²)`` of the reprojection error r, times the weight;
+    errors are in thousandths of the focal length. A point is NaN with fewer than two weighted
+    views, with rays too parallel (`MAX_ELONGATION`), or if its detections contradict each other
+    (``max_error``).
+
+    Args:
+        cameras: ``C`` cameras.
+        uv: ``[C, N, 2]`` undistorted pixels, NaN allowed where the weight is 0.
+        weight: ``[C, N]`` confidence, minimum 0.
+        iterations: of reweighting.
+        max_error: maximum median error of a point.
     """
-    chunks = [slice(at, at + CHUNK) for at in range(0, max(uv.shape[1], 1), CHUNK)]
-    parts = [
-        _robust(cameras, uv[:, at], weight[:, at], iterations, max_error)
-        for at in chunks
-    ]
+    parts = []
+    for start in range(0, max(uv.shape[1], 1), CHUNK):
+        at = slice(start, start + CHUNK)
+        part = _robust(cameras, uv[:, at], weight[:, at], iterations, max_error)
+        parts.append(part)
     return Triangulated(
         p=np.concatenate([part.p for part in parts]),
         weight=np.concatenate([part.weight for part in parts], axis=1),
@@ -85,29 +92,35 @@ def _robust(
     weight = np.where(known(uv), weight, 0.0)
     a, b = _rows(cameras, uv, weight)
     p = _best_pair(cameras, uv, weight, a, b)
+
+    # Rows are depth times pixels: dividing their squares by depth² gives pixels.
     reweighted = weight
     information = np.zeros((p.shape[0], 3, 3))
     for _ in range(iterations):
-        loss = 1 / (1 + (cameras.errors(p, uv) / SCALE) ** 2)
-        reweighted = weight * np.nan_to_num(loss, nan=0.0)
-        depth = np.maximum(cameras.project(p)[1], NEAR)
-        scaled = np.nan_to_num(reweighted / depth**2)  # rows are depth times pixels
+        cauchy = 1 / (1 + (cameras.errors(p, uv) / SCALE) ** 2)
+        reweighted = weight * np.nan_to_num(cauchy, nan=0.0)
+        _, depth = cameras.project(p)
+        scaled = np.nan_to_num(reweighted / np.maximum(depth, NEAR) ** 2)
         new, information = _solve(a, b, scaled)
         p = np.where(np.isfinite(new), new, p)
+
+    # points with parallel rays, contradicting detections or too few views
     error = cameras.errors(p, uv)
     certainty = np.linalg.eigvalsh(information)
     missing = certainty[:, 0] * MAX_ELONGATION**2 < certainty[:, 2]
-    used = np.where(weight > 0, np.nan_to_num(error, nan=np.nan, posinf=FAR), np.nan)
+    finite = np.nan_to_num(error, nan=np.nan, posinf=FAR)
+    used = np.where(weight > 0, finite, np.nan)
     missing |= nanmedian(used) > max_error
     missing |= (weight > 0).sum(0) < MIN_VIEWS
-    p = np.where(missing[:, None], np.nan, p)
     return Triangulated(
-        p, np.where(missing, 0.0, reweighted), np.where(missing, np.nan, error)
+        p=np.where(missing[:, None], np.nan, p),
+        weight=np.where(missing, 0.0, reweighted),
+        error=np.where(missing, np.nan, error),
     )
 
 
 def robust_cost(error: Float, weight: Float) -> Float:
-    """``[N]`` weighted Cauchy loss over the cameras, of ``error`` and ``weight [C, N]``.
+    """The weighted Cauchy loss ``[N]`` over the cameras, of ``error`` and ``weight [C, N]``.
 
     Detections with weight 0 cost nothing; a point that was not found costs as one far away.
     """
@@ -116,16 +129,22 @@ def robust_cost(error: Float, weight: Float) -> Float:
 
 
 def _rows(cameras: CameraArray, uv: Float, weight: Float) -> tuple[Float, Float]:
-    """``a [C, N, 2, 3]``, ``b [C, N, 2]``: ``a·X - b`` is depth times the error in pixels."""
+    """The rows ``a [C, N, 2, 3]`` and ``b [C, N, 2]`` of linear equations.
+
+    With ``K R X + K t = (x, y, z)``, z being the depth, the error in pixels is ``u - x / z``;
+    times z it is linear in X: ``a·X - b``.
+    """
     uv = np.where((weight > 0)[..., None], uv, 0.0)
     KR = cameras.K @ cameras.R
     Kt = np.einsum("cij,cj->ci", cameras.K, cameras.t)
     a = uv[..., None] * KR[:, None, 2:] - KR[:, None, :2]
-    return a, Kt[:, None, :2] - uv * Kt[:, None, 2:]
+    b = Kt[:, None, :2] - uv * Kt[:, None, 2:]
+    return a, b
 
 
 def _solve(a: Float, b: Float, weight: Float) -> tuple[Float, Float]:
-    """Least squares ``[N, 3]``, NaN where views are too few, and its information ``[N, 3, 3]``."""
+    """Least squares ``[N, 3]``, NaN if views are too few, and its information ``[N, 3, 3]``."""
+    # normal equations, singular if the rays are parallel
     w = weight[..., None]
     information = np.einsum("cnki,cnkj->nij", a * w[..., None], a)
     right = np.einsum("cnki,cnk->ni", a, b * w)
@@ -140,14 +159,16 @@ def _solve(a: Float, b: Float, weight: Float) -> tuple[Float, Float]:
 def _best_pair(
     cameras: CameraArray, uv: Float, weight: Float, a: Float, b: Float
 ) -> Float:
-    """``[N, 3]`` of all pairs' points and the linear one, that with the smallest robust cost."""
-    best = _solve(a, b, weight)[0]
+    """The points ``[N, 3]`` with the smallest robust cost: of a camera pair, or linear from all."""
+    best, _ = _solve(a, b, weight)
     cost = robust_cost(cameras.errors(best, uv), weight)
-    pairs = list(combinations(range(len(cameras)), 2))
+    pairs = [list(pair) for pair in combinations(range(len(cameras)), 2)]
     if len(pairs) > MAX_PAIRS:
         pairs = [pairs[k * PROGRESSION % len(pairs)] for k in range(MAX_PAIRS)]
-    for pair in map(list, pairs):
-        p = _solve(a[pair], b[pair], weight[pair])[0]
+
+    # Each pair's point replaces the best one so far if it fits all cameras better.
+    for pair in pairs:
+        p, _ = _solve(a[pair], b[pair], weight[pair])
         new = robust_cost(cameras.errors(p, uv), weight)
         better = (new < cost) & np.isfinite(p).all(-1)
         best = np.where(better[:, None], p, best)
@@ -158,7 +179,7 @@ def _best_pair(
 def find_flips(
     cameras: CameraArray, uv: Float, weight: Float, groups: Sequence[Pairs]
 ) -> Bool:
-    """``[C, F, G]`` which camera swapped which group of joints in which frame.
+    """The groups of joints ``[C, F, G]`` that each camera swapped in each frame.
 
     Detectors confuse left and right, mostly when a person is seen from behind. Per frame, one
     camera at a time is changed as long as the triangulated points fit better. That does not
@@ -167,29 +188,31 @@ def find_flips(
 
     Args:
         cameras: ``C`` cameras.
-        uv, weight: ``[C, F, J, 2]`` undistorted pixels and their confidence.
+        uv: ``[C, F, J, 2]`` undistorted pixels.
+        weight: ``[C, F, J]`` their confidence.
         groups: ``G`` tuples of (left, right) joints that swap together.
     """
-    return np.stack(
-        [_group_flips(cameras, uv, weight, pairs) for pairs in groups], axis=-1
-    )
+    flips = [_group_flips(cameras, uv, weight, pairs) for pairs in groups]
+    return np.stack(flips, axis=-1)
 
 
 def apply_flips(values: Float, flips: Bool, groups: Sequence[Pairs]) -> Float:
     """Values ``[C, F, J, ...]`` with left and right exchanged where ``flips [C, F, G]``."""
-    out = values.copy()
+    result = values.copy()
     for g, pairs in enumerate(groups):
-        at = flips[..., g].reshape(*flips.shape[:2], *[1] * (values.ndim - 2))
-        left, right = (list(side) for side in zip(*pairs, strict=True))
-        for a, b in ((left, right), (right, left)):
-            out[:, :, a] = np.where(at, values[:, :, b], values[:, :, a])
-    return out
+        flipped = np.expand_dims(flips[..., g], tuple(range(2, values.ndim)))
+        left, right = np.array(pairs).T
+        lefts = values[:, :, left]
+        rights = values[:, :, right]
+        result[:, :, left] = np.where(flipped, rights, lefts)
+        result[:, :, right] = np.where(flipped, lefts, rights)
+    return result
 
 
 def points_and_cost(
     cameras: CameraArray, uv: Float, weight: Float
 ) -> tuple[Float, Float]:
-    """``p [F, J, 3]`` of ``uv [C, F, J, 2]`` and ``weight [C, F, J]``, and its cost ``[F]``."""
+    """Points ``[F, J, 3]`` of ``uv [C, F, J, 2]``, ``weight [C, F, J]``, and their cost ``[F]``."""
     C, F, J = weight.shape
     flat = weight.reshape(C, -1)
     found = robust(cameras, uv.reshape(C, -1, 2), flat, QUICK_ITERATIONS, np.inf)
@@ -199,45 +222,54 @@ def points_and_cost(
 
 
 def _group_flips(cameras: CameraArray, uv: Float, weight: Float, pairs: Pairs) -> Bool:
-    """``[C, F]`` for one group."""
+    """The swaps ``[C, F]`` of one group."""
     joints = [j for pair in pairs for j in pair]  # pairs are then adjacent: j and j ^ 1
-    local = [tuple((2 * i, 2 * i + 1) for i in range(len(pairs)))]
+    adjacent = [tuple((j, j + 1) for j in range(0, len(joints), 2))]
     uv = uv[:, :, joints]
     weight = weight[:, :, joints]
     C, F, _ = weight.shape
-    everywhere = np.arange(F)
 
     def points(flips: Bool, frames: Ints) -> tuple[Float, Float]:
-        sided = apply_flips(uv[:, frames], flips[..., None], local)
-        seen = apply_flips(weight[:, frames], flips[..., None], local)
+        sided = apply_flips(uv[:, frames], flips[..., None], adjacent)
+        seen = apply_flips(weight[:, frames], flips[..., None], adjacent)
         return points_and_cost(cameras, sided, seen)
 
-    few = (weight > 0).sum(-1) < LEAST_JOINTS
-    price = np.where(few, np.inf, FLIP_GAIN * weight.sum(-1))
-    flips = cheapest_flips(
-        lambda f, at: points(f, at)[1], np.zeros((C, F), bool), price
-    )
-    flips = flips ^ exchanged(points(flips, everywhere)[0])
+    def cost_of(flips: Bool, frames: Ints) -> Float:
+        _, cost = points(flips, frames)
+        return cost
+
+    # the swaps that make the points fit better
     votes = weight.sum(-1)
-    return ~flips if (votes * flips).sum() > votes.sum() / 2 else flips
+    few = (weight > 0).sum(-1) < LEAST_JOINTS
+    price = np.where(few, np.inf, FLIP_GAIN * votes)
+    flips = cheapest_flips(cost_of, np.zeros((C, F), bool), price)
+
+    # all cameras or none: by the motion from frame to frame, then by the majority
+    p, _ = points(flips, np.arange(F))
+    flips = flips ^ exchanged(p)
+    if (votes * flips).sum() > votes.sum() / 2:
+        return ~flips
+    return flips
 
 
 def cheapest_flips(
     cost_of: Callable[[Bool, Ints], Float], flips: Bool, price: Float
 ) -> Bool:
-    """``flips [C, F]``, one camera at a time changed as long as that saves more than its price.
+    """Flips ``[C, F]``: one camera at a time is changed as long as that saves more than its price.
 
     Args:
         cost_of: cost ``[f]`` of flips ``[C, f]`` in these ``f`` frames.
-        flips: to start from.
+        flips: ``[C, F]`` initial values.
         price: ``[C, F]`` that a change must save.
     """
+    # `active` are the frames in which the last change still saved something
     C, F = flips.shape
     flips = flips.copy()
     active = np.arange(F)
     toggles = np.eye(C, dtype=bool)[:, :, None]
     cost = cost_of(flips, active)
     for _ in range(C):
+        # the camera whose change saves most, in the frames that are still changing
         trials = np.stack([cost_of(flips[:, active] ^ one, active) for one in toggles])
         saved = cost[active] - trials - price[:, active]
         best = saved.argmax(0)
@@ -252,7 +284,7 @@ def cheapest_flips(
 
 
 def exchanged(p: Float) -> Bool:
-    """``[F]`` frames whose sides ``p [F, J, 3]`` are exchanged against the first frame's."""
+    """The frames ``[F]`` whose sides ``p [F, J, 3]`` are exchanged against the first frame's."""
     state = np.zeros(len(p), bool)
     last = p[0]
     before = known(p[0])
@@ -260,10 +292,13 @@ def exchanged(p: Float) -> Bool:
     for f in range(1, len(p)):
         now = known(p[f])
         both = before & now & before[swap] & now[swap]
+
+        # the shorter way from the last places of the joints
         straight = np.linalg.norm(p[f] - last, axis=-1)[both].sum()
         crossed = np.linalg.norm(p[f][swap] - last, axis=-1)[both].sum()
         state[f] = crossed < straight if both.any() else state[f - 1]
-        settled, seen = (p[f][swap], now[swap]) if state[f] else (p[f], now)
-        last = np.where(seen[:, None], settled, last)
-        before = before | seen
+
+        order = swap if state[f] else slice(None)
+        last = np.where(now[order][:, None], p[f][order], last)
+        before = before | now[order]
     return state
