@@ -127,7 +127,7 @@ def solve_video(options: Options, stages: StageFolder, console: Console) -> Film
 
     # frames that fit much worse than the others
     errors = np.nanmedian(view.error.numpy(), axis=1)
-    doubtful = errors > DOUBTFUL * np.median(errors)
+    doubtful = errors > DOUBTFUL * np.nanmedian(errors)
     left["doubtful pose"] = np.zeros(len(numbers), bool)
     left["doubtful pose"][used[doubtful]] = True
     good = ~doubtful
