@@ -122,3 +122,13 @@ def test_the_page_has_the_parts_in_their_order():
     rows = [line.split("|")[1] for line in page.splitlines() if line.startswith("| `")]
     named = [name for row in rows for name in re.findall(r"`(\w+)(?:/|\.py)`", row)]
     assert [name for name in named if name in PARTS] == list(PARTS)
+
+
+def test_no_public_class_name_is_defined_twice():
+    names = []
+    for path in FILES:
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                names.append(node.name)
+    twice = {name for name in names if names.count(name) > 1}
+    assert not twice

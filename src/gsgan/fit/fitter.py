@@ -68,7 +68,7 @@ class Fit:
         between("fit.hold", self.hold, 0, 1)
 
 
-class Surface(nn.Module):
+class FittedSurface(nn.Module):
     """Gaussians on a body's vertices, moved along the normals by the same distance in each frame.
 
     The distances represent clothes. Because all frames share them, they cannot absorb the error of
@@ -158,7 +158,7 @@ class Fitter:
         self.frames = frames
         self.seed = seed
         device = frames.device
-        surface = Surface(body.to(device), settings.points, settings.accuracy)
+        surface = FittedSurface(body.to(device), settings.points, settings.accuracy)
         self.surface = surface.to(device)
 
         # the change of each frame's angles and translation

@@ -8,7 +8,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from gsgan.metrics.names import METRICS
-from gsgan.report.runs import Run
+from gsgan.report.runs import ScoredRun
 from gsgan.report.spec import subject_of
 from gsgan.report.write import NOT_HAD, Cell, Grid, Row
 from gsgan.utils.errors import ConfigError
@@ -30,7 +30,7 @@ class PaperTable:
     reason: str | None = None
     note: str | None = None
 
-    def why_apart(self, runs: Sequence[Run], split: str) -> str | None:
+    def why_apart(self, runs: Sequence[ScoredRun], split: str) -> str | None:
         """Why the numbers are not comparable with these runs' scores; None if they are."""
         if self.reason is not None:
             return self.reason

@@ -34,7 +34,7 @@ IDLE = ("model.backend", "training.log_every", "training.perceptual.path")
 
 
 @dataclass(frozen=True)
-class Run:
+class ScoredRun:
     """One run folder.
 
     Args:
@@ -107,7 +107,7 @@ class Run:
 
 
 def check_same(
-    where: str, runs: Sequence[Run], facts: Sequence[Mapping[str, Any]]
+    where: str, runs: Sequence[ScoredRun], facts: Sequence[Mapping[str, Any]]
 ) -> None:
     """Runs must not differ in ``facts``, one mapping per run.
 
@@ -116,7 +116,7 @@ def check_same(
     Raises:
         ConfigError: naming two runs and what differs.
     """
-    first: dict[str, tuple[Run, Any]] = {}
+    first: dict[str, tuple[ScoredRun, Any]] = {}
     for run, held in zip(runs, facts, strict=True):
         for what, value in held.items():
             if value is None:
@@ -172,7 +172,7 @@ def _runs_inside(folder: Path) -> Iterator[Path]:
             yield Path(at)
 
 
-def read_runs(folders: Sequence[Path]) -> tuple[list[Run], dict[Path, str]]:
+def read_runs(folders: Sequence[Path]) -> tuple[list[ScoredRun], dict[Path, str]]:
     """The runs that can be read, and why the others cannot."""
     runs = []
     left_out = {}
@@ -185,7 +185,7 @@ def read_runs(folders: Sequence[Path]) -> tuple[list[Run], dict[Path, str]]:
     return runs, left_out
 
 
-def read_run(folder: Path, *, scored: bool = True) -> Run:
+def read_run(folder: Path, *, scored: bool = True) -> ScoredRun:
     """The run in a folder; with ``scored=False`` also one that was never scored.
 
     Raises:
@@ -221,7 +221,7 @@ def read_run(folder: Path, *, scored: bool = True) -> Run:
         raise DataError(f"{folder}: damaged ({reason}); score the run again") from None
 
     departed = _departures(hydra, chosen)
-    run = Run(
+    run = ScoredRun(
         folder, str(name), data, facts.get("seed"), scores, settings, departed, facts
     )
     # A run may have been scored before its end.
@@ -268,7 +268,7 @@ def _departures(hydra: DictConfig, chosen: Mapping[str, Any]) -> list[str] | Non
     ]
 
 
-def by_settings(run: Run, keys: Sequence[str]) -> Run:
+def by_settings(run: ScoredRun, keys: Sequence[str]) -> ScoredRun:
     """The run under a name that has those settings in it, so that each value has its own row.
 
     Raises:

@@ -18,7 +18,7 @@ from gsgan.report.paper import PaperTable, read_paper
 from gsgan.report.runs import (
     DATA,
     NAME,
-    Run,
+    ScoredRun,
     by_settings,
     check_same,
     find_runs,
@@ -68,7 +68,7 @@ class Part:
     """One grid: the scores of one split, of one ``metric`` where subjects are the columns."""
 
     spec: TableSpec
-    runs: Sequence[Run]
+    runs: Sequence[ScoredRun]
     split: str
     metric: str | None = None
 
@@ -93,7 +93,7 @@ class Part:
         """A value of this table, with the metric's digits."""
         return written(metric, value, times_1000=metric in self.spec.times_1000)
 
-    def of(self, name: str | None, column: str = MEAN) -> list[Run]:
+    def of(self, name: str | None, column: str = MEAN) -> list[ScoredRun]:
         """The runs of a model or method (None: of all) that a column shows."""
         shown = (
             self.runs
@@ -194,7 +194,7 @@ class Part:
                 check_same(where, row, [_row_facts(run, self.split) for run in row])
 
 
-def _row_facts(run: Run, split: str) -> dict[str, Any]:
+def _row_facts(run: ScoredRun, split: str) -> dict[str, Any]:
     """Properties that must be equal in one row: all but the seed."""
     return {
         "kind": "predictions" if run.seed is None else "a model trained here",
@@ -205,7 +205,7 @@ def _row_facts(run: Run, split: str) -> dict[str, Any]:
 
 
 def _column_facts(
-    run: Run, part: Part, mean: bool, allow_dirty: bool
+    run: ScoredRun, part: Part, mean: bool, allow_dirty: bool
 ) -> dict[str, Any]:
     """Properties that must be equal in one column; data may differ for a mean over subjects."""
     split = part.split
@@ -257,7 +257,7 @@ def make_tables(config: DictConfig) -> None:
 
 def build(
     spec: TableSpec,
-    runs: Sequence[Run],
+    runs: Sequence[ScoredRun],
     left_out: Mapping[Path, str],
     paper: PaperTable | None,
     *,
@@ -294,7 +294,7 @@ def build(
     return Report(spec.title, _grids(parts, paper), left)
 
 
-def _no_place(spec: TableSpec, run: Run) -> str | None:
+def _no_place(spec: TableSpec, run: ScoredRun) -> str | None:
     """Why the table has no row for a run; raises ConfigError for another data set."""
     if spec.data not in (None, run.data.get("name")):
         what = f"is of {spec.data}, but {run} is of {run.data_name}"
@@ -370,7 +370,7 @@ def _row(part: Part, spec: RowSpec, *, beside_paper: bool) -> Row:
 
 
 def _value(
-    run: Run, split: str, variant: str, metric: str
+    run: ScoredRun, split: str, variant: str, metric: str
 ) -> tuple[float | None, str | None]:
     """A score, and why it is missing or incomplete."""
     held = run.of(split, variant)
@@ -406,7 +406,7 @@ def _with_best(rows: Sequence[Row], part: Part) -> list[Row]:
     return [replace(row, cells=cells) for row, cells in zip(rows, found, strict=True)]
 
 
-def _origin(runs: Sequence[Run]) -> tuple[str, ...]:
+def _origin(runs: Sequence[ScoredRun]) -> tuple[str, ...]:
     """Data, protocol and commit of a row."""
     data = join_unique(run.data_name for run in runs)
     if len(roots := {run.data.get("root") for run in runs}) > 1:
@@ -416,7 +416,7 @@ def _origin(runs: Sequence[Run]) -> tuple[str, ...]:
     return data, join_unique(protocols), join_unique(commits)
 
 
-def _marks(runs: Sequence[Run], split: str) -> Iterator[str]:
+def _marks(runs: Sequence[ScoredRun], split: str) -> Iterator[str]:
     """Marks (such as a stand-in perceptual loss) and departures that a row must carry."""
     for run in runs:
         for held in run.scores.get(split, {}).values():
@@ -427,13 +427,13 @@ def _marks(runs: Sequence[Run], split: str) -> Iterator[str]:
         )
 
 
-def _lpips(run: Run, split: str) -> str | None:
+def _lpips(run: ScoredRun, split: str) -> str | None:
     """What the networks of a run's LPIPS get, if it has one."""
     scores = run.scores.get(split, {}).values()
     return next((s["lpips_input"] for s in scores if s.get("lpips_input")), None)
 
 
-def _boxes(run: Run, part: Part) -> str | None:
+def _boxes(run: ScoredRun, part: Part) -> str | None:
     """The boxes of hands and mouth of a run, if the grid has a metric in them."""
     shown = {*BOX_METRICS} & {*part.columns.values()}
     scores = run.scores.get(part.split, {}).values() if shown else ()

@@ -14,7 +14,7 @@ from gsgan.data.validation import spans
 from gsgan.evaluate.origin import fingerprint
 from gsgan.metrics.image import edge_f1, psnr
 from gsgan.model.avatar import Avatar
-from gsgan.report.runs import DATA, NAME, Run, check_same, read_run
+from gsgan.report.runs import DATA, NAME, ScoredRun, check_same, read_run
 from gsgan.run.assemble import build_data
 from gsgan.run.runs import load_avatar
 from gsgan.run.stored import CHECKPOINT, DataPaths, load_config, read_checkpoint
@@ -130,7 +130,7 @@ class Subject:
     fingerprint of ``data``, and the marks that every figure of it must carry."""
 
     name: str
-    run: Run
+    run: ScoredRun
     data: GsganData
     avatar: Avatar
     marks: list[str]
