@@ -207,3 +207,15 @@ def test_a_camera_that_training_refuses_is_explained_by_the_check(copy, check):
     assert report.numbers["readable"]
     assert report.errors == 1
     assert only(report, "error").startswith("camera cam01: ")
+
+
+def test_every_file_that_cannot_be_read_is_named_at_once(copy, check):
+    """Not the first alone: people correct all of them before they check again."""
+    (copy / "meta.json").write_text('{"unit": "ell"}')
+    (copy / "cameras.json").write_text("{")
+    (copy / "landmarks3d.npz").write_bytes(b"no archive")
+    report = check(copy)
+    messages = [finding.sentence for finding in report.findings]
+    assert report.errors == len(messages) == 3
+    for name in ("meta.json", "cameras.json", "landmarks3d.npz"):
+        assert any(name in message for message in messages), messages

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +16,7 @@ from rich.console import Console
 from gsgan.check.report import CheckReport, Finding, Section, page, print_report
 from gsgan.check.sections import Measurements, sections
 from gsgan.check.settings import Limits, Sampling
+from gsgan.data.formats.capture import CaptureReader, capture_problems
 from gsgan.effects import EffectSettings
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError, DataError
@@ -51,17 +53,22 @@ def check_data(
             data, sampling, limits, effects or EffectSettings(), console
         )
     except DataError as error:
-        return unreadable(data.root, error)
+        messages = [str(error)]
+        if isinstance(data.reader, CaptureReader) and data.root is not None:
+            messages += capture_problems(Path(data.root).expanduser(), data.limits)
+        return unreadable(data.root, messages)
     return CheckReport(
         str(measured.subject.layout.root), sections(measured), measured.numbers()
     )
 
 
-def unreadable(root: str | None, error: DataError) -> CheckReport:
-    """The report of a dataset that the reader refuses, with the reason."""
+def unreadable(root: str | None, messages: Sequence[str]) -> CheckReport:
+    """The report of a dataset that the reader refuses, with every reason that was found."""
+    reasons = dict.fromkeys(messages)  # each once, in their order
+    findings = [Finding("error", "reading", reason) for reason in reasons]
     section = Section(
         "The dataset cannot be read",
-        findings=(Finding("error", "reading", str(error)),),
+        findings=tuple(findings),
         text="Nothing further could be checked. Correct this, then check again.",
     )
     return CheckReport(str(root), (section,), {"readable": False})
@@ -103,7 +110,7 @@ def run_check(config: DictConfig) -> CheckReport:
         # Hydra wraps the error of a dataset that is made when it is instantiated.
         if not isinstance(error.__cause__, DataError):
             raise
-        report = unreadable(config.data.get("root"), error.__cause__)
+        report = unreadable(config.data.get("root"), [str(error.__cause__)])
     write_report(report, Path(config.report).expanduser(), console)
     return report
 

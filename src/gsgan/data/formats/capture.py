@@ -15,10 +15,11 @@
                       (2,2,3) where some were seen: of the free body, by gsgan.fit
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -165,6 +166,51 @@ def _find(
         ),
         notes=tuple(notes),
     )
+
+
+T = TypeVar("T")
+
+
+def capture_problems(root: Path, limits: Thresholds) -> list[str]:
+    """Every reason why a capture cannot be read: each file is read although others are damaged.
+
+    A file without which another one cannot be understood is replaced by its defaults.
+    """
+    problems: list[str] = []
+
+    def attempt(read: Callable[[], T]) -> T | None:
+        try:
+            return read()
+        except DataError as error:
+            if str(error) not in problems:
+                problems.append(str(error))
+            return None
+
+    # Facts about the capture; with damaged ones, metres and 33 landmarks are assumed.
+    path = root / "meta.json"
+    content = attempt(lambda: read_json(path)) or {"unit": "m"}
+    meta = attempt(lambda: _read_meta(path, content, None))
+    conventions = attempt(lambda: read_conventions(path, content))
+    if conventions is None:
+        conventions = read_conventions(path, {"unit": "m"})
+
+    # Cameras, and the images of each.
+    cameras_path = root / "cameras.json"
+    cameras_json = attempt(lambda: read_json(cameras_path))
+    if cameras_json is not None:
+        cameras = attempt(lambda: read_cameras(cameras_path, cameras_json, conventions))
+        if cameras is not None:
+            attempt(lambda: _index_images(root, cameras))
+
+    # Landmarks and body poses.
+    joints = SKELETONS["mediapipe33" if meta is None else meta.skeleton]
+    for name, count in ((LANDMARKS, joints), (HANDS_FILE, 2 * HAND), (FACE_FILE, FACE)):
+        file = root / name
+        if name == LANDMARKS or file.exists():
+            attempt(partial(_read_landmarks, file, count, conventions, limits, []))
+    if meta is not None and (root / POSES).exists():
+        attempt(lambda: _read_poses(root, meta, conventions))
+    return problems
 
 
 def _read_meta(path: Path, content: Mapping[str, Any], smpl: str | None) -> Meta:
