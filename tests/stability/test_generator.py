@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn import functional
 
-from gsgan.model.generator import Style
+from gsgan.model.generator import StyleModulation
 
 HALVES = (torch.bfloat16, torch.float16)
 
@@ -12,7 +12,7 @@ HALVES = (torch.bfloat16, torch.float16)
 @pytest.mark.parametrize("size", [1e-4, 1.0, 300.0, 6e4])
 def test_half_precision_normalises_what_its_squares_cannot_hold(size):
     """fp16 squares overflow above 256 and vanish below 2e-4; the norm is one all the same."""
-    style = Style(4, 2, 3)
+    style = StyleModulation(4, 2, 3)
     h = torch.tensor([1.0, -1.0, 1.0, -1.0]).view(1, 4, 1, 1) * size
     with torch.autocast("cpu", dtype=torch.float16):
         out = style(h.half(), torch.zeros(1, 2, 1, 1), torch.zeros(1, 3))

@@ -6,7 +6,7 @@ from functools import lru_cache, partial
 import torch
 from torch import Tensor, nn
 
-from gsgan.model.generator import Generator, Style
+from gsgan.model.generator import Generator, StyleModulation
 from stability.cases.case import Case, Inputs, Outputs, Tolerance
 
 SIDE = 16  # pixels
@@ -61,7 +61,7 @@ def _generator(dtype: torch.dtype, device: torch.device, biased: bool) -> Genera
         F, S, p2d = CHANNELS.values()
         made = Generator(F, S, p2d, POSE, TIMES, base=4)
         for module in made.modules():
-            if isinstance(module, Style) and module.from_map is not None:
+            if isinstance(module, StyleModulation) and module.from_map is not None:
                 nn.init.normal_(module.from_map.weight, std=0.1)
                 nn.init.normal_(module.from_pose.weight, std=0.1)
     if not biased:
