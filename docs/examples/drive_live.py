@@ -35,7 +35,11 @@ def steady(skeletons: Iterable[Tensor], share: float = 0.7) -> Iterator[Tensor]:
     """Smooths a stream by an exponential average of each joint, from the past alone."""
     last = None
     for p in skeletons:
-        last = p if last is None else torch.where(p.isnan() | last.isnan(), p, last.lerp(p, share))
+        last = (
+            p
+            if last is None
+            else torch.where(p.isnan() | last.isnan(), p, last.lerp(p, share))
+        )
         yield last
 
 
@@ -45,7 +49,9 @@ def look_at(centre: Tensor, eye: Tensor, pixels: int) -> Camera:
     right = torch.nn.functional.normalize(
         torch.linalg.cross(forward, forward.new_tensor([0.0, 0.0, 1.0])), dim=0
     )
-    R = torch.stack([right, torch.linalg.cross(forward, right), forward])  # x right, y down
+    R = torch.stack(
+        [right, torch.linalg.cross(forward, right), forward]
+    )  # x right, y down
     focal = pixels / 2 / math.tan(math.radians(35) / 2)
     K = torch.tensor([[focal, 0, pixels / 2], [0, focal, pixels / 2], [0, 0, 1]])
     return Camera(K[None], R[None], -(R @ eye)[None], size=(pixels, pixels))
@@ -56,12 +62,20 @@ def main(run: Path, landmarks: Path, out: Path, pixels: int) -> None:
     out.mkdir(parents=True, exist_ok=True)
     camera, count, start = None, 0, time.perf_counter()
     for skeleton in steady(stream(landmarks)):
-        if camera is None:  # fixed from here on, 3.5 m in front of where the person starts
+        if (
+            camera is None
+        ):  # fixed from here on, 3.5 m in front of where the person starts
             centre = skeleton.nanmean(dim=0)
-            camera = look_at(centre, centre + centre.new_tensor([0.0, -3.5, 0.3]), pixels)
-        image = avatar.render(skeleton, camera, background=(0.2, 0.2, 0.25))  # [1, 3, H, W]
+            camera = look_at(
+                centre, centre + centre.new_tensor([0.0, -3.5, 0.3]), pixels
+            )
+        image = avatar.render(
+            skeleton, camera, background=(0.2, 0.2, 0.25)
+        )  # [1, 3, H, W]
         rgb = (image[0] * 255).round().byte().permute(1, 2, 0).cpu().numpy()
-        (out / f"{count:06d}.png").write_bytes(png_bytes(Image.fromarray(rgb)))  # or show it
+        (out / f"{count:06d}.png").write_bytes(
+            png_bytes(Image.fromarray(rgb))
+        )  # or show it
         count += 1
     print(f"{count} images, {count / (time.perf_counter() - start):.1f} per second")
 

@@ -28,11 +28,20 @@ CAMERAS, FRAMES, SIZE = 4, 12, 160
 def camera(angle: float) -> dict[str, list]:
     """A camera on a circle of 3 m round the person, z up; OpenCV's axes: x right, y down."""
     forward = np.array([np.sin(angle), np.cos(angle), 0.0])
-    right, down = np.array([np.cos(angle), -np.sin(angle), 0.0]), np.array([0.0, 0.0, -1.0])
+    right, down = (
+        np.array([np.cos(angle), -np.sin(angle), 0.0]),
+        np.array([0.0, 0.0, -1.0]),
+    )
     R = np.stack([right, down, forward])  # world to camera
     t = -R @ (np.array([0, 0, 0.85]) - 3 * forward)  # x_cam = R x_world + t, metres
     K = [[1.2 * SIZE, 0, SIZE / 2], [0, 1.2 * SIZE, SIZE / 2], [0, 0, 1]]  # pixels
-    return {"K": K, "R": R.tolist(), "t": t.tolist(), "dist": [0.0] * 5, "size": [SIZE, SIZE]}
+    return {
+        "K": K,
+        "R": R.tolist(),
+        "t": t.tolist(),
+        "dist": [0.0] * 5,
+        "size": [SIZE, SIZE],
+    }
 
 
 def joints(time: float) -> np.ndarray:
@@ -44,12 +53,17 @@ def joints(time: float) -> np.ndarray:
     return p
 
 
-def film(rig: dict[str, dict], p: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def film(
+    rig: dict[str, dict], p: np.ndarray
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Image [H, W, 3] (BGR) and mask [H, W] of one frame, by camera."""
     shots = {}
     for name, entry in rig.items():
         K, R, t = (np.array(entry[key]) for key in ("K", "R", "t"))
-        image, mask = np.zeros((SIZE, SIZE, 3), np.uint8), np.zeros((SIZE, SIZE), np.uint8)
+        image, mask = (
+            np.zeros((SIZE, SIZE, 3), np.uint8),
+            np.zeros((SIZE, SIZE), np.uint8),
+        )
         at = p @ R.T + t
         pixels = np.rint((at @ K.T)[:, :2] / at[:, 2:] - 0.5).astype(int)
         hull = cv2.convexHull(pixels[list(MEDIAPIPE33.torso)])
@@ -58,7 +72,9 @@ def film(rig: dict[str, dict], p: np.ndarray) -> dict[str, tuple[np.ndarray, np.
         for i, (a, b) in enumerate(MEDIAPIPE33.edges):
             colour = (40 + 5 * i, 220 - 5 * i, 130)
             for canvas, ink in ((image, colour), (mask, 255)):
-                cv2.line(canvas, pixels[a].tolist(), pixels[b].tolist(), ink, SIZE // 18)
+                cv2.line(
+                    canvas, pixels[a].tolist(), pixels[b].tolist(), ink, SIZE // 18
+                )
         shots[name] = (image, mask)
     return shots
 
@@ -89,16 +105,25 @@ def write_capture(folder: Path) -> Path:
 
 def main(folder: Path, overrides: list[str]) -> None:
     capture, run = write_capture(folder / "capture"), folder / "run"
-    command = ["gsgan.train", "data=capture", f"data.root={capture}", f"hydra.run.dir={run}"]
+    command = [
+        "gsgan.train",
+        "data=capture",
+        f"data.root={capture}",
+        f"hydra.run.dir={run}",
+    ]
     subprocess.run([sys.executable, "-m", *command, *overrides], check=True)
 
     avatar = gsgan.load(run)
     entry = camera(np.pi / CAMERAS)  # where no camera stood
-    K, R, t = (torch.tensor([entry[key]], dtype=torch.float32) for key in ("K", "R", "t"))
+    K, R, t = (
+        torch.tensor([entry[key]], dtype=torch.float32) for key in ("K", "R", "t")
+    )
     skeleton = torch.from_numpy(joints(0.3)).float()  # a pose between two frames
     image = avatar.render(skeleton, Camera(K, R, t, size=(SIZE, SIZE)), background=1.0)
     pixels = (image[0] * 255).round().byte().permute(1, 2, 0).numpy()
-    (folder / "new_view.png").write_bytes(png_bytes(Image.fromarray(pixels)))  # marked synthetic
+    (folder / "new_view.png").write_bytes(
+        png_bytes(Image.fromarray(pixels))
+    )  # marked synthetic
     print(folder / "new_view.png")
 
 

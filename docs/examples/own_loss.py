@@ -31,14 +31,24 @@ class Smoothness(nn.Module):
 
     def forward(self, rendering: Rendering, frame: Frame) -> Tensor:
         image = rendering.image  # [B, 3, H, W], as is frame.image
-        return self.weight * (image.diff(dim=-1).abs().mean() + image.diff(dim=-2).abs().mean())
+        return self.weight * (
+            image.diff(dim=-1).abs().mean() + image.diff(dim=-2).abs().mean()
+        )
 
 
 def main(overrides: list[str]) -> None:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), *sys.path])}
-    ours = ["--config-dir", str(HERE / "conf"), "model=full,wo_normals", "training=smooth"]
+    ours = [
+        "--config-dir",
+        str(HERE / "conf"),
+        "model=full,wo_normals",
+        "training=smooth",
+    ]
     sweep = ["gsgan.train", "-m", *ours, "hydra.sweep.dir=runs/own_loss", *overrides]
-    for command in (sweep, ["gsgan.report", "runs=[runs/own_loss]", "out=runs/own_loss_table"]):
+    for command in (
+        sweep,
+        ["gsgan.report", "runs=[runs/own_loss]", "out=runs/own_loss_table"],
+    ):
         subprocess.run([sys.executable, "-m", *command], check=True, env=environment)
 
 
