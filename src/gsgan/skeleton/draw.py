@@ -50,7 +50,7 @@ def draw_skeleton(
     Raises:
         ValueError: on a wrong shape or batch size.
 
-    Source: paper Sec. 3.5 (p₂D is not specified there); method notes, section 4.
+    Source: paper Sec. 3.5 (p₂D is not specified there).
     """
     valid = check_skeleton("draw_skeleton", p, valid, template)
     if len(camera) != len(p):

@@ -78,7 +78,7 @@ def bone_frames(
     Raises:
         ValueError: when a shape does not match the template.
 
-    Source: method notes, section 6 (6D bone rotations of paper Sec. 3.5, which leaves the frames
+    Source: ours (6D bone rotations of paper Sec. 3.5, which leaves the frames
     open).
     """
     valid = check_skeleton("bone_frames", p, valid, template)
@@ -228,7 +228,7 @@ def omega(
     Raises:
         ValueError: on a wrong shape.
 
-    Source: method notes, section 6; pose code of paper Sec. 3.5 (DANBO's input).
+    Source: ours; pose code of paper Sec. 3.5 (DANBO's input).
     """
     valid = check_skeleton("omega", p, valid, template)
     if R_cam.shape != (len(p), 3, 3):

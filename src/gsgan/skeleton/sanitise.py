@@ -38,7 +38,7 @@ def limb_length_sum(
     Raises:
         ValueError: when a shape does not match the template.
 
-    Source: method notes, section 2 (one constant per subject, the median over training frames).
+    Source: ours; one constant per subject, the median over training frames.
     """
     valid = check_skeleton("limb_length_sum", p, valid, template)
     c = constants(template, p.device, p.dtype)
@@ -80,7 +80,7 @@ def sanitise(
         ValueError: on a wrong shape, or when too few shoulders and hips are seen, naming batch
             items and joints.
 
-    Source: method notes, sections 1 and 10 (ours; the paper does not treat missing joints).
+    Source: ours; the paper does not treat missing joints.
     """
     check_skeleton("sanitise", p, None, template)
     valid = torch.isfinite(p).all(-1)

@@ -28,7 +28,7 @@ class SkeletonTemplate:
     Compared and hashed by identity, so that it can be the key of cached tensors. Left joints come
     before right ones.
 
-    Source: method notes, sections 1, 5 and 6; the paper names MediaPipe Pose and Algorithm 1.
+    Source: ours; the paper names MediaPipe Pose and Algorithm 1.
     """
 
     names: tuple[str, ...]  # of the J joints

@@ -24,7 +24,7 @@ class Accuracy:
     Raises:
         ValueError: on a value outside its range, naming it.
 
-    Source: the table of settings in the rasteriser's design notes; the paper (Sec. 3.1) states no
+    Source: docs/rasteriser.md; the paper (Sec. 3.1) states no
     cut-off, 1/255 and 0.3 square pixels are the values of 3D Gaussian splatting.
     """
 
