@@ -12,7 +12,7 @@ from rich.console import Console
 
 from gsgan.data.formats.capture import read_capture
 from gsgan.prepare.frames import look, sample
-from gsgan.prepare.one_camera import FOCAL, stated_focal
+from gsgan.prepare.one_camera import FOCAL, doubtful_poses, stated_focal
 from gsgan.prepare.one_view import Seen, solve_view
 from gsgan.prepare.options import Options
 from gsgan.prepare.run import prepare
@@ -181,3 +181,8 @@ def test_a_moving_camera_is_measured(tmp_path):
     )
     assert look(paths, px)[1] == pytest.approx(72 / 800, rel=0.1)
     assert look([paths[0]] * 10, px)[1] < 0.002
+
+
+def test_a_frame_without_a_landmark_hides_no_doubtful_pose():
+    errors = np.array([[1.0, 2], [np.nan, 2], [np.nan, np.nan], [20, 30], [2, 2]])
+    assert doubtful_poses(errors).tolist() == [False, False, False, True, False]

@@ -39,7 +39,7 @@ from gsgan.prepare.stages import StageFolder
 from gsgan.prepare.triangulate import exchanged
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.skeleton.hands import HAND
-from gsgan.utils.arrays import Bool, Float, Ints, expect_array
+from gsgan.utils.arrays import Bool, Float, Ints, expect_array, nanmedian
 from gsgan.utils.errors import DataError
 
 # the diagonal of film in millimetres, to which equivalent focal lengths refer
@@ -126,8 +126,7 @@ def solve_video(options: Options, stages: StageFolder, console: Console) -> Film
         view = _solve(options, detected[used], time[used], source.size, guess)
 
     # frames that fit much worse than the others
-    errors = np.nanmedian(view.error.numpy(), axis=1)
-    doubtful = errors > DOUBTFUL * np.nanmedian(errors)
+    doubtful = doubtful_poses(view.error.numpy())
     left["doubtful pose"] = np.zeros(len(numbers), bool)
     left["doubtful pose"][used[doubtful]] = True
     good = ~doubtful
@@ -165,6 +164,17 @@ def solve_video(options: Options, stages: StageFolder, console: Console) -> Film
         round(1 / float(np.median(np.diff(time))), 3),
     )
     return Filmed(inputs, masks, numbers[kept], solution, measured)
+
+
+def doubtful_poses(errors: Float) -> Bool:
+    """``[F]`` whether a frame fits much worse than the others.
+
+    Args:
+        errors: ``[F, L]`` pixels, the error of each landmark; NaN if it was not seen. A frame
+            without a seen landmark is not doubtful.
+    """
+    medians = nanmedian(errors, axis=1)
+    return medians > DOUBTFUL * nanmedian(medians, axis=0)
 
 
 def _read(path: Path, numbers: Ints, size: tuple[int, int]) -> tuple[Detected, Bool]:
