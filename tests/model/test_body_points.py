@@ -299,7 +299,7 @@ def test_the_jacobian_is_that_of_the_learnt_weights(body):
         pose = replace(rest(body), theta=0.4 * torch.randn(1, len(body.joints), 3))
         points = placed(pose)
         bones = placed.points.with_bones(pose).bones
-        own = placed.own_columns, placed.own_factors
+        own = placed.gradients(placed.points.bone_index, placed.points.bone_weight)
         wrong = stretched(points.frames, bones, *own)
     a, b = body.faces[:, 0], body.faces[:, 1]
     edge = (body.vertices[b] - body.vertices[a]).float().unsqueeze(-1)

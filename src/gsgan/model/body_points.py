@@ -267,11 +267,11 @@ class BodyPoints(nn.Module):
         )
         self.stretch = stretch
         if stretch:
-            own = self.points.bone_index, self.points.bone_weight
             self.gradients = WeightGradients(body, self.points.chosen)
-            columns, factors = self.gradients(*own)
-            self.register_buffer("own_columns", columns, persistent=False)
-            self.register_buffer("own_factors", factors, persistent=False)
+            if self.points.learnt is None:
+                columns, factors = self.gradients(*self.points.weights)
+                self.register_buffer("own_columns", columns, persistent=False)
+                self.register_buffer("own_factors", factors, persistent=False)
 
     @property
     def n_points(self) -> int:
