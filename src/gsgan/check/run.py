@@ -77,7 +77,6 @@ def unreadable(root: str | None, messages: Sequence[str]) -> CheckReport:
 def check_capture(root: Path, path: Path, console: Console) -> CheckReport:
     """Checks a capture with the default settings, see `write_report`."""
     from gsgan.data.datamodule import GsganData
-    from gsgan.data.formats.capture import CaptureReader
 
     data = GsganData(root=str(root), reader=CaptureReader())
     report = check_data(data, Sampling(), Limits(), console=console)

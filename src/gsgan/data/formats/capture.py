@@ -53,6 +53,7 @@ from gsgan.utils.arrays import expect_array
 from gsgan.utils.checks import is_number, whole
 from gsgan.utils.errors import DataError
 
+T = TypeVar("T")
 LANDMARKS = "landmarks3d.npz"
 HANDS_FILE = "hands3d.npz"
 FACE_FILE = "face3d.npz"
@@ -166,9 +167,6 @@ def _find(
         ),
         notes=tuple(notes),
     )
-
-
-T = TypeVar("T")
 
 
 def capture_problems(root: Path, limits: Thresholds) -> list[str]:
