@@ -56,7 +56,7 @@ format: $(STAMP) ## fix and format the code with ruff
 
 docs: $(STAMP) ## build the website of the documentation into build/site
 	$(BIN)/python -m mkdocs build --quiet --strict
-	@$(BIN)/python scripts/figures_age.py
+	-@$(BIN)/python scripts/figures_age.py # needs the history of git
 	@echo "build/site/index.html"
 
 wheel: $(STAMP) ## build the wheel into dist/

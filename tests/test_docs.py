@@ -1,5 +1,6 @@
 """The docs say what is there: pages, links, budgets, the comments of conf/, the website."""
 
+import importlib
 import re
 import subprocess
 import sys
@@ -202,3 +203,14 @@ def test_make_targets_of_the_docs_exist():
 def test_ci_calls_the_readmes_test_command():
     assert "make test" in (ROOT / ".ci" / "run").read_text()
     assert "make test" in (ROOT / "README.md").read_text()
+
+
+def test_the_age_of_a_pages_figures_counts_from_the_commits_that_it_names(
+    tmp_path, monkeypatch
+):
+    monkeypatch.syspath_prepend(str(ROOT / "scripts"))
+    figures_age = importlib.import_module("figures_age")
+    page = tmp_path / "page.md"
+    page.write_text("Commit d9dcc37, later 818c7cf8d32a; 1234567 is no commit.")
+    later = {"d9dcc37": 11, "818c7cf": 4, "0000000": 2}
+    assert figures_age.ages(page, later) == [4, 11]

@@ -24,15 +24,25 @@ MOVED = {"gsgan.model.assemble.": "gsgan.run.assemble."}
 CONFIG = Path(".hydra") / "config.yaml"
 # Keys that may differ between a run and its continuation: they do not change what it learns.
 FREE_KEYS = (
-    *("trainer", "logger", "resume", "evaluate", "grid_rows", "lpips", "cpu_hours"),
-    *("objective", "page"),
-    *("data.root", "data.smpl", "data.workers", "data.cache_mb", "data.val_images"),
-    *(
-        "data.source.workers",
-        "training.max_skipped",
-        "training.skip_window",
-        "model.backend",
-    ),
+    "trainer",
+    "logger",
+    "callbacks",
+    "resume",
+    "evaluate",
+    "grid_rows",
+    "lpips",
+    "cpu_hours",
+    "objective",
+    "page",
+    "data.root",
+    "data.smpl",
+    "data.workers",
+    "data.cache_mb",
+    "data.val_images",
+    "data.source.workers",
+    "training.max_skipped",
+    "training.skip_window",
+    "model.backend",
 )
 
 

@@ -112,9 +112,10 @@ def run_training(config: DictConfig) -> None:
     logs = "logs" if resume is None else f"logs_{done:06d}"
     trainer = build_trainer(config, folder, module, data, console, logs, stop)
     _fit(trainer, module, data, resume, folder, console)
-    if stop.asked and module.step < module.schedule.total:
+    if module.step < module.schedule.total:
+        cause = "signal" if stop.asked else "callback"
         console.print(
-            f"stopped by a signal at iteration {module.step}; the same command with "
+            f"stopped by a {cause} at iteration {module.step}; the same command with "
             f"hydra.run.dir={folder} goes on",
             soft_wrap=True,
         )
@@ -458,7 +459,7 @@ def describe(
         )
         table.add_row("", f"{avatar.segmentation_why}; S learns from {source}")
 
-    # How it computes, and for how long.
+    # The rasteriser, the precision and the schedule.
     if avatar.splats is not None:
         backend = resolve_backend(avatar.backend, device_of(config), avatar.accuracy)[0]
         table.add_row("rasteriser", backend)
