@@ -62,14 +62,15 @@ SAMPLING = (
     "batch_size",
     "val_images",
 )
-# Metric: heading, digits, and 1 where more is better, -1 where less is.
+# Metric: heading, digits, 1 where more is better or -1 where less is, and the margin within which
+# two means over a few images count as equal.
 QUALITIES = {
-    "psnr": ("PSNR dB", 2, 1),
-    "ssim": ("SSIM", 4, 1),
-    "edge_f1": ("edge F1", 3, 1),
-    "lpips": ("LPIPS", 4, -1),
+    "psnr": ("PSNR dB", 2, 1, 0.2),
+    "ssim": ("SSIM", 4, 1, 0.001),
+    "edge_f1": ("edge F1", 3, 1, 0.005),
+    "lpips": ("LPIPS", 4, -1, 0.001),
     # of another capture of the person, where one is given
-    "far": ("far PSNR dB", 2, 1),
+    "far": ("far PSNR dB", 2, 1, 0.2),
 }
 # The base point's first, then Okabe and Ito's, which are distinct with any colour vision.
 ORDER = (
@@ -420,19 +421,19 @@ def make_rows(
 
 
 def front(frame: pd.DataFrame, metric: str) -> list[int]:
-    """The Pareto front: indices of the rows that no other beats, from the fastest up.
+    """Indices of the rows whose score no faster row reaches within the metric's margin.
 
-    Convention: a row is beaten when another is at least as good in time and in the metric, and
-    better in one; of equal rows all stay; those without a score are left out.
+    They run from the fastest up. Rows without a score are left out.
     """
-    ms = frame.ms.to_numpy()
-    score = frame[metric].to_numpy(dtype=float) * QUALITIES[metric][2]
+    _, _, sign, margin = QUALITIES[metric]
+    score = sign * frame[metric].to_numpy(dtype=float)
     found = []
-    for i in np.argsort(ms, kind="stable").tolist():
-        least = (ms <= ms[i]) & (score >= score[i])
-        beaten = least & ((ms < ms[i]) | (score > score[i]))
-        if np.isfinite(score[i]) and not beaten.any():
+    best = -math.inf
+    for i in np.argsort(frame.ms.to_numpy(), kind="stable").tolist():
+        if score[i] > best + margin:
             found.append(i)
+        if score[i] > best:
+            best = score[i]
     return found
 
 
@@ -453,8 +454,8 @@ def text(
         )
     heading = (
         f"{about['images']} images of {about['split']}; settings changed on {about['subject']}; "
-        f"one image at a time. Front: nothing is as fast and scores as much "
-        f"({QUALITIES[metric][0]})."
+        "one image at a time. Front: nothing faster comes within "
+        f"{QUALITIES[metric][3]:g} of its score ({QUALITIES[metric][0]})."
     )
     listed = "\n".join(f"- {note}" for note in notes)
     return f"{common.sentence(where)}.\n\n{heading}\n\n{table(frame, metric)}\n\n{listed}".strip()
@@ -464,7 +465,7 @@ def table(frame: pd.DataFrame, metric: str) -> str:
     """The rows in Markdown."""
     seeds = [f" ({n} seeds)" if n > 1 else "" for n in frame.seeds]
     shown = pd.DataFrame({"changed": frame.factor, "to": frame.label + seeds})
-    for name, (heading, digits, _) in QUALITIES.items():
+    for name, (heading, digits, *_) in QUALITIES.items():
         if frame[name].notna().any():
             shown[heading] = [
                 NOTHING if pd.isna(v) else f"{v:.{digits}f}" for v in frame[name]
@@ -499,7 +500,7 @@ def plot(frame: pd.DataFrame, metrics: Sequence[str]) -> bytes:
     metrics = [m for m in metrics if frame[m].notna().any()] or metrics[:1]
     figure, all_axes = bench_common.panels(len(metrics), 6.4 * len(metrics), 5.6)
     for axes, metric in zip(all_axes, metrics, strict=True):
-        heading, _, sign = QUALITIES[metric]
+        heading, _, sign, _ = QUALITIES[metric]
         ahead = frame.iloc[front(frame, metric)]
         label = "front: nothing beats these"
         axes.step(
