@@ -1,6 +1,6 @@
 """A capture as a torch dataset of `Frame`, one camera and frame per item; its sampling order."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -156,20 +156,29 @@ class CaptureDataset(Dataset[Frame]):
         )
         return found if self.packed else found.unpacked()
 
+    def mask(self, index: int) -> tuple[Bytes, Bytes | None]:
+        """The mask ``[H, W]`` of an item and its unsure pixels, 0..255; reads no image.
+
+        Raises:
+            DataError: when the mask's file is damaged, naming the file.
+        """
+        item = self.items[index]
+        fit = self._fitting(item)
+        mask, unsure = self._stored_mask(item)
+        mask = fit(mask, self.layout.pixels.mask_sampling == "nearest")
+        if unsure is not None:
+            unsure = fit(unsure, True)
+        return mask, unsure
+
     def inside(self, index: int) -> Tensor | None:
         """``[1, 1, H, W]`` 1 at pixels of the item that lie in the stored image; None if all do.
 
         Windows reach beyond borders, and undistorted images have empty rims.
         """
         item = self.items[index]
-        window = self.window(item)
-        camera = self._entry(item)
-
         # A white image, cropped and resized like the item's: what stays white is inside.
-        white = np.full(camera.size, 255, np.uint8)
-        mapping = self._mapping(camera, window)
-        taken = cropping.take(white, window, mapping, exact=True)
-        taken = cropping.resize(taken, self._target(window), exact=True)
+        white = np.full(self._entry(item).size, 255, np.uint8)
+        taken = self._fitting(item)(white, True)
         return None if taken.all() else unit(torch.from_numpy(taken))[None, None]
 
     def _entry(self, item: Item) -> CameraEntry:
@@ -216,40 +225,57 @@ class CaptureDataset(Dataset[Frame]):
     def _load(self, item: Item) -> DecodedImage:
         camera = self._entry(item)
 
-        # How this dataset stores masks, and the window of the item.
+        # How this dataset stores masks.
         rules = self.layout.pixels
-        window = self.window(item)
-        mapping = self._mapping(camera, window)
-        size = self._target(window)
-
-        def fit(image: Bytes, exact: bool) -> Bytes:
-            taken = cropping.take(image, window, mapping, exact)
-            return cropping.resize(taken, size, exact)
+        fit = self._fitting(item)
 
         # Mask and image as stored.
-        mask_files = self.layout.mask_files(*item)
-        mask = pixels.read_mask(mask_files, rules)
-        unsure = pixels.read_unsure(mask_files, mask, rules)
+        mask, unsure = self._stored_mask(item)
         image = read_colour(self.layout.image_path(*item))
         self._check_size(self.layout.image_path(*item), image, camera)
-        self._check_size(self.layout.mask_path(*item), mask, camera)
 
         # Blacked out before anything is interpolated, so that no background bleeds in.
-        image = fit(cropping.black_out(image, mask, rules.composed), exact=False)
+        image = cropping.black_out(image, mask, rules.composed)
+        image = fit(image, False)
 
         # Labels near the stored mask's outline, before the mask is resampled.
         labels = self._label_image(item)
         if labels is not None:
             if self.ignore_band:
                 labels = pixels.with_ignored_border(labels, mask, rules.ignore_band)
-            labels = fit(labels, exact=True)
+            labels = fit(labels, True)
         if unsure is not None:
-            unsure = fit(unsure, exact=True)
-        mask = fit(mask, exact=rules.mask_sampling == "nearest")
+            unsure = fit(unsure, True)
+        mask = fit(mask, rules.mask_sampling == "nearest")
 
         # Channels first, as networks take them.
         chw = np.ascontiguousarray(image.transpose(2, 0, 1))
         return DecodedImage(chw, mask, labels, unsure)
+
+    def _stored_mask(self, item: Item) -> tuple[Bytes, Bytes | None]:
+        """The mask of an item and its unsure pixels, as stored."""
+        rules = self.layout.pixels
+        mask_files = self.layout.mask_files(*item)
+        mask = pixels.read_mask(mask_files, rules)
+        unsure = pixels.read_unsure(mask_files, mask, rules)
+        self._check_size(self.layout.mask_path(*item), mask, self._entry(item))
+        return mask, unsure
+
+    def _fitting(self, item: Item) -> Callable[[Bytes, bool], Bytes]:
+        """Undistorts a stored image, cuts it to the item's window and resizes it.
+
+        The function takes an image and whether its values may not be mixed.
+        """
+        # All images of an item share one mapping, which takes longer than its use.
+        window = self.window(item)
+        mapping = self._mapping(self._entry(item), window)
+        size = self._target(window)
+
+        def fit(image: Bytes, exact: bool) -> Bytes:
+            taken = cropping.take(image, window, mapping, exact)
+            return cropping.resize(taken, size, exact)
+
+        return fit
 
     @staticmethod
     def _check_size(path: Path, image: Bytes, camera: CameraEntry) -> None:

@@ -332,7 +332,7 @@ def moved_normals(A: Tensor, normals: Tensor) -> Tensor:
 
 
 def farthest_points(vertices: Tensor, count: int) -> Tensor:
-    """``[count]`` indices of vertices ``[V, 3]`` far from each other, the first one first.
+    """``[count]`` indices of vertices ``[V, D]`` far from each other, the first one first.
 
     Meshes are dense in faces and hands; a subset in list order would leave arms and legs thin.
     A count of V keeps the mesh's own order.
@@ -344,8 +344,8 @@ def farthest_points(vertices: Tensor, count: int) -> Tensor:
     chosen = np.zeros(count, np.int64)
     nearest = np.full(len(vertices), np.inf, axes.dtype)
     for i in range(1, count):
-        x, y, z = (axes - axes[:, chosen[i - 1], None]) ** 2
-        np.minimum(nearest, x + y + z, out=nearest)
+        squared = (axes - axes[:, chosen[i - 1], None]) ** 2
+        np.minimum(nearest, squared.sum(0), out=nearest)
         chosen[i] = nearest.argmax()
     return torch.from_numpy(chosen)
 
