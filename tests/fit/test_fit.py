@@ -3,6 +3,7 @@
 import json
 import shutil
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -21,9 +22,10 @@ from gsgan.data.datamodule import GsganData
 from gsgan.evaluate.origin import fingerprint
 from gsgan.evaluate.run import make_scorer
 from gsgan.fit.fitter import Fitter, _wrong
-from gsgan.fit.frames import MaskedFrames
+from gsgan.fit.frames import MaskedFrames, rotated, spread_frames
 from gsgan.fit.run import fit_before_training, run_fit
 from gsgan.fit.shape import fit_shape
+from gsgan.run.assemble import moves_with_body
 from gsgan.scene import BodyPose
 from gsgan.train.run import training_record
 from gsgan.utils.errors import ConfigError, DataError
@@ -307,23 +309,23 @@ def test_outside_the_image_alpha_costs_nothing(people, tmp_path, compose):
     oblong = write_tiny_capture(tmp_path / "oblong", cameras=2, frames=2, size=(96, 64))
     data = GsganData(str(oblong), size=48)
     frames = MaskedFrames(data, torch.device("cpu"))
-    frame = frames.images(0)[0]
+    frame = frames.silhouettes(0)[0]
     beyond = frame.unsure > 0.5
     assert beyond.float().mean() == pytest.approx(1 / 3)
     assert float(frame.mask[beyond].max()) == 0
     everything = torch.ones_like(frame.mask)
     assert float(_wrong(everything, frame)[beyond].max()) == 0
     inside = GsganData(str(people), size=48)
-    assert MaskedFrames(inside, torch.device("cpu")).images(0)[0].unsure is None
+    assert MaskedFrames(inside, torch.device("cpu")).silhouettes(0)[0].unsure is None
 
 
 def test_the_rims_of_an_undistorted_image_are_unsure(tmp_path):
     bent = write_tiny_capture(
         tmp_path / "bent", cameras=2, frames=2, size=(96, 96), dist=(0.3, 0, 0, 0, 0)
     )
-    frame = MaskedFrames(GsganData(str(bent), size=48), torch.device("cpu")).images(0)[
-        0
-    ]
+    frame = MaskedFrames(
+        GsganData(str(bent), size=48), torch.device("cpu")
+    ).silhouettes(0)[0]
     assert float(frame.unsure[0, 0, 0, 0]) == 1
     assert float(frame.unsure[0, 0, 24, 24]) == 0
 
@@ -370,3 +372,60 @@ def test_a_truncated_shape_is_named(fitted, tmp_path):
     path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(DataError, match="body_shape"):
         GsganData(str(root), size=48).setup()
+
+
+def test_no_image_is_read(fit, monkeypatch):
+    def read(path):
+        raise AssertionError(path)
+
+    monkeypatch.setattr("gsgan.data.dataset.read_colour", read)
+    assert len(fit("fit.sweeps=1")["theta"]) == 5
+
+
+def test_a_long_capture_is_registered_in_a_few_frames(fit, tmp_path):
+    """All poses are written all the same; registered ones are kept of all frames or none."""
+    found = fit("fit.frames=2", "fit.cameras=2", keep=False)
+    assert np.isfinite(found["theta"]).all()
+    assert len(found["theta"]) == 5
+    report = json.loads((tmp_path / "out/body_fit.json").read_text())
+    assert len(report["frames"]) == 2
+    assert fit("fit.frames=2", name="kept")["registered"].tolist() == [0, 1, 2]
+
+
+def test_frames_with_poses_far_from_each_other_are_used(people, monkeypatch):
+    data = GsganData(str(people), size=48)
+    landmarks = data.layout.landmarks
+    frames = [*data.trained, *data.trained]
+    assert spread_frames(data, data.trained, 3) == data.trained
+    assert spread_frames(data, frames, 5) == data.trained
+    p = dict(landmarks.p)
+    p[1] = p[0] + 0.001
+    p[2] = p[0] + 0.5 * (p[3] - p[0])
+    moved = replace(data.layout, landmarks=replace(landmarks, p=p))
+    monkeypatch.setitem(vars(data), "layout", moved)
+    assert spread_frames(data, data.trained, 2) == [0, 2]
+
+
+def test_cameras_rotate():
+    cameras = ["a", "b", "c", "d"]
+    assert rotated(cameras, None, 1) == cameras
+    assert rotated(cameras, 4, 1) == cameras
+    used = [rotated(cameras, 2, turn) for turn in range(4)]
+    assert all(len(set(pair)) == 2 for pair in used)
+    assert {camera for pair in used for camera in pair} == set(cameras)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "moves"),
+    [
+        (["model=full"], True),
+        (["model=lbs_splat"], True),
+        (["model=splat_only"], True),
+        (["model=splat_only", "effects.body_points=off"], False),
+        (["model=wo_seg", "effects.body_points=off"], False),
+        (["model=full", "effects.body_points=off"], True),
+        (["model=image_to_image"], False),
+    ],
+)
+def test_only_models_that_move_with_a_body_need_a_fit(compose, overrides, moves):
+    assert moves_with_body(compose("train", *overrides)) is moves

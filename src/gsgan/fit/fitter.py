@@ -9,9 +9,9 @@ from torch import Tensor, nn
 
 from gsgan.body import Body, blend_transforms, skin
 from gsgan.body.skinned import carry, vertex_normals
-from gsgan.fit.frames import MaskedFrames, around
+from gsgan.fit.frames import MaskedFrames, Silhouette, around
 from gsgan.model.body_points import SkinnedPoints, farthest_points
-from gsgan.scene import BodyPose, Camera, Frame, Gaussians
+from gsgan.scene import BodyPose, Camera, Gaussians
 from gsgan.splat import Accuracy, rasterise
 from gsgan.utils.checks import above, at_least, between, whole
 from gsgan.utils.errors import ConfigError
@@ -40,6 +40,7 @@ class Fit:
     points: int = 3000
     surface_steps: int = 150
     sweeps: int = 15
+    frames: int = 100
     cameras: int = 8
     noise: float = 0.02
     landmarks: float = 0.02
@@ -56,6 +57,7 @@ class Fit:
             )
         whole("fit.surface_steps", self.surface_steps, 0)
         whole("fit.sweeps", self.sweeps, 1)
+        whole("fit.frames", self.frames, 1)
         whole("fit.cameras", self.cameras, 1)
         whole("fit.points", self.points, 1)
         above("fit.least_mask", self.least_mask)
@@ -205,7 +207,7 @@ class Fitter:
         i = chance.randrange(len(self.start.theta))
         with torch.no_grad():
             pose = self.pose(torch.tensor([i]))
-        share, _ = self._share(i, pose, chance)
+        share, _ = self._share(i, pose)
         self.surface_optimiser.zero_grad()
         share.backward()  # type: ignore[no-untyped-call]
         self.surface_optimiser.step()
@@ -220,7 +222,7 @@ class Fitter:
         chance.shuffle(order)
         for i in order:
             pose = self.pose(torch.tensor([i]))
-            share, landmarks = self._share(i, pose, chance)
+            share, landmarks = self._share(i, pose)
 
             # the priors of landmarks (robust, linear far away) and of angles
             square = (landmarks[0] - self.frames.skeletons[i]).square().sum(-1)
@@ -251,40 +253,34 @@ class Fitter:
 
             # Unsure pixels do not count.
             ious = []
-            for frame in self._windows(i):
-                filled = self.surface.alpha(person, frame.camera) > 0.5
-                mask = frame.mask > 0.5
-                if frame.unsure is not None:
-                    filled &= frame.unsure < 0.5
-                    mask &= frame.unsure < 0.5
+            for seen in self._windows(i):
+                filled = self.surface.alpha(person, seen.camera) > 0.5
+                mask = seen.mask > 0.5
+                if seen.unsure is not None:
+                    filled &= seen.unsure < 0.5
+                    mask &= seen.unsure < 0.5
                 union = (filled | mask).sum().item()
                 if union:
                     ious.append((filled & mask).sum().item() / union)
             by_frame.append(sum(ious) / len(ious) if ious else math.nan)
         return torch.tensor(by_frame)
 
-    def _share(
-        self, i: int, pose: BodyPose, chance: random.Random
-    ) -> tuple[Tensor, Tensor]:
+    def _share(self, i: int, pose: BodyPose) -> tuple[Tensor, Tensor]:
         """Wrong alpha as a share of the masks, and the posed landmarks."""
-        frames = self._windows(i)
-        # a few random cameras are enough for a step
-        if len(frames) > self.settings.cameras:
-            frames = chance.sample(frames, self.settings.cameras)
         person, landmarks = self.surface.posed(pose)
         wrong = []
         areas = []
-        for frame in frames:
-            alpha = self.surface.alpha(person, frame.camera)
-            wrong.append(_wrong(alpha, frame).sum())
-            areas.append(frame.mask.sum())
+        for seen in self._windows(i):
+            alpha = self.surface.alpha(person, seen.camera)
+            wrong.append(_wrong(alpha, seen).sum())
+            areas.append(seen.mask.sum())
         area = torch.stack(areas).sum().clamp_min(1.0)
         return torch.stack(wrong).sum() / area, landmarks
 
-    def _windows(self, i: int) -> list[Frame]:
+    def _windows(self, i: int) -> list[Silhouette]:
         """The compared parts of the i-th frame's images."""
         skeleton = self.frames.skeletons[i]
-        return [around(skeleton, frame) for frame in self.frames.images(i)]
+        return [around(skeleton, seen) for seen in self.frames.silhouettes(i)]
 
     def _set_rates(self) -> None:
         """Learning rates of this sweep: held first, then a cosine down to `FINAL_RATE`."""
@@ -299,9 +295,9 @@ class Fitter:
         self.pose_optimiser.param_groups[0]["lr"] = angle_rate
 
 
-def _wrong(alpha: Tensor, frame: Frame) -> Tensor:
+def _wrong(alpha: Tensor, seen: Silhouette) -> Tensor:
     """The difference of alpha and mask; 0 where the image is unknown."""
-    difference = (alpha - frame.mask).abs()
-    if frame.unsure is None:
+    difference = (alpha - seen.mask).abs()
+    if seen.unsure is None:
         return difference
-    return difference * (1 - frame.unsure)
+    return difference * (1 - seen.unsure)

@@ -1,7 +1,7 @@
 """The frames of a capture that the fit uses, with their masks."""
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +15,7 @@ from gsgan.data.splits import Item
 from gsgan.data.training_poses import pose_in_pelvis
 from gsgan.model.body_points import farthest_points
 from gsgan.scene import Camera, Window, body_window, unit
+from gsgan.utils.arrays import Bytes, evenly_spaced
 from gsgan.utils.errors import DataError
 
 NEAR = 0.01  # metres: nearer joints are not projected
@@ -77,23 +78,118 @@ class MaskedFrames:
         layout = data.layout
         cameras = data.splits.train_cameras
 
-        # the frames, and of each the cameras
+        # the frames, and the cameras of each
         used = layout.frames if held_out else data.trained
-        used = spread_frames(data, used, most_frames)
+        if most_frames is not None:
+            used = spread_frames(data, used, most_frames)
         items: list[Item] = []
         for turn, frame in enumerate(used):
-            seen = [camera for camera in cameras if frame in layout.images[camera]]
-            for camera in rotated(seen, most_cameras, turn):
+            seeing = [camera for camera in cameras if frame in layout.images[camera]]
+            for camera in rotated(seeing, most_cameras, turn):
                 items.append((camera, frame))
         self.dataset = CaptureDataset(
             layout, items, data.size, data.crop, lens=data.lens
         )
         self.cameras = cameras
         self.device = device
+        self._masks: dict[int, tuple[Bytes, Bytes | None]] = {}
+        for place in track(range(len(items))):
+            self._masks[place] = self._read(place)
 
-        # the masks of each frame
-        found = self._usable([self._read(place) for place in track(range(len(items)))], least_mask)
+        # the masks of each frame, as places in the data set
+        places = self._usable(least_mask)
         if not places:
             raise DataError(
                 f"{layout.root}: the masks of {', '.join(cameras)} hold no person"
             )
+        self.left_out = len(items) - len(places)
+        by_frame: dict[int, list[int]] = defaultdict(list)
+        for place in places:
+            _, frame = items[place]
+            by_frame[frame].append(place)
+        self.frames = tuple(sorted(by_frame))
+        self._places = by_frame
+        self.skeletons = self._stacked(layout.landmarks.p)
+        self.visibility = self._stacked(layout.landmarks.visibility)
+
+    def silhouettes(self, i: int) -> list[Silhouette]:
+        """The masks of the i-th frame, one per camera."""
+        return [self._silhouette(place) for place in self._places[self.frames[i]]]
+
+    def _read(self, place: int) -> tuple[Bytes, Bytes | None]:
+        """A mask and its unsure pixels, 0..255.
+
+        Pixels outside the camera's image are unsure, as are those that the mask marks.
+        """
+        mask, unsure = self.dataset.mask(place)
+        inside = self.dataset.inside(place)
+        if inside is not None:
+            outside = np.where(inside[0, 0].numpy() < 0.5, 255, 0).astype(np.uint8)
+            unsure = outside if unsure is None else np.maximum(unsure, outside)
+        return mask, unsure
+
+    def _silhouette(self, place: int) -> Silhouette:
+        mask, unsure = self._masks[place]
+        return Silhouette(
+            mask=unit(torch.from_numpy(mask))[None, None].to(self.device),
+            camera=self.dataset.camera(self.dataset.items[place]).to(self.device),
+            unsure=None
+            if unsure is None
+            else unit(torch.from_numpy(unsure))[None, None].to(self.device),
+        )
+
+    def _usable(self, least: float) -> list[int]:
+        """Places of the images whose masks hold enough of the person.
+
+        Areas are of the part that is compared, in square metres at the person's depth: masks
+        shrink with the distance, and the rest of an image may show other persons.
+        """
+        landmarks = self.dataset.layout.landmarks
+        areas = []
+        for place in range(len(self.dataset)):
+            _, frame = self.dataset.items[place]
+            skeleton = torch.from_numpy(landmarks.p[frame]).to(
+                self.device, torch.float32
+            )
+            seen = around(skeleton, self._silhouette(place))
+            mask = seen.mask
+            if seen.unsure is not None:
+                mask = mask * (1 - seen.unsure)
+            depth = seen.camera.to_camera(skeleton[None])[0, :, 2].median()
+            pixel = (depth / seen.camera.K[0, 0, 0]).square()
+            areas.append(float(mask.sum() * pixel))
+
+        known = [area for area in areas if area > 0]
+        usual = float(np.quantile(known, USUAL)) if known else np.inf
+        return [place for place, area in enumerate(areas) if area >= least * usual]
+
+    def _stacked(self, by_frame: Mapping[int, NDArray[np.float64]]) -> Tensor:
+        values = np.stack([by_frame[frame] for frame in self.frames])
+        return torch.from_numpy(values).to(self.device, torch.float32)
+
+
+def spread_frames(data: GsganData, frames: Sequence[int], most: int) -> list[int]:
+    """At most so many frames, rising, whose poses are far from each other."""
+    if len(frames) <= most:
+        return list(frames)
+    p, _ = data.layout.landmarks.joints(frames)
+    chosen = farthest_points(pose_in_pelvis(p), most)
+    return sorted({frames[i] for i in chosen.tolist()})
+
+
+def rotated(cameras: Sequence[str], most: int | None, turn: int) -> list[str]:
+    """At most so many cameras, evenly spaced; the next turn takes their neighbours."""
+    if most is None or len(cameras) <= most:
+        return list(cameras)
+    places = [
+        (turn + place) % len(cameras) for place in evenly_spaced(len(cameras), most)
+    ]
+    return [cameras[place] for place in sorted(places)]
+
+
+def around(skeleton: Tensor, seen: Silhouette) -> Silhouette:
+    """The part of an image around ``skeleton [J, 3]`` that is compared with the mask."""
+    window = body_window(
+        skeleton[None], seen.camera, margin=MARGIN, multiple=16, least=32, near=NEAR
+    )
+    return seen.cut(window)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from copy import copy
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +29,9 @@ from gsgan.data.validation import spans
 from gsgan.fit.fitter import Fit, Fitter
 from gsgan.fit.frames import MaskedFrames
 from gsgan.fit.shape import fit_hands, fit_offsets, fit_shape
-from gsgan.scene import BodyPose
+from gsgan.scene import BodyPose, cat
 from gsgan.skeleton import MEDIAPIPE33, TEMPLATES
-from gsgan.utils.console import make_console, progress
+from gsgan.utils.console import make_console, progress, working
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import locked, write_atomically, write_json, write_npz, writing
 from gsgan.utils.tensors import pick_device
@@ -120,6 +120,7 @@ def summary(report: dict[str, Any], folder: Path, masked: MaskedFrames) -> list[
 SIZE = 128  # pixels of the images that the fit before training uses
 MARGIN = 0.2  # metres around the person in these images
 LOCK = ".body_fit.lock"
+BLOCK = 500  # frames whose poses are solved at once, which bounds memory
 
 
 def run_fit(config: DictConfig) -> Path:
@@ -210,9 +211,19 @@ def fit_body(
     folder = layout.root if out is None else Path(out).expanduser()
     _make_folder(folder, overwrite)
 
-    # the frames with a person in their masks
-    with console.status("reading masks"):
-        frames = MaskedFrames(data, device, settings.least_mask, settings.held_out)
+    # the frames with a person in their masks; registered poses are kept of all or none
+    keeps = settings.held_out or settings.keep
+    refuse_swapped_sides(layout, data.trained)
+    with progress(console) as bars:
+        frames = MaskedFrames(
+            data,
+            device,
+            settings.least_mask,
+            settings.held_out,
+            most_frames=None if keeps else settings.frames,
+            most_cameras=settings.cameras,
+            track=partial(bars.track, description="masks"),
+        )
     if frames.left_out:
         console.print(
             f"{frames.left_out} images with empty masks, or nearly so, are left out"
@@ -220,11 +231,10 @@ def fit_body(
     rows = torch.tensor([layout.frames.index(frame) for frame in frames.frames])
 
     # the shape and the poses by the skeletons
-    with console.status("solving poses"):
-        refuse_swapped_sides(layout, data.trained)
+    with working(console, "solving shape and poses"):
         joints, visibility = _joints(data, data.trained)
         shape = fit_shape(joints, visibility)
-        start = _solve_with_fingers(data, shape)[rows]
+        start = _solve_with_fingers(data, shape, frames.frames)
 
     # the poses by the masks, and with them the places of the landmarks
     fitter = Fitter(settings, frames, shaped_body(shape), start, seed)
@@ -234,13 +244,12 @@ def fit_body(
         shape = _refined(data, shape, frames.frames, registered)
 
     # all poses by the skeletons again
-    poses = {False: _solve(data, shape, layout.frames)}
+    poses = {False: _solve_all(data, shape, console)}
     if layout.hands is not None:
-        poses[True] = _solve(data, shape, layout.frames, hands=True)
+        poses[True] = _solve_all(data, shape, console, hands=True)
     driven = poses[_by_hands(data)][rows].to(device)
     report = fit_report(fitter, shaped_body(shape).to(device), driven, found)
 
-    keeps = settings.held_out or settings.keep
     write_json(folder / REPORT, report)
     _write_body(
         folder=folder,
@@ -353,12 +362,28 @@ def _solve(
         raise DataError(f"{data.layout.root / LANDMARKS}: {error} ({names})") from None
 
 
-def _solve_with_fingers(data: GsganData, shape: BodyShape) -> BodyPose:
-    """Poses of all frames by 33 landmarks, with the fingers that hand landmarks show."""
-    solved = _solve(data, shape, data.layout.frames)
+def _solve_all(
+    data: GsganData, shape: BodyShape, console: Console, hands: bool = False
+) -> BodyPose:
+    """The poses of all frames, block by block."""
+    frames = data.layout.frames
+    blocks = []
+    with progress(console) as bars:
+        starts = range(0, len(frames), BLOCK)
+        for start in bars.track(starts, description="poses from skeletons"):
+            block = frames[start : start + BLOCK]
+            blocks.append(_solve(data, shape, block, hands=hands))
+    return cat(blocks)
+
+
+def _solve_with_fingers(
+    data: GsganData, shape: BodyShape, frames: Sequence[int]
+) -> BodyPose:
+    """Poses by 33 landmarks, with the fingers that hand landmarks show."""
+    solved = _solve(data, shape, frames)
     if _by_hands(data):
         fingers = _fingers(shape)
-        by_hands = _solve(data, shape, data.layout.frames, hands=True)
+        by_hands = _solve(data, shape, frames, hands=True)
         solved.theta[:, fingers] = by_hands.theta[:, fingers]
     return solved
 

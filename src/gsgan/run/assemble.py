@@ -18,6 +18,7 @@ from gsgan.body.skinned import MarkedBody
 from gsgan.body.solve import Solver
 from gsgan.data.scene_info import SceneInfo
 from gsgan.effects import Effects, EffectSettings, ModelParts, decide
+from gsgan.effects.record import OFF
 from gsgan.model.avatar import Avatar
 from gsgan.model.body_points import BodyPoints
 from gsgan.model.colour import ColourCorrection
@@ -47,6 +48,15 @@ def build_data(config: DictConfig) -> GsganData:
     data.prepare_data()
     data.setup()
     return data
+
+
+def moves_with_body(config: DictConfig) -> bool:
+    """Whether a config's model has parts that move with a skinned body, if the data has one."""
+    model = config.model
+    if model.get("segmentation") is not None or model.get("surface") is not None:
+        return True
+    on_body = _effect_settings(config).requested("body_points") != OFF
+    return model.get("body_points") is not None and on_body
 
 
 def build_avatar(

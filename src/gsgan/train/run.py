@@ -37,7 +37,12 @@ from gsgan.metrics.lpips import build_lpips
 from gsgan.model.avatar import Avatar
 from gsgan.model.harmonic import Harmonic, distilled
 from gsgan.motion.clip import FPS
-from gsgan.run.assemble import build_avatar, build_data, naming_group
+from gsgan.run.assemble import (
+    build_avatar,
+    build_data,
+    moves_with_body,
+    naming_group,
+)
 from gsgan.run.runs import load
 from gsgan.run.stored import CHECKPOINT, read_checkpoint, record
 from gsgan.scene import BodyPose
@@ -52,7 +57,7 @@ from gsgan.train.module import AvatarTraining
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import whole
 from gsgan.utils.config import BFLOAT16_SINCE, defaults_of
-from gsgan.utils.console import make_console
+from gsgan.utils.console import make_console, working
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.sweeps import STOPPED
 
@@ -83,7 +88,7 @@ def run_training(config: DictConfig) -> None:
         # fails now, not after hours of training
         build_lpips(config.lpips.nets, config.lpips.path)
 
-    data, module = build_training(config)
+    data, module = build_training(config, console)
     seed_everything(config.seed, workers=True, verbose=False)
     resume = (
         checkpoint_to_resume(folder, module.record, module.marks)
@@ -128,18 +133,25 @@ def run_training(config: DictConfig) -> None:
         console.print(f"run folder: {folder}", soft_wrap=True)
 
 
-def build_training(config: DictConfig) -> tuple[GsganData, AvatarTraining]:
-    """Data and training module of a config.
+def build_training(
+    config: DictConfig, console: Console | None = None
+) -> tuple[GsganData, AvatarTraining]:
+    """Data and training module of a config; ``console`` shows what takes long.
 
     Raises:
         GsganError: on a dataset or a value that cannot be used.
     """
     whole("seed", config.seed, 0)
-    data = build_data(config)
-    if data.lacks_body:
+    console = console or Console(quiet=True)
+    with working(console, "reading the data"):
+        data = build_data(config)
+    if data.lacks_body and moves_with_body(config):
         data = fit_before_training(data, config.fit, device_of(config))
-    avatar = build_avatar(config, data.info, data.labelled("train"))
-    _store_poses(avatar, data)
+    with working(console, "measuring the scene"):
+        info = data.info
+    with working(console, "building the avatar"):
+        avatar = build_avatar(config, info, data.labelled("train"))
+        _store_poses(avatar, data)
     # the same start beside every avatar
     torch.manual_seed(config.seed + DISCRIMINATOR_SALT)
     with naming_group("training"):
