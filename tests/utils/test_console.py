@@ -26,10 +26,8 @@ def test_progress_is_counted_in_a_log_file(monkeypatch):
             bars.advance(task)
 
     lines = logged(run).splitlines()
-    assert [line.partition(",")[0] for line in lines[:2]] == [
-        "masks: 1 of 3",
-        "masks: 2 of 3",
-    ]
+    counted = [line.partition(",")[0] for line in lines]
+    assert counted == ["masks: 1 of 3", "masks: 2 of 3"]
 
 
 def test_quick_work_leaves_a_log_file_empty():
@@ -37,7 +35,7 @@ def test_quick_work_leaves_a_log_file_empty():
         with working(console, "reading"), progress(console) as bars:
             assert list(bars.track(range(3))) == [0, 1, 2]
 
-    assert logged(run).strip() == ""
+    assert logged(run) == ""
 
 
 def test_slow_work_is_named_in_a_log_file(monkeypatch):

@@ -15,7 +15,6 @@ from matplotlib.figure import Figure
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError
 from rich.console import Console
-from rich.progress import track
 
 from gsgan.data.datamodule import GsganData
 from gsgan.data.metric_variants import MetricVariants
@@ -50,7 +49,7 @@ from gsgan.run.stored import (
     read_checkpoint,
     read_config,
 )
-from gsgan.utils.console import make_console
+from gsgan.utils.console import make_console, track
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.files import write_atomically
 from gsgan.utils.tensors import pick_device
@@ -418,7 +417,7 @@ def evaluate_method(
         count = len(dataset)
         rows = min(grid_rows, count)
         shown = {round((i + 0.5) * count / rows - 0.5) for i in range(rows)}
-        order = track(range(count), f"scoring {split}", console=console, transient=True)
+        order = track(range(count), f"scoring {split}", console)
         frames = ((dataset.items[i], dataset[i].to(device)) for i in order)
         scores[split] = score_split(frames, predict, scorer, shown)
 

@@ -10,7 +10,6 @@ import numpy as np
 import torch
 import yaml
 from omegaconf import DictConfig, OmegaConf, open_dict
-from rich.progress import track
 
 from gsgan import __version__
 from gsgan.export.page import block, page, refuse_unsuitable
@@ -18,7 +17,7 @@ from gsgan.export.splats import Splats, glb_bytes, ply_bytes, splats_of
 from gsgan.run.drive import REST, Drive, distilled_of, drive_of, inputs_of
 from gsgan.run.runs import Run
 from gsgan.utils.checks import above, one_of, whole
-from gsgan.utils.console import make_console
+from gsgan.utils.console import make_console, track
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.files import write_atomically, writing
 from gsgan.utils.pages import markdown
@@ -178,7 +177,7 @@ def export_config(config: DictConfig) -> None:
         drive = _poses(_with_motion(config, REST) if rest else config, run)
         tell(drive.text)
         numbers = range(len(drive.p)) if sequence else range(1)
-        for i in track(numbers, "writing", console=console, transient=True):
+        for i in track(numbers, "writing", console):
             name = out / f"{drive.numbers[i]:06d}{ENDINGS[kind]}" if sequence else out
             splats = _splats(run, drive, i)
             up = run.proportions.up

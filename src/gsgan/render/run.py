@@ -8,7 +8,6 @@ import torch
 from numpy.typing import NDArray
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
-from rich.progress import track
 from torch import Tensor
 
 from gsgan.data.calibration import read_calibration
@@ -22,7 +21,7 @@ from gsgan.run.drive import Drive, distilled_of, drive_of, inputs_of, joints_of
 from gsgan.run.runs import Run
 from gsgan.scene import Camera, cat
 from gsgan.utils.checks import above, whole
-from gsgan.utils.console import make_console
+from gsgan.utils.console import make_console, track
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import writing
 from gsgan.utils.images import Background, background, eight_bits
@@ -61,9 +60,8 @@ def render_config(config: DictConfig) -> None:
     painted = track(
         _images(run, drive, cameras, index, paint_on),
         "rendering",
+        console,
         total=len(drive.p),
-        console=console,
-        transient=True,
     )
     with writing(output.out):
         output.begin(record, bool(config.overwrite))

@@ -1,10 +1,10 @@
 """The console that commands print to."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from threading import Timer
-from typing import Any
+from typing import Any, TypeVar
 
 from rich.console import Console
 from rich.progress import (
@@ -15,6 +15,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+T = TypeVar("T")
 LEAST_WIDTH = 100  # columns: tables cut to the 80 of a log file cannot be read
 LOG_SECONDS = 10.0  # between two lines of progress in a log file
 SLOW_SECONDS = 2.0  # work that takes longer is named in a log file
@@ -36,6 +37,10 @@ class LoggedProgress(Progress):
     def __init__(self, *columns: Any, **options: Any) -> None:
         super().__init__(*columns, **options)
         self._said = time.monotonic()
+
+    def stop(self) -> None:
+        """Ends the bars without rich's empty line in log files."""
+        self.live.stop()
 
     def advance(self, task_id: TaskID, advance: float = 1) -> None:
         """Moves a task on, see `rich.progress.Progress`."""
@@ -87,3 +92,11 @@ def progress(console: Console, disable: bool = False) -> Progress:
         TimeRemainingColumn(),
     )
     return LoggedProgress(*columns, console=console, transient=True, disable=disable)
+
+
+def track(
+    items: Iterable[T], description: str, console: Console, total: int | None = None
+) -> Iterator[T]:
+    """The items one by one, with their number and the remaining time shown by `progress`."""
+    with progress(console) as bars:
+        yield from bars.track(items, total=total, description=description)
