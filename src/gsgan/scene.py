@@ -289,6 +289,24 @@ class Window:
     size: tuple[int, int]
     whole: tuple[int, int]
 
+    def part(self, side: int, at: Tensor) -> Window:
+        """Smaller boxes inside these, of at most ``side`` pixels each way.
+
+        Args:
+            side: pixels.
+            at: ``[B, 2]`` the centre of each in its box, row and column in [0, 1]; a part that
+                would reach beyond its box is moved inside. On the CPU.
+        """
+        size = (min(side, self.size[0]), min(side, self.size[1]))
+        corners = []
+        for (top, left), (row, column) in zip(self.corners, at.tolist(), strict=True):
+            y = round(row * self.size[0] - size[0] / 2)
+            x = round(column * self.size[1] - size[1] / 2)
+            y = min(max(0, y), self.size[0] - size[0])
+            x = min(max(0, x), self.size[1] - size[1])
+            corners.append((top + y, left + x))
+        return Window(tuple(corners), size, self.whole)
+
     def camera(self, camera: Camera) -> Camera:
         """The cameras of the boxes."""
         shift = torch.zeros_like(camera.K)

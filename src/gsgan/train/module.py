@@ -18,7 +18,7 @@ from gsgan.metrics.image import psnr
 from gsgan.model.avatar import Avatar
 from gsgan.model.discriminator import Discriminator
 from gsgan.model.rendering import Rendering
-from gsgan.scene import Frame
+from gsgan.scene import Frame, Window
 from gsgan.train.losses import DiscriminatorMaps, StepOneLoss, StepTwoLoss
 from gsgan.train.optimisers import (
     MovingAverage,
@@ -29,7 +29,7 @@ from gsgan.train.optimisers import (
 )
 from gsgan.train.rollback import Rollback, SkippedSteps, likely_cause, save_batch
 from gsgan.train.schedule import SEGMENTATION, SPLATTING, STEP_ONE, Schedule
-from gsgan.utils.checks import at_least
+from gsgan.utils.checks import at_least, whole
 from gsgan.utils.errors import ConfigError, GsganError
 from gsgan.utils.tensors import full_precision
 
@@ -50,7 +50,7 @@ class AvatarTraining(LightningModule):
         step_one, step_two: loss weights.
         seed: with the iteration it determines every random number drawn here, so a resumed run
             draws the same ones.
-        pose_noise, max_skipped, skip_window, log_every, average, average_every: see
+        pose_noise, window, max_skipped, skip_window, log_every, average, average_every: see
             conf/training/long.yaml.
         rollback: recovers from a collapse of the rendered person.
         extra_losses: further terms of Step II by name: modules of a rendering and its frame.
@@ -71,6 +71,7 @@ class AvatarTraining(LightningModule):
         step_two: StepTwoLoss,
         *,
         pose_noise: float = 0.01,
+        window: int | None = None,
         seed: int = 0,
         max_skipped: int = 20,
         skip_window: int = 1000,
@@ -103,6 +104,7 @@ class AvatarTraining(LightningModule):
         self.step_one = step_one
         self.step_two = step_two
         self.pose_noise = pose_noise
+        self.window = None if window is None else whole("training.window", window, 16)
         self.seed = seed
         self.log_every = at_least("training.log_every", log_every, 1)
         self.skipped = SkippedSteps(max_skipped, skip_window)
@@ -171,8 +173,7 @@ class AvatarTraining(LightningModule):
             self.avatar.splats.active_degree = self.schedule.degree(
                 self.step, self.avatar.splats.sh_degree
             )
-        window = self.avatar.window(frame.skeleton, frame.camera)
-        frame = frame if window is None else window.frame(frame)
+        frame = self._cut(frame)
         phase = self.schedule.phase(self.step)
         self._frame = frame
         if phase == SEGMENTATION:
@@ -182,6 +183,18 @@ class AvatarTraining(LightningModule):
         else:
             self._train_step_two(frame)
         self.step += 1
+
+    def _cut(self, frame: Frame) -> Frame:
+        """The frame in the window around the person, or in a random part of it."""
+        window = self.avatar.window(frame.skeleton, frame.camera)
+        if self.window is not None:
+            if window is None:
+                size = frame.camera.size
+                window = Window(corners=((0, 0),) * len(frame), size=size, whole=size)
+            window = window.part(
+                self.window, self._random(torch.rand, 3, len(frame), 2)
+            )
+        return frame if window is None else window.frame(frame)
 
     def _train_segmentation(self, frame: Frame) -> None:
         assert self.avatar.segmentation is not None

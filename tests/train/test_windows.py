@@ -1,0 +1,106 @@
+"""Training on parts of the person's window: what is seen, and its gradients."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from lightning import Callback
+
+from gsgan.scene import Window
+from gsgan.utils.errors import ConfigError
+
+
+def test_parts_lie_inside_their_boxes_and_reach_every_pixel():
+    window = Window(corners=((4, 8), (0, 2)), size=(48, 32), whole=(64, 64))
+    seen = torch.zeros(2, 64, 64)
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(200):
+        part = window.part(16, torch.rand(2, 2, generator=generator))
+        assert part.size == (16, 16)
+        assert part.whole == (64, 64)
+        for i, (top, left) in enumerate(part.corners):
+            seen[i, top : top + 16, left : left + 16] += 1
+    for i, (top, left) in enumerate(window.corners):
+        inside = seen[i, top : top + 48, left : left + 32]
+        assert inside.min() > 0
+        assert inside.sum() == seen[i].sum()
+
+
+def test_a_part_as_large_as_its_box_is_the_box():
+    window = Window(corners=((4, 8),), size=(48, 32), whole=(64, 64))
+    assert window.part(64, torch.tensor([[0.1, 0.9]])) == window
+
+
+class Sizes(Callback):
+    """The sizes of the images that training sees."""
+
+    def __init__(self) -> None:
+        self.found = set()
+
+    def on_train_batch_end(self, trainer, module, *_):
+        self.found.add(module._frame.camera.size)
+        assert module._frame.image.shape[-2:] == module._frame.camera.size
+
+
+@pytest.mark.parametrize("margin", ["0.25", "null"])
+def test_every_phase_trains_on_parts(make, margin):
+    sizes = Sizes()
+    module, trainer, data = make(
+        "training.window=16",
+        f"model.window_margin={margin}",
+        "size.image=48",
+        callbacks=[sizes],
+    )
+    trainer.fit(module, data)
+    assert module.step == module.schedule.total
+    assert not module.skipped.steps
+    assert sizes.found == {(16, 16)}
+
+
+def test_the_same_iteration_sees_the_same_part(make):
+    module, _, data = make("training.window=16", "size.image=48")
+    frame = next(iter(data.train_dataloader())).unpacked()
+    module.step = 3
+    first = module._cut(frame)
+    assert torch.equal(first.image, module._cut(frame).image)
+    module.step = 4
+    assert not torch.equal(first.camera.K, module._cut(frame).camera.K)
+
+
+def test_a_part_too_small_is_refused(make):
+    with pytest.raises(ConfigError, match=r"training\.window"):
+        make("training.window=8")
+
+
+@pytest.mark.parametrize("model", ["splat_only", "full"])
+def test_gradients_of_a_part_are_those_of_its_pixels_in_the_whole_image(make, model):
+    """The weights of a loss that reads the part's pixels alone get the same gradients."""
+    module, _, data = make(f"model={model}", "size.image=48", "size.supersample=2")
+    avatar = module.avatar.train()
+    frame = next(iter(data.train_dataloader())).unpacked()
+    whole = Window(corners=((0, 0),) * len(frame), size=(48, 48), whole=(48, 48))
+    part = whole.part(16, torch.full((len(frame), 2), 0.5))
+
+    def gradients(seen: Window) -> dict[str, torch.Tensor]:
+        rendered = avatar(
+            *replace(frame, camera=seen.camera(frame.camera)).inputs, generate=False
+        )
+        colour = rendered.colour
+        if seen is whole:
+            colour = part.cut(colour)
+        avatar.zero_grad()
+        (colour - part.cut(frame.image)).square().sum().backward()
+        return {
+            name: parameter.grad.clone()
+            for name, parameter in avatar.deformation.named_parameters()
+            if parameter.grad is not None
+        }
+
+    of_whole = gradients(whole)
+    of_part = gradients(part)
+    assert of_whole.keys() == of_part.keys()
+    assert sum(float(grad.abs().sum()) for grad in of_whole.values()) > 0
+    for name, expected in of_whole.items():
+        scale = float(expected.abs().max())
+        difference = float((of_part[name] - expected).abs().max())
+        assert difference <= 1e-4 * scale + 1e-9, name
