@@ -40,7 +40,7 @@ class Fit:
     points: int = 3000
     surface_steps: int = 150
     sweeps: int = 15
-    frames: int = 100
+    frames: int = 60
     cameras: int = 8
     noise: float = 0.02
     landmarks: float = 0.02
