@@ -2,8 +2,9 @@
 
 import io
 import json
+import shutil
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ from omegaconf.errors import ConfigKeyError
 from rich.console import Console
 
 from gsgan.data.datamodule import GsganData
+from gsgan.data.dataset import CaptureDataset
 from gsgan.data.metric_variants import MetricVariants
 from gsgan.data.training_poses import TrainingPoses
 from gsgan.evaluate.files import (
@@ -28,15 +30,16 @@ from gsgan.evaluate.files import (
     write_scored,
 )
 from gsgan.evaluate.grids import write_grid
-from gsgan.evaluate.origin import Method, origin, trained
+from gsgan.evaluate.kept import FOLDER, KeptScores
+from gsgan.evaluate.origin import Method, fingerprint, origin, trained
 from gsgan.evaluate.predictions import FLOOR, FULL, BodyBoxes, Preparation, read_folder
 from gsgan.evaluate.scores import (
     Predict,
     Scorer,
     SplitScores,
+    Tally,
     empty,
     painter,
-    score_split,
 )
 from gsgan.metrics.lpips import LPIPS_NETS, build_lpips
 from gsgan.metrics.regions import BACKGROUNDS
@@ -49,6 +52,8 @@ from gsgan.run.stored import (
     read_checkpoint,
     read_config,
 )
+from gsgan.utils.arrays import evenly_spaced
+from gsgan.utils.checks import whole
 from gsgan.utils.console import make_console, track
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.files import write_atomically
@@ -408,33 +413,91 @@ def evaluate_method(
     """
     # Settings that commands of other packages may lack have defaults.
     scorer = make_scorer(config, data, marks)
+    if config.get("score_images") is not None:
+        most = whole("score_images", config.score_images, 1)
+        scorer.marks.append(f"at most {most} evenly spaced images of each split")
     grid_rows = 4 if config.get("grid_rows") is None else config.grid_rows
 
-    # Every split, with the images of the grid evenly spaced.
+    # Every split, with the images of the grid evenly spaced. Scores of a run are kept.
     scores: dict[str, SplitScores] = {}
     for split in config.get("splits") or SPLITS:
         dataset = data.dataset(split)
         count = len(dataset)
-        rows = min(grid_rows, count)
-        shown = {round((i + 0.5) * count / rows - 0.5) for i in range(rows)}
-        order = track(range(count), f"scoring {split}", console)
-        frames = ((dataset.items[i], dataset[i].to(device)) for i in order)
-        scores[split] = score_split(frames, predict, scorer, shown)
+        places = evenly_spaced(count, config.get("score_images") or count)
+        kept = None
+        if poses is not None:
+            key = {
+                "method": asdict(method),
+                "data": fingerprint(data),
+                "images": len(places),
+                "grid_rows": grid_rows,
+                "lpips": sorted(scorer.lpips),
+                "marks": scorer.marks,
+                "measures": asdict(scorer.prepare.measures),
+            }
+            kept = KeptScores(folder / FOLDER / f"{split}.pt", key)
+        scores[split] = _scored(
+            f"scoring {split}",
+            dataset,
+            places,
+            predict,
+            Tally(scorer),
+            grid_rows=grid_rows,
+            device=device,
+            kept=kept,
+            console=console,
+        )
 
     # Only now, as everything is scored, files are written.
     for split, found in scores.items():
         if found.grid:
             write_grid(found.grid, folder / "grids" / f"{split}.png")
-    whole = _joined_splits(scores, scorer, data, origin(method, data, device))
-    print_table(whole.results, whole.origin, console)
+    joined = _joined_splits(scores, scorer, data, origin(method, data, device))
+    print_table(joined.results, joined.origin, console)
     if poses is not None:
         own = None if config.get("on") is None else Path(config.run).expanduser()
-        write_distances(folder, whole.rows, data, poses, console, own)
+        write_distances(folder, joined.rows, data, poses, console, own)
 
     # metrics.json is the last file: if it is new, all others are.
-    write_scored(whole, folder)
+    write_scored(joined, folder)
+    shutil.rmtree(folder / FOLDER, ignore_errors=True)
     console.print(f"scores: {folder}", markup=False, highlight=False, soft_wrap=True)
-    return whole.results
+    return joined.results
+
+
+def _scored(
+    title: str,
+    dataset: CaptureDataset,
+    places: Sequence[int],
+    predict: Predict,
+    tally: Tally,
+    *,
+    grid_rows: int,
+    device: torch.device,
+    kept: KeptScores | None,
+    console: Console,
+) -> SplitScores:
+    """Scores these places of a dataset, from where an interrupted scoring ended."""
+    shown = {places[row] for row in evenly_spaced(len(places), grid_rows)}
+    if kept is not None:
+        kept.restore(tally)
+
+    # The frame before the first one, which flicker needs.
+    done = tally.images
+    if done:
+        console.print(f"{title}: {done} of {len(places)} images were scored before")
+        before = places[done - 1]
+        frame = dataset[before].to(device)
+        item = dataset.items[before]
+        tally.look_at(item, frame, predict(frame, item))
+
+    for place in track(places[done:], title, console):
+        frame = dataset[place].to(device)
+        item = dataset.items[place]
+        tally.add(item, frame, predict(frame, item), show=place in shown)
+        if kept is not None:
+            kept.keep(tally)
+    return tally.result()
 
 
 def _joined_splits(

@@ -42,6 +42,8 @@ NO_LPIPS = "left out by lpips.nets"
 NO_LABELS = "the data has no part labels"
 NO_PARTS_OF_SPLAT = "Step I's colour is not a segmentation"
 NO_PARTS_OF_FLOOR = "an all-background image is not a segmentation"
+# what a tally keeps of the images that it has scored
+KEPT = ("rows", "grid", "matrices", "no_parts")
 Predict = Callable[[Frame, Item], Prediction]
 # "camera", "frame", and a score by metric
 Row = dict[str, Any]
@@ -249,7 +251,7 @@ def score_split(
         GsganError: when a prediction is not finite, naming camera and frame.
     """
     # Frames are predicted one by one, so that only one is in memory.
-    tally = _Tally(scorer)
+    tally = Tally(scorer)
     for i, (item, frame) in enumerate(items):
         tally.add(item, frame, predict(frame, item), show=i in shown)
     return tally.result()
@@ -265,7 +267,7 @@ class _Last(NamedTuple):
 
 
 @dataclass
-class _Tally:
+class Tally:
     """The scores of the frames so far."""
 
     scorer: Scorer
@@ -275,6 +277,27 @@ class _Tally:
     matrices: dict[str, Tensor] = field(default_factory=dict)
     no_parts: str = ""
     last: _Last | None = None
+
+    @property
+    def images(self) -> int:
+        """The number of images scored so far."""
+        return len(self.rows.get(FULL, ()))
+
+    def state_dict(self) -> dict[str, Any]:
+        """The scores so far as plain values and tensors, without the last frame."""
+        return {name: getattr(self, name) for name in KEPT}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Goes on from the scores of `state_dict`; `look_at` gives the last frame."""
+        for name in KEPT:
+            setattr(self, name, state[name])
+
+    def look_at(self, item: Item, frame: Frame, prediction: Prediction) -> None:
+        """Takes a frame as the one before the next, without scoring it."""
+        prepare = self.scorer.prepare
+        images = self._images(item, frame, prediction, prepare.box(frame))
+        target = prepare.target(frame)
+        self.last = _Last(item, frame, target, images)
 
     def add(
         self, item: Item, frame: Frame, prediction: Prediction, *, show: bool
@@ -286,17 +309,7 @@ class _Tally:
         target = prepare.target(frame)
         box = prepare.box(frame)
         regions = prepare.regions(frame)
-
-        # The images as the protocol scores them.
-        images = {}
-        for name, image in prediction.images.items():
-            bad = int((~torch.isfinite(image)).sum())
-            if bad:
-                raise GsganError(
-                    f"camera {camera}, frame {number}: {bad} values of the predicted image are not "
-                    "finite; it cannot be scored"
-                )
-            images[name] = prepare.image(prediction, name, box)
+        images = self._images(item, frame, prediction, box)
         if show:
             painting = Rendering(
                 images[FULL],
@@ -304,7 +317,6 @@ class _Tally:
                 segmentation=prediction.segmentation,
             )
             self.grid += grid_rows(replace(frame, image=target), painting)
-        images[FLOOR] = torch.full_like(frame.image, prepare.background)
 
         # Features of the ground truth, shared by all variants.
         lpips = None
@@ -334,6 +346,28 @@ class _Tally:
             self.rows.setdefault(name, []).append(row)
         self.last = _Last(item, frame, target, images)
         self._add_parts(camera, frame, prediction)
+
+    def _images(
+        self, item: Item, frame: Frame, prediction: Prediction, box: Tensor | None
+    ) -> dict[str, Tensor]:
+        """The images of every variant as the protocol scores them, by the body's ``box``.
+
+        Raises:
+            GsganError: when an image is not finite, naming camera and frame.
+        """
+        camera, number = item
+        prepare = self.scorer.prepare
+        images = {}
+        for name, image in prediction.images.items():
+            bad = int((~torch.isfinite(image)).sum())
+            if bad:
+                raise GsganError(
+                    f"camera {camera}, frame {number}: {bad} values of the predicted image are not "
+                    "finite; it cannot be scored"
+                )
+            images[name] = prepare.image(prediction, name, box)
+        images[FLOOR] = torch.full_like(frame.image, prepare.background)
+        return images
 
     def _add_parts(self, camera: str, frame: Frame, prediction: Prediction) -> None:
         """Counts the pixels of a segmentation, if there is one."""

@@ -30,6 +30,7 @@ FREE_KEYS = (
     "resume",
     "evaluate",
     "grid_rows",
+    "score_images",
     "lpips",
     "cpu_hours",
     "objective",

@@ -3,6 +3,7 @@
 import json
 import logging
 import os
+import shutil
 import sys
 import time
 import warnings
@@ -28,6 +29,7 @@ from rich.table import Table
 
 from gsgan.data.datamodule import GsganData
 from gsgan.evaluate.files import NAMES
+from gsgan.evaluate.kept import FOLDER as SCORING
 from gsgan.evaluate.origin import trained, training_code
 from gsgan.evaluate.run import evaluate_method
 from gsgan.evaluate.scores import painter
@@ -365,6 +367,7 @@ def remove_old_results(folder: Path) -> None:
     """Removes the results of an earlier run from a folder that starts over."""
     for name in (*NAMES, CHECKPOINT, PAGE):
         (folder / name).unlink(missing_ok=True)
+    shutil.rmtree(folder / SCORING, ignore_errors=True)
     for scores in folder.glob("on_*/*"):  # on another background
         if scores.name in NAMES:
             scores.unlink()
