@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import tomllib
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -19,6 +21,7 @@ from gsgan.scene import BodyPose, Frame, Gaussians
 from gsgan.train.run import build_training
 
 HERE = __name__
+ROOT = Path(__file__).parents[1]
 
 
 class NpzReader(FolderReader):
@@ -176,3 +179,26 @@ def test_a_splatting_baseline(tiny):
     )
     module.step_one_loss(painting, frame).backward()
     assert float(module.avatar.surface.colour.grad.abs().max()) > 0
+
+
+def test_an_installed_package_adds_its_config_folder(tmp_path, monkeypatch):
+    """Installed as pip does it: the module on the path, its entry points beside it."""
+    from hydra import compose, initialize_config_dir
+
+    from gsgan.utils.config import config_folder
+
+    example = ROOT / "docs/examples/package"
+    project = tomllib.loads((example / "pyproject.toml").read_text())["project"]
+    shutil.copytree(example / "my_avatars", tmp_path / "my_avatars")
+    installed = tmp_path / "my_avatars-0.1.dist-info"
+    installed.mkdir()
+    (installed / "METADATA").write_text("Name: my-avatars\nVersion: 0.1\n")
+    lines = ["[gsgan.conf]"]
+    for name, module in project["entry-points"]["gsgan.conf"].items():
+        lines.append(f"{name} = {module}")
+    (installed / "entry_points.txt").write_text("\n".join(lines) + "\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        config = compose("train", ["model=few_points"])
+    assert config.model.body_points.points == 540

@@ -7,10 +7,14 @@ import re
 import shutil
 import sys
 from collections.abc import Callable, Mapping
+from importlib.metadata import entry_points
 from pathlib import Path
 
+from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.plugins import Plugins
 from hydra.errors import CompactHydraException, HydraException, InstantiationException
+from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.types import RunMode
 from hydra.utils import get_method
 from omegaconf import DictConfig, OmegaConf
@@ -21,6 +25,7 @@ from gsgan.utils.errors import GsganError
 from gsgan.utils.sweeps import note, run_job
 
 FAILED = 1
+CONFIG_ENTRY_POINTS = "gsgan.conf"  # group of entry points of installed packages
 BFLOAT16_SINCE = (8, 0)  # compute capability: before it bfloat16 is emulated or refused
 # bytes of a sweep's folder; file systems take 255, files beside it need some
 LONGEST_NAME = 200
@@ -42,6 +47,22 @@ def config_folder() -> Path:
     raise GsganError(
         f"{package / 'conf'}: the config folder is missing; install gsgan again"
     )
+
+
+class PackageConfigs(SearchPathPlugin):
+    """Adds the config folders of installed packages to those of every command.
+
+    A package names its folder, a Python module with YAML files, by an entry point of the group
+    `CONFIG_ENTRY_POINTS`.
+    """
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        """Appends the folders: a file of gsgan's own comes before one of the same name."""
+        for point in entry_points(group=CONFIG_ENTRY_POINTS):
+            search_path.append(provider=point.name, path=f"pkg://{point.value}")
+
+
+Plugins.instance().register(PackageConfigs)
 
 
 def defaults_of(command: str) -> DictConfig:
