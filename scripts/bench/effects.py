@@ -151,7 +151,8 @@ def decide(row: Row, base: Sequence[str]) -> None:
         config = compose("train", [*base, *row.overrides, f"effects.{row.effect}=auto"])
     data = build_data(config)
     if data.lacks_body:
-        data = fit_before_training(data, config.fit, torch.device("cpu"))
+        fit_before_training(data, config.fit, torch.device("cpu"))
+        data = build_data(config)
     decisions = decide_effects(data.info, instantiate(config.effects))
     found = getattr(decisions, row.effect)
     row.auto, row.why = found.on, found.why

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from copy import copy
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -141,18 +141,15 @@ def run_fit(config: DictConfig) -> Path:
 
 def fit_before_training(
     data: GsganData, settings: DictConfig, device: torch.device
-) -> GsganData:
-    """Fits the body of a capture that has no body poses.
+) -> None:
+    """Fits the body of a capture that has no body poses, and writes it into the capture.
 
-    One process of a run fits, and the others wait for its files.
+    One process of a run fits, and the others wait for its files. The data must be read again.
 
     Args:
         data: the capture, read as the run reads it.
         settings: the config group ``fit``.
         device: of the run.
-
-    Returns:
-        The data, which reads the capture again, with the new poses.
 
     Raises:
         DataError: when the masks hold no person, or the folder is read-only.
@@ -168,12 +165,6 @@ def fit_before_training(
         # Another process may have made the poses while this one waited.
         if not (root / POSES).exists():
             fit_body(seen, instantiate(settings), device=device)
-
-    # What the data has cached is read again.
-    for name, attribute in vars(GsganData).items():
-        if isinstance(attribute, cached_property):
-            vars(data).pop(name, None)
-    return data
 
 
 def fit_body(

@@ -148,7 +148,9 @@ def build_training(
     with working(console, "reading the data"):
         data = build_data(config)
     if data.lacks_body and moves_with_body(config):
-        data = fit_before_training(data, config.fit, device_of(config))
+        fit_before_training(data, config.fit, device_of(config))
+        with working(console, "reading the data with its body"):
+            data = build_data(config)
     with working(console, "measuring the scene"):
         info = data.info
     with working(console, "building the avatar"):
