@@ -60,3 +60,15 @@ def quiet_trainer(folder: Path, **options):
         off, False
     )
     return Trainer(default_root_dir=folder, **(given | options))
+
+
+def stored(module, folder):
+    """The run folder of a training that has just begun."""
+    import torch  # here: other tests need commands alone
+
+    from gsgan.run.stored import CHECKPOINT
+
+    checkpoint = {"state_dict": module.state_dict()}
+    module.on_save_checkpoint(checkpoint)
+    (folder / CHECKPOINT).parent.mkdir()
+    torch.save(checkpoint, folder / CHECKPOINT)

@@ -27,7 +27,7 @@ from gsgan.fit.run import fit_before_training, run_fit
 from gsgan.fit.shape import fit_shape
 from gsgan.run.assemble import moves_with_body
 from gsgan.scene import BodyPose
-from gsgan.train.run import training_record
+from gsgan.train.resume import training_record
 from gsgan.utils.errors import ConfigError, DataError
 
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from commands import stored
 from hydra.errors import ConfigCompositionException
 from tiny_characters import TINY
 from torch.nn import functional
@@ -15,7 +16,6 @@ from gsgan.data.datamodule import GsganData
 from gsgan.data.surface_colours import body_inside
 from gsgan.model.body_points import BodyPoints, moved_normals
 from gsgan.run.runs import load_avatar
-from gsgan.run.stored import CHECKPOINT
 from gsgan.scene import BodyPose
 from gsgan.synthetic.scenes import ensure_scene
 from gsgan.train.run import build_training
@@ -190,14 +190,6 @@ def test_untrained_gaussians_sit_on_the_surface(build):
     _, avatar, frame = build(ON)
     means = avatar(*frame.inputs).gaussians.means
     torch.testing.assert_close(means, avatar.body_points(frame.body).means)
-
-
-def stored(module, folder):
-    """The run folder of a training that has just begun."""
-    checkpoint = {"state_dict": module.state_dict()}
-    module.on_save_checkpoint(checkpoint)
-    (folder / CHECKPOINT).parent.mkdir()
-    torch.save(checkpoint, folder / CHECKPOINT)
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from commands import stored
 from frames import frame_of
-from test_body_points import stored
 
 from gsgan.body import SkinnedBody, free_body, open_body
 from gsgan.body.shape import BodyShape

@@ -4,7 +4,8 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from gsgan.train.run import device_of, remove_old_results
+from gsgan.train.resume import remove_old_results
+from gsgan.train.trainer import device_of
 
 
 def test_starting_over_removes_an_earlier_runs_results_and_logs(tmp_path):

@@ -249,7 +249,7 @@ def test_bf16_only_on_gpus_that_have_it(monkeypatch, capability, precision):
 
 
 def test_the_precision_of_an_old_gpu_is_explained(monkeypatch):
-    from gsgan.train.run import _precision
+    from gsgan.train.description import _precision
 
     assert _precision("32-true") == "32-true"
     monkeypatch.setattr("torch.cuda.is_available", lambda: True)

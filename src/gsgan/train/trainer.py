@@ -1,0 +1,86 @@
+"""The Trainer of a run, and the device that it will use."""
+
+import logging
+import os
+import warnings
+from pathlib import Path
+from typing import Any
+
+import gsgan.utils.compat  # noqa: F401  (must come before lightning)
+
+# isort: split
+import torch
+from hydra.utils import instantiate
+from lightning import Callback, Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
+from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+
+from gsgan.data.datamodule import GsganData
+from gsgan.run.stored import CHECKPOINT
+from gsgan.train.callbacks import AtomicCheckpoints, ImageGrid, ProgressLines
+from gsgan.train.module import AvatarTraining
+
+# what launchers call a process' rank on its machine
+LOCAL_RANKS = ("LOCAL_RANK", "SLURM_LOCALID")
+
+
+def build_trainer(
+    config: DictConfig,
+    folder: Path,
+    module: AvatarTraining,
+    data: GsganData,
+    console: Console,
+    logs: str,
+    *callbacks: Callback,
+) -> Trainer:
+    """The Trainer of the config, as long as the schedule."""
+    # A logger overwrites its files: each part of a resumed run has a folder of its own.
+    version = {"version": logs} if "version" in config.logger else {}
+    logger = instantiate(config.logger, **version)
+    own = [instantiate(callback) for callback in (config.callbacks or {}).values()]
+    used: list[Any] = [
+        *callbacks,
+        *own,
+        ImageGrid(folder / "grids", config.grid_rows),
+        ProgressLines(console),
+        ModelCheckpoint(
+            dirpath=folder / CHECKPOINT.parent,
+            filename=CHECKPOINT.stem,
+            enable_version_counter=False,
+            save_on_train_epoch_end=True,
+        ),
+    ]
+    if console.is_terminal:
+        used.append(RichProgressBar())
+    return instantiate(
+        config.trainer,
+        max_epochs=-(-module.schedule.total // len(data.train_dataloader())),
+        callbacks=used,
+        default_root_dir=folder,
+        plugins=[AtomicCheckpoints()],
+        logger=logger,
+        enable_progress_bar=console.is_terminal,
+    )
+
+
+def device_of(config: DictConfig) -> torch.device:
+    """Where Lightning will put the model of a process."""
+    if config.trainer.accelerator == "cpu" or not torch.cuda.is_available():
+        return torch.device("cpu")
+    ranks = (os.environ.get(name) for name in LOCAL_RANKS)
+    rank = int(next(filter(None, ranks), 0))
+    chosen = config.trainer.devices
+    return torch.device("cuda", chosen[rank] if OmegaConf.is_list(chosen) else rank)
+
+
+def quiet_lightning() -> None:
+    """Silences Lightning's tips and device lists."""
+    for name in ("lightning.pytorch", "lightning.fabric", "lightning"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", message=".*does not have many workers.*")
+    warnings.filterwarnings("ignore", message=".*Checkpoint directory .* exists.*")
+    warnings.filterwarnings(
+        "ignore", message=".*is smaller than the logging interval.*"
+    )
+    warnings.filterwarnings("ignore", message=".*isinstance.treespec, LeafSpec.*")
