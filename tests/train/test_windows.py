@@ -7,6 +7,7 @@ import torch
 from lightning import Callback
 
 from gsgan.scene import Window
+from gsgan.train.module import REACH
 from gsgan.utils.errors import ConfigError
 
 
@@ -72,10 +73,18 @@ def test_a_part_too_small_is_refused(make):
         make("training.window=8")
 
 
-@pytest.mark.parametrize("model", ["splat_only", "full"])
-def test_gradients_of_a_part_are_those_of_its_pixels_in_the_whole_image(make, model):
+@pytest.mark.parametrize("model", ["splat_only", "full", "harmonic"])
+@pytest.mark.parametrize("anchors", ["null", "100"])
+def test_gradients_of_a_part_are_those_of_its_pixels_in_the_whole_image(
+    make, model, anchors
+):
     """The weights of a loss that reads the part's pixels alone get the same gradients."""
-    module, _, data = make(f"model={model}", "size.image=48", "size.supersample=2")
+    module, _, data = make(
+        f"model={model}",
+        f"size.anchors={anchors}",
+        "size.image=48",
+        "size.supersample=2",
+    )
     avatar = module.avatar.train()
     frame = next(iter(data.train_dataloader())).unpacked()
     whole = Window(corners=((0, 0),) * len(frame), size=(48, 48), whole=(48, 48))
@@ -83,7 +92,9 @@ def test_gradients_of_a_part_are_those_of_its_pixels_in_the_whole_image(make, mo
 
     def gradients(seen: Window) -> dict[str, torch.Tensor]:
         rendered = avatar(
-            *replace(frame, camera=seen.camera(frame.camera)).inputs, generate=False
+            *replace(frame, camera=seen.camera(frame.camera)).inputs,
+            generate=False,
+            reach=None if seen is whole else REACH,
         )
         colour = rendered.colour
         if seen is whole:

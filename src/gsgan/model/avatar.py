@@ -235,6 +235,7 @@ class Avatar(nn.Module):
         generate: bool = True,
         maps: bool = True,
         supersample: bool = True,
+        reach: float | None = None,
     ) -> Rendering:
         """Renders poses: I_pred and every map that led to it.
 
@@ -252,6 +253,8 @@ class Avatar(nn.Module):
             generate: False stops after F (Step I needs no more).
             maps: False returns image and alpha alone.
             supersample: False draws F once per pixel, whatever ``accuracy`` says.
+            reach: metres; Ψ is not computed at points farther than this from what the cameras
+                see. None computes it at all points.
         """
         body = self.body_pose(skeleton, visibility) if body is None else body
         window = self.window(skeleton, camera)
@@ -263,6 +266,7 @@ class Avatar(nn.Module):
             pose_noise=pose_noise,
             generate=generate,
             supersample=supersample,
+            reach=reach,
         )
         if camera_index is not None:
             rendering = self._corrected(rendering, camera_index)
@@ -300,6 +304,7 @@ class Avatar(nn.Module):
         pose_noise: Tensor | None,
         generate: bool,
         supersample: bool,
+        reach: float | None,
     ) -> Rendering:
         """The drawings and images that the cameras see (paper Fig. 3)."""
         raster = S = image = alpha = None
@@ -311,7 +316,7 @@ class Avatar(nn.Module):
             if body is not None and follows is not None:
                 with self.stage("bones"):
                     body = follows.points.with_bones(body)  # once for G and S
-            gaussians = self.splat(p, valid, frames, camera, body, pose_noise)
+            gaussians = self.splat(p, valid, frames, camera, body, pose_noise, reach)
             if gaussians is not None:
                 raster = self._rasterised(gaussians, camera, supersample)
             if generate and self.generator is not None:
@@ -358,6 +363,7 @@ class Avatar(nn.Module):
         camera: Camera,
         body: BodyPose | None,
         pose_noise: Tensor | None = None,
+        reach: float | None = None,
     ) -> Gaussians | None:
         """Ĝ, or None where nothing is splatted.
 
@@ -368,11 +374,14 @@ class Avatar(nn.Module):
                 gaussians = self.surface(body, camera.centre)
         elif self.deformation is not None:
             points = self.points(p, valid, frames, body)
+            chosen = None
+            if reach is not None:
+                chosen = seen_points(points.means, camera, reach)
             with self.stage("Ψ"):  # Sec. 3.3: Ĝ = G + Ψ(p)
                 face = face_code(p, frames.head, self.template)
                 pelvis = frames.hubs[:, 0]
                 gaussians = self.deformation(
-                    p, points, camera.centre, pelvis, pose_noise, face
+                    p, points, camera.centre, pelvis, pose_noise, face, chosen
                 )
         else:
             return None
@@ -451,6 +460,27 @@ class Avatar(nn.Module):
             # detached: losses of the corrected colours must not move alpha
             image = self.colour(image, rendering.alpha.detach(), camera_index)
         return replace(rendering, image=image, corrected=colour)
+
+
+@torch.no_grad()
+def seen_points(means: Tensor, camera: Camera, reach: float) -> Tensor:
+    """``[B, M]`` numbers of the points ``[B, N, 3]`` that are within reach of what a camera sees.
+
+    Items with fewer than M such points have others as well.
+
+    Args:
+        means: metres.
+        camera: B cameras.
+        reach: metres round the part of space that an image shows.
+    """
+    height, width = camera.size
+    pixels, depth = camera.project(means)
+    focal = torch.stack([camera.K[:, 0, 0], camera.K[:, 1, 1]], dim=-1)
+    beyond = reach * focal[:, None] / depth.clamp_min(reach).unsqueeze(-1)
+    size = pixels.new_tensor([width, height])
+    inside = ((pixels >= -beyond) & (pixels <= size + beyond)).all(-1)
+    count = int(inside.sum(1).max().clamp_min(1))
+    return inside.byte().sort(dim=1, descending=True, stable=True).indices[:, :count]
 
 
 def line_width(camera: Camera) -> float:

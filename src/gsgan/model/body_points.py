@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
+from scipy.spatial import cKDTree
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -18,6 +19,7 @@ from gsgan.body import (
 )
 from gsgan.body.lbs import stretched
 from gsgan.body.skinned import WeightGradients, vertex_normals
+from gsgan.body.subdivide import subdivided
 from gsgan.scene import BodyPose, Gaussians
 from gsgan.skeleton import Points
 from gsgan.utils.checks import above, whole
@@ -222,7 +224,8 @@ class BodyPoints(nn.Module):
     Args:
         body: vertices, weights and joints.
         body_height: metres, the length scale of Ψ's input.
-        points: vertices used, spread evenly over the surface; None for all.
+        points: number of points: vertices spread evenly over the surface, or, if the body has
+            fewer, all of them and the middles of its longest edges; None for all vertices.
         sigma: initial standard deviation, as a share of the distance to the nearest neighbour.
         mean_step: of Ψ: its means move by this share of what they would on a skeleton's points.
         stretch: shapes and normals also follow the stretch of the surface, see
@@ -250,6 +253,8 @@ class BodyPoints(nn.Module):
         rate: float = 1.0,
     ) -> None:
         super().__init__()
+        if points is not None:
+            body = subdivided(body, points)
         above("model.body_points.sigma", sigma)
         above("model.body_points.mean_step", mean_step)
         self.points = SkinnedPoints(
@@ -353,10 +358,7 @@ def farthest_points(vertices: Tensor, count: int) -> Tensor:
 def neighbour_distance(points: Tensor, k: int = 1) -> Tensor:
     """``[V]`` metres from each point to its k-th nearest other point, or to the farthest one."""
     k = min(k, max(1, len(points) - 1))
-    found = []
-    for start in range(0, len(points), ROWS):
-        distance = torch.cdist(points[start : start + ROWS], points)
-        rows = torch.arange(len(distance))
-        distance[rows, rows + start] = math.inf
-        found.append(distance.topk(k, largest=False).values[:, -1])
-    return torch.cat(found)
+    places = points.numpy()
+    # The nearest point is the point itself.
+    distance, _ = cKDTree(places).query(places, k=[k + 1])
+    return torch.from_numpy(distance[:, 0]).to(points.dtype)

@@ -6,17 +6,20 @@ from typing import Any
 
 import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
+from scipy.spatial import cKDTree
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from gsgan.model import compiled
+from gsgan.model.body_points import farthest_points
 from gsgan.scene import Gaussians
 from gsgan.skeleton import Points, root_of
 from gsgan.splat.sh import sh_to_colour
 from gsgan.utils.checks import between, one_of, whole
 from gsgan.utils.tensors import constant, derived
 
+NEAREST = 3  # anchors between which the MLP's output is interpolated
 POSE_AXES = 20  # principal directions of the training poses' codes
 POSES = ("pose_mean", "pose_axes", "pose_spread", "place_mean", "place_spread")
 # inside the root that normalises a quaternion: q0 + δq ≈ 0 stays finite
@@ -87,10 +90,22 @@ class ResidualGaussians(nn.Module):
         return [(list(self.parameters()), 1.0)]
 
     def residuals(
-        self, points: Points, pose: Tensor, root: Tensor, pelvis: Tensor
+        self,
+        points: Points,
+        pose: Tensor,
+        root: Tensor,
+        pelvis: Tensor,
+        chosen: Tensor | None = None,
     ) -> Residuals:
-        """ΔG of posed points, from the `pose_code` and the pelvis: ``root [B, 3]`` (metres) and
-        axes ``[B, 3, 3]`` (columns)."""
+        """ΔG of posed points.
+
+        Args:
+            points: all of them.
+            pose: ``[B, 3 J]`` of `pose_code`.
+            root: ``[B, 3]`` metres.
+            pelvis: ``[B, 3, 3]`` its axes (columns).
+            chosen: ``[B, M]`` numbers of the points whose residuals are returned; None: all.
+        """
         raise NotImplementedError
 
     def _active(self, values: Tensor) -> Tensor:
@@ -210,11 +225,15 @@ class ResidualGaussians(nn.Module):
         pelvis: Tensor,
         noise: Tensor | None = None,
         face: Tensor | None = None,
+        chosen: Tensor | None = None,
     ) -> Gaussians:
-        """Ĝ for joints ``p`` ``[B, J, 3]``, seen from ``eye`` ``[B, 3]`` (both world, metres)."""
+        """Ĝ for joints ``p`` ``[B, J, 3]``, seen from ``eye`` ``[B, 3]`` (both world, metres); of
+        the points ``chosen [B, M]`` alone, if these are given."""
         root = root_of(p)
         code = self.pose_code(p, root, pelvis, noise, face)
-        residuals = self.residuals(points, code, root, pelvis)
+        residuals = self.residuals(points, code, root, pelvis, chosen)
+        if chosen is not None:
+            points = points.take(chosen)
         return self.compose(points, residuals, eye)
 
 
@@ -226,7 +245,10 @@ class Deformation(ResidualGaussians):
         body_height: metres, the subject's constant length scale.
         joints: joints in the skeleton.
         width, layers: the MLP's trunk.
-        embedding: learned numbers per point.
+        embedding: learned numbers per anchor.
+        anchors: number of points at which the MLP is computed, spread over the body; its output is
+            interpolated between them, and each point adds residuals of its own (``free_table``).
+            None: all points.
         settings: of `ResidualGaussians`.
 
     The other settings are explained in conf/model/deformation/psi.yaml.
@@ -234,13 +256,16 @@ class Deformation(ResidualGaussians):
     Source: paper Sec. 3.3, without the table.
     """
 
+    anchors: Tensor  # [A] int64
+    near: Tensor  # [N, NEAREST] int64, anchors near each point
+    share: Tensor  # [N, NEAREST] and their weights
     rest_code: Tensor
     pose_mean: Tensor  # [3 J] of training poses' codes
     pose_axes: Tensor  # [3 J, K] directions
     pose_spread: Tensor  # [K] standard deviations; infinite: not known
-    # [N, 3] of points in training poses, about the root, in body heights
+    # [A, 3] of anchors in training poses, about the root, in body heights
     place_mean: Tensor
-    place_spread: Tensor  # [N, 3] standard deviations; infinite: not known
+    place_spread: Tensor  # [A, 3] standard deviations; infinite: not known
 
     def __init__(
         self,
@@ -257,6 +282,7 @@ class Deformation(ResidualGaussians):
         free_table: bool = True,
         pose_frame: str = "world",
         pose_limit: float | None = 2.0,
+        anchors: int | None = None,
         **settings: Any,
     ) -> None:
         super().__init__(body_height, **settings)
@@ -269,7 +295,12 @@ class Deformation(ResidualGaussians):
         )
 
         # The poses of the training data are stored later, by `Avatar.store_poses`.
-        points = rest_points.shape[0]
+        every = len(rest_points)
+        self.anchored = anchors is not None and anchors < every
+        if anchors is not None and self.anchored:
+            whole("model.deformation.anchors", anchors, NEAREST)
+            rest_points = self._place_anchors(rest_points, anchors)
+        points = len(rest_points)
         self.position_octaves = position_octaves
         self.pose_frame = pose_frame
         self.pose_limit = pose_limit
@@ -300,8 +331,23 @@ class Deformation(ResidualGaussians):
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias)
         self.table = (
-            nn.Parameter(torch.zeros(points, sum(self.parts))) if free_table else None
+            nn.Parameter(torch.zeros(every, sum(self.parts))) if free_table else None
         )
+
+    def _place_anchors(self, rest_points: Tensor, count: int) -> Tensor:
+        """Chooses the anchors and the points' shares of them; returns the anchors ``[A, 3]``.
+
+        They are stored with the weights: another processor may round other anchors.
+        """
+        anchors = farthest_points(rest_points, count)
+        places = rest_points[anchors]
+        distance, near = cKDTree(places.numpy()).query(rest_points.numpy(), k=NEAREST)
+        spread = distance[:, 0].mean()
+        share = torch.from_numpy(-((distance / spread) ** 2)).float().softmax(1)
+        self.register_buffer("anchors", anchors)
+        self.register_buffer("near", torch.from_numpy(near))
+        self.register_buffer("share", share)
+        return places
 
     def store_poses(
         self, codes: Tensor, means: Tensor, root: Tensor, pelvis: Tensor
@@ -313,6 +359,8 @@ class Deformation(ResidualGaussians):
         known = min(POSE_AXES, len(spread))
         self.pose_axes[:, :known] = axes[:known].mT
         self.pose_spread.zero_()[:known] = spread[:known] / len(codes) ** 0.5
+        if self.anchored:
+            means = means[:, self.anchors]
         places = self._places(means, root, pelvis)
         self.place_mean.copy_(places.mean(0))
         self.place_spread.copy_(places.std(0, correction=0))
@@ -341,16 +389,58 @@ class Deformation(ResidualGaussians):
         super()._load_from_state_dict(state, prefix, *rest)
 
     def residuals(
-        self, points: Points, pose: Tensor, root: Tensor, pelvis: Tensor
+        self,
+        points: Points,
+        pose: Tensor,
+        root: Tensor,
+        pelvis: Tensor,
+        chosen: Tensor | None = None,
     ) -> Residuals:
         """See `ResidualGaussians.residuals`."""
+        means = points.means
+        normals = points.normals
+        if self.anchored:
+            means = means[:, self.anchors]
+            normals = normals[:, self.anchors]
+        raw = self._network(means, normals, pose, root, pelvis)
+
+        # From the anchors to the points, each with residuals of its own.
+        if self.anchored:
+            raw = self._interpolated(raw, chosen)
+        elif chosen is not None:
+            index = chosen.unsqueeze(-1).expand(-1, -1, raw.shape[-1])
+            raw = raw.gather(1, index)
+        if self.table is not None:
+            table = self._active(self.table)
+            raw = raw + (
+                table if chosen is None else functional.embedding(chosen, table)
+            )
+        return self._parted(raw)
+
+    def _interpolated(self, raw: Tensor, chosen: Tensor | None) -> Tensor:
+        """The anchors' ``raw [B, A, C]`` at the points ``chosen [B, M]``, or at all."""
+        B, A, _ = raw.shape
+        near = self.near.expand(B, -1, -1) if chosen is None else self.near[chosen]
+        share = self.share.expand(B, -1, -1) if chosen is None else self.share[chosen]
+        first = A * torch.arange(B, device=raw.device)
+        spread = functional.embedding_bag(
+            (near + first[:, None, None]).flatten(0, 1),
+            raw.flatten(0, 1),
+            mode="sum",
+            per_sample_weights=share.flatten(0, 1).to(raw.dtype),
+        )
+        return spread.unflatten(0, (B, -1))
+
+    def _network(
+        self, means: Tensor, normals: Tensor, pose: Tensor, root: Tensor, pelvis: Tensor
+    ) -> Tensor:
+        """``[B, A, C]`` the MLP's output at the anchors."""
         limit = None if self.training else self.pose_limit
         if limit is not None:
             pose = self._within(pose, limit)
         # Only a skeleton's gradient passes through Ψ's inputs, not one of skinning weights.
-        means = points.means if root.requires_grad else points.means.detach()
+        means = means if root.requires_grad else means.detach()
         position = self._places(means, root, pelvis)
-        normals = points.normals
         if limit is not None:
             far = limit * self.place_spread
             position = self.place_mean + (position - self.place_mean).clamp(-far, far)
@@ -373,10 +463,7 @@ class Deformation(ResidualGaussians):
                 x = functional.relu(layer(x), inplace=True)
         weight = self._active(self.head.weight.mT).mT
         bias = self._active(self.head.bias)
-        raw = functional.linear(x, weight, bias)
-        return self._parted(
-            raw if self.table is None else raw + self._active(self.table)
-        )
+        return functional.linear(x, weight, bias)
 
     def _point_part(self) -> Tensor:
         """``[N, width]``: the part of the first layer that depends on the point alone."""

@@ -110,7 +110,12 @@ class Harmonic(ResidualGaussians):
         return torch.cat(found, dim=-1)
 
     def residuals(
-        self, points: Points, pose: Tensor, root: Tensor, pelvis: Tensor
+        self,
+        points: Points,
+        pose: Tensor,
+        root: Tensor,
+        pelvis: Tensor,
+        chosen: Tensor | None = None,
     ) -> Residuals:
         """ΔG of posed points; pose, root and pelvis are not used."""
         given = list(self.slopes.values())
@@ -130,7 +135,10 @@ class Harmonic(ResidualGaussians):
             )
             values = constant.expand(len(points.means), -1, -1)[..., :used]
             found.append(values + parts[name][..., :used] if name in parts else values)
-        return self._parted(torch.cat(found, dim=-1))
+        raw = torch.cat(found, dim=-1)
+        if chosen is not None:
+            raw = raw.gather(1, chosen.unsqueeze(-1).expand(-1, -1, raw.shape[-1]))
+        return self._parted(raw)
 
 
 @torch.no_grad()

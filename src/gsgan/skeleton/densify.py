@@ -56,6 +56,21 @@ class Points:
         """``[B, N, 3, 3]``: what shapes are transformed by, as covariances."""
         return self.frames if self.stretched is None else self.stretched
 
+    def take(self, chosen: Tensor) -> "Points":
+        """The points of these numbers, ``[B, M]`` int64; each is a part of its own."""
+        parts = self.part_id[chosen]
+        stretched = self.stretched
+        return Points(
+            means=_rows(self.means, chosen),
+            rotations=_rows(self.rotations, parts),
+            origins=_rows(self.origins, parts),
+            scales=_rows(self.scales, chosen),
+            valid=_rows(self.valid, chosen),
+            part_id=torch.arange(chosen.shape[1], device=chosen.device),
+            normals=_rows(self.normals, chosen),
+            stretched=None if stretched is None else _rows(stretched, chosen),
+        )
+
     def local(self) -> Tensor:
         """``[B, N, 3]`` metres: the points in their parts' frames, invariant to rigid motions.
 
@@ -63,6 +78,13 @@ class Points:
         """
         offset = self.means - self.origins.index_select(1, self.part_id)
         return (offset.unsqueeze(-2) @ self.frames).squeeze(-2)
+
+
+def _rows(values: Tensor, chosen: Tensor) -> Tensor:
+    """``[B, M, ...]``: the rows ``[B, M]`` of each item of ``values [B, N, ...]``."""
+    own = values.shape[2:]
+    index = chosen.view(*chosen.shape, *(1 for _ in own))
+    return values.gather(1, index.expand(*chosen.shape, *own))
 
 
 class Densify(nn.Module):

@@ -35,6 +35,8 @@ from gsgan.utils.tensors import full_precision
 
 PSNR_CAP = 100.0  # dB: one image equal to the ground truth would make the mean infinite
 T = TypeVar("T")
+# metres: Gaussians whose points are farther from a part of the image do not reach into it
+REACH = 0.1
 SEED_STRIDE = 1_000_003  # a prime: (seed, step) pairs do not meet
 
 
@@ -236,6 +238,7 @@ class AvatarTraining(LightningModule):
             pose_noise=self._pose_noise(frame.skeleton),
             generate=generate,
             supersample=self.schedule.fine(self.step),
+            reach=None if self.window is None else REACH,
         )
         if rendering.splat_alpha is not None and rendering.colour is not None:
             seen = {
