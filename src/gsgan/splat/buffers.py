@@ -15,10 +15,11 @@ from torch import Tensor
 
 CACHE_LINE = 64  # bytes; rows of tiles are whole cache lines
 LARGE = 1 << 20  # bytes from which memory is reused
-KEPT = 1 << 28  # maximum bytes of unused memory that a process keeps
+MAX_KEPT = 1 << 28  # maximum bytes of unused memory that a process keeps
 
-_NAMES = {torch.float32: "float32", torch.float64: "float64"}
-# By size in bytes. A deque's append and pop are atomic: finalisers run in any thread, at any time.
+_DTYPE_NAMES = {torch.float32: "float32", torch.float64: "float64"}
+# Unused memory by size in bytes. A deque's append and pop are atomic: finalisers run in any
+# thread, at any time.
 _free: dict[int, deque[NDArray[np.uint8]]] = {}
 
 
@@ -34,12 +35,16 @@ def zeros(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
     used = math.prod(shape) * dtype.itemsize
     size = used + CACHE_LINE
     kept = _take(size) if size >= LARGE else None
+
     # numpy's large zeros are huge pages, which the system clears on first access.
     memory = np.zeros(size, np.uint8) if kept is None else kept
     first = -memory.ctypes.data % CACHE_LINE
+
     # Sliced in numpy: autograd forbids in-place changes of views made by torch.
-    array = memory[first : first + used].view(_NAMES[dtype]).reshape(shape)
-    if size >= LARGE:  # the array lives as long as the tensors that share its memory
+    array = memory[first : first + used].view(_DTYPE_NAMES[dtype]).reshape(shape)
+
+    # The array lives as long as the tensors that share its memory.
+    if size >= LARGE:
         weakref.finalize(array, _give_back, memory).atexit = False
     tensor = torch.from_numpy(array)
     return tensor if kept is None else tensor.zero_()
@@ -63,6 +68,7 @@ def _take(size: int) -> NDArray[np.uint8] | None:
 
 
 def _give_back(memory: NDArray[np.uint8]) -> None:
-    if kept() + memory.nbytes > KEPT:
+    # All other memory is freed if this would be too much.
+    if kept() + memory.nbytes > MAX_KEPT:
         _free.clear()
     _free.setdefault(memory.nbytes, deque()).append(memory)

@@ -9,9 +9,17 @@ from torch import Tensor
 # 3D Gaussian splatting (Condon-Shortley phase), so that its .ply files can be used as they are.
 _C0 = math.sqrt(1 / (4 * math.pi))
 _C1 = math.sqrt(3 / (4 * math.pi))
-_C2 = tuple(math.sqrt(k / math.pi) for k in (15 / 4, 5 / 16, 15 / 16))
-_C3 = tuple(
-    math.sqrt(k / math.pi) for k in (35 / 32, 105 / 4, 21 / 32, 7 / 16, 105 / 16)
+_C2 = (
+    math.sqrt(15 / 4 / math.pi),
+    math.sqrt(5 / 16 / math.pi),
+    math.sqrt(15 / 16 / math.pi),
+)
+_C3 = (
+    math.sqrt(35 / 32 / math.pi),
+    math.sqrt(105 / 4 / math.pi),
+    math.sqrt(21 / 32 / math.pi),
+    math.sqrt(7 / 16 / math.pi),
+    math.sqrt(105 / 16 / math.pi),
 )
 
 MAX_DEGREE = 3
@@ -20,7 +28,7 @@ MAX_DEGREE = 3
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
     """The real spherical harmonics of unit directions.
 
-    Convention: order (0,0), (1,-1), (1,0), (1,1), (2,-2), … with the signs of 3D Gaussian
+    They are in the order (0,0), (1,-1), (1,0), (1,1), (2,-2), … with the signs of 3D Gaussian
     splatting: degree 1 is ``(-y, z, -x)`` times a constant.
 
     Args:
@@ -48,8 +56,8 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
             -k0 * y * z,
             k1 * (2 * z * z - x * x - y * y),
             -k0 * x * z,
+            k2 * (x * x - y * y),
         ]
-        basis.append(k2 * (x * x - y * y))
     if degree >= 3:
         k0, k1, k2, k3, k4 = _C3
         xx = x * x
@@ -70,7 +78,7 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
 def sh_to_colour(sh: Tensor, directions: Tensor) -> Tensor:
     """Colours along directions of view.
 
-    Convention: the sum of the series plus 0.5, not clamped (the caller clamps at 0). Directions
+    A colour is the sum of the series plus 0.5, not clamped (the caller clamps at 0). Directions
     run from the camera to the Gaussian, in the frame of the coefficients.
 
     Args:
@@ -91,7 +99,9 @@ def sh_to_colour(sh: Tensor, directions: Tensor) -> Tensor:
             "sh_to_colour: sh must have shape [B, N, (d+1)², 3] with d from 0 to "
             f"{MAX_DEGREE}, got {list(sh.shape)}"
         )
-    if degree == 0:  # no directions needed: view-dependent colour is off
+
+    # Degree 0 needs no directions: view-dependent colour is off.
+    if degree == 0:
         return _C0 * sh[..., 0, :] + 0.5
     basis = sh_basis(torch.nn.functional.normalize(directions, dim=-1), degree)
     return (basis.unsqueeze(-1) * sh).sum(-2) + 0.5
