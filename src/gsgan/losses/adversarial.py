@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-# by scale: feature maps, the logits last
+# Feature maps by scale; the last one of each scale holds the logits.
 Maps = Sequence[Sequence[Tensor]]
 Term = Callable[[Tensor, Tensor], Tensor]
 softplus = functional.softplus
@@ -40,7 +40,7 @@ _FORMS = {
     ),
 }
 FORMS = tuple(_FORMS)
-# forms whose generator loss depends on the real image
+# Forms whose generator loss depends on the real image.
 COMPARING = ("relativistic",)
 
 
@@ -48,7 +48,7 @@ def _over_scales(term: Term, real: Maps, fake: Maps) -> Tensor:
     """The sum over scales of a term's mean over positions, in float32."""
     losses = []
     for real_scale, fake_scale in zip(real, fake, strict=True):
-        # The last map holds the logits.
+        # Logits may come in half precision.
         loss = term(real_scale[-1].float(), fake_scale[-1].float())
         losses.append(loss.mean())
     return torch.stack(losses).sum()
