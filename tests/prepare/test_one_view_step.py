@@ -12,11 +12,11 @@ from gsgan.fit.shape import shape_of
 from gsgan.prepare.one_view import (
     ACCELERATION,
     ACCELERATIONS,
-    FEET,
-    GAP,
-    GROUPS,
+    FOOT_JOINTS,
+    MAX_TIME_GAP,
     OUTLIER,
     PLANE,
+    RESIDUAL_GROUPS,
     SLIDING,
     Problem,
     Seen,
@@ -45,7 +45,7 @@ def problem_and_state(*, smooth: bool, shape: bool) -> tuple[Problem, State]:
         world=torch.from_numpy(world_landmarks(truth)),
         time=torch.tensor([0.0, 0.1, 0.25, 0.3], dtype=torch.float64),
     )
-    standing = torch.ones(FRAMES, len(FEET), dtype=torch.float64)
+    standing = torch.ones(FRAMES, len(FOOT_JOINTS), dtype=torch.float64)
     standing[2, :2] = 0
     problem = Problem(seen, shape=shape, smooth=smooth, standing=standing)
 
@@ -93,7 +93,7 @@ def dense_step(problem: Problem, at: State) -> tuple[torch.Tensor, torch.Tensor]
         return 2 * speed.diff(dim=0) / (step[1:] + step[:-1]) / ACCELERATION
 
     def slides(X: torch.Tensor) -> torch.Tensor:
-        return X.diff(dim=0)[:, FEET] / seen.time.diff()[:, None, None] / SLIDING
+        return X.diff(dim=0)[:, FOOT_JOINTS] / seen.time.diff()[:, None, None] / SLIDING
 
     # Weights of the groups of residuals, at the state.
     standing = problem.standing
@@ -102,10 +102,10 @@ def dense_step(problem: Problem, at: State) -> tuple[torch.Tensor, torch.Tensor]
     r = data(X, at.shared[:PLANE])
     by_group = []
     for group in range(confidence.shape[1]):
-        by_group.append(robust(r[:, GROUPS.eq(group)], confidence[:, group]))
-    of_data = torch.stack(by_group, dim=1)[:, GROUPS]
+        by_group.append(robust(r[:, RESIDUAL_GROUPS.eq(group)], confidence[:, group]))
+    of_data = torch.stack(by_group, dim=1)[:, RESIDUAL_GROUPS]
     both = seen.time[2:] - seen.time[:-2]
-    known = (both < GAP)[:, None] * both[:, None] * ACCELERATIONS
+    known = (both < MAX_TIME_GAP)[:, None] * both[:, None] * ACCELERATIONS
     of_accelerations = robust(accelerations(X), known.expand(-1, 33))[..., None]
     of_slides = robust(slides(X), standing[:-1] * standing[1:])[..., None]
 

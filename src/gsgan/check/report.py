@@ -16,7 +16,7 @@ from rich.text import Text
 STYLES = {"error": "bold red", "warning": "yellow"}
 
 # Jinja's template of the page
-PAGE = """<!DOCTYPE html>
+REPORT_PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>Check of a dataset</title><style>
@@ -160,7 +160,7 @@ def page(report: CheckReport) -> str:
     # Names from the dataset are escaped.
     environment = Environment(autoescape=True, trim_blocks=True)
     colour = "error" if report.errors else "warning" if report.warnings else "good"
-    return environment.from_string(PAGE).render(report=report, colour=colour)
+    return environment.from_string(REPORT_PAGE).render(report=report, colour=colour)
 
 
 def print_report(report: CheckReport, console: Console) -> None:

@@ -50,7 +50,11 @@ def check_data(
     """
     try:
         measured = Measurements(
-            data, sampling, limits, effects or EffectSettings(), console
+            data,
+            sampling,
+            limits,
+            effects or EffectSettings(),
+            console,
         )
     except DataError as error:
         messages = [str(error)]
@@ -58,7 +62,9 @@ def check_data(
             messages += capture_problems(Path(data.root).expanduser(), data.limits)
         return unreadable(data.root, messages)
     return CheckReport(
-        str(measured.subject.layout.root), sections(measured), measured.numbers()
+        str(measured.subject.layout.root),
+        sections(measured),
+        measured.numbers(),
     )
 
 
@@ -103,7 +109,11 @@ def run_check(config: DictConfig) -> CheckReport:
     effects = instantiate(config.effects)
     try:
         report = check_data(
-            instantiate(config.data), sampling, limits, effects, console
+            instantiate(config.data),
+            sampling,
+            limits,
+            effects,
+            console,
         )
     except InstantiationException as error:
         # Hydra wraps the error of a dataset that is made when it is instantiated.

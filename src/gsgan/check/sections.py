@@ -23,30 +23,23 @@ from gsgan.skeleton.sanitise import limb_length_sum
 from gsgan.utils.arrays import Float, nanmedian
 from gsgan.utils.errors import DataError
 
-# metres of person: outside, units are wrong
+# Metres of person: outside of these, units are wrong.
 POSSIBLE = (0.4, 3.0)
-# metres: smaller is a child or a wrong unit, taller is rare
+# Metres: smaller is a child or a wrong unit, taller is rare.
 PLAUSIBLE = (1.2, 2.1)
-# degrees from trunk to up axis, median over frames: nobody stands like that
-LEAN = 50.0
+# Maximum degrees from trunk to up axis, median over frames.
+MAX_LEAN = 50.0
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """Distances, sizes and directions of cameras and person.
+    """Distances, sizes and directions of cameras and person."""
 
-    Args:
-        distances: metres from the person, by camera.
-        stature: metres, median over frames, estimated from limb lengths.
-        up, lean: ``[3]`` direction of the trunk, median over frames; degrees from the up axis.
-        far: a message for each camera that is far too near or far.
-    """
-
-    distances: dict[str, float]
-    stature: float
-    up: Float
-    lean: float
-    far: dict[str, str]
+    distances: dict[str, float]  # metres from the person, by camera
+    stature: float  # metres, median over frames, estimated from limb lengths
+    up: Float  # [3] direction of the trunk, median over frames
+    lean: float  # degrees of the trunk from the up axis
+    far: dict[str, str]  # a message for each camera that is far too near or far
 
     @property
     def distance(self) -> float:
@@ -98,7 +91,7 @@ def geometry_findings(subject: CheckedData, geometry: Geometry) -> list[Finding]
         possible = POSSIBLE[0] <= stature <= POSSIBLE[1]
         found.append(Finding("warning" if possible else "error", "units", text))
 
-    if geometry.lean > LEAN:
+    if geometry.lean > MAX_LEAN:
         way = axis_name(geometry.up)
         axis = subject.layout.meta.up_axis
         text = f"the trunk points along {way}, {geometry.lean:.0f} degrees from the up axis {axis}"
@@ -160,9 +153,9 @@ def lens_table(subject: CheckedData, geometry: Geometry) -> Table:
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
 
-# damaged images listed
+# Maximum number of damaged images that are listed.
 LISTED_BROKEN = 6
-# doubtful frames listed
+# Maximum number of doubtful frames that are listed.
 TABLE_FRAMES = 40
 AGREEMENT = (
     "Joints are compared with masks, undistorted. Overlap is that of the mask with the silhouette "
@@ -375,7 +368,10 @@ def _agreement(m: Measurements) -> Section:
     min_inside = m.subject.consistency.min_inside
     found = calibration_findings(m.cameras, m.limits, min_inside, m.geometry.far)
     return Section(
-        "Skeleton, masks and cameras", (table,), tuple(found), text=AGREEMENT
+        "Skeleton, masks and cameras",
+        (table,),
+        tuple(found),
+        text=AGREEMENT,
     )
 
 

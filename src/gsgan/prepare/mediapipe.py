@@ -20,7 +20,7 @@ TOOL = Path(__file__).parent / "mediapipe_tool"
 SCRIPT = TOOL / "detect.py"
 REQUIREMENTS = TOOL / "requirements.txt"
 NEWEST = (3, 12)  # the pinned MediaPipe has no build for later Pythons
-# written first: a folder with it was made here and may be replaced
+# Written first: a folder with it was made here and may be replaced.
 MARKER = ".gsgan-mediapipe"
 READY = ".ready"  # written last: an environment without it is incomplete
 
@@ -71,6 +71,8 @@ def run_tool(
     tool = options.mediapipe
     masks = options.masks == MEDIAPIPE
     parts = {"hands": options.hands, "face": options.face}
+
+    # Results depend on the images, the tool, and the parts that it looks for.
     results = {}
     folders = {}
     for name, source in sources.items():
@@ -97,6 +99,8 @@ def run_tool(
             _detect(command, sources[name].path, advance)
 
         each_camera(one, "finding landmarks", missing, options.workers)
+
+    # The masks; a source without any shows nobody.
     found = {}
     for name, folder in folders.items():
         files = sorted(folder.glob("*.png"))
@@ -113,7 +117,10 @@ def _detect(command: list[str], source: Path, advance: Advance) -> None:
     with (
         tempfile.TemporaryFile("w+") as errors,
         subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=errors, text=True
+            command,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            text=True,
         ) as process,
     ):
         try:
@@ -133,7 +140,9 @@ def _detect(command: list[str], source: Path, advance: Advance) -> None:
 
 
 def ensure_environment(
-    tool: MediaPipe, setup: bool, say: Callable[[str], None]
+    tool: MediaPipe,
+    setup: bool,
+    say: Callable[[str], None],
 ) -> Path:
     """The environment's Python; a missing environment is created if ``setup`` allows it.
 
@@ -151,7 +160,7 @@ def ensure_environment(
             "it (some 400 MB), or give landmarks=<folder> and masks=<folder>"
         )
 
-    # a Python that MediaPipe supports
+    # A Python that MediaPipe supports.
     base = tool.python
     if not base and sys.version_info[:2] <= NEWEST:
         base = sys.executable
@@ -161,7 +170,7 @@ def ensure_environment(
             "MediaPipe needs Python 3.11 or 3.12: set mediapipe.python=<path>"
         )
 
-    # the folder, marked as made here
+    # The folder, marked as made here.
     with writing(place):
         if place.exists():
             if any(place.iterdir()) and not (place / MARKER).is_file():
@@ -172,7 +181,7 @@ def ensure_environment(
         place.mkdir(parents=True)
         (place / MARKER).touch()
 
-    # the environment, complete with its last file
+    # The environment, complete with its last file.
     say(f"creating the MediaPipe environment at {place}, once")
     _run([base, "-m", "venv", str(place)], "the environment cannot be created")
     install = [
@@ -194,6 +203,7 @@ def ensure_environment(
 
 
 def _run(command: list[str], what: str) -> None:
+    """Runs a command; ``what`` begins the message if it fails."""
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
     except OSError as error:

@@ -47,9 +47,9 @@ for side, shoulder, elbow, wrist, hip, knee, ankle, landmarks in (
         f"{side} knee": Handle((hip, knee), moved=(ankle, *foot)),
     }
 NOSE_JOINT = 0
-HEAD = "head"
-BODY = "body"
-NAMES = (*HANDLES, HEAD, BODY)
+HEAD_HANDLE = "head"
+BODY_HANDLE = "body"
+HANDLE_NAMES = (*HANDLES, HEAD_HANDLE, BODY_HANDLE)
 
 
 def _present(p: Float, joints: tuple[int, ...]) -> list[int]:
@@ -59,9 +59,9 @@ def _present(p: Float, joints: tuple[int, ...]) -> list[int]:
 
 def position(p: Float, name: str) -> Float:
     """The position ``[3]`` of a handle in a pose ``[J, 3]``, metres."""
-    if name == BODY:
+    if name == BODY_HANDLE:
         return middle(p, HIPS)
-    joint = NOSE_JOINT if name == HEAD else HANDLES[name].chain[-1]
+    joint = NOSE_JOINT if name == HEAD_HANDLE else HANDLES[name].chain[-1]
     return np.asarray(p[joint])
 
 
@@ -73,17 +73,17 @@ def dragged(p: Float, name: str, target: Float) -> Float:
 
     Args:
         p: ``[J, 3]`` metres, finite; 33 joints, 75 with hands or 105 with a face.
-        name: of ``NAMES``.
+        name: of ``HANDLE_NAMES``.
         target: ``[3]`` metres.
 
     Source: Aristidou and Lasenby, FABRIK (2011), for the chains.
     """
     q = p.copy()
-    if name == BODY:
+    if name == BODY_HANDLE:
         return q + (target - middle(p, HIPS))
 
     # The head rotates so that the nose points to the target.
-    if name == HEAD:
+    if name == HEAD_HANDLE:
         neck = middle(p, SHOULDERS)
         turn = between(p[NOSE_JOINT] - neck, target - neck)
         face = _present(p, (*HEAD_LANDMARKS, *HOLISTIC.expression))

@@ -23,7 +23,7 @@ from gsgan.scene import BodyPose, Camera, Gaussians
 from gsgan.utils.errors import GsganError
 from gsgan.utils.images import eight_bits
 from gsgan.utils.provenance import png_bytes
-from gsgan.view.drag import NAMES, dragged, position
+from gsgan.view.drag import HANDLE_NAMES, dragged, position
 
 Float = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
@@ -40,7 +40,7 @@ GREY = (160, 165, 175)
 # layers
 FINAL_IMAGE = "image"
 COLOUR = "Step I's colour"
-SEGMENTATION = "segmentation S"
+SEGMENTATION_LAYER = "segmentation S"
 ALPHA = "alpha"
 
 
@@ -199,7 +199,7 @@ class Session:
         # All handles are set at once: the rendering thread iterates over them.
         if self.handles.value:
             gizmos = {}
-            for name in NAMES:
+            for name in HANDLE_NAMES:
                 gizmo = self.client.scene.add_transform_controls(
                     f"/drag/{name}",
                     scale=0.12,
@@ -415,7 +415,7 @@ def layers(avatar: Avatar) -> tuple[str, ...]:
     if avatar.splats is not None:
         names.append(COLOUR)
     if avatar.segmentation is not None:
-        names.append(SEGMENTATION)
+        names.append(SEGMENTATION_LAYER)
     return tuple(names)
 
 
@@ -435,7 +435,7 @@ def shown(layer: str, rendering: Rendering, behind: torch.Tensor) -> Bytes:
     if layer == ALPHA:
         grey = (alpha[0].clamp(0, 1) * 255).byte().numpy()
         return np.repeat(grey[..., None], 3, axis=2)
-    if layer == SEGMENTATION and rendering.segmentation is not None:
+    if layer == SEGMENTATION_LAYER and rendering.segmentation is not None:
         colours = colour_labels(rendering.segmentation.argmax(dim=1))[0]
         return np.asarray((colours.permute(1, 2, 0) * 255).byte().cpu().numpy())
 
