@@ -153,13 +153,15 @@ def calibration_findings(
     # Masks far larger than the body: one finding for all of them, which then do not count.
     big = [s for s in scores if s.oversized(limits) and s.name not in named]
     if big:
-        sizes = listed(f"{score.name} {score.fullness:.1f}" for score in big)
+        sizes = []
+        for score in big:
+            sizes.append(f"{score.name} {score.fullness:.1f}")
+            named.add(score.name)
         text = (
-            f"masks are far larger than the body (times its area: {sizes}): a focal length that is "
-            "too short, K of smaller images, a skeleton in another unit, or masks of more"
+            f"masks are far larger than the body (times its area: {listed(sizes)}): a focal length "
+            "that is too short, K of smaller images, a skeleton in another unit, or masks of more"
         )
         found.append(Finding("error", TOPIC, text))
-        named.update(score.name for score in big)
         scores = [score for score in scores if score not in big]
 
     # Pairs that fit better with each other's calibration.

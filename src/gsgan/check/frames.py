@@ -60,10 +60,11 @@ def skeleton_doubts(subject: CheckedData, limits: Limits) -> list[Doubt]:
     ) -> None:
         """Adds the frames in which any of the flags ``[F, N]`` holds."""
         for row in np.flatnonzero(flags.any(1)).tolist():
-            places = np.flatnonzero(flags[row]).tolist()
-            texts = listed([text(row, place) for place in places], 3)
+            texts = []
+            for place in np.flatnonzero(flags[row]).tolist():
+                texts.append(text(row, place))
             frame = int(subject.frames[row])
-            found.append(Doubt(frame, kind, f"{what}{texts}"))
+            found.append(Doubt(frame, kind, f"{what}{listed(texts, 3)}"))
 
     # Jumps, unless neighbours in the list are not neighbours in time.
     jump = jump_distance(p)

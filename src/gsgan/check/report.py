@@ -12,10 +12,10 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
-# rich's styles by level
+# Styles of rich by level.
 STYLES = {"error": "bold red", "warning": "yellow"}
 
-# Jinja's template of the page
+# Jinja's template of the page.
 REPORT_PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
@@ -58,8 +58,8 @@ class Finding:
     """
 
     level: Literal["error", "warning"]
-    topic: str
-    sentence: str
+    topic: str  # one word
+    sentence: str  # for the user
 
 
 @dataclass(frozen=True)
@@ -90,6 +90,7 @@ class Figure:
     @property
     def source(self) -> str:
         """A data URL, for the page."""
+        # The page has all images in itself.
         return f"data:image/jpeg;base64,{base64.b64encode(self.image).decode()}"
 
 

@@ -48,6 +48,7 @@ def check_data(
     Raises:
         ConfigError: when the data's config is wrong.
     """
+    # A dataset that cannot be read has a report, too.
     try:
         measured = Measurements(
             data,
@@ -57,6 +58,7 @@ def check_data(
             console,
         )
     except DataError as error:
+        # The reader stops at the first problem; captures are searched for all.
         messages = [str(error)]
         if isinstance(data.reader, CaptureReader) and data.root is not None:
             messages += capture_problems(Path(data.root).expanduser(), data.limits)

@@ -221,19 +221,20 @@ class Measurements:
 
     def numbers(self) -> dict[str, object]:
         """The scores, for the JSON file."""
-        # Each camera with its three best rivals.
+        # Each camera with its three best rivals, and the reasons by frame; JSON has text keys.
         cameras = {}
         for score in self.cameras:
             best = list(score.rivals.items())[:3]
             cameras[score.name] = asdict(score) | {"rivals": dict(best)}
+        doubtful = {}
+        for frame, text in self.reasons.items():
+            doubtful[str(frame)] = text
         return {
             "readable": True,
             "cameras": cameras,
             "camera_distance": self.geometry.distance,
             "stature": self.geometry.stature,
-            "doubtful_frames": {
-                str(frame): text for frame, text in self.reasons.items()
-            },
+            "doubtful_frames": doubtful,
             "settings": {
                 "sampling": asdict(self.sampling),
                 "limits": asdict(self.limits),
