@@ -245,7 +245,7 @@ def jumped(distance: Float, limit: float) -> Bool:
     here = known[1:-1]
     after = known[2:]
     peak = (here >= before) & (here >= after)
-    return np.asarray((here > limit) & peak)
+    return (here > limit) & peak
 
 
 def facing(p: Float, template: SkeletonTemplate) -> Float:

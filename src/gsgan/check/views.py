@@ -153,7 +153,7 @@ class MaskView:
     @property
     def beyond(self) -> Bool:
         """``[J]`` joints outside the mask by more than the tolerance."""
-        return np.asarray(self.outside > self.tolerance)
+        return self.outside > self.tolerance
 
     @property
     def distance(self) -> float:
@@ -269,7 +269,7 @@ def _view(subject: CheckedData, item: Item, sampling: Sampling) -> MaskView:
     K = frame.camera.K[0].double().numpy()
     camera = replace(entry, K=K, size=frame.camera.size)
     soft = frame.mask[0, 0].numpy()  # [H, W]
-    mask = np.asarray(soft > 0.5)
+    mask = soft > 0.5
     body = body_silhouette(camera, p, visible, subject.template)
 
     # Joints outside the mask; those in the padding are not in the image.

@@ -77,7 +77,7 @@ def cleanse(p: Float) -> tuple[Float, dict[str, int]]:
 def _distance_from_median(p: Float) -> Float:
     """Distances ``[F, J]`` of points ``[F, J, 3]`` from their median point in each frame."""
     middle = nanmedian(p, 1)[:, None]
-    return np.asarray(np.linalg.norm(p - middle, axis=-1))
+    return np.linalg.norm(p - middle, axis=-1)
 
 
 def _mark_ends(mask: Bool, bones: Bones, wrong: Bool) -> None:
@@ -105,7 +105,7 @@ def _misfit(p: Float, bones: Bones, share: float, noise: float = 0.0) -> Bool:
 
     # A length must be off by a share and by more than the noise.
     change = np.abs(lengths - usual)
-    return np.asarray((change > share * usual) & (change > noise))
+    return (change > share * usual) & (change > noise)
 
 
 def smooth(p: Float, weight: Float, time: Float, seconds: float) -> Float:

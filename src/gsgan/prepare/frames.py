@@ -131,7 +131,7 @@ def left_out(px: Float, conf: Float, sharp: Float) -> LeftOut:
     # Somebody else: the trunk is too far from its place in the last frame of the person.
     middle = px[:, HUBS].mean(1)
     size = extents(px)
-    good = np.asarray(~(few | cut_off))
+    good = ~(few | cut_off)
     same = good.copy()
     before = -1
     for f in np.flatnonzero(good).tolist():
@@ -154,7 +154,7 @@ def left_out(px: Float, conf: Float, sharp: Float) -> LeftOut:
     result: LeftOut = {}
     taken = np.zeros(len(px), bool)
     for reason, frames in reasons.items():
-        result[reason] = np.asarray(frames & ~taken)
+        result[reason] = frames & ~taken
         taken |= frames
     return result
 

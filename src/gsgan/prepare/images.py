@@ -78,7 +78,7 @@ def tidy(mask: Bytes, levels: tuple[float, float]) -> Bytes:
     areas = stats[:, cv2.CC_STAT_AREA].copy()
     areas[0] = 0  # the background
     large = areas >= MIN_BLOB * areas.max()
-    return np.asarray(mask * large[labels], np.uint8)
+    return mask * large[labels]
 
 
 def write_images(

@@ -446,23 +446,22 @@ def _notes(found: Mapping[str, Any], options: Options, natural: float) -> list[s
     moved = found["background_moved"]
     others = found["several_faces"]
     feet = found["feet_seen"]
-    doubts = []
     if seconds < MIN_SECONDS:
-        doubts.append(f"{seconds:.1f} seconds are short, 20 to 40 are better")
+        notes.append(f"doubtful: {seconds:.1f} seconds are short, 20 to 40 are better")
     if turned < MIN_TURN:
-        doubts.append(
-            f"only {turned} of 360 degrees were filmed; training guesses the rest"
+        notes.append(
+            f"doubtful: only {turned} of 360 degrees were filmed; training guesses the rest"
         )
     if moved > MAX_BACKGROUND_MOVE:
-        doubts.append(
-            f"the background moved by {moved:.0%} of the image; it counts as still"
+        notes.append(
+            f"doubtful: the background moved by {moved:.0%} of the image; it counts as still"
         )
     if others > MAX_OTHER_FACES:
-        doubts.append(f"{others:.0%} of the images show more than one face")
+        notes.append(f"doubtful: {others:.0%} of the images show more than one face")
     if feet < MIN_FEET_SEEN:
-        doubts.append(
-            f"feet are in {feet:.0%} of the images; legs and distance are guesses"
+        notes.append(
+            f"doubtful: feet are in {feet:.0%} of the images; legs and distance are guesses"
         )
     if not found["standing"]:
-        doubts.append("no foot stood still, so the ground is a guess")
-    return notes + [f"doubtful: {doubt}" for doubt in doubts]
+        notes.append("doubtful: no foot stood still, so the ground is a guess")
+    return notes

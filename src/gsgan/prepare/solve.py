@@ -284,7 +284,7 @@ def _flat(values: Float) -> Float:
 def _mean_seen(values: Float, weight: Float) -> Float:
     """The mean ``[F, J]`` over the cameras that see a joint."""
     views = (weight > 0).sum(0)
-    return np.asarray(values.sum(0) / np.maximum(views, 1))
+    return values.sum(0) / np.maximum(views, 1)
 
 
 def clock_errors(cameras: CameraArray, uv: Float, weight: Float) -> tuple[Float, Float]:

@@ -62,7 +62,7 @@ def position(p: Float, name: str) -> Float:
     if name == BODY_HANDLE:
         return middle(p, HIPS)
     joint = NOSE_JOINT if name == HEAD_HANDLE else HANDLES[name].chain[-1]
-    return np.asarray(p[joint])
+    return p[joint]
 
 
 def dragged(p: Float, name: str, target: Float) -> Float:
@@ -114,7 +114,7 @@ def fabrik(chain: Float, target: Float) -> Float:
     # Out of reach, the chain is straight towards the target.
     if np.linalg.norm(along) >= reach:
         steps = np.concatenate([[0.0], np.cumsum(lengths)])
-        return np.asarray(root + steps[:, None] * unit(along))
+        return root + steps[:, None] * unit(along)
 
     # A chain that is straight along the target is bent to any side first.
     sine = np.linalg.norm(np.cross(unit(q[1] - root), unit(along)))

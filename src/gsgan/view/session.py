@@ -437,7 +437,7 @@ def shown(layer: str, rendering: Rendering, behind: torch.Tensor) -> Bytes:
         return np.repeat(grey[..., None], 3, axis=2)
     if layer == SEGMENTATION_LAYER and rendering.segmentation is not None:
         colours = colour_labels(rendering.segmentation.argmax(dim=1))[0]
-        return np.asarray((colours.permute(1, 2, 0) * 255).byte().cpu().numpy())
+        return (colours.permute(1, 2, 0) * 255).byte().cpu().numpy()
 
     # Colours are shown on the background.
     features = rendering.features
