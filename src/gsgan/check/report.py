@@ -1,7 +1,5 @@
 """A report: findings, tables and figures in sections; as one HTML page and on the terminal."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Iterable
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@ Images are ``[B, 3, H, W]`` RGB in [0, 1], masks ``[B, 1, H, W]``; a background 
 for black or 1 for white.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 import cv2

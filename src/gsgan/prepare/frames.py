@@ -1,7 +1,5 @@
 """Frames of one video: sampled in time, and which of them show one whole person sharply."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -20,6 +20,7 @@ import importlib.util
 import math
 import re
 from functools import lru_cache
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -31,7 +32,7 @@ from gsgan.splat.settings import Accuracy
 
 DEVICE = "cuda"
 # Cut-offs of gsplat 1.5.3. Its boxes reach to the alpha cut-off: the extent "opacity".
-COMPILED_IN: dict[str, float | str] = {
+COMPILED_IN: dict[str, Any] = {
     "alpha_min": 1 / 255,
     "transmittance_min": 1e-4,
     "extent": "opacity",
@@ -232,10 +233,4 @@ def first_error(error: Exception) -> str:
 
 
 # The settings that gsplat's own cut-offs are.
-_PROBE = Accuracy(
-    name="probe",
-    alpha_min=1 / 255,
-    transmittance_min=1e-4,
-    extent="opacity",
-    dtype="float32",
-)
+_PROBE = Accuracy(name="probe", **COMPILED_IN)

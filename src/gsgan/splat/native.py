@@ -3,20 +3,16 @@
 When it cannot be built, ``available()`` is False and ``why_not()`` has the reason.
 """
 
-from __future__ import annotations
-
 import ctypes
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from gsgan.splat import build
 from gsgan.splat.buffers import zeros
-
-if TYPE_CHECKING:
-    from gsgan.splat.project import Projected
-    from gsgan.splat.settings import Accuracy
+from gsgan.splat.project import Projected
+from gsgan.splat.settings import Accuracy
 
 # Memory of the backward pass for gradients per (tile, Gaussian) before they are summed.
 SLOT_BYTES = 1 << 28
