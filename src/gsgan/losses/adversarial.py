@@ -5,13 +5,11 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn import functional
+from torch.nn.functional import l1_loss, relu, softplus
 
 # Feature maps by scale; the last one of each scale holds the logits.
 Maps = Sequence[Sequence[Tensor]]
 Term = Callable[[Tensor, Tensor], Tensor]
-softplus = functional.softplus
-relu = functional.relu
 
 
 class Form(NamedTuple):
@@ -86,6 +84,6 @@ def feature_matching(real: Maps, fake: Maps) -> Tensor:
         weight = 4 / ((len(real_scale) - 1) * len(real))
         features = zip(real_scale[:-1], fake_scale[:-1], strict=True)
         for truth, generated in features:
-            distance = functional.l1_loss(generated, truth.detach())
+            distance = l1_loss(generated, truth.detach())
             loss = loss + weight * distance
     return loss

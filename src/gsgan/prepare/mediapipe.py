@@ -7,6 +7,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 from gsgan.prepare.images import find_masks
 from gsgan.prepare.landmarks import find_landmarks
@@ -36,22 +37,30 @@ def tool_key() -> list[str]:
     return [SCRIPT.read_text(), REQUIREMENTS.read_text()]
 
 
+class People(NamedTuple):
+    """Files by source."""
+
+    landmarks: dict[str, Path]
+    masks: dict[str, dict[int, Path]]  # by frame number
+
+
 def find_people(
     options: Options,
     sources: Mapping[str, Recording],
     stages: StageFolder,
     say: Callable[[str], None],
-) -> tuple[dict[str, Path], dict[str, dict[int, Path]]]:
-    """Landmark files by source, and its masks by frame number: given ones, or those of the tool."""
-    found: dict[str, Path] = {}
-    masks: dict[str, dict[int, Path]] = {}
+) -> People:
+    """Landmarks and masks of each source: given ones, or those of the tool."""
+    found = People({}, {})
     if options.needs_tool:
-        found, masks = run_tool(options, sources, stages, say)
+        found = run_tool(options, sources, stages, say)
     if options.masks != MEDIAPIPE:
         masks = find_masks(options.folder("masks"), sources)
+        found = found._replace(masks=masks)
     if options.landmarks != MEDIAPIPE:
-        found = find_landmarks(options.folder("landmarks"), sources)
-    return found, masks
+        landmarks = find_landmarks(options.folder("landmarks"), sources)
+        found = found._replace(landmarks=landmarks)
+    return found
 
 
 def run_tool(
@@ -59,8 +68,8 @@ def run_tool(
     sources: Mapping[str, Recording],
     stages: StageFolder,
     say: Callable[[str], None],
-) -> tuple[dict[str, Path], dict[str, dict[int, Path]]]:
-    """The npz of landmarks and the masks by frame number of each source.
+) -> People:
+    """Landmarks and masks of each source by MediaPipe.
 
     The tool runs for sources whose results are not stored.
 
@@ -109,7 +118,7 @@ def run_tool(
                 f"MediaPipe found nobody in {name}; show a person, or leave it out"
             )
         found[name] = {int(path.stem): path for path in files}
-    return results, found
+    return People(results, found)
 
 
 def _detect(command: list[str], source: Path, advance: Advance) -> None:

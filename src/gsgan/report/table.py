@@ -478,19 +478,12 @@ def _with_best(rows: Sequence[Row], part: Part) -> list[Row]:
 def _origin(runs: Sequence[ScoredRun]) -> tuple[str, ...]:
     """Data, protocol and commit of a row."""
     # Many subjects are counted, not listed.
-    names = []
-    roots = set()
-    protocols = []
-    commits = []
-    for run in runs:
-        names.append(run.data_name)
-        roots.add(run.data.get("root"))
-        protocols.append(run.protocol()["name"])
-        commits.append(run.commit)
-    data = join_unique(names)
+    data = join_unique(run.data_name for run in runs)
+    roots = {run.data.get("root") for run in runs}
     if len(roots) > 1:
         data = f"{runs[0].data['name']}, {len(roots)} subjects"
-    return data, join_unique(protocols), join_unique(commits)
+    protocols = join_unique(run.protocol()["name"] for run in runs)
+    return data, protocols, join_unique(run.commit for run in runs)
 
 
 def _marks(runs: Sequence[ScoredRun], split: str) -> Iterator[str]:

@@ -88,7 +88,7 @@ class Format:
     """The parts of one text format; ``italic``, ``bold`` and ``raised`` are patterns."""
 
     escape: Callable[[str], str]
-    table: Callable[[str, pd.DataFrame], str]  # of a title and cells
+    table: Callable[[str, list[str], list[list[str]]], str]  # of title, header and rows
     italic: str
     bold: str
     raised: str  # for the numbers of notes
@@ -118,8 +118,8 @@ class Format:
         columns = ["", *grid.columns]
         if with_origin:
             columns += ORIGIN
-        frame = pd.DataFrame(rows, columns=list(map(self.escape, columns)))
-        table = self.table(self.escape(grid.title), frame)
+        header = list(map(self.escape, columns))
+        table = self.table(self.escape(grid.title), header, rows)
         return "\n\n".join([table, *map(self.escape, grid.remarks)])
 
     def body(self, report: Report) -> str:
@@ -140,9 +140,8 @@ def _escape_markdown(text: str) -> str:
     return re.sub(r"(?<!\w)_|_(?!\w)", r"\\_", text)
 
 
-def _markdown_table(title: str, frame: pd.DataFrame) -> str:
-    table = markdown_table(list(frame.columns), frame.to_numpy().tolist())
-    return f"**{title}**\n\n{table}"
+def _markdown_table(title: str, header: list[str], rows: list[list[str]]) -> str:
+    return f"**{title}**\n\n{markdown_table(header, rows)}"
 
 
 # After \\ the letters [ ] * would be an argument.
@@ -178,10 +177,11 @@ def _escape_latex(text: str) -> str:
     return written
 
 
-def _latex_table(title: str, frame: pd.DataFrame) -> str:
+def _latex_table(title: str, header: list[str], rows: list[list[str]]) -> str:
     """A ``table`` that is no wider than the text."""
     # The first column has the labels, the others have numbers.
-    alignment = "l".ljust(len(frame.columns), "r")
+    alignment = "l".ljust(len(header), "r")
+    frame = pd.DataFrame(rows, columns=header)
     tabular = frame.to_latex(index=False, escape=False, column_format=alignment)
     return (
         f"\\begin{{table}}\n\\centering\n\\caption{{{title}}}\n"

@@ -197,9 +197,8 @@ class _Walk:
     def chunks(self) -> Iterator[slice]:
         """Ranges of listed tiles that are processed together."""
         tiles = max(1, self.tiling.block_elements // (self.tiling.layers * self.pixels))
-        listed = len(self.lists.tiles)
-        for start in range(0, listed, tiles):
-            yield slice(start, min(start + tiles, listed))
+        for start in range(0, len(self.lists.tiles), tiles):
+            yield slice(start, start + tiles)
 
     def forward(
         self,
