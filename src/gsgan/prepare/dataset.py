@@ -106,9 +106,7 @@ def standing_axis(p: Float) -> str:
     """
     # Ankles to nose, hips to shoulders.
     ankles = (p[:, 27] + p[:, 28]) / 2
-    whole = p[:, 0] - ankles
-    trunk = p[:, 11] - p[:, 23]
-    body = np.concatenate([whole, trunk])
+    body = np.concatenate([p[:, 0] - ankles, p[:, 11] - p[:, 23]])
 
     # Shoulders to ears.
     ears = p[:, [7, 8]].mean(1)

@@ -45,11 +45,10 @@ def find_masks(folder: Path, names: Iterable[str]) -> dict[str, dict[int, Path]]
         place = folder / name
 
         # Names such as 000012_1.png have the number of a person after that of the frame.
-        of_persons = []
-        for path in place.glob("*"):
-            if path.suffix.lower() in IMAGE_SUFFIXES:
-                of_persons.append(re.fullmatch(r"\d+_\d+", path.stem) is not None)
-        number = _first_number if of_persons and all(of_persons) else last_number
+        paths = place.glob("*")
+        stems = [path.stem for path in paths if path.suffix.lower() in IMAGE_SUFFIXES]
+        of_persons = stems and all(re.fullmatch(r"\d+_\d+", stem) for stem in stems)
+        number = _first_number if of_persons else last_number
         files = frame_files(folder, name, IMAGE_SUFFIXES, number)
         if not files:
             raise DataError(

@@ -138,13 +138,9 @@ def _read_json(path: Path) -> Detections:
     # The person of each file, and the set of joints of all bodies together.
     files = json_files(path)
     best = []
-    bodies = []
     for file in files.values():
-        person = max(_read_people(file), key=_confidence, default=None)
-        best.append(person)
-        if person is not None:
-            bodies.append(person.body)
-    numbers = joint_numbers(bodies)
+        best.append(max(_read_people(file), key=_confidence, default=None))
+    numbers = joint_numbers([person.body for person in best if person is not None])
 
     px = np.full((len(files), ALL, 2), np.nan)
     conf = np.zeros((len(files), ALL))
@@ -212,11 +208,8 @@ def _read_people(path: Path) -> list[_Person]:
         )
 
     # The content may be anything: whatever is wrong with it is one error.
-    found = []
     try:
-        for person in people:
-            if person is not None:
-                found.append(_person(person, keys))
+        return [_person(person, keys) for person in people if person is not None]
     except (
         ArithmeticError,
         AttributeError,
@@ -229,7 +222,6 @@ def _read_people(path: Path) -> list[_Person]:
             f"{path}: a person must hold '{keys[0]}' with x, y, confidence of {sets} joints "
             f"({error})"
         ) from None
-    return found
 
 
 def _person(person: Mapping[str, Any], keys: tuple[str, ...]) -> _Person:
@@ -264,8 +256,9 @@ def joint_numbers(bodies: Sequence[Float]) -> dict[int, dict[int, int]]:
     for body in bodies:
         if len(body) != 25:
             continue
-        neck, eighth, right, left = body[[1, 8, 9, 12], :2]
-        if (body[[1, 8, 9, 12], 2] > 0).all():
+        used = body[[1, 8, 9, 12]]
+        neck, eighth, right, left = used[:, :2]
+        if (used[:, 2] > 0).all():
             hips = (left + right) / 2
             trunk = max(float(np.linalg.norm(neck - hips)), 1e-6)
             distances.append(np.linalg.norm(eighth - hips) / trunk)

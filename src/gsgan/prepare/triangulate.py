@@ -216,9 +216,7 @@ def find_flips(
         groups: ``G`` tuples of (left, right) joints that swap together.
     """
     # Groups are independent: a detector may confuse the legs only.
-    flips = []
-    for pairs in groups:
-        flips.append(_group_flips(cameras, uv, weight, pairs))
+    flips = [_group_flips(cameras, uv, weight, pairs) for pairs in groups]
     return np.stack(flips, axis=-1)
 
 
@@ -260,8 +258,9 @@ def _group_flips(cameras: CameraArray, uv: Float, weight: Float, pairs: Pairs) -
     C, F, _ = weight.shape
 
     def points(flips: Bool, frames: Ints) -> tuple[Float, Float]:
-        sided = apply_flips(uv[:, frames], flips[..., None], adjacent)
-        seen = apply_flips(weight[:, frames], flips[..., None], adjacent)
+        flips = flips[..., None]
+        sided = apply_flips(uv[:, frames], flips, adjacent)
+        seen = apply_flips(weight[:, frames], flips, adjacent)
         return points_and_cost(cameras, sided, seen)
 
     def cost_of(flips: Bool, frames: Ints) -> Float:
@@ -302,10 +301,7 @@ def cheapest_flips(
     cost = cost_of(flips, active)
     for _ in range(C):
         # The cost of changing each camera, in the active frames.
-        trial_costs = []
-        for one in toggles:
-            trial_costs.append(cost_of(flips[:, active] ^ one, active))
-        trials = np.stack(trial_costs)
+        trials = np.stack([cost_of(flips[:, active] ^ one, active) for one in toggles])
         saved = cost[active] - trials - price[:, active]
 
         # The camera whose change saves most is changed.

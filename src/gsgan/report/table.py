@@ -207,12 +207,8 @@ class Part:
             # Runs of one row differ in their seeds only.
             for name in self.names:
                 row = self.of(name, column)
-                seeds = set()
-                facts = []
-                for run in row:
-                    seeds.add(run.seed)
-                    facts.append(_row_facts(run, self.split))
-                if len(seeds) < len(row):
+                facts = [_row_facts(run, self.split) for run in row]
+                if len({run.seed for run in row}) < len(row):
                     names = " and ".join(map(str, row))
                     raise ConfigError(
                         f"{where}: {names} have the same row and seed; leave one out"

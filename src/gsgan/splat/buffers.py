@@ -61,6 +61,8 @@ def forget() -> None:
 
 
 def _take(size: int) -> NDArray[np.uint8] | None:
+    """Unused memory of a size; None if there is none."""
+    # Another thread may take the last one at any time.
     try:
         return _free[size].pop()
     except (KeyError, IndexError):

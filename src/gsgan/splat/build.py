@@ -25,10 +25,11 @@ from torch import Tensor
 
 from gsgan.utils.files import cache_root
 
+# The kernels are one program, which includes the headers.
 SOURCE = Path(__file__).with_name("native.cpp")
 KERNEL_HEADERS = SOURCE.with_name("kernels")
 COMPILERS = ("c++", "g++", "clang++")
-COMPILE_SECONDS = 300.0
+COMPILE_SECONDS = 300.0  # after which the compiler counts as hanging
 
 # No -ffast-math: NaN and infinity keep their meaning, sums keep their order.
 BASE_FLAGS = (
@@ -173,6 +174,8 @@ def compiler() -> list[str]:
         if shutil.which(named[0]) is None:
             raise Unavailable(f"The compiler {named[0]!r} from CXX is not found.")
         return named
+
+    # The first one that is installed.
     for name in COMPILERS:
         if (path := shutil.which(name)) is not None:
             return [path]
@@ -183,6 +186,7 @@ def compiler() -> list[str]:
 
 def _cache_folder() -> Path:
     """Folder of the compiled kernels; created, for this user only, when missing."""
+    # Others must not be able to replace a library that is loaded here.
     folder = cache_root() / "native"
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -205,6 +209,7 @@ def _flags() -> tuple[tuple[str, ...], ...]:
 
 def _source() -> str:
     """The source of the kernels."""
+    # An incomplete installation has no kernels, but works without them.
     headers = sorted(KERNEL_HEADERS.glob("*.h"))
     if not SOURCE.is_file() or not headers:
         raise Unavailable(
@@ -243,6 +248,7 @@ def _build(command: list[str], library: Path) -> None:
     with tempfile.TemporaryDirectory(dir=library.parent, prefix="build-") as work:
         target = Path(work) / "native.so"
         for flags in _flags():
+            # The library appears under its name only when it is complete.
             done = _run([*command, *BASE_FLAGS, *flags, str(SOURCE), "-o", str(target)])
             if done.returncode == 0 and target.is_file():
                 os.replace(target, library)

@@ -24,6 +24,7 @@ def check(gaussians: Gaussians, camera: Camera) -> None:
 
 
 def _tensors(record: Gaussians | Camera) -> dict[str, Tensor]:
+    """The tensors of a record by the names that messages have."""
     owner = type(record).__name__
     return {f"{owner}.{k}": v for k, v in vars(record).items() if isinstance(v, Tensor)}
 
@@ -35,6 +36,8 @@ def _check_types(gaussians: Gaussians, camera: Camera) -> None:
             f"rasterise: camera must have the batch size of gaussians, {len(gaussians)}, "
             f"got {len(camera)}"
         )
+
+    # Backends decide on the dtype of the arithmetic by that of the means.
     means = gaussians.means
     if not means.is_floating_point():
         raise ValueError(
@@ -52,6 +55,7 @@ def _check_types(gaussians: Gaussians, camera: Camera) -> None:
 
 def _check_camera(camera: Camera) -> None:
     """Checks that K is a pinhole's and R a rotation."""
+    # In float64, so that the check itself does not round.
     K = camera.K.detach().double()
     R = camera.R.detach().double()
     t = camera.t.detach().double()
@@ -72,6 +76,7 @@ def _check_camera(camera: Camera) -> None:
         ("R", not_mirrored, "a rotation: it mirrors; flip one axis of R and t"),
     )
     for name, good, expected in rules:
+        # The message has the first item that breaks the rule.
         if not good.all():
             i = int((~good).nonzero()[0])
             raise ValueError(
@@ -88,6 +93,7 @@ def _check_gaussians(gaussians: Gaussians) -> None:
 
     # Something is wrong: the message names the first number that is.
     for name, value in _shape_tensors(gaussians).items():
+        # Scales and opacities have ranges; other numbers only have to be finite.
         value = value.detach().reshape(B, N, -1)
         good = value.isfinite()
         expected = "finite"

@@ -48,6 +48,7 @@ def why_not(settings: Accuracy, device: torch.device) -> str:
     Returns:
         One sentence; empty when it can be used.
     """
+    # Settings that it does not have; then whether it works at all.
     if device.type != DEVICE:
         return f"gsplat runs on CUDA only, the Gaussians are on {device}."
     if settings.dtype != "float32":
@@ -57,6 +58,7 @@ def why_not(settings: Accuracy, device: torch.device) -> str:
 
 def differences(settings: Accuracy, device: torch.device) -> list[str]:
     """Differences between gsplat's cut-offs and the settings, one clause each."""
+    # Numbers are equal up to rounding, and printed alike.
     cap, _ = _measured_cap(device)
     found = []
     for name, value in {**COMPILED_IN, "alpha_max": cap or 0.0}.items():
@@ -86,6 +88,7 @@ def unsuited(gaussians: Gaussians, camera: Camera) -> str:
     Returns:
         One sentence; empty when it can.
     """
+    # Inputs that other backends can draw.
     if gaussians.means.dtype == torch.float64:
         return "gsplat computes in float32, the Gaussians are float64."
     if gaussians.opacities.numel() == 0:
@@ -154,6 +157,7 @@ def _shapes(gaussians: Gaussians) -> dict[str, Tensor | None]:
 
 def _usable(quats: Tensor) -> Tensor:
     """Quaternions rescaled so that squares neither underflow nor overflow; zero gives identity."""
+    # As in `gsgan.splat.project.rotations`.
     largest = quats.detach().abs().amax(-1, keepdim=True)
     usable = largest > QUAT_MIN
     identity = functional.pad(torch.ones_like(quats[..., :1]), (0, 3))
@@ -176,6 +180,7 @@ def _seen_from_the_camera(means: Tensor, camera: Camera) -> tuple[Tensor, Tensor
     K = camera.K.detach()
     shear = torch.eye(3, dtype=K.dtype, device=K.device).repeat(len(camera), 1, 1)
     shear[:, 0, 1] = K[:, 0, 1] / K[:, 0, 0]
+    # [shear [R t]; 0 0 0 1]
     top = shear @ torch.cat([camera.R, left], dim=-1)
     bottom = functional.pad(torch.ones_like(top[:, :1, :1]), (3, 0))
     viewmats = torch.cat([top, bottom], dim=1)
@@ -218,6 +223,7 @@ def _measured_cap(device: torch.device) -> tuple[float | None, str]:
 
 
 def _version() -> str:
+    # A package that was not installed by pip may have no metadata.
     try:
         return importlib.metadata.version("gsplat")
     except importlib.metadata.PackageNotFoundError:
@@ -227,6 +233,7 @@ def _version() -> str:
 def first_error(error: Exception) -> str:
     """The type of an error and the line that tells its cause: of a failed build the compiler's
     first error, which is far below "Error building extension"."""
+    # Without such a line, the first line of the error.
     lines = str(error).strip().splitlines()
     causes = [line for line in lines if re.search(r"\b(fatal )?error\b\s*:", line)]
     return ": ".join([type(error).__name__, *(causes or lines)[:1]])

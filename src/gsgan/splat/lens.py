@@ -53,8 +53,11 @@ def as_pinhole_sees(
 
 
 def _covariances(gaussians: Gaussians) -> Tensor:
+    """The covariances Σ = (R S)(R S)ᵀ ``[B, N, 3, 3]``."""
     if gaussians.covariances is not None:
         return gaussians.covariances
+
+    # The columns of R, scaled.
     assert gaussians.quats is not None and gaussians.scales is not None  # noqa: PT018
     axes = rotations(gaussians.quats) * gaussians.scales.unsqueeze(-2)
     return axes @ axes.mT
@@ -82,7 +85,7 @@ def bend(x_cam: Tensor, dist: Tensor, near: float) -> tuple[Tensor, Tensor, Tens
         first-order projection of small shapes is the lens's), and which of them lie beyond the
         fold, where a lens shows nothing ``[B, M]``.
     """
-    # n = (x, y) / z of the points that move
+    # n = (x, y) / z of the points that move; 0 for the others.
     z = x_cam[..., 2:]
     ahead = (z > near) & torch.isfinite(x_cam).all(dim=-1, keepdim=True)
     n = torch.where(ahead, x_cam[..., :2], 0.0) / torch.where(ahead, z, 1.0)
@@ -91,11 +94,11 @@ def bend(x_cam: Tensor, dist: Tensor, near: float) -> tuple[Tensor, Tensor, Tens
     moves = ahead & ~beyond
     n = torch.where(moves, n, 0.0)
 
-    # d(n), D and the moved points
+    # d(n), D and the moved points.
     shown, slope = distort(n, dist)
     moved = torch.cat([shown * torch.where(moves, z, 1.0), z], dim=-1)
 
-    # the derivative, and the identity for points that stay
+    # The derivative, and the identity for points that stay.
     by_depth = shown - (slope @ n.unsqueeze(-1)).squeeze(-1)
     top = torch.cat([slope, by_depth.unsqueeze(-1)], dim=-1)
     bottom = constant((0.0, 0.0, 1.0), top).expand(*top.shape[:-2], 1, 3)

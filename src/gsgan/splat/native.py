@@ -101,6 +101,7 @@ def composite(
 
     Source: paper Sec. 3.1; tiles after 3D Gaussian splatting, gradients derived in native.cpp.
     """
+    # autograd has no types for what a function returns.
     composed: tuple[Tensor, Tensor, Tensor | None] = _Composite.apply(
         projected.means,
         projected.factors,
@@ -121,6 +122,7 @@ class _Plan:
     """Tile lists of the forward pass, for the backward pass; owns memory of the library."""
 
     def __init__(self, dtype: torch.dtype) -> None:
+        # The function is kept, since modules may be gone when Python ends.
         self.pointer = ctypes.c_void_p()
         self._free = build.function("free", dtype)
 
@@ -145,6 +147,7 @@ class _Composite(torch.autograd.Function):
         times: int,
         grad_enabled: bool,
     ) -> tuple[Tensor, Tensor, Tensor | None]:
+        # The kernel reads contiguous arrays.
         tensors = [means, factors, opacities, features, depths, extents, visible]
         inputs = [x.detach().contiguous() for x in tensors]
         B, _, C = features.shape
@@ -167,6 +170,8 @@ class _Composite(torch.autograd.Function):
         plan = _Plan(dtype)
         run = build.function("forward", dtype)
         _raise_for(run(ctypes.byref(job), ctypes.byref(plan.pointer)), job)
+
+        # The plan lives as long as the graph.
         if job.keep:
             ctx.save_for_backward(*tensors)
             ctx.plan = plan
@@ -179,6 +184,7 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+        # The same job as in the forward pass.
         inputs = [x.detach().contiguous() for x in ctx.saved_tensors]
         job = _job(ctx.size, ctx.settings, inputs, ctx.times)
 

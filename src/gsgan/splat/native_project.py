@@ -95,6 +95,7 @@ def project(gaussians: Gaussians, camera: Camera, settings: Accuracy) -> Project
 class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
+        # Tensors that are not given are None, and stay so in the job.
         *tensors, size, settings = arguments
         job, held = _job(tensors, size, settings)
         means = held[0]
@@ -112,6 +113,7 @@ class _Project(torch.autograd.Function):
         build.point(job, _PROJECTED, outputs)
         build.function("project", means.dtype)(ctypes.byref(job))
 
+        # Extents and visibility are cut-offs, without gradients.
         ctx.save_for_backward(*tensors)
         ctx.size = size
         ctx.settings = settings
@@ -148,6 +150,7 @@ def _job(
     settings: Accuracy,
 ) -> tuple[Any, list[Tensor | None]]:
     """The job without its outputs, and the tensors it points to."""
+    # The caller keeps these tensors alive until the kernel has run.
     held = [None if x is None else x.detach().contiguous() for x in tensors]
     means = held[0]
     assert means is not None

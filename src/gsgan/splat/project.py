@@ -210,6 +210,7 @@ def _jacobian(
     limits: tuple[Tensor, Tensor],
 ) -> Tensor:
     """The projection's Jacobian times R, ``[B, 2, 3, N]`` pixels per metre of world."""
+    # Far outside of the image the linear approximation is bad, so the ratios are clamped.
     A = K[:, :2, :2]
     clamped = torch.minimum(torch.maximum(ratios, limits[0]), limits[1])
     # J = A [1/z 0 -x/z²; 0 1/z -y/z²], multiplied out so that no small matrices are batched.
@@ -262,6 +263,8 @@ def _footprint(
         reach = (2 * torch.log(opacities / settings.alpha_min).clamp_min(0)).sqrt()
     else:
         reach = torch.full_like(opacities, math.sqrt(2 * EXP_UNDERFLOW))
+
+    # Rounding must not lose a pixel, but a box of 3 sigma is a box of 3 sigma.
     if settings.extent != "sigma":
         reach = reach * (1 + EXTENT_MARGIN) + EXTENT_MARGIN
     extents = reach.unsqueeze(1) * variances.sqrt()

@@ -52,6 +52,8 @@ def rasterise(
     """
     if isinstance(settings, str):
         settings = accuracy(settings)
+
+    # While torch.export records, drawing is one operator.
     if torch.compiler.is_compiling():
         return _recorded(gaussians, camera, settings, backend)
     checks.check(gaussians, camera)
@@ -172,7 +174,8 @@ def _recorded(
     backend: str,
 ) -> Raster:
     """The operator that ``torch.export`` records in place of `rasterise`, without gradient."""
-    assert gaussians.covariances is not None  # avatars always give covariances
+    # Avatars always give covariances. An operator takes settings as text.
+    assert gaussians.covariances is not None
     height, width = camera.size
     features, alpha, fine = _rasterise(
         gaussians.means,
@@ -241,6 +244,7 @@ def _rasterise_shapes(
     settings: str,
     backend: str,
 ) -> tuple[Tensor, Tensor, Tensor]:
+    # The shapes of all outputs, without drawing.
     batch, _, channels = features.shape
     factor = json.loads(settings)["supersample"]
 

@@ -27,6 +27,7 @@ def composite(
 
     Source: paper Sec. 3.1, ``C = Σ c_i α_i Π_{j<i} (1 - α_j)``.
     """
+    # Pixels are independent: chunks of them bound the memory.
     front_to_back = _sorted(projected)
     chunks = []
     for pixels in _pixel_chunks(projected, size):
@@ -38,6 +39,7 @@ def composite(
 
 def _sorted(projected: Projected) -> Projected:
     """The ellipses of each batch item, front to back."""
+    # Gaussians of equal depth keep their order.
     order = projected.depths.detach().argsort(dim=1, stable=True)
     found = {}
     for name, x in vars(projected).items():
@@ -48,6 +50,7 @@ def _sorted(projected: Projected) -> Projected:
 
 def _pixel_chunks(projected: Projected, size: tuple[int, int]) -> tuple[Tensor, ...]:
     """Pixel centres ``[P, 2]`` row by row, in chunks of at most CHUNK_ELEMENTS alphas."""
+    # Pixel centres are at +0.5.
     H, W = size
     y, x = torch.meshgrid(torch.arange(H) + 0.5, torch.arange(W) + 0.5, indexing="ij")
     pixels = torch.stack([x, y], dim=-1).to(projected.features).reshape(-1, 2)
@@ -56,6 +59,7 @@ def _pixel_chunks(projected: Projected, size: tuple[int, int]) -> tuple[Tensor, 
 
 def _alphas(projected: Projected, pixels: Tensor, settings: Accuracy) -> Tensor:
     """Alphas ``[B, P, N]`` after the cut-offs, but for transmittance."""
+    # q = (p (dx + k dy))² + (r dy)²
     d = pixels[:, None] - projected.means.to(pixels).unsqueeze(1)
     dx, dy = d.unbind(-1)
     p, k, r = projected.factors.to(pixels).unsqueeze(1).unbind(-1)

@@ -31,9 +31,9 @@ class Accuracy:
     name: str  # in configs and tables
     alpha_min: float  # in [0, 1); 0 keeps every contribution
     transmittance_min: float  # in [0, 1); 0 never stops a pixel
-    extent: str
+    extent: str  # all, opacity or sigma
     dtype: str  # float32 or float64, of the arithmetic
-    radius_sigmas: float = 3.0
+    radius_sigmas: float = 3.0  # for the extent ``sigma``
     near: float = 0.01  # metres; Gaussians whose mean is nearer are not drawn
     # Near 1 the gradient of hidden layers is lost in float32 rounding: 1 is for float64.
     alpha_max: float = 0.999
@@ -45,6 +45,7 @@ class Accuracy:
     supersample: int = 1  # draw this many times larger, low-pass included, then average
 
     def __post_init__(self) -> None:
+        # The cut-offs of contributions.
         self._require("alpha_min", 0 <= self.alpha_min < 1, "in [0, 1)")
         self._require("transmittance_min", 0 <= self.transmittance_min < 1, "in [0, 1)")
         self._require(
@@ -54,6 +55,8 @@ class Accuracy:
         )
         self._require("dtype", self.dtype in _DTYPES, f"one of {', '.join(_DTYPES)}")
         self._require("radius_sigmas", self.radius_sigmas > 0, "> 0")
+
+        # The projection, and the limits of opacity.
         self._require("near", self.near > 0, "> 0 metres")
         self._require(
             "alpha_max",
@@ -62,6 +65,8 @@ class Accuracy:
         )
         self._require("low_pass", self.low_pass > 0, "> 0 square pixels")
         self._require("fov_clamp", self.fov_clamp >= 1, ">= 1")
+
+        # A bool is an int in Python, but no number of pixels.
         whole = isinstance(self.supersample, int) and not isinstance(
             self.supersample,
             bool,

@@ -9,17 +9,9 @@ from torch import Tensor
 # 3D Gaussian splatting (Condon-Shortley phase), so that its .ply files can be used as they are.
 _C0 = math.sqrt(1 / (4 * math.pi))
 _C1 = math.sqrt(3 / (4 * math.pi))
-_C2 = (
-    math.sqrt(15 / 4 / math.pi),
-    math.sqrt(5 / 16 / math.pi),
-    math.sqrt(15 / 16 / math.pi),
-)
-_C3 = (
-    math.sqrt(35 / 32 / math.pi),
-    math.sqrt(105 / 4 / math.pi),
-    math.sqrt(21 / 32 / math.pi),
-    math.sqrt(7 / 16 / math.pi),
-    math.sqrt(105 / 16 / math.pi),
+_C2 = tuple(math.sqrt(k / math.pi) for k in (15 / 4, 5 / 16, 15 / 16))
+_C3 = tuple(
+    math.sqrt(k / math.pi) for k in (35 / 32, 105 / 4, 21 / 32, 7 / 16, 105 / 16)
 )
 
 MAX_DEGREE = 3
@@ -93,6 +85,7 @@ def sh_to_colour(sh: Tensor, directions: Tensor) -> Tensor:
 
     Source: paper Sec. 3.1; Kerbl et al., 3D Gaussian splatting.
     """
+    # The number of coefficients tells the degree.
     degree = math.isqrt(sh.shape[-2]) - 1
     if (degree + 1) ** 2 != sh.shape[-2] or degree not in range(MAX_DEGREE + 1):
         raise ValueError(
@@ -103,5 +96,7 @@ def sh_to_colour(sh: Tensor, directions: Tensor) -> Tensor:
     # Degree 0 needs no directions: view-dependent colour is off.
     if degree == 0:
         return _C0 * sh[..., 0, :] + 0.5
+
+    # The sum over coefficients, channel by channel.
     basis = sh_basis(torch.nn.functional.normalize(directions, dim=-1), degree)
     return (basis.unsqueeze(-1) * sh).sum(-2) + 0.5

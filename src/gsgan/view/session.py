@@ -428,7 +428,6 @@ def shown(layer: str, rendering: Rendering, behind: torch.Tensor) -> Bytes:
         behind: ``[3, H, W]`` the background.
     """
     assert rendering.image is not None and rendering.alpha is not None  # noqa: PT018
-    image = rendering.image[0].cpu()
     alpha = rendering.alpha[0].cpu()
 
     # Alpha and labels are opaque.
@@ -444,7 +443,7 @@ def shown(layer: str, rendering: Rendering, behind: torch.Tensor) -> Bytes:
     splat_alpha = rendering.splat_alpha
     if layer == COLOUR and features is not None and splat_alpha is not None:
         return eight_bits(features[0, :3].cpu(), splat_alpha[0].cpu(), behind)
-    return eight_bits(image, alpha, behind)
+    return eight_bits(rendering.image[0].cpu(), alpha, behind)
 
 
 def _message(error: Exception) -> str:

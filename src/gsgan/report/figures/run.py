@@ -172,9 +172,9 @@ def make_figures(config: DictConfig) -> None:
         ConfigError: on a wrong value, runs of different data, or a comparison of one run.
         DataError: when a run or its data cannot be read.
     """
-    folders = []
-    for folder in (config.run, *_list(config.compare)):
-        folders.append(Path(str(folder)).expanduser())
+    # The first run leads; its folder gets the figures by default.
+    given = (config.run, *_list(config.compare))
+    folders = [Path(str(folder)).expanduser() for folder in given]
 
     names = _names(config, alone=len(folders) < 2)
     at_least("margin", config.margin, 0)

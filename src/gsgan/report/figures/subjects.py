@@ -185,19 +185,12 @@ def open_subjects(
         raise ConfigError(
             "a run is given twice; every run in run and compare must differ"
         )
-    subjects = []
-    runs = []
-    facts = []
-    models = []
-    for folder in folders:
-        subject = _open(folder, moved, device)
-        subjects.append(subject)
-        runs.append(subject.run)
-        facts.append({DATA: subject.run.data["fingerprint"]})
-        models.append(subject.name)
-    check_same("figures", runs, facts)
+    subjects = [_open(folder, moved, device) for folder in folders]
+    runs = [subject.run for subject in subjects]
+    check_same("figures", runs, [{DATA: run.data["fingerprint"]} for run in runs])
 
     # Equal names get the place of the run.
+    models = [subject.name for subject in subjects]
     for i, subject in enumerate(subjects, 1):
         if models.count(subject.name) > 1:
             subject.name += f" ({i})"
