@@ -1,7 +1,7 @@
 """A report: findings, tables and figures in sections; as one HTML page and on the terminal."""
 
 import base64
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -64,8 +64,8 @@ class Finding:
 class Table:
     """Rows of text."""
 
-    headers: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
+    headers: Sequence[str]
+    rows: Sequence[Sequence[str]]
 
     def for_terminal(self, title: str | None = None) -> RichTable:
         """The table as rich prints it."""
@@ -97,9 +97,9 @@ class Section:
     """One part of a report; ``text`` explains it on the page."""
 
     title: str
-    tables: tuple[Table, ...] = ()
-    findings: tuple[Finding, ...] = ()
-    figures: tuple[Figure, ...] = ()
+    tables: Sequence[Table] = ()
+    findings: Sequence[Finding] = ()
+    figures: Sequence[Figure] = ()
     text: str = ""
 
 
@@ -108,7 +108,7 @@ class CheckReport:
     """All findings on a folder; ``numbers`` are the scores, plain values for JSON."""
 
     root: str
-    sections: tuple[Section, ...]
+    sections: Sequence[Section]
     numbers: dict[str, object] = field(default_factory=dict)
 
     @property

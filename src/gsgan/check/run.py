@@ -76,7 +76,7 @@ def unreadable(root: str | None, messages: Sequence[str]) -> CheckReport:
     findings = [Finding("error", "reading", reason) for reason in reasons]
     section = Section(
         "The dataset cannot be read",
-        findings=tuple(findings),
+        findings=findings,
         text="Nothing further could be checked. Correct this, then check again.",
     )
     return CheckReport(str(root), (section,), {"readable": False})

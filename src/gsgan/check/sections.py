@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
@@ -147,7 +148,7 @@ def lens_table(subject: CheckedData, geometry: Geometry) -> Table:
         "distance m",
         "images",
     )
-    return Table(headers, tuple(rows))
+    return Table(headers, rows)
 
 
 if TYPE_CHECKING:
@@ -243,7 +244,7 @@ class Measurements:
         }
 
 
-def sections(m: Measurements) -> tuple[Section, ...]:
+def sections(m: Measurements) -> Sequence[Section]:
     """Every section, in reading order."""
     units = (geometry_table(m.subject, m.geometry), lens_table(m.subject, m.geometry))
     found = geometry_findings(m.subject, m.geometry)
@@ -256,9 +257,9 @@ def sections(m: Measurements) -> tuple[Section, ...]:
         strips.append(Figure(f"camera {name}", image))
     return (
         _contents(m),
-        Section("Units and cameras", units, tuple(found)),
+        Section("Units and cameras", units, found),
         _agreement(m),
-        Section("Overlays", figures=tuple(strips), text=overlays.LEGEND),
+        Section("Overlays", figures=strips, text=overlays.LEGEND),
         _frames(m),
         _effects(m),
     )
@@ -312,8 +313,8 @@ def _contents(m: Measurements) -> Section:
         if lacking:
             text = f"{len(lacking)} of the {len(frames)} frames: {shortened(lacking)}"
             found.append(Finding("warning", "files", f"camera {name} lacks {text}"))
-    table = Table(("what", "how much"), tuple(contents))
-    return Section("Contents", (table,), tuple(found))
+    table = Table(("what", "how much"), contents)
+    return Section("Contents", (table,), found)
 
 
 def _skeleton(m: Measurements) -> str:
@@ -365,13 +366,13 @@ def _agreement(m: Measurements) -> Section:
         "best other",
         "mask / body",
     )
-    table = Table(headers, tuple(rows))
+    table = Table(headers, rows)
     min_inside = m.subject.consistency.min_inside
     found = calibration_findings(m.cameras, m.limits, min_inside, m.geometry.far)
     return Section(
         "Skeleton, masks and cameras",
         (table,),
-        tuple(found),
+        found,
         text=AGREEMENT,
     )
 
@@ -381,16 +382,16 @@ def _frames(m: Measurements) -> Section:
     rows = []
     for frame, reasons in m.reasons.items():
         rows.append((str(frame), "; ".join(reasons)))
-    tables: tuple[Table, ...] = ()
+    tables: Sequence[Table] = ()
     if rows:
-        tables = (Table(("frame", "why"), tuple(rows[:TABLE_FRAMES])),)
+        tables = (Table(("frame", "why"), rows[:TABLE_FRAMES]),)
     text = (
         f"{counted(len(rows), 'frame')} of {len(m.subject.frames)}; skeletons were checked in all "
         f"frames, masks in {counted(len(m.views), 'image')}. At most {TABLE_FRAMES} are listed; "
         "the JSON file has all."
     )
     findings = frame_findings(m.subject, m.doubts, m.limits)
-    return Section("Doubtful frames", tables, tuple(findings), text=text)
+    return Section("Doubtful frames", tables, findings, text=text)
 
 
 def _effects(m: Measurements) -> Section:
@@ -400,4 +401,4 @@ def _effects(m: Measurements) -> Section:
     if m.info is None:
         return Section(title, text=f"Not decided: {m.no_info}")
     decided = decide(m.info, m.effects).rows()
-    return Section(title, (Table(HEADERS, tuple(decided)),), text=EFFECTS)
+    return Section(title, (Table(HEADERS, decided),), text=EFFECTS)

@@ -60,7 +60,7 @@ class CheckedData:
     layout: Layout  # the reader's index
     consistency: Consistency  # the reader's thresholds
     frames: Ints  # [F] rising frame numbers
-    pairs: Mapping[str, tuple[int, ...]]  # the existing frames of each camera
+    pairs: Mapping[str, Sequence[int]]  # the existing frames of each camera
     p: Float  # [F, J, 3] metres, finite
     visible: Bool  # [F, J]
     up: Float  # [3] unit, the world's up axis
@@ -108,7 +108,7 @@ def subject_of(data: GsganData) -> CheckedData:
     layout = data.layout
     pairs = {}
     for name in layout.camera_names:
-        pairs[name] = tuple(sorted(layout.images[name]))
+        pairs[name] = sorted(layout.images[name])
     p = []
     visibility = []
     for frame in layout.frames:
@@ -176,7 +176,7 @@ def grouped(views: Sequence[MaskView]) -> dict[str, list[MaskView]]:
     return groups
 
 
-def sampled_items(subject: CheckedData, images: int) -> tuple[Item, ...]:
+def sampled_items(subject: CheckedData, images: int) -> list[Item]:
     """At most ``images`` items, at least one per camera: the same moments, evenly spaced."""
     # The same moments in all cameras, as many as the budget allows.
     each = max(1, images // len(subject.pairs))
@@ -187,21 +187,21 @@ def sampled_items(subject: CheckedData, images: int) -> tuple[Item, ...]:
         chosen = [frame for frame in files if frame in moments] or spread(files, each)
         for frame in chosen:
             items.append((name, frame))
-    return tuple(items)
+    return items
 
 
-def cut_items(subject: CheckedData, most: int) -> tuple[Item, ...]:
+def cut_items(subject: CheckedData, most: int) -> list[Item]:
     """Items with an image or mask file that was cut off, at most ``most``; nothing is decoded."""
     layout = subject.layout
     found: list[Item] = []
     for name, files in subject.pairs.items():
         for frame in files:
             if len(found) == most:
-                return tuple(found)
+                return found
             masks = [path for _, path in layout.mask_files(name, frame)]
             if not all(map(complete, [layout.image_path(name, frame), *masks])):
                 found.append((name, frame))
-    return tuple(found)
+    return found
 
 
 def complete(path: Path) -> bool:
@@ -217,7 +217,7 @@ def complete(path: Path) -> bool:
     for first, end in END_MARKS.items():
         if start.startswith(first):
             return end in tail
-    return len(start) > 0
+    return bool(start)
 
 
 def measure(

@@ -169,15 +169,7 @@ class _Photometric(torch.autograd.Function):
         totals = torch.empty(planes, dtype=torch.float64)
 
         height, width = image.shape[-2:]
-        job = _Job(
-            planes=planes,
-            H=height,
-            W=width,
-            threads=build.threads(),
-            l1=l1,
-            l2=l2,
-            ssim=ssim,
-        )
+        job = _Job(planes, height, width, build.threads(), l1, l2, ssim)
         build.point(job, _TENSORS, [image, target, gradient, totals])
         if build.function("photometric", image.dtype)(ctypes.byref(job)):
             raise MemoryError("photometric: out of memory")

@@ -57,7 +57,7 @@ def cleanse(p: Float) -> tuple[Float, dict[str, int]]:
     p[far] = np.nan
 
     # Joints at the end of bones of the wrong length.
-    wrong = np.zeros(far.shape, bool)
+    wrong = np.zeros_like(far)
     _mark_ends(wrong, CHECKED_BONES, _misfit(p, CHECKED_BONES, BONE))
     if has_hands:
         palms = _misfit(p, HAND_BONES, HAND_BONE)

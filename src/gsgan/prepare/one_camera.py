@@ -176,7 +176,7 @@ def solve_video(options: Options, stages: StageFolder, console: Console) -> Film
             video, "estimated from the person", {camera.name: camera}
         ),
         cameras=(camera,),
-        notes=tuple(notes),
+        notes=notes,
         fps=round(fps, 3),
     )
     return Filmed(inputs, masks, numbers[kept], solution, measured)

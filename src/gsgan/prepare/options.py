@@ -1,6 +1,6 @@
 """The options of `gsgan.prepare`, and the images and cameras that they name."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -140,8 +140,8 @@ class Inputs:
     sources: Mapping[str, Recording]
     calibration: Calibration
     # in the order of the sources, with their names and sizes
-    cameras: tuple[CameraEntry, ...]
-    notes: tuple[str, ...]  # one sentence for each thing that was converted or left out
+    cameras: Sequence[CameraEntry]
+    notes: Sequence[str]  # one sentence for each thing that was converted or left out
     fps: float
 
 
@@ -196,4 +196,4 @@ def read_inputs(options: Options) -> Inputs:
     if options.fps is None and not rates:
         raise ConfigError("images have no frame rate; give fps=<frames per second>")
     fps = float(options.fps or rates[len(rates) // 2])
-    return Inputs(sources, calibration, tuple(cameras), tuple(notes), fps)
+    return Inputs(sources, calibration, cameras, notes, fps)

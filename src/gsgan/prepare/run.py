@@ -117,7 +117,7 @@ def print_summary(numbers: Mapping[str, Any], console: Console) -> None:
         "Median error in pixels by stage; refinement, swapped sides, frames that clocks "
         "are late"
     )
-    console.print(Table(headers, tuple(rows)).for_terminal(title))
+    console.print(Table(headers, rows).for_terminal(title))
 
     # The notes, a line each.
     notes = [

@@ -121,7 +121,7 @@ def point(
 
 def threads() -> int:
     """The number of threads of a kernel."""
-    return max(1, torch.get_num_threads())
+    return torch.get_num_threads()
 
 
 def function(name: str, dtype: torch.dtype) -> Any:

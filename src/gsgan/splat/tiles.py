@@ -376,7 +376,7 @@ class _Walk:
         return torch.stack([one, sum_u, sum_v, uu, uv, vv], dim=-1)
 
     def _add(self, total: Tensor, ids: Tensor, part: Tensor) -> None:
-        total.index_add_(0, ids.flatten(), part.reshape(-1, part.shape[-1]))
+        total.index_add_(0, ids.flatten(), part.flatten(0, 1))
 
 
 def _behind(alpha: Tensor, seen: Tensor, behind: Tensor) -> tuple[Tensor, Tensor]:
