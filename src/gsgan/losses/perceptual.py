@@ -14,10 +14,8 @@ from gsgan.weights.networks import FeatureNetwork, Lpips, pretrained
 
 FEATURES = "features"
 LPIPS = "lpips"
-DISTANCES = (FEATURES, LPIPS)
 PRETRAINED = "pretrained"
 RANDOM = "random"
-SOURCES = (PRETRAINED, RANDOM)
 # relu1_2, relu2_2, relu3_3, relu4_3, as Johnson et al.
 VGG_LAYERS = 4
 # Pixels: AlexNet's last map is empty for smaller crops.
@@ -73,9 +71,9 @@ class Perceptual(nn.Module):
 
         # The options as they are called in configs.
         key = "training.perceptual"
-        one_of(f"{key}.weights", weights, SOURCES)
+        one_of(f"{key}.weights", weights, (PRETRAINED, RANDOM))
         one_of(f"{key}.net", net, ("vgg", "alex"))
-        one_of(f"{key}.form", form, DISTANCES)
+        one_of(f"{key}.form", form, (FEATURES, LPIPS))
         if crop is not None:
             whole(f"{key}.crop", crop, MIN_CROP)
         self.crop = crop

@@ -78,8 +78,7 @@ def rectangle(where: Tensor, least: int = 1) -> tuple[slice, slice] | None:
         if not held:
             return None
         first = held[0]
-        last = held[-1]
-        extent = last + 1 - first
+        extent = held[-1] + 1 - first
 
         # Extended equally to both sides, but not beyond the image.
         side = min(max(extent, least), size)

@@ -10,8 +10,9 @@ from collections import deque
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
+
+from gsgan.utils.arrays import Bytes
 
 CACHE_LINE = 64  # bytes; rows of tiles are whole cache lines
 LARGE = 1 << 20  # bytes from which memory is reused
@@ -20,7 +21,7 @@ MAX_KEPT = 1 << 28  # maximum bytes of unused memory that a process keeps
 _DTYPE_NAMES = {torch.float32: "float32", torch.float64: "float64"}
 # Unused memory by size in bytes. A deque's append and pop are atomic: finalisers run in any
 # thread, at any time.
-_free: dict[int, deque[NDArray[np.uint8]]] = {}
+_free: dict[int, deque[Bytes]] = {}
 
 
 def zeros(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
@@ -60,7 +61,7 @@ def forget() -> None:
     _free.clear()
 
 
-def _take(size: int) -> NDArray[np.uint8] | None:
+def _take(size: int) -> Bytes | None:
     """Unused memory of a size; None if there is none."""
     # Another thread may take the last one at any time.
     try:
@@ -69,7 +70,7 @@ def _take(size: int) -> NDArray[np.uint8] | None:
         return None
 
 
-def _give_back(memory: NDArray[np.uint8]) -> None:
+def _give_back(memory: Bytes) -> None:
     # All other memory is freed if this would be too much.
     if kept() + memory.nbytes > MAX_KEPT:
         _free.clear()

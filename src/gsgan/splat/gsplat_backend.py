@@ -14,7 +14,6 @@ Differences between gsplat and ``Accuracy``, which `given_up` describes:
 - Gradients are summed in no fixed order: their last bits differ between runs.
 """
 
-import importlib
 import importlib.metadata
 import importlib.util
 import math

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gsgan.data.joints import LEFT, RIGHT
 from gsgan.data.proportions import (
@@ -16,8 +15,7 @@ from gsgan.data.proportions import (
 )
 from gsgan.motion.rotations import between, unit
 from gsgan.skeleton import HOLISTIC
-
-Float = NDArray[np.float64]
+from gsgan.utils.arrays import Float
 
 FABRIK_ROUNDS = 20
 BEND = 0.01  # of a chain's length: FABRIK cannot bend a straight chain along itself

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -20,13 +19,11 @@ from gsgan.model.avatar import Avatar
 from gsgan.model.rendering import Rendering
 from gsgan.run.drive import Drive, inputs_of, joints_of
 from gsgan.scene import BodyPose, Camera, Gaussians
+from gsgan.utils.arrays import Bytes, Float
 from gsgan.utils.errors import GsganError
 from gsgan.utils.images import eight_bits
 from gsgan.utils.provenance import png_bytes
 from gsgan.view.drag import HANDLE_NAMES, dragged, position
-
-Float = NDArray[np.float64]
-Bytes = NDArray[np.uint8]
 
 IDLE_SECONDS = 0.1  # between two checks whether an image is due
 RESTS = 0.3  # seconds without movement after which the full-size image is rendered
@@ -78,7 +75,7 @@ class Session:
         self.full = False  # whether the current image is of full size
         self.seconds = 0.0  # to render a full-size image
         self.times: deque[float] = deque(maxlen=200)  # of the last images
-        self.image: NDArray[np.uint8] | None = None
+        self.image: Bytes | None = None
         self._problem = ""  # that the page shows
 
         # The 3D nodes of the page, and the state that they were drawn from.
@@ -168,7 +165,8 @@ class Session:
                 drive = self.show.read(str(path))
         except Exception as error:
             text = _message(error).replace(folder + "/", "")
-            self._warn("This motion cannot be used", text)
+            title = "This motion cannot be used"
+            self.client.add_notification(title, text, color="red")
             return
 
         # The new motion is shown from its first frame.
@@ -177,9 +175,6 @@ class Session:
         self.slider.max = max(1, len(drive.p) - 1)
         self.slider.value = 0
         self._scrub(0)
-
-    def _warn(self, title: str, text: str) -> None:
-        self.client.add_notification(title, text, color="red")
 
     def _save(self) -> None:
         if self.image is not None:
@@ -283,7 +278,8 @@ class Session:
             text = _message(error)
             if self._problem != text:
                 self._problem = text
-                self._warn("This pose cannot be rendered", text)
+                title = "This pose cannot be rendered"
+                self.client.add_notification(title, text, color="red")
             self.play.value = False
             self.full = True
             return IDLE_SECONDS

@@ -161,7 +161,6 @@ FIGURES: dict[str, Callable[[Sequence[Subject], Sequence[Shot]], Drawing]] = {
     "ablation": partial(comparison, detail=True),
     "strip": strip,
 }
-TRIMMED: dict[str, Any] = {"bbox_inches": "tight", "pad_inches": 0.02}
 COMPARE = ("comparison", "ablation")  # figures that need a second run
 
 
@@ -205,7 +204,11 @@ def make_figures(config: DictConfig) -> None:
             for kind, metadata in METADATA.items():
                 stream = io.BytesIO()
                 drawing.figure.savefig(
-                    stream, format=kind, metadata=metadata, **TRIMMED
+                    stream,
+                    format=kind,
+                    metadata=metadata,
+                    bbox_inches="tight",
+                    pad_inches=0.02,
                 )
                 write_atomically(out / f"{name}.{kind}", stream.getvalue())
 
