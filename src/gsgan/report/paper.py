@@ -107,6 +107,7 @@ def read_paper(name: str) -> PaperTable:
     Raises:
         ConfigError: when there is no such table.
     """
+    # The keys of a table are the fields of `PaperTable`.
     tables: Any = OmegaConf.to_container(OmegaConf.load(FILE))
     if name not in tables:
         raise ConfigError(f"table.paper={name}: {FILE.name} has {', '.join(tables)}")

@@ -255,6 +255,7 @@ def _read_settings(folder: Path) -> dict[str, Any] | None:
 
 def flat(value: Any, at: str = "") -> Iterator[tuple[str, Any]]:
     """A nested config by dotted key."""
+    # An empty mapping is a value.
     if isinstance(value, Mapping) and value:
         for key, held in value.items():
             yield from flat(held, f"{at}.{key}" if at else str(key))
@@ -285,6 +286,7 @@ def by_settings(run: ScoredRun, keys: Sequence[str]) -> ScoredRun:
     Raises:
         ConfigError: when the run has no such setting.
     """
+    # The last part of a key is enough in a label.
     parts = [run.name]
     for key in map(str, keys):
         if run.settings is None or key not in run.settings or key == "seed":

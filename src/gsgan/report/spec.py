@@ -91,6 +91,7 @@ class TableSpec:
 
 def natural(name: str) -> list[str | float]:
     """A sort key: numbers by value, the words between them by letters."""
+    # Numbers after a space, such as values of settings; the pattern's matches have odd places.
     parts: list[Any] = re.split(r"((?<= )-?\d+(?:\.\d+)?(?:e[+-]?\d+)?)", name)
-    parts[1::2] = map(float, parts[1::2])  # the pattern's matches
+    parts[1::2] = map(float, parts[1::2])
     return parts

@@ -81,6 +81,7 @@ class Part:
 
     def heading(self, metric: str) -> str:
         """The heading of a metric; LPIPS with the input of its network, if runs tell it."""
+        # Inputs of LPIPS differ between protocols.
         name = METRICS[metric].name
         described = join_unique(
             run.stated("lpips_input", self.split) for run in self.runs
@@ -97,6 +98,7 @@ class Part:
 
     def of(self, name: str | None, column: str = MEAN) -> list[ScoredRun]:
         """The runs of a model or method (None: of all) that a column shows."""
+        # A column of a subject shows that subject's runs only.
         shown = []
         for run in self.runs:
             if name is not None and run.name != name:
@@ -117,6 +119,7 @@ class Part:
         if self.spec.rows is not None:
             return list(self.spec.rows)
 
+        # Step I's colour is named as such, the final image has the model's name.
         rows = []
         for name in self.names:
             for variant in self.spec.variants:
@@ -368,6 +371,7 @@ def _grids(parts: Sequence[Part], paper: PaperTable | None) -> list[Grid]:
 def _grid(part: Part, paper: PaperTable | None) -> Grid:
     """The scores, the comparable numbers of the paper, and the floor."""
     columns = part.columns
+    # The paper's rows by the name of our model.
     printed = {}
     if paper is not None:
         printed = paper.beside(columns)
@@ -398,6 +402,7 @@ def _grid(part: Part, paper: PaperTable | None) -> Grid:
 
 
 def _row(part: Part, spec: RowSpec, *, beside_paper: bool) -> Row:
+    # A row that the table asks for has a place, even if no run was scored.
     runs = part.of(spec.run)
     label = spec.label or spec.run
     if not runs:

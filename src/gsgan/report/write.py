@@ -209,6 +209,7 @@ LATEX = Format(
 
 def files_of(report: Report) -> dict[str, str]:
     """The files of a report by name; LaTeX has a ``table`` per grid, for ``\\input``."""
+    # Wide tables are scaled to the width of the text.
     packages = (
         "% needs \\usepackage{booktabs} and, for wide tables, \\usepackage{graphicx}"
     )

@@ -241,6 +241,7 @@ def _names(config: DictConfig, *, alone: bool) -> list[str]:
 
 def _draw(name: str, subjects: Sequence[Subject], config: DictConfig) -> Drawing:
     """One figure with its whole caption."""
+    # All runs are of the data of the first one.
     data = subjects[0].data
     split = config.split
 
@@ -270,6 +271,7 @@ def _draw(name: str, subjects: Sequence[Subject], config: DictConfig) -> Drawing
 
 def _list(value: Any) -> list[Any]:
     """A list as it is, one value as a list of one, null as none."""
+    # An option may be a list, one value or null.
     if OmegaConf.is_list(value):
         return list(value)
     return [] if value is None else [value]

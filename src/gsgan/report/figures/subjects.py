@@ -181,6 +181,7 @@ def open_subjects(
         ConfigError: on a folder given twice, or runs of different data.
         DataError: when a run cannot be read.
     """
+    # A link and its target are the same run.
     if len({folder.resolve() for folder in folders}) < len(folders):
         raise ConfigError(
             "a run is given twice; every run in run and compare must differ"
