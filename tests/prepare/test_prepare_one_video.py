@@ -12,7 +12,7 @@ from rich.console import Console
 
 from gsgan.data.formats.capture import read_capture
 from gsgan.prepare.frames import look, sample
-from gsgan.prepare.one_camera import FOCAL, doubtful_poses, stated_focal
+from gsgan.prepare.one_camera import FOCAL_KEY, doubtful_poses, stated_focal
 from gsgan.prepare.one_view import Seen, solve_view
 from gsgan.prepare.options import Options
 from gsgan.prepare.run import prepare
@@ -160,7 +160,7 @@ def test_the_focal_length_that_a_phone_states(tmp_path, stated, found):
     av, path = pytest.importorskip("av"), tmp_path / "phone.mov"
     with av.open(str(path), "w", options={"movflags": "use_metadata_tags"}) as file:
         if stated:
-            file.metadata[FOCAL] = stated
+            file.metadata[FOCAL_KEY] = stated
         stream = file.add_stream("mpeg4", rate=10)
         stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
         file.mux(

@@ -6,7 +6,7 @@ import torch
 from matplotlib import rc_context
 
 from gsgan.report.figures.layout import (
-    COLUMN,
+    COLUMN_WIDTH,
     STYLE,
     TALLEST,
     Panel,
@@ -62,7 +62,7 @@ def test_a_panel_holds_its_image():
     corner = drawn[round(height - box.y0) - 3, round(box.x1) - 3]
     assert corner.tolist() == [255, 0, 0]
     assert drawn[round(height - box.y1) + 3, round(box.x0) + 3].tolist() == [0, 0, 0]
-    assert figure.get_size_inches()[0] == COLUMN
+    assert figure.get_size_inches()[0] == COLUMN_WIDTH
     assert figure.get_size_inches()[1] < TALLEST + 0.5  # with text
 
 

@@ -56,7 +56,7 @@ def test_small_and_large_are_aligned_zeros(dtype):
 
 
 def test_kept_memory_is_bounded(monkeypatch):
-    monkeypatch.setattr(buffers, "KEPT", 5 << 20)
+    monkeypatch.setattr(buffers, "MAX_KEPT", 5 << 20)
     tensors = [buffers.zeros(SHAPE, torch.float32) for _ in range(4)]
     del tensors
     gc.collect()

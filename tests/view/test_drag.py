@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 
 from gsgan.skeleton import HOLISTIC, MEDIAPIPE33
-from gsgan.view.drag import BODY, HANDLES, HEAD, NAMES, dragged, fabrik, position
+from gsgan.view.drag import (
+    BODY_HANDLE,
+    HANDLE_NAMES,
+    HANDLES,
+    HEAD_HANDLE,
+    dragged,
+    fabrik,
+    position,
+)
 
 REST = np.array(MEDIAPIPE33.rest_positions)
 RIGID = [*MEDIAPIPE33.limbs, (0, 7), (7, 8), (9, 10)]
@@ -14,7 +22,7 @@ def lengths(p: np.ndarray) -> np.ndarray:
     return np.array([np.linalg.norm(p[b] - p[a]) for a, b in RIGID])
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", HANDLE_NAMES)
 def test_bones_keep_their_lengths(name):
     generator = np.random.default_rng(0)
     for reach in (0.05, 0.3, 2.0):
@@ -26,24 +34,28 @@ def test_bones_keep_their_lengths(name):
             np.testing.assert_allclose(lengths(p), lengths(REST), atol=1e-9)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", HANDLE_NAMES)
 def test_a_joint_goes_to_the_pointer_where_bones_reach(name):
     limb = name in HANDLES and len(HANDLES[name].chain) == 3
     start = position(REST, name)
     if limb:  # towards the joint that stays
         target = start + 0.2 * (REST[HANDLES[name].chain[0]] - start)
-    elif name == BODY:
+    elif name == BODY_HANDLE:
         target = start + np.array([1.0, 2.0, 3.0])
     else:  # on the sphere about the joint before it
         pivot = (
-            (REST[11] + REST[12]) / 2 if name == HEAD else REST[HANDLES[name].chain[0]]
+            (REST[11] + REST[12]) / 2
+            if name == HEAD_HANDLE
+            else REST[HANDLES[name].chain[0]]
         )
         side = start - pivot
         target = pivot + np.linalg.norm(side) * np.array([0.0, 0.6, 0.8])
     moved = dragged(REST, name, target)
     assert np.linalg.norm(position(moved, name) - target) < 2e-3
     others = [i for i in range(33) if np.array_equal(moved[i], REST[i])]
-    assert (len(others) > 20) == (name != BODY and name != HEAD) or len(others) == 22
+    assert (len(others) > 20) == (name != BODY_HANDLE and name != HEAD_HANDLE) or len(
+        others
+    ) == 22
 
 
 def test_a_straight_limb_bends():

@@ -13,38 +13,31 @@ from gsgan.data.cameras import CameraEntry
 from gsgan.data.formats.consistency import spread
 
 TOPIC = "calibration"
-MIRRORED = "mirrored images"
-# maximum number of images per camera on which calibrations are tried
+MIRRORED_IMAGES = "mirrored images"
+# Maximum number of images per camera on which calibrations are tried.
 TRIED = 8
-# the right calibration has 0.6 to 0.7, with slim masks 0.4
+# The right calibration has 0.6 to 0.7, with slim masks 0.4.
 CREDIBLE_OVERLAP = 0.35
-# of a standing person's joints lie in the mask from any camera
+# Share of a standing person's joints that lie in the mask from any camera.
 SHARE_OF_ANY_CAMERA = 0.5
-# times the other cameras' distance: noisy landmarks are off in all of them
+# Times the other cameras' distance: noisy landmarks are off in all of them.
 OUTSIDE_RATIO = 3.0
-# times the limit of one camera, if all are off
+# Times the limit of one camera, if all are off.
 OUTSIDE_ALL = 2.0
 
 
 @dataclass(frozen=True)
 class CameraScore:
-    """The fit of one camera's calibration to its masks.
+    """The fit of one camera's calibration to its masks."""
 
-    Args:
-        name, inside: the camera; mean share of joints inside the mask.
-        overlap: mean overlap of mask and estimated silhouette.
-        fullness: median area of the mask over that of the estimated silhouette.
-        rivals: the mean overlap with other calibrations, best first; by the name of their camera,
-            or `MIRRORED`.
-        outside: metres, mean distance of the joints from the mask.
-    """
-
-    name: str
-    inside: float
-    overlap: float
-    fullness: float
+    name: str  # of the camera
+    inside: float  # mean share of joints inside the mask
+    overlap: float  # mean overlap of mask and estimated silhouette
+    fullness: float  # median area of the mask over that of the estimated silhouette
+    # Mean overlap with other calibrations, best first, by the name of their camera or
+    # `MIRRORED_IMAGES`.
     rivals: dict[str, float]
-    outside: float
+    outside: float  # metres, mean distance of the joints from the mask
 
     @property
     def best_rival(self) -> float:
@@ -84,22 +77,30 @@ def score_cameras(subject: CheckedData, views: Sequence[MaskView]) -> list[Camer
         best_first = sorted(rivals.items(), key=lambda rival: -rival[1])
 
         # Empty masks tell nothing about joints.
-        filled = [view for view in own if view.mask.any()]
+        inside = []
+        outside = []
+        fullness = []
+        for view in own:
+            fullness.append(view.fullness)
+            if view.mask.any():
+                inside.append(view.inside)
+                outside.append(view.distance)
         scores.append(
             CameraScore(
                 name,
-                inside=known_mean(view.inside for view in filled),
+                inside=known_mean(inside),
                 overlap=_fit(subject, chosen, camera),
-                fullness=float(np.median([view.fullness for view in own])),
+                fullness=float(np.median(fullness)),
                 rivals=dict(best_first),
-                outside=known_mean(view.distance for view in filled),
+                outside=known_mean(outside),
             )
         )
     return scores
 
 
 def calibrations(
-    own: CameraEntry, cameras: Mapping[str, CameraEntry]
+    own: CameraEntry,
+    cameras: Mapping[str, CameraEntry],
 ) -> Iterator[tuple[str, CameraEntry]]:
     """Other calibrations that a camera may have: mirrored, and those of other cameras.
 
@@ -109,7 +110,7 @@ def calibrations(
     mirror = own.K.copy()
     mirror[0] = -mirror[0]
     mirror[0, 2] += own.size[1]
-    yield MIRRORED, replace(own, K=mirror)
+    yield MIRRORED_IMAGES, replace(own, K=mirror)
     for name, other in cameras.items():
         if name != own.name:
             yield name, replace(own, R=other.R, t=other.t)
@@ -123,16 +124,20 @@ def _fit(subject: CheckedData, views: Sequence[MaskView], camera: CameraEntry) -
         # The silhouette that this camera would see.
         row = subject.rows[view.frame]
         body = body_silhouette(
-            view.small(camera), subject.p[row], subject.visible[row], subject.template
+            view.small(camera),
+            subject.p[row],
+            subject.visible[row],
+            subject.template,
         )
         overlaps.append(overlap(view.mask, body))
     return float(np.mean(overlaps))
 
 
-def known_mean(values: Iterable[float]) -> float:
+def known_mean(values: Sequence[float]) -> float:
     """The mean of the values that are not NaN; NaN if there are none."""
-    known = [value for value in values if not np.isnan(value)]
-    return float(np.mean(known)) if known else np.nan
+    array = np.array(values)
+    known = array[~np.isnan(array)]
+    return float(known.mean()) if len(known) else np.nan
 
 
 def calibration_findings(
@@ -148,13 +153,15 @@ def calibration_findings(
     # Masks far larger than the body: one finding for all of them, which then do not count.
     big = [s for s in scores if s.oversized(limits) and s.name not in named]
     if big:
-        sizes = listed(f"{score.name} {score.fullness:.1f}" for score in big)
+        sizes = []
+        for score in big:
+            sizes.append(f"{score.name} {score.fullness:.1f}")
+            named.add(score.name)
         text = (
-            f"masks are far larger than the body (times its area: {sizes}): a focal length that is "
-            "too short, K of smaller images, a skeleton in another unit, or masks of more"
+            f"masks are far larger than the body (times its area: {listed(sizes)}): a focal length "
+            "that is too short, K of smaller images, a skeleton in another unit, or masks of more"
         )
         found.append(Finding("error", TOPIC, text))
-        named.update(score.name for score in big)
         scores = [score for score in scores if score not in big]
 
     # Pairs that fit better with each other's calibration.
@@ -204,25 +211,28 @@ def _exchanged(one: CameraScore, other: CameraScore, limits: Limits) -> bool:
 
 
 def _of_one(
-    score: CameraScore, scores: Sequence[CameraScore], limits: Limits, min_inside: float
+    score: CameraScore,
+    scores: Sequence[CameraScore],
+    limits: Limits,
+    min_inside: float,
 ) -> Finding | None:
     """The finding on one camera; None if nothing is wrong."""
     seen = f"{score.inside:.0%} of the joints lie inside its masks"
     if len(scores) > 1:
-        others = known_mean(s.inside for s in scores if s is not score)
+        others = known_mean([s.inside for s in scores if s is not score])
         seen += f", {others:.0%} in the other cameras"
 
+    # Another calibration fits better, or joints lie outside the masks.
     error = not score.inside >= limits.inside_error
     if score.beaten(limits):
-        # Another calibration fits better: which, and what to do.
         error = True
         names = []
         advice = "check its R, t and folder name"
         rivals = score.close_rivals(limits)
         for rival in rivals:
-            mirrored = rival == MIRRORED
+            mirrored = rival == MIRRORED_IMAGES
             names.append(rival if mirrored else f"the calibration of {rival}")
-        if MIRRORED in rivals:
+        if MIRRORED_IMAGES in rivals:
             other = f", or {advice}" if len(rivals) > 1 else ""
             advice = f"mirror its images and masks back{other}"
         text = (
@@ -240,7 +250,9 @@ def _of_one(
     else:
         return None
     return Finding(
-        "error" if error else "warning", TOPIC, f"camera {score.name}: {text}"
+        "error" if error else "warning",
+        TOPIC,
+        f"camera {score.name}: {text}",
     )
 
 
@@ -261,7 +273,7 @@ def small_errors(scores: Sequence[CameraScore], limits: Limits) -> list[Finding]
     found = []
     for name, own in metres.items():
         rest = [value for other, value in metres.items() if other != name]
-        others = float(np.median(rest)) if rest else np.inf  # one camera has no others
+        others = float(np.median(rest)) if rest else np.inf
         if own > max(limits.outside, OUTSIDE_RATIO * others):
             text = (
                 f"camera {name}: joints lie {100 * own:.1f} cm outside its masks on average, "

@@ -18,8 +18,8 @@ from gsgan.data.validation import spans
 from gsgan.skeleton.template import SkeletonTemplate
 from gsgan.utils.arrays import Bool, Float, expect_array, nanmedian
 
-# of doubts, with their text
-KINDS = {
+# The kinds of doubts, with their text.
+DOUBTS = {
     "outside": "joints lie outside the mask",
     "mask": "the mask is not of the body's size",
     "jump": "joints jump",
@@ -28,21 +28,21 @@ KINDS = {
     "unseen": "few joints were seen",
     "detections": "joints lie far from their 2D detections",
 }
-# a jump exceeds the upper quartile of all by this: low frame rates pass
+# A jump exceeds the upper quartile of all by this factor: low frame rates pass.
 JUMP_RATIO = 4.0
-# metres that a limb must be off as well: noise moves the ends of short bones
+# Metres that a limb must be off as well: noise moves the ends of short bones.
 LIMB_METRES = 0.06
-# share of frames facing backwards: then left and right of all of them are exchanged
-MIRRORED = 0.5
+# Share of frames facing backwards, above which left and right of all of them are exchanged.
+MAX_BACKWARDS = 0.5
 
 
 @dataclass(frozen=True)
 class Doubt:
-    """A frame number and one reason to doubt it: a key of `KINDS`, and a text with numbers."""
+    """One reason to doubt a frame."""
 
-    frame: int
-    kind: str
-    text: str
+    frame: int  # number
+    kind: str  # a key of `DOUBTS`
+    text: str  # with numbers
 
 
 def skeleton_doubts(subject: CheckedData, limits: Limits) -> list[Doubt]:
@@ -53,13 +53,18 @@ def skeleton_doubts(subject: CheckedData, limits: Limits) -> list[Doubt]:
     found = list[Doubt]()
 
     def doubt(
-        kind: str, what: str, flags: Bool, text: Callable[[int, int], str]
+        kind: str,
+        what: str,
+        flags: Bool,
+        text: Callable[[int, int], str],
     ) -> None:
         """Adds the frames in which any of the flags ``[F, N]`` holds."""
         for row in np.flatnonzero(flags.any(1)).tolist():
-            places = np.flatnonzero(flags[row]).tolist()
-            texts = listed([text(row, place) for place in places], 3)
-            found.append(Doubt(int(subject.frames[row]), kind, f"{what}{texts}"))
+            texts = []
+            for place in np.flatnonzero(flags[row]).tolist():
+                texts.append(text(row, place))
+            frame = int(subject.frames[row])
+            found.append(Doubt(frame, kind, f"{what}{listed(texts, 3)}"))
 
     # Jumps, unless neighbours in the list are not neighbours in time.
     jump = jump_distance(p)
@@ -79,11 +84,12 @@ def skeleton_doubts(subject: CheckedData, limits: Limits) -> list[Doubt]:
     lengths = bone_lengths(p, template.limbs)  # [F, limbs]
     typical = nanmedian(lengths)
     change = np.abs(lengths - typical) / np.maximum(typical, 1e-6)
+    changed = (change > limits.limb_share) & (change * typical > LIMB_METRES)
     bones = [f"{names[a]} to {names[b]}" for a, b in template.limbs]
     doubt(
         "limb",
         "length off its median: ",
-        (change > limits.limb_share) & (change * typical > LIMB_METRES),
+        changed,
         lambda row, bone: f"{bones[bone]} {change[row, bone]:.0%}",
     )
 
@@ -111,13 +117,14 @@ def skeleton_doubts(subject: CheckedData, limits: Limits) -> list[Doubt]:
 
 
 def reprojection_errors(subject: CheckedData) -> Float:
-    """``[F, J]`` pixels between projected joints and 2D detections, NaN where unknown.
+    """Pixels ``[F, J]`` between projected joints and 2D detections, NaN if unknown.
 
     They are ``reproj_px`` of landmarks3d.npz, the mean over cameras, as `gsgan.prepare` writes it.
 
     Raises:
         DataError: if the array has another shape than the joints.
     """
+    # Other datasets have no such file, or no such array in it.
     result = np.full(subject.visible.shape, np.nan)
     path = subject.layout.root / "landmarks3d.npz"
     if not path.is_file():
@@ -135,7 +142,9 @@ def reprojection_errors(subject: CheckedData) -> Float:
 
 
 def mask_doubts(
-    views: Sequence[MaskView], limits: Limits, unfit: Collection[str] = ()
+    views: Sequence[MaskView],
+    limits: Limits,
+    unfit: Collection[str] = (),
 ) -> Iterable[Doubt]:
     """Reasons to doubt masks, without the cameras ``unfit``, whose masks fit in no frame."""
     for name, own in grouped(views).items():
@@ -149,6 +158,8 @@ def mask_doubts(
             if not view.mask.any():
                 yield Doubt(view.frame, "mask", f"{name}: the mask is empty")
                 continue
+
+            # Joints outside of the mask.
             known = int(view.known.sum())
             out = int(view.beyond.sum())
             if known and out / known > limits.frame_outside:
@@ -164,7 +175,9 @@ def mask_doubts(
 
 
 def frame_findings(
-    subject: CheckedData, found: Sequence[Doubt], limits: Limits
+    subject: CheckedData,
+    found: Sequence[Doubt],
+    limits: Limits,
 ) -> list[Finding]:
     """One finding per kind of doubt; an error if left and right, or most frames, are wrong."""
     findings = []
@@ -175,7 +188,7 @@ def frame_findings(
 
     # Most frames face backwards: one error in place of many warnings.
     backwards = len(by_kind.get("backwards", [])) / count
-    mirrored = backwards > MIRRORED
+    mirrored = backwards > MAX_BACKWARDS
     if mirrored:
         text = (
             f"in {backwards:.0%} of the frames nose and toes point backwards: the skeleton's left "
@@ -184,7 +197,7 @@ def frame_findings(
         findings.append(Finding("error", "skeleton", text))
 
     # A warning per kind, with the first frame's text.
-    for kind, what in KINDS.items():
+    for kind, what in DOUBTS.items():
         some = by_kind.get(kind)
         if some and not (mirrored and kind == "backwards"):
             frames = sorted({doubt.frame for doubt in some})
@@ -194,6 +207,7 @@ def frame_findings(
             )
             findings.append(Finding("warning", "frames", text))
 
+    # Most frames are doubtful for any reason.
     share = len({doubt.frame for doubt in found}) / count
     if share > limits.doubtful and not mirrored:
         text = f"{share:.0%} of the frames are doubtful; training on them is not worth its time"
@@ -231,11 +245,11 @@ def jumped(distance: Float, limit: float) -> Bool:
     here = known[1:-1]
     after = known[2:]
     peak = (here >= before) & (here >= after)
-    return np.asarray((here > limit) & peak)
+    return (here > limit) & peak
 
 
 def facing(p: Float, template: SkeletonTemplate) -> Float:
-    """``[F]`` positive where nose and toes lie before the trunk, negative behind; NaN unknown.
+    """Votes ``[F]``, positive if nose and toes lie before the trunk, negative behind; NaN unknown.
 
     The trunk's front follows from its left and right; nose against ears and toes against ankles
     show the true front. If all frames are negative, left and right are exchanged throughout.

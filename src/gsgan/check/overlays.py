@@ -14,21 +14,21 @@ from gsgan.skeleton.hands import HAND
 from gsgan.utils.arrays import Bytes, Float
 from gsgan.utils.images import caption, encode
 
-# pixels of a tile
-HEIGHT = 360
-# width to height of a tile: a standing person
+# Pixels.
+TILE_HEIGHT = 360
+# Width to height of a tile: a standing person.
 ASPECT = 0.75
-# of the box around person and skeleton, on each side
-MARGIN = 0.08
-# RGB, the person's sides
-LEFT = (60, 150, 255)
-RIGHT = (255, 140, 40)
-MIDDLE = (240, 240, 240)
-OUTLINE = (70, 255, 90)
-OUTSIDE = (255, 40, 60)
-NEUTRAL = (70, 70, 70)
-# pixels between tiles
-GAP = 4
+# Share of the box around person and skeleton, on each side.
+TILE_MARGIN = 0.08
+# RGB; left and right are the person's.
+LEFT_COLOUR = (60, 150, 255)
+RIGHT_COLOUR = (255, 140, 40)
+MIDDLE_COLOUR = (240, 240, 240)
+OUTLINE_COLOUR = (70, 255, 90)
+OUTSIDE_COLOUR = (255, 40, 60)
+CAPTION_COLOUR = (70, 70, 70)
+# Pixels between tiles.
+TILE_GAP = 4
 LEGEND = (
     "Green: the mask's outline. Blue: the person's left, orange: the right, white: the middle; "
     "red rings: joints outside the mask; small dots: hands and face. Images are cropped to the "
@@ -37,7 +37,9 @@ LEGEND = (
 
 
 def strip(
-    subject: CheckedData, views: Sequence[MaskView], doubtful: Collection[int] = ()
+    subject: CheckedData,
+    views: Sequence[MaskView],
+    doubtful: Collection[int] = (),
 ) -> bytes:
     """A row of at least one tile as a JPEG; captions of ``doubtful`` frames are red."""
     tiles = []
@@ -46,16 +48,18 @@ def strip(
         known = int(view.known.sum())
         out = int(view.beyond.sum())
         text = f"{view.frame}   {known - out}/{known} inside"
-        colour = OUTSIDE if view.frame in doubtful else NEUTRAL
+        colour = OUTSIDE_COLOUR if view.frame in doubtful else CAPTION_COLOUR
         captioned = caption(tile(subject, view), text, colour)
-        tiles += [captioned, np.full((len(captioned), GAP, 3), 255, np.uint8)]
+        tiles.append(captioned)
+        tiles.append(np.full((len(captioned), TILE_GAP, 3), 255, np.uint8))
 
     # Without the gap after the last tile.
     return encode(np.concatenate(tiles[:-1], axis=1))
 
 
 def tile(subject: CheckedData, view: MaskView) -> Bytes:
-    """``[HEIGHT, 0.75 HEIGHT, 3]`` RGB: the image around the person, with overlays."""
+    """The image around the person with overlays, ``[TILE_HEIGHT, 0.75 TILE_HEIGHT, 3]`` RGB."""
+    # The joints that are drawn.
     camera = subject.cameras[view.camera]
     row = subject.rows[view.frame]
     joints, depth = project(camera, subject.p[row])  # [J, 2], [J]
@@ -66,7 +70,7 @@ def tile(subject: CheckedData, view: MaskView) -> Bytes:
     mapping = None
     if camera.distorted:
         mapping = undistort_map(camera.K, camera.dist, window)
-    size = (HEIGHT, round(HEIGHT * ASPECT))
+    size = (TILE_HEIGHT, round(TILE_HEIGHT * ASPECT))
 
     def shown(image: Bytes) -> Bytes:
         return resize(take(image, window, mapping, exact=False), size, exact=False)
@@ -79,7 +83,7 @@ def tile(subject: CheckedData, view: MaskView) -> Bytes:
 
     # The mask's outline.
     contours, _ = cv2.findContours(person, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(canvas, contours, -1, OUTLINE, 1, cv2.LINE_AA)
+    cv2.drawContours(canvas, contours, -1, OUTLINE_COLOUR, 1, cv2.LINE_AA)
 
     # Whole pixels of the tile, whose centres are whole numbers for OpenCV.
     corner = (window.left, window.top)
@@ -94,15 +98,17 @@ def tile(subject: CheckedData, view: MaskView) -> Bytes:
     names = subject.template.names
     for a, b in subject.template.edges:
         if drawn[a] and drawn[b]:
-            cv2.line(canvas, at[a], at[b], (0, 0, 0), 3, cv2.LINE_AA)
+            start = at[a]
+            end = at[b]
             colour = _side(names[a], names[b])
-            cv2.line(canvas, at[a], at[b], colour, 1, cv2.LINE_AA)
+            cv2.line(canvas, start, end, (0, 0, 0), 3, cv2.LINE_AA)
+            cv2.line(canvas, start, end, colour, 1, cv2.LINE_AA)
 
     # Joints, with a ring around those outside the mask.
     for joint in np.flatnonzero(drawn).tolist():
         cv2.circle(canvas, at[joint], 2, _side(names[joint]), -1, cv2.LINE_AA)
         if view.beyond[joint]:
-            cv2.circle(canvas, at[joint], 6, OUTSIDE, 2, cv2.LINE_AA)
+            cv2.circle(canvas, at[joint], 6, OUTSIDE_COLOUR, 2, cv2.LINE_AA)
 
     # Hands and face as dots.
     for p, colour in _hands_and_face(subject, view.frame):
@@ -113,7 +119,8 @@ def tile(subject: CheckedData, view: MaskView) -> Bytes:
 
 
 def _hands_and_face(
-    subject: CheckedData, frame: int
+    subject: CheckedData,
+    frame: int,
 ) -> list[tuple[Float, tuple[int, int, int]]]:
     """The visible landmarks ``[N, 3]`` of left hand, right hand and face, with their colours."""
     found = []
@@ -122,10 +129,10 @@ def _hands_and_face(
     if hands is not None and frame in hands.p:
         p = hands.p[frame]
         seen = hands.visibility[frame] > 0
-        found.append((p[:HAND][seen[:HAND]], LEFT))
-        found.append((p[HAND:][seen[HAND:]], RIGHT))
+        found.append((p[:HAND][seen[:HAND]], LEFT_COLOUR))
+        found.append((p[HAND:][seen[HAND:]], RIGHT_COLOUR))
     if face is not None and frame in face.p:
-        found.append((face.seen(frame), MIDDLE))
+        found.append((face.seen(frame), MIDDLE_COLOUR))
     return found
 
 
@@ -139,7 +146,8 @@ def person_window(view: MaskView, joints: Float, size: tuple[int, int]) -> Crop:
         first = (columns.min(), rows.min())
         last = (columns.max() + 1, rows.max() + 1)
         small = np.array([first, last])
-        points.append((small - view.to_small[:2, 2]) / np.diag(view.to_small)[:2])
+        scale = np.diag(view.to_small)[:2]
+        points.append((small - view.to_small[:2, 2]) / scale)
     box = np.concatenate(points)
     if len(box) == 0:
         box = np.array([(0, 0), limit])
@@ -147,17 +155,18 @@ def person_window(view: MaskView, joints: Float, size: tuple[int, int]) -> Crop:
     # Margins, then the longer side decides.
     low = box.min(0)
     high = box.max(0)
-    across, along = np.maximum((high - low) * (1 + 2 * MARGIN), 8)
+    across, along = np.maximum((high - low) * (1 + 2 * TILE_MARGIN), 8)
     height = max(along, across / ASPECT)
     width = height * ASPECT
     left, top = (low + high) / 2 - (width / 2, height / 2)
-    return Crop(int(np.floor(top)), int(np.floor(left)), (round(height), round(width)))
+    size = (round(height), round(width))
+    return Crop(int(np.floor(top)), int(np.floor(left)), size)
 
 
 def _side(*names: str) -> tuple[int, int, int]:
     """The colour of the person's side that all of these joints are on."""
-    for side, colour in (("left", LEFT), ("right", RIGHT)):
+    for side, colour in (("left", LEFT_COLOUR), ("right", RIGHT_COLOUR)):
         # A bone between two sides, such as the shoulders, is in the middle.
         if all(side in name for name in names):
             return colour
-    return MIDDLE
+    return MIDDLE_COLOUR

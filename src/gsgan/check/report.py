@@ -1,9 +1,7 @@
 """A report: findings, tables and figures in sections; as one HTML page and on the terminal."""
 
-from __future__ import annotations
-
 import base64
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -12,11 +10,11 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
-# rich's styles by level
+# Styles of rich by level.
 STYLES = {"error": "bold red", "warning": "yellow"}
 
-# Jinja's template of the page
-PAGE = """<!DOCTYPE html>
+# Jinja's template of the page.
+REPORT_PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>Check of a dataset</title><style>
@@ -58,16 +56,16 @@ class Finding:
     """
 
     level: Literal["error", "warning"]
-    topic: str
-    sentence: str
+    topic: str  # one word
+    sentence: str  # for the user
 
 
 @dataclass(frozen=True)
 class Table:
     """Rows of text."""
 
-    headers: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
+    headers: Sequence[str]
+    rows: Sequence[Sequence[str]]
 
     def for_terminal(self, title: str | None = None) -> RichTable:
         """The table as rich prints it."""
@@ -90,6 +88,7 @@ class Figure:
     @property
     def source(self) -> str:
         """A data URL, for the page."""
+        # The page has all images in itself.
         return f"data:image/jpeg;base64,{base64.b64encode(self.image).decode()}"
 
 
@@ -98,9 +97,9 @@ class Section:
     """One part of a report; ``text`` explains it on the page."""
 
     title: str
-    tables: tuple[Table, ...] = ()
-    findings: tuple[Finding, ...] = ()
-    figures: tuple[Figure, ...] = ()
+    tables: Sequence[Table] = ()
+    findings: Sequence[Finding] = ()
+    figures: Sequence[Figure] = ()
     text: str = ""
 
 
@@ -109,7 +108,7 @@ class CheckReport:
     """All findings on a folder; ``numbers`` are the scores, plain values for JSON."""
 
     root: str
-    sections: tuple[Section, ...]
+    sections: Sequence[Section]
     numbers: dict[str, object] = field(default_factory=dict)
 
     @property
@@ -160,7 +159,7 @@ def page(report: CheckReport) -> str:
     # Names from the dataset are escaped.
     environment = Environment(autoescape=True, trim_blocks=True)
     colour = "error" if report.errors else "warning" if report.warnings else "good"
-    return environment.from_string(PAGE).render(report=report, colour=colour)
+    return environment.from_string(REPORT_PAGE).render(report=report, colour=colour)
 
 
 def print_report(report: CheckReport, console: Console) -> None:

@@ -48,17 +48,25 @@ def check_data(
     Raises:
         ConfigError: when the data's config is wrong.
     """
+    # A dataset that cannot be read has a report, too.
     try:
         measured = Measurements(
-            data, sampling, limits, effects or EffectSettings(), console
+            data,
+            sampling,
+            limits,
+            effects or EffectSettings(),
+            console,
         )
     except DataError as error:
+        # The reader stops at the first problem; captures are searched for all.
         messages = [str(error)]
         if isinstance(data.reader, CaptureReader) and data.root is not None:
             messages += capture_problems(Path(data.root).expanduser(), data.limits)
         return unreadable(data.root, messages)
     return CheckReport(
-        str(measured.subject.layout.root), sections(measured), measured.numbers()
+        str(measured.subject.layout.root),
+        sections(measured),
+        measured.numbers(),
     )
 
 
@@ -68,7 +76,7 @@ def unreadable(root: str | None, messages: Sequence[str]) -> CheckReport:
     findings = [Finding("error", "reading", reason) for reason in reasons]
     section = Section(
         "The dataset cannot be read",
-        findings=tuple(findings),
+        findings=findings,
         text="Nothing further could be checked. Correct this, then check again.",
     )
     return CheckReport(str(root), (section,), {"readable": False})
@@ -103,7 +111,11 @@ def run_check(config: DictConfig) -> CheckReport:
     effects = instantiate(config.effects)
     try:
         report = check_data(
-            instantiate(config.data), sampling, limits, effects, console
+            instantiate(config.data),
+            sampling,
+            limits,
+            effects,
+            console,
         )
     except InstantiationException as error:
         # Hydra wraps the error of a dataset that is made when it is instantiated.

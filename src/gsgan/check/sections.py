@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
@@ -23,30 +24,23 @@ from gsgan.skeleton.sanitise import limb_length_sum
 from gsgan.utils.arrays import Float, nanmedian
 from gsgan.utils.errors import DataError
 
-# metres of person: outside, units are wrong
+# Metres of person: outside of these, units are wrong.
 POSSIBLE = (0.4, 3.0)
-# metres: smaller is a child or a wrong unit, taller is rare
+# Metres: smaller is a child or a wrong unit, taller is rare.
 PLAUSIBLE = (1.2, 2.1)
-# degrees from trunk to up axis, median over frames: nobody stands like that
-LEAN = 50.0
+# Maximum degrees from trunk to up axis, median over frames.
+MAX_LEAN = 50.0
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """Distances, sizes and directions of cameras and person.
+    """Distances, sizes and directions of cameras and person."""
 
-    Args:
-        distances: metres from the person, by camera.
-        stature: metres, median over frames, estimated from limb lengths.
-        up, lean: ``[3]`` direction of the trunk, median over frames; degrees from the up axis.
-        far: a message for each camera that is far too near or far.
-    """
-
-    distances: dict[str, float]
-    stature: float
-    up: Float
-    lean: float
-    far: dict[str, str]
+    distances: dict[str, float]  # metres from the person, by camera
+    stature: float  # metres, median over frames, estimated from limb lengths
+    up: Float  # [3] direction of the trunk, median over frames
+    lean: float  # degrees of the trunk from the up axis
+    far: dict[str, str]  # a message for each camera that is far too near or far
 
     @property
     def distance(self) -> float:
@@ -98,7 +92,7 @@ def geometry_findings(subject: CheckedData, geometry: Geometry) -> list[Finding]
         possible = POSSIBLE[0] <= stature <= POSSIBLE[1]
         found.append(Finding("warning" if possible else "error", "units", text))
 
-    if geometry.lean > LEAN:
+    if geometry.lean > MAX_LEAN:
         way = axis_name(geometry.up)
         axis = subject.layout.meta.up_axis
         text = f"the trunk points along {way}, {geometry.lean:.0f} degrees from the up axis {axis}"
@@ -154,15 +148,15 @@ def lens_table(subject: CheckedData, geometry: Geometry) -> Table:
         "distance m",
         "images",
     )
-    return Table(headers, tuple(rows))
+    return Table(headers, rows)
 
 
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
 
-# damaged images listed
+# Maximum number of damaged images that are listed.
 LISTED_BROKEN = 6
-# doubtful frames listed
+# Maximum number of doubtful frames that are listed.
 TABLE_FRAMES = 40
 AGREEMENT = (
     "Joints are compared with masks, undistorted. Overlap is that of the mask with the silhouette "
@@ -228,19 +222,20 @@ class Measurements:
 
     def numbers(self) -> dict[str, object]:
         """The scores, for the JSON file."""
-        # Each camera with its three best rivals.
+        # Each camera with its three best rivals, and the reasons by frame; JSON has text keys.
         cameras = {}
         for score in self.cameras:
             best = list(score.rivals.items())[:3]
             cameras[score.name] = asdict(score) | {"rivals": dict(best)}
+        doubtful = {}
+        for frame, text in self.reasons.items():
+            doubtful[str(frame)] = text
         return {
             "readable": True,
             "cameras": cameras,
             "camera_distance": self.geometry.distance,
             "stature": self.geometry.stature,
-            "doubtful_frames": {
-                str(frame): text for frame, text in self.reasons.items()
-            },
+            "doubtful_frames": doubtful,
             "settings": {
                 "sampling": asdict(self.sampling),
                 "limits": asdict(self.limits),
@@ -249,7 +244,7 @@ class Measurements:
         }
 
 
-def sections(m: Measurements) -> tuple[Section, ...]:
+def sections(m: Measurements) -> Sequence[Section]:
     """Every section, in reading order."""
     units = (geometry_table(m.subject, m.geometry), lens_table(m.subject, m.geometry))
     found = geometry_findings(m.subject, m.geometry)
@@ -262,9 +257,9 @@ def sections(m: Measurements) -> tuple[Section, ...]:
         strips.append(Figure(f"camera {name}", image))
     return (
         _contents(m),
-        Section("Units and cameras", units, tuple(found)),
+        Section("Units and cameras", units, found),
         _agreement(m),
-        Section("Overlays", figures=tuple(strips), text=overlays.LEGEND),
+        Section("Overlays", figures=strips, text=overlays.LEGEND),
         _frames(m),
         _effects(m),
     )
@@ -318,8 +313,8 @@ def _contents(m: Measurements) -> Section:
         if lacking:
             text = f"{len(lacking)} of the {len(frames)} frames: {shortened(lacking)}"
             found.append(Finding("warning", "files", f"camera {name} lacks {text}"))
-    table = Table(("what", "how much"), tuple(contents))
-    return Section("Contents", (table,), tuple(found))
+    table = Table(("what", "how much"), contents)
+    return Section("Contents", (table,), found)
 
 
 def _skeleton(m: Measurements) -> str:
@@ -371,11 +366,14 @@ def _agreement(m: Measurements) -> Section:
         "best other",
         "mask / body",
     )
-    table = Table(headers, tuple(rows))
+    table = Table(headers, rows)
     min_inside = m.subject.consistency.min_inside
     found = calibration_findings(m.cameras, m.limits, min_inside, m.geometry.far)
     return Section(
-        "Skeleton, masks and cameras", (table,), tuple(found), text=AGREEMENT
+        "Skeleton, masks and cameras",
+        (table,),
+        found,
+        text=AGREEMENT,
     )
 
 
@@ -384,16 +382,16 @@ def _frames(m: Measurements) -> Section:
     rows = []
     for frame, reasons in m.reasons.items():
         rows.append((str(frame), "; ".join(reasons)))
-    tables: tuple[Table, ...] = ()
+    tables: Sequence[Table] = ()
     if rows:
-        tables = (Table(("frame", "why"), tuple(rows[:TABLE_FRAMES])),)
+        tables = (Table(("frame", "why"), rows[:TABLE_FRAMES]),)
     text = (
         f"{counted(len(rows), 'frame')} of {len(m.subject.frames)}; skeletons were checked in all "
         f"frames, masks in {counted(len(m.views), 'image')}. At most {TABLE_FRAMES} are listed; "
         "the JSON file has all."
     )
     findings = frame_findings(m.subject, m.doubts, m.limits)
-    return Section("Doubtful frames", tables, tuple(findings), text=text)
+    return Section("Doubtful frames", tables, findings, text=text)
 
 
 def _effects(m: Measurements) -> Section:
@@ -403,4 +401,4 @@ def _effects(m: Measurements) -> Section:
     if m.info is None:
         return Section(title, text=f"Not decided: {m.no_info}")
     decided = decide(m.info, m.effects).rows()
-    return Section(title, (Table(HEADERS, tuple(decided)),), text=EFFECTS)
+    return Section(title, (Table(HEADERS, decided),), text=EFFECTS)

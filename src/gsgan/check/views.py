@@ -39,40 +39,32 @@ from gsgan.utils.errors import DataError
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
 
-# metres: distances of joints from the mask are clipped to this before they are averaged
-FAR = 0.3
-# pixels, maximum side of the masks that calibrations are tried on
-SMALL = 128
-# bytes: some writers append a few after the end mark
+# Metres: distances of joints from the mask are clipped to this before they are averaged.
+MAX_OUTSIDE = 0.3
+# Pixels, maximum side of the masks that calibrations are tried on.
+SMALL_SIDE = 128
+# Bytes: some writers append a few after the end mark.
 TAIL = 64
-# by the first bytes
+# The end of each format by its first bytes.
 END_MARKS = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8": b"\xff\xd9"}
-# metres of body around every bone: between an arm and a thigh
+# Metres of body around every bone: between an arm and a thigh.
 FLESH = 0.07
-# metres around the middle of the face: half of a head's height
+# Metres around the middle of the face: half of a head's height.
 HEAD_RADIUS = 0.12
 
 
 @dataclass(frozen=True)
 class CheckedData:
-    """The arrays of one dataset.
+    """The arrays of one dataset."""
 
-    Args:
-        layout, consistency: the reader's index and thresholds.
-        frames, pairs: ``[F]`` rising frame numbers; the existing frames of each camera.
-        p, visible: ``[F, J, 3]`` metres, finite; ``[F, J]``.
-        up: ``[3]`` unit, the world's up axis.
-        template: names of the joints and bones.
-    """
-
-    layout: Layout
-    consistency: Consistency
-    frames: Ints
-    pairs: Mapping[str, tuple[int, ...]]
-    p: Float
-    visible: Bool
-    up: Float
-    template: SkeletonTemplate = MEDIAPIPE33
+    layout: Layout  # the reader's index
+    consistency: Consistency  # the reader's thresholds
+    frames: Ints  # [F] rising frame numbers
+    pairs: Mapping[str, Sequence[int]]  # the existing frames of each camera
+    p: Float  # [F, J, 3] metres, finite
+    visible: Bool  # [F, J]
+    up: Float  # [3] unit, the world's up axis
+    template: SkeletonTemplate = MEDIAPIPE33  # names of the joints and bones
 
     @property
     def cameras(self) -> Mapping[str, CameraEntry]:
@@ -82,11 +74,12 @@ class CheckedData:
     @cached_property
     def rows(self) -> dict[int, int]:
         """Row of ``p`` by frame number."""
-        return {int(frame): row for row, frame in enumerate(self.frames)}
+        frames = self.frames.tolist()
+        return dict(zip(frames, range(len(frames)), strict=True))
 
     @cached_property
     def seen_p(self) -> Float:
-        """``[F, J, 3]`` metres, NaN where a joint is not visible."""
+        """``[F, J, 3]`` metres, NaN if a joint is not visible."""
         return np.where(self.visible[..., None], self.p, np.nan)
 
     @cached_property
@@ -115,9 +108,12 @@ def subject_of(data: GsganData) -> CheckedData:
     layout = data.layout
     pairs = {}
     for name in layout.camera_names:
-        pairs[name] = tuple(sorted(layout.images[name]))
-    p = [layout.landmarks.p[frame] for frame in layout.frames]
-    visibility = [layout.landmarks.visibility[frame] for frame in layout.frames]
+        pairs[name] = sorted(layout.images[name])
+    p = []
+    visibility = []
+    for frame in layout.frames:
+        p.append(layout.landmarks.p[frame])
+        visibility.append(layout.landmarks.visibility[frame])
 
     # The up axis is a name such as "-y".
     axis = layout.meta.up_axis
@@ -135,23 +131,15 @@ def subject_of(data: GsganData) -> CheckedData:
 
 @dataclass(frozen=True)
 class MaskView:
-    """The measures of one image.
-
-    Args:
-        camera, frame: of the image.
-        outside, tolerance: ``[J]`` metres by which joints lie outside the mask, NaN where unknown;
-            metres that they may.
-        fullness: area of the mask over that of the estimated silhouette.
-        mask, to_small: ``[h, w]`` small mask; ``[3, 3]`` maps pixels of the whole image to it.
-    """
+    """The measures of one image."""
 
     camera: str
     frame: int
-    outside: Float
-    tolerance: float
-    fullness: float
-    mask: Bool
-    to_small: Float
+    outside: Float  # [J] metres by which joints lie outside the mask, NaN = unknown
+    tolerance: float  # metres by which joints may lie outside
+    fullness: float  # area of the mask over that of the estimated silhouette
+    mask: Bool  # [h, w] small mask
+    to_small: Float  # [3, 3] maps pixels of the whole image to the small mask
 
     def small(self, camera: CameraEntry) -> CameraEntry:
         """A camera of the whole image as one of the small mask."""
@@ -165,12 +153,12 @@ class MaskView:
     @property
     def beyond(self) -> Bool:
         """``[J]`` joints outside the mask by more than the tolerance."""
-        return np.asarray(self.outside > self.tolerance)
+        return self.outside > self.tolerance
 
     @property
     def distance(self) -> float:
         """Metres, mean distance of the known joints from the mask; NaN without any."""
-        metres = np.minimum(self.outside[self.known], FAR)
+        metres = np.minimum(self.outside[self.known], MAX_OUTSIDE)
         return float(metres.mean()) if len(metres) else np.nan
 
     @property
@@ -188,7 +176,7 @@ def grouped(views: Sequence[MaskView]) -> dict[str, list[MaskView]]:
     return groups
 
 
-def sampled_items(subject: CheckedData, images: int) -> tuple[Item, ...]:
+def sampled_items(subject: CheckedData, images: int) -> list[Item]:
     """At most ``images`` items, at least one per camera: the same moments, evenly spaced."""
     # The same moments in all cameras, as many as the budget allows.
     each = max(1, images // len(subject.pairs))
@@ -199,21 +187,21 @@ def sampled_items(subject: CheckedData, images: int) -> tuple[Item, ...]:
         chosen = [frame for frame in files if frame in moments] or spread(files, each)
         for frame in chosen:
             items.append((name, frame))
-    return tuple(items)
+    return items
 
 
-def cut_items(subject: CheckedData, most: int) -> tuple[Item, ...]:
-    """At most ``most`` items with an image or mask file that was cut off; nothing is decoded."""
+def cut_items(subject: CheckedData, most: int) -> list[Item]:
+    """Items with an image or mask file that was cut off, at most ``most``; nothing is decoded."""
     layout = subject.layout
     found: list[Item] = []
     for name, files in subject.pairs.items():
         for frame in files:
             if len(found) == most:
-                return tuple(found)
+                return found
             masks = [path for _, path in layout.mask_files(name, frame)]
             if not all(map(complete, [layout.image_path(name, frame), *masks])):
                 found.append((name, frame))
-    return tuple(found)
+    return found
 
 
 def complete(path: Path) -> bool:
@@ -229,7 +217,7 @@ def complete(path: Path) -> bool:
     for first, end in END_MARKS.items():
         if start.startswith(first):
             return end in tail
-    return len(start) > 0
+    return bool(start)
 
 
 def measure(
@@ -251,7 +239,9 @@ def measure(
     bar = progress(console or Console(), disable=console is None)
     with ThreadPoolExecutor(sampling.workers) as pool, bar:
         found = bar.track(
-            pool.map(one, unique), len(unique), description="checking images"
+            pool.map(one, unique),
+            len(unique),
+            description="checking images",
         )
         results = list(found)
 
@@ -279,7 +269,7 @@ def _view(subject: CheckedData, item: Item, sampling: Sampling) -> MaskView:
     K = frame.camera.K[0].double().numpy()
     camera = replace(entry, K=K, size=frame.camera.size)
     soft = frame.mask[0, 0].numpy()  # [H, W]
-    mask = np.asarray(soft > 0.5)
+    mask = soft > 0.5
     body = body_silhouette(camera, p, visible, subject.template)
 
     # Joints outside the mask; those in the padding are not in the image.
@@ -291,7 +281,7 @@ def _view(subject: CheckedData, item: Item, sampling: Sampling) -> MaskView:
 
     # A small mask, and the map from the whole image to it: by the camera's K, then the scale.
     height, width = mask.shape
-    factor = min(1.0, SMALL / max(height, width))
+    factor = min(1.0, SMALL_SIDE / max(height, width))
     small = [max(1, round(width * factor)), max(1, round(height * factor))]
     scale = np.diag([small[0] / width, small[1] / height, 1])
     return MaskView(
@@ -306,12 +296,16 @@ def _view(subject: CheckedData, item: Item, sampling: Sampling) -> MaskView:
 
 
 def body_silhouette(
-    camera: CameraEntry, p: Float, visible: Bool, template: SkeletonTemplate
+    camera: CameraEntry,
+    p: Float,
+    visible: Bool,
+    template: SkeletonTemplate,
 ) -> Bool:
     """``[H, W]`` silhouette estimated from a skeleton: thick bones, a filled trunk, a round head.
 
     Joints ``p [J, 3]`` (metres) behind the camera are left out, and so is lens distortion.
     """
+    # The joints in whole pixels, and the pixels of a metre at each joint.
     size = camera.size
     pixels, depth = project(camera, p)
     drawn = visible & (depth > NEAR)

@@ -5,13 +5,11 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn import functional
+from torch.nn.functional import l1_loss, relu, softplus
 
-# by scale: feature maps, the logits last
+# Feature maps by scale; the last one of each scale holds the logits.
 Maps = Sequence[Sequence[Tensor]]
 Term = Callable[[Tensor, Tensor], Tensor]
-softplus = functional.softplus
-relu = functional.relu
 
 
 class Form(NamedTuple):
@@ -40,7 +38,7 @@ _FORMS = {
     ),
 }
 FORMS = tuple(_FORMS)
-# forms whose generator loss depends on the real image
+# Forms whose generator loss depends on the real image.
 COMPARING = ("relativistic",)
 
 
@@ -48,7 +46,7 @@ def _over_scales(term: Term, real: Maps, fake: Maps) -> Tensor:
     """The sum over scales of a term's mean over positions, in float32."""
     losses = []
     for real_scale, fake_scale in zip(real, fake, strict=True):
-        # The last map holds the logits.
+        # Logits may come in half precision.
         loss = term(real_scale[-1].float(), fake_scale[-1].float())
         losses.append(loss.mean())
     return torch.stack(losses).sum()
@@ -86,6 +84,6 @@ def feature_matching(real: Maps, fake: Maps) -> Tensor:
         weight = 4 / ((len(real_scale) - 1) * len(real))
         features = zip(real_scale[:-1], fake_scale[:-1], strict=True)
         for truth, generated in features:
-            distance = functional.l1_loss(generated, truth.detach())
+            distance = l1_loss(generated, truth.detach())
             loss = loss + weight * distance
     return loss

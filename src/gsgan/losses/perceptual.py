@@ -14,15 +14,13 @@ from gsgan.weights.networks import FeatureNetwork, Lpips, pretrained
 
 FEATURES = "features"
 LPIPS = "lpips"
-FORMS = (FEATURES, LPIPS)
 PRETRAINED = "pretrained"
 RANDOM = "random"
-SOURCES = (PRETRAINED, RANDOM)
 # relu1_2, relu2_2, relu3_3, relu4_3, as Johnson et al.
 VGG_LAYERS = 4
-# pixels: AlexNet's last map is empty for smaller crops
-LEAST_CROP = 32
-# weight of a pixel off the person, so that a crop exists without a person
+# Pixels: AlexNet's last map is empty for smaller crops.
+MIN_CROP = 32
+# Weight of a pixel off the person, so that a crop exists without a person.
 ANYWHERE = 1e-6
 
 
@@ -70,12 +68,14 @@ class Perceptual(nn.Module):
         width: int = 16,
     ) -> None:
         super().__init__()
+
+        # The options as they are called in configs.
         key = "training.perceptual"
-        one_of(f"{key}.weights", weights, SOURCES)
+        one_of(f"{key}.weights", weights, (PRETRAINED, RANDOM))
         one_of(f"{key}.net", net, ("vgg", "alex"))
-        one_of(f"{key}.form", form, FORMS)
+        one_of(f"{key}.form", form, (FEATURES, LPIPS))
         if crop is not None:
-            whole(f"{key}.crop", crop, LEAST_CROP)
+            whole(f"{key}.crop", crop, MIN_CROP)
         self.crop = crop
         self.crops = whole(f"{key}.crops", crops, 1)
         self.warmup = warmup
@@ -138,7 +138,10 @@ class Perceptual(nn.Module):
 
 
 def crop_person(
-    images: Sequence[Tensor], mask: Tensor, draws: Tensor, size: int
+    images: Sequence[Tensor],
+    mask: Tensor,
+    draws: Tensor,
+    size: int,
 ) -> list[Tensor]:
     """Cuts the same squares around random pixels of the person out of several images.
 
@@ -173,9 +176,11 @@ def crop_person(
 
     # One gather per image: [B, N, rows, columns, C].
     batch = torch.arange(len(mask), device=mask.device)[:, None, None, None]
+    y = y[..., :, None]
+    x = x[..., None, :]
     cut = []
     for image in images:
-        squares = image.movedim(1, -1)[batch, y[..., :, None], x[..., None, :]]
+        squares = image.movedim(1, -1)[batch, y, x]
         cut.append(squares.flatten(0, 1).movedim(-1, 1))
     return cut
 

@@ -10,10 +10,10 @@ from torch import Tensor
 from gsgan.splat import build, native
 from gsgan.utils.tensors import full_precision
 
-# pixels, of the Gaussian; shorter sides cannot be reflected
+# Pixels, of the Gaussian window; shorter sides cannot be reflected.
 HALF_WINDOW = 5
-# pixels
-SIGMA = 1.5
+# Pixels.
+WINDOW_SIGMA = 1.5
 
 
 def d_ssim(image: Tensor, target: Tensor) -> Tensor:
@@ -25,7 +25,10 @@ def d_ssim(image: Tensor, target: Tensor) -> Tensor:
 
 
 def d_ssim_map(
-    image: Tensor, target: Tensor, *, k: tuple[float, float] = (0.01, 0.03)
+    image: Tensor,
+    target: Tensor,
+    *,
+    k: tuple[float, float] = (0.01, 0.03),
 ) -> Tensor:
     """1 - SSIM at every pixel, accurate in float32 for flat and nearly equal images too.
 
@@ -63,9 +66,14 @@ def d_ssim_map(
         d = difference - shift
 
         # Local means of x, d, x² + y² and d² in one convolution.
-        moments = torch.cat([x, d, x.square() + y.square(), d.square()], dim=1)
+        squares = x.square() + y.square()
+        moments = torch.cat([x, d, squares, d.square()], dim=1)
+        window = 2 * HALF_WINDOW + 1
         kernel = get_gaussian_kernel1d(
-            2 * HALF_WINDOW + 1, SIGMA, device=x.device, dtype=wide
+            window,
+            WINDOW_SIGMA,
+            device=x.device,
+            dtype=wide,
         )
         local = filter2d_separable(moments, kernel, kernel)
         mean_x, mean_d, power, power_d = local.chunk(4, dim=1)
@@ -132,10 +140,11 @@ def _compiled(image: Tensor, target: Tensor) -> bool:
 
 
 # struct PhotometricJob of splat/kernels/photometric.h
+_TENSORS = ("image", "target", "d_image", "totals")
 _Job = build.job_type(
-    ("planes", "H", "W", "threads"),
-    ("l1", "l2", "ssim"),
-    ("image", "target", "d_image", "totals"),
+    integers=("planes", "H", "W", "threads"),
+    numbers=("l1", "l2", "ssim"),
+    addresses=_TENSORS,
 )
 
 
@@ -145,7 +154,12 @@ class _Photometric(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, image: Tensor, target: Tensor, l1: float, l2: float, ssim: float
+        ctx: Any,
+        image: Tensor,
+        target: Tensor,
+        l1: float,
+        l2: float,
+        ssim: float,
     ) -> Tensor:
         # The kernel reads planes of pixels; it writes each plane's loss and the gradient.
         image = image.detach().contiguous()
@@ -156,11 +170,7 @@ class _Photometric(torch.autograd.Function):
 
         height, width = image.shape[-2:]
         job = _Job(planes, height, width, build.threads(), l1, l2, ssim)
-        build.point(
-            job,
-            ("image", "target", "d_image", "totals"),
-            [image, target, gradient, totals],
-        )
+        build.point(job, _TENSORS, [image, target, gradient, totals])
         if build.function("photometric", image.dtype)(ctypes.byref(job)):
             raise MemoryError("photometric: out of memory")
 

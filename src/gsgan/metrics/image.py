@@ -17,13 +17,13 @@ from gsgan.utils.arrays import Bool
 from gsgan.utils.images import to_bytes
 
 Score = Callable[[Tensor, Tensor], Tensor]
-# K1 and K2 of Wang et al. 2004
+# K1 and K2 of Wang et al. 2004.
 SSIM_CONSTANTS = (0.01, 0.03)
-# pixels: smaller images cannot be reflected by half of SSIM's window
-LEAST_SIDE = 6
-# pixels on each side of the mask's outline
-OUTLINE = 2
-# pixels, scikit-image's default
+# Pixels: smaller images cannot be reflected by half of SSIM's window.
+MIN_SIDE = 6
+# Pixels on each side of the mask's outline.
+OUTLINE_WIDTH = 2
+# Pixels, scikit-image's default.
 UNIFORM_WINDOW = 7
 
 
@@ -42,7 +42,10 @@ def psnr(image: Tensor, target: Tensor, pooling: str = "image") -> Tensor:
 
 
 def psnr_where(
-    image: Tensor, target: Tensor, where: Tensor, pooling: str = "image"
+    image: Tensor,
+    target: Tensor,
+    where: Tensor,
+    pooling: str = "image",
 ) -> Tensor:
     """PSNR of the pixels ``where [B, 1, H, W]`` in dB; NaN without any."""
     scores = []
@@ -68,7 +71,10 @@ def person_box(mask: Tensor) -> Tensor:
 
 
 def flicker(
-    image: Tensor, target: Tensor, mask: Tensor, before: tuple[Tensor, Tensor, Tensor]
+    image: Tensor,
+    target: Tensor,
+    mask: Tensor,
+    before: tuple[Tensor, Tensor, Tensor],
 ) -> Tensor:
     """Mean |Δt image - Δt target| from the frame before to this one, in the box around the person
     in both; NaN if both masks are empty.
@@ -86,13 +92,15 @@ def flicker(
 
 
 def psnr_inside(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
-    """PSNR in the person's box without the pixels within `OUTLINE` of the mask's outline, whose
-    error is due to the mask if masks are uneven; NaN if the mask is empty."""
+    """PSNR in the person's box without the pixels within `OUTLINE_WIDTH` of the mask's outline.
+
+    Their error is due to the mask if masks are uneven. The score is NaN if the mask is empty.
+    """
     # The maximum filter dilates the mask; the minimum filter erodes it.
     person = (mask >= 0.5).to(mask)
-    side = 2 * OUTLINE + 1
-    dilated = functional.max_pool2d(person, side, 1, OUTLINE)
-    eroded = -functional.max_pool2d(-person, side, 1, OUTLINE)
+    side = 2 * OUTLINE_WIDTH + 1
+    dilated = functional.max_pool2d(person, side, 1, OUTLINE_WIDTH)
+    eroded = -functional.max_pool2d(-person, side, 1, OUTLINE_WIDTH)
     return psnr_where(image, target, person_box(mask) & (dilated == eroded))
 
 
@@ -103,7 +111,8 @@ def ssim_where(image: Tensor, target: Tensor, *regions: Tensor) -> list[Tensor]:
     means = []
     for region in regions:
         total = (similar * region).flatten(1).sum(dim=1)
-        means.append(total / region.flatten(1).sum(dim=1))
+        count = region.flatten(1).sum(dim=1)
+        means.append(total / count)
     return means
 
 
@@ -113,10 +122,10 @@ def ssim(image: Tensor, target: Tensor, *, value_range: float = 1.0) -> Tensor:
     The arithmetic differs: in float32 torchmetrics gives two equal grey images 0.9991.
 
     Args:
-        image, target: images; the score is NaN if a side is shorter than `LEAST_SIDE`.
+        image, target: images; the score is NaN if a side is shorter than `MIN_SIDE`.
         value_range: of the values; 1 is correct for [0, 1].
     """
-    if min(image.shape[-2:]) < LEAST_SIDE:
+    if min(image.shape[-2:]) < MIN_SIDE:
         return image.new_full((len(image),), torch.nan)
     k1, k2 = SSIM_CONSTANTS
     k = (k1 * value_range, k2 * value_range)
@@ -138,7 +147,8 @@ def ssim_uniform(image: Tensor, target: Tensor, *, value_range: float = 1.0) -> 
     # Means over each window of x, y, x², y² and x y.
     x = image.double()
     y = target.double()
-    moments = torch.cat([x, y, x * x, y * y, x * y], dim=1)
+    squares = [x, y, x * x, y * y, x * y]
+    moments = torch.cat(squares, dim=1)
     local = functional.avg_pool2d(moments, window, 1)
     mean_x, mean_y, xx, yy, xy = local.chunk(5, dim=1)
 
@@ -174,8 +184,9 @@ def high_frequencies(image: Tensor, target: Tensor, *, above: float = 0.25) -> T
     high = (rows.square() + columns.square()).sqrt() > above
 
     def energy(x: Tensor) -> Tensor:
-        spectrum = torch.fft.rfft2(x.double().mean(dim=1))
-        return (spectrum.abs().square() * high).sum(dim=(-2, -1))
+        grey = x.double().mean(dim=1)
+        power = torch.fft.rfft2(grey).abs().square()
+        return (power * high).sum(dim=(-2, -1))
 
     # Energy is the sum of squared magnitudes at high frequencies.
     truth = energy(target)
@@ -209,7 +220,8 @@ def edge_scores(
         Two float64 ``[B]``; NaN if the ground truth has no edge.
     """
     scores = []
-    kernel = np.ones((2 * tolerance + 1, 2 * tolerance + 1), np.uint8)
+    side = 2 * tolerance + 1
+    kernel = np.ones((side, side), np.uint8)
     for i, (own, true) in enumerate(zip(image, target, strict=True)):
         edges = _canny(own, low, high)
         truth = _canny(true, low, high)
@@ -217,6 +229,8 @@ def edge_scores(
         # Pixels within the tolerance of an edge.
         near_edges = cv2.dilate(edges.astype(np.uint8), kernel) > 0
         near_truth = cv2.dilate(truth.astype(np.uint8), kernel) > 0
+
+        # Edges elsewhere do not count, but may confirm edges that do.
         if where is not None:
             inside = where[i, 0].cpu().numpy()
             edges = edges & inside
@@ -231,8 +245,10 @@ def edge_scores(
         # F1 is the harmonic mean of precision and recall.
         precision = (edges & near_truth).sum() / max(count, 1)
         recall = (truth & near_edges).sum() / expected
+        f1 = 0.0
         total = precision + recall
-        f1 = 2 * precision * recall / total if total else 0.0
+        if total:
+            f1 = 2 * precision * recall / total
         scores.append((f1, count / expected))
     f1s, ratios = torch.tensor(scores, dtype=torch.float64).unbind(1)
     return f1s, ratios

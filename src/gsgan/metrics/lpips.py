@@ -13,7 +13,7 @@ from gsgan.utils.checks import one_of
 from gsgan.weights.networks import Lpips
 
 LPIPS_NETS = ("vgg", "alex")
-# the scores of an image by metric
+# The scores of an image by metric.
 LpipsScores = Callable[[Tensor], dict[str, float]]
 
 
@@ -53,6 +53,7 @@ class LpipsAgainst:
         networks: Mapping[str, Lpips],
         measures: MetricVariants | None = None,
     ) -> None:
+        # Without measures, LPIPS is that of whole images in [0, 1].
         self.networks = networks
         self.measures = measures or MetricVariants()
         self.mask = mask
@@ -107,6 +108,7 @@ class LpipsAgainst:
 
     def _seen(self, image: Tensor) -> Tensor:
         """The image with the protocol's channels and range, as the networks get it."""
+        # Some published scores are of images whose channels were swapped.
         if self.measures.lpips_channels == "bgr":
             image = image.flip(1)
         # The network maps [0, 1] to [-1, 1]; an unscaled range reverses that.

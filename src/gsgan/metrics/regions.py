@@ -4,8 +4,6 @@ Images are ``[B, 3, H, W]`` RGB in [0, 1], masks ``[B, 1, H, W]``; a background 
 for black or 1 for white.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 import cv2
@@ -23,21 +21,21 @@ from gsgan.utils.arrays import Bool, Float
 from gsgan.utils.tensors import constant
 
 BACKGROUNDS = {"black": 0.0, "white": 1.0}
-# of 1/255: values that are 8-bit already must not drop by one
+# Of 1/255: values that are 8-bit already must not drop by one.
 CUT_SLACK = 1e-3
-# metres; nearer parts of the body's box are cut off
-NEAR = 1e-2
-# of a box's corners
-PAIRS = torch.combinations(torch.arange(8))
+# Metres; nearer parts of the body's box are cut off.
+MIN_BOX_DEPTH = 1e-2
+# Indices of any two corners of a box.
+CORNER_PAIRS = torch.combinations(torch.arange(8))
 HANDS = "hands"
 MOUTH = "mouth"
 # On every side, relative to the longer side of the box around the projected landmarks.
 HAND_MARGIN = 0.15
 LIP_MARGIN = 0.25
-# of the mouth's box without lip landmarks, relative to the mouth's width
+# Side of the mouth's box without lip landmarks, relative to the mouth's width.
 MOUTH_SIDE = 1.5
-# pixels: SSIM's window
-LEAST_BOX = 11
+# Minimum side of a box in pixels: SSIM's window.
+MIN_BOX = 11
 
 
 def on_background(image: Tensor, alpha: Tensor, background: float) -> Tensor:
@@ -56,8 +54,9 @@ def eight_bits(image: Tensor, how: Literal["none", "rounded", "cut"]) -> Tensor:
     if how == "none":
         return image
     steps = image.clamp(0, 1) * 255
-    whole = steps.round() if how == "rounded" else (steps + CUT_SLACK).floor()
-    return whole / 255
+    if how == "rounded":
+        return steps.round() / 255
+    return (steps + CUT_SLACK).floor() / 255
 
 
 def cleared(image: Tensor, keep: Tensor, background: float) -> Tensor:
@@ -66,10 +65,10 @@ def cleared(image: Tensor, keep: Tensor, background: float) -> Tensor:
 
 
 def rectangle(where: Tensor, least: int = 1) -> tuple[slice, slice] | None:
-    """Rows and columns of the smallest rectangle around ``where [1, H, W]``; None if it is empty.
+    """Rows and columns of the smallest rectangle around a mask; None if it is empty.
 
     Args:
-        where: bool.
+        where: ``[1, H, W]`` bool.
         least: minimum side in pixels, limited by the image.
     """
     sides = []
@@ -83,14 +82,20 @@ def rectangle(where: Tensor, least: int = 1) -> tuple[slice, slice] | None:
 
         # Extended equally to both sides, but not beyond the image.
         side = min(max(extent, least), size)
-        start = min(max(first - (side - extent) // 2, 0), size - side)
+        centred = first - (side - extent) // 2
+        start = min(max(centred, 0), size - side)
         sides.append(slice(start, start + side))
     rows, columns = sides
     return rows, columns
 
 
 def mask_crop(
-    image: Tensor, mask: Tensor, background: float, *, margin: int = 50, size: int = 512
+    image: Tensor,
+    mask: Tensor,
+    background: float,
+    *,
+    margin: int = 50,
+    size: int = 512,
 ) -> Tensor | None:
     """The mask's box and a margin, centred in a square of the background, resized.
 
@@ -114,7 +119,9 @@ def mask_crop(
     rows, columns = box
     top = max(rows.start - margin, 0)
     left = max(columns.start - margin, 0)
-    part = image[:, top : rows.stop - 1 + margin, left : columns.stop - 1 + margin]
+    bottom = rows.stop - 1 + margin
+    right = columns.stop - 1 + margin
+    part = image[:, top:bottom, left:right]
 
     # The square around it.
     height, width = part.shape[-2:]
@@ -124,9 +131,13 @@ def mask_crop(
     border = (before, side - width - before, above, side - height - above)
     square = functional.pad(part, border, value=background)[None]
 
+    # A square of the right size is not resampled.
     if side != size:
         square = functional.interpolate(
-            square, (size, size), mode="bilinear", align_corners=False
+            square,
+            (size, size),
+            mode="bilinear",
+            align_corners=False,
         )
     return square[0]
 
@@ -146,8 +157,8 @@ def box_corners(points: Tensor, margin: float) -> Tensor:
 def box_mask(corners: Tensor, camera: Camera) -> Tensor:
     """The pixels whose centre lies in the convex hull of the projected corners.
 
-    The box is clipped at `NEAR`, so it may reach behind the camera. With a lens, each pixel is
-    tested at its undistorted position.
+    The box is clipped at `MIN_BOX_DEPTH`, so it may reach behind the camera. With a lens, each
+    pixel is tested at its undistorted position.
 
     Args:
         corners: ``[8, 3]`` metres, world.
@@ -156,19 +167,22 @@ def box_mask(corners: Tensor, camera: Camera) -> Tensor:
     Returns:
         ``[1, H, W]`` bool; all false if the box is behind the camera.
     """
-    seen = in_front(camera.to_camera(corners.to(camera.K)[None])[0].double())
+    x_cam = camera.to_camera(corners.to(camera.K)[None])[0]
+    seen = in_front(x_cam.double())
     if len(seen) == 0:
         return torch.zeros(1, *camera.size, dtype=torch.bool, device=corners.device)
 
     # The outline of the box, without the lens.
     K = camera.K[0].double()
     pixels = (seen / seen[:, 2:]) @ K.T
-    hull = cv2.convexHull(pixels[:, :2].float().cpu().numpy())[:, 0]  # [n, 2]
+    projected = pixels[:, :2].float().cpu().numpy()
+    hull = cv2.convexHull(projected)[:, 0]  # [n, 2]
 
     # The centre of each pixel, moved to where a pinhole shows it.
     height, width = camera.size
-    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    shown = np.stack([u, v], axis=-1)  # [H, W, 2]
+    columns = np.arange(width) + 0.5
+    rows = np.arange(height) + 0.5
+    shown = np.stack(np.meshgrid(columns, rows), axis=-1)  # [H, W, 2]
     if camera.dist is not None:
         focal = K[:2, :2].cpu().numpy()
         centre = K[:2, 2].cpu().numpy()
@@ -187,16 +201,17 @@ def in_front(x_cam: Tensor) -> Tensor:
     Clipping keeps the corners beyond the plane, and adds the points in which lines between two
     corners cross it. Lines inside the box do no harm.
     """
-    a = x_cam[PAIRS[:, 0]]
-    b = x_cam[PAIRS[:, 1]]
-    crosses = (a[:, 2] > NEAR) != (b[:, 2] > NEAR)
-    a = a[crosses]
-    b = b[crosses]
+    # The pairs of which one corner is beyond the plane.
+    beyond = x_cam[:, 2] > MIN_BOX_DEPTH
+    first, second = CORNER_PAIRS.unbind(1)
+    crosses = beyond[first] != beyond[second]
+    a = x_cam[first[crosses]]
+    b = x_cam[second[crosses]]
 
-    # a + share (b - a) has the depth NEAR.
-    share = (NEAR - a[:, 2:]) / (b[:, 2:] - a[:, 2:])
-    beyond = x_cam[x_cam[:, 2] > NEAR]
-    return torch.cat([beyond, a + share * (b - a)])
+    # a + share (b - a) has the depth MIN_BOX_DEPTH.
+    depth = a[:, 2:]
+    share = (MIN_BOX_DEPTH - depth) / (b[:, 2:] - depth)
+    return torch.cat([x_cam[beyond], a + share * (b - a)])
 
 
 def inside_hull(hull: Float, points: Float) -> Bool:
@@ -208,10 +223,12 @@ def inside_hull(hull: Float, points: Float) -> Bool:
     # The cross product of each edge with the vector to the point: all have one sign inside.
     sides = []
     for a, b in zip(hull, np.roll(hull, -1, axis=0), strict=True):
-        edge = b - a
-        sides.append(edge[0] * (y - a[1]) - edge[1] * (x - a[0]))
+        along_x, along_y = b - a
+        sides.append(along_x * (y - a[1]) - along_y * (x - a[0]))
     side = np.stack(sides)
-    return np.asarray((side >= 0).all(0) | (side <= 0).all(0))
+    left = (side >= 0).all(0)
+    right = (side <= 0).all(0)
+    return np.asarray(left | right)
 
 
 # -- boxes of hands and mouth
@@ -220,7 +237,7 @@ def inside_hull(hull: Float, points: Float) -> Bool:
 def hands_and_mouth(frame: Frame, template: SkeletonTemplate) -> dict[str, Tensor]:
     """The pixels in the boxes of both hands, `HANDS`, and of the mouth, `MOUTH`.
 
-    A box surrounds the projected landmarks with a margin, is at least `LEAST_BOX` pixels wide and
+    A box surrounds the projected landmarks with a margin, is at least `MIN_BOX` pixels wide and
     high, and clipped to the image. Landmarks of visibility 0 or behind the camera do not count. A
     hand or mouth without a landmark in the image has no box, nor has the mouth of a head that faces
     away from the camera; a hand hidden by the body has one.
@@ -235,16 +252,15 @@ def hands_and_mouth(frame: Frame, template: SkeletonTemplate) -> dict[str, Tenso
     if not template.palms:
         return {}
     camera = frame.camera
-    pixels, depth = camera.project(frame.skeleton, NEAR)
-    seen = (frame.visibility > 0) & (depth > NEAR)
+    pixels, depth = camera.project(frame.skeleton, MIN_BOX_DEPTH)
+    seen = (frame.visibility > 0) & (depth > MIN_BOX_DEPTH)
 
     # Each hand's landmarks follow its wrist.
     hands = []
     for wrist, *_ in template.palms:
         own = slice(wrist, wrist + HAND)
-        hands.append(
-            landmark_box(pixels[:, own], seen[:, own], camera.size, HAND_MARGIN)
-        )
+        box = landmark_box(pixels[:, own], seen[:, own], camera.size, HAND_MARGIN)
+        hands.append(box)
 
     # The mouth, of the lips if there are any, else a square.
     corners = [template.names.index(f"mouth_{side}") for side in ("left", "right")]
@@ -253,7 +269,8 @@ def hands_and_mouth(frame: Frame, template: SkeletonTemplate) -> dict[str, Tenso
         mouth = landmark_box(pixels[:, lips], seen[:, lips], camera.size, LIP_MARGIN)
     else:
         around = mouth_square(frame.skeleton[:, corners], camera)
-        known = seen[:, corners].all(dim=1, keepdim=True).expand(-1, around.shape[1])
+        known = seen[:, corners].all(dim=1, keepdim=True)
+        known = known.expand(-1, around.shape[1])
         mouth = landmark_box(around, known, camera.size, 0.0)
 
     # A face turned to the camera has its mouth nearer than its ears.
@@ -278,7 +295,7 @@ def describe_boxes(skeleton: str) -> str | None:
         mouth = f"lips, margin {LIP_MARGIN:.0%} of the longer side"
     return (
         f"skeleton {skeleton}; hands: {HAND} landmarks each, margin {HAND_MARGIN:.0%} of the "
-        f"longer side; mouth: {mouth}; at least {LEAST_BOX} pixels"
+        f"longer side; mouth: {mouth}; at least {MIN_BOX} pixels"
     )
 
 
@@ -301,12 +318,15 @@ def mouth_square(corners: Tensor, camera: Camera) -> Tensor:
     half = MOUTH_SIDE / 2 * width * camera.R[:, :2]
     middle = corners.mean(dim=1, keepdim=True)
     ends = torch.cat([middle - half, middle + half], dim=1)
-    pixels, _ = camera.project(ends, NEAR)
+    pixels, _ = camera.project(ends, MIN_BOX_DEPTH)
     return pixels
 
 
 def landmark_box(
-    pixels: Tensor, seen: Tensor, size: tuple[int, int], margin: float
+    pixels: Tensor,
+    seen: Tensor,
+    size: tuple[int, int],
+    margin: float,
 ) -> Tensor:
     """The pixels whose centre is in the box around landmarks.
 
@@ -325,17 +345,20 @@ def landmark_box(
     shown = (seen & inside).any(dim=1)
 
     # The box around the landmarks that were seen, then its margin.
-    low = torch.where(seen.unsqueeze(-1), pixels, torch.inf).amin(dim=1)
-    high = torch.where(seen.unsqueeze(-1), pixels, -torch.inf).amax(dim=1)
+    seen = seen.unsqueeze(-1)
+    low = torch.where(seen, pixels, torch.inf).amin(dim=1)
+    high = torch.where(seen, pixels, -torch.inf).amax(dim=1)
     extent = high - low
     middle = (low + high) / 2
     half = extent / 2 + margin * extent.amax(dim=1, keepdim=True)
-    half = half.clamp_min(LEAST_BOX / 2)
+    half = half.clamp_min(MIN_BOX / 2)
 
     # Columns and rows whose centres lie in it.
     x = torch.arange(width, device=pixels.device) + 0.5
     y = torch.arange(height, device=pixels.device) + 0.5
-    columns = (x - middle[:, 0, None]).abs() <= half[:, 0, None]
-    rows = (y - middle[:, 1, None]).abs() <= half[:, 1, None]
-    box = rows.unsqueeze(-1) & columns.unsqueeze(-2) & shown[:, None, None]
-    return box.unsqueeze(1)
+    middle_x, middle_y = middle.unsqueeze(-1).unbind(1)
+    half_width, half_height = half.unsqueeze(-1).unbind(1)
+    columns = (x - middle_x).abs() <= half_width
+    rows = (y - middle_y).abs() <= half_height
+    box = rows.unsqueeze(-1) & columns.unsqueeze(-2)
+    return (box & shown[:, None, None]).unsqueeze(1)

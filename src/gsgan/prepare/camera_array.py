@@ -16,12 +16,14 @@ from gsgan.data.joints import known
 from gsgan.utils.arrays import Bool, Float, Ints
 
 MIN_VIEWS = 2
-FOCAL = 1000.0  # pixels; errors are then thousandths of the focal length
-STEPS = 30  # of the optimiser
-SCALE = 5.0  # error at which a detection counts half, thousandths of the focal length
-SETTLED = 1e-7  # relative change of the cost at which the refinement ends
-# square pixels: keeps the residual's scaling finite at an error of 0
-LEAST_SQUARE = 1e-12
+UNIT_FOCAL = 1000.0  # pixels; errors are then thousandths of the focal length
+MAX_EVALUATIONS = 30  # of the optimiser
+LOSS_SCALE = (
+    5.0  # error at which a detection counts half, thousandths of the focal length
+)
+COST_TOLERANCE = 1e-7  # relative change of the cost at which the refinement ends
+# Square pixels: keeps the residual's scaling finite at an error of 0.
+MIN_SQUARE = 1e-12
 
 
 @dataclass(frozen=True)
@@ -55,12 +57,15 @@ class CameraArray:
         return (self.K[:, 0, 0] + self.K[:, 1, 1]) / 2
 
     def normalised(self, uv: Float) -> tuple[CameraArray, Float]:
-        """The cameras with focal lengths of `FOCAL` pixels, and pixels ``uv [C, ..., 2]`` to match.
+        """The cameras with focal lengths of `UNIT_FOCAL` pixels, and matching pixels.
+
+        Args:
+            uv: ``[C, ..., 2]`` pixels of these cameras.
 
         Thresholds in such pixels hold for images of any size, and cameras of different sizes count
         alike.
         """
-        ratio = FOCAL / self.focal
+        ratio = UNIT_FOCAL / self.focal
         K = self.K.copy()
         K[:, :2] *= ratio[:, None, None]
         scale = np.expand_dims(ratio, tuple(range(1, uv.ndim)))
@@ -81,9 +86,12 @@ class CameraArray:
 
         Points nearer than `NEAR` get finite, meaningless pixels: mask them by depth. NaN stays NaN.
         """
+        # u = K x / z, with x = R p + t
         x = np.einsum("cij,nj->cni", self.R, p) + self.t[:, None]
-        uvw = np.einsum("cij,cnj->cni", self.K, x / np.maximum(x[..., 2:], NEAR))
-        return uvw[..., :2], x[..., 2]
+        depth = x[..., 2:]
+        rays = x / np.maximum(depth, NEAR)
+        uvw = np.einsum("cij,cnj->cni", self.K, rays)
+        return uvw[..., :2], depth[..., 0]
 
     def errors(self, p: Float, uv: Float) -> Float:
         """Reprojection errors ``[C, N]`` of ``p [N, 3]`` metres against pixels ``uv [C, N, 2]``.
@@ -101,7 +109,9 @@ def undistort_points(camera: CameraEntry, px: Float) -> Float:
     seen = known(px)
     if not camera.distorted or not seen.any():
         return np.asarray(px, np.float64)
-    rays = np.c_[px[seen], np.ones(seen.sum())] @ np.linalg.inv(camera.K).T
+    # Rays at a depth of 1, where the lens has its distortion.
+    homogeneous = np.c_[px[seen], np.ones(seen.sum())]
+    rays = homogeneous @ np.linalg.inv(camera.K).T
     straight = undistort(rays[:, :2], camera.dist)
     result = np.full(px.shape, np.nan)
     result[seen] = straight @ camera.K[:2, :2].T + camera.K[:2, 2]
@@ -135,22 +145,24 @@ def refine_cameras(
         rotation_prior: standard deviation of the orientations of ``given``, degrees.
         position_prior: standard deviation of its positions, metres.
     """
-    # the points that are used, and their detections one by one
+    # The points that are used.
     weight = np.where(known(uv), weight, 0.0)
     use = known(p) & ((weight > 0).sum(0) >= MIN_VIEWS)
     p = p[use]
     uv = uv[:, use]
     weight = weight[:, use]
+
+    # Their detections one by one, with the camera and the point of each.
     camera, point = np.nonzero(weight)
     uv = uv[camera, point]
     weight = weight[camera, point]
-    square = SCALE**2
+    square = LOSS_SCALE**2
     poses = 6 * len(start)
 
     def cameras_at(x: Float) -> CameraArray:
-        turn, move = np.moveaxis(x[:poses].reshape(-1, 2, 3), 1, 0)
-        R = Rotation.from_rotvec(turn).as_matrix() @ start.R
-        return replace(start, R=R, t=start.t + move)
+        changes = x[:poses].reshape(-1, 2, 3)
+        R = Rotation.from_rotvec(changes[:, 0]).as_matrix() @ start.R
+        return replace(start, R=R, t=start.t + changes[:, 1])
 
     def priors(cameras: CameraArray) -> Float:
         turned = _turns(given, cameras) / np.radians(rotation_prior)
@@ -162,22 +174,24 @@ def refine_cameras(
         projected, _ = cameras.project(p + x[poses:].reshape(-1, 3))
         r = projected[camera, point] - uv
 
-        # scaled so that its square is Cauchy's loss
-        error = (r**2).sum(1) + LEAST_SQUARE
-        r *= np.sqrt(weight * square * np.log1p(error / square) / error)[:, None]
+        # Residuals are scaled so that their squares are Cauchy's loss.
+        error = (r**2).sum(1) + MIN_SQUARE
+        scale = np.sqrt(weight * square * np.log1p(error / square) / error)
+        r *= scale[:, None]
         return np.concatenate([r.ravel(), priors(cameras)])
 
+    # Few of the parameters act on each residual.
     found = least_squares(
         residuals,
         np.zeros(poses + p.size),
         jac_sparsity=_sparsity(camera, point, len(start), len(p)),
         x_scale="jac",
-        ftol=SETTLED,
-        max_nfev=STEPS,
+        ftol=COST_TOLERANCE,
+        max_nfev=MAX_EVALUATIONS,
     )
 
     # A similarity of the whole world does not change the projections, so that the search hardly
-    # moves along it: the priors decide it.
+    # moves along it. The priors alone determine it.
     cameras = cameras_at(found.x)
 
     def world_priors(x: Float) -> Float:
@@ -196,18 +210,24 @@ def _similar(cameras: CameraArray, x: Float) -> CameraArray:
 
 
 def _sparsity(
-    camera: Ints, point: Ints, cameras: int, points: int
+    camera: Ints,
+    point: Ints,
+    cameras: int,
+    points: int,
 ) -> sparse.csr_matrix:
     """The parameters that each residual depends on: its camera's 6 and its point's 3."""
+    # Two rows per detection: u and v.
     at_camera = 6 * camera[:, None] + np.arange(6)
     at_point = 6 * cameras + 3 * point[:, None] + np.arange(3)
-    columns = np.c_[at_camera, at_point].repeat(2, axis=0)  # u and v
+    columns = np.c_[at_camera, at_point].repeat(2, axis=0)
     rows = np.arange(len(columns)).repeat(9)
     parameters = 6 * cameras + 3 * points
     detections = sparse.coo_matrix(
         (np.ones(columns.size), (rows, columns.ravel())),
         shape=(len(columns), parameters),
     )
+
+    # Six rows per camera: its priors.
     priors = sparse.kron(np.eye(cameras), np.ones((6, 6)), format="coo")
     priors.resize(6 * cameras, parameters)
     return sparse.vstack([detections, priors]).tocsr()

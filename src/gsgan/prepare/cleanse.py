@@ -8,8 +8,8 @@ from gsgan.skeleton.hands import FINGER_BONES, HAND
 from gsgan.utils.arrays import Bool, Float, nanmedian
 
 Bones = tuple[tuple[int, int], ...]
-# Bones of constant length, as (inner, outer) joint: the outer one is removed when it differs.
-BODY_BONES = (
+# Bones of constant length, as (inner, outer) joint: the outer one is removed if it differs.
+CHECKED_BONES = (
     (11, 13),
     (13, 15),
     (12, 14),
@@ -21,17 +21,19 @@ BODY_BONES = (
 )
 HAND_ROOTS = [BODY, BODY + HAND]
 HAND_BONES = tuple((start, start + knuckle) for start in HAND_ROOTS for knuckle in PALM)
-FINGERS = tuple((start + a, start + b) for start in HAND_ROOTS for a, b in FINGER_BONES)
+FINGERS_OF_BOTH = tuple(
+    (start + a, start + b) for start in HAND_ROOTS for a, b in FINGER_BONES
+)
 FINGER_NOISE = 0.02  # metres by which noise alone changes the length of a finger's bone
 MAX_REACH = 1.5  # metres from the median joint of the frame
-# maximum difference of a length from its median, as a share of it
+# Maximum difference of a length from its median, as a share of it.
 BONE = 0.3
 HAND_BONE = 0.3
 FINGER_BONE = 0.5
-WRIST = 0.1  # maximum distance from the pose's wrist to the hand's, metres
+MAX_WRIST_GAP = 0.1  # maximum distance from the pose's wrist to the hand's, metres
 FACE_RADIUS = 0.15  # maximum distance from the middle of the face, metres
 DEGREE = 2  # of the polynomial that smooths
-REACH = 3  # standard deviations at which the smoothing kernel ends
+KERNEL_END = 3  # standard deviations at which the smoothing kernel ends
 
 
 def cleanse(p: Float) -> tuple[Float, dict[str, int]]:
@@ -45,23 +47,28 @@ def cleanse(p: Float) -> tuple[Float, dict[str, int]]:
     seen = known(p)
     has_hands = p.shape[1] == ALL
 
-    # too far from the body, the wrist or the middle of the face
+    # Joints too far from the body, the wrist or the middle of the face.
     far = _distance_from_median(p) > MAX_REACH
     if has_hands:
         gap = np.linalg.norm(p[:, HAND_ROOTS] - p[:, WRISTS], axis=-1)
-        far[:, HANDS] |= (gap > WRIST).repeat(HAND, axis=1)
+        far[:, HANDS] |= (gap > MAX_WRIST_GAP).repeat(HAND, axis=1)
         far[:, FACE] |= _distance_from_median(p[:, FACE]) > FACE_RADIUS
     far &= seen
     p[far] = np.nan
 
-    # bones of the wrong length
-    wrong = np.zeros(far.shape, bool)
-    _mark_ends(wrong, BODY_BONES, _misfit(p, BODY_BONES, BONE))
+    # Joints at the end of bones of the wrong length.
+    wrong = np.zeros_like(far)
+    _mark_ends(wrong, CHECKED_BONES, _misfit(p, CHECKED_BONES, BONE))
     if has_hands:
-        palms = _misfit(p, HAND_BONES, HAND_BONE).reshape(len(p), 2, len(PALM))
+        palms = _misfit(p, HAND_BONES, HAND_BONE)
+        palms = palms.reshape(len(p), 2, len(PALM))
         most = palms.sum(-1) * 2 > len(PALM)
         wrong[:, HANDS] |= most.repeat(HAND, axis=1)
-        _mark_ends(wrong, FINGERS, _misfit(p, FINGERS, FINGER_BONE, FINGER_NOISE))
+        _mark_ends(
+            wrong,
+            FINGERS_OF_BOTH,
+            _misfit(p, FINGERS_OF_BOTH, FINGER_BONE, FINGER_NOISE),
+        )
     wrong &= known(p)
     p[wrong] = np.nan
     return p, {"too far away": int(far.sum()), "bone length": int(wrong.sum())}
@@ -69,7 +76,8 @@ def cleanse(p: Float) -> tuple[Float, dict[str, int]]:
 
 def _distance_from_median(p: Float) -> Float:
     """Distances ``[F, J]`` of points ``[F, J, 3]`` from their median point in each frame."""
-    return np.asarray(np.linalg.norm(p - nanmedian(p, 1)[:, None], axis=-1))
+    middle = nanmedian(p, 1)[:, None]
+    return np.linalg.norm(p - middle, axis=-1)
 
 
 def _mark_ends(mask: Bool, bones: Bones, wrong: Bool) -> None:
@@ -87,15 +95,17 @@ def _misfit(p: Float, bones: Bones, share: float, noise: float = 0.0) -> Bool:
         share: of the median by which a length may differ.
         noise: metres by which it may differ too.
     """
-    # the median length of each bone; 1 if it is never known
+    # The median length of each bone; 1 if it is never known.
     lengths = bone_lengths(p, bones)
     usual = np.ones(len(bones))
     for b, values in enumerate(lengths.T):
         finite = values[np.isfinite(values)]
         if len(finite):
             usual[b] = max(np.median(finite), 1e-9)
+
+    # A length must be off by a share and by more than the noise.
     change = np.abs(lengths - usual)
-    return np.asarray((change > share * usual) & (change > noise))
+    return (change > share * usual) & (change > noise)
 
 
 def smooth(p: Float, weight: Float, time: Float, seconds: float) -> Float:
@@ -112,6 +122,7 @@ def smooth(p: Float, weight: Float, time: Float, seconds: float) -> Float:
         time: ``[F]`` seconds, increasing; steps may be uneven.
         seconds: standard deviation of the Gaussian neighbourhood.
     """
+    # Points that are not used are 0 in the sums and NaN in the result.
     usable = known(p) & (weight > 0)
     filled = np.where(usable[..., None], p, 0.0)
     weight = np.where(usable, weight, 0.0)
@@ -119,13 +130,15 @@ def smooth(p: Float, weight: Float, time: Float, seconds: float) -> Float:
     if seconds == 0:
         return result
 
-    # normal equations of each frame's parabola, whose constant is the value at that frame
+    # Normal equations of each frame's parabola, whose constant is the value at that frame.
     for f, now in enumerate(time):
-        # a Gaussian neighbourhood, in units of its standard deviation
-        near = np.abs(time - now) <= REACH * seconds
+        # A Gaussian neighbourhood, in units of its standard deviation.
+        near = np.abs(time - now) <= KERNEL_END * seconds
         s = (time[near] - now) / seconds
         basis = s[:, None] ** np.arange(DEGREE + 1)
         w = np.exp(-0.5 * s**2)[:, None] * weight[near]
+
+        # The equations of each joint; too few frames leave it as it is.
         H = np.einsum("fj,fa,fb->jab", w, basis, basis)
         right = np.einsum("fj,fa,fjx->jax", w, basis, filled[near])
         enough = usable[f] & (usable[near].sum(0) > DEGREE)

@@ -23,7 +23,7 @@ from gsgan.utils.arrays import Float, Ints
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import write_json, write_npz, writing
 
-GENERATOR = "gsgan.prepare"
+MADE_BY = "gsgan.prepare"
 
 
 @dataclass(frozen=True)
@@ -48,6 +48,8 @@ def write_files(root: Path, outcome: Outcome, key: str) -> None:
     solution = outcome.solution
     options = outcome.options
     p = solution.p
+
+    # Cameras without a lens, which the images were corrected for.
     cameras = {}
     for camera in outcome.cameras:
         cameras[camera.name] = {
@@ -67,27 +69,31 @@ def write_files(root: Path, outcome: Outcome, key: str) -> None:
             "names": np.array(joint_names()[part]),
         }
 
-    # landmarks, with the mean error over the cameras that see them
+    # Landmarks of the body, with the mean error over the cameras that see them.
     error = solution.error[:, :, :BODY] * options.scale
     seen = np.isfinite(error)
-    mean = np.where(seen, error, 0.0).sum(0) / np.maximum(seen.sum(0), 1)
+    total = np.where(seen, error, 0.0).sum(0)
+    mean = total / np.maximum(seen.sum(0), 1)
     write_npz(
         root / "landmarks3d.npz",
         **landmarks(slice(BODY)),
         reproj_px=np.where(seen.any(0), mean, np.nan).astype(np.float32),
     )
+
+    # Hands and face, if the detections have them.
     if options.hands and p.shape[1] > BODY:
         write_npz(root / "hands3d.npz", **landmarks(HANDS))
     if options.face and p.shape[1] > BODY:
         write_npz(root / "face3d.npz", **landmarks(FACE))
 
+    # The facts that a reader needs, and the key of the settings.
     meta = {
         "fps": outcome.inputs.fps,
         "unit": "m",
         "up_axis": options.up_axis or standing_axis(p),
         "skeleton": "mediapipe33",
         "pixel_centre": 0.5,
-        "made_by": {"generator": GENERATOR, "version": gsgan.__version__, "key": key},
+        "made_by": {"generator": MADE_BY, "version": gsgan.__version__, "key": key},
     }
     write_json(root / "meta.json", meta)
 
@@ -98,9 +104,13 @@ def standing_axis(p: Float) -> str:
     It is the direction from ankles to nose and from hips to shoulders; if these are never seen,
     from shoulders to ears. NaN = missing.
     """
+    # Ankles to nose, hips to shoulders.
     ankles = (p[:, 27] + p[:, 28]) / 2
     body = np.concatenate([p[:, 0] - ankles, p[:, 11] - p[:, 23]])
-    head = p[:, [7, 8]].mean(1) - p[:, [11, 12]].mean(1)
+
+    # Shoulders to ears.
+    ears = p[:, [7, 8]].mean(1)
+    head = ears - p[:, [11, 12]].mean(1)
     for directions in (body, head):
         seen = directions[known(directions)]
         if len(seen):
@@ -116,10 +126,12 @@ def exists(out: Path, key: str, overwrite: bool) -> bool:
     """
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return False
+
+    # A damaged or foreign file has no origin.
     made_by: Any = None
     with contextlib.suppress(OSError, ValueError, AttributeError):
         made_by = json.loads((out / "meta.json").read_text()).get("made_by")
-    if not isinstance(made_by, dict) or made_by.get("generator") != GENERATOR:
+    if not isinstance(made_by, dict) or made_by.get("generator") != MADE_BY:
         raise DataError(f"{out} holds something else; choose another out")
     if made_by.get("key") != key and not overwrite:
         raise DataError(f"{out} was made with other settings; add overwrite=true")
@@ -138,6 +150,8 @@ def publish(root: Path, out: Path) -> None:
         raise DataError(
             f"nothing was made, because training could not read it: {error}"
         ) from None
+
+    # A dataset is at the place at all times but between two renames.
     old = out.with_name(f".{out.name}.old")
     with writing(out):
         if out.exists():

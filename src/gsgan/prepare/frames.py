@@ -1,7 +1,5 @@
 """Frames of one video: sampled in time, and which of them show one whole person sharply."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,31 +9,28 @@ import numpy as np
 from gsgan.data.files import read_arrays, read_grey
 from gsgan.data.joints import known
 from gsgan.data.skeletons import HUBS
-from gsgan.prepare.images import QUALITY
+from gsgan.prepare.images import JPEG_QUALITY
 from gsgan.prepare.sources import Recording, opened, video_recording
 from gsgan.utils.arrays import Bool, Bytes, Float, Ints
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import write_npz, writing
 
-RATE = 12.0  # images per second, unless that makes fewer than FEW or more than MOST
-FEW = 60
-MOST = 400
-LEAST = 12  # minimum number of usable images for a solution
-LONGEST = 1920  # maximum pixels of the longer side: larger images are reduced
-SAMPLING = [
-    RATE,
-    FEW,
-    MOST,
-    LONGEST,
-]  # the sampled images depend on these and the video
+# Images per second, unless that makes fewer than FEW_IMAGES or more than MAX_IMAGES.
+IMAGE_RATE = 12.0
+FEW_IMAGES = 60
+MAX_IMAGES = 400
+MIN_IMAGES = 12  # minimum number of usable images for a solution
+MAX_SIDE = 1920  # maximum pixels of the longer side: larger images are reduced
+# The sampled images depend on these and the video.
+SAMPLING = [IMAGE_RATE, FEW_IMAGES, MAX_IMAGES, MAX_SIDE]
 TIMES = "times.npz"  # written last
-LEAST_JOINTS = 16  # of 33: fewer are not a whole person
+MIN_JOINTS = 16  # of 33: fewer are not a whole person
 CONFIDENT = 0.5
 BLURRED = 0.3  # share of the usual sharpness
 JUMP = 0.5  # of the person's size from image to image: the detector found somebody else
 SHARP_SIZE = 256  # pixels: sharpness is measured on the person at this height
-CORNERS = 200  # maximum corners of the background, which show a moving camera
-FEW_CORNERS = 20  # minimum number of them
+MAX_CORNERS = 200  # maximum corners of the background, which show a moving camera
+MIN_CORNERS = 20  # minimum number of them
 
 LeftOut = dict[str, Bool]
 """Masks ``[F]`` of the frames that are left out, by reason."""
@@ -50,11 +45,14 @@ def sample(video: Path, folder: Path) -> tuple[Recording, Float]:
     Raises:
         DataError: when the video cannot be decoded, or the folder not be written.
     """
+    # The times are written last, so they show whether all images were.
     source = video_recording(video, rotate=True)
     if not (folder / TIMES).is_file():
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
         _extract(source, folder)
+
+    # The images as a recording.
     arrays = read_arrays(folder / TIMES, ("number", "time"))
     files = {}
     for number in arrays["number"].tolist():
@@ -73,29 +71,40 @@ def sample(video: Path, folder: Path) -> tuple[Recording, Float]:
 
 def _extract(source: Recording, folder: Path) -> None:
     """Writes evenly spaced images, then their numbers and times."""
+    # Seconds between two images, and their scale.
     rate = source.fps or 30.0
     seconds = source.count / rate
-    every = max(min(1 / RATE, seconds / FEW), seconds / MOST)
-    shrink = min(1.0, LONGEST / max(source.size))
+    every = max(min(1 / IMAGE_RATE, seconds / FEW_IMAGES), seconds / MAX_IMAGES)
+    shrink = min(1.0, MAX_SIDE / max(source.size))
+
+    # The header's length may be wrong, so the number of images is bounded.
     video = opened(source.path, True)
     number = -1
     numbers = list[int]()
     times = list[float]()
-    while video.grab() and len(times) < 2 * MOST:  # the header's length may be wrong
+    while video.grab() and len(times) < 2 * MAX_IMAGES:
         number += 1
+
+        # Without times in the file, images are evenly spaced.
         now = video.get(cv2.CAP_PROP_POS_MSEC) / 1000
-        if now <= 0:  # the file has no times
+        if now <= 0:
             now = number / rate
         if times and now < times[-1] + every * 0.99:
             continue
         done, image = video.retrieve()
         if not done:
             break
+
+        # The image is reduced and written as a JPEG.
         if shrink < 1:
             image = cv2.resize(
-                image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA
+                image,
+                None,
+                fx=shrink,
+                fy=shrink,
+                interpolation=cv2.INTER_AREA,
             )
-        options = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
+        options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
         _, encoded = cv2.imencode(".jpg", image, options)
         with writing(folder):
             (folder / f"{number:06d}.jpg").write_bytes(encoded.tobytes())
@@ -113,13 +122,14 @@ def left_out(px: Float, conf: Float, sharp: Float) -> LeftOut:
         conf: ``[F, 33]``.
         sharp: ``[F]`` of `look`.
     """
-    few = (conf > CONFIDENT).sum(1) < LEAST_JOINTS
+    # Not enough of a person, or without a shoulder or hip.
+    few = (conf > CONFIDENT).sum(1) < MIN_JOINTS
     cut_off = (conf[:, HUBS] <= 0).any(1)
 
     # Somebody else: the trunk is too far from its place in the last frame of the person.
     middle = px[:, HUBS].mean(1)
     size = extents(px)
-    good = np.asarray(~(few | cut_off))
+    good = ~(few | cut_off)
     same = good.copy()
     before = -1
     for f in np.flatnonzero(good).tolist():
@@ -129,6 +139,7 @@ def left_out(px: Float, conf: Float, sharp: Float) -> LeftOut:
         else:
             same[f] = False
 
+    # Blurred, compared with the images of the person.
     usual = np.median(sharp[same]) if same.any() else np.inf
     reasons = {
         "nobody, or too little of a person": few,
@@ -137,11 +148,11 @@ def left_out(px: Float, conf: Float, sharp: Float) -> LeftOut:
         "blurred": sharp < BLURRED * usual,
     }
 
-    # the first reason of each frame
+    # The first reason of each frame.
     result: LeftOut = {}
     taken = np.zeros(len(px), bool)
     for reason, frames in reasons.items():
-        result[reason] = np.asarray(frames & ~taken)
+        result[reason] = frames & ~taken
         taken |= frames
     return result
 
@@ -170,29 +181,36 @@ def look(files: Sequence[Path], px: Float) -> tuple[Float, float]:
         if len(seen):
             box = np.r_[seen.min(0), seen.max(0)].astype(np.int64)
 
-        # the person at a fixed height
+        # The sharpness of the person at a fixed height.
         left, top, right, bottom = box.clip(0).tolist()
         crop = image[top : bottom + 1, left : right + 1]
         if len(seen) > 1 and min(crop.shape) > 1:
             scale = SHARP_SIZE / crop.shape[0]
             sized = cv2.resize(
-                crop, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA
+                crop,
+                None,
+                fx=scale,
+                fy=scale,
+                interpolation=cv2.INTER_AREA,
             )
             sharp[f] = cv2.Laplacian(sized, cv2.CV_64F).var()
 
-        # the background at a quarter of the size
+        # The motion of the background at a quarter of the size.
         small = np.asarray(cv2.resize(image, None, fx=0.25, fy=0.25), np.uint8)
         if before is not None:
             moves.append(_flow(before, small, box // 4))
         before = small
     assert before is not None
-    path_of = np.cumsum(moves, axis=0)
-    return sharp, float(np.ptp(path_of, axis=0).max() / np.hypot(*before.shape))
+
+    # The extent of the background's way.
+    way = np.cumsum(moves, axis=0)
+    extent = np.ptp(way, axis=0).max()
+    return sharp, float(extent / np.hypot(*before.shape))
 
 
 def _flow(before: Bytes, after: Bytes, box: Ints) -> Float:
     """The median motion ``[2]`` of the background's corners, pixels."""
-    # the background: all but the box of the person and a margin
+    # The background: all but the box of the person and a margin.
     left, top, right, bottom = box.tolist()
     margin = (bottom - top) // 8
     rows = slice(max(top - margin, 0), bottom + margin)
@@ -200,8 +218,9 @@ def _flow(before: Bytes, after: Bytes, box: Ints) -> Float:
     mask = np.full(before.shape, 255, np.uint8)
     mask[rows, columns] = 0
 
-    points = cv2.goodFeaturesToTrack(before, CORNERS, 0.01, 8, mask=mask)
-    if points is None or len(points) < FEW_CORNERS:
+    # Corners that are found again.
+    points = cv2.goodFeaturesToTrack(before, MAX_CORNERS, 0.01, 8, mask=mask)
+    if points is None or len(points) < MIN_CORNERS:
         return np.zeros(2)
     start = np.asarray(points, np.float32)
     moved, found, _ = cv2.calcOpticalFlowPyrLK(before, after, start, start.copy())
@@ -215,11 +234,15 @@ def check_enough(video: Path, frames: int, left: LeftOut) -> None:
     Raises:
         DataError: with the number of frames left out, by reason.
     """
-    counts = {reason: int(mask.sum()) for reason, mask in left.items()}
-    used = frames - sum(counts.values())
-    if used >= LEAST:
+    used = frames
+    reasons = []
+    for reason, mask in left.items():
+        count = int(mask.sum())
+        used -= count
+        if count:
+            reasons.append(f"{reason}: {count}")
+    if used >= MIN_IMAGES:
         return
-    reasons = [f"{reason}: {count}" for reason, count in counts.items() if count]
     why = f" ({', '.join(reasons)})" if reasons else ""
     raise DataError(
         f"{video}: only {used} of {frames} sampled images show one whole person sharply"

@@ -18,8 +18,8 @@ from gsgan.utils.arrays import Bytes
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import writing
 
-LEAST_BLOB = 0.02  # share of the largest piece of a mask: smaller ones are removed
-QUALITY = 95  # of jpg, 1 to 100
+MIN_BLOB = 0.02  # share of the largest piece of a mask: smaller ones are removed
+JPEG_QUALITY = 95  # of jpg, 1 to 100
 PNG_COMPRESSION = 3  # 0..9; higher is smaller and slower
 
 
@@ -43,12 +43,12 @@ def find_masks(folder: Path, names: Iterable[str]) -> dict[str, dict[int, Path]]
     found = {}
     for name in names:
         place = folder / name
+
         # Names such as 000012_1.png have the number of a person after that of the frame.
-        of_persons = []
-        for path in place.glob("*"):
-            if path.suffix.lower() in IMAGE_SUFFIXES:
-                of_persons.append(re.fullmatch(r"\d+_\d+", path.stem) is not None)
-        number = _first_number if of_persons and all(of_persons) else last_number
+        paths = place.glob("*")
+        stems = [path.stem for path in paths if path.suffix.lower() in IMAGE_SUFFIXES]
+        of_persons = stems and all(re.fullmatch(r"\d+_\d+", stem) for stem in stems)
+        number = _first_number if of_persons else last_number
         files = frame_files(folder, name, IMAGE_SUFFIXES, number)
         if not files:
             raise DataError(
@@ -64,20 +64,20 @@ def _first_number(stem: str) -> int:
 
 def tidy(mask: Bytes, levels: tuple[float, float]) -> Bytes:
     """A mask ``[H, W]`` 0..255 with its levels stretched and small pieces removed."""
-    # the levels, by a table of all values
+    # The levels, by a table of all values.
     low = 255 * levels[0]
     high = 255 * levels[1]
     share = np.clip((np.arange(256) - low) / (high - low), 0, 1)
     table = np.round(255 * share).astype(np.uint8)
     mask = np.asarray(cv2.LUT(mask, table), np.uint8)
 
-    # pieces that are too small against the largest
+    # Pieces that are too small against the largest one.
     covered = (mask > 0).astype(np.uint8)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(covered)
     areas = stats[:, cv2.CC_STAT_AREA].copy()
     areas[0] = 0  # the background
-    large = areas >= LEAST_BLOB * areas.max()
-    return np.asarray(mask * large[labels], np.uint8)
+    large = areas >= MIN_BLOB * areas.max()
+    return mask * large[labels]
 
 
 def write_images(
@@ -112,16 +112,19 @@ def write_images(
     Raises:
         DataError: when an image or mask is damaged or of the wrong size, or the disk is full.
     """
+    # Folders of a run that was killed may exist.
     images = root / "images" / camera.name
     alphas = root / "masks" / camera.name
     for folder in (images, alphas):
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
 
-    # images are straightened at the full size, then scaled
+    # Images are straightened at the full size, then scaled.
     window = Crop(0, 0, camera.size)
     size = scaled(camera, scale).size
-    mapping = undistort_map(camera.K, camera.dist, window) if camera.distorted else None
+    mapping = None
+    if camera.distorted:
+        mapping = undistort_map(camera.K, camera.dist, window)
 
     def write(path: Path, pixels: Bytes, number: int, where: Path) -> None:
         if pixels.shape[:2] != camera.size:
@@ -132,7 +135,7 @@ def write_images(
         straight = take(pixels, window, mapping, exact=False)
         _write(path, resize(straight, size, exact=False))
 
-    # a video is read in order, up to the last frame
+    # A video is read in order, up to the last frame.
     written = list[int]()
     last = max(frames, default=-1)
     for number, image in source.images():
@@ -141,6 +144,8 @@ def write_images(
             break
         if frame not in frames or number not in masks:
             continue
+
+        # The mask is cleaned before it is straightened.
         written.append(frame)
         advance(len(written), len(frames))
         mask = tidy(read_mask_values(masks[number]), levels)
@@ -150,9 +155,10 @@ def write_images(
 
 
 def _write(path: Path, pixels: Bytes) -> None:
+    """Writes an image in place: a run that was killed here writes all of them again."""
     options = [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION]
     if path.suffix == ".jpg":
-        options = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
+        options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
     _, encoded = cv2.imencode(path.suffix, pixels, options)
-    with writing(path):  # in place: a run that was killed here writes all of them again
+    with writing(path):
         path.write_bytes(encoded.tobytes())

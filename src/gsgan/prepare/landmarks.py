@@ -28,7 +28,7 @@ from gsgan.utils.errors import DataError
 
 # Joint 8 farther than this from the middle of the hips, as a share of the trunk, is another one.
 MIDDLE_OF_HIPS = 0.35
-MESH = 468  # landmarks of MediaPipe's face mesh
+MESH_LANDMARKS = 468  # landmarks of MediaPipe's face mesh
 PIXEL_CENTRE = 0.5  # added to detectors that count from the centre of the first pixel
 OPENPOSE_KEYS = (
     "pose_keypoints_2d",
@@ -54,17 +54,21 @@ def find_landmarks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
     Raises:
         DataError: when a camera has none, listing those found.
     """
-    there = sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
     found = {}
     for name in names:
-        candidates = (f"{name}.npz", f"{name}_json", name)
-        existing = [entry for entry in candidates if entry in there]
-        if not existing:
+        for entry in (f"{name}.npz", f"{name}_json", name):
+            if (folder / entry).exists():
+                found[name] = folder / entry
+                break
+        else:
+            # The message lists the first entries of the folder.
+            there = []
+            if folder.is_dir():
+                there = sorted(path.name for path in folder.iterdir())
             raise DataError(
                 f"{folder} has no landmarks of the camera {name}, such as {name}.npz or "
                 f"{name}_json/, found {', '.join(there[:20]) or 'nothing'}"
             )
-        found[name] = folder / existing[0]
     return found
 
 
@@ -74,6 +78,7 @@ def read_detections(path: Path) -> Detections:
     Raises:
         DataError: on a damaged file or an unknown set of joints.
     """
+    # Frames are sorted; NaN, infinity or no confidence mean that a landmark is not seen.
     found = _read_json(path) if path.is_dir() else _read_npz(path)
     order = np.argsort(found.frame_id)
     conf = np.where(known(found.px), np.nan_to_num(found.conf), 0.0)
@@ -91,7 +96,8 @@ class Gathered(NamedTuple):
 
 
 def gather(
-    detections: Mapping[str, Detections], offsets: Mapping[str, int]
+    detections: Mapping[str, Detections],
+    offsets: Mapping[str, int],
 ) -> Gathered:
     """Detections of all cameras by common frame numbers: a camera's own plus its offset."""
     ids = []
@@ -100,7 +106,7 @@ def gather(
     frames = np.unique(np.concatenate(ids))
     frames = frames[frames >= 0]  # file names hold no negative numbers
 
-    # frames that a camera lacks stay NaN
+    # Frames that a camera lacks stay NaN.
     px = np.full((len(ids), len(frames), ALL, 2), np.nan)
     conf = np.zeros(px.shape[:3])
     for c, (own, found) in enumerate(zip(ids, detections.values(), strict=True)):
@@ -119,13 +125,17 @@ def inside(px: Float, conf: Float, sizes: Float) -> tuple[Float, Float]:
         conf: ``[C, F, J]``.
         sizes: ``[C, 2]`` width and height.
     """
+    # Comparisons with NaN are false.
     with np.errstate(invalid="ignore"):
-        seen = np.asarray(((px >= 0) & (px < sizes[:, None, None])).all(-1))
-    return np.where(seen[..., None], px, np.nan), np.where(seen, conf, 0.0)
+        in_image = (px >= 0) & (px < sizes[:, None, None])
+    seen = np.asarray(in_image.all(-1))
+    shown = np.where(seen[..., None], px, np.nan)
+    return shown, np.where(seen, conf, 0.0)
 
 
 def _read_json(path: Path) -> Detections:
     """Detections in a folder of JSON files; of several people, the one with most confidence."""
+    # The person of each file, and the set of joints of all bodies together.
     files = json_files(path)
     best = []
     for file in files.values():
@@ -147,18 +157,19 @@ def _read_npz(path: Path) -> Detections:
     F = len(body)
     frame_id = whole_frame_ids(expect_array(arrays, "frame_id", (F,), path), str(path))
 
-    # the body, then hands and face if the file has them
+    # The body.
     px = np.full((F, ALL, 2), np.nan)
     conf = np.zeros((F, ALL))
     px[:, :BODY] = body
     conf[:, :BODY] = expect_array(arrays, "conf", (F, BODY), path)
+
+    # Hands and face, if the file has them; MediaPipe has no confidence for their landmarks.
     for name, part in (("left", LEFT), ("right", RIGHT)):
         if name in arrays:
             px[:, part] = expect_array(arrays, name, (F, HAND, 2), path)
-            # MediaPipe has no confidence per landmark of hands and face.
             conf[:, part] = 1.0
     if "face" in arrays:
-        mesh = expect_array(arrays, "face", (F, MESH, 2), path)
+        mesh = expect_array(arrays, "face", (F, MESH_LANDMARKS, 2), path)
         px[:, FACE] = mesh[:, list(FACE_MESH.values())]
         conf[:, FACE] = 1.0
     return Detections(frame_id, px, conf)
@@ -167,9 +178,9 @@ def _read_npz(path: Path) -> Detections:
 class _Person(NamedTuple):
     """A person in a file: rows of x, y, confidence; a missing part has no rows."""
 
-    body: Float
-    left: Float
-    right: Float
+    body: Float  # [n, 3]
+    left: Float  # [21, 3] hand
+    right: Float  # [21, 3] hand
 
 
 def _confidence(person: _Person) -> float:
@@ -183,6 +194,7 @@ def _read_people(path: Path) -> list[_Person]:
     Raises:
         DataError: if it is neither, or a person does not hold joints of a known set.
     """
+    # Each program has a key of its own for the people.
     content = read_json(path)
     if isinstance(content.get("people"), list):
         keys = OPENPOSE_KEYS
@@ -194,6 +206,8 @@ def _read_people(path: Path) -> list[_Person]:
         raise DataError(
             f"{path} has neither 'people' (OpenPose) nor 'annots' (EasyMocap)"
         )
+
+    # The content may be anything: whatever is wrong with it is one error.
     try:
         return [_person(person, keys) for person in people if person is not None]
     except (
@@ -211,13 +225,14 @@ def _read_people(path: Path) -> list[_Person]:
 
 
 def _person(person: Mapping[str, Any], keys: tuple[str, ...]) -> _Person:
+    """The parts of one person, whose ``keys`` are those of its program."""
     # OpenPose of 2017 had names without _2d.
     if not {keys[0], keys[0].removesuffix("_2d")} & person.keys():
         raise KeyError(f"found {', '.join(person)}")
     parts = []
     for key in keys:
-        values = person.get(key) or person.get(key.removesuffix("_2d")) or []
         # OpenPose writes triples flat, EasyMocap in rows.
+        values = person.get(key) or person.get(key.removesuffix("_2d")) or []
         parts.append(np.array(values, np.float64).reshape(-1, 3))
     body, left, right = parts
     if len(body) and len(body) not in SETS:
@@ -235,10 +250,15 @@ def joint_numbers(bodies: Sequence[Float]) -> dict[int, dict[int, int]]:
         bodies: ``[n, 3]`` x, y, confidence of a person, in all frames.
     """
     numbers = {count: joints for count, (_, joints) in SETS.items()}
+
+    # The distance of joint 8 from the middle of the hips, as a share of the trunk.
     distances = []
     for body in bodies:
-        if len(body) == 25 and (body[[1, 8, 9, 12], 2] > 0).all():
-            neck, eighth, right, left = body[[1, 8, 9, 12], :2]
+        if len(body) != 25:
+            continue
+        used = body[[1, 8, 9, 12]]
+        neck, eighth, right, left = used[:, :2]
+        if (used[:, 2] > 0).all():
             hips = (left + right) / 2
             trunk = max(float(np.linalg.norm(neck - hips)), 1e-6)
             distances.append(np.linalg.norm(eighth - hips) / trunk)
@@ -248,18 +268,20 @@ def joint_numbers(bodies: Sequence[Float]) -> dict[int, dict[int, int]]:
 
 
 def _joints(
-    person: _Person, numbers: Mapping[int, Mapping[int, int]]
+    person: _Person,
+    numbers: Mapping[int, Mapping[int, int]],
 ) -> tuple[Float, Float]:
     """Pixels ``[J, 2]`` and confidence ``[J]`` of a person; NaN and 0 = not seen."""
     px = np.full((ALL, 2), np.nan)
     conf = np.zeros(ALL)
 
-    # joints of the body, then those of each whole hand
     def put(joints: list[int], triples: Float) -> None:
-        seen = known(triples) & (triples[:, 2] > 0)
+        confidence = triples[:, 2]
+        seen = known(triples) & (confidence > 0)
         px[joints] = np.where(seen[:, None], triples[:, :2] + PIXEL_CENTRE, np.nan)
-        conf[joints] = np.where(seen, triples[:, 2], 0.0)
+        conf[joints] = np.where(seen, confidence, 0.0)
 
+    # Joints of the body, then those of each whole hand.
     if len(person.body):
         joints = numbers[len(person.body)]
         put(list(joints), person.body[list(joints.values())])
@@ -267,7 +289,7 @@ def _joints(
         if len(hand) == HAND:
             put(list(range(part.start, part.stop)), hand)
 
-    # joints of the body that only the hands have
+    # Joints of the body that only the hands have.
     for target, origin in FROM_HANDS.items():
         if conf[target] == 0:
             px[target] = px[origin]

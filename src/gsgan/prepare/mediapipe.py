@@ -7,6 +7,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 from gsgan.prepare.images import find_masks
 from gsgan.prepare.landmarks import find_landmarks
@@ -20,7 +21,7 @@ TOOL = Path(__file__).parent / "mediapipe_tool"
 SCRIPT = TOOL / "detect.py"
 REQUIREMENTS = TOOL / "requirements.txt"
 NEWEST = (3, 12)  # the pinned MediaPipe has no build for later Pythons
-# written first: a folder with it was made here and may be replaced
+# Written first: a folder with it was made here and may be replaced.
 MARKER = ".gsgan-mediapipe"
 READY = ".ready"  # written last: an environment without it is incomplete
 
@@ -36,22 +37,30 @@ def tool_key() -> list[str]:
     return [SCRIPT.read_text(), REQUIREMENTS.read_text()]
 
 
+class People(NamedTuple):
+    """Files by source."""
+
+    landmarks: dict[str, Path]
+    masks: dict[str, dict[int, Path]]  # by frame number
+
+
 def find_people(
     options: Options,
     sources: Mapping[str, Recording],
     stages: StageFolder,
     say: Callable[[str], None],
-) -> tuple[dict[str, Path], dict[str, dict[int, Path]]]:
-    """Landmark files by source, and its masks by frame number: given ones, or those of the tool."""
-    found: dict[str, Path] = {}
-    masks: dict[str, dict[int, Path]] = {}
+) -> People:
+    """Landmarks and masks of each source: given ones, or those of the tool."""
+    found = People({}, {})
     if options.needs_tool:
-        found, masks = run_tool(options, sources, stages, say)
+        found = run_tool(options, sources, stages, say)
     if options.masks != MEDIAPIPE:
         masks = find_masks(options.folder("masks"), sources)
+        found = found._replace(masks=masks)
     if options.landmarks != MEDIAPIPE:
-        found = find_landmarks(options.folder("landmarks"), sources)
-    return found, masks
+        landmarks = find_landmarks(options.folder("landmarks"), sources)
+        found = found._replace(landmarks=landmarks)
+    return found
 
 
 def run_tool(
@@ -59,8 +68,8 @@ def run_tool(
     sources: Mapping[str, Recording],
     stages: StageFolder,
     say: Callable[[str], None],
-) -> tuple[dict[str, Path], dict[str, dict[int, Path]]]:
-    """The npz of landmarks and the masks by frame number of each source.
+) -> People:
+    """Landmarks and masks of each source by MediaPipe.
 
     The tool runs for sources whose results are not stored.
 
@@ -71,6 +80,8 @@ def run_tool(
     tool = options.mediapipe
     masks = options.masks == MEDIAPIPE
     parts = {"hands": options.hands, "face": options.face}
+
+    # Results depend on the images, the tool, and the parts that it looks for.
     results = {}
     folders = {}
     for name, source in sources.items():
@@ -97,6 +108,8 @@ def run_tool(
             _detect(command, sources[name].path, advance)
 
         each_camera(one, "finding landmarks", missing, options.workers)
+
+    # The masks; a source without any shows nobody.
     found = {}
     for name, folder in folders.items():
         files = sorted(folder.glob("*.png"))
@@ -105,7 +118,7 @@ def run_tool(
                 f"MediaPipe found nobody in {name}; show a person, or leave it out"
             )
         found[name] = {int(path.stem): path for path in files}
-    return results, found
+    return People(results, found)
 
 
 def _detect(command: list[str], source: Path, advance: Advance) -> None:
@@ -113,7 +126,10 @@ def _detect(command: list[str], source: Path, advance: Advance) -> None:
     with (
         tempfile.TemporaryFile("w+") as errors,
         subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=errors, text=True
+            command,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            text=True,
         ) as process,
     ):
         try:
@@ -133,7 +149,9 @@ def _detect(command: list[str], source: Path, advance: Advance) -> None:
 
 
 def ensure_environment(
-    tool: MediaPipe, setup: bool, say: Callable[[str], None]
+    tool: MediaPipe,
+    setup: bool,
+    say: Callable[[str], None],
 ) -> Path:
     """The environment's Python; a missing environment is created if ``setup`` allows it.
 
@@ -151,7 +169,7 @@ def ensure_environment(
             "it (some 400 MB), or give landmarks=<folder> and masks=<folder>"
         )
 
-    # a Python that MediaPipe supports
+    # A Python that MediaPipe supports.
     base = tool.python
     if not base and sys.version_info[:2] <= NEWEST:
         base = sys.executable
@@ -161,7 +179,7 @@ def ensure_environment(
             "MediaPipe needs Python 3.11 or 3.12: set mediapipe.python=<path>"
         )
 
-    # the folder, marked as made here
+    # The folder, marked as made here.
     with writing(place):
         if place.exists():
             if any(place.iterdir()) and not (place / MARKER).is_file():
@@ -172,7 +190,7 @@ def ensure_environment(
         place.mkdir(parents=True)
         (place / MARKER).touch()
 
-    # the environment, complete with its last file
+    # The environment, complete with its last file.
     say(f"creating the MediaPipe environment at {place}, once")
     _run([base, "-m", "venv", str(place)], "the environment cannot be created")
     install = [
@@ -194,6 +212,7 @@ def ensure_environment(
 
 
 def _run(command: list[str], what: str) -> None:
+    """Runs a command; ``what`` begins the message if it fails."""
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
     except OSError as error:

@@ -25,13 +25,21 @@ from gsgan.data.joints import (
     LEFT,
     LEG_PAIRS,
     RIGHT,
+    WRISTS,
 )
 from gsgan.prepare import landmarks
 from gsgan.prepare.camera_array import CameraArray
 from gsgan.prepare.cleanse import cleanse, smooth
 from gsgan.prepare.frames import SAMPLING, LeftOut, check_enough, left_out, look, sample
 from gsgan.prepare.mediapipe import find_people
-from gsgan.prepare.one_view import FEET, HEIGHT, Seen, View, solve_view
+from gsgan.prepare.one_view import (
+    FOOT_JOINTS,
+    HIP_JOINTS,
+    USUAL_HEIGHT,
+    Seen,
+    View,
+    solve_view,
+)
 from gsgan.prepare.options import Inputs, Options
 from gsgan.prepare.solve import Solution
 from gsgan.prepare.sources import Recording, stamp
@@ -42,26 +50,24 @@ from gsgan.skeleton.hands import HAND
 from gsgan.utils.arrays import Bool, Float, Ints, expect_array, nanmedian
 from gsgan.utils.errors import DataError
 
-# the diagonal of film in millimetres, to which equivalent focal lengths refer
+# The diagonal of film in millimetres, to which equivalent focal lengths refer.
 FILM = np.hypot(36.0, 24.0)
-# millimetres: phones' main cameras have 24 to 28 and record a part of their image
-USUAL = 30.0
+# Millimetres: phones' main cameras have 24 to 28 and record a part of their image.
+USUAL_FOCAL = 30.0
 # Apple's phones state the focal length here, in millimetres; not the recorded part of the image.
-FOCAL = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
-# errors of focal lengths over the solution's own estimate, on synthetic scenes
+FOCAL_KEY = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
+# Errors of focal lengths over the solution's own estimate, on synthetic scenes.
 OVERCONFIDENT = 3.0
 DOUBTFUL = 3.0  # a frame with this many times the usual error is left out
 # The result is in doubt with a shorter video, a smaller turn, a background that moves more, more
 # images of several people, or fewer images of the feet.
-SHORT = 8.0  # seconds
-TURN = 300  # degrees
-MOVED = 0.03  # share of the image
-OTHERS = 0.2  # share of the images
-FEET_SEEN = 0.5  # share of the images
-DIRECTIONS = 12
-SHOULDERS = [11, 12]
-HIPS = [23, 24]
-WRISTS = [15, 16]
+MIN_SECONDS = 8.0  # seconds
+MIN_TURN = 300  # degrees
+MAX_BACKGROUND_MOVE = 0.03  # share of the image
+MAX_OTHER_FACES = 0.2  # share of the images
+MIN_FEET_SEEN = 0.5  # share of the images
+TURN_SECTORS = 12
+SHOULDER_JOINTS = [11, 12]
 SWAPPED = [j for pair in (*ARM_PAIRS[:3], *LEG_PAIRS[:3]) for j in pair]
 
 
@@ -102,6 +108,7 @@ def solve_video(options: Options, stages: StageFolder, console: Console) -> Film
     Raises:
         DataError: when too few frames show one whole person, or landmarks have no depth.
     """
+    # Images of the video, and the detections in them.
     video = options.folder("source")
     with console.status("taking images from the video"):
         folder = stages.path("frames", [*stamp(video), SAMPLING])
@@ -111,6 +118,7 @@ def solve_video(options: Options, stages: StageFolder, console: Console) -> Film
     detected, there = _read(found[source.name], numbers, source.size)
     there &= np.isin(numbers, list(masks[source.name]))
 
+    # Images of one whole, sharp person.
     with console.status("choosing frames"):
         px = detected.px[:, :BODY]
         conf = detected.conf[:, :BODY] * there[:, None]
@@ -119,24 +127,27 @@ def solve_video(options: Options, stages: StageFolder, console: Console) -> Film
     check_enough(video, len(numbers), left)
     used = np.flatnonzero(~np.logical_or.reduce(list(left.values())))
 
+    # The solution starts from a focal length that is given, stated or usual.
     with console.status("solving for the camera, the body and its poses"):
         stated = stated_focal(video)
-        first = options.focal or stated or USUAL
+        first = options.focal or stated or USUAL_FOCAL
         guess = float(np.hypot(*source.size) * first / FILM)
         view = _solve(options, detected[used], time[used], source.size, guess)
 
-    # frames that fit much worse than the others
+    # Frames that fit much worse than the others are left out, too.
     doubtful = doubtful_poses(view.error.numpy())
     left["doubtful pose"] = np.zeros(len(numbers), bool)
     left["doubtful pose"][used[doubtful]] = True
     good = ~doubtful
 
-    # joints in the world, and their errors in pixels
+    # Joints in the world, and their errors in pixels.
     camera, p = _in_world(source, view, guess, options.height)
     p = p[good]
     kept = used[good]
     seen = detected[kept]
     joints, removed = _with_hands(p, seen, camera, time[kept], options)
+
+    # The solution in the form of several cameras, without sides and clocks to correct.
     F, J, _ = joints.shape
     error = np.full((1, F, J), np.nan)
     error[0, :, :BODY] = view.error.numpy()[good] * guess
@@ -153,21 +164,26 @@ def solve_video(options: Options, stages: StageFolder, console: Console) -> Film
         removed=removed,
     )
 
+    # The numbers and notes of the report.
     measured = _measured(view, camera, p, time[kept], seen, left)
     measured["background_moved"] = moved
     measured["focal_stated"] = stated
+    notes = _notes(measured, options, natural_height(view.shape))
+    fps = 1 / float(np.median(np.diff(time)))
     inputs = Inputs(
-        {source.name: source},
-        Calibration(video, "estimated from the person", {camera.name: camera}),
-        (camera,),
-        tuple(_notes(measured, options, natural_height(view.shape))),
-        round(1 / float(np.median(np.diff(time))), 3),
+        sources={source.name: source},
+        calibration=Calibration(
+            video, "estimated from the person", {camera.name: camera}
+        ),
+        cameras=(camera,),
+        notes=notes,
+        fps=round(fps, 3),
     )
     return Filmed(inputs, masks, numbers[kept], solution, measured)
 
 
 def doubtful_poses(errors: Float) -> Bool:
-    """``[F]`` whether a frame fits much worse than the others.
+    """The frames ``[F]`` that fit much worse than the others.
 
     Args:
         errors: ``[F, L]`` pixels, the error of each landmark; NaN if it was not seen. A frame
@@ -179,6 +195,7 @@ def doubtful_poses(errors: Float) -> Bool:
 
 def _read(path: Path, numbers: Ints, size: tuple[int, int]) -> tuple[Detected, Bool]:
     """Detections at these frame numbers ``[F]``, and which of the frames have any."""
+    # The arrays of depth, which only MediaPipe's files have.
     found = landmarks.read_detections(path)
     depth = {"world": (BODY, 3), "left_z": (HAND,), "right_z": (HAND,), "faces": ()}
     arrays = {} if path.is_dir() else read_arrays(path, depth)
@@ -188,9 +205,8 @@ def _read(path: Path, numbers: Ints, size: tuple[int, int]) -> tuple[Detected, B
             "give landmarks=mediapipe, or videos of two calibrated cameras"
         )
     F = len(found.frame_id)
-    px, conf = landmarks.inside(
-        found.px[None], found.conf[None], np.array([size[::-1]])
-    )
+    sizes = np.array([size[::-1]])
+    px, conf = landmarks.inside(found.px[None], found.conf[None], sizes)
 
     # Rows of the file are in its own order, those of `found` by frame number.
     at = np.searchsorted(found.frame_id, numbers).clip(max=F - 1)
@@ -204,6 +220,7 @@ def _read(path: Path, numbers: Ints, size: tuple[int, int]) -> tuple[Detected, B
         values = expect_array(arrays, name, shape, path)
         return np.asarray(values, np.float64)[order][at]
 
+    # Frames without depth are not used.
     world = depths("world", np.nan)
     known = there & np.isfinite(world).all((1, 2))
     hand_z = [depths("left_z", np.nan), depths("right_z", np.nan)]
@@ -227,16 +244,21 @@ def stated_focal(video: Path) -> float | None:
     except ImportError:
         return None
     with av.open(str(video)) as file:
-        stated = re.match(r"[\d.]+", file.metadata.get(FOCAL, ""))
+        stated = re.match(r"[\d.]+", file.metadata.get(FOCAL_KEY, ""))
     if stated is None:
         return None
     return float(stated[0]) or None
 
 
 def _solve(
-    options: Options, seen: Detected, time: Float, size: tuple[int, int], guess: float
+    options: Options,
+    seen: Detected,
+    time: Float,
+    size: tuple[int, int],
+    guess: float,
 ) -> View:
     """The solution, which starts from a focal length of ``guess`` pixels."""
+    # Landmarks of little confidence count as not seen.
     px = seen.px[:, :BODY].copy()
     conf = seen.conf[:, :BODY].copy()
     world = seen.world.copy()
@@ -248,7 +270,9 @@ def _solve(
     for values in (px, conf, world):
         values[swapped] = values[swapped][:, mirror]
 
-    u = np.nan_to_num(px - np.array(size[::-1]) / 2) / guess
+    # Offsets from the principal point, which is in the middle of the image.
+    middle = np.array(size[::-1]) / 2
+    u = np.nan_to_num(px - middle) / guess
     given = Seen(
         u=torch.from_numpy(u),
         weight=torch.from_numpy(conf),
@@ -259,56 +283,70 @@ def _solve(
         given,
         noise=options.landmark_noise,
         focal=options.focal is None,
-        height=options.height or HEIGHT,
+        height=options.height or USUAL_HEIGHT,
     )
 
 
 def natural_height(shape: BodyShape) -> float:
-    """Metres from the soles to the top of the head."""
+    """The height in metres from the soles to the top of the head."""
     plain = BodyShape(shape.coefficients.float(), shape.stretch.float())
     z = shaped_body(plain).vertices[:, 2]
     return float(z.max() - z.min())
 
 
 def _in_world(
-    source: Recording, view: View, guess: float, height: float | None
+    source: Recording,
+    view: View,
+    guess: float,
+    height: float | None,
 ) -> tuple[CameraEntry, Float]:
     """The camera and joints ``[F, 33, 3]`` in a world with z upwards.
 
     The ground is at 0, and the person has the given height.
     """
     p = view.p.numpy()
-    hips = p[:, HIPS].mean(1)
+    hips = p[:, HIP_JOINTS].mean(1)
 
-    # the up direction and a point of the ground, in the axes of the camera
+    # The up direction and a point of the ground, in the axes of the camera.
     if view.ground is None:
-        up = (p[:, SHOULDERS].mean(1) - hips).mean(0)
-        below = np.percentile(p[:, FEET].reshape(-1, 3), 98, axis=0)
+        up = (p[:, SHOULDER_JOINTS].mean(1) - hips).mean(0)
+        below = np.percentile(p[:, FOOT_JOINTS].reshape(-1, 3), 98, axis=0)
     else:
         a, b, c = view.ground.tolist()
         up = np.array([a, -1.0, b])
         below = np.array([0, c, 0])
     up = up / np.linalg.norm(up)
 
-    # the rotation from world to camera, which looks along +y
+    # The rotation from world to camera, which looks along +y.
     across = np.cross([0.0, 0.0, 1.0], up)
     across /= np.linalg.norm(across)
     R = np.stack([across, np.cross(up, across), up], axis=1)
 
-    # the origin, on the ground below the mean of the hips
-    middle = p[:, HIPS].mean((0, 1))
+    # The origin, on the ground below the mean of the hips.
+    middle = p[:, HIP_JOINTS].mean((0, 1))
     origin = middle - ((middle - below) @ up) * up
     scale = 1.0 if height is None else height / natural_height(view.shape)
 
+    # The camera, without a lens.
     focal = guess * view.focal
     h, w = source.size
-    K = np.array([[focal, 0, w / 2], [0, focal, h / 2], [0, 0, 1]])
-    camera = CameraEntry(source.name, K, R, scale * origin, np.zeros(8), source.size)
+    camera = CameraEntry(
+        name=source.name,
+        K=np.array([[focal, 0, w / 2], [0, focal, h / 2], [0, 0, 1]]),
+        R=R,
+        t=scale * origin,
+        dist=np.zeros(8),
+        size=source.size,
+    )
     return camera, scale * (p - origin) @ R
 
 
 def _with_hands(
-    p: Float, seen: Detected, camera: CameraEntry, time: Float, options: Options
+    p: Float,
+    seen: Detected,
+    camera: CameraEntry,
+    time: Float,
+    options: Options,
 ) -> tuple[Float, dict[str, int]]:
     """Joints ``[F, 33 or 105, 3]``, and the number of removed ones by reason.
 
@@ -319,7 +357,7 @@ def _with_hands(
     joints = np.full((len(p), ALL, 3), np.nan)
     joints[:, :BODY] = p
 
-    # the hands' depth: the wrist's, and the detector's own from there
+    # The hands' depth: the wrist's, and the detector's own from there.
     in_camera = p @ camera.R.T + camera.t
     depth = in_camera[:, WRISTS, 2].repeat(HAND, axis=1)
     depth = depth * (1 + seen.hand_z / camera.K[0, 0])
@@ -328,10 +366,12 @@ def _with_hands(
     rays = pixels @ np.linalg.inv(camera.K).T
     joints[:, HANDS] = (rays * depth[..., None] - camera.t) @ camera.R
 
-    # the hand begins at the solved wrist
+    # The hand begins at the solved wrist.
     for part, wrist in zip((LEFT, RIGHT), WRISTS, strict=True):
-        joints[:, part] += p[:, [wrist]] - joints[:, part][:, :1]
+        hand = joints[:, part]
+        hand += p[:, [wrist]] - hand[:, :1]
 
+    # Impossible hands are removed, the others are smoothed; the body is smooth already.
     joints, removed = cleanse(joints)
     weight = np.isfinite(joints).all(-1).astype(float)
     joints[:, HANDS] = smooth(
@@ -356,31 +396,36 @@ def _measured(
     focal = float(camera.K[0, 0])
     diagonal = float(np.hypot(*camera.size))
 
-    # the directions from which the camera saw the person
-    left_shoulder, right_shoulder = SHOULDERS
+    # The sectors of directions from which the camera saw the person.
+    left_shoulder, right_shoulder = SHOULDER_JOINTS
     side = p[:, left_shoulder, :2] - p[:, right_shoulder, :2]
-    toward = camera.centre[:2] - p[:, HIPS, :2].mean(1)
-    turn = np.arctan2(side[:, 0], side[:, 1]) - np.arctan2(toward[:, 0], toward[:, 1])
-    directions = np.unique(np.floor(DIRECTIONS * (turn / (2 * np.pi) % 1)))
+    toward = camera.centre[:2] - p[:, HIP_JOINTS, :2].mean(1)
+    facing = np.arctan2(side[:, 0], side[:, 1])
+    turn = facing - np.arctan2(toward[:, 0], toward[:, 1])
+    directions = np.unique(np.floor(TURN_SECTORS * (turn / (2 * np.pi) % 1)))
 
-    counts = {reason: int(frames.sum()) for reason, frames in left.items()}
+    # Reasons that left out a frame.
+    counts = {}
+    for reason, frames in left.items():
+        if frames.any():
+            counts[reason] = int(frames.sum())
     return {
         "focal_px": focal,
         "focal_mm": focal / diagonal * FILM,
         "focal_uncertainty": OVERCONFIDENT * view.spread,
-        "degrees_seen": 360 // DIRECTIONS * len(directions),
+        "degrees_seen": 360 // TURN_SECTORS * len(directions),
         "seconds": float(np.ptp(time)),
         "sampled": len(next(iter(left.values()))),
-        "left_out": {reason: count for reason, count in counts.items() if count},
+        "left_out": counts,
         "several_faces": float((detected.faces > 1).mean()),
-        "feet_seen": float((detected.conf[:, FEET] > 0).any(1).mean()),
+        "feet_seen": float((detected.conf[:, FOOT_JOINTS] > 0).any(1).mean()),
         "standing": view.ground is not None,
     }
 
 
 def _notes(found: Mapping[str, Any], options: Options, natural: float) -> list[str]:
     """Sentences on what was estimated, and on what is in doubt."""
-    # estimates
+    # The estimates.
     focal = f"focal length {found['focal_px']:.0f} pixels, {found['focal_mm']:.0f} mm on film"
     if options.focal is None:
         stated = found["focal_stated"]
@@ -391,33 +436,32 @@ def _notes(found: Mapping[str, Any], options: Options, natural: float) -> list[s
     if options.height is None:
         notes.append(f"height {natural:.2f} m, as a usual person; height=<m> sets it")
     if found["left_out"]:
-        counts = [f"{reason} {count}" for reason, count in found["left_out"].items()]
-        reasons = ", ".join(counts)
+        counts = found["left_out"].items()
+        reasons = ", ".join(f"{reason} {count}" for reason, count in counts)
         notes.append(f"left out of {found['sampled']} sampled images: {reasons}")
 
-    # doubts
+    # The doubts, each with its limit.
     seconds = found["seconds"]
     turned = found["degrees_seen"]
     moved = found["background_moved"]
     others = found["several_faces"]
     feet = found["feet_seen"]
-    doubts = []
-    if seconds < SHORT:
-        doubts.append(f"{seconds:.1f} seconds are short, 20 to 40 are better")
-    if turned < TURN:
-        doubts.append(
-            f"only {turned} of 360 degrees were filmed; training guesses the rest"
+    if seconds < MIN_SECONDS:
+        notes.append(f"doubtful: {seconds:.1f} seconds are short, 20 to 40 are better")
+    if turned < MIN_TURN:
+        notes.append(
+            f"doubtful: only {turned} of 360 degrees were filmed; training guesses the rest"
         )
-    if moved > MOVED:
-        doubts.append(
-            f"the background moved by {moved:.0%} of the image; it counts as still"
+    if moved > MAX_BACKGROUND_MOVE:
+        notes.append(
+            f"doubtful: the background moved by {moved:.0%} of the image; it counts as still"
         )
-    if others > OTHERS:
-        doubts.append(f"{others:.0%} of the images show more than one face")
-    if feet < FEET_SEEN:
-        doubts.append(
-            f"feet are in {feet:.0%} of the images; legs and distance are guesses"
+    if others > MAX_OTHER_FACES:
+        notes.append(f"doubtful: {others:.0%} of the images show more than one face")
+    if feet < MIN_FEET_SEEN:
+        notes.append(
+            f"doubtful: feet are in {feet:.0%} of the images; legs and distance are guesses"
         )
     if not found["standing"]:
-        doubts.append("no foot stood still, so the ground is a guess")
-    return notes + [f"doubtful: {doubt}" for doubt in doubts]
+        notes.append("doubtful: no foot stood still, so the ground is a guess")
+    return notes

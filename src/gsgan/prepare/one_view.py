@@ -47,62 +47,56 @@ from gsgan.utils.arrays import Float, evenly_spaced
 
 KEYFRAMES = 50  # maximum number of frames for shape and focal length
 FOCAL_SPREAD = 0.12  # standard deviation of the guess's logarithm
-NOISE = 0.01  # of landmarks in the first steps, share of the person's size
+FIRST_NOISE = 0.01  # of landmarks in the first steps, share of the person's size
 # Standard deviation in metres of the detector's own 3D landmarks, given 2D landmarks with that
 # noise; more accurate 2D landmarks constrain depth more, so the 3D ones get less weight.
-DEPTH = 0.08
+WORLD_SPREAD = 0.08
 ACCELERATION = 8.0  # standard deviation, metres per square second
 ACCELERATIONS = 10.0  # independent accelerations per second
 SLIDING = 0.1  # speed of a standing foot, metres per second
 GROUND = 0.02  # distance of a standing foot from the ground, metres
 BALANCE = 0.08  # horizontal distance from trunk to standing feet, metres
-STILL = 0.25  # metres per second: a slower foot stands
+STANDING_SPEED = 0.25  # metres per second: a slower foot stands
 OUTLIER = 3.0  # standard deviations at which a landmark counts half
 # The person's height in metres, and the standard deviation of its logarithm. Images do not tell the
 # size, and errors of speed, depth and sliding feet are in metres: without this term a small person
 # would fit best.
-HEIGHT = 1.7
-SIZE = 0.003
-LIMBS = 0.05  # weight of the prior of arms and legs, which would make them shorter
-GAP = 0.5  # seconds: motion is not smooth over a longer gap
+USUAL_HEIGHT = 1.7
+HEIGHT_SPREAD = 0.003
+LIMB_PRIOR = 0.05  # weight of the prior of arms and legs, which would make them shorter
+MAX_TIME_GAP = 0.5  # seconds: motion is not smooth over a longer gap
 ZOOMS = np.arange(-4, 5) / 10  # logarithms of focal lengths to try
 ZOOM_STEPS = 8  # Gauss-Newton steps for each focal length
-NEAREST = 2  # neighbours on each side of the minimum in the parabola fit
-STEPS = 20  # maximum number of Gauss-Newton steps
-SETTLED = 1e-4  # relative change of the cost at which the solver stops
+ZOOM_NEIGHBOURS = 2  # neighbours on each side of the minimum in the parabola fit
+MAX_STEPS = 20  # maximum number of Gauss-Newton steps
+MIN_GAIN = 1e-4  # relative change of the cost at which the solver stops
 MIN_STANDING = 8  # landmarks of feet: fewer do not show the ground
-# Levenberg-Marquardt damping, and its factors after a good and after a bad step.
-DAMPING = 1e-3
-EASIER = 0.3
-HARDER = 10.0
-NEAR = 0.2  # minimum depth, metres
-FEET = [29, 31, 30, 32]  # heels and toes
+# Levenberg-Marquardt damping: its first value, and its factors after a good and a bad step.
+FIRST_DAMPING = 1e-3
+GOOD_STEP_DAMPING = 0.3
+BAD_STEP_DAMPING = 10.0
+MIN_DEPTH = 0.2  # minimum depth, metres
+FOOT_JOINTS = [29, 31, 30, 32]  # heels and toes
 LIMB = re.compile(r"arm_|elbow$|thigh_|knee$")
 # The group that each residual belongs to: each landmark in two and in three dimensions, each
 # landmark of the feet, and the balance.
-GROUPS = torch.arange(71).repeat_interleave(
-    torch.tensor([2] * 33 + [3] * 33 + [1] * 4 + [2])
-)
+GROUP_SIZES = torch.tensor([2] * 33 + [3] * 33 + [1] * 4 + [2])
+RESIDUAL_GROUPS = torch.arange(len(GROUP_SIZES)).repeat_interleave(GROUP_SIZES)
 PLANE = 3  # numbers of the ground, the first of `State.shared`
-HIPS = list(MEDIAPIPE33.hips)
-TRUNK = list(MEDIAPIPE33.torso)
+HIP_JOINTS = list(MEDIAPIPE33.hips)
+TRUNK_JOINTS = list(MEDIAPIPE33.torso)
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What one camera saw in ``F`` frames.
+    """Detections of one camera in ``F`` frames."""
 
-    Args:
-        u: ``[F, 33, 2]`` offsets from the principal point over the guessed focal length.
-        weight: ``[F, 33]`` confidence, 0 = not seen.
-        world: ``[F, 33, 3]`` the detector's own 3D landmarks, metres from the middle of the hips.
-        time: ``[F]`` seconds, increasing.
-    """
-
+    # [F, 33, 2] offsets from the principal point over the guessed focal length
     u: Tensor
-    weight: Tensor
+    weight: Tensor  # [F, 33] confidence, 0 = not seen
+    # [F, 33, 3] the detector's own 3D landmarks, metres from the middle of the hips
     world: Tensor
-    time: Tensor
+    time: Tensor  # [F] seconds, increasing
 
     def __getitem__(self, frames: Tensor) -> Seen:
         return Seen(
@@ -123,40 +117,24 @@ class Seen:
 
 @dataclass(frozen=True)
 class State:
-    """The unknowns.
+    """The unknowns."""
 
-    Args:
-        q: ``[F, D]`` the poses' numbers, of `Solver`.
-        root: ``[F, 3, 3]`` the root's rotations, of `Solver`.
-        shared: ``[3 + S]`` the ground ``y = a x + b z + c``, and the shape.
-    """
-
-    q: Tensor
-    root: Tensor
-    shared: Tensor
+    q: Tensor  # [F, D] the poses' numbers, of `Solver`
+    root: Tensor  # [F, 3, 3] the root's rotations, of `Solver`
+    shared: Tensor  # [3 + S] the ground y = a x + b z + c, and the shape
 
 
 @dataclass
 class Normal:
-    """Normal equations by landmarks, ``N`` of 99 numbers a frame, before the chain rule.
+    """Normal equations by landmarks, ``N`` = 99 numbers a frame, before the chain rule."""
 
-    Args:
-        cost: scalar.
-        g: ``[F, N]`` half the gradient.
-        W: ``[F, N, N]`` Hessian of each frame.
-        near: ``[2, F, N]`` diagonals that couple a frame with the first and second later frame.
-        cross: ``[F, N, 3]`` Hessian between landmarks and the ground.
-        g_ground: ``[3]`` half the gradient by the ground.
-        W_ground: ``[3, 3]`` Hessian by the ground.
-    """
-
-    cost: Tensor
-    g: Tensor
-    W: Tensor
-    near: Tensor
-    cross: Tensor
-    g_ground: Tensor
-    W_ground: Tensor
+    cost: Tensor  # scalar
+    g: Tensor  # [F, N] half the gradient
+    W: Tensor  # [F, N, N] Hessian of each frame
+    near: Tensor  # [2, F, N] diagonals that couple a frame with the first and second later one
+    cross: Tensor  # [F, N, 3] Hessian between landmarks and the ground
+    g_ground: Tensor  # [3] half the gradient by the ground
+    W_ground: Tensor  # [3, 3] Hessian by the ground
 
     def add_motion(self, X: Tensor, stencil: Tensor, weight: Tensor) -> None:
         """Adds squares of finite differences ``c[0] X[f] + c[1] X[f + 1] + …``.
@@ -166,17 +144,19 @@ class Normal:
             stencil: ``[K, n]`` coefficients c of each difference.
             weight: ``[n, 33]``.
         """
+        # The differences r [n, 33, 3].
         n = stencil.shape[1]
         terms = []
         for k, c in enumerate(stencil):
             terms.append(c[:, None, None] * X[k : k + n])
         r = torch.stack(terms).sum(0)
 
-        # Cauchy's cost, and the weights that make its squares
+        # Cauchy's cost, and the weights with which squares have the same gradient.
         square = r.square().sum(-1) / OUTLIER**2
         self.cost = self.cost + (weight * OUTLIER**2 * square.log1p()).sum()
         w = (weight / (1 + square)).repeat_interleave(3, dim=1)
 
+        # r is linear in X: dr / dX[f + k] = c[k]. Each pair of coefficients couples two frames.
         diagonal = self.W.diagonal(dim1=1, dim2=2)
         for k, c in enumerate(stencil):
             self.g[k : k + n] += w * c[:, None] * r.flatten(1)
@@ -198,29 +178,23 @@ class Blocks(NamedTuple):
 
 @dataclass(frozen=True)
 class View:
-    """The solution.
+    """The solution."""
 
-    Args:
-        p: ``[F, 33, 3]`` landmarks, metres, camera axes; the size is that of a usual person.
-        error: ``[F, 33]`` of reprojection, in units of ``u``; NaN = not seen.
-        shape: of the person.
-        focal: the focal length over its guess.
-        spread: standard deviation of the focal length's logarithm.
-        ground: ``[3]`` of the plane ``y = a x + b z + c`` under the feet; None: no foot stood.
-        standing: ``[F, 4]`` 1 for those of `FEET` that stood, else 0.
-    """
-
-    p: Tensor
-    error: Tensor
+    p: Tensor  # [F, 33, 3] landmarks, metres, camera axes; the size is a usual person's
+    error: Tensor  # [F, 33] of reprojection, in units of ``u``; NaN = not seen
     shape: BodyShape
-    focal: float
-    spread: float
+    focal: float  # the focal length over its guess
+    spread: float  # standard deviation of the focal length's logarithm
+    # [3] of the plane y = a x + b z + c under the feet; None: no foot stood
     ground: Tensor | None
-    standing: Tensor
+    standing: Tensor  # [F, 4] 1 for those of `FOOT_JOINTS` that stood, else 0
 
 
 def solve_view(
-    seen: Seen, noise: float, focal: bool = True, height: float = HEIGHT
+    seen: Seen,
+    noise: float,
+    focal: bool = True,
+    height: float = USUAL_HEIGHT,
 ) -> View:
     """The person and the camera that fit what one camera saw.
 
@@ -236,6 +210,7 @@ def solve_view(
         focal: whether the focal length is unknown; else the guess is exact.
         height: metres, of the person.
     """
+    # Feet that stand show the ground.
     standing = Problem(seen).standing_feet()
     has_ground = bool(standing.sum() >= MIN_STANDING)
     keyframes = torch.tensor(evenly_spaced(len(seen.u), KEYFRAMES, ends=True))
@@ -250,9 +225,9 @@ def solve_view(
             **options,
         )
 
-    # the cost of each focal length, from the longest to the shortest and back
+    # The cost of each focal length, from the longest to the shortest and back.
     tried = np.concatenate([ZOOMS[::-1], ZOOMS]) if focal else np.zeros(1)
-    first = problem(keyframes, NOISE, float(tried[0]))
+    first = problem(keyframes, FIRST_NOISE, float(tried[0]))
     state, _ = first.minimise(first.start())
     states = []
     costs = []
@@ -262,15 +237,15 @@ def solve_view(
         states.append(state)
         costs.append(cost)
 
-    # the shape, from the solution of the way back whose focal length is nearest to the best one
+    # The shape, from the solution of the way back whose focal length is nearest to the best one.
     zoom, spread = _best_zoom(np.array(costs)) if focal else (0.0, 0.0)
     from_last = int(np.argmin(np.abs(tried[::-1] - zoom)))
     nearest = states[-1 - from_last]
     state, _ = problem(keyframes, noise, zoom).minimise(nearest)
 
-    # all frames: first one by one, then as a motion
+    # All frames: first one by one, then as a motion.
     every = torch.arange(len(seen.u))
-    alone = problem(every, NOISE, zoom, shape=False)
+    alone = problem(every, FIRST_NOISE, zoom, shape=False)
     start = replace(alone.start(), shared=state.shared)
     begun, _ = alone.minimise(start, 6)
     whole = problem(every, noise, zoom, smooth=True, shape=False)
@@ -297,30 +272,31 @@ class Problem:
         zoom: logarithm of the focal length over its guess.
         shape: whether the body's shape is unknown.
         smooth: whether the frames follow each other in time.
-        standing: ``[F, 4]`` 1 for those of `FEET` that stand, else 0.
+        standing: ``[F, 4]`` 1 for those of `FOOT_JOINTS` that stand, else 0.
         height: metres, of the person.
     """
 
     def __init__(
         self,
         seen: Seen,
-        noise: float = NOISE,
+        noise: float = FIRST_NOISE,
         zoom: float = 0.0,
         shape: bool = True,
         smooth: bool = False,
         standing: Tensor | None = None,
-        height: float = HEIGHT,
+        height: float = USUAL_HEIGHT,
     ) -> None:
+        # The data, and the standard deviations of landmarks in 2D and 3D.
         self.seen = seen
         self.zoom = math.exp(zoom)
         self.smooth = smooth
         if standing is None:
-            standing = seen.weight.new_zeros(len(seen.weight), len(FEET))
+            standing = seen.weight.new_zeros(len(seen.weight), len(FOOT_JOINTS))
         self.standing = standing
         self.noise = (noise * seen.size)[:, None]
-        self.depth = DEPTH * (NOISE / noise) ** 0.5
+        self.depth = WORLD_SPREAD * (FIRST_NOISE / noise) ** 0.5
 
-        # the priors of size and shape
+        # The priors of size and shape.
         space = free_space()
         self.space = without_surface(space)
         z = space.body.vertices[:, 2]
@@ -335,7 +311,8 @@ class Problem:
         # The detector assumes that the person is in the middle of the image: its landmarks are
         # turned to the direction in which the camera sees the person.
         w = seen.weight.unsqueeze(-1)
-        middle = (w * seen.u.nan_to_num()).sum(1) / w.sum(1).clamp_min(1e-9)
+        total = (w * seen.u.nan_to_num()).sum(1)
+        middle = total / w.sum(1).clamp_min(1e-9)
         rays = torch.cat([middle, torch.ones_like(middle[:, :1])], dim=1)
         rays = rays / rays.norm(dim=1, keepdim=True)
         forward = rays.new_tensor([0.0, 0, 1]).expand_as(rays)
@@ -346,7 +323,9 @@ class Problem:
         """The solver for the body with this shape."""
         solver = Solver(self.space.shaped(shape_of(self.space, shared[PLANE:])))
         of_limb = [LIMB.search(name) is not None for name in solver.rig.names]
-        weight = torch.where(torch.tensor(of_limb), LIMBS**0.5, 1.0).to(solver.prior)
+        weight = torch.where(torch.tensor(of_limb), LIMB_PRIOR**0.5, 1.0).to(
+            solver.prior
+        )
         solver.prior = solver.prior * torch.outer(weight, weight)
         return solver
 
@@ -357,7 +336,7 @@ class Problem:
         u = self.seen.u.nan_to_num() / self.zoom
         w = self.seen.weight
 
-        # translations t by least squares of  x + tx = u (z + tz),  y + ty = v (z + tz)
+        # Translations t by least squares of  x + tx = u (z + tz),  y + ty = v (z + tz).
         A = torch.zeros(*u.shape, 3, dtype=u.dtype)
         A[..., 0, 0] = 1
         A[..., 1, 1] = 1
@@ -368,18 +347,18 @@ class Problem:
         t = torch.linalg.solve(H, torch.einsum("fjki,fjk->fi", wA, b))
         t[:, 2] = t[:, 2].clamp_min(1.0)
 
-        # the body in the pose of these landmarks
+        # The body in the pose of these landmarks.
         p = self.world + t[:, None]
         q, root = solver.guess(p)
         q, root = solver.descend(q, root, p, solver.weights(w > 0))
         if self.standing.any():
-            shared[PLANE - 1] = p[:, FEET, 1].median()
+            shared[PLANE - 1] = p[:, FOOT_JOINTS, 1].median()
         return State(q, root, shared)
 
     def too_large(self, x: Tensor) -> Tensor:
         """The number of standard deviations by which a body of the shape ``x [S]`` is too large."""
         body = self.space.shaped(shape_of(self.space, x))
-        return (_log_size(body.landmarks) - self.size) / SIZE
+        return (_log_size(body.landmarks) - self.size) / HEIGHT_SPREAD
 
     def landmarks(self, at: State, solver: Solver) -> Tensor:
         """The landmarks ``[F, 33, 3]`` of a state."""
@@ -387,18 +366,33 @@ class Problem:
         return solver.points(transforms, solver.landmarks)
 
     def residuals(
-        self, x: Tensor, ground: Tensor, u: Tensor, world: Tensor, noise: Tensor
+        self,
+        x: Tensor,
+        ground: Tensor,
+        u: Tensor,
+        world: Tensor,
+        noise: Tensor,
     ) -> Tensor:
-        """``[R]`` of one frame's landmarks ``x [33, 3]``, in standard deviations: see `GROUPS`."""
+        """Residuals ``[R]`` of one frame in standard deviations, see `RESIDUAL_GROUPS`.
+
+        Args:
+            x: ``[33, 3]`` landmarks, metres.
+            ground: ``[3]`` of the plane.
+            u, world, noise: of the frame, ``[33, 2]``, ``[33, 3]``, ``[1]``.
+        """
+        # Differences from the landmarks in the image and from the detector's own 3D landmarks.
         a, b, c = ground
-        projected = self.zoom * x[:, :2] / x[:, 2:].clamp_min(NEAR)
-        from_hips = x - x[HIPS].mean(0) - world
-        feet = x[FEET]
-        height = feet[:, 1] - a * feet[:, 0] - b * feet[:, 2] - c
+        projected = self.zoom * x[:, :2] / x[:, 2:].clamp_min(MIN_DEPTH)
+        from_hips = x - x[HIP_JOINTS].mean(0) - world
+
+        # Feet are on the ground y = a x + b z + c.
+        feet = x[FOOT_JOINTS]
+        foot_x, foot_y, foot_z = feet.unbind(1)
+        height = foot_y - a * foot_x - b * foot_z - c
 
         # A standing person's trunk is above the feet: this shows the ground's slope.
-        trunk = x[TRUNK].mean(0) - feet.mean(0)
-        aside = torch.stack([trunk[0] + a * trunk[1], trunk[2] + b * trunk[1]])
+        right, down, ahead = x[TRUNK_JOINTS].mean(0) - feet.mean(0)
+        aside = torch.stack([right + a * down, ahead + b * down])
 
         parts = [
             (projected - u) / noise,
@@ -414,12 +408,12 @@ class Problem:
         F = len(X)
 
         # The detector's own 3D landmarks have an arbitrary scale: the best one is used.
-        from_hips = X - X[:, HIPS].mean(1, keepdim=True)
+        from_hips = X - X[:, HIP_JOINTS].mean(1, keepdim=True)
         w = seen.weight.unsqueeze(-1)
         own_size = (w * from_hips.square()).sum()
         scale = (own_size / (w * self.world.square()).sum()).sqrt()
 
-        # Cauchy's cost of each group of residuals, and the weights that make its squares
+        # The residuals of each frame, and the confidence of each group.
         data = (seen.u, scale * self.world, self.noise)
         dims = (0, None, 0, 0, 0)
         r = torch.vmap(self.residuals, dims)(X, ground, *data)
@@ -429,18 +423,22 @@ class Problem:
             [seen.weight, seen.weight, self.standing, left * right],
             dim=1,
         )
-        squares = r.new_zeros(weight.shape).index_add_(1, GROUPS, r.square())
+
+        # Cauchy's cost of each group, and the weights with which squares have the same gradient.
+        squares = r.new_zeros(weight.shape).index_add_(1, RESIDUAL_GROUPS, r.square())
         squares = squares / OUTLIER**2
         cost = (weight * OUTLIER**2 * squares.log1p()).sum()
-        w = (weight / (1 + squares))[:, GROUPS]
+        w = (weight / (1 + squares))[:, RESIDUAL_GROUPS]
 
-        # A = dr / dX, C = dr / dground
+        # A = dr / dX, C = dr / dground.
         A = r.new_zeros(F, r.shape[1], X[0].numel())
         C = r.new_zeros(F, r.shape[1], PLANE)
         if linear:
             derivatives = torch.func.jacfwd(self.residuals, (0, 1))
             A, C = torch.vmap(derivatives, dims)(X, ground, *data)
             A = A.flatten(2)
+
+        # The blocks of Aᵀ w A and Aᵀ w r.
         wA = w[..., None] * A
         wC = w[..., None] * C
         wr = (w * r)[..., None]
@@ -461,41 +459,47 @@ class Problem:
         """Adds accelerations of all landmarks, and speeds of standing feet."""
         step = self.seen.time.diff()
 
-        # second differences over uneven steps
+        # Accelerations: second differences over uneven steps. The weight makes the sum over frames
+        # an integral over time.
         before = step[:-1]
         after = step[1:]
         both = before + after
         stencil = torch.stack([1 / before, -1 / before - 1 / after, 1 / after])
-        weight = (both < GAP) * both * ACCELERATIONS
+        weight = (both < MAX_TIME_GAP) * both * ACCELERATIONS
         terms.add_motion(
             X,
             stencil * 2 / both / ACCELERATION,
             weight[:, None].expand(-1, 33),
         )
 
-        # first differences
+        # Speeds: first differences of feet that stand in both frames.
         stencil = torch.stack([-1 / step, 1 / step])
         weight = torch.zeros_like(self.seen.weight[1:])
         stays = self.standing[:-1] * self.standing[1:]
-        weight[:, FEET] = stays * (step < GAP)[:, None]
+        weight[:, FOOT_JOINTS] = stays * (step < MAX_TIME_GAP)[:, None]
         terms.add_motion(X, stencil / SLIDING, weight)
 
     def cost(self, at: State) -> Tensor:
         """The whole cost."""
+        # The landmarks.
         solver = self.solver(at.shared)
         X = self.landmarks(at, solver)
         found = self.terms(X, at.shared[:PLANE], linear=False)
+
+        # The priors of poses, of the size and of shared numbers, and the joints' limits.
         stop, amount = below_least(at.q, solver.least)
-        pull = ((at.q @ solver.prior) * at.q).sum() + (stop * amount.square()).sum()
+        of_poses = ((at.q @ solver.prior) * at.q).sum()
+        pull = of_poses + (stop * amount.square()).sum()
         pull = pull + self.too_large(at.shared[PLANE:]).square()
-        return found.cost + (pull + (self.prior * at.shared.square()).sum())
+        of_shared = (self.prior * at.shared.square()).sum()
+        return found.cost + (pull + of_shared)
 
     def step(self, at: State, damping: float) -> State:
         """One damped Gauss-Newton step: see the top of this module."""
         blocks = self._blocks(at)
         F, D = blocks.g_pose.shape
 
-        # the inverse of H_pose_pose times [H_pose_shared, g_pose]
+        # The inverse of H_pose_pose times [H_pose_shared, g_pose], with damping on its diagonal.
         H = blocks.pose_pose
         H = H + torch.diag_embed(damping * torch.diagonal(H, dim1=-2, dim2=-1))
         columns = torch.cat([blocks.pose_shared, blocks.g_pose[..., None]], dim=-1)
@@ -505,7 +509,7 @@ class Problem:
         else:
             solved = _solve_diagonal(H, columns)
 
-        # the numbers that all frames share, by the Schur complement
+        # The numbers that all frames share, by the Schur complement.
         shared_pose = columns[:, :-1].mT
         S = blocks.shared_shared - shared_pose @ solved[:, :-1]
         ds = torch.linalg.solve(
@@ -514,7 +518,8 @@ class Problem:
         )
 
         # The poses; the root's rotation is a matrix that takes up the first three numbers.
-        dq = -(solved[:, -1] + solved[:, :-1] @ ds).view(F, D)
+        dq = -(solved[:, -1] + solved[:, :-1] @ ds)
+        dq = dq.view(F, D)
         q = at.q + dq
         root = axis_angle_to_matrix(dq[:, :3]) @ at.root
         q[:, :3] = 0
@@ -522,6 +527,7 @@ class Problem:
 
     def _blocks(self, at: State) -> Blocks:
         """The normal equations by poses and shared numbers, without damping."""
+        # Derivatives of landmarks: J by poses, G by shared numbers, of which the ground moves none.
         solver = self.solver(at.shared)
         linear = solver.linear(at.q, at.root, torch.zeros_like(self.seen.world))
         found = self.terms(linear.residual, at.shared[:PLANE])
@@ -531,14 +537,15 @@ class Problem:
         if self.free[-1]:
             G[..., PLANE:] = self._by_shape(at, solver).flatten(1, 2)
 
-        # poses: the landmarks by the chain rule, the prior and the joints' limits
+        # Poses: the landmarks by the chain rule, the prior and the joints' limits.
         stop, amount = below_least(at.q, solver.least)
         pose_pose = J.mT @ (found.W @ J) + solver.prior
         pose_pose = pose_pose + torch.diag_embed(stop + FLOOR)
         g_pose = (J.mT @ found.g[..., None])[..., 0]
         g_pose = g_pose + at.q @ solver.prior + stop * amount
 
-        # the coupling with the first and the second later frame
+        # The coupling with the first and the second later frame: J[f + k]ᵀ near J[f], and its part
+        # of W G in both frames.
         near = found.near.unsqueeze(-1)
         WG = found.W @ G
         below = []
@@ -548,23 +555,27 @@ class Problem:
             WG[: F - k] += coupling * G[k:]
             WG[k:] += coupling * G[: F - k]
 
-        # poses and shared numbers; the ground moves no landmark, but its residuals
+        # Poses and shared numbers; the ground moves no landmark, but its residuals.
         pose_shared = J.mT @ WG
         pose_shared[..., :PLANE] += J.mT @ found.cross
 
-        # shared numbers: by landmarks, by the ground, and by the person's size
+        # Shared numbers: by landmarks and the prior.
         shared_shared = torch.einsum("fni,fnj->ij", G, WG) + self.prior.diag()
+        g_shared = torch.einsum("fni,fn->i", G, found.g) + self.prior * at.shared
+
+        # By the ground, whose residuals also depend on the shape.
         by_ground = torch.einsum("fni,fnj->ij", G, found.cross)
         shared_shared[:, :PLANE] += by_ground
         shared_shared[:PLANE] += by_ground.mT
         shared_shared[:PLANE, :PLANE] += found.W_ground
-        g_shared = torch.einsum("fni,fn->i", G, found.g) + self.prior * at.shared
         g_shared[:PLANE] += found.g_ground
+
+        # By the person's size, one residual of the shape.
         size = torch.func.jacfwd(self.too_large)(at.shared[PLANE:])
         shared_shared[PLANE:, PLANE:] += torch.outer(size, size)
         g_shared[PLANE:] += size * self.too_large(at.shared[PLANE:])
 
-        # numbers that are not free stay as they are
+        # Numbers that are not free stay as they are.
         fixed = ~self.free
         pose_shared[..., fixed] = 0
         shared_shared[fixed] = 0
@@ -596,6 +607,7 @@ class Problem:
         of_joints = moves[:T]
         of_landmarks = moves[T:]
 
+        # A joint that moves at rest moves all that follows by the difference of two rotations.
         transforms = solver.transforms(at.q, at.root, solver.joints)
         R = transforms[..., :3, :3]
         before = (R[:, solver.before] - R[:, :T]) @ of_joints  # [F, T, 3, S]
@@ -603,10 +615,11 @@ class Problem:
         carried = torch.einsum("nt,ftis->fnis", follows, before)
         return carried + R[:, solver.carrier] @ of_landmarks
 
-    def minimise(self, at: State, steps: int = STEPS) -> tuple[State, float]:
+    def minimise(self, at: State, steps: int = MAX_STEPS) -> tuple[State, float]:
         """The solution, and its cost."""
+        # Levenberg-Marquardt: a step that raises the cost is undone.
         best = self.cost(at)
-        damping = DAMPING
+        damping = FIRST_DAMPING
         for _ in range(steps):
             new = self.step(at, damping)
             cost = self.cost(new)
@@ -614,33 +627,34 @@ class Problem:
             if gain > 0:
                 at = new
                 best = cost
-                damping *= EASIER
+                damping *= GOOD_STEP_DAMPING
             else:
-                damping *= HARDER
-            if abs(gain) < SETTLED or damping > 1e6:
+                damping *= BAD_STEP_DAMPING
+            if abs(gain) < MIN_GAIN or damping > 1e6:
                 break
         return at, float(best)
 
     def standing_feet(self) -> Tensor:
-        """``[F, 4]`` 1 for those of `FEET` that stand: they hardly move across the image."""
+        """``[F, 4]`` 1 for those of `FOOT_JOINTS` that stand: they hardly move across the image."""
+        # The speed of each foot across the image, at its depth.
         state = self.start()
         p = self.landmarks(state, self.solver(state.shared))
-        depth = p[:, FEET, 2].clamp_min(NEAR)
+        depth = p[:, FOOT_JOINTS, 2].clamp_min(MIN_DEPTH)
         step = self.seen.time.diff()[:, None]
-        moved = self.seen.u[:, FEET].diff(dim=0).norm(dim=-1)
+        moved = self.seen.u[:, FOOT_JOINTS].diff(dim=0).norm(dim=-1)
         speed = moved * depth[1:] / step
 
         # A foot stands if it is slow both before and after the frame.
-        slow = (speed < STILL) & (step < GAP)
+        slow = (speed < STANDING_SPEED) & (step < MAX_TIME_GAP)
         none = torch.zeros_like(slow[:1])
         standing = torch.cat([slow, none]) & torch.cat([none, slow])
-        visible = self.seen.weight[:, FEET] > 0
+        visible = self.seen.weight[:, FOOT_JOINTS] > 0
         return (standing & visible).to(depth)
 
     def errors(self, at: State) -> tuple[Tensor, Tensor]:
         """Landmarks ``[F, 33, 3]`` and their reprojection errors ``[F, 33]``, NaN = not seen."""
         X = self.landmarks(at, self.solver(at.shared))
-        projected = self.zoom * X[..., :2] / X[..., 2:].clamp_min(NEAR)
+        projected = self.zoom * X[..., :2] / X[..., 2:].clamp_min(MIN_DEPTH)
         error = (projected - self.seen.u).norm(dim=-1)
         return X, torch.where(self.seen.weight > 0, error, torch.nan)
 
@@ -650,11 +664,15 @@ def _best_zoom(costs: Float) -> tuple[float, float]:
 
     A parabola is fitted to the lower cost of both ways, near its minimum.
     """
+    # The cost of each focal length, with the prior of the guess.
     there = costs[: len(ZOOMS)][::-1]
     back = costs[len(ZOOMS) :]
     cost = np.minimum(there, back) + (ZOOMS / FOCAL_SPREAD) ** 2
-    best = int(np.clip(cost.argmin(), NEAREST, len(ZOOMS) - 1 - NEAREST))
-    near = slice(best - NEAREST, best + NEAREST + 1)
+
+    # The parabola a z² + b z + c has its minimum at -b / 2a, and the variance 1 / a there.
+    last = len(ZOOMS) - 1
+    best = int(np.clip(cost.argmin(), ZOOM_NEIGHBOURS, last - ZOOM_NEIGHBOURS))
+    near = slice(best - ZOOM_NEIGHBOURS, best + ZOOM_NEIGHBOURS + 1)
     a, b, _ = np.polyfit(ZOOMS[near], cost[near], 2)
     zoom = float(np.clip(-b / (2 * a), ZOOMS[0], ZOOMS[-1]))
     return zoom, float(max(a, 1.0) ** -0.5)
@@ -676,6 +694,8 @@ def _solve_diagonal(H: Tensor, right: Tensor) -> Tensor:
 def _solve_banded(H: Tensor, below: list[Tensor], right: Tensor) -> Tensor:
     """Solves the equations with diagonal blocks ``H [F, D, D]`` and the blocks below them."""
     F, D, _ = H.shape
+
+    # LAPACK's band storage: row k holds the k-th diagonal below the main one.
     row, column = np.indices((D, D)).reshape(2, -1)
     band = np.zeros((3 * D, F * D))
     for k, block in enumerate([H, *below]):

@@ -1,6 +1,6 @@
 """The options of `gsgan.prepare`, and the images and cameras that they name."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,8 +21,8 @@ from gsgan.utils.checks import above, between, one_of, whole
 from gsgan.utils.errors import ConfigError, DataError
 
 MEDIAPIPE = "mediapipe"
-AXES = ("x", "y", "z", "-x", "-y", "-z")
-# options that do not change the dataset
+UP_AXES = ("x", "y", "z", "-x", "-y", "-z")
+# Options that do not change the dataset.
 FREE = ("out", "setup", "workers", "overwrite", "keep_work")
 
 
@@ -73,14 +73,14 @@ class Options:
     format: str = "jpg"
 
     def __post_init__(self) -> None:
-        # what must be given
+        # Options that must be given.
         if not self.source:
             raise ConfigError("give source=<folder with the videos, or one video>")
         if not self.out:
             raise ConfigError("give out=<folder to make>")
 
-        # values of each key
-        for name, choices in (("unit", UNITS), ("up_axis", AXES)):
+        # Values of each key.
+        for name, choices in (("unit", UNITS), ("up_axis", UP_AXES)):
             if getattr(self, name) is not None:
                 one_of(name, getattr(self, name), choices)
         if self.pixel_centre not in (0, 0.5):
@@ -140,8 +140,8 @@ class Inputs:
     sources: Mapping[str, Recording]
     calibration: Calibration
     # in the order of the sources, with their names and sizes
-    cameras: tuple[CameraEntry, ...]
-    notes: tuple[str, ...]  # one sentence for each thing that was converted or left out
+    cameras: Sequence[CameraEntry]
+    notes: Sequence[str]  # one sentence for each thing that was converted or left out
     fps: float
 
 
@@ -160,7 +160,7 @@ def read_inputs(options: Options) -> Inputs:
             f"offsets name {unknown[0]}, but the videos are {', '.join(sources)}"
         )
 
-    # the calibration, in a file that is given or found
+    # The calibration, in a file that is given or found.
     path = folder if options.calibration is None else options.folder("calibration")
     if path.is_dir():
         path = find_calibration(path)
@@ -172,9 +172,11 @@ def read_inputs(options: Options) -> Inputs:
             f"{folder} holds only the camera {next(iter(sources), 'none')}; 3D needs two"
         )
 
-    # the cameras in the order of the sources, with a note on each difference
+    # The cameras in the order of the sources, with a note on each difference.
     pairs = pair_cameras(
-        list(sources), list(calibration.cameras), options.cameras or {}
+        list(sources),
+        list(calibration.cameras),
+        options.cameras or {},
     )
     notes = list(calibration.notes)
     cameras = []
@@ -189,9 +191,9 @@ def read_inputs(options: Options) -> Inputs:
         notes.append(f"calibrated without a video, left out: {', '.join(unused)}")
     notes += recording_notes(sources)
 
-    # the median of the videos' rates, if none is given
+    # The median of the videos' rates, if none is given.
     rates = sorted(source.fps for source in sources.values() if source.fps)
     if options.fps is None and not rates:
         raise ConfigError("images have no frame rate; give fps=<frames per second>")
     fps = float(options.fps or rates[len(rates) // 2])
-    return Inputs(sources, calibration, tuple(cameras), tuple(notes), fps)
+    return Inputs(sources, calibration, cameras, notes, fps)

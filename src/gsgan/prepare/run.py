@@ -38,6 +38,7 @@ DELAY_GAIN = 0.05  # share of the error that correcting a delay must remove
 
 def summarise(outcome: Outcome) -> dict[str, Any]:
     """The content of prepare.json; errors are medians, in pixels of the full-size image."""
+    # The numbers of each camera.
     inputs = outcome.inputs
     solution = outcome.solution
     turned, moved = camera_moves(CameraArray.of(inputs.cameras), solution.cameras)
@@ -58,7 +59,7 @@ def summarise(outcome: Outcome) -> dict[str, Any]:
             "frames_written": len(outcome.written[name]),
         }
 
-    # frames without an image of any camera
+    # Frames without an image of any camera.
     kept = set().union(*outcome.written.values())
     frames = outcome.frames.tolist()
     dropped = [frame for frame in frames if frame not in kept]
@@ -82,6 +83,7 @@ def summarise(outcome: Outcome) -> dict[str, Any]:
 
 
 def _late_clocks(solution: Solution, names: Iterable[str]) -> list[str]:
+    """Notes on cameras whose clocks are late."""
     notes = []
     for name, delay, gain in zip(names, solution.delay, solution.gain, strict=True):
         if abs(delay) > DELAY and gain > DELAY_GAIN:
@@ -95,14 +97,13 @@ def print_summary(numbers: Mapping[str, Any], console: Console) -> None:
     stages = numbers["error_px"]
     cameras = numbers["cameras"]
 
-    # a row for each camera, and one for all
+    # A row for each camera, and one for all.
     rows: list[tuple[str, ...]] = []
     for name, camera in cameras.items():
-        errors = [_number(error, ".2f") for error in camera["error_px"].values()]
         rows.append(
             (
                 name,
-                *errors,
+                *_errors(camera["error_px"]),
                 f"{camera['turned_degrees']:.2f}°",
                 f"{camera['moved_mm']:.0f} mm",
                 f"{camera['flipped_share']:.0%}",
@@ -110,16 +111,15 @@ def print_summary(numbers: Mapping[str, Any], console: Console) -> None:
                 str(camera["frames_written"]),
             )
         )
-    errors = [_number(error, ".2f") for error in stages.values()]
-    rows.append(("all", *errors))
+    rows.append(("all", *_errors(stages)))
     headers = ("camera", *stages, "turned", "moved", "swapped", "late", "images")
     title = (
         "Median error in pixels by stage; refinement, swapped sides, frames that clocks "
         "are late"
     )
-    console.print(Table(headers, tuple(rows)).for_terminal(title))
+    console.print(Table(headers, rows).for_terminal(title))
 
-    # the notes, a line each
+    # The notes, a line each.
     notes = [
         *numbers["notes"],
         f"{numbers['frames']} frames at {numbers['fps']:g} per second",
@@ -128,6 +128,11 @@ def print_summary(numbers: Mapping[str, Any], console: Console) -> None:
     if dropped:
         notes.append(f"{len(dropped)} frames were dropped: no skeleton or no mask")
     console.print("\n".join(notes), markup=False, highlight=False)
+
+
+def _errors(by_stage: Mapping[str, float]) -> list[str]:
+    """The error after each stage as text."""
+    return [_number(error, ".2f") for error in by_stage.values()]
 
 
 def _number(value: float, form: str) -> str:
@@ -148,17 +153,19 @@ def prepare(options: Options, console: Console) -> Path:
         GsganError: on anything the user can correct, also errors that the check of the dataset
             finds.
     """
+    # The same dataset, if it exists.
     out = options.folder("out")
     inputs = None if options.one_camera else read_inputs(options)
     key = digest([STAGE_VERSION, options.record(), _fingerprint(options, inputs)])
     if exists(out, key, options.overwrite):
         console.print(f"{out} exists already, made from the same images and settings")
-        if not (out / "check.json").is_file():  # killed before its last file
+        # A run may have been killed before its last file.
+        if not (out / "check.json").is_file():
             check_capture(out, out / "check.html", console)
         _refuse_errors(out)
         return out
 
-    # joints, cameras and masks, from one camera or from several
+    # Joints, cameras and masks, from one camera or from several.
     stages = StageFolder(out.parent / f".{out.name}.prepare")
     extra: dict[str, object] = {}
     if inputs is None:
@@ -176,20 +183,22 @@ def prepare(options: Options, console: Console) -> Path:
             detections[name] = landmarks.read_detections(found[name])
         frames, solution = _solved(options, inputs, detections, console)
 
-    # the dataset, in a folder of its own until it is complete
+    # The dataset, in a folder of its own until it is complete; a run that was killed leaves one.
     root = stages.path("dataset", key)
-    shutil.rmtree(root, ignore_errors=True)  # of a run that was killed
+    shutil.rmtree(root, ignore_errors=True)
     written = _write_images(options, inputs, masks, frames, solution, root)
     outcome = Outcome(options, inputs, frames, solution, written)
     write_files(root, outcome, key)
     numbers = summarise(outcome) | extra
     write_json(root / "prepare.json", numbers)
     publish(root, out)
+
+    # Results of this run are kept for the next one, if so asked.
     stages.remove_others()
     if not options.keep_work:
         shutil.rmtree(stages.folder, ignore_errors=True)
 
-    # the check, and what to do next
+    # The check, and what to do next.
     check_capture(out, out / "check.html", console)
     print_summary(numbers, console)
     _refuse_errors(out)
@@ -218,18 +227,23 @@ def _refuse_errors(out: Path) -> None:
 
 def _fingerprint(options: Options, inputs: Inputs | None) -> list[object]:
     """The identity of all inputs: images, calibration, landmark and mask files, the tool."""
-    parts: list[object] = [stamp(options.folder("source"))]
-    if inputs is not None:
-        parts = [source.fingerprint() for source in inputs.sources.values()]
+    # Images and calibration.
+    parts: list[object] = []
+    if inputs is None:
+        parts.append(stamp(options.folder("source")))
+    else:
+        for source in inputs.sources.values():
+            parts.append(source.fingerprint())
         parts.append(inputs.calibration.path.name)
-        parts += [str(camera) for camera in inputs.cameras]
+        parts += map(str, inputs.cameras)
 
-    # given files; the tool's results depend on the images and the tool
+    # Given files; the tool's results depend on the images and the tool.
     for name in ("landmarks", "masks"):
         if getattr(options, name) != MEDIAPIPE:
             place = options.folder(name)
-            paths = sorted((place, *place.rglob("*")))
-            parts += [stamp(path) for path in paths if path.is_file()]
+            for path in sorted((place, *place.rglob("*"))):
+                if path.is_file():
+                    parts.append(stamp(path))
     parts.append(tool_key() if options.needs_tool else None)
     return parts
 
@@ -241,7 +255,7 @@ def _solved(
     console: Console,
 ) -> tuple[Ints, Solution]:
     """The joints and cameras that fit the 2D landmarks of the chosen frames."""
-    # the detections of the chosen frames and joints, inside their images
+    # The chosen frames.
     frames, px, conf = landmarks.gather(detections, options.offsets or {})
     chosen = np.ones(len(frames), bool)
     if options.frames is not None:
@@ -250,6 +264,8 @@ def _solved(
         raise DataError(
             f"{options.folder('source')}: frames={options.frames} leaves no frame"
         )
+
+    # Their detections of the chosen joints, inside the images.
     joints = slice(None if options.hands or options.face else BODY)
     frames = frames[chosen]
     px = px[:, chosen, joints]
@@ -259,14 +275,16 @@ def _solved(
     sizes = np.array([camera.size[::-1] for camera in inputs.cameras])
     px, conf = landmarks.inside(px, conf, sizes)
 
-    # without lens distortion
+    # The same pixels without lens distortion.
     uv = np.empty(px.shape)
     for c, camera in enumerate(inputs.cameras):
         uv[c] = undistort_points(camera, px[c])
 
+    # A quick solution shows cameras in a wrong unit before the long one begins.
     cameras = CameraArray.of(inputs.cameras)
     C = len(cameras)
-    p = plain(cameras, uv.reshape(C, -1, 2), conf.reshape(C, -1))
+    flat_uv = uv.reshape(C, -1, 2)
+    p = plain(cameras, flat_uv, conf.reshape(C, -1))
     _check_distance(inputs, p)
     with console.status("finding 3D joints and refining the cameras"):
         return frames, solve(cameras, frames / inputs.fps, uv, conf, options.solve)
@@ -294,7 +312,8 @@ def _write_images(
 ) -> dict[str, list[int]]:
     """Writes the images of every frame that has a skeleton."""
     # Frames without a joint of the body are left out.
-    posed = set(frames[known(solution.p[:, :BODY]).any(1)].tolist())
+    has_joint = known(solution.p[:, :BODY]).any(1)
+    posed = set(frames[has_joint].tolist())
     if not posed:
         raise DataError(
             f"{options.landmarks}: no body joint of any frame came out in "

@@ -5,7 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsgan.data.joints import ALL, BODY, FLIP_GROUPS, HAND_PAIRS, HANDS, WRISTS, known
-from gsgan.prepare.camera_array import FOCAL, MIN_VIEWS, CameraArray, refine_cameras
+from gsgan.prepare.camera_array import (
+    MIN_VIEWS,
+    UNIT_FOCAL,
+    CameraArray,
+    refine_cameras,
+)
 from gsgan.prepare.cleanse import cleanse, smooth
 from gsgan.prepare.triangulate import (
     FLIP_GAIN,
@@ -22,8 +27,8 @@ from gsgan.utils.arrays import Bool, Float, Ints, evenly_spaced, nanmedian
 from gsgan.utils.checks import above, at_least, whole
 
 # Errors and distances are in thousandths of the focal length.
-WRIST = 40.0  # distance from the pose's wrist at which a hand counts half
-MAX_ERROR = 20.0  # maximum median error of a detected hand
+WRIST_SCALE = 40.0  # distance from the pose's wrist at which a hand counts half
+MAX_HAND_ERROR = 20.0  # maximum median error of a detected hand
 OWN_PAIRS = tuple((j, j + HAND) for j in range(len(HAND_PAIRS)))
 REFINED = 200  # maximum number of frames that refine the cameras, evenly spaced
 LAG = 6  # frames by which clocks are compared, either way
@@ -39,20 +44,19 @@ def match_hands(cameras: CameraArray, uv: Float, weight: Float, wrists: Float) -
 
     Args:
         cameras: ``C`` cameras.
-        cameras: ``C`` cameras.
         uv: ``[C, F, 42, 2]`` undistorted pixels, the left hand's first, NaN = not seen.
         weight: ``[C, F, 42]`` their confidence.
         wrists: ``[C, F, 2, 2]`` the pose's wrists in each view; NaN = unknown.
     """
+    # Distances [C, F, hand, wrist] of the first landmark of each hand from the pose's wrists.
     C, F, _ = weight.shape
     roots = uv.reshape(C, F, 2, HAND, 2)[:, :, :, 0]
     root_weight = weight.reshape(C, F, 2, HAND, 1)[:, :, :, 0]
-    # [C, F, hand, wrist]
     distance = np.linalg.norm(roots[:, :, :, None] - wrists[:, :, None], axis=-1)
 
     # A hand is left out if one wrist is unknown: its distances cannot be compared.
     known = np.isfinite(distance).all(-1, keepdims=True)
-    loss = HAND * root_weight * np.log1p((distance / WRIST) ** 2)
+    loss = HAND * root_weight * np.log1p((distance / WRIST_SCALE) ** 2)
     loss = np.where(known, loss, 0.0)
     kept = loss[..., 0, 0] + loss[..., 1, 1]
     swapped = loss[..., 0, 1] + loss[..., 1, 0]
@@ -64,29 +68,30 @@ def match_hands(cameras: CameraArray, uv: Float, weight: Float, wrists: Float) -
         _, cost = points_and_cost(cameras, sided, seen)
         return cost + from_wrists
 
+    # Hands nearer to the other wrist start swapped.
     flips = cheapest_flips(cost_of, swapped < kept, FLIP_GAIN * weight.sum(-1))
     everywhere = np.arange(F)
     return flips ^ (cost_of(~flips, everywhere) < cost_of(flips, everywhere))
 
 
 def misfits(error: Float) -> Bool:
-    """The hands ``[C, F, 2]`` whose median of ``error [C, F, 42]`` is above `MAX_ERROR`.
+    """The hands ``[C, F, 2]`` whose median of ``error [C, F, 42]`` is above `MAX_HAND_ERROR`.
 
     They are another person's, something else, or the same hand detected twice.
     """
     by_hand = error.reshape(*error.shape[:2], 2, HAND)
-    return nanmedian(by_hand, -1) > MAX_ERROR
+    return nanmedian(by_hand, -1) > MAX_HAND_ERROR
 
 
 @dataclass(frozen=True)
 class SolveSettings:
     """Settings of the solution, see conf/prepare.yaml."""
 
-    min_confidence: float = 0.1
-    refinements: int = 2
-    rotation_prior: float = 2.0
-    position_prior: float = 0.05
-    smoothing: float = 0.02
+    min_confidence: float = 0.1  # of a detection
+    refinements: int = 2  # number of rounds
+    rotation_prior: float = 2.0  # standard deviation, degrees
+    position_prior: float = 0.05  # standard deviation, metres
+    smoothing: float = 0.02  # seconds
 
     def __post_init__(self) -> None:
         whole("solve.refinements", self.refinements, 0)
@@ -135,7 +140,11 @@ class Corrected:
 
 
 def solve(
-    cameras: CameraArray, time: Float, uv: Float, conf: Float, settings: SolveSettings
+    cameras: CameraArray,
+    time: Float,
+    uv: Float,
+    conf: Float,
+    settings: SolveSettings,
 ) -> Solution:
     """All stages: plain, robust, flips, refined, smoothed.
 
@@ -147,8 +156,9 @@ def solve(
         conf: ``[C, F, J]`` 0 = not seen.
         settings: of every stage.
     """
+    # Errors are in pixels of cameras of one focal length.
     given = cameras
-    to_pixels = (given.focal / FOCAL)[:, None, None]
+    to_pixels = (given.focal / UNIT_FOCAL)[:, None, None]
     cameras, scaled = cameras.normalised(uv)
     weight = np.where(conf > settings.min_confidence, conf, 0.0)
 
@@ -167,10 +177,13 @@ def solve(
 
     # Remove impossible joints and smooth the rest.
     p, removed = cleanse(found.points.p.reshape(*conf.shape[1:], 3))
-    agreed = _mean_seen(found.points.weight.reshape(conf.shape), found.weight)
+    final_weight = found.points.weight.reshape(conf.shape)
+    agreed = _mean_seen(final_weight, found.weight)
     p = smooth(p, agreed, time, settings.smoothing)
-    error = cameras.errors(p.reshape(-1, 3), _flat(found.uv)).reshape(conf.shape)
-    error = np.where(found.weight > 0, error, np.nan)
+
+    # The final errors, of detections that were used.
+    error = cameras.errors(p.reshape(-1, 3), _flat(found.uv))
+    error = np.where(found.weight > 0, error.reshape(conf.shape), np.nan)
     stages["smoothed"] = error
 
     # Errors by stage are those of the body, in pixels of each camera.
@@ -180,7 +193,9 @@ def solve(
         stages_in_pixels[name] = of_body * to_pixels
 
     delay, gain = clock_errors(
-        cameras, found.uv[:, :, :BODY], found.weight[:, :, :BODY]
+        cameras,
+        found.uv[:, :, :BODY],
+        found.weight[:, :, :BODY],
     )
     return Solution(
         cameras=CameraArray(given.K, cameras.R, cameras.t),
@@ -204,6 +219,7 @@ def _refined(
     settings: SolveSettings,
 ) -> tuple[CameraArray, Corrected]:
     """Refines the cameras and triangulates again, in turn."""
+    # Some frames are enough for the cameras; each round begins with better points.
     cameras = start
     F = weight.shape[1]
     at = np.array(evenly_spaced(F, REFINED, ends=True))
@@ -230,7 +246,7 @@ def correct(cameras: CameraArray, uv: Float, conf: Float) -> Corrected:
         uv: ``[C, F, J, 2]`` thousandths of the focal length.
         conf: ``[C, F, J]`` 0 = not seen.
     """
-    # the body
+    # Sides of the body.
     flips = find_flips(cameras, uv, conf, FLIP_GROUPS)
     sided = apply_flips(uv, flips, FLIP_GROUPS)
     weight = apply_flips(conf, flips, FLIP_GROUPS)
@@ -246,11 +262,13 @@ def correct(cameras: CameraArray, uv: Float, conf: Float) -> Corrected:
     projected, _ = cameras.project(arms.p)
     wrists = np.where(np.isfinite(own), own, projected.reshape(own.shape))
 
-    # the hands: swapped sides, then hands that do not fit the others
+    # Sides of the hands.
     swapped = match_hands(cameras, sided[:, :, HANDS], weight[:, :, HANDS], wrists)
     swapped = swapped[..., None]
     sided = apply_flips(sided, swapped, [HAND_PAIRS])
     weight = apply_flips(weight, swapped, [HAND_PAIRS])
+
+    # Hands that do not fit those of other cameras are left out.
     points = robust(cameras, _flat(sided), _flat(weight))
     left_out = misfits(points.error.reshape(conf.shape)[:, :, HANDS])
     weight[:, :, HANDS] *= ~left_out.repeat(HAND, axis=-1)
@@ -265,7 +283,8 @@ def _flat(values: Float) -> Float:
 
 def _mean_seen(values: Float, weight: Float) -> Float:
     """The mean ``[F, J]`` over the cameras that see a joint."""
-    return np.asarray(values.sum(0) / np.maximum((weight > 0).sum(0), 1))
+    views = (weight > 0).sum(0)
+    return values.sum(0) / np.maximum(views, 1)
 
 
 def clock_errors(cameras: CameraArray, uv: Float, weight: Float) -> tuple[Float, Float]:
@@ -292,18 +311,20 @@ def clock_errors(cameras: CameraArray, uv: Float, weight: Float) -> tuple[Float,
     if C <= MIN_VIEWS or lag < 1:
         return delay, gain
     for c in range(C):
+        # The joints as the other cameras see them, in this camera.
         others = np.arange(C) != c
         points = robust(cameras[others], _flat(uv[others]), _flat(weight[others]))
         projected, _ = cameras.project(points.p)
         expected = projected[c].reshape(uv.shape[1:])
         seen = np.where((weight[c] > 0)[..., None], uv[c], np.nan)
 
-        # the camera's frame f against the others' frame f - s
+        # The camera's frame f against the others' frame f - s.
         errors = []
         for s in range(-lag, lag + 1):
             ours = seen[max(s, 0) : F + min(s, 0)]
             theirs = expected[max(-s, 0) : F - max(s, 0)]
             errors.append(median(np.linalg.norm(ours - theirs, axis=-1)))
+        # The best lag, between frames by a parabola.
         if np.isfinite(errors[lag]):
             best = int(np.nanargmin(errors))
             delay[c] = lag - best - _vertex(errors[max(best - 1, 0) : best + 2])

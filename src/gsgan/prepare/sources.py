@@ -72,7 +72,8 @@ def find_sources(folder: Path, rotate: bool = False) -> dict[str, Recording]:
         DataError: when there are none, or two videos have the same stem.
     """
     # The first folder with recordings counts.
-    for place in [folder / name for name in INSIDE] + [folder]:
+    for name in (*INSIDE, "."):
+        place = folder / name
         sources = _sources_in(place, rotate) if place.is_dir() else {}
         if sources:
             return sources
@@ -87,14 +88,16 @@ def find_sources(folder: Path, rotate: bool = False) -> dict[str, Recording]:
 
 
 def _sources_in(folder: Path, rotate: bool) -> dict[str, Recording]:
+    """The recordings in a folder by name; other files do not count."""
     sources: dict[str, Recording] = {}
     for path in sorted(folder.iterdir(), key=lambda path: natural_order(path.name)):
         if path.name.startswith("."):
             continue
-        is_folder = path.is_dir()
-        files = frame_files(folder, path.name, IMAGE_SUFFIXES) if is_folder else None
 
-        # a folder of images, or a video
+        # A folder of images, or a video.
+        files = None
+        if path.is_dir():
+            files = frame_files(folder, path.name, IMAGE_SUFFIXES)
         if files:
             paths = {number: folder / files[number] for number in sorted(files)}
             size = read_header(next(iter(paths.values())))[0]
@@ -128,7 +131,9 @@ def video_recording(path: Path, rotate: bool) -> Recording:
     fps = float(video.get(cv2.CAP_PROP_FPS))
     turned = int(video.get(cv2.CAP_PROP_ORIENTATION_META))
     count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
-    first = next(_decoded(video), None)  # the header's size may differ from the images'
+
+    # The header's size may differ from that of the images.
+    first = next(_decoded(video), None)
     if first is None:
         raise DataError(
             f"{path} holds no image that can be decoded; convert it to H.264 MP4"
@@ -171,7 +176,9 @@ def _decoded(video: cv2.VideoCapture) -> Iterator[Bytes]:
 
 
 def pair_cameras(
-    sources: Sequence[str], cameras: Sequence[str], given: Mapping[str, object]
+    sources: Sequence[str],
+    cameras: Sequence[str],
+    given: Mapping[str, object],
 ) -> dict[str, str]:
     """The calibrated camera of each source.
 
@@ -181,6 +188,7 @@ def pair_cameras(
     Raises:
         DataError: when a source has no camera or two have the same, listing both sides.
     """
+    # Given pairs must name sources and cameras that exist.
     both = f"videos: {', '.join(sources)}; calibration: {', '.join(cameras)}"
     named = {str(source): str(camera) for source, camera in given.items()}
     for source, camera in named.items():
@@ -212,14 +220,20 @@ def matching_cameras(source: str, cameras: Sequence[str]) -> list[str]:
     """The calibrated cameras that a source's name fits, see `pair_cameras`."""
     if source in cameras:
         return [source]
-    # the same name, or a word of the source's name
-    words = re.split(r"[^0-9a-z]+", source.lower())
-    same = [camera for camera in cameras if camera.lower() == source.lower()]
+
+    # The same name, or a word of the source's name.
+    name = source.lower()
+    words = re.split(r"[^0-9a-z]+", name)
+    same = [camera for camera in cameras if camera.lower() == name]
     return same or [camera for camera in cameras if camera.lower() in words]
 
 
 def fit_size(
-    camera: CameraEntry, name: str, size: tuple[int, int], crop_px: int, where: Path
+    camera: CameraEntry,
+    name: str,
+    size: tuple[int, int],
+    crop_px: int,
+    where: Path,
 ) -> tuple[CameraEntry, str | None]:
     """A camera with its source's name and image size, and a note when the sizes differ.
 
@@ -246,15 +260,21 @@ def fit_size(
 
 def recording_notes(sources: Mapping[str, Recording]) -> list[str]:
     """Notes on frame rates and lengths that differ, and on rotation metadata."""
+    rates = {}
+    counts = {}
+    for name, source in sources.items():
+        counts[name] = source.count
+        if source.fps:
+            rates[name] = source.fps
+
+    # Rates and counts that differ.
     notes = []
-    rates = {name: source.fps for name, source in sources.items() if source.fps}
-    counts = {name: source.count for name, source in sources.items()}
     for what, values in (("frame rates", rates), ("numbers of frames", counts)):
         if values and max(values.values()) > (1 + DIFFERENT) * min(values.values()):
             text = ", ".join(f"{name} {value:g}" for name, value in values.items())
             notes.append(f"{what} differ ({text}); frames are paired by number")
 
-    # rotations that are not applied
+    # Rotations that are not applied.
     for name, source in sources.items():
         if source.turned and not source.rotate:
             notes.append(

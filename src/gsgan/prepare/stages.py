@@ -14,14 +14,17 @@ from rich.console import Console
 from gsgan.utils.console import progress
 from gsgan.utils.files import writing
 
-T = TypeVar("T")
+Result = TypeVar("Result")
 Advance = Callable[[int, int], None]  # takes the number of steps done and in total
 KEY_LENGTH = 12
 
 
 def each_camera(
-    task: Callable[[str, Advance], T], what: str, names: Sequence[str], workers: int
-) -> dict[str, T]:
+    task: Callable[[str, Advance], Result],
+    what: str,
+    names: Sequence[str],
+    workers: int,
+) -> dict[str, Result]:
     """Runs ``task(camera, advance)`` per camera in threads, with one progress bar each on stderr.
 
     The first failure or an interrupt is raised; tasks that have not started are cancelled, and
@@ -31,7 +34,7 @@ def each_camera(
     console = Console(stderr=True)
     bars = progress(console, disable=not console.is_terminal)
 
-    def run(name: str) -> T:
+    def run(name: str) -> Result:
         row = bars.add_task(f"{what}: {name}", total=None)
 
         def advance(done: int, count: int) -> None:
@@ -41,6 +44,7 @@ def each_camera(
 
         return task(name, advance)
 
+    # The results are in the order of the names.
     with bars, ThreadPoolExecutor(workers) as pool:
         futures = {name: pool.submit(run, name) for name in names}
         try:

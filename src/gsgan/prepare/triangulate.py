@@ -12,20 +12,24 @@ from gsgan.prepare.camera_array import MIN_VIEWS, CameraArray
 from gsgan.utils.arrays import Bool, Float, Ints, nanmedian
 
 # Errors are in thousandths of the focal length: pixels, at a focal length of 1000 pixels.
-SCALE = 3.5  # error at which a detection counts half (Cauchy's weight)
-MAX_ERROR = 35.0  # median error beyond which detections contradict each other
+HALF_WEIGHT_ERROR = 3.5  # error at which a detection counts half (Cauchy's weight)
+MAX_MEDIAN_ERROR = 35.0  # median error beyond which detections contradict each other
 # maximum ratio of a point's uncertainty along the rays to that across: above, they are too parallel
 MAX_ELONGATION = 20.0
-# mean loss per detection that a swap must save; an error of SCALE costs 0.7
+# mean loss per detection that a swap must save; an error of HALF_WEIGHT_ERROR costs 0.7
 FLIP_GAIN = 0.15
-FAR = 1e6  # pixels: stands for an infinite error
-FLAT = 1e-15  # determinant over trace³: below it the equations are singular in float64
+FAR_ERROR = 1e6  # pixels: stands for an infinite error
+MIN_DETERMINANT = (
+    1e-15  # determinant over trace³: below it the equations are singular in float64
+)
 ITERATIONS = 10  # of reweighting
 QUICK_ITERATIONS = 3  # of reweighting, in the search for swapped sides
-CHUNK = 100_000  # points processed at once: bounds the memory, changes nothing else
+POINTS_AT_ONCE = (
+    100_000  # points processed at once: bounds the memory, changes nothing else
+)
 MAX_PAIRS = 60  # pairs of cameras tried as a start; of more, a spread-out part
 # minimum number of a group: hips at the border of an image do not tell left from right
-LEAST_JOINTS = 3
+MIN_GROUP = 3
 PROGRESSION = 7919  # a prime: spreads the chosen camera pairs when there are too many
 
 Pairs = tuple[tuple[int, int], ...]
@@ -58,14 +62,14 @@ def robust(
     uv: Float,
     weight: Float,
     iterations: int = ITERATIONS,
-    max_error: float = MAX_ERROR,
+    max_error: float = MAX_MEDIAN_ERROR,
 ) -> Triangulated:
     """Robust triangulation: starts from the best camera pair, then reweights iteratively.
 
-    The loss is Cauchy's, ``log(1 + (r/SCALE)²)`` of the reprojection error r, times the weight;
-    errors are in thousandths of the focal length. A point is NaN with fewer than two weighted
-    views, with rays too parallel (`MAX_ELONGATION`), or if its detections contradict each other
-    (``max_error``).
+    The loss of a reprojection error r is Cauchy's, ``log(1 + (r/s)²)`` with s `HALF_WEIGHT_ERROR`,
+    times the weight; errors are in thousandths of the focal length. A point is NaN with fewer than
+    two weighted views, with rays too parallel (`MAX_ELONGATION`), or if its detections contradict
+    each other (``max_error``).
 
     Args:
         cameras: ``C`` cameras.
@@ -74,20 +78,28 @@ def robust(
         iterations: of reweighting.
         max_error: maximum median error of a point.
     """
-    parts = []
-    for start in range(0, max(uv.shape[1], 1), CHUNK):
-        at = slice(start, start + CHUNK)
+    p = []
+    weights = []
+    errors = []
+    for start in range(0, max(uv.shape[1], 1), POINTS_AT_ONCE):
+        at = slice(start, start + POINTS_AT_ONCE)
         part = _robust(cameras, uv[:, at], weight[:, at], iterations, max_error)
-        parts.append(part)
+        p.append(part.p)
+        weights.append(part.weight)
+        errors.append(part.error)
     return Triangulated(
-        p=np.concatenate([part.p for part in parts]),
-        weight=np.concatenate([part.weight for part in parts], axis=1),
-        error=np.concatenate([part.error for part in parts], axis=1),
+        p=np.concatenate(p),
+        weight=np.concatenate(weights, axis=1),
+        error=np.concatenate(errors, axis=1),
     )
 
 
 def _robust(
-    cameras: CameraArray, uv: Float, weight: Float, iterations: int, max_error: float
+    cameras: CameraArray,
+    uv: Float,
+    weight: Float,
+    iterations: int,
+    max_error: float,
 ) -> Triangulated:
     weight = np.where(known(uv), weight, 0.0)
     a, b = _rows(cameras, uv, weight)
@@ -97,18 +109,21 @@ def _robust(
     reweighted = weight
     information = np.zeros((p.shape[0], 3, 3))
     for _ in range(iterations):
-        cauchy = 1 / (1 + (cameras.errors(p, uv) / SCALE) ** 2)
+        # Points that are not found yet keep a weight of 0.
+        cauchy = 1 / (1 + (cameras.errors(p, uv) / HALF_WEIGHT_ERROR) ** 2)
         reweighted = weight * np.nan_to_num(cauchy, nan=0.0)
         _, depth = cameras.project(p)
         scaled = np.nan_to_num(reweighted / np.maximum(depth, NEAR) ** 2)
         new, information = _solve(a, b, scaled)
         p = np.where(np.isfinite(new), new, p)
 
-    # points with parallel rays, contradicting detections or too few views
-    error = cameras.errors(p, uv)
+    # Points with parallel rays: eigenvalues of the information are inverse variances.
     certainty = np.linalg.eigvalsh(information)
     missing = certainty[:, 0] * MAX_ELONGATION**2 < certainty[:, 2]
-    finite = np.nan_to_num(error, nan=np.nan, posinf=FAR)
+
+    # Points with contradicting detections or too few views.
+    error = cameras.errors(p, uv)
+    finite = np.nan_to_num(error, nan=np.nan, posinf=FAR_ERROR)
     used = np.where(weight > 0, finite, np.nan)
     missing |= nanmedian(used) > max_error
     missing |= (weight > 0).sum(0) < MIN_VIEWS
@@ -124,8 +139,8 @@ def robust_cost(error: Float, weight: Float) -> Float:
 
     Detections with weight 0 cost nothing; a point that was not found costs as one far away.
     """
-    far = np.nan_to_num(error, nan=FAR, posinf=FAR)
-    return (np.log1p((far / SCALE) ** 2) * weight).sum(0)
+    far = np.nan_to_num(error, nan=FAR_ERROR, posinf=FAR_ERROR)
+    return (np.log1p((far / HALF_WEIGHT_ERROR) ** 2) * weight).sum(0)
 
 
 def _rows(cameras: CameraArray, uv: Float, weight: Float) -> tuple[Float, Float]:
@@ -134,22 +149,23 @@ def _rows(cameras: CameraArray, uv: Float, weight: Float) -> tuple[Float, Float]
     With ``K R X + K t = (x, y, z)``, z being the depth, the error in pixels is ``u - x / z``;
     times z it is linear in X: ``a·X - b``.
     """
+    # Detections that are not used may be NaN.
     uv = np.where((weight > 0)[..., None], uv, 0.0)
-    KR = cameras.K @ cameras.R
-    Kt = np.einsum("cij,cj->ci", cameras.K, cameras.t)
-    a = uv[..., None] * KR[:, None, 2:] - KR[:, None, :2]
-    b = Kt[:, None, :2] - uv * Kt[:, None, 2:]
+    KR = (cameras.K @ cameras.R)[:, None]
+    Kt = np.einsum("cij,cj->ci", cameras.K, cameras.t)[:, None]
+    a = uv[..., None] * KR[:, :, 2:] - KR[:, :, :2]
+    b = Kt[:, :, :2] - uv * Kt[:, :, 2:]
     return a, b
 
 
 def _solve(a: Float, b: Float, weight: Float) -> tuple[Float, Float]:
     """Least squares ``[N, 3]``, NaN if views are too few, and its information ``[N, 3, 3]``."""
-    # normal equations, singular if the rays are parallel
+    # Normal equations, singular if the rays are parallel.
     w = weight[..., None]
     information = np.einsum("cnki,cnkj->nij", a * w[..., None], a)
     right = np.einsum("cnki,cnk->ni", a, b * w)
     size = np.einsum("nii->n", information)
-    regular = np.linalg.det(information) > FLAT * size**3
+    regular = np.linalg.det(information) > MIN_DETERMINANT * size**3
     enough = ((weight > 0).sum(0) >= MIN_VIEWS) & regular
     safe = np.where(enough[:, None, None], information, np.eye(3))
     p = np.linalg.solve(safe, right[..., None])[..., 0]
@@ -157,7 +173,11 @@ def _solve(a: Float, b: Float, weight: Float) -> tuple[Float, Float]:
 
 
 def _best_pair(
-    cameras: CameraArray, uv: Float, weight: Float, a: Float, b: Float
+    cameras: CameraArray,
+    uv: Float,
+    weight: Float,
+    a: Float,
+    b: Float,
 ) -> Float:
     """The points ``[N, 3]`` with the smallest robust cost: of a camera pair, or linear from all."""
     best, _ = _solve(a, b, weight)
@@ -177,7 +197,10 @@ def _best_pair(
 
 
 def find_flips(
-    cameras: CameraArray, uv: Float, weight: Float, groups: Sequence[Pairs]
+    cameras: CameraArray,
+    uv: Float,
+    weight: Float,
+    groups: Sequence[Pairs],
 ) -> Bool:
     """The groups of joints ``[C, F, G]`` that each camera swapped in each frame.
 
@@ -192,6 +215,7 @@ def find_flips(
         weight: ``[C, F, J]`` their confidence.
         groups: ``G`` tuples of (left, right) joints that swap together.
     """
+    # Groups are independent: a detector may confuse the legs only.
     flips = [_group_flips(cameras, uv, weight, pairs) for pairs in groups]
     return np.stack(flips, axis=-1)
 
@@ -200,6 +224,7 @@ def apply_flips(values: Float, flips: Bool, groups: Sequence[Pairs]) -> Float:
     """Values ``[C, F, J, ...]`` with left and right exchanged where ``flips [C, F, G]``."""
     result = values.copy()
     for g, pairs in enumerate(groups):
+        # The flips of this group, in the dimensions of the values.
         flipped = np.expand_dims(flips[..., g], tuple(range(2, values.ndim)))
         left, right = np.array(pairs).T
         lefts = values[:, :, left]
@@ -210,7 +235,9 @@ def apply_flips(values: Float, flips: Bool, groups: Sequence[Pairs]) -> Float:
 
 
 def points_and_cost(
-    cameras: CameraArray, uv: Float, weight: Float
+    cameras: CameraArray,
+    uv: Float,
+    weight: Float,
 ) -> tuple[Float, Float]:
     """Points ``[F, J, 3]`` of ``uv [C, F, J, 2]``, ``weight [C, F, J]``, and their cost ``[F]``."""
     C, F, J = weight.shape
@@ -223,28 +250,30 @@ def points_and_cost(
 
 def _group_flips(cameras: CameraArray, uv: Float, weight: Float, pairs: Pairs) -> Bool:
     """The swaps ``[C, F]`` of one group."""
-    joints = [j for pair in pairs for j in pair]  # pairs are then adjacent: j and j ^ 1
+    # The joints of a pair become adjacent: j and j ^ 1.
+    joints = np.ravel(pairs)
     adjacent = [tuple((j, j + 1) for j in range(0, len(joints), 2))]
     uv = uv[:, :, joints]
     weight = weight[:, :, joints]
     C, F, _ = weight.shape
 
     def points(flips: Bool, frames: Ints) -> tuple[Float, Float]:
-        sided = apply_flips(uv[:, frames], flips[..., None], adjacent)
-        seen = apply_flips(weight[:, frames], flips[..., None], adjacent)
+        flips = flips[..., None]
+        sided = apply_flips(uv[:, frames], flips, adjacent)
+        seen = apply_flips(weight[:, frames], flips, adjacent)
         return points_and_cost(cameras, sided, seen)
 
     def cost_of(flips: Bool, frames: Ints) -> Float:
         _, cost = points(flips, frames)
         return cost
 
-    # the swaps that make the points fit better
+    # The swaps that make the points fit better.
     votes = weight.sum(-1)
-    few = (weight > 0).sum(-1) < LEAST_JOINTS
+    few = (weight > 0).sum(-1) < MIN_GROUP
     price = np.where(few, np.inf, FLIP_GAIN * votes)
     flips = cheapest_flips(cost_of, np.zeros((C, F), bool), price)
 
-    # all cameras or none: by the motion from frame to frame, then by the majority
+    # All cameras or none: by the motion from frame to frame, then by the majority.
     p, _ = points(flips, np.arange(F))
     flips = flips ^ exchanged(p)
     if (votes * flips).sum() > votes.sum() / 2:
@@ -253,7 +282,9 @@ def _group_flips(cameras: CameraArray, uv: Float, weight: Float, pairs: Pairs) -
 
 
 def cheapest_flips(
-    cost_of: Callable[[Bool, Ints], Float], flips: Bool, price: Float
+    cost_of: Callable[[Bool, Ints], Float],
+    flips: Bool,
+    price: Float,
 ) -> Bool:
     """Flips ``[C, F]``: one camera at a time is changed as long as that saves more than its price.
 
@@ -262,16 +293,18 @@ def cheapest_flips(
         flips: ``[C, F]`` initial values.
         price: ``[C, F]`` that a change must save.
     """
-    # `active` are the frames in which the last change still saved something
+    # Frames are active as long as the last change saved something.
     C, F = flips.shape
     flips = flips.copy()
     active = np.arange(F)
     toggles = np.eye(C, dtype=bool)[:, :, None]
     cost = cost_of(flips, active)
     for _ in range(C):
-        # the camera whose change saves most, in the frames that are still changing
+        # The cost of changing each camera, in the active frames.
         trials = np.stack([cost_of(flips[:, active] ^ one, active) for one in toggles])
         saved = cost[active] - trials - price[:, active]
+
+        # The camera whose change saves most is changed.
         best = saved.argmax(0)
         better = saved.max(0) > 0
         active = active[better]
@@ -285,19 +318,22 @@ def cheapest_flips(
 
 def exchanged(p: Float) -> Bool:
     """The frames ``[F]`` whose sides ``p [F, J, 3]`` are exchanged against the first frame's."""
+    # The last known place of each joint, and the index that exchanges the sides.
     state = np.zeros(len(p), bool)
     last = p[0]
     before = known(p[0])
-    swap = [j ^ 1 for j in range(p.shape[1])]
+    swap = np.arange(p.shape[1]) ^ 1
     for f in range(1, len(p)):
+        # Both joints of a pair must be known, now and before.
         now = known(p[f])
         both = before & now & before[swap] & now[swap]
 
-        # the shorter way from the last places of the joints
+        # The shorter way from the last places of the joints.
         straight = np.linalg.norm(p[f] - last, axis=-1)[both].sum()
         crossed = np.linalg.norm(p[f][swap] - last, axis=-1)[both].sum()
         state[f] = crossed < straight if both.any() else state[f - 1]
 
+        # The last places are those of the first frame's sides.
         order = swap if state[f] else slice(None)
         last = np.where(now[order][:, None], p[f][order], last)
         before = before | now[order]

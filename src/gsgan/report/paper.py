@@ -1,6 +1,6 @@
 """The numbers printed in the paper, and when they are comparable with runs."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,12 +9,11 @@ from omegaconf import OmegaConf
 
 from gsgan.metrics.names import METRICS
 from gsgan.report.runs import ScoredRun
-from gsgan.report.spec import subject_of
 from gsgan.report.write import NOT_HAD, Cell, Grid, Row
 from gsgan.utils.errors import ConfigError
 
 FILE = Path(__file__).with_name("paper.yaml")
-MARK = "as printed"  # in the label of every row of the paper's
+AS_PRINTED = "as printed"  # in the label of every row that the paper prints
 
 
 @dataclass(frozen=True)
@@ -24,16 +23,18 @@ class PaperTable:
     title: str
     data: str
     rows: Sequence[dict[str, Any]]
-    protocol: str | None = None
+    protocol: str | None = None  # under which the numbers are read
     split: str | None = None
-    subject: str | None = None
-    reason: str | None = None
+    subject: str | None = None  # of the columns, unless they are subjects
+    reason: str | None = None  # why no run is comparable
     note: str | None = None
 
     def why_apart(self, runs: Sequence[ScoredRun], split: str) -> str | None:
-        """Why the numbers are not comparable with these runs' scores; None if they are."""
+        """The reason why the numbers are not comparable with runs' scores; None if they are."""
         if self.reason is not None:
             return self.reason
+
+        # Runs must be of the data, protocol, split and subject of the paper's table.
         for run in runs:
             record = run.protocol(split)
             for mine, printed in (
@@ -43,50 +44,61 @@ class PaperTable:
             ):
                 if mine != printed:
                     return f"runs here are {mine}, the paper's {printed}"
-            if (
-                self.subject
-                and subject_of(run.data.get("root"), [self.subject]) is None
-            ):
+            if self.subject and not run.is_of([self.subject]):
                 return f"runs here are of {run.data_name}, the paper's of subject {self.subject}"
             if record.get("departures"):
                 return f"runs here depart from {self.protocol}: {'; '.join(record['departures'])}"
         return None
 
-    def beside(self, columns: Sequence[tuple[str | None, str]]) -> dict[str, list[Row]]:
-        """The rows by model; ``columns``: subject (None: the table's own) and metric of each."""
-        note = f"{MARK} in {self.title}" + (f"; {self.note}" if self.note else "")
+    def beside(self, columns: Mapping[str, str]) -> dict[str, list[Row]]:
+        """The rows by model.
+
+        Args:
+            columns: the metric of each subject, or of each metric for the table's own subject.
+        """
+        # All rows carry one note, which says where they are from.
+        note = f"{AS_PRINTED} in {self.title}"
+        if self.note:
+            note += f"; {self.note}"
         found: dict[str, list[Row]] = {}
         for held in self.rows:
-            values = held["values"]
-            texts = [
-                values.get(s or self.subject, {}).get(metric) for s, metric in columns
-            ]
+            texts = []
+            for column, metric in columns.items():
+                subject = self.subject if column == metric else column
+                texts.append(held["values"].get(subject, {}).get(metric))
             row = self._row(held["label"], texts, (note,))
             found.setdefault(held.get("beside") or held["label"], []).append(row)
         return found
 
     def grid(self, why: str) -> Grid:
         """The whole printed table: a row for each of its rows and subjects."""
-        cells = [
-            (row["label"], s, v) for row in self.rows for s, v in row["values"].items()
-        ]
-        shown = [m for m in METRICS if any(m in values for *_, values in cells)]
-        rows = [
-            self._row(f"{label}, {s}", [v.get(m) for m in shown])
-            for label, s, v in cells
-        ]
+        # The columns are the metrics that any row has.
+        printed: dict[str, dict[str, str]] = {}
+        for row in self.rows:
+            for subject, values in row["values"].items():
+                printed[f"{row['label']}, {subject}"] = values
+        known = set().union(*printed.values())
+        shown = [metric for metric in METRICS if metric in known]
+        rows = []
+        for label, values in printed.items():
+            rows.append(self._row(label, map(values.get, shown)))
+
         remarks = [f"Not beside the scores above: {why}."]
-        remarks += [f"{self.note[:1].upper()}{self.note[1:]}."] if self.note else []
+        if self.note:
+            remarks.append(f"{self.note[:1].upper()}{self.note[1:]}.")
         title = f"As printed, not measured here: {self.title}"
         return Grid(title, [METRICS[m].heading for m in shown], rows, remarks)
 
     def _row(
-        self, label: str, texts: Sequence[str | None], notes: tuple[str, ...] = ()
+        self, label: str, texts: Iterable[str | None], notes: tuple[str, ...] = ()
     ) -> Row:
-        cells = [Cell(NOT_HAD) if t is None else Cell(t) for t in texts]
-        read = f", read as {self.protocol}" if self.protocol else ""
-        origin = (NOT_HAD, self.data, f"the paper's{read}", NOT_HAD)
-        return Row(f"{label} ({MARK})", cells, origin, "paper", notes)
+        # The paper states neither seeds nor commits.
+        cells = [Cell(NOT_HAD if text is None else text) for text in texts]
+        protocol = "the paper's"
+        if self.protocol:
+            protocol += f", read as {self.protocol}"
+        origin = (NOT_HAD, self.data, protocol, NOT_HAD)
+        return Row(f"{label} ({AS_PRINTED})", cells, origin, "paper", notes)
 
 
 def read_paper(name: str) -> PaperTable:
@@ -95,6 +107,7 @@ def read_paper(name: str) -> PaperTable:
     Raises:
         ConfigError: when there is no such table.
     """
+    # The keys of a table are the fields of `PaperTable`.
     tables: Any = OmegaConf.to_container(OmegaConf.load(FILE))
     if name not in tables:
         raise ConfigError(f"table.paper={name}: {FILE.name} has {', '.join(tables)}")

@@ -14,48 +14,39 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gsgan.run.stored import hydra_record, record
+from gsgan.evaluate.files import FACTS_FILE, METRICS_FILE
+from gsgan.run.stored import CONFIG, hydra_record, record
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.sweeps import unfinished
 
-METRICS_FILE = "metrics.json"
-FACTS_FILE = "facts.json"
-CONFIG = Path(".hydra") / "config.yaml"
 DATA = "data (cameras, frames, split, image size, crop or fitted poses)"
-TOLERANCE = 1e-3  # between equal floats, for rounding
+SCORE_TOLERANCE = 1e-3  # between equal floats, for rounding
 NAME = "GaussianGAN (paper)"
 PAPER = ("paper", "paper_slp")  # experiments that set the paper's method
 # Overrides that change the method; the model is one of the paper's ablations.
 METHOD = re.compile(
     r"[+~]*(?!model=)(model|training|effects|accuracy|size|segments)[.@=]"
 )
-# change no result
-IDLE = ("model.backend", "training.log_every", "training.perceptual.path")
+# Settings that change no result.
+WITHOUT_EFFECT = ("model.backend", "training.log_every", "training.perceptual.path")
 
 
 @dataclass(frozen=True)
 class ScoredRun:
-    """One run folder.
-
-    Args:
-        folder: where it is.
-        name: of the model, or of the method whose predictions were scored.
-        data: ``name`` of the data group's choice, ``root`` (the folder's name), ``fingerprint``.
-        seed: None for predictions.
-        scores: ``{split: {variant: {metric: value}}}``.
-        settings: the training config by dotted key, without seed and paths; None for predictions.
-        departures: what its command line changes of ``experiment=paper``, whose models are those of
-            the paper's ablations; None where Hydra recorded nothing.
-        facts: contents of facts.json; empty where nothing was scored yet.
-    """
+    """One run folder."""
 
     folder: Path
-    name: str
+    name: str  # of the model, or of the method whose predictions were scored
+    # ``name`` of the data group's choice, ``root`` (the folder's name) and ``fingerprint``.
     data: dict[str, Any]
-    seed: int | None
-    scores: dict[str, dict[str, dict[str, Any]]]
+    seed: int | None  # None for predictions
+    scores: dict[str, dict[str, dict[str, Any]]]  # {split: {variant: {metric: value}}}
+    # The training config by dotted key, without seed and paths; None for predictions.
     settings: dict[str, Any] | None = None
+    # The changes of ``experiment=paper`` on the command line, where its models are those of the
+    # paper's ablations; None if Hydra recorded nothing.
     departures: list[str] | None = None
+    # The contents of facts.json; empty if nothing was scored yet.
     facts: dict[str, Any] = field(default_factory=dict)
 
     def __str__(self) -> str:
@@ -63,30 +54,36 @@ class ScoredRun:
         return f"{self.folder} ({self.name}, {seed})"
 
     def of(self, split: str, variant: str) -> dict[str, Any]:
-        """The scores of one split and variant; empty where there are none."""
+        """The scores of one split and variant; empty if there are none."""
         return self.scores.get(split, {}).get(variant, {})
 
     def images(self, split: str) -> int:
         """How many images of a split were scored."""
-        return max(
-            (int(v["images"]) for v in self.scores.get(split, {}).values()), default=0
-        )
+        variants = self.scores.get(split, {}).values()
+        return max((int(scores["images"]) for scores in variants), default=0)
+
+    def stated(self, key: str, *splits: str) -> Any:
+        """The first value of ``key`` in the scores of some or all splits; None if none has it."""
+        for split in splits or self.scores:
+            for scores in self.scores.get(split, {}).values():
+                if scores.get(key):
+                    return scores[key]
+        return None
 
     def protocol(self, *splits: str) -> dict[str, Any]:
         """The record of the published protocol in the scores of some or all splits."""
-        held = [
-            v for s in splits or self.scores for v in self.scores.get(s, {}).values()
-        ]
-        return next(
-            (v["protocol"] for v in held if v.get("protocol")), {"name": "none"}
-        )
+        return self.stated("protocol", *splits) or {"name": "none"}
+
+    def is_of(self, subjects: Sequence[str]) -> bool:
+        """Whether the data are a subject's: ``CoreView_377`` and ``my_377`` are both 377's."""
+        root = self.data.get("root") or ""
+        return any(root == s or root.endswith(f"_{s}") for s in subjects)
 
     @property
     def data_name(self) -> str:
-        """The dataset, and its folder where known."""
-        return ", ".join(
-            str(self.data[key]) for key in ("name", "root") if self.data.get(key)
-        )
+        """The dataset, and its folder if known."""
+        parts = [self.data.get("name"), self.data.get("root")]
+        return ", ".join(map(str, filter(None, parts)))
 
     @property
     def commit(self) -> str:
@@ -96,14 +93,17 @@ class ScoredRun:
         return f"{short} + changes" if self.facts.get("dirty") else short
 
     def planned(self, *, segmentation: bool) -> int:
-        """Iterations of the whole schedule, 0 where there is none; ``segmentation`` adds the phase
-        of its own, which not every scene has."""
+        """Iterations of the whole schedule, 0 if there is none; ``segmentation`` adds the phase of
+        its own, which not every scene has."""
         start = "training.schedule."
         settings = self.settings or {}
         stretch = settings.get(f"{start}stretch", 1)
-        steps = [settings.get(start + phase, 0) for phase in ("step_one", "step_two")]
-        own = settings.get(f"{start}segmentation", 0) if segmentation else 0
-        return sum(round(step * stretch) for step in steps) + own
+        planned = 0
+        for phase in ("step_one", "step_two"):
+            planned += round(settings.get(start + phase, 0) * stretch)
+        if segmentation:
+            planned += settings.get(f"{start}segmentation", 0)
+        return planned
 
 
 def check_same(
@@ -121,16 +121,17 @@ def check_same(
         for what, value in held.items():
             if value is None:
                 continue
+
+            # Each fact is compared with that of the first run that has it. The message shows both
+            # values, or names the keys that differ.
             other, expected = first.setdefault(what, (run, value))
             text = f"{expected} and {value}"
             if isinstance(value, dict):
-                keys = value.keys() | expected.keys()
-                text = ", ".join(
-                    sorted(k for k in keys if value.get(k) != expected.get(k))
-                )
+                keys = sorted(value.keys() | expected.keys())
+                text = ", ".join(k for k in keys if value.get(k) != expected.get(k))
                 same = not text
             elif isinstance(value, float):
-                same = math.isclose(value, expected, rel_tol=0, abs_tol=TOLERANCE)
+                same = math.isclose(value, expected, rel_tol=0, abs_tol=SCORE_TOLERANCE)
             else:
                 same = value == expected
             if not same:
@@ -145,15 +146,15 @@ def find_runs(given: Sequence[str]) -> list[Path]:
     Raises:
         ConfigError: when an entry contains no run.
     """
+    # A dict keeps the order, and has each folder once.
     found: dict[Path, None] = {}
     for entry in given:
-        path = Path(entry).expanduser()
-        places = (
-            sorted(glob.glob(str(path), recursive=True))
-            if glob.has_magic(entry)
-            else [path]
-        )
-        runs = [run for place in places for run in _runs_inside(Path(place).resolve())]
+        places = [str(Path(entry).expanduser())]
+        if glob.has_magic(entry):
+            places = sorted(glob.glob(places[0], recursive=True))
+        runs: list[Path] = []
+        for place in places:
+            runs += _runs_inside(Path(place).resolve())
         if not entry.strip() or not runs:
             raise ConfigError(
                 f"runs: {entry!r} contains no run folder ({METRICS_FILE} or {CONFIG}); give run "
@@ -166,6 +167,7 @@ def find_runs(given: Sequence[str]) -> list[Path]:
 def _runs_inside(folder: Path) -> Iterator[Path]:
     """The folder itself if it is a run, else the runs below it; runs are not nested."""
     for at, below, files in os.walk(folder):
+        # os.walk visits the folders that remain in this list.
         below[:] = sorted(name for name in below if not name.startswith("."))
         if METRICS_FILE in files or (Path(at) / CONFIG).is_file():
             below.clear()
@@ -177,6 +179,7 @@ def read_runs(folders: Sequence[Path]) -> tuple[list[ScoredRun], dict[Path, str]
     runs = []
     left_out = {}
     for folder in folders:
+        # The folder is the key of the reason, so it is removed from the text.
         try:
             runs.append(read_run(folder))
         except DataError as error:
@@ -191,11 +194,13 @@ def read_run(folder: Path, *, scored: bool = True) -> ScoredRun:
     Raises:
         DataError: when a file is damaged, or the run is unfinished or not scored yet.
     """
-    # A run that trains still, or was never scored, is named as such.
-    for name in (METRICS_FILE, FACTS_FILE) if scored else ():
-        if not (folder / name).is_file():
+    # A run that is still training, or was never scored, is named as such.
+    for name in (METRICS_FILE, FACTS_FILE):
+        if scored and not (folder / name).is_file():
             why = unfinished(folder) or "the run is not finished, or was not scored"
             raise DataError(f"{folder}: no {name}; {why}")
+
+    # A damaged file has one message, whatever its parser says.
     try:
         scores = json.loads((folder / METRICS_FILE).read_text()) if scored else {}
         found = folder / FACTS_FILE
@@ -203,12 +208,7 @@ def read_run(folder: Path, *, scored: bool = True) -> ScoredRun:
         settings = _read_settings(folder)
         hydra = hydra_record(folder)
         chosen = OmegaConf.select(hydra, "hydra.runtime.choices") or {}
-        name = (
-            facts.get("model")
-            or facts.get("method")
-            or chosen.get("model")
-            or folder.name
-        )
+        model = facts.get("model") or facts.get("method") or chosen.get("model")
         data = dict(facts.get("data", {"name": chosen.get("data")}))
     except (
         OSError,
@@ -220,10 +220,17 @@ def read_run(folder: Path, *, scored: bool = True) -> ScoredRun:
         reason = str(error).splitlines()[0]
         raise DataError(f"{folder}: damaged ({reason}); score the run again") from None
 
-    departed = _departures(hydra, chosen)
     run = ScoredRun(
-        folder, str(name), data, facts.get("seed"), scores, settings, departed, facts
+        folder=folder,
+        name=str(model or folder.name),
+        data=data,
+        seed=facts.get("seed"),
+        scores=scores,
+        settings=settings,
+        departures=_departures(hydra, chosen),
+        facts=facts,
     )
+
     # A run may have been scored before its end.
     done = facts.get("iterations")
     planned = run.planned(segmentation=False)
@@ -248,6 +255,7 @@ def _read_settings(folder: Path) -> dict[str, Any] | None:
 
 def flat(value: Any, at: str = "") -> Iterator[tuple[str, Any]]:
     """A nested config by dotted key."""
+    # An empty mapping is a value.
     if isinstance(value, Mapping) and value:
         for key, held in value.items():
             yield from flat(held, f"{at}.{key}" if at else str(key))
@@ -258,14 +266,18 @@ def flat(value: Any, at: str = "") -> Iterator[tuple[str, Any]]:
 def _departures(hydra: DictConfig, chosen: Mapping[str, Any]) -> list[str] | None:
     if not chosen:
         return None
+
+    # Other experiments are not compared option by option.
     if chosen.get("experiment") not in PAPER:
         return [f"experiment={chosen.get('experiment')}"]
-    given = OmegaConf.select(hydra, "hydra.overrides.task") or ()
-    return [
-        text
-        for text in given
-        if METHOD.match(text) and text.partition("=")[0] not in IDLE
-    ]
+
+    # Only overrides that change the method or its training count.
+    departures = []
+    for text in OmegaConf.select(hydra, "hydra.overrides.task") or ():
+        key = text.partition("=")[0]
+        if METHOD.match(text) and key not in WITHOUT_EFFECT:
+            departures.append(text)
+    return departures
 
 
 def by_settings(run: ScoredRun, keys: Sequence[str]) -> ScoredRun:
@@ -274,6 +286,7 @@ def by_settings(run: ScoredRun, keys: Sequence[str]) -> ScoredRun:
     Raises:
         ConfigError: when the run has no such setting.
     """
+    # The last part of a key is enough in a label.
     parts = [run.name]
     for key in map(str, keys):
         if run.settings is None or key not in run.settings or key == "seed":

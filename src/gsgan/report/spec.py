@@ -10,10 +10,11 @@ from gsgan.metrics.names import METRICS
 from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError
 
-# variants in metrics.json
+# Variants in metrics.json: the final image, Step I's colour, the all-background image. They are
+# those of `gsgan.evaluate.predictions`, which would be slow to import here.
 PAINTED = "full"
-SPLAT = "splat"
-FLOOR = "floor"
+SPLATTED = "splat"
+BACKGROUND = "floor"
 MEAN = "mean"  # the column over subjects
 
 
@@ -22,19 +23,22 @@ def written(metric: str, value: float, *, times_1000: bool = False) -> str:
 
     A value that was multiplied by 1000 has two digits fewer.
     """
-    digits = METRICS[metric].digits - (2 if times_1000 else 0)
+    digits = METRICS[metric].digits
+    if times_1000:
+        digits -= 2
+
+    # A rounded value of -0.00 is printed without its sign.
     text = f"{value:.{digits}f}"
     return text.lstrip("-") if float(text) == 0 else text.replace("-", "−")
 
 
 @dataclass(frozen=True)
 class RowSpec:
-    """One row: the runs of a model or method, its label (None: the name), and ``full`` for the
-    final image or ``splat`` for Step I's colour."""
+    """One row of a table."""
 
-    run: str
-    label: str | None = None
-    variant: str = PAINTED
+    run: str  # name of a model or method
+    label: str | None = None  # None: the name
+    variant: str = PAINTED  # the final image, or ``splat``: Step I's colour
 
 
 @dataclass(frozen=True)
@@ -42,38 +46,41 @@ class TableSpec:
     """One table; `conf/table/plain.yaml` explains the keys.
 
     Raises:
-        ConfigError: on an unknown metric, split or variant, or where a list must not be empty.
+        ConfigError: on an unknown metric, split or variant, or if a list is empty that must not be.
     """
 
     name: str
     title: str
     metrics: Sequence[str]
-    splits: Sequence[str]
-    rows: Sequence[RowSpec] | None = None
-    by: Sequence[str] | None = None
+    splits: Sequence[str]  # one grid each
+    rows: Sequence[RowSpec] | None = None  # None: a row per name
+    by: Sequence[str] | None = None  # settings whose values have rows of their own
     variants: Sequence[str] = (PAINTED,)
-    subjects: Sequence[str] | None = None
-    data: str | None = None
-    paper: str | None = None
-    times_1000: Sequence[str] = ()
+    subjects: Sequence[str] | None = None  # columns, with a grid per metric
+    data: str | None = None  # the only data set of the runs
+    paper: str | None = None  # a table of paper.yaml
+    times_1000: Sequence[str] = ()  # metrics that are printed times 1000
 
     def __post_init__(self) -> None:
+        # Rows come as mappings, and subjects may be numbers.
+        variants = list(self.variants)
         rows: Any = self.rows
         if rows is not None:
-            object.__setattr__(self, "rows", [RowSpec(**row) for row in rows])
+            if self.by:
+                raise ConfigError(
+                    "table.by makes rows of its own, so table.rows must be null"
+                )
+            rows = [RowSpec(**row) for row in rows]
+            variants += [row.variant for row in rows]
+            object.__setattr__(self, "rows", rows)
         if self.subjects is not None:
-            object.__setattr__(
-                self, "subjects", [str(subject) for subject in self.subjects]
-            )
-        if self.by and rows is not None:
-            raise ConfigError(
-                "table.by makes rows of its own, so table.rows must be null"
-            )
-        variants = [*self.variants, *(row.variant for row in self.rows or ())]
+            object.__setattr__(self, "subjects", list(map(str, self.subjects)))
+
+        # Each list has known values only, and all but one list must have some.
         for key, known, values in (
             ("metrics", METRICS, self.metrics),
             ("splits", SPLITS, self.splits),
-            ("variants", (PAINTED, SPLAT), variants),
+            ("variants", (PAINTED, SPLATTED), variants),
             ("times_1000", METRICS, self.times_1000),
         ):
             if not values and key != "times_1000":
@@ -84,11 +91,7 @@ class TableSpec:
 
 def natural(name: str) -> list[str | float]:
     """A sort key: numbers by value, the words between them by letters."""
-    parts = re.split(r"((?<= )-?\d+(?:\.\d+)?(?:e[+-]?\d+)?)", name)
-    return [float(part) if i % 2 else part for i, part in enumerate(parts)]
-
-
-def subject_of(root: str | None, subjects: Sequence[str]) -> str | None:
-    """The subject of a data folder: ``CoreView_377`` and ``my_377`` are both 377's."""
-    name = root or ""
-    return next((s for s in subjects if name == s or name.endswith(f"_{s}")), None)
+    # Numbers after a space, such as values of settings; the pattern's matches have odd places.
+    parts: list[Any] = re.split(r"((?<= )-?\d+(?:\.\d+)?(?:e[+-]?\d+)?)", name)
+    parts[1::2] = map(float, parts[1::2])
+    return parts

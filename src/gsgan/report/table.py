@@ -25,14 +25,13 @@ from gsgan.report.runs import (
     read_runs,
 )
 from gsgan.report.spec import (
-    FLOOR,
+    BACKGROUND,
     MEAN,
     PAINTED,
-    SPLAT,
+    SPLATTED,
     RowSpec,
     TableSpec,
     natural,
-    subject_of,
     written,
 )
 from gsgan.report.write import (
@@ -51,38 +50,42 @@ from gsgan.utils.errors import ConfigError
 from gsgan.utils.files import write_atomically
 
 FLOOR_LABEL = "all background (floor)"
-SPREAD = (
+SPREAD_REMARK = (
     "Mean ± sample standard deviation over seeds, as many as the column seeds says; one seed has "
     "no spread."
 )
 SPLIT_TITLES = {"novel_view": " (held-out cameras)", "novel_pose": " (held-out poses)"}
-# of a protocol, differ by subject
+# values of a protocol that differ by subject
 PER_SUBJECT = ("subject", "train_frames", "test_frames")
-DIRTY = "uncommitted changes of the code (allow_dirty=true allows them)"
+UNCOMMITTED = "uncommitted changes of the code (allow_dirty=true allows them)"
 NO_SEED = "None"  # of predictions and of the all-background image
 NO_MEAN = "no mean over subjects: not all have scores of these seeds"
 
 
 @dataclass(frozen=True)
 class Part:
-    """One grid: the scores of one split, of one ``metric`` where subjects are the columns."""
+    """One grid: the scores of one split."""
 
     spec: TableSpec
     runs: Sequence[ScoredRun]
     split: str
-    metric: str | None = None
+    metric: str | None = None  # the only one, if subjects are the columns
 
     @property
     def columns(self) -> dict[str, str]:
         """The metric of each column: metrics themselves, or subjects and their mean."""
         if self.metric is None:
-            return {metric: metric for metric in self.spec.metrics}
+            metrics = self.spec.metrics
+            return dict(zip(metrics, metrics, strict=True))
         return dict.fromkeys([*(self.spec.subjects or ()), MEAN], self.metric)
 
     def heading(self, metric: str) -> str:
-        """Of a metric; LPIPS with what its network gets, if runs have it."""
+        """The heading of a metric; LPIPS with the input of its network, if runs tell it."""
+        # Inputs of LPIPS differ between protocols.
         name = METRICS[metric].name
-        described = join_unique(_lpips(run, self.split) or "" for run in self.runs)
+        described = join_unique(
+            run.stated("lpips_input", self.split) for run in self.runs
+        )
         if metric.startswith("lpips") and described:
             name = f"{name} {described}"
         if metric in self.spec.times_1000:
@@ -95,29 +98,35 @@ class Part:
 
     def of(self, name: str | None, column: str = MEAN) -> list[ScoredRun]:
         """The runs of a model or method (None: of all) that a column shows."""
-        shown = (
-            self.runs
-            if name is None
-            else [run for run in self.runs if run.name == name]
-        )
-        if self.metric is None or column == MEAN:
-            return list(shown)
-        return [run for run in shown if subject_of(run.data.get("root"), [column])]
+        # A column of a subject shows that subject's runs only.
+        shown = []
+        for run in self.runs:
+            if name is not None and run.name != name:
+                continue
+            if self.metric is None or column == MEAN or run.is_of([column]):
+                shown.append(run)
+        return shown
+
+    @property
+    def names(self) -> list[str]:
+        """The names of models and methods; the full model is first."""
+        names = {run.name for run in self.runs}
+        return sorted(names, key=lambda name: (name != "full", natural(name)))
 
     @property
     def rows(self) -> list[RowSpec]:
-        """The table's rows; where it does not fix them, those that have a score."""
+        """The table's rows; if it does not fix them, those that have a score."""
         if self.spec.rows is not None:
             return list(self.spec.rows)
-        names = {run.name for run in self.runs}
-        return [
-            RowSpec(
-                name, f"{name}: Step I's colour" if variant == SPLAT else None, variant
-            )
-            for name in sorted(names, key=lambda name: (name != "full", natural(name)))
-            for variant in self.spec.variants
-            if any(run.of(self.split, variant) for run in self.of(name))
-        ]
+
+        # Step I's colour is named as such, the final image has the model's name.
+        rows = []
+        for name in self.names:
+            for variant in self.spec.variants:
+                label = f"{name}: Step I's colour" if variant == SPLATTED else None
+                if any(run.of(self.split, variant) for run in self.of(name)):
+                    rows.append(RowSpec(name, label, variant))
+        return rows
 
     @cached_property
     def scores(self) -> pd.DataFrame:
@@ -126,29 +135,31 @@ class Part:
         The all-background image is of the data, not of a model or seed, so it has one row per
         column, without a name.
         """
-        rows = [
-            (
-                run.name,
-                variant,
-                column,
-                str(run.seed),
-                *_value(run, self.split, variant, metric),
-            )
-            for column, metric in self.columns.items()
-            if column != MEAN
-            for run in self.of(None, column)
-            for variant in (PAINTED, SPLAT, FLOOR)
-        ]
+        # Every run has three variants, whether they were scored or not.
+        rows = []
+        for column, metric in self.columns.items():
+            if column == MEAN:
+                continue
+            for run in self.of(None, column):
+                for variant in (PAINTED, SPLATTED, BACKGROUND):
+                    value, note = _value(run, self.split, variant, metric)
+                    seed = str(run.seed)
+                    rows.append((run.name, variant, column, seed, value, note))
         names = ["name", "variant", "column", "seed", "value", "note"]
         frame = pd.DataFrame(rows, columns=names)
+
+        # Some tables print values times 1000.
         shown_larger = frame.column.map(self.columns).isin(self.spec.times_1000)
         frame.loc[shown_larger, "value"] *= 1000
-        frame.loc[frame.variant == FLOOR, ["name", "seed"]] = "", NO_SEED
+
+        # Of equal rows, such as the floors of all runs, one with a value is kept.
+        frame.loc[frame.variant == BACKGROUND, ["name", "seed"]] = "", NO_SEED
         frame = frame.sort_values("value", kind="stable", na_position="last")
         frame = frame.drop_duplicates(names[:4]).sort_index()
         if self.metric is None:
             return frame
-        # The mean over subjects, seed by seed, where all subjects have scores of the same seeds.
+
+        # The mean over subjects, seed by seed, if all subjects have scores of the same seeds.
         wide = frame.pivot(index=[*names[:2], "seed"], columns="column", values="value")
         means = wide.reindex(columns=self.spec.subjects).mean(axis=1, skipna=False)
         whole = means.groupby(level=names[:2]).transform(lambda own: own.notna().all())
@@ -161,37 +172,53 @@ class Part:
         at = self.scores
         metric = self.columns[column]
         own = at[(at["name"] == name) & (at.variant == variant) & (at.column == column)]
-        notes = [
-            note if len(few) == len(own) else f"seed {', '.join(few.seed)}: {note}"
-            for note, few in own.groupby("note", sort=False)
-        ]
+
+        # A note names its seeds unless it is about all of them.
+        notes = []
+        for note, few in own.groupby("note", sort=False):
+            seeds = "" if len(few) == len(own) else f"seed {', '.join(few.seed)}: "
+            notes.append(f"{seeds}{note}")
+
+        # Without a value, the notes tell why.
         values = own.value.dropna()
         if values.empty:
-            notes = [f"{NOT_HAD}: {note}" for note in notes or ["no scored run"]]
-            return Cell(NOT_HAD, notes=tuple(notes))
+            reasons = notes or ["no scored run"]
+            return Cell(NOT_HAD, notes=tuple(f"{NOT_HAD}: {why}" for why in reasons))
+
+        # The spread is printed with the digits of the mean.
         mean = float(values.mean())
-        spread = float(values.std()) if len(values) > 1 else None
         text = self.written(metric, mean)
-        if spread is not None:
+        spread = None
+        if len(values) > 1:
+            spread = float(values.std())
             text += f" ± {self.written(metric, spread)}"
         return Cell(text, mean, spread, tuple(notes))
 
     def check(self, allow_dirty: bool) -> None:
-        """Raises ConfigError where the runs of a column or a row are not comparable."""
+        """Raises ConfigError if the runs of a column or a row are not comparable."""
         where = f"table {self.spec.name}, {self.split}"
         for column in self.columns:
-            scored = [run for run in self.of(None, column) if run.images(self.split)]
-            mean = column == MEAN
-            facts = [_column_facts(run, self, mean, allow_dirty) for run in scored]
+            # Runs of one column have equal data and protocols.
+            scored = []
+            facts = []
+            for run in self.of(None, column):
+                if run.images(self.split):
+                    scored.append(run)
+                    facts.append(_column_facts(run, self, column == MEAN, allow_dirty))
             check_same(where, scored, facts)
-            for name in {run.name for run in self.runs} if column != MEAN else ():
+            if column == MEAN:
+                continue
+
+            # Runs of one row differ in their seeds only.
+            for name in self.names:
                 row = self.of(name, column)
+                facts = [_row_facts(run, self.split) for run in row]
                 if len({run.seed for run in row}) < len(row):
                     names = " and ".join(map(str, row))
                     raise ConfigError(
                         f"{where}: {names} have the same row and seed; leave one out"
                     )
-                check_same(where, row, [_row_facts(run, self.split) for run in row])
+                check_same(where, row, facts)
 
 
 def _row_facts(run: ScoredRun, split: str) -> dict[str, Any]:
@@ -212,17 +239,19 @@ def _column_facts(
     record = run.protocol(split)
     facts = {
         "protocol": record["name"],
-        "LPIPS": _lpips(run, split),
+        "LPIPS": run.stated("lpips_input", split),
         "boxes of hands and mouth": _boxes(run, part),
-        DIRTY: None if allow_dirty else bool(run.facts.get("dirty")),
+        UNCOMMITTED: None if allow_dirty else bool(run.facts.get("dirty")),
     }
+
+    # Subjects differ in data, and in a few values of their protocol.
     if mean:
         record = {k: v for k, v in record.items() if k not in PER_SUBJECT}
         return facts | {"values of the protocol": record}
     return facts | {
         DATA: str(run.data.get("fingerprint")),
         "images scored": run.images(split),
-        "PSNR of an all-background image": run.of(split, FLOOR).get("psnr"),
+        "PSNR of an all-background image": run.of(split, BACKGROUND).get("psnr"),
         "values of the protocol": record,
     }
 
@@ -234,11 +263,14 @@ def make_tables(config: DictConfig) -> None:
         ConfigError: on runs that do not exist or are not comparable, or on a folder that cannot be
             written.
     """
+    # All settings are read before any run is.
     given = [config.runs] if isinstance(config.runs, str) else config.runs
     spec: TableSpec = instantiate(config.table)
     paper = None if spec.paper is None else read_paper(spec.paper)
-    runs, left_out = read_runs(find_runs([str(entry) for entry in given]))
+    runs, left_out = read_runs(find_runs(list(map(str, given))))
     report = build(spec, runs, left_out, paper, allow_dirty=config.allow_dirty)
+
+    # Files are written into a folder named after the time, unless ``out`` names one.
     now = f"{datetime.now():%Y-%m-%d_%H-%M-%S}"
     folder = Path(str(config.out or f"runs/report/{now}")).expanduser()
     files = files_of(report)
@@ -248,11 +280,12 @@ def make_tables(config: DictConfig) -> None:
     except OSError as error:
         where = error.filename or folder
         raise ConfigError(f"{where} cannot be written: {error.strerror}") from None
+
+    # The terminal shows the same tables without origins.
     console = make_console()
     console.print(Markdown(TERMINAL.body(report)))
-    console.print(
-        f"tables: {folder}/{{{','.join(files)}}}", markup=False, soft_wrap=True
-    )
+    written_files = f"tables: {folder}/{{{','.join(files)}}}"
+    console.print(written_files, markup=False, soft_wrap=True)
 
 
 def build(
@@ -268,40 +301,49 @@ def build(
     Raises:
         ConfigError: when runs in one column or row differ in more than they may, or no run is left.
     """
-    unfit = {run.folder: why for run in runs if (why := _no_place(spec, run))}
-    taken = [by_settings(run, spec.by or ()) for run in runs if run.folder not in unfit]
-    left_out = {**left_out, **unfit}
-    parts = [
-        Part(spec, taken, split, metric)
-        for split in spec.splits
-        for metric in ([None] if spec.subjects is None else spec.metrics)
-        if any(run.images(split) for run in taken)
-    ]
+    # Runs that have no place in this table are left out, too.
+    left_out = dict(left_out)
+    taken = []
+    for run in runs:
+        why = _no_place(spec, run)
+        if why is not None:
+            left_out[run.folder] = why
+        else:
+            taken.append(by_settings(run, spec.by or ()))
+
+    # Each split has a grid, or a grid per metric if subjects are the columns.
+    parts = []
+    for split in spec.splits:
+        if any(run.images(split) for run in taken):
+            for metric in [None] if spec.subjects is None else spec.metrics:
+                parts.append(Part(spec, taken, split, metric))
     if not parts:
-        reasons = "; ".join(
-            f"{folder}: {reason}" for folder, reason in left_out.items()
-        )
+        reasons = "; ".join(f"{folder}: {why}" for folder, why in left_out.items())
         raise ConfigError(
             f"table {spec.name}: no run is left that has scored an image of "
             f"{' or '.join(spec.splits)} ({reasons or 'none left out'})"
         )
     for part in parts:
         part.check(allow_dirty)
-    folders = [*(run.folder for run in taken), *left_out]
-    shared = os.path.commonpath([folder.parent for folder in folders])
-    names = {folder: os.path.relpath(folder, shared) for folder in folders}
-    left = {names[folder]: reason for folder, reason in left_out.items()}
+
+    # Folders that were left out are named relative to the folder that holds all runs.
+    parents = [run.folder.parent for run in taken]
+    parents += [folder.parent for folder in left_out]
+    shared = os.path.commonpath(parents)
+    left = {}
+    for folder, why in left_out.items():
+        left[os.path.relpath(folder, shared)] = why
     return Report(spec.title, _grids(parts, paper), left)
 
 
 def _no_place(spec: TableSpec, run: ScoredRun) -> str | None:
-    """Why the table has no row for a run; raises ConfigError for another data set."""
+    """The reason why the table has no row for a run; raises ConfigError for another data set."""
     if spec.data not in (None, run.data.get("name")):
         what = f"is of {spec.data}, but {run} is of {run.data_name}"
         raise ConfigError(
             f"table {spec.name} {what}; leave it out of runs, or use table=plain"
         )
-    if spec.subjects and subject_of(run.data.get("root"), spec.subjects) is None:
+    if spec.subjects and not run.is_of(spec.subjects):
         return f"its subject is none of {', '.join(spec.subjects)} ({run.data_name})"
     if spec.rows is not None and run.name not in {row.run for row in spec.rows}:
         return f"table {spec.name} has no row for {run.name}"
@@ -309,63 +351,85 @@ def _no_place(spec: TableSpec, run: ScoredRun) -> str | None:
 
 
 def _grids(parts: Sequence[Part], paper: PaperTable | None) -> list[Grid]:
-    """The grids of all parts; the paper's rows are added where comparable, else as a last grid."""
-    if paper is None:
-        return [_grid(part, None) for part in parts]
-    reasons = {part.split: paper.why_apart(part.runs, part.split) for part in parts}
-    found = [_grid(part, None if reasons[part.split] else paper) for part in parts]
-    if all(reasons.values()):
+    """The grids of all parts; the paper's rows are added if comparable, else as a last grid."""
+    # The paper's rows are added to the grids of splits whose runs are comparable with them.
+    grids = []
+    reasons = {}
+    for part in parts:
+        beside = paper
+        if paper is not None:
+            reasons[part.split] = paper.why_apart(part.runs, part.split)
+            if reasons[part.split]:
+                beside = None
+        grids.append(_grid(part, beside))
+    if paper is not None and all(reasons.values()):
         why = reasons.get(str(paper.split)) or next(iter(reasons.values()))
-        found.append(paper.grid(str(why)))
-    return found
+        grids.append(paper.grid(str(why)))
+    return grids
 
 
 def _grid(part: Part, paper: PaperTable | None) -> Grid:
     """The scores, the comparable numbers of the paper, and the floor."""
     columns = part.columns
+    # The paper's rows by the name of our model.
     printed = {}
     if paper is not None:
-        printed = paper.beside([(None if c == m else c, m) for c, m in columns.items()])
+        printed = paper.beside(columns)
+
+    # The paper's rows follow the rows of the same models; the remaining ones are last.
     rows: list[Row] = []
     for spec in part.rows:
         rows.append(_row(part, spec, beside_paper=paper is not None))
         if spec.variant == PAINTED:
             rows += printed.pop(spec.run, [])
-    rows = _with_best(
-        [*rows, *(row for left in printed.values() for row in left)], part
-    )
-    floor = [part.cell("", FLOOR, c) for c in columns]
+    for left in printed.values():
+        rows += left
+    rows = _with_best(rows, part)
+
+    # The floor is last, and never marked as the best.
+    floor = [part.cell("", BACKGROUND, column) for column in columns]
     rows.append(Row(FLOOR_LABEL, floor, (NOT_HAD, *_origin(part.runs)), "floor"))
+
+    # The metric is in the headings, or in the title if subjects are the columns.
     title = f"{part.split}{SPLIT_TITLES.get(part.split, '')}"
-    boxes = join_unique(_boxes(run, part) or "" for run in part.runs)
-    remarks = [SPREAD, f"Boxes: {boxes}."] if boxes else [SPREAD]
+    remarks = [SPREAD_REMARK]
+    boxes = join_unique(_boxes(run, part) for run in part.runs)
+    if boxes:
+        remarks.append(f"Boxes: {boxes}.")
     if part.metric is None:
-        return Grid(title, [part.heading(m) for m in columns], rows, remarks)
+        return Grid(title, list(map(part.heading, columns)), rows, remarks)
     return Grid(f"{part.heading(part.metric)}, {title}", list(columns), rows, remarks)
 
 
 def _row(part: Part, spec: RowSpec, *, beside_paper: bool) -> Row:
+    # A row that the table asks for has a place, even if no run was scored.
     runs = part.of(spec.run)
     label = spec.label or spec.run
-    shown = (spec.run, spec.variant)
     if not runs:
-        cells = [Cell(NO_RUN) for _ in part.columns]
-        return Row(
-            label, cells, ("0", NO_RUN, NO_RUN, NO_RUN), notes=("no scored run",)
-        )
+        cells = [Cell(NO_RUN)] * len(part.columns)
+        origin = ("0", NO_RUN, NO_RUN, NO_RUN)
+        return Row(label, cells, origin, notes=("no scored run",))
+
+    # Next to the paper's numbers, a row is named as the paper's method if all its runs are.
     notes = list(dict.fromkeys(_marks(runs, part.split)))
-    if beside_paper:  # named as the paper's method where all runs are
-        if any(run.departures is None for run in runs):
+    if beside_paper:
+        departures = [run.departures for run in runs]
+        if None in departures:
             notes.append("no config says whether it is experiment=paper")
-        elif found := next(filter(None, (run.departures for run in runs)), None):
+        elif found := next(filter(None, departures), None):
             notes.append(f"differs from experiment=paper: {', '.join(found)}")
         else:
-            label = NAME if shown == ("full", PAINTED) else f"{NAME}, {label}"
-    counts = [
-        len(part.of(spec.run, column)) for column in part.columns if column != MEAN
-    ]
-    seeds = " to ".join(map(str, dict.fromkeys((min(counts), max(counts)))))
-    cells = [part.cell(*shown, c) for c in part.columns]
+            whole = (spec.run, spec.variant) == ("full", PAINTED)
+            label = NAME if whole else f"{NAME}, {label}"
+
+    # Columns of subjects may have different numbers of seeds.
+    cells = []
+    counts = []
+    for column in part.columns:
+        cells.append(part.cell(spec.run, spec.variant, column))
+        if column != MEAN:
+            counts.append(len(part.of(spec.run, column)))
+    seeds = " to ".join(map(str, sorted({min(counts), max(counts)})))
     return Row(label, cells, (seeds, *_origin(runs)), notes=tuple(notes))
 
 
@@ -373,16 +437,14 @@ def _value(
     run: ScoredRun, split: str, variant: str, metric: str
 ) -> tuple[float | None, str | None]:
     """A score, and why it is missing or incomplete."""
+    # The evaluation writes why it left out a metric.
     held = run.of(split, variant)
     if held.get(metric) is None:
         why = "not scored" if held else f"no {variant} image of {split} was scored"
         return None, str(held.get(f"{metric}_reason", why))
-    left_out = held.get(f"{metric}_left_out")
-    note = (
-        f"{left_out} images without a finite score are not in the mean"
-        if left_out
-        else None
-    )
+    note = None
+    if left_out := held.get(f"{metric}_left_out"):
+        note = f"{left_out} images without a finite score are not in the mean"
     return float(held[metric]), note
 
 
@@ -390,51 +452,57 @@ def _with_best(rows: Sequence[Row], part: Part) -> list[Row]:
     """Marks the best of our rows in each column that several of them have."""
     found = [list(row.cells) for row in rows]
     for i, metric in enumerate(part.columns.values()):
-        sign = {"↑": -1, "↓": 1}.get(METRICS[metric].better)
-        means = [mean for cells in found if (mean := cells[i].mean) is not None]
-        if len(means) < 2:
-            continue
-        best = min(
-            means, key=lambda mean: abs(mean - 1) if sign is None else sign * mean
-        )
+        means = []
         for cells in found:
             mean = cells[i].mean
-            equal = mean is not None and part.written(metric, mean) == part.written(
-                metric, best
-            )
-            cells[i] = replace(cells[i], best=equal)
+            if mean is not None:
+                means.append(mean)
+        if len(means) < 2:
+            continue
+
+        # Some metrics are better near 1 than above or below it.
+        better = METRICS[metric].better
+        if better == "↑":
+            best = max(means)
+        elif better == "↓":
+            best = min(means)
+        else:
+            best = min(means, key=lambda mean: abs(mean - 1))
+
+        # Values that are printed alike are all marked.
+        printed = part.written(metric, best)
+        for cells in found:
+            mean = cells[i].mean
+            if mean is not None and part.written(metric, mean) == printed:
+                cells[i] = replace(cells[i], best=True)
     return [replace(row, cells=cells) for row, cells in zip(rows, found, strict=True)]
 
 
 def _origin(runs: Sequence[ScoredRun]) -> tuple[str, ...]:
     """Data, protocol and commit of a row."""
+    # Many subjects are counted, not listed.
     data = join_unique(run.data_name for run in runs)
-    if len(roots := {run.data.get("root") for run in runs}) > 1:
+    roots = {run.data.get("root") for run in runs}
+    if len(roots) > 1:
         data = f"{runs[0].data['name']}, {len(roots)} subjects"
-    protocols = [run.protocol()["name"] for run in runs]
-    commits = [run.commit for run in runs]
-    return data, join_unique(protocols), join_unique(commits)
+    protocols = join_unique(run.protocol()["name"] for run in runs)
+    return data, protocols, join_unique(run.commit for run in runs)
 
 
 def _marks(runs: Sequence[ScoredRun], split: str) -> Iterator[str]:
     """Marks (such as a stand-in perceptual loss) and departures that a row must carry."""
     for run in runs:
         for held in run.scores.get(split, {}).values():
-            yield from (f"marked: {mark}" for mark in held.get("marks", []))
+            for mark in held.get("marks", []):
+                yield f"marked: {mark}"
         record = run.protocol(split)
-        yield from (
-            f"departs from {record['name']}: {d}" for d in record.get("departures", [])
-        )
-
-
-def _lpips(run: ScoredRun, split: str) -> str | None:
-    """What the networks of a run's LPIPS get, if it has one."""
-    scores = run.scores.get(split, {}).values()
-    return next((s["lpips_input"] for s in scores if s.get("lpips_input")), None)
+        for departure in record.get("departures", []):
+            yield f"departs from {record['name']}: {departure}"
 
 
 def _boxes(run: ScoredRun, part: Part) -> str | None:
     """The boxes of hands and mouth of a run, if the grid has a metric in them."""
-    shown = {*BOX_METRICS} & {*part.columns.values()}
-    scores = run.scores.get(part.split, {}).values() if shown else ()
-    return next((s["boxes"] for s in scores if s.get("boxes")), None)
+    # Without such a metric, runs of different boxes are comparable.
+    if set(BOX_METRICS).isdisjoint(part.columns.values()):
+        return None
+    return run.stated("boxes", part.split)

@@ -1,10 +1,8 @@
 """Tables as Markdown and LaTeX."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import pandas as pd
@@ -18,161 +16,173 @@ ORIGIN = ("seeds", "data", "protocol", "commit")  # columns after the scores
 
 @dataclass(frozen=True)
 class Cell:
-    """One value: its text, mean and spread, notes below the table, and whether it is the best of
-    its column."""
+    """One value of a table."""
 
     text: str
-    mean: float | None = None
-    spread: float | None = None
-    notes: tuple[str, ...] = ()
-    best: bool = False
+    mean: float | None = None  # over seeds
+    spread: float | None = None  # standard deviation over seeds
+    notes: tuple[str, ...] = ()  # printed below the table
+    best: bool = False  # of its column
 
 
 @dataclass(frozen=True)
 class Row:
-    """One row: label, a cell per column, a text for each of `ORIGIN` or none, notes on all of it.
-
-    ``kind`` is ``floor`` for the all-background image, ``paper`` for numbers that the paper prints.
-    """
+    """One row of a table."""
 
     label: str
-    cells: Sequence[Cell]
-    origin: Sequence[str] = ()
+    cells: Sequence[Cell]  # one per column
+    origin: Sequence[str] = ()  # a text for each of `ORIGIN`, or none
+    # ``floor`` for the all-background image, ``paper`` for numbers that the paper prints.
     kind: Literal["run", "floor", "paper"] = "run"
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # on the whole row
 
 
 @dataclass(frozen=True)
 class Grid:
-    """One table: its heading, the headings of its cells, its rows, remarks below it."""
+    """One table."""
 
     title: str
-    columns: Sequence[str]
+    columns: Sequence[str]  # headings of the cells
     rows: Sequence[Row]
-    remarks: Sequence[str] = ()
+    remarks: Sequence[str] = ()  # below the table
 
 
 @dataclass(frozen=True)
 class Report:
-    """All tables, and the reasons by folder of runs that were left out."""
+    """All tables, and the runs that were left out."""
 
     title: str
     grids: Sequence[Grid]
-    left_out: Mapping[str, str] = field(default_factory=dict)
+    left_out: Mapping[str, str] = field(default_factory=dict)  # reasons by folder
 
     def notes(self) -> dict[str, str]:
         """A number for every note, in the order of appearance."""
-        rows = [row for grid in self.grids for row in grid.rows]
-        notes = (
-            n
-            for row in rows
-            for n in (*row.notes, *(n for c in row.cells for n in c.notes))
-        )
-        return {note: str(i) for i, note in enumerate(dict.fromkeys(notes), start=1)}
+        # Equal notes share the number of the first one.
+        notes: dict[str, str] = {}
+        for grid in self.grids:
+            for row in grid.rows:
+                for held in (row.notes, *(cell.notes for cell in row.cells)):
+                    for note in held:
+                        notes.setdefault(note, str(len(notes) + 1))
+        return notes
 
     def frame(self) -> pd.DataFrame:
         """One row per value: table, row, column, text, mean and spread."""
-        values = [
-            (grid.title, row.label, column, cell.text, cell.mean, cell.spread)
-            for grid in self.grids
-            for row in grid.rows
-            for column, cell in zip(grid.columns, row.cells, strict=True)
-        ]
-        return pd.DataFrame(
-            values, columns=["table", "row", "column", "text", "mean", "spread"]
-        )
+        values = []
+        for grid in self.grids:
+            for row in grid.rows:
+                for column, cell in zip(grid.columns, row.cells, strict=True):
+                    place = (grid.title, row.label, column)
+                    values.append((*place, cell.text, cell.mean, cell.spread))
+        columns = ["table", "row", "column", "text", "mean", "spread"]
+        return pd.DataFrame(values, columns=columns)
 
 
-def join_unique(texts: Iterable[str]) -> str:
+def join_unique(texts: Iterable[str | None]) -> str:
     """The texts that are not empty, each once, joined by commas."""
-    return ", ".join(dict.fromkeys(text for text in texts if text))
+    return ", ".join(dict.fromkeys(filter(None, texts)))
 
 
 @dataclass(frozen=True)
 class Format:
-    """How text is written in one format: a function that escapes it, one that makes a table of a
-    title and cells, and patterns; ``origin`` adds the columns `ORIGIN`."""
+    """The parts of one text format; ``italic``, ``bold`` and ``raised`` are patterns."""
 
     escape: Callable[[str], str]
-    table: Callable[[str, pd.DataFrame], str]
+    table: Callable[[str, list[str], list[list[str]]], str]  # of title, header and rows
     italic: str
     bold: str
-    raised: str  # numbers of notes
-    origin: bool = True
+    raised: str  # for the numbers of notes
+    origin: bool = True  # whether tables have the columns `ORIGIN`
 
     def grid(self, grid: Grid, notes: Mapping[str, str]) -> str:
         """One table with its remarks."""
 
         def cell(text: str, marks: Sequence[str], pattern: str) -> str:
-            raised = (
-                self.raised.format(" ".join(notes[mark] for mark in marks))
-                if marks
-                else ""
-            )
-            return pattern.format(self.escape(text)) + raised
+            written = pattern.format(self.escape(text))
+            if marks:
+                written += self.raised.format(" ".join(notes[mark] for mark in marks))
+            return written
 
-        origin = ORIGIN if self.origin and any(row.origin for row in grid.rows) else ()
-        rows = [
-            [
-                cell(row.label, row.notes, "{}" if row.kind == "run" else self.italic),
-                *(
-                    cell(c.text, c.notes, self.bold if c.best else "{}")
-                    for c in row.cells
-                ),
-                *(self.escape(text) for text in row.origin if origin),
-            ]
-            for row in grid.rows
-        ]
-        frame = pd.DataFrame(
-            rows, columns=[*map(self.escape, ("", *grid.columns, *origin))]
-        )
-        table = self.table(self.escape(grid.title), frame)
+        # The best values are bold; labels of rows that are not runs are italic.
+        with_origin = self.origin and any(row.origin for row in grid.rows)
+        rows = []
+        for row in grid.rows:
+            pattern = "{}" if row.kind == "run" else self.italic
+            line = [cell(row.label, row.notes, pattern)]
+            for c in row.cells:
+                line.append(cell(c.text, c.notes, self.bold if c.best else "{}"))
+            if with_origin:
+                line += map(self.escape, row.origin)
+            rows.append(line)
+
+        columns = ["", *grid.columns]
+        if with_origin:
+            columns += ORIGIN
+        header = list(map(self.escape, columns))
+        table = self.table(self.escape(grid.title), header, rows)
         return "\n\n".join([table, *map(self.escape, grid.remarks)])
 
     def body(self, report: Report) -> str:
         """All but the title."""
         notes = report.notes()
-        below = [f"{number}: {note}" for note, number in notes.items()]
-        below += [
-            f"Left out: {folder}: {reason}"
-            for folder, reason in report.left_out.items()
-        ]
-        tables = (self.grid(grid, notes) for grid in report.grids)
-        return "\n\n".join([*tables, *map(self.escape, below)])
+        # Notes and reasons are below all tables.
+        parts = [self.grid(grid, notes) for grid in report.grids]
+        for note, number in notes.items():
+            parts.append(self.escape(f"{number}: {note}"))
+        for folder, reason in report.left_out.items():
+            parts.append(self.escape(f"Left out: {folder}: {reason}"))
+        return "\n\n".join(parts)
 
 
 def _escape_markdown(text: str) -> str:
+    # An underscore within a word is plain text in Markdown.
     text = re.sub(r"([\\`*\[\]<>~$])", r"\\\1", text.replace("&", "&amp;"))
     return re.sub(r"(?<!\w)_|_(?!\w)", r"\\_", text)
 
 
-def _markdown_table(title: str, frame: pd.DataFrame) -> str:
-    return f"**{title}**\n\n" + markdown_table(
-        list(frame.columns), frame.to_numpy().tolist()
-    )
+def _markdown_table(title: str, header: list[str], rows: list[list[str]]) -> str:
+    return f"**{title}**\n\n{markdown_table(header, rows)}"
 
 
+# After \\ the letters [ ] * would be an argument.
 LATEX_LETTERS = str.maketrans(
     {c: f"\\{c}" for c in "{}$&#%_"}
-    | {c: f"{{{c}}}" for c in "[]*"}  # after \\ they would be an argument
-    | {"\\": r"\textbackslash{}", "^": r"\textasciicircum{}", "~": r"\textasciitilde{}"}
-    | {"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", "\n": " "}
-    | {"±": r"$\pm$", "−": "$-$", "→": r"$\rightarrow$", "↑": r"$\uparrow$"}
-    | {"↓": r"$\downarrow$", "Ψ": r"$\Psi$", "…": r"\ldots{}", "–": "--", "²": "$^2$"}
+    | {c: f"{{{c}}}" for c in "[]*"}
+    | {
+        "\\": r"\textbackslash{}",
+        "^": r"\textasciicircum{}",
+        "~": r"\textasciitilde{}",
+        "<": r"\textless{}",
+        ">": r"\textgreater{}",
+        "|": r"\textbar{}",
+        "\n": " ",
+        "±": r"$\pm$",
+        "−": "$-$",
+        "→": r"$\rightarrow$",
+        "↑": r"$\uparrow$",
+        "↓": r"$\downarrow$",
+        "Ψ": r"$\Psi$",
+        "…": r"\ldots{}",
+        "–": "--",
+        "²": "$^2$",
+    }
 )
 
 
 def _escape_latex(text: str) -> str:
-    """Letters that pdfLaTeX's fonts lack are written as their code point."""
-    known = text.translate(LATEX_LETTERS)
-    return "".join(c if c < "\u0180" else f"{{[}}U+{ord(c):04X}{{]}}" for c in known)
+    """Text for LaTeX; letters that pdfLaTeX's fonts lack are written as their code point."""
+    written = ""
+    for letter in text.translate(LATEX_LETTERS):
+        written += letter if letter < "\u0180" else f"{{[}}U+{ord(letter):04X}{{]}}"
+    return written
 
 
-def _latex_table(title: str, frame: pd.DataFrame) -> str:
+def _latex_table(title: str, header: list[str], rows: list[list[str]]) -> str:
     """A ``table`` that is no wider than the text."""
-    tabular = frame.to_latex(
-        index=False, escape=False, column_format="l" + "r" * len(frame.T[1:])
-    )
+    # The first column has the labels, the others have numbers.
+    alignment = "l".ljust(len(header), "r")
+    frame = pd.DataFrame(rows, columns=header)
+    tabular = frame.to_latex(index=False, escape=False, column_format=alignment)
     return (
         f"\\begin{{table}}\n\\centering\n\\caption{{{title}}}\n"
         "\\resizebox{\\ifdim\\width>\\linewidth\\linewidth\\else\\width\\fi}{!}{%\n"
@@ -180,21 +190,26 @@ def _latex_table(title: str, frame: pd.DataFrame) -> str:
     )
 
 
-MARKDOWN = Format(_escape_markdown, _markdown_table, "*{}*", "**{}**", "<sup>{}</sup>")
-TERMINAL = Format(
-    _escape_markdown, _markdown_table, "*{}*", "**{}**", " ({})", origin=False
+MARKDOWN = Format(
+    escape=_escape_markdown,
+    table=_markdown_table,
+    italic="*{}*",
+    bold="**{}**",
+    raised="<sup>{}</sup>",
 )
+TERMINAL = replace(MARKDOWN, raised=" ({})", origin=False)
 LATEX = Format(
-    _escape_latex,
-    _latex_table,
-    r"\textit{{{}}}",
-    r"\textbf{{{}}}",
-    r"\textsuperscript{{{}}}",
+    escape=_escape_latex,
+    table=_latex_table,
+    italic=r"\textit{{{}}}",
+    bold=r"\textbf{{{}}}",
+    raised=r"\textsuperscript{{{}}}",
 )
 
 
 def files_of(report: Report) -> dict[str, str]:
     """The files of a report by name; LaTeX has a ``table`` per grid, for ``\\input``."""
+    # Wide tables are scaled to the width of the text.
     packages = (
         "% needs \\usepackage{booktabs} and, for wide tables, \\usepackage{graphicx}"
     )

@@ -10,16 +10,18 @@ from collections import deque
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
+
+from gsgan.utils.arrays import Bytes
 
 CACHE_LINE = 64  # bytes; rows of tiles are whole cache lines
 LARGE = 1 << 20  # bytes from which memory is reused
-KEPT = 1 << 28  # maximum bytes of unused memory that a process keeps
+MAX_KEPT = 1 << 28  # maximum bytes of unused memory that a process keeps
 
-_NAMES = {torch.float32: "float32", torch.float64: "float64"}
-# By size in bytes. A deque's append and pop are atomic: finalisers run in any thread, at any time.
-_free: dict[int, deque[NDArray[np.uint8]]] = {}
+_DTYPE_NAMES = {torch.float32: "float32", torch.float64: "float64"}
+# Unused memory by size in bytes. A deque's append and pop are atomic: finalisers run in any
+# thread, at any time.
+_free: dict[int, deque[Bytes]] = {}
 
 
 def zeros(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
@@ -34,12 +36,16 @@ def zeros(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
     used = math.prod(shape) * dtype.itemsize
     size = used + CACHE_LINE
     kept = _take(size) if size >= LARGE else None
+
     # numpy's large zeros are huge pages, which the system clears on first access.
     memory = np.zeros(size, np.uint8) if kept is None else kept
     first = -memory.ctypes.data % CACHE_LINE
+
     # Sliced in numpy: autograd forbids in-place changes of views made by torch.
-    array = memory[first : first + used].view(_NAMES[dtype]).reshape(shape)
-    if size >= LARGE:  # the array lives as long as the tensors that share its memory
+    array = memory[first : first + used].view(_DTYPE_NAMES[dtype]).reshape(shape)
+
+    # The array lives as long as the tensors that share its memory.
+    if size >= LARGE:
         weakref.finalize(array, _give_back, memory).atexit = False
     tensor = torch.from_numpy(array)
     return tensor if kept is None else tensor.zero_()
@@ -55,14 +61,17 @@ def forget() -> None:
     _free.clear()
 
 
-def _take(size: int) -> NDArray[np.uint8] | None:
+def _take(size: int) -> Bytes | None:
+    """Unused memory of a size; None if there is none."""
+    # Another thread may take the last one at any time.
     try:
         return _free[size].pop()
     except (KeyError, IndexError):
         return None
 
 
-def _give_back(memory: NDArray[np.uint8]) -> None:
-    if kept() + memory.nbytes > KEPT:
+def _give_back(memory: Bytes) -> None:
+    # All other memory is freed if this would be too much.
+    if kept() + memory.nbytes > MAX_KEPT:
         _free.clear()
     _free.setdefault(memory.nbytes, deque()).append(memory)

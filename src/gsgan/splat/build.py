@@ -25,15 +25,22 @@ from torch import Tensor
 
 from gsgan.utils.files import cache_root
 
+# The kernels are one program, which includes the headers.
 SOURCE = Path(__file__).with_name("native.cpp")
-HEADERS = SOURCE.with_name("kernels")
+KERNEL_HEADERS = SOURCE.with_name("kernels")
 COMPILERS = ("c++", "g++", "clang++")
-COMPILE_SECONDS = 300.0
+COMPILE_SECONDS = 300.0  # after which the compiler counts as hanging
 
 # No -ffast-math: NaN and infinity keep their meaning, sums keep their order.
 BASE_FLAGS = (
-    *("-std=c++17", "-O3", "-fPIC", "-shared", "-fopenmp-simd"),
-    *("-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast"),
+    "-std=c++17",
+    "-O3",
+    "-fPIC",
+    "-shared",
+    "-fopenmp-simd",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-ffp-contract=fast",
 )
 # Tried in this order: some compilers have no OpenMP (Apple's clang) or no flags for this CPU.
 _NATIVE_FLAGS = (
@@ -49,8 +56,18 @@ _NATIVE_FLAGS = (
 DTYPES = {torch.float32: "float32", torch.float64: "float64"}
 # Functions of the library, one per dtype; each takes a job and at most one more pointer.
 _FUNCTIONS = (
-    *("forward", "backward", "free", "project", "project_backward"),
-    *("compose", "compose_backward", "photometric", "solve"),
+    # compositing: kernels/job.h
+    "forward",
+    "backward",
+    "free",
+    # projection: kernels/ewa.h
+    "project",
+    "project_backward",
+    # parts of the model, losses and body
+    "compose",
+    "compose_backward",
+    "photometric",
+    "solve",
 )
 
 _LOCK = threading.Lock()
@@ -66,7 +83,8 @@ def library() -> tuple[ctypes.CDLL | None, str]:
     Returns:
         The library and "", or None and the reason in one sentence.
     """
-    with _LOCK:  # two threads must not compile at once
+    # Two threads must not compile at once.
+    with _LOCK:
         return _load_once()
 
 
@@ -76,20 +94,25 @@ def job_type(
     addresses: Sequence[str],
     results: Sequence[str] = (),
 ) -> type[ctypes.Structure]:
-    """The type of a kernel's argument, field by field as its header in kernels/ declares it:
-    64-bit integers, doubles, addresses of tensors, and integers that the kernel sets."""
-    kinds = (
-        (integers, ctypes.c_int64),
-        (numbers, ctypes.c_double),
-        (addresses, ctypes.c_void_p),
-        (results, ctypes.c_int64),
-    )
-    fields = [(name, kind) for names, kind in kinds for name in names]
+    """The type of a kernel's argument, field by field as its header in kernels/ declares it.
+
+    Args:
+        integers: names of 64-bit integers.
+        numbers: names of doubles.
+        addresses: names of tensors' addresses.
+        results: names of 64-bit integers that the kernel sets.
+    """
+    fields: list[tuple[str, Any]] = [(name, ctypes.c_int64) for name in integers]
+    fields += [(name, ctypes.c_double) for name in numbers]
+    fields += [(name, ctypes.c_void_p) for name in addresses]
+    fields += [(name, ctypes.c_int64) for name in results]
     return type("Job", (ctypes.Structure,), {"_fields_": fields})
 
 
 def point(
-    job: ctypes.Structure, names: Sequence[str], tensors: Sequence[Tensor | None]
+    job: ctypes.Structure,
+    names: Sequence[str],
+    tensors: Sequence[Tensor | None],
 ) -> None:
     """Sets fields of a job to tensors' addresses; the caller keeps the tensors alive."""
     for name, tensor in zip(names, tensors, strict=False):
@@ -98,7 +121,7 @@ def point(
 
 def threads() -> int:
     """The number of threads of a kernel."""
-    return max(1, torch.get_num_threads())
+    return torch.get_num_threads()
 
 
 def function(name: str, dtype: torch.dtype) -> Any:
@@ -116,18 +139,24 @@ def function(name: str, dtype: torch.dtype) -> Any:
 @functools.lru_cache(maxsize=1)
 def _load_once() -> tuple[ctypes.CDLL | None, str]:
     try:
+        # The file's name is a hash of all that a compiled kernel depends on.
         command = compiler()
-        # all that a compiled kernel depends on
-        parts = (_source(), repr(BASE_FLAGS), repr(_flags()), repr(command))
-        key = hashlib.sha256(
-            "\0".join((*parts, _version(command), _cpu())).encode()
-        ).hexdigest()
-        folder = _cache_folder()
-        path = folder / f"{key[:24]}.so"
-        if path.is_file() and (loaded := open_library(path)) is not None:
-            return loaded, ""
-        _build(command, path)
+        parts = (
+            _source(),
+            repr(BASE_FLAGS),
+            repr(_flags()),
+            repr(command),
+            _version(command),
+            _cpu(),
+        )
+        key = hashlib.sha256("\0".join(parts).encode()).hexdigest()
+        path = _cache_folder() / f"{key[:24]}.so"
+
+        # A file that is damaged is compiled again.
         loaded = open_library(path)
+        if loaded is None:
+            _build(command, path)
+            loaded = open_library(path)
     except Unavailable as reason:
         return None, str(reason)
     except OSError as error:
@@ -139,11 +168,14 @@ def _load_once() -> tuple[ctypes.CDLL | None, str]:
 
 def compiler() -> list[str]:
     """The compiler's command; with ``CXX`` set, no other one is tried."""
+    # A command may have arguments, such as "ccache g++".
     named = shlex.split(os.environ.get("CXX", ""))
     if named:
         if shutil.which(named[0]) is None:
             raise Unavailable(f"The compiler {named[0]!r} from CXX is not found.")
         return named
+
+    # The first one that is installed.
     for name in COMPILERS:
         if (path := shutil.which(name)) is not None:
             return [path]
@@ -154,6 +186,7 @@ def compiler() -> list[str]:
 
 def _cache_folder() -> Path:
     """Folder of the compiled kernels; created, for this user only, when missing."""
+    # Others must not be able to replace a library that is loaded here.
     folder = cache_root() / "native"
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -168,18 +201,19 @@ def _cache_folder() -> Path:
 def _flags() -> tuple[tuple[str, ...], ...]:
     """Sets of flags to try, best first."""
     march = os.environ.get("GSGAN_MARCH")
-    return (
-        ((f"-march={march}", "-fopenmp"), (f"-march={march}",))
-        if march
-        else _NATIVE_FLAGS
-    )
+    if not march:
+        return _NATIVE_FLAGS
+    processor = f"-march={march}"
+    return (processor, "-fopenmp"), (processor,)
 
 
 def _source() -> str:
-    headers = sorted(HEADERS.glob("*.h"))
+    """The source of the kernels."""
+    # An incomplete installation has no kernels, but works without them.
+    headers = sorted(KERNEL_HEADERS.glob("*.h"))
     if not SOURCE.is_file() or not headers:
         raise Unavailable(
-            f"The kernel's source {SOURCE} or {HEADERS} is missing; reinstall gsgan."
+            f"The kernel's source {SOURCE} or {KERNEL_HEADERS} is missing; reinstall gsgan."
         )
     return "\0".join(path.read_text(encoding="utf-8") for path in (SOURCE, *headers))
 
@@ -196,14 +230,10 @@ def _cpu() -> str:
     lines = [platform.machine(), platform.processor()]
     info = Path("/proc/cpuinfo")
     if info.is_file():
+        # Processors of one kind have the same lines.
         fields = ("model name", "flags", "CPU implementer", "CPU part", "Features")
-        lines += sorted(
-            {
-                x
-                for x in info.read_text(errors="replace").splitlines()
-                if x.startswith(fields)
-            }
-        )
+        found = info.read_text(errors="replace").splitlines()
+        lines += sorted({line for line in found if line.startswith(fields)})
     return "\n".join(lines)
 
 
@@ -213,26 +243,26 @@ def _build(command: list[str], library: Path) -> None:
     Raises:
         Unavailable: when no set of flags compiles.
     """
+    # The message has the first error of the first set of flags that has one.
     message = ""
     with tempfile.TemporaryDirectory(dir=library.parent, prefix="build-") as work:
         target = Path(work) / "native.so"
         for flags in _flags():
+            # The library appears under its name only when it is complete.
             done = _run([*command, *BASE_FLAGS, *flags, str(SOURCE), "-o", str(target)])
             if done.returncode == 0 and target.is_file():
                 os.replace(target, library)
                 return
-            wrong = [
-                line for line in done.stderr.splitlines() if "error" in line.lower()
-            ]
-            message = message or "".join(
-                f": {line.strip().rstrip('.')}" for line in wrong[:1]
-            )
+            for line in done.stderr.splitlines():
+                if not message and "error" in line.lower():
+                    message = f": {line.strip().rstrip('.')}"
     raise Unavailable(
         f"The compiler {shlex.join(command)!r} failed on the native kernel{message}."
     )
 
 
 def _run(command: list[str]) -> subprocess.CompletedProcess[str]:
+    """Runs a command to its end; the caller looks at its exit status."""
     try:
         return subprocess.run(
             command,
@@ -251,11 +281,12 @@ def open_library(path: Path) -> ctypes.CDLL | None:
     """The library with its functions declared, or None when it cannot be loaded."""
     try:
         loaded = ctypes.CDLL(str(path))
+        # Compositing has a second pointer, to tile lists.
         for name in _FUNCTIONS:
             for dtype in DTYPES.values():
                 declared = getattr(loaded, f"gsgan_{name}_{dtype}")
-                count = 2 if name in ("forward", "backward") else 1
-                declared.argtypes = (ctypes.c_void_p,) * count
+                pointers = 2 if name in ("forward", "backward") else 1
+                declared.argtypes = (ctypes.c_void_p,) * pointers
                 declared.restype = None if name == "free" else ctypes.c_int
     except (OSError, AttributeError):
         return None

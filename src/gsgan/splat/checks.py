@@ -7,11 +7,12 @@ from torch import Tensor
 
 from gsgan.scene import Camera, Gaussians
 
-ROTATION = 1e-3  # largest difference of an entry of R Rᵀ from the identity's
+ROTATION = 1e-3  # maximum difference of an entry of R Rᵀ from the identity's
 
 
 def check(gaussians: Gaussians, camera: Camera) -> None:
-    """Checks the arguments of ``rasterise``; values on a CPU only: elsewhere the host would wait.
+    """Checks the arguments of ``rasterise``; values on a CPU only, since the host would wait for
+    other devices.
 
     Raises:
         ValueError: naming the argument, the expectation and the value.
@@ -23,6 +24,7 @@ def check(gaussians: Gaussians, camera: Camera) -> None:
 
 
 def _tensors(record: Gaussians | Camera) -> dict[str, Tensor]:
+    """The tensors of a record by the names that messages have."""
     owner = type(record).__name__
     return {f"{owner}.{k}": v for k, v in vars(record).items() if isinstance(v, Tensor)}
 
@@ -34,16 +36,17 @@ def _check_types(gaussians: Gaussians, camera: Camera) -> None:
             f"rasterise: camera must have the batch size of gaussians, {len(gaussians)}, "
             f"got {len(camera)}"
         )
+
+    # Backends decide on the dtype of the arithmetic by that of the means.
     means = gaussians.means
     if not means.is_floating_point():
         raise ValueError(
             f"rasterise: Gaussians.means must be floating point, got {means.dtype}"
         )
     for name, value in {**_tensors(gaussians), **_tensors(camera)}.items():
-        for what, have, want in (
-            ("device", value.device, means.device),
-            ("dtype", value.dtype, means.dtype),
-        ):
+        for what in ("device", "dtype"):
+            have = getattr(value, what)
+            want = getattr(means, what)
             if have != want:
                 raise ValueError(
                     f"rasterise: {name} must have the {what} of Gaussians.means, {want}, got {have}"
@@ -51,30 +54,29 @@ def _check_types(gaussians: Gaussians, camera: Camera) -> None:
 
 
 def _check_camera(camera: Camera) -> None:
-    """K is a pinhole's, R a rotation."""
+    """Checks that K is a pinhole's and R a rotation."""
+    # In float64, so that the check itself does not round.
     K = camera.K.detach().double()
     R = camera.R.detach().double()
     t = camera.t.detach().double()
     identity = torch.eye(3, dtype=R.dtype)
-    off = (R @ R.mT - identity).abs().amax((-2, -1))
+    focal = (K[:, 0, 0] > 0) & (K[:, 1, 1] > 0)
+    pinhole = (K[:, 2] == identity[2]).all(-1) & (K[:, 1, 0] == 0)
+    orthogonal = (R @ R.mT - identity).abs().amax((-2, -1)) <= ROTATION
+    not_mirrored = torch.linalg.det(R) > 0
+
+    # Each rule: the matrix, whether each item keeps the rule, and the rule in words.
     rules = (
         ("K", K.isfinite().all((-2, -1)), "finite"),
         ("R", R.isfinite().all((-2, -1)), "finite"),
         ("t", t.isfinite().all(-1), "finite"),
-        ("K", (K[:, 0, 0] > 0) & (K[:, 1, 1] > 0), "of fx, fy > 0"),
-        (
-            "K",
-            (K[:, 2] == identity[2]).all(-1) & (K[:, 1, 0] == 0),
-            "[fx s cx; 0 fy cy; 0 0 1]",
-        ),
-        ("R", off <= ROTATION, f"a rotation, R Rᵀ the identity to {ROTATION:g}"),
-        (
-            "R",
-            torch.linalg.det(R) > 0,
-            "a rotation: it mirrors; flip one axis of R and t",
-        ),
+        ("K", focal, "of fx, fy > 0"),
+        ("K", pinhole, "[fx s cx; 0 fy cy; 0 0 1]"),
+        ("R", orthogonal, f"a rotation, R Rᵀ the identity to {ROTATION:g}"),
+        ("R", not_mirrored, "a rotation: it mirrors; flip one axis of R and t"),
     )
     for name, good, expected in rules:
+        # The message has the first item that breaks the rule.
         if not good.all():
             i = int((~good).nonzero()[0])
             raise ValueError(
@@ -84,11 +86,14 @@ def _check_camera(camera: Camera) -> None:
 
 
 def _check_gaussians(gaussians: Gaussians) -> None:
-    """Numbers are finite and in their ranges."""
+    """Checks that numbers are finite and in their ranges."""
     B, N = gaussians.means.shape[:2]
     if B * N == 0 or _all_valid(gaussians):
         return
+
+    # Something is wrong: the message names the first number that is.
     for name, value in _shape_tensors(gaussians).items():
+        # Scales and opacities have ranges; other numbers only have to be finite.
         value = value.detach().reshape(B, N, -1)
         good = value.isfinite()
         expected = "finite"
@@ -110,20 +115,20 @@ def _shape_tensors(gaussians: Gaussians) -> dict[str, Tensor]:
     """The tensors that are used: with covariances, quats and scales are not."""
     found = _tensors(gaussians)
     if gaussians.covariances is not None:
-        found = {
-            k: v
-            for k, v in found.items()
-            if k not in ("Gaussians.quats", "Gaussians.scales")
-        }
+        found.pop("Gaussians.quats", None)
+        found.pop("Gaussians.scales", None)
     return found
 
 
+@torch.no_grad()
 def _all_valid(gaussians: Gaussians) -> bool:
-    """A sum is finite only where all its terms are: one pass."""
-    used = {name: value.detach() for name, value in _shape_tensors(gaussians).items()}
+    """Whether all numbers are finite and in their ranges, in one pass over each tensor."""
+    # A sum is finite only if all its terms are.
+    total = 0.0
+    used = _shape_tensors(gaussians)
+    for value in used.values():
+        total += float(value.sum(dtype=torch.float64))
+    low, high = torch.aminmax(gaussians.opacities)
     scales = used.get("Gaussians.scales")
-    opacities = used["Gaussians.opacities"]
-    total = sum(float(value.sum(dtype=torch.float64)) for value in used.values())
-    low, high = torch.aminmax(opacities)
     positive = scales is None or float(scales.amin()) > 0
     return math.isfinite(total) and positive and float(low) >= 0 and float(high) <= 1

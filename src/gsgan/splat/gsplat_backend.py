@@ -14,12 +14,12 @@ Differences between gsplat and ``Accuracy``, which `given_up` describes:
 - Gradients are summed in no fixed order: their last bits differ between runs.
 """
 
-import importlib
 import importlib.metadata
 import importlib.util
 import math
 import re
 from functools import lru_cache
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -31,14 +31,14 @@ from gsgan.splat.settings import Accuracy
 
 DEVICE = "cuda"
 # Cut-offs of gsplat 1.5.3. Its boxes reach to the alpha cut-off: the extent "opacity".
-COMPILED_IN: dict[str, float | str] = {
+COMPILED_IN: dict[str, Any] = {
     "alpha_min": 1 / 255,
     "transmittance_min": 1e-4,
     "extent": "opacity",
     "dtype": "float32",
     "fov_clamp": 1.3,
 }
-TOLERANCE = 1e-5  # relative, between a setting and the compiled-in value
+CUTOFF_TOLERANCE = 1e-5  # relative, between a setting and the compiled-in value
 
 
 def why_not(settings: Accuracy, device: torch.device) -> str:
@@ -47,6 +47,7 @@ def why_not(settings: Accuracy, device: torch.device) -> str:
     Returns:
         One sentence; empty when it can be used.
     """
+    # Settings that it does not have; then whether it works at all.
     if device.type != DEVICE:
         return f"gsplat runs on CUDA only, the Gaussians are on {device}."
     if settings.dtype != "float32":
@@ -56,18 +57,19 @@ def why_not(settings: Accuracy, device: torch.device) -> str:
 
 def differences(settings: Accuracy, device: torch.device) -> list[str]:
     """Differences between gsplat's cut-offs and the settings, one clause each."""
-    have = {**COMPILED_IN, "alpha_max": _measured_cap(device)[0] or 0.0}
-    return [
-        f"{name} is {value if isinstance(value, str) else f'{value:.6g}'}, not {want}"
-        for name, value in have.items()
-        if not (
-            (want := getattr(settings, name)) == value
-            or (
-                isinstance(value, float)
-                and math.isclose(want, value, rel_tol=TOLERANCE)
-            )
-        )
-    ]
+    # Numbers are equal up to rounding, and printed alike.
+    cap, _ = _measured_cap(device)
+    found = []
+    for name, value in {**COMPILED_IN, "alpha_max": cap or 0.0}.items():
+        want = getattr(settings, name)
+        if isinstance(value, float):
+            same = math.isclose(want, value, rel_tol=CUTOFF_TOLERANCE)
+            value = f"{value:.6g}"
+        else:
+            same = want == value
+        if not same:
+            found.append(f"{name} is {value}, not {want}")
+    return found
 
 
 def given_up(settings: Accuracy, device: torch.device) -> str:
@@ -85,6 +87,7 @@ def unsuited(gaussians: Gaussians, camera: Camera) -> str:
     Returns:
         One sentence; empty when it can.
     """
+    # Inputs that other backends can draw.
     if gaussians.means.dtype == torch.float64:
         return "gsplat computes in float32, the Gaussians are float64."
     if gaussians.opacities.numel() == 0:
@@ -95,12 +98,15 @@ def unsuited(gaussians: Gaussians, camera: Camera) -> str:
 
 
 def draw(
-    gaussians: Gaussians, camera: Camera, settings: Accuracy
+    gaussians: Gaussians,
+    camera: Camera,
+    settings: Accuracy,
 ) -> tuple[Tensor, Tensor]:
     """Projects and blends.
 
-    Convention: as ``gsgan.splat.rasterise``, for inputs for which ``why_not`` and ``unsuited`` are
-    empty. Differentiable in every tensor of the Gaussians and in the camera's R and t.
+    Conventions are those of ``gsgan.splat.rasterise``; ``why_not`` and ``unsuited`` must be empty
+    for the inputs. The result is differentiable in every tensor of the Gaussians and in the
+    camera's R and t.
 
     Args:
         gaussians: N >= 1 Gaussians per batch item, of at most float32.
@@ -112,6 +118,7 @@ def draw(
 
     Source: Ye et al., gsplat: An open-source library for Gaussian splatting (version 1.5.3).
     """
+    # gsplat has a dimension of cameras after that of batch items.
     H, W = camera.size
     means, viewmats = _seen_from_the_camera(gaussians.means, camera)
     colours, alphas, _ = importlib.import_module("gsplat").rasterization(
@@ -139,21 +146,17 @@ def _shapes(gaussians: Gaussians) -> dict[str, Tensor | None]:
     if gaussians.covariances is not None:
         # gsplat reads the upper triangle; the other backends use the symmetric part.
         covariances = gaussians.covariances.float()
-        return {
-            "quats": None,
-            "scales": None,
-            "covars": (covariances + covariances.mT) / 2,
-        }
+        symmetric = (covariances + covariances.mT) / 2
+        return {"quats": None, "scales": None, "covars": symmetric}
     assert gaussians.quats is not None
     assert gaussians.scales is not None
-    return {
-        "quats": _usable(gaussians.quats.float()),
-        "scales": gaussians.scales.float(),
-    }
+    quats = _usable(gaussians.quats.float())
+    return {"quats": quats, "scales": gaussians.scales.float()}
 
 
 def _usable(quats: Tensor) -> Tensor:
     """Quaternions rescaled so that squares neither underflow nor overflow; zero gives identity."""
+    # As in `gsgan.splat.project.rotations`.
     largest = quats.detach().abs().amax(-1, keepdim=True)
     usable = largest > QUAT_MIN
     identity = functional.pad(torch.ones_like(quats[..., :1]), (0, 3))
@@ -163,17 +166,20 @@ def _usable(quats: Tensor) -> Tensor:
 def _seen_from_the_camera(means: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     """Means ``[B, N, 3]`` relative to the camera's centre, and the ``[B, 4, 4]`` view transform.
 
-    In float64, so that a camera far from the origin costs no digits. The centre is a constant that
-    cancels: gradients are those of the means, R and t. gsplat has no skew, so the transform
-    includes it: ``fx x + s y`` is ``fx (x + y s / fx)``, and the matrix applied to means and shapes
-    need not be a rotation.
+    They are computed in float64, so that a camera far from the origin costs no digits. gsplat has
+    no skew, so the transform includes it: ``fx x + s y`` is ``fx (x + y s / fx)``, and the matrix
+    applied to means and shapes need not be a rotation.
     """
+    # The centre is a constant that cancels: gradients are those of the means, R and t.
     camera = camera.to(torch.float64)
     centre = camera.centre.detach()
+    left = camera.t.unsqueeze(-1) + camera.R @ centre.unsqueeze(-1)
+
+    # The shear of the skew, as the left factor of the transform.
     K = camera.K.detach()
     shear = torch.eye(3, dtype=K.dtype, device=K.device).repeat(len(camera), 1, 1)
     shear[:, 0, 1] = K[:, 0, 1] / K[:, 0, 0]
-    left = camera.t.unsqueeze(-1) + camera.R @ centre.unsqueeze(-1)
+    # [shear [R t]; 0 0 0 1]
     top = shear @ torch.cat([camera.R, left], dim=-1)
     bottom = functional.pad(torch.ones_like(top[:, :1, :1]), (3, 0))
     viewmats = torch.cat([top, bottom], dim=1)
@@ -185,6 +191,8 @@ def _measured_cap(device: torch.device) -> tuple[float | None, str]:
     """The alpha of an opaque Gaussian at its centre, or None and the reason."""
     if importlib.util.find_spec("gsplat") is None:
         return None, "gsplat is not installed: pip install 'gsgan[gsplat]'."
+
+    # An opaque Gaussian of unit size, one metre in front of a camera of one pixel.
     gaussians = Gaussians(
         means=torch.tensor([[[0.0, 0.0, 1.0]]], device=device),
         quats=torch.tensor([[[1.0, 0.0, 0.0, 0.0]]], device=device),
@@ -192,17 +200,20 @@ def _measured_cap(device: torch.device) -> tuple[float | None, str]:
         opacities=torch.ones(1, 1, device=device),
         features=torch.ones(1, 1, 1, device=device),
     )
-    K = torch.tensor(
-        [[[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]]], device=device
-    )
+    K = [[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]]
     camera = Camera(
-        K, torch.eye(3, device=device)[None], torch.zeros(1, 3, device=device), (1, 1)
+        K=torch.tensor([K], device=device),
+        R=torch.eye(3, device=device)[None],
+        t=torch.zeros(1, 3, device=device),
+        size=(1, 1),
     )
+
+    # Without a compiler, or on an unknown GPU or version, torch is used.
     try:
         with torch.no_grad():
-            alpha = draw(gaussians, camera, _PROBE)[1]
+            _, alpha = draw(gaussians, camera, _PROBE)
         return float(alpha), ""
-    except Exception as error:  # no compiler, unknown GPU, other version: torch is used
+    except Exception as error:
         return None, (
             f"gsplat {_version()} is installed but cannot draw here ({first_error(error)}); gsplat "
             "1.5.3 or newer is needed, and 1.5.3 does not compile against CUDA 13: take torch 2.8 "
@@ -211,6 +222,7 @@ def _measured_cap(device: torch.device) -> tuple[float | None, str]:
 
 
 def _version() -> str:
+    # A package that was not installed by pip may have no metadata.
     try:
         return importlib.metadata.version("gsplat")
     except importlib.metadata.PackageNotFoundError:
@@ -219,10 +231,12 @@ def _version() -> str:
 
 def first_error(error: Exception) -> str:
     """The type of an error and the line that tells its cause: of a failed build the compiler's
-    first error, which stands far below "Error building extension"."""
+    first error, which is far below "Error building extension"."""
+    # Without such a line, the first line of the error.
     lines = str(error).strip().splitlines()
     causes = [line for line in lines if re.search(r"\b(fatal )?error\b\s*:", line)]
     return ": ".join([type(error).__name__, *(causes or lines)[:1]])
 
 
-_PROBE = Accuracy("probe", 1 / 255, 1e-4, "opacity", "float32")
+# The settings that gsplat's own cut-offs are.
+_PROBE = Accuracy(name="probe", **COMPILED_IN)

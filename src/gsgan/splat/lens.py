@@ -1,6 +1,6 @@
 """Applies lens distortion to Gaussians, because rasterisers support pinholes only.
 
-Convention: OpenCV's model (k1 k2 p1 p2 k3), see `gsgan.scene.distort`.
+Lenses follow OpenCV's model (k1 k2 p1 p2 k3), see `gsgan.scene.distort`.
 """
 
 from dataclasses import replace
@@ -14,7 +14,9 @@ from gsgan.utils.tensors import constant
 
 
 def as_pinhole_sees(
-    gaussians: Gaussians, camera: Camera, near: float
+    gaussians: Gaussians,
+    camera: Camera,
+    near: float,
 ) -> tuple[Gaussians, Camera]:
     """Gaussians moved so that a pinhole shows them as the cameras' lenses show the given ones.
 
@@ -23,7 +25,7 @@ def as_pinhole_sees(
     lens's of the original. Depths, and so the order, stay. Gaussians beyond the fold of a lens
     become transparent.
 
-    Convention: differentiable in Gaussians and camera, the lens's coefficients included.
+    The result is differentiable in Gaussians and camera, the lens's coefficients included.
 
     Args:
         gaussians: N Gaussians per batch item.
@@ -35,21 +37,27 @@ def as_pinhole_sees(
     """
     assert camera.dist is not None
     means, jacobian, beyond = bend(camera.to_camera(gaussians.means), camera.dist, near)
+
+    # The derivative J of the move, in world axes, moves Σ to J Σ Jᵀ.
     R = camera.R.unsqueeze(1)
-    turn = R.mT @ jacobian @ R  # of the move, in world axes
-    return replace(
+    J = R.mT @ jacobian @ R
+    moved = replace(
         gaussians,
         means=(means - camera.t.unsqueeze(1)) @ camera.R,
         quats=None,
         scales=None,
-        covariances=turn @ _covariances(gaussians) @ turn.mT,
+        covariances=J @ _covariances(gaussians) @ J.mT,
         opacities=torch.where(beyond, 0.0, gaussians.opacities),
-    ), replace(camera, dist=None)
+    )
+    return moved, replace(camera, dist=None)
 
 
 def _covariances(gaussians: Gaussians) -> Tensor:
+    """The covariances Σ = (R S)(R S)ᵀ ``[B, N, 3, 3]``."""
     if gaussians.covariances is not None:
         return gaussians.covariances
+
+    # The columns of R, scaled.
     assert gaussians.quats is not None and gaussians.scales is not None  # noqa: PT018
     axes = rotations(gaussians.quats) * gaussians.scales.unsqueeze(-2)
     return axes @ axes.mT
@@ -58,7 +66,13 @@ def _covariances(gaussians: Gaussians) -> Tensor:
 def bend(x_cam: Tensor, dist: Tensor, near: float) -> tuple[Tensor, Tensor, Tensor]:
     """Moves points so that a pinhole shows them where the lens does, at the same depth.
 
-    Convention: differentiable; values and gradients are finite for every finite point. Points
+    With x = z n and the lens's distortion d(n), whose derivative is D, a point (x, z) moves to
+    (z d(n), z). Since ``dn / dx = I / z`` and ``dn / dz = -n / z``, the move's derivative is
+
+        [ D  d - D n ]
+        [ 0  1       ].
+
+    The move is differentiable; values and gradients are finite for every finite point. Points
     nearer than ``near``, beyond the lens's fold or not finite stay where they are.
 
     Args:
@@ -71,17 +85,20 @@ def bend(x_cam: Tensor, dist: Tensor, near: float) -> tuple[Tensor, Tensor, Tens
         first-order projection of small shapes is the lens's), and which of them lie beyond the
         fold, where a lens shows nothing ``[B, M]``.
     """
+    # n = (x, y) / z of the points that move; 0 for the others.
     z = x_cam[..., 2:]
     ahead = (z > near) & torch.isfinite(x_cam).all(dim=-1, keepdim=True)
     n = torch.where(ahead, x_cam[..., :2], 0.0) / torch.where(ahead, z, 1.0)
-    beyond = (
-        n.norm(dim=-1, keepdim=True)
-        >= RIM * fold_radius(dist).to(n.dtype)[:, None, None]
-    )
+    rim = RIM * fold_radius(dist).to(n.dtype)[:, None, None]
+    beyond = n.norm(dim=-1, keepdim=True) >= rim
     moves = ahead & ~beyond
     n = torch.where(moves, n, 0.0)
+
+    # d(n), D and the moved points.
     shown, slope = distort(n, dist)
     moved = torch.cat([shown * torch.where(moves, z, 1.0), z], dim=-1)
+
+    # The derivative, and the identity for points that stay.
     by_depth = shown - (slope @ n.unsqueeze(-1)).squeeze(-1)
     top = torch.cat([slope, by_depth.unsqueeze(-1)], dim=-1)
     bottom = constant((0.0, 0.0, 1.0), top).expand(*top.shape[:-2], 1, 3)

@@ -3,20 +3,16 @@
 When it cannot be built, ``available()`` is False and ``why_not()`` has the reason.
 """
 
-from __future__ import annotations
-
 import ctypes
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from gsgan.splat import build
 from gsgan.splat.buffers import zeros
-
-if TYPE_CHECKING:
-    from gsgan.splat.project import Projected
-    from gsgan.splat.settings import Accuracy
+from gsgan.splat.project import Projected
+from gsgan.splat.settings import Accuracy
 
 # Memory of the backward pass for gradients per (tile, Gaussian) before they are summed.
 SLOT_BYTES = 1 << 28
@@ -24,18 +20,39 @@ SLOT_BYTES = 1 << 28
 _OUT_OF_MEMORY = 1
 _NOT_FINITE = 2
 
-_INPUTS = ("means", "factors", "opacities", "features", "depths", "extents")
-_OUTPUTS = ("out_features", "out_alpha", "out_average")
-_GRADS_OUT = ("g_features", "g_alpha", "g_average")
-_GRADS_IN = ("d_means", "d_factors", "d_opacities", "d_features")
+# Fields of a job that are addresses of tensors.
+_ELLIPSES = (
+    "means",
+    "factors",
+    "opacities",
+    "features",
+    "depths",
+    "extents",
+    "visible",
+)
+_IMAGES = ("out_features", "out_alpha", "out_average")
+_IMAGE_GRADS = ("g_features", "g_alpha", "g_average")
+_ELLIPSE_GRADS = ("d_means", "d_factors", "d_opacities", "d_features")
 AVERAGES = (1, 2, 4, 8)  # supersampling that is averaged here: divisors of a tile
 
+# struct Job of kernels/job.h
 _Job = build.job_type(
-    ("B", "N", "C", "H", "W", "threads", "keep", "box", "slot_bytes", "times"),
-    ("alpha_min", "transmittance_min", "alpha_max"),
-    (*_INPUTS, "visible", *_OUTPUTS, *_GRADS_OUT, *_GRADS_IN),
-    ("bad",),
-)  # struct Job of kernels/job.h
+    integers=(
+        "B",  # batch items
+        "N",  # Gaussians per item
+        "C",  # channels
+        "H",
+        "W",
+        "threads",
+        "keep",  # whether tile lists are kept for the backward pass
+        "box",  # whether extents cut off pixels
+        "slot_bytes",
+        "times",
+    ),
+    numbers=("alpha_min", "transmittance_min", "alpha_max"),
+    addresses=(*_ELLIPSES, *_IMAGES, *_IMAGE_GRADS, *_ELLIPSE_GRADS),
+    results=("bad",),
+)
 
 
 def available() -> bool:
@@ -52,13 +69,16 @@ def why_not() -> str:
 
 
 def composite(
-    projected: Projected, size: tuple[int, int], settings: Accuracy, times: int = 1
+    projected: Projected,
+    size: tuple[int, int],
+    settings: Accuracy,
+    times: int = 1,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Blends ellipses front to back on the CPU.
 
-    Convention: pixel centres at +0.5; ``alpha = min(alpha_max, o exp(-q / 2))`` inside the extent,
-    skipped below ``alpha_min`` and where the incoming transmittance is below
-    ``transmittance_min``; ordered by depth, ties by index. Where alpha is capped, opacity and shape
+    Pixel centres are at +0.5; ``alpha = min(alpha_max, o exp(-q / 2))`` inside the extent,
+    skipped below ``alpha_min`` or if the incoming transmittance is below
+    ``transmittance_min``; ordered by depth, ties by index. If alpha is capped, opacity and shape
     get no gradient. The result is bit-identical for any number of threads
     (``torch.get_num_threads()``).
 
@@ -72,7 +92,7 @@ def composite(
             each way.
 
     Returns:
-        features ``[B, C, H, W]`` premultiplied, channels last where they are averaged; alpha
+        features ``[B, C, H, W]`` premultiplied, channels last if they are averaged; alpha
         ``[B, 1, H / times, W / times]``, and averaged features ``[B, C, H / times, W / times]`` or
         None. Differentiable once in means, factors, opacities and features.
 
@@ -81,6 +101,7 @@ def composite(
 
     Source: paper Sec. 3.1; tiles after 3D Gaussian splatting, gradients derived in native.cpp.
     """
+    # autograd has no types for what a function returns.
     composed: tuple[Tensor, Tensor, Tensor | None] = _Composite.apply(
         projected.means,
         projected.factors,
@@ -101,6 +122,7 @@ class _Plan:
     """Tile lists of the forward pass, for the backward pass; owns memory of the library."""
 
     def __init__(self, dtype: torch.dtype) -> None:
+        # The function is kept, since modules may be gone when Python ends.
         self.pointer = ctypes.c_void_p()
         self._free = build.function("free", dtype)
 
@@ -125,9 +147,9 @@ class _Composite(torch.autograd.Function):
         times: int,
         grad_enabled: bool,
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        tensors = [means, factors, opacities, features, depths, extents]
+        # The kernel reads contiguous arrays.
+        tensors = [means, factors, opacities, features, depths, extents, visible]
         inputs = [x.detach().contiguous() for x in tensors]
-        shown = visible.contiguous()
         B, _, C = features.shape
         dtype = features.dtype
         coarse = (size[0] // times, size[1] // times)
@@ -142,14 +164,16 @@ class _Composite(torch.autograd.Function):
             average = zeros((B, C, *coarse), dtype)
 
         # The kernel writes into the outputs and keeps its tile lists for the backward pass.
-        job = _job(size, settings, inputs, shown, times)
+        job = _job(size, settings, inputs, times)
         job.keep = grad_enabled and any(ctx.needs_input_grad)
-        build.point(job, _OUTPUTS, [drawn, alpha, average])
+        build.point(job, _IMAGES, [drawn, alpha, average])
         plan = _Plan(dtype)
         run = build.function("forward", dtype)
         _raise_for(run(ctypes.byref(job), ctypes.byref(plan.pointer)), job)
+
+        # The plan lives as long as the graph.
         if job.keep:
-            ctx.save_for_backward(*tensors, visible)
+            ctx.save_for_backward(*tensors)
             ctx.plan = plan
             ctx.size = size
             ctx.settings = settings
@@ -160,53 +184,59 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        *tensors, visible = ctx.saved_tensors
-        inputs = [x.detach().contiguous() for x in tensors]
-        shown = visible.contiguous()
-        job = _job(ctx.size, ctx.settings, inputs, shown, ctx.times)
+        # The same job as in the forward pass.
+        inputs = [x.detach().contiguous() for x in ctx.saved_tensors]
+        job = _job(ctx.size, ctx.settings, inputs, ctx.times)
 
         # Gradients of the outputs, in the memory format of the outputs.
         incoming = [None if g is None else g.contiguous() for g in grads]
         if ctx.times > 1 and grads[0] is not None:
             incoming[0] = grads[0].contiguous(memory_format=torch.channels_last)
-        build.point(job, _GRADS_OUT, incoming)
+        build.point(job, _IMAGE_GRADS, incoming)
 
         # The kernel adds the gradients of means, factors, opacities and features.
-        outgoing = [torch.zeros_like(x) for x in inputs[: len(_GRADS_IN)]]
-        build.point(job, _GRADS_IN, outgoing)
+        outgoing = [torch.zeros_like(x) for x in inputs[: len(_ELLIPSE_GRADS)]]
+        build.point(job, _ELLIPSE_GRADS, outgoing)
         run = build.function("backward", inputs[3].dtype)
         _raise_for(run(ctypes.byref(job), ctx.plan.pointer), job)
-        needed = [
-            g if need else None
-            for g, need in zip(outgoing, ctx.needs_input_grad, strict=False)
-        ]
-        return (*needed, *[None] * (len(ctx.needs_input_grad) - len(needed)))
+
+        # Other arguments have no gradient, and some tensors need none.
+        needed = ctx.needs_input_grad
+        returned: list[Tensor | None] = [None] * len(needed)
+        for i, gradient in enumerate(outgoing):
+            if needed[i]:
+                returned[i] = gradient
+        return tuple(returned)
 
 
 def _job(
     size: tuple[int, int],
     settings: Accuracy,
     inputs: list[Tensor],
-    visible: Tensor,
     times: int,
 ) -> Any:
-    sizes = (
-        *inputs[3].shape,
-        *size,
-        build.threads(),
-        0,
-        settings.extent == "sigma",
-        SLOT_BYTES,
-        times,
-    )
+    """A job with its inputs, without outputs and gradients."""
+    B, N, C = inputs[3].shape
     job = _Job(
-        *sizes, settings.alpha_min, settings.transmittance_min, settings.alpha_max
+        B=B,
+        N=N,
+        C=C,
+        H=size[0],
+        W=size[1],
+        threads=build.threads(),
+        box=settings.extent == "sigma",
+        slot_bytes=SLOT_BYTES,
+        times=times,
+        alpha_min=settings.alpha_min,
+        transmittance_min=settings.transmittance_min,
+        alpha_max=settings.alpha_max,
     )
-    build.point(job, (*_INPUTS, "visible"), [*inputs, visible])
+    build.point(job, _ELLIPSES, inputs)
     return job
 
 
 def _raise_for(status: int, job: Any) -> None:
+    # The kernel returns 0, or the kind of its error.
     if status == 0:
         return
     if status == _NOT_FINITE:

@@ -52,6 +52,8 @@ def rasterise(
     """
     if isinstance(settings, str):
         settings = accuracy(settings)
+
+    # While torch.export records, drawing is one operator.
     if torch.compiler.is_compiling():
         return _recorded(gaussians, camera, settings, backend)
     checks.check(gaussians, camera)
@@ -67,8 +69,9 @@ def rasterise(
     if name == "gsplat" and (reason := gsplat_backend.unsuited(gaussians, camera)):
         name = "torch"
         message = f"Drawing with the torch backend: {reason}"
-    if message:
-        _warn_once(message)
+    if message and message not in _logged:
+        _logged.add(message)
+        _log.warning(message)
 
     # Supersampling draws a larger image and averages its pixels.
     factor = settings.supersample
@@ -77,6 +80,7 @@ def rasterise(
             features, alpha, _ = _draw(name, gaussians, camera, settings)
         return Raster(features.to(dtype), alpha.to(dtype), None)
 
+    # A backend that averages by itself has averaged alpha, too.
     height, width = camera.size
     larger = camera.resize((height * factor, width * factor))
     with tiles.full_precision(device):
@@ -89,7 +93,9 @@ def rasterise(
 
 
 def resolve_backend(
-    name: str, device: torch.device, settings: Accuracy
+    name: str,
+    device: torch.device,
+    settings: Accuracy,
 ) -> tuple[str, str]:
     """The backend that is used, and why when it is not the requested or the fastest one.
 
@@ -110,30 +116,38 @@ def resolve_backend(
         )
     if name in ("reference", "torch"):
         return name, ""
+
+    # The fastest backend of the device, unless nothing may be skipped.
     if name == "auto" and settings.is_dense:
         return "reference", ""
     if name == "gsplat" or (name == "auto" and device.type == gsplat_backend.DEVICE):
         if why_not := gsplat_backend.why_not(settings, device):
             return "torch", f"Drawing with the torch backend: {why_not}"
         return "gsplat", gsplat_backend.given_up(settings, device)
+
+    # The native backend, or torch without its kernel. Other devices always get torch.
     if device.type != "cpu":
-        message = (
+        why_not = (
             f"The native backend runs on CPU only; drawing with torch on {device}."
         )
-        return "torch", message if name == "native" else ""
+        return "torch", why_not if name == "native" else ""
     if why_not := native.why_not():
         return "torch", f"Drawing with the torch backend, which is slower: {why_not}"
     return "native", ""
 
 
 def _draw(
-    name: str, gaussians: Gaussians, camera: Camera, settings: Accuracy
+    name: str,
+    gaussians: Gaussians,
+    camera: Camera,
+    settings: Accuracy,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Features and alpha by one backend, and averaged features or None.
 
     If the backend averages supersampled pixels itself, alpha is averaged too, and the third value
     holds the averaged features.
     """
+    # gsplat and the native backend project by themselves.
     if name == "gsplat":
         features, alpha = gsplat_backend.draw(gaussians, camera, settings)
         return features, alpha, None
@@ -142,28 +156,26 @@ def _draw(
         factor = settings.supersample
         averaged = factor if factor in native.AVERAGES else 1
         return native.composite(projected, camera.size, settings, averaged)
+
+    # The others share a projection.
     projected = project(gaussians, camera, settings)
-    if name == "reference":
-        features, alpha = reference.composite(projected, camera.size, settings)
-    else:
-        features, alpha = tiles.composite(projected, camera.size, settings)
+    module = reference if name == "reference" else tiles
+    features, alpha = module.composite(projected, camera.size, settings)
     return features, alpha, None
-
-
-def _warn_once(message: str) -> None:
-    if message not in _logged:
-        _logged.add(message)
-        _log.warning(message)
 
 
 # -- what torch.export records
 
 
 def _recorded(
-    gaussians: Gaussians, camera: Camera, settings: Accuracy, backend: str
+    gaussians: Gaussians,
+    camera: Camera,
+    settings: Accuracy,
+    backend: str,
 ) -> Raster:
     """The operator that ``torch.export`` records in place of `rasterise`, without gradient."""
-    assert gaussians.covariances is not None  # avatars always give covariances
+    # Avatars always give covariances. An operator takes settings as text.
+    assert gaussians.covariances is not None
     height, width = camera.size
     features, alpha, fine = _rasterise(
         gaussians.means,
@@ -197,12 +209,22 @@ def _rasterise(
     settings: str,
     backend: str,
 ) -> tuple[Tensor, Tensor, Tensor]:
+    gaussians = Gaussians(
+        means=means,
+        quats=None,
+        scales=None,
+        opacities=opacities,
+        features=features,
+        covariances=covariances,
+    )
     raster = rasterise(
-        Gaussians(means, None, None, opacities, features, covariances),
-        Camera(K, R, t, (height, width), dist),
+        gaussians,
+        Camera(K=K, R=R, t=t, size=(height, width), dist=dist),
         settings=Accuracy(**json.loads(settings)),
         backend=backend,
     )
+
+    # An operator has no optional outputs: an empty tensor stands for None.
     fine = features.new_empty(0) if raster.fine is None else raster.fine
     return raster.features.contiguous(), raster.alpha.contiguous(), fine.contiguous()
 
@@ -222,6 +244,7 @@ def _rasterise_shapes(
     settings: str,
     backend: str,
 ) -> tuple[Tensor, Tensor, Tensor]:
+    # The shapes of all outputs, without drawing.
     batch, _, channels = features.shape
     factor = json.loads(settings)["supersample"]
 

@@ -24,45 +24,57 @@ class Accuracy:
     Raises:
         ValueError: on a value outside its range, naming it.
 
-    Source: docs/rasteriser.md; the paper (Sec. 3.1) states no
-    cut-off, 1/255 and 0.3 square pixels are the values of 3D Gaussian splatting.
+    Source: docs/rasteriser.md; the paper (Sec. 3.1) states no cut-off, 1/255 and 0.3 square pixels
+    are the values of 3D Gaussian splatting.
     """
 
     name: str  # in configs and tables
     alpha_min: float  # in [0, 1); 0 keeps every contribution
     transmittance_min: float  # in [0, 1); 0 never stops a pixel
-    extent: str
+    extent: str  # all, opacity or sigma
     dtype: str  # float32 or float64, of the arithmetic
-    radius_sigmas: float = 3.0
+    radius_sigmas: float = 3.0  # for the extent ``sigma``
     near: float = 0.01  # metres; Gaussians whose mean is nearer are not drawn
-    # near 1 the gradient of hidden layers is lost in float32 rounding: 1 is for float64
+    # Near 1 the gradient of hidden layers is lost in float32 rounding: 1 is for float64.
     alpha_max: float = 0.999
     low_pass: float = 0.3  # square pixels, added to the diagonal of every 2D covariance
-    # half fields of view, to which x/z and y/z are clamped in the projection's Jacobian, >= 1
+    # Half fields of view, to which x/z and y/z are clamped in the projection's Jacobian, >= 1.
     fov_clamp: float = 1.3
-    # multiply opacities by sqrt(det before / det after) of the low-pass
+    # Whether opacities are multiplied by sqrt(det before / det after) of the low-pass.
     antialias: bool = False
     supersample: int = 1  # draw this many times larger, low-pass included, then average
 
     def __post_init__(self) -> None:
+        # The cut-offs of contributions.
         self._require("alpha_min", 0 <= self.alpha_min < 1, "in [0, 1)")
         self._require("transmittance_min", 0 <= self.transmittance_min < 1, "in [0, 1)")
         self._require(
-            "extent", self.extent in _EXTENTS, f"one of {', '.join(_EXTENTS)}"
+            "extent",
+            self.extent in _EXTENTS,
+            f"one of {', '.join(_EXTENTS)}",
         )
         self._require("dtype", self.dtype in _DTYPES, f"one of {', '.join(_DTYPES)}")
         self._require("radius_sigmas", self.radius_sigmas > 0, "> 0")
+
+        # The projection, and the limits of opacity.
         self._require("near", self.near > 0, "> 0 metres")
         self._require(
-            "alpha_max", self.alpha_min < self.alpha_max <= 1, "in (alpha_min, 1]"
+            "alpha_max",
+            self.alpha_min < self.alpha_max <= 1,
+            "in (alpha_min, 1]",
         )
         self._require("low_pass", self.low_pass > 0, "> 0 square pixels")
         self._require("fov_clamp", self.fov_clamp >= 1, ">= 1")
+
+        # A bool is an int in Python, but no number of pixels.
         whole = isinstance(self.supersample, int) and not isinstance(
-            self.supersample, bool
+            self.supersample,
+            bool,
         )
         self._require(
-            "supersample", whole and self.supersample >= 1, "a whole number >= 1"
+            "supersample",
+            whole and self.supersample >= 1,
+            "a whole number >= 1",
         )
 
     def _require(self, field: str, holds: bool, expected: str) -> None:

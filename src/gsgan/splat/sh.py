@@ -20,7 +20,7 @@ MAX_DEGREE = 3
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
     """The real spherical harmonics of unit directions.
 
-    Convention: order (0,0), (1,-1), (1,0), (1,1), (2,-2), … with the signs of 3D Gaussian
+    They are in the order (0,0), (1,-1), (1,0), (1,1), (2,-2), … with the signs of 3D Gaussian
     splatting: degree 1 is ``(-y, z, -x)`` times a constant.
 
     Args:
@@ -48,8 +48,8 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
             -k0 * y * z,
             k1 * (2 * z * z - x * x - y * y),
             -k0 * x * z,
+            k2 * (x * x - y * y),
         ]
-        basis.append(k2 * (x * x - y * y))
     if degree >= 3:
         k0, k1, k2, k3, k4 = _C3
         xx = x * x
@@ -70,7 +70,7 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
 def sh_to_colour(sh: Tensor, directions: Tensor) -> Tensor:
     """Colours along directions of view.
 
-    Convention: the sum of the series plus 0.5, not clamped (the caller clamps at 0). Directions
+    A colour is the sum of the series plus 0.5, not clamped (the caller clamps at 0). Directions
     run from the camera to the Gaussian, in the frame of the coefficients.
 
     Args:
@@ -85,13 +85,18 @@ def sh_to_colour(sh: Tensor, directions: Tensor) -> Tensor:
 
     Source: paper Sec. 3.1; Kerbl et al., 3D Gaussian splatting.
     """
+    # The number of coefficients tells the degree.
     degree = math.isqrt(sh.shape[-2]) - 1
     if (degree + 1) ** 2 != sh.shape[-2] or degree not in range(MAX_DEGREE + 1):
         raise ValueError(
             "sh_to_colour: sh must have shape [B, N, (d+1)², 3] with d from 0 to "
             f"{MAX_DEGREE}, got {list(sh.shape)}"
         )
-    if degree == 0:  # no directions needed: view-dependent colour is off
+
+    # Degree 0 needs no directions: view-dependent colour is off.
+    if degree == 0:
         return _C0 * sh[..., 0, :] + 0.5
+
+    # The sum over coefficients, channel by channel.
     basis = sh_basis(torch.nn.functional.normalize(directions, dim=-1), degree)
     return (basis.unsqueeze(-1) * sh).sum(-2) + 0.5

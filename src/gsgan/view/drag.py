@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gsgan.data.joints import LEFT, RIGHT
 from gsgan.data.proportions import (
@@ -16,62 +15,52 @@ from gsgan.data.proportions import (
 )
 from gsgan.motion.rotations import between, unit
 from gsgan.skeleton import HOLISTIC
+from gsgan.utils.arrays import Float
 
-Float = NDArray[np.float64]
-
-ROUNDS = 20
+FABRIK_ROUNDS = 20
 BEND = 0.01  # of a chain's length: FABRIK cannot bend a straight chain along itself
 
 
 @dataclass(frozen=True)
 class Handle:
-    """What moves with a dragged joint.
+    """The joints that move with a dragged joint."""
 
-    Args:
-        chain: joints from the fixed one to the dragged one.
-        turned: joints that rotate with the last bone.
-        moved: joints that follow without rotating.
-    """
-
-    chain: tuple[int, ...]
-    turned: tuple[int, ...] = ()
-    moved: tuple[int, ...] = ()
+    chain: tuple[int, ...]  # joints from the fixed one to the dragged one
+    turned: tuple[int, ...] = ()  # joints that rotate with the last bone
+    moved: tuple[int, ...] = ()  # joints that follow without rotating
 
 
-SIDES = (
-    ("left", 11, 13, 15, 23, 25, 27, range(LEFT.start, LEFT.stop)),
-    ("right", 12, 14, 16, 24, 26, 28, range(RIGHT.start, RIGHT.stop)),
-)
-HANDLES = {
-    f"{side} {name}": handle
-    for side, shoulder, elbow, wrist, hip, knee, ankle, hand in SIDES
-    for name, handle in {
-        "wrist": Handle(
-            (shoulder, elbow, wrist), turned=(*HAND_LANDMARKS[wrist], *hand)
-        ),
-        "elbow": Handle(
-            (shoulder, elbow), moved=(wrist, *HAND_LANDMARKS[wrist], *hand)
-        ),
-        "ankle": Handle((hip, knee, ankle), turned=FEET[ankle]),
-        "knee": Handle((hip, knee), moved=(ankle, *FEET[ankle])),
-    }.items()
-}
-NOSE = 0
-HEAD = "head"
-BODY = "body"
-NAMES = (*HANDLES, HEAD, BODY)
+HANDLES: dict[str, Handle] = {}
+for side, shoulder, elbow, wrist, hip, knee, ankle, landmarks in (
+    ("left", 11, 13, 15, 23, 25, 27, LEFT),
+    ("right", 12, 14, 16, 24, 26, 28, RIGHT),
+):
+    # Landmarks of the hand are in the skeleton of the body, and in that with hands.
+    hand = (*HAND_LANDMARKS[wrist], *range(landmarks.start, landmarks.stop))
+    foot = FEET[ankle]
+    HANDLES |= {
+        f"{side} wrist": Handle((shoulder, elbow, wrist), turned=hand),
+        f"{side} elbow": Handle((shoulder, elbow), moved=(wrist, *hand)),
+        f"{side} ankle": Handle((hip, knee, ankle), turned=foot),
+        f"{side} knee": Handle((hip, knee), moved=(ankle, *foot)),
+    }
+NOSE_JOINT = 0
+HEAD_HANDLE = "head"
+BODY_HANDLE = "body"
+HANDLE_NAMES = (*HANDLES, HEAD_HANDLE, BODY_HANDLE)
 
 
-def _of(p: Float, joints: tuple[int, ...]) -> list[int]:
-    """Those of the joints that a pose ``[J, 3]`` has."""
+def _present(p: Float, joints: tuple[int, ...]) -> list[int]:
+    """The joints that a pose ``[J, 3]`` has."""
     return [j for j in joints if j < len(p)]
 
 
 def position(p: Float, name: str) -> Float:
-    """``[3]`` metres: the position of a handle in a pose ``[J, 3]``."""
-    if name == BODY:
+    """The position ``[3]`` of a handle in a pose ``[J, 3]``, metres."""
+    if name == BODY_HANDLE:
         return middle(p, HIPS)
-    return np.asarray(p[NOSE if name == HEAD else HANDLES[name].chain[-1]])
+    joint = NOSE_JOINT if name == HEAD_HANDLE else HANDLES[name].chain[-1]
+    return p[joint]
 
 
 def dragged(p: Float, name: str, target: Float) -> Float:
@@ -82,27 +71,31 @@ def dragged(p: Float, name: str, target: Float) -> Float:
 
     Args:
         p: ``[J, 3]`` metres, finite; 33 joints, 75 with hands or 105 with a face.
-        name: of ``NAMES``.
+        name: of ``HANDLE_NAMES``.
         target: ``[3]`` metres.
 
     Source: Aristidou and Lasenby, FABRIK (2011), for the chains.
     """
     q = p.copy()
-    if name == BODY:
+    if name == BODY_HANDLE:
         return q + (target - middle(p, HIPS))
-    if name == HEAD:
+
+    # The head rotates so that the nose points to the target.
+    if name == HEAD_HANDLE:
         neck = middle(p, SHOULDERS)
-        turn = between(p[NOSE] - neck, target - neck)
-        face = _of(p, (*HEAD_LANDMARKS, *HOLISTIC.expression))
+        turn = between(p[NOSE_JOINT] - neck, target - neck)
+        face = _present(p, (*HEAD_LANDMARKS, *HOLISTIC.expression))
         q[face] = neck + (p[face] - neck) @ turn.T
         return q
+
+    # The chain bends, then the joints behind it follow its end.
     handle = HANDLES[name]
     chain = list(handle.chain)
     q[chain] = fabrik(p[chain], target)
     before, end = chain[-2:]
     turn = between(p[end] - p[before], q[end] - q[before])
-    turned = _of(p, handle.turned)
-    moved = _of(p, handle.moved)
+    turned = _present(p, handle.turned)
+    moved = _present(p, handle.moved)
     q[turned] = q[end] + (p[turned] - p[end]) @ turn.T
     q[moved] += q[end] - p[end]
     return q
@@ -115,12 +108,19 @@ def fabrik(chain: Float, target: Float) -> Float:
     root = chain[0]
     reach = lengths.sum()
     along = target - root
+
+    # Out of reach, the chain is straight towards the target.
     if np.linalg.norm(along) >= reach:
         steps = np.concatenate([[0.0], np.cumsum(lengths)])
-        return np.asarray(root + steps[:, None] * unit(along))
-    if len(q) > 2 and np.linalg.norm(np.cross(unit(q[1] - root), unit(along))) < BEND:
+        return root + steps[:, None] * unit(along)
+
+    # A chain that is straight along the target is bent to any side first.
+    sine = np.linalg.norm(np.cross(unit(q[1] - root), unit(along)))
+    if len(q) > 2 and sine < BEND:
         q[1:-1] += BEND * reach * unit(np.cross(along, [1.0, 2.0, 3.0]))
-    for _ in range(ROUNDS):
+
+    # In turn, the end is put on the target and the start on the root; the others follow.
+    for _ in range(FABRIK_ROUNDS):
         q[-1] = target
         for i in range(len(q) - 2, -1, -1):
             q[i] = q[i + 1] + lengths[i] * unit(q[i] - q[i + 1])

@@ -10,9 +10,9 @@ from urllib.parse import urlsplit
 
 
 def refusal(host: str | None, origin: str | None, served: str) -> str | None:
-    """Why a request is refused, or None.
+    """The reason why a request is refused, or None.
 
-    Convention: a browser says in ``Origin`` which page opens a connection, so other pages are
+    A browser sends in ``Origin`` which page opens a connection, so other pages are
     refused. A page whose own domain name points at this machine (DNS rebinding) has the same
     origin, but its name as ``Host``: that must be an address, localhost or a name of this machine.
     Programs other than browsers send no origin.
@@ -21,12 +21,15 @@ def refusal(host: str | None, origin: str | None, served: str) -> str | None:
         host, origin: the request's headers.
         served: the option ``host``.
     """
+    # A name that is no address must be known.
     name = urlsplit(f"//{host}").hostname or ""
     try:
         ipaddress.ip_address(name)
     except ValueError:
         if name not in ("localhost", served.lower(), socket.gethostname().lower()):
             return "open the viewer by the address that it prints"
+
+    # The page has the address that it connects to.
     if origin is not None and origin.partition("://")[2] != host:
         return "only the viewer's own page may connect"
     return None
@@ -34,7 +37,7 @@ def refusal(host: str | None, origin: str | None, served: str) -> str | None:
 
 @contextmanager
 def guarded(served: str) -> Iterator[None]:
-    """Servers that viser starts inside refuse requests as `refusal` does, with status 403.
+    """A context in which viser starts servers that refuse requests with status 403, see `refusal`.
 
     Args:
         served: the option ``host``.
@@ -45,17 +48,15 @@ def guarded(served: str) -> Iterator[None]:
         host = request.headers.get("Host")
         origin = request.headers.get("Origin")
         why = refusal(host, origin, served)
-        return (
-            inner(connection, request)
-            if why is None
-            else connection.respond(403, f"{why}\n")
-        )
+        if why is None:
+            return inner(connection, request)
+        return connection.respond(403, f"{why}\n")
 
     def serve(*args: Any, process_request: Any, **options: Any) -> Any:
-        return original(
-            *args, process_request=partial(check, process_request), **options
-        )
+        checked = partial(check, process_request)
+        return original(*args, process_request=checked, **options)
 
+    # viser has no option for this, so the function that it calls is replaced.
     original = server.serve
     server.serve = serve  # type: ignore[assignment,misc]
     try:

@@ -20,10 +20,10 @@ from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.images import background
 from gsgan.view.guard import guarded
-from gsgan.view.session import IDLE, Session, Show
+from gsgan.view.session import IDLE_SECONDS, Session, Show
 
 MEGABYTE = 1 << 20
-MOST_UPLOADS = 8  # of a browser at the same time
+MAX_UPLOADS = 8  # of a browser at the same time
 
 
 def view_config(config: DictConfig) -> None:
@@ -53,6 +53,7 @@ class Viewer:
     """
 
     def __init__(self, config: DictConfig) -> None:
+        # The avatar.
         viser = import_viser()
         self.run = Run.load(config)
         fps = float(above("fps", config.fps))
@@ -62,48 +63,62 @@ class Viewer:
         def read(motion: str) -> Drive:
             return drive_of(OmegaConf.merge(config, {"motion": motion}), self.run, fps)  # type: ignore[arg-type]
 
+        # The settings and the first motion of all browsers.
         drive = read(config.motion or self.run.data.watched[0])
         size = whole("pixels", config.pixels or self.run.stored.data.size or 512, 16)
         behind: Any = background(str(config.background), video=True)
-        rate = float(above("rate", config.rate))
         self.show = Show(
-            self.run.avatar, self.run.body, drive, read, behind, size, fps, rate
+            avatar=self.run.avatar,
+            body=self.run.body,
+            drive=drive,
+            read=read,
+            behind=behind,
+            size=size,
+            fps=fps,
+            rate=float(above("rate", config.rate)),
         )
+
+        # With an address of another machine, viser would never return.
         host = str(config.host)
         port = between("port", whole("port", config.port, 0), 0, 65535)
-        try:  # viser itself would never return
+        try:
             family = socket.AF_INET6 if ":" in host else socket.AF_INET
             socket.create_server((host, 0), family=family).close()
         except OSError as error:
             raise ConfigError(
                 f"host={host} is not an address of this machine ({error})"
             ) from None
+
+        # The server without viser's own banner, and without its share button, which would put the
+        # avatar on a public address.
         logging.getLogger("websockets").setLevel(logging.WARNING)
-        # without viser's own banner
         with contextlib.redirect_stdout(io.StringIO()), guarded(host):
             self.server = viser.ViserServer(host, port, label="gsgan", verbose=False)
-        # viser's share button would put the avatar on a public address
         self.server.request_share_url = lambda verbose=True: None  # type: ignore[method-assign]
         self.server.gui.configure_theme(show_share_button=False, control_width="medium")
         self._camera(size)
-        limit = int(above("max_upload", config.max_upload) * MEGABYTE)
+
+        # A session per browser, and one thread that renders for all.
+        self._limit = int(above("max_upload", config.max_upload) * MEGABYTE)
         self.sessions: dict[int, Session] = {}
         self._wake = threading.Event()
         self._ended = False
-        self.server.on_client_connect(lambda client: self._join(client, limit))
-        self.server.on_client_disconnect(
-            lambda client: self.sessions.pop(client.client_id, None)
-        )
+        self.server.on_client_connect(self._join)
+        self.server.on_client_disconnect(self._leave)
         self._renderer = threading.Thread(
-            target=self._render, daemon=True, name="rendering"
+            target=self._render,
+            daemon=True,
+            name="rendering",
         )
         self._renderer.start()
 
     @property
     def address(self) -> str:
-        """What to open in a browser."""
+        """The address to open in a browser."""
         host = self.server.get_host()
-        return f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}"
+        if ":" in host:  # IPv6
+            host = f"[{host}]"
+        return f"http://{host}:{self.server.get_port()}"
 
     def serve(self) -> None:
         """Waits until interrupted."""
@@ -121,29 +136,38 @@ class Viewer:
     def _camera(self, size: int) -> None:
         """Sets the first view of new browsers: the first pose from the front, as large as in
         training images."""
-        drive = self.show.drive
-        scene = self.run.scene
+        p = self.show.drive.p
+        orbit = Orbit()
         proportions = self.run.proportions
         trained = self.run.stored.data.size or size
-        camera = Orbit().cameras(drive.p[:1], proportions, scene, size, trained)
+        camera = orbit.cameras(p[:1], proportions, self.run.scene, size, trained)
+
+        # The same camera in viser's terms.
         up = upright(proportions.up)[2]
         self.server.scene.set_up_direction(tuple(map(float, up)))
-        self.server.initial_camera.up = up
-        self.server.initial_camera.position = camera.centre[0].double().numpy()
-        self.server.initial_camera.look_at = np.nanmean(drive.p[0], axis=0)
-        self.server.initial_camera.fov = float(np.radians(Orbit().fov))
+        view = self.server.initial_camera
+        view.up = up
+        view.position = camera.centre[0].double().numpy()
+        view.look_at = np.nanmean(p[0], axis=0)
+        view.fov = float(np.radians(orbit.fov))
 
-    def _join(self, client: Any, limit: int) -> None:
-        _bound_uploads(client, limit)
+    def _join(self, client: Any) -> None:
+        _bound_uploads(client, self._limit)
         self.sessions[client.client_id] = Session(client, self.show, self._wake.set)
         self._wake.set()
+
+    def _leave(self, client: Any) -> None:
+        self.sessions.pop(client.client_id, None)
 
     def _render(self) -> None:
         """Renders for each browser in turn, as long as one of them needs a new image."""
         while not self._ended:
-            due = min((s.step() for s in list(self.sessions.values())), default=IDLE)
+            # Browsers come and go while others are served.
+            due = IDLE_SECONDS
+            for session in list(self.sessions.values()):
+                due = min(due, session.step())
             if due > 0:
-                self._wake.wait(min(due, IDLE))
+                self._wake.wait(due)
                 self._wake.clear()
 
 
@@ -163,26 +187,38 @@ def import_viser() -> Any:
 
 
 def _bound_uploads(client: Any, limit: int) -> None:
-    """Drops uploads beyond `MOST_UPLOADS`, or of more than ``limit`` bytes together, whatever size
+    """Drops uploads beyond `MAX_UPLOADS`, or of more than ``limit`` bytes together, whatever size
     the browser declares.
 
     viser itself collects the parts of an upload without a limit.
     """
     from viser import _messages
 
+    # viser has no public access to uploads.
     uploads: dict[str, Any] = client.gui._current_file_upload_states
     connection = client._websock_connection
 
     def check(_: int, message: Any) -> None:
-        state = uploads.get(message.transfer_uuid)
-        held = (max(s["total_bytes"], s["transferred_bytes"]) for s in uploads.values())
-        if state and (sum(held) > limit or len(uploads) > MOST_UPLOADS):
-            uploads.pop(message.transfer_uuid)
-            total = state["total_bytes"]  # the browser stops waiting
-            ends = message.source_component_uuid, message.transfer_uuid, total, total
-            connection.queue_message(_messages.FileTransferPartAck(*ends))
-            text = f"Motion files are limited to {limit // MEGABYTE} MB."
-            client.add_notification("This file is too large", text, color="red")
+        held = 0
+        for upload in uploads.values():
+            held += max(upload["total_bytes"], upload["transferred_bytes"])
+        if held <= limit and len(uploads) <= MAX_UPLOADS:
+            return
+        dropped = uploads.pop(message.transfer_uuid, None)
+        if dropped is None:
+            return
+
+        # An acknowledgement of all bytes ends the browser's waiting.
+        total = dropped["total_bytes"]
+        end = _messages.FileTransferPartAck(
+            message.source_component_uuid,
+            message.transfer_uuid,
+            total,
+            total,
+        )
+        connection.queue_message(end)
+        text = f"Motion files are limited to {limit // MEGABYTE} MB."
+        client.add_notification("This file is too large", text, color="red")
 
     register: Callable[..., None] = connection.register_handler
     for kind in (_messages.FileTransferStartUpload, _messages.FileTransferPart):

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -10,13 +11,13 @@ from torch import Tensor
 
 from gsgan.utils.images import to_bytes
 
-# inches, width of a figure in one column and across the page
-COLUMN = 3.5
-PAGE = 7.16
+# Width of a figure in one column and across the page, inches.
+COLUMN_WIDTH = 3.5
+PAGE_WIDTH = 7.16
 TALLEST = 1.9  # inches, maximum height of a row of images, without its text
 # points
 FONT = 8.0
-SMALL = 7.0
+NOTE_FONT = 7.0
 LINE = 1.4 / 72  # inches per line and point of font size
 # Text in the PDF stays text (TrueType).
 STYLE: dict[Any, Any] = {
@@ -30,20 +31,19 @@ STYLE: dict[Any, Any] = {
 
 @dataclass(frozen=True)
 class Drawing:
-    """A figure, its caption (whole sentences, Markdown), and the numbers in it by image, panel and
-    score, None where a score is not defined."""
+    """A figure with its caption and numbers."""
 
     figure: Figure
-    caption: str
-    numbers: dict[str, Any]
+    caption: str  # whole sentences, Markdown
+    numbers: dict[str, Any]  # by image, panel and score; None if a score is not defined
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One image ``[1, 3, h, w]`` in [0, 1], and a note below it."""
+    """One image of a figure."""
 
-    image: Tensor
-    note: str = ""
+    image: Tensor  # [1, 3, h, w] in [0, 1]
+    note: str = ""  # below the image
 
 
 def draw_panels(
@@ -60,31 +60,34 @@ def draw_panels(
         The figure, and its axes ``[rows, columns]``, in pixels of the images, pixel centres at
         +0.5.
     """
-    shown = [[to_bytes(panel.image[0]) for panel in row] for row in panels]
-    aspect = max(image.shape[0] / image.shape[1] for row in shown for image in row)
+    # The tallest image and the longest note determine the height of all rows.
+    aspect = 0.0
+    note_lines = 0
+    for panel in chain(*panels):
+        height, width = panel.image.shape[-2:]
+        aspect = max(aspect, height / width)
+        note_lines = max(note_lines, len(panel.note.splitlines()))
     rows = len(panels)
     columns = len(panels[0])
-    width = COLUMN if columns <= 3 else PAGE
-    notes = max(
-        1 + panel.note.count("\n") if panel.note else 0
-        for row in panels
-        for panel in row
-    )
-    tall = min(width / columns * aspect, TALLEST) + notes * FONT * LINE
-    height = rows * tall + (FONT * LINE if titles else 0)
-    figure = Figure(figsize=(width, height))
+    page_width = COLUMN_WIDTH if columns <= 3 else PAGE_WIDTH
+    tall = min(page_width / columns * aspect, TALLEST) + note_lines * FONT * LINE
+    title_height = FONT * LINE if titles else 0
+    figure = Figure(figsize=(page_width, rows * tall + title_height))
+    # Nearly no space is left between images, which are drawn without ticks and frames.
     figure.set_layout_engine(
         "compressed", w_pad=0.01, h_pad=0.01, wspace=0.01, hspace=0.01
     )
     axes = figure.subplots(rows, columns, squeeze=False)
-    for i, row in enumerate(panels):
-        for one, panel, image in zip(axes[i], row, shown[i], strict=True):
-            one.set(xticks=[], yticks=[])
-            one.spines[:].set_visible(False)
-            extent = (0, image.shape[1], image.shape[0], 0)
-            one.imshow(image, interpolation="nearest", extent=extent)
-            one.set_xlabel(panel.note, size=SMALL, labelpad=2)
-    plain: dict[str, Any] = {"parse_math": False, "size": FONT}  # "$x" is no formula
+    for one, panel in zip(axes.flat, chain(*panels), strict=True):
+        one.set(xticks=[], yticks=[])
+        one.spines[:].set_visible(False)
+        height, width = panel.image.shape[-2:]
+        image = to_bytes(panel.image[0])
+        one.imshow(image, interpolation="nearest", extent=(0, width, height, 0))
+        one.set_xlabel(panel.note, size=NOTE_FONT, labelpad=2)
+
+    # Names of runs may contain "$", which is no formula.
+    plain: dict[str, Any] = {"parse_math": False, "size": FONT}
     for one, title in zip(axes[0], titles, strict=False):
         one.set_title(title, pad=2, **plain)
     for one, name in zip(axes[:, 0], names, strict=False):

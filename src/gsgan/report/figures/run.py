@@ -44,12 +44,14 @@ Images = list[dict[str, Tensor]]  # per shot, by name
 def strip(subjects: Sequence[Subject], shots: Sequence[Shot]) -> Drawing:
     """One camera over time: a row for the ground truth and one per run, PSNR below each image."""
     images, numbers = _measured(subjects, shots)
+
+    # The first row is the truth, each other row a run.
     panels = [[Panel(shot.truth) for shot in shots]]
     for name in images[0]:
-        notes = [_decibels(numbers[shot.name][name]) for shot in shots]
-        panels.append(
-            [Panel(x[name], note) for x, note in zip(images, notes, strict=True)]
-        )
+        row = []
+        for shot, held in zip(shots, images, strict=True):
+            row.append(Panel(held[name], _decibels(numbers[shot.name][name])))
+        panels.append(row)
     titles = [f"frame {shot.item[1]}" for shot in shots]
     names = ["truth", *images[0]]
     figure, _ = draw_panels(panels, titles=titles, names=names)
@@ -69,23 +71,25 @@ def comparison(
     # A row per shot: the truth, then every run with its scores.
     images, numbers = _measured(subjects, shots)
     panels: list[list[Panel]] = []
-    boxes = [most_disputed(torch.cat(list(held.values())), DETAIL) for held in images]
-    for shot, held, box in zip(shots, images, boxes, strict=True):
+    boxes = []
+    for shot, held in zip(shots, images, strict=True):
+        box = most_disputed(torch.cat(list(held.values())), DETAIL)
+        boxes.append(box)
+        true_detail = shot.truth[..., *box]
         above = [Panel(shot.truth)]
-        below = [Panel(shot.truth[..., *box])]
+        below = [Panel(true_detail)]
         for name, image in held.items():
             found = numbers[shot.name][name]
-            above.append(
-                Panel(image, f"{_decibels(found)}\nF1 {written(found['edge_f1'], 3)}")
-            )
+            note = f"{_decibels(found)}\nF1 {written(found['edge_f1'], 3)}"
+            above.append(Panel(image, note))
             if detail:
-                found["psnr_detail"] = finite(
-                    psnr(image[..., *box], shot.truth[..., *box])
-                )
-                below.append(
-                    Panel(image[..., *box], written(found["psnr_detail"], 2, " dB"))
-                )
-        panels += [above, below] if detail else [above]
+                magnified = image[..., *box]
+                score = finite(psnr(magnified, true_detail))
+                found["psnr_detail"] = score
+                below.append(Panel(magnified, written(score, 2, " dB")))
+        panels.append(above)
+        if detail:
+            panels.append(below)
     figure, axes = draw_panels(panels, titles=["truth", *images[0]])
     caption = (
         "The ground truth and each run's image, with PSNR and the F1 of Canny edges"
@@ -95,13 +99,13 @@ def comparison(
 
     # The magnified box is framed in both rows.
     for i, (rows, columns) in enumerate(boxes):
-        size = columns.stop - columns.start, rows.stop - rows.start
-        for entire, magnified in zip(axes[2 * i], axes[2 * i + 1], strict=True):
-            frame = Rectangle(
-                (columns.start, rows.start), *size, fill=False, ec=VERMILLION, lw=0.8
-            )
+        corner = (columns.start, rows.start)
+        width = columns.stop - columns.start
+        height = rows.stop - rows.start
+        for entire, below in zip(axes[2 * i], axes[2 * i + 1], strict=True):
+            frame = Rectangle(corner, width, height, fill=False, ec=VERMILLION, lw=0.8)
             entire.add_patch(frame)
-            magnified.spines[:].set(visible=True, color=VERMILLION, linewidth=1.6)
+            below.spines[:].set(visible=True, color=VERMILLION, linewidth=1.6)
     caption += (
         "; below, magnified, the box in which the runs' images differ most from each other, with "
         "PSNR in the box."
@@ -110,49 +114,54 @@ def comparison(
 
 
 def most_disputed(images: Tensor, share: float) -> tuple[slice, slice]:
-    """Rows and columns where images ``[n, 3, h, w]`` of one scene differ most from each other.
+    """Rows and columns of the box in which images of one scene differ most from each other.
 
-    The box's sides are a ``share`` of the images'.
+    Args:
+        images: ``[n, 3, h, w]``.
+        share: sides of the box over those of the images.
     """
+    # The variance over images, averaged over colours and then over each possible box.
     spread = images.var(dim=0, unbiased=False).mean(dim=0)[None, None]
-    size = [max(1, round(share * side)) for side in spread.shape[-2:]]
-    sums = functional.avg_pool2d(spread.double(), size, stride=1)[0, 0]
+    height = max(1, round(share * spread.shape[-2]))
+    width = max(1, round(share * spread.shape[-1]))
+    sums = functional.avg_pool2d(spread.double(), (height, width), stride=1)[0, 0]
     top, left = divmod(int(sums.argmax()), sums.shape[1])
-    return slice(top, top + size[0]), slice(left, left + size[1])
+    return slice(top, top + height), slice(left, left + width)
 
 
 def _measured(
     subjects: Sequence[Subject], shots: Sequence[Shot]
 ) -> tuple[Images, dict[str, dict[str, Numbers]]]:
     """Images of each shot by run, and their scores."""
-    images = [
-        {subject.name: subject.image(shot) for subject in subjects} for shot in shots
-    ]
-    return images, {
-        shot.name: {name: measure(image, shot.truth) for name, image in held.items()}
-        for shot, held in zip(shots, images, strict=True)
-    }
+    # An image that is shown twice is rendered once, by `Subject.image`.
+    images: Images = []
+    numbers = {}
+    for shot in shots:
+        held = {subject.name: subject.image(shot) for subject in subjects}
+        images.append(held)
+        scores = {name: measure(image, shot.truth) for name, image in held.items()}
+        numbers[shot.name] = scores
+    return images, numbers
 
 
 def _decibels(found: Numbers) -> str:
     return written(found["psnr"], 2, " dB")
 
 
-RECORD = "figures.json"
+NUMBERS_FILE = "figures.json"
 CAPTIONS = "captions.md"
-# no dates: the same figure gives the same bytes
+# Without dates and versions the same figure gives the same bytes.
 METADATA: dict[str, dict[str, Any]] = {
     "png": {"Software": ""},
     "pdf": {"CreationDate": None},
 }
-# Each draws shots of subjects, the first one leading.
+# Functions that draw shots of subjects; the first subject leads.
 FIGURES: dict[str, Callable[[Sequence[Subject], Sequence[Shot]], Drawing]] = {
     "comparison": comparison,
     "ablation": partial(comparison, detail=True),
     "strip": strip,
 }
-TRIMMED: dict[str, Any] = {"bbox_inches": "tight", "pad_inches": 0.02}
-COMPARE = ("comparison", "ablation")  # need a second run
+COMPARE = ("comparison", "ablation")  # figures that need a second run
 
 
 def make_figures(config: DictConfig) -> None:
@@ -162,60 +171,84 @@ def make_figures(config: DictConfig) -> None:
         ConfigError: on a wrong value, runs of different data, or a comparison of one run.
         DataError: when a run or its data cannot be read.
     """
-    folders = [Path(str(f)).expanduser() for f in (config.run, *_list(config.compare))]
-    names = [one_of("figures", name, FIGURES) for name in _list(config.figures)]
-    if not names:
-        names = [name for name in FIGURES if len(folders) > 1 or name not in COMPARE]
-    if len(folders) < 2 and (lacking := [name for name in names if name in COMPARE]):
-        raise ConfigError(
-            f"figures={lacking[0]} compares runs, but there is one; add others as "
-            "compare=[<folder>,…]"
-        )
+    # The first run leads; its folder gets the figures by default.
+    given = (config.run, *_list(config.compare))
+    folders = [Path(str(folder)).expanduser() for folder in given]
+
+    names = _names(config, alone=len(folders) < 2)
     at_least("margin", config.margin, 0)
-    out = (
-        folders[0] / "figures" if config.out is None else Path(config.out).expanduser()
-    )
+
+    # Other folders are refused before anything is written.
+    out = folders[0] / "figures"
+    if config.out is not None:
+        out = Path(config.out).expanduser()
     moved = DataPaths.from_config(config)
     for folder in folders:
-        load_config(folder, moved)  # refuses other folders before anything is written
+        load_config(folder, moved)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(
             f"out={out}: cannot be written to ({error.strerror})"
         ) from error
-    # it logs every glyph of a PDF
+
+    # Each figure is written as soon as it is drawn. fontTools logs every glyph of a PDF.
     logging.getLogger("fontTools").setLevel(logging.WARNING)
     subjects = open_subjects(folders, moved, pick_device(config.device))
     console = make_console()
     made = dict[str, Drawing]()
     with matplotlib.rc_context(STYLE):
-        for name in track(
-            list(dict.fromkeys(names)), "drawing", console=console, transient=True
-        ):
-            made[name] = _draw(name, subjects, config)
+        for name in track(names, "drawing", console=console, transient=True):
+            drawing = _draw(name, subjects, config)
+            made[name] = drawing
             for kind, metadata in METADATA.items():
                 stream = io.BytesIO()
-                made[name].figure.savefig(
-                    stream, format=kind, metadata=metadata, **TRIMMED
+                drawing.figure.savefig(
+                    stream,
+                    format=kind,
+                    metadata=metadata,
+                    bbox_inches="tight",
+                    pad_inches=0.02,
                 )
                 write_atomically(out / f"{name}.{kind}", stream.getvalue())
-    marks = sorted({mark for subject in subjects for mark in subject.marks})
+
+    # The numbers and captions are of all figures together.
+    found: set[str] = set()
+    for subject in subjects:
+        found.update(subject.marks)
+    marks = sorted(found)
     _write_record(out, made, subjects, marks)
     lines = [f"marked: {mark}" for mark in marks]
     lines.append(
-        f"figures: {out}: {', '.join(made)} ({CAPTIONS} has their captions, {RECORD} their numbers)"
+        f"figures: {out}: {', '.join(made)} ({CAPTIONS} has their captions, {NUMBERS_FILE} their "
+        "numbers)"
     )
     console.print("\n".join(lines), soft_wrap=True, markup=False, highlight=False)
 
 
+def _names(config: DictConfig, *, alone: bool) -> list[str]:
+    """The figures to draw, each once; by default all, but none that compares a run ``alone``."""
+    names = list(dict.fromkeys(_list(config.figures)))
+    for name in names:
+        one_of("figures", name, FIGURES)
+        if alone and name in COMPARE:
+            raise ConfigError(
+                f"figures={name} compares runs, but there is one; add others as "
+                "compare=[<folder>,…]"
+            )
+    return names or [name for name in FIGURES if not (alone and name in COMPARE)]
+
+
 def _draw(name: str, subjects: Sequence[Subject], config: DictConfig) -> Drawing:
     """One figure with its whole caption."""
+    # All runs are of the data of the first one.
     data = subjects[0].data
     split = config.split
-    frames = [
-        whole("frames", frame, 0) for frame in dict.fromkeys(_list(config.frames))
-    ]
+
+    # Options are checked here, since each figure has its own number of shots.
+    frames = list(dict.fromkeys(_list(config.frames)))
+    for frame in frames:
+        whole("frames", frame, 0)
     items = choose_items(
         data,
         split,
@@ -224,10 +257,13 @@ def _draw(name: str, subjects: Sequence[Subject], config: DictConfig) -> Drawing
         count=whole(f"shots.{name}", config.shots.get(name), 1),
         one_camera=name == "strip",
     )
+
+    # The caption names the images, and says what the numbers are of.
     shots = make_shots(data, split, items, config.margin)
     drawing = FIGURES[name](subjects, shots)
+    images = ", ".join(shot.name for shot in shots)
     about = (
-        f" Images: {', '.join(shot.name for shot in shots)}. Numbers are of the windows shown, "
+        f" Images: {images}. Numbers are of the windows shown, "
         f"which reach at least {config.margin:g} m beyond the joints, not of whole images."
     )
     return replace(drawing, caption=f"{drawing.caption}{about} Split {split}.")
@@ -235,6 +271,7 @@ def _draw(name: str, subjects: Sequence[Subject], config: DictConfig) -> Drawing
 
 def _list(value: Any) -> list[Any]:
     """A list as it is, one value as a list of one, null as none."""
+    # An option may be a list, one value or null.
     if OmegaConf.is_list(value):
         return list(value)
     return [] if value is None else [value]
@@ -247,16 +284,26 @@ def _write_record(
     marks: Sequence[str],
 ) -> None:
     """Numbers as JSON and captions as Markdown."""
-    runs = {subject.name: str(subject.run.folder) for subject in subjects}
-    figures = {
-        name: {"caption": d.caption, "numbers": d.numbers} for name, d in made.items()
-    }
+    # Each figure has a section with its caption.
+    figures = {}
+    parts = ["# Captions"]
+    for name, drawing in made.items():
+        figures[name] = {"caption": drawing.caption, "numbers": drawing.numbers}
+        parts.append(f"## {name}\n\n{drawing.caption}")
+
+    # The last section tells which run has which name.
+    runs = {}
+    lines = []
+    for subject in subjects:
+        folder = str(subject.run.folder)
+        runs[subject.name] = folder
+        lines.append(f"- {subject.name}: `{folder}`")
+    parts.append("## Runs\n\n" + "\n".join(lines))
+    if marks:
+        parts.append(f"Marked: {'; '.join(marks)}.")
+
+    # NaN is no JSON; scores that are not defined are null.
     record = {"runs": runs, "marks": marks, "figures": figures}
-    write_atomically(out / RECORD, json.dumps(record, indent=1, allow_nan=False) + "\n")
-    parts = ["# Captions", *(f"## {name}\n\n{d.caption}" for name, d in made.items())]
-    parts += [
-        "## Runs\n\n"
-        + "\n".join(f"- {name}: `{folder}`" for name, folder in runs.items())
-    ]
-    parts += [f"Marked: {'; '.join(marks)}."] if marks else []
+    numbers = json.dumps(record, indent=1, allow_nan=False)
+    write_atomically(out / NUMBERS_FILE, numbers + "\n")
     write_atomically(out / CAPTIONS, "\n\n".join(parts) + "\n")

@@ -23,9 +23,9 @@ from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError, DataError
 
-# metres: with a joint nearer to the camera than this, the whole image is shown
-NEAR = 0.01
-LEAST = 16  # pixels, the shortest side of a window
+# Metres: if a joint is nearer to the camera than this, the whole image is shown.
+MIN_JOINT_DEPTH = 0.01
+MIN_WINDOW = 16  # pixels, the shortest side of a window
 TITLES = {  # of models, in print
     "full": "gsgan",
     "wo_seg": "w/o S",
@@ -40,11 +40,11 @@ Numbers = dict[str, float | None]
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One image of a split, (camera name, frame number), and the part of it that is shown."""
+    """One image of a split, and the part of it that is shown."""
 
-    item: Item
+    item: Item  # camera name and frame number
     frame: Frame
-    window: Window
+    window: Window  # the part
 
     @property
     def name(self) -> str:
@@ -77,29 +77,39 @@ def choose_items(
     """
     items = data.splits.items[one_of("split", split, SPLITS)]
     if not items:
-        others = ", ".join(
-            f"split={name}" for name in SPLITS if data.splits.items[name]
-        )
+        others = [f"split={name}" for name in SPLITS if data.splits.items[name]]
+        use = ", ".join(others)
         raise DataError(
-            f"split {split} has no images: {data.reasons[split]}; use {others}"
+            f"split {split} has no images: {data.reasons[split]}; use {use}"
         )
+
+    # The cameras: a chosen one, the first, or all.
     cameras = list(dict.fromkeys(name for name, _ in items))
-    if camera is not None and camera not in cameras:
+    if camera not in (None, *cameras):
         names = ", ".join(cameras)
         raise ConfigError(f"camera {camera} is not in split {split}, which has {names}")
     if one_camera:
         camera = camera or cameras[0]
-    held = [item for item in items if camera in (None, item[0])]
-    known = sorted({frame for _, frame in held})
+
+    # The cameras of each frame.
+    seen_by: dict[int, list[Item]] = {}
+    for item in items:
+        if camera in (None, item[0]):
+            seen_by.setdefault(item[1], []).append(item)
+    known = sorted(seen_by)
+
+    # The frames: chosen ones that all exist, or some that are spread evenly.
     if frames is None:
         frames = [known[i] for i in evenly_spaced(len(known), count)]
     if lacking := [frame for frame in frames if frame not in known]:
         of = f"split {split}" if camera is None else f"camera {camera} in split {split}"
         raise ConfigError(f"frames: {of} lacks {spans(lacking)}; it has {spans(known)}")
+
+    # The i-th of n frames is shown by the camera at (i + 1/2) / n of its cameras.
     chosen = []
     for place, frame in enumerate(frames):
-        seen_by = [item for item in held if item[1] == frame]
-        chosen.append(seen_by[(2 * place + 1) * len(seen_by) // (2 * len(frames))])
+        views = seen_by[frame]
+        chosen.append(views[(2 * place + 1) * len(views) // (2 * len(frames))])
     return chosen
 
 
@@ -107,16 +117,23 @@ def make_shots(
     data: GsganData, split: str, items: Sequence[Item], margin: float
 ) -> list[Shot]:
     """Images of a split in windows that reach ``margin`` metres beyond the joints, all of one size
-    where the images are."""
+    if the images are."""
     dataset = data.dataset(split)
     frames = [dataset[dataset.items.index(item)] for item in items]
+
+    # Images of one size are one batch, whose windows have one size.
     one_size = len({frame.camera.size for frame in frames}) == 1
+    batch_size = len(frames) if one_size else 1
     shots: list[Shot] = []
-    for batch in [frames] if one_size else [[frame] for frame in frames]:
-        p = torch.cat([f.skeleton for f in batch])
-        camera = cat([f.camera for f in batch])
+    for first in range(0, len(frames), batch_size):
+        batch = frames[first : first + batch_size]
         boxes = body_window(
-            p, camera, margin=margin, multiple=1, least=LEAST, near=NEAR
+            torch.cat([frame.skeleton for frame in batch]),
+            cat([frame.camera for frame in batch]),
+            margin=margin,
+            multiple=1,
+            least=MIN_WINDOW,
+            near=MIN_JOINT_DEPTH,
         )
         for corner, frame in zip(boxes.corners, batch, strict=True):
             window = Window((corner,), boxes.size, boxes.whole)
@@ -126,14 +143,14 @@ def make_shots(
 
 @dataclass
 class Subject:
-    """A trained avatar in eval mode on the device that renders, its name in print, its run with the
-    fingerprint of ``data``, and the marks that every figure of it must carry."""
+    """A trained avatar and its data."""
 
-    name: str
-    run: ScoredRun
+    name: str  # in print
+    run: ScoredRun  # with the fingerprint of ``data``
     data: GsganData
-    avatar: Avatar
-    marks: list[str]
+    avatar: Avatar  # in eval mode, on the device that renders
+    marks: list[str]  # carried by every figure
+    # Whole images that were rendered, on the CPU.
     _images: dict[Item, Tensor] = field(default_factory=dict, repr=False)
 
     def image(self, shot: Shot) -> Tensor:
@@ -142,6 +159,7 @@ class Subject:
         Raises:
             DataError: when the image is not finite.
         """
+        # Several figures may show parts of one image.
         if shot.item not in self._images:
             device = next(self.avatar.parameters()).device
             with torch.no_grad():
@@ -157,12 +175,13 @@ class Subject:
 def open_subjects(
     folders: Sequence[Path], moved: DataPaths, device: torch.device | str
 ) -> list[Subject]:
-    """The avatars of run folders, named as their models, with a number where models are equal.
+    """The avatars of run folders, named as their models, with a number if models are equal.
 
     Raises:
         ConfigError: on a folder given twice, or runs of different data.
         DataError: when a run cannot be read.
     """
+    # A link and its target are the same run.
     if len({folder.resolve() for folder in folders}) < len(folders):
         raise ConfigError(
             "a run is given twice; every run in run and compare must differ"
@@ -170,24 +189,28 @@ def open_subjects(
     subjects = [_open(folder, moved, device) for folder in folders]
     runs = [subject.run for subject in subjects]
     check_same("figures", runs, [{DATA: run.data["fingerprint"]} for run in runs])
+
+    # Equal names get the place of the run.
     models = [subject.name for subject in subjects]
-    return [
-        s if models.count(s.name) < 2 else replace(s, name=f"{s.name} ({i})")
-        for i, s in enumerate(subjects, 1)
-    ]
+    for i, subject in enumerate(subjects, 1):
+        if models.count(subject.name) > 1:
+            subject.name += f" ({i})"
+    return subjects
 
 
 def _open(folder: Path, moved: DataPaths, device: torch.device | str) -> Subject:
+    # The run's seed and data are those of the config that is opened.
     config = load_config(folder, moved)
     data = build_data(config)
     avatar, marks = load_avatar(folder, config, data)
     run = read_run(folder, scored=False)
-    run = replace(
-        run, seed=config.seed, data=run.data | {"fingerprint": fingerprint(data)}
-    )
+    found = run.data | {"fingerprint": fingerprint(data)}
+    run = replace(run, seed=config.seed, data=found)
     name = TITLES.get(run.name, run.name)
     if run.name == "full" and run.departures == []:
         name = NAME
+
+    # A figure of an unfinished run says so.
     step = int(read_checkpoint(folder / CHECKPOINT)["gsgan"]["step"])
     total = run.planned(segmentation=avatar.segmentation is not None)
     if step < total:
@@ -196,7 +219,7 @@ def _open(folder: Path, moved: DataPaths, device: torch.device | str) -> Subject
 
 
 def measure(image: Tensor, truth: Tensor) -> Numbers:
-    """PSNR in dB and edge F1 of one image ``[1, 3, h, w]`` as it is shown; None where not defined:
+    """PSNR in dB and edge F1 of one image ``[1, 3, h, w]`` as it is shown; None if not defined:
     equal images, or a ground truth without edges."""
     return {
         "psnr": finite(psnr(image, truth)),
@@ -205,6 +228,6 @@ def measure(image: Tensor, truth: Tensor) -> Numbers:
 
 
 def finite(score: Tensor) -> float | None:
-    """The number in a tensor of one; None where it is not finite."""
+    """The number in a tensor of one; None if it is not finite."""
     value = float(score)
     return value if math.isfinite(value) else None
