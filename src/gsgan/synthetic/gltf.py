@@ -226,7 +226,7 @@ def _part(glb: Glb, skeleton: _Skeleton, number: int, primitive: Any) -> _Part:
     linear = binding.to_world[:, :3, :3]
     normals = np.zeros_like(position)
     if "NORMAL" in attributes:
-        upright: Array = np.linalg.inv(linear).transpose(0, 2, 1)
+        upright = np.linalg.inv(linear).transpose(0, 2, 1)
         normals = _transformed(upright, glb.accessor(attributes["NORMAL"]))
 
     # Corners of the triangles; without indices, every three vertices are one.
@@ -257,7 +257,7 @@ def _part(glb: Glb, skeleton: _Skeleton, number: int, primitive: Any) -> _Part:
     )
 
 
-def _transformed(matrices: Array, vectors: Array) -> Array:
+def _transformed(matrices: np.ndarray, vectors: Array) -> Array:
     """Vectors ``[V, 3]``, each multiplied by its own matrix ``[V, 3, 3]``."""
     transformed: Array = np.einsum("vij,vj->vi", matrices, vectors)
     return transformed
