@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 
 from gsgan.body.free import Body
 from gsgan.body.lbs import axis_angle_to_matrix, left_jacobian, shortest_turn
-from gsgan.skeleton.hands import FINGERS, HAND, PALM, PINKY, SHORT, palm_frames
+from gsgan.skeleton.hands import FINGERS, HAND, MIN_PALM, PALM, PINKY, palm_frames
 from gsgan.utils.tensors import constant
 
 # Per number, for the thumb and for the fingers: flexion, turn to the side and twist of the first
@@ -230,7 +230,7 @@ def _placed(x: Tensor, hands: Tensor, seen: Tensor, R: Tensor) -> tuple[Tensor, 
     for _ in range(PLACING):
         now = away @ R.mT
         H = (share * now).mT @ now
-        H = (torch.einsum("...ii", H)[..., None, None] + SHORT**2) * eye - H
+        H = (torch.einsum("...ii", H)[..., None, None] + MIN_PALM**2) * eye - H
         slope = (share * torch.linalg.cross(now, towards)).sum(2)
         R = axis_angle_to_matrix(torch.linalg.solve(H, slope)) @ R
     return R, goal - (R @ centre.unsqueeze(-1)).squeeze(-1)

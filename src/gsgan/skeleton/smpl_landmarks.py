@@ -1,6 +1,6 @@
-"""MediaPipe's 33 pose landmarks from the joints, and where given the vertices, of SMPL or SMPL-X.
+"""MediaPipe's 33 pose landmarks from the joints, and if given the vertices, of SMPL or SMPL-X.
 
-Convention: metres, any frame; landmarks that the body model lacks are NaN with confidence 0.
+Units are metres in any frame; landmarks that the body model lacks are NaN with confidence 0.
 Confidence 1: the same point in both; 0.5: a point nearby.
 
 Source: vertex numbers as in public loaders.
@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gsgan.skeleton.template import MEDIAPIPE33
 
+# Confidences.
 SAME = 1.0
 NEAR = 0.5
 Floats = NDArray[np.float64]
@@ -36,11 +37,11 @@ def _sides(
     names: dict[str, tuple[int, int]], confidence: float
 ) -> dict[str, tuple[int, float]]:
     """Left and right landmark from one name: ``{"hip": (1, 2)}``."""
-    return {
-        f"{side}_{name}": (number, confidence)
-        for name, pair in names.items()
-        for side, number in zip(("left", "right"), pair, strict=True)
-    }
+    sided = {}
+    for name, (left, right) in names.items():
+        sided[f"left_{name}"] = (left, confidence)
+        sided[f"right_{name}"] = (right, confidence)
+    return sided
 
 
 def _eyes(left: int, right: int) -> dict[str, tuple[int, float]]:
@@ -51,19 +52,19 @@ def _eyes(left: int, right: int) -> dict[str, tuple[int, float]]:
 
 _ARMS = {"shoulder": (16, 17), "elbow": (18, 19), "wrist": (20, 21)}
 _LEGS = {"hip": (1, 2), "knee": (4, 5), "ankle": (7, 8)}
-_LIMBS = _sides(_ARMS | _LEGS, SAME) | _sides({"foot_index": (10, 11)}, NEAR)
+_LIMB_JOINTS = _sides(_ARMS | _LEGS, SAME) | _sides({"foot_index": (10, 11)}, NEAR)
 
 TABLES = {
     "smpl": LandmarkTable(
         counts=(24, 6890),
-        joints=_LIMBS | _sides({"index": (22, 23)}, NEAR),
+        joints=_LIMB_JOINTS | _sides({"index": (22, 23)}, NEAR),
         vertices={
             "nose": (332, SAME),
             **_eyes(2800, 6260),
             **_sides({"ear": (583, 4071), "heel": (3387, 6787)}, SAME),
             **_sides({"foot_index": (3216, 6617)}, SAME),
         },
-        # MediaPipe's three hand points are knuckles: about halfway to the finger tip
+        # MediaPipe's three points of a hand are knuckles, about half-way to the finger tips.
         midpoints={
             "left_index": (20, 2319),
             "left_pinky": (20, 2673),
@@ -75,7 +76,7 @@ TABLES = {
     ),
     "smplx": LandmarkTable(
         counts=(55, 10475),
-        joints=_LIMBS
+        joints=_LIMB_JOINTS
         | _sides({"index": (25, 40), "pinky": (31, 46), "thumb": (38, 53)}, SAME)
         | {name: (number, NEAR) for name, (number, _) in _eyes(23, 24).items()},
         vertices={
@@ -125,6 +126,7 @@ def to_mediapipe33(
         p[..., landmark, :] = position
         conf[..., landmark] = confidence
 
+    # Vertices are nearer to the landmarks than joints and replace them.
     for name, (joint, confidence) in table.joints.items():
         put(name, j[..., joint, :], confidence)
     if vertices is not None:
@@ -133,6 +135,8 @@ def to_mediapipe33(
             put(name, v[..., vertex, :], confidence)
         for name, (joint, vertex) in table.midpoints.items():
             put(name, (j[..., joint, :] + v[..., vertex, :]) / 2, NEAR)
+
+    # A landmark with a coordinate that is not finite is unknown.
     known = np.isfinite(p).all(axis=-1)
     p[~known] = np.nan
     return p, np.where(known, conf, 0.0)

@@ -19,15 +19,15 @@ class Swing(NamedTuple):
     """The shortest rotations from fixed unit directions ``rest [M, 3]`` to any other."""
 
     rest: Tensor
-    straight: Tensor
-    folded: Tensor
+    straight: Tensor  # [M, 3, 3] first half turn of usual swings
+    folded: Tensor  # [M, 3, 3] first two half turns of nearly opposite directions
 
     @classmethod
     def of(cls, rest: Tensor) -> Swing:
-        half_turn_rest = _half_turn(rest)
-        return cls(
-            rest, half_turn_rest, half_turn_rest @ _half_turn(orthogonal_to(rest))
-        )
+        """The swings from these directions."""
+        straight = _half_turn(rest)
+        folded = straight @ _half_turn(orthogonal_to(rest))
+        return cls(rest, straight, folded)
 
     def to(self, d: Tensor) -> Tensor:
         """``[B, M, 3, 3]`` rotations from ``rest`` to the directions ``d [B, M, 3]``.
@@ -35,7 +35,7 @@ class Swing(NamedTuple):
         A d shorter than 1 gives a part of the rotation, a zero d none.
 
         The swing is composed of two half turns, about ``rest`` and about the bisector of ``rest``
-        and ``d``, without a division by ``1 + cos``. Where ``1 + cos < FOLDED`` the bisector is
+        and ``d``, without a division by ``1 + cos``. If ``1 + cos < FOLDED``, the bisector is
         undefined and a third half turn, about a fixed axis orthogonal to ``rest``, goes first: the
         result still maps ``rest`` exactly to ``d``, with an arbitrary but fixed roll.
         """
@@ -88,7 +88,7 @@ def constants(
     template: SkeletonTemplate, device: torch.device, dtype: torch.dtype
 ) -> Constants:
     """The template's tensors on a device, cached."""
-    # tensors created in inference mode cannot be used for training later
+    # Tensors created in inference mode cannot be used for training later.
     with torch.inference_mode(False), torch.no_grad():
         return _constants(template, device, dtype)
 
@@ -112,34 +112,38 @@ def _constants(
     # Limbs by level, each with the position of its parent's frame.
     ordered = [limb for level in t.levels for limb in level]
     position = {hub: hub for hub in range(t.n_hubs)}
-    position |= {t.n_hubs + limb: t.n_hubs + k for k, limb in enumerate(ordered)}
-    levels = tuple(
-        Level(
-            limbs=index(limbs),
-            parents=index([position[t.limb_parents[limb]] for limb in limbs]),
-            swing=swing(directions[list(limbs)]),
+    for k, limb in enumerate(ordered):
+        position[t.n_hubs + limb] = t.n_hubs + k
+    levels = []
+    for limbs in t.levels:
+        parents = [position[t.limb_parents[limb]] for limb in limbs]
+        levels.append(
+            Level(
+                limbs=index(limbs),
+                parents=index(parents),
+                swing=swing(directions[list(limbs)]),
+            )
         )
-        for limbs in t.levels
-    )
 
     # The face's joints but the nose turn with their line from the middle of the ears.
     turned = [j for j in t.face if j != t.nose]
     from_ears = rest[turned] - rest[list(t.ears)].mean(0)
 
     # Where omega finds each joint's rotation: among pelvis, chest, head, face and limbs.
-    place = (
-        dict.fromkeys(t.hips, PELVIS)
-        | dict.fromkeys(t.shoulders, CHEST)
-        | {t.nose: HEAD}
-    )
-    place |= {joint: N_HUBS + k for k, joint in enumerate(turned)}
-    place |= {joint: N_HUBS + len(turned) + limb for joint, limb in t.incoming.items()}
+    place = dict.fromkeys(t.hips, PELVIS)
+    place |= dict.fromkeys(t.shoulders, CHEST)
+    place[t.nose] = HEAD
+    for k, joint in enumerate(turned):
+        place[joint] = N_HUBS + k
+    for joint, limb in t.incoming.items():
+        place[joint] = N_HUBS + len(turned) + limb
+    posed = [joint for joint in range(len(t.names)) if joint not in t.expression]
 
     return Constants(
         rest=cast(rest),
         starts=index([a for a, _ in t.limbs]),
         ends=index([b for _, b in t.limbs]),
-        levels=levels,
+        levels=tuple(levels),
         limb_order=index([ordered.index(limb) for limb in range(len(t.limbs))]),
         head_from_eyes=cast(_eye_frame(t, rest).mT.contiguous()),
         head_points=index(t.head),
@@ -151,9 +155,7 @@ def _constants(
         face_swing=swing(from_ears / from_ears.norm(dim=-1, keepdim=True)),
         expression=index(t.expression),
         face_rest=cast(rest[list(t.expression)] - rest[list(t.head)].mean(0)),
-        omega_order=index(
-            [place[j] for j in range(len(t.names)) if j not in t.expression]
-        ),
+        omega_order=index([place[joint] for joint in posed]),
         axes=cast(torch.eye(3, dtype=torch.float64)),
     )
 
@@ -161,11 +163,11 @@ def _constants(
 def _eye_frame(t: SkeletonTemplate, rest: Tensor) -> Tensor:
     """``[3, 3]``: the frame of eyes and nose at rest, whose head frame is the identity."""
     left, right = t.eyes
+    middle = (rest[left] + rest[right]) / 2
     across_eyes = unit(rest[left] - rest[right])
-    front = unit(across(across_eyes, rest[t.nose] - (rest[left] + rest[right]) / 2))
-    return torch.stack(
-        [across_eyes, torch.linalg.cross(front, across_eyes), front], dim=-1
-    )
+    front = unit(across(across_eyes, rest[t.nose] - middle))
+    up = torch.linalg.cross(front, across_eyes)
+    return torch.stack([across_eyes, up, front], dim=-1)
 
 
 def check_skeleton(
