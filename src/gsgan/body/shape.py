@@ -270,14 +270,17 @@ def _with_hands(body: B, hands: Tensor) -> B:
     none = torch.zeros_like(hands[:1, 1])
     moves = torch.cat([none, hands[:, 1]])  # [3, 3]
 
-    # Wrists have their own.
+    weight = body.bone_weight.unsqueeze(-1)
+    vertices = body.vertices + (weight * moves[sides[body.bone_index]]).sum(1)
+    landmarks = body.landmarks + moves[sides[body.landmark_bone]]
+
+    # Wrists have moves of their own.
     wrists = [body.joint_names.index(name) for name in WRISTS]
     at = body.joints[wrists] + hands[:, 0]
     joints = (body.joints + moves[sides]).index_copy(0, torch.tensor(wrists), at)
-    weight = body.bone_weight.unsqueeze(-1)
     changes: dict[str, Any] = {
-        "vertices": body.vertices + (weight * moves[sides[body.bone_index]]).sum(1),
-        "landmarks": body.landmarks + moves[sides[body.landmark_bone]],
+        "vertices": vertices,
+        "landmarks": landmarks,
         "joints": joints,
     }
     if isinstance(body, Body):
