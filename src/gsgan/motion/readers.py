@@ -46,14 +46,14 @@ WORLD_KEYS = (
 )
 # Keys of SMPL's parameters: AMASS, HuMMan, smplx, AIST++, ZJU-MoCap.
 POSE_KEYS = ("poses", "pose", "smpl_poses", "body_pose", "pose_body")
-PART_KEYS = ("pose_jaw", "pose_eye", "pose_hand")  # of SMPL-X, after the body
+PART_KEYS = ("pose_jaw", "pose_eye", "pose_hand")  # parts of SMPL-X, after the body
 ROOT_KEYS = ("Rh", "root_orient", "global_orient")
 MOVE_KEYS = ("trans", "transl", "smpl_trans", "Th")
 SHAPE_KEYS = ("betas", "shapes")
-# numbers of poses of SMPL-X's body, SMPL, SMPL-H, SMPL-X
+# Numbers of poses of SMPL-X's body, SMPL, SMPL-H, SMPL-X.
 WITHOUT_ROOT = (63, 69, 153, 162)
 RATE_KEYS = ("fps", "mocap_framerate", "mocap_frame_rate")
-SCALE = "smpl_scaling"  # of AIST++: units of its translations in a metre
+SCALE = "smpl_scaling"  # in AIST++: units of its translations in a metre
 ARRAYS = (
     "p",
     "conf",
@@ -185,7 +185,10 @@ def _first(
     arrays: dict[str, NDArray[Any]], keys: tuple[str, ...], default: Any = None
 ) -> Any:
     """The first array that there is."""
-    return next((arrays[key] for key in keys if key in arrays), default)
+    for key in keys:
+        if key in arrays:
+            return arrays[key]
+    return default
 
 
 def _meta(path: Path) -> dict[str, Any]:
@@ -246,20 +249,23 @@ def _body_pose(
     transl = scale * expect_array(arrays, "transl", (F, 3), path)
     fps = fps or meta.get("fps")
 
-    # another number of bones: SMPL
+    # Another number of bones: SMPL.
     if bones != len(free_body().parents):
         smpl = {"poses": theta.reshape(F, -1), "trans": transl}
         if "betas" in arrays:
             smpl["betas"] = arrays["betas"]
         return _smpl(path, smpl, fps, source)
 
-    shape = path.with_name(SHAPE)  # by gsgan.fit
+    # The free body in the shape that gsgan.fit has stored, if any.
+    shape = path.with_name(SHAPE)
     subject = open_body("free", betas=read_shape(shape) if shape.is_file() else ())
     assert subject is not None
     poses = BodyPose(
         theta=torch.from_numpy(np.nan_to_num(theta)).float(),
         transl=torch.from_numpy(np.nan_to_num(transl)).float(),
     )
+
+    # Frames with NaN were posed as zeros.
     p = subject.posed_landmarks(poses).double().numpy()
     known = np.isfinite(theta).all((1, 2)) & np.isfinite(transl).all(1)
     p[~known] = np.nan
@@ -289,7 +295,7 @@ def _smpl(
             f"smpl={source.smpl} does not exist; expected a .pkl or .npz file"
         )
 
-    # poses, moves in metres and the median shape
+    # Poses, moves in metres and the median shape.
     model = read_smpl(source.smpl)
     poses = _smpl_poses(path, arrays)
     F = len(poses)
@@ -309,9 +315,8 @@ def _smpl(
         root = model.rest_joints(torch.from_numpy(betas[None]))[0, 0].numpy()
         theta[:, 0], moves = from_zju(theta[:, 0], moves, root)
 
-    motion = smpl_motion.SmplMotion(
-        np.arange(F), theta, moves, np.repeat(betas[None], F, axis=0)
-    )
+    shapes = np.repeat(betas[None], F, axis=0)
+    motion = smpl_motion.SmplMotion(np.arange(F), theta, moves, shapes)
     p, conf = smpl_motion.landmarks_of(model, motion)
     p[~known] = np.nan
     return Clip(path=path, p=p, visibility=conf, fps=fps, up=None, unit="metres")
@@ -324,7 +329,7 @@ def _smpl_poses(path: Path, arrays: dict[str, Any]) -> Float:
     too; HuMMan holds ``global_orient`` and ``body_pose`` (69); ZJU-MoCap an empty root in ``poses``
     (72) and ``Rh``.
     """
-    # one row of numbers for each frame
+    # One row of numbers for each frame.
     poses = np.asarray(_first(arrays, POSE_KEYS), np.float64)
     poses = poses.reshape(len(poses), -1)
     root = _first(arrays, ROOT_KEYS)
@@ -425,7 +430,7 @@ def _landmark_row(where: str, frame: Any) -> Float:
     if not points:
         return np.repeat([[np.nan, np.nan, np.nan, 0]], JOINTS, axis=0)
 
-    # 33 landmarks of 4 numbers
+    # 33 landmarks of 4 numbers.
     try:
         rows = [_numbers(point) for point in points]
     except TypeError:
@@ -442,7 +447,7 @@ def _numbers(point: Any) -> list[Any]:
     """x, y, z and visibility of a landmark; a missing visibility is 1."""
     if not isinstance(point, dict):
         return [*point, 1.0][:4]
-    # TensorFlow.js calls the visibility score
+    # TensorFlow.js calls the visibility score.
     visibility = point.get("visibility", point.get("score", 1.0))
     return [point.get("x"), point.get("y"), point.get("z"), visibility]
 
@@ -483,7 +488,8 @@ def _rig(path: Path, motion: RigMotion, metres: float | None, source: Source) ->
         raise DataError(
             f"{path} is no motion of a person ({reason}); export it again"
         ) from error
-    # the unit with which the legs are about as long as the subject's
+
+    # The unit with which the legs are about as long as the subject's.
     if metres is None:
 
         def mismatch(unit: str) -> float:

@@ -572,7 +572,7 @@ def _flatten_feet(turns: dict[str, Array], joints: dict[str, Array]) -> None:
         if toe not in joints:
             continue
 
-        # A foot rests in the slowest fifth of the frames. The first frame has the speed of the second.
+        # A foot rests in the slowest fifth of the frames. The first frame's step is to the second.
         ends = np.stack([joints[foot], joints[toe]])
         second = ends[:, :2][:, -1:]
         speed = np.linalg.norm(np.diff(ends, axis=1, prepend=second), axis=-1)
