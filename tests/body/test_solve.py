@@ -136,8 +136,8 @@ def test_the_learnt_covariance_is_a_covariance_and_symmetrical():
 
 def test_gradients_are_those_of_the_solution(monkeypatch, poses):
     """In float64, against finite differences; Gauss-Newton's matrix leaves a few percent."""
-    monkeypatch.setattr(solve, "CONVERGED", 1e-9)
-    monkeypatch.setattr(solve, "STEPS", 30)
+    monkeypatch.setattr(solve, "MIN_IMPROVEMENT", 1e-9)
+    monkeypatch.setattr(solve, "MAX_STEPS", 30)
     fine = Solver(free_body().to(torch.float64))
     p, seen = (x[:1].double() for x in shown(poses[3:4]))
     p = p.clone().requires_grad_()

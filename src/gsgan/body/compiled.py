@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gsgan.splat import build, native
 
+# Fields of struct SolveJob, in its order: counts, numbers, and arrays of body, fingers and frames.
 COUNTS = (
     "J",
     "T",

@@ -29,28 +29,23 @@ MAX_ANGLES = (
     (1.2, 0.8, 0.8, 2.0, 0.3),
     (1.75, 0.45, 0.4, 2.6, 0.1),
 )
-FINGER_NOISE = 0.004  # metres, standard deviation of a landmark
+FINGER_LANDMARK_NOISE = 0.004  # metres, standard deviation of a landmark
 # Gauss-Newton steps of the fingers in each round, which then places the hand.
-ROUNDS = (1, 2)
+FINGER_ROUNDS = (1, 2)
 PLACING = 3  # Gauss-Newton steps of a hand's rotation
 TRACE = 1e-4  # share of a bone at rest, added to the observed one: a bone of no length rests
 
 
 class Hands(NamedTuple):
-    """Quantities of B frames that follow from the hands' landmarks.
+    """Quantities of B frames that follow from the hands' landmarks."""
 
-    Args:
-        turns: ``[B, 20, 3]`` of `Fingers.joints`.
-        shown: ``[B, 20]`` bool: those that landmarks determine; others are finite but arbitrary.
-        rotations, shifts: ``[B, 2, 3, 3]`` and ``[B, 2, 3]`` metres: each hand's rigid motion from
-            rest to where it is nearest to all its landmarks.
-        placed: ``[B, 2]`` bool: those that landmarks determine; others are finite but arbitrary.
-    """
-
-    turns: Tensor
+    turns: Tensor  # [B, 20, 3] of `Fingers.joints`
+    # [B, 20] bool: those that landmarks determine; others are finite but arbitrary
     shown: Tensor
-    rotations: Tensor
-    shifts: Tensor
+    # Each hand's rigid motion from rest to where it is nearest to all its landmarks.
+    rotations: Tensor  # [B, 2, 3, 3]
+    shifts: Tensor  # [B, 2, 3] metres
+    # [B, 2] bool: those that landmarks determine; others are finite but arbitrary
     placed: Tensor
 
 
@@ -118,7 +113,7 @@ class Fingers(nn.Module):
                 finger, a finger its two landmarks nearest to the palm, its second joint one more.
         """
         R = palm_frames(_palms(hands)) @ self.palms.mT
-        for steps in ROUNDS:
+        for steps in FINGER_ROUNDS:
             turns = self._turned(R, hands, seen, steps)
             R, shift = _placed(self._posed(turns), hands, seen, R)
         return Hands(
@@ -137,7 +132,7 @@ class Fingers(nn.Module):
         lengths = self.bones.norm(dim=-1, keepdim=True)
         bones = lengths * normalize(bones, dim=-1, eps=1e-9)
 
-        weight = seen[:, self.chains[:, 1:]].to(bones) / FINGER_NOISE**2
+        weight = seen[:, self.chains[:, 1:]].to(bones) / FINGER_LANDMARK_NOISE**2
         numbers = self._start(bones, weight)
         for _ in range(steps):
             numbers = numbers - self._step(numbers, bones, weight)

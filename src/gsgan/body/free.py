@@ -30,10 +30,10 @@ class Body(MarkedBody):
     face_labels: Tensor
     face_surface: Tensor  # [F] int64 material of each face, see surface_names
     surface_names: tuple[str, ...]  # skin, hair, eye and the garments
-    landmark_names: tuple[str, ...]
+    landmark_names: tuple[str, ...]  # of the 33
     hand_landmarks: Tensor  # [42, 3] metres
-    hand_bone: Tensor  # [42] int64
-    hand_names: tuple[str, ...]
+    hand_bone: Tensor  # [42] int64, the joint that each hand landmark moves with
+    hand_names: tuple[str, ...]  # of the 42
 
     def posed_hands(self, pose: BodyPose) -> Tensor:
         """``[B, 42, 3]`` MediaPipe hand landmarks, left then right, metres, world frame."""

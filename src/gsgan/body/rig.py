@@ -74,11 +74,11 @@ NUMBER_SIGMAS = {
 }
 # A hinge does not bend backwards; elbows are bent at rest.
 HINGE_MINIMA = {"knee": -0.1, "elbow": -0.7}
-SIDES = {"left": "L", "right": "R"}
+SIDE_LETTERS = {"left": "L", "right": "R"}
 SPINE = ("spine1", "spine2", "spine3")  # from the pelvis to the chest
 TRUNK = (
     *(f"{joint}_{axis}" for joint in SPINE for axis in "xyz"),
-    *(f"{side}_collar_{axis}" for side in SIDES for axis in "yz"),
+    *(f"{side}_collar_{axis}" for side in SIDE_LETTERS for axis in "yz"),
 )
 BENT = 0.15  # sine: an elbow that is bent more at rest determines its hinge
 AT_JOINT = 1e-4  # metres
@@ -115,28 +115,18 @@ class Limb:
 
 @dataclass(frozen=True)
 class BodyRig:
-    """T turns and D numbers of a body; one entry for every turn that a number moves.
+    """T turns and D numbers of a body; one entry for every turn that a number moves."""
 
-    Args:
-        names: of the numbers; the first six are the root's rotation and translation.
-        joint: ``[T]`` the joint of each turn, the root's first.
-        parent: ``[T]`` the turn before it on the way to the root, -1 for the root's.
-        entry_turn, entry_number: ``[E]``.
-        entry_axis: ``[E, 3]`` axis times share.
-        carrier: ``[33]`` the turn that each landmark follows.
-        reaches: ``[D, 33]`` bool, the landmarks that a number moves.
-        limbs: arms and legs.
-    """
-
+    # of the numbers; the first six are the root's rotation and translation
     names: tuple[str, ...]
-    joint: Tensor
-    parent: Tensor
-    entry_turn: Tensor
-    entry_number: Tensor
-    entry_axis: Tensor
-    carrier: Tensor
-    reaches: Tensor
-    limbs: tuple[Limb, ...]
+    joint: Tensor  # [T] the joint of each turn, the root's first
+    parent: Tensor  # [T] the turn before it on the way to the root, -1 for the root's
+    entry_turn: Tensor  # [E]
+    entry_number: Tensor  # [E]
+    entry_axis: Tensor  # [E, 3] axis times share
+    carrier: Tensor  # [33] the turn that each landmark follows
+    reaches: Tensor  # [D, 33] bool, the landmarks that a number moves
+    limbs: tuple[Limb, ...]  # arms and legs
 
     def numbers(self, name: str) -> list[int]:
         """The numbers about x, y and z of a name."""
@@ -198,7 +188,7 @@ def build_rig(body: MarkedBody) -> BodyRig:
 
     # Arms and legs.
     limbs = {}
-    for side, letter in SIDES.items():
+    for side, letter in SIDE_LETTERS.items():
         of_side = _Turns(body, chains, letter if chains is FREE else side)
         limbs[f"{side} arm shoulder elbow wrist"] = _arm(of_side, side, axes)
         limbs[f"{side} thigh hip knee ankle"] = _leg(of_side, side, axes)

@@ -28,10 +28,10 @@ from gsgan.utils.errors import DataError
 
 # Groups of bones with one stretch each, shared by left and right: limbs are scaled along their
 # axis, other parts in all directions.
-LIMBS = ("upper_arm", "forearm", "thigh", "shank")
-STRETCHED = (*LIMBS, "hand", "foot", "head", "trunk")
+STRETCHED_LIMBS = ("upper_arm", "forearm", "thigh", "shank")
+STRETCHED = (*STRETCHED_LIMBS, "hand", "foot", "head", "trunk")
 # Patterns of joint names, in the free body | in SMPL's family; others are the trunk's.
-GROUPS = {
+BONE_GROUPS = {
     "upper_arm": r"upperarm.*|.*_shoulder",
     "forearm": r"lowerarm.*|.*_elbow",
     "thigh": r"upperleg.*|.*_hip",
@@ -149,8 +149,8 @@ class ShapeSpace(Generic[B]):
         directions: ``[N, 3, K]`` metres per unit, by the body's field: vertices, joints, landmarks.
     """
 
-    body: B
-    directions: Mapping[str, Tensor]
+    body: B  # at coefficients of zero
+    directions: Mapping[str, Tensor]  # [N, 3, K] by the body's field
 
     @property
     def coefficients(self) -> int:
@@ -193,7 +193,7 @@ class ShapeSpace(Generic[B]):
 
 def group_of(joint: str) -> str:
     """The group whose stretch scales what a joint of that name moves."""
-    for group, names in GROUPS.items():
+    for group, names in BONE_GROUPS.items():
         if re.fullmatch(names, joint):
             return group
     return "trunk"
@@ -204,7 +204,7 @@ def limb_axes(body: MarkedBody) -> Tensor:
     groups = [group_of(name) for name in body.joint_names]
     axes = torch.zeros_like(body.joints)
     for joint, group in enumerate(groups):
-        if group not in LIMBS:
+        if group not in STRETCHED_LIMBS:
             continue
         # From the first joint of the limb to the first one after it.
         first = joint

@@ -21,7 +21,7 @@ from gsgan.body.lbs import (
 )
 from gsgan.scene import BodyPose
 
-KEPT = 4  # number of bones per vertex whose weights' gradients are used
+KEPT_BONES = 4  # number of bones per vertex whose weights' gradients are used
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,7 +160,8 @@ class WeightGradients(nn.Module):
     Source: ours.
     """
 
-    homogeneous: Tensor
+    homogeneous: Tensor  # [N, 4] rest positions and 1
+    # The gradient operator as a compressed sparse matrix, 3 rows per vertex.
     rows: Tensor
     columns: Tensor
     values: Tensor
@@ -205,7 +206,7 @@ class WeightGradients(nn.Module):
 
         # The largest, shifted to sum to zero.
         change = slopes.square().sum(dim=1)
-        _, bones = change.topk(min(KEPT, self.joints), dim=1)
+        _, bones = change.topk(min(KEPT_BONES, self.joints), dim=1)
         slopes = slopes.gather(2, bones.unsqueeze(1).expand(-1, 3, -1))
         slopes = slopes - slopes.mean(dim=2, keepdim=True)
 

@@ -33,6 +33,7 @@ from gsgan.utils.arrays import expect_array
 from gsgan.utils.errors import DataError
 from gsgan.utils.pickles import read_npz, read_pickle
 
+# The arrays of a model file.
 KEYS = (
     "v_template",
     "shapedirs",

@@ -7,6 +7,7 @@ from typing import Literal, get_args
 
 Parts = Literal["clothes", "cihp", "joints"]
 
+# The 22 joints that SMPL and SMPL-X share.
 _BODY = (
     "pelvis",
     "left_hip",
@@ -110,6 +111,8 @@ def part_of_joint(parts: Parts, joint: str) -> str:
     """
     if parts == "joints":
         return joint
+
+    # The head and the trunk have parts without a side.
     side, _, limb = joint.partition("_")
     if joint in ("neck", "head", "jaw") or limb == "eye":
         return "face_neck" if parts == "clothes" else "face"

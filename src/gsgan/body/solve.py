@@ -16,7 +16,13 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from gsgan.body import compiled
-from gsgan.body.fingers import FINGER_NOISE, PLACING, ROUNDS, TRACE, Fingers
+from gsgan.body.fingers import (
+    FINGER_LANDMARK_NOISE,
+    FINGER_ROUNDS,
+    PLACING,
+    TRACE,
+    Fingers,
+)
 from gsgan.body.free import Body
 from gsgan.body.lbs import axis_angle_to_matrix, left_jacobian, shortest_turn
 from gsgan.body.rig import SPINE, Limb, ancestors, build_rig, prior
@@ -33,9 +39,10 @@ from gsgan.skeleton.hands import HAND, PALM
 from gsgan.skeleton.tensors import constants
 from gsgan.utils.tensors import constant
 
+# Numbers of landmarks: of the pose, and with both hands.
 BODY = len(MEDIAPIPE33.names)
-ALL = len(MEDIAPIPE33_HANDS.names)
-SIZES = [len(template.names) for template in TEMPLATES.values()]
+WITH_HANDS = len(MEDIAPIPE33_HANDS.names)
+SKELETON_SIZES = [len(template.names) for template in TEMPLATES.values()]
 BEYOND = 0.05  # standard deviation of a number below its minimum
 # Metres, standard deviations of landmarks: detectors locate those of face and palm less well.
 LANDMARK_NOISE = 0.004
@@ -45,17 +52,17 @@ HIP_NOISE = 0.05  # of estimated hips: nothing else keeps the trunk from tilting
 KNUCKLES = slice(17, 23)  # of 33 landmarks: pinky, index and thumb of both hands
 ON_HANDS = ((17, 19, 21), (18, 20, 22))  # the 33 landmarks that hand landmarks replace
 ROBUST = 5.0  # standard deviations at which the loss of a landmark becomes linear
-STEPS = 10  # Levenberg-Marquardt steps at most
-CONVERGED = 1e-3  # relative change of the cost at which a frame stops
+MAX_STEPS = 10  # Levenberg-Marquardt steps at most
+MIN_IMPROVEMENT = 1e-3  # relative change of the cost at which a frame stops
 GRADIENT_STEPS = 8  # error of gradients: a few percent if a landmark hardly matters
-DAMPING = 1e-3  # at the first step
-EASIER = 0.2  # factor of the damping after a step that lowers the cost
-HARDER = 20.0  # and after one that does not
+FIRST_DAMPING = 1e-3  # at the first step
+DAMPING_DECREASE = 0.2  # factor of the damping after a step that lowers the cost
+DAMPING_INCREASE = 20.0  # and after one that does not
 FLOOR = 1e-3  # on the diagonal: the root has no prior
-CHUNK = 64  # frames at a time: their matrices fit into a processor's cache
+CHUNK_FRAMES = 64  # frames at a time: their matrices fit into a processor's cache
 # Between these bends, radians, the weight of the twist rises from 0 to 1.
-STRAIGHT = 0.1
-SHARP = 0.4
+STRAIGHT_BEND = 0.1
+SHARP_BEND = 0.4
 
 
 class Linear(NamedTuple):
@@ -65,7 +72,7 @@ class Linear(NamedTuple):
     by_number: Tensor  # [B, D, N, 3]
 
 
-class Normal(NamedTuple):
+class NormalEquations(NamedTuple):
     """The cost of some numbers and its normal equations."""
 
     cost: Tensor  # [B]
@@ -182,9 +189,9 @@ class Solver(nn.Module):
         Raises:
             ValueError: on a wrong shape; with too few shoulders and hips (`sanitise`).
         """
-        if skeleton.shape[1] not in SIZES:
+        if skeleton.shape[1] not in SKELETON_SIZES:
             raise ValueError(
-                f"Solver: the skeleton must have {', '.join(map(str, SIZES))} joints, got "
+                f"Solver: the skeleton must have {', '.join(map(str, SKELETON_SIZES))} joints, got "
                 f"{skeleton.shape[1]}"
             )
         if not self._live(skeleton) and compiled.available(skeleton):
@@ -202,9 +209,9 @@ class Solver(nn.Module):
 
         # Hands: their fingers, and the landmarks of the palm if they place the hand.
         found = None
-        hands = skeleton[:, BODY:ALL]
+        hands = skeleton[:, BODY:WITH_HANDS]
         if self.fingers is not None and hands.shape[1]:
-            seen = (visibility[:, BODY:ALL] > 0) & hands.isfinite().all(-1)
+            seen = (visibility[:, BODY:WITH_HANDS] > 0) & hands.isfinite().all(-1)
             near = torch.where(seen.unsqueeze(-1), hands - shift, 0.0)
             found = self.fingers(near, seen)
             replaced = (found.placed.unsqueeze(-1) & self.replaced).any(1)
@@ -218,8 +225,8 @@ class Solver(nn.Module):
         # Frame by frame, in chunks.
         thetas = []
         transls = []
-        weights = weight.detach().split(CHUNK)
-        for near, near_weight in zip(p.split(CHUNK), weights, strict=True):
+        weights = weight.detach().split(CHUNK_FRAMES)
+        for near, near_weight in zip(p.split(CHUNK_FRAMES), weights, strict=True):
             theta, transl = self._solve(near, near_weight)
             thetas.append(theta)
             transls.append(transl)
@@ -241,8 +248,8 @@ class Solver(nn.Module):
         body, valid = sanitise(p[:, :BODY], shown[:, :BODY])
         hands = None
         if self.fingers is not None and p.shape[1] > BODY:
-            landmarks = p[:, BODY:ALL]
-            seen = (shown[:, BODY:ALL] > 0) & landmarks.isfinite().all(-1)
+            landmarks = p[:, BODY:WITH_HANDS]
+            seen = (shown[:, BODY:WITH_HANDS] > 0) & landmarks.isfinite().all(-1)
             hands = (landmarks, seen)
         theta, transl = compiled.solve(
             *self.job(),
@@ -266,8 +273,8 @@ class Solver(nn.Module):
             "landmarks": len(self.landmarks),
             "bends": 1 + len(SPINE),
             "limbs": len(rig.limbs),
-            "steps": STEPS,
-            "rounds": len(ROUNDS),
+            "steps": MAX_STEPS,
+            "rounds": len(FINGER_ROUNDS),
             "placing": PLACING,
         }
 
@@ -302,7 +309,7 @@ class Solver(nn.Module):
             # The finger solver's own constants, if the body has fingers.
             if self.fingers is not None:
                 buffers = dict(self.fingers.named_buffers())
-                buffers["rounds"] = torch.tensor(ROUNDS)
+                buffers["rounds"] = torch.tensor(FINGER_ROUNDS)
                 for name in compiled.FINGERS:
                     own[f"finger_{name}"] = buffers[name]
             return compiled.held(own)
@@ -326,7 +333,7 @@ class Solver(nn.Module):
         """``[B, joints]`` bool: joints at rest in `solve`, for want of visible landmarks."""
         # The landmarks that count: those of a palm replace some of the 33.
         seen = visibility[:, :BODY] > 0
-        hands = visibility[:, BODY:ALL] > 0
+        hands = visibility[:, BODY:WITH_HANDS] > 0
         fingers = self.fingers if hands.shape[1] else None
         if fingers is not None:
             placed = fingers.placed(hands)
@@ -409,7 +416,9 @@ class Solver(nn.Module):
         normal = torch.linalg.cross(along.expand_as(lower), lower)
         bend = torch.atan2(normal.norm(dim=-1), lower @ along)
         twist = torch.atan2(normal @ torch.linalg.cross(along, flat), normal @ flat)
-        twist = twist * ((bend - STRAIGHT) / (SHARP - STRAIGHT)).clamp(0, 1)
+        twist = twist * ((bend - STRAIGHT_BEND) / (SHARP_BEND - STRAIGHT_BEND)).clamp(
+            0, 1
+        )
         by_axis = swing @ axes[:2].mT
         return torch.cat(
             [by_axis, twist.unsqueeze(1), (bend - limb.bend).unsqueeze(1)], dim=1
@@ -471,7 +480,7 @@ class Solver(nn.Module):
         J[:, 3:6] = torch.eye(3).to(x).unsqueeze(1)
         return Linear(x - p, J)
 
-    def normal(self, q: Tensor, at: Linear, weight: Tensor) -> Normal:
+    def normal(self, q: Tensor, at: Linear, weight: Tensor) -> NormalEquations:
         """The normal equations at numbers ``q [B, D]``.
 
         The cost of a landmark with the residual r and the precision w is the pseudo-Huber loss
@@ -488,7 +497,7 @@ class Solver(nn.Module):
         stop, below = below_least(q, self.least)
         pull = q @ self.prior
         penalty = pull * q + stop * below.square().nan_to_num()
-        return Normal(
+        return NormalEquations(
             cost=2 * ROBUST**2 * (root - 1).sum(-1) + penalty.sum(-1),
             gradient=gradient + pull + stop * below,
             matrix=weighted @ J.mT + self.prior + torch.diag_embed(stop + FLOOR),
@@ -496,11 +505,11 @@ class Solver(nn.Module):
         )
 
     def descend(
-        self, q: Tensor, root: Tensor, p: Tensor, weight: Tensor, steps: int = STEPS
+        self, q: Tensor, root: Tensor, p: Tensor, weight: Tensor, steps: int = MAX_STEPS
     ) -> tuple[Tensor, Tensor]:
         """Numbers and root rotation after at most ``steps``; one that raises the cost is undone."""
         best = self._state(q, root, p, weight)
-        damping = q.new_full((len(q), 1), DAMPING)
+        damping = q.new_full((len(q), 1), FIRST_DAMPING)
         done = torch.zeros(len(q), dtype=torch.bool, device=q.device)
         for _ in range(steps):
             diagonal = torch.diagonal(best.matrix, dim1=-2, dim2=-1)
@@ -514,8 +523,10 @@ class Solver(nn.Module):
 
             # A frame stops by itself, so that its result does not depend on the others.
             better = (new.cost < best.cost) & ~done
-            done = done | ((new.cost - best.cost).abs() <= CONVERGED * best.cost)
-            damping = torch.where(better[:, None], damping * EASIER, damping * HARDER)
+            done = done | ((new.cost - best.cost).abs() <= MIN_IMPROVEMENT * best.cost)
+            damping = torch.where(
+                better[:, None], damping * DAMPING_DECREASE, damping * DAMPING_INCREASE
+            )
             chosen = []
             for a, b in zip(new, best, strict=True):
                 by_frame = better.view(-1, *[1] * (a.ndim - 1))
@@ -556,18 +567,18 @@ def _with_palms(body: Body) -> Body:
 def _settings() -> dict[str, float]:
     """The numbers of `compiled.NUMBERS`."""
     return {
-        "converged": CONVERGED,
-        "damping": DAMPING,
-        "easier": EASIER,
-        "harder": HARDER,
+        "converged": MIN_IMPROVEMENT,
+        "damping": FIRST_DAMPING,
+        "easier": DAMPING_DECREASE,
+        "harder": DAMPING_INCREASE,
         "floor": FLOOR,
         "robust": ROBUST,
         "beyond": BEYOND,
         "held": HIP_NOISE,
         "noise": LANDMARK_NOISE,
-        "straight": STRAIGHT,
-        "sharp": SHARP,
-        "finger_noise": FINGER_NOISE,
+        "straight": STRAIGHT_BEND,
+        "sharp": SHARP_BEND,
+        "finger_noise": FINGER_LANDMARK_NOISE,
         "trace": TRACE,
     }
 

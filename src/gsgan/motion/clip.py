@@ -49,32 +49,24 @@ PARENT = {b: a for a, b in MEDIAPIPE33.limbs if b not in TRUNK_LANDMARKS}
 
 @dataclass(frozen=True)
 class Clip:
-    """A person in motion.
+    """A person in motion."""
 
-    Args:
-        path: the file.
-        p: ``[F, J, 3]`` metres; NaN = unknown landmark. Not all formats tell where hands and face
-            are on the body.
-        visibility: ``[F, J]`` in [0, 1].
-        fps: frames per second, or None if unknown.
-        up: the axis that points up, or None to infer it from the skeleton.
-        unit: of the file's lengths, in words.
-        file_up: the up axis of the file, if ``up`` is that of converted landmarks.
-        body: ``[F]`` poses of the subject's body that the landmarks come from, or None.
-        filled: number of frames without shoulders and hips, see `checked`.
-        detached: whether hands and face are not where they are on the body, so that the motion
-            must be retargeted.
-    """
-
-    path: Path
+    path: Path  # the file
+    # [F, J, 3] metres; NaN = unknown landmark. Not all formats tell where hands and face are on the
+    # body
     p: Float
-    visibility: Float
-    fps: float | None
-    up: str | None
-    unit: str
-    file_up: str | None = None
+    visibility: Float  # [F, J] in [0, 1]
+    fps: float | None  # frames per second, or None if unknown
+    up: str | None  # the axis that points up, or None to infer it from the skeleton
+    unit: str  # of the file's lengths, in words
+    file_up: str | None = (
+        None  # the up axis of the file, if up is that of converted landmarks
+    )
+    # [F] poses of the subject's body that the landmarks come from, or None
     body: BodyPose | None = None
-    filled: int = 0
+    filled: int = 0  # number of frames without shoulders and hips, see `checked`
+    # whether hands and face are not where they are on the body, so that the motion must be
+    # retargeted
     detached: bool = False
 
     def __len__(self) -> int:

@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 class Orbit:
     """A circle around the person; angles in degrees, metres; see conf/render.yaml."""
 
-    turns: float = 1.0
-    elevation: float = 10.0
-    start: float = 0.0
-    distance: float | None = None
-    fov: float = 30.0
+    turns: float = 1.0  # over the whole motion
+    elevation: float = 10.0  # above the horizontal
+    start: float = 0.0  # azimuth of the first frame from the front
+    distance: float | None = None  # None: as large as in training images
+    fov: float = 30.0  # vertical field of view
 
     def __post_init__(self) -> None:
         between("orbit.elevation", self.elevation, -89, 89)

@@ -16,6 +16,7 @@ from gsgan.utils.files import read_text
 
 Float = NDArray[np.float64]
 Ints = NDArray[np.int64]
+# Metres in a unit that a file may name.
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 LEFT_RIGHT_SHOULDER = [11, 12]
 LEFT_RIGHT_HIP = [23, 24]

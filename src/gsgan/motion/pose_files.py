@@ -30,15 +30,16 @@ Float = NDArray[np.float64]
 
 GUESSED = 0.5  # visibility below which MediaPipe's hips are guesses
 # Names of the parts in files of pose-format.
-IMAGE = "POSE_LANDMARKS"
-WORLD = "POSE_WORLD_LANDMARKS"
+IMAGE_PART = "POSE_LANDMARKS"
+WORLD_PART = "POSE_WORLD_LANDMARKS"
 HAND_PARTS = ("LEFT_HAND_LANDMARKS", "RIGHT_HAND_LANDMARKS")
-MESH = "FACE_LANDMARKS"
-MESH_SIZE = 478
+MESH_PART = "FACE_LANDMARKS"
+MESH_SIZE = 478  # landmarks of MediaPipe's face mesh
 # The bones of a hand without the thumb: hands differ most in where its base is.
 HAND_LENGTHS: list[tuple[int, int]] = []
 for _finger in FINGERS[1:]:
     HAND_LENGTHS += pairwise((WRIST, *_finger))
+# The default person's face at rest, metres; NaN for landmarks that no one uses.
 AVERAGE_FACE = np.full((MESH_SIZE, 3), np.nan)
 AVERAGE_FACE[list(FACE_MESH.values())] = rest_face()
 # Pairs of landmarks that are much further apart than an expression moves them.
@@ -66,11 +67,11 @@ def read_pose(path: Path, subject: Proportions) -> Clip:
         DataError: when the package is missing, the file is damaged or has no depth.
     """
     file = _PoseFile(path)
-    name = IMAGE if IMAGE in file.parts else WORLD
+    name = IMAGE_PART if IMAGE_PART in file.parts else WORLD_PART
     if name not in file.parts or "Z" not in file.parts[name].layout:
         raise DataError(
             f"{path} has {', '.join(file.parts)} without depth; expected MediaPipe's "
-            f"{WORLD} or {IMAGE} in 3D"
+            f"{WORLD_PART} or {IMAGE_PART} in 3D"
         )
 
     # The body. Hips that are guesses are placed below the shoulders.
@@ -79,7 +80,7 @@ def read_pose(path: Path, subject: Proportions) -> Clip:
     guessed_hips = person.any() and np.median(visibility[person][:, HIPS]) < GUESSED
     if guessed_hips:
         visibility[:, HIPS] = 0
-    p = _to_metres(path, p, visibility, subject, pixels=name == IMAGE)
+    p = _to_metres(path, p, visibility, subject, pixels=name == IMAGE_PART)
     if guessed_hips:
         p[:, HIPS] = p[:, SHOULDERS] + (0, length(subject.rest, (11, 23)), 0)
         visibility[:, HIPS] = visibility[:, SHOULDERS]
@@ -87,7 +88,7 @@ def read_pose(path: Path, subject: Proportions) -> Clip:
     # Hands and face, if there are any.
     hands = [file.landmarks(hand, HAND_NAMES) for hand in HAND_PARTS]
     mesh_names = tuple(map(str, range(MESH_SIZE)))
-    face = file.landmarks(MESH, mesh_names)
+    face = file.landmarks(MESH_PART, mesh_names)
     points = [p]
     confidences = [visibility]
     if any(part.confidence.any() for part in (*hands, face)):

@@ -35,7 +35,8 @@ from gsgan.utils.pickles import read_npy, read_pickle
 
 Float = NDArray[np.float64]
 
-JOINTS = len(MEDIAPIPE33.names)
+POSE_JOINTS = len(MEDIAPIPE33.names)
+# Keys of MediaPipe's world landmarks in its several APIs.
 WORLD_KEYS = (
     "pose_world_landmarks",
     "poseWorldLandmarks",
@@ -49,17 +50,19 @@ POSE_KEYS = ("poses", "pose", "smpl_poses", "body_pose", "pose_body")
 PART_KEYS = ("pose_jaw", "pose_eye", "pose_hand")  # parts of SMPL-X, after the body
 ROOT_KEYS = ("Rh", "root_orient", "global_orient")
 MOVE_KEYS = ("trans", "transl", "smpl_trans", "Th")
+# Of the shape coefficients.
 SHAPE_KEYS = ("betas", "shapes")
 # Numbers of poses of SMPL-X's body, SMPL, SMPL-H, SMPL-X.
 WITHOUT_ROOT = (63, 69, 153, 162)
 RATE_KEYS = ("fps", "mocap_framerate", "mocap_frame_rate")
-SCALE = "smpl_scaling"  # in AIST++: units of its translations in a metre
+SCALE_KEY = "smpl_scaling"  # in AIST++: units of its translations in a metre
+# All arrays that are read, if a file has them.
 ARRAYS = (
     "p",
     "conf",
     "theta",
     "visibility",
-    SCALE,
+    SCALE_KEY,
     *WORLD_KEYS,
     *POSE_KEYS,
     *PART_KEYS,
@@ -69,6 +72,7 @@ ARRAYS = (
     *RATE_KEYS,
 )
 SMPL_BODY = 22  # joints that SMPL, SMPL-H and SMPL-X share
+# Metres in the units that rigs are made in.
 LEG_UNITS = {
     "metres": 1.0,
     "decimetres": 0.1,
@@ -81,18 +85,13 @@ LEG_UNITS = {
 
 @dataclass(frozen=True)
 class Source:
-    """What readers may need besides the file.
+    """What readers may need besides the file."""
 
-    Args:
-        subject: the subject's proportions, for formats without face, hands and scale.
-        smpl: an SMPL or SMPL-X model file, or None.
-        skeleton: the ASF file of an AMC motion, or None for the one in the same folder.
-        up: the axis of a rig's file that points up, or None to find it from the frames.
-    """
-
-    subject: Proportions
-    smpl: Path | None = None
+    subject: Proportions  # the subject's proportions, for formats without face, hands and scale
+    smpl: Path | None = None  # an SMPL or SMPL-X model file, or None
+    # the ASF file of an AMC motion, or None for the one in the same folder
     skeleton: Path | None = None
+    # the axis of a rig's file that points up, or None to find it from the frames
     up: str | None = None
 
 
@@ -201,10 +200,10 @@ def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Clip:
     """Landmarks as `gsgan.prepare` writes them."""
     hands = EXPRESSION.start
     face = EXPRESSION.stop
-    if arrays["p"].shape[1:] not in ((JOINTS, 3), (hands, 3), (face, 3)):
+    if arrays["p"].shape[1:] not in ((POSE_JOINTS, 3), (hands, 3), (face, 3)):
         raise DataError(
-            f"{path}: 'p' must have shape [F, {JOINTS}, 3], with hands [F, {hands}, 3], or with "
-            f"hands and face [F, {face}, 3]; got {list(arrays['p'].shape)}"
+            f"{path}: 'p' must have shape [F, {POSE_JOINTS}, 3], with hands [F, {hands}, 3], or "
+            f"with hands and face [F, {face}, 3]; got {list(arrays['p'].shape)}"
         )
     p = arrays["p"].astype(np.float64)
     conf = np.ones(p.shape[:2])
@@ -213,13 +212,13 @@ def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Clip:
     conf = np.where(np.isfinite(p).all(-1), np.nan_to_num(conf), 0.0)
 
     # People filmed from the waist up get hips below their shoulders.
-    seen = conf[:, :JOINTS] > 0
+    seen = conf[:, :POSE_JOINTS] > 0
     no_hips = seen[:, SHOULDERS].all(1) & ~seen[:, HIPS].any(1)
-    body = np.nan_to_num(p[:, :JOINTS])
+    body = np.nan_to_num(p[:, :POSE_JOINTS])
     placed = hips_below(body, seen)
     if no_hips.any() and (placed != body).any():
-        p[no_hips, :JOINTS] = np.where(
-            seen[no_hips, :, None], p[no_hips, :JOINTS], np.nan
+        p[no_hips, :POSE_JOINTS] = np.where(
+            seen[no_hips, :, None], p[no_hips, :POSE_JOINTS], np.nan
         )
         for hip, shoulder in zip(HIPS, SHOULDERS, strict=True):
             p[no_hips, hip] = placed[no_hips, hip]
@@ -300,7 +299,7 @@ def _smpl(
     poses = _smpl_poses(path, arrays)
     F = len(poses)
     moves = np.asarray(_first(arrays, MOVE_KEYS, np.zeros((F, 3))), np.float64)
-    moves = moves.reshape(F, 3) / arrays.get(SCALE, 1.0)
+    moves = moves.reshape(F, 3) / arrays.get(SCALE_KEY, 1.0)
     betas = np.asarray(_first(arrays, SHAPE_KEYS, np.zeros(10)), np.float64)
     betas = np.median(betas.reshape(-1, betas.shape[-1]), axis=0)
     betas = betas[: model.shapedirs.shape[-1]]
@@ -428,7 +427,7 @@ def _landmark_row(where: str, frame: Any) -> Float:
     if isinstance(points, list) and len(points) == 1:
         points = points[0]  # the Tasks API returns a list of people
     if not points:
-        return np.repeat([[np.nan, np.nan, np.nan, 0]], JOINTS, axis=0)
+        return np.repeat([[np.nan, np.nan, np.nan, 0]], POSE_JOINTS, axis=0)
 
     # 33 landmarks of 4 numbers.
     try:
@@ -436,9 +435,9 @@ def _landmark_row(where: str, frame: Any) -> Float:
     except TypeError:
         rows = []
     row = as_floats(rows)
-    if row.shape != (JOINTS, 4) or np.isnan(row).any():
+    if row.shape != (POSE_JOINTS, 4) or np.isnan(row).any():
         raise DataError(
-            f"{where}: expected {JOINTS} landmarks with x, y, z; found {len(rows)}"
+            f"{where}: expected {POSE_JOINTS} landmarks with x, y, z; found {len(rows)}"
         )
     return row
 
@@ -460,9 +459,9 @@ def _with_visibility(path: Path, points: NDArray[Any], visibility: Any) -> Float
         points: ``[F, 33, 3 or 4 or 5]``; the fourth number is the visibility.
         visibility: ``[F, 33]``, or None.
     """
-    if points.ndim != 3 or points.shape[1] != JOINTS or points.shape[2] < 3:
+    if points.ndim != 3 or points.shape[1] != POSE_JOINTS or points.shape[2] < 3:
         raise DataError(
-            f"{path}: the world landmarks must have shape (any, {JOINTS}, 3 or 4), found "
+            f"{path}: the world landmarks must have shape (any, {POSE_JOINTS}, 3 or 4), found "
             f"{points.shape}"
         )
     if visibility is None and points.shape[2] > 3:
@@ -540,6 +539,7 @@ def _read_pose(path: Path, source: Source) -> Clip:
     return read_pose(path, source.subject)
 
 
+# By the suffix of the file.
 READERS: dict[str, Callable[[Path, Source], Clip]] = {
     ".npz": read_npz,
     ".pkl": read_dictionary,

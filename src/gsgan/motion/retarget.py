@@ -41,10 +41,9 @@ from gsgan.skeleton.template import CHEST, HEAD, PELVIS
 Float = NDArray[np.float64]
 
 PALM_LANDMARKS = (WRIST, PINKY, INDEX)  # landmarks of a hand that give its axes
-FACE_STILL = (
-    0.001  # metres: landmarks that move less count fully in the face's alignment
-)
-ROUNDS = 10  # iterations of the alignment
+# Metres: landmarks that move less count fully in the face's alignment.
+FACE_STILL = 0.001
+ALIGN_ROUNDS = 10  # iterations of the alignment
 # Radians: detectors place faces too far forward.
 MAX_NECK_BEND = 0.45
 RIG_JOINTS = ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot")
@@ -170,7 +169,7 @@ def steadied(p: Float) -> Float:
     seen = found.isfinite().all(-1, keepdim=True).double()
     usual = found[seen.sum((1, 2)).argmax()]
     weight = seen * usual.isfinite()[:, :1]
-    for _ in range(ROUNDS):
+    for _ in range(ALIGN_ROUNDS):
         found = _aligned(found, usual.nan_to_num(), weight)
         usual, _ = found.nanmedian(0)
 

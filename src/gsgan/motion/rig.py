@@ -17,7 +17,9 @@ from gsgan.motion.rotations import Array, between, rotation, twist, unit
 
 SIDES = ("Left", "Right")
 FINGERS = ("Thumb", "Index", "Middle", "Ring", "Pinky")
+# The side's direction along +X.
 SIGN = {"Left": 1.0, "Right": -1.0}
+# Chains of bones, from the hips outwards.
 SPINE = ("Spine", "Spine1", "Spine2")
 PALM_FINGERS = ("Index", "Middle", "Pinky")  # fingers whose bases give the hand's axes
 ARM = ("Arm", "ForeArm", "Hand")
@@ -28,7 +30,7 @@ FOREARM_TWIST = 0.55
 # Feet may be tilted with legs that stand apart by more than the angle with this sine.
 SPLAYED = 0.17
 # Maximum reach of a limb in full lengths: below 1, so that it always bends.
-MAX_REACH = 0.998
+MAX_LIMB_REACH = 0.998
 # Metres above the floor up to which a vertex of the resting foot is its sole.
 SOLE_HEIGHT = 0.02
 
@@ -109,8 +111,8 @@ def phalanges(
 class FingerHinge(NamedTuple):
     """A finger bone and the axis about which it bends."""
 
-    bone: str
-    finger: str
+    bone: str  # Mixamo's name
+    finger: str  # one of `FINGERS`
     number: int  # from the finger's base
     axis: Array  # [3] of flexion at rest
     straight: float  # flexion of the rest pose, radians
@@ -291,7 +293,7 @@ class Pose:
 
     def lower_hips(self, ankles: list[Array]) -> None:
         """Lowers the hips to where both legs reach their ankles ``[F, 3]``."""
-        longest = 0.995 * MAX_REACH * self.rig.leg
+        longest = 0.995 * MAX_LIMB_REACH * self.rig.leg
         drop = np.zeros(len(self.hips))
         for side, ankle in zip(SIDES, ankles, strict=True):
             # By Pythagoras, the height of the hip joint at which the leg is fully stretched.
@@ -357,7 +359,7 @@ def two_bone(
     """
     # The distance d of the target, within reach.
     nearest = abs(upper - lower) + 0.05 * min(upper, lower)
-    farthest = MAX_REACH * (upper + lower)
+    farthest = MAX_LIMB_REACH * (upper + lower)
     d = np.linalg.norm(target, axis=-1, keepdims=True).clip(nearest, farthest)
 
     # The way to the target, and the direction beside it in which the middle joint bends.

@@ -27,11 +27,13 @@ from gsgan.motion.rotations import Array, between, blend, rotation, unit
 from gsgan.utils.errors import DataError
 
 # Maximum tilt of trunk and legs in a zero pose that is a standing person.
-STANDING = np.radians(40)
+MAX_STANDING_TILT = np.radians(40)
 # Maximum tilt in a frame whose pose is upright enough to serve as a zero pose.
-NEUTRAL = np.radians(10)
-UPRIGHT = np.radians(30)  # maximum tilt of the trunk in frames that may serve otherwise
-MIN_STANDING = 0.1  # share of frames in which a person stands, in motions on the floor
+MAX_NEUTRAL_TILT = np.radians(10)
+# Maximum tilt of the trunk in frames that may serve otherwise.
+MAX_UPRIGHT_TILT = np.radians(30)
+# Share of frames in which a person stands, in motions on the floor.
+MIN_STANDING_SHARE = 0.1
 SAME_TILT = np.radians(1)  # frames within this tilt of the best one are used too
 MAX_REFERENCES = 100  # number of frames for calibration
 # Share of knees and toes behind the body above which left and right are exchanged.
@@ -57,6 +59,7 @@ ALIASES = {
     "Hand": "wrist hand",
     "Head": "head",
 }
+# Regular expressions of the fingers' names.
 FINGER_ALIASES = {
     "Thumb": "thumb",
     "Index": "index",
@@ -64,7 +67,9 @@ FINGER_ALIASES = {
     "Ring": "ring",
     "Pinky": "pinky|little",
 }
-PARTS = {"metacarpal": 1, "proximal": 1, "intermediate": 2, "distal": 3}
+# Mixamo's numbers of the parts of fingers.
+PHALANX_NUMBERS = {"metacarpal": 1, "proximal": 1, "intermediate": 2, "distal": 3}
+# Words that mean a side.
 SIDE_WORDS = {"l": "Left", "r": "Right", "left": "Left", "right": "Right"}
 
 
@@ -123,37 +128,32 @@ def _stem(stem: str, sided: bool) -> tuple[str, int]:
     # Fingers have a number, or the name of a part.
     if not sided:
         return "", 0
-    parts = "|".join(PARTS)
+    parts = "|".join(PHALANX_NUMBERS)
     for finger, alias in FINGER_ALIASES.items():
         pattern = rf"(?:hand|f)?(?:{alias})(?:finger)?0?(\d?)({parts})?"
         match = re.fullmatch(pattern, stem)
         if match:
-            number = match[1] or PARTS.get(match[2], 1)
+            number = match[1] or PHALANX_NUMBERS.get(match[2], 1)
             return f"Hand{finger}{number}", 0
     return "", 0
 
 
 @dataclass(frozen=True)
 class RigMotion:
-    """The motion of a rig in a file: joints and their world rotations since the zero pose.
+    """The motion of a rig in a file: joints and their world rotations since the zero pose."""
 
-    Args:
-        names: of the J joints, parents first; end sites are called "<joint> end".
-        parents: ``[J]``, -1 for roots.
-        offsets: ``[J, 3]`` from the parent in the zero pose, units and axes of the file.
-        rotations: ``[F, J, 3, 3]`` world, axes of the file.
-        root: ``[F, 3]`` position of the first joint.
-        frame_time: seconds.
-        local: ``[F, J, 3]`` positions in the parent's axes, in place of the offsets, or None if
-            only the root has position channels.
-    """
-
-    names: tuple[str, ...]
-    parents: tuple[int, ...]
-    offsets: Array
-    rotations: Array
-    root: Array
-    frame_time: float
+    names: tuple[
+        str, ...
+    ]  # of the J joints, parents first; end sites are called "<joint> end"
+    parents: tuple[int, ...]  # [J], -1 for roots
+    offsets: (
+        Array  # [J, 3] from the parent in the zero pose, units and axes of the file
+    )
+    rotations: Array  # [F, J, 3, 3] world, axes of the file
+    root: Array  # [F, 3] position of the first joint
+    frame_time: float  # seconds
+    # [F, J, 3] positions in the parent's axes, in place of the offsets, or None if only the root
+    # has position channels
     local: Array | None = None
 
     def zero_pose(self) -> Array:
@@ -191,21 +191,14 @@ class StandardMotion:
 
 @dataclass(frozen=True)
 class Reference:
-    """Poses in which bones have known turns: they calibrate the joints' own axes.
+    """Poses in which bones have known turns: they calibrate the joints' own axes."""
 
-    Args:
-        rotations: ``[N, J, 3, 3]`` world rotations of the joints, axes of the file.
-        axes: ``[N, 3, 3]`` rows left, back, up of the person, axes of the file.
-        joints: ``[N, J, 3]`` positions, axes of the file.
-        zero: whether it is the zero pose.
-        neutral: whether the person stands upright and looks ahead; else the trunk has to be
-            calibrated by the joints' positions.
-    """
-
-    rotations: Array
-    axes: Array
-    joints: Array
-    zero: bool
+    rotations: Array  # [N, J, 3, 3] world rotations of the joints, axes of the file
+    axes: Array  # [N, 3, 3] rows left, back, up of the person, axes of the file
+    joints: Array  # [N, J, 3] positions, axes of the file
+    zero: bool  # whether it is the zero pose
+    # whether the person stands upright and looks ahead; else the trunk has to be calibrated by the
+    # joints' positions
     neutral: bool
 
 
@@ -232,7 +225,7 @@ def standard_motion(
     # The axis that points up, and left and right.
     zero = rig.zero_pose()[None]
     highest = _upward(zero, known)
-    stands = tilts(zero, known, highest).max() < STANDING
+    stands = tilts(zero, known, highest).max() < MAX_STANDING_TILT
     zero_axis = highest if stands else None
     if up is None:
         axis = _upward(posed, known, usual=zero_axis)
@@ -350,8 +343,8 @@ def _upward(p: Array, known: dict[str, int], usual: Array | None = None) -> Arra
     cosine = np.minimum(trunk @ axes.T, legs @ axes.T)
 
     # The usual axis, if the person stands along it in enough poses.
-    standing = (cosine > np.cos(UPRIGHT)).mean(axis=0)
-    if usual is not None and standing[(axes @ usual).argmax()] > MIN_STANDING:
+    standing = (cosine > np.cos(MAX_UPRIGHT_TILT)).mean(axis=0)
+    if usual is not None and standing[(axes @ usual).argmax()] > MIN_STANDING_SHARE:
         return usual
 
     # The mean direction decides between axes with the same share.
@@ -446,12 +439,12 @@ def _reference(
     tilt = tilts(posed, known, up)
     worst = tilt.max(axis=-1)
     best = float(worst.min())
-    neutral = best < NEUTRAL
+    neutral = best < MAX_NEUTRAL_TILT
     if neutral:
         chosen = np.flatnonzero(worst < best + SAME_TILT)
     else:
         trunk = tilt[:, 0]
-        limit = max(UPRIGHT, float(trunk.min()) + SAME_TILT)
+        limit = max(MAX_UPRIGHT_TILT, float(trunk.min()) + SAME_TILT)
         chosen = np.flatnonzero(trunk < limit)
 
     # A few of them, evenly spread.

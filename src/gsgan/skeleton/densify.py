@@ -23,7 +23,12 @@ Array = NDArray[np.float64]
 
 GOLDEN = (5**0.5 - 1) / 2
 PLASTIC = 1.32471795724474602596  # root of x³ = x + 1, the two-dimensional golden ratio
-COUNTS = ("points_per_limb", "face_points", "torso_points", "points_per_finger_bone")
+COUNT_NAMES = (
+    "points_per_limb",
+    "face_points",
+    "torso_points",
+    "points_per_finger_bone",
+)
 # Minimum and maximum of the box's edges (``fit``), in multiples of the rest pose's.
 TORSO_RANGE = (0.25, 4.0)
 
@@ -141,8 +146,10 @@ class Densify(nn.Module):
         super().__init__()
         one_of("Densify: sampler", sampler, get_args(Sampler))
         counts = (points_per_limb, face_points, torso_points, points_per_finger_bone)
-        for name, count in zip(COUNTS, counts, strict=True):
+        for name, count in zip(COUNT_NAMES, counts, strict=True):
             whole(f"Densify: {name}", count, 1)
+
+        # The options that scale the shapes.
         self.template = named_template(template)
         self.counts = counts
         self.radius_ratio = above("Densify: radius_ratio", radius_ratio)
@@ -356,6 +363,7 @@ def even_cylinder(n: int) -> Samples:
 
 def even_sphere(n: int) -> Samples:
     """``n`` points of the Fibonacci lattice on the unit sphere."""
+    # Heights of equal areas, a golden angle apart.
     k = np.arange(n)
     z = 1 - (2 * k + 1) / n
     turn = 2 * np.pi * np.modf(k * GOLDEN)[0]

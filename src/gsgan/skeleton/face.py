@@ -33,7 +33,7 @@ FACE_NAMES = (*LIPS, *BROWS[0], *BROWS[1], *LIDS[0], *LIDS[1])
 """In the order of face3d.npz."""
 FACE = len(FACE_NAMES)
 
-OFFSET = 0.005
+CODE_UNIT = 0.005
 """Metres per unit of `face_code`: in speech and signs these landmarks move by 2 to 10 mm, in body
 heights a hundredth of what joints move by."""
 
@@ -129,7 +129,7 @@ def in_head(
 
 
 def face_code(p: Tensor, head: Tensor, template: SkeletonTemplate) -> Tensor | None:
-    """``[B, E, 3]`` offsets of the face's landmarks from the face at rest, in units of `OFFSET`.
+    """``[B, E, 3]`` offsets of the face's landmarks from the face at rest, in units of `CODE_UNIT`.
 
     Offsets are in the head's axes; they are zero for a face at rest, however the head turns, and so
     for one that `sanitise` placed. Differentiable in p. None for a skeleton without a face.
@@ -143,4 +143,4 @@ def face_code(p: Tensor, head: Tensor, template: SkeletonTemplate) -> Tensor | N
         return None
     c = constants(template, p.device, p.dtype)
     found = in_head(p.index_select(1, c.expression), p, head, template)
-    return (found - c.face_rest) / OFFSET
+    return (found - c.face_rest) / CODE_UNIT

@@ -26,11 +26,13 @@ FINGERS = (
     (17, 18, 19, 20),
 )
 FINGER_BONES = tuple(bone for finger in FINGERS for bone in pairwise(finger))
+# Landmarks of the palm.
 WRIST = 0
 INDEX = 5
 PINKY = 17
 PALM = (WRIST, INDEX, PINKY)  # points that span it
 MIN_PALM = 1e-3  # metres: a smaller palm has no frame
+# The connections that MediaPipe draws.
 HAND_EDGES = (
     *((0, 1), (1, 2), (2, 3), (3, 4), (0, 5), (5, 6), (6, 7), (7, 8)),
     *((5, 9), (9, 10), (10, 11), (11, 12), (9, 13), (13, 14), (14, 15), (15, 16)),

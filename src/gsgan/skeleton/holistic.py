@@ -31,8 +31,8 @@ from gsgan.utils.checks import one_of
 
 POSE = MEDIAPIPE33
 STARTS = (len(POSE.names), len(POSE.names) + HAND)  # each hand's wrist
-ARMS = ((11, 13, 15), (12, 14, 16))  # shoulder, elbow and wrist of the pose
-HUBS = N_HUBS + len(STARTS)
+POSE_ARMS = ((11, 13, 15), (12, 14, 16))  # shoulder, elbow and wrist of the pose
+HUBS_WITH_PALMS = N_HUBS + len(STARTS)
 # Lengths of a straight finger's bones and of the thumb's last ones, metres.
 FINGER_LENGTHS = {
     "index": (0.040, 0.024, 0.020),
@@ -54,7 +54,7 @@ def _limbs(side: int) -> list[Edge]:
     """The forearm to the hand's own wrist, the palm's bones, and the fingers' from base to tip."""
     wrist = STARTS[side]
     chains = _chains(wrist)
-    limbs = [(ARMS[side][1], wrist)]
+    limbs = [(POSE_ARMS[side][1], wrist)]
     for chain in chains:
         limbs.append((wrist, chain[0]))
     for chain in chains:
@@ -106,12 +106,12 @@ def _with_hands() -> SkeletonTemplate:
     for side, start in enumerate(STARTS):
         first = len(limbs)
         bare.append(first)
-        forearm = POSE.limbs.index(ARMS[side][1:])
+        forearm = POSE.limbs.index(POSE_ARMS[side][1:])
         limbs += _limbs(side)
-        parents += [parents[forearm], *[HUBS + first] * len(FINGERS)]
+        parents += [parents[forearm], *[HUBS_WITH_PALMS + first] * len(FINGERS)]
         directions += [POSE.rest_directions[forearm]] * (1 + len(FINGERS))
         for k, chain in enumerate(_chains(start)):
-            place = HUBS + len(parents)
+            place = HUBS_WITH_PALMS + len(parents)
             parents += [N_HUBS + side, place, place + 1]
             directions += [STRAIGHT if k else SPREAD] * 3
             name = f"{('left', 'right')[side]}_{FINGER_NAMES[k]}"
@@ -123,7 +123,9 @@ def _with_hands() -> SkeletonTemplate:
 
     # Edges to draw and for the graph network, within hands and from wrist to hand.
     edges = tuple((start + a, start + b) for start in STARTS for a, b in HAND_EDGES)
-    wrists = tuple((arm[-1], start) for arm, start in zip(ARMS, STARTS, strict=True))
+    wrists = tuple(
+        (arm[-1], start) for arm, start in zip(POSE_ARMS, STARTS, strict=True)
+    )
 
     # The hands' own forearms have no cylinder; left and right hands exchange in the mirror.
     fingers = set(range(len(POSE.limbs), len(limbs))) - set(bare)

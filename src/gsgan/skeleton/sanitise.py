@@ -13,7 +13,7 @@ from gsgan.skeleton.template import CHEST, HEAD, MEDIAPIPE33, N_HUBS, SkeletonTe
 from gsgan.skeleton.tensors import Constants, check_skeleton, constants
 from gsgan.utils.tensors import constant
 
-SIZES = {len(t.names) for t in TEMPLATES.values()}
+TEMPLATE_SIZES = {len(t.names) for t in TEMPLATES.values()}
 MIN_TRUNK_JOINTS = 3
 """Number of shoulders and hips that must be seen: with fewer the trunk's frame is undefined."""
 
@@ -126,7 +126,7 @@ def complete_skeleton(
 
     # The joints of each template are the first ones of the next larger template.
     found = p.shape[1]
-    if found != J and {found, J} <= SIZES:
+    if found != J and {found, J} <= TEMPLATE_SIZES:
         missing = (0, max(J - found, 0))
         p = pad(p[:, :J], (0, 0, *missing), value=torch.nan)
         shown = pad(shown[:, :J], missing)

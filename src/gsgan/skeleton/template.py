@@ -42,6 +42,7 @@ class SkeletonTemplate:
     rest_directions: tuple[Vector, ...]
     rest_positions: tuple[Vector, ...]  # J points of an A-pose on the ground y = 0
     stature: float  # metres, sole to crown of the rest pose
+    # pairs of joints, left and right
     shoulders: Edge
     hips: Edge
     ears: Edge
@@ -150,7 +151,8 @@ def _across(axis: Vector, direction: Vector) -> Vector:
     return _unit(*(a - along * d for a, d in zip(axis, direction, strict=True)))
 
 
-_NAMES = (
+# MediaPipe's 33 joints, and the edges and limbs between them.
+_POSE_NAMES = (
     "nose",
     "left_eye_inner",
     "left_eye",
@@ -238,7 +240,7 @@ def _twin(name: str) -> str:
 def _rest_positions() -> tuple[Vector, ...]:
     """Points of the A-pose, in the order of the names."""
     positions = []
-    for name in _NAMES:
+    for name in _POSE_NAMES:
         if name in _LEFT_REST:
             positions.append(_LEFT_REST[name])
         else:
@@ -260,7 +262,7 @@ def _rest_directions() -> dict[Edge, Vector]:
     """
     arm: Vector = _unit(0.6, -0.6, 0.5)
     leg: Vector = _unit(0.0, -0.8, 0.6)
-    rest = dict(zip(_NAMES, _rest_positions(), strict=True))
+    rest = dict(zip(_POSE_NAMES, _rest_positions(), strict=True))
 
     def neutral(a: str, b: str) -> Vector:
         offset = [y - x for x, y in zip(rest[a], rest[b], strict=True)]
@@ -295,12 +297,12 @@ def _mediapipe33() -> SkeletonTemplate:
         return N_HUBS + ends.index(base)
 
     mirror = []
-    for name in _NAMES:
+    for name in _POSE_NAMES:
         twin = _twin(name)
-        mirror.append(_NAMES.index(twin) if twin in _NAMES else 0)
+        mirror.append(_POSE_NAMES.index(twin) if twin in _POSE_NAMES else 0)
 
     return SkeletonTemplate(
-        names=_NAMES,
+        names=_POSE_NAMES,
         edges=_EDGES,
         limbs=_POSE_LIMBS,
         limb_parents=tuple(parent(limb) for limb in _POSE_LIMBS),

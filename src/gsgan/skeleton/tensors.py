@@ -64,19 +64,19 @@ class Level(NamedTuple):
 class Constants(NamedTuple):
     """A template as tensors."""
 
-    rest: Tensor  # [J, 3]
-    starts: Tensor  # [L]
-    ends: Tensor  # [L]
-    levels: tuple[Level, ...]
+    rest: Tensor  # [J, 3] metres
+    starts: Tensor  # [L] joints where limbs start
+    ends: Tensor  # [L] joints where limbs end
+    levels: tuple[Level, ...]  # limbs by depth
     limb_order: Tensor  # [L] undoes the sorting by level
-    head_from_eyes: Tensor  # [3, 3]
+    head_from_eyes: Tensor  # [3, 3] the head's axes in those of eyes and nose
     head_points: Tensor  # [5] left ear, right ear, left eye, right eye, nose
-    torso: Tensor  # [4]
+    torso: Tensor  # [4] left and right shoulder, left and right hip
     palms: Tensor  # [3 H] wrist, index's and little finger's knuckle of each hand
     measured: Tensor  # limbs that measure the subject's size
     fingers: Tensor  # limbs that are bones of hands
     face_turned: Tensor  # [F] face joints but the nose
-    face_swing: Swing
+    face_swing: Swing  # of their lines from the middle of the ears
     expression: Tensor  # [E] landmarks of a face
     face_rest: Tensor  # [E, 3] metres, from the middle of the head's points
     omega_order: Tensor  # [J - E] into pelvis, chest, head, face, limbs

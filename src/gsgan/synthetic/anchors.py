@@ -13,7 +13,8 @@ from gsgan.skeleton.face import BROW_POINTS, FACE_NAMES, LIP_POINTS
 from gsgan.synthetic.parts import LABEL_NAMES, texture_lab
 from gsgan.synthetic.trace import Tracer
 
-JOINTS = {
+# The bone whose joint is a pose landmark, without sides.
+JOINT_BONES = {
     "shoulder": "Arm",
     "elbow": "ForeArm",
     "wrist": "Hand",
@@ -24,6 +25,7 @@ JOINTS = {
     "index": "HandIndex1",
     "pinky": "HandPinky1",
 }
+# Landmarks of a finger and of the thumb, from the base.
 SEGMENTS = ("mcp", "pip", "dip", "tip")
 THUMB = ("cmc", "mcp", "ip", "tip")
 
@@ -80,7 +82,7 @@ def _limb_anchors(c: Character, main: Ints, side: str) -> Anchors:
     # Without bones, the fingers of the pose landmarks are at the knuckles of the hand landmarks.
     for finger in ("thumb", "index", "pinky"):
         found[f"{low}_{finger}"] = found[f"{low}_{finger}_mcp"]
-    for name, bone in JOINTS.items():
+    for name, bone in JOINT_BONES.items():
         if side + bone in c.bones:
             found[f"{low}_{name}"] = c.bones.index(side + bone), -1
     return found
@@ -163,12 +165,16 @@ class _Face:
         self.c = c
         self.main = main
         self.head = c.bones.index("Head")
+
+        # Vertices of the face's skin; of the whole head if no face is labelled.
         on_head = np.isin(main, c.with_descendants(self.head))
         self.skin = np.zeros(len(c.vertices), bool)
         self.skin[c.faces[c.labels == LABEL_NAMES.index("face_neck")]] = True
         self.skin &= on_head
         if not self.skin.any():
             self.skin = on_head if on_head.any() else np.ones_like(on_head)
+
+        # The eyes, their distance (metres) and the middle between them.
         self.eyes = self._eye_centres()
         self.d = float(np.linalg.norm(self.eyes[0] - self.eyes[1]))
         self.mid = self.eyes.mean(0)

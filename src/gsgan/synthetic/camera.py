@@ -17,9 +17,9 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 CAMERA_DISTANCE = 2.8  # metres from the middle of the scene to the cameras
-IMAGE_MARGIN = (
-    0.02  # share of the image kept free at each edge, over all frames and cameras
-)
+# Share of the image kept free at each edge, over all frames and cameras.
+IMAGE_MARGIN = 0.02
+# The fractional part of the golden ratio.
 GOLDEN_RATIO = (5**0.5 - 1) / 2
 
 
@@ -27,10 +27,10 @@ GOLDEN_RATIO = (5**0.5 - 1) / 2
 class SceneCamera:
     """A camera: ``K [3, 3]``, ``R [3, 3]``, ``t [3]``, ``size`` (H, W), lens ``dist`` or None."""
 
-    K: Array
-    R: Array
-    t: Array
-    size: tuple[int, int]
+    K: Array  # [3, 3] pixels
+    R: Array  # [3, 3] world to camera
+    t: Array  # [3] metres
+    size: tuple[int, int]  # height and width, pixels
     dist: Array | None = None  # [4, 5 or 8] OpenCV's coefficients
 
     @property

@@ -41,6 +41,7 @@ def walk(c: Controls, s: Array, style: Style) -> None:
         z=heading,
     )
 
+    # The arms swing with the legs, and the head turns with the curve.
     c.swing[:] = style.amplitude
     rotate(c.head, turn=0.25 * sine)
     c.set_face(smile=0.3)
@@ -163,6 +164,7 @@ def overhead(c: Controls, s: Array, style: Style) -> None:
 
 def twist(c: Controls, s: Array, style: Style) -> None:
     """The trunk turns and leans from side to side, bent arms held out."""
+    # The head turns less than the trunk.
     turn = np.sin(TAU * 1.5 * s + 0.3 * style.phase)
     rotate(
         c.spine,
@@ -253,6 +255,7 @@ def _sign_arms(c: Controls, s: Array, style: Style) -> None:
             bent = np.sin(frequency * angle + 1.7 * finger)
             c.curl[:, i, finger] = 0.45 + 0.45 * bent
 
+    # Mouthing goes with signs.
     smile = _wander(s, 2, style.phase)
     c.set_face(
         mouth=0.3 + 0.45 * _wander(s, 9, style.phase),

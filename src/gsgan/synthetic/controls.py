@@ -113,11 +113,11 @@ def rotate(
 
 @dataclass(frozen=True)
 class Style:
-    """What the seed varies: amplitude, phase (radians) and leading hand (0 left, 1 right)."""
+    """Style of a passage, which the seed varies: amplitude, phase and leading hand."""
 
-    amplitude: float
-    phase: float
-    lead: int
+    amplitude: float  # from 0.85 to 1.15
+    phase: float  # radians
+    lead: int  # 0 left, 1 right
 
 
 Passage = Callable[[Controls, Array, Style], None]
@@ -128,7 +128,7 @@ class Programme:
     """Passages in their order; each starts and ends in the resting controls."""
 
     passages: tuple[tuple[str, Passage, float], ...]  # name, passage, seconds
-    resting: Callable[[int], Controls] = Controls
+    resting: Callable[[int], Controls] = Controls  # for a number of frames
     blend: float = 0.6  # seconds from rest into a passage, and back
 
     @property

@@ -34,14 +34,14 @@ SIDED_BONES = {
     "foot": "Foot",
     "toe1-1": "ToeBase",
 }
-# sRGB colours of skin, hair, eyes, shirt, trousers and shoes
+# sRGB colours of the surfaces.
 COLOURS = (
-    (214, 160, 128),
-    (70, 48, 34),
-    (235, 235, 230),
-    (52, 110, 168),
-    (64, 66, 88),
-    (150, 60, 48),
+    (214, 160, 128),  # skin
+    (70, 48, 34),  # hair
+    (235, 235, 230),  # eyes
+    (52, 110, 168),  # shirt
+    (64, 66, 88),  # trousers
+    (150, 60, 48),  # shoes
 )
 
 

@@ -16,7 +16,7 @@ from gsgan.motion.rotations import Array
 from gsgan.synthetic.anchors import with_anchors
 from gsgan.synthetic.glb import Glb
 from gsgan.synthetic.humanoid import (
-    REQUIRED,
+    REQUIRED_BONES,
     WANTED,
     canonical_shapes,
     humanoid_bones,
@@ -36,10 +36,10 @@ Z_UP = np.array(
     ]
 )
 HEIGHTS = (1.2, 2.3)  # metres: heights that are taken as they are
-UNITS = (1.0, 0.01, 0.001, 0.0254)  # metres per unit of a file, likeliest first
+UNIT_LENGTHS = (1.0, 0.01, 0.001, 0.0254)  # metres per unit of a file, likeliest first
 TRIANGLES = 4  # glTF's number of this primitive mode
 # Errors of reading a damaged file.
-DAMAGED = (
+FILE_ERRORS = (
     ArithmeticError,
     AttributeError,
     AssertionError,
@@ -77,7 +77,7 @@ def read_character(path: Path) -> Character:
     try:
         glb = Glb(path)
         return _character(glb, _Skeleton(glb))
-    except DAMAGED as error:
+    except FILE_ERRORS as error:
         reason = str(error).split("\n")[0] or type(error).__name__
         raise DataError(
             f"{path}: damaged ({reason}); export the character again"
@@ -89,7 +89,7 @@ class _Skeleton:
 
     def __init__(self, glb: Glb) -> None:
         self.nodes = glb.doc.nodes
-        self._worlds: dict[int, Array] = {}
+        self._worlds: dict[int, Array] = {}  # cache of `world`
         skins = glb.doc.skins
         if not skins:
             raise DataError(
@@ -112,7 +112,7 @@ class _Skeleton:
         self.number = {node: k for k, node in enumerate(self.ids)}
         self.bones = self._names(named)
 
-        missing = [bone for bone in REQUIRED if bone not in self.bones]
+        missing = [bone for bone in REQUIRED_BONES if bone not in self.bones]
         if missing:
             more = ", …" if len(missing) > 6 else ""
             raise DataError(
@@ -184,14 +184,14 @@ class _Part:
     """The triangles of one primitive, in world axes."""
 
     name: str  # of the node and its mesh
-    material: int
-    vertices: Array
-    normals: Array
-    uv: Array
-    faces: Ints
-    bone_index: Ints
-    bone_weight: Array
-    shapes: dict[str, Array]
+    material: int  # -1 for none
+    vertices: Array  # [V, 3]
+    normals: Array  # [V, 3], zero if the file has none
+    uv: Array  # [V, 2]
+    faces: Ints  # [F, 3]
+    bone_index: Ints  # [V, 4]
+    bone_weight: Array  # [V, 4], sums to 1
+    shapes: dict[str, Array]  # [V, 3] offsets by plain name
 
 
 class _Binding(NamedTuple):
@@ -413,7 +413,7 @@ def _standing(skeleton: _Skeleton, vertices: Array) -> _Standing:
         raise ValueError("its mesh is flat or has positions that are not numbers")
     low, high = HEIGHTS
     scale = 1.7 / height
-    for unit in UNITS:
+    for unit in UNIT_LENGTHS:
         if low <= unit * height <= high:
             scale = unit
             break

@@ -10,27 +10,30 @@ import numpy as np
 from gsgan.motion.rig import FINGERS, SIDES
 from gsgan.motion.rotations import Array
 
+# Mixamo's names of bones; those of limbs, side and fingers follow "Left" or "Right".
 LIMB_BONES = ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot")
 SIDE_BONES = ("Shoulder", "ToeBase", "ToeEnd", "Eye")
-FINGER_BONES = [f"Hand{finger}{k}" for finger in FINGERS for k in (1, 2, 3, 4)]
+FINGER_BONE_NAMES = [f"Hand{finger}{k}" for finger in FINGERS for k in (1, 2, 3, 4)]
 
 
 def _on_both_sides(names: Iterable[str]) -> list[str]:
     return [side + name for side in SIDES for name in names]
 
 
-REQUIRED = ("Hips", "Spine", "Head", *_on_both_sides(LIMB_BONES))
-BONES = (
-    *REQUIRED,
+REQUIRED_BONES = ("Hips", "Spine", "Head", *_on_both_sides(LIMB_BONES))
+HUMANOID_BONES = (
+    *REQUIRED_BONES,
     "Spine1",
     "Spine2",
     "Neck",
     "Jaw",
     *_on_both_sides(SIDE_BONES),
-    *_on_both_sides(FINGER_BONES),
+    *_on_both_sides(FINGER_BONE_NAMES),
 )
-CANONICAL = {bone.lower(): bone for bone in BONES}
+# Mixamo's names by their lower-case form.
+CANONICAL = {bone.lower(): bone for bone in HUMANOID_BONES}
 
+# Mixamo's names by VRM's; those of limbs without the side.
 VRM_LIMBS = {
     "shoulder": "Shoulder",
     "upperArm": "Arm",

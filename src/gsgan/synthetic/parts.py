@@ -12,6 +12,7 @@ from trimesh.graph import connected_component_labels
 from gsgan.motion.character import Character, Ints
 from gsgan.motion.rotations import Array
 
+# The names of the free body's parts, in the same order.
 LABEL_NAMES = (
     "background",
     "hair",
@@ -29,7 +30,7 @@ LABEL_NAMES = (
 )
 LABEL = {name: k for k, name in enumerate(LABEL_NAMES)}
 HAIR = LABEL["hair"]
-FACE = LABEL["face_neck"]
+FACE_NECK = LABEL["face_neck"]
 UPPER = LABEL["upper_clothes"]
 LOWER = LABEL["lower_clothes"]
 LEFT_SHOE = LABEL["left_shoe"]
@@ -61,7 +62,8 @@ GARMENT_DISTANCE = 8.0  # garments nearer in colour are told apart by bones
 SHIRT_BONES = ("Spine1", "Spine2", "LeftArm", "RightArm")
 TROUSER_BONES = ("LeftLeg", "RightLeg")
 WAIST_BONES = ("Hips", "Spine", "LeftUpLeg", "RightUpLeg")
-CHEST = 0.16  # metres below the shoulders: skin above is the neck's, below the trunk's
+# Metres below the shoulders: skin above is the neck's, below the trunk's.
+NECK_SKIN_DEPTH = 0.16
 
 
 def face_labels(character: Character, names: np.ndarray) -> Ints:
@@ -88,7 +90,11 @@ def face_labels(character: Character, names: np.ndarray) -> Ints:
     skin = skin_of[bone]
     root = root_of[bone]
     shoulders = c.joints[_numbers(c, ("LeftArm", "RightArm")), 2].min()
-    chest = (skin == FACE) & (root == "Spine") & (centre[:, 2] < shoulders - CHEST)
+    chest = (
+        (skin == FACE_NECK)
+        & (root == "Spine")
+        & (centre[:, 2] < shoulders - NECK_SKIN_DEPTH)
+    )
     skin = np.where(chest, UPPER, skin)
 
     # Skin has the colour of the cheeks.

@@ -25,7 +25,7 @@ from gsgan.synthetic.footsteps import FootState, Footsteps
 X, Y, Z = np.eye(3)
 # Flexion of a finger's joints at full curl, radians; the thumb's first joint turns in its saddle.
 FLEXION = {"Thumb": (0.5, 0.6, 0.9)} | dict.fromkeys(FINGERS[1:], (1.4, 1.7, 1.1))
-FAN = (0, 1.5, 0.5, -0.5, -1.5)  # a finger's place, in spreads towards the thumb
+FINGER_FAN = (0, 1.5, 0.5, -0.5, -1.5)  # a finger's place, in spreads towards the thumb
 KNUCKLE = 0.1  # metres from the wrist, of hands without fingers
 # The forearm's range, radians from mid-way.
 PRONATION = -1.3
@@ -210,7 +210,7 @@ class Choreography:
             k = FINGERS.index(finger)
             is_first = float(joint == 0)
             curl = c.curl[:, i, k, None]
-            aside = is_first * FAN[k] * c.spread[:, i, None] * thumbwards
+            aside = is_first * FINGER_FAN[k] * c.spread[:, i, None] * thumbwards
             flexion = curl + is_first * c.bend[:, i, k, None]
             flexion = FLEXION[finger][joint] * flexion - straight
             turn = rotation(flexion * hinge + curl * across + aside)

@@ -42,8 +42,8 @@ MAX_OFFSET = 0.25  # of a channel, as a share of the tint
 class Tint:
     """One camera's colours, ``A c + b`` on sRGB in [0, 1]: ``A [3, 3]``, ``b [3]``."""
 
-    A: Array
-    b: Array
+    A: Array  # [3, 3]
+    b: Array  # [3]
 
     def __call__(self, image: Array, alpha: Array) -> Array:
         """Tints a premultiplied image ``[H, W, 3]`` with alpha ``[H, W]``."""
@@ -86,8 +86,10 @@ def _centred(x: Array) -> Array:
 VERSION = 2
 """Of the generator. Raise it when any pixel changes: cached datasets are then made again."""
 
+# Names of avatars.
 DEFAULT = "polo"
 FREE_BODY = "free_body"
+# Names of motions.
 CHOREOGRAPHY = "choreography"
 SIGNING = "signs"
 FURTHER = "far"
@@ -95,9 +97,9 @@ PROGRAMMES = {CHOREOGRAPHY: EVERYDAY, SIGNING: SIGNS, FURTHER: FAR}
 
 CAMERA_ARC = math.radians(150)  # in front of a person who signs
 CAMERA_HEIGHTS = (1.35, 0.95, 1.75)  # metres, in turn around the person
-TEST_HEIGHTS = (1.15, 1.55)
+TEST_HEIGHTS = (1.15, 1.55)  # metres, of test cameras around the person
 ARC_HEIGHTS = (1.35, 1.55, 1.2)  # metres, in turn along the arc
-ARC_TEST_HEIGHTS = (1.45, 1.3)
+ARC_TEST_HEIGHTS = (1.45, 1.3)  # metres, of test cameras along the arc
 
 # Minimum of each whole number, and the ranges of the parameters that may be None.
 MIN_VALUES = {
@@ -109,8 +111,8 @@ MIN_VALUES = {
     "test_frames": 0,
     "seed": 0,
 }
-NUMBERS = {"tint": (0.0, 0.3), "gloss": (0.0, 1.0)}
-LISTS = {"lens": (-math.inf, math.inf), "test_scale": (0.25, 4)}
+OPTIONAL_NUMBERS = {"tint": (0.0, 0.3), "gloss": (0.0, 1.0)}
+OPTIONAL_LISTS = {"lens": (-math.inf, math.inf), "test_scale": (0.25, 4)}
 
 
 @dataclass(frozen=True)
@@ -123,20 +125,20 @@ class SceneSettings:
         ConfigError: naming the parameter that is out of range.
     """
 
-    size: int = 128
+    size: int = 128  # pixels of the square images
     train_cameras: int = 6
-    test_cameras: int = 2
+    test_cameras: int = 2  # held out, between training cameras
     frames: int = 84
-    test_frames: int = 21
+    test_frames: int = 21  # held out, of all frames
     rays_per_pixel: int = 16
-    seed: int = 0
-    avatar: str = DEFAULT
-    motion: str = CHOREOGRAPHY
-    secondary: bool = True
-    lens: tuple[float, ...] | None = None
-    tint: float | None = None
-    gloss: float | None = None
-    test_scale: tuple[float, ...] | None = None
+    seed: int = 0  # of the motion's style and of the tints
+    avatar: str = DEFAULT  # name, or path of a .glb
+    motion: str = CHOREOGRAPHY  # name, or path of a .bvh or .amc
+    secondary: bool = True  # sway and wrinkles of cloth
+    lens: tuple[float, ...] | None = None  # OpenCV's distortion coefficients
+    tint: float | None = None  # maximum change of a channel's gain
+    gloss: float | None = None  # added highlight of clothes
+    test_scale: tuple[float, ...] | None = None  # zooms of copies of the test cameras
 
     def __post_init__(self) -> None:
         # Whole numbers.
@@ -144,14 +146,14 @@ class SceneSettings:
             whole(f"data.source.{name}", getattr(self, name), minimum)
 
         # Numbers that may be None; 0 disables the effect too.
-        for name, bounds in NUMBERS.items():
+        for name, bounds in OPTIONAL_NUMBERS.items():
             value = getattr(self, name)
             if value is not None:
                 between(f"data.source.{name}", value, *bounds)
             object.__setattr__(self, name, float(value) if value else None)
 
         # Lists that may be None; zeros alone disable the effect too.
-        for name, (low, high) in LISTS.items():
+        for name, (low, high) in OPTIONAL_LISTS.items():
             raw = getattr(self, name)
             values = as_floats([] if raw is None else raw)
             _require(

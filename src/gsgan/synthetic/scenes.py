@@ -34,8 +34,10 @@ from gsgan.synthetic.scene_setup import FREE_BODY, Scene, SceneSettings, dataset
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import cache_root, locked, write_atomically
 
+# Folders of what is traced, in the order of `PosedCharacter.render`.
 IMAGE_FOLDERS = ("images", "masks", "labels")
-POLL_SECONDS = 0.05
+POLL_SECONDS = 0.05  # between looks at the workers
+# The program of a worker.
 WORKER = "from gsgan.synthetic.scenes import trace_share; trace_share()"
 
 
@@ -68,6 +70,8 @@ def ensure_scene(
         raise ConfigError(
             f"synthetic data: unknown parameter {unknown[0]!r}; known are {', '.join(known)}"
         )
+
+    # The name of the folder identifies the content.
     settings = SceneSettings(**parameters)
     root = (cache or cache_root()) / "data" / "synthetic" / dataset_key(settings)
     if not _is_complete(root):
@@ -173,7 +177,7 @@ def trace_share() -> None:
 def trace_frames(root: Path, scene: Scene, frames: Iterable[int]) -> None:
     """Writes images, masks and labels of the frames for all cameras, unless they exist."""
     for frame in frames:
-        person = None
+        person = None  # posed for the first image that does not exist
         for name, view in scene.views.items():
             paths = [root / kind / name / f"{frame:06d}.png" for kind in IMAGE_FOLDERS]
             if all(path.is_file() for path in paths):

@@ -32,7 +32,8 @@ class LooseCloth(NamedTuple):
     share: float  # of the full sway
 
 
-LOOSE = (
+LOOSE_CLOTH = (
+    # Sleeves.
     LooseCloth(
         label="upper_clothes",
         bones=("LeftArm", "LeftForeArm", "LeftHand"),
@@ -49,6 +50,7 @@ LOOSE = (
         full=0.28,
         share=1.0,
     ),
+    # The shirt on the trunk, and its hem on the thighs.
     LooseCloth(
         label="upper_clothes",
         bones=("Spine2", "Spine1", "Spine", "Hips"),
@@ -65,6 +67,7 @@ LOOSE = (
         full=0.60,
         share=0.5,
     ),
+    # Trouser legs.
     LooseCloth(
         label="lower_clothes",
         bones=("LeftUpLeg", "LeftLeg", "LeftFoot"),
@@ -81,6 +84,7 @@ LOOSE = (
         full=0.85,
         share=0.8,
     ),
+    # A skirt.
     LooseCloth(
         label="lower_clothes",
         bones=("Hips",),
@@ -89,6 +93,7 @@ LOOSE = (
         full=0.60,
         share=1.0,
     ),
+    # Long hair.
     LooseCloth(
         label="hair",
         bones=("Head", "Neck", "Spine2", "Spine1"),
@@ -98,9 +103,9 @@ LOOSE = (
         share=1.0,
     ),
 )
-FREQUENCY = 2.4  # Hz of the springs
-DAMPING = 0.35  # of the springs, as a share of critical damping
-RATE = 60.0  # samples per second of the springs
+SPRING_FREQUENCY = 2.4  # Hz of the springs
+SPRING_DAMPING = 0.35  # of the springs, as a share of critical damping
+SAMPLE_RATE = 60.0  # samples per second of the springs
 LEAD = 2.5  # seconds of rest before the motion starts
 LIMIT = 0.04  # metres: a sway approaches it and never exceeds it
 HANG = 0.025  # metres by which cloth hangs off a horizontal bone
@@ -129,7 +134,7 @@ CREASES = (
     Crease("Spine2", "Hips", "Neck", 0.15),
 )
 WAVELENGTH = 0.055  # metres from one fold to the next
-SLOPE = 0.8  # of the deepest folds
+MAX_SLOPE = 0.8  # of the deepest folds
 STIFFNESS = 1.5  # how soon folds appear as a joint bends
 FLANK = 0.05  # metres from a limb's axis at which folds are fully one-sided
 
@@ -185,7 +190,7 @@ class Secondary:
             normals: ``[V, 3]`` skinned, unit.
         """
         # The sway at this time, between two samples of the springs.
-        at = np.clip(time, 0, self._times[-1]) * RATE
+        at = np.clip(time, 0, self._times[-1]) * SAMPLE_RATE
         low = min(int(at), len(self._times) - 2)
         share = at - low
         sway = (1 - share) * self._sway[low] + share * self._sway[low + 1]
@@ -254,7 +259,7 @@ class Secondary:
     def _looseness(self) -> Array:
         """``[W]`` share of a sway that each vertex follows: 0 where tight, growing to the hems."""
         loose = np.zeros(len(self._rest))
-        for cloth in LOOSE:
+        for cloth in LOOSE_CLOTH:
             of_label = self._share_of(cloth.label)
             known = cloth.origin is None or cloth.origin in self._index
             if not of_label.any() or not known:
@@ -284,8 +289,8 @@ class Secondary:
         s'' + 2 D w s' + w^2 s = -x'' + w^2 h.
         """
         joints = self.character.joints
-        count = max(2, int(np.ceil(motion.duration * RATE)) + 1)
-        times = np.arange(count) / RATE
+        count = max(2, int(np.ceil(motion.duration * SAMPLE_RATE)) + 1)
+        times = np.arange(count) / SAMPLE_RATE
         poses = motion.at(np.minimum(times, motion.duration))
 
         # The middle of the loose vertices of each bone, the joint if it has none.
@@ -302,8 +307,8 @@ class Secondary:
         hang = -HANG * (up - along * along[..., 2:])
 
         # The springs' transfer functions.
-        w = 2 * np.pi * FREQUENCY
-        spring = [1, 2 * DAMPING * w, w * w]
+        w = 2 * np.pi * SPRING_FREQUENCY
+        spring = [1, 2 * SPRING_DAMPING * w, w * w]
         inertia = _filtered([-1, 0, 0], spring, place)
         sway = inertia + _filtered([w * w], spring, hang)
 
@@ -374,7 +379,7 @@ class Secondary:
             side = (offset * inner[self._own]).sum(axis=1) / FLANK
             side = np.clip(side, -flexion, flexion)
             deep = np.tanh(STIFFNESS * (0.6 * flexion + 0.4 * side))
-            slope = SLOPE * self._near * deep
+            slope = MAX_SLOPE * self._near * deep
 
             # Their direction turns with the skin.
             blended = self._skin @ rotations.reshape(len(rotations), 9)
@@ -389,11 +394,11 @@ class Secondary:
 
 def _filtered(numerator: list[float], denominator: list[float], signal: Array) -> Array:
     """Samples ``[T, …]`` after a transfer function in s (bilinear transform), from rest."""
-    b, a = bilinear(numerator, denominator, RATE)
+    b, a = bilinear(numerator, denominator, SAMPLE_RATE)
 
     # The signal is extended by its mirror image about the first sample: it starts with its
     # speed, without a jerk.
-    lead = min(int(LEAD * RATE), len(signal) - 1)
+    lead = min(int(LEAD * SAMPLE_RATE), len(signal) - 1)
     padded = signal
     if lead:
         before = 2 * signal[:1] - signal[lead:0:-1]

@@ -33,39 +33,40 @@ class HandShape(NamedTuple):
     spread: float
 
 
-STRAIGHT = (0.0,) * 5
-LOOSE = HandShape(
+# Shapes of hands.
+STRAIGHT_FINGERS = (0.0,) * 5
+LOOSE_HAND = HandShape(
     curl=(0.2, 0.2, 0.25, 0.3, 0.35),
-    bend=STRAIGHT,
+    bend=STRAIGHT_FINGERS,
     spread=0.03,
 )
-FLAT = HandShape(
-    curl=STRAIGHT,
+FLAT_HAND = HandShape(
+    curl=STRAIGHT_FINGERS,
     bend=(-1.0, 0, 0, 0, 0),
     spread=0.0,
 )
-FAN = HandShape(
-    curl=STRAIGHT,
+FAN_HAND = HandShape(
+    curl=STRAIGHT_FINGERS,
     bend=(-0.8, 0, 0, 0, 0),
     spread=0.17,
 )
 FIST = HandShape(
     curl=(0.75, 0.95, 0.97, 1.0, 1.0),
-    bend=STRAIGHT,
+    bend=STRAIGHT_FINGERS,
     spread=0.0,
 )
-INDEX = HandShape(
+INDEX_HAND = HandShape(
     curl=(0.8, 0.0, 0.95, 1.0, 1.0),
-    bend=STRAIGHT,
+    bend=STRAIGHT_FINGERS,
     spread=0.0,
 )
 TWO = HandShape(
     curl=(0.8, 0.0, 0.0, 0.95, 1.0),
-    bend=STRAIGHT,
+    bend=STRAIGHT_FINGERS,
     spread=0.12,
 )
 OPEN = HandShape(
-    curl=STRAIGHT,
+    curl=STRAIGHT_FINGERS,
     bend=(-1.0, 0, 0, 0, 0),
     spread=0.2,
 )
@@ -74,9 +75,10 @@ CLASP = HandShape(
     bend=(-1.0, 0.03, 0.03, 0.03, 0.03),
     spread=0.28,
 )
-BOTH = (0, 1)
-LEFT = (0,)
-RIGHT = (1,)
+# Sides of the controls.
+BOTH_HANDS = (0, 1)
+LEFT_HAND = (0,)
+RIGHT_HAND = (1,)
 
 
 def at_ease(frames: int) -> Controls:
@@ -85,12 +87,12 @@ def at_ease(frames: int) -> Controls:
     c.elbow[...] = (0.8, 0.35, -1.0)
     _place(
         c,
-        BOTH,
+        BOTH_HANDS,
         knuckle=(0.1, -0.31, -0.34),
         pointing=(-0.55, -0.85, 0.05),
         facing=(-0.85, 0.55, 0.1),
     )
-    _shape(c, BOTH, LOOSE)
+    _shape(c, BOTH_HANDS, LOOSE_HAND)
     return c
 
 
@@ -136,12 +138,12 @@ def hello(c: Controls, s: Array, style: Style) -> None:
     out = _there(s)
     _place(
         c,
-        RIGHT,
+        RIGHT_HAND,
         knuckle=_mix(out, (0.13, -0.21, 0.26), (0.33, -0.3, 0.24)),
         pointing=_mix(out, (-0.5, 0.1, 0.85), (0.25, -0.2, 1)),
         facing=(-0.1, -1, 0),
     )
-    _shape(c, RIGHT, FLAT)
+    _shape(c, RIGHT_HAND, FLAT_HAND)
     c.elbow[:, 1] = (1.0, 0.3, -0.9)
     c.set_face(
         smile=1,
@@ -156,12 +158,14 @@ def mask(c: Controls, s: Array, style: Style) -> None:
     down = _there(s, 0.25, 0.8)
     _place(
         c,
-        RIGHT,
+        RIGHT_HAND,
         knuckle=_mix(down, (0.03, -0.28, 0.25), (0.02, -0.27, 0.1)),
         pointing=(-1, 0.1, 0.3),
         facing=(0, 1, 0),
     )
-    _shape(c, RIGHT, FAN)
+    _shape(c, RIGHT_HAND, FAN_HAND)
+
+    # The fingers ripple, one after the other.
     for finger in range(1, 5):
         ripple = np.sin(TAU * 2 * s + style.phase + finger)
         c.bend[:, 1, finger] += 0.12 * ripple
@@ -171,10 +175,11 @@ def mask(c: Controls, s: Array, style: Style) -> None:
 
 def interlace(c: Controls, s: Array, style: Style) -> None:
     """Hands meet and their fingers interlace; the clasped hands sway."""
+    # The hands come near, then the fingers close; they open before the hands part.
     near = _there(s, 0.1, 0.35) * (1 - _there(s, 0.68, 0.92))
     closed = _there(s, 0.3, 0.5) * (1 - _there(s, 0.55, 0.75))
     sway = 0.03 * style.amplitude * np.sin(TAU * s)
-    for side, sign in zip(BOTH, (1, -1), strict=True):
+    for side, sign in zip(BOTH_HANDS, (1, -1), strict=True):
         # The hands are half a finger's width apart, so that fingers pass between fingers.
         across = 0.09 - 0.052 * near + sign * sway
         _place(
@@ -184,8 +189,8 @@ def interlace(c: Controls, s: Array, style: Style) -> None:
             pointing=(0, -0.5, 0.85),
             facing=(-1, 0, 0),
         )
-    _shape(c, BOTH, OPEN)
-    _shape(c, BOTH, CLASP, closed)
+    _shape(c, BOTH_HANDS, OPEN)
+    _shape(c, BOTH_HANDS, CLASP, closed)
     c.elbow[...] = (1.0, 0.2, -0.8)
     c.set_face(round=0.9, brows=0.4)
     rotate(c.head, forwards=0.1 * closed)
@@ -194,7 +199,7 @@ def interlace(c: Controls, s: Array, style: Style) -> None:
 def palms(c: Controls, s: Array, style: Style) -> None:
     """Palm on palm, rubbing."""
     rub = 0.02 * style.amplitude * np.sin(TAU * 2 * s + style.phase)
-    for side, sign in zip(BOTH, (1, -1), strict=True):
+    for side, sign in zip(BOTH_HANDS, (1, -1), strict=True):
         _place(
             c,
             (side,),
@@ -202,7 +207,7 @@ def palms(c: Controls, s: Array, style: Style) -> None:
             pointing=(-0.07, -0.6, 0.8),
             facing=(-1, 0, 0),
         )
-    _shape(c, BOTH, FLAT)
+    _shape(c, BOTH_HANDS, FLAT_HAND)
     c.elbow[...] = (1.0, 0.2, -0.8)
     c.set_face(round=0.5, mouth=0.3, brows=-0.7)
 
@@ -212,20 +217,20 @@ def support(c: Controls, s: Array, style: Style) -> None:
     rise = -0.24 + 0.1 * _there(s, 0.25, 0.75)
     _place(
         c,
-        LEFT,
+        LEFT_HAND,
         knuckle=(0.0, -0.33, rise),
         pointing=(-0.75, -0.65, 0),
         facing=(-0.4, 0.1, 0.9),
     )
     _place(
         c,
-        RIGHT,
+        RIGHT_HAND,
         knuckle=(-0.02, -0.33, rise + 0.1),
         pointing=(-0.8, -0.6, 0),
         facing=(-0.6, 0.8, 0),
     )
-    _shape(c, LEFT, FLAT)
-    _shape(c, RIGHT, FIST)
+    _shape(c, LEFT_HAND, FLAT_HAND)
+    _shape(c, RIGHT_HAND, FIST)
     c.set_face(wide=0.5, mouth=0.3, brows=0.5)
 
 
@@ -234,20 +239,20 @@ def point(c: Controls, s: Array, style: Style) -> None:
     back = 0.05 * np.sin(TAU * s) ** 2
     _place(
         c,
-        LEFT,
+        LEFT_HAND,
         knuckle=(0.08, -0.33, -0.06),
         pointing=(-0.1, -0.5, 0.85),
         facing=(-1, 0, 0),
     )
     _place(
         c,
-        RIGHT,
+        RIGHT_HAND,
         knuckle=(0.04 + back, -0.31, -0.1),
         pointing=(-1, -0.15, 0.1),
         facing=(0, 0.3, -1),
     )
-    _shape(c, LEFT, FLAT)
-    _shape(c, RIGHT, INDEX)
+    _shape(c, LEFT_HAND, FLAT_HAND)
+    _shape(c, RIGHT_HAND, INDEX_HAND)
     c.elbow[:, 1] = (1.0, 0.1, -0.6)
     c.set_face(wide=0.8, brows=-1)
 
@@ -258,19 +263,19 @@ def hug(c: Controls, s: Array, style: Style) -> None:
     rock = 0.02 * style.amplitude * np.sin(TAU * s)
     _place(
         c,
-        LEFT,
+        LEFT_HAND,
         knuckle=(x + rock, -0.25, -0.02),
         pointing=(-0.8, 0.05, 0.6),
         facing=(0, 1, 0),
     )
     _place(
         c,
-        RIGHT,
+        RIGHT_HAND,
         knuckle=(x - rock, -0.34, -0.02),
         pointing=(-0.8, 0.05, 0.6),
         facing=(0, 1, 0),
     )
-    _shape(c, BOTH, FIST)
+    _shape(c, BOTH_HANDS, FIST)
     c.elbow[...] = (0.8, -0.2, -1.0)
     c.set_face(smile=1, mouth=0.2)
     rotate(c.head, sideways=0.15 * np.sin(TAU * s))
@@ -278,7 +283,7 @@ def hug(c: Controls, s: Array, style: Style) -> None:
 
 def turn(c: Controls, s: Array, style: Style) -> None:
     """Index fingers circle round each other."""
-    for side, shift in zip(BOTH, (0.0, TAU / 2), strict=True):
+    for side, shift in zip(BOTH_HANDS, (0.0, TAU / 2), strict=True):
         angle = TAU * 2 * s + style.phase + shift
         ahead = -0.34 + 0.055 * np.cos(angle)
         height = -0.08 + 0.055 * np.sin(angle)
@@ -289,7 +294,7 @@ def turn(c: Controls, s: Array, style: Style) -> None:
             pointing=(-1, -0.2, 0.05),
             facing=(-0.2, 1, 0),
         )
-    _shape(c, BOTH, INDEX)
+    _shape(c, BOTH_HANDS, INDEX_HAND)
     c.elbow[...] = (1.0, 0.1, -0.8)
     c.set_face(
         mouth=0.9 * np.sin(TAU * 1.5 * s) ** 2,
@@ -302,12 +307,12 @@ def look(c: Controls, s: Array, style: Style) -> None:
     out = _there(s)
     _place(
         c,
-        RIGHT,
+        RIGHT_HAND,
         knuckle=_mix(out, (0.06, -0.3, 0.2), (0.02, -0.45, 0.08)),
         pointing=_mix(out, (-0.4, -0.3, 0.9), (-0.25, -0.8, 0.45)),
         facing=(-0.2, -0.8, -0.6),
     )
-    _shape(c, RIGHT, TWO)
+    _shape(c, RIGHT_HAND, TWO)
     c.set_face(brows=-0.9, round=0.6)
     rotate(c.head, forwards=0.1 * out)
 
@@ -317,12 +322,12 @@ def roof(c: Controls, s: Array, style: Style) -> None:
     down = _there(s, 0.4, 0.7)
     _place(
         c,
-        BOTH,
+        BOTH_HANDS,
         knuckle=_mix(down, (0.081, -0.32, 0.0), (0.13, -0.32, -0.16)),
         pointing=_mix(down, (-0.7, -0.15, 0.7), (0, -0.5, 0.85)),
         facing=_mix(down, (-0.7, 0, -0.7), (-1, 0, 0)),
     )
-    _shape(c, BOTH, FLAT)
+    _shape(c, BOTH_HANDS, FLAT_HAND)
     c.elbow[...] = (1.0, 0.2, -0.8)
     c.set_face(mouth=0.4, round=0.4 * down, brows=0.6)
 
@@ -332,19 +337,19 @@ def cancel(c: Controls, s: Array, style: Style) -> None:
     x = 0.05 + 0.1 * np.cos(TAU * 2 * s)
     _place(
         c,
-        LEFT,
+        LEFT_HAND,
         knuckle=(x, -0.41, -0.07),
         pointing=(-0.5, -0.2, 0.8),
         facing=(-0.7, -0.7, 0),
     )
     _place(
         c,
-        RIGHT,
+        RIGHT_HAND,
         knuckle=(x, -0.31, -0.01),
         pointing=(-0.5, -0.2, 0.8),
         facing=(-0.7, -0.7, 0),
     )
-    _shape(c, BOTH, OPEN)
+    _shape(c, BOTH_HANDS, OPEN)
     c.set_face(wide=0.9, brows=-0.8)
     rotate(c.head, turn=0.25 * np.sin(TAU * 2 * s))
 
@@ -354,13 +359,13 @@ def peek(c: Controls, s: Array, style: Style) -> None:
     open_ = _there(s, 0.45, 0.7)
     _place(
         c,
-        BOTH,
+        BOTH_HANDS,
         knuckle=_mix(open_, (0.066, -0.28, 0.19), (0.22, -0.28, 0.19)),
         pointing=(-0.12, 0.05, 1),
         facing=(-0.2, 1, 0),
     )
-    _shape(c, BOTH, FLAT)
-    _shape(c, BOTH, FAN, open_)
+    _shape(c, BOTH_HANDS, FLAT_HAND)
+    _shape(c, BOTH_HANDS, FAN_HAND, open_)
     c.elbow[...] = (1.0, -0.1, -0.9)
     c.set_face(
         smile=open_,

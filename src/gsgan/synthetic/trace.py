@@ -26,7 +26,7 @@ Colour = tuple[float, float, float]
 BLOCK = 1 << 15  # rays traced at once: their arrays stay in the processor's cache
 # exponent of the highlight's lobe: falls to half within about 19 degrees
 SHININESS = 12.0
-CLOTHES = ("upper_clothes", "lower_clothes", "left_shoe", "right_shoe")
+GLOSSY_PARTS = ("upper_clothes", "lower_clothes", "left_shoe", "right_shoe")
 SKY_RAYS = 48  # directions in which each vertex looks for the sky
 SKY_OFFSET = 3e-3  # metres from the surface to sky rays
 SHADOW_OFFSET = 1e-3  # metres from the surface to shadow rays; less gives speckles
@@ -79,12 +79,16 @@ class Appearance:
 
     def __init__(self, character: Character) -> None:
         self.character = character
+
+        # Arrays in the types that tracing needs.
         self.faces = character.faces.astype(np.int32)
         self.uv = character.uv.astype(np.float32)
         self.textures = Textures(character.surfaces)
         self.cutoff = np.array([s.cutoff for s in character.surfaces], np.float32)
         self.bumpy = any(s.normal is not None for s in character.surfaces)
-        clothes = [name in CLOTHES for name in character.label_names]
+
+        # 1 on faces of clothes and shoes, which get the added gloss.
+        clothes = [name in GLOSSY_PARTS for name in character.label_names]
         self.glossy = np.array(clothes, np.float32)[character.labels]
 
         # Edges of each face in texture coordinates.
@@ -137,6 +141,7 @@ class Tracer:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
 
+        # The mesh has to be kept as long as the scene.
         self._scene = EmbreeScene()
         self._solid = solid
         self._mesh = TriangleMesh(
@@ -150,7 +155,7 @@ class Tracer:
             return face, bary
 
         # Rays that hit a hole go on behind it.
-        travelled = np.zeros(len(face), np.float32)
+        travelled = np.zeros(len(face), np.float32)  # metres until the last hole
         going = np.arange(len(face))
         for _ in range(LAYERS):
             going = going[face[going] >= 0]
