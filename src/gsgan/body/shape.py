@@ -44,6 +44,12 @@ WRISTS = ("wrist.L", "wrist.R")
 BACK = (0.0, 1.0, 0.0)  # the direction behind the free body
 LANDMARKS = (len(MEDIAPIPE33.names), 3)
 HANDS_SHAPE = (2, 2, 3)
+SHAPES = {
+    "stretch": (len(STRETCHED),),
+    "offsets": LANDMARKS,
+    "hands": HANDS_SHAPE,
+    "spine": (1,),
+}
 
 B = TypeVar("B", bound=MarkedBody)
 
@@ -72,25 +78,16 @@ class BodyShape:
     spine: Tensor | None = None
 
     def __post_init__(self) -> None:
-        found = {
-            "coefficients": list(self.coefficients.shape),
-            "stretch": list(self.stretch.shape),
-            "offsets": list(LANDMARKS if self.offsets is None else self.offsets.shape),
-            "hands": list(HANDS_SHAPE if self.hands is None else self.hands.shape),
-            "spine": list((1,) if self.spine is None else self.spine.shape),
-        }
-        expected = {
-            "coefficients": [self.coefficients.numel()],
-            "stretch": [len(STRETCHED)],
-            "offsets": list(LANDMARKS),
-            "hands": list(HANDS_SHAPE),
-            "spine": [1],
-        }
-        if found != expected:
+        # A tensor that is None has the expected shape.
+        found = []
+        for name, shape in SHAPES.items():
+            value = getattr(self, name)
+            found.append(list(shape if value is None else value.shape))
+        if self.coefficients.ndim != 1 or found != list(map(list, SHAPES.values())):
             raise ValueError(
                 f"BodyShape: expected coefficients [K], stretch [{len(STRETCHED)}], offsets "
                 f"{list(LANDMARKS)}, hands {list(HANDS_SHAPE)}, spine [1], got "
-                f"{', '.join(map(str, found.values()))}"
+                f"{', '.join(map(str, [list(self.coefficients.shape), *found]))}"
             )
 
     def arrays(self) -> dict[str, NDArray[np.float32]]:

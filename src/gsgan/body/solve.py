@@ -4,7 +4,7 @@ Units are metres in the world frame and radians.
 """
 
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import torch
@@ -79,16 +79,6 @@ class NormalEquations(NamedTuple):
     gradient: Tensor  # [B, D] half the cost's
     matrix: Tensor  # [B, D, D] Gauss-Newton's
     weight: Tensor  # [B, N] of iteratively reweighted least squares
-
-
-class _State(NamedTuple):
-    """Where the steps are, for B frames."""
-
-    q: Tensor  # [B, D] numbers
-    root: Tensor  # [B, 3, 3] rotation
-    cost: Tensor  # [B]
-    gradient: Tensor  # [B, D]
-    matrix: Tensor  # [B, D, D]
 
 
 class Solver(nn.Module):
@@ -508,37 +498,33 @@ class Solver(nn.Module):
         self, q: Tensor, root: Tensor, p: Tensor, weight: Tensor, steps: int = MAX_STEPS
     ) -> tuple[Tensor, Tensor]:
         """Numbers and root rotation after at most ``steps``; one that raises the cost is undone."""
-        best = self._state(q, root, p, weight)
+        best_q = q
+        best_root = root
+        best = self.normal(q, self.linear(q, root, p), weight)
         damping = q.new_full((len(q), 1), FIRST_DAMPING)
         done = torch.zeros(len(q), dtype=torch.bool, device=q.device)
         for _ in range(steps):
             diagonal = torch.diagonal(best.matrix, dim1=-2, dim2=-1)
             scaled = best.matrix + torch.diag_embed(damping * diagonal)
-            q = best.q + _solved(scaled, -best.gradient)
+            q = best_q + _solved(scaled, -best.gradient)
 
             # The root's turn goes into its rotation: the next step starts from no turn.
-            root = axis_angle_to_matrix(q[:, :3]) @ best.root
+            root = axis_angle_to_matrix(q[:, :3]) @ best_root
             q = torch.cat([torch.zeros_like(q[:, :3]), q[:, 3:]], dim=1)
-            new = self._state(q, root, p, weight)
+            new = self.normal(q, self.linear(q, root, p), weight)
 
             # A frame stops by itself, so that its result does not depend on the others.
             better = (new.cost < best.cost) & ~done
-            done = done | ((new.cost - best.cost).abs() <= MIN_IMPROVEMENT * best.cost)
-            damping = torch.where(
-                better[:, None], damping * DAMPING_DECREASE, damping * DAMPING_INCREASE
-            )
-            chosen = []
-            for a, b in zip(new, best, strict=True):
-                by_frame = better.view(-1, *[1] * (a.ndim - 1))
-                chosen.append(torch.where(by_frame, a, b))
-            best = _State(*chosen)
+            change = (new.cost - best.cost).abs()
+            done = done | (change <= MIN_IMPROVEMENT * best.cost)
+            easier = damping * DAMPING_DECREASE
+            damping = torch.where(better[:, None], easier, damping * DAMPING_INCREASE)
+            best_q = _chosen(better, q, best_q)
+            best_root = _chosen(better, root, best_root)
+            best = NormalEquations(*map(partial(_chosen, better), new, best))
             if bool(done.all()):
                 break
-        return best.q, best.root
-
-    def _state(self, q: Tensor, root: Tensor, p: Tensor, weight: Tensor) -> _State:
-        at = self.normal(q, self.linear(q, root, p), weight)
-        return _State(q, root, at.cost, at.gradient, at.matrix)
+        return best_q, best_root
 
     def _last_steps(self, q: Tensor, root: Tensor, p: Tensor, weight: Tensor) -> Tensor:
         """Steps with a fixed matrix, which hardly move a solution.
@@ -552,6 +538,11 @@ class Solver(nn.Module):
             at = self.normal(q, self.linear(q, root, p), weight)
             q = q - _solved(H, at.gradient)
         return q
+
+
+def _chosen(frames: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    """``a`` of the frames ``[B]`` bool, ``b`` of the others."""
+    return torch.where(frames.view(-1, *[1] * (a.ndim - 1)), a, b)
 
 
 def _with_palms(body: Body) -> Body:

@@ -413,41 +413,39 @@ def extent(
 
 def ring(settings: SceneSettings, points: Array) -> list[SceneCamera]:
     """Cameras around the person, training cameras first, zoomed to keep ``points`` in view."""
-    middle = (points.min(axis=0) + points.max(axis=0)) / 2
     step = 2 * math.pi / settings.train_cameras
-    cameras = []
+    places = []
 
     # Training cameras start at 0.3, so that none looks exactly along the person's axis.
     for i in range(settings.train_cameras):
-        azimuth = 0.3 + i * step
-        height = CAMERA_HEIGHTS[i % 3]
-        cameras.append(look_at(azimuth, height, middle, points, settings.size))
+        places.append((0.3 + i * step, CAMERA_HEIGHTS[i % 3]))
 
     # Test cameras stand half-way between neighbours, spread evenly around the person.
     for k in range(settings.test_cameras):
         gap = (k * settings.train_cameras) // settings.test_cameras
-        azimuth = 0.3 + (gap + 0.5) * step
-        height = TEST_HEIGHTS[k % 2]
-        cameras.append(look_at(azimuth, height, middle, points, settings.size))
-    return cameras
+        places.append((0.3 + (gap + 0.5) * step, TEST_HEIGHTS[k % 2]))
+    return _cameras_at(places, points, settings.size)
 
 
 def front(settings: SceneSettings, points: Array) -> list[SceneCamera]:
     """Cameras on an arc before the person, training cameras first, zoomed to ``points``."""
-    middle = (points.min(axis=0) + points.max(axis=0)) / 2
     step = CAMERA_ARC / settings.train_cameras
-    cameras = []
+    places = []
 
     # Training cameras, spread evenly along the arc.
     for i in range(settings.train_cameras):
-        azimuth = (i + 0.5) * step - CAMERA_ARC / 2
-        height = ARC_HEIGHTS[i % 3]
-        cameras.append(look_at(azimuth, height, middle, points, settings.size))
+        places.append(((i + 0.5) * step - CAMERA_ARC / 2, ARC_HEIGHTS[i % 3]))
 
     # Test cameras, half-way between neighbours.
     for k in range(settings.test_cameras):
         gap = int((k + 0.5) * (settings.train_cameras - 1) / settings.test_cameras)
-        azimuth = (gap + 1) * step - CAMERA_ARC / 2
-        height = ARC_TEST_HEIGHTS[k % 2]
-        cameras.append(look_at(azimuth, height, middle, points, settings.size))
-    return cameras
+        places.append(((gap + 1) * step - CAMERA_ARC / 2, ARC_TEST_HEIGHTS[k % 2]))
+    return _cameras_at(places, points, settings.size)
+
+
+def _cameras_at(
+    places: list[tuple[float, float]], points: Array, size: int
+) -> list[SceneCamera]:
+    """Cameras at azimuths and heights that look at the middle of the points."""
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    return [look_at(a, height, middle, points, size) for a, height in places]

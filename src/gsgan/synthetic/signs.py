@@ -25,25 +25,25 @@ from gsgan.utils.errors import ConfigError
 Value = Array | float  # a number, or one per frame [F]
 
 
+STRAIGHT_FINGERS = (0.0,) * 5
+
+
 class HandShape(NamedTuple):
     """The flexion of a hand's fingers, thumb first, as in `Controls`."""
 
     curl: tuple[float, ...]
-    bend: tuple[float, ...]
-    spread: float
+    bend: tuple[float, ...] = STRAIGHT_FINGERS
+    spread: float = 0.0
 
 
 # Shapes of hands.
-STRAIGHT_FINGERS = (0.0,) * 5
 LOOSE_HAND = HandShape(
     curl=(0.2, 0.2, 0.25, 0.3, 0.35),
-    bend=STRAIGHT_FINGERS,
     spread=0.03,
 )
 FLAT_HAND = HandShape(
     curl=STRAIGHT_FINGERS,
     bend=(-1.0, 0, 0, 0, 0),
-    spread=0.0,
 )
 FAN_HAND = HandShape(
     curl=STRAIGHT_FINGERS,
@@ -52,17 +52,12 @@ FAN_HAND = HandShape(
 )
 FIST = HandShape(
     curl=(0.75, 0.95, 0.97, 1.0, 1.0),
-    bend=STRAIGHT_FINGERS,
-    spread=0.0,
 )
 INDEX_HAND = HandShape(
     curl=(0.8, 0.0, 0.95, 1.0, 1.0),
-    bend=STRAIGHT_FINGERS,
-    spread=0.0,
 )
 TWO = HandShape(
     curl=(0.8, 0.0, 0.0, 0.95, 1.0),
-    bend=STRAIGHT_FINGERS,
     spread=0.12,
 )
 OPEN = HandShape(
