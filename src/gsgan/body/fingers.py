@@ -72,8 +72,8 @@ class Fingers(nn.Module):
     bones: Tensor  # [10, 3, 3] at rest: base to middle; middle to both landmarks beyond
     axes: Tensor  # [10, 5, 3] of the numbers
     prior: Tensor  # [10, 5] precisions
-    least: Tensor  # [10, 5]
-    most: Tensor  # [10, 5]
+    least: Tensor  # [10, 5] minimum of each number
+    most: Tensor  # [10, 5] maximum of each number
 
     def __init__(self, body: Body) -> None:
         super().__init__()
@@ -112,6 +112,7 @@ class Fingers(nn.Module):
             seen: ``[B, 42]`` bool. A hand needs its wrist and the knuckles of index and little
                 finger, a finger its two landmarks nearest to the palm, its second joint one more.
         """
+        # At first, hands turn as their palms.
         R = palm_frames(_palms(hands)) @ self.palms.mT
         for steps in FINGER_ROUNDS:
             turns = self._turned(R, hands, seen, steps)
@@ -141,6 +142,7 @@ class Fingers(nn.Module):
 
     def _posed(self, turns: Tensor) -> Tensor:
         """``[B, 42, 3]`` landmarks of hands at rest with turned fingers."""
+        # The second joint of a finger turns after the first.
         first, second = axis_angle_to_matrix(turns).chunk(2, dim=1)
         base_bone = (first @ self.bones[:, 0].unsqueeze(-1)).squeeze(-1)
         middle = (self.rest[self.chains[:, 0]] + base_bone).unsqueeze(2)

@@ -215,6 +215,7 @@ def blend_transforms(
 
     Source: paper Sec. 3.4, ``x_o = (Σ_b w_b ΔB_b) x_c``.
     """
+    # Weights that sum to 1.
     weight = bone_weight.to(transforms.dtype)
     weight = weight / weight.sum(-1, keepdim=True)
 

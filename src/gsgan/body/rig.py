@@ -51,7 +51,7 @@ SMPL: dict[str, Chain] = {
     "foot": (("{}_ankle", 1.0),),
     "toe": (("{}_foot", 1.0),),
 }
-# Standard deviation of each number about the rest pose: wide where a joint turns freely, narrow
+# Standard deviation of each number about the rest pose: wide if a joint turns freely, narrow
 # across hinges and if 33 landmarks do not determine the turn. That of `TRUNK` is learnt.
 NUMBER_SIGMAS = {
     "neck": 0.5,
@@ -256,6 +256,8 @@ def rest_axes(body: MarkedBody) -> tuple[Tensor, Tensor, Tensor]:
     """Unit left, up and front of the rest pose, from its hips and shoulders."""
     l_sh, r_sh = body.landmarks[list(MEDIAPIPE33.shoulders)]
     l_hip, r_hip = body.landmarks[list(MEDIAPIPE33.hips)]
+
+    # The spine's part orthogonal to the line of the hips points up.
     left = normalize(l_hip - r_hip, dim=0)
     up = _across(l_sh + r_sh - l_hip - r_hip, left)
     return left, up, torch.linalg.cross(left, up)
@@ -387,6 +389,7 @@ def _limb(names: tuple[str, ...], words: str, axes: LimbAxes) -> Limb:
 
 def ancestors(parent: Tensor) -> Tensor:
     """``[T, T]`` bool: whether the turn of a row follows that of a column, itself included."""
+    # Parents come before their children.
     above = torch.eye(len(parent), dtype=torch.bool)
     for i, p in enumerate(parent.tolist()):
         if p >= 0:

@@ -121,7 +121,7 @@ class SkinnedBody:
 
 @dataclass(frozen=True, kw_only=True)
 class MarkedBody(SkinnedBody):
-    """A skinned body with MediaPipe's 33 pose landmarks; NaN where the body does not define one."""
+    """A skinned body with MediaPipe's 33 pose landmarks; NaN if the body does not define one."""
 
     landmarks: Tensor  # [33, 3] rest positions, metres
     landmark_bone: Tensor  # [33] int64, the joint that each landmark moves with
@@ -139,6 +139,7 @@ def carry(transforms: Tensor, points: Tensor, bones: Tensor | None = None) -> Te
 
 def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     """``[V, 3]`` outward unit normals, faces weighted by their area; zero without a face."""
+    # Twice the area along each face's normal, summed over the faces of a vertex.
     a, b, c = vertices[faces].unbind(1)
     face = torch.linalg.cross(b - a, c - a)
     summed = torch.zeros_like(vertices)
@@ -169,6 +170,8 @@ class WeightGradients(nn.Module):
     def __init__(self, body: SkinnedBody, chosen: Tensor) -> None:
         super().__init__()
         self.joints = len(body.joints)
+
+        # The rows of the operator are the axes of each vertex.
         operator = surface_gradient(body.vertices, body.faces, chosen)
         places = body.vertices[chosen].float()
         buffers = {
@@ -184,16 +187,16 @@ class WeightGradients(nn.Module):
     def forward(self, index: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
         """The terms of `gsgan.body.lbs.stretched` for these skinning weights.
 
-        Only the KEPT bones of each vertex whose weights change most are used. The gradients of
-        their weights are shifted to sum to zero, as those of all bones do.
+        Only the `KEPT_BONES` bones of each vertex whose weights change most are used. The gradients
+        of their weights are shifted to sum to zero, as those of all bones do.
 
         Args:
             index, weight: ``[N, n]`` bones of each chosen vertex and their weights.
 
         Returns:
-            ``[3 N, 4 KEPT]``: of each chosen vertex and axis, columns of the bones' transforms,
-            int64 from 0 to 4 J, and their factors: products of the vertex's position and the
-            gradients.
+            ``[3 N, 4 KEPT_BONES]``: for each chosen vertex and axis, columns of the bones'
+            transforms, int64 from 0 to 4 J, and their factors: products of the vertex's position
+            and the gradients.
         """
         # The gradients [N, 3, J] of all bones' weights.
         weight = (weight / weight.sum(dim=1, keepdim=True)).to(self.values)
@@ -229,6 +232,7 @@ def surface_gradient(vertices: Tensor, faces: Tensor, chosen: Tensor) -> csr_arr
         ``[3 N, N]``, times ``[N]`` numbers: their gradients at these vertices, axis by axis. A
         vertex without a neighbour has the gradient zero.
     """
+    # Edges a to b between chosen vertices.
     x = vertices.double()
     normals = vertex_normals(x, faces)[chosen]
     a, b = neighbours_on_surface(x, faces, chosen).T

@@ -183,6 +183,7 @@ class SkinnedModel:
     @cached_property
     def bones(self) -> tuple[Tensor, Tensor]:
         """``[V, n]`` joints and weights of each vertex, n the largest number per vertex: exact."""
+        # Weights of zero are last in each row.
         n = int((self.weights > 0).sum(dim=1).max())
         weight, index = self.weights.sort(dim=1, descending=True, stable=True)
         return index[:, :n].contiguous(), weight[:, :n].contiguous()
@@ -378,6 +379,7 @@ def from_zju(Rh: ArrayLike, Th: ArrayLike, J0: ArrayLike) -> tuple[Floats, Float
 
     Source: the release's loaders.
     """
+    # Both are equal at the root joint: R J0 + Th = J0 + transl.
     orient = np.asarray(Rh, np.float64)
     root = np.asarray(J0, np.float64)
     R = axis_angle_to_matrix(torch.from_numpy(orient)).numpy()

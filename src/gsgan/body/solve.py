@@ -100,19 +100,19 @@ class Solver(nn.Module):
     """
 
     joints: Tensor  # [J, 3] rest
-    # [N, 3] rest, 0 where not known: 33, and 3 of each hand of the free body
+    # [N, 3] rest, 0 if not known: 33, and 3 of each hand of the free body
     landmarks: Tensor
     known: Tensor  # [N] bool
     replaced: Tensor  # [2, 33] bool, `ON_HANDS`
     precision: Tensor  # [33] of the body's own landmarks
     prior: Tensor  # [D, D] precisions
-    least: Tensor  # [D]
+    least: Tensor  # [D] minimum of each number
     matrix: Tensor  # [D, 3 T] from numbers to the turns' axis-angles
     follows: Tensor  # [E, N, 1] bool, whether a landmark follows an entry's turn
     jumps: Tensor  # [n, T + 1]
-    before: Tensor  # [T]
-    rest_hubs: Tensor  # [3, 3, 3]
-    rest_hips: Tensor  # [3]
+    before: Tensor  # [T] the turn before each, T for the root's
+    rest_hubs: Tensor  # [3, 3, 3] frames of pelvis, chest and head
+    rest_hips: Tensor  # [3] the middle of the hips
     joint: Tensor  # of `BodyRig`, like the others
     entry_turn: Tensor
     entry_number: Tensor
@@ -577,6 +577,7 @@ def _settings() -> dict[str, float]:
 def _noise() -> Tensor:
     """``[33]`` metres, the standard deviation of each landmark."""
     noise = torch.full((len(MEDIAPIPE33.names),), LANDMARK_NOISE)
+    # Landmarks that detectors locate less well.
     noise[list(MEDIAPIPE33.face)] = FACE_NOISE
     noise[KNUCKLES] = KNUCKLE_NOISE
     return noise
@@ -595,6 +596,7 @@ def _jumps(parent: Tensor) -> Tensor:
 
 def _solved(H: Tensor, g: Tensor) -> Tensor:
     """``H⁻¹ g`` for positive definite ``H [B, D, D]``."""
+    # Without a check, which would wait for the device.
     factor, _ = torch.linalg.cholesky_ex(H)
     return torch.cholesky_solve(g.unsqueeze(-1), factor).squeeze(-1)
 

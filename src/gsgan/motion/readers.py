@@ -85,7 +85,7 @@ LEG_UNITS = {
 
 @dataclass(frozen=True)
 class Source:
-    """What readers may need besides the file."""
+    """Settings that readers may need besides the file."""
 
     subject: Proportions  # the subject's proportions, for formats without face, hands and scale
     smpl: Path | None = None  # an SMPL or SMPL-X model file, or None

@@ -49,11 +49,11 @@ class Points:
     """The points of a body in a batch of poses; P parts: limbs, then face, then torso.
 
     On a skinned body (`gsgan.model.body_points`) each point is a part, whose frame may shear, and
-    normals are shorter than 1, down to zero, where the skin is flat.
+    normals are shorter than 1, down to zero, if the skin is flat.
     """
 
     means: Tensor  # [B, N, 3] metres, world frame
-    rotations: Tensor  # [B, P, 3, 3] frames of the parts
+    rotations: Tensor  # [B, P, 3, 3] frames of the parts in the world
     origins: Tensor  # [B, P, 3] metres, world frame: origin of each part's frame
     scales: Tensor  # [B, N] metres, initial standard deviation, isotropic
     valid: Tensor  # [B, N] bool, False on parts whose joints are unseen
@@ -301,6 +301,7 @@ class Densify(nn.Module):
 
     def _longest(self, q: Tensor, pairs: Tensor) -> Tensor:
         """``[B]`` metres: the longest distance over pairs of joints, never zero."""
+        # Never zero, so that the gradient of the root is finite.
         d = q.index_select(1, pairs[0]) - q.index_select(1, pairs[1])
         return (d.square().sum(-1).amax(-1) + MIN_LENGTH**2).sqrt()
 
@@ -354,6 +355,7 @@ def _turned(cylinder: Samples, radius: float, axes: Array) -> Samples:
 
 def even_cylinder(n: int) -> Samples:
     """``n`` points on the unit cylinder: evenly spaced in height, a golden angle apart."""
+    # The angle of each point, and its unit normal.
     k = np.arange(n)
     turn = 2 * np.pi * np.modf(k * GOLDEN)[0]
     normals = np.stack([np.cos(turn), np.sin(turn), np.zeros(n)], axis=-1)
@@ -386,6 +388,7 @@ def even_box(n: int, extents: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> S
     points = []
     normals = []
     for face, count in enumerate(counts):
+        # The R2 sequence on a face, as its two other coordinates.
         axis = face // 2
         sign = 1.0 - 2.0 * (face % 2)
         k = np.arange(count)[:, None] + 1

@@ -134,6 +134,7 @@ def _nearest(
     along_x: Tensor, along_y: Tensor, across_x: Tensor, across_y: Tensor, length: Tensor
 ) -> Tensor:
     """``[B, h, w]`` squared pixels to the nearest of one group's segments ``[B, S, ...]``."""
+    # The distance along the segment beyond its ends, and that from its line.
     beyond = F.softshrink(along_x + along_y, 0.5) * length  # 0 between the ends
     across = across_x + across_y
     return torch.addcmul(across * across, beyond, beyond).amin(1)

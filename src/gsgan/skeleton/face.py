@@ -27,6 +27,7 @@ def _lid(side: str) -> tuple[str, ...]:
     return tuple(f"{side}_lid_{name}" for name in LID_POINTS)
 
 
+# Left and right.
 BROWS = (_brow("left"), _brow("right"))
 LIDS = (_lid("left"), _lid("right"))
 FACE_NAMES = (*LIPS, *BROWS[0], *BROWS[1], *LIDS[0], *LIDS[1])
@@ -80,7 +81,7 @@ def rest_face() -> tuple[Vector, ...]:
 
 
 def face_mirror(start: int) -> tuple[int, ...]:
-    """Per landmark its counterpart's number, where the first one has the number ``start``."""
+    """Per landmark its counterpart's number, if the first one has the number ``start``."""
     return tuple(start + FACE_NAMES.index(_twin(name)) for name in FACE_NAMES)
 
 

@@ -114,6 +114,7 @@ def bone_frames(
 
 def swings(bones: Tensor, parent: Tensor, level: Level) -> Tensor:
     """``[B, M, 3, 3]`` frames relative to ``parent [B, M, 3, 3]`` of a level's ``[B, M, 3]``."""
+    # Short bones swing only in part.
     directions, _ = _shortened(bones)
     return level.swing.to((directions.unsqueeze(-2) @ parent).squeeze(-2))
 
@@ -139,9 +140,9 @@ def _trunk(q: Tensor, c: Constants) -> Tensor:
     lines = across(up, lines)
 
     # A short line fades to the other one, and this to the world's x axis, or, if the spine lies
-    # along it, to the axis that is least along the spine.
-    least = c.axes[up.detach().abs().argmin(-1).squeeze(1)].unsqueeze(1)
-    axis = torch.where(up[..., :1].abs() < 0.9, c.axes[0], least)
+    # along it, to the axis that is farthest from the spine's direction.
+    farthest = c.axes[up.detach().abs().argmin(-1).squeeze(1)].unsqueeze(1)
+    axis = torch.where(up[..., :1].abs() < 0.9, c.axes[0], farthest)
     other = _faded(lines.flip(1), unit(across(up, axis)))
     lines = _faded(lines, other)
     # Once more: a line nearly along the spine keeps the rounding of its long part.
@@ -198,6 +199,7 @@ def _faded(v: Tensor, fallback: Tensor) -> Tensor:
     No continuous map from the ball to the sphere is the identity on the surface, so one point must
     jump: here the v opposite to the fallback, where the two cancel.
     """
+    # In units of the minimum length, the fallback's share is 1 - |v|².
     v = v / MIN_LENGTH
     v = v + (1 - v.square().sum(-1, keepdim=True)).clamp_min(0) * fallback
     lost = v.square().sum(-1, keepdim=True) < FOLDED

@@ -69,6 +69,8 @@ def _hand_at_rest() -> np.ndarray:
     index = rest["left_index"]
     pinky = rest["left_pinky"]
     thumb = rest["left_thumb"]
+
+    # Fingers point from the wrist to the middle of the knuckles.
     along = (index + pinky) / 2 - wrist
     along = along / np.linalg.norm(along)
     p = np.zeros((HAND, 3))
@@ -151,6 +153,7 @@ def _with_hands() -> SkeletonTemplate:
 
 def _with_face(hands: SkeletonTemplate) -> SkeletonTemplate:
     """A template with the 30 landmarks of a face, which have no limbs."""
+    # The face's landmarks follow those of the hands.
     start = len(hands.names)
     groups = face_groups(start)
     edges = tuple(edge for _, group in groups for edge in group)

@@ -23,7 +23,7 @@ def rotation_from_6d(x: Tensor, eps: float = 1e-5) -> Tensor:
 
     The columns need not be unit or orthogonal. A first column shorter than ``eps`` is
     replaced by the x axis; a second one whose part orthogonal to the first is shorter than ``eps``
-    times its own length (or than ``eps``) by the axis least along the first. The result is always
+    times its own length (or than ``eps``) by the axis farthest from the first. The result is always
     a rotation with a finite gradient; the gradient of replaced columns is zero.
 
     Args:
@@ -59,9 +59,10 @@ def rotation_from_6d(x: Tensor, eps: float = 1e-5) -> Tensor:
 
 
 def orthogonal_to(axis: Tensor) -> Tensor:
-    """``[..., 3]`` unit vectors orthogonal to unit vectors: the world axis least along each."""
-    least = axis.abs().argmin(dim=-1, keepdim=True)
-    world_axis = torch.zeros_like(axis).scatter(-1, least, 1.0)
+    """``[..., 3]`` unit vectors orthogonal to unit vectors: the world axis farthest from each."""
+    # The axis with the smallest component, as a one-hot vector.
+    farthest = axis.abs().argmin(dim=-1, keepdim=True)
+    world_axis = torch.zeros_like(axis).scatter(-1, farthest, 1.0)
     return unit(across(axis, world_axis))
 
 

@@ -85,6 +85,8 @@ def sanitise(
     Source: ours; the paper does not treat missing joints.
     """
     check_skeleton("sanitise", p, None, template)
+
+    # Seen joints are finite and visible.
     valid = torch.isfinite(p).all(-1)
     if visibility is not None:
         if visibility.shape != valid.shape:
@@ -95,6 +97,8 @@ def sanitise(
         valid = valid & (visibility > 0)
     if bool(valid.all()):
         return p, valid
+
+    # Estimated hips are used, but not marked as seen.
     placed = valid | _estimated_hips(p, valid, template)
     _refuse_without_trunk(placed, template)
     return _filled(p, placed, template, body_height), valid
@@ -301,9 +305,12 @@ def _complete_trunk(
     q: Tensor, valid: Tensor, template: SkeletonTemplate, c: Constants
 ) -> Tensor:
     """One missing corner: its partner plus the other line, scaled by the rest skeleton's ratio."""
+    # The ratio of the lines between shoulders and between hips at rest.
     l_sh, r_sh, l_hip, r_hip = c.rest.index_select(0, c.torso)
     ratio = (l_sh - r_sh).norm() / (l_hip - r_hip).norm()
     l_sh, r_sh, l_hip, r_hip = q.index_select(1, c.torso).unbind(1)
+
+    # Each corner from its partner, by the other line.
     hips = (l_hip - r_hip) * ratio
     shoulders = (l_sh - r_sh) / ratio
     corners = [

@@ -122,6 +122,7 @@ class SkeletonTemplate:
     @property
     def rest_torso(self) -> Vector:
         """Metres: edges (left-right, up, front) of the trunk's box in the rest pose."""
+        # As wide as shoulders or hips, as high as the spine, half as deep as wide.
         l_sh, r_sh, l_hip, r_hip = np.asarray(self.rest_positions)[list(self.torso)]
         width = float(max(np.linalg.norm(l_sh - r_sh), np.linalg.norm(l_hip - r_hip)))
         height = float(np.linalg.norm((l_sh + r_sh - l_hip - r_hip) / 2))
@@ -147,6 +148,7 @@ def _mirrored(v: Vector) -> Vector:
 
 def _across(axis: Vector, direction: Vector) -> Vector:
     """The part of ``axis`` orthogonal to the unit ``direction``, normalised."""
+    # The part along the direction is subtracted.
     along = sum(a * d for a, d in zip(axis, direction, strict=True))
     return _unit(*(a - along * d for a, d in zip(axis, direction, strict=True)))
 

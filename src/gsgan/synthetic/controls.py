@@ -1,4 +1,4 @@
-"""What a choreography controls, as smooth functions of time, and programmes of its passages.
+"""Controls of a choreography as smooth functions of time, and programmes of its passages.
 
 Lengths are metres of a person whose legs (hip to ankle) measure `LEG` and arms (shoulder to wrist)
 `ARM`; Z is up; the person faces -Y at the start and stands on z = 0. Passages describe where body,
@@ -197,6 +197,6 @@ def controls_at(times: Array, seed: int, programme: Programme) -> Controls:
 
 
 def smoothstep(x: Array) -> Array:
-    """0 below 0, 1 above 1, a cubic between."""
+    """0 below 0, 1 above 1, a cubic between: 3 x² - 2 x³."""
     x = np.clip(x, 0, 1)
     return x * x * (3 - 2 * x)

@@ -89,6 +89,7 @@ def _standing(
     times: Array, seed: int, foot: int, programme: Programme
 ) -> tuple[Array, Array]:
     """Where a foot should stand ``[F, 3]`` (x, y, heading), and the march's height ``[F]``."""
+    # After the end, the person stays.
     times = times.clip(max=programme.duration - 1e-6)
     c = controls_at(times, seed, programme)
 

@@ -49,6 +49,8 @@ def mixamo_name(joint: str) -> str:
     """Mixamo's name of a joint of the free body."""
     if joint in TRUNK_BONES:
         return TRUNK_BONES[joint]
+
+    # Other names end with their side.
     part, _, letter = joint.partition(".")
     side = {"L": "Left", "R": "Right"}.get(letter, "")
     if part in SIDED_BONES:

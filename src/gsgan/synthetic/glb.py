@@ -49,6 +49,8 @@ class Glb:
         for name in self.doc.extensionsRequired or ():
             if name in UNSUPPORTED:
                 raise DataError(f"{path}: {name} is not supported; export it without")
+
+        # The binary chunk and the cache of its views.
         self._blob = self.doc.binary_blob() or b""
         self._views: dict[int, tuple[Any, int]] = {}
 

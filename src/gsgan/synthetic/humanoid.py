@@ -80,6 +80,7 @@ def vrm_bone(name: str, version: int) -> str | None:
 
 def mixamo_bone(name: str) -> str | None:
     """Mixamo's name without prefix of a bone, None for other bones."""
+    # Without namespaces and separators.
     plain = re.sub(r"^.*[:|]|^mixamorig\d*_?|[ _.-]", "", name)
     return CANONICAL.get(re.sub(r"^mixamorig\d*", "", plain).lower())
 
@@ -96,6 +97,8 @@ def humanoid_bones(
         pairs = [(bone["node"], vrm_bone(bone["bone"], 0)) for bone in bones]
     else:
         pairs = [(node, mixamo_bone(name or "")) for node, name in enumerate(names)]
+
+    # The first node of each bone counts.
     found: dict[str, int] = {}
     for node, bone in pairs:
         if bone is not None:

@@ -200,6 +200,7 @@ def texture_lab(c: Character, uv: Array, material: Ints) -> Array:
 
 def _lab(c: Character) -> Array:
     """``[F, 3]`` CIELAB colour of each face, lightness halved: the mean of four points."""
+    # Barycentric weights of the middle and of a point near each corner.
     points = np.vstack([np.full((1, 3), 1 / 3), 0.2 + 0.4 * np.eye(3)])
     uv = np.einsum("pk,fkd->pfd", points, c.uv[c.faces])
     lab = np.mean([texture_lab(c, at, c.material) for at in uv], axis=0)
@@ -208,12 +209,14 @@ def _lab(c: Character) -> Array:
 
 def _neighbours(c: Character) -> Ints:
     """``[E, 2]`` pairs of faces with a common edge, vertices at one place taken as one."""
+    # The number of each vertex's place.
     _, place = np.unique(np.round(c.vertices, 5), axis=0, return_inverse=True)
     return trimesh.graph.face_adjacency(faces=place.reshape(-1)[c.faces])
 
 
 def _voted(c: Character, flag: np.ndarray, rounds: int = 4) -> np.ndarray:
     """A flag of faces without its specks: the majority of each face and its neighbours."""
+    # A face votes for itself and for its neighbours.
     pairs = _neighbours(c)
     for _ in range(rounds):
         votes = 2.0 * flag - 1

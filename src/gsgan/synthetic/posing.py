@@ -82,7 +82,7 @@ class Choreography:
         pose.lower_hips(ankles)
 
         for i, side in enumerate(SIDES):
-            # The knee points half-way between body and foot, or where a free leg's knee points.
+            # The knee points half-way between body and foot; a free leg has its own direction.
             middle = (c.path[:, 2:] + feet[i].place[:, 2:]) / 2
             pole = rotation(middle * Z) @ (0.1 * SIGN[side], -1.0, 0.0)
             freed = _turned(heading, c.knee[:, i] * (SIGN[side], 1, 1))
@@ -226,6 +226,8 @@ class Choreography:
         shapes["mouth_open"] = 0.7 * mouth
         shapes["mouth_round"] = 0.5 * mouth * vowel + c.round
         shapes["mouth_wide"] = 0.5 * mouth * (1 - vowel) + c.wide
+
+        # Smiles and brows are the same on both sides.
         for side in ("left", "right"):
             shapes[f"smile_{side}"] = 0.8 * c.smile.clip(0, 1)
             shapes[f"brow_up_{side}"] = c.brows.clip(0, 1)
@@ -241,6 +243,8 @@ def _turned(turns: Array, vectors: Array) -> Array:
 def _hand_turn(c: Controls, i: int, side: str) -> Array:
     """``[F, 3, 3]`` the hand's turn in the axes of its `pointing` and `facing`."""
     mirror = np.array([SIGN[side], 1, 1])
+
+    # The palm's direction, orthogonal to the hand's.
     along = unit(c.pointing[:, i] * mirror)
     palm = c.facing[:, i] * mirror
     palm = unit(palm - (palm * along).sum(-1, keepdims=True) * along)
@@ -249,6 +253,7 @@ def _hand_turn(c: Controls, i: int, side: str) -> Array:
 
 def _freed(c: Controls, i: int, foot: FootState) -> FootState:
     """The state of a foot in its steps or, as far as it is free, as the passage places it."""
+    # The place of a free foot, from body axes to the world.
     x, y, out, height, pitch, toes = c.step[:, i].T
     sign = 1 - 2 * i
     heading = c.path[:, 2]
@@ -269,6 +274,7 @@ def _freed(c: Controls, i: int, foot: FootState) -> FootState:
 
 def blinks(times: Array, duration: float, seed: int) -> dict[str, Array]:
     """Weights of the face shapes of both eyes at times ``[F]``: a blink every three seconds."""
+    # Moments in the middle of blinks.
     random = np.random.default_rng([seed, 1])
     moments = np.cumsum(random.uniform(1.5, 4.5, int(duration / 1.5) + 1))
     near = np.exp(-(((times[:, None] - moments) / 0.08) ** 2))

@@ -57,6 +57,8 @@ class RecordedMotion:
             read = read_bvh(path)
         else:
             read, _ = read_amc(path, asf_of(path))
+
+        # Times of the frames, from 0.
         self.duration = len(read.root) * read.frame_time
         self._times = np.arange(len(read.root), dtype=np.float64) * read.frame_time
 
@@ -85,6 +87,7 @@ class RecordedMotion:
 
     def _settle(self, step: float) -> None:
         """Moves the hips near the origin and to the floor, and finds the ankles' targets."""
+        # The floor below the lower sole, and the shift that puts the motion on it.
         leg = self.rig.leg
         pose = self._pose(self._turns, self._hips)
         lows = [pose.lowest(side) for side in SIDES]
@@ -108,6 +111,7 @@ class RecordedMotion:
             self._ankles.append(ankle)
 
     def _pose(self, turns: dict[str, Array], hips: Array) -> Pose:
+        # Hands last: their twist is shared with the forearms.
         pose = Pose(self.rig, hips)
         for bone, turn in turns.items():
             pose.set_turn(bone, turn)

@@ -47,6 +47,7 @@ class Tint:
 
     def __call__(self, image: Array, alpha: Array) -> Array:
         """Tints a premultiplied image ``[H, W, 3]`` with alpha ``[H, W]``."""
+        # Premultiplied colours are between 0 and alpha.
         share = alpha[..., None]
         return np.clip(image @ self.A.T + share * self.b, 0, share)
 
@@ -84,7 +85,7 @@ def _centred(x: Array) -> Array:
 
 
 VERSION = 2
-"""Of the generator. Raise it when any pixel changes: cached datasets are then made again."""
+"""Version of the generator. Raise it when any pixel changes: datasets are then made again."""
 
 # Names of avatars.
 DEFAULT = "polo"
@@ -335,6 +336,7 @@ class Scene:
 
     def mesh(self, frame: int) -> tuple[Array, Array, Wrinkles | None]:
         """Vertices (metres) and unit normals ``[V, 3]`` of a frame, and the wrinkles of cloth."""
+        # Without secondary motion, there are no wrinkles.
         vertices, normals = self._skinned(frame)
         if self.secondary is None:
             return vertices, normals, None

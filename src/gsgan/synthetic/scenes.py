@@ -6,7 +6,7 @@ meta.json last: a dataset that was interrupted is incomplete and is continued. T
 written to any file: a model has to estimate them.
 
 Workers are separate programs rather than children of multiprocessing, which would import the
-user's main script again, and fail where it is a notebook or lacks a ``__main__`` guard.
+user's main script again, and fail if it is a notebook or lacks a ``__main__`` guard.
 """
 
 import contextlib

@@ -232,6 +232,7 @@ class Secondary:
         """``[W]`` 1 on a label, falling smoothly to 0 beyond its hem."""
         c = self.character
         W = len(self._rest)
+        # A person without such clothes has none of it.
         if label not in c.label_names:
             return np.zeros(W)
 

@@ -22,6 +22,7 @@ FLAT_NORMAL = (0.0, 0.0, 1.0)  # a normal map's neutral value
 
 def linear(srgb: Floats) -> Floats:
     """Linear light of sRGB in [0, 1]."""
+    # The standard's curve, linear near black.
     curve = ((srgb + np.float32(0.055)) / np.float32(1.055)) ** np.float32(2.4)
     return np.where(srgb <= 0.04045, srgb / np.float32(12.92), curve)
 

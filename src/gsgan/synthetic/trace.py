@@ -68,6 +68,7 @@ def wave(phase: Floats) -> Floats:
 
 def encode(light: Array) -> Array:
     """sRGB of linear light: exact up to `SHOULDER`, then rolled off, below 1 for any light."""
+    # Above the shoulder, the rest of the range is approached exponentially.
     rest = 1 - SHOULDER
     over = np.maximum(light - SHOULDER, 0)
     light = np.where(over > 0, 1 - rest * np.exp(-over / rest), light)
@@ -275,7 +276,7 @@ class PosedCharacter:
         if depth.min() <= 0:
             return np.ones((H, W), dtype=bool)
 
-        # Pixels of vertices.
+        # Pixels of vertices; far ones are moved to where OpenCV can draw them.
         pixels = np.floor(view.project(self.vertices))
         pixels = np.clip(pixels, -9999, 9999).astype(np.int32)
         edges = np.zeros((H, W), np.uint8)
@@ -422,7 +423,7 @@ class PosedCharacter:
 
 
 def majority(part: Ints, classes: int) -> Ints:
-    """``[n]`` most frequent part of ``[n, rays]``; 0 where more than half the rays miss."""
+    """``[n]`` most frequent part of ``[n, rays]``; 0 if more than half the rays miss."""
     # Votes of each part in each row, counted in one call.
     slot = np.arange(len(part))[:, None] * classes + part
     votes = np.bincount(slot.ravel(), minlength=len(part) * classes)
