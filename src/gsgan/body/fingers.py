@@ -158,6 +158,7 @@ class Fingers(nn.Module):
 
     def shown(self, seen: Tensor) -> Tensor:
         """``[B, 20]`` bool: the joints that the landmarks ``seen [B, 42]`` bool determine."""
+        # A first joint needs its own bone, a second joint one landmark beyond it.
         base, middle, next_one, tip = seen[:, self.chains].unbind(-1)
         placed = self.placed(seen).repeat_interleave(len(FINGERS), dim=1)
         first = base & middle & placed
@@ -229,6 +230,7 @@ def _velocities(axes: Tensor, arms: Tensor) -> Tensor:
 
 def _palms(hands: Tensor) -> Tensor:
     """The palms' landmarks ``[B, 2, 3, ...]`` of ``hands [B, 42, ...]``."""
+    # The left hand, then the right one.
     palm = constant(PALM, hands, torch.int64)
     return hands.unflatten(1, (2, HAND)).index_select(2, palm)
 

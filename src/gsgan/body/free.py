@@ -42,6 +42,7 @@ class Body(MarkedBody):
 
 def majority_vertex_labels(faces: Tensor, face_labels: Tensor, vertices: int) -> Tensor:
     """``[V]`` int64: the label of most faces around a vertex, the lowest one on a tie."""
+    # Votes of each label at each vertex, counted in one call.
     classes = int(face_labels.max()) + 1
     votes = torch.zeros(vertices * classes, dtype=torch.int64, device=faces.device)
     slot = faces * classes + face_labels[:, None]

@@ -117,6 +117,7 @@ class BodyShape:
         Raises:
             ValueError: when the count is that of no shape.
         """
+        # Hands and spine are left out if they are None.
         sizes = [free_space().coefficients, len(STRETCHED), math.prod(LANDMARKS)]
         hands = math.prod(HANDS_SHAPE)
         counts = [sum(sizes) + more for more in (0, 1, hands, hands + 1)]
@@ -198,6 +199,7 @@ def group_of(joint: str) -> str:
 
 def limb_axes(body: MarkedBody) -> Tensor:
     """``[J, 3]`` unit direction of the limb that a joint belongs to, zero outside limbs."""
+    # A limb may have several joints, as the two of the free body's upper arm.
     groups = [group_of(name) for name in body.joint_names]
     axes = torch.zeros_like(body.joints)
     for joint, group in enumerate(groups):

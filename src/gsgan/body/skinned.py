@@ -266,6 +266,7 @@ def neighbours_on_surface(vertices: Tensor, faces: Tensor, chosen: Tensor) -> Te
     Each vertex belongs to the chosen one that is nearest along the edges; two chosen vertices are
     neighbours if an edge joins what belongs to them. With all vertices chosen these are the edges.
     """
+    # The edges of all faces, and their lengths.
     edges = torch.cat([faces[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
     start, end = edges.T
     length = (vertices[end] - vertices[start]).norm(dim=1).clamp_min(1e-9)

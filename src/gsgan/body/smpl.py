@@ -242,6 +242,7 @@ class SkinnedModel:
         Raises:
             ValueError: on shapes that do not fit, naming the argument.
         """
+        # The transforms of the shaped skeleton's joints.
         rotations = axis_angle_to_matrix(theta.to(self.v_template))
         rest = self.rest_joints(betas, expression).expand(len(theta), -1, -1)
         transforms = forward_kinematics(rest, self.parents, rotations, transl.to(rest))

@@ -418,6 +418,7 @@ class Solver(nn.Module):
 
     def rotations(self, q: Tensor, root: Tensor) -> Tensor:
         """``[B, T, 3, 3]`` of each turn."""
+        # The root's turn is about its rotation so far.
         R = axis_angle_to_matrix((q @ self.matrix).unflatten(1, (-1, 3)))
         return torch.cat([R[:, :1] @ root.unsqueeze(1), R[:, 1:]], dim=1)
 
@@ -603,6 +604,7 @@ def _solved(H: Tensor, g: Tensor) -> Tensor:
 
 def below_least(q: Tensor, least: Tensor) -> tuple[Tensor, Tensor]:
     """Precisions and amounts of numbers ``q [B, D]`` below their minimum ``least [D]``."""
+    # Numbers above their minimum are free.
     below = (q - least).clamp_max(0)
     return (below < 0) / BEYOND**2, below
 

@@ -230,6 +230,7 @@ class _Face:
 
     def at(self, x: float, z: float) -> int:
         """The vertex seen at a place of the face; the nearest on its skin beside the map."""
+        # The ray that is nearest to the place.
         row = np.abs(self.z - z).argmin()
         column = np.abs(self.x - x).argmin()
         vertex = int(self.vertex[row, column])
@@ -257,6 +258,8 @@ class _Face:
         for side, sign, eye in zip(("left", "right"), (1, -1), self.eyes, strict=True):
             found |= self._eye(side, sign, eye)
             found |= self._brow(side, sign, eye)
+
+            # The vertex nearest to the mean of the outermost ones.
             outwards = np.where(level, sign * x[:, 0], -np.inf)
             ear = x[outwards > outwards.max() - 0.012].mean(axis=0)
             far = np.linalg.norm(x - ear, axis=1)

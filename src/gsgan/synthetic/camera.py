@@ -40,6 +40,7 @@ class SceneCamera:
     def project(self, points: Array) -> Array:
         """``[N, 2]`` pixels of world points ``[N, 3]``, all in front of the camera."""
         x = points @ self.R.T + self.t
+        # The lens acts before the intrinsics.
         if self.dist is not None:
             shown = distort(x[:, :2] / x[:, 2:], self.dist)
             return shown @ self.K[:2, :2].T + self.K[:2, 2]
@@ -70,6 +71,7 @@ def pixel_offsets(rays: int) -> Array:
 
 def pixel_rays(view: SceneCamera, x: Ints, y: Ints, rays: int) -> tuple[Array, Array]:
     """Origin ``[3]`` and unit directions ``[N*rays, 3]`` of a pinhole's pixels ``x, y [N]``."""
+    # Positions of the rays in the image, and their directions in the world.
     offset = pixel_offsets(rays)
     across = (x[:, None] + offset[:, 0]).ravel()
     down = (y[:, None] + offset[:, 1]).ravel()

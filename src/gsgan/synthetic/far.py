@@ -77,6 +77,7 @@ def _programme(path: Path) -> Programme:
     data = yaml.safe_load(path.read_text(encoding="utf-8"))
     passages = []
     for name, keys in data["passages"].items():
+        # The poses that are named together make one, the last one's values taking precedence.
         seconds = float(keys.pop("seconds"))
         poses: dict[float, dict[str, Any]] = {}
         for share, pose_names in keys.items():

@@ -120,13 +120,10 @@ class _Skeleton:
                 f"include {', '.join(missing[:6])}{more}; name them as Mixamo or VRM does"
             )
 
-        parents = []
-        joints = []
-        for i in self.ids:
-            parents.append(self.bone_above(self.above.get(i, -1)))
-            joints.append(self.world(i)[:3, 3])
-        self.parents = np.array(parents)
-        self.joints = np.array(joints)
+        # Parents and rest positions.
+        above = [self.above.get(i, -1) for i in self.ids]
+        self.parents = np.array([self.bone_above(node) for node in above])
+        self.joints = np.array([self.world(i)[:3, 3] for i in self.ids])
 
     def ancestors(self, node: int) -> list[int]:
         """Nodes above a node, from its parent to the root."""
@@ -243,6 +240,7 @@ def _part(glb: Glb, skeleton: _Skeleton, number: int, primitive: Any) -> _Part:
     if f"TEXCOORD_{uv_set}" in attributes:
         uv = glb.accessor(attributes[f"TEXCOORD_{uv_set}"])
 
+    # Exporters store the names of shapes with the mesh or with the primitive.
     names = (mesh.extras or primitive.extras or {}).get("targetNames", ())
     return _Part(
         name=f"{node.name} {mesh.name}",
@@ -426,6 +424,7 @@ def _standing(skeleton: _Skeleton, vertices: Array) -> _Standing:
 
 def _unit_normals(normals: Array, vertices: Array, faces: Ints) -> Array:
     """Unit normals; missing ones are means of the faces' normals, weighted by area."""
+    # The file's normals, where it has any.
     made = vertex_normals(torch.from_numpy(vertices), torch.from_numpy(faces)).numpy()
     given = np.abs(normals).sum(axis=1, keepdims=True) > 0
     normals = np.where(given, normals, made)

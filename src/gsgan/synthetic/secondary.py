@@ -32,24 +32,31 @@ class LooseCloth(NamedTuple):
     share: float  # of the full sway
 
 
+def _sleeve(side: str) -> LooseCloth:
+    return LooseCloth(
+        label="upper_clothes",
+        bones=(f"{side}Arm", f"{side}ForeArm", f"{side}Hand"),
+        origin=f"{side}Arm",
+        start=0.05,
+        full=0.28,
+        share=1.0,
+    )
+
+
+def _trouser_leg(side: str) -> LooseCloth:
+    return LooseCloth(
+        label="lower_clothes",
+        bones=(f"{side}UpLeg", f"{side}Leg", f"{side}Foot"),
+        origin=f"{side}UpLeg",
+        start=0.15,
+        full=0.85,
+        share=0.8,
+    )
+
+
 LOOSE_CLOTH = (
-    # Sleeves.
-    LooseCloth(
-        label="upper_clothes",
-        bones=("LeftArm", "LeftForeArm", "LeftHand"),
-        origin="LeftArm",
-        start=0.05,
-        full=0.28,
-        share=1.0,
-    ),
-    LooseCloth(
-        label="upper_clothes",
-        bones=("RightArm", "RightForeArm", "RightHand"),
-        origin="RightArm",
-        start=0.05,
-        full=0.28,
-        share=1.0,
-    ),
+    _sleeve("Left"),
+    _sleeve("Right"),
     # The shirt on the trunk, and its hem on the thighs.
     LooseCloth(
         label="upper_clothes",
@@ -67,23 +74,8 @@ LOOSE_CLOTH = (
         full=0.60,
         share=0.5,
     ),
-    # Trouser legs.
-    LooseCloth(
-        label="lower_clothes",
-        bones=("LeftUpLeg", "LeftLeg", "LeftFoot"),
-        origin="LeftUpLeg",
-        start=0.15,
-        full=0.85,
-        share=0.8,
-    ),
-    LooseCloth(
-        label="lower_clothes",
-        bones=("RightUpLeg", "RightLeg", "RightFoot"),
-        origin="RightUpLeg",
-        start=0.15,
-        full=0.85,
-        share=0.8,
-    ),
+    _trouser_leg("Left"),
+    _trouser_leg("Right"),
     # A skirt.
     LooseCloth(
         label="lower_clothes",
@@ -262,8 +254,7 @@ class Secondary:
         loose = np.zeros(len(self._rest))
         for cloth in LOOSE_CLOTH:
             of_label = self._share_of(cloth.label)
-            known = cloth.origin is None or cloth.origin in self._index
-            if not of_label.any() or not known:
+            if not of_label.any() or cloth.origin not in (None, *self._index):
                 continue
 
             # The point that the cloth hangs from.
