@@ -6,7 +6,7 @@ rest frame is aligned with the world's axes: zero rotations are the rest pose.
 
 from collections.abc import Sequence
 from functools import lru_cache
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import NamedTuple
 
 import torch
@@ -164,17 +164,17 @@ class KinematicPlan(NamedTuple):
 def kinematic_plan(parents: tuple[int, ...]) -> KinematicPlan:
     """The plan of a skeleton with these parents, -1 for a root."""
     levels = kinematic_levels(parents)
-    order = tuple(joint for level in levels for joint in level)
+    order = tuple(chain.from_iterable(levels))
     own_parents = [joint if parents[joint] < 0 else parents[joint] for joint in order]
     parent_places = []
     for above, level in pairwise(levels):
         parent_places.append(tuple(above.index(parents[joint]) for joint in level))
     return KinematicPlan(
-        level_sizes=[len(level) for level in levels],
+        level_sizes=list(map(len, levels)),
         order=order,
         parents=tuple(own_parents),
         parent_places=tuple(parent_places),
-        inverse=tuple(order.index(joint) for joint in range(len(parents))),
+        inverse=tuple(map(order.index, range(len(parents)))),
     )
 
 

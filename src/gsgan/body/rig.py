@@ -8,7 +8,7 @@ joint, its axis-angle v linear in the body's numbers; a joint has one or more, a
 import json
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import chain, pairwise
+from itertools import chain, pairwise, product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -77,8 +77,8 @@ HINGE_MINIMA = {"knee": -0.1, "elbow": -0.7}
 SIDE_LETTERS = {"left": "L", "right": "R"}
 SPINE = ("spine1", "spine2", "spine3")  # from the pelvis to the chest
 TRUNK = (
-    *(f"{joint}_{axis}" for joint in SPINE for axis in "xyz"),
-    *(f"{side}_collar_{axis}" for side in SIDE_LETTERS for axis in "yz"),
+    *map("_".join, product(SPINE, "xyz")),
+    *map("_collar_".join, product(SIDE_LETTERS, "yz")),
 )
 BENT = 0.15  # sine: an elbow that is bent more at rest determines its hinge
 AT_JOINT = 1e-4  # metres

@@ -3,6 +3,7 @@
 Source: public loaders.
 """
 
+from itertools import product
 from typing import Literal, get_args
 
 Parts = Literal["clothes", "cihp", "joints"]
@@ -34,8 +35,8 @@ _BODY = (
 )
 # SMPL-X's order, not MediaPipe's.
 _FINGERS = ("index", "middle", "pinky", "ring", "thumb")
-_HAND = tuple(f"{finger}{joint}" for finger in _FINGERS for joint in (1, 2, 3))
-_HANDS = tuple(f"{side}_{name}" for side in ("left", "right") for name in _HAND)
+_HAND = tuple(map("".join, product(_FINGERS, "123")))
+_HANDS = tuple(map("_".join, product(("left", "right"), _HAND)))
 SMPL_JOINTS = (*_BODY, "left_hand", "right_hand")
 SMPLX_JOINTS = (*_BODY, "jaw", "left_eye", "right_eye", *_HANDS)
 

@@ -191,7 +191,7 @@ def _read_frames(
         elif frames:
             if key not in bones:
                 raise ValueError(f"it moves a bone {key}, which the skeleton lacks")
-            frames[-1][key] = [float(number) for number in numbers]
+            frames[-1][key] = list(map(float, numbers))
     if not frames:
         raise ValueError("it has no frames")
 
@@ -248,9 +248,14 @@ def _motion(path: Path, skeleton: _Skeleton) -> RigMotion:
     for name in names[1:]:
         starts.append(bones[parents[name]].end)
         above.append(index[parents[name]])
-    last = [name for name in names if name not in parents.values()]
-    at_last = [index[name] for name in last]
-    ends = [bones[name].end for name in last]
+    last = []
+    at_last = []
+    ends = []
+    for j, name in enumerate(names):
+        if name not in parents.values():
+            last.append(name)
+            at_last.append(j)
+            ends.append(bones[name].end)
 
     # CMU's wrist bone is the lower half of the forearm: the hand starts at the hand bone.
     plain = [re.sub("wrist$", "lowerforearmtwist", name) for name in names]

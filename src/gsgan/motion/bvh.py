@@ -134,16 +134,19 @@ def _rig_motion(joints: list[_Joint], values: Array, frame_time: float) -> RigMo
             given = given + offsets[j]
         local[:, j] = given
         rotations[:, j] = R
-    names = tuple(joint.name for joint in joints)
-    parents = tuple(joint.parent for joint in joints)
+    names = []
+    parents = []
+    for joint in joints:
+        names.append(joint.name)
+        parents.append(joint.parent)
 
     # Bones move if there are several roots, or if a joint leaves the place that its OFFSET gives.
     tolerance = REST_TOLERANCE * np.abs(offsets).max()
     leaves_offset = np.abs(local[:, 1:] - offsets[1:]) > tolerance
     moving_bones = parents.count(-1) > 1 or bool(leaves_offset.any())
     return RigMotion(
-        names=names,
-        parents=parents,
+        names=tuple(names),
+        parents=tuple(parents),
         offsets=offsets,
         rotations=rotations,
         root=local[:, 0],

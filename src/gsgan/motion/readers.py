@@ -431,7 +431,7 @@ def _landmark_row(where: str, frame: Any) -> Float:
 
     # 33 landmarks of 4 numbers.
     try:
-        rows = [_numbers(point) for point in points]
+        rows = list(map(_numbers, points))
     except TypeError:
         rows = []
     row = as_floats(rows)

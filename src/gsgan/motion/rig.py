@@ -169,8 +169,11 @@ class Rig:
 
     def __init__(self, character: Character) -> None:
         self.character = character
-        self.index = {name: j for j, name in enumerate(character.bones)}
-        self.joint = {name: character.joints[j] for name, j in self.index.items()}
+        self.index = {}
+        self.joint = {}
+        for j, name in enumerate(character.bones):
+            self.index[name] = j
+            self.joint[name] = character.joints[j]
         self.turns = rest_turns(self.joint)
         self.leg = self._limb_length(LEG)
         self.arm = self._limb_length(ARM)

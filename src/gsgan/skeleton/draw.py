@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gsgan.scene import Camera
-from gsgan.skeleton.template import MEDIAPIPE33, SkeletonTemplate
+from gsgan.skeleton.template import MEDIAPIPE33, Edge, SkeletonTemplate
 from gsgan.skeleton.tensors import check_skeleton
 from gsgan.utils.tensors import constant
 
@@ -80,7 +80,10 @@ def draw_skeleton(
 @lru_cache(maxsize=64)
 def _segment_ends(template: SkeletonTemplate, device: torch.device) -> Tensor:
     """``[2, S]`` joints of all groups' segments; cached, not copied to the device in every call."""
-    segments = [edge for _, group in template.draw_groups for edge in group]
+    segments: list[Edge] = []
+    for _, group in template.draw_groups:
+        segments += group
+
     # Tensors created in inference mode cannot be used for training later.
     with torch.inference_mode(False):
         return torch.tensor(segments, device=device).T

@@ -1,6 +1,6 @@
 """MediaPipe's 21 landmarks of a hand: names, fingers, connections, and the frame of the palm."""
 
-from itertools import pairwise
+from itertools import chain, pairwise, product
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ HAND_NAMES = (
     "thumb_mcp",
     "thumb_ip",
     "thumb_tip",
-    *(f"{finger}_{part}" for finger in FINGER_NAMES[1:] for part in FINGER_PARTS),
+    *map("_".join, product(FINGER_NAMES[1:], FINGER_PARTS)),
 )
 HAND = len(HAND_NAMES)
 # Landmarks of each finger from base to tip, thumb first.
@@ -25,7 +25,8 @@ FINGERS = (
     (13, 14, 15, 16),
     (17, 18, 19, 20),
 )
-FINGER_BONES = tuple(bone for finger in FINGERS for bone in pairwise(finger))
+# Pairs of neighbouring landmarks of the fingers.
+FINGER_BONES = tuple(chain.from_iterable(map(pairwise, FINGERS)))
 # Landmarks of the palm.
 WRIST = 0
 INDEX = 5
@@ -42,7 +43,7 @@ HAND_EDGES = (
 
 def hand_names() -> tuple[str, ...]:
     """Names of 42 landmarks, the left hand's first."""
-    return tuple(f"{side}_{name}" for side in ("left", "right") for name in HAND_NAMES)
+    return tuple(map("_".join, product(("left", "right"), HAND_NAMES)))
 
 
 def palm_frames(palm: Tensor) -> Tensor:

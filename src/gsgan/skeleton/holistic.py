@@ -131,7 +131,8 @@ def _with_hands() -> SkeletonTemplate:
 
     # The hands' own forearms have no cylinder; left and right hands exchange in the mirror.
     fingers = set(range(len(POSE.limbs), len(limbs))) - set(bare)
-    swapped = [start + j for start in reversed(STARTS) for j in range(HAND)]
+    left_start, right_start = STARTS
+    swapped = [*range(right_start, right_start + HAND), *range(left_start, right_start)]
     names = [name.replace("wrist", "hand_wrist") for name in hand_names()]
     wrist, index, pinky = PALM
     return replace(
@@ -156,7 +157,9 @@ def _with_face(hands: SkeletonTemplate) -> SkeletonTemplate:
     # The face's landmarks follow those of the hands.
     start = len(hands.names)
     groups = face_groups(start)
-    edges = tuple(edge for _, group in groups for edge in group)
+    edges: list[Edge] = []
+    for _, group in groups:
+        edges += group
     return replace(
         hands,
         names=(*hands.names, *FACE_NAMES),

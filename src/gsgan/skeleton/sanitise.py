@@ -288,10 +288,10 @@ def _bones(
 def _same_bone(template: SkeletonTemplate, bare: int) -> int:
     """The end of the first other limb that starts where a bare limb does."""
     start = template.limbs[bare][0]
-    others = [
-        end for i, (a, end) in enumerate(template.limbs) if a == start and i != bare
-    ]
-    return others[0]
+    for limb, (other_start, end) in enumerate(template.limbs):
+        if other_start == start and limb != bare:
+            return end
+    raise ValueError(f"no other limb starts where limb {bare} does")
 
 
 def _put(q: Tensor, valid: Tensor, joints: Tensor, where_to: Tensor) -> Tensor:

@@ -116,8 +116,12 @@ class SkeletonTemplate:
     def limb_length_sum(self) -> float:
         """Metres: the sum of limb lengths of the rest pose, the counterpart of ``h_body``."""
         rest = np.asarray(self.rest_positions)
-        limbs = [self.limbs[i] for i in self.measured]
-        return float(sum(np.linalg.norm(rest[j] - rest[i]) for i, j in limbs))
+        # The same limbs as in `limb_length_sum` of a skeleton.
+        total = 0.0
+        for limb in self.measured:
+            start, end = self.limbs[limb]
+            total += float(np.linalg.norm(rest[end] - rest[start]))
+        return total
 
     @property
     def rest_torso(self) -> Vector:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from itertools import chain
 from typing import NamedTuple
 
 import torch
@@ -110,8 +111,9 @@ def _constants(
     directions = torch.tensor(t.rest_directions, dtype=torch.float64)
 
     # Limbs by level, each with the position of its parent's frame.
-    ordered = [limb for level in t.levels for limb in level]
-    position = {hub: hub for hub in range(t.n_hubs)}
+    ordered = list(chain.from_iterable(t.levels))
+    starts, ends = zip(*t.limbs, strict=True)
+    position = dict(enumerate(range(t.n_hubs)))
     for k, limb in enumerate(ordered):
         position[t.n_hubs + limb] = t.n_hubs + k
     levels = []
@@ -141,14 +143,14 @@ def _constants(
 
     return Constants(
         rest=cast(rest),
-        starts=index([a for a, _ in t.limbs]),
-        ends=index([b for _, b in t.limbs]),
+        starts=index(starts),
+        ends=index(ends),
         levels=tuple(levels),
         limb_order=index([ordered.index(limb) for limb in range(len(t.limbs))]),
         head_from_eyes=cast(_eye_frame(t, rest).mT.contiguous()),
         head_points=index(t.head),
         torso=index(t.torso),
-        palms=index([joint for palm in t.palms for joint in palm]),
+        palms=index(list(chain.from_iterable(t.palms))),
         measured=index(t.measured),
         fingers=index(t.fingers),
         face_turned=index(turned),
