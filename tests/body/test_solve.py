@@ -13,7 +13,7 @@ from torch import Tensor
 from writers.smpl import write_smpl
 
 from gsgan.body import free_body, solve
-from gsgan.body.rig import LEAST, TRUNK, build_rig, trunk_covariance
+from gsgan.body.rig import HINGE_MINIMA, TRUNK, build_rig, trunk_covariance
 from gsgan.body.smpl import read_smpl
 from gsgan.body.solve import Solver
 from gsgan.scene import BodyPose
@@ -70,7 +70,7 @@ def test_knees_and_elbows_are_hinges_and_ankles_hardly_turn(solver, poses):
             number = rig.names.index(f"{side}_{name}")
             axis = rig.entry_axis[rig.entry_number == number][0]
             turn = theta[:, names.index(joint.format(letter))]
-            assert (turn @ axis).min() > LEAST[name] - 0.25
+            assert (turn @ axis).min() > HINGE_MINIMA[name] - 0.25
             if name == "knee":
                 assert (turn - (turn @ axis).unsqueeze(1) * axis).norm(
                     dim=-1
@@ -136,8 +136,8 @@ def test_the_learnt_covariance_is_a_covariance_and_symmetrical():
 
 def test_gradients_are_those_of_the_solution(monkeypatch, poses):
     """In float64, against finite differences; Gauss-Newton's matrix leaves a few percent."""
-    monkeypatch.setattr(solve, "CONVERGED", 1e-9)
-    monkeypatch.setattr(solve, "STEPS", 30)
+    monkeypatch.setattr(solve, "MIN_IMPROVEMENT", 1e-9)
+    monkeypatch.setattr(solve, "MAX_STEPS", 30)
     fine = Solver(free_body().to(torch.float64))
     p, seen = (x[:1].double() for x in shown(poses[3:4]))
     p = p.clone().requires_grad_()

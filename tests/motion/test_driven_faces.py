@@ -20,7 +20,7 @@ from gsgan.skeleton import (
     in_head,
     limb_length_sum,
 )
-from gsgan.skeleton.face import FACE_NAMES, OFFSET
+from gsgan.skeleton.face import CODE_UNIT, FACE_NAMES
 from gsgan.skeleton.template import HEAD
 from gsgan.utils.errors import DataError
 
@@ -136,7 +136,7 @@ def test_missing_faces_rest_and_short_gaps_are_bridged(tmp_path, talking, signer
     assert not seen[5:11, EXPRESSION].any()
     code = face_code(whole, bone_frames(whole, seen > 0, HOLISTIC).head, HOLISTIC)
     np.testing.assert_allclose(code[5:11], 0, atol=1e-3)
-    assert code[3:5, LOWER, 1].max() * OFFSET < -0.010
+    assert code[3:5, LOWER, 1].max() * CODE_UNIT < -0.010
     for template in TEMPLATES.values():  # the smaller ones leave the face out
         assert (
             complete_skeleton(torch.from_numpy(q), None, template, height)[0]

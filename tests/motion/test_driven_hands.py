@@ -8,7 +8,7 @@ from test_motion_readers import Y_DOWN, standard, write_pose
 
 from gsgan.data.proportions import HAND_JOINTS, hand_frame, measure_proportions, upright
 from gsgan.motion.clip import is_own, up_axis
-from gsgan.motion.retarget import PALM, joined, retargeted
+from gsgan.motion.retarget import PALM_LANDMARKS, joined, retargeted
 from gsgan.skeleton import HOLISTIC, MEDIAPIPE33, complete_skeleton, limb_length_sum
 from gsgan.skeleton.hands import FINGER_BONES, HAND_NAMES
 
@@ -61,7 +61,7 @@ def test_the_figure_has_the_lengths_of_finger_bones(signing, signer, proportions
     np.testing.assert_allclose(
         np.linalg.norm(fingers(rest[None]), axis=-1)[0], true, rtol=1e-4
     )
-    palms = hand_frame(np.stack([rest[LEFT], rest[RIGHT]]), *PALM)
+    palms = hand_frame(np.stack([rest[LEFT], rest[RIGHT]]), *PALM_LANDMARKS)
     np.testing.assert_allclose(palms[0], np.eye(3), atol=1e-9)  # along +X, palm down
     np.testing.assert_allclose(palms[1], np.diag([-1.0, 1, -1]), atol=1e-9)
     assert proportions.hands is None
@@ -89,7 +89,7 @@ def test_fingers_of_a_pose_file_keep_their_directions(tmp_path, signing, signer)
         np.linalg.norm(fingers(q), axis=-1), lengths.repeat(12, 0)
     )
     for wrist, at in HAND_JOINTS.items():
-        palms = [hand_frame(x[:, at], *PALM) for x in (q, signing)]
+        palms = [hand_frame(x[:, at], *PALM_LANDMARKS) for x in (q, signing)]
         assert angles(palms[0].mT, palms[1].mT).max() < 1
         np.testing.assert_allclose(q[:, at][:, 0], q[:, wrist], atol=0.01)
 

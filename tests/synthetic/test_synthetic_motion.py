@@ -101,15 +101,15 @@ def test_standing_feet_do_not_slide(person, seed):
         0,
     )
     for foot, side in enumerate(SIDES):
-        _, height, pitch, _ = steps.at(times, foot)
+        state = steps.at(times, foot)
         toe, ankle = (
             joint(person, moves, side + "ToeBase"),
             joint(person, moves, side + "Foot"),
         )
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], height < 1e-9, [0]])))
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], state.height < 1e-9, [0]])))
         for begin, end in edges.reshape(-1, 2):
             assert np.ptp(toe[begin:end], axis=0).max() < 1e-3
-            flat = ankle[begin:end][pitch[begin:end] < 1e-9]
+            flat = ankle[begin:end][state.pitch[begin:end] < 1e-9]
             assert not len(flat) or np.ptp(flat, axis=0).max() < 1e-3
         walked += len(edges) // 2
     assert walked > 20  # feet do move

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gsgan.splat import build, native
 
+# Fields of struct SolveJob, in its order: counts, numbers, and arrays of body, fingers and frames.
 COUNTS = (
     "J",
     "T",
@@ -25,40 +26,46 @@ COUNTS = (
     "placing",
 )
 NUMBERS = (
-    *(
-        "converged",
-        "damping",
-        "easier",
-        "harder",
-        "floor",
-        "robust",
-        "beyond",
-        "held",
-        "noise",
-    ),
-    *("straight", "sharp", "finger_noise", "trace"),
+    "converged",
+    "damping",
+    "easier",
+    "harder",
+    "floor",
+    "robust",
+    "beyond",
+    "held",
+    "noise",
+    "straight",
+    "sharp",
+    "finger_noise",
+    "trace",
 )
 RIG = (
-    *(
-        "joint",
-        "parent",
-        "entry_turn",
-        "entry_number",
-        "carrier",
-        "joints",
-        "entry_axis",
-    ),
-    *("landmarks", "precision", "prior", "least", "rest_hubs", "rest_hips"),
-    *(
-        "head_from_eyes",
-        "torso",
-        "head",
-        "replaced",
-        "bend_numbers",
-        "bend_hub",
-        "bend_axes",
-    ),
-    *("limb_hub", "limb_points", "limb_numbers", "limb_axes", "limb_bend"),
+    "joint",
+    "parent",
+    "entry_turn",
+    "entry_number",
+    "carrier",
+    "joints",
+    "entry_axis",
+    "landmarks",
+    "precision",
+    "prior",
+    "least",
+    "rest_hubs",
+    "rest_hips",
+    "head_from_eyes",
+    "torso",
+    "head",
+    "replaced",
+    "bend_numbers",
+    "bend_hub",
+    "bend_axes",
+    "limb_hub",
+    "limb_points",
+    "limb_numbers",
+    "limb_axes",
+    "limb_bend",
 )
 FINGERS = (
     "chains",
@@ -74,9 +81,12 @@ FINGERS = (
 )
 FRAMES = ("p", "visibility", "valid", "hands", "seen", "theta", "transl")
 CONSTANTS = (*RIG, *(f"finger_{name}" for name in FINGERS))
+# struct SolveJob of kernels/solve.h
 _Job = build.job_type(
-    ("B", "threads", *COUNTS), NUMBERS, (*(f"of_{name}" for name in CONSTANTS), *FRAMES)
-)  # struct SolveJob of kernels/solve.h
+    ("B", "threads", *COUNTS),
+    NUMBERS,
+    (*(f"of_{name}" for name in CONSTANTS), *FRAMES),
+)
 
 
 def available(skeleton: Tensor) -> bool:
@@ -87,11 +97,11 @@ def available(skeleton: Tensor) -> bool:
 
 def held(constants: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Constants of a body as `solve` takes them: on the CPU, float64 or int64."""
-    kinds = (torch.int64, torch.float64)
-    return {
-        name: x.detach().to("cpu", kinds[x.is_floating_point()]).contiguous()
-        for name, x in constants.items()
-    }
+    held = {}
+    for name, x in constants.items():
+        kind = torch.float64 if x.is_floating_point() else torch.int64
+        held[name] = x.detach().to("cpu", kind).contiguous()
+    return held
 
 
 def solve(
@@ -103,7 +113,7 @@ def solve(
 ) -> tuple[Tensor, Tensor]:
     """``theta [B, J, 3]`` and ``transl [B, 3]`` of frames on the CPU.
 
-    Convention: of the frames' dtype; the arithmetic is float64. A frame's result is the same to
+    They have the frames' dtype; the arithmetic is float64. A frame's result is the same to
     the bit in any batch and with any number of threads.
 
     Args:
@@ -115,13 +125,19 @@ def solve(
     p = body[0]
     theta = p.new_empty(len(p), counts["J"], 3)
     transl = p.new_empty(len(p), 3)
+
+    # Counts and numbers are copied, arrays are passed by address.
     job = _Job(len(p), build.threads())
     for name, value in (*counts.items(), *numbers.items()):
         setattr(job, name, value)
     build.point(job, [f"of_{name}" for name in constants], list(constants.values()))
-    frames = [
-        None if x is None else x.contiguous() for x in (*body, *(hands or (None, None)))
-    ]
+
+    # Without hands, their addresses are null.
+    frames: list[Tensor | None] = [x.contiguous() for x in body]
+    if hands is None:
+        frames += [None, None]
+    else:
+        frames += [x.contiguous() for x in hands]
     build.point(job, FRAMES, [*frames, theta, transl])
     build.function("solve", p.dtype)(ctypes.byref(job))
     return theta, transl

@@ -1,14 +1,13 @@
 """The free body, a clothed person under a free licence; and the body of a dataset's poses.
 
-Convention: metres; Z up, the person faces -Y, the person's left is +X; rest pose with the arms away
-from the trunk. The asset in this package is made by scripts/bake_free_body.py.
+Units are metres; Z is up, the person faces -Y, the person's left is +X; in the rest pose the arms
+are away from the trunk. The asset in this package is made by scripts/bake_free_body.py.
 """
 
 import zipfile
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -31,10 +30,10 @@ class Body(MarkedBody):
     face_labels: Tensor
     face_surface: Tensor  # [F] int64 material of each face, see surface_names
     surface_names: tuple[str, ...]  # skin, hair, eye and the garments
-    landmark_names: tuple[str, ...]
+    landmark_names: tuple[str, ...]  # of the 33
     hand_landmarks: Tensor  # [42, 3] metres
-    hand_bone: Tensor  # [42] int64
-    hand_names: tuple[str, ...]
+    hand_bone: Tensor  # [42] int64, the joint that each hand landmark moves with
+    hand_names: tuple[str, ...]  # of the 42
 
     def posed_hands(self, pose: BodyPose) -> Tensor:
         """``[B, 42, 3]`` MediaPipe hand landmarks, left then right, metres, world frame."""
@@ -43,6 +42,7 @@ class Body(MarkedBody):
 
 def majority_vertex_labels(faces: Tensor, face_labels: Tensor, vertices: int) -> Tensor:
     """``[V]`` int64: the label of most faces around a vertex, the lowest one on a tie."""
+    # Votes of each label at each vertex, counted in one call.
     classes = int(face_labels.max()) + 1
     votes = torch.zeros(vertices * classes, dtype=torch.int64, device=faces.device)
     slot = faces * classes + face_labels[:, None]
@@ -84,41 +84,38 @@ def read_body(path: Path) -> Body:
 
 
 def _body(arrays: dict[str, np.ndarray]) -> Body:
+    """The body of stored arrays; weights are stored as bytes."""
+
     def tensor(name: str) -> Tensor:
         whole = arrays[name].dtype.kind in "iu"
         return torch.from_numpy(arrays[name].astype(np.int64 if whole else np.float32))
 
     def names(name: str) -> tuple[str, ...]:
-        return tuple(str(n) for n in arrays[name])
+        return tuple(map(str, arrays[name]))
 
+    # Divided by their sum, weights are shares again.
     weight = torch.from_numpy(arrays["bone_weight"].astype(np.float32))
+    vertices = tensor("vertices")
     faces = tensor("faces")
     face_labels = tensor("face_labels")
-
-    # Fields that are stored under their own names.
-    stored = (
-        "vertices",
-        "bone_index",
-        "joints",
-        "face_surface",
-        "landmarks",
-        "landmark_bone",
-    )
-    named = ("joint", "label", "surface", "landmark", "hand")
-    fields: dict[str, Any] = {
-        **{name: tensor(name) for name in (*stored, "hand_landmarks", "hand_bone")},
-        **{f"{name}_names": names(f"{name}_names") for name in named},
-    }
-
-    # Weights are stored as bytes; divided by their sum they are shares again.
     return Body(
+        vertices=vertices,
         faces=faces,
+        bone_index=tensor("bone_index"),
         bone_weight=weight / weight.sum(dim=1, keepdim=True),
-        parents=tuple(int(p) for p in arrays["parents"]),
+        joints=tensor("joints"),
+        parents=tuple(map(int, arrays["parents"])),
+        joint_names=names("joint_names"),
+        vertex_labels=majority_vertex_labels(faces, face_labels, len(vertices)),
+        label_names=names("label_names"),
+        template=vertices,
+        landmarks=tensor("landmarks"),
+        landmark_bone=tensor("landmark_bone"),
         face_labels=face_labels,
-        vertex_labels=majority_vertex_labels(
-            faces, face_labels, len(arrays["vertices"])
-        ),
-        template=fields["vertices"],
-        **fields,
+        face_surface=tensor("face_surface"),
+        surface_names=names("surface_names"),
+        landmark_names=names("landmark_names"),
+        hand_landmarks=tensor("hand_landmarks"),
+        hand_bone=tensor("hand_bone"),
+        hand_names=names("hand_names"),
     )

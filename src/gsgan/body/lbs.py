@@ -1,12 +1,12 @@
 """Linear blend skinning: joint rotations to bone transforms to one affine map per vertex.
 
-Convention: metres; column vectors, ``x_posed = A @ x_rest + t``; batch first. Every joint's
+Units are metres; vectors are columns, ``x_posed = A @ x_rest + t``; batch first. Every joint's
 rest frame is aligned with the world's axes: zero rotations are the rest pose.
 """
 
 from collections.abc import Sequence
 from functools import lru_cache
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import NamedTuple
 
 import torch
@@ -25,8 +25,10 @@ def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
     squared = (axis_angle * axis_angle).sum(-1)[..., None, None]
     is_small = squared < 1e-6
     angle = torch.where(is_small, torch.ones_like(squared), squared).sqrt()
+
+    # R = 1 + a K + b K², with a = sin x / x and b = (1 - cos x) / x².
     a = torch.where(is_small, 1 - squared / 6, angle.sin() / angle)
-    # (1 - cos x) / x² with the half angle: no cancellation near zero
+    # b from the half angle: no cancellation near zero.
     half = torch.sin(angle / 2) / angle
     b = torch.where(is_small, 0.5 - squared / 24, 2 * half * half)
     K = _cross_matrix(axis_angle)
@@ -38,9 +40,8 @@ def shortest_turn(a: Tensor, b: Tensor) -> Tensor:
     """Axis-angle ``[..., 3]`` of the shortest rotations from unit ``a`` to ``b [..., 3]``."""
     axis = torch.linalg.cross(a, b)
     sine = axis.norm(dim=-1, keepdim=True)
-    return (
-        axis * torch.atan2(sine, (a * b).sum(-1, keepdim=True)) / sine.clamp_min(1e-6)
-    )
+    cosine = (a * b).sum(-1, keepdim=True)
+    return axis * torch.atan2(sine, cosine) / sine.clamp_min(1e-6)
 
 
 def left_jacobian(v: Tensor) -> Tensor:
@@ -49,20 +50,23 @@ def left_jacobian(v: Tensor) -> Tensor:
     small = squared < 1e-4
     safe = torch.where(small, torch.ones_like(squared), squared)
     angle = safe.sqrt()
+
+    # J = 1 + a K + b K², with a = (1 - cos x) / x² and b = (x - sin x) / x³; near zero their
+    # Taylor series.
     a = torch.where(small, 0.5 - squared / 24, (1 - angle.cos()) / safe)
-    b = torch.where(
-        small, 1 / 6 - squared / 120, (angle - angle.sin()) / (safe * angle)
-    )
+    b = (angle - angle.sin()) / (safe * angle)
+    b = torch.where(small, 1 / 6 - squared / 120, b)
     K = _cross_matrix(v)
-    return torch.eye(3, dtype=v.dtype, device=v.device) + a * K + b * (K @ K)
+    eye = torch.eye(3, dtype=v.dtype, device=v.device)
+    return eye + a * K + b * (K @ K)
 
 
 def _cross_matrix(v: Tensor) -> Tensor:
+    """``[..., 3, 3]`` whose product with a vector is its cross product with ``v``."""
     x, y, z = v.unbind(-1)
     zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(
-        -1, (3, 3)
-    )
+    entries = [zero, -z, y, z, zero, -x, -y, x, zero]
+    return torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
 
 
 def kinematic_levels(parents: Sequence[int]) -> list[list[int]]:
@@ -70,10 +74,10 @@ def kinematic_levels(parents: Sequence[int]) -> list[list[int]]:
     depth: list[int] = []
     for parent in parents:
         depth.append(0 if parent < 0 else depth[parent] + 1)
-    return [
-        [j for j, d in enumerate(depth) if d == level]
-        for level in range(max(depth) + 1)
-    ]
+    levels: list[list[int]] = [[] for _ in range(max(depth) + 1)]
+    for joint, level in enumerate(depth):
+        levels[level].append(joint)
+    return levels
 
 
 def forward_kinematics(
@@ -104,6 +108,8 @@ def forward_kinematics(
             f"forward_kinematics: transl must have shape [{len(rotations)}, 3], "
             f"got {list(transl.shape)}"
         )
+
+    # A bone moves its own joint from the rest position to the posed one.
     R, position = _accumulate(joints, parents, rotations, transl)
     shift = position - R @ joints.unsqueeze(-1)
     top = torch.cat([R, shift], dim=-1)
@@ -124,9 +130,8 @@ def _accumulate(
     rest = taken(joints, plan.order, -2)
     offsets = (rest - taken(joints, plan.parents, -2)).unsqueeze(-1)
     offsets_by_level = offsets.split(plan.level_sizes, dim=-3)
-    rotations_by_level = list(
-        taken(rotations, plan.order, 1).split(plan.level_sizes, dim=1)
-    )
+    ordered = taken(rotations, plan.order, 1)
+    rotations_by_level = list(ordered.split(plan.level_sizes, dim=1))
 
     # Roots stand at their rest position, moved by the translation.
     roots = rest[..., : plan.level_sizes[0], :].expand(len(rotations), -1, -1)
@@ -159,18 +164,17 @@ class KinematicPlan(NamedTuple):
 def kinematic_plan(parents: tuple[int, ...]) -> KinematicPlan:
     """The plan of a skeleton with these parents, -1 for a root."""
     levels = kinematic_levels(parents)
-    order = tuple(joint for level in levels for joint in level)
+    order = tuple(chain.from_iterable(levels))
+    own_parents = [joint if parents[joint] < 0 else parents[joint] for joint in order]
     parent_places = []
     for above, level in pairwise(levels):
         parent_places.append(tuple(above.index(parents[joint]) for joint in level))
     return KinematicPlan(
-        level_sizes=[len(level) for level in levels],
+        level_sizes=list(map(len, levels)),
         order=order,
-        parents=tuple(
-            joint if parents[joint] < 0 else parents[joint] for joint in order
-        ),
+        parents=tuple(own_parents),
         parent_places=tuple(parent_places),
-        inverse=tuple(order.index(joint) for joint in range(len(parents))),
+        inverse=tuple(map(order.index, range(len(parents)))),
     )
 
 
@@ -197,8 +201,8 @@ def blend_transforms(
 ) -> tuple[Tensor, Tensor]:
     """The affine map of each vertex: the weighted average of its bones' transforms.
 
-    Weights are divided by their sum first. ``A`` is a rotation only where one bone has all the
-    weight: elsewhere it also shears and shrinks, so shapes attached to a vertex are transformed as
+    Weights are divided by their sum first. ``A`` is a rotation only if one bone has all the
+    weight: otherwise it also shears and shrinks, so shapes attached to a vertex are transformed as
     covariances, ``A Σ Aᵀ``.
 
     Args:
@@ -211,8 +215,11 @@ def blend_transforms(
 
     Source: paper Sec. 3.4, ``x_o = (Σ_b w_b ΔB_b) x_c``.
     """
+    # Weights that sum to 1.
     weight = bone_weight.to(transforms.dtype)
     weight = weight / weight.sum(-1, keepdim=True)
+
+    # One lookup averages the transforms of all poses: its table has a row for each bone.
     bones = transforms[:, :, :3].transpose(0, 1).flatten(1)
     blended = embedding_bag(bone_index, bones, per_sample_weights=weight, mode="sum")
     affine = blended.unflatten(1, (-1, 3, 4)).transpose(0, 1)
@@ -224,8 +231,9 @@ def stretched(
 ) -> Tensor:
     """The Jacobian of skinning at each vertex: how the surface about it turns and stretches.
 
-    ``A`` is that of constant weights. Where weights change along the surface, skinning also pulls
-    neighbours apart: in a high kick, vertices of the hip by centimetres, while A shrinks there.
+    ``A`` is the Jacobian of constant weights. Where weights change along the surface, skinning
+    also pulls neighbours apart: in a high kick, vertices of the hip by centimetres, while A shrinks
+    there.
 
     Args:
         A: ``[B, V, 3, 3]`` from :func:`blend_transforms`.
@@ -237,17 +245,18 @@ def stretched(
 
     Source: Tarini et al., Accurate and Efficient Lighting for Skinned Models, 2014.
     """
-    turns, places = transforms[:, :, :3].split((3, 1), dim=-1)
     # Gradients sum to zero: less the root's place, numbers are as small as distances of bones.
-    table = (
-        torch.cat([turns, places - places[:, :1]], dim=-1)
-        .permute(1, 3, 0, 2)
-        .flatten(2)
-    )
+    turns, places = transforms[:, :, :3].split((3, 1), dim=-1)
+    affine = torch.cat([turns, places - places[:, :1]], dim=-1)
+
+    # One lookup sums the terms of all poses: its table has a row for each bone and column, and its
+    # numbers are the poses and axes.
+    table = affine.permute(1, 3, 0, 2).flatten(2).flatten(0, 1)
     terms = embedding_bag(
-        columns, table.flatten(0, 1), per_sample_weights=factors.to(table), mode="sum"
+        columns, table, per_sample_weights=factors.to(table), mode="sum"
     )
-    return A + terms.unflatten(1, (-1, 3)).unflatten(0, (-1, 3)).permute(2, 0, 3, 1)
+    terms = terms.unflatten(1, (-1, 3)).unflatten(0, (-1, 3))
+    return A + terms.permute(2, 0, 3, 1)
 
 
 def skin(vertices: Tensor, A: Tensor, t: Tensor) -> Tensor:

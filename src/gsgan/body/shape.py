@@ -1,6 +1,6 @@
 """The shape of a person: coefficients of a body's shape space, and a stretch per bone group.
 
-Convention: metres; the rest pose and axes of the body (see `gsgan.body.free`, `gsgan.body.smpl`).
+Units are metres, in the rest pose and axes of the body (see `gsgan.body.free`, `gsgan.body.smpl`).
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from gsgan.utils.errors import DataError
 
 # Groups of bones with one stretch each, shared by left and right: limbs are scaled along their
 # axis, other parts in all directions.
-LIMBS = ("upper_arm", "forearm", "thigh", "shank")
-STRETCHED = (*LIMBS, "hand", "foot", "head", "trunk")
-# by the joint's name in the free body | in SMPL's family; the others are the trunk's
-GROUPS = {
+STRETCHED_LIMBS = ("upper_arm", "forearm", "thigh", "shank")
+STRETCHED = (*STRETCHED_LIMBS, "hand", "foot", "head", "trunk")
+# Patterns of joint names, in the free body | in SMPL's family; others are the trunk's.
+BONE_GROUPS = {
     "upper_arm": r"upperarm.*|.*_shoulder",
     "forearm": r"lowerarm.*|.*_elbow",
     "thigh": r"upperleg.*|.*_hip",
@@ -41,9 +41,15 @@ GROUPS = {
     "head": r"head|jaw|.*_eye",
 }
 WRISTS = ("wrist.L", "wrist.R")
-BACK = (0.0, 1.0, 0.0)  # of the free body
+BACK = (0.0, 1.0, 0.0)  # the direction behind the free body
 LANDMARKS = (len(MEDIAPIPE33.names), 3)
 HANDS_SHAPE = (2, 2, 3)
+SHAPES = {
+    "stretch": (len(STRETCHED),),
+    "offsets": LANDMARKS,
+    "hands": HANDS_SHAPE,
+    "spine": (1,),
+}
 
 B = TypeVar("B", bound=MarkedBody)
 
@@ -72,31 +78,37 @@ class BodyShape:
     spine: Tensor | None = None
 
     def __post_init__(self) -> None:
-        off = LANDMARKS if self.offsets is None else self.offsets.shape
-        hands = HANDS_SHAPE if self.hands is None else self.hands.shape
-        spine = (1,) if self.spine is None else self.spine.shape
-        given = (self.coefficients.ndim, self.stretch.shape, off, hands, spine)
-        if given != (1, (len(STRETCHED),), LANDMARKS, HANDS_SHAPE, (1,)):
+        # A tensor that is None has the expected shape.
+        found = []
+        for name, shape in SHAPES.items():
+            value = getattr(self, name)
+            found.append(list(shape if value is None else value.shape))
+        if self.coefficients.ndim != 1 or found != list(map(list, SHAPES.values())):
             raise ValueError(
                 f"BodyShape: expected coefficients [K], stretch [{len(STRETCHED)}], offsets "
                 f"{list(LANDMARKS)}, hands {list(HANDS_SHAPE)}, spine [1], got "
-                f"{list(self.coefficients.shape)}, {list(self.stretch.shape)}, {list(off)}, "
-                f"{list(hands)}, {list(spine)}"
+                f"{', '.join(map(str, [list(self.coefficients.shape), *found]))}"
             )
 
     def arrays(self) -> dict[str, NDArray[np.float32]]:
         """The tensors by name, to store in body_shape.npz."""
-        return {
-            name: x.detach().numpy() for name, x in vars(self).items() if x is not None
-        }
+        arrays = {}
+        for name, x in vars(self).items():
+            if x is not None:
+                arrays[name] = x.detach().numpy()
+        return arrays
 
     def flat(self) -> Tensor:
         """``[K + 8 + 99]`` all numbers, to store; 12 more of hands, 1 of a spine; see `of_flat`."""
-        off = (
-            self.stretch.new_zeros(LANDMARKS) if self.offsets is None else self.offsets
-        )
-        more = [x.flatten() for x in (self.hands, self.spine) if x is not None]
-        return torch.cat([self.coefficients, self.stretch, off.flatten(), *more])
+        offsets = self.offsets
+        if offsets is None:
+            offsets = self.stretch.new_zeros(LANDMARKS)
+        parts = [self.coefficients, self.stretch, offsets.flatten()]
+        if self.hands is not None:
+            parts.append(self.hands.flatten())
+        if self.spine is not None:
+            parts.append(self.spine)
+        return torch.cat(parts)
 
     @classmethod
     def of_flat(cls, values: Tensor) -> BodyShape:
@@ -105,6 +117,7 @@ class BodyShape:
         Raises:
             ValueError: when the count is that of no shape.
         """
+        # Hands and spine are left out if they are None.
         sizes = [free_space().coefficients, len(STRETCHED), math.prod(LANDMARKS)]
         hands = math.prod(HANDS_SHAPE)
         counts = [sum(sizes) + more for more in (0, 1, hands, hands + 1)]
@@ -113,13 +126,15 @@ class BodyShape:
             raise ValueError(
                 f"BodyShape: expected {known} numbers, got {list(values.shape)}"
             )
-        K, stretch, off, more = values.split([*sizes, len(values) - sum(sizes)])
+        K, stretch, offsets, more = values.split([*sizes, len(values) - sum(sizes)])
+        has_hands = len(more) >= hands
+        has_spine = len(more) in (1, hands + 1)
         return cls(
-            K,
-            stretch,
-            off.view(LANDMARKS),
-            more[:hands].view(HANDS_SHAPE) if len(more) >= hands else None,
-            more[-1:] if len(more) in (1, hands + 1) else None,
+            coefficients=K,
+            stretch=stretch,
+            offsets=offsets.view(LANDMARKS),
+            hands=more[:hands].view(HANDS_SHAPE) if has_hands else None,
+            spine=more[-1:] if has_spine else None,
         )
 
 
@@ -132,12 +147,12 @@ class ShapeSpace(Generic[B]):
         directions: ``[N, 3, K]`` metres per unit, by the body's field: vertices, joints, landmarks.
     """
 
-    body: B
-    directions: Mapping[str, Tensor]
+    body: B  # at coefficients of zero
+    directions: Mapping[str, Tensor]  # [N, 3, K] by the body's field
 
     @property
     def coefficients(self) -> int:
-        """K."""
+        """Number of coefficients, K."""
         return self.directions["vertices"].shape[-1]
 
     def neutral(self) -> BodyShape:
@@ -155,38 +170,44 @@ class ShapeSpace(Generic[B]):
             raise ValueError(
                 f"ShapeSpace.shaped: at most {self.coefficients} coefficients, got {len(given)}"
             )
-        moved = {
-            name: getattr(self.body, name).to(given)
-            + directions[..., : len(given)].to(given) @ given
-            for name, directions in self.directions.items()
-        }
+        # The points of the body, moved along the directions.
+        moved = {}
+        for name, directions in self.directions.items():
+            used = directions[..., : len(given)].to(given)
+            moved[name] = getattr(self.body, name).to(given) + used @ given
+
+        # Bones are stretched; then what belongs to this person's skeletons is moved.
         body = _stretched(replace(self.body, **moved), shape.stretch)
         if shape.offsets is not None:
             body = replace(body, landmarks=body.landmarks + shape.offsets)
         if shape.spine is not None:
             spine = [name.startswith("spine") for name in body.joint_names]
-            back = shape.spine * torch.outer(
-                given.new_tensor(spine), given.new_tensor(BACK)
-            )
-            body = replace(body, joints=body.joints + back)
-        return body if shape.hands is None else _with_hands(body, shape.hands)
+            back = torch.outer(given.new_tensor(spine), given.new_tensor(BACK))
+            body = replace(body, joints=body.joints + shape.spine * back)
+        if shape.hands is not None:
+            body = _with_hands(body, shape.hands)
+        return body
 
 
 def group_of(joint: str) -> str:
     """The group whose stretch scales what a joint of that name moves."""
-    return next(
-        (g for g, names in GROUPS.items() if re.fullmatch(names, joint)), "trunk"
-    )
+    for group, names in BONE_GROUPS.items():
+        if re.fullmatch(names, joint):
+            return group
+    return "trunk"
 
 
 def limb_axes(body: MarkedBody) -> Tensor:
     """``[J, 3]`` unit direction of the limb that a joint belongs to, zero outside limbs."""
+    # A limb may have several joints, as the two of the free body's upper arm.
     groups = [group_of(name) for name in body.joint_names]
     axes = torch.zeros_like(body.joints)
     for joint, group in enumerate(groups):
-        if group not in LIMBS:
+        if group not in STRETCHED_LIMBS:
             continue
-        first = end = joint
+        # From the first joint of the limb to the first one after it.
+        first = joint
+        end = joint
         while groups[body.parents[first]] == group:
             first = body.parents[first]
         while groups[end] == group:
@@ -199,61 +220,73 @@ def limb_axes(body: MarkedBody) -> Tensor:
 def _stretched(body: B, stretch: Tensor) -> B:
     """The body with each joint's part scaled about that joint."""
     joints = body.joints
-    factor = stretch[[STRETCHED.index(group_of(name)) for name in body.joint_names]]
+    groups = [STRETCHED.index(group_of(name)) for name in body.joint_names]
+    factor = stretch[groups]
+
+    # S = 1 + (factor - 1) a aᵀ stretches a limb along its axis a; S = factor elsewhere.
     axes = limb_axes(body)
     along = axes.unsqueeze(-1) * axes.unsqueeze(-2)
     eye = torch.eye(3).to(joints)
-    S = eye + (factor - 1)[:, None, None] * torch.where(
-        along.any(-1, keepdim=True), along, eye
-    )
+    scaled = torch.where(along.any(-1, keepdim=True), along, eye)
+    S = eye + (factor - 1)[:, None, None] * scaled
+
+    # Each joint moves with its parent's part.
     places = [joints[0]]
     for joint, parent in enumerate(body.parents[1:], start=1):
         places.append(places[parent] + S[parent] @ (joints[joint] - joints[parent]))
     moved = torch.stack(places)
     shift = moved - (S @ joints.unsqueeze(-1)).squeeze(-1)
+
     # As lbs.blend_transforms, which has no forward-mode derivative.
     maps = torch.cat([S, shift.unsqueeze(-1)], dim=-1).flatten(1)
     weight = body.bone_weight.to(S)
     weight = weight / weight.sum(-1, keepdim=True)
-    blended = sum(
-        w.unsqueeze(-1) * maps[b]
-        for b, w in zip(body.bone_index.T, weight.T, strict=True)
-    )
+    blended = torch.zeros_like(maps[:1])
+    for bone, share in zip(body.bone_index.T, weight.T, strict=True):
+        blended = blended + share.unsqueeze(-1) * maps[bone]
     A, t = blended.unflatten(-1, (3, 4)).split((3, 1), dim=-1)
-    points = {"landmarks": body.landmark_bone}
-    if isinstance(body, Body):
-        points["hand_landmarks"] = body.hand_bone
-    carried = {
-        n: (S[b] @ getattr(body, n).unsqueeze(-1)).squeeze(-1) + shift[b]
-        for n, b in points.items()
+
+    def carried(points: Tensor, bone: Tensor) -> Tensor:
+        return (S[bone] @ points.unsqueeze(-1)).squeeze(-1) + shift[bone]
+
+    changes: dict[str, Any] = {
+        "vertices": skin(body.vertices, A, t.squeeze(-1)),
+        "joints": moved,
+        "landmarks": carried(body.landmarks, body.landmark_bone),
     }
-    return replace(
-        body, vertices=skin(body.vertices, A, t.squeeze(-1)), joints=moved, **carried
-    )
+    if isinstance(body, Body):
+        changes["hand_landmarks"] = carried(body.hand_landmarks, body.hand_bone)
+    return replace(body, **changes)
 
 
 def _with_hands(body: B, hands: Tensor) -> B:
     """The body with wrists and hands moved by ``hands [2, 2, 3]``, see `BodyShape`."""
-    names = body.joint_names  # 1: of the left hand, 2: of the right hand, 0: others
-    sides = torch.tensor(
-        [".LR".index(n[-1]) if group_of(n) == "hand" else 0 for n in names]
-    )
-    # [3, 3], none first
-    moves = torch.cat([torch.zeros_like(hands[:1, 1]), hands[:, 1]])
+    # The hand of each joint, 1 the left, 2 the right, 0 none; and their moves.
+    sides = torch.zeros(len(body.joint_names), dtype=torch.int64)
+    for joint, name in enumerate(body.joint_names):
+        if group_of(name) == "hand":
+            sides[joint] = ".LR".index(name[-1])
+    none = torch.zeros_like(hands[:1, 1])
+    moves = torch.cat([none, hands[:, 1]])  # [3, 3]
+
     weight = body.bone_weight.unsqueeze(-1)
-    out: dict[str, Any] = {
-        "vertices": body.vertices + (weight * moves[sides[body.bone_index]]).sum(1),
-        "landmarks": body.landmarks + moves[sides[body.landmark_bone]],
-    }
+    vertices = body.vertices + (weight * moves[sides[body.bone_index]]).sum(1)
+    landmarks = body.landmarks + moves[sides[body.landmark_bone]]
+
+    # Wrists have moves of their own.
     wrists = [body.joint_names.index(name) for name in WRISTS]
     at = body.joints[wrists] + hands[:, 0]
-    out["joints"] = (body.joints + moves[sides]).index_copy(0, torch.tensor(wrists), at)
+    joints = (body.joints + moves[sides]).index_copy(0, torch.tensor(wrists), at)
+    changes: dict[str, Any] = {
+        "vertices": vertices,
+        "landmarks": landmarks,
+        "joints": joints,
+    }
     if isinstance(body, Body):
         own = body.hand_landmarks + moves[sides[body.hand_bone]]
-        out["hand_landmarks"] = own.index_copy(
-            0, torch.tensor([WRIST, HAND + WRIST]), at
-        )
-    return replace(body, **out)
+        own_wrists = torch.tensor([WRIST, HAND + WRIST])
+        changes["hand_landmarks"] = own.index_copy(0, own_wrists, at)
+    return replace(body, **changes)
 
 
 # -- spaces
@@ -272,13 +305,11 @@ def free_space() -> ShapeSpace[Body]:
     body = free_body()
     try:
         with np.load(path, allow_pickle=False) as archive:
-            directions = {
-                n: torch.from_numpy(archive[n].astype(np.float32))
-                for n in archive.files
-            }
-        return ShapeSpace(
-            body, {n: d.permute(1, 2, 0).contiguous() for n, d in directions.items()}
-        )
+            directions = {}
+            for name in archive.files:
+                stored = torch.from_numpy(archive[name].astype(np.float32))
+                directions[name] = stored.permute(1, 2, 0).contiguous()
+        return ShapeSpace(body, directions)
     except Exception as error:
         raise DataError(
             f"{path} is missing or cannot be read ({error}): reinstall gsgan, or bake it with "
@@ -314,11 +345,9 @@ def open_body(
         DataError: when the file cannot be read or is of another body.
     """
     if kind == "free":
-        return (
-            shaped_body(BodyShape.of_flat(torch.tensor(betas)))
-            if betas
-            else free_body()
-        )
+        if not betas:
+            return free_body()
+        return shaped_body(BodyShape.of_flat(torch.tensor(betas)))
     if kind is None or file is None:
         return None
     model = read_smpl(file)

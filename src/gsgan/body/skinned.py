@@ -21,14 +21,14 @@ from gsgan.body.lbs import (
 )
 from gsgan.scene import BodyPose
 
-KEPT = 4  # bones whose weights change most
+KEPT_BONES = 4  # number of bones per vertex whose weights' gradients are used
 
 
 @dataclass(frozen=True, kw_only=True)
 class SkinnedBody:
     """A skinned body with part labels, unbatched.
 
-    Convention: metres; the axes depend on the body (the free body has Z up, SMPL's have Y up); the
+    Units are metres; the axes depend on the body (the free body has Z up, SMPL's have Y up); the
     root rotates about its own joint. ``label_source`` is the source of a vertex's part: "own", the
     body's definition; "guess", its joint, where the true part depends on the clothes; "vote", the
     data's label images. Subsets of vertices are chosen on ``template``, so that they do not depend
@@ -60,16 +60,15 @@ class SkinnedBody:
             value = getattr(self, field.name)
             if isinstance(value, Tensor):
                 moved = value.to(*args, **kwargs)
-                floating = value.is_floating_point()
-                changes[field.name] = moved if floating else moved.to(value.dtype)
+                if not value.is_floating_point():
+                    moved = moved.to(value.dtype)
+                changes[field.name] = moved
         return replace(self, **changes)
 
     def shares_labels(self, names: Sequence[str]) -> bool:
         """Whether these names of labels are the body's own parts."""
-        return (
-            self.label_source == "own"
-            and tuple(names) == self.label_names[: len(names)]
-        )
+        own_names = self.label_names[: len(names)]
+        return self.label_source == "own" and tuple(names) == own_names
 
     def voted(self, vertex_labels: Tensor, label_names: Sequence[str]) -> Self:
         """The body with the data's labels on its vertices ``[V]``.
@@ -78,18 +77,20 @@ class SkinnedBody:
             ValueError: when there is not one label per vertex, or a label has no name.
         """
         shape = vertex_labels.shape
-        least = vertex_labels.min()
-        most = vertex_labels.max()
-        if shape != self.vertex_labels.shape or least < 0 or most >= len(label_names):
+        minimum = vertex_labels.min()
+        maximum = vertex_labels.max()
+        known = minimum >= 0 and maximum < len(label_names)
+        if shape != self.vertex_labels.shape or not known:
             raise ValueError(
                 f"{type(self).__name__}.voted: vertex_labels must be {len(self.vertex_labels)} "
-                f"numbers from 0 to {len(label_names) - 1}, got {list(vertex_labels.shape)} from "
-                f"{int(least)} to {int(most)}"
+                f"numbers from 0 to {len(label_names) - 1}, got {list(shape)} from "
+                f"{int(minimum)} to {int(maximum)}"
             )
-        labels = vertex_labels.to(self.vertex_labels)
-        names = tuple(label_names)
         return replace(
-            self, vertex_labels=labels, label_names=names, label_source="vote"
+            self,
+            vertex_labels=vertex_labels.to(self.vertex_labels),
+            label_names=tuple(label_names),
+            label_source="vote",
         )
 
     def transforms(self, pose: BodyPose) -> Tensor:
@@ -120,7 +121,7 @@ class SkinnedBody:
 
 @dataclass(frozen=True, kw_only=True)
 class MarkedBody(SkinnedBody):
-    """A skinned body with MediaPipe's 33 pose landmarks; NaN where the body does not define one."""
+    """A skinned body with MediaPipe's 33 pose landmarks; NaN if the body does not define one."""
 
     landmarks: Tensor  # [33, 3] rest positions, metres
     landmark_bone: Tensor  # [33] int64, the joint that each landmark moves with
@@ -137,7 +138,8 @@ def carry(transforms: Tensor, points: Tensor, bones: Tensor | None = None) -> Te
 
 
 def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
-    """``[V, 3]`` outward unit normals, faces weighted by their area; zero where there is none."""
+    """``[V, 3]`` outward unit normals, faces weighted by their area; zero without a face."""
+    # Twice the area along each face's normal, summed over the faces of a vertex.
     a, b, c = vertices[faces].unbind(1)
     face = torch.linalg.cross(b - a, c - a)
     summed = torch.zeros_like(vertices)
@@ -159,7 +161,8 @@ class WeightGradients(nn.Module):
     Source: ours.
     """
 
-    homogeneous: Tensor
+    homogeneous: Tensor  # [N, 4] rest positions and 1
+    # The gradient operator as a compressed sparse matrix, 3 rows per vertex.
     rows: Tensor
     columns: Tensor
     values: Tensor
@@ -167,6 +170,8 @@ class WeightGradients(nn.Module):
     def __init__(self, body: SkinnedBody, chosen: Tensor) -> None:
         super().__init__()
         self.joints = len(body.joints)
+
+        # The rows of the operator are the axes of each vertex.
         operator = surface_gradient(body.vertices, body.faces, chosen)
         places = body.vertices[chosen].float()
         buffers = {
@@ -182,30 +187,33 @@ class WeightGradients(nn.Module):
     def forward(self, index: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
         """The terms of `gsgan.body.lbs.stretched` for these skinning weights.
 
-        Only the KEPT bones of each vertex whose weights change most are used. The gradients of
-        their weights are shifted to sum to zero, as those of all bones do.
+        Only the `KEPT_BONES` bones of each vertex whose weights change most are used. The gradients
+        of their weights are shifted to sum to zero, as those of all bones do.
 
         Args:
             index, weight: ``[N, n]`` bones of each chosen vertex and their weights.
 
         Returns:
-            ``[3 N, 4 KEPT]``: of each chosen vertex and axis, columns of the bones' transforms,
-            int64 from 0 to 4 J, and their factors: products of the vertex's position and the
-            gradients.
+            ``[3 N, 4 KEPT_BONES]``: for each chosen vertex and axis, columns of the bones'
+            transforms, int64 from 0 to 4 J, and their factors: products of the vertex's position
+            and the gradients.
         """
+        # The gradients [N, 3, J] of all bones' weights.
         weight = (weight / weight.sum(dim=1, keepdim=True)).to(self.values)
-        dense = weight.new_zeros(len(weight), self.joints).scatter_add_(
-            1, index, weight
-        )
+        dense = weight.new_zeros(len(weight), self.joints)
+        dense.scatter_add_(1, index, weight)
         slopes = embedding_bag(
             self.columns, dense, self.rows, mode="sum", per_sample_weights=self.values
         )
-        slopes = slopes.unflatten(0, (-1, 3))  # [N, 3, J]
+        slopes = slopes.unflatten(0, (-1, 3))
+
+        # The largest, shifted to sum to zero.
         change = slopes.square().sum(dim=1)
-        bones = change.topk(min(KEPT, self.joints), dim=1).indices
+        _, bones = change.topk(min(KEPT_BONES, self.joints), dim=1)
         slopes = slopes.gather(2, bones.unsqueeze(1).expand(-1, 3, -1))
         slopes = slopes - slopes.mean(dim=2, keepdim=True)
-        # [N, 3, KEPT, 4]
+
+        # Times the vertex's homogeneous position, [N, 3, KEPT, 4].
         factors = slopes.unsqueeze(-1) * self.homogeneous[:, None, None]
         columns = 4 * bones.unsqueeze(-1) + torch.arange(4, device=bones.device)
         columns = columns.unsqueeze(1).expand_as(factors)
@@ -224,6 +232,7 @@ def surface_gradient(vertices: Tensor, faces: Tensor, chosen: Tensor) -> csr_arr
         ``[3 N, N]``, times ``[N]`` numbers: their gradients at these vertices, axis by axis. A
         vertex without a neighbour has the gradient zero.
     """
+    # Edges a to b between chosen vertices.
     x = vertices.double()
     normals = vertex_normals(x, faces)[chosen]
     a, b = neighbours_on_surface(x, faces, chosen).T
@@ -232,9 +241,8 @@ def surface_gradient(vertices: Tensor, faces: Tensor, chosen: Tensor) -> csr_arr
     step = x[b] - x[a]
 
     # Least squares in the tangent plane: (Σ step stepᵀ) gradient = Σ step (difference).
-    square = x.new_zeros(count, 3, 3).index_add_(
-        0, a, step.unsqueeze(2) * step.unsqueeze(1)
-    )
+    square = x.new_zeros(count, 3, 3)
+    square.index_add_(0, a, step.unsqueeze(2) * step.unsqueeze(1))
     size = square.diagonal(dim1=1, dim2=2).sum(dim=1).clamp_min(1e-12)[:, None, None]
     across = normals.unsqueeze(2) * normals.unsqueeze(1)
     square = square + size * (across + 1e-6 * torch.eye(3).to(x))
@@ -258,11 +266,14 @@ def neighbours_on_surface(vertices: Tensor, faces: Tensor, chosen: Tensor) -> Te
     Each vertex belongs to the chosen one that is nearest along the edges; two chosen vertices are
     neighbours if an edge joins what belongs to them. With all vertices chosen these are the edges.
     """
+    # The edges of all faces, and their lengths.
     edges = torch.cat([faces[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
-    length = (vertices[edges[:, 1]] - vertices[edges[:, 0]]).norm(dim=1).clamp_min(1e-9)
-    graph = csr_array(
-        (length.numpy(), tuple(edges.T.numpy())), (len(vertices), len(vertices))
-    )
+    start, end = edges.T
+    length = (vertices[end] - vertices[start]).norm(dim=1).clamp_min(1e-9)
+
+    # The chosen vertex that is nearest to each vertex.
+    V = len(vertices)
+    graph = csr_array((length.numpy(), (start.numpy(), end.numpy())), (V, V))
     _, _, nearest = dijkstra(
         graph,
         directed=False,
@@ -271,12 +282,12 @@ def neighbours_on_surface(vertices: Tensor, faces: Tensor, chosen: Tensor) -> Te
         return_predecessors=True,
     )
     nearest = torch.from_numpy(nearest).long()
-    place = torch.full((len(vertices),), -1).index_copy_(
-        0, chosen, torch.arange(len(chosen))
-    )
-    # the others are on pieces of the mesh without a chosen vertex
+
+    # Vertices on pieces of the mesh without a chosen vertex are not reached.
     reached = nearest >= 0
     edges = edges[reached[edges].all(dim=1)]
+    place = torch.full((V,), -1)
+    place[chosen] = torch.arange(len(chosen))
     pairs = place[nearest[edges]]
     pairs = pairs[pairs[:, 0] != pairs[:, 1]]
     return torch.cat([pairs, pairs.flip(1)]).unique(dim=0)

@@ -1,6 +1,6 @@
 """Skinned body models of the SMPL family, from the user's files.
 
-Convention: metres; the rest pose has Y up and faces +Z, the person's left is +X; axis-angle
+Units are metres; the rest pose has Y up and faces +Z, the person's left is +X; axis-angle
 rotations relative to the parent joint; the root rotates about its own joint and is then
 translated by ``transl``. Hands have full rotations (no PCA) and zero is the flat hand: SMPL-X
 parameters made with ``flat_hand_mean=False`` need the model's mean hand pose added first.
@@ -33,6 +33,7 @@ from gsgan.utils.arrays import expect_array
 from gsgan.utils.errors import DataError
 from gsgan.utils.pickles import read_npz, read_pickle
 
+# The arrays of a model file.
 KEYS = (
     "v_template",
     "shapedirs",
@@ -66,26 +67,31 @@ def read_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], tuple[int, ...]]:
     J = len(parents)
     directions = expect_array(raw, "shapedirs", (V, 3, None), path)
     S = directions.shape[-1]
-    if J == SMPLX_JOINT_COUNT:  # shape and expression: 300 + 100, or 10 + 10
-        S = 300 if S >= 400 else 10 if S == 20 else S
-    floats = {
-        "v_template": v_template,
-        "shapedirs": directions,
-        "posedirs": expect_array(raw, "posedirs", (V, 3, 9 * (J - 1)), path),
-        "J_regressor": expect_array(raw, "J_regressor", (J, V), path),
-        "weights": expect_array(raw, "weights", (V, J), path),
-    }
-    checked = {name: _finite(array, name, path) for name, array in floats.items()}
-    directions = checked["shapedirs"]
-    return checked | {
+    if J == SMPLX_JOINT_COUNT:
+        # Directions of shape, then of expression: 300 + 100, or 10 + 10.
+        if S >= 400:
+            S = 300
+        elif S == 20:
+            S = 10
+
+    directions = _finite(directions, "shapedirs", path)
+    posedirs = expect_array(raw, "posedirs", (V, 3, 9 * (J - 1)), path)
+    regressor = expect_array(raw, "J_regressor", (J, V), path)
+    weights = expect_array(raw, "weights", (V, J), path)
+    arrays = {
+        "v_template": _finite(v_template, "v_template", path),
         "shapedirs": directions[..., :S],
         "expression_dirs": directions[..., S:],
-        "weights": _weights(checked["weights"], path),
+        "posedirs": _finite(posedirs, "posedirs", path),
+        "J_regressor": _finite(regressor, "J_regressor", path),
+        "weights": _weights(_finite(weights, "weights", path), path),
         "faces": _faces(expect_array(raw, "f", (None, 3), path), V, path),
-    }, parents
+    }
+    return arrays, parents
 
 
 def _raw(path: Path) -> dict[str, Any]:
+    """The content of a model file, which has all `KEYS`."""
     content = read_npz(path, KEYS) if zipfile.is_zipfile(path) else read_pickle(path)
     if not isinstance(content, dict):
         raise DataError(
@@ -103,7 +109,10 @@ def _raw(path: Path) -> dict[str, Any]:
 def _parents(table: NDArray[Any], path: Path) -> tuple[int, ...]:
     """Parent of each joint from the kinematic tree (row 0 the parents, row 1 the joints)."""
     column = {int(joint): place for place, joint in enumerate(table[1])}
-    parents = [-1, *(column.get(int(parent), -1) for parent in table[0, 1:])]
+    parents = [-1]
+    for parent in table[0, 1:]:
+        parents.append(column.get(int(parent), -1))
+
     broken = [j for j, parent in enumerate(parents) if j and not 0 <= parent < j]
     found = f"no earlier parent for joint {broken[0]}" if broken else None
     if len(column) != table.shape[1] or len(column) < 2:
@@ -126,7 +135,9 @@ def _finite(array: NDArray[Any], name: str, path: Path) -> Floats:
 
 
 def _weights(weights: Floats, path: Path) -> Floats:
-    off = np.maximum(np.abs(weights.sum(axis=1) - 1), -weights.min(axis=1, initial=0))
+    """Weights without the negative ones that rounding leaves."""
+    error = np.abs(weights.sum(axis=1) - 1)
+    off = np.maximum(error, -weights.min(axis=1, initial=0))
     if (off > WEIGHT_TOLERANCE).any():
         vertex = int(off.argmax())
         raise DataError(
@@ -146,7 +157,7 @@ def _faces(faces: NDArray[Any], vertices: int, path: Path) -> NDArray[np.int64]:
     return indices
 
 
-KINDS = {24: "smpl", 55: "smplx"}
+MODEL_KINDS = {24: "smpl", 55: "smplx"}  # by number of joints
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,6 +183,7 @@ class SkinnedModel:
     @cached_property
     def bones(self) -> tuple[Tensor, Tensor]:
         """``[V, n]`` joints and weights of each vertex, n the largest number per vertex: exact."""
+        # Weights of zero are last in each row.
         n = int((self.weights > 0).sum(dim=1).max())
         weight, index = self.weights.sort(dim=1, descending=True, stable=True)
         return index[:, :n].contiguous(), weight[:, :n].contiguous()
@@ -179,16 +191,13 @@ class SkinnedModel:
     @cached_property
     def joint_shapes(self) -> tuple[Tensor, Tensor, Tensor]:
         """The joints of the mean shape ``[J, 3]``, and their shape and expression directions."""
-        mean = (self.J_regressor @ self.v_template.flatten(1)).unflatten(
-            1, self.v_template.shape[1:]
-        )
-        shape = (self.J_regressor @ self.shapedirs.flatten(1)).unflatten(
-            1, self.shapedirs.shape[1:]
-        )
-        face = (self.J_regressor @ self.expression_dirs.flatten(1)).unflatten(
-            1, self.expression_dirs.shape[1:]
-        )
-        return mean, shape, face
+        mean = self._regressed(self.v_template)
+        shape = self._regressed(self.shapedirs)
+        return mean, shape, self._regressed(self.expression_dirs)
+
+    def _regressed(self, x: Tensor) -> Tensor:
+        """``[J, 3, ...]`` of the vertices' ``[V, 3, ...]``."""
+        return (self.J_regressor @ x.flatten(1)).unflatten(1, x.shape[1:])
 
     def rest_vertices(self, betas: Tensor, expression: Tensor | None = None) -> Tensor:
         """``[B, V, 3]`` metres, the shaped body at rest.
@@ -206,7 +215,8 @@ class SkinnedModel:
     def rest_joints(self, betas: Tensor, expression: Tensor | None = None) -> Tensor:
         """``[B, J, 3]`` metres, the joints of the shaped body at rest; arguments as above."""
         mean, shape, face = self.joint_shapes
-        return _add("expression", _add("betas", mean, shape, betas), face, expression)
+        shaped = _add("betas", mean, shape, betas)
+        return _add("expression", shaped, face, expression)
 
     def pose(
         self,
@@ -232,17 +242,19 @@ class SkinnedModel:
         Raises:
             ValueError: on shapes that do not fit, naming the argument.
         """
+        # The transforms of the shaped skeleton's joints.
         rotations = axis_angle_to_matrix(theta.to(self.v_template))
         rest = self.rest_joints(betas, expression).expand(len(theta), -1, -1)
         transforms = forward_kinematics(rest, self.parents, rotations, transl.to(rest))
+
+        # The shape in this pose, before skinning.
         vertices = self.rest_vertices(betas, expression)
         if pose_blend:
             eye = torch.eye(3, dtype=rotations.dtype)
             feature = (rotations[:, 1:] - eye).flatten(1)
             vertices = _add("theta", vertices, self.posedirs, feature)
-        return skin(vertices, *blend_transforms(transforms, *self.bones)), carry(
-            transforms, rest
-        )
+        A, t = blend_transforms(transforms, *self.bones)
+        return skin(vertices, A, t), carry(transforms, rest)
 
     def as_body(self, betas: ArrayLike = (), parts: Parts = "clothes") -> MarkedBody:
         """The shaped body as a `MarkedBody`: float32, one part per vertex, no blend shapes.
@@ -267,9 +279,11 @@ class SkinnedModel:
             )
         shape = torch.from_numpy(np.atleast_2d(np.asarray(betas, np.float64)))
         names = part_names(parts, self.joint_names)
+
+        # The part of each vertex, by its joint with the largest weight, the first of equals.
         own = [names.index(part_of_joint(parts, joint)) for joint in self.joint_names]
-        # the first of equals
         first = torch.from_numpy(self.weights.numpy().argmax(axis=1))
+
         index, weight = self.bones
         vertices = self.rest_vertices(shape)[0]
         joints = self.rest_joints(shape)[0]
@@ -293,13 +307,12 @@ class SkinnedModel:
     def landmarks(self, vertices: Tensor, joints: Tensor) -> tuple[Tensor, Tensor]:
         """MediaPipe's 33 landmarks ``[33, 3]`` at rest, and the joint ``[33]`` that carries each.
 
-        Convention: NaN, carried by the root, where the model has none: the mouth; and without
-        SMPL's or SMPL-X's own vertices also face, heels and most of the hands.
+        A landmark that the model does not have is NaN and carried by the root: the mouth; and
+        without SMPL's or SMPL-X's own vertices also face, heels and most of the hands.
         """
         if self.kind not in TABLES:
-            return joints.new_full((len(MEDIAPIPE33.names), 3), torch.nan), torch.zeros(
-                33
-            ).long()
+            unknown = joints.new_full((len(MEDIAPIPE33.names), 3), torch.nan)
+            return unknown, torch.zeros(len(unknown), dtype=torch.int64)
         table = TABLES[self.kind]
         whole = len(vertices) == table.counts[1]
         p, _ = to_mediapipe33(
@@ -307,11 +320,15 @@ class SkinnedModel:
             vertices.numpy() if whole else None,
             "smpl" if self.kind == "smpl" else "smplx",
         )
-        first = self.weights.numpy().argmax(axis=1)
+
+        # The carrier of a vertex is the joint with the largest weight.
         carriers = {name: joint for name, (joint, _) in table.joints.items()}
         if whole:
-            carriers |= {name: int(first[v]) for name, (v, _) in table.vertices.items()}
-            carriers |= {name: joint for name, (joint, _) in table.midpoints.items()}
+            largest = self.weights.numpy().argmax(axis=1)
+            for name, (vertex, _) in table.vertices.items():
+                carriers[name] = int(largest[vertex])
+            for name, (joint, _) in table.midpoints.items():
+                carriers[name] = joint
         bones = torch.tensor([carriers.get(name, 0) for name in MEDIAPIPE33.names])
         return torch.from_numpy(p), bones
 
@@ -322,10 +339,10 @@ def _add(
     """``base [N, 3]`` plus directions ``[N, 3, n]`` times coefficients ``[B, n]`` or fewer."""
     if coefficients is None:
         return base
-    most = directions.shape[-1]
-    if coefficients.ndim != 2 or coefficients.shape[1] > most:
+    maximum = directions.shape[-1]
+    if coefficients.ndim != 2 or coefficients.shape[1] > maximum:
         raise ValueError(
-            f"SkinnedModel: {name} must have shape [B, n] with n at most {most}, "
+            f"SkinnedModel: {name} must have shape [B, n] with n at most {maximum}, "
             f"got {list(coefficients.shape)}"
         )
     given = coefficients.to(base)
@@ -342,7 +359,7 @@ def read_smpl(path: Path | str) -> SkinnedModel:
         DataError: when the file is missing, damaged, refused, or not such a model.
     """
     arrays, parents = read_arrays(Path(path))
-    kind = KINDS.get(len(parents), "generic")
+    kind = MODEL_KINDS.get(len(parents), "generic")
     tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
     return SkinnedModel(kind=kind, parents=parents, **tensors)
 
@@ -350,8 +367,8 @@ def read_smpl(path: Path | str) -> SkinnedModel:
 def from_zju(Rh: ArrayLike, Th: ArrayLike, J0: ArrayLike) -> tuple[Floats, Floats]:
     """Root rotation and translation of :class:`SkinnedModel` from EasyMocap's and ZJU-MoCap's.
 
-    Convention: theirs is ``R(Rh) x + Th`` of the body posed with an unrotated root, about the
-    model's origin; ours rotates about the root joint: ``transl = Th + R J0 - J0``.
+    Theirs is ``R(Rh) x + Th`` of the body posed with an unrotated root, about the model's origin;
+    ours rotates about the root joint: ``transl = Th + R J0 - J0``.
 
     Args:
         Rh: ``[..., 3]`` axis-angle.
@@ -363,6 +380,7 @@ def from_zju(Rh: ArrayLike, Th: ArrayLike, J0: ArrayLike) -> tuple[Floats, Float
 
     Source: the release's loaders.
     """
+    # Both are equal at the root joint: R J0 + Th = J0 + transl.
     orient = np.asarray(Rh, np.float64)
     root = np.asarray(J0, np.float64)
     R = axis_angle_to_matrix(torch.from_numpy(orient)).numpy()

@@ -3,58 +3,83 @@
 Source: public loaders.
 """
 
+from itertools import product
 from typing import Literal, get_args
 
 Parts = Literal["clothes", "cihp", "joints"]
 
+# The 22 joints that SMPL and SMPL-X share.
 _BODY = (
-    *("pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2"),
-    *("left_ankle", "right_ankle", "spine3", "left_foot", "right_foot", "neck"),
-    *("left_collar", "right_collar", "head", "left_shoulder", "right_shoulder"),
-    *("left_elbow", "right_elbow", "left_wrist", "right_wrist"),
+    "pelvis",
+    "left_hip",
+    "right_hip",
+    "spine1",
+    "left_knee",
+    "right_knee",
+    "spine2",
+    "left_ankle",
+    "right_ankle",
+    "spine3",
+    "left_foot",
+    "right_foot",
+    "neck",
+    "left_collar",
+    "right_collar",
+    "head",
+    "left_shoulder",
+    "right_shoulder",
+    "left_elbow",
+    "right_elbow",
+    "left_wrist",
+    "right_wrist",
 )
-# SMPL-X's order, not MediaPipe's
+# SMPL-X's order, not MediaPipe's.
 _FINGERS = ("index", "middle", "pinky", "ring", "thumb")
-_HANDS = tuple(
-    f"{side}_{finger}{joint}"
-    for side in ("left", "right")
-    for finger in _FINGERS
-    for joint in (1, 2, 3)
-)
+_HAND = tuple(map("".join, product(_FINGERS, "123")))
+_HANDS = tuple(map("_".join, product(("left", "right"), _HAND)))
 SMPL_JOINTS = (*_BODY, "left_hand", "right_hand")
 SMPLX_JOINTS = (*_BODY, "jaw", "left_eye", "right_eye", *_HANDS)
 
 JOINT_NAMES = {"smpl": SMPL_JOINTS, "smplx": SMPLX_JOINTS}
 
 CLOTHES = (
-    *("background", "hair", "face_neck", "upper_clothes", "lower_clothes"),
-    *("left_arm", "right_arm", "left_hand", "right_hand"),
-    *("left_leg", "right_leg", "left_shoe", "right_shoe"),
+    "background",
+    "hair",
+    "face_neck",
+    "upper_clothes",
+    "lower_clothes",
+    "left_arm",
+    "right_arm",
+    "left_hand",
+    "right_hand",
+    "left_leg",
+    "right_leg",
+    "left_shoe",
+    "right_shoe",
 )
 """The parts of the free body, in the same order."""
 
 CIHP = (
-    *(
-        "background",
-        "hat",
-        "hair",
-        "glove",
-        "sunglasses",
-        "upper_clothes",
-        "dress",
-        "coat",
-    ),
-    *(
-        "socks",
-        "pants",
-        "torso_skin",
-        "scarf",
-        "skirt",
-        "face",
-        "left_arm",
-        "right_arm",
-    ),
-    *("left_leg", "right_leg", "left_shoe", "right_shoe"),
+    "background",
+    "hat",
+    "hair",
+    "glove",
+    "sunglasses",
+    "upper_clothes",
+    "dress",
+    "coat",
+    "socks",
+    "pants",
+    "torso_skin",
+    "scarf",
+    "skirt",
+    "face",
+    "left_arm",
+    "right_arm",
+    "left_leg",
+    "right_leg",
+    "left_shoe",
+    "right_shoe",
 )
 """ZJU-MoCap's ``mask_cihp``, ids 0 to 19; it has no hands."""
 
@@ -67,18 +92,19 @@ def part_names(parts: Parts, joint_names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def fitting_parts(label_names: tuple[str, ...], joint_names: tuple[str, ...]) -> Parts:
-    """The set of parts with these names; the free body's where there is none."""
-    return next(
-        (p for p in get_args(Parts) if part_names(p, joint_names) == label_names),
-        "clothes",
-    )
+    """The set of parts with these names; the free body's if there is none."""
+    parts: Parts
+    for parts in get_args(Parts):
+        if part_names(parts, joint_names) == label_names:
+            return parts
+    return "clothes"
 
 
 def part_of_joint(parts: Parts, joint: str) -> str:
     """The part that vertices moved by a joint usually belong to.
 
-    Convention: a body in a shirt, trousers and shoes; the head is face (a body model has no
-    hairline), the shins are legs.
+    The body wears a shirt, trousers and shoes; the head is face (a body model has no hairline), the
+    shins are legs.
 
     Args:
         parts: the set of parts.
@@ -86,6 +112,8 @@ def part_of_joint(parts: Parts, joint: str) -> str:
     """
     if parts == "joints":
         return joint
+
+    # The head and the trunk have parts without a side.
     side, _, limb = joint.partition("_")
     if joint in ("neck", "head", "jaw") or limb == "eye":
         return "face_neck" if parts == "clothes" else "face"
@@ -106,6 +134,6 @@ def group_of_part(name: str) -> str:
     """The group of a part or joint: "left_hand", "right_hand", "face_neck", or "" for any other."""
     if name == "face":
         return "face_neck"
-    joint = name in SMPL_JOINTS or name in SMPLX_JOINTS
-    group = part_of_joint("clothes", name) if joint else name
+    is_joint = name in SMPL_JOINTS or name in SMPLX_JOINTS
+    group = part_of_joint("clothes", name) if is_joint else name
     return group if group in ("left_hand", "right_hand", "face_neck") else ""

@@ -1,10 +1,10 @@
 """From a skeleton to the pose of a body.
 
-Convention: metres, world frame, radians.
+Units are metres in the world frame and radians.
 """
 
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import torch
@@ -15,11 +15,17 @@ from kornia.geometry.conversions import (
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
-from gsgan.body import compiled, fingers
-from gsgan.body.fingers import PLACING, ROUNDS, Fingers
+from gsgan.body import compiled
+from gsgan.body.fingers import (
+    FINGER_LANDMARK_NOISE,
+    FINGER_ROUNDS,
+    PLACING,
+    TRACE,
+    Fingers,
+)
 from gsgan.body.free import Body
 from gsgan.body.lbs import axis_angle_to_matrix, left_jacobian, shortest_turn
-from gsgan.body.rig import SPINE, ancestors, build_rig, prior
+from gsgan.body.rig import SPINE, Limb, ancestors, build_rig, prior
 from gsgan.body.skinned import MarkedBody
 from gsgan.scene import BodyPose
 from gsgan.skeleton import (
@@ -33,30 +39,30 @@ from gsgan.skeleton.hands import HAND, PALM
 from gsgan.skeleton.tensors import constants
 from gsgan.utils.tensors import constant
 
+# Numbers of landmarks: of the pose, and with both hands.
 BODY = len(MEDIAPIPE33.names)
-ALL = len(MEDIAPIPE33_HANDS.names)
-SIZES = [len(template.names) for template in TEMPLATES.values()]
-BEYOND = 0.05  # standard deviation of a number below its least value
+WITH_HANDS = len(MEDIAPIPE33_HANDS.names)
+SKELETON_SIZES = [len(template.names) for template in TEMPLATES.values()]
+BEYOND = 0.05  # standard deviation of a number below its minimum
 # Metres, standard deviations of landmarks: detectors locate those of face and palm less well.
-NOISE = 0.004
+LANDMARK_NOISE = 0.004
 FACE_NOISE = 0.008
 KNUCKLE_NOISE = 0.007
+HIP_NOISE = 0.05  # of estimated hips: nothing else keeps the trunk from tilting
 KNUCKLES = slice(17, 23)  # of 33 landmarks: pinky, index and thumb of both hands
 ON_HANDS = ((17, 19, 21), (18, 20, 22))  # the 33 landmarks that hand landmarks replace
-HELD = 0.05  # the same of estimated hips: nothing else keeps the trunk from tilting
 ROBUST = 5.0  # standard deviations at which the loss of a landmark becomes linear
-# of the cost
-STEPS = 10
-CONVERGED = 1e-3
-GRADIENT_STEPS = 8  # error of gradients: a few percent where a landmark hardly matters
-DAMPING = 1e-3
-EASIER = 0.2
-HARDER = 20.0
+MAX_STEPS = 10  # Levenberg-Marquardt steps at most
+MIN_IMPROVEMENT = 1e-3  # relative change of the cost at which a frame stops
+GRADIENT_STEPS = 8  # error of gradients: a few percent if a landmark hardly matters
+FIRST_DAMPING = 1e-3  # at the first step
+DAMPING_DECREASE = 0.2  # factor of the damping after a step that lowers the cost
+DAMPING_INCREASE = 20.0  # and after one that does not
 FLOOR = 1e-3  # on the diagonal: the root has no prior
-CHUNK = 64  # frames at a time: their matrices fit into a processor's cache
-# radians: between these bends the twist's weight rises from 0 to 1
-STRAIGHT = 0.1
-SHARP = 0.4
+CHUNK_FRAMES = 64  # frames at a time: their matrices fit into a processor's cache
+# Between these bends, radians, the weight of the twist rises from 0 to 1.
+STRAIGHT_BEND = 0.1
+SHARP_BEND = 0.4
 
 
 class Linear(NamedTuple):
@@ -64,6 +70,15 @@ class Linear(NamedTuple):
 
     residual: Tensor  # [B, N, 3] metres
     by_number: Tensor  # [B, D, N, 3]
+
+
+class NormalEquations(NamedTuple):
+    """The cost of some numbers and its normal equations."""
+
+    cost: Tensor  # [B]
+    gradient: Tensor  # [B, D] half the cost's
+    matrix: Tensor  # [B, D, D] Gauss-Newton's
+    weight: Tensor  # [B, N] of iteratively reweighted least squares
 
 
 class Solver(nn.Module):
@@ -85,19 +100,19 @@ class Solver(nn.Module):
     """
 
     joints: Tensor  # [J, 3] rest
-    # [N, 3] rest, 0 where not known: 33, and 3 of each hand of the free body
+    # [N, 3] rest, 0 if not known: 33, and 3 of each hand of the free body
     landmarks: Tensor
     known: Tensor  # [N] bool
     replaced: Tensor  # [2, 33] bool, `ON_HANDS`
     precision: Tensor  # [33] of the body's own landmarks
     prior: Tensor  # [D, D] precisions
-    least: Tensor  # [D]
+    least: Tensor  # [D] minimum of each number
     matrix: Tensor  # [D, 3 T] from numbers to the turns' axis-angles
     follows: Tensor  # [E, N, 1] bool, whether a landmark follows an entry's turn
     jumps: Tensor  # [n, T + 1]
-    before: Tensor  # [T]
-    rest_hubs: Tensor  # [3, 3, 3]
-    rest_hips: Tensor  # [3]
+    before: Tensor  # [T] the turn before each, T for the root's
+    rest_hubs: Tensor  # [3, 3, 3] frames of pelvis, chest and head
+    rest_hips: Tensor  # [3] the middle of the hips
     joint: Tensor  # of `BodyRig`, like the others
     entry_turn: Tensor
     entry_number: Tensor
@@ -111,48 +126,49 @@ class Solver(nn.Module):
         self.fingers = Fingers(body) if isinstance(body, Body) else None
         known = body.landmarks.isfinite().all(-1)
         if isinstance(body, Body):
-            palms = [i + start for start in (0, HAND) for i in PALM]
-            body = replace(
-                body,
-                landmarks=torch.cat([body.landmarks, body.hand_landmarks[palms]]),
-                landmark_bone=torch.cat([body.landmark_bone, body.hand_bone[palms]]),
-            )
+            body = _with_palms(body)
+        own = body.landmarks[:BODY]
         with torch.no_grad():
             rig = self.rig = build_rig(body)
-            own = body.landmarks[:BODY]
             rest, _ = sanitise(torch.where(known[:, None], own, torch.nan)[None])
             matrix = body.joints.new_zeros(len(rig.names), len(rig.joint), 3)
             matrix[rig.entry_number, rig.entry_turn] = rig.entry_axis.to(matrix)
-            precision, least = prior(rig)
+            precision, minimum = prior(rig)
+            follows = ancestors(rig.parent)[rig.carrier].mT
+            replaced = torch.zeros(len(ON_HANDS), BODY, dtype=torch.bool)
+            for hand, replaced_landmarks in enumerate(ON_HANDS):
+                replaced[hand, list(replaced_landmarks)] = True
+
             held = {
                 "precision": known / _noise().square(),
                 "prior": precision,
-                "least": least,
+                "least": minimum,
                 "matrix": matrix.flatten(1),
-                "follows": ancestors(rig.parent)[rig.carrier].mT[
-                    rig.entry_turn, :, None
-                ],
+                "follows": follows[rig.entry_turn, :, None],
                 "jumps": _jumps(rig.parent),
                 "before": torch.where(rig.parent < 0, len(rig.parent), rig.parent),
                 "rest_hubs": bone_frames(rest).hubs[0],
                 "rest_hips": rest[0, MEDIAPIPE33.hips].mean(0),
-                "replaced": torch.tensor(
-                    [[i in hand for i in range(BODY)] for hand in ON_HANDS]
-                ),
+                "replaced": replaced,
                 "known": body.landmarks.isfinite().all(-1),
-                **{k: v for k, v in vars(rig).items() if isinstance(v, Tensor)},
             }
-        # the body's own tensors keep their graph: gradients reach its shape
-        held |= {"joints": body.joints, "landmarks": body.landmarks.nan_to_num()}
+            for name, value in vars(rig).items():
+                if isinstance(value, Tensor):
+                    held[name] = value
+
+        # The body's own tensors keep their graph: gradients reach its shape.
+        held["joints"] = body.joints
+        held["landmarks"] = body.landmarks.nan_to_num()
         for name, value in held.items():
-            value = value.to(body.joints) if value.is_floating_point() else value
+            if value.is_floating_point():
+                value = value.to(body.joints)
             self.register_buffer(name, value, persistent=False)
 
     def solve(self, skeleton: Tensor, visibility: Tensor) -> BodyPose:
         """The pose of each skeleton; differentiable in the skeleton and in the body.
 
-        Convention: joints that no visible landmark determines stay at rest, see `at_rest`. Without
-        gradients the arithmetic is compiled code on the CPU, where that is available.
+        Joints that no visible landmark determines stay at rest, see `at_rest`. Without gradients
+        the arithmetic is compiled code on the CPU, if that is available.
 
         Args:
             skeleton: ``[B, J, 3]`` metres, world: of a template. With 75 joints or more the fingers
@@ -163,53 +179,55 @@ class Solver(nn.Module):
         Raises:
             ValueError: on a wrong shape; with too few shoulders and hips (`sanitise`).
         """
-        if skeleton.shape[1] not in SIZES:
+        if skeleton.shape[1] not in SKELETON_SIZES:
             raise ValueError(
-                f"Solver: the skeleton must have {', '.join(map(str, SIZES))} joints, got "
+                f"Solver: the skeleton must have {', '.join(map(str, SKELETON_SIZES))} joints, got "
                 f"{skeleton.shape[1]}"
             )
         if not self._live(skeleton) and compiled.available(skeleton):
             return self._compiled(skeleton, visibility)
+
+        # The 33 landmarks, about the middle of the hips.
         skeleton = skeleton.to(self.joints.device)
         visibility = visibility.to(self.joints.device)
-        # the 33 landmarks, about the middle of the hips
-        hands = skeleton[:, BODY:ALL]
-        seen = visibility[:, BODY:ALL]
-        skeleton = skeleton[:, :BODY]
-        visibility = visibility[:, :BODY]
-        p, valid = sanitise(skeleton, visibility)
+        shown = visibility[:, :BODY]
+        p, valid = sanitise(skeleton[:, :BODY], shown)
         shift = p[:, MEDIAPIPE33.hips].mean(1, keepdim=True)
-        weight = (
-            self.weights(valid) * torch.where(valid, visibility, 1).clamp(0, 1)
-        ).to(p)
+        share = torch.where(valid, shown, 1).clamp(0, 1)
+        weight = (self.weights(valid) * share).to(p)
         p = p - shift
+
+        # Hands: their fingers, and the landmarks of the palm if they place the hand.
         found = None
-        # hands: their fingers, and three more landmarks each where the hand is placed
+        hands = skeleton[:, BODY:WITH_HANDS]
         if self.fingers is not None and hands.shape[1]:
-            seen = (seen > 0) & hands.isfinite().all(-1)
-            found = self.fingers(
-                torch.where(seen.unsqueeze(-1), hands - shift, 0.0), seen
-            )
+            seen = (visibility[:, BODY:WITH_HANDS] > 0) & hands.isfinite().all(-1)
+            near = torch.where(seen.unsqueeze(-1), hands - shift, 0.0)
+            found = self.fingers(near, seen)
             replaced = (found.placed.unsqueeze(-1) & self.replaced).any(1)
-            held = (
-                found.placed.repeat_interleave(len(PALM), dim=1).to(weight) / NOISE**2
-            )
+            placed = found.placed.repeat_interleave(len(PALM), dim=1)
+            held = placed.to(weight) / LANDMARK_NOISE**2
             weight = torch.cat([weight.masked_fill(replaced, 0), held], dim=1)
             own = self.landmarks[BODY:].unflatten(0, (2, -1))
             at = own @ found.rotations.mT + found.shifts.unsqueeze(-2)
             p = torch.cat([p, at.flatten(1, 2)], dim=1)
-        solved = [
-            self._solve(near, w)
-            for near, w in zip(
-                p.split(CHUNK), weight.detach().split(CHUNK), strict=True
-            )
-        ]
-        theta, transl = (torch.cat(parts) for parts in zip(*solved, strict=True))
+
+        # Frame by frame, in chunks.
+        thetas = []
+        transls = []
+        weights = weight.detach().split(CHUNK_FRAMES)
+        for near, near_weight in zip(p.split(CHUNK_FRAMES), weights, strict=True):
+            theta, transl = self._solve(near, near_weight)
+            thetas.append(theta)
+            transls.append(transl)
+        theta = torch.cat(thetas)
+        transl = torch.cat(transls)
+
+        # Fingers that are shown replace those at rest.
         if self.fingers is not None and found is not None:
             joints = self.fingers.joints
-            turns = torch.where(
-                found.shown.unsqueeze(-1), found.turns, theta[:, joints]
-            )
+            shown = found.shown.unsqueeze(-1)
+            turns = torch.where(shown, found.turns, theta[:, joints])
             theta = theta.index_copy(1, joints, turns)
         return BodyPose(theta, transl + shift[:, 0])
 
@@ -220,11 +238,15 @@ class Solver(nn.Module):
         body, valid = sanitise(p[:, :BODY], shown[:, :BODY])
         hands = None
         if self.fingers is not None and p.shape[1] > BODY:
-            landmarks = p[:, BODY:ALL]
-            hands = landmarks, (shown[:, BODY:ALL] > 0) & landmarks.isfinite().all(-1)
-        seen = body, shown[:, :BODY], valid
-        found = compiled.solve(*self.job(), seen, hands)
-        return BodyPose(*(x.to(skeleton.device) for x in found))
+            landmarks = p[:, BODY:WITH_HANDS]
+            seen = (shown[:, BODY:WITH_HANDS] > 0) & landmarks.isfinite().all(-1)
+            hands = (landmarks, seen)
+        theta, transl = compiled.solve(
+            *self.job(),
+            body=(body, shown[:, :BODY], valid),
+            hands=hands,
+        )
+        return BodyPose(theta.to(skeleton.device), transl.to(skeleton.device))
 
     def job(self) -> tuple[dict[str, Tensor], dict[str, int], dict[str, float]]:
         """Constants, counts and numbers of the compiled solve, see `compiled`."""
@@ -233,99 +255,103 @@ class Solver(nn.Module):
     def _counts(self) -> dict[str, int]:
         """The counts that `compiled.COUNTS` names."""
         rig = self.rig
-        sizes = (self.parents, len(rig.joint), len(rig.names), len(rig.entry_turn))
-        more = (
-            len(self.landmarks),
-            1 + len(SPINE),
-            len(rig.limbs),
-            STEPS,
-            len(ROUNDS),
-            PLACING,
-        )
-        return dict(zip(compiled.COUNTS, (*sizes, *more), strict=True))
+        return {
+            "J": self.parents,
+            "T": len(rig.joint),
+            "D": len(rig.names),
+            "E": len(rig.entry_turn),
+            "landmarks": len(self.landmarks),
+            "bends": 1 + len(SPINE),
+            "limbs": len(rig.limbs),
+            "steps": MAX_STEPS,
+            "rounds": len(FINGER_ROUNDS),
+            "placing": PLACING,
+        }
 
     @cached_property
     def _constants(self) -> dict[str, Tensor]:
         """The tensors that `compiled.CONSTANTS` names."""
         with torch.inference_mode(False), torch.no_grad():
+            own = {}
+            for name in compiled.RIG:
+                if hasattr(self, name):
+                    own[name] = getattr(self, name)
+            own["parent"] = self.rig.parent
+
+            # Constants of the template, for the frames of trunk and head.
             template = constants(MEDIAPIPE33, self.joints.device, self.joints.dtype)
+            own["head_from_eyes"] = template.head_from_eyes
+            own["torso"] = template.torso
+            own["head"] = template.head_points
 
             # The numbers of each joint that bends trunk and neck, and its share of the bend.
-            bends = [(name, 0, len(SPINE)) for name in SPINE] + [("neck", 1, 1)]
-            own = {
-                **{
-                    name: getattr(self, name)
-                    for name in compiled.RIG
-                    if hasattr(self, name)
-                },
-                "parent": self.rig.parent,
-                "head_from_eyes": template.head_from_eyes,
-                "torso": template.torso,
-                "head": template.head_points,
-                "bend_numbers": torch.tensor(
-                    [self.rig.numbers(name) for name, _, _ in bends]
-                ),
-                "bend_hub": torch.tensor([hub for _, hub, _ in bends]),
-                "bend_axes": torch.stack(
-                    [self._axes(name) / n for name, _, n in bends]
-                ),
-            }
+            names = (*SPINE, "neck")
+            axes = [self._axes(name) / len(SPINE) for name in SPINE]
+            own["bend_numbers"] = torch.tensor([self.rig.numbers(n) for n in names])
+            own["bend_hub"] = torch.tensor([0] * len(SPINE) + [1])
+            own["bend_axes"] = torch.stack([*axes, self._axes("neck")])
 
             # One row per limb.
             for name in ("hub", "points", "numbers", "axes", "bend"):
-                values = [
-                    torch.as_tensor(getattr(limb, name)) for limb in self.rig.limbs
-                ]
-                own[f"limb_{name}"] = torch.stack(values)
+                values = [getattr(limb, name) for limb in self.rig.limbs]
+                own[f"limb_{name}"] = torch.stack(list(map(torch.as_tensor, values)))
 
             # The finger solver's own constants, if the body has fingers.
             if self.fingers is not None:
-                buffers = {
-                    **dict(self.fingers.named_buffers()),
-                    "rounds": torch.tensor(ROUNDS),
-                }
-                own |= {f"finger_{name}": buffers[name] for name in compiled.FINGERS}
+                buffers = dict(self.fingers.named_buffers())
+                buffers["rounds"] = torch.tensor(FINGER_ROUNDS)
+                for name in compiled.FINGERS:
+                    own[f"finger_{name}"] = buffers[name]
             return compiled.held(own)
 
     def _axes(self, name: str) -> Tensor:
         """``[3, 3]`` unit axes, by rows, of the numbers of a chain."""
-        return normalize(
-            self.matrix[self.rig.numbers(name)].unflatten(1, (-1, 3)).sum(1)
-        )
+        rows = self.matrix[self.rig.numbers(name)]
+        return normalize(rows.unflatten(1, (-1, 3)).sum(1))
 
     def weights(self, valid: Tensor) -> Tensor:
-        """``[B, 33]`` precisions of landmarks, 0 where not ``valid [B, 33]``, bool.
+        """``[B, 33]`` precisions of landmarks, 0 of those that are not ``valid [B, 33]``, bool.
 
-        Where neither hip is valid, both hold the trunk weakly, as `sanitise` completed them.
+        If neither hip is valid, both hold the trunk weakly, as `sanitise` completed them.
         """
         hips = list(MEDIAPIPE33.hips)
         held = torch.zeros_like(self.precision)
-        held[hips] = 1 / HELD**2
+        held[hips] = 1 / HIP_NOISE**2
         return self.precision * valid + held * ~valid[:, hips].any(1, keepdim=True)
 
     def at_rest(self, visibility: Tensor) -> Tensor:
-        """``[B, joints]`` bool: joints that no visible landmark determines, which `solve` leaves at
-        rest."""
+        """``[B, joints]`` bool: joints at rest in `solve`, for want of visible landmarks."""
+        # The landmarks that count: those of a palm replace some of the 33.
         seen = visibility[:, :BODY] > 0
-        hands = visibility[:, BODY:ALL] > 0
-        if self.fingers is not None and hands.shape[1]:
-            placed = self.fingers.placed(hands)
+        hands = visibility[:, BODY:WITH_HANDS] > 0
+        fingers = self.fingers if hands.shape[1] else None
+        if fingers is not None:
+            placed = fingers.placed(hands)
             seen = seen & ~(placed.unsqueeze(-1) & self.replaced).any(1)
             seen = torch.cat([seen, placed.repeat_interleave(len(PALM), dim=1)], dim=1)
-        seen, n = seen & self.known[: seen.shape[1]], seen.shape[1]
+
+        # The numbers that they show; the root's always.
+        n = seen.shape[1]
+        seen = seen & self.known[:n]
         shown = (seen.to(self.prior) @ self.reaches[:, :n].to(self.prior).mT) > 0
         shown[:, :6] = True
+
+        # The joints that these numbers move.
         moved = torch.zeros(len(visibility), self.parents, device=visibility.device)
         joints = self.joint[self.entry_turn].expand(len(visibility), -1)
         moved = moved.scatter_add(1, joints, shown[:, self.entry_number].float())
-        if self.fingers is not None and hands.shape[1]:
-            moved[:, self.fingers.joints] += self.fingers.shown(hands)
+        if fingers is not None:
+            moved[:, fingers.joints] += fingers.shown(hands)
         return moved == 0
 
     def _solve(self, p: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+        """Pose ``[B, J, 3]`` and translation ``[B, 3]`` of landmarks ``[B, N, 3]``."""
         with torch.no_grad():
-            q, root = self.descend(*self.guess(p.detach()), p.detach(), weight)
+            q, root = self.guess(p.detach())
+            q, root = self.descend(q, root, p.detach(), weight)
         q = self._last_steps(q, root, p, weight)
+
+        # A joint's turns, one after the other.
         turns = self.rotations(q, root).unbind(1)
         whole: dict[int, Tensor] = {}
         for joint, R in zip(self.rig.joint.tolist(), turns, strict=True):
@@ -346,47 +372,70 @@ class Solver(nn.Module):
         hubs = bone_frames(p[:, :BODY]).hubs @ self.rest_hubs.mT
         pelvis, chest, head = hubs.unbind(1)
         q = p.new_zeros(len(p), len(self.prior))
-        for names, R in ((SPINE, pelvis.mT @ chest), (("neck",), chest.mT @ head)):
-            for name in names:
-                numbers = self.rig.numbers(name)
-                q[:, numbers] = log_of(R) @ self._axes(name).mT / len(names)
+
+        # The spine shares the turn from pelvis to chest, the neck has that from chest to head.
+        bend = log_of(pelvis.mT @ chest)
+        for name in SPINE:
+            q[:, self.rig.numbers(name)] = bend @ self._axes(name).mT / len(SPINE)
+        nod = log_of(chest.mT @ head)
+        q[:, self.rig.numbers("neck")] = nod @ self._axes("neck").mT
         for limb in self.rig.limbs:
-            first, middle, end = (p[:, i] for i in limb.points)
-            bones = (
-                torch.stack([middle - first, end - middle], dim=1) @ hubs[:, limb.hub]
-            )
-            upper, lower = normalize(bones, dim=-1, eps=1e-6).unbind(1)
-            axes = limb.axes.to(p)
-            flat, _, along = axes
-            swing = shortest_turn(along.expand_as(upper), upper)
-            lower = (lower.unsqueeze(1) @ axis_angle_to_matrix(swing)).squeeze(1)
-            normal = torch.linalg.cross(along.expand_as(lower), lower)
-            bend = torch.atan2(normal.norm(dim=-1), lower @ along)
-            twist = torch.atan2(normal @ torch.linalg.cross(along, flat), normal @ flat)
-            twist = twist * ((bend - STRAIGHT) / (SHARP - STRAIGHT)).clamp(0, 1)
-            found = [*(swing @ axes[:2].mT).unbind(1), twist, bend - limb.bend]
-            q[:, limb.numbers] = torch.stack(found, dim=1)
+            q[:, limb.numbers] = self._guess_limb(limb, p, hubs[:, limb.hub])
+
+        # The root is where the middle of the hips is right.
         hips = p[:, MEDIAPIPE33.hips].mean(1)
         q[:, 3:6] = hips - self.joints[0] - pelvis @ (self.rest_hips - self.joints[0])
         return q, pelvis
+
+    def _guess_limb(self, limb: Limb, p: Tensor, hub: Tensor) -> Tensor:
+        """``[B, 4]`` swing, twist and hinge of a limb on a hub ``[B, 3, 3]``."""
+        # Unit directions of the two bones, in the hub's axes.
+        first = p[:, limb.points[0]]
+        middle = p[:, limb.points[1]]
+        end = p[:, limb.points[2]]
+        bones = torch.stack([middle - first, end - middle], dim=1) @ hub
+        upper, lower = normalize(bones, dim=-1, eps=1e-6).unbind(1)
+
+        # The upper bone swings to its direction.
+        axes = limb.axes.to(p)
+        flat, _, along = axes
+        swing = shortest_turn(along.expand_as(upper), upper)
+
+        # The lower bone bends, in a plane that the twist turns; a straight limb shows no twist.
+        lower = (lower.unsqueeze(1) @ axis_angle_to_matrix(swing)).squeeze(1)
+        normal = torch.linalg.cross(along.expand_as(lower), lower)
+        bend = torch.atan2(normal.norm(dim=-1), lower @ along)
+        twist = torch.atan2(normal @ torch.linalg.cross(along, flat), normal @ flat)
+        twist = twist * ((bend - STRAIGHT_BEND) / (SHARP_BEND - STRAIGHT_BEND)).clamp(
+            0, 1
+        )
+        by_axis = swing @ axes[:2].mT
+        return torch.cat(
+            [by_axis, twist.unsqueeze(1), (bend - limb.bend).unsqueeze(1)], dim=1
+        )
 
     # -- the steps
 
     def rotations(self, q: Tensor, root: Tensor) -> Tensor:
         """``[B, T, 3, 3]`` of each turn."""
+        # The root's turn is about its rotation so far.
         R = axis_angle_to_matrix((q @ self.matrix).unflatten(1, (-1, 3)))
         return torch.cat([R[:, :1] @ root.unsqueeze(1), R[:, 1:]], dim=1)
 
     def transforms(self, q: Tensor, root: Tensor, joints: Tensor) -> Tensor:
         """``[B, T + 1, 4, 4]`` world transforms since rest after each turn; last the identity."""
+        # Each turn about its joint; the root's also translates.
         R = self.rotations(q, root)
         o = joints[self.joint]
         shift = o - (R @ o.unsqueeze(-1)).squeeze(-1)
         shift = torch.cat([shift[:, :1] + q[:, None, 3:6], shift[:, 1:]], dim=1)
+        top = torch.cat([R, shift.unsqueeze(-1)], dim=-1)
         bottom = constant((0.0, 0.0, 0.0, 1.0), R).expand(*R.shape[:2], 1, 4)
-        T = torch.cat([torch.cat([R, shift.unsqueeze(-1)], dim=-1), bottom], dim=-2)
+        T = torch.cat([top, bottom], dim=-2)
         T = torch.cat([T, torch.eye(4).to(T).expand(len(T), 1, 4, 4)], dim=1)
-        for jump in self.jumps:  # with the turn 1, 2, 4, ... before
+
+        # Products of 2, 4, 8, ... turns: with the product that ends 1, 2, 4, ... turns before.
+        for jump in self.jumps:
             T = T[:, jump] @ T
         return T
 
@@ -397,116 +446,146 @@ class Solver(nn.Module):
 
     def linear(self, q: Tensor, root: Tensor, p: Tensor) -> Linear:
         """Residuals to ``p [B, N, 3]`` and their derivatives, the root's about its rotation."""
-        T = self.transforms(q, root, self.joints)
         n = p.shape[1]
+        T = self.transforms(q, root, self.joints)
         x = self.points(T, self.landmarks[:n])
+
+        # Where each turn's joint is: moved by the turns before it, and the root by its translation.
         before = T[:, self.before]
-        origin = (before[..., :3, :3] @ self.joints[self.joint].unsqueeze(-1)).squeeze(
-            -1
-        )
+        before_R = before[..., :3, :3]
+        origin = (before_R @ self.joints[self.joint].unsqueeze(-1)).squeeze(-1)
         origin = origin + before[..., :3, 3]
         origin = torch.cat([origin[:, :1] + q[:, None, 3:6], origin[:, 1:]], dim=1)
-        turned = before[..., :3, :3] @ left_jacobian(
-            (q @ self.matrix).unflatten(1, (-1, 3))
-        )
+
+        # World axes about which a number turns, and arms from there to the landmarks that follow.
+        v = (q @ self.matrix).unflatten(1, (-1, 3))
+        turned = before_R @ left_jacobian(v)
         axes = (turned[:, self.entry_turn] @ self.entry_axis.unsqueeze(-1)).squeeze(-1)
-        arms = (
-            x.unsqueeze(1) - origin[:, self.entry_turn].unsqueeze(2)
-        ) * self.follows[:, :n]
+        arms = x.unsqueeze(1) - origin[:, self.entry_turn].unsqueeze(2)
+        arms = arms * self.follows[:, :n]
         moved = torch.linalg.cross(axes.unsqueeze(2).expand_as(arms), arms)
+
+        # A number's derivative is the sum over the turns that it moves.
         J = x.new_zeros(len(x), len(self.prior), *x.shape[1:])
         J.index_add_(1, self.entry_number, moved)
         J[:, 3:6] = torch.eye(3).to(x).unsqueeze(1)
         return Linear(x - p, J)
 
-    def normal(
-        self, q: Tensor, at: Linear, weight: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Cost ``[B]``, half its gradient ``[B, D]``, matrix ``[B, D, D]``, weights ``[B, N]``.
+    def normal(self, q: Tensor, at: Linear, weight: Tensor) -> NormalEquations:
+        """The normal equations at numbers ``q [B, D]``.
 
-        The weights are those of iteratively reweighted least squares.
+        The cost of a landmark with the residual r and the precision w is the pseudo-Huber loss
+        ``2 k² (sqrt(1 + w |r|² / k²) - 1)``, with k = `ROBUST`. Its gradient is that of least
+        squares with the weight ``w / sqrt(1 + w |r|² / k²)``.
         """
         root = (1 + weight * at.residual.square().sum(-1) / ROBUST**2).sqrt()
         w = weight / root
         J = at.by_number.flatten(2)
         weighted = (at.by_number * w[:, None, :, None]).flatten(2)
+        gradient = (weighted @ at.residual.flatten(1).unsqueeze(-1)).squeeze(-1)
+
+        # The prior, and what holds numbers above their minimum.
         stop, below = below_least(q, self.least)
-        cost = 2 * ROBUST**2 * (root - 1).sum(-1)
         pull = q @ self.prior
-        cost = cost + (pull * q + stop * below.square().nan_to_num()).sum(-1)
-        g = (weighted @ at.residual.flatten(1).unsqueeze(-1)).squeeze(-1)
-        g = g + pull + stop * below
-        return cost, g, weighted @ J.mT + self.prior + torch.diag_embed(stop + FLOOR), w
+        penalty = pull * q + stop * below.square().nan_to_num()
+        return NormalEquations(
+            cost=2 * ROBUST**2 * (root - 1).sum(-1) + penalty.sum(-1),
+            gradient=gradient + pull + stop * below,
+            matrix=weighted @ J.mT + self.prior + torch.diag_embed(stop + FLOOR),
+            weight=w,
+        )
 
     def descend(
-        self, q: Tensor, root: Tensor, p: Tensor, weight: Tensor, steps: int = STEPS
+        self, q: Tensor, root: Tensor, p: Tensor, weight: Tensor, steps: int = MAX_STEPS
     ) -> tuple[Tensor, Tensor]:
         """Numbers and root rotation after at most ``steps``; one that raises the cost is undone."""
-        best: tuple[Tensor, ...]
-        best = (q, root, *self.normal(q, self.linear(q, root, p), weight)[:3])
-        damping = q.new_full((len(q), 1), DAMPING)
+        best_q = q
+        best_root = root
+        best = self.normal(q, self.linear(q, root, p), weight)
+        damping = q.new_full((len(q), 1), FIRST_DAMPING)
         done = torch.zeros(len(q), dtype=torch.bool, device=q.device)
         for _ in range(steps):
-            q, root, cost, g, H = best
-            scaled = H + torch.diag_embed(damping * torch.diagonal(H, dim1=-2, dim2=-1))
-            q = q + _solved(scaled, -g)
-            # the next step starts from no turn
-            root = axis_angle_to_matrix(q[:, :3]) @ root
+            diagonal = torch.diagonal(best.matrix, dim1=-2, dim2=-1)
+            scaled = best.matrix + torch.diag_embed(damping * diagonal)
+            q = best_q + _solved(scaled, -best.gradient)
+
+            # The root's turn goes into its rotation: the next step starts from no turn.
+            root = axis_angle_to_matrix(q[:, :3]) @ best_root
             q = torch.cat([torch.zeros_like(q[:, :3]), q[:, 3:]], dim=1)
-            new = (q, root, *self.normal(q, self.linear(q, root, p), weight)[:3])
-            better = (new[2] < cost) & ~done
-            best = tuple(
-                torch.where(better.view(-1, *[1] * (a.ndim - 1)), a, b)
-                for a, b in zip(new, best, strict=True)
-            )
-            damping = torch.where(better[:, None], damping * EASIER, damping * HARDER)
-            # a frame stops by itself, so that its result does not depend on the others
-            done = done | ((new[2] - cost).abs() <= CONVERGED * cost)
+            new = self.normal(q, self.linear(q, root, p), weight)
+
+            # A frame stops by itself, so that its result does not depend on the others.
+            better = (new.cost < best.cost) & ~done
+            change = (new.cost - best.cost).abs()
+            done = done | (change <= MIN_IMPROVEMENT * best.cost)
+            easier = damping * DAMPING_DECREASE
+            damping = torch.where(better[:, None], easier, damping * DAMPING_INCREASE)
+            best_q = _chosen(better, q, best_q)
+            best_root = _chosen(better, root, best_root)
+            best = NormalEquations(*map(partial(_chosen, better), new, best))
             if bool(done.all()):
                 break
-        return best[0], best[1]
+        return best_q, best_root
 
     def _last_steps(self, q: Tensor, root: Tensor, p: Tensor, weight: Tensor) -> Tensor:
-        """Steps with a fixed matrix: they hardly move a solution. The derivative of their result
-        approaches that of the exact solution, whose matrix is not Gauss-Newton's."""
+        """Steps with a fixed matrix, which hardly move a solution.
+
+        The derivative of their result approaches that of the exact solution, whose matrix is not
+        Gauss-Newton's.
+        """
         with torch.no_grad():
-            H = self.normal(q, self.linear(q, root, p), weight)[2]
+            H = self.normal(q, self.linear(q, root, p), weight).matrix
         for _ in range(GRADIENT_STEPS if self._live(p) else 1):
-            q = q - _solved(H, self.normal(q, self.linear(q, root, p), weight)[1])
+            at = self.normal(q, self.linear(q, root, p), weight)
+            q = q - _solved(H, at.gradient)
         return q
+
+
+def _chosen(frames: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    """``a`` of the frames ``[B]`` bool, ``b`` of the others."""
+    return torch.where(frames.view(-1, *[1] * (a.ndim - 1)), a, b)
+
+
+def _with_palms(body: Body) -> Body:
+    """The body with the landmarks of its palms after the 33, the left hand's first."""
+    palms = [start + i for start in (0, HAND) for i in PALM]
+    return replace(
+        body,
+        landmarks=torch.cat([body.landmarks, body.hand_landmarks[palms]]),
+        landmark_bone=torch.cat([body.landmark_bone, body.hand_bone[palms]]),
+    )
 
 
 def _settings() -> dict[str, float]:
     """The numbers of `compiled.NUMBERS`."""
-    values = (
-        *(
-            CONVERGED,
-            DAMPING,
-            EASIER,
-            HARDER,
-            FLOOR,
-            ROBUST,
-            BEYOND,
-            HELD,
-            NOISE,
-            STRAIGHT,
-            SHARP,
-        ),
-        *(fingers.NOISE, fingers.TRACE),
-    )
-    return dict(zip(compiled.NUMBERS, values, strict=True))
+    return {
+        "converged": MIN_IMPROVEMENT,
+        "damping": FIRST_DAMPING,
+        "easier": DAMPING_DECREASE,
+        "harder": DAMPING_INCREASE,
+        "floor": FLOOR,
+        "robust": ROBUST,
+        "beyond": BEYOND,
+        "held": HIP_NOISE,
+        "noise": LANDMARK_NOISE,
+        "straight": STRAIGHT_BEND,
+        "sharp": SHARP_BEND,
+        "finger_noise": FINGER_LANDMARK_NOISE,
+        "trace": TRACE,
+    }
 
 
 def _noise() -> Tensor:
-    """``[33]`` metres."""
-    noise = torch.full((len(MEDIAPIPE33.names),), NOISE)
+    """``[33]`` metres, the standard deviation of each landmark."""
+    noise = torch.full((len(MEDIAPIPE33.names),), LANDMARK_NOISE)
+    # Landmarks that detectors locate less well.
     noise[list(MEDIAPIPE33.face)] = FACE_NOISE
     noise[KNUCKLES] = KNUCKLE_NOISE
     return noise
 
 
 def _jumps(parent: Tensor) -> Tensor:
-    """``[n, T + 1]`` the turns 1, 2, 4, ... before each; T, the identity, before the root's."""
+    """``[n, T + 1]`` the turn 1, 2, 4, ... before each; T, the identity, is before the root's."""
     T = len(parent)
     jump = torch.cat([torch.where(parent < 0, T, parent), torch.tensor([T])])
     found = []
@@ -518,12 +597,14 @@ def _jumps(parent: Tensor) -> Tensor:
 
 def _solved(H: Tensor, g: Tensor) -> Tensor:
     """``H⁻¹ g`` for positive definite ``H [B, D, D]``."""
+    # Without a check, which would wait for the device.
     factor, _ = torch.linalg.cholesky_ex(H)
     return torch.cholesky_solve(g.unsqueeze(-1), factor).squeeze(-1)
 
 
 def below_least(q: Tensor, least: Tensor) -> tuple[Tensor, Tensor]:
-    """How numbers ``q [B, D]`` are held back below their ``least [D]``: precisions, amounts."""
+    """Precisions and amounts of numbers ``q [B, D]`` below their minimum ``least [D]``."""
+    # Numbers above their minimum are free.
     below = (q - least).clamp_max(0)
     return (below < 0) / BEYOND**2, below
 

@@ -20,7 +20,7 @@ from gsgan.utils.files import read_text
 
 INCH = 0.0254
 ROOT = "root"
-FPS = 120.0  # of CMU's clips; the format does not store it
+CMU_FPS = 120.0  # frames per second of CMU's clips; the format does not store it
 
 
 def asf_of(amc: Path) -> Path:
@@ -29,9 +29,9 @@ def asf_of(amc: Path) -> Path:
     Raises:
         DataError: when there is none, or more than one candidate.
     """
-    stems = {amc.stem, amc.stem.split("_")[0]}
+    subject, _, _ = amc.stem.partition("_")
     found = sorted(amc.parent.glob("*.asf"))
-    named = [path for path in found if path.stem in stems] or found
+    named = [path for path in found if path.stem in (amc.stem, subject)] or found
     if len(named) != 1:
         raise DataError(
             f"{amc} needs its skeleton, an .asf file: found {len(named)} beside it; give "
@@ -61,6 +61,7 @@ def read_amc(amc: Path, asf: Path) -> tuple[RigMotion, float]:
 
 
 def _reason(error: Exception) -> str:
+    """The words of an error; a KeyError has only the key."""
     return f"{error} is missing" if isinstance(error, KeyError) else str(error)
 
 
@@ -72,7 +73,8 @@ def _lines(path: Path) -> list[list[str]]:
         raise DataError(f"{path} cannot be read: {error.strerror}") from error
     lines = []
     for line in text.splitlines():
-        words = re.sub("[()]", " ", line.split("#")[0]).split()
+        content, _, _ = line.partition("#")
+        words = re.sub("[()]", " ", content).split()
         if words:
             lines.append(words)
     return lines
@@ -83,8 +85,12 @@ class _Bone:
 
     def __init__(self, words: dict[str, list[str]], radians: float) -> None:
         direction = np.array(words.get("direction", ["0", "0", "0"]), dtype=float)
-        self.end = direction * float(words.get("length", ["0"])[0])
-        self.dof = [name.upper() for name in words.get("dof", words.get("order", []))]
+        length, *_ = words.get("length", ["0"])
+        self.end = direction * float(length)
+
+        # The names of the numbers of a frame: the root has them in "order".
+        dof = words.get("dof", words.get("order", []))
+        self.dof = list(map(str.upper, dof))
 
         # The root has its angles in "orientation" and their order in "axis", bones both in "axis".
         axis = words["axis"]
@@ -99,7 +105,8 @@ def _turn(angles: Array, names: list[str]) -> Array:
     R = np.broadcast_to(np.eye(3), (*angles.shape[:-1], 3, 3))
     for k, name in enumerate(names):
         if name[0] == "R":
-            R = rotation(angles[..., k, None] * np.eye(3)["XYZ".index(name[1])]) @ R
+            axis = np.eye(3)["XYZ".index(name[1])]
+            R = rotation(angles[..., k, None] * axis) @ R
     return R
 
 
@@ -113,7 +120,8 @@ class _Skeleton(NamedTuple):
 
 
 def _read_skeleton(path: Path) -> _Skeleton:
-    # the lines of each section, which begins with a line such as ":units"
+    """The skeleton in an ASF file."""
+    # The lines of each section, which begins with a line such as ":units".
     sections = defaultdict(list)
     section = ""
     for line in _lines(path):
@@ -122,28 +130,22 @@ def _read_skeleton(path: Path) -> _Skeleton:
         else:
             sections[section].append(line)
 
-    # units and the root, one value to a key
+    # Units and the root: each line has a key and its values.
     units = {"length": ["1"], "angle": ["deg"]}
-    units |= {key: values for key, *values in sections["units"]}
+    for key, *values in sections["units"]:
+        units[key] = values
     radians = np.pi / 180 if units["angle"][0].startswith("deg") else 1.0
-    root = {key: values for key, *values in sections["root"]}
+    root = {}
+    for key, *values in sections["root"]:
+        root[key] = values
 
-    # bones, of which the first value of each key counts
-    described = []
-    bone: dict[str, list[str]] = {}
-    for key, *values in sections["bonedata"]:
-        if key == "begin":
-            bone = {}
-        elif key == "end":
-            described.append(bone)
-        else:
-            bone.setdefault(key, values)
+    # The bones.
     bones = {ROOT: _Bone(root, radians)}
-    for words in described:
+    for words in _described_bones(sections["bonedata"]):
         name = words["name"][0]
         bones[name] = _Bone(words, radians)
 
-    # the hierarchy: each line has a parent and its children
+    # The hierarchy: each line has a parent and its children.
     parents: dict[str, str] = {}
     for parent, *children in sections["hierarchy"]:
         if parent not in ("begin", "end"):
@@ -153,7 +155,28 @@ def _read_skeleton(path: Path) -> _Skeleton:
         raise ValueError(
             f"the hierarchy lacks {', '.join(lost[:3])}; is the file cut off?"
         )
-    return _Skeleton(bones, parents, INCH / float(units["length"][0]), radians)
+
+    # CMU's unit of length is an inch / 0.45.
+    return _Skeleton(
+        bones=bones,
+        parents=parents,
+        metres=INCH / float(units["length"][0]),
+        radians=radians,
+    )
+
+
+def _described_bones(lines: list[list[str]]) -> list[dict[str, list[str]]]:
+    """The values of each bone by key; the first ones of each key count."""
+    described = []
+    bone: dict[str, list[str]] = {}
+    for key, *values in lines:
+        if key == "begin":
+            bone = {}
+        elif key == "end":
+            described.append(bone)
+        else:
+            bone.setdefault(key, values)
+    return described
 
 
 def _read_frames(
@@ -168,7 +191,7 @@ def _read_frames(
         elif frames:
             if key not in bones:
                 raise ValueError(f"it moves a bone {key}, which the skeleton lacks")
-            frames[-1][key] = [float(number) for number in numbers]
+            frames[-1][key] = list(map(float, numbers))
     if not frames:
         raise ValueError("it has no frames")
 
@@ -190,10 +213,11 @@ def _read_frames(
 
 
 def _motion(path: Path, skeleton: _Skeleton) -> RigMotion:
+    """The motion in an AMC file."""
     bones = skeleton.bones
     parents = skeleton.parents
 
-    # the names, parents first
+    # The names, parents first.
     names = [ROOT]
     while len(names) < len(bones):
         more = []
@@ -206,7 +230,7 @@ def _motion(path: Path, skeleton: _Skeleton) -> RigMotion:
             )
         names += more
 
-    # world rotations
+    # World rotations.
     values = _read_frames(path, bones, names)
     index = {name: j for j, name in enumerate(names)}
     rotations = np.empty((len(values[ROOT]), len(names), 3, 3))
@@ -220,12 +244,18 @@ def _motion(path: Path, skeleton: _Skeleton) -> RigMotion:
 
     # A bone starts where its parent ends; bones without children get an end site.
     starts = [np.zeros(3)]
-    starts += [bones[parents[name]].end for name in names[1:]]
     above = [-1]
-    above += [index[parents[name]] for name in names[1:]]
-    last = [name for name in names if name not in parents.values()]
-    at_last = [index[name] for name in last]
-    ends = [bones[name].end for name in last]
+    for name in names[1:]:
+        starts.append(bones[parents[name]].end)
+        above.append(index[parents[name]])
+    last = []
+    at_last = []
+    ends = []
+    for j, name in enumerate(names):
+        if name not in parents.values():
+            last.append(name)
+            at_last.append(j)
+            ends.append(bones[name].end)
 
     # CMU's wrist bone is the lower half of the forearm: the hand starts at the hand bone.
     plain = [re.sub("wrist$", "lowerforearmtwist", name) for name in names]
@@ -236,5 +266,5 @@ def _motion(path: Path, skeleton: _Skeleton) -> RigMotion:
         offsets=np.array(starts + ends),
         rotations=np.concatenate([rotations, rotations[:, at_last]], axis=1),
         root=values[ROOT][:, place],
-        frame_time=1 / FPS,
+        frame_time=1 / CMU_FPS,
     )

@@ -12,7 +12,8 @@ from gsgan.utils.errors import DataError
 from gsgan.utils.files import read_text
 
 SLOWEST = 1.0  # seconds between two frames from which the number is read as a rate
-STILL = 1e-3  # share of the longest bone: joints that leave their places by less are at rest
+# Share of the longest bone: joints that leave their places by less are at rest.
+REST_TOLERANCE = 1e-3
 
 
 @dataclass
@@ -75,9 +76,11 @@ def _read_hierarchy(words: list[str]) -> list[_Joint]:
             above.append(len(joints))
             joints.append(joint)
         elif word == "OFFSET":
-            joints[above[-1]].offset = np.array([float(next(rest)) for _ in range(3)])
+            offset = [float(next(rest)) for _ in range(3)]
+            joints[above[-1]].offset = np.array(offset)
         elif word == "CHANNELS":
-            joints[above[-1]].channels = [next(rest) for _ in range(int(next(rest)))]
+            count = int(next(rest))
+            joints[above[-1]].channels = [next(rest) for _ in range(count)]
         elif word == "}":
             above.pop()
     return joints
@@ -123,23 +126,27 @@ def _rig_motion(joints: list[_Joint], values: Array, frame_time: float) -> RigMo
             axis = "XYZ".index(channel[0].upper())
             column = next(columns)
             if channel.lower().endswith("rotation"):
-                R = R @ rotation(np.radians(column[:, None]) * np.eye(3)[axis])
+                angle = np.radians(column[:, None])
+                R = R @ rotation(angle * np.eye(3)[axis])
             else:
                 given[:, axis] = column
         if joint.parent >= 0 and _counts_from_offset(given, offsets[j]):
             given = given + offsets[j]
         local[:, j] = given
         rotations[:, j] = R
-    names = tuple(joint.name for joint in joints)
-    parents = tuple(joint.parent for joint in joints)
+    names = []
+    parents = []
+    for joint in joints:
+        names.append(joint.name)
+        parents.append(joint.parent)
 
     # Bones move if there are several roots, or if a joint leaves the place that its OFFSET gives.
-    tolerance = STILL * np.abs(offsets).max()
+    tolerance = REST_TOLERANCE * np.abs(offsets).max()
     leaves_offset = np.abs(local[:, 1:] - offsets[1:]) > tolerance
     moving_bones = parents.count(-1) > 1 or bool(leaves_offset.any())
     return RigMotion(
-        names=names,
-        parents=parents,
+        names=tuple(names),
+        parents=tuple(parents),
         offsets=offsets,
         rotations=rotations,
         root=local[:, 0],

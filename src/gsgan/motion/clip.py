@@ -34,47 +34,39 @@ from gsgan.utils.errors import DataError
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-TRUNK = (*SHOULDERS, *HIPS)
+TRUNK_LANDMARKS = (*SHOULDERS, *HIPS)
 AXES = ("x", "y", "z", "-x", "-y", "-z")
 FPS = 30.0  # assumed if neither the file nor the user gives a rate
-# maximum relative difference of bone lengths at which a motion is the subject's own
-OWN = 0.02
-# a joint seen in a smaller share of the frames counts as a false detection
-SELDOM = 0.2
+# Maximum relative difference of bone lengths at which a motion is the subject's own.
+OWN_LENGTHS = 0.02
+# A joint seen in a smaller share of the frames counts as a false detection.
+MIN_SEEN = 0.2
 ROUNDED = 5e-4  # relative difference of a rate from a whole number
-JUST_BEYOND = 0.05  # of a frame
-GAP = 5  # frames: in a longer gap a hand or face is not seen
-PARENT = {b: a for a, b in MEDIAPIPE33.limbs if b not in TRUNK}
+JUST_BEYOND = 0.05  # share of a frame
+MAX_GAP = 5  # frames: in a longer gap a hand or face is not seen
+PARENT = {b: a for a, b in MEDIAPIPE33.limbs if b not in TRUNK_LANDMARKS}
 
 
 @dataclass(frozen=True)
 class Clip:
-    """A person in motion.
+    """A person in motion."""
 
-    Args:
-        path: the file.
-        p: ``[F, J, 3]`` metres; NaN = unknown landmark. Not all formats tell where hands and face
-            are on the body.
-        visibility: ``[F, J]`` in [0, 1].
-        fps: frames per second, or None if unknown.
-        up: the axis that points up, or None to infer it from the skeleton.
-        unit: of the file's lengths, in words.
-        file_up: the up axis of the file, if ``up`` is that of converted landmarks.
-        body: ``[F]`` poses of the subject's body that the landmarks come from, or None.
-        filled: number of frames without shoulders and hips, see `checked`.
-        detached: whether hands and face are not where they are on the body, so that the motion
-            must be retargeted.
-    """
-
-    path: Path
+    path: Path  # the file
+    # [F, J, 3] metres; NaN = unknown landmark. Not all formats tell where hands and face are on the
+    # body
     p: Float
-    visibility: Float
-    fps: float | None
-    up: str | None
-    unit: str
-    file_up: str | None = None
+    visibility: Float  # [F, J] in [0, 1]
+    fps: float | None  # frames per second, or None if unknown
+    up: str | None  # the axis that points up, or None to infer it from the skeleton
+    unit: str  # of the file's lengths, in words
+    file_up: str | None = (
+        None  # the up axis of the file, if up is that of converted landmarks
+    )
+    # [F] poses of the subject's body that the landmarks come from, or None
     body: BodyPose | None = None
-    filled: int = 0
+    filled: int = 0  # number of frames without shoulders and hips, see `checked`
+    # whether hands and face are not where they are on the body, so that the motion must be
+    # retargeted
     detached: bool = False
 
     def __len__(self) -> int:
@@ -94,8 +86,9 @@ def checked(motion: Clip, least_visibility: float) -> Clip:
     """
     if not len(motion):
         raise DataError(f"{motion.path} has no frames; expected a motion")
-    trunk = list(TRUNK)
-    # shoulders and hips count at any visibility above 0
+
+    # Shoulders and hips count at any visibility above 0.
+    trunk = list(TRUNK_LANDMARKS)
     finite: Bool = np.asarray(np.isfinite(motion.p).all(-1))
     known = finite & (motion.visibility >= least_visibility)
     known[:, trunk] = finite[:, trunk] & (motion.visibility[:, trunk] > 0)
@@ -115,10 +108,10 @@ def checked(motion: Clip, least_visibility: float) -> Clip:
     p = np.where(known[..., None], motion.p, np.nan)
     filled = mixed(p[before], p[after], share)
     filled = np.where(np.isfinite(filled), filled, p[nearest])
+
+    # Hands and face stay.
     visibility = np.where(known, motion.visibility, 0.0)
     shown = visibility[nearest]
-
-    # hands and face stay
     filled[:, BODY:] = p[:, BODY:]
     shown[:, BODY:] = visibility[:, BODY:]
     return replace(
@@ -142,10 +135,12 @@ def neighbours(known: Bool) -> Neighbours:
     """The nearest known frames before and after each frame of ``known [F]``."""
     at = np.flatnonzero(known)
     times = np.arange(len(known))
-    after = at[np.searchsorted(at, times).clip(max=len(at) - 1)]
-    before = at[(np.searchsorted(at, times, side="right") - 1).clip(min=0)]
+    first_after = np.searchsorted(at, times)
+    after = at[first_after.clip(max=len(at) - 1)]
+    last_before = np.searchsorted(at, times, side="right") - 1
+    before = at[last_before.clip(min=0)]
     share = (times - before) / np.maximum(after - before, 1)
-    return Neighbours(before, after, share.clip(0, 1))
+    return Neighbours(before=before, after=after, share=share.clip(0, 1))
 
 
 def mixed(a: Float, b: Float, share: Float) -> Float:
@@ -160,29 +155,30 @@ def is_own(motion: Clip, subject: Proportions) -> bool:
     """Whether the motion's bones are as long as the subject's: it needs no retargeting."""
     with np.errstate(invalid="ignore"):
         lengths = bone_lengths(motion.p, BONES).T
-    # the relative difference of each bone's median length
+
+    # The relative difference of each bone's median length.
     differences = []
     for values, bone in zip(lengths, BONES, strict=True):
         seen = values[np.isfinite(values)]
         if len(seen):
             ratio = np.median(seen) / length(subject.rest, bone)
             differences.append(abs(ratio - 1))
-    return bool(differences) and bool(np.max(differences) <= OWN)
+    return bool(differences) and bool(np.max(differences) <= OWN_LENGTHS)
 
 
 def up_axis(motion: Clip) -> str:
     """The axis nearest to the median direction from hips to shoulders, e.g. "-y"."""
     known = np.nan_to_num(motion.p)
-    spine = np.median(middle(known, SHOULDERS) - middle(known, HIPS), axis=0)
-    return axis_name(spine)
+    spine = middle(known, SHOULDERS) - middle(known, HIPS)
+    return axis_name(np.median(spine, axis=0))
 
 
 def completed(motion: Clip, up: str) -> Float:
     """All landmarks ``[F, J, 3]`` in standard axes, Z up.
 
     Gaps of a joint are interpolated linearly, relative to its parent joint. A joint that fewer than
-    `SELDOM` of the frames show takes its place in the rest pose, relative to its parent. Gaps of a
-    hand or the face of up to `GAP` frames are interpolated; in longer ones it is NaN.
+    `MIN_SEEN` of the frames show takes its place in the rest pose, relative to its parent. Gaps of
+    a hand or the face of up to `MAX_GAP` frames are interpolated; in longer ones it is NaN.
     """
     # Offsets of the body's joints from their parents are interpolated.
     whole = motion.p @ upright(up).T
@@ -192,7 +188,7 @@ def completed(motion: Clip, up: str) -> Float:
     for joint, parent in PARENT.items():
         offset = p[:, joint] - p[:, parent]
         seen = known[:, joint] & known[:, parent]
-        if seen.mean() < SELDOM:
+        if seen.mean() < MIN_SEEN:
             known[:, joint] = False
         elif not seen.all():
             gaps = ~seen
@@ -204,7 +200,7 @@ def completed(motion: Clip, up: str) -> Float:
     # Joints without an offset take their places in the rest pose.
     body, _ = sanitise(torch.from_numpy(p), torch.from_numpy(known))
 
-    # hands and the face
+    # Hands and the face.
     parts = [body.numpy()]
     for part in (*HAND_JOINTS.values(), EXPRESSION):
         parts.append(_bridged(whole[:, part]))
@@ -212,14 +208,15 @@ def completed(motion: Clip, up: str) -> Float:
 
 
 def _bridged(part: Float) -> Float:
-    """A hand or face ``[F, n, 3]``; gaps of up to `GAP` frames are interpolated."""
+    """A hand or face ``[F, n, 3]``; gaps of up to `MAX_GAP` frames are interpolated."""
     known: Bool = np.asarray(np.isfinite(part).all((1, 2)))
     if not known.any():
         return part
     before, after, share = neighbours(known)
-    short = ~known & (after - before - 1 <= GAP) & (after > before)
+    is_short = (after - before - 1 <= MAX_GAP) & (after > before)
+    bridged = ~known & is_short
     filled = mixed(part[before], part[after], share)
-    return np.where(short[:, None, None], filled, part)
+    return np.where(bridged[:, None, None], filled, part)
 
 
 def resampled(p: Float, fps: float, wanted: float) -> Float:

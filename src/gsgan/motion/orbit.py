@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 class Orbit:
     """A circle around the person; angles in degrees, metres; see conf/render.yaml."""
 
-    turns: float = 1.0
-    elevation: float = 10.0
-    start: float = 0.0
-    distance: float | None = None
-    fov: float = 30.0
+    turns: float = 1.0  # over the whole motion
+    elevation: float = 10.0  # above the horizontal
+    start: float = 0.0  # azimuth of the first frame from the front
+    distance: float | None = None  # None: as large as in training images
+    fov: float = 30.0  # vertical field of view
 
     def __post_init__(self) -> None:
         between("orbit.elevation", self.elevation, -89, 89)
@@ -47,41 +47,42 @@ class Orbit:
             size: pixels of the square images.
             trained: pixels of the training images.
         """
+        # The middle of the motion, in standard axes; unknown joints are amid the others.
         F = len(p)
         to_world = upright(subject.up).T
         p = np.where(np.isfinite(p), p, np.nanmean(p, axis=1, keepdims=True))
         points = (p @ to_world).reshape(-1, 3)
-        middle = (np.min(points, axis=0) + np.max(points, axis=0)) / 2
+        middle = (points.min(axis=0) + points.max(axis=0)) / 2
 
-        # the distance at which the person is as large as in the training images
+        # The distance at which the person is as large as in the training images.
         focal = size / 2 / np.tan(np.radians(self.fov) / 2)
         pixels_per_metre = sum(scene.scale_train) / 2 * size / trained
         distance = self.distance or focal / pixels_per_metre
 
-        # directions from the person to the camera
+        # Directions from the person to the camera.
         share = np.arange(F) / max(F, 1)
         turned = np.radians(self.start + 360 * self.turns * share)
         azimuth = heading(p[0] @ to_world) + turned
         elevation = np.radians(self.elevation)
-        away = np.stack(
-            [
-                np.cos(elevation) * np.sin(azimuth),
-                -np.cos(elevation) * np.cos(azimuth),
-                np.full(F, np.sin(elevation)),
-            ],
-            axis=1,
-        )
+        sine = np.sin(azimuth)
+        cosine = np.cos(azimuth)
+        level = np.cos(elevation)
+        height = np.full(F, np.sin(elevation))
+        away = np.stack([level * sine, -level * cosine, height], axis=1)
 
-        # extrinsics, in the axes of the world
-        right = np.stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth], axis=1)
+        # Extrinsics, in the axes of the world.
+        right = np.stack([cosine, sine, 0 * azimuth], axis=1)
         R = np.stack([right, np.cross(-away, right), -away], axis=1)
         R = R @ upright(subject.up)
         centres = (middle + distance * away) @ upright(subject.up)
         t = -(R @ centres[..., None])[..., 0]
-        K = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
+
+        # Intrinsics: the principal point is the image's centre.
+        K = np.diag([focal, focal, 1])
+        K[:2, 2] = size / 2
         return Camera(
-            torch.from_numpy(K).float().expand(F, 3, 3),
-            torch.from_numpy(R).float(),
-            torch.from_numpy(t).float(),
-            (size, size),
+            K=torch.from_numpy(K).float().expand(F, 3, 3),
+            R=torch.from_numpy(R).float(),
+            t=torch.from_numpy(t).float(),
+            size=(size, size),
         )

@@ -16,8 +16,10 @@ from gsgan.utils.files import read_text
 
 Float = NDArray[np.float64]
 Ints = NDArray[np.int64]
+# Metres in a unit that a file may name.
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
-TRUNK = [11, 12, 23, 24]  # shoulders and hips
+LEFT_RIGHT_SHOULDER = [11, 12]
+LEFT_RIGHT_HIP = [23, 24]
 TRUNK_LENGTH = 0.5  # metres from shoulder to hip
 TRC_HEADER = 5  # lines before the first frame; markers are named in the fourth
 TRC_AXES = [2, 0, 1]  # Pose2Sim writes (y, z, x) so that y is up: columns of x, y, z
@@ -48,9 +50,11 @@ def read_points3d(path: Path) -> Points3D:
     frames, p = _read_trc(path)
     order = np.argsort(frames)
     p = p[order]
+
+    # A joint without all coordinates is missing.
     seen = known(p)
     p = np.where(seen[..., None], p, np.nan)
-    return Points3D(frames[order], p, seen.astype(np.float64))
+    return Points3D(frames=frames[order], p=p, conf=seen.astype(np.float64))
 
 
 def _read_trc(path: Path) -> tuple[Ints, Float]:
@@ -60,13 +64,12 @@ def _read_trc(path: Path) -> tuple[Ints, Float]:
         header = dict(zip(lines[1].split(), lines[2].split(), strict=False))
         markers = [name for name in lines[3].split("\t")[2:] if name]
 
-        # frame, time and the coordinates; an empty cell is missing
+        # Frame, time and the coordinates.
         columns = 2 + 3 * len(markers)
         rows = []
         for line in lines[TRC_HEADER:]:
             if line.strip():
-                cells = (line.split("\t") + [""] * columns)[:columns]
-                rows.append([float(x) if x.strip() else np.nan for x in cells])
+                rows.append(_numbers(line, columns))
     except (OSError, ValueError, IndexError) as error:
         raise DataError(f"{path} cannot be read as a .trc file ({error})") from None
 
@@ -79,17 +82,18 @@ def _read_trc(path: Path) -> tuple[Ints, Float]:
             f"{path}: Units is {unit!r}; expected one of {', '.join(UNITS)}"
         )
 
-    # the joints that MediaPipe has too
+    # The joints that MediaPipe has too.
     table = np.array(rows).reshape(-1, columns)
     F = len(table)
-    coordinates = table[:, 2:].reshape(F, len(markers), 3)[..., TRC_AXES]
+    coordinates = table[:, 2:].reshape(F, len(markers), 3)
+    coordinates = coordinates[..., TRC_AXES]
     p = np.full((F, BODY, 3), np.nan)
     for marker, name in enumerate(markers):
         joint = _joint(name)
         if joint is not None:
             p[:, joint] = coordinates[:, marker]
     p = zeros_as_missing(p)
-    if not np.isfinite(p[:, TRUNK]).any():
+    if not np.isfinite(p[:, LEFT_RIGHT_SHOULDER + LEFT_RIGHT_HIP]).any():
         raise DataError(
             f"{path} has no shoulders and hips; expected markers such as LShoulder and LHip, found "
             f"{', '.join(markers)}"
@@ -99,23 +103,34 @@ def _read_trc(path: Path) -> tuple[Ints, Float]:
     return whole_frame_ids(table[:, 0], str(path)), p * scale
 
 
+def _numbers(line: str, count: int) -> list[float]:
+    """The numbers of a line; NaN for an empty or missing cell."""
+    numbers = [np.nan] * count
+    for column, cell in enumerate(line.split("\t")[:count]):
+        if cell.strip():
+            numbers[column] = float(cell)
+    return numbers
+
+
 def _metres(p: Float) -> float:
     """Metres in the unit of joints ``[F, 33, 3]``: the trunk then has nearly its usual length."""
-    trunk = np.nanmedian(np.linalg.norm(p[:, [11, 12]] - p[:, [23, 24]], axis=-1))
+    trunk = p[:, LEFT_RIGHT_SHOULDER] - p[:, LEFT_RIGHT_HIP]
+    length = np.nanmedian(np.linalg.norm(trunk, axis=-1))
 
     def mismatch(scale: float) -> float:
-        return float(abs(np.log(scale * trunk / TRUNK_LENGTH)))
+        return float(abs(np.log(scale * length / TRUNK_LENGTH)))
 
     return min(UNITS.values(), key=mismatch)
 
 
 def _joint(name: str) -> int | None:
     """The MediaPipe joint of a marker: LShoulder, left_shoulder, Lknee, LBigToe, Nose."""
-    # the letters, without a prefix such as "person:"
-    word = re.sub(r"[^a-z]", "", name.split(":")[-1].lower())
+    # The letters, without a prefix such as "person:".
+    _, _, plain_name = name.rpartition(":")
+    word = re.sub(r"[^a-z]", "", plain_name.lower())
     word = word.replace("bigtoe", "footindex")
 
-    # "l" and "r" stand for "left" and "right"
+    # "l" and "r" stand for "left" and "right".
     word = re.sub("^r(?!ight)", "right", word)
     word = re.sub("^l(?!eft)", "left", word)
     plain = [name.replace("_", "") for name in MEDIAPIPE33.names]

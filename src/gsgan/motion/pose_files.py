@@ -29,24 +29,24 @@ from gsgan.utils.errors import DataError
 Float = NDArray[np.float64]
 
 GUESSED = 0.5  # visibility below which MediaPipe's hips are guesses
-# in files of pose-format
-IMAGE = "POSE_LANDMARKS"
-WORLD = "POSE_WORLD_LANDMARKS"
+# Names of the parts in files of pose-format.
+IMAGE_PART = "POSE_LANDMARKS"
+WORLD_PART = "POSE_WORLD_LANDMARKS"
 HAND_PARTS = ("LEFT_HAND_LANDMARKS", "RIGHT_HAND_LANDMARKS")
-MESH = "FACE_LANDMARKS"
-MESH_SIZE = 478
+MESH_PART = "FACE_LANDMARKS"
+MESH_SIZE = 478  # landmarks of MediaPipe's face mesh
 # The bones of a hand without the thumb: hands differ most in where its base is.
-HAND_LENGTHS = tuple(
-    bone for finger in FINGERS[1:] for bone in pairwise((WRIST, *finger))
-)
+HAND_LENGTHS: list[tuple[int, int]] = []
+for _finger in FINGERS[1:]:
+    HAND_LENGTHS += pairwise((WRIST, *_finger))
+# The default person's face at rest, metres; NaN for landmarks that no one uses.
 AVERAGE_FACE = np.full((MESH_SIZE, 3), np.nan)
 AVERAGE_FACE[list(FACE_MESH.values())] = rest_face()
 # Pairs of landmarks that are much further apart than an expression moves them.
-FACE_LENGTHS = tuple(
-    pair
-    for pair in combinations(FACE_MESH.values(), 2)
-    if length(AVERAGE_FACE, pair) > 0.05
-)
+FACE_LENGTHS = []
+for _pair in combinations(FACE_MESH.values(), 2):
+    if length(AVERAGE_FACE, _pair) > 0.05:
+        FACE_LENGTHS.append(_pair)
 # Rigid lengths, which show the scale of the axes.
 LENGTHS = (*BONES, SHOULDERS, HIPS, EARS, (11, 23), (12, 24))
 
@@ -67,34 +67,36 @@ def read_pose(path: Path, subject: Proportions) -> Clip:
         DataError: when the package is missing, the file is damaged or has no depth.
     """
     file = _PoseFile(path)
-    name = IMAGE if IMAGE in file.parts else WORLD
+    name = IMAGE_PART if IMAGE_PART in file.parts else WORLD_PART
     if name not in file.parts or "Z" not in file.parts[name].layout:
         raise DataError(
             f"{path} has {', '.join(file.parts)} without depth; expected MediaPipe's "
-            f"{WORLD} or {IMAGE} in 3D"
+            f"{WORLD_PART} or {IMAGE_PART} in 3D"
         )
 
-    # the body
+    # The body. Hips that are guesses are placed below the shoulders.
     p, visibility = file.landmarks(name, MEDIAPIPE33.names)
     person = visibility[:, SHOULDERS].all(1)
     guessed_hips = person.any() and np.median(visibility[person][:, HIPS]) < GUESSED
     if guessed_hips:
         visibility[:, HIPS] = 0
-    p = _to_metres(path, p, visibility, subject, pixels=name == IMAGE)
+    p = _to_metres(path, p, visibility, subject, pixels=name == IMAGE_PART)
     if guessed_hips:
         p[:, HIPS] = p[:, SHOULDERS] + (0, length(subject.rest, (11, 23)), 0)
         visibility[:, HIPS] = visibility[:, SHOULDERS]
 
-    # hands and face, if there are any
+    # Hands and face, if there are any.
     hands = [file.landmarks(hand, HAND_NAMES) for hand in HAND_PARTS]
-    mesh_names = tuple(str(number) for number in range(MESH_SIZE))
-    face = file.landmarks(MESH, mesh_names)
+    mesh_names = tuple(map(str, range(MESH_SIZE)))
+    face = file.landmarks(MESH_PART, mesh_names)
     points = [p]
     confidences = [visibility]
     if any(part.confidence.any() for part in (*hands, face)):
         rest = [subject.rest_with_hands[joints] for joints in HAND_JOINTS.values()]
         points += _parts_to_metres(hands, rest, HAND_LENGTHS)
         confidences += [hand.confidence for hand in hands]
+
+    # The whole mesh fixes the axes of the face.
     if face.confidence.any():
         (mesh,) = _parts_to_metres([face], [AVERAGE_FACE], FACE_LENGTHS)
         chosen = list(FACE_MESH.values())
@@ -155,7 +157,11 @@ class _PoseFile:
         start = 0
         for part in pose.header.components:
             stop = start + len(part.points)
-            self.parts[part.name] = _Part(slice(start, stop), part.points, part.format)
+            self.parts[part.name] = _Part(
+                columns=slice(start, stop),
+                points=part.points,
+                layout=part.format,
+            )
             start = stop
 
     def landmarks(self, name: str, points: tuple[str, ...]) -> _Landmarks:
@@ -167,7 +173,7 @@ class _PoseFile:
         if part is None or "Z" not in part.layout:
             return _Landmarks(p, confidence)
 
-        # the first person in each frame
+        # The first person in each frame.
         data = self.data[:, 0, part.columns]
         own_confidence = self.confidence[:, 0, part.columns]
         for k, point in enumerate(part.points):
@@ -185,14 +191,15 @@ def _to_metres(
     """Scales each of the three axes so that bones get the subject's lengths.
 
     The squares of the scales solve ``Σ sᵢ² dᵢ² = length²`` over all seen bones and frames, by
-    non-negative least squares. Pixels are square: x and y then take their mean scale. One unknown
+    non-negative least squares. For pixels, x and y take their mean scale. One unknown
     for both would leave no depth to a person with longer arms, or narrower shoulders.
     """
-    # one row for each bone in each frame in which it is seen
+    # One row for each bone in each frame in which it is seen.
     rows = []
     for a, b in LENGTHS:
-        visible = (visibility[:, (a, b)] > 0.2).all(1)
-        seen = visible & np.isfinite(p[:, (a, b)]).all((1, 2))
+        ends = [a, b]
+        visible = (visibility[:, ends] > 0.2).all(1)
+        seen = visible & np.isfinite(p[:, ends]).all((1, 2))
         squares = (p[seen, b] - p[seen, a]) ** 2
         rows.append(squares / length(subject.rest, (a, b)) ** 2)
     table = np.concatenate(rows)
@@ -200,6 +207,8 @@ def _to_metres(
         raise DataError(
             f"{path}: no frame shows two joints of a limb; expected a person"
         )
+
+    # Pixels are square.
     squares, _ = nnls(table, np.ones(len(table)))
     scales = np.sqrt(squares)
     if pixels:
@@ -217,15 +226,15 @@ def _parts_to_metres(
     The scale of x and y, and that of z, solve `_to_metres`' equations for pairs of all parts that
     are as long as in ``rest [n, 3]``.
     """
-    # one row for each pair in each frame: x and y together, then z
+    # One row for each pair in each frame: x and y together, then z.
     rows = []
     points = []
     for part, at_rest in zip(parts, rest, strict=True):
         p = np.where(part.confidence[..., None] > 0, part.p, np.nan)
         for a, b in lengths:
             squares = (p[:, b] - p[:, a]) ** 2 / length(at_rest, (a, b)) ** 2
-            row = np.stack([squares[:, 0] + squares[:, 1], squares[:, 2]], axis=1)
-            rows.append(row)
+            x, y, z = squares.T
+            rows.append(np.stack([x + y, z], axis=1))
         points.append(p)
     table = np.concatenate(rows)
     table = table[np.isfinite(table).all(1)]

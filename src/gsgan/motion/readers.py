@@ -35,7 +35,8 @@ from gsgan.utils.pickles import read_npy, read_pickle
 
 Float = NDArray[np.float64]
 
-JOINTS = len(MEDIAPIPE33.names)
+POSE_JOINTS = len(MEDIAPIPE33.names)
+# Keys of MediaPipe's world landmarks in its several APIs.
 WORLD_KEYS = (
     "pose_world_landmarks",
     "poseWorldLandmarks",
@@ -46,20 +47,22 @@ WORLD_KEYS = (
 )
 # Keys of SMPL's parameters: AMASS, HuMMan, smplx, AIST++, ZJU-MoCap.
 POSE_KEYS = ("poses", "pose", "smpl_poses", "body_pose", "pose_body")
-PART_KEYS = ("pose_jaw", "pose_eye", "pose_hand")  # of SMPL-X, after the body
+PART_KEYS = ("pose_jaw", "pose_eye", "pose_hand")  # parts of SMPL-X, after the body
 ROOT_KEYS = ("Rh", "root_orient", "global_orient")
 MOVE_KEYS = ("trans", "transl", "smpl_trans", "Th")
+# Of the shape coefficients.
 SHAPE_KEYS = ("betas", "shapes")
-# numbers of poses of SMPL-X's body, SMPL, SMPL-H, SMPL-X
+# Numbers of poses of SMPL-X's body, SMPL, SMPL-H, SMPL-X.
 WITHOUT_ROOT = (63, 69, 153, 162)
 RATE_KEYS = ("fps", "mocap_framerate", "mocap_frame_rate")
-SCALE = "smpl_scaling"  # of AIST++: units of its translations in a metre
+SCALE_KEY = "smpl_scaling"  # in AIST++: units of its translations in a metre
+# All arrays that are read, if a file has them.
 ARRAYS = (
     "p",
     "conf",
     "theta",
     "visibility",
-    SCALE,
+    SCALE_KEY,
     *WORLD_KEYS,
     *POSE_KEYS,
     *PART_KEYS,
@@ -69,6 +72,7 @@ ARRAYS = (
     *RATE_KEYS,
 )
 SMPL_BODY = 22  # joints that SMPL, SMPL-H and SMPL-X share
+# Metres in the units that rigs are made in.
 LEG_UNITS = {
     "metres": 1.0,
     "decimetres": 0.1,
@@ -81,18 +85,13 @@ LEG_UNITS = {
 
 @dataclass(frozen=True)
 class Source:
-    """What readers may need besides the file.
+    """Settings that readers may need besides the file."""
 
-    Args:
-        subject: the subject's proportions, for formats without face, hands and scale.
-        smpl: an SMPL or SMPL-X model file, or None.
-        skeleton: the ASF file of an AMC motion, or None for the one in the same folder.
-        up: the axis of a rig's file that points up, or None to find it from the frames.
-    """
-
-    subject: Proportions
-    smpl: Path | None = None
+    subject: Proportions  # the subject's proportions, for formats without face, hands and scale
+    smpl: Path | None = None  # an SMPL or SMPL-X model file, or None
+    # the ASF file of an AMC motion, or None for the one in the same folder
     skeleton: Path | None = None
+    # the axis of a rig's file that points up, or None to find it from the frames
     up: str | None = None
 
 
@@ -185,7 +184,10 @@ def _first(
     arrays: dict[str, NDArray[Any]], keys: tuple[str, ...], default: Any = None
 ) -> Any:
     """The first array that there is."""
-    return next((arrays[key] for key in keys if key in arrays), default)
+    for key in keys:
+        if key in arrays:
+            return arrays[key]
+    return default
 
 
 def _meta(path: Path) -> dict[str, Any]:
@@ -198,10 +200,10 @@ def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Clip:
     """Landmarks as `gsgan.prepare` writes them."""
     hands = EXPRESSION.start
     face = EXPRESSION.stop
-    if arrays["p"].shape[1:] not in ((JOINTS, 3), (hands, 3), (face, 3)):
+    if arrays["p"].shape[1:] not in ((POSE_JOINTS, 3), (hands, 3), (face, 3)):
         raise DataError(
-            f"{path}: 'p' must have shape [F, {JOINTS}, 3], with hands [F, {hands}, 3], or with "
-            f"hands and face [F, {face}, 3]; got {list(arrays['p'].shape)}"
+            f"{path}: 'p' must have shape [F, {POSE_JOINTS}, 3], with hands [F, {hands}, 3], or "
+            f"with hands and face [F, {face}, 3]; got {list(arrays['p'].shape)}"
         )
     p = arrays["p"].astype(np.float64)
     conf = np.ones(p.shape[:2])
@@ -210,13 +212,13 @@ def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Clip:
     conf = np.where(np.isfinite(p).all(-1), np.nan_to_num(conf), 0.0)
 
     # People filmed from the waist up get hips below their shoulders.
-    seen = conf[:, :JOINTS] > 0
+    seen = conf[:, :POSE_JOINTS] > 0
     no_hips = seen[:, SHOULDERS].all(1) & ~seen[:, HIPS].any(1)
-    body = np.nan_to_num(p[:, :JOINTS])
+    body = np.nan_to_num(p[:, :POSE_JOINTS])
     placed = hips_below(body, seen)
     if no_hips.any() and (placed != body).any():
-        p[no_hips, :JOINTS] = np.where(
-            seen[no_hips, :, None], p[no_hips, :JOINTS], np.nan
+        p[no_hips, :POSE_JOINTS] = np.where(
+            seen[no_hips, :, None], p[no_hips, :POSE_JOINTS], np.nan
         )
         for hip, shoulder in zip(HIPS, SHOULDERS, strict=True):
             p[no_hips, hip] = placed[no_hips, hip]
@@ -246,20 +248,23 @@ def _body_pose(
     transl = scale * expect_array(arrays, "transl", (F, 3), path)
     fps = fps or meta.get("fps")
 
-    # another number of bones: SMPL
+    # Another number of bones: SMPL.
     if bones != len(free_body().parents):
         smpl = {"poses": theta.reshape(F, -1), "trans": transl}
         if "betas" in arrays:
             smpl["betas"] = arrays["betas"]
         return _smpl(path, smpl, fps, source)
 
-    shape = path.with_name(SHAPE)  # by gsgan.fit
+    # The free body in the shape that gsgan.fit has stored, if any.
+    shape = path.with_name(SHAPE)
     subject = open_body("free", betas=read_shape(shape) if shape.is_file() else ())
     assert subject is not None
     poses = BodyPose(
         theta=torch.from_numpy(np.nan_to_num(theta)).float(),
         transl=torch.from_numpy(np.nan_to_num(transl)).float(),
     )
+
+    # Frames with NaN were posed as zeros.
     p = subject.posed_landmarks(poses).double().numpy()
     known = np.isfinite(theta).all((1, 2)) & np.isfinite(transl).all(1)
     p[~known] = np.nan
@@ -289,12 +294,12 @@ def _smpl(
             f"smpl={source.smpl} does not exist; expected a .pkl or .npz file"
         )
 
-    # poses, moves in metres and the median shape
+    # Poses, moves in metres and the median shape.
     model = read_smpl(source.smpl)
     poses = _smpl_poses(path, arrays)
     F = len(poses)
     moves = np.asarray(_first(arrays, MOVE_KEYS, np.zeros((F, 3))), np.float64)
-    moves = moves.reshape(F, 3) / arrays.get(SCALE, 1.0)
+    moves = moves.reshape(F, 3) / arrays.get(SCALE_KEY, 1.0)
     betas = np.asarray(_first(arrays, SHAPE_KEYS, np.zeros(10)), np.float64)
     betas = np.median(betas.reshape(-1, betas.shape[-1]), axis=0)
     betas = betas[: model.shapedirs.shape[-1]]
@@ -309,9 +314,8 @@ def _smpl(
         root = model.rest_joints(torch.from_numpy(betas[None]))[0, 0].numpy()
         theta[:, 0], moves = from_zju(theta[:, 0], moves, root)
 
-    motion = smpl_motion.SmplMotion(
-        np.arange(F), theta, moves, np.repeat(betas[None], F, axis=0)
-    )
+    shapes = np.repeat(betas[None], F, axis=0)
+    motion = smpl_motion.SmplMotion(np.arange(F), theta, moves, shapes)
     p, conf = smpl_motion.landmarks_of(model, motion)
     p[~known] = np.nan
     return Clip(path=path, p=p, visibility=conf, fps=fps, up=None, unit="metres")
@@ -324,7 +328,7 @@ def _smpl_poses(path: Path, arrays: dict[str, Any]) -> Float:
     too; HuMMan holds ``global_orient`` and ``body_pose`` (69); ZJU-MoCap an empty root in ``poses``
     (72) and ``Rh``.
     """
-    # one row of numbers for each frame
+    # One row of numbers for each frame.
     poses = np.asarray(_first(arrays, POSE_KEYS), np.float64)
     poses = poses.reshape(len(poses), -1)
     root = _first(arrays, ROOT_KEYS)
@@ -423,17 +427,17 @@ def _landmark_row(where: str, frame: Any) -> Float:
     if isinstance(points, list) and len(points) == 1:
         points = points[0]  # the Tasks API returns a list of people
     if not points:
-        return np.repeat([[np.nan, np.nan, np.nan, 0]], JOINTS, axis=0)
+        return np.repeat([[np.nan, np.nan, np.nan, 0]], POSE_JOINTS, axis=0)
 
-    # 33 landmarks of 4 numbers
+    # 33 landmarks of 4 numbers.
     try:
-        rows = [_numbers(point) for point in points]
+        rows = list(map(_numbers, points))
     except TypeError:
         rows = []
     row = as_floats(rows)
-    if row.shape != (JOINTS, 4) or np.isnan(row).any():
+    if row.shape != (POSE_JOINTS, 4) or np.isnan(row).any():
         raise DataError(
-            f"{where}: expected {JOINTS} landmarks with x, y, z; found {len(rows)}"
+            f"{where}: expected {POSE_JOINTS} landmarks with x, y, z; found {len(rows)}"
         )
     return row
 
@@ -442,7 +446,7 @@ def _numbers(point: Any) -> list[Any]:
     """x, y, z and visibility of a landmark; a missing visibility is 1."""
     if not isinstance(point, dict):
         return [*point, 1.0][:4]
-    # TensorFlow.js calls the visibility score
+    # TensorFlow.js calls the visibility score.
     visibility = point.get("visibility", point.get("score", 1.0))
     return [point.get("x"), point.get("y"), point.get("z"), visibility]
 
@@ -455,9 +459,9 @@ def _with_visibility(path: Path, points: NDArray[Any], visibility: Any) -> Float
         points: ``[F, 33, 3 or 4 or 5]``; the fourth number is the visibility.
         visibility: ``[F, 33]``, or None.
     """
-    if points.ndim != 3 or points.shape[1] != JOINTS or points.shape[2] < 3:
+    if points.ndim != 3 or points.shape[1] != POSE_JOINTS or points.shape[2] < 3:
         raise DataError(
-            f"{path}: the world landmarks must have shape (any, {JOINTS}, 3 or 4), found "
+            f"{path}: the world landmarks must have shape (any, {POSE_JOINTS}, 3 or 4), found "
             f"{points.shape}"
         )
     if visibility is None and points.shape[2] > 3:
@@ -483,7 +487,8 @@ def _rig(path: Path, motion: RigMotion, metres: float | None, source: Source) ->
         raise DataError(
             f"{path} is no motion of a person ({reason}); export it again"
         ) from error
-    # the unit with which the legs are about as long as the subject's
+
+    # The unit with which the legs are about as long as the subject's.
     if metres is None:
 
         def mismatch(unit: str) -> float:
@@ -534,6 +539,7 @@ def _read_pose(path: Path, source: Source) -> Clip:
     return read_pose(path, source.subject)
 
 
+# By the suffix of the file.
 READERS: dict[str, Callable[[Path, Source], Clip]] = {
     ".npz": read_npz,
     ".pkl": read_dictionary,

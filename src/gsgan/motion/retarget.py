@@ -40,20 +40,15 @@ from gsgan.skeleton.template import CHEST, HEAD, PELVIS
 
 Float = NDArray[np.float64]
 
-PALM = (WRIST, PINKY, INDEX)  # landmarks of a hand that give its axes
-STILL = 0.001  # metres: landmarks of a face that move less count fully in its alignment
-ROUNDS = 10  # iterations of the alignment
-# maximum bend of the neck in radians: detectors place faces too far forward
-NECK = 0.45
+PALM_LANDMARKS = (WRIST, PINKY, INDEX)  # landmarks of a hand that give its axes
+# Metres: landmarks that move less count fully in the face's alignment.
+FACE_STILL = 0.001
+ALIGN_ROUNDS = 10  # iterations of the alignment
+# Radians: detectors place faces too far forward.
+MAX_NECK_BEND = 0.45
 RIG_JOINTS = ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot")
-LEFT_LANDMARKS = (
-    11,
-    13,
-    15,
-    23,
-    25,
-    27,
-)  # of these joints; those of the right are one more
+# Landmarks of these joints on the left; those on the right are one more.
+LEFT_LANDMARKS = (11, 13, 15, 23, 25, 27)
 
 
 def retargeted(p: Float, subject: Proportions, scale: float | None = None) -> Float:
@@ -78,7 +73,7 @@ def retargeted(p: Float, subject: Proportions, scale: float | None = None) -> Fl
     result = np.full_like(given, np.nan)
     q = result[:, :BODY]
 
-    # the path
+    # The path, scaled by the median lengths of the legs.
     if scale is None:
         legs = []
         for a, b in chain.from_iterable(LEGS):
@@ -86,7 +81,7 @@ def retargeted(p: Float, subject: Proportions, scale: float | None = None) -> Fl
         scale = 2 * subject.leg / float(np.median(legs, axis=1).sum())
     hips = middle(p, HIPS) * scale
 
-    # trunk, arms and legs
+    # Hips and shoulders, each pair about its middle.
     upward = unit(middle(p, SHOULDERS) - middle(p, HIPS))
     chest = hips + upward * rest[SHOULDERS[0], 2]
     for pair, centre in ((HIPS, hips), (SHOULDERS, chest)):
@@ -94,10 +89,12 @@ def retargeted(p: Float, subject: Proportions, scale: float | None = None) -> Fl
         half = unit(p[:, left] - p[:, right]) * length(rest, pair) / 2
         q[:, left] = centre + half
         q[:, right] = centre - half
+
+    # Arms and legs, from the trunk outwards.
     for a, b in BONES:
         q[:, b] = q[:, a] + unit(p[:, b] - p[:, a]) * length(rest, (a, b))
 
-    # hands: turned as the palm's three landmarks of the pose, or better as the hand's own
+    # Hands: turned as the palm's three landmarks of the pose, or better as the hand's own.
     for wrist, ends in HAND_LANDMARKS.items():
         first, second = ends[:2]
         axes = hand_frame(p, wrist, first, second)
@@ -107,23 +104,26 @@ def retargeted(p: Float, subject: Proportions, scale: float | None = None) -> Fl
             from_wrist, palm = _posed_hand(given[:, hand], subject, wrist)
             result[:, hand] = q[:, wrist, None] + from_wrist
             turn = np.where(np.isfinite(palm), palm, turn)
-        q[:, ends] = q[:, wrist, None] + (rest[list(ends)] - rest[wrist]) @ turn.mT
+        own = rest[list(ends)] - rest[wrist]
+        q[:, ends] = q[:, wrist, None] + own @ turn.mT
 
-    # feet
+    # Feet: turned as heel, toe and ankle.
     for ankle, feet in FEET.items():
         turn = _foot_frame(p, ankle) @ _foot_frame(rest, ankle).T
-        q[:, feet] = q[:, ankle, None] + (rest[list(feet)] - rest[ankle]) @ turn.mT
+        own = rest[list(feet)] - rest[ankle]
+        q[:, feet] = q[:, ankle, None] + own @ turn.mT
 
-    # the neck, bent from the chest's axes by at most `NECK`
+    # The neck, bent from the chest's axes by at most `MAX_NECK_BEND`
     neck = middle(rest, EARS) - middle(rest, SHOULDERS)
     chest_axes = bone_frames(torch.from_numpy(p)).hubs[:, CHEST].numpy()
     straight = chest_axes @ (TO_STANDARD.T @ neck)
-    bend = axis_angle(between(straight, middle(p, EARS) - middle(p, SHOULDERS)))
+    shown = middle(p, EARS) - middle(p, SHOULDERS)
+    bend = axis_angle(between(straight, shown))
     angle = np.linalg.norm(bend, axis=-1, keepdims=True)
-    bend = bend * (NECK / np.maximum(angle, NECK))
+    bend = bend * (MAX_NECK_BEND / np.maximum(angle, MAX_NECK_BEND))
     ears = chest + (rotation(bend) @ straight[..., None])[..., 0]
 
-    # the head, and the face on it
+    # The head, and the face on it.
     turn = _head_frame(p) @ _head_frame(rest[None]).mT
     from_ears = rest[list(HEAD_LANDMARKS)] - middle(rest, EARS)
     q[:, HEAD_LANDMARKS] = ears[:, None] + from_ears @ turn.mT
@@ -146,12 +146,15 @@ def expressed(p: Float, rest: Float) -> Float:
     Returns:
         Metres; NaN where not seen.
     """
+    # All frames as one, whose points are aligned with as many copies of the subject's face.
     given = torch.from_numpy(p)
     own = torch.from_numpy(rest)
     seen = given.isfinite().all(-1).double().reshape(1, -1, 1)
     onto = own.repeat(len(given), 1)
     found = _aligned(given.reshape(1, -1, 3), onto, seen).reshape(p.shape)
-    at_rest = found.nanmedian(0).values
+
+    # Expressions are offsets from the other person's face at rest.
+    at_rest, _ = found.nanmedian(0)
     return (own + found - at_rest).numpy()
 
 
@@ -161,15 +164,18 @@ def steadied(p: Float) -> Float:
     Frames are aligned with their median. Landmarks that move much count little in the frame's
     alignment: a jaw that drops does not nod the head.
     """
+    # At first, the frame with most landmarks stands for the median.
     found = torch.from_numpy(p)
     seen = found.isfinite().all(-1, keepdim=True).double()
-    usual = found[seen.sum((1, 2)).argmax()]  # the frame with most landmarks
+    usual = found[seen.sum((1, 2)).argmax()]
     weight = seen * usual.isfinite()[:, :1]
-    for _ in range(ROUNDS):
+    for _ in range(ALIGN_ROUNDS):
         found = _aligned(found, usual.nan_to_num(), weight)
-        usual = found.nanmedian(0).values
-        moved = (found - usual).square().sum(-1, keepdim=True) / STILL**2
-        weight = (1 / (1 + moved)).nan_to_num()  # Cauchy's
+        usual, _ = found.nanmedian(0)
+
+        # Cauchy's weights.
+        moved = (found - usual).square().sum(-1, keepdim=True) / FACE_STILL**2
+        weight = (1 / (1 + moved)).nan_to_num()
     return found.numpy()
 
 
@@ -184,6 +190,7 @@ def _aligned(p: Tensor, onto: Tensor, weight: Tensor) -> Tensor:
         onto: ``[n, 3]``.
         weight: ``[F, n, 1]``, 0 for NaN.
     """
+    # Both sets of points about their centres.
     weight = weight / weight.sum(1, keepdim=True).clamp_min(1e-9)
     a = p - (weight * p.nan_to_num()).sum(1, keepdim=True)
     centre = (weight * onto).sum(1, keepdim=True)
@@ -192,9 +199,11 @@ def _aligned(p: Tensor, onto: Tensor, weight: Tensor) -> Tensor:
     U, S, Vh = torch.linalg.svd(weighted.mT @ b)
 
     # A reflection becomes a rotation by the sign of the smallest singular value.
-    S[:, 2] *= torch.linalg.det(U @ Vh)
-    U[..., 2] *= torch.linalg.det(U @ Vh)[:, None]
-    scale = S.sum(-1) / (weighted * a.nan_to_num()).sum((1, 2))
+    det = torch.linalg.det(U @ Vh)
+    S[:, 2] *= det
+    U[..., 2] *= det[:, None]
+    spread = (weighted * a.nan_to_num()).sum((1, 2))
+    scale = S.sum(-1) / spread
     return centre + scale[:, None, None] * a @ U @ Vh
 
 
@@ -206,21 +215,26 @@ def _posed_hand(p: Float, subject: Proportions, wrist: int) -> tuple[Float, Floa
         the standard pose; NaN if the palm is unknown.
     """
     rest = subject.rest_with_hands[HAND_JOINTS[wrist]]
-    # the palm turns as a whole; fingers keep their own directions
-    palm = hand_frame(p, *PALM) @ hand_frame(rest, *PALM).T
+    # The palm turns as a whole.
+    axes = hand_frame(p, *PALM_LANDMARKS)
+    palm = axes @ hand_frame(rest, *PALM_LANDMARKS).T
     q = (rest - subject.rest[wrist]) @ palm.mT
+
+    # Fingers keep their own directions.
     for a, b in FINGER_BONES:
         q[:, b] = q[:, a] + unit(p[:, b] - p[:, a]) * length(rest, (a, b))
     return q, palm
 
 
 def _foot_frame(p: Float, ankle: int) -> Float:
+    """Axes ``[..., 3, 3]`` of a foot, along the sole and up to the ankle."""
     heel, toe = FEET[ankle]
     origin = p[..., heel, :]
     return part_frame(p[..., toe, :] - origin, p[..., ankle, :] - origin)
 
 
 def _head_frame(p: Float) -> Float:
+    """Axes ``[F, 3, 3]`` of the head."""
     return bone_frames(torch.from_numpy(p)).hubs[:, HEAD].numpy()
 
 
@@ -230,7 +244,7 @@ def rig_landmarks(standard: StandardMotion, subject: Proportions) -> Float:
     Shoulders, elbows, wrists, hips, knees and ankles are the rig's joints. Rigs have no landmarks
     of hands, feet and face: the subject's own are rotated as the rig's hands, feet and head.
     """
-    # joints, and with hands and feet the subject's landmarks
+    # The joints, and the subject's landmarks of hands and feet.
     rest = subject.rest
     scale = subject.leg / standard.leg
     p = np.full((len(standard.joints["Hips"]), *rest.shape), np.nan)
@@ -243,10 +257,11 @@ def rig_landmarks(standard: StandardMotion, subject: Proportions) -> Float:
         ):
             joint = start + i
             ends = landmarks[joint]
-            turned = (rest[list(ends)] - rest[joint]) @ standard.turns[side + bone].mT
+            own = rest[list(ends)] - rest[joint]
+            turned = own @ standard.turns[side + bone].mT
             p[:, ends] = p[:, joint, None] + turned
 
-    # the head, at the end of the neck
+    # The head, at the end of the neck.
     if "Head" in standard.turns:
         neck = middle(rest, EARS) - middle(rest, SHOULDERS)
         ears = middle(p, SHOULDERS) + (standard.turns["Neck"] @ neck)
@@ -266,7 +281,7 @@ def joined(clips: Sequence[Float], subject: Proportions, n: int) -> Float:
         a = face_in_head(before)
         b = face_in_head(after)
 
-        # positions and speeds at both ends
+        # Positions and speeds at both ends.
         ends = np.stack([a[-1], b[0]])
         speeds = np.zeros_like(ends)
         if len(a) > 1:
@@ -274,7 +289,9 @@ def joined(clips: Sequence[Float], subject: Proportions, n: int) -> Float:
         if len(b) > 1:
             speeds[1] = b[1] - b[0]
         path = CubicHermiteSpline(
-            [0, n + 1], np.nan_to_num(ends), np.nan_to_num(speeds)
+            x=[0, n + 1],
+            y=np.nan_to_num(ends),
+            dydx=np.nan_to_num(speeds),
         )
 
         # Landmarks that an end lacks are missing in between.
@@ -321,16 +338,18 @@ def placed(
             whole motion touches it.
         stay: subtract the path of a person who walks away, as on a treadmill.
     """
-    # the subject's heading
+    # The subject's heading.
     turn = rotation(np.array([0, 0, subject.facing - heading(p[0])]))
     q = p @ turn.T
 
-    # the ground below the feet, and the path of the hips
-    path = middle(q, HIPS)[:, :2]
+    # The ground below the feet.
     lowest = q[:, HEELS_AND_TOES, 2].min(axis=1)
     floor = np.full(len(q), lowest.min())
     if ground:
         floor = floor_under(lowest, subject.leg, 1 / fps)
+
+    # The start of the path, or all of it that leads away.
+    path = middle(q, HIPS)[:, :2]
     gone = drift(path, 1 / fps) if stay else path[:1]
     q[..., :2] += centre[:2] - np.broadcast_to(gone, path.shape)[:, None]
     q[..., 2] += (subject.ground - floor)[:, None]

@@ -17,9 +17,11 @@ from gsgan.motion.rotations import Array, between, rotation, twist, unit
 
 SIDES = ("Left", "Right")
 FINGERS = ("Thumb", "Index", "Middle", "Ring", "Pinky")
+# The side's direction along +X.
 SIGN = {"Left": 1.0, "Right": -1.0}
+# Chains of bones, from the hips outwards.
 SPINE = ("Spine", "Spine1", "Spine2")
-PALM = ("Index", "Middle", "Pinky")  # fingers whose bases give the hand's axes
+PALM_FINGERS = ("Index", "Middle", "Pinky")  # fingers whose bases give the hand's axes
 ARM = ("Arm", "ForeArm", "Hand")
 LEG = ("UpLeg", "Leg", "Foot")
 REQUIRED = ("Hips", *(side + bone for side in SIDES for bone in LEG + ARM))
@@ -27,10 +29,10 @@ REQUIRED = ("Hips", *(side + bone for side in SIDES for bone in LEG + ARM))
 FOREARM_TWIST = 0.55
 # Feet may be tilted with legs that stand apart by more than the angle with this sine.
 SPLAYED = 0.17
-# maximum reach of a limb in full lengths: below 1, so that it always bends
-REACH = 0.998
-# metres above the floor up to which a vertex of the resting foot is its sole
-SOLE = 0.02
+# Maximum reach of a limb in full lengths: below 1, so that it always bends.
+MAX_LIMB_REACH = 0.998
+# Metres above the floor up to which a vertex of the resting foot is its sole.
+SOLE_HEIGHT = 0.02
 
 
 def limb_axes(part: tuple[str, ...], side: str) -> tuple[Array, Array]:
@@ -46,6 +48,8 @@ def hand_axes(joint: Mapping[str, Array], side: str) -> Array:
     middle = joint[side + "HandMiddle1"]
     pinky = joint[side + "HandPinky1"]
     along = unit(middle - joint[side + "Hand"])
+
+    # The part of the line between the knuckles that is orthogonal to the first axis.
     across = pinky - index
     across = unit(across - (across @ along) * along)
     return np.stack([along, across, np.cross(along, across)], axis=-1)
@@ -79,11 +83,12 @@ def rest_turns(joint: Mapping[str, Array]) -> dict[str, Array]:
 
         # The hand turns with its palm if that is known, else with the forearm.
         hand = turns[side + "ForeArm"]
-        if all(f"{side}Hand{finger}1" in joint for finger in PALM):
+        if all(f"{side}Hand{finger}1" in joint for finger in PALM_FINGERS):
             standard = np.diag([SIGN[side], 1.0, SIGN[side]])
             hand = hand_axes(joint, side) @ standard
         turns[side + "Hand"] = hand
 
+        # Fingers turn from the hand's direction to their own.
         for finger in FINGERS:
             for bone, following in phalanges(joint, side, finger):
                 along = joint[following] - joint[bone]
@@ -96,14 +101,18 @@ def phalanges(
 ) -> list[tuple[str, str]]:
     """A finger's bones that have a following joint, with the name of that joint."""
     names = [f"{side}Hand{finger}{k}" for k in (1, 2, 3, 4)]
-    return [pair for pair in pairwise(names) if joint.keys() >= set(pair)]
+    found = []
+    for bone, following in pairwise(names):
+        if bone in joint and following in joint:
+            found.append((bone, following))
+    return found
 
 
 class FingerHinge(NamedTuple):
     """A finger bone and the axis about which it bends."""
 
-    bone: str
-    finger: str
+    bone: str  # Mixamo's name
+    finger: str  # one of `FINGERS`
     number: int  # from the finger's base
     axis: Array  # [3] of flexion at rest
     straight: float  # flexion of the rest pose, radians
@@ -121,7 +130,7 @@ def finger_hinges(
     hand = turns[side + "Hand"]
     forward = hand[:, 0] * SIGN[side]
     palm = -hand[:, 2]
-    # the point to which the thumb's tip bends
+    # The point to which the thumb's tip bends.
     opposite = joint[side + "HandPinky1"] + 0.03 * palm
 
     for finger in FINGERS:
@@ -138,9 +147,19 @@ def finger_hinges(
                 axis = unit(np.cross(along, palm))
                 sine = np.cross(before, along) @ axis
                 straight = float(np.arctan2(sine, before @ along))
+                # The base also closes most of the gap to the middle finger.
                 gap = float(np.arcsin(np.cross(along, forward) @ palm))
                 across = 0.8 * gap * palm * (k == 0)
-            hinges.append(FingerHinge(bone, finger, k, axis, straight, across))
+            hinges.append(
+                FingerHinge(
+                    bone=bone,
+                    finger=finger,
+                    number=k,
+                    axis=axis,
+                    straight=straight,
+                    across=across,
+                )
+            )
             before = along
     return hinges
 
@@ -150,18 +169,23 @@ class Rig:
 
     def __init__(self, character: Character) -> None:
         self.character = character
-        self.index = {name: j for j, name in enumerate(character.bones)}
-        self.joint = {name: character.joints[j] for name, j in self.index.items()}
+        self.index = {}
+        self.joint = {}
+        for j, name in enumerate(character.bones):
+            self.index[name] = j
+            self.joint[name] = character.joints[j]
         self.turns = rest_turns(self.joint)
         self.leg = self._limb_length(LEG)
         self.arm = self._limb_length(ARM)
+
+        # The last bone of the spine that there is.
         trunk = [bone for bone in ("Hips", *SPINE) if bone in self.index]
         self.chest = max(trunk, key=self.index.__getitem__)
         self.fingers = {}
         for side in SIDES:
             self.fingers[side] = finger_hinges(self.joint, self.turns, side)
 
-        # the lower sides of foot and toes
+        # The lower sides of foot and toes.
         self.soles: dict[str, Array] = {}
         for side in SIDES:
             toes = self._with_descendants(side + "ToeBase")
@@ -170,10 +194,12 @@ class Rig:
             self.soles[side + "ToeBase"] = self._sole(set(toes))
 
     def _limb_length(self, part: tuple[str, ...]) -> float:
+        """Length of both bones of a left limb, metres."""
         first, middle, end = ["Left" + bone for bone in part]
         return self.length(first, middle) + self.length(middle, end)
 
     def _with_descendants(self, bone: str) -> list[int]:
+        """Numbers of a bone and of all below it, none if the character does not have it."""
         if bone not in self.index:
             return []
         return self.character.with_descendants(self.index[bone])
@@ -182,7 +208,8 @@ class Rig:
         """Vertices ``[n, 3]`` near the floor that follow these bones most, about 300 of them."""
         character = self.character
         of_bones = np.isin(character.dominant_bones(), list(bones))
-        points = character.vertices[of_bones & (character.vertices[:, 2] < SOLE)]
+        is_low = character.vertices[:, 2] < SOLE_HEIGHT
+        points = character.vertices[of_bones & is_low]
         return points[:: max(1, len(points) // 300)]
 
     def length(self, start: str, end: str) -> float:
@@ -252,7 +279,8 @@ class Pose:
             pole: ``[F, 3]`` direction.
         """
         first, middle, end = [side + bone for bone in part]
-        # the directions of both bones in the world
+
+        # The directions of both bones in the world.
         upper, lower, hinge = two_bone(
             target=target - self.position(first),
             pole=pole,
@@ -260,7 +288,7 @@ class Pose:
             lower=self.rig.length(middle, end),
         )
 
-        # their turns, from the same axes in the standard pose
+        # Their turns, from the same axes in the standard pose.
         along, axis = limb_axes(part, side)
         rest = frame(along, axis).T
         self.set_turn(first, frame(upper, hinge) @ rest)
@@ -268,10 +296,10 @@ class Pose:
 
     def lower_hips(self, ankles: list[Array]) -> None:
         """Lowers the hips to where both legs reach their ankles ``[F, 3]``."""
-        longest = 0.995 * REACH * self.rig.leg
+        longest = 0.995 * MAX_LIMB_REACH * self.rig.leg
         drop = np.zeros(len(self.hips))
         for side, ankle in zip(SIDES, ankles, strict=True):
-            # Pythagoras: the height of the hip joint at which the leg is fully stretched
+            # By Pythagoras, the height of the hip joint at which the leg is fully stretched.
             gap = self.position(side + "UpLeg") - ankle
             horizontal = (gap[:, :2] ** 2).sum(axis=1)
             vertical = np.sqrt(np.maximum(longest**2 - horizontal, 0))
@@ -282,7 +310,8 @@ class Pose:
         """Sets a hand's turn ``[F, 3, 3]``; the forearm takes a share of its twist."""
         upper = self.turn(side + "Arm")
         lower = self.turn(side + "ForeArm")
-        # the forearm without twist, and the hand's twist against it
+
+        # The forearm without twist, and the hand's twist against it.
         neutral = between(upper[..., 0], lower[..., 0]) @ upper
         angle = FOREARM_TWIST * twist(neutral.mT @ turn, axis=0)
         x_axis = np.eye(3)[0]
@@ -304,13 +333,18 @@ class Pose:
     ) -> Animation:
         """The finished poses, with the face shapes that the character has."""
         character = self.rig.character
-        rotations = np.stack([self.rotation(bone) for bone in character.bones], axis=1)
-        joints = np.stack([self.position(bone) for bone in character.bones], axis=1)
+        rotations = [self.rotation(bone) for bone in character.bones]
+        joints = [self.position(bone) for bone in character.bones]
         known = {}
         for name, weight in shapes.items():
             if name in character.shapes:
                 known[name] = weight
-        return Animation(rotations, joints, known, passages)
+        return Animation(
+            rotations=np.stack(rotations, axis=1),
+            joints=np.stack(joints, axis=1),
+            shapes=known,
+            passages=passages,
+        )
 
 
 def two_bone(
@@ -326,14 +360,17 @@ def two_bone(
     Returns:
         Unit vectors ``[F, 3]``: upper bone, lower bone, the axis that flexes the lower one.
     """
-    # the distance d of the target, within reach
+    # The distance d of the target, within reach.
     nearest = abs(upper - lower) + 0.05 * min(upper, lower)
-    farthest = REACH * (upper + lower)
+    farthest = MAX_LIMB_REACH * (upper + lower)
     d = np.linalg.norm(target, axis=-1, keepdims=True).clip(nearest, farthest)
 
-    # upper * cosine and upper * sine are the middle joint along and beside the way to the target
+    # The way to the target, and the direction beside it in which the middle joint bends.
     along = unit(target)
-    side = unit(pole - (pole * along).sum(-1, keepdims=True) * along)
+    pole_along = (pole * along).sum(-1, keepdims=True) * along
+    side = unit(pole - pole_along)
+
+    # With the angle between the upper bone and the way, lower² = upper² + d² - 2 upper d cosine.
     cosine = (upper**2 + d**2 - lower**2) / (2 * upper * d)
     sine = np.sqrt(np.maximum(1 - cosine**2, 0))
     middle = upper * (cosine * along + sine * side)

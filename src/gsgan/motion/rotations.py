@@ -9,7 +9,8 @@ Array = NDArray[np.float64]
 
 def unit(v: Array) -> Array:
     """Vectors ``[..., 3]`` divided by their length."""
-    return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12)
+    length = np.linalg.norm(v, axis=-1, keepdims=True)
+    return v / np.maximum(length, 1e-12)
 
 
 def rotation(axis_angle: Array) -> Array:
@@ -28,6 +29,8 @@ def between(a: Array, b: Array) -> Array:
     """Smallest rotations ``[..., 3, 3]`` that take directions ``a`` to directions ``b``."""
     a = unit(a)
     b = unit(b)
+
+    # About the normal of both, by the angle between them.
     axis = np.cross(a, b)
     sine = np.linalg.norm(axis, axis=-1)
     cosine = (a * b).sum(-1)

@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from gsgan.data.proportions import axis_name
 from gsgan.motion.rig import (
     ARM,
-    FINGERS,
     LEG,
     REQUIRED,
     SIDES,
@@ -27,24 +26,26 @@ from gsgan.motion.rig import (
 from gsgan.motion.rotations import Array, between, blend, rotation, unit
 from gsgan.utils.errors import DataError
 
-# maximum tilt of trunk and legs in a zero pose that is a standing person
-STANDING = np.radians(40)
-# the same, in a frame whose pose is upright enough to serve as a zero pose
-NEUTRAL = np.radians(10)
-UPRIGHT = np.radians(30)  # maximum tilt of the trunk in frames that may serve otherwise
-SELDOM = 0.1  # share of frames in which a person stands, in motions on the floor
-SAME = np.radians(1)  # frames within this tilt of the best one are used too
-MOST = 100  # maximum number of frames for calibration
-# share of knees and toes behind the body above which left and right are exchanged
+# Maximum tilt of trunk and legs in a zero pose that is a standing person.
+MAX_STANDING_TILT = np.radians(40)
+# Maximum tilt in a frame whose pose is upright enough to serve as a zero pose.
+MAX_NEUTRAL_TILT = np.radians(10)
+# Maximum tilt of the trunk in frames that may serve otherwise.
+MAX_UPRIGHT_TILT = np.radians(30)
+# Share of frames in which a person stands, in motions on the floor.
+MIN_STANDING_SHARE = 0.1
+SAME_TILT = np.radians(1)  # frames within this tilt of the best one are used too
+MAX_REFERENCES = 100  # number of frames for calibration
+# Share of knees and toes behind the body above which left and right are exchanged.
 BACKWARDS = 0.8
-# minimum sine of the slope from ankle to toes of a flat foot: steeper ones are in the air
+# Minimum sine of the slope from ankle to toes of a flat foot: steeper ones are in the air.
 STEEPEST = -0.7
-BENT = 0.15  # minimum mean sine of the bend at which a limb's plane is known
-# Legs: feet up to this height above the lowest of a second stand on the floor and do not jump.
+MIN_BEND = 0.15  # minimum mean sine of the bend at which a limb's plane is known
+# Leg lengths: feet up to this height above the lowest of a second stand on the floor.
 HOVER = 0.06
-# metres from the origin that a motion may reach before its drift is subtracted
+# Metres from the origin that a motion may reach before its drift is subtracted.
 ROOM = 0.6
-# standard deviation of the smoothing that separates drift from sway
+# Standard deviation of the smoothing that separates drift from sway.
 DRIFT_SECONDS = 0.5
 # Names of joints without side, in lower case and letters only, first choices first.
 ALIASES = {
@@ -58,11 +59,17 @@ ALIASES = {
     "Hand": "wrist hand",
     "Head": "head",
 }
-FINGER_ALIASES = {finger: finger.lower() for finger in FINGERS} | {
+# Regular expressions of the fingers' names.
+FINGER_ALIASES = {
+    "Thumb": "thumb",
+    "Index": "index",
     "Middle": "middle|mid",
+    "Ring": "ring",
     "Pinky": "pinky|little",
 }
-PARTS = {"metacarpal": 1, "proximal": 1, "intermediate": 2, "distal": 3}
+# Mixamo's numbers of the parts of fingers.
+PHALANX_NUMBERS = {"metacarpal": 1, "proximal": 1, "intermediate": 2, "distal": 3}
+# Words that mean a side.
 SIDE_WORDS = {"l": "Left", "r": "Right", "left": "Left", "right": "Right"}
 
 
@@ -74,7 +81,7 @@ def known_joints(names: tuple[str, ...]) -> dict[str, int]:
     found: dict[str, int] = {}
     ranks: dict[str, int] = {}
     for j, name in enumerate(names):
-        # MakeHuman's helpers; end sites
+        # MakeHuman's helpers and end sites are no bones.
         if name.startswith("__") or name.endswith(" end"):
             continue
         bone, rank = _bone(name)
@@ -86,17 +93,22 @@ def known_joints(names: tuple[str, ...]) -> dict[str, int]:
 
 def _bone(name: str) -> tuple[str, int]:
     """The bone that a joint's name means, and the rank of this alias; ("", 0) for other names."""
-    words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", name.split(":")[-1])
-    words = [word.lower() for word in words]
+    _, _, plain = name.rpartition(":")
+    words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", plain)
 
-    # the side is a word of its own, or the beginning of the first word
-    side = next((word for word in words if word in SIDE_WORDS), "")
-    stem = "".join(word for word in words if word != side)
+    # The side is a word of its own, or the beginning of the first word.
+    side = ""
+    stem = ""
+    for word in map(str.lower, words):
+        if word in SIDE_WORDS and side in ("", word):
+            side = word
+        else:
+            stem += word
     match = re.match(r"(left|right|l|r)(.+)", stem)
     if not side and match and _stem(match[2], sided=True)[0]:
-        side = match[1]
-        stem = match[2]
+        side, stem = match.groups()
 
+    # Mixamo's and VRoid's prefixes.
     stem = re.sub(r"^(mixamorig|j?bip)\d*(c(?=hips|head))?", "", stem)
     bone, rank = _stem(stem, sided=bool(side))
     if bone and side:
@@ -113,39 +125,35 @@ def _stem(stem: str, sided: bool) -> tuple[str, int]:
         if plain in ranked and sided != in_middle:
             return bone, ranked.index(plain)
 
+    # Fingers have a number, or the name of a part.
     if not sided:
         return "", 0
-    parts = "|".join(PARTS)
+    parts = "|".join(PHALANX_NUMBERS)
     for finger, alias in FINGER_ALIASES.items():
         pattern = rf"(?:hand|f)?(?:{alias})(?:finger)?0?(\d?)({parts})?"
         match = re.fullmatch(pattern, stem)
         if match:
-            number = match[1] or PARTS.get(match[2], 1)
+            number = match[1] or PHALANX_NUMBERS.get(match[2], 1)
             return f"Hand{finger}{number}", 0
     return "", 0
 
 
 @dataclass(frozen=True)
 class RigMotion:
-    """The motion of a rig in a file: joints and their world rotations since the zero pose.
+    """The motion of a rig in a file: joints and their world rotations since the zero pose."""
 
-    Args:
-        names: of the J joints, parents first; end sites are called "<joint> end".
-        parents: ``[J]``, -1 for roots.
-        offsets: ``[J, 3]`` from the parent in the zero pose, units and axes of the file.
-        rotations: ``[F, J, 3, 3]`` world, axes of the file.
-        root: ``[F, 3]`` position of the first joint.
-        frame_time: seconds.
-        local: ``[F, J, 3]`` positions in the parent's axes, in place of the offsets, or None if
-            only the root has position channels.
-    """
-
-    names: tuple[str, ...]
-    parents: tuple[int, ...]
-    offsets: Array
-    rotations: Array
-    root: Array
-    frame_time: float
+    names: tuple[
+        str, ...
+    ]  # of the J joints, parents first; end sites are called "<joint> end"
+    parents: tuple[int, ...]  # [J], -1 for roots
+    offsets: (
+        Array  # [J, 3] from the parent in the zero pose, units and axes of the file
+    )
+    rotations: Array  # [F, J, 3, 3] world, axes of the file
+    root: Array  # [F, 3] position of the first joint
+    frame_time: float  # seconds
+    # [F, J, 3] positions in the parent's axes, in place of the offsets, or None if only the root
+    # has position channels
     local: Array | None = None
 
     def zero_pose(self) -> Array:
@@ -183,21 +191,14 @@ class StandardMotion:
 
 @dataclass(frozen=True)
 class Reference:
-    """Poses in which bones have known turns: they calibrate the joints' own axes.
+    """Poses in which bones have known turns: they calibrate the joints' own axes."""
 
-    Args:
-        rotations: ``[N, J, 3, 3]`` world rotations of the joints, axes of the file.
-        axes: ``[N, 3, 3]`` rows left, back, up of the person, axes of the file.
-        joints: ``[N, J, 3]`` positions, axes of the file.
-        zero: whether it is the zero pose.
-        neutral: whether the person stands upright and looks ahead; else the trunk has to be
-            calibrated by the joints' positions.
-    """
-
-    rotations: Array
-    axes: Array
-    joints: Array
-    zero: bool
+    rotations: Array  # [N, J, 3, 3] world rotations of the joints, axes of the file
+    axes: Array  # [N, 3, 3] rows left, back, up of the person, axes of the file
+    joints: Array  # [N, J, 3] positions, axes of the file
+    zero: bool  # whether it is the zero pose
+    # whether the person stands upright and looks ahead; else the trunk has to be calibrated by the
+    # joints' positions
     neutral: bool
 
 
@@ -221,10 +222,10 @@ def standard_motion(
     known = body_joints(rig, path)
     posed = rig.posed()
 
-    # the axis that points up, and left and right
+    # The axis that points up, and left and right.
     zero = rig.zero_pose()[None]
     highest = _upward(zero, known)
-    stands = tilts(zero, known, highest).max() < STANDING
+    stands = tilts(zero, known, highest).max() < MAX_STANDING_TILT
     zero_axis = highest if stands else None
     if up is None:
         axis = _upward(posed, known, usual=zero_axis)
@@ -233,12 +234,12 @@ def standard_motion(
         axis["xyz".index(up[-1])] = -1.0 if up.startswith("-") else 1.0
     known = _by_side(posed, known, axis)
 
-    # turns of limbs and fingers; axes by positions do not depend on the zero pose
+    # Turns of limbs and fingers. Axes by positions do not depend on the zero pose.
     reference = _reference(rig, posed, known, axis, zero_axis)
     axes = person_axes(posed[:1], known, axis)[0]
     R, turns = _turns(rig, axes, known, reference)
 
-    # corrections by positions, if no zero pose is known
+    # Corrections by positions, if no zero pose is known.
     joints = {bone: posed[:, j] @ axes.T for bone, j in known.items()}
     if not reference.zero:
         _bend_in_plane(turns, joints)
@@ -247,10 +248,16 @@ def standard_motion(
             _flatten_feet(turns, joints)
     turns |= _trunk(rig, known, R)
 
+    # The median length of a leg.
     thigh = np.linalg.norm(joints["LeftUpLeg"] - joints["LeftLeg"], axis=1)
     shin = np.linalg.norm(joints["LeftLeg"] - joints["LeftFoot"], axis=1)
     leg = float(np.median(thigh) + np.median(shin))
-    return StandardMotion(turns, joints, leg, axis_name(axis))
+    return StandardMotion(
+        turns=turns,
+        joints=joints,
+        leg=leg,
+        up=axis_name(axis),
+    )
 
 
 def body_joints(rig: RigMotion, path: Path) -> dict[str, int]:
@@ -269,8 +276,9 @@ def body_joints(rig: RigMotion, path: Path) -> dict[str, int]:
         )
 
     # One person has a joint above both legs, and not each limb twice.
+    above_left = _line(rig, known["LeftUpLeg"])
     above_right = _line(rig, known["RightUpLeg"])
-    shared = [j for j in _line(rig, known["LeftUpLeg"]) if j in above_right]
+    shared = [j for j in above_left if j in above_right]
     counts = []
     for side, bone in product(SIDES, ("UpLeg", "Arm")):
         counts.append(_count(rig, side + bone))
@@ -278,7 +286,7 @@ def body_joints(rig: RigMotion, path: Path) -> dict[str, int]:
         raise DataError(f"{path} holds more than one person; give a file of one")
     known.setdefault("Hips", shared[-1])
 
-    # the joint after a finger's last bone
+    # The joint after a finger's last bone is its end.
     for bone in list(known):
         if re.search(r"Hand\D+[23]$", bone) and known[bone] in rig.parents:
             end = bone[:-1] + str(int(bone[-1]) + 1)
@@ -288,8 +296,12 @@ def body_joints(rig: RigMotion, path: Path) -> dict[str, int]:
 
 def _count(rig: RigMotion, bone: str) -> int:
     """The number of joints that may be a bone, without the further segments below them."""
-    found = [j for j, name in enumerate(rig.names) if _bone(name)[0] == bone]
-    return sum(set(found).isdisjoint(_line(rig, j)) for j in found)
+    found = set()
+    for j, name in enumerate(rig.names):
+        meant, _ = _bone(name)
+        if meant == bone:
+            found.add(j)
+    return sum(found.isdisjoint(_line(rig, j)) for j in found)
 
 
 def _line(rig: RigMotion, j: int) -> list[int]:
@@ -326,12 +338,13 @@ def _upward(p: Array, known: dict[str, int], usual: Array | None = None) -> Arra
     trunk = unit(_middle(p, known, "Arm") - hips)
     legs = unit(hips - _middle(p, known, "Foot"))
 
-    # the smaller cosine of trunk and legs with each axis
+    # The smaller cosine of trunk and legs with each axis.
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     cosine = np.minimum(trunk @ axes.T, legs @ axes.T)
 
-    standing = (cosine > np.cos(UPRIGHT)).mean(axis=0)
-    if usual is not None and standing[(axes @ usual).argmax()] > SELDOM:
+    # The usual axis, if the person stands along it in enough poses.
+    standing = (cosine > np.cos(MAX_UPRIGHT_TILT)).mean(axis=0)
+    if usual is not None and standing[(axes @ usual).argmax()] > MIN_STANDING_SHARE:
         return usual
 
     # The mean direction decides between axes with the same share.
@@ -343,7 +356,8 @@ def _upward(p: Array, known: dict[str, int], usual: Array | None = None) -> Arra
 def person_axes(p: Array, known: dict[str, int], up: Array) -> Array:
     """``[..., 3, 3]`` rows left, back, up of poses ``[..., J, 3]``; ``up [..., 3]`` is kept."""
     left = _across(p, known, "UpLeg")
-    left = unit(left - (left * up).sum(-1, keepdims=True) * up)
+    vertical = (left * up).sum(-1, keepdims=True) * up
+    left = unit(left - vertical)
     up = np.broadcast_to(up, left.shape)
     return np.stack([left, np.cross(up, left), up], axis=-2)
 
@@ -357,13 +371,15 @@ def _by_side(p: Array, known: dict[str, int], up: Array) -> dict[str, int]:
         hip = p[:, known[side + "UpLeg"]]
         knee = p[:, known[side + "Leg"]]
         ankle = p[:, known[side + "Foot"]]
-        votes.append(((knee - (hip + ankle) / 2) * back).sum(-1))
+        bend = knee - (hip + ankle) / 2
+        votes.append((bend * back).sum(-1))
         if side + "ToeBase" in known:
             toe = p[:, known[side + "ToeBase"]]
             votes.append(((toe - ankle) * back).sum(-1))
     if np.mean(np.stack(votes) > 0) < BACKWARDS:
         return known
 
+    # The same joints by the names of the other side.
     exchanged = {}
     for bone, j in known.items():
         if bone.startswith("Left"):
@@ -383,7 +399,9 @@ def tilts(p: Array, known: dict[str, int], up: Array) -> Array:
     left = axes[..., 0, :]
     up = axes[..., 2, :]
 
-    pairs = [(_middle(p, known, "Arm") - _middle(p, known, "UpLeg"), up)]
+    # Directions of the body's parts, and those of a person who stands.
+    trunk = _middle(p, known, "Arm") - _middle(p, known, "UpLeg")
+    pairs = [(trunk, up)]
     for side in SIDES:
         hip = p[..., known[side + "UpLeg"], :]
         knee = p[..., known[side + "Leg"], :]
@@ -417,17 +435,20 @@ def _reference(
             neutral=True,
         )
 
-    # the frames that stand as well as the best one, else all whose trunk is upright
+    # The frames that stand as well as the best one, else all whose trunk is upright.
     tilt = tilts(posed, known, up)
     worst = tilt.max(axis=-1)
     best = float(worst.min())
-    neutral = best < NEUTRAL
+    neutral = best < MAX_NEUTRAL_TILT
     if neutral:
-        chosen = np.flatnonzero(worst < best + SAME)
+        chosen = np.flatnonzero(worst < best + SAME_TILT)
     else:
         trunk = tilt[:, 0]
-        chosen = np.flatnonzero(trunk < max(UPRIGHT, float(trunk.min()) + SAME))
-    chosen = chosen[:: max(1, len(chosen) // MOST)]
+        limit = max(MAX_UPRIGHT_TILT, float(trunk.min()) + SAME_TILT)
+        chosen = np.flatnonzero(trunk < limit)
+
+    # A few of them, evenly spread.
+    chosen = chosen[:: max(1, len(chosen) // MAX_REFERENCES)]
     return Reference(
         rotations=rig.rotations[chosen],
         axes=person_axes(posed[chosen], known, up),
@@ -441,10 +462,11 @@ def _turns(
     rig: RigMotion, axes: Array, known: dict[str, int], reference: Reference
 ) -> tuple[Array, dict[str, Array]]:
     """Turns ``[F, J, 3, 3]`` of all joints, and of the known bones with their turns at rest."""
-    # turns of the limbs in the reference poses, by joint positions
+    # Turns of the limbs in the reference poses, by joint positions.
     at_rest = []
     for A, p in zip(reference.axes, reference.joints, strict=True):
-        at_rest.append(rest_turns({bone: A @ p[j] for bone, j in known.items()}))
+        joints = {bone: A @ p[j] for bone, j in known.items()}
+        at_rest.append(rest_turns(joints))
     if not reference.neutral:
         _follow_positions(at_rest, known, reference)
 
@@ -456,11 +478,12 @@ def _turns(
     for bone, j in known.items():
         if bone.endswith("4"):  # a finger's tip follows its last bone
             continue
-        hand = re.sub("(Hand).+", r"\1", bone)  # fingers of one joint rest as the hand
+        # Fingers of one joint rest as the hand.
+        hand = re.sub("(Hand).+", r"\1", bone)
         rest = [turn.get(bone, turn.get(hand, np.eye(3))) for turn in at_rest]
         turns[bone] = R[:, j] @ _mean(to_rest[:, j] @ np.stack(rest))
 
-    # all joints as parts of the trunk
+    # All joints as parts of the trunk.
     trunk = np.stack([turn.get("Hips", np.eye(3)) for turn in at_rest])
     constants = [_mean(to_rest[:, j] @ trunk) for j in range(to_rest.shape[1])]
     return R @ np.stack(constants), turns
@@ -471,11 +494,11 @@ def _follow_positions(
 ) -> None:
     """Adds the turns of the trunk and the feet of frames in which the person does not stand."""
     for turn, A, p in zip(at_rest, reference.axes, reference.joints, strict=True):
-        # the trunk, by the line from hips to shoulders
+        # The trunk, by the line from hips to shoulders.
         trunk = A @ (_middle(p, known, "Arm") - _middle(p, known, "UpLeg"))
         turn["Hips"] = between(np.array([0.0, 0, 1]), trunk)
 
-        # feet, by their heading
+        # Feet, by their heading.
         for side in SIDES:
             if side + "ToeBase" in known:
                 toe = A @ (p[known[side + "ToeBase"]] - p[known[side + "Foot"]])
@@ -490,15 +513,18 @@ def _bend_in_plane(turns: dict[str, Array], joints: dict[str, Array]) -> None:
         first, second, end = [side + bone for bone in part]
         along, hinge = limb_axes(part, side)
 
-        # the direction of the bend about the limb's length: 1 is forwards, 1j away from its plane
+        # The direction of the bend about the limb's length, as a complex number: 1 is forwards, 1j
+        # is out of the plane. Larger bends count more.
         lower = unit(joints[end] - joints[second])
         local = (turns[first].mT @ lower[..., None])[..., 0]
         away = local @ hinge
         forward = local @ np.cross(hinge, along)
-        mean = ((forward + 1j * away) * np.hypot(forward, away)).mean()
-        if abs(mean) <= BENT**2:
+        bend = forward + 1j * away
+        mean = (bend * np.hypot(forward, away)).mean()
+        if abs(mean) <= MIN_BEND**2:
             continue
 
+        # The twist that takes it to 1; a hand without a palm follows its arm.
         twisted = rotation(along * float(np.angle(mean)))
         turns[first] = turns[first] @ twisted
         turns[second] = turns[second] @ twisted
@@ -514,14 +540,16 @@ def _point_hands(turns: dict[str, Array], joints: dict[str, Array]) -> None:
         middle = f"{side}HandMiddle1"
         if middle not in joints or f"{side}HandPinky1" in joints:
             continue
+        # Along the arm's direction in the standard pose.
         along, _ = limb_axes(ARM, side)
         calibration = between(along, _local(turns, joints, hand, middle))
 
-        # the twist, by the last known joint of the thumb
+        # The twist, by the last known joint of the thumb.
         thumbs = [f"{side}HandThumb{k}" for k in (1, 2, 3)]
         thumbs = [bone for bone in thumbs if bone in joints]
         if thumbs:
-            thumb = calibration.T @ _local(turns, joints, hand, thumbs[-1]) * (0, 1, 1)
+            thumb = calibration.T @ _local(turns, joints, hand, thumbs[-1])
+            thumb = thumb * (0, 1, 1)
             calibration = calibration @ between(np.array([0.0, -1, 0]), thumb)
 
         for bone in turns:
@@ -537,7 +565,7 @@ def _flatten_feet(turns: dict[str, Array], joints: dict[str, Array]) -> None:
         if toe not in joints:
             continue
 
-        # A foot rests in the slowest fifth of the frames; the first frame's step is to the second.
+        # A foot rests in the slowest fifth of the frames. The first frame's step is to the second.
         ends = np.stack([joints[foot], joints[toe]])
         second = ends[:, :2][:, -1:]
         speed = np.linalg.norm(np.diff(ends, axis=1, prepend=second), axis=-1)
@@ -571,14 +599,18 @@ def floor_under(lowest: Array, leg: float, step: float) -> Array:
 
     Jumps lose `HOVER`: a floor that follows the lowest of a second may be too low by that much.
     """
-    # the lowest of a second, smoothed
+    # The lowest of a second, smoothed.
     window = max(1, round(1 / step))
     floor = gaussian_filter1d(minimum_filter1d(lowest, window), window / 4)
-    return np.asarray(floor + np.minimum(lowest - floor, HOVER * leg))
+
+    # A foot that is not much higher stands on it.
+    above = np.minimum(lowest - floor, HOVER * leg)
+    return np.asarray(floor + above)
 
 
 def drift(path: Array, step: float) -> Array:
     """The drift ``[F, 2]`` of a horizontal path: subtracting it keeps the path near the origin."""
+    # A motion in one place has none.
     middle = (path.min(axis=0) + path.max(axis=0)) / 2
     if np.linalg.norm(path - middle, axis=1).max() <= ROOM:
         return np.broadcast_to(middle, path.shape)
@@ -602,10 +634,12 @@ def _trunk(rig: RigMotion, known: dict[str, int], R: Array) -> dict[str, Array]:
     chain = [known["Hips"], *spine]
     for k, bone in enumerate(SPINE, 1):
         at = k * len(spine) / len(SPINE)
-        lower = chain[int(at)]
-        upper = chain[min(int(at) + 1, len(spine))]
-        turns[bone] = blend(R[:, lower], R[:, upper], at - int(at))
+        below = int(at)
+        lower = chain[below]
+        upper = chain[min(below + 1, len(spine))]
+        turns[bone] = blend(R[:, lower], R[:, upper], at - below)
 
+    # The neck is above the head only; without one, it turns half-way.
     if "Head" in known:
         head = known["Head"]
         neck = [j for j in _line(rig, head) if j not in left]

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from importlib.resources import files
 from itertools import combinations
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -19,13 +19,29 @@ from gsgan.utils.errors import ConfigError
 
 Torso = Literal["fit", "cube"]
 Sampler = Literal["even", "trimesh"]
-Samples = tuple[NDArray[np.float64], NDArray[np.float64]]
+Array = NDArray[np.float64]
 
 GOLDEN = (5**0.5 - 1) / 2
 PLASTIC = 1.32471795724474602596  # root of x³ = x + 1, the two-dimensional golden ratio
-COUNTS = ("points_per_limb", "face_points", "torso_points", "points_per_finger_bone")
-# of the box's edges (``fit``), in multiples of the rest pose's
+COUNT_NAMES = (
+    "points_per_limb",
+    "face_points",
+    "torso_points",
+    "points_per_finger_bone",
+)
+# Minimum and maximum of the box's edges (``fit``), in multiples of the rest pose's.
 TORSO_RANGE = (0.25, 4.0)
+
+
+class Samples(NamedTuple):
+    """Points on a unit shape, in the shape's own frame.
+
+    The cylinder has radius 1 and height 1 from z = 0 up, lateral face only (caps would be inside
+    the neighbouring limb); the sphere has radius 1; the box has edges of 1 around the origin.
+    """
+
+    points: Array  # [n, 3]
+    normals: Array  # [n, 3] unit, outward
 
 
 @dataclass(frozen=True)
@@ -33,17 +49,17 @@ class Points:
     """The points of a body in a batch of poses; P parts: limbs, then face, then torso.
 
     On a skinned body (`gsgan.model.body_points`) each point is a part, whose frame may shear, and
-    normals are shorter than 1, down to zero, where the skin is flat.
+    normals are shorter than 1, down to zero, if the skin is flat.
     """
 
     means: Tensor  # [B, N, 3] metres, world frame
-    rotations: Tensor  # [B, P, 3, 3] frames of the parts
+    rotations: Tensor  # [B, P, 3, 3] frames of the parts in the world
     origins: Tensor  # [B, P, 3] metres, world frame: origin of each part's frame
     scales: Tensor  # [B, N] metres, initial standard deviation, isotropic
     valid: Tensor  # [B, N] bool, False on parts whose joints are unseen
     part_id: Tensor  # [N] int64 into the parts
     normals: Tensor  # [B, N, 3] outward, world frame, unit length
-    # [B, N, 3, 3] what moves shapes, where frames do not
+    # [B, N, 3, 3] linear maps for covariances if they differ from `frames`
     stretched: Tensor | None = None
 
     @property
@@ -53,7 +69,7 @@ class Points:
 
     @property
     def shapes(self) -> Tensor:
-        """``[B, N, 3, 3]``: what shapes are transformed by, as covariances."""
+        """``[B, N, 3, 3]``: linear maps that transform covariances."""
         return self.frames if self.stretched is None else self.stretched
 
     def take(self, chosen: Tensor) -> "Points":
@@ -74,7 +90,7 @@ class Points:
     def local(self) -> Tensor:
         """``[B, N, 3]`` metres: the points in their parts' frames, invariant to rigid motions.
 
-        Convention: frames are rotations, as densify's are.
+        The frames have to be rotations, as those of `Densify` are.
         """
         offset = self.means - self.origins.index_select(1, self.part_id)
         return (offset.unsqueeze(-2) @ self.frames).squeeze(-2)
@@ -90,9 +106,9 @@ def _rows(values: Tensor, chosen: Tensor) -> Tensor:
 class Densify(nn.Module):
     """Cylinders on the limbs, a sphere around the face, a box around the trunk.
 
-    Convention: unit shapes are sampled once in their part's frame and moved by similarity
+    Unit shapes are sampled once in their part's frame and moved by similarity
     transforms, so that index k is the same body point in every pose. The layout is fixed: limb
-    l has ``[n l, n (l + 1))`` with ``n = points_per_limb``, then the bones of hands where the
+    l has ``[n l, n (l + 1))`` with ``n = points_per_limb``, then the bones of hands if the
     template has some, then the face, then the torso; 5400 points by default, 7800 with hands. The
     module has no parameters and no state.
 
@@ -102,7 +118,7 @@ class Densify(nn.Module):
         face_points: points on the sphere.
         torso_points: points on the box.
         radius_ratio: cylinder radius over its length.
-        points_per_finger_bone, finger_radius_ratio: the same for the bones of hands, where the
+        points_per_finger_bone, finger_radius_ratio: the same for the bones of hands, if the
             template has some: they are short and thick.
         face_radius_scale: sphere radius over the longest distance between face joints.
         torso: ``fit`` (as wide as shoulders or hips, as high as the spine, half as deep as wide)
@@ -152,8 +168,10 @@ class Densify(nn.Module):
         super().__init__()
         one_of("Densify: sampler", sampler, get_args(Sampler))
         counts = (points_per_limb, face_points, torso_points, points_per_finger_bone)
-        for name, count in zip(COUNTS, counts, strict=True):
+        for name, count in zip(COUNT_NAMES, counts, strict=True):
             whole(f"Densify: {name}", count, 1)
+
+        # The options that scale the shapes.
         self.template = named_template(template)
         self.counts = counts
         self.radius_ratio = above("Densify: radius_ratio", radius_ratio)
@@ -171,15 +189,15 @@ class Densify(nn.Module):
         return len(self.part_id)
 
     def _make_buffers(self, sampler: str, dtype: torch.dtype) -> None:
-        t, (n_limb, n_face, n_torso, n_bone) = self.template, self.counts
+        t = self.template
+        n_limb, n_face, n_torso, n_bone = self.counts
         torso_rest = t.rest_torso
 
-        # Points and normals of the unit shapes.
+        # The unit shapes.
         if sampler == "trimesh":
-            fit = "box" if self.torso == "cube" else "box_fit"
             cylinder = shipped("cylinder", n_limb)
             sphere = shipped("sphere", n_face)
-            box = shipped(fit, n_torso)
+            box = shipped("box" if self.torso == "cube" else "box_fit", n_torso)
         else:
             extents = (1.0, 1.0, 1.0) if self.torso == "cube" else torso_rest
             cylinder = even_cylinder(n_limb)
@@ -188,43 +206,30 @@ class Densify(nn.Module):
 
         # Each limb has a cylinder along its direction at rest.
         along = _limb_axes(t).mT.numpy()
-        (limb_points, limb_normals), (bone_points, bone_normals) = (
-            (
-                (points * [radius, radius, 1.0]) @ along[list(limbs)],
-                normals @ along[list(limbs)],
-            )
-            for limbs, radius, (points, normals) in (
-                (t.measured, self.radius_ratio, cylinder),
-                (t.fingers, self.finger_radius_ratio, even_cylinder(n_bone)),
-            )
-        )
+        finger = even_cylinder(n_bone)
+        limbs = _turned(cylinder, self.radius_ratio, along[list(t.measured)])
+        bones = _turned(finger, self.finger_radius_ratio, along[list(t.fingers)])
 
         def buffer(name: str, value: object) -> None:
             tensor = torch.as_tensor(np.asarray(value))
-            self.register_buffer(
-                name,
-                tensor.to(dtype) if tensor.is_floating_point() else tensor,
-                persistent=not name.startswith("_"),
-            )
+            if tensor.is_floating_point():
+                tensor = tensor.to(dtype)
+            self.register_buffer(name, tensor, persistent=not name.startswith("_"))
 
         # The order of the points: limbs, bones of hands, face, torso.
         face = len(t.limbs)
-        counts = (
-            [n_limb] * len(t.measured) + [n_bone] * len(t.fingers) + [n_face, n_torso]
-        )
-        buffer("part_id", np.repeat([*t.measured, *t.fingers, face, face + 1], counts))
-        buffer(
-            "template_points",
-            np.concatenate([*limb_points, *bone_points, sphere[0], box[0]]),
-        )
-        buffer(
-            "normals", np.concatenate([*limb_normals, *bone_normals, sphere[1], box[1]])
-        )
-        buffer("_limb_points", limb_points)
-        buffer("_bone_points", bone_points)
+        parts = [*t.measured, *t.fingers, face, face + 1]
+        counts = [n_limb] * len(t.measured) + [n_bone] * len(t.fingers)
+        points = [*limbs.points, *bones.points, sphere.points, box.points]
+        normals = [*limbs.normals, *bones.normals, sphere.normals, box.normals]
+        buffer("part_id", np.repeat(parts, [*counts, n_face, n_torso]))
+        buffer("template_points", np.concatenate(points))
+        buffer("normals", np.concatenate(normals))
+        buffer("_limb_points", limbs.points)
+        buffer("_bone_points", bones.points)
         buffer("_limb_sigma", self._sigma_by_limb())
-        buffer("_face_points", sphere[0])
-        buffer("_torso_points", box[0])
+        buffer("_face_points", sphere.points)
+        buffer("_torso_points", box.points)
         buffer("_torso_rest", torso_rest)
         buffer("_face", t.face)
         buffer("_face_pairs", np.array(list(combinations(t.face, 2))).T)
@@ -242,8 +247,8 @@ class Densify(nn.Module):
     ) -> Points:
         """Moves the points to a pose.
 
-        Convention: metres, world frame; differentiable in p. Far from the world's origin the
-        resolution of the dtype limits the result (1 mm at 1e4 m in float32).
+        Units are metres in the world frame; the result is differentiable in p. Far from the world's
+        origin the resolution of the dtype limits it (1 mm at 1e4 m in float32).
 
         Args:
             p: ``[B, J, 3]`` finite joints (see :func:`gsgan.skeleton.sanitise`).
@@ -261,53 +266,55 @@ class Densify(nn.Module):
         c = constants(self.template, p.device, p.dtype)
         if frames is None:
             frames = bone_frames(p, valid, self.template)
+
+        # Joints relative to the root, where the dtype resolves more.
         root = p[:, self.template.hips[0], None].detach()
         q = p - root
         face = q.index_select(1, self._face)
         torso = q.index_select(1, c.torso)
-        head_R = frames.head
-        trunk_R = frames.torso
+
+        # The origin and the rotation of each part's frame.
         centres = torch.stack([face.mean(1), torso.mean(1)], dim=1)
         origins = torch.cat([q.index_select(1, c.starts), centres], dim=1)
-        radius = self._longest(q, self._face_pairs) * self.face_radius_scale
-        edges = self._torso_edges(q, torso)
+        hubs = torch.stack([frames.head, frames.torso], dim=1)
+        rotations = torch.cat([frames.limbs, hubs], dim=1)
 
+        # Cylinders on limbs and on bones of hands, as long as these.
         axes = (frames.limbs * frames.lengths[..., None, None]).mT
-        cylinders = [
-            (
-                points @ axes.index_select(1, chosen)
-                + origins.index_select(1, chosen).unsqueeze(2)
-            )
-            for points, chosen in (
-                (self._limb_points, c.measured),
-                (self._bone_points, c.fingers),
-            )
-            if len(chosen)
-        ]
-        head = (
-            self._face_points @ (head_R * radius[:, None, None]).mT + origins[:, -2:-1]
-        )
-        trunk = self._torso_points @ (trunk_R * edges.unsqueeze(1)).mT + origins[:, -1:]
-        spread = torch.cat(
-            [frames.lengths * self._limb_sigma, self._hub_sigma(radius, edges)], 1
-        )
-        rotations = torch.cat(
-            [frames.limbs, head_R.unsqueeze(1), trunk_R.unsqueeze(1)], dim=1
-        )
+        means = []
+        for points, limbs in (
+            (self._limb_points, c.measured),
+            (self._bone_points, c.fingers),
+        ):
+            if len(limbs):
+                start = origins.index_select(1, limbs).unsqueeze(2)
+                cylinders = points @ axes.index_select(1, limbs) + start
+                means.append(cylinders.flatten(1, 2))
+
+        # A sphere around the face, a box around the trunk.
+        radius = self._longest(q, self._face_pairs) * self.face_radius_scale
+        sphere_axes = (frames.head * radius[:, None, None]).mT
+        means.append(self._face_points @ sphere_axes + origins[:, -2:-1])
+        edges = self._torso_edges(q, torso)
+        box_axes = (frames.torso * edges.unsqueeze(1)).mT
+        means.append(self._torso_points @ box_axes + origins[:, -1:])
+
         # Stretching a cylinder or a box along its axes does not change its normals.
         turned = rotations.index_select(1, self.part_id) @ self.normals.unsqueeze(-1)
+        limb_sigma = frames.lengths * self._limb_sigma
+        sigma = torch.cat([limb_sigma, self._hub_sigma(radius, edges)], dim=1)
         return Points(
-            means=torch.cat([*(x.flatten(1, 2) for x in cylinders), head, trunk], dim=1)
-            + root,
+            means=torch.cat(means, dim=1) + root,
             rotations=rotations,
             origins=origins + root,
-            scales=spread.index_select(1, self.part_id),
+            scales=sigma.index_select(1, self.part_id),
             valid=self._seen(valid).index_select(1, self.part_id),
             part_id=self.part_id,
             normals=turned.squeeze(-1),
         )
 
     def _seen(self, valid: Tensor) -> Tensor:
+        """``[B, P]`` whether each part is seen, of joints ``[B, J]``."""
         c = constants(self.template, valid.device, self.template_points.dtype)
         limbs = valid.index_select(1, c.starts) & valid.index_select(1, c.ends)
         face = valid.index_select(1, self._face).any(1, keepdim=True)
@@ -316,6 +323,7 @@ class Densify(nn.Module):
 
     def _longest(self, q: Tensor, pairs: Tensor) -> Tensor:
         """``[B]`` metres: the longest distance over pairs of joints, never zero."""
+        # Never zero, so that the gradient of the root is finite.
         d = q.index_select(1, pairs[0]) - q.index_select(1, pairs[1])
         return (d.square().sum(-1).amax(-1) + MIN_LENGTH**2).sqrt()
 
@@ -323,11 +331,12 @@ class Densify(nn.Module):
         """``[B, 3]`` metres: left-right, up, front."""
         if self.torso == "cube":
             return self._longest(q, self._torso_pairs).unsqueeze(1).expand(-1, 3)
+        # The lines between the shoulders, between the hips, and along the spine.
         l_sh, r_sh, l_hip, r_hip = torso.unbind(1)
-        lines = torch.stack(
-            [l_sh - r_sh, l_hip - r_hip, (l_sh + r_sh - l_hip - r_hip) * 0.5], 1
-        )
+        spine = (l_sh + r_sh - l_hip - r_hip) * 0.5
+        lines = torch.stack([l_sh - r_sh, l_hip - r_hip, spine], dim=1)
         lengths = (lines.square().sum(-1) + MIN_LENGTH**2).sqrt()
+
         width = lengths[:, :2].amax(1)
         height = lengths[:, 2]
         low, high = TORSO_RANGE
@@ -336,20 +345,20 @@ class Densify(nn.Module):
 
     def _sigma_by_limb(self) -> list[float]:
         """Per metre of limb: ``sigma sqrt(area / n)`` with lateral area ``2 pi r h²``."""
-        limb = float(
-            self.sigma * (2 * np.pi * self.radius_ratio / self.counts[0]) ** 0.5
-        )
-        finger = float(
-            self.sigma * (2 * np.pi * self.finger_radius_ratio / self.counts[3]) ** 0.5
-        )
-        thin = set(self.template.fingers)
-        return [finger if i in thin else limb for i in range(len(self.template.limbs))]
+        limb_area = 2 * np.pi * self.radius_ratio
+        finger_area = 2 * np.pi * self.finger_radius_ratio
+        limb = float(self.sigma * (limb_area / self.counts[0]) ** 0.5)
+        sigmas = [limb] * len(self.template.limbs)
+        for i in self.template.fingers:
+            sigmas[i] = float(self.sigma * (finger_area / self.counts[3]) ** 0.5)
+        return sigmas
 
     def _hub_sigma(self, radius: Tensor, edges: Tensor) -> Tensor:
         """``[B, 2]`` metres: initial standard deviations of face and torso."""
         x, y, z = edges.unbind(-1)
+        area = 2 * (x * y + y * z + z * x)
         face = radius * float(self.sigma * (4 * np.pi / self.counts[1]) ** 0.5)
-        torso = self.sigma * (2 * (x * y + y * z + z * x) / self.counts[2]).sqrt()
+        torso = self.sigma * (area / self.counts[2]).sqrt()
         return torch.stack([face, torso], dim=1)
 
 
@@ -360,28 +369,31 @@ def _limb_axes(template: SkeletonTemplate) -> Tensor:
     return Swing.of(up).to(rest.unsqueeze(1)).squeeze(1)
 
 
-# Samples on unit shapes, in the shape's own frame: float64 ``points [n, 3]`` and outward unit
-# ``normals [n, 3]``. The cylinder has radius 1 and height 1 from z = 0 up, lateral face only (caps
-# would be inside the neighbouring limb); the sphere has radius 1; the box has edges of 1 around the
-# origin.
+def _turned(cylinder: Samples, radius: float, axes: Array) -> Samples:
+    """Cylinders ``[L, n, 3]`` of a radius, along the axes ``[L, 3, 3]`` of limbs."""
+    points = cylinder.points * [radius, radius, 1.0]
+    return Samples(points @ axes, cylinder.normals @ axes)
 
 
 def even_cylinder(n: int) -> Samples:
     """``n`` points on the unit cylinder: evenly spaced in height, a golden angle apart."""
+    # The angle of each point, and its unit normal.
     k = np.arange(n)
     turn = 2 * np.pi * np.modf(k * GOLDEN)[0]
     normals = np.stack([np.cos(turn), np.sin(turn), np.zeros(n)], axis=-1)
-    return normals + np.outer((k + 0.5) / n, [0.0, 0.0, 1.0]), normals
+    height = np.outer((k + 0.5) / n, [0.0, 0.0, 1.0])
+    return Samples(normals + height, normals)
 
 
 def even_sphere(n: int) -> Samples:
     """``n`` points of the Fibonacci lattice on the unit sphere."""
+    # Heights of equal areas, a golden angle apart.
     k = np.arange(n)
     z = 1 - (2 * k + 1) / n
     turn = 2 * np.pi * np.modf(k * GOLDEN)[0]
     ring = np.sqrt(1 - z * z)
     points = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=-1)
-    return points, points.copy()
+    return Samples(points, points.copy())
 
 
 def even_box(n: int, extents: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Samples:
@@ -389,21 +401,23 @@ def even_box(n: int, extents: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> S
 
     Faces are filled by the R2 sequence (Roberts 2018), a two-dimensional golden ratio.
     """
+    # The number of points on each face: x, y and z, each on both sides.
     x, y, z = extents
     areas = np.array([y * z, y * z, z * x, z * x, x * y, x * y])
-    counts = np.diff(
-        np.round(np.cumsum(np.append(0.0, areas)) / areas.sum() * n).astype(int)
-    )
+    ends = np.cumsum(np.append(0.0, areas)) / areas.sum() * n
+    counts = np.diff(np.round(ends).astype(int))
+
     points = []
     normals = []
     for face, count in enumerate(counts):
+        # The R2 sequence on a face, as its two other coordinates.
         axis = face // 2
         sign = 1.0 - 2.0 * (face % 2)
         k = np.arange(count)[:, None] + 1
-        flat = np.modf(0.5 + k / PLASTIC ** np.array([1, 2]))[0] - 0.5
-        points.append(np.insert(flat, axis, 0.5 * sign, axis=1))
+        fraction, _ = np.modf(0.5 + k / PLASTIC ** np.array([1, 2]))
+        points.append(np.insert(fraction - 0.5, axis, 0.5 * sign, axis=1))
         normals.append(np.tile(np.eye(3)[axis] * sign, (count, 1)))
-    return np.concatenate(points), np.concatenate(normals)
+    return Samples(np.concatenate(points), np.concatenate(normals))
 
 
 def shipped(shape: str, n: int) -> Samples:
@@ -424,4 +438,4 @@ def shipped(shape: str, n: int) -> Samples:
             f"Densify: sampler 'trimesh' has {len(points)} {shape} points, {n} were requested; "
             "use sampler 'even' for other numbers"
         )
-    return points, normals.astype(np.float64)
+    return Samples(points, normals.astype(np.float64))

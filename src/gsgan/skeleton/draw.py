@@ -8,14 +8,14 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gsgan.scene import Camera
-from gsgan.skeleton.template import MEDIAPIPE33, SkeletonTemplate
+from gsgan.skeleton.template import MEDIAPIPE33, Edge, SkeletonTemplate
 from gsgan.skeleton.tensors import check_skeleton
 from gsgan.utils.tensors import constant
 
 MIN_SEGMENT_PX = 1e-2
 """Pixels: a shorter segment is drawn as a point, with a finite slope."""
 MIN_SIGMA = 0.8
-"""Pixels: the least line width."""
+"""Pixels: the minimum line width."""
 MIN_EXPONENT = -60.0
 """Below this exponent a line is exactly zero: at 1e-26, eleven sigmas away."""
 
@@ -30,7 +30,7 @@ def draw_skeleton(
 ) -> Tensor:
     """Draws the skeleton as the camera sees it.
 
-    Convention: a channel is the maximum of ``exp(-d² / 2 sigma²)`` over its group's segments, d the
+    A channel is the maximum of ``exp(-d² / 2 sigma²)`` over its group's segments, d the
     distance of the pixel's centre in pixels; 1 on the bone. ``sigma = sigma_px H / 512``, at least
     `MIN_SIGMA` pixels. Segments with an end that is unseen or
     nearer than ``near`` are not drawn. Joints are distorted by the camera's lens, bones stay
@@ -59,21 +59,20 @@ def draw_skeleton(
         )
     sigma = max(sigma_px * camera.size[0] / 512, MIN_SIGMA)
 
-    # the ends of the segments that are drawn
+    # Segments whose two ends are seen and in front of the camera.
     pixels, depth = camera.project(p, near)
     drawn = valid & (depth > near)
-    ends = _segment_ends(template, p.device)
-    shown = (drawn.index_select(1, ends[0]) & drawn.index_select(1, ends[1])).unsqueeze(
-        -1
-    )
-    a, b = (pixels.index_select(1, end) for end in ends)
-    # masked before the arithmetic: pixels of unseen joints are arbitrary
-    a = torch.where(shown, a, 0.0)
-    b = torch.where(shown, b, 0.0)
-    distance2 = _distance2(
-        a, b, shown, camera.size, [len(g) for _, g in template.draw_groups]
-    )
-    # zero below the bound: denormal numbers would slow down all later operations
+    starts, ends = _segment_ends(template, p.device)
+    shown = drawn.index_select(1, starts) & drawn.index_select(1, ends)
+    shown = shown.unsqueeze(-1)
+
+    # Masked before the arithmetic: pixels of unseen joints are arbitrary.
+    a = torch.where(shown, pixels.index_select(1, starts), 0.0)
+    b = torch.where(shown, pixels.index_select(1, ends), 0.0)
+    counts = [len(group) for _, group in template.draw_groups]
+    distance2 = _distance2(a, b, shown, camera.size, counts)
+
+    # Zero below the bound: denormal numbers would slow down all later operations.
     exponent = (distance2 * (-0.5 / sigma**2)).clamp_min(MIN_EXPONENT)
     return exponent.exp() - math.exp(MIN_EXPONENT)
 
@@ -81,8 +80,11 @@ def draw_skeleton(
 @lru_cache(maxsize=64)
 def _segment_ends(template: SkeletonTemplate, device: torch.device) -> Tensor:
     """``[2, S]`` joints of all groups' segments; cached, not copied to the device in every call."""
-    segments = [edge for _, group in template.draw_groups for edge in group]
-    # tensors created in inference mode cannot be used for training later
+    segments: list[Edge] = []
+    for _, group in template.draw_groups:
+        segments += group
+
+    # Tensors created in inference mode cannot be used for training later.
     with torch.inference_mode(False):
         return torch.tensor(segments, device=device).T
 
@@ -90,44 +92,52 @@ def _segment_ends(template: SkeletonTemplate, device: torch.device) -> Tensor:
 def _distance2(
     a: Tensor, b: Tensor, shown: Tensor, size: tuple[int, int], counts: list[int]
 ) -> Tensor:
-    """``[B, groups, h, w]`` squared pixels to each group's nearest segment; huge where none is.
+    """``[B, groups, h, w]`` squared pixels to each group's nearest segment; huge if none is drawn.
 
     In a segment's own axes a pixel is ``along`` lengths from its middle and ``across`` pixels
     from its line. Both are affine: the sum of a column term and a row term.
     """
     h, w = size
+
+    # A very short segment is drawn as one of a minimum length along x.
     d = b - a
     length2 = d.square().sum(-1, keepdim=True)
     short = length2 < MIN_SEGMENT_PX**2
     length2 = torch.where(short, MIN_SEGMENT_PX**2, length2)
     d = torch.where(short, constant((MIN_SEGMENT_PX, 0.0), d), d)
-    # an unseen segment gets such a large distance that its value is exactly zero
+    # An unseen segment gets such a large distance that its value is exactly zero.
     away = torch.where(shown, 0.0, 1e4 * float(max(h, w)))
 
+    # Pixel centres from the segments' first ends, and the segments' own axes.
     x = torch.arange(w, device=a.device, dtype=a.dtype) + 0.5 - a[..., :1]  # [B, S, w]
     y = torch.arange(h, device=a.device, dtype=a.dtype) + 0.5 - a[..., 1:]  # [B, S, h]
     forward = d / length2
     sideways = d * length2.rsqrt()
-    along = (x * forward[..., :1] - 0.5, y * forward[..., 1:])
-    across = (x * sideways[..., 1:] + away, y * -sideways[..., :1])
 
-    parts = ((col.unsqueeze(-2), row.unsqueeze(-1)) for col, row in (along, across))
-    (along_x, along_y), (across_x, across_y) = parts
-    terms = (along_x, along_y, across_x, across_y, length2.sqrt().unsqueeze(-1))
-    # per group: the [B, segments, h, w] temporaries fit into the cache
-    return torch.stack(
-        [
-            _nearest(*group)
-            for group in zip(*(t.split(counts, 1) for t in terms), strict=True)
-        ],
-        1,
+    # The terms of columns [B, S, 1, w] and of rows [B, S, h, 1].
+    along_x = (x * forward[..., :1] - 0.5).unsqueeze(-2)
+    along_y = (y * forward[..., 1:]).unsqueeze(-1)
+    across_x = (x * sideways[..., 1:] + away).unsqueeze(-2)
+    across_y = (y * -sideways[..., :1]).unsqueeze(-1)
+    length = length2.sqrt().unsqueeze(-1)
+
+    # Group by group, so that the temporaries [B, segments, h, w] fit into the cache.
+    groups = zip(
+        along_x.split(counts, dim=1),
+        along_y.split(counts, dim=1),
+        across_x.split(counts, dim=1),
+        across_y.split(counts, dim=1),
+        length.split(counts, dim=1),
+        strict=True,
     )
+    return torch.stack([_nearest(*group) for group in groups], dim=1)
 
 
 def _nearest(
     along_x: Tensor, along_y: Tensor, across_x: Tensor, across_y: Tensor, length: Tensor
 ) -> Tensor:
     """``[B, h, w]`` squared pixels to the nearest of one group's segments ``[B, S, ...]``."""
+    # The distance along the segment beyond its ends, and that from its line.
     beyond = F.softshrink(along_x + along_y, 0.5) * length  # 0 between the ends
     across = across_x + across_y
     return torch.addcmul(across * across, beyond, beyond).amin(1)

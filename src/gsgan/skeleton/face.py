@@ -2,7 +2,7 @@
 
 They represent what a face adds to a sign: the mouth's shape, brows, gaze and blinks. The oval is
 left out, because the pose's own ears, eyes and nose determine the head's position and rotation.
-Convention: as in `gsgan.skeleton.template`.
+Units and axes are as in `gsgan.skeleton.template`.
 """
 
 from itertools import pairwise
@@ -17,13 +17,24 @@ BROW_POINTS = 5  # from the nose outwards
 LID_POINTS = ("inner", "upper", "outer", "lower")
 SIDES = ("left", "right")
 LIPS = tuple(f"mouth_outer_{k}" for k in range(LIP_POINTS))
-BROWS = tuple(tuple(f"{side}_brow_{k}" for k in range(BROW_POINTS)) for side in SIDES)
-LIDS = tuple(tuple(f"{side}_lid_{name}" for name in LID_POINTS) for side in SIDES)
+
+
+def _brow(side: str) -> tuple[str, ...]:
+    return tuple(f"{side}_brow_{k}" for k in range(BROW_POINTS))
+
+
+def _lid(side: str) -> tuple[str, ...]:
+    return tuple(f"{side}_lid_{name}" for name in LID_POINTS)
+
+
+# Left and right.
+BROWS = (_brow("left"), _brow("right"))
+LIDS = (_lid("left"), _lid("right"))
 FACE_NAMES = (*LIPS, *BROWS[0], *BROWS[1], *LIDS[0], *LIDS[1])
 """In the order of face3d.npz."""
 FACE = len(FACE_NAMES)
 
-OFFSET = 0.005
+CODE_UNIT = 0.005
 """Metres per unit of `face_code`: in speech and signs these landmarks move by 2 to 10 mm, in body
 heights a hundredth of what joints move by."""
 
@@ -46,11 +57,15 @@ _LEFT_REST: dict[str, Vector] = {
     "left_lid_outer": (0.046, 1.588, 0.088),
     "left_lid_lower": (0.033, 1.584, 0.102),
 }
-_TWINS = {
-    **{LIPS[k]: LIPS[(LIP_POINTS // 2 - k) % LIP_POINTS] for k in range(LIP_POINTS)},
-    **{name: name.replace("left", "right") for name in (*BROWS[0], *LIDS[0])},
-    **{name: name.replace("right", "left") for name in (*BROWS[1], *LIDS[1])},
-}
+
+
+def _twin(name: str) -> str:
+    """The landmark on the other side."""
+    if name in LIPS:  # counted round the mouth, whose middle is at the top
+        return LIPS[(LIP_POINTS // 2 - LIPS.index(name)) % LIP_POINTS]
+    if "left" in name:
+        return name.replace("left", "right")
+    return name.replace("right", "left")
 
 
 def rest_face() -> tuple[Vector, ...]:
@@ -59,15 +74,15 @@ def rest_face() -> tuple[Vector, ...]:
     def place(name: str) -> Vector:
         if name in _LEFT_REST:
             return _LEFT_REST[name]
-        x, y, z = _LEFT_REST[_TWINS[name]]
+        x, y, z = _LEFT_REST[_twin(name)]
         return -x, y, z
 
     return tuple(place(name) for name in FACE_NAMES)
 
 
 def face_mirror(start: int) -> tuple[int, ...]:
-    """Per landmark its counterpart's number, where the first one has the number ``start``."""
-    return tuple(start + FACE_NAMES.index(_TWINS[name]) for name in FACE_NAMES)
+    """Per landmark its counterpart's number, if the first one has the number ``start``."""
+    return tuple(start + FACE_NAMES.index(_twin(name)) for name in FACE_NAMES)
 
 
 def face_groups(start: int) -> tuple[tuple[str, tuple[Edge, ...]], ...]:
@@ -91,8 +106,9 @@ def face_links(start: int) -> tuple[Edge, ...]:
     """Edges to the pose's mouth and eyes, which connect lips, brows and lids to the graph."""
     ends = {"mouth_left": LIPS[0], "mouth_right": LIPS[LIP_POINTS // 2]}
     for side, brow, lid in zip(SIDES, BROWS, LIDS, strict=True):
-        ends |= {f"{side}_eye": brow[BROW_POINTS // 2]}
-        ends |= {f"{side}_eye_inner": lid[0], f"{side}_eye_outer": lid[2]}
+        ends[f"{side}_eye"] = brow[BROW_POINTS // 2]
+        ends[f"{side}_eye_inner"] = lid[0]
+        ends[f"{side}_eye_outer"] = lid[2]
     names = MEDIAPIPE33.names
     return tuple((names.index(a), start + FACE_NAMES.index(b)) for a, b in ends.items())
 
@@ -109,14 +125,15 @@ def in_head(
         template: of the joints.
     """
     c = constants(template, p.device, p.dtype)
-    return (points - p.index_select(1, c.head_points).mean(1, keepdim=True)) @ head
+    middle = p.index_select(1, c.head_points).mean(1, keepdim=True)
+    return (points - middle) @ head
 
 
 def face_code(p: Tensor, head: Tensor, template: SkeletonTemplate) -> Tensor | None:
-    """``[B, E, 3]`` offsets of the face's landmarks from the face at rest, in units of `OFFSET`.
+    """``[B, E, 3]`` offsets of the face's landmarks from the face at rest, in units of `CODE_UNIT`.
 
-    Convention: in the head's axes; zero for a face at rest, however the head turns, and so for one
-    that `sanitise` placed. Differentiable in p. None for a skeleton without a face.
+    Offsets are in the head's axes; they are zero for a face at rest, however the head turns, and so
+    for one that `sanitise` placed. Differentiable in p. None for a skeleton without a face.
 
     Args:
         p: ``[B, J, 3]`` finite joints, metres, world frame.
@@ -127,4 +144,4 @@ def face_code(p: Tensor, head: Tensor, template: SkeletonTemplate) -> Tensor | N
         return None
     c = constants(template, p.device, p.dtype)
     found = in_head(p.index_select(1, c.expression), p, head, template)
-    return (found - c.face_rest) / OFFSET
+    return (found - c.face_rest) / CODE_UNIT

@@ -22,15 +22,15 @@ from gsgan.skeleton.tensors import FOLDED, Constants, Level, check_skeleton, con
 
 MIN_LENGTH = 1e-3
 """Metres: a shorter bone or baseline has no direction (1 mm, below any landmark's accuracy)."""
-# summed squares of a rotation's entries are 3, those of a palm that shrinks are less
-WHOLE = 2.99
+# The squares of a rotation's entries sum to 3, those of a palm that shrinks to less.
+MIN_SQUARES = 2.99
 
 
 @dataclass(frozen=True)
 class BoneFrames:
     """The frames of a batch of skeletons.
 
-    Convention: rotations map the frame's axes to the world; at the rest directions every limb
+    Rotations map the frame's axes to the world; at the rest directions every limb
     frame equals its hub's.
     """
 
@@ -58,14 +58,14 @@ def bone_frames(
 ) -> BoneFrames:
     """The frames of trunk, head and limbs.
 
-    Convention: metres, world frame; everything but the last fallbacks rotates with the skeleton.
-    The head's frame comes from nose and ears, else from nose and eyes, else from the chest. Where
-    shoulders or hips are in line with the spine, the other baseline is used, then a world axis.
-    Below `MIN_LENGTH` a bone's swing fades to none and a baseline to its fallback, so that bones
-    that vanish and grow again do not jump: a joint's step moves a frame by at most a few times
-    ``step / MIN_LENGTH``. Four cases must jump, because no continuous choice exists: a limb folded
-    back onto itself, shoulders facing backwards over the hips, a baseline that passes the exact
-    opposite of its fallback below `MIN_LENGTH`, and the world axis for a trunk without width.
+    Units are metres in the world frame; everything but the last fallbacks rotates with the
+    skeleton. The head's frame comes from nose and ears, else from nose and eyes, else from the
+    chest. If shoulders or hips are in line with the spine, the other baseline is used, then a world
+    axis. Below `MIN_LENGTH` a bone's swing fades to none and a baseline to its fallback, so that
+    bones that vanish and grow again do not jump: a joint's step moves a frame by at most a few
+    times ``step / MIN_LENGTH``. Four cases must jump, because no continuous choice exists: a limb
+    folded back onto itself, shoulders facing backwards over the hips, a baseline that passes the
+    exact opposite of its fallback below `MIN_LENGTH`, and the world axis for a trunk without width.
 
     Args:
         p: ``[B, J, 3]`` finite joints (see :func:`gsgan.skeleton.sanitise`).
@@ -83,21 +83,26 @@ def bone_frames(
     """
     valid = check_skeleton("bone_frames", p, valid, template)
     c = constants(template, p.device, p.dtype)
-    # baselines are differences of nearby points: exact once the root is subtracted
+
+    # Baselines are differences of nearby points: exact once the root is subtracted.
     q = p - p[:, template.hips[0], None].detach()
     trunk = _trunk(q, c)
-    known = torch.cat([trunk[:, :2], _head(q, valid, trunk[:, 1], c)], dim=1)
+    chest = trunk[:, 1]
+    known = torch.cat([trunk[:, :2], _head(q, valid, chest, c)], dim=1)
     if template.palms:
-        known = torch.cat([known, palms_of(q, trunk[:, 1:2], c)], dim=1)
+        known = torch.cat([known, palms_of(q, chest.unsqueeze(1), c)], dim=1)
 
+    # Limbs, level by level: each parent's frame is known before.
     bones = q.index_select(1, c.ends) - q.index_select(1, c.starts)
-    length2 = bones.square().sum(-1, keepdim=True)
-    lengths = (length2.squeeze(-1) + MIN_LENGTH**2).sqrt()
     relative = []
     for level in c.levels:
         parent = known.index_select(1, level.parents)
-        relative.append(swings(bones.index_select(1, level.limbs), parent, level))
-        known = torch.cat([known, parent @ relative[-1]], dim=1)
+        swing = swings(bones.index_select(1, level.limbs), parent, level)
+        relative.append(swing)
+        known = torch.cat([known, parent @ swing], dim=1)
+
+    length2 = bones.square().sum(-1, keepdim=True)
+    lengths = (length2.squeeze(-1) + MIN_LENGTH**2).sqrt()
     return BoneFrames(
         hubs=known[:, : template.n_hubs],
         limbs=known[:, template.n_hubs :].index_select(1, c.limb_order),
@@ -109,6 +114,7 @@ def bone_frames(
 
 def swings(bones: Tensor, parent: Tensor, level: Level) -> Tensor:
     """``[B, M, 3, 3]`` frames relative to ``parent [B, M, 3, 3]`` of a level's ``[B, M, 3]``."""
+    # Short bones swing only in part.
     directions, _ = _shortened(bones)
     return level.swing.to((directions.unsqueeze(-2) @ parent).squeeze(-2))
 
@@ -129,18 +135,24 @@ def _trunk(q: Tensor, c: Constants) -> Tensor:
     spine = (l_sh + r_sh - l_hip - r_hip) * 0.5
     up = _faded(spine, c.axes[1]).unsqueeze(1)
 
+    # The left axes of hips and shoulders, orthogonal to the spine.
     lines = torch.stack([l_hip - r_hip, l_sh - r_sh], dim=1)
     lines = across(up, lines)
-    least = c.axes[up.detach().abs().argmin(-1).squeeze(1)].unsqueeze(1)
-    # the world's x axis unless the spine lies along it
-    stray = unit(across(up, torch.where(up[..., :1].abs() < 0.9, c.axes[0], least)))
-    other = _faded(lines.flip(1), stray)
+
+    # A short line fades to the other one, and this to the world's x axis, or, if the spine lies
+    # along it, to the axis that is farthest from the spine's direction.
+    farthest = c.axes[up.detach().abs().argmin(-1).squeeze(1)].unsqueeze(1)
+    axis = torch.where(up[..., :1].abs() < 0.9, c.axes[0], farthest)
+    other = _faded(lines.flip(1), unit(across(up, axis)))
     lines = _faded(lines, other)
-    # again: a line nearly along the spine keeps the rounding of its long part
+    # Once more: a line nearly along the spine keeps the rounding of its long part.
     lines = unit(across(up, lines))
+
+    # The box's left axis is their mean, or the hips' if the shoulders face backwards.
     both = lines.sum(1, keepdim=True)
-    opposed = both.square().sum(-1, keepdim=True) < 2 * FOLDED  # facing backwards
-    left = torch.cat([lines, unit(torch.where(opposed, lines[:, :1], both))], dim=1)
+    opposed = both.square().sum(-1, keepdim=True) < 2 * FOLDED
+    middle = unit(torch.where(opposed, lines[:, :1], both))
+    left = torch.cat([lines, middle], dim=1)
     up = up.expand_as(left)
     return torch.stack([left, up, torch.linalg.cross(left, up)], dim=-1)
 
@@ -150,31 +162,34 @@ def _head(q: Tensor, valid: Tensor, chest: Tensor, c: Constants) -> Tensor:
 
     A baseline that shrinks below `MIN_LENGTH` fades to the next frame.
     """
+    # Pairs of ears and of eyes, each seen if the nose is too.
     points = q.index_select(1, c.head_points)
     seen = valid.index_select(1, c.head_points)
     pairs = points[:, :4].unflatten(1, (2, 2))
-    nose = points[:, 4:]
     seen_pair = seen[:, :4].unflatten(1, (2, 2)).all(-1) & seen[:, 4:]
 
+    # Their frames: left along the pair, front from its middle to the nose.
     left, wide = _shortened(pairs[:, :, 0] - pairs[:, :, 1])
-    front = nose - (pairs[:, :, 0] + pairs[:, :, 1]) * 0.5
+    front = points[:, 4:] - (pairs[:, :, 0] + pairs[:, :, 1]) * 0.5
     front, deep = _shortened(across(left, front))
     frames = torch.stack([left, torch.linalg.cross(front, left), front], dim=-1)
-    share = torch.where(seen_pair.unsqueeze(-1), wide * deep, 0.0).unsqueeze(-1)
+    ears, eyes = frames.unbind(1)
 
-    (by_ears, by_eyes), (ears, eyes) = share.unbind(1), frames.unbind(1)
+    # Blended by how long the baselines are.
+    share = torch.where(seen_pair.unsqueeze(-1), wide * deep, 0.0).unsqueeze(-1)
+    by_ears, by_eyes = share.unbind(1)
     head = by_eyes * (eyes @ c.head_from_eyes) + (1 - by_eyes) * chest
-    head = rotation_from_6d(rotation_to_6d(by_ears * ears + (1 - by_ears) * head))
-    return head.unsqueeze(1)
+    head = by_ears * ears + (1 - by_ears) * head
+    return rotation_from_6d(rotation_to_6d(head)).unsqueeze(1)
 
 
 def palms_of(q: Tensor, chest: Tensor, c: Constants) -> Tensor:
-    """``[B, hands, 3, 3]`` frames of the palms; of one that vanishes, the chest's ``[B, 1, 3, 3]``.
+    """``[B, hands, 3, 3]`` palm frames; a degenerate palm gets the chest's ``[B, 1, 3, 3]``.
 
     Fingers' swings then start from the palm, which turns with the forearm as no bone shows.
     """
     frames = palm_frames(q.index_select(1, c.palms).unflatten(1, (-1, 3)))
-    lost = frames.square().sum((-2, -1), keepdim=True) < WHOLE
+    lost = frames.square().sum((-2, -1), keepdim=True) < MIN_SQUARES
     return torch.where(lost, chest, frames)
 
 
@@ -184,6 +199,7 @@ def _faded(v: Tensor, fallback: Tensor) -> Tensor:
     No continuous map from the ball to the sphere is the identity on the surface, so one point must
     jump: here the v opposite to the fallback, where the two cancel.
     """
+    # In units of the minimum length, the fallback's share is 1 - |v|².
     v = v / MIN_LENGTH
     v = v + (1 - v.square().sum(-1, keepdim=True)).clamp_min(0) * fallback
     lost = v.square().sum(-1, keepdim=True) < FOLDED
@@ -191,12 +207,10 @@ def _faded(v: Tensor, fallback: Tensor) -> Tensor:
 
 
 def _shortened(v: Tensor) -> tuple[Tensor, Tensor]:
-    """v divided by the larger of its length and `MIN_LENGTH`, and the squared result's length."""
+    """v divided by the larger of its length and `MIN_LENGTH`, and the result's squared length."""
     length2 = v.square().sum(-1, keepdim=True)
-    return (
-        v * length2.clamp_min(MIN_LENGTH**2).rsqrt(),
-        (length2 / MIN_LENGTH**2).clamp_max(1),
-    )
+    shortened = v * length2.clamp_min(MIN_LENGTH**2).rsqrt()
+    return shortened, (length2 / MIN_LENGTH**2).clamp_max(1)
 
 
 def omega(
@@ -209,11 +223,11 @@ def omega(
 ) -> Tensor:
     """The 6D pose code Ω, incoming-bone convention.
 
-    Convention: joint j has the rotation of the bone that ends at j relative to its parent's
-    frame. Hips have the pelvis and shoulders the chest, in camera axes, so that the code depends on
-    the viewpoint; the nose has the head relative to the chest, the other face joints the swing of
-    their line from the middle of the ears. A face's landmarks have their `face_code`, then zeros,
-    in place of a rotation. All but hips and shoulders are invariant to rigid motions.
+    Joint j has the rotation of the bone that ends at j relative to its parent's frame. Hips have
+    the pelvis and shoulders the chest, in camera axes, so that the code depends on the viewpoint;
+    the nose has the head relative to the chest, the other face joints the swing of their line from
+    the middle of the ears. A face's landmarks have their `face_code`, then zeros, in place of a
+    rotation. All but hips and shoulders are invariant to rigid motions.
 
     Args:
         p: ``[B, J, 3]`` finite joints, metres, world frame.
@@ -237,18 +251,25 @@ def omega(
         )
     f = frames or bone_frames(p, valid, template)
     c = constants(template, p.device, p.dtype)
+
+    # Pelvis and chest in camera axes.
     pelvis_chest = R_cam.unsqueeze(1) @ f.hubs[:, :HEAD]
     chest = f.hubs[:, CHEST]
     head = f.head
+
+    # Lines from the middle of the ears to the other joints of the face. Offsets from one ear are
+    # exact far from the world's origin too.
     ears = p.index_select(1, c.head_points[:2])
-    d = (p.index_select(1, c.face_turned) - ears[:, :1]) - (
-        ears[:, 1:] - ears[:, :1]
-    ) * 0.5
+    ear = ears[:, :1]
+    d = (p.index_select(1, c.face_turned) - ear) - (ears[:, 1:] - ear) * 0.5
     d = d * d.square().sum(-1, keepdim=True).clamp_min(MIN_LENGTH**2).rsqrt()
     face = c.face_swing.to(d @ head)
-    rotations = torch.cat(
-        [pelvis_chest, (chest.mT @ head).unsqueeze(1), face, f.local], dim=1
-    )
-    code = rotation_to_6d(rotations.index_select(1, c.omega_order))
+
+    # In the order of the joints, then the landmarks of the face.
+    rotations = [pelvis_chest, (chest.mT @ head).unsqueeze(1), face, f.local]
+    by_joint = torch.cat(rotations, dim=1).index_select(1, c.omega_order)
+    code = rotation_to_6d(by_joint)
     offsets = face_code(p, head, template)
-    return code if offsets is None else torch.cat([code, pad(offsets, (0, 3))], dim=1)
+    if offsets is None:
+        return code
+    return torch.cat([code, pad(offsets, (0, 3))], dim=1)

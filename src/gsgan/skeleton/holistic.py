@@ -1,6 +1,6 @@
 """Skeletons with hands and face: MediaPipe's 33 pose landmarks, 21 of each hand, 30 of the face.
 
-Convention: as in `gsgan.skeleton.template`. Constants only.
+Units and axes are as in `gsgan.skeleton.template`. Constants only.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,6 @@ from gsgan.skeleton.hands import (
     HAND,
     HAND_EDGES,
     PALM,
-    PINKY,
     WRIST,
     hand_names,
 )
@@ -32,84 +31,93 @@ from gsgan.utils.checks import one_of
 
 POSE = MEDIAPIPE33
 STARTS = (len(POSE.names), len(POSE.names) + HAND)  # each hand's wrist
-ARMS = ((11, 13, 15), (12, 14, 16))  # shoulder, elbow and wrist of the pose
-HUBS = N_HUBS + len(STARTS)
-# Metres, lengths of a straight finger's bones; the thumb's from its base.
-BONES = {
+POSE_ARMS = ((11, 13, 15), (12, 14, 16))  # shoulder, elbow and wrist of the pose
+HUBS_WITH_PALMS = N_HUBS + len(STARTS)
+# Lengths of a straight finger's bones and of the thumb's last ones, metres.
+FINGER_LENGTHS = {
     "index": (0.040, 0.024, 0.020),
     "middle": (0.044, 0.027, 0.021),
     "ring": (0.040, 0.026, 0.020),
     "pinky": (0.032, 0.019, 0.018),
 }
-THUMB = (0.034, 0.026)
-STRAIGHT: Vector = (1.0, 0.0, 0.0)  # in the palm's axes
-SPREAD: Vector = (0.5**0.5, 0.5**0.5, 0.0)  # a thumb
+THUMB_LENGTHS = (0.034, 0.026)
+# Directions of straight fingers and of a spread thumb, in the palm's axes.
+STRAIGHT: Vector = (1.0, 0.0, 0.0)
+SPREAD: Vector = (0.5**0.5, 0.5**0.5, 0.0)
 
 
 def _chains(start: int) -> tuple[tuple[int, ...], ...]:
     return tuple(tuple(start + j for j in finger) for finger in FINGERS)
 
 
-def _limbs(side: int) -> tuple[Edge, ...]:
+def _limbs(side: int) -> list[Edge]:
     """The forearm to the hand's own wrist, the palm's bones, and the fingers' from base to tip."""
     wrist = STARTS[side]
-    chains = _chains(STARTS[side])
-    palm = tuple((wrist, base) for base, *_ in chains)
-    return (
-        (ARMS[side][1], wrist),
-        *palm,
-        *(pair for chain in chains for pair in pairwise(chain)),
-    )
+    chains = _chains(wrist)
+    limbs = [(POSE_ARMS[side][1], wrist)]
+    for chain in chains:
+        limbs.append((wrist, chain[0]))
+    for chain in chains:
+        limbs += pairwise(chain)
+    return limbs
 
 
 def _hand_at_rest() -> np.ndarray:
     """``[21, 3]`` a flat left hand that continues the pose's wrist and knuckles."""
     rest = dict(zip(POSE.names, np.asarray(POSE.rest_positions), strict=True))
-    wrist, index, pinky, thumb = (
-        rest[f"left_{n}"] for n in ("wrist", "index", "pinky", "thumb")
-    )
+    wrist = rest["left_wrist"]
+    index = rest["left_index"]
+    pinky = rest["left_pinky"]
+    thumb = rest["left_thumb"]
+
+    # Fingers point from the wrist to the middle of the knuckles.
     along = (index + pinky) / 2 - wrist
     along = along / np.linalg.norm(along)
     p = np.zeros((HAND, 3))
     p[WRIST] = wrist
-    for k, (finger, bones) in enumerate(BONES.items()):
-        chain = FINGERS[1 + k]
+
+    # Straight fingers, whose knuckles are on a slight arc.
+    for k, (finger, lengths) in enumerate(FINGER_LENGTHS.items()):
+        knuckle, *joints = FINGERS[1 + k]
         share = k / 3
         bulge = 0.008 * (finger in ("middle", "ring"))
-        p[chain[0]] = (1 - share) * index + share * pinky + bulge * along
-        for joint, at in zip(chain[1:], np.cumsum(bones), strict=True):
-            p[joint] = p[chain[0]] + at * along
-    base, knuckle, *tips = FINGERS[0]
+        p[knuckle] = (1 - share) * index + share * pinky + bulge * along
+        for joint, at in zip(joints, np.cumsum(lengths), strict=True):
+            p[joint] = p[knuckle] + at * along
+
+    # The thumb points away from its base.
+    base, knuckle, *joints = FINGERS[0]
     p[base] = wrist + 0.45 * (thumb - wrist)
     p[knuckle] = thumb
     outwards = (thumb - p[base]) / np.linalg.norm(thumb - p[base])
-    for joint, at in zip(tips, np.cumsum(THUMB), strict=True):
+    for joint, at in zip(joints, np.cumsum(THUMB_LENGTHS), strict=True):
         p[joint] = thumb + at * outwards
-    assert np.allclose(p[PINKY], pinky)
     return p
 
 
 def _with_hands() -> SkeletonTemplate:
+    """MediaPipe's pose with two hands of 21 landmarks."""
+    # Palms are additional hubs, so that the frames of limbs have larger numbers.
     limbs = list(POSE.limbs)
-    parents = []
     directions = list(POSE.rest_directions)
     parents = [p if p < N_HUBS else p + len(STARTS) for p in POSE.limb_parents]
 
     # Each hand adds its limbs: the palm follows the forearm, fingers follow the palm.
     groups = []
+    bare = []
     for side, start in enumerate(STARTS):
         first = len(limbs)
-        forearm = POSE.limbs.index(ARMS[side][1:])
+        bare.append(first)
+        forearm = POSE.limbs.index(POSE_ARMS[side][1:])
         limbs += _limbs(side)
-        parents += [parents[forearm], *[HUBS + first] * len(FINGERS)]
+        parents += [parents[forearm], *[HUBS_WITH_PALMS + first] * len(FINGERS)]
         directions += [POSE.rest_directions[forearm]] * (1 + len(FINGERS))
         for k, chain in enumerate(_chains(start)):
-            place = HUBS + len(parents)
+            place = HUBS_WITH_PALMS + len(parents)
             parents += [N_HUBS + side, place, place + 1]
             directions += [STRAIGHT if k else SPREAD] * 3
             name = f"{('left', 'right')[side]}_{FINGER_NAMES[k]}"
-            segments = zip((start, *chain), chain, strict=False)
-            groups.append((name, tuple(segments)))
+            groups.append((name, tuple(pairwise((start, *chain)))))
 
     # The right hand at rest is the mirror image of the left one.
     left = _hand_at_rest()
@@ -117,18 +125,19 @@ def _with_hands() -> SkeletonTemplate:
 
     # Edges to draw and for the graph network, within hands and from wrist to hand.
     edges = tuple((start + a, start + b) for start in STARTS for a, b in HAND_EDGES)
-    wrists = tuple((arm[-1], start) for arm, start in zip(ARMS, STARTS, strict=True))
+    wrists = tuple(
+        (arm[-1], start) for arm, start in zip(POSE_ARMS, STARTS, strict=True)
+    )
 
-    # The palms' own limbs have no cylinder; left and right hands exchange in the mirror.
-    own = len(_limbs(0))
-    bare = tuple(len(POSE.limbs) + side * own for side in (0, 1))
-    swapped = tuple(start + j for start in reversed(STARTS) for j in range(HAND))
+    # The hands' own forearms have no cylinder; left and right hands exchange in the mirror.
+    fingers = set(range(len(POSE.limbs), len(limbs))) - set(bare)
+    left_start, right_start = STARTS
+    swapped = [*range(right_start, right_start + HAND), *range(left_start, right_start)]
+    names = [name.replace("wrist", "hand_wrist") for name in hand_names()]
+    wrist, index, pinky = PALM
     return replace(
         POSE,
-        names=(
-            *POSE.names,
-            *(name.replace("wrist", "hand_wrist") for name in hand_names()),
-        ),
+        names=(*POSE.names, *names),
         edges=(*POSE.edges, *edges),
         limbs=tuple(limbs),
         limb_parents=tuple(parents),
@@ -137,18 +146,20 @@ def _with_hands() -> SkeletonTemplate:
         mirror=(*POSE.mirror, *swapped),
         draw_groups=(*POSE.draw_groups, *groups),
         gnn_edges=(*POSE.gnn_edges, *edges, *wrists),
-        palms=tuple(
-            (start + PALM[0], start + PALM[1], start + PALM[2]) for start in STARTS
-        ),
-        fingers=tuple(i for i in range(len(POSE.limbs), len(limbs)) if i not in bare),
-        bare=bare,
+        palms=tuple((start + wrist, start + index, start + pinky) for start in STARTS),
+        fingers=tuple(sorted(fingers)),
+        bare=tuple(bare),
     )
 
 
 def _with_face(hands: SkeletonTemplate) -> SkeletonTemplate:
+    """A template with the 30 landmarks of a face, which have no limbs."""
+    # The face's landmarks follow those of the hands.
     start = len(hands.names)
     groups = face_groups(start)
-    edges = tuple(edge for _, group in groups for edge in group)
+    edges: list[Edge] = []
+    for _, group in groups:
+        edges += group
     return replace(
         hands,
         names=(*hands.names, *FACE_NAMES),
@@ -172,11 +183,11 @@ TEMPLATES = {
     "mediapipe33_hands": MEDIAPIPE33_HANDS,
     "holistic": HOLISTIC,
 }
-"""By the name that ``data.skeleton`` has; the joints of each are the first ones of the next."""
+"""Templates by the values of ``data.skeleton``; each begins with the joints of the one before."""
 
 
 def template_of(skeleton: str, face: Sequence[Vector] | None) -> SkeletonTemplate:
-    """A template by its name, with a person's own face at rest where there is one."""
+    """A template by its name, with a person's own face at rest if it is known."""
     template = TEMPLATES[skeleton]
     return template if face is None else template.with_face(face)
 

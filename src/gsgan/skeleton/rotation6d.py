@@ -21,9 +21,9 @@ def rotation_to_6d(R: Tensor) -> Tensor:
 def rotation_from_6d(x: Tensor, eps: float = 1e-5) -> Tensor:
     """The rotation nearest to two columns, by Gram-Schmidt.
 
-    Convention: the columns need not be unit or orthogonal. A first column shorter than ``eps`` is
+    The columns need not be unit or orthogonal. A first column shorter than ``eps`` is
     replaced by the x axis; a second one whose part orthogonal to the first is shorter than ``eps``
-    times its own length (or than ``eps``) by the axis least along the first. The result is always
+    times its own length (or than ``eps``) by the axis farthest from the first. The result is always
     a rotation with a finite gradient; the gradient of replaced columns is zero.
 
     Args:
@@ -40,25 +40,30 @@ def rotation_from_6d(x: Tensor, eps: float = 1e-5) -> Tensor:
         raise ValueError(
             f"rotation_from_6d: x must have shape [..., 6], got {list(x.shape)}"
         )
+
+    # The first column, or the x axis.
     a = x[..., :3]
     b = x[..., 3:]
     x_axis = torch.eye(3, dtype=x.dtype, device=x.device)[0].expand_as(a)
-    a = torch.where((a.square().sum(-1, keepdim=True) < eps**2), x_axis, a)
-    first = unit(a)
+    is_short = a.square().sum(-1, keepdim=True) < eps**2
+    first = unit(torch.where(is_short, x_axis, a))
 
+    # The second column's part orthogonal to the first, or an axis orthogonal to it.
     part = across(first, b)
     length2 = b.square().sum(-1, keepdim=True).clamp_min(1.0)
     unusable = part.square().sum(-1, keepdim=True) < eps**2 * length2
     second = unit(torch.where(unusable, orthogonal_to(first.detach()), part))
-    # again: after cancellation the first pass leaves a part along the first column
+    # Once more: after cancellation the first pass leaves a part along the first column.
     second = unit(across(first, second))
     return torch.stack([first, second, torch.linalg.cross(first, second)], dim=-1)
 
 
 def orthogonal_to(axis: Tensor) -> Tensor:
-    """``[..., 3]`` unit vectors orthogonal to unit vectors: the world axis least along each."""
-    least = axis.abs().argmin(dim=-1, keepdim=True)
-    return unit(across(axis, torch.zeros_like(axis).scatter(-1, least, 1.0)))
+    """``[..., 3]`` unit vectors orthogonal to unit vectors: the world axis farthest from each."""
+    # The axis with the smallest component, as a one-hot vector.
+    farthest = axis.abs().argmin(dim=-1, keepdim=True)
+    world_axis = torch.zeros_like(axis).scatter(-1, farthest, 1.0)
+    return unit(across(axis, world_axis))
 
 
 def across(axis: Tensor, v: Tensor) -> Tensor:

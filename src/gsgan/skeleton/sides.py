@@ -1,16 +1,16 @@
 """Detects skeletons whose left and right are swapped."""
 
+from itertools import compress
+
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-# Cosines: a pair's line against the other pairs', and all lines against the left by feet and head.
-APART = -0.3
-OPPOSED = -0.6
-PAIRS = {"hips": (23, 24), "shoulders": (11, 12), "ears": (7, 8), "eyes": (2, 5)}
-# knee, ankle, heel, toes
-NOSE = 0
-LEGS = ((25, 27, 29, 31), (26, 28, 30, 32))
+APART = -0.3  # maximum cosine of a swapped pair's line against the other pairs'
+OPPOSED = -0.6  # maximum cosine of swapped lines against the left by feet and head
+SIDE_PAIRS = {"hips": (23, 24), "shoulders": (11, 12), "ears": (7, 8), "eyes": (2, 5)}
+NOSE_JOINT = 0
+LEG_JOINTS = ((25, 27, 29, 31), (26, 28, 30, 32))  # knee, ankle, heel, toes
 
 
 def refuse_swapped(p: Tensor, valid: Tensor) -> None:
@@ -37,37 +37,36 @@ def refuse_swapped(p: Tensor, valid: Tensor) -> None:
 
     # The left, as it follows from each foot: shank and foot span the sagittal plane.
     by_feet = torch.zeros_like(p[:, 0])
-    for knee, ankle, heel, toes in LEGS:
-        left = torch.linalg.cross(p[:, knee] - p[:, ankle], p[:, toes] - p[:, heel])
+    for knee, ankle, heel, toes in LEG_JOINTS:
+        shank = p[:, knee] - p[:, ankle]
+        left = torch.linalg.cross(shank, p[:, toes] - p[:, heel])
         by_feet = by_feet + seen(left, (knee, ankle, heel, toes))
 
     # The left, as it follows from the head: the eyes are above the nose, the ears behind it.
-    ears = p[:, PAIRS["ears"]].mean(1)
-    eyes = p[:, PAIRS["eyes"]].mean(1)
-    by_head = torch.linalg.cross(eyes - p[:, NOSE], p[:, NOSE] - ears)
-    by_head = seen(by_head, (NOSE, *PAIRS["ears"], *PAIRS["eyes"]))
+    ears = p[:, SIDE_PAIRS["ears"]].mean(1)
+    eyes = p[:, SIDE_PAIRS["eyes"]].mean(1)
+    by_head = torch.linalg.cross(eyes - p[:, NOSE_JOINT], p[:, NOSE_JOINT] - ears)
+    by_head = seen(by_head, (NOSE_JOINT, *SIDE_PAIRS["ears"], *SIDE_PAIRS["eyes"]))
 
     # The lines from right to left that the names of the landmarks state.
-    lines = torch.stack(
-        [seen(p[:, a] - p[:, b], (a, b)) for a, b in PAIRS.values()], dim=1
-    )
-    lines = normalize(lines, dim=-1)
+    named = [seen(p[:, a] - p[:, b], (a, b)) for a, b in SIDE_PAIRS.values()]
+    lines = normalize(torch.stack(named, dim=1), dim=-1)
 
     # A line that opposes the sum of the others stands apart.
     others = normalize(lines.sum(1, keepdim=True) - lines, dim=-1)
     apart = (lines * others).sum(-1) < APART
 
     # The remaining lines together may oppose feet and head.
-    whole = normalize((lines * ~apart.unsqueeze(-1)).sum(1), dim=-1)
+    remaining = lines * ~apart.unsqueeze(-1)
+    whole = normalize(remaining.sum(1), dim=-1)
     left = normalize(by_feet, dim=-1) + normalize(by_head, dim=-1)
     opposed = (whole * left).sum(-1, keepdim=True) < OPPOSED
 
     # A pair is swapped if it is so in most of the frames that show it.
     shown = (lines != 0).any(-1)
-    wrong = ((apart ^ opposed) & shown).sum(0) > 0.5 * shown.sum(0)
-    swapped = [
-        name for name, is_wrong in zip(PAIRS, wrong.tolist(), strict=True) if is_wrong
-    ]
+    contrary = (apart ^ opposed) & shown
+    wrong = contrary.sum(0) > 0.5 * shown.sum(0)
+    swapped = list(compress(SIDE_PAIRS, wrong.tolist()))
     if swapped:
         raise ValueError(
             f"left and right are swapped: by the direction of nose and toes, the left of "

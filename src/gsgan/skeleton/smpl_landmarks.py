@@ -1,6 +1,6 @@
-"""MediaPipe's 33 pose landmarks from the joints, and where given the vertices, of SMPL or SMPL-X.
+"""MediaPipe's 33 pose landmarks from the joints, and if given the vertices, of SMPL or SMPL-X.
 
-Convention: metres, any frame; landmarks that the body model lacks are NaN with confidence 0.
+Units are metres in any frame; landmarks that the body model lacks are NaN with confidence 0.
 Confidence 1: the same point in both; 0.5: a point nearby.
 
 Source: vertex numbers as in public loaders.
@@ -16,8 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from gsgan.skeleton.template import MEDIAPIPE33
 
-SAME = 1.0
-NEAR = 0.5
+# Confidences.
+SAME_POINT = 1.0
+NEARBY = 0.5
 Floats = NDArray[np.float64]
 
 
@@ -36,34 +37,38 @@ def _sides(
     names: dict[str, tuple[int, int]], confidence: float
 ) -> dict[str, tuple[int, float]]:
     """Left and right landmark from one name: ``{"hip": (1, 2)}``."""
-    return {
-        f"{side}_{name}": (number, confidence)
-        for name, pair in names.items()
-        for side, number in zip(("left", "right"), pair, strict=True)
-    }
+    sided = {}
+    for name, (left, right) in names.items():
+        sided[f"left_{name}"] = (left, confidence)
+        sided[f"right_{name}"] = (right, confidence)
+    return sided
 
 
 def _eyes(left: int, right: int) -> dict[str, tuple[int, float]]:
     """The eye, and its two corners as copies of it."""
     corners = {"eye_inner": (left, right), "eye_outer": (left, right)}
-    return _sides({"eye": (left, right)}, SAME) | _sides(corners, NEAR)
+    return _sides({"eye": (left, right)}, SAME_POINT) | _sides(corners, NEARBY)
 
 
+# SMPL's joints, left and right, which SMPL-X shares.
 _ARMS = {"shoulder": (16, 17), "elbow": (18, 19), "wrist": (20, 21)}
 _LEGS = {"hip": (1, 2), "knee": (4, 5), "ankle": (7, 8)}
-_LIMBS = _sides(_ARMS | _LEGS, SAME) | _sides({"foot_index": (10, 11)}, NEAR)
+_LIMB_JOINTS = _sides(_ARMS | _LEGS, SAME_POINT) | _sides(
+    {"foot_index": (10, 11)}, NEARBY
+)
 
 TABLES = {
+    # SMPL: joints of hands are near the index finger's base.
     "smpl": LandmarkTable(
         counts=(24, 6890),
-        joints=_LIMBS | _sides({"index": (22, 23)}, NEAR),
+        joints=_LIMB_JOINTS | _sides({"index": (22, 23)}, NEARBY),
         vertices={
-            "nose": (332, SAME),
+            "nose": (332, SAME_POINT),
             **_eyes(2800, 6260),
-            **_sides({"ear": (583, 4071), "heel": (3387, 6787)}, SAME),
-            **_sides({"foot_index": (3216, 6617)}, SAME),
+            **_sides({"ear": (583, 4071), "heel": (3387, 6787)}, SAME_POINT),
+            **_sides({"foot_index": (3216, 6617)}, SAME_POINT),
         },
-        # MediaPipe's three hand points are knuckles: about halfway to the finger tip
+        # MediaPipe's three points of a hand are knuckles, about half-way to the finger tips.
         midpoints={
             "left_index": (20, 2319),
             "left_pinky": (20, 2673),
@@ -73,17 +78,18 @@ TABLES = {
             "right_thumb": (21, 6191),
         },
     ),
+    # SMPL-X has finger joints and eyes.
     "smplx": LandmarkTable(
         counts=(55, 10475),
-        joints=_LIMBS
-        | _sides({"index": (25, 40), "pinky": (31, 46), "thumb": (38, 53)}, SAME)
-        | {name: (number, NEAR) for name, (number, _) in _eyes(23, 24).items()},
+        joints=_LIMB_JOINTS
+        | _sides({"index": (25, 40), "pinky": (31, 46), "thumb": (38, 53)}, SAME_POINT)
+        | {name: (number, NEARBY) for name, (number, _) in _eyes(23, 24).items()},
         vertices={
-            "nose": (9120, SAME),
+            "nose": (9120, SAME_POINT),
             **_eyes(9448, 9929),
             **_sides(
                 {"ear": (6, 616), "heel": (8846, 8635), "foot_index": (5770, 8463)},
-                SAME,
+                SAME_POINT,
             ),
         },
         midpoints={},
@@ -125,6 +131,7 @@ def to_mediapipe33(
         p[..., landmark, :] = position
         conf[..., landmark] = confidence
 
+    # Vertices are nearer to the landmarks than joints and replace them.
     for name, (joint, confidence) in table.joints.items():
         put(name, j[..., joint, :], confidence)
     if vertices is not None:
@@ -132,7 +139,9 @@ def to_mediapipe33(
         for name, (vertex, confidence) in table.vertices.items():
             put(name, v[..., vertex, :], confidence)
         for name, (joint, vertex) in table.midpoints.items():
-            put(name, (j[..., joint, :] + v[..., vertex, :]) / 2, NEAR)
+            put(name, (j[..., joint, :] + v[..., vertex, :]) / 2, NEARBY)
+
+    # A landmark with a coordinate that is not finite is unknown.
     known = np.isfinite(p).all(axis=-1)
     p[~known] = np.nan
     return p, np.where(known, conf, 0.0)

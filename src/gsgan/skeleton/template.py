@@ -1,7 +1,7 @@
 """Skeleton definitions: joint names, bones, rest shape. Constants only, no tensors.
 
-Convention: body axes are x = the subject's left, y = up, z = out of the chest (right-handed),
-metres. Left and right are the person's.
+Body axes are x = the subject's left, y = up, z = out of the chest (right-handed), in metres. Left
+and right are the person's.
 """
 
 from __future__ import annotations
@@ -42,6 +42,7 @@ class SkeletonTemplate:
     rest_directions: tuple[Vector, ...]
     rest_positions: tuple[Vector, ...]  # J points of an A-pose on the ground y = 0
     stature: float  # metres, sole to crown of the rest pose
+    # pairs of joints, left and right
     shoulders: Edge
     hips: Edge
     ears: Edge
@@ -83,18 +84,24 @@ class SkeletonTemplate:
 
     @property
     def levels(self) -> tuple[tuple[int, ...], ...]:
-        """Limbs by depth: every limb's parent frame is a hub or in an earlier level, where a palm's
-        are the limbs that end at its knuckles."""
+        """Limbs by depth: every limb's parent frame is a hub or in an earlier level.
+
+        A palm is as deep as the limbs that end at its knuckles.
+        """
         depth: dict[int, int] = {}
         for limb, parent in enumerate(self.limb_parents):
-            before = parent - self.n_hubs
-            if N_HUBS <= parent < self.n_hubs:
-                before = self.incoming[self.palms[parent - N_HUBS][1]]
-            depth[limb] = 0 if parent < N_HUBS else depth[before] + 1
-        return tuple(
-            tuple(limb for limb in depth if depth[limb] == level)
-            for level in range(max(depth.values()) + 1)
-        )
+            if parent < N_HUBS:
+                depth[limb] = 0
+            elif parent < self.n_hubs:
+                _, knuckle, _ = self.palms[parent - N_HUBS]
+                depth[limb] = depth[self.incoming[knuckle]] + 1
+            else:
+                depth[limb] = depth[parent - self.n_hubs] + 1
+
+        levels: list[list[int]] = [[] for _ in range(max(depth.values()) + 1)]
+        for limb, level in depth.items():
+            levels[level].append(limb)
+        return tuple(map(tuple, levels))
 
     @property
     def incoming(self) -> dict[int, int]:
@@ -109,28 +116,29 @@ class SkeletonTemplate:
     def limb_length_sum(self) -> float:
         """Metres: the sum of limb lengths of the rest pose, the counterpart of ``h_body``."""
         rest = np.asarray(self.rest_positions)
-        limbs = [self.limbs[i] for i in self.measured]
-        return float(sum(np.linalg.norm(rest[j] - rest[i]) for i, j in limbs))
+        # The same limbs as in `limb_length_sum` of a skeleton.
+        total = 0.0
+        for limb in self.measured:
+            start, end = self.limbs[limb]
+            total += float(np.linalg.norm(rest[end] - rest[start]))
+        return total
 
     @property
     def rest_torso(self) -> Vector:
         """Metres: edges (left-right, up, front) of the trunk's box in the rest pose."""
+        # As wide as shoulders or hips, as high as the spine, half as deep as wide.
         l_sh, r_sh, l_hip, r_hip = np.asarray(self.rest_positions)[list(self.torso)]
         width = float(max(np.linalg.norm(l_sh - r_sh), np.linalg.norm(l_hip - r_hip)))
-        return (
-            width,
-            float(np.linalg.norm((l_sh + r_sh - l_hip - r_hip) / 2)),
-            width / 2,
-        )
+        height = float(np.linalg.norm((l_sh + r_sh - l_hip - r_hip) / 2))
+        return width, height, width / 2
 
     def with_face(self, at_rest: Sequence[Vector]) -> SkeletonTemplate:
         """A copy with another person's face at rest, as `gsgan.skeleton.in_head` gives it."""
         rest = np.asarray(self.rest_positions)
         moved = np.asarray(at_rest) + rest[list(self.head)].mean(0)
         kept = self.rest_positions[: -len(self.expression)]
-        return replace(
-            self, rest_positions=(*kept, *((x, y, z) for x, y, z in moved.tolist()))
-        )
+        face = [(x, y, z) for x, y, z in moved.tolist()]
+        return replace(self, rest_positions=(*kept, *face))
 
 
 def _unit(x: float, y: float, z: float) -> Vector:
@@ -144,33 +152,46 @@ def _mirrored(v: Vector) -> Vector:
 
 def _across(axis: Vector, direction: Vector) -> Vector:
     """The part of ``axis`` orthogonal to the unit ``direction``, normalised."""
+    # The part along the direction is subtracted.
     along = sum(a * d for a, d in zip(axis, direction, strict=True))
     return _unit(*(a - along * d for a, d in zip(axis, direction, strict=True)))
 
 
-_NAMES = (
+# MediaPipe's 33 joints, and the edges and limbs between them.
+_POSE_NAMES = (
     "nose",
-    *("left_eye_inner", "left_eye", "left_eye_outer"),
-    *("right_eye_inner", "right_eye", "right_eye_outer"),
-    *("left_ear", "right_ear", "mouth_left", "mouth_right"),
-    *(
-        "left_shoulder",
-        "right_shoulder",
-        "left_elbow",
-        "right_elbow",
-        "left_wrist",
-        "right_wrist",
-    ),
-    *(
-        "left_pinky",
-        "right_pinky",
-        "left_index",
-        "right_index",
-        "left_thumb",
-        "right_thumb",
-    ),
-    *("left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle"),
-    *("left_heel", "right_heel", "left_foot_index", "right_foot_index"),
+    "left_eye_inner",
+    "left_eye",
+    "left_eye_outer",
+    "right_eye_inner",
+    "right_eye",
+    "right_eye_outer",
+    "left_ear",
+    "right_ear",
+    "mouth_left",
+    "mouth_right",
+    "left_shoulder",
+    "right_shoulder",
+    "left_elbow",
+    "right_elbow",
+    "left_wrist",
+    "right_wrist",
+    "left_pinky",
+    "right_pinky",
+    "left_index",
+    "right_index",
+    "left_thumb",
+    "right_thumb",
+    "left_hip",
+    "right_hip",
+    "left_knee",
+    "right_knee",
+    "left_ankle",
+    "right_ankle",
+    "left_heel",
+    "right_heel",
+    "left_foot_index",
+    "right_foot_index",
 )
 _FACE_EDGES = ((0, 1), (1, 2), (2, 3), (3, 7), (0, 4), (4, 5), (5, 6), (6, 8), (9, 10))
 _TORSO_EDGES = ((11, 12), (11, 23), (12, 24), (23, 24))
@@ -182,7 +203,7 @@ _L_LEG = ((23, 25), (25, 27))
 _R_LEG = ((24, 26), (26, 28))
 _L_FOOT = ((27, 29), (27, 31), (29, 31))
 _R_FOOT = ((28, 30), (28, 32), (30, 32))
-_LIMBS = _L_ARM + _R_ARM + _L_HAND + _R_HAND + _L_LEG + _R_LEG + _L_FOOT + _R_FOOT
+_POSE_LIMBS = _L_ARM + _R_ARM + _L_HAND + _R_HAND + _L_LEG + _R_LEG + _L_FOOT + _R_FOOT
 _EDGES = (
     *_FACE_EDGES[:8],
     (9, 10),
@@ -216,19 +237,25 @@ _LEFT_REST: dict[str, Vector] = {
 
 
 def _twin(name: str) -> str:
+    """The name on the other side."""
     if "left" in name:
         return name.replace("left", "right")
     return name.replace("right", "left")
 
 
 def _rest_positions() -> tuple[Vector, ...]:
-    return tuple(
-        _LEFT_REST[n] if n in _LEFT_REST else _mirrored(_LEFT_REST[_twin(n)])
-        for n in _NAMES
-    )
+    """Points of the A-pose, in the order of the names."""
+    positions = []
+    for name in _POSE_NAMES:
+        if name in _LEFT_REST:
+            positions.append(_LEFT_REST[name])
+        else:
+            positions.append(_mirrored(_LEFT_REST[_twin(name)]))
+    return tuple(positions)
 
 
 def _about_x(v: Vector, cos: float, sin: float) -> Vector:
+    """A vector turned about the x axis."""
     return (v[0], cos * v[1] - sin * v[2], sin * v[1] + cos * v[2])
 
 
@@ -241,27 +268,29 @@ def _rest_directions() -> dict[Edge, Vector]:
     """
     arm: Vector = _unit(0.6, -0.6, 0.5)
     leg: Vector = _unit(0.0, -0.8, 0.6)
-    rest = dict(zip(_NAMES, _rest_positions(), strict=True))
+    rest = dict(zip(_POSE_NAMES, _rest_positions(), strict=True))
 
     def neutral(a: str, b: str) -> Vector:
         offset = [y - x for x, y in zip(rest[a], rest[b], strict=True)]
-        # the swing from straight down to the shin's rest direction
+        # The swing from straight down to the shin's rest direction.
         return _about_x(_unit(*offset), cos=-leg[1], sin=-leg[2])
 
     left: dict[Edge, Vector] = dict.fromkeys((*_L_ARM, *_L_HAND[:3]), arm)
-    # thumb side forward, halfway through pronation
+    # The thumb's side is in front, half-way through pronation.
     left[(17, 19)] = _across((0.0, 0.0, 1.0), arm)
     left |= dict.fromkeys(_L_LEG, leg)
     left[(27, 29)] = neutral("left_ankle", "left_heel")
     left[(27, 31)] = neutral("left_ankle", "left_foot_index")
     left[(29, 31)] = neutral("left_heel", "left_foot_index")
+
+    # Each right joint follows its left one.
     right = {(a + 1, b + 1): _mirrored(v) for (a, b), v in left.items()}
     return left | right
 
 
 def _mediapipe33() -> SkeletonTemplate:
     directions = _rest_directions()
-    index = {limb: i for i, limb in enumerate(_LIMBS)}
+    ends = [b for _, b in _POSE_LIMBS]
 
     def parent(limb: Edge) -> int:
         a = limb[0]
@@ -269,16 +298,21 @@ def _mediapipe33() -> SkeletonTemplate:
             return CHEST
         if a in (23, 24):
             return PELVIS
-        # parents of fingers and of the foot's three bones are the forearm and the shin
+        # Parents of fingers and of the foot's three bones are the forearm and the shin.
         base = {17: 15, 18: 16, 29: 27, 30: 28}.get(a, a)
-        return N_HUBS + next(i for (_, b), i in index.items() if b == base)
+        return N_HUBS + ends.index(base)
+
+    mirror = []
+    for name in _POSE_NAMES:
+        twin = _twin(name)
+        mirror.append(_POSE_NAMES.index(twin) if twin in _POSE_NAMES else 0)
 
     return SkeletonTemplate(
-        names=_NAMES,
+        names=_POSE_NAMES,
         edges=_EDGES,
-        limbs=_LIMBS,
-        limb_parents=tuple(parent(limb) for limb in _LIMBS),
-        rest_directions=tuple(directions[limb] for limb in _LIMBS),
+        limbs=_POSE_LIMBS,
+        limb_parents=tuple(parent(limb) for limb in _POSE_LIMBS),
+        rest_directions=tuple(directions[limb] for limb in _POSE_LIMBS),
         rest_positions=_rest_positions(),
         stature=1.7,
         shoulders=(11, 12),
@@ -287,9 +321,7 @@ def _mediapipe33() -> SkeletonTemplate:
         eyes=(2, 5),
         nose=0,
         face=tuple(range(11)),
-        mirror=tuple(
-            _NAMES.index(_twin(n)) if _twin(n) in _NAMES else 0 for n in _NAMES
-        ),
+        mirror=tuple(mirror),
         draw_groups=(
             ("head", (*_FACE_EDGES, (7, 8))),
             ("torso", _TORSO_EDGES),
@@ -300,7 +332,7 @@ def _mediapipe33() -> SkeletonTemplate:
             ("left_leg", _L_LEG + _L_FOOT),
             ("right_leg", _R_LEG + _R_FOOT),
         ),
-        # without these edges face, mouth and body are three separate components
+        # Without these edges, face, mouth and body are three separate components.
         gnn_edges=(*_EDGES, (0, 9), (0, 10), (0, 11), (0, 12)),
     )
 

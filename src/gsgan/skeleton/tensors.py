@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from itertools import chain
 from typing import NamedTuple
 
 import torch
@@ -19,15 +20,15 @@ class Swing(NamedTuple):
     """The shortest rotations from fixed unit directions ``rest [M, 3]`` to any other."""
 
     rest: Tensor
-    straight: Tensor
-    folded: Tensor
+    straight: Tensor  # [M, 3, 3] first half turn of usual swings
+    folded: Tensor  # [M, 3, 3] first two half turns of nearly opposite directions
 
     @classmethod
     def of(cls, rest: Tensor) -> Swing:
-        half_turn_rest = _half_turn(rest)
-        return cls(
-            rest, half_turn_rest, half_turn_rest @ _half_turn(orthogonal_to(rest))
-        )
+        """The swings from these directions."""
+        straight = _half_turn(rest)
+        folded = straight @ _half_turn(orthogonal_to(rest))
+        return cls(rest, straight, folded)
 
     def to(self, d: Tensor) -> Tensor:
         """``[B, M, 3, 3]`` rotations from ``rest`` to the directions ``d [B, M, 3]``.
@@ -35,7 +36,7 @@ class Swing(NamedTuple):
         A d shorter than 1 gives a part of the rotation, a zero d none.
 
         The swing is composed of two half turns, about ``rest`` and about the bisector of ``rest``
-        and ``d``, without a division by ``1 + cos``. Where ``1 + cos < FOLDED`` the bisector is
+        and ``d``, without a division by ``1 + cos``. If ``1 + cos < FOLDED``, the bisector is
         undefined and a third half turn, about a fixed axis orthogonal to ``rest``, goes first: the
         result still maps ``rest`` exactly to ``d``, with an arbitrary but fixed roll.
         """
@@ -64,19 +65,19 @@ class Level(NamedTuple):
 class Constants(NamedTuple):
     """A template as tensors."""
 
-    rest: Tensor  # [J, 3]
-    starts: Tensor  # [L]
-    ends: Tensor  # [L]
-    levels: tuple[Level, ...]
+    rest: Tensor  # [J, 3] metres
+    starts: Tensor  # [L] joints where limbs start
+    ends: Tensor  # [L] joints where limbs end
+    levels: tuple[Level, ...]  # limbs by depth
     limb_order: Tensor  # [L] undoes the sorting by level
-    head_from_eyes: Tensor  # [3, 3]
+    head_from_eyes: Tensor  # [3, 3] the head's axes in those of eyes and nose
     head_points: Tensor  # [5] left ear, right ear, left eye, right eye, nose
-    torso: Tensor  # [4]
+    torso: Tensor  # [4] left and right shoulder, left and right hip
     palms: Tensor  # [3 H] wrist, index's and little finger's knuckle of each hand
     measured: Tensor  # limbs that measure the subject's size
     fingers: Tensor  # limbs that are bones of hands
     face_turned: Tensor  # [F] face joints but the nose
-    face_swing: Swing
+    face_swing: Swing  # of their lines from the middle of the ears
     expression: Tensor  # [E] landmarks of a face
     face_rest: Tensor  # [E, 3] metres, from the middle of the head's points
     omega_order: Tensor  # [J - E] into pelvis, chest, head, face, limbs
@@ -88,7 +89,7 @@ def constants(
     template: SkeletonTemplate, device: torch.device, dtype: torch.dtype
 ) -> Constants:
     """The template's tensors on a device, cached."""
-    # tensors created in inference mode cannot be used for training later
+    # Tensors created in inference mode cannot be used for training later.
     with torch.inference_mode(False), torch.no_grad():
         return _constants(template, device, dtype)
 
@@ -110,50 +111,53 @@ def _constants(
     directions = torch.tensor(t.rest_directions, dtype=torch.float64)
 
     # Limbs by level, each with the position of its parent's frame.
-    ordered = [limb for level in t.levels for limb in level]
-    position = {hub: hub for hub in range(t.n_hubs)}
-    position |= {t.n_hubs + limb: t.n_hubs + k for k, limb in enumerate(ordered)}
-    levels = tuple(
-        Level(
-            limbs=index(limbs),
-            parents=index([position[t.limb_parents[limb]] for limb in limbs]),
-            swing=swing(directions[list(limbs)]),
+    ordered = list(chain.from_iterable(t.levels))
+    starts, ends = zip(*t.limbs, strict=True)
+    position = dict(enumerate(range(t.n_hubs)))
+    for k, limb in enumerate(ordered):
+        position[t.n_hubs + limb] = t.n_hubs + k
+    levels = []
+    for limbs in t.levels:
+        parents = [position[t.limb_parents[limb]] for limb in limbs]
+        levels.append(
+            Level(
+                limbs=index(limbs),
+                parents=index(parents),
+                swing=swing(directions[list(limbs)]),
+            )
         )
-        for limbs in t.levels
-    )
 
     # The face's joints but the nose turn with their line from the middle of the ears.
     turned = [j for j in t.face if j != t.nose]
     from_ears = rest[turned] - rest[list(t.ears)].mean(0)
 
     # Where omega finds each joint's rotation: among pelvis, chest, head, face and limbs.
-    place = (
-        dict.fromkeys(t.hips, PELVIS)
-        | dict.fromkeys(t.shoulders, CHEST)
-        | {t.nose: HEAD}
-    )
-    place |= {joint: N_HUBS + k for k, joint in enumerate(turned)}
-    place |= {joint: N_HUBS + len(turned) + limb for joint, limb in t.incoming.items()}
+    place = dict.fromkeys(t.hips, PELVIS)
+    place |= dict.fromkeys(t.shoulders, CHEST)
+    place[t.nose] = HEAD
+    for k, joint in enumerate(turned):
+        place[joint] = N_HUBS + k
+    for joint, limb in t.incoming.items():
+        place[joint] = N_HUBS + len(turned) + limb
+    posed = [joint for joint in range(len(t.names)) if joint not in t.expression]
 
     return Constants(
         rest=cast(rest),
-        starts=index([a for a, _ in t.limbs]),
-        ends=index([b for _, b in t.limbs]),
-        levels=levels,
+        starts=index(starts),
+        ends=index(ends),
+        levels=tuple(levels),
         limb_order=index([ordered.index(limb) for limb in range(len(t.limbs))]),
         head_from_eyes=cast(_eye_frame(t, rest).mT.contiguous()),
         head_points=index(t.head),
         torso=index(t.torso),
-        palms=index([joint for palm in t.palms for joint in palm]),
+        palms=index(list(chain.from_iterable(t.palms))),
         measured=index(t.measured),
         fingers=index(t.fingers),
         face_turned=index(turned),
         face_swing=swing(from_ears / from_ears.norm(dim=-1, keepdim=True)),
         expression=index(t.expression),
         face_rest=cast(rest[list(t.expression)] - rest[list(t.head)].mean(0)),
-        omega_order=index(
-            [place[j] for j in range(len(t.names)) if j not in t.expression]
-        ),
+        omega_order=index([place[joint] for joint in posed]),
         axes=cast(torch.eye(3, dtype=torch.float64)),
     )
 
@@ -161,11 +165,11 @@ def _constants(
 def _eye_frame(t: SkeletonTemplate, rest: Tensor) -> Tensor:
     """``[3, 3]``: the frame of eyes and nose at rest, whose head frame is the identity."""
     left, right = t.eyes
+    middle = (rest[left] + rest[right]) / 2
     across_eyes = unit(rest[left] - rest[right])
-    front = unit(across(across_eyes, rest[t.nose] - (rest[left] + rest[right]) / 2))
-    return torch.stack(
-        [across_eyes, torch.linalg.cross(front, across_eyes), front], dim=-1
-    )
+    front = unit(across(across_eyes, rest[t.nose] - middle))
+    up = torch.linalg.cross(front, across_eyes)
+    return torch.stack([across_eyes, up, front], dim=-1)
 
 
 def check_skeleton(

@@ -1,20 +1,31 @@
 """Steps that follow the choreography: feet stand still, or swing to where they will be needed.
 
-Convention: that of :mod:`gsgan.synthetic.controls`.
+Units and axes are those of :mod:`gsgan.synthetic.controls`.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from gsgan.synthetic.controls import STANCE, Array, Programme, controls_at, smoothstep
 
-# seconds: from step to step of a foot, its two parts
-PERIOD = 1.0
-SWING = 0.42
-STAND = 0.58
-# metres and radians: a standing foot this near to its goal stays
-SHORTEST = (0.03, 0.12)
+PERIOD = 1.0  # seconds from step to step of a foot
+SWING = 0.42  # seconds of a step
+STAND = 0.58  # seconds from a step to the next
+# A standing foot that is this near to its goal stays.
+MIN_STEP = 0.03  # metres
+MIN_TURN = 0.12  # radians
+
+
+class FootState(NamedTuple):
+    """A foot at F moments."""
+
+    place: Array  # [F, 3] x, y, heading
+    height: Array  # [F] metres
+    pitch: Array  # [F] radians, positive lifts the heel
+    toes: Array  # [F] minimum share of the pitch that the toes take
+    load: Array  # [F] 1 while the foot swings and the other one carries the body
 
 
 class Footsteps:
@@ -32,39 +43,45 @@ class Footsteps:
         for foot in range(2):
             start = turns + foot * PERIOD / 2
             goals, march = _standing(start + SWING + STAND / 2, seed, foot, programme)
-            place = np.array([(1 - 2 * foot) * STANCE, 0, 0])
+
+            # The foot steps from place to place.
+            place = _first_place(foot)
             shift = []
             height = []
-            for goal, least in zip(goals, march, strict=True):
+            for goal, minimum in zip(goals, march, strict=True):
                 move = goal - place
-                far = np.linalg.norm(move[:2])
-                steps = least > 0.03 or far > SHORTEST[0] or abs(move[2]) > SHORTEST[1]
+                distance = np.linalg.norm(move[:2])
+                far = distance > MIN_STEP or abs(move[2]) > MIN_TURN
+                steps = minimum > 0.03 or far
                 shift.append(move * steps)
-                height.append(max(least, 0.03 + 0.15 * far) * steps)
+                height.append(max(minimum, 0.03 + 0.15 * distance) * steps)
                 place = place + shift[-1]
             self.start.append(start)
             self.shift.append(np.array(shift))
             self.height.append(np.array(height))
 
-    def at(self, times: Array, foot: int) -> tuple[Array, Array, Array, Array]:
-        """Where a foot is at times ``[F]``: place ``[F, 3]``, and ``[F]`` height, pitch and load.
-
-        The place is x, y, heading; pitch is in radians, positive lifts the heel; load is 1 while
-        the foot swings and the other one carries the body.
-        """
+    def at(self, times: Array, foot: int) -> FootState:
+        """The state of a foot at times ``[F]``: the sum of its steps until then."""
         t = times[:, None] - self.start[foot]
-        stride = np.linalg.norm(self.shift[foot][:, :2], axis=1)
-        place = (
-            np.array([(1 - 2 * foot) * STANCE, 0, 0])
-            + smoothstep(t / SWING) @ self.shift[foot]
+        shift = self.shift[foot]
+        height = self.height[foot]
+        stride = np.linalg.norm(shift[:, :2], axis=1)
+        return FootState(
+            place=_first_place(foot) + smoothstep(t / SWING) @ shift,
+            height=_bump(t / SWING) @ height,
+            pitch=_bump((t + 0.12) / 0.45) @ np.minimum(1.6 * stride, 0.45),
+            toes=np.zeros(len(times)),
+            load=_bump((t + 0.15) / (SWING + 0.3)) @ (height > 0),
         )
-        height = _bump(t / SWING) @ self.height[foot]
-        pitch = _bump((t + 0.12) / 0.45) @ np.minimum(1.6 * stride, 0.45)
-        load = _bump((t + 0.15) / (SWING + 0.3)) @ (self.height[foot] > 0)
-        return place, height, pitch, load
+
+
+def _first_place(foot: int) -> Array:
+    """Where a foot stands before its first step: x, y, heading."""
+    return np.array([(1 - 2 * foot) * STANCE, 0, 0])
 
 
 def _bump(u: Array) -> Array:
+    """0 until 0, 1 at 0.5, 0 from 1."""
     return np.sin(math.pi * u.clip(0, 1)) ** 2
 
 
@@ -72,13 +89,18 @@ def _standing(
     times: Array, seed: int, foot: int, programme: Programme
 ) -> tuple[Array, Array]:
     """Where a foot should stand ``[F, 3]`` (x, y, heading), and the march's height ``[F]``."""
+    # After the end, the person stays.
     times = times.clip(max=programme.duration - 1e-6)
     c = controls_at(times, seed, programme)
+
+    # The foot beside the body's path, turned by the heading.
     sign = 1 - 2 * foot
     heading = c.path[:, 2]
     x = sign * (STANCE + c.foot[:, foot, 0])
     y = c.foot[:, foot, 1]
     cosine = np.cos(heading)
     sine = np.sin(heading)
-    turned = np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=1)
-    return np.column_stack([c.path[:, :2] + turned, heading]), c.march
+    across = cosine * x - sine * y
+    along = sine * x + cosine * y
+    place = [c.path[:, 0] + across, c.path[:, 1] + along, heading]
+    return np.column_stack(place), c.march

@@ -16,41 +16,49 @@ from gsgan.motion.rotations import axis_angle
 from gsgan.scene import BodyPose
 
 # Mixamo's names of the free body's joints; other joints keep their names and follow their parents.
-TRUNK = {"root": "Hips", "spine05": "Spine", "spine03": "Spine1", "spine01": "Spine2"}
-TRUNK |= {"neck01": "Neck", "head": "Head"}
-LIMBS = {
+TRUNK_BONES = {
+    "root": "Hips",
+    "spine05": "Spine",
+    "spine03": "Spine1",
+    "spine01": "Spine2",
+    "neck01": "Neck",
+    "head": "Head",
+}
+SIDED_BONES = {
     "clavicle": "Shoulder",
     "upperarm01": "Arm",
     "lowerarm01": "ForeArm",
     "wrist": "Hand",
-}
-LIMBS |= {
     "upperleg01": "UpLeg",
     "lowerleg01": "Leg",
     "foot": "Foot",
     "toe1-1": "ToeBase",
 }
-# sRGB of skin, hair, eyes, shirt, trousers and shoes
+# sRGB colours of the surfaces.
 COLOURS = (
-    (214, 160, 128),
-    (70, 48, 34),
-    (235, 235, 230),
-    (52, 110, 168),
-    (64, 66, 88),
-    (150, 60, 48),
+    (214, 160, 128),  # skin
+    (70, 48, 34),  # hair
+    (235, 235, 230),  # eyes
+    (52, 110, 168),  # shirt
+    (64, 66, 88),  # trousers
+    (150, 60, 48),  # shoes
 )
 
 
 def mixamo_name(joint: str) -> str:
     """Mixamo's name of a joint of the free body."""
-    if joint in TRUNK:
-        return TRUNK[joint]
+    if joint in TRUNK_BONES:
+        return TRUNK_BONES[joint]
+
+    # Other names end with their side.
     part, _, letter = joint.partition(".")
     side = {"L": "Left", "R": "Right"}.get(letter, "")
-    if part in LIMBS:
-        return side + LIMBS[part]
-    if match := re.fullmatch(r"finger(\d)-(\d)", part):
-        return f"{side}Hand{FINGERS[int(match[1]) - 1]}{match[2]}"
+    if part in SIDED_BONES:
+        return side + SIDED_BONES[part]
+    match = re.fullmatch(r"finger(\d)-(\d)", part)
+    if match:
+        finger = FINGERS[int(match[1]) - 1]
+        return f"{side}Hand{finger}{match[2]}"
     return joint
 
 
@@ -60,9 +68,12 @@ def free_character() -> Character:
     faces = body.faces.numpy()
     vertices = body.vertices.double().numpy()
     none = np.zeros(0, dtype=np.int64)
-    colours = np.full((len(COLOURS), 1, 1, 4), 255, np.uint8)
-    colours[:, 0, 0, :3] = COLOURS
-    surfaces = zip(body.surface_names, colours, strict=True)
+
+    # Each surface is a texture of one opaque texel.
+    surfaces = []
+    for name, colour in zip(body.surface_names, COLOURS, strict=True):
+        texel = np.array([[[*colour, 255]]], np.uint8)
+        surfaces.append(Surface(name, texel))
     return Character(
         name="free_body",
         vertices=vertices,
@@ -72,7 +83,7 @@ def free_character() -> Character:
         material=body.face_surface.numpy(),
         labels=body.face_labels.numpy(),
         label_names=body.label_names,
-        surfaces=tuple(Surface(name, colour) for name, colour in surfaces),
+        surfaces=tuple(surfaces),
         bones=tuple(map(mixamo_name, body.joint_names)),
         parents=np.array(body.parents),
         joints=body.joints.double().numpy(),
@@ -88,12 +99,16 @@ def free_character() -> Character:
 def free_pose(motion: Animation) -> BodyPose:
     """The free body's pose in every frame of the animation of `free_character`."""
     body = free_body()
+
+    # The rotation of each bone relative to its parent; roots keep theirs.
     R = motion.rotations
     parents = np.array(body.parents)
-    local = np.where(
-        (parents < 0)[:, None, None], R, np.swapaxes(R[:, parents], -1, -2) @ R
-    )
+    relative = np.swapaxes(R[:, parents], -1, -2) @ R
+    is_root = (parents < 0)[:, None, None]
+    local = np.where(is_root, R, relative)
+
     transl = motion.joints[:, 0] - body.joints[0].double().numpy()
     return BodyPose(
-        torch.from_numpy(axis_angle(local)).float(), torch.from_numpy(transl).float()
+        theta=torch.from_numpy(axis_angle(local)).float(),
+        transl=torch.from_numpy(transl).float(),
     )

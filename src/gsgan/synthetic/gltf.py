@@ -1,21 +1,22 @@
 """Any rigged ``.glb`` as a `Character`: VALID, Ready Player Me, Mixamo, VRoid and their like."""
 
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
 from gsgan.body.skinned import vertex_normals
-from gsgan.motion.character import Character, Ints, Surface
+from gsgan.motion.character import Bytes, Character, Ints, Surface
 from gsgan.motion.rotations import Array
 from gsgan.synthetic.anchors import with_anchors
 from gsgan.synthetic.glb import Glb
 from gsgan.synthetic.humanoid import (
-    REQUIRED,
+    REQUIRED_BONES,
     WANTED,
     canonical_shapes,
     humanoid_bones,
@@ -25,12 +26,20 @@ from gsgan.synthetic.parts import LABEL_NAMES, face_labels
 from gsgan.synthetic.textures import linear, srgb
 from gsgan.utils.errors import DataError
 
-# glTF is y up
-Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+# glTF has y up, gsgan has z up.
+Z_UP = np.array(
+    [
+        [1.0, 0, 0, 0],
+        [0, 0, -1, 0],
+        [0, 1, 0, 0],
+        [0, 0, 0, 1],
+    ]
+)
 HEIGHTS = (1.2, 2.3)  # metres: heights that are taken as they are
-UNITS = (1.0, 0.01, 0.001, 0.0254)  # metres per unit of a file, likeliest first
-TRIANGLES = 4
-DAMAGED = (
+UNIT_LENGTHS = (1.0, 0.01, 0.001, 0.0254)  # metres per unit of a file, likeliest first
+TRIANGLES = 4  # glTF's number of this primitive mode
+# Errors of reading a damaged file.
+FILE_ERRORS = (
     ArithmeticError,
     AttributeError,
     AssertionError,
@@ -42,10 +51,8 @@ DAMAGED = (
     struct.error,
 )
 
-AVATARS = {
-    path.stem: path
-    for path in sorted(Path(__file__).with_name("avatars").glob("*.glb"))
-}
+AVATAR_FILES = sorted(Path(__file__).with_name("avatars").glob("*.glb"))
+AVATARS = {path.stem: path for path in AVATAR_FILES}
 """Files of the avatars that come with gsgan, by name."""
 
 
@@ -69,48 +76,57 @@ def read_character(path: Path) -> Character:
         raise DataError(f"{path}: no such file; expected a rigged character as .glb")
     try:
         glb = Glb(path)
-        return _character(glb, _Rig(glb))
-    except DAMAGED as error:
+        return _character(glb, _Skeleton(glb))
+    except FILE_ERRORS as error:
         reason = str(error).split("\n")[0] or type(error).__name__
         raise DataError(
             f"{path}: damaged ({reason}); export the character again"
         ) from error
 
 
-class _Rig:
+class _Skeleton:
     """The bones of a file: its joints and the nodes that humanoid bones are mapped to."""
 
     def __init__(self, glb: Glb) -> None:
-        nodes = glb.doc.nodes
+        self.nodes = glb.doc.nodes
+        self._worlds: dict[int, Array] = {}  # cache of `world`
         skins = glb.doc.skins
         if not skins:
             raise DataError(
                 f"{glb.path}: no skin; expected a rigged character, export its bones"
             )
-        self.nodes = nodes
-        self._worlds: dict[int, Array] = {}
-        self.above = {
-            child: i for i, node in enumerate(nodes) for child in node.children or ()
-        }
-        named = humanoid_bones([node.name for node in nodes], glb.doc.extensions or {})
-        used = {joint for skin in skins for joint in skin.joints} | named.keys()
-        # parents first
+
+        # The parent of each node.
+        self.above: dict[int, int] = {}
+        for i, node in enumerate(self.nodes):
+            for child in node.children or ():
+                self.above[child] = i
+
+        # Bones are the joints of all skins and the humanoid bones, parents first.
+        node_names = [node.name for node in self.nodes]
+        named = humanoid_bones(node_names, glb.doc.extensions or {})
+        used = set(named)
+        for skin in skins:
+            used.update(skin.joints)
         self.ids = sorted(used, key=lambda i: (len(self.ancestors(i)), i))
         self.number = {node: k for k, node in enumerate(self.ids)}
         self.bones = self._names(named)
-        missing = [bone for bone in REQUIRED if bone not in self.bones]
+
+        missing = [bone for bone in REQUIRED_BONES if bone not in self.bones]
         if missing:
+            more = ", …" if len(missing) > 6 else ""
             raise DataError(
                 f"{glb.path}: its {len(self.bones)} bones ({', '.join(self.bones[:6])}, …) do not "
-                f"include {', '.join(missing[:6])}{', …' * (len(missing) > 6)}; name them as "
-                "Mixamo or VRM does"
+                f"include {', '.join(missing[:6])}{more}; name them as Mixamo or VRM does"
             )
-        self.parents = np.array(
-            [self.bone_above(self.above.get(i, -1)) for i in self.ids]
-        )
+
+        # Parents and rest positions.
+        above = [self.above.get(i, -1) for i in self.ids]
+        self.parents = np.array([self.bone_above(node) for node in above])
         self.joints = np.array([self.world(i)[:3, 3] for i in self.ids])
 
     def ancestors(self, node: int) -> list[int]:
+        """Nodes above a node, from its parent to the root."""
         chain = []
         while node in self.above:
             node = self.above[node]
@@ -121,8 +137,10 @@ class _Rig:
 
     def bone_above(self, node: int) -> int:
         """The number of the bone that a node is or hangs on, -1 for none."""
-        chain = [node, *self.ancestors(node)]
-        return next((self.number[i] for i in chain if i in self.number), -1)
+        for i in [node, *self.ancestors(node)]:
+            if i in self.number:
+                return self.number[i]
+        return -1
 
     def world(self, node: int) -> Array:
         """``[4, 4]`` from a node's axes to world axes, z up."""
@@ -132,20 +150,27 @@ class _Rig:
         return self._worlds[node]
 
     def _names(self, named: dict[int, str]) -> tuple[str, ...]:
-        """Canonical names; other joints keep theirs, made unique."""
+        """Canonical names of humanoid bones; other joints keep theirs, made unique."""
         names: list[str] = []
         for i in self.ids:
-            name = named.get(i) or self.nodes[i].name or f"node{i}"
-            taken = i not in named and (name in names or name in named.values())
-            names.append(f"{name}.{i}" if taken else name)
+            if i in named:
+                names.append(named[i])
+                continue
+            name = self.nodes[i].name or f"node{i}"
+            if name in names or name in named.values():
+                name = f"{name}.{i}"
+            names.append(name)
         return tuple(names)
 
 
 def _local(node: Any) -> Array:
-    if node.matrix:
+    """``[4, 4]`` from a node's axes to those of its parent."""
+    if node.matrix:  # stored column by column
         return np.reshape(np.array(node.matrix, np.float64), (4, 4)).T
+
     matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_quat(node.rotation or [0, 0, 0, 1]).as_matrix()
+    rotation = Rotation.from_quat(node.rotation or [0, 0, 0, 1])
+    matrix[:3, :3] = rotation.as_matrix()
     matrix[:3, :3] *= np.array(node.scale or [1, 1, 1])
     matrix[:3, 3] = node.translation or 0
     return matrix
@@ -156,196 +181,304 @@ class _Part:
     """The triangles of one primitive, in world axes."""
 
     name: str  # of the node and its mesh
-    material: int
-    vertices: Array
-    normals: Array
-    uv: Array
-    faces: Ints
-    bone_index: Ints
-    bone_weight: Array
-    shapes: dict[str, Array]
+    material: int  # -1 for none
+    vertices: Array  # [V, 3]
+    normals: Array  # [V, 3], zero if the file has none
+    uv: Array  # [V, 2]
+    faces: Ints  # [F, 3]
+    bone_index: Ints  # [V, 4]
+    bone_weight: Array  # [V, 4], sums to 1
+    shapes: dict[str, Array]  # [V, 3] offsets by plain name
 
 
-def _parts(glb: Glb, rig: _Rig) -> list[_Part]:
+class _Binding(NamedTuple):
+    """How the vertices of one primitive follow the bones."""
+
+    bones: Ints  # [V, 4]
+    weights: Array  # [V, 4]
+    to_world: Array  # [V, 4, 4]
+
+
+def _parts(glb: Glb, skeleton: _Skeleton) -> list[_Part]:
     """All triangles that hang on bones; others are no part of the person."""
-    return [
-        _part(glb, rig, i, primitive)
-        for i, node in enumerate(rig.nodes)
-        if node.mesh is not None and (node.skin is not None or rig.bone_above(i) >= 0)
-        for primitive in glb.doc.meshes[node.mesh].primitives
-        if primitive.mode in (None, TRIANGLES)
-    ]
+    parts = []
+    for i, node in enumerate(skeleton.nodes):
+        on_bone = node.skin is not None or skeleton.bone_above(i) >= 0
+        if node.mesh is None or not on_bone:
+            continue
+        for primitive in glb.doc.meshes[node.mesh].primitives:
+            if primitive.mode in (None, TRIANGLES):
+                parts.append(_part(glb, skeleton, i, primitive))
+    return parts
 
 
-def _part(glb: Glb, rig: _Rig, number: int, primitive: Any) -> _Part:
-    node = rig.nodes[number]
+def _part(glb: Glb, skeleton: _Skeleton, number: int, primitive: Any) -> _Part:
+    node = skeleton.nodes[number]
     mesh = glb.doc.meshes[node.mesh]
     attributes = {k: v for k, v in vars(primitive.attributes).items() if v is not None}
+
+    # Positions and normals in world axes. Missing normals are made of the faces later.
     position = glb.accessor(attributes["POSITION"])
-    index, weight, matrix = _bound(glb, rig, number, attributes, len(position))
-    linear = matrix[:, :3, :3]
-    normals = np.zeros_like(position)  # of files without any: made of the faces later
+    binding = _bound(glb, skeleton, number, attributes, len(position))
+    linear = binding.to_world[:, :3, :3]
+    normals = np.zeros_like(position)
     if "NORMAL" in attributes:
         upright = np.linalg.inv(linear).transpose(0, 2, 1)
-        normals = np.einsum("vij,vj->vi", upright, glb.accessor(attributes["NORMAL"]))
-    shapes: dict[str, Array] = {}
-    names = (mesh.extras or primitive.extras or {}).get("targetNames", ())
-    for name, target in zip(
-        map(plain_shape, names), primitive.targets or (), strict=False
-    ):
-        entry = target if isinstance(target, dict) else vars(target)
-        if name in WANTED and entry.get("POSITION") is not None:
-            offsets = np.einsum("vij,vj->vi", linear, glb.accessor(entry["POSITION"]))
-            shapes[name] = shapes.get(name, 0) + offsets
+        normals = _transformed(upright, glb.accessor(attributes["NORMAL"]))
+
+    # Corners of the triangles; without indices, every three vertices are one.
     corners = np.arange(len(position))
     if primitive.indices is not None:
         corners = glb.accessor(primitive.indices)[:, 0].astype(np.int64)
     if len(corners) and corners.max() >= len(position):
         raise ValueError("a face names a vertex that is not there")
+
+    # Texture coordinates, of the set that the base colour uses.
     base = _base_texture(glb, primitive.material)
-    uv = attributes.get(f"TEXCOORD_{(base and base.texCoord) or 0}")
+    uv_set = (base and base.texCoord) or 0
+    uv = np.zeros((len(position), 2))
+    if f"TEXCOORD_{uv_set}" in attributes:
+        uv = glb.accessor(attributes[f"TEXCOORD_{uv_set}"])
+
+    # Exporters store the names of shapes with the mesh or with the primitive.
+    names = (mesh.extras or primitive.extras or {}).get("targetNames", ())
     return _Part(
         name=f"{node.name} {mesh.name}",
         material=-1 if primitive.material is None else primitive.material,
-        vertices=np.einsum("vij,vj->vi", linear, position) + matrix[:, :3, 3],
+        vertices=_transformed(linear, position) + binding.to_world[:, :3, 3],
         normals=normals,
-        uv=np.zeros((len(position), 2)) if uv is None else glb.accessor(uv),
+        uv=uv,
         faces=corners[: len(corners) // 3 * 3].reshape(-1, 3),
-        bone_index=index,
-        bone_weight=weight,
-        shapes=shapes,
+        bone_index=binding.bones,
+        bone_weight=binding.weights,
+        shapes=_shapes(glb, names, primitive.targets or (), linear),
     )
 
 
+def _transformed(matrices: np.ndarray, vectors: Array) -> Array:
+    """Vectors ``[V, 3]``, each multiplied by its own matrix ``[V, 3, 3]``."""
+    transformed: Array = np.einsum("vij,vj->vi", matrices, vectors)
+    return transformed
+
+
+def _shapes(
+    glb: Glb, names: Sequence[str], targets: Sequence[Any], linear: Array
+) -> dict[str, Array]:
+    """Offsets ``[V, 3]`` of the wanted shapes in world axes; shapes of one name are added."""
+    shapes: dict[str, Array] = {}
+    for name, target in zip(names, targets, strict=False):
+        plain = plain_shape(name)
+        entry = target if isinstance(target, dict) else vars(target)
+        position = entry.get("POSITION")
+        if plain in WANTED and position is not None:
+            offsets = _transformed(linear, glb.accessor(position))
+            shapes[plain] = shapes.get(plain, 0) + offsets
+    return shapes
+
+
 def _bound(
-    glb: Glb, rig: _Rig, number: int, attributes: dict[str, int], count: int
-) -> tuple[Ints, Array, Array]:
-    """Bones and weights ``[V, 4]``, and matrices ``[V, 4, 4]`` to world axes."""
-    node = rig.nodes[number]
+    glb: Glb,
+    skeleton: _Skeleton,
+    number: int,
+    attributes: dict[str, int],
+    count: int,
+) -> _Binding:
+    """How the ``count`` vertices of a primitive of a node follow the bones."""
+    # A mesh without a skin follows the bone that it hangs on.
+    node = skeleton.nodes[number]
     if node.skin is None:
-        index = np.full((count, 4), rig.bone_above(number))
-        weight = np.zeros((count, 4))
-        weight[:, 0] = 1
-        return index, weight, np.broadcast_to(rig.world(number), (count, 4, 4))
+        weights = np.zeros((count, 4))
+        weights[:, 0] = 1
+        to_world = skeleton.world(number)
+        return _Binding(
+            bones=np.full((count, 4), skeleton.bone_above(number)),
+            weights=weights,
+            to_world=np.broadcast_to(to_world, (count, 4, 4)),
+        )
+
+    # A skinned mesh is at the weighted mean of its joints' matrices.
     skin = glb.doc.skins[node.skin]
-    slots, weight = _four_largest(glb, attributes)
-    matrices = np.array([rig.world(joint) for joint in skin.joints])
+    slots, weights = _four_largest(glb, attributes)
+    matrices = np.array([skeleton.world(joint) for joint in skin.joints])
     if skin.inverseBindMatrices is not None:
-        bind = glb.accessor(skin.inverseBindMatrices).reshape(-1, 4, 4)[: len(matrices)]
-        matrices = matrices @ bind.transpose(0, 2, 1)
-    index = np.array([rig.number[joint] for joint in skin.joints])[slots]
-    return index, weight, np.einsum("vk,vkij->vij", weight, matrices[slots])
+        bind = glb.accessor(skin.inverseBindMatrices).reshape(-1, 4, 4)
+        matrices = matrices @ bind[: len(matrices)].transpose(0, 2, 1)
+    numbers = np.array([skeleton.number[joint] for joint in skin.joints])
+    return _Binding(
+        bones=numbers[slots],
+        weights=weights,
+        to_world=np.einsum("vk,vkij->vij", weights, matrices[slots]),
+    )
 
 
 def _four_largest(glb: Glb, attributes: dict[str, int]) -> tuple[Ints, Array]:
-    """The four largest weights of each vertex, summing to 1, and their joints in the skin."""
-    sets = [k for k in range(4) if f"JOINTS_{k}" in attributes]
-    slots = np.concatenate([glb.accessor(attributes[f"JOINTS_{k}"]) for k in sets], 1)
-    weight = np.concatenate([glb.accessor(attributes[f"WEIGHTS_{k}"]) for k in sets], 1)
-    order = np.argsort(-weight, 1, kind="stable")[:, :4]
-    weight = np.take_along_axis(weight, order, 1)
-    weight[weight.sum(1) <= 0] = [1, 0, 0, 0]
-    slots = np.take_along_axis(slots, order, 1).astype(np.int64)
-    return slots, weight / weight.sum(1, keepdims=True)
+    """Joints in the skin ``[V, 4]`` of the four largest weights, and these, summing to 1."""
+    # A file stores four joints and weights per vertex in each of its sets.
+    joint_sets = []
+    weight_sets = []
+    for k in range(4):
+        if f"JOINTS_{k}" in attributes:
+            joint_sets.append(glb.accessor(attributes[f"JOINTS_{k}"]))
+            weight_sets.append(glb.accessor(attributes[f"WEIGHTS_{k}"]))
+    slots = np.concatenate(joint_sets, axis=1)
+    weight = np.concatenate(weight_sets, axis=1)
+
+    # A vertex without a weight follows the first joint.
+    order = np.argsort(-weight, axis=1, kind="stable")[:, :4]
+    weight = np.take_along_axis(weight, order, axis=1)
+    weight[weight.sum(axis=1) <= 0] = [1, 0, 0, 0]
+    slots = np.take_along_axis(slots, order, axis=1)
+    return slots.astype(np.int64), weight / weight.sum(axis=1, keepdims=True)
 
 
 def _base_texture(glb: Glb, material: int | None) -> Any:
     """The base colour's texture info, None without a texture."""
-    shader = (
-        None if material is None else glb.doc.materials[material].pbrMetallicRoughness
-    )
+    if material is None:
+        return None
+    shader = glb.doc.materials[material].pbrMetallicRoughness
     return shader and shader.baseColorTexture
 
 
 def _surface(glb: Glb, material: int) -> Surface:
+    """Colours, normals and cut-off of a material; -1 is white."""
+    white = np.full((1, 1, 4), 255, np.uint8)
     if material < 0:
-        return Surface("", np.full((1, 1, 4), 255, np.uint8))
+        return Surface("", white)
     entry = glb.doc.materials[material]
+
+    # The base colour is a texture times a factor.
     base = _base_texture(glb, material)
     shader = entry.pbrMetallicRoughness
+    colour = glb.image(base.index) if base else white
     factor = np.array((shader and shader.baseColorFactor) or (1, 1, 1, 1), np.float64)
-    colour = glb.image(base.index) if base else np.full((1, 1, 4), 255, np.uint8)
-    if (factor != 1).any():  # the factor scales linear light
-        table = np.arange(256) / 255
-        scaled = np.clip(linear(table)[:, None] * factor[:3], 0, 1)
-        curve = np.c_[srgb(scaled), np.clip(table * factor[3], 0, 1)]
-        curve = np.rint(curve * 255).astype(np.uint8)
-        colour = np.stack([curve[colour[..., k], k] for k in range(4)], -1)
-    opaque = (entry.alphaMode or "OPAQUE") == "OPAQUE"
-    if opaque:
-        colour = np.concatenate(
-            [colour[..., :3], np.full_like(colour[..., 3:], 255)], -1
-        )
-    bump = entry.normalTexture
+    if (factor != 1).any():
+        colour = _scaled(colour, factor)
+
+    # Only materials that are not opaque are cut out by alpha.
+    cutoff = 0.5 if entry.alphaCutoff is None else entry.alphaCutoff
+    if entry.alphaMode in (None, "", "OPAQUE"):
+        cutoff = 0.0
+        colour = colour.copy()
+        colour[..., 3] = 255
+
+    normal = None
+    if entry.normalTexture is not None:
+        normal = glb.image(entry.normalTexture.index)[..., :3]
     return Surface(
         name=entry.name or "",
         colour=colour,
-        normal=None if bump is None else glb.image(bump.index)[..., :3],
-        cutoff=0.0
-        if opaque
-        else (0.5 if entry.alphaCutoff is None else entry.alphaCutoff),
+        normal=normal,
+        cutoff=cutoff,
     )
 
 
-def _standing(rig: _Rig, vertices: Array) -> tuple[Array, float, Array]:
-    """Rotation, scale and origin that put the person on z = 0, in metres, facing -Y."""
-    at = dict(zip(rig.bones, rig.joints, strict=True))
-    left = sum(at[f"Left{k}"] - at[f"Right{k}"] for k in ("UpLeg", "Arm"))
+def _scaled(colour: Bytes, factor: Array) -> Bytes:
+    """Colours ``[H, W, 4]`` times a factor ``[4]`` that scales linear light and alpha."""
+    # New values of all 256 bytes in each channel.
+    level = np.arange(256) / 255
+    light = np.clip(linear(level)[:, None] * factor[:3], 0, 1)
+    alpha = np.clip(level * factor[3], 0, 1)
+    table = np.rint(np.c_[srgb(light), alpha] * 255).astype(np.uint8)
+
+    channels = [table[colour[..., k], k] for k in range(4)]
+    return np.stack(channels, axis=-1)
+
+
+class _Standing(NamedTuple):
+    """A similarity that puts the person on z = 0, in metres, facing -Y."""
+
+    turn: Array  # [3, 3]
+    scale: float
+    origin: Array  # [3] metres
+
+    def points(self, x: Array) -> Array:
+        return self.scale * x @ self.turn.T - self.origin
+
+
+def _standing(skeleton: _Skeleton, vertices: Array) -> _Standing:
+    """How to stand the person up, whose left side tells its heading."""
+    # Files face one of few directions: the heading is rounded to 5 degrees.
+    at = dict(zip(skeleton.bones, skeleton.joints, strict=True))
+    hips = at["LeftUpLeg"] - at["RightUpLeg"]
+    arms = at["LeftArm"] - at["RightArm"]
+    left = hips + arms
     degrees = 5 * np.round(np.degrees(np.arctan2(left[1], left[0])) / 5)
     turn = Rotation.from_euler("z", -degrees, degrees=True).as_matrix()
+
+    # The first unit that makes a person's height.
     height = float(np.ptp(vertices[:, 2]))
     if not 0 < height < np.inf:
         raise ValueError("its mesh is flat or has positions that are not numbers")
     low, high = HEIGHTS
-    scale = next((unit for unit in UNITS if low <= unit * height <= high), 1.7 / height)
+    scale = 1.7 / height
+    for unit in UNIT_LENGTHS:
+        if low <= unit * height <= high:
+            scale = unit
+            break
+
+    # The hips are over the origin, the lowest vertex is on the floor.
     origin = scale * turn @ (at["LeftUpLeg"] + at["RightUpLeg"]) / 2
     origin[2] = scale * vertices[:, 2].min()
-    return turn, scale, origin
+    return _Standing(turn, scale, origin)
 
 
 def _unit_normals(normals: Array, vertices: Array, faces: Ints) -> Array:
-    """Unit normals; where there are none, those of the faces, weighted by area."""
+    """Unit normals; missing ones are means of the faces' normals, weighted by area."""
+    # The file's normals, where it has any.
     made = vertex_normals(torch.from_numpy(vertices), torch.from_numpy(faces)).numpy()
-    normals = np.where(np.abs(normals).sum(1, keepdims=True) > 0, normals, made)
+    given = np.abs(normals).sum(axis=1, keepdims=True) > 0
+    normals = np.where(given, normals, made)
+
+    # Where both are missing, normals point up.
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return np.where(length > 0, normals / np.where(length > 0, length, 1), [0.0, 0, 1])
+    unit = normals / np.where(length > 0, length, 1)
+    return np.where(length > 0, unit, [0.0, 0, 1])
 
 
-def _character(glb: Glb, rig: _Rig) -> Character:
-    parts = [part for part in _parts(glb, rig) if len(part.faces)]
+def _character(glb: Glb, skeleton: _Skeleton) -> Character:
+    """All parts of the person, merged and standing, with labels and landmarks."""
+    parts = [part for part in _parts(glb, skeleton) if len(part.faces)]
     if not parts:
         raise DataError(
             f"{glb.path}: no triangles on its bones; export the character's meshes"
         )
-    first = np.cumsum([0, *(len(part.vertices) for part in parts)]).tolist()
-    faces = np.concatenate(
-        [i + part.faces for i, part in zip(first, parts, strict=False)]
-    )
     vertices = np.concatenate([part.vertices for part in parts])
-    turn, scale, origin = _standing(rig, vertices)
-    vertices = scale * vertices @ turn.T - origin
-    joints = scale * rig.joints @ turn.T - origin
+    standing = _standing(skeleton, vertices)
+    vertices = standing.points(vertices)
+    normals = np.concatenate([part.normals for part in parts]) @ standing.turn.T
+
+    # Faces and shapes refer to the merged vertices.
+    faces = []
     shapes: dict[str, Array] = {}
-    for start, part in zip(first, parts, strict=False):
+    start = 0
+    for part in parts:
+        end = start + len(part.vertices)
+        faces.append(start + part.faces)
         for name, offsets in part.shapes.items():
             total = shapes.setdefault(name, np.zeros_like(vertices))
-            total[start : start + len(offsets)] = scale * offsets @ turn.T
-    normals = np.concatenate([part.normals for part in parts]) @ turn.T
-    materials = sorted({part.material for part in parts})
+            total[start:end] = standing.scale * offsets @ standing.turn.T
+        start = end
+    merged_faces = np.concatenate(faces)
+
+    # The material and the name of each face's part.
     counts = [len(part.faces) for part in parts]
+    materials = sorted({part.material for part in parts})
+    material = [materials.index(part.material) for part in parts]
+    names = np.repeat([part.name for part in parts], counts)
+
     character = Character(
         name=glb.path.stem,
         vertices=vertices,
-        normals=_unit_normals(normals, vertices, faces),
+        normals=_unit_normals(normals, vertices, merged_faces),
         uv=np.concatenate([part.uv for part in parts]),
-        faces=faces,
-        material=np.repeat([materials.index(part.material) for part in parts], counts),
-        labels=np.ones(len(faces), np.int64),
+        faces=merged_faces,
+        material=np.repeat(material, counts),
+        labels=np.ones(len(merged_faces), np.int64),
         label_names=LABEL_NAMES,
         surfaces=tuple(_surface(glb, material) for material in materials),
-        bones=rig.bones,
-        parents=rig.parents,
-        joints=joints,
+        bones=skeleton.bones,
+        parents=skeleton.parents,
+        joints=standing.points(skeleton.joints),
         bone_index=np.concatenate([part.bone_index for part in parts]),
         bone_weight=np.concatenate([part.bone_weight for part in parts]),
         shapes=canonical_shapes(shapes),
@@ -353,5 +486,5 @@ def _character(glb: Glb, rig: _Rig) -> Character:
         anchor_joint=np.zeros(0, np.int64),
         anchor_vertex=np.zeros(0, np.int64),
     )
-    names = np.repeat([part.name for part in parts], counts)
-    return with_anchors(replace(character, labels=face_labels(character, names)))
+    labels = face_labels(character, names)
+    return with_anchors(replace(character, labels=labels))

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterable, Mapping
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -9,49 +10,64 @@ import numpy as np
 from gsgan.motion.rig import FINGERS, SIDES
 from gsgan.motion.rotations import Array
 
-LIMBS = ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot")
-REQUIRED = ("Hips", "Spine", "Head", *(side + limb for side in SIDES for limb in LIMBS))
-BONES = (
-    *REQUIRED,
-    *("Spine1", "Spine2", "Neck", "Jaw"),
-    *(
-        side + name
-        for side in SIDES
-        for name in ("Shoulder", "ToeBase", "ToeEnd", "Eye")
-    ),
-    *(
-        f"{side}Hand{finger}{k}"
-        for side in SIDES
-        for finger in FINGERS
-        for k in (1, 2, 3, 4)
-    ),
-)
-CANONICAL = {bone.lower(): bone for bone in BONES}
+# Mixamo's names of bones; those of limbs, side and fingers follow "Left" or "Right".
+LIMB_BONES = ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot")
+SIDE_BONES = ("Shoulder", "ToeBase", "ToeEnd", "Eye")
+FINGER_BONE_NAMES = [f"Hand{finger}{k}" for finger in FINGERS for k in (1, 2, 3, 4)]
 
+
+def _on_both_sides(names: Iterable[str]) -> list[str]:
+    return [side + name for side in SIDES for name in names]
+
+
+REQUIRED_BONES = ("Hips", "Spine", "Head", *_on_both_sides(LIMB_BONES))
+HUMANOID_BONES = (
+    *REQUIRED_BONES,
+    "Spine1",
+    "Spine2",
+    "Neck",
+    "Jaw",
+    *_on_both_sides(SIDE_BONES),
+    *_on_both_sides(FINGER_BONE_NAMES),
+)
+# Mixamo's names by their lower-case form.
+CANONICAL = {bone.lower(): bone for bone in HUMANOID_BONES}
+
+# Mixamo's names by VRM's; those of limbs without the side.
 VRM_LIMBS = {
     "shoulder": "Shoulder",
     "upperArm": "Arm",
     "lowerArm": "ForeArm",
     "hand": "Hand",
+    "upperLeg": "UpLeg",
+    "lowerLeg": "Leg",
+    "foot": "Foot",
+    "toes": "ToeBase",
+    "eye": "Eye",
 }
-VRM_LIMBS |= {"upperLeg": "UpLeg", "lowerLeg": "Leg", "foot": "Foot", "toes": "ToeBase"}
-VRM_LIMBS |= {"eye": "Eye"}
 VRM_BONES = {
     "hips": "Hips",
     "spine": "Spine",
     "chest": "Spine1",
     "upperChest": "Spine2",
+    "neck": "Neck",
+    "head": "Head",
+    "jaw": "Jaw",
 }
-VRM_BONES |= {"neck": "Neck", "head": "Head", "jaw": "Jaw"}
 
 
 def vrm_bone(name: str, version: int) -> str | None:
     """Mixamo's name of a humanoid bone of VRM; ``version`` 0 or 1 (thumbs differ)."""
     if name in VRM_BONES:
         return VRM_BONES[name]
-    side, rest = ("Left", name[4:]) if name.startswith("left") else ("Right", name[5:])
-    if (limb := rest[:1].lower() + rest[1:]) in VRM_LIMBS:
+    # VRM's names of limbs begin with a side.
+    side = "Left" if name.startswith("left") else "Right"
+    rest = name[len(side) :]
+    limb = rest[:1].lower() + rest[1:]
+    if limb in VRM_LIMBS:
         return side + VRM_LIMBS[limb]
+
+    # Fingers have numbered segments in Mixamo's names.
     match = re.fullmatch(r"(\w+?)(Metacarpal|Proximal|Intermediate|Distal)", rest)
     if match is None:
         return None
@@ -64,6 +80,7 @@ def vrm_bone(name: str, version: int) -> str | None:
 
 def mixamo_bone(name: str) -> str | None:
     """Mixamo's name without prefix of a bone, None for other bones."""
+    # Without namespaces and separators.
     plain = re.sub(r"^.*[:|]|^mixamorig\d*_?|[ _.-]", "", name)
     return CANONICAL.get(re.sub(r"^mixamorig\d*", "", plain).lower())
 
@@ -80,6 +97,8 @@ def humanoid_bones(
         pairs = [(bone["node"], vrm_bone(bone["bone"], 0)) for bone in bones]
     else:
         pairs = [(node, mixamo_bone(name or "")) for node, name in enumerate(names)]
+
+    # The first node of each bone counts.
     found: dict[str, int] = {}
     for node, bone in pairs:
         if bone is not None:
@@ -94,17 +113,27 @@ def _choices(table: str) -> dict[str, tuple[dict[str, float], ...]]:
     """
     shapes = {}
     for line in table.strip().splitlines():
-        shape, names = (part.strip() for part in line.split(":"))
-        for side in ("left", "right") if "{" in names else ("",):
-            whole = f"{shape}_{side}" if side else shape
-            sums = [{plain_shape(whole): 1.0}]
-            for choice in names.format(S=side[:1], side=side).split(","):
-                terms = [term.strip().split("*") for term in choice.split("+")]
-                sums.append(
-                    {term[-1]: float(term[0]) if term[1:] else 1.0 for term in terms}
-                )
-            shapes[whole] = tuple(sums)
+        shape, choices = line.split(":")
+        shape = shape.strip()
+        if "{" not in choices:
+            shapes[shape] = _sums(shape, choices)
+            continue
+        for side in ("left", "right"):
+            sided = f"{shape}_{side}"
+            shapes[sided] = _sums(sided, choices.format(S=side[0], side=side))
     return shapes
+
+
+def _sums(shape: str, choices: str) -> tuple[dict[str, float], ...]:
+    """Weights of each choice's terms by name; the first choice is the shape's own name."""
+    sums = [{plain_shape(shape): 1.0}]
+    for choice in choices.split(","):
+        weights = {}
+        for term in choice.split("+"):
+            weight, _, name = term.strip().rpartition("*")
+            weights[name] = float(weight or 1)
+        sums.append(weights)
+    return tuple(sums)
 
 
 def plain_shape(name: str) -> str:
@@ -113,7 +142,7 @@ def plain_shape(name: str) -> str:
     return re.sub(r"[ _-]", "", name).lower()
 
 
-# What a canonical shape is made of, best choice first: names as `plain_shape` writes them, of
+# The sums that make a canonical shape, best choice first: names as `plain_shape` writes them, of
 # gsgan's own avatars (always the first choice), VALID, ARKit, Ready Player Me and VRoid.
 SHAPES = _choices("""
     mouth_open: jawopen, mouthopen, fclmtha
@@ -129,7 +158,9 @@ SHAPES = _choices("""
     brow_up: {S}browup+{S}{S}browup, browouterup{side}+0.5*browinnerup, 0.5*fclbrwsurprised
     brow_down: {S}browdown+{S}{S}browdown, browdown{side}, 0.5*fclbrwangry
 """)
-WANTED = {name for choices in SHAPES.values() for choice in choices for name in choice}
+WANTED: set[str] = set()
+for _choice in chain.from_iterable(SHAPES.values()):
+    WANTED.update(_choice)
 
 
 def canonical_shapes(found: Mapping[str, Array]) -> dict[str, Array]:
@@ -137,11 +168,12 @@ def canonical_shapes(found: Mapping[str, Array]) -> dict[str, Array]:
     shapes = {}
     for shape, choices in SHAPES.items():
         for choice in choices:
-            if all(name in found for name in choice):
-                total = np.sum(
-                    [weight * found[name] for name, weight in choice.items()], 0
-                )
-                if np.abs(total).max() > 0:
-                    shapes[shape] = total
-                break
+            if not choice.keys() <= found.keys():
+                continue
+            # The first choice that the file has all terms of is taken, unless it is empty.
+            terms = [weight * found[name] for name, weight in choice.items()]
+            total = np.sum(terms, axis=0)
+            if np.abs(total).max() > 0:
+                shapes[shape] = total
+            break
     return shapes

@@ -1,6 +1,7 @@
 """The motion of a BVH or AMC file on a character."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +16,9 @@ from gsgan.motion.standard import drift, floor_under, standard_motion
 from gsgan.synthetic.posing import blinks
 
 RECORDED = (".bvh", ".amc")  # suffixes
-# A foot stands where it is this low and slow, legs and legs per second.
-CONTACT_HEIGHT = 0.04
-CONTACT_SPEED = 0.3
+# A foot rests while it is this low and slow.
+CONTACT_HEIGHT = 0.04  # leg lengths
+CONTACT_SPEED = 0.3  # leg lengths per second
 SECTION = 2.5  # seconds that share a passage's name
 
 
@@ -52,57 +53,65 @@ class RecordedMotion:
         self.rig = Rig(character)
         self.seed = seed
         self.name = path.stem
-        read = (
-            read_bvh(path) if path.suffix == ".bvh" else read_amc(path, asf_of(path))[0]
-        )
+        if path.suffix == ".bvh":
+            read = read_bvh(path)
+        else:
+            read, _ = read_amc(path, asf_of(path))
+
+        # Times of the frames, from 0.
         self.duration = len(read.root) * read.frame_time
         self._times = np.arange(len(read.root), dtype=np.float64) * read.frame_time
+
+        # Turns of the bones, with collarbones that follow the upper arms.
         standard = standard_motion(read, path)
         self._turns = standard.turns
-        joint = self.rig.joint
         if collars is not None:
             chest = self._turns["Spine2"]
             for side in SIDES:
-                self._turns[side + "Shoulder"] = blend(
-                    chest, self._turns[side + "Arm"], collars
-                )
+                arm = self._turns[side + "Arm"]
+                self._turns[side + "Shoulder"] = blend(chest, arm, collars)
+
+        # The middle of the thighs' joints goes where it is in the file, by the length of the legs.
+        joint = self.rig.joint
         offset = (joint["LeftUpLeg"] + joint["RightUpLeg"]) / 2 - joint["Hips"]
-        thighs = (standard.joints["LeftUpLeg"] + standard.joints["RightUpLeg"]) / 2
-        self._hips = thighs * self.rig.leg / standard.leg - self._turns["Hips"] @ offset
-        across = standard.joints["LeftUpLeg"] - standard.joints["RightUpLeg"]
-        width = (
-            float(np.median(np.linalg.norm(across, axis=1)))
-            * self.rig.leg
-            / standard.leg
-        )
+        left = standard.joints["LeftUpLeg"]
+        right = standard.joints["RightUpLeg"]
+        thighs = (left + right) / 2 * self.rig.leg / standard.leg
+        self._hips = thighs - self._turns["Hips"] @ offset
+
         # Legs that go straight down from wider hips would cross below narrow ones.
+        width = float(np.median(np.linalg.norm(left - right, axis=1)))
+        width = width * self.rig.leg / standard.leg
         self._apart = max(0.0, width - self.rig.length("LeftUpLeg", "RightUpLeg")) / 2
         self._settle(read.frame_time)
 
     def _settle(self, step: float) -> None:
         """Moves the hips near the origin and to the floor, and finds the ankles' targets."""
-        hips = self._hips
+        # The floor below the lower sole, and the shift that puts the motion on it.
         leg = self.rig.leg
-        pose = self._pose(self._turns, hips)
+        pose = self._pose(self._turns, self._hips)
         lows = [pose.lowest(side) for side in SIDES]
         floor = floor_under(np.minimum(*lows), leg, step)
-        shift = np.column_stack([-drift(hips[:, :2], step), -floor])
-        self._hips = hips + shift
+        shift = np.column_stack([-drift(self._hips[:, :2], step), -floor])
+        self._hips = self._hips + shift
+
         self._ankles = []
         for side, low in zip(SIDES, lows, strict=True):
-            toe = (
-                side + "ToeBase"
-                if side + "ToeBase" in self.rig.index
-                else side + "Foot"
-            )
+            toe = side + "ToeBase"
+            if toe not in self.rig.index:
+                toe = side + "Foot"
             ball = (pose.position(toe) + shift)[:, :2]
+
+            # A foot is above the floor, and held in place while it rests.
             ankle = pose.position(side + "Foot") + shift
             ankle += SIGN[side] * self._apart * self._turns["Hips"][:, :, 0]
             ankle[:, 2] += (floor - low).clip(0)
-            ankle[:, :2] += _held(ball, low - floor < CONTACT_HEIGHT * leg, leg, step)
+            is_low = low - floor < CONTACT_HEIGHT * leg
+            ankle[:, :2] += _held(ball, is_low, leg, step)
             self._ankles.append(ankle)
 
     def _pose(self, turns: dict[str, Array], hips: Array) -> Pose:
+        # Hands last: their twist is shared with the forearms.
         pose = Pose(self.rig, hips)
         for bone, turn in turns.items():
             pose.set_turn(bone, turn)
@@ -114,38 +123,43 @@ class RecordedMotion:
         """The poses at times ``[F]``, seconds in [0, `duration`]."""
         times = times.clip(0, self._times[-1])
 
-        def between_frames(values: Array) -> Array:
-            return np.stack(
-                [np.interp(times, self._times, x) for x in values.T], axis=1
-            )
+        turns = {}
+        for bone, turn in self._turns.items():
+            turns[bone] = _interpolated(turn, self._times, times)
+        pose = self._pose(turns, _between(self._hips, self._times, times))
+        ankles = [_between(ankle, self._times, times) for ankle in self._ankles]
 
-        turns = {
-            bone: _interpolated(turn, self._times, times)
-            for bone, turn in self._turns.items()
-        }
-        pose = self._pose(turns, between_frames(self._hips))
-        ankles = [between_frames(ankle) for ankle in self._ankles]
+        # Knees keep their direction from the line of the leg; straight ones point ahead.
         knees = []
         for side in SIDES:
-            hip, knee, ankle = (pose.position(side + bone) for bone in LEG)
+            hip = pose.position(side + "UpLeg")
+            knee = pose.position(side + "Leg")
+            ankle = pose.position(side + "Foot")
             ahead = pose.turn(side + "UpLeg") @ (0.0, -1.0, 0.0)
             knees.append(knee - (hip + ankle) / 2 + 0.05 * self.rig.leg * ahead)
+
+        # The legs reach their targets.
         pose.lower_hips(ankles)
-        for side, ankle, pole in zip(SIDES, ankles, knees, strict=True):
-            pose.reach(side, LEG, ankle, pole)
+        for side, target, pole in zip(SIDES, ankles, knees, strict=True):
+            pose.reach(side, LEG, target, pole)
+
         sections = (times // SECTION).astype(int)
-        blink = blinks(times, self.duration, self.seed)
-        return pose.motion(blink, tuple(f"{self.name} {k}" for k in sections))
+        names = tuple(f"{self.name} {k}" for k in sections)
+        return pose.motion(blinks(times, self.duration, self.seed), names)
 
 
 def _held(ball: Array, low: NDArray[np.bool_], leg: float, step: float) -> Array:
-    """``[F, 2]`` what keeps a foot in place while it rests, and fades between such times."""
+    """``[F, 2]`` shifts that keep a foot in place while it rests, and fade between such times."""
+    still = np.zeros_like(ball)
     if len(ball) < 2:
-        return np.zeros_like(ball)
-    resting = low & (
-        np.linalg.norm(np.gradient(ball, step, axis=0), axis=1) < CONTACT_SPEED * leg
-    )
+        return still
+
+    # The frames from which and before which the foot rests.
+    speed = np.linalg.norm(np.gradient(ball, step, axis=0), axis=1)
+    resting = low & (speed < CONTACT_SPEED * leg)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], resting, [0]])))
+
+    # Shifts to the mean place of each rest, unless the foot moves too far in it.
     frames = [np.zeros(0, dtype=int)]
     shift = [np.zeros((0, 2))]
     for begin, end in edges.reshape(-1, 2):
@@ -154,13 +168,19 @@ def _held(ball: Array, low: NDArray[np.bool_], leg: float, step: float) -> Array
             frames.append(np.arange(begin, end))
             shift.append(run.mean(axis=0) - run)
     at = np.concatenate(frames)
-    values = np.concatenate(shift)
     if not len(at):
-        return np.zeros_like(ball)
-    return np.stack([np.interp(np.arange(len(ball)), at, v) for v in values.T], axis=1)
+        return still
+    return _between(np.concatenate(shift), at, np.arange(len(ball)))
+
+
+def _between(values: Array, known: NDArray[Any], times: NDArray[Any]) -> Array:
+    """``[F, C]`` values known at some times, interpolated linearly."""
+    return np.stack([np.interp(times, known, x) for x in values.T], axis=1)
 
 
 def _interpolated(turns: Array, known: Array, times: Array) -> Array:
+    """``[F, 3, 3]`` rotations known at some times, interpolated along the shortest way."""
     if len(known) == 1:
         return np.repeat(turns, len(times), axis=0)
-    return np.asarray(Slerp(known, Rotation.from_matrix(turns))(times).as_matrix())
+    between = Slerp(known, Rotation.from_matrix(turns))
+    return np.asarray(between(times).as_matrix())

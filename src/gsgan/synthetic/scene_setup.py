@@ -35,18 +35,19 @@ Array = NDArray[np.float64]
 
 TINT_STREAM = 77
 CROSSTALK = 0.25  # leak from channel to channel, as a share of the tint
-OFFSET = 0.25  # largest offset of a channel, as a share of the tint
+MAX_OFFSET = 0.25  # of a channel, as a share of the tint
 
 
 @dataclass(frozen=True)
 class Tint:
     """One camera's colours, ``A c + b`` on sRGB in [0, 1]: ``A [3, 3]``, ``b [3]``."""
 
-    A: Array
-    b: Array
+    A: Array  # [3, 3]
+    b: Array  # [3]
 
     def __call__(self, image: Array, alpha: Array) -> Array:
         """Tints a premultiplied image ``[H, W, 3]`` with alpha ``[H, W]``."""
+        # Premultiplied colours are between 0 and alpha.
         share = alpha[..., None]
         return np.clip(image @ self.A.T + share * self.b, 0, share)
 
@@ -60,36 +61,59 @@ def make_tints(strength: float, cameras: int, seed: int) -> list[Tint]:
     gain = rng.uniform(-1, 1, (cameras, 3))
     leak = rng.uniform(-1, 1, (cameras, 9))
     offset = rng.uniform(-1, 1, (cameras, 3))
-    leak = leak.reshape(-1, 3, 3) * (1 - np.eye(3))
-    # a leak is subtracted from the channel itself, so that grey stays grey but for the gains
-    leak -= leak.sum(axis=2, keepdims=True) * np.eye(3)
-    change = _centred(gain)[:, :, None] * np.eye(3) + CROSSTALK * _centred(leak)
-    shift = OFFSET * _centred(offset)
-    return [
-        Tint(np.eye(3) + strength * a, strength * b)
-        for a, b in zip(change, shift, strict=True)
-    ]
+
+    # What leaks into a channel is subtracted from the channel itself, so that only the gains
+    # change grey.
+    identity = np.eye(3)
+    leak = leak.reshape(-1, 3, 3) * (1 - identity)
+    leak -= leak.sum(axis=2, keepdims=True) * identity
+
+    # The mean over the cameras is the identity.
+    change = _centred(gain)[:, :, None] * identity + CROSSTALK * _centred(leak)
+    shift = MAX_OFFSET * _centred(offset)
+    tints = []
+    for matrix, vector in zip(change, shift, strict=True):
+        tints.append(Tint(A=identity + strength * matrix, b=strength * vector))
+    return tints
 
 
 def _centred(x: Array) -> Array:
     """Shifted to mean 0 over the cameras, then scaled to within [-1, 1]."""
     x = x - x.mean(axis=0)
-    return x / max(1.0, float(np.abs(x).max(initial=0)))
+    largest = np.abs(x).max(initial=0)
+    return x / max(1.0, float(largest))
 
 
 VERSION = 2
-"""Of the generator. Raise it when any pixel changes: cached datasets are then made again."""
+"""Version of the generator. Raise it when any pixel changes: datasets are then made again."""
 
-DEFAULT, FREE_BODY, CHOREOGRAPHY, SIGNING, FURTHER = (
-    *("polo", "free_body", "choreography", "signs", "far"),
-)
+# Names of avatars.
+DEFAULT = "polo"
+FREE_BODY = "free_body"
+# Names of motions.
+CHOREOGRAPHY = "choreography"
+SIGNING = "signs"
+FURTHER = "far"
 PROGRAMMES = {CHOREOGRAPHY: EVERYDAY, SIGNING: SIGNS, FURTHER: FAR}
-ARC = math.radians(150)  # round the front of a person who signs
-# Least value of each whole number, and the ranges of those that may be None.
-LEAST = {"size": 8, "train_cameras": 1, "frames": 1, "rays_per_pixel": 1}
-LEAST |= {"test_cameras": 0, "test_frames": 0, "seed": 0}
-NUMBERS = {"tint": (0.0, 0.3), "gloss": (0.0, 1.0)}
-LISTS = {"lens": (-math.inf, math.inf), "test_scale": (0.25, 4)}
+
+CAMERA_ARC = math.radians(150)  # in front of a person who signs
+CAMERA_HEIGHTS = (1.35, 0.95, 1.75)  # metres, in turn around the person
+TEST_HEIGHTS = (1.15, 1.55)  # metres, of test cameras around the person
+ARC_HEIGHTS = (1.35, 1.55, 1.2)  # metres, in turn along the arc
+ARC_TEST_HEIGHTS = (1.45, 1.3)  # metres, of test cameras along the arc
+
+# Minimum of each whole number, and the ranges of the parameters that may be None.
+MIN_VALUES = {
+    "size": 8,
+    "train_cameras": 1,
+    "frames": 1,
+    "rays_per_pixel": 1,
+    "test_cameras": 0,
+    "test_frames": 0,
+    "seed": 0,
+}
+OPTIONAL_NUMBERS = {"tint": (0.0, 0.3), "gloss": (0.0, 1.0)}
+OPTIONAL_LISTS = {"lens": (-math.inf, math.inf), "test_scale": (0.25, 4)}
 
 
 @dataclass(frozen=True)
@@ -102,41 +126,49 @@ class SceneSettings:
         ConfigError: naming the parameter that is out of range.
     """
 
-    size: int = 128
+    size: int = 128  # pixels of the square images
     train_cameras: int = 6
-    test_cameras: int = 2
+    test_cameras: int = 2  # held out, between training cameras
     frames: int = 84
-    test_frames: int = 21
+    test_frames: int = 21  # held out, of all frames
     rays_per_pixel: int = 16
-    seed: int = 0
-    avatar: str = DEFAULT
-    motion: str = CHOREOGRAPHY
-    secondary: bool = True
-    lens: tuple[float, ...] | None = None
-    tint: float | None = None
-    gloss: float | None = None
-    test_scale: tuple[float, ...] | None = None
+    seed: int = 0  # of the motion's style and of the tints
+    avatar: str = DEFAULT  # name, or path of a .glb
+    motion: str = CHOREOGRAPHY  # name, or path of a .bvh or .amc
+    secondary: bool = True  # sway and wrinkles of cloth
+    lens: tuple[float, ...] | None = None  # OpenCV's distortion coefficients
+    tint: float | None = None  # maximum change of a channel's gain
+    gloss: float | None = None  # added highlight of clothes
+    test_scale: tuple[float, ...] | None = None  # zooms of copies of the test cameras
 
     def __post_init__(self) -> None:
-        for name, least in LEAST.items():
-            whole(f"data.source.{name}", getattr(self, name), least)
-        for name, bounds in NUMBERS.items():
-            if (value := getattr(self, name)) is not None:
+        # Whole numbers.
+        for name, minimum in MIN_VALUES.items():
+            whole(f"data.source.{name}", getattr(self, name), minimum)
+
+        # Numbers that may be None; 0 disables the effect too.
+        for name, bounds in OPTIONAL_NUMBERS.items():
+            value = getattr(self, name)
+            if value is not None:
                 between(f"data.source.{name}", value, *bounds)
             object.__setattr__(self, name, float(value) if value else None)
-        for name, (low, high) in LISTS.items():
+
+        # Lists that may be None; zeros alone disable the effect too.
+        for name, (low, high) in OPTIONAL_LISTS.items():
             raw = getattr(self, name)
             values = as_floats([] if raw is None else raw)
             _require(
-                (raw is None or (isinstance(raw, Sequence) and len(values) == len(raw)))
-                and bool(
-                    (np.isfinite(values) & (values >= low) & (values <= high)).all()
-                ),
+                raw is None or _is_list_within(raw, values, low, high),
                 f"{name} must be a list of numbers in [{low:g}, {high:g}], got {raw!r}",
             )
-            object.__setattr__(
-                self, name, tuple(values.tolist()) if values.any() else None
-            )
+            stored = tuple(values.tolist()) if values.any() else None
+            object.__setattr__(self, name, stored)
+
+        self._check_sources()
+        self._check_together()
+
+    def _check_sources(self) -> None:
+        """The avatar and the motion are known names or files of a known format."""
         named = (*AVATARS, FREE_BODY)
         _require(
             self.avatar in named or str(self.avatar).endswith(".glb"),
@@ -148,6 +180,9 @@ class SceneSettings:
             f"got {self.motion!r}",
         )
         one_of("data.source.secondary", self.secondary, (True, False))
+
+    def _check_together(self) -> None:
+        """The parameters agree with each other."""
         _require(
             self.test_frames < self.frames,
             f"test_frames must be less than frames = {self.frames}, got {self.test_frames}",
@@ -168,6 +203,14 @@ class SceneSettings:
         )
 
 
+def _is_list_within(raw: object, values: Array, low: float, high: float) -> bool:
+    """Whether a parameter is a list whose elements are all numbers from low to high."""
+    if not isinstance(raw, Sequence) or len(values) != len(raw):
+        return False
+    finite = np.isfinite(values)
+    return bool((finite & (values >= low) & (values <= high)).all())
+
+
 def _require(holds: bool, message: str) -> None:
     if not holds:
         raise ConfigError(f"data.source.{message}")
@@ -181,23 +224,25 @@ def dataset_key(settings: SceneSettings) -> str:
     Raises:
         DataError: when a file does not exist.
     """
+    # A file is replaced by the hash of its content.
     parameters = asdict(settings)
     for name in ("avatar", "motion"):
-        if parameters[name] not in (*AVATARS, FREE_BODY, *PROGRAMMES):
-            path = Path(parameters[name]).expanduser()
-            if not path.is_file():
-                raise DataError(f"data.source.{name}: {path} does not exist")
-            parameters[name] = hashlib.sha256(path.read_bytes()).hexdigest()
+        if parameters[name] in (*AVATARS, FREE_BODY, *PROGRAMMES):
+            continue
+        path = Path(parameters[name]).expanduser()
+        if not path.is_file():
+            raise DataError(f"data.source.{name}: {path} does not exist")
+        parameters[name] = hashlib.sha256(path.read_bytes()).hexdigest()
+
     content = repr((VERSION, sorted(parameters.items())))
     digest = hashlib.sha256(content.encode()).hexdigest()[:12]
-    effects = [
-        name
-        for name in ("lens", "tint", "gloss", "test_scale")
-        if getattr(settings, name)
-    ]
-    return "-".join(
-        [f"{Path(settings.avatar).stem}-{settings.size}-{digest}", *effects]
-    )
+    key = f"{Path(settings.avatar).stem}-{settings.size}-{digest}"
+
+    # The name ends with the effects that are enabled.
+    for effect in ("lens", "tint", "gloss", "test_scale"):
+        if getattr(settings, effect):
+            key += f"-{effect}"
+    return key
 
 
 def load_character(avatar: str) -> Character:
@@ -228,24 +273,20 @@ class Scene:
     def __init__(self, settings: SceneSettings) -> None:
         self.settings = settings
         self.light = Light(gloss=settings.gloss or 0.0)
-        self.character = character = load_character(settings.avatar)
-        self.appearance = Appearance(character)
-        self.source: Moving = (
-            Choreography(character, settings.seed, PROGRAMMES[settings.motion])
-            if settings.motion in PROGRAMMES
-            else RecordedMotion(
-                character, Path(settings.motion).expanduser(), settings.seed
-            )
-        )
-        times = frame_times(settings.frames, self.source.duration)
-        self.motion = self.source.at(times)
-        self.secondary = (
-            Secondary(character, self.source) if settings.secondary else None
-        )
-        self.times = times
+        self.character = load_character(settings.avatar)
+        self.appearance = Appearance(self.character)
+
+        # The motion and what follows from it.
+        self.source = self._moving()
+        self.times = frame_times(settings.frames, self.source.duration)
+        self.motion = self.source.at(self.times)
+        self.secondary = None
+        if settings.secondary:
+            self.secondary = Secondary(self.character, self.source)
+
+        # The split of the frames.
         passages = self.motion.passages
-        signing = settings.motion == SIGNING
-        if signing:
+        if settings.motion == SIGNING:
             self.train_frames, self.test_frames = split_signs(
                 passages, settings.test_frames
             )
@@ -254,27 +295,48 @@ class Scene:
             self.train_frames = [
                 i for i in range(settings.frames) if i not in self.test_frames
             ]
-        names = [
-            f"cam{i:02d}" for i in range(settings.train_cameras + settings.test_cameras)
-        ]
+
+        # The cameras and their split.
+        self.views = self._cameras()
+        names = list(self.views)
         self.train_cameras = names[: settings.train_cameras]
-        points = extent(character, self.source, upper=signing)
-        views = (front if signing else ring)(settings, points)
-        self.views = dict(zip(names, views, strict=True))
-        for name in names[settings.train_cameras :]:
+        self.test_cameras = names[settings.train_cameras :]
+
+        self.tints: dict[str, Tint] = {}
+        if settings.tint:
+            tints = make_tints(settings.tint, settings.train_cameras, settings.seed)
+            self.tints = dict(zip(self.train_cameras, tints, strict=True))
+
+    def _moving(self) -> Moving:
+        """The choreography or the recorded motion on this character."""
+        settings = self.settings
+        if settings.motion in PROGRAMMES:
+            programme = PROGRAMMES[settings.motion]
+            return Choreography(self.character, settings.seed, programme)
+        path = Path(settings.motion).expanduser()
+        return RecordedMotion(self.character, path, settings.seed)
+
+    def _cameras(self) -> dict[str, SceneCamera]:
+        """All cameras by name: for training, for testing, then zoomed copies of the latter."""
+        settings = self.settings
+        signing = settings.motion == SIGNING
+        points = extent(self.character, self.source, upper=signing)
+        placed = front(settings, points) if signing else ring(settings, points)
+        views = {f"cam{i:02d}": view for i, view in enumerate(placed)}
+
+        for name in list(views)[settings.train_cameras :]:
             for scale in settings.test_scale or ():
-                self.views[f"{name}_x{scale:g}"] = zoomed(self.views[name], scale)
-        self.test_cameras = list(self.views)[settings.train_cameras :]
+                views[f"{name}_x{scale:g}"] = zoomed(views[name], scale)
+
         if settings.lens is not None:
             dist = np.array(settings.lens)
-            self.views = {name: through_lens(v, dist) for name, v in self.views.items()}
-        tints = make_tints(settings.tint or 0.0, settings.train_cameras, settings.seed)
-        self.tints = (
-            dict(zip(self.train_cameras, tints, strict=True)) if settings.tint else {}
-        )
+            for name, view in views.items():
+                views[name] = through_lens(view, dist)
+        return views
 
     def mesh(self, frame: int) -> tuple[Array, Array, Wrinkles | None]:
         """Vertices (metres) and unit normals ``[V, 3]`` of a frame, and the wrinkles of cloth."""
+        # Without secondary motion, there are no wrinkles.
         vertices, normals = self._skinned(frame)
         if self.secondary is None:
             return vertices, normals, None
@@ -294,28 +356,24 @@ class Scene:
         if self.settings.avatar == FREE_BODY:
             body = free_body()
             pose = free_pose(self.motion)
-            points = torch.cat(
-                [body.posed_landmarks(pose), body.posed_hands(pose)], dim=1
-            )
-            return (*body.landmark_names, *body.hand_names), points.double().numpy()
-        character = self.character
-        joints = self.motion.joints
-        posed = [
-            character.landmarks(self._skinned(f)[0], p) for f, p in enumerate(joints)
-        ]
-        return character.anchor_names, np.stack(posed)
+            posed = [body.posed_landmarks(pose), body.posed_hands(pose)]
+            names = (*body.landmark_names, *body.hand_names)
+            return names, torch.cat(posed, dim=1).double().numpy()
+
+        points = []
+        for frame, joints in enumerate(self.motion.joints):
+            vertices, _ = self._skinned(frame)
+            points.append(self.character.landmarks(vertices, joints))
+        return self.character.anchor_names, np.stack(points)
 
     def _skinned(self, frame: int) -> tuple[Array, Array]:
+        """Vertices and normals ``[V, 3]`` by linear blend skinning of the shaped rest pose."""
         character = self.character
         motion = self.motion
-        offsets = sum(
-            (
-                motion.shapes[name][frame] * shape
-                for name, shape in character.shapes.items()
-                if name in motion.shapes
-            ),
-            np.zeros_like(character.vertices),
-        )
+        offsets = np.zeros_like(character.vertices)
+        for name, shape in character.shapes.items():
+            if name in motion.shapes:
+                offsets = offsets + motion.shapes[name][frame] * shape
         return character.skinned(motion.rotations[frame], motion.joints[frame], offsets)
 
 
@@ -331,12 +389,14 @@ def extent(
     Every ``stride``-th vertex at a fixed number of moments: cameras fitted to these points do not
     depend on ``frames``.
     """
+    # With `upper`, only vertices that the spine or its descendants carry.
     chosen = np.arange(len(character.vertices))
     if upper:
         trunk = character.with_descendants(character.bones.index("Spine"))
         chosen = np.flatnonzero(np.isin(character.dominant_bones(), trunk))
+
+    # A character of the chosen vertices alone is quick to skin.
     chosen = chosen[::stride]
-    motion = source.at(frame_times(samples, source.duration))
     thinned = replace(
         character,
         vertices=character.vertices[chosen],
@@ -344,37 +404,50 @@ def extent(
         bone_index=character.bone_index[chosen],
         bone_weight=character.bone_weight[chosen],
     )
-    poses = zip(motion.rotations, motion.joints, strict=True)
-    return np.concatenate([thinned.skinned(R, joints)[0] for R, joints in poses])
+
+    motion = source.at(frame_times(samples, source.duration))
+    points = []
+    for rotations, joints in zip(motion.rotations, motion.joints, strict=True):
+        vertices, _ = thinned.skinned(rotations, joints)
+        points.append(vertices)
+    return np.concatenate(points)
 
 
 def ring(settings: SceneSettings, points: Array) -> list[SceneCamera]:
     """Cameras around the person, training cameras first, zoomed to keep ``points`` in view."""
-    n = settings.train_cameras
-    low = points.min(axis=0)
-    high = points.max(axis=0)
-    middle = (low + high) / 2
-    step = 2 * math.pi / n
-    # starting at 0.3, so that no camera looks exactly along the person's axis
-    train = [(0.3 + i * step, (1.35, 0.95, 1.75)[i % 3]) for i in range(n)]
-    gaps = [
-        (i * n) // max(settings.test_cameras, 1) for i in range(settings.test_cameras)
-    ]
-    test = [(0.3 + (i + 0.5) * step, (1.15, 1.55)[k % 2]) for k, i in enumerate(gaps)]
-    return [look_at(a, h, middle, points, settings.size) for a, h in train + test]
+    step = 2 * math.pi / settings.train_cameras
+    places = []
+
+    # Training cameras start at 0.3, so that none looks exactly along the person's axis.
+    for i in range(settings.train_cameras):
+        places.append((0.3 + i * step, CAMERA_HEIGHTS[i % 3]))
+
+    # Test cameras stand half-way between neighbours, spread evenly around the person.
+    for k in range(settings.test_cameras):
+        gap = (k * settings.train_cameras) // settings.test_cameras
+        places.append((0.3 + (gap + 0.5) * step, TEST_HEIGHTS[k % 2]))
+    return _cameras_at(places, points, settings.size)
 
 
 def front(settings: SceneSettings, points: Array) -> list[SceneCamera]:
     """Cameras on an arc before the person, training cameras first, zoomed to ``points``."""
-    n = settings.train_cameras
+    step = CAMERA_ARC / settings.train_cameras
+    places = []
+
+    # Training cameras, spread evenly along the arc.
+    for i in range(settings.train_cameras):
+        places.append(((i + 0.5) * step - CAMERA_ARC / 2, ARC_HEIGHTS[i % 3]))
+
+    # Test cameras, half-way between neighbours.
+    for k in range(settings.test_cameras):
+        gap = int((k + 0.5) * (settings.train_cameras - 1) / settings.test_cameras)
+        places.append(((gap + 1) * step - CAMERA_ARC / 2, ARC_TEST_HEIGHTS[k % 2]))
+    return _cameras_at(places, points, settings.size)
+
+
+def _cameras_at(
+    places: list[tuple[float, float]], points: Array, size: int
+) -> list[SceneCamera]:
+    """Cameras at azimuths and heights that look at the middle of the points."""
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
-    step = ARC / n
-    train = [((i + 0.5) * step - ARC / 2, (1.35, 1.55, 1.2)[i % 3]) for i in range(n)]
-    gaps = [
-        int((k + 0.5) * (n - 1) / settings.test_cameras)
-        for k in range(settings.test_cameras)
-    ]
-    test = [
-        ((gap + 1) * step - ARC / 2, (1.45, 1.3)[k % 2]) for k, gap in enumerate(gaps)
-    ]
-    return [look_at(a, h, middle, points, settings.size) for a, h in train + test]
+    return [look_at(a, height, middle, points, size) for a, height in places]

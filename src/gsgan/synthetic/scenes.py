@@ -6,7 +6,7 @@ meta.json last: a dataset that was interrupted is incomplete and is continued. T
 written to any file: a model has to estimate them.
 
 Workers are separate programs rather than children of multiprocessing, which would import the
-user's main script again, and fail where it is a notebook or lacks a ``__main__`` guard.
+user's main script again, and fail if it is a notebook or lacks a ``__main__`` guard.
 """
 
 import contextlib
@@ -34,8 +34,10 @@ from gsgan.synthetic.scene_setup import FREE_BODY, Scene, SceneSettings, dataset
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import cache_root, locked, write_atomically
 
-KINDS = ("images", "masks", "labels")
-POLL_SECONDS = 0.05
+# Folders of what is traced, in the order of `PosedCharacter.render`.
+IMAGE_FOLDERS = ("images", "masks", "labels")
+POLL_SECONDS = 0.05  # between looks at the workers
+# The program of a worker.
 WORKER = "from gsgan.synthetic.scenes import trace_share; trace_share()"
 
 
@@ -68,6 +70,8 @@ def ensure_scene(
         raise ConfigError(
             f"synthetic data: unknown parameter {unknown[0]!r}; known are {', '.join(known)}"
         )
+
+    # The name of the folder identifies the content.
     settings = SceneSettings(**parameters)
     root = (cache or cache_root()) / "data" / "synthetic" / dataset_key(settings)
     if not _is_complete(root):
@@ -93,10 +97,9 @@ def _write(root: Path, settings: SceneSettings, workers: int, progress: bool) ->
     from rich.progress import Progress
 
     scene = Scene(settings)
-    with Progress(
-        console=Console(stderr=True), disable=not progress, transient=True
-    ) as bar:
-        count = f"{settings.frames} frames, {len(scene.views)} cameras"
+    count = f"{settings.frames} frames, {len(scene.views)} cameras"
+    bar = Progress(console=Console(stderr=True), disable=not progress, transient=True)
+    with bar:
         task = bar.add_task(
             f"tracing the synthetic person ({count})", total=settings.frames
         )
@@ -105,9 +108,12 @@ def _write(root: Path, settings: SceneSettings, workers: int, progress: bool) ->
                 trace_frames(root, scene, [frame])
                 bar.advance(task)
         else:
+            # Progress is the number of images of the camera that is traced last.
             last = root / "labels" / list(scene.views)[-1]
             for _ in _trace_in_processes(root, settings, min(workers, settings.frames)):
                 bar.update(task, completed=len(list(last.glob("*.png"))))
+
+    # meta.json is written last: it marks the dataset as complete.
     _write_skeletons(root, scene)
     cameras = {name: _calibration(view) for name, view in scene.views.items()}
     write_atomically(root / "cameras.json", json.dumps(cameras, indent=1) + "\n")
@@ -122,23 +128,31 @@ def _trace_in_processes(
     Raises:
         DataError: with a failed worker's last line of output.
     """
+    # One thread per worker; the modules come from where this process has them.
     environment = dict(os.environ, OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
     environment["PYTHONPATH"] = os.pathsep.join(p or os.getcwd() for p in sys.path)
     command = [sys.executable, "-c", WORKER, str(root), json.dumps(asdict(settings))]
+
+    # Workers are killed if this process is interrupted or one of them fails.
     with tempfile.TemporaryFile("w+") as errors, contextlib.ExitStack() as stack:
         running = []
         for first in range(workers):
             process = subprocess.Popen(
-                [*command, str(first), str(workers)], stderr=errors, env=environment
+                [*command, str(first), str(workers)],
+                stderr=errors,
+                env=environment,
             )
             stack.callback(process.wait)
             stack.callback(process.kill)
             running.append(process)
-        while None in (codes := [process.poll() for process in running]) and not any(
-            codes
-        ):
+
+        # A code is None while its process runs, and 0 once it has succeeded.
+        codes = [process.poll() for process in running]
+        while None in codes and not any(codes):
             yield
             time.sleep(POLL_SECONDS)
+            codes = [process.poll() for process in running]
+
         if any(codes):
             errors.seek(0)
             lines = [line.strip() for line in errors if line.strip()]
@@ -156,26 +170,27 @@ def trace_share() -> None:
     cv2.setNumThreads(1)
     root, parameters, first, step = sys.argv[1:]
     settings = SceneSettings(**json.loads(parameters))
-    trace_frames(
-        Path(root), Scene(settings), range(int(first), settings.frames, int(step))
-    )
+    frames = range(int(first), settings.frames, int(step))
+    trace_frames(Path(root), Scene(settings), frames)
 
 
 def trace_frames(root: Path, scene: Scene, frames: Iterable[int]) -> None:
-    """Writes images, masks and labels of the frames for all cameras, where they do not exist."""
+    """Writes images, masks and labels of the frames for all cameras, unless they exist."""
     for frame in frames:
-        person = None
+        person = None  # posed for the first image that does not exist
         for name, view in scene.views.items():
-            paths = [root / kind / name / f"{frame:06d}.png" for kind in KINDS]
+            paths = [root / kind / name / f"{frame:06d}.png" for kind in IMAGE_FOLDERS]
             if all(path.is_file() for path in paths):
                 continue
             person = person or scene.posed(frame)
             image, alpha, labels = person.render(view, scene.settings.rays_per_pixel)
             if name in scene.tints:
                 image = scene.tints[name](image, alpha)
-            pixels = (_bytes(image[..., ::-1]), _bytes(alpha), labels.astype(np.uint8))
+            # OpenCV writes blue, green, red.
+            bgr = np.ascontiguousarray(image[..., ::-1])
+            pixels = (_bytes(bgr), _bytes(alpha), labels.astype(np.uint8))
             for path, content in zip(paths, pixels, strict=True):
-                encoded = cv2.imencode(".png", np.ascontiguousarray(content))[1]
+                _, encoded = cv2.imencode(".png", content)
                 write_atomically(path, encoded.tobytes())
 
 
@@ -184,19 +199,24 @@ def _bytes(x: NDArray[np.float64]) -> NDArray[np.uint8]:
 
 
 def _calibration(view: SceneCamera) -> dict[str, Any]:
+    """A camera's entry of cameras.json."""
+    H, W = view.size
     return {
         "K": view.K.tolist(),
         "R": view.R.tolist(),
         "t": view.t.tolist(),
         "dist": [0.0] * 5 if view.dist is None else view.dist.tolist(),
-        "size": [view.size[1], view.size[0]],
+        "size": [W, H],
     }
 
 
 def _write_skeletons(root: Path, scene: Scene) -> None:
+    """Writes landmarks of body, hands and face, and the free body's exact pose."""
     names, points = scene.landmarks()
     p = points.astype(np.float32)
-    ids = np.arange(len(points))
+    ids = np.arange(len(p))
+
+    # The body's landmarks, with the fields of triangulated ones.
     shape = (len(p), BODY)
     np.savez(
         root / "landmarks3d.npz",
@@ -208,6 +228,8 @@ def _write_skeletons(root: Path, scene: Scene) -> None:
         names=np.array(names[:BODY]),
         passage=np.array(scene.motion.passages),
     )
+
+    # The free body has no landmarks of the face.
     for name, part in (("hands3d", HANDS), ("face3d", FACE)):
         if names[part]:
             np.savez(
@@ -216,6 +238,7 @@ def _write_skeletons(root: Path, scene: Scene) -> None:
                 frame_id=ids,
                 names=np.array(names[part]),
             )
+
     if scene.settings.avatar == FREE_BODY:
         pose = free_pose(scene.motion)
         np.savez(
@@ -228,27 +251,35 @@ def _write_skeletons(root: Path, scene: Scene) -> None:
 
 
 def _meta(scene: Scene) -> dict[str, Any]:
-    chosen = {
-        name: value
-        for name, value in asdict(scene.settings).items()
-        if value is not None
-    }
-    splits = ("train_cameras", "test_cameras", "train_frames", "test_frames")
-    return {
-        "fps": scene.settings.frames / scene.source.duration,
+    """The content of meta.json."""
+    settings = scene.settings
+    meta: dict[str, Any] = {
+        "fps": settings.frames / scene.source.duration,
         "unit": "m",
         "up_axis": "z",
         "skeleton": "mediapipe33",
         "pixel_centre": 0.5,
-        # images are premultiplied: blending them again darkens edges
+        # Images are premultiplied: blending them again darkens edges.
         "background": "black",
-        **({"body": "free"} if scene.settings.avatar == FREE_BODY else {}),
-        "label_names": list(scene.character.label_names),
-        "splits": {name: getattr(scene, name) for name in splits},
-        "made_by": {
-            "generator": "gsgan.synthetic",
-            "version": gsgan.__version__,
-            "key": dataset_key(scene.settings),
-            **chosen,
-        },
     }
+    if settings.avatar == FREE_BODY:
+        meta["body"] = "free"
+    meta["label_names"] = list(scene.character.label_names)
+    meta["splits"] = {
+        "train_cameras": scene.train_cameras,
+        "test_cameras": scene.test_cameras,
+        "train_frames": scene.train_frames,
+        "test_frames": scene.test_frames,
+    }
+
+    # Settings of disabled effects are left out.
+    made_by = {
+        "generator": "gsgan.synthetic",
+        "version": gsgan.__version__,
+        "key": dataset_key(settings),
+    }
+    for name, value in asdict(settings).items():
+        if value is not None:
+            made_by[name] = value
+    meta["made_by"] = made_by
+    return meta

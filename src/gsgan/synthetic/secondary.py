@@ -3,10 +3,10 @@
 Linear blend skinning cannot do these: the sway depends on the motion before a moment, the wrinkles
 on the pose. Both are smooth over the mesh, and the same whichever moments are requested.
 
-Convention: metres, seconds, world frame, Z up.
+Units are metres and seconds, in the world frame with Z up.
 """
 
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,81 +20,114 @@ from gsgan.synthetic.trace import Wrinkles
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# Where cloth is loose: its label, the bones that carry it, the joint it hangs from (None: the top
-# of the hair), metres from there at which it starts to sway and sways fully, and its share then.
-LOOSE: tuple[tuple[str, tuple[str, ...], str | None, float, float, float], ...] = (
-    (
-        "upper_clothes",
-        ("LeftArm", "LeftForeArm", "LeftHand"),
-        "LeftArm",
-        0.05,
-        0.28,
-        1.0,
+
+class LooseCloth(NamedTuple):
+    """A region of cloth or hair that sways: less near its origin, fully far from it."""
+
+    label: str
+    bones: tuple[str, ...]  # that carry it
+    origin: str | None  # joint that it hangs from; None: the top of the hair
+    start: float  # metres from the origin at which it starts to sway
+    full: float  # metres from the origin from which it sways fully
+    share: float  # of the full sway
+
+
+def _sleeve(side: str) -> LooseCloth:
+    return LooseCloth(
+        label="upper_clothes",
+        bones=(f"{side}Arm", f"{side}ForeArm", f"{side}Hand"),
+        origin=f"{side}Arm",
+        start=0.05,
+        full=0.28,
+        share=1.0,
+    )
+
+
+def _trouser_leg(side: str) -> LooseCloth:
+    return LooseCloth(
+        label="lower_clothes",
+        bones=(f"{side}UpLeg", f"{side}Leg", f"{side}Foot"),
+        origin=f"{side}UpLeg",
+        start=0.15,
+        full=0.85,
+        share=0.8,
+    )
+
+
+LOOSE_CLOTH = (
+    _sleeve("Left"),
+    _sleeve("Right"),
+    # The shirt on the trunk, and its hem on the thighs.
+    LooseCloth(
+        label="upper_clothes",
+        bones=("Spine2", "Spine1", "Spine", "Hips"),
+        origin="Neck",
+        start=0.20,
+        full=0.60,
+        share=0.5,
     ),
-    (
-        "upper_clothes",
-        ("RightArm", "RightForeArm", "RightHand"),
-        "RightArm",
-        0.05,
-        0.28,
-        1.0,
+    LooseCloth(
+        label="upper_clothes",
+        bones=("LeftUpLeg", "RightUpLeg"),
+        origin="Neck",
+        start=0.20,
+        full=0.60,
+        share=0.5,
     ),
-    ("upper_clothes", ("Spine2", "Spine1", "Spine", "Hips"), "Neck", 0.20, 0.60, 0.5),
-    ("upper_clothes", ("LeftUpLeg", "RightUpLeg"), "Neck", 0.20, 0.60, 0.5),
-    (
-        "lower_clothes",
-        ("LeftUpLeg", "LeftLeg", "LeftFoot"),
-        "LeftUpLeg",
-        0.15,
-        0.85,
-        0.8,
+    _trouser_leg("Left"),
+    _trouser_leg("Right"),
+    # A skirt.
+    LooseCloth(
+        label="lower_clothes",
+        bones=("Hips",),
+        origin="Hips",
+        start=0.15,
+        full=0.60,
+        share=1.0,
     ),
-    (
-        "lower_clothes",
-        ("RightUpLeg", "RightLeg", "RightFoot"),
-        "RightUpLeg",
-        0.15,
-        0.85,
-        0.8,
+    # Long hair.
+    LooseCloth(
+        label="hair",
+        bones=("Head", "Neck", "Spine2", "Spine1"),
+        origin=None,
+        start=0.15,
+        full=0.45,
+        share=1.0,
     ),
-    ("lower_clothes", ("Hips",), "Hips", 0.15, 0.60, 1.0),
-    ("hair", ("Head", "Neck", "Spine2", "Spine1"), None, 0.15, 0.45, 1.0),
 )
-# Hz of the springs, and their share of critical damping
-FREQUENCY = 2.4
-DAMPING = 0.35
-# samples per second of the springs, and seconds before the motion starts
-RATE = 60.0
-LEAD = 2.5
+SPRING_FREQUENCY = 2.4  # Hz of the springs
+SPRING_DAMPING = 0.35  # of the springs, as a share of critical damping
+SAMPLE_RATE = 60.0  # samples per second of the springs
+LEAD = 2.5  # seconds of rest before the motion starts
 LIMIT = 0.04  # metres: a sway approaches it and never exceeds it
 HANG = 0.025  # metres by which cloth hangs off a horizontal bone
 INWARDS = 0.25  # share of a sway into the body that is kept
 SMOOTHING = 4  # rounds that spread looseness from vertex to vertex
 
-# Joints that crease cloth: the bone that bends, the one that it bends against, the end of the
-# creased limb, and the metres along the limb over which folds fade.
+
+class Crease(NamedTuple):
+    """A joint that creases cloth."""
+
+    bone: str  # that bends
+    base: str  # that it bends against
+    end: str  # of the creased limb
+    reach: float  # metres along the limb over which folds fade
+
+
 CREASES = (
-    *(
-        (
-            f"{side}{bone}",
-            f"{side}{base}" if base != "Hips" else base,
-            f"{side}{end}",
-            reach,
-        )
-        for side in ("Left", "Right")
-        for bone, base, end, reach in (
-            ("ForeArm", "Arm", "Hand", 0.12),
-            ("Arm", "Shoulder", "ForeArm", 0.10),
-            ("Leg", "UpLeg", "Foot", 0.15),
-            ("UpLeg", "Hips", "Leg", 0.13),
-        )
-    ),
-    ("Spine2", "Hips", "Neck", 0.15),
+    Crease("LeftForeArm", "LeftArm", "LeftHand", 0.12),
+    Crease("LeftArm", "LeftShoulder", "LeftForeArm", 0.10),
+    Crease("LeftLeg", "LeftUpLeg", "LeftFoot", 0.15),
+    Crease("LeftUpLeg", "Hips", "LeftLeg", 0.13),
+    Crease("RightForeArm", "RightArm", "RightHand", 0.12),
+    Crease("RightArm", "RightShoulder", "RightForeArm", 0.10),
+    Crease("RightLeg", "RightUpLeg", "RightFoot", 0.15),
+    Crease("RightUpLeg", "Hips", "RightLeg", 0.13),
+    Crease("Spine2", "Hips", "Neck", 0.15),
 )
 WAVELENGTH = 0.055  # metres from one fold to the next
-# of the deepest folds, and how soon they appear
-SLOPE = 0.8
-STIFFNESS = 1.5
+MAX_SLOPE = 0.8  # of the deepest folds
+STIFFNESS = 1.5  # how soon folds appear as a joint bends
 FLANK = 0.05  # metres from a limb's axis at which folds are fully one-sided
 
 
@@ -111,23 +144,28 @@ class Secondary:
 
     def __init__(self, character: Character, motion: Moving) -> None:
         self.character = character
-        # vertices that a seam of the texture duplicates move as one
-        _, first, self._weld = np.unique(
+        self._index = {name: i for i, name in enumerate(character.bones)}
+
+        # Vertices that a seam of the texture duplicates are welded, so that they move as one.
+        _, first, weld = np.unique(
             np.round(character.vertices, 5),
             axis=0,
             return_index=True,
             return_inverse=True,
         )
-        self._weld = self._weld.ravel()
+        self._weld = weld.ravel()
         self._count = np.bincount(self._weld)
         self._faces = self._weld[character.faces]
+        self._corner = self._faces.ravel()
         self._rest = character.vertices[first]
-        V = len(first)
-        J = len(character.bones)
-        rows = np.repeat(np.arange(V), 4)
+
+        # The skinning weights as a sparse matrix [W, J].
+        rows = np.repeat(np.arange(len(first)), 4)
         columns = character.bone_index[first].ravel()
         weights = character.bone_weight[first].ravel()
-        self._skin = coo_array((weights, (rows, columns)), shape=(V, J)).tocsr()
+        shape = (len(first), len(character.bones))
+        self._skin = coo_array((weights, (rows, columns)), shape=shape).tocsr()
+
         self._loose = self._looseness()
         self._times, self._sway = self._springs(motion)
         self._crease()
@@ -143,21 +181,29 @@ class Secondary:
             vertices: ``[V, 3]`` skinned, metres.
             normals: ``[V, 3]`` skinned, unit.
         """
-        at = np.clip(time, 0, self._times[-1]) * RATE
+        # The sway at this time, between two samples of the springs.
+        at = np.clip(time, 0, self._times[-1]) * SAMPLE_RATE
         low = min(int(at), len(self._times) - 2)
         share = at - low
         sway = (1 - share) * self._sway[low] + share * self._sway[low + 1]
         offset = self._loose[:, None] * (self._skin @ sway)
+
+        # Cloth hardly sways into the body.
         outwards = self._welded(normals)
         into = np.minimum((offset * outwards).sum(axis=1, keepdims=True), 0)
         offset -= (1 - INWARDS) * into * outwards
+
+        # Cloth does not sway below the floor.
         before = self._welded(vertices)
         after = before + offset
-        # not below the floor
-        after[:, 2] = np.maximum(after[:, 2], np.minimum(before[:, 2], 0))
+        floor = np.minimum(before[:, 2], 0)
+        after[:, 2] = np.maximum(after[:, 2], floor)
+
+        # Normals turn as the faces do.
         turned = self._face_normals(after) - self._face_normals(before)
         moved = vertices + (after - before)[self._weld]
-        return moved, unit(normals + turned[self._weld]), self._wrinkles(rotations)
+        shaded = unit(normals + turned[self._weld])
+        return moved, shaded, self._wrinkles(rotations)
 
     def _welded(self, x: Array) -> Array:
         """Mean ``[W, 3]`` of the duplicates of each vertex."""
@@ -166,151 +212,191 @@ class Secondary:
 
     def _face_normals(self, vertices: Array) -> Array:
         """``[W, 3]`` unit normals of a mesh, faces weighted by their area."""
-        a, b, c = (vertices[self._faces[:, i]] for i in range(3))
-        area = np.cross(b - a, c - a)
-        corner = self._faces.ravel()
-        sums = [
-            np.bincount(corner, np.repeat(area[:, i], 3), len(vertices))
-            for i in range(3)
-        ]
+        a = vertices[self._faces[:, 0]]
+        b = vertices[self._faces[:, 1]]
+        c = vertices[self._faces[:, 2]]
+        area = np.repeat(np.cross(b - a, c - a), 3, axis=0)
+        W = len(vertices)
+        sums = [np.bincount(self._corner, area[:, i], W) for i in range(3)]
         return unit(np.stack(sums, axis=1))
 
     def _share_of(self, label: str) -> Array:
         """``[W]`` 1 on a label, falling smoothly to 0 beyond its hem."""
         c = self.character
-        V = len(self._rest)
+        W = len(self._rest)
+        # A person without such clothes has none of it.
         if label not in c.label_names:
-            return np.zeros(V)
-        corner = self._faces.ravel()
+            return np.zeros(W)
+
+        # Share of the label among the faces around each vertex.
         own = np.repeat(c.labels == c.label_names.index(label), 3)
-        share = np.bincount(corner, own, V) / np.maximum(
-            np.bincount(corner, minlength=V), 1
-        )
-        start = self._faces.ravel()
+        faces = np.bincount(self._corner, minlength=W)
+        share = np.bincount(self._corner, own, W) / np.maximum(faces, 1)
+
+        # Smoothing over each vertex and its neighbours along the edges.
+        start = self._corner
         end = np.roll(self._faces, 1, axis=1).ravel()
-        ends = (np.r_[start, end, np.arange(V)], np.r_[end, start, np.arange(V)])
-        near: csr_array = coo_array((np.ones(len(ends[0])), ends), shape=(V, V)).tocsr()
+        every = np.arange(W)
+        rows = np.r_[start, end, every]
+        columns = np.r_[end, start, every]
+        near: csr_array = coo_array(
+            (np.ones(len(rows)), (rows, columns)), shape=(W, W)
+        ).tocsr()
         total = near.sum(axis=1)
         for _ in range(SMOOTHING):
             share = (near @ share) / total
-        # 1 up to the hem, where half of the faces are cloth's
+
+        # At the hem, half of the faces have the label: it keeps the share 1.
         return np.minimum(2 * share, 1)
 
     def _looseness(self) -> Array:
         """``[W]`` share of a sway that each vertex follows: 0 where tight, growing to the hems."""
-        c = self.character
         loose = np.zeros(len(self._rest))
-        index = {name: i for i, name in enumerate(c.bones)}
-        for label, bones, origin, start, full, share in LOOSE:
-            of_label = self._share_of(label)
-            carried = self._skin[:, [index[b] for b in bones if b in index]].sum(axis=1)
-            if not of_label.any() or (origin is not None and origin not in index):
+        for cloth in LOOSE_CLOTH:
+            of_label = self._share_of(cloth.label)
+            if not of_label.any() or cloth.origin not in (None, *self._index):
                 continue
-            if origin is None:
+
+            # The point that the cloth hangs from.
+            if cloth.origin is not None:
+                top = self.character.joints[self._index[cloth.origin]]
+            else:
                 hair = self._rest[of_label > 0.5]
                 top = hair[hair[:, 2].argmax()] if len(hair) else self._rest[0]
-            else:
-                top = c.joints[index[origin]]
-            far = np.clip(
-                (np.linalg.norm(self._rest - top, axis=1) - start) / (full - start),
-                0,
-                1,
-            )
-            loose += share * of_label * carried * far * far * (3 - 2 * far)
+
+            # A smooth step with the distance from that point.
+            distance = np.linalg.norm(self._rest - top, axis=1)
+            far = (distance - cloth.start) / (cloth.full - cloth.start)
+            far = np.clip(far, 0, 1)
+            bones = [self._index[b] for b in cloth.bones if b in self._index]
+            carried = self._skin[:, bones].sum(axis=1)
+            loose += cloth.share * of_label * carried * far * far * (3 - 2 * far)
         return loose
 
     def _springs(self, motion: Moving) -> tuple[Array, Array]:
         """Times ``[T]`` and the sway ``[T, J, 3]`` of what hangs on each bone.
 
-        A damped spring holds a mass at the middle of the bone's loose vertices.
+        A damped spring holds a mass at the middle of the bone's loose vertices. With the place
+        x(t) of its anchor and the displacement h(t) at which it hangs, its sway s follows
+        s'' + 2 D w s' + w^2 s = -x'' + w^2 h.
         """
-        c = self.character
-        times = np.arange(max(2, int(np.ceil(motion.duration * RATE)) + 1)) / RATE
+        joints = self.character.joints
+        count = max(2, int(np.ceil(motion.duration * SAMPLE_RATE)) + 1)
+        times = np.arange(count) / SAMPLE_RATE
         poses = motion.at(np.minimum(times, motion.duration))
+
+        # The middle of the loose vertices of each bone, the joint if it has none.
         hold = self._skin.multiply(self._loose[:, None]).tocsr()
         total = hold.sum(axis=0)
         middle = (hold.T @ self._rest) / np.maximum(total, 1e-9)[:, None]
-        middle = np.where((total > 1e-9)[:, None], middle, c.joints)
-        place = poses.joints + np.einsum(
-            "tjab,jb->tja", poses.rotations, middle - c.joints
-        )
-        along = np.einsum("tjab,jb->tja", poses.rotations, unit(middle - c.joints))
-        hang = -HANG * (np.array([0, 0, 1.0]) - along * along[..., 2:])
-        w = 2 * np.pi * FREQUENCY
-        spring = [1, 2 * DAMPING * w, w * w]
-        sway = _filtered([-1, 0, 0], spring, place) + _filtered([w * w], spring, hang)
+        middle = np.where((total > 1e-9)[:, None], middle, joints)
+        arm = middle - joints
+
+        # The anchors over time. Cloth hangs straight down, but not along its own bone.
+        place = poses.joints + np.einsum("tjab,jb->tja", poses.rotations, arm)
+        along = np.einsum("tjab,jb->tja", poses.rotations, unit(arm))
+        up = np.array([0, 0, 1.0])
+        hang = -HANG * (up - along * along[..., 2:])
+
+        # The springs' transfer functions.
+        w = 2 * np.pi * SPRING_FREQUENCY
+        spring = [1, 2 * SPRING_DAMPING * w, w * w]
+        inertia = _filtered([-1, 0, 0], spring, place)
+        sway = inertia + _filtered([w * w], spring, hang)
+
+        # The sway is limited smoothly.
         size = np.linalg.norm(sway, axis=-1, keepdims=True)
-        return times, sway * (LIMIT * np.tanh(size / LIMIT) / np.maximum(size, 1e-9))
+        limited = LIMIT * np.tanh(size / LIMIT)
+        return times, sway * (limited / np.maximum(size, 1e-9))
 
     def _crease(self) -> None:
-        """What is constant of the wrinkles: each vertex belongs to the joint nearest to it."""
-        c = self.character
+        """Pose-independent part of the wrinkles: each vertex has the folds of its nearest joint."""
         x = self._rest
+        index = self._index
+        known = []
+        for crease in CREASES:
+            if {crease.bone, crease.base, crease.end} <= index.keys():
+                known.append(crease)
+
+        self._bends = np.zeros((len(known), 2), np.int64)
+        self._axis = np.zeros((len(known), 3))
+        near = np.zeros((len(known), len(x)))
+        phase = np.zeros((len(known), len(x)))
+        for k, crease in enumerate(known):
+            # The limb's axis, and coordinates along and across it.
+            joint = self.character.joints[index[crease.bone]]
+            axis = unit(self.character.joints[index[crease.end]] - joint)
+            across = unit(np.cross(axis, [0.36, 0.48, 0.8]))
+            offset = x - joint
+            along = offset @ axis
+            self._bends[k] = index[crease.bone], index[crease.base]
+            self._axis[k] = axis
+
+            # Folds run askew round the limb, and are neither straight nor evenly spaced.
+            warp = 1.1 * np.sin(offset @ across / 0.03)
+            warp = warp + 0.9 * np.sin(along / 0.05 + 1)
+            askew = offset @ (axis + 0.5 * across)
+            phase[k] = 2 * np.pi * askew / WAVELENGTH + warp
+
+            # Only the limb's own skin is creased, not a hand that rests on the hip.
+            limb = self._skin[:, self._bends[k]].sum(axis=1)
+            fading = np.exp(-((along / crease.reach) ** 2))
+            near[k] = fading * np.minimum(2 * limb, 1)
+
+        # Folds belong to the nearest joint, and vanish where two joints are equally near.
+        self._own = np.zeros(len(x), np.int64)
+        self._phase = np.zeros(len(x))
+        if known:
+            self._own = near.argmax(axis=0)
+            self._phase = phase[self._own, np.arange(len(x))]
+        ordered = np.sort(np.vstack([np.zeros((2, len(x))), near]), axis=0)
         cloth = np.maximum(
             self._share_of("upper_clothes"), self._share_of("lower_clothes")
         )
-        index = {name: i for i, name in enumerate(c.bones)}
-        known = [k for k in CREASES if all(name in index for name in k[:3])]
-        self._bends = np.array([[index[n] for n in k[:2]] for k in known]).reshape(
-            -1, 2
-        )
-        near = np.zeros((len(known), len(x)))
-        phase = np.zeros((len(known), len(x)))
-        self._axis = np.zeros((len(known), 3))
-        for k, (bone, _, end, reach) in enumerate(known):
-            joint = c.joints[index[bone]]
-            axis = self._axis[k] = unit(c.joints[index[end]] - joint)
-            off = x - joint
-            across = unit(np.cross(axis, [0.36, 0.48, 0.8]))
-            # folds run askew round the limb, and are neither straight nor evenly spaced
-            warp = 1.1 * np.sin(off @ across / 0.03) + 0.9 * np.sin(
-                off @ axis / 0.05 + 1
-            )
-            phase[k] = 2 * np.pi * (off @ (axis + 0.5 * across)) / WAVELENGTH + warp
-            # of the limb's own skin alone: a hand that rests on the hip has no part in it
-            limb = self._skin[:, self._bends[k]].sum(axis=1)
-            near[k] = np.exp(-((off @ axis / reach) ** 2)) * np.minimum(2 * limb, 1)
-        self._own = near.argmax(axis=0) if known else np.zeros(len(x), np.int64)
-        ordered = np.sort(np.vstack([np.zeros((2, len(x))), near]), axis=0)
-        # 0 where two joints are equally near
         self._near = cloth * (ordered[-1] - ordered[-2])
-        self._phase = phase[self._own, np.arange(len(x))] if known else np.zeros(len(x))
 
     def _wrinkles(self, rotations: Array) -> Wrinkles:
-        c = self.character
+        """The folds of a pose, deepest on the inner side of bent joints."""
         slope = np.zeros(len(self._rest))
         across = np.zeros_like(self._rest)
         if len(self._bends):
+            # The limb's end moves in this direction as the joint bends: its inner side.
             bone, base = self._bends.T
             bent = np.swapaxes(rotations[base], 1, 2) @ rotations[bone]
-            # where the limb's end moves as the joint bends: folds are deepest on that side
             inner = np.einsum("kij,kj->ki", bent, self._axis) - self._axis
-            own = self._own
-            off = self._rest - c.joints[bone[self._own]]
-            flexion = np.linalg.norm(inner, axis=1)
-            side = np.clip(
-                (off * inner[own]).sum(axis=1) / FLANK, -flexion[own], flexion[own]
-            )
-            deep = np.tanh(STIFFNESS * (0.6 * flexion[own] + 0.4 * side))
-            slope = SLOPE * self._near * deep
-            R = np.reshape(
-                self._skin @ rotations.reshape(len(rotations), 9), (-1, 3, 3)
-            )
-            across = unit(np.einsum("vij,vj->vi", R, self._axis[own]))
-        fields = (self._phase[self._weld], slope[self._weld], across[self._weld])
-        return Wrinkles(*(x.astype(np.float32) for x in fields))
+            flexion = np.linalg.norm(inner, axis=1)[self._own]
+
+            # Folds deepen as the joint bends.
+            offset = self._rest - self.character.joints[bone[self._own]]
+            side = (offset * inner[self._own]).sum(axis=1) / FLANK
+            side = np.clip(side, -flexion, flexion)
+            deep = np.tanh(STIFFNESS * (0.6 * flexion + 0.4 * side))
+            slope = MAX_SLOPE * self._near * deep
+
+            # Their direction turns with the skin.
+            blended = self._skin @ rotations.reshape(len(rotations), 9)
+            R = np.reshape(blended, (-1, 3, 3))
+            across = unit(np.einsum("vij,vj->vi", R, self._axis[self._own]))
+        return Wrinkles(
+            phase=self._phase[self._weld].astype(np.float32),
+            slope=slope[self._weld].astype(np.float32),
+            across=across[self._weld].astype(np.float32),
+        )
 
 
 def _filtered(numerator: list[float], denominator: list[float], signal: Array) -> Array:
-    """A filter of Laplace's s over samples ``[T, …]``, at rest long before they start."""
-    b, a = bilinear(numerator, denominator, RATE)
-    lead = min(int(LEAD * RATE), len(signal) - 1)
-    # mirrored about the first sample: the signal starts with its speed, without a jerk
-    before = 2 * signal[:1] - signal[lead:0:-1]
-    padded = (
-        np.concatenate([before, signal]) - before[:1] if lead else signal - signal[:1]
-    )
-    start = before[0] if lead else signal[0]
+    """Samples ``[T, …]`` after a transfer function in s (bilinear transform), from rest."""
+    b, a = bilinear(numerator, denominator, SAMPLE_RATE)
+
+    # The signal is extended by its mirror image about the first sample: it starts with its
+    # speed, without a jerk.
+    lead = min(int(LEAD * SAMPLE_RATE), len(signal) - 1)
+    padded = signal
+    if lead:
+        before = 2 * signal[:1] - signal[lead:0:-1]
+        padded = np.concatenate([before, signal])
+
+    # A constant signal is only scaled, so the filter starts at rest from the first value.
     gain = numerator[-1] / denominator[-1]
-    out: Array = lfilter(b, a, padded, axis=0)[lead:] + gain * start
-    return out
+    filtered: Array = lfilter(b, a, padded - padded[:1], axis=0)
+    return filtered[lead:] + gain * padded[0]

@@ -1,6 +1,6 @@
 """Textures of a character's surfaces, looked up by rays.
 
-Convention: v runs down, texel centres at +0.5, textures repeat; colours in linear light.
+v runs down, texel centres are at +0.5, textures repeat; colours are in linear light.
 """
 
 from collections.abc import Iterator
@@ -15,13 +15,14 @@ from gsgan.motion.character import Surface
 Floats = NDArray[np.floating[Any]]  # float32
 Ints = NDArray[np.int64]
 
-# texels along a side, about 2 mm on a person; larger textures are reduced
-LARGEST = 1024
-FLAT = (0.0, 0.0, 1.0)  # a normal map's neutral value
+# Texels along a side, about 2 mm on a person; larger textures are reduced.
+MAX_TEXELS = 1024
+FLAT_NORMAL = (0.0, 0.0, 1.0)  # a normal map's neutral value
 
 
 def linear(srgb: Floats) -> Floats:
     """Linear light of sRGB in [0, 1]."""
+    # The standard's curve, linear near black.
     curve = ((srgb + np.float32(0.055)) / np.float32(1.055)) ** np.float32(2.4)
     return np.where(srgb <= 0.04045, srgb / np.float32(12.92), curve)
 
@@ -38,18 +39,21 @@ class Textures:
     def __init__(self, surfaces: tuple[Surface, ...]) -> None:
         pyramids = [list(_pyramid(surface)) for surface in surfaces]
         self.levels = np.array([len(levels) for levels in pyramids])
+
+        # The first texel and the size of each level of each surface.
         shape = (len(pyramids), self.levels.max())
         self._start = np.zeros(shape, np.int64)
         self._size = np.ones((*shape, 2), np.int64)
+        texels = []
         count = 0
         for m, levels in enumerate(pyramids):
-            for k, texels in enumerate(levels):
+            for k, level in enumerate(levels):
+                height, width = level.shape[:2]
                 self._start[m, k] = count
-                self._size[m, k] = texels.shape[1::-1]
-                count += texels.shape[0] * texels.shape[1]
-        self._texels = np.concatenate(
-            [t.reshape(-1, 8) for levels in pyramids for t in levels]
-        )
+                self._size[m, k] = (width, height)
+                texels.append(level.reshape(-1, 8))
+                count += height * width
+        self._texels = np.concatenate(texels)
 
     def size(self, surface: Ints) -> Ints:
         """``[N, 2]`` width and height in texels of surfaces ``[N]``."""
@@ -68,21 +72,29 @@ class Textures:
         level = np.clip(level, 0, self.levels[surface] - 1)
         start = self._start[surface, level]
         size = self._size[surface, level]
+
+        # The texel up and left of each point, and the point's place between it and the next.
         at = (uv - np.floor(uv)) * size.astype(np.float32) - np.float32(0.5)
         corner = np.floor(at)
         share = at - corner
-        low = corner.astype(np.int64)
-        high = corner.astype(np.int64) + 1
-        low = np.where(low < 0, size - 1, low)
-        high = np.where(high >= size, 0, high)
-        top = start + low[:, 1] * size[:, 0]
-        bottom = start + high[:, 1] * size[:, 0]
         x = share[:, :1]
         y = share[:, 1:]
-        out = self._texels[top + low[:, 0]] * ((1 - x) * (1 - y))
-        out += self._texels[top + high[:, 0]] * (x * (1 - y))
-        out += self._texels[bottom + low[:, 0]] * ((1 - x) * y)
-        out += self._texels[bottom + high[:, 0]] * (x * y)
+
+        # Textures repeat.
+        low = corner.astype(np.int64)
+        high = low + 1
+        low = np.where(low < 0, size - 1, low)
+        high = np.where(high >= size, 0, high)
+
+        # The four texels around each point, weighted.
+        top = start + low[:, 1] * size[:, 0]
+        bottom = start + high[:, 1] * size[:, 0]
+        left = low[:, 0]
+        right = high[:, 0]
+        out = self._texels[top + left] * ((1 - x) * (1 - y))
+        out += self._texels[top + right] * (x * (1 - y))
+        out += self._texels[bottom + left] * ((1 - x) * y)
+        out += self._texels[bottom + right] * (x * y)
         return out[:, :3], out[:, 3], out[:, 4:7]
 
 
@@ -91,25 +103,30 @@ def _pyramid(surface: Surface) -> Iterator[Floats]:
 
     Linear RGB, coverage, normal, and one unused channel that keeps texels aligned in memory.
     """
+    # The first level, reduced to at most `MAX_TEXELS` a side.
     h, w = surface.colour.shape[:2]
-    shrink = max(1.0, max(h, w) / LARGEST)
+    shrink = max(1.0, max(h, w) / MAX_TEXELS)
     h = max(1, round(h / shrink))
     w = max(1, round(w / shrink))
     texels = np.zeros((h, w, 8), np.float32)
     colour = surface.colour.astype(np.float32) / 255
     colour[..., :3] = linear(colour[..., :3])
-    texels[..., :4] = cv2.resize(colour, (w, h), interpolation=cv2.INTER_AREA)
-    texels[..., 4:7] = FLAT
+    texels[..., :4] = _resized(colour, w, h)
+    texels[..., 4:7] = FLAT_NORMAL
     if surface.normal is not None:
         normal = surface.normal.astype(np.float32) / 127.5 - 1
-        texels[..., 4:7] = cv2.resize(normal, (w, h), interpolation=cv2.INTER_AREA)
+        texels[..., 4:7] = _resized(normal, w, h)
     yield texels
+
+    # OpenCV resizes at most four channels at once.
     while h > 1 or w > 1:
         h = max(1, h // 2)
         w = max(1, w // 2)
-        halves = [
-            cv2.resize(texels[..., c : c + 4], (w, h), interpolation=cv2.INTER_AREA)
-            for c in (0, 4)  # OpenCV resizes at most four channels
-        ]
-        texels = np.concatenate(halves, axis=2)
+        first = _resized(texels[..., :4], w, h)
+        last = _resized(texels[..., 4:], w, h)
+        texels = np.concatenate([first, last], axis=2)
         yield texels
+
+
+def _resized(texels: Floats, width: int, height: int) -> NDArray[Any]:
+    return cv2.resize(texels, (width, height), interpolation=cv2.INTER_AREA)
