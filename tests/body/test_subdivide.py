@@ -7,7 +7,9 @@ import trimesh
 
 from gsgan.body import free_body
 from gsgan.body.subdivide import subdivided
+from gsgan.model.body_points import BodyPoints, points_for
 from gsgan.scene import BodyPose
+from gsgan.utils.errors import ConfigError
 
 
 @pytest.fixture(scope="module")
@@ -63,3 +65,18 @@ def test_new_vertices_move_with_their_edge(body):
     rest = torch.cdist(finer.vertices[count:], body.vertices).min(1).values
     assert (posed[count:] - finer.vertices[count:]).norm(dim=1).max() > 0.1
     assert (apart - rest).abs().max() < 0.01
+
+
+def test_points_for_images_are_as_far_apart_as_asked(body):
+    """Also for a person twice as large in the images; within the bounds."""
+    height = 1.8757
+    for scale in (150.0, 300.0):
+        count = points_for(height, scale, spacing=1.5)
+        points = BodyPoints(body, height, points="auto", scale=scale).points
+        assert len(points) == count
+        mean_square = mesh(body).area / count
+        assert scale * mean_square**0.5 == pytest.approx(1.5, rel=0.05)
+    assert points_for(height, 5.0, spacing=1.5) == 5000
+    assert points_for(height, 5000.0, spacing=1.5) == 100_000
+    with pytest.raises(ConfigError, match="spacing"):
+        points_for(height, 100.0, spacing=0.0)

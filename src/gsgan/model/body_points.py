@@ -31,6 +31,11 @@ ROWS = 1024  # points compared with all others at a time
 # controls that correct a point; bones that it may follow
 NEAREST = 4
 BONES = 6
+AUTO = "auto"
+SKIN = 2.1  # square metres, the surface of a body of the stature
+STATURE = 1.75  # metres
+FEWEST = 5000
+MOST = 100_000
 LEAST = 1e-3  # a possible weight below it starts there, so that it can grow
 
 
@@ -225,7 +230,10 @@ class BodyPoints(nn.Module):
         body: vertices, weights and joints.
         body_height: metres, the length scale of Ψ's input.
         points: number of points: vertices spread evenly over the surface, or, if the body has
-            fewer, all of them and the middles of its longest edges; None for all vertices.
+            fewer, all of them and the middles of its longest edges; None for all vertices; "auto"
+            for `points_for` the training images.
+        scale: pixels per metre at the person in training images, for "auto".
+        spacing: pixels between neighbouring points in these images, for "auto".
         sigma: initial standard deviation, as a share of the distance to the nearest neighbour.
         mean_step: of Ψ: its means move by this share of what they would on a skeleton's points.
         stretch: shapes and normals also follow the stretch of the surface, see
@@ -245,7 +253,9 @@ class BodyPoints(nn.Module):
         body: SkinnedBody,
         body_height: float,
         *,
-        points: int | None = None,
+        points: int | str | None = None,
+        scale: float = 1.0,
+        spacing: float = 1.5,
         sigma: float = 0.7,
         mean_step: float = 1.0,
         stretch: bool = True,
@@ -253,7 +263,10 @@ class BodyPoints(nn.Module):
         rate: float = 1.0,
     ) -> None:
         super().__init__()
+        if points == AUTO:
+            points = points_for(body_height, scale, spacing)
         if points is not None:
+            points = whole("model.body_points.points", points, 1)
             body = subdivided(body, points)
         above("model.body_points.sigma", sigma)
         above("model.body_points.mean_step", mean_step)
@@ -282,6 +295,10 @@ class BodyPoints(nn.Module):
     def n_points(self) -> int:
         """N."""
         return len(self.points)
+
+    def pixels_apart(self, scale: float) -> float:
+        """The median distance of neighbouring points in images of ``scale`` pixels per metre."""
+        return scale * float(self.points.spacing.median())
 
     def stretch_terms(self) -> tuple[Tensor, Tensor]:
         """Columns and factors of `gsgan.body.lbs.stretched`, of the weights that move the means."""
@@ -322,6 +339,22 @@ class BodyPoints(nn.Module):
             ),
             stretched=jacobian,
         )
+
+
+def points_for(body_height: float, scale: float, spacing: float) -> int:
+    """The number of points that are ``spacing`` pixels apart, on average, in training images.
+
+    It is a multiple of 100 between the bounds `FEWEST` and `MOST`.
+
+    Args:
+        body_height: metres.
+        scale: pixels per metre at the person.
+        spacing: pixels.
+    """
+    above("model.body_points.spacing", spacing)
+    area = SKIN * (body_height / STATURE) ** 2
+    count = area * (scale / spacing) ** 2
+    return int(min(max(FEWEST, round(count, -2)), MOST))
 
 
 def moved_normals(A: Tensor, normals: Tensor) -> Tensor:

@@ -195,7 +195,9 @@ def _assembled(
     body_points = None
     if parts.densify and parts.body_points and effects.body_points.on:
         body = _required_body(scene, "effects.body_points=on")
-        body_points = parts.body_points(body=body, body_height=body_height)
+        body_points = parts.body_points(
+            body=body, body_height=body_height, scale=scene.scale_train[1]
+        )
     sizes = {"body_height": body_height, "sh_degree": effects.degree}
     deformation = surface = None
     if parts.deformation and (points := body_points or parts.densify):

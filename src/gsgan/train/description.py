@@ -60,6 +60,13 @@ def describe(
                 name, f"{sum(p.numel() for p in part.parameters()):,} parameters"
             )
 
+    # The Gaussians.
+    on_body = avatar.body_points
+    if on_body is not None:
+        apart = on_body.pixels_apart(info.scale_train[1])
+        number = f"{len(on_body.points):,} on the body"
+        table.add_row("Gaussians", f"{number}, {apart:.1f} pixels apart")
+
     # The losses that need other networks or labels.
     if module.perceptual is not None:
         every = module.step_two.perceptual_every
