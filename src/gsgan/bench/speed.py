@@ -38,7 +38,7 @@ PRECISIONS: dict[str, torch.dtype | None] = {
     "16-mixed": torch.float16,
 }
 # frames come from the first that has any
-SPLITS = ("novel_pose", "novel_view", "train")
+SHOWN_SPLITS = ("novel_pose", "novel_view", "train")
 Painter = Callable[[Frame], Tensor]
 
 
@@ -142,12 +142,12 @@ def load_subject(
 
 
 def spread(data: GsganData, count: int, split: str | None = None) -> list[Frame]:
-    """At most ``count`` frames, evenly over a split; None selects the first of `SPLITS` with any.
+    """At most ``count`` frames, evenly over a split; None: of the first that has any.
 
     Raises:
         ConfigError: when the split has no frame.
     """
-    names = SPLITS if split is None else (split,)
+    names = SHOWN_SPLITS if split is None else (split,)
     name = next((n for n in names if len(data.dataset(n))), None)
     if name is None:
         why = data.reasons.get(names[0], "it has no frames")

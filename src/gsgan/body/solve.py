@@ -41,7 +41,7 @@ from gsgan.utils.tensors import constant
 
 # Numbers of landmarks: of the pose, and with both hands.
 BODY = len(MEDIAPIPE33.names)
-WITH_HANDS = len(MEDIAPIPE33_HANDS.names)
+WITH_HAND_JOINTS = len(MEDIAPIPE33_HANDS.names)
 SKELETON_SIZES = [len(template.names) for template in TEMPLATES.values()]
 BEYOND = 0.05  # standard deviation of a number below its minimum
 # Metres, standard deviations of landmarks: detectors locate those of face and palm less well.
@@ -199,9 +199,9 @@ class Solver(nn.Module):
 
         # Hands: their fingers, and the landmarks of the palm if they place the hand.
         found = None
-        hands = skeleton[:, BODY:WITH_HANDS]
+        hands = skeleton[:, BODY:WITH_HAND_JOINTS]
         if self.fingers is not None and hands.shape[1]:
-            seen = (visibility[:, BODY:WITH_HANDS] > 0) & hands.isfinite().all(-1)
+            seen = (visibility[:, BODY:WITH_HAND_JOINTS] > 0) & hands.isfinite().all(-1)
             near = torch.where(seen.unsqueeze(-1), hands - shift, 0.0)
             found = self.fingers(near, seen)
             replaced = (found.placed.unsqueeze(-1) & self.replaced).any(1)
@@ -238,8 +238,8 @@ class Solver(nn.Module):
         body, valid = sanitise(p[:, :BODY], shown[:, :BODY])
         hands = None
         if self.fingers is not None and p.shape[1] > BODY:
-            landmarks = p[:, BODY:WITH_HANDS]
-            seen = (shown[:, BODY:WITH_HANDS] > 0) & landmarks.isfinite().all(-1)
+            landmarks = p[:, BODY:WITH_HAND_JOINTS]
+            seen = (shown[:, BODY:WITH_HAND_JOINTS] > 0) & landmarks.isfinite().all(-1)
             hands = (landmarks, seen)
         theta, transl = compiled.solve(
             *self.job(),
@@ -323,7 +323,7 @@ class Solver(nn.Module):
         """``[B, joints]`` bool: joints at rest in `solve`, for want of visible landmarks."""
         # The landmarks that count: those of a palm replace some of the 33.
         seen = visibility[:, :BODY] > 0
-        hands = visibility[:, BODY:WITH_HANDS] > 0
+        hands = visibility[:, BODY:WITH_HAND_JOINTS] > 0
         fingers = self.fingers if hands.shape[1] else None
         if fingers is not None:
             placed = fingers.placed(hands)

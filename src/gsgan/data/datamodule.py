@@ -48,7 +48,7 @@ log = logging.getLogger(__name__)
 
 MOST_WORKERS = 8
 # choices of data.body
-BODY = ("auto", "file", "fit", "none")
+BODY_SOURCES = ("auto", "file", "fit", "none")
 # choices of effects.distortion, as the dataset calls them
 LENSES: dict[str, Lens] = {
     "auto": "undistort",
@@ -134,7 +134,7 @@ class GsganData(LightningDataModule):
         self.source = source
         self.smpl = smpl
         self.reader = CaptureReader() if reader is None else reader
-        self.body = one_of("data.body", body, BODY)
+        self.body = one_of("data.body", body, BODY_SOURCES)
         self.skeleton = one_of("data.skeleton", skeleton, TEMPLATES)
         self.protocol = protocol
         self.split_keys = split_keys

@@ -35,7 +35,7 @@ HAND_JOINTS = {15: numbers.LEFT, 16: numbers.RIGHT}
 # lips, brows and lids
 EXPRESSION = numbers.FACE
 # sign of the standard pose's x, by wrist
-SIDES = {15: 1.0, 16: -1.0}
+BODY_SIDES = {15: 1.0, 16: -1.0}
 HEELS_AND_TOES = (29, 30, 31, 32)
 # nose, eyes, ears, corners of the mouth
 HEAD_LANDMARKS = tuple(range(11))
@@ -117,7 +117,7 @@ def measure_proportions(p: Tensor, valid: Tensor, up: str) -> Proportions:
         ends = [pinky, index, thumb]
         frames = hand_frame(q, wrist, pinky, index)  # [F, 3, 3]
         held = _local(frames, q[:, ends] - q[:, wrist, None])  # [3, 3]
-        rest[ends] = rest[wrist] + held * (SIDES[wrist], 1.0, SIDES[wrist])
+        rest[ends] = rest[wrist] + held * (BODY_SIDES[wrist], 1.0, BODY_SIDES[wrist])
     _place_feet(rest, q)
     _place_head(rest, q, hubs)
     hands = _hands(p.double().numpy() @ to_standard, valid.numpy())
@@ -242,7 +242,7 @@ def _standing_hands(rest: Float, hands: Mapping[int, Float]) -> Float:
     """``[42, 3]`` the hands of `_hands` at the wrists of a standard pose ``[33, 3]``."""
     placed = []
     for wrist, hand in hands.items():
-        placed.append(rest[wrist] + hand * (SIDES[wrist], 1.0, SIDES[wrist]))
+        placed.append(rest[wrist] + hand * (BODY_SIDES[wrist], 1.0, BODY_SIDES[wrist]))
     return np.concatenate(placed)
 
 

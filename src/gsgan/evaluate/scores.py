@@ -43,7 +43,7 @@ NO_LABELS = "the data has no part labels"
 NO_PARTS_OF_SPLAT = "Step I's colour is not a segmentation"
 NO_PARTS_OF_FLOOR = "an all-background image is not a segmentation"
 # what a tally keeps of the images that it has scored
-KEPT = ("rows", "grid", "matrices", "no_parts")
+TALLY_STATE = ("rows", "grid", "matrices", "no_parts")
 Predict = Callable[[Frame, Item], Prediction]
 # "camera", "frame", and a score by metric
 Row = dict[str, Any]
@@ -285,11 +285,11 @@ class Tally:
 
     def state_dict(self) -> dict[str, Any]:
         """The scores so far as plain values and tensors, without the last frame."""
-        return {name: getattr(self, name) for name in KEPT}
+        return {name: getattr(self, name) for name in TALLY_STATE}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Goes on from the scores of `state_dict`; `look_at` gives the last frame."""
-        for name in KEPT:
+        for name in TALLY_STATE:
             setattr(self, name, state[name])
 
     def look_at(self, item: Item, frame: Frame, prediction: Prediction) -> None:

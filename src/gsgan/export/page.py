@@ -32,7 +32,7 @@ from gsgan.utils.errors import ConfigError
 from gsgan.utils.provenance import SOFTWARE, SOURCE_TYPE, XMP
 
 WEB = Path(__file__).with_name("web")
-VERSION = 2  # of the block
+PAGE_VERSION = 2  # of the block
 ALPHA_MIN = 1 / 255  # of the page, where the avatar's own is less
 KINDS = {"i1": "int8", "u1": "uint8", "i2": "int16", "u2": "uint16", "f4": "float32"}
 BEFORE_COLOUR = (
@@ -103,7 +103,7 @@ def block(
     """
     header, arrays = gaussians_of(avatar)
     people, more = body_of(run)
-    header |= people | {"version": VERSION, "name": name, "xmp": XMP}
+    header |= people | {"version": PAGE_VERSION, "name": name, "xmp": XMP}
     arrays |= more
     listed = []
     still = {"rest pose": (rest_pose(run.proportions), 1.0)}

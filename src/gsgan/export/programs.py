@@ -12,7 +12,7 @@ from gsgan.model.avatar import Avatar
 from gsgan.scene import BodyPose, Camera
 from gsgan.utils.errors import ConfigError
 
-LARGEST = 8192  # largest side of an ONNX program's images, pixels
+MAX_PROGRAM_SIDE = 8192  # largest side of an ONNX program's images, pixels
 
 
 def unfrozen(avatar: Avatar) -> Avatar:
@@ -171,7 +171,9 @@ def onnx_program(avatar: Avatar) -> bytes:
         raise ConfigError("format=onnx needs: pip install 'gsgan[export]'") from None
     networks = PoseAndGenerator(unfrozen(avatar)).eval()
     (given, times), stride = networks.inputs(), networks.generator.stride
-    sides = [stride * Dim(name, min=1, max=LARGEST // stride) for name in ("h", "w")]
+    sides = [
+        stride * Dim(name, min=1, max=MAX_PROGRAM_SIDE // stride) for name in ("h", "w")
+    ]
     shapes = {
         name: {2 + i: times[name] * side for i, side in enumerate(sides)}
         if name in times

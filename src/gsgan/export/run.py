@@ -48,7 +48,7 @@ SCORES = {
     "lpips_alex": "LPIPS-Alex ↓",
     "edge_f1": "edge F1 ↑",
 }
-VARIANTS = {"full": "final image", "splat": "Step I's colour"}
+EXPORTED_VARIANTS = {"full": "final image", "splat": "Step I's colour"}
 USE = """\
 Images of this one person in new poses and from new cameras, with the person's consent: sign
 language, research, telepresence, film. Its images are synthetic: say so where they are shown
@@ -113,10 +113,14 @@ def _licence(data: str | None) -> str:
 
 def _scores(folder: Path) -> str:
     table = [
-        (split, VARIANTS[variant], *(_number(scores.get(key)) for key in SCORES))
+        (
+            split,
+            EXPORTED_VARIANTS[variant],
+            *(_number(scores.get(key)) for key in SCORES),
+        )
         for split, variants in _read(folder / "metrics.json").items()
         for variant, scores in variants.items()
-        if variant in VARIANTS
+        if variant in EXPORTED_VARIANTS
     ]
     if not table:
         return "Not evaluated: run `python -m gsgan.evaluate` first."

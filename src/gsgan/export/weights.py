@@ -15,12 +15,12 @@ from gsgan.utils.config import config_folder
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.tensors import pick_device
 
-KEPT = ("effects", "scene", "marks")  # of a checkpoint's facts
+KEPT_FACTS = ("effects", "scene", "marks")  # of a checkpoint's facts
 DAMAGED = (
     *(AttributeError, LookupError, RecursionError, TypeError, ValueError),
     OmegaConfBaseException,
 )
-MISSING = "safetensors files need: pip install 'gsgan[export]'"
+NEEDS_SAFETENSORS = "safetensors files need: pip install 'gsgan[export]'"
 
 
 def weights_bytes(folder: Path, avatar: Avatar, facts: dict[str, Any]) -> bytes:
@@ -37,11 +37,11 @@ def weights_bytes(folder: Path, avatar: Avatar, facts: dict[str, Any]) -> bytes:
     try:
         from safetensors.torch import save
     except ImportError:
-        raise ConfigError(MISSING) from None
+        raise ConfigError(NEEDS_SAFETENSORS) from None
 
     config = OmegaConf.to_container(read_config(folder), resolve=False)
     metadata = {"format": "pt", "config": json.dumps(config)}
-    metadata["gsgan"] = json.dumps({key: facts.get(key) for key in KEPT})
+    metadata["gsgan"] = json.dumps({key: facts.get(key) for key in KEPT_FACTS})
     return save({k: v.contiguous() for k, v in avatar.state_dict().items()}, metadata)
 
 
@@ -59,7 +59,7 @@ def load_weights(path: str | Path, *, device: str = "auto") -> Avatar:
     try:
         from safetensors import SafetensorError, safe_open
     except ImportError:
-        raise ConfigError(MISSING) from None
+        raise ConfigError(NEEDS_SAFETENSORS) from None
     path = Path(path).expanduser()
     try:
         with safe_open(path, "pt") as file:

@@ -19,12 +19,12 @@ from gsgan.utils.errors import ConfigError
 BETAS = (0.9, 0.99)
 FINAL_RATE = 0.02  # of the learning rates, in the last sweep
 CONTROLS = 200  # points whose distances from the body the surface interpolates
-REACH = 0.06  # metres: the surface stays this close to the body
-SPREAD = 1.5  # of the controls' influence, in distances between them
+MAX_CLOTHES = 0.06  # metres: the surface stays this close to the body
+CONTROL_SPREAD = 1.5  # of the controls' influence, in distances between them
 # standard deviation of a Gaussian, as a share of the points' spacing
 SIGMA = 0.7
 OPACITY = 0.95
-LOOSE = 0.25  # weight of landmarks of face and palm, whose definitions differ
+LOOSE_WEIGHT = 0.25  # weight of landmarks of face and palm, whose definitions differ
 LOOSE_LANDMARKS = (*range(11), *range(17, 23))
 ANGLE = 0.1  # radians of a joint's turn that cost as much as a landmark `noise` away
 
@@ -98,7 +98,7 @@ class FittedSurface(nn.Module):
         controls = farthest_points(means, min(CONTROLS, len(means)))
         distance = torch.cdist(means, means[controls])
         second = distance.topk(2, largest=False).values[:, 1]
-        spread = SPREAD * second.median()
+        spread = CONTROL_SPREAD * second.median()
         basis = torch.softmax(-(distance / spread).square(), dim=1)
         self.register_buffer("basis", basis, persistent=False)
         self.offsets = nn.Parameter(torch.zeros(basis.shape[1]))
@@ -106,11 +106,11 @@ class FittedSurface(nn.Module):
 
     def posed(self, pose: BodyPose) -> tuple[Gaussians, Tensor]:
         """The Gaussians of a pose, and its landmarks ``[B, 33, 3]`` metres."""
-        # points at rest, moved along their normals by at most `REACH`, and then with the bones
+        # points at rest, moved along their normals by at most `MAX_CLOTHES`, then with the bones
         bones = self.body.transforms(pose)
         points = self.points
         A, t = blend_transforms(bones, points.bone_index, points.bone_weight)
-        distance = self.basis @ (REACH * torch.tanh(self.offsets / REACH))
+        distance = self.basis @ (MAX_CLOTHES * torch.tanh(self.offsets / MAX_CLOTHES))
         means = skin(points.means + distance.unsqueeze(-1) * self.normals, A, t)
 
         # round Gaussians, which turn and stretch with the skin
@@ -180,7 +180,7 @@ class Fitter:
 
         # weights of the landmarks, and an optimiser each for surface and poses
         self.weight = frames.visibility.clone()
-        self.weight[:, list(LOOSE_LANDMARKS)] *= LOOSE
+        self.weight[:, list(LOOSE_LANDMARKS)] *= LOOSE_WEIGHT
         self.surface_optimiser = torch.optim.Adam(
             self.surface.parameters(), settings.surface_rate, BETAS
         )

@@ -18,9 +18,9 @@ from gsgan.scene import Camera, Window, body_window, unit
 from gsgan.utils.arrays import Bytes, evenly_spaced
 from gsgan.utils.errors import DataError
 
-NEAR = 0.01  # metres: nearer joints are not projected
+MIN_DEPTH = 0.01  # metres: nearer joints are not projected
 # metres around the joints, as in the avatar's windows: a wider margin costs time
-MARGIN = 0.25
+WINDOW_MARGIN = 0.25
 # quantile of the masks' areas that counts as usual: most masks may be nearly empty
 USUAL = 0.75
 
@@ -190,6 +190,11 @@ def rotated(cameras: Sequence[str], most: int | None, turn: int) -> list[str]:
 def around(skeleton: Tensor, seen: Silhouette) -> Silhouette:
     """The part of an image around ``skeleton [J, 3]`` that is compared with the mask."""
     window = body_window(
-        skeleton[None], seen.camera, margin=MARGIN, multiple=16, least=32, near=NEAR
+        skeleton[None],
+        seen.camera,
+        margin=WINDOW_MARGIN,
+        multiple=16,
+        least=32,
+        near=MIN_DEPTH,
     )
     return seen.cut(window)

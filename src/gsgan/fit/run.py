@@ -118,9 +118,9 @@ def summary(report: dict[str, Any], folder: Path, masked: MaskedFrames) -> list[
 
 
 SIZE = 128  # pixels of the images that the fit before training uses
-MARGIN = 0.2  # metres around the person in these images
+IMAGE_MARGIN = 0.2  # metres around the person in these images
 LOCK = ".body_fit.lock"
-BLOCK = 500  # frames whose poses are solved at once, which bounds memory
+FRAMES_AT_ONCE = 500  # frames whose poses are solved at once, which bounds memory
 
 
 def run_fit(config: DictConfig) -> Path:
@@ -158,7 +158,7 @@ def fit_before_training(
     # small images around the person
     seen = copy(data)
     seen.size = SIZE
-    seen.crop = PersonCrop(margin=MARGIN)
+    seen.crop = PersonCrop(margin=IMAGE_MARGIN)
     with ExitStack() as stack:
         with writing(root):
             stack.enter_context(locked(root / LOCK))
@@ -360,9 +360,9 @@ def _solve_all(
     frames = data.layout.frames
     blocks = []
     with progress(console) as bars:
-        starts = range(0, len(frames), BLOCK)
+        starts = range(0, len(frames), FRAMES_AT_ONCE)
         for start in bars.track(starts, description="poses from skeletons"):
-            block = frames[start : start + BLOCK]
+            block = frames[start : start + FRAMES_AT_ONCE]
             blocks.append(_solve(data, shape, block, hands=hands))
     return cat(blocks)
 

@@ -26,7 +26,7 @@ from gsgan.skeleton import MEDIAPIPE33, sanitise
 from gsgan.skeleton.hands import HAND, HAND_EDGES, WRIST
 from gsgan.utils.errors import DataError
 
-FRAMES = 24  # maximum number: every frame shows the same lengths
+MAX_SHAPE_FRAMES = 24  # maximum number: every frame shows the same lengths
 # Standard deviations of the prior; that of coefficients is 1.
 STRETCH = 0.1  # of a stretch's logarithm
 OFFSET = 0.015  # metres
@@ -48,7 +48,7 @@ UNSURE = 0.1
 INDEPENDENT = 4.0
 FOREARMS = [[13, 15], [14, 16]]  # elbow and wrist
 SIZES = (0.75, 1.35)  # minimum and maximum size of a hand, as a share of the body's
-FARTHEST = 0.05  # maximum move of a hand, metres
+MAX_HAND_MOVE = 0.05  # maximum move of a hand, metres
 NUMBERS = 99  # of the offsets: x, y, z of 33 landmarks
 LENGTH_STEPS = 10
 STEPS = 8
@@ -63,7 +63,7 @@ def fit_shape(skeletons: Tensor, visibility: Tensor) -> BodyShape:
     shape. Coefficients, stretches and offsets have a Gaussian prior.
 
     Args:
-        skeletons: ``[F, 33, 3]`` metres; at most `FRAMES` of them are used.
+        skeletons: ``[F, 33, 3]`` metres; at most `MAX_SHAPE_FRAMES` of them are used.
         visibility: ``[F, 33]``; landmarks at 0, and those not finite, are not used.
 
     Raises:
@@ -96,7 +96,7 @@ def fit_hands(
     Returns:
         The shape, unchanged if no frame shows a hand. The wrist and place of a hand stay the
         body's if no frame shows the hand with its forearm, or if they would move by more than
-        `FARTHEST`.
+        `MAX_HAND_MOVE`.
     """
     shape = replace(shape, hands=None)
     hands = skeletons[:, BODY:]
@@ -135,7 +135,7 @@ def fit_hands(
     in_hand = _median(in_hand, usable.unsqueeze(-1))
     joints = body.joints[[body.joint_names.index(name) for name in WRISTS]]
     moves = torch.stack([on_arm - joints, on_arm - in_hand], dim=1)
-    near = (moves.norm(dim=-1) <= FARTHEST).all(-1)
+    near = (moves.norm(dim=-1) <= MAX_HAND_MOVE).all(-1)
     return replace(shape, hands=moves.where(near[:, None, None], 0.0))
 
 
@@ -183,7 +183,7 @@ def _usable(skeletons: Tensor, visibility: Tensor) -> tuple[Tensor, Tensor]:
         frames = seen[:, MEDIAPIPE33.shoulders].all(-1).nonzero().flatten()
     if not len(frames):
         raise DataError("fit_shape: no frame has both shoulders")
-    chosen = frames[:: math.ceil(len(frames) / FRAMES)]
+    chosen = frames[:: math.ceil(len(frames) / MAX_SHAPE_FRAMES)]
     p, valid = sanitise(skeletons[chosen].double(), seen[chosen].double())
     return p, valid
 

@@ -29,8 +29,8 @@ from gsgan.utils.tensors import derived
 NORMAL_FLOOR = 1e-2
 ROWS = 1024  # points compared with all others at a time
 # controls that correct a point; bones that it may follow
-NEAREST = 4
-BONES = 6
+NEAREST_CONTROLS = 4
+FOLLOWED_BONES = 6
 AUTO = "auto"
 SKIN = 2.1  # square metres, the surface of a body of the stature
 STATURE = 1.75  # metres
@@ -72,7 +72,7 @@ class LearntWeights(nn.Module):
         count = min(controls, len(places))
         at = places[farthest_points(places, count)]
         distance, near = torch.cdist(places, at).topk(
-            min(NEAREST, count), largest=False
+            min(NEAREST_CONTROLS, count), largest=False
         )
         share = functional.softmax(-2 * (distance / distance.mean()).square(), dim=1)
         own = bone_weight / bone_weight.sum(1, keepdim=True)
@@ -81,7 +81,9 @@ class LearntWeights(nn.Module):
         total = interpolate.sum(0).clamp_min(1e-6).unsqueeze(1)
         # weights of the neighbourhood
         around = interpolate @ (interpolate.mT @ dense / total)
-        index = ((dense > LEAST) + around).topk(min(BONES, joints), dim=1).indices
+        index = (
+            ((dense > LEAST) + around).topk(min(FOLLOWED_BONES, joints), dim=1).indices
+        )
         possible = (dense + around).gather(1, index) > LEAST
         start = (
             dense.gather(1, index).clamp_min(LEAST).log().masked_fill(~possible, -30.0)

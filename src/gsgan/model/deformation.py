@@ -19,9 +19,9 @@ from gsgan.splat.sh import sh_to_colour
 from gsgan.utils.checks import between, one_of, whole
 from gsgan.utils.tensors import constant, derived
 
-NEAREST = 3  # anchors between which the MLP's output is interpolated
+NEAREST_ANCHORS = 3  # anchors between which the MLP's output is interpolated
 POSE_AXES = 20  # principal directions of the training poses' codes
-POSES = ("pose_mean", "pose_axes", "pose_spread", "place_mean", "place_spread")
+POSE_BUFFERS = ("pose_mean", "pose_axes", "pose_spread", "place_mean", "place_spread")
 # inside the root that normalises a quaternion: q0 + δq ≈ 0 stays finite
 QUAT_FLOOR = 1e-12
 
@@ -298,7 +298,7 @@ class Deformation(ResidualGaussians):
         every = len(rest_points)
         self.anchored = anchors is not None and anchors < every
         if anchors is not None and self.anchored:
-            whole("model.deformation.anchors", anchors, NEAREST)
+            whole("model.deformation.anchors", anchors, NEAREST_ANCHORS)
             rest_points = self._place_anchors(rest_points, anchors)
         points = len(rest_points)
         self.position_octaves = position_octaves
@@ -306,7 +306,7 @@ class Deformation(ResidualGaussians):
         self.pose_limit = pose_limit
         size = 3 * joints
         shapes = (size,), (size, POSE_AXES), (POSE_AXES,), (points, 3), (points, 3)
-        for name, shape in zip(POSES, shapes, strict=True):
+        for name, shape in zip(POSE_BUFFERS, shapes, strict=True):
             value = math.inf if name.endswith("spread") else 0.0
             self.register_buffer(name, torch.full(shape, value))
 
@@ -341,7 +341,9 @@ class Deformation(ResidualGaussians):
         """
         anchors = farthest_points(rest_points, count)
         places = rest_points[anchors]
-        distance, near = cKDTree(places.numpy()).query(rest_points.numpy(), k=NEAREST)
+        distance, near = cKDTree(places.numpy()).query(
+            rest_points.numpy(), k=NEAREST_ANCHORS
+        )
         spread = distance[:, 0].mean()
         share = torch.from_numpy(-((distance / spread) ** 2)).float().softmax(1)
         self.register_buffer("anchors", anchors)
@@ -384,7 +386,7 @@ class Deformation(ResidualGaussians):
     def _load_from_state_dict(
         self, state: dict[str, Tensor], prefix: str, *rest: Any
     ) -> None:
-        for name in POSES:  # runs of before 2026-11-25 have none
+        for name in POSE_BUFFERS:  # runs of before 2026-11-25 have none
             state.setdefault(prefix + name, getattr(self, name))
         super()._load_from_state_dict(state, prefix, *rest)
 

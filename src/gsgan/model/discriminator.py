@@ -5,7 +5,7 @@ from torch.nn import functional
 
 from gsgan.utils.checks import one_of, whole
 
-SLOPE = 0.2
+LEAKY_SLOPE = 0.2
 
 
 class PatchDiscriminator(nn.Module):
@@ -36,7 +36,7 @@ class PatchDiscriminator(nn.Module):
             between: list[nn.Module] = (
                 [nn.InstanceNorm2d(channels)] if normal and i > 0 else []
             )
-            blocks.append(nn.Sequential(conv, *between, nn.LeakyReLU(SLOPE)))
+            blocks.append(nn.Sequential(conv, *between, nn.LeakyReLU(LEAKY_SLOPE)))
             previous = channels
         self.blocks = nn.ModuleList(blocks)
         self.logits = nn.Conv2d(previous, 1, 4, padding=2)
@@ -47,7 +47,9 @@ class PatchDiscriminator(nn.Module):
                 nn.init.normal_(conv.weight, 0.0, 0.02)
             # He et al. 2015: without normalisation the signal would vanish under 0.02
             else:
-                nn.init.kaiming_normal_(conv.weight, a=SLOPE, nonlinearity="leaky_relu")
+                nn.init.kaiming_normal_(
+                    conv.weight, a=LEAKY_SLOPE, nonlinearity="leaky_relu"
+                )
             nn.init.zeros_(conv.bias)  # type: ignore[arg-type]
 
     def forward(self, image: Tensor) -> list[Tensor]:

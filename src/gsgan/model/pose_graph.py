@@ -18,7 +18,7 @@ from gsgan.skeleton import (
     root_of,
 )
 
-NEIGHBOUR = 0.05  # initial weight of an edge; the diagonal starts at 1
+NEIGHBOUR_WEIGHT = 0.05  # initial weight of an edge; the diagonal starts at 1
 READOUT_START = 0.8  # initial standard deviation of g for joint channels of 1
 
 
@@ -41,7 +41,7 @@ class GraphLayer(nn.Module):
         joints = mask.shape[0]
         self.register_buffer("mask", mask, persistent=False)
         identity = torch.eye(joints)
-        self.adjacency = nn.Parameter(identity + NEIGHBOUR * (mask - identity))
+        self.adjacency = nn.Parameter(identity + NEIGHBOUR_WEIGHT * (mask - identity))
         self.weight = nn.Parameter(torch.empty(joints, inputs, outputs))
         bound = 1 / math.sqrt(inputs)
         nn.init.uniform_(self.weight, -bound, bound)

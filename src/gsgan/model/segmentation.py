@@ -18,9 +18,11 @@ from gsgan.utils.errors import ConfigError
 from gsgan.utils.tensors import full_precision
 
 IGNORE = 255
-FLOOR = 1e-6  # inside logarithms, so that a class without splats has a gradient
+PROBABILITY_FLOOR = (
+    1e-6  # inside logarithms, so that a class without splats has a gradient
+)
 HANDS = ("left_hand", "right_hand")
-FACE = "face_neck"
+FACE_CLASS = "face_neck"
 
 
 class Segmentation(SkinnedGaussians):
@@ -159,7 +161,7 @@ def _classes_as_loaded(segmentation: nn.Module, _: Any) -> None:
 
 
 def segmentation_loss(segmentation: Tensor, labels: Tensor) -> Tensor:
-    """Cross-entropy of rendered probabilities: mean of -log(P of the true class + `FLOOR`).
+    """Cross-entropy of rendered probabilities: the mean of -log(P of the true class + floor).
 
     There is no softmax: the maps are probabilities. Pixels whose label has no channel (255, and
     classes that no vertex has) are left out. Without any other pixel the loss is 0.
@@ -169,7 +171,7 @@ def segmentation_loss(segmentation: Tensor, labels: Tensor) -> Tensor:
         labels: ``[B, H, W]`` int64, see `Segmentation.truth`.
     """
     labels = torch.where(labels < segmentation.shape[1], labels, IGNORE)
-    log = (segmentation + FLOOR).log()
+    log = (segmentation + PROBABILITY_FLOOR).log()
     total = functional.nll_loss(log, labels, ignore_index=IGNORE, reduction="sum")
     return total / (labels != IGNORE).sum().clamp_min(1)
 
@@ -187,7 +189,9 @@ def silhouette_loss(
     Returns:
         The mean over the other pixels; 0 where there are none.
     """
-    loss = -(mask * (alpha + FLOOR).log() + (1 - mask) * (1 - alpha + FLOOR).log())
+    log_person = (alpha + PROBABILITY_FLOOR).log()
+    log_rest = (1 - alpha + PROBABILITY_FLOOR).log()
+    loss = -(mask * log_person + (1 - mask) * log_rest)
     sure = torch.ones_like(loss) if unsure is None else (unsure <= 0).to(loss)
     return (loss * sure).sum() / sure.sum().clamp_min(1)
 
@@ -247,7 +251,7 @@ def class_map(
 
 
 def _hands(label_names: Sequence[str], face: bool) -> ClassMap:
-    requested = (*HANDS, FACE) if face else HANDS
+    requested = (*HANDS, FACE_CLASS) if face else HANDS
     groups = [group_of_part(name) for name in label_names]
     lacking = [name for name in requested if name not in groups]
     if lacking:

@@ -62,7 +62,7 @@ DOUBTFUL = 3.0  # a frame with this many times the usual error is left out
 # The result is in doubt with a shorter video, a smaller turn, a background that moves more, more
 # images of several people, or fewer images of the feet.
 MIN_SECONDS = 8.0  # seconds
-MIN_TURN = 300  # degrees
+MIN_CAMERA_TURN = 300  # degrees
 MAX_BACKGROUND_MOVE = 0.03  # share of the image
 MAX_OTHER_FACES = 0.2  # share of the images
 MIN_FEET_SEEN = 0.5  # share of the images
@@ -448,7 +448,7 @@ def _notes(found: Mapping[str, Any], options: Options, natural: float) -> list[s
     feet = found["feet_seen"]
     if seconds < MIN_SECONDS:
         notes.append(f"doubtful: {seconds:.1f} seconds are short, 20 to 40 are better")
-    if turned < MIN_TURN:
+    if turned < MIN_CAMERA_TURN:
         notes.append(
             f"doubtful: only {turned} of 360 degrees were filmed; training guesses the rest"
         )

@@ -68,11 +68,11 @@ MAX_TIME_GAP = 0.5  # seconds: motion is not smooth over a longer gap
 ZOOMS = np.arange(-4, 5) / 10  # logarithms of focal lengths to try
 ZOOM_STEPS = 8  # Gauss-Newton steps for each focal length
 ZOOM_NEIGHBOURS = 2  # neighbours on each side of the minimum in the parabola fit
-MAX_STEPS = 20  # maximum number of Gauss-Newton steps
+MAX_VIEW_STEPS = 20  # maximum number of Gauss-Newton steps
 MIN_GAIN = 1e-4  # relative change of the cost at which the solver stops
 MIN_STANDING = 8  # landmarks of feet: fewer do not show the ground
 # Levenberg-Marquardt damping: its first value, and its factors after a good and a bad step.
-FIRST_DAMPING = 1e-3
+START_DAMPING = 1e-3
 GOOD_STEP_DAMPING = 0.3
 BAD_STEP_DAMPING = 10.0
 MIN_DEPTH = 0.2  # minimum depth, metres
@@ -615,11 +615,11 @@ class Problem:
         carried = torch.einsum("nt,ftis->fnis", follows, before)
         return carried + R[:, solver.carrier] @ of_landmarks
 
-    def minimise(self, at: State, steps: int = MAX_STEPS) -> tuple[State, float]:
+    def minimise(self, at: State, steps: int = MAX_VIEW_STEPS) -> tuple[State, float]:
         """The solution, and its cost."""
         # Levenberg-Marquardt: a step that raises the cost is undone.
         best = self.cost(at)
-        damping = FIRST_DAMPING
+        damping = START_DAMPING
         for _ in range(steps):
             new = self.step(at, damping)
             cost = self.cost(new)

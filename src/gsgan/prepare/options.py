@@ -23,7 +23,7 @@ from gsgan.utils.errors import ConfigError, DataError
 MEDIAPIPE = "mediapipe"
 UP_AXES = ("x", "y", "z", "-x", "-y", "-z")
 # Options that do not change the dataset.
-FREE = ("out", "setup", "workers", "overwrite", "keep_work")
+FREE_OPTIONS = ("out", "setup", "workers", "overwrite", "keep_work")
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,9 @@ class Options:
 
     def record(self) -> dict[str, Any]:
         """The settings that the dataset depends on, as plain values."""
-        return {key: value for key, value in asdict(self).items() if key not in FREE}
+        return {
+            key: value for key, value in asdict(self).items() if key not in FREE_OPTIONS
+        }
 
     def folder(self, name: str) -> Path:
         """The path that a key holds."""

@@ -23,7 +23,7 @@ Bytes = NDArray[np.uint8]
 
 RECORD = "render.json"
 VIDEO = ".mp4"
-QUALITY = "16"  # x264's constant rate factor: visually lossless
+VIDEO_QUALITY = "16"  # x264's constant rate factor: visually lossless
 # ffmpeg's codes for the result of its RGB conversion
 BT601 = 6
 STUDIO_RANGE = 1
@@ -116,7 +116,7 @@ def encoded(images: Iterable[Bytes], fps: float) -> bytes:
             if stream is None:
                 try:
                     rate = Fraction(fps).limit_denominator(100_000)
-                    options = {"crf": QUALITY}
+                    options = {"crf": VIDEO_QUALITY}
                     stream = container.add_stream("libx264", rate=rate, options=options)
                 except Exception as error:  # PyAV's own kinds
                     raise DataError(

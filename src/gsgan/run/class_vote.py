@@ -24,7 +24,7 @@ NEIGHBOUR = 4
 DEPTH_TOLERANCE = 0.03
 CELLS = 2.0  # cells of the depth map per median occluder radius
 # cells, the largest occluder radius: a disc close to the camera would fill the map
-WIDEST = 8
+MAX_RADIUS_CELLS = 8
 MOST_CELLS = 2048  # along a side of the depth map
 
 
@@ -164,15 +164,17 @@ def seen(points: Tensor, reach: Tensor, camera: Camera, tolerance: float) -> Ten
         return visible
     cell = radius[ahead].median() / CELLS
     size = pixel.new_tensor([camera.size[1], camera.size[0]])
-    ahead &= ((pixel >= -WIDEST * cell) & (pixel <= size + WIDEST * cell)).all(-1)
+    ahead &= (
+        (pixel >= -MAX_RADIUS_CELLS * cell) & (pixel <= size + MAX_RADIUS_CELLS * cell)
+    ).all(-1)
     if not bool(ahead.any()):
         return visible
     radius = radius[ahead]
     extent = pixel[ahead].amax(0) - pixel[ahead].amin(0)
     cell = torch.maximum(cell, extent.max() / MOST_CELLS).clamp_min(1e-6)
     at = (pixel[ahead] / cell).floor().long()
-    at = at - at.amin(0) + WIDEST
-    nearest = _depth_map(at, depth[ahead], (radius / cell).clamp_max(WIDEST))
+    at = at - at.amin(0) + MAX_RADIUS_CELLS
+    nearest = _depth_map(at, depth[ahead], (radius / cell).clamp_max(MAX_RADIUS_CELLS))
     visible[ahead] = depth[ahead] <= nearest[at[:, 1], at[:, 0]] + tolerance
     return visible
 
@@ -181,9 +183,9 @@ def _depth_map(at: Tensor, depth: Tensor, radius: Tensor) -> Tensor:
     """``[h, w]`` smallest depth of the discs over each cell.
 
     Centres ``at [V, 2]`` (column, row) and radii ``[V]`` are in cells; the former are at least
-    `WIDEST`, the latter at most.
+    `MAX_RADIUS_CELLS`, the latter at most.
     """
-    width, height = (at.amax(0) + 1 + WIDEST).tolist()
+    width, height = (at.amax(0) + 1 + MAX_RADIUS_CELLS).tolist()
     flat = torch.full(
         (height * width,), torch.inf, dtype=depth.dtype, device=depth.device
     )

@@ -39,7 +39,7 @@ CODE_UNIT = 0.005
 heights a hundredth of what joints move by."""
 
 # Left half and midline: the default person's, as deep as the pose's own eyes and mouth.
-_LEFT_REST: dict[str, Vector] = {
+_LEFT_FACE: dict[str, Vector] = {
     "mouth_outer_0": (0.026, 1.515, 0.105),
     "mouth_outer_1": (0.022, 1.520, 0.110),
     "mouth_outer_2": (0.012, 1.526, 0.118),
@@ -72,9 +72,9 @@ def rest_face() -> tuple[Vector, ...]:
     """Positions of the landmarks in the rest pose of the skeleton templates, metres."""
 
     def place(name: str) -> Vector:
-        if name in _LEFT_REST:
-            return _LEFT_REST[name]
-        x, y, z = _LEFT_REST[_twin(name)]
+        if name in _LEFT_FACE:
+            return _LEFT_FACE[name]
+        x, y, z = _LEFT_FACE[_twin(name)]
         return -x, y, z
 
     return tuple(place(name) for name in FACE_NAMES)

@@ -144,7 +144,7 @@ def plain_shape(name: str) -> str:
 
 # The sums that make a canonical shape, best choice first: names as `plain_shape` writes them, of
 # gsgan's own avatars (always the first choice), VALID, ARKit, Ready Player Me and VRoid.
-SHAPES = _choices("""
+PART_SHAPES = _choices("""
     mouth_open: jawopen, mouthopen, fclmtha
     mouth_round: kiss, mouthpucker, fclmthu
     mouth_wide: tdi, mouthstretchleft+mouthstretchright, fclmthi
@@ -159,14 +159,14 @@ SHAPES = _choices("""
     brow_down: {S}browdown+{S}{S}browdown, browdown{side}, 0.5*fclbrwangry
 """)
 WANTED: set[str] = set()
-for _choice in chain.from_iterable(SHAPES.values()):
+for _choice in chain.from_iterable(PART_SHAPES.values()):
     WANTED.update(_choice)
 
 
 def canonical_shapes(found: Mapping[str, Array]) -> dict[str, Array]:
     """The canonical shapes ``[V, 3]`` that a file's own shapes can make."""
     shapes = {}
-    for shape, choices in SHAPES.items():
+    for shape, choices in PART_SHAPES.items():
         for choice in choices:
             if not choice.keys() <= found.keys():
                 continue

@@ -23,7 +23,7 @@ Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 Colour = tuple[float, float, float]
 
-BLOCK = 1 << 15  # rays traced at once: their arrays stay in the processor's cache
+BLOCK_RAYS = 1 << 15  # rays traced at once: their arrays stay in the processor's cache
 # exponent of the highlight's lobe: falls to half within about 19 degrees
 SHININESS = 12.0
 GLOSSY_PARTS = ("upper_clothes", "lower_clothes", "left_shoe", "right_shoe")
@@ -249,7 +249,7 @@ class PosedCharacter:
 
         # Pixels are traced in blocks.
         touched = np.argwhere(self._touched(view))
-        step = max(1, BLOCK // rays)
+        step = max(1, BLOCK_RAYS // rays)
         for first in range(0, len(touched), step):
             y, x = touched[first : first + step].T
             origin, directions = pixel_rays(view, x, y, rays)

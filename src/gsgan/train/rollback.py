@@ -14,7 +14,7 @@ from gsgan.scene import Frame
 from gsgan.utils.checks import between, whole
 from gsgan.utils.files import write_atomically, writing
 
-FARTHEST = 1e6  # a weight beyond it has exploded
+MAX_WEIGHT = 1e6  # a weight beyond it has exploded
 BRIGHTEST = 10.0  # mean of an image whose ground truth is within 0 and 1, likewise
 # mean difference of a discriminator's logits that no longer follow the image
 SAME = 1e-7
@@ -149,7 +149,7 @@ def likely_cause(
         largest = max(
             (float(p.detach().abs().max()) for p in held if p.numel()), key=_or_infinite
         )
-        if not _or_infinite(largest) <= FARTHEST:
+        if not _or_infinite(largest) <= MAX_WEIGHT:
             return (
                 f"the weights of {name} have exploded (up to {largest:.3g}): resume from the last "
                 f"checkpoint with a lower training.recipes.{name}.rate.peak"

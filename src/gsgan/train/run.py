@@ -61,7 +61,7 @@ from gsgan.utils.sweeps import STOPPED
 # 512² with VGG-16 and the discriminator. With small ones at 128² it was 3.4.
 STEP_PER_RENDERING = 10
 DISCRIMINATOR_SALT = 1000
-POSES = 100  # at most, whose spread is stored: all are posed at once
+MAX_STORED_POSES = 100  # at most, whose spread is stored: all are posed at once
 
 
 def run_training(config: DictConfig) -> None:
@@ -172,9 +172,9 @@ def build_training(
 
 
 def _store_poses(avatar: Avatar, data: GsganData) -> None:
-    """Stores the spread of the training poses, or of `POSES` of them, in the avatar."""
+    """Stores the spread of the training poses, or of `MAX_STORED_POSES` of them, in the avatar."""
     frames = data.splits.items["train"].frames
-    frames = [frames[i] for i in evenly_spaced(len(frames), POSES)]
+    frames = [frames[i] for i in evenly_spaced(len(frames), MAX_STORED_POSES)]
     p, valid = data.dataset("train").skeletons.joints(frames)
     poses = data.layout.poses
     body = None

@@ -11,7 +11,13 @@ from gsgan.utils.errors import ConfigError
 SEGMENTATION = "segmentation"
 STEP_ONE = "step I"
 STEP_TWO = "step II"
-STRETCHED = ("step_one", "step_two", "discriminator_start", "degree_every", "coarse")
+STRETCHED_STEPS = (
+    "step_one",
+    "step_two",
+    "discriminator_start",
+    "degree_every",
+    "coarse",
+)
 SPLATTING = ("psi", "colour")  # optimisers of the parts that make Step I's image
 # iterations of S, at most, where two numbers learn from masks (docs/effects.md)
 FROM_MASKS = 800
@@ -35,7 +41,7 @@ class Schedule:
 
     def __post_init__(self) -> None:
         above("training.schedule.stretch", self.stretch)
-        for name in ("segmentation", *STRETCHED):
+        for name in ("segmentation", *STRETCHED_STEPS):
             at_least(f"training.schedule.{name}", getattr(self, name), 0)
         at_least("training.schedule.epoch", self.epoch, 1)
         if self.total == 0:
@@ -53,7 +59,7 @@ class Schedule:
         two numbers from masks, which needs fewer iterations.
         """
         numbers = {
-            name: round(getattr(self, name) * self.stretch) for name in STRETCHED
+            name: round(getattr(self, name) * self.stretch) for name in STRETCHED_STEPS
         }
         one = numbers["step_one"]
         two = numbers["step_two"]

@@ -44,7 +44,7 @@ for side, shoulder, elbow, wrist, hip, knee, ankle, landmarks in (
         f"{side} ankle": Handle((hip, knee, ankle), turned=foot),
         f"{side} knee": Handle((hip, knee), moved=(ankle, *foot)),
     }
-NOSE_JOINT = 0
+NOSE_NUMBER = 0
 HEAD_HANDLE = "head"
 BODY_HANDLE = "body"
 HANDLE_NAMES = (*HANDLES, HEAD_HANDLE, BODY_HANDLE)
@@ -59,7 +59,7 @@ def position(p: Float, name: str) -> Float:
     """The position ``[3]`` of a handle in a pose ``[J, 3]``, metres."""
     if name == BODY_HANDLE:
         return middle(p, HIPS)
-    joint = NOSE_JOINT if name == HEAD_HANDLE else HANDLES[name].chain[-1]
+    joint = NOSE_NUMBER if name == HEAD_HANDLE else HANDLES[name].chain[-1]
     return p[joint]
 
 
@@ -83,7 +83,7 @@ def dragged(p: Float, name: str, target: Float) -> Float:
     # The head rotates so that the nose points to the target.
     if name == HEAD_HANDLE:
         neck = middle(p, SHOULDERS)
-        turn = between(p[NOSE_JOINT] - neck, target - neck)
+        turn = between(p[NOSE_NUMBER] - neck, target - neck)
         face = _present(p, (*HEAD_LANDMARKS, *HOLISTIC.expression))
         q[face] = neck + (p[face] - neck) @ turn.T
         return q

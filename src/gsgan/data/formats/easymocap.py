@@ -36,7 +36,10 @@ from gsgan.skeleton.hands import HAND
 from gsgan.utils.arrays import Float, Ints, as_floats
 from gsgan.utils.errors import DataError
 
-SKELETONS = {"smpl": "smpl24 -> mediapipe33", "keypoints3d": "body25 -> mediapipe33"}
+SKELETON_SOURCES = {
+    "smpl": "smpl24 -> mediapipe33",
+    "keypoints3d": "body25 -> mediapipe33",
+}
 # folders of EasyMocap's results
 RESULTS = ("{kind}", "output/{kind}", "output-{kind}/{kind}")
 # bound on the person's number in a mask's name
@@ -45,9 +48,9 @@ PEOPLE = 1000
 PEOPLE_KEYS = ("annots", "people")
 
 BODY_25 = 25
-WITH_HANDS = BODY_25 + 2 * HAND
+BODY_AND_HANDS = BODY_25 + 2 * HAND
 # the body; with hands, left first; with hands and face
-COUNTS = (BODY_25, WITH_HANDS, WITH_HANDS + 51)
+JOINT_COUNTS = (BODY_25, BODY_AND_HANDS, BODY_AND_HANDS + 51)
 # their numbers by MediaPipe's
 BODY_25_TO_33 = SETS[BODY_25][1]
 HANDS_TO_33 = {
@@ -104,7 +107,7 @@ class EasymocapReader(FolderReader):
             meta=Meta(
                 fps=self.fps,
                 up_axis=up_axis(cameras.values()),
-                skeleton_source=SKELETONS[kind],
+                skeleton_source=SKELETON_SOURCES[kind],
                 body=body,
                 layout="EasyMocap",
             ),
@@ -157,7 +160,7 @@ class EasymocapReader(FolderReader):
 def _source(root: Path, smpl: str | None) -> tuple[str, str]:
     """The kind of skeletons to use, fits if the user has the model, and their folder."""
     places = []
-    for kind in SKELETONS:
+    for kind in SKELETON_SOURCES:
         for pattern in RESULTS:
             place = pattern.format(kind=kind)
             if (root / place).is_dir():
@@ -308,8 +311,12 @@ def _read_keypoints(
 def _joints(where: str, raw: Any) -> Float:
     """``[J, 4]`` x, y, z and confidence, which is 1 if the file has none."""
     joints = as_floats(raw)
-    if joints.ndim != 2 or len(joints) not in COUNTS or joints.shape[1] not in (3, 4):
-        counts = ", ".join(map(str, COUNTS))
+    if (
+        joints.ndim != 2
+        or len(joints) not in JOINT_COUNTS
+        or joints.shape[1] not in (3, 4)
+    ):
+        counts = ", ".join(map(str, JOINT_COUNTS))
         raise DataError(
             f"{where}: 'keypoints3d' must have shape (J, 4) with J one of {counts} (BODY_25, with "
             f"hands, with face), found {joints.shape if joints.size else type(raw).__name__}"
