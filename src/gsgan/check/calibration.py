@@ -26,6 +26,11 @@ OUTSIDE_RATIO = 3.0
 OUTSIDE_ALL = 2.0
 
 
+def percent(share: float, digits: int = 0) -> str:
+    """A share in percent; "n/a" if nothing is known."""
+    return "n/a" if np.isnan(share) else f"{share:.{digits}%}"
+
+
 @dataclass(frozen=True)
 class CameraScore:
     """The fit of one camera's calibration to its masks."""
@@ -182,7 +187,7 @@ def calibration_findings(
     # All cameras are off, so no single one is the cause.
     off = [score for score in scores if not score.inside >= min_inside]
     if len(scores) > 1 and not beaten and not big and off == scores:
-        shares = listed(f"{score.name} {score.inside:.0%}" for score in scores)
+        shares = listed(f"{score.name} {percent(score.inside)}" for score in scores)
         text = (
             f"in every camera joints lie outside the masks (inside: {shares}): axes, unit, size or "
             "frame numbers of the skeleton are wrong, K does not follow a crop, or the masks "
@@ -217,7 +222,7 @@ def _of_one(
     min_inside: float,
 ) -> Finding | None:
     """The finding on one camera; None if nothing is wrong."""
-    seen = f"{score.inside:.0%} of the joints lie inside its masks"
+    seen = f"{percent(score.inside)} of the joints lie inside its masks"
     if len(scores) > 1:
         others = known_mean([s.inside for s in scores if s is not score])
         seen += f", {others:.0%} in the other cameras"

@@ -11,7 +11,7 @@ import torch
 from rich.console import Console
 
 from gsgan.check import overlays, views
-from gsgan.check.calibration import calibration_findings, score_cameras
+from gsgan.check.calibration import calibration_findings, percent, score_cameras
 from gsgan.check.frames import frame_findings, mask_doubts, shortened, skeleton_doubts
 from gsgan.check.report import Figure, Finding, Section, Table, counted
 from gsgan.check.settings import Limits, Sampling
@@ -351,7 +351,7 @@ def _agreement(m: Measurements) -> Section:
         rows.append(
             (
                 score.name,
-                f"{score.inside:.1%}",
+                percent(score.inside, digits=1),
                 outside,
                 f"{score.overlap:.2f}",
                 f"{score.best_rival:.2f}",
