@@ -324,3 +324,27 @@ def test_neighbours_of_a_subset_are_neighbours_on_the_surface(body):
         if labels[few[i]].startswith("left")
     }
     assert not any(second.startswith("right") for _, second in sides)
+
+
+def test_the_terms_of_the_stretch_are_renewed_every_so_many_iterations(body):
+    points = BodyPoints(body, 1.7, points=300, controls=20, stretch_every=3).train()
+    pose = BodyPose(torch.zeros(1, len(body.joints), 3), torch.zeros(1, 3))
+    field = points.points.learnt.field
+    found = []
+    for _ in range(5):
+        points(pose)
+        found.append(points._terms[1])
+        with torch.no_grad():
+            field += torch.randn(
+                field.shape, generator=torch.Generator().manual_seed(0)
+            )
+    assert found[0] is found[2]
+    assert not torch.equal(found[2], found[3])
+    assert found[3] is found[4]
+    points.renew()
+    points(pose)
+    assert not torch.equal(points._terms[1], found[4])
+    points.eval()
+    with torch.no_grad():
+        exact = points.gradients(*points.points.weights)[1]
+        torch.testing.assert_close(points.stretch_terms()[1], exact)

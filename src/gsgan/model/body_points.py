@@ -240,6 +240,8 @@ class BodyPoints(nn.Module):
         mean_step: of Ψ: its means move by this share of what they would on a skeleton's points.
         stretch: shapes and normals also follow the stretch of the surface, see
             `gsgan.body.lbs.stretched`.
+        stretch_every: iterations of training between updates of the stretch's terms, which change
+            slowly with the learnt weights.
         controls: of `LearntWeights`; 0 keeps the body's skinning weights.
         rate: of these weights' learning, times that of Ψ.
     """
@@ -249,6 +251,8 @@ class BodyPoints(nn.Module):
     part_id: Tensor
     own_columns: Tensor
     own_factors: Tensor
+    _terms: tuple[Tensor, Tensor] | None
+    _age: int
 
     def __init__(
         self,
@@ -261,6 +265,7 @@ class BodyPoints(nn.Module):
         sigma: float = 0.7,
         mean_step: float = 1.0,
         stretch: bool = True,
+        stretch_every: int = 1,
         controls: int = 0,
         rate: float = 1.0,
     ) -> None:
@@ -286,6 +291,8 @@ class BodyPoints(nn.Module):
             "part_id", torch.arange(len(self.points)), persistent=False
         )
         self.stretch = stretch
+        self.stretch_every = whole("model.body_points.stretch_every", stretch_every, 1)
+        self.renew()
         if stretch:
             self.gradients = WeightGradients(body, self.points.chosen)
             if self.points.learnt is None:
@@ -311,7 +318,22 @@ class BodyPoints(nn.Module):
         def make() -> tuple[Tensor, Tensor]:
             return self.gradients(*self.points.weights)
 
-        return derived(self, "terms", make, learnt.field)
+        if not self.training:
+            return derived(self, "terms", make, learnt.field)
+        if self._terms is None or self._age == self.stretch_every:
+            with torch.no_grad():
+                self._terms = make()
+            self._age = 0
+        self._age += 1
+        return self._terms
+
+    def renew(self) -> None:
+        """Computes the stretch's terms anew in the next iteration of training.
+
+        Every epoch begins so, and a resumed run is then the same as an unbroken one.
+        """
+        self._terms = None
+        self._age = 0
 
     def forward(self, pose: BodyPose) -> Points:
         """G in pose; each point is its own part, its frame the linear part of its skinning.

@@ -369,6 +369,10 @@ class AvatarTraining(LightningModule):
         rate = recipe.rate.at(self.step, *self.schedule.span(name, recipe.span))
         return rate * self.rollback.rate if name == "psi" else rate
 
+    def on_train_epoch_start(self) -> None:
+        if self.avatar.body_points is not None:
+            self.avatar.body_points.renew()
+
     def on_train_epoch_end(self) -> None:
         """Restores the last good state when the person has vanished, before it is saved."""
         # over all processes, so that they decide alike
