@@ -115,3 +115,22 @@ def test_gradients_of_a_part_are_those_of_its_pixels_in_the_whole_image(
         scale = float(expected.abs().max())
         difference = float((of_part[name] - expected).abs().max())
         assert difference <= 1e-4 * scale + 1e-9, name
+
+
+@pytest.mark.parametrize("model", ["splat_only", "full"])
+def test_step_one_has_a_perceptual_loss_where_asked(make, model):
+    """After its share of Step I, and with a gradient that reaches Ψ; else none is built."""
+    words = (f"model={model}", "training.step_one.perceptual=0.5")
+    module, trainer, data = make(*words, "training.step_one.perceptual_from=0.5")
+    logged = {}
+    module._log = lambda name, value: logged.setdefault(name, []).append(
+        (module.step, float(value))
+    )
+    trainer.fit(module, data)
+    first = module.schedule.segmentation + module.schedule.step_one // 2
+    steps = [step for step, _ in logged["step_one/perceptual"]]
+    last = module.schedule.segmentation + module.schedule.step_one
+    assert steps == list(range(first, last))
+    assert all(value > 0 for _, value in logged["step_one/perceptual"])
+    plain, _, _ = make(f"model={model}")
+    assert (plain.perceptual is None) == (model == "splat_only")

@@ -19,7 +19,7 @@ from gsgan.losses.photometric import photometric, without_unsure
 from gsgan.model.discriminator import Discriminator
 from gsgan.model.rendering import Rendering
 from gsgan.scene import Frame
-from gsgan.utils.checks import at_least, one_of
+from gsgan.utils.checks import at_least, between, one_of
 from gsgan.utils.tensors import full_precision
 
 
@@ -29,15 +29,23 @@ class StepOneLoss:
 
     Args:
         l1, ssim: weights (paper: 0.8, 0.2).
-        feature_head, alpha: weights, see conf/training/long.yaml; 0 builds no readout of F.
+        feature_head, alpha, perceptual: weights, see conf/training/long.yaml; 0 builds no readout
+            of F, and no perceptual network for Step I.
+        perceptual_from: share of Step I without the perceptual loss.
 
-    Source: paper Sec. 3.5 (λ = 0.2), without readout and alpha.
+    Source: paper Sec. 3.5 (λ = 0.2), without readout, alpha and the perceptual loss.
     """
 
     l1: float = 0.8
     ssim: float = 0.2
     feature_head: float = 0.5
     alpha: float = 0.1
+    perceptual: float = 0.0
+    perceptual_from: float = 0.3
+
+    def __post_init__(self) -> None:
+        at_least("training.step_one.perceptual", self.perceptual, 0)
+        between("training.step_one.perceptual_from", self.perceptual_from, 0, 1)
 
     def __call__(
         self,
@@ -79,6 +87,18 @@ class StepOneLoss:
                 )
                 loss = loss + self.alpha * matte
             return loss
+
+
+def perceptual_distance(
+    perceptual: Perceptual, image: Tensor, frame: Frame, draws: Tensor | None
+) -> Tensor:
+    """L_perc of an image ``[B, 3, H, W]`` of a frame, or of crops that ``draws`` place."""
+    target = without_unsure(frame.image, image, frame.unsure)
+    compared = [image, target]
+    if perceptual.crop is not None:
+        assert draws is not None
+        compared = crop_person(compared, frame.mask, draws, perceptual.crop)
+    return perceptual(*compared)  # type: ignore[no-any-return]
 
 
 def discriminate(
@@ -229,11 +249,8 @@ class StepTwoLoss:
             terms["anchor"] = self.anchor * anchor
         if perceptual is not None and step % self.perceptual_every == 0:
             scale = self.perceptual * self.perceptual_every
-            compared = [image, target]
-            if perceptual.crop is not None:
-                assert draws is not None
-                compared = crop_person(compared, frame.mask, draws, perceptual.crop)
-            terms["perceptual"] = scale * perceptual(*compared)
+            distance = perceptual_distance(perceptual, image, frame, draws)
+            terms["perceptual"] = scale * distance
         if maps is not None:
             terms |= maps.terms(self.adversarial, self.feature_matching)
         return terms

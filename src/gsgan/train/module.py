@@ -19,7 +19,12 @@ from gsgan.model.avatar import Avatar
 from gsgan.model.discriminator import Discriminator
 from gsgan.model.rendering import Rendering
 from gsgan.scene import Frame, Window
-from gsgan.train.losses import DiscriminatorMaps, StepOneLoss, StepTwoLoss
+from gsgan.train.losses import (
+    DiscriminatorMaps,
+    StepOneLoss,
+    StepTwoLoss,
+    perceptual_distance,
+)
 from gsgan.train.optimisers import (
     MovingAverage,
     Recipe,
@@ -93,8 +98,11 @@ class AvatarTraining(LightningModule):
         self.discriminator = (
             discriminator if generates and step_two.adversarial_terms else None
         )
-        needed = generates and bool(step_two.perceptual) and perceptual is not None
-        self.perceptual = perceptual() if needed else None  # type: ignore[misc]
+        compares = bool(step_one.perceptual) and avatar.splats is not None
+        compares |= generates and bool(step_two.perceptual)
+        self.perceptual = None
+        if perceptual is not None and compares:
+            self.perceptual = perceptual()
         self.extra_losses = nn.ModuleDict(extra_losses or {})
         self.schedule = schedule.fitted(
             segmentation=S is not None,
@@ -208,8 +216,21 @@ class AvatarTraining(LightningModule):
         rendering = self._computed(partial(self._rendered, frame, generate=False))
         if rendering is None:
             return
-        loss = self.step_one_loss(rendering, frame)
-        self._descend({"step_one/loss": loss}, *self._splatting())
+        terms = {"step_one/loss": self.step_one_loss(rendering, frame)}
+        weight = self.step_one.perceptual
+        done = self.schedule.share_of_step_one(self.step)
+        if (
+            self.perceptual is not None
+            and weight
+            and done >= self.step_one.perceptual_from
+        ):
+            assert rendering.colour is not None
+            draws = self._crop_draws(len(frame))
+            distance = perceptual_distance(
+                self.perceptual, rendering.colour, frame, draws
+            )
+            terms["step_one/perceptual"] = weight * distance
+        self._descend(terms, *self._splatting())
         # this is its last step
         if self.average is not None and self.avatar.generator is None:
             self.average.update(self.avatar, self.step)
@@ -265,7 +286,7 @@ class AvatarTraining(LightningModule):
             rendering,
             frame,
             anchor=self.step_one_loss(rendering, frame) if anchored else None,
-            perceptual=self.perceptual,
+            perceptual=self.perceptual if self.step_two.perceptual else None,
             draws=self._crop_draws(len(frame)),
             maps=maps,
             step=self.step,

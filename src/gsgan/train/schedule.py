@@ -98,6 +98,10 @@ class Schedule:
             self.phase(step) == STEP_ONE and step - self.segmentation < self.coarse
         )
 
+    def share_of_step_one(self, step: int) -> float:
+        """The share of Step I that is done before an iteration of it."""
+        return (step - self.segmentation) / max(1, self.step_one)
+
     def bounds(self, phase: str) -> tuple[int, int]:
         """First iteration of a phase, and the first after it."""
         ends = {
