@@ -30,7 +30,7 @@ from gsgan.utils.files import write_atomically, write_json
 from gsgan.utils.tensors import pick_device
 
 TOTAL = "end to end"
-REST = "between stages"
+REST_STAGE = "between stages"
 # Lightning's names, as in conf/trainer.
 PRECISIONS: dict[str, torch.dtype | None] = {
     "32-true": None,
@@ -97,9 +97,10 @@ def run(config: DictConfig, folder: Path) -> None:
         "times_ms": {
             "total": dict(times.loc[TOTAL]),
             "stages": {
-                stage: dict(row) for stage, row in times.drop([TOTAL, REST]).iterrows()
+                stage: dict(row)
+                for stage, row in times.drop([TOTAL, REST_STAGE]).iterrows()
             },
-            "rest": dict(times.loc[REST]),
+            "rest": dict(times.loc[REST_STAGE]),
             "batches": batches,
         },
     }
@@ -272,7 +273,7 @@ def measure(
         finally:
             avatar.stage = unwatched
         rest = staged - sum(clock.frame.values())
-        for name, took in {**clock.frame, REST: rest, TOTAL: total}.items():
+        for name, took in {**clock.frame, REST_STAGE: rest, TOTAL: total}.items():
             samples.setdefault(name, []).append(took)
     return pd.DataFrame({name: deciles(s) for name, s in samples.items()}).T
 

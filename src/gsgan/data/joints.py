@@ -22,9 +22,9 @@ FACE = slice(HANDS.stop, HANDS.stop + len(FACE_MESH))
 ALL = FACE.stop
 
 # of the body
-WRISTS = [15, 16]
+WRIST_JOINTS = [15, 16]
 # knuckles: their bones from the wrist keep their length
-PALM = (5, 9, 13, 17)
+PALM_JOINTS = (5, 9, 13, 17)
 
 HEAD_PAIRS = ((1, 4), (2, 5), (3, 6), (7, 8), (9, 10))
 ARM_PAIRS = tuple((j, j + 1) for j in range(11, 23, 2))

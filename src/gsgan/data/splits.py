@@ -23,7 +23,7 @@ FRAME_RANGE = re.compile(
     r"\s*(\d{1,18})\s*(?:-\s*(\d{1,18})\s*)?(?::\s*(\d{1,18})\s*)?"
 )
 # bounds the memory that a range from a file can ask for
-MOST_FRAMES = 10**7
+MAX_LISTED_FRAMES = 10**7
 # training, held-out cameras, held-out frames
 SPLITS = ("train", "novel_view", "novel_pose")
 # camera name, frame number
@@ -392,8 +392,8 @@ def parse_frames(value: Any, where: str) -> tuple[int, ...]:
             )
 
         # Bounds, checked before the numbers take memory.
-        if len(numbers) + len(frames) > MOST_FRAMES:
-            raise ConfigError(f"{where} names more than {MOST_FRAMES} frames")
+        if len(numbers) + len(frames) > MAX_LISTED_FRAMES:
+            raise ConfigError(f"{where} names more than {MAX_LISTED_FRAMES} frames")
         if numbers[-1] > LARGEST_FRAME:
             raise ConfigError(
                 f"{where} names frame {numbers[-1]}; frame numbers end at {LARGEST_FRAME}"

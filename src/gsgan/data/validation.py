@@ -23,7 +23,7 @@ Index = Mapping[str, Mapping[int, str]]
 # headers read on opening, in even steps; every image is checked again when decoded
 MOST_HEADERS = 10_000
 # frames on which the cameras are checked, in even steps
-MOST_FRAMES = 10_000
+MAX_CHECKED_FRAMES = 10_000
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ def check_geometry(
     frames, joints, valid = _seen(images, landmarks)
 
     # A long capture is checked on some of its frames.
-    some = slice(None, None, -(-len(frames) // MOST_FRAMES))
+    some = slice(None, None, -(-len(frames) // MAX_CHECKED_FRAMES))
     joints = joints[some]
     valid = valid[some]
     check_distance(

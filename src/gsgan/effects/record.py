@@ -61,7 +61,7 @@ class Effects:
     cameras: tuple[str, ...] = ()
 
     def __iter__(self) -> Iterator[tuple[str, Effect]]:
-        return ((name, getattr(self, name)) for name in NAMES)
+        return ((name, getattr(self, name)) for name in EFFECT_NAMES)
 
     @property
     def degree(self) -> int:
@@ -92,7 +92,7 @@ class Effects:
     @classmethod
     def from_plain(cls, values: Mapping[str, Any]) -> Effects:
         """The inverse of `plain`."""
-        found = {name: Effect(**values[name]) for name in NAMES}
+        found = {name: Effect(**values[name]) for name in EFFECT_NAMES}
         return cls(**found, cameras=tuple(values["cameras"]))
 
     def check_same(self, stored: Mapping[str, Any]) -> None:
@@ -112,4 +112,4 @@ class Effects:
                 )
 
 
-NAMES = tuple(field.name for field in fields(Effects) if field.name != "cameras")
+EFFECT_NAMES = tuple(field.name for field in fields(Effects) if field.name != "cameras")

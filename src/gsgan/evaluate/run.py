@@ -32,7 +32,13 @@ from gsgan.evaluate.files import (
 from gsgan.evaluate.grids import write_grid
 from gsgan.evaluate.kept import FOLDER, KeptScores
 from gsgan.evaluate.origin import Method, fingerprint, origin, trained
-from gsgan.evaluate.predictions import FLOOR, FULL, BodyBoxes, Preparation, read_folder
+from gsgan.evaluate.predictions import (
+    FLOOR_STAGE,
+    FULL,
+    BodyBoxes,
+    Preparation,
+    read_folder,
+)
 from gsgan.evaluate.scores import (
     Predict,
     Scorer,
@@ -177,7 +183,7 @@ def _plot(curves: dict[str, pd.DataFrame]) -> bytes:
 
 
 # the splits that can be scored, and the mark of scores with drive=skeleton
-SPLITS = ("novel_view", "novel_pose")
+HELD_OUT_SPLITS = ("novel_view", "novel_pose")
 BY_SKELETON = "driven by skeletons alone"
 
 
@@ -213,9 +219,9 @@ def evaluate_config(config: DictConfig) -> Results:
         )
     if config.get("drive") not in (None, "skeleton"):
         raise ConfigError(f"drive must be skeleton or null; got {config.drive!r}")
-    if not config.splits or not set(config.splits) <= set(SPLITS):
+    if not config.splits or not set(config.splits) <= set(HELD_OUT_SPLITS):
         raise ConfigError(
-            f"splits must be a list of {' and '.join(SPLITS)}; got {config.splits}"
+            f"splits must be a list of {' and '.join(HELD_OUT_SPLITS)}; got {config.splits}"
         )
 
     score = evaluate_predictions if config.run is None else evaluate_folder
@@ -257,7 +263,7 @@ def evaluate_folder(
     if config.drive is not None and not other:
         out = out / "by_skeleton"
         marks = [*marks, BY_SKELETON]
-    if len(set(config.splits)) < len(SPLITS):
+    if len(set(config.splits)) < len(HELD_OUT_SPLITS):
         out = out / config.splits[0]
 
     # What facts.json states about the run.
@@ -420,7 +426,7 @@ def evaluate_method(
 
     # Every split, with the images of the grid evenly spaced. Scores of a run are kept.
     scores: dict[str, SplitScores] = {}
-    for split in config.get("splits") or SPLITS:
+    for split in config.get("splits") or HELD_OUT_SPLITS:
         dataset = data.dataset(split)
         count = len(dataset)
         places = evenly_spaced(count, config.get("score_images") or count)
@@ -508,7 +514,9 @@ def _joined_splits(
 ) -> Scored:
     """The scores of all splits, with the protocol's record and reasons for empty splits."""
     # An empty split has the variants of the others.
-    variants = next((s.variants for s in scores.values() if s.variants), (FULL, FLOOR))
+    variants = next(
+        (s.variants for s in scores.values() if s.variants), (FULL, FLOOR_STAGE)
+    )
 
     # metrics.json by split, scores.csv by image.
     results = {}

@@ -12,7 +12,7 @@ from torch import Tensor
 from gsgan.data.metric_variants import MetricVariants
 from gsgan.data.splits import Item
 from gsgan.evaluate.grids import grid_rows
-from gsgan.evaluate.predictions import FLOOR, FULL, SPLAT, Prediction, Preparation
+from gsgan.evaluate.predictions import FLOOR_STAGE, FULL, SPLAT, Prediction, Preparation
 from gsgan.metrics.image import (
     Score,
     edge_scores,
@@ -366,7 +366,7 @@ class Tally:
                     "finite; it cannot be scored"
                 )
             images[name] = prepare.image(prediction, name, box)
-        images[FLOOR] = torch.full_like(frame.image, prepare.background)
+        images[FLOOR_STAGE] = torch.full_like(frame.image, prepare.background)
         return images
 
     def _add_parts(self, camera: str, frame: Frame, prediction: Prediction) -> None:
@@ -386,7 +386,7 @@ class Tally:
     def result(self) -> SplitScores:
         """The scores of the split."""
         # Only the final image has a segmentation.
-        no_parts = {SPLAT: NO_PARTS_OF_SPLAT, FLOOR: NO_PARTS_OF_FLOOR}
+        no_parts = {SPLAT: NO_PARTS_OF_SPLAT, FLOOR_STAGE: NO_PARTS_OF_FLOOR}
         variants = {}
         for name, own in self.rows.items():
             if name == FULL:

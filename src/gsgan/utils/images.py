@@ -13,7 +13,7 @@ from gsgan.utils.arrays import Bytes
 from gsgan.utils.errors import ConfigError
 
 BAR = 18  # pixels of the caption above a tile
-JPEG_QUALITY = 88  # of the JPEG
+PAGE_JPEG_QUALITY = 88  # of the JPEG
 
 Background = Tensor | None
 
@@ -99,5 +99,5 @@ def caption(image: Bytes, text: str, colour: tuple[int, int, int]) -> Bytes:
 def encode(image: Bytes) -> bytes:
     """A JPEG of an RGB image."""
     return cv2.imencode(
-        ".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+        ".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, PAGE_JPEG_QUALITY]
     )[1].tobytes()

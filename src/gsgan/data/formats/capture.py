@@ -54,10 +54,10 @@ from gsgan.utils.checks import is_number, whole
 from gsgan.utils.errors import DataError
 
 T = TypeVar("T")
-LANDMARKS = "landmarks3d.npz"
+LANDMARKS_FILE = "landmarks3d.npz"
 HANDS_FILE = "hands3d.npz"
 FACE_FILE = "face3d.npz"
-POSES = "body_pose.npz"
+POSES_FILE = "body_pose.npz"
 SHAPE = "body_shape.npz"
 # endings of masks and labels
 MASKS = (".png",)
@@ -132,7 +132,9 @@ def _find(
 
     # Landmarks; hands and face are optional.
     joints = SKELETONS[meta.skeleton]
-    skeletons = _read_landmarks(root / LANDMARKS, joints, conventions, limits, notes)
+    skeletons = _read_landmarks(
+        root / LANDMARKS_FILE, joints, conventions, limits, notes
+    )
     hands = None
     if (root / HANDS_FILE).exists():
         hands = _read_landmarks(root / HANDS_FILE, 2 * HAND, conventions, limits, notes)
@@ -143,7 +145,7 @@ def _find(
 
     # Body poses, which may also name the body.
     poses = None
-    if (root / POSES).exists():
+    if (root / POSES_FILE).exists():
         poses, meta = _read_poses(root, meta, conventions)
 
     return Found(
@@ -202,11 +204,15 @@ def capture_problems(root: Path, limits: Thresholds) -> list[str]:
 
     # Landmarks and body poses.
     joints = SKELETONS["mediapipe33" if meta is None else meta.skeleton]
-    for name, count in ((LANDMARKS, joints), (HANDS_FILE, 2 * HAND), (FACE_FILE, FACE)):
+    for name, count in (
+        (LANDMARKS_FILE, joints),
+        (HANDS_FILE, 2 * HAND),
+        (FACE_FILE, FACE),
+    ):
         file = root / name
-        if name == LANDMARKS or file.exists():
+        if name == LANDMARKS_FILE or file.exists():
             attempt(partial(_read_landmarks, file, count, conventions, limits, []))
-    if meta is not None and (root / POSES).exists():
+    if meta is not None and (root / POSES_FILE).exists():
         attempt(lambda: _read_poses(root, meta, conventions))
     return problems
 
@@ -322,7 +328,7 @@ def _refuse_other_names(path: Path) -> None:
 def _read_poses(root: Path, meta: Meta, conventions: Conventions) -> tuple[Poses, Meta]:
     """The poses of frames in which all numbers are finite, and ``meta`` with the body and its
     shape."""
-    path = root / POSES
+    path = root / POSES_FILE
     names = ("theta", "transl", "frame_id", "betas", "registered", "fitted_to")
     arrays = read_arrays(path, (*names, "theta_hands", "transl_hands"))
 
