@@ -47,8 +47,9 @@ Painter = Callable[[Frame], Tensor]
 def run(config: DictConfig, folder: Path) -> None:
     """Times ``avatar.render(skeleton, camera)``; writes ``speed.md`` and ``speed.json``.
 
-    The input is bare skeletons, one at a time as a camera delivers them, and in batches. Skeletons and
-    cameras are on the CPU, images stay on the device: reading and displaying them is not included.
+    The input is bare skeletons, one at a time as a camera delivers them, and in batches. Skeletons
+    and cameras are on the CPU, images stay on the device: reading and displaying them is not
+    included.
 
     Args:
         config: as conf/bench_speed.yaml.
