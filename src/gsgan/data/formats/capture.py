@@ -59,9 +59,9 @@ HANDS_FILE = "hands3d.npz"
 FACE_FILE = "face3d.npz"
 POSES_FILE = "body_pose.npz"
 SHAPE = "body_shape.npz"
-# endings of masks and labels
+# Endings of masks and labels: compression would damage them.
 MASKS = (".png",)
-# by kind of body
+# The number of rotations in a pose, by kind of body.
 BODY_BONES = {"free": 56, "smpl": 24, "smplx": 55}
 SKELETON_LIMITS = Consistency(least_inside=0.2)
 """A capture's own landmarks are noisier than those of a fitted body."""
@@ -110,7 +110,10 @@ def read_capture(
 
 
 def _find(
-    root: Path, limits: Thresholds, smpl: str | None, reader: CaptureReader
+    root: Path,
+    limits: Thresholds,
+    smpl: str | None,
+    reader: CaptureReader,
 ) -> Found:
     """The files of a capture, each checked separately."""
     notes: list[str] = []
@@ -178,6 +181,7 @@ def capture_problems(root: Path, limits: Thresholds) -> list[str]:
     """
     problems: list[str] = []
 
+    # Each message once: several steps may read the same file.
     def attempt(read: Callable[[], T]) -> T | None:
         try:
             return read()
@@ -240,6 +244,7 @@ def _read_meta(path: Path, content: Mapping[str, Any], smpl: str | None) -> Meta
         kind = choose(path, content, "body", None, tuple(BODY_BONES))
         body = BodyModel(kind, smpl if kind != "free" else None)
 
+    # Facts with a fixed set of values.
     axes = ("x", "y", "z", "-x", "-y", "-z")
     return Meta(
         unit=choose(path, content, "unit", None, tuple(METRES)),
@@ -268,9 +273,8 @@ def _index_images(
         if path.is_dir() and not path.name.startswith("."):
             found.add(path.name)
 
-    unknown = sorted(found - set(cameras))
-
     # A folder and a camera without each other are most likely misspelt.
+    unknown = sorted(found - set(cameras))
     if unknown:
         raise DataError(
             f"{folder} has the camera {unknown[0]}, which {root / 'cameras.json'} does not list; "
@@ -283,6 +287,7 @@ def _index_images(
                 f"does not exist; there are {', '.join(sorted(found)) or 'none'}"
             )
 
+    # A camera without images is most likely a mistake too.
     images = {name: frame_files(root, f"images/{name}", IMAGES) for name in cameras}
     for name, files in images.items():
         if not files:
@@ -357,9 +362,13 @@ def _read_poses(root: Path, meta: Meta, conventions: Conventions) -> tuple[Poses
         moves.append(transl.astype(np.float64))
 
     # Only frames in which all of them are finite.
-    values = np.concatenate([*rotations, *(move[:, None] for move in moves)], axis=1)
+    rotated = np.concatenate(rotations, axis=1)
+    moved = np.stack(moves, axis=1)
+    values = np.concatenate([rotated, moved], axis=1)
     rows = np.flatnonzero(np.isfinite(values).all((1, 2)))
     frames = ids[rows].tolist()
+
+    # Translations are in metres; axis-angles have no unit.
     poses = []
     for theta, transl in zip(rotations, moves, strict=True):
         poses.append(
@@ -371,6 +380,8 @@ def _read_poses(root: Path, meta: Meta, conventions: Conventions) -> tuple[Poses
                 fitted_to=fitted_to,
             )
         )
+
+    # The second version, if there is one, follows the hands.
     own = poses[0]
     if len(poses) > 1:
         own = replace(own, with_hands=poses[1])
@@ -390,6 +401,7 @@ def read_shape(path: Path) -> tuple[float, ...]:
     Raises:
         DataError: when the file is damaged or lacks an array.
     """
+    # The arrays that every file has, and those of people with hands or a bent spine.
     shapes: dict[str, tuple[int, ...]] = {
         "coefficients": (free_space().coefficients,),
         "stretch": (len(STRETCHED),),
