@@ -249,7 +249,7 @@ def _hand(p: Float, wrist: Float) -> Float:
 
 def _standing_hands(rest: Float, hands: Mapping[int, Float]) -> Float:
     """``[42, 3]`` the hands of `_hands` at the wrists of a standard pose ``[33, 3]``."""
-    # The right hand is the mirror image in the standard pose, and its palm faces down too.
+    # The signs turn the palm's axes into the standard axes of that side.
     placed = []
     for wrist, hand in hands.items():
         placed.append(rest[wrist] + hand * (BODY_SIDES[wrist], 1.0, BODY_SIDES[wrist]))

@@ -3,7 +3,7 @@
 import io
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -75,7 +75,7 @@ COLUMNS = (
     "lpips_alex_person",
     "flicker",
 )
-# edges of the bins of distances
+# Edges of the bins of distances.
 BINS = (0, 1, 2, 3, 4, 6, 8, 12, np.inf)
 
 
@@ -109,6 +109,8 @@ def write_distances(
     """
     # The distance of each frame's pose, by image.
     table = rows.loc[rows["variant"] == FULL, ["split", "camera", "frame", *COLUMNS]]
+
+    # Frames repeat in the table: the distance of each is computed once.
     frames, places = np.unique(table["frame"], return_inverse=True)
     skeletons = data.dataset("train").skeletons.p
     p = np.stack([skeletons[frame] for frame in frames.tolist()])
@@ -177,12 +179,14 @@ def _plot(curves: dict[str, pd.DataFrame]) -> bytes:
     axes.set_ylabel("PSNR in the person's box, dB")
     axes.grid(alpha=0.3)
     axes.legend()
+
+    # Made in memory, since files are written completely or not at all.
     image = io.BytesIO()
     figure.savefig(image, format="png", dpi=150)
     return image.getvalue()
 
 
-# the splits that can be scored, and the mark of scores with drive=skeleton
+# The splits that can be scored, and the mark of scores with drive=skeleton.
 HELD_OUT_SPLITS = ("novel_view", "novel_pose")
 BY_SKELETON = "driven by skeletons alone"
 
@@ -194,6 +198,7 @@ def evaluate_config(config: DictConfig) -> Results:
         ConfigError: unless exactly one of them is given, or on a value that cannot be used.
         DataError: when the run, its data or an image of the folder cannot be used.
     """
+    # Everything that the options alone can tell is checked first.
     if (config.run is None) == (config.predictions is None):
         raise ConfigError(
             "give either run=<the folder that gsgan.train printed>, or predictions=<folder of "
@@ -209,6 +214,8 @@ def evaluate_config(config: DictConfig) -> Results:
     for key in others:
         if config.get(key) is not None:
             raise ConfigError(f"{key}= cannot be given with {kind}=; leave it out")
+
+    # Another capture is named by `on` alone.
     if config.get("on") is not None and config.data_root is not None:
         raise ConfigError("data_root= cannot be given with on=; leave it out")
 
@@ -232,12 +239,12 @@ def evaluate_folder(
     config: DictConfig, console: Console, device: torch.device
 ) -> Results:
     """Loads the avatar of ``config.run`` and scores it."""
+    # By default the networks of LPIPS that the run was configured with.
     folder = Path(config.run).expanduser()
     stored = read_config(folder)
     if config.lpips.nets is None:
-        config.lpips.nets = OmegaConf.select(
-            stored, "lpips.nets", default=list(LPIPS_NETS)
-        )
+        nets = OmegaConf.select(stored, "lpips.nets", default=list(LPIPS_NETS))
+        config.lpips.nets = nets
 
     # The weights, and the number of steps, the time and the code that made them.
     checkpoint = read_checkpoint(folder / CHECKPOINT)
@@ -379,6 +386,8 @@ def _out(config: DictConfig, root: Path, method: str) -> Path:
             raise ConfigError(
                 f"{held} is damaged; choose another folder with out="
             ) from None
+
+    # Scores of the same method are replaced.
     if found != method:
         raise ConfigError(
             f"out={out} holds scores of {found}, not of {method}; choose another folder"
@@ -427,9 +436,12 @@ def evaluate_method(
     # Every split, with the images of the grid evenly spaced. Scores of a run are kept.
     scores: dict[str, SplitScores] = {}
     for split in config.get("splits") or HELD_OUT_SPLITS:
+        # Some of its images, if the config bounds their number.
         dataset = data.dataset(split)
         count = len(dataset)
         places = evenly_spaced(count, config.get("score_images") or count)
+
+        # An interrupted scoring goes on only if nothing that scores depend on has changed.
         kept = None
         if poses is not None:
             key = {
@@ -488,7 +500,7 @@ def _scored(
     if kept is not None:
         kept.restore(tally)
 
-    # The frame before the first one, which flicker needs.
+    # Flicker compares with the frame before, which must be painted again.
     done = tally.images
     if done:
         console.print(f"{title}: {done} of {len(places)} images were scored before")
@@ -497,6 +509,7 @@ def _scored(
         item = dataset.items[before]
         tally.look_at(item, frame, predict(frame, item))
 
+    # The remaining images, with the scores so far kept from time to time.
     for place in track(places[done:], title, console):
         frame = dataset[place].to(device)
         item = dataset.items[place]
@@ -514,22 +527,20 @@ def _joined_splits(
 ) -> Scored:
     """The scores of all splits, with the protocol's record and reasons for empty splits."""
     # An empty split has the variants of the others.
-    variants = next(
-        (s.variants for s in scores.values() if s.variants), (FULL, FLOOR_STAGE)
-    )
+    filled = [found.variants for found in scores.values() if found.variants]
+    variants: Iterable[str] = filled[0] if filled else (FULL, FLOOR_STAGE)
 
     # metrics.json by split, scores.csv by image.
-    results = {}
+    results: Results = {}
     rows = []
     for split, found in scores.items():
         held = found.variants
         if not held:
             reason = data.reasons.get(split, "no frames")
             held = {name: empty(reason, scorer) for name in variants}
-        results[split] = {
-            name: values | {"protocol": scorer.protocol}
-            for name, values in held.items()
-        }
+        results[split] = {}
+        for name, values in held.items():
+            results[split][name] = values | {"protocol": scorer.protocol}
         for variant, of_variant in found.rows.items():
             for row in of_variant:
                 rows.append({"split": split, "variant": variant, **row})
@@ -563,6 +574,7 @@ def make_scorer(config: DictConfig, data: GsganData, marks: Sequence[str]) -> Sc
     boxes = BodyBoxes(data) if measures.needs_body_box else None
     record = data.protocol_record(config.lpips.nets)
     if record is not None:
+        # The record says what was asked for, and the departures what was done.
         asked = record["measures"]["background"]
         if asked != measures.background:
             different = f"background is {measures.background}, asked for: {asked}"
