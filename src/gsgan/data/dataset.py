@@ -187,10 +187,6 @@ class CaptureDataset(Dataset[Frame]):
         """The calibrated camera of an item."""
         return self.layout.cameras[item[0]]
 
-    def _target(self, window: Crop) -> tuple[int, int]:
-        """``(H, W)`` of the item's image."""
-        return window.size if self.size is None else (self.size, self.size)
-
     def window(self, item: Item) -> Crop:
         """The part of the (undistorted) image that an item shows."""
         camera = self._entry(item)
@@ -272,7 +268,7 @@ class CaptureDataset(Dataset[Frame]):
         # All images of an item share one mapping, which takes longer than its use.
         window = self.window(item)
         mapping = self._mapping(self._entry(item), window)
-        size = self._target(window)
+        size = window.size if self.size is None else (self.size, self.size)
 
         def fit(image: Bytes, exact: bool) -> Bytes:
             taken = cropping.take(image, window, mapping, exact)

@@ -182,7 +182,7 @@ def markdown(results: Results, origin: dict[str, Any]) -> str:
     header = ["split", "variant", "images"]
     for metric in METRICS.values():
         header.append(metric.short_heading)
-    by_split = pages.markdown(header, list(rows(results, cameras=False)))
+    by_split = pages.markdown(header, list(rows(results)))
     by_camera = pages.markdown(header, list(rows(results, cameras=True)))
     listed = "\n".join(f"- {note}" for note in notes(results))
 

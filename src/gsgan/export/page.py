@@ -97,7 +97,8 @@ def page(content: bytes, name: str) -> str:
 
 def _hash(text: str) -> str:
     """A source of a Content-Security-Policy: this text and nothing else."""
-    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+    digest = hashlib.sha256(text.encode()).digest()
+    return "sha256-" + base64.b64encode(digest).decode()
 
 
 def block(

@@ -59,7 +59,7 @@ class Whole(nn.Module):
                 with a face.
             visibility: ``[1, J]`` 0 marks a stand-in.
             K, R, t: ``[1, 3, 3]``, ``[1, 3, 3]``, ``[1, 3]`` of the camera.
-            theta, transl: pose of the skinned body, where the avatar needs one.
+            theta, transl: pose of the skinned body, if the avatar needs one.
         """
         body = None if theta is None or transl is None else BodyPose(theta, transl)
         rendering = self.avatar(skeleton, visibility, Camera(K, R, t, self.size), body)
@@ -109,9 +109,9 @@ def torch_program(avatar: Avatar, size: tuple[int, int]) -> bytes:
 class PoseAndGenerator(nn.Module):
     """Images of the avatar's splats and skeleton in, its image out: pose encoder and UNet.
 
-    Its inputs, by name: ``features`` F ``[1, C, H, W]``, ``fine`` F before it was averaged, where
-    the avatar supersamples; ``splat_alpha`` of F ``[1, 1, H, W]``; ``segmentation`` S ``[1,
-    classes, H, W]``, where it has one; ``skeleton`` p₂D ``[1, groups, H, W]``; ``omega`` Ω ``[1, J,
+    Its inputs, by name: ``features`` F ``[1, C, H, W]``, ``fine`` F before it was averaged, if the
+    avatar supersamples; ``splat_alpha`` of F ``[1, 1, H, W]``; ``segmentation`` S ``[1,
+    classes, H, W]``, if it has one; ``skeleton`` p₂D ``[1, groups, H, W]``; ``omega`` Ω ``[1, J,
     6]`` and ``joints`` ``[1, J, 3]``, see `gsgan.model.pose_graph.pose_inputs`.
 
     Args:
@@ -128,6 +128,8 @@ class PoseAndGenerator(nn.Module):
         self.template = avatar.template
         self.pose_encoder = avatar.pose_encoder
         self.generator = avatar.generator
+
+        # Images that the avatar does not render have no channels.
         classes = 0 if avatar.segmentation is None else avatar.segmentation.classes
         self.channels = {"features": avatar.splat_channels, "segmentation": classes}
 
@@ -215,5 +217,7 @@ def onnx_program(avatar: Avatar) -> bytes:
             verbose=False,
         )
     assert program is not None
+
+    # A single file: the weights are part of it.
     content: bytes = program.model_proto.SerializeToString()
     return content

@@ -4,17 +4,24 @@ import json
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
 import yaml
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, open_dict
 
 from gsgan import __version__
 from gsgan.export.page import block, page, refuse_unsuitable
 from gsgan.export.splats import Splats, glb_bytes, ply_bytes, splats_of
-from gsgan.run.drive import REST, Drive, distilled_of, drive_of, inputs_of
+from gsgan.run.drive import (
+    REST,
+    Drive,
+    distilled_of,
+    drive_of,
+    inputs_of,
+    with_motion,
+)
 from gsgan.run.runs import Run
 from gsgan.utils.checks import above, one_of, whole
 from gsgan.utils.console import make_console, track
@@ -27,6 +34,7 @@ LINEAR = (
     "without its networks: Step I's colour, with residuals linear in the harmonics of each "
     "Gaussian's normal."
 )
+# What a model card says about the content of each format.
 HOLDS = {
     "ply": "The avatar's Gaussians in one pose per file, in the convention of 3D Gaussian "
     "splatting. They show Step I's colour; the generator's image needs gsgan.",
@@ -41,6 +49,7 @@ HOLDS = {
     "safetensors": "The weights, with the config as metadata: "
     "`gsgan.export.weights.load_weights(file)` gives the avatar.",
 }
+# Metrics of a model card, and their headings.
 SCORES = {
     "psnr": "PSNR ↑",
     "ssim": "SSIM ↑",
@@ -197,7 +206,7 @@ def export_config(config: DictConfig) -> None:
     # Gaussians in one pose per file; a glTF file without a motion shows the rest pose.
     if kind in ("ply", "gltf"):
         rest = config.motion is None and kind == "gltf"
-        drive = _poses(_with_motion(config, REST) if rest else config, run)
+        drive = _poses(with_motion(config, REST) if rest else config, run)
         tell(drive.text)
         numbers = range(len(drive.p)) if sequence else range(1)
         for i in track(numbers, "writing", console):
@@ -269,18 +278,15 @@ def _block(
     # Motions are named by their files.
     motions = {}
     for motion in chosen:
-        drive = _poses(_with_motion(config, str(motion)), run)
+        drive = _poses(with_motion(config, str(motion)), run)
         tell(drive.text)
         motions[Path(motion).stem] = drive, float(config.fps)
     return block(run, distilled_of(config, run), motions, name)
 
 
-def _with_motion(config: DictConfig, motion: str) -> DictConfig:
-    return cast(DictConfig, OmegaConf.merge(config, {"motion": motion}))
-
-
 def _poses(config: DictConfig, run: Run) -> Drive:
     """The frames to export; by default a held-out one."""
+    # The whole motion; its length is known only now.
     drive = drive_of(config, run, float(above("fps", config.fps)))
 
     # Some of its frames, if the user asks for them.

@@ -108,10 +108,12 @@ def _refuse_other_classes(path: Path, config: Any) -> None:
     pending = [OmegaConf.to_container(config)]
     while pending:
         node = pending.pop()
-        if isinstance(node, dict) and node.get("_target_", "") not in known:
-            raise DataError(
-                f"{path} names {node['_target_']!r}, which is not a class of gsgan's own configs; "
-                "load the run folder that it was exported from"
-            )
-        if isinstance(node, (dict, list)):
-            pending += node.values() if isinstance(node, dict) else node
+        if isinstance(node, list):
+            pending += node
+        elif isinstance(node, dict):
+            if node.get("_target_", "") not in known:
+                raise DataError(
+                    f"{path} names {node['_target_']!r}, which is not a class of gsgan's own "
+                    "configs; load the run folder that it was exported from"
+                )
+            pending += node.values()

@@ -120,7 +120,7 @@ class AvatarParts:
         segmentation: S; None leaves it out (``wo_seg``).
         pose_encoder, generator: Ω (or the flat skeleton) to g; the UNet. Without them Step I's
             colour is the image (``splat_only``).
-        low_pass, supersample, backend: of F, and of S where it has them.
+        low_pass, supersample, backend: of F, and of S as far as it has them.
         window_margin, window_multiple, window_least: of `Avatar`.
 
     Raises:

@@ -35,7 +35,7 @@ def labelled_body(
 ) -> tuple[SkinnedBody | None, str]:
     """The body, and a clause on where its labels come from, or why there is no body.
 
-    The body keeps its own labels where the data has the same ones, or none. Otherwise, and on a
+    The body keeps its own labels if the data has the same ones, or none. Otherwise, and on a
     body fitted to a person, whose clothes end elsewhere, labels come from a checkpoint
     (``vertex_labels [V]``) or from a vote over ``images``.
 
@@ -175,7 +175,7 @@ def seen(points: Tensor, reach: Tensor, camera: Camera, tolerance: float) -> Ten
     radius = reach * camera.K[0, :2, :2].diagonal().mean() / depth
     ahead = (depth > tolerance) & pixel.isfinite().all(-1)
     visible = torch.zeros_like(ahead)
-    if not bool(ahead.any()):
+    if not ahead.any():
         return visible
 
     # Points well outside the image are left out: the largest disc cannot reach it.
@@ -183,7 +183,7 @@ def seen(points: Tensor, reach: Tensor, camera: Camera, tolerance: float) -> Ten
     size = pixel.new_tensor([camera.size[1], camera.size[0]])
     border = MAX_RADIUS_CELLS * cell
     ahead &= ((pixel >= -border) & (pixel <= size + border)).all(-1)
-    if not bool(ahead.any()):
+    if not ahead.any():
         return visible
     radius = radius[ahead]
 
@@ -222,7 +222,7 @@ def _depth_map(at: Tensor, depth: Tensor, radius: Tensor) -> Tensor:
 
 
 def _majority(votes: Tensor) -> tuple[Tensor, Tensor]:
-    """The winner of each row ``[V]``, and where there is exactly one ``[V]``."""
+    """The winner of each row ``[V]``, and whether there is exactly one ``[V]``."""
     # Vertices without votes have a maximum of zero, which all labels share.
     most = votes.amax(dim=1)
     winners = votes == most[:, None]

@@ -113,6 +113,11 @@ def drive_of(config: DictConfig, run: Run, fps: float) -> Drive:
     return found if config.drive is None else replace(found, body=None)
 
 
+def with_motion(config: DictConfig, motion: str) -> DictConfig:
+    """A copy of a config with another motion."""
+    return cast(DictConfig, OmegaConf.merge(config, {"motion": motion}))
+
+
 def _chosen(config: DictConfig, run: Run, fps: float) -> Drive:
     """The motion of a config: files, a split, the rest pose, or one held-out frame."""
     # Without a motion: one held-out frame, held still.
@@ -217,7 +222,7 @@ def _joined(
 def _shown(p: Float, proportions: Proportions) -> Float:
     """Visibility ``[F, J]`` of retargeted joints: the body's as in training, 1 for others that are
     known."""
-    # The body's landmarks are all known after retargeting.
+    # The body's landmarks are as visible as they were in training.
     visibility = np.asarray(np.isfinite(p).all(-1), np.float64)
     visibility[:, : len(proportions.seen)] = proportions.seen
     return visibility
@@ -236,7 +241,7 @@ def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
     motion = checked(motion, float(config.min_visibility))
     _refuse_swapped(motion)
 
-    # What the file does not say is given by the user, or else estimated.
+    # The user's rate comes before the file's, but the file's up axis before the user's.
     rate = config.motion_fps or motion.fps
     rate = float(above("motion_fps", rate)) if rate else FPS
     up = (None if motion.file_up else up) or motion.up or up_axis(motion)
@@ -380,7 +385,6 @@ def distilled_of(config: DictConfig, run: Run) -> Avatar:
         return run.avatar
 
     # The fit takes poses at even distances, from the first to the last.
-    trained = cast(DictConfig, OmegaConf.merge(config, {"motion": "train"}))
-    drive = drive_of(trained, run, 1.0)
+    drive = drive_of(with_motion(config, "train"), run, 1.0)
     chosen = evenly_spaced(len(drive.p), DISTILLED, ends=True)
     return distilled(run.avatar, (inputs_of(run.avatar, drive, i) for i in chosen))
