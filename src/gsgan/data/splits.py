@@ -16,7 +16,7 @@ from gsgan.data.validation import spans
 from gsgan.utils.arrays import Ints
 from gsgan.utils.errors import ConfigError, DataError
 
-T = TypeVar("T", int, str)
+NameOrNumber = TypeVar("NameOrNumber", int, str)
 
 # first, last and step: "12", "0-55" or "0-55:5"
 FRAME_RANGE = re.compile(
@@ -85,11 +85,11 @@ class Items(Sequence[Item]):
         return int(self._ends[camera] + found[0])
 
 
-class Sides(NamedTuple, Generic[T]):
+class Sides(NamedTuple, Generic[NameOrNumber]):
     """The cameras or frames for training, and those for tests."""
 
-    train: tuple[T, ...]
-    test: tuple[T, ...]
+    train: tuple[NameOrNumber, ...]
+    test: tuple[NameOrNumber, ...]
 
 
 @dataclass(frozen=True)
@@ -299,8 +299,10 @@ def _protocol_cameras(
 
 
 def _complete(
-    everything: tuple[T, ...], train: tuple[T, ...] | None, test: tuple[T, ...] | None
-) -> Sides[T]:
+    everything: tuple[NameOrNumber, ...],
+    train: tuple[NameOrNumber, ...] | None,
+    test: tuple[NameOrNumber, ...] | None,
+) -> Sides[NameOrNumber]:
     """Both sides; a side that is None takes everything outside the other."""
     # With both sides missing, all of them train.
     if train is None:
@@ -328,10 +330,10 @@ def _sides(
     layout: Layout,
     name: str,
     given: tuple[Any, Any],
-    everything: tuple[T, ...],
-    default: tuple[tuple[T, ...], tuple[T, ...]],
-    parse: Callable[[Any, str], tuple[T, ...]],
-) -> Sides[T]:
+    everything: tuple[NameOrNumber, ...],
+    default: tuple[tuple[NameOrNumber, ...], tuple[NameOrNumber, ...]],
+    parse: Callable[[Any, str], tuple[NameOrNumber, ...]],
+) -> Sides[NameOrNumber]:
     """The train and test side of ``name``, cameras or frames, from the first source that has one:
     the config's ``given`` values, meta.json, else the default."""
     stored = layout.meta.splits

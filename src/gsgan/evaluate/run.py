@@ -243,8 +243,9 @@ def evaluate_folder(
     folder = Path(config.run).expanduser()
     stored = read_config(folder)
     if config.lpips.nets is None:
-        nets = OmegaConf.select(stored, "lpips.nets", default=list(LPIPS_NETS))
-        config.lpips.nets = nets
+        config.lpips.nets = OmegaConf.select(
+            stored, "lpips.nets", default=list(LPIPS_NETS)
+        )
 
     # The weights, and the number of steps, the time and the code that made them.
     checkpoint = read_checkpoint(folder / CHECKPOINT)

@@ -102,9 +102,8 @@ def image_scores(
         person = person_box(mask)
         regions["person"] = person
         scores["psnr_inside"] = psnr_inside(image, target, mask)
-        f1, ratio = edge_scores(image, target, person)
-        scores["edge_f1_person"] = f1
-        scores["edge_ratio_person"] = ratio
+        edges = edge_scores(image, target, person)
+        scores["edge_f1_person"], scores["edge_ratio_person"] = edges
 
     # PSNR and SSIM of all regions, from one map of SSIM.
     if regions:

@@ -80,7 +80,7 @@ def labelled_body(
         return body.voted(vertex_labels, names), "parts voted when training began"
 
     # A new avatar votes over its training images.
-    if images is None or len(images) == 0:
+    if not images:
         raise DataError(
             f"labels: the images' parts are {', '.join(names)}, the {scene.body} body has others, "
             "and there is no training image with labels to vote on them; choose model=wo_seg"

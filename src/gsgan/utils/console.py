@@ -15,7 +15,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-T = TypeVar("T")
+Item = TypeVar("Item")
 LEAST_WIDTH = 100  # columns: tables cut to the 80 of a log file cannot be read
 LOG_SECONDS = 10.0  # between two lines of progress in a log file
 SLOW_SECONDS = 2.0  # work that takes longer is named in a log file
@@ -100,8 +100,8 @@ def progress(console: Console, disable: bool = False) -> Progress:
 
 
 def track(
-    items: Iterable[T], description: str, console: Console, total: int | None = None
-) -> Iterator[T]:
+    items: Iterable[Item], description: str, console: Console, total: int | None = None
+) -> Iterator[Item]:
     """The items one by one, with their number and the remaining time shown by `progress`."""
     with progress(console) as bars:
         yield from bars.track(items, total=total, description=description)

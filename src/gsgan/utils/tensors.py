@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from gsgan.utils.errors import ConfigError
 
-T = TypeVar("T")
+Result = TypeVar("Result")
 # of glibc's mallopt
 M_TRIM_THRESHOLD = -1
 M_MMAP_THRESHOLD = -3
@@ -92,11 +92,13 @@ def keep_freed_memory() -> None:
         mallopt(M_MMAP_THRESHOLD, LARGEST)
 
 
-def derived(module: nn.Module, name: str, make: Callable[[], T], *weights: Tensor) -> T:
+def derived(
+    module: nn.Module, name: str, make: Callable[[], Result], *weights: Tensor
+) -> Result:
     """``make()``, a function of these weights alone. In a frozen module (one with a dictionary
     ``derived``) it is kept until a weight changes or moves."""
     # While training every call computes anew.
-    kept: dict[str, tuple[Any, T]] | None = getattr(module, "derived", None)
+    kept: dict[str, tuple[Any, Result]] | None = getattr(module, "derived", None)
     if kept is None:
         return make()
 

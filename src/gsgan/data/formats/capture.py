@@ -53,7 +53,7 @@ from gsgan.utils.arrays import expect_array
 from gsgan.utils.checks import is_number, whole
 from gsgan.utils.errors import DataError
 
-T = TypeVar("T")
+Content = TypeVar("Content")
 LANDMARKS_FILE = "landmarks3d.npz"
 HANDS_FILE = "hands3d.npz"
 FACE_FILE = "face3d.npz"
@@ -182,7 +182,7 @@ def capture_problems(root: Path, limits: Thresholds) -> list[str]:
     problems: list[str] = []
 
     # Each message once: several steps may read the same file.
-    def attempt(read: Callable[[], T]) -> T | None:
+    def attempt(read: Callable[[], Content]) -> Content | None:
         try:
             return read()
         except DataError as error:

@@ -19,7 +19,7 @@ from gsgan.data.pixels import read_mask
 from gsgan.utils.arrays import Bool, Bytes, Float, evenly_spaced
 from gsgan.utils.errors import DataError
 
-T = TypeVar("T")
+Value = TypeVar("Value")
 
 # pixels, maximum side of a mask that joints are compared with
 LONGEST = 512
@@ -195,6 +195,6 @@ def inside_share(
     return float((outside <= allowed)[known].mean())
 
 
-def spread(values: Sequence[T], count: int) -> list[T]:
+def spread(values: Sequence[Value], count: int) -> list[Value]:
     """At most ``count`` of the values, evenly spaced, first and last included."""
     return [values[i] for i in evenly_spaced(len(values), count, ends=True)]

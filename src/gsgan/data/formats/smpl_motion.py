@@ -65,7 +65,7 @@ def landmarks_of(
     vertices = sorted(used)
     small = _only(model, vertices)
 
-    # Frames are posed in chunks.
+    # Chunks bound the memory; each frame is posed by itself.
     kind = cast(Literal["smpl", "smplx"], model.kind)
     p = []
     conf = []
