@@ -135,7 +135,7 @@ def encoded(images: Iterable[Bytes], fps: float) -> bytes:
                 stream.height = height + height % 2
                 stream.width = width + width % 2
 
-                # Players support 4:2:0, whose colours are coded by the standard BT.601.
+                # Most players support 4:2:0 alone. Its colours are coded as BT.601.
                 stream.pix_fmt = "yuv420p"
                 context = stream.codec_context
                 context.colorspace = BT601

@@ -106,7 +106,7 @@ def avatar_of(
 def _trained(
     folder: Path, config: DictConfig, checkpoint: dict[str, Any], scene: SceneInfo
 ) -> Avatar:
-    # The avatar's weights; averaged ones are preferred, as in evaluation during training.
+    # The avatar's weights: the averaged ones, once averaging has begun.
     stored = checkpoint["gsgan"]
     prefix = "average.copy.module." if stored.get("averaged") else "avatar."
     state = {
@@ -133,7 +133,7 @@ def _trained(
             f"data.smpl in {folder / CONFIG} to the model file"
         )
 
-    # All weights are loaded, or none: there is no other way to see a changed config.
+    # The weights do not fit if the config was changed after the training.
     try:
         avatar.load_state_dict(state)
     except RuntimeError as error:

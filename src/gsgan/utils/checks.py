@@ -16,7 +16,7 @@ def _require(holds: bool, name: str, expected: str, value: Any) -> None:
 
 def is_number(value: Any) -> bool:
     """Whether a value is a number; true and false are not."""
-    # bool is a subclass of int.
+    # For Python they are integers.
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 

@@ -124,7 +124,7 @@ def _property(xmp: str, name: str) -> str | None:
 
 def _image_xmp(data: bytes) -> str:
     with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
-        # PNG has XMP behind the pixels, so these are read first.
+        # A PNG may have XMP behind the pixels, so these are read first.
         image.load()
         found = image.info.get(PNG_KEY) or image.info.get("xmp") or ""
     return found if isinstance(found, str) else found.decode("utf-8", "replace")

@@ -260,7 +260,7 @@ def empty_layers(network: Network) -> torch.nn.Sequential:
     """torchvision's ``features`` without values: nothing is drawn, no memory is taken."""
     from torchvision import models  # heavy: only where it is used
 
-    # Only the kinds of layers are needed; tensors on `meta` have no memory.
+    # Values come from a file, if at all; tensors on `meta` have no memory.
     with torch.device("meta"):
         return getattr(models, network.model)(weights=None).features  # type: ignore[no-any-return]
 

@@ -151,7 +151,7 @@ class Lpips(nn.Module):
         size: tuple[int, int],
     ) -> Tensor:
         """The distance of each pixel, ``[B, 1, H, W]``: the layers' maps, enlarged to ``size``."""
-        # The sum begins with zero, so that every layer is added in the same way.
+        # The zero is a scalar, which broadcasts to the size of the maps.
         total = features[0].new_zeros(())
         for layer in self.layers(features, others):
             total = total + functional.interpolate(layer, size, mode="bilinear")
