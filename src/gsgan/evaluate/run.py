@@ -357,12 +357,17 @@ def evaluate_predictions(
     )
 
     # The choice of the config group data, if a command made one.
-    method = Method(name)
+    chosen = None
     if HydraConfig.initialized():
-        chosen = HydraConfig.get().runtime.choices
-        method = replace(method, data=chosen.get("data"))
+        chosen = HydraConfig.get().runtime.choices.get("data")
     return evaluate_method(
-        out, config, console, data, folder.predict, method=method, device=device
+        out,
+        config,
+        console,
+        data,
+        predict=folder.predict,
+        method=Method(name, data=chosen),
+        device=device,
     )
 
 

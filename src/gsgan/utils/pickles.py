@@ -171,6 +171,7 @@ class _Unpickler(pickle._Unpickler):
     """In Python: a damaged file makes the one in C reserve as much memory as a number names."""
 
     def find_class(self, module: str, name: str) -> Any:
+        # The names of one version stand for those of all.
         known = RENAMED.get(module, module), name
         if known not in ALLOWED:
             raise _Refused(f"{module}.{name}")

@@ -125,6 +125,7 @@ def _score(path: Path, name: str) -> float:
 
 def unfinished(folder: Path) -> str | None:
     """Why the job in a folder is unfinished, or None."""
+    # A job without a mark has ended well, or is none of a sweep.
     mark = folder / MARK
     return mark.read_text() if mark.is_file() else None
 
