@@ -21,7 +21,7 @@ from torch.utils.flop_counter import flop_registry
 
 from gsgan.bench.common import NOTHING, check_whole, markdown, number, sentence
 from gsgan.bench.speed import (
-    REST,
+    REST_STAGE,
     TOTAL,
     load_subject,
     make_painter,
@@ -63,7 +63,9 @@ def run(config: DictConfig, folder: Path) -> None:
             )
             work = [stage_work(avatar, frame) for frame in frames]
         mean = pd.concat(work).groupby(level=0, sort=False).mean()
-        tables.append(against(mean, times["median"].drop(REST), peak).assign(size=size))
+        tables.append(
+            against(mean, times["median"].drop(REST_STAGE), peak).assign(size=size)
+        )
     table = pd.concat(tables).rename_axis("stage").reset_index()
     page = text(table, peak, sentence(bench.where))
     bench.write("Roofline", page, {"peak": peak}, frame=table)

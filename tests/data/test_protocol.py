@@ -47,7 +47,7 @@ def test_frames_may_have_a_step():
     "value", ["0-99999999999", "5000000000", 10**10, "9" * 5000, ["0-600", "601-1200"]]
 )
 def test_frames_without_end_are_refused(value, monkeypatch):
-    monkeypatch.setattr("gsgan.data.splits.MOST_FRAMES", 1000)
+    monkeypatch.setattr("gsgan.data.splits.MAX_LISTED_FRAMES", 1000)
     with pytest.raises(ConfigError, match=r"^x"):
         parse_frames(value, "x")
 

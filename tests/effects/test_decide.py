@@ -6,7 +6,7 @@ import pytest
 
 from gsgan.data.scene_info import SceneInfo
 from gsgan.data.surface_colours import SurfaceColours
-from gsgan.effects import NAMES, Effects, EffectSettings, ModelParts, decide
+from gsgan.effects import EFFECT_NAMES, Effects, EffectSettings, ModelParts, decide
 from gsgan.effects.decide import CHOICES
 from gsgan.utils.errors import ConfigError
 
@@ -52,7 +52,7 @@ def test_each_call_turns_on_its_own_effect_and_no_other(change, effect, value):
     )
     assert getattr(after, effect).value == value
     assert {
-        n for n in NAMES if getattr(before, n).value != getattr(after, n).value
+        n for n in EFFECT_NAMES if getattr(before, n).value != getattr(after, n).value
     } == {effect}
 
 

@@ -20,6 +20,7 @@ Other benchmarks are in scripts/bench of a checkout."""
 
 def bench(config: DictConfig) -> None:
     """Times an avatar and writes the result into Hydra's output folder."""
+    # The imports take long, so they come after Hydra has read the command line.
     from hydra.core.hydra_config import HydraConfig
 
     from gsgan.bench.speed import run
@@ -29,6 +30,7 @@ def bench(config: DictConfig) -> None:
 
 def main() -> None:
     """Passes the command line, without its first word, to Hydra."""
+    # Hydra's own help would not name the first word.
     if sys.argv[1:2] in (["--help"], ["-h"]):
         print(HELP)
         return

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
+from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
 
@@ -29,15 +30,16 @@ from gsgan.utils.errors import ConfigError
 from gsgan.utils.files import write_atomically, write_json
 from gsgan.utils.tensors import pick_device
 
+# Rows of the table besides the avatar's own stages.
 TOTAL = "end to end"
-REST = "between stages"
+REST_STAGE = "between stages"
 # Lightning's names, as in conf/trainer.
 PRECISIONS: dict[str, torch.dtype | None] = {
     "32-true": None,
     "bf16-mixed": torch.bfloat16,
     "16-mixed": torch.float16,
 }
-# frames come from the first that has any
+# Frames come from the first of these that has any.
 SHOWN_SPLITS = ("novel_pose", "novel_view", "train")
 Painter = Callable[[Frame], Tensor]
 
@@ -45,7 +47,7 @@ Painter = Callable[[Frame], Tensor]
 def run(config: DictConfig, folder: Path) -> None:
     """Times ``avatar.render(skeleton, camera)``; writes ``speed.md`` and ``speed.json``.
 
-    Convention: bare skeletons, one at a time as a camera delivers them, and in batches. Skeletons
+    The input is bare skeletons, one at a time as a camera delivers them, and in batches. Skeletons
     and cameras are on the CPU, images stay on the device: reading and displaying them is not
     included.
 
@@ -83,12 +85,13 @@ def run(config: DictConfig, folder: Path) -> None:
             tick=lambda: bars.advance(task),
         )
         batches = in_batches(painter, frames, device, config.batch, config.frames)
+
+    # Times in batches are a note below the table of stages.
     median = number(batches["median"])
     least = number(batches["least"])
-    marks = [
-        *marks,
-        f"in batches of {config.batch}: {median} ms an image, at the least {least}",
-    ]
+    marks.append(
+        f"in batches of {config.batch}: {median} ms an image, at the least {least}"
+    )
     settings = {"avatar": name, **settings_of(config, avatar, frames)}
     record = {
         "where": where,
@@ -96,13 +99,13 @@ def run(config: DictConfig, folder: Path) -> None:
         "marks": marks,
         "times_ms": {
             "total": dict(times.loc[TOTAL]),
-            "stages": {
-                stage: dict(row) for stage, row in times.drop([TOTAL, REST]).iterrows()
-            },
-            "rest": dict(times.loc[REST]),
+            "stages": times.drop([TOTAL, REST_STAGE]).to_dict("index"),
+            "rest": dict(times.loc[REST_STAGE]),
             "batches": batches,
         },
     }
+
+    # The table for people, the record for programs.
     page = text(times, where, settings, marks)
     console.print(page, markup=False, highlight=False, soft_wrap=True)
     write_atomically(folder / "speed.md", f"# From skeleton to image\n\n{page}\n")
@@ -117,6 +120,7 @@ def load_subject(
 
     The avatar of ``run`` with its held-out poses, or an untrained one of ``config.model``.
     """
+    # A trained run, with its own data and config.
     moved = DataPaths(config.data_root, config.data_smpl)
     if config.run is not None:
         folder = Path(config.run).expanduser()
@@ -125,6 +129,8 @@ def load_subject(
         avatar, marks = load_avatar(folder, stored, data)
         name = f"trained run {folder.name}"
         frames = spread(data, config.poses)
+
+    # An untrained avatar of the command's config.
     else:
         moved.refuse_without_run()
         data = build_data(config)
@@ -133,10 +139,11 @@ def load_subject(
         marks = [
             "untrained weights: the time of F depends on the places of its Gaussians"
         ]
+        # The size can be chosen freely, so cameras are scaled to it.
         size = (int(config.size.image), int(config.size.image))
-        frames = [
-            replace(f, camera=f.camera.resize(size)) for f in spread(data, config.poses)
-        ]
+        frames = []
+        for frame in spread(data, config.poses):
+            frames.append(replace(frame, camera=frame.camera.resize(size)))
     avatar = place(avatar, device, channels_last=config.channels_last)
     return avatar, frames, name, marks
 
@@ -148,24 +155,27 @@ def spread(data: GsganData, count: int, split: str | None = None) -> list[Frame]
         ConfigError: when the split has no frame.
     """
     names = SHOWN_SPLITS if split is None else (split,)
-    name = next((n for n in names if len(data.dataset(n))), None)
-    if name is None:
-        why = data.reasons.get(names[0], "it has no frames")
-        raise ConfigError(
-            f"no frame to paint in {', '.join(names)}: {why}; choose another split"
-        )
-    dataset = data.dataset(name)
-    return [dataset[i] for i in evenly_spaced(len(dataset), count)]
+    for name in names:
+        dataset = data.dataset(name)
+        if len(dataset):
+            return [dataset[i] for i in evenly_spaced(len(dataset), count)]
+
+    why = data.reasons.get(names[0], "it has no frames")
+    raise ConfigError(
+        f"no frame to paint in {', '.join(names)}: {why}; choose another split"
+    )
 
 
 def place(avatar: Avatar, device: torch.device, *, channels_last: bool) -> Avatar:
     """The frozen avatar on a device, its weights with channels last or not."""
+    # Convolutions are faster on some devices if each pixel's channels lie together.
     layout = torch.channels_last if channels_last else torch.contiguous_format
     return avatar.freeze().to(device=device, memory_format=layout)  # type: ignore[call-overload]
 
 
 def set_backend(avatar: Avatar, backend: str) -> None:
     """Selects the rasteriser of F and S."""
+    # S is drawn by a part of its own.
     avatar.backend = backend
     if avatar.segmentation is not None:
         avatar.segmentation.backend = backend
@@ -186,12 +196,16 @@ def make_painter(
 
     @torch.inference_mode()
     def paint(frame: Frame) -> Tensor:
-        kind = next(avatar.parameters()).device.type
+        # Autocast needs some dtype even if it is off.
         with torch.autocast(
-            kind, dtype=dtype or torch.bfloat16, enabled=dtype is not None
+            next(avatar.parameters()).device.type,
+            dtype=dtype or torch.bfloat16,
+            enabled=dtype is not None,
         ):
             return avatar.render(
-                frame.skeleton, frame.camera, visibility=frame.visibility
+                frame.skeleton,
+                frame.camera,
+                visibility=frame.visibility,
             )
 
     return paint
@@ -200,6 +214,7 @@ def make_painter(
 @contextmanager
 def without_denormals() -> Iterator[None]:
     """Flushes denormals, as in training: a black background decays into them, which is slow."""
+    # The setting is global, so it is taken back.
     torch.set_flush_denormal(True)
     try:
         yield
@@ -209,6 +224,7 @@ def without_denormals() -> Iterator[None]:
 
 def timed(action: Callable[[], object], device: torch.device | None) -> float:
     """Milliseconds of one call, device synchronised."""
+    # Kernels run asynchronously: the clock starts and stops when the device is idle.
     wait(device)
     start = time.perf_counter()
     result = action()
@@ -233,6 +249,7 @@ class StageClock:
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
+        # A stage may run several times in a frame; its times are added.
         wait(self.device)
         start = time.perf_counter()
         yield
@@ -257,22 +274,28 @@ def measure(
         timed by stage, the time outside all stages) and ``end to end`` (without waiting between
         stages).
     """
+    # Frames with a negative number warm up caches and kernels, and are not counted.
     device = next(avatar.parameters()).device
     samples: dict[str, list[float]] = {}
     for i in range(-warmup, count):
+        # End to end: the device is synchronised only at the end.
         frame = frames[i % len(frames)]
         clock = StageClock(device)
         total = timed(lambda frame=frame: painter(frame), device)  # type: ignore[misc]
         tick()
         if i < 0:
             continue
+
+        # The same frame by stage, with the device synchronised after each.
         avatar.stage = clock
         try:
             staged = timed(lambda frame=frame: painter(frame), device)  # type: ignore[misc]
         finally:
             avatar.stage = unwatched
+
+        # The time outside all stages.
         rest = staged - sum(clock.frame.values())
-        for name, took in {**clock.frame, REST: rest, TOTAL: total}.items():
+        for name, took in {**clock.frame, REST_STAGE: rest, TOTAL: total}.items():
             samples.setdefault(name, []).append(took)
     return pd.DataFrame({name: deciles(s) for name, s in samples.items()}).T
 
@@ -285,35 +308,44 @@ def in_batches(
     count: int,
 ) -> dict[str, float]:
     """`deciles` of the milliseconds per image, of at least ``count`` images in batches."""
-    starts = range(0, count, size)
-    groups = [cat([frames[(i + k) % len(frames)] for k in range(size)]) for i in starts]
+    # Batches are made before the first is timed; frames are repeated as needed.
+    repeated = cycle(frames)
+    groups = []
+    for _ in range(0, count, size):
+        groups.append(cat(list(islice(repeated, size))))
     return deciles([timed(partial(painter, group), device) / size for group in groups])
 
 
 def deciles(samples: Sequence[float]) -> dict[str, float]:
-    """The median, the two deciles around it, linear between samples, and the least."""
-    found = np.quantile(samples, [0.5, 0.1, 0.9, 0])
-    return dict(zip(("median", "p10", "p90", "least"), map(float, found), strict=True))
+    """The median, the first and last decile, linear between samples, and the minimum."""
+    median, low, high, least = np.quantile(samples, [0.5, 0.1, 0.9, 0]).tolist()
+    return {"median": median, "p10": low, "p90": high, "least": least}
 
 
 def settings_of(
     config: DictConfig, avatar: Avatar, frames: Sequence[Frame]
 ) -> dict[str, Any]:
     """The settings on which the times depend, by printed name."""
+    # The size of an image; all frames have the same.
     height, width = frames[0].camera.size
     device = next(avatar.parameters()).device
-    windows = [avatar.window(frame.skeleton, frame.camera) for frame in frames]
-    pixels = sum(
-        height * width if w is None else w.size[0] * w.size[1] for w in windows
-    )
+
+    # Networks see windows around the person, if the avatar has them.
+    pixels = 0
+    for frame in frames:
+        window = avatar.window(frame.skeleton, frame.camera)
+        rows, columns = (height, width) if window is None else window.size
+        pixels += rows * columns
     found: dict[str, Any] = {
         "image": f"{width} x {height}",
-        "painted": f"{pixels / (len(windows) * height * width):.0%} of its pixels",
+        "painted": f"{pixels / (len(frames) * height * width):.0%} of its pixels",
         "precision": config.precision,
         "memory format": "channels last" if config.channels_last else "contiguous",
         "batch": 1,
         "frames": config.frames,
     }
+
+    # Settings of avatars with Gaussians.
     if avatar.splats is not None:
         backend, _ = resolve_backend(config.backend, device, avatar.accuracy)
         found |= {"accuracy": avatar.accuracy.name, "backend": backend}
@@ -333,16 +365,22 @@ def text(
     marks: Sequence[str],
 ) -> str:
     """The content of speed.md: the machine, the settings, the table, the notes."""
+    # Shares are of the sum of the stages, not of the time end to end.
     stages = times.drop(TOTAL)
     total = times.loc[TOTAL]
-    shares = [f"{share:.0%}" for share in stages["median"] / stages["median"].sum()]
+    shares = (stages["median"] / stages["median"].sum()).map("{:.0%}".format)
+
+    # Columns in the order of the table; the total is in bold.
     table = times.map(number)
     table.insert(0, "stage", [*stages.index, f"**{TOTAL}**"])
     table["share"] = [*shares, f"{1000 / total['median']:.1f} frames/s"]
     table.columns = pd.Index(
         ["stage", "median ms", "10 % below", "90 % below", "least", "share"]
     )
+
+    # Two sentences, the table, and a list of notes.
     how = ", ".join(f"{key} {value}" for key, value in settings.items())
     lines = [f"{sentence(where)}.", f"{how[0].upper()}{how[1:]}.", markdown(table)]
-    lines += ["\n".join(f"- {mark}" for mark in marks)] if marks else []
+    if marks:
+        lines.append("\n".join(f"- {mark}" for mark in marks))
     return "\n\n".join(lines)

@@ -21,11 +21,11 @@ from gsgan.utils.arrays import Float, as_floats
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import read_text
 
-# in one unit
+# Metres in one unit.
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
-# enough to recognise the format
+# Bytes at the start of a file that are enough to recognise its format.
 HEAD_BYTES = 65536
-# some 1000 cameras
+# The maximum size of a YAML file, in bytes: enough for some 1000 cameras.
 MAX_YAML_BYTES = 2**20
 # names of calibration files
 PATTERNS = ("cameras.json", "intri.yml", "intri.yaml", "*.toml")
@@ -83,6 +83,7 @@ def find_calibration(folder: Path) -> Path:
         if path.is_dir() and "calib" in path.name.lower():
             places.append(path)
 
+    # Files by name, each once although patterns overlap.
     files = set[Path]()
     for place in places:
         for pattern in PATTERNS:
@@ -94,6 +95,7 @@ def find_calibration(folder: Path) -> Path:
         if path.suffix != ".toml" or b"matrix" in path.read_bytes():
             found.append(path)
 
+    # Exactly one must be left.
     if not found:
         raise DataError(
             f"{folder} holds no calibration; give calibration=<file>: {KNOWN}"
@@ -120,6 +122,7 @@ def read_calibration(
     Raises:
         DataError: when it is none of the formats, or a value is impossible.
     """
+    # The start of the file tells its format, whatever its name is.
     try:
         with path.open("rb") as stream:
             head = stream.read(HEAD_BYTES).decode("utf-8-sig", errors="replace")
@@ -186,12 +189,14 @@ def read_cameras(
     Raises:
         DataError: naming the camera and the problem.
     """
+    # Files of other programs may have the same name.
     if not content:
         raise DataError(f"{path} lists no camera")
     if isinstance(content.get("frames"), list):  # a camera would be an object
         raise DataError(
             f"{path} is a scene of nerfstudio, which is not read yet; write its cameras as {KNOWN}"
         )
+
     cameras = {}
     for name, entry in content.items():
         where = f"{path}, camera {name}"
@@ -220,13 +225,19 @@ def read_cameras(
 
 
 def _read_json(
-    path: Path, scale: float | None, pixel_centre: float, notes: list[str]
+    path: Path,
+    scale: float | None,
+    pixel_centre: float,
+    notes: list[str],
 ) -> dict[str, CameraEntry]:
     """The cameras of cameras.json; a meta.json next to it gives unit and pixel centre."""
+    # Without meta.json, the defaults of the bring-your-own layout.
     meta = path.with_name("meta.json")
     found = Conventions()
     if meta.is_file():
         found = read_conventions(meta, read_json(meta))
+
+    # A unit that the user gives comes first.
     if scale:
         found = replace(found, scale=scale)
     return read_cameras(path, read_json(path), found)
@@ -236,7 +247,10 @@ def _read_json(
 
 
 def _read_toml(
-    path: Path, scale: float | None, pixel_centre: float, notes: list[str]
+    path: Path,
+    scale: float | None,
+    pixel_centre: float,
+    notes: list[str],
 ) -> dict[str, CameraEntry]:
     """Cameras by name: size [w, h], matrix, distortions, rotation, translation.
 
@@ -245,6 +259,7 @@ def _read_toml(
     [cameras.0]: the number is its name; a camera that it ignores is left out. aniposelib keeps the
     unit of its calibration board, often mm, without naming it: give it with ``unit``.
     """
+    # A damaged file can fail in any of these ways.
     try:
         content = tomllib.loads(read_text(path))
     except (
@@ -261,22 +276,29 @@ def _read_toml(
 
     cameras: dict[str, CameraEntry] = {}
     for table, entry in tables.items():
+        # Tables about the file or the board, single values, and cameras that are ignored.
         if table in TOML_OTHER_TABLES or not isinstance(entry, dict):
             continue
         if entry.get("ignore"):
             continue
+
+        # A camera's name is the table's, unless the table has one.
         name = str(entry.get("name", table))
         if name in cameras:
             raise DataError(f"{path} names two cameras {name}; give each its own name")
-        cameras[name] = _toml_camera(
-            f"{path}, [{table}]", name, entry, scale or 1.0, pixel_centre
-        )
+        where = f"{path}, [{table}]"
+        cameras[name] = _toml_camera(where, name, entry, scale or 1.0, pixel_centre)
     return cameras
 
 
 def _toml_camera(
-    where: str, name: str, entry: dict[str, Any], scale: float, pixel_centre: float
+    where: str,
+    name: str,
+    entry: dict[str, Any],
+    scale: float,
+    pixel_centre: float,
 ) -> CameraEntry:
+    # All keys are needed; a missing one is most likely misspelt.
     for key in TOML_KEYS:
         if key not in entry:
             raise DataError(f"{where} lacks '{key}'; expected {', '.join(TOML_KEYS)}")
@@ -332,12 +354,15 @@ def read_opencv_yaml(path: Path) -> dict[str, Any]:
     Raises:
         DataError: when it is too large, not such a file, or damaged.
     """
+    # Every error ends in the same message, with its reason.
     reason = "no keys"
     try:
         if path.stat().st_size > MAX_YAML_BYTES:
             raise ValueError(f"more than {MAX_YAML_BYTES} bytes")
         # The first line is %YAML:1.0, where YAML itself has a blank; its line number must stay.
         text = re.sub(r"\A(\s*)%YAML.*", r"\1", read_text(path))
+
+        # Names of entries are text; a file of other content has none.
         values = yaml.load(text, _Loader)
         if isinstance(values, dict) and all(isinstance(key, str) for key in values):
             return values
@@ -357,7 +382,10 @@ def read_opencv_yaml(path: Path) -> dict[str, Any]:
 
 
 def _read_yaml(
-    path: Path, scale: float | None, pixel_centre: float, notes: list[str]
+    path: Path,
+    scale: float | None,
+    pixel_centre: float,
+    notes: list[str],
 ) -> dict[str, CameraEntry]:
     """Cameras by name: K, dist (or D), H, W from intri; Rot or R (Rodrigues), T from extri.
 
@@ -372,6 +400,8 @@ def _read_yaml(
         raise DataError(
             f"{path}: expected OpenCV YAML named intri.yml beside extri.yml"
         )
+
+    # One alone is of no use.
     for file in (intri_path, extri_path):
         if not file.is_file():
             raise DataError(
@@ -389,6 +419,8 @@ def _read_yaml(
         if name == "none":
             continue
         where = f"{intri_path}, camera {name}"
+
+        # Each camera needs K, R and T, from the two files.
         if f"K_{name}" not in intri:
             raise DataError(f"{where} lacks K_{name}; export it again")
 
@@ -425,6 +457,7 @@ def _read_yaml(
 
 def _opencv_rotation(where: str, name: str, extri: Mapping[str, Any]) -> Any:
     """A camera's rotation: the matrix Rot, else from the Rodrigues vector R, else None."""
+    # Files have the matrix, the vector, or both.
     R = extri.get(f"Rot_{name}")
     if R is None and f"R_{name}" in extri:
         vector = numbers(where, extri[f"R_{name}"], f"R_{name}", (3,))
@@ -434,6 +467,7 @@ def _opencv_rotation(where: str, name: str, extri: Mapping[str, Any]) -> Any:
 
 Reader = Callable[[Path, float | None, float, list[str]], dict[str, CameraEntry]]
 """Cameras of a path, metres in a unit (None: the format's own), K's pixel centre; gains notes."""
+# The test of a file's head and the reader of each format; the first that fits is taken.
 FORMATS: dict[str, tuple[Callable[[str], bool], Reader]] = {
     "OpenCV YAML": (
         lambda head: (

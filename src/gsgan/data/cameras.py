@@ -11,7 +11,7 @@ from gsgan.scene import Camera
 from gsgan.utils.arrays import Float, as_floats
 from gsgan.utils.errors import DataError
 
-# numbers of OpenCV's coefficients
+# Numbers of coefficients that OpenCV's lens model can have.
 DISTORTION_LENGTHS = (4, 5, 8)
 # maximum entry of R Rᵀ - I
 ROTATION_TOLERANCE = 1e-3
@@ -76,6 +76,7 @@ class CameraEntry:
             size: ``(H, W)`` that the window is scaled to; None leaves it as it is.
             lens: keep the distortion if `keeps_lens`; otherwise the camera is a pinhole.
         """
+        # The rasteriser knows five coefficients.
         dist = None
         if lens and self.keeps_lens:
             dist = torch.from_numpy(self.dist[None, :5])
@@ -146,11 +147,18 @@ def make_camera(
         raise DataError(
             f"{where}: R mirrors; expected a rotation, world to OpenCV camera axes"
         )
+
+    # All lengths are in metres from here on.
     metres = numbers(where, t, "t", (3,)) * scale
     return CameraEntry(name, K, R, metres, _lens(where, dist), size)
 
 
-def numbers(where: str, raw: Any, key: str, shape: tuple[int, ...]) -> Float:
+def numbers(
+    where: str,
+    raw: Any,
+    key: str,
+    shape: tuple[int, ...],
+) -> Float:
     """Finite float64 numbers of a shape; a column or row in place of a vector is flattened.
 
     Raises:

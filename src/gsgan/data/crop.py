@@ -30,6 +30,7 @@ def project(view: CameraEntry, points: Float) -> tuple[Float, Float]:
     The projection is ``K (R x + t)``, without lens distortion. Points nearer than `NEAR` get
     finite, meaningless pixels: mask them by depth.
     """
+    # x_cam = R x + t, then the pinhole.
     x_cam = np.tensordot(points, view.R.T, 1) + view.t
     depth = x_cam[..., 2]  # [...]
     rays = x_cam / np.maximum(depth, NEAR)[..., None]
@@ -81,6 +82,7 @@ class PersonCrop:
             usable: ``[J]`` which of them count; joints behind the camera never do.
             dist: ``[8]`` the lens if the image keeps its distortion; None for a pinhole.
         """
+        # Joints in the image, as this image shows them.
         pixels, depth = project(view, joints)
         if dist is not None:
             pixels = through_lens(view.K, dist, pixels[:, 0], pixels[:, 1])
@@ -105,6 +107,7 @@ class PersonCrop:
 
 def square_window(size: tuple[int, int]) -> Crop:
     """The smallest centred square that holds a whole image of size ``(H, W)``."""
+    # Half of the missing pixels on each side.
     height, width = size
     side = max(size)
     return Crop((height - side) // 2, (width - side) // 2, (side, side))
@@ -112,6 +115,7 @@ def square_window(size: tuple[int, int]) -> Crop:
 
 def cut(image: Bytes, crop: Crop) -> Bytes:
     """``[h, w, ...]`` the crop of an image ``[H, W, ...]``, zero beyond the border."""
+    # Everything beyond the border stays 0.
     height, width = image.shape[:2]
     h, w = crop.size
     result = np.zeros((h, w, *image.shape[2:]), image.dtype)
@@ -130,7 +134,11 @@ def cut(image: Bytes, crop: Crop) -> Bytes:
     return result
 
 
-def undistort_map(K: Float, dist: Float, crop: Crop) -> NDArray[np.float32]:
+def undistort_map(
+    K: Float,
+    dist: Float,
+    crop: Crop,
+) -> NDArray[np.float32]:
     """``[h, w, 2]`` where each pixel of an undistorted crop lies in the distorted image.
 
     Coordinates as `cv2.remap` takes them (pixel centres at whole numbers). K is kept, skew
@@ -187,7 +195,14 @@ def undistort(points: Float, dist: Float) -> Float:
     if points.size == 0:
         return points
     eye = np.eye(3)
-    raw = _undistort(points[:, None], eye, dist, R=eye, P=eye, criteria=CONVERGED)
+    raw = _undistort(
+        points[:, None],
+        eye,
+        dist,
+        R=eye,
+        P=eye,
+        criteria=CONVERGED,
+    )
     found = raw[:, 0].astype(np.float64)
 
     # The iteration may end at a wrong point, so its result is distorted again and compared.
@@ -195,14 +210,23 @@ def undistort(points: Float, dist: Float) -> Float:
     return np.asarray(np.where(error < FOUND, found, np.nan))
 
 
-def through_lens(K: Float, dist: Float, u: Float, v: Float) -> Float:
+def through_lens(
+    K: Float,
+    dist: Float,
+    u: Float,
+    v: Float,
+) -> Float:
     """``[..., 2]`` pixels where the lens shows what a pinhole shows at pixels u, v ``[...]``."""
     x, y = _unproject(K, u, v)
     shown = distort(np.stack([x, y], axis=-1), dist)
     return shown @ K[:2, :2].T + K[:2, 2]
 
 
-def _unproject(K: Float, u: Float, v: Float) -> tuple[Float, Float]:
+def _unproject(
+    K: Float,
+    u: Float,
+    v: Float,
+) -> tuple[Float, Float]:
     """x/z and y/z of pixels: the inverse of ``u = fx x + s y + cx``, ``v = fy y + cy``."""
     y = (v - K[1, 2]) / K[1, 1]
     x = (u - K[0, 2] - K[0, 1] * y) / K[0, 0]
@@ -216,7 +240,12 @@ def _grid(crop: Crop) -> tuple[Float, Float]:
     return u, v
 
 
-def fold_radius(K: Float, dist: Float, crop: Crop, samples: int = 256) -> float | None:
+def fold_radius(
+    K: Float,
+    dist: Float,
+    crop: Crop,
+    samples: int = 256,
+) -> float | None:
     """The radius (of x/z, y/z) beyond which the lens model folds back, None within the crop.
 
     Args:
@@ -242,7 +271,10 @@ def fold_radius(K: Float, dist: Float, crop: Crop, samples: int = 256) -> float 
 
 
 def take(
-    image: Bytes, crop: Crop, mapping: NDArray[np.float32] | None, exact: bool
+    image: Bytes,
+    crop: Crop,
+    mapping: NDArray[np.float32] | None,
+    exact: bool,
 ) -> Bytes:
     """A crop of an image, undistorted if a mapping is given, zero beyond the border.
 
@@ -263,7 +295,11 @@ def take(
     return np.asarray(taken, np.uint8)
 
 
-def resize(image: Bytes, size: tuple[int, int], exact: bool) -> Bytes:
+def resize(
+    image: Bytes,
+    size: tuple[int, int],
+    exact: bool,
+) -> Bytes:
     """An image resampled to ``(H, W)``; its borders stay, so K scales with the size alone.
 
     Shrinking averages areas, enlarging interpolates linearly, ``exact`` takes the nearest value.
@@ -279,7 +315,11 @@ def resize(image: Bytes, size: tuple[int, int], exact: bool) -> Bytes:
     return np.asarray(cv2.resize(image, size[::-1], interpolation=mode), np.uint8)
 
 
-def black_out(image: Bytes, mask: Bytes, composed: bool) -> Bytes:
+def black_out(
+    image: Bytes,
+    mask: Bytes,
+    composed: bool,
+) -> Bytes:
     """An image ``[H, W, 3]`` on black by its mask ``[H, W]``.
 
     Args:

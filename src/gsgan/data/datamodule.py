@@ -46,8 +46,9 @@ __all__ = [
 
 log = logging.getLogger(__name__)
 
+# The maximum number of loading processes of each training process.
 MOST_WORKERS = 8
-# choices of data.body
+# Choices of data.body.
 BODY_SOURCES = ("auto", "file", "fit", "none")
 # choices of effects.distortion, as the dataset calls them
 LENSES: dict[str, Lens] = {
@@ -121,6 +122,8 @@ class GsganData(LightningDataModule):
         super().__init__()
         # An unknown key is an error.
         inspect.signature(make_splits).bind_partial(**split_keys)
+
+        # Options that contradict each other.
         if root is None and source is None:
             raise ConfigError(
                 f"data.root is not set: give the folder of {wanted}, e.g. "
@@ -169,6 +172,7 @@ class GsganData(LightningDataModule):
         Raises:
             DataError: see the reader and `make_splits`.
         """
+        # Lightning calls this before every stage.
         if "_datasets" not in self.__dict__:
             for note in (*self.layout.notes, *self.splits.notes):
                 log.warning("%s: %s", self.layout.root, note)
@@ -199,6 +203,8 @@ class GsganData(LightningDataModule):
             raise ConfigError(
                 f"data.body=fit, but {layout.root} has body poses of its own; choose data.body=file"
             )
+
+        # Fitted poses come in two versions; the one with hands follows hand landmarks.
         if poses.fitted and skeleton.palms:
             if poses.with_hands is None:
                 raise ConfigError(
@@ -225,6 +231,7 @@ class GsganData(LightningDataModule):
     @cached_property
     def splits(self) -> Splits:
         """The training and held-out items."""
+        # A protocol leaves nothing to choose.
         if self.protocol is None:
             splits = make_splits(self.layout, **self.split_keys)
         else:
@@ -305,6 +312,7 @@ class GsganData(LightningDataModule):
             face=layout.face,
         )
 
+        # Only training leaves out labels near outlines.
         datasets = {}
         for name in SPLITS:
             datasets[name] = CaptureDataset(
@@ -320,6 +328,7 @@ class GsganData(LightningDataModule):
         return datasets
 
     def _folder(self) -> str | Path:
+        # A folder that the user gives comes first.
         if self.root is not None:
             return self.root
         assert self.source is not None  # checked in __init__
@@ -344,6 +353,7 @@ class GsganData(LightningDataModule):
             side = max(sizes[0])
             scale = (self.size or side) / side
 
+        # The departures of images and backbone are found by the protocol itself.
         departures = self.protocol.departures(
             lpips_nets=lpips_nets,
             scale=scale,
@@ -399,6 +409,7 @@ class GsganData(LightningDataModule):
 
     def train_dataloader(self) -> DataLoader[Frame]:
         """Batches of `Frame` in `StepSampler` order."""
+        # Without a trainer, the loader of a single process.
         dataset = self.dataset("train")
         replicas = 1
         rank = 0

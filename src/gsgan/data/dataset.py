@@ -54,6 +54,7 @@ class ImageCache(LRUCache[Item, DecodedImage]):
     def getsizeof(value: DecodedImage) -> int:
         """Bytes held."""
         parts = (value.image, value.mask, value.labels, value.unsure)
+        # A part that the capture lacks is None.
         return sum(part.nbytes for part in parts if part is not None)
 
 
@@ -162,6 +163,7 @@ class CaptureDataset(Dataset[Frame]):
         Raises:
             DataError: when the mask's file is damaged, naming the file.
         """
+        # Resampled as `_load` does.
         item = self.items[index]
         fit = self._fitting(item)
         mask, unsure = self._stored_mask(item)
@@ -184,10 +186,6 @@ class CaptureDataset(Dataset[Frame]):
     def _entry(self, item: Item) -> CameraEntry:
         """The calibrated camera of an item."""
         return self.layout.cameras[item[0]]
-
-    def _target(self, window: Crop) -> tuple[int, int]:
-        """``(H, W)`` of the item's image."""
-        return window.size if self.size is None else (self.size, self.size)
 
     def window(self, item: Item) -> Crop:
         """The part of the (undistorted) image that an item shows."""
@@ -254,6 +252,7 @@ class CaptureDataset(Dataset[Frame]):
 
     def _stored_mask(self, item: Item) -> tuple[Bytes, Bytes | None]:
         """The mask of an item and its unsure pixels, as stored."""
+        # Several files may make one mask; its size is checked once they are joined.
         rules = self.layout.pixels
         mask_files = self.layout.mask_files(*item)
         mask = pixels.read_mask(mask_files, rules)
@@ -269,7 +268,7 @@ class CaptureDataset(Dataset[Frame]):
         # All images of an item share one mapping, which takes longer than its use.
         window = self.window(item)
         mapping = self._mapping(self._entry(item), window)
-        size = self._target(window)
+        size = window.size if self.size is None else (self.size, self.size)
 
         def fit(image: Bytes, exact: bool) -> Bytes:
             taken = cropping.take(image, window, mapping, exact)
@@ -278,7 +277,11 @@ class CaptureDataset(Dataset[Frame]):
         return fit
 
     @staticmethod
-    def _check_size(path: Path, image: Bytes, camera: CameraEntry) -> None:
+    def _check_size(
+        path: Path,
+        image: Bytes,
+        camera: CameraEntry,
+    ) -> None:
         """Refuses an image of another size than the camera's.
 
         Only some headers are checked at the start, see `Thresholds.header_stride`.
@@ -340,7 +343,11 @@ class StepSampler(DistributedSampler[int]):
         # The base class only needs the length of its dataset.
         length: Any = range(items)
         super().__init__(
-            length, num_replicas=replicas, rank=rank, shuffle=True, seed=seed
+            length,
+            num_replicas=replicas,
+            rank=rank,
+            shuffle=True,
+            seed=seed,
         )
         self.items = items
         self.batch_size = batch_size
@@ -350,6 +357,7 @@ class StepSampler(DistributedSampler[int]):
         return self.steps * self.batch_size
 
     def __iter__(self) -> Iterator[int]:
+        # The pass whose order is known; no pass has the number -1.
         order = torch.empty(0)
         shuffled = -1
         first_step = self.epoch * self.steps
@@ -365,7 +373,11 @@ class StepSampler(DistributedSampler[int]):
                 yield int(order[place])
 
 
-def pass_order(items: int, seed: int, number: int) -> torch.Tensor:
+def pass_order(
+    items: int,
+    seed: int,
+    number: int,
+) -> torch.Tensor:
     """``[items]`` the order of a shuffled pass, a pure function of its arguments."""
     # A hash of seed and number, so that neighbouring seeds give unrelated orders.
     mixed = np.random.SeedSequence([seed, number]).generate_state(1, np.uint64)[0]

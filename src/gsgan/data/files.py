@@ -26,7 +26,7 @@ from gsgan.utils.pickles import read_npz
 JPEG_SIGNATURE = b"\xff\xd8"
 JPEG_END = b"\xff\xd9"
 JPEG_SCAN = b"\xff\xda"
-# the last group of digits in a name
+# The last group of digits in a name.
 LAST_DIGITS = re.compile(r"([0-9]+)[^0-9]*$")
 # frame numbers beyond it are dates or damage
 LARGEST_FRAME = 10**9
@@ -57,7 +57,12 @@ def read_header(path: Path) -> tuple[tuple[int, int], int, str]:
     raise DataError(f"{path} is not a valid PNG or JPEG file; copy or export it again")
 
 
-def check_image(path: Path, kind: str, size: tuple[int, int], expected_by: str) -> None:
+def check_image(
+    path: Path,
+    kind: str,
+    size: tuple[int, int],
+    expected_by: str,
+) -> None:
     """Refuses an image whose header does not fit its use, without decoding it.
 
     Args:
@@ -136,6 +141,7 @@ def read_alpha(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]] | None
     Raises:
         DataError: when the file is missing, damaged or cut off.
     """
+    # The header tells, so that other images are not decoded twice.
     if read_header(path)[2] not in ("LA", "RGBA"):
         return None
     image = _decode_8_bit(path)
@@ -144,6 +150,7 @@ def read_alpha(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]] | None
 
 def _decode_8_bit(path: Path) -> NDArray[np.uint8]:
     """The channels of an 8-bit file as OpenCV orders them."""
+    # Unchanged: alpha is kept, and the depth is that of the file.
     image = _decode(path, cv2.IMREAD_UNCHANGED)
     if image.dtype != np.uint8:
         raise DataError(
@@ -154,6 +161,7 @@ def _decode_8_bit(path: Path) -> NDArray[np.uint8]:
 
 def _decode(path: Path, flags: int) -> NDArray[Any]:
     """The image of a whole, undamaged file, by OpenCV with its ``flags``."""
+    # Read by Python, whose errors name the reason; OpenCV only returns None.
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -204,6 +212,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 def read_json_value(path: Path) -> Any:
     """The content of a JSON file, of any type; errors as `read_json`."""
+    # Deep nesting is a RecursionError, other damage a ValueError.
     try:
         return json.loads(read_text(path))
     except OSError as error:
@@ -279,6 +288,7 @@ def frame_files(
     Raises:
         DataError: when a name has no number, two names have the same, or a link leads out.
     """
+    # A folder that does not exist is the same as an empty one.
     place = root / folder
     names = frozenset(own_entries(place, root) if place.is_dir() else ())
     # The index is cached without its folder, so this camera gets a copy with its own.
@@ -304,6 +314,8 @@ def _by_frame(
         if f".{suffix.lower()}" not in suffixes or name.startswith("."):
             continue
         frame = number(stem)
+
+        # Every image needs a number of its own, by which it finds its mask.
         if frame is None:
             raise DataError(
                 f"{name} has no frame number up to {LARGEST_FRAME} in its name; number the "
@@ -324,6 +336,7 @@ def own_entries(folder: Path, root: Path) -> list[str]:
         DataError: if the folder or an entry is a link to a place outside the dataset: a downloaded
             dataset could then read any file of this machine.
     """
+    # Places are compared without links and dots.
     home = root.resolve()
     with os.scandir(folder) as found:
         entries = list(found)

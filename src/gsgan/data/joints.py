@@ -7,6 +7,7 @@ from gsgan.skeleton.hands import HAND, hand_names
 from gsgan.skeleton.template import MEDIAPIPE33
 from gsgan.utils.arrays import Bool, Float
 
+# All joints in one array: the body, the left hand, the right hand, the face.
 BODY = len(MEDIAPIPE33.names)
 LEFT = slice(BODY, BODY + HAND)
 RIGHT = slice(BODY + HAND, BODY + 2 * HAND)
@@ -21,11 +22,12 @@ FACE_MESH = dict(zip(FACE_NAMES, _LIPS + _BROWS + _LIDS, strict=True))
 FACE = slice(HANDS.stop, HANDS.stop + len(FACE_MESH))
 ALL = FACE.stop
 
-# of the body
-WRISTS = [15, 16]
+# The body's wrists, left and right.
+WRIST_JOINTS = [15, 16]
 # knuckles: their bones from the wrist keep their length
-PALM = (5, 9, 13, 17)
+PALM_JOINTS = (5, 9, 13, 17)
 
+# Pairs of a left and a right joint.
 HEAD_PAIRS = ((1, 4), (2, 5), (3, 6), (7, 8), (9, 10))
 ARM_PAIRS = tuple((j, j + 1) for j in range(11, 23, 2))
 LEG_PAIRS = tuple((j, j + 1) for j in range(23, 33, 2))
@@ -43,6 +45,7 @@ _SHARED = (0, 2, 5, 7, 8, *range(11, 17), *range(23, 29))
 _FEET = (29, 30, 31, 32)
 # nose, eyes, ears, arms and legs, in COCO's order
 _COCO = {landmark: joint for joint, landmark in enumerate(_SHARED)}
+# OpenPose's, with feet.
 _BODY_25 = dict(
     zip(
         _SHARED + _FEET,
@@ -53,11 +56,13 @@ _BODY_25 = dict(
 # OpenPose's experimental one
 BODY_25B = _COCO | dict(zip(_FEET, (21, 24, 19, 22), strict=True))
 _HALPE_26 = _COCO | dict(zip(_FEET, (24, 25, 20, 21), strict=True))
+# Body, feet, a face mesh that is left out, and hands.
 _WHOLE_BODY = {
     **_COCO,
     **dict(zip(_FEET, (19, 22, 17, 20), strict=True)),
     **{BODY + j: 91 + j for j in range(2 * HAND)},
 }
+# OpenPose's first model, without feet.
 _COCO_18 = dict(
     zip(
         _SHARED,

@@ -22,10 +22,11 @@ from gsgan.data.validation import (
     drop_frames,
     drop_unmasked,
     drop_unseen,
+    frames_of,
 )
 from gsgan.utils.errors import DataError
 
-# masks by camera and frame
+# Masks by camera and frame.
 MaskIndex = Mapping[str, Mapping[int, tuple[MaskFile, ...]]]
 
 
@@ -144,6 +145,7 @@ class Layout(_Contents):
 
     def mask_files(self, camera: str, frame: int) -> list[tuple[str, Path]]:
         """All masks of a camera and frame with their rules, for `gsgan.data.pixels.read_mask`."""
+        # Paths are stored relative to the root.
         files = []
         for mask in self.masks[camera][frame]:
             files.append((mask.rule, self.root / mask.path))
@@ -151,6 +153,7 @@ class Layout(_Contents):
 
     def label_path(self, camera: str, frame: int) -> Path | None:
         """The part labels of a camera and frame, or None without labels."""
+        # Single images may lack labels in a capture that has them.
         name = self.labels.get(camera, {}).get(frame)
         return None if name is None else self.root / name
 
@@ -161,6 +164,7 @@ def dataset_folder(root: str | Path, expected: str) -> Path:
     Raises:
         DataError: when it does not exist, naming the ``expected`` content, or a link leads out.
     """
+    # A wrong path is the most frequent mistake, so the message says what is expected.
     folder = Path(root).expanduser()
     if not folder.is_dir():
         problem = "is a file, not a folder" if folder.exists() else "does not exist"
@@ -178,6 +182,7 @@ def assemble(found: Found, limits: Thresholds) -> Layout:
     Raises:
         DataError: for whatever is missing or contradictory, naming the file.
     """
+    # Notes of the reader come before those of the checks.
     root = found.root
     cameras = found.cameras
     landmarks = found.landmarks
@@ -204,6 +209,8 @@ def assemble(found: Found, limits: Thresholds) -> Layout:
         labels[name] = {f: path for f, path in stored.items() if f in files}
     if not any(labels.values()):
         labels = {}
+
+    # Headers are read last: this takes longest.
     check_images(
         root,
         cameras,
@@ -217,4 +224,4 @@ def assemble(found: Found, limits: Thresholds) -> Layout:
     # All other fields stay as the reader found them.
     kept = {one.name: getattr(found, one.name) for one in fields(_Contents)}
     kept |= {"images": images, "labels": labels, "notes": tuple(notes)}
-    return Layout(**kept, frames=tuple(sorted(set[int]().union(*images.values()))))
+    return Layout(**kept, frames=tuple(frames_of(images)))

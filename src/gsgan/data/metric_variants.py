@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from gsgan.utils.errors import ConfigError
 
-# allowed values of the fields below
+# Allowed values of the fields below.
 CHOICES: dict[str, tuple[Any, ...]] = {
     "region": ("full", "body_box_cleared", "body_box"),
     "background": ("black", "white"),
@@ -69,6 +69,7 @@ class MetricVariants:
             # True and False equal 1 and 0, but are no choices.
             value = getattr(self, name)
             if isinstance(value, bool) or value not in choices:
+                # Ranges are shown as lists, as a config writes them.
                 listed = []
                 for choice in choices:
                     shown = list(choice) if isinstance(choice, tuple) else choice

@@ -18,7 +18,7 @@ from gsgan.data.files import read_alpha, read_grey, read_stored
 from gsgan.utils.arrays import Bool, Bytes
 from gsgan.utils.errors import DataError
 
-# part number of pixels without a known part
+# The part number of pixels without a known part.
 IGNORE_LABEL = 255
 
 
@@ -77,6 +77,7 @@ def read_mask(files: Sequence[tuple[str, Path]], rules: PixelRules) -> Bytes:
     Raises:
         DataError: when a file is missing, damaged, does not fit its rule, or differs in size.
     """
+    # A person split over several masks is their union.
     first_rule, first = files[0]
     joined = _one_mask(first_rule, first, rules)
     for rule, path in files[1:]:
@@ -93,6 +94,7 @@ def read_mask_values(path: Path) -> Bytes:
     Raises:
         DataError: if the file is missing, damaged or cut off.
     """
+    # Some tools write masks as alpha over a single colour.
     alpha = read_alpha(path)
     if alpha is not None:
         # Colours that vary are an image, whose alpha is not the mask.
@@ -141,6 +143,7 @@ def read_labels(path: Path, rules: PixelRules, names: Sequence[str] | None) -> B
     Raises:
         DataError: when the file is damaged or holds a part that has no name.
     """
+    # Releases number their parts differently.
     labels = read_grey(path)
     if rules.label_table is not None:
         table = np.array(rules.label_table, np.uint8)
@@ -159,6 +162,7 @@ def read_labels(path: Path, rules: PixelRules, names: Sequence[str] | None) -> B
 
 def with_ignored_border(labels: Bytes, mask: Bytes, band: int) -> Bytes:
     """Labels ``[H, W]`` with "ignore" on the `outline` of the mask ``[H, W]``."""
+    # Labels at the outline are often of the wrong part.
     if band == 0:
         return labels
     return np.where(outline(mask, band), np.uint8(IGNORE_LABEL), labels)

@@ -18,12 +18,13 @@ from gsgan.skeleton.template import CHEST, HEAD, PELVIS
 from gsgan.utils.arrays import Bool, Float
 from gsgan.utils.errors import DataError
 
+# Numbers of MediaPipe's landmarks, the left one first.
 SHOULDERS = (11, 12)
 EARS = (7, 8)
 HIPS = (23, 24)
 ARMS = ((11, 13), (13, 15)), ((12, 14), (14, 16))
 LEGS = ((23, 25), (25, 27)), ((24, 26), (26, 28))
-# parents first
+# All bones of the limbs, parents first.
 BONES = (*ARMS[0], *ARMS[1], *LEGS[0], *LEGS[1])
 # by wrist: base of the little finger, base of the index finger, thumb
 HAND_LANDMARKS = {15: (17, 19, 21), 16: (18, 20, 22)}
@@ -34,7 +35,7 @@ BODY = numbers.BODY
 HAND_JOINTS = {15: numbers.LEFT, 16: numbers.RIGHT}
 # lips, brows and lids
 EXPRESSION = numbers.FACE
-# sign of the standard pose's x, by wrist
+# Sign of the standard pose's x, by wrist.
 BODY_SIDES = {15: 1.0, 16: -1.0}
 HEELS_AND_TOES = (29, 30, 31, 32)
 # nose, eyes, ears, corners of the mouth
@@ -95,7 +96,11 @@ class Proportions:
         return length(self.rest, thigh) + length(self.rest, shin)
 
 
-def measure_proportions(p: Tensor, valid: Tensor, up: str) -> Proportions:
+def measure_proportions(
+    p: Tensor,
+    valid: Tensor,
+    up: str,
+) -> Proportions:
     """Measures the proportions of a person.
 
     Args:
@@ -177,7 +182,11 @@ def _place_feet(rest: Float, q: Float) -> None:
         rest[foot] = rest[ankle] + held
 
 
-def _place_head(rest: Float, q: Float, hubs: Float) -> None:
+def _place_head(
+    rest: Float,
+    q: Float,
+    hubs: Float,
+) -> None:
     """Face and ears of the standard pose, the gaze level, above its shoulders."""
     # From the middle of the shoulders to that of the ears, in the chest's axes.
     ears = middle(q, EARS)
@@ -240,6 +249,7 @@ def _hand(p: Float, wrist: Float) -> Float:
 
 def _standing_hands(rest: Float, hands: Mapping[int, Float]) -> Float:
     """``[42, 3]`` the hands of `_hands` at the wrists of a standard pose ``[33, 3]``."""
+    # The signs turn the palm's axes into the standard axes of that side.
     placed = []
     for wrist, hand in hands.items():
         placed.append(rest[wrist] + hand * (BODY_SIDES[wrist], 1.0, BODY_SIDES[wrist]))
@@ -248,6 +258,7 @@ def _standing_hands(rest: Float, hands: Mapping[int, Float]) -> Float:
 
 def _palm_length(p: Float) -> float:
     """Metres from the left wrist of ``[J, 3]`` to the middle of the finger bases."""
+    # The body's own landmarks of the hand, which every skeleton has.
     pinky, index, _ = HAND_LANDMARKS[15]
     return float(np.linalg.norm(middle(p, (pinky, index)) - p[15]))
 
@@ -271,6 +282,7 @@ def upright(up: str) -> Float:
 
 def axis_name(direction: Float) -> str:
     """The axis nearest to a direction ``[3]``: "z" or "-y"; the inverse of `upright`."""
+    # The largest component decides, and its sign.
     axis = int(np.abs(direction).argmax())
     return ("-" if direction[axis] < 0 else "") + "xyz"[axis]
 
@@ -285,7 +297,12 @@ def length(rest: Float, bone: tuple[int, int]) -> float:
     return float(np.linalg.norm(rest[bone[1]] - rest[bone[0]]))
 
 
-def hand_frame(p: Float, wrist: int, pinky: int, index: int) -> Float:
+def hand_frame(
+    p: Float,
+    wrist: int,
+    pinky: int,
+    index: int,
+) -> Float:
     """``[..., 3, 3]`` axes of a hand, see `part_frame`: along it, towards the little finger.
 
     The second axis is opposite to that of `gsgan.skeleton.hands.palm_frames`.

@@ -74,6 +74,7 @@ class Protocol:
 
     def record(self) -> dict[str, Any]:
         """The protocol as plain values, with the frames of the subject."""
+        # The frames alone are kept of those that differ by subject.
         plain = asdict(self)
         plain["train_frames"] = self.frames("train")
         plain["test_frames"] = self.frames("test")

@@ -25,7 +25,7 @@ from gsgan.utils.errors import DataError
 
 # mask value of solid pixels: those at the outline are darkened by the black behind them
 SOLID = 0.9
-# images per requested sample on which the posed body is compared with masks
+# Images per requested sample on which the posed body is compared with masks.
 MOST_BODY_IMAGES = 2
 
 
@@ -64,6 +64,7 @@ class SceneInfo:
         poses: the spread of the training poses; None in checkpoints from before it was stored.
     """
 
+    # Without a default: every checkpoint has them.
     camera_names: tuple[str, ...]
     n_train_cameras: int
     has_distortion: bool
@@ -76,6 +77,8 @@ class SceneInfo:
     body_height: float
     centre: tuple[float, float, float]
     frames: int
+
+    # With the values for checkpoints from before they were stored.
     body_file: str | None = None
     betas: tuple[float, ...] = ()
     train_cameras: tuple[str, ...] = ()
@@ -117,6 +120,7 @@ def scene_info(
         tested: names of the held-out cameras. Only their lenses are looked at, since a lens
             decides what can be rendered.
     """
+    # Only training items are looked at.
     items = splits.items["train"]
     frames = items.frames
     cameras = set(items.cameras)
@@ -125,7 +129,9 @@ def scene_info(
 
     # The centre of the volume: the median over frames of the middle of the visible joints.
     p, valid = layout.landmarks.joints(frames)
-    middles = [joints[seen].mean(0) for joints, seen in zip(p, valid, strict=True)]
+    middles = []
+    for joints, seen in zip(p, valid, strict=True):
+        middles.append(joints[seen].mean(0))
     x, y, z = torch.stack(middles).median(0).values.tolist()
 
     # Proportions of the body with hands; poses of the completed skeletons.
@@ -135,12 +141,13 @@ def scene_info(
     whole_p, whole_valid = whole.joints(frames)
     completed = np.stack([dataset.skeletons.p[frame] for frame in frames])  # [F, J, 3]
 
+    # The skinned body, whose file is the user's.
     body = layout.meta.body
+    labelled = bool(layout.labels)
     return SceneInfo(
         camera_names=layout.camera_names,
         n_train_cameras=len(cameras),
-        has_labels=bool(layout.labels)
-        and any(layout.label_path(*item) for item in items),
+        has_labels=labelled and any(layout.label_path(*item) for item in items),
         has_body_pose=layout.poses is not None,
         body=None if body is None else body.kind,
         skeleton=layout.meta.skeleton,
@@ -174,6 +181,7 @@ def count_labels(layout: Layout, items: Sequence[Item]) -> int:
     if layout.meta.label_names is not None:
         return len(layout.meta.label_names)
 
+    # Pixels to ignore have the highest value, and are no part.
     highest = 0
     for item in items:
         path = layout.label_path(*item)
@@ -184,22 +192,26 @@ def count_labels(layout: Layout, items: Sequence[Item]) -> int:
     return highest + 1
 
 
-def _lenses(layout: Layout, cameras: set[str], tested: set[str]) -> dict[str, Any]:
+def _lenses(
+    layout: Layout,
+    cameras: set[str],
+    tested: set[str],
+) -> dict[str, Any]:
     """The fields of `SceneInfo` about distortion."""
     # Held-out cameras are those that do not train.
     training = [layout.cameras[name] for name in cameras]
     held_out = [layout.cameras[name] for name in tested]
-    lenses = [camera.dist for camera in training + held_out]
+    rational = [camera.dist[5:] for camera in training + held_out]  # k4, k5 and k6
     return {
         "has_distortion": any(camera.distorted for camera in training),
         "held_out_distortion": any(camera.distorted for camera in held_out),
-        # k4, k5 and k6
-        "has_rational_lens": bool(np.any([dist[5:] for dist in lenses])),
+        "has_rational_lens": bool(np.any(rational)),
     }
 
 
 def _scale(dataset: CaptureDataset, samples: int) -> tuple[float, float]:
     """Pixels per metre at the person: minimum and maximum of the cameras' medians."""
+    # A camera may see the person at many distances, so its median counts.
     medians = []
     for indices in _sampled(dataset, samples):
         scales = []
@@ -224,6 +236,7 @@ def _sampled(dataset: CaptureDataset, samples: int) -> list[list[int]]:
     for index, (camera, _) in enumerate(dataset.items):
         by_camera.setdefault(camera, []).append(index)
 
+    # From the first to the last, in even steps.
     sampled = []
     for own in by_camera.values():
         places = evenly_spaced(len(own), samples, ends=True)
@@ -233,6 +246,7 @@ def _sampled(dataset: CaptureDataset, samples: int) -> list[list[int]]:
 
 def _darkest(dataset: CaptureDataset, samples: int) -> float:
     """The brightness in [0, 1] below which the darkest percent of the person's pixels lies."""
+    # Brightness is that of the brightest channel: a saturated colour is not dark.
     brightness = []
     for indices in _sampled(dataset, samples):
         for index in indices:
@@ -243,7 +257,11 @@ def _darkest(dataset: CaptureDataset, samples: int) -> float:
     return float(np.percentile(solid, 1)) if solid.size else 0.0
 
 
-def _body_inside(layout: Layout, dataset: CaptureDataset, samples: int) -> float | None:
+def _body_inside(
+    layout: Layout,
+    dataset: CaptureDataset,
+    samples: int,
+) -> float | None:
     """Mean share of the posed body inside the masks of some training images."""
     # The user's mesh, if the capture has poses and the model file is there.
     body = layout.meta.body
@@ -266,7 +284,9 @@ def _body_inside(layout: Layout, dataset: CaptureDataset, samples: int) -> float
 
 
 def _shared_surface(
-    dataset: CaptureDataset, cameras: tuple[str, ...], samples: int
+    dataset: CaptureDataset,
+    cameras: tuple[str, ...],
+    samples: int,
 ) -> SurfaceColours | None:
     """Differences of colour in frames that all training cameras have; None for a single camera."""
     if len(cameras) < 2:

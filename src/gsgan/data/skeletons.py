@@ -52,6 +52,7 @@ class Landmarks:
 
     def joints(self, frames: Sequence[int]) -> tuple[Tensor, Tensor]:
         """Joints ``[F, J, 3]`` in metres, and ``[F, J]`` whether each of them is visible."""
+        # Visibility 0 marks an estimate.
         p = np.stack([self.p[frame] for frame in frames])
         visibility = np.stack([self.visibility[frame] for frame in frames])
         return torch.from_numpy(p), torch.from_numpy(visibility) > 0
@@ -156,9 +157,9 @@ def make_landmarks(
         p = hips_below(p, valid)
     frames = ids.tolist()
     return Landmarks(
-        dict(zip(frames, p, strict=True)),
-        dict(zip(frames, visibility, strict=True)),
-        source,
+        p=dict(zip(frames, p, strict=True)),
+        visibility=dict(zip(frames, visibility, strict=True)),
+        source=source,
     )
 
 
@@ -168,6 +169,7 @@ def whole_frame_ids(raw: NDArray[Any], where: str) -> NDArray[np.int64]:
     Raises:
         DataError: if they are not.
     """
+    # NaN and infinity are found below, without a warning here.
     with np.errstate(invalid="ignore"):
         ids = np.asarray(raw, np.int64)
 
@@ -188,7 +190,11 @@ def whole_frame_ids(raw: NDArray[Any], where: str) -> NDArray[np.int64]:
     return ids
 
 
-def fill_missing(p: Float, valid: Bool, ids: NDArray[np.int64]) -> Float:
+def fill_missing(
+    p: Float,
+    valid: Bool,
+    ids: NDArray[np.int64],
+) -> Float:
     """Finite estimates of missing joints.
 
     Args:
@@ -266,6 +272,7 @@ def hips_below(p: Float, valid: Bool) -> Float:
     narrow = np.linalg.norm(rest[hips[0]] - rest[hips[1]])
     half = line * (narrow / wide / 2)
 
+    # Half of the hips' width to each side.
     result = p.copy()
     result[hung, hips[0]] = (top + down + half)[hung]
     result[hung, hips[1]] = (top + down - half)[hung]
@@ -274,6 +281,7 @@ def hips_below(p: Float, valid: Bool) -> Float:
 
 def bone_lengths(p: Float, bones: Sequence[tuple[int, int]]) -> Float:
     """``[..., B]`` lengths of bones of ``p [..., J, 3]``; NaN if an end is NaN."""
+    # The joints at the two ends of every bone.
     starts, ends = np.array(bones).T
     return np.asarray(np.linalg.norm(p[..., ends, :] - p[..., starts, :], axis=-1))
 
@@ -284,7 +292,9 @@ def body_height(p: Tensor, valid: Tensor) -> float:
 
 
 def face_at_rest(
-    landmarks: Landmarks, face: Landmarks, trained: Sequence[int]
+    landmarks: Landmarks,
+    face: Landmarks,
+    trained: Sequence[int],
 ) -> tuple[Vector, ...]:
     """Metres: a person's face without expression, see `gsgan.skeleton.in_head`.
 
@@ -296,6 +306,7 @@ def face_at_rest(
         face: its faces.
         trained: training frames.
     """
+    # The face comes after the body's joints.
     p, seen = landmarks.with_face(face).joints(trained)
     first = len(MEDIAPIPE33.names)
 
@@ -341,6 +352,7 @@ def complete_skeletons(
     if template.expression and face is not None:
         whole = whole.with_face(face)
 
+    # Joints that are seen stay as they are.
     p, visible = whole.joints(frames)
     completed, _ = sanitise(p, visible, template, height)
     return replace(whole, p=dict(zip(frames, completed.numpy(), strict=True)))

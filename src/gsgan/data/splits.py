@@ -16,14 +16,14 @@ from gsgan.data.validation import spans
 from gsgan.utils.arrays import Ints
 from gsgan.utils.errors import ConfigError, DataError
 
-T = TypeVar("T", int, str)
+NameOrNumber = TypeVar("NameOrNumber", int, str)
 
 # first, last and step: "12", "0-55" or "0-55:5"
 FRAME_RANGE = re.compile(
     r"\s*(\d{1,18})\s*(?:-\s*(\d{1,18})\s*)?(?::\s*(\d{1,18})\s*)?"
 )
-# bounds the memory that a range from a file can ask for
-MOST_FRAMES = 10**7
+# Bounds the memory that a range from a file can ask for.
+MAX_LISTED_FRAMES = 10**7
 # training, held-out cameras, held-out frames
 SPLITS = ("train", "novel_view", "novel_pose")
 # camera name, frame number
@@ -38,6 +38,7 @@ class Items(Sequence[Item]):
     """
 
     def __init__(self, frames: Mapping[str, Ints]) -> None:
+        # Cameras without an item are left out.
         self._of = {name: numbers for name, numbers in frames.items() if len(numbers)}
         # The places at which the cameras' items end, after a leading 0.
         self._ends = np.cumsum([0, *map(len, self._of.values())])
@@ -58,7 +59,10 @@ class Items(Sequence[Item]):
         return int(self._ends[-1])
 
     def __getitem__(self, index: int) -> Item:  # type: ignore[override]
-        place = range(len(self))[index]  # counts negative places from the end
+        # A range counts negative places from the end, and refuses those beyond it.
+        place = range(len(self))[index]
+
+        # The camera among whose items the place lies.
         camera = int(self._ends.searchsorted(place, side="right")) - 1
         name = self.cameras[camera]
         number = self._of[name][place - self._ends[camera]]
@@ -81,11 +85,11 @@ class Items(Sequence[Item]):
         return int(self._ends[camera] + found[0])
 
 
-class Sides(NamedTuple, Generic[T]):
+class Sides(NamedTuple, Generic[NameOrNumber]):
     """The cameras or frames for training, and those for tests."""
 
-    train: tuple[T, ...]
-    test: tuple[T, ...]
+    train: tuple[NameOrNumber, ...]
+    test: tuple[NameOrNumber, ...]
 
 
 @dataclass(frozen=True)
@@ -159,6 +163,8 @@ def make_splits(
         default=(frames[:cut], frames[cut:]),
         parse=parse_frames,
     )
+
+    # Frames that do not exist are only noted, but a wrong camera is a mistake.
     for camera in (*cameras.train, *cameras.test):
         if camera not in layout.cameras:
             raise DataError(
@@ -172,6 +178,8 @@ def make_splits(
         "novel_view": _items(layout, cameras.test, usable.train),
         "novel_pose": _items(layout, cameras.train, usable.test),
     }
+
+    # The reasons if one of them is empty.
     reasons = {
         "novel_view": "no camera is held out (data.test_cameras)",
         "novel_pose": "no frame is held out (data.test_frames)",
@@ -185,9 +193,10 @@ def _usable(
     """The train and test frames that the capture has, and a note on the others."""
     # Frames that were dropped, or never existed.
     known = set(layout.frames)
-    train = tuple(frame for frame in frames.train if frame in known)
-    test = tuple(frame for frame in frames.test if frame in known)
-    usable = Sides(train, test)
+    usable = Sides(
+        train=tuple(frame for frame in frames.train if frame in known),
+        test=tuple(frame for frame in frames.test if frame in known),
+    )
     missing = sorted({*frames.train, *frames.test} - known)
     if not missing:
         return usable, ()
@@ -204,6 +213,7 @@ def _splits(
     notes: tuple[str, ...],
 ) -> Splits:
     """The splits, with the reasons of the empty ones; the training split must not be empty."""
+    # Held-out splits may be empty.
     if not items["train"]:
         raise DataError(
             f"{layout.root}: nothing to train on with cameras {', '.join(cameras.train) or 'none'} "
@@ -268,6 +278,7 @@ def protocol_splits(layout: Layout, protocol: Protocol) -> Splits:
             "in both splits; test images must not be used for training"
         )
 
+    # A test frame is a new pose unless other cameras train on it.
     new = [frame for frame in frames.test if frame not in trained]
     items = {
         "train": _items(layout, cameras.train, frames.train),
@@ -288,9 +299,12 @@ def _protocol_cameras(
 
 
 def _complete(
-    everything: tuple[T, ...], train: tuple[T, ...] | None, test: tuple[T, ...] | None
-) -> Sides[T]:
+    everything: tuple[NameOrNumber, ...],
+    train: tuple[NameOrNumber, ...] | None,
+    test: tuple[NameOrNumber, ...] | None,
+) -> Sides[NameOrNumber]:
     """Both sides; a side that is None takes everything outside the other."""
+    # With both sides missing, all of them train.
     if train is None:
         train = tuple(x for x in everything if x not in (test or ()))
     if test is None:
@@ -316,10 +330,10 @@ def _sides(
     layout: Layout,
     name: str,
     given: tuple[Any, Any],
-    everything: tuple[T, ...],
-    default: tuple[tuple[T, ...], tuple[T, ...]],
-    parse: Callable[[Any, str], tuple[T, ...]],
-) -> Sides[T]:
+    everything: tuple[NameOrNumber, ...],
+    default: tuple[tuple[NameOrNumber, ...], tuple[NameOrNumber, ...]],
+    parse: Callable[[Any, str], tuple[NameOrNumber, ...]],
+) -> Sides[NameOrNumber]:
     """The train and test side of ``name``, cameras or frames, from the first source that has one:
     the config's ``given`` values, meta.json, else the default."""
     stored = layout.meta.splits
@@ -337,6 +351,7 @@ def _sides(
             test = parse(test_value, f"{where}test_{name}")
         sides = _complete(everything, train, test)
 
+        # What is tested must not be trained on.
         both = sorted(set(sides.train) & set(sides.test))
         if both:
             raise ConfigError(
@@ -344,6 +359,8 @@ def _sides(
                 "not be used for training"
             )
         return sides
+
+    # Neither source has any.
     return Sides(*default)
 
 
@@ -353,6 +370,7 @@ def parse_names(value: Any, where: str) -> tuple[str, ...]:
     Raises:
         ConfigError: when it is neither.
     """
+    # A list in a config may be written as one text.
     if isinstance(value, str):
         names = [name.strip() for name in value.split(",")]
         return tuple(filter(None, names))
@@ -372,6 +390,7 @@ def parse_frames(value: Any, where: str) -> tuple[int, ...]:
     Raises:
         ConfigError: when a part is neither.
     """
+    # A list, a text of several parts, or a single number.
     parts = value.split(",") if isinstance(value, str) else value
     if not isinstance(parts, Iterable):
         parts = (parts,)
@@ -392,8 +411,8 @@ def parse_frames(value: Any, where: str) -> tuple[int, ...]:
             )
 
         # Bounds, checked before the numbers take memory.
-        if len(numbers) + len(frames) > MOST_FRAMES:
-            raise ConfigError(f"{where} names more than {MOST_FRAMES} frames")
+        if len(numbers) + len(frames) > MAX_LISTED_FRAMES:
+            raise ConfigError(f"{where} names more than {MAX_LISTED_FRAMES} frames")
         if numbers[-1] > LARGEST_FRAME:
             raise ConfigError(
                 f"{where} names frame {numbers[-1]}; frame numbers end at {LARGEST_FRAME}"

@@ -103,6 +103,7 @@ def surface_colours(moments: Sequence[Sequence[Frame]]) -> SurfaceColours | None
 
 def _metres_per_pixel(frame: Frame) -> float:
     """The size of a pixel at the person's median depth."""
+    # At depth z a pixel is z / f metres wide.
     depth = float(frame.camera.to_camera(frame.skeleton)[..., 2].median())
     return depth / float(frame.camera.K[0, 0, 0])
 
@@ -112,6 +113,7 @@ def body_inside(frame: Frame, body: SkinnedBody) -> float | None:
 
     None if the image shows none of them, or its mask is empty.
     """
+    # The posed vertices in the image.
     assert frame.body is not None
     with torch.no_grad():
         vertices = body.to(torch.float32).posed_vertices(frame.body)[0]

@@ -23,7 +23,7 @@ Index = Mapping[str, Mapping[int, str]]
 # headers read on opening, in even steps; every image is checked again when decoded
 MOST_HEADERS = 10_000
 # frames on which the cameras are checked, in even steps
-MOST_FRAMES = 10_000
+MAX_CHECKED_FRAMES = 10_000
 
 
 @dataclass(frozen=True)
@@ -62,13 +62,14 @@ def drop_frames(
         DataError: when no frame is left.
     """
     # The frames that cannot be used, by reason.
-    frames = _frames(images)
+    frames = frames_of(images)
     dropped: dict[str, list[int]] = {}
     for frame in frames:
         reason = _unusable(frame, landmarks, poses, limits)
         if reason:
             dropped.setdefault(reason, []).append(frame)
 
+    # One note per reason, with the frames as ranges.
     gone: list[int] = []
     for reason, ids in dropped.items():
         gone += ids
@@ -81,13 +82,16 @@ def drop_frames(
     return {name: files.without(gone) for name, files in images.items()}
 
 
-def _frames(images: Images) -> list[int]:
+def frames_of(images: Images) -> list[int]:
     """The frames of any camera, rising."""
     return sorted(set[int]().union(*images.values()))
 
 
 def _unusable(
-    frame: int, landmarks: Landmarks, poses: Poses | None, limits: Thresholds
+    frame: int,
+    landmarks: Landmarks,
+    poses: Poses | None,
+    limits: Thresholds,
 ) -> str | None:
     """The reason to drop a frame, for the notes; None to keep it."""
     if frame not in landmarks.visibility:
@@ -116,6 +120,7 @@ def spans(ids: list[int]) -> str:
     """Numbers as ranges: [1, 2, 3, 7] is "1-3, 7"."""
     if not ids:
         return ""
+
     # Runs of consecutive numbers: a run ends where the next number is not one more.
     numbers = np.array(sorted(ids), int)
     gaps = np.flatnonzero(np.diff(numbers) != 1) + 1
@@ -141,10 +146,11 @@ def check_geometry(
     Raises:
         DataError: naming the ``calibration`` file and camera, or the distance and ``unit_hint``.
     """
+    # All joints at once, which is faster than frame by frame.
     frames, joints, valid = _seen(images, landmarks)
 
     # A long capture is checked on some of its frames.
-    some = slice(None, None, -(-len(frames) // MOST_FRAMES))
+    some = slice(None, None, -(-len(frames) // MAX_CHECKED_FRAMES))
     joints = joints[some]
     valid = valid[some]
     check_distance(
@@ -167,7 +173,7 @@ def _seen(
 ) -> tuple[list[int], NDArray[Any], NDArray[Any]]:
     """The frames of any camera ``[F]``, rising, their joints ``[F, J, 3]``, and ``[F, J]`` whether
     each is visible."""
-    frames = _frames(images)
+    frames = frames_of(images)
     joints = np.stack([landmarks.p[frame] for frame in frames])
     visibility = np.stack([landmarks.visibility[frame] for frame in frames])
     return frames, joints, visibility > 0
@@ -210,6 +216,7 @@ def drop_unseen(
     Raises:
         DataError: when a camera never sees the person.
     """
+    # Only cameras that lose an image get a new index.
     kept = dict(images)
     frames, joints, valid = _seen(images, landmarks)
     for name, files in images.items():
@@ -256,6 +263,7 @@ def drop_unmasked(
     if not lost:
         return images
 
+    # The first missing mask stands for the others in messages.
     count = sum(map(len, images.values()))
     missing = sum(map(len, lost.values()))
     camera = next(iter(lost))

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 AUTO = "auto"
 ON_OFF = (AUTO, "on", "off")
+# Values that each effect may be set to.
 CHOICES: dict[str, tuple[str | int, ...]] = {
     "view_dependence": (*ON_OFF, 0, 1, 2, 3),
     "distortion": (*ON_OFF, "undistort", "project"),
@@ -23,6 +24,8 @@ CHOICES: dict[str, tuple[str | int, ...]] = {
     "body_points": ON_OFF,
     "random_background": ON_OFF,
 }
+
+# Reasons that more than one rule gives.
 FORCED = "set in the config"
 TOO_LITTLE = (
     "the cameras share too little surface, or images are too coarse, to compare colours"
@@ -37,21 +40,26 @@ RATIONAL = (
 class EffectSettings:
     """A requested value per effect, and the thresholds of ``auto``; see conf/effects/auto.yaml.
 
-    Convention: ``auto`` decides from the scene, ``off`` builds and computes nothing, any other
-    value forces the effect. YAML's bare on and off arrive as true and false and are accepted.
+    ``auto`` decides from the scene, ``off`` builds and computes nothing, any other value forces the
+    effect. YAML's bare on and off arrive as true and false and are accepted.
 
     Raises:
         ConfigError: on a value that is not allowed, naming it.
     """
 
+    # The requested values.
     view_dependence: str | int | bool = AUTO
     distortion: str | bool = AUTO
     antialias: str | bool = AUTO
     colour_correction: str | bool = AUTO
     body_points: str | bool = AUTO
     random_background: str | bool = AUTO
+
+    # Restrictions of all of them, and what happens to a forced effect that is not possible.
     only: Sequence[str] | None = None
     impossible: str | bool = "error"
+
+    # Thresholds of ``auto``.
     view_residual: float = 0.09
     rendered_scales: Sequence[float] = (1.0, 1.0)
     degree_cameras: Sequence[int] = (2, 4, 8)
@@ -62,8 +70,10 @@ class EffectSettings:
     body_inside: float = 0.95
 
     def __post_init__(self) -> None:
+        # Each requested value is one of the effect's.
         for name in CHOICES:
             value = getattr(self, name)
+            # YAML reads a bare on or off as a truth value.
             if isinstance(value, bool):
                 value = "on" if value else "off"
             object.__setattr__(
@@ -72,20 +82,21 @@ class EffectSettings:
         if self.impossible is False:  # YAML's off
             object.__setattr__(self, "impossible", "off")
         one_of("effects.impossible", self.impossible, ("error", "off"))
+
+        # Lists must have the right length and order.
         counts = list(self.degree_cameras)
         if len(counts) != 3 or counts != sorted(counts):
             raise ConfigError(
                 f"effects.degree_cameras must be three rising numbers, got {counts}"
             )
         scales = list(self.rendered_scales)
-        if (
-            len(scales) != 2
-            or not all(map(is_number, scales))
-            or not 0 < scales[0] <= scales[1]
-        ):
+        numbers = len(scales) == 2 and all(map(is_number, scales))
+        if not numbers or not 0 < scales[0] <= scales[1]:
             raise ConfigError(
                 f"effects.rendered_scales must be two rising positive numbers, got {scales}"
             )
+
+        # A single name is a mistake: its letters would be taken for effects.
         listed = [self.only] if isinstance(self.only, str) else list(self.only or ())
         if isinstance(self.only, str) or set(listed) - set(CHOICES):
             raise ConfigError(
@@ -94,12 +105,16 @@ class EffectSettings:
 
     def requested(self, name: str) -> str | int:
         """The value requested for an effect, with ``only`` taken into account."""
+        # Without `only` every effect is as requested.
         value: str | int = getattr(self, name)
         if self.only is None:
             return value
-        # distortion is a property of the camera, not an option
+
+        # Effects that are not listed are off, but distortion is a property of the camera.
         if name not in self.only:
             return value if name == "distortion" else "off"
+
+        # Listed effects are on.
         return "on" if value in (AUTO, "off", 0) else value
 
 
@@ -118,13 +133,16 @@ class ModelParts:
     body_points: bool = True
 
     def lacks(self, effect: str) -> str | None:
-        """Why the model cannot have an effect; None where it can."""
+        """The reason why the model cannot have an effect; None if it can."""
+        # Images are undistorted before any model sees them.
         if effect == "distortion":
             return None
         if effect == "body_points":
             if not self.points:
                 return "this model has no points on the skeleton"
             return None if self.body_points else "the model leaves them out"
+
+        # All other effects are of Gaussians.
         return None if self.splats else "this model has no Gaussians"
 
 
@@ -141,6 +159,7 @@ def decide(
     Raises:
         ConfigError: when a forced effect is not possible in this scene or model.
     """
+    # Each effect by itself: none depends on another.
     model = model or ModelParts()
     found = {name: _one(name, info, settings, model) for name in CHOICES}
     cameras = info.train_cameras if found["colour_correction"].on else ()
@@ -150,15 +169,20 @@ def decide(
 def _one(
     name: str, info: SceneInfo, settings: EffectSettings, model: ModelParts
 ) -> Effect:
+    # Off by request.
     requested = settings.requested(name)
     off: str | int = 0 if name == "view_dependence" else OFF
     if requested in (OFF, 0):
         return Effect(off, FORCED)
+
+    # Not possible in this scene or model. Lenses that cannot be rendered are undistorted.
     reason = _impossible(name, info, requested) or model.lacks(name)
     if reason is not None:
         if requested != AUTO and settings.impossible == "error":
             raise ConfigError(f"effects.{name}={requested} is not possible: {reason}")
         return Effect("undistort" if reason == RATIONAL else off, reason)
+
+    # Decided by rule, or forced; "on" stands for the usual mode or degree.
     if requested == AUTO:
         return _RULES[name](info, settings)
     if name == "distortion" and requested == "on":
@@ -169,13 +193,18 @@ def _one(
 
 
 def _impossible(name: str, info: SceneInfo, requested: str | int) -> str | None:
-    """Why the scene cannot have an effect; None where it can."""
+    """The reason why the scene cannot have an effect; None if it can."""
+    # Lenses that are all pinholes need nothing.
     if name == "distortion":
         if not (info.has_distortion or info.held_out_distortion):
             return "no camera of this data has a lens coefficient other than zero"
         return RATIONAL if requested == "project" and info.has_rational_lens else None
+
+    # Corrections are relative to other cameras.
     if name == "colour_correction" and info.n_train_cameras < 2:
         return "one training camera has no other to differ from"
+
+    # A skinned body needs poses, and a model file unless it is the free one.
     if name == "body_points" and not info.has_body_pose:
         return "the data has no body pose"
     if name == "body_points" and info.body != "free" and info.body_file is None:
@@ -184,12 +213,15 @@ def _impossible(name: str, info: SceneInfo, requested: str | int) -> str | None:
 
 
 def _view_dependence(info: SceneInfo, settings: EffectSettings) -> Effect:
+    # Few cameras see a point from too few sides to resolve its harmonics.
     cameras = info.n_train_cameras
     degree = most_degree(info, settings)
     if degree == 0:
         return Effect(
             0, f"{cameras} training camera sees each moment from one side only"
         )
+
+    # Colours of one surface that differ between cameras after colour correction.
     if info.surface is None:
         return Effect(0, TOO_LITTLE)
     left = info.surface.residual
@@ -212,9 +244,10 @@ def _distortion(info: SceneInfo, settings: EffectSettings) -> Effect:
 
 
 def _antialias(info: SceneInfo, settings: EffectSettings) -> Effect:
+    # The ratio of the largest to the smallest scale, trained or rendered.
     low, high = info.scale_train
-    smallest, largest = (float(factor) for factor in settings.rendered_scales)
-    ratio = max(high * largest, high) / min(low * smallest, low)
+    smallest, largest = settings.rendered_scales
+    ratio = max(high * float(largest), high) / min(low * float(smallest), low)
     measured = f"training and rendered images differ by {ratio:.2f} times in scale"
     if ratio < settings.scale_ratio:
         return Effect(OFF, f"{measured} at most (limit {settings.scale_ratio:g})")
@@ -225,6 +258,8 @@ def _colour_correction(info: SceneInfo, settings: EffectSettings) -> Effect:
     seen = info.surface
     if seen is None:
         return Effect(OFF, TOO_LITTLE)
+
+    # Differences that highlights can cause are not the camera's.
     measured = f"two cameras differ by {seen.difference:.3f} on shared surface"
     highlights = settings.colour_share * seen.residual
     if seen.difference < settings.colour_difference:
@@ -241,6 +276,8 @@ def _colour_correction(info: SceneInfo, settings: EffectSettings) -> Effect:
 def _body_points(info: SceneInfo, settings: EffectSettings) -> Effect:
     if info.body_inside is None:
         return Effect(OFF, "the body's mesh cannot be read")
+
+    # A body that reaches beyond the masks does not fit the person.
     measured = f"{100 * info.body_inside:.0f} % of the posed body lies inside the masks"
     limit = f"limit {100 * settings.body_inside:g} %"
     if info.body_inside < settings.body_inside:
@@ -249,6 +286,7 @@ def _body_points(info: SceneInfo, settings: EffectSettings) -> Effect:
 
 
 def _random_background(info: SceneInfo, settings: EffectSettings) -> Effect:
+    # Dark clothes on black look the same whether they are painted or transparent.
     measured = f"the person's darkest percent has brightness {info.darkest:.2f}"
     limit = f"limit {settings.dark:g}"
     if info.darkest < settings.dark:
@@ -256,6 +294,7 @@ def _random_background(info: SceneInfo, settings: EffectSettings) -> Effect:
     return Effect(OFF, f"{measured} ({limit})")
 
 
+# The rule that decides each effect if its value is `auto`.
 _RULES: dict[str, Callable[[SceneInfo, EffectSettings], Effect]] = {
     "view_dependence": _view_dependence,
     "distortion": _distortion,

@@ -52,6 +52,7 @@ class Effects:
         cameras: training cameras in the order of the colour corrections.
     """
 
+    # The order of the fields is that of the printed table.
     view_dependence: Effect = Effect(0, _DEFAULT.why)
     distortion: Effect = _DEFAULT
     antialias: Effect = _DEFAULT
@@ -61,7 +62,8 @@ class Effects:
     cameras: tuple[str, ...] = ()
 
     def __iter__(self) -> Iterator[tuple[str, Effect]]:
-        return ((name, getattr(self, name)) for name in NAMES)
+        for name in EFFECT_NAMES:
+            yield name, getattr(self, name)
 
     @property
     def degree(self) -> int:
@@ -70,12 +72,16 @@ class Effects:
 
     def rows(self) -> list[tuple[str, str, str]]:
         """One row per effect: name, value, why."""
-        return [
-            (name, str(one.value) if one.on else OFF, one.why) for name, one in self
-        ]
+        # A degree of 0 is printed as off.
+        rows = []
+        for name, effect in self:
+            value = str(effect.value) if effect.on else OFF
+            rows.append((name, value, effect.why))
+        return rows
 
     def table(self) -> Table:
         """The rows for a terminal."""
+        # Effects that are off are dimmed.
         table = Table(title="effects", title_justify="left")
         for header in HEADERS:
             table.add_column(header, overflow="fold")
@@ -85,22 +91,23 @@ class Effects:
 
     def plain(self) -> dict[str, Any]:
         """Plain values, as a checkpoint holds them."""
-        return {name: asdict(effect) for name, effect in self} | {
-            "cameras": list(self.cameras)
-        }
+        plain: dict[str, Any] = {name: asdict(effect) for name, effect in self}
+        plain["cameras"] = list(self.cameras)
+        return plain
 
     @classmethod
     def from_plain(cls, values: Mapping[str, Any]) -> Effects:
         """The inverse of `plain`."""
-        found = {name: Effect(**values[name]) for name in NAMES}
+        found = {name: Effect(**values[name]) for name in EFFECT_NAMES}
         return cls(**found, cameras=tuple(values["cameras"]))
 
     def check_same(self, stored: Mapping[str, Any]) -> None:
-        """Refuses to resume a run that began with other effects, stored as of `plain`.
+        """Refuses to resume a run that began with other effects, stored as `plain` gives them.
 
         Raises:
             ConfigError: naming the effect and what to do.
         """
+        # Reasons may differ: the measured values can change with the machine.
         before = Effects.from_plain(stored)
         for name, effect in self:
             was: Effect = getattr(before, name)
@@ -112,4 +119,5 @@ class Effects:
                 )
 
 
-NAMES = tuple(field.name for field in fields(Effects) if field.name != "cameras")
+# The fields that are effects.
+EFFECT_NAMES = tuple(field.name for field in fields(Effects) if field.name != "cameras")

@@ -21,7 +21,7 @@ SCORES_FILE = "scores.csv"
 FACTS_FILE = "facts.json"
 TABLE_FILE = "metrics.md"
 NAMES = (METRICS_FILE, SCORES_FILE, FACTS_FILE, TABLE_FILE)
-# columns of scores.csv
+# Columns of scores.csv.
 HEADER = ("split", "variant", "camera", "frame", *METRICS)
 # {split: {variant: {metric: value}}}
 Results = dict[str, dict[str, dict[str, Any]]]
@@ -46,7 +46,7 @@ WITH_HANDS = (
     "lpips_alex",
     "miou",
 )
-# names in tables
+# Names in tables.
 VARIANTS = {
     "full": "final image",
     "splat": "Step I's colour",
@@ -71,6 +71,7 @@ class Scored:
 
 def write_scored(scored: Scored, folder: Path) -> None:
     """Writes the four files atomically; metrics.json is last, so if it is new, all of them are."""
+    # Everything is formatted before the first file is written.
     origin = json.dumps(scored.origin, indent=2, allow_nan=False)
     table = scored.rows.to_csv(columns=list(HEADER), index=False, lineterminator="\n")
     write_atomically(folder / SCORES_FILE, table)
@@ -124,6 +125,7 @@ def notes(results: Results) -> list[str]:
         for mark in scores["marks"]:
             found[f"marked: {mark}"] = None
 
+        # The protocol is the same for every split, and so is its note.
         if scores.get("protocol"):
             found |= dict.fromkeys(_protocol_notes(scores["protocol"]))
 
@@ -167,6 +169,8 @@ def print_table(results: Results, origin: dict[str, Any], console: Console) -> N
             table.add_row(f"[bold]{split}[/bold], {images} images")
             previous = split
         table.add_row(variant, *scores)
+
+    # The caption and the notes are not part of the table: they would widen its columns.
     console.print(table)
     for line in (caption(origin), *notes(results)):
         console.print(f"  {line}", markup=False, highlight=False)
@@ -178,7 +182,7 @@ def markdown(results: Results, origin: dict[str, Any]) -> str:
     header = ["split", "variant", "images"]
     for metric in METRICS.values():
         header.append(metric.short_heading)
-    by_split = pages.markdown(header, list(rows(results, cameras=False)))
+    by_split = pages.markdown(header, list(rows(results)))
     by_camera = pages.markdown(header, list(rows(results, cameras=True)))
     listed = "\n".join(f"- {note}" for note in notes(results))
 

@@ -15,7 +15,7 @@ from gsgan.scene import Frame
 from gsgan.utils.files import write_atomically
 from gsgan.utils.images import to_bytes
 
-# pixels
+# The height of captions, pixels.
 CAPTION_HEIGHT = 22
 # errors are small: they are shown brighter by this factor
 ERROR_GAIN = 4.0
@@ -36,6 +36,7 @@ def error_heat(image: Tensor, target: Tensor) -> Tensor:
 
 def grid_rows(frame: Frame, painting: Rendering) -> list[dict[str, Tensor]]:
     """One row per batch item: images ``[3, H, W]`` by caption; what was not rendered is absent."""
+    # Values beyond the range of a display are cut off.
     assert painting.image is not None
     image = painting.image.clamp(0, 1)
 
@@ -67,9 +68,9 @@ def write_grid(rows: Sequence[dict[str, Tensor]], path: Path, least: int = 160) 
         least: pixels; smaller images are enlarged by a whole factor to at least this width.
     """
     # All images in the size of the largest.
-    sizes = [image.shape[-2:] for row in rows for image in row.values()]
-    height = max(h for h, _ in sizes)
-    width = max(w for _, w in sizes)
+    images = [image for row in rows for image in row.values()]
+    height = max(image.shape[-2] for image in images)
+    width = max(image.shape[-1] for image in images)
     lines = []
     for row in rows:
         padded = []
@@ -97,6 +98,8 @@ def write_grid(rows: Sequence[dict[str, Tensor]], path: Path, least: int = 160) 
             thickness=1,
             lineType=cv2.LINE_AA,
         )
+
+    # OpenCV writes BGR.
     bgr = np.concatenate([header, pixels])[..., ::-1]
     _, encoded = cv2.imencode(".png", bgr)
     write_atomically(path, encoded.tobytes())

@@ -41,8 +41,11 @@ class KeptScores:
 
     def keep(self, tally: Tally) -> None:
         """Writes the scores, if the last time was long ago."""
+        # Once a minute is enough: an interruption then costs little.
         if time.monotonic() - self._written < KEEP_SECONDS:
             return
+
+        # Packed in memory first, since the file is written completely or not at all.
         stream = io.BytesIO()
         torch.save({"key": self.key, "tally": tally.state_dict()}, stream)
         with writing(self.path):

@@ -18,7 +18,7 @@ from gsgan.run.stored import choices
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
 
-# the ending of a commit with local changes
+# The ending of a commit with local changes.
 DIRTY = "+changes"
 
 
@@ -81,6 +81,7 @@ def origin(method: Method, data: GsganData, device: torch.device) -> dict[str, A
 def fingerprint(data: GsganData) -> str:
     """A short hash of cameras, frames, splits, image size and fitted body poses. It does not depend
     on the contents of images, nor on the place of the files."""
+    # All inputs that images depend on, without the images: reading them would take long.
     layout = data.layout
     cameras = {name: list(camera.size) for name, camera in layout.cameras.items()}
     splits = {name: list(map(list, items)) for name, items in data.splits.items.items()}
@@ -102,6 +103,7 @@ def fingerprint(data: GsganData) -> str:
 
 def training_code() -> list[str]:
     """The commit that a checkpoint records; empty if unknown."""
+    # Local changes are part of the code, though git cannot name them.
     commit, dirty = _commit()
     if commit is None:
         return []

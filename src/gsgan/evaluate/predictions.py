@@ -33,14 +33,14 @@ from gsgan.utils.errors import ConfigError, DataError
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
 
-# metres around the body's vertices, as in published scoring scripts
+# Metres around the body's vertices, as in published scoring scripts.
 VERTEX_MARGIN = 0.05
 # metres around joints, which are inside the body; as in `PersonCrop`
 JOINT_MARGIN = 0.2
 # Variants: the final image, the colour of Step I, and the all-background image.
 FULL = "full"
 SPLAT = "splat"
-FLOOR = "floor"
+FLOOR_STAGE = "floor"
 # of a pattern of file names
 FIELDS = ("split", "camera", "camera_index", "frame")
 FIELD = re.compile(r"\{(.*?)\}")
@@ -103,6 +103,7 @@ class BodyBoxes:
 
     def masks(self, frame: Frame) -> Tensor:
         """``[B, 1, H, W]`` bool: the pixels inside the projected box."""
+        # The box is projected by the item's own camera.
         masks = []
         for i in range(len(frame)):
             corners = self.corners(frame, i)
@@ -188,6 +189,7 @@ class PredictionFolder:
             DataError: when it is damaged, not 8-bit RGB, or on another background than
                 ``background``.
         """
+        # An RGB image in [0, 1], on the frame's device.
         path = self.root / self.files[item]
         rgb, alpha = read_with_alpha(path)
         colours = torch.from_numpy(rgb).float() / 255
@@ -198,6 +200,8 @@ class PredictionFolder:
             cover = torch.from_numpy(alpha).float() / 255
             cover = cover[None, None].to(frame.image)
             return Prediction({FULL: image * cover}, {FULL: cover})
+
+        # An opaque image is on the protocol's background, which only its pixels can tell.
         self._check_background(path, image, frame.mask)
         return Prediction({FULL: image}, {})
 
@@ -247,6 +251,8 @@ def read_folder(
             f"predictions_pattern={pattern} must have {{frame}} and {{camera}} or "
             "{camera_index}, may have {split}, and no other field"
         )
+
+    # A missing folder would otherwise look like one without any image.
     if not root.is_dir():
         raise DataError(
             f"predictions={root} is not a folder; give that of a method's images"
@@ -257,6 +263,7 @@ def read_folder(
     for name in sorted(glob("**", root_dir=root, recursive=True)):
         stored.setdefault(_unpadded(name), []).append(name)
 
+    # Every expected image, once. All missing ones are counted before they are reported.
     files = {}
     missing = []
     for split, sizes in expected.items():
@@ -283,6 +290,8 @@ def read_folder(
             files[camera, frame] = found[0]
             truth = f"the ground truth of {what}, as scored,"
             check_image(root / found[0], "image", size, truth)
+
+    # The number of missing images, and the first of them.
     if missing:
         raise DataError(
             f"{root} lacks {len(missing)} of {len(missing) + len(files)} images; the first is "

@@ -3,7 +3,7 @@
 import io
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,7 +32,13 @@ from gsgan.evaluate.files import (
 from gsgan.evaluate.grids import write_grid
 from gsgan.evaluate.kept import FOLDER, KeptScores
 from gsgan.evaluate.origin import Method, fingerprint, origin, trained
-from gsgan.evaluate.predictions import FLOOR, FULL, BodyBoxes, Preparation, read_folder
+from gsgan.evaluate.predictions import (
+    FLOOR_STAGE,
+    FULL,
+    BodyBoxes,
+    Preparation,
+    read_folder,
+)
 from gsgan.evaluate.scores import (
     Predict,
     Scorer,
@@ -69,7 +75,7 @@ COLUMNS = (
     "lpips_alex_person",
     "flicker",
 )
-# edges of the bins of distances
+# Edges of the bins of distances.
 BINS = (0, 1, 2, 3, 4, 6, 8, 12, np.inf)
 
 
@@ -103,6 +109,8 @@ def write_distances(
     """
     # The distance of each frame's pose, by image.
     table = rows.loc[rows["variant"] == FULL, ["split", "camera", "frame", *COLUMNS]]
+
+    # Frames repeat in the table: the distance of each is computed once.
     frames, places = np.unique(table["frame"], return_inverse=True)
     skeletons = data.dataset("train").skeletons.p
     p = np.stack([skeletons[frame] for frame in frames.tolist()])
@@ -171,13 +179,15 @@ def _plot(curves: dict[str, pd.DataFrame]) -> bytes:
     axes.set_ylabel("PSNR in the person's box, dB")
     axes.grid(alpha=0.3)
     axes.legend()
+
+    # Made in memory, since files are written completely or not at all.
     image = io.BytesIO()
     figure.savefig(image, format="png", dpi=150)
     return image.getvalue()
 
 
-# the splits that can be scored, and the mark of scores with drive=skeleton
-SPLITS = ("novel_view", "novel_pose")
+# The splits that can be scored, and the mark of scores with drive=skeleton.
+HELD_OUT_SPLITS = ("novel_view", "novel_pose")
 BY_SKELETON = "driven by skeletons alone"
 
 
@@ -188,6 +198,7 @@ def evaluate_config(config: DictConfig) -> Results:
         ConfigError: unless exactly one of them is given, or on a value that cannot be used.
         DataError: when the run, its data or an image of the folder cannot be used.
     """
+    # Everything that the options alone can tell is checked first.
     if (config.run is None) == (config.predictions is None):
         raise ConfigError(
             "give either run=<the folder that gsgan.train printed>, or predictions=<folder of "
@@ -203,6 +214,8 @@ def evaluate_config(config: DictConfig) -> Results:
     for key in others:
         if config.get(key) is not None:
             raise ConfigError(f"{key}= cannot be given with {kind}=; leave it out")
+
+    # Another capture is named by `on` alone.
     if config.get("on") is not None and config.data_root is not None:
         raise ConfigError("data_root= cannot be given with on=; leave it out")
 
@@ -213,9 +226,9 @@ def evaluate_config(config: DictConfig) -> Results:
         )
     if config.get("drive") not in (None, "skeleton"):
         raise ConfigError(f"drive must be skeleton or null; got {config.drive!r}")
-    if not config.splits or not set(config.splits) <= set(SPLITS):
+    if not config.splits or not set(config.splits) <= set(HELD_OUT_SPLITS):
         raise ConfigError(
-            f"splits must be a list of {' and '.join(SPLITS)}; got {config.splits}"
+            f"splits must be a list of {' and '.join(HELD_OUT_SPLITS)}; got {config.splits}"
         )
 
     score = evaluate_predictions if config.run is None else evaluate_folder
@@ -226,6 +239,7 @@ def evaluate_folder(
     config: DictConfig, console: Console, device: torch.device
 ) -> Results:
     """Loads the avatar of ``config.run`` and scores it."""
+    # By default the networks of LPIPS that the run was configured with.
     folder = Path(config.run).expanduser()
     stored = read_config(folder)
     if config.lpips.nets is None:
@@ -257,7 +271,7 @@ def evaluate_folder(
     if config.drive is not None and not other:
         out = out / "by_skeleton"
         marks = [*marks, BY_SKELETON]
-    if len(set(config.splits)) < len(SPLITS):
+    if len(set(config.splits)) < len(HELD_OUT_SPLITS):
         out = out / config.splits[0]
 
     # What facts.json states about the run.
@@ -343,12 +357,17 @@ def evaluate_predictions(
     )
 
     # The choice of the config group data, if a command made one.
-    method = Method(name)
+    chosen = None
     if HydraConfig.initialized():
-        chosen = HydraConfig.get().runtime.choices
-        method = replace(method, data=chosen.get("data"))
+        chosen = HydraConfig.get().runtime.choices.get("data")
     return evaluate_method(
-        out, config, console, data, folder.predict, method=method, device=device
+        out,
+        config,
+        console,
+        data,
+        predict=folder.predict,
+        method=Method(name, data=chosen),
+        device=device,
     )
 
 
@@ -373,6 +392,8 @@ def _out(config: DictConfig, root: Path, method: str) -> Path:
             raise ConfigError(
                 f"{held} is damaged; choose another folder with out="
             ) from None
+
+    # Scores of the same method are replaced.
     if found != method:
         raise ConfigError(
             f"out={out} holds scores of {found}, not of {method}; choose another folder"
@@ -420,10 +441,13 @@ def evaluate_method(
 
     # Every split, with the images of the grid evenly spaced. Scores of a run are kept.
     scores: dict[str, SplitScores] = {}
-    for split in config.get("splits") or SPLITS:
+    for split in config.get("splits") or HELD_OUT_SPLITS:
+        # Some of its images, if the config bounds their number.
         dataset = data.dataset(split)
         count = len(dataset)
         places = evenly_spaced(count, config.get("score_images") or count)
+
+        # An interrupted scoring goes on only if nothing that scores depend on has changed.
         kept = None
         if poses is not None:
             key = {
@@ -482,7 +506,7 @@ def _scored(
     if kept is not None:
         kept.restore(tally)
 
-    # The frame before the first one, which flicker needs.
+    # Flicker compares with the frame before, which must be painted again.
     done = tally.images
     if done:
         console.print(f"{title}: {done} of {len(places)} images were scored before")
@@ -491,6 +515,7 @@ def _scored(
         item = dataset.items[before]
         tally.look_at(item, frame, predict(frame, item))
 
+    # The remaining images, with the scores so far kept from time to time.
     for place in track(places[done:], title, console):
         frame = dataset[place].to(device)
         item = dataset.items[place]
@@ -508,20 +533,20 @@ def _joined_splits(
 ) -> Scored:
     """The scores of all splits, with the protocol's record and reasons for empty splits."""
     # An empty split has the variants of the others.
-    variants = next((s.variants for s in scores.values() if s.variants), (FULL, FLOOR))
+    filled = [found.variants for found in scores.values() if found.variants]
+    variants: Iterable[str] = filled[0] if filled else (FULL, FLOOR_STAGE)
 
     # metrics.json by split, scores.csv by image.
-    results = {}
+    results: Results = {}
     rows = []
     for split, found in scores.items():
         held = found.variants
         if not held:
             reason = data.reasons.get(split, "no frames")
             held = {name: empty(reason, scorer) for name in variants}
-        results[split] = {
-            name: values | {"protocol": scorer.protocol}
-            for name, values in held.items()
-        }
+        results[split] = {}
+        for name, values in held.items():
+            results[split][name] = values | {"protocol": scorer.protocol}
         for variant, of_variant in found.rows.items():
             for row in of_variant:
                 rows.append({"split": split, "variant": variant, **row})
@@ -555,6 +580,7 @@ def make_scorer(config: DictConfig, data: GsganData, marks: Sequence[str]) -> Sc
     boxes = BodyBoxes(data) if measures.needs_body_box else None
     record = data.protocol_record(config.lpips.nets)
     if record is not None:
+        # The record says what was asked for, and the departures what was done.
         asked = record["measures"]["background"]
         if asked != measures.background:
             different = f"background is {measures.background}, asked for: {asked}"

@@ -12,7 +12,7 @@ from torch import Tensor
 from gsgan.data.metric_variants import MetricVariants
 from gsgan.data.splits import Item
 from gsgan.evaluate.grids import grid_rows
-from gsgan.evaluate.predictions import FLOOR, FULL, SPLAT, Prediction, Preparation
+from gsgan.evaluate.predictions import FLOOR_STAGE, FULL, SPLAT, Prediction, Preparation
 from gsgan.metrics.image import (
     Score,
     edge_scores,
@@ -36,13 +36,13 @@ from gsgan.scene import Frame
 from gsgan.utils.errors import GsganError
 from gsgan.weights.networks import Lpips
 
-# reasons for missing scores
+# Reasons for missing scores.
 NO_PAIR = "no two images are of consecutive frames, in one window of one camera"
 NO_LPIPS = "left out by lpips.nets"
 NO_LABELS = "the data has no part labels"
 NO_PARTS_OF_SPLAT = "Step I's colour is not a segmentation"
 NO_PARTS_OF_FLOOR = "an all-background image is not a segmentation"
-# what a tally keeps of the images that it has scored
+# The fields that hold what a tally has counted so far.
 TALLY_STATE = ("rows", "grid", "matrices", "no_parts")
 Predict = Callable[[Frame, Item], Prediction]
 # "camera", "frame", and a score by metric
@@ -72,6 +72,7 @@ def image_scores(
     Returns:
         ``{metric: score}``; a metric that was not computed is absent, an undefined one NaN.
     """
+    # Values beyond the range of a display do not count.
     measures = measures or MetricVariants()
     image = image.clamp(0, 1)
     scores: dict[str, Any] = {"high_frequencies": high_frequencies(image, target)}
@@ -101,9 +102,8 @@ def image_scores(
         person = person_box(mask)
         regions["person"] = person
         scores["psnr_inside"] = psnr_inside(image, target, mask)
-        f1, ratio = edge_scores(image, target, person)
-        scores["edge_f1_person"] = f1
-        scores["edge_ratio_person"] = ratio
+        edges = edge_scores(image, target, person)
+        scores["edge_f1_person"], scores["edge_ratio_person"] = edges
 
     # PSNR and SSIM of all regions, from one map of SSIM.
     if regions:
@@ -111,13 +111,17 @@ def image_scores(
         for (name, region), mean in zip(regions.items(), similar, strict=True):
             scores[f"psnr_{name}"] = psnr_where(image, target, region)
             scores[f"ssim_{name}"] = mean
+
+    # LPIPS, with features of the ground truth that all variants share.
     if lpips is not None:
         scores |= lpips(image)
 
     # In the order of the tables.
-    return {
-        metric: float(scores[metric]) for metric in IMAGE_METRICS if metric in scores
-    }
+    ordered = {}
+    for metric in IMAGE_METRICS:
+        if metric in scores:
+            ordered[metric] = float(scores[metric])
+    return ordered
 
 
 def _inside(box: Tensor, score: Score, a: Tensor, b: Tensor) -> Tensor | float:
@@ -139,6 +143,8 @@ def means(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     for metric in IMAGE_METRICS:
         # A metric that was not computed is absent, an undefined one is NaN.
         scores = [row[metric] for row in rows if metric in row]
+
+        # PSNR of equal images is infinite, and would make the mean infinite.
         finite = list(filter(math.isfinite, scores))
         result[metric] = sum(finite) / len(finite) if finite else None
         left_out = len(scores) - len(finite)
@@ -294,6 +300,7 @@ class Tally:
 
     def look_at(self, item: Item, frame: Frame, prediction: Prediction) -> None:
         """Takes a frame as the one before the next, without scoring it."""
+        # The images as they would be scored.
         prepare = self.scorer.prepare
         images = self._images(item, frame, prediction, prepare.box(frame))
         target = prepare.target(frame)
@@ -339,11 +346,17 @@ class Tally:
                 measures=prepare.measures,
                 lpips=lpips,
             )
+
+            # The same variant of the frame before.
             if last is not None:
                 before = (last.images[name], last.target, last.frame.mask)
                 own["flicker"] = float(flicker(image, target, frame.mask, before))
+
+            # One row per image and variant.
             row = {"camera": camera, "frame": number, **own}
             self.rows.setdefault(name, []).append(row)
+
+        # Parts come last: their scores are added to the row of the final image.
         self.last = _Last(item, frame, target, images)
         self._add_parts(camera, frame, prediction)
 
@@ -357,6 +370,8 @@ class Tally:
         """
         camera, number = item
         prepare = self.scorer.prepare
+
+        # A broken image would get a broken score, or none; it is refused instead.
         images = {}
         for name, image in prediction.images.items():
             bad = int((~torch.isfinite(image)).sum())
@@ -366,7 +381,9 @@ class Tally:
                     "finite; it cannot be scored"
                 )
             images[name] = prepare.image(prediction, name, box)
-        images[FLOOR] = torch.full_like(frame.image, prepare.background)
+
+        # An image of the background alone shows what the scores are worth.
+        images[FLOOR_STAGE] = torch.full_like(frame.image, prepare.background)
         return images
 
     def _add_parts(self, camera: str, frame: Frame, prediction: Prediction) -> None:
@@ -386,7 +403,7 @@ class Tally:
     def result(self) -> SplitScores:
         """The scores of the split."""
         # Only the final image has a segmentation.
-        no_parts = {SPLAT: NO_PARTS_OF_SPLAT, FLOOR: NO_PARTS_OF_FLOOR}
+        no_parts = {SPLAT: NO_PARTS_OF_SPLAT, FLOOR_STAGE: NO_PARTS_OF_FLOOR}
         variants = {}
         for name, own in self.rows.items():
             if name == FULL:
@@ -416,6 +433,7 @@ def _variant(
     rows: Sequence[Row], matrices: dict[str, Tensor], no_parts: str, scorer: Scorer
 ) -> dict[str, Any]:
     """One variant as in metrics.json."""
+    # Means over all images.
     result = means(rows)
 
     # Reasons for metrics that cannot be computed.
@@ -469,6 +487,7 @@ def lpips_input(measures: MetricVariants) -> str:
 
 def no_scores(metrics: Iterable[str], reason: str) -> dict[str, Any]:
     """Each metric None, with the reason."""
+    # Every missing score has a reason, so that no table has a bare n/a.
     result: dict[str, Any] = {}
     for metric in metrics:
         result[metric] = None

@@ -1,7 +1,7 @@
 """An avatar as one web page: quantised Gaussians, the body's solver, motions and the renderer.
 
-Convention: the page evaluates `gsgan.model.harmonic` and projects as `gsgan.splat.project` does
-(src/gsgan/export/web). Its block is a JSON header and little-endian arrays, deflated.
+The page (src/gsgan/export/web) evaluates `gsgan.model.harmonic` and projects as
+`gsgan.splat.project` does. Its block is a JSON header and little-endian arrays, deflated.
 """
 
 import base64
@@ -33,12 +33,16 @@ from gsgan.utils.provenance import SOFTWARE, SOURCE_TYPE, XMP
 
 WEB = Path(__file__).with_name("web")
 PAGE_VERSION = 2  # of the block
-ALPHA_MIN = 1 / 255  # of the page, where the avatar's own is less
-KINDS = {"i1": "int8", "u1": "uint8", "i2": "int16", "u2": "uint16", "f4": "float32"}
-BEFORE_COLOUR = (
-    # numbers of a Gaussian before its colour: mean 3, quaternion 4, scale 3, opacity
-    11
-)
+ALPHA_MIN = 1 / 255  # smallest alpha that the page draws, if the avatar's own is less
+KINDS = {
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "float32": "f4",
+}
+# Numbers of a Gaussian before its colour: mean 3, quaternion 4, scale 3, opacity 1.
+BEFORE_COLOUR = 11
 
 Arrays = dict[str, NDArray]
 Plain = dict[str, object]
@@ -59,6 +63,8 @@ def refuse_unsuitable(avatar: Avatar) -> None:
             "a page needs Gaussians on a skinned body and residuals of Ψ: an avatar with "
             "effects.body_points, not model=lbs_splat or image_to_image"
         )
+
+    # Only the free body has a solver for fingers.
     if avatar.solver.fingers is None:
         raise ConfigError(
             "a page publishes the body that the avatar moves with, which the licence of "
@@ -69,8 +75,12 @@ def refuse_unsuitable(avatar: Avatar) -> None:
 def page(content: bytes, name: str) -> str:
     """The text of a page that shows the `block`'s avatar; the name is its title."""
     style = (WEB / "page.css").read_text()
+
+    # The parts of the page lie beside this module.
     script = (WEB / "gsgan.js").read_text()
     text = (WEB / "page.html").read_text()
+
+    # The Content-Security-Policy names style and script by their hashes.
     for key, value in {
         "script_hash": _hash(script),
         "style_hash": _hash(style),
@@ -87,7 +97,8 @@ def page(content: bytes, name: str) -> str:
 
 def _hash(text: str) -> str:
     """A source of a Content-Security-Policy: this text and nothing else."""
-    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+    digest = hashlib.sha256(text.encode()).digest()
+    return "sha256-" + base64.b64encode(digest).decode()
 
 
 def block(
@@ -101,10 +112,13 @@ def block(
         motions: drives and their frames per second by name.
         name: the avatar's.
     """
+    # The avatar, and the body that it moves with.
     header, arrays = gaussians_of(avatar)
-    people, more = body_of(run)
-    header |= people | {"version": PAGE_VERSION, "name": name, "xmp": XMP}
-    arrays |= more
+    body_header, body_arrays = body_of(run)
+    header |= body_header | {"version": PAGE_VERSION, "name": name, "xmp": XMP}
+    arrays |= body_arrays
+
+    # The rest pose is always the first motion: a page without motions shows it.
     listed = []
     still = {"rest pose": (rest_pose(run.proportions), 1.0)}
     for i, (title, (drive, fps)) in enumerate((still | dict(motions)).items()):
@@ -112,30 +126,35 @@ def block(
         arrays[f"theta{i}"], step = quantised(theta, 32767)
         arrays[f"transl{i}"] = transl
         listed.append(
-            {"name": title, "fps": fps, "frames": len(theta), "step": float(step)}
+            {
+                "name": title,
+                "fps": fps,
+                "frames": len(theta),
+                "step": float(step),
+            }
         )
     header["motions"] = listed
+
+    # Each array begins at a multiple of eight bytes, as typed arrays of a browser need.
     places = {}
     data = b""
     for key, array in arrays.items():
-        kind = next(kind for kind, dtype in KINDS.items() if array.dtype == dtype)
+        kind = KINDS[array.dtype.name]
         places[key] = (kind, len(data), array.size)
-        data += _padded(array.astype(f"<{kind}").tobytes())
+        raw = array.astype(f"<{kind}").tobytes()
+        data += raw + bytes(-len(raw) % 8)
+
+    # The length of the header comes first; blanks keep the arrays aligned.
     text = json.dumps(header | {"arrays": places}).encode()
     text += b" " * (-len(text) % 8)
     return zlib.compress(len(text).to_bytes(8, "little") + text + data, 9)
 
 
-def _padded(data: bytes) -> bytes:
-    return data + bytes(-len(data) % 8)
-
-
 def quantised(values: NDArray, most: int) -> tuple[NDArray, NDArray]:
-    """Whole numbers within ± ``most`` and their step; of a matrix one step a row."""
-    largest = np.abs(values).max(
-        axis=-1 if values.ndim == 2 else None, keepdims=values.ndim == 2
-    )
-    step = np.maximum(largest, 1e-12) / most
+    """Whole numbers within ± ``most`` and their step; a matrix has one step per row."""
+    size = np.abs(values)
+    largest = size.max(axis=-1, keepdims=True) if values.ndim == 2 else size.max()
+    step = np.maximum(largest, 1e-12) / most  # rows of zeros have a step too
     kind = np.int8 if most < 128 else np.int16
     return np.rint(values / step).astype(kind), np.asarray(step, np.float32)
 
@@ -143,8 +162,8 @@ def quantised(values: NDArray, most: int) -> tuple[NDArray, NDArray]:
 def gaussians_of(avatar: Avatar) -> tuple[Plain, Arrays]:
     """The Gaussians at rest, their skinning, and the coefficients of their numbers.
 
-    Convention: what `gsgan.model.deformation` adds to residuals before it bounds them is added to
-    the first coefficient.
+    Constants that `gsgan.model.deformation` adds to residuals before it bounds them are folded
+    into the first coefficient.
     """
     on_body = avatar.body_points
     linear = avatar.deformation
@@ -152,25 +171,38 @@ def gaussians_of(avatar: Avatar) -> tuple[Plain, Arrays]:
     assert isinstance(linear, Harmonic)
     points = on_body.points
     degree = linear.active_degree
+
+    # Coefficients of each Gaussian, with the constants: the real part of the unit
+    # quaternion, and size and opacity at rest.
     numbers = BEFORE_COLOUR + 3 * (degree + 1) ** 2
     table = linear.coefficients.detach().double()[..., :numbers].clone()
     table[..., :3] *= linear.mean_step
     table[:, 0, 3] += 1
     table[:, 0, 7:10] += (on_body.sigma * points.spacing).log()[:, None].double()
     table[:, 0, 10] += math.log(linear.opacity / (1 - linear.opacity))
+
+    # The first harmonic is constant and needs 16 bits; for the others 8 bits suffice. Numbers
+    # whose other coefficients are all zero do not follow the normal and are left out.
     rows = table.permute(2, 1, 0).numpy()  # [numbers, 9, N]
     follow = np.flatnonzero(rows[:, 1:].any((1, 2)))
     first, first_step = quantised(rows[:, 0], 32767)
     others, steps = quantised(rows[follow, 1:].reshape(-1, len(table)), 127)
+
+    # Positions at rest fill the range of 16 bits.
     means = points.means.numpy()
-    bones = points.weights[0].numpy()
-    weight = points.weights[1].detach().double().numpy()
     low = float(means.min())
     step = float(means.max() - low) / 65535
+
+    # LBS weights sum to one; their gradients let covariances stretch with the skin.
+    bones = points.weights[0].numpy()
+    weight = points.weights[1].detach().double().numpy()
     weight = weight / weight.sum(1, keepdims=True)
     slope_bone, slopes = slopes_of(on_body)
     slope, slope_step = quantised(slopes.flatten(), 32767)
+
+    # The header: bounds of the residuals in metres, and the settings of the rasteriser.
     settings = avatar.accuracy
+    scales = [math.log(limit * linear.body_height) for limit in linear.scale_range]
     header: Plain = {
         "count": len(table),
         "degree": degree,
@@ -181,9 +213,7 @@ def gaussians_of(avatar: Avatar) -> tuple[Plain, Arrays]:
         "range": (low, step),
         "bound": (linear.mean_bound or 0) * linear.body_height,
         "height": linear.body_height,
-        "scales": [
-            math.log(limit * linear.body_height) for limit in linear.scale_range
-        ],
+        "scales": scales,
         "logit": linear.logit_bound,
         "lowPass": settings.low_pass,
         "alphaMin": max(settings.alpha_min, ALPHA_MIN),
@@ -193,6 +223,8 @@ def gaussians_of(avatar: Avatar) -> tuple[Plain, Arrays]:
         "antialias": settings.antialias,
         "supersample": settings.supersample,
     }
+
+    # The arrays, in the smallest types that hold their values.
     return header, {
         "mean": np.rint((means - low) / step).astype(np.uint16),
         "normal": np.rint(32767 * on_body.rest_normals.numpy()).astype(np.int16),
@@ -211,33 +243,37 @@ def slopes_of(on_body: BodyPoints) -> tuple[NDArray, NDArray]:
 
     Source: `gsgan.body.skinned.WeightGradients`, whose factors are these times (x, 1).
     """
+    count = on_body.n_points
     if not on_body.stretch:
-        return np.zeros((on_body.n_points, 1), np.uint8), np.zeros(
-            (on_body.n_points, 1, 3)
-        )
-    columns, factors = (
-        term.view(on_body.n_points, 3, -1, 4).numpy()
-        for term in on_body.stretch_terms()
-    )
-    return (columns[:, 0, :, 0] // 4).astype(np.uint8), factors[..., 3].swapaxes(1, 2)
+        return np.zeros((count, 1), np.uint8), np.zeros((count, 1, 3))
+
+    # Each bone has four columns, x y z 1; the factor of the last one is the gradient itself.
+    columns, factors = on_body.stretch_terms()
+    shape = (count, 3, -1, 4)
+    bones = columns.view(shape)[:, 0, :, 0] // 4
+    gradients = factors.view(shape)[..., 3]
+    return bones.numpy().astype(np.uint8), gradients.numpy().swapaxes(1, 2)
 
 
 def body_of(run: Run) -> tuple[Plain, Arrays]:
     """The body's landmarks and solver, the subject's proportions and the world's axes."""
     body = run.body
     subject = run.proportions
+    # A page has one body, which `refuse_unsuitable` has checked.
     assert isinstance(body, Body)
     assert run.avatar.solver is not None
+
+    # The standard axes in the world, turned to where the person faces.
+    axes = upright(subject.up).T @ rotation(np.array([0, 0, subject.facing]))
     header: Plain = {
         "bones": len(body.parents),
-        "axes": (
-            upright(subject.up).T @ rotation(np.array([0, 0, subject.facing]))
-        ).tolist(),
+        "axes": axes.flatten().tolist(),
         "ground": subject.ground,
         "centre": list(run.scene.centre),
         "rest": subject.rest.tolist(),
     }
-    header["axes"] = [x for row in header["axes"] for x in row]  # type: ignore[attr-defined]
+
+    # Landmarks of body and hands are each fixed to one bone.
     landmarks = torch.cat([body.landmarks, body.hand_landmarks]).float().numpy()
     carrier = torch.cat([body.landmark_bone, body.hand_bone]).numpy()
     return header, {
@@ -249,16 +285,25 @@ def body_of(run: Run) -> tuple[Plain, Arrays]:
 
 def solver_block(solver: Solver, parents: tuple[int, ...]) -> bytes:
     """``struct Body`` of web/solve.cpp for 32-bit addresses, which count from its start."""
+    # The structure is one skeleton's job for the solver: sizes, numbers, and pointers
+    # to arrays.
     constants, counts, numbers = solver.job()
-    integers = np.array(
-        [1, 1, *(counts[name] for name in compiled.COUNTS)], "<i8"
-    ).tobytes()
-    head = integers + np.array([numbers[n] for n in compiled.NUMBERS], "<f8").tobytes()
+
+    # The head: one skeleton, one thread, then the sizes and the solver's numbers.
+    integers = [1, 1]
+    for name in compiled.COUNTS:
+        integers.append(counts[name])
+    floats = [numbers[name] for name in compiled.NUMBERS]
+    head = np.array(integers, "<i8").tobytes() + np.array(floats, "<f8").tobytes()
+
+    # Addresses of the constants follow; those of a frame's arrays are set by the page.
     given = [constants[name].numpy() for name in compiled.CONSTANTS]
     slots = len(given) + len(compiled.FRAMES)
     slots += slots % 2  # structures are multiples of eight bytes
     start = len(head) + 4 * (slots + 2)
     addresses = np.zeros(slots + 2, "<u4")
+
+    # The arrays themselves, with the bones' parents behind all fields of the structure.
     data = b""
     for slot, array in (*enumerate(given), (slots, np.array(parents))):
         addresses[slot] = start + len(data)
@@ -271,10 +316,13 @@ def poses_of(avatar: Avatar, drive: Drive) -> tuple[NDArray, NDArray]:
     """``theta [F, J, 3]`` and ``transl [F, 3]`` of a drive: its own, else solved."""
     body = drive.body
     if body is None:
-        p = torch.from_numpy(drive.p)
-        seen = torch.from_numpy(drive.visibility)
-        body = avatar.body_pose(
-            *complete_skeleton(p, seen, avatar.template, avatar.limb_length_sum)
+        # The drive has joints alone: unknown ones are completed, and the body is fitted.
+        p, visibility = complete_skeleton(
+            torch.from_numpy(drive.p),
+            torch.from_numpy(drive.visibility),
+            avatar.template,
+            avatar.limb_length_sum,
         )
+        body = avatar.body_pose(p, visibility)
     assert body is not None
     return body.theta.float().numpy(), body.transl.float().numpy()

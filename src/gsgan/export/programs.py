@@ -2,6 +2,7 @@
 
 import copy
 import io
+from typing import Any
 from warnings import catch_warnings
 
 import torch
@@ -18,8 +19,10 @@ MAX_PROGRAM_SIDE = 8192  # largest side of an ONNX program's images, pixels
 def unfrozen(avatar: Avatar) -> Avatar:
     """A copy without the values that `Avatar.freeze` caches: it computes from its weights alone."""
     bare = copy.deepcopy(avatar).cpu()
+    # Frozen modules keep derived values in this dictionary.
     for part in bare.modules():
         vars(part).pop("derived", None)
+    # The exporters record the strides of weights: they are made contiguous.
     return bare.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload, no-any-return]
 
 
@@ -35,6 +38,8 @@ class Whole(nn.Module):
         super().__init__()
         self.avatar = avatar
         self.size = size
+
+        # A window would have another size in every pose.
         avatar.window_margin = None
 
     def forward(
@@ -54,7 +59,7 @@ class Whole(nn.Module):
                 with a face.
             visibility: ``[1, J]`` 0 marks a stand-in.
             K, R, t: ``[1, 3, 3]``, ``[1, 3, 3]``, ``[1, 3]`` of the camera.
-            theta, transl: pose of the skinned body, where the avatar needs one.
+            theta, transl: pose of the skinned body, if the avatar needs one.
         """
         body = None if theta is None or transl is None else BodyPose(theta, transl)
         rendering = self.avatar(skeleton, visibility, Camera(K, R, t, self.size), body)
@@ -65,36 +70,48 @@ class Whole(nn.Module):
 def torch_program(avatar: Avatar, size: tuple[int, int]) -> bytes:
     """A .pt2 file of `Whole`, which ``torch.export.load`` reads.
 
-    Convention: rasterisation is the operator ``gsgan::rasterise``, so a program that loads it
-    imports `gsgan.splat` first.
+    Rasterisation is the operator ``gsgan::rasterise``, so a program that loads it imports
+    `gsgan.splat` first.
     """
+    # Example inputs: the template at rest, before a camera three metres away.
     p = torch.tensor(avatar.template.rest_positions)[None]
+    height, width = size
     K = torch.tensor(
-        [[[float(size[1]), 0, size[1] / 2], [0, size[1], size[0] / 2], [0, 0, 1]]]
+        [
+            [
+                [float(width), 0, width / 2],
+                [0, width, height / 2],
+                [0, 0, 1],
+            ]
+        ]
     )
     R = torch.tensor([[[-1.0, 0, 0], [0, -1, 0], [0, 0, 1]]])
     t = torch.tensor([[0.0, 0.9, 3.0]])
     given = [p, torch.ones(p.shape[:2]), K, R, t]
+
+    # The body's pose is an input of avatars that move with a skinned body.
     if avatar.needs_body:
         part = avatar.body_points or avatar.surface or avatar.segmentation
         bones = len(part.points.parents)  # type: ignore[union-attr]
         given += [torch.zeros(1, bones, 3), torch.zeros(1, 3)]
+
+    # Constants are made by a first call, outside of the recording. The exporter warns about
+    # internals of its own.
     program = Whole(unfrozen(avatar), size)
     stream = io.BytesIO()
-    with torch.no_grad(), catch_warnings(action="ignore"):  # about its own internals
-        program(*given)  # constants are made once, outside of the recording
-        torch.export.save(
-            torch.export.export(program, tuple(given), strict=False), stream
-        )
+    with torch.no_grad(), catch_warnings(action="ignore"):
+        program(*given)
+        recorded = torch.export.export(program, tuple(given), strict=False)
+        torch.export.save(recorded, stream)
     return stream.getvalue()
 
 
 class PoseAndGenerator(nn.Module):
     """Images of the avatar's splats and skeleton in, its image out: pose encoder and UNet.
 
-    Its inputs, by name: ``features`` F ``[1, C, H, W]``, ``fine`` F before it was averaged, where
-    the avatar supersamples; ``splat_alpha`` of F ``[1, 1, H, W]``; ``segmentation`` S ``[1,
-    classes, H, W]``, where it has one; ``skeleton`` p₂D ``[1, groups, H, W]``; ``omega`` Ω ``[1, J,
+    Its inputs, by name: ``features`` F ``[1, C, H, W]``, ``fine`` F before it was averaged, if the
+    avatar supersamples; ``splat_alpha`` of F ``[1, 1, H, W]``; ``segmentation`` S ``[1,
+    classes, H, W]``, if it has one; ``skeleton`` p₂D ``[1, groups, H, W]``; ``omega`` Ω ``[1, J,
     6]`` and ``joints`` ``[1, J, 3]``, see `gsgan.model.pose_graph.pose_inputs`.
 
     Args:
@@ -111,29 +128,35 @@ class PoseAndGenerator(nn.Module):
         self.template = avatar.template
         self.pose_encoder = avatar.pose_encoder
         self.generator = avatar.generator
+
+        # Images that the avatar does not render have no channels.
         classes = 0 if avatar.segmentation is None else avatar.segmentation.classes
         self.channels = {"features": avatar.splat_channels, "segmentation": classes}
 
     def inputs(self) -> tuple[dict[str, Tensor], dict[str, int]]:
         """Examples by name, for the exporter; of images, the pixels per pixel of the output."""
+        # Channels of each image; an image without channels is no input.
         k = self.generator.supersample
-        channels = self.channels | {"skeleton": len(self.template.draw_groups)}
-        channels |= {
+        channels = self.channels | {
+            "skeleton": len(self.template.draw_groups),
             "splat_alpha": int(self.splats),
-            "fine": (k > 1) * channels["features"],
+            "fine": self.channels["features"] if k > 1 else 0,
         }
-        times = {
-            name: k if name == "fine" else 1
-            for name, count in channels.items()
-            if count
-        }
+
+        # Random images of a small size that the UNet can halve as often as it does.
         side = 4 * self.generator.stride
-        images = {
-            n: torch.rand(1, channels[n], f * side, f * side) for n, f in times.items()
-        }
+        times = {}
+        examples = {}
+        for name, count in channels.items():
+            if count:
+                times[name] = k if name == "fine" else 1
+                pixels = times[name] * side
+                examples[name] = torch.rand(1, count, pixels, pixels)
+
         J = len(self.template.names)
-        joints = {"omega": torch.rand(1, J, 6), "joints": torch.rand(1, J, 3)}
-        return images | joints, times
+        examples["omega"] = torch.rand(1, J, 6)
+        examples["joints"] = torch.rand(1, J, 3)
+        return examples, times
 
     def forward(
         self,
@@ -148,7 +171,8 @@ class PoseAndGenerator(nn.Module):
         """``[1, 3, H, W]`` RGB on black and ``[1, 1, H, W]`` alpha, both in [0, 1]."""
         assert self.pose_encoder is not None
         g = self.pose_encoder(omega, joints)
-        if features is None:  # image_to_image: the drawing stands in F's place
+        # Without splats (image_to_image) the drawn skeleton takes F's place.
+        if features is None:
             made = self.generator(skeleton, segmentation, None, g)
         else:
             made = self.generator(
@@ -170,17 +194,19 @@ def onnx_program(avatar: Avatar) -> bytes:
     except ImportError:
         raise ConfigError("format=onnx needs: pip install 'gsgan[export]'") from None
     networks = PoseAndGenerator(unfrozen(avatar)).eval()
-    (given, times), stride = networks.inputs(), networks.generator.stride
-    sides = [
-        stride * Dim(name, min=1, max=MAX_PROGRAM_SIDE // stride) for name in ("h", "w")
-    ]
-    shapes = {
-        name: {2 + i: times[name] * side for i, side in enumerate(sides)}
-        if name in times
-        else None
-        for name in given
-    }
-    with torch.no_grad(), catch_warnings(action="ignore"):  # about its own internals
+    given, times = networks.inputs()
+
+    # Sides of images are free multiples of the UNet's stride.
+    stride = networks.generator.stride
+    most = MAX_PROGRAM_SIDE // stride
+    height = stride * Dim("h", min=1, max=most)
+    width = stride * Dim("w", min=1, max=most)
+    shapes: dict[str, dict[int, Any] | None] = dict.fromkeys(given)
+    for name, factor in times.items():
+        shapes[name] = {2: factor * height, 3: factor * width}
+
+    # The exporter warns about internals of its own.
+    with torch.no_grad(), catch_warnings(action="ignore"):
         program = torch.onnx.export(
             networks,
             kwargs=given,
@@ -191,5 +217,7 @@ def onnx_program(avatar: Avatar) -> bytes:
             verbose=False,
         )
     assert program is not None
+
+    # A single file: the weights are part of it.
     content: bytes = program.model_proto.SerializeToString()
     return content

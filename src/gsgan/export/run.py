@@ -4,17 +4,24 @@ import json
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
 import yaml
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, open_dict
 
 from gsgan import __version__
 from gsgan.export.page import block, page, refuse_unsuitable
 from gsgan.export.splats import Splats, glb_bytes, ply_bytes, splats_of
-from gsgan.run.drive import REST, Drive, distilled_of, drive_of, inputs_of
+from gsgan.run.drive import (
+    REST,
+    Drive,
+    distilled_of,
+    drive_of,
+    inputs_of,
+    with_motion,
+)
 from gsgan.run.runs import Run
 from gsgan.utils.checks import above, one_of, whole
 from gsgan.utils.console import make_console, track
@@ -27,6 +34,7 @@ LINEAR = (
     "without its networks: Step I's colour, with residuals linear in the harmonics of each "
     "Gaussian's normal."
 )
+# What a model card says about the content of each format.
 HOLDS = {
     "ply": "The avatar's Gaussians in one pose per file, in the convention of 3D Gaussian "
     "splatting. They show Step I's colour; the generator's image needs gsgan.",
@@ -41,6 +49,7 @@ HOLDS = {
     "safetensors": "The weights, with the config as metadata: "
     "`gsgan.export.weights.load_weights(file)` gives the avatar.",
 }
+# Metrics of a model card, and their headings.
 SCORES = {
     "psnr": "PSNR ↑",
     "ssim": "SSIM ↑",
@@ -69,14 +78,19 @@ def card(run: Run, kind: str, name: str, licence: str | None) -> str:
     """
     facts = _read(run.folder / "facts.json")
     data = facts.get("data", {})
-    scene = run.scene
-    head = {"license": licence or "other", "library_name": "gsgan"}
-    head["tags"] = ["gaussian-splatting", "human-avatar", "synthetic-media"]  # type: ignore[assignment]
+
+    # The card's header is read by hubs such as Hugging Face.
+    head = {
+        "license": licence or "other",
+        "library_name": "gsgan",
+        "tags": ["gaussian-splatting", "human-avatar", "synthetic-media"],
+    }
+
+    # How the avatar was trained; unknown facts are left out.
+    identity = [data.get(key) for key in ("name", "root", "fingerprint")]
     about = {
-        "data": " ".join(
-            str(data[k]) for k in ("name", "root", "fingerprint") if data.get(k)
-        ),
-        "training cameras": scene.n_train_cameras,
+        "data": " ".join(str(value) for value in identity if value),
+        "training cameras": run.scene.n_train_cameras,
         "image size": run.stored.data.size,
         "protocol": facts.get("protocol") or "none",
         "model": facts.get("model"),
@@ -85,16 +99,20 @@ def card(run: Run, kind: str, name: str, licence: str | None) -> str:
         "gsgan": facts.get("version", __version__),
         "commit": facts.get("commit"),
     }
-    known = [
-        (key, str(value)) for key, value in about.items() if value not in (None, "")
-    ]
-    marks = [f"- marked: {mark}" for mark in run.checkpoint.get("marks", [])]
+    known = []
+    for key, value in about.items():
+        if value not in (None, ""):
+            known.append((key, str(value)))
+
+    # Scores, and what makes them incomparable with others.
+    scores = [_scores(run.folder)]
+    scores += [f"- marked: {mark}" for mark in run.checkpoint.get("marks", [])]
     parts = [
         f"---\n{yaml.safe_dump(head, sort_keys=False)}---",
         f"# {name}\n\nOne person's avatar, trained with gsgan (GaussianGAN). {HOLDS[kind]}",
         f"## Data and training\n\n{markdown(('', ''), known)}",
         f"## Effects\n\n{markdown(('effect', '', 'why'), run.avatar.effects.rows())}",
-        "## Scores on held-out images\n\n" + "\n\n".join([_scores(run.folder), *marks]),
+        "## Scores on held-out images\n\n" + "\n\n".join(scores),
         f"## Intended use\n\n{USE}",
         "## Licence\n\n" + (licence or _licence(data.get("name"))),
     ]
@@ -102,26 +120,28 @@ def card(run: Run, kind: str, name: str, licence: str | None) -> str:
 
 
 def _licence(data: str | None) -> str:
-    owner = (
-        "The default person is a character under the MIT licence; weights trained on it are too."
-        if data == "synthetic"
-        else "The weights show a person: that person and the owner of the training images decide "
-        "what may be done with them. State it with licence=."
-    )
+    if data == "synthetic":
+        owner = (
+            "The default person is a character under the MIT licence; weights trained on it are "
+            "too."
+        )
+    else:
+        owner = (
+            "The weights show a person: that person and the owner of the training images decide "
+            "what may be done with them. State it with licence=."
+        )
     return f"gsgan itself is under Apache-2.0. {owner}"
 
 
 def _scores(folder: Path) -> str:
-    table = [
-        (
-            split,
-            EXPORTED_VARIANTS[variant],
-            *(_number(scores.get(key)) for key in SCORES),
-        )
-        for split, variants in _read(folder / "metrics.json").items()
-        for variant, scores in variants.items()
-        if variant in EXPORTED_VARIANTS
-    ]
+    # One row per split and variant that a user of the file can render.
+    table = []
+    for split, variants in _read(folder / "metrics.json").items():
+        for variant, scores in variants.items():
+            if variant in EXPORTED_VARIANTS:
+                numbers = [_number(scores.get(key)) for key in SCORES]
+                table.append((split, EXPORTED_VARIANTS[variant], *numbers))
+
     if not table:
         return "Not evaluated: run `python -m gsgan.evaluate` first."
     return markdown(("split", "", *SCORES.values()), table)
@@ -132,13 +152,15 @@ def _number(value: float | None) -> str:
 
 
 def _read(path: Path) -> dict[str, Any]:
+    # A run that has not been evaluated lacks these files.
     try:
         found = json.loads(path.read_text())
-    except (OSError, ValueError):  # the run has not been evaluated
+    except (OSError, ValueError):
         return {}
     return found if isinstance(found, dict) else {}
 
 
+# The ending of each format's files; a model card lies beside each file.
 ENDINGS = {
     "ply": ".ply",
     "gltf": ".glb",
@@ -163,6 +185,7 @@ def export_config(config: DictConfig) -> None:
     def tell(line: str) -> None:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
 
+    # With `verify` nothing is exported: a file is read for its marks.
     if config.verify is not None:
         path = Path(config.verify).expanduser()
         found = verify(path)
@@ -170,15 +193,20 @@ def export_config(config: DictConfig) -> None:
         tell(f"{path.name}: {state}")
         tell(found.summary())
         return
+
+    # Options are checked before the run is loaded. Programs are made on the CPU, so
+    # that they name no device.
     kind = one_of("format", config.format, tuple(ENDINGS))
     out = _place(config, kind)
     sequence = not out.suffix
     with open_dict(config):
         config.device = "cpu"
     run = Run.load(config)
+
+    # Gaussians in one pose per file; a glTF file without a motion shows the rest pose.
     if kind in ("ply", "gltf"):
         rest = config.motion is None and kind == "gltf"
-        drive = _poses(_with_motion(config, REST) if rest else config, run)
+        drive = _poses(with_motion(config, REST) if rest else config, run)
         tell(drive.text)
         numbers = range(len(drive.p)) if sequence else range(1)
         for i in track(numbers, "writing", console):
@@ -186,18 +214,24 @@ def export_config(config: DictConfig) -> None:
             splats = _splats(run, drive, i)
             up = run.proportions.up
             _write(name, ply_bytes(splats) if kind == "ply" else glb_bytes(splats, up))
-        if sequence and (out / CARD).is_file():  # what is left of a longer one
+
+        # A shorter sequence replaces a longer one: files of later frames are removed.
+        if sequence and (out / CARD).is_file():
             kept = {f"{number:06d}.ply" for number in drive.numbers}
             with writing(out):
                 for path in out.glob("[0-9]" * 6 + ".ply"):
                     if path.name not in kept:
                         path.unlink()
+
+    # A page, or its content for a page of the user's own.
     elif kind in ("html", "bin"):
         title = out.name.split(".")[0]
         content = _block(config, run, title, tell)
         _write(out, content if kind == "bin" else page(content, title))
     else:
         _write(out, _program(config, run, kind))
+
+    # The model card lies beside the file, or in the folder of a sequence.
     beside = out / CARD if sequence else out.with_name(f"{out.stem}.{CARD}")
     _write(beside, card(run, kind, out.name, config.licence))
     tell(f"written: {out}, {beside.name}")
@@ -210,6 +244,7 @@ def _write(path: Path, content: str | bytes) -> None:
 
 def _place(config: DictConfig, kind: str) -> Path:
     """``out``, checked: a file of the format's ending, or a folder for a sequence of .ply files."""
+    # The name must say the format: a file with its ending, or a folder for .ply files.
     ending = ENDINGS[kind]
     folders = " or a folder" if kind == "ply" else ""
     if config.out is None:
@@ -217,6 +252,8 @@ def _place(config: DictConfig, kind: str) -> Path:
     out = Path(config.out).expanduser()
     if out.suffix.lower() != ending and (out.suffix or kind != "ply"):
         raise ConfigError(f"out={out}: format={kind} needs a {ending} file{folders}")
+
+    # Nothing is overwritten unless the user says so.
     folder = not out.suffix
     if out.exists() and out.is_dir() != folder:
         found = "a file; expected a folder" if folder else "a folder; expected a file"
@@ -227,27 +264,32 @@ def _place(config: DictConfig, kind: str) -> Path:
 
 
 def _block(
-    config: DictConfig, run: Run, name: str, tell: Callable[[str], None]
+    config: DictConfig,
+    run: Run,
+    name: str,
+    tell: Callable[[str], None],
 ) -> bytes:
     """The content of a .bin file, and of a page; each motion is one of its own."""
     refuse_unsuitable(run.avatar)
+    chosen = config.motion or ()
+    if isinstance(chosen, str):
+        chosen = [chosen]
+
+    # Motions are named by their files.
     motions = {}
-    for motion in (
-        [config.motion] if isinstance(config.motion, str) else config.motion or ()
-    ):
-        drive = _poses(_with_motion(config, str(motion)), run)
+    for motion in chosen:
+        drive = _poses(with_motion(config, str(motion)), run)
         tell(drive.text)
         motions[Path(motion).stem] = drive, float(config.fps)
     return block(run, distilled_of(config, run), motions, name)
 
 
-def _with_motion(config: DictConfig, motion: str) -> DictConfig:
-    return cast(DictConfig, OmegaConf.merge(config, {"motion": motion}))
-
-
 def _poses(config: DictConfig, run: Run) -> Drive:
     """The frames to export; by default a held-out one."""
+    # The whole motion; its length is known only now.
     drive = drive_of(config, run, float(above("fps", config.fps)))
+
+    # Some of its frames, if the user asks for them.
     start = whole("start", config.start, 0)
     if start >= len(drive.p):
         raise ConfigError(f"start={start}: the motion has {len(drive.p)} frames")
@@ -266,10 +308,12 @@ def _program(config: DictConfig, run: Run, kind: str) -> bytes:
     if kind == "safetensors":
         from gsgan.export.weights import weights_bytes
 
+        # The scene as plain values, with the fields that this version reads.
         facts = run.checkpoint | {"scene": asdict(run.scene)}
         return weights_bytes(run.folder, run.avatar, facts)
     from gsgan.export.programs import onnx_program, torch_program
 
+    # The other formats need the exporters of torch, which take long to import.
     if kind == "onnx":
         return onnx_program(run.avatar)
     side = whole("pixels", config.pixels or run.stored.data.size or 512, 1)

@@ -29,7 +29,7 @@ THINNEST = 1e-7
 FAINTEST = 1e-30  # opacity of Gaussians that are not drawn, for a finite logit
 EXTENSION = "KHR_gaussian_splatting"
 GENERATOR = f"gsgan {__version__}"
-# glTF's numbers
+# Numbers of glTF's specification (component type, primitive mode, and target of a buffer view)
 FLOAT = 5126
 POINTS = 0
 ARRAY_BUFFER = 34962
@@ -55,12 +55,15 @@ class Splats:
 
 
 def splats_of(
-    avatar: Avatar, p: Tensor, valid: Tensor, body: BodyPose | None
+    avatar: Avatar,
+    p: Tensor,
+    valid: Tensor,
+    body: BodyPose | None,
 ) -> Splats:
     """Ĝ of a pose: Step I's Gaussians, in Step I's colours.
 
-    Convention: Ψ's harmonics turn with the body part. Here they are in world axes, so that other
-    programs see the same colours: exact for densify's frames, which are rotations. Frames of a
+    Ψ's harmonics turn with the body part. Here they are in world axes, so that other programs
+    show the same colours. This is exact for densify's frames, which are rotations. Frames of a
     skinned body shear; their harmonics are the least-squares fit over all directions.
 
     Args:
@@ -74,28 +77,42 @@ def splats_of(
     """
     gaussians, sh, frames = _posed(avatar, p, valid, body)
     assert gaussians.covariances is not None
+
+    # Covariances are Σ = R diag(s²) Rᵀ. The eigenvectors may be mirrored; R is a rotation.
     values, axes = torch.linalg.eigh(gaussians.covariances[0].double())
-    # eigenvectors may be mirrored
     axes = axes * torch.linalg.det(axes).sign()[:, None, None]
-    given = (
-        gaussians.means[0],
-        values.clamp_min(THINNEST**2).sqrt(),
-        functional.normalize(rotation_matrix_to_quaternion(axes), dim=-1),
-        gaussians.opacities[0],
-        in_world(sh.double(), frames.double())[0],
+    scales = values.clamp_min(THINNEST**2).sqrt()
+    quats = functional.normalize(rotation_matrix_to_quaternion(axes), dim=-1)
+    return Splats(
+        means=_float32(gaussians.means[0]),
+        scales=_float32(scales),
+        quats=_float32(quats),
+        opacities=_float32(gaussians.opacities[0]),
+        sh=_float32(in_world(sh.double(), frames.double())[0]),
     )
-    return Splats(*(np.ascontiguousarray(x.float().cpu().numpy()) for x in given))
+
+
+def _float32(values: Tensor) -> Float:
+    return np.ascontiguousarray(values.float().cpu().numpy())
 
 
 def _posed(
-    avatar: Avatar, p: Tensor, valid: Tensor, body: BodyPose | None
+    avatar: Avatar,
+    p: Tensor,
+    valid: Tensor,
+    body: BodyPose | None,
 ) -> tuple[Gaussians, Tensor, Tensor]:
     """Ĝ, its harmonics ``[1, N, (d+1)², 3]``, and the frames ``[1, N, 3, 3]`` they are in."""
     eye = p.new_zeros(1, 3)  # colours as seen from there are not used
+
+    # Gaussians that move with the body have colours of their own; their frames are the
+    # blended bones.
     if avatar.surface is not None:
         assert body is not None
         A, _ = avatar.surface.points.blend(body)
         return avatar.surface(body, eye), avatar.surface.sh[None], A
+
+    # All others get harmonics from Ψ, in the frames of the points that it moves.
     psi = avatar.deformation
     if psi is None:
         raise ConfigError(
@@ -108,8 +125,12 @@ def _posed(
 def in_world(sh: Tensor, frames: Tensor) -> Tensor:
     """Harmonics ``[B, N, (d+1)², 3]`` of parts with frames ``[B, N, 3, 3]``, in world axes."""
     degree = math.isqrt(sh.shape[-2]) - 1
+    # Constant colours look the same in every frame.
     if degree == 0:
         return sh
+
+    # Colours that the part's harmonics have in its own axes, and the world's harmonics
+    # with the same colours in the same directions (least squares).
     world = torch.from_numpy(even_sphere(DIRECTIONS)[1]).to(sh)  # [K, 3]
     own = functional.normalize(world @ frames, dim=-1, eps=1e-6)  # rows Fᵀ v
     colours = sh_basis(own, degree) @ sh
@@ -119,36 +140,51 @@ def in_world(sh: Tensor, frames: Tensor) -> Tensor:
 def ply_bytes(splats: Splats) -> bytes:
     """A binary .ply file as 3D Gaussian splatting writes it (Kerbl et al., 2023).
 
-    Convention: log scales, logit opacities, harmonics channel by channel, zeros above the avatar's
-    degree; quaternions w x y z; normals are zero.
+    Scales are logarithms, opacities logits, and harmonics lie channel by channel with zeros above
+    the avatar's degree. Quaternions are w x y z; normals are zero.
     """
+    # Harmonics above the constant one, padded to the format's fixed degree.
     count = len(splats.means)
     rest = np.zeros((count, 3, (MAX_DEGREE + 1) ** 2 - 1), np.float32)
     rest[..., : splats.sh.shape[1] - 1] = splats.sh[:, 1:].transpose(0, 2, 1)
+
+    # Logits are finite for an opacity of 1 too: it is clipped in float64, below 1.
     opacities = splats.opacities.astype(np.float64).clip(FAINTEST)
-    # of float32's 1.0 too: no logit of a float64 below 1 is infinite
     logits = np.log(opacities) - np.log1p(-opacities.clip(max=1 - 1e-12))
-    columns = {
-        ("x", "y", "z"): splats.means,
-        ("nx", "ny", "nz"): np.zeros((count, 3)),
-        tuple(f"f_dc_{i}" for i in range(3)): splats.sh[:, 0],
-        tuple(f"f_rest_{i}" for i in range(rest[0].size)): rest.reshape(count, -1),
-        ("opacity",): logits[:, None],
-        tuple(f"scale_{i}" for i in range(3)): np.log(splats.scales.astype(np.float64)),
-        tuple(f"rot_{i}" for i in range(4)): splats.quats,
+
+    # Columns, and the prefix under which each block's properties are numbered.
+    numbered = {
+        "f_dc": splats.sh[:, 0],
+        "f_rest": rest.reshape(count, -1),
+        "opacity": logits[:, None],
+        "scale": np.log(splats.scales.astype(np.float64)),
+        "rot": splats.quats,
     }
-    header = ["ply", "format binary_little_endian 1.0", f"comment {GENERATOR}"]
-    header += [f"element vertex {count}"]
-    header += [f"property float {name}" for names in columns for name in names]
-    rows = np.concatenate(list(columns.values()), axis=1).astype("<f4")
+    names = ["x", "y", "z", "nx", "ny", "nz"]
+    for prefix, values in numbered.items():
+        if prefix == "opacity":
+            names.append(prefix)
+        else:
+            names += [f"{prefix}_{i}" for i in range(values.shape[1])]
+
+    # The header declares one float per property; the rows follow in the same order.
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment {GENERATOR}",
+        f"element vertex {count}",
+    ]
+    header += [f"property float {name}" for name in names]
+    columns = [splats.means, np.zeros((count, 3)), *numbered.values()]
+    rows = np.concatenate(columns, axis=1).astype("<f4")
     return "\n".join([*header, "end_header\n"]).encode() + rows.tobytes()
 
 
 def glb_bytes(splats: Splats, up: str) -> bytes:
     """A binary glTF file of one point primitive with KHR_gaussian_splatting.
 
-    Convention: linear scales and opacities, quaternions x y z w. A node turns the world, whose up
-    axis is ``up``, to glTF's: Y up, a person in the standard pose faces +Z.
+    Scales and opacities are linear, quaternions x y z w. A node turns the world, whose up axis is
+    ``up``, to glTF's: Y up, a person in the standard pose faces +Z.
 
     Source: KHR_gaussian_splatting as ratified in 2026, kernel ``ellipse``.
     """
@@ -170,33 +206,45 @@ def glb_bytes(splats: Splats, up: str) -> bytes:
     accessors = []
     for i, array in enumerate(arrays.values()):
         raw = np.ascontiguousarray(array, "<f4").tobytes()
-        view = {"buffer": 0, "byteOffset": len(data), "byteLength": len(raw)}
-        views.append(view | {"target": ARRAY_BUFFER})
+        views.append(
+            {
+                "buffer": 0,
+                "byteOffset": len(data),
+                "byteLength": len(raw),
+                "target": ARRAY_BUFFER,
+            }
+        )
         kind = "SCALAR" if array.shape[1] == 1 else f"VEC{array.shape[1]}"
-        accessor = {
-            "bufferView": i,
-            "componentType": FLOAT,
-            "count": len(array),
-            "type": kind,
-        }
         accessors.append(
-            accessor | {"min": array.min(0).tolist(), "max": array.max(0).tolist()}
+            {
+                "bufferView": i,
+                "componentType": FLOAT,
+                "count": len(array),
+                "type": kind,
+                "min": array.min(0).tolist(),
+                "max": array.max(0).tolist(),
+            }
         )
         data += raw
 
     # The extension says how the points are drawn.
-    kernel = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
     primitive = {
         "mode": POINTS,
         "attributes": {name: i for i, name in enumerate(arrays)},
+        "extensions": {
+            EXTENSION: {
+                "kernel": "ellipse",
+                "colorSpace": "srgb_rec709_display",
+            },
+        },
     }
-    primitive["extensions"] = {EXTENSION: kernel}
 
     # A node turns the world to glTF's axes.
     to_gltf = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]) @ upright(up)
-    w, x, y, z = rotation_matrix_to_quaternion(torch.from_numpy(to_gltf)[None])[
-        0
-    ].tolist()
+    turn = rotation_matrix_to_quaternion(torch.from_numpy(to_gltf)[None])[0]
+    w, x, y, z = turn.tolist()
+
+    # The scene: one node with one mesh, which has one primitive.
     content = {
         "asset": {"version": "2.0", "generator": GENERATOR},
         "extensionsUsed": [EXTENSION],

@@ -17,7 +17,11 @@ from gsgan.utils.tensors import pick_device
 
 KEPT_FACTS = ("effects", "scene", "marks")  # of a checkpoint's facts
 DAMAGED = (
-    *(AttributeError, LookupError, RecursionError, TypeError, ValueError),
+    AttributeError,
+    LookupError,
+    RecursionError,
+    TypeError,
+    ValueError,
     OmegaConfBaseException,
 )
 NEEDS_SAFETENSORS = "safetensors files need: pip install 'gsgan[export]'"
@@ -39,10 +43,13 @@ def weights_bytes(folder: Path, avatar: Avatar, facts: dict[str, Any]) -> bytes:
     except ImportError:
         raise ConfigError(NEEDS_SAFETENSORS) from None
 
+    # The metadata are what an avatar is built from: its config, and facts about its
+    # scene.
     config = OmegaConf.to_container(read_config(folder), resolve=False)
     metadata = {"format": "pt", "config": json.dumps(config)}
     metadata["gsgan"] = json.dumps({key: facts.get(key) for key in KEPT_FACTS})
-    return save({k: v.contiguous() for k, v in avatar.state_dict().items()}, metadata)
+    state = {key: value.contiguous() for key, value in avatar.state_dict().items()}
+    return save(state, metadata)
 
 
 def load_weights(path: str | Path, *, device: str = "auto") -> Avatar:
@@ -60,6 +67,8 @@ def load_weights(path: str | Path, *, device: str = "auto") -> Avatar:
         from safetensors import SafetensorError, safe_open
     except ImportError:
         raise ConfigError(NEEDS_SAFETENSORS) from None
+
+    # Weights and metadata, without pickle.
     path = Path(path).expanduser()
     try:
         with safe_open(path, "pt") as file:
@@ -67,10 +76,14 @@ def load_weights(path: str | Path, *, device: str = "auto") -> Avatar:
             state = {f"avatar.{key}": file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
     except (OSError, SafetensorError) as error:
         raise DataError(f"{path}: not a readable safetensors file ({error})") from None
+
+    # The metadata of files by other programs lack these keys.
     if not {"config", "gsgan"} <= metadata.keys():
         raise DataError(
             f"{path}: not written by gsgan.export (its metadata has no config)"
         )
+
+    # A damaged config can fail anywhere in the building of the avatar.
     try:
         config = OmegaConf.create(json.loads(metadata["config"]))
         _refuse_other_classes(path, config)
@@ -87,15 +100,20 @@ def load_weights(path: str | Path, *, device: str = "auto") -> Avatar:
 def _refuse_other_classes(path: Path, config: Any) -> None:
     """A config names the classes that it builds: only those in conf/ are taken from a file that may
     come from anybody."""
+    # The classes that the shipped configs name.
     shipped = "\n".join(file.read_text() for file in config_folder().rglob("*.yaml"))
     known = {"", *re.findall(r"_target_: *([\w.]+)", shipped)}
+
+    # Every node of the config is visited, however deep it lies.
     pending = [OmegaConf.to_container(config)]
     while pending:
         node = pending.pop()
-        if isinstance(node, dict) and node.get("_target_", "") not in known:
-            raise DataError(
-                f"{path} names {node['_target_']!r}, which is not a class of gsgan's own configs; "
-                "load the run folder that it was exported from"
-            )
-        if isinstance(node, (dict, list)):
-            pending += node.values() if isinstance(node, dict) else node
+        if isinstance(node, list):
+            pending += node
+        elif isinstance(node, dict):
+            if node.get("_target_", "") not in known:
+                raise DataError(
+                    f"{path} names {node['_target_']!r}, which is not a class of gsgan's own "
+                    "configs; load the run folder that it was exported from"
+                )
+            pending += node.values()

@@ -23,7 +23,7 @@ from gsgan.body.solve import ON_HANDS, Solver
 from gsgan.data.calibration import METRES
 from gsgan.data.crop import PersonCrop
 from gsgan.data.datamodule import GsganData
-from gsgan.data.formats.capture import LANDMARKS, POSES, SHAPE, CaptureReader
+from gsgan.data.formats.capture import LANDMARKS_FILE, POSES_FILE, SHAPE, CaptureReader
 from gsgan.data.scene_info import refuse_swapped_sides
 from gsgan.data.validation import spans
 from gsgan.fit.fitter import Fit, Fitter
@@ -113,7 +113,7 @@ def summary(report: dict[str, Any], folder: Path, masked: MaskedFrames) -> list[
         f"registered, {report['driven']['iou']:.3f} solved again; least in frames {least}",
         f"landmarks {before['residual_mm']:.0f} mm from the skeleton's solved, "
         f"{after['residual_mm']:.0f} mm registered (medians); most: {worst}",
-        f"{folder} has {SHAPE} and {POSES}; {REPORT} has all numbers",
+        f"{folder} has {SHAPE} and {POSES_FILE}; {REPORT} has all numbers",
     ]
 
 
@@ -163,7 +163,7 @@ def fit_before_training(
         with writing(root):
             stack.enter_context(locked(root / LOCK))
         # Another process may have made the poses while this one waited.
-        if not (root / POSES).exists():
+        if not (root / POSES_FILE).exists():
             fit_body(seen, instantiate(settings), device=device)
 
 
@@ -275,14 +275,15 @@ def _make_folder(out: Path, overwrite: bool) -> None:
         write_atomically(attempt, b"")
         attempt.unlink(missing_ok=True)  # another fit may have removed it
     # Poses are replaced only if a fit made them and overwrite is set.
-    if (out / POSES).exists():
+    if (out / POSES_FILE).exists():
         if not (out / SHAPE).exists():
             raise ConfigError(
-                f"{out / POSES} holds poses that gsgan.fit did not make; give another folder, out="
+                f"{out / POSES_FILE} holds poses that gsgan.fit did not make; "
+                "give another folder, out="
             )
         if not overwrite:
             raise ConfigError(
-                f"{out / POSES} exists already; overwrite=true replaces it"
+                f"{out / POSES_FILE} exists already; overwrite=true replaces it"
             )
 
 
@@ -316,11 +317,11 @@ def _write_body(
         arrays[f"transl{name}"] = transl.numpy() / unit
 
     # The old poses are removed first: a fit that is killed here leaves no poses of another shape.
-    with writing(folder / POSES):
-        (folder / POSES).unlink(missing_ok=True)
+    with writing(folder / POSES_FILE):
+        (folder / POSES_FILE).unlink(missing_ok=True)
     write_npz(folder / SHAPE, **shape.arrays())
     write_npz(
-        folder / POSES,
+        folder / POSES_FILE,
         **arrays,
         frame_id=np.array(data.layout.frames),
         registered=np.array(() if kept is None else frames.frames, np.int64),
@@ -350,7 +351,9 @@ def _solve(
             return Solver(shaped_body(shape)).solve(joints, visibility)
     except ValueError as error:
         names = f"items are the frames {spans(list(frames))} in order"
-        raise DataError(f"{data.layout.root / LANDMARKS}: {error} ({names})") from None
+        raise DataError(
+            f"{data.layout.root / LANDMARKS_FILE}: {error} ({names})"
+        ) from None
 
 
 def _solve_all(

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gsgan.data.joints import ALL, BODY, FACE, HANDS, PALM, WRISTS, known
+from gsgan.data.joints import ALL, BODY, FACE, HANDS, PALM_JOINTS, WRIST_JOINTS, known
 from gsgan.data.skeletons import bone_lengths
 from gsgan.skeleton.hands import FINGER_BONES, HAND
 from gsgan.utils.arrays import Bool, Float, nanmedian
@@ -20,7 +20,9 @@ CHECKED_BONES = (
     (26, 28),
 )
 HAND_ROOTS = [BODY, BODY + HAND]
-HAND_BONES = tuple((start, start + knuckle) for start in HAND_ROOTS for knuckle in PALM)
+HAND_BONES = tuple(
+    (start, start + knuckle) for start in HAND_ROOTS for knuckle in PALM_JOINTS
+)
 FINGERS_OF_BOTH = tuple(
     (start + a, start + b) for start in HAND_ROOTS for a, b in FINGER_BONES
 )
@@ -50,7 +52,7 @@ def cleanse(p: Float) -> tuple[Float, dict[str, int]]:
     # Joints too far from the body, the wrist or the middle of the face.
     far = _distance_from_median(p) > MAX_REACH
     if has_hands:
-        gap = np.linalg.norm(p[:, HAND_ROOTS] - p[:, WRISTS], axis=-1)
+        gap = np.linalg.norm(p[:, HAND_ROOTS] - p[:, WRIST_JOINTS], axis=-1)
         far[:, HANDS] |= (gap > MAX_WRIST_GAP).repeat(HAND, axis=1)
         far[:, FACE] |= _distance_from_median(p[:, FACE]) > FACE_RADIUS
     far &= seen
@@ -61,8 +63,8 @@ def cleanse(p: Float) -> tuple[Float, dict[str, int]]:
     _mark_ends(wrong, CHECKED_BONES, _misfit(p, CHECKED_BONES, BONE))
     if has_hands:
         palms = _misfit(p, HAND_BONES, HAND_BONE)
-        palms = palms.reshape(len(p), 2, len(PALM))
-        most = palms.sum(-1) * 2 > len(PALM)
+        palms = palms.reshape(len(p), 2, len(PALM_JOINTS))
+        most = palms.sum(-1) * 2 > len(PALM_JOINTS)
         wrong[:, HANDS] |= most.repeat(HAND, axis=1)
         _mark_ends(
             wrong,

@@ -25,7 +25,7 @@ from gsgan.data.joints import (
     LEFT,
     LEG_PAIRS,
     RIGHT,
-    WRISTS,
+    WRIST_JOINTS,
 )
 from gsgan.prepare import landmarks
 from gsgan.prepare.camera_array import CameraArray
@@ -359,7 +359,7 @@ def _with_hands(
 
     # The hands' depth: the wrist's, and the detector's own from there.
     in_camera = p @ camera.R.T + camera.t
-    depth = in_camera[:, WRISTS, 2].repeat(HAND, axis=1)
+    depth = in_camera[:, WRIST_JOINTS, 2].repeat(HAND, axis=1)
     depth = depth * (1 + seen.hand_z / camera.K[0, 0])
     ones = np.ones_like(depth)[..., None]
     pixels = np.concatenate([seen.px[:, HANDS], ones], axis=-1)
@@ -367,7 +367,7 @@ def _with_hands(
     joints[:, HANDS] = (rays * depth[..., None] - camera.t) @ camera.R
 
     # The hand begins at the solved wrist.
-    for part, wrist in zip((LEFT, RIGHT), WRISTS, strict=True):
+    for part, wrist in zip((LEFT, RIGHT), WRIST_JOINTS, strict=True):
         hand = joints[:, part]
         hand += p[:, [wrist]] - hand[:, :1]
 

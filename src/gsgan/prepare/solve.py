@@ -4,7 +4,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsgan.data.joints import ALL, BODY, FLIP_GROUPS, HAND_PAIRS, HANDS, WRISTS, known
+from gsgan.data.joints import (
+    ALL,
+    BODY,
+    FLIP_GROUPS,
+    HAND_PAIRS,
+    HANDS,
+    WRIST_JOINTS,
+    known,
+)
 from gsgan.prepare.camera_array import (
     MIN_VIEWS,
     UNIT_FOCAL,
@@ -256,9 +264,9 @@ def correct(cameras: CameraArray, uv: Float, conf: Float) -> Corrected:
         return Corrected(sided, weight, flips, left_out, points)
 
     # If a camera does not see a wrist, the other cameras show where it is.
-    sees_wrist = weight[..., WRISTS, None] > 0
-    own = np.where(sees_wrist, sided[:, :, WRISTS], np.nan)
-    arms = robust(cameras, _flat(own), _flat(weight[:, :, WRISTS]))
+    sees_wrist = weight[..., WRIST_JOINTS, None] > 0
+    own = np.where(sees_wrist, sided[:, :, WRIST_JOINTS], np.nan)
+    arms = robust(cameras, _flat(own), _flat(weight[:, :, WRIST_JOINTS]))
     projected, _ = cameras.project(arms.p)
     wrists = np.where(np.isfinite(own), own, projected.reshape(own.shape))
 

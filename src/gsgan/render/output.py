@@ -21,10 +21,11 @@ from gsgan.utils.provenance import marked_mp4, png_bytes
 
 Bytes = NDArray[np.uint8]
 
+# The record in a folder of frames, and the ending of videos.
 RECORD = "render.json"
 VIDEO = ".mp4"
 VIDEO_QUALITY = "16"  # x264's constant rate factor: visually lossless
-# ffmpeg's codes for the result of its RGB conversion
+# Codes in ffmpeg of the colours that its RGB conversion gives.
 BT601 = 6
 STUDIO_RANGE = 1
 
@@ -58,15 +59,18 @@ class Output:
         Raises:
             ConfigError: when the output exists, or PyAV is missing.
         """
+        # A missing package, and a video that exists, are found before anything is painted.
         if self.video:
             _av()
             if self.out.exists() and not overwrite:
                 raise ConfigError(
                     f"out={self.out} exists; give overwrite=true or another name"
                 )
-            # else found when all is painted
             self.out.parent.mkdir(parents=True, exist_ok=True)
             return
+
+        # Only a folder that a render wrote is written to again. Its frames are removed,
+        # since it may have more of them than the new one.
         if self.out.exists() and (not self.out.is_dir() or any(self.out.glob("[!.]*"))):
             if not (self.out / RECORD).is_file():
                 raise ConfigError(
@@ -86,17 +90,20 @@ class Output:
         Raises:
             DataError: when this build of PyAV has no H.264.
         """
+        # A video is written when its last frame is encoded.
         if self.video:
             data = encoded(images, self.fps)
             data = marked_mp4(data) if self.marked else data
             write_atomically(self.out, data)
             return
+
         for number, image in zip(numbers, images, strict=True):
             data = png_bytes(Image.fromarray(image), self.marked)
             write_atomically(self.out / f"{number:06d}.png", data)
 
 
 def _av() -> Any:
+    # PyAV is optional, since folders of PNG files need no encoder.
     try:
         import av
     except ImportError:
@@ -108,11 +115,13 @@ def _av() -> Any:
 
 def encoded(images: Iterable[Bytes], fps: float) -> bytes:
     """An MP4 file of images ``[H, W, 3]``, H.264; odd sides repeat their last row or column."""
+    # The file is made in memory, since it is written completely or not at all.
     av = _av()
     stream = None
     out = io.BytesIO()
     with av.open(out, "w", format="mp4") as container:
         for image in images:
+            # The first image gives the size, which H.264 needs to be even.
             if stream is None:
                 try:
                     rate = Fraction(fps).limit_denominator(100_000)
@@ -122,16 +131,24 @@ def encoded(images: Iterable[Bytes], fps: float) -> bytes:
                     raise DataError(
                         f"this build of av has no H.264 encoder ({error}); give a folder as out"
                     ) from error
-                stream.height, stream.width = (n + n % 2 for n in image.shape[:2])
+                height, width = image.shape[:2]
+                stream.height = height + height % 2
+                stream.width = width + width % 2
+
+                # Most players support 4:2:0 alone. Its colours are coded as BT.601.
                 stream.pix_fmt = "yuv420p"
                 context = stream.codec_context
                 context.colorspace = BT601
                 context.color_range = STUDIO_RANGE
+
+            # An odd last row or column is repeated.
             sides = ((0, image.shape[0] % 2), (0, image.shape[1] % 2), (0, 0))
             padded = np.ascontiguousarray(np.pad(image, sides, mode="edge"))
             container.mux(
                 stream.encode(av.VideoFrame.from_ndarray(padded, format="rgb24"))
             )
+
+        # The encoder holds back frames until it is flushed.
         if stream is not None:
             container.mux(stream.encode())
     return out.getvalue()

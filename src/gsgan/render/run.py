@@ -76,8 +76,11 @@ def render_config(config: DictConfig) -> None:
 def _print_distances(
     poses: TrainingPoses, avatar: Avatar, drive: Drive, console: Console
 ) -> None:
-    """How far the motion is from the training poses: its median and farthest frame."""
+    """Prints how far the motion is from the training poses: its median and farthest frame."""
+    # Frames are completed one by one, as when they are rendered.
     p = torch.cat([joints_of(avatar, drive, i)[0] for i in range(len(drive.p))])
+
+    # One distance per frame, in deviations of the training poses.
     far = poses.distance(p)
     most = int(far.argmax())
     console.print(
@@ -89,10 +92,13 @@ def _print_distances(
 
 
 def _output(config: DictConfig) -> Output:
+    # A folder or a video; the folder may have a dot in its name.
     if config.out is None:
         raise ConfigError(
             "out is not set: give out=<video.mp4>, or out=<folder> for PNG files"
         )
+
+    # Every other ending is most likely a mistake.
     out = Path(config.out).expanduser()
     if out.suffix and out.suffix.lower() != ".mp4" and not out.is_dir():
         raise ConfigError(f"out={out} must be a .mp4 file, or a folder for PNG files")
@@ -101,12 +107,15 @@ def _output(config: DictConfig) -> Output:
 
 def _chosen(drive: Drive, config: DictConfig, fps: float) -> Drive:
     """``frames`` frames from ``start`` on; a single pose is held."""
+    # The first frame must exist.
     start = whole("start", config.start, 0)
     total = len(drive.p)
     if start >= total:
         raise ConfigError(
             f"start={start}: the motion has {total} frames at {fps:g} per second"
         )
+
+    # A single pose is shown for some seconds, unless the user gives a number of frames.
     still = total == 1 and drive.camera is None
     count = round(STILL_SECONDS * fps) if still else total - start
     if config.frames is not None:
@@ -124,22 +133,31 @@ def _cameras(
     config: DictConfig, run: Run, drive: Drive
 ) -> tuple[Camera, Tensor | None]:
     """One camera, or one per frame; and their indices, if images are to have their colours."""
+    # A held-out motion comes with its camera, at the size of its images.
     trained = run.stored.data.size
     if drive.camera is not None:
         camera, index = drive.camera
         if config.pixels is not None:
-            camera = camera.resize((whole("pixels", config.pixels, 1),) * 2)
+            side = whole("pixels", config.pixels, 1)
+            camera = camera.resize((side, side))
         return camera, index
+
+    # All others give square images, by default as large as in training.
     size = whole("pixels", config.pixels or trained or 512, 1)
     name = "orbit" if config.camera is None else str(config.camera)
     if name == "orbit":
         orbit = Orbit(**OmegaConf.to_container(config.orbit))  # type: ignore[arg-type]
-        return orbit.cameras(
+        cameras = orbit.cameras(
             drive.p, run.proportions, run.scene, size, trained or size
-        ), None
-    if (path := Path(name).expanduser()).is_file():
+        )
+        return cameras, None
+
+    # A calibration file, or a camera of the run's data.
+    path = Path(name).expanduser()
+    if path.is_file():
         return from_file(path, drive.p, size), None
-    if name not in (entries := run.data.layout.cameras):
+    entries = run.data.layout.cameras
+    if name not in entries:
         raise ConfigError(
             f"camera={name} is neither a camera of the run's data nor a file; choose orbit or one "
             f"of {', '.join(entries)}"
@@ -165,6 +183,7 @@ def of_entry(
         crop: of the training images, or None.
         lens: keep its distortion, see `CameraEntry.seen`.
     """
+    # One window for all frames, so that the camera stands still.
     window = square_window(entry.size)
     if crop is not None:
         joints = p.reshape(-1, 3)
@@ -179,6 +198,7 @@ def from_file(path: Path, p: NDArray[np.float64], size: int) -> Camera:
     Raises:
         DataError: when it cannot be read, or the number of cameras is neither 1 nor F.
     """
+    # One camera for all frames, or one for each; both need an image size for their window.
     found = list(read_calibration(path).cameras.values())
     if len(found) not in (1, len(p)):
         raise DataError(
@@ -205,9 +225,12 @@ def _images(
         DataError: when a frame cannot be rendered.
     """
     for i, number in enumerate(drive.numbers):
+        # One camera serves all frames.
         at = slice(i, i + 1) if len(cameras) > 1 else slice(0, 1)
         camera = cameras[at]
         colours = None if index is None else index[at]
+
+        # A pose with too few known joints cannot be completed.
         try:
             with torch.no_grad():
                 p, visibility, body = inputs_of(run.avatar, drive, i)

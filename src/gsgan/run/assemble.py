@@ -42,9 +42,9 @@ OPTIONS = ("backend", "window_margin", "window_multiple", "window_least")  # of 
 
 def build_data(config: DictConfig) -> GsganData:
     """The data module of a config, its dataset made if need be, read and checked."""
-    data: GsganData = instantiate(
-        config.data, distortion=_effect_settings(config).distortion
-    )
+    # Images are undistorted when they are read, so the dataset knows that effect.
+    distortion = _effect_settings(config).distortion
+    data: GsganData = instantiate(config.data, distortion=distortion)
     data.prepare_data()
     data.setup()
     return data
@@ -52,6 +52,7 @@ def build_data(config: DictConfig) -> GsganData:
 
 def moves_with_body(config: DictConfig) -> bool:
     """Whether a config's model has parts that move with a skinned body, if the data has one."""
+    # S and Gaussians on the body always need it; placing G there is an effect.
     model = config.model
     if model.get("segmentation") is not None or model.get("surface") is not None:
         return True
@@ -81,18 +82,21 @@ def build_avatar(
             on a key that is not read.
         DataError: when the data lacks the body that the model needs.
     """
-    if (
-        config.model.get("densify") is not None
-        and "_target_" not in config.model.densify
-    ):
+    # The experiment sets keys of `densify` in models that have no such part.
+    densify = config.model.get("densify")
+    if densify is not None and "_target_" not in densify:
         raise ConfigError(
             "experiment=paper changes parts that this model does not have; it goes with "
             "model=full, wo_feat, wo_seg, wo_gcn or splat_only"
         )
+
+    # Parts draw their weights when they are made, so the seed comes first.
     torch.manual_seed(config.seed)
     with naming_group("model"):
         parts: AvatarParts = instantiate(config.model)()
         effects = effects or decide(scene, _effect_settings(config), parts.in_effects)
+
+        # S needs the body with a label per vertex.
         labelled: tuple[SkinnedBody | None, str] = None, "the model leaves it out"
         if parts.segmentation is not None:
             labelled = labelled_body(scene, images, vertex_labels)
@@ -103,32 +107,35 @@ def build_avatar(
 class AvatarParts:
     """The config group ``model`` (keys: conf/model/full.yaml).
 
-    Convention: parts whose sizes depend on the scene are functions of those sizes (``_partial_`` in
-    the config).
+    Parts whose sizes depend on the scene are functions of those sizes (``_partial_`` in the
+    config).
 
     Args:
         accuracy: the rasteriser's settings for F.
         densify, deformation: skeleton to points; Ψ.
-        body_points: in place of densify where that effect is on.
+        body_points: in place of densify, if that effect is on.
         surface: in place of Ψ, any Gaussians that move with the body (``lbs_splat``). Without
             either nothing is splatted and the UNet paints the drawn skeleton alone
             (``image_to_image``).
         segmentation: S; None leaves it out (``wo_seg``).
         pose_encoder, generator: Ω (or the flat skeleton) to g; the UNet. Without them Step I's
             colour is the image (``splat_only``).
-        low_pass, supersample, backend: of F, and of S where it has them.
+        low_pass, supersample, backend: of F, and of S as far as it has them.
         window_margin, window_multiple, window_least: of `Avatar`.
 
     Raises:
         ValueError: on parts that do not go together.
     """
 
+    # Every model names these, if only as null.
     accuracy: Accuracy
     densify: Densify | None
     deformation: Callable[..., ResidualGaussians] | None
     segmentation: Callable[..., Segmentation] | None
     pose_encoder: nn.Module | None
     generator: Callable[..., Generator] | None
+
+    # Some models have these, too.
     surface: Callable[..., SurfaceGaussians] | None = None
     body_points: Callable[..., BodyPoints] | None = None
     low_pass: float = 0.3
@@ -140,26 +147,20 @@ class AvatarParts:
 
     def __post_init__(self) -> None:
         one_of("model.backend", self.backend, BACKENDS)
-        for wrong, message in (
-            (
-                (self.deformation is None) != (self.densify is None),
-                "densify and deformation go together",
-            ),
-            (
-                (self.generator is None) != (self.pose_encoder is None),
-                "generator and pose_encoder go together",
-            ),
-            (
-                self.deformation and self.surface,
-                "give a deformation or a surface, got both",
-            ),
-            (
-                not (self.deformation or self.surface or self.generator),
-                "nothing paints; give a deformation, a surface or a generator",
-            ),
-        ):
-            if wrong:
-                raise ValueError(message)
+
+        # Pairs of parts that need each other.
+        if (self.deformation is None) != (self.densify is None):
+            raise ValueError("densify and deformation go together")
+        if (self.generator is None) != (self.pose_encoder is None):
+            raise ValueError("generator and pose_encoder go together")
+
+        # Exactly one source of Gaussians, unless the UNet paints without any.
+        if self.deformation and self.surface:
+            raise ValueError("give a deformation or a surface, got both")
+        if not (self.deformation or self.surface or self.generator):
+            raise ValueError(
+                "nothing paints; give a deformation, a surface or a generator"
+            )
 
     @property
     def in_effects(self) -> ModelParts:
@@ -178,7 +179,7 @@ def _assembled(
     labelled: tuple[SkinnedBody | None, str],
     seed: int,
 ) -> Avatar:
-    """Sizes the parts to the scene and puts them together.
+    """The avatar of parts that are sized to the scene.
 
     Each group of parts draws from its own seed, so that leaving one out does not change the start
     of the others. ``labelled``: S's body, and where its labels come from or why there is none.
@@ -191,6 +192,8 @@ def _assembled(
         "antialias": effects.antialias.on,
     }
 
+    # The points that Gaussians start from: on the skinned body, or on the skeleton's
+    # shapes.
     torch.manual_seed(seed + 1)
     body_points = None
     if parts.densify and parts.body_points and effects.body_points.on:
@@ -198,26 +201,38 @@ def _assembled(
         body_points = parts.body_points(
             body=body, body_height=body_height, scale=scene.scale_train[1]
         )
+
+    # Ψ, which moves these points, or Gaussians that move with the body alone.
     sizes = {"body_height": body_height, "sh_degree": effects.degree}
     deformation = surface = None
-    if parts.deformation and (points := body_points or parts.densify):
-        rest = points.rest_points
-        joints = len(template.names)
-        own: dict[str, Any] = (
-            {"mean_step": body_points.mean_step} if body_points else {}
-        )
+    points = body_points or parts.densify
+    if parts.deformation and points:
+        own: dict[str, Any] = {}
+        if body_points:
+            own["mean_step"] = body_points.mean_step
+        # A config with normals=null leaves it to the number of cameras.
         if getattr(parts.deformation, "keywords", {}).get("normals", False) is None:
             own["normals"] = scene.n_train_cameras > 1
-        deformation = parts.deformation(rest_points=rest, joints=joints, **sizes, **own)
+        deformation = parts.deformation(
+            rest_points=points.rest_points,
+            joints=len(template.names),
+            **sizes,
+            **own,
+        )
     if parts.surface:
         surface = parts.surface(body=_required_body(scene, "model.surface"), **sizes)
+
+    # S forms its images like F.
     segmentation = None
     if parts.segmentation and labelled[0] is not None:
         segmentation = parts.segmentation(body=labelled[0], labelled=scene.has_labels)
         segmentation.accuracy = replace(segmentation.accuracy, **formation)
         segmentation.backend = parts.backend
+
+    # Parts on a body need its solver for skeletons without a body pose.
     on_a_body = any(part is not None for part in (body_points, surface, segmentation))
 
+    # The rest: the generator and the colour corrections.
     torch.manual_seed(seed + 2)
     colours = effects.colour_correction.on
     return Avatar(
@@ -249,9 +264,11 @@ def _generator(
     splats: ResidualGaussians | SurfaceGaussians | None,
     segmentation: Segmentation | None,
 ) -> Generator | None:
-    """The UNet; where nothing is splatted the drawn skeleton takes F's place."""
+    """The UNet; if nothing is splatted, the drawn skeleton takes F's place."""
     if parts.generator is None or parts.pose_encoder is None:
         return None
+
+    # Channels of its inputs; F has three for the colour of Step I before its features.
     drawn = len(template.draw_groups)
     return parts.generator(
         feature_channels=3 + splats.features if splats else drawn,
@@ -282,6 +299,8 @@ def _required_body(scene: SceneInfo, part: str) -> MarkedBody:
             f"{part} cannot be built: the data lacks a body pose for every frame; choose "
             "model=splat_only or model=full"
         )
+
+    # The body itself may be absent: model files of SMPL are the user's.
     body = open_body(scene.body, scene.body_file, scene.betas, scene.label_names)
     if body is None:
         raise DataError(

@@ -35,13 +35,14 @@ def labelled_body(
 ) -> tuple[SkinnedBody | None, str]:
     """The body, and a clause on where its labels come from, or why there is no body.
 
-    The body keeps its own labels where the data has the same ones, or none. Otherwise, and on a
+    The body keeps its own labels if the data has the same ones, or none. Otherwise, and on a
     body fitted to a person, whose clothes end elsewhere, labels come from a checkpoint
     (``vertex_labels [V]``) or from a vote over ``images``.
 
     Raises:
         DataError: when a vote is needed and not possible, or the labels do not fit the body.
     """
+    # S needs a body that can be posed.
     if not scene.has_body_pose:
         return None, "the data has no body pose"
     body = open_body(scene.body, scene.body_file, scene.betas, scene.label_names)
@@ -49,13 +50,15 @@ def labelled_body(
         return None, (
             f"the data's poses are of the body {scene.body!r}, of which there is no model file"
         )
+
+    # Images without labels need none of the data's: the body has its own.
     if not scene.has_labels:
-        guess = body.label_source == "guess"
-        return (
-            body,
-            "parts by the body's joints" if guess else "parts are the body's own",
-        )
-    fitted = bool(scene.betas) and scene.body == "free"  # to a person in other clothes
+        if body.label_source == "guess":
+            return body, "parts by the body's joints"
+        return body, "parts are the body's own"
+
+    # The images' labels are the body's own, unless the person wears other clothes.
+    fitted = bool(scene.betas) and scene.body == "free"
     if not fitted and body.shares_labels(scene.label_names):
         if scene.n_labels > len(body.label_names):
             raise DataError(
@@ -63,18 +66,21 @@ def labelled_body(
                 f"{', '.join(body.label_names)}; map them to these ids, or choose model=wo_seg"
             )
         return body, "the labels are the body's own, so there is no class vote"
+
+    # A trained avatar keeps the labels that its training voted.
     numbered = ("background", *(f"part {i}" for i in range(1, scene.n_labels)))
     names = scene.label_names or numbered
     if vertex_labels is not None:
-        if len(vertex_labels) != len(body.vertices) or int(vertex_labels.max()) >= len(
-            names
-        ):
+        fits = len(vertex_labels) == len(body.vertices)
+        if not fits or int(vertex_labels.max()) >= len(names):
             raise DataError(
                 f"the checkpoint's labels of {len(vertex_labels)} vertices do not fit this "
                 f"{scene.body} body or its data; give the model file and the data of the training"
             )
         return body.voted(vertex_labels, names), "parts voted when training began"
-    if images is None or len(images) == 0:
+
+    # A new avatar votes over its training images.
+    if not images:
         raise DataError(
             f"labels: the images' parts are {', '.join(names)}, the {scene.body} body has others, "
             "and there is no training image with labels to vote on them; choose model=wo_seg"
@@ -110,6 +116,7 @@ def class_vote(body: SkinnedBody, images: Subset[Frame], n_labels: int) -> Votes
 
     Source: paper Sec. 3.4, which gives each vertex one class but not how.
     """
+    # Votes over images at even distances.
     chosen = evenly_spaced(len(images), VOTE_FRAMES)
     reach = neighbour_distance(body.vertices.float(), NEIGHBOUR)
     votes = torch.zeros(len(body.vertices), n_labels, dtype=torch.int64)
@@ -120,8 +127,10 @@ def class_vote(body: SkinnedBody, images: Subset[Frame], n_labels: int) -> Votes
             f"labels: in none of {len(chosen)} images is the posed body on a labelled pixel; "
             "check that labels, cameras and body poses belong together, or choose model=wo_seg"
         )
+
+    # Vertices without a majority take the nearest one's label. With ties alone, the
+    # first of the tied labels counts.
     labels, decided = _majority(votes)
-    # ties alone: the first label
     decided = decided if decided.any() else votes.any(dim=1)
     labels = _from_the_nearest(body.vertices.float(), labels, decided)
     return Votes(labels, float(decided.double().mean()), len(chosen))
@@ -131,10 +140,14 @@ def _count(votes: Tensor, body: SkinnedBody, reach: Tensor, frame: Frame) -> Non
     """Adds one image's votes to ``[V, n_labels]``."""
     if frame.labels is None or frame.body is None:
         return
+
+    # The pixel of each vertex, and whether the vertex is hidden.
     posed = body.posed_vertices(frame.body)[0]
     shown = seen(posed, reach, frame.camera, DEPTH_TOLERANCE)
     pixel, _ = frame.camera.project(posed[None])
     column, row = pixel[0].floor().long().unbind(-1)
+
+    # Labels at the pixels within the image.
     h, w = frame.labels.shape[-2:]
     inside = shown & (column >= 0) & (column < w) & (row >= 0) & (row < h)
     vertex = inside.nonzero().squeeze(-1)
@@ -146,9 +159,8 @@ def _count(votes: Tensor, body: SkinnedBody, reach: Tensor, frame: Frame) -> Non
 def seen(points: Tensor, reach: Tensor, camera: Camera, tolerance: float) -> Tensor:
     """``[V]`` bool: points not hidden behind others, each a disc that faces the camera.
 
-    Convention: the depth map's cells are a fraction of the discs, so the result does not depend on
-    the image size. Points at or behind the camera, or well outside the image, are neither seen nor
-    occluders.
+    The depth map's cells are a fraction of the discs, so the result does not depend on the image
+    size. Points at or behind the camera, or well outside the image, are neither seen nor occluders.
 
     Args:
         points: ``[V, 3]`` metres, world.
@@ -156,22 +168,30 @@ def seen(points: Tensor, reach: Tensor, camera: Camera, tolerance: float) -> Ten
         camera: one camera.
         tolerance: metres behind the nearest disc that still count as seen.
     """
-    pixel, depth = (x[0] for x in camera.project(points[None]))
+    # The discs in the image: centres and radii in pixels.
+    pixels, depths = camera.project(points[None])
+    pixel = pixels[0]
+    depth = depths[0]
     radius = reach * camera.K[0, :2, :2].diagonal().mean() / depth
     ahead = (depth > tolerance) & pixel.isfinite().all(-1)
     visible = torch.zeros_like(ahead)
-    if not bool(ahead.any()):
+    if not ahead.any():
         return visible
+
+    # Points well outside the image are left out: the largest disc cannot reach it.
     cell = radius[ahead].median() / CELLS
     size = pixel.new_tensor([camera.size[1], camera.size[0]])
-    ahead &= (
-        (pixel >= -MAX_RADIUS_CELLS * cell) & (pixel <= size + MAX_RADIUS_CELLS * cell)
-    ).all(-1)
-    if not bool(ahead.any()):
+    border = MAX_RADIUS_CELLS * cell
+    ahead &= ((pixel >= -border) & (pixel <= size + border)).all(-1)
+    if not ahead.any():
         return visible
     radius = radius[ahead]
+
+    # Cells are enlarged if the map would have too many of them.
     extent = pixel[ahead].amax(0) - pixel[ahead].amin(0)
     cell = torch.maximum(cell, extent.max() / MOST_CELLS).clamp_min(1e-6)
+
+    # A point is seen if it is not much deeper than the nearest disc over its cell.
     at = (pixel[ahead] / cell).floor().long()
     at = at - at.amin(0) + MAX_RADIUS_CELLS
     nearest = _depth_map(at, depth[ahead], (radius / cell).clamp_max(MAX_RADIUS_CELLS))
@@ -185,10 +205,13 @@ def _depth_map(at: Tensor, depth: Tensor, radius: Tensor) -> Tensor:
     Centres ``at [V, 2]`` (column, row) and radii ``[V]`` are in cells; the former are at least
     `MAX_RADIUS_CELLS`, the latter at most.
     """
+    # The border takes the largest disc at any edge.
     width, height = (at.amax(0) + 1 + MAX_RADIUS_CELLS).tolist()
     flat = torch.full(
         (height * width,), torch.inf, dtype=depth.dtype, device=depth.device
     )
+
+    # All discs at once, one offset from their centres after the other.
     widest = int(radius.max())
     for dy in range(-widest, widest + 1):
         for dx in range(-widest, widest + 1):
@@ -199,7 +222,8 @@ def _depth_map(at: Tensor, depth: Tensor, radius: Tensor) -> Tensor:
 
 
 def _majority(votes: Tensor) -> tuple[Tensor, Tensor]:
-    """The winner of each row ``[V]``, and where there is exactly one ``[V]``."""
+    """The winner of each row ``[V]``, and whether there is exactly one ``[V]``."""
+    # Vertices without votes have a maximum of zero, which all labels share.
     most = votes.amax(dim=1)
     winners = votes == most[:, None]
     return winners.int().argmax(dim=1), (most > 0) & (winners.sum(dim=1) == 1)
@@ -207,6 +231,7 @@ def _majority(votes: Tensor) -> tuple[Tensor, Tensor]:
 
 def _from_the_nearest(vertices: Tensor, labels: Tensor, decided: Tensor) -> Tensor:
     """Labels ``[V]``, those not decided taken from the nearest decided vertex."""
+    # In groups of rows, since all distances at once would take too much memory.
     labels = labels.clone()
     known = decided.nonzero().squeeze(-1)
     for rows in (~decided).nonzero().squeeze(-1).split(ROWS):

@@ -73,54 +73,70 @@ class Drive:
 
     def rows(self, chosen: NDArray[np.int64]) -> Drive:
         """The frames at some indices, numbered from 0 if an index repeats."""
-        own = len(set(chosen.tolist())) == len(chosen)
+        # Files are named by number, so numbers must not repeat.
+        numbers = [self.numbers[i] for i in chosen]
+        if len(set(numbers)) < len(numbers):
+            numbers = list(range(len(numbers)))
+
         at = torch.from_numpy(chosen)
+        body = None if self.body is None else self.body[at]
         camera = self.camera
-        index = chosen.tolist()
+        if camera is not None:
+            camera = (camera[0][at], camera[1][at])
         return replace(
             self,
             p=self.p[chosen],
             visibility=self.visibility[chosen],
-            body=None if self.body is None else self.body[at],
-            numbers=[self.numbers[i] for i in index]
-            if own
-            else list(range(len(index))),
-            camera=None if camera is None else (camera[0][at], camera[1][at]),
+            body=body,
+            numbers=numbers,
+            camera=camera,
         )
 
 
 def drive_of(config: DictConfig, run: Run, fps: float) -> Drive:
     """The whole motion of a config at ``fps`` frames per second.
 
-    Convention: options of `gsgan.render` that the config lacks take their defaults.
+    Options of `gsgan.render` that the config lacks take their defaults.
 
     Raises:
         ConfigError: when an option has an invalid value.
         DataError: when the motion cannot be read.
     """
+    # Other commands have some of the options of `gsgan.render`, and some of their own.
     defaults = defaults_of("render")
     given = {key: value for key, value in config.items() if key in defaults}
     config = cast(DictConfig, OmegaConf.merge(defaults, given))
+
+    # With drive=skeleton the body follows from the joints, as for a motion without one.
     one_of("drive", config.drive, (None, "skeleton"))
     found = _chosen(config, run, fps)
     return found if config.drive is None else replace(found, body=None)
 
 
+def with_motion(config: DictConfig, motion: str) -> DictConfig:
+    """A copy of a config with another motion."""
+    return cast(DictConfig, OmegaConf.merge(config, {"motion": motion}))
+
+
 def _chosen(config: DictConfig, run: Run, fps: float) -> Drive:
     """The motion of a config: files, a split, the rest pose, or one held-out frame."""
+    # Without a motion: one held-out frame, held still.
     if config.motion is None:
         split, _ = run.data.watched
         found = _held_out(config, run, split)
         frame = found.numbers[0]
         still = found.rows(np.zeros(1, np.int64))
         return replace(still, text=f"frame {frame} of {split}, held still", camera=None)
+
+    # Several files: one after the other, with transitions.
     if OmegaConf.is_list(config.motion):
         if config.retarget is False:
             raise ConfigError("retarget=false is not supported for a list of motions")
         clips = [_from_file(config, run, str(path), fps) for path in config.motion]
-        return _joined(
-            clips, run.proportions, float(above("transition", config.transition)), fps
-        )
+        seconds = float(above("transition", config.transition))
+        return _joined(clips, run.proportions, seconds, fps)
+
+    # A name, or else a file.
     if config.motion == REST:
         return rest_pose(run.proportions)
     if config.motion in SPLITS:
@@ -135,28 +151,41 @@ def _held_out(config: DictConfig, run: Run, split: str) -> Drive:
         raise DataError(
             f"motion={split}: the run has no such frames ({run.data.reasons[split]})"
         )
-    names = list(dict.fromkeys(camera for camera, _ in dataset.items))
-    # "7" is parsed as a number
-    camera = names[0] if config.camera is None else str(config.camera)
-    own = camera in names
-    items = [item for item in dataset.items if item[0] == (camera if own else names[0])]
+
+    # The frames of the chosen camera. Another view of the motion (an orbit, a file) takes
+    # the frames of the first camera. YAML reads a name like "7" as a number.
+    first = dataset.items[0][0]
+    camera = first if config.camera is None else str(config.camera)
+    own = camera in dict(dataset.items)
+    shown = camera if own else first
+    items = [item for item in dataset.items if item[0] == shown]
     frames = [frame for _, frame in items]
+
+    # Body poses of the data, as tensors.
     layout = dataset.layout
-    poses = dataset.layout.poses
+    poses = layout.poses
     body = None
     if poses is not None and run.avatar.needs_body:
-        stacked = (
-            np.stack([part[f] for f in frames]) for part in (poses.theta, poses.transl)
+        theta = np.stack([poses.theta[frame] for frame in frames])
+        transl = np.stack([poses.transl[frame] for frame in frames])
+        body = BodyPose(
+            theta=torch.from_numpy(theta).float(),
+            transl=torch.from_numpy(transl).float(),
         )
-        body = BodyPose(*(torch.from_numpy(x).float() for x in stacked))
-    index = torch.tensor([layout.camera_names.index(items[0][0])] * len(items))
-    seen = (cat([dataset.camera(item) for item in items]), index) if own else None
+
+    # The camera of each frame, with its index for the colour correction.
+    text = f"{split}: {len(frames)} frames"
+    seen = None
+    if own:
+        text += f" of camera {camera}"
+        index = torch.tensor([layout.camera_names.index(shown)] * len(items))
+        seen = cat([dataset.camera(item) for item in items]), index
     return Drive(
-        p=np.stack([dataset.skeletons.p[f] for f in frames]),
-        visibility=np.stack([dataset.skeletons.visibility[f] for f in frames]),
+        p=np.stack([dataset.skeletons.p[frame] for frame in frames]),
+        visibility=np.stack([dataset.skeletons.visibility[frame] for frame in frames]),
         body=body,
         numbers=frames,
-        text=f"{split}: {len(frames)} frames" + f" of camera {camera}" * own,
+        text=text,
         camera=seen,
     )
 
@@ -167,33 +196,40 @@ def _joined(
     """Clips one after the other, with transitions of ``seconds``."""
     if not clips:
         raise ConfigError("motion=[] names no file; expected motion=[a.pose,b.pose]")
+
+    # Joints that a clip lacks (hands, a face) are unknown in its frames. Transitions are
+    # made in standard axes.
     standard = upright(proportions.up)
-    between = max(1, round(seconds * fps) - 1)
     joints = max(clip.p.shape[1] for clip in clips)
     parts = []
-    for clip in clips:  # some may lack hands or a face
+    for clip in clips:
         lacking = (0, joints - clip.p.shape[1])
-        parts.append(
-            np.pad(clip.p, ((0, 0), lacking, (0, 0)), constant_values=np.nan)
-            @ standard.T
-        )
+        padded = np.pad(clip.p, ((0, 0), lacking, (0, 0)), constant_values=np.nan)
+        parts.append(padded @ standard.T)
+    between = max(1, round(seconds * fps) - 1)
     p = joined(parts, proportions, between) @ standard
-    text = (
-        "; ".join(clip.text for clip in clips)
-        + f"; {seconds:g} s from each to the next"
+
+    names = "; ".join(clip.text for clip in clips)
+    return Drive(
+        p=p,
+        visibility=_shown(p, proportions),
+        body=None,
+        numbers=list(range(len(p))),
+        text=f"{names}; {seconds:g} s from each to the next",
     )
-    return Drive(p, _shown(p, proportions), None, list(range(len(p))), text)
 
 
 def _shown(p: Float, proportions: Proportions) -> Float:
-    """``[F, J]`` visibility of retargeted joints: the body's as in training, 1 for others that are
+    """Visibility ``[F, J]`` of retargeted joints: the body's as in training, 1 for others that are
     known."""
+    # The body's landmarks are as visible as they were in training.
     visibility = np.asarray(np.isfinite(p).all(-1), np.float64)
     visibility[:, : len(proportions.seen)] = proportions.seen
     return visibility
 
 
 def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
+    # The clip, as the file has it.
     proportions = run.proportions
     smpl = config.smpl or run.body_file
     skeleton = config.skeleton
@@ -204,17 +240,23 @@ def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
     motion = read_motion(Path(path).expanduser(), source)
     motion = checked(motion, float(config.min_visibility))
     _refuse_swapped(motion)
+
+    # The user's rate comes before the file's, but the file's up axis before the user's.
     rate = config.motion_fps or motion.fps
     rate = float(above("motion_fps", rate)) if rate else FPS
     up = (None if motion.file_up else up) or motion.up or up_axis(motion)
+
+    # Bones that are the subject's own already are left as they are. A list of motions is
+    # always retargeted, because transitions need every joint.
     choice = one_of("retarget", config.retarget, ("auto", True, False))
     own = is_own(motion, proportions) if choice == "auto" else not choice
     if choice is False and motion.detached:
         raise ConfigError(
             f"retarget=false is not supported for {motion.path}: leave retarget out"
         )
-    # a list of motions is retargeted, because transitions need every joint
     own = own and not motion.detached and not OmegaConf.is_list(config.motion)
+
+    # Joints are interpolated in time; visibility and body pose are of the nearest frame.
     times = frame_times(len(motion), rate, fps)
     nearest = np.rint(times).astype(int)
     visibility = motion.visibility[nearest]
@@ -224,6 +266,8 @@ def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
         if motion.body is not None and run.avatar.needs_body:
             body = motion.body[torch.from_numpy(nearest)]
     else:
+        # In standard axes: expressions on the subject's face, directions on the subject's
+        # bones, and the place in the scene.
         standard = upright(proportions.up)
         centre = standard @ np.array(run.scene.centre)
         p = completed(motion, up)
@@ -231,36 +275,54 @@ def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
             p = p if motion.detached else face_in_head(p)
             p[:, EXPRESSION] = expressed(p[:, EXPRESSION], run.face)
         p = retargeted(resampled(p, rate, fps), proportions)
-        p = (
-            placed(p, proportions, centre, fps, ground=config.ground, stay=config.stay)
-            @ standard
+        p = placed(
+            p,
+            proportions,
+            centre,
+            fps,
+            ground=config.ground,
+            stay=config.stay,
         )
+        p = p @ standard
         visibility = _shown(p, proportions)
-    filled = (
-        f", {_frames(motion.filled)} without shoulders or hips filled"
-        if motion.filled
-        else ""
-    )
-    seen = [np.isfinite(p[:, hand]).all((1, 2)).sum() for hand in HAND_JOINTS.values()]
-    hands = (
-        f", left hand in {seen[0]} frames, right hand in {seen[1]}"
-        if p.shape[1] > BODY
-        else ""
-    )
-    if p.shape[1] > EXPRESSION.start:
-        hands += f", face in {np.isfinite(p[:, EXPRESSION]).any((1, 2)).sum()}"
+
+    # One line on what was read and what was made of it.
+    bones = "bones as they are" if own else "on the subject's bones"
     assumed = "" if config.motion_fps or motion.fps else " (assumed: give motion_fps)"
     text = (
         f"{motion.path.name}: {_frames(len(motion))} at {rate:.5g} per second{assumed}, "
         f"{motion.unit}, {(motion.file_up or up).upper()} up -> {_frames(len(p))} at {fps:g}, "
-        + ("bones as they are" if own else "on the subject's bones")
-        + hands
-        + filled
+        f"{bones}{_hands_and_face(p)}"
     )
-    return Drive(p, visibility, body, list(range(len(p))), text)
+    if motion.filled:
+        text += f", {_frames(motion.filled)} without shoulders or hips filled"
+    return Drive(
+        p=p,
+        visibility=visibility,
+        body=body,
+        numbers=list(range(len(p))),
+        text=text,
+    )
+
+
+def _hands_and_face(p: Float) -> str:
+    """The numbers of frames that have hands and a face, as a clause."""
+    if p.shape[1] <= BODY:
+        return ""
+    left, right = HAND_JOINTS.values()
+    known = np.isfinite(p)
+    text = (
+        f", left hand in {known[:, left].all((1, 2)).sum()} frames, "
+        f"right hand in {known[:, right].all((1, 2)).sum()}"
+    )
+    if p.shape[1] > EXPRESSION.start:
+        text += f", face in {known[:, EXPRESSION].any((1, 2)).sum()}"
+    return text
 
 
 def _refuse_swapped(clip: Clip) -> None:
+    # The check needs the landmarks of the body, without gaps; hands and face say nothing
+    # about left and right.
     p = torch.from_numpy(clip.p[:, :BODY])
     visibility = torch.from_numpy(clip.visibility[:, :BODY])
     try:
@@ -275,14 +337,15 @@ def _frames(count: int) -> str:
 
 def rest_pose(proportions: Proportions) -> Drive:
     """The subject standing in a T-pose at the world's origin, feet at height 0."""
-    standing = proportions.rest - [
-        0,
-        0,
-        proportions.rest[list(HEELS_AND_TOES), 2].min(),
-    ]
-    p = (standing @ upright(proportions.up))[None]
+    # In standard axes z is the height; heels and toes are the lowest landmarks.
+    lowest = proportions.rest[list(HEELS_AND_TOES), 2].min()
+    standing = proportions.rest - [0, 0, lowest]
     return Drive(
-        p, np.array(proportions.seen, np.float64)[None], None, [0], "the rest pose"
+        p=(standing @ upright(proportions.up))[None],
+        visibility=np.array(proportions.seen, np.float64)[None],
+        body=None,
+        numbers=[0],
+        text="the rest pose",
     )
 
 
@@ -293,6 +356,7 @@ def joints_of(avatar: Avatar, drive: Drive, i: int) -> tuple[Tensor, Tensor]:
     Raises:
         ValueError: when fewer than three of shoulders and hips are known.
     """
+    # Unknown joints are filled in: the networks need finite values.
     p = torch.from_numpy(drive.p[i : i + 1])
     seen = torch.from_numpy(drive.visibility[i : i + 1])
     return complete_skeleton(p, seen, avatar.template, avatar.limb_length_sum)
@@ -301,12 +365,13 @@ def joints_of(avatar: Avatar, drive: Drive, i: int) -> tuple[Tensor, Tensor]:
 def inputs_of(
     avatar: Avatar, drive: Drive, i: int
 ) -> tuple[Tensor, Tensor, BodyPose | None]:
-    """`joints_of`, and the body pose where the avatar needs one: the drive's, else solved.
+    """`joints_of`, and the body pose if the avatar needs one: the drive's, else solved.
 
     Raises:
         ValueError: as `joints_of`.
     """
     p, visibility = joints_of(avatar, drive, i)
+    # The body pose of the drive, or the one that fits the joints.
     if drive.body is not None and avatar.needs_body:
         return p, visibility, drive.body[i : i + 1].to(p)
     return p, visibility, avatar.body_pose(p, visibility)
@@ -315,10 +380,11 @@ def inputs_of(
 def distilled_of(config: DictConfig, run: Run) -> Avatar:
     """A run's avatar with Ψ's residuals as linear functions, fitted over training poses: see
     `gsgan.model.harmonic.distilled`."""
+    # An avatar that was trained with linear residuals needs no fit.
     if isinstance(run.avatar.deformation, Harmonic):
         return run.avatar
-    drive = drive_of(
-        cast(DictConfig, OmegaConf.merge(config, {"motion": "train"})), run, 1.0
-    )
+
+    # The fit takes poses at even distances, from the first to the last.
+    drive = drive_of(with_motion(config, "train"), run, 1.0)
     chosen = evenly_spaced(len(drive.p), DISTILLED, ends=True)
     return distilled(run.avatar, (inputs_of(run.avatar, drive, i) for i in chosen))

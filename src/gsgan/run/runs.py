@@ -54,6 +54,7 @@ def load(
         GsganError: when the folder holds no run or no checkpoint, its checkpoint is damaged, or the
             model file is missing.
     """
+    # The config says how the avatar is built, and the checkpoint has its weights.
     folder = Path(run).expanduser()
     config = read_config(folder)
     checkpoint = read_checkpoint(folder / CHECKPOINT)
@@ -70,6 +71,7 @@ def load_avatar(
         config: of the run.
         data: its dataset, from which the body model file and the order of the cameras are taken.
     """
+    # Facts that depend on where the data is now replace the stored ones.
     checkpoint = read_checkpoint(folder / CHECKPOINT)
     info = data.info
     scene = replace(
@@ -77,9 +79,8 @@ def load_avatar(
         body_file=info.body_file,
         camera_names=info.camera_names,
     )
-    return _trained(folder, config, checkpoint, scene), list(
-        checkpoint["gsgan"]["marks"]
-    )
+    marks = list(checkpoint["gsgan"]["marks"])
+    return _trained(folder, config, checkpoint, scene), marks
 
 
 def avatar_of(
@@ -96,6 +97,7 @@ def avatar_of(
         checkpoint: its weights, and what it stores of the scene.
         smpl: as for `load`.
     """
+    # The body model file may lie elsewhere than when the avatar was trained.
     scene = stored_scene(checkpoint["gsgan"]["scene"])
     file = absolute_path(folder, scene.body_file) if smpl is None else str(smpl)
     return _trained(folder, config, checkpoint, replace(scene, body_file=file))
@@ -104,6 +106,7 @@ def avatar_of(
 def _trained(
     folder: Path, config: DictConfig, checkpoint: dict[str, Any], scene: SceneInfo
 ) -> Avatar:
+    # The avatar's weights: the averaged ones, once averaging has begun.
     stored = checkpoint["gsgan"]
     prefix = "average.copy.module." if stored.get("averaged") else "avatar."
     state = {
@@ -111,6 +114,8 @@ def _trained(
         for key, value in checkpoint["state_dict"].items()
         if key.startswith(prefix)
     }
+
+    # The avatar is built as when training began, with the labels that were voted then.
     labels = state.get("segmentation.vertex_labels")
     effects = Effects.from_plain(stored["effects"])
     try:
@@ -120,11 +125,15 @@ def _trained(
         raise DataError(
             f"{folder / CONFIG}: no avatar can be built from it: {reason}"
         ) from error
+
+    # S is missing if its body cannot be opened; the weights would not fit.
     if "segmentation.quats" in state and avatar.segmentation is None:
         raise DataError(
             f"{folder}: trained with S, which cannot be built now: {avatar.segmentation_why}; set "
             f"data.smpl in {folder / CONFIG} to the model file"
         )
+
+    # The weights do not fit if the config was changed after the training.
     try:
         avatar.load_state_dict(state)
     except RuntimeError as error:
@@ -164,14 +173,20 @@ class Run:
             raise ConfigError(
                 "run is not set: give run=<the folder that gsgan.train printed>"
             )
+
+        # The dataset itself is opened later, and only by commands that need it.
         folder = Path(config.run).expanduser()
         paths = DataPaths.from_config(config)
         stored = read_config(folder)
         checkpoint = read_checkpoint(folder / CHECKPOINT)
-        avatar = avatar_of(folder, stored, checkpoint, paths.smpl).to(
-            pick_device(config.device)
+        avatar = avatar_of(folder, stored, checkpoint, paths.smpl)
+        return cls(
+            folder=folder,
+            stored=stored,
+            checkpoint=checkpoint["gsgan"],
+            avatar=avatar.to(pick_device(config.device)),
+            paths=paths,
         )
-        return cls(folder, stored, checkpoint["gsgan"], avatar, paths)
 
     @cached_property
     def data(self) -> GsganData:
@@ -186,6 +201,7 @@ class Run:
     @property
     def body(self) -> MarkedBody | None:
         """The skinned body that the avatar moves with, in the subject's shape, or None."""
+        # Avatars on the skeleton alone have none.
         if not self.avatar.needs_body:
             return None
         return open_body(self.scene.body, self.body_file, self.scene.betas)
@@ -205,6 +221,7 @@ class Run:
     def face(self) -> Float:
         """``[30, 3]`` metres: the subject's face at rest, see `gsgan.skeleton.in_head`; the
         template's for avatars without a face."""
+        # Without a face of its own the avatar gets the template's.
         template = self.avatar.template
         template = template if template.expression else HOLISTIC
         return constants(template, torch.device("cpu"), torch.float64).face_rest.numpy()

@@ -24,10 +24,12 @@ MOVED = {"gsgan.model.assemble.": "gsgan.run.assemble."}
 CONFIG = Path(".hydra") / "config.yaml"
 # Keys that may differ between a run and its continuation: they do not change what it learns.
 FREE_KEYS = (
+    # The machine, and how long the run goes on.
     "trainer",
     "logger",
     "callbacks",
     "resume",
+    # What is scored and shown at the end.
     "evaluate",
     "grid_rows",
     "score_images",
@@ -35,14 +37,17 @@ FREE_KEYS = (
     "cpu_hours",
     "objective",
     "page",
+    # Where the data is, and how it is loaded.
     "data.root",
     "data.smpl",
     "data.workers",
     "data.cache_mb",
     "data.val_images",
     "data.source.workers",
+    # When a diverged training gives up.
     "training.max_skipped",
     "training.skip_window",
+    # Backends compute the same image.
     "model.backend",
 )
 
@@ -52,7 +57,7 @@ FREE_KEYS = (
 
 @dataclass(frozen=True)
 class DataPaths:
-    """Paths of a run's dataset and body model file; None where they have not moved."""
+    """Paths of a run's dataset and body model file; None if they have not moved."""
 
     root: str | None = None
     smpl: str | None = None
@@ -63,7 +68,7 @@ class DataPaths:
         return cls(config.data_root, config.data_smpl)
 
     def refuse_without_run(self) -> None:
-        """Raises a ConfigError where a path is given without a run."""
+        """Raises a ConfigError if a path is given without a run."""
         if self != DataPaths():
             raise ConfigError("data_root and data_smpl require run=")
 
@@ -74,6 +79,7 @@ def read_config(folder: Path) -> DictConfig:
     Raises:
         DataError: when the folder holds no run, or its config is damaged.
     """
+    # The config lies where Hydra wrote it when the run was started.
     path = folder / CONFIG
     if not path.is_file():
         raise DataError(
@@ -88,6 +94,7 @@ def read_config(folder: Path) -> DictConfig:
 def _read_yaml(path: Path) -> DictConfig:
     try:
         text = path.read_text(encoding="utf-8")
+        # Runs of earlier versions name classes by modules that have moved.
         for before, now in MOVED.items():
             text = text.replace(before, now)
         config = OmegaConf.create(text)
@@ -102,14 +109,18 @@ def load_config(folder: Path, paths: DataPaths | None = None) -> DictConfig:
     """`read_config` with absolute paths of dataset and body model file, which must exist."""
     config = read_config(folder)
     paths = paths or DataPaths()
+
+    # Only a run that read a model file can read another copy of it.
     if paths.smpl is not None and OmegaConf.select(config, "data.smpl") is None:
-        # skeletons from SMPL fits are others: the scores would be of another model
+        # Skeletons would then be those of SMPL fits, and the scores of another model.
         raise ConfigError(f"data_smpl: {folder} was trained without a body model file")
+
+    # Paths of the run, unless the user gives others.
     for key, what in (("root", "dataset"), ("smpl", "body model file")):
         now = getattr(paths, key)
         stored = OmegaConf.select(config, f"data.{key}")
         place = absolute_path(folder, stored) if now is None else now
-        if place is None:
+        if place is None:  # the run reads no such file
             continue
         if not Path(place).expanduser().exists():
             raise DataError(
@@ -123,6 +134,8 @@ def absolute_path(folder: Path, path: str | None) -> str | None:
     """A path of a run's config; a relative one counts from where the run was started."""
     if path is None or Path(path).expanduser().is_absolute():
         return path
+
+    # Hydra has recorded the folder in which the command was started.
     start = OmegaConf.select(hydra_record(folder), "hydra.runtime.cwd")
     return path if start is None else str(Path(start) / path)
 
@@ -145,13 +158,16 @@ def choices(folder: Path) -> dict[str, Any]:
 
 def record(config: DictConfig) -> dict[str, Any]:
     """The config as plain values, without the keys that a continuation may change."""
-    plain: dict[str, Any] = {
-        str(key): OmegaConf.to_container(value, resolve=True)
-        if OmegaConf.is_config(value := config[key])
-        else value
-        for key in config
-        if key not in FREE_KEYS
-    }
+    # Free groups are left out before anything is resolved.
+    plain: dict[str, Any] = {}
+    for key in config:
+        if key not in FREE_KEYS:
+            value = config[key]
+            if OmegaConf.is_config(value):
+                value = OmegaConf.to_container(value, resolve=True)
+            plain[str(key)] = value
+
+    # Single keys of groups are removed by their dotted names.
     for key in FREE_KEYS:
         *groups, last = key.split(".")
         node: Any = plain
@@ -167,6 +183,7 @@ def record(config: DictConfig) -> dict[str, Any]:
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
     """A checkpoint of gsgan, read without unrestricted pickle; a DataError when damaged."""
+    # Tensors and plain values only: a checkpoint from somebody else cannot run code.
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
@@ -177,6 +194,8 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         raise DataError(
             f"{path}: not a readable checkpoint; remove it to start over"
         ) from error
+
+    # Other programs' checkpoints lack these entries.
     if not (
         isinstance(checkpoint, dict) and {"gsgan", "state_dict"} <= checkpoint.keys()
     ):
@@ -188,10 +207,10 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 def stored_scene(plain: Mapping[str, Any]) -> SceneInfo:
     """The facts about a scene that a checkpoint holds as plain values."""
-    values: dict[str, Any] = {
-        key: tuple(value) if isinstance(value, list) else value
-        for key, value in plain.items()
-    }
+    # Checkpoints hold lists for tuples, and dicts for dataclasses.
+    values: dict[str, Any] = {}
+    for key, value in plain.items():
+        values[key] = tuple(value) if isinstance(value, list) else value
     for key, kind in (
         ("surface", SurfaceColours),
         ("proportions", Proportions),
@@ -199,5 +218,7 @@ def stored_scene(plain: Mapping[str, Any]) -> SceneInfo:
     ):
         if values.get(key) is not None:
             values[key] = kind(**values[key])
-    values.pop("scale_test", None)  # stored until 2026-11-26; nothing depends on it now
+
+    # Stored until 2026-11-26; nothing depends on it now.
+    values.pop("scale_test", None)
     return SceneInfo(**values)

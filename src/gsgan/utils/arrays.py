@@ -26,19 +26,26 @@ def expect_array(
     Raises:
         DataError: when it is missing, has another shape, or holds no numbers.
     """
-    expected = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
+    # The shape in words, for every message.
+    lengths = ["any" if length is None else str(length) for length in shape]
+    expected = f"({', '.join(lengths)})"
     if name not in arrays:
         raise DataError(
             f"{path} has no array '{name}'; expected one of shape {expected}"
         )
+
+    # Lengths that are given must agree, and so must their number.
     array = arrays[name]
-    if array.ndim != len(shape) or any(
-        due is not None and due != found
-        for due, found in zip(shape, array.shape, strict=True)
-    ):
+    agrees = array.ndim == len(shape)
+    for due, found in zip(shape, array.shape, strict=False):
+        if due not in (None, found):
+            agrees = False
+    if not agrees:
         raise DataError(
             f"{path}: '{name}' must have shape {expected}, found {array.shape}"
         )
+
+    # Signed and unsigned integers, and floats.
     if array.dtype.kind not in "iuf":
         raise DataError(f"{path}: '{name}' must hold numbers, found {array.dtype}")
     return array
@@ -46,6 +53,7 @@ def expect_array(
 
 def as_floats(raw: Any) -> Float:
     """A float64 copy of lists or arrays; empty when they are ragged or hold no numbers."""
+    # Nested lists of unequal lengths are a ValueError, other objects a TypeError.
     try:
         return np.array(raw, np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -54,6 +62,7 @@ def as_floats(raw: Any) -> Float:
 
 def nanmedian(values: Float, axis: int = 0) -> Float:
     """The median along an axis, NaN where nothing is known, without numpy's warning."""
+    # numpy warns about every slice that has no known value.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         return np.asarray(np.nanmedian(values, axis=axis))
@@ -62,7 +71,9 @@ def nanmedian(values: Float, axis: int = 0) -> Float:
 def evenly_spaced(count: int, most: int, *, ends: bool = False) -> list[int]:
     """At most ``most`` of ``count`` positions, rising: the middles of equal parts, or with ``ends``
     from the first to the last."""
-    if ends:
-        return sorted({round(x) for x in np.linspace(0, count - 1, min(count, most))})
     most = min(most, count)
+    if ends:
+        return np.linspace(0, count - 1, most).round().astype(int).tolist()
+
+    # The middle of part i is at (i + 1/2) count / most, rounded down.
     return [(2 * i + 1) * count // (2 * most) for i in range(most)]

@@ -30,8 +30,11 @@ def declare_torchvision_operators() -> None:
         for schema in _SCHEMAS:
             library.define(schema)
         _LIBRARIES.append(library)
-        for name in [n for n in sys.modules if n.partition(".")[0] == "torchvision"]:
-            del sys.modules[name]  # half imported
+
+        # Modules that are half imported must be imported anew.
+        for name in list(sys.modules):
+            if name.partition(".")[0] == "torchvision":
+                del sys.modules[name]
 
 
 declare_torchvision_operators()

@@ -27,7 +27,7 @@ from gsgan.utils.sweeps import note, run_job
 FAILED = 1
 CONFIG_ENTRY_POINTS = "gsgan.conf"  # group of entry points of installed packages
 BFLOAT16_SINCE = (8, 0)  # compute capability: before it bfloat16 is emulated or refused
-# bytes of a sweep's folder; file systems take 255, files beside it need some
+# Bytes of the name of a sweep's folder: file systems take 255, and files beside it need some.
 LONGEST_NAME = 200
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 ASSIGNED = re.compile(r"\+{0,2}[A-Za-z_][\w./@]*")  # the key of an override
@@ -40,6 +40,7 @@ def config_folder() -> Path:
     Raises:
         GsganError: when neither exists.
     """
+    # An installed package has the folder inside, a checkout has it beside src/.
     package = Path(__file__).resolve().parents[1]
     for folder in (package / "conf", package.parents[1] / "conf"):
         if (folder / "train.yaml").is_file():
@@ -80,10 +81,13 @@ def folder_name(overrides: str) -> str:
 
     A name that had to be changed ends in a digest of the overrides, so no two runs share a folder.
     """
+    # Other characters need quotes in a shell.
     overrides = overrides or "defaults"
     name = re.sub(r"[^A-Za-z0-9_.+-]", "_", overrides)
     if name == overrides and len(name) <= LONGEST_NAME:
         return name
+
+    # A changed name may be that of other overrides too, so a digest follows.
     end = "_" + hashlib.sha256(overrides.encode()).hexdigest()[:12]
     return name[: LONGEST_NAME - len(end)] + end
 
@@ -110,6 +114,7 @@ def by_name(name: str, choices: Mapping[str, str], default: str) -> str:
     return choices.get(name, default)
 
 
+# Functions that files in conf/ call, as in ${by_name:…}.
 OmegaConf.register_new_resolver("by_name", by_name, replace=True)
 OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)
 OmegaConf.register_new_resolver("gpu_precision", gpu_precision, replace=True)
@@ -128,8 +133,11 @@ def entry(name: str, task: Callable[[DictConfig], object] | str) -> Callable[[],
 
     def run(config: DictConfig) -> float | None:
         try:
+            # A sweep starts its jobs as processes.
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 return run_job(name, config.get("objective"))
+
+            # Imports that take long begin here, so that --help is fast.
             import gsgan.utils.compat  # noqa: F401  (before lightning and torchmetrics)
             from gsgan.utils.tensors import keep_freed_memory
 
@@ -139,6 +147,7 @@ def entry(name: str, task: Callable[[DictConfig], object] | str) -> Callable[[],
             _print_error("interrupted")
             sys.exit(130)
         except Exception as error:
+            # A bug keeps its traceback; the user's errors are one sentence.
             message = one_sentence(error)
             if message is None:
                 raise
@@ -151,13 +160,14 @@ def entry(name: str, task: Callable[[DictConfig], object] | str) -> Callable[[],
     def main() -> None:
         import hydra  # here: importing an entry point stays fast
 
-        sys.argv[1:] = [
-            quoted(spelled_out(argument, name)) for argument in sys.argv[1:]
-        ]
+        # Arguments in forms that Hydra's grammar lacks.
+        arguments = [spelled_out(argument, name) for argument in sys.argv[1:]]
+        sys.argv[1:] = map(quoted, arguments)
         command = hydra.main(
             version_base="1.3", config_path=str(config_folder()), config_name=name
         )(run)
-        # else Hydra prints the traceback of a file of its own that it cannot write, and exits
+
+        # Errors come through to here, also those of files that Hydra itself writes.
         os.environ.setdefault("HYDRA_FULL_ERROR", "1")
         try:
             command()
@@ -193,11 +203,14 @@ def quoted(argument: str) -> str:
     shell does not expand there."""
     from hydra.core.override_parser.overrides_parser import OverridesParser
 
+    # Options such as --help are no assignments.
     key, sign, value = argument.partition("=")
     if not sign or not ASSIGNED.fullmatch(key):
         return argument
     if value.startswith("~/"):
         value = str(Path(value).expanduser())
+
+    # The mark is one that the value does not contain, if there is one.
     try:
         OverridesParser.create().parse_override(f"{key}={value}")
     except (HydraException, OmegaConfBaseException):
@@ -210,6 +223,8 @@ def one_sentence(error: BaseException) -> str | None:
     """The message for the user, or None for a bug, which keeps its traceback."""
     if isinstance(error, GsganError):
         return _without_worker(error)
+
+    # The constructor of a class that a config names has failed.
     if isinstance(error, InstantiationException):
         cause = error.__cause__
         if isinstance(cause, GsganError):
@@ -218,6 +233,8 @@ def one_sentence(error: BaseException) -> str | None:
         if isinstance(cause, (ValueError, TypeError)):
             return f"{where}: {cause}"
         return f"{where}: {str(error).splitlines()[0]}"
+
+    # A full disk, a bad override, or a value that gsgan refuses.
     if isinstance(error, OSError) and error.errno in NO_ROOM:
         return (
             f"{error.filename or 'a file'} cannot be written ({error.strerror}): make room, then "
@@ -232,6 +249,7 @@ def one_sentence(error: BaseException) -> str | None:
 
 def _raised_here(error: BaseException) -> bool:
     """Whether a line of gsgan raised the error, about what it was given."""
+    # The last entry of a traceback is the line that raised.
     at = error.__traceback__
     while at is not None and at.tb_next is not None:
         at = at.tb_next

@@ -15,20 +15,20 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-T = TypeVar("T")
+Item = TypeVar("Item")
 LEAST_WIDTH = 100  # columns: tables cut to the 80 of a log file cannot be read
 LOG_SECONDS = 10.0  # between two lines of progress in a log file
 SLOW_SECONDS = 2.0  # work that takes longer is named in a log file
 
 
 def make_console() -> Console:
-    """A console on stdout, at least 100 columns wide where that is a file."""
+    """A console on stdout, at least 100 columns wide if that is a file."""
     console = Console()
-    return (
-        console
-        if console.is_terminal
-        else Console(width=max(LEAST_WIDTH, console.width))
-    )
+
+    # A log file has no width of its own.
+    if console.is_terminal:
+        return console
+    return Console(width=max(LEAST_WIDTH, console.width))
 
 
 class LoggedProgress(Progress):
@@ -53,10 +53,13 @@ class LoggedProgress(Progress):
         self._say(task_id)
 
     def _say(self, task_id: TaskID) -> None:
+        # A terminal shows the bar itself.
         now = time.monotonic()
         if self.console.is_terminal or now - self._said < LOG_SECONDS:
             return
         self._said = now
+
+        # The remaining time is not known at the start.
         task = self._tasks[task_id]
         left = task.time_remaining
         about = "" if left is None else f", about {left:.0f} s left"
@@ -74,6 +77,8 @@ def working(console: Console, what: str) -> Iterator[None]:
         with console.status(what):
             yield
         return
+
+    # A log file gets the line only if the work takes long.
     say = Timer(SLOW_SECONDS, console.print, [f"{what} …"], {"highlight": False})
     say.daemon = True
     say.start()
@@ -95,8 +100,8 @@ def progress(console: Console, disable: bool = False) -> Progress:
 
 
 def track(
-    items: Iterable[T], description: str, console: Console, total: int | None = None
-) -> Iterator[T]:
+    items: Iterable[Item], description: str, console: Console, total: int | None = None
+) -> Iterator[Item]:
     """The items one by one, with their number and the remaining time shown by `progress`."""
     with progress(console) as bars:
         yield from bars.track(items, total=total, description=description)

@@ -15,9 +15,11 @@ from gsgan.utils.errors import DataError
 
 
 def cache_root() -> Path:
-    """Folder for what gsgan can make again: GSGAN_CACHE, by default the user's cache folder."""
+    """The folder for files that gsgan can make again: GSGAN_CACHE, by default the user's cache."""
     if os.environ.get("GSGAN_CACHE"):
         return Path(os.environ["GSGAN_CACHE"]).expanduser()
+
+    # The place that the XDG specification gives.
     base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     return Path(base).expanduser() / "gsgan"
 
@@ -33,6 +35,7 @@ def read_text(path: Path, errors: str = "strict") -> str:
         OSError: if the file cannot be read.
         UnicodeDecodeError: if it is no such text and ``errors`` is ``strict``.
     """
+    # UTF-16 begins with a byte order mark; the one of UTF-8 is dropped.
     content = path.read_bytes()
     wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     return content.decode("utf-16" if wide else "utf-8-sig", errors)
@@ -40,9 +43,12 @@ def read_text(path: Path, errors: str = "strict") -> str:
 
 def write_atomically(path: Path, content: str | bytes) -> None:
     """Writes under a temporary name beside ``path``, then renames."""
+    # The process's id keeps processes apart that write the same file.
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     data = content.encode() if isinstance(content, str) else content
+
+    # The content is on the disk before the file gets its name.
     try:
         with temporary.open("wb") as stream:
             stream.write(data)
@@ -71,7 +77,8 @@ def writing(path: Path) -> Iterator[None]:
 def locked(lock: Path) -> Iterator[None]:
     """Holds a lock that the system releases when the process dies."""
     with lock.open("w") as file:
-        # not on Windows and some network file systems: two processes then write the same files
+        # There are no locks on Windows and some network file systems: two processes may
+        # then write the same files.
         with contextlib.suppress(ImportError, OSError):
             import fcntl
 
@@ -81,6 +88,7 @@ def locked(lock: Path) -> Iterator[None]:
 
 def write_npz(path: Path, **arrays: Any) -> None:
     """Writes an npz completely or not at all."""
+    # Packed in memory first, since the file is written in one go.
     stream = io.BytesIO()
     np.savez_compressed(stream, **arrays)
     with writing(path):
@@ -98,4 +106,5 @@ def _plain(value: Any) -> Any:
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [_plain(item) for item in value]
+    # JSON has no NaN and no infinity.
     return None if isinstance(value, float) and not np.isfinite(value) else value

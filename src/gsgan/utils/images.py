@@ -13,7 +13,7 @@ from gsgan.utils.arrays import Bytes
 from gsgan.utils.errors import ConfigError
 
 BAR = 18  # pixels of the caption above a tile
-JPEG_QUALITY = 88  # of the JPEG
+PAGE_JPEG_QUALITY = 88  # of images within pages, 1 to 100
 
 Background = Tensor | None
 
@@ -34,6 +34,8 @@ def background(name: str, video: bool) -> Callable[[tuple[int, int]], Background
                 "background=alpha needs PNG files: H.264 has no alpha; give a folder"
             )
         return lambda size: None
+
+    # An image is cropped and scaled to the size of each frame.
     path = Path(name).expanduser()
     if path.is_file():
         try:
@@ -44,6 +46,8 @@ def background(name: str, video: bool) -> Callable[[tuple[int, int]], Background
                 f"background={name} cannot be read as an image ({error})"
             ) from None
         return lambda size: _unit(np.asarray(ImageOps.fit(image, size[::-1])))
+
+    # A colour in any notation of PIL.
     try:
         colour = torch.tensor(ImageColor.getrgb(name)[:3]).float() / 255
     except ValueError:
@@ -63,8 +67,10 @@ def eight_bits(image: Tensor, alpha: Tensor, behind: Background) -> Bytes:
     background, with straight alpha: ``[H, W, 4]``."""
     image = image.clamp(0, 1)
     alpha = alpha.clamp(0, 1)
+
+    # PNG files have straight alpha: colours are divided by it. Where 8-bit alpha is 0,
+    # the quotient would be noise.
     if behind is None:
-        # elsewhere 8-bit alpha is 0, and colours would be noise
         shown = alpha >= 0.5 / 255
         straight = torch.where(shown, image / alpha.clamp_min(1e-6), 0.0).clamp(0, 1)
         image = torch.cat([straight, alpha])
@@ -75,13 +81,13 @@ def eight_bits(image: Tensor, alpha: Tensor, behind: Background) -> Bytes:
 
 def to_bytes(image: Tensor) -> Bytes:
     """``[H, W, C]`` of an image ``[C, H, W]``, clamped to [0, 1] and rounded to 8 bits."""
-    return (
-        (image.detach().cpu().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()
-    )
+    levels = (image.detach().cpu().clamp(0, 1) * 255).round().byte()
+    return levels.permute(1, 2, 0).numpy()
 
 
 def caption(image: Bytes, text: str, colour: tuple[int, int, int]) -> Bytes:
     """The image under a bar of the colour with white text."""
+    # White text at the left, its baseline five pixels above the lower edge.
     bar = np.full((BAR, image.shape[1], 3), colour, np.uint8)
     cv2.putText(
         bar,
@@ -98,6 +104,6 @@ def caption(image: Bytes, text: str, colour: tuple[int, int, int]) -> Bytes:
 
 def encode(image: Bytes) -> bytes:
     """A JPEG of an RGB image."""
-    return cv2.imencode(
-        ".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
-    )[1].tobytes()
+    settings = [cv2.IMWRITE_JPEG_QUALITY, PAGE_JPEG_QUALITY]
+    _, data = cv2.imencode(".jpg", image[..., ::-1], settings)  # OpenCV takes BGR
+    return data.tobytes()

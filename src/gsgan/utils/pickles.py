@@ -22,6 +22,9 @@ from gsgan.utils.errors import DataError
 LARGEST_ARRAY = 2**30  # bytes of one array, unpacked
 
 
+# -- stand-ins for the classes that files name
+
+
 class _Refused(pickle.UnpicklingError):
     """The pickle names something that is not in `ALLOWED`."""
 
@@ -39,6 +42,7 @@ class _DType:
         _expect(self.value.kind in "biufcSUO", f"it holds arrays of type {name!r}")
 
     def __setstate__(self, state: Any) -> None:
+        # The second entry of numpy's state is the byte order.
         if state[1] in ("<", ">"):
             self.value = self.value.newbyteorder(state[1])
 
@@ -47,6 +51,7 @@ class _Array(np.ndarray):
     """Checks the pickled state first: numpy reads beyond it, or takes bytes for pointers."""
 
     def __setstate__(self, state: Any) -> None:
+        # Objects are in a list, and numbers in bytes.
         shape, dtype, fortran, content = state[-4:]
         objects = dtype.value.hasobject
         content = content if objects else _bytes(content)
@@ -54,6 +59,8 @@ class _Array(np.ndarray):
             isinstance(content, list) or not objects,
             "an array of objects has no list of them",
         )
+
+        # The content must have exactly as many of them as the shape says.
         count = math.prod(shape) * (1 if objects else dtype.value.itemsize)
         _expect(
             min(shape, default=0) >= 0 and len(content) == count,
@@ -66,7 +73,7 @@ class _Array(np.ndarray):
 
 
 def _bytes(content: Any) -> bytes:
-    # str: Python 2
+    # Bytes of Python 2 arrive as text.
     return content.encode("latin1") if isinstance(content, str) else bytes(content)
 
 
@@ -105,6 +112,8 @@ class _Sparse(_Chumpy):
         _expect(
             math.prod(shape) * 8 <= LARGEST_ARRAY, f"a sparse matrix of shape {shape}"
         )
+
+        # Indices beyond the shape are refused before anything is unpacked.
         parts = tuple(_array(self.state[key]) for key in ("data", "indices", "indptr"))
         matrix = scipy.sparse.csc_matrix(parts, shape)
         matrix.check_format(full_check=True)
@@ -115,17 +124,29 @@ def _array(value: Any) -> NDArray[Any]:
     return value.array() if isinstance(value, _Chumpy) else np.asarray(value)
 
 
+# -- names that a pickle may use
+
+
+def _scalar(dtype: _DType, content: Any) -> Any:
+    return np.frombuffer(_bytes(content), dtype.value)[0]
+
+
+def _from_buffer(content: Any, dtype: _DType, shape: Any, order: Any) -> NDArray[Any]:
+    return np.frombuffer(content, dtype.value).reshape(shape, order=order).copy()
+
+
+def _encode(text: str, _encoding: str) -> bytes:
+    return text.encode("latin1")
+
+
+# Module and name in the pickle, and the object that it gets.
 ALLOWED: dict[tuple[str, str], Any] = {
     ("numpy", "ndarray"): "numpy.ndarray",  # pickles only name the class
     ("numpy", "dtype"): _DType,
     ("numpy.core.multiarray", "_reconstruct"): _reconstruct,
-    ("numpy.core.multiarray", "scalar"): lambda dtype, content: np.frombuffer(
-        _bytes(content), dtype.value
-    )[0],
-    ("numpy.core.numeric", "_frombuffer"): lambda content, dtype, shape, order: (
-        np.frombuffer(content, dtype.value).reshape(shape, order=order).copy()
-    ),
-    ("_codecs", "encode"): lambda text, _encoding: text.encode("latin1"),
+    ("numpy.core.multiarray", "scalar"): _scalar,
+    ("numpy.core.numeric", "_frombuffer"): _from_buffer,
+    ("_codecs", "encode"): _encode,
     ("copyreg", "_reconstructor"): copyreg._reconstructor,  # type: ignore[attr-defined]
     ("builtins", "object"): object,
     ("builtins", "set"): set,
@@ -133,6 +154,7 @@ ALLOWED: dict[tuple[str, str], Any] = {
     ("chumpy.reordering", "Select"): _Select,
     ("scipy.sparse.csc", "csc_matrix"): _Sparse,
 }
+# Modules that other versions call by another name.
 RENAMED = {
     "__builtin__": "builtins",  # in Python 2
     "copy_reg": "copyreg",
@@ -142,10 +164,14 @@ RENAMED = {
 }
 
 
+# -- reading
+
+
 class _Unpickler(pickle._Unpickler):
     """In Python: a damaged file makes the one in C reserve as much memory as a number names."""
 
     def find_class(self, module: str, name: str) -> Any:
+        # The names of one version stand for those of all.
         known = RENAMED.get(module, module), name
         if known not in ALLOWED:
             raise _Refused(f"{module}.{name}")
@@ -153,17 +179,18 @@ class _Unpickler(pickle._Unpickler):
 
 
 def _load(stream: BinaryIO) -> Any:
+    # Stand-ins become arrays, alone or as values of a dict.
     content = _Unpickler(stream, encoding="latin1").load()
     if isinstance(content, dict):
-        return {
-            k: v.array() if isinstance(v, _Chumpy) else v for k, v in content.items()
-        }
-    return _array(content) if isinstance(content, _Chumpy) else content
+        for key, value in content.items():
+            if isinstance(value, _Chumpy):
+                content[key] = value.array()
+    return content.array() if isinstance(content, _Chumpy) else content
 
 
 @contextmanager
 def _as_data_error(path: Path, what: str) -> Iterator[None]:
-    """Turns whatever goes wrong inside into one sentence that names the file."""
+    """Turns any error inside into one sentence that names the file."""
     try:
         yield
     except FileNotFoundError:
@@ -171,7 +198,7 @@ def _as_data_error(path: Path, what: str) -> Iterator[None]:
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror or error}") from None
     except _Refused as error:
-        # of a damaged file: it may have line breaks
+        # The name in a damaged file may have line breaks.
         name = " ".join(str(error).split())
         raise DataError(
             f"{path} asks for {name}, which is not allowed, since a pickle can run code; nothing "
@@ -187,8 +214,8 @@ def _as_data_error(path: Path, what: str) -> Iterator[None]:
 def read_pickle(path: Path) -> Any:
     """The content of a .pkl file.
 
-    Convention: text and bytes of Python 2 are read as latin1. The values of a dict that are arrays
-    of chumpy or sparse matrices become plain arrays.
+    Text and bytes of Python 2 are read as latin1. The values of a dict that are arrays of chumpy or
+    sparse matrices become plain arrays.
 
     Raises:
         DataError: when the file is missing, damaged, or names a class that is not allowed.
@@ -218,9 +245,11 @@ def read_npz(
             `LARGEST_ARRAY` bytes, or names a class that is not allowed.
     """
     with _as_data_error(path, "npz file"), zipfile.ZipFile(path) as archive:
-        members = {
-            info.filename.removesuffix(".npy"): info for info in archive.infolist()
-        }
+        members = {}
+        for info in archive.infolist():
+            members[info.filename.removesuffix(".npy")] = info
+
+        # Sizes are checked before anything is unpacked.
         found = {}
         for name in members if names is None else members.keys() & set(names):
             size = members[name].file_size
@@ -230,6 +259,7 @@ def read_npz(
 
 
 def _read_array(stream: BinaryIO, objects: bool = True) -> Any:
+    # Arrays of numbers; numpy refuses arrays of objects after their header.
     try:
         return np.lib.format.read_array(stream, allow_pickle=False)
     except ValueError as error:
@@ -237,9 +267,9 @@ def _read_array(stream: BinaryIO, objects: bool = True) -> Any:
             raise
     if not objects:
         raise _Refused("pickled Python objects")
-    content = _load(io.BytesIO(stream.read()))  # the header has been read
-    return (
-        content.item()
-        if isinstance(content, np.ndarray) and content.ndim == 0
-        else content
-    )
+
+    # The rest of the stream is a pickle. A 0-d array holds one object.
+    content = _load(io.BytesIO(stream.read()))
+    if isinstance(content, np.ndarray) and content.ndim == 0:
+        return content.item()
+    return content

@@ -22,12 +22,14 @@ SOURCE_TYPE = "http://cv.iptc.org/newscodes/digitalsourcetype/trainedAlgorithmic
 SOFTWARE = f"gsgan {__version__}"
 PNG_KEY = "XML:com.adobe.xmp"
 MP4_UUID = bytes.fromhex("be7acfcb97a942e89c71999491e3afac")
+# Formats whose metadata can be read.
 MIMES = {
     ".png": "image/png",
     ".jpg": "image/jpeg",
     ".jpeg": "image/jpeg",
     ".mp4": "video/mp4",
 }
+# The packet in every marked file: the origin and the program, as attributes.
 XMP = (
     '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>'
     '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF '
@@ -66,7 +68,7 @@ class Provenance:
 
 
 def png_bytes(image: Image.Image, marked: bool = True) -> bytes:
-    """The image as a PNG file, marked as synthetic."""
+    """The image as a PNG file, marked as synthetic unless ``marked`` is false."""
     info = PngInfo()
     stream = io.BytesIO()
     if marked:
@@ -77,6 +79,7 @@ def png_bytes(image: Image.Image, marked: bool = True) -> bytes:
 
 def marked_mp4(video: bytes) -> bytes:
     """An MP4 file with XMP that marks it as synthetic."""
+    # A box: its size, its type, and its content. Readers skip types that they do not know.
     content = MP4_UUID + XMP.encode()
     return video + struct.pack(">I", 8 + len(content)) + b"uuid" + content
 
@@ -87,12 +90,15 @@ def verify(path: Path) -> Provenance:
     Raises:
         DataError: when it is missing, damaged or of another format.
     """
+    # The ending says what is read; a wrong one is found below.
     mime = MIMES.get(path.suffix.lower())
     if mime is None:
         raise DataError(
             f"{path} has an unsupported format for provenance metadata: expected one of "
             f"{', '.join(MIMES)}"
         )
+
+    # A file that cannot be read, and one that is damaged, are different errors.
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -109,14 +115,16 @@ def verify(path: Path) -> Provenance:
 
 def _property(xmp: str, name: str) -> str | None:
     """A property's text, written as an attribute or an element of any namespace prefix."""
-    found = re.search(
-        rf"""[\w.-]+:{name}(?:\s*=\s*["']([^"']*)["']|[^>]*>([^<]*)<)""", xmp
-    )
+    # As an attribute `prefix:name="text"`, or as an element `<prefix:name …>text<`.
+    attribute = r"""\s*=\s*["']([^"']*)["']"""
+    element = r"[^>]*>([^<]*)<"
+    found = re.search(rf"[\w.-]+:{name}(?:{attribute}|{element})", xmp)
     return (found[1] or found[2]) if found else None
 
 
 def _image_xmp(data: bytes) -> str:
     with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
+        # A PNG may have XMP behind the pixels, so these are read first.
         image.load()
         found = image.info.get(PNG_KEY) or image.info.get("xmp") or ""
     return found if isinstance(found, str) else found.decode("utf-8", "replace")
@@ -126,6 +134,7 @@ def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
     """Type and content of an MP4 file's top-level boxes."""
     at = 0
     while at < len(data):
+        # A size of 1 stands for a 64-bit size after the type, and 0 for the rest of the file.
         size, kind = struct.unpack_from(">I4s", data, at)
         header = 8
         if size == 1:
@@ -142,5 +151,9 @@ def _mp4_xmp(data: bytes) -> str:
     boxes = list(_boxes(data))
     if not boxes or boxes[0][0] != b"ftyp":
         raise ValueError("no ftyp box")
-    found = (c[16:] for kind, c in boxes if kind == b"uuid" and c[:16] == MP4_UUID)
-    return next(found, b"").decode("utf-8", "replace")
+
+    # The first box with Adobe's UUID; the metadata follow these 16 bytes.
+    for kind, content in boxes:
+        if kind == b"uuid" and content.startswith(MP4_UUID):
+            return content.removeprefix(MP4_UUID).decode("utf-8", "replace")
+    return ""

@@ -23,6 +23,7 @@ class TensorRecord:
         return self._each(lambda value: value.pin_memory())
 
     def _each(self: S, change: Callable[[Tensor], Tensor]) -> S:
+        # Fields of other types, such as sizes, stay as they are.
         changes: dict[str, Any] = {}
         for field in fields(self):
             value = getattr(self, field.name)
@@ -34,23 +35,21 @@ class TensorRecord:
 
     def __getitem__(self: S, index: slice | Tensor) -> S:
         """The batch items of a slice or at indices ``[n]``; the batch dimension stays."""
+        # An integer would drop the batch dimension.
         if isinstance(index, int):
             raise TypeError(
                 f"{type(self).__name__} takes a slice of the batch, got {index!r}"
             )
-        changes: dict[str, Any] = {}
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, (TensorRecord, Tensor)):
-                changes[field.name] = value[index]
-        return replace(self, **changes)
+        return self._each(lambda value: value[index])
 
 
 def _to(value: Tensor, *args: Any, **kwargs: Any) -> Tensor:
     if value.is_floating_point():
         return value.to(*args, **kwargs)
-    kwargs = {k: v for k, v in kwargs.items() if k != "dtype"}
-    args = tuple(a for a in args if not isinstance(a, torch.dtype))
+
+    # Labels and masks move, but keep their dtype.
+    kwargs.pop("dtype", None)
+    args = tuple(value for value in args if not isinstance(value, torch.dtype))
     return value.to(*args, **kwargs) if args or kwargs else value
 
 
@@ -62,10 +61,13 @@ def cat(records: Sequence[S]) -> S:
     """
     if not records:
         raise ValueError("cat: expected at least one record, got none")
+
+    # Tensors are joined; all other values must be equal.
     first = records[0]
     changes = {}
     for field in fields(first):
         values = [getattr(record, field.name) for record in records]
+        # A field that is None in one record must be None in all.
         if len({value is None for value in values}) == 2:
             raise ValueError(
                 f"cat: {type(first).__name__}.{field.name} is present in some records only"

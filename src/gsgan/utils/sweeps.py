@@ -17,11 +17,12 @@ from omegaconf import DictConfig
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
 
+# The file in a job's folder until the job has ended well; it says why it has not.
 MARK = "unfinished.txt"
-"""In a job's folder until it has ended well; says why it has not."""
 STARTED = "it was started and has not ended"
 STOPPED = 75  # exit status of a job that can go on: EX_TEMPFAIL of sysexits.h
 PR_SET_PDEATHSIG = 1
+# Signals that ask a job to stop; Windows lacks some of them.
 STOPS = tuple(
     getattr(signal, name)
     for name in ("SIGINT", "SIGTERM", "SIGUSR1", "SIGUSR2")
@@ -33,9 +34,9 @@ OF_THE_SWEEP = re.compile(r"[+~]*hydra[./](mode|run|sweep|sweeper|launcher)\b")
 def run_job(command: str, objective: str | None) -> float | None:
     """Runs one job of a sweep as a command of its own, in its own folder.
 
-    Convention: a job that fails does not raise, since that would end some sweepers; it leaves
-    `MARK` in its folder and has no score. A signal that asks this process to stop is passed on,
-    and takes effect here when the job has ended: submitit requeues a job in its handler.
+    A job that fails does not raise, since that would end some sweepers; it leaves `MARK` in its
+    folder and has no score. A signal that asks this process to stop is passed on, and takes effect
+    here when the job has ended: submitit requeues a job in its handler.
 
     Args:
         command: ``train`` of ``python -m gsgan.train``.
@@ -48,26 +49,30 @@ def run_job(command: str, objective: str | None) -> float | None:
     folder = Path(settings.runtime.output_dir)
     mark = folder / MARK
     mark.write_text(STARTED)
+
+    # The job has the overrides of the sweep, but is a single run in a folder of its own.
     given = (*settings.overrides.task, *settings.overrides.hydra)
-    arguments = [x for x in given if not OF_THE_SWEEP.match(x)]
+    arguments = [override for override in given if not OF_THE_SWEEP.match(override)]
     quoted = str(folder).replace("\\", "\\\\").replace("'", "\\'")
     own = ["hydra.mode=RUN", f"hydra.run.dir='{quoted}'"]
     for source in settings.runtime.config_sources:
         if source.provider == "command-line":  # --config-dir, of which Hydra takes one
             own += ["--config-dir", source.path]
     status = _status([sys.executable, "-m", f"gsgan.{command}", *arguments, *own])
+
+    # The mark goes when the job has ended well and has the score that is asked for.
     if status == 0:
         try:
-            score = (
-                None
-                if objective is None
-                else _score(folder / "metrics.json", objective)
-            )
+            score = None
+            if objective is not None:
+                score = _score(folder / "metrics.json", objective)
         except ConfigError as error:
             mark.write_text(str(error))
         else:
             mark.unlink()
             return score
+
+    # Otherwise it says why: the job itself has noted errors of the user.
     elif status < 0:
         mark.write_text(f"it was killed by {signal.Signals(-status).name}")
     elif status == STOPPED:
@@ -81,13 +86,16 @@ def _status(command: list[str]) -> int:
     """The exit status of a command, negative for a signal; see `run_job`."""
     received: list[int] = []
 
+    # Signals that stop this process are passed on, and raised here after the job's end.
     def relay(number: int, _: Any) -> None:
         received.append(number)
         child.send_signal(number)
 
-    # Linux kills the job with its parent: the sweep may be started again at once
+    # Linux kills the job with its parent: the sweep may be started again at once.
     prctl = ctypes.CDLL(None).prctl if sys.platform == "linux" else None
     bound = prctl and partial(prctl, PR_SET_PDEATHSIG, signal.SIGKILL)
+
+    # The handlers are replaced only while the job runs.
     with subprocess.Popen(command, preexec_fn=bound) as child:
         before = {number: signal.signal(number, relay) for number in STOPS}
         try:
@@ -95,6 +103,8 @@ def _status(command: list[str]) -> int:
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
+
+    # A job that ended well in spite of the signal needs no further handling.
     if received and status:
         signal.raise_signal(received[0])
     return status
@@ -102,6 +112,8 @@ def _status(command: list[str]) -> int:
 
 def _score(path: Path, name: str) -> float:
     found: Any = json.loads(path.read_text())
+
+    # A name such as novel_pose.full.psnr is a path into nested groups.
     for key in name.split("."):
         found = found.get(key) if isinstance(found, dict) else None
     if not isinstance(found, (int, float)):
@@ -113,6 +125,7 @@ def _score(path: Path, name: str) -> float:
 
 def unfinished(folder: Path) -> str | None:
     """Why the job in a folder is unfinished, or None."""
+    # A job without a mark has ended well, or is none of a sweep.
     mark = folder / MARK
     return mark.read_text() if mark.is_file() else None
 
@@ -128,16 +141,14 @@ class NameUnfinished(Callback):
 
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
         """Called by Hydra."""
-        folders = sorted(
-            mark.parent for mark in Path(config.hydra.sweep.dir).rglob(MARK)
-        )
-        if folders:
+        # Every job without a mark has ended well.
+        marks = sorted(Path(config.hydra.sweep.dir).rglob(MARK))
+        if marks:
             console = make_console()
             console.print(
-                f"{len(folders)} jobs are unfinished; the same command continues them:"
+                f"{len(marks)} jobs are unfinished; the same command continues them:"
             )
-            for folder in folders:
-                console.print(
-                    f"{folder}: {unfinished(folder)}", soft_wrap=True, highlight=False
-                )
+            for mark in marks:
+                line = f"{mark.parent}: {mark.read_text()}"
+                console.print(line, soft_wrap=True, highlight=False)
             sys.exit(1)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from gsgan.utils.errors import ConfigError
 
-T = TypeVar("T")
+Result = TypeVar("Result")
 # of glibc's mallopt
 M_TRIM_THRESHOLD = -1
 M_MMAP_THRESHOLD = -3
@@ -23,14 +23,14 @@ LARGEST = 1 << 25  # bytes; glibc takes larger blocks from the system in any cas
 def constant(values: Any, like: Tensor, dtype: torch.dtype | None = None) -> Tensor:
     """Nested tuples of numbers as a tensor on the device of ``like``, of its dtype unless another
     is given; read only."""
-    # what torch.export sees is a stand-in, and must not be kept
+    # torch.export sees a stand-in, which must not be kept.
     make = _constant.__wrapped__ if torch.compiler.is_compiling() else _constant
     return make(values, dtype or like.dtype, like.device)
 
 
 @lru_cache(maxsize=1024)
 def _constant(values: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
-    # an inference tensor could not be used in training later
+    # An inference tensor could not be used in training later.
     with torch.inference_mode(False):
         return torch.tensor(values, dtype=dtype, device=device)
 
@@ -49,6 +49,7 @@ def full_precision(device: torch.device) -> Iterator[None]:
     bf16 projections are off by pixels, and TF32 keeps 10 bits. Gradients that are computed outside
     have the precision that is set there.
     """
+    # The settings of TF32 are global: they are restored at the end.
     tf32 = torch.backends.cudnn.allow_tf32
     products = torch.get_float32_matmul_precision()
     torch.backends.cudnn.allow_tf32 = False
@@ -70,6 +71,7 @@ def pick_device(name: str) -> torch.device:
     Raises:
         ConfigError: when it is not usable.
     """
+    # Whether a device is usable shows when something is put there.
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
@@ -79,7 +81,7 @@ def pick_device(name: str) -> torch.device:
 
 
 def keep_freed_memory() -> None:
-    """Makes the process keep freed memory for its next image, where the C library is glibc.
+    """Makes the process keep freed memory for its next image, if the C library is glibc.
 
     By default most of it goes back to the system, which maps and clears it anew for every image:
     16 thousand pages in an image of 256², a third of the time of painting it.
@@ -90,12 +92,17 @@ def keep_freed_memory() -> None:
         mallopt(M_MMAP_THRESHOLD, LARGEST)
 
 
-def derived(module: nn.Module, name: str, make: Callable[[], T], *weights: Tensor) -> T:
+def derived(
+    module: nn.Module, name: str, make: Callable[[], Result], *weights: Tensor
+) -> Result:
     """``make()``, a function of these weights alone. In a frozen module (one with a dictionary
     ``derived``) it is kept until a weight changes or moves."""
-    kept: dict[str, tuple[Any, T]] | None = getattr(module, "derived", None)
+    # While training every call computes anew.
+    kept: dict[str, tuple[Any, Result]] | None = getattr(module, "derived", None)
     if kept is None:
         return make()
+
+    # A change in place raises the version; a move or a cast changes the address or dtype.
     state = [(x.data_ptr(), x._version, x.dtype) for x in weights]
     found = kept.get(name)
     if found is None or found[0] != state:

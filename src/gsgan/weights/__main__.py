@@ -20,6 +20,7 @@ def list_weights(config: DictConfig) -> None:
     console = make_console()
     problems = []
     for net in config.nets:
+        # On this machine, or else downloaded.
         title = files.network_of(net).title
         try:
             found = files.find(net, config.path)
@@ -29,7 +30,9 @@ def list_weights(config: DictConfig) -> None:
                 raise DataError(
                     f"{title} is not on this machine: {files.how_to_get(net)}"
                 )
-            pretrained(net, found.path)  # refuses a wrong or damaged file
+
+            # A wrong or damaged file is refused by the network.
+            pretrained(net, found.path)
         except DataError as error:
             problems.append(str(error))
             console.print(f"{title}: missing", highlight=False)

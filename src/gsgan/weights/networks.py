@@ -1,7 +1,6 @@
 """Pretrained networks as feature extractors, and LPIPS."""
 
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 
 import torch
@@ -17,12 +16,13 @@ from gsgan.weights.files import (
     state_of_heads,
 )
 
+# The mean and deviation of ImageNet's channels, with which both networks were trained.
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 # Layers of torchvision's `features` after which LPIPS compares: every ReLU before a pooling
 # (VGG-16: relu1_2, relu2_2, relu3_3, relu4_3, relu5_3), and every ReLU (AlexNet).
 TAPS = {"vgg": (3, 8, 15, 22, 29), "alex": (1, 4, 7, 9, 11)}
-# of the features' norm, as in torchmetrics: the gradient is finite at zero
+# Added to the squared norm of features, as in torchmetrics: the gradient is finite at zero.
 EPSILON = 1e-8
 
 
@@ -46,6 +46,7 @@ class FeatureNetwork(nn.Module):
 
     def forward(self, image: Tensor) -> list[Tensor]:
         """The maps ``[B, C, h, w]``, from the finest to the coarsest."""
+        # Each stage continues from the map of the one before.
         maps = []
         features = (image - self.mean) / self.std
         for stage in self.stages:
@@ -66,6 +67,7 @@ def pretrained(net: str, path: str | Path | None = None) -> FeatureNetwork:
         DataError: if the weights are not found and cannot be downloaded, or belong to another
             network.
     """
+    # Weights are assigned to layers without values, so nothing is drawn at random.
     found = get(net, path)
     network = NETWORKS[net]
     layers = empty_layers(network)
@@ -76,13 +78,19 @@ def pretrained(net: str, path: str | Path | None = None) -> FeatureNetwork:
         raise DataError(
             f"{found.path}: these are not torchvision's weights of {network.title}"
         ) from error
+
+    # Layers must not overwrite the maps before them, which are kept.
     for layer in layers:
         if isinstance(layer, nn.ReLU):
-            layer.inplace = False  # the maps before it are kept
-    bounds = [0, *(tap + 1 for tap in TAPS[net])]
-    return FeatureNetwork(
-        nn.ModuleList(layers[start:end] for start, end in pairwise(bounds))
-    )
+            layer.inplace = False
+
+    # A stage ends with the layer whose map LPIPS compares.
+    stages = nn.ModuleList()
+    start = 0
+    for tap in TAPS[net]:
+        stages.append(layers[start : tap + 1])
+        start = tap + 1
+    return FeatureNetwork(stages)
 
 
 class Lpips(nn.Module):
@@ -106,6 +114,7 @@ class Lpips(nn.Module):
 
     def __init__(self, net: str, path: str | Path | None = None) -> None:
         super().__init__()
+        # One head per layer: the weights of its channels.
         self.network = pretrained(net, path)
         state = state_of_heads(net)
         for layer in range(len(TAPS[net])):
@@ -123,6 +132,7 @@ class Lpips(nn.Module):
         self, features: Sequence[Tensor], others: Sequence[Tensor]
     ) -> list[Tensor]:
         """The distance of two images in each layer, as maps ``[B, 1, h, w]``."""
+        # A head is a convolution of 1 x 1: the weighted sum over channels.
         maps = []
         for layer, (ours, theirs) in enumerate(zip(features, others, strict=True)):
             head = self.get_buffer(f"head{layer}")
@@ -141,6 +151,7 @@ class Lpips(nn.Module):
         size: tuple[int, int],
     ) -> Tensor:
         """The distance of each pixel, ``[B, 1, H, W]``: the layers' maps, enlarged to ``size``."""
+        # The zero is a scalar, which broadcasts to the size of the maps.
         total = features[0].new_zeros(())
         for layer in self.layers(features, others):
             total = total + functional.interpolate(layer, size, mode="bilinear")

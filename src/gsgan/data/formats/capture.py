@@ -53,15 +53,15 @@ from gsgan.utils.arrays import expect_array
 from gsgan.utils.checks import is_number, whole
 from gsgan.utils.errors import DataError
 
-T = TypeVar("T")
-LANDMARKS = "landmarks3d.npz"
+Content = TypeVar("Content")
+LANDMARKS_FILE = "landmarks3d.npz"
 HANDS_FILE = "hands3d.npz"
 FACE_FILE = "face3d.npz"
-POSES = "body_pose.npz"
+POSES_FILE = "body_pose.npz"
 SHAPE = "body_shape.npz"
-# endings of masks and labels
+# Endings of masks and labels: compression would damage them.
 MASKS = (".png",)
-# by kind of body
+# The number of rotations in a pose, by kind of body.
 BODY_BONES = {"free": 56, "smpl": 24, "smplx": 55}
 SKELETON_LIMITS = Consistency(least_inside=0.2)
 """A capture's own landmarks are noisier than those of a fitted body."""
@@ -110,7 +110,10 @@ def read_capture(
 
 
 def _find(
-    root: Path, limits: Thresholds, smpl: str | None, reader: CaptureReader
+    root: Path,
+    limits: Thresholds,
+    smpl: str | None,
+    reader: CaptureReader,
 ) -> Found:
     """The files of a capture, each checked separately."""
     notes: list[str] = []
@@ -132,7 +135,9 @@ def _find(
 
     # Landmarks; hands and face are optional.
     joints = SKELETONS[meta.skeleton]
-    skeletons = _read_landmarks(root / LANDMARKS, joints, conventions, limits, notes)
+    skeletons = _read_landmarks(
+        root / LANDMARKS_FILE, joints, conventions, limits, notes
+    )
     hands = None
     if (root / HANDS_FILE).exists():
         hands = _read_landmarks(root / HANDS_FILE, 2 * HAND, conventions, limits, notes)
@@ -143,7 +148,7 @@ def _find(
 
     # Body poses, which may also name the body.
     poses = None
-    if (root / POSES).exists():
+    if (root / POSES_FILE).exists():
         poses, meta = _read_poses(root, meta, conventions)
 
     return Found(
@@ -176,7 +181,8 @@ def capture_problems(root: Path, limits: Thresholds) -> list[str]:
     """
     problems: list[str] = []
 
-    def attempt(read: Callable[[], T]) -> T | None:
+    # Each message once: several steps may read the same file.
+    def attempt(read: Callable[[], Content]) -> Content | None:
         try:
             return read()
         except DataError as error:
@@ -202,11 +208,15 @@ def capture_problems(root: Path, limits: Thresholds) -> list[str]:
 
     # Landmarks and body poses.
     joints = SKELETONS["mediapipe33" if meta is None else meta.skeleton]
-    for name, count in ((LANDMARKS, joints), (HANDS_FILE, 2 * HAND), (FACE_FILE, FACE)):
+    for name, count in (
+        (LANDMARKS_FILE, joints),
+        (HANDS_FILE, 2 * HAND),
+        (FACE_FILE, FACE),
+    ):
         file = root / name
-        if name == LANDMARKS or file.exists():
+        if name == LANDMARKS_FILE or file.exists():
             attempt(partial(_read_landmarks, file, count, conventions, limits, []))
-    if meta is not None and (root / POSES).exists():
+    if meta is not None and (root / POSES_FILE).exists():
         attempt(lambda: _read_poses(root, meta, conventions))
     return problems
 
@@ -234,6 +244,7 @@ def _read_meta(path: Path, content: Mapping[str, Any], smpl: str | None) -> Meta
         kind = choose(path, content, "body", None, tuple(BODY_BONES))
         body = BodyModel(kind, smpl if kind != "free" else None)
 
+    # Facts with a fixed set of values.
     axes = ("x", "y", "z", "-x", "-y", "-z")
     return Meta(
         unit=choose(path, content, "unit", None, tuple(METRES)),
@@ -262,9 +273,8 @@ def _index_images(
         if path.is_dir() and not path.name.startswith("."):
             found.add(path.name)
 
-    unknown = sorted(found - set(cameras))
-
     # A folder and a camera without each other are most likely misspelt.
+    unknown = sorted(found - set(cameras))
     if unknown:
         raise DataError(
             f"{folder} has the camera {unknown[0]}, which {root / 'cameras.json'} does not list; "
@@ -277,6 +287,7 @@ def _index_images(
                 f"does not exist; there are {', '.join(sorted(found)) or 'none'}"
             )
 
+    # A camera without images is most likely a mistake too.
     images = {name: frame_files(root, f"images/{name}", IMAGES) for name in cameras}
     for name, files in images.items():
         if not files:
@@ -322,7 +333,7 @@ def _refuse_other_names(path: Path) -> None:
 def _read_poses(root: Path, meta: Meta, conventions: Conventions) -> tuple[Poses, Meta]:
     """The poses of frames in which all numbers are finite, and ``meta`` with the body and its
     shape."""
-    path = root / POSES
+    path = root / POSES_FILE
     names = ("theta", "transl", "frame_id", "betas", "registered", "fitted_to")
     arrays = read_arrays(path, (*names, "theta_hands", "transl_hands"))
 
@@ -351,9 +362,13 @@ def _read_poses(root: Path, meta: Meta, conventions: Conventions) -> tuple[Poses
         moves.append(transl.astype(np.float64))
 
     # Only frames in which all of them are finite.
-    values = np.concatenate([*rotations, *(move[:, None] for move in moves)], axis=1)
+    rotated = np.concatenate(rotations, axis=1)
+    moved = np.stack(moves, axis=1)
+    values = np.concatenate([rotated, moved], axis=1)
     rows = np.flatnonzero(np.isfinite(values).all((1, 2)))
     frames = ids[rows].tolist()
+
+    # Translations are in metres; axis-angles have no unit.
     poses = []
     for theta, transl in zip(rotations, moves, strict=True):
         poses.append(
@@ -365,6 +380,8 @@ def _read_poses(root: Path, meta: Meta, conventions: Conventions) -> tuple[Poses
                 fitted_to=fitted_to,
             )
         )
+
+    # The second version, if there is one, follows the hands.
     own = poses[0]
     if len(poses) > 1:
         own = replace(own, with_hands=poses[1])
@@ -384,6 +401,7 @@ def read_shape(path: Path) -> tuple[float, ...]:
     Raises:
         DataError: when the file is damaged or lacks an array.
     """
+    # The arrays that every file has, and those of people with hands or a bent spine.
     shapes: dict[str, tuple[int, ...]] = {
         "coefficients": (free_space().coefficients,),
         "stretch": (len(STRETCHED),),

@@ -20,7 +20,7 @@ from gsgan.skeleton.smpl_landmarks import TABLES
 from gsgan.utils.errors import ConfigError, DataError
 
 IMAGES = (".jpg", ".jpeg", ".png")
-# by kind: name, and an example of a model's file
+# By kind of body: its name, and an example of a model's file.
 MODELS = {
     "smpl": ("SMPL", "SMPL_NEUTRAL.pkl"),
     "smplx": ("SMPL-X", "SMPLX_NEUTRAL.npz"),
@@ -34,6 +34,7 @@ class FolderReader:
     conf/data/*.yaml explain the settings.
     """
 
+    # Settings that a format may have other defaults for.
     drop_frames: Any = None
     distance: tuple[float, float] = (0.5, 20.0)
     max_missing_masks: float = 0.05
@@ -59,6 +60,7 @@ class FolderReader:
             DataError: for whatever is missing, damaged or contradictory, naming the file.
         """
         folder = dataset_folder(root, self.contents)
+
         # The images of a release are alike, so fewer headers are read.
         limits = replace(
             limits,
@@ -168,6 +170,7 @@ def image_size(root: Path, files: Mapping[int, str]) -> tuple[int, int]:
     Raises:
         DataError: when it is damaged.
     """
+    # All images of a camera have one size, which is checked later.
     first = next(iter(files.values()))
     size, _, _ = read_header(root / first)
     return size
@@ -181,6 +184,7 @@ class _Masks(Mapping[int, tuple[MaskFile, ...]]):
         self.rule = rule
 
     def __getitem__(self, frame: int) -> tuple[MaskFile, ...]:
+        # Millions of tuples would take more memory than the paths.
         return (MaskFile(self.rule, self.files[frame]),)
 
     def __iter__(self) -> Iterator[int]:

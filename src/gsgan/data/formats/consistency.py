@@ -19,7 +19,7 @@ from gsgan.data.pixels import read_mask
 from gsgan.utils.arrays import Bool, Bytes, Float, evenly_spaced
 from gsgan.utils.errors import DataError
 
-T = TypeVar("T")
+Value = TypeVar("Value")
 
 # pixels, maximum side of a mask that joints are compared with
 LONGEST = 512
@@ -43,7 +43,11 @@ class Consistency:
     joint_tolerance: float = 0.05
 
 
-def check_consistency(layout: Layout, limits: Consistency, hint: str) -> None:
+def check_consistency(
+    layout: Layout,
+    limits: Consistency,
+    hint: str,
+) -> None:
     """Checks that the joints lie where the masks are.
 
     Args:
@@ -64,10 +68,14 @@ def check_consistency(layout: Layout, limits: Consistency, hint: str) -> None:
         for frame in frames:
             if frame not in layout.images[name]:
                 continue
+
+            # The mask as stored, which no resampling has blurred.
             mask = read_mask(layout.mask_files(name, frame), layout.pixels)
             masks.append(layout.mask_path(name, frame))
             empty = empty and not mask.any()
             joints = layout.landmarks.seen(frame)
+
+            # NaN if no joint is in view.
             share = inside_share(mask, camera, joints, limits.joint_tolerance)
             if np.isfinite(share):
                 shares.setdefault(name, []).append(share)
@@ -89,6 +97,8 @@ def check_consistency(layout: Layout, limits: Consistency, hint: str) -> None:
             f"{masks[0]} shows no person, nor does any of the {len(masks)} masks compared; "
             "expected values above 0 where the person is"
         )
+
+    # The mean share of each camera; the message shows all, since one may be wrong.
     inside = {name: np.mean(found) for name, found in shares.items()}
     if inside and min(inside.values()) < limits.least_inside:
         text = ", ".join(f"{name} {share:.0%}" for name, share in inside.items())
@@ -124,7 +134,11 @@ def mask_distance(mask: Bool) -> Float:
 
 
 def joint_distance(
-    distance: Float, pixels: Float, depth: Float, visible: Bool, focal: float
+    distance: Float,
+    pixels: Float,
+    depth: Float,
+    visible: Bool,
+    focal: float,
 ) -> Float:
     """``[J]`` metres by which joints lie outside the mask; NaN where unknown.
 
@@ -149,7 +163,10 @@ def joint_distance(
 
 
 def inside_share(
-    mask: Bytes, camera: CameraEntry, joints: Float, tolerance: float
+    mask: Bytes,
+    camera: CameraEntry,
+    joints: Float,
+    tolerance: float,
 ) -> float:
     """Share of world points ``[N, 3]`` in view that lie inside a stored mask ``[H, W]``.
 
@@ -178,6 +195,6 @@ def inside_share(
     return float((outside <= allowed)[known].mean())
 
 
-def spread(values: Sequence[T], count: int) -> list[T]:
+def spread(values: Sequence[Value], count: int) -> list[Value]:
     """At most ``count`` of the values, evenly spaced, first and last included."""
     return [values[i] for i in evenly_spaced(len(values), count, ends=True)]

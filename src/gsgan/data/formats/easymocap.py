@@ -31,7 +31,7 @@ from gsgan.data.joints import BODY, FROM_HANDS, SETS
 from gsgan.data.layout import BodyModel, Found, Meta
 from gsgan.data.pixels import MaskFile, mask_file
 from gsgan.data.skeletons import make_landmarks
-from gsgan.data.validation import Thresholds, spans
+from gsgan.data.validation import Thresholds, frames_of, spans
 from gsgan.skeleton.hands import HAND
 from gsgan.utils.arrays import Float, Ints, as_floats
 from gsgan.utils.errors import DataError
@@ -40,9 +40,9 @@ SKELETON_SOURCES = {
     "smpl": "smpl24 -> mediapipe33",
     "keypoints3d": "body25 -> mediapipe33",
 }
-# folders of EasyMocap's results
+# Folders of EasyMocap's results, which depend on its version.
 RESULTS = ("{kind}", "output/{kind}", "output-{kind}/{kind}")
-# bound on the person's number in a mask's name
+# Bound on the person's number in a mask's name.
 PEOPLE = 1000
 # keys of the list of people
 PEOPLE_KEYS = ("annots", "people")
@@ -51,7 +51,7 @@ BODY_25 = 25
 BODY_AND_HANDS = BODY_25 + 2 * HAND
 # the body; with hands, left first; with hands and face
 JOINT_COUNTS = (BODY_25, BODY_AND_HANDS, BODY_AND_HANDS + 51)
-# their numbers by MediaPipe's
+# Numbers of joints in the file by MediaPipe's.
 BODY_25_TO_33 = SETS[BODY_25][1]
 HANDS_TO_33 = {
     landmark: BODY_25 + joint - BODY for landmark, joint in FROM_HANDS.items()
@@ -89,8 +89,7 @@ class EasymocapReader(FolderReader):
 
         # The person's SMPL fits, if the user has the model, else the keypoints.
         kind, place = _source(root, smpl)
-        frames = set[int]().union(*images.values())
-        people = _read_people(root, place, frames, self.person, notes)
+        people = _read_people(root, place, frames_of(images), self.person, notes)
         motion = None
         body = None
         if kind == "smpl":
@@ -159,6 +158,7 @@ class EasymocapReader(FolderReader):
 
 def _source(root: Path, smpl: str | None) -> tuple[str, str]:
     """The kind of skeletons to use, fits if the user has the model, and their folder."""
+    # Folders that exist, fits first.
     places = []
     for kind in SKELETON_SOURCES:
         for pattern in RESULTS:
@@ -198,11 +198,14 @@ def _masks(
 
 def _camera_folders(root: Path, contents: str) -> list[str]:
     """Names of the cameras that have a folder of images, in natural order."""
+    # Without calibration the images are of no use.
     for name in ("intri.yml", "extri.yml"):
         if not (root / name).is_file():
             raise DataError(
                 f"{root / name} does not exist; a folder of EasyMocap holds {contents}"
             )
+
+    # Hidden folders do not count.
     place = root / "images"
     names = []
     for path in place.glob("*"):
@@ -228,7 +231,11 @@ def _frame_and_person(stem: str) -> int | None:
 
 
 def _read_people(
-    root: Path, folder: str, frames: Collection[int], person: int, notes: list[str]
+    root: Path,
+    folder: str,
+    frames: Collection[int],
+    person: int,
+    notes: list[str],
 ) -> dict[int, tuple[str, Mapping[str, Any]]]:
     """The person's entry, with the file's name for messages, by frame that has images."""
     # One file per frame, each with all people.
@@ -263,13 +270,15 @@ def _people(path: Path) -> dict[int, Mapping[str, Any]]:
     # Some versions wrap the list in an object.
     if isinstance(content, Mapping):
         content = next((content[key] for key in PEOPLE_KEYS if key in content), None)
-    if not isinstance(content, list) or not all(
-        isinstance(entry, Mapping) for entry in content
-    ):
-        raise DataError(f"{path} must hold a list of people, each an object with 'id'")
-
+    entries = content if isinstance(content, list) else [None]
     people: dict[int, Mapping[str, Any]] = {}
-    for entry in content:
+    for entry in entries:
+        if not isinstance(entry, Mapping):
+            raise DataError(
+                f"{path} must hold a list of people, each an object with 'id'"
+            )
+
+        # Ids tell people apart from frame to frame.
         number = entry.get("id")
         if type(number) is not int or number in people:
             raise DataError(
@@ -290,6 +299,7 @@ def _read_keypoints(
     Returns:
         ``ids [F]`` rising, ``p [F, 33, 3]`` metres and ``conf [F, 33]``.
     """
+    # Joints are unknown until a file has them.
     p = np.full((len(people), BODY, 3), np.nan)
     conf = np.zeros((len(people), BODY))
     for row, (where, entry) in enumerate(people.values()):
@@ -310,12 +320,10 @@ def _read_keypoints(
 
 def _joints(where: str, raw: Any) -> Float:
     """``[J, 4]`` x, y, z and confidence, which is 1 if the file has none."""
+    # Ragged lists, and other objects, give an array without numbers.
     joints = as_floats(raw)
-    if (
-        joints.ndim != 2
-        or len(joints) not in JOINT_COUNTS
-        or joints.shape[1] not in (3, 4)
-    ):
+    fits = joints.ndim == 2 and joints.shape[1] in (3, 4)
+    if not fits or len(joints) not in JOINT_COUNTS:
         counts = ", ".join(map(str, JOINT_COUNTS))
         raise DataError(
             f"{where}: 'keypoints3d' must have shape (J, 4) with J one of {counts} (BODY_25, with "

@@ -13,7 +13,7 @@ from gsgan.skeleton.smpl_landmarks import TABLES, to_mediapipe33
 from gsgan.utils.arrays import Float, Ints, as_floats
 from gsgan.utils.errors import DataError
 
-# frames posed at once: bounds memory, nothing else
+# Frames posed at once, which bounds memory.
 CHUNK = 32
 # radians in poses[:3] that count as none
 ROOT_TOLERANCE = 1e-6
@@ -43,14 +43,16 @@ class SmplMotion:
         """Body poses by frame."""
         frames = self.ids.tolist()
         return Poses(
-            dict(zip(frames, self.theta, strict=True)),
-            dict(zip(frames, self.transl, strict=True)),
-            source,
+            theta=dict(zip(frames, self.theta, strict=True)),
+            transl=dict(zip(frames, self.transl, strict=True)),
+            source=source,
         )
 
 
 def landmarks_of(
-    model: SkinnedModel, motion: SmplMotion, pose_blend: bool = True
+    model: SkinnedModel,
+    motion: SmplMotion,
+    pose_blend: bool = True,
 ) -> tuple[Float, Float]:
     """MediaPipe's 33 landmarks ``p [F, 33, 3]`` (NaN = unknown) and ``conf [F, 33]``.
 
@@ -63,6 +65,7 @@ def landmarks_of(
     vertices = sorted(used)
     small = _only(model, vertices)
 
+    # Chunks bound the memory; each frame is posed by itself.
     kind = cast(Literal["smpl", "smplx"], model.kind)
     p = []
     conf = []
@@ -164,8 +167,14 @@ def zju_motion(
     )
 
 
-def _parameter(content: Any, key: str, sizes: tuple[int, ...], where: str) -> Float:
+def _parameter(
+    content: Any,
+    key: str,
+    sizes: tuple[int, ...],
+    where: str,
+) -> Float:
     """One frame's parameter as finite numbers, flat; its length is one of ``sizes``."""
+    # The file may be of another kind of body.
     expected = " or ".join(map(str, sizes))
     if not isinstance(content, Mapping) or key not in content:
         raise DataError(f"{where} has no '{key}'; expected {expected} numbers")

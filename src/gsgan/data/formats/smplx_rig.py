@@ -27,7 +27,7 @@ from gsgan.data.formats.smpl_motion import SmplMotion, landmarks_of
 from gsgan.data.layout import BodyModel, Found, Meta
 from gsgan.data.pixels import PixelRules
 from gsgan.data.skeletons import make_landmarks
-from gsgan.data.validation import Thresholds, spans
+from gsgan.data.validation import Thresholds, frames_of, spans
 from gsgan.utils.arrays import Float, as_floats
 from gsgan.utils.checks import whole
 from gsgan.utils.errors import ConfigError, DataError
@@ -39,7 +39,7 @@ Files = dict[str, FrameFiles]
 
 PARAMETERS = "smpl_params.npz"
 MISSING = "missing_img_files.txt"
-# in the order of SMPL-X's joints: numbers per frame of each
+# Numbers per frame of each array, in the order of SMPL-X's joints.
 POSES = {
     "global_orient": 3,
     "body_pose": 63,
@@ -49,7 +49,7 @@ POSES = {
     "left_hand_pose": 45,
     "right_hand_pose": 45,
 }
-# arrays that a file must have
+# Arrays that a file must have.
 NEEDED = ("global_orient", "body_pose", "transl", "betas")
 HAND_POSES = ("left_hand_pose", "right_hand_pose")
 
@@ -77,6 +77,7 @@ class SmplxRigReader(FolderReader):
     )
 
     def __post_init__(self) -> None:
+        # Options of a config are checked before any file is read.
         whole("data.reader.ignore_band", self.ignore_band, 0)
         alpha = self.ignore_alpha
         if alpha is None:
@@ -108,8 +109,7 @@ class SmplxRigReader(FolderReader):
         cameras = self._cameras(root, path, entries, images, notes)
 
         # The fitted body, and the landmarks on it.
-        frames = set[int]().union(*images.values())
-        motion = read_motion(root / PARAMETERS, frames, model, notes)
+        motion = read_motion(root / PARAMETERS, frames_of(images), model, notes)
         p, conf = landmarks_of(model, motion)
 
         # A pair: a config gives a list.
@@ -153,6 +153,8 @@ class SmplxRigReader(FolderReader):
         cameras = {}
         for name, entry in entries.items():
             where = f"{path}, camera {name}"
+
+            # Other files of the release are JSON too.
             if not isinstance(entry, dict):
                 raise DataError(
                     f"{where}: expected K, R and T, found {type(entry).__name__}"
@@ -187,8 +189,14 @@ class SmplxRigReader(FolderReader):
         return cameras
 
 
-def _index(root: Path, cameras: Mapping[str, Any], place: str, kind: str) -> Files:
+def _index(
+    root: Path,
+    cameras: Mapping[str, Any],
+    place: str,
+    kind: str,
+) -> Files:
     """The files by camera and frame; each camera must have some."""
+    # Folders are named by camera.
     found = {}
     for name in cameras:
         folder = place.format(camera=name)
@@ -212,6 +220,8 @@ def _leave_out(images: Files, path: Path, notes: list[str]) -> None:
         kept = files.without(frame for name, frame in named if name == camera)
         gone += len(files) - len(kept)
         images[camera] = kept
+
+    # Frames that were named without a file are no error.
     notes.append(
         f"{len(named)} images named in {path} are left out, {gone} of them with a file"
     )
@@ -226,6 +236,7 @@ def read_missing(path: Path, cameras: Mapping[str, Any]) -> set[tuple[str, int]]
     Raises:
         DataError: on a line that names no image of a camera.
     """
+    # One image per line; empty lines do not count.
     found = set()
     lines = read_text(path, errors="replace").splitlines()
     for number, raw in enumerate(lines, 1):
@@ -250,7 +261,10 @@ def read_missing(path: Path, cameras: Mapping[str, Any]) -> set[tuple[str, int]]
 
 
 def read_motion(
-    path: Path, frames: Collection[int], model: SkinnedModel, notes: list[str]
+    path: Path,
+    frames: Collection[int],
+    model: SkinnedModel,
+    notes: list[str],
 ) -> SmplMotion:
     """The parameters of the frames that have any, in the model's own convention.
 
@@ -263,6 +277,7 @@ def read_motion(
     Raises:
         DataError: on a damaged file, or a missing or misshapen array, such as one of SMPL.
     """
+    # Only these arrays are read: nothing else in the file is unpacked.
     arrays = read_npz(path, (*POSES, "transl", "betas", "expression"))
     missing = [key for key in NEEDED if key not in arrays]
     if missing:
@@ -279,6 +294,8 @@ def read_motion(
         if key in arrays:
             theta[:, first : first + width] = _rows(arrays, key, width, path, count)
         first += width
+
+    # The hands are then flat, which the user should know.
     absent = [key for key in HAND_POSES if key not in arrays]
     if absent:
         notes.append(f"{path} has no {' and '.join(absent)}: taken as flat hands")
@@ -296,13 +313,16 @@ def read_motion(
 
     # Only the frames that have images, and finite numbers.
     finite = np.isfinite(np.concatenate([theta, transl, face], axis=1)).all(1)
-    there = np.array([f for f in sorted(frames) if f < count], np.int64)
+    there = np.array(sorted(frames), np.int64)
+    there = there[there < count]
     ids = there[finite[there]]
     if not len(ids):
         raise DataError(
             f"{path} has {count} rows, but no finite one of a frame that has images; expected row "
             "i to be frame i"
         )
+
+    # Frames that a fit has failed on.
     lost = there[~finite[there]].tolist()
     if lost:
         notes.append(f"{path}: NaN or infinity at frames {spans(lost)}")
@@ -340,7 +360,11 @@ def _rows(
 
 
 def _coefficients(
-    arrays: dict[str, Any], key: str, most: int, path: Path, count: int | None = None
+    arrays: dict[str, Any],
+    key: str,
+    most: int,
+    path: Path,
+    count: int | None = None,
 ) -> Float:
     """``[N, n]`` coefficients, at most as many as the model's; further ones must be 0."""
     # A model file with fewer shapes than the fit would give another body.

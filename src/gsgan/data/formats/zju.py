@@ -34,7 +34,7 @@ from gsgan.data.formats.smpl_motion import SmplMotion, landmarks_of, zju_motion
 from gsgan.data.layout import BodyModel, Found, Meta
 from gsgan.data.pixels import IGNORE_LABEL, MaskFile, PixelRules, mask_file
 from gsgan.data.skeletons import make_landmarks
-from gsgan.data.validation import Thresholds
+from gsgan.data.validation import Thresholds, frames_of
 from gsgan.utils.errors import DataError
 from gsgan.utils.pickles import read_npy
 
@@ -43,13 +43,13 @@ Files = Mapping[str, Mapping[int, str]]
 
 ANNOTS = ("annots.npy", "annots_new.npy")
 MILLIMETRES = 1e-3
-# metres: plausible lengths of the cameras' T
+# Plausible lengths of the cameras' T, metres.
 TRANSLATION = (0.05, 20.0)
 # as in CoreView_313_Camera_(1)_0001_2019-08-23_16-08-50.592
 NAMED_FRAME = re.compile(r"\)_(\d+)")
 # part numbers by stored label: files may hold stray numbers beyond CIHP's
 CIHP_TABLE = tuple(i if i < len(CIHP) else IGNORE_LABEL for i in range(256))
-# folders of SMPL parameters, the best fit first
+# Folders of SMPL parameters, the best fit first.
 FITS = {"refit": "new_params", "refined": "smpl_params", "first": "params"}
 # the fit whose body is posed without pose blend shapes
 UNBLENDED = "first"
@@ -79,17 +79,20 @@ class ZjuReader(FolderReader):
         cameras = self._cameras(root, annots, images)
 
         # The SMPL fit that the release has, the best first.
-        kind = next((name for name, at in FITS.items() if (root / at).is_dir()), None)
-        if kind is None:
-            looked = ", ".join(f"{folder}/" for folder in FITS.values())
+        kinds = [kind for kind, folder in FITS.items() if (root / folder).is_dir()]
+        if not kinds:
+            looked = "/, ".join(FITS.values())
             raise DataError(
-                f"{root} has no SMPL parameters; expected one of the folders {looked}"
+                f"{root} has no SMPL parameters; expected one of the folders {looked}/"
             )
+        kind = kinds[0]
         params = FITS[kind]
-        frames = set[int]().union(*images.values())
-        motion = _read_motion(root, params, frames, model)
+
+        # Poses of the frames that have images, and the landmarks on the posed body.
+        motion = _read_motion(root, params, frames_of(images), model)
         p, conf = landmarks_of(model, motion, pose_blend=kind != UNBLENDED)
 
+        # Part labels count as masks too.
         masks, labels = _index_masks(root, folders)
         return Found(
             root=root,
@@ -168,12 +171,15 @@ def read_annots(root: Path) -> Annots:
     Raises:
         DataError: when there is none, it is damaged, or its cameras are not complete.
     """
+    # The file that every release has, under one of two names.
     path = next((root / name for name in ANNOTS if (root / name).exists()), None)
     if path is None:
         raise DataError(
             f"{root} is not a ZJU-MoCap subject: it has no annots.npy (copies that other projects "
             "prepared are not supported)"
         )
+
+    # A pickled dict: the cameras, and the images of each frame.
     content = read_npy(path)
     cams = content.get("cams") if isinstance(content, dict) else None
     if not isinstance(cams, dict):
@@ -191,6 +197,7 @@ def read_annots(root: Path) -> Annots:
             image = PurePosixPath(str(name).replace("\\", "/"))
             folders.append(str(image.parent))
 
+    # Every list has one entry per camera.
     annots = Annots(
         path=path,
         K=_entries(cams.get("K")),
@@ -222,6 +229,7 @@ def camera_folders(root: Path, annots: Annots) -> dict[str, str]:
     Raises:
         DataError: when a folder is not one of the subject's, or two cameras share one.
     """
+    # Copies move the folders, so each is looked for.
     places = [_place(root, folder) for folder in annots.folders]
 
     # Masks are found by the folder's name, so it must be unique.
@@ -242,6 +250,8 @@ def _place(root: Path, folder: str) -> str:
         raise DataError(
             f"{root}: annots lists images in {folder!r}, which is not a folder in it"
         )
+
+    # As listed, at the top, or in a folder of images.
     for place in (folder, parts[-1], f"images/{parts[-1]}"):
         if (root / place).is_dir():
             return place
@@ -257,6 +267,7 @@ def frame_number(stem: str) -> int | None:
 
 def _index_images(root: Path, folders: Mapping[str, str]) -> dict[str, FrameFiles]:
     """The images of each camera by frame number."""
+    # A single camera may have none, but not all of them.
     images = {}
     for name, folder in folders.items():
         images[name] = frame_files(root, folder, IMAGES, frame_number)
@@ -278,8 +289,12 @@ def _index_masks(
     # CIHP's part labels, which JPEG compression would damage; as masks, every part is the person.
     for name, folder in folders.items():
         parts = _mask_files(root, "mask_cihp", name, folder)
-        labels[name] = {f: path for f, path in parts.items() if path.endswith(".png")}
-        masks[name] = {f: (MaskFile("nonzero", path),) for f, path in parts.items()}
+        masks[name] = {}
+        labels[name] = {}
+        for frame, path in parts.items():
+            masks[name][frame] = (MaskFile("nonzero", path),)
+            if path.endswith(".png"):
+                labels[name][frame] = path
 
     # The other masks of the same images are joined with them.
     for name, folder in folders.items():
@@ -289,7 +304,12 @@ def _index_masks(
     return masks, labels if any(labels.values()) else {}
 
 
-def _mask_files(root: Path, kind: str, name: str, folder: str) -> FrameFiles:
+def _mask_files(
+    root: Path,
+    kind: str,
+    name: str,
+    folder: str,
+) -> FrameFiles:
     """A camera's masks of one kind: in mask/Camera_B1, or mask/images/00 as some copies have it."""
     place = f"{kind}/{name}"
     other = f"{kind}/{folder}"
@@ -299,9 +319,13 @@ def _mask_files(root: Path, kind: str, name: str, folder: str) -> FrameFiles:
 
 
 def _read_motion(
-    root: Path, folder: str, frames: Iterable[int], model: SkinnedModel
+    root: Path,
+    folder: str,
+    frames: Iterable[int],
+    model: SkinnedModel,
 ) -> SmplMotion:
     """The parameters of the frames that have any, in the model's own convention."""
+    # One file per frame, named by its number.
     files = frame_files(root, folder, (".npy",))
     ids = sorted(set(frames) & set(files))
     if not ids:
