@@ -226,7 +226,7 @@ class Avatar(nn.Module):
         body = self.body_pose(skeleton, visibility) if body is None else body
         window = self.window(skeleton, camera)
 
-        # All inputs go to the device; `forward` finds no window a second time.
+        # All inputs go to the device. `forward` renders cameras that see a window as they are.
         rendering = self(
             skeleton.to(device),
             visibility.to(device),
@@ -334,14 +334,15 @@ class Avatar(nn.Module):
             follows = self.body_points or self.surface or self.segmentation
             if body is not None and follows is not None:
                 with self.stage("bones"):
-                    body = follows.points.with_bones(body)  # once for G and S
+                    # The bones are computed once for G and S.
+                    body = follows.points.with_bones(body)
 
             # Step I's part: Ĝ and its splatted features F.
             gaussians = self.splat(p, valid, frames, camera, body, pose_noise, reach)
             if gaussians is not None:
                 raster = self._rasterised(gaussians, camera, supersample)
 
-            # The generator's other inputs; the frozen S gets no gradient.
+            # The generator's other inputs: S, the drawn skeleton p₂D and the rotations Ω.
             if generate and self.generator is not None:
                 if self.segmentation is not None:
                     # trained on its own, then frozen
@@ -373,9 +374,11 @@ class Avatar(nn.Module):
             image = generated[:, :3]
             alpha = generated[:, 3:]
 
-        # Step I's colour is the image where there is no generator.
+        # Nothing is splatted in image_to_image.
         if raster is None:
             return Rendering(image, alpha, segmentation=S)
+
+        # Step I's colour is the image where there is no generator.
         if self.generator is None:
             image = raster.features[:, :3]
             alpha = raster.alpha
@@ -414,7 +417,7 @@ class Avatar(nn.Module):
         else:
             return None
 
-        # The generator states the range of its features, if there is one.
+        # The bound of the features is the generator's, so there is none without a generator.
         bound = getattr(self.generator, "feature_bound", None)
         if bound is None:
             return gaussians  # type: ignore[no-any-return]

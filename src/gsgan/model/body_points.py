@@ -94,7 +94,8 @@ class LearntWeights(nn.Module):
             ((dense > LEAST) + around).topk(min(FOLLOWED_BONES, joints), dim=1).indices
         )
 
-        # Logarithms of the weights at the start; bones that no neighbour follows stay at zero.
+        # Logarithms of the weights at the start. Bones that neither the point nor its
+        # neighbourhood follows keep a weight of about zero.
         possible = (dense + around).gather(1, index) > LEAST
         start = (
             dense.gather(1, index).clamp_min(LEAST).log().masked_fill(~possible, -30.0)
@@ -314,7 +315,7 @@ class BodyPoints(nn.Module):
         self.mean_step = mean_step
         self.rate = above("model.body_points.rate", rate)
 
-        # Places and normals at rest, which Ψ takes as the identity of a point.
+        # Places at rest, which tell Ψ one point from another, and normals, which move with the pose.
         rest = (self.points.means - self.points.means.mean(dim=0)) / body_height
         self.register_buffer("rest_points", rest, persistent=False)
         normals = vertex_normals(body.vertices.float(), body.faces)[self.points.chosen]
@@ -358,7 +359,7 @@ class BodyPoints(nn.Module):
         # A trained avatar computes the terms once for its weights.
         if not self.training:
             return derived(self, "terms", make, learnt.field)
-        # In training the terms are kept for a few iterations, and have no gradient.
+        # In training the terms are kept for `stretch_every` iterations and have no gradient.
         if self._terms is None or self._age == self.stretch_every:
             with torch.no_grad():
                 self._terms = make()
@@ -384,7 +385,9 @@ class BodyPoints(nn.Module):
         # The means, moved by LBS.
         A, t = self.points.blend(pose)
         means = skin(self.points.means, A, t)
-        if not pose.bones.requires_grad:  # only the means give the weights a gradient
+
+        # Only the means give the weights a gradient.
+        if not pose.bones.requires_grad:
             A = A.detach()
             t = t.detach()
         # Shapes and normals follow the stretch of the surface.
