@@ -100,6 +100,7 @@ class Avatar(nn.Module):
         window_least: int = 32,
     ) -> None:
         super().__init__()
+
         # Settings of the rendering.
         self.effects = effects
         self.accuracy = accuracy
@@ -110,16 +111,19 @@ class Avatar(nn.Module):
         self.window_margin = window_margin
         self.window_multiple = window_multiple
         self.window_least = window_least
+
         # Parts of Step I: G, Ψ or the surface's Gaussians.
         self.deformation = deformation
         self.densify = densify
         self.body_points = body_points
         self.surface = surface
+
         # Parts of Step II: S, the pose code and the image.
         self.segmentation = segmentation
         self.segmentation_why = segmentation_why
         self.pose_encoder = pose_encoder
         self.generator = generator
+
         # Parts that are not networks of the paper.
         self.colour = colour
         self.solver = solver
@@ -154,6 +158,7 @@ class Avatar(nn.Module):
         Weights get no gradient; skeleton and camera do.
         """
         self.eval().requires_grad_(False)
+
         # Every part gets a store, in which `gsgan.utils.tensors.derived` keeps its results.
         for part in self.modules():
             part.derived = {}  # type: ignore[assignment]
@@ -305,6 +310,7 @@ class Avatar(nn.Module):
         """The part of the images that holds the person; None means all of what the cameras see."""
         if self.window_margin is None or camera.whole_height is not None:
             return None
+
         # The window's sides suit the generator's stride.
         sides = {"multiple": self.window_multiple, "least": self.window_least}
         margin = self.window_margin
@@ -438,6 +444,7 @@ class Avatar(nn.Module):
     ) -> tuple[Points, Residuals]:
         """G in pose and Ψ's ΔG without noise; arguments as for `splat`."""
         assert self.deformation is not None
+
         # G in the pose, from the same frames as the pose code.
         frames = bone_frames(p, valid, self.template)
         points = self.points(p, valid, frames, body)

@@ -69,6 +69,7 @@ class LearntWeights(nn.Module):
         controls: int,
     ) -> None:
         super().__init__()
+
         # The controls are spread over the body, and each point is near a few of them.
         count = min(controls, len(places))
         at = places[farthest_points(places, count)]
@@ -144,6 +145,7 @@ class SkinnedPoints(nn.Module):
         self, body: SkinnedBody, count: int | None = None, controls: int = 0
     ) -> None:
         super().__init__()
+
         # The subset is spread over the template, so that it is the same for every shape of the
         # body.
         if count is not None:
@@ -214,6 +216,7 @@ class SkinnedGaussians(nn.Module):
         self, body: SkinnedBody, points: int | None, opacity: float, scale: float
     ) -> None:
         super().__init__()
+
         # Quats start at the identity.
         self.points = SkinnedPoints(body, points)
         count = len(self.points)
@@ -298,6 +301,7 @@ class BodyPoints(nn.Module):
         rate: float = 1.0,
     ) -> None:
         super().__init__()
+
         # The number of points; a mesh with too few vertices is subdivided.
         if points == AUTO:
             points = points_for(body_height, scale, spacing)
@@ -315,7 +319,7 @@ class BodyPoints(nn.Module):
         self.mean_step = mean_step
         self.rate = above("model.body_points.rate", rate)
 
-        # Places at rest, which tell Ψ one point from another, and normals, which move with the pose.
+        # Places at rest tell Ψ one point from another; normals move with the pose.
         rest = (self.points.means - self.points.means.mean(dim=0)) / body_height
         self.register_buffer("rest_points", rest, persistent=False)
         normals = vertex_normals(body.vertices.float(), body.faces)[self.points.chosen]
@@ -359,6 +363,7 @@ class BodyPoints(nn.Module):
         # A trained avatar computes the terms once for its weights.
         if not self.training:
             return derived(self, "terms", make, learnt.field)
+
         # In training the terms are kept for `stretch_every` iterations and have no gradient.
         if self._terms is None or self._age == self.stretch_every:
             with torch.no_grad():
@@ -382,6 +387,7 @@ class BodyPoints(nn.Module):
         """
         pose = self.points.with_bones(pose)
         assert pose.bones is not None
+
         # The means, moved by LBS.
         A, t = self.points.blend(pose)
         means = skin(self.points.means, A, t)
@@ -390,6 +396,7 @@ class BodyPoints(nn.Module):
         if not pose.bones.requires_grad:
             A = A.detach()
             t = t.detach()
+
         # Shapes and normals follow the stretch of the surface.
         jacobian = (
             stretched(A, pose.bones, *self.stretch_terms()) if self.stretch else None
@@ -422,6 +429,7 @@ def points_for(body_height: float, scale: float, spacing: float) -> int:
         spacing: pixels.
     """
     above("model.body_points.spacing", spacing)
+
     # The skin's area grows with the square of the stature.
     area = SKIN * (body_height / STATURE) ** 2
     count = area * (scale / spacing) ** 2
@@ -435,6 +443,7 @@ def moved_normals(A: Tensor, normals: Tensor) -> Tensor:
     flattens a point's neighbourhood to about NORMAL_FLOOR of its area, the normal fades to zero.
     """
     x, y, z = A.unbind(-1)
+
     # Columns of the cofactor matrix are cross products of the columns of A.
     cofactors = [torch.linalg.cross(a, b) for a, b in ((y, z), (z, x), (x, y))]
     moved = (torch.stack(cofactors, dim=-1) @ normals.unsqueeze(-1)).squeeze(-1)
@@ -453,6 +462,7 @@ def farthest_points(vertices: Tensor, count: int) -> Tensor:
     axes = np.ascontiguousarray(vertices.numpy().T)
     chosen = np.zeros(count, np.int64)
     nearest = np.full(len(vertices), np.inf, axes.dtype)
+
     # Each step takes the vertex that is farthest from all chosen ones.
     for i in range(1, count):
         squared = (axes - axes[:, chosen[i - 1], None]) ** 2

@@ -26,6 +26,7 @@ class ColourCorrection(nn.Module):
     def __init__(self, trained: Sequence[str], cameras: Sequence[str]) -> None:
         super().__init__()
         self.offsets = nn.Parameter(torch.zeros(len(trained), 3, 4))
+
         # The last row, after those of the training cameras, is the identity of held-out ones.
         rows = [
             trained.index(name) if name in trained else len(trained) for name in cameras

@@ -68,6 +68,7 @@ class _Geometry(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor, Tensor]:
         raw, *fixed, numbers = arguments
+
         # The job points to the inputs and to empty outputs, which the compiled code fills.
         B, N, _ = raw.shape
         outputs = raw.new_empty(B, N, 3), raw.new_empty(B, N, 3, 3), raw.new_empty(B, N)
@@ -85,6 +86,7 @@ class _Geometry(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         raw, *fixed = ctx.saved_tensors
+
         # The job is the forward one, with incoming gradients and the gradient of raw as its
         # output.
         job, _held = _job(raw, fixed, ctx.numbers)

@@ -73,6 +73,7 @@ class ResidualGaussians(nn.Module):
     ) -> None:
         super().__init__()
         one_of("model.deformation: sh_degree", sh_degree, range(4))
+
         # Lengths of the network are in body heights.
         self.body_height = float(body_height)
 
@@ -120,6 +121,7 @@ class ResidualGaussians(nn.Module):
         start at zero and get no gradient until they are active."""
         if self.active_degree >= self.sh_degree:
             return values
+
         # The harmonics are the fifth part; the active ones are its first channels.
         first = sum(self.parts[:4])
         last = sum(self.parts[:5])
@@ -129,12 +131,13 @@ class ResidualGaussians(nn.Module):
     def _parted(self, raw: Tensor) -> Residuals:
         """The residuals of raw numbers ``[B, N, ...]``, those of `_active`."""
         sizes = (*self.parts[:4], 3 * (self.active_degree + 1) ** 2, self.features)
+
         # Only the active harmonics are there to split.
         means, quats, scales, opacities, sh, features = raw.split(sizes, dim=-1)
         sh = sh.unflatten(-1, (-1, 3))
         opacities = opacities[..., 0]
 
-        # Means move in steps that suit the learning rate.
+        # The factor on the means sets how fast they move.
         return Residuals(self.mean_step * means, quats, scales, opacities, sh, features)
 
     def compose(self, points: Points, residuals: Residuals, eye: Tensor) -> Gaussians:
@@ -223,7 +226,7 @@ class ResidualGaussians(nn.Module):
             face: ``[B, E, 3]`` in place of the last E joints, since an expression in body heights
                 would be a hundredth of the code; None: E is 0.
         """
-        # Joints are about the root, so that walking elsewhere changes nothing.
+        # Joints are about the root, so that the person's place in the world changes nothing.
         code = (p - root[:, None]) / self.body_height
         if self.pose_frame == "pelvis":
             code = code @ pelvis
@@ -232,7 +235,7 @@ class ResidualGaussians(nn.Module):
         if face is not None:
             code = torch.cat([code[:, : -face.shape[1]], face], dim=1)
 
-        # Noise keeps Ψ from learning each training pose by heart.
+        # Noise is given in training only.
         if noise is not None:
             code = code + noise
         return code.flatten(1)
@@ -459,11 +462,12 @@ class Deformation(ResidualGaussians):
     def _interpolated(self, raw: Tensor, chosen: Tensor | None) -> Tensor:
         """The anchors' ``raw [B, A, C]`` at the points ``chosen [B, M]``, or at all."""
         B, A, _ = raw.shape
+
         # Anchors and shares of the points that are wanted.
         near = self.near.expand(B, -1, -1) if chosen is None else self.near[chosen]
         share = self.share.expand(B, -1, -1) if chosen is None else self.share[chosen]
 
-        # One table of the whole batch: anchors of item b begin at row b A.
+        # One table holds the whole batch: the anchors of item b begin at row A · b.
         first = A * torch.arange(B, device=raw.device)
         spread = functional.embedding_bag(
             (near + first[:, None, None]).flatten(0, 1),
@@ -472,7 +476,7 @@ class Deformation(ResidualGaussians):
             per_sample_weights=share.flatten(0, 1).to(raw.dtype),
         )
 
-        # One row for each item and point becomes a row per item again.
+        # The rows of all items are split into items again.
         return spread.unflatten(0, (B, -1))
 
     def _network(
@@ -487,7 +491,7 @@ class Deformation(ResidualGaussians):
         means = means if root.requires_grad else means.detach()
         position = self._places(means, root, pelvis)
 
-        # Likewise the places of the anchors.
+        # The places of the anchors are limited likewise.
         if limit is not None:
             far = limit * self.place_spread
             position = self.place_mean + (position - self.place_mean).clamp(-far, far)
@@ -503,7 +507,7 @@ class Deformation(ResidualGaussians):
         ):
             x = self._trained(code, normals, pose)
         else:
-            # All that depends on both pose and point is one product.
+            # The inputs that depend on both pose and point enter by one product.
             weight = self.from_position.weight
             if self.from_normal is not None:
                 code = torch.cat([code, normals], dim=-1)
@@ -514,7 +518,7 @@ class Deformation(ResidualGaussians):
             x = torch.baddbmm(start, code, weight.mT.expand(len(pose), -1, -1))
             x = functional.relu(x, inplace=True)
 
-            # The other layers work in place: no gradient or autograd needs what they overwrite.
+            # The other layers work in place, since ReLU's gradient needs its output only.
             for layer in self.trunk:
                 x = functional.relu(layer(x), inplace=True)
 
@@ -549,7 +553,7 @@ class Deformation(ResidualGaussians):
             given.append(normals)
             weights.append(self.from_normal.weight)
 
-        # All points have the same code at rest in each item of the batch.
+        # The codes at rest are the same in every item of the batch.
         size = code.shape[:2]
         known = torch.cat([x.expand(*size, -1) for x in given], dim=-1)
         weight = torch.cat([from_rest, *weights, from_embedding], dim=-1)
@@ -579,6 +583,7 @@ def colour_from(eye: Tensor, means: Tensor, frames: Tensor, sh: Tensor) -> Tenso
     keeps its highlights.
     """
     view = means  # at degree 0 a colour has no direction
+
     # Higher degrees depend on the direction from the eye to the point, in the frame of the part.
     if sh.shape[-2] > 1:
         view = functional.normalize(means - eye[:, None], dim=-1, eps=1e-6)
@@ -602,6 +607,7 @@ def positional_encoding(x: Tensor, octaves: int) -> Tensor:
     """
     if octaves == 0:
         return x
+
     # Each coordinate gets its own angles, in the order of the coordinates.
     frequencies = math.pi * 2.0 ** torch.arange(octaves, device=x.device, dtype=x.dtype)
     angles = (x.unsqueeze(-1) * frequencies).flatten(-2)
@@ -649,7 +655,7 @@ class _Trunk(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        # Half of the rest are weights, half are outputs: one output more than layers below it.
+        # The rest are n weights, then n + 1 outputs, those of the first layer first.
         inputs, weight, *rest = ctx.saved_tensors
         B, N, learned = ctx.size
         count = len(rest) // 2
@@ -668,7 +674,7 @@ class _Trunk(torch.autograd.Function):
             g = g @ w
             through.grad_input(g, x, 0, grad_input=g)
 
-        # The first layer: only the learned part of its input has a gradient.
+        # Of the first layer's input only the learned part, its last columns, has a gradient.
         d_learned = g @ weight[:, weight.shape[1] - learned :]
         return (
             None,
@@ -691,8 +697,8 @@ class _Bounded(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
         (x,) = ctx.saved_tensors
         low, high = ctx.bounds
-        # The gradient's descent step is against its sign: these values would move away from the
-        # range.
+
+        # A descent step against these gradients would lead further out of the range.
         outwards = ((x > high) & (grad < 0)) | ((x < low) & (grad > 0))
         return grad.masked_fill(outwards, 0.0), None, None
 

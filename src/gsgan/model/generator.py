@@ -24,6 +24,7 @@ class Encoder(nn.Module):
 
     def __init__(self, inputs: int, channels: Sequence[int], patch: int = 1) -> None:
         super().__init__()
+
         # The stem reads single pixels, or patches of them.
         first = channels[0]
         kernel = {"kernel_size": 3, "padding": 1}
@@ -43,7 +44,7 @@ class Encoder(nn.Module):
 
     def levels(self, stem: Tensor) -> list[Tensor]:
         """The features of every level from the stem's output, before its activation."""
-        # The stem's own activation and, with patches, a second convolution.
+        # The stem is activated; with patches a second convolution follows.
         levels = [_activate(stem)]
         if self.after is not None:
             levels = [_activate(self.after(levels[0]))]
@@ -73,6 +74,7 @@ class StyleModulation(nn.Module):
         activated."""
         # channels last in memory: channels of a pixel are a row
         rows = h.permute(0, 2, 3, 1)
+
         # The pose gives each channel a scale and a shift.
         modulation = self.from_pose(g).unsqueeze(1)
 
@@ -168,6 +170,7 @@ class Generator(nn.Module):
     ) -> None:
         super().__init__()
         one_of("model.generator.patch", patch, [2**i for i in range(len(multipliers))])
+
         # The whole network halves the resolution this often; images are padded to a multiple of
         # it.
         self.patch = patch
@@ -319,7 +322,7 @@ def upsampled_kernel(weight: Tensor) -> Tensor:
     """``[I, O, 4, 4]`` of a transposed convolution of stride 2 and padding 1: the kernel
     ``[O, I, 3, 3]`` after upsampling to the nearest."""
     for dim in (2, 3):
-        # Rows (or columns) of the sums of weights that meet the same pixel of the smaller map.
+        # A pixel reaches four upsampled ones in each direction, with these sums of weights.
         first, middle, last = weight.unbind(dim)
         weight = torch.stack([last, middle + last, first + middle, first], dim)
     return channels_last(weight.transpose(0, 1))
