@@ -61,6 +61,7 @@ class ImageGrid(Callback):
     def on_validation_epoch_end(
         self, trainer: Trainer, module: LightningModule
     ) -> None:
+        # Only the first process has collected rows.
         if self._collected:
             write_grid(
                 self._collected, self.folder / f"step_{_training(module).step:06d}.png"
@@ -72,6 +73,8 @@ class ProgressLines(Callback):
 
     def __init__(self, console: Console) -> None:
         self.console = console
+
+        # When this part of the run began, and at which iteration.
         self._clock = time.monotonic()
         self._first = 0
 

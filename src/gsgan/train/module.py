@@ -355,7 +355,7 @@ class AvatarTraining(LightningModule):
     def _computed(self, compute: Callable[[], T]) -> T | None:
         """The result, or None in every process where one cannot compute it: where data or weights
         are not finite, or far away, the rasteriser refuses them with a ValueError."""
-        # The rasteriser's refusal is a ValueError.
+        # A failure is kept until all processes know of it.
         found = None
         problem = ""
         try:
@@ -535,6 +535,7 @@ class AvatarTraining(LightningModule):
             self.log(name, value.detach(), sync_dist=True)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        # The counters are for a later part of the run, the rest is for scores and `gsgan.load`.
         checkpoint["gsgan"] = {
             "step": self.step,
             "processes": self.processes,

@@ -88,6 +88,8 @@ def check_recipes(recipes: dict[str, Recipe], names: Iterable[str]) -> None:
     for name in names:
         if name not in recipes:
             raise ConfigError(f"training.recipes lacks {name}")
+
+        # Only psi and colour train in both steps.
         if name not in SPLATTING and recipes[name].span != "both":
             raise ConfigError(
                 f"training.recipes.{name}.span is read for psi and colour only"

@@ -113,6 +113,7 @@ class Schedule:
 
     def bounds(self, phase: str) -> tuple[int, int]:
         """First iteration of a phase, and the first after it."""
+        # Each phase begins where the one before it ends.
         ends = {
             SEGMENTATION: (0, self.segmentation),
             STEP_ONE: (self.segmentation, self.segmentation + self.step_one),
