@@ -275,7 +275,7 @@ class Avatar(nn.Module):
             reach: metres; Ψ is not computed at points farther than this from what the cameras
                 see. None computes it at all points.
         """
-        # The window crops the cameras, so that everything after it is drawn smaller.
+        # The window crops the cameras, so that only the part with the person is drawn.
         body = self.body_pose(skeleton, visibility) if body is None else body
         window = self.window(skeleton, camera)
         rendering = self._rendered(
@@ -523,7 +523,7 @@ def seen_points(means: Tensor, camera: Camera, reach: float) -> Tensor:
     height, width = camera.size
     pixels, depth = camera.project(means)
 
-    # The reach in pixels, at each point's depth; depths below the reach would make it endless.
+    # The reach in pixels at each point's depth. A depth below the reach counts as the reach.
     focal = torch.stack([camera.K[:, 0, 0], camera.K[:, 1, 1]], dim=-1)
     beyond = reach * focal[:, None] / depth.clamp_min(reach).unsqueeze(-1)
 

@@ -560,9 +560,9 @@ class Deformation(ResidualGaussians):
 
         # The pose is the same for all points of an item, so it is part of the bias.
         bias = self.from_point.bias + self.from_pose(pose)
-        layers = [x for layer in self.trunk for x in (layer.weight, layer.bias)]
 
         # Weights and biases take turns, as `_Trunk` expects them.
+        layers = [x for layer in self.trunk for x in (layer.weight, layer.bias)]
         x: Tensor = _Trunk.apply(
             known, self.embedding.expand(*size, -1), weight, bias, *layers
         )
