@@ -34,17 +34,25 @@ class Fit:
     """Settings of the registration, see conf/fit/standard.yaml; docs/data.md has measurements."""
 
     accuracy: Accuracy
+
+    # Which poses are written, and which masks are used.
     keep: bool = False
     held_out: bool = False
     least_mask: float = 0.1
+
+    # The surface, and the numbers of steps, frames and cameras.
     points: int = 3000
     surface_steps: int = 150
     sweeps: int = 15
     frames: int = 60
     cameras: int = 8
+
+    # Weights of the priors, see `Fitter`.
     noise: float = 0.02
     landmarks: float = 0.02
     prior: float = 0.005
+
+    # Learning rates, and the share of the sweeps in which they stay.
     angle_rate: float = 0.004
     transl_rate: float = 0.0015
     surface_rate: float = 0.01
@@ -87,6 +95,8 @@ class FittedSurface(nn.Module):
 
     def __init__(self, body: Body, points: int, accuracy: Accuracy) -> None:
         super().__init__()
+
+        # The points are a subset of the vertices, with their bones and normals.
         self.body = body
         self.accuracy = accuracy
         self.points = SkinnedPoints(body, points)
@@ -101,6 +111,8 @@ class FittedSurface(nn.Module):
         spread = CONTROL_SPREAD * second.median()
         basis = torch.softmax(-(distance / spread).square(), dim=1)
         self.register_buffer("basis", basis, persistent=False)
+
+        # All distances start at zero, and all Gaussians at the size that fits the spacing.
         self.offsets = nn.Parameter(torch.zeros(basis.shape[1]))
         self.log_scale = nn.Parameter(torch.zeros(()))
 
@@ -192,6 +204,8 @@ class Fitter:
 
     def pose(self, rows: Tensor | None = None) -> BodyPose:
         """The current poses of these rows, or of all."""
+        # The start of each frame plus its learned change, of which the last row is the
+        # translation.
         if rows is None:
             rows = torch.arange(len(self.start.theta))
         rows = rows.to(self.start.theta.device)
@@ -203,10 +217,13 @@ class Fitter:
 
     def surface_step(self) -> None:
         """One step of the surface on one frame; poses stay."""
+        # The frame follows from the seed and the step.
         chance = random.Random(f"{self.seed} surface {self.shaped}")
         i = chance.randrange(len(self.start.theta))
         with torch.no_grad():
             pose = self.pose(torch.tensor([i]))
+
+        # Only the surface gets a gradient.
         share, _ = self._share(i, pose)
         self.surface_optimiser.zero_grad()
         share.backward()  # type: ignore[no-untyped-call]
@@ -221,6 +238,7 @@ class Fitter:
         order = list(range(len(self.start.theta)))
         chance.shuffle(order)
         for i in order:
+            # The difference from the masks, in the frame's current pose.
             pose = self.pose(torch.tensor([i]))
             share, landmarks = self._share(i, pose)
 
@@ -233,6 +251,8 @@ class Fitter:
                 + settings.landmarks * (self.weight[i] * robust).sum() / len(robust)
                 + settings.prior * turned.square().sum() / self.bones
             )
+
+            # Surface and pose take a step each.
             self.surface_optimiser.zero_grad()
             self.pose_optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
@@ -248,6 +268,7 @@ class Fitter:
         """
         by_frame = []
         for i in range(len(poses.theta)):
+            # The surface in this frame's pose.
             pose = BodyPose(poses.theta[i][None], poses.transl[i][None])
             person, _ = self.surface.posed(pose)
 
@@ -270,6 +291,8 @@ class Fitter:
         person, landmarks = self.surface.posed(pose)
         wrong = []
         areas = []
+
+        # The sum over all cameras, so that an image with little of the person counts little.
         for seen in self._windows(i):
             alpha = self.surface.alpha(person, seen.camera)
             wrong.append(_wrong(alpha, seen).sum())
@@ -289,6 +312,8 @@ class Fitter:
         rest = max(self.settings.sweeps - held, 1e-9)
         fallen = min(max(self.swept - held, 0) / rest, 1)
         factor = FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * fallen))
+
+        # Both optimisers share the course of the rate.
         surface_rate = self.settings.surface_rate * factor
         angle_rate = self.settings.angle_rate * factor
         self.surface_optimiser.param_groups[0]["lr"] = surface_rate

@@ -92,6 +92,8 @@ class MaskedFrames:
         )
         self.cameras = cameras
         self.device = device
+
+        # The masks are read once and stay in memory as bytes.
         self._masks: dict[int, tuple[Bytes, Bytes | None]] = {}
         for place in track(range(len(items))):
             self._masks[place] = self._read(place)
@@ -103,6 +105,8 @@ class MaskedFrames:
                 f"{layout.root}: the masks of {', '.join(cameras)} hold no person"
             )
         self.left_out = len(items) - len(places)
+
+        # Frames that no usable image shows are not fitted.
         by_frame: dict[int, list[int]] = defaultdict(list)
         for place in places:
             _, frame = items[place]
@@ -121,6 +125,7 @@ class MaskedFrames:
 
         Pixels outside the camera's image are unsure, as are those that the mask marks.
         """
+        # The mask's own unsure pixels.
         mask, unsure = self.dataset.mask(place)
         inside = self.dataset.inside(place)
         if inside is not None:
@@ -145,6 +150,8 @@ class MaskedFrames:
         shrink with the distance, and the rest of an image may show other persons.
         """
         landmarks = self.dataset.layout.landmarks
+
+        # The area of the mask where it is compared.
         areas = []
         for place in range(len(self.dataset)):
             _, frame = self.dataset.items[place]
@@ -155,10 +162,13 @@ class MaskedFrames:
             mask = seen.mask
             if seen.unsure is not None:
                 mask = mask * (1 - seen.unsure)
+
+            # The area of a pixel at the person's depth, in square metres.
             depth = seen.camera.to_camera(skeleton[None])[0, :, 2].median()
             pixel = (depth / seen.camera.K[0, 0, 0]).square()
             areas.append(float(mask.sum() * pixel))
 
+        # The usual area is that of masks with a person.
         known = [area for area in areas if area > 0]
         usual = float(np.quantile(known, USUAL)) if known else np.inf
         return [place for place, area in enumerate(areas) if area >= least * usual]
@@ -170,6 +180,7 @@ class MaskedFrames:
 
 def spread_frames(data: GsganData, frames: Sequence[int], most: int) -> list[int]:
     """At most so many frames, rising, whose poses are far from each other."""
+    # All frames are used if they are few.
     if len(frames) <= most:
         return list(frames)
     p, _ = data.layout.landmarks.joints(frames)
@@ -181,6 +192,8 @@ def rotated(cameras: Sequence[str], most: int | None, turn: int) -> list[str]:
     """At most so many cameras, evenly spaced; the next turn takes their neighbours."""
     if most is None or len(cameras) <= most:
         return list(cameras)
+
+    # The cameras are evenly spaced, and each turn begins one camera later.
     places = [
         (turn + place) % len(cameras) for place in evenly_spaced(len(cameras), most)
     ]

@@ -132,6 +132,7 @@ def run_fit(config: DictConfig) -> Path:
     Raises:
         ConfigError, DataError: on anything the user can correct.
     """
+    # The parts of the config, and the folder of the results.
     settings: Fit = instantiate(config.fit)
     data: GsganData = instantiate(config.data, _convert_="all")
     device = pick_device(config.device)
@@ -258,6 +259,7 @@ def fit_body(
 
 def _registered(fitter: Fitter, settings: Fit, console: Console) -> BodyPose:
     """The poses after all steps of the fit."""
+    # The surface comes first, in the solved poses; surface and poses follow together.
     with progress(console) as bars:
         for _ in bars.track(range(settings.surface_steps), description="surface"):
             fitter.surface_step()
@@ -269,6 +271,7 @@ def _registered(fitter: Fitter, settings: Fit, console: Console) -> BodyPose:
 
 def _make_folder(out: Path, overwrite: bool) -> None:
     """Makes the folder; fails before minutes of work if it cannot be written."""
+    # An empty file shows whether the folder can be written.
     attempt = out / ".body_fit.try"
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
@@ -302,6 +305,8 @@ def _write_body(
     where they are in the masks.
     """
     arrays: dict[str, NDArray[Any]] = {}
+
+    # Translations are stored in the unit of the capture.
     fingers = _fingers(shape)
     unit = METRES[data.layout.meta.unit]
     for hands, solved in poses.items():
@@ -333,6 +338,7 @@ def _joints(
     data: GsganData, frames: Sequence[int], hands: bool = False
 ) -> tuple[Tensor, Tensor]:
     """Joints ``[F, 33, 3]`` metres and their visibility; 75 with hands, if the data has some."""
+    # Landmarks of the body, with those of the hands where they are wanted.
     landmarks = data.layout.landmarks
     if hands and data.layout.hands is not None:
         landmarks = landmarks.with_hands(data.layout.hands)
@@ -363,6 +369,7 @@ def _solve_all(
     frames = data.layout.frames
     blocks = []
     with progress(console) as bars:
+        # Blocks of frames bound the memory.
         starts = range(0, len(frames), FRAMES_AT_ONCE)
         for start in bars.track(starts, description="poses from skeletons"):
             block = frames[start : start + FRAMES_AT_ONCE]
@@ -374,6 +381,7 @@ def _solve_with_fingers(
     data: GsganData, shape: BodyShape, frames: Sequence[int]
 ) -> BodyPose:
     """Poses by 33 landmarks, with the fingers that hand landmarks show."""
+    # The fingers alone are taken from the poses by hand landmarks.
     solved = _solve(data, shape, frames)
     if _by_hands(data):
         fingers = _fingers(shape)
@@ -400,6 +408,7 @@ def _refined(
     Poses solved with it approximate the registered ones, except for differences that vary between
     frames.
     """
+    # The offsets of the 33 landmarks in the registered poses.
     p, seen = _joints(data, frames)
     shape = replace(shape, offsets=fit_offsets(shape, registered, p, seen))
     if data.layout.hands is None:

@@ -69,10 +69,15 @@ def fit_shape(skeletons: Tensor, visibility: Tensor) -> BodyShape:
     Raises:
         DataError: when no frame shows enough of shoulders, hips and limbs.
     """
+    # The body without its surface, and the frames that are used.
     reduced = without_surface(free_space())
     p, seen = _usable(skeletons, visibility)
+
+    # Lengths first, then all numbers of the shape together with the poses.
     x = _fit_lengths(reduced, p, seen)
     shape = _fit_landmarks(reduced, x, p, seen)
+
+    # The shape is solved in float64 and stored in float32.
     single = {}
     for name, values in vars(shape).items():
         if values is not None:
@@ -110,6 +115,8 @@ def fit_hands(
     known = length.isfinite()
     if not known.any():
         return shape
+
+    # The size is the ratio of the person's lengths to the body's.
     own = shaped_body(shape).hand_landmarks
     own_length = (own[last] - own[first]).norm(dim=-1)
     size = length[known].sum() / own_length[known].sum()
@@ -130,9 +137,13 @@ def fit_hands(
     forearms = body.transforms(poses)[:, body.hand_bone[wrists]]
     on_arm = _at_rest(forearms[..., :3, :3], forearms[..., :3, 3], hands[:, wrists])
     in_hand = _at_rest(found.rotations, found.shifts, hands[:, wrists])
+
+    # The medians over frames that show the hand with its forearm.
     usable = fingers.placed(seen) & (visibility[:, FOREARMS] > 0).all(-1)
     on_arm = _median(on_arm, usable.unsqueeze(-1))
     in_hand = _median(in_hand, usable.unsqueeze(-1))
+
+    # A wrist or hand that would move far keeps the body's place.
     joints = body.joints[[body.joint_names.index(name) for name in WRISTS]]
     moves = torch.stack([on_arm - joints, on_arm - in_hand], dim=1)
     near = (moves.norm(dim=-1) <= MAX_HAND_MOVE).all(-1)
@@ -157,10 +168,13 @@ def fit_offsets(
         skeletons: ``[F, 33, 3]`` metres.
         visibility: ``[F, 33]``; landmarks at 0 are not used.
     """
+    # The landmarks in the person's skeletons, moved back to the rest pose.
     body = shaped_body(shape)
     bones = body.transforms(poses)[:, body.landmark_bone]
     moved = _at_rest(bones[..., :3, :3], bones[..., :3, 3], skeletons) - body.landmarks
     moved = _median(moved, (visibility > 0).unsqueeze(-1))
+
+    # The offsets add to those that the shape has.
     before = shape.offsets
     if before is None:
         before = torch.zeros_like(body.landmarks)
@@ -177,12 +191,15 @@ def _usable(skeletons: Tensor, visibility: Tensor) -> tuple[Tensor, Tensor]:
 
     The frames show the whole trunk, or the shoulders if none does.
     """
+    # Frames with the whole trunk, else with both shoulders.
     seen = (visibility > 0) & skeletons.isfinite().all(-1)
     frames = seen[:, MEDIAPIPE33.torso].all(-1).nonzero().flatten()
     if not len(frames):
         frames = seen[:, MEDIAPIPE33.shoulders].all(-1).nonzero().flatten()
     if not len(frames):
         raise DataError("fit_shape: no frame has both shoulders")
+
+    # The frames are evenly spaced, and what they do not show is completed.
     chosen = frames[:: math.ceil(len(frames) / MAX_SHAPE_FRAMES)]
     p, valid = sanitise(skeletons[chosen].double(), seen[chosen].double())
     return p, valid
@@ -202,6 +219,7 @@ def shape_of(space: ShapeSpace[B], x: Tensor) -> BodyShape:
 
 def _offsets(space: ShapeSpace[B], values: Tensor) -> Tensor:
     """Symmetric offsets ``[33, 3]`` from 99 numbers: the mean of both sides."""
+    # The mean of each offset and of the mirror image of its partner on the other side.
     offsets = values.view(-1, 3)
     across = rest_axes(space.body)[0]
     mirrored = offsets[list(MEDIAPIPE33.mirror)]
@@ -210,6 +228,7 @@ def _offsets(space: ShapeSpace[B], values: Tensor) -> Tensor:
 
 def shape_prior(space: ShapeSpace[MarkedBody]) -> Tensor:
     """Precisions ``[S]`` of the numbers of `shape_of`."""
+    # An offset is the mean of two numbers, whose spread is larger by √2.
     sigmas = [1.0] * space.coefficients
     sigmas += [STRETCH] * len(STRETCHED)
     sigmas += [DEPTH]
@@ -284,6 +303,7 @@ def _fit_lengths(space: ShapeSpace[MarkedBody], p: Tensor, seen: Tensor) -> Tens
             "fit_shape: no frame shows a limb of which the body has both ends"
         )
 
+    # The logarithm of each distance against the target's, in standard deviations.
     def residual(x: Tensor) -> Tensor:
         q = space.shaped(shape_of(space, x)).landmarks
         return ((q[a] - q[b]).norm(dim=-1).log() - target) / sigma
@@ -291,10 +311,12 @@ def _fit_lengths(space: ShapeSpace[MarkedBody], p: Tensor, seen: Tensor) -> Tens
     prior = shape_prior(space)
     prior[-NUMBERS:] *= 100  # the offsets hardly change here
 
+    # The robust cost lets a few wrong distances pass.
     def cost(x: Tensor) -> Tensor:
         robust = 2 * ((1 + residual(x).square()).sqrt() - 1).sum()
         return robust + (prior * x.square()).sum()
 
+    # The steps start at the mean of the prior.
     x = torch.zeros_like(prior)
     damping = 1e-2
     best = cost(x)
@@ -380,6 +402,7 @@ def _posed(
     offsets: Tensor,
 ) -> Tensor:
     """The landmarks ``[F, 33, 3]`` of a shape in poses."""
+    # The body of this shape, and its bones in the poses.
     body = space.shaped(shape_of(space, torch.cat([own, offsets])))
     transforms = solver.transforms(q, root, body.joints)
     return solver.points(transforms, body.landmarks.nan_to_num())
@@ -387,6 +410,7 @@ def _posed(
 
 def without_surface(space: ShapeSpace[B]) -> ShapeSpace[MarkedBody]:
     """The space in float64 with one vertex: only landmarks are compared."""
+    # One vertex and no face remain; joints and landmarks are kept.
     body = space.body
     small = MarkedBody(
         vertices=body.vertices[:1],
@@ -401,6 +425,8 @@ def without_surface(space: ShapeSpace[B]) -> ShapeSpace[MarkedBody]:
         landmarks=body.landmarks,
         landmark_bone=body.landmark_bone,
     ).to(torch.float64)
+
+    # The directions of the shape space for what remains.
     directions = {
         "vertices": space.directions["vertices"][:1].double(),
         "joints": space.directions["joints"].double(),

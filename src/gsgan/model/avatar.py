@@ -100,6 +100,8 @@ class Avatar(nn.Module):
         window_least: int = 32,
     ) -> None:
         super().__init__()
+
+        # Settings of the rendering.
         self.effects = effects
         self.accuracy = accuracy
         self.backend = backend
@@ -109,14 +111,20 @@ class Avatar(nn.Module):
         self.window_margin = window_margin
         self.window_multiple = window_multiple
         self.window_least = window_least
+
+        # Parts of Step I: G, Ψ or the surface's Gaussians.
         self.deformation = deformation
         self.densify = densify
         self.body_points = body_points
         self.surface = surface
+
+        # Parts of Step II: S, the pose code and the image.
         self.segmentation = segmentation
         self.segmentation_why = segmentation_why
         self.pose_encoder = pose_encoder
         self.generator = generator
+
+        # Parts that are not networks of the paper.
         self.colour = colour
         self.solver = solver
         self.poses = poses
@@ -150,6 +158,8 @@ class Avatar(nn.Module):
         Weights get no gradient; skeleton and camera do.
         """
         self.eval().requires_grad_(False)
+
+        # Every part gets a store, in which `gsgan.utils.tensors.derived` keeps its results.
         for part in self.modules():
             part.derived = {}  # type: ignore[assignment]
         return self.to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
@@ -181,14 +191,19 @@ class Avatar(nn.Module):
         Raises:
             ValueError: on wrong shapes, or when too few shoulders and hips are finite.
         """
+        # Joints that were not seen are replaced, on the CPU.
         visibility = None if visibility is None else visibility.cpu()
         height = self.limb_length_sum
         p, seen = complete_skeleton(skeleton.cpu(), visibility, self.template, height)
+
+        # One camera serves all skeletons.
         if len(camera) not in (1, len(p)):
             raise ValueError(
                 f"render: expected 1 or {len(p)} cameras, got {len(camera)}"
             )
         cameras = camera if len(camera) == len(p) else cat([camera] * len(p))
+
+        # The image, which is on black, gets the requested background.
         rendering = self.rendered(p, seen, cameras.to("cpu"), body, maps=False)
         assert rendering.image is not None
         assert rendering.alpha is not None
@@ -210,9 +225,13 @@ class Avatar(nn.Module):
 
         Convention: nothing is read back from the avatar's device.
         """
+        # The body and the window need values, so they are computed before the transfer to the
+        # device.
         device = next(self.parameters()).device
         body = self.body_pose(skeleton, visibility) if body is None else body
         window = self.window(skeleton, camera)
+
+        # All inputs go to the device. `forward` renders cameras that see a window as they are.
         rendering = self(
             skeleton.to(device),
             visibility.to(device),
@@ -256,6 +275,7 @@ class Avatar(nn.Module):
             reach: metres; Ψ is not computed at points farther than this from what the cameras
                 see. None computes it at all points.
         """
+        # The window crops the cameras, so that only the part with the person is drawn.
         body = self.body_pose(skeleton, visibility) if body is None else body
         window = self.window(skeleton, camera)
         rendering = self._rendered(
@@ -268,6 +288,8 @@ class Avatar(nn.Module):
             supersample=supersample,
             reach=reach,
         )
+
+        # Step I's colour and I_pred take on the tint of the training camera.
         if camera_index is not None:
             rendering = self._corrected(rendering, camera_index)
         rendering = rendering if maps else rendering.only_image()
@@ -288,6 +310,8 @@ class Avatar(nn.Module):
         """The part of the images that holds the person; None means all of what the cameras see."""
         if self.window_margin is None or camera.whole_height is not None:
             return None
+
+        # The window's sides suit the generator's stride.
         sides = {"multiple": self.window_multiple, "least": self.window_least}
         margin = self.window_margin
         near = self.accuracy.near
@@ -309,16 +333,22 @@ class Avatar(nn.Module):
         """The drawings and images that the cameras see (paper Fig. 3)."""
         raster = S = image = alpha = None
         with full_precision(p.device):
+            # The frames of the bones serve densify, the face code and Ω.
             with self.stage("skeleton"):
                 valid = visibility > 0
                 frames = bone_frames(p, valid, self.template)
             follows = self.body_points or self.surface or self.segmentation
             if body is not None and follows is not None:
                 with self.stage("bones"):
-                    body = follows.points.with_bones(body)  # once for G and S
+                    # The bones are computed once for G and S.
+                    body = follows.points.with_bones(body)
+
+            # Step I's part: Ĝ and its splatted features F.
             gaussians = self.splat(p, valid, frames, camera, body, pose_noise, reach)
             if gaussians is not None:
                 raster = self._rasterised(gaussians, camera, supersample)
+
+            # The generator's other inputs: S, the drawn skeleton p₂D and the rotations Ω.
             if generate and self.generator is not None:
                 if self.segmentation is not None:
                     # trained on its own, then frozen
@@ -331,7 +361,8 @@ class Avatar(nn.Module):
                     pose = pose_inputs(
                         p, valid, frames, camera, self.template, self.body_height
                     )
-        # Sec. 3.5
+
+        # Sec. 3.5: the pose code and the UNet run in the precision of the trainer.
         if generate and self.generator is not None and self.pose_encoder is not None:
             with self.stage("pose encoder"):
                 g = self.pose_encoder(*pose)
@@ -348,8 +379,12 @@ class Avatar(nn.Module):
                 generated = self.generator(S=S, g=g, **maps).to(p.dtype)
             image = generated[:, :3]
             alpha = generated[:, 3:]
+
+        # Nothing is splatted in image_to_image.
         if raster is None:
             return Rendering(image, alpha, segmentation=S)
+
+        # Step I's colour is the image where there is no generator.
         if self.generator is None:
             image = raster.features[:, :3]
             alpha = raster.alpha
@@ -370,9 +405,11 @@ class Avatar(nn.Module):
         Features are clamped to what the generator takes: their blends are then in that range too.
         """
         if self.surface is not None:
+            # The baseline's Gaussians follow the body and need no residuals.
             with self.stage("surface"):
                 gaussians = self.surface(body, camera.centre)
         elif self.deformation is not None:
+            # Points far from what the cameras see are left out, which saves time in training.
             points = self.points(p, valid, frames, body)
             chosen = None
             if reach is not None:
@@ -385,6 +422,8 @@ class Avatar(nn.Module):
                 )
         else:
             return None
+
+        # The bound of the features is the generator's, so there is none without a generator.
         bound = getattr(self.generator, "feature_bound", None)
         if bound is None:
             return gaussians  # type: ignore[no-any-return]
@@ -405,6 +444,8 @@ class Avatar(nn.Module):
     ) -> tuple[Points, Residuals]:
         """G in pose and Ψ's ΔG without noise; arguments as for `splat`."""
         assert self.deformation is not None
+
+        # G in the pose, from the same frames as the pose code.
         frames = bone_frames(p, valid, self.template)
         points = self.points(p, valid, frames, body)
         pelvis = frames.hubs[:, 0]
@@ -421,6 +462,7 @@ class Avatar(nn.Module):
     def store_poses(self, p: Tensor, valid: Tensor, body: BodyPose | None) -> None:
         """Stores the spread of training poses ``[F, J, 3]`` in Ψ; arguments as for `splat`."""
         if isinstance(self.deformation, Deformation):
+            # The means give the places of the anchors in the training poses.
             frames = bone_frames(p, valid, self.template)
             means = self.points(p, valid, frames, body).means
             pelvis = frames.hubs[:, 0]
@@ -450,9 +492,13 @@ class Avatar(nn.Module):
             or rendering.splat_alpha is None
         ):
             return rendering
+
+        # Step I's colour, corrected with its own alpha.
         colour = self.colour(
             rendering.features[:, :3], rendering.splat_alpha, camera_index
         )
+
+        # The image is either the same colour or the generator's, which has an alpha of its own.
         image = rendering.image
         if self.generator is None:
             image = colour
@@ -473,12 +519,19 @@ def seen_points(means: Tensor, camera: Camera, reach: float) -> Tensor:
         camera: B cameras.
         reach: metres round the part of space that an image shows.
     """
+    # Places of the points in the image.
     height, width = camera.size
     pixels, depth = camera.project(means)
+
+    # The reach in pixels at each point's depth. A depth below the reach counts as the reach.
     focal = torch.stack([camera.K[:, 0, 0], camera.K[:, 1, 1]], dim=-1)
     beyond = reach * focal[:, None] / depth.clamp_min(reach).unsqueeze(-1)
+
+    # Points within the image and the margin round it.
     size = pixels.new_tensor([width, height])
     inside = ((pixels >= -beyond) & (pixels <= size + beyond)).all(-1)
+
+    # All items have as many points as the one with most; the stable sort puts these first.
     count = int(inside.sum(1).max().clamp_min(1))
     return inside.byte().sort(dim=1, descending=True, stable=True).indices[:, :count]
 

@@ -69,25 +69,40 @@ class LearntWeights(nn.Module):
         controls: int,
     ) -> None:
         super().__init__()
+
+        # The controls are spread over the body, and each point is near a few of them.
         count = min(controls, len(places))
         at = places[farthest_points(places, count)]
         distance, near = torch.cdist(places, at).topk(
             min(NEAREST_CONTROLS, count), largest=False
         )
+
+        # A point's shares of its controls fall with distance; they sum to 1.
         share = functional.softmax(-2 * (distance / distance.mean()).square(), dim=1)
+
+        # The body's weights as a dense table, each row of sum 1.
         own = bone_weight / bone_weight.sum(1, keepdim=True)
         dense = places.new_zeros(len(places), joints).scatter_add_(1, bone_index, own)
+
+        # The average weights of each control's points, carried back to the points.
         interpolate = places.new_zeros(len(places), count).scatter_add_(1, near, share)
         total = interpolate.sum(0).clamp_min(1e-6).unsqueeze(1)
         # weights of the neighbourhood
         around = interpolate @ (interpolate.mT @ dense / total)
+
+        # A point may follow its own bones first, then those of its neighbourhood.
         index = (
             ((dense > LEAST) + around).topk(min(FOLLOWED_BONES, joints), dim=1).indices
         )
+
+        # Logarithms of the weights at the start. Bones that neither the point nor its
+        # neighbourhood follows keep a weight of about zero.
         possible = (dense + around).gather(1, index) > LEAST
         start = (
             dense.gather(1, index).clamp_min(LEAST).log().masked_fill(~possible, -30.0)
         )
+
+        # The tables follow from the body, so that checkpoints do not hold them.
         for name, value in {
             "index": index,
             "start": start,
@@ -101,6 +116,7 @@ class LearntWeights(nn.Module):
         """``[N, BONES]``: the weights of bones ``index``; rows sum to 1."""
 
         def make() -> Tensor:
+            # The field at the controls near each point, for the point's bones alone.
             moved = self.field[self.near.unsqueeze(-1), self.index.unsqueeze(1)]
             return (self.start + (self.share.unsqueeze(-1) * moved).sum(1)).softmax(1)
 
@@ -129,6 +145,9 @@ class SkinnedPoints(nn.Module):
         self, body: SkinnedBody, count: int | None = None, controls: int = 0
     ) -> None:
         super().__init__()
+
+        # The subset is spread over the template, so that it is the same for every shape of the
+        # body.
         if count is not None:
             whole("points", count, 1)
         vertices = body.vertices.float()
@@ -137,6 +156,8 @@ class SkinnedPoints(nn.Module):
         chosen = farthest_points(
             template, every if count is None else min(count, every)
         )
+
+        # Bones, weights and places of the chosen vertices; the body gives them, not a checkpoint.
         self.parents = body.parents
         means = vertices[chosen]
         for name, value in {
@@ -148,6 +169,8 @@ class SkinnedPoints(nn.Module):
             "spacing": neighbour_distance(means).clamp_min(1e-4),
         }.items():
             self.register_buffer(name, value, persistent=False)
+
+        # The learnt weights start at the body's, as they are on the template.
         own = template[chosen], self.bone_index, self.bone_weight, len(body.joints)
         self.learnt = LearntWeights(*own, controls) if controls else None
 
@@ -193,11 +216,17 @@ class SkinnedGaussians(nn.Module):
         self, body: SkinnedBody, points: int | None, opacity: float, scale: float
     ) -> None:
         super().__init__()
+
+        # Quats start at the identity.
         self.points = SkinnedPoints(body, points)
         count = len(self.points)
         self.quats = nn.Parameter(torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1))
+
+        # Scales start as spheres of a size that fits the spacing of the points.
         spacing = (scale * self.points.spacing).log()
         self.log_scales = nn.Parameter(spacing.unsqueeze(-1).repeat(1, 3))
+
+        # All opacities start alike, as logits.
         logit = math.log(opacity / (1 - opacity))
         self.logit_opacities = nn.Parameter(torch.full((count,), logit))
 
@@ -212,9 +241,11 @@ class SkinnedGaussians(nn.Module):
         """Gaussians at ``means [B, N, 3]``, their shapes transformed by ``A [B, N, 3, 3]``."""
 
         def make() -> Tensor:
+            # Axes of the Gaussians at rest: a rotation times the scales.
             unit = functional.normalize(self.quats, dim=-1, eps=1e-6)
             return quaternion_to_rotation_matrix(unit) * log_scales.exp().unsqueeze(-2)
 
+        # Covariances A Σ Aᵀ, from the transformed axes.
         axes = A @ derived(self, "axes", make, *self.parameters(recurse=False))
         opacities = torch.sigmoid(logits).expand(len(A), -1)
         return Gaussians(
@@ -270,11 +301,15 @@ class BodyPoints(nn.Module):
         rate: float = 1.0,
     ) -> None:
         super().__init__()
+
+        # The number of points; a mesh with too few vertices is subdivided.
         if points == AUTO:
             points = points_for(body_height, scale, spacing)
         if points is not None:
             points = whole("model.body_points.points", points, 1)
             body = subdivided(body, points)
+
+        # The points, and how Ψ learns with them.
         above("model.body_points.sigma", sigma)
         above("model.body_points.mean_step", mean_step)
         self.points = SkinnedPoints(
@@ -283,13 +318,20 @@ class BodyPoints(nn.Module):
         self.sigma = sigma
         self.mean_step = mean_step
         self.rate = above("model.body_points.rate", rate)
+
+        # Places at rest tell Ψ one point from another; normals move with the pose.
         rest = (self.points.means - self.points.means.mean(dim=0)) / body_height
         self.register_buffer("rest_points", rest, persistent=False)
         normals = vertex_normals(body.vertices.float(), body.faces)[self.points.chosen]
         self.register_buffer("rest_normals", normals, persistent=False)
+
+        # Each point is a part of its own, because its skinning gives it a frame of its own.
         self.register_buffer(
             "part_id", torch.arange(len(self.points)), persistent=False
         )
+
+        # The stretch's terms need the gradients of the weights over the surface. Where the
+        # weights are fixed, the terms are fixed too.
         self.stretch = stretch
         self.stretch_every = whole("model.body_points.stretch_every", stretch_every, 1)
         self.renew()
@@ -318,8 +360,11 @@ class BodyPoints(nn.Module):
         def make() -> tuple[Tensor, Tensor]:
             return self.gradients(*self.points.weights)
 
+        # A trained avatar computes the terms once for its weights.
         if not self.training:
             return derived(self, "terms", make, learnt.field)
+
+        # In training the terms are kept for `stretch_every` iterations and have no gradient.
         if self._terms is None or self._age == self.stretch_every:
             with torch.no_grad():
                 self._terms = make()
@@ -342,14 +387,22 @@ class BodyPoints(nn.Module):
         """
         pose = self.points.with_bones(pose)
         assert pose.bones is not None
+
+        # The means, moved by LBS.
         A, t = self.points.blend(pose)
         means = skin(self.points.means, A, t)
-        if not pose.bones.requires_grad:  # only the means give the weights a gradient
+
+        # Only the means give the weights a gradient.
+        if not pose.bones.requires_grad:
             A = A.detach()
             t = t.detach()
+
+        # Shapes and normals follow the stretch of the surface.
         jacobian = (
             stretched(A, pose.bones, *self.stretch_terms()) if self.stretch else None
         )
+
+        # Shapes start as spheres of a share of the spacing at rest.
         scales = (self.sigma * self.points.spacing).expand(len(A), -1)
         return Points(
             means=means,
@@ -376,6 +429,8 @@ def points_for(body_height: float, scale: float, spacing: float) -> int:
         spacing: pixels.
     """
     above("model.body_points.spacing", spacing)
+
+    # The skin's area grows with the square of the stature.
     area = SKIN * (body_height / STATURE) ** 2
     count = area * (scale / spacing) ** 2
     return int(min(max(FEWEST, round(count, -2)), MOST))
@@ -388,6 +443,8 @@ def moved_normals(A: Tensor, normals: Tensor) -> Tensor:
     flattens a point's neighbourhood to about NORMAL_FLOOR of its area, the normal fades to zero.
     """
     x, y, z = A.unbind(-1)
+
+    # Columns of the cofactor matrix are cross products of the columns of A.
     cofactors = [torch.linalg.cross(a, b) for a, b in ((y, z), (z, x), (x, y))]
     moved = (torch.stack(cofactors, dim=-1) @ normals.unsqueeze(-1)).squeeze(-1)
     return moved * torch.rsqrt(moved.square().sum(-1, keepdim=True) + NORMAL_FLOOR**2)
@@ -405,6 +462,8 @@ def farthest_points(vertices: Tensor, count: int) -> Tensor:
     axes = np.ascontiguousarray(vertices.numpy().T)
     chosen = np.zeros(count, np.int64)
     nearest = np.full(len(vertices), np.inf, axes.dtype)
+
+    # Each step takes the vertex that is farthest from all chosen ones.
     for i in range(1, count):
         squared = (axes - axes[:, chosen[i - 1], None]) ** 2
         np.minimum(nearest, squared.sum(0), out=nearest)

@@ -26,6 +26,8 @@ class ColourCorrection(nn.Module):
     def __init__(self, trained: Sequence[str], cameras: Sequence[str]) -> None:
         super().__init__()
         self.offsets = nn.Parameter(torch.zeros(len(trained), 3, 4))
+
+        # The last row, after those of the training cameras, is the identity of held-out ones.
         rows = [
             trained.index(name) if name in trained else len(trained) for name in cameras
         ]
@@ -53,6 +55,7 @@ class ColourCorrection(nn.Module):
             camera_index: ``[B]`` int64.
         """
         with full_precision(image.device):
+            # The constant term is weighted by alpha, so that the background stays black.
             affine = self.of_cameras(camera_index).to(image.dtype)
             mixed = torch.einsum("bij,bjhw->bihw", affine[..., :3], image)
             return mixed + affine[..., 3, None, None] * alpha

@@ -68,11 +68,15 @@ class _Geometry(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor, Tensor]:
         raw, *fixed, numbers = arguments
+
+        # The job points to the inputs and to empty outputs, which the compiled code fills.
         B, N, _ = raw.shape
         outputs = raw.new_empty(B, N, 3), raw.new_empty(B, N, 3, 3), raw.new_empty(B, N)
         job, _held = _job(raw, fixed, numbers)
         build.point(job, [f"out_{name}" for name in OUTPUTS], outputs)
         build.function("compose", raw.dtype)(ctypes.byref(job))
+
+        # The backward pass starts from the inputs; gradients of unused outputs stay None.
         ctx.save_for_backward(raw, *fixed)
         ctx.numbers = numbers
         ctx.set_materialize_grads(False)
@@ -82,6 +86,9 @@ class _Geometry(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         raw, *fixed = ctx.saved_tensors
+
+        # The job is the forward one, with incoming gradients and the gradient of raw as its
+        # output.
         job, _held = _job(raw, fixed, ctx.numbers)
         incoming = [None if g is None else g.contiguous() for g in grads]
         d_raw = raw.new_empty(*raw.shape[:2], RESIDUALS)
@@ -97,9 +104,12 @@ def _job(
     raw: Tensor, fixed: list[Tensor], numbers: tuple[float, ...]
 ) -> tuple[ctypes.Structure, list[Tensor]]:
     """The job without its outputs, and the tensors it points to."""
+    # The compiled code reads rows with a constant stride, so raw may be a part of wider rows.
     rows = raw.detach()
     if rows.stride(-1) != 1 or rows.stride(0) != rows.shape[1] * rows.stride(1):
         rows = rows.contiguous()
+
+    # The tensors must live as long as the job, which holds addresses only.
     held = [rows, *(x.detach().contiguous() for x in fixed)]
     job = _Job(rows.shape[0] * rows.shape[1], build.threads(), rows.stride(1), *numbers)
     build.point(job, INPUTS, held)

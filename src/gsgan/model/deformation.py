@@ -73,16 +73,24 @@ class ResidualGaussians(nn.Module):
     ) -> None:
         super().__init__()
         one_of("model.deformation: sh_degree", sh_degree, range(4))
+
+        # Lengths of the network are in body heights.
         self.body_height = float(body_height)
+
+        # Channels of F beside colour, and the harmonics of colour.
         self.features = features
         self.sh_degree = sh_degree
         # raised during training; higher degrees are not computed
         self.active_degree = sh_degree
+
+        # Initial values and bounds.
         self.opacity = opacity
         self.mean_bound = mean_bound
         self.logit_bound = logit_bound
         self.mean_step = mean_step
         self.scale_range = (scale_min, scale_max)
+
+        # Sizes of the residuals of a point, in the order of `Residuals`.
         self.parts = (3, 4, 3, 1, 3 * (sh_degree + 1) ** 2, features)
 
     def parameter_groups(self) -> list[tuple[list[nn.Parameter], float]]:
@@ -113,6 +121,8 @@ class ResidualGaussians(nn.Module):
         start at zero and get no gradient until they are active."""
         if self.active_degree >= self.sh_degree:
             return values
+
+        # The harmonics are the fifth part; the active ones are its first channels.
         first = sum(self.parts[:4])
         last = sum(self.parts[:5])
         active = values[..., : first + 3 * (self.active_degree + 1) ** 2]
@@ -121,9 +131,13 @@ class ResidualGaussians(nn.Module):
     def _parted(self, raw: Tensor) -> Residuals:
         """The residuals of raw numbers ``[B, N, ...]``, those of `_active`."""
         sizes = (*self.parts[:4], 3 * (self.active_degree + 1) ** 2, self.features)
+
+        # Only the active harmonics are there to split.
         means, quats, scales, opacities, sh, features = raw.split(sizes, dim=-1)
         sh = sh.unflatten(-1, (-1, 3))
         opacities = opacities[..., 0]
+
+        # The factor on the means sets how fast they move.
         return Residuals(self.mean_step * means, quats, scales, opacities, sh, features)
 
     def compose(self, points: Points, residuals: Residuals, eye: Tensor) -> Gaussians:
@@ -132,8 +146,11 @@ class ResidualGaussians(nn.Module):
         Returns:
             Gaussians with covariances, features = colour (3) then F's other channels.
         """
+        # Ĝ's geometry, in world axes.
         frames = points.frames
         means, covariances, opacities = self._geometry(points, frames, residuals)
+
+        # The colour comes from the harmonics and the direction from the eye.
         colour = colour_from(eye, means, frames, residuals.sh)
         return Gaussians(
             means=means,
@@ -148,6 +165,7 @@ class ResidualGaussians(nn.Module):
         self, points: Points, frames: Tensor, residuals: Residuals
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Means, covariances and opacities; in compiled code where that is possible."""
+        # Bounds of means and scales are body heights, so they become metres here.
         bound = self.mean_bound
         height = self.body_height
         low, high = (math.log(limit * height) for limit in self.scale_range)
@@ -208,11 +226,16 @@ class ResidualGaussians(nn.Module):
             face: ``[B, E, 3]`` in place of the last E joints, since an expression in body heights
                 would be a hundredth of the code; None: E is 0.
         """
+        # Joints are about the root, so that the person's place in the world changes nothing.
         code = (p - root[:, None]) / self.body_height
         if self.pose_frame == "pelvis":
             code = code @ pelvis
+
+        # Landmarks of the face have a code of their own.
         if face is not None:
             code = torch.cat([code[:, : -face.shape[1]], face], dim=1)
+
+        # Noise is given in training only.
         if noise is not None:
             code = code + noise
         return code.flatten(1)
@@ -229,9 +252,12 @@ class ResidualGaussians(nn.Module):
     ) -> Gaussians:
         """Ĝ for joints ``p`` ``[B, J, 3]``, seen from ``eye`` ``[B, 3]`` (both world, metres); of
         the points ``chosen [B, M]`` alone, if these are given."""
+        # The residuals depend on the pose alone, not on the camera.
         root = root_of(p)
         code = self.pose_code(p, root, pelvis, noise, face)
         residuals = self.residuals(points, code, root, pelvis, chosen)
+
+        # Residuals are of the chosen points only, so G must be as well.
         if chosen is not None:
             points = points.take(chosen)
         return self.compose(points, residuals, eye)
@@ -339,11 +365,14 @@ class Deformation(ResidualGaussians):
 
         They are stored with the weights: another processor may round other anchors.
         """
+        # The anchors are spread over the body, and each point is near a few of them.
         anchors = farthest_points(rest_points, count)
         places = rest_points[anchors]
         distance, near = cKDTree(places.numpy()).query(
             rest_points.numpy(), k=NEAREST_ANCHORS
         )
+
+        # A point's shares of its anchors fall with distance; they sum to 1.
         spread = distance[:, 0].mean()
         share = torch.from_numpy(-((distance / spread) ** 2)).float().softmax(1)
         self.register_buffer("anchors", anchors)
@@ -356,11 +385,16 @@ class Deformation(ResidualGaussians):
     ) -> None:
         """Stores the spread of the training poses' codes ``[F, 3 J]``, see `_within`, and of the
         places of their points ``[F, N, 3]``; root and pelvis as for `residuals`."""
+        # The principal directions of the codes, and the standard deviation along each.
         self.pose_mean.copy_(codes.mean(0))
         _, spread, axes = torch.linalg.svd(codes - self.pose_mean, full_matrices=False)
+
+        # Few poses have fewer directions than the buffer; the rest keep a spread of 0.
         known = min(POSE_AXES, len(spread))
         self.pose_axes[:, :known] = axes[:known].mT
         self.pose_spread.zero_()[:known] = spread[:known] / len(codes) ** 0.5
+
+        # The places that the MLP is computed at, their mean and standard deviation.
         if self.anchored:
             means = means[:, self.anchors]
         places = self._places(means, root, pelvis)
@@ -378,9 +412,12 @@ class Deformation(ResidualGaussians):
 
         Source: the projection of poses of AnimatableGaussians.
         """
+        # The code's coordinates along the principal directions, each within its limit.
         far = limit * self.pose_spread
         axes = self.pose_axes
         along = ((code - self.pose_mean) @ axes).clamp(-far, far)
+
+        # Without stored poses the spread is infinite, and the code stays as it is.
         return torch.where(far.isfinite().all(), self.pose_mean + along @ axes.mT, code)
 
     def _load_from_state_dict(
@@ -399,6 +436,7 @@ class Deformation(ResidualGaussians):
         chosen: Tensor | None = None,
     ) -> Residuals:
         """See `ResidualGaussians.residuals`."""
+        # The MLP sees the anchors alone, or all points where there are none.
         means = points.means
         normals = points.normals
         if self.anchored:
@@ -412,6 +450,8 @@ class Deformation(ResidualGaussians):
         elif chosen is not None:
             index = chosen.unsqueeze(-1).expand(-1, -1, raw.shape[-1])
             raw = raw.gather(1, index)
+
+        # The table adds what neighbours do not share.
         if self.table is not None:
             table = self._active(self.table)
             raw = raw + (
@@ -422,8 +462,12 @@ class Deformation(ResidualGaussians):
     def _interpolated(self, raw: Tensor, chosen: Tensor | None) -> Tensor:
         """The anchors' ``raw [B, A, C]`` at the points ``chosen [B, M]``, or at all."""
         B, A, _ = raw.shape
+
+        # Anchors and shares of the points that are wanted.
         near = self.near.expand(B, -1, -1) if chosen is None else self.near[chosen]
         share = self.share.expand(B, -1, -1) if chosen is None else self.share[chosen]
+
+        # One table holds the whole batch: the anchors of item b begin at row A · b.
         first = A * torch.arange(B, device=raw.device)
         spread = functional.embedding_bag(
             (near + first[:, None, None]).flatten(0, 1),
@@ -431,38 +475,54 @@ class Deformation(ResidualGaussians):
             mode="sum",
             per_sample_weights=share.flatten(0, 1).to(raw.dtype),
         )
+
+        # The rows of all items are split into items again.
         return spread.unflatten(0, (B, -1))
 
     def _network(
         self, means: Tensor, normals: Tensor, pose: Tensor, root: Tensor, pelvis: Tensor
     ) -> Tensor:
         """``[B, A, C]`` the MLP's output at the anchors."""
+        # A rendered pose is limited to what the training poses show; training is not.
         limit = None if self.training else self.pose_limit
         if limit is not None:
             pose = self._within(pose, limit)
         # Only a skeleton's gradient passes through Ψ's inputs, not one of skinning weights.
         means = means if root.requires_grad else means.detach()
         position = self._places(means, root, pelvis)
+
+        # The places of the anchors are limited likewise.
         if limit is not None:
             far = limit * self.place_spread
             position = self.place_mean + (position - self.place_mean).clamp(-far, far)
+
+        # Normals turn with the axes that places are given in.
         if self.pose_frame == "pelvis":
             normals = normals @ pelvis
         code = positional_encoding(position, self.position_octaves)
+
+        # In training, the trunk is one operation, if no gradient passes to its inputs.
         if torch.is_grad_enabled() and not (
             code.requires_grad or normals.requires_grad
         ):
             x = self._trained(code, normals, pose)
         else:
+            # The inputs that depend on both pose and point enter by one product.
             weight = self.from_position.weight
             if self.from_normal is not None:
                 code = torch.cat([code, normals], dim=-1)
                 weight = torch.cat([weight, self.from_normal.weight], dim=1)
+
+            # The first layer's parts of the point alone and of the pose alone are added to it.
             start = self._point_part() + self.from_pose(pose).unsqueeze(1)
             x = torch.baddbmm(start, code, weight.mT.expand(len(pose), -1, -1))
             x = functional.relu(x, inplace=True)
+
+            # The other layers work in place, since ReLU's gradient needs its output only.
             for layer in self.trunk:
                 x = functional.relu(layer(x), inplace=True)
+
+        # The last layer leaves out harmonics that are not active yet.
         weight = self._active(self.head.weight.mT).mT
         bias = self._active(self.head.bias)
         return functional.linear(x, weight, bias)
@@ -473,6 +533,7 @@ class Deformation(ResidualGaussians):
         own = self.embedding
 
         def make() -> Tensor:
+            # The place at rest and the learned numbers of the point.
             found: Tensor = layer(torch.cat([self.rest_code, own], dim=-1))
             return found
 
@@ -482,6 +543,7 @@ class Deformation(ResidualGaussians):
 
     def _trained(self, code: Tensor, normals: Tensor, pose: Tensor) -> Tensor:
         """The trunk's output; its layers are one operation, which computes no unused gradient."""
+        # Inputs that need no gradient come first, those that learn last.
         given = [self.rest_code, code]
         weights = [self.from_position.weight]
         from_rest, from_embedding = self.from_point.weight.split(
@@ -490,10 +552,16 @@ class Deformation(ResidualGaussians):
         if self.from_normal is not None:
             given.append(normals)
             weights.append(self.from_normal.weight)
+
+        # The codes at rest are the same in every item of the batch.
         size = code.shape[:2]
         known = torch.cat([x.expand(*size, -1) for x in given], dim=-1)
         weight = torch.cat([from_rest, *weights, from_embedding], dim=-1)
+
+        # The pose is the same for all points of an item, so it is part of the bias.
         bias = self.from_point.bias + self.from_pose(pose)
+
+        # Weights and biases take turns, as `_Trunk` expects them.
         layers = [x for layer in self.trunk for x in (layer.weight, layer.bias)]
         x: Tensor = _Trunk.apply(
             known, self.embedding.expand(*size, -1), weight, bias, *layers
@@ -503,6 +571,7 @@ class Deformation(ResidualGaussians):
 
 def _unit_quat(residual: Tensor) -> Tensor:
     """(1, 0, 0, 0) + δq, w x y z, of length one; finite where the sum vanishes."""
+    # The residual is added to the identity's quaternion.
     quat = residual + constant((1.0, 0.0, 0.0, 0.0), residual)
     return quat * torch.rsqrt(quat.square().sum(-1, keepdim=True) + QUAT_FLOOR)
 
@@ -514,6 +583,8 @@ def colour_from(eye: Tensor, means: Tensor, frames: Tensor, sh: Tensor) -> Tenso
     keeps its highlights.
     """
     view = means  # at degree 0 a colour has no direction
+
+    # Higher degrees depend on the direction from the eye to the point, in the frame of the part.
     if sh.shape[-2] > 1:
         view = functional.normalize(means - eye[:, None], dim=-1, eps=1e-6)
         view = (frames.mT @ view.unsqueeze(-1)).squeeze(-1)
@@ -536,6 +607,8 @@ def positional_encoding(x: Tensor, octaves: int) -> Tensor:
     """
     if octaves == 0:
         return x
+
+    # Each coordinate gets its own angles, in the order of the coordinates.
     frequencies = math.pi * 2.0 ** torch.arange(octaves, device=x.device, dtype=x.dtype)
     angles = (x.unsqueeze(-1) * frequencies).flatten(-2)
     return torch.cat([x, angles.sin(), angles.cos()], dim=-1)
@@ -558,6 +631,7 @@ class _Trunk(torch.autograd.Function):
         bias: Tensor,
         *layers: Tensor,
     ) -> Tensor:
+        # The first layer, whose bias differs from item to item.
         B, N, _ = known.shape
         inputs = torch.cat([known, learned], dim=-1).flatten(0, 1)
         x = (
@@ -568,8 +642,12 @@ class _Trunk(torch.autograd.Function):
             .flatten(0, 1)
         )
         outputs = [x]
+
+        # The other layers; their outputs are kept for the backward pass.
         for w, b in zip(layers[::2], layers[1::2], strict=True):
             outputs.append(torch.addmm(b, outputs[-1], w.mT).relu_())
+
+        # Biases are not needed for the gradients.
         ctx.save_for_backward(inputs, weight, *layers[::2], *outputs)
         ctx.size = (B, N, learned.shape[-1])
         return outputs[-1].view(B, N, -1)
@@ -577,18 +655,26 @@ class _Trunk(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        # The rest are n weights, then n + 1 outputs, those of the first layer first.
         inputs, weight, *rest = ctx.saved_tensors
         B, N, learned = ctx.size
         count = len(rest) // 2
         weights = rest[:count]
         outputs = rest[count:]
         through = torch.ops.aten.threshold_backward  # ReLU's gradient
+
+        # The gradient at the last layer's output, before its ReLU.
         g = through(grad.reshape(B * N, -1), outputs[-1], 0)
         found: list[Tensor | None] = []
+
+        # From the last layer to the second: gradients of weight and bias, then of the layer's
+        # input.
         for w, x in zip(reversed(weights), reversed(outputs[:-1]), strict=True):
             found = [g.mT @ x, g.sum(0), *found]
             g = g @ w
             through.grad_input(g, x, 0, grad_input=g)
+
+        # Of the first layer's input only the learned part, its last columns, has a gradient.
         d_learned = g @ weight[:, weight.shape[1] - learned :]
         return (
             None,
@@ -611,6 +697,8 @@ class _Bounded(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
         (x,) = ctx.saved_tensors
         low, high = ctx.bounds
+
+        # A descent step against these gradients would lead further out of the range.
         outwards = ((x > high) & (grad < 0)) | ((x < low) & (grad > 0))
         return grad.masked_fill(outwards, 0.0), None, None
 

@@ -25,9 +25,13 @@ class PatchDiscriminator(nn.Module):
         whole("training.discriminator.layers", layers, 2)
         one_of("training.discriminator.norm", norm, ("instance", "none"))
         normal = norm == "instance"
+
+        # Channels double from layer to layer, up to eight times the base.
         widths = [base * min(2**i, 8) for i in range(layers)]
         blocks: list[nn.Module] = []
         previous = 3
+
+        # The last feature layer keeps the resolution; the first has no normalisation.
         for i, channels in enumerate(widths):
             stride = 2 if i < layers - 1 else 1
             conv = nn.Conv2d(
@@ -38,8 +42,12 @@ class PatchDiscriminator(nn.Module):
             )
             blocks.append(nn.Sequential(conv, *between, nn.LeakyReLU(LEAKY_SLOPE)))
             previous = channels
+
+        # The last layer gives one logit per patch.
         self.blocks = nn.ModuleList(blocks)
         self.logits = nn.Conv2d(previous, 1, 4, padding=2)
+
+        # The start of the weights depends on whether their outputs are normalised.
         for conv in (
             module for module in self.modules() if isinstance(module, nn.Conv2d)
         ):
@@ -54,6 +62,7 @@ class PatchDiscriminator(nn.Module):
 
     def forward(self, image: Tensor) -> list[Tensor]:
         """Feature maps, then the logits, of an image ``[B, 3, H, W]``."""
+        # Each block reads the map before it; the image itself is not a feature.
         maps = [image]
         for block in self.blocks:
             maps.append(block(maps[-1]))
@@ -91,11 +100,14 @@ class Discriminator(nn.Module):
         Raises:
             ValueError: when the coarsest map would have a single pixel, which normalisation erases.
         """
+        # The coarsest map must have more than one pixel.
         if min(image.shape[-2:]) < 2 * self.stride:
             raise ValueError(
                 f"Discriminator: an image of {tuple(image.shape[-2:])} is too small; give at least "
                 f"{2 * self.stride} pixels, or fewer scales or layers"
             )
+
+        # Each discriminator sees the image at half the resolution of the one before.
         results = []
         for patches in self.judges:
             results.append(patches(image))

@@ -24,11 +24,15 @@ class Encoder(nn.Module):
 
     def __init__(self, inputs: int, channels: Sequence[int], patch: int = 1) -> None:
         super().__init__()
+
+        # The stem reads single pixels, or patches of them.
         first = channels[0]
         kernel = {"kernel_size": 3, "padding": 1}
         stem = kernel if patch == 1 else {"kernel_size": patch, "stride": patch}
         self.stem = nn.Conv2d(inputs, first, **stem)  # type: ignore[arg-type]
         self.after = nn.Conv2d(first, first, **kernel) if patch > 1 else None  # type: ignore[arg-type]
+
+        # Each level halves the resolution, then refines what it has.
         self.down = nn.ModuleList(
             nn.Conv2d(a, b, 3, stride=2, padding=1) for a, b in pairwise(channels)
         )
@@ -40,9 +44,12 @@ class Encoder(nn.Module):
 
     def levels(self, stem: Tensor) -> list[Tensor]:
         """The features of every level from the stem's output, before its activation."""
+        # The stem is activated; with patches a second convolution follows.
         levels = [_activate(stem)]
         if self.after is not None:
             levels = [_activate(self.after(levels[0]))]
+
+        # Each level is computed from the one before it.
         for down, refine in zip(self.down, self.refine, strict=True):
             levels.append(_activate(refine(_activate(down(levels[-1])))))
         return levels
@@ -67,11 +74,17 @@ class StyleModulation(nn.Module):
         activated."""
         # channels last in memory: channels of a pixel are a row
         rows = h.permute(0, 2, 3, 1)
+
+        # The pose gives each channel a scale and a shift.
         modulation = self.from_pose(g).unsqueeze(1)
+
+        # The style map adds its own at each pixel; a 1×1 convolution is a matrix product.
         weight = self.from_map.weight.flatten(1).mT.expand(len(h), -1, -1)
         styles = style.permute(0, 2, 3, 1).flatten(1, 2)
         modulation = torch.baddbmm(modulation + self.from_map.bias, styles, weight)
         modulation = modulation.unflatten(1, rows.shape[1:3])
+
+        # Scale and shift of every pixel's channels.
         gamma, beta = modulation.chunk(2, dim=-1)
         # In float32 at least: half precision loses squares above 256 and below 2e-4.
         wide = rows.to(torch.promote_types(h.dtype, torch.float32))
@@ -96,6 +109,7 @@ class DecoderLevel(nn.Module):
         )
 
     def forward(self, h: Tensor, skip: Tensor, style: Tensor, g: Tensor) -> Tensor:
+        # The first convolution also joins the skip.
         first, second = self.convs
         h = self._join(self.reduce(h), skip, first.weight, first.bias)  # type: ignore[arg-type]
         h = self.styles[0](h, style, g)
@@ -107,6 +121,7 @@ class DecoderLevel(nn.Module):
         Two of three pixels under a kernel on an upsampled image are equal, so a transposed
         convolution with the sums of their weights does the same with 4/9 of the arithmetic.
         """
+        # The kernel has a part for the upsampled map, and one for the skip.
         C = h.shape[1]
         kernel = derived(self, "upper", lambda: upsampled_kernel(weight[:, :C]), weight)
         lower = derived(self, "lower", lambda: channels_last(weight[:, C:]), weight)
@@ -155,10 +170,17 @@ class Generator(nn.Module):
     ) -> None:
         super().__init__()
         one_of("model.generator.patch", patch, [2**i for i in range(len(multipliers))])
+
+        # The whole network halves the resolution this often; images are padded to a multiple of
+        # it.
         self.patch = patch
         self.stride = 2 ** (len(multipliers) - 1)
+
+        # A patch takes the place of the first levels, so their channels are left out.
         channels = [base * m for m in multipliers][patch.bit_length() - 1 :]
         widths = [max(1, round(style_share * c)) for c in channels]
+
+        # E_c reads F, S, p₂D and F's fine pixels; E_s reads F alone.
         inputs = feature_channels + segmentation_channels + skeleton_channels
         self.supersample = supersample
         if supersample > 1:
@@ -167,6 +189,8 @@ class Generator(nn.Module):
         self.feature_bound = feature_bound
         self.content = Encoder(inputs, channels, patch)
         self.style = Encoder(feature_channels, widths, patch)
+
+        # The coarsest level is styled too.
         self.mid = nn.ModuleList(
             nn.Conv2d(channels[-1], channels[-1], 3, padding=1)
             for _ in range(MIDDLE_BLOCKS)
@@ -175,10 +199,14 @@ class Generator(nn.Module):
             StyleModulation(channels[-1], widths[-1], pose_channels)
             for _ in range(MIDDLE_BLOCKS)
         )
+
+        # The decoder goes from coarse to fine.
         self.up = nn.ModuleList(
             DecoderLevel(channels[i + 1], channels[i], widths[i], pose_channels)
             for i in reversed(range(len(channels) - 1))
         )
+
+        # The last layer paints RGB and alpha for every pixel of a patch.
         self.paint = nn.Conv2d(channels[0], 4 * patch**2, 3, padding=1)
         if rgb_skip:
             start_at_zero(self.paint)
@@ -205,16 +233,21 @@ class Generator(nn.Module):
         Raises:
             ValueError: when ``fine`` or alpha is missing, or ``fine`` is of another size.
         """
+        # The fine image must be there where the stem reads it, and only there.
         height, width = F.shape[-2:]
         k = self.supersample
         given = None if fine is None else tuple(fine.shape[-2:])
         expected = None if k == 1 else (k * height, k * width)
         if given != expected:
             raise ValueError(f"Generator: fine must be {expected} pixels, got {given}")
+
+        # E_c and E_s give features at every level.
         features = self._padded(F)
         others = [x for x in (S, p2d) if x is not None]
         skips = self.content.levels(self._stem(features, others, fine))
         styles = self.style(features)
+
+        # The coarsest level, then the decoder with the skips from coarse to fine.
         h = skips[-1]
         for conv, style in zip(self.mid, self.mid_style, strict=True):
             h = style(conv(h), styles[-1], g)
@@ -222,7 +255,11 @@ class Generator(nn.Module):
             h = level(h, skips[-2 - i], styles[-2 - i], g)
         with full_precision(h.device):  # bf16 would round the image to 8 bits
             painted = self.paint(h.to(self.paint.weight.dtype))
+
+        # Pixels of a patch are its channels; the padding is cut off.
         painted = functional.pixel_shuffle(painted, self.patch)[..., :height, :width]
+
+        # The painted image is a correction of Step I's colour and alpha.
         if self.rgb_skip:
             if alpha is None:
                 raise ValueError(
@@ -235,12 +272,15 @@ class Generator(nn.Module):
         self, features: Tensor, others: list[Tensor], fine: Tensor | None
     ) -> Tensor:
         """E_c's stem on F, S, p₂D and F's fine pixels, without forming them as channels."""
+        # Without fine pixels the stem is an ordinary convolution of all inputs.
         stem = self.content.stem
         k = self.supersample
         C = features.shape[1]
         if fine is None:
             padded = [self._padded(x) for x in others]
             return stem(torch.cat([features, *padded], dim=1))  # type: ignore[no-any-return]
+
+        # The convolution is split into a part for F with its fine pixels and a part for the rest.
         stride = self.patch
         padding = int(self.patch == 1)
         weight = stem.weight
@@ -248,8 +288,12 @@ class Generator(nn.Module):
         rest = derived(
             self, "rest", lambda: channels_last(weight[:, C : -C * k * k]), weight
         )
+
+        # The fine part has a stride and padding in fine pixels.
         fine = self._padded(fine, k)
         h = functional.conv2d(fine, kernel, stem.bias, k * stride, k * padding)
+
+        # S and p₂D have the resolution of the image.
         if others:
             given = self._padded(torch.cat(others, dim=1))
             h = h + functional.conv2d(given, rest, None, stride, padding)
@@ -266,7 +310,10 @@ class Generator(nn.Module):
 def fine_kernel(weight: Tensor, C: int, k: int) -> Tensor:
     """``[O, C, n k, n k]``: the part of a stem's ``weight`` that reads F, as one kernel on F's fine
     pixels: its first C channels read their averages, its last C k² each single one."""
+    # Weights of single fine pixels, as a kernel over the fine grid.
     fine = weight[:, -C * k * k :].unflatten(1, (C, k, k)).permute(0, 1, 4, 2, 5, 3)
+
+    # Weights of the averages, spread over the k² fine pixels of each.
     mean = weight[:, :C, :, None, :, None] / (k * k)
     return channels_last((fine + mean).flatten(4, 5).flatten(2, 3))
 
@@ -275,6 +322,7 @@ def upsampled_kernel(weight: Tensor) -> Tensor:
     """``[I, O, 4, 4]`` of a transposed convolution of stride 2 and padding 1: the kernel
     ``[O, I, 3, 3]`` after upsampling to the nearest."""
     for dim in (2, 3):
+        # A pixel reaches four upsampled ones in each direction, with these sums of weights.
         first, middle, last = weight.unbind(dim)
         weight = torch.stack([last, middle + last, first + middle, first], dim)
     return channels_last(weight.transpose(0, 1))

@@ -77,6 +77,9 @@ class Harmonic(ResidualGaussians):
         for name in follow:
             one_of("model.deformation.follow", name, tuple(RATES))
         count = len(rest_points)
+
+        # Every Gaussian has a constant for each residual, and slopes for those that follow its
+        # normal.
         sizes = dict(zip(RATES, self.parts, strict=True))
         # lists of pairs, since dictionaries would be sorted
         self.constants = nn.ParameterDict(
@@ -103,6 +106,8 @@ class Harmonic(ResidualGaussians):
         features; `_geometry` and `colour_from` make Gaussians of the sums. Means count in
         `mean_step`."""
         found = []
+
+        # A residual that does not follow the normals has slopes of zero.
         for name, constant in self.constants.items():
             none = constant.new_zeros(len(constant), HARMONICS - 1, constant.shape[-1])
             slopes = self.slopes.get(name, none)
@@ -118,6 +123,8 @@ class Harmonic(ResidualGaussians):
         chosen: Tensor | None = None,
     ) -> Residuals:
         """ΔG of posed points; pose, root and pelvis are not used."""
+        # The part that follows the normals; the first harmonic is 1, and its factor is the
+        # constant.
         given = list(self.slopes.values())
         parts = {}
         if given:
@@ -126,6 +133,9 @@ class Harmonic(ResidualGaussians):
             moved = (harmonics(points.normals)[..., 1:, None] * slopes).sum(-2)
             sizes = [x.shape[-1] for x in given]
             parts = dict(zip(self.slopes, moved.split(sizes, dim=-1), strict=True))
+
+        # Constants and moving parts are added; harmonics of colour that are not active are left
+        # out.
         found = []
         for name, constant in self.constants.items():
             used = (
@@ -135,6 +145,8 @@ class Harmonic(ResidualGaussians):
             )
             values = constant.expand(len(points.means), -1, -1)[..., :used]
             found.append(values + parts[name][..., :used] if name in parts else values)
+
+        # All residuals in the order of `Residuals`, of the chosen points.
         raw = torch.cat(found, dim=-1)
         if chosen is not None:
             raw = raw.gather(1, chosen.unsqueeze(-1).expand(-1, -1, raw.shape[-1]))
@@ -163,6 +175,7 @@ def distilled(
     Raises:
         ConfigError: when the avatar has no Ψ.
     """
+    # The copy keeps every part but Ψ.
     found = deepcopy(avatar)
     psi = avatar.deformation
     if psi is None:
@@ -171,6 +184,8 @@ def distilled(
         )
     if isinstance(psi, Harmonic):
         return found
+
+    # The settings that bounds and activations depend on stay as they are.
     same = (
         "features",
         "sh_degree",
@@ -182,9 +197,13 @@ def distilled(
     settings: dict[str, Any] = {name: getattr(psi, name) for name in same}
     settings["scale_min"], settings["scale_max"] = psi.scale_range
     fitted = Harmonic(avatar.rest_points, psi.body_height, follow=follow, **settings)
+
+    # The fit over all poses. `Harmonic` multiplies its means by mean_step, so they are divided.
     maps, mean = ridge_regression(_samples(avatar, poses), ridge)
     maps[..., :3] /= psi.mean_step
     mean[..., :3] /= psi.mean_step
+
+    # Each residual gets its columns: a linear map, or the mean over the poses.
     parts = (x.split(psi.parts, dim=-1) for x in (maps, mean))
     for name, linear, constant in zip(RATES, *parts, strict=True):
         fitted.constants[name].copy_(linear[:, 0] if name in follow else constant)
@@ -197,8 +216,11 @@ def distilled(
 def _samples(avatar: Avatar, poses: Iterable[Pose]) -> Iterator[tuple[Tensor, Tensor]]:
     """Harmonics ``[N, 9]`` and residuals ``[N, C]`` of each pose."""
     for p, visibility, given in poses:
+        # Ψ's residuals in this pose, without noise.
         body = avatar.body_pose(p, visibility) if given is None else given
         points, residuals = avatar.residuals(p, visibility > 0, body)
+
+        # The columns are in the order of `Harmonic.coefficients`.
         values = [
             getattr(residuals, name).reshape(points.scales.numel(), -1)
             for name in RATES
@@ -218,6 +240,7 @@ def ridge_regression(
     Returns:
         ``[N, K, C]`` and ``[N, C]``, float64.
     """
+    # Sums over the poses; the shapes follow from the first sample.
     count = 0
     gram = torch.zeros(())
     moment = torch.zeros(())
@@ -227,6 +250,8 @@ def ridge_regression(
         count = count + 1
         gram = gram + x @ x.mT
         moment = moment + x @ y
+
+    # Averages make the penalty independent of the number of poses.
     penalty = torch.full_like(gram[0, 0], ridge)
     penalty[0] = 0
     gram = gram / count

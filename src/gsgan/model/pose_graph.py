@@ -39,9 +39,13 @@ class GraphLayer(nn.Module):
     def __init__(self, mask: Tensor, inputs: int, outputs: int) -> None:
         super().__init__()
         joints = mask.shape[0]
+
+        # The adjacency starts as the joint itself with a little of its neighbours.
         self.register_buffer("mask", mask, persistent=False)
         identity = torch.eye(joints)
         self.adjacency = nn.Parameter(identity + NEIGHBOUR_WEIGHT * (mask - identity))
+
+        # Every joint has weights of its own.
         self.weight = nn.Parameter(torch.empty(joints, inputs, outputs))
         bound = 1 / math.sqrt(inputs)
         nn.init.uniform_(self.weight, -bound, bound)
@@ -49,6 +53,7 @@ class GraphLayer(nn.Module):
 
     def forward(self, h: Tensor) -> Tensor:
         """``[B, J, inputs]`` to ``[B, J, outputs]``."""
+        # Features pass through the weights of their joint, then joints take in their neighbours.
         h = torch.bmm(h.transpose(0, 1), self.weight).transpose(0, 1)
         return (self.adjacency * self.mask) @ h + self.bias
 
@@ -76,10 +81,14 @@ class PoseGraph(nn.Module):
     ) -> None:
         super().__init__()
         template = named_template(template)
+
+        # Joints that share an edge are neighbours; the mask is symmetric.
         joints = len(template.names)
         mask = torch.eye(joints)
         for a, b in template.gnn_edges:
             mask[a, b] = mask[b, a] = 1
+
+        # Two layers mix neighbours, and two work on each joint alone.
         alone = torch.eye(joints)
         self.octaves = octaves
         self.layers = nn.ModuleList(
@@ -90,6 +99,8 @@ class PoseGraph(nn.Module):
                 GraphLayer(alone, width, joint_channels),
             ]
         )
+
+        # The readout has a number per edge, from the channels of both its joints.
         self.register_buffer(
             "edges", torch.tensor(template.edges).long(), persistent=False
         )
@@ -101,10 +112,13 @@ class PoseGraph(nn.Module):
 
     def forward(self, omega: Tensor, pose: Tensor) -> Tensor:
         """g ``[B, 35]`` from Ω ``[B, J, 6]``; ``pose`` is the other encoder's input, unused."""
+        # The layers turn Ω into features of the joints; the last one has no ReLU.
         h = positional_encoding(omega, self.octaves)
         for layer in self.layers[:-1]:
             h = functional.relu(layer(h))
         h = self.layers[-1](h)
+
+        # Each number of g is a weighted sum over the two joints of its edge.
         pairs = torch.cat([h[:, self.edges[:, 0]], h[:, self.edges[:, 1]]], dim=-1)
         return (pairs * self.readout).sum(-1) + self.readout_bias
 
@@ -144,8 +158,11 @@ def pose_inputs(
         Ω ``[B, J, 6]``, and joints ``[B, J, 3]`` about the root in camera axes and body heights,
         those of the face replaced by its `face_code`.
     """
+    # Joints in camera axes, so that g depends on what the camera sees of the pose.
     root = root_of(p, template).unsqueeze(1)
     in_camera = (p - root) @ camera.R.mT / body_height
+
+    # Landmarks of the face have a code of their own.
     if (face := face_code(p, frames.head, template)) is not None:
         in_camera = torch.cat([in_camera[:, : -face.shape[1]], face], dim=1)
     return omega(p, valid, camera.R, template, frames=frames), in_camera

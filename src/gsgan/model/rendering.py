@@ -48,6 +48,7 @@ class Rendering:
 
     def pasted(self, window: Window) -> Rendering:
         """The rendering in the whole image, with background outside the window."""
+        # Only the maps that exist are pasted, into images of zeros.
         names = (
             "image",
             "alpha",
@@ -60,6 +61,8 @@ class Rendering:
             name: value for name in names if (value := getattr(self, name)) is not None
         }
         whole = {name: window.paste(value) for name, value in held.items()}
+
+        # Outside the window all of S is background.
         if self.segmentation is not None:
             inside = window.paste(torch.ones_like(self.segmentation[:, :1]))
             parts = whole["segmentation"]

@@ -63,15 +63,21 @@ class Segmentation(SkinnedGaussians):
         labelled: bool = True,
     ) -> None:
         super().__init__(body, points, opacity, scale)
+
+        # The classes of S, and how the data's labels map to them.
         self.accuracy = accuracy
         self.map = class_map(body.label_names, body.vertex_labels, mode, hands_face)
         # Voted labels are saved, so that the vote is not repeated; the body's own are not.
         self.voted = body.label_source == "vote"
         self.register_buffer("vertex_labels", body.vertex_labels, persistent=self.voted)
         self.register_buffer("truth_table", self.map.as_table(), persistent=False)
+
+        # The class of each vertex is fixed.
         self.register_buffer("one_hot", self._classes_of_points(), persistent=False)
         self.register_load_state_dict_post_hook(_classes_as_loaded)
         self.all_classed = bool((self.one_hot.sum(dim=1) > 0).all())
+
+        # Without part labels two numbers learn in place of all shapes.
         self.common: nn.Parameter | None = None
         if not labelled:
             self.requires_grad_(False)
@@ -113,11 +119,15 @@ class Segmentation(SkinnedGaussians):
     def gaussians(self, pose: BodyPose) -> Gaussians:
         """The body's Gaussians in pose: covariances A Σ Aᵀ, features = one-hot class."""
         A, t = self.points.blend(pose)
+
+        # Shapes and opacities, with the two common factors where S learns from masks.
         log_scales: Tensor = self.log_scales
         logits: Tensor = self.logit_opacities
         if self.common is not None:
             log_scales = log_scales + self.common[0]
             logits = logits + self.common[1]
+
+        # The means move by LBS.
         means = skin(self.points.means, A, t)
         features = self.one_hot.expand(len(A), -1, -1)
         return self.deformed(A, means, log_scales, logits, features)
@@ -135,6 +145,8 @@ class Segmentation(SkinnedGaussians):
     def forward(self, pose: BodyPose, camera: Camera) -> Tensor:
         """S ``[B, classes, H, W]``: probabilities; channel 0 is the rest."""
         raster = self.raster(pose, camera)
+
+        # Vertices without a class occlude, but their share of a pixel is background.
         covered = (
             raster.alpha
             if self.all_classed
@@ -145,11 +157,15 @@ class Segmentation(SkinnedGaussians):
     def loss(self, frame: Frame) -> Tensor:
         """The loss of a frame: on its labels, or on its mask where the data has no labels."""
         assert frame.body is not None
+
+        # Without part labels the silhouette is compared with the mask.
         if self.common is not None:
             alpha = self.raster(frame.body, frame.camera).alpha
             return silhouette_loss(alpha, frame.mask, frame.unsure)
         labels = torch.full_like(frame.mask[:, 0], IGNORE, dtype=torch.long)
-        if frame.labels is not None:  # nothing is learned from an image without labels
+
+        # Nothing is learned from an image without labels.
+        if frame.labels is not None:
             labels = self.truth(frame.labels)
         return segmentation_loss(self(frame.body, frame.camera), labels)
 
@@ -170,8 +186,11 @@ def segmentation_loss(segmentation: Tensor, labels: Tensor) -> Tensor:
         segmentation: ``[B, classes, H, W]``.
         labels: ``[B, H, W]`` int64, see `Segmentation.truth`.
     """
+    # Labels without a channel are ignored.
     labels = torch.where(labels < segmentation.shape[1], labels, IGNORE)
     log = (segmentation + PROBABILITY_FLOOR).log()
+
+    # The mean is over pixels with a label, and 0 where there are none.
     total = functional.nll_loss(log, labels, ignore_index=IGNORE, reduction="sum")
     return total / (labels != IGNORE).sum().clamp_min(1)
 
@@ -189,9 +208,12 @@ def silhouette_loss(
     Returns:
         The mean over the other pixels; 0 where there are none.
     """
+    # Probabilities of the person and of the rest, kept away from a logarithm of zero.
     log_person = (alpha + PROBABILITY_FLOOR).log()
     log_rest = (1 - alpha + PROBABILITY_FLOOR).log()
     loss = -(mask * log_person + (1 - mask) * log_rest)
+
+    # Unsure pixels are left out of the mean.
     sure = torch.ones_like(loss) if unsure is None else (unsure <= 0).to(loss)
     return (loss * sure).sum() / sure.sum().clamp_min(1)
 
@@ -239,8 +261,12 @@ def class_map(
     one_of("model.segmentation.mode", mode, ("body", "hands"))
     if mode == "hands":
         return _hands(label_names, face)
+
+    # The background and every label with a vertex have a channel.
     present = set(vertex_labels.unique().tolist()) - {0}
     kept = [0, *sorted(present)]
+
+    # Labels without a vertex are numbered after the channels.
     absent = [label for label in range(1, len(label_names)) if label not in present]
     number = {label: i for i, label in enumerate([*kept, *absent])}
     return ClassMap(
@@ -251,6 +277,7 @@ def class_map(
 
 
 def _hands(label_names: Sequence[str], face: bool) -> ClassMap:
+    # Every requested group must be among those that the labels name.
     requested = (*HANDS, FACE_CLASS) if face else HANDS
     groups = [group_of_part(name) for name in label_names]
     lacking = [name for name in requested if name not in groups]
@@ -259,5 +286,7 @@ def _hands(label_names: Sequence[str], face: bool) -> ClassMap:
             f"model.segmentation.mode=hands needs labels for {', '.join(requested)}, but they name "
             f"no {' and no '.join(lacking)} ({', '.join(label_names)}); choose mode=body"
         )
+
+    # The requested groups are numbered from 1; all else is background.
     table = tuple(1 + requested.index(g) if g in requested else 0 for g in groups)
     return ClassMap(names=("background", *requested), absent=(), table=table)

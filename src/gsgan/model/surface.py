@@ -48,14 +48,20 @@ class SurfaceGaussians(SkinnedGaussians):
         super().__init__(body, points, opacity, scale)
         one_of("model.surface: sh_degree", sh_degree, range(4))
         count = len(self.points)
+
+        # Colour is splatted alone, without other features.
         self.features = 0
         self.sh_degree = sh_degree
         self.body_height = float(body_height)
         # raised during training; higher degrees are not computed
         self.active_degree = sh_degree
+
+        # Bounds of what is learned.
         self.mean_bound = mean_bound
         self.logit_bound = logit_bound
         self.scale_range = (scale_min, scale_max)
+
+        # Means start at their vertices, colours at grey.
         self.offsets = nn.Parameter(torch.zeros(count, 3))
         self.sh = nn.Parameter(torch.zeros(count, (sh_degree + 1) ** 2, 3))
 
@@ -71,9 +77,12 @@ class SurfaceGaussians(SkinnedGaussians):
 
     def forward(self, pose: BodyPose, eye: Tensor) -> Gaussians:
         """The Gaussians in pose, coloured as seen from ``eye`` ``[B, 3]`` (world, metres)."""
+        # The means: offsets at rest within a bound, then LBS.
         A, t = self.points.blend(pose)
         offsets = self.mean_bound * self.body_height * torch.tanh(self.offsets)
         means = skin(self.points.means + offsets, A, t)
+
+        # Bounds of the scales in metres, and the harmonics that are active.
         low, high = (math.log(bound * self.body_height) for bound in self.scale_range)
         sh = self.sh[:, : (self.active_degree + 1) ** 2].expand(len(A), -1, -1, -1)
         return self.deformed(

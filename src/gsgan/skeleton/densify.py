@@ -167,6 +167,8 @@ class Densify(nn.Module):
     ) -> None:
         super().__init__()
         one_of("Densify: sampler", sampler, get_args(Sampler))
+
+        # Every part has at least one point.
         counts = (points_per_limb, face_points, torso_points, points_per_finger_bone)
         for name, count in zip(COUNT_NAMES, counts, strict=True):
             whole(f"Densify: {name}", count, 1)
@@ -315,6 +317,7 @@ class Densify(nn.Module):
 
     def _seen(self, valid: Tensor) -> Tensor:
         """``[B, P]`` whether each part is seen, of joints ``[B, J]``."""
+        # Each part needs other joints: both ends, any of the face, three of the trunk.
         c = constants(self.template, valid.device, self.template_points.dtype)
         limbs = valid.index_select(1, c.starts) & valid.index_select(1, c.ends)
         face = valid.index_select(1, self._face).any(1, keepdim=True)
@@ -337,6 +340,7 @@ class Densify(nn.Module):
         lines = torch.stack([l_sh - r_sh, l_hip - r_hip, spine], dim=1)
         lengths = (lines.square().sum(-1) + MIN_LENGTH**2).sqrt()
 
+        # The wider line gives the width, and half of the width is the depth.
         width = lengths[:, :2].amax(1)
         height = lengths[:, 2]
         low, high = TORSO_RANGE
@@ -345,6 +349,7 @@ class Densify(nn.Module):
 
     def _sigma_by_limb(self) -> list[float]:
         """Per metre of limb: ``sigma sqrt(area / n)`` with lateral area ``2 pi r h²``."""
+        # A cylinder of length h has a radius in proportion to h.
         limb_area = 2 * np.pi * self.radius_ratio
         finger_area = 2 * np.pi * self.finger_radius_ratio
         limb = float(self.sigma * (limb_area / self.counts[0]) ** 0.5)
@@ -355,6 +360,7 @@ class Densify(nn.Module):
 
     def _hub_sigma(self, radius: Tensor, edges: Tensor) -> Tensor:
         """``[B, 2]`` metres: initial standard deviations of face and torso."""
+        # The areas of the box and of the sphere, shared by their points.
         x, y, z = edges.unbind(-1)
         area = 2 * (x * y + y * z + z * x)
         face = radius * float(self.sigma * (4 * np.pi / self.counts[1]) ** 0.5)
@@ -433,6 +439,8 @@ def shipped(shape: str, n: int) -> Samples:
         stored = np.load(file, allow_pickle=False)
         points = stored[shape].astype(np.float64)
         normals = stored[f"{shape}_normals"]
+
+    # The file has one sample of each shape.
     if len(points) != n:
         raise ConfigError(
             f"Densify: sampler 'trimesh' has {len(points)} {shape} points, {n} were requested; "

@@ -94,6 +94,7 @@ def face_groups(start: int) -> tuple[tuple[str, tuple[Edge, ...]], ...]:
         )
         return tuple(pair for chain in numbers for pair in pairwise(chain))
 
+    # A ring returns to its first landmark.
     rings = [(*ring, ring[0]) for ring in (LIPS, *LIDS)]
     return (
         ("brows", joined(*BROWS)),
@@ -104,6 +105,7 @@ def face_groups(start: int) -> tuple[tuple[str, tuple[Edge, ...]], ...]:
 
 def face_links(start: int) -> tuple[Edge, ...]:
     """Edges to the pose's mouth and eyes, which connect lips, brows and lids to the graph."""
+    # The corners of the mouth, the middles of the brows and the corners of the lids.
     ends = {"mouth_left": LIPS[0], "mouth_right": LIPS[LIP_POINTS // 2]}
     for side, brow, lid in zip(SIDES, BROWS, LIDS, strict=True):
         ends[f"{side}_eye"] = brow[BROW_POINTS // 2]

@@ -101,6 +101,7 @@ def bone_frames(
         relative.append(swing)
         known = torch.cat([known, parent @ swing], dim=1)
 
+    # The lengths of the bones never reach zero, so that their gradient is finite.
     length2 = bones.square().sum(-1, keepdim=True)
     lengths = (length2.squeeze(-1) + MIN_LENGTH**2).sqrt()
     return BoneFrames(

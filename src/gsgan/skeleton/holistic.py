@@ -52,6 +52,7 @@ def _chains(start: int) -> tuple[tuple[int, ...], ...]:
 
 def _limbs(side: int) -> list[Edge]:
     """The forearm to the hand's own wrist, the palm's bones, and the fingers' from base to tip."""
+    # The limbs to the bases of all fingers come before those along the fingers.
     wrist = STARTS[side]
     chains = _chains(wrist)
     limbs = [(POSE_ARMS[side][1], wrist)]

@@ -145,6 +145,8 @@ def _estimated_hips(p: Tensor, valid: Tensor, template: SkeletonTemplate) -> Ten
     """
     hips = list(template.hips)
     left, right = template.hips
+
+    # Both shoulders are seen, and the hips have finite places that differ.
     seen = valid[:, list(template.shoulders)].all(1) & ~valid[:, hips].any(1)
     apart = (p[:, left] != p[:, right]).any(1)
     finite = p[:, hips].isfinite().all((1, 2))
@@ -155,10 +157,13 @@ def _estimated_hips(p: Tensor, valid: Tensor, template: SkeletonTemplate) -> Ten
 
 def _refuse_without_trunk(valid: Tensor, template: SkeletonTemplate) -> None:
     """Raises a ValueError that names the missing joints of each skeleton without a trunk."""
+    # Skeletons with too few joints of the trunk.
     trunk = valid[:, list(template.torso)]
     bad = (trunk.sum(-1) < MIN_TRUNK_JOINTS).nonzero().flatten().tolist()
     if not bad:
         return
+
+    # The message names the joints that each of them lacks.
     lost = []
     for item in bad:
         names = [template.names[j] for j in template.torso if not valid[item, j]]
@@ -246,6 +251,7 @@ def _bones(
     def index(values: list[int]) -> Tensor:
         return torch.tensor(values, dtype=torch.int64, device=device)
 
+    # The rest skeleton and its frames, from which lengths and directions are taken.
     with torch.inference_mode(False), torch.no_grad():
         c = constants(template, device, dtype)
         at_rest = bone_frames(c.rest.unsqueeze(0), None, template)

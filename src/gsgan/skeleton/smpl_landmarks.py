@@ -121,6 +121,8 @@ def to_mediapipe33(
         raise ValueError(
             f"to_mediapipe33: kind must be one of {list(TABLES)}, got {kind!r}"
         )
+
+    # All landmarks are unknown at first.
     table = TABLES[kind]
     j = _points("joints", joints, table.counts[0])
     p = np.full((*j.shape[:-2], len(MEDIAPIPE33.names), 3), np.nan)

@@ -88,6 +88,7 @@ class SkeletonTemplate:
 
         A palm is as deep as the limbs that end at its knuckles.
         """
+        # Parents come before their limbs, so their depth is known.
         depth: dict[int, int] = {}
         for limb, parent in enumerate(self.limb_parents):
             if parent < N_HUBS:
@@ -98,6 +99,7 @@ class SkeletonTemplate:
             else:
                 depth[limb] = depth[parent - self.n_hubs] + 1
 
+        # Limbs of the same depth, which are computed together.
         levels: list[list[int]] = [[] for _ in range(max(depth.values()) + 1)]
         for limb, level in depth.items():
             levels[level].append(limb)
@@ -245,6 +247,7 @@ def _twin(name: str) -> str:
 
 def _rest_positions() -> tuple[Vector, ...]:
     """Points of the A-pose, in the order of the names."""
+    # Joints of the right side are mirror images of those of the left.
     positions = []
     for name in _POSE_NAMES:
         if name in _LEFT_REST:
@@ -302,6 +305,7 @@ def _mediapipe33() -> SkeletonTemplate:
         base = {17: 15, 18: 16, 29: 27, 30: 28}.get(a, a)
         return N_HUBS + ends.index(base)
 
+    # The joint on the other side; the nose is its own.
     mirror = []
     for name in _POSE_NAMES:
         twin = _twin(name)

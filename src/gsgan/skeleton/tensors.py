@@ -141,6 +141,7 @@ def _constants(
         place[joint] = N_HUBS + len(turned) + limb
     posed = [joint for joint in range(len(t.names)) if joint not in t.expression]
 
+    # Everything on the device, in the dtype of the skeletons.
     return Constants(
         rest=cast(rest),
         starts=index(starts),
@@ -164,6 +165,7 @@ def _constants(
 
 def _eye_frame(t: SkeletonTemplate, rest: Tensor) -> Tensor:
     """``[3, 3]``: the frame of eyes and nose at rest, whose head frame is the identity."""
+    # The axes are across the eyes, up, and to the front.
     left, right = t.eyes
     middle = (rest[left] + rest[right]) / 2
     across_eyes = unit(rest[left] - rest[right])
@@ -180,6 +182,7 @@ def check_skeleton(
     Raises:
         ValueError: naming the argument, when a shape does not match the template.
     """
+    # The joints must be those of the template.
     joints = len(template.names)
     if p.ndim != 3 or p.shape[1:] != (joints, 3) or not p.is_floating_point():
         raise ValueError(
@@ -188,6 +191,8 @@ def check_skeleton(
         )
     if valid is None:
         return torch.ones(p.shape[:2], dtype=torch.bool, device=p.device)
+
+    # The mask must be of the same skeletons.
     if valid.shape != p.shape[:2] or valid.dtype != torch.bool:
         raise ValueError(
             f"{owner}: valid must be a bool tensor of shape {list(p.shape[:2])}, "

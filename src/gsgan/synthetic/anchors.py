@@ -57,6 +57,7 @@ def with_anchors(c: Character) -> Character:
     and lips, and the slit that the shape ``mouth_open`` opens; in their absence from the
     proportions of a face.
     """
+    # Limbs by their bones, the face by rays.
     main = c.dominant_bones()
     found: Anchors = {}
     for side in SIDES:
@@ -64,6 +65,7 @@ def with_anchors(c: Character) -> Character:
     for name, vertex in _Face(c, main).vertices().items():
         found[name] = -1, vertex
 
+    # Each landmark is a joint or a vertex; the other number is -1.
     body = free_body()
     names = (*body.landmark_names, *body.hand_names, *FACE_NAMES)
     pairs = np.array([found[name] for name in names], dtype=np.int64)
@@ -103,6 +105,7 @@ def _hand(c: Character, main: Ints, side: str) -> Anchors:
     if len(hand):
         length = float(((c.vertices[hand] - wrist) @ along).max())
 
+    # A finger without bones is placed on the hand, in shares of the hand's length.
     for finger, absent in zip(FINGERS, ABSENT_FINGERS, strict=True):
         for k, part in enumerate(THUMB if finger == "Thumb" else SEGMENTS):
             name = f"{side.lower()}_{finger.lower()}_{part}"

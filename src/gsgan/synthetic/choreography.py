@@ -321,6 +321,7 @@ def freestyle(c: Controls, s: Array, style: Style) -> None:
         c.foot[:, i, 0] = 0.04 + 0.04 * _wander(s, 1.9, phase + shift + 0.7)
         c.foot[:, i, 1] = 0.18 * _wander(s, 2.2, phase + shift + 2.2)
 
+    # The square keeps the squat shallow most of the time.
     depth = 0.6 * (0.5 + 0.5 * _wander(s, 2, phase + 6)) ** 2
     _squat_legs(c, depth, style.amplitude)
 
@@ -338,6 +339,7 @@ def freestyle(c: Controls, s: Array, style: Style) -> None:
     )
     c.path[:, 2] = 0.9 * _wander(s, 1.4, phase + 0.5)
 
+    # The face changes on its own too.
     c.set_face(
         mouth=0.5 * _wander(s, 6, phase + 7),
         smile=0.8 * _wander(s, 2, phase + 8),

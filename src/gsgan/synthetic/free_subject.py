@@ -67,6 +67,8 @@ def free_character() -> Character:
     body = free_body()
     faces = body.faces.numpy()
     vertices = body.vertices.double().numpy()
+
+    # Landmarks are not anchored here: their arrays are empty.
     none = np.zeros(0, dtype=np.int64)
 
     # Each surface is a texture of one opaque texel.
@@ -74,6 +76,8 @@ def free_character() -> Character:
     for name, colour in zip(body.surface_names, COLOURS, strict=True):
         texel = np.array([[[*colour, 255]]], np.uint8)
         surfaces.append(Surface(name, texel))
+
+    # The arrays of the body, with bones named as the motions expect them.
     return Character(
         name="free_body",
         vertices=vertices,
@@ -107,6 +111,7 @@ def free_pose(motion: Animation) -> BodyPose:
     is_root = (parents < 0)[:, None, None]
     local = np.where(is_root, R, relative)
 
+    # The translation is that of the first joint from its place at rest.
     transl = motion.joints[:, 0] - body.joints[0].double().numpy()
     return BodyPose(
         theta=torch.from_numpy(axis_angle(local)).float(),

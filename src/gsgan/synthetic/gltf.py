@@ -112,6 +112,7 @@ class _Skeleton:
         self.number = {node: k for k, node in enumerate(self.ids)}
         self.bones = self._names(named)
 
+        # The poses need these bones.
         missing = [bone for bone in REQUIRED_BONES if bone not in self.bones]
         if missing:
             more = ", …" if len(missing) > 6 else ""
@@ -361,6 +362,7 @@ def _surface(glb: Glb, material: int) -> Surface:
         colour = colour.copy()
         colour[..., 3] = 255
 
+    # Normal maps are optional.
     normal = None
     if entry.normalTexture is not None:
         normal = glb.image(entry.normalTexture.index)[..., :3]
@@ -442,6 +444,8 @@ def _character(glb: Glb, skeleton: _Skeleton) -> Character:
         raise DataError(
             f"{glb.path}: no triangles on its bones; export the character's meshes"
         )
+
+    # All parts in one list of vertices, turned and scaled so that the person stands.
     vertices = np.concatenate([part.vertices for part in parts])
     standing = _standing(skeleton, vertices)
     vertices = standing.points(vertices)
@@ -466,6 +470,7 @@ def _character(glb: Glb, skeleton: _Skeleton) -> Character:
     material = [materials.index(part.material) for part in parts]
     names = np.repeat([part.name for part in parts], counts)
 
+    # Labels and landmarks need a character, so they are added afterwards.
     character = Character(
         name=glb.path.stem,
         vertices=vertices,

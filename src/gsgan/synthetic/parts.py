@@ -147,6 +147,8 @@ def _bone_labels(c: Character) -> tuple[Ints, Ints, np.ndarray]:
     cloth: list[int] = []
     skin: list[int] = []
     roots: list[str] = []
+
+    # Bones without labels of their own have those of their parents, and roots those of the hips.
     for bone, parent in zip(c.bones, c.parents, strict=True):
         name = bone.removeprefix("Left").removeprefix("Right")
         side = bone.removesuffix(name).lower()

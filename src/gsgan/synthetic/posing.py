@@ -61,6 +61,7 @@ class Choreography:
 
     def at(self, times: Array) -> Animation:
         """The poses at times ``[F]``, seconds in [0, `duration`]."""
+        # The passage's controls, with the feet in their steps.
         c = controls_at(times, self.seed, self.programme)
         feet = [self.steps.at(times, foot) for foot in range(2)]
         _follow_feet(c, feet)
@@ -89,6 +90,7 @@ class Choreography:
             pole = pole + c.free[:, i, None] * (freed - pole)
             pose.reach(side, LEG, ankles[i], pole)
 
+            # A hand goes where its knuckles are placed, if the passage places them.
             placed = None
             if not np.isnan(c.knuckle[:, i]).any():
                 placed = self._placed(pose, c, i, side)
@@ -242,6 +244,7 @@ def _turned(turns: Array, vectors: Array) -> Array:
 
 def _hand_turn(c: Controls, i: int, side: str) -> Array:
     """``[F, 3, 3]`` the hand's turn in the axes of its `pointing` and `facing`."""
+    # Mirrored directions become those of this side.
     mirror = np.array([SIGN[side], 1, 1])
 
     # The palm's direction, orthogonal to the hand's.
@@ -263,6 +266,7 @@ def _freed(c: Controls, i: int, foot: FootState) -> FootState:
     own_y = c.path[:, 1] + sine * sign * x + cosine * y
     own_place = np.column_stack([own_x, own_y, heading + sign * out])
 
+    # The share by which the foot is free blends both states.
     free = c.free[:, i]
     return foot._replace(
         place=foot.place + free[:, None] * (own_place - foot.place),

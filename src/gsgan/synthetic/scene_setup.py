@@ -183,6 +183,7 @@ class SceneSettings:
 
     def _check_together(self) -> None:
         """The parameters agree with each other."""
+        # The held-out frames and cameras must fit those of the training.
         _require(
             self.test_frames < self.frames,
             f"test_frames must be less than frames = {self.frames}, got {self.test_frames}",
@@ -192,6 +193,8 @@ class SceneSettings:
             f"test_cameras stand between training cameras, so there can be at most "
             f"{self.train_cameras}, got {self.test_cameras}",
         )
+
+        # A lens has one of OpenCV's numbers of coefficients; zoomed cameras copy test cameras.
         _require(
             self.lens is None or len(self.lens) in DISTORTION_LENGTHS,
             f"lens must list {' or '.join(map(str, DISTORTION_LENGTHS))} coefficients "
@@ -234,6 +237,7 @@ def dataset_key(settings: SceneSettings) -> str:
             raise DataError(f"data.source.{name}: {path} does not exist")
         parameters[name] = hashlib.sha256(path.read_bytes()).hexdigest()
 
+    # The hash covers the version of the generator and every parameter.
     content = repr((VERSION, sorted(parameters.items())))
     digest = hashlib.sha256(content.encode()).hexdigest()[:12]
     key = f"{Path(settings.avatar).stem}-{settings.size}-{digest}"
@@ -309,6 +313,7 @@ class Scene:
 
     def _moving(self) -> Moving:
         """The choreography or the recorded motion on this character."""
+        # Names of choreographies, else the file of a recording.
         settings = self.settings
         if settings.motion in PROGRAMMES:
             programme = PROGRAMMES[settings.motion]
@@ -318,16 +323,19 @@ class Scene:
 
     def _cameras(self) -> dict[str, SceneCamera]:
         """All cameras by name: for training, for testing, then zoomed copies of the latter."""
+        # Signs are filmed from the front, other motions from all round.
         settings = self.settings
         signing = settings.motion == SIGNING
         points = extent(self.character, self.source, upper=signing)
         placed = front(settings, points) if signing else ring(settings, points)
         views = {f"cam{i:02d}": view for i, view in enumerate(placed)}
 
+        # Copies of the test cameras at other scales.
         for name in list(views)[settings.train_cameras :]:
             for scale in settings.test_scale or ():
                 views[f"{name}_x{scale:g}"] = zoomed(views[name], scale)
 
+        # The lens is the same for all cameras.
         if settings.lens is not None:
             dist = np.array(settings.lens)
             for name, view in views.items():
@@ -405,6 +413,7 @@ def extent(
         bone_weight=character.bone_weight[chosen],
     )
 
+    # The vertices at moments that are evenly spread over the motion.
     motion = source.at(frame_times(samples, source.duration))
     points = []
     for rotations, joints in zip(motion.rotations, motion.joints, strict=True):

@@ -96,6 +96,7 @@ def _write(root: Path, settings: SceneSettings, workers: int, progress: bool) ->
     from rich.console import Console
     from rich.progress import Progress
 
+    # The progress bar counts frames.
     scene = Scene(settings)
     count = f"{settings.frames} frames, {len(scene.views)} cameras"
     bar = Progress(console=Console(stderr=True), disable=not progress, transient=True)
@@ -153,6 +154,7 @@ def _trace_in_processes(
             time.sleep(POLL_SECONDS)
             codes = [process.poll() for process in running]
 
+        # The last line of the output tells why a worker failed.
         if any(codes):
             errors.seek(0)
             lines = [line.strip() for line in errors if line.strip()]
@@ -179,9 +181,12 @@ def trace_frames(root: Path, scene: Scene, frames: Iterable[int]) -> None:
     for frame in frames:
         person = None  # posed for the first image that does not exist
         for name, view in scene.views.items():
+            # Only images that do not exist are traced, so that a run that was killed can go on.
             paths = [root / kind / name / f"{frame:06d}.png" for kind in IMAGE_FOLDERS]
             if all(path.is_file() for path in paths):
                 continue
+
+            # The image in the colours of its camera.
             person = person or scene.posed(frame)
             image, alpha, labels = person.render(view, scene.settings.rays_per_pixel)
             if name in scene.tints:
@@ -212,6 +217,7 @@ def _calibration(view: SceneCamera) -> dict[str, Any]:
 
 def _write_skeletons(root: Path, scene: Scene) -> None:
     """Writes landmarks of body, hands and face, and the free body's exact pose."""
+    # Landmarks of all frames, which are numbered from 0.
     names, points = scene.landmarks()
     p = points.astype(np.float32)
     ids = np.arange(len(p))
@@ -239,6 +245,7 @@ def _write_skeletons(root: Path, scene: Scene) -> None:
                 names=np.array(names[part]),
             )
 
+    # The free body's pose is known exactly, in the format of a fitted one.
     if scene.settings.avatar == FREE_BODY:
         pose = free_pose(scene.motion)
         np.savez(

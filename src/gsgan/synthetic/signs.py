@@ -130,6 +130,7 @@ def _there(s: Array, start: float = 0.3, end: float = 0.7) -> Array:
 
 def hello(c: Controls, s: Array, style: Style) -> None:
     """A flat hand from the temple outwards; the other one rests."""
+    # The palm stays towards the front while the hand moves and tilts outwards.
     out = _there(s)
     _place(
         c,
@@ -139,6 +140,8 @@ def hello(c: Controls, s: Array, style: Style) -> None:
         facing=(-0.1, -1, 0),
     )
     _shape(c, RIGHT_HAND, FLAT_HAND)
+
+    # The elbow is outside; the mouth goes from wide to round.
     c.elbow[:, 1] = (1.0, 0.3, -0.9)
     c.set_face(
         smile=1,
@@ -150,6 +153,7 @@ def hello(c: Controls, s: Array, style: Style) -> None:
 
 def mask(c: Controls, s: Array, style: Style) -> None:
     """An open hand passes before eyes and mouth, its fingers moving."""
+    # The hand goes down from the eyes to the mouth.
     down = _there(s, 0.25, 0.8)
     _place(
         c,
@@ -164,6 +168,8 @@ def mask(c: Controls, s: Array, style: Style) -> None:
     for finger in range(1, 5):
         ripple = np.sin(TAU * 2 * s + style.phase + finger)
         c.bend[:, 1, finger] += 0.12 * ripple
+
+    # The elbow hangs down; brows and mouth open.
     c.elbow[:, 1] = (0.5, 0.2, -1.0)
     c.set_face(brows=1, mouth=0.8)
 
@@ -184,6 +190,8 @@ def interlace(c: Controls, s: Array, style: Style) -> None:
             pointing=(0, -0.5, 0.85),
             facing=(-1, 0, 0),
         )
+
+    # Open hands close round each other; the elbows are outside.
     _shape(c, BOTH_HANDS, OPEN)
     _shape(c, BOTH_HANDS, CLASP, closed)
     c.elbow[...] = (1.0, 0.2, -0.8)
@@ -193,6 +201,7 @@ def interlace(c: Controls, s: Array, style: Style) -> None:
 
 def palms(c: Controls, s: Array, style: Style) -> None:
     """Palm on palm, rubbing."""
+    # Each hand moves forwards where the other one moves back.
     rub = 0.02 * style.amplitude * np.sin(TAU * 2 * s + style.phase)
     for side, sign in zip(BOTH_HANDS, (1, -1), strict=True):
         _place(
@@ -202,6 +211,8 @@ def palms(c: Controls, s: Array, style: Style) -> None:
             pointing=(-0.07, -0.6, 0.8),
             facing=(-1, 0, 0),
         )
+
+    # The elbows are outside.
     _shape(c, BOTH_HANDS, FLAT_HAND)
     c.elbow[...] = (1.0, 0.2, -0.8)
     c.set_face(round=0.5, mouth=0.3, brows=-0.7)
@@ -209,6 +220,7 @@ def palms(c: Controls, s: Array, style: Style) -> None:
 
 def support(c: Controls, s: Array, style: Style) -> None:
     """A fist on the other hand's palm; both rise."""
+    # The palm and the fist on it rise together.
     rise = -0.24 + 0.1 * _there(s, 0.25, 0.75)
     _place(
         c,
@@ -224,6 +236,8 @@ def support(c: Controls, s: Array, style: Style) -> None:
         pointing=(-0.8, -0.6, 0),
         facing=(-0.6, 0.8, 0),
     )
+
+    # The lower hand is flat.
     _shape(c, LEFT_HAND, FLAT_HAND)
     _shape(c, RIGHT_HAND, FIST)
     c.set_face(wide=0.5, mouth=0.3, brows=0.5)
@@ -231,6 +245,7 @@ def support(c: Controls, s: Array, style: Style) -> None:
 
 def point(c: Controls, s: Array, style: Style) -> None:
     """The index finger touches the other hand's palm, twice."""
+    # The finger goes away from the palm and back, twice.
     back = 0.05 * np.sin(TAU * s) ** 2
     _place(
         c,
@@ -246,6 +261,8 @@ def point(c: Controls, s: Array, style: Style) -> None:
         pointing=(-1, -0.15, 0.1),
         facing=(0, 0.3, -1),
     )
+
+    # The touched hand is flat; the elbow of the other arm is outside.
     _shape(c, LEFT_HAND, FLAT_HAND)
     _shape(c, RIGHT_HAND, INDEX_HAND)
     c.elbow[:, 1] = (1.0, 0.1, -0.6)
@@ -254,6 +271,7 @@ def point(c: Controls, s: Array, style: Style) -> None:
 
 def hug(c: Controls, s: Array, style: Style) -> None:
     """Forearms crossed before the chest, the right one in front."""
+    # The forearms cross, rock, and part.
     x = 0.1 - 0.22 * _there(s, 0.1, 0.3) * (1 - _there(s, 0.7, 0.9))
     rock = 0.02 * style.amplitude * np.sin(TAU * s)
     _place(
@@ -270,6 +288,8 @@ def hug(c: Controls, s: Array, style: Style) -> None:
         pointing=(-0.8, 0.05, 0.6),
         facing=(0, 1, 0),
     )
+
+    # The hands are fists, and the head rocks with the arms.
     _shape(c, BOTH_HANDS, FIST)
     c.elbow[...] = (0.8, -0.2, -1.0)
     c.set_face(smile=1, mouth=0.2)
@@ -278,6 +298,7 @@ def hug(c: Controls, s: Array, style: Style) -> None:
 
 def turn(c: Controls, s: Array, style: Style) -> None:
     """Index fingers circle round each other."""
+    # The fingers are on opposite sides of a circle.
     for side, shift in zip(BOTH_HANDS, (0.0, TAU / 2), strict=True):
         angle = TAU * 2 * s + style.phase + shift
         ahead = -0.34 + 0.055 * np.cos(angle)
@@ -289,6 +310,8 @@ def turn(c: Controls, s: Array, style: Style) -> None:
             pointing=(-1, -0.2, 0.05),
             facing=(-0.2, 1, 0),
         )
+
+    # The mouth opens and closes three times meanwhile.
     _shape(c, BOTH_HANDS, INDEX_HAND)
     c.elbow[...] = (1.0, 0.1, -0.8)
     c.set_face(
@@ -299,6 +322,7 @@ def turn(c: Controls, s: Array, style: Style) -> None:
 
 def look(c: Controls, s: Array, style: Style) -> None:
     """Two fingers go from before the eyes forwards."""
+    # The hand goes from the eyes to the front.
     out = _there(s)
     _place(
         c,
@@ -314,6 +338,7 @@ def look(c: Controls, s: Array, style: Style) -> None:
 
 def roof(c: Controls, s: Array, style: Style) -> None:
     """Finger tips touch as a roof; then the hands go down as walls."""
+    # The palms turn towards each other while the hands go down.
     down = _there(s, 0.4, 0.7)
     _place(
         c,
@@ -329,6 +354,7 @@ def roof(c: Controls, s: Array, style: Style) -> None:
 
 def cancel(c: Controls, s: Array, style: Style) -> None:
     """Spread hands cross and part, twice, the left one in front; the head shakes."""
+    # The hands cross twice, one in front of the other.
     x = 0.05 + 0.1 * np.cos(TAU * 2 * s)
     _place(
         c,
@@ -344,6 +370,8 @@ def cancel(c: Controls, s: Array, style: Style) -> None:
         pointing=(-0.5, -0.2, 0.8),
         facing=(-0.7, -0.7, 0),
     )
+
+    # The head shakes as often as the hands cross.
     _shape(c, BOTH_HANDS, OPEN)
     c.set_face(wide=0.9, brows=-0.8)
     rotate(c.head, turn=0.25 * np.sin(TAU * 2 * s))
@@ -351,6 +379,7 @@ def cancel(c: Controls, s: Array, style: Style) -> None:
 
 def peek(c: Controls, s: Array, style: Style) -> None:
     """Both hands cover the eyes, and open to the sides."""
+    # The hands part, and their fingers spread.
     open_ = _there(s, 0.45, 0.7)
     _place(
         c,
@@ -361,6 +390,8 @@ def peek(c: Controls, s: Array, style: Style) -> None:
     )
     _shape(c, BOTH_HANDS, FLAT_HAND)
     _shape(c, BOTH_HANDS, FAN_HAND, open_)
+
+    # The face frowns while it is covered, and smiles afterwards.
     c.elbow[...] = (1.0, -0.1, -0.9)
     c.set_face(
         smile=open_,

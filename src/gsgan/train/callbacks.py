@@ -49,6 +49,7 @@ class ImageGrid(Callback):
         batch_idx: int,
         dataloader_idx: int = 0,
     ) -> None:
+        # The rows are spread over the validation batches, with one image from a batch.
         stride = max(1, int(sum(trainer.num_val_batches)) // max(1, self.rows))
         if (
             trainer.is_global_zero
@@ -60,6 +61,7 @@ class ImageGrid(Callback):
     def on_validation_epoch_end(
         self, trainer: Trainer, module: LightningModule
     ) -> None:
+        # Only the first process has collected rows.
         if self._collected:
             write_grid(
                 self._collected, self.folder / f"step_{_training(module).step:06d}.png"
@@ -71,6 +73,8 @@ class ProgressLines(Callback):
 
     def __init__(self, console: Console) -> None:
         self.console = console
+
+        # When this part of the run began, and at which iteration.
         self._clock = time.monotonic()
         self._first = 0
 
@@ -82,6 +86,8 @@ class ProgressLines(Callback):
         if not trainer.is_global_zero:
             return
         module = _training(module)
+
+        # The iteration, the phase that was trained last, and the scores.
         step = module.step
         total = module.schedule.total
         scores = trainer.callback_metrics
@@ -89,6 +95,8 @@ class ProgressLines(Callback):
         line += f" held-out PSNR {float(scores['val/psnr']):5.2f} dB"
         if module.avatar.generator is not None and "val/psnr_splat" in scores:
             line += f" (Step I's colour {float(scores['val/psnr_splat']):5.2f})"
+
+        # The time left, from the speed of this part of the run.
         done = step - self._first
         if done:
             spent = time.monotonic() - self._clock
@@ -106,6 +114,8 @@ class StopOnSignal(Callback):
 
     def __init__(self) -> None:
         self.asked = False
+
+        # Systems without these signals have no such scheduler.
         for name in ("SIGUSR1", "SIGUSR2"):
             if hasattr(signal, name):
                 signal.signal(getattr(signal, name), self._ask)
@@ -125,6 +135,7 @@ class AtomicCheckpoints(TorchCheckpointIO):
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: Any, storage_options: Any | None = None
     ) -> None:
+        # The checkpoint is complete in memory before a file is touched.
         buffer = io.BytesIO()
         torch.save(checkpoint, buffer)
         write_atomically(Path(path), buffer.getvalue())

@@ -100,8 +100,11 @@ def describe(
 
 def _precision(chosen: str) -> str:
     """The trainer's precision, and why it is 32 bits on an old GPU."""
+    # Without a GPU, or with bf16, the setting speaks for itself.
     if chosen == "bf16-mixed" or not torch.cuda.is_available():
         return chosen
+
+    # On a GPU that has bf16 the user chose another precision.
     capability = torch.cuda.get_device_capability()
     if capability >= BFLOAT16_SINCE:
         return chosen

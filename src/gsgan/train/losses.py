@@ -59,11 +59,15 @@ class StepOneLoss:
         with full_precision(frame.image.device):
             assert rendering.features is not None and rendering.splat_alpha is not None  # noqa: PT018
             assert rendering.colour is not None
+
+            # Ground truth and rendering are both put on the random background.
             target = frame.image
             behind = frame.image.new_zeros(())
             if background is not None:
                 target = frame.image + (1 - frame.mask) * background
                 behind = (1 - rendering.splat_alpha) * background
+
+            # Step I's colour.
             pixels = {"l1": self.l1, "ssim": self.ssim}
             loss = photometric(
                 rendering.colour + behind, target, unsure=frame.unsure, **pixels
@@ -77,6 +81,8 @@ class StepOneLoss:
                 loss = loss + self.feature_head * photometric(
                     read + behind, target, unsure=frame.unsure, **pixels
                 )
+
+            # Alpha has the mask as its target where no background supervises it.
             if background is None and self.alpha:
                 matte = photometric(
                     rendering.splat_alpha,
@@ -93,8 +99,11 @@ def perceptual_distance(
     perceptual: Perceptual, image: Tensor, frame: Frame, draws: Tensor | None
 ) -> Tensor:
     """L_perc of an image ``[B, 3, H, W]`` of a frame, or of crops that ``draws`` place."""
+    # Unsure pixels of the target show the image itself.
     target = without_unsure(frame.image, image, frame.unsure)
     compared = [image, target]
+
+    # Slow networks compare squares of the person alone.
     if perceptual.crop is not None:
         assert draws is not None
         compared = crop_person(compared, frame.mask, draws, perceptual.crop)
@@ -106,6 +115,7 @@ def discriminate(
 ) -> list[list[Tensor]]:
     """The discriminator's maps of an image; in full precision where the GAN's form compares two
     images, since bf16 rounds away small differences."""
+    # Other forms judge each image on its own and bear autocast.
     if gan not in COMPARING:
         return discriminator(image)  # type: ignore[no-any-return]
     with full_precision(image.device):
@@ -130,12 +140,15 @@ class DiscriminatorMaps:
         self.gan = gan
         # a leaf, so that neither loss reaches the other's parameters
         self.copy = image.detach().requires_grad_(image.requires_grad)
+
+        # Both images are judged, the rendering through its copy.
         with torch.enable_grad():
             self.fake = discriminate(discriminator, self.copy, gan)
             self.real = discriminate(discriminator, target.detach(), gan)
 
     def terms(self, adversarial: float, matching: float) -> dict[str, Tensor]:
         """The generator's terms by name, weighted; a term of weight 0 is left out."""
+        # The terms of the copy would also give the discriminator's parameters a gradient.
         terms = {}
         if adversarial:
             terms["adversarial"] = adversarial * generator_loss(
@@ -145,6 +158,8 @@ class DiscriminatorMaps:
             terms["feature_matching"] = matching * feature_matching(
                 self.real, self.fake
             )
+
+        # Through this function the image gets its gradient, and the parameters get none.
         found = _Through.apply(self.image, (self.copy, list(terms.values())))
         return dict(zip(terms, found, strict=True))
 
@@ -174,6 +189,7 @@ class _Through(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
+        # The gradient is of the copy alone. The graph is kept for the discriminator's loss.
         (grad,) = torch.autograd.grad(ctx.terms, ctx.copy, grads, retain_graph=True)
         return grad, None
 
@@ -185,15 +201,20 @@ class StepTwoLoss:
     Source: paper Sec. 3.5 and Alg. 2, an unweighted sum of L_GAN, L_perc and L_feat.
     """
 
+    # Terms of I_pred against the ground truth, by pixel.
     l1: float = 1.0
     l2: float = 0.0
     ssim: float = 0.2
     alpha: float = 1.0
+
+    # Terms of networks: L_perc, L_GAN and L_feat.
     perceptual: float = 1.0
     perceptual_every: int = 1
     adversarial: float = 1.0
     feature_matching: float = 10.0
     gan: str = "logistic"
+
+    # The term of Step I's colour, L_Ψ.
     anchor: float = 1.0
 
     def __post_init__(self) -> None:
@@ -204,6 +225,7 @@ class StepTwoLoss:
         self, discriminator: Discriminator, rendering: Rendering, frame: Frame
     ) -> DiscriminatorMaps:
         """The discriminator's maps of a rendering of ``frame``."""
+        # Unsure pixels show the image itself in the target.
         assert rendering.image is not None
         target = without_unsure(frame.image, rendering.image, frame.unsure)
         return DiscriminatorMaps(discriminator, rendering.image, target, self.gan)
@@ -235,22 +257,29 @@ class StepTwoLoss:
             maps: the discriminator's maps; None before the GAN starts.
             step: the iteration, for ``perceptual_every``.
         """
+        # I_pred on black.
         image = rendering.image
         alpha = rendering.alpha
         assert image is not None and alpha is not None  # noqa: PT018
         target = without_unsure(frame.image, image, frame.unsure)
         by_pixel = partial(photometric, l1=self.l1, l2=self.l2, ssim=self.ssim)
         terms = {"photometric": by_pixel(image, target)}
+
+        # The same on white, which supervises the alpha.
         if self.alpha:
             white = image + 1 - alpha
             truth = frame.image + 1 - frame.mask
             terms["alpha"] = self.alpha * by_pixel(white, truth, unsure=frame.unsure)
+
+        # L_Ψ and L_perc, which is weighted as much more as it is computed less often.
         if anchor is not None:
             terms["anchor"] = self.anchor * anchor
         if perceptual is not None and step % self.perceptual_every == 0:
             scale = self.perceptual * self.perceptual_every
             distance = perceptual_distance(perceptual, image, frame, draws)
             terms["perceptual"] = scale * distance
+
+        # The terms of the GAN, once it trains.
         if maps is not None:
             terms |= maps.terms(self.adversarial, self.feature_matching)
         return terms

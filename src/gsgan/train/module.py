@@ -91,10 +91,14 @@ class AvatarTraining(LightningModule):
         scene: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
+
+        # Several optimisers take turns, so the module steps them itself.
         self.automatic_optimization = False
         self.avatar = avatar
         S = avatar.segmentation
         generates = avatar.generator is not None
+
+        # The discriminator and the perceptual network are built only where a loss needs them.
         self.discriminator = (
             discriminator if generates and step_two.adversarial_terms else None
         )
@@ -104,35 +108,49 @@ class AvatarTraining(LightningModule):
         if perceptual is not None and compares:
             self.perceptual = perceptual()
         self.extra_losses = nn.ModuleDict(extra_losses or {})
+
+        # The phases of this avatar, see `Schedule.fitted`.
         self.schedule = schedule.fitted(
             segmentation=S is not None,
             from_masks=S is not None and S.common is not None,
             splats=avatar.splats is not None,
             generator=generates,
         )
+
+        # Optimisers, losses and the random changes of the input.
         self.recipes = recipes
         self.step_one = step_one
         self.step_two = step_two
         self.pose_noise = pose_noise
         self.window = None if window is None else whole("training.window", window, 16)
         self.seed = seed
+
+        # Logs, and what happens where training fails.
         self.log_every = at_least("training.log_every", log_every, 1)
         self.skipped = SkippedSteps(max_skipped, skip_window)
         self.rollback = rollback or Rollback()
+
+        # Facts that checkpoints store.
         self.record = record or {}
         self.scene = scene
+
+        # The average of the weights is validated and scored.
         self.average = (
             None if average is None else MovingAverage(avatar, average, average_every)
         )
         # Step I over a random colour, so that black clothes do not become transparent.
         self.random_background = avatar.effects.random_background.on
+
+        # A linear readout of F gives its further channels something to learn in Step I.
         reads = step_one.feature_head and avatar.splat_channels > 3
         self.feature_head = nn.Conv2d(avatar.splat_channels, 3, 1) if reads else None
         # iterations done: Lightning's global_step counts every optimiser's steps
         self.step = 0
         # commits of the code, several where a run was resumed
         self.code: list[str] = []
-        self.seconds_before = 0.0  # of earlier parts of the run
+
+        # seconds of earlier parts of the run
+        self.seconds_before = 0.0
         self._began: float | None = None
 
     @property
@@ -179,10 +197,14 @@ class AvatarTraining(LightningModule):
     def training_step(self, frame: Frame, batch_idx: int) -> None:
         if self.step >= self.schedule.total:
             return
+
+        # The view dependence of colour grows with the iterations.
         if self.avatar.splats is not None:
             self.avatar.splats.active_degree = self.schedule.degree(
                 self.step, self.avatar.splats.sh_degree
             )
+
+        # The frame in a window, trained by the phase that the iteration belongs to.
         frame = self._cut(frame)
         phase = self.schedule.phase(self.step)
         self._frame = frame
@@ -196,6 +218,7 @@ class AvatarTraining(LightningModule):
 
     def _cut(self, frame: Frame) -> Frame:
         """The frame in the window around the person, or in a random part of it."""
+        # A random part of the window, or of the whole image where there is no window.
         window = self.avatar.window(frame.skeleton, frame.camera)
         if self.window is not None:
             if window is None:
@@ -213,9 +236,12 @@ class AvatarTraining(LightningModule):
             self._descend({"segmentation/nll": loss}, "segmentation")
 
     def _train_step_one(self, frame: Frame) -> None:
+        # Only Step I's colour is rendered; no image is generated.
         rendering = self._computed(partial(self._rendered, frame, generate=False))
         if rendering is None:
             return
+
+        # L_Ψ and, in the later part of Step I, L_perc of the same image.
         terms = {"step_one/loss": self.step_one_loss(rendering, frame)}
         weight = self.step_one.perceptual
         done = self.schedule.share_of_step_one(self.step)
@@ -236,6 +262,7 @@ class AvatarTraining(LightningModule):
             self.average.update(self.avatar, self.step)
 
     def _train_step_two(self, frame: Frame) -> None:
+        # I_pred is rendered, and judged by the discriminator while the GAN trains.
         rendering = self._computed(partial(self._rendered, frame, generate=True))
         if rendering is None:
             return
@@ -245,15 +272,21 @@ class AvatarTraining(LightningModule):
                 self.discriminator, rendering, frame
             )
             self.rollback.watch(logits=maps.difference)
+
+        # One step of Ψ and the generator together.
         terms = self.step_two_terms(rendering, frame, maps)
         losses = {f"step_two/{name}": term for name, term in terms.items()}
         self._descend(losses, *self._splatting(), "generator")
         if self.average is not None:
             self.average.update(self.avatar, self.step)
+
+        # One step of the discriminator, on the same maps.
         if maps is not None:
             self._descend({"step_two/discriminator": maps.loss()}, "discriminator")
 
     def _rendered(self, frame: Frame, *, generate: bool) -> Rendering:
+        # The training's own settings: noise on the pose, and less work where the schedule allows
+        # it.
         rendering: Rendering = self.avatar(
             *frame.inputs,
             pose_noise=self._pose_noise(frame.skeleton),
@@ -261,6 +294,8 @@ class AvatarTraining(LightningModule):
             supersample=self.schedule.fine(self.step),
             reach=None if self.window is None else REACH,
         )
+
+        # The rollback watches the person's alpha and colours.
         if rendering.splat_alpha is not None and rendering.colour is not None:
             seen = {
                 "alpha": rendering.splat_alpha,
@@ -281,6 +316,7 @@ class AvatarTraining(LightningModule):
         self, rendering: Rendering, frame: Frame, maps: DiscriminatorMaps | None
     ) -> dict[str, Tensor]:
         """The generator's losses, weighted, by name."""
+        # L_Ψ keeps Step I's colour an image while Ψ learns from the generator.
         anchored = self.step_two.anchor and rendering.features is not None
         terms = self.step_two.terms(
             rendering,
@@ -291,6 +327,8 @@ class AvatarTraining(LightningModule):
             maps=maps,
             step=self.step,
         )
+
+        # The terms that the config adds.
         return terms | {
             name: loss(rendering, frame) for name, loss in self.extra_losses.items()
         }
@@ -298,6 +336,7 @@ class AvatarTraining(LightningModule):
     # -- optimisers
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
+        # The names tell which of Lightning's list each optimiser is.
         groups = parameter_groups(self.avatar, self.feature_head, self.discriminator)
         check_recipes(self.recipes, groups)
         self._names = list(groups)
@@ -316,16 +355,22 @@ class AvatarTraining(LightningModule):
     def _computed(self, compute: Callable[[], T]) -> T | None:
         """The result, or None in every process where one cannot compute it: where data or weights
         are not finite, or far away, the rasteriser refuses them with a ValueError."""
+        # A failure is kept until all processes know of it.
         found = None
         problem = ""
         try:
             found = compute()
         except ValueError as error:
             problem = str(error)
+
+        # All processes skip the iteration if one of them must.
         failed = found is None
-        if self.processes > 1:  # none may wait for another
+        if self.processes > 1:
+            # A process that skips alone would leave the others waiting.
             flag = torch.tensor(float(failed), device=self.device)
             failed = bool(self.trainer.strategy.reduce(flag, reduce_op="max"))
+
+        # A failed iteration counts as skipped.
         if not failed:
             return found
         self._skip({}, problem or "another process could not render its images")
@@ -333,6 +378,7 @@ class AvatarTraining(LightningModule):
 
     def _skip(self, losses: Mapping[str, Tensor], problem: str) -> None:
         """Counts a skipped iteration and prints why; after too many the run stops."""
+        # The likely cause is found from the data, the weights of every optimiser and the losses.
         stop = self.skipped.add(self.step)
         held = {
             name: [p for group in optimiser.param_groups for p in group["params"]]
@@ -340,6 +386,8 @@ class AvatarTraining(LightningModule):
         }
         cause = likely_cause(self._frame, held, losses, problem)
         count = self.skipped.count
+
+        # The run stops if too many were skipped, else it goes on.
         if stop:
             raise self._stopped(
                 f"{count} were skipped; likely cause: {cause}; correct it, or go on with a larger "
@@ -364,15 +412,20 @@ class AvatarTraining(LightningModule):
     def _descend(self, losses: Mapping[str, Tensor], *names: str) -> None:
         """One backward pass of the losses' sum and one step of each named optimiser; none if a
         gradient is not finite."""
+        # The losses add up, and each one has a curve.
         loss = torch.stack(list(losses.values())).sum()
         for name, term in losses.items():
             self._log(name, term)
+
+        # Gradients of earlier iterations are removed.
         optimisers = {name: self._optimisers()[name] for name in names}
         for optimiser in optimisers.values():
             optimiser.zero_grad(set_to_none=True)
         # Else gradients of what is computed in float32 are rounded too.
         with full_precision(loss.device):
             self.manual_backward(loss)
+
+        # Each optimiser clips its own gradients; a norm that is not finite ends the iteration.
         norms = [
             clip(optimiser.optimizer, self.recipes[name].clip).to(loss.device)
             for name, optimiser in optimisers.items()
@@ -380,12 +433,15 @@ class AvatarTraining(LightningModule):
         if not bool(torch.isfinite(torch.stack(norms)).all()):
             self._skip(losses, f"a gradient of {', '.join(names)} was not finite")
             return
+
+        # The rates follow the schedule, times the factor of each group.
         for name, optimiser in optimisers.items():
             for group in optimiser.param_groups:
                 group["lr"] = self._rate(name) * group["multiplier"]
             optimiser.step()
 
     def _rate(self, name: str) -> float:
+        # The schedule's rate over the span of the optimiser; each restoration slows Ψ.
         recipe = self.recipes[name]
         rate = recipe.rate.at(self.step, *self.schedule.span(name, recipe.span))
         return rate * self.rollback.rate if name == "psi" else rate
@@ -404,6 +460,9 @@ class AvatarTraining(LightningModule):
             if what is not None:
                 self.rollback.keep(self)
             return
+
+        # The person, Ψ or the discriminator has collapsed: the optimisers restart from the kept
+        # state.
         optimisers = [wrapped.optimizer for wrapped in self._optimisers().values()]
         if not self.rollback.restore(self, optimisers):
             raise self._stopped(
@@ -422,9 +481,12 @@ class AvatarTraining(LightningModule):
     ) -> Tensor:
         """``[size, *shape]`` this process's rows of numbers drawn for the batches of all processes,
         so that several processes draw what one with the whole batch would."""
+        # A seed of its own for each iteration and kind of number.
         state = (self.seed * SEED_STRIDE + self.step) * 64 + salt
         ranks = self.processes
         rank = 0 if self._trainer is None else self.trainer.global_rank
+
+        # Every process draws all numbers and takes the rows of its rank.
         generator = torch.Generator().manual_seed(state % (2**63))
         return draw((ranks * size, *shape), generator=generator)[
             rank * size : (rank + 1) * size
@@ -453,6 +515,7 @@ class AvatarTraining(LightningModule):
     def validation_step(  # type: ignore[override]
         self, frame: Frame, batch_idx: int
     ) -> Rendering:
+        # I_pred and Step I's colour are compared with the ground truth.
         rendering: Rendering = self.shown(*frame.inputs)
         for name, image in (
             ("psnr", rendering.image),
@@ -472,6 +535,7 @@ class AvatarTraining(LightningModule):
             self.log(name, value.detach(), sync_dist=True)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        # The counters are for a later part of the run, the rest is for scores and `gsgan.load`.
         checkpoint["gsgan"] = {
             "step": self.step,
             "processes": self.processes,
@@ -486,6 +550,7 @@ class AvatarTraining(LightningModule):
         }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        # The avatar and the number of processes must be those of the earlier part.
         state = checkpoint["gsgan"]
         self.avatar.effects.check_same(state["effects"])
         if (before := state.get("processes", self.processes)) != self.processes:
@@ -493,6 +558,8 @@ class AvatarTraining(LightningModule):
                 f"the run was trained by {before} processes, and {self.processes} would draw "
                 f"other batches; resume with trainer.devices × trainer.num_nodes = {before}"
             )
+
+        # Counters go on where the earlier part ended.
         self.step = state["step"]
         self.rollback.done = state["rollbacks"]
         self.seconds_before = state["train_seconds"]

@@ -41,6 +41,7 @@ class Recipe:
         self, groups: Iterable[tuple[list[nn.Parameter], float]]
     ) -> torch.optim.Adam:
         """Adam over groups of (parameters, rate multiplier)."""
+        # Each group keeps its multiplier, which `AvatarTraining` applies to every new rate.
         return torch.optim.Adam(
             [
                 {"params": p, "lr": self.rate.peak * k, "multiplier": k}
@@ -57,16 +58,23 @@ def parameter_groups(
     avatar: Avatar, feature_head: nn.Module | None, discriminator: nn.Module | None
 ) -> dict[str, list[tuple[list[nn.Parameter], float]]]:
     """Groups of (parameters, rate multiplier) by optimiser, for the parts that are built."""
+    # S learns alone, in the first phase.
     groups = {}
     if avatar.segmentation is not None:
         groups["segmentation"] = avatar.segmentation.parameter_groups()
+
+    # Ψ, the readout of F and the learnt skinning weights share an optimiser.
     if avatar.splats is not None:
         head = list(feature_head.parameters()) if feature_head is not None else []
         groups["psi"] = [*avatar.splats.parameter_groups(), (head, 1.0)]
         if (on_body := avatar.body_points) is not None:
             groups["psi"].append((list(on_body.parameters()), on_body.rate))
+
+    # The colours of the training cameras.
     if avatar.colour is not None:
         groups["colour"] = [(list(avatar.colour.parameters()), 1.0)]
+
+    # The pose code learns with the generator, and the discriminator against them.
     if avatar.generator is not None and avatar.pose_encoder is not None:
         encoder = avatar.pose_encoder.parameters()
         groups["generator"] = [([*avatar.generator.parameters(), *encoder], 1.0)]
@@ -80,6 +88,8 @@ def check_recipes(recipes: dict[str, Recipe], names: Iterable[str]) -> None:
     for name in names:
         if name not in recipes:
             raise ConfigError(f"training.recipes lacks {name}")
+
+        # Only psi and colour train in both steps.
         if name not in SPLATTING and recipes[name].span != "both":
             raise ConfigError(
                 f"training.recipes.{name}.span is read for psi and colour only"
@@ -88,6 +98,7 @@ def check_recipes(recipes: dict[str, Recipe], names: Iterable[str]) -> None:
 
 def clip(optimiser: torch.optim.Optimizer, largest: float | None) -> Tensor:
     """Clips all gradients together and returns their norm before clipping."""
+    # One norm for all parameters; without a limit the norm is only measured.
     parameters = [p for group in optimiser.param_groups for p in group["params"]]
     return nn.utils.clip_grad_norm_(
         parameters, float("inf") if largest is None else largest
@@ -106,6 +117,8 @@ class MovingAverage(nn.Module):
         super().__init__()
         between("training.average", decay, 0, 1)
         at_least("training.average_every", every, 1)
+
+        # The decay of one update stands for `every` iterations.
         self.decay = decay**every
         self.every = every
         self.copy = AveragedModel(module, multi_avg_fn=self._blend)
@@ -127,6 +140,7 @@ class MovingAverage(nn.Module):
             self.copy.update_parameters(module)
 
     def _blend(self, averaged: Any, current: Any, count: Tensor | int) -> None:
+        # The decay is small at first, so that the average forgets its start quickly.
         n = int(count)
         decay = min(self.decay, (1 + n) / (10 + n))
         with torch.no_grad():

@@ -20,6 +20,8 @@ def training_record(config: DictConfig, data: GsganData) -> dict[str, Any]:
     """Settings that must not change when a run is resumed, and the poses that `gsgan.fit`
     made, whose file may be overwritten under the same name."""
     settings = record(config)
+
+    # Fitted poses are compared by their content.
     poses = data.layout.poses
     if poses is not None and poses.fitted:
         settings["fitted poses"] = poses.digest(data.layout.frames)
@@ -34,9 +36,12 @@ def checkpoint_to_resume(
     Raises:
         ConfigError: when the folder holds a run with other settings.
     """
+    # A folder without a checkpoint starts a new run.
     path = folder / CHECKPOINT
     if not path.is_file():
         return None
+
+    # Scores with a stand-in must not be mixed with others.
     state = read_checkpoint(path)["gsgan"]
     if state["marks"] != marks:
         raise ConfigError(
@@ -44,6 +49,8 @@ def checkpoint_to_resume(
             f"{marks or 'none'}; set training.perceptual.weights as it was, or resume=false to "
             "start over there"
         )
+
+    # The settings must be the same; the message names the first five that differ.
     changed = sorted(set(_differences(state["record"], now)))
     if changed:
         shown = ", ".join(changed[:5]) + (" …" if len(changed) > 5 else "")
@@ -55,6 +62,7 @@ def checkpoint_to_resume(
 
 
 def _differences(before: Any, now: Any, at: str = "") -> list[str]:
+    # Nested settings are compared key by key; the dotted names of those that differ are returned.
     if isinstance(before, dict) and isinstance(now, dict):
         keys = sorted(before.keys() | now.keys(), key=str)
         pairs = [(k, before.get(k), now.get(k)) for k in keys]
@@ -73,6 +81,7 @@ def is_written(path: Path, checkpoint: Path) -> bool:
 
 def remove_old_results(folder: Path) -> None:
     """Removes the results of an earlier run from a folder that starts over."""
+    # Scores, the checkpoint, the page and what was kept while scoring.
     for name in (*NAMES, CHECKPOINT, PAGE):
         (folder / name).unlink(missing_ok=True)
     shutil.rmtree(folder / SCORING, ignore_errors=True)

@@ -59,6 +59,7 @@ class Rollback:
         """Adds one iteration's values: the ``alpha`` and ``mask`` of the person, the absolute
         ``colour`` of the rendering, the absolute difference of the discriminator's ``logits``."""
         for name, value in values.items():
+            # A moving average of each value, which starts at zero.
             now = value.detach().float().mean()
             before = self.means.get(name, torch.zeros_like(now))
             mixed = self.memory * before + (1 - self.memory) * now
@@ -74,18 +75,28 @@ class Rollback:
         """
         if not self.means:
             return ""
+
+        # The averages over all processes, so that they decide alike.
         names = sorted(self.means)
         held = torch.stack([self.means[name] for name in names])
         means = dict(zip(names, over_ranks(held).tolist(), strict=True))
+
+        # The share of the masks that the rendered person covers.
         share = means["alpha"] / means["mask"] if means.get("mask") else float("inf")
         if share < self.collapse:
             return (
                 f"the rendered person has vanished (alpha is {share:.1%} of the masks')"
             )
+
+        # Colours far outside the images' range.
         if (mean := means.get("colour", 0.0)) > BRIGHTEST:
             return f"Ψ has exploded (its colours are {mean:.3g} in the mean, images within 0 and 1)"
+
+        # Logits that no longer tell real images from generated ones.
         if means.get("logits", 1.0) < SAME:
             return "the discriminator has collapsed (real and generated images are equal to it)"
+
+        # Nothing has collapsed, but only a healthy state is kept.
         return "" if share >= self.healthy else None
 
     def keep(self, module: nn.Module) -> None:
@@ -98,8 +109,12 @@ class Rollback:
         """Restores the last good state; False where there is none, or after too many times."""
         if self._state is None or self.done >= self.most:
             return False
+
+        # The averages start anew, since they describe the collapse.
         self.done += 1
         self.means.clear()
+
+        # The weights of the good state, without the momenta of the bad one.
         module.load_state_dict(self._state)
         for optimiser in optimisers:
             optimiser.state.clear()
@@ -116,8 +131,11 @@ class SkippedSteps:
 
     def add(self, step: int) -> bool:
         """Counts an iteration; whether that is one too many."""
-        if step not in self.steps:  # the discriminator's may follow the generator's
+        # The discriminator's skipped step may follow the generator's in the same iteration.
+        if step not in self.steps:
             self.steps.append(step)
+
+        # Iterations that have left the window are forgotten.
         while self.steps[0] <= step - self.window:
             self.steps.popleft()
         return len(self.steps) >= self.most
@@ -142,9 +160,12 @@ def likely_cause(
         losses: the terms by name; empty where they could not be computed.
         problem: what was noticed, the answer if all of these are finite.
     """
+    # The data comes first: values that are not finite there explain all others.
     items = f"frame {frame.frame_id.tolist()}, camera {frame.camera_index.tolist()}"
     if bad := _not_finite(asdict(frame)):
         return f"{', '.join(bad)} of the data is not finite ({items}, counted from 0)"
+
+    # The weights of each optimiser come next, by their largest absolute value.
     for name, held in parameters.items():
         largest = max(
             (float(p.detach().abs().max()) for p in held if p.numel()), key=_or_infinite
@@ -154,6 +175,8 @@ def likely_cause(
                 f"the weights of {name} have exploded (up to {largest:.3g}): resume from the last "
                 f"checkpoint with a lower training.recipes.{name}.rate.peak"
             )
+
+    # The terms of the loss come last.
     if bad := _not_finite(dict(losses)):
         return f"the loss {', '.join(bad)} is not finite ({items})"
     return problem
@@ -165,6 +188,7 @@ def _or_infinite(value: float) -> float:
 
 def _not_finite(values: Mapping[str, Any], before: str = "") -> list[str]:
     """Names of the tensors that hold NaN or infinity."""
+    # Nested values are named by their path.
     found = []
     for name, value in values.items():
         if isinstance(value, Mapping):
@@ -176,6 +200,7 @@ def _not_finite(values: Mapping[str, Any], before: str = "") -> list[str]:
 
 def save_batch(path: Path, step: int, frame: Frame, cause: str) -> None:
     """Writes the batch of a run that stops, as plain tensors that ``torch.load`` reads."""
+    # The file is written whole or not at all.
     stream = io.BytesIO()
     torch.save({"step": step, "cause": cause, "frame": asdict(frame.to("cpu"))}, stream)
     with writing(path):

@@ -148,6 +148,7 @@ def build_training(
     Raises:
         GsganError: on a dataset or a value that cannot be used.
     """
+    # The data, whose body is fitted first where the avatar needs one that the data lacks.
     whole("seed", config.seed, 0)
     console = console or Console(quiet=True)
     with working(console, "reading the data"):
@@ -156,6 +157,8 @@ def build_training(
         fit_before_training(data, config.fit, device_of(config))
         with working(console, "reading the data with its body"):
             data = build_data(config)
+
+    # The avatar, and the spread of the training poses, beyond which it extrapolates.
     with working(console, "measuring the scene"):
         info = data.info
     with working(console, "building the avatar"):
@@ -163,6 +166,8 @@ def build_training(
         _store_poses(avatar, data)
     # the same start beside every avatar
     torch.manual_seed(config.seed + DISCRIMINATOR_SALT)
+
+    # The training, with the settings that checkpoints store.
     with naming_group("training"):
         return data, instantiate(config.training)(
             avatar,
@@ -173,9 +178,12 @@ def build_training(
 
 def _store_poses(avatar: Avatar, data: GsganData) -> None:
     """Stores the spread of the training poses, or of `MAX_STORED_POSES` of them, in the avatar."""
+    # All poses, or a number of them that is spread evenly over the training frames.
     frames = data.splits.items["train"].frames
     frames = [frames[i] for i in evenly_spaced(len(frames), MAX_STORED_POSES)]
     p, valid = data.dataset("train").skeletons.joints(frames)
+
+    # Poses of the body belong to the same frames, if the data has them.
     poses = data.layout.poses
     body = None
     if poses is not None:
@@ -198,12 +206,15 @@ def start_from(avatar: Avatar, data: GsganData, run: Path) -> None:
         raise ConfigError(
             "distil: only residuals without Ψ start from a run; add model=harmonic"
         )
+
+    # One camera per training frame is enough, because residuals depend on the pose alone.
     trained = load(run, device="cpu")
     frames = data.dataset("train")
-    # by one camera each
     once = {frame: i for i, (_, frame) in enumerate(frames.items)}.values()
     poses = (frames[i].inputs for i in once)
     fitted = distilled(trained, ((p, seen, body) for p, seen, _, body, _ in poses))
+
+    # Other points at rest would need other residuals, so both avatars must have the same.
     state = {"rest_points": fitted.rest_points, **fitted.state_dict()}
     own = avatar.state_dict()
     own["rest_points"] = avatar.rest_points
@@ -220,6 +231,7 @@ def start_from(avatar: Avatar, data: GsganData, run: Path) -> None:
 
 def _write_page(folder: Path, data: GsganData) -> None:
     """Writes the web page, with the training poses as its motion."""
+    # The page is an export with its default settings but these.
     given = {
         "run": str(folder),
         "format": "html",
@@ -240,7 +252,8 @@ def _fit(
 ) -> None:
     """Trains, from the checkpoint ``resume`` if there is one."""
     try:
-        if resume is None:  # curves start at the untrained avatar
+        if resume is None:
+            # Curves start at the untrained avatar.
             trainer.validate(module, data, verbose=False)
         else:
             console.print(f"resuming from {resume}", soft_wrap=True)
@@ -265,7 +278,11 @@ def _evaluate(
 ) -> None:
     """Scores the trained avatar on the held-out splits."""
     device = trainer.strategy.root_device
-    module.to(device)  # Lightning leaves it on the CPU
+
+    # Lightning leaves the module on the CPU.
+    module.to(device)
+
+    # Facts about the training are written beside the scores.
     method = trained(
         folder,
         seed=config.seed,
@@ -273,6 +290,8 @@ def _evaluate(
         train_seconds=module.train_seconds,
         trained_by=module.code,
     )
+
+    # The average of the weights is scored, if there is one.
     avatar = module.shown.eval()
     evaluate_method(
         folder,
@@ -291,15 +310,20 @@ def refuse_long_cpu_run(
     config: DictConfig, data: GsganData, module: AvatarTraining, iterations: int
 ) -> None:
     """Refuses a run that would take very long because ``trainer=auto`` found no GPU."""
+    # A CPU that the user chose is accepted.
     chosen = not OmegaConf.is_interpolation(config.trainer, "accelerator")
     if chosen or config.trainer.accelerator != "cpu":
         return
+
+    # The time of one rendering, measured after a warm-up.
     frame = data.dataset("train")[0]
     with torch.no_grad():
-        module.avatar(*frame.inputs)  # warm-up
+        module.avatar(*frame.inputs)
         began = time.perf_counter()
         module.avatar(*frame.inputs)
         seconds = time.perf_counter() - began
+
+    # The estimate for the whole run, against the limit of the config.
     hours = STEP_PER_RENDERING * seconds * iterations / 3600
     if hours > config.cpu_hours:
         raise ConfigError(

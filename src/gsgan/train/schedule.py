@@ -30,9 +30,12 @@ class Schedule:
     Source: paper Alg. 2; of the numbers in conf/training only Step I's 10,000 are the paper's.
     """
 
+    # Iterations of the phases.
     segmentation: int
     step_one: int
     step_two: int
+
+    # Iterations within the steps, see conf/training/long.yaml.
     discriminator_start: int = 0
     epoch: int = 250
     stretch: float = 1.0
@@ -40,6 +43,7 @@ class Schedule:
     coarse: int = 0
 
     def __post_init__(self) -> None:
+        # No length may be negative, and the run needs at least one iteration.
         above("training.schedule.stretch", self.stretch)
         for name in ("segmentation", *STRETCHED_STEPS):
             at_least(f"training.schedule.{name}", getattr(self, name), 0)
@@ -58,9 +62,12 @@ class Schedule:
         without splats the other way round, so that every variant trains equally long. S learns only
         two numbers from masks, which needs fewer iterations.
         """
+        # All lengths but those of S and the epoch are stretched.
         numbers = {
             name: round(getattr(self, name) * self.stretch) for name in STRETCHED_STEPS
         }
+
+        # A step without parts to train gives its iterations to the other one.
         one = numbers["step_one"]
         two = numbers["step_two"]
         if not generator:
@@ -68,6 +75,8 @@ class Schedule:
             two = 0
         if not splats:
             one, two = 0, one + two
+
+        # S has fewer iterations where it learns from masks.
         most = FROM_MASKS if from_masks else self.segmentation
         return replace(
             self,
@@ -104,6 +113,7 @@ class Schedule:
 
     def bounds(self, phase: str) -> tuple[int, int]:
         """First iteration of a phase, and the first after it."""
+        # Each phase begins where the one before it ends.
         ends = {
             SEGMENTATION: (0, self.segmentation),
             STEP_ONE: (self.segmentation, self.segmentation + self.step_one),
@@ -113,10 +123,13 @@ class Schedule:
 
     def span(self, optimiser: str, recipe_span: str = "both") -> tuple[int, int]:
         """First iteration of an optimiser, and the first after its last, see `Recipe`."""
+        # S and the discriminator have spans of their own.
         if optimiser == "segmentation":
             return self.bounds(SEGMENTATION)
         if optimiser == "discriminator":
             return self.adversarial_span
+
+        # The generator learns in Step II.
         start, end = self.bounds(STEP_TWO)
         if optimiser not in SPLATTING:
             return start, end
@@ -167,8 +180,11 @@ class Rate:
 
     def at(self, step: int, start: int, end: int) -> float:
         """The rate at iteration ``step`` of the span [start, end)."""
+        # The share of the span that is done, and the linear warm-up.
         done = (step - start) / max(1, end - start)
         scale = min(1.0, (step - start + 1) / (self.warmup + 1))
+
+        # After the constant part the rate descends in the chosen shape.
         if done > self.hold:
             fallen = min(1.0, (done - self.hold) / max(1e-9, 1 - self.hold))
             scale *= _SHAPES[self.shape](fallen, self.final)

@@ -38,6 +38,8 @@ def build_trainer(
     # A logger overwrites its files: each part of a resumed run has a folder of its own.
     version = {"version": logs} if "version" in config.logger else {}
     logger = instantiate(config.logger, **version)
+
+    # Callbacks of the config, beside those that every run has.
     own = [instantiate(callback) for callback in (config.callbacks or {}).values()]
     used: list[Any] = [
         *callbacks,
@@ -51,8 +53,12 @@ def build_trainer(
             save_on_train_epoch_end=True,
         ),
     ]
+
+    # A progress bar is of use in a terminal only.
     if console.is_terminal:
         used.append(RichProgressBar())
+
+    # An epoch is as long as the loader, so the schedule is rounded up to whole epochs.
     return instantiate(
         config.trainer,
         max_epochs=-(-module.schedule.total // len(data.train_dataloader())),
@@ -68,6 +74,8 @@ def device_of(config: DictConfig) -> torch.device:
     """Where Lightning will put the model of a process."""
     if config.trainer.accelerator == "cpu" or not torch.cuda.is_available():
         return torch.device("cpu")
+
+    # The launcher's rank of a process picks its GPU.
     ranks = (os.environ.get(name) for name in LOCAL_RANKS)
     rank = int(next(filter(None, ranks), 0))
     chosen = config.trainer.devices
@@ -76,6 +84,7 @@ def device_of(config: DictConfig) -> torch.device:
 
 def quiet_lightning() -> None:
     """Silences Lightning's tips and device lists."""
+    # Messages below warnings are silenced, then those warnings that are no problem here.
     for name in ("lightning.pytorch", "lightning.fabric", "lightning"):
         logging.getLogger(name).setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", message=".*does not have many workers.*")
