@@ -5,6 +5,7 @@ import shutil
 import threading
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -392,18 +393,28 @@ def test_a_long_capture_is_registered_in_a_few_frames(fit, tmp_path):
     assert fit("fit.frames=2", name="kept")["registered"].tolist() == [0, 1, 2]
 
 
-def test_frames_with_poses_far_from_each_other_are_used(people, monkeypatch):
-    data = GsganData(str(people), size=48)
-    landmarks = data.layout.landmarks
-    frames = [*data.trained, *data.trained]
-    assert spread_frames(data, data.trained, 3) == data.trained
-    assert spread_frames(data, frames, 5) == data.trained
-    p = dict(landmarks.p)
-    p[1] = p[0] + 0.001
-    p[2] = p[0] + 0.5 * (p[3] - p[0])
-    moved = replace(data.layout, landmarks=replace(landmarks, p=p))
-    monkeypatch.setitem(vars(data), "layout", moved)
-    assert spread_frames(data, data.trained, 2) == [0, 2]
+def test_frames_with_poses_far_from_each_other_are_used(people):
+    """An arm rises from frame to frame: its ends are chosen, a skeleton gone wrong is not."""
+    landmarks = GsganData(str(people), size=48).layout.landmarks
+    frames = range(40)
+    p = {}
+    for frame in frames:
+        p[frame] = landmarks.p[0].copy()
+        p[frame][[13, 15]] += [0.0, 0.0, 0.01 * frame]  # metres
+    p[20][[13, 15]] += [0.0, 0.0, 3.0]
+    visibility = dict.fromkeys(frames, landmarks.visibility[0])
+    moved = replace(landmarks, p=p, visibility=visibility)
+    data = SimpleNamespace(layout=SimpleNamespace(landmarks=moved))
+
+    assert spread_frames(data, frames, 40) == list(frames)
+    chosen = spread_frames(data, frames, 5)
+    assert len(chosen) == 5
+    assert 20 not in chosen
+    assert chosen[0] <= 2
+    assert chosen[-1] >= 37
+    assert max(np.diff(chosen)) < 20
+    p[1] = p[0]
+    assert len(spread_frames(data, [0, 1] * 20, 5)) == 1
 
 
 def test_cameras_rotate():

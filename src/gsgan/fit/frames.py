@@ -12,7 +12,7 @@ from torch import Tensor
 from gsgan.data.datamodule import GsganData
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.splits import Item
-from gsgan.data.training_poses import pose_in_pelvis
+from gsgan.data.training_poses import pose_in_pelvis, training_poses
 from gsgan.model.body_points import farthest_points
 from gsgan.scene import Camera, Window, body_window, unit
 from gsgan.utils.arrays import Bytes, evenly_spaced
@@ -23,6 +23,9 @@ MIN_DEPTH = 0.01  # metres: nearer joints are not projected
 WINDOW_MARGIN = 0.25
 # quantile of the masks' areas that counts as usual: most masks may be nearly empty
 USUAL = 0.75
+OUTLIERS = (
+    0.05  # share of the poses, those least like all others, that is not chosen from
+)
 
 
 @dataclass(frozen=True)
@@ -179,12 +182,23 @@ class MaskedFrames:
 
 
 def spread_frames(data: GsganData, frames: Sequence[int], most: int) -> list[int]:
-    """At most so many frames, rising, whose poses are far from each other."""
+    """At most so many frames, rising, whose poses are far from each other.
+
+    The share `OUTLIERS` of the poses that are least like all others is not chosen from: wrong
+    landmarks are among them.
+    """
     # All frames are used if they are few.
     if len(frames) <= most:
         return list(frames)
     p, _ = data.layout.landmarks.joints(frames)
-    chosen = farthest_points(pose_in_pelvis(p), most)
+
+    # Poses that are not outliers.
+    distance = training_poses(p).distance(p)
+    usual = (distance <= distance.quantile(1 - OUTLIERS)).nonzero().flatten()
+
+    # Frames of equal poses are chosen once.
+    poses = pose_in_pelvis(p[usual])
+    chosen = usual[farthest_points(poses, min(most, len(usual)))]
     return sorted({frames[i] for i in chosen.tolist()})
 
 
