@@ -266,7 +266,7 @@ def test_masks_and_labels_agree_with_a_z_buffer(view):
     ("where", "name", "value"),
     [
         (PosedCharacter, "_touched", lambda self, v: np.ones(v.size, bool)),
-        (trace, "BLOCK", 100),
+        (trace, "BLOCK_RAYS", 100),
     ],
 )
 def test_every_touched_pixel_is_found_and_the_same_in_any_blocks(

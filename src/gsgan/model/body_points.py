@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -371,6 +372,11 @@ class BodyPoints(nn.Module):
             self._age = 0
         self._age += 1
         return self._terms
+
+    def _apply(self, *arguments: Any, **options: Any) -> Self:
+        # A module that moves to another device leaves the terms of the old one behind.
+        self.renew()
+        return super()._apply(*arguments, **options)
 
     def renew(self) -> None:
         """Computes the stretch's terms anew in the next iteration of training.
