@@ -10,7 +10,13 @@ from frames import frame_of
 from torchmetrics.classification import MulticlassJaccardIndex
 
 from gsgan.data.metric_variants import MetricVariants
-from gsgan.evaluate.predictions import FLOOR_STAGE, FULL, SPLAT, Prediction, Preparation
+from gsgan.evaluate.predictions import (
+    FLOOR_VARIANT,
+    FULL,
+    SPLAT,
+    Prediction,
+    Preparation,
+)
 from gsgan.evaluate.scores import (
     Scorer,
     confusion,
@@ -105,7 +111,7 @@ def test_the_floor_of_a_split_is_the_background_and_its_psnr_is_known():
             lambda f, _: Prediction({FULL: f.image}, {FULL: f.mask}),
             scorer(MetricVariants(background=background)),
         )
-        assert found.variants[FLOOR_STAGE]["psnr"] == pytest.approx(
+        assert found.variants[FLOOR_VARIANT]["psnr"] == pytest.approx(
             -10 * math.log10(power / 576), abs=1e-4
         )
         # equal: its own alpha puts it on white too
@@ -151,7 +157,9 @@ def test_flicker_needs_consecutive_frames_of_one_camera_and_window():
     ]
     # rounded to 8 bits
     assert found.variants[FULL]["flicker"] == pytest.approx(0.1, abs=1e-2)
-    assert found.variants[FLOOR_STAGE]["flicker"] == 0  # the ground truth stands still
+    assert (
+        found.variants[FLOOR_VARIANT]["flicker"] == 0
+    )  # the ground truth stands still
     alone = score_split(
         items[:1], lambda f, _: Prediction({FULL: f.image}, {}), scorer()
     )

@@ -40,7 +40,7 @@ JOINT_MARGIN = 0.2
 # Variants: the final image, the colour of Step I, and the all-background image.
 FULL = "full"
 SPLAT = "splat"
-FLOOR_STAGE = "floor"
+FLOOR_VARIANT = "floor"
 # of a pattern of file names
 FIELDS = ("split", "camera", "camera_index", "frame")
 FIELD = re.compile(r"\{(.*?)\}")

@@ -33,7 +33,7 @@ from gsgan.evaluate.grids import write_grid
 from gsgan.evaluate.kept import FOLDER, KeptScores
 from gsgan.evaluate.origin import Method, fingerprint, origin, trained
 from gsgan.evaluate.predictions import (
-    FLOOR_STAGE,
+    FLOOR_VARIANT,
     FULL,
     BodyBoxes,
     Preparation,
@@ -46,6 +46,7 @@ from gsgan.evaluate.scores import (
     Tally,
     empty,
     painter,
+    score_split,
 )
 from gsgan.metrics.lpips import LPIPS_NETS, build_lpips
 from gsgan.metrics.regions import BACKGROUNDS
@@ -460,12 +461,12 @@ def evaluate_method(
                 "measures": asdict(scorer.prepare.measures),
             }
             kept = KeptScores(folder / FOLDER / f"{split}.pt", key)
-        scores[split] = _scored(
+        scores[split] = _score(
             f"scoring {split}",
             dataset,
             places,
             predict,
-            Tally(scorer),
+            scorer,
             grid_rows=grid_rows,
             device=device,
             kept=kept,
@@ -489,12 +490,12 @@ def evaluate_method(
     return joined.results
 
 
-def _scored(
+def _score(
     title: str,
     dataset: CaptureDataset,
     places: Sequence[int],
     predict: Predict,
-    tally: Tally,
+    scorer: Scorer,
     *,
     grid_rows: int,
     device: torch.device,
@@ -502,27 +503,28 @@ def _scored(
     console: Console,
 ) -> SplitScores:
     """Scores these places of a dataset, from where an interrupted scoring ended."""
-    shown = {places[row] for row in evenly_spaced(len(places), grid_rows)}
+    tally = Tally(scorer)
     if kept is not None:
         kept.restore(tally)
 
-    # Flicker compares with the frame before, which must be painted again.
+    # Flicker compares with the frame before, which must be rendered again.
     done = tally.images
     if done:
         console.print(f"{title}: {done} of {len(places)} images were scored before")
-        before = places[done - 1]
-        frame = dataset[before].to(device)
-        item = dataset.items[before]
-        tally.look_at(item, frame, predict(frame, item))
+        before = dataset.items[places[done - 1]]
+        frame = dataset[places[done - 1]].to(device)
+        tally.look_at(before, frame, predict(frame, before))
 
     # The remaining images, with the scores so far kept from time to time.
-    for place in track(places[done:], title, console):
-        frame = dataset[place].to(device)
-        item = dataset.items[place]
-        tally.add(item, frame, predict(frame, item), show=place in shown)
-        if kept is not None:
-            kept.keep(tally)
-    return tally.result()
+    order = track(places[done:], title, console)
+    return score_split(
+        ((dataset.items[place], dataset[place].to(device)) for place in order),
+        predict,
+        scorer,
+        shown=evenly_spaced(len(places), grid_rows),
+        tally=tally,
+        after_each=None if kept is None else kept.keep,
+    )
 
 
 def _joined_splits(
@@ -534,7 +536,7 @@ def _joined_splits(
     """The scores of all splits, with the protocol's record and reasons for empty splits."""
     # An empty split has the variants of the others.
     filled = [found.variants for found in scores.values() if found.variants]
-    variants: Iterable[str] = filled[0] if filled else (FULL, FLOOR_STAGE)
+    variants: Iterable[str] = filled[0] if filled else (FULL, FLOOR_VARIANT)
 
     # metrics.json by split, scores.csv by image.
     results: Results = {}

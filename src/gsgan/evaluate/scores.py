@@ -12,7 +12,13 @@ from torch import Tensor
 from gsgan.data.metric_variants import MetricVariants
 from gsgan.data.splits import Item
 from gsgan.evaluate.grids import grid_rows
-from gsgan.evaluate.predictions import FLOOR_STAGE, FULL, SPLAT, Prediction, Preparation
+from gsgan.evaluate.predictions import (
+    FLOOR_VARIANT,
+    FULL,
+    SPLAT,
+    Prediction,
+    Preparation,
+)
 from gsgan.metrics.image import (
     Score,
     edge_scores,
@@ -244,22 +250,29 @@ def score_split(
     predict: Predict,
     scorer: Scorer,
     shown: Collection[int] = (),
+    *,
+    tally: "Tally | None" = None,
+    after_each: "Callable[[Tally], None] | None" = None,
 ) -> SplitScores:
-    """Scores every frame of a split.
+    """Scores the frames of a split.
 
     Args:
         items: (camera and frame number, frame) pairs, on the device that predicts.
         predict: the method.
         scorer: the settings.
         shown: numbers of the frames that go into the grid, counted from 0.
+        tally: the scores of the frames before ``items``, if there are some.
+        after_each: called with the scores so far after each frame.
 
     Raises:
         GsganError: when a prediction is not finite, naming camera and frame.
     """
     # Frames are predicted one by one, so that only one is in memory.
-    tally = Tally(scorer)
-    for i, (item, frame) in enumerate(items):
+    tally = Tally(scorer) if tally is None else tally
+    for i, (item, frame) in enumerate(items, start=tally.images):
         tally.add(item, frame, predict(frame, item), show=i in shown)
+        if after_each is not None:
+            after_each(tally)
     return tally.result()
 
 
@@ -383,7 +396,7 @@ class Tally:
             images[name] = prepare.image(prediction, name, box)
 
         # An image of the background alone shows what the scores are worth.
-        images[FLOOR_STAGE] = torch.full_like(frame.image, prepare.background)
+        images[FLOOR_VARIANT] = torch.full_like(frame.image, prepare.background)
         return images
 
     def _add_parts(self, camera: str, frame: Frame, prediction: Prediction) -> None:
@@ -403,7 +416,7 @@ class Tally:
     def result(self) -> SplitScores:
         """The scores of the split."""
         # Only the final image has a segmentation.
-        no_parts = {SPLAT: NO_PARTS_OF_SPLAT, FLOOR_STAGE: NO_PARTS_OF_FLOOR}
+        no_parts = {SPLAT: NO_PARTS_OF_SPLAT, FLOOR_VARIANT: NO_PARTS_OF_FLOOR}
         variants = {}
         for name, own in self.rows.items():
             if name == FULL:
