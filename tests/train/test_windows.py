@@ -7,7 +7,6 @@ import torch
 from lightning import Callback
 
 from gsgan.scene import Window
-from gsgan.train.module import REACH
 from gsgan.utils.errors import ConfigError
 
 
@@ -94,7 +93,7 @@ def test_gradients_of_a_part_are_those_of_its_pixels_in_the_whole_image(
         rendered = avatar(
             *replace(frame, camera=seen.camera(frame.camera)).inputs,
             generate=False,
-            reach=None if seen is whole else REACH,
+            reach=None if seen is whole else module.window_reach,
         )
         colour = rendered.colour
         if seen is whole:

@@ -34,14 +34,12 @@ from gsgan.train.optimisers import (
 )
 from gsgan.train.rollback import Rollback, SkippedSteps, likely_cause, save_batch
 from gsgan.train.schedule import SEGMENTATION, SPLATTING, STEP_ONE, Schedule
-from gsgan.utils.checks import at_least, whole
+from gsgan.utils.checks import above, at_least, whole
 from gsgan.utils.errors import ConfigError, GsganError
 from gsgan.utils.tensors import full_precision
 
 PSNR_CAP = 100.0  # dB: one image equal to the ground truth would make the mean infinite
 T = TypeVar("T")
-# metres: Gaussians whose points are farther from a part of the image do not reach into it
-REACH = 0.1
 SEED_STRIDE = 1_000_003  # a prime: (seed, step) pairs do not meet
 
 
@@ -57,8 +55,8 @@ class AvatarTraining(LightningModule):
         step_one, step_two: loss weights.
         seed: with the iteration it determines every random number drawn here, so a resumed run
             draws the same ones.
-        pose_noise, window, max_skipped, skip_window, log_every, average, average_every: see
-            conf/training/long.yaml.
+        pose_noise, window, window_reach, max_skipped, skip_window, log_every, average,
+            average_every: see conf/training/long.yaml.
         rollback: recovers from a collapse of the rendered person.
         extra_losses: further terms of Step II by name: modules of a rendering and its frame.
         record: plain config values stored with every checkpoint.
@@ -79,6 +77,7 @@ class AvatarTraining(LightningModule):
         *,
         pose_noise: float = 0.01,
         window: int | None = None,
+        window_reach: float = 0.2,
         seed: int = 0,
         max_skipped: int = 20,
         skip_window: int = 1000,
@@ -123,6 +122,7 @@ class AvatarTraining(LightningModule):
         self.step_two = step_two
         self.pose_noise = pose_noise
         self.window = None if window is None else whole("training.window", window, 16)
+        self.window_reach = above("training.window_reach", window_reach)
         self.seed = seed
 
         # Logs, and what happens where training fails.
@@ -292,7 +292,7 @@ class AvatarTraining(LightningModule):
             pose_noise=self._pose_noise(frame.skeleton),
             generate=generate,
             supersample=self.schedule.fine(self.step),
-            reach=None if self.window is None else REACH,
+            reach=None if self.window is None else self.window_reach,
         )
 
         # The rollback watches the person's alpha and colours.
