@@ -5,13 +5,12 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from gsgan.body.skinned import SkinnedBody
+from gsgan.utils.arrays import Ints
 
 B = TypeVar("B", bound=SkinnedBody)
-Ints = NDArray[np.int64]
 
 
 def subdivided(body: B, count: int) -> B:

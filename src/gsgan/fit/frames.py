@@ -23,9 +23,8 @@ MIN_DEPTH = 0.01  # metres: nearer joints are not projected
 WINDOW_MARGIN = 0.25
 # quantile of the masks' areas that counts as usual: most masks may be nearly empty
 USUAL = 0.75
-OUTLIERS = (
-    0.05  # share of the poses, those least like all others, that is not chosen from
-)
+# share of the poses, those least like all others, that is not chosen from
+OUTLIERS = 0.05
 
 
 @dataclass(frozen=True)
@@ -138,13 +137,16 @@ class MaskedFrames:
 
     def _silhouette(self, place: int) -> Silhouette:
         mask, unsure = self._masks[place]
+        camera = self.dataset.camera(self.dataset.items[place])
         return Silhouette(
-            mask=unit(torch.from_numpy(mask))[None, None].to(self.device),
-            camera=self.dataset.camera(self.dataset.items[place]).to(self.device),
-            unsure=None
-            if unsure is None
-            else unit(torch.from_numpy(unsure))[None, None].to(self.device),
+            mask=self._as_tensor(mask),
+            camera=camera.to(self.device),
+            unsure=None if unsure is None else self._as_tensor(unsure),
         )
+
+    def _as_tensor(self, pixels: Bytes) -> Tensor:
+        """``[1, 1, H, W]`` in [0, 1] of bytes ``[H, W]``."""
+        return unit(torch.from_numpy(pixels))[None, None].to(self.device)
 
     def _usable(self, least: float) -> list[int]:
         """Places of the images whose masks hold enough of the person.

@@ -283,8 +283,8 @@ class Deformation(ResidualGaussians):
     """
 
     anchors: Tensor  # [A] int64
-    near: Tensor  # [N, NEAREST] int64, anchors near each point
-    share: Tensor  # [N, NEAREST] and their weights
+    near: Tensor  # [N, NEAREST_ANCHORS] int64, the anchors near each point
+    share: Tensor  # [N, NEAREST_ANCHORS] their weights, which sum to 1
     rest_code: Tensor
     pose_mean: Tensor  # [3 J] of training poses' codes
     pose_axes: Tensor  # [3 J, K] directions

@@ -65,7 +65,9 @@ def describe(
     if on_body is not None:
         apart = on_body.pixels_apart(info.scale_train[1])
         number = f"{len(on_body.points):,} on the body"
-        table.add_row("Gaussians", f"{number}, {apart:.1f} pixels apart")
+        table.add_row(
+            "Gaussians", f"{number}, {apart:.1f} pixels apart in the training images"
+        )
 
     # The losses that need other networks or labels.
     if module.perceptual is not None:
