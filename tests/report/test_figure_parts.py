@@ -5,6 +5,7 @@ import pytest
 import torch
 from matplotlib import rc_context
 
+from gsgan.report.figures.details import detail_boxes
 from gsgan.report.figures.layout import (
     COLUMN_WIDTH,
     STYLE,
@@ -15,6 +16,8 @@ from gsgan.report.figures.layout import (
 )
 from gsgan.report.figures.run import most_disputed
 from gsgan.report.figures.subjects import choose_items, make_shots, measure
+from gsgan.scene import Camera
+from gsgan.skeleton import TEMPLATES
 from gsgan.utils.errors import ConfigError, DataError
 
 
@@ -49,6 +52,41 @@ def test_the_box_lies_where_the_runs_differ():
     assert (columns.start, columns.stop) == (6, 9)
     whole = most_disputed(torch.zeros(2, 3, 5, 5), 1.0)
     assert whole == (slice(0, 5), slice(0, 5))
+
+
+@pytest.mark.parametrize("name", ["mediapipe33", "mediapipe33_hands"])
+def test_details_are_squares_that_hold_the_head_and_the_hands(name):
+    template = TEMPLATES[name]
+    K = torch.tensor([[[200.0, 0, 100], [0, 200, 200], [0, 0, 1]]])
+    R = torch.diag(torch.tensor([1.0, -1, -1]))[None]
+    camera = Camera(K, R, torch.tensor([[0.0, 1.0, 2.5]]), size=(400, 200))
+    skeleton = torch.tensor([template.rest_positions])
+    visibility = torch.ones(1, len(template.names))
+    boxes = detail_boxes(template, skeleton, visibility, camera)
+    assert list(boxes) == ["head", "left hand", "right hand"]
+    pixels, _ = camera.project(skeleton)
+    for part, joint in (
+        ("head", "nose"),
+        ("left hand", "left_index"),
+        ("right hand", "right_wrist"),
+    ):
+        rows, columns = boxes[part]
+        assert rows.stop - rows.start == columns.stop - columns.start
+        assert rows.start >= 0
+        assert rows.stop <= 400
+        assert columns.start >= 0
+        assert columns.stop <= 200
+        column, row = pixels[0, template.names.index(joint)].tolist()
+        assert rows.start <= row <= rows.stop
+        assert columns.start <= column <= columns.stop
+
+    # A hand that was not detected, or lies outside the image, is not shown.
+    left = [i for i, joint in enumerate(template.names) if joint.startswith("left_")]
+    visibility[:, left] = 0
+    hidden = detail_boxes(template, skeleton, visibility, camera)
+    assert "left hand" not in hidden
+    far = skeleton + torch.tensor([9.0, 0, 0])
+    assert detail_boxes(template, far, visibility, camera) == {}
 
 
 def test_a_panel_holds_its_image():

@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from gsgan.metrics.image import psnr
+from gsgan.report.figures.details import details
 from gsgan.report.figures.layout import STYLE, Drawing, Panel, draw_panels, written
 from gsgan.report.figures.subjects import (
     Numbers,
@@ -160,6 +161,7 @@ FIGURES: dict[str, Callable[[Sequence[Subject], Sequence[Shot]], Drawing]] = {
     "comparison": comparison,
     "ablation": partial(comparison, detail=True),
     "strip": strip,
+    "details": details,
 }
 COMPARE = ("comparison", "ablation")  # figures that need a second run
 
