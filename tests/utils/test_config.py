@@ -76,6 +76,7 @@ def differences(a, b, at: str = "") -> set[str]:
             "splat_only",
             {
                 *("model.segmentation", "model.pose_encoder", "model.generator"),
+                "model.deformation.features",
                 "training.schedule.stretch",
             },
         ),
@@ -91,8 +92,11 @@ def test_an_ablation_changes_what_it_says_and_nothing_else(
     assert {next(c for c in changed if key.startswith(c)) for key in found} == changed
 
 
-def test_demo_is_what_train_does_by_default(compose):
-    assert compose("train") == compose("train", "experiment=demo")
+def test_demo_is_what_train_does_by_default_without_a_generator(compose):
+    plain = compose("train", "model=splat_only", "score_images=42")
+    assert compose("train", "experiment=demo") == plain
+    whole = compose("train", "experiment=demo", "model=full", "score_images=null")
+    assert whole == compose("train")
 
 
 def test_every_top_level_key_is_read_by_code(compose):
