@@ -28,7 +28,6 @@ from gsgan.utils.tensors import derived
 
 # share of the area at rest, below which rounding errors dominate a normal
 NORMAL_FLOOR = 1e-2
-ROWS = 1024  # points compared with all others at a time
 # controls that correct a point; bones that it may follow
 NEAREST_CONTROLS = 4
 FOLLOWED_BONES = 6
