@@ -70,7 +70,8 @@ def refused(root: Path, *parts: str, smpl: Path | None = None, **settings: Any) 
     ],
 )
 def test_natural_order(names):
-    assert sorted(names[::-1], key=natural_order) == names
+    others = names[::-1]
+    assert sorted(others, key=natural_order) == names
 
 
 def test_cameras_are_paired_by_name_and_have_their_images(written, subject):
