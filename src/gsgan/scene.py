@@ -15,7 +15,7 @@ from torch.nn import functional
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from gsgan.utils.records import TensorRecord, cat
-from gsgan.utils.tensors import constant
+from gsgan.utils.tensors import constant, matvec
 
 __all__ = [
     "BodyPose",
@@ -102,7 +102,7 @@ class Camera(TensorRecord):
     @property
     def centre(self) -> Tensor:
         """``[B, 3]`` metres: the camera's position in the world."""
-        return -(self.R.mT @ self.t.unsqueeze(-1)).squeeze(-1)
+        return -matvec(self.R.mT, self.t)
 
     def to_camera(self, points: Tensor) -> Tensor:
         """``[B, M, 3]`` world points in camera axes, metres."""

@@ -32,11 +32,12 @@ from gsgan.data.proportions import (
     middle,
     part_frame,
 )
-from gsgan.motion.rotations import axis_angle, between, rotation, unit
+from gsgan.motion.rotations import axis_angle, between, matvec, rotation, unit
 from gsgan.motion.standard import StandardMotion, drift, floor_under
 from gsgan.skeleton import MEDIAPIPE33, bone_frames, in_head
 from gsgan.skeleton.hands import FINGER_BONES, INDEX, PINKY, WRIST
 from gsgan.skeleton.template import CHEST, HEAD, PELVIS
+from gsgan.utils.tensors import squared_norm
 
 Float = NDArray[np.float64]
 
@@ -121,7 +122,7 @@ def retargeted(p: Float, subject: Proportions, scale: float | None = None) -> Fl
     bend = axis_angle(between(straight, shown))
     angle = np.linalg.norm(bend, axis=-1, keepdims=True)
     bend = bend * (MAX_NECK_BEND / np.maximum(angle, MAX_NECK_BEND))
-    ears = chest + (rotation(bend) @ straight[..., None])[..., 0]
+    ears = chest + matvec(rotation(bend), straight)
 
     # The head, and the face on it.
     turn = _head_frame(p) @ _head_frame(rest[None]).mT
@@ -174,7 +175,7 @@ def steadied(p: Float) -> Float:
         usual, _ = found.nanmedian(0)
 
         # Cauchy's weights.
-        moved = (found - usual).square().sum(-1, keepdim=True) / FACE_STILL**2
+        moved = squared_norm(found - usual) / FACE_STILL**2
         weight = (1 / (1 + moved)).nan_to_num()
     return found.numpy()
 
