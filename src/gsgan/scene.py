@@ -104,6 +104,11 @@ class Camera(TensorRecord):
         """``[B, 3]`` metres: the camera's position in the world."""
         return -matvec(self.R.mT, self.t)
 
+    @property
+    def focal(self) -> Tensor:
+        """``[B, 2]`` pixels: the focal lengths along x and y."""
+        return self.K.diagonal(dim1=1, dim2=2)[:, :2]
+
     def to_camera(self, points: Tensor) -> Tensor:
         """``[B, M, 3]`` world points in camera axes, metres."""
         return points @ self.R.mT + self.t.unsqueeze(1)
@@ -368,7 +373,7 @@ def body_window(
     """
     height, width = camera.size
     pixels, depth = camera.project(p)
-    focal = torch.stack([camera.K[:, 0, 0], camera.K[:, 1, 1]], dim=-1)
+    focal = camera.focal
     reach = margin * focal[:, None] / depth.clamp_min(near).unsqueeze(-1)
     low = (pixels - reach).amin(dim=1).floor()
     high = (pixels + reach).amax(dim=1).ceil()

@@ -20,6 +20,7 @@ from gsgan.body.lbs import (
     skin,
 )
 from gsgan.scene import BodyPose
+from gsgan.utils.tensors import matvec
 
 KEPT_BONES = 4  # number of bones per vertex whose weights' gradients are used
 
@@ -134,7 +135,7 @@ class MarkedBody(SkinnedBody):
 def carry(transforms: Tensor, points: Tensor, bones: Tensor | None = None) -> Tensor:
     """``[B, N, 3]``: points ``[N, 3]`` moved rigidly with their bones; None: one of each bone."""
     T = transforms if bones is None else transforms[:, bones]
-    return (T[..., :3, :3] @ points.to(T)[..., None]).squeeze(-1) + T[..., :3, 3]
+    return matvec(T[..., :3, :3], points.to(T)) + T[..., :3, 3]
 
 
 def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:

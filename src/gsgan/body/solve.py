@@ -26,7 +26,7 @@ from gsgan.body.fingers import (
 from gsgan.body.free import Body
 from gsgan.body.lbs import axis_angle_to_matrix, left_jacobian, shortest_turn
 from gsgan.body.rig import SPINE, Limb, ancestors, build_rig, prior
-from gsgan.body.skinned import MarkedBody
+from gsgan.body.skinned import MarkedBody, carry
 from gsgan.scene import BodyPose
 from gsgan.skeleton import (
     MEDIAPIPE33,
@@ -441,8 +441,7 @@ class Solver(nn.Module):
 
     def points(self, T: Tensor, landmarks: Tensor) -> Tensor:
         """``[B, N, 3]`` the posed landmarks."""
-        T = T[:, self.carrier[: len(landmarks)]]
-        return matvec(T[..., :3, :3], landmarks) + T[..., :3, 3]
+        return carry(T, landmarks, self.carrier[: len(landmarks)])
 
     def linear(self, q: Tensor, root: Tensor, p: Tensor) -> Linear:
         """Residuals to ``p [B, N, 3]`` and their derivatives, the root's about its rotation."""

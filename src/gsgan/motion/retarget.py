@@ -3,7 +3,7 @@
 Axes are the standard ones (`gsgan.data.proportions`), Z up; units are metres.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import chain, pairwise
 
 import numpy as np
@@ -92,8 +92,7 @@ def retargeted(p: Float, subject: Proportions, scale: float | None = None) -> Fl
         q[:, right] = centre - half
 
     # Arms and legs, from the trunk outwards.
-    for a, b in BONES:
-        q[:, b] = q[:, a] + unit(p[:, b] - p[:, a]) * length(rest, (a, b))
+    _extend(q, p, rest, BONES)
 
     # Hands: turned as the palm's three landmarks of the pose, or better as the hand's own.
     for wrist, ends in HAND_LANDMARKS.items():
@@ -222,9 +221,15 @@ def _posed_hand(p: Float, subject: Proportions, wrist: int) -> tuple[Float, Floa
     q = (rest - subject.rest[wrist]) @ palm.mT
 
     # Fingers keep their own directions.
-    for a, b in FINGER_BONES:
-        q[:, b] = q[:, a] + unit(p[:, b] - p[:, a]) * length(rest, (a, b))
+    _extend(q, p, rest, FINGER_BONES)
     return q, palm
+
+
+def _extend(q: Float, p: Float, rest: Float, bones: Iterable[tuple[int, int]]) -> None:
+    """Moves the ends of bones of ``q`` to where those of ``p`` point, at the lengths of ``rest``."""
+    for a, b in bones:
+        way = unit(p[:, b] - p[:, a])
+        q[:, b] = q[:, a] + way * length(rest, (a, b))
 
 
 def _foot_frame(p: Float, ankle: int) -> Float:

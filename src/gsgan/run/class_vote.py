@@ -173,7 +173,7 @@ def seen(points: Tensor, reach: Tensor, camera: Camera, tolerance: float) -> Ten
     pixels, depths = camera.project(points[None])
     pixel = pixels[0]
     depth = depths[0]
-    radius = reach * camera.K[0, :2, :2].diagonal().mean() / depth
+    radius = reach * camera.focal[0].mean() / depth
     ahead = (depth > tolerance) & pixel.isfinite().all(-1)
     visible = torch.zeros_like(ahead)
     if not ahead.any():
