@@ -1,7 +1,5 @@
 """A skinned body: vertices, bones and part labels, and their transformation by a pose."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, Self

@@ -226,7 +226,7 @@ def _posed_hand(p: Float, subject: Proportions, wrist: int) -> tuple[Float, Floa
 
 
 def _extend(q: Float, p: Float, rest: Float, bones: Iterable[tuple[int, int]]) -> None:
-    """Moves the ends of bones of ``q`` to where those of ``p`` point, at the lengths of ``rest``."""
+    """Places the ends of bones of ``q`` in the directions of ``p``, at the lengths of ``rest``."""
     for a, b in bones:
         way = unit(p[:, b] - p[:, a])
         q[:, b] = q[:, a] + way * length(rest, (a, b))

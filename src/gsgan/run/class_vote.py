@@ -1,7 +1,5 @@
 """The body that S splats, with a part label per vertex: its own, or by a vote over the images."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch
