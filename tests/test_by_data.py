@@ -1,6 +1,7 @@
 """What data and machine decide by themselves, and the factors that belong to a study."""
 
 import pytest
+from hydra import compose, initialize_config_dir
 
 from gsgan.utils.config import config_folder
 
@@ -11,13 +12,45 @@ DATA = sorted(path.stem for path in (config_folder() / "data").glob("[!_]*.yaml"
 def test_large_captures_train_at_full_size_by_themselves(compose, data):
     config = compose("train", f"data={data}")
     large = data in ("thuman4", "zju_mocap", "avatarrex")
-    assert config.size.image == (512 if large else 256 if data == "synthetic" else 128)
-    default = data == "synthetic"  # at 256² iterations take longer
+    assert config.size.image == (512 if large or data == "synthetic" else 128)
+    default = data == "synthetic"
     assert config.training.schedule.step_two == (
         250_000 if large else 3000 if default else 3200
     )
     small = compose("train", f"data={data}", "size=small", "training=demo")
     assert (small.size.image, small.training.schedule.step_two) == (128, 3200)
+
+
+# The groups that the data chooses, with nothing else on the command line.
+CHOICES = {
+    "avatarrex": ("full", "long"),
+    "capture": ("small", "demo"),
+    "easymocap": ("small", "demo"),
+    "synthetic": ("cpu_512", "cpu_512"),
+    "thuman4": ("full", "long"),
+    "zju_mocap": ("full", "long"),
+}
+
+
+def choices(*overrides):
+    """The choices of the groups size and training, and the data's name."""
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        config = compose("train", list(overrides), return_hydra_config=True)
+    found = config.hydra.runtime.choices
+    return found.size, found.training, found.data
+
+
+@pytest.mark.parametrize("data", DATA)
+def test_the_data_chooses_size_and_training(data):
+    assert choices(f"data={data}") == (*CHOICES[data], data)
+
+
+def test_the_command_line_comes_before_the_experiment_and_that_before_the_data():
+    assert choices("experiment=smoke") == ("tiny", "smoke", "synthetic")
+    large = ("experiment=smoke", "data=thuman4")
+    assert choices(*large) == ("tiny", "smoke", "thuman4")
+    assert choices(*large, "size=mid") == ("mid", "smoke", "thuman4")
+    assert choices("data=thuman4", "training=demo") == ("full", "demo", "thuman4")
 
 
 @pytest.mark.parametrize(

@@ -331,7 +331,9 @@ def test_every_documented_command_runs(
         write_face(capture, 6)
         line = line.replace("/path/to/capture", str(capture))
     # The tiny run is of a capture, which has no source: it is scored on a folder.
-    line = line.replace("on.source.motion=far", "on.root=/path/to/capture")
+    line = line.replace(
+        "+other_capture.source.motion=far", "other_capture=/path/to/capture"
+    )
     line = place(line)
     name, arguments = line.split()[2 if " -m gsgan." in line else 1], arguments_of(line)
     if name == "gsgan.train":

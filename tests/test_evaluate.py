@@ -124,7 +124,12 @@ def test_a_run_is_scored_on_another_capture_against_the_distance_from_training(
     """The capture itself under another name: poses are solved, though it has some."""
     own = shutil.copytree(run, tmp_path / "run")
     other = shutil.copytree(capture, tmp_path / "other")
-    result = inside("evaluate", f"run={own}", f"on.root={other}", "on.test_frames=4-5")
+    result = inside(
+        "evaluate",
+        f"run={own}",
+        f"+other_capture.root={other}",
+        "+other_capture.test_frames=4-5",
+    )
     assert result.returncode == 0, result.stderr
     folder = own / "on" / "other"
     for variants in scores(folder).values():
@@ -148,8 +153,11 @@ def test_a_run_is_scored_on_another_capture_against_the_distance_from_training(
     assert cv2.imread(str(folder / "distance.png")) is not None
     assert "by distance from the training poses" in result.stdout
     for arguments, named in (
-        (["on.source.motion=far"], "Key 'source' is not in struct"),
-        ([f"on={other}", "data_root=a"], "data_root= cannot be given with on="),
+        (["+other_capture.source.motion=far"], "Key 'source' is not in struct"),
+        (
+            [f"other_capture={other}", "data_root=a"],
+            "data_root= cannot be given with other_capture=",
+        ),
     ):
         refused(inside("evaluate", f"run={own}", *arguments), named)
 

@@ -147,12 +147,13 @@ def test_a_loss_term(tiny):
     assert float(terms["smooth"]) == float(expected) > 0
 
 
-def test_a_generator(build):
-    keys = ("base", "multipliers", "style_share", "rgb_skip", "feature_bound", "patch")
-    _, avatar, frame = build(
-        f"model.generator._target_={HERE}.OneLayer",
-        *(f"~model.generator.{key}" for key in keys),
-    )
+def test_a_generator(build, tmp_path):
+    folder = tmp_path / "model" / "generator"
+    folder.mkdir(parents=True)
+    content = f"_target_: {HERE}.OneLayer\n_partial_: true\n"
+    (folder / "one_layer.yaml").write_text(content)
+    path = f"hydra.searchpath=[file://{tmp_path}]"
+    _, avatar, frame = build(path, "model/generator=one_layer")
     assert isinstance(avatar.generator, OneLayer)
     assert avatar(*frame.inputs).image.shape == frame.image.shape
 

@@ -230,7 +230,7 @@ def main() -> None:
     where = [f"data.root={folder}/joined", f"hydra.run.dir={folder}/run"]
     run("gsgan.train", "experiment=one_camera", *where, *splits, *overrides)
     same = [word.replace("data.", "on.") for word in splits]
-    run("gsgan.evaluate", f"run={folder}/run", f"on.root={folder}/true", *same)
+    run("gsgan.evaluate", f"run={folder}/run", f"other_capture={folder}/true", *same)
     show(folder / "run" / "metrics.json", "estimated skeletons")
     show(folder / "run" / "on" / "true" / "metrics.json", "true skeletons")
     print(

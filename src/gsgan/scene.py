@@ -15,7 +15,7 @@ from torch.nn import functional
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from gsgan.utils.records import TensorRecord, cat
-from gsgan.utils.tensors import constant
+from gsgan.utils.tensors import constant, matvec
 
 __all__ = [
     "BodyPose",
@@ -102,7 +102,12 @@ class Camera(TensorRecord):
     @property
     def centre(self) -> Tensor:
         """``[B, 3]`` metres: the camera's position in the world."""
-        return -(self.R.mT @ self.t.unsqueeze(-1)).squeeze(-1)
+        return -matvec(self.R.mT, self.t)
+
+    @property
+    def focal(self) -> Tensor:
+        """``[B, 2]`` pixels: the focal lengths along x and y."""
+        return self.K.diagonal(dim1=1, dim2=2)[:, :2]
 
     def to_camera(self, points: Tensor) -> Tensor:
         """``[B, M, 3]`` world points in camera axes, metres."""
@@ -368,7 +373,7 @@ def body_window(
     """
     height, width = camera.size
     pixels, depth = camera.project(p)
-    focal = torch.stack([camera.K[:, 0, 0], camera.K[:, 1, 1]], dim=-1)
+    focal = camera.focal
     reach = margin * focal[:, None] / depth.clamp_min(near).unsqueeze(-1)
     low = (pixels - reach).amin(dim=1).floor()
     high = (pixels + reach).amax(dim=1).ceil()

@@ -18,6 +18,7 @@ from writers.easymocap import (
     write_easymocap,
 )
 
+from gsgan.data.files import natural_order
 from gsgan.data.formats.easymocap import EasymocapReader
 from gsgan.data.layout import Layout
 from gsgan.data.validation import Thresholds
@@ -56,6 +57,21 @@ def refused(root: Path, *parts: str, smpl: Path | None = None, **settings: Any) 
     assert "\n" not in str(caught.value)
     for part in parts:
         assert part in str(caught.value), caught.value
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["Camera_B2", "Camera_B10"],
+        ["2", "10", "a"],
+        ["rate -2", "rate -0.5", "rate 1e-3", "rate 0.05", "rate 0.5", "rate 10"],
+        ["1400000000000000001", "1400000000000000002"],
+        ["cam", "cam 1", "cam_1"],
+    ],
+)
+def test_natural_order(names):
+    others = names[::-1]
+    assert sorted(others, key=natural_order) == names
 
 
 def test_cameras_are_paired_by_name_and_have_their_images(written, subject):

@@ -1,7 +1,5 @@
 """A description of the machine, and tables, for all benchmarks."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib.metadata
 import os

@@ -12,7 +12,7 @@ from torch.nn.functional import normalize
 from gsgan.body.free import Body
 from gsgan.body.lbs import axis_angle_to_matrix, left_jacobian, shortest_turn
 from gsgan.skeleton.hands import FINGERS, HAND, MIN_PALM, PALM, PINKY, palm_frames
-from gsgan.utils.tensors import constant
+from gsgan.utils.tensors import constant, matvec
 
 # Per number, for the thumb and for the fingers: flexion, turn to the side and twist of the first
 # joint; flexion and turn to the side of the second, which represents the last two if a body has
@@ -144,7 +144,7 @@ class Fingers(nn.Module):
         """``[B, 42, 3]`` landmarks of hands at rest with turned fingers."""
         # The second joint of a finger turns after the first.
         first, second = axis_angle_to_matrix(turns).chunk(2, dim=1)
-        base_bone = (first @ self.bones[:, 0].unsqueeze(-1)).squeeze(-1)
+        base_bone = matvec(first, self.bones[:, 0])
         middle = (self.rest[self.chains[:, 0]] + base_bone).unsqueeze(2)
         beyond = middle + self.bones[:, 1:] @ (first @ second).mT
         x = torch.cat([middle, beyond], dim=2).flatten(1, 2)
@@ -210,7 +210,7 @@ class Fingers(nn.Module):
         # The normal equations.
         weighted = (J * weight[:, :, None, :, None]).flatten(3)
         H = weighted @ J.flatten(3).mT + torch.diag_embed(self.prior)
-        g = (weighted @ r.flatten(2).unsqueeze(-1)).squeeze(-1) + self.prior * numbers
+        g = matvec(weighted, r.flatten(2)) + self.prior * numbers
         return torch.linalg.solve(H, g)
 
 
@@ -219,7 +219,7 @@ def _shown_turn(axes: Tensor, rest: Tensor, now: Tensor) -> Tensor:
     rest = normalize(rest, dim=-1, eps=1e-9)
     now = normalize(now, dim=-1, eps=1e-9)
     turn = shortest_turn(rest, now)
-    return (axes @ turn.unsqueeze(-1)).squeeze(-1)
+    return matvec(axes, turn)
 
 
 def _velocities(axes: Tensor, arms: Tensor) -> Tensor:
@@ -261,7 +261,7 @@ def _placed(x: Tensor, hands: Tensor, seen: Tensor, R: Tensor) -> tuple[Tensor, 
         H = (torch.einsum("...ii", H)[..., None, None] + MIN_PALM**2) * eye - H
         slope = (share * torch.linalg.cross(now, towards)).sum(2)
         R = axis_angle_to_matrix(torch.linalg.solve(H, slope)) @ R
-    return R, goal - (R @ centre.unsqueeze(-1)).squeeze(-1)
+    return R, goal - matvec(R, centre)
 
 
 def _bones(x: Tensor, chains: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from gsgan.utils.tensors import constant
+from gsgan.utils.tensors import constant, matvec
 
 
 def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
@@ -261,4 +261,4 @@ def stretched(
 
 def skin(vertices: Tensor, A: Tensor, t: Tensor) -> Tensor:
     """Posed vertices ``[B, V, 3]``: rest ``[V, 3]`` (or a batch) by ``A [B,V,3,3], t [B,V,3]``."""
-    return (A @ vertices[..., None]).squeeze(-1) + t
+    return matvec(A, vertices) + t

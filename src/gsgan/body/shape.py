@@ -25,6 +25,7 @@ from gsgan.body.smpl_names import fitting_parts
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.skeleton.hands import HAND, WRIST
 from gsgan.utils.errors import DataError
+from gsgan.utils.tensors import matvec
 
 # Groups of bones with one stretch each, shared by left and right: limbs are scaled along their
 # axis, other parts in all directions.
@@ -235,7 +236,7 @@ def _stretched(body: B, stretch: Tensor) -> B:
     for joint, parent in enumerate(body.parents[1:], start=1):
         places.append(places[parent] + S[parent] @ (joints[joint] - joints[parent]))
     moved = torch.stack(places)
-    shift = moved - (S @ joints.unsqueeze(-1)).squeeze(-1)
+    shift = moved - matvec(S, joints)
 
     # As lbs.blend_transforms, which has no forward-mode derivative.
     maps = torch.cat([S, shift.unsqueeze(-1)], dim=-1).flatten(1)
@@ -247,7 +248,7 @@ def _stretched(body: B, stretch: Tensor) -> B:
     A, t = blended.unflatten(-1, (3, 4)).split((3, 1), dim=-1)
 
     def carried(points: Tensor, bone: Tensor) -> Tensor:
-        return (S[bone] @ points.unsqueeze(-1)).squeeze(-1) + shift[bone]
+        return matvec(S[bone], points) + shift[bone]
 
     changes: dict[str, Any] = {
         "vertices": skin(body.vertices, A, t.squeeze(-1)),

@@ -1,7 +1,5 @@
 """A skinned body: vertices, bones and part labels, and their transformation by a pose."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, Self
@@ -20,6 +18,7 @@ from gsgan.body.lbs import (
     skin,
 )
 from gsgan.scene import BodyPose
+from gsgan.utils.tensors import matvec
 
 KEPT_BONES = 4  # number of bones per vertex whose weights' gradients are used
 
@@ -134,7 +133,7 @@ class MarkedBody(SkinnedBody):
 def carry(transforms: Tensor, points: Tensor, bones: Tensor | None = None) -> Tensor:
     """``[B, N, 3]``: points ``[N, 3]`` moved rigidly with their bones; None: one of each bone."""
     T = transforms if bones is None else transforms[:, bones]
-    return (T[..., :3, :3] @ points.to(T)[..., None]).squeeze(-1) + T[..., :3, 3]
+    return matvec(T[..., :3, :3], points.to(T)) + T[..., :3, 3]
 
 
 def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:

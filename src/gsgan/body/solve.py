@@ -26,7 +26,7 @@ from gsgan.body.fingers import (
 from gsgan.body.free import Body
 from gsgan.body.lbs import axis_angle_to_matrix, left_jacobian, shortest_turn
 from gsgan.body.rig import SPINE, Limb, ancestors, build_rig, prior
-from gsgan.body.skinned import MarkedBody
+from gsgan.body.skinned import MarkedBody, carry
 from gsgan.scene import BodyPose
 from gsgan.skeleton import (
     MEDIAPIPE33,
@@ -37,7 +37,7 @@ from gsgan.skeleton import (
 )
 from gsgan.skeleton.hands import HAND, PALM
 from gsgan.skeleton.tensors import constants
-from gsgan.utils.tensors import constant
+from gsgan.utils.tensors import constant, matvec
 
 # Numbers of landmarks: of the pose, and with both hands.
 BODY = len(MEDIAPIPE33.names)
@@ -427,7 +427,7 @@ class Solver(nn.Module):
         # Each turn about its joint; the root's also translates.
         R = self.rotations(q, root)
         o = joints[self.joint]
-        shift = o - (R @ o.unsqueeze(-1)).squeeze(-1)
+        shift = o - matvec(R, o)
         shift = torch.cat([shift[:, :1] + q[:, None, 3:6], shift[:, 1:]], dim=1)
         top = torch.cat([R, shift.unsqueeze(-1)], dim=-1)
         bottom = constant((0.0, 0.0, 0.0, 1.0), R).expand(*R.shape[:2], 1, 4)
@@ -441,8 +441,7 @@ class Solver(nn.Module):
 
     def points(self, T: Tensor, landmarks: Tensor) -> Tensor:
         """``[B, N, 3]`` the posed landmarks."""
-        T = T[:, self.carrier[: len(landmarks)]]
-        return (T[..., :3, :3] @ landmarks.unsqueeze(-1)).squeeze(-1) + T[..., :3, 3]
+        return carry(T, landmarks, self.carrier[: len(landmarks)])
 
     def linear(self, q: Tensor, root: Tensor, p: Tensor) -> Linear:
         """Residuals to ``p [B, N, 3]`` and their derivatives, the root's about its rotation."""
@@ -453,14 +452,14 @@ class Solver(nn.Module):
         # Where each turn's joint is: moved by the turns before it, and the root by its translation.
         before = T[:, self.before]
         before_R = before[..., :3, :3]
-        origin = (before_R @ self.joints[self.joint].unsqueeze(-1)).squeeze(-1)
+        origin = matvec(before_R, self.joints[self.joint])
         origin = origin + before[..., :3, 3]
         origin = torch.cat([origin[:, :1] + q[:, None, 3:6], origin[:, 1:]], dim=1)
 
         # World axes about which a number turns, and arms from there to the landmarks that follow.
         v = (q @ self.matrix).unflatten(1, (-1, 3))
         turned = before_R @ left_jacobian(v)
-        axes = (turned[:, self.entry_turn] @ self.entry_axis.unsqueeze(-1)).squeeze(-1)
+        axes = matvec(turned[:, self.entry_turn], self.entry_axis)
         arms = x.unsqueeze(1) - origin[:, self.entry_turn].unsqueeze(2)
         arms = arms * self.follows[:, :n]
         moved = torch.linalg.cross(axes.unsqueeze(2).expand_as(arms), arms)
@@ -482,7 +481,7 @@ class Solver(nn.Module):
         w = weight / root
         J = at.by_number.flatten(2)
         weighted = (at.by_number * w[:, None, :, None]).flatten(2)
-        gradient = (weighted @ at.residual.flatten(1).unsqueeze(-1)).squeeze(-1)
+        gradient = matvec(weighted, at.residual.flatten(1))
 
         # The prior, and what holds numbers above their minimum.
         stop, below = below_least(q, self.least)

@@ -16,7 +16,7 @@ from gsgan.check.frames import frame_findings, mask_doubts, shortened, skeleton_
 from gsgan.check.report import Figure, Finding, Section, Table, counted
 from gsgan.check.settings import Limits, Sampling
 from gsgan.check.views import CheckedData
-from gsgan.data.formats.consistency import far_cameras, spread
+from gsgan.data.formats.consistency import camera_distances, far_cameras, spread
 from gsgan.data.proportions import axis_name
 from gsgan.effects import EffectSettings, decide
 from gsgan.effects.record import HEADERS
@@ -72,9 +72,7 @@ def geometry_of(subject: CheckedData) -> Geometry:
 
     # Distances from the median joint. Of two cameras neither is the median one.
     centre = np.median(subject.p[subject.visible], axis=0)
-    distances = {}
-    for name, camera in subject.cameras.items():
-        distances[name] = float(np.linalg.norm(camera.centre - centre))
+    distances = camera_distances(subject.cameras, centre)
     far = {}
     if len(distances) > 2:
         far = far_cameras(distances, subject.consistency.far_camera)

@@ -10,6 +10,7 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from copy import copy
+from decimal import Decimal
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Self
@@ -372,10 +373,10 @@ def frame_of(digits: str) -> int | None:
     return number if number <= LARGEST_FRAME else None
 
 
-def natural_order(name: str) -> tuple[tuple[int, str | int], ...]:
-    """Sort key by which ``Camera_B2`` comes before ``Camera_B10``."""
-    key: list[tuple[int, str | int]] = []
-    for part in filter(None, re.split(r"([0-9]+)", name)):
-        # Numbers before text, so that unlike parts can be compared.
-        key.append((1, int(part)) if part.isdigit() else (0, part))
-    return tuple(key)
+def natural_order(name: str) -> list[Any]:
+    """Sort key: ``Camera_B2`` before ``Camera_B10``, ``rate -1e-3`` before ``rate 0.5``."""
+    # Numbers after a space, such as values of settings, may have a sign and decimals. Decimal
+    # keeps all digits. The pattern's matches have odd places.
+    parts: list[Any] = re.split(r"((?<= )-?\d+(?:\.\d+)?(?:e[+-]?\d{1,3})?|\d+)", name)
+    parts[1::2] = map(Decimal, parts[1::2])
+    return parts

@@ -1,7 +1,5 @@
 """The scored region of an image and the variants of the metrics in published evaluations."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Literal
 

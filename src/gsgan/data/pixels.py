@@ -4,8 +4,6 @@ A mask rule defines the meaning of the numbers in a mask file; several masks of 
 image are joined by their maximum. All results are uint8.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -4,8 +4,6 @@ Numbers of two protocols do not belong in one table; so a protocol has a name, i
 every score, and lists where a run departs from it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal

@@ -1,7 +1,5 @@
 """Splits a capture by cameras and frames: training, held-out views, held-out poses."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

@@ -211,14 +211,16 @@ def evaluate_config(config: DictConfig) -> Results:
     others = ["data", "protocol", "out", "method"]
     if config.run is None:
         kind = "predictions"
-        others = ["data_root", "data_smpl", "drive", "on"]
+        others = ["data_root", "data_smpl", "drive", "other_capture"]
     for key in others:
         if config.get(key) is not None:
             raise ConfigError(f"{key}= cannot be given with {kind}=; leave it out")
 
-    # Another capture is named by `on` alone.
-    if config.get("on") is not None and config.data_root is not None:
-        raise ConfigError("data_root= cannot be given with on=; leave it out")
+    # Another capture is named by `other_capture` alone.
+    if config.get("other_capture") is not None and config.data_root is not None:
+        raise ConfigError(
+            "data_root= cannot be given with other_capture=; leave it out"
+        )
 
     # Values.
     if config.background not in (None, *BACKGROUNDS):
@@ -253,11 +255,11 @@ def evaluate_folder(
     state = checkpoint["gsgan"]
 
     # The avatar, on its own data or on another capture, whose poses are of another body.
-    other = config.get("on") is not None
+    other = config.get("other_capture") is not None
     out = folder
     if other:
         avatar = avatar_of(folder, stored, checkpoint, config.data_smpl)
-        data = build_data(other_capture(stored, config.on))
+        data = build_data(other_capture(stored, config.other_capture))
         name = Path(data.layout.root).resolve().name
         out = folder / "on" / name
         marks = [*state["marks"], f"on another capture: {name}", BY_SKELETON]
@@ -299,7 +301,7 @@ def evaluate_folder(
     )
 
 
-def other_capture(stored: DictConfig, on: str | DictConfig) -> DictConfig:
+def other_capture(stored: DictConfig, given: str | DictConfig) -> DictConfig:
     """A run's config with the data of another capture: its folder, or the keys that differ.
 
     Body poses are left out, as they are of another body, and so are the run's splits.
@@ -317,10 +319,10 @@ def other_capture(stored: DictConfig, on: str | DictConfig) -> DictConfig:
     # Only keys that the data has can be changed.
     OmegaConf.set_struct(config, True)
     try:
-        config.data.merge_with({"root": on} if isinstance(on, str) else on)
+        config.data.merge_with({"root": given} if isinstance(given, str) else given)
     except ConfigKeyError as error:
         raise ConfigError(
-            f"on: {str(error).splitlines()[0]} of the run's data"
+            f"other_capture: {str(error).splitlines()[0]} of the run's data"
         ) from None
     return config
 
@@ -480,7 +482,11 @@ def evaluate_method(
     joined = _joined_splits(scores, scorer, data, origin(method, data, device))
     print_table(joined.results, joined.origin, console)
     if poses is not None:
-        own = None if config.get("on") is None else Path(config.run).expanduser()
+        own = (
+            None
+            if config.get("other_capture") is None
+            else Path(config.run).expanduser()
+        )
         write_distances(folder, joined.rows, data, poses, console, own)
 
     # metrics.json is the last file: if it is new, all others are.

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from filelock import FileLock
 from hydra.utils import instantiate
 from numpy.typing import NDArray
 from omegaconf import DictConfig
@@ -33,7 +34,7 @@ from gsgan.scene import BodyPose, cat
 from gsgan.skeleton import MEDIAPIPE33, TEMPLATES
 from gsgan.utils.console import make_console, progress, working
 from gsgan.utils.errors import ConfigError, DataError
-from gsgan.utils.files import locked, write_atomically, write_json, write_npz, writing
+from gsgan.utils.files import write_atomically, write_json, write_npz, writing
 from gsgan.utils.tensors import pick_device
 
 REPORT = "body_fit.json"
@@ -162,7 +163,7 @@ def fit_before_training(
     seen.crop = PersonCrop(margin=IMAGE_MARGIN)
     with ExitStack() as stack:
         with writing(root):
-            stack.enter_context(locked(root / LOCK))
+            stack.enter_context(FileLock(root / LOCK))
         # Another process may have made the poses while this one waited.
         if not (root / POSES_FILE).exists():
             fit_body(seen, instantiate(settings), device=device)

@@ -25,6 +25,7 @@ from gsgan.scene import BodyPose
 from gsgan.skeleton import MEDIAPIPE33, sanitise
 from gsgan.skeleton.hands import HAND, HAND_EDGES, WRIST
 from gsgan.utils.errors import DataError
+from gsgan.utils.tensors import matvec
 
 MAX_SHAPE_FRAMES = 24  # maximum number: every frame shows the same lengths
 # Standard deviations of the prior; that of coefficients is 1.
@@ -183,7 +184,7 @@ def fit_offsets(
 
 def _at_rest(R: Tensor, t: Tensor, points: Tensor) -> Tensor:
     """Points ``[..., 3]`` before the motion by ``R [..., 3, 3]`` and ``t [..., 3]``."""
-    return (R.mT @ (points - t).unsqueeze(-1)).squeeze(-1)
+    return matvec(R.mT, points - t)
 
 
 def _usable(skeletons: Tensor, visibility: Tensor) -> tuple[Tensor, Tensor]:

@@ -524,7 +524,7 @@ def seen_points(means: Tensor, camera: Camera, reach: float) -> Tensor:
     pixels, depth = camera.project(means)
 
     # The reach in pixels at each point's depth. A depth below the reach counts as the reach.
-    focal = torch.stack([camera.K[:, 0, 0], camera.K[:, 1, 1]], dim=-1)
+    focal = camera.focal
     beyond = reach * focal[:, None] / depth.clamp_min(reach).unsqueeze(-1)
 
     # Points within the image and the margin round it.

@@ -24,11 +24,10 @@ from gsgan.body.subdivide import subdivided
 from gsgan.scene import BodyPose, Gaussians
 from gsgan.skeleton import Points
 from gsgan.utils.checks import above, whole
-from gsgan.utils.tensors import derived
+from gsgan.utils.tensors import derived, matvec, squared_norm
 
 # share of the area at rest, below which rounding errors dominate a normal
 NORMAL_FLOOR = 1e-2
-ROWS = 1024  # points compared with all others at a time
 # controls that correct a point; bones that it may follow
 NEAREST_CONTROLS = 4
 FOLLOWED_BONES = 6
@@ -452,8 +451,8 @@ def moved_normals(A: Tensor, normals: Tensor) -> Tensor:
 
     # Columns of the cofactor matrix are cross products of the columns of A.
     cofactors = [torch.linalg.cross(a, b) for a, b in ((y, z), (z, x), (x, y))]
-    moved = (torch.stack(cofactors, dim=-1) @ normals.unsqueeze(-1)).squeeze(-1)
-    return moved * torch.rsqrt(moved.square().sum(-1, keepdim=True) + NORMAL_FLOOR**2)
+    moved = matvec(torch.stack(cofactors, dim=-1), normals)
+    return moved * torch.rsqrt(squared_norm(moved) + NORMAL_FLOOR**2)
 
 
 def farthest_points(vertices: Tensor, count: int) -> Tensor:

@@ -17,7 +17,7 @@ from gsgan.scene import Gaussians
 from gsgan.skeleton import Points, root_of
 from gsgan.splat.sh import sh_to_colour
 from gsgan.utils.checks import between, one_of, whole
-from gsgan.utils.tensors import constant, derived
+from gsgan.utils.tensors import constant, derived, matvec, squared_norm
 
 NEAREST_ANCHORS = 3  # anchors between which the MLP's output is interpolated
 POSE_AXES = 20  # principal directions of the training poses' codes
@@ -190,7 +190,7 @@ class ResidualGaussians(nn.Module):
         offset = (
             residuals.means if bound is None else bound * torch.tanh(residuals.means)
         )
-        means = points.means + (frames @ (offset * height).unsqueeze(-1)).squeeze(-1)
+        means = points.means + matvec(frames, offset * height)
 
         # Shapes: the point's own frame, turned by the quaternion and scaled.
         scales = bounded(
@@ -573,7 +573,7 @@ def _unit_quat(residual: Tensor) -> Tensor:
     """(1, 0, 0, 0) + δq, w x y z, of length one; finite where the sum vanishes."""
     # The residual is added to the identity's quaternion.
     quat = residual + constant((1.0, 0.0, 0.0, 0.0), residual)
-    return quat * torch.rsqrt(quat.square().sum(-1, keepdim=True) + QUAT_FLOOR)
+    return quat * torch.rsqrt(squared_norm(quat) + QUAT_FLOOR)
 
 
 def colour_from(eye: Tensor, means: Tensor, frames: Tensor, sh: Tensor) -> Tensor:
@@ -587,7 +587,7 @@ def colour_from(eye: Tensor, means: Tensor, frames: Tensor, sh: Tensor) -> Tenso
     # Higher degrees depend on the direction from the eye to the point, in the frame of the part.
     if sh.shape[-2] > 1:
         view = functional.normalize(means - eye[:, None], dim=-1, eps=1e-6)
-        view = (frames.mT @ view.unsqueeze(-1)).squeeze(-1)
+        view = matvec(frames.mT, view)
         # frames of a skinned body shear
         view = functional.normalize(view, dim=-1, eps=1e-6)
     return functional.relu(sh_to_colour(sh, view))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from gsgan.data.proportions import Proportions, upright
 from gsgan.motion.retarget import heading
+from gsgan.motion.rotations import matvec
 from gsgan.scene import Camera
 from gsgan.utils.checks import above, between
 
@@ -75,7 +76,7 @@ class Orbit:
         R = np.stack([right, np.cross(-away, right), -away], axis=1)
         R = R @ upright(subject.up)
         centres = (middle + distance * away) @ upright(subject.up)
-        t = -(R @ centres[..., None])[..., 0]
+        t = -matvec(R, centres)
 
         # Intrinsics: the principal point is the image's centre.
         K = np.diag([focal, focal, 1])

@@ -3,7 +3,7 @@
 Axes are the standard ones (`gsgan.data.proportions`), Z up; units are metres.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import chain, pairwise
 
 import numpy as np
@@ -32,11 +32,12 @@ from gsgan.data.proportions import (
     middle,
     part_frame,
 )
-from gsgan.motion.rotations import axis_angle, between, rotation, unit
+from gsgan.motion.rotations import axis_angle, between, matvec, rotation, unit
 from gsgan.motion.standard import StandardMotion, drift, floor_under
 from gsgan.skeleton import MEDIAPIPE33, bone_frames, in_head
 from gsgan.skeleton.hands import FINGER_BONES, INDEX, PINKY, WRIST
 from gsgan.skeleton.template import CHEST, HEAD, PELVIS
+from gsgan.utils.tensors import squared_norm
 
 Float = NDArray[np.float64]
 
@@ -91,8 +92,7 @@ def retargeted(p: Float, subject: Proportions, scale: float | None = None) -> Fl
         q[:, right] = centre - half
 
     # Arms and legs, from the trunk outwards.
-    for a, b in BONES:
-        q[:, b] = q[:, a] + unit(p[:, b] - p[:, a]) * length(rest, (a, b))
+    _extend(q, p, rest, BONES)
 
     # Hands: turned as the palm's three landmarks of the pose, or better as the hand's own.
     for wrist, ends in HAND_LANDMARKS.items():
@@ -121,7 +121,7 @@ def retargeted(p: Float, subject: Proportions, scale: float | None = None) -> Fl
     bend = axis_angle(between(straight, shown))
     angle = np.linalg.norm(bend, axis=-1, keepdims=True)
     bend = bend * (MAX_NECK_BEND / np.maximum(angle, MAX_NECK_BEND))
-    ears = chest + (rotation(bend) @ straight[..., None])[..., 0]
+    ears = chest + matvec(rotation(bend), straight)
 
     # The head, and the face on it.
     turn = _head_frame(p) @ _head_frame(rest[None]).mT
@@ -174,7 +174,7 @@ def steadied(p: Float) -> Float:
         usual, _ = found.nanmedian(0)
 
         # Cauchy's weights.
-        moved = (found - usual).square().sum(-1, keepdim=True) / FACE_STILL**2
+        moved = squared_norm(found - usual) / FACE_STILL**2
         weight = (1 / (1 + moved)).nan_to_num()
     return found.numpy()
 
@@ -221,9 +221,15 @@ def _posed_hand(p: Float, subject: Proportions, wrist: int) -> tuple[Float, Floa
     q = (rest - subject.rest[wrist]) @ palm.mT
 
     # Fingers keep their own directions.
-    for a, b in FINGER_BONES:
-        q[:, b] = q[:, a] + unit(p[:, b] - p[:, a]) * length(rest, (a, b))
+    _extend(q, p, rest, FINGER_BONES)
     return q, palm
+
+
+def _extend(q: Float, p: Float, rest: Float, bones: Iterable[tuple[int, int]]) -> None:
+    """Places the ends of bones of ``q`` in the directions of ``p``, at the lengths of ``rest``."""
+    for a, b in bones:
+        way = unit(p[:, b] - p[:, a])
+        q[:, b] = q[:, a] + way * length(rest, (a, b))
 
 
 def _foot_frame(p: Float, ankle: int) -> Float:

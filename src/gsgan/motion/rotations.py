@@ -19,6 +19,11 @@ def rotation(axis_angle: Array) -> Array:
     return R.reshape(*axis_angle.shape[:-1], 3, 3)
 
 
+def matvec(R: Array, v: Array) -> Array:
+    """Vectors ``[..., 3]``, each multiplied by its own matrix ``[..., 3, 3]``."""
+    return (R @ v[..., None])[..., 0]
+
+
 def axis_angle(R: Array) -> Array:
     """Axis-angle vectors ``[..., 3]`` of rotation matrices ``[..., 3, 3]``, radians."""
     vectors = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec()

@@ -23,7 +23,7 @@ from gsgan.motion.rig import (
     limb_axes,
     rest_turns,
 )
-from gsgan.motion.rotations import Array, between, blend, rotation, unit
+from gsgan.motion.rotations import Array, between, blend, matvec, rotation, unit
 from gsgan.utils.errors import DataError
 
 # Maximum tilt of trunk and legs in a zero pose that is a standing person.
@@ -516,7 +516,7 @@ def _bend_in_plane(turns: dict[str, Array], joints: dict[str, Array]) -> None:
         # The direction of the bend about the limb's length, as a complex number: 1 is forwards, 1j
         # is out of the plane. Larger bends count more.
         lower = unit(joints[end] - joints[second])
-        local = (turns[first].mT @ lower[..., None])[..., 0]
+        local = matvec(turns[first].mT, lower)
         away = local @ hinge
         forward = local @ np.cross(hinge, along)
         bend = forward + 1j * away

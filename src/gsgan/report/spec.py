@@ -1,6 +1,5 @@
 """The content of a table, as set in ``conf/table``."""
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -87,11 +86,3 @@ class TableSpec:
                 raise ConfigError(f"table.{key} must be a list of at least one")
             for value in values:
                 one_of(f"table.{key}", value, known)
-
-
-def natural(name: str) -> list[str | float]:
-    """A sort key: numbers by value, the words between them by letters."""
-    # Numbers after a space, such as values of settings; the pattern's matches have odd places.
-    parts: list[Any] = re.split(r"((?<= )-?\d+(?:\.\d+)?(?:e[+-]?\d+)?)", name)
-    parts[1::2] = map(float, parts[1::2])
-    return parts

@@ -13,6 +13,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from rich.markdown import Markdown
 
+from gsgan.data.files import natural_order
 from gsgan.metrics.names import BOX_METRICS, METRICS
 from gsgan.report.paper import PaperTable, read_paper
 from gsgan.report.runs import (
@@ -31,7 +32,6 @@ from gsgan.report.spec import (
     SPLATTED,
     RowSpec,
     TableSpec,
-    natural,
     written,
 )
 from gsgan.report.write import (
@@ -111,7 +111,7 @@ class Part:
     def names(self) -> list[str]:
         """The names of models and methods; the full model is first."""
         names = {run.name for run in self.runs}
-        return sorted(names, key=lambda name: (name != "full", natural(name)))
+        return sorted(names, key=lambda name: (name != "full", natural_order(name)))
 
     @property
     def rows(self) -> list[RowSpec]:

@@ -1,16 +1,15 @@
 """The body that S splats, with a part label per vertex: its own, or by a vote over the images."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.utils.data import Subset
 
 from gsgan.body import SkinnedBody, open_body
 from gsgan.data.scene_info import SceneInfo
-from gsgan.model.body_points import ROWS, neighbour_distance
+from gsgan.model.body_points import neighbour_distance
 from gsgan.model.segmentation import IGNORE
 from gsgan.scene import Camera, Frame
 from gsgan.utils.arrays import evenly_spaced
@@ -172,7 +171,7 @@ def seen(points: Tensor, reach: Tensor, camera: Camera, tolerance: float) -> Ten
     pixels, depths = camera.project(points[None])
     pixel = pixels[0]
     depth = depths[0]
-    radius = reach * camera.K[0, :2, :2].diagonal().mean() / depth
+    radius = reach * camera.focal[0].mean() / depth
     ahead = (depth > tolerance) & pixel.isfinite().all(-1)
     visible = torch.zeros_like(ahead)
     if not ahead.any():
@@ -231,10 +230,8 @@ def _majority(votes: Tensor) -> tuple[Tensor, Tensor]:
 
 def _from_the_nearest(vertices: Tensor, labels: Tensor, decided: Tensor) -> Tensor:
     """Labels ``[V]``, those not decided taken from the nearest decided vertex."""
-    # In groups of rows, since all distances at once would take too much memory.
-    labels = labels.clone()
     known = decided.nonzero().squeeze(-1)
-    for rows in (~decided).nonzero().squeeze(-1).split(ROWS):
-        nearest = torch.cdist(vertices[rows], vertices[known]).argmin(dim=1)
-        labels[rows] = labels[known[nearest]]
+    _, nearest = cKDTree(vertices[known]).query(vertices[~decided])
+    labels = labels.clone()
+    labels[~decided] = labels[known[nearest]]
     return labels

@@ -10,7 +10,7 @@ from torch import Tensor
 from gsgan.scene import Camera
 from gsgan.skeleton.template import MEDIAPIPE33, Edge, SkeletonTemplate
 from gsgan.skeleton.tensors import check_skeleton
-from gsgan.utils.tensors import constant
+from gsgan.utils.tensors import constant, squared_norm
 
 MIN_SEGMENT_PX = 1e-2
 """Pixels: a shorter segment is drawn as a point, with a finite slope."""
@@ -101,7 +101,7 @@ def _distance2(
 
     # A very short segment is drawn as one of a minimum length along x.
     d = b - a
-    length2 = d.square().sum(-1, keepdim=True)
+    length2 = squared_norm(d)
     short = length2 < MIN_SEGMENT_PX**2
     length2 = torch.where(short, MIN_SEGMENT_PX**2, length2)
     d = torch.where(short, constant((MIN_SEGMENT_PX, 0.0), d), d)

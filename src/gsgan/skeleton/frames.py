@@ -19,6 +19,7 @@ from gsgan.skeleton.hands import palm_frames
 from gsgan.skeleton.rotation6d import across, rotation_from_6d, rotation_to_6d, unit
 from gsgan.skeleton.template import CHEST, HEAD, MEDIAPIPE33, SkeletonTemplate
 from gsgan.skeleton.tensors import FOLDED, Constants, Level, check_skeleton, constants
+from gsgan.utils.tensors import squared_norm
 
 MIN_LENGTH = 1e-3
 """Metres: a shorter bone or baseline has no direction (1 mm, below any landmark's accuracy)."""
@@ -102,7 +103,7 @@ def bone_frames(
         known = torch.cat([known, parent @ swing], dim=1)
 
     # The lengths of the bones never reach zero, so that their gradient is finite.
-    length2 = bones.square().sum(-1, keepdim=True)
+    length2 = squared_norm(bones)
     lengths = (length2.squeeze(-1) + MIN_LENGTH**2).sqrt()
     return BoneFrames(
         hubs=known[:, : template.n_hubs],
@@ -151,7 +152,7 @@ def _trunk(q: Tensor, c: Constants) -> Tensor:
 
     # The box's left axis is their mean, or the hips' if the shoulders face backwards.
     both = lines.sum(1, keepdim=True)
-    opposed = both.square().sum(-1, keepdim=True) < 2 * FOLDED
+    opposed = squared_norm(both) < 2 * FOLDED
     middle = unit(torch.where(opposed, lines[:, :1], both))
     left = torch.cat([lines, middle], dim=1)
     up = up.expand_as(left)
@@ -202,14 +203,14 @@ def _faded(v: Tensor, fallback: Tensor) -> Tensor:
     """
     # In units of the minimum length, the fallback's share is 1 - |v|².
     v = v / MIN_LENGTH
-    v = v + (1 - v.square().sum(-1, keepdim=True)).clamp_min(0) * fallback
-    lost = v.square().sum(-1, keepdim=True) < FOLDED
+    v = v + (1 - squared_norm(v)).clamp_min(0) * fallback
+    lost = squared_norm(v) < FOLDED
     return unit(torch.where(lost, fallback, v))
 
 
 def _shortened(v: Tensor) -> tuple[Tensor, Tensor]:
     """v divided by the larger of its length and `MIN_LENGTH`, and the result's squared length."""
-    length2 = v.square().sum(-1, keepdim=True)
+    length2 = squared_norm(v)
     shortened = v * length2.clamp_min(MIN_LENGTH**2).rsqrt()
     return shortened, (length2 / MIN_LENGTH**2).clamp_max(1)
 
@@ -263,7 +264,7 @@ def omega(
     ears = p.index_select(1, c.head_points[:2])
     ear = ears[:, :1]
     d = (p.index_select(1, c.face_turned) - ear) - (ears[:, 1:] - ear) * 0.5
-    d = d * d.square().sum(-1, keepdim=True).clamp_min(MIN_LENGTH**2).rsqrt()
+    d = d * squared_norm(d).clamp_min(MIN_LENGTH**2).rsqrt()
     face = c.face_swing.to(d @ head)
 
     # In the order of the joints, then the landmarks of the face.

@@ -3,6 +3,8 @@
 import torch
 from torch import Tensor
 
+from gsgan.utils.tensors import squared_norm
+
 
 def rotation_to_6d(R: Tensor) -> Tensor:
     """The first two columns of a rotation, one after the other.
@@ -45,13 +47,13 @@ def rotation_from_6d(x: Tensor, eps: float = 1e-5) -> Tensor:
     a = x[..., :3]
     b = x[..., 3:]
     x_axis = torch.eye(3, dtype=x.dtype, device=x.device)[0].expand_as(a)
-    is_short = a.square().sum(-1, keepdim=True) < eps**2
+    is_short = squared_norm(a) < eps**2
     first = unit(torch.where(is_short, x_axis, a))
 
     # The second column's part orthogonal to the first, or an axis orthogonal to it.
     part = across(first, b)
-    length2 = b.square().sum(-1, keepdim=True).clamp_min(1.0)
-    unusable = part.square().sum(-1, keepdim=True) < eps**2 * length2
+    length2 = squared_norm(b).clamp_min(1.0)
+    unusable = squared_norm(part) < eps**2 * length2
     second = unit(torch.where(unusable, orthogonal_to(first.detach()), part))
     # Once more: after cancellation the first pass leaves a part along the first column.
     second = unit(across(first, second))
@@ -73,4 +75,4 @@ def across(axis: Tensor, v: Tensor) -> Tensor:
 
 def unit(v: Tensor) -> Tensor:
     """v divided by its length."""
-    return v * v.square().sum(-1, keepdim=True).rsqrt()
+    return v * squared_norm(v).rsqrt()

@@ -11,7 +11,7 @@ from gsgan.skeleton.frames import bone_frames, hubs_of, palms_of, swings
 from gsgan.skeleton.holistic import TEMPLATES
 from gsgan.skeleton.template import CHEST, HEAD, MEDIAPIPE33, N_HUBS, SkeletonTemplate
 from gsgan.skeleton.tensors import Constants, check_skeleton, constants
-from gsgan.utils.tensors import constant
+from gsgan.utils.tensors import constant, matvec
 
 TEMPLATE_SIZES = {len(t.names) for t in TEMPLATES.values()}
 MIN_TRUNK_JOINTS = 3
@@ -215,7 +215,7 @@ def _filled(
 
         # Joints at the ends of their rest bones.
         frames = known.index_select(1, bones.frames)
-        bone = (frames @ bones.rest.unsqueeze(-1)).squeeze(-1) * scale[:, None, None]
+        bone = matvec(frames, bones.rest) * scale[:, None, None]
         q = _put(q, valid, bones.ends, q.index_select(1, bones.starts) + bone)
         if template.bare:
             # Two limbs for one bone, as from elbow to wrist, end at the same place.

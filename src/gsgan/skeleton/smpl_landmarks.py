@@ -6,8 +6,6 @@ Confidence 1: the same point in both; 0.5: a point nearby.
 Source: vertex numbers as in public loaders.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gsgan.skeleton.rotation6d import across, orthogonal_to, unit
 from gsgan.skeleton.template import CHEST, HEAD, N_HUBS, PELVIS, SkeletonTemplate
+from gsgan.utils.tensors import squared_norm
 
 FOLDED = 1e-4
 """A swing with ``1 + cos(angle)`` below this is composed via the opposite direction."""
@@ -49,7 +50,7 @@ class Swing(NamedTuple):
 
 def _half_turn(axis: Tensor) -> Tensor:
     """``[..., 3, 3]``: ``2 a aᵀ / |a|² - I``, by half a turn about ``axis [..., 3]``."""
-    scaled = axis * (2.0 / axis.square().sum(-1, keepdim=True))
+    scaled = axis * (2.0 / squared_norm(axis))
     eye = torch.eye(3, dtype=axis.dtype, device=axis.device)
     return scaled.unsqueeze(-1) * axis.unsqueeze(-2) - eye
 

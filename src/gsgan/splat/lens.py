@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gsgan.scene import RIM, Camera, Gaussians, distort, fold_radius
 from gsgan.splat.project import rotations
-from gsgan.utils.tensors import constant
+from gsgan.utils.tensors import constant, matvec
 
 
 def as_pinhole_sees(
@@ -99,7 +99,7 @@ def bend(x_cam: Tensor, dist: Tensor, near: float) -> tuple[Tensor, Tensor, Tens
     moved = torch.cat([shown * torch.where(moves, z, 1.0), z], dim=-1)
 
     # The derivative, and the identity for points that stay.
-    by_depth = shown - (slope @ n.unsqueeze(-1)).squeeze(-1)
+    by_depth = shown - matvec(slope, n)
     top = torch.cat([slope, by_depth.unsqueeze(-1)], dim=-1)
     bottom = constant((0.0, 0.0, 1.0), top).expand(*top.shape[:-2], 1, 3)
     eye = torch.eye(3, dtype=top.dtype, device=top.device)

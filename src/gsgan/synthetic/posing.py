@@ -10,7 +10,7 @@ import numpy as np
 
 from gsgan.motion.character import Animation, Character
 from gsgan.motion.rig import ARM, FINGERS, LEG, SIDES, SIGN, SPINE, Pose, Rig, frame
-from gsgan.motion.rotations import Array, blend, rotation, unit
+from gsgan.motion.rotations import Array, blend, matvec, rotation, unit
 from gsgan.synthetic import controls
 from gsgan.synthetic.choreography import EVERYDAY
 from gsgan.synthetic.controls import (
@@ -70,7 +70,7 @@ class Choreography:
         # Hips, spine and head.
         scale = self.rig.leg / controls.LEG
         hips = self.rig.joint["Hips"] + scale * c.pelvis
-        hips = scale * c.path * (1, 1, 0) + _turned(heading, hips)
+        hips = scale * c.path * (1, 1, 0) + matvec(heading, hips)
         pose = Pose(self.rig, hips)
         pose.set_turn("Hips", heading @ rotation(c.lean))
         pose.bend(SPINE, c.spine)
@@ -86,7 +86,7 @@ class Choreography:
             # The knee points half-way between body and foot; a free leg has its own direction.
             middle = (c.path[:, 2:] + feet[i].place[:, 2:]) / 2
             pole = rotation(middle * Z) @ (0.1 * SIGN[side], -1.0, 0.0)
-            freed = _turned(heading, c.knee[:, i] * (SIGN[side], 1, 1))
+            freed = matvec(heading, c.knee[:, i] * (SIGN[side], 1, 1))
             pole = pole + c.free[:, i, None] * (freed - pole)
             pose.reach(side, LEG, ankles[i], pole)
 
@@ -129,7 +129,7 @@ class Choreography:
         middle = (joint["LeftArm"] + joint["RightArm"]) / 2
         origin = pose.position(chest) + pose.rotation(chest) @ (middle - joint[chest])
         place = scale * np.array([SIGN[side], 1, 1]) * c.knuckle[:, i]
-        knuckle = origin + _turned(pose.turn(chest), place)
+        knuckle = origin + matvec(pose.turn(chest), place)
 
         # The wrist is behind it by the length of the hand.
         length = scale * KNUCKLE * SIGN[side] * X
@@ -142,7 +142,7 @@ class Choreography:
         """Where `Controls.grip` places the wrist, and the hand's turn."""
         scale = self.rig.leg / controls.LEG
         heading = rotation(c.path[:, 2:] * Z)
-        grip = _turned(heading, c.grip[:, i] * np.array([SIGN[side], 1, 1]))
+        grip = matvec(heading, c.grip[:, i] * np.array([SIGN[side], 1, 1]))
         wrist = c.path * (1, 1, 0) + grip
         return PlacedHand(wrist=scale * wrist, turn=heading @ _hand_turn(c, i, side))
 
@@ -165,9 +165,9 @@ class Choreography:
         # The wrist in mirrored chest axes, from the shoulder.
         wrist = c.wrist[:, i]
         if placed is not None:
-            wrist = _turned(to_chest, (placed.wrist - shoulder) / scale) * mirror
+            wrist = matvec(to_chest, (placed.wrist - shoulder) / scale) * mirror
         hold = c.hold[:, i, None]
-        held = _turned(to_chest, (grip.wrist - shoulder) / scale) * mirror
+        held = matvec(to_chest, (grip.wrist - shoulder) / scale) * mirror
         wrist = wrist + hold * (held - wrist)
 
         # The collarbone rises and goes forwards with a wrist that is high or far in front.
@@ -180,11 +180,11 @@ class Choreography:
         # The shoulder has moved with the collarbone.
         if placed is None:
             shoulder = pose.position(side + "Arm")
-            target = shoulder + scale * _turned(chest, wrist * mirror)
+            target = shoulder + scale * matvec(chest, wrist * mirror)
             target = target + hold * (grip.wrist - target)
         else:
             target = placed.wrist
-        elbow = _turned(chest, c.elbow[:, i] * mirror)
+        elbow = matvec(chest, c.elbow[:, i] * mirror)
         pose.reach(side, ARM, target, elbow)
 
     def _hand(
@@ -235,11 +235,6 @@ class Choreography:
             shapes[f"brow_up_{side}"] = c.brows.clip(0, 1)
             shapes[f"brow_down_{side}"] = (-c.brows).clip(0, 1)
         return shapes
-
-
-def _turned(turns: Array, vectors: Array) -> Array:
-    """Vectors ``[F, 3]``, each multiplied by its own matrix ``[F, 3, 3]``."""
-    return (turns @ vectors[..., None])[..., 0]
 
 
 def _hand_turn(c: Controls, i: int, side: str) -> Array:

@@ -23,6 +23,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from filelock import FileLock
 from numpy.typing import NDArray
 
 import gsgan
@@ -32,7 +33,7 @@ from gsgan.synthetic.camera import SceneCamera
 from gsgan.synthetic.free_subject import free_pose
 from gsgan.synthetic.scene_setup import FREE_BODY, Scene, SceneSettings, dataset_key
 from gsgan.utils.errors import ConfigError, DataError
-from gsgan.utils.files import cache_root, locked, write_atomically
+from gsgan.utils.files import cache_root, write_atomically
 
 # Folders of what is traced, in the order of `PosedCharacter.render`.
 IMAGE_FOLDERS = ("images", "masks", "labels")
@@ -77,7 +78,7 @@ def ensure_scene(
     if not _is_complete(root):
         try:
             root.mkdir(parents=True, exist_ok=True)
-            with locked(root.with_name(f".{root.name}.lock")):
+            with FileLock(root.with_name(f".{root.name}.lock")):
                 if not _is_complete(root):  # else made while this process waited
                     _write(root, settings, workers, progress)
         except OSError as error:

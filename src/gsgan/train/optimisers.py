@@ -1,7 +1,5 @@
 """Optimisers, gradient clipping and the moving average of weights."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Literal

@@ -31,7 +31,6 @@ BFLOAT16_SINCE = (8, 0)  # compute capability: before it bfloat16 is emulated or
 LONGEST_NAME = 200
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 ASSIGNED = re.compile(r"\+{0,2}[A-Za-z_][\w./@]*")  # the key of an override
-EFFECTS_LIST = re.compile(r"effects=(\[[^\[\]]*\])")
 
 
 def config_folder() -> Path:
@@ -160,9 +159,8 @@ def entry(name: str, task: Callable[[DictConfig], object] | str) -> Callable[[],
     def main() -> None:
         import hydra  # here: importing an entry point stays fast
 
-        # Arguments in forms that Hydra's grammar lacks.
-        arguments = [spelled_out(argument, name) for argument in sys.argv[1:]]
-        sys.argv[1:] = map(quoted, arguments)
+        # Paths that Hydra's grammar cannot read as they are.
+        sys.argv[1:] = map(quoted, sys.argv[1:])
         command = hydra.main(
             version_base="1.3", config_path=str(config_folder()), config_name=name
         )(run)
@@ -184,17 +182,6 @@ def entry(name: str, task: Callable[[DictConfig], object] | str) -> Callable[[],
             sys.exit(FAILED)
 
     return main
-
-
-def spelled_out(argument: str, command: str) -> str:
-    """``effects=[antialias]`` as ``effects.only=[antialias]``: Hydra would look for files.
-
-    And gsgan.evaluate's ``on.key=value`` as ``++on.key=value``: its keys are those of a run's data.
-    """
-    if command == "evaluate" and argument.startswith("on."):
-        return f"++{argument}"
-    found = EFFECTS_LIST.fullmatch(argument)
-    return argument if found is None else f"effects.only={found[1]}"
 
 
 def quoted(argument: str) -> str:

@@ -73,19 +73,6 @@ def writing(path: Path) -> Iterator[None]:
         ) from None
 
 
-@contextlib.contextmanager
-def locked(lock: Path) -> Iterator[None]:
-    """Holds a lock that the system releases when the process dies."""
-    with lock.open("w") as file:
-        # There are no locks on Windows and some network file systems: two processes may
-        # then write the same files.
-        with contextlib.suppress(ImportError, OSError):
-            import fcntl
-
-            fcntl.flock(file, fcntl.LOCK_EX)
-        yield
-
-
 def write_npz(path: Path, **arrays: Any) -> None:
     """Writes an npz completely or not at all."""
     # Packed in memory first, since the file is written in one go.

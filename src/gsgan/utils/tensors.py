@@ -35,6 +35,16 @@ def _constant(values: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
         return torch.tensor(values, dtype=dtype, device=device)
 
 
+def matvec(A: Tensor, v: Tensor) -> Tensor:
+    """``[..., N]`` products of matrices ``[..., N, M]`` and vectors ``[..., M]``."""
+    return (A @ v.unsqueeze(-1)).squeeze(-1)
+
+
+def squared_norm(v: Tensor) -> Tensor:
+    """``[..., 1]`` squared lengths of vectors ``[..., N]``."""
+    return v.square().sum(-1, keepdim=True)
+
+
 def filled(values: Any, like: Tensor) -> Tensor:
     """Like `constant` for values that change between calls: filled on the device, not copied."""
     if isinstance(values, tuple | list):

