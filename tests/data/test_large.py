@@ -5,10 +5,10 @@ import pytest
 from make import write_tiny_capture
 
 from gsgan.data import validation
-from gsgan.data.files import FrameFiles, frame_files
 from gsgan.data.formats.capture import read_capture
 from gsgan.data.splits import Items
 from gsgan.utils.errors import DataError
+from gsgan.utils.frame_files import FrameFiles, frame_files
 
 
 def test_files_by_frame_are_a_mapping():

@@ -12,13 +12,13 @@ import torch
 
 from gsgan.body.shape import free_space, shaped_body
 from gsgan.body.smpl import read_smpl
-from gsgan.data.proportions import BONES, measure_proportions, upright
 from gsgan.motion.asf import asf_of, read_amc
 from gsgan.motion.clip import checked, completed, is_own, resampled, up_axis
 from gsgan.motion.readers import Source, read_motion
 from gsgan.motion.retarget import retargeted
 from gsgan.motion.rotations import rotation
 from gsgan.skeleton import MEDIAPIPE33
+from gsgan.skeleton.proportions import BONES, measure_proportions, upright
 from gsgan.utils.errors import DataError
 
 REAL = Path(__file__).parents[3] / "shared" / "data" / "motion"

@@ -5,7 +5,10 @@ import pytest
 import torch
 from test_motion_readers import directions
 
-from gsgan.data.proportions import (
+from gsgan.motion.retarget import heading, joined, placed, retargeted
+from gsgan.motion.rotations import rotation
+from gsgan.skeleton import MEDIAPIPE33
+from gsgan.skeleton.proportions import (
     BONES,
     HEAD_LANDMARKS,
     HEELS_AND_TOES,
@@ -15,9 +18,6 @@ from gsgan.data.proportions import (
     middle,
     upright,
 )
-from gsgan.motion.retarget import heading, joined, placed, retargeted
-from gsgan.motion.rotations import rotation
-from gsgan.skeleton import MEDIAPIPE33
 
 ALL = torch.ones(1, 33, dtype=torch.bool)
 

@@ -12,11 +12,11 @@ import numpy as np
 from gsgan.check.report import Finding, listed
 from gsgan.check.settings import Limits
 from gsgan.check.views import CheckedData, MaskView, grouped
-from gsgan.data.files import read_arrays
 from gsgan.data.skeletons import bone_lengths
 from gsgan.data.validation import spans
 from gsgan.skeleton.template import SkeletonTemplate
 from gsgan.utils.arrays import Bool, Float, expect_array, nanmedian
+from gsgan.utils.pickles import read_arrays
 
 # The kinds of doubts, with their text.
 DOUBTS = {

@@ -13,13 +13,14 @@ from gsgan.body import open_body
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import IGNORE_LABEL, read_labels
-from gsgan.data.proportions import BODY, Proportions, measure_proportions
 from gsgan.data.skeletons import body_height
 from gsgan.data.splits import Item, Splits
 from gsgan.data.surface_colours import SurfaceColours, body_inside, surface_colours
-from gsgan.data.training_poses import TrainingPoses, training_poses
+from gsgan.skeleton.joints import BODY
+from gsgan.skeleton.proportions import Proportions, measure_proportions
 from gsgan.skeleton.sides import refuse_swapped
 from gsgan.skeleton.template import Vector
+from gsgan.skeleton.training_poses import TrainingPoses, training_poses
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.errors import DataError
 

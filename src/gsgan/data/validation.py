@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import NEAR, inside, project
-from gsgan.data.files import FrameFiles, check_image
 from gsgan.data.pixels import MaskFile
 from gsgan.data.skeletons import HUBS, Landmarks, Poses
 from gsgan.utils.errors import DataError
+from gsgan.utils.frame_files import FrameFiles
+from gsgan.utils.image_files import check_image
 
 Images = Mapping[str, FrameFiles]
 Index = Mapping[str, Mapping[int, str]]

@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from gsgan.body import SkinnedBody, open_body
-from gsgan.data.files import check_image, read_with_alpha
 from gsgan.data.metric_variants import MetricVariants
 from gsgan.data.splits import Item
 from gsgan.metrics.regions import (
@@ -29,6 +28,7 @@ from gsgan.metrics.regions import (
 from gsgan.scene import Frame
 from gsgan.skeleton import TEMPLATES
 from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.image_files import check_image, read_with_alpha
 
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData

@@ -20,7 +20,6 @@ from rich.console import Console
 from gsgan.data.datamodule import GsganData
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.metric_variants import MetricVariants
-from gsgan.data.training_poses import TrainingPoses
 from gsgan.evaluate.files import (
     FACTS_FILE,
     HEADER,
@@ -59,6 +58,7 @@ from gsgan.run.stored import (
     read_checkpoint,
     read_config,
 )
+from gsgan.skeleton.training_poses import TrainingPoses
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import whole
 from gsgan.utils.console import make_console, track

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from gsgan.body import compiled
 from gsgan.body.free import Body
 from gsgan.body.solve import Solver
-from gsgan.data.proportions import upright
 from gsgan.model.avatar import Avatar
 from gsgan.model.body_points import BodyPoints
 from gsgan.model.harmonic import Harmonic
@@ -28,6 +27,7 @@ from gsgan.motion.rotations import rotation
 from gsgan.run.drive import Drive, rest_pose
 from gsgan.run.runs import Run
 from gsgan.skeleton import complete_skeleton
+from gsgan.skeleton.proportions import upright
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.provenance import SOFTWARE, SOURCE_TYPE, XMP
 

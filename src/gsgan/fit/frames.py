@@ -12,9 +12,9 @@ from torch import Tensor
 from gsgan.data.datamodule import GsganData
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.splits import Item
-from gsgan.data.training_poses import pose_in_pelvis, training_poses
 from gsgan.model.body_points import farthest_points
 from gsgan.scene import Camera, Window, body_window, unit
+from gsgan.skeleton.training_poses import pose_in_pelvis, training_poses
 from gsgan.utils.arrays import Bytes, evenly_spaced
 from gsgan.utils.errors import DataError
 

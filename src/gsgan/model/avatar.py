@@ -9,7 +9,6 @@ import torch
 from torch import Tensor, nn
 
 from gsgan.body.solve import Solver
-from gsgan.data.training_poses import TrainingPoses
 from gsgan.effects import Effects
 from gsgan.model.body_points import BodyPoints
 from gsgan.model.colour import ColourCorrection
@@ -32,6 +31,7 @@ from gsgan.skeleton import (
     face_code,
     root_of,
 )
+from gsgan.skeleton.training_poses import TrainingPoses
 from gsgan.splat import Accuracy, rasterise
 from gsgan.utils.tensors import filled, full_precision
 

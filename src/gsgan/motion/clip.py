@@ -12,10 +12,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsgan.data.proportions import (
-    BODY,
+from gsgan.data.skeletons import bone_lengths
+from gsgan.scene import BodyPose
+from gsgan.skeleton import MEDIAPIPE33, sanitise
+from gsgan.skeleton.joints import BODY, FACE
+from gsgan.skeleton.proportions import (
     BONES,
-    EXPRESSION,
     HAND_JOINTS,
     HIPS,
     SHOULDERS,
@@ -25,9 +27,6 @@ from gsgan.data.proportions import (
     middle,
     upright,
 )
-from gsgan.data.skeletons import bone_lengths
-from gsgan.scene import BodyPose
-from gsgan.skeleton import MEDIAPIPE33, sanitise
 from gsgan.skeleton.sanitise import MIN_TRUNK_JOINTS
 from gsgan.utils.errors import DataError
 
@@ -202,7 +201,7 @@ def completed(motion: Clip, up: str) -> Float:
 
     # Hands and the face.
     parts = [body.numpy()]
-    for part in (*HAND_JOINTS.values(), EXPRESSION):
+    for part in (*HAND_JOINTS.values(), FACE):
         parts.append(_bridged(whole[:, part]))
     return np.concatenate(parts, axis=1)
 

@@ -13,11 +13,8 @@ from numpy.typing import NDArray
 from gsgan.body import free_body, open_body
 from gsgan.body.smpl import SkinnedModel, from_zju, read_smpl
 from gsgan.data.calibration import METRES
-from gsgan.data.files import read_arrays, read_json, read_json_value
 from gsgan.data.formats import smpl_motion
 from gsgan.data.formats.capture import SHAPE, read_shape
-from gsgan.data.joints import zeros_as_missing
-from gsgan.data.proportions import EXPRESSION, HIPS, SHOULDERS, Proportions
 from gsgan.data.skeletons import hips_below
 from gsgan.motion.asf import asf_of, read_amc
 from gsgan.motion.bvh import read_bvh
@@ -28,10 +25,12 @@ from gsgan.motion.retarget import rig_landmarks
 from gsgan.motion.standard import RigMotion, standard_motion
 from gsgan.scene import BodyPose
 from gsgan.skeleton import MEDIAPIPE33
+from gsgan.skeleton.joints import FACE, zeros_as_missing
+from gsgan.skeleton.proportions import HIPS, SHOULDERS, Proportions
 from gsgan.utils.arrays import as_floats, expect_array
 from gsgan.utils.errors import ConfigError, DataError
-from gsgan.utils.files import read_text
-from gsgan.utils.pickles import read_npy, read_pickle
+from gsgan.utils.files import read_json, read_json_value, read_text
+from gsgan.utils.pickles import read_arrays, read_npy, read_pickle
 
 Float = NDArray[np.float64]
 
@@ -198,8 +197,8 @@ def _meta(path: Path) -> dict[str, Any]:
 
 def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Clip:
     """Landmarks as `gsgan.prepare` writes them."""
-    hands = EXPRESSION.start
-    face = EXPRESSION.stop
+    hands = FACE.start
+    face = FACE.stop
     if arrays["p"].shape[1:] not in ((POSE_JOINTS, 3), (hands, 3), (face, 3)):
         raise DataError(
             f"{path}: 'p' must have shape [F, {POSE_JOINTS}, 3], with hands [F, {hands}, 3], or "

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import NEAR, undistort
-from gsgan.data.joints import known
+from gsgan.skeleton.joints import known
 from gsgan.utils.arrays import Bool, Float, Ints
 
 MIN_VIEWS = 2

@@ -2,9 +2,17 @@
 
 import numpy as np
 
-from gsgan.data.joints import ALL, BODY, FACE, HANDS, PALM_JOINTS, WRIST_JOINTS, known
 from gsgan.data.skeletons import bone_lengths
 from gsgan.skeleton.hands import FINGER_BONES, HAND
+from gsgan.skeleton.joints import (
+    ALL,
+    BODY,
+    FACE,
+    HANDS,
+    PALM_JOINTS,
+    WRIST_JOINTS,
+    known,
+)
 from gsgan.utils.arrays import Bool, Float, nanmedian
 
 Bones = tuple[tuple[int, int], ...]

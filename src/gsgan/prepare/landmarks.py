@@ -7,8 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gsgan.data.files import read_arrays, read_json
-from gsgan.data.joints import (
+from gsgan.data.skeletons import whole_frame_ids
+from gsgan.motion.points import json_files
+from gsgan.skeleton.hands import HAND
+from gsgan.skeleton.joints import (
     ALL,
     BODY,
     BODY_25B,
@@ -20,11 +22,10 @@ from gsgan.data.joints import (
     SETS,
     known,
 )
-from gsgan.data.skeletons import whole_frame_ids
-from gsgan.motion.points import json_files
-from gsgan.skeleton.hands import HAND
 from gsgan.utils.arrays import Float, Ints, expect_array
 from gsgan.utils.errors import DataError
+from gsgan.utils.files import read_json
+from gsgan.utils.pickles import read_arrays
 
 # Joint 8 farther than this from the middle of the hips, as a share of the trunk, is another one.
 MIDDLE_OF_HIPS = 0.35

@@ -11,8 +11,6 @@ from rich.console import Console
 
 from gsgan.check.report import Table
 from gsgan.check.run import check_capture
-from gsgan.data.files import read_json
-from gsgan.data.joints import BODY, FACE, HANDS, known
 from gsgan.data.splits import parse_frames
 from gsgan.data.validation import Thresholds, check_distance
 from gsgan.prepare import landmarks
@@ -28,9 +26,10 @@ from gsgan.prepare.sources import stamp
 from gsgan.prepare.stages import Advance, StageFolder, digest, each_camera
 from gsgan.prepare.triangulate import plain
 from gsgan.skeleton import MEDIAPIPE33
+from gsgan.skeleton.joints import BODY, FACE, HANDS, known
 from gsgan.utils.arrays import Float, Ints
 from gsgan.utils.errors import DataError
-from gsgan.utils.files import write_json
+from gsgan.utils.files import read_json, write_json
 
 DELAY = 0.5  # frames: larger delays of a clock are noted
 DELAY_GAIN = 0.05  # share of the error that correcting a delay must remove

@@ -13,13 +13,13 @@ from torch import Tensor
 from gsgan.data.calibration import read_calibration
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import PersonCrop, square_window
-from gsgan.data.training_poses import TrainingPoses
 from gsgan.model.avatar import Avatar
 from gsgan.motion.orbit import Orbit
 from gsgan.render.output import Output
 from gsgan.run.drive import Drive, distilled_of, drive_of, inputs_of, joints_of
 from gsgan.run.runs import Run
 from gsgan.scene import Camera, cat
+from gsgan.skeleton.training_poses import TrainingPoses
 from gsgan.utils.checks import above, whole
 from gsgan.utils.console import make_console, track
 from gsgan.utils.errors import ConfigError, DataError

@@ -12,10 +12,10 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gsgan.data.proportions import Proportions
 from gsgan.data.scene_info import SceneInfo
 from gsgan.data.surface_colours import SurfaceColours
-from gsgan.data.training_poses import TrainingPoses
+from gsgan.skeleton.proportions import Proportions
+from gsgan.skeleton.training_poses import TrainingPoses
 from gsgan.utils.errors import ConfigError, DataError
 
 CHECKPOINT = Path("checkpoints") / "last.ckpt"

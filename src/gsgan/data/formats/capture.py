@@ -33,10 +33,8 @@ from gsgan.data.calibration import (
     read_conventions,
 )
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.files import FrameFiles, frame_files, read_arrays, read_json
 from gsgan.data.formats.common import IMAGES, finish, one_mask_each
 from gsgan.data.formats.consistency import Consistency
-from gsgan.data.joints import zeros_as_missing
 from gsgan.data.layout import BodyModel, Found, Layout, Meta, dataset_folder
 from gsgan.data.pixels import PixelRules
 from gsgan.data.skeletons import (
@@ -49,9 +47,13 @@ from gsgan.data.skeletons import (
 from gsgan.data.validation import Thresholds
 from gsgan.skeleton.face import FACE, FACE_NAMES
 from gsgan.skeleton.hands import HAND
+from gsgan.skeleton.joints import zeros_as_missing
 from gsgan.utils.arrays import expect_array
 from gsgan.utils.checks import is_number, whole
 from gsgan.utils.errors import DataError
+from gsgan.utils.files import read_json
+from gsgan.utils.frame_files import FrameFiles, frame_files
+from gsgan.utils.pickles import read_arrays
 
 Content = TypeVar("Content")
 LANDMARKS_FILE = "landmarks3d.npz"

@@ -14,7 +14,6 @@ import numpy as np
 
 from gsgan.body.smpl import SkinnedModel
 from gsgan.data.cameras import CameraEntry, make_camera, numbers
-from gsgan.data.files import FrameFiles, frame_files, last_number, read_json
 from gsgan.data.formats.common import (
     IMAGES,
     FolderReader,
@@ -31,7 +30,8 @@ from gsgan.data.validation import Thresholds, frames_of, spans
 from gsgan.utils.arrays import Float, as_floats
 from gsgan.utils.checks import whole
 from gsgan.utils.errors import ConfigError, DataError
-from gsgan.utils.files import read_text
+from gsgan.utils.files import read_json, read_text
+from gsgan.utils.frame_files import FrameFiles, frame_files, last_number
 from gsgan.utils.pickles import read_npz
 
 Files = dict[str, FrameFiles]

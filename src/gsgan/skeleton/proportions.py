@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsgan.data import joints as numbers
 from gsgan.skeleton import HOLISTIC, bone_frames, sanitise
 from gsgan.skeleton.hands import FINGER_BONES, INDEX, PINKY, WRIST
+from gsgan.skeleton.joints import BODY, LEFT, RIGHT
 from gsgan.skeleton.template import CHEST, HEAD, PELVIS
 from gsgan.utils.arrays import Bool, Float
 from gsgan.utils.errors import DataError
@@ -30,11 +30,8 @@ BONES = (*ARMS[0], *ARMS[1], *LEGS[0], *LEGS[1])
 HAND_LANDMARKS = {15: (17, 19, 21), 16: (18, 20, 22)}
 # by ankle: heel, toes
 FEET = {27: (29, 31), 28: (30, 32)}
-BODY = numbers.BODY
 # by wrist
-HAND_JOINTS = {15: numbers.LEFT, 16: numbers.RIGHT}
-# lips, brows and lids
-EXPRESSION = numbers.FACE
+HAND_JOINTS = {15: LEFT, 16: RIGHT}
 # Sign of the standard pose's x, by wrist.
 BODY_SIDES = {15: 1.0, 16: -1.0}
 HEELS_AND_TOES = (29, 30, 31, 32)
