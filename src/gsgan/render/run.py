@@ -234,9 +234,7 @@ def _images(
         try:
             with torch.no_grad():
                 p, visibility, body = inputs_of(run.avatar, drive, i)
-                found = run.avatar.rendered(
-                    p, visibility, camera, body, colours, maps=False
-                )
+                found = run.avatar(p, visibility, camera, body, colours, maps=False)
             assert found.image is not None
             assert found.alpha is not None
             yield eight_bits(
