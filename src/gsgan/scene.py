@@ -31,6 +31,7 @@ __all__ = [
     "fold_radius",
 ]
 
+NEAR = 0.01  # metres: nearer points are not projected
 RIM = 0.999  # share of a lens's fold radius: points beyond it are shown there
 
 
@@ -108,7 +109,7 @@ class Camera(TensorRecord):
         """``[B, M, 3]`` world points in camera axes, metres."""
         return points @ self.R.mT + self.t.unsqueeze(1)
 
-    def project(self, points: Tensor, near: float = 1e-2) -> tuple[Tensor, Tensor]:
+    def project(self, points: Tensor, near: float = NEAR) -> tuple[Tensor, Tensor]:
         """Pixel positions ``[B, M, 2]`` and depths ``[B, M]`` of world points ``[B, M, 3]``.
 
         Points nearer than ``near`` metres are divided by ``near`` instead of their depth: their
@@ -351,7 +352,13 @@ class Window:
 
 
 def body_window(
-    p: Tensor, camera: Camera, *, margin: float, multiple: int, least: int, near: float
+    p: Tensor,
+    camera: Camera,
+    *,
+    margin: float,
+    multiple: int,
+    least: int,
+    near: float = NEAR,
 ) -> Window:
     """The boxes round the projected joints; they depend on skeleton and camera only.
 

@@ -19,7 +19,7 @@ from rich.console import Console
 
 from gsgan.check.settings import Sampling
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.crop import NEAR, inside, project
+from gsgan.data.crop import inside, project
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.formats.consistency import (
     FAR_PIXELS,
@@ -31,6 +31,7 @@ from gsgan.data.formats.consistency import (
 )
 from gsgan.data.layout import Layout
 from gsgan.data.splits import Item
+from gsgan.scene import NEAR
 from gsgan.skeleton.template import MEDIAPIPE33, SkeletonTemplate
 from gsgan.utils.arrays import Bool, Float, Ints
 from gsgan.utils.console import progress

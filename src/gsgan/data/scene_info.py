@@ -16,6 +16,7 @@ from gsgan.data.pixels import IGNORE_LABEL, read_labels
 from gsgan.data.skeletons import body_height
 from gsgan.data.splits import Item, Splits
 from gsgan.data.surface_colours import SurfaceColours, body_inside, surface_colours
+from gsgan.scene import NEAR
 from gsgan.skeleton.joints import BODY
 from gsgan.skeleton.proportions import Proportions, measure_proportions
 from gsgan.skeleton.sides import refuse_swapped
@@ -225,7 +226,7 @@ def _scale(dataset: CaptureDataset, samples: int) -> tuple[float, float]:
             x_cam = camera.to_camera(joints.to(camera.K))
             depth = float(x_cam[..., 2].median())
             focal = float(camera.K[0, 0, 0])
-            scales.append(focal / max(depth, 1e-2))
+            scales.append(focal / max(depth, NEAR))
         medians.append(float(np.median(scales)))
     return min(medians), max(medians)
 

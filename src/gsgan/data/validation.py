@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.crop import NEAR, inside, project
+from gsgan.data.crop import inside, project
 from gsgan.data.pixels import MaskFile
 from gsgan.data.skeletons import HUBS, Landmarks, Poses
+from gsgan.scene import NEAR
 from gsgan.utils.errors import DataError
 from gsgan.utils.frame_files import FrameFiles
 from gsgan.utils.image_files import check_image

@@ -31,13 +31,7 @@ from gsgan.evaluate.files import (
 from gsgan.evaluate.grids import write_grid
 from gsgan.evaluate.kept import FOLDER, KeptScores
 from gsgan.evaluate.origin import Method, fingerprint, origin, trained
-from gsgan.evaluate.predictions import (
-    FLOOR_VARIANT,
-    FULL,
-    BodyBoxes,
-    Preparation,
-    read_folder,
-)
+from gsgan.evaluate.predictions import BodyBoxes, Preparation, read_folder
 from gsgan.evaluate.scores import (
     Predict,
     Scorer,
@@ -48,6 +42,7 @@ from gsgan.evaluate.scores import (
     score_split,
 )
 from gsgan.metrics.lpips import LPIPS_NETS, build_lpips
+from gsgan.metrics.names import FLOOR_VARIANT, FULL
 from gsgan.metrics.regions import BACKGROUNDS
 from gsgan.run.assemble import build_data
 from gsgan.run.runs import avatar_of, load_avatar

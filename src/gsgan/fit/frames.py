@@ -18,7 +18,6 @@ from gsgan.skeleton.training_poses import pose_in_pelvis, training_poses
 from gsgan.utils.arrays import Bytes, evenly_spaced
 from gsgan.utils.errors import DataError
 
-MIN_DEPTH = 0.01  # metres: nearer joints are not projected
 # metres around the joints, as in the avatar's windows: a wider margin costs time
 WINDOW_MARGIN = 0.25
 # quantile of the masks' areas that counts as usual: most masks may be nearly empty
@@ -224,6 +223,5 @@ def around(skeleton: Tensor, seen: Silhouette) -> Silhouette:
         margin=WINDOW_MARGIN,
         multiple=16,
         least=32,
-        near=MIN_DEPTH,
     )
     return seen.cut(window)

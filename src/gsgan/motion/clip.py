@@ -34,7 +34,6 @@ Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 TRUNK_LANDMARKS = (*SHOULDERS, *HIPS)
-AXES = ("x", "y", "z", "-x", "-y", "-z")
 FPS = 30.0  # assumed if neither the file nor the user gives a rate
 # Maximum relative difference of bone lengths at which a motion is the subject's own.
 OWN_LENGTHS = 0.02

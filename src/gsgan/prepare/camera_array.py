@@ -11,7 +11,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.crop import NEAR, undistort
+from gsgan.data.crop import undistort
+from gsgan.scene import NEAR
 from gsgan.skeleton.joints import known
 from gsgan.utils.arrays import Bool, Float, Ints
 

@@ -6,8 +6,8 @@ from itertools import combinations
 
 import numpy as np
 
-from gsgan.data.crop import NEAR
 from gsgan.prepare.camera_array import MIN_VIEWS, CameraArray
+from gsgan.scene import NEAR
 from gsgan.skeleton.joints import known
 from gsgan.utils.arrays import Bool, Float, Ints, nanmedian
 

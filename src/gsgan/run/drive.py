@@ -16,7 +16,6 @@ from gsgan.data.splits import SPLITS
 from gsgan.model.avatar import Avatar
 from gsgan.model.harmonic import Harmonic, distilled
 from gsgan.motion.clip import (
-    AXES,
     FPS,
     Clip,
     checked,
@@ -35,6 +34,7 @@ from gsgan.skeleton.joints import BODY, FACE
 from gsgan.skeleton.proportions import (
     HAND_JOINTS,
     HEELS_AND_TOES,
+    UP_AXES,
     Proportions,
     upright,
 )
@@ -234,7 +234,7 @@ def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
     skeleton = config.skeleton
     model = None if smpl is None else Path(smpl).expanduser()
     asf = None if skeleton is None else Path(skeleton).expanduser()
-    up = None if config.up is None else one_of("up", config.up, AXES)
+    up = None if config.up is None else one_of("up", config.up, UP_AXES)
     source = Source(proportions, model, asf, up)
     motion = read_motion(Path(path).expanduser(), source)
     motion = checked(motion, float(config.min_visibility))

@@ -18,6 +18,8 @@ from gsgan.skeleton.template import CHEST, HEAD, PELVIS
 from gsgan.utils.arrays import Bool, Float
 from gsgan.utils.errors import DataError
 
+# Names of the world's up axis.
+UP_AXES = ("x", "y", "z", "-x", "-y", "-z")
 # Numbers of MediaPipe's landmarks, the left one first.
 SHOULDERS = (11, 12)
 EARS = (7, 8)
@@ -266,9 +268,9 @@ def upright(up: str) -> Float:
     Raises:
         DataError: when the name is not that of an axis.
     """
-    axis = "xyz".find(up[-1:])
-    if axis < 0 or up[:-1] not in ("", "-"):
-        raise DataError(f"up must be x, y, z, -x, -y or -z, got {up!r}")
+    if up not in UP_AXES:
+        raise DataError(f"up must be one of {', '.join(UP_AXES)}, got {up!r}")
+    axis = "xyz".index(up[-1])
     sign = -1 if up[:-1] else 1
     above = np.eye(3)[axis] * sign
     first = np.eye(3)[(axis + 1) % 3]

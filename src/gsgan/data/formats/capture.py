@@ -48,6 +48,7 @@ from gsgan.data.validation import Thresholds
 from gsgan.skeleton.face import FACE, FACE_NAMES
 from gsgan.skeleton.hands import HAND
 from gsgan.skeleton.joints import zeros_as_missing
+from gsgan.skeleton.proportions import UP_AXES
 from gsgan.utils.arrays import expect_array
 from gsgan.utils.checks import is_number, whole
 from gsgan.utils.errors import DataError
@@ -247,11 +248,10 @@ def _read_meta(path: Path, content: Mapping[str, Any], smpl: str | None) -> Meta
         body = BodyModel(kind, smpl if kind != "free" else None)
 
     # Facts with a fixed set of values.
-    axes = ("x", "y", "z", "-x", "-y", "-z")
     return Meta(
         unit=choose(path, content, "unit", None, tuple(METRES)),
         fps=None if fps is None else float(fps),
-        up_axis=choose(path, content, "up_axis", "z", axes),
+        up_axis=choose(path, content, "up_axis", "z", UP_AXES),
         skeleton=choose(path, content, "skeleton", "mediapipe33", tuple(SKELETONS)),
         body=body,
         label_names=None if names is None else tuple(map(str, names)),

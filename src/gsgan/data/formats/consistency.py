@@ -13,9 +13,10 @@ import cv2
 import numpy as np
 
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.crop import NEAR, project, through_lens
+from gsgan.data.crop import project, through_lens
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_mask
+from gsgan.scene import NEAR
 from gsgan.utils.arrays import Bool, Bytes, Float, evenly_spaced
 from gsgan.utils.errors import DataError
 
