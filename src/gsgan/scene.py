@@ -357,7 +357,7 @@ def body_window(
     *,
     margin: float,
     multiple: int,
-    least: int,
+    minimum: int,
     near: float = NEAR,
 ) -> Window:
     """The boxes round the projected joints; they depend on skeleton and camera only.
@@ -367,7 +367,7 @@ def body_window(
         camera: B cameras.
         margin: metres kept round every joint (hair, fingertips, clothes).
         multiple: sides are rounded up to multiples of this many pixels, where the image has room.
-        least: pixels, the shortest side, where the image has room.
+        minimum: pixels, the shortest side, where the image has room.
         near: metres; with a joint nearer than this the box is the whole image.
 
     Returns:
@@ -392,8 +392,8 @@ def body_window(
         .minimum(everywhere)
     )
     bounds = torch.cat([low, high], dim=-1).long().tolist()
-    w = _side(max(least, *(x1 - x0 for x0, _, x1, _ in bounds)), multiple, width)
-    h = _side(max(least, *(y1 - y0 for _, y0, _, y1 in bounds)), multiple, height)
+    w = _side(max(minimum, *(x1 - x0 for x0, _, x1, _ in bounds)), multiple, width)
+    h = _side(max(minimum, *(y1 - y0 for _, y0, _, y1 in bounds)), multiple, height)
     corners = tuple(
         (_start(y0, y1, h, height), _start(x0, x1, w, width))
         for x0, y0, x1, y1 in bounds

@@ -31,12 +31,12 @@ def surface_error(got: BodyPose, truth: BodyPose) -> Tensor:
 
 
 @pytest.mark.parametrize(
-    ("noise", "median", "most"), [(0.0, 0.0045, 0.015), (0.01, 0.012, 0.03)]
+    ("noise", "median", "maximum"), [(0.0, 0.0045, 0.015), (0.01, 0.012, 0.03)]
 )
-def test_the_solved_surface_is_near_the_true_one(solver, poses, noise, median, most):
+def test_the_solved_surface_is_near_the_true_one(solver, poses, noise, median, maximum):
     off = surface_error(solver.solve(*shown(poses, noise)), poses)
     assert off.median() < median
-    assert np.quantile(off.numpy(), 0.9) < most
+    assert np.quantile(off.numpy(), 0.9) < maximum
 
 
 def test_a_frame_does_not_depend_on_the_others_and_repeats_to_the_bit(solver, poses):

@@ -45,7 +45,7 @@ def test_items_are_a_sequence():
 def test_headers_of_large_captures_are_checked_in_steps(tmp_path, monkeypatch):
     root, read = write_tiny_capture(tmp_path / "c", cameras=2, frames=10), []
     check = validation.check_image
-    monkeypatch.setattr(validation, "MOST_HEADERS", 5)
+    monkeypatch.setattr(validation, "MAX_HEADERS", 5)
     monkeypatch.setattr(
         validation,
         "check_image",

@@ -106,7 +106,7 @@ class Solver(nn.Module):
     replaced: Tensor  # [2, 33] bool, `ON_HANDS`
     precision: Tensor  # [33] of the body's own landmarks
     prior: Tensor  # [D, D] precisions
-    least: Tensor  # [D] minimum of each number
+    minimum: Tensor  # [D] minimum of each number
     matrix: Tensor  # [D, 3 T] from numbers to the turns' axis-angles
     follows: Tensor  # [E, N, 1] bool, whether a landmark follows an entry's turn
     jumps: Tensor  # [n, T + 1]
@@ -142,7 +142,7 @@ class Solver(nn.Module):
             held = {
                 "precision": known / _noise().square(),
                 "prior": precision,
-                "least": minimum,
+                "minimum": minimum,
                 "matrix": matrix.flatten(1),
                 "follows": follows[rig.entry_turn, :, None],
                 "jumps": _jumps(rig.parent),
@@ -485,7 +485,7 @@ class Solver(nn.Module):
         gradient = (weighted @ at.residual.flatten(1).unsqueeze(-1)).squeeze(-1)
 
         # The prior, and what holds numbers above their minimum.
-        stop, below = below_least(q, self.least)
+        stop, below = below_minimum(q, self.minimum)
         pull = q @ self.prior
         penalty = pull * q + stop * below.square().nan_to_num()
         return NormalEquations(
@@ -602,10 +602,10 @@ def _solved(H: Tensor, g: Tensor) -> Tensor:
     return torch.cholesky_solve(g.unsqueeze(-1), factor).squeeze(-1)
 
 
-def below_least(q: Tensor, least: Tensor) -> tuple[Tensor, Tensor]:
-    """Precisions and amounts of numbers ``q [B, D]`` below their minimum ``least [D]``."""
+def below_minimum(q: Tensor, minimum: Tensor) -> tuple[Tensor, Tensor]:
+    """Precisions and amounts of numbers ``q [B, D]`` below their ``minimum [D]``."""
     # Numbers above their minimum are free.
-    below = (q - least).clamp_max(0)
+    below = (q - minimum).clamp_max(0)
     return (below < 0) / BEYOND**2, below
 
 

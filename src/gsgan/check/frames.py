@@ -215,12 +215,12 @@ def frame_findings(
     return findings
 
 
-def shortened(frames: Sequence[int], most: int = 8) -> str:
+def shortened(frames: Sequence[int], maximum: int = 8) -> str:
     """Frame numbers as ranges, the rest of a long list left out."""
     # Ranges count, not frames.
     ranges = spans(list(frames)).split(", ")
-    text = ", ".join(ranges[:most])
-    return f"{text} …" if len(ranges) > most else text
+    text = ", ".join(ranges[:maximum])
+    return f"{text} …" if len(ranges) > maximum else text
 
 
 def jump_distance(p: Float) -> Float:

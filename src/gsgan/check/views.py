@@ -191,13 +191,13 @@ def sampled_items(subject: CheckedData, images: int) -> list[Item]:
     return items
 
 
-def cut_items(subject: CheckedData, most: int) -> list[Item]:
-    """Items with an image or mask file that was cut off, at most ``most``; nothing is decoded."""
+def cut_items(subject: CheckedData, maximum: int) -> list[Item]:
+    """At most ``maximum`` items with an image or mask file that was cut off; none is decoded."""
     layout = subject.layout
     found: list[Item] = []
     for name, files in subject.pairs.items():
         for frame in files:
-            if len(found) == most:
+            if len(found) == maximum:
                 return found
             masks = [path for _, path in layout.mask_files(name, frame)]
             if not all(map(complete, [layout.image_path(name, frame), *masks])):

@@ -28,7 +28,7 @@ from gsgan.utils.errors import DataError
 # mask value of solid pixels: those at the outline are darkened by the black behind them
 SOLID = 0.9
 # Images per requested sample on which the posed body is compared with masks.
-MOST_BODY_IMAGES = 2
+MAX_BODY_IMAGES = 2
 
 
 @dataclass(frozen=True)
@@ -277,7 +277,7 @@ def _body_inside(
     # Images that show nothing of the body, or whose mask is empty, do not count.
     shares = []
     for index in evenly_spaced(
-        len(dataset.items), MOST_BODY_IMAGES * samples, ends=True
+        len(dataset.items), MAX_BODY_IMAGES * samples, ends=True
     ):
         share = body_inside(dataset[index], mesh)
         if share is not None:

@@ -23,7 +23,7 @@ Index = Mapping[str, Mapping[int, str]]
 
 
 # headers read on opening, in even steps; every image is checked again when decoded
-MOST_HEADERS = 10_000
+MAX_HEADERS = 10_000
 # frames on which the cameras are checked, in even steps
 MAX_CHECKED_FRAMES = 10_000
 
@@ -294,14 +294,14 @@ def check_images(
     stride: int,
     calibration: Path,
 ) -> None:
-    """Checks sizes and channel layouts of at most `MOST_HEADERS` images, from the headers alone.
+    """Checks sizes and channel layouts of at most `MAX_HEADERS` images, from the headers alone.
 
     Raises:
         DataError: on the first file that does not fit.
     """
     # Every `stride`-th image, fewer of a large capture.
     count = sum(map(len, images.values()))
-    stride = max(stride, -(-count // MOST_HEADERS))
+    stride = max(stride, -(-count // MAX_HEADERS))
     for name, files in images.items():
         size = cameras[name].size
         for frame in list(files)[::stride]:

@@ -431,8 +431,8 @@ def evaluate_method(
     # Settings that commands of other packages may lack have defaults.
     scorer = make_scorer(config, data, marks)
     if config.get("score_images") is not None:
-        most = whole("score_images", config.score_images, 1)
-        scorer.marks.append(f"at most {most} evenly spaced images of each split")
+        maximum = whole("score_images", config.score_images, 1)
+        scorer.marks.append(f"at most {maximum} evenly spaced images of each split")
     grid_rows = 4 if config.get("grid_rows") is None else config.grid_rows
 
     # Every split, with the images of the grid evenly spaced. Scores of a run are kept.

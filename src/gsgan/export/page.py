@@ -150,12 +150,12 @@ def block(
     return zlib.compress(len(text).to_bytes(8, "little") + text + data, 9)
 
 
-def quantised(values: NDArray, most: int) -> tuple[NDArray, NDArray]:
-    """Whole numbers within ± ``most`` and their step; a matrix has one step per row."""
+def quantised(values: NDArray, maximum: int) -> tuple[NDArray, NDArray]:
+    """Whole numbers within ± ``maximum`` and their step; a matrix has one step per row."""
     size = np.abs(values)
     largest = size.max(axis=-1, keepdims=True) if values.ndim == 2 else size.max()
-    step = np.maximum(largest, 1e-12) / most  # rows of zeros have a step too
-    kind = np.int8 if most < 128 else np.int16
+    step = np.maximum(largest, 1e-12) / maximum  # rows of zeros have a step too
+    kind = np.int8 if maximum < 128 else np.int16
     return np.rint(values / step).astype(kind), np.asarray(step, np.float32)
 
 

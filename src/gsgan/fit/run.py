@@ -106,11 +106,11 @@ def summary(report: dict[str, Any], folder: Path, masked: MaskedFrames) -> list[
     joints = sorted(distances, key=lambda joint: -np.nan_to_num(distances[joint]))
     frames = sorted(overlaps, key=lambda frame: np.nan_to_num(overlaps[frame]))
     worst = ", ".join(f"{joint} {distances[joint]:.0f}" for joint in joints[:WORST])
-    least = ", ".join(f"{frame} {overlaps[frame]:.3f}" for frame in frames[:WORST])
+    lowest = ", ".join(f"{frame} {overlaps[frame]:.3f}" for frame in frames[:WORST])
     return [
         f"{len(masked.frames)} frames, masks of {', '.join(masked.cameras)}: overlap (IoU) with "
         f"the body's surface {before['iou']:.3f} solved from the skeletons, {after['iou']:.3f} "
-        f"registered, {report['driven']['iou']:.3f} solved again; least in frames {least}",
+        f"registered, {report['driven']['iou']:.3f} solved again; least in frames {lowest}",
         f"landmarks {before['residual_mm']:.0f} mm from the skeleton's solved, "
         f"{after['residual_mm']:.0f} mm registered (medians); most: {worst}",
         f"{folder} has {SHAPE} and {POSES_FILE}; {REPORT} has all numbers",
@@ -210,10 +210,10 @@ def fit_body(
         frames = MaskedFrames(
             data,
             device,
-            settings.least_mask,
+            settings.min_mask,
             settings.held_out,
-            most_frames=None if keeps else settings.frames,
-            most_cameras=settings.cameras,
+            max_frames=None if keeps else settings.frames,
+            max_cameras=settings.cameras,
             track=partial(bars.track, description="masks"),
         )
     if frames.left_out:

@@ -62,12 +62,12 @@ def cleared(image: Tensor, keep: Tensor, background: float) -> Tensor:
     return torch.where(keep, image, image.new_tensor(background))
 
 
-def rectangle(where: Tensor, least: int = 1) -> tuple[slice, slice] | None:
+def rectangle(where: Tensor, minimum: int = 1) -> tuple[slice, slice] | None:
     """Rows and columns of the smallest rectangle around a mask; None if it is empty.
 
     Args:
         where: ``[1, H, W]`` bool.
-        least: minimum side in pixels, limited by the image.
+        minimum: minimum side in pixels, limited by the image.
     """
     sides = []
     for dim, size in enumerate(where.shape[-2:]):
@@ -79,7 +79,7 @@ def rectangle(where: Tensor, least: int = 1) -> tuple[slice, slice] | None:
         extent = held[-1] + 1 - first
 
         # Extended equally to both sides, but not beyond the image.
-        side = min(max(extent, least), size)
+        side = min(max(extent, minimum), size)
         centred = first - (side - extent) // 2
         start = min(max(centred, 0), size - side)
         sides.append(slice(start, start + side))

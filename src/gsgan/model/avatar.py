@@ -100,8 +100,8 @@ class Avatar(nn.Module):
         solver: of body poses that are not given, for avatars on a skinned body.
         poses: the spread of the training poses, or None.
         backend: that rasterises F, see `gsgan.splat.rasterise`.
-        window_margin, window_multiple, window_least: of the rendered window, metres and pixels; see
-            `gsgan.scene.body_window`. No margin renders whole images.
+        window_margin, window_multiple, window_minimum: of the rendered window, metres and pixels;
+            see `gsgan.scene.body_window`. No margin renders whole images.
 
     Source: paper Fig. 3 and Sec. 3.
     """
@@ -131,7 +131,7 @@ class Avatar(nn.Module):
         backend: str = "auto",
         window_margin: float | None = 0.25,
         window_multiple: int = 16,
-        window_least: int = 32,
+        window_minimum: int = 32,
     ) -> None:
         super().__init__()
 
@@ -144,7 +144,7 @@ class Avatar(nn.Module):
         self.template = template
         self.window_margin = window_margin
         self.window_multiple = window_multiple
-        self.window_least = window_least
+        self.window_minimum = window_minimum
 
         # Parts of Step I: G, Ψ or the surface's Gaussians.
         self.deformation = deformation
@@ -326,7 +326,7 @@ class Avatar(nn.Module):
             return None
 
         # The window's sides suit the generator's stride.
-        sides = {"multiple": self.window_multiple, "least": self.window_least}
+        sides = {"multiple": self.window_multiple, "minimum": self.window_minimum}
         margin = self.window_margin
         near = self.accuracy.near
         with self.stage("window"), full_precision(skeleton.device):

@@ -71,7 +71,7 @@ class Clip:
         return len(self.p)
 
 
-def checked(motion: Clip, least_visibility: float) -> Clip:
+def checked(motion: Clip, min_visibility: float) -> Clip:
     """The motion with unseen landmarks set to NaN.
 
     Shoulders and hips are kept wherever they are finite: without them there is no skeleton. Frames
@@ -88,7 +88,7 @@ def checked(motion: Clip, least_visibility: float) -> Clip:
     # Shoulders and hips count at any visibility above 0.
     trunk = list(TRUNK_LANDMARKS)
     finite: Bool = np.asarray(np.isfinite(motion.p).all(-1))
-    known = finite & (motion.visibility >= least_visibility)
+    known = finite & (motion.visibility >= min_visibility)
     known[:, trunk] = finite[:, trunk] & (motion.visibility[:, trunk] > 0)
     good = known[:, trunk].sum(1) >= MIN_TRUNK_JOINTS
     if not good.any():

@@ -82,10 +82,10 @@ def _print_distances(
 
     # One distance per frame, in deviations of the training poses.
     far = poses.distance(p)
-    most = int(far.argmax())
+    farthest = int(far.argmax())
     console.print(
         f"distance from the training poses, in deviations: {far.median():.1f} in the median, "
-        f"{far[most]:.1f} in frame {drive.numbers[most]}",
+        f"{far[farthest]:.1f} in frame {drive.numbers[farthest]}",
         highlight=False,
         soft_wrap=True,
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, MutableMapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,13 @@ from gsgan.utils.errors import ConfigError, DataError
 CHECKPOINT = Path("checkpoints") / "last.ckpt"
 # Classes that configs of runs before 2026-11-26 name by another module.
 MOVED = {"gsgan.model.assemble.": "gsgan.run.assemble."}
+# Keys that configs of runs before 2026-11-27 have, and their last part now.
+RENAMED = {
+    "data.reader.consistency.least_inside": "refused_below",
+    "fit.least_mask": "min_mask",
+    "model.window_least": "window_minimum",
+    "training.rollback.most": "max_restorations",
+}
 CONFIG = Path(".hydra") / "config.yaml"
 # Keys that may differ between a run and its continuation: they do not change what it learns.
 FREE_KEYS = (
@@ -88,6 +95,7 @@ def read_config(folder: Path) -> DictConfig:
     config = _read_yaml(path)
     if not {"data", "model"} <= config.keys():
         raise DataError(f"{path}: expected the config of a run with data and model")
+    rename_keys(config)
     return config
 
 
@@ -101,8 +109,27 @@ def _read_yaml(path: Path) -> DictConfig:
     except (UnicodeDecodeError, yaml.YAMLError, OmegaConfBaseException) as error:
         raise DataError(f"{path}: damaged ({str(error).splitlines()[0]})") from None
     if not isinstance(config, DictConfig):
-        raise DataError(f"{path}: expected the config of a run with data and model")
+        raise DataError(f"{path}: damaged (expected keys with values)")
     return config
+
+
+def rename_keys(settings: MutableMapping[str, Any]) -> None:
+    """Gives the keys of a config, or of its `record`, their present names, in place."""
+    for before, now in RENAMED.items():
+        group, last = _group(settings, before)
+        if last in group:
+            group[now] = group.pop(last)
+
+
+def _group(
+    settings: MutableMapping[str, Any], key: str
+) -> tuple[MutableMapping[str, Any], str]:
+    """The group that a dotted key belongs to, empty where there is none, and its last part."""
+    *groups, last = key.split(".")
+    for group in groups:
+        found = settings.get(group)
+        settings = found if isinstance(found, MutableMapping) else {}
+    return settings, last
 
 
 def load_config(folder: Path, paths: DataPaths | None = None) -> DictConfig:
@@ -169,12 +196,8 @@ def record(config: DictConfig) -> dict[str, Any]:
 
     # Single keys of groups are removed by their dotted names.
     for key in FREE_KEYS:
-        *groups, last = key.split(".")
-        node: Any = plain
-        for group in groups:
-            node = node.get(group) if isinstance(node, dict) else None
-        if isinstance(node, dict):
-            node.pop(last, None)
+        group, last = _group(plain, key)
+        group.pop(last, None)
     return plain
 
 

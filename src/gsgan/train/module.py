@@ -394,7 +394,7 @@ class AvatarTraining(LightningModule):
                 "training.max_skipped"
             )
         self.print(
-            f"iteration {self.step}: skipped ({count}, at most {self.skipped.most}): {cause}"
+            f"iteration {self.step}: skipped ({count}, at most {self.skipped.maximum}): {cause}"
         )
 
     def _stopped(self, why: str) -> GsganError:
@@ -469,9 +469,10 @@ class AvatarTraining(LightningModule):
                 f"{what}, also after {self.rollback.done} returns to a good state; start again "
                 "with a lower training.recipes.psi.rate.peak"
             )
+        count = f"{self.rollback.done} of at most {self.rollback.max_restorations}"
         self.print(
             f"iteration {self.step}: {what}; back to the last good state, Ψ's learning rate times "
-            f"{self.rollback.rate:g} ({self.rollback.done} of at most {self.rollback.most})"
+            f"{self.rollback.rate:g} ({count})"
         )
 
     # -- randomness: from (seed, iteration), so that resuming changes nothing

@@ -66,7 +66,7 @@ SHAPE = "body_shape.npz"
 MASKS = (".png",)
 # The number of rotations in a pose, by kind of body.
 BODY_BONES = {"free": 56, "smpl": 24, "smplx": 55}
-SKELETON_LIMITS = Consistency(least_inside=0.2)
+SKELETON_LIMITS = Consistency(refused_below=0.2)
 """A capture's own landmarks are noisier than those of a fitted body."""
 
 

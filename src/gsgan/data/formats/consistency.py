@@ -38,7 +38,7 @@ class Consistency:
     """
 
     frames: int = 3
-    least_inside: float = 0.5
+    refused_below: float = 0.5
     min_inside: float = 0.9
     far_camera: float = 10.0
     joint_tolerance: float = 0.05
@@ -101,7 +101,7 @@ def check_consistency(
 
     # The mean share of each camera; the message shows all, since one may be wrong.
     inside = {name: np.mean(found) for name, found in shares.items()}
-    if inside and min(inside.values()) < limits.least_inside:
+    if inside and min(inside.values()) < limits.refused_below:
         text = ", ".join(f"{name} {share:.0%}" for name, share in inside.items())
         raise DataError(
             f"{layout.root}: joints lie outside the masks (inside: {text}); {hint}: "

@@ -362,16 +362,16 @@ def _rows(
 def _coefficients(
     arrays: dict[str, Any],
     key: str,
-    most: int,
+    maximum: int,
     path: Path,
     count: int | None = None,
 ) -> Float:
     """``[N, n]`` coefficients, at most as many as the model's; further ones must be 0."""
     # A model file with fewer shapes than the fit would give another body.
     values = _rows(arrays, key, None, path, count)
-    if np.any(values[:, most:] != 0):
+    if np.any(values[:, maximum:] != 0):
         raise DataError(
-            f"{path}: '{key}' has {values.shape[1]} coefficients, the model file {most}; give the "
-            "SMPL-X file with all of them as data.smpl"
+            f"{path}: '{key}' has {values.shape[1]} coefficients, the model file {maximum}; give "
+            "the SMPL-X file with all of them as data.smpl"
         )
-    return values[:, :most]
+    return values[:, :maximum]

@@ -130,7 +130,7 @@ def make_shots(
             cat([frame.camera for frame in batch]),
             margin=margin,
             multiple=1,
-            least=MIN_WINDOW,
+            minimum=MIN_WINDOW,
         )
         for corner, frame in zip(boxes.corners, batch, strict=True):
             window = Window((corner,), boxes.size, boxes.whole)
