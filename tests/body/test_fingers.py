@@ -159,8 +159,7 @@ def test_a_missing_hand_rests_and_the_other_does_not_change(solver, poses, how):
             assert torch.equal(theta[:, joint], whole[:, joint])
         elif names[joint] != "finger1-1.L":  # the pose's own thumb landmark shows it
             assert not theta[:, joint].any()
-    seen[:, LEFT] = 0
-    rest = solver.at_rest(seen)
+    rest = solver.at_rest(p, seen)
     assert rest[:, names.index("finger3-2.L")].all()
     assert not rest[:, [names.index("finger3-2.R"), names.index("finger1-1.L")]].any()
 

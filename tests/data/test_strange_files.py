@@ -156,6 +156,19 @@ def test_body_25b_is_told_from_body_25_by_the_middle_of_the_hips(tmp_path):
     np.testing.assert_allclose(found.px[0, 32], [42.5, 102.5])  # the right big toe
 
 
+def test_25_joints_without_hips_are_doubtful(tmp_path):
+    """Of either set: both are then the same numbers."""
+    _, person = body_25b()
+    told = write_frames(tmp_path / "told", [{"pose_keypoints_2d": person}])
+    assert read_detections(told).notes == ()
+    person[3 * 12 + 2] = 0.0
+    untold = write_frames(tmp_path / "untold", [{"pose_keypoints_2d": person}])
+    (note,) = read_detections(untold).notes
+    assert "read as BODY_25, which cannot be told from BODY_25B" in note
+    others = write_frames(tmp_path / "others", [{"pose_keypoints_2d": triples(18)}])
+    assert read_detections(others).notes == ()
+
+
 @needs_reports
 def test_the_reported_detections():
     nobody = read_detections(REPORTS / "detections" / "null_person" / "cam01_json")

@@ -393,6 +393,33 @@ def test_damaged_amc(tmp_path, proportions, file, damage, message):
         standard(path, proportions)
 
 
+@pytest.mark.parametrize(
+    ("section", "damage"),
+    [
+        ("root", "missing"),
+        ("bonedata", "missing"),
+        ("bonedata", "cut off"),
+        ("hierarchy", "missing"),
+        ("hierarchy", "cut off"),
+    ],
+)
+def test_a_section_of_an_asf_that_is_cut_off_is_named(
+    tmp_path, proportions, section, damage
+):
+    """Also where what is left would be a skeleton: a bone that was not ended was dropped."""
+    path = write_amc(tmp_path)
+    asf = tmp_path / "07.asf"
+    before, _, after = asf.read_text().partition(f":{section}\n")
+    own, sign, others = after.partition("\n:")
+    if damage == "missing":
+        own = ""
+    else:
+        own, _, _ = own.rpartition("end")
+    asf.write_text(f"{before}:{section}\n{own}{sign}{others}")
+    with pytest.raises(DataError, match=rf"07\.asf .*section :{section} is {damage}"):
+        standard(path, proportions)
+
+
 def test_an_amc_without_its_skeleton(tmp_path, proportions):
     path = write_amc(tmp_path)
     (tmp_path / "07.asf").rename(tmp_path / "x.asf")

@@ -59,6 +59,14 @@ def test_another_person_keeps_directions_and_gets_the_lengths(landmarks, proport
     ) == pytest.approx(1 / (1.2 * 0.7), rel=0.02)
 
 
+@pytest.mark.parametrize("empty", [0, 1])
+def test_an_empty_clip_is_not_joined(proportions, empty):
+    clips = [proportions.rest[None], proportions.rest[None]]
+    clips[empty] = clips[empty][:0]
+    with pytest.raises(ValueError, match=f"joined: clip {empty} has no frame"):
+        joined(clips, proportions, 7)
+
+
 def test_joined_clips_keep_their_frames_their_speed_and_the_bones(proportions):
     step = np.array([0.01, 0, 0])
     p = np.stack([proportions.rest + i * step for i in range(4)])

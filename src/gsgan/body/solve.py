@@ -319,11 +319,13 @@ class Solver(nn.Module):
         held[hips] = 1 / HIP_NOISE**2
         return self.precision * valid + held * ~valid[:, hips].any(1, keepdim=True)
 
-    def at_rest(self, visibility: Tensor) -> Tensor:
-        """``[B, joints]`` bool: joints at rest in `solve`, for want of visible landmarks."""
+    def at_rest(self, skeleton: Tensor, visibility: Tensor) -> Tensor:
+        """``[B, joints]`` bool: joints at rest in `solve`, for want of landmarks that are visible
+        and finite; arguments as there."""
         # The landmarks that count: those of a palm replace some of the 33.
-        seen = visibility[:, :BODY] > 0
-        hands = visibility[:, BODY:WITH_HAND_JOINTS] > 0
+        shown = (visibility > 0) & skeleton.isfinite().all(-1)
+        seen = shown[:, :BODY]
+        hands = shown[:, BODY:WITH_HAND_JOINTS]
         fingers = self.fingers if hands.shape[1] else None
         if fingers is not None:
             placed = fingers.placed(hands)
@@ -333,13 +335,13 @@ class Solver(nn.Module):
         # The numbers that they show; the root's always.
         n = seen.shape[1]
         seen = seen & self.known[:n]
-        shown = (seen.to(self.prior) @ self.reaches[:, :n].to(self.prior).mT) > 0
-        shown[:, :6] = True
+        free = (seen.to(self.prior) @ self.reaches[:, :n].to(self.prior).mT) > 0
+        free[:, :6] = True
 
         # The joints that these numbers move.
         moved = torch.zeros(len(visibility), self.parents, device=visibility.device)
         joints = self.joint[self.entry_turn].expand(len(visibility), -1)
-        moved = moved.scatter_add(1, joints, shown[:, self.entry_number].float())
+        moved = moved.scatter_add(1, joints, free[:, self.entry_number].float())
         if fingers is not None:
             moved[:, fingers.joints] += fingers.shown(hands)
         return moved == 0

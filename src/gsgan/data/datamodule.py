@@ -347,16 +347,15 @@ class GsganData(LightningDataModule):
         sizes = [camera.size for camera in self.layout.cameras.values()]
         oblong = any(height != width for height, width in sizes)
 
-        # The images of the first camera decide the scale; cropped images have none.
-        scale = None
+        # Cameras of unlike sizes are scored at unlike scales; cropped images have none.
+        scales = None
         if self.crop is None:
-            side = max(sizes[0])
-            scale = (self.size or side) / side
+            scales = [self.size / max(size) if self.size else 1.0 for size in sizes]
 
         # The departures of images and backbone are found by the protocol itself.
         departures = self.protocol.departures(
             lpips_nets=lpips_nets,
-            scale=scale,
+            scales=scales,
             padded=self.crop is None and self.size is not None and oblong,
         )
         return self.protocol.record() | {"departures": list(departures)}

@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import pandas as pd
@@ -238,10 +238,8 @@ def evaluate_folder(
     # By default the networks of LPIPS that the run was configured with.
     folder = Path(config.run).expanduser()
     stored = read_config(folder)
-    if config.lpips.nets is None:
-        config.lpips.nets = OmegaConf.select(
-            stored, "lpips.nets", default=list(LPIPS_NETS)
-        )
+    own = OmegaConf.select(stored, "lpips.nets", default=list(LPIPS_NETS))
+    config = _with_lpips(config, own)
 
     # The weights, and the number of steps, the time and the code that made them.
     checkpoint = read_checkpoint(folder / CHECKPOINT)
@@ -294,6 +292,13 @@ def evaluate_folder(
     )
 
 
+def _with_lpips(config: DictConfig, nets: Sequence[str]) -> DictConfig:
+    """The config with these networks of LPIPS where it names none."""
+    if config.lpips.nets is not None:
+        return config
+    return cast(DictConfig, OmegaConf.merge(config, {"lpips": {"nets": nets}}))
+
+
 def other_capture(stored: DictConfig, on: str | DictConfig) -> DictConfig:
     """A run's config with the data of another capture: its folder, or the keys that differ.
 
@@ -332,8 +337,7 @@ def evaluate_predictions(
     # Without a name, the folder's name is that of the method.
     root = Path(config.predictions).expanduser()
     name = config.method or root.resolve().name
-    if config.lpips.nets is None:
-        config.lpips.nets = list(LPIPS_NETS)
+    config = _with_lpips(config, list(LPIPS_NETS))
 
     # The data, and a folder for the results that holds no others.
     data = build_data(config)

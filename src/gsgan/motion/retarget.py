@@ -274,7 +274,13 @@ def joined(clips: Sequence[Float], subject: Proportions, n: int) -> Float:
 
     A transition is a cubic that continues the joints' speeds at both ends, on the subject's bones;
     hands and faces that either end lacks (NaN) are missing in it.
+
+    Raises:
+        ValueError: if a clip has no frame.
     """
+    for i, clip in enumerate(clips):
+        if not len(clip):
+            raise ValueError(f"joined: clip {i} has no frame")
     parts = [clips[0]]
     for before, after in pairwise(clips):
         a = face_in_head(before)

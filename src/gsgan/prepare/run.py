@@ -178,8 +178,11 @@ def prepare(options: Options, console: Console) -> Path:
     else:
         found, masks = find_people(options, inputs.sources, stages, console.print)
         detections = {}
+        notes = [*inputs.notes]
         for name in inputs.sources:
             detections[name] = landmarks.read_detections(found[name])
+            notes += [f"{name}: {note}" for note in detections[name].notes]
+        inputs = replace(inputs, notes=notes)
         frames, solution = _solved(options, inputs, detections, console)
 
     # The dataset, in a folder of its own until it is complete; a run that was killed leaves one.
