@@ -434,31 +434,17 @@ def evaluate_method(
     """
     # Settings that commands of other packages may lack have defaults.
     scorer = make_scorer(config, data, marks)
-    if config.get("score_images") is not None:
-        maximum = whole("score_images", config.score_images, 1)
-        scorer.marks.append(f"at most {maximum} evenly spaced images of each split")
     grid_rows = 4 if config.get("grid_rows") is None else config.grid_rows
 
-    # Every split, with the images of the grid evenly spaced. Scores of a run are kept.
+    # Every split, or some of its images. Only scores of a run are kept until all are there.
     scores: dict[str, SplitScores] = {}
     for split in config.get("splits") or HELD_OUT_SPLITS:
-        # Some of its images, if the config bounds their number.
         dataset = data.dataset(split)
         count = len(dataset)
         places = evenly_spaced(count, config.get("score_images") or count)
-
-        # An interrupted scoring goes on only if nothing that scores depend on has changed.
         kept = None
         if poses is not None:
-            key = {
-                "method": asdict(method),
-                "data": fingerprint(data),
-                "images": len(places),
-                "grid_rows": grid_rows,
-                "lpips": sorted(scorer.lpips),
-                "marks": scorer.marks,
-                "measures": asdict(scorer.prepare.measures),
-            }
+            key = _key(method, data, scorer, grid_rows, len(places))
             kept = KeptScores(folder / FOLDER / f"{split}.pt", key)
         scores[split] = _score(
             f"scoring {split}",
@@ -487,6 +473,21 @@ def evaluate_method(
     shutil.rmtree(folder / FOLDER, ignore_errors=True)
     console.print(f"scores: {folder}", markup=False, highlight=False, soft_wrap=True)
     return joined.results
+
+
+def _key(
+    method: Method, data: GsganData, scorer: Scorer, grid_rows: int, images: int
+) -> dict[str, Any]:
+    """All that scores depend on: an interrupted scoring goes on only if none of it changed."""
+    return {
+        "method": asdict(method),
+        "data": fingerprint(data),
+        "images": images,
+        "grid_rows": grid_rows,
+        "lpips": sorted(scorer.lpips),
+        "marks": scorer.marks,
+        "measures": asdict(scorer.prepare.measures),
+    }
 
 
 def _score(
@@ -558,7 +559,7 @@ def make_scorer(config: DictConfig, data: GsganData, marks: Sequence[str]) -> Sc
     """The scorer of a dataset: its protocol's measures, on the config's background.
 
     Raises:
-        ConfigError: on an unknown network of LPIPS.
+        ConfigError: on an unknown network of LPIPS, or a number of images that is not one.
         DataError: if LPIPS' weights or a body model cannot be read.
     """
     marks = list(marks)
@@ -576,6 +577,11 @@ def make_scorer(config: DictConfig, data: GsganData, marks: Sequence[str]) -> Sc
         marks.append(
             f"body poses of {len(frames)} held-out frames fitted to their own masks"
         )
+
+    # Some images of each split alone.
+    if config.get("score_images") is not None:
+        maximum = whole("score_images", config.score_images, 1)
+        marks.append(f"at most {maximum} evenly spaced images of each split")
 
     # The protocol, and what departs from it.
     boxes = BodyBoxes(data) if measures.needs_body_box else None
