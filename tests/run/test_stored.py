@@ -4,7 +4,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from gsgan.run.stored import CHECKPOINT, CONFIG, RENAMED, hydra_record, read_config
+from gsgan.run.stored import CHECKPOINT, CONFIG, RENAMED_KEYS, hydra_record, read_config
 from gsgan.train.resume import checkpoint_to_resume
 from gsgan.utils.errors import ConfigError, DataError
 
@@ -67,7 +67,7 @@ def test_a_run_of_an_earlier_version_is_resumed(tmp_path):
 
 def test_conf_has_the_names_of_now(compose):
     config = compose("train", "data=capture")
-    for before, now in RENAMED.items():
+    for before, now in RENAMED_KEYS.items():
         group, _, last = before.rpartition(".")
         settings = OmegaConf.select(config, group)
         assert now in settings

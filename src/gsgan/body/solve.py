@@ -36,11 +36,11 @@ from gsgan.skeleton import (
     sanitise,
 )
 from gsgan.skeleton.hands import HAND, PALM
+from gsgan.skeleton.joints import BODY
 from gsgan.skeleton.tensors import constants
 from gsgan.utils.tensors import constant
 
-# Numbers of landmarks: of the pose, and with both hands.
-BODY = len(MEDIAPIPE33.names)
+# Number of landmarks of the pose with both hands.
 WITH_HAND_JOINTS = len(MEDIAPIPE33_HANDS.names)
 SKELETON_SIZES = [len(template.names) for template in TEMPLATES.values()]
 BEYOND = 0.05  # standard deviation of a number below its minimum

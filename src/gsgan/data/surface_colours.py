@@ -35,7 +35,7 @@ BLUR = 0.03
 # share of the blur in the mask: outlines mix with the background
 WHOLE = 0.95
 # minimum number that two cameras share in a frame: fewer lie at outlines, at grazing angles
-MIN_POINTS = 30
+MIN_SHARED = 30
 # minimum number of such frames
 MIN_FRAMES = 3
 # metres per pixel: in coarser images every colour is a mixture
@@ -80,7 +80,7 @@ def surface_colours(moments: Sequence[Sequence[Frame]]) -> SurfaceColours | None
         for i, j in combinations(range(len(frames)), 2):
             difference = colours[i] - colours[j]
             both = difference[~np.isnan(difference[:, 0])]
-            if len(both) >= MIN_POINTS:
+            if len(both) >= MIN_SHARED:
                 found.setdefault((i, j), []).append(both)
 
     # The median is due to the cameras, the residual to highlights and errors of the hull.

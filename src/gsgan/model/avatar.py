@@ -67,7 +67,7 @@ class Prepared(NamedTuple):
     window: Window | None
 
     def to(self, device: torch.device) -> Prepared:
-        """The same on another device."""
+        """The inputs on another device."""
         index = self.camera_index
         return Prepared(
             skeleton=self.skeleton.to(device),
@@ -403,9 +403,9 @@ class Avatar(nn.Module):
         rendering = Rendering(image, alpha, raster.features, raster.alpha, S, gaussians)
 
         # Step I's colour and I_pred take on the tint of the training camera.
-        if camera_index is None:
+        if self.colour is None or camera_index is None:
             return rendering
-        return self._corrected(rendering, camera_index)
+        return self._corrected(rendering, raster, self.colour, camera_index)
 
     def splat(
         self,
@@ -501,19 +501,16 @@ class Avatar(nn.Module):
                 backend=self.backend,
             )
 
-    def _corrected(self, rendering: Rendering, camera_index: Tensor) -> Rendering:
+    def _corrected(
+        self,
+        rendering: Rendering,
+        raster: Raster,
+        correction: ColourCorrection,
+        camera_index: Tensor,
+    ) -> Rendering:
         """The rendering in the colours of its cameras."""
-        if (
-            self.colour is None
-            or rendering.features is None
-            or rendering.splat_alpha is None
-        ):
-            return rendering
-
         # Step I's colour, corrected with its own alpha.
-        colour = self.colour(
-            rendering.features[:, :3], rendering.splat_alpha, camera_index
-        )
+        colour = correction(raster.features[:, :3], raster.alpha, camera_index)
 
         # The image is either the same colour or the generator's, which has an alpha of its own.
         image = rendering.image
@@ -521,7 +518,7 @@ class Avatar(nn.Module):
             image = colour
         elif image is not None and rendering.alpha is not None:
             # detached: losses of the corrected colours must not move alpha
-            image = self.colour(image, rendering.alpha.detach(), camera_index)
+            image = correction(image, rendering.alpha.detach(), camera_index)
         return replace(rendering, image=image, corrected=colour)
 
 

@@ -22,7 +22,7 @@ CHECKPOINT = Path("checkpoints") / "last.ckpt"
 # Classes that configs of runs before 2026-11-26 name by another module.
 MOVED = {"gsgan.model.assemble.": "gsgan.run.assemble."}
 # Keys that configs of runs before 2026-11-27 have, and their last part now.
-RENAMED = {
+RENAMED_KEYS = {
     "data.reader.consistency.least_inside": "refused_below",
     "fit.least_mask": "min_mask",
     "model.window_least": "window_minimum",
@@ -115,7 +115,7 @@ def _read_yaml(path: Path) -> DictConfig:
 
 def rename_keys(settings: MutableMapping[str, Any]) -> None:
     """Gives the keys of a config, or of its `record`, their present names, in place."""
-    for before, now in RENAMED.items():
+    for before, now in RENAMED_KEYS.items():
         group, last = _group(settings, before)
         if last in group:
             group[now] = group.pop(last)
