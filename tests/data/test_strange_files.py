@@ -13,6 +13,8 @@ from gsgan.data.formats.capture import CaptureReader
 from gsgan.data.pixels import PixelRules, read_mask
 from gsgan.data.validation import Thresholds
 from gsgan.prepare.landmarks import read_detections
+from gsgan.prepare.options import Inputs
+from gsgan.prepare.run import with_detections
 from gsgan.utils.errors import DataError
 
 REPORTS = Path(__file__).parents[3] / "shared" / "data" / "reports"
@@ -165,6 +167,12 @@ def test_25_joints_without_hips_are_doubtful(tmp_path):
     untold = write_frames(tmp_path / "untold", [{"pose_keypoints_2d": person}])
     (note,) = read_detections(untold).notes
     assert "read as BODY_25, which cannot be told from BODY_25B" in note
+
+    # The note is printed with those on the other inputs.
+    inputs = Inputs({"a": None, "b": None}, None, (), ["first"], 30.0)
+    inputs, detections = with_detections(inputs, {"a": told, "b": untold})
+    assert inputs.notes == ["first", f"b: {note}"]
+    assert list(detections) == ["a", "b"]
     others = write_frames(tmp_path / "others", [{"pose_keypoints_2d": triples(18)}])
     assert read_detections(others).notes == ()
 

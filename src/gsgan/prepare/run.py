@@ -177,12 +177,7 @@ def prepare(options: Options, console: Console) -> Path:
         options = replace(options, face=False)
     else:
         found, masks = find_people(options, inputs.sources, stages, console.print)
-        detections = {}
-        notes = [*inputs.notes]
-        for name in inputs.sources:
-            detections[name] = landmarks.read_detections(found[name])
-            notes += [f"{name}: {note}" for note in detections[name].notes]
-        inputs = replace(inputs, notes=notes)
+        inputs, detections = with_detections(inputs, found)
         frames, solution = _solved(options, inputs, detections, console)
 
     # The dataset, in a folder of its own until it is complete; a run that was killed leaves one.
@@ -211,6 +206,24 @@ def prepare(options: Options, console: Console) -> Path:
     )
     console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
     return out
+
+
+def with_detections(
+    inputs: Inputs, found: Mapping[str, Path]
+) -> tuple[Inputs, dict[str, Detections]]:
+    """The inputs with a note on all that is doubtful in the detections, and these by camera.
+
+    Args:
+        inputs: the cameras.
+        found: by camera, its file or folder of landmarks.
+    """
+    notes = [*inputs.notes]
+    detections = {}
+    for name in inputs.sources:
+        detections[name] = landmarks.read_detections(found[name])
+        for note in detections[name].notes:
+            notes.append(f"{name}: {note}")
+    return replace(inputs, notes=notes), detections
 
 
 def _refuse_errors(out: Path) -> None:
