@@ -92,14 +92,18 @@ def read_config(folder: Path) -> DictConfig:
         raise DataError(
             f"{folder}: not a run folder (no {CONFIG}); give the folder that gsgan.train printed"
         )
-    config = _read_yaml(path)
+    config = read_yaml(path)
     if not {"data", "model"} <= config.keys():
         raise DataError(f"{path}: expected the config of a run with data and model")
-    rename_keys(config)
     return config
 
 
-def _read_yaml(path: Path) -> DictConfig:
+def read_yaml(path: Path) -> DictConfig:
+    """A file of Hydra's in a run folder, with the present names of classes and keys.
+
+    Raises:
+        DataError: when it is damaged.
+    """
     try:
         text = path.read_text(encoding="utf-8")
         # Runs of earlier versions name classes by modules that have moved.
@@ -110,6 +114,7 @@ def _read_yaml(path: Path) -> DictConfig:
         raise DataError(f"{path}: damaged ({str(error).splitlines()[0]})") from None
     if not isinstance(config, DictConfig):
         raise DataError(f"{path}: damaged (expected keys with values)")
+    rename_keys(config)
     return config
 
 
@@ -174,7 +179,7 @@ def hydra_record(folder: Path) -> DictConfig:
         DataError: when it is damaged.
     """
     path = folder / ".hydra" / "hydra.yaml"
-    return _read_yaml(path) if path.is_file() else OmegaConf.create()
+    return read_yaml(path) if path.is_file() else OmegaConf.create()
 
 
 def choices(folder: Path) -> dict[str, Any]:
