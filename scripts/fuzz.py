@@ -77,12 +77,12 @@ def seeds(home: Path, run: Path) -> dict[str, list[tuple[Path, Reader]]]:
     from gsgan.body.smpl import read_smpl
     from gsgan.data.calibration import read_calibration
     from gsgan.data.formats.capture import read_capture
-    from gsgan.data.proportions import measure_proportions
     from gsgan.export.weights import load_weights, weights_bytes
     from gsgan.motion.readers import Source, read_motion
     from gsgan.run.runs import load
     from gsgan.run.stored import CHECKPOINT, read_checkpoint
     from gsgan.skeleton import MEDIAPIPE33
+    from gsgan.skeleton.proportions import measure_proportions
     from gsgan.synthetic.gltf import read_character
     from gsgan.synthetic.posing import Choreography
 

@@ -20,8 +20,8 @@ from omegaconf import DictConfig
 
 import gsgan.utils.compat  # noqa: F401  (before anything imports torchvision)
 from gsgan.body import free_body
-from gsgan.data.proportions import measure_proportions
 from gsgan.scene import BodyPose
+from gsgan.skeleton.proportions import measure_proportions
 
 # what tests of other folders share with them
 for folder in ("data", "prepare", "synthetic"):

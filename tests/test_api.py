@@ -87,7 +87,12 @@ def test_a_folder_without_a_run_or_a_checkpoint_is_one_sentence(run, tmp_path):
 
 @pytest.mark.parametrize(
     ("module", "heavy"),
-    [("gsgan", "torch"), ("gsgan.scene", "lightning kornia torchmetrics cv2 hydra")],
+    [
+        ("gsgan", "torch"),
+        ("gsgan.scene", "lightning kornia torchmetrics cv2 hydra"),
+        ("gsgan.model.avatar", "gsgan.data gsgan.motion gsgan.run hydra omegaconf"),
+        ("gsgan.model.harmonic", "gsgan.data gsgan.motion gsgan.run hydra omegaconf"),
+    ],
 )
 def test_importing_is_light(module, heavy):
     code = (

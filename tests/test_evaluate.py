@@ -381,7 +381,7 @@ def test_cameras_of_several_sizes_share_one_grid(tmp_path):
 
     small, large = torch.ones(3, 2, 5), torch.ones(3, 4, 3)
     path = tmp_path / "grid.png"
-    write_grid([{"x": small}, {"x": large}], path, least=1)
+    write_grid([{"x": small}, {"x": large}], path, minimum=1)
     shown = cv2.imread(str(path))[CAPTION_HEIGHT:]
     assert shown.shape == (8, 5, 3)
     assert (shown[:2] == 255).all()

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor, nn
 
 from gsgan.data.cameras import make_camera
-from gsgan.data.files import frame_files
 from gsgan.data.formats.common import FolderReader, image_size, one_mask_each
 from gsgan.data.layout import Found, Meta
 from gsgan.data.skeletons import make_landmarks
@@ -19,6 +18,7 @@ from gsgan.model.rendering import Rendering
 from gsgan.run.assemble import build_data
 from gsgan.scene import BodyPose, Frame, Gaussians
 from gsgan.train.run import build_training
+from gsgan.utils.frame_files import frame_files
 
 HERE = __name__
 ROOT = Path(__file__).parents[1]

@@ -17,13 +17,13 @@ PARTS = (
     "skeleton",
     "splat",
     "body",
+    "effects",
+    "model",
     "data",
     "motion",
     "synthetic",
-    "effects",
     "losses",
     "metrics",
-    "model",
     "run",
 )
 ENTRIES = 27

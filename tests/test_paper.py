@@ -135,7 +135,7 @@ UNLISTED = (
         "training.perceptual.weights",
         "training.recipes.psi.span",
     ),
-    *("model.backend", "model.window_multiple", "model.window_least"),
+    *("model.backend", "model.window_multiple", "model.window_minimum"),
     *(
         "training.seed",
         "training.log_every",

@@ -21,7 +21,7 @@ def camera(batch: int = 1) -> Camera:
 def window(points, batch: int = 1, margin: float = 0.1, multiple: int = 8) -> Window:
     p = torch.tensor(points).expand(batch, -1, -1)
     return body_window(
-        p, camera(batch), margin=margin, multiple=multiple, least=8, near=0.01
+        p, camera(batch), margin=margin, multiple=multiple, minimum=8, near=0.01
     )
 
 
@@ -57,7 +57,7 @@ def test_a_person_out_of_the_picture_leaves_a_small_box_inside():
 
 def test_boxes_of_a_batch_share_one_size():
     p = torch.tensor([[[0.0, 0.0, 2.0]] * 2, [[-0.5, 0.0, 2.0], [0.5, 0.0, 2.0]]])
-    found = body_window(p, camera(2), margin=0.1, multiple=8, least=8, near=0.01)
+    found = body_window(p, camera(2), margin=0.1, multiple=8, minimum=8, near=0.01)
     assert len(found.corners) == 2
     picture = (
         torch.arange(HEIGHT * WIDTH)

@@ -31,6 +31,7 @@ __all__ = [
     "fold_radius",
 ]
 
+NEAR = 0.01  # metres: nearer points are not projected
 RIM = 0.999  # share of a lens's fold radius: points beyond it are shown there
 
 
@@ -113,7 +114,7 @@ class Camera(TensorRecord):
         """``[B, M, 3]`` world points in camera axes, metres."""
         return points @ self.R.mT + self.t.unsqueeze(1)
 
-    def project(self, points: Tensor, near: float = 1e-2) -> tuple[Tensor, Tensor]:
+    def project(self, points: Tensor, near: float = NEAR) -> tuple[Tensor, Tensor]:
         """Pixel positions ``[B, M, 2]`` and depths ``[B, M]`` of world points ``[B, M, 3]``.
 
         Points nearer than ``near`` metres are divided by ``near`` instead of their depth: their
@@ -356,7 +357,13 @@ class Window:
 
 
 def body_window(
-    p: Tensor, camera: Camera, *, margin: float, multiple: int, least: int, near: float
+    p: Tensor,
+    camera: Camera,
+    *,
+    margin: float,
+    multiple: int,
+    minimum: int,
+    near: float = NEAR,
 ) -> Window:
     """The boxes round the projected joints; they depend on skeleton and camera only.
 
@@ -365,7 +372,7 @@ def body_window(
         camera: B cameras.
         margin: metres kept round every joint (hair, fingertips, clothes).
         multiple: sides are rounded up to multiples of this many pixels, where the image has room.
-        least: pixels, the shortest side, where the image has room.
+        minimum: pixels, the shortest side, where the image has room.
         near: metres; with a joint nearer than this the box is the whole image.
 
     Returns:
@@ -390,8 +397,8 @@ def body_window(
         .minimum(everywhere)
     )
     bounds = torch.cat([low, high], dim=-1).long().tolist()
-    w = _side(max(least, *(x1 - x0 for x0, _, x1, _ in bounds)), multiple, width)
-    h = _side(max(least, *(y1 - y0 for _, y0, _, y1 in bounds)), multiple, height)
+    w = _side(max(minimum, *(x1 - x0 for x0, _, x1, _ in bounds)), multiple, width)
+    h = _side(max(minimum, *(y1 - y0 for _, y0, _, y1 in bounds)), multiple, height)
     corners = tuple(
         (_start(y0, y1, h, height), _start(x0, x1, w, width))
         for x0, y0, x1, y1 in bounds

@@ -53,7 +53,7 @@ def check(monkeypatch):
     ) -> CheckReport:
         sampling = Sampling(images=images, shown=1)
         reader = CaptureReader(
-            consistency=Consistency(**({"least_inside": 0.2} | (consistency or {})))
+            consistency=Consistency(**({"refused_below": 0.2} | (consistency or {})))
         )
         data = GsganData(root=str(root), reader=reader)
         # the forearm of the test person grows as it is raised

@@ -10,7 +10,6 @@ from writers.smpl import posed
 
 from gsgan.body.smpl_names import CIHP
 from gsgan.data.dataset import CaptureDataset
-from gsgan.data.files import read_colour
 from gsgan.data.formats.capture import SKELETON_LIMITS, read_capture
 from gsgan.data.formats.consistency import Consistency
 from gsgan.data.formats.smpl_motion import SmplMotion
@@ -18,6 +17,7 @@ from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_labels, read_mask
 from gsgan.scene import Frame
 from gsgan.skeleton.smpl_landmarks import to_mediapipe33
+from gsgan.utils.image_files import read_colour
 
 
 def items(layout: Layout) -> list[tuple[str, int]]:

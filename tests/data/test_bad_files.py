@@ -28,7 +28,6 @@ from writers.thuman4 import write_thuman4
 from writers.zju import write_original
 
 from gsgan.data.dataset import CaptureDataset
-from gsgan.data.files import last_number
 from gsgan.data.formats.capture import read_capture
 from gsgan.data.formats.easymocap import EasymocapReader
 from gsgan.data.formats.thuman4 import Thuman4Reader
@@ -36,6 +35,7 @@ from gsgan.data.formats.zju import ZjuReader
 from gsgan.data.layout import Layout
 from gsgan.data.validation import Thresholds
 from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.frame_files import last_number
 
 pytestmark = pytest.mark.usefixtures("model_once")
 Damage = Callable[[Path], object]

@@ -11,12 +11,12 @@ from capture_frames import every_frame, items, png
 from make import edit_json, ring_camera, skeletons, write_landmarks, write_tiny_capture
 
 from gsgan.data.dataset import CaptureDataset, ImageCache
-from gsgan.data.files import cut_off
 from gsgan.data.formats.capture import CaptureReader, read_capture
 from gsgan.data.formats.consistency import Consistency
 from gsgan.data.validation import Thresholds
 from gsgan.scene import cat
 from gsgan.utils.errors import DataError
+from gsgan.utils.image_files import cut_off
 
 
 def test_frame_holds_what_its_docstring_says(tmp_path):

@@ -18,11 +18,11 @@ from writers.easymocap import (
     write_easymocap,
 )
 
-from gsgan.data.files import natural_order
 from gsgan.data.formats.easymocap import EasymocapReader
 from gsgan.data.layout import Layout
 from gsgan.data.validation import Thresholds
 from gsgan.utils.errors import DataError
+from gsgan.utils.frame_files import natural_order
 
 pytestmark = pytest.mark.usefixtures("model_once")
 

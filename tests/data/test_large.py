@@ -5,10 +5,10 @@ import pytest
 from make import write_tiny_capture
 
 from gsgan.data import validation
-from gsgan.data.files import FrameFiles, frame_files
 from gsgan.data.formats.capture import read_capture
 from gsgan.data.splits import Items
 from gsgan.utils.errors import DataError
+from gsgan.utils.frame_files import FrameFiles, frame_files
 
 
 def test_files_by_frame_are_a_mapping():
@@ -45,7 +45,7 @@ def test_items_are_a_sequence():
 def test_headers_of_large_captures_are_checked_in_steps(tmp_path, monkeypatch):
     root, read = write_tiny_capture(tmp_path / "c", cameras=2, frames=10), []
     check = validation.check_image
-    monkeypatch.setattr(validation, "MOST_HEADERS", 5)
+    monkeypatch.setattr(validation, "MAX_HEADERS", 5)
     monkeypatch.setattr(
         validation,
         "check_image",

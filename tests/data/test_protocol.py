@@ -175,17 +175,17 @@ def test_frames_by_subject():
 
 def test_departures_are_said():
     same = replace(ONE, scale=0.5)
-    assert list(same.departures(lpips_nets=["vgg"], scale=0.5)) == []
+    assert list(same.departures(lpips_nets=["vgg"], scales=[0.5, 0.5])) == []
     other = replace(
         ONE, measures=MetricVariants(background="white", lpips_range=(0, 1))
     )
-    said = list(other.departures(lpips_nets=["alex"], scale=0.25))
+    said = list(other.departures(lpips_nets=["alex"], scales=[0.25, 1]))
     assert said == [  # what the measures ask for is done
         "LPIPS is not computed with vgg, as requested (lpips.nets)",
         "images are scored at scale 0.25, requested: 1 (data.size)",
     ]
     assert "cut round the person" in next(
-        ONE.departures(lpips_nets=["vgg"], scale=None)
+        ONE.departures(lpips_nets=["vgg"], scales=None)
     )
     assert set(CHOICES) == set(ONE.record()["measures"])
 
@@ -206,6 +206,14 @@ def test_the_data_follows_the_protocol_and_records_it(root):
         ["vgg"]
     )
     assert len(cut["departures"]) == 1
+
+
+def test_cameras_of_other_sizes_depart_from_the_scale(root):
+    data = GsganData(str(root), size=16, protocol=replace(ONE, scale=0.5))
+    name, camera = list(data.layout.cameras.items())[-1]
+    data.layout.cameras[name] = replace(camera, size=(48, 64))
+    departures = data.protocol_record(["vgg"])["departures"]
+    assert "images are scored at scale 0.25, requested: 0.5 (data.size)" in departures
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -48,21 +48,21 @@ def test_looking_a_scene_over_holds_few_images_at_once(tmp_path, monkeypatch):
     """8 moments of 4 cameras are compared; all of them at 1330 × 1150 would be gigabytes."""
     root = write_tiny_capture(tmp_path / "c", cameras=4, frames=12, size=(48, 48))
     alive: weakref.WeakSet = weakref.WeakSet()
-    most, reads = 0, 0
+    maximum, reads = 0, 0
     plain = CaptureDataset.__getitem__
 
     def watched(self, index):
-        nonlocal most, reads
+        nonlocal maximum, reads
         frame = plain(self, index)
         gc.collect(0)
         alive.add(frame.image)
-        most, reads = max(most, len(alive)), reads + 1
+        maximum, reads = max(maximum, len(alive)), reads + 1
         return frame
 
     monkeypatch.setattr(CaptureDataset, "__getitem__", watched)
     assert GsganData(str(root), info_samples=8).info.n_train_cameras == 4
     assert reads > 30
-    assert most <= 3
+    assert maximum <= 3
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,8 @@ from gsgan.data.formats.capture import CaptureReader
 from gsgan.data.pixels import PixelRules, read_mask
 from gsgan.data.validation import Thresholds
 from gsgan.prepare.landmarks import read_detections
+from gsgan.prepare.options import Inputs
+from gsgan.prepare.run import with_detections
 from gsgan.utils.errors import DataError
 
 REPORTS = Path(__file__).parents[3] / "shared" / "data" / "reports"
@@ -154,6 +156,25 @@ def test_body_25b_is_told_from_body_25_by_the_middle_of_the_hips(tmp_path):
     for landmark, joint in ((0, 0), (11, 5), (16, 10), (23, 11), (28, 16)):
         np.testing.assert_allclose(found.px[0, landmark], coco[joint] + 0.5)
     np.testing.assert_allclose(found.px[0, 32], [42.5, 102.5])  # the right big toe
+
+
+def test_25_joints_without_hips_are_doubtful(tmp_path):
+    """Of either set: both are then the same numbers."""
+    _, person = body_25b()
+    told = write_frames(tmp_path / "told", [{"pose_keypoints_2d": person}])
+    assert read_detections(told).notes == ()
+    person[3 * 12 + 2] = 0.0
+    untold = write_frames(tmp_path / "untold", [{"pose_keypoints_2d": person}])
+    (note,) = read_detections(untold).notes
+    assert "read as BODY_25, which cannot be told from BODY_25B" in note
+
+    # The note is printed with those on the other inputs.
+    inputs = Inputs({"a": None, "b": None}, None, (), ["first"], 30.0)
+    inputs, detections = with_detections(inputs, {"a": told, "b": untold})
+    assert inputs.notes == ["first", f"b: {note}"]
+    assert list(detections) == ["a", "b"]
+    others = write_frames(tmp_path / "others", [{"pose_keypoints_2d": triples(18)}])
+    assert read_detections(others).notes == ()
 
 
 @needs_reports

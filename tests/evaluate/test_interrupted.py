@@ -9,7 +9,7 @@ import pytest
 from gsgan.evaluate import kept
 from gsgan.evaluate.run import evaluate_config
 from gsgan.evaluate.scores import Tally
-from gsgan.utils.errors import ConfigError
+from gsgan.utils.errors import ConfigError, DataError
 
 
 @pytest.fixture
@@ -50,6 +50,18 @@ def test_an_interrupted_scoring_goes_on(copied, compose, monkeypatch, capsys):
     assert "3 of" in capsys.readouterr().out
     assert (copied / "grids/novel_view.png").read_bytes() == grid
     assert not (copied / ".scoring").exists()
+
+
+def test_the_config_of_the_caller_stays_as_it_is(copied, capture, compose, tmp_path):
+    """Its null for LPIPS' networks means those of each run."""
+    (copied / "checkpoints/last.ckpt").unlink()
+    data = ("data=capture", f"data.root={capture}")
+    for given in ([f"run={copied}"], [f"predictions={tmp_path / 'none'}", *data]):
+        config = compose("evaluate", "device=cpu", *given)
+        before = config.copy()
+        with pytest.raises(DataError):
+            evaluate_config(config)
+        assert config == before
 
 
 def test_scores_of_other_settings_are_not_used(copied, compose, monkeypatch, capsys):

@@ -8,13 +8,13 @@ import torch
 from gsgan.data.datamodule import GsganData
 from gsgan.data.metric_variants import MetricVariants
 from gsgan.evaluate.predictions import (
-    FULL,
     JOINT_MARGIN,
     VERTEX_MARGIN,
     BodyBoxes,
     Prediction,
     Preparation,
 )
+from gsgan.metrics.names import FULL
 from gsgan.metrics.regions import box_corners, box_mask
 
 

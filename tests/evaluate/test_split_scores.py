@@ -10,13 +10,7 @@ from frames import frame_of
 from torchmetrics.classification import MulticlassJaccardIndex
 
 from gsgan.data.metric_variants import MetricVariants
-from gsgan.evaluate.predictions import (
-    FLOOR_VARIANT,
-    FULL,
-    SPLAT,
-    Prediction,
-    Preparation,
-)
+from gsgan.evaluate.predictions import Prediction, Preparation
 from gsgan.evaluate.scores import (
     Scorer,
     confusion,
@@ -27,6 +21,7 @@ from gsgan.evaluate.scores import (
     score_split,
 )
 from gsgan.metrics.image import psnr, ssim, ssim_uniform
+from gsgan.metrics.names import FLOOR_VARIANT, FULL, SPLAT
 from gsgan.model.rendering import Rendering
 from gsgan.scene import Frame
 from gsgan.utils.errors import GsganError

@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from gsgan.data.metric_variants import MetricVariants
-from gsgan.evaluate.predictions import FULL, Prediction, Preparation
+from gsgan.evaluate.predictions import Prediction, Preparation
 from gsgan.evaluate.scores import BOX_METRICS, Scorer, score_split
+from gsgan.metrics.names import FULL
 from gsgan.metrics.regions import HANDS, MOUTH, describe_boxes, hands_and_mouth
 from gsgan.scene import Camera, Frame
 from gsgan.skeleton import TEMPLATES

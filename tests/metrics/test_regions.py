@@ -104,7 +104,7 @@ def test_the_crop_shrinks_as_opencv_interpolates():
 
 
 @pytest.mark.parametrize(
-    ("box", "least", "expected"),
+    ("box", "minimum", "expected"),
     [
         ((10, 14, 20, 30), 1, (slice(10, 14), slice(20, 30))),
         ((10, 14, 20, 30), 16, (slice(4, 20), slice(17, 33))),
@@ -113,7 +113,7 @@ def test_the_crop_shrinks_as_opencv_interpolates():
         ((10, 14, 20, 30), 64, (slice(0, 40), slice(0, 40))),
     ],
 )
-def test_a_rectangle_is_widened_as_asked(box, least, expected):
+def test_a_rectangle_is_widened_as_asked(box, minimum, expected):
     where = torch.zeros(1, 40, 40, dtype=torch.bool)
     where[:, box[0] : box[1], box[2] : box[3]] = True
-    assert rectangle(where, least) == expected
+    assert rectangle(where, minimum) == expected

@@ -43,6 +43,30 @@ def test_the_window_changes_nothing_about_step_one(build):
     assert float(difference.detach()) < 1e-4
 
 
+def test_body_and_window_are_found_once(build, monkeypatch):
+    _, avatar, frame = build()
+    found = []
+
+    def counted(name):
+        finds = getattr(avatar, name)
+
+        def find(*arguments):
+            found.append(name)
+            return finds(*arguments)
+
+        return find
+
+    for name in ("body_pose", "window"):
+        monkeypatch.setattr(avatar, name, counted(name))
+    avatar.render(frame.skeleton, frame.camera)
+    assert found == ["body_pose", "window"]
+
+    # A body that is given is not solved.
+    found.clear()
+    avatar.render(frame.skeleton, frame.camera, body=frame.body)
+    assert found == ["window"]
+
+
 def test_gradients_reach_every_trained_part(build):
     _, avatar, frame = build("size.rgb_skip=false")
     left_of_zero(avatar).train()(*frame.inputs).image.square().sum().backward()

@@ -258,9 +258,9 @@ def test_what_is_the_models_is_not_the_accuracys_too(tiny, key):
 
 
 @pytest.mark.parametrize(
-    ("amount", "most"), [(0.15, 1.0), (0.4, 2.5)], ids=["near", "far"]
+    ("amount", "maximum"), [(0.15, 1.0), (0.4, 2.5)], ids=["near", "far"]
 )
-def test_normals_are_those_of_the_posed_mesh_part_by_part(body, amount, most):
+def test_normals_are_those_of_the_posed_mesh_part_by_part(body, amount, maximum):
     """Mean angle to the posed mesh's own normals, degrees; A alone is several times as far off."""
     torch.manual_seed(0)
     pose = replace(rest(body, 4), theta=amount * torch.randn(4, len(body.joints), 3))
@@ -276,7 +276,7 @@ def test_normals_are_those_of_the_posed_mesh_part_by_part(body, amount, most):
     found, before = angle(points.normals), angle(plain)
     for label in body.vertex_labels.unique():
         part = body.vertex_labels == label
-        assert found[:, part].mean() < most, body.label_names[label]
+        assert found[:, part].mean() < maximum, body.label_names[label]
         assert found[:, part].mean() < 0.6 * before[:, part].mean(), body.label_names[
             label
         ]

@@ -115,9 +115,11 @@ def test_discriminator_judges_every_scale():
     assert maps[0][0].shape[-1] == 2 * maps[1][0].shape[-1]
 
 
-def test_discriminator_refuses_pictures_that_normalisation_would_erase():
+@pytest.mark.parametrize("norm", ["instance", "none"])
+def test_discriminator_refuses_pictures_that_normalisation_would_erase(norm):
+    judge = Discriminator(scales=2, base=4, layers=4, norm=norm)
     with pytest.raises(ValueError, match="too small"):
-        Discriminator(scales=2, base=4, layers=4)(torch.rand(1, 3, 16, 16))
+        judge(torch.rand(1, 3, 16, 16))
 
 
 def test_a_judge_without_normalisation_sees_contrast():

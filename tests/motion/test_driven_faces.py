@@ -5,8 +5,6 @@ import pytest
 import torch
 from test_motion_readers import Y_DOWN, standard, write_pose
 
-from gsgan.data.joints import FACE_MESH
-from gsgan.data.proportions import EXPRESSION
 from gsgan.motion.clip import is_own
 from gsgan.motion.retarget import expressed, face_in_head, joined, retargeted, steadied
 from gsgan.motion.rotations import rotation
@@ -21,6 +19,7 @@ from gsgan.skeleton import (
     limb_length_sum,
 )
 from gsgan.skeleton.face import CODE_UNIT, FACE_NAMES
+from gsgan.skeleton.joints import FACE, FACE_MESH
 from gsgan.skeleton.template import HEAD
 from gsgan.utils.errors import DataError
 
@@ -36,7 +35,7 @@ TURNED = rotation(np.array([0.2, 0.7, 0.0]))  # by 42 degrees
 def rest():
     """``[30, 3]`` the subject's face at rest, in the head's axes: up is y, ahead is z."""
     p = np.array(HOLISTIC.rest_positions)
-    return p[EXPRESSION] - p[list(HOLISTIC.head)].mean(0)
+    return p[FACE] - p[list(HOLISTIC.head)].mean(0)
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +66,7 @@ def head_of(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def offsets_of(q: np.ndarray, rest: np.ndarray) -> np.ndarray:
     """``[F, 30, 3]`` metres, in the axes of each frame's head."""
-    face, body = torch.from_numpy(q[:, EXPRESSION]), torch.from_numpy(q[:, :33])
+    face, body = torch.from_numpy(q[:, FACE]), torch.from_numpy(q[:, :33])
     return (
         in_head(face, body, bone_frames(body).hubs[:, HEAD], MEDIAPIPE33).numpy() - rest
     )
@@ -78,7 +77,7 @@ def write_face(path, p: np.ndarray, kept: tuple[int, ...] = tuple(range(30))):
     q = p @ Y_DOWN.T
     names = [n.upper() for n in MEDIAPIPE33.names]
     parts = {"POSE_WORLD_LANDMARKS": (names, q[:, :33])}
-    pixels = 900 * q[:, EXPRESSION] * (1, 1, 1 / 640) + (90, 50, 0.1)
+    pixels = 900 * q[:, FACE] * (1, 1, 1 / 640) + (90, 50, 0.1)
     parts["FACE_LANDMARKS"] = ([POINTS[k] for k in kept], pixels[:, list(kept)])
     return write_pose(path, parts)
 
@@ -87,7 +86,7 @@ def driven(path, proportions, rest) -> np.ndarray:
     """``[F, 105, 3]`` the subject as `gsgan.render` drives it, in standard axes."""
     p, motion = standard(path, proportions)
     p = p if motion.detached else face_in_head(p)
-    p[:, EXPRESSION] = expressed(p[:, EXPRESSION], rest)
+    p[:, FACE] = expressed(p[:, FACE], rest)
     return retargeted(p, proportions)
 
 
@@ -105,12 +104,12 @@ def test_a_mouth_that_opens_opens_the_subjects(tmp_path, talking, signer, rest, 
 
 
 def test_the_source_may_be_turned_and_the_heads_of_both_differ(talking, rest, moves):
-    turned = 500 * steadied(talking[:, EXPRESSION] @ TURNED.T) + 7
+    turned = 500 * steadied(talking[:, FACE] @ TURNED.T) + 7
     check(expressed(turned, rest) - rest, moves)
 
 
 def test_another_shape_of_face_is_no_expression(talking, rest, moves):
-    wide = talking[:, EXPRESSION] + 0.1 * rest[::-1] * (1, 0, 0)
+    wide = talking[:, FACE] + 0.1 * rest[::-1] * (1, 0, 0)
     one = expressed(wide[:1], rest)
     np.testing.assert_allclose(one[0], rest, atol=1e-9)  # a single frame is at rest
 
@@ -126,14 +125,14 @@ def test_a_file_may_lack_landmarks(tmp_path, talking, signer, rest, moves):
 
 def test_missing_faces_rest_and_short_gaps_are_bridged(tmp_path, talking, signer, rest):
     p = talking.copy()
-    p[1, EXPRESSION] = np.nan
-    p[5:11, EXPRESSION] = np.nan  # six frames
+    p[1, FACE] = np.nan
+    p[5:11, FACE] = np.nan  # six frames
     q = driven(write_face(tmp_path / "a.pose", p), signer, rest)
-    assert np.isfinite(q[:5, EXPRESSION]).all()
-    assert np.isnan(q[5:11, EXPRESSION]).all()
+    assert np.isfinite(q[:5, FACE]).all()
+    assert np.isnan(q[5:11, FACE]).all()
     height = float(limb_length_sum(torch.from_numpy(signer.rest[None])))
     whole, seen = complete_skeleton(torch.from_numpy(q), None, HOLISTIC, height)
-    assert not seen[5:11, EXPRESSION].any()
+    assert not seen[5:11, FACE].any()
     code = face_code(whole, bone_frames(whole, seen > 0, HOLISTIC).head, HOLISTIC)
     np.testing.assert_allclose(code[5:11], 0, atol=1e-3)
     assert code[3:5, LOWER, 1].max() * CODE_UNIT < -0.010
@@ -147,7 +146,7 @@ def test_missing_faces_rest_and_short_gaps_are_bridged(tmp_path, talking, signer
 
 @pytest.mark.parametrize("seen", [0, 1, 2])
 def test_next_to_no_landmarks(talking, rest, seen):
-    p = talking[:, EXPRESSION].copy()
+    p = talking[:, FACE].copy()
     p[4:, seen:] = np.nan
     found = expressed(p, rest)
     assert np.isfinite(found[:4]).all()
@@ -159,7 +158,7 @@ def test_landmarks_with_a_face(tmp_path, talking, signer, rest, moves):
     """An .npz file of 105 joints; the subject's own are not changed."""
     path, p = tmp_path / "a.npz", talking.copy()
     head, centre = head_of(p)
-    p[:, EXPRESSION] = centre + BIGGER * (rest + moves) @ head.mT
+    p[:, FACE] = centre + BIGGER * (rest + moves) @ head.mT
     np.savez(path, p=p, fps=30)
     _, motion = standard(path, signer)
     assert is_own(motion, signer)
@@ -172,11 +171,11 @@ def test_landmarks_with_a_face(tmp_path, talking, signer, rest, moves):
 
 def test_clips_with_and_without_a_face(talking, signer, rest, moves):
     p = talking.copy()
-    p[:, EXPRESSION] = rest + moves[3]  # in the head's axes
+    p[:, FACE] = rest + moves[3]  # in the head's axes
     p = retargeted(p, signer)
     bare = p.copy()
-    bare[:, EXPRESSION] = np.nan
+    bare[:, FACE] = np.nan
     found = joined([p, p[::-1].copy(), bare], signer, 7)
     np.testing.assert_allclose(offsets_of(found[:31], rest), moves[[3] * 31], atol=1e-6)
-    assert np.isnan(found[31:, EXPRESSION]).all()
+    assert np.isnan(found[31:, FACE]).all()
     assert np.isfinite(found[:, :75]).all()

@@ -6,11 +6,16 @@ import numpy as np
 import torch
 from test_motion_readers import Y_DOWN, standard, write_pose
 
-from gsgan.data.proportions import HAND_JOINTS, hand_frame, measure_proportions, upright
 from gsgan.motion.clip import is_own, up_axis
 from gsgan.motion.retarget import PALM_LANDMARKS, joined, retargeted
 from gsgan.skeleton import HOLISTIC, MEDIAPIPE33, complete_skeleton, limb_length_sum
 from gsgan.skeleton.hands import FINGER_BONES, HAND_NAMES
+from gsgan.skeleton.proportions import (
+    HAND_JOINTS,
+    hand_frame,
+    measure_proportions,
+    upright,
+)
 
 LEFT, RIGHT = HAND_JOINTS.values()
 POINTS = [

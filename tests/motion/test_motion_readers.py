@@ -12,13 +12,13 @@ import torch
 
 from gsgan.body.shape import free_space, shaped_body
 from gsgan.body.smpl import read_smpl
-from gsgan.data.proportions import BONES, measure_proportions, upright
 from gsgan.motion.asf import asf_of, read_amc
 from gsgan.motion.clip import checked, completed, is_own, resampled, up_axis
 from gsgan.motion.readers import Source, read_motion
 from gsgan.motion.retarget import retargeted
 from gsgan.motion.rotations import rotation
 from gsgan.skeleton import MEDIAPIPE33
+from gsgan.skeleton.proportions import BONES, measure_proportions, upright
 from gsgan.utils.errors import DataError
 
 REAL = Path(__file__).parents[3] / "shared" / "data" / "motion"
@@ -390,6 +390,33 @@ def test_damaged_amc(tmp_path, proportions, file, damage, message):
     path = write_amc(tmp_path)
     (tmp_path / file).write_text(damage((tmp_path / file).read_text()))
     with pytest.raises(DataError, match=message):
+        standard(path, proportions)
+
+
+@pytest.mark.parametrize(
+    ("section", "damage"),
+    [
+        ("root", "missing"),
+        ("bonedata", "missing"),
+        ("bonedata", "cut off"),
+        ("hierarchy", "missing"),
+        ("hierarchy", "cut off"),
+    ],
+)
+def test_a_section_of_an_asf_that_is_cut_off_is_named(
+    tmp_path, proportions, section, damage
+):
+    """Also where what is left would be a skeleton: a bone that was not ended was dropped."""
+    path = write_amc(tmp_path)
+    asf = tmp_path / "07.asf"
+    before, _, after = asf.read_text().partition(f":{section}\n")
+    own, sign, others = after.partition("\n:")
+    if damage == "missing":
+        own = ""
+    else:
+        own, _, _ = own.rpartition("end")
+    asf.write_text(f"{before}:{section}\n{own}{sign}{others}")
+    with pytest.raises(DataError, match=rf"07\.asf .*section :{section} is {damage}"):
         standard(path, proportions)
 
 

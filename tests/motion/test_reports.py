@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from test_motion_readers import directions, standard
 
-from gsgan.data.proportions import BONES
 from gsgan.motion.bvh import read_bvh
 from gsgan.motion.clip import frame_times, usual_rate
 from gsgan.motion.readers import Source, read_motion
 from gsgan.motion.standard import known_joints
+from gsgan.skeleton.proportions import BONES
 from gsgan.utils.errors import DataError
 
 REPORTS = Path(__file__).parents[3] / "shared" / "data" / "reports" / "motion"

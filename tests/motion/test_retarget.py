@@ -5,7 +5,10 @@ import pytest
 import torch
 from test_motion_readers import directions
 
-from gsgan.data.proportions import (
+from gsgan.motion.retarget import heading, joined, placed, retargeted
+from gsgan.motion.rotations import rotation
+from gsgan.skeleton import MEDIAPIPE33
+from gsgan.skeleton.proportions import (
     BONES,
     HEAD_LANDMARKS,
     HEELS_AND_TOES,
@@ -15,9 +18,6 @@ from gsgan.data.proportions import (
     middle,
     upright,
 )
-from gsgan.motion.retarget import heading, joined, placed, retargeted
-from gsgan.motion.rotations import rotation
-from gsgan.skeleton import MEDIAPIPE33
 
 ALL = torch.ones(1, 33, dtype=torch.bool)
 
@@ -57,6 +57,14 @@ def test_another_person_keeps_directions_and_gets_the_lengths(landmarks, proport
     assert np.linalg.norm(way) / np.linalg.norm(
         theirs[-1] - theirs[0]
     ) == pytest.approx(1 / (1.2 * 0.7), rel=0.02)
+
+
+@pytest.mark.parametrize("empty", [0, 1])
+def test_an_empty_clip_is_not_joined(proportions, empty):
+    clips = [proportions.rest[None], proportions.rest[None]]
+    clips[empty] = clips[empty][:0]
+    with pytest.raises(ValueError, match=f"joined: clip {empty} has no frame"):
+        joined(clips, proportions, 7)
 
 
 def test_joined_clips_keep_their_frames_their_speed_and_the_bones(proportions):

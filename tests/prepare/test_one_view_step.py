@@ -7,7 +7,7 @@ import pytest
 import torch
 from one_person import turning, world_landmarks
 
-from gsgan.body.solve import FLOOR, below_least
+from gsgan.body.solve import FLOOR, below_minimum
 from gsgan.fit.shape import shape_of
 from gsgan.prepare.one_view import (
     ACCELERATION,
@@ -69,7 +69,7 @@ def dense_step(problem: Problem, at: State) -> tuple[torch.Tensor, torch.Tensor]
     F, D = at.q.shape
     eigenvalues, axes = torch.linalg.eigh(solver.prior)
     prior = axes * eigenvalues.clamp_min(0).sqrt()
-    stop, amount = below_least(at.q, solver.least)
+    stop, amount = below_minimum(at.q, solver.minimum)
 
     def landmarks(dq: torch.Tensor, shared: torch.Tensor) -> torch.Tensor:
         body = problem.space.shaped(shape_of(problem.space, shared[PLANE:]))

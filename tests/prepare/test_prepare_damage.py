@@ -18,13 +18,13 @@ from writers.easymocap import write_calibration
 
 import gsgan.prepare.mediapipe as tool
 from gsgan.data.calibration import read_calibration
-from gsgan.data.joints import BODY
 from gsgan.motion.points import read_points3d
 from gsgan.prepare.camera_array import undistort_points
 from gsgan.prepare.dataset import publish
 from gsgan.prepare.landmarks import read_detections
 from gsgan.prepare.options import MediaPipe, Options
 from gsgan.prepare.stages import StageFolder
+from gsgan.skeleton.joints import BODY
 from gsgan.utils.errors import ConfigError, DataError, GsganError
 
 

@@ -5,12 +5,12 @@ import pytest
 from capture_scenes import ring, seen
 from make import skeletons
 
-from gsgan.data.joints import BODY, FACE, HAND_PAIRS, HANDS, LEFT, RIGHT
 from gsgan.prepare.camera_array import CameraArray
 from gsgan.prepare.cleanse import cleanse
 from gsgan.prepare.solve import Solution, SolveSettings, solve
 from gsgan.prepare.triangulate import apply_flips
 from gsgan.skeleton.hands import FINGERS, HAND
+from gsgan.skeleton.joints import BODY, FACE, HAND_PAIRS, HANDS, LEFT, RIGHT
 
 FRAMES = 8
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsgan.data.joints import BODY, FACE, FACE_MESH, RIGHT, SETS
 from gsgan.prepare.landmarks import gather, inside, read_detections
 from gsgan.skeleton.hands import HAND, hand_names
+from gsgan.skeleton.joints import BODY, FACE, FACE_MESH, RIGHT, SETS
 from gsgan.skeleton.template import MEDIAPIPE33
 from gsgan.utils.errors import DataError
 

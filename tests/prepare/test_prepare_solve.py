@@ -5,7 +5,6 @@ import pytest
 from capture_scenes import LENS, ring, seen, turned
 from make import distorted_pixels, skeletons
 
-from gsgan.data.joints import FLIP_GROUPS as GROUPS
 from gsgan.prepare import triangulate
 from gsgan.prepare.camera_array import (
     CameraArray,
@@ -16,6 +15,7 @@ from gsgan.prepare.camera_array import (
 from gsgan.prepare.cleanse import cleanse, smooth
 from gsgan.prepare.solve import SolveSettings, clock_errors, median, solve
 from gsgan.prepare.triangulate import apply_flips, find_flips, plain, robust
+from gsgan.skeleton.joints import FLIP_GROUPS as GROUPS
 from gsgan.utils.errors import ConfigError
 
 PRIORS = 2.0, 0.05  # degrees, metres

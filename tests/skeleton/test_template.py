@@ -5,7 +5,9 @@ import pytest
 
 from gsgan.skeleton import MEDIAPIPE33 as T
 from gsgan.skeleton import TEMPLATES
+from gsgan.skeleton.proportions import upright
 from gsgan.skeleton.template import N_HUBS
+from gsgan.utils.errors import DataError
 
 every_template = pytest.mark.parametrize("t", TEMPLATES.values(), ids=TEMPLATES)
 
@@ -105,3 +107,9 @@ def test_rest_directions_are_unit_and_mirrored():
     for (a, b), d in zip(T.limbs, directions, strict=True):
         twin = T.limbs.index((T.mirror[a], T.mirror[b]))
         np.testing.assert_allclose(directions[twin], d * [-1, 1, 1], atol=1e-12)
+
+
+@pytest.mark.parametrize("up", ["", "w", "+z", "-"])
+def test_an_up_axis_has_one_of_six_names(up):
+    with pytest.raises(DataError, match="up must be one of x, y, z, -x, -y, -z, got"):
+        upright(up)

@@ -28,8 +28,10 @@ def test_a_vanishing_limb_starts_at_the_least_scale():
     with torch.no_grad():
         made = psi(p, points, torch.tensor([[0.0, 1, 4]]), torch.eye(3).unsqueeze(0))
     sigma = made.covariances.diagonal(dim1=-2, dim2=-1).sqrt()[..., 0]
-    least = psi.scale_range[0] * psi.body_height
-    torch.testing.assert_close(sigma, points.scales.clamp_min(least), rtol=1e-5, atol=0)
+    minimum = psi.scale_range[0] * psi.body_height
+    torch.testing.assert_close(
+        sigma, points.scales.clamp_min(minimum), rtol=1e-5, atol=0
+    )
 
 
 @given(st.fixed_dictionaries(dict.fromkeys(NAMES, VALUES)), st.integers(0, 100))

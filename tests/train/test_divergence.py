@@ -122,7 +122,7 @@ def test_a_collapsed_discriminator_is_undone_and_stops_the_run_when_it_recurs(
     make, capsys
 ):
     spoil = Spoil(weights("discriminator", 0.0), 26)
-    words = ("training.rollback.most=1", "training.schedule.step_two=20")
+    words = ("training.rollback.max_restorations=1", "training.schedule.step_two=20")
     module, trainer, data = make(*LONGER, *words, callbacks=[spoil])
     with pytest.raises(GsganError, match="the discriminator has collapsed"):
         trainer.fit(module, data)

@@ -83,8 +83,8 @@ def markdown(frame: pd.DataFrame) -> str:
     return pages.markdown(list(frame.columns), frame.astype(str).to_numpy().tolist())
 
 
-def check_whole(config: DictConfig, **least: int) -> None:
+def check_whole(config: DictConfig, **minimum: int) -> None:
     """Raises ConfigError for keys that are not whole numbers of at least the given value."""
     # Keys of the config are the names of the arguments.
-    for name, low in least.items():
+    for name, low in minimum.items():
         whole(name, config[name], low)

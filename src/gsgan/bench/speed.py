@@ -88,9 +88,9 @@ def run(config: DictConfig, folder: Path) -> None:
 
     # Times in batches are a note below the table of stages.
     median = number(batches["median"])
-    least = number(batches["least"])
+    minimum = number(batches["minimum"])
     marks.append(
-        f"in batches of {config.batch}: {median} ms an image, at the least {least}"
+        f"in batches of {config.batch}: {median} ms an image, at the least {minimum}"
     )
     settings = {"avatar": name, **settings_of(config, avatar, frames)}
     record = {
@@ -318,8 +318,8 @@ def in_batches(
 
 def deciles(samples: Sequence[float]) -> dict[str, float]:
     """The median, the first and last decile, linear between samples, and the minimum."""
-    median, low, high, least = np.quantile(samples, [0.5, 0.1, 0.9, 0]).tolist()
-    return {"median": median, "p10": low, "p90": high, "least": least}
+    median, low, high, minimum = np.quantile(samples, [0.5, 0.1, 0.9, 0]).tolist()
+    return {"median": median, "p10": low, "p90": high, "minimum": minimum}
 
 
 def settings_of(
@@ -375,7 +375,7 @@ def text(
     table.insert(0, "stage", [*stages.index, f"**{TOTAL}**"])
     table["share"] = [*shares, f"{1000 / total['median']:.1f} frames/s"]
     table.columns = pd.Index(
-        ["stage", "median ms", "10 % below", "90 % below", "least", "share"]
+        ["stage", "median ms", "10 % below", "90 % below", "minimum", "share"]
     )
 
     # Two sentences, the table, and a list of notes.

@@ -51,7 +51,7 @@ RIG = (
     "landmarks",
     "precision",
     "prior",
-    "least",
+    "minimum",
     "rest_hubs",
     "rest_hips",
     "head_from_eyes",
@@ -75,8 +75,8 @@ FINGERS = (
     "bones",
     "axes",
     "prior",
-    "least",
-    "most",
+    "minimum",
+    "maximum",
     "rounds",
 )
 FRAMES = ("p", "visibility", "valid", "hands", "seen", "theta", "transl")

@@ -72,8 +72,8 @@ class Fingers(nn.Module):
     bones: Tensor  # [10, 3, 3] at rest: base to middle; middle to both landmarks beyond
     axes: Tensor  # [10, 5, 3] of the numbers
     prior: Tensor  # [10, 5] precisions
-    least: Tensor  # [10, 5] minimum of each number
-    most: Tensor  # [10, 5] maximum of each number
+    minimum: Tensor  # [10, 5] minimum of each number
+    maximum: Tensor  # [10, 5] maximum of each number
 
     def __init__(self, body: Body) -> None:
         super().__init__()
@@ -98,8 +98,8 @@ class Fingers(nn.Module):
             "bones": bones,
             "axes": axes,
             "prior": sigma.square().reciprocal(),
-            "least": rest.new_tensor(MIN_ANGLES)[row] - bend,
-            "most": rest.new_tensor(MAX_ANGLES)[row] - bend,
+            "minimum": rest.new_tensor(MIN_ANGLES)[row] - bend,
+            "maximum": rest.new_tensor(MAX_ANGLES)[row] - bend,
         }
         for name, value in held.items():
             self.register_buffer(name, value, persistent=False)
@@ -137,7 +137,7 @@ class Fingers(nn.Module):
         numbers = self._start(bones, weight)
         for _ in range(steps):
             numbers = numbers - self._step(numbers, bones, weight)
-            numbers = numbers.clamp(self.least, self.most)
+            numbers = numbers.clamp(self.minimum, self.maximum)
         return torch.cat(self._turns(numbers), dim=1)
 
     def _posed(self, turns: Tensor) -> Tensor:
@@ -184,7 +184,7 @@ class Fingers(nn.Module):
         before = axis_angle_to_matrix((first.unsqueeze(-1) * own).sum(2))
         beyond = (now[:, :, 1:].sum(2).unsqueeze(-2) @ before).squeeze(-2)
         second = _shown_turn(others, rest[:, :, 1:].sum(2), beyond)
-        return torch.cat([first, second], dim=2).clamp(self.least, self.most)
+        return torch.cat([first, second], dim=2).clamp(self.minimum, self.maximum)
 
     def _step(self, numbers: Tensor, bones: Tensor, weight: Tensor) -> Tensor:
         """``[B, 10, 5]``: what a Gauss-Newton step subtracts."""

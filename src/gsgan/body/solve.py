@@ -36,11 +36,11 @@ from gsgan.skeleton import (
     sanitise,
 )
 from gsgan.skeleton.hands import HAND, PALM
+from gsgan.skeleton.joints import BODY
 from gsgan.skeleton.tensors import constants
 from gsgan.utils.tensors import constant, matvec
 
-# Numbers of landmarks: of the pose, and with both hands.
-BODY = len(MEDIAPIPE33.names)
+# Number of landmarks of the pose with both hands.
 WITH_HAND_JOINTS = len(MEDIAPIPE33_HANDS.names)
 SKELETON_SIZES = [len(template.names) for template in TEMPLATES.values()]
 BEYOND = 0.05  # standard deviation of a number below its minimum
@@ -106,7 +106,7 @@ class Solver(nn.Module):
     replaced: Tensor  # [2, 33] bool, `ON_HANDS`
     precision: Tensor  # [33] of the body's own landmarks
     prior: Tensor  # [D, D] precisions
-    least: Tensor  # [D] minimum of each number
+    minimum: Tensor  # [D] minimum of each number
     matrix: Tensor  # [D, 3 T] from numbers to the turns' axis-angles
     follows: Tensor  # [E, N, 1] bool, whether a landmark follows an entry's turn
     jumps: Tensor  # [n, T + 1]
@@ -142,7 +142,7 @@ class Solver(nn.Module):
             held = {
                 "precision": known / _noise().square(),
                 "prior": precision,
-                "least": minimum,
+                "minimum": minimum,
                 "matrix": matrix.flatten(1),
                 "follows": follows[rig.entry_turn, :, None],
                 "jumps": _jumps(rig.parent),
@@ -319,11 +319,13 @@ class Solver(nn.Module):
         held[hips] = 1 / HIP_NOISE**2
         return self.precision * valid + held * ~valid[:, hips].any(1, keepdim=True)
 
-    def at_rest(self, visibility: Tensor) -> Tensor:
-        """``[B, joints]`` bool: joints at rest in `solve`, for want of visible landmarks."""
+    def at_rest(self, skeleton: Tensor, visibility: Tensor) -> Tensor:
+        """``[B, joints]`` bool: joints at rest in `solve`, for want of landmarks that are visible
+        and finite; arguments as there."""
         # The landmarks that count: those of a palm replace some of the 33.
-        seen = visibility[:, :BODY] > 0
-        hands = visibility[:, BODY:WITH_HAND_JOINTS] > 0
+        shown = (visibility > 0) & skeleton.isfinite().all(-1)
+        seen = shown[:, :BODY]
+        hands = shown[:, BODY:WITH_HAND_JOINTS]
         fingers = self.fingers if hands.shape[1] else None
         if fingers is not None:
             placed = fingers.placed(hands)
@@ -333,13 +335,13 @@ class Solver(nn.Module):
         # The numbers that they show; the root's always.
         n = seen.shape[1]
         seen = seen & self.known[:n]
-        shown = (seen.to(self.prior) @ self.reaches[:, :n].to(self.prior).mT) > 0
-        shown[:, :6] = True
+        free = (seen.to(self.prior) @ self.reaches[:, :n].to(self.prior).mT) > 0
+        free[:, :6] = True
 
         # The joints that these numbers move.
         moved = torch.zeros(len(visibility), self.parents, device=visibility.device)
         joints = self.joint[self.entry_turn].expand(len(visibility), -1)
-        moved = moved.scatter_add(1, joints, shown[:, self.entry_number].float())
+        moved = moved.scatter_add(1, joints, free[:, self.entry_number].float())
         if fingers is not None:
             moved[:, fingers.joints] += fingers.shown(hands)
         return moved == 0
@@ -484,7 +486,7 @@ class Solver(nn.Module):
         gradient = matvec(weighted, at.residual.flatten(1))
 
         # The prior, and what holds numbers above their minimum.
-        stop, below = below_least(q, self.least)
+        stop, below = below_minimum(q, self.minimum)
         pull = q @ self.prior
         penalty = pull * q + stop * below.square().nan_to_num()
         return NormalEquations(
@@ -601,10 +603,10 @@ def _solved(H: Tensor, g: Tensor) -> Tensor:
     return torch.cholesky_solve(g.unsqueeze(-1), factor).squeeze(-1)
 
 
-def below_least(q: Tensor, least: Tensor) -> tuple[Tensor, Tensor]:
-    """Precisions and amounts of numbers ``q [B, D]`` below their minimum ``least [D]``."""
+def below_minimum(q: Tensor, minimum: Tensor) -> tuple[Tensor, Tensor]:
+    """Precisions and amounts of numbers ``q [B, D]`` below their ``minimum [D]``."""
     # Numbers above their minimum are free.
-    below = (q - least).clamp_max(0)
+    below = (q - minimum).clamp_max(0)
     return (below < 0) / BEYOND**2, below
 
 

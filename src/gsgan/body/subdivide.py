@@ -25,7 +25,7 @@ def subdivided(body: B, count: int) -> B:
     return body
 
 
-def _halved(body: B, most: int) -> B:
+def _halved(body: B, maximum: int) -> B:
     """The body with at most so many edges halved, the longest first."""
     # Every edge once, and the edges ab, bc and ca of each face.
     faces = body.faces.numpy()
@@ -39,7 +39,7 @@ def _halved(body: B, most: int) -> B:
     template = body.vertices if body.template is None else body.template
     places = template.numpy()
     length = np.linalg.norm(places[edges[:, 0]] - places[edges[:, 1]], axis=1)
-    chosen = np.argsort(-length, kind="stable")[:most]
+    chosen = np.argsort(-length, kind="stable")[:maximum]
     middle = np.full(len(edges), -1)
     middle[chosen] = len(places) + np.arange(len(chosen))
     ends = torch.from_numpy(edges[chosen])  # [M, 2]

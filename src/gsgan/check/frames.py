@@ -12,11 +12,11 @@ import numpy as np
 from gsgan.check.report import Finding, listed
 from gsgan.check.settings import Limits
 from gsgan.check.views import CheckedData, MaskView, grouped
-from gsgan.data.files import read_arrays
 from gsgan.data.skeletons import bone_lengths
 from gsgan.data.validation import spans
 from gsgan.skeleton.template import SkeletonTemplate
 from gsgan.utils.arrays import Bool, Float, expect_array, nanmedian
+from gsgan.utils.pickles import read_arrays
 
 # The kinds of doubts, with their text.
 DOUBTS = {
@@ -215,12 +215,12 @@ def frame_findings(
     return findings
 
 
-def shortened(frames: Sequence[int], most: int = 8) -> str:
+def shortened(frames: Sequence[int], maximum: int = 8) -> str:
     """Frame numbers as ranges, the rest of a long list left out."""
     # Ranges count, not frames.
     ranges = spans(list(frames)).split(", ")
-    text = ", ".join(ranges[:most])
-    return f"{text} …" if len(ranges) > most else text
+    text = ", ".join(ranges[:maximum])
+    return f"{text} …" if len(ranges) > maximum else text
 
 
 def jump_distance(p: Float) -> Float:

@@ -6,12 +6,13 @@ import cv2
 import numpy as np
 
 from gsgan.check.views import CheckedData, MaskView
-from gsgan.data.crop import NEAR, Crop, project, resize, take, undistort_map
-from gsgan.data.files import read_colour
+from gsgan.data.crop import Crop, project, resize, take, undistort_map
 from gsgan.data.formats.consistency import FAR_PIXELS
 from gsgan.data.pixels import read_mask
+from gsgan.scene import NEAR
 from gsgan.skeleton.hands import HAND
 from gsgan.utils.arrays import Bytes, Float
+from gsgan.utils.image_files import read_colour
 from gsgan.utils.images import caption, encode
 
 # Pixels.

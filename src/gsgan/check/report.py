@@ -145,12 +145,12 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}{plural}"
 
 
-def listed(names: Iterable[object], most: int = 6) -> str:
+def listed(names: Iterable[object], maximum: int = 6) -> str:
     """Names with commas, the rest of a long list counted."""
     shown = list(map(str, names))
-    text = ", ".join(shown[:most])
-    if len(shown) > most:
-        text += f" and {len(shown) - most} more"
+    text = ", ".join(shown[:maximum])
+    if len(shown) > maximum:
+        text += f" and {len(shown) - maximum} more"
     return text
 
 

@@ -17,9 +17,9 @@ from gsgan.check.report import Figure, Finding, Section, Table, counted
 from gsgan.check.settings import Limits, Sampling
 from gsgan.check.views import CheckedData
 from gsgan.data.formats.consistency import camera_distances, far_cameras, spread
-from gsgan.data.proportions import axis_name
 from gsgan.effects import EffectSettings, decide
 from gsgan.effects.record import HEADERS
+from gsgan.skeleton.proportions import axis_name
 from gsgan.skeleton.sanitise import limb_length_sum
 from gsgan.utils.arrays import Float, nanmedian
 from gsgan.utils.errors import DataError

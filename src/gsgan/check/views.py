@@ -19,7 +19,7 @@ from rich.console import Console
 
 from gsgan.check.settings import Sampling
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.crop import NEAR, inside, project
+from gsgan.data.crop import inside, project
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.formats.consistency import (
     FAR_PIXELS,
@@ -31,6 +31,7 @@ from gsgan.data.formats.consistency import (
 )
 from gsgan.data.layout import Layout
 from gsgan.data.splits import Item
+from gsgan.scene import NEAR
 from gsgan.skeleton.template import MEDIAPIPE33, SkeletonTemplate
 from gsgan.utils.arrays import Bool, Float, Ints
 from gsgan.utils.console import progress
@@ -190,13 +191,13 @@ def sampled_items(subject: CheckedData, images: int) -> list[Item]:
     return items
 
 
-def cut_items(subject: CheckedData, most: int) -> list[Item]:
-    """Items with an image or mask file that was cut off, at most ``most``; nothing is decoded."""
+def cut_items(subject: CheckedData, maximum: int) -> list[Item]:
+    """At most ``maximum`` items with an image or mask file that was cut off; none is decoded."""
     layout = subject.layout
     found: list[Item] = []
     for name, files in subject.pairs.items():
         for frame in files:
-            if len(found) == most:
+            if len(found) == maximum:
                 return found
             masks = [path for _, path in layout.mask_files(name, frame)]
             if not all(map(complete, [layout.image_path(name, frame), *masks])):

@@ -16,10 +16,9 @@ import numpy as np
 import yaml
 
 from gsgan.data.cameras import CameraEntry, make_camera, numbers
-from gsgan.data.files import read_json
 from gsgan.utils.arrays import Float, as_floats
 from gsgan.utils.errors import DataError
-from gsgan.utils.files import read_text
+from gsgan.utils.files import read_json, read_text
 
 # Metres in one unit.
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}

@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsgan.data.cameras import CameraEntry, Crop
+from gsgan.scene import NEAR
 from gsgan.utils.arrays import Bytes, Float
 from gsgan.utils.checks import above
 
-# metres: points nearer than this are not seen
-NEAR = 1e-2
 # of x/z: maximum error of an undistorted point
 FOUND = 1e-8
 # OpenCV's default of 5 iterations is pixels off in the corners of a strong lens.

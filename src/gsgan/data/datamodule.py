@@ -47,7 +47,7 @@ __all__ = [
 log = logging.getLogger(__name__)
 
 # The maximum number of loading processes of each training process.
-MOST_WORKERS = 8
+MAX_WORKERS = 8
 # Choices of data.body.
 BODY_SOURCES = ("auto", "file", "fit", "none")
 # choices of effects.distortion, as the dataset calls them
@@ -84,7 +84,7 @@ class GsganData(LightningDataModule):
             or ``holistic``, also with the face of face3d.npz: 105 joints.
         protocol: the splits of a publication; None takes those of the dataset or the keys below.
         workers: loading processes; 0 loads in this one; None is 0 without a GPU, else up to
-            `MOST_WORKERS`, one per processor that each GPU has.
+            `MAX_WORKERS`, one per processor that each GPU has.
         cache_mb: bound on decoded images kept in memory, over all loading processes.
         distortion: ``auto`` and ``undistort`` undistort images on reading; ``off`` treats them as
             a pinhole's; ``project`` keeps the distortion, with the lens in ``camera.dist``.
@@ -347,16 +347,15 @@ class GsganData(LightningDataModule):
         sizes = [camera.size for camera in self.layout.cameras.values()]
         oblong = any(height != width for height, width in sizes)
 
-        # The images of the first camera decide the scale; cropped images have none.
-        scale = None
+        # Cameras of unlike sizes are scored at unlike scales; cropped images have none.
+        scales = None
         if self.crop is None:
-            side = max(sizes[0])
-            scale = (self.size or side) / side
+            scales = [self.size / max(size) if self.size else 1.0 for size in sizes]
 
         # The departures of images and backbone are found by the protocol itself.
         departures = self.protocol.departures(
             lpips_nets=lpips_nets,
-            scale=scale,
+            scales=scales,
             padded=self.crop is None and self.size is not None and oblong,
         )
         return self.protocol.record() | {"departures": list(departures)}
@@ -495,4 +494,4 @@ def default_workers() -> int:
     else:
         processors = os.cpu_count() or 1
     per_gpu = processors // torch.cuda.device_count()
-    return max(0, min(MOST_WORKERS, per_gpu - 1))
+    return max(0, min(MAX_WORKERS, per_gpu - 1))

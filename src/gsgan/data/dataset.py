@@ -17,7 +17,6 @@ from gsgan.data import crop as cropping
 from gsgan.data import pixels
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import Crop, PersonCrop
-from gsgan.data.files import read_colour
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import IGNORE_LABEL
 from gsgan.data.skeletons import Landmarks
@@ -26,6 +25,7 @@ from gsgan.scene import BodyPose, Camera, Frame, unit
 from gsgan.utils.arrays import Bytes
 from gsgan.utils.checks import whole
 from gsgan.utils.errors import DataError
+from gsgan.utils.image_files import read_colour
 
 Lens = Literal["undistort", "ignore", "raw"]
 

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.files import FrameFiles, own_entries
 from gsgan.data.pixels import MaskFile, PixelRules
 from gsgan.data.skeletons import Landmarks, Poses
 from gsgan.data.validation import (
@@ -25,6 +24,7 @@ from gsgan.data.validation import (
     frames_of,
 )
 from gsgan.utils.errors import DataError
+from gsgan.utils.frame_files import FrameFiles, own_entries
 
 # Masks by camera and frame.
 MaskIndex = Mapping[str, Mapping[int, tuple[MaskFile, ...]]]

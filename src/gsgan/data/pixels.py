@@ -12,9 +12,9 @@ from typing import Literal, NamedTuple
 import cv2
 import numpy as np
 
-from gsgan.data.files import read_alpha, read_grey, read_stored
 from gsgan.utils.arrays import Bool, Bytes
 from gsgan.utils.errors import DataError
+from gsgan.utils.image_files import read_alpha, read_grey, read_stored
 
 # The part number of pixels without a known part.
 IGNORE_LABEL = 255

@@ -84,22 +84,30 @@ class Protocol:
         return plain
 
     def departures(
-        self, *, lpips_nets: Sequence[str], scale: float | None, padded: bool = False
+        self,
+        *,
+        lpips_nets: Sequence[str],
+        scales: Sequence[float] | None,
+        padded: bool = False,
     ) -> Iterator[str]:
         """Departures of images and backbone from the protocol, one sentence each.
 
         Args:
             lpips_nets: the networks that LPIPS is computed with.
-            scale: fraction of the stored size at which images are scored; None if they are cut
-                around the person.
+            scales: fractions of the stored sizes at which each camera's images are scored; None if
+                they are cut around the person.
             padded: whole images are padded with black to squares.
         """
         # The backbone, then the size and form of the images.
         if self.lpips_net not in lpips_nets:
             yield f"LPIPS is not computed with {self.lpips_net}, as requested (lpips.nets)"
-        if scale is None:
+        if scales is None:
             yield "images are cut round the person, requested: whole images (data.crop=null)"
-        elif abs(scale - self.scale) > 1e-3:
-            yield f"images are scored at scale {scale:.3g}, requested: {self.scale:g} (data.size)"
+        for scale in sorted(set(scales or ())):
+            if abs(scale - self.scale) > 1e-3:
+                yield (
+                    f"images are scored at scale {scale:.3g}, requested: {self.scale:g} "
+                    "(data.size)"
+                )
         if padded:
             yield "images are padded to squares with black, requested: as stored (data.size=null)"

@@ -13,20 +13,22 @@ from gsgan.body import open_body
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import IGNORE_LABEL, read_labels
-from gsgan.data.proportions import BODY, Proportions, measure_proportions
 from gsgan.data.skeletons import body_height
 from gsgan.data.splits import Item, Splits
 from gsgan.data.surface_colours import SurfaceColours, body_inside, surface_colours
-from gsgan.data.training_poses import TrainingPoses, training_poses
+from gsgan.scene import NEAR
+from gsgan.skeleton.joints import BODY
+from gsgan.skeleton.proportions import Proportions, measure_proportions
 from gsgan.skeleton.sides import refuse_swapped
 from gsgan.skeleton.template import Vector
+from gsgan.skeleton.training_poses import TrainingPoses, training_poses
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.errors import DataError
 
 # mask value of solid pixels: those at the outline are darkened by the black behind them
 SOLID = 0.9
 # Images per requested sample on which the posed body is compared with masks.
-MOST_BODY_IMAGES = 2
+MAX_BODY_IMAGES = 2
 
 
 @dataclass(frozen=True)
@@ -224,7 +226,7 @@ def _scale(dataset: CaptureDataset, samples: int) -> tuple[float, float]:
             x_cam = camera.to_camera(joints.to(camera.K))
             depth = float(x_cam[..., 2].median())
             focal = float(camera.K[0, 0, 0])
-            scales.append(focal / max(depth, 1e-2))
+            scales.append(focal / max(depth, NEAR))
         medians.append(float(np.median(scales)))
     return min(medians), max(medians)
 
@@ -275,7 +277,7 @@ def _body_inside(
     # Images that show nothing of the body, or whose mask is empty, do not count.
     shares = []
     for index in evenly_spaced(
-        len(dataset.items), MOST_BODY_IMAGES * samples, ends=True
+        len(dataset.items), MAX_BODY_IMAGES * samples, ends=True
     ):
         share = body_inside(dataset[index], mesh)
         if share is not None:

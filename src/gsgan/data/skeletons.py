@@ -12,7 +12,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gsgan.data.files import LARGEST_FRAME
 from gsgan.skeleton import (
     HOLISTIC,
     MEDIAPIPE33,
@@ -28,6 +27,7 @@ from gsgan.skeleton.template import HEAD, Vector
 from gsgan.skeleton.tensors import constants
 from gsgan.utils.arrays import Bool, Float, nanmedian
 from gsgan.utils.errors import DataError
+from gsgan.utils.frame_files import LARGEST_FRAME
 
 SKELETONS = {"mediapipe33": 33}
 # shoulders and hips: the bone frames of the whole body depend on them

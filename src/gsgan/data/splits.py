@@ -7,12 +7,12 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from gsgan.data.files import LARGEST_FRAME
 from gsgan.data.layout import Layout
 from gsgan.data.protocol import Protocol
 from gsgan.data.validation import spans
 from gsgan.utils.arrays import Ints
 from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.frame_files import LARGEST_FRAME
 
 NameOrNumber = TypeVar("NameOrNumber", int, str)
 

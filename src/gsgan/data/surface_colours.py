@@ -35,9 +35,9 @@ BLUR = 0.03
 # share of the blur in the mask: outlines mix with the background
 WHOLE = 0.95
 # minimum number that two cameras share in a frame: fewer lie at outlines, at grazing angles
-LEAST_POINTS = 30
+MIN_SHARED = 30
 # minimum number of such frames
-LEAST_FRAMES = 3
+MIN_FRAMES = 3
 # metres per pixel: in coarser images every colour is a mixture
 COARSEST = 0.03
 # metres by which a body may leave the mask: masks cut off feet and hair that far
@@ -80,14 +80,14 @@ def surface_colours(moments: Sequence[Sequence[Frame]]) -> SurfaceColours | None
         for i, j in combinations(range(len(frames)), 2):
             difference = colours[i] - colours[j]
             both = difference[~np.isnan(difference[:, 0])]
-            if len(both) >= LEAST_POINTS:
+            if len(both) >= MIN_SHARED:
                 found.setdefault((i, j), []).append(both)
 
     # The median is due to the cameras, the residual to highlights and errors of the hull.
     medians = []
     residuals = []
     for differences in found.values():
-        if len(differences) >= LEAST_FRAMES:
+        if len(differences) >= MIN_FRAMES:
             pair = np.concatenate(differences)
             median = np.median(pair, axis=0)
             medians.append(median)

@@ -9,11 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.crop import NEAR, inside, project
-from gsgan.data.files import FrameFiles, check_image
+from gsgan.data.crop import inside, project
 from gsgan.data.pixels import MaskFile
 from gsgan.data.skeletons import HUBS, Landmarks, Poses
+from gsgan.scene import NEAR
 from gsgan.utils.errors import DataError
+from gsgan.utils.frame_files import FrameFiles
+from gsgan.utils.image_files import check_image
 
 Images = Mapping[str, FrameFiles]
 Index = Mapping[str, Mapping[int, str]]
@@ -21,7 +23,7 @@ Index = Mapping[str, Mapping[int, str]]
 
 
 # headers read on opening, in even steps; every image is checked again when decoded
-MOST_HEADERS = 10_000
+MAX_HEADERS = 10_000
 # frames on which the cameras are checked, in even steps
 MAX_CHECKED_FRAMES = 10_000
 
@@ -292,14 +294,14 @@ def check_images(
     stride: int,
     calibration: Path,
 ) -> None:
-    """Checks sizes and channel layouts of at most `MOST_HEADERS` images, from the headers alone.
+    """Checks sizes and channel layouts of at most `MAX_HEADERS` images, from the headers alone.
 
     Raises:
         DataError: on the first file that does not fit.
     """
     # Every `stride`-th image, fewer of a large capture.
     count = sum(map(len, images.values()))
-    stride = max(stride, -(-count // MOST_HEADERS))
+    stride = max(stride, -(-count // MAX_HEADERS))
     for name, files in images.items():
         size = cameras[name].size
         for frame in list(files)[::stride]:

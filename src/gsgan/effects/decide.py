@@ -188,7 +188,7 @@ def _one(
     if name == "distortion" and requested == "on":
         requested = "undistort"
     if name == "view_dependence" and requested == "on":
-        requested = max(1, most_degree(info, settings))
+        requested = max(1, max_degree(info, settings))
     return Effect(requested, FORCED, forced=True)
 
 
@@ -215,7 +215,7 @@ def _impossible(name: str, info: SceneInfo, requested: str | int) -> str | None:
 def _view_dependence(info: SceneInfo, settings: EffectSettings) -> Effect:
     # Few cameras see a point from too few sides to resolve its harmonics.
     cameras = info.n_train_cameras
-    degree = most_degree(info, settings)
+    degree = max_degree(info, settings)
     if degree == 0:
         return Effect(
             0, f"{cameras} training camera sees each moment from one side only"
@@ -232,7 +232,7 @@ def _view_dependence(info: SceneInfo, settings: EffectSettings) -> Effect:
     return Effect(degree, why)
 
 
-def most_degree(info: SceneInfo, settings: EffectSettings) -> int:
+def max_degree(info: SceneInfo, settings: EffectSettings) -> int:
     """The highest degree, 0 to 3, that this number of training cameras can resolve."""
     return sum(info.n_train_cameras >= count for count in settings.degree_cameras)
 

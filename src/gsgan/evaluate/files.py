@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gsgan.evaluate.origin import caption
-from gsgan.metrics.names import METRICS
+from gsgan.metrics.names import FULL, METRICS, VARIANTS
 from gsgan.utils import pages
 from gsgan.utils.files import write_atomically
 
@@ -46,12 +46,6 @@ WITH_HANDS = (
     "lpips_alex",
     "miou",
 )
-# Names in tables.
-VARIANTS = {
-    "full": "final image",
-    "splat": "Step I's colour",
-    "floor": "floor: background",
-}
 
 
 @dataclass(frozen=True)
@@ -113,7 +107,7 @@ def notes(results: Results) -> list[str]:
     # Keys of a dictionary: each note once, in the order of the table.
     found: dict[str, None] = {}
     for split, variants in results.items():
-        scores = variants["full"]
+        scores = variants[FULL]
 
         # The inputs of the metrics, and marks.
         described = scores.get("lpips_input")
@@ -156,7 +150,7 @@ def print_table(results: Results, origin: dict[str, Any], console: Console) -> N
     # Columns of metrics; those of hands only if they were scored.
     table = Table(title=TITLE, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("variant", no_wrap=True)
-    hands = any(scores["full"]["psnr_hands"] is not None for scores in results.values())
+    hands = any(scores[FULL]["psnr_hands"] is not None for scores in results.values())
     shown = WITH_HANDS if hands else IN_TERMINAL
     for metric in shown:
         table.add_column(METRICS[metric].short_heading, justify="right", no_wrap=True)

@@ -57,7 +57,9 @@ def grid_rows(frame: Frame, painting: Rendering) -> list[dict[str, Tensor]]:
     return rows
 
 
-def write_grid(rows: Sequence[dict[str, Tensor]], path: Path, least: int = 160) -> None:
+def write_grid(
+    rows: Sequence[dict[str, Tensor]], path: Path, minimum: int = 160
+) -> None:
     """Writes rows of images ``[3, H, W]`` as one PNG with a caption over each column.
 
     Smaller images are padded with black to the largest.
@@ -65,7 +67,7 @@ def write_grid(rows: Sequence[dict[str, Tensor]], path: Path, least: int = 160) 
     Args:
         rows: at least one row, each with the same captions.
         path: of the PNG.
-        least: pixels; smaller images are enlarged by a whole factor to at least this width.
+        minimum: pixels; smaller images are enlarged by a whole factor to at least this width.
     """
     # All images in the size of the largest.
     images = [image for row in rows for image in row.values()]
@@ -81,7 +83,7 @@ def write_grid(rows: Sequence[dict[str, Tensor]], path: Path, least: int = 160) 
     body = torch.cat(lines, dim=-2)
 
     # Enlarged by a whole factor.
-    scale = max(1, -(-least // width))
+    scale = max(1, -(-minimum // width))
     body = body.repeat_interleave(scale, -1).repeat_interleave(scale, -2)
     pixels = to_bytes(body)
 

@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from gsgan.body import SkinnedBody, open_body
-from gsgan.data.files import check_image, read_with_alpha
 from gsgan.data.metric_variants import MetricVariants
 from gsgan.data.splits import Item
+from gsgan.metrics.names import FULL
 from gsgan.metrics.regions import (
     BACKGROUNDS,
     box_corners,
@@ -29,6 +29,7 @@ from gsgan.metrics.regions import (
 from gsgan.scene import Frame
 from gsgan.skeleton import TEMPLATES
 from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.image_files import check_image, read_with_alpha
 
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
@@ -37,10 +38,6 @@ if TYPE_CHECKING:
 VERTEX_MARGIN = 0.05
 # metres around joints, which are inside the body; as in `PersonCrop`
 JOINT_MARGIN = 0.2
-# Variants: the final image, the colour of Step I, and the all-background image.
-FULL = "full"
-SPLAT = "splat"
-FLOOR_VARIANT = "floor"
 # of a pattern of file names
 FIELDS = ("split", "camera", "camera_index", "frame")
 FIELD = re.compile(r"\{(.*?)\}")

@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import pandas as pd
@@ -20,7 +20,6 @@ from rich.console import Console
 from gsgan.data.datamodule import GsganData
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.metric_variants import MetricVariants
-from gsgan.data.training_poses import TrainingPoses
 from gsgan.evaluate.files import (
     FACTS_FILE,
     HEADER,
@@ -32,13 +31,7 @@ from gsgan.evaluate.files import (
 from gsgan.evaluate.grids import write_grid
 from gsgan.evaluate.kept import FOLDER, KeptScores
 from gsgan.evaluate.origin import Method, fingerprint, origin, trained
-from gsgan.evaluate.predictions import (
-    FLOOR_VARIANT,
-    FULL,
-    BodyBoxes,
-    Preparation,
-    read_folder,
-)
+from gsgan.evaluate.predictions import BodyBoxes, Preparation, read_folder
 from gsgan.evaluate.scores import (
     Predict,
     Scorer,
@@ -49,6 +42,7 @@ from gsgan.evaluate.scores import (
     score_split,
 )
 from gsgan.metrics.lpips import LPIPS_NETS, build_lpips
+from gsgan.metrics.names import FLOOR_VARIANT, FULL
 from gsgan.metrics.regions import BACKGROUNDS
 from gsgan.run.assemble import build_data
 from gsgan.run.runs import avatar_of, load_avatar
@@ -59,6 +53,7 @@ from gsgan.run.stored import (
     read_checkpoint,
     read_config,
 )
+from gsgan.skeleton.training_poses import TrainingPoses
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import whole
 from gsgan.utils.console import make_console, track
@@ -245,10 +240,8 @@ def evaluate_folder(
     # By default the networks of LPIPS that the run was configured with.
     folder = Path(config.run).expanduser()
     stored = read_config(folder)
-    if config.lpips.nets is None:
-        config.lpips.nets = OmegaConf.select(
-            stored, "lpips.nets", default=list(LPIPS_NETS)
-        )
+    own = OmegaConf.select(stored, "lpips.nets", default=list(LPIPS_NETS))
+    config = _with_lpips(config, own)
 
     # The weights, and the number of steps, the time and the code that made them.
     checkpoint = read_checkpoint(folder / CHECKPOINT)
@@ -301,6 +294,13 @@ def evaluate_folder(
     )
 
 
+def _with_lpips(config: DictConfig, nets: Sequence[str]) -> DictConfig:
+    """The config with these networks of LPIPS where it names none."""
+    if config.lpips.nets is not None:
+        return config
+    return cast(DictConfig, OmegaConf.merge(config, {"lpips": {"nets": nets}}))
+
+
 def other_capture(stored: DictConfig, given: str | DictConfig) -> DictConfig:
     """A run's config with the data of another capture: its folder, or the keys that differ.
 
@@ -339,8 +339,7 @@ def evaluate_predictions(
     # Without a name, the folder's name is that of the method.
     root = Path(config.predictions).expanduser()
     name = config.method or root.resolve().name
-    if config.lpips.nets is None:
-        config.lpips.nets = list(LPIPS_NETS)
+    config = _with_lpips(config, list(LPIPS_NETS))
 
     # The data, and a folder for the results that holds no others.
     data = build_data(config)
@@ -437,31 +436,17 @@ def evaluate_method(
     """
     # Settings that commands of other packages may lack have defaults.
     scorer = make_scorer(config, data, marks)
-    if config.get("score_images") is not None:
-        most = whole("score_images", config.score_images, 1)
-        scorer.marks.append(f"at most {most} evenly spaced images of each split")
     grid_rows = 4 if config.get("grid_rows") is None else config.grid_rows
 
-    # Every split, with the images of the grid evenly spaced. Scores of a run are kept.
+    # Every split, or some of its images. Only scores of a run are kept until all are there.
     scores: dict[str, SplitScores] = {}
     for split in config.get("splits") or HELD_OUT_SPLITS:
-        # Some of its images, if the config bounds their number.
         dataset = data.dataset(split)
         count = len(dataset)
         places = evenly_spaced(count, config.get("score_images") or count)
-
-        # An interrupted scoring goes on only if nothing that scores depend on has changed.
         kept = None
         if poses is not None:
-            key = {
-                "method": asdict(method),
-                "data": fingerprint(data),
-                "images": len(places),
-                "grid_rows": grid_rows,
-                "lpips": sorted(scorer.lpips),
-                "marks": scorer.marks,
-                "measures": asdict(scorer.prepare.measures),
-            }
+            key = _key(method, data, scorer, grid_rows, len(places))
             kept = KeptScores(folder / FOLDER / f"{split}.pt", key)
         scores[split] = _score(
             f"scoring {split}",
@@ -494,6 +479,21 @@ def evaluate_method(
     shutil.rmtree(folder / FOLDER, ignore_errors=True)
     console.print(f"scores: {folder}", markup=False, highlight=False, soft_wrap=True)
     return joined.results
+
+
+def _key(
+    method: Method, data: GsganData, scorer: Scorer, grid_rows: int, images: int
+) -> dict[str, Any]:
+    """All that scores depend on: an interrupted scoring goes on only if none of it changed."""
+    return {
+        "method": asdict(method),
+        "data": fingerprint(data),
+        "images": images,
+        "grid_rows": grid_rows,
+        "lpips": sorted(scorer.lpips),
+        "marks": scorer.marks,
+        "measures": asdict(scorer.prepare.measures),
+    }
 
 
 def _score(
@@ -565,7 +565,7 @@ def make_scorer(config: DictConfig, data: GsganData, marks: Sequence[str]) -> Sc
     """The scorer of a dataset: its protocol's measures, on the config's background.
 
     Raises:
-        ConfigError: on an unknown network of LPIPS.
+        ConfigError: on an unknown network of LPIPS, or a number of images that is not one.
         DataError: if LPIPS' weights or a body model cannot be read.
     """
     marks = list(marks)
@@ -583,6 +583,11 @@ def make_scorer(config: DictConfig, data: GsganData, marks: Sequence[str]) -> Sc
         marks.append(
             f"body poses of {len(frames)} held-out frames fitted to their own masks"
         )
+
+    # Some images of each split alone.
+    if config.get("score_images") is not None:
+        maximum = whole("score_images", config.score_images, 1)
+        marks.append(f"at most {maximum} evenly spaced images of each split")
 
     # The protocol, and what departs from it.
     boxes = BodyBoxes(data) if measures.needs_body_box else None

@@ -12,13 +12,7 @@ from torch import Tensor
 from gsgan.data.metric_variants import MetricVariants
 from gsgan.data.splits import Item
 from gsgan.evaluate.grids import grid_rows
-from gsgan.evaluate.predictions import (
-    FLOOR_VARIANT,
-    FULL,
-    SPLAT,
-    Prediction,
-    Preparation,
-)
+from gsgan.evaluate.predictions import Prediction, Preparation
 from gsgan.metrics.image import (
     Score,
     edge_scores,
@@ -33,7 +27,15 @@ from gsgan.metrics.image import (
     ssim_where,
 )
 from gsgan.metrics.lpips import LpipsAgainst, LpipsScores
-from gsgan.metrics.names import BOX_METRICS, IMAGE_METRICS, METRICS, PART_METRICS
+from gsgan.metrics.names import (
+    BOX_METRICS,
+    FLOOR_VARIANT,
+    FULL,
+    IMAGE_METRICS,
+    METRICS,
+    PART_METRICS,
+    SPLAT,
+)
 from gsgan.metrics.regions import BACKGROUNDS, cleared, describe_boxes, rectangle
 from gsgan.metrics.segmentation import confusion, miou
 from gsgan.model.avatar import Avatar

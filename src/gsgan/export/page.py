@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from gsgan.body import compiled
 from gsgan.body.free import Body
 from gsgan.body.solve import Solver
-from gsgan.data.proportions import upright
 from gsgan.model.avatar import Avatar
 from gsgan.model.body_points import BodyPoints
 from gsgan.model.harmonic import Harmonic
@@ -28,6 +27,7 @@ from gsgan.motion.rotations import rotation
 from gsgan.run.drive import Drive, rest_pose
 from gsgan.run.runs import Run
 from gsgan.skeleton import complete_skeleton
+from gsgan.skeleton.proportions import upright
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.provenance import SOFTWARE, SOURCE_TYPE, XMP
 
@@ -150,12 +150,12 @@ def block(
     return zlib.compress(len(text).to_bytes(8, "little") + text + data, 9)
 
 
-def quantised(values: NDArray, most: int) -> tuple[NDArray, NDArray]:
-    """Whole numbers within ± ``most`` and their step; a matrix has one step per row."""
+def quantised(values: NDArray, maximum: int) -> tuple[NDArray, NDArray]:
+    """Whole numbers within ± ``maximum`` and their step; a matrix has one step per row."""
     size = np.abs(values)
     largest = size.max(axis=-1, keepdims=True) if values.ndim == 2 else size.max()
-    step = np.maximum(largest, 1e-12) / most  # rows of zeros have a step too
-    kind = np.int8 if most < 128 else np.int16
+    step = np.maximum(largest, 1e-12) / maximum  # rows of zeros have a step too
+    kind = np.int8 if maximum < 128 else np.int16
     return np.rint(values / step).astype(kind), np.asarray(step, np.float32)
 
 

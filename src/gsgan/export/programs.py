@@ -198,9 +198,9 @@ def onnx_program(avatar: Avatar) -> bytes:
 
     # Sides of images are free multiples of the UNet's stride.
     stride = networks.generator.stride
-    most = MAX_PROGRAM_SIDE // stride
-    height = stride * Dim("h", min=1, max=most)
-    width = stride * Dim("w", min=1, max=most)
+    maximum = MAX_PROGRAM_SIDE // stride
+    height = stride * Dim("h", min=1, max=maximum)
+    width = stride * Dim("w", min=1, max=maximum)
     shapes: dict[str, dict[int, Any] | None] = dict.fromkeys(given)
     for name, factor in times.items():
         shapes[name] = {2: factor * height, 3: factor * width}

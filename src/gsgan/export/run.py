@@ -14,6 +14,7 @@ from omegaconf import DictConfig, open_dict
 from gsgan import __version__
 from gsgan.export.page import block, page, refuse_unsuitable
 from gsgan.export.splats import Splats, glb_bytes, ply_bytes, splats_of
+from gsgan.metrics.names import FLOOR_VARIANT, VARIANTS
 from gsgan.run.drive import (
     REST,
     Drive,
@@ -57,7 +58,6 @@ SCORES = {
     "lpips_alex": "LPIPS-Alex ↓",
     "edge_f1": "edge F1 ↑",
 }
-EXPORTED_VARIANTS = {"full": "final image", "splat": "Step I's colour"}
 USE = """\
 Images of this one person in new poses and from new cameras, with the person's consent: sign
 language, research, telepresence, film. Its images are synthetic: say so where they are shown
@@ -138,9 +138,9 @@ def _scores(folder: Path) -> str:
     table = []
     for split, variants in _read(folder / "metrics.json").items():
         for variant, scores in variants.items():
-            if variant in EXPORTED_VARIANTS:
+            if variant != FLOOR_VARIANT:
                 numbers = [_number(scores.get(key)) for key in SCORES]
-                table.append((split, EXPORTED_VARIANTS[variant], *numbers))
+                table.append((split, VARIANTS[variant], *numbers))
 
     if not table:
         return "Not evaluated: run `python -m gsgan.evaluate` first."

@@ -14,10 +14,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from gsgan import __version__
-from gsgan.data.proportions import upright
 from gsgan.model.avatar import Avatar
 from gsgan.scene import BodyPose, Gaussians
 from gsgan.skeleton.densify import even_sphere
+from gsgan.skeleton.proportions import upright
 from gsgan.splat.sh import MAX_DEGREE, sh_basis
 from gsgan.utils.errors import ConfigError
 

@@ -38,7 +38,7 @@ class Fit:
     # Which poses are written, and which masks are used.
     keep: bool = False
     held_out: bool = False
-    least_mask: float = 0.1
+    min_mask: float = 0.1
 
     # The surface, and the numbers of steps, frames and cameras.
     points: int = 3000
@@ -68,7 +68,7 @@ class Fit:
         whole("fit.frames", self.frames, 1)
         whole("fit.cameras", self.cameras, 1)
         whole("fit.points", self.points, 1)
-        above("fit.least_mask", self.least_mask)
+        above("fit.min_mask", self.min_mask)
         above("fit.noise", self.noise)
         above("fit.angle_rate", self.angle_rate)
         above("fit.transl_rate", self.transl_rate)

@@ -12,13 +12,12 @@ from torch import Tensor
 from gsgan.data.datamodule import GsganData
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.splits import Item
-from gsgan.data.training_poses import pose_in_pelvis, training_poses
 from gsgan.model.body_points import farthest_points
 from gsgan.scene import Camera, Window, body_window, unit
+from gsgan.skeleton.training_poses import pose_in_pelvis, training_poses
 from gsgan.utils.arrays import Bytes, evenly_spaced
 from gsgan.utils.errors import DataError
 
-MIN_DEPTH = 0.01  # metres: nearer joints are not projected
 # metres around the joints, as in the avatar's windows: a wider margin costs time
 WINDOW_MARGIN = 0.25
 # quantile of the masks' areas that counts as usual: most masks may be nearly empty
@@ -56,10 +55,10 @@ class MaskedFrames:
     Args:
         data: the capture.
         device: of the masks.
-        least_mask: minimum share of the usual mask area.
+        min_mask: minimum share of the usual mask area.
         held_out: whether to use frames of held-out poses too.
-        most_frames: maximum number of frames, whose poses are far from each other; None uses all.
-        most_cameras: maximum number of cameras per frame; they rotate from frame to frame. None
+        max_frames: maximum number of frames, whose poses are far from each other; None uses all.
+        max_cameras: maximum number of cameras per frame; they rotate from frame to frame. None
             uses all.
         track: follows the masks that are read, for example with a progress bar.
 
@@ -71,10 +70,10 @@ class MaskedFrames:
         self,
         data: GsganData,
         device: torch.device,
-        least_mask: float = 0.1,
+        min_mask: float = 0.1,
         held_out: bool = False,
-        most_frames: int | None = None,
-        most_cameras: int | None = None,
+        max_frames: int | None = None,
+        max_cameras: int | None = None,
         track: Callable[[Sequence[int]], Iterable[int]] = iter,
     ) -> None:
         layout = data.layout
@@ -82,12 +81,12 @@ class MaskedFrames:
 
         # the frames, and the cameras of each
         used = layout.frames if held_out else data.trained
-        if most_frames is not None:
-            used = spread_frames(data, used, most_frames)
+        if max_frames is not None:
+            used = spread_frames(data, used, max_frames)
         items: list[Item] = []
         for turn, frame in enumerate(used):
             seeing = [camera for camera in cameras if frame in layout.images[camera]]
-            for camera in rotated(seeing, most_cameras, turn):
+            for camera in rotated(seeing, max_cameras, turn):
                 items.append((camera, frame))
         self.dataset = CaptureDataset(
             layout, items, data.size, data.crop, lens=data.lens
@@ -101,7 +100,7 @@ class MaskedFrames:
             self._masks[place] = self._read(place)
 
         # the masks of each frame, as places in the data set
-        places = self._usable(least_mask)
+        places = self._usable(min_mask)
         if not places:
             raise DataError(
                 f"{layout.root}: the masks of {', '.join(cameras)} hold no person"
@@ -148,7 +147,7 @@ class MaskedFrames:
         """``[1, 1, H, W]`` in [0, 1] of bytes ``[H, W]``."""
         return unit(torch.from_numpy(pixels))[None, None].to(self.device)
 
-    def _usable(self, least: float) -> list[int]:
+    def _usable(self, minimum: float) -> list[int]:
         """Places of the images whose masks hold enough of the person.
 
         Areas are of the part that is compared, in square metres at the person's depth: masks
@@ -176,21 +175,21 @@ class MaskedFrames:
         # The usual area is that of masks with a person.
         known = [area for area in areas if area > 0]
         usual = float(np.quantile(known, USUAL)) if known else np.inf
-        return [place for place, area in enumerate(areas) if area >= least * usual]
+        return [place for place, area in enumerate(areas) if area >= minimum * usual]
 
     def _stacked(self, by_frame: Mapping[int, NDArray[np.float64]]) -> Tensor:
         values = np.stack([by_frame[frame] for frame in self.frames])
         return torch.from_numpy(values).to(self.device, torch.float32)
 
 
-def spread_frames(data: GsganData, frames: Sequence[int], most: int) -> list[int]:
+def spread_frames(data: GsganData, frames: Sequence[int], maximum: int) -> list[int]:
     """At most so many frames, rising, whose poses are far from each other.
 
     The share `OUTLIERS` of the poses that are least like all others is not chosen from: wrong
     landmarks are among them.
     """
     # All frames are used if they are few.
-    if len(frames) <= most:
+    if len(frames) <= maximum:
         return list(frames)
     p, _ = data.layout.landmarks.joints(frames)
 
@@ -200,18 +199,18 @@ def spread_frames(data: GsganData, frames: Sequence[int], most: int) -> list[int
 
     # Frames of equal poses are chosen once.
     poses = pose_in_pelvis(p[usual])
-    chosen = usual[farthest_points(poses, min(most, len(usual)))]
+    chosen = usual[farthest_points(poses, min(maximum, len(usual)))]
     return sorted({frames[i] for i in chosen.tolist()})
 
 
-def rotated(cameras: Sequence[str], most: int | None, turn: int) -> list[str]:
+def rotated(cameras: Sequence[str], maximum: int | None, turn: int) -> list[str]:
     """At most so many cameras, evenly spaced; the next turn takes their neighbours."""
-    if most is None or len(cameras) <= most:
+    if maximum is None or len(cameras) <= maximum:
         return list(cameras)
 
     # The cameras are evenly spaced, and each turn begins one camera later.
     places = [
-        (turn + place) % len(cameras) for place in evenly_spaced(len(cameras), most)
+        (turn + place) % len(cameras) for place in evenly_spaced(len(cameras), maximum)
     ]
     return [cameras[place] for place in sorted(places)]
 
@@ -223,7 +222,6 @@ def around(skeleton: Tensor, seen: Silhouette) -> Silhouette:
         seen.camera,
         margin=WINDOW_MARGIN,
         multiple=16,
-        least=32,
-        near=MIN_DEPTH,
+        minimum=32,
     )
     return seen.cut(window)

@@ -107,11 +107,11 @@ def summary(report: dict[str, Any], folder: Path, masked: MaskedFrames) -> list[
     joints = sorted(distances, key=lambda joint: -np.nan_to_num(distances[joint]))
     frames = sorted(overlaps, key=lambda frame: np.nan_to_num(overlaps[frame]))
     worst = ", ".join(f"{joint} {distances[joint]:.0f}" for joint in joints[:WORST])
-    least = ", ".join(f"{frame} {overlaps[frame]:.3f}" for frame in frames[:WORST])
+    lowest = ", ".join(f"{frame} {overlaps[frame]:.3f}" for frame in frames[:WORST])
     return [
         f"{len(masked.frames)} frames, masks of {', '.join(masked.cameras)}: overlap (IoU) with "
         f"the body's surface {before['iou']:.3f} solved from the skeletons, {after['iou']:.3f} "
-        f"registered, {report['driven']['iou']:.3f} solved again; least in frames {least}",
+        f"registered, {report['driven']['iou']:.3f} solved again; least in frames {lowest}",
         f"landmarks {before['residual_mm']:.0f} mm from the skeleton's solved, "
         f"{after['residual_mm']:.0f} mm registered (medians); most: {worst}",
         f"{folder} has {SHAPE} and {POSES_FILE}; {REPORT} has all numbers",
@@ -196,6 +196,8 @@ def fit_body(
     """
     console = make_console()
     device = device or torch.device("cpu")
+
+    # What would fail after minutes of work is refused first.
     if not isinstance(data.reader, CaptureReader):
         raise ConfigError(
             "gsgan.fit supports captures in the bring-your-own layout: data=capture"
@@ -203,24 +205,10 @@ def fit_body(
     layout = data.layout
     folder = layout.root if out is None else Path(out).expanduser()
     _make_folder(folder, overwrite)
-
-    # the frames with a person in their masks; registered poses are kept of all or none
-    keeps = settings.held_out or settings.keep
     refuse_swapped_sides(layout, data.trained)
-    with progress(console) as bars:
-        frames = MaskedFrames(
-            data,
-            device,
-            settings.least_mask,
-            settings.held_out,
-            most_frames=None if keeps else settings.frames,
-            most_cameras=settings.cameras,
-            track=partial(bars.track, description="masks"),
-        )
-    if frames.left_out:
-        console.print(
-            f"{frames.left_out} images with empty masks, or nearly so, are left out"
-        )
+
+    # the frames with a person in their masks
+    frames = _masked_frames(data, settings, device, console)
     rows = torch.tensor([layout.frames.index(frame) for frame in frames.frames])
 
     # the shape and the poses by the skeletons
@@ -243,6 +231,7 @@ def fit_body(
     driven = poses[_by_hands(data)][rows].to(device)
     report = fit_report(fitter, shaped_body(shape).to(device), driven, found)
 
+    # the files, and what they say
     write_json(folder / REPORT, report)
     _write_body(
         folder=folder,
@@ -251,11 +240,37 @@ def fit_body(
         shape=shape,
         poses=poses,
         rows=rows,
-        kept=registered if keeps else None,
+        kept=registered if _keeps(settings) else None,
     )
     lines = summary(report, folder, frames)
     console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
     return folder
+
+
+def _keeps(settings: Fit) -> bool:
+    """Whether registered poses are kept, of all frames."""
+    return settings.held_out or settings.keep
+
+
+def _masked_frames(
+    data: GsganData, settings: Fit, device: torch.device, console: Console
+) -> MaskedFrames:
+    """The frames that are registered, with the progress of reading their masks."""
+    with progress(console) as bars:
+        frames = MaskedFrames(
+            data,
+            device,
+            settings.min_mask,
+            settings.held_out,
+            max_frames=None if _keeps(settings) else settings.frames,
+            max_cameras=settings.cameras,
+            track=partial(bars.track, description="masks"),
+        )
+    if frames.left_out:
+        console.print(
+            f"{frames.left_out} images with empty masks, or nearly so, are left out"
+        )
+    return frames
 
 
 def _registered(fitter: Fitter, settings: Fit, console: Console) -> BodyPose:

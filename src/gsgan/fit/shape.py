@@ -20,10 +20,11 @@ from gsgan.body.shape import (
     shaped_body,
 )
 from gsgan.body.skinned import MarkedBody
-from gsgan.body.solve import BODY, Solver
+from gsgan.body.solve import Solver
 from gsgan.scene import BodyPose
 from gsgan.skeleton import MEDIAPIPE33, sanitise
 from gsgan.skeleton.hands import HAND, HAND_EDGES, WRIST
+from gsgan.skeleton.joints import BODY
 from gsgan.utils.errors import DataError
 from gsgan.utils.tensors import matvec
 

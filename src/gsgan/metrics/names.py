@@ -1,6 +1,15 @@
-"""The metrics of an evaluation by their key in metrics.json, as tables print them."""
+"""Variants and metrics of an evaluation by their key in metrics.json, as tables print them."""
 
 from typing import NamedTuple
+
+FULL = "full"  # the final image
+SPLAT = "splat"  # Step I's colour
+FLOOR_VARIANT = "floor"  # the all-background image
+VARIANTS = {
+    FULL: "final image",
+    SPLAT: "Step I's colour",
+    FLOOR_VARIANT: "floor: background",
+}
 
 
 class Metric(NamedTuple):

@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from gsgan.data.crop import undistort
 from gsgan.metrics.image import person_box
-from gsgan.scene import Camera, Frame
+from gsgan.scene import NEAR, Camera, Frame
 from gsgan.skeleton import TEMPLATES, SkeletonTemplate
 from gsgan.skeleton.hands import HAND
 from gsgan.utils.arrays import Bool, Float
@@ -23,8 +23,6 @@ from gsgan.utils.tensors import constant
 BACKGROUNDS = {"black": 0.0, "white": 1.0}
 # Of 1/255: values that are 8-bit already must not drop by one.
 CUT_SLACK = 1e-3
-# Metres; nearer parts of the body's box are cut off.
-MIN_BOX_DEPTH = 1e-2
 # Indices of any two corners of a box.
 CORNER_PAIRS = torch.combinations(torch.arange(8))
 HANDS = "hands"
@@ -64,12 +62,12 @@ def cleared(image: Tensor, keep: Tensor, background: float) -> Tensor:
     return torch.where(keep, image, image.new_tensor(background))
 
 
-def rectangle(where: Tensor, least: int = 1) -> tuple[slice, slice] | None:
+def rectangle(where: Tensor, minimum: int = 1) -> tuple[slice, slice] | None:
     """Rows and columns of the smallest rectangle around a mask; None if it is empty.
 
     Args:
         where: ``[1, H, W]`` bool.
-        least: minimum side in pixels, limited by the image.
+        minimum: minimum side in pixels, limited by the image.
     """
     sides = []
     for dim, size in enumerate(where.shape[-2:]):
@@ -81,7 +79,7 @@ def rectangle(where: Tensor, least: int = 1) -> tuple[slice, slice] | None:
         extent = held[-1] + 1 - first
 
         # Extended equally to both sides, but not beyond the image.
-        side = min(max(extent, least), size)
+        side = min(max(extent, minimum), size)
         centred = first - (side - extent) // 2
         start = min(max(centred, 0), size - side)
         sides.append(slice(start, start + side))
@@ -157,7 +155,7 @@ def box_corners(points: Tensor, margin: float) -> Tensor:
 def box_mask(corners: Tensor, camera: Camera) -> Tensor:
     """The pixels whose centre lies in the convex hull of the projected corners.
 
-    The box is clipped at `MIN_BOX_DEPTH`, so it may reach behind the camera. With a lens, each
+    The box is clipped at `NEAR`, so it may reach behind the camera. With a lens, each
     pixel is tested at its undistorted position.
 
     Args:
@@ -202,15 +200,15 @@ def in_front(x_cam: Tensor) -> Tensor:
     corners cross it. Lines inside the box do no harm.
     """
     # The pairs of which one corner is beyond the plane.
-    beyond = x_cam[:, 2] > MIN_BOX_DEPTH
+    beyond = x_cam[:, 2] > NEAR
     first, second = CORNER_PAIRS.unbind(1)
     crosses = beyond[first] != beyond[second]
     a = x_cam[first[crosses]]
     b = x_cam[second[crosses]]
 
-    # a + share (b - a) has the depth MIN_BOX_DEPTH.
+    # a + share (b - a) has the depth NEAR.
     depth = a[:, 2:]
-    share = (MIN_BOX_DEPTH - depth) / (b[:, 2:] - depth)
+    share = (NEAR - depth) / (b[:, 2:] - depth)
     return torch.cat([x_cam[beyond], a + share * (b - a)])
 
 
@@ -252,8 +250,8 @@ def hands_and_mouth(frame: Frame, template: SkeletonTemplate) -> dict[str, Tenso
     if not template.palms:
         return {}
     camera = frame.camera
-    pixels, depth = camera.project(frame.skeleton, MIN_BOX_DEPTH)
-    seen = (frame.visibility > 0) & (depth > MIN_BOX_DEPTH)
+    pixels, depth = camera.project(frame.skeleton)
+    seen = (frame.visibility > 0) & (depth > NEAR)
 
     # Each hand's landmarks follow its wrist.
     hands = []
@@ -318,7 +316,7 @@ def mouth_square(corners: Tensor, camera: Camera) -> Tensor:
     half = MOUTH_SIDE / 2 * width * camera.R[:, :2]
     middle = corners.mean(dim=1, keepdim=True)
     ends = torch.cat([middle - half, middle + half], dim=1)
-    pixels, _ = camera.project(ends, MIN_BOX_DEPTH)
+    pixels, _ = camera.project(ends)
     return pixels
 
 

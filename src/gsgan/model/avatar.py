@@ -1,15 +1,16 @@
 """The avatar: skeleton and camera in, image out."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-from typing import Self
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
 
 from gsgan.body.solve import Solver
-from gsgan.data.training_poses import TrainingPoses
 from gsgan.effects import Effects
 from gsgan.model.body_points import BodyPoints
 from gsgan.model.colour import ColourCorrection
@@ -32,6 +33,7 @@ from gsgan.skeleton import (
     face_code,
     root_of,
 )
+from gsgan.skeleton.training_poses import TrainingPoses
 from gsgan.splat import Accuracy, rasterise
 from gsgan.utils.tensors import filled, full_precision
 
@@ -43,6 +45,38 @@ UNWATCHED: AbstractContextManager[None] = nullcontext()
 def unwatched(stage: str) -> AbstractContextManager[None]:
     """The context of a stage while no bench times it."""
     return UNWATCHED
+
+
+class Prepared(NamedTuple):
+    """The inputs of an avatar, with the values that are found before anything is rendered.
+
+    Args:
+        skeleton: ``[B, J, 3]`` metres, world, finite.
+        visibility: ``[B, J]`` in [0, 1].
+        camera: B cameras, which see the window alone.
+        body: B poses of the skinned body; None where none is needed.
+        camera_index: ``[B]`` cameras whose colours to correct for, or None.
+        window: the part of the images that is rendered; None where the cameras stayed as given.
+    """
+
+    skeleton: Tensor
+    visibility: Tensor
+    camera: Camera
+    body: BodyPose | None
+    camera_index: Tensor | None
+    window: Window | None
+
+    def to(self, device: torch.device) -> Prepared:
+        """The inputs on another device."""
+        index = self.camera_index
+        return Prepared(
+            skeleton=self.skeleton.to(device),
+            visibility=self.visibility.to(device),
+            camera=self.camera.to(device),
+            body=None if self.body is None else self.body.to(device),
+            camera_index=None if index is None else index.to(device),
+            window=self.window,
+        )
 
 
 class Avatar(nn.Module):
@@ -66,8 +100,8 @@ class Avatar(nn.Module):
         solver: of body poses that are not given, for avatars on a skinned body.
         poses: the spread of the training poses, or None.
         backend: that rasterises F, see `gsgan.splat.rasterise`.
-        window_margin, window_multiple, window_least: of the rendered window, metres and pixels; see
-            `gsgan.scene.body_window`. No margin renders whole images.
+        window_margin, window_multiple, window_minimum: of the rendered window, metres and pixels;
+            see `gsgan.scene.body_window`. No margin renders whole images.
 
     Source: paper Fig. 3 and Sec. 3.
     """
@@ -97,7 +131,7 @@ class Avatar(nn.Module):
         backend: str = "auto",
         window_margin: float | None = 0.25,
         window_multiple: int = 16,
-        window_least: int = 32,
+        window_minimum: int = 32,
     ) -> None:
         super().__init__()
 
@@ -110,7 +144,7 @@ class Avatar(nn.Module):
         self.template = template
         self.window_margin = window_margin
         self.window_multiple = window_multiple
-        self.window_least = window_least
+        self.window_minimum = window_minimum
 
         # Parts of Step I: G, Ψ or the surface's Gaussians.
         self.deformation = deformation
@@ -204,43 +238,12 @@ class Avatar(nn.Module):
         cameras = camera if len(camera) == len(p) else cat([camera] * len(p))
 
         # The image, which is on black, gets the requested background.
-        rendering = self.rendered(p, seen, cameras.to("cpu"), body, maps=False)
+        rendering = self(p, seen, cameras.to("cpu"), body, maps=False)
         assert rendering.image is not None
         assert rendering.alpha is not None
         colour = filled(background, rendering.image).expand(3).view(1, 3, 1, 1)
         image = rendering.image.clamp(0, 1)
         return (image + (1 - rendering.alpha.clamp(0, 1)) * colour).clamp(0, 1)
-
-    def rendered(
-        self,
-        skeleton: Tensor,
-        visibility: Tensor,
-        camera: Camera,
-        body: BodyPose | None = None,
-        camera_index: Tensor | None = None,
-        *,
-        maps: bool = True,
-    ) -> Rendering:
-        """`forward` of inputs on the CPU, where the body is solved and the window found.
-
-        Convention: nothing is read back from the avatar's device.
-        """
-        # The body and the window need values, so they are computed before the transfer to the
-        # device.
-        device = next(self.parameters()).device
-        body = self.body_pose(skeleton, visibility) if body is None else body
-        window = self.window(skeleton, camera)
-
-        # All inputs go to the device. `forward` renders cameras that see a window as they are.
-        rendering = self(
-            skeleton.to(device),
-            visibility.to(device),
-            (camera if window is None else window.camera(camera)).to(device),
-            None if body is None else body.to(device),
-            None if camera_index is None else camera_index.to(device),
-            maps=maps,
-        )
-        return rendering if window is None else self._pasted(rendering, window)
 
     def forward(
         self,
@@ -259,7 +262,9 @@ class Avatar(nn.Module):
         """Renders poses: I_pred and every map that led to it.
 
         Convention: a window round the person is rendered, and pasted into the whole image. Cameras
-        that see a window already (`Window.camera`) are rendered as they are.
+        that see a window already (`Window.camera`) are rendered as they are. Inputs may be on the
+        CPU: body and window are then found there, and nothing is read back from the avatar's
+        device.
 
         Args:
             skeleton: ``[B, J, 3]`` metres, world, finite: `gsgan.skeleton.sanitise` replaces joints
@@ -275,29 +280,38 @@ class Avatar(nn.Module):
             reach: metres; Ψ is not computed at points farther than this from what the cameras
                 see. None computes it at all points.
         """
-        # The window crops the cameras, so that only the part with the person is drawn.
-        body = self.body_pose(skeleton, visibility) if body is None else body
-        window = self.window(skeleton, camera)
+        # The body and the window need values, so they are found before the transfer to the device.
+        device = next(self.parameters()).device
+        prepared = self.prepared(skeleton, visibility, camera, body, camera_index)
         rendering = self._rendered(
-            skeleton,
-            visibility,
-            camera if window is None else window.camera(camera),
-            body,
+            prepared.to(device),
             pose_noise=pose_noise,
             generate=generate,
             supersample=supersample,
             reach=reach,
         )
 
-        # Step I's colour and I_pred take on the tint of the training camera.
-        if camera_index is not None:
-            rendering = self._corrected(rendering, camera_index)
+        # Image and maps in the whole image.
         rendering = rendering if maps else rendering.only_image()
-        return rendering if window is None else self._pasted(rendering, window)
-
-    def _pasted(self, rendering: Rendering, window: Window) -> Rendering:
+        if prepared.window is None:
+            return rendering
         with self.stage("paste"):
-            return rendering.pasted(window)
+            return rendering.pasted(prepared.window)
+
+    def prepared(
+        self,
+        skeleton: Tensor,
+        visibility: Tensor,
+        camera: Camera,
+        body: BodyPose | None,
+        camera_index: Tensor | None,
+    ) -> Prepared:
+        """What is rendered, on the device of the inputs; arguments as for `forward`."""
+        # The window crops the cameras, so that only the part with the person is drawn.
+        body = self.body_pose(skeleton, visibility) if body is None else body
+        window = self.window(skeleton, camera)
+        seen = camera if window is None else window.camera(camera)
+        return Prepared(skeleton, visibility, seen, body, camera_index, window)
 
     def body_pose(self, skeleton: Tensor, visibility: Tensor) -> BodyPose | None:
         """The body pose of skeletons ``[B, J, 3]``, see `Solver.solve`; None if none is needed."""
@@ -312,7 +326,7 @@ class Avatar(nn.Module):
             return None
 
         # The window's sides suit the generator's stride.
-        sides = {"multiple": self.window_multiple, "least": self.window_least}
+        sides = {"multiple": self.window_multiple, "minimum": self.window_minimum}
         margin = self.window_margin
         near = self.accuracy.near
         with self.stage("window"), full_precision(skeleton.device):
@@ -320,10 +334,7 @@ class Avatar(nn.Module):
 
     def _rendered(
         self,
-        p: Tensor,
-        visibility: Tensor,
-        camera: Camera,
-        body: BodyPose | None,
+        prepared: Prepared,
         *,
         pose_noise: Tensor | None,
         generate: bool,
@@ -331,6 +342,7 @@ class Avatar(nn.Module):
         reach: float | None,
     ) -> Rendering:
         """The drawings and images that the cameras see (paper Fig. 3)."""
+        p, visibility, camera, body, camera_index, _ = prepared
         raster = S = image = alpha = None
         with full_precision(p.device):
             # The frames of the bones serve densify, the face code and Ω.
@@ -388,7 +400,12 @@ class Avatar(nn.Module):
         if self.generator is None:
             image = raster.features[:, :3]
             alpha = raster.alpha
-        return Rendering(image, alpha, raster.features, raster.alpha, S, gaussians)
+        rendering = Rendering(image, alpha, raster.features, raster.alpha, S, gaussians)
+
+        # Step I's colour and I_pred take on the tint of the training camera.
+        if self.colour is None or camera_index is None:
+            return rendering
+        return self._corrected(rendering, raster, self.colour, camera_index)
 
     def splat(
         self,
@@ -484,19 +501,16 @@ class Avatar(nn.Module):
                 backend=self.backend,
             )
 
-    def _corrected(self, rendering: Rendering, camera_index: Tensor) -> Rendering:
+    def _corrected(
+        self,
+        rendering: Rendering,
+        raster: Raster,
+        correction: ColourCorrection,
+        camera_index: Tensor,
+    ) -> Rendering:
         """The rendering in the colours of its cameras."""
-        if (
-            self.colour is None
-            or rendering.features is None
-            or rendering.splat_alpha is None
-        ):
-            return rendering
-
         # Step I's colour, corrected with its own alpha.
-        colour = self.colour(
-            rendering.features[:, :3], rendering.splat_alpha, camera_index
-        )
+        colour = correction(raster.features[:, :3], raster.alpha, camera_index)
 
         # The image is either the same colour or the generator's, which has an alpha of its own.
         image = rendering.image
@@ -504,7 +518,7 @@ class Avatar(nn.Module):
             image = colour
         elif image is not None and rendering.alpha is not None:
             # detached: losses of the corrected colours must not move alpha
-            image = self.colour(image, rendering.alpha.detach(), camera_index)
+            image = correction(image, rendering.alpha.detach(), camera_index)
         return replace(rendering, image=image, corrected=colour)
 
 

@@ -34,9 +34,9 @@ FOLLOWED_BONES = 6
 AUTO = "auto"
 SKIN = 2.1  # square metres, the surface of a body of the stature
 STATURE = 1.75  # metres
-FEWEST = 5000
-MOST = 100_000
-LEAST = 1e-3  # a possible weight below it starts there, so that it can grow
+MIN_POINTS = 5000
+MAX_POINTS = 100_000
+MIN_WEIGHT = 1e-3  # a possible weight below it starts there, so that it can grow
 
 
 class LearntWeights(nn.Module):
@@ -92,14 +92,19 @@ class LearntWeights(nn.Module):
 
         # A point may follow its own bones first, then those of its neighbourhood.
         index = (
-            ((dense > LEAST) + around).topk(min(FOLLOWED_BONES, joints), dim=1).indices
+            ((dense > MIN_WEIGHT) + around)
+            .topk(min(FOLLOWED_BONES, joints), dim=1)
+            .indices
         )
 
         # Logarithms of the weights at the start. Bones that neither the point nor its
         # neighbourhood follows keep a weight of about zero.
-        possible = (dense + around).gather(1, index) > LEAST
+        possible = (dense + around).gather(1, index) > MIN_WEIGHT
         start = (
-            dense.gather(1, index).clamp_min(LEAST).log().masked_fill(~possible, -30.0)
+            dense.gather(1, index)
+            .clamp_min(MIN_WEIGHT)
+            .log()
+            .masked_fill(~possible, -30.0)
         )
 
         # The tables follow from the body, so that checkpoints do not hold them.
@@ -426,7 +431,7 @@ class BodyPoints(nn.Module):
 def points_for(body_height: float, scale: float, spacing: float) -> int:
     """The number of points that are ``spacing`` pixels apart, on average, in training images.
 
-    It is a multiple of 100 between the bounds `FEWEST` and `MOST`.
+    It is a multiple of 100 between the bounds `MIN_POINTS` and `MAX_POINTS`.
 
     Args:
         body_height: metres.
@@ -438,7 +443,7 @@ def points_for(body_height: float, scale: float, spacing: float) -> int:
     # The skin's area grows with the square of the stature.
     area = SKIN * (body_height / STATURE) ** 2
     count = area * (scale / spacing) ** 2
-    return int(min(max(FEWEST, round(count, -2)), MOST))
+    return int(min(max(MIN_POINTS, round(count, -2)), MAX_POINTS))
 
 
 def moved_normals(A: Tensor, normals: Tensor) -> Tensor:

@@ -98,7 +98,8 @@ class Discriminator(nn.Module):
         """For each scale its feature maps with the logits last.
 
         Raises:
-            ValueError: when the coarsest map would have a single pixel, which normalisation erases.
+            ValueError: when the coarsest map could have a single pixel. Instance normalisation
+                would erase it; without normalisation the same images are refused.
         """
         # The coarsest map must have more than one pixel.
         if min(image.shape[-2:]) < 2 * self.stride:

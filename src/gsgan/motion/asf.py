@@ -130,6 +130,9 @@ def _read_skeleton(path: Path) -> _Skeleton:
         else:
             sections[section].append(line)
 
+    for name in ("root", "bonedata", "hierarchy"):
+        _refuse_cut(name, sections[name])
+
     # Units and the root: each line has a key and its values.
     units = {"length": ["1"], "angle": ["deg"]}
     for key, *values in sections["units"]:
@@ -163,6 +166,15 @@ def _read_skeleton(path: Path) -> _Skeleton:
         metres=INCH / float(units["length"][0]),
         radians=radians,
     )
+
+
+def _refuse_cut(name: str, lines: list[list[str]]) -> None:
+    """Raises a ValueError if a section is missing, or ends before a part of it does."""
+    keys = [key for key, *_ in lines]
+    if not keys:
+        raise ValueError(f"its section :{name} is missing; is the file cut off?")
+    if keys.count("begin") != keys.count("end"):
+        raise ValueError(f"its section :{name} is cut off: a begin has no end")
 
 
 def _described_bones(lines: list[list[str]]) -> list[dict[str, list[str]]]:

@@ -12,10 +12,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsgan.data.proportions import (
-    BODY,
+from gsgan.data.skeletons import bone_lengths
+from gsgan.scene import BodyPose
+from gsgan.skeleton import MEDIAPIPE33, sanitise
+from gsgan.skeleton.joints import BODY, FACE
+from gsgan.skeleton.proportions import (
     BONES,
-    EXPRESSION,
     HAND_JOINTS,
     HIPS,
     SHOULDERS,
@@ -25,9 +27,6 @@ from gsgan.data.proportions import (
     middle,
     upright,
 )
-from gsgan.data.skeletons import bone_lengths
-from gsgan.scene import BodyPose
-from gsgan.skeleton import MEDIAPIPE33, sanitise
 from gsgan.skeleton.sanitise import MIN_TRUNK_JOINTS
 from gsgan.utils.errors import DataError
 
@@ -35,7 +34,6 @@ Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 TRUNK_LANDMARKS = (*SHOULDERS, *HIPS)
-AXES = ("x", "y", "z", "-x", "-y", "-z")
 FPS = 30.0  # assumed if neither the file nor the user gives a rate
 # Maximum relative difference of bone lengths at which a motion is the subject's own.
 OWN_LENGTHS = 0.02
@@ -73,7 +71,7 @@ class Clip:
         return len(self.p)
 
 
-def checked(motion: Clip, least_visibility: float) -> Clip:
+def checked(motion: Clip, min_visibility: float) -> Clip:
     """The motion with unseen landmarks set to NaN.
 
     Shoulders and hips are kept wherever they are finite: without them there is no skeleton. Frames
@@ -90,7 +88,7 @@ def checked(motion: Clip, least_visibility: float) -> Clip:
     # Shoulders and hips count at any visibility above 0.
     trunk = list(TRUNK_LANDMARKS)
     finite: Bool = np.asarray(np.isfinite(motion.p).all(-1))
-    known = finite & (motion.visibility >= least_visibility)
+    known = finite & (motion.visibility >= min_visibility)
     known[:, trunk] = finite[:, trunk] & (motion.visibility[:, trunk] > 0)
     good = known[:, trunk].sum(1) >= MIN_TRUNK_JOINTS
     if not good.any():
@@ -202,7 +200,7 @@ def completed(motion: Clip, up: str) -> Float:
 
     # Hands and the face.
     parts = [body.numpy()]
-    for part in (*HAND_JOINTS.values(), EXPRESSION):
+    for part in (*HAND_JOINTS.values(), FACE):
         parts.append(_bridged(whole[:, part]))
     return np.concatenate(parts, axis=1)
 

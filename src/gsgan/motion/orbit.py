@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsgan.data.proportions import Proportions, upright
 from gsgan.motion.retarget import heading
 from gsgan.motion.rotations import matvec
 from gsgan.scene import Camera
+from gsgan.skeleton.proportions import Proportions, upright
 from gsgan.utils.checks import above, between
 
 Float = NDArray[np.float64]

@@ -7,12 +7,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gsgan.data.files import frame_files
-from gsgan.data.joints import BODY, known, zeros_as_missing
 from gsgan.data.skeletons import whole_frame_ids
+from gsgan.skeleton.joints import BODY, known, zeros_as_missing
 from gsgan.skeleton.template import MEDIAPIPE33
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import read_text
+from gsgan.utils.frame_files import frame_files
 
 Float = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -9,8 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from gsgan.data.joints import FACE_MESH
-from gsgan.data.proportions import (
+from gsgan.motion.clip import Clip, rate_of
+from gsgan.motion.retarget import steadied
+from gsgan.skeleton import MEDIAPIPE33
+from gsgan.skeleton.face import rest_face
+from gsgan.skeleton.hands import FINGERS, HAND_NAMES, WRIST
+from gsgan.skeleton.joints import FACE_MESH
+from gsgan.skeleton.proportions import (
     BONES,
     EARS,
     HAND_JOINTS,
@@ -19,11 +24,6 @@ from gsgan.data.proportions import (
     Proportions,
     length,
 )
-from gsgan.motion.clip import Clip, rate_of
-from gsgan.motion.retarget import steadied
-from gsgan.skeleton import MEDIAPIPE33
-from gsgan.skeleton.face import rest_face
-from gsgan.skeleton.hands import FINGERS, HAND_NAMES, WRIST
 from gsgan.utils.errors import DataError
 
 Float = NDArray[np.float64]

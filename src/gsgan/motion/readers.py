@@ -13,11 +13,8 @@ from numpy.typing import NDArray
 from gsgan.body import free_body, open_body
 from gsgan.body.smpl import SkinnedModel, from_zju, read_smpl
 from gsgan.data.calibration import METRES
-from gsgan.data.files import read_arrays, read_json, read_json_value
 from gsgan.data.formats import smpl_motion
 from gsgan.data.formats.capture import SHAPE, read_shape
-from gsgan.data.joints import zeros_as_missing
-from gsgan.data.proportions import EXPRESSION, HIPS, SHOULDERS, Proportions
 from gsgan.data.skeletons import hips_below
 from gsgan.motion.asf import asf_of, read_amc
 from gsgan.motion.bvh import read_bvh
@@ -27,15 +24,15 @@ from gsgan.motion.pose_files import read_pose
 from gsgan.motion.retarget import rig_landmarks
 from gsgan.motion.standard import RigMotion, standard_motion
 from gsgan.scene import BodyPose
-from gsgan.skeleton import MEDIAPIPE33
+from gsgan.skeleton.joints import BODY, FACE, zeros_as_missing
+from gsgan.skeleton.proportions import HIPS, SHOULDERS, Proportions
 from gsgan.utils.arrays import as_floats, expect_array
 from gsgan.utils.errors import ConfigError, DataError
-from gsgan.utils.files import read_text
-from gsgan.utils.pickles import read_npy, read_pickle
+from gsgan.utils.files import read_json, read_json_value, read_text
+from gsgan.utils.pickles import read_arrays, read_npy, read_pickle
 
 Float = NDArray[np.float64]
 
-POSE_JOINTS = len(MEDIAPIPE33.names)
 # Keys of MediaPipe's world landmarks in its several APIs.
 WORLD_KEYS = (
     "pose_world_landmarks",
@@ -198,11 +195,11 @@ def _meta(path: Path) -> dict[str, Any]:
 
 def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Clip:
     """Landmarks as `gsgan.prepare` writes them."""
-    hands = EXPRESSION.start
-    face = EXPRESSION.stop
-    if arrays["p"].shape[1:] not in ((POSE_JOINTS, 3), (hands, 3), (face, 3)):
+    hands = FACE.start
+    face = FACE.stop
+    if arrays["p"].shape[1:] not in ((BODY, 3), (hands, 3), (face, 3)):
         raise DataError(
-            f"{path}: 'p' must have shape [F, {POSE_JOINTS}, 3], with hands [F, {hands}, 3], or "
+            f"{path}: 'p' must have shape [F, {BODY}, 3], with hands [F, {hands}, 3], or "
             f"with hands and face [F, {face}, 3]; got {list(arrays['p'].shape)}"
         )
     p = arrays["p"].astype(np.float64)
@@ -212,14 +209,12 @@ def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Clip:
     conf = np.where(np.isfinite(p).all(-1), np.nan_to_num(conf), 0.0)
 
     # People filmed from the waist up get hips below their shoulders.
-    seen = conf[:, :POSE_JOINTS] > 0
+    seen = conf[:, :BODY] > 0
     no_hips = seen[:, SHOULDERS].all(1) & ~seen[:, HIPS].any(1)
-    body = np.nan_to_num(p[:, :POSE_JOINTS])
+    body = np.nan_to_num(p[:, :BODY])
     placed = hips_below(body, seen)
     if no_hips.any() and (placed != body).any():
-        p[no_hips, :POSE_JOINTS] = np.where(
-            seen[no_hips, :, None], p[no_hips, :POSE_JOINTS], np.nan
-        )
+        p[no_hips, :BODY] = np.where(seen[no_hips, :, None], p[no_hips, :BODY], np.nan)
         for hip, shoulder in zip(HIPS, SHOULDERS, strict=True):
             p[no_hips, hip] = placed[no_hips, hip]
             conf[no_hips, hip] = conf[no_hips, shoulder]
@@ -427,7 +422,7 @@ def _landmark_row(where: str, frame: Any) -> Float:
     if isinstance(points, list) and len(points) == 1:
         points = points[0]  # the Tasks API returns a list of people
     if not points:
-        return np.repeat([[np.nan, np.nan, np.nan, 0]], POSE_JOINTS, axis=0)
+        return np.repeat([[np.nan, np.nan, np.nan, 0]], BODY, axis=0)
 
     # 33 landmarks of 4 numbers.
     try:
@@ -435,9 +430,9 @@ def _landmark_row(where: str, frame: Any) -> Float:
     except TypeError:
         rows = []
     row = as_floats(rows)
-    if row.shape != (POSE_JOINTS, 4) or np.isnan(row).any():
+    if row.shape != (BODY, 4) or np.isnan(row).any():
         raise DataError(
-            f"{where}: expected {POSE_JOINTS} landmarks with x, y, z; found {len(rows)}"
+            f"{where}: expected {BODY} landmarks with x, y, z; found {len(rows)}"
         )
     return row
 
@@ -459,9 +454,9 @@ def _with_visibility(path: Path, points: NDArray[Any], visibility: Any) -> Float
         points: ``[F, 33, 3 or 4 or 5]``; the fourth number is the visibility.
         visibility: ``[F, 33]``, or None.
     """
-    if points.ndim != 3 or points.shape[1] != POSE_JOINTS or points.shape[2] < 3:
+    if points.ndim != 3 or points.shape[1] != BODY or points.shape[2] < 3:
         raise DataError(
-            f"{path}: the world landmarks must have shape (any, {POSE_JOINTS}, 3 or 4), found "
+            f"{path}: the world landmarks must have shape (any, {BODY}, 3 or 4), found "
             f"{points.shape}"
         )
     if visibility is None and points.shape[2] > 3:

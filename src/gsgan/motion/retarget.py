@@ -1,6 +1,6 @@
 """Retargeting: a motion's directions with the subject's own bone lengths, hands, feet and face.
 
-Axes are the standard ones (`gsgan.data.proportions`), Z up; units are metres.
+Axes are the standard ones (`gsgan.skeleton.proportions`), Z up; units are metres.
 """
 
 from collections.abc import Iterable, Sequence
@@ -12,11 +12,14 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 from torch import Tensor
 
-from gsgan.data.proportions import (
-    BODY,
+from gsgan.motion.rotations import axis_angle, between, matvec, rotation, unit
+from gsgan.motion.standard import StandardMotion, drift, floor_under
+from gsgan.skeleton import MEDIAPIPE33, bone_frames, in_head
+from gsgan.skeleton.hands import FINGER_BONES, INDEX, PINKY, WRIST
+from gsgan.skeleton.joints import BODY, FACE
+from gsgan.skeleton.proportions import (
     BONES,
     EARS,
-    EXPRESSION,
     FEET,
     HAND_JOINTS,
     HAND_LANDMARKS,
@@ -32,10 +35,6 @@ from gsgan.data.proportions import (
     middle,
     part_frame,
 )
-from gsgan.motion.rotations import axis_angle, between, matvec, rotation, unit
-from gsgan.motion.standard import StandardMotion, drift, floor_under
-from gsgan.skeleton import MEDIAPIPE33, bone_frames, in_head
-from gsgan.skeleton.hands import FINGER_BONES, INDEX, PINKY, WRIST
 from gsgan.skeleton.template import CHEST, HEAD, PELVIS
 from gsgan.utils.tensors import squared_norm
 
@@ -128,7 +127,7 @@ def retargeted(p: Float, subject: Proportions, scale: float | None = None) -> Fl
     from_ears = rest[list(HEAD_LANDMARKS)] - middle(rest, EARS)
     q[:, HEAD_LANDMARKS] = ears[:, None] + from_ears @ turn.mT
     centre = q[:, MEDIAPIPE33.head].mean(1, keepdims=True)
-    result[:, EXPRESSION] = centre + given[:, EXPRESSION] @ _head_frame(q).mT
+    result[:, FACE] = centre + given[:, FACE] @ _head_frame(q).mT
     return result
 
 
@@ -281,7 +280,13 @@ def joined(clips: Sequence[Float], subject: Proportions, n: int) -> Float:
 
     A transition is a cubic that continues the joints' speeds at both ends, on the subject's bones;
     hands and faces that either end lacks (NaN) are missing in it.
+
+    Raises:
+        ValueError: if a clip has no frame.
     """
+    for i, clip in enumerate(clips):
+        if not len(clip):
+            raise ValueError(f"joined: clip {i} has no frame")
     parts = [clips[0]]
     for before, after in pairwise(clips):
         a = face_in_head(before)
@@ -311,9 +316,9 @@ def joined(clips: Sequence[Float], subject: Proportions, n: int) -> Float:
 def face_in_head(p: Float) -> Float:
     """Landmarks ``[F, J, 3]`` with the face in the head's axes, as `retargeted` takes it."""
     body = torch.from_numpy(p[:, :BODY])
-    face = torch.from_numpy(p[:, EXPRESSION])
+    face = torch.from_numpy(p[:, FACE])
     local = in_head(face, body, bone_frames(body).hubs[:, HEAD], MEDIAPIPE33)
-    return np.concatenate([p[:, : EXPRESSION.start], local.numpy()], axis=1)
+    return np.concatenate([p[:, : FACE.start], local.numpy()], axis=1)
 
 
 def heading(p: Float) -> float:

@@ -13,7 +13,6 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 from scipy.spatial.transform import Rotation
 
-from gsgan.data.proportions import axis_name
 from gsgan.motion.rig import (
     ARM,
     LEG,
@@ -24,6 +23,7 @@ from gsgan.motion.rig import (
     rest_turns,
 )
 from gsgan.motion.rotations import Array, between, blend, matvec, rotation, unit
+from gsgan.skeleton.proportions import axis_name
 from gsgan.utils.errors import DataError
 
 # Maximum tilt of trunk and legs in a zero pose that is a standing person.

@@ -11,8 +11,9 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.crop import NEAR, undistort
-from gsgan.data.joints import known
+from gsgan.data.crop import undistort
+from gsgan.scene import NEAR
+from gsgan.skeleton.joints import known
 from gsgan.utils.arrays import Bool, Float, Ints
 
 MIN_VIEWS = 2

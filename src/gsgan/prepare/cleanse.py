@@ -2,9 +2,17 @@
 
 import numpy as np
 
-from gsgan.data.joints import ALL, BODY, FACE, HANDS, PALM_JOINTS, WRIST_JOINTS, known
 from gsgan.data.skeletons import bone_lengths
 from gsgan.skeleton.hands import FINGER_BONES, HAND
+from gsgan.skeleton.joints import (
+    ALL,
+    BODY,
+    FACE,
+    HANDS,
+    PALM_JOINTS,
+    WRIST_JOINTS,
+    known,
+)
 from gsgan.utils.arrays import Bool, Float, nanmedian
 
 Bones = tuple[tuple[int, int], ...]
@@ -64,8 +72,8 @@ def cleanse(p: Float) -> tuple[Float, dict[str, int]]:
     if has_hands:
         palms = _misfit(p, HAND_BONES, HAND_BONE)
         palms = palms.reshape(len(p), 2, len(PALM_JOINTS))
-        most = palms.sum(-1) * 2 > len(PALM_JOINTS)
-        wrong[:, HANDS] |= most.repeat(HAND, axis=1)
+        majority = palms.sum(-1) * 2 > len(PALM_JOINTS)
+        wrong[:, HANDS] |= majority.repeat(HAND, axis=1)
         _mark_ends(
             wrong,
             FINGERS_OF_BOTH,

@@ -14,11 +14,11 @@ import numpy as np
 import gsgan
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.formats.capture import read_capture
-from gsgan.data.joints import BODY, FACE, HANDS, joint_names, known
-from gsgan.data.proportions import axis_name
 from gsgan.prepare.images import scaled
 from gsgan.prepare.options import Inputs, Options
 from gsgan.prepare.solve import Solution
+from gsgan.skeleton.joints import BODY, FACE, HANDS, joint_names, known
+from gsgan.skeleton.proportions import axis_name
 from gsgan.utils.arrays import Float, Ints
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import write_json, write_npz, writing

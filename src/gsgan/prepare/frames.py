@@ -6,14 +6,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gsgan.data.files import read_arrays, read_grey
-from gsgan.data.joints import known
 from gsgan.data.skeletons import HUBS
 from gsgan.prepare.images import JPEG_QUALITY
 from gsgan.prepare.sources import Recording, opened, video_recording
+from gsgan.skeleton.joints import known
 from gsgan.utils.arrays import Bool, Bytes, Float, Ints
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import write_npz, writing
+from gsgan.utils.image_files import read_grey
+from gsgan.utils.pickles import read_arrays
 
 # Images per second, unless that makes fewer than FEW_IMAGES or more than MAX_IMAGES.
 IMAGE_RATE = 12.0

@@ -10,13 +10,13 @@ import numpy as np
 
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import Crop, resize, take, undistort_map
-from gsgan.data.files import frame_files, last_number
 from gsgan.data.pixels import read_mask_values
 from gsgan.prepare.sources import IMAGE_SUFFIXES, Recording
 from gsgan.prepare.stages import Advance
 from gsgan.utils.arrays import Bytes
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import writing
+from gsgan.utils.frame_files import frame_files, last_number
 
 MIN_BLOB = 0.02  # share of the largest piece of a mask: smaller ones are removed
 JPEG_QUALITY = 95  # of jpg, 1 to 100

@@ -7,8 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gsgan.data.files import read_arrays, read_json
-from gsgan.data.joints import (
+from gsgan.data.skeletons import whole_frame_ids
+from gsgan.motion.points import json_files
+from gsgan.skeleton.hands import HAND
+from gsgan.skeleton.joints import (
     ALL,
     BODY,
     BODY_25B,
@@ -20,14 +22,17 @@ from gsgan.data.joints import (
     SETS,
     known,
 )
-from gsgan.data.skeletons import whole_frame_ids
-from gsgan.motion.points import json_files
-from gsgan.skeleton.hands import HAND
 from gsgan.utils.arrays import Float, Ints, expect_array
 from gsgan.utils.errors import DataError
+from gsgan.utils.files import read_json
+from gsgan.utils.pickles import read_arrays
 
 # Joint 8 farther than this from the middle of the hips, as a share of the trunk, is another one.
 MIDDLE_OF_HIPS = 0.35
+UNTOLD = (
+    "its 25 joints were read as BODY_25, which cannot be told from BODY_25B: no frame shows neck "
+    "and hips"
+)
 MESH_LANDMARKS = 468  # landmarks of MediaPipe's face mesh
 PIXEL_CENTRE = 0.5  # added to detectors that count from the centre of the first pixel
 OPENPOSE_KEYS = (
@@ -46,6 +51,7 @@ class Detections:
     # [F, J, 2] pixels of the image as stored, pixel centres at +0.5; NaN = not seen
     px: Float
     conf: Float  # [F, J] in [0, 1], 0 = not seen
+    notes: tuple[str, ...] = ()  # what is doubtful, for the user
 
 
 def find_landmarks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
@@ -84,7 +90,7 @@ def read_detections(path: Path) -> Detections:
     conf = np.where(known(found.px), np.nan_to_num(found.conf), 0.0)
     conf = np.clip(conf, 0.0, 1.0)[order]
     px = np.where(conf[..., None] > 0, found.px[order], np.nan)
-    return Detections(found.frame_id[order], px, conf)
+    return Detections(found.frame_id[order], px, conf, found.notes)
 
 
 class Gathered(NamedTuple):
@@ -140,14 +146,15 @@ def _read_json(path: Path) -> Detections:
     best = []
     for file in files.values():
         best.append(max(_read_people(file), key=_confidence, default=None))
-    numbers = joint_numbers([person.body for person in best if person is not None])
+    bodies = [person.body for person in best if person is not None]
+    numbers, notes = joint_numbers(bodies)
 
     px = np.full((len(files), ALL, 2), np.nan)
     conf = np.zeros((len(files), ALL))
     for f, person in enumerate(best):
         if person is not None:
             px[f], conf[f] = _joints(person, numbers)
-    return Detections(np.array(list(files)), px, conf)
+    return Detections(np.array(list(files)), px, conf, notes)
 
 
 def _read_npz(path: Path) -> Detections:
@@ -240,11 +247,14 @@ def _person(person: Mapping[str, Any], keys: tuple[str, ...]) -> _Person:
     return _Person(body, left, right)
 
 
-def joint_numbers(bodies: Sequence[Float]) -> dict[int, dict[int, int]]:
-    """The numbers of MediaPipe's joints in bodies of each count of joints.
+def joint_numbers(
+    bodies: Sequence[Float],
+) -> tuple[dict[int, dict[int, int]], tuple[str, ...]]:
+    """The numbers of MediaPipe's joints in bodies of each count of joints, and notes on doubts.
 
     Two sets have 25 joints. Joint 8 of BODY_25 is the middle of the hips, joints 9 and 12; of
-    BODY_25B it is an elbow.
+    BODY_25B it is an elbow. Where no frame shows these joints and the neck, it is taken for
+    BODY_25, with a note.
 
     Args:
         bodies: ``[n, 3]`` x, y, confidence of a person, in all frames.
@@ -253,9 +263,8 @@ def joint_numbers(bodies: Sequence[Float]) -> dict[int, dict[int, int]]:
 
     # The distance of joint 8 from the middle of the hips, as a share of the trunk.
     distances = []
-    for body in bodies:
-        if len(body) != 25:
-            continue
+    of_25 = [body for body in bodies if len(body) == 25]
+    for body in of_25:
         used = body[[1, 8, 9, 12]]
         neck, eighth, right, left = used[:, :2]
         if (used[:, 2] > 0).all():
@@ -264,7 +273,8 @@ def joint_numbers(bodies: Sequence[Float]) -> dict[int, dict[int, int]]:
             distances.append(np.linalg.norm(eighth - hips) / trunk)
     if distances and np.median(distances) > MIDDLE_OF_HIPS:
         numbers[25] = BODY_25B
-    return numbers
+    notes = (UNTOLD,) if of_25 and not distances else ()
+    return numbers, notes
 
 
 def _joints(

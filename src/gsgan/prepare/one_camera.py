@@ -15,18 +15,6 @@ from rich.console import Console
 from gsgan.body.shape import BodyShape, shaped_body
 from gsgan.data.calibration import Calibration
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.files import read_arrays
-from gsgan.data.joints import (
-    ALL,
-    ARM_PAIRS,
-    BODY,
-    FLIP_GROUPS,
-    HANDS,
-    LEFT,
-    LEG_PAIRS,
-    RIGHT,
-    WRIST_JOINTS,
-)
 from gsgan.prepare import landmarks
 from gsgan.prepare.camera_array import CameraArray
 from gsgan.prepare.cleanse import cleanse, smooth
@@ -47,8 +35,20 @@ from gsgan.prepare.stages import StageFolder
 from gsgan.prepare.triangulate import exchanged
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.skeleton.hands import HAND
+from gsgan.skeleton.joints import (
+    ALL,
+    ARM_PAIRS,
+    BODY,
+    FLIP_GROUPS,
+    HANDS,
+    LEFT,
+    LEG_PAIRS,
+    RIGHT,
+    WRIST_JOINTS,
+)
 from gsgan.utils.arrays import Bool, Float, Ints, expect_array, nanmedian
 from gsgan.utils.errors import DataError
+from gsgan.utils.pickles import read_arrays
 
 # The diagonal of film in millimetres, to which equivalent focal lengths refer.
 FILM = np.hypot(36.0, 24.0)

@@ -40,7 +40,7 @@ from torch import Tensor
 from gsgan.body.lbs import axis_angle_to_matrix, shortest_turn
 from gsgan.body.rig import ancestors
 from gsgan.body.shape import BodyShape, free_space
-from gsgan.body.solve import FLOOR, Solver, below_least
+from gsgan.body.solve import FLOOR, Solver, below_minimum
 from gsgan.fit.shape import shape_of, shape_prior, without_surface
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.utils.arrays import Float, evenly_spaced
@@ -487,7 +487,7 @@ class Problem:
         found = self.terms(X, at.shared[:PLANE], linear=False)
 
         # The priors of poses, of the size and of shared numbers, and the joints' limits.
-        stop, amount = below_least(at.q, solver.least)
+        stop, amount = below_minimum(at.q, solver.minimum)
         of_poses = ((at.q @ solver.prior) * at.q).sum()
         pull = of_poses + (stop * amount.square()).sum()
         pull = pull + self.too_large(at.shared[PLANE:]).square()
@@ -538,7 +538,7 @@ class Problem:
             G[..., PLANE:] = self._by_shape(at, solver).flatten(1, 2)
 
         # Poses: the landmarks by the chain rule, the prior and the joints' limits.
-        stop, amount = below_least(at.q, solver.least)
+        stop, amount = below_minimum(at.q, solver.minimum)
         pose_pose = J.mT @ (found.W @ J) + solver.prior
         pose_pose = pose_pose + torch.diag_embed(stop + FLOOR)
         g_pose = (J.mT @ found.g[..., None])[..., 0]

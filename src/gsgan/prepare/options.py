@@ -17,11 +17,11 @@ from gsgan.prepare.sources import (
     pair_cameras,
     recording_notes,
 )
+from gsgan.skeleton.proportions import UP_AXES
 from gsgan.utils.checks import above, between, one_of, whole
 from gsgan.utils.errors import ConfigError, DataError
 
 MEDIAPIPE = "mediapipe"
-UP_AXES = ("x", "y", "z", "-x", "-y", "-z")
 # Options that do not change the dataset.
 FREE_OPTIONS = ("out", "setup", "workers", "overwrite", "keep_work")
 

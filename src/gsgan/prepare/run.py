@@ -11,8 +11,6 @@ from rich.console import Console
 
 from gsgan.check.report import Table
 from gsgan.check.run import check_capture
-from gsgan.data.files import read_json
-from gsgan.data.joints import BODY, FACE, HANDS, known
 from gsgan.data.splits import parse_frames
 from gsgan.data.validation import Thresholds, check_distance
 from gsgan.prepare import landmarks
@@ -28,9 +26,10 @@ from gsgan.prepare.sources import stamp
 from gsgan.prepare.stages import Advance, StageFolder, digest, each_camera
 from gsgan.prepare.triangulate import plain
 from gsgan.skeleton import MEDIAPIPE33
+from gsgan.skeleton.joints import BODY, FACE, HANDS, known
 from gsgan.utils.arrays import Float, Ints
 from gsgan.utils.errors import DataError
-from gsgan.utils.files import write_json
+from gsgan.utils.files import read_json, write_json
 
 DELAY = 0.5  # frames: larger delays of a clock are noted
 DELAY_GAIN = 0.05  # share of the error that correcting a delay must remove
@@ -178,9 +177,7 @@ def prepare(options: Options, console: Console) -> Path:
         options = replace(options, face=False)
     else:
         found, masks = find_people(options, inputs.sources, stages, console.print)
-        detections = {}
-        for name in inputs.sources:
-            detections[name] = landmarks.read_detections(found[name])
+        inputs, detections = with_detections(inputs, found)
         frames, solution = _solved(options, inputs, detections, console)
 
     # The dataset, in a folder of its own until it is complete; a run that was killed leaves one.
@@ -209,6 +206,24 @@ def prepare(options: Options, console: Console) -> Path:
     )
     console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
     return out
+
+
+def with_detections(
+    inputs: Inputs, found: Mapping[str, Path]
+) -> tuple[Inputs, dict[str, Detections]]:
+    """The inputs with a note on all that is doubtful in the detections, and these by camera.
+
+    Args:
+        inputs: the cameras.
+        found: by camera, its file or folder of landmarks.
+    """
+    notes = [*inputs.notes]
+    detections = {}
+    for name in inputs.sources:
+        detections[name] = landmarks.read_detections(found[name])
+        for note in detections[name].notes:
+            notes.append(f"{name}: {note}")
+    return replace(inputs, notes=notes), detections
 
 
 def _refuse_errors(out: Path) -> None:

@@ -4,15 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsgan.data.joints import (
-    ALL,
-    BODY,
-    FLIP_GROUPS,
-    HAND_PAIRS,
-    HANDS,
-    WRIST_JOINTS,
-    known,
-)
 from gsgan.prepare.camera_array import (
     MIN_VIEWS,
     UNIT_FOCAL,
@@ -31,6 +22,15 @@ from gsgan.prepare.triangulate import (
     robust,
 )
 from gsgan.skeleton.hands import HAND
+from gsgan.skeleton.joints import (
+    ALL,
+    BODY,
+    FLIP_GROUPS,
+    HAND_PAIRS,
+    HANDS,
+    WRIST_JOINTS,
+    known,
+)
 from gsgan.utils.arrays import Bool, Float, Ints, evenly_spaced, nanmedian
 from gsgan.utils.checks import above, at_least, whole
 

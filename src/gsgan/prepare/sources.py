@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.files import frame_files, natural_order, read_colour, read_header
 from gsgan.utils.arrays import Bytes
 from gsgan.utils.errors import DataError
+from gsgan.utils.frame_files import frame_files, natural_order
+from gsgan.utils.image_files import read_colour, read_header
 
 VIDEO_SUFFIXES = (
     ".mp4",

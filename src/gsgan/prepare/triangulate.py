@@ -6,9 +6,9 @@ from itertools import combinations
 
 import numpy as np
 
-from gsgan.data.crop import NEAR
-from gsgan.data.joints import known
 from gsgan.prepare.camera_array import MIN_VIEWS, CameraArray
+from gsgan.scene import NEAR
+from gsgan.skeleton.joints import known
 from gsgan.utils.arrays import Bool, Float, Ints, nanmedian
 
 # Errors are in thousandths of the focal length: pixels, at a focal length of 1000 pixels.

@@ -13,13 +13,13 @@ from torch import Tensor
 from gsgan.data.calibration import read_calibration
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import PersonCrop, square_window
-from gsgan.data.training_poses import TrainingPoses
 from gsgan.model.avatar import Avatar
 from gsgan.motion.orbit import Orbit
 from gsgan.render.output import Output
 from gsgan.run.drive import Drive, distilled_of, drive_of, inputs_of, joints_of
 from gsgan.run.runs import Run
 from gsgan.scene import Camera, cat
+from gsgan.skeleton.training_poses import TrainingPoses
 from gsgan.utils.checks import above, whole
 from gsgan.utils.console import make_console, track
 from gsgan.utils.errors import ConfigError, DataError
@@ -82,10 +82,10 @@ def _print_distances(
 
     # One distance per frame, in deviations of the training poses.
     far = poses.distance(p)
-    most = int(far.argmax())
+    farthest = int(far.argmax())
     console.print(
         f"distance from the training poses, in deviations: {far.median():.1f} in the median, "
-        f"{far[most]:.1f} in frame {drive.numbers[most]}",
+        f"{far[farthest]:.1f} in frame {drive.numbers[farthest]}",
         highlight=False,
         soft_wrap=True,
     )
@@ -234,9 +234,7 @@ def _images(
         try:
             with torch.no_grad():
                 p, visibility, body = inputs_of(run.avatar, drive, i)
-                found = run.avatar.rendered(
-                    p, visibility, camera, body, colours, maps=False
-                )
+                found = run.avatar(p, visibility, camera, body, colours, maps=False)
             assert found.image is not None
             assert found.alpha is not None
             yield eight_bits(

@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gsgan.evaluate.files import FACTS_FILE, METRICS_FILE
-from gsgan.run.stored import CONFIG, hydra_record, record
+from gsgan.run.stored import CONFIG, hydra_record, read_yaml, record
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.sweeps import unfinished
 
@@ -246,9 +246,7 @@ def _read_settings(folder: Path) -> dict[str, Any] | None:
     predictions."""
     if not (folder / CONFIG).is_file():
         return None
-    config = OmegaConf.load(folder / CONFIG)
-    if not isinstance(config, DictConfig):
-        raise ValueError(f"{CONFIG} is not a config")
+    config = read_yaml(folder / CONFIG)
     config.seed = 0  # data and training interpolate it
     return dict(flat(record(config)))
 

@@ -5,15 +5,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from gsgan.data.splits import SPLITS
-from gsgan.metrics.names import METRICS
+from gsgan.metrics.names import FULL, METRICS, SPLAT
 from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError
 
-# Variants in metrics.json: the final image, Step I's colour, the all-background image. They are
-# those of `gsgan.evaluate.predictions`, which would be slow to import here.
-PAINTED = "full"
-SPLATTED = "splat"
-BACKGROUND = "floor"
 MEAN = "mean"  # the column over subjects
 
 
@@ -37,7 +32,7 @@ class RowSpec:
 
     run: str  # name of a model or method
     label: str | None = None  # None: the name
-    variant: str = PAINTED  # the final image, or ``splat``: Step I's colour
+    variant: str = FULL  # the final image, or ``splat``: Step I's colour
 
 
 @dataclass(frozen=True)
@@ -54,7 +49,7 @@ class TableSpec:
     splits: Sequence[str]  # one grid each
     rows: Sequence[RowSpec] | None = None  # None: a row per name
     by: Sequence[str] | None = None  # settings whose values have rows of their own
-    variants: Sequence[str] = (PAINTED,)
+    variants: Sequence[str] = (FULL,)
     subjects: Sequence[str] | None = None  # columns, with a grid per metric
     data: str | None = None  # the only data set of the runs
     paper: str | None = None  # a table of paper.yaml
@@ -79,7 +74,7 @@ class TableSpec:
         for key, known, values in (
             ("metrics", METRICS, self.metrics),
             ("splits", SPLITS, self.splits),
-            ("variants", (PAINTED, SPLATTED), variants),
+            ("variants", (FULL, SPLAT), variants),
             ("times_1000", METRICS, self.times_1000),
         ):
             if not values and key != "times_1000":

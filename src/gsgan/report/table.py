@@ -13,8 +13,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from rich.markdown import Markdown
 
-from gsgan.data.files import natural_order
-from gsgan.metrics.names import BOX_METRICS, METRICS
+from gsgan.metrics.names import BOX_METRICS, FLOOR_VARIANT, FULL, METRICS, SPLAT
 from gsgan.report.paper import PaperTable, read_paper
 from gsgan.report.runs import (
     DATA,
@@ -26,10 +25,7 @@ from gsgan.report.runs import (
     read_runs,
 )
 from gsgan.report.spec import (
-    BACKGROUND,
     MEAN,
-    PAINTED,
-    SPLATTED,
     RowSpec,
     TableSpec,
     written,
@@ -48,6 +44,7 @@ from gsgan.report.write import (
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.files import write_atomically
+from gsgan.utils.frame_files import natural_order
 
 FLOOR_LABEL = "all background (floor)"
 SPREAD_REMARK = (
@@ -123,7 +120,7 @@ class Part:
         rows = []
         for name in self.names:
             for variant in self.spec.variants:
-                label = f"{name}: Step I's colour" if variant == SPLATTED else None
+                label = f"{name}: Step I's colour" if variant == SPLAT else None
                 if any(run.of(self.split, variant) for run in self.of(name)):
                     rows.append(RowSpec(name, label, variant))
         return rows
@@ -141,7 +138,7 @@ class Part:
             if column == MEAN:
                 continue
             for run in self.of(None, column):
-                for variant in (PAINTED, SPLATTED, BACKGROUND):
+                for variant in (FULL, SPLAT, FLOOR_VARIANT):
                     value, note = _value(run, self.split, variant, metric)
                     seed = str(run.seed)
                     rows.append((run.name, variant, column, seed, value, note))
@@ -153,7 +150,7 @@ class Part:
         frame.loc[shown_larger, "value"] *= 1000
 
         # Of equal rows, such as the floors of all runs, one with a value is kept.
-        frame.loc[frame.variant == BACKGROUND, ["name", "seed"]] = "", NO_SEED
+        frame.loc[frame.variant == FLOOR_VARIANT, ["name", "seed"]] = "", NO_SEED
         frame = frame.sort_values("value", kind="stable", na_position="last")
         frame = frame.drop_duplicates(names[:4]).sort_index()
         if self.metric is None:
@@ -227,7 +224,7 @@ def _row_facts(run: ScoredRun, split: str) -> dict[str, Any]:
         "kind": "predictions" if run.seed is None else "a model trained here",
         "settings": run.settings,
         "iterations": run.facts.get("iterations"),
-        "marks": "; ".join(run.of(split, PAINTED).get("marks", [])) or "none",
+        "marks": "; ".join(run.of(split, FULL).get("marks", [])) or "none",
     }
 
 
@@ -251,7 +248,7 @@ def _column_facts(
     return facts | {
         DATA: str(run.data.get("fingerprint")),
         "images scored": run.images(split),
-        "PSNR of an all-background image": run.of(split, BACKGROUND).get("psnr"),
+        "PSNR of an all-background image": run.of(split, FLOOR_VARIANT).get("psnr"),
         "values of the protocol": record,
     }
 
@@ -380,14 +377,14 @@ def _grid(part: Part, paper: PaperTable | None) -> Grid:
     rows: list[Row] = []
     for spec in part.rows:
         rows.append(_row(part, spec, beside_paper=paper is not None))
-        if spec.variant == PAINTED:
+        if spec.variant == FULL:
             rows += printed.pop(spec.run, [])
     for left in printed.values():
         rows += left
     rows = _with_best(rows, part)
 
     # The floor is last, and never marked as the best.
-    floor = [part.cell("", BACKGROUND, column) for column in columns]
+    floor = [part.cell("", FLOOR_VARIANT, column) for column in columns]
     rows.append(Row(FLOOR_LABEL, floor, (NOT_HAD, *_origin(part.runs)), "floor"))
 
     # The metric is in the headings, or in the title if subjects are the columns.
@@ -419,7 +416,7 @@ def _row(part: Part, spec: RowSpec, *, beside_paper: bool) -> Row:
         elif found := next(filter(None, departures), None):
             notes.append(f"differs from experiment=paper: {', '.join(found)}")
         else:
-            whole = (spec.run, spec.variant) == ("full", PAINTED)
+            whole = (spec.run, spec.variant) == ("full", FULL)
             label = NAME if whole else f"{NAME}, {label}"
 
     # Columns of subjects may have different numbers of seeds.

@@ -37,7 +37,12 @@ if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData  # loads lightning
 
 
-OPTIONS = ("backend", "window_margin", "window_multiple", "window_least")  # of `Avatar`
+OPTIONS = (
+    "backend",
+    "window_margin",
+    "window_multiple",
+    "window_minimum",
+)  # of `Avatar`
 
 
 def build_data(config: DictConfig) -> GsganData:
@@ -121,7 +126,7 @@ class AvatarParts:
         pose_encoder, generator: Ω (or the flat skeleton) to g; the UNet. Without them Step I's
             colour is the image (``splat_only``).
         low_pass, supersample, backend: of F, and of S as far as it has them.
-        window_margin, window_multiple, window_least: of `Avatar`.
+        window_margin, window_multiple, window_minimum: of `Avatar`.
 
     Raises:
         ValueError: on parts that do not go together.
@@ -143,7 +148,7 @@ class AvatarParts:
     backend: str = "auto"
     window_margin: float | None = 0.25
     window_multiple: int = 16
-    window_least: int = 32
+    window_minimum: int = 32
 
     def __post_init__(self) -> None:
         one_of("model.backend", self.backend, BACKENDS)

@@ -24,7 +24,7 @@ DEPTH_TOLERANCE = 0.03
 CELLS = 2.0  # cells of the depth map per median occluder radius
 # cells, the largest occluder radius: a disc close to the camera would fill the map
 MAX_RADIUS_CELLS = 8
-MOST_CELLS = 2048  # along a side of the depth map
+MAX_CELLS = 2048  # along a side of the depth map
 
 
 def labelled_body(
@@ -188,7 +188,7 @@ def seen(points: Tensor, reach: Tensor, camera: Camera, tolerance: float) -> Ten
 
     # Cells are enlarged if the map would have too many of them.
     extent = pixel[ahead].amax(0) - pixel[ahead].amin(0)
-    cell = torch.maximum(cell, extent.max() / MOST_CELLS).clamp_min(1e-6)
+    cell = torch.maximum(cell, extent.max() / MAX_CELLS).clamp_min(1e-6)
 
     # A point is seen if it is not much deeper than the nearest disc over its cell.
     at = (pixel[ahead] / cell).floor().long()
@@ -223,9 +223,9 @@ def _depth_map(at: Tensor, depth: Tensor, radius: Tensor) -> Tensor:
 def _majority(votes: Tensor) -> tuple[Tensor, Tensor]:
     """The winner of each row ``[V]``, and whether there is exactly one ``[V]``."""
     # Vertices without votes have a maximum of zero, which all labels share.
-    most = votes.amax(dim=1)
-    winners = votes == most[:, None]
-    return winners.int().argmax(dim=1), (most > 0) & (winners.sum(dim=1) == 1)
+    maximum = votes.amax(dim=1)
+    winners = votes == maximum[:, None]
+    return winners.int().argmax(dim=1), (maximum > 0) & (winners.sum(dim=1) == 1)
 
 
 def _from_the_nearest(vertices: Tensor, labels: Tensor, decided: Tensor) -> Tensor:

@@ -12,19 +12,10 @@ from numpy.typing import NDArray
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from gsgan.data.proportions import (
-    BODY,
-    EXPRESSION,
-    HAND_JOINTS,
-    HEELS_AND_TOES,
-    Proportions,
-    upright,
-)
 from gsgan.data.splits import SPLITS
 from gsgan.model.avatar import Avatar
 from gsgan.model.harmonic import Harmonic, distilled
 from gsgan.motion.clip import (
-    AXES,
     FPS,
     Clip,
     checked,
@@ -39,6 +30,14 @@ from gsgan.motion.retarget import expressed, face_in_head, joined, placed, retar
 from gsgan.run.runs import Run
 from gsgan.scene import BodyPose, Camera, cat
 from gsgan.skeleton import complete_skeleton, sanitise
+from gsgan.skeleton.joints import BODY, FACE
+from gsgan.skeleton.proportions import (
+    HAND_JOINTS,
+    HEELS_AND_TOES,
+    UP_AXES,
+    Proportions,
+    upright,
+)
 from gsgan.skeleton.sides import refuse_swapped
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import above, one_of
@@ -235,7 +234,7 @@ def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
     skeleton = config.skeleton
     model = None if smpl is None else Path(smpl).expanduser()
     asf = None if skeleton is None else Path(skeleton).expanduser()
-    up = None if config.up is None else one_of("up", config.up, AXES)
+    up = None if config.up is None else one_of("up", config.up, UP_AXES)
     source = Source(proportions, model, asf, up)
     motion = read_motion(Path(path).expanduser(), source)
     motion = checked(motion, float(config.min_visibility))
@@ -271,9 +270,9 @@ def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
         standard = upright(proportions.up)
         centre = standard @ np.array(run.scene.centre)
         p = completed(motion, up)
-        if p.shape[1] > EXPRESSION.start:
+        if p.shape[1] > FACE.start:
             p = p if motion.detached else face_in_head(p)
-            p[:, EXPRESSION] = expressed(p[:, EXPRESSION], run.face)
+            p[:, FACE] = expressed(p[:, FACE], run.face)
         p = retargeted(resampled(p, rate, fps), proportions)
         p = placed(
             p,
@@ -315,8 +314,8 @@ def _hands_and_face(p: Float) -> str:
         f", left hand in {known[:, left].all((1, 2)).sum()} frames, "
         f"right hand in {known[:, right].all((1, 2)).sum()}"
     )
-    if p.shape[1] > EXPRESSION.start:
-        text += f", face in {known[:, EXPRESSION].any((1, 2)).sum()}"
+    if p.shape[1] > FACE.start:
+        text += f", face in {known[:, FACE].any((1, 2)).sum()}"
     return text
 
 

@@ -14,7 +14,6 @@ from omegaconf import DictConfig
 
 from gsgan.body import open_body
 from gsgan.body.skinned import MarkedBody
-from gsgan.data.proportions import Proportions
 from gsgan.data.scene_info import SceneInfo
 from gsgan.effects import Effects
 from gsgan.model.avatar import Avatar
@@ -30,6 +29,7 @@ from gsgan.run.stored import (
     stored_scene,
 )
 from gsgan.skeleton import HOLISTIC
+from gsgan.skeleton.proportions import Proportions
 from gsgan.skeleton.tensors import constants
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.tensors import pick_device

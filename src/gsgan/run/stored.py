@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, MutableMapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,15 +12,22 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gsgan.data.proportions import Proportions
 from gsgan.data.scene_info import SceneInfo
 from gsgan.data.surface_colours import SurfaceColours
-from gsgan.data.training_poses import TrainingPoses
+from gsgan.skeleton.proportions import Proportions
+from gsgan.skeleton.training_poses import TrainingPoses
 from gsgan.utils.errors import ConfigError, DataError
 
 CHECKPOINT = Path("checkpoints") / "last.ckpt"
 # Classes that configs of runs before 2026-11-26 name by another module.
 MOVED = {"gsgan.model.assemble.": "gsgan.run.assemble."}
+# Keys that configs of runs before 2026-11-27 have, and their last part now.
+RENAMED_KEYS = {
+    "data.reader.consistency.least_inside": "refused_below",
+    "fit.least_mask": "min_mask",
+    "model.window_least": "window_minimum",
+    "training.rollback.most": "max_restorations",
+}
 CONFIG = Path(".hydra") / "config.yaml"
 # Keys that may differ between a run and its continuation: they do not change what it learns.
 FREE_KEYS = (
@@ -85,13 +92,18 @@ def read_config(folder: Path) -> DictConfig:
         raise DataError(
             f"{folder}: not a run folder (no {CONFIG}); give the folder that gsgan.train printed"
         )
-    config = _read_yaml(path)
+    config = read_yaml(path)
     if not {"data", "model"} <= config.keys():
         raise DataError(f"{path}: expected the config of a run with data and model")
     return config
 
 
-def _read_yaml(path: Path) -> DictConfig:
+def read_yaml(path: Path) -> DictConfig:
+    """A file of Hydra's in a run folder, with the present names of classes and keys.
+
+    Raises:
+        DataError: when it is damaged.
+    """
     try:
         text = path.read_text(encoding="utf-8")
         # Runs of earlier versions name classes by modules that have moved.
@@ -101,8 +113,28 @@ def _read_yaml(path: Path) -> DictConfig:
     except (UnicodeDecodeError, yaml.YAMLError, OmegaConfBaseException) as error:
         raise DataError(f"{path}: damaged ({str(error).splitlines()[0]})") from None
     if not isinstance(config, DictConfig):
-        raise DataError(f"{path}: expected the config of a run with data and model")
+        raise DataError(f"{path}: damaged (expected keys with values)")
+    rename_keys(config)
     return config
+
+
+def rename_keys(settings: MutableMapping[str, Any]) -> None:
+    """Gives the keys of a config, or of its `record`, their present names, in place."""
+    for before, now in RENAMED_KEYS.items():
+        group, last = _group(settings, before)
+        if last in group:
+            group[now] = group.pop(last)
+
+
+def _group(
+    settings: MutableMapping[str, Any], key: str
+) -> tuple[MutableMapping[str, Any], str]:
+    """The group that a dotted key belongs to, empty where there is none, and its last part."""
+    *groups, last = key.split(".")
+    for group in groups:
+        found = settings.get(group)
+        settings = found if isinstance(found, MutableMapping) else {}
+    return settings, last
 
 
 def load_config(folder: Path, paths: DataPaths | None = None) -> DictConfig:
@@ -147,7 +179,7 @@ def hydra_record(folder: Path) -> DictConfig:
         DataError: when it is damaged.
     """
     path = folder / ".hydra" / "hydra.yaml"
-    return _read_yaml(path) if path.is_file() else OmegaConf.create()
+    return read_yaml(path) if path.is_file() else OmegaConf.create()
 
 
 def choices(folder: Path) -> dict[str, Any]:
@@ -169,12 +201,8 @@ def record(config: DictConfig) -> dict[str, Any]:
 
     # Single keys of groups are removed by their dotted names.
     for key in FREE_KEYS:
-        *groups, last = key.split(".")
-        node: Any = plain
-        for group in groups:
-            node = node.get(group) if isinstance(node, dict) else None
-        if isinstance(node, dict):
-            node.pop(last, None)
+        group, last = _group(plain, key)
+        group.pop(last, None)
     return plain
 
 

@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gsgan.scene import Camera
+from gsgan.scene import NEAR, Camera
 from gsgan.skeleton.template import MEDIAPIPE33, Edge, SkeletonTemplate
 from gsgan.skeleton.tensors import check_skeleton
 from gsgan.utils.tensors import constant, squared_norm
@@ -26,7 +26,7 @@ def draw_skeleton(
     camera: Camera,
     template: SkeletonTemplate = MEDIAPIPE33,
     sigma_px: float = 2.5,
-    near: float = 0.01,
+    near: float = NEAR,
 ) -> Tensor:
     """Draws the skeleton as the camera sees it.
 

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 import gsgan
 from gsgan.body.free import free_body
-from gsgan.data.joints import BODY, FACE, HANDS
+from gsgan.skeleton.joints import BODY, FACE, HANDS
 from gsgan.synthetic.camera import SceneCamera
 from gsgan.synthetic.free_subject import free_pose
 from gsgan.synthetic.scene_setup import FREE_BODY, Scene, SceneSettings, dataset_key

@@ -43,6 +43,24 @@ T = TypeVar("T")
 SEED_STRIDE = 1_000_003  # a prime: (seed, step) pairs do not meet
 
 
+def fitted_schedule(schedule: Schedule, avatar: Avatar) -> Schedule:
+    """The schedule with the phases that an avatar has, see `Schedule.fitted`."""
+    S = avatar.segmentation
+    return schedule.fitted(
+        segmentation=S is not None,
+        from_masks=S is not None and S.common is not None,
+        splats=avatar.splats is not None,
+        generator=avatar.generator is not None,
+    )
+
+
+def compares(avatar: Avatar, step_one: StepOneLoss, step_two: StepTwoLoss) -> bool:
+    """Whether a step of an avatar's training has L_perc."""
+    if avatar.generator is not None and step_two.perceptual:
+        return True
+    return avatar.splats is not None and bool(step_one.perceptual)
+
+
 class AvatarTraining(LightningModule):
     """Trains S, then Ψ (Step I), then generator and discriminator with Ψ (Step II).
 
@@ -94,36 +112,26 @@ class AvatarTraining(LightningModule):
         # Several optimisers take turns, so the module steps them itself.
         self.automatic_optimization = False
         self.avatar = avatar
-        S = avatar.segmentation
-        generates = avatar.generator is not None
+        self.schedule = fitted_schedule(schedule, avatar)
+        self.recipes = recipes
 
-        # The discriminator and the perceptual network are built only where a loss needs them.
-        self.discriminator = (
-            discriminator if generates and step_two.adversarial_terms else None
-        )
-        compares = bool(step_one.perceptual) and avatar.splats is not None
-        compares |= generates and bool(step_two.perceptual)
+        # The losses, with the networks that they need.
+        self.step_one = step_one
+        self.step_two = step_two
+        judges = avatar.generator is not None and step_two.adversarial_terms
+        self.discriminator = discriminator if judges else None
         self.perceptual = None
-        if perceptual is not None and compares:
+        if perceptual is not None and compares(avatar, step_one, step_two):
             self.perceptual = perceptual()
         self.extra_losses = nn.ModuleDict(extra_losses or {})
 
-        # The phases of this avatar, see `Schedule.fitted`.
-        self.schedule = schedule.fitted(
-            segmentation=S is not None,
-            from_masks=S is not None and S.common is not None,
-            splats=avatar.splats is not None,
-            generator=generates,
-        )
-
-        # Optimisers, losses and the random changes of the input.
-        self.recipes = recipes
-        self.step_one = step_one
-        self.step_two = step_two
+        # Random changes of the input.
         self.pose_noise = pose_noise
         self.window = None if window is None else whole("training.window", window, 16)
         self.window_reach = above("training.window_reach", window_reach)
         self.seed = seed
+        # Step I over a random colour, so that black clothes do not become transparent.
+        self.random_background = avatar.effects.random_background.on
 
         # Logs, and what happens where training fails.
         self.log_every = at_least("training.log_every", log_every, 1)
@@ -135,21 +143,19 @@ class AvatarTraining(LightningModule):
         self.scene = scene
 
         # The average of the weights is validated and scored.
-        self.average = (
-            None if average is None else MovingAverage(avatar, average, average_every)
-        )
-        # Step I over a random colour, so that black clothes do not become transparent.
-        self.random_background = avatar.effects.random_background.on
+        self.average = None
+        if average is not None:
+            self.average = MovingAverage(avatar, average, average_every)
 
         # A linear readout of F gives its further channels something to learn in Step I.
-        reads = step_one.feature_head and avatar.splat_channels > 3
-        self.feature_head = nn.Conv2d(avatar.splat_channels, 3, 1) if reads else None
-        # iterations done: Lightning's global_step counts every optimiser's steps
-        self.step = 0
-        # commits of the code, several where a run was resumed
-        self.code: list[str] = []
+        self.feature_head = None
+        if step_one.feature_head and avatar.splat_channels > 3:
+            self.feature_head = nn.Conv2d(avatar.splat_channels, 3, 1)
 
-        # seconds of earlier parts of the run
+        # The course of the run: iterations (Lightning's global_step counts every optimiser's
+        # steps), commits of the code, seconds of the parts before it was resumed.
+        self.step = 0
+        self.code: list[str] = []
         self.seconds_before = 0.0
         self._began: float | None = None
 
@@ -394,7 +400,7 @@ class AvatarTraining(LightningModule):
                 "training.max_skipped"
             )
         self.print(
-            f"iteration {self.step}: skipped ({count}, at most {self.skipped.most}): {cause}"
+            f"iteration {self.step}: skipped ({count}, at most {self.skipped.maximum}): {cause}"
         )
 
     def _stopped(self, why: str) -> GsganError:
@@ -469,9 +475,10 @@ class AvatarTraining(LightningModule):
                 f"{what}, also after {self.rollback.done} returns to a good state; start again "
                 "with a lower training.recipes.psi.rate.peak"
             )
+        count = f"{self.rollback.done} of at most {self.rollback.max_restorations}"
         self.print(
             f"iteration {self.step}: {what}; back to the last good state, Ψ's learning rate times "
-            f"{self.rollback.rate:g} ({self.rollback.done} of at most {self.rollback.most})"
+            f"{self.rollback.rate:g} ({count})"
         )
 
     # -- randomness: from (seed, iteration), so that resuming changes nothing

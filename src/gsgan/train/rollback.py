@@ -37,7 +37,7 @@ class Rollback:
     collapse: float = 0.05
     healthy: float = 0.5
     memory: float = 0.9
-    most: int = 3
+    max_restorations: int = 3
     slower: float = 0.5
     done: int = 0
     means: dict[str, Tensor] = field(default_factory=dict)
@@ -48,7 +48,7 @@ class Rollback:
         between("training.rollback.collapse", self.collapse, 0, self.healthy)
         between("training.rollback.memory", self.memory, 0, 1)
         between("training.rollback.slower", self.slower, 0, 1)
-        whole("training.rollback.most", self.most, 0)
+        whole("training.rollback.max_restorations", self.max_restorations, 0)
 
     @property
     def rate(self) -> float:
@@ -107,7 +107,7 @@ class Rollback:
         self, module: nn.Module, optimisers: Sequence[torch.optim.Optimizer]
     ) -> bool:
         """Restores the last good state; False where there is none, or after too many times."""
-        if self._state is None or self.done >= self.most:
+        if self._state is None or self.done >= self.max_restorations:
             return False
 
         # The averages start anew, since they describe the collapse.
@@ -122,10 +122,10 @@ class Rollback:
 
 
 class SkippedSteps:
-    """Counts skipped iterations; ``most`` within ``window`` are too many."""
+    """Counts skipped iterations; ``maximum`` within ``window`` are too many."""
 
-    def __init__(self, most: int, window: int) -> None:
-        self.most = most
+    def __init__(self, maximum: int, window: int) -> None:
+        self.maximum = maximum
         self.window = window
         self.steps: deque[int] = deque()  # within the window
 
@@ -138,7 +138,7 @@ class SkippedSteps:
         # Iterations that have left the window are forgotten.
         while self.steps[0] <= step - self.window:
             self.steps.popleft()
-        return len(self.steps) >= self.most
+        return len(self.steps) >= self.maximum
 
     @property
     def count(self) -> str:

@@ -77,10 +77,10 @@ class Schedule:
             one, two = 0, one + two
 
         # S has fewer iterations where it learns from masks.
-        most = FROM_MASKS if from_masks else self.segmentation
+        maximum = FROM_MASKS if from_masks else self.segmentation
         return replace(
             self,
-            segmentation=min(self.segmentation, most) if segmentation else 0,
+            segmentation=min(self.segmentation, maximum) if segmentation else 0,
             **numbers | {"step_one": one, "step_two": two},
         )
 
@@ -95,11 +95,11 @@ class Schedule:
             return SEGMENTATION
         return STEP_ONE if step < self.segmentation + self.step_one else STEP_TWO
 
-    def degree(self, step: int, most: int) -> int:
-        """The degree of the spherical harmonics at an iteration, up to ``most``."""
+    def degree(self, step: int, maximum: int) -> int:
+        """The degree of the spherical harmonics at an iteration, up to ``maximum``."""
         if self.degree_every == 0:
-            return most
-        return min(most, max(0, step - self.segmentation) // self.degree_every)
+            return maximum
+        return min(maximum, max(0, step - self.segmentation) // self.degree_every)
 
     def fine(self, step: int) -> bool:
         """Whether F is supersampled at an iteration: not in the first ``coarse`` of Step I."""

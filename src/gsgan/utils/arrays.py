@@ -68,12 +68,12 @@ def nanmedian(values: Float, axis: int = 0) -> Float:
         return np.asarray(np.nanmedian(values, axis=axis))
 
 
-def evenly_spaced(count: int, most: int, *, ends: bool = False) -> list[int]:
-    """At most ``most`` of ``count`` positions, rising: the middles of equal parts, or with ``ends``
-    from the first to the last."""
-    most = min(most, count)
+def evenly_spaced(count: int, maximum: int, *, ends: bool = False) -> list[int]:
+    """At most ``maximum`` of ``count`` positions, rising: the middles of equal parts, or with
+    ``ends`` from the first to the last."""
+    maximum = min(maximum, count)
     if ends:
-        return np.linspace(0, count - 1, most).round().astype(int).tolist()
+        return np.linspace(0, count - 1, maximum).round().astype(int).tolist()
 
     # The middle of part i is at (i + 1/2) count / most, rounded down.
-    return [(2 * i + 1) * count // (2 * most) for i in range(most)]
+    return [(2 * i + 1) * count // (2 * maximum) for i in range(maximum)]

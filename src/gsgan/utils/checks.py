@@ -20,17 +20,17 @@ def is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def between(name: str, value: Any, least: float, most: float) -> Any:
-    """A number from ``least`` to ``most``, both included."""
-    good = is_number(value) and least <= value <= most
-    _require(good, name, f"a number from {least} to {most}", value)
+def between(name: str, value: Any, minimum: float, maximum: float) -> Any:
+    """A number from ``minimum`` to ``maximum``, both included."""
+    good = is_number(value) and minimum <= value <= maximum
+    _require(good, name, f"a number from {minimum} to {maximum}", value)
     return value
 
 
-def at_least(name: str, value: Any, least: float) -> Any:
-    """A number of at least ``least``."""
-    good = is_number(value) and value >= least
-    _require(good, name, f"a number of at least {least}", value)
+def at_least(name: str, value: Any, minimum: float) -> Any:
+    """A number of at least ``minimum``."""
+    good = is_number(value) and value >= minimum
+    _require(good, name, f"a number of at least {minimum}", value)
     return value
 
 
@@ -40,11 +40,11 @@ def above(name: str, value: Any, bound: float = 0) -> Any:
     return value
 
 
-def whole(name: str, value: Any, least: int) -> int:
-    """A whole number of at least ``least``."""
+def whole(name: str, value: Any, minimum: int) -> int:
+    """A whole number of at least ``minimum``."""
     # True and False are integers of Python.
-    good = isinstance(value, int) and not isinstance(value, bool) and value >= least
-    _require(good, name, f"a whole number of at least {least}", value)
+    good = isinstance(value, int) and not isinstance(value, bool) and value >= minimum
+    _require(good, name, f"a whole number of at least {minimum}", value)
     return int(value)
 
 

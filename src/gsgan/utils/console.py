@@ -16,7 +16,7 @@ from rich.progress import (
 )
 
 Item = TypeVar("Item")
-LEAST_WIDTH = 100  # columns: tables cut to the 80 of a log file cannot be read
+MIN_WIDTH = 100  # columns: tables cut to the 80 of a log file cannot be read
 LOG_SECONDS = 10.0  # between two lines of progress in a log file
 SLOW_SECONDS = 2.0  # work that takes longer is named in a log file
 
@@ -28,7 +28,7 @@ def make_console() -> Console:
     # A log file has no width of its own.
     if console.is_terminal:
         return console
-    return Console(width=max(LEAST_WIDTH, console.width))
+    return Console(width=max(MIN_WIDTH, console.width))
 
 
 class LoggedProgress(Progress):

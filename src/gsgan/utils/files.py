@@ -1,4 +1,4 @@
-"""Files that are written completely or not at all, also by a run that is killed."""
+"""Text and JSON files; files are written completely or not at all, also by a run that is killed."""
 
 import codecs
 import contextlib
@@ -95,3 +95,37 @@ def _plain(value: Any) -> Any:
         return [_plain(item) for item in value]
     # JSON has no NaN and no infinity.
     return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The object in a JSON file.
+
+    Raises:
+        DataError: when the file is missing, is not JSON, or is not an object.
+    """
+    content = read_json_value(path)
+    if not isinstance(content, dict):
+        raise DataError(
+            f"{path} must hold a JSON object, found {type(content).__name__}"
+        )
+    return content
+
+
+def read_json_value(path: Path) -> Any:
+    """The content of a JSON file, of any type; errors as `read_json`."""
+    # Deep nesting is a RecursionError, other damage a ValueError.
+    try:
+        return json.loads(read_text(path))
+    except OSError as error:
+        raise unreadable(path, error) from None
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{path} is not valid JSON: {error}") from None
+
+
+def unreadable(path: Path, error: OSError) -> DataError:
+    """The error for the user about a file that cannot be opened, with the reason."""
+    if isinstance(error, FileNotFoundError):
+        return DataError(
+            f"{path} does not exist; docs/data.md lists the files of each format"
+        )
+    return DataError(f"{path} cannot be read: {error.strerror or error}")

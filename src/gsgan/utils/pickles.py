@@ -258,6 +258,15 @@ def read_npz(
         return found
 
 
+def read_arrays(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
+    """The named arrays of an npz file, without those that are absent.
+
+    Raises:
+        DataError: when the file is missing or no npz, an array is too large, or holds objects.
+    """
+    return read_npz(path, names, objects=False)
+
+
 def _read_array(stream: BinaryIO, objects: bool = True) -> Any:
     # Arrays of numbers; numpy refuses arrays of objects after their header.
     try:

@@ -4,8 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsgan.data.joints import LEFT, RIGHT
-from gsgan.data.proportions import (
+from gsgan.motion.rotations import between, unit
+from gsgan.skeleton import HOLISTIC
+from gsgan.skeleton.joints import LEFT, RIGHT
+from gsgan.skeleton.proportions import (
     FEET,
     HAND_LANDMARKS,
     HEAD_LANDMARKS,
@@ -13,8 +15,6 @@ from gsgan.data.proportions import (
     SHOULDERS,
     middle,
 )
-from gsgan.motion.rotations import between, unit
-from gsgan.skeleton import HOLISTIC
 from gsgan.utils.arrays import Float
 
 FABRIK_ROUNDS = 20

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
-from gsgan.data.proportions import upright
 from gsgan.motion.orbit import Orbit
 from gsgan.run.drive import Drive, distilled_of, drive_of
 from gsgan.run.runs import Run
+from gsgan.skeleton.proportions import upright
 from gsgan.utils.checks import above, between, whole
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError

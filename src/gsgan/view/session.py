@@ -321,7 +321,7 @@ class Session:
         p, visibility, body = inputs_of(avatar, current, 0)
         maps = layer != FINAL_IMAGE or self.splats.value
         with torch.no_grad():
-            rendering = avatar.rendered(p, visibility, camera, body, maps=maps)
+            rendering = avatar(p, visibility, camera, body, maps=maps)
         if avatar.poses is not None:
             self.far.value = f"{float(avatar.poses.distance(p)):.1f}"
 

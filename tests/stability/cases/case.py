@@ -169,7 +169,7 @@ def compare(
         exact_outputs, exact_slopes, _ = _run(case, exact, "reference")
         floors, tolerance = case.gradient_floor or {}, case.tolerance.at(dtype)
         value_error = max(
-            (_error(outputs[k], v, least=1.0) for k, v in exact_outputs.items())
+            (_error(outputs[k], v, minimum=1.0) for k, v in exact_outputs.items())
         )
         errors = {
             k: _error(slopes[k], v, floor=floors.get(k, 0))
@@ -240,7 +240,7 @@ def _run(case: Case, inputs: Inputs, backend: str) -> tuple[Inputs, Inputs, str]
 
 
 def _error(
-    got: Tensor, want: Tensor, *, least: float = 0.0, floor: float = 0.0
+    got: Tensor, want: Tensor, *, minimum: float = 0.0, floor: float = 0.0
 ) -> float:
     """Largest difference relative to ``max(least, |want|)``; equal infinities and NaNs differ by 0.
 
@@ -255,5 +255,5 @@ def _error(
     ]
     if not difference.numel() or max(largest) < floor:
         return 0.0
-    scale = max(least, largest[1])
+    scale = max(minimum, largest[1])
     return float(difference.max()) / scale if scale > 0 else math.inf

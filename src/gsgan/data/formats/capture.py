@@ -33,10 +33,8 @@ from gsgan.data.calibration import (
     read_conventions,
 )
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.files import FrameFiles, frame_files, read_arrays, read_json
 from gsgan.data.formats.common import IMAGES, finish, one_mask_each
 from gsgan.data.formats.consistency import Consistency
-from gsgan.data.joints import zeros_as_missing
 from gsgan.data.layout import BodyModel, Found, Layout, Meta, dataset_folder
 from gsgan.data.pixels import PixelRules
 from gsgan.data.skeletons import (
@@ -49,9 +47,14 @@ from gsgan.data.skeletons import (
 from gsgan.data.validation import Thresholds
 from gsgan.skeleton.face import FACE, FACE_NAMES
 from gsgan.skeleton.hands import HAND
+from gsgan.skeleton.joints import zeros_as_missing
+from gsgan.skeleton.proportions import UP_AXES
 from gsgan.utils.arrays import expect_array
 from gsgan.utils.checks import is_number, whole
 from gsgan.utils.errors import DataError
+from gsgan.utils.files import read_json
+from gsgan.utils.frame_files import FrameFiles, frame_files
+from gsgan.utils.pickles import read_arrays
 
 Content = TypeVar("Content")
 LANDMARKS_FILE = "landmarks3d.npz"
@@ -63,7 +66,7 @@ SHAPE = "body_shape.npz"
 MASKS = (".png",)
 # The number of rotations in a pose, by kind of body.
 BODY_BONES = {"free": 56, "smpl": 24, "smplx": 55}
-SKELETON_LIMITS = Consistency(least_inside=0.2)
+SKELETON_LIMITS = Consistency(refused_below=0.2)
 """A capture's own landmarks are noisier than those of a fitted body."""
 
 
@@ -245,11 +248,10 @@ def _read_meta(path: Path, content: Mapping[str, Any], smpl: str | None) -> Meta
         body = BodyModel(kind, smpl if kind != "free" else None)
 
     # Facts with a fixed set of values.
-    axes = ("x", "y", "z", "-x", "-y", "-z")
     return Meta(
         unit=choose(path, content, "unit", None, tuple(METRES)),
         fps=None if fps is None else float(fps),
-        up_axis=choose(path, content, "up_axis", "z", axes),
+        up_axis=choose(path, content, "up_axis", "z", UP_AXES),
         skeleton=choose(path, content, "skeleton", "mediapipe33", tuple(SKELETONS)),
         body=body,
         label_names=None if names is None else tuple(map(str, names)),

@@ -9,15 +9,15 @@ import numpy as np
 
 from gsgan.body.smpl import SkinnedModel, read_smpl
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.files import read_header
 from gsgan.data.formats.consistency import Consistency, check_consistency
 from gsgan.data.layout import Found, Layout, MaskIndex, assemble, dataset_folder
 from gsgan.data.pixels import MaskFile
-from gsgan.data.proportions import axis_name
 from gsgan.data.splits import parse_frames
 from gsgan.data.validation import Thresholds
+from gsgan.skeleton.proportions import axis_name
 from gsgan.skeleton.smpl_landmarks import TABLES
 from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.image_files import read_header
 
 IMAGES = (".jpg", ".jpeg", ".png")
 # By kind of body: its name, and an example of a model's file.

@@ -13,9 +13,10 @@ import cv2
 import numpy as np
 
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.crop import NEAR, project, through_lens
+from gsgan.data.crop import project, through_lens
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_mask
+from gsgan.scene import NEAR
 from gsgan.utils.arrays import Bool, Bytes, Float, evenly_spaced
 from gsgan.utils.errors import DataError
 
@@ -37,7 +38,7 @@ class Consistency:
     """
 
     frames: int = 3
-    least_inside: float = 0.5
+    refused_below: float = 0.5
     min_inside: float = 0.9
     far_camera: float = 10.0
     joint_tolerance: float = 0.05
@@ -98,7 +99,7 @@ def check_consistency(
 
     # The mean share of each camera; the message shows all, since one may be wrong.
     inside = {name: np.mean(found) for name, found in shares.items()}
-    if inside and min(inside.values()) < limits.least_inside:
+    if inside and min(inside.values()) < limits.refused_below:
         text = ", ".join(f"{name} {share:.0%}" for name, share in inside.items())
         raise DataError(
             f"{layout.root}: joints lie outside the masks (inside: {text}); {hint}: "

@@ -18,7 +18,6 @@ import numpy as np
 
 from gsgan.data.calibration import read_calibration
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.files import frame_files, natural_order, read_json_value
 from gsgan.data.formats.common import (
     IMAGES,
     FolderReader,
@@ -27,14 +26,16 @@ from gsgan.data.formats.common import (
     up_axis,
 )
 from gsgan.data.formats.smpl_motion import landmarks_of, zju_motion
-from gsgan.data.joints import BODY, FROM_HANDS, SETS
 from gsgan.data.layout import BodyModel, Found, Meta
 from gsgan.data.pixels import MaskFile, mask_file
 from gsgan.data.skeletons import make_landmarks
 from gsgan.data.validation import Thresholds, frames_of, spans
 from gsgan.skeleton.hands import HAND
+from gsgan.skeleton.joints import BODY, FROM_HANDS, SETS
 from gsgan.utils.arrays import Float, Ints, as_floats
 from gsgan.utils.errors import DataError
+from gsgan.utils.files import read_json_value
+from gsgan.utils.frame_files import frame_files, natural_order
 
 SKELETON_SOURCES = {
     "smpl": "smpl24 -> mediapipe33",

@@ -14,7 +14,6 @@ import numpy as np
 
 from gsgan.body.smpl import SkinnedModel
 from gsgan.data.cameras import CameraEntry, make_camera, numbers
-from gsgan.data.files import FrameFiles, frame_files, last_number, read_json
 from gsgan.data.formats.common import (
     IMAGES,
     FolderReader,
@@ -31,7 +30,8 @@ from gsgan.data.validation import Thresholds, frames_of, spans
 from gsgan.utils.arrays import Float, as_floats
 from gsgan.utils.checks import whole
 from gsgan.utils.errors import ConfigError, DataError
-from gsgan.utils.files import read_text
+from gsgan.utils.files import read_json, read_text
+from gsgan.utils.frame_files import FrameFiles, frame_files, last_number
 from gsgan.utils.pickles import read_npz
 
 Files = dict[str, FrameFiles]
@@ -362,16 +362,16 @@ def _rows(
 def _coefficients(
     arrays: dict[str, Any],
     key: str,
-    most: int,
+    maximum: int,
     path: Path,
     count: int | None = None,
 ) -> Float:
     """``[N, n]`` coefficients, at most as many as the model's; further ones must be 0."""
     # A model file with fewer shapes than the fit would give another body.
     values = _rows(arrays, key, None, path, count)
-    if np.any(values[:, most:] != 0):
+    if np.any(values[:, maximum:] != 0):
         raise DataError(
-            f"{path}: '{key}' has {values.shape[1]} coefficients, the model file {most}; give the "
-            "SMPL-X file with all of them as data.smpl"
+            f"{path}: '{key}' has {values.shape[1]} coefficients, the model file {maximum}; give "
+            "the SMPL-X file with all of them as data.smpl"
         )
-    return values[:, :most]
+    return values[:, :maximum]

@@ -22,7 +22,6 @@ import numpy as np
 from gsgan.body.smpl import SkinnedModel
 from gsgan.body.smpl_names import CIHP
 from gsgan.data.cameras import CameraEntry, make_camera
-from gsgan.data.files import FrameFiles, frame_files, frame_of, last_number
 from gsgan.data.formats.common import (
     IMAGES,
     FolderReader,
@@ -36,6 +35,7 @@ from gsgan.data.pixels import IGNORE_LABEL, MaskFile, PixelRules, mask_file
 from gsgan.data.skeletons import make_landmarks
 from gsgan.data.validation import Thresholds, frames_of
 from gsgan.utils.errors import DataError
+from gsgan.utils.frame_files import FrameFiles, frame_files, frame_of, last_number
 from gsgan.utils.pickles import read_npy
 
 Files = Mapping[str, Mapping[int, str]]

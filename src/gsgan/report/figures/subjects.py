@@ -23,8 +23,6 @@ from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError, DataError
 
-# Metres: if a joint is nearer to the camera than this, the whole image is shown.
-MIN_JOINT_DEPTH = 0.01
 MIN_WINDOW = 16  # pixels, the shortest side of a window
 TITLES = {  # of models, in print
     "full": "gsgan",
@@ -132,8 +130,7 @@ def make_shots(
             cat([frame.camera for frame in batch]),
             margin=margin,
             multiple=1,
-            least=MIN_WINDOW,
-            near=MIN_JOINT_DEPTH,
+            minimum=MIN_WINDOW,
         )
         for corner, frame in zip(boxes.corners, batch, strict=True):
             window = Window((corner,), boxes.size, boxes.whole)

@@ -14,7 +14,7 @@ constexpr double NO_BONE = 1e-9;  // metres: a shorter one has no direction
 // Of body/fingers.py, arrays as the buffers of Fingers; noise and trace are its constants.
 struct FingerModel {
   const int64_t *chains, *joints, *steps;  // [10, 4], [20], [rounds]
-  const double *rest, *palms, *bones, *axes, *prior, *least, *most;
+  const double *rest, *palms, *bones, *axes, *prior, *minimum, *maximum;
   double noise, trace;
   int64_t rounds, placing;
 };
@@ -129,7 +129,7 @@ inline void fit_hand(const FingerModel& m, int side, const Vec3* hand, const uin
         if (step > 0) step_finger(f, now, weight, m.prior + NUMBERS * k);
         for (int i = 0; i < NUMBERS; ++i) {
           const int at = NUMBERS * k + i;
-          f.numbers[i] = std::min(std::max(f.numbers[i], m.least[at]), m.most[at]);
+          f.numbers[i] = std::min(std::max(f.numbers[i], m.minimum[at]), m.maximum[at]);
         }
       }
       out.turns[k] = f.first(), out.turns[2 * FINGERS + k] = f.second();

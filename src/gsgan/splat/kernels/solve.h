@@ -20,7 +20,7 @@ struct SolveJob {
   double finger_noise, trace;
   // of body/solve.py: buffers of Solver, and its first guess
   const int64_t *joint, *parent, *entry_turn, *entry_number, *carrier;
-  const double *joints, *entry_axis, *rest, *precision, *prior, *least, *rest_hubs, *rest_hips;
+  const double *joints, *entry_axis, *rest, *precision, *prior, *minimum, *rest_hubs, *rest_hips;
   const double* head_from_eyes;
   const int64_t *torso, *head, *replaced;                // [4], [5], [2, 33]
   const int64_t *bend_numbers, *bend_hub;                // [bends, 3], [bends]
@@ -30,7 +30,7 @@ struct SolveJob {
   // of body/fingers.py: buffers of Fingers, and its steps by round
   const int64_t *finger_chains, *finger_joints;
   const double *finger_rest, *finger_palms, *finger_bones, *finger_axes, *finger_prior;
-  const double *finger_least, *finger_most;
+  const double *finger_minimum, *finger_maximum;
   const int64_t* finger_steps;
   // the frames
   const void *p, *visibility;    // [B, 33, 3] finite, [B, 33]
@@ -53,10 +53,10 @@ template <class T> class BodySolver {
         factor(job.D * job.D), first_entry(job.T + 1) {
     for (int64_t e = 0; e < job.E; ++e) ++first_entry[job.entry_turn[e] + 1];
     for (int64_t t = 0; t < job.T; ++t) first_entry[t + 1] += first_entry[t];
-    fingers = {job.finger_chains, job.finger_joints, job.finger_steps, job.finger_rest,
-               job.finger_palms,  job.finger_bones,  job.finger_axes,  job.finger_prior,
-               job.finger_least,  job.finger_most,   job.finger_noise, job.trace,
-               job.rounds,        job.placing};
+    fingers = {job.finger_chains,  job.finger_joints,  job.finger_steps, job.finger_rest,
+               job.finger_palms,   job.finger_bones,   job.finger_axes,  job.finger_prior,
+               job.finger_minimum, job.finger_maximum, job.finger_noise, job.trace,
+               job.rounds,         job.placing};
   }
 
   void solve(int64_t b) {
@@ -192,7 +192,7 @@ template <class T> class BodySolver {
     move(at);
     at.cost = 0;
     for (int i = 0; i < D; ++i) {
-      const double below = std::min(at.q[i] - job.least[i], 0.0);
+      const double below = std::min(at.q[i] - job.minimum[i], 0.0);
       const double stop = below < 0 ? 1 / (job.beyond * job.beyond) : 0;
       double pull = 0;
       for (int j = 0; j < D; ++j) pull += job.prior[i * D + j] * at.q[j];

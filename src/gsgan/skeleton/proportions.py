@@ -11,13 +11,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsgan.data import joints as numbers
 from gsgan.skeleton import HOLISTIC, bone_frames, sanitise
 from gsgan.skeleton.hands import FINGER_BONES, INDEX, PINKY, WRIST
+from gsgan.skeleton.joints import BODY, LEFT, RIGHT
 from gsgan.skeleton.template import CHEST, HEAD, PELVIS
 from gsgan.utils.arrays import Bool, Float
 from gsgan.utils.errors import DataError
 
+# Names of the world's up axis.
+UP_AXES = ("x", "y", "z", "-x", "-y", "-z")
 # Numbers of MediaPipe's landmarks, the left one first.
 SHOULDERS = (11, 12)
 EARS = (7, 8)
@@ -30,11 +32,8 @@ BONES = (*ARMS[0], *ARMS[1], *LEGS[0], *LEGS[1])
 HAND_LANDMARKS = {15: (17, 19, 21), 16: (18, 20, 22)}
 # by ankle: heel, toes
 FEET = {27: (29, 31), 28: (30, 32)}
-BODY = numbers.BODY
 # by wrist
-HAND_JOINTS = {15: numbers.LEFT, 16: numbers.RIGHT}
-# lips, brows and lids
-EXPRESSION = numbers.FACE
+HAND_JOINTS = {15: LEFT, 16: RIGHT}
 # Sign of the standard pose's x, by wrist.
 BODY_SIDES = {15: 1.0, 16: -1.0}
 HEELS_AND_TOES = (29, 30, 31, 32)
@@ -269,9 +268,9 @@ def upright(up: str) -> Float:
     Raises:
         DataError: when the name is not that of an axis.
     """
-    axis = "xyz".find(up[-1:])
-    if axis < 0 or up[:-1] not in ("", "-"):
-        raise DataError(f"up must be x, y, z, -x, -y or -z, got {up!r}")
+    if up not in UP_AXES:
+        raise DataError(f"up must be one of {', '.join(UP_AXES)}, got {up!r}")
+    axis = "xyz".index(up[-1])
     sign = -1 if up[:-1] else 1
     above = np.eye(3)[axis] * sign
     first = np.eye(3)[(axis + 1) % 3]

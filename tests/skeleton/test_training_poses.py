@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from gsgan.data.training_poses import NOISE, training_poses
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.skeleton.tensors import constants
+from gsgan.skeleton.training_poses import NOISE, training_poses
 
 REST = constants(MEDIAPIPE33, torch.device("cpu"), torch.float64).rest * 1.7
 WRIST = MEDIAPIPE33.names.index("left_wrist")

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from gsgan.data.proportions import BODY
 from gsgan.skeleton import bone_frames, root_of
+from gsgan.skeleton.joints import BODY
 
 # metres: a direction that varied less in training counts as varying by this
 NOISE = 0.03

@@ -1,0 +1,170 @@
+"""The files of a dataset's folder by frame number, none of which lies outside the dataset."""
+
+import os
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from copy import copy
+from decimal import Decimal
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from gsgan.utils.errors import DataError
+
+# The last group of digits in a name.
+LAST_DIGITS = re.compile(r"([0-9]+)[^0-9]*$")
+# frame numbers beyond it are dates or damage
+LARGEST_FRAME = 10**9
+
+
+class FrameFiles(Mapping[int, str]):
+    """Paths of files by frame number, rising.
+
+    Stored as two arrays: reading Python objects changes their reference counts, so copy-on-write
+    would soon duplicate millions of paths in every loading process.
+
+    Args:
+        folder: before every name.
+        names: of the files, by frame number in any order.
+    """
+
+    def __init__(self, folder: str, names: Mapping[int, str]) -> None:
+        self.folder = folder
+        self.frames = np.array(sorted(names), np.int64)
+        # Encoded together, which is faster; no name holds a slash.
+        held = [names[frame] for frame in self.frames.tolist()]
+        self._names = np.array(os.fsencode("/".join(held)).split(b"/")[: len(held)])
+
+    def __getitem__(self, frame: int) -> str:
+        # The frames are sorted, so that a binary search finds them.
+        place = int(self.frames.searchsorted(frame))
+        if place == len(self.frames) or self.frames[place] != frame:
+            raise KeyError(frame)
+        return f"{self.folder}/{os.fsdecode(self._names[place])}"
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self.frames.tolist())
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def without(self, frames: Iterable[int]) -> Self:
+        """The paths of all other frames."""
+        # The folder is shared, the arrays are cut.
+        keep = np.isin(self.frames, np.fromiter(frames, np.int64), invert=True)
+        found = copy(self)
+        found.frames = self.frames[keep]
+        found._names = self._names[keep]
+        return found
+
+
+def frame_files(
+    root: Path,
+    folder: str,
+    suffixes: tuple[str, ...],
+    number: Callable[[str], int | None] | None = None,
+) -> FrameFiles:
+    """Paths relative to ``root`` of the images in one of its folders, by frame number.
+
+    Args:
+        root: the dataset.
+        folder: relative to it; empty when it does not exist.
+        suffixes: of the files to list, lower case.
+        number: frame number of a file's stem; by default the last group of digits.
+
+    Raises:
+        DataError: when a name has no number, two names have the same, or a link leads out.
+    """
+    # A folder that does not exist is the same as an empty one.
+    place = root / folder
+    names = frozenset(own_entries(place, root) if place.is_dir() else ())
+    # The index is cached without its folder, so this camera gets a copy with its own.
+    try:
+        found = copy(_by_frame(names, suffixes, number or last_number))
+    except DataError as error:
+        raise DataError(f"{place}: {error}") from None
+    found.folder = folder
+    return found
+
+
+@lru_cache(maxsize=1)  # cameras mostly have files of the same names
+def _by_frame(
+    names: frozenset[str],
+    suffixes: tuple[str, ...],
+    number: Callable[[str], int | None],
+) -> FrameFiles:
+    """The files with one of the suffixes, by the number that each stem gives."""
+    found = dict[int, str]()
+    for name in sorted(names):
+        # Hidden files, such as those that macOS makes of every copied file, do not count.
+        stem, _, suffix = name.rpartition(".")
+        if f".{suffix.lower()}" not in suffixes or name.startswith("."):
+            continue
+        frame = number(stem)
+
+        # Every image needs a number of its own, by which it finds its mask.
+        if frame is None:
+            raise DataError(
+                f"{name} has no frame number up to {LARGEST_FRAME} in its name; number the "
+                f"frames 0, 1, 2 … equally in all cameras, e.g. 000012.{suffix}"
+            )
+        if frame in found:
+            raise DataError(
+                f"frame {frame} is there twice, as {found[frame]} and {name}; keep one of them"
+            )
+        found[frame] = name
+    return FrameFiles("", found)
+
+
+def own_entries(folder: Path, root: Path) -> list[str]:
+    """The names in a dataset's folder.
+
+    Raises:
+        DataError: if the folder or an entry is a link to a place outside the dataset: a downloaded
+            dataset could then read any file of this machine.
+    """
+    # Places are compared without links and dots.
+    home = root.resolve()
+    with os.scandir(folder) as found:
+        entries = list(found)
+
+    # Only links can lead out, so only those are resolved.
+    links = [folder]
+    for entry in entries:
+        if entry.is_symlink():
+            links.append(Path(entry))
+    for link in links:
+        if not link.resolve().is_relative_to(home):
+            raise DataError(
+                f"{link} is a link to {link.resolve()}, outside the dataset; copy the files into "
+                f"{root}, or mount their folder there"
+            )
+    return [entry.name for entry in entries]
+
+
+def last_number(stem: str) -> int | None:
+    """The last group of digits in a file's stem; None above `LARGEST_FRAME`."""
+    # Names often have other numbers in front, such as a date.
+    found = LAST_DIGITS.search(stem)
+    return frame_of(found[1]) if found else None
+
+
+def frame_of(digits: str) -> int | None:
+    """The frame number in a group of digits; None above `LARGEST_FRAME`."""
+    digits = digits.lstrip("0") or "0"
+    # int() refuses very long numbers.
+    if len(digits) > len(str(LARGEST_FRAME)):
+        return None
+    number = int(digits)
+    return number if number <= LARGEST_FRAME else None
+
+
+def natural_order(name: str) -> list[Any]:
+    """Sort key: ``Camera_B2`` before ``Camera_B10``, ``rate -1e-3`` before ``rate 0.5``."""
+    # Numbers after a space, such as values of settings, may have a sign and decimals. Decimal
+    # keeps all digits. The pattern's matches have odd places.
+    parts: list[Any] = re.split(r"((?<= )-?\d+(?:\.\d+)?(?:e[+-]?\d{1,3})?|\d+)", name)
+    parts[1::2] = map(Decimal, parts[1::2])
+    return parts
