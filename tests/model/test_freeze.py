@@ -42,6 +42,18 @@ def test_the_image_is_that_of_training(build, model, effects):
     assert trained.image.requires_grad
 
 
+@pytest.mark.parametrize(
+    ("model", "channels"), [("splat_only", 3), ("harmonic", 3), ("full", 5)]
+)
+def test_features_that_nothing_reads_are_not_painted(build, model, channels):
+    _, avatar, frame = build(f"model={model}")
+    assert avatar(*frame.inputs).features.shape[1] == 5
+    with torch.inference_mode():
+        frozen = avatar.freeze()
+        assert frozen(*frame.inputs).features.shape[1] == channels
+    assert frozen.splat_channels == channels
+
+
 def test_it_follows_the_weights(build):
     _, avatar, frame = build("size.rgb_skip=false")
     frozen = copy.deepcopy(left_of_zero(avatar)).freeze()

@@ -73,11 +73,13 @@ def poses_of(data):
         yield p, visibility, body
 
 
+@pytest.mark.parametrize("frozen", [False, True])
 @pytest.mark.parametrize("points", ["on", "off"])
-def test_residuals_without_the_pose_are_distilled_exactly(build, points):
+def test_residuals_without_the_pose_are_distilled_exactly(build, points, frozen):
     data, avatar, frame = build("model=splat_only", f"effects.body_points={points}")
     torch.nn.init.normal_(avatar.deformation.table, std=0.1)  # the network's are zero
-    found = distilled(avatar.eval(), poses_of(data))
+    avatar = avatar.freeze() if frozen else avatar.eval()
+    found = distilled(avatar, poses_of(data))
     assert isinstance(found.deformation, Harmonic)
     assert not found.deformation.coefficients.requires_grad
     ours, theirs = (x(*frame.inputs).image for x in (found, avatar))

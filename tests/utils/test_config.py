@@ -75,7 +75,6 @@ def differences(a, b, at: str = "") -> set[str]:
             "splat_only",
             {
                 *("model.segmentation", "model.pose_encoder", "model.generator"),
-                "model.deformation.features",
                 *("training.schedule.stretch", "equal_time"),
             },
         ),

@@ -178,7 +178,7 @@ class Avatar(nn.Module):
     @property
     def splat_channels(self) -> int:
         """Channels of F, colour included; 0 where nothing is splatted."""
-        return 0 if self.splats is None else 3 + self.splats.features
+        return 0 if self.splats is None else 3 + self.splats.active_features
 
     @property
     def needs_body(self) -> bool:
@@ -192,6 +192,8 @@ class Avatar(nn.Module):
         Weights get no gradient; skeleton and camera do.
         """
         self.eval().requires_grad_(False)
+        if self.generator is None and self.deformation is not None:
+            self.deformation.active_features = 0
 
         # Every part gets a store, in which `gsgan.utils.tensors.derived` keeps its results.
         for part in self.modules():

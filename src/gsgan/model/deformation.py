@@ -82,6 +82,8 @@ class ResidualGaussians(nn.Module):
         self.sh_degree = sh_degree
         # raised during training; higher degrees are not computed
         self.active_degree = sh_degree
+        # 0 in a frozen avatar whose image is Step I's colour: nothing reads the others
+        self.active_features = features
 
         # Initial values and bounds.
         self.opacity = opacity
@@ -117,20 +119,26 @@ class ResidualGaussians(nn.Module):
         raise NotImplementedError
 
     def _active(self, values: Tensor) -> Tensor:
-        """Raw residuals ``[..., sum(parts)]`` without the harmonics above the active degree: those
-        start at zero and get no gradient until they are active."""
+        """Raw residuals ``[..., sum(parts)]`` without features that nothing reads, and without the
+        harmonics above the active degree: those start at zero and get no gradient until they are
+        active."""
+        last = sum(self.parts[:5])
+        values = values[..., : last + self.active_features]
         if self.active_degree >= self.sh_degree:
             return values
 
         # The harmonics are the fifth part; the active ones are its first channels.
         first = sum(self.parts[:4])
-        last = sum(self.parts[:5])
         active = values[..., : first + 3 * (self.active_degree + 1) ** 2]
         return torch.cat([active, values[..., last:]], dim=-1)
 
     def _parted(self, raw: Tensor) -> Residuals:
         """The residuals of raw numbers ``[B, N, ...]``, those of `_active`."""
-        sizes = (*self.parts[:4], 3 * (self.active_degree + 1) ** 2, self.features)
+        sizes = (
+            *self.parts[:4],
+            3 * (self.active_degree + 1) ** 2,
+            self.active_features,
+        )
 
         # Only the active harmonics are there to split.
         means, quats, scales, opacities, sh, features = raw.split(sizes, dim=-1)

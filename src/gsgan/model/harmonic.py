@@ -135,14 +135,14 @@ class Harmonic(ResidualGaussians):
             parts = dict(zip(self.slopes, moved.split(sizes, dim=-1), strict=True))
 
         # Constants and moving parts are added; harmonics of colour that are not active are left
-        # out.
+        # out, and so are features that nothing reads.
+        active = {
+            "sh": 3 * (self.active_degree + 1) ** 2,
+            "features": self.active_features,
+        }
         found = []
         for name, constant in self.constants.items():
-            used = (
-                3 * (self.active_degree + 1) ** 2
-                if name == "sh"
-                else constant.shape[-1]
-            )
+            used = active.get(name, constant.shape[-1])
             values = constant.expand(len(points.means), -1, -1)[..., :used]
             found.append(values + parts[name][..., :used] if name in parts else values)
 
@@ -177,13 +177,16 @@ def distilled(
     """
     # The copy keeps every part but Ψ.
     found = deepcopy(avatar)
-    psi = avatar.deformation
+    psi = found.deformation
     if psi is None:
         raise ConfigError(
             "only avatars with Ψ have residuals to distil (model=full, splat_only)"
         )
     if isinstance(psi, Harmonic):
         return found
+
+    # All features are fitted, also those that a frozen avatar leaves out.
+    psi.active_features = psi.features
 
     # The settings that bounds and activations depend on stay as they are.
     same = (
@@ -199,7 +202,7 @@ def distilled(
     fitted = Harmonic(avatar.rest_points, psi.body_height, follow=follow, **settings)
 
     # The fit over all poses. `Harmonic` multiplies its means by mean_step, so they are divided.
-    maps, mean = ridge_regression(_samples(avatar, poses), ridge)
+    maps, mean = ridge_regression(_samples(found, poses), ridge)
     maps[..., :3] /= psi.mean_step
     mean[..., :3] /= psi.mean_step
 
