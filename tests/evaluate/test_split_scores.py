@@ -150,8 +150,9 @@ def test_flicker_needs_consecutive_frames_of_one_camera_and_window():
         False,
         False,
     ]
-    # rounded to 8 bits
+    # rounded to 8 bits; the ground truth stands still, so the warped form is the same
     assert found.variants[FULL]["flicker"] == pytest.approx(0.1, abs=1e-2)
+    assert found.variants[FULL]["warped_flicker"] == pytest.approx(0.1, abs=1e-2)
     assert (
         found.variants[FLOOR_VARIANT]["flicker"] == 0
     )  # the ground truth stands still
@@ -159,6 +160,7 @@ def test_flicker_needs_consecutive_frames_of_one_camera_and_window():
         items[:1], lambda f, _: Prediction({FULL: f.image}, {}), scorer()
     )
     assert "consecutive" in alone.variants[FULL]["flicker_reason"]
+    assert "consecutive" in alone.variants[FULL]["warped_flicker_reason"]
 
 
 def test_an_image_that_is_not_finite_is_an_error_that_names_it():

@@ -70,6 +70,7 @@ COLUMNS = (
     "lpips_vgg_person",
     "lpips_alex_person",
     "flicker",
+    "warped_flicker",
 )
 # Edges of the bins of distances.
 BINS = (0, 1, 2, 3, 4, 6, 8, 12, np.inf)

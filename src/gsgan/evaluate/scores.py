@@ -27,12 +27,14 @@ from gsgan.metrics.image import (
     ssim_where,
 )
 from gsgan.metrics.lpips import LpipsAgainst, LpipsScores
+from gsgan.metrics.motion import truth_motion, warped_flicker
 from gsgan.metrics.names import (
     BOX_METRICS,
     FLOOR_VARIANT,
     FULL,
     IMAGE_METRICS,
     METRICS,
+    MOTION_METRICS,
     PART_METRICS,
     SPLAT,
 )
@@ -162,7 +164,7 @@ def means(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         # Why there is no score.
         if not finite:
             reason = "no image has a finite score" if left_out else "no image"
-            if metric == "flicker":
+            if metric in MOTION_METRICS:
                 reason = NO_PAIR
             elif metric.startswith("lpips"):
                 reason = NO_LPIPS
@@ -347,10 +349,12 @@ class Tally:
                 target, frame.mask, self.scorer.lpips, prepare.measures
             )
 
-        # Flicker needs the frame before, seen by the same camera.
+        # Motion needs the frame before, seen by the same camera.
         last = self.last
-        if last is not None and not _follows(item, frame, last.item, last.frame):
-            last = None
+        motion = None
+        if last is not None and _follows(item, frame, last.item, last.frame):
+            mask = last.frame.mask
+            motion = truth_motion(target, frame.mask, last.target, mask)
         for name, image in images.items():
             own = image_scores(
                 image,
@@ -363,9 +367,12 @@ class Tally:
             )
 
             # The same variant of the frame before.
-            if last is not None:
+            if last is not None and motion is not None:
                 before = (last.images[name], last.target, last.frame.mask)
                 own["flicker"] = float(flicker(image, target, frame.mask, before))
+                error_before = last.images[name] - last.target
+                moved = warped_flicker(image - target, error_before, motion)
+                own["warped_flicker"] = moved
 
             # One row per image and variant.
             row = {"camera": camera, "frame": number, **own}

@@ -56,12 +56,15 @@ IMAGE_METRICS = {
     "edge_ratio_person": Metric("edges in box", "edges in box", 3, "→1"),
     "high_frequencies": Metric("HF energy", "HF energy", 3, "→1"),
     "flicker": Metric("flicker in box", "flicker", 4, "↓"),
+    "warped_flicker": Metric("warped flicker", "warped flicker", 4, "↓"),
     # hands and mouth
     "psnr_hands": Metric("PSNR dB hands", "hands", 2, "↑"),
     "ssim_hands": Metric("SSIM hands", "SSIM hands", 4, "↑"),
     "psnr_mouth": Metric("PSNR dB mouth", "mouth", 2, "↑"),
     "ssim_mouth": Metric("SSIM mouth", "SSIM mouth", 4, "↑"),
 }
+# of two consecutive frames
+MOTION_METRICS = ("flicker", "warped_flicker")
 # in the boxes of hands and mouth
 BOX_METRICS = ("psnr_hands", "ssim_hands", "psnr_mouth", "ssim_mouth")
 # of segmentations
