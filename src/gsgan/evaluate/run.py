@@ -66,6 +66,7 @@ CSV = "distance.csv"
 PNG = "distance.png"
 COLUMNS = (
     "psnr_person",
+    "psnr_person_shifted",
     "ssim_person",
     "lpips_vgg_person",
     "lpips_alex_person",
@@ -596,7 +597,12 @@ def make_scorer(config: DictConfig, data: GsganData, marks: Sequence[str]) -> Sc
         if boxes is not None:
             record["departures"] += boxes.departures
     return Scorer(
-        prepare=Preparation(measures, boxes, data.skeleton),
+        prepare=Preparation(
+            measures,
+            boxes,
+            data.skeleton,
+            data.layout.meta.label_names or (),
+        ),
         lpips=build_lpips(config.lpips.nets, config.lpips.path),
         marks=marks,
         protocol=record,

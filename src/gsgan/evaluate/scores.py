@@ -33,6 +33,7 @@ from gsgan.metrics.names import (
     FLOOR_VARIANT,
     FULL,
     IMAGE_METRICS,
+    LABEL_METRICS,
     METRICS,
     MOTION_METRICS,
     PART_METRICS,
@@ -40,6 +41,8 @@ from gsgan.metrics.names import (
 )
 from gsgan.metrics.regions import BACKGROUNDS, cleared, describe_boxes, rectangle
 from gsgan.metrics.segmentation import confusion, miou
+from gsgan.metrics.shares import region_shares
+from gsgan.metrics.shifted import psnr_shifted
 from gsgan.model.avatar import Avatar
 from gsgan.model.rendering import Rendering
 from gsgan.scene import Frame
@@ -50,6 +53,7 @@ from gsgan.weights.networks import Lpips
 NO_PAIR = "no two images are of consecutive frames, in one window of one camera"
 NO_LPIPS = "left out by lpips.nets"
 NO_LABELS = "the data has no part labels"
+NO_NAMED_LABELS = "the data has no part labels with names"
 NO_PARTS_OF_SPLAT = "Step I's colour is not a segmentation"
 NO_PARTS_OF_FLOOR = "an all-background image is not a segmentation"
 # The fields that hold what a tally has counted so far.
@@ -66,6 +70,7 @@ def image_scores(
     box: Tensor | None = None,
     *,
     regions: Mapping[str, Tensor] | None = None,
+    parts: Mapping[str, Tensor] | None = None,
     measures: MetricVariants | None = None,
     lpips: LpipsScores | None = None,
 ) -> dict[str, float]:
@@ -76,6 +81,7 @@ def image_scores(
         mask: ``[1, 1, H, W]`` of the person; required for the metrics of the person alone.
         box: ``[1, 1, H, W]`` bool, the body's projected box; required if the measures use it.
         regions: of hands and mouth, from `gsgan.metrics.regions.hands_and_mouth`.
+        parts: of trunk and limbs, from `gsgan.metrics.shares.trunk_and_limbs`.
         measures: regions and ranges; None takes the defaults.
         lpips: against this ground truth, a `gsgan.metrics.lpips.LpipsAgainst`.
 
@@ -112,6 +118,8 @@ def image_scores(
         person = person_box(mask)
         regions["person"] = person
         scores["psnr_inside"] = psnr_inside(image, target, mask)
+        scores["psnr_person_shifted"] = psnr_shifted(image, target, mask)
+        scores |= region_shares(image, target, mask, parts or {})
         edges = edge_scores(image, target, person)
         scores["edge_f1_person"], scores["edge_ratio_person"] = edges
 
@@ -168,6 +176,8 @@ def means(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
                 reason = NO_PAIR
             elif metric.startswith("lpips"):
                 reason = NO_LPIPS
+            elif metric in LABEL_METRICS and not left_out:
+                reason = NO_NAMED_LABELS
             result[f"{metric}_reason"] = reason
     return result
 
@@ -333,6 +343,7 @@ class Tally:
         target = prepare.target(frame)
         box = prepare.box(frame)
         regions = prepare.regions(frame)
+        parts = prepare.parts(frame)
         images = self._images(item, frame, prediction, box)
         if show:
             painting = Rendering(
@@ -362,6 +373,7 @@ class Tally:
                 frame.mask,
                 box,
                 regions=regions,
+                parts=parts,
                 measures=prepare.measures,
                 lpips=lpips,
             )
