@@ -312,7 +312,8 @@ def other_capture(stored: DictConfig, on: str | DictConfig) -> DictConfig:
     config = stored.copy()
 
     # The run's own data, splits and protocol do not hold for another capture.
-    splits = ("train_cameras", "test_cameras", "train_frames", "test_frames")
+    cameras = ("train_cameras", "test_cameras")
+    splits = (*cameras, "train_frames", "test_frames", "train_poses")
     own = dict.fromkeys(("root", "protocol", *splits)) | {"body": "none"}
     config.data.merge_with(own)
 
