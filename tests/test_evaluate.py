@@ -144,6 +144,7 @@ def test_a_run_is_scored_on_another_capture_against_the_distance_from_training(
             solved[split]["full"]["psnr"]
         )
         assert found[split]["full"]["flicker"] > 0
+        assert found[split]["full"]["warped_flicker"] > 0
     with (folder / "distance.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) == sum(variants["full"]["images"] for variants in found.values())

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -20,27 +20,17 @@ from PIL import Image
 from torch import Tensor
 
 import gsgan
+from gsgan.motion.smooth import OneEuro
 from gsgan.scene import Camera
 from gsgan.utils.provenance import png_bytes
 
 
-def stream(path: Path) -> Iterator[Tensor]:
-    """[33, 3] skeletons, NaN where a joint is not seen; here those of a capture."""
+def stream(path: Path) -> Iterator[tuple[float, np.ndarray]]:
+    """Seconds and [33, 3] skeletons, NaN where a joint is not seen; here those of a capture at 30
+    frames per second. With a tracker, take time.monotonic() when a skeleton comes."""
     with np.load(path) as arrays:
-        for p in arrays["p"]:
-            yield torch.from_numpy(p).float()
-
-
-def steady(skeletons: Iterable[Tensor], share: float = 0.7) -> Iterator[Tensor]:
-    """Smooths a stream by an exponential average of each joint, from the past alone."""
-    last = None
-    for p in skeletons:
-        last = (
-            p
-            if last is None
-            else torch.where(p.isnan() | last.isnan(), p, last.lerp(p, share))
-        )
-        yield last
+        for number, p in enumerate(arrays["p"].astype(np.float64)):
+            yield number / 30, p
 
 
 def look_at(centre: Tensor, eye: Tensor, pixels: int) -> Camera:
@@ -61,7 +51,9 @@ def main(run: Path, landmarks: Path, out: Path, pixels: int) -> None:
     avatar = gsgan.load(run)  # on the GPU if there is one
     out.mkdir(parents=True, exist_ok=True)
     camera, count, start = None, 0, time.perf_counter()
-    for skeleton in steady(stream(landmarks)):
+    smooth = OneEuro()  # about a frame of delay; docs/render.md has its settings
+    for seconds, p in stream(landmarks):
+        skeleton = torch.from_numpy(smooth(p, seconds)).float()
         if (
             camera is None
         ):  # fixed from here on, 3.5 m in front of where the person starts

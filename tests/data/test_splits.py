@@ -1,5 +1,7 @@
 """Which frames and cameras are trained on, and which are held out."""
 
+from dataclasses import replace
+
 import pytest
 from make import write_tiny_capture
 from omegaconf import OmegaConf
@@ -51,6 +53,30 @@ def test_splits_of_the_config_with_ranges_and_the_rest(layout):
         8,
         9,
     )
+
+
+def test_train_poses_are_far_from_each_other_and_held_out_frames_stay(layout):
+    """An arm rises over frames 0 to 3 and rests in the others: half of the rests are left out."""
+    frames = layout.frames
+    p = {frame: layout.landmarks.p[0].copy() for frame in frames}
+    for frame in range(4):
+        p[frame][[13, 15]] += [0.0, 0.0, 0.05 + 0.05 * frame]
+    shown = dict.fromkeys(frames, layout.landmarks.visibility[0])
+    moved = replace(layout.landmarks, p=p, visibility=shown)
+    layout = replace(layout, landmarks=moved)
+    everything = make_splits(layout, test_cameras=["cam01"])
+    splits = make_splits(layout, test_cameras=["cam01"], train_poses=4)
+    assert len(splits.train_frames) == 4
+    assert set(splits.train_frames) & {4, 5, 6, 7}
+    assert len(set(splits.train_frames) & {4, 5, 6, 7}) == 1
+    assert splits.test_frames == everything.test_frames == (8, 9)
+    assert set(splits.items["novel_view"]) == {
+        ("cam01", f) for f in splits.train_frames
+    }
+    assert splits.items["novel_pose"].frames == [8, 9]
+    assert make_splits(layout, train_poses=8).train_frames == tuple(range(8))
+    with pytest.raises(ConfigError, match=r"data\.train_poses"):
+        make_splits(layout, train_poses=0)
 
 
 def test_splits_of_meta_json_give_way_to_the_config(tmp_path):

@@ -31,7 +31,9 @@ FACTS = {
 def results(marks=("perceptual loss: stand-in",), boxes=None):
     scores = {
         "psnr": 30.123, "psnr_person": 28.0, "psnr_inside": 31.0, "ssim": 0.98,
-        "high_frequencies": 0.9, "ssim_person": 0.9, "flicker": 0.01,
+        "high_frequencies": 0.9, "ssim_person": 0.9, "flicker": 0.01, "warped_flicker": 0.02,
+        "psnr_person_shifted": 28.5, "area_outline": 0.2, "error_outline": 0.5,
+        "area_trunk": 0.5, "error_trunk": 0.2, "area_limbs": 0.3, "error_limbs": 0.3,
         "lpips_input": "[-1,1]", "lpips_alex": 0.01, "lpips_alex_person": 0.02,
         "lpips_vgg": None, "lpips_vgg_reason": "left out by lpips.nets",
         "lpips_vgg_person": None, "lpips_vgg_person_reason": "left out by lpips.nets",

@@ -9,6 +9,7 @@ import torch
 from frames import frame_of
 from torchmetrics.classification import MulticlassJaccardIndex
 
+from gsgan.body.smpl_names import CLOTHES
 from gsgan.data.metric_variants import MetricVariants
 from gsgan.evaluate.predictions import Prediction, Preparation
 from gsgan.evaluate.scores import (
@@ -150,8 +151,9 @@ def test_flicker_needs_consecutive_frames_of_one_camera_and_window():
         False,
         False,
     ]
-    # rounded to 8 bits
+    # rounded to 8 bits; the ground truth stands still, so the warped form is the same
     assert found.variants[FULL]["flicker"] == pytest.approx(0.1, abs=1e-2)
+    assert found.variants[FULL]["warped_flicker"] == pytest.approx(0.1, abs=1e-2)
     assert (
         found.variants[FLOOR_VARIANT]["flicker"] == 0
     )  # the ground truth stands still
@@ -159,6 +161,30 @@ def test_flicker_needs_consecutive_frames_of_one_camera_and_window():
         items[:1], lambda f, _: Prediction({FULL: f.image}, {}), scorer()
     )
     assert "consecutive" in alone.variants[FULL]["flicker_reason"]
+    assert "consecutive" in alone.variants[FULL]["warped_flicker_reason"]
+
+
+def test_shares_of_trunk_and_limbs_need_labels_with_names():
+    size = 40
+    mask = torch.zeros(1, 1, size, size)
+    mask[..., 10:30, 10:30] = 1
+    labels = CLOTHES.index("left_leg") * mask[:, 0].long()
+    labels[:, :20] = CLOTHES.index("hair") * mask[:, 0, :20].long()
+    f = frame_of(0.4 * mask.expand(1, 3, -1, -1), mask, labels=labels)
+    image = f.image.clone()
+    image[..., 24, 14:24] += 0.2
+    found = {}
+    for names in (CLOTHES, ()):
+        prepare = Preparation(MetricVariants(), None, label_names=names)
+        split = score_split(
+            [(("a", 0), f)], lambda f, _: Prediction({FULL: image}, {}), Scorer(prepare)
+        )
+        found[names] = split.variants[FULL]
+    assert found[CLOTHES]["area_trunk"] == found[CLOTHES]["area_limbs"] > 0.2
+    assert found[CLOTHES]["error_limbs"] == pytest.approx(1)
+    assert found[()]["error_limbs"] is None
+    assert "no part labels" in found[()]["error_limbs_reason"]
+    assert found[()]["error_outline"] == 0
 
 
 def test_an_image_that_is_not_finite_is_an_error_that_names_it():

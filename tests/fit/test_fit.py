@@ -5,7 +5,6 @@ import shutil
 import threading
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -20,10 +19,11 @@ import gsgan.utils.compat  # noqa: F401
 from gsgan.body.shape import BodyShape, free_space, shaped_body
 from gsgan.body.solve import Solver
 from gsgan.data.datamodule import GsganData
+from gsgan.data.splits import spread_frames
 from gsgan.evaluate.origin import fingerprint
 from gsgan.evaluate.run import make_scorer
 from gsgan.fit.fitter import Fitter, _wrong
-from gsgan.fit.frames import MaskedFrames, rotated, spread_frames
+from gsgan.fit.frames import MaskedFrames, rotated
 from gsgan.fit.run import fit_before_training, run_fit
 from gsgan.fit.shape import fit_shape
 from gsgan.run.assemble import moves_with_body
@@ -404,17 +404,16 @@ def test_frames_with_poses_far_from_each_other_are_used(people):
     p[20][[13, 15]] += [0.0, 0.0, 3.0]
     visibility = dict.fromkeys(frames, landmarks.visibility[0])
     moved = replace(landmarks, p=p, visibility=visibility)
-    data = SimpleNamespace(layout=SimpleNamespace(landmarks=moved))
 
-    assert spread_frames(data, frames, 40) == list(frames)
-    chosen = spread_frames(data, frames, 5)
+    assert spread_frames(moved, frames, 40) == list(frames)
+    chosen = spread_frames(moved, frames, 5)
     assert len(chosen) == 5
     assert 20 not in chosen
     assert chosen[0] <= 2
     assert chosen[-1] >= 37
     assert max(np.diff(chosen)) < 20
     p[1] = p[0]
-    assert len(spread_frames(data, [0, 1] * 20, 5)) == 1
+    assert len(spread_frames(moved, [0, 1] * 20, 5)) == 1
 
 
 def test_cameras_rotate():

@@ -139,6 +139,24 @@ def test_a_motion_of_another_person(render, motion, tmp_path):
     assert verify(files[0]).source_type == SOURCE_TYPE
 
 
+def test_smoothing_delays_all_frames_but_the_first(render, motion, tmp_path):
+    given = (f"motion={motion}", "pixels=32", "frames=4", "camera=cam00")
+    for folder, options in (
+        ("plain", ()),
+        ("smooth", ("smooth.enabled=true", "smooth.min_cutoff=0.2", "smooth.beta=0")),
+    ):
+        result = render(*given, f"out={folder}", *options)
+        assert result.returncode == 0, result.stderr
+        assert (", smoothed" in result.stdout) == (folder == "smooth")
+    same = []
+    for name in ("000000.png", "000003.png"):
+        plain = read(tmp_path / "plain" / name)
+        same.append(bool((plain == read(tmp_path / "smooth" / name)).all()))
+    assert same == [True, False]
+    wrong = render(*given, "out=x", "smooth.enabled=true", "smooth.max_pause=0")
+    refused(wrong, "smooth.max_pause")
+
+
 def test_clips_become_one_motion(render, motion, landmarks, tmp_path):
     other = tmp_path / "b.npz"
     # with a face, which this avatar has not

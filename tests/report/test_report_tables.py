@@ -95,6 +95,16 @@ def test_the_best_of_several_rows_is_emphasised(tmp_path):
     }
 
 
+def test_no_share_is_the_best(tmp_path):
+    runs = [
+        write_run(tmp_path / name, name, error_outline=share)
+        for name, share in (("a", 0.4), ("b", 0.6))
+    ]
+    (grid,) = report_of(table(metrics=["error_outline"]), *runs).grids
+    assert grid.columns == ["error, outline"]
+    assert not any(cell.best for row in grid.rows for cell in row.cells)
+
+
 def test_step_ones_colour_is_a_row_of_its_own(tmp_path):
     run = write_run(tmp_path / "a", psnr=30.0, splat={"psnr": 29.0})
     grid = report_of(table(variants=["full", "splat"]), run).grids[0]

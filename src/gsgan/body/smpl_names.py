@@ -84,6 +84,10 @@ CIHP = (
 """ZJU-MoCap's ``mask_cihp``, ids 0 to 19; it has no hands."""
 
 
+# The last words of the names of limbs and of clothes on legs, feet and hands.
+LIMB_WORDS = ("arm", "hand", "leg", "shoe", "pants", "skirt", "socks", "glove")
+
+
 def part_names(parts: Parts, joint_names: tuple[str, ...]) -> tuple[str, ...]:
     """Names of a set of parts, background first."""
     if parts == "joints":
@@ -134,6 +138,17 @@ def group_of_part(name: str) -> str:
     """The group of a part or joint: "left_hand", "right_hand", "face_neck", or "" for any other."""
     if name == "face":
         return "face_neck"
-    is_joint = name in SMPL_JOINTS or name in SMPLX_JOINTS
-    group = part_of_joint("clothes", name) if is_joint else name
+    group = _worn(name)
     return group if group in ("left_hand", "right_hand", "face_neck") else ""
+
+
+def is_limb(name: str) -> bool:
+    """Whether a part or joint is of arms, hands, legs or feet; lower clothes are of legs."""
+    part = _worn(name)
+    return part == "lower_clothes" or part.rpartition("_")[2] in LIMB_WORDS
+
+
+def _worn(name: str) -> str:
+    """The part of `CLOTHES` of a joint; the name of another part."""
+    is_joint = name in SMPL_JOINTS or name in SMPLX_JOINTS
+    return part_of_joint("clothes", name) if is_joint else name

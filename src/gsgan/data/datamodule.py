@@ -89,8 +89,8 @@ class GsganData(LightningDataModule):
         distortion: ``auto`` and ``undistort`` undistort images on reading; ``off`` treats them as
             a pinhole's; ``project`` keeps the distortion, with the lens in ``camera.dist``.
         wanted: description of the root, for the message when it is not set.
-        split_keys: train_cameras, test_cameras, train_frames, test_frames and test_share, see
-            `make_splits`.
+        split_keys: train_cameras, test_cameras, train_frames, test_frames, test_share and
+            train_poses, see `make_splits`.
 
     Raises:
         ConfigError: when neither root nor source is given, or a number is out of range.

@@ -9,10 +9,14 @@ import numpy as np
 
 from gsgan.data.layout import Layout
 from gsgan.data.protocol import Protocol
+from gsgan.data.skeletons import Landmarks
 from gsgan.data.validation import spans
+from gsgan.skeleton.training_poses import pose_in_pelvis, training_poses
 from gsgan.utils.arrays import Ints
+from gsgan.utils.checks import whole
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.frame_files import LARGEST_FRAME
+from gsgan.utils.tensors import farthest_points
 
 NameOrNumber = TypeVar("NameOrNumber", int, str)
 
@@ -20,6 +24,8 @@ NameOrNumber = TypeVar("NameOrNumber", int, str)
 FRAME_RANGE = re.compile(
     r"\s*(\d{1,18})\s*(?:-\s*(\d{1,18})\s*)?(?::\s*(\d{1,18})\s*)?"
 )
+# share of the poses, those least like all others, that is not chosen from
+OUTLIERS = 0.05
 # Bounds the memory that a range from a file can ask for.
 MAX_LISTED_FRAMES = 10**7
 # training, held-out cameras, held-out frames
@@ -119,6 +125,7 @@ def make_splits(
     train_frames: Any = None,
     test_frames: Any = None,
     test_share: float = 0.2,
+    train_poses: int | None = None,
 ) -> Splits:
     """Splits a capture by cameras and by frames.
 
@@ -131,6 +138,7 @@ def make_splits(
         train_cameras, test_cameras: names, or None.
         train_frames, test_frames: numbers and "a-b" ranges (both ends included), or None.
         test_share: in [0, 1), the share of frames held out by default.
+        train_poses: maximum number of train frames, see `spread_frames`; None uses all.
 
     Raises:
         DataError: when a camera does not exist, or nothing is left to train on.
@@ -171,6 +179,10 @@ def make_splits(
 
     # Only items that exist.
     usable, notes = _usable(layout, wanted, "of the splits")
+    if train_poses is not None:
+        maximum = whole("data.train_poses", train_poses, 1)
+        spread = spread_frames(layout.landmarks, usable.train, maximum)
+        usable = usable._replace(train=tuple(spread))
     items = {
         "train": _items(layout, cameras.train, usable.train),
         "novel_view": _items(layout, cameras.test, usable.train),
@@ -183,6 +195,29 @@ def make_splits(
         "novel_pose": "no frame is held out (data.test_frames)",
     }
     return _splits(layout, cameras, usable, items, reasons, notes)
+
+
+def spread_frames(
+    landmarks: Landmarks, frames: Sequence[int], maximum: int
+) -> list[int]:
+    """At most so many frames, rising, whose poses are far from each other.
+
+    The share `OUTLIERS` of the poses that are least like all others is not chosen from: wrong
+    landmarks are among them.
+    """
+    # All frames are used if they are few.
+    if len(frames) <= maximum:
+        return list(frames)
+    p, _ = landmarks.joints(frames)
+
+    # Poses that are not outliers.
+    distance = training_poses(p).distance(p)
+    usual = (distance <= distance.quantile(1 - OUTLIERS)).nonzero().flatten()
+
+    # Frames of equal poses are chosen once.
+    poses = pose_in_pelvis(p[usual])
+    chosen = usual[farthest_points(poses, min(maximum, len(usual)))]
+    return sorted({frames[i] for i in chosen.tolist()})
 
 
 def _usable(

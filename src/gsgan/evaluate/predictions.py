@@ -26,6 +26,7 @@ from gsgan.metrics.regions import (
     hard_outline,
     on_background,
 )
+from gsgan.metrics.shares import trunk_and_limbs
 from gsgan.scene import Frame
 from gsgan.skeleton import TEMPLATES
 from gsgan.utils.errors import ConfigError, DataError
@@ -116,11 +117,13 @@ class Preparation:
         measures: of the protocol.
         boxes: None unless the measures need the body's box.
         skeleton: name of the frames' skeleton.
+        label_names: of the frames' part labels, background first; empty if unknown.
     """
 
     measures: MetricVariants
     boxes: BodyBoxes | None
     skeleton: str = "mediapipe33"
+    label_names: tuple[str, ...] = ()
 
     @property
     def background(self) -> float:
@@ -160,6 +163,12 @@ class Preparation:
     def regions(self, frame: Frame) -> dict[str, Tensor]:
         """The boxes of hands and mouth, ``[B, 1, H, W]`` each, if the skeleton has hands."""
         return hands_and_mouth(frame, TEMPLATES[self.skeleton])
+
+    def parts(self, frame: Frame) -> dict[str, Tensor]:
+        """The pixels of trunk and limbs, ``[B, 1, H, W]`` each, if labels name them."""
+        if frame.labels is None or not self.label_names:
+            return {}
+        return trunk_and_limbs(frame.labels, self.label_names)
 
 
 # -- a folder of images

@@ -66,10 +66,12 @@ CSV = "distance.csv"
 PNG = "distance.png"
 COLUMNS = (
     "psnr_person",
+    "psnr_person_shifted",
     "ssim_person",
     "lpips_vgg_person",
     "lpips_alex_person",
     "flicker",
+    "warped_flicker",
 )
 # Edges of the bins of distances.
 BINS = (0, 1, 2, 3, 4, 6, 8, 12, np.inf)
@@ -312,7 +314,8 @@ def other_capture(stored: DictConfig, given: str | DictConfig) -> DictConfig:
     config = stored.copy()
 
     # The run's own data, splits and protocol do not hold for another capture.
-    splits = ("train_cameras", "test_cameras", "train_frames", "test_frames")
+    cameras = ("train_cameras", "test_cameras")
+    splits = (*cameras, "train_frames", "test_frames", "train_poses")
     own = dict.fromkeys(("root", "protocol", *splits)) | {"body": "none"}
     config.data.merge_with(own)
 
@@ -601,7 +604,12 @@ def make_scorer(config: DictConfig, data: GsganData, marks: Sequence[str]) -> Sc
         if boxes is not None:
             record["departures"] += boxes.departures
     return Scorer(
-        prepare=Preparation(measures, boxes, data.skeleton),
+        prepare=Preparation(
+            measures,
+            boxes,
+            data.skeleton,
+            data.layout.meta.label_names or (),
+        ),
         lpips=build_lpips(config.lpips.nets, config.lpips.path),
         marks=marks,
         protocol=record,

@@ -27,17 +27,22 @@ from gsgan.metrics.image import (
     ssim_where,
 )
 from gsgan.metrics.lpips import LpipsAgainst, LpipsScores
+from gsgan.metrics.motion import truth_motion, warped_flicker
 from gsgan.metrics.names import (
     BOX_METRICS,
     FLOOR_VARIANT,
     FULL,
     IMAGE_METRICS,
+    LABEL_METRICS,
     METRICS,
+    MOTION_METRICS,
     PART_METRICS,
     SPLAT,
 )
 from gsgan.metrics.regions import BACKGROUNDS, cleared, describe_boxes, rectangle
 from gsgan.metrics.segmentation import confusion, miou
+from gsgan.metrics.shares import region_shares
+from gsgan.metrics.shifted import psnr_shifted
 from gsgan.model.avatar import Avatar
 from gsgan.model.rendering import Rendering
 from gsgan.scene import Frame
@@ -48,6 +53,7 @@ from gsgan.weights.networks import Lpips
 NO_PAIR = "no two images are of consecutive frames, in one window of one camera"
 NO_LPIPS = "left out by lpips.nets"
 NO_LABELS = "the data has no part labels"
+NO_NAMED_LABELS = "the data has no part labels with names"
 NO_PARTS_OF_SPLAT = "Step I's colour is not a segmentation"
 NO_PARTS_OF_FLOOR = "an all-background image is not a segmentation"
 # The fields that hold what a tally has counted so far.
@@ -64,6 +70,7 @@ def image_scores(
     box: Tensor | None = None,
     *,
     regions: Mapping[str, Tensor] | None = None,
+    parts: Mapping[str, Tensor] | None = None,
     measures: MetricVariants | None = None,
     lpips: LpipsScores | None = None,
 ) -> dict[str, float]:
@@ -74,6 +81,7 @@ def image_scores(
         mask: ``[1, 1, H, W]`` of the person; required for the metrics of the person alone.
         box: ``[1, 1, H, W]`` bool, the body's projected box; required if the measures use it.
         regions: of hands and mouth, from `gsgan.metrics.regions.hands_and_mouth`.
+        parts: of trunk and limbs, from `gsgan.metrics.shares.trunk_and_limbs`.
         measures: regions and ranges; None takes the defaults.
         lpips: against this ground truth, a `gsgan.metrics.lpips.LpipsAgainst`.
 
@@ -110,6 +118,8 @@ def image_scores(
         person = person_box(mask)
         regions["person"] = person
         scores["psnr_inside"] = psnr_inside(image, target, mask)
+        scores["psnr_person_shifted"] = psnr_shifted(image, target, mask)
+        scores |= region_shares(image, target, mask, parts or {})
         edges = edge_scores(image, target, person)
         scores["edge_f1_person"], scores["edge_ratio_person"] = edges
 
@@ -162,10 +172,12 @@ def means(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         # Why there is no score.
         if not finite:
             reason = "no image has a finite score" if left_out else "no image"
-            if metric == "flicker":
+            if metric in MOTION_METRICS:
                 reason = NO_PAIR
             elif metric.startswith("lpips"):
                 reason = NO_LPIPS
+            elif metric in LABEL_METRICS and not left_out:
+                reason = NO_NAMED_LABELS
             result[f"{metric}_reason"] = reason
     return result
 
@@ -331,6 +343,7 @@ class Tally:
         target = prepare.target(frame)
         box = prepare.box(frame)
         regions = prepare.regions(frame)
+        parts = prepare.parts(frame)
         images = self._images(item, frame, prediction, box)
         if show:
             painting = Rendering(
@@ -347,10 +360,12 @@ class Tally:
                 target, frame.mask, self.scorer.lpips, prepare.measures
             )
 
-        # Flicker needs the frame before, seen by the same camera.
+        # Motion needs the frame before, seen by the same camera.
         last = self.last
-        if last is not None and not _follows(item, frame, last.item, last.frame):
-            last = None
+        motion = None
+        if last is not None and _follows(item, frame, last.item, last.frame):
+            mask = last.frame.mask
+            motion = truth_motion(target, frame.mask, last.target, mask)
         for name, image in images.items():
             own = image_scores(
                 image,
@@ -358,14 +373,18 @@ class Tally:
                 frame.mask,
                 box,
                 regions=regions,
+                parts=parts,
                 measures=prepare.measures,
                 lpips=lpips,
             )
 
             # The same variant of the frame before.
-            if last is not None:
+            if last is not None and motion is not None:
                 before = (last.images[name], last.target, last.frame.mask)
                 own["flicker"] = float(flicker(image, target, frame.mask, before))
+                error_before = last.images[name] - last.target
+                moved = warped_flicker(image - target, error_before, motion)
+                own["warped_flicker"] = moved
 
             # One row per image and variant.
             row = {"camera": camera, "frame": number, **own}

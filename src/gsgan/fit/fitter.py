@@ -10,11 +10,12 @@ from torch import Tensor, nn
 from gsgan.body import Body, blend_transforms, skin
 from gsgan.body.skinned import carry, vertex_normals
 from gsgan.fit.frames import MaskedFrames, Silhouette, around
-from gsgan.model.body_points import SkinnedPoints, farthest_points
+from gsgan.model.body_points import SkinnedPoints
 from gsgan.scene import BodyPose, Camera, Gaussians
 from gsgan.splat import Accuracy, rasterise
 from gsgan.utils.checks import above, at_least, between, whole
 from gsgan.utils.errors import ConfigError
+from gsgan.utils.tensors import farthest_points
 
 BETAS = (0.9, 0.99)
 FINAL_RATE = 0.02  # of the learning rates, in the last sweep

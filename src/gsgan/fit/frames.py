@@ -11,10 +11,8 @@ from torch import Tensor
 
 from gsgan.data.datamodule import GsganData
 from gsgan.data.dataset import CaptureDataset
-from gsgan.data.splits import Item
-from gsgan.model.body_points import farthest_points
+from gsgan.data.splits import Item, spread_frames
 from gsgan.scene import Camera, Window, body_window, unit
-from gsgan.skeleton.training_poses import pose_in_pelvis, training_poses
 from gsgan.utils.arrays import Bytes, evenly_spaced
 from gsgan.utils.errors import DataError
 
@@ -22,8 +20,6 @@ from gsgan.utils.errors import DataError
 WINDOW_MARGIN = 0.25
 # quantile of the masks' areas that counts as usual: most masks may be nearly empty
 USUAL = 0.75
-# share of the poses, those least like all others, that is not chosen from
-OUTLIERS = 0.05
 
 
 @dataclass(frozen=True)
@@ -82,7 +78,7 @@ class MaskedFrames:
         # the frames, and the cameras of each
         used = layout.frames if held_out else data.trained
         if max_frames is not None:
-            used = spread_frames(data, used, max_frames)
+            used = spread_frames(layout.landmarks, used, max_frames)
         items: list[Item] = []
         for turn, frame in enumerate(used):
             seeing = [camera for camera in cameras if frame in layout.images[camera]]
@@ -180,27 +176,6 @@ class MaskedFrames:
     def _stacked(self, by_frame: Mapping[int, NDArray[np.float64]]) -> Tensor:
         values = np.stack([by_frame[frame] for frame in self.frames])
         return torch.from_numpy(values).to(self.device, torch.float32)
-
-
-def spread_frames(data: GsganData, frames: Sequence[int], maximum: int) -> list[int]:
-    """At most so many frames, rising, whose poses are far from each other.
-
-    The share `OUTLIERS` of the poses that are least like all others is not chosen from: wrong
-    landmarks are among them.
-    """
-    # All frames are used if they are few.
-    if len(frames) <= maximum:
-        return list(frames)
-    p, _ = data.layout.landmarks.joints(frames)
-
-    # Poses that are not outliers.
-    distance = training_poses(p).distance(p)
-    usual = (distance <= distance.quantile(1 - OUTLIERS)).nonzero().flatten()
-
-    # Frames of equal poses are chosen once.
-    poses = pose_in_pelvis(p[usual])
-    chosen = usual[farthest_points(poses, min(maximum, len(usual)))]
-    return sorted({frames[i] for i in chosen.tolist()})
 
 
 def rotated(cameras: Sequence[str], maximum: int | None, turn: int) -> list[str]:

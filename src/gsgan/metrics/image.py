@@ -96,12 +96,17 @@ def psnr_inside(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
 
     Their error is due to the mask if masks are uneven. The score is NaN if the mask is empty.
     """
+    return psnr_where(image, target, person_box(mask) & ~outline(mask))
+
+
+def outline(mask: Tensor) -> Tensor:
+    """``[B, 1, H, W]`` bool: the pixels within `OUTLINE_WIDTH` of the mask's outline."""
     # The maximum filter dilates the mask; the minimum filter erodes it.
     person = (mask >= 0.5).to(mask)
     side = 2 * OUTLINE_WIDTH + 1
     dilated = functional.max_pool2d(person, side, 1, OUTLINE_WIDTH)
     eroded = -functional.max_pool2d(-person, side, 1, OUTLINE_WIDTH)
-    return psnr_where(image, target, person_box(mask) & (dilated == eroded))
+    return dilated != eroded
 
 
 def ssim_where(image: Tensor, target: Tensor, *regions: Tensor) -> list[Tensor]:

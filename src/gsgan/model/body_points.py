@@ -4,7 +4,6 @@ import math
 from dataclasses import replace
 from typing import Any, Self
 
-import numpy as np
 import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from scipy.spatial import cKDTree
@@ -24,7 +23,7 @@ from gsgan.body.subdivide import subdivided
 from gsgan.scene import BodyPose, Gaussians
 from gsgan.skeleton import Points
 from gsgan.utils.checks import above, whole
-from gsgan.utils.tensors import derived, matvec, squared_norm
+from gsgan.utils.tensors import derived, farthest_points, matvec, squared_norm
 
 # share of the area at rest, below which rounding errors dominate a normal
 NORMAL_FLOOR = 1e-2
@@ -458,27 +457,6 @@ def moved_normals(A: Tensor, normals: Tensor) -> Tensor:
     cofactors = [torch.linalg.cross(a, b) for a, b in ((y, z), (z, x), (x, y))]
     moved = matvec(torch.stack(cofactors, dim=-1), normals)
     return moved * torch.rsqrt(squared_norm(moved) + NORMAL_FLOOR**2)
-
-
-def farthest_points(vertices: Tensor, count: int) -> Tensor:
-    """``[count]`` indices of vertices ``[V, D]`` far from each other, the first one first.
-
-    Meshes are dense in faces and hands; a subset in list order would leave arms and legs thin.
-    A count of V keeps the mesh's own order.
-    """
-    if count == len(vertices):
-        return torch.arange(count)
-    # numpy: a third of torch's time at this size
-    axes = np.ascontiguousarray(vertices.numpy().T)
-    chosen = np.zeros(count, np.int64)
-    nearest = np.full(len(vertices), np.inf, axes.dtype)
-
-    # Each step takes the vertex that is farthest from all chosen ones.
-    for i in range(1, count):
-        squared = (axes - axes[:, chosen[i - 1], None]) ** 2
-        np.minimum(nearest, squared.sum(0), out=nearest)
-        chosen[i] = nearest.argmax()
-    return torch.from_numpy(chosen)
 
 
 def neighbour_distance(points: Tensor, k: int = 1) -> Tensor:

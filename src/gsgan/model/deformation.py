@@ -12,12 +12,17 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from gsgan.model import compiled
-from gsgan.model.body_points import farthest_points
 from gsgan.scene import Gaussians
 from gsgan.skeleton import Points, root_of
 from gsgan.splat.sh import sh_to_colour
 from gsgan.utils.checks import between, one_of, whole
-from gsgan.utils.tensors import constant, derived, matvec, squared_norm
+from gsgan.utils.tensors import (
+    constant,
+    derived,
+    farthest_points,
+    matvec,
+    squared_norm,
+)
 
 NEAREST_ANCHORS = 3  # anchors between which the MLP's output is interpolated
 POSE_AXES = 20  # principal directions of the training poses' codes

@@ -16,7 +16,14 @@ from gsgan.data.crop import PersonCrop, square_window
 from gsgan.model.avatar import Avatar
 from gsgan.motion.orbit import Orbit
 from gsgan.render.output import Output
-from gsgan.run.drive import Drive, distilled_of, drive_of, inputs_of, joints_of
+from gsgan.run.drive import (
+    Drive,
+    distilled_of,
+    drive_of,
+    inputs_of,
+    joints_of,
+    smoothed,
+)
 from gsgan.run.runs import Run
 from gsgan.scene import Camera, cat
 from gsgan.skeleton.training_poses import TrainingPoses
@@ -47,7 +54,8 @@ def render_config(config: DictConfig) -> None:
         run.avatar = distilled_of(config, run)
 
     # The motion, and the camera of each frame.
-    drive = _chosen(drive_of(config, run, fps), config, fps)
+    drive = smoothed(config, drive_of(config, run, fps), fps)
+    drive = _chosen(drive, config, fps)
     console.print(drive.text, markup=False, highlight=False, soft_wrap=True)
     cameras, index = _cameras(config, run, drive)
     record = {

@@ -87,7 +87,7 @@ class Part:
             name = f"{name} {described}"
         if metric in self.spec.times_1000:
             name = f"{name} ×1000"
-        return f"{name} {METRICS[metric].better}"
+        return f"{name} {METRICS[metric].better}".rstrip()
 
     def written(self, metric: str, value: float) -> str:
         """A value of this table, with the metric's digits."""
@@ -454,11 +454,11 @@ def _with_best(rows: Sequence[Row], part: Part) -> list[Row]:
             mean = cells[i].mean
             if mean is not None:
                 means.append(mean)
-        if len(means) < 2:
+        better = METRICS[metric].better
+        if len(means) < 2 or not better:
             continue
 
         # Some metrics are better near 1 than above or below it.
-        better = METRICS[metric].better
         if better == "↑":
             best = max(means)
         elif better == "↓":

@@ -27,6 +27,7 @@ from gsgan.motion.clip import (
 )
 from gsgan.motion.readers import Source, read_motion
 from gsgan.motion.retarget import expressed, face_in_head, joined, placed, retargeted
+from gsgan.motion.smooth import OneEuro
 from gsgan.run.runs import Run
 from gsgan.scene import BodyPose, Camera, cat
 from gsgan.skeleton import complete_skeleton, sanitise
@@ -110,6 +111,27 @@ def drive_of(config: DictConfig, run: Run, fps: float) -> Drive:
     one_of("drive", config.drive, (None, "skeleton"))
     found = _chosen(config, run, fps)
     return found if config.drive is None else replace(found, body=None)
+
+
+def smoothed(config: DictConfig, drive: Drive, fps: float) -> Drive:
+    """The motion after the filter ``config.smooth``, if that is enabled.
+
+    Joints are smoothed from the past alone. Body poses follow from them.
+
+    Raises:
+        ConfigError: on a setting of the filter that is out of range.
+    """
+    # The other settings are those of the filter.
+    settings = dict(config.smooth)
+    if not settings.pop("enabled"):
+        return drive
+    smooth = OneEuro(**settings)
+
+    # Held-out frames may be apart; then the filter starts anew.
+    joints = []
+    for number, p in zip(drive.numbers, drive.p, strict=True):
+        joints.append(smooth(p, number / fps))
+    return replace(drive, p=np.stack(joints), body=None, text=f"{drive.text}, smoothed")
 
 
 def with_motion(config: DictConfig, motion: str) -> DictConfig:

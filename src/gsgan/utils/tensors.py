@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -119,3 +120,24 @@ def derived(
         with torch.inference_mode(False), torch.no_grad():
             found = kept[name] = state, make()
     return found[1]
+
+
+def farthest_points(points: Tensor, count: int) -> Tensor:
+    """``[count]`` indices of points ``[V, D]`` far from each other, the first one first.
+
+    Meshes are dense in faces and hands; a subset in list order would leave arms and legs thin.
+    A count of V keeps the points' own order.
+    """
+    if count == len(points):
+        return torch.arange(count)
+    # numpy: a third of torch's time at this size
+    axes = np.ascontiguousarray(points.numpy().T)
+    chosen = np.zeros(count, np.int64)
+    nearest = np.full(len(points), np.inf, axes.dtype)
+
+    # Each step takes the point that is farthest from all chosen ones.
+    for i in range(1, count):
+        squared = (axes - axes[:, chosen[i - 1], None]) ** 2
+        np.minimum(nearest, squared.sum(0), out=nearest)
+        chosen[i] = nearest.argmax()
+    return torch.from_numpy(chosen)

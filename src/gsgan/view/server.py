@@ -9,10 +9,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from gsgan.motion.orbit import Orbit
-from gsgan.run.drive import Drive, distilled_of, drive_of
+from gsgan.run.drive import Drive, distilled_of, drive_of, smoothed, with_motion
 from gsgan.run.runs import Run
 from gsgan.skeleton.proportions import upright
 from gsgan.utils.checks import above, between, whole
@@ -61,7 +61,8 @@ class Viewer:
             self.run.avatar = distilled_of(config, self.run)
 
         def read(motion: str) -> Drive:
-            return drive_of(OmegaConf.merge(config, {"motion": motion}), self.run, fps)  # type: ignore[arg-type]
+            drive = drive_of(with_motion(config, motion), self.run, fps)
+            return smoothed(config, drive, fps)
 
         # The settings and the first motion of all browsers.
         drive = read(config.motion or self.run.data.watched[0])
