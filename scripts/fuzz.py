@@ -65,6 +65,7 @@ class Hostile:
 
 def seeds(home: Path, run: Path) -> dict[str, list[tuple[Path, Reader]]]:
     """Whole and hostile files by kind, each in a folder with what its reader needs beside it."""
+    from animated_glb import write_gltf
     from capture_scenes import ring, write_toml
     from conventions import write_bvh
     from make import skeletons, write_face, write_hands, write_tiny_capture
@@ -126,6 +127,9 @@ def seeds(home: Path, run: Path) -> dict[str, list[tuple[Path, Reader]]]:
         home / "a.bvh", person, Choreography(person).at(np.ones(4)), 1 / 30
     )
     add("bvh", move_file, move)
+    moves = Choreography(person).at(np.arange(4) / 30)
+    for suffix in ("glb", "gltf", "vrma"):
+        add("glb", write_gltf(home / f"moves.{suffix}", person, moves, 1 / 30), move)
     amc = write_amc(folder("amc"))
     add("amc", amc, move)
     add("asf", amc.with_name("07.asf"), lambda path: move(path.with_name("07_01.amc")))
