@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from gsgan.motion.clip import usual_rate
+from gsgan.motion.clip import JUST_BEYOND, usual_rate
 from gsgan.motion.gltf_file import FILE_ERRORS, GltfFile, local_matrix, posed_matrix
 from gsgan.motion.humanoid import humanoid_bones
 from gsgan.motion.rotations import Array
@@ -15,10 +15,12 @@ from gsgan.motion.standard import RigMotion
 from gsgan.utils.errors import ConfigError, DataError
 
 # Numbers in a value of each animated property that moves joints.
-WIDTHS = {"translation": 3, "rotation": 4, "scale": 3}
-RATES = (24.0, 120.0)  # lowest and highest frames per second at which keys are sampled
+PROPERTIES = {"translation": 3, "rotation": 4, "scale": 3}
+KEY_RATES = (
+    24.0,
+    120.0,
+)  # lowest and highest frames per second at which keys are sampled
 SAME_TIME = 1e-3  # seconds: keys that are nearer than this count as one
-JUST_BEYOND = 0.05  # share of a frame
 # Joints times frames: more would need gigabytes.
 MAX_PLACES = 2_000_000
 # Extensions that map nodes to the bones of a human.
@@ -89,7 +91,10 @@ def _joints(glb: GltfFile) -> list[int]:
     if not joints:
         for animation in doc.animations:
             for channel in animation.channels:
-                if channel.target.path in WIDTHS and channel.target.node is not None:
+                if (
+                    channel.target.path in PROPERTIES
+                    and channel.target.node is not None
+                ):
                     joints.add(channel.target.node)
     above = set()
     for joint in joints:
@@ -138,7 +143,7 @@ def _channels(
     for channel in animation.channels:
         node = channel.target.node
         path = channel.target.path
-        if node not in nodes or path not in WIDTHS:
+        if node not in nodes or path not in PROPERTIES:
             continue
         sampler = animation.samplers[channel.sampler]
         times = glb.accessor(sampler.input)[:, 0]
@@ -146,7 +151,7 @@ def _channels(
         interpolation = sampler.interpolation or "LINEAR"
         if interpolation == "CUBICSPLINE":
             values = values.reshape(len(times), 3, -1)
-        if len(values) != len(times) or values.shape[-1] != WIDTHS[path]:
+        if len(values) != len(times) or values.shape[-1] != PROPERTIES[path]:
             raise ValueError(f"{len(times)} keys have values of shape {values.shape}")
         if not (np.isfinite(times).all() and np.isfinite(values).all()):
             raise ValueError("a key is not a number")
@@ -167,11 +172,11 @@ def _frame_times(channels: Mapping[tuple[int, str], _Channel]) -> Array:
     end = max(channel.times[-1] for channel in channels.values())
 
     # The rate that has a frame at the nearest two keys.
-    steps = [end - start, 1 / RATES[0]]
+    steps = [end - start, 1 / KEY_RATES[0]]
     for channel in channels.values():
         steps.extend(np.diff(channel.times))
     steps = [step for step in steps if step > SAME_TIME]
-    rate = usual_rate(float(np.clip(1 / min(steps), *RATES)))
+    rate = usual_rate(float(np.clip(1 / min(steps), *KEY_RATES)))
     count = int((end - start) * rate + JUST_BEYOND) + 1
     return np.asarray(start + np.arange(count) / rate)
 
@@ -246,7 +251,7 @@ def _rig_motion(
         offsets=offsets,
         rotations=rotations,
         root=posed[:, 0, :3, 3],
-        frame_time=float(times[1] - times[0]) if len(times) > 1 else 1 / RATES[0],
+        frame_time=float(times[1] - times[0]) if len(times) > 1 else 1 / KEY_RATES[0],
         local=local,
     )
 
@@ -259,7 +264,7 @@ def _posed(
     times: Array,
 ) -> Array:
     """``[F, 4, 4]`` from a node's axes to those of its parent."""
-    if not any((node, path) in channels for path in WIDTHS):
+    if not any((node, path) in channels for path in PROPERTIES):
         return np.broadcast_to(rest, (len(times), 4, 4))
 
     # Properties without keys are the node's own.
