@@ -72,6 +72,7 @@ def seeds(home: Path, run: Path) -> dict[str, list[tuple[Path, Reader]]]:
     from mannequin import mannequin
     from test_motion_readers import write_amc, write_pose
     from test_prepare_damage import opencv_yaml
+    from test_prepare_reconstructions import write_colmap, write_nerfstudio
     from tiny_glb import TinyGlb
     from writers.smpl import write_smpl
 
@@ -139,6 +140,12 @@ def seeds(home: Path, run: Path) -> dict[str, list[tuple[Path, Reader]]]:
     for name in ("intri.yml", "extri.yml"):
         add("calibration", opencv_yaml(folder(name[:5]), name), read_calibration)
     add("calibration", write_toml(home / "Calib.toml", ring()), read_calibration)
+    for name in ("cameras.bin", "images.bin"):
+        place = folder(f"colmap_{name[:-4]}")
+        write_colmap(place, ring(), "OPENCV", binary=True)
+        add("calibration", place / name, read_calibration)
+    scene = write_nerfstudio(home / "transforms.json", ring(), own=True)
+    add("calibration", scene, read_calibration)
     (home / "hostile.yml").write_text(
         "%YAML:1.0\n---\na: !!python/object/apply:os.system [touch x]\n"
     )
