@@ -20,7 +20,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from gsgan.motion.character import Character
-from gsgan.synthetic.glb import Glb
+from gsgan.motion.gltf_file import GltfFile
 from gsgan.synthetic.gltf import read_character
 
 AVATARS = {"blouse": "Hispanic_F_1_Casual.glb", "polo": "White_M_1_Casual.glb"}
@@ -223,7 +223,7 @@ def write(c: Character, source: Path, out: Path) -> None:
     doc.nodes.append(pygltflib.Node(name="person", mesh=0, skin=0))
     doc.scenes.append(pygltflib.Scene(nodes=[0, len(joints)]))
     doc.scene = 0
-    original = Glb(source)
+    original = GltfFile(source)
     for texture in range(2):
         data = original.image_bytes(texture)
         if texture == 1:

@@ -65,12 +65,14 @@ class Hostile:
 
 def seeds(home: Path, run: Path) -> dict[str, list[tuple[Path, Reader]]]:
     """Whole and hostile files by kind, each in a folder with what its reader needs beside it."""
+    from animated_glb import write_gltf
     from capture_scenes import ring, write_toml
     from conventions import write_bvh
     from make import skeletons, write_face, write_hands, write_tiny_capture
     from mannequin import mannequin
     from test_motion_readers import write_amc, write_pose
     from test_prepare_damage import opencv_yaml
+    from test_prepare_reconstructions import write_colmap, write_nerfstudio
     from tiny_glb import TinyGlb
     from writers.smpl import write_smpl
 
@@ -126,6 +128,9 @@ def seeds(home: Path, run: Path) -> dict[str, list[tuple[Path, Reader]]]:
         home / "a.bvh", person, Choreography(person).at(np.ones(4)), 1 / 30
     )
     add("bvh", move_file, move)
+    moves = Choreography(person).at(np.arange(4) / 30)
+    for suffix in ("glb", "gltf", "vrma"):
+        add("glb", write_gltf(home / f"moves.{suffix}", person, moves, 1 / 30), move)
     amc = write_amc(folder("amc"))
     add("amc", amc, move)
     add("asf", amc.with_name("07.asf"), lambda path: move(path.with_name("07_01.amc")))
@@ -135,6 +140,12 @@ def seeds(home: Path, run: Path) -> dict[str, list[tuple[Path, Reader]]]:
     for name in ("intri.yml", "extri.yml"):
         add("calibration", opencv_yaml(folder(name[:5]), name), read_calibration)
     add("calibration", write_toml(home / "Calib.toml", ring()), read_calibration)
+    for name in ("cameras.bin", "images.bin"):
+        place = folder(f"colmap_{name[:-4]}")
+        write_colmap(place, ring(), "OPENCV", binary=True)
+        add("calibration", place / name, read_calibration)
+    scene = write_nerfstudio(home / "transforms.json", ring(), own=True)
+    add("calibration", scene, read_calibration)
     (home / "hostile.yml").write_text(
         "%YAML:1.0\n---\na: !!python/object/apply:os.system [touch x]\n"
     )

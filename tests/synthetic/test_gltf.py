@@ -12,9 +12,9 @@ from scipy.spatial import cKDTree
 from tiny_glb import BONES, TinyGlb
 
 from gsgan.body.free import free_body
+from gsgan.motion.humanoid import mixamo_bone, vrm_bone
 from gsgan.synthetic.anchors import FACE_NAMES
 from gsgan.synthetic.gltf import AVATARS, read_character
-from gsgan.synthetic.humanoid import mixamo_bone, vrm_bone
 from gsgan.utils.errors import DataError
 
 VALID = Path(__file__).resolve().parents[3] / "shared" / "data" / "valid"
@@ -255,7 +255,7 @@ def test_damaged_bytes_end_in_one_sentence(tmp_path):
     for damaged, message in (
         (data[: len(data) // 2], "damaged"),
         (data[:40] + b"\xff" * 200 + data[240:], "damaged"),
-        (b"", "not a binary glTF"),
+        (b"", "not a glTF 2 file"),
     ):
         path.write_bytes(damaged)
         with pytest.raises(DataError, match=message):

@@ -310,7 +310,7 @@ def test_key_depends_on_every_parameter():
         ({"avatar": "nobody"}, "avatar must be blouse, polo, free_body or the path"),
         (
             {"motion": "waltz"},
-            "motion must be choreography, signs, far or the path of a .bvh or .amc",
+            "far or the path of a .bvh, .amc, .glb, .gltf, .vrma file",
         ),
         ({"secondary": "some"}, "secondary must be one of True, False"),
         ({"avatar": "mine.glb"}, r"data.source.*mine.* does not exist"),

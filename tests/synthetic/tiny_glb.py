@@ -41,7 +41,54 @@ SIDES = np.array(
 )
 
 
-class TinyGlb:
+class GlbWriter:
+    """A document under construction with its buffer."""
+
+    def __init__(self) -> None:
+        self.doc = pygltflib.GLTF2()
+        self.blob = bytearray()
+
+    def view(self, data: bytes) -> int:
+        self.blob.extend(bytes(-len(self.blob) % 4))
+        view = pygltflib.BufferView(
+            buffer=0, byteOffset=len(self.blob), byteLength=len(data)
+        )
+        self.doc.bufferViews.append(view)
+        self.blob.extend(data)
+        return len(self.doc.bufferViews) - 1
+
+    def accessor(self, values: Any, kind: str, **more: Any) -> int:
+        code = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "f4": 5126}
+        accessor = pygltflib.Accessor(
+            bufferView=self.view(values.tobytes()),
+            componentType=code[values.dtype.str[1:]],
+            count=len(values),
+            type=kind,
+            **more,
+        )
+        self.doc.accessors.append(accessor)
+        return len(self.doc.accessors) - 1
+
+    def sparse(self, at: Any, values: Any, count: int) -> int:
+        indices = pygltflib.AccessorSparseIndices(
+            bufferView=self.view(at.astype("u2").tobytes()), componentType=5123
+        )
+        rows = pygltflib.AccessorSparseValues(bufferView=self.view(values.tobytes()))
+        sparse = pygltflib.Sparse(count=len(at), indices=indices, values=rows)
+        accessor = pygltflib.Accessor(
+            componentType=5126, count=count, type="VEC3", sparse=sparse
+        )
+        self.doc.accessors.append(accessor)
+        return len(self.doc.accessors) - 1
+
+    def write(self, path: Path) -> Path:
+        self.doc.buffers = [pygltflib.Buffer(byteLength=len(self.blob))]
+        self.doc.set_binary_blob(bytes(self.blob))
+        self.doc.save_binary(path)
+        return path
+
+
+class TinyGlb(GlbWriter):
     """Builds the document; change ``doc`` before `write`."""
 
     def __init__(
@@ -50,7 +97,7 @@ class TinyGlb:
         unit: float = 1.0,
         names: dict[str, str] | None = None,
     ) -> None:
-        self.doc, self.blob = pygltflib.GLTF2(), bytearray()
+        super().__init__()
         joints = {bone: unit * np.array(at) for bone, (_, at) in BONES.items()}
         order = list(BONES)
         for bone, (parent, _) in BONES.items():
@@ -114,42 +161,3 @@ class TinyGlb:
             texture.extensions = {"EXT_texture_webp": {"source": number}}
         self.doc.textures.append(texture)
         return len(self.doc.textures) - 1
-
-    def view(self, data: bytes) -> int:
-        self.blob.extend(bytes(-len(self.blob) % 4))
-        view = pygltflib.BufferView(
-            buffer=0, byteOffset=len(self.blob), byteLength=len(data)
-        )
-        self.doc.bufferViews.append(view)
-        self.blob.extend(data)
-        return len(self.doc.bufferViews) - 1
-
-    def accessor(self, values: Any, kind: str, **more: Any) -> int:
-        code = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "f4": 5126}
-        accessor = pygltflib.Accessor(
-            bufferView=self.view(values.tobytes()),
-            componentType=code[values.dtype.str[1:]],
-            count=len(values),
-            type=kind,
-            **more,
-        )
-        self.doc.accessors.append(accessor)
-        return len(self.doc.accessors) - 1
-
-    def sparse(self, at: Any, values: Any, count: int) -> int:
-        indices = pygltflib.AccessorSparseIndices(
-            bufferView=self.view(at.astype("u2").tobytes()), componentType=5123
-        )
-        rows = pygltflib.AccessorSparseValues(bufferView=self.view(values.tobytes()))
-        sparse = pygltflib.Sparse(count=len(at), indices=indices, values=rows)
-        accessor = pygltflib.Accessor(
-            componentType=5126, count=count, type="VEC3", sparse=sparse
-        )
-        self.doc.accessors.append(accessor)
-        return len(self.doc.accessors) - 1
-
-    def write(self, path: Path) -> Path:
-        self.doc.buffers = [pygltflib.Buffer(byteLength=len(self.blob))]
-        self.doc.set_binary_blob(bytes(self.blob))
-        self.doc.save_binary(path)
-        return path

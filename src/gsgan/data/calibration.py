@@ -1,4 +1,5 @@
-"""Calibration files, recognised by their content: cameras.json, OpenCV YAML and TOML.
+"""Calibration files, recognised by their content: cameras.json, OpenCV YAML, TOML, nerfstudio,
+and by their name: COLMAP.
 
 cameras.json is the bring-your-own layout's calibration:
 ``{camera: {K 3x3, R 3x3, t 3, dist 0/4/5/8, size [w, h]}}``
@@ -16,6 +17,12 @@ import numpy as np
 import yaml
 
 from gsgan.data.cameras import CameraEntry, make_camera, numbers
+from gsgan.data.reconstructions import (
+    is_colmap,
+    is_nerfstudio,
+    read_colmap,
+    read_nerfstudio,
+)
 from gsgan.utils.arrays import Float, as_floats
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import read_json, read_text
@@ -27,11 +34,23 @@ HEAD_BYTES = 65536
 # The maximum size of a YAML file, in bytes: enough for some 1000 cameras.
 MAX_YAML_BYTES = 2**20
 # names of calibration files
-PATTERNS = ("cameras.json", "intri.yml", "intri.yaml", "*.toml")
-KNOWN = (
-    "OpenCV YAML (intri.yml beside extri.yml), TOML of Pose2Sim, aniposelib or caliscope, or "
-    "cameras.json"
+PATTERNS = (
+    "cameras.json",
+    "intri.yml",
+    "intri.yaml",
+    "*.toml",
+    "transforms.json",
+    "cameras.txt",
+    "cameras.bin",
 )
+# folders of a project that hold calibrations, beside those named like calibration
+PLACES = ("sparse", "sparse/0", "colmap/sparse/0")
+KNOWN = (
+    "OpenCV YAML (intri.yml beside extri.yml), TOML of Pose2Sim, aniposelib or caliscope, COLMAP's "
+    "cameras and images (.txt or .bin), nerfstudio's transforms.json, or cameras.json"
+)
+# formats whose worlds have no scale and any orientation
+WITHOUT_SCALE = ("COLMAP", "nerfstudio")
 # of a camera's table in TOML
 TOML_KEYS = ("size", "matrix", "distortions", "rotation", "translation")
 # tables that are no cameras
@@ -62,12 +81,15 @@ class Calibration:
         format: its name in words.
         cameras: by name, metres, K with pixel centres at +0.5; a size of (0, 0) is unknown.
         notes: one sentence for each omission or oddity.
+        metric: whether lengths are in metres; otherwise their unit is unknown, and the world has
+            any orientation.
     """
 
     path: Path
     format: str
     cameras: dict[str, CameraEntry]
     notes: tuple[str, ...] = ()
+    metric: bool = True
 
 
 def find_calibration(folder: Path) -> Path:
@@ -76,8 +98,8 @@ def find_calibration(folder: Path) -> Path:
     Raises:
         DataError: when there is none, or more than one.
     """
-    # The folder itself, and subfolders such as "calibration" and "calib_test".
-    places = [folder]
+    # The folder itself, and subfolders such as "calibration", "calib_test" and "sparse/0".
+    places = [folder, *(folder / place for place in PLACES)]
     for path in folder.glob("*"):
         if path.is_dir() and "calib" in path.name.lower():
             places.append(path)
@@ -113,10 +135,11 @@ def read_calibration(
     """Reads the cameras of a calibration file in any of the known formats.
 
     Args:
-        path: the file; for OpenCV YAML either of the two.
+        path: the file; for OpenCV YAML and COLMAP either of the two.
         unit_scale: metres in one unit of its lengths; None for the format's own (metres, or the
             unit in meta.json next to cameras.json).
-        pixel_centre: where K puts the first pixel's centre, 0 or 0.5; not read for cameras.json.
+        pixel_centre: where K puts the first pixel's centre, 0 or 0.5; not read for cameras.json,
+            COLMAP and nerfstudio.
 
     Raises:
         DataError: when it is none of the formats, or a value is impossible.
@@ -132,12 +155,13 @@ def read_calibration(
 
     # The first format whose test the head passes.
     for name, (fits, reader) in FORMATS.items():
-        if fits(head):
+        if fits(path, head):
             notes: list[str] = []
             cameras = reader(path, unit_scale, pixel_centre, notes)
             if not cameras:
                 raise DataError(f"{path} ({name}) lists no camera that can be used")
-            return Calibration(path, name, cameras, tuple(notes))
+            metric = unit_scale is not None or name not in WITHOUT_SCALE
+            return Calibration(path, name, cameras, tuple(notes), metric)
     raise DataError(f"{path} is not a known calibration; expected {KNOWN}")
 
 
@@ -193,7 +217,7 @@ def read_cameras(
         raise DataError(f"{path} lists no camera")
     if isinstance(content.get("frames"), list):  # a camera would be an object
         raise DataError(
-            f"{path} is a scene of nerfstudio, which is not read yet; write its cameras as {KNOWN}"
+            f"{path} is a scene of nerfstudio; gsgan.prepare calibration={path} reads it"
         )
 
     cameras = {}
@@ -464,16 +488,33 @@ def _opencv_rotation(where: str, name: str, extri: Mapping[str, Any]) -> Any:
     return R
 
 
+# -- all formats
+
+
+def _read_colmap(
+    path: Path, scale: float | None, pixel_centre: float, notes: list[str]
+) -> dict[str, CameraEntry]:
+    return read_colmap(path, scale or 1.0)
+
+
+def _read_nerfstudio(
+    path: Path, scale: float | None, pixel_centre: float, notes: list[str]
+) -> dict[str, CameraEntry]:
+    return read_nerfstudio(path, scale or 1.0)
+
+
 Reader = Callable[[Path, float | None, float, list[str]], dict[str, CameraEntry]]
 """Cameras of a path, metres in a unit (None: the format's own), K's pixel centre; gains notes."""
-# The test of a file's head and the reader of each format; the first that fits is taken.
-FORMATS: dict[str, tuple[Callable[[str], bool], Reader]] = {
+# The test of a path and a file's head, and the reader of each format; the first that fits is taken.
+FORMATS: dict[str, tuple[Callable[[Path, str], bool], Reader]] = {
+    "COLMAP": (lambda path, _: is_colmap(path), _read_colmap),
     "OpenCV YAML": (
-        lambda head: (
+        lambda _, head: (
             head.lstrip().startswith(("%YAML", "---")) or "!!opencv-matrix" in head
         ),
         _read_yaml,
     ),
-    "cameras.json": (lambda head: head.lstrip().startswith("{"), _read_json),
-    "TOML": (lambda head: "[" in head and "matrix" in head, _read_toml),
+    "nerfstudio": (lambda _, head: is_nerfstudio(head), _read_nerfstudio),
+    "cameras.json": (lambda _, head: head.lstrip().startswith("{"), _read_json),
+    "TOML": (lambda _, head: "[" in head and "matrix" in head, _read_toml),
 }

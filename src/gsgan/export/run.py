@@ -10,8 +10,10 @@ import numpy as np
 import torch
 import yaml
 from omegaconf import DictConfig, open_dict
+from rich.console import Console
 
 from gsgan import __version__
+from gsgan.export.motions import BodyMotion, bvh_text, captured_motion, motion_glb
 from gsgan.export.page import block, page, refuse_unsuitable
 from gsgan.export.splats import Splats, glb_bytes, ply_bytes, splats_of
 from gsgan.metrics.names import FLOOR_VARIANT, VARIANTS
@@ -24,6 +26,7 @@ from gsgan.run.drive import (
     with_motion,
 )
 from gsgan.run.runs import Run
+from gsgan.scene import BodyPose, cat
 from gsgan.utils.checks import above, one_of, whole
 from gsgan.utils.console import make_console, track
 from gsgan.utils.errors import ConfigError
@@ -169,7 +172,10 @@ ENDINGS = {
     "safetensors": ".safetensors",
     "html": ".html",
     "bin": ".bin",
+    "bvh": ".bvh",
+    "motion_glb": ".glb",
 }
+MOTIONS = ("bvh", "motion_glb")  # formats that hold a motion and no avatar
 CARD = "MODEL_CARD.md"
 
 
@@ -201,6 +207,11 @@ def export_config(config: DictConfig) -> None:
     sequence = not out.suffix
     with open_dict(config):
         config.device = "cpu"
+    if kind in MOTIONS:
+        motion = _motion(config, console)
+        _write(out, bvh_text(motion) if kind == "bvh" else motion_glb(motion))
+        tell(f"written: {out}, {len(motion.poses.theta)} frames at {motion.fps:g}")
+        return
     run = Run.load(config)
 
     # Gaussians in one pose per file; a glTF file without a motion shows the rest pose.
@@ -244,6 +255,12 @@ def _write(path: Path, content: str | bytes) -> None:
 
 def _place(config: DictConfig, kind: str) -> Path:
     """``out``, checked: a file of the format's ending, or a folder for a sequence of .ply files."""
+    # A capture has motion, but no avatar.
+    if config.capture is not None and kind not in MOTIONS:
+        raise ConfigError(
+            f"capture: format={kind} needs run=<folder>; a capture gives {', '.join(MOTIONS)}"
+        )
+
     # The name must say the format: a file with its ending, or a folder for .ply files.
     ending = ENDINGS[kind]
     folders = " or a folder" if kind == "ply" else ""
@@ -295,6 +312,31 @@ def _poses(config: DictConfig, run: Run) -> Drive:
         raise ConfigError(f"start={start}: the motion has {len(drive.p)} frames")
     end = None if config.frames is None else start + whole("frames", config.frames, 1)
     return drive.rows(np.arange(len(drive.p))[start:end])
+
+
+@torch.no_grad()
+def _motion(config: DictConfig, console: Console) -> BodyMotion:
+    """The body poses of a capture, or of the motion that drives a run."""
+    fps = float(above("fps", config.fps))
+    if config.capture is not None:
+        capture = Path(config.capture).expanduser()
+        return captured_motion(capture, config.data_smpl, fps)
+
+    # The body that the avatar moves with, whose poses are those of the motion or solved.
+    run = Run.load(config)
+    body = run.body
+    if body is None:
+        raise ConfigError(
+            f"run={run.folder}: its avatar moves without a body; give capture=<folder>"
+        )
+    drive = _poses(config, run)
+    console.print(drive.text, markup=False, highlight=False, soft_wrap=True)
+    poses = []
+    for i in track(range(len(drive.p)), "posing", console):
+        _, _, pose = inputs_of(run.avatar, drive, i)
+        assert pose is not None
+        poses.append(BodyPose(pose.theta.float(), pose.transl.float()))
+    return BodyMotion(body, cat(poses), fps, run.proportions.up)
 
 
 @torch.no_grad()

@@ -1,7 +1,6 @@
 """The Gaussians of a pose as other programs expect them: scales, quaternions, harmonics in world
 axes; written as .ply (3D Gaussian splatting) and as glTF (KHR_gaussian_splatting)."""
 
-import json
 import math
 from dataclasses import dataclass
 
@@ -9,15 +8,13 @@ import numpy as np
 import torch
 from kornia.geometry.conversions import rotation_matrix_to_quaternion
 from numpy.typing import NDArray
-from pygltflib import GLTF2
 from torch import Tensor
 from torch.nn import functional
 
-from gsgan import __version__
+from gsgan.export.glb import ARRAY_BUFFER, GENERATOR, GlbContent, to_y_up
 from gsgan.model.avatar import Avatar
 from gsgan.scene import BodyPose, Gaussians
 from gsgan.skeleton.densify import even_sphere
-from gsgan.skeleton.proportions import upright
 from gsgan.splat.sh import MAX_DEGREE, sh_basis
 from gsgan.utils.errors import ConfigError
 
@@ -28,11 +25,7 @@ DIRECTIONS = 64  # over which harmonics are fitted; 16 would do for rotations
 THINNEST = 1e-7
 FAINTEST = 1e-30  # opacity of Gaussians that are not drawn, for a finite logit
 EXTENSION = "KHR_gaussian_splatting"
-GENERATOR = f"gsgan {__version__}"
-# Numbers of glTF's specification (component type, primitive mode, and target of a buffer view)
-FLOAT = 5126
-POINTS = 0
-ARRAY_BUFFER = 34962
+POINTS = 0  # glTF's number of this primitive mode
 
 
 @dataclass(frozen=True)
@@ -201,36 +194,15 @@ def glb_bytes(splats: Splats, up: str) -> bytes:
             arrays[f"{EXTENSION}:SH_DEGREE_{l}_COEF_{m}"] = splats.sh[:, l * l + m]
 
     # All attributes lie one after the other in a single buffer.
-    data = b""
-    views = []
-    accessors = []
-    for i, array in enumerate(arrays.values()):
-        raw = np.ascontiguousarray(array, "<f4").tobytes()
-        views.append(
-            {
-                "buffer": 0,
-                "byteOffset": len(data),
-                "byteLength": len(raw),
-                "target": ARRAY_BUFFER,
-            }
-        )
-        kind = "SCALAR" if array.shape[1] == 1 else f"VEC{array.shape[1]}"
-        accessors.append(
-            {
-                "bufferView": i,
-                "componentType": FLOAT,
-                "count": len(array),
-                "type": kind,
-                "min": array.min(0).tolist(),
-                "max": array.max(0).tolist(),
-            }
-        )
-        data += raw
+    glb = GlbContent()
+    attributes = {}
+    for name, array in arrays.items():
+        attributes[name] = glb.add(array.astype("<f4"), ARRAY_BUFFER)
 
     # The extension says how the points are drawn.
     primitive = {
         "mode": POINTS,
-        "attributes": {name: i for i, name in enumerate(arrays)},
+        "attributes": attributes,
         "extensions": {
             EXTENSION: {
                 "kernel": "ellipse",
@@ -240,22 +212,16 @@ def glb_bytes(splats: Splats, up: str) -> bytes:
     }
 
     # A node turns the world to glTF's axes.
-    to_gltf = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]) @ upright(up)
-    turn = rotation_matrix_to_quaternion(torch.from_numpy(to_gltf)[None])[0]
+    turn = rotation_matrix_to_quaternion(torch.from_numpy(to_y_up(up))[None])[0]
     w, x, y, z = turn.tolist()
 
     # The scene: one node with one mesh, which has one primitive.
-    content = {
-        "asset": {"version": "2.0", "generator": GENERATOR},
-        "extensionsUsed": [EXTENSION],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "rotation": [x, y, z, w]}],
-        "meshes": [{"primitives": [primitive]}],
-        "buffers": [{"byteLength": len(data)}],
-        "bufferViews": views,
-        "accessors": accessors,
-    }
-    gltf = GLTF2.gltf_from_json(json.dumps(content))
-    gltf.set_binary_blob(data)
-    return b"".join(gltf.save_to_bytes())
+    return glb.file(
+        {
+            "extensionsUsed": [EXTENSION],
+            "scene": 0,
+            "scenes": [{"nodes": [0]}],
+            "nodes": [{"mesh": 0, "rotation": [x, y, z, w]}],
+            "meshes": [{"primitives": [primitive]}],
+        }
+    )

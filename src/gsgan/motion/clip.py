@@ -60,6 +60,7 @@ class Clip:
     file_up: str | None = (
         None  # the up axis of the file, if up is that of converted landmarks
     )
+    part: str = ""  # which part of the file it is, in words, if it has several
     # [F] poses of the subject's body that the landmarks come from, or None
     body: BodyPose | None = None
     filled: int = 0  # number of frames without shoulders and hips, see `checked`

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -68,6 +68,7 @@ ARRAYS = (
     *SHAPE_KEYS,
     *RATE_KEYS,
 )
+RIGS = (".bvh", ".amc", ".glb", ".gltf", ".vrma")  # suffixes of files of rigs
 SMPL_BODY = 22  # joints that SMPL, SMPL-H and SMPL-X share
 # Metres in the units that rigs are made in.
 LEG_UNITS = {
@@ -90,6 +91,8 @@ class Source:
     skeleton: Path | None = None
     # the axis of a rig's file that points up, or None to find it from the frames
     up: str | None = None
+    # the name or number of one of a glTF file's animations, or None for the longest
+    animation: str | None = None
 
 
 def read_motion(path: Path, source: Source) -> Clip:
@@ -472,8 +475,45 @@ def _with_visibility(path: Path, points: NDArray[Any], visibility: Any) -> Float
 # -- rigs
 
 
-def _rig(path: Path, motion: RigMotion, metres: float | None, source: Source) -> Clip:
-    """The motion of a rig; ``metres`` is its unit of length, or None to find it by the legs."""
+class RigFile(NamedTuple):
+    """What the file of a rig holds."""
+
+    motion: RigMotion
+    metres: float | None  # in its unit of length, or None if that is unknown
+    part: str = ""  # which part of the file it is, in words, if it has several
+
+
+def read_rig(
+    path: Path, skeleton: Path | None = None, animation: str | None = None
+) -> RigFile:
+    """The motion of a rig in a file of one of `RIGS`.
+
+    Args:
+        path: of the file.
+        skeleton: the ASF file of an AMC motion, or None for the one in the same folder.
+        animation: the name or number of one of a glTF file's animations, or None for the longest.
+
+    Raises:
+        ConfigError: when there is no such animation.
+        DataError: when the file is damaged.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".bvh":
+        return RigFile(read_bvh(path), None)
+    if suffix == ".amc":
+        motion, metres = read_amc(path, skeleton or asf_of(path))
+        return RigFile(motion, metres)
+
+    # pygltflib is imported only for its files.
+    from gsgan.motion.gltf_motion import read_gltf_motion
+
+    motion, part = read_gltf_motion(path, animation)
+    return RigFile(motion, None, part)
+
+
+def _read_rig(path: Path, source: Source) -> Clip:
+    """The motion of a rig on landmarks."""
+    motion, metres, part = read_rig(path, source.skeleton, source.animation)
     try:
         standard = standard_motion(motion, path, source.up)
     # Numbers that are finite but absurd cause such errors.
@@ -503,16 +543,8 @@ def _rig(path: Path, motion: RigMotion, metres: float | None, source: Source) ->
         up="z",
         unit=unit,
         file_up=standard.up,
+        part=part,
     )
-
-
-def _read_bvh(path: Path, source: Source) -> Clip:
-    return _rig(path, read_bvh(path), None, source)
-
-
-def _read_amc(path: Path, source: Source) -> Clip:
-    motion, metres = read_amc(path, source.skeleton or asf_of(path))
-    return _rig(path, motion, metres, source)
 
 
 # -- triangulated and detected points
@@ -540,8 +572,7 @@ READERS: dict[str, Callable[[Path, Source], Clip]] = {
     ".pkl": read_dictionary,
     ".npy": read_dictionary,
     ".json": read_mediapipe_json,
-    ".bvh": _read_bvh,
-    ".amc": _read_amc,
+    **dict.fromkeys(RIGS, _read_rig),
     ".trc": read_trc,
     ".pose": _read_pose,
 }

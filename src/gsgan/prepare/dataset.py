@@ -99,10 +99,16 @@ def write_files(root: Path, outcome: Outcome, key: str) -> None:
 
 
 def standing_axis(p: Float) -> str:
-    """The world axis along which a person ``p [F, J, 3]`` stands: "z", "-y", ...; unknown is "z".
+    """The world axis along which a person ``p [F, J, 3]`` stands: "z", "-y"; unknown is "z"."""
+    direction = standing_direction(p)
+    return "z" if direction is None else axis_name(direction)
 
-    It is the direction from ankles to nose and from hips to shoulders; if these are never seen,
-    from shoulders to ears. NaN = missing.
+
+def standing_direction(p: Float) -> Float | None:
+    """The direction ``[3]`` in which a person ``p [F, J, 3]`` stands, of any length.
+
+    It is that from ankles to nose and from hips to shoulders; if these are never seen, that from
+    shoulders to ears; then None. NaN = missing.
     """
     # Ankles to nose, hips to shoulders.
     ankles = (p[:, 27] + p[:, 28]) / 2
@@ -114,8 +120,8 @@ def standing_axis(p: Float) -> str:
     for directions in (body, head):
         seen = directions[known(directions)]
         if len(seen):
-            return axis_name(np.median(seen, axis=0))
-    return "z"
+            return np.asarray(np.median(seen, axis=0))
+    return None
 
 
 def exists(out: Path, key: str, overwrite: bool) -> bool:

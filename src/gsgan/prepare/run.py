@@ -7,25 +7,34 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from rich.console import Console
 
 from gsgan.check.report import Table
 from gsgan.check.run import check_capture
 from gsgan.data.splits import parse_frames
 from gsgan.data.validation import Thresholds, check_distance
+from gsgan.motion.rotations import between
 from gsgan.prepare import landmarks
 from gsgan.prepare.camera_array import CameraArray, camera_moves, undistort_points
-from gsgan.prepare.dataset import Outcome, exists, publish, write_files
+from gsgan.prepare.dataset import (
+    Outcome,
+    exists,
+    publish,
+    standing_direction,
+    write_files,
+)
 from gsgan.prepare.images import write_images
 from gsgan.prepare.landmarks import Detections
 from gsgan.prepare.mediapipe import find_people, tool_key
 from gsgan.prepare.one_camera import solve_video
+from gsgan.prepare.one_view import USUAL_HEIGHT
 from gsgan.prepare.options import MEDIAPIPE, Inputs, Options, read_inputs
 from gsgan.prepare.solve import Solution, median, solve
 from gsgan.prepare.sources import stamp
 from gsgan.prepare.stages import Advance, StageFolder, digest, each_camera
-from gsgan.prepare.triangulate import plain
-from gsgan.skeleton import MEDIAPIPE33
+from gsgan.prepare.triangulate import plain, robust
+from gsgan.skeleton import MEDIAPIPE33, limb_length_sum
 from gsgan.skeleton.joints import BODY, FACE, HANDS, known
 from gsgan.utils.arrays import Float, Ints
 from gsgan.utils.errors import DataError
@@ -178,7 +187,10 @@ def prepare(options: Options, console: Console) -> Path:
     else:
         found, masks = find_people(options, inputs.sources, stages, console.print)
         inputs, detections = with_detections(inputs, found)
-        frames, solution = _solved(options, inputs, detections, console)
+        frames, uv, conf = _undistorted(options, inputs, detections)
+        if not inputs.calibration.metric:
+            inputs = _in_metres(options, inputs, uv, conf)
+        solution = _solved(options, inputs, frames, uv, conf, console)
 
     # The dataset, in a folder of its own until it is complete; a run that was killed leaves one.
     root = stages.path("dataset", key)
@@ -263,13 +275,10 @@ def _fingerprint(options: Options, inputs: Inputs | None) -> list[object]:
     return parts
 
 
-def _solved(
-    options: Options,
-    inputs: Inputs,
-    detections: Mapping[str, Detections],
-    console: Console,
-) -> tuple[Ints, Solution]:
-    """The joints and cameras that fit the 2D landmarks of the chosen frames."""
+def _undistorted(
+    options: Options, inputs: Inputs, detections: Mapping[str, Detections]
+) -> tuple[Ints, Float, Float]:
+    """The chosen frames ``[F]``; undistorted pixels ``[C, F, J, 2]``, confidence ``[C, F, J]``."""
     # The chosen frames.
     frames, px, conf = landmarks.gather(detections, options.offsets or {})
     chosen = np.ones(len(frames), bool)
@@ -294,7 +303,65 @@ def _solved(
     uv = np.empty(px.shape)
     for c, camera in enumerate(inputs.cameras):
         uv[c] = undistort_points(camera, px[c])
+    return frames, uv, conf
 
+
+def _in_metres(options: Options, inputs: Inputs, uv: Float, conf: Float) -> Inputs:
+    """The inputs with cameras in metres, of a calibration without a scale.
+
+    The person, triangulated in the given world, gets the height of ``options`` or the usual one.
+    Without ``options.up_axis`` the world is turned so that the person stands along z.
+
+    Args:
+        options: of the command.
+        inputs: with C cameras in any unit.
+        uv: ``[C, F, J, 2]`` undistorted pixels.
+        conf: ``[C, F, J]`` their confidence.
+
+    Raises:
+        DataError: when no limb is seen by two cameras.
+    """
+    # The body's joints in the world of the calibration.
+    uv = uv[:, :, :BODY]
+    C, F, J = uv.shape[:3]
+    rig, pixels = CameraArray.of(inputs.cameras).normalised(uv.reshape(C, -1, 2))
+    p = robust(rig, pixels, conf[:, :, :BODY].reshape(C, -1)).p.reshape(F, J, 3)
+    seen = torch.from_numpy(known(p))
+    limbs = limb_length_sum(torch.from_numpy(np.nan_to_num(p)), seen).nanmedian()
+    if not limbs > 0:
+        raise DataError(
+            f"{inputs.calibration.path}: no limb was seen by two cameras; do frame numbers agree?"
+        )
+
+    # The person's height there, by the limbs of a usual body.
+    rest = torch.tensor(MEDIAPIPE33.rest_positions)[None]
+    usual = limb_length_sum(rest) / MEDIAPIPE33.stature
+    height = options.height or USUAL_HEIGHT
+    scale = height / float(limbs / usual)
+    assumed = "" if options.height else ", as a usual person; height=<m> sets it"
+    note = f"the calibration has no scale: the person is {height:.2f} m tall{assumed}"
+
+    # The turn that takes the person's upward direction to z.
+    turn = np.eye(3)
+    upward = standing_direction(p)
+    if options.up_axis is None and upward is not None:
+        turn = between(upward, np.array([0.0, 0, 1]))
+        note += "; the world was turned so that the person stands along z"
+    cameras = []
+    for camera in inputs.cameras:
+        cameras.append(replace(camera, R=camera.R @ turn.T, t=scale * camera.t))
+    return replace(inputs, cameras=cameras, notes=[*inputs.notes, note])
+
+
+def _solved(
+    options: Options,
+    inputs: Inputs,
+    frames: Ints,
+    uv: Float,
+    conf: Float,
+    console: Console,
+) -> Solution:
+    """The joints and cameras that fit undistorted pixels, see `_undistorted`."""
     # A quick solution shows cameras in a wrong unit before the long one begins.
     cameras = CameraArray.of(inputs.cameras)
     C = len(cameras)
@@ -302,7 +369,7 @@ def _solved(
     p = plain(cameras, flat_uv, conf.reshape(C, -1))
     _check_distance(inputs, p)
     with console.status("finding 3D joints and refining the cameras"):
-        return frames, solve(cameras, frames / inputs.fps, uv, conf, options.solve)
+        return solve(cameras, frames / inputs.fps, uv, conf, options.solve)
 
 
 def _check_distance(inputs: Inputs, p: Float) -> None:

@@ -257,7 +257,8 @@ def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
     model = None if smpl is None else Path(smpl).expanduser()
     asf = None if skeleton is None else Path(skeleton).expanduser()
     up = None if config.up is None else one_of("up", config.up, UP_AXES)
-    source = Source(proportions, model, asf, up)
+    animation = None if config.animation is None else str(config.animation)
+    source = Source(proportions, model, asf, up, animation)
     motion = read_motion(Path(path).expanduser(), source)
     motion = checked(motion, float(config.min_visibility))
     _refuse_swapped(motion)
@@ -311,9 +312,9 @@ def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
     bones = "bones as they are" if own else "on the subject's bones"
     assumed = "" if config.motion_fps or motion.fps else " (assumed: give motion_fps)"
     text = (
-        f"{motion.path.name}: {_frames(len(motion))} at {rate:.5g} per second{assumed}, "
-        f"{motion.unit}, {(motion.file_up or up).upper()} up -> {_frames(len(p))} at {fps:g}, "
-        f"{bones}{_hands_and_face(p)}"
+        f"{motion.path.name}{motion.part}: {_frames(len(motion))} at {rate:.5g} per "
+        f"second{assumed}, {motion.unit}, {(motion.file_up or up).upper()} up -> "
+        f"{_frames(len(p))} at {fps:g}, {bones}{_hands_and_face(p)}"
     )
     if motion.filled:
         text += f", {_frames(motion.filled)} without shoulders or hips filled"

@@ -1,6 +1,5 @@
 """Any rigged ``.glb`` as a `Character`: VALID, Ready Player Me, Mixamo, VRoid and their like."""
 
-import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,16 +11,16 @@ from scipy.spatial.transform import Rotation
 
 from gsgan.body.skinned import vertex_normals
 from gsgan.motion.character import Bytes, Character, Ints, Surface
-from gsgan.motion.rotations import Array
-from gsgan.synthetic.anchors import with_anchors
-from gsgan.synthetic.glb import Glb
-from gsgan.synthetic.humanoid import (
+from gsgan.motion.gltf_file import FILE_ERRORS, UNSUPPORTED, GltfFile, local_matrix
+from gsgan.motion.humanoid import (
     REQUIRED_BONES,
     WANTED,
     canonical_shapes,
     humanoid_bones,
     plain_shape,
 )
+from gsgan.motion.rotations import Array
+from gsgan.synthetic.anchors import with_anchors
 from gsgan.synthetic.parts import LABEL_NAMES, face_labels
 from gsgan.synthetic.textures import linear, srgb
 from gsgan.utils.errors import DataError
@@ -37,20 +36,9 @@ Z_UP = np.array(
 )
 HEIGHTS = (1.2, 2.3)  # metres: heights that are taken as they are
 UNIT_LENGTHS = (1.0, 0.01, 0.001, 0.0254)  # metres per unit of a file, likeliest first
+# Required by a file, these would change the meshes and textures that are read here.
+UNSUPPORTED_LOOKS = ("KHR_draco_mesh_compression", "KHR_texture_basisu")
 TRIANGLES = 4  # glTF's number of this primitive mode
-# Errors of reading a damaged file.
-FILE_ERRORS = (
-    ArithmeticError,
-    AttributeError,
-    AssertionError,
-    LookupError,
-    OSError,
-    RuntimeError,
-    TypeError,
-    ValueError,
-    struct.error,
-)
-
 AVATAR_FILES = sorted(Path(__file__).with_name("avatars").glob("*.glb"))
 AVATARS = {path.stem: path for path in AVATAR_FILES}
 """Files of the avatars that come with gsgan, by name."""
@@ -75,7 +63,7 @@ def read_character(path: Path) -> Character:
     if not path.is_file():
         raise DataError(f"{path}: no such file; expected a rigged character as .glb")
     try:
-        glb = Glb(path)
+        glb = GltfFile(path, (*UNSUPPORTED, *UNSUPPORTED_LOOKS))
         return _character(glb, _Skeleton(glb))
     except FILE_ERRORS as error:
         reason = str(error).split("\n")[0] or type(error).__name__
@@ -87,7 +75,8 @@ def read_character(path: Path) -> Character:
 class _Skeleton:
     """The bones of a file: its joints and the nodes that humanoid bones are mapped to."""
 
-    def __init__(self, glb: Glb) -> None:
+    def __init__(self, glb: GltfFile) -> None:
+        self.glb = glb
         self.nodes = glb.doc.nodes
         self._worlds: dict[int, Array] = {}  # cache of `world`
         skins = glb.doc.skins
@@ -96,19 +85,13 @@ class _Skeleton:
                 f"{glb.path}: no skin; expected a rigged character, export its bones"
             )
 
-        # The parent of each node.
-        self.above: dict[int, int] = {}
-        for i, node in enumerate(self.nodes):
-            for child in node.children or ():
-                self.above[child] = i
-
         # Bones are the joints of all skins and the humanoid bones, parents first.
         node_names = [node.name for node in self.nodes]
         named = humanoid_bones(node_names, glb.doc.extensions or {})
         used = set(named)
         for skin in skins:
             used.update(skin.joints)
-        self.ids = sorted(used, key=lambda i: (len(self.ancestors(i)), i))
+        self.ids = glb.parents_first(used)
         self.number = {node: k for k, node in enumerate(self.ids)}
         self.bones = self._names(named)
 
@@ -122,23 +105,13 @@ class _Skeleton:
             )
 
         # Parents and rest positions.
-        above = [self.above.get(i, -1) for i in self.ids]
+        above = [glb.above.get(i, -1) for i in self.ids]
         self.parents = np.array([self.bone_above(node) for node in above])
         self.joints = np.array([self.world(i)[:3, 3] for i in self.ids])
 
-    def ancestors(self, node: int) -> list[int]:
-        """Nodes above a node, from its parent to the root."""
-        chain = []
-        while node in self.above:
-            node = self.above[node]
-            if node in chain:
-                raise ValueError("nodes form a circle")
-            chain.append(node)
-        return chain
-
     def bone_above(self, node: int) -> int:
         """The number of the bone that a node is or hangs on, -1 for none."""
-        for i in [node, *self.ancestors(node)]:
+        for i in [node, *self.glb.ancestors(node)]:
             if i in self.number:
                 return self.number[i]
         return -1
@@ -146,8 +119,9 @@ class _Skeleton:
     def world(self, node: int) -> Array:
         """``[4, 4]`` from a node's axes to world axes, z up."""
         if node not in self._worlds:
-            above = self.world(self.above[node]) if node in self.above else Z_UP
-            self._worlds[node] = above @ _local(self.nodes[node])
+            parent = self.glb.above.get(node)
+            above = Z_UP if parent is None else self.world(parent)
+            self._worlds[node] = above @ local_matrix(self.nodes[node])
         return self._worlds[node]
 
     def _names(self, named: dict[int, str]) -> tuple[str, ...]:
@@ -162,19 +136,6 @@ class _Skeleton:
                 name = f"{name}.{i}"
             names.append(name)
         return tuple(names)
-
-
-def _local(node: Any) -> Array:
-    """``[4, 4]`` from a node's axes to those of its parent."""
-    if node.matrix:  # stored column by column
-        return np.reshape(np.array(node.matrix, np.float64), (4, 4)).T
-
-    matrix = np.eye(4)
-    rotation = Rotation.from_quat(node.rotation or [0, 0, 0, 1])
-    matrix[:3, :3] = rotation.as_matrix()
-    matrix[:3, :3] *= np.array(node.scale or [1, 1, 1])
-    matrix[:3, 3] = node.translation or 0
-    return matrix
 
 
 @dataclass(frozen=True)
@@ -200,7 +161,7 @@ class _Binding(NamedTuple):
     to_world: Array  # [V, 4, 4]
 
 
-def _parts(glb: Glb, skeleton: _Skeleton) -> list[_Part]:
+def _parts(glb: GltfFile, skeleton: _Skeleton) -> list[_Part]:
     """All triangles that hang on bones; others are no part of the person."""
     parts = []
     for i, node in enumerate(skeleton.nodes):
@@ -213,7 +174,7 @@ def _parts(glb: Glb, skeleton: _Skeleton) -> list[_Part]:
     return parts
 
 
-def _part(glb: Glb, skeleton: _Skeleton, number: int, primitive: Any) -> _Part:
+def _part(glb: GltfFile, skeleton: _Skeleton, number: int, primitive: Any) -> _Part:
     node = skeleton.nodes[number]
     mesh = glb.doc.meshes[node.mesh]
     attributes = {k: v for k, v in vars(primitive.attributes).items() if v is not None}
@@ -263,7 +224,7 @@ def _transformed(matrices: np.ndarray, vectors: Array) -> Array:
 
 
 def _shapes(
-    glb: Glb, names: Sequence[str], targets: Sequence[Any], linear: Array
+    glb: GltfFile, names: Sequence[str], targets: Sequence[Any], linear: Array
 ) -> dict[str, Array]:
     """Offsets ``[V, 3]`` of the wanted shapes in world axes; shapes of one name are added."""
     shapes: dict[str, Array] = {}
@@ -278,7 +239,7 @@ def _shapes(
 
 
 def _bound(
-    glb: Glb,
+    glb: GltfFile,
     skeleton: _Skeleton,
     number: int,
     attributes: dict[str, int],
@@ -312,7 +273,7 @@ def _bound(
     )
 
 
-def _four_largest(glb: Glb, attributes: dict[str, int]) -> tuple[Ints, Array]:
+def _four_largest(glb: GltfFile, attributes: dict[str, int]) -> tuple[Ints, Array]:
     """Joints in the skin ``[V, 4]`` of the four largest weights, and these, summing to 1."""
     # A file stores four joints and weights per vertex in each of its sets.
     joint_sets = []
@@ -332,7 +293,7 @@ def _four_largest(glb: Glb, attributes: dict[str, int]) -> tuple[Ints, Array]:
     return slots.astype(np.int64), weight / weight.sum(axis=1, keepdims=True)
 
 
-def _base_texture(glb: Glb, material: int | None) -> Any:
+def _base_texture(glb: GltfFile, material: int | None) -> Any:
     """The base colour's texture info, None without a texture."""
     if material is None:
         return None
@@ -340,7 +301,7 @@ def _base_texture(glb: Glb, material: int | None) -> Any:
     return shader and shader.baseColorTexture
 
 
-def _surface(glb: Glb, material: int) -> Surface:
+def _surface(glb: GltfFile, material: int) -> Surface:
     """Colours, normals and cut-off of a material; -1 is white."""
     white = np.full((1, 1, 4), 255, np.uint8)
     if material < 0:
@@ -437,7 +398,7 @@ def _unit_normals(normals: Array, vertices: Array, faces: Ints) -> Array:
     return np.where(length > 0, unit, [0.0, 0, 1])
 
 
-def _character(glb: Glb, skeleton: _Skeleton) -> Character:
+def _character(glb: GltfFile, skeleton: _Skeleton) -> Character:
     """All parts of the person, merged and standing, with labels and landmarks."""
     parts = [part for part in _parts(glb, skeleton) if len(part.faces)]
     if not parts:

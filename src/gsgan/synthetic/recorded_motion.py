@@ -1,4 +1,4 @@
-"""The motion of a BVH or AMC file on a character."""
+"""The motion of a rig's file on a character."""
 
 from pathlib import Path
 from typing import Any
@@ -7,15 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from gsgan.motion.asf import asf_of, read_amc
-from gsgan.motion.bvh import read_bvh
 from gsgan.motion.character import Animation, Character
+from gsgan.motion.readers import read_rig
 from gsgan.motion.rig import LEG, SIDES, SIGN, Pose, Rig
 from gsgan.motion.rotations import Array, blend
 from gsgan.motion.standard import drift, floor_under, standard_motion
 from gsgan.synthetic.posing import blinks
 
-RECORDED = (".bvh", ".amc")  # suffixes
 # A foot rests while it is this low and slow.
 CONTACT_HEIGHT = 0.04  # leg lengths
 CONTACT_SPEED = 0.3  # leg lengths per second
@@ -34,7 +32,8 @@ class RecordedMotion:
     Args:
         character: the subject. What its rig or the file lacks rests on its parent.
         path: a BVH file of a person, joints named as by Mixamo, MakeHuman, CMU, Blender, VRM, …;
-            or an AMC file with its ASF skeleton beside it.
+            an AMC file with its ASF skeleton beside it; or a glTF file or VRM animation, of which
+            the longest animation is taken.
         seed: of the blinks.
         collars: share of the upper arms' turns that collarbones take, for files such as CMU's
             whose collarbones do not move; None leaves them as they are.
@@ -53,10 +52,7 @@ class RecordedMotion:
         self.rig = Rig(character)
         self.seed = seed
         self.name = path.stem
-        if path.suffix == ".bvh":
-            read = read_bvh(path)
-        else:
-            read, _ = read_amc(path, asf_of(path))
+        read = read_rig(path).motion
 
         # Times of the frames, from 0.
         self.duration = len(read.root) * read.frame_time

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from gsgan.body.free import free_body
 from gsgan.data.cameras import DISTORTION_LENGTHS
 from gsgan.motion.character import Character
+from gsgan.motion.readers import RIGS
 from gsgan.synthetic.camera import SceneCamera, look_at, through_lens, zoomed
 from gsgan.synthetic.choreography import EVERYDAY, held_out
 from gsgan.synthetic.controls import frame_times
@@ -23,7 +24,7 @@ from gsgan.synthetic.far import FAR
 from gsgan.synthetic.free_subject import free_character, free_pose
 from gsgan.synthetic.gltf import AVATARS, read_character
 from gsgan.synthetic.posing import Choreography
-from gsgan.synthetic.recorded_motion import RECORDED, RecordedMotion
+from gsgan.synthetic.recorded_motion import RecordedMotion
 from gsgan.synthetic.secondary import Moving, Secondary
 from gsgan.synthetic.signs import SIGNS, split_signs
 from gsgan.synthetic.trace import Appearance, Light, PosedCharacter, Wrinkles
@@ -134,7 +135,7 @@ class SceneSettings:
     rays_per_pixel: int = 16
     seed: int = 0  # of the motion's style and of the tints
     avatar: str = DEFAULT  # name, or path of a .glb
-    motion: str = CHOREOGRAPHY  # name, or path of a .bvh or .amc
+    motion: str = CHOREOGRAPHY  # name, or path of a motion file of a rig
     secondary: bool = True  # sway and wrinkles of cloth
     lens: tuple[float, ...] | None = None  # OpenCV's distortion coefficients
     tint: float | None = None  # maximum change of a channel's gain
@@ -175,8 +176,8 @@ class SceneSettings:
             f"avatar must be {', '.join(named)} or the path of a rigged .glb, got {self.avatar!r}",
         )
         _require(
-            self.motion in tuple(PROGRAMMES) or str(self.motion).endswith(RECORDED),
-            f"motion must be {', '.join(PROGRAMMES)} or the path of a .bvh or .amc, "
+            self.motion in tuple(PROGRAMMES) or str(self.motion).endswith(RIGS),
+            f"motion must be {', '.join(PROGRAMMES)} or the path of a {', '.join(RIGS)} file, "
             f"got {self.motion!r}",
         )
         one_of("data.source.secondary", self.secondary, (True, False))

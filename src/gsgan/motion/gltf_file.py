@@ -1,12 +1,17 @@
-"""The numbers and images inside a binary glTF 2 file."""
+"""The numbers, images and nodes inside a glTF 2 file."""
 
+import base64
 import io
+import struct
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, cast
+from urllib.parse import unquote
 
 import numpy as np
 import pygltflib
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from gsgan.motion.character import Bytes
 from gsgan.motion.rotations import Array
@@ -22,37 +27,70 @@ COMPONENT_TYPES = {
     5126: "f4",
 }
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-# Required by a file, these would change what is read here; all others concern looks only.
-UNSUPPORTED = (
-    "KHR_draco_mesh_compression",
-    "KHR_texture_basisu",
-    "KHR_meshopt_compression",
-)
+# Required by a file, this would change all that is read here.
+UNSUPPORTED = ("KHR_meshopt_compression",)
 MAX_IMAGE_SIDE = 2048  # pixels a side
+# Errors of reading a damaged file.
+FILE_ERRORS = (
+    ArithmeticError,
+    AttributeError,
+    AssertionError,
+    LookupError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+    struct.error,
+)
 
 
-class Glb:
-    """A .glb file; ``doc`` is pygltflib's document.
+class GltfFile:
+    """A .glb file, or a .gltf file with its buffers; ``doc`` is pygltflib's document.
+
+    Args:
+        path: of the file.
+        unsupported: extensions without which it can be read only if they are not required.
 
     Raises:
-        DataError: when it is no .glb or is compressed in an unsupported way.
+        DataError: when it is no glTF 2 file, or requires an unsupported extension.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, unsupported: tuple[str, ...] = UNSUPPORTED) -> None:
         data = path.read_bytes()
-        if data[:4] != b"glTF":
-            raise DataError(
-                f"{path}: not a binary glTF file; export the character as .glb"
-            )
         self.path = path
-        self.doc = pygltflib.GLTF2.load_from_bytes(data)
+        if data[:4] == b"glTF":
+            self.doc = pygltflib.GLTF2.load_from_bytes(data)
+        elif data.lstrip()[:1] == b"{":
+            self.doc = pygltflib.GLTF2.gltf_from_json(data.decode())
+        else:
+            raise DataError(f"{path}: not a glTF 2 file; export it as .glb")
         for name in self.doc.extensionsRequired or ():
-            if name in UNSUPPORTED:
+            if name in unsupported:
                 raise DataError(f"{path}: {name} is not supported; export it without")
 
-        # The binary chunk and the cache of its views.
-        self._blob = self.doc.binary_blob() or b""
+        # Caches of the buffers and of their views.
+        self._buffers: dict[int, bytes] = {}
         self._views: dict[int, tuple[Any, int]] = {}
+
+        # The parent of each node.
+        self.above: dict[int, int] = {}
+        for i, node in enumerate(self.doc.nodes):
+            for child in node.children or ():
+                self.above[child] = i
+
+    def ancestors(self, node: int) -> list[int]:
+        """Nodes above a node, from its parent to the root."""
+        chain: list[int] = []
+        while node in self.above:
+            node = self.above[node]
+            if node in chain:
+                raise ValueError("nodes form a circle")
+            chain.append(node)
+        return chain
+
+    def parents_first(self, nodes: Iterable[int]) -> list[int]:
+        """Nodes by their distance from the root, then by their number."""
+        return sorted(nodes, key=lambda i: (len(self.ancestors(i)), i))
 
     def accessor(self, index: int) -> Array:
         """``[count, width]`` float64 values of an accessor; normalised integers are scaled."""
@@ -113,11 +151,33 @@ class Glb:
             packed = (view.extensions or {}).get("EXT_meshopt_compression")
             entry = packed or vars(view)
             start = entry.get("byteOffset") or 0
-            data = self._blob[start : start + entry["byteLength"]]
+            buffer = self._buffer(entry["buffer"])
+            data: Any = buffer[start : start + entry["byteLength"]]
             if packed:
                 data = self._decompressed(data, packed)
             self._views[index] = (data, entry.get("byteStride") or 0)
         return self._views[index]
+
+    def _buffer(self, index: int) -> bytes:
+        """A buffer: the file's binary chunk, text in base64, or a file in the same folder."""
+        if index not in self._buffers:
+            uri = self.doc.buffers[index].uri
+            if uri is None:
+                data = self.doc.binary_blob() or b""
+            elif uri.startswith("data:"):
+                _, _, text = uri.partition(",")
+                data = base64.b64decode(text)
+            else:
+                folder = self.path.parent.resolve()
+                file = (folder / unquote(uri)).resolve()
+                if not file.is_relative_to(folder) or not file.is_file():
+                    raise DataError(
+                        f"{self.path}: its buffer {uri} is not in the same folder; put it there, "
+                        "or export as .glb"
+                    )
+                data = file.read_bytes()
+            self._buffers[index] = data
+        return self._buffers[index]
 
     def _decompressed(self, data: bytes, packed: dict[str, Any]) -> Bytes:
         """The bytes of a view of EXT_meshopt_compression."""
@@ -147,3 +207,32 @@ class Glb:
             unfilter = getattr(decoder, f"decode_filter_{filters[name]}")
             decoded = unfilter(decoded, count, stride)
         return cast(Bytes, decoded)
+
+
+def local_matrix(node: Any) -> Array:
+    """``[4, 4]`` from a node's axes to those of its parent."""
+    if node.matrix:  # stored column by column
+        return np.reshape(np.array(node.matrix, np.float64), (4, 4)).T
+    return posed_matrix(
+        np.array(node.translation or [0, 0, 0], np.float64),
+        np.array(node.rotation or [0, 0, 0, 1], np.float64),
+        np.array(node.scale or [1, 1, 1], np.float64),
+    )
+
+
+def posed_matrix(translation: Array, quaternion: Array, scale: Array) -> Array:
+    """``[..., 4, 4]`` that scales, then turns, then moves.
+
+    Args:
+        translation: ``[..., 3]``.
+        quaternion: ``[..., 4]``, x y z w, of any length above 0.
+        scale: ``[..., 3]``.
+    """
+    R = Rotation.from_quat(quaternion.reshape(-1, 4)).as_matrix()
+    R = R.reshape(*quaternion.shape[:-1], 3, 3)
+    scaled = R * scale[..., None, :]
+    matrix = np.zeros((*scaled.shape[:-2], 4, 4))
+    matrix[..., :3, :3] = scaled
+    matrix[..., :3, 3] = translation
+    matrix[..., 3, 3] = 1
+    return matrix

@@ -89,8 +89,9 @@ def humanoid_bones(
     names: Iterable[str | None], extensions: Mapping[str, Any]
 ) -> dict[int, str]:
     """Node number → Mixamo's bone name, of a document's node names and extensions."""
-    if "VRMC_vrm" in extensions:
-        bones = extensions["VRMC_vrm"]["humanoid"]["humanBones"]
+    version_1 = extensions.get("VRMC_vrm") or extensions.get("VRMC_vrm_animation")
+    if version_1:
+        bones = version_1["humanoid"]["humanBones"]
         pairs = [(bone["node"], vrm_bone(name, 1)) for name, bone in bones.items()]
     elif "VRM" in extensions:
         bones = extensions["VRM"]["humanoid"]["humanBones"]
