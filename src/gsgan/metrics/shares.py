@@ -10,13 +10,9 @@ from gsgan.body.smpl_names import is_limb
 from gsgan.data.pixels import IGNORE_LABEL
 from gsgan.metrics.image import outline
 
-OUTLINE = "outline"
-TRUNK = "trunk"
-LIMBS = "limbs"
-
 
 def trunk_and_limbs(labels: Tensor, names: tuple[str, ...]) -> dict[str, Tensor]:
-    """The pixels of `TRUNK`, which has the head, and of `LIMBS`, by part labels.
+    """The pixels of ``trunk``, which has the head, and of ``limbs``, by part labels.
 
     Clothes have one label each: trousers and skirts are limbs, sleeves are trunk.
 
@@ -31,7 +27,7 @@ def trunk_and_limbs(labels: Tensor, names: tuple[str, ...]) -> dict[str, Tensor]
     table[: len(names)] = torch.tensor([is_limb(name) for name in names])
     limbs = table[labels]
     known = (labels > 0) & (labels != IGNORE_LABEL)
-    return {TRUNK: (known & ~limbs)[:, None], LIMBS: limbs[:, None]}
+    return {"trunk": (known & ~limbs)[:, None], "limbs": limbs[:, None]}
 
 
 def region_shares(
@@ -48,7 +44,7 @@ def region_shares(
         parts: from `trunk_and_limbs`; empty without part labels.
 
     Returns:
-        ``{"area_<region>": share, "error_<region>": share}`` for `OUTLINE` and the parts;
+        ``{"area_<region>": share, "error_<region>": share}`` for ``outline`` and the parts;
         NaN without a person, for the error of equal images, and for the parts of an image
         without labels.
     """
@@ -58,7 +54,7 @@ def region_shares(
     total = squared[person].sum()
 
     # The inside of the person, by part; an image may have no label.
-    regions = {OUTLINE: border}
+    regions = {"outline": border}
     labelled = False
     for name, part in parts.items():
         regions[name] = part & person & ~border
@@ -66,7 +62,7 @@ def region_shares(
 
     shares = {}
     for name, region in regions.items():
-        defined = labelled or name == OUTLINE
+        defined = labelled or name == "outline"
         area = region.sum() / person.sum()
         error = squared[region].sum() / total
         shares[f"area_{name}"] = float(area) if defined else math.nan
