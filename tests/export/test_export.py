@@ -1,9 +1,13 @@
 """``python -m gsgan.export``: files, cards and refusals of the real command."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 from commands import refused
 from PIL import Image
 
+from gsgan.export.splats import Splats, ply_bytes
 from gsgan.utils.errors import DataError
 from gsgan.utils.provenance import png_bytes
 
@@ -36,6 +40,40 @@ def test_a_sequence_of_ply_files_and_its_card(bare, tmp_path, inside):
     assert again.returncode == 0, again.stderr
     assert sorted(p.name for p in out.glob("*.ply")) == ["000004.ply", "notes.ply"]
     assert "license: cc-by-nc-4.0" in (out / "MODEL_CARD.md").read_text()
+
+
+def test_a_ply_says_how_it_is_filtered(bare, tmp_path, inside, monkeypatch):
+    """The header has Brush's comment where the avatar was trained with effects.antialias."""
+    from gsgan.run.runs import Run
+
+    splats = Splats(
+        means=np.zeros((1, 3), np.float32),
+        scales=np.ones((1, 3), np.float32),
+        quats=np.array([[1, 0, 0, 0]], np.float32),
+        opacities=np.array([0.5], np.float32),
+        sh=np.zeros((1, 1, 3), np.float32),
+    )
+    line = b"\ncomment SplatRenderMode: mip\n"
+    marked, plain = ply_bytes(splats, antialias=True), ply_bytes(splats)
+    assert line not in plain
+    assert marked.replace(line, b"\n") == plain
+
+    # The command, with and without the effect.
+    load = Run.load
+    for antialias in (False, True):
+
+        def changed(config, antialias=antialias):
+            run = load(config)
+            accuracy = replace(run.avatar.accuracy, antialias=antialias)
+            run.avatar.accuracy = accuracy
+            return run
+
+        monkeypatch.setattr(Run, "load", changed)
+        out = tmp_path / f"{antialias}.ply"
+        result = inside("export", f"run={bare}", f"out={out}")
+        assert result.returncode == 0, result.stderr
+        header = out.read_bytes().partition(b"end_header")[0]
+        assert (line in header) == antialias
 
 
 def test_a_file_in_place_of_a_folder_and_the_reverse(bare, tmp_path, inside):

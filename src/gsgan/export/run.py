@@ -15,7 +15,7 @@ from rich.console import Console
 from gsgan import __version__
 from gsgan.export.motions import BodyMotion, bvh_text, captured_motion, motion_glb
 from gsgan.export.page import block, page, refuse_unsuitable
-from gsgan.export.splats import Splats, glb_bytes, ply_bytes, splats_of
+from gsgan.export.splats import glb_bytes, ply_bytes, splats_of
 from gsgan.metrics.names import FLOOR_VARIANT, VARIANTS
 from gsgan.run.drive import (
     REST,
@@ -222,9 +222,7 @@ def export_config(config: DictConfig) -> None:
         numbers = range(len(drive.p)) if sequence else range(1)
         for i in track(numbers, "writing", console):
             name = out / f"{drive.numbers[i]:06d}{ENDINGS[kind]}" if sequence else out
-            splats = _splats(run, drive, i)
-            up = run.proportions.up
-            _write(name, ply_bytes(splats) if kind == "ply" else glb_bytes(splats, up))
+            _write(name, _splats(run, drive, i, kind))
 
         # A shorter sequence replaces a longer one: files of later frames are removed.
         if sequence and (out / CARD).is_file():
@@ -340,9 +338,13 @@ def _motion(config: DictConfig, console: Console) -> BodyMotion:
 
 
 @torch.no_grad()
-def _splats(run: Run, drive: Drive, i: int) -> Splats:
+def _splats(run: Run, drive: Drive, i: int, kind: str) -> bytes:
+    """The content of a .ply or .glb file of frame i."""
     p, visibility, body = inputs_of(run.avatar, drive, i)
-    return splats_of(run.avatar, p, visibility > 0, body)
+    splats = splats_of(run.avatar, p, visibility > 0, body)
+    if kind == "gltf":
+        return glb_bytes(splats, run.proportions.up)
+    return ply_bytes(splats, run.avatar.accuracy.antialias)
 
 
 def _program(config: DictConfig, run: Run, kind: str) -> bytes:

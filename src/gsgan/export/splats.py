@@ -130,11 +130,16 @@ def in_world(sh: Tensor, frames: Tensor) -> Tensor:
     return torch.linalg.pinv(sh_basis(world, degree)) @ colours
 
 
-def ply_bytes(splats: Splats) -> bytes:
+def ply_bytes(splats: Splats, antialias: bool = False) -> bytes:
     """A binary .ply file as 3D Gaussian splatting writes it (Kerbl et al., 2023).
 
     Scales are logarithms, opacities logits, and harmonics lie channel by channel with zeros above
     the avatar's degree. Quaternions are w x y z; normals are zero.
+
+    Args:
+        splats: N Gaussians.
+        antialias: whether opacities compensate for the low-pass filter, see `Accuracy`. A comment
+            in Brush's words says so; viewers that do not read it show such Gaussians too opaque.
     """
     # Harmonics above the constant one, padded to the format's fixed degree.
     count = len(splats.means)
@@ -165,8 +170,10 @@ def ply_bytes(splats: Splats) -> bytes:
         "ply",
         "format binary_little_endian 1.0",
         f"comment {GENERATOR}",
-        f"element vertex {count}",
     ]
+    if antialias:
+        header.append("comment SplatRenderMode: mip")
+    header.append(f"element vertex {count}")
     header += [f"property float {name}" for name in names]
     columns = [splats.means, np.zeros((count, 3)), *numbered.values()]
     rows = np.concatenate(columns, axis=1).astype("<f4")
