@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from gsgan.data.calibration import find_calibration, read_calibration
 from gsgan.data.cameras import CameraEntry, make_camera
 from gsgan.data.formats.capture import read_capture
-from gsgan.data.reconstructions import MODELS
+from gsgan.data.reconstructions import CAMERA_MODELS
 from gsgan.prepare.run import prepare
 from gsgan.utils.errors import DataError
 
@@ -52,7 +52,7 @@ def write_colmap(
         pose = [*quaternion, *camera.t]
         name = f"{camera.name}/000000.jpg"
         if binary:
-            number = list(MODELS).index(model)
+            number = list(CAMERA_MODELS).index(model)
             lenses.append(struct.pack(f"<iiQQ{len(values)}d", i, number, w, h, *values))
             points = struct.pack("<Qddqddq", 2, 1.5, 2.5, 7, 3.5, 4.5, -1)
             head = struct.pack("<i7di", 10 + i, *pose, i)
@@ -139,15 +139,15 @@ def test_images_of_a_camera_that_stands_still_are_one(tmp_path):
         read_calibration(path)
 
 
-@pytest.mark.parametrize("model", sorted(set(MODELS) - set(PARAMETERS)))
+@pytest.mark.parametrize("model", sorted(set(CAMERA_MODELS) - set(PARAMETERS)))
 def test_other_lenses_of_colmap_are_refused_by_name(tmp_path, model):
-    values = [800.0] * MODELS[model]
+    values = [800.0] * CAMERA_MODELS[model]
     (tmp_path / "images.txt").write_text("")
     text = tmp_path / "cameras.txt"
     text.write_text(f"1 {model} 640 480 {' '.join(map(str, values))}\n")
     (tmp_path / "images.bin").write_bytes(struct.pack("<Q", 0))
     binary = tmp_path / "cameras.bin"
-    number = list(MODELS).index(model)
+    number = list(CAMERA_MODELS).index(model)
     packed = struct.pack(f"<QiiQQ{len(values)}d", 1, 1, number, 640, 480, *values)
     binary.write_bytes(packed)
     for path in (text, binary):

@@ -19,7 +19,7 @@ from gsgan.utils.errors import DataError
 from gsgan.utils.files import read_json, read_text
 
 # COLMAP's camera models in the order of their numbers, with the numbers of their parameters.
-MODELS = {
+CAMERA_MODELS = {
     "SIMPLE_PINHOLE": 3,
     "PINHOLE": 4,
     "SIMPLE_RADIAL": 4,
@@ -45,7 +45,7 @@ PINHOLES = (
 ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")  # with one focal length
 POINT_BYTES = 24  # of a 2D point in images.bin: x, y, and the number of the 3D point
 # Errors of reading a damaged file.
-DAMAGED = (ArithmeticError, LookupError, OSError, struct.error, ValueError)
+DAMAGE = (ArithmeticError, LookupError, OSError, struct.error, ValueError)
 # OpenGL's camera axes, x right, y up, z backward, in OpenCV's.
 OPENGL = np.diag([1.0, -1.0, -1.0])
 # A camera stands still if the poses of its images differ by less: degrees, and a share of the
@@ -165,12 +165,12 @@ def read_colmap(path: Path, scale: float) -> dict[str, CameraEntry]:
     binary = path.suffix == ".bin"
     try:
         lenses = _binary_lenses(lens_path) if binary else _text_lenses(lens_path)
-    except DAMAGED as error:
+    except DAMAGE as error:
         raise _damaged(lens_path, error) from None
     try:
         images = _binary_images if binary else _text_images
         views = list(images(image_path, lenses))
-    except DAMAGED as error:
+    except DAMAGE as error:
         raise _damaged(image_path, error) from None
     if not views:
         raise DataError(f"{image_path} lists no image")
@@ -193,7 +193,7 @@ def _lens(
             f"{where}: the camera model {model} is not supported; expected one of "
             f"{', '.join(PINHOLES)}"
         )
-    if len(values) != MODELS[model]:
+    if len(values) != CAMERA_MODELS[model]:
         raise ValueError(f"{model} has {len(values)} parameters")
 
     # The focal lengths, the principal point, and then the lens.
@@ -219,7 +219,8 @@ def _text_lenses(path: Path) -> dict[int, Lens]:
 
 
 def _text_images(path: Path, lenses: Mapping[int, Lens]) -> Iterator[CalibratedImage]:
-    """Of lines ``number qw qx qy qz tx ty tz camera name``, each with a line of points below."""
+    """The images of a text file: lines ``number qw qx qy qz tx ty tz camera name``, each with
+    a line of points below."""
     lines = iter(read_text(path).splitlines())
     for line in lines:
         if not line.strip() or line.startswith("#"):
@@ -236,16 +237,16 @@ def _binary_lenses(path: Path) -> dict[int, Lens]:
         (count,) = _unpacked(stream, "<Q")
         for _ in range(count):
             number, model, width, height = _unpacked(stream, "<iiQQ")
-            names = list(MODELS)
+            names = list(CAMERA_MODELS)
             name = names[model] if 0 <= model < len(names) else f"number {model}"
-            parameters = _unpacked(stream, f"<{MODELS.get(name, 0)}d")
+            parameters = _unpacked(stream, f"<{CAMERA_MODELS.get(name, 0)}d")
             where = f"{path}, camera {number}"
             lenses[number] = _lens(where, name, (height, width), parameters)
     return lenses
 
 
 def _binary_images(path: Path, lenses: Mapping[int, Lens]) -> Iterator[CalibratedImage]:
-    """Of records of number, pose, camera, name and points."""
+    """The images of records of number, pose, camera, name and points."""
     with path.open("rb") as stream:
         (count,) = _unpacked(stream, "<Q")
         for _ in range(count):

@@ -12,9 +12,9 @@ from gsgan.skeleton import SkeletonTemplate
 from gsgan.skeleton.hands import HAND
 
 # On every side of a head's or hand's joints, relative to the longest side of their box.
-HEAD_MARGIN = 0.6
-HAND_MARGIN = 0.3
-MIN_SIDE = 16  # pixels
+DETAIL_HEAD_MARGIN = 0.6
+DETAIL_HAND_MARGIN = 0.3
+MIN_DETAIL = 16  # pixels
 Box = tuple[slice, slice]
 
 
@@ -82,15 +82,15 @@ def detail_boxes(
         By "head", "left hand" and "right hand"; parts without a joint in the image are left out.
     """
     # The joints of each part: a skeleton without hands has three landmarks of each.
-    parts = {"head": (list(template.face), HEAD_MARGIN)}
+    parts = {"head": (list(template.face), DETAIL_HEAD_MARGIN)}
     for side in ("left", "right"):
         joints = [
             template.names.index(f"{side}_{name}")
             for name in ("wrist", "pinky", "index", "thumb")
         ]
-        parts[f"{side} hand"] = (joints, HAND_MARGIN)
+        parts[f"{side} hand"] = (joints, DETAIL_HAND_MARGIN)
     for side, (wrist, *_) in zip(("left", "right"), template.palms, strict=False):
-        parts[f"{side} hand"] = (list(range(wrist, wrist + HAND)), HAND_MARGIN)
+        parts[f"{side} hand"] = (list(range(wrist, wrist + HAND)), DETAIL_HAND_MARGIN)
 
     # A square around the part's joints that lie in the image.
     pixels, depth = camera.project(skeleton)
@@ -107,7 +107,7 @@ def detail_boxes(
         high = points.amax(dim=0)
         extent = float((high - low).max())
         side_length = min(
-            max(round(extent * (1 + 2 * margin)), MIN_SIDE), height, width
+            max(round(extent * (1 + 2 * margin)), MIN_DETAIL), height, width
         )
 
         # It is moved into the image where it would leave it.
