@@ -178,7 +178,9 @@ class Avatar(nn.Module):
     @property
     def splat_channels(self) -> int:
         """Channels of F, colour included; 0 where nothing is splatted."""
-        return 0 if self.splats is None else 3 + self.splats.active_features
+        if self.deformation is not None:
+            return 3 + self.deformation.active_features
+        return 0 if self.surface is None else 3 + self.surface.features
 
     @property
     def needs_body(self) -> bool:

@@ -50,7 +50,7 @@ class SurfaceGaussians(SkinnedGaussians):
         count = len(self.points)
 
         # Colour is splatted alone, without other features.
-        self.active_features = self.features = 0
+        self.features = 0
         self.sh_degree = sh_degree
         self.body_height = float(body_height)
         # raised during training; higher degrees are not computed
