@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
+from torch.nn import functional
 
 from gsgan.body import open_body
 from gsgan.body.skinned import SkinnedBody, vertex_normals
@@ -27,6 +28,7 @@ from gsgan.utils.errors import DataError
 
 CENTIMETRES = 100.0  # of BVH in a metre: most programs expect them
 INFLUENCES = 4  # bones per vertex in glTF
+FIRST_JOINT = 2  # its node in glTF, after the mesh and the world
 LAST_BONE = 0.5  # length of an end site, share of the bone before
 
 
@@ -142,84 +144,94 @@ def motion_glb(motion: BodyMotion) -> bytes:
     joints = body.joints.numpy().astype("<f4")
     J = len(joints)
     content = GlbContent()
+    primitive = _mesh(content, body)
 
-    # The mesh, with the four largest weights of each vertex.
+    # Joints at rest have the world's axes, so that their inverse is a move; columns first.
+    bind = np.tile(np.eye(4, dtype="<f4"), (J, 1, 1))
+    bind[:, 3, :3] = -joints
+    skin = {
+        "joints": list(range(FIRST_JOINT, FIRST_JOINT + J)),
+        "inverseBindMatrices": content.add(bind.reshape(J, 16)),
+        "skeleton": FIRST_JOINT,
+    }
+    return content.file(
+        {
+            "scene": 0,
+            "scenes": [{"nodes": [0, 1]}],
+            "nodes": _nodes(motion),
+            "meshes": [{"primitives": [primitive]}],
+            "materials": [{"name": "body"}],
+            "skins": [skin],
+            "animations": [_animation(content, motion)],
+        }
+    )
+
+
+def _mesh(content: GlbContent, body: SkinnedBody) -> dict[str, object]:
+    """The body's mesh at rest, with the `INFLUENCES` largest weights of each vertex."""
+    # Weights and bones of fewer columns are filled with zeros.
     weights, slots = body.bone_weight.double().topk(
         min(INFLUENCES, body.bone_weight.shape[1]), dim=1
     )
     bones = body.bone_index.gather(1, slots)
     bones = torch.where(weights > 0, bones, 0)
     missing = (0, INFLUENCES - weights.shape[1])
-    weights = torch.nn.functional.pad(weights / weights.sum(1, keepdim=True), missing)
-    bones = torch.nn.functional.pad(bones, missing)
-    normals = vertex_normals(body.vertices, body.faces)
-    attributes = {
+    weights = functional.pad(weights / weights.sum(1, keepdim=True), missing)
+    bones = functional.pad(bones, missing)
+
+    # The attributes of vertices, then the faces.
+    values = {
         "POSITION": body.vertices.numpy().astype("<f4"),
-        "NORMAL": normals.numpy().astype("<f4"),
+        "NORMAL": vertex_normals(body.vertices, body.faces).numpy().astype("<f4"),
         "JOINTS_0": bones.numpy().astype("<u2"),
         "WEIGHTS_0": weights.numpy().astype("<f4"),
     }
-    primitive = {
-        "attributes": {
-            name: content.add(values, ARRAY_BUFFER)
-            for name, values in attributes.items()
-        },
-        "indices": content.add(
-            body.faces.reshape(-1, 1).numpy().astype("<u4"), ELEMENT_ARRAY_BUFFER
-        ),
-        "material": 0,
-    }
+    attributes = {}
+    for name, array in values.items():
+        attributes[name] = content.add(array, ARRAY_BUFFER)
+    corners = body.faces.reshape(-1, 1).numpy().astype("<u4")
+    indices = content.add(corners, ELEMENT_ARRAY_BUFFER)
+    return {"attributes": attributes, "indices": indices, "material": 0}
 
-    # Joints at rest have the world's axes, so that their inverse is a move; columns first.
-    bind = np.tile(np.eye(4, dtype="<f4"), (J, 1, 1))
-    bind[:, 3, :3] = -joints
-    inverse = content.add(bind.reshape(J, 16))
 
-    # Nodes: the mesh, the turn to Y up, then the joints.
-    first = 2
-    x, y, z, w = Rotation.from_matrix(to_y_up(motion.up)).as_quat().tolist()
+def _nodes(motion: BodyMotion) -> list[dict[str, object]]:
+    """The mesh, the turn to Y up, then the joints at rest."""
+    body = motion.body
+    joints = body.joints.numpy().astype("<f4")
+    turn = Rotation.from_matrix(to_y_up(motion.up)).as_quat().tolist()
     nodes: list[dict[str, object]] = [
         {"name": "body", "mesh": 0, "skin": 0},
-        {"name": "world", "rotation": [x, y, z, w], "children": [first]},
+        {"name": "world", "rotation": turn, "children": [FIRST_JOINT]},
     ]
     for j, name in enumerate(body.joint_names):
+        # A joint's place is relative to its parent's.
         parent = body.parents[j]
         offset = joints[j] - joints[parent] if parent >= 0 else joints[j]
         node: dict[str, object] = {"name": name, "translation": offset.tolist()}
-        children = [first + k for k, above in enumerate(body.parents) if above == j]
+        children = []
+        for child, above in enumerate(body.parents):
+            if above == j:
+                children.append(FIRST_JOINT + child)
         if children:
             node["children"] = children
         nodes.append(node)
+    return nodes
 
-    # The animation: every joint turns, the root moves too.
-    F = len(motion.poses.theta)
-    times = content.add((np.arange(F) / motion.fps).astype("<f4")[:, None])
-    moves = joints[0] + motion.poses.transl.numpy().astype("<f4")
-    samplers = [{"input": times, "output": content.add(moves)}]
-    channels = [{"sampler": 0, "target": {"node": first, "path": "translation"}}]
+
+def _animation(content: GlbContent, motion: BodyMotion) -> dict[str, object]:
+    """Every joint turns, and the root moves too."""
     theta = motion.poses.theta.double().numpy()
-    for j in range(J):
-        quaternions = Rotation.from_rotvec(theta[:, j]).as_quat().astype("<f4")
-        samplers.append({"input": times, "output": content.add(quaternions)})
-        target = {"node": first + j, "path": "rotation"}
-        channels.append({"sampler": j + 1, "target": target})
+    times = (np.arange(len(theta)) / motion.fps).astype("<f4")
+    keys = content.add(times[:, None])
 
-    return content.file(
-        {
-            "scene": 0,
-            "scenes": [{"nodes": [0, 1]}],
-            "nodes": nodes,
-            "meshes": [{"primitives": [primitive]}],
-            "materials": [{"name": "body"}],
-            "skins": [
-                {
-                    "joints": list(range(first, first + J)),
-                    "inverseBindMatrices": inverse,
-                    "skeleton": first,
-                }
-            ],
-            "animations": [
-                {"name": "motion", "samplers": samplers, "channels": channels}
-            ],
-        }
-    )
+    # The root's translation, then the rotations of all joints.
+    root = motion.body.joints[0].numpy().astype("<f4")
+    moves = root + motion.poses.transl.numpy().astype("<f4")
+    samplers = [{"input": keys, "output": content.add(moves)}]
+    channels = [{"sampler": 0, "target": {"node": FIRST_JOINT, "path": "translation"}}]
+    for j in range(theta.shape[1]):
+        quaternions = Rotation.from_rotvec(theta[:, j]).as_quat().astype("<f4")
+        samplers.append({"input": keys, "output": content.add(quaternions)})
+        target = {"node": FIRST_JOINT + j, "path": "rotation"}
+        channels.append({"sampler": j + 1, "target": target})
+    return {"name": "motion", "samplers": samplers, "channels": channels}

@@ -16,10 +16,8 @@ from gsgan.utils.errors import ConfigError, DataError
 
 # Numbers in a value of each animated property that moves joints.
 PROPERTIES = {"translation": 3, "rotation": 4, "scale": 3}
-KEY_RATES = (
-    24.0,
-    120.0,
-)  # lowest and highest frames per second at which keys are sampled
+# Lowest and highest frames per second at which keys are sampled.
+KEY_RATES = (24.0, 120.0)
 SAME_TIME = 1e-3  # seconds: keys that are nearer than this count as one
 # Joints times frames: more would need gigabytes.
 MAX_PLACES = 2_000_000
