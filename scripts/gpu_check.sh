@@ -82,7 +82,7 @@ step speed_1024_bf16 60 "${speed[@]}" size.image=1024 precision=bf16-mixed \
 step fit 120 "$python" -m gsgan.fit "${data[@]}" "${fit[@]}" out="$out/fit" overwrite=true \
   device="$device"
 # the default avatar (body, hands, S), its body fitted before training on the device
-step person 180 "$python" -m gsgan.train experiment=demo training=smoke trainer=$trainer \
+step person 180 "$python" -m gsgan.train experiment=demo_256 training=smoke trainer=$trainer \
   trainer.precision=bf16-mixed "${data[@]}" "${demo[@]}" resume=false hydra.run.dir="$out/person"
 step render 60 "$python" -m gsgan.render run="$out/person" motion=novel_pose drive=skeleton \
   "${video[@]}" out="$out/render.mp4" overwrite=true device="$device"
