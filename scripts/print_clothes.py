@@ -18,25 +18,26 @@ from numpy.typing import NDArray
 
 BRIGHT = 150  # of 255: darker pixels of a box are no cloth
 TEXT = "GAUSSIAN AVATAR 0123456789"
-LINE_HEIGHT = 44  # pixels of a 2048² texture
+TEXT_WIDTH = 560  # pixels of a 2048² texture
+LINE_HEIGHT = 44
 STRIPE = 11
 
 
 def pattern(height: int, width: int) -> NDArray[np.uint8]:
     """``[height, width, 3]`` BGR: lines of letters, red and blue, over thin stripes."""
-    print_ = np.full((height, width, 3), 255, np.uint8)
-    print_[:, ::STRIPE] = (170, 190, 120)
-    for row, top in enumerate(range(LINE_HEIGHT, height + LINE_HEIGHT, LINE_HEIGHT)):
+    printed = np.full((height, width, 3), 255, np.uint8)
+    printed[:, ::STRIPE] = (170, 190, 120)
+    for row, bottom in enumerate(range(LINE_HEIGHT, height + LINE_HEIGHT, LINE_HEIGHT)):
         colour = (40, 40, 190) if row % 2 else (150, 60, 20)
-        for left in range(-97 * (row % 3), width, 560):
-            cv2.putText(
-                print_, TEXT, (left, top), cv2.FONT_HERSHEY_DUPLEX, 1.0, colour, 3
-            )
-    return print_
+        for left in range(-97 * (row % 3), width, TEXT_WIDTH):
+            place = (left, bottom)
+            cv2.putText(printed, TEXT, place, cv2.FONT_HERSHEY_DUPLEX, 1.0, colour, 3)
+    return printed
 
 
 def main(source: str, target: str, *boxes: str) -> None:
-    # A .glb is a header, a JSON chunk and a binary chunk.
+    # A .glb is a header, a JSON chunk and a binary chunk. They are written here because pygltflib
+    # joins all buffers when it saves, and compressed meshes would be lost.
     data = Path(source).read_bytes()
     (length,) = struct.unpack_from("<I", data, 12)
     scene = json.loads(data[20 : 20 + length])

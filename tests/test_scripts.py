@@ -3,8 +3,11 @@
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from commands import ENVIRONMENT, ROOT
+
+from gsgan.synthetic.scene_setup import load_character
 
 
 @pytest.mark.parametrize(
@@ -28,3 +31,21 @@ def test_a_script_ends_well(words, tmp_path):
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_a_print_changes_the_colours_in_its_box_and_no_shape(tmp_path):
+    source = ROOT / "src" / "gsgan" / "synthetic" / "avatars" / "polo.glb"
+    target = tmp_path / "printed.glb"
+    script = str(ROOT / "scripts" / "print_clothes.py")
+    box = "0,0,0.5,1"  # the left half of the texture
+    command = [sys.executable, script, str(source), str(target), box]
+    subprocess.run(command, env=ENVIRONMENT, cwd=tmp_path, check=True)
+    before = load_character(str(source))
+    after = load_character(str(target))
+    assert np.array_equal(before.vertices, after.vertices)
+    old = before.surfaces[0].colour.astype(int)
+    new = after.surfaces[0].colour.astype(int)
+    half = old.shape[1] // 2
+    changed = np.abs(new - old).max(axis=-1) > 60  # more than compressing it again does
+    assert changed[:, :half].mean() > 0.01
+    assert changed[:, half:].mean() < 0.001
