@@ -86,14 +86,19 @@ class Writer:
         view = self.view(values.tobytes(), None, target)
         self.doc.accessors.append(
             pygltflib.Accessor(
-                bufferView=view, componentType=component, count=len(values), type=kind
+                bufferView=view,
+                componentType=component,
+                count=len(values),
+                type=kind,
             )
         )
         return len(self.doc.accessors) - 1
 
     def sparse(self, values: np.ndarray) -> int:
         """Float vectors that are zero nearly everywhere."""
-        at = np.flatnonzero(np.linalg.norm(values, axis=1) > SMALLEST).astype(np.uint16)
+        at = np.flatnonzero(np.linalg.norm(values, axis=1) > SMALLEST).astype(
+            np.uint16
+        )
         rows = values[at].astype(np.float32)
         self.doc.accessors.append(
             pygltflib.Accessor(
@@ -120,13 +125,17 @@ def simpler_mouth(c: Character) -> np.ndarray:
     """``[F, 3]`` faces with fewer of them on teeth and tongue: parts of the head off the body."""
     _, place = np.unique(np.round(c.vertices, 5), axis=0, return_inverse=True)
     edges = place.reshape(-1)[np.concatenate([c.faces[:, :2], c.faces[:, 1:]])]
-    graph = coo_array((np.ones(len(edges)), edges.T), shape=(place.max() + 1,) * 2)
+    graph = coo_array(
+        (np.ones(len(edges)), edges.T), shape=(place.max() + 1,) * 2
+    )
     part = connected_components(graph, directed=False)[1][
         place.reshape(-1)[c.faces[:, 0]]
     ]
     corner = c.faces[:, 0]
     bone = c.bone_index[corner, c.bone_weight[corner].argmax(1)]
-    mouth = (part != np.bincount(part).argmax()) & (bone == c.bones.index("Head"))
+    mouth = (part != np.bincount(part).argmax()) & (
+        bone == c.bones.index("Head")
+    )
     inside = c.faces[mouth].ravel().astype(np.uint32)
     fewer = np.zeros(len(inside), np.uint32)
     count = meshoptimizer.simplify(
@@ -198,7 +207,8 @@ def write(c: Character, source: Path, out: Path) -> None:
         WEIGHTS_0=writer.accessor(weight, "VEC4", normalized=True),
     )
     targets = [
-        {"POSITION": writer.sparse(v[used] @ Y_UP.T / scale)} for v in c.shapes.values()
+        {"POSITION": writer.sparse(v[used] @ Y_UP.T / scale)}
+        for v in c.shapes.values()
     ]
     doc = writer.doc
     primitive = pygltflib.Primitive(
@@ -228,10 +238,14 @@ def write(c: Character, source: Path, out: Path) -> None:
         data = original.image_bytes(texture)
         if texture == 1:
             data = upwards(data)
-        image = pygltflib.Image(bufferView=writer.view(data), mimeType="image/webp")
+        image = pygltflib.Image(
+            bufferView=writer.view(data), mimeType="image/webp"
+        )
         doc.images.append(image)
         doc.textures.append(
-            pygltflib.Texture(extensions={"EXT_texture_webp": {"source": texture}})
+            pygltflib.Texture(
+                extensions={"EXT_texture_webp": {"source": texture}}
+            )
         )
     shader = pygltflib.PbrMetallicRoughness(
         baseColorTexture=pygltflib.TextureInfo(index=0),
@@ -261,7 +275,9 @@ def write(c: Character, source: Path, out: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("source", type=Path, help="folder with VALID's .glb files")
+    parser.add_argument(
+        "source", type=Path, help="folder with VALID's .glb files"
+    )
     parser.add_argument("--out", type=Path, default=OUT)
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)

@@ -28,7 +28,10 @@ from free_body_mesh import (
 PEOPLE = 600
 DIRECTIONS = 10
 CHILDREN = 0.25  # share of the people
-CHILD, ADULT = (0.2, 0.5), (0.6, 1.0)  # anny's ages: 1/3 is a child, 2/3 a young adult
+CHILD, ADULT = (
+    (0.2, 0.5),
+    (0.6, 1.0),
+)  # anny's ages: 1/3 is a child, 2/3 a young adult
 
 
 def people(count: int) -> list[dict[str, float]]:
@@ -55,7 +58,9 @@ def area_of(vertices: Array, triangles: Array) -> Array:
 def principal(source: Source, cache: Path, count: int) -> tuple[Array, Array]:
     """Directions of vertices ``[K, V, 3]`` and of heads ``[K, J, 3]``, largest first."""
     model = load_model(cache)
-    found = [rest_points(model, person, source.groups) for person in people(count)]
+    found = [
+        rest_points(model, person, source.groups) for person in people(count)
+    ]
     vertices = np.stack([v for v, _ in found]) - source.vertices
     heads = np.stack([h for _, h in found]) - source.heads
     # by the surface: meshes are dense in faces and hands
@@ -65,7 +70,9 @@ def principal(source: Source, cache: Path, count: int) -> tuple[Array, Array]:
     values, mixing = values[::-1][:DIRECTIONS], mixing[:, ::-1][:, :DIRECTIONS]
     mixing = mixing * np.sign(mixing.sum(axis=0))
     explained = values.sum() / (weighted**2).sum()
-    print(f"{DIRECTIONS} directions hold {100 * explained:.2f} % of the variance")
+    print(
+        f"{DIRECTIONS} directions hold {100 * explained:.2f} % of the variance"
+    )
     left = weighted - mixing @ (mixing.T @ weighted)
     rms = np.sqrt((left**2).sum(axis=1) / (area**2).sum())
     print(f"left over: {1000 * np.median(rms):.1f} mm in the median person")
@@ -75,7 +82,9 @@ def principal(source: Source, cache: Path, count: int) -> tuple[Array, Array]:
     )
 
 
-def carried(source: Source, points: Array, vertices: Array, heads: Array) -> Array:
+def carried(
+    source: Source, points: Array, vertices: Array, heads: Array
+) -> Array:
     """Directions ``[K, N, 3]`` of points: of the head that lies there, else of the skin near by."""
     moved = []
     skin = np.unique(np.concatenate([source.groups[g].ravel() for g in SKIN]))
@@ -84,7 +93,9 @@ def carried(source: Source, points: Array, vertices: Array, heads: Array) -> Arr
         if to_head.min() < 1e-6:
             moved.append(heads[:, to_head.argmin()])
             continue
-        near = np.argsort(np.linalg.norm(source.vertices[skin] - point, axis=1))[:8]
+        near = np.argsort(
+            np.linalg.norm(source.vertices[skin] - point, axis=1)
+        )[:8]
         moved.append(vertices[:, skin[near]].mean(axis=1))
     return np.stack(moved, axis=1)
 
@@ -114,14 +125,20 @@ def main() -> None:
     # directions go through cutting and subdividing as the skinning weights do
     columns = vertices.transpose(1, 0, 2).reshape(len(full.vertices), -1)
     pieces = dress(
-        replace(source, weights=np.concatenate([source.weights, columns], axis=1))
+        replace(
+            source, weights=np.concatenate([source.weights, columns], axis=1)
+        )
     )
-    dressed = np.concatenate([p.mesh.weights[:, len(source.names) :] for p in pieces])
+    dressed = np.concatenate(
+        [p.mesh.weights[:, len(source.names) :] for p in pieces]
+    )
     kept = [full.names.index(name) for name in source.names]
     pose = pose_landmarks(full)
     hands = hand_landmarks(full, "L") + hand_landmarks(full, "R")
     arrays = {
-        "vertices": dressed.reshape(len(dressed), DIRECTIONS, 3).transpose(1, 0, 2),
+        "vertices": dressed.reshape(len(dressed), DIRECTIONS, 3).transpose(
+            1, 0, 2
+        ),
         "joints": heads[:, kept],
         "landmarks": carried(
             full, np.array([pose[n][0] for n in LANDMARKS]), vertices, heads
@@ -133,7 +150,9 @@ def main() -> None:
     half = {name: value.astype(np.float16) for name, value in arrays.items()}
     np.savez_compressed(arguments.out, **half)
     size = arguments.out.stat().st_size / 1000
-    print(f"{arguments.out}: {[list(v.shape) for v in half.values()]}, {size:.0f} kB")
+    print(
+        f"{arguments.out}: {[list(v.shape) for v in half.values()]}, {size:.0f} kB"
+    )
 
 
 if __name__ == "__main__":

@@ -155,15 +155,25 @@ def shoes(tights: Mesh, source: Source) -> Piece:
     v[:, 2] = np.maximum(v[:, 2], 0.0)
     mesh = replace(mesh, vertices=v)
     return Piece(
-        mesh, sided(mesh, "shoe"), np.full(len(mesh.faces), SURFACES.index("shoe"))
+        mesh,
+        sided(mesh, "shoe"),
+        np.full(len(mesh.faces), SURFACES.index("shoe")),
     )
 
 
-def hairline_field(points: Array, eye: Array, skull: tuple[float, float]) -> Array:
+def hairline_field(
+    points: Array, eye: Array, skull: tuple[float, float]
+) -> Array:
     """Positive where there is hair, in metres; ``skull`` is the head's (front, back) y."""
     front, back = skull
     depth = back - front
-    y = [front, front + 0.28 * depth, front + 0.48 * depth, front + 0.60 * depth, back]
+    y = [
+        front,
+        front + 0.28 * depth,
+        front + 0.48 * depth,
+        front + 0.60 * depth,
+        back,
+    ]
     line = np.interp(points[:, 1], y, [0.062, 0.048, -0.02, -0.055, -0.075])
     return points[:, 2] - (eye[2] + line)
 
@@ -171,11 +181,18 @@ def hairline_field(points: Array, eye: Array, skull: tuple[float, float]) -> Arr
 def hair(body: Mesh, source: Source, eye: Array) -> Piece:
     """Short hair: the scalp smoothed and pushed out, thin at the hairline."""
     inside = body.bones(source, "head.*") > 0.5
-    mesh = compact(replace(body, faces=body.faces[inside[body.faces].all(axis=1)]))
+    mesh = compact(
+        replace(body, faces=body.faces[inside[body.faces].all(axis=1)])
+    )
     skull = (mesh.vertices[:, 1].min() + 0.02, mesh.vertices[:, 1].max())
     mesh = clip(mesh, hairline_field(mesh.vertices, eye, skull))
-    outer = np.linalg.norm(mesh.vertices - [0, eye[1] + 0.08, eye[2]], axis=1) > 0.06
-    mesh = compact(replace(mesh, faces=mesh.faces[outer[mesh.faces].all(axis=1)]))
+    outer = (
+        np.linalg.norm(mesh.vertices - [0, eye[1] + 0.08, eye[2]], axis=1)
+        > 0.06
+    )
+    mesh = compact(
+        replace(mesh, faces=mesh.faces[outer[mesh.faces].all(axis=1)])
+    )
     field = hairline_field(mesh.vertices, eye, skull)
     shell = smooth(mesh, 30, 0.5 * ramp(field, 0.0, 0.03))
     # smoothing removes the ears but also shrinks the skull: lift sunk vertices above the skin
@@ -184,7 +201,9 @@ def hair(body: Mesh, source: Source, eye: Array) -> Piece:
     height = ((shell.vertices - mesh.vertices) * n).sum(axis=1)
     sunk = np.maximum(lift - height, 0)[:, None] * n
     shell = replace(shell, vertices=shell.vertices + sunk)
-    return uniform(smooth(shell, 3, 0.5 * ramp(field, 0.0, 0.02)), "hair", "hair")
+    return uniform(
+        smooth(shell, 3, 0.5 * ramp(field, 0.0, 0.02)), "hair", "hair"
+    )
 
 
 def skin(body: Mesh, source: Source) -> Piece:
@@ -201,7 +220,10 @@ def skin(body: Mesh, source: Source) -> Piece:
         return mesh.bones(source, pattern)[mesh.faces].mean(axis=1) > 0.5
 
     arm, leg, foot = mostly(ARM), mostly(LEG), faces(shoe_tuck)
-    arm_shown, leg_shown = arm & ~faces(sleeve_tuck), leg & ~faces(shorts_tuck) & ~foot
+    arm_shown, leg_shown = (
+        arm & ~faces(sleeve_tuck),
+        leg & ~faces(shorts_tuck) & ~foot,
+    )
     head_shown = ~arm & ~leg & ~faces(collar_tuck)
     labels = np.full(len(mesh.faces), LABELS.index("face_neck"))
     labels = np.where(arm, sided(mesh, "arm"), labels)
@@ -240,22 +262,29 @@ def shoe_tuck(mesh: Mesh, source: Source) -> Array:
 def sided(mesh: Mesh, part: str) -> Array:
     """``[F]`` the left or right label of a part, by the sign of x."""
     left = mesh.vertices[mesh.faces].mean(axis=1)[:, 0] > 0
-    return np.where(left, LABELS.index(f"left_{part}"), LABELS.index(f"right_{part}"))
+    return np.where(
+        left, LABELS.index(f"left_{part}"), LABELS.index(f"right_{part}")
+    )
 
 
 def uniform(mesh: Mesh, label: str, surface: str) -> Piece:
     n = len(mesh.faces)
     return Piece(
-        mesh, np.full(n, LABELS.index(label)), np.full(n, SURFACES.index(surface))
+        mesh,
+        np.full(n, LABELS.index(label)),
+        np.full(n, SURFACES.index(surface)),
     )
 
 
 def dress(source: Source) -> list[Piece]:
     """All visible pieces of the clothed person."""
-    tights = subdivide(source.vertices, source.weights, source.groups["helper-tights"])
+    tights = subdivide(
+        source.vertices, source.weights, source.groups["helper-tights"]
+    )
     body = group_mesh(source, "body")
     eyes = [
-        uniform(group_mesh(source, f"helper-{s}-eye"), "face_neck", "eye") for s in "lr"
+        uniform(group_mesh(source, f"helper-{s}-eye"), "face_neck", "eye")
+        for s in "lr"
     ]
     return [
         skin(body, source),
@@ -286,8 +315,12 @@ def eyeball(source: Source, side: str) -> tuple[Array, float]:
 def body_points(source: Source, pattern: str) -> Array:
     """Body vertices that mostly follow the matching bones."""
     index = np.unique(source.groups["body"])
-    columns = [i for i, n in enumerate(source.names) if re.fullmatch(pattern, n)]
-    return source.vertices[index[source.weights[index][:, columns].sum(axis=1) > 0.5]]
+    columns = [
+        i for i, n in enumerate(source.names) if re.fullmatch(pattern, n)
+    ]
+    return source.vertices[
+        index[source.weights[index][:, columns].sum(axis=1) > 0.5]
+    ]
 
 
 def pose_landmarks(source: Source) -> dict[str, tuple[Array, str]]:
@@ -295,7 +328,9 @@ def pose_landmarks(source: Source) -> dict[str, tuple[Array, str]]:
     head = body_points(source, "head")
     centre = head[np.abs(head[:, 0]) < 0.01]
     eye_l, _ = eyeball(source, "l")
-    below_eye = centre[(centre[:, 2] < eye_l[2]) & (centre[:, 2] > eye_l[2] - 0.07)]
+    below_eye = centre[
+        (centre[:, 2] < eye_l[2]) & (centre[:, 2] > eye_l[2] - 0.07)
+    ]
     nose = below_eye[below_eye[:, 1].argmin()]
     out: dict[str, tuple[Array, str]] = {"nose": (nose, "head")}
     for side, S, sign in (("left", "L", 1.0), ("right", "R", -1.0)):
@@ -307,7 +342,9 @@ def pose_landmarks(source: Source) -> dict[str, tuple[Array, str]]:
             )
         band = head[np.abs(head[:, 2] - eye[2] + 0.015) < 0.03]
         out[f"{side}_ear"] = (band[(sign * band[:, 0]).argmax()], "head")
-        target = np.array([0.38 * 2 * eye[0], eye[2] - 1.88 * (eye[2] - nose[2])])
+        target = np.array(
+            [0.38 * 2 * eye[0], eye[2] - 1.88 * (eye[2] - nose[2])]
+        )
         near = head[np.linalg.norm(head[:, [0, 2]] - target, axis=1) < 0.008]
         out[f"mouth_{side}"] = (near[near[:, 1].argmin()], "head")
         for name, bone, carrier in (
@@ -321,7 +358,10 @@ def pose_landmarks(source: Source) -> dict[str, tuple[Array, str]]:
             ("knee", "lowerleg01", "upperleg02"),
             ("ankle", "foot", "lowerleg02"),
         ):
-            out[f"{side}_{name}"] = (source.head(f"{bone}.{S}"), f"{carrier}.{S}")
+            out[f"{side}_{name}"] = (
+                source.head(f"{bone}.{S}"),
+                f"{carrier}.{S}",
+            )
         foot = body_points(source, rf"(foot|toe.*)\.{S}")
         low = foot[foot[:, 2] < source.head(f"foot.{S}")[2]]
         out[f"{side}_heel"] = (low[low[:, 1].argmax()], f"foot.{S}")
@@ -339,7 +379,9 @@ def hand_landmarks(source: Source, side: str) -> list[tuple[Array, str]]:
         direction = last - source.head(bones[1])
         direction = direction / np.linalg.norm(direction)
         points = body_points(source, re.escape(bones[2]))
-        reach = ((points - last) @ direction).max() - 0.004  # just under the skin
+        reach = (
+            (points - last) @ direction
+        ).max() - 0.004  # just under the skin
         out.append((last + reach * direction, kept_bone(bones[2])))
     return out
 
@@ -350,7 +392,9 @@ def hand_landmarks(source: Source, side: str) -> list[tuple[Array, str]]:
 def pack(pieces: list[Piece], source: Source, full: Source) -> dict[str, Array]:
     """The arrays of the asset, in their stored dtypes."""
     vertices = np.concatenate([p.mesh.vertices for p in pieces])
-    weights = np.concatenate([p.mesh.weights for p in pieces])[:, : len(source.names)]
+    weights = np.concatenate([p.mesh.weights for p in pieces])[
+        :, : len(source.names)
+    ]
     weights = np.maximum(weights, 0)  # subdivision may leave -1e-17
     starts = np.cumsum([0] + [len(p.mesh.vertices) for p in pieces])
     faces = np.concatenate(
@@ -364,8 +408,12 @@ def pack(pieces: list[Piece], source: Source, full: Source) -> dict[str, Array]:
     return {
         "vertices": vertices.astype(np.float32),
         "faces": faces.astype(np.uint16),
-        "face_labels": np.concatenate([p.labels for p in pieces]).astype(np.uint8),
-        "face_surface": np.concatenate([p.surfaces for p in pieces]).astype(np.uint8),
+        "face_labels": np.concatenate([p.labels for p in pieces]).astype(
+            np.uint8
+        ),
+        "face_surface": np.concatenate([p.surfaces for p in pieces]).astype(
+            np.uint8
+        ),
         "bone_index": index.astype(np.uint8),
         "bone_weight": np.rint(top * 255).astype(np.uint8),
         "joints": source.heads.astype(np.float32),
@@ -373,14 +421,18 @@ def pack(pieces: list[Piece], source: Source, full: Source) -> dict[str, Array]:
         "joint_names": np.array(source.names),
         "label_names": np.array(LABELS),
         "surface_names": np.array(SURFACES),
-        "landmarks": np.array([pose[n][0] for n in LANDMARKS], dtype=np.float32),
+        "landmarks": np.array(
+            [pose[n][0] for n in LANDMARKS], dtype=np.float32
+        ),
         "landmark_bone": np.array(
             [bone(pose[n][1]) for n in LANDMARKS], dtype=np.uint8
         ),
         "landmark_names": np.array(LANDMARKS),
         "hand_landmarks": np.array([p for p, _ in hands], dtype=np.float32),
         "hand_bone": np.array([bone(b) for _, b in hands], dtype=np.uint8),
-        "hand_names": np.array([f"{s}_{n}" for s in ("left", "right") for n in HAND]),
+        "hand_names": np.array(
+            [f"{s}_{n}" for s in ("left", "right") for n in HAND]
+        ),
     }
 
 

@@ -28,7 +28,10 @@ from gsgan.data.dataset import CaptureDataset
 from gsgan.data.formats.capture import read_capture
 from gsgan.data.splits import make_splits
 
-FILES, LINKS = 4, 30_000  # images that differ; links to one file (ext4 allows 65,000)
+FILES, LINKS = (
+    4,
+    30_000,
+)  # images that differ; links to one file (ext4 allows 65,000)
 SECONDS, ALLOWED = 20, 0.02
 
 
@@ -41,7 +44,9 @@ def make(root: Path, frames: int, cameras: int) -> None:
         arrays = dict(np.load(path))
         ids = np.arange(frames)
         per_frame = {k: v for k, v in arrays.items() if v.shape[:1] == (FILES,)}
-        arrays |= {name: values[ids % FILES] for name, values in per_frame.items()}
+        arrays |= {
+            name: values[ids % FILES] for name, values in per_frame.items()
+        }
         np.savez(path, **arrays | {"frame_id": ids})
     for folder in (*(root / "images").iterdir(), *(root / "masks").iterdir()):
         first = sorted(folder.iterdir())
@@ -62,7 +67,9 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=100_000)
     parser.add_argument("--cameras", type=int, default=20)
     parser.add_argument("--reads", type=int, default=1_600)
-    parser.add_argument("--folder", type=Path, help="kept; else a temporary folder")
+    parser.add_argument(
+        "--folder", type=Path, help="kept; else a temporary folder"
+    )
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         root = given.folder or Path(temporary) / "capture"

@@ -39,7 +39,9 @@ from typing import Any
 # also because a process with threads cannot be forked
 os.environ["OMP_NUM_THREADS"] = "1"
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "data"))
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "prepare"))
+sys.path.insert(
+    0, str(Path(__file__).resolve().parents[1] / "tests" / "prepare")
+)
 
 import gsgan.utils.compat  # noqa: F401  (before lightning)
 
@@ -77,9 +79,18 @@ SCHEDULE = {
     "epoch": 2,
 }
 TINY = [
-    *("size=tiny", "data=synthetic", "training=smoke", "trainer=cpu", "size.image=16"),
+    *(
+        "size=tiny",
+        "data=synthetic",
+        "training=smoke",
+        "trainer=cpu",
+        "size.image=16",
+    ),
     *("grid_rows=1", "trainer.check_val_every_n_epoch=2"),
-    *(f"data.source.{key}={str(value).lower()}" for key, value in SCENE.items()),
+    *(
+        f"data.source.{key}={str(value).lower()}"
+        for key, value in SCENE.items()
+    ),
     *(f"training.schedule.{key}={value}" for key, value in SCHEDULE.items()),
 ]
 FIT = [
@@ -148,7 +159,9 @@ STAGES = {
         again=("overwrite=true",),
     ),
     "sweep": Stage(
-        "train", ["-m", *TINY, "seed=0,1", "hydra.sweep.dir={out}/sweep"], share=0.4
+        "train",
+        ["-m", *TINY, "seed=0,1", "hydra.sweep.dir={out}/sweep"],
+        share=0.4,
     ),
 }
 
@@ -169,7 +182,9 @@ def child(work: Callable[[], None], log: Path) -> int:
     try:
         work()
     except SystemExit as end:
-        code = end.code if isinstance(end.code, int) else int(end.code is not None)
+        code = (
+            end.code if isinstance(end.code, int) else int(end.code is not None)
+        )
     except BaseException:
         traceback.print_exc()
         code = 99
@@ -193,9 +208,14 @@ def command(stage: Stage, place: dict[str, Path], again: bool) -> None:
 
 def remember_configs() -> None:
     """Makes Hydra compose each config once, which takes most of the time of a tiny run."""
-    compose, known = ConfigLoaderImpl.load_configuration, dict[str, DictConfig]()
+    compose, known = (
+        ConfigLoaderImpl.load_configuration,
+        dict[str, DictConfig](),
+    )
 
-    def load(self: ConfigLoaderImpl, *given: object, **named: object) -> DictConfig:
+    def load(
+        self: ConfigLoaderImpl, *given: object, **named: object
+    ) -> DictConfig:
         key = repr((given, named))
         if key not in known:
             known[key] = compose(self, *given, **named)  # type: ignore[arg-type]
@@ -232,9 +252,16 @@ def result(name: str, place: Path) -> dict[str, str]:
     found: dict[str, str] = {}
     for path in sorted(place.rglob("*")):
         inside = path.relative_to(place)
-        if not path.is_file() or path.suffix in (".part", ".lock", ".html", ".log"):
+        if not path.is_file() or path.suffix in (
+            ".part",
+            ".lock",
+            ".html",
+            ".log",
+        ):
             continue
-        if {"logs", "multirun.yaml", "facts.json", "MODEL_CARD.md"} & {*inside.parts}:
+        if {"logs", "multirun.yaml", "facts.json", "MODEL_CARD.md"} & {
+            *inside.parts
+        }:
             continue  # times, versions
         if any(part.startswith((".", "logs_")) for part in inside.parts):
             continue
@@ -250,7 +277,11 @@ def result(name: str, place: Path) -> dict[str, str]:
 def weights(path: Path) -> bytes:
     """Weights, optimisers' states and iteration of a checkpoint, as bytes."""
     state = torch.load(path, map_location="cpu", weights_only=True)
-    kept = [state["state_dict"], state["optimizer_states"], state["gsgan"]["step"]]
+    kept = [
+        state["state_dict"],
+        state["optimizer_states"],
+        state["gsgan"]["step"],
+    ]
     digest = hashlib.sha256()
 
     def add(value: object) -> None:
@@ -305,14 +336,21 @@ class Chaos:
         self, name: str, out: Path, again: bool = False, make: bool = True
     ) -> str:
         """Runs a stage to its end; its output. An AssertionError where it fails."""
-        place = self.place(name, out) if make else {"out": out, "base": self.base}
+        place = (
+            self.place(name, out) if make else {"out": out, "base": self.base}
+        )
         pid = child(
-            lambda: command(STAGES[name], place, again), log := self.folder / "log"
+            lambda: command(STAGES[name], place, again),
+            log := self.folder / "log",
         )
         status = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
         text = log.read_text(errors="replace")
-        finished = again and ("exists already" in text or "exists; give" in text)
-        assert status == 0 or finished, f"{name} ends with {status}: {text[-2000:]}"
+        finished = again and (
+            "exists already" in text or "exists; give" in text
+        )
+        assert status == 0 or finished, (
+            f"{name} ends with {status}: {text[-2000:]}"
+        )
         return text
 
     def prepare(self, name: str) -> Truth:
@@ -341,7 +379,9 @@ class Chaos:
         status = os.waitpid(child(work, log), 0)[1]
         assert status == 0, log.read_text()[-2000:]
         shutil.copytree(place["out"], self.folder / "whole" / name)
-        return Truth(result(name, place["out"]), *json.loads(numbers.read_text()))
+        return Truth(
+            result(name, place["out"]), *json.loads(numbers.read_text())
+        )
 
     def kill(self, name: str, way: str, truth: Truth) -> None:
         """One kill, the same command again, and the comparison."""
@@ -364,7 +404,9 @@ class Chaos:
 
         pid = child(work, log)
         if way in (s.name for s in SIGNALS):
-            while not os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT):
+            while not os.waitid(
+                os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT
+            ):
                 if processor_seconds(pid) >= moment:
                     os.kill(pid, signal.Signals[way])
                     break
@@ -372,7 +414,9 @@ class Chaos:
         status = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
         text = log.read_text(errors="replace")
         when = (
-            f"{moment:.1f} s" if way in (s.name for s in SIGNALS) else f"operation {at}"
+            f"{moment:.1f} s"
+            if way in (s.name for s in SIGNALS)
+            else f"operation {at}"
         )
         what = f"{name}, {way} at {when}"
         if way == "no space" and (
@@ -384,7 +428,9 @@ class Chaos:
             if self.equal(name, expected, out):
                 self.counts[name, way, "too late"] += 1  # it had finished
             else:
-                self.problem(name, way, f"{what}: unfinished, but the exit status is 0")
+                self.problem(
+                    name, way, f"{what}: unfinished, but the exit status is 0"
+                )
             return
         try:
             self.whole(name, out, again=True, make=False)
@@ -424,7 +470,9 @@ class Chaos:
         """The command on a file system with room for a share of its result, then with room."""
         kept = pages(self.base / (STAGES[name].inputs or "none"))
         made = pages(self.folder / "whole" / name) - kept
-        with mounted(self.folder / "disk", 4096 * int(2 + kept + share * made)) as room:
+        with mounted(
+            self.folder / "disk", 4096 * int(2 + kept + share * made)
+        ) as room:
             try:
                 place = self.place(name, room / "out")
             except OSError:
@@ -458,10 +506,13 @@ class Chaos:
 def processor_seconds(pid: int) -> float:
     """Of a process and those it started; a busy machine moves no moment."""
     with contextlib.suppress(OSError):  # it has ended
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2].split()
+        fields = (
+            Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2].split()
+        )
         spent = sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
         started = (
-            p.read_text().split() for p in Path(f"/proc/{pid}/task").glob("*/children")
+            p.read_text().split()
+            for p in Path(f"/proc/{pid}/task").glob("*/children")
         )
         return spent + sum(
             processor_seconds(int(one)) for some in started for one in some
@@ -472,7 +523,9 @@ def processor_seconds(pid: int) -> float:
 def pages(folder: Path) -> int:
     """Of memory that a folder's files take in a tmpfs."""
     return sum(
-        -(-path.stat().st_size // 4096) for path in folder.rglob("*") if path.is_file()
+        -(-path.stat().st_size // 4096)
+        for path in folder.rglob("*")
+        if path.is_file()
     )
 
 
@@ -497,7 +550,9 @@ def inputs(base: Path) -> None:
     from make import write_tiny_capture
 
     write_project(base / "project", 3, 4, (64, 48))
-    people = write_tiny_capture(base / "people", cameras=3, frames=4, size=(48, 48))
+    people = write_tiny_capture(
+        base / "people", cameras=3, frames=4, size=(48, 48)
+    )
     for left in ("labels", "body_pose.npz"):
         shutil.rmtree(people / left, ignore_errors=True)
 
@@ -523,8 +578,12 @@ def main() -> None:
         any("{base}/run" in a for n in names for a in STAGES[n].arguments)
         or "evaluate" in names
     ):
-        names += [] if "train" in names else ["train"]  # its run is the others' input
-    with tempfile.TemporaryDirectory(prefix="gsgan-chaos-", dir=given.work) as folder:
+        names += (
+            [] if "train" in names else ["train"]
+        )  # its run is the others' input
+    with tempfile.TemporaryDirectory(
+        prefix="gsgan-chaos-", dir=given.work
+    ) as folder:
         chaos = Chaos(Path(folder), given.seed)
         chaos.base.mkdir()
         built, cache = cache_root() / "native", chaos.base / "cache"
@@ -548,9 +607,12 @@ def main() -> None:
         ways = [*(s.name for s in SIGNALS), "operation", "no space"]
         total = sum(STAGES[name].share for name in names)
         wanted = {
-            name: round(given.kills * STAGES[name].share / total) for name in names
+            name: round(given.kills * STAGES[name].share / total)
+            for name in names
         }
-        wanted |= {name: 0 for name in names if name not in given.only.split(",")}
+        wanted |= {
+            name: 0 for name in names if name not in given.only.split(",")
+        }
         for i in range(3 * max(wanted.values())):
             for name in names:
                 if chaos.kills(name) < wanted[name]:

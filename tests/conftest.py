@@ -26,7 +26,9 @@ from gsgan.skeleton.proportions import measure_proportions
 # what tests of other folders share with them
 for folder in ("data", "prepare", "synthetic"):
     sys.path.insert(0, str(Path(__file__).parent / folder))
-torch.set_num_threads(1)  # tensors here are tiny: more threads only wait for each other
+torch.set_num_threads(
+    1
+)  # tensors here are tiny: more threads only wait for each other
 # nor do those of the commands that tests start
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -46,7 +48,9 @@ def _loggers_stay_on():
     """A command run in this process configures logging, which may switch loggers off for good."""
     yield
     for logger in logging.root.manager.loggerDict.values():
-        if isinstance(logger, logging.Logger) and logger.name.startswith("gsgan"):
+        if isinstance(logger, logging.Logger) and logger.name.startswith(
+            "gsgan"
+        ):
             logger.disabled, logger.propagate = False, True
             logger.setLevel(logging.NOTSET)
 
@@ -125,7 +129,13 @@ def entry_module(command: str) -> str:
     )
 
 
-TINY = ("size=tiny", "training=smoke", "data=capture", "data.size=32", "data.crop=null")
+TINY = (
+    "size=tiny",
+    "training=smoke",
+    "data=capture",
+    "data.size=32",
+    "data.crop=null",
+)
 TINY += ("lpips.nets=[]",)
 
 
@@ -136,7 +146,9 @@ def weights():
 
     missing = [net for net in NETWORKS if find(net) is None]
     if missing:
-        (pytest.fail if "CI" in os.environ else pytest.skip)(f"no weights of {missing}")
+        (pytest.fail if "CI" in os.environ else pytest.skip)(
+            f"no weights of {missing}"
+        )
 
 
 @pytest.fixture
@@ -188,7 +200,11 @@ def forked(command: list[str]) -> int:
             ).main()
             code = 0
         except SystemExit as end:
-            code = end.code if isinstance(end.code, int) else int(end.code is not None)
+            code = (
+                end.code
+                if isinstance(end.code, int)
+                else int(end.code is not None)
+            )
         finally:
             sys.stdout.flush()
             os._exit(code)
@@ -205,7 +221,9 @@ def inside(tmp_path, monkeypatch, capfd):
         monkeypatch.setenv("COLUMNS", "120")
         monkeypatch.setattr(sys, "argv", [f"gsgan.{command}", *args])
         # tests of memory in this process need it given back
-        monkeypatch.setattr("gsgan.utils.tensors.keep_freed_memory", lambda: None)
+        monkeypatch.setattr(
+            "gsgan.utils.tensors.keep_freed_memory", lambda: None
+        )
         capfd.readouterr()
         code = 0
         try:
@@ -230,7 +248,9 @@ def run(capture, shared, tmp_path_factory):
         assert "floor" in result.stdout
         assert "marked: perceptual loss" in result.stdout
 
-    return shutil.copytree(shared("run", make), tmp_path_factory.mktemp("runs") / "one")
+    return shutil.copytree(
+        shared("run", make), tmp_path_factory.mktemp("runs") / "one"
+    )
 
 
 def trained(capture: Path, folder: Path, *overrides: str) -> None:
@@ -253,7 +273,9 @@ def bare(capture, shared, tmp_path_factory):
 def on_body(capture, shared):
     """``on_body()``: a tiny run with a page, whose Gaussians are on the body's surface."""
     on = ("effects.body_points=on", "page=true")
-    return lambda: shared("on_body", lambda folder: trained(capture, folder, *on))
+    return lambda: shared(
+        "on_body", lambda folder: trained(capture, folder, *on)
+    )
 
 
 @pytest.fixture(scope="session")
@@ -264,8 +286,12 @@ def dance():
     ends[:, 0] = 0
     share = np.linspace(0, 1, 12)[:, None, None]
     theta = (1 - share) * ends[0] + share * ends[1]
-    transl = np.stack([np.linspace(0, 0.3, 12), np.zeros(12), np.zeros(12)], axis=1)
-    return BodyPose(torch.from_numpy(theta).float(), torch.from_numpy(transl).float())
+    transl = np.stack(
+        [np.linspace(0, 0.3, 12), np.zeros(12), np.zeros(12)], axis=1
+    )
+    return BodyPose(
+        torch.from_numpy(theta).float(), torch.from_numpy(transl).float()
+    )
 
 
 @pytest.fixture(scope="session")
@@ -277,14 +303,18 @@ def landmarks(dance):
 @pytest.fixture(scope="session")
 def proportions(landmarks):
     p = torch.from_numpy(landmarks)
-    return measure_proportions(p, torch.ones(p.shape[:2], dtype=torch.bool), "z")
+    return measure_proportions(
+        p, torch.ones(p.shape[:2], dtype=torch.bool), "z"
+    )
 
 
 @pytest.fixture(scope="session")
 def signing(dance):
     """``[12, 75, 3]`` metres, Z up: the free body's motion with its hands."""
     body = free_body()
-    both = torch.cat([body.posed_landmarks(dance), body.posed_hands(dance)], dim=1)
+    both = torch.cat(
+        [body.posed_landmarks(dance), body.posed_hands(dance)], dim=1
+    )
     return both.double().numpy()
 
 
@@ -306,7 +336,11 @@ def chromium():
         (pytest.fail if "CI" in os.environ else pytest.skip)(
             "chromium is not installed"
         )
-    flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    flags = [
+        "--no-sandbox",
+        "--use-angle=swiftshader",
+        "--enable-unsafe-swiftshader",
+    ]
     with playwright.sync_playwright() as tool:
         browser = tool.chromium.launch(executable_path=found, args=flags)
         yield browser

@@ -33,7 +33,9 @@ def test_a_loaded_avatar_renders_what_evaluation_paints(run, scored, tmp_path):
     copy = tmp_path / "copy"
     shutil.copytree(run, copy)
     text = (copy / CONFIG).read_text()
-    (copy / CONFIG).write_text(text.replace("root: /", "root: /no/longer/there/"))
+    (copy / CONFIG).write_text(
+        text.replace("root: /", "root: /no/longer/there/")
+    )
     avatar = gsgan.load(str(copy), device="cpu")
     assert not avatar.training
     image = avatar.render(frame.skeleton[0], frame.camera, body=frame.body)
@@ -47,7 +49,9 @@ def test_a_loaded_avatar_renders_what_evaluation_paints(run, scored, tmp_path):
     assert torch.equal(on_white, expected.clamp(0, 1))
     with pytest.raises(ValueError, match="expected 1 or 3 cameras, got 2"):
         avatar.render(
-            frame.skeleton.repeat(3, 1, 1), cat([frame.camera] * 2), body=frame.body
+            frame.skeleton.repeat(3, 1, 1),
+            cat([frame.camera] * 2),
+            body=frame.body,
         )
 
 
@@ -69,7 +73,9 @@ def test_a_bare_skeleton_is_enough(run, scored):
     avatar = gsgan.load(run, device="cpu")
     body = avatar.body_pose(frame.skeleton, frame.visibility)
     image = avatar.render(frame.skeleton, frame.camera)
-    assert torch.equal(image, avatar.render(frame.skeleton, frame.camera, body=body))
+    assert torch.equal(
+        image, avatar.render(frame.skeleton, frame.camera, body=body)
+    )
     swapped = frame.skeleton[:, list(MEDIAPIPE33.mirror)]
     assert torch.isfinite(
         avatar.render(swapped, frame.camera)
@@ -90,14 +96,18 @@ def test_a_folder_without_a_run_or_a_checkpoint_is_one_sentence(run, tmp_path):
     [
         ("gsgan", "torch"),
         ("gsgan.scene", "lightning kornia torchmetrics cv2 hydra"),
-        ("gsgan.model.avatar", "gsgan.data gsgan.motion gsgan.run hydra omegaconf"),
-        ("gsgan.model.harmonic", "gsgan.data gsgan.motion gsgan.run hydra omegaconf"),
+        (
+            "gsgan.model.avatar",
+            "gsgan.data gsgan.motion gsgan.run hydra omegaconf",
+        ),
+        (
+            "gsgan.model.harmonic",
+            "gsgan.data gsgan.motion gsgan.run hydra omegaconf",
+        ),
     ],
 )
 def test_importing_is_light(module, heavy):
-    code = (
-        f"import sys, {module}; print([m for m in {heavy.split()} if m in sys.modules])"
-    )
+    code = f"import sys, {module}; print([m for m in {heavy.split()} if m in sys.modules])"
     out = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )

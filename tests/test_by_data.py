@@ -5,7 +5,9 @@ from hydra import compose, initialize_config_dir
 
 from gsgan.utils.config import config_folder
 
-DATA = sorted(path.stem for path in (config_folder() / "data").glob("[!_]*.yaml"))
+DATA = sorted(
+    path.stem for path in (config_folder() / "data").glob("[!_]*.yaml")
+)
 
 
 @pytest.mark.parametrize("data", DATA)
@@ -50,13 +52,20 @@ def test_the_command_line_comes_before_the_experiment_and_that_before_the_data()
     large = ("experiment=smoke", "data=thuman4")
     assert choices(*large) == ("tiny", "smoke", "thuman4")
     assert choices(*large, "size=mid") == ("mid", "smoke", "thuman4")
-    assert choices("data=thuman4", "training=demo") == ("full", "demo", "thuman4")
+    assert choices("data=thuman4", "training=demo") == (
+        "full",
+        "demo",
+        "thuman4",
+    )
 
 
 @pytest.mark.parametrize(
-    ("there", "told"), [(True, ("gpu", "bf16-mixed")), (False, ("cpu", "32-true"))]
+    ("there", "told"),
+    [(True, ("gpu", "bf16-mixed")), (False, ("cpu", "32-true"))],
 )
-def test_the_accelerator_is_the_one_that_is_there(compose, monkeypatch, there, told):
+def test_the_accelerator_is_the_one_that_is_there(
+    compose, monkeypatch, there, told
+):
     monkeypatch.setattr("torch.cuda.is_available", lambda: there)
     monkeypatch.setattr("torch.cuda.get_device_capability", lambda *_: (8, 6))
     trainer = compose("train").trainer
@@ -85,7 +94,9 @@ def test_a_long_run_without_a_gpu_is_refused_with_its_price_until_it_is_asked_fo
     assert "size=small training=demo" in refused.stderr
     assert refused.stderr.count("\n") == 1
     assert not (tmp_path / "run").exists()
-    assert inside("train", *few, "cpu_hours=1e-9", "trainer=cpu").returncode == 0
+    assert (
+        inside("train", *few, "cpu_hours=1e-9", "trainer=cpu").returncode == 0
+    )
 
 
 # --- factors that make baselines train equally long
@@ -96,7 +107,9 @@ def test_a_long_run_without_a_gpu_is_refused_with_its_price_until_it_is_asked_fo
 )
 def test_a_baseline_is_stretched_by_an_experiment_only(compose, model):
     assert (
-        compose("train", f"model={model}", "training=paper").training.schedule.stretch
+        compose(
+            "train", f"model={model}", "training=paper"
+        ).training.schedule.stretch
         == 1
     )
     study = compose("train", "experiment=study", f"model={model}")

@@ -26,7 +26,9 @@ def chaos(tmp_path_factory):
 def survives(chaos, stage: str) -> None:
     truth = chaos.prepare(stage)
     if stage == "train":  # the input of the others
-        shutil.copytree(chaos.folder / "whole" / "train" / "run", chaos.base / "run")
+        shutil.copytree(
+            chaos.folder / "whole" / "train" / "run", chaos.base / "run"
+        )
     for way in WAYS:
         chaos.kill(stage, way, truth)
     assert not chaos.problems
@@ -34,7 +36,9 @@ def survives(chaos, stage: str) -> None:
 
 
 @pytest.mark.parametrize("stage", ["data", "prepare"])
-def test_a_command_that_is_killed_finishes_when_it_is_started_again(chaos, stage):
+def test_a_command_that_is_killed_finishes_when_it_is_started_again(
+    chaos, stage
+):
     survives(chaos, stage)
 
 

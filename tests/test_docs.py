@@ -51,12 +51,14 @@ def test_links_and_images_exist(page):
 def test_pages_named_in_the_code_exist():
     for folder in ("src", "conf", "scripts"):
         for path in (
-            p for p in (ROOT / folder).rglob("*") if p.suffix in (".py", ".yaml", ".sh")
+            p
+            for p in (ROOT / folder).rglob("*")
+            if p.suffix in (".py", ".yaml", ".sh")
         ):
             for page in re.findall(r"docs/[a-z_/]+\.md", path.read_text()):
-                assert (ROOT / page).exists() or page == "docs/results/gpu.md", (
-                    f"{path}: {page}"
-                )
+                assert (
+                    ROOT / page
+                ).exists() or page == "docs/results/gpu.md", f"{path}: {page}"
 
 
 @pytest.mark.parametrize("page", RESULTS, ids=names(RESULTS))
@@ -83,13 +85,17 @@ def unproven(text: str, results: str) -> list[str]:
     A number stands in a page if one of the page's numbers rounds to it.
     """
     exceptions = set(" ".join(NOT_MEASURED.findall(text)).split())
-    prose = re.sub(r"```.*?```|`[^`]*`|\]\([^)]*\)|<!--.*?-->", "", text, flags=re.S)
+    prose = re.sub(
+        r"```.*?```|`[^`]*`|\]\([^)]*\)|<!--.*?-->", "", text, flags=re.S
+    )
     stored = set(re.findall(r"(?<![\d.])\d+(?:\.\d+)?(?![\d.]*\d)", results))
 
     found = set()
     for number in set(NUMBER.findall(prose)) - exceptions - stored:
         decimals = len(number.partition(".")[2])
-        rounded = {f"{float(value):.{decimals}f}" for value in stored if "." in value}
+        rounded = {
+            f"{float(value):.{decimals}f}" for value in stored if "." in value
+        }
         if number not in rounded:
             found.add(number)
     return sorted(found)
@@ -149,7 +155,8 @@ def test_the_website_builds_without_a_warning(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert (
-        'id="gsgan.scene.Camera"' in (tmp_path / "reference" / "index.html").read_text()
+        'id="gsgan.scene.Camera"'
+        in (tmp_path / "reference" / "index.html").read_text()
     )
 
 
@@ -158,7 +165,9 @@ def keys(path: Path) -> list[tuple[str, int]]:
     found: list[tuple[str, int]] = []
 
     def walk(node: yaml.Node) -> None:
-        for key, value in node.value if isinstance(node, yaml.MappingNode) else ():
+        for key, value in (
+            node.value if isinstance(node, yaml.MappingNode) else ()
+        ):
             name = key.value
             if name in ("defaults", "hydra") or name.startswith("_"):
                 continue
@@ -187,7 +196,9 @@ def test_every_key_of_conf_has_a_comment():
             if has_comment(lines, number):
                 explained.add(name)
             else:
-                missing.append((name, f"{path.relative_to(CONF)}:{number + 1}: {name}"))
+                missing.append(
+                    (name, f"{path.relative_to(CONF)}:{number + 1}: {name}")
+                )
     # a preset need not repeat what the file says that it changes
     lacking = [where for name, where in missing if name not in explained]
     assert not lacking, "\n".join(lacking)
@@ -202,7 +213,9 @@ def test_the_architecture_page_maps_every_package_of_the_code():
 
 def test_make_targets_of_the_docs_exist():
     targets = set(
-        re.findall(r"^([a-z-]+):.*##", (ROOT / "Makefile").read_text(), flags=re.M)
+        re.findall(
+            r"^([a-z-]+):.*##", (ROOT / "Makefile").read_text(), flags=re.M
+        )
     )
     for page in PAGES:
         used = re.findall(

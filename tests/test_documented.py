@@ -34,7 +34,12 @@ SMALL_BENCH = {
             "settings.scales=[0.5]",
             "settings.backends=[]",
         ),
-        *("settings.precisions=[]", "settings.windows=[]", "repeats=1", "images=1"),
+        *(
+            "settings.precisions=[]",
+            "settings.windows=[]",
+            "repeats=1",
+            "images=1",
+        ),
     ],
     "raster": [
         *(
@@ -50,7 +55,13 @@ SMALL_BENCH = {
 
 
 # These need hands, or a face too.
-SIGNING = ("skeleton=holistic", "33_hands", "sign_demo", "paper_slp", "data=synthetic")
+SIGNING = (
+    "skeleton=holistic",
+    "33_hands",
+    "sign_demo",
+    "paper_slp",
+    "data=synthetic",
+)
 FEW = {
     "segmentation": 2,
     "step_one": 2,
@@ -71,10 +82,16 @@ def documented(pages: list[Path]) -> list[str]:
     text = "\n".join(page.read_text() for page in pages)
     blocks = re.findall(r"```bash\n(.*?)```", text, flags=re.DOTALL)
     lines = [
-        line.split("#")[0].strip() for block in blocks for line in block.splitlines()
+        line.split("#")[0].strip()
+        for block in blocks
+        for line in block.splitlines()
     ]
     return sorted(
-        {x for x in lines if x.startswith(("python -m gsgan.", "python scripts/"))}
+        {
+            x
+            for x in lines
+            if x.startswith(("python -m gsgan.", "python scripts/"))
+        }
     )
 
 
@@ -90,7 +107,9 @@ def model_file(shared):
 
     def run(kind: str) -> Path:
         suffix = "pkl" if kind == "smpl" else "npz"
-        return shared(f"{kind}.{suffix}", lambda path: write_smpl(path, kind=kind))
+        return shared(
+            f"{kind}.{suffix}", lambda path: write_smpl(path, kind=kind)
+        )
 
     return run
 
@@ -122,7 +141,9 @@ def place(capture, run, bare, on_body, model_file, tmp_path_factory):
         from writers.common import make_subject
         from writers.easymocap import write_easymocap
 
-        return write_easymocap(folder() / "take", make_subject(model_file("smpl")))
+        return write_easymocap(
+            folder() / "take", make_subject(model_file("smpl"))
+        )
 
     def videos() -> Path:
         from capture_scenes import write_project
@@ -146,7 +167,11 @@ def place(capture, run, bare, on_body, model_file, tmp_path_factory):
                 path = root / split / camera / f"{frame:06d}.png"
                 path.parent.mkdir(parents=True, exist_ok=True)
                 picture = (
-                    (dataset[i].image[0] * 255).round().byte().permute(1, 2, 0).numpy()
+                    (dataset[i].image[0] * 255)
+                    .round()
+                    .byte()
+                    .permute(1, 2, 0)
+                    .numpy()
                 )
                 cv2.imwrite(str(path), picture[..., ::-1])
         return root
@@ -187,7 +212,10 @@ def place(capture, run, bare, on_body, model_file, tmp_path_factory):
         from gsgan.skeleton import MEDIAPIPE33
 
         p = skeletons(4)[:, None][..., [0, 2, 1]] * [1, -1, 1]  # y down
-        points = ("POSE_WORLD_LANDMARKS", [n.upper() for n in MEDIAPIPE33.names])
+        points = (
+            "POSE_WORLD_LANDMARKS",
+            [n.upper() for n in MEDIAPIPE33.names],
+        )
         part = PoseHeaderComponent(*points, [(0, 1)], [(255, 0, 0)], "XYZC")
         header = PoseHeader(0.1, PoseHeaderDimensions(640, 480, 0), [part])
         path = folder() / name
@@ -229,26 +257,34 @@ def place(capture, run, bare, on_body, model_file, tmp_path_factory):
         for text, make in makers.items():
             if text in line:
                 line = line.replace(text, str(make()))
-        assert "/path/to" not in line, f"no stand-in for a placeholder of: {line}"
+        assert "/path/to" not in line, (
+            f"no stand-in for a placeholder of: {line}"
+        )
         return line
 
     return fill
 
 
 def tiny_training(arguments: list[str], capture: Path) -> list[str]:
-    given = [a for a in arguments if a != "experiment=demo" and a not in ELSEWHERE]
+    given = [
+        a for a in arguments if a != "experiment=demo" and a not in ELSEWHERE
+    ]
     # the tiny capture has a pose
     given = [a for a in given if not a.startswith("data.source.")]
     if not any(a.startswith("data=") for a in given):
         given.append("data=capture")
-    given += [t for t in TINY if not t.startswith("data=") and not fixed(given, t)]
+    given += [
+        t for t in TINY if not t.startswith("data=") and not fixed(given, t)
+    ]
     if not any(a.startswith("data.root=") for a in given):
         given.append(f"data.root={capture}")
     # three cameras stand in for 24
     if {"experiment=paper", "data=thuman4"} <= set(given):
         given += ["protocol.test_cameras=[cam02]", "protocol.test_frames=2-3"]
         given += ["protocol.train_frames=0-1"]
-    return given + [f"training.schedule.{name}={value}" for name, value in FEW.items()]
+    return given + [
+        f"training.schedule.{name}={value}" for name, value in FEW.items()
+    ]
 
 
 def shorter_sweep(arguments: list[str], folder: Path) -> list[str]:
@@ -270,7 +306,9 @@ def fixed(given: list[str], option: str) -> bool:
 def tiny_bench(name: str, arguments: list[str], capture: Path) -> list[str]:
     large = {"repeats", "gaussians", "sizes", "size"}
     given = [a.strip("'") for a in arguments if a.split("=")[0] not in large]
-    small = (w.replace("/path/to/capture", str(capture)) for w in SMALL_BENCH[name])
+    small = (
+        w.replace("/path/to/capture", str(capture)) for w in SMALL_BENCH[name]
+    )
     return [*given, *small]
 
 
@@ -306,11 +344,15 @@ def arguments_of(line: str) -> list[str]:
     return words[3:] if words[1] == "-m" else words[2:]
 
 
-@pytest.mark.parametrize("line", [x for x in LINES if x not in WHOLE or x not in QUICK])
+@pytest.mark.parametrize(
+    "line", [x for x in LINES if x not in WHOLE or x not in QUICK]
+)
 def test_a_documented_command_composes(line, execute):
     arguments = arguments_of(line.replace("<run folder>", "/path/to/run"))
     if "-m" in arguments:  # the last of the values that it varies
-        arguments = [re.sub(r"=.*,", "=", a) if "=[" not in a else a for a in arguments]
+        arguments = [
+            re.sub(r"=.*,", "=", a) if "=[" not in a else a for a in arguments
+        ]
     arguments = [a.strip("'") for a in arguments if a != "-m"]
     result = execute(line, [*arguments, "--cfg", "job"])
     assert result.returncode == 0, result.stdout + result.stderr
@@ -318,7 +360,10 @@ def test_a_documented_command_composes(line, execute):
 
 @pytest.mark.parametrize(
     "line",
-    [x if x in QUICK else pytest.param(x, marks=pytest.mark.slow) for x in WHOLE],
+    [
+        x if x in QUICK else pytest.param(x, marks=pytest.mark.slow)
+        for x in WHOLE
+    ],
 )
 def test_every_documented_command_runs(
     line, place, capture, execute, tmp_path, monkeypatch
@@ -335,30 +380,41 @@ def test_every_documented_command_runs(
         "+other_capture.source.motion=far", "other_capture=/path/to/capture"
     )
     line = place(line)
-    name, arguments = line.split()[2 if " -m gsgan." in line else 1], arguments_of(line)
+    name, arguments = (
+        line.split()[2 if " -m gsgan." in line else 1],
+        arguments_of(line),
+    )
     if name == "gsgan.train":
         if "-m" in arguments:
             arguments = shorter_sweep(arguments, tmp_path)
         arguments = tiny_training(arguments, capture)
     if name == "gsgan.bench":
-        arguments = [arguments[0], *tiny_bench(arguments[0], arguments[1:], capture)]
+        arguments = [
+            arguments[0],
+            *tiny_bench(arguments[0], arguments[1:], capture),
+        ]
     if name.startswith("scripts/bench/"):
         arguments = tiny_bench(Path(name).stem, arguments, capture)
     if name == "gsgan.fit":
         arguments += ["size.image=32", "fit.points=200", "fit.surface_steps=2"]
         arguments += ["fit.sweeps=1", f"out={tmp_path / 'fit'}"]
     if name == "gsgan.prepare":  # MediaPipe is not at hand: its output is given
-        source = next(a for a in arguments if a.startswith("source=")).removeprefix(
-            "source="
-        )
+        source = next(
+            a for a in arguments if a.startswith("source=")
+        ).removeprefix("source=")
         arguments = [a for a in arguments if a != "setup=true"]
         if source.endswith(".avi"):
-            arguments += [f"landmarks={Path(source).parent}/landmarks", "hands=false"]
+            arguments += [
+                f"landmarks={Path(source).parent}/landmarks",
+                "hands=false",
+            ]
             source = str(Path(source).parent)
         else:
             arguments += [f"landmarks={source}/pose"]
         arguments += [f"masks={source}/masks"]
     if name == "gsgan.view":
-        monkeypatch.setattr("gsgan.view.server.Viewer.serve", lambda viewer: None)
+        monkeypatch.setattr(
+            "gsgan.view.server.Viewer.serve", lambda viewer: None
+        )
     result = execute(line, arguments)
     assert result.returncode == 0, result.stdout + result.stderr

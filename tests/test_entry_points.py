@@ -33,9 +33,13 @@ def test_a_run_leaves_metrics_pictures_config_log_and_checkpoint(run):
 
 
 def test_the_checkpoint_loads_without_pickle(run):
-    checkpoint = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
+    checkpoint = torch.load(
+        run / "checkpoints" / "last.ckpt", weights_only=True
+    )
     assert checkpoint["gsgan"]["step"] == 16
-    assert not any("perceptual.network" in key for key in checkpoint["state_dict"])
+    assert not any(
+        "perceptual.network" in key for key in checkpoint["state_dict"]
+    )
 
 
 def test_evaluate_gives_the_same_numbers_again(run, tmp_path, inside):
@@ -43,7 +47,9 @@ def test_evaluate_gives_the_same_numbers_again(run, tmp_path, inside):
     (copy / "metrics.json").unlink()
     result = inside("evaluate", f"run={copy}", "device=cpu")
     assert result.returncode == 0, result.stderr
-    assert (copy / "metrics.json").read_text() == (run / "metrics.json").read_text()
+    assert (copy / "metrics.json").read_text() == (
+        run / "metrics.json"
+    ).read_text()
     assert "floor" in result.stdout
     assert list(tmp_path.iterdir()) == [copy]  # nothing of its own left behind
 
@@ -58,26 +64,34 @@ def test_evaluate_finds_a_dataset_that_moved(run, capture, tmp_path, inside):
         json.loads((folder / "metrics.json").read_text())
         for folder in (copy, copy / "novel_pose")
     )
-    assert found == {"novel_pose": kept["novel_pose"]}  # the scores of both splits stay
+    assert found == {
+        "novel_pose": kept["novel_pose"]
+    }  # the scores of both splits stay
 
 
 @pytest.mark.parametrize("command", ["evaluate", "report", "bench speed"])
 def test_a_model_file_is_refused_for_a_run_that_read_none(command, run, inside):
     command, *first = command.split()
-    result = inside(command, *first, f"run={run}", "data_smpl=/SMPL_NEUTRAL.pkl")
+    result = inside(
+        command, *first, f"run={run}", "data_smpl=/SMPL_NEUTRAL.pkl"
+    )
     refused(result, "data_smpl", "was trained without a body model file")
 
 
 def test_a_dataset_that_is_gone_is_asked_for(run, tmp_path, inside):
     result = inside("evaluate", f"run={run}", f"data_root={tmp_path / 'away'}")
     refused(
-        result, str(tmp_path / "away"), "does not exist", "data_root=<where it is now>"
+        result,
+        str(tmp_path / "away"),
+        "does not exist",
+        "data_root=<where it is now>",
     )
 
 
 def test_nothing_has_moved_where_there_is_no_run(inside):
     refused(
-        inside("bench", "speed", "data_root=/x"), "data_root and data_smpl require run="
+        inside("bench", "speed", "data_root=/x"),
+        "data_root and data_smpl require run=",
     )
 
 
@@ -85,10 +99,15 @@ def test_nothing_has_moved_where_there_is_no_run(inside):
     ("file", "text"),
     [("config.yaml", "data: {"), ("config.yaml", ""), ("hydra.yaml", "a: [")],
 )
-def test_a_damaged_run_folder_is_one_sentence(file, text, run, tmp_path, inside):
+def test_a_damaged_run_folder_is_one_sentence(
+    file, text, run, tmp_path, inside
+):
     copy = shutil.copytree(run, tmp_path / "copy")
     (copy / ".hydra" / file).write_text(text)
-    refused(inside("evaluate", f"run={copy}", "splits=[novel_pose]"), f".hydra/{file}")
+    refused(
+        inside("evaluate", f"run={copy}", "splits=[novel_pose]"),
+        f".hydra/{file}",
+    )
 
 
 def test_evaluate_refuses_what_is_no_run(run, tmp_path, inside):
@@ -96,14 +115,18 @@ def test_evaluate_refuses_what_is_no_run(run, tmp_path, inside):
     refused(inside("evaluate", f"run={tmp_path}"), "not a run folder")
     refused(inside("evaluate", f"run={run}", "device=abacus"), "device=abacus")
     refused(
-        inside("evaluate", f"run={run}", "splits=[training]"), "splits", "novel_pose"
+        inside("evaluate", f"run={run}", "splits=[training]"),
+        "splits",
+        "novel_pose",
     )
     broken = shutil.copytree(run, tmp_path / "broken")
     checkpoint = broken / "checkpoints" / "last.ckpt"
     checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
     refused(inside("evaluate", f"run={broken}"), "last.ckpt", "not a readable")
     checkpoint.unlink()
-    refused(inside("evaluate", f"run={broken}"), "last.ckpt", "no checkpoint yet")
+    refused(
+        inside("evaluate", f"run={broken}"), "last.ckpt", "no checkpoint yet"
+    )
 
 
 def test_the_list_of_commands(tmp_path):
@@ -155,15 +178,17 @@ def test_killed_half_way_and_resumed_ends_with_the_same_weights(
     assert killed.returncode == -9
     assert not (folder / "metrics.json").exists()
     assert (
-        torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)["gsgan"][
-            "step"
-        ]
+        torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)[
+            "gsgan"
+        ]["step"]
         == 8
     )
     resumed = inside("train", *given)
     assert resumed.returncode == 0, resumed.stderr
     assert "resuming from" in resumed.stdout
-    assert (folder / "logs" / "metrics.csv").is_file()  # the first part's log is kept
+    assert (
+        folder / "logs" / "metrics.csv"
+    ).is_file()  # the first part's log is kept
     assert (folder / "logs_000008" / "metrics.csv").is_file()
     assert same(weights(run), weights(folder))
 
@@ -172,35 +197,49 @@ def test_a_finished_run_is_passed_over(run, capture, inside):
     before = {path: path.stat().st_mtime_ns for path in run.rglob("*.json")}
     result = inside("train", *arguments(capture, run))
     assert result.returncode == 0, result.stderr
-    assert "trained and scored before; nothing to do" in " ".join(result.stdout.split())
-    assert {path: path.stat().st_mtime_ns for path in run.rglob("*.json")} == before
+    assert "trained and scored before; nothing to do" in " ".join(
+        result.stdout.split()
+    )
+    assert {
+        path: path.stat().st_mtime_ns for path in run.rglob("*.json")
+    } == before
 
 
 def test_a_folder_with_another_run_is_not_overwritten(run, capture, inside):
     before = (run / "checkpoints" / "last.ckpt").read_bytes()
-    result = inside("train", *arguments(capture, run), "training.pose_noise=0.5")
+    result = inside(
+        "train", *arguments(capture, run), "training.pose_noise=0.5"
+    )
     refused(result, "other settings", "training.pose_noise", "resume=false")
     assert (run / "checkpoints" / "last.ckpt").read_bytes() == before
 
 
 def test_the_papers_command_fails_only_for_the_missing_path(inside):
-    refused(inside("train", "model=full", "data=thuman4"), "data.root is not set")
+    refused(
+        inside("train", "model=full", "data=thuman4"), "data.root is not set"
+    )
     missing = inside("train", "data=zju_mocap", "data.root=/nowhere")
     refused(missing, "/nowhere", "does not exist")
 
 
-def test_bad_data_ends_in_one_sentence_and_leaves_nothing(capture, tmp_path, inside):
+def test_bad_data_ends_in_one_sentence_and_leaves_nothing(
+    capture, tmp_path, inside
+):
     root = shutil.copytree(capture, tmp_path / "data")
     cameras = json.loads((root / "cameras.json").read_text())
     del cameras["cam01"]
     (root / "cameras.json").write_text(json.dumps(cameras))
     refused(
-        inside("train", *arguments(root, tmp_path / "run")), "cam01", "cameras.json"
+        inside("train", *arguments(root, tmp_path / "run")),
+        "cam01",
+        "cameras.json",
     )
     assert not (tmp_path / "run").exists()
 
 
-def test_an_image_that_cannot_be_read_ends_in_one_sentence(capture, tmp_path, inside):
+def test_an_image_that_cannot_be_read_ends_in_one_sentence(
+    capture, tmp_path, inside
+):
     """It is found when it is first read, perhaps after training began."""
     root = shutil.copytree(capture, tmp_path / "data")
     path = next((root / "images" / "cam00").iterdir())
@@ -219,18 +258,27 @@ def test_an_image_that_cannot_be_read_ends_in_one_sentence(capture, tmp_path, in
         ("seed=-1", ("seed", "-1")),
     ],
 )
-def test_a_wrong_value_ends_in_one_sentence(capture, tmp_path, inside, argument, words):
-    refused(inside("train", *arguments(capture, tmp_path / "run"), argument), *words)
+def test_a_wrong_value_ends_in_one_sentence(
+    capture, tmp_path, inside, argument, words
+):
+    refused(
+        inside("train", *arguments(capture, tmp_path / "run"), argument), *words
+    )
 
 
 def test_a_name_that_hydra_does_not_know_ends_in_a_sentence(
     capture, tmp_path, inside, monkeypatch
 ):
     """Under a tracer, as for coverage, Hydra would print its developers' view."""
-    monkeypatch.setattr("hydra._internal.utils.is_under_debugger", lambda: False)
+    monkeypatch.setattr(
+        "hydra._internal.utils.is_under_debugger", lambda: False
+    )
     for argument, word in (
         ("model=huge", "model/huge"),
         ("modle=full", "modle"),
         ("accuracy@model.segmentation.accuracy=best", "accuracy/best"),
     ):
-        refused(inside("train", *arguments(capture, tmp_path / "run"), argument), word)
+        refused(
+            inside("train", *arguments(capture, tmp_path / "run"), argument),
+            word,
+        )

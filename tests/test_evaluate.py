@@ -13,9 +13,19 @@ from commands import refused
 
 from gsgan.utils.errors import GsganError
 
-DATA = ("data=capture", "data.size=32", "data.crop=null", "size=tiny", "lpips.nets=[]")
+DATA = (
+    "data=capture",
+    "data.size=32",
+    "data.crop=null",
+    "size=tiny",
+    "lpips.nets=[]",
+)
 PROTOCOL = (
-    *("protocol=paper_thuman4", "protocol.train_cameras=[cam00,cam01]", "data.size=32"),
+    *(
+        "protocol=paper_thuman4",
+        "protocol.train_cameras=[cam00,cam01]",
+        "data.size=32",
+    ),
     *(
         "protocol.test_cameras=[cam02]",
         "protocol.train_frames=0-3",
@@ -30,7 +40,9 @@ def given(capture: Path) -> list[str]:
 
 
 @pytest.fixture(scope="session")
-def painted(run: Path, capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def painted(
+    run: Path, capture: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
     """The images of the tiny run as another method would leave them: 8-bit PNGs."""
     from gsgan.run.assemble import build_data
     from gsgan.run.runs import load_avatar
@@ -62,7 +74,9 @@ def scores(folder: Path) -> dict:
 
 def test_images_of_a_run_score_as_the_run_does(run, painted, given, inside):
     """Up to the rounding to 8 bits: 0.5/255 at most a value, and the floor is the very same."""
-    result = inside("evaluate", f"predictions={painted}", "method=other", *given)
+    result = inside(
+        "evaluate", f"predictions={painted}", "method=other", *given
+    )
     assert result.returncode == 0, result.stderr
     out = painted.with_name("other_scores")
     own, others = scores(run), scores(out)
@@ -77,21 +91,32 @@ def test_images_of_a_run_score_as_the_run_does(run, painted, given, inside):
             == "predictions are images, not a segmentation"
         )
         assert variants["full"]["images"] == own[split]["full"]["images"]
-    facts, runs = (json.loads((f / "facts.json").read_text()) for f in (out, run))
-    for key in ("name", "fingerprint"):  # where it lies may have been another folder
+    facts, runs = (
+        json.loads((f / "facts.json").read_text()) for f in (out, run)
+    )
+    for key in (
+        "name",
+        "fingerprint",
+    ):  # where it lies may have been another folder
         assert facts["data"][key] == runs["data"][key]
-    assert (facts["method"], facts["model"], facts["seed"]) == ("other", None, None)
+    assert (facts["method"], facts["model"], facts["seed"]) == (
+        "other",
+        None,
+        None,
+    )
     assert (runs["method"], runs["model"], runs["seed"]) == ("gsgan", "full", 0)
     assert runs["iterations"] == 16
     assert 0 < runs["train_seconds"] < 600
-    stored = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)["gsgan"][
-        "code"
-    ]
+    stored = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)[
+        "gsgan"
+    ]["code"]
     assert runs["trained_by"] == stored
     assert facts["trained_by"] is None
     # a checkout: the run was trained and scored by the same code
     if runs["commit"] is not None:
-        assert [code.removesuffix("+changes") for code in stored] == [runs["commit"]]
+        assert [code.removesuffix("+changes") for code in stored] == [
+            runs["commit"]
+        ]
     assert "other" in result.stdout
     assert {p.name for p in (out / "grids").iterdir()} == {
         "novel_view.png",
@@ -104,9 +129,19 @@ def test_the_csv_holds_every_image_and_its_mean_is_the_score(run):
         lines = list(csv.DictReader(stream))
     for split, variants in scores(run).items():
         for variant, means in variants.items():
-            held = [x for x in lines if (x["split"], x["variant"]) == (split, variant)]
+            held = [
+                x
+                for x in lines
+                if (x["split"], x["variant"]) == (split, variant)
+            ]
             assert len(held) == means["images"]
-            for metric in ("psnr", "psnr_person", "ssim", "ssim_person", "edge_ratio"):
+            for metric in (
+                "psnr",
+                "psnr_person",
+                "ssim",
+                "ssim_person",
+                "edge_ratio",
+            ):
                 values = [float(x[metric]) for x in held]
                 mean = sum(values) / len(values)
                 assert mean == pytest.approx(means[metric], abs=1e-9)
@@ -139,7 +174,9 @@ def test_a_run_is_scored_on_another_capture_against_the_distance_from_training(
     assert scores(own) == scores(run)  # the run's own stay
     for split in found:
         assert solved[split]["full"]["marks"][-1] == "driven by skeletons alone"
-        assert solved[split]["full"]["psnr"] != scores(own)[split]["full"]["psnr"]
+        assert (
+            solved[split]["full"]["psnr"] != scores(own)[split]["full"]["psnr"]
+        )
         assert found[split]["full"]["psnr"] == pytest.approx(
             solved[split]["full"]["psnr"]
         )
@@ -147,7 +184,9 @@ def test_a_run_is_scored_on_another_capture_against_the_distance_from_training(
         assert found[split]["full"]["warped_flicker"] > 0
     with (folder / "distance.csv").open() as stream:
         rows = list(csv.DictReader(stream))
-    assert len(rows) == sum(variants["full"]["images"] for variants in found.values())
+    assert len(rows) == sum(
+        variants["full"]["images"] for variants in found.values()
+    )
     assert len({row["distance"] for row in rows}) > 2
     # of the pose alone
     assert len({(row["frame"], row["distance"]) for row in rows}) == 6
@@ -163,7 +202,9 @@ def test_a_run_is_scored_on_another_capture_against_the_distance_from_training(
         refused(inside("evaluate", f"run={own}", *arguments), named)
 
 
-def test_the_ground_truth_as_prediction_on_white(capture, given, inside, tmp_path):
+def test_the_ground_truth_as_prediction_on_white(
+    capture, given, inside, tmp_path
+):
     """On white, given as it is or as alpha: the truth scores nothing but its own 8-bit rounding."""
     from gsgan.data.datamodule import GsganData
     from gsgan.metrics.regions import on_background
@@ -180,7 +221,9 @@ def test_the_ground_truth_as_prediction_on_white(capture, given, inside, tmp_pat
                     if kind == "alpha"
                     else on_background(f.image, f.mask, 1.0)
                 )
-                planes = [colour[0], f.mask[0]] if kind == "alpha" else [colour[0]]
+                planes = (
+                    [colour[0], f.mask[0]] if kind == "alpha" else [colour[0]]
+                )
                 pixels = (
                     (torch.cat(planes).clamp(0, 1) * 255)
                     .round()
@@ -190,11 +233,17 @@ def test_the_ground_truth_as_prediction_on_white(capture, given, inside, tmp_pat
                 path = tmp_path / kind / f"{camera}_{frame}.png"
                 path.parent.mkdir(exist_ok=True)
                 order = [2, 1, 0, 3] if kind == "alpha" else [2, 1, 0]
-                cv2.imwrite(str(path), np.ascontiguousarray(pixels.numpy()[..., order]))
+                cv2.imwrite(
+                    str(path), np.ascontiguousarray(pixels.numpy()[..., order])
+                )
     named = "predictions_pattern='{camera}_{frame}.png'"
     for kind in ("opaque", "alpha"):
         result = inside(
-            "evaluate", f"predictions={tmp_path / kind}", named, *given, *PROTOCOL
+            "evaluate",
+            f"predictions={tmp_path / kind}",
+            named,
+            *given,
+            *PROTOCOL,
         )
         assert result.returncode == 0, result.stderr
         found = scores(tmp_path / f"{kind}_scores")["novel_view"]
@@ -215,7 +264,9 @@ def test_a_run_is_scored_on_white_by_request(run, inside, tmp_path):
     from gsgan.run.stored import load_config
 
     copy = shutil.copytree(run, tmp_path / "copy")
-    result = inside("evaluate", f"run={copy}", "background=white", "grid_rows=1")
+    result = inside(
+        "evaluate", f"run={copy}", "background=white", "grid_rows=1"
+    )
     assert result.returncode == 0, result.stderr
     assert "scored on white" in result.stdout
     on_white = copy / "on_white"
@@ -236,9 +287,15 @@ def test_a_run_is_scored_on_white_by_request(run, inside, tmp_path):
                 painting = avatar(*frame.inputs)
             truth = on_background(frame.image, frame.mask, 1.0)
             for name, picture in (
-                ("full", (painting.image.clamp(0, 1), painting.alpha.clamp(0, 1))),
+                (
+                    "full",
+                    (painting.image.clamp(0, 1), painting.alpha.clamp(0, 1)),
+                ),
                 ("splat", (painting.colour.clamp(0, 1), painting.splat_alpha)),
-                ("floor", (torch.zeros_like(truth), torch.zeros_like(frame.mask))),
+                (
+                    "floor",
+                    (torch.zeros_like(truth), torch.zeros_like(frame.mask)),
+                ),
             ):
                 found[name].append(
                     float(psnr(on_background(*picture, 1.0).clamp(0, 1), truth))
@@ -253,7 +310,12 @@ def test_a_run_is_scored_on_white_by_request(run, inside, tmp_path):
 
 
 def test_another_background_departs_from_the_protocol(copy, given, inside):
-    arguments = [f"predictions={copy}", "splits=[novel_view]", *given, *PROTOCOL]
+    arguments = [
+        f"predictions={copy}",
+        "splits=[novel_view]",
+        *given,
+        *PROTOCOL,
+    ]
     for word in ("null", "white"):
         result = inside("evaluate", *arguments, f"background={word}")
         refused(result, "has a black background, expected white", "with alpha")
@@ -279,8 +341,14 @@ def resize(path: Path) -> None:
     [
         (Path.unlink, ("lacks 1 of 8", "camera cam01, frame 5")),
         (resize, ("camera cam01, frame 5", "32x16", "32x32")),
-        (lambda path: path.write_bytes(path.read_bytes()[:70]), ("cam01/0005.png",)),
-        (lambda path: shutil.copy(path, path.with_name("5.png")), ("frame 5 twice",)),
+        (
+            lambda path: path.write_bytes(path.read_bytes()[:70]),
+            ("cam01/0005.png",),
+        ),
+        (
+            lambda path: shutil.copy(path, path.with_name("5.png")),
+            ("frame 5 twice",),
+        ),
         (lambda path: path.write_bytes(b""), ("cam01/0005.png",)),
     ],
 )
@@ -292,7 +360,9 @@ def test_one_wrong_image_is_named_and_nothing_is_written(
     assert not copy.with_name("other_scores").exists()
 
 
-def test_arguments_that_do_not_fit_together_are_refused(run, copy, given, compose):
+def test_arguments_that_do_not_fit_together_are_refused(
+    run, copy, given, compose
+):
     from gsgan.evaluate.run import evaluate_config
 
     here = f"predictions={copy}"
@@ -340,13 +410,21 @@ def test_arguments_that_do_not_fit_together_are_refused(run, copy, given, compos
 def test_another_methods_scores_are_not_overwritten(copy, given, inside):
     arguments = [f"predictions={copy}", "splits=[novel_pose]", *given]
     out = copy.parent / "kept"
-    assert inside("evaluate", *arguments, "method=one", f"out={out}").returncode == 0
+    assert (
+        inside("evaluate", *arguments, "method=one", f"out={out}").returncode
+        == 0
+    )
     refused(
         inside("evaluate", *arguments, "method=two", f"out={out}"),
         "scores of one, not of two",
     )
-    (copy / "novel_pose" / "notes.txt").write_text("mine")  # other files are ignored
-    assert inside("evaluate", *arguments, "method=one", f"out={out}").returncode == 0
+    (copy / "novel_pose" / "notes.txt").write_text(
+        "mine"
+    )  # other files are ignored
+    assert (
+        inside("evaluate", *arguments, "method=one", f"out={out}").returncode
+        == 0
+    )
 
 
 def test_seconds_of_a_resumed_training_add_up(tiny, monkeypatch):

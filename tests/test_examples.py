@@ -12,7 +12,13 @@ from PIL import Image
 
 FOLDER = ROOT / "docs" / "examples"
 TINY = ["size=tiny", "data.size=32", "data.body=none"]
-FEW = ["segmentation=1", "step_one=1", "step_two=2", "discriminator_start=1", "epoch=4"]
+FEW = [
+    "segmentation=1",
+    "step_one=1",
+    "step_two=2",
+    "discriminator_start=1",
+    "epoch=4",
+]
 EACH_STEP = ["training.log_every=1", "+trainer.log_every_n_steps=1"]
 SHORT = [*TINY, *(f"training.schedule.{phase}" for phase in FEW)]
 
@@ -21,7 +27,9 @@ SHORT = [*TINY, *(f"training.schedule.{phase}" for phase in FEW)]
 def script(inside, monkeypatch):
     """Imports an example by its name."""
 
-    def run(command: list[str], check: bool, env: dict[str, str] | None = None) -> None:
+    def run(
+        command: list[str], check: bool, env: dict[str, str] | None = None
+    ) -> None:
         assert check
         result = inside(command[2].removeprefix("gsgan."), *command[3:])
         assert result.returncode == 0, result.stdout + result.stderr
@@ -71,6 +79,6 @@ def test_a_loss_and_an_ablation_of_your_own(script, capture, tmp_path):
 def test_the_page_lists_the_scripts():
     page = (FOLDER / "README.md").read_text()
     for path in FOLDER.glob("*.py"):
-        assert re.search(rf"^python docs/examples/{path.name}", page, flags=re.M), (
-            path.name
-        )
+        assert re.search(
+            rf"^python docs/examples/{path.name}", page, flags=re.M
+        ), path.name

@@ -81,7 +81,9 @@ class OneLayer(nn.Module):
         self.paint = nn.Conv2d(inputs, 4, 3, padding=1)
 
     def forward(self, F, S, p2d, g, fine=None, alpha=None) -> Tensor:
-        return self.paint(torch.cat([x for x in (F, S, p2d) if x is not None], dim=1))
+        return self.paint(
+            torch.cat([x for x in (F, S, p2d) if x is not None], dim=1)
+        )
 
 
 class Blobs(nn.Module):
@@ -119,10 +121,15 @@ def test_a_dataset_format(tiny, capture, tmp_path):
     np.savez(
         tmp_path / "cameras.npz",
         name=list(stored),
-        **{key: [camera[key] for camera in stored.values()] for key in ("K", "R", "t")},
+        **{
+            key: [camera[key] for camera in stored.values()]
+            for key in ("K", "R", "t")
+        },
     )
     with np.load(capture / "landmarks3d.npz") as arrays:
-        np.savez(tmp_path / "skeletons.npz", p=arrays["p"], frame=arrays["frame_id"])
+        np.savez(
+            tmp_path / "skeletons.npz", p=arrays["p"], frame=arrays["frame_id"]
+        )
     for name in stored:
         shutil.copytree(capture / "images" / name, tmp_path / name)
         shutil.copytree(capture / "masks" / name, tmp_path / f"{name}_mask")
@@ -176,7 +183,11 @@ def test_a_splatting_baseline(tiny):
     data, module = build_training(config)
     frame = data.dataset("train")[0]
     painting = module.avatar(
-        frame.skeleton, frame.visibility, frame.camera, frame.body, generate=False
+        frame.skeleton,
+        frame.visibility,
+        frame.camera,
+        frame.body,
+        generate=False,
     )
     module.step_one_loss(painting, frame).backward()
     assert float(module.avatar.surface.colour.grad.abs().max()) > 0

@@ -32,4 +32,7 @@ def test_the_hook_sees_a_program_and_a_file(tmp_path):
         )
         assert list(found) == ["code"]
     greedy = [(whole, lambda _: bytearray(3 << 30)), (whole, lambda _: b"1")]
-    assert list(script["batch"](tmp_path, greedy, "a", 0, 2)) == ["memory", "read"]
+    assert list(script["batch"](tmp_path, greedy, "a", 0, 2)) == [
+        "memory",
+        "read",
+    ]

@@ -13,7 +13,9 @@ DOCKERFILE = (ROOT / "Dockerfile").read_text()
 
 
 def test_the_workflow_runs_what_ci_runs():
-    workflow = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text())
+    workflow = yaml.safe_load(
+        (ROOT / ".github" / "workflows" / "ci.yml").read_text()
+    )
     (job,) = workflow["jobs"].values()
     assert "bash .ci/run" in [step.get("run") for step in job["steps"]]
     assert (ROOT / ".ci" / "run").is_file()
@@ -55,5 +57,7 @@ def test_the_dockerfile_copies_what_exists_and_the_wheel_needs():
 def test_the_dockerfile_takes_the_tested_torch():
     tested = (ROOT / "constraints.txt").read_text().split()
     for argument, package in (("TORCH", "torch"), ("VISION", "torchvision")):
-        (version,) = re.findall(rf"^ARG {argument}=(\S+)$", DOCKERFILE, flags=re.M)
+        (version,) = re.findall(
+            rf"^ARG {argument}=(\S+)$", DOCKERFILE, flags=re.M
+        )
         assert f"{package}=={version}" in tested

@@ -12,9 +12,7 @@ from omegaconf import OmegaConf
 
 ROOT = Path(__file__).parents[1]
 SCRIPT = ROOT / "scripts" / "gpu_check.sh"
-NO_CUDA = (
-    "gpu_check: torch finds no CUDA device on this machine, so nothing was checked.\n"
-)
+NO_CUDA = "gpu_check: torch finds no CUDA device on this machine, so nothing was checked.\n"
 FAKE = """#!/bin/bash
 mkdir -p "$OUT" # a Python that finds one device and does nothing
 [[ $* == *device_count* ]] && echo 1
@@ -94,13 +92,16 @@ def test_each_step_runs_once_and_its_options_exist(tmp_path, compose, device):
         "# On a GPU" if device == "cuda" else "# A rehearsal on a CPU"
     )
     commands = [
-        shlex.split(path.read_text())[1:] for path in sorted(out.glob("*.command"))
+        shlex.split(path.read_text())[1:]
+        for path in sorted(out.glob("*.command"))
     ]
     assert len(commands) == 12
     for words in commands:
         if words[1] == "pytest":
             assert all(
-                Path(word).exists() for word in words if word.startswith("tests")
+                Path(word).exists()
+                for word in words
+                if word.startswith("tests")
             )
         elif words[1] == "gsgan.bench":
             compose(f"bench_{words[2]}", *without_folder(words[3:]))

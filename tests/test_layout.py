@@ -52,7 +52,9 @@ def imported(path: Path, typing: bool = False) -> Iterator[str]:
         ):
             continue
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names if alias.name in MODULES)
+            yield from (
+                alias.name for alias in node.names if alias.name in MODULES
+            )
         elif isinstance(node, ast.ImportFrom) and node.module in MODULES:
             names = {f"{node.module}.{alias.name}" for alias in node.names}
             yield from (names & MODULES) or {node.module}
@@ -61,14 +63,18 @@ def imported(path: Path, typing: bool = False) -> Iterator[str]:
 
 def test_few_entries():
     entries = [
-        p.name for p in PACKAGE.iterdir() if p.name not in ("__pycache__", "conf")
+        p.name
+        for p in PACKAGE.iterdir()
+        if p.name not in ("__pycache__", "conf")
     ]
     assert len(entries) <= ENTRIES, sorted(entries)
 
 
 def packed(node: ast.AST) -> bool:
     """Whether an assignment gives several names unrelated values; a swap does not."""
-    if not isinstance(node, ast.Assign) or not isinstance(node.targets[0], ast.Tuple):
+    if not isinstance(node, ast.Assign) or not isinstance(
+        node.targets[0], ast.Tuple
+    ):
         return False
     if isinstance(node.value, ast.GeneratorExp):
         return True
@@ -100,11 +106,15 @@ def test_a_part_imports_only_earlier_parts(part):
             continue
         for other in imported(path):
             package = [*other.split("."), ""][1]
-            assert package in ("", *allowed), f"{'.'.join(name)} imports {other}"
+            assert package in ("", *allowed), (
+                f"{'.'.join(name)} imports {other}"
+            )
 
 
 def test_no_circles():
-    with_types = {module_name(path): set(imported(path, typing=True)) for path in FILES}
+    with_types = {
+        module_name(path): set(imported(path, typing=True)) for path in FILES
+    }
     TopologicalSorter(with_types).prepare()  # raises CycleError
     modules = {module_name(path): set(imported(path)) for path in FILES}
     packages: dict[str, set[str]] = {}
@@ -119,8 +129,14 @@ def test_no_circles():
 
 def test_the_page_has_the_parts_in_their_order():
     page = (PACKAGE.parents[1] / "docs" / "architecture.md").read_text()
-    rows = [line.split("|")[1] for line in page.splitlines() if line.startswith("| `")]
-    named = [name for row in rows for name in re.findall(r"`(\w+)(?:/|\.py)`", row)]
+    rows = [
+        line.split("|")[1]
+        for line in page.splitlines()
+        if line.startswith("| `")
+    ]
+    named = [
+        name for row in rows for name in re.findall(r"`(\w+)(?:/|\.py)`", row)
+    ]
     assert [name for name in named if name in PARTS] == list(PARTS)
 
 

@@ -9,7 +9,9 @@ from gsgan.report.runs import flat
 from gsgan.run.stored import record
 from gsgan.utils.config import config_folder
 
-DATA = sorted(path.stem for path in (config_folder() / "data").glob("[!_]*.yaml"))
+DATA = sorted(
+    path.stem for path in (config_folder() / "data").glob("[!_]*.yaml")
+)
 OURS = {  # what gsgan adds to the paper's method, and the value that leaves it out
     "effects.body_points": "off",
     "effects.colour_correction": "off",
@@ -79,7 +81,9 @@ def test_baselines_that_are_not_the_papers_are_refused_in_one_sentence(
     assert result.stderr.count("\n") == 1
 
 
-@pytest.mark.parametrize("model", ["full", "wo_feat", "wo_seg", "wo_gcn", "splat_only"])
+@pytest.mark.parametrize(
+    "model", ["full", "wo_feat", "wo_seg", "wo_gcn", "splat_only"]
+)
 def test_it_builds_with_the_papers_models(build, model):
     small = ("size=tiny", "training=smoke")
     _, avatar, frame = build("experiment=paper", f"model={model}", *small)
@@ -102,10 +106,14 @@ def test_the_page_lists_keys_that_exist_and_values_of_the_preset(compose):
     config = compose("train", "experiment=paper")
     groups = ("model", "training", "effects", "size", "data", "trainer")
     known = dict(
-        flat({g: OmegaConf.to_container(config[g], resolve=True) for g in groups})
+        flat(
+            {g: OmegaConf.to_container(config[g], resolve=True) for g in groups}
+        )
     )
     groups = {key.rpartition(".")[0] for key in known} | set(known)
-    parents = {".".join(key.split(".")[:n]) for key in known for n in range(1, 6)}
+    parents = {
+        ".".join(key.split(".")[:n]) for key in known for n in range(1, 6)
+    }
     for row in (line for line in page.splitlines() if line.startswith("|")):
         cell = row.split("|")[3]
         keys = re.findall(r"`([a-z0-9_.]+)`", cell)
@@ -114,7 +122,9 @@ def test_the_page_lists_keys_that_exist_and_values_of_the_preset(compose):
                 assert key in parents | groups, key
                 first = key
             else:
-                assert f"{first.rpartition('.')[0]}.{key}" in parents | groups, key
+                assert (
+                    f"{first.rpartition('.')[0]}.{key}" in parents | groups
+                ), key
     for key in OURS:
         group, _, name = key.rpartition(".")
         assert name in page, key
@@ -142,7 +152,11 @@ UNLISTED = (
         "training.max_skipped",
         "training.skip_window",
     ),
-    *("training.rollback", "training.average_every", "training.perceptual.path"),
+    *(
+        "training.rollback",
+        "training.average_every",
+        "training.perceptual.path",
+    ),
     *("training.schedule.epoch", "effects.impossible"),
 )
 

@@ -10,7 +10,9 @@ from gsgan.scene import BodyPose, Camera, Frame, cat
 
 def camera(batch: int = 1, **changes) -> Camera:
     parts = {
-        "K": torch.tensor([[50.0, 0, 20], [0, 40, 15], [0, 0, 1]]).expand(batch, 3, 3),
+        "K": torch.tensor([[50.0, 0, 20], [0, 40, 15], [0, 0, 1]]).expand(
+            batch, 3, 3
+        ),
         "R": torch.eye(3).expand(batch, 3, 3),
         "t": torch.zeros(batch, 3),
         "size": (30, 40),
@@ -49,7 +51,10 @@ def test_centre_is_where_depth_vanishes():
     turn = torch.linalg.qr(torch.randn(3, 3)).Q
     one = camera(R=turn[None], t=torch.tensor([[1.0, 2.0, 3.0]]))
     torch.testing.assert_close(
-        one.to_camera(one.centre[:, None])[0, 0], torch.zeros(3), atol=1e-5, rtol=0
+        one.to_camera(one.centre[:, None])[0, 0],
+        torch.zeros(3),
+        atol=1e-5,
+        rtol=0,
     )
 
 

@@ -15,13 +15,18 @@ from gsgan.synthetic.scene_setup import load_character
     [
         ("big_data", "--frames=200", "--cameras=2", "--reads=160"),
         pytest.param(
-            ("sweeps", "joblib", "--runs=4", "--kills=1"), marks=pytest.mark.slow
+            ("sweeps", "joblib", "--runs=4", "--kills=1"),
+            marks=pytest.mark.slow,
         ),
     ],
     ids=lambda words: words[0],
 )
 def test_a_script_ends_well(words, tmp_path):
-    command = [sys.executable, str(ROOT / "scripts" / f"{words[0]}.py"), *words[1:]]
+    command = [
+        sys.executable,
+        str(ROOT / "scripts" / f"{words[0]}.py"),
+        *words[1:],
+    ]
     done = subprocess.run(
         command,
         env=ENVIRONMENT,
@@ -46,6 +51,8 @@ def test_a_print_changes_the_colours_in_its_box_and_no_shape(tmp_path):
     old = before.surfaces[0].colour.astype(int)
     new = after.surfaces[0].colour.astype(int)
     half = old.shape[1] // 2
-    changed = np.abs(new - old).max(axis=-1) > 60  # more than compressing it again does
+    changed = (
+        np.abs(new - old).max(axis=-1) > 60
+    )  # more than compressing it again does
     assert changed[:, :half].mean() > 0.01
     assert changed[:, half:].mean() < 0.001

@@ -10,15 +10,20 @@ HEIGHT, WIDTH = 60, 100
 
 
 def camera(batch: int = 1) -> Camera:
-    K = torch.tensor([[50.0, 0, WIDTH / 2], [0, 50, HEIGHT / 2], [0, 0, 1]]).expand(
-        batch, 3, 3
-    )
+    K = torch.tensor(
+        [[50.0, 0, WIDTH / 2], [0, 50, HEIGHT / 2], [0, 0, 1]]
+    ).expand(batch, 3, 3)
     return Camera(
-        K, torch.eye(3).expand(batch, 3, 3), torch.zeros(batch, 3), (HEIGHT, WIDTH)
+        K,
+        torch.eye(3).expand(batch, 3, 3),
+        torch.zeros(batch, 3),
+        (HEIGHT, WIDTH),
     )
 
 
-def window(points, batch: int = 1, margin: float = 0.1, multiple: int = 8) -> Window:
+def window(
+    points, batch: int = 1, margin: float = 0.1, multiple: int = 8
+) -> Window:
     p = torch.tensor(points).expand(batch, -1, -1)
     return body_window(
         p, camera(batch), margin=margin, multiple=multiple, minimum=8, near=0.01
@@ -56,8 +61,12 @@ def test_a_person_out_of_the_picture_leaves_a_small_box_inside():
 
 
 def test_boxes_of_a_batch_share_one_size():
-    p = torch.tensor([[[0.0, 0.0, 2.0]] * 2, [[-0.5, 0.0, 2.0], [0.5, 0.0, 2.0]]])
-    found = body_window(p, camera(2), margin=0.1, multiple=8, minimum=8, near=0.01)
+    p = torch.tensor(
+        [[[0.0, 0.0, 2.0]] * 2, [[-0.5, 0.0, 2.0], [0.5, 0.0, 2.0]]]
+    )
+    found = body_window(
+        p, camera(2), margin=0.1, multiple=8, minimum=8, near=0.01
+    )
     assert len(found.corners) == 2
     picture = (
         torch.arange(HEIGHT * WIDTH)
@@ -84,9 +93,13 @@ def test_the_boxs_camera_sees_the_same_point():
 
 def test_a_frame_seen_through_its_box_is_cut_in_every_map():
     """With ``unsure`` left whole, the loss would compare pictures of two sizes."""
-    pixels = torch.arange(HEIGHT * WIDTH, dtype=torch.float32).view(1, 1, HEIGHT, WIDTH)
+    pixels = torch.arange(HEIGHT * WIDTH, dtype=torch.float32).view(
+        1, 1, HEIGHT, WIDTH
+    )
     labels = pixels[:, 0].long()
-    frame = frame_of(pixels.expand(1, 3, -1, -1), pixels, labels=labels, unsure=pixels)
+    frame = frame_of(
+        pixels.expand(1, 3, -1, -1), pixels, labels=labels, unsure=pixels
+    )
     seen = window([[[-0.2, -0.2, 2.0], [0.2, 0.2, 2.0]]]).frame(frame)
     cut = pixels[..., 22:38, 42:58]
     assert torch.equal(seen.unsure, cut)

@@ -43,7 +43,9 @@ def look_at(centre: Tensor, eye: Tensor, pixels: int) -> Camera:
         [right, torch.linalg.cross(forward, right), forward]
     )  # x right, y down
     focal = pixels / 2 / math.tan(math.radians(35) / 2)
-    K = torch.tensor([[focal, 0, pixels / 2], [0, focal, pixels / 2], [0, 0, 1]])
+    K = torch.tensor(
+        [[focal, 0, pixels / 2], [0, focal, pixels / 2], [0, 0, 1]]
+    )
     return Camera(K[None], R[None], -(R @ eye)[None], size=(pixels, pixels))
 
 
@@ -51,7 +53,9 @@ def main(run: Path, landmarks: Path, out: Path, pixels: int) -> None:
     avatar = gsgan.load(run)  # on the GPU if there is one
     out.mkdir(parents=True, exist_ok=True)
     camera, count, start = None, 0, time.perf_counter()
-    smooth = OneEuro()  # about a frame of delay; docs/render.md has its settings
+    smooth = (
+        OneEuro()
+    )  # about a frame of delay; docs/render.md has its settings
     for seconds, p in stream(landmarks):
         skeleton = torch.from_numpy(smooth(p, seconds)).float()
         if (
@@ -69,7 +73,9 @@ def main(run: Path, landmarks: Path, out: Path, pixels: int) -> None:
             png_bytes(Image.fromarray(rgb))
         )  # or show it
         count += 1
-    print(f"{count} images, {count / (time.perf_counter() - start):.1f} per second")
+    print(
+        f"{count} images, {count / (time.perf_counter() - start):.1f} per second"
+    )
 
 
 if __name__ == "__main__":

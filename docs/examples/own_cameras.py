@@ -33,8 +33,14 @@ def camera(angle: float) -> dict[str, list]:
         np.array([0.0, 0.0, -1.0]),
     )
     R = np.stack([right, down, forward])  # world to camera
-    t = -R @ (np.array([0, 0, 0.85]) - 3 * forward)  # x_cam = R x_world + t, metres
-    K = [[1.2 * SIZE, 0, SIZE / 2], [0, 1.2 * SIZE, SIZE / 2], [0, 0, 1]]  # pixels
+    t = -R @ (
+        np.array([0, 0, 0.85]) - 3 * forward
+    )  # x_cam = R x_world + t, metres
+    K = [
+        [1.2 * SIZE, 0, SIZE / 2],
+        [0, 1.2 * SIZE, SIZE / 2],
+        [0, 0, 1],
+    ]  # pixels
     return {
         "K": K,
         "R": R.tolist(),
@@ -48,7 +54,9 @@ def joints(time: float) -> np.ndarray:
     """[33, 3] metres, z up: MediaPipe's landmarks of a person who waves."""
     p = np.array(MEDIAPIPE33.rest_positions)[:, [0, 2, 1]] * [1, -1, 1]
     angle, arm = 0.5 + 0.5 * np.sin(2 * np.pi * time), [13, 15, 17, 19, 21]
-    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    turn = np.array(
+        [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
+    )
     p[arm, ::2] = (p[arm, ::2] - p[11, ::2]) @ turn + p[11, ::2]
     return p
 
@@ -73,7 +81,11 @@ def film(
             colour = (40 + 5 * i, 220 - 5 * i, 130)
             for canvas, ink in ((image, colour), (mask, 255)):
                 cv2.line(
-                    canvas, pixels[a].tolist(), pixels[b].tolist(), ink, SIZE // 18
+                    canvas,
+                    pixels[a].tolist(),
+                    pixels[b].tolist(),
+                    ink,
+                    SIZE // 18,
                 )
         shots[name] = (image, mask)
     return shots
@@ -81,7 +93,9 @@ def film(
 
 def write_capture(folder: Path) -> Path:
     """The folder that docs/data.md describes. Frames and cameras are matched by name."""
-    rig = {f"cam{i:02d}": camera(2 * np.pi * i / CAMERAS) for i in range(CAMERAS)}
+    rig = {
+        f"cam{i:02d}": camera(2 * np.pi * i / CAMERAS) for i in range(CAMERAS)
+    }
     skeletons = np.stack([joints(i / FRAMES) for i in range(FRAMES)])
     for kind in ("images", "masks"):
         for name in rig:
@@ -116,10 +130,15 @@ def main(folder: Path, overrides: list[str]) -> None:
     avatar = gsgan.load(run)
     entry = camera(np.pi / CAMERAS)  # where no camera stood
     K, R, t = (
-        torch.tensor([entry[key]], dtype=torch.float32) for key in ("K", "R", "t")
+        torch.tensor([entry[key]], dtype=torch.float32)
+        for key in ("K", "R", "t")
     )
-    skeleton = torch.from_numpy(joints(0.3)).float()  # a pose between two frames
-    image = avatar.render(skeleton, Camera(K, R, t, size=(SIZE, SIZE)), background=1.0)
+    skeleton = torch.from_numpy(
+        joints(0.3)
+    ).float()  # a pose between two frames
+    image = avatar.render(
+        skeleton, Camera(K, R, t, size=(SIZE, SIZE)), background=1.0
+    )
     pixels = (image[0] * 255).round().byte().permute(1, 2, 0).numpy()
     (folder / "new_view.png").write_bytes(
         png_bytes(Image.fromarray(pixels))

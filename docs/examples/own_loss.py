@@ -37,19 +37,30 @@ class Smoothness(nn.Module):
 
 
 def main(overrides: list[str]) -> None:
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), *sys.path])}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(HERE), *sys.path]),
+    }
     ours = [
         "--config-dir",
         str(HERE / "conf"),
         "model=full,wo_normals",
         "training=smooth",
     ]
-    sweep = ["gsgan.train", "-m", *ours, "hydra.sweep.dir=runs/own_loss", *overrides]
+    sweep = [
+        "gsgan.train",
+        "-m",
+        *ours,
+        "hydra.sweep.dir=runs/own_loss",
+        *overrides,
+    ]
     for command in (
         sweep,
         ["gsgan.report", "runs=[runs/own_loss]", "out=runs/own_loss_table"],
     ):
-        subprocess.run([sys.executable, "-m", *command], check=True, env=environment)
+        subprocess.run(
+            [sys.executable, "-m", *command], check=True, env=environment
+        )
 
 
 if __name__ == "__main__":

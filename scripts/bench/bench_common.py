@@ -71,7 +71,9 @@ class Bench:
             pick_device(config.get("device", "cpu")),
             config.docs and Path(config.docs),
         )
-        bench = cls(name, folder, make_console(), device, environment(device), page)
+        bench = cls(
+            name, folder, make_console(), device, environment(device), page
+        )
         if page is not None:  # before anything is measured
             check_block(page, *bench.markers)
         bench.console.print(sentence(bench.where), highlight=False)
@@ -84,7 +86,11 @@ class Bench:
 
     def progress(self) -> Progress:
         """A progress bar with a description."""
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+        )
         return Progress(
             *columns, TimeElapsedColumn(), console=self.console, transient=True
         )
@@ -122,7 +128,9 @@ class Bench:
         if self.page is not None:
             fill_block(self.page, *self.markers, docs or text)
         self.console.print(
-            f"tables and raw numbers: {self.folder}", markup=False, highlight=False
+            f"tables and raw numbers: {self.folder}",
+            markup=False,
+            highlight=False,
         )
 
 
@@ -159,7 +167,9 @@ def _around(page: Path, start: str, end: str) -> tuple[str, str]:
             f"docs={page}: no such page; give a Markdown file or docs=null"
         ) from None
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"docs={page} cannot be read as a page: {error}") from None
+        raise ConfigError(
+            f"docs={page} cannot be read as a page: {error}"
+        ) from None
     head, found, rest = text.partition(start)
     _, closed, tail = rest.partition(end)
     if not found or not closed:
@@ -204,7 +214,9 @@ def preset(name: str) -> Accuracy:
     """
     path = config_folder() / "accuracy" / f"{name}.yaml"
     if not path.is_file():
-        known = ", ".join(sorted(other.stem for other in path.parent.glob("*.yaml")))
+        known = ", ".join(
+            sorted(other.stem for other in path.parent.glob("*.yaml"))
+        )
         raise GsganError(f"accuracy {name} is not one of {known}")
     setting: Accuracy = instantiate(OmegaConf.load(path))
     return setting
@@ -237,14 +249,18 @@ def train(overrides: Sequence[str], run: Path) -> None:
         )
         try:
             code = process.wait()
-        except BaseException:  # Ctrl-C reaches it as well: it saves a checkpoint
+        except (
+            BaseException
+        ):  # Ctrl-C reaches it as well: it saves a checkpoint
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(timeout=30)
             process.kill()
             raise
     if code:
         lines = [
-            x.strip() for x in log.read_text(errors="replace").splitlines() if x.strip()
+            x.strip()
+            for x in log.read_text(errors="replace").splitlines()
+            if x.strip()
         ]
         last = lines[-1] if lines else f"it ended with {code}"
         raise GsganError(
@@ -252,7 +268,9 @@ def train(overrides: Sequence[str], run: Path) -> None:
         )
 
 
-def panels(count: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
+def panels(
+    count: int, width: float, height: float
+) -> tuple[Figure, list[Axes]]:
     """A figure of panels side by side, sizes in inches."""
     figure = Figure(figsize=(width, height), dpi=120, layout="constrained")
     axes = list(figure.subplots(1, count, squeeze=False)[0])
@@ -286,7 +304,9 @@ def painting_memory(
     )
 
 
-def peak_memory(action: Callable[[], object], device: torch.device) -> float | None:
+def peak_memory(
+    action: Callable[[], object], device: torch.device
+) -> float | None:
     """Megabytes by which the peak of this process grows while ``action`` runs a second time.
 
     Convention: free memory is returned to the system first, and the system's record of the peak is
@@ -301,7 +321,10 @@ def peak_memory(action: Callable[[], object], device: torch.device) -> float | N
         # glibc keeps what was freed for reuse
         with contextlib.suppress(OSError, AttributeError):
             ctypes.CDLL(None).malloc_trim(0)
-        with contextlib.suppress(OSError), open("/proc/self/clear_refs", "w") as stream:
+        with (
+            contextlib.suppress(OSError),
+            open("/proc/self/clear_refs", "w") as stream,
+        ):
             stream.write("5")
     before = _peak(device)
     action()

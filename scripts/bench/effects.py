@@ -47,15 +47,23 @@ class Row:
     runs: dict[str, list[str]] = field(default_factory=dict)
     auto: bool = False  # whether `auto` turned it on
     why: str = ""
-    scores: dict[str, dict[str, float]] = field(default_factory=dict)  # dB by SHOWN
-    paint_ms: dict[str, float] = field(default_factory=dict)  # medians per frame
+    scores: dict[str, dict[str, float]] = field(
+        default_factory=dict
+    )  # dB by SHOWN
+    paint_ms: dict[str, float] = field(
+        default_factory=dict
+    )  # medians per frame
     read_ms: dict[str, float] = field(default_factory=dict)
     parameters: dict[str, int] = field(default_factory=dict)
-    marks: list[str] = field(default_factory=list)  # notes that the table must carry
+    marks: list[str] = field(
+        default_factory=list
+    )  # notes that the table must carry
 
     def gain(self, variant: str) -> float | None:
         """dB that the effect adds; None where either was not scored."""
-        on, off = (self.scores.get(state, {}).get(variant) for state in ("on", "off"))
+        on, off = (
+            self.scores.get(state, {}).get(variant) for state in ("on", "off")
+        )
         return None if on is None or off is None else on - off
 
 
@@ -74,7 +82,9 @@ def run(config: DictConfig, folder: Path) -> None:
     check(config)
     bench = bench_common.Bench.start("effects", config, folder)
     rows = list(rows_of(config))
-    trainings = {name: words for row in rows for name, words in row.runs.items()}
+    trainings = {
+        name: words for row in rows for name, words in row.runs.items()
+    }
     metrics = {}
     with bench.progress() as progress:
         task = progress.add_task("", total=len(trainings) + 2 * len(rows))
@@ -90,7 +100,9 @@ def run(config: DictConfig, folder: Path) -> None:
             )
             progress.advance(task)
         for row in rows:
-            progress.update(task, description=f"timing {row.effect} in {row.scene}")
+            progress.update(
+                task, description=f"timing {row.effect} in {row.scene}"
+            )
             if row.runs:
                 score(row, metrics)
                 measure(row, folder / "runs", config.frames, config.repeats)
@@ -98,7 +110,8 @@ def run(config: DictConfig, folder: Path) -> None:
     record = {
         "settings": OmegaConf.to_container(config),
         "rows": [
-            asdict(row) | {"gain_db": {v: row.gain(v) for v in SHOWN}} for row in rows
+            asdict(row) | {"gain_db": {v: row.gain(v) for v in SHOWN}}
+            for row in rows
         ],
         "failures": failures(rows),
     }
@@ -148,7 +161,9 @@ def rows_of(config: DictConfig) -> Iterator[Row]:
 def decide(row: Row, base: Sequence[str]) -> None:
     """Fills in whether `auto` turns the effect on in the scene, and its reason."""
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
-        config = compose("train", [*base, *row.overrides, f"effects.{row.effect}=auto"])
+        config = compose(
+            "train", [*base, *row.overrides, f"effects.{row.effect}=auto"]
+        )
     data = build_data(config)
     if data.lacks_body:
         fit_before_training(data, config.fit, torch.device("cpu"))
@@ -162,9 +177,13 @@ def score(row: Row, metrics: Mapping[str, Any]) -> None:
     """Fills in the PSNR in the person's box and the notes of both runs."""
     for state, name in zip(("off", "on"), row.runs, strict=True):
         variants = metrics[name][row.split]
-        row.scores[state] = {v: variants[v][SCORE] for v in SHOWN if v in variants}
+        row.scores[state] = {
+            v: variants[v][SCORE] for v in SHOWN if v in variants
+        }
         splits = metrics[name].values()
-        row.marks += [m for split in splits for v in split.values() for m in v["marks"]]
+        row.marks += [
+            m for split in splits for v in split.values() for m in v["marks"]
+        ]
     row.marks = sorted(set(row.marks))
 
 
@@ -188,7 +207,8 @@ def measure(row: Row, folder: Path, frames: int, repeats: int) -> None:
         for actions, found in ((paint, row.paint_ms), (read, row.read_ms)):
             samples = interleaved(actions, repeats)
             found |= {
-                state: (median(ms) or 0.0) / count for state, ms in samples.items()
+                state: (median(ms) or 0.0) / count
+                for state, ms in samples.items()
             }
 
 
@@ -202,7 +222,9 @@ def failures(rows: Sequence[Row]) -> list[str]:
                 f"auto leaves {name} {'on' if row.auto else 'off'} ({row.why})"
             )
         if row.called and gain is not None and gain <= 0:
-            found.append(f"{name} gains {gain:+.2f} dB although it is called for")
+            found.append(
+                f"{name} gains {gain:+.2f} dB although it is called for"
+            )
     return found
 
 
@@ -239,9 +261,7 @@ def _gain(row: Row, variant: str) -> str:
     gain = row.gain(variant)
     if gain is None:
         return NOTHING
-    return (
-        f"{gain:+.2f} ({_change({s: row.scores[s][variant] for s in ('off', 'on')})})"
-    )
+    return f"{gain:+.2f} ({_change({s: row.scores[s][variant] for s in ('off', 'on')})})"
 
 
 def _change(values: Mapping[str, float]) -> str:

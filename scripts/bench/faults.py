@@ -38,7 +38,9 @@ UPRIGHT, LEVEL, SIGHT = (
 Camera = dict[str, Any]  # an entry of cameras.json, its lists as arrays
 
 
-def turned(axis: np.ndarray, degrees: float, *, about_centre: bool = True) -> Callable:
+def turned(
+    axis: np.ndarray, degrees: float, *, about_centre: bool = True
+) -> Callable:
     """Turned about its own axis; with t kept it moves along its circle about the world's origin."""
     turn = cv2.Rodrigues(np.radians(degrees) * axis)[0]
     return lambda c: {
@@ -60,7 +62,9 @@ def scaled(factor: float) -> Callable:
 def zoomed(factor: float, *, centre: bool = False) -> Callable:
     """Of the focal lengths; with ``centre`` also of the principal point, as of a resized image."""
     by = np.array([factor, factor, 1])
-    return lambda c: {"K": c["K"] * (by[:, None] if centre else np.diag(by - 1) + 1)}
+    return lambda c: {
+        "K": c["K"] * (by[:, None] if centre else np.diag(by - 1) + 1)
+    }
 
 
 def inverse(c: Camera) -> Camera:
@@ -101,13 +105,21 @@ FAULTS: list[tuple[str, Callable | None, str]] = [
     ("R and t of two cameras exchanged", None, "R t"),
     ("all of two cameras exchanged", None, "K R t dist size"),
     *(
-        (f"turned by {degrees}° about its {name} axis", turned(axis, degrees), "one")
+        (
+            f"turned by {degrees}° about its {name} axis",
+            turned(axis, degrees),
+            "one",
+        )
         for degrees in (5, 2)
         for name, axis in (("upright", UPRIGHT), ("level", LEVEL))
     ),
     ("turned by 5° about its line of sight", turned(SIGHT, 5), "one"),
     ("turned by 2° about its line of sight", turned(SIGHT, 2), "one"),
-    ("turned by 5° with `t` kept", turned(UPRIGHT, 5, about_centre=False), "one"),
+    (
+        "turned by 5° with `t` kept",
+        turned(UPRIGHT, 5, about_centre=False),
+        "one",
+    ),
     *(
         (f"moved sideways by {100 * d:.0f} cm", moved(d), "one")
         for d in (0.2, 0.1, 0.05)
@@ -121,14 +133,25 @@ FAULTS: list[tuple[str, Callable | None, str]] = [
     *(("`t` holds the position", position, which) for which in ("one", "all")),
     ("axes of OpenGL", opengl, "all"),
     ("width and height exchanged in `size`", size_exchanged, "all"),
-    *(("cx and cy exchanged", centre_exchanged, which) for which in ("one", "all")),
     *(
-        (f"K of an image {factor} times as large", zoomed(factor, centre=True), which)
+        ("cx and cy exchanged", centre_exchanged, which)
+        for which in ("one", "all")
+    ),
+    *(
+        (
+            f"K of an image {factor} times as large",
+            zoomed(factor, centre=True),
+            which,
+        )
         for factor in (2, 0.5)
         for which in ("one", "all")
     ),
     *(
-        (f"focal lengths times {factor}, cx and cy right", zoomed(factor), which)
+        (
+            f"focal lengths times {factor}, cx and cy right",
+            zoomed(factor),
+            which,
+        )
         for factor in (0.5, 1.3, 1.1, 0.9, 1.05)
         for which in ("one", "all")
     ),
@@ -160,7 +183,9 @@ def findings(root: Path) -> tuple[Finding, ...] | None:
     return report.findings if report.numbers.get("readable", True) else None
 
 
-def verdict(root: Path, known: set[Finding], names: set[str], *, every: bool) -> str:
+def verdict(
+    root: Path, known: set[Finding], names: set[str], *, every: bool
+) -> str:
     """What is found beyond ``known``."""
     found = findings(root)
     if found is None:
@@ -179,14 +204,17 @@ def column(capture: Path) -> list[str]:
     """The verdict on every fault, in a copy of the capture."""
     rig = {
         name: {key: np.array(value) for key, value in camera.items()}
-        for name, camera in json.loads((capture / "cameras.json").read_text()).items()
+        for name, camera in json.loads(
+            (capture / "cameras.json").read_text()
+        ).items()
     }
     with tempfile.TemporaryDirectory() as folder:
         root = Path(shutil.copytree(capture, Path(folder) / capture.name))
 
         def write(cameras: dict[str, Camera]) -> None:
             entries = {
-                n: {k: v.tolist() for k, v in c.items()} for n, c in cameras.items()
+                n: {k: v.tolist() for k, v in c.items()}
+                for n, c in cameras.items()
             }
             (root / "cameras.json").write_text(json.dumps(entries))
 
@@ -198,7 +226,9 @@ def column(capture: Path) -> list[str]:
             cameras = {name: dict(camera) for name, camera in rig.items()}
             names = damaged(cameras, change, which)
             write(cameras)
-            verdicts.append(verdict(root, set(correct), names, every=which == "all"))
+            verdicts.append(
+                verdict(root, set(correct), names, every=which == "all")
+            )
     return verdicts
 
 

@@ -29,27 +29,37 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "prepare"))
+sys.path.insert(
+    0, str(Path(__file__).resolve().parents[2] / "tests" / "prepare")
+)
 from one_person import world_landmarks
 
 from gsgan.synthetic.scenes import ensure_scene
 
 LARGER = 3  # the video's pixels per pixel of the traced image
-NOISE, LOST, EMPTY = 0.005, 0.05, 0.03  # shares of the person's size, landmarks, frames
+NOISE, LOST, EMPTY = (
+    0.005,
+    0.05,
+    0.03,
+)  # shares of the person's size, landmarks, frames
 NAME = "me"
 
 
 def project(camera, p):
     """Pixels ``[…, 2]`` and camera axes ``[…, 3]`` of points in the world."""
     own = p @ camera.R.T + camera.t
-    return own[..., :2] / own[..., 2:] @ camera.K[:2, :2].T + camera.K[:2, 2], own
+    return own[..., :2] / own[..., 2:] @ camera.K[:2, :2].T + camera.K[
+        :2, 2
+    ], own
 
 
 def read_cameras(folder: Path) -> dict[str, SimpleNamespace]:
     """K, R, t of every camera of a capture."""
     raw = json.loads((folder / "cameras.json").read_text())
     return {
-        name: SimpleNamespace(**{k: np.array(entry[k]) for k in ("K", "R", "t")})
+        name: SimpleNamespace(
+            **{k: np.array(entry[k]) for k in ("K", "R", "t")}
+        )
         for name, entry in raw.items()
     }
 
@@ -59,7 +69,9 @@ def film(scene: Path, folder: Path, landmarks: str) -> SimpleNamespace:
     name, camera = next(iter(read_cameras(scene).items()))
     images = sorted((scene / "images" / name).iterdir())
     size = np.array(cv2.imread(str(images[0])).shape[1::-1])
-    half = np.ceil(np.maximum(camera.K[:2, 2], size - camera.K[:2, 2])).astype(int)
+    half = np.ceil(np.maximum(camera.K[:2, 2], size - camera.K[:2, 2])).astype(
+        int
+    )
     corner = np.round(half - camera.K[:2, 2]).astype(int)
     camera.K[:2, 2] += corner
     camera.K[:2] *= LARGER
@@ -78,9 +90,13 @@ def film(scene: Path, folder: Path, landmarks: str) -> SimpleNamespace:
             small = cv2.imread(str(scene / kind / name / path.name))
             padded = np.zeros((2 * half[1], 2 * half[0], 3), np.uint8)
             padded[corner[1] :, corner[0] :][: size[1], : size[0]] = small
-            pair.append(cv2.resize(padded, whole, interpolation=cv2.INTER_CUBIC))
+            pair.append(
+                cv2.resize(padded, whole, interpolation=cv2.INTER_CUBIC)
+            )
         image, mask = pair
-        video.write(np.clip(image + wall * (1 - mask / 255.0), 0, 255).astype(np.uint8))
+        video.write(
+            np.clip(image + wall * (1 - mask / 255.0), 0, 255).astype(np.uint8)
+        )
         cv2.imwrite(str(folder / "masks" / NAME / path.name), mask[..., 0])
     video.release()
     if landmarks != "mediapipe":
@@ -123,11 +139,16 @@ def join(
     """
     found = dict(np.load(capture / "landmarks3d.npz"))
     frames = found["frame_id"]
-    p, truth = found["p"][:, :33], np.load(scene / "landmarks3d.npz")["p"][frames, :33]
+    p, truth = (
+        found["p"][:, :33],
+        np.load(scene / "landmarks3d.npz")["p"][frames, :33],
+    )
     seen = np.isfinite(p + truth).all(-1)
     for scaled in (False, True):
         s, A, b = similarity(p[seen], truth[seen], scaled)
-        error = 1000 * np.linalg.norm(s * p[seen] @ A.T + b - truth[seen], axis=-1)
+        error = 1000 * np.linalg.norm(
+            s * p[seen] @ A.T + b - truth[seen], axis=-1
+        )
         print(
             f"landmarks, {'with scale' if scaled else 'rigid'}: {np.median(error):.1f} mm"
         )
@@ -160,7 +181,9 @@ def join(
 def show(metrics: Path, how: str) -> None:
     """Prints a run's dB, in images and in the box."""
     for split, variants in json.loads(metrics.read_text()).items():
-        for variant, scores in variants.items() if isinstance(variants, dict) else ():
+        for variant, scores in (
+            variants.items() if isinstance(variants, dict) else ()
+        ):
             if isinstance(scores, dict) and scores.get("psnr_person"):
                 dB = f"{scores['psnr']:.2f} dB, box {scores['psnr_person']:.2f}"
                 print(f"{split} {variant}, {how}: {dB}")
@@ -193,7 +216,8 @@ def main() -> None:
         camera = read_cameras(scene)[name]
         width = cv2.VideoCapture(str(given.video)).get(cv2.CAP_PROP_FRAME_WIDTH)
         camera.K[:2] *= (
-            width / json.loads((scene / "cameras.json").read_text())[name]["size"][0]
+            width
+            / json.loads((scene / "cameras.json").read_text())[name]["size"][0]
         )
         video = folder / f"{NAME}{given.video.suffix}"
         shutil.copyfile(given.video, video)
@@ -209,12 +233,23 @@ def main() -> None:
             rays_per_pixel=given.rays,
         )
         name = next(iter(read_cameras(scene)))
-        video, camera = folder / f"{NAME}.avi", film(scene, folder, given.landmarks)
+        video, camera = (
+            folder / f"{NAME}.avi",
+            film(scene, folder, given.landmarks),
+        )
     capture = folder / "capture"
     if not (capture / "prepare.json").is_file():
-        own = [f"landmarks={folder}/landmarks", f"masks={folder}/masks", "hands=false"]
-        noise = f"landmark_noise={0.001 if given.landmarks == 'exact' else NOISE}"
-        detector = [*own, noise] if given.landmarks != "mediapipe" else ["setup=true"]
+        own = [
+            f"landmarks={folder}/landmarks",
+            f"masks={folder}/masks",
+            "hands=false",
+        ]
+        noise = (
+            f"landmark_noise={0.001 if given.landmarks == 'exact' else NOISE}"
+        )
+        detector = (
+            [*own, noise] if given.landmarks != "mediapipe" else ["setup=true"]
+        )
         run("gsgan.prepare", f"source={video}", f"out={capture}", *detector)
     prepared = time.monotonic()
     frames = join(scene, capture, folder / "joined", name, camera)
@@ -225,12 +260,20 @@ def main() -> None:
     )
     held = [f for f in held if f in frames] if held else frames[2::4]
     others = list(read_cameras(folder / "joined"))[1:]
-    splits = [f"data.train_cameras=[{NAME}]", f"data.test_cameras=[{','.join(others)}]"]
+    splits = [
+        f"data.train_cameras=[{NAME}]",
+        f"data.test_cameras=[{','.join(others)}]",
+    ]
     splits.append(f"data.test_frames=[{','.join(map(str, held))}]")
     where = [f"data.root={folder}/joined", f"hydra.run.dir={folder}/run"]
     run("gsgan.train", "experiment=one_camera", *where, *splits, *overrides)
     same = [word.replace("data.", "on.") for word in splits]
-    run("gsgan.evaluate", f"run={folder}/run", f"other_capture={folder}/true", *same)
+    run(
+        "gsgan.evaluate",
+        f"run={folder}/run",
+        f"other_capture={folder}/true",
+        *same,
+    )
     show(folder / "run" / "metrics.json", "estimated skeletons")
     show(folder / "run" / "on" / "true" / "metrics.json", "true skeletons")
     print(

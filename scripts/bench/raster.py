@@ -36,7 +36,9 @@ from gsgan.splat import (
 from gsgan.synthetic.camera import look_at
 
 # The reference holds every Gaussian at every pixel: others are compared with it, it is not timed.
-TIMED = tuple(backend for backend in BACKENDS if backend not in ("auto", "reference"))
+TIMED = tuple(
+    backend for backend in BACKENDS if backend not in ("auto", "reference")
+)
 LIMBS = len(MEDIAPIPE33.limbs)
 # How the Gaussians differ from those that an avatar starts with; about as in a trained one.
 SCALE_SPREAD = 0.5  # standard deviation of the logarithm of each axis's scale
@@ -44,7 +46,9 @@ SCALE_RANGE = (1e-4, 0.06)  # body heights, the bounds of Ψ
 JITTER = 0.5  # of a mean about its surface point, in the point's initial scales
 OPACITY_LOGIT = (0.5, 1.5)  # mean and standard deviation
 AZIMUTH, HEIGHT = 0.3, 1.35  # of the camera, radians and metres
-MARGIN = 1.2  # the camera sees this many times the body: Gaussians leave its surface
+MARGIN = (
+    1.2  # the camera sees this many times the body: Gaussians leave its surface
+)
 # Heading and significant digits of the table's columns of numbers.
 NUMBERS = {
     "forward_ms": ("forward ms", 3),
@@ -80,7 +84,9 @@ def run(config: DictConfig, folder: Path) -> None:
             cell = {"gaussians": n, "channels": channels, "size": size}
             rows += [
                 cell | row
-                for row in measure(config, n, channels, size, found, bench.device)
+                for row in measure(
+                    config, n, channels, size, found, bench.device
+                )
             ]
             progress.advance(task)
     frame = pd.DataFrame(rows)
@@ -93,7 +99,10 @@ def run(config: DictConfig, folder: Path) -> None:
 
 
 def variants(
-    config: DictConfig, settings: Sequence[Accuracy], n: int, device: torch.device
+    config: DictConfig,
+    settings: Sequence[Accuracy],
+    n: int,
+    device: torch.device,
 ) -> list[Variant]:
     """Every backend with every setting that it supports, and that ``n`` Gaussians allow."""
     return [
@@ -130,7 +139,10 @@ def measure(
     )
     rows: list[dict[str, Any]] = [
         {"backend": backend, "setting": setting.name}
-        | {f"{kind}_ms": median(samples[i, kind]) for kind in ("forward", "both")}
+        | {
+            f"{kind}_ms": median(samples[i, kind])
+            for kind in ("forward", "both")
+        }
         for i, (backend, setting) in enumerate(found)
     ]
     if n <= config.compare_upto:
@@ -150,7 +162,8 @@ def measure(
                 image = torch.cat([raster.features, raster.alpha], dim=1)[0]
                 side = config.window
                 return [
-                    image[:, t : t + side, left : left + side] for t, left in corners
+                    image[:, t : t + side, left : left + side]
+                    for t, left in corners
                 ]
 
             row |= errors(
@@ -186,8 +199,12 @@ def choose_windows(
     x, y = camera.project(gaussians.means)[0][0].cpu().unbind(-1)
     seen = (x >= 0) & (x < W - W % side) & (y >= 0) & (y < H - H % side)
     pairs = zip(y[seen].tolist(), x[seen].tolist(), strict=True)
-    cells = sorted({(int(row // side), int(column // side)) for row, column in pairs})
-    order = torch.randperm(len(cells), generator=torch.Generator().manual_seed(seed))
+    cells = sorted(
+        {(int(row // side), int(column // side)) for row, column in pairs}
+    )
+    order = torch.randperm(
+        len(cells), generator=torch.Generator().manual_seed(seed)
+    )
     return sorted(
         (cells[i][0] * side, cells[i][1] * side) for i in order[:count].tolist()
     )
@@ -202,7 +219,8 @@ def draw_windows(
     images = []
     for top, left in corners:
         moved = replace(
-            projected, means=projected.means - projected.means.new_tensor([left, top])
+            projected,
+            means=projected.means - projected.means.new_tensor([left, top]),
         )
         features, alpha = reference.composite(moved, (side, side), settings)
         images.append(torch.cat([features, alpha], dim=1)[0])
@@ -221,12 +239,15 @@ def values_and_gradients(
     random = torch.Generator().manual_seed(seed)
     weights = torch.randn(images.shape, generator=random, dtype=torch.float64)
     (images * weights.to(images.device)).sum().backward()
-    grads = {k: v.grad.double() for k, v in vars(inputs).items() if v is not None}
+    grads = {
+        k: v.grad.double() for k, v in vars(inputs).items() if v is not None
+    }
     return images.detach(), grads
 
 
 def errors(
-    truth: tuple[Tensor, dict[str, Tensor]], got: tuple[Tensor, dict[str, Tensor]]
+    truth: tuple[Tensor, dict[str, Tensor]],
+    got: tuple[Tensor, dict[str, Tensor]],
 ) -> dict[str, float]:
     """Largest and mean error of a value, and of the worst field ``‖g - g_true‖ / ‖g_true‖``."""
     off = (got[0] - truth[0]).abs()
@@ -284,7 +305,9 @@ def human_cloud(n: int, channels: int, seed: int = 0) -> Gaussians:
         means=points.means + JITTER * sigma * normal(3),
         quats=normal(4),
         opacities=torch.sigmoid(mean + spread * normal()),
-        features=torch.rand(1, n, channels, generator=random, dtype=torch.float64),
+        features=torch.rand(
+            1, n, channels, generator=random, dtype=torch.float64
+        ),
     ).to(torch.float32)
 
 
@@ -292,8 +315,12 @@ def make_camera(size: int) -> Camera:
     """A camera in front of the free body at rest, ``size`` pixels square, a batch of one."""
     points = free_body().vertices.double().numpy()
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
-    view = look_at(AZIMUTH, HEIGHT, middle, middle + MARGIN * (points - middle), size)
-    K, R, t = (torch.as_tensor(x).unsqueeze(0) for x in (view.K, view.R, view.t))
+    view = look_at(
+        AZIMUTH, HEIGHT, middle, middle + MARGIN * (points - middle), size
+    )
+    K, R, t = (
+        torch.as_tensor(x).unsqueeze(0) for x in (view.K, view.R, view.t)
+    )
     return Camera(K, R, t, view.size).to(torch.float32)
 
 

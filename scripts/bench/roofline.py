@@ -34,7 +34,9 @@ from gsgan.splat import Accuracy
 from gsgan.splat.project import project
 from gsgan.utils.config import config_folder
 
-PER_PAIR = 20  # operations to evaluate a Gaussian at a pixel; then 2 per channel
+PER_PAIR = (
+    20  # operations to evaluate a Gaussian at a pixel; then 2 per channel
+)
 SIDE, COPIED = 1024, 1 << 26  # of the matrix product; bytes of the copy
 
 
@@ -59,12 +61,18 @@ def run(config: DictConfig, folder: Path) -> None:
         with without_denormals():
             painter = make_painter(avatar)
             times = measure(
-                avatar, painter, frames, count=config.frames, warmup=config.warmup
+                avatar,
+                painter,
+                frames,
+                count=config.frames,
+                warmup=config.warmup,
             )
             work = [stage_work(avatar, frame) for frame in frames]
         mean = pd.concat(work).groupby(level=0, sort=False).mean()
         tables.append(
-            against(mean, times["median"].drop(REST_STAGE), peak).assign(size=size)
+            against(mean, times["median"].drop(REST_STAGE), peak).assign(
+                size=size
+            )
         )
     table = pd.concat(tables).rename_axis("stage").reset_index()
     page = text(table, peak, sentence(bench.where))
@@ -78,7 +86,8 @@ def peaks(device: torch.device) -> dict[str, float]:
     copy = torch.empty_like(source)
     actions = {"GFLOP/s": lambda: a @ b, "GB/s": lambda: copy.copy_(source)}
     best = {
-        name: min(ms) for name, ms in interleaved(actions, 10, device=device).items()
+        name: min(ms)
+        for name, ms in interleaved(actions, 10, device=device).items()
     }
     work = {"GFLOP/s": 2 * SIDE**3, "GB/s": 2 * COPIED}
     return {name: work[name] / best[name] / 1e6 for name in work}
@@ -145,7 +154,9 @@ def stage_work(avatar: Avatar, frame: Frame) -> pd.DataFrame:
             flop, moved = composited(drawn, camera, accuracy)
             found[name] = [found[name][0] + flop, found[name][1] + moved]
     found[TOTAL] = [sum(column) for column in zip(*found.values(), strict=True)]
-    return pd.DataFrame.from_dict(found, orient="index", columns=["flop", "bytes"])
+    return pd.DataFrame.from_dict(
+        found, orient="index", columns=["flop", "bytes"]
+    )
 
 
 def composited(
@@ -159,19 +170,25 @@ def composited(
     reach = 2 * (p.opacities / max(accuracy.alpha_min, 1e-6)).clamp_min(1).log()
     area = math.pi * reach / (p.factors[..., 0] * p.factors[..., 2])
     pairs = float((area.clamp_max(size[0] * size[1]) * p.visible).sum())
-    moved = 4 * (C + 10) * p.opacities.numel() + 4 * (C + 1) * size[0] * size[1] * len(
-        camera
-    )
+    moved = 4 * (C + 10) * p.opacities.numel() + 4 * (C + 1) * size[0] * size[
+        1
+    ] * len(camera)
     return pairs * (PER_PAIR + 2 * C), float(moved)
 
 
-def against(work: pd.DataFrame, ms: pd.Series, peak: dict[str, float]) -> pd.DataFrame:
+def against(
+    work: pd.DataFrame, ms: pd.Series, peak: dict[str, float]
+) -> pd.DataFrame:
     """The work beside its times: ``bound_ms``, the least that the peaks allow, and its share."""
     table = work.join(ms.rename("ms"), how="inner")
     arithmetic = table.flop / peak["GFLOP/s"] / 1e6
-    table["bound_ms"] = arithmetic.combine(table.bytes / peak["GB/s"] / 1e6, max)
+    table["bound_ms"] = arithmetic.combine(
+        table.bytes / peak["GB/s"] / 1e6, max
+    )
     return table.assign(
-        limit=(arithmetic >= table.bound_ms).map({True: "products", False: "memory"})
+        limit=(arithmetic >= table.bound_ms).map(
+            {True: "products", False: "memory"}
+        )
     )
 
 
@@ -189,7 +206,9 @@ def text(table: pd.DataFrame, peak: dict[str, float], where: str) -> str:
             "share of peak": [f"{x:.0%}" for x in table.bound_ms / table.ms],
         }
     )
-    found = " and ".join(f"{number(value)} {name}" for name, value in peak.items())
+    found = " and ".join(
+        f"{number(value)} {name}" for name, value in peak.items()
+    )
     return f"{where}.\n\nPeak: {found}.\n\n{markdown(shown)}"
 
 

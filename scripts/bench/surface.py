@@ -32,8 +32,13 @@ from gsgan.synthetic.posing import Choreography
 from gsgan.synthetic.recorded_motion import RecordedMotion
 from gsgan.synthetic.scene_setup import PROGRAMMES, load_character
 
-JOINTS, NEAREST = 75, 8  # landmarks of body and hands; training frames that bind points
-COLLARS = 0.18  # of the arm's turn: CMU's clips have collarbones that do not move
+JOINTS, NEAREST = (
+    75,
+    8,
+)  # landmarks of body and hands; training frames that bind points
+COLLARS = (
+    0.18  # of the arm's turn: CMU's clips have collarbones that do not move
+)
 PARTS = {  # by the name of a point's bone, first match
     "head": "Head|Neck|.*Eye|Jaw",
     "hands": ".*Hand.*",
@@ -88,7 +93,9 @@ class Bound:
         self.nearest = apart.argmin(1)
         A, t = A[:, self.nearest], t[:, self.nearest]
         self.rest = (
-            torch.linalg.solve(A, (points - t).unsqueeze(-1)).squeeze(-1).mean(0)
+            torch.linalg.solve(A, (points - t).unsqueeze(-1))
+            .squeeze(-1)
+            .mean(0)
         )
 
     def error(self, pose: BodyPose, points: Tensor) -> Tensor:
@@ -105,7 +112,11 @@ def parts(character: Character, chosen: NDArray[np.int64]) -> dict[str, Tensor]:
         next((p for p, rule in PARTS.items() if re.fullmatch(rule, n)), "")
         for n in names
     ]
-    return {part: torch.tensor([o == part for o in of]) for part in PARTS if part in of}
+    return {
+        part: torch.tensor([o == part for o in of])
+        for part in PARTS
+        if part in of
+    }
 
 
 def rms(error: Tensor) -> float:
@@ -121,11 +132,14 @@ def errors(
     marks, points = found["training"]
     seen = torch.ones(len(marks), JOINTS)
     shape = fit_shape(marks[:, :33], seen[:, :33])
-    shape = fit_hands(shape, Solver(shaped_body(shape)).solve(marks, seen), marks, seen)
+    shape = fit_hands(
+        shape, Solver(shaped_body(shape)).solve(marks, seen), marks, seen
+    )
     body = shaped_body(shape)
     solver = Solver(body)
     pose = {
-        name: solver.solve(p, torch.ones(p.shape[:2])) for name, (p, _) in found.items()
+        name: solver.solve(p, torch.ones(p.shape[:2]))
+        for name, (p, _) in found.items()
     }
     bound, table = Bound(body, pose["training"], points), {}
     for name, (p, x) in found.items():
@@ -145,12 +159,16 @@ def run(options: DictConfig, out: Path) -> None:
     torch.set_num_threads(1)
     character = load_character(options.avatar)
     chosen = np.arange(
-        0, len(character.vertices), -(-len(character.vertices) // options.points)
+        0,
+        len(character.vertices),
+        -(-len(character.vertices) // options.points),
     )
     sets: dict[str, list[str]] = {"training": list(options.train)}
     for name, clip in (word.split("@") for word in options.test):
         sets.setdefault(name, []).append(clip)
-    found = {name: truth(character, clips, chosen) for name, clips in sets.items()}
+    found = {
+        name: truth(character, clips, chosen) for name, clips in sets.items()
+    }
     table = errors(found, parts(character, chosen))
     rows = [f"| part | {' | '.join(table)} |", "|---" * (len(table) + 1) + "|"]
     for part in table["training"]:

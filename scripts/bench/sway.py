@@ -13,8 +13,13 @@ import numpy as np
 
 from gsgan.synthetic.scene_setup import Scene, SceneSettings
 
-LOOSE, EVERY = 0.3, 7  # share of a point's sway; every so many points are predicted
-RIDGES = 10.0 ** np.arange(-3, 4)  # the best on held-out frames: a little optimistic
+LOOSE, EVERY = (
+    0.3,
+    7,
+)  # share of a point's sway; every so many points are predicted
+RIDGES = 10.0 ** np.arange(
+    -3, 4
+)  # the best on held-out frames: a little optimistic
 PATHS = {
     "1 and 2 frames before": (1, 2),
     "1/30, 2/30 and 4/30 s before": (0.08, 0.16, 0.32),
@@ -70,7 +75,9 @@ def main() -> None:
     sway, points = np.stack(off)[:, keep], np.stack(points)[:, keep]
     Y = sway.reshape(len(t), -1)
     print(f"loose points: {(loose > LOOSE).mean():.1%}")
-    print(f"none: {rms(Y[test]):.2f}, mean: {rms(Y[test] - Y[train].mean(0)):.2f}")
+    print(
+        f"none: {rms(Y[test]):.2f}, mean: {rms(Y[test] - Y[train].mean(0)):.2f}"
+    )
 
     def before(lag):
         return source.at(np.clip(t - lag * (t[1] - t[0]), 0, source.duration))
@@ -91,7 +98,9 @@ def main() -> None:
             0.3 * (b.joints - now).reshape(len(t), -1) / lag
             for b, lag in zip(past, lags, strict=True)
         ]
-        found = regressed(np.concatenate([pose, *steps], axis=1), Y, train, test)
+        found = regressed(
+            np.concatenate([pose, *steps], axis=1), Y, train, test
+        )
         own = np.stack([surface(b) - points for b in past], axis=-1)
         print(
             f"{name}: joints {found:.2f}, own path {by_own_path(own, sway, train, test):.2f}"

@@ -38,7 +38,9 @@ def interleaved(
         The samples of each action: ``repeats`` of them, or one.
     """
     if repeats < 1:
-        raise ValueError(f"interleaved: repeats must be at least 1, got {repeats}")
+        raise ValueError(
+            f"interleaved: repeats must be at least 1, got {repeats}"
+        )
     samples: dict[Key, list[float]] = {}
     for name, action in actions.items():
         first = timed(action, device)

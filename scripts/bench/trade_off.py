@@ -52,7 +52,9 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h")
 SCORES = "metrics.json"  # what a finished run has, beside its checkpoint
 # Of a multirun's overrides: a point is the mean over seeds; others do not change what is trained.
 SEED = "seed"
-IGNORED = re.compile(r"^(data\.(source\.)?workers|hydra\..*|trainer(\..*)?|grid_rows)$")
+IGNORED = re.compile(
+    r"^(data\.(source\.)?workers|hydra\..*|trainer(\..*)?|grid_rows)$"
+)
 # Of a run's data: how it is read and sampled, not what is in it.
 SAMPLING = (
     "seed",
@@ -94,8 +96,12 @@ class Way:
     accuracy: Accuracy | None = None  # of F; None: as it was trained
     precision: str = "32-true"  # of the networks
     backend: str = "auto"  # of both rasterisations
-    scale: float = 1.0  # of the image's sides; the image is resized to its own size
-    whole: bool = False  # paint the whole image, not only the window around the person
+    scale: float = (
+        1.0  # of the image's sides; the image is resized to its own size
+    )
+    whole: bool = (
+        False  # paint the whole image, not only the window around the person
+    )
 
     def __post_init__(self) -> None:
         one_of("precision", self.precision, PRECISIONS)
@@ -141,7 +147,8 @@ def changed(avatar: Avatar, way: Way) -> Iterator[None]:
     # how pixels are formed belongs to the model, not to the preset
     if way.accuracy is not None:
         formed = {
-            k: getattr(before[0], k) for k in ("low_pass", "supersample", "antialias")
+            k: getattr(before[0], k)
+            for k in ("low_pass", "supersample", "antialias")
         }
         avatar.accuracy = replace(way.accuracy, **formed)
     avatar.window_margin = None if way.whole else avatar.window_margin
@@ -180,18 +187,29 @@ def run(config: DictConfig, folder: Path) -> None:
     bench = bench_common.Bench.start("trade_off", config, folder)
     perceptual = None
     if config.lpips.net is not None:
-        perceptual = Lpips(config.lpips.net, config.lpips.path).eval().to(bench.device)
+        perceptual = (
+            Lpips(config.lpips.net, config.lpips.path).eval().to(bench.device)
+        )
     runs = trained(config, bench)
     subject = standard_run(runs).folder
     points = [*runs, *ways(subject, config.settings)]
     painters, frames, far, marks = load(points, config, bench)
-    found, samples = measure(points, painters, frames, far, perceptual, config, bench)
-    checkpoints = {p.folder: read_checkpoint(p.folder / CHECKPOINT) for p in runs}
+    found, samples = measure(
+        points, painters, frames, far, perceptual, config, bench
+    )
+    checkpoints = {
+        p.folder: read_checkpoint(p.folder / CHECKPOINT) for p in runs
+    }
     seconds = {
-        folder: held["gsgan"]["train_seconds"] for folder, held in checkpoints.items()
+        folder: held["gsgan"]["train_seconds"]
+        for folder, held in checkpoints.items()
     }
     frame = make_rows(points, found, samples, seconds)
-    about = {"split": config.split, "images": len(frames), "subject": subject.name}
+    about = {
+        "split": config.split,
+        "images": len(frames),
+        "subject": subject.name,
+    }
     page = text(frame, config.quality, about, bench.where, marks)
     record = {
         **about,
@@ -200,7 +218,9 @@ def run(config: DictConfig, folder: Path) -> None:
         "front": [frame.label[i] for i in front(frame, config.quality)],
     }
     second = "far" if far else "edge_f1" if perceptual is None else "lpips"
-    images = {"trade_off.png": plot(frame, [*dict.fromkeys((config.quality, second))])}
+    images = {
+        "trade_off.png": plot(frame, [*dict.fromkeys((config.quality, second))])
+    }
     docs = f"{page}\n\n![Quality against time per frame](images/trade_off.png)"
     bench.write("Quality against time", page, record, frame, images, docs=docs)
 
@@ -238,7 +258,9 @@ def runs_in(folder: Path) -> tuple[list[Point], list[str]]:
     common = set.intersection(*(set(own.items()) for own in overrides.values()))
     found = []
     for run, own in overrides.items():
-        rest = {k: v for k, v in own.items() if (k, v) not in common and k != SEED}
+        rest = {
+            k: v for k, v in own.items() if (k, v) not in common and k != SEED
+        }
         factor = "run" if len(rest) > 1 else next(iter(rest), BASE)
         found.append(Point(factor, ", ".join(rest.values()) or BASE, run))
     return found, [run.name for run in runs if run not in finished]
@@ -248,7 +270,9 @@ def _overrides(run: Path) -> dict[str, str]:
     path = run / ".hydra" / "overrides.yaml"
     words = OmegaConf.load(path) if path.is_file() else OmegaConf.create([])
     pairs = (str(word).partition("=")[::2] for word in words)
-    return {k.lstrip("+"): v for k, v in pairs if not IGNORED.match(k.lstrip("+"))}
+    return {
+        k.lstrip("+"): v for k, v in pairs if not IGNORED.match(k.lstrip("+"))
+    }
 
 
 def standard_run(runs: Sequence[Point]) -> Point:
@@ -271,7 +295,9 @@ def ways(folder: Path, settings: Mapping[str, Any]) -> list[Point]:
         "windows": lambda _: ("window", "whole image", Way(whole=True)),
     }
     found = [
-        one(value) for name, one in make.items() for value in settings.get(name, ())
+        one(value)
+        for name, one in make.items()
+        for value in settings.get(name, ())
     ]
     return [Point(factor, label, folder, way) for factor, label, way in found]
 
@@ -286,7 +312,9 @@ def load(
         ConfigError: when the runs do not share their data, or the split has no frame.
     """
     moved = DataPaths(config.data_root, config.data_smpl)
-    configs = {point.folder: load_config(point.folder, moved) for point in points}
+    configs = {
+        point.folder: load_config(point.folder, moved) for point in points
+    }
     first, standard = next(iter(configs.items()))
     for folder, stored in configs.items():
         if _content(stored) != _content(standard):
@@ -308,7 +336,11 @@ def load(
         ]
 
     elsewhere = DataPaths(config.far_root, config.data_smpl)
-    far = shown(build_data(load_config(first, elsewhere))) if config.far_root else []
+    far = (
+        shown(build_data(load_config(first, elsewhere)))
+        if config.far_root
+        else []
+    )
     painters = [Painter(avatars[point.folder], point.way) for point in points]
     return painters, shown(data), far, list(marks)
 
@@ -317,7 +349,9 @@ def _content(config: DictConfig) -> dict[Any, Any]:
     data = OmegaConf.to_container(config.data, resolve=True)
     assert isinstance(data, dict)
     if isinstance(data.get("source"), dict):
-        data["source"] = {k: v for k, v in data["source"].items() if k != "workers"}
+        data["source"] = {
+            k: v for k, v in data["source"].items() if k != "workers"
+        }
     return {k: v for k, v in data.items() if k not in SAMPLING}
 
 
@@ -343,7 +377,9 @@ def measure(
     with without_denormals(), bench.progress() as progress:
         task = progress.add_task("", total=(config.repeats + 2) * len(points))
         for point, painter in zip(points, painters, strict=True):
-            progress.update(task, description=f"scoring {point.factor} {point.label}")
+            progress.update(
+                task, description=f"scoring {point.factor} {point.label}"
+            )
             found.append(quality(painter, frames, perceptual))
             if far:
                 found[-1]["far"] = quality(painter, far, None)["psnr"]
@@ -406,16 +442,24 @@ def make_rows(
     ``factor label``, the metrics (NaN where a seed has none), ``left_out`` scores, ``ms p10 p90``
     per frame, ``memory_mb`` at its peak, ``seconds``, and ``seeds``.
     """
-    each = pd.DataFrame(found).reindex(columns=[*QUALITIES, "left_out", "memory_mb"])
+    each = pd.DataFrame(found).reindex(
+        columns=[*QUALITIES, "left_out", "memory_mb"]
+    )
     each["seconds"] = [seconds.get(point.folder) for point in points]
     each = each.astype(float).assign(ms=list(samples))
     rows = []
-    names = [[point.factor for point in points], [point.label for point in points]]
+    names = [
+        [point.factor for point in points],
+        [point.label for point in points],
+    ]
     for (factor, label), few in each.groupby(names, sort=False):
         ms = deciles([ms for own in few.ms for ms in own])
         row = {"factor": factor, "label": label, "ms": ms.pop("median"), **ms}
         row |= few[[*QUALITIES, "seconds"]].mean(skipna=False)
-        row |= {"left_out": int(few.left_out.sum()), "memory_mb": few.memory_mb.max()}
+        row |= {
+            "left_out": int(few.left_out.sum()),
+            "memory_mb": few.memory_mb.max(),
+        }
         rows.append({**row, "seeds": len(few)})
     return pd.DataFrame(rows)
 
@@ -468,7 +512,8 @@ def table(frame: pd.DataFrame, metric: str) -> str:
     for name, (heading, digits, *_) in QUALITIES.items():
         if frame[name].notna().any():
             shown[heading] = [
-                NOTHING if pd.isna(v) else f"{v:.{digits}f}" for v in frame[name]
+                NOTHING if pd.isna(v) else f"{v:.{digits}f}"
+                for v in frame[name]
             ]
     shown["ms per frame"] = frame.ms.map(number)
     shown["10–90 %"] = frame.p10.map(number) + "–" + frame.p90.map(number)
@@ -484,8 +529,14 @@ def labels(frame: pd.DataFrame, metric: str) -> list[tuple[float, float, str]]:
     shown = frame[frame[metric].notna()].sort_values("ms")
     near = 0.04 * (shown[metric].max() - shown[metric].min())
     found: list[tuple[float, float, str]] = []
-    for ms, score, label in zip(shown.ms, shown[metric], shown.label, strict=True):
-        if found and ms < 1.1 * found[-1][0] and abs(score - found[-1][1]) <= near:
+    for ms, score, label in zip(
+        shown.ms, shown[metric], shown.label, strict=True
+    ):
+        if (
+            found
+            and ms < 1.1 * found[-1][0]
+            and abs(score - found[-1][1]) <= near
+        ):
             found[-1] = (*found[-1][:2], f"{found[-1][2]}, {label}")
         else:
             found.append((ms, score, label))
@@ -498,7 +549,9 @@ def plot(frame: pd.DataFrame, metrics: Sequence[str]) -> bytes:
     A metric without any score has no panel, unless none has one.
     """
     metrics = [m for m in metrics if frame[m].notna().any()] or metrics[:1]
-    figure, all_axes = bench_common.panels(len(metrics), 6.4 * len(metrics), 5.6)
+    figure, all_axes = bench_common.panels(
+        len(metrics), 6.4 * len(metrics), 5.6
+    )
     for axes, metric in zip(all_axes, metrics, strict=True):
         heading, _, sign, _ = QUALITIES[metric]
         ahead = frame.iloc[front(frame, metric)]
@@ -527,17 +580,28 @@ def plot(frame: pd.DataFrame, metrics: Sequence[str]) -> bytes:
                 label=factor,
                 ms=8,
             )
-        axes.set(xscale="log", xlabel="milliseconds per frame (whiskers: deciles)")
-        axes.set_ylabel(f"{heading}, {'higher' if sign > 0 else 'lower'} is better")
+        axes.set(
+            xscale="log", xlabel="milliseconds per frame (whiskers: deciles)"
+        )
+        axes.set_ylabel(
+            f"{heading}, {'higher' if sign > 0 else 'lower'} is better"
+        )
         bench_common.plain_ticks(axes.xaxis)
         axes.margins(x=0.16, y=0.1)
         if sign < 0:
             axes.invert_yaxis()
         for i, (ms, score, label) in enumerate(labels(frame, metric)):
-            blank = "\n" * (1 + i // 2 % 2)  # neighbours are written at four heights
+            blank = "\n" * (
+                1 + i // 2 % 2
+            )  # neighbours are written at four heights
             va = ("bottom", "top")[i % 2]
             axes.text(
-                ms, score, f"{blank}{label}{blank}", ha="center", va=va, fontsize=7.5
+                ms,
+                score,
+                f"{blank}{label}{blank}",
+                ha="center",
+                va=va,
+                fontsize=7.5,
             )
     shown = all_axes[0].get_legend_handles_labels()
     figure.legend(*shown, loc="outside lower center", ncols=6, frameon=False)

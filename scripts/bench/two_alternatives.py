@@ -72,11 +72,15 @@ def row(number: int, images: list[np.ndarray]) -> np.ndarray:
     return np.asarray(page)
 
 
-def draw(folder: Path, runs: list[Path], pairs: int, split: str, seed: int) -> None:
+def draw(
+    folder: Path, runs: list[Path], pairs: int, split: str, seed: int
+) -> None:
     """Writes pages and order.json."""
     subjects = open_subjects(runs, DataPaths(), "cpu")
     first, second = subjects[0], subjects[-1]
-    items = choose_items(first.data, split, frames=None, camera=None, count=pairs)
+    items = choose_items(
+        first.data, split, frames=None, camera=None, count=pairs
+    )
     shots = make_shots(first.data, split, items, MARGIN)
     shown = np.random.default_rng(seed).permutation(2 * len(shots)).tolist()
     rows = []
@@ -87,30 +91,44 @@ def draw(folder: Path, runs: list[Path], pairs: int, split: str, seed: int) -> N
         box = most_disputed(torch.cat([a, b]), SHARE)
         left, right = (b, a) if swap else (a, b)
         rows.append(
-            row(number, [magnified(x[..., *box]) for x in (left, shot.truth, right)])
+            row(
+                number,
+                [magnified(x[..., *box]) for x in (left, shot.truth, right)],
+            )
         )
     folder.mkdir(parents=True, exist_ok=True)
     width = max(x.shape[1] for x in rows)
     rows = [
-        np.pad(x, ((0, 0), (0, width - x.shape[1]), (0, 0)), constant_values=255)
+        np.pad(
+            x, ((0, 0), (0, width - x.shape[1]), (0, 0)), constant_values=255
+        )
         for x in rows
     ]
     for page in range(0, len(rows), ROWS):
         name = folder / f"page_{page // ROWS + 1:02d}.png"
         Image.fromarray(np.vstack(rows[page : page + ROWS])).save(name)
-    names = [str(runs[0]), str(runs[1]) if len(runs) == 2 else "its Step I's colour"]
-    (folder / "order.json").write_text(json.dumps({"runs": names, "rows": shown}))
+    names = [
+        str(runs[0]),
+        str(runs[1]) if len(runs) == 2 else "its Step I's colour",
+    ]
+    (folder / "order.json").write_text(
+        json.dumps({"runs": names, "rows": shown})
+    )
 
 
 def count(folder: Path, answers: Path) -> None:
     """Prints how often each was chosen twice, and the chance of that if they were equal."""
     order = json.loads((folder / "order.json").read_text())
     lines = dict(
-        line.split() for line in answers.read_text().splitlines() if line.strip()
+        line.split()
+        for line in answers.read_text().splitlines()
+        if line.strip()
     )
     rows = {str(i): place for i, place in enumerate(order["rows"], 1)}
     if set(lines) != set(rows) or not set(lines.values()) <= set(NAMES):
-        raise SystemExit(f"{answers}: expected lines '1 left' to '{len(rows)} equal'")
+        raise SystemExit(
+            f"{answers}: expected lines '1 left' to '{len(rows)} equal'"
+        )
     chosen: dict[int, set[int | None]] = {}
     for number, place in rows.items():
         side = NAMES.index(lines[number])
@@ -129,7 +147,9 @@ def count(folder: Path, answers: Path) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("folder", type=Path)
-    parser.add_argument("runs", type=Path, nargs="*", help="one or two run folders")
+    parser.add_argument(
+        "runs", type=Path, nargs="*", help="one or two run folders"
+    )
     parser.add_argument("--answers", type=Path)
     parser.add_argument("--pairs", type=int, default=20)
     parser.add_argument("--split", default="novel_pose")

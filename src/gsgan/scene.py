@@ -83,7 +83,9 @@ class Camera(TensorRecord):
         if self.dist is not None:
             _check("Camera", "dist", self.dist, None, 5)
         batches = {
-            v.shape[0] for v in (self.K, self.R, self.t, self.dist) if v is not None
+            v.shape[0]
+            for v in (self.K, self.R, self.t, self.dist)
+            if v is not None
         }
         if len(batches) != 1:
             raise ValueError(
@@ -114,7 +116,9 @@ class Camera(TensorRecord):
         """``[B, M, 3]`` world points in camera axes, metres."""
         return points @ self.R.mT + self.t.unsqueeze(1)
 
-    def project(self, points: Tensor, near: float = NEAR) -> tuple[Tensor, Tensor]:
+    def project(
+        self, points: Tensor, near: float = NEAR
+    ) -> tuple[Tensor, Tensor]:
         """Pixel positions ``[B, M, 2]`` and depths ``[B, M]`` of world points ``[B, M, 3]``.
 
         Points nearer than ``near`` metres are divided by ``near`` instead of their depth: their
@@ -141,7 +145,9 @@ class Camera(TensorRecord):
 
     def resize(self, size: tuple[int, int]) -> Camera:
         """The camera of the whole image resampled to ``size = (H, W)``."""
-        scale = constant((size[1] / self.size[1], size[0] / self.size[0], 1.0), self.K)
+        scale = constant(
+            (size[1] / self.size[1], size[0] / self.size[0], 1.0), self.K
+        )
         return replace(self, K=self.K * scale[:, None], size=size)
 
 
@@ -260,7 +266,13 @@ class Frame(TensorRecord):
     @property
     def inputs(self) -> tuple[Tensor, Tensor, Camera, BodyPose | None, Tensor]:
         """The inputs of an avatar: skeleton, visibility, camera, body pose, camera index."""
-        return self.skeleton, self.visibility, self.camera, self.body, self.camera_index
+        return (
+            self.skeleton,
+            self.visibility,
+            self.camera,
+            self.body,
+            self.camera_index,
+        )
 
     def unpacked(self) -> Frame:
         """The frame with images in [0, 1] and labels as int64, of one whose pixels are bytes.
@@ -305,7 +317,9 @@ class Window:
         """
         size = (min(side, self.size[0]), min(side, self.size[1]))
         corners = []
-        for (top, left), (row, column) in zip(self.corners, at.tolist(), strict=True):
+        for (top, left), (row, column) in zip(
+            self.corners, at.tolist(), strict=True
+        ):
             y = round(row * self.size[0] - size[0] / 2)
             x = round(column * self.size[1] - size[1] / 2)
             y = min(max(0, y), self.size[0] - size[0])
@@ -320,7 +334,10 @@ class Window:
             shift[i, 0, 2] = left
             shift[i, 1, 2] = top
         return replace(
-            camera, K=camera.K - shift, size=self.size, whole_height=self.whole[0]
+            camera,
+            K=camera.K - shift,
+            size=self.size,
+            whole_height=self.whole[0],
         )
 
     def cut(self, images: Tensor) -> Tensor:
@@ -349,7 +366,12 @@ class Window:
         pasted = [
             functional.pad(
                 boxes[i : i + 1],
-                (left, whole_width - left - width, top, whole_height - top - height),
+                (
+                    left,
+                    whole_width - left - width,
+                    top,
+                    whole_height - top - height,
+                ),
             )
             for i, (top, left) in enumerate(self.corners)
         ]
@@ -379,11 +401,15 @@ def body_window(
         Boxes inside the image.
     """
     height, width = camera.size
+
+    # The joints' pixels, and how many pixels the margin takes at each joint's depth.
     pixels, depth = camera.project(p)
     focal = camera.focal
     reach = margin * focal[:, None] / depth.clamp_min(near).unsqueeze(-1)
     low = (pixels - reach).amin(dim=1).floor()
     high = (pixels + reach).amax(dim=1).ceil()
+
+    # The box is clipped to the image; a joint behind the camera makes it the whole image.
     everywhere = constant((width, height), low)
     behind = (depth < near).any(dim=1, keepdim=True)
     low = (
@@ -396,9 +422,15 @@ def body_window(
         .clamp_min(1)
         .minimum(everywhere)
     )
+
+    # All boxes of a batch have the size of the largest, each about its own centre.
     bounds = torch.cat([low, high], dim=-1).long().tolist()
-    w = _side(max(minimum, *(x1 - x0 for x0, _, x1, _ in bounds)), multiple, width)
-    h = _side(max(minimum, *(y1 - y0 for _, y0, _, y1 in bounds)), multiple, height)
+    w = _side(
+        max(minimum, *(x1 - x0 for x0, _, x1, _ in bounds)), multiple, width
+    )
+    h = _side(
+        max(minimum, *(y1 - y0 for _, y0, _, y1 in bounds)), multiple, height
+    )
     corners = tuple(
         (_start(y0, y1, h, height), _start(x0, x1, w, width))
         for x0, y0, x1, y1 in bounds
@@ -428,15 +460,21 @@ def distort(points: Tensor, dist: Tensor) -> tuple[Tensor, Tensor]:
     k1, k2, p1, p2, k3 = (c.unsqueeze(-1) for c in dist.unbind(-1))
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))  # of radial, by x it is slope * x
+    slope = 2 * (
+        k1 + r2 * (2 * k2 + 3 * r2 * k3)
+    )  # of radial, by x it is slope * x
     shown = [
         x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
         y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
     ]
     across = slope * x * y + 2 * p1 * x + 2 * p2 * y
     rows = [
-        torch.stack([radial + slope * x * x + 2 * p1 * y + 6 * p2 * x, across], dim=-1),
-        torch.stack([across, radial + slope * y * y + 6 * p1 * y + 2 * p2 * x], dim=-1),
+        torch.stack(
+            [radial + slope * x * x + 2 * p1 * y + 6 * p2 * x, across], dim=-1
+        ),
+        torch.stack(
+            [across, radial + slope * y * y + 6 * p1 * y + 2 * p2 * x], dim=-1
+        ),
     ]
     return torch.stack(shown, dim=-1), torch.stack(rows, dim=-2)
 
@@ -446,7 +484,9 @@ def distort_within(points: Tensor, dist: Tensor) -> Tensor:
 
     The polynomial folds points beyond that radius back into the image, which no lens does.
     """
-    radius = points.norm(dim=-1, keepdim=True).clamp_min(torch.finfo(points.dtype).tiny)
+    radius = points.norm(dim=-1, keepdim=True).clamp_min(
+        torch.finfo(points.dtype).tiny
+    )
     rim = RIM * fold_radius(dist).to(points.dtype)[:, None, None]
     return distort(points * (rim / radius).clamp_max(1), dist)[0]
 

@@ -36,7 +36,9 @@ def script(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
 
     def call(name: str, *arguments: str) -> str:
-        monkeypatch.setattr(sys, "argv", [name, f"out={tmp_path / 'out'}", *arguments])
+        monkeypatch.setattr(
+            sys, "argv", [name, f"out={tmp_path / 'out'}", *arguments]
+        )
         try:
             runpy.run_path(str(SCRIPTS / f"{name}.py"), run_name="__main__")
         except SystemExit as end:
@@ -62,7 +64,9 @@ def test_raster_measures_time_and_error(script, tmp_path):
         "repeats=1",
     ]
     assert not script("raster", *grid, "windows=2", "window=16", f"docs={page}")
-    rows = pd.DataFrame(read(tmp_path, "raster")["rows"]).query("backend == 'torch'")
+    rows = pd.DataFrame(read(tmp_path, "raster")["rows"]).query(
+        "backend == 'torch'"
+    )
     worst = rows.set_index("setting").value_max
     assert worst["exact"] < 1e-6 < worst["high"] < worst["draft"]
     assert (rows[["forward_ms", "both_ms"]] > 0).all(axis=None)
@@ -124,7 +128,9 @@ def test_peak_memory_is_what_an_action_takes_on_top_of_what_is_held(script):
     from bench_common import peak_memory
 
     held = torch.ones(20_000_000)  # 80 MB that must not count
-    found = peak_memory(lambda: torch.ones(5_000_000).exp(), torch.device("cpu"))
+    found = peak_memory(
+        lambda: torch.ones(5_000_000).exp(), torch.device("cpu")
+    )
     if found is None:
         pytest.skip("this system does not report a peak of memory")
     assert 20 < found < 70
@@ -157,9 +163,13 @@ def test_faults_are_found_in_a_capture(script, monkeypatch, capture, capsys):
         for row in faults.FAULTS
         if row[0] == "`t` in mm" or row[0].startswith("K of")
     ][:3]
-    monkeypatch.setattr(faults, "FAULTS", [*kept, ("nothing", lambda _: {}, "one")])
+    monkeypatch.setattr(
+        faults, "FAULTS", [*kept, ("nothing", lambda _: {}, "one")]
+    )
     faults.main([capture])
-    rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines()[2:]]
+    rows = [
+        line.split(" | ") for line in capsys.readouterr().out.splitlines()[2:]
+    ]
     assert [row[2].strip("| ") for row in rows] == [
         "error",
         "refused",
@@ -172,8 +182,12 @@ def test_a_two_alternative_test_counts_what_was_chosen(
     tmp_path, run, monkeypatch, capsys
 ):
     def call(*words: str) -> None:
-        monkeypatch.setattr(sys, "argv", ["two_alternatives", str(tmp_path), *words])
-        runpy.run_path(str(SCRIPTS / "two_alternatives.py"), run_name="__main__")
+        monkeypatch.setattr(
+            sys, "argv", ["two_alternatives", str(tmp_path), *words]
+        )
+        runpy.run_path(
+            str(SCRIPTS / "two_alternatives.py"), run_name="__main__"
+        )
 
     call(str(run), "--pairs", "2")
     assert (tmp_path / "page_01.png").is_file()
@@ -181,7 +195,9 @@ def test_a_two_alternative_test_counts_what_was_chosen(
     answers = tmp_path / "answers.txt"
     first_wins = ["right" if place % 2 else "left" for place in rows]
     for sides, won in ((first_wins, len(rows) // 2), (["left"] * len(rows), 0)):
-        answers.write_text("\n".join(f"{i} {side}" for i, side in enumerate(sides, 1)))
+        answers.write_text(
+            "\n".join(f"{i} {side}" for i, side in enumerate(sides, 1))
+        )
         call("--answers", str(answers))
         assert f"{run}: {won} of {len(rows) // 2}" in capsys.readouterr().out
     answers.write_text("1 left\n")

@@ -10,18 +10,38 @@ from commands import refused
 
 from gsgan.bench.__main__ import main
 from gsgan.bench.common import cpu_name, environment, number, sentence
-from gsgan.bench.speed import deciles, in_batches, make_painter, measure, spread, text
+from gsgan.bench.speed import (
+    deciles,
+    in_batches,
+    make_painter,
+    measure,
+    spread,
+    text,
+)
 from gsgan.model.avatar import UNWATCHED, unwatched
 from gsgan.utils.errors import ConfigError
 
-ALL = ["solve", "window", "skeleton", "bones", "densify", "Ψ", "F", "S", "p₂D", "Ω"]
+ALL = [
+    "solve",
+    "window",
+    "skeleton",
+    "bones",
+    "densify",
+    "Ψ",
+    "F",
+    "S",
+    "p₂D",
+    "Ω",
+]
 ALL += ["pose encoder", "UNet", "paste"]
 
 
 @pytest.fixture
 def small(build):
     data, avatar, frame = build()
-    with torch.no_grad():  # a trained one: where the UNet paints and Gaussians differ
+    with (
+        torch.no_grad()
+    ):  # a trained one: where the UNet paints and Gaussians differ
         for parameter in avatar.parameters():
             parameter += 0.05 * torch.randn(
                 parameter.shape, generator=torch.manual_seed(1)
@@ -30,8 +50,15 @@ def small(build):
 
 
 def test_the_median_and_deciles():
-    assert deciles(range(11)) == {"median": 5.0, "p10": 1.0, "p90": 9.0, "minimum": 0.0}
-    assert deciles([7.0]) == dict.fromkeys(("median", "p10", "p90", "minimum"), 7.0)
+    assert deciles(range(11)) == {
+        "median": 5.0,
+        "p10": 1.0,
+        "p90": 9.0,
+        "minimum": 0.0,
+    }
+    assert deciles([7.0]) == dict.fromkeys(
+        ("median", "p10", "p90", "minimum"), 7.0
+    )
 
 
 def test_every_stage_is_timed_and_the_avatar_is_left_unwatched(small):
@@ -39,13 +66,20 @@ def test_every_stage_is_timed_and_the_avatar_is_left_unwatched(small):
     ticks = []
     painter = make_painter(avatar)
     times = measure(
-        avatar, painter, [frame], count=3, warmup=2, tick=lambda: ticks.append(1)
+        avatar,
+        painter,
+        [frame],
+        count=3,
+        warmup=2,
+        tick=lambda: ticks.append(1),
     )
     assert list(times.index) == [*ALL, "between stages", "end to end"]
     assert len(ticks) == 5
     stages = times.loc[ALL]
     assert (stages.p10 > 0).all()
-    assert ((stages.p10 <= stages["median"]) & (stages["median"] <= stages.p90)).all()
+    assert (
+        (stages.p10 <= stages["median"]) & (stages["median"] <= stages.p90)
+    ).all()
     assert avatar.stage is unwatched
     assert avatar.stage("F") is UNWATCHED
     avatar.generator.forward = None  # a stage that fails
@@ -84,7 +118,10 @@ def test_batches_are_timed_per_image(small):
 
 def test_precision_reaches_the_networks_and_not_the_image_type(small):
     _, avatar, frame = small
-    full, half = make_painter(avatar)(frame), make_painter(avatar, "bf16-mixed")(frame)
+    full, half = (
+        make_painter(avatar)(frame),
+        make_painter(avatar, "bf16-mixed")(frame),
+    )
     assert half.dtype == full.dtype == torch.float32
     assert 0 < (half - full).abs().max() < 0.1
 
@@ -104,9 +141,13 @@ def test_the_machine_is_described_without_its_host(tmp_path):
     host = platform.node()
     assert len(host) < 4 or host not in json.dumps(where)
     listing = tmp_path / "cpuinfo"
-    listing.write_text("processor : 0\nmodel name : Abacus 3000\nmodel name : Second\n")
+    listing.write_text(
+        "processor : 0\nmodel name : Abacus 3000\nmodel name : Second\n"
+    )
     assert cpu_name(listing) == "Abacus 3000"
-    assert cpu_name(tmp_path / "absent") == (platform.processor() or platform.machine())
+    assert cpu_name(tmp_path / "absent") == (
+        platform.processor() or platform.machine()
+    )
 
 
 @pytest.mark.parametrize(
@@ -137,14 +178,23 @@ def test_the_table_adds_up():
         times, environment(torch.device("cpu")), settings, ["untrained weights"]
     )
     assert "| F | 6.00 | 5.00 | 7.00 | 4.00 | 60% |" in page
-    assert "| **end to end** | 10.0 | 9.00 | 12.0 | 8.00 | 100.0 frames/s |" in page
+    assert (
+        "| **end to end** | 10.0 | 9.00 | 12.0 | 8.00 | 100.0 frames/s |"
+        in page
+    )
     assert "- untrained weights" in page
 
 
 @pytest.mark.slow
 def test_the_command_times_a_run(run, tmp_path, inside):
     out = tmp_path / "out"
-    given = [f"run={run}", "frames=2", "warmup=1", "poses=2", f"hydra.run.dir={out}"]
+    given = [
+        f"run={run}",
+        "frames=2",
+        "warmup=1",
+        "poses=2",
+        f"hydra.run.dir={out}",
+    ]
     done = inside("bench", "speed", *given)
     assert done.returncode == 0, done.stderr
     found = json.loads((out / "speed.json").read_text())
@@ -164,7 +214,9 @@ def test_the_command_times_a_run(run, tmp_path, inside):
     assert torch.tensor([1e-310], dtype=torch.float64) * 1 > 0
 
 
-def test_the_command_times_an_untrained_avatar_at_its_size(capture, tmp_path, inside):
+def test_the_command_times_an_untrained_avatar_at_its_size(
+    capture, tmp_path, inside
+):
     out = tmp_path / "out"
     given = [
         "size=tiny",
@@ -173,7 +225,9 @@ def test_the_command_times_an_untrained_avatar_at_its_size(capture, tmp_path, in
         "frames=1",
         "warmup=0",
     ]
-    done = inside("bench", "speed", *given, "model=splat_only", f"hydra.run.dir={out}")
+    done = inside(
+        "bench", "speed", *given, "model=splat_only", f"hydra.run.dir={out}"
+    )
     assert done.returncode == 0, done.stderr
     found = json.loads((out / "speed.json").read_text())
     assert found["settings"]["image"] == "64 x 64"

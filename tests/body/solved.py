@@ -14,10 +14,12 @@ def shown(
 ) -> tuple[Tensor, Tensor]:
     """``[B, joints, 3]`` and their visibility."""
     body = free_body()
-    p = torch.cat([body.posed_landmarks(truth), body.posed_hands(truth)], dim=1)[
-        :, :joints
-    ]
-    p = p + noise * torch.randn(p.shape, generator=torch.Generator().manual_seed(0))
+    p = torch.cat(
+        [body.posed_landmarks(truth), body.posed_hands(truth)], dim=1
+    )[:, :joints]
+    p = p + noise * torch.randn(
+        p.shape, generator=torch.Generator().manual_seed(0)
+    )
     return p, torch.ones(p.shape[:2])
 
 

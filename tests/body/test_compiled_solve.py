@@ -23,7 +23,8 @@ from gsgan.synthetic.recorded_motion import RecordedMotion
 pytestmark = pytest.mark.skipif(not native.available(), reason=native.why_not())
 CMU = Path(
     os.environ.get(
-        "GSGAN_CMU", Path(__file__).parents[3] / "shared" / "data" / "motion" / "cmu"
+        "GSGAN_CMU",
+        Path(__file__).parents[3] / "shared" / "data" / "motion" / "cmu",
     )
 )
 SAME = 1e-4  # metres, the surface's: float32 against float64
@@ -33,7 +34,9 @@ SAME = 1e-4  # metres, the surface's: float32 against float64
 def both(monkeypatch):
     """Poses by compiled code and by tensor operations."""
 
-    def solved(solver: Solver, p: Tensor, seen: Tensor) -> tuple[BodyPose, BodyPose]:
+    def solved(
+        solver: Solver, p: Tensor, seen: Tensor
+    ) -> tuple[BodyPose, BodyPose]:
         fast = solver.solve(p, seen)
         with monkeypatch.context() as patch:
             patch.setattr(compiled, "available", lambda _: False)
@@ -42,7 +45,9 @@ def both(monkeypatch):
     return solved
 
 
-def apart(pair: tuple[BodyPose, BodyPose], body: MarkedBody | None = None) -> Tensor:
+def apart(
+    pair: tuple[BodyPose, BodyPose], body: MarkedBody | None = None
+) -> Tensor:
     """``[B, V]`` metres between the surfaces of two solutions."""
     a, b = ((body or free_body()).posed_vertices(pose) for pose in pair)
     return (a - b).norm(dim=-1)
@@ -69,7 +74,9 @@ def test_motion_capture_has_the_same_poses(solver, both, clip):
 def test_hidden_landmarks_give_the_same_poses(solver, poses, both, joints):
     """A third of all but the trunk's. A limb of which only the end is seen has two solutions."""
     p, seen = (x[:, :joints].clone() for x in shown(poses, 0.005))
-    lost = torch.rand(seen.shape, generator=torch.Generator().manual_seed(4)) < 0.3
+    lost = (
+        torch.rand(seen.shape, generator=torch.Generator().manual_seed(4)) < 0.3
+    )
     lost[:, [11, 12, 23, 24]] = False
     seen[lost], p[lost] = 0, math.nan
     off = apart(both(solver, p, seen))
@@ -80,7 +87,8 @@ def test_hidden_landmarks_give_the_same_poses(solver, poses, both, joints):
 def test_landmarks_that_are_seen_weakly_weigh_the_same(solver, poses, both):
     p, seen = shown(poses, 0.02)
     seen = (
-        torch.rand(seen.shape, generator=torch.Generator().manual_seed(4)) * 1.5 + 0.01
+        torch.rand(seen.shape, generator=torch.Generator().manual_seed(4)) * 1.5
+        + 0.01
     )
     assert apart(both(solver, p, seen)).max() < SAME
 
@@ -93,7 +101,13 @@ ALIKE = (
     "infinite",
     "only the trunk",
 )
-ALIKE = (*ALIKE, "estimated hips", "lost fingers", "lying on the side", "upside down")
+ALIKE = (
+    *ALIKE,
+    "estimated hips",
+    "lost fingers",
+    "lying on the side",
+    "upside down",
+)
 
 
 @pytest.mark.parametrize("kind", ALIKE)
@@ -128,7 +142,9 @@ def test_a_frame_is_the_same_to_the_bit_in_any_batch_and_with_any_threads(
 
 
 def test_no_frames(solver):
-    assert solver.solve(torch.zeros(0, 75, 3), torch.zeros(0, 75)).theta.shape == (
+    assert solver.solve(
+        torch.zeros(0, 75, 3), torch.zeros(0, 75)
+    ).theta.shape == (
         0,
         56,
         3,

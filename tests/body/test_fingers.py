@@ -20,7 +20,9 @@ from gsgan.skeleton.hands import FINGERS, HAND
 
 LEFT, RIGHT = slice(33, 33 + HAND), slice(33 + HAND, 33 + 2 * HAND)
 JOINTS = [
-    i for i, name in enumerate(free_body().joint_names) if name.startswith("finger")
+    i
+    for i, name in enumerate(free_body().joint_names)
+    if name.startswith("finger")
 ]
 
 
@@ -41,7 +43,9 @@ def test_fingers_of_exact_landmarks_are_the_true_ones(solver, poses):
     assert [body.label_names[i] for i in (7, 8)] == ["left_hand", "right_hand"]
     without = solver.solve(p[:, :33], seen[:, :33])
     away, before = (
-        (body.posed_vertices(x) - body.posed_vertices(poses))[:, hands].norm(dim=-1)
+        (body.posed_vertices(x) - body.posed_vertices(poses))[:, hands].norm(
+            dim=-1
+        )
         for x in (pose, without)
     )
     assert away.median() < 0.005
@@ -52,17 +56,25 @@ def test_hands_move_no_more_of_the_body_than_the_arms(solver, poses):
     p, seen = shown(poses[:4])
     moved = r"(finger|wrist|lowerarm|upperarm|shoulder|clavicle).*"
     names = free_body().joint_names
-    others = [i for i, name in enumerate(names) if not re.fullmatch(moved, name)]
+    others = [
+        i for i, name in enumerate(names) if not re.fullmatch(moved, name)
+    ]
     without = solver.solve(p[:, :33], seen[:, :33])
     far = p.clone()
     far[:, LEFT] += 0.02
     wrist = names.index("wrist.L")
-    moved = (solver.solve(p, seen).theta - solver.solve(far, seen).theta)[:, wrist]
+    moved = (solver.solve(p, seen).theta - solver.solve(far, seen).theta)[
+        :, wrist
+    ]
     assert moved.norm(dim=-1).min() > 0.02  # the arm follows
     for pose in (solver.solve(p, seen), solver.solve(far, seen)):
-        assert (pose.theta[:, others] - without.theta[:, others]).abs().max() < 0.02
+        assert (
+            pose.theta[:, others] - without.theta[:, others]
+        ).abs().max() < 0.02
         assert (pose.transl - without.transl).abs().max() < 0.002
-    assert not without.theta[:, [j for j in JOINTS if "1-1" not in names[j]]].any()
+    assert not without.theta[
+        :, [j for j in JOINTS if "1-1" not in names[j]]
+    ].any()
 
 
 def test_a_hand_is_where_its_own_landmarks_are(solver, poses):
@@ -72,7 +84,8 @@ def test_a_hand_is_where_its_own_landmarks_are(solver, poses):
     wrong[:, [15, 17, 19, 21]] += torch.tensor([0.015, -0.01, 0.0])
     off, before = (
         (
-            free_body().posed_hands(solver.solve(wrong[:, :n], seen[:, :n])) - p[:, 33:]
+            free_body().posed_hands(solver.solve(wrong[:, :n], seen[:, :n]))
+            - p[:, 33:]
         ).norm(dim=-1)
         for n in (75, 33)
     )
@@ -88,26 +101,31 @@ def test_hands_that_close_and_spread(solver):
     body, random = free_body(), torch.Generator().manual_seed(0)
     theta = torch.zeros(40, 56, 3)
     for start, letter, side in ((0, "L", 1.0), (HAND, "R", -1.0)):
-        wrist, index, pinky = (body.hand_landmarks[start + j] for j in (0, 5, 17))
+        wrist, index, pinky = (
+            body.hand_landmarks[start + j] for j in (0, 5, 17)
+        )
         knuckles = -side * torch.nn.functional.normalize(index - pinky, dim=0)
         out = torch.linalg.cross((index + pinky) / 2 - wrist, index - pinky)
         for finger in range(2, 6):
             bends = torch.rand(2, 40, 1, generator=random) * torch.tensor(
                 [1.4, 1.8]
             ).view(2, 1, 1)
-            apart = 0.15 * torch.randn(40, 1, generator=random) * out / out.norm()
+            apart = (
+                0.15 * torch.randn(40, 1, generator=random) * out / out.norm()
+            )
             for joint, turn in enumerate(
                 (bends[0] * knuckles + apart, bends[1] * knuckles), 1
             ):
-                theta[:, body.joint_names.index(f"finger{finger}-{joint}.{letter}")] = (
-                    turn
-                )
+                theta[
+                    :,
+                    body.joint_names.index(f"finger{finger}-{joint}.{letter}"),
+                ] = turn
     truth = BodyPose(theta, torch.zeros(40, 3))
     pose = solver.solve(*shown(truth))
     hands = torch.isin(body.vertex_labels, torch.tensor([7, 8]))
-    away = (body.posed_vertices(pose) - body.posed_vertices(truth))[:, hands].norm(
-        dim=-1
-    )
+    away = (body.posed_vertices(pose) - body.posed_vertices(truth))[
+        :, hands
+    ].norm(dim=-1)
     assert away.median() < 0.003
     assert np.quantile(away.numpy(), 0.9) < 0.01
 
@@ -116,9 +134,9 @@ def test_a_persons_proportions_and_place_do_not_matter(poses):
     p, seen = shown(poses[:6])
     fingers = Fingers(free_body())
     expected = fingers(p[:, 33:], seen[:, 33:] > 0).turns
-    R = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(3)))[
-        0
-    ]
+    R = torch.linalg.qr(
+        torch.randn(3, 3, generator=torch.Generator().manual_seed(3))
+    )[0]
     moved = 1.3 * p[:, 33:] @ (R * torch.det(R)).mT + 2.0
     tip = moved.clone()
     for start in (0, HAND):  # longer last bones
@@ -157,11 +175,15 @@ def test_a_missing_hand_rests_and_the_other_does_not_change(solver, poses, how):
     for joint in JOINTS:
         if names[joint].endswith("R"):
             assert torch.equal(theta[:, joint], whole[:, joint])
-        elif names[joint] != "finger1-1.L":  # the pose's own thumb landmark shows it
+        elif (
+            names[joint] != "finger1-1.L"
+        ):  # the pose's own thumb landmark shows it
             assert not theta[:, joint].any()
     rest = solver.at_rest(p, seen)
     assert rest[:, names.index("finger3-2.L")].all()
-    assert not rest[:, [names.index("finger3-2.R"), names.index("finger1-1.L")]].any()
+    assert not rest[
+        :, [names.index("finger3-2.R"), names.index("finger1-1.L")]
+    ].any()
 
 
 def test_a_finger_rests_from_the_first_joint_that_is_not_seen(solver, poses):
@@ -170,11 +192,17 @@ def test_a_finger_rests_from_the_first_joint_that_is_not_seen(solver, poses):
     truth = solver.solve(p, seen).theta
     p[:, 33 + 8] = math.nan  # the index's tip: its middle still shows the bend
     p[:, 33 + 9] = math.nan  # the middle finger's knuckle
-    p[:, [33 + 15, 33 + 16]] = math.nan  # all beyond the ring finger's second joint
+    p[:, [33 + 15, 33 + 16]] = (
+        math.nan
+    )  # all beyond the ring finger's second joint
     theta = solver.solve(p, seen).theta
     index, ring = names.index("finger2-2.L"), names.index("finger4-1.L")
-    torch.testing.assert_close(theta[:, index], truth[:, index], atol=0.01, rtol=0)
-    assert not theta[:, [names.index("finger3-1.L"), names.index("finger3-2.L")]].any()
+    torch.testing.assert_close(
+        theta[:, index], truth[:, index], atol=0.01, rtol=0
+    )
+    assert not theta[
+        :, [names.index("finger3-1.L"), names.index("finger3-2.L")]
+    ].any()
     assert not theta[:, names.index("finger4-2.L")].any()
     torch.testing.assert_close(theta[:, ring], truth[:, ring], atol=0.1, rtol=0)
 
@@ -204,7 +232,9 @@ def test_gradients_are_those_of_finite_differences(poses):
     goal = torch.randn(
         20, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64
     )
-    (slope,) = torch.autograd.grad((fingers(hands, seen)[0] * goal).sum(), hands)
+    (slope,) = torch.autograd.grad(
+        (fingers(hands, seen)[0] * goal).sum(), hands
+    )
     for joint, axis in ((0, 0), (6, 1), (8, 2), (HAND + 3, 0), (HAND + 17, 1)):
         step = torch.zeros_like(hands)
         step[:, joint, axis] = 1e-5
@@ -230,14 +260,18 @@ def test_gradients_reach_landmarks_and_shape(poses):
         slopes = torch.autograd.grad(
             theta[:, joints].square().sum(), of, retain_graph=True
         )
-        assert all(slope.abs().sum() > 0 for slope in (*slopes, slopes[2][:, shown_by]))
+        assert all(
+            slope.abs().sum() > 0 for slope in (*slopes, slopes[2][:, shown_by])
+        )
 
 
 def test_a_mirrored_person_has_mirrored_fingers(poses):
     """The free body is symmetric: left and right exchanged give each other's angles."""
     fingers = Fingers(free_body())
     p, seen = shown(poses[:6])
-    mirrored = (p[:, 33:] * torch.tensor([-1.0, 1, 1])).unflatten(1, (2, HAND)).flip(1)
+    mirrored = (
+        (p[:, 33:] * torch.tensor([-1.0, 1, 1])).unflatten(1, (2, HAND)).flip(1)
+    )
     own = fingers(p[:, 33:], seen[:, 33:] > 0).turns
     other = fingers(mirrored.flatten(1, 2), seen[:, 33:] > 0).turns
     other = other.unflatten(1, (2, 2, 5)).flip(2).flatten(1, 3) * torch.tensor(
@@ -262,14 +296,16 @@ def test_bodies_without_hand_landmarks_keep_their_fingers_at_rest(tmp_path):
 def test_a_person_whose_hands_are_larger_and_elsewhere_on_the_arms(poses):
     """Found by landmarks and forearms; then hands agree with 33 landmarks."""
     own, truth = free_space().neutral(), poses[:12]
-    moves = torch.tensor([[[0.01, -0.01, 0.0], [-0.01, 0.0, -0.015]]]) * torch.tensor(
-        [[[1.0, 1, 1]], [[-1.0, 1, 1]]]
-    )
+    moves = torch.tensor(
+        [[[0.01, -0.01, 0.0], [-0.01, 0.0, -0.015]]]
+    ) * torch.tensor([[[1.0, 1, 1]], [[-1.0, 1, 1]]])
     stretch = torch.tensor([1.0] * 4 + [1.2] + [1.0] * 3)
     person = shaped_body(
         replace(own, stretch=stretch, offsets=torch.zeros(33, 3), hands=moves)
     )
-    p = torch.cat([person.posed_landmarks(truth), person.posed_hands(truth)], dim=1)
+    p = torch.cat(
+        [person.posed_landmarks(truth), person.posed_hands(truth)], dim=1
+    )
     seen = torch.ones(p.shape[:2])
     seen[0, LEFT] = 0
     p[0, LEFT] = torch.nan
@@ -300,9 +336,13 @@ def test_a_person_whose_hands_are_larger_and_elsewhere_on_the_arms(poses):
 
 def test_where_hands_are_on_the_arms_has_gradients(poses):
     hands = torch.zeros(2, 2, 3, requires_grad=True)
-    shape = replace(free_space().neutral(), offsets=torch.zeros(33, 3), hands=hands)
+    shape = replace(
+        free_space().neutral(), offsets=torch.zeros(33, 3), hands=hands
+    )
     body = shaped_body(shape)
-    total = body.posed_vertices(poses[:2]).sum() + body.posed_hands(poses[:2]).sum()
+    total = (
+        body.posed_vertices(poses[:2]).sum() + body.posed_hands(poses[:2]).sum()
+    )
     total.backward()
     assert hands.grad.isfinite().all()
     assert (hands.grad.abs() > 0).any(dim=-1).all()

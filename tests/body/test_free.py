@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from gsgan.body.free import free_body, free_body_path, majority_vertex_labels, read_body
+from gsgan.body.free import (
+    free_body,
+    free_body_path,
+    majority_vertex_labels,
+    read_body,
+)
 from gsgan.body.skinned import carry
 from gsgan.scene import BodyPose
 from gsgan.utils.errors import DataError
@@ -13,8 +18,12 @@ from gsgan.utils.errors import DataError
 def poses(n: int, scale: float = 0.5) -> BodyPose:
     generator = torch.Generator().manual_seed(1)
     J = len(free_body().parents)
-    theta = scale * torch.randn(n, J, 3, generator=generator, dtype=torch.float64)
-    return BodyPose(theta, torch.randn(n, 3, generator=generator, dtype=torch.float64))
+    theta = scale * torch.randn(
+        n, J, 3, generator=generator, dtype=torch.float64
+    )
+    return BodyPose(
+        theta, torch.randn(n, 3, generator=generator, dtype=torch.float64)
+    )
 
 
 def test_asset_is_small_and_complete():
@@ -35,7 +44,9 @@ def test_every_part_has_area():
     per_label = torch.zeros(13).index_add_(0, body.face_labels, area)
     assert per_label[0] == 0
     assert per_label[1:].min() > 0.02  # square metres
-    assert set(body.face_surface.tolist()) == set(range(len(body.surface_names)))
+    assert set(body.face_surface.tolist()) == set(
+        range(len(body.surface_names))
+    )
     assert set(body.vertex_labels.tolist()) == set(range(1, 13))
 
 
@@ -69,9 +80,13 @@ def test_faces_point_outwards():
     body = free_body()
     for label, name in enumerate(body.label_names[1:], start=1):
         tri = body.vertices[body.faces[body.face_labels == label]]
-        normal = torch.linalg.cross(tri[:, 1] - tri[:, 0], tri[:, 2] - tri[:, 0])
+        normal = torch.linalg.cross(
+            tri[:, 1] - tri[:, 0], tri[:, 2] - tri[:, 0]
+        )
         flux = (normal * (tri.mean(1) - tri.mean((0, 1)))).sum()
-        assert flux > 0, name  # three times twice the volume, if the part were closed
+        assert flux > 0, (
+            name
+        )  # three times twice the volume, if the part were closed
 
 
 def test_rest_pose_moves_nothing():
@@ -117,7 +132,9 @@ def test_bones_keep_their_lengths_in_any_pose():
     pose = poses(4)
     # twist joints are inside a bone: at rest here, their bones are one rigid piece
     for i, name in enumerate(body.joint_names):
-        if name.startswith(("upperarm02", "lowerarm02", "upperleg02", "lowerleg02")):
+        if name.startswith(
+            ("upperarm02", "lowerarm02", "upperleg02", "lowerleg02")
+        ):
             pose.theta[:, i] = 0
     p, rest = body.posed_landmarks(pose), body.landmarks
     for a, b in BONES:
@@ -128,14 +145,19 @@ def test_bones_keep_their_lengths_in_any_pose():
     for first in range(1, 42):
         if first % 21 in (2, 3, 4, 6, 7, 8, 10, 11, 12, 14, 15, 16, 18, 19, 20):
             length = (hands[:, first] - hands[:, first - 1]).norm(dim=-1)
-            expected = (rest_hands[first] - rest_hands[first - 1]).norm().expand(4)
+            expected = (
+                (rest_hands[first] - rest_hands[first - 1]).norm().expand(4)
+            )
             torch.testing.assert_close(length, expected, atol=1e-9, rtol=0)
 
 
 def test_landmarks_are_at_the_joints_of_the_same_name():
     body = free_body().to(torch.float64)
     pose = poses(3)
-    p, joints = body.posed_landmarks(pose), carry(body.transforms(pose), body.joints)
+    p, joints = (
+        body.posed_landmarks(pose),
+        carry(body.transforms(pose), body.joints),
+    )
     for landmark, joint in (
         (13, "lowerarm01.L"),
         (26, "lowerleg01.R"),
@@ -155,7 +177,9 @@ def test_majority_label_and_its_tie():
 
 
 def test_pose_of_another_body_is_refused():
-    with pytest.raises(ValueError, match=r"\[B, 56, 3, 3\], got \[1, 24, 3, 3\]"):
+    with pytest.raises(
+        ValueError, match=r"\[B, 56, 3, 3\], got \[1, 24, 3, 3\]"
+    ):
         free_body().pose(BodyPose(torch.zeros(1, 24, 3), torch.zeros(1, 3)))
 
 

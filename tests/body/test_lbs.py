@@ -32,10 +32,14 @@ def rz(degrees: float) -> torch.Tensor:
 CHAIN = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]], dtype=D)
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-9, 9.9e-4, 1.01e-3, 1.0, math.pi, 6.0])
+@pytest.mark.parametrize(
+    "angle", [0.0, 1e-9, 9.9e-4, 1.01e-3, 1.0, math.pi, 6.0]
+)
 def test_axis_angle_matches_matrix_exponential(angle):
     v = angle * torch.tensor([1.0, 2.0, -2.0], dtype=D) / 3
-    K = torch.tensor([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]], dtype=D)
+    K = torch.tensor(
+        [[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]], dtype=D
+    )
     torch.testing.assert_close(
         axis_angle_to_matrix(v), torch.linalg.matrix_exp(K), atol=1e-12, rtol=0
     )
@@ -67,10 +71,14 @@ def test_weights_are_renormalised():
 def test_gradients_agree_with_finite_differences():
     index = torch.tensor([[0, 1], [1, 2], [2, 0]])
     weight = torch.tensor([[0.5, 0.5], [0.2, 0.8], [1.0, 0.0]], dtype=D)
-    points = torch.tensor([[0.5, 0.1, 0], [1.5, 0, 0.2], [2.5, 0.3, 0]], dtype=D)
+    points = torch.tensor(
+        [[0.5, 0.1, 0], [1.5, 0, 0.2], [2.5, 0.3, 0]], dtype=D
+    )
 
     def posed(theta, transl):
-        T = forward_kinematics(CHAIN, (-1, 0, 1), axis_angle_to_matrix(theta), transl)
+        T = forward_kinematics(
+            CHAIN, (-1, 0, 1), axis_angle_to_matrix(theta), transl
+        )
         return skin(points, *blend_transforms(T, index, weight))
 
     generator = torch.Generator().manual_seed(0)
@@ -125,9 +133,9 @@ def bent_tube():
         torch.arange(24, dtype=D) * math.pi / 12,
         indexing="ij",
     )
-    vertices = torch.stack([x, 0.1 * angle.cos(), 0.1 * angle.sin()], dim=-1).reshape(
-        -1, 3
-    )
+    vertices = torch.stack(
+        [x, 0.1 * angle.cos(), 0.1 * angle.sin()], dim=-1
+    ).reshape(-1, 3)
     a = torch.arange(80 * 24)
     right = a // 24 * 24 + (a + 1) % 24
     faces = torch.cat(
@@ -170,10 +178,13 @@ def test_the_jacobian_predicts_where_neighbours_go(bent_tube, turn):
     posed = skin(bent_tube.vertices, A, t)[0]
     inner = torch.arange(24 * 30, 24 * 50)
     # 2.5 cm
-    step = (bent_tube.vertices[inner + 48] - bent_tube.vertices[inner]).unsqueeze(-1)
+    step = (
+        bent_tube.vertices[inner + 48] - bent_tube.vertices[inner]
+    ).unsqueeze(-1)
     moved = posed[inner + 48] - posed[inner]
     off, off_plain = (
-        ((M[0, inner] @ step).squeeze(-1) - moved).norm(dim=-1).max() for M in (J, A)
+        ((M[0, inner] @ step).squeeze(-1) - moved).norm(dim=-1).max()
+        for M in (J, A)
     )
     assert off <= 0.005
     if turn == 0:
@@ -190,11 +201,15 @@ def test_all_bones_turned_alike_stretch_nothing_far_from_the_origin(bent_tube):
     bones[..., :3, 3] = torch.tensor([500.0, -3.0, 1.0])
     A, _ = blend_transforms(bones, bent_tube.bone_index, bent_tube.bone_weight)
     J = stretched(A, bones, *stretch_terms(bent_tube))
-    torch.testing.assert_close(J[0], rz(70).float().expand_as(J[0]), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        J[0], rz(70).float().expand_as(J[0]), atol=1e-5, rtol=0
+    )
 
 
 def test_stretch_terms_of_degenerate_surfaces_are_finite(bent_tube):
     flat = replace(bent_tube, vertices=torch.zeros_like(bent_tube.vertices))
-    loose = replace(bent_tube, faces=bent_tube.faces[:1])  # most vertices have no edge
+    loose = replace(
+        bent_tube, faces=bent_tube.faces[:1]
+    )  # most vertices have no edge
     for body in (flat, loose):
         assert stretch_terms(body)[1].isfinite().all()

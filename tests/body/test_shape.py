@@ -52,7 +52,9 @@ def moving(body, frames: int = 20) -> BodyPose:
 
 
 def test_the_asset_is_small_and_its_origin_is_the_free_body():
-    assert free_body_path().with_name("body_space.npz").stat().st_size < 1_000_000
+    assert (
+        free_body_path().with_name("body_space.npz").stat().st_size < 1_000_000
+    )
     own, body = free_body(), free_space().shaped(free_space().neutral())
     for name in ("vertices", "joints", "landmarks", "hand_landmarks"):
         torch.testing.assert_close(
@@ -72,7 +74,9 @@ def test_the_first_coefficient_is_mostly_size_and_people_stay_symmetric():
     body = shaped_body(other(0))
     for left, right in ((23, 24), (25, 26), (15, 16), (7, 8)):
         mirrored = body.landmarks[right] * torch.tensor([-1.0, 1, 1])
-        torch.testing.assert_close(body.landmarks[left], mirrored, atol=3e-3, rtol=0)
+        torch.testing.assert_close(
+            body.landmarks[left], mirrored, atol=3e-3, rtol=0
+        )
 
 
 def test_a_stretch_scales_its_part_alone():
@@ -80,7 +84,9 @@ def test_a_stretch_scales_its_part_alone():
 
     def length(body, a: str, b: str) -> float:
         return float(
-            (body.landmarks[names.index(a)] - body.landmarks[names.index(b)]).norm()
+            (
+                body.landmarks[names.index(a)] - body.landmarks[names.index(b)]
+            ).norm()
         )
 
     pairs = {
@@ -107,7 +113,9 @@ def test_a_stretch_scales_its_part_alone():
 
 def test_limbs_keep_their_girth():
     own = free_body()
-    arm = next(j for j, n in enumerate(own.joint_names) if group_of(n) == "forearm")
+    arm = next(
+        j for j, n in enumerate(own.joint_names) if group_of(n) == "forearm"
+    )
     axis = limb_axes(own)[arm]
     of_arm = (own.bone_index[:, 0] == arm) & (own.bone_weight[:, 0] > 0.99)
     stretch = torch.ones(8)
@@ -132,7 +140,9 @@ def test_a_shape_is_stored_as_numbers_and_wrong_ones_are_refused():
     for make in (
         lambda: BodyShape(torch.zeros(K), torch.ones(7)),
         lambda: BodyShape(torch.zeros(K), torch.ones(8), torch.zeros(3, 33)),
-        lambda: BodyShape(torch.zeros(K), torch.ones(8), hands=torch.zeros(2, 3)),
+        lambda: BodyShape(
+            torch.zeros(K), torch.ones(8), hands=torch.zeros(2, 3)
+        ),
         lambda: BodyShape.of_flat(torch.zeros(20)),
         lambda: shaped_body(BodyShape(torch.zeros(11), torch.ones(8))),
     ):
@@ -157,7 +167,9 @@ def test_a_child_and_a_very_tall_person_are_found(stature_wanted):
     """Not in the space: the free body scaled."""
     body = free_body()
     scale = stature_wanted / stature(body)
-    scaled = {n: getattr(body, n) * scale for n in ("vertices", "joints", "landmarks")}
+    scaled = {
+        n: getattr(body, n) * scale for n in ("vertices", "joints", "landmarks")
+    }
     person = replace(body, **scaled)
     p = person.posed_landmarks(moving(body))
     found = shaped_body(fit_shape(p, torch.ones(p.shape[:2])))
@@ -167,7 +179,9 @@ def test_a_child_and_a_very_tall_person_are_found(stature_wanted):
 def test_one_frame_gaps_and_noise_still_give_a_person():
     body = shaped_body(other(4))
     p = body.posed_landmarks(moving(body))
-    p = p + 0.01 * torch.randn(p.shape, generator=torch.Generator().manual_seed(0))
+    p = p + 0.01 * torch.randn(
+        p.shape, generator=torch.Generator().manual_seed(0)
+    )
     seen = torch.ones(p.shape[:2])
     p[:, 15], seen[:, 31] = float("nan"), 0
     for part in (slice(0, 1), slice(None)):
@@ -193,7 +207,9 @@ def test_the_depth_of_the_spine_is_found_where_the_trunk_bends():
     found = []
     for depth in (0.0, 0.07):
         body = shaped_body(
-            BodyShape(torch.zeros(K), torch.ones(8), spine=torch.tensor([depth]))
+            BodyShape(
+                torch.zeros(K), torch.ones(8), spine=torch.tensor([depth])
+            )
         )
         pose = moving(body)
         bends = 0.4 * torch.rand(20, generator=torch.Generator().manual_seed(1))

@@ -74,11 +74,19 @@ def test_shape_and_expression_are_split_by_their_number(small):
     arrays = smpl_arrays("smplx", SMALL)
     many = np.zeros((SMALL, 3, 400))
     model, _ = small(kind="smplx", replace={"shapedirs": many})
-    assert (model.shapedirs.shape[-1], model.expression_dirs.shape[-1]) == (300, 100)
-    ten, _ = small(kind="smplx", replace={"shapedirs": arrays["shapedirs"][..., :10]})
+    assert (model.shapedirs.shape[-1], model.expression_dirs.shape[-1]) == (
+        300,
+        100,
+    )
+    ten, _ = small(
+        kind="smplx", replace={"shapedirs": arrays["shapedirs"][..., :10]}
+    )
     assert (ten.shapedirs.shape[-1], ten.expression_dirs.shape[-1]) == (10, 0)
     smpl, _ = small(kind="smpl", replace={"shapedirs": many[..., :300]})
-    assert (smpl.shapedirs.shape[-1], smpl.expression_dirs.shape[-1]) == (300, 0)
+    assert (smpl.shapedirs.shape[-1], smpl.expression_dirs.shape[-1]) == (
+        300,
+        0,
+    )
 
 
 def test_joint_names():
@@ -97,10 +105,16 @@ def test_zero_pose_is_the_shaped_rest_moved(small):
     betas = torch.tensor([[1.0, -2.0, 0.5]], dtype=D)
     transl = torch.tensor([[1.0, 2.0, 3.0]], dtype=D)
     vertices, joints = model.pose(torch.zeros(1, 24, 3, dtype=D), betas, transl)
-    shaped = written["v_template"] + written["shapedirs"][..., :3] @ betas[0].numpy()
-    np.testing.assert_allclose(vertices[0].numpy(), shaped + transl.numpy(), atol=1e-12)
+    shaped = (
+        written["v_template"] + written["shapedirs"][..., :3] @ betas[0].numpy()
+    )
+    np.testing.assert_allclose(
+        vertices[0].numpy(), shaped + transl.numpy(), atol=1e-12
+    )
     rest = written["J_regressor"] @ shaped
-    np.testing.assert_allclose(joints[0].numpy(), rest + transl.numpy(), atol=1e-12)
+    np.testing.assert_allclose(
+        joints[0].numpy(), rest + transl.numpy(), atol=1e-12
+    )
     torch.testing.assert_close(joints, model.rest_joints(betas) + transl)
 
 
@@ -153,25 +167,39 @@ def test_pose_blend_shapes_by_hand(small):
     theta = torch.zeros(1, 24, 3, dtype=D)
     theta[0, knee, 0] = 0.4
     args = (theta, torch.zeros(1, 10), torch.zeros(1, 3))
-    with_blend, without = model.pose(*args)[0], model.pose(*args, pose_blend=False)[0]
+    with_blend, without = (
+        model.pose(*args)[0],
+        model.pose(*args, pose_blend=False)[0],
+    )
     moved = (with_blend - without)[0].numpy()
     expected = np.zeros((SMALL, 3))
     expected[3, 0] = -0.2 * math.sin(0.4)
     np.testing.assert_allclose(moved, expected, atol=1e-12)
-    theta[0, 0] = torch.tensor([0.3, 0.2, 0.1])  # the root's own rotation adds nothing
+    theta[0, 0] = torch.tensor(
+        [0.3, 0.2, 0.1]
+    )  # the root's own rotation adds nothing
     theta[0, knee] = 0
     torch.testing.assert_close(
         model.pose(*args)[0], model.pose(*args, pose_blend=False)[0]
     )
-    assert not np.allclose(written["v_template"], model.pose(*args)[0][0].numpy())
+    assert not np.allclose(
+        written["v_template"], model.pose(*args)[0][0].numpy()
+    )
 
 
-def test_the_root_turns_about_its_own_joint_and_expression_moves_the_face(small):
+def test_the_root_turns_about_its_own_joint_and_expression_moves_the_face(
+    small,
+):
     model, written = small(kind="smplx")
     theta = torch.zeros(2, 55, 3, dtype=D)
     theta[:, 0, 1] = torch.tensor([0.0, 1.0])
-    betas, face = torch.zeros(1, 10, dtype=D), torch.tensor([[0.0, 2.0]], dtype=D)
-    vertices, joints = model.pose(theta, betas, torch.zeros(2, 3), face.expand(2, -1))
+    betas, face = (
+        torch.zeros(1, 10, dtype=D),
+        torch.tensor([[0.0, 2.0]], dtype=D),
+    )
+    vertices, joints = model.pose(
+        theta, betas, torch.zeros(2, 3), face.expand(2, -1)
+    )
     torch.testing.assert_close(joints[0, 0], joints[1, 0])
     np.testing.assert_allclose(
         vertices[0].numpy(),
@@ -210,7 +238,9 @@ def test_wrong_shapes_name_the_argument(small):
         "expression": (2, 1),
     }
     for name, shape in wrong.items():
-        with pytest.raises(ValueError, match="rotations" if name == "theta" else name):
+        with pytest.raises(
+            ValueError, match="rotations" if name == "theta" else name
+        ):
             model.pose(**(good | {name: torch.zeros(shape)}))
 
 
@@ -224,7 +254,9 @@ def test_zju_convention(small):
     poses[:, 0] = 0
     local, _ = model.pose(poses, betas, torch.zeros(5, 3))
     R = torch.linalg.matrix_exp(
-        torch.tensor([[[0, -z, y], [z, 0, -x], [-y, x, 0]] for x, y, z in Rh], dtype=D)
+        torch.tensor(
+            [[[0, -z, y], [z, 0, -x], [-y, x, 0]] for x, y, z in Rh], dtype=D
+        )
     )
     theirs = local @ R.mT + torch.from_numpy(Th)[:, None]
     J0 = model.rest_joints(betas)[0, 0].numpy()
@@ -261,7 +293,9 @@ def test_as_body_moves_as_the_model_without_blend_shapes(small):
     model, _ = small(kind="smplx")
     betas = torch.tensor([[0.5, -1.0]], dtype=D)
     body = model.as_body(betas[0])
-    theta = 0.4 * torch.randn(2, 55, 3, generator=torch.Generator().manual_seed(0))
+    theta = 0.4 * torch.randn(
+        2, 55, 3, generator=torch.Generator().manual_seed(0)
+    )
     transl = torch.tensor([[0.0, 1, 2], [3, 4, 5]])
     vertices, joints = model.pose(theta, betas, transl, pose_blend=False)
     pose = BodyPose(theta, transl)
@@ -271,7 +305,9 @@ def test_as_body_moves_as_the_model_without_blend_shapes(small):
     own = carry(body.transforms(pose), body.joints)
     torch.testing.assert_close(own.double(), joints, atol=1e-5, rtol=0)
     A, t = body.pose(pose)
-    torch.testing.assert_close(skin(body.vertices, A, t), body.posed_vertices(pose))
+    torch.testing.assert_close(
+        skin(body.vertices, A, t), body.posed_vertices(pose)
+    )
 
 
 def test_segmentation_is_built_from_a_model_file(tmp_path):
@@ -279,13 +315,20 @@ def test_segmentation_is_built_from_a_model_file(tmp_path):
     body = open_body("smpl", str(tmp_path / "m.pkl"), (0.1, 0.2), CIHP)
     assert body.label_names == CIHP
     K = torch.tensor([[[35.0, 0, 16], [0, 35, 16], [0, 0, 1]]])
-    R = torch.tensor([[[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]])  # in front of it, Y up
+    R = torch.tensor(
+        [[[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]]
+    )  # in front of it, Y up
     camera = Camera(
-        K, R, -(R @ torch.tensor([[[0.0], [0.85], [3.0]]])).squeeze(-1), (32, 32)
+        K,
+        R,
+        -(R @ torch.tensor([[[0.0], [0.85], [3.0]]])).squeeze(-1),
+        (32, 32),
     )
     with torch.no_grad():
         segmentation = Segmentation(body)
-        S = segmentation(BodyPose(torch.zeros(1, 24, 3), torch.zeros(1, 3)), camera)
+        S = segmentation(
+            BodyPose(torch.zeros(1, 24, 3), torch.zeros(1, 3)), camera
+        )
     names = segmentation.map.names
     assert S.shape == (1, len(names), 32, 32)
     assert "hat" in segmentation.map.absent  # no joint wears one: no channel
@@ -316,10 +359,13 @@ def test_open_body_chooses_parts_by_the_labels_names(tmp_path):
     for names in (CLOTHES, CIHP, ("background", "hat")):
         assert not open_body("smpl", path, (), names).shares_labels(names)
     with pytest.raises(
-        DataError, match=r"kind smpl \(24 joints\), but the data's poses are of sm"
+        DataError,
+        match=r"kind smpl \(24 joints\), but the data's poses are of sm",
     ):
         open_body("smplx", path)
-    with pytest.raises(DataError, match="10 shape coefficients, the data gives 11"):
+    with pytest.raises(
+        DataError, match="10 shape coefficients, the data gives 11"
+    ):
         open_body("smpl", path, (0.0,) * 11)
 
 
@@ -341,12 +387,18 @@ WRONG = {
         {"replace": {"weights": np.ones((7, 24))}},
         r"\(120, 24\), found \(7, 24\)",
     ),
-    "weights": ({"replace": {"weights": np.ones((SMALL, 24))}}, "vertex 0 sum to 24"),
+    "weights": (
+        {"replace": {"weights": np.ones((SMALL, 24))}},
+        "vertex 0 sum to 24",
+    ),
     "faces": (
         {"replace": {"f": np.array([[0, 1, SMALL]])}},
         "below 120, found 0 to 120",
     ),
-    "text": ({"replace": {"f": np.array([["a", "b", "c"]])}}, "must hold numbers"),
+    "text": (
+        {"replace": {"f": np.array([["a", "b", "c"]])}},
+        "must hold numbers",
+    ),
     "tree": (
         {"replace": {"kintree_table": np.zeros((2, 24), int)}},
         "found 1 joints in 24 columns",
@@ -354,7 +406,9 @@ WRONG = {
     "order": (
         {
             "replace": {
-                "kintree_table": np.stack([np.arange(1, 25) % 24, np.arange(24)])
+                "kintree_table": np.stack(
+                    [np.arange(1, 25) % 24, np.arange(24)]
+                )
             }
         },
         "no earlier parent for joint 1",
@@ -399,6 +453,9 @@ def test_a_model_of_another_kind_is_generic(tmp_path):
     write_smpl(tmp_path / "hand.pkl", vertices=SMALL, replace=kept)
     model = read_smpl(tmp_path / "hand.pkl")
     assert model.kind == "generic"
-    assert model.as_body(parts="joints").label_names[:2] == ("background", "joint0")
+    assert model.as_body(parts="joints").label_names[:2] == (
+        "background",
+        "joint0",
+    )
     with pytest.raises(ValueError, match="parts must be 'joints'"):
         model.as_body()

@@ -33,31 +33,41 @@ def surface_error(got: BodyPose, truth: BodyPose) -> Tensor:
 @pytest.mark.parametrize(
     ("noise", "median", "maximum"), [(0.0, 0.0045, 0.015), (0.01, 0.012, 0.03)]
 )
-def test_the_solved_surface_is_near_the_true_one(solver, poses, noise, median, maximum):
+def test_the_solved_surface_is_near_the_true_one(
+    solver, poses, noise, median, maximum
+):
     off = surface_error(solver.solve(*shown(poses, noise)), poses)
     assert off.median() < median
     assert np.quantile(off.numpy(), 0.9) < maximum
 
 
-def test_a_frame_does_not_depend_on_the_others_and_repeats_to_the_bit(solver, poses):
+def test_a_frame_does_not_depend_on_the_others_and_repeats_to_the_bit(
+    solver, poses
+):
     p, seen = shown(poses[:5], 0.01)
     together = solver.solve(p, seen)
     assert torch.equal(together.theta, solver.solve(p, seen).theta)
     alone = solver.solve(p[2:3], seen[2:3])
-    torch.testing.assert_close(alone.theta, together.theta[2:3], atol=1e-3, rtol=0)
+    torch.testing.assert_close(
+        alone.theta, together.theta[2:3], atol=1e-3, rtol=0
+    )
 
 
 def test_a_pose_moves_and_turns_with_the_skeleton(solver, poses):
     p, seen = shown(poses[:4])
-    R = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(3)))[
-        0
-    ]
+    R = torch.linalg.qr(
+        torch.randn(3, 3, generator=torch.Generator().manual_seed(3))
+    )[0]
     R = R * torch.det(R)
     far = p @ R.mT + torch.tensor([40.0, -7.0, 3.0])
     moved, here = solver.solve(far, seen), solver.solve(p, seen)
     body = free_body()
-    expected = body.posed_landmarks(here) @ R.mT + torch.tensor([40.0, -7.0, 3.0])
-    torch.testing.assert_close(body.posed_landmarks(moved), expected, atol=2e-3, rtol=0)
+    expected = body.posed_landmarks(here) @ R.mT + torch.tensor(
+        [40.0, -7.0, 3.0]
+    )
+    torch.testing.assert_close(
+        body.posed_landmarks(moved), expected, atol=2e-3, rtol=0
+    )
 
 
 def test_knees_and_elbows_are_hinges_and_ankles_hardly_turn(solver, poses):
@@ -84,7 +94,8 @@ def test_twist_spreads_along_the_forearm_and_the_upper_arm(solver):
     body, names = free_body(), free_body().joint_names
     truth = BodyPose(torch.zeros(1, 56, 3), torch.zeros(1, 3))
     along = (
-        body.joints[names.index("wrist.L")] - body.joints[names.index("lowerarm01.L")]
+        body.joints[names.index("wrist.L")]
+        - body.joints[names.index("lowerarm01.L")]
     )
     truth.theta[0, names.index("lowerarm02.L")] = 1.0 * along / along.norm()
     theta = solver.solve(*shown(truth)).theta[0]
@@ -113,11 +124,13 @@ def test_the_trunk_bends_as_people_bend_it(solver):
         theta[:, joint] += value.unsqueeze(1) * rig.entry_axis[entry]
     truth = BodyPose(theta, torch.zeros(2, 3))
     got = solver.solve(*shown(truth))
-    main = body.bone_index.gather(1, body.bone_weight.argmax(1, keepdim=True)).squeeze(
-        1
-    )
+    main = body.bone_index.gather(
+        1, body.bone_weight.argmax(1, keepdim=True)
+    ).squeeze(1)
     spine = [i for i, n in enumerate(body.joint_names) if n.startswith("spine")]
-    off = surface_error(got, truth)[:, torch.isin(main, torch.tensor([0, *spine]))]
+    off = surface_error(got, truth)[
+        :, torch.isin(main, torch.tensor([0, *spine]))
+    ]
     assert off.square().mean(1).sqrt().max() < 0.013
     assert got.theta[:, 0].norm(dim=-1).rad2deg().max() < 25
 
@@ -149,9 +162,13 @@ def test_gradients_are_those_of_the_solution(monkeypatch, poses):
         step = torch.zeros_like(p)
         step[0, joint, axis] = 1e-3
         with torch.no_grad():
-            ahead, back = (fine.solve(p + s * step, seen).theta for s in (1, -1))
+            ahead, back = (
+                fine.solve(p + s * step, seen).theta for s in (1, -1)
+            )
         found = ((ahead - back) * goal).sum() / 2e-3
-        assert slope[0, joint, axis] == pytest.approx(float(found), rel=0.1, abs=0.1)
+        assert slope[0, joint, axis] == pytest.approx(
+            float(found), rel=0.1, abs=0.1
+        )
 
 
 # -- damage
@@ -186,7 +203,13 @@ def test_limbs_that_are_not_seen_stay_at_rest_and_are_marked(solver, poses):
     theta = solver.solve(p, seen).theta
     rest, names = solver.at_rest(p, seen), free_body().joint_names
     assert rest.shape == (3, 56)
-    for name in ("upperarm01.L", "lowerarm01.L", "wrist.L", "lowerleg01.R", "foot.R"):
+    for name in (
+        "upperarm01.L",
+        "lowerarm01.L",
+        "wrist.L",
+        "lowerleg01.R",
+        "foot.R",
+    ):
         joint = names.index(name)
         assert theta[:, joint].abs().max() < 1e-5
         assert rest[:, joint].all(), name
@@ -195,15 +218,21 @@ def test_limbs_that_are_not_seen_stay_at_rest_and_are_marked(solver, poses):
         for n in ("root", "spine05", "upperarm01.R", "lowerleg01.L", "head")
     ]
     assert not rest[:, moved].any()
-    elsewhere = surface_error(BodyPose(theta, solver.solve(p, seen).transl), poses[:3])
-    whole = free_body().vertex_labels == free_body().label_names.index("left_leg")
+    elsewhere = surface_error(
+        BodyPose(theta, solver.solve(p, seen).transl), poses[:3]
+    )
+    whole = free_body().vertex_labels == free_body().label_names.index(
+        "left_leg"
+    )
     assert elsewhere[:, whole].median() < 0.01
 
 
 def test_a_trunk_without_hips_does_not_nod_with_the_head(solver):
     """Hips are estimates 3 cm off; legs stay at rest and are marked."""
     theta = torch.zeros(1, len(free_body().parents), 3)
-    theta[:, free_body().joint_names.index("head")] = torch.tensor([0.5, 0.0, 0.0])
+    theta[:, free_body().joint_names.index("head")] = torch.tensor(
+        [0.5, 0.0, 0.0]
+    )
     p, _ = shown(BodyPose(theta, torch.zeros(1, 3)))
     truth, seen = p.clone(), SEEN.clone()
     p[:, 23:25] += 0.02
@@ -220,9 +249,13 @@ def test_a_trunk_without_hips_does_not_nod_with_the_head(solver):
 def test_too_few_trunk_joints_are_refused_by_name(solver, poses):
     p, seen = shown(poses[:2])
     seen[1, [11, 12]] = 0
-    with pytest.raises(ValueError, match="item 1: left_shoulder, right_shoulder"):
+    with pytest.raises(
+        ValueError, match="item 1: left_shoulder, right_shoulder"
+    ):
         solver.solve(p, seen)
-    with pytest.raises(ValueError, match="must have 33, 75, 105 joints, got 20"):
+    with pytest.raises(
+        ValueError, match="must have 33, 75, 105 joints, got 20"
+    ):
         solver.solve(p[:, :20], seen[:, :20])
 
 
@@ -235,12 +268,17 @@ def test_swapped_sides_are_refused_by_name(solver, poses, kind):
         p = p * torch.tensor([-1.0, 1.0, 1.0])
     else:
         p[:, [11, 12]] = p[:, [12, 11]]
-    where = "shoulders" if kind == "shoulders" else "hips, shoulders, ears, eyes"
+    where = (
+        "shoulders" if kind == "shoulders" else "hips, shoulders, ears, eyes"
+    )
     with pytest.raises(
-        ValueError, match=f"left and right are swapped: .* the left of {where} lies"
+        ValueError,
+        match=f"left and right are swapped: .* the left of {where} lies",
     ):
         refuse_swapped(p, seen > 0)
-    refuse_swapped(p[3:4], seen[3:4] > 0)  # a single frame may be an extreme pose
+    refuse_swapped(
+        p[3:4], seen[3:4] > 0
+    )  # a single frame may be an extreme pose
     assert solver.solve(p[3:4], seen[3:4]).theta.isfinite().all()
 
 
@@ -262,7 +300,9 @@ def test_bodies_of_the_users_files_follow_their_landmarks(tmp_path, kind):
         "neck",
         "left_collar",
     ):
-        theta[:, names.index(joint)] = 0.15 * torch.randn(6, 3, generator=random)
+        theta[:, names.index(joint)] = 0.15 * torch.randn(
+            6, 3, generator=random
+        )
     truth = BodyPose(theta, torch.randn(6, 3, generator=random))
     p = body.posed_landmarks(truth)
     known = p.isfinite().all(-1)
@@ -272,7 +312,9 @@ def test_bodies_of_the_users_files_follow_their_landmarks(tmp_path, kind):
     pose = Solver(body).solve(p, known.float())
     off = (body.posed_landmarks(pose) - p).norm(dim=-1)[known]
     assert off.median() < 0.003
-    surface = (body.posed_vertices(pose) - body.posed_vertices(truth)).norm(dim=-1)
+    surface = (body.posed_vertices(pose) - body.posed_vertices(truth)).norm(
+        dim=-1
+    )
     assert surface.median() < 0.02
 
 

@@ -18,7 +18,9 @@ def body():
 
 
 def mesh(body) -> trimesh.Trimesh:
-    return trimesh.Trimesh(body.vertices.numpy(), body.faces.numpy(), process=False)
+    return trimesh.Trimesh(
+        body.vertices.numpy(), body.faces.numpy(), process=False
+    )
 
 
 def test_a_smaller_count_changes_nothing(body):

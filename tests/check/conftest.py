@@ -26,7 +26,9 @@ def good(tmp_path_factory):
         p, ids = held["p"], held["frame_id"]
     # measured joints are never still and never exact: a millimetre of noise
     p = p + np.random.default_rng(0).normal(0, 0.001, p.shape)
-    write_landmarks(root, p=p, frame_id=ids, reproj_px=np.full(p.shape[:2], 0.2))
+    write_landmarks(
+        root, p=p, frame_id=ids, reproj_px=np.full(p.shape[:2], 0.2)
+    )
     return root
 
 
@@ -49,11 +51,16 @@ def check(monkeypatch):
     monkeypatch.setattr(overlays, "strip", lambda *_, **__: b"")
 
     def run(
-        root: Path, images: int = 48, consistency: dict | None = None, **limits: float
+        root: Path,
+        images: int = 48,
+        consistency: dict | None = None,
+        **limits: float,
     ) -> CheckReport:
         sampling = Sampling(images=images, shown=1)
         reader = CaptureReader(
-            consistency=Consistency(**({"refused_below": 0.2} | (consistency or {})))
+            consistency=Consistency(
+                **({"refused_below": 0.2} | (consistency or {}))
+            )
         )
         data = GsganData(root=str(root), reader=reader)
         # the forearm of the test person grows as it is raised

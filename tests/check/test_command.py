@@ -41,7 +41,9 @@ def command(tmp_path, monkeypatch, capfd):
 
 
 def test_a_good_capture_passes_and_leaves_a_report(good, command, tmp_path):
-    code, output, page = command(f"data.root={good}", "limits.limb_share=2", *FEW)
+    code, output, page = command(
+        f"data.root={good}", "limits.limb_share=2", *FEW
+    )
     assert code == 0
     assert "nothing wrong was found" in output
     assert sorted(path.name for path in (tmp_path / "work").iterdir()) == [
@@ -53,7 +55,9 @@ def test_a_good_capture_passes_and_leaves_a_report(good, command, tmp_path):
     assert "http" not in page
     strips = re.findall(r'src="data:image/jpeg;base64,([^"]+)"', page)
     assert len(strips) == 4  # one per camera
-    strip = cv2.imdecode(np.frombuffer(base64.b64decode(strips[0]), np.uint8), 1)
+    strip = cv2.imdecode(
+        np.frombuffer(base64.b64decode(strips[0]), np.uint8), 1
+    )
     assert strip.shape == (360 + 18, 270 + 4 + 270, 3)
     for camera in ("cam00", "cam01", "cam02", "cam03"):
         assert f"camera {camera}" in page
@@ -73,11 +77,16 @@ def test_something_wrong_ends_with_1(copy, command, tmp_path):
     assert code == 1
     assert "cameras cam00 and cam01 look exchanged" in " ".join(output.split())
     assert "cameras cam00 and cam01 look exchanged" in page
-    assert json.loads((tmp_path / "work" / "check.json").read_text())["errors"] == 1
+    assert (
+        json.loads((tmp_path / "work" / "check.json").read_text())["errors"]
+        == 1
+    )
 
 
 @pytest.mark.parametrize(("strict", "ends"), [("false", 0), ("true", 1)])
-def test_warnings_end_with_1_where_strict(good, command, tmp_path, strict, ends):
+def test_warnings_end_with_1_where_strict(
+    good, command, tmp_path, strict, ends
+):
     # at the usual limit the little man's forearm is a warning
     code, *_ = command(f"data.root={good}", f"strict={strict}", *FEW)
     numbers = json.loads((tmp_path / "work" / "check.json").read_text())
@@ -105,7 +114,9 @@ def test_a_root_that_is_not_set_is_one_sentence(command):
 def test_a_report_that_cannot_be_written_is_reported(good, command, tmp_path):
     (tmp_path / "work").mkdir()
     (tmp_path / "work" / "taken").write_text("")
-    code, output, _ = command(f"data.root={good}", *FEW, report="taken/check.html")
+    code, output, _ = command(
+        f"data.root={good}", *FEW, report="taken/check.html"
+    )
     assert code == 1
     assert "taken/check.html cannot be written" in " ".join(output.split())
 
@@ -121,7 +132,9 @@ def test_the_real_capture_has_what_is_known_of_it(command, tmp_path):
     assert code == 0
     assert "0 errors, 1 warning" in output
     numbers = json.loads((tmp_path / "work" / "check.json").read_text())
-    found = {finding["topic"]: finding["sentence"] for finding in numbers["findings"]}
+    found = {
+        finding["topic"]: finding["sentence"] for finding in numbers["findings"]
+    }
     assert "far from their 2D detections" in found["frames"]
     # the right foot, found flipped
     assert set(numbers["doubtful_frames"]) == {"64", "65"}

@@ -18,7 +18,9 @@ def images(pattern: str, change):
 
     def damage(root: Path) -> None:
         for path in root.glob(pattern):
-            cv2.imwrite(str(path), change(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)))
+            cv2.imwrite(
+                str(path), change(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
+            )
 
     return damage
 
@@ -44,7 +46,9 @@ def test_a_good_capture_has_nothing_wrong(good, check):
     assert report.findings == ()
     cameras = report.numbers["cameras"]
     assert all(score["inside"] == 1 for score in cameras.values())
-    assert all(s["overlap"] > max(s["rivals"].values()) for s in cameras.values())
+    assert all(
+        s["overlap"] > max(s["rivals"].values()) for s in cameras.values()
+    )
     assert report.numbers["camera_distance"] == pytest.approx(3.0, abs=0.1)
 
 
@@ -71,10 +75,14 @@ WARNINGS = {
 @pytest.mark.parametrize("named", [*ERRORS, *WARNINGS])
 def test_each_damage_has_one_finding(copy, check, named):
     (ERRORS | WARNINGS)[named](copy)
-    assert re.match(named, only(check(copy), "error" if named in ERRORS else "warning"))
+    assert re.match(
+        named, only(check(copy), "error" if named in ERRORS else "warning")
+    )
 
 
-def test_all_cameras_in_millimetres_stop_the_reader_and_are_reported(copy, check):
+def test_all_cameras_in_millimetres_stop_the_reader_and_are_reported(
+    copy, check
+):
     def scale(cameras):
         for camera in cameras.values():
             camera["t"] = [1000 * x for x in camera["t"]]
@@ -120,22 +128,32 @@ def shrink(p):
 @pytest.mark.parametrize(
     ("change", "level", "named"),
     [
-        (exchange, "warning", "nose or toes point backwards in 2 of 12 frames: 5-6"),
+        (
+            exchange,
+            "warning",
+            "nose or toes point backwards in 2 of 12 frames: 5-6",
+        ),
         (exchange_throughout, "error", "left and right are exchanged"),
-        (jump, "warning", r"in 1 of 12 frames: 6 .frame 6: jumps: left_wrist 0.50 m"),
+        (
+            jump,
+            "warning",
+            r"in 1 of 12 frames: 6 .frame 6: jumps: left_wrist 0.50 m",
+        ),
         (lose, "warning", "few joints were seen in 1 of 12 frames: 8"),
         (lose_throughout, "warning", None),
         (shrink, "warning", "limb lengths suggest a person of 0.79"),
     ],
 )
-def test_wrong_landmarks_are_named_with_their_frames(copy, check, change, level, named):
+def test_wrong_landmarks_are_named_with_their_frames(
+    copy, check, change, level, named
+):
     edit_npz(copy / "landmarks3d.npz", lambda arrays: change(arrays["p"]))
     report = check(copy)
     assert report.errors == 0 or level == "error" or change is shrink
     found = [f.sentence for f in report.findings if f.level == level]
-    assert [bool(re.search(named or "were seen", text)) for text in found].count(
-        True
-    ) == (named is not None)
+    assert [
+        bool(re.search(named or "were seen", text)) for text in found
+    ].count(True) == (named is not None)
 
 
 @pytest.mark.parametrize(("cameras", "frames"), [(1, 1), (2, 3)])
@@ -155,7 +173,9 @@ def test_lens_distortion_is_undone_before_anything_is_measured(tmp_path, check):
 
     lens = {"dist": (-0.3, 0.1, 0, 0, 0), "size": (96, 96)}
     root = write_tiny_capture(tmp_path / "lens", cameras=3, frames=4, **lens)
-    assert min(c["inside"] for c in check(root).numbers["cameras"].values()) > 0.99
+    assert (
+        min(c["inside"] for c in check(root).numbers["cameras"].values()) > 0.99
+    )
 
 
 def turn(root: Path, axis: tuple[float, float, float], degrees: float) -> None:
@@ -170,7 +190,9 @@ def turn(root: Path, axis: tuple[float, float, float], degrees: float) -> None:
     edit_json(root / "cameras.json", change)
 
 
-def scale_focal(root: Path, factor: float, *names: str, centre: bool = False) -> None:
+def scale_focal(
+    root: Path, factor: float, *names: str, centre: bool = False
+) -> None:
     def change(cameras):
         for name in names:
             K = np.array(cameras[name]["K"])
@@ -184,18 +206,27 @@ def scale_focal(root: Path, factor: float, *names: str, centre: bool = False) ->
 def test_a_camera_that_is_nearly_right_is_named(copy, check):
     turn(copy, (0, 0, 1), 12)
     sentences = [
-        f.sentence for f in check(copy, consistency={"min_inside": 0.71}).findings
+        f.sentence
+        for f in check(copy, consistency={"min_inside": 0.71}).findings
     ]
     assert any(s.startswith("camera cam01: joints lie") for s in sentences)
-    assert not any("camera cam00" in s or "camera cam02" in s for s in sentences)
+    assert not any(
+        "camera cam00" in s or "camera cam02" in s for s in sentences
+    )
 
 
 def test_focal_lengths_of_half_are_named(copy, check):
     names = "cam01", "cam03"
     scale_focal(copy, 0.5, *names)
     # the tiny person is of thin discs, so all is smaller than in a capture
-    limits = {"fullness": 1.2, "consistency": {"min_inside": 0.3}, "inside_error": 0.2}
-    errors = [f.sentence for f in check(copy, **limits).findings if f.level == "error"]
+    limits = {
+        "fullness": 1.2,
+        "consistency": {"min_inside": 0.3},
+        "inside_error": 0.2,
+    }
+    errors = [
+        f.sentence for f in check(copy, **limits).findings if f.level == "error"
+    ]
     (found,) = (s for s in errors if "far larger than the body" in s)
     assert all(f"{name} " in found for name in names)
     assert not any("would fit" in s for s in errors)

@@ -20,7 +20,8 @@ SAMPLING = Sampling(images=8)
 def test_images_are_the_same_moments_in_every_camera(subject):
     items = sampled_items(subject, 12)
     frames = {
-        camera: [f for c, f in items if c == camera] for camera in subject.cameras
+        camera: [f for c, f in items if c == camera]
+        for camera in subject.cameras
     }
     assert set(map(tuple, frames.values())) == {(0, 6, 11)}
 
@@ -30,7 +31,8 @@ def test_joints_below_the_image_are_not_outside_its_mask(copy):
     for path in copy.glob("*/cam00/*.png"):
         cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[:48])
     edit_json(
-        copy / "cameras.json", lambda content: content["cam00"].update(size=[64, 48])
+        copy / "cameras.json",
+        lambda content: content["cam00"].update(size=[64, 48]),
     )
     subject = subject_of(GsganData(root=str(copy)))
     views = measure(subject, [("cam00", 3)], SAMPLING)[0]
@@ -50,7 +52,10 @@ def test_joints_far_from_their_detections_are_named(copy):
     assert np.nanmedian(errors) == pytest.approx(0.2)
     found = skeleton_doubts(subject, Limits())
     (doubt,) = (doubt for doubt in found if doubt.kind == "detections")
-    assert (doubt.frame, doubt.text[:14]) == (subject.frames[3], "left_wrist 40 ")
+    assert (doubt.frame, doubt.text[:14]) == (
+        subject.frames[3],
+        "left_wrist 40 ",
+    )
 
 
 def test_units_of_a_good_capture(subject):
@@ -91,8 +96,14 @@ def test_complete_files_have_an_end_mark(tmp_path, content, whole):
 @pytest.mark.parametrize(
     ("make", "named"),
     [
-        (lambda: Sampling(images=0), r"sampling\.images must be a number above 0"),
-        (lambda: Limits(outside="wide"), r"limits\.outside must be a number above 0"),
+        (
+            lambda: Sampling(images=0),
+            r"sampling\.images must be a number above 0",
+        ),
+        (
+            lambda: Limits(outside="wide"),
+            r"limits\.outside must be a number above 0",
+        ),
     ],
 )
 def test_settings_out_of_range_are_refused(make, named):
@@ -116,9 +127,11 @@ def test_every_setting_is_read():
     import gsgan.check
 
     folder = Path(gsgan.check.__file__).parent
-    code = "\n".join(p.read_text() for p in folder.glob("*.py") if p.stem != "settings")
+    code = "\n".join(
+        p.read_text() for p in folder.glob("*.py") if p.stem != "settings"
+    )
     for group in (Sampling, Limits):
         for field in fields(group):
-            assert re.search(rf"\b{group.__name__.lower()}\.{field.name}\b", code), (
-                field.name
-            )
+            assert re.search(
+                rf"\b{group.__name__.lower()}\.{field.name}\b", code
+            ), field.name

@@ -10,7 +10,12 @@ from gsgan.skeleton.template import MEDIAPIPE33
 def silhouette(pixels, depth=2.0, visible=None, size=(200, 120), focal=200.0):
     visible = np.ones(33, bool) if visible is None else visible
     camera = CameraEntry(
-        "a", np.diag([focal, focal, 1]), np.eye(3), np.zeros(3), np.zeros(8), size
+        "a",
+        np.diag([focal, focal, 1]),
+        np.eye(3),
+        np.zeros(3),
+        np.zeros(8),
+        size,
     )
     p = np.concatenate([pixels / focal, np.ones((33, 1))], 1) * depth
     return body_silhouette(camera, p, visible, MEDIAPIPE33)

@@ -75,7 +75,9 @@ def check_poses(layout: Layout, subject: Any, blend: bool = True) -> None:
 def check_skeletons(layout: Layout, subject: Any, kind: str = "smpl") -> None:
     for i, frame in enumerate(subject.frames):
         p, conf = to_mediapipe33(subject.joints[i], subject.vertices[i], kind)
-        assert np.allclose(layout.landmarks.p[frame][conf > 0], p[conf > 0], atol=1e-5)
+        assert np.allclose(
+            layout.landmarks.p[frame][conf > 0], p[conf > 0], atol=1e-5
+        )
         assert np.array_equal(layout.landmarks.visibility[frame], conf)
         assert np.isfinite(layout.landmarks.p[frame]).all()
 
@@ -85,14 +87,22 @@ def check_images(layout: Layout, subject: Any) -> None:
     soft = hasattr(subject, "alphas")
     for i, frame in enumerate(subject.frames):
         for c, name in enumerate(layout.camera_names):
-            cover = subject.alphas[i][c] if soft else 255 * (subject.labels[i][c] > 0)
+            cover = (
+                subject.alphas[i][c]
+                if soft
+                else 255 * (subject.labels[i][c] > 0)
+            )
             mask = read_mask(layout.mask_files(name, frame), layout.pixels)
             clear = np.abs(cover.astype(int) - 127.5) > 12
-            assert np.array_equal(mask[clear], np.where(cover > 127, 255, 0)[clear])
+            assert np.array_equal(
+                mask[clear], np.where(cover > 127, 255, 0)[clear]
+            )
             assert set(np.unique(mask)) <= {0, 255}
             image = read_colour(layout.image_path(name, frame)).astype(int)
             # chroma of a small JPEG
             assert np.abs(image - subject.images[i][c]).mean() < 12
             if layout.labels:
-                found = read_labels(layout.label_path(name, frame), layout.pixels, CIHP)
+                found = read_labels(
+                    layout.label_path(name, frame), layout.pixels, CIHP
+                )
                 assert np.array_equal(found, subject.labels[i][c])

@@ -29,7 +29,9 @@ def ten_frames(tmp_path_factory):
     from make import write_tiny_capture
 
     root = tmp_path_factory.mktemp("data") / "capture"
-    return write_tiny_capture(root, cameras=3, frames=10, labels=True, body_pose=True)
+    return write_tiny_capture(
+        root, cameras=3, frames=10, labels=True, body_pose=True
+    )
 
 
 @pytest.fixture(scope="session")

@@ -41,7 +41,10 @@ def skeletons(frames: int) -> np.ndarray:
     p[7:9] = [[0.07, 0, 1.58], [-0.07, 0, 1.58]]
     p[9:11] = [[0.03, -0.08, 1.5], [-0.03, -0.08, 1.5]]
     for joint in x:
-        p[joint], p[joint + 1] = [x[joint], 0, z[joint]], [-x[joint], 0, z[joint]]
+        p[joint], p[joint + 1] = (
+            [x[joint], 0, z[joint]],
+            [-x[joint], 0, z[joint]],
+        )
     p[29:33] = [
         [0.1, 0.05, 0.03],
         [-0.1, 0.05, 0.03],
@@ -134,28 +137,39 @@ def write_tiny_capture(
         for frame, joints in zip(ids, p, strict=True):
             image, mask = draw_person(camera, joints)
             cv2.imwrite(
-                str(root / f"images/{name}/{frame:06d}.{suffix}"), image[..., ::-1]
+                str(root / f"images/{name}/{frame:06d}.{suffix}"),
+                image[..., ::-1],
             )
             cv2.imwrite(str(root / f"masks/{name}/{frame:06d}.png"), mask)
             if labels:
-                parts = np.where(np.arange(size[1])[:, None] < size[1] // 2, 1, 2) * (
-                    mask > 0
-                )
+                parts = np.where(
+                    np.arange(size[1])[:, None] < size[1] // 2, 1, 2
+                ) * (mask > 0)
                 cv2.imwrite(
-                    str(root / f"labels/{name}/{frame:06d}.png"), parts.astype(np.uint8)
+                    str(root / f"labels/{name}/{frame:06d}.png"),
+                    parts.astype(np.uint8),
                 )
         camera["t"] = [x * per_metre for x in camera["t"]]
     (root / "cameras.json").write_text(json.dumps(rig))
-    content = {"fps": 30, "unit": unit, "up_axis": "z", "skeleton": "mediapipe33"}
+    content = {
+        "fps": 30,
+        "unit": unit,
+        "up_axis": "z",
+        "skeleton": "mediapipe33",
+    }
     content |= (
-        {"pixel_centre": 0.5} | ({"splits": splits} if splits else {}) | (meta or {})
+        {"pixel_centre": 0.5}
+        | ({"splits": splits} if splits else {})
+        | (meta or {})
     )
     (root / "meta.json").write_text(json.dumps(content))
     write_landmarks(root, p=p * per_metre, frame_id=ids)
     if body_pose:
         theta, transl = np.zeros((frames, 56, 3)), np.zeros((frames, 3))
         theta[:, 0, 2], transl[:, 1] = 0.1 * ids, p[:, 0, 1] * per_metre
-        np.savez(root / "body_pose.npz", theta=theta, transl=transl, frame_id=ids)
+        np.savez(
+            root / "body_pose.npz", theta=theta, transl=transl, frame_id=ids
+        )
     return root
 
 
@@ -168,7 +182,8 @@ def write_landmarks(
         "names": np.array(["joint"] * p.shape[1]),
     }
     np.savez(
-        root / "landmarks3d.npz", **(held | {"p": p, "frame_id": frame_id} | arrays)
+        root / "landmarks3d.npz",
+        **(held | {"p": p, "frame_id": frame_id} | arrays),
     )
 
 
@@ -180,7 +195,9 @@ def write_hands(
     rest = _rest()[33:75].reshape(2, 21, 3)
     tips = rest - rest[:, :1]
     tips[:, [8, 12, 16, 20]] = tips[:, [6, 10, 14, 18]] + [0, -0.02, 0]
-    offset = np.stack([tips if f % 2 else rest - rest[:, :1] for f in range(frames)])
+    offset = np.stack(
+        [tips if f % 2 else rest - rest[:, :1] for f in range(frames)]
+    )
     p = (skeletons(frames)[:, [15, 16], None] + offset).reshape(frames, 42, 3)
     held = {"p": p * per_metre, "frame_id": np.arange(frames)}
     np.savez(root / "hands3d.npz", **(held | arrays))

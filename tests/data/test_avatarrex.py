@@ -32,13 +32,17 @@ def test_read_equals_written(root, smplx_subject, smplx_file):
     check_cameras(layout, s.cameras)
     for name in SERIALS:
         assert layout.image_path(name, 1) == root / name / "00000001.jpg"
-        assert layout.mask_path(name, 1) == root / name / "mask/pha/00000001.jpg"
+        assert (
+            layout.mask_path(name, 1) == root / name / "mask/pha/00000001.jpg"
+        )
     check_images(layout, s)
     check_skeletons(layout, s, "smplx")
     assert layout.meta.layout == "AvatarReX"
 
 
-def test_the_list_of_missing_files_is_optional_and_names_serials(root, smplx_file):
+def test_the_list_of_missing_files_is_optional_and_names_serials(
+    root, smplx_file
+):
     (root / "missing_img_files.txt").write_text(
         f"D:\\avatarrex_zzr\\{SERIALS[1]}\\00000002.jpg\n{SERIALS[0]}/mask/pha/00000000.jpg\n"
     )

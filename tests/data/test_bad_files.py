@@ -158,10 +158,14 @@ def cmyk(root: Path) -> None:
 GREY = np.zeros((24, 32), np.uint8)
 CAPTURE: dict[str, Damage] = {
     "cameras.json does not exist": remove("cameras.json"),
-    "cameras.json is not valid JSON.*line 1": write("cameras.json", b'{"cam00": '),
+    "cameras.json is not valid JSON.*line 1": write(
+        "cameras.json", b'{"cam00": '
+    ),
     "must hold a JSON object, found list": write("cameras.json", b"[]"),
     "lists no camera": write("cameras.json", b"{}"),
-    "cam00: expected an object with K, R, t": write("cameras.json", b'{"cam00": 3}'),
+    "cam00: expected an object with K, R, t": write(
+        "cameras.json", b'{"cam00": 3}'
+    ),
     r"images/cam01 does not exist; there are cam00": remove("images/cam01"),
     "has the camera cam07, which .*lists cam00, cam01": write(
         "images/cam07/000000.png", b""
@@ -170,14 +174,22 @@ CAPTURE: dict[str, Damage] = {
     "images/cam00 holds no frames": empty("images/cam00"),
     r"'K' must hold finite numbers of shape \(3, 3\)": camera(K=[[1], [2, 3]]),
     "K must be .*found": camera(K=[[30, 0, 0], [0, 30, 0], [16, 12, 1]]),
-    "cam01: the focal lengths in K": camera(K=[[-30, 0, 16], [0, 30, 12], [0, 0, 1]]),
-    "cam01: R is not a rotation.*by 0.21": camera(R=np.diag([1.0, 1.1, 1.0]).tolist()),
+    "cam01: the focal lengths in K": camera(
+        K=[[-30, 0, 16], [0, 30, 12], [0, 0, 1]]
+    ),
+    "cam01: R is not a rotation.*by 0.21": camera(
+        R=np.diag([1.0, 1.1, 1.0]).tolist()
+    ),
     "R mirrors": camera(R=np.diag([1, 1, -1]).tolist()),
     "dist must hold 4, 5 or 8 finite numbers": camera(dist=[0.1, 0.2, 0.3]),
     r"size must be \[width, height\] in pixels": camera(size=[32.5, 24]),
     "000000.png is 32x24 pixels.*cameras.json has 24x32": camera(size=[24, 32]),
-    "cam01: 100% of the joints lie behind it": edited("cameras.json", turned_round),
-    "cam01: no frame has 4 joints": camera(K=[[30, 0, 900], [0, 30, 12], [0, 0, 1]]),
+    "cam01: 100% of the joints lie behind it": edited(
+        "cameras.json", turned_round
+    ),
+    "cam01: no frame has 4 joints": camera(
+        K=[[30, 0, 900], [0, 30, 12], [0, 0, 1]]
+    ),
     "meta.json does not exist": remove("meta.json"),
     "'unit' is None; expected one of m, cm, mm": meta(unit=None),
     "cameras stand 0.003.* m from the person.*check 'unit'": meta(unit="mm"),
@@ -192,9 +204,15 @@ CAPTURE: dict[str, Damage] = {
     ),
     r"'p' must have shape \(any, 33, 3\)": landmarks(p=np.zeros((4, 25, 3))),
     "'p' must hold numbers, found <U1": landmarks(p=np.full((4, 33, 3), "a")),
-    "frame_id 1 appears more than once": landmarks(frame_id=np.array([0, 1, 1, 2])),
-    "'frame_id' must hold whole numbers": landmarks(frame_id=np.arange(4) + 0.5),
-    "frame_id .* is a time stamp": landmarks(frame_id=np.arange(4) + 1_700_000_000_123),
+    "frame_id 1 appears more than once": landmarks(
+        frame_id=np.array([0, 1, 1, 2])
+    ),
+    "'frame_id' must hold whole numbers": landmarks(
+        frame_id=np.arange(4) + 0.5
+    ),
+    "frame_id .* is a time stamp": landmarks(
+        frame_id=np.arange(4) + 1_700_000_000_123
+    ),
     "has no array 'frame_id'": lambda root: np.savez(
         root / "landmarks3d.npz", p=skeletons(4)
     ),
@@ -204,11 +222,21 @@ CAPTURE: dict[str, Damage] = {
     "no usable frame: 4 without a row in landmarks3d": landmarks(
         frame_id=np.arange(100, 104)
     ),
-    r"hands3d.npz: .*'p' must have shape \(any, 42, 3\)": hands(p=np.zeros((4, 21, 3))),
-    r"hands3d.npz: .*'conf' must have shape \(4, 42\)": hands(conf=np.ones((4, 33))),
-    "hands3d.npz: .*frame_id 0 appears more than once": hands(frame_id=np.zeros(4)),
-    r"face3d.npz: .*'p' must have shape \(any, 30, 3\)": face(p=np.zeros((4, 468, 3))),
-    "'names' must be those .*from mouth_outer_0 to": face(names=np.array(["lip"] * 30)),
+    r"hands3d.npz: .*'p' must have shape \(any, 42, 3\)": hands(
+        p=np.zeros((4, 21, 3))
+    ),
+    r"hands3d.npz: .*'conf' must have shape \(4, 42\)": hands(
+        conf=np.ones((4, 33))
+    ),
+    "hands3d.npz: .*frame_id 0 appears more than once": hands(
+        frame_id=np.zeros(4)
+    ),
+    r"face3d.npz: .*'p' must have shape \(any, 30, 3\)": face(
+        p=np.zeros((4, 468, 3))
+    ),
+    "'names' must be those .*from mouth_outer_0 to": face(
+        names=np.array(["lip"] * 30)
+    ),
     r"'theta' must have shape \(4, any, 3\)": poses(theta=np.zeros((4, 168))),
     "masks/cam00/000000.png shows no person, nor": image("masks/*/*.png", GREY),
     "000001.png has 16 bits a channel": image(
@@ -223,9 +251,13 @@ CAPTURE: dict[str, Damage] = {
     "000001.png is 16x12 pixels .*the image": image(
         "masks/cam01/000001.png", GREY[::2, ::2]
     ),
-    "000001.png is not a valid PNG or JPEG": write("images/cam00/000001.png", b""),
+    "000001.png is not a valid PNG or JPEG": write(
+        "images/cam00/000001.png", b""
+    ),
     "000000.jpg is a CMYK JPEG": cmyk,
-    "is a palette PNG": write("masks/cam00/000001.png", png(32, 24, 8, 3, bytes(32))),
+    "is a palette PNG": write(
+        "masks/cam00/000001.png", png(32, 24, 8, 3, bytes(32))
+    ),
     "frame 1 is there twice, as 000001.png and 0001.png": write(
         "images/cam00/0001.png", b""
     ),
@@ -245,7 +277,9 @@ def params(**values: Any) -> Damage:
 
 def T_times(factor: float) -> Damage:
     return annots(
-        lambda c: c["cams"].update(T=[factor * np.array(T) for T in c["cams"]["T"]])
+        lambda c: c["cams"].update(
+            T=[factor * np.array(T) for T in c["cams"]["T"]]
+        )
     )
 
 
@@ -260,16 +294,24 @@ ZJU: dict[str, Damage] = {
         root / "annots.npy", {"cams": Evil()}
     ),
     "annots.npy has no 'cams'": annots(lambda c: c.pop("cams")),
-    "found 3 K, 3 R, 3 T, 0 D, 3 image folders": annots(lambda c: c["cams"].pop("D")),
+    "found 3 K, 3 R, 3 T, 0 D, 3 image folders": annots(
+        lambda c: c["cams"].pop("D")
+    ),
     "3 D, 0 image folders": annots(lambda c: c.update(ims=[])),
-    "no camera folder holds images": remove("Camera_B1", "Camera_B2", "Camera_B3"),
+    "no camera folder holds images": remove(
+        "Camera_B1", "Camera_B2", "Camera_B3"
+    ),
     r"annots.npy: T is 0.00\d+ m long .*expected 0.05-20 m": T_times(1e-3),
-    "has no SMPL parameters; expected one of .*new_params/": remove("new_params"),
+    "has no SMPL parameters; expected one of .*new_params/": remove(
+        "new_params"
+    ),
     "new_params has no parameters of any frame": lambda root: [
         path.rename(path.with_name(f"9{path.name}"))
         for path in (root / "new_params").iterdir()
     ],
-    "2.npy: 'poses' must hold 72 or 69 numbers": params(poses=np.zeros((1, 66))),
+    "2.npy: 'poses' must hold 72 or 69 numbers": params(
+        poses=np.zeros((1, 66))
+    ),
     "2.npy: the first 3 numbers of 'poses' must be 0": params(
         poses=np.full((1, 72), 0.1)
     ),
@@ -283,29 +325,41 @@ ZJU: dict[str, Damage] = {
 }
 
 
-def people(change: Callable[[list[Any]], object], kind: str = "keypoints3d") -> Damage:
+def people(
+    change: Callable[[list[Any]], object], kind: str = "keypoints3d"
+) -> Damage:
     return edited(f"{kind}/000001.json", change)
 
 
 EASYMOCAP: dict[str, Damage] = {
     "extri.yml lacks .*T_10": replaced("extri.yml", "T_10:", "T_11:"),
-    "extri.yml does not exist; a folder of EasyMocap holds": remove("extri.yml"),
-    "images/4 is not a camera of .*lists 1, 2, 10": lambda root: shutil.copytree(
-        root / "images/1", root / "images/4"
+    "extri.yml does not exist; a folder of EasyMocap holds": remove(
+        "extri.yml"
+    ),
+    "images/4 is not a camera of .*lists 1, 2, 10": lambda root: (
+        shutil.copytree(root / "images/1", root / "images/4")
     ),
     "images holds no folder of a camera.*extract the frames": remove("images"),
     "images/2 holds no images": empty("images/2"),
-    "images/2/000000.jpg is 40x40.*80x40": replaced("intri.yml", "W_2: 40", "W_2: 80"),
+    "images/2/000000.jpg is 40x40.*80x40": replaced(
+        "intri.yml", "W_2: 40", "W_2: 80"
+    ),
     "person 0: 'keypoints3d' must have shape": people(
         lambda p: p[0].pop("keypoints3d")
     ),
-    "needs a whole 'id' that no other has, found 0": people(lambda p: p.append(p[0])),
+    "needs a whole 'id' that no other has, found 0": people(
+        lambda p: p.append(p[0])
+    ),
     "must hold a list of people": people(lambda p: p.append(3)),
-    "000001.json is not valid JSON": write("keypoints3d/000001.json", b"[" * 5000),
+    "000001.json is not valid JSON": write(
+        "keypoints3d/000001.json", b"[" * 5000
+    ),
     "joints lie outside.*one person": image(
         "mask/*/*.png", np.eye(40, dtype=np.uint8) * 255
     ),
-    "mask/1/000000.png does not exist; every image needs a mask": remove("mask"),
+    "mask/1/000000.png does not exist; every image needs a mask": remove(
+        "mask"
+    ),
 }
 
 
@@ -318,7 +372,8 @@ THUMAN4: dict[str, Damage] = {
         "missing_img_files.txt", b"\xffnothing here\n"
     ),
     "leaves no image of camera cam01": write(
-        "missing_img_files.txt", b"".join(b"cam01/%08d.jpg\n" % i for i in range(4))
+        "missing_img_files.txt",
+        b"".join(b"cam01/%08d.jpg\n" % i for i in range(4)),
     ),
     "images/cam01 holds no images": remove("images/cam01"),
     "calibration.json does not exist; a folder of THuman4.0 holds": remove(
@@ -337,7 +392,9 @@ THUMAN4: dict[str, Damage] = {
     ),
     "has 30 coefficients, the model file 10": fitted(betas=np.ones((1, 30))),
     "'betas' must hold finite numbers": fitted(betas=np.full((1, 10), np.nan)),
-    "no finite one of a frame that has images": fitted(transl=np.full((4, 3), np.inf)),
+    "no finite one of a frame that has images": fitted(
+        transl=np.full((4, 3), np.inf)
+    ),
     "smpl_params.npz asks for .*system.*nothing was run": fitted(
         betas=np.array(Evil())
     ),
@@ -346,8 +403,14 @@ THUMAN4: dict[str, Damage] = {
 
 FORMATS: dict[str, tuple[dict[str, Damage], Callable[[Path], object]]] = {
     "capture": (CAPTURE, read_capture),
-    "zju": (ZJU, lambda root: ZjuReader()(root, Thresholds(), str(SMPL["smpl"]))),
-    "easymocap": (EASYMOCAP, lambda root: EasymocapReader()(root, Thresholds())),
+    "zju": (
+        ZJU,
+        lambda root: ZjuReader()(root, Thresholds(), str(SMPL["smpl"])),
+    ),
+    "easymocap": (
+        EASYMOCAP,
+        lambda root: EasymocapReader()(root, Thresholds()),
+    ),
     "thuman4": (
         THUMAN4,
         lambda root: Thuman4Reader()(root, Thresholds(), str(smplx_once())),
@@ -425,7 +488,9 @@ def test_model_files_that_do_not_fit(written, tmp_path):
         DataError, match=r"SMPL parameters but no joints.*data.smpl=/path"
     ):
         zju(written["zju"], None)
-    with pytest.raises(ConfigError, match=r"data.smpl=.*none.pkl does not exist"):
+    with pytest.raises(
+        ConfigError, match=r"data.smpl=.*none.pkl does not exist"
+    ):
         zju(written["zju"], tmp_path / "none.pkl")
     write_smpl(tmp_path / "x.npz", "smplx", vertices=60)
     with pytest.raises(
@@ -444,12 +509,16 @@ def test_model_files_that_do_not_fit(written, tmp_path):
     [("a-b", "must be frame numbers"), ("0-9", "leaves no frame")],
 )
 def test_frames_to_drop_that_cannot_be(written, frames, message):
-    with pytest.raises(ConfigError, match=f"data.reader.drop_frames.*{message}"):
+    with pytest.raises(
+        ConfigError, match=f"data.reader.drop_frames.*{message}"
+    ):
         zju(written["zju"], SMPL["smpl"], drop_frames=frames)
 
 
 def test_wrong_folders_and_frame_numbers(tmp_path):
-    with pytest.raises(DataError, match=r"nowhere does not exist; expected the folder"):
+    with pytest.raises(
+        DataError, match=r"nowhere does not exist; expected the folder"
+    ):
         read_capture(tmp_path / "nowhere")
     (tmp_path / "file").touch()
     with pytest.raises(DataError, match="file is a file, not a folder"):

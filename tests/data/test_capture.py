@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 import torch
 from capture_frames import every_frame, items, png
-from make import edit_json, ring_camera, skeletons, write_landmarks, write_tiny_capture
+from make import (
+    edit_json,
+    ring_camera,
+    skeletons,
+    write_landmarks,
+    write_tiny_capture,
+)
 
 from gsgan.data.dataset import CaptureDataset, ImageCache
 from gsgan.data.formats.capture import CaptureReader, read_capture
@@ -20,7 +26,9 @@ from gsgan.utils.image_files import cut_off
 
 
 def test_frame_holds_what_its_docstring_says(tmp_path):
-    root = write_tiny_capture(tmp_path, labels=True, body_pose=True, first_frame=7)
+    root = write_tiny_capture(
+        tmp_path, labels=True, body_pose=True, first_frame=7
+    )
     frames = every_frame(root)
     assert len(frames) == 8
     frame = cat(frames)
@@ -50,16 +58,23 @@ def test_colours_are_rgb_and_the_background_is_black(tmp_path):
     assert torch.allclose(red, torch.full_like(red, 200 / 255))
     assert torch.allclose(blue, torch.full_like(blue, 60 / 255))
     assert (green <= 200 / 255).all()
-    assert (frame.image[0][:, frame.mask[0, 0] == 0] == 0).all()  # the wall was grey
+    assert (
+        frame.image[0][:, frame.mask[0, 0] == 0] == 0
+    ).all()  # the wall was grey
 
 
 def test_soft_masks_mix_with_black_once(tmp_path):
     root = write_tiny_capture(tmp_path, cameras=1, frames=1)
     cv2.imwrite(
-        str(root / "images/cam00/000000.png"), np.full((24, 32, 3), 100, np.uint8)
+        str(root / "images/cam00/000000.png"),
+        np.full((24, 32, 3), 100, np.uint8),
     )
-    cv2.imwrite(str(root / "masks/cam00/000000.png"), np.full((24, 32), 51, np.uint8))
-    consistency = Consistency(frames=0)  # no pixel of such a mask counts as the person
+    cv2.imwrite(
+        str(root / "masks/cam00/000000.png"), np.full((24, 32), 51, np.uint8)
+    )
+    consistency = Consistency(
+        frames=0
+    )  # no pixel of such a mask counts as the person
     assert torch.allclose(
         every_frame(root, consistency)[0].image, torch.tensor(20 / 255)
     )
@@ -82,7 +97,9 @@ def test_millimetres_become_metres_and_it_is_said(tmp_path):
 def test_frames_pair_by_number_not_by_position(tmp_path):
     root = write_tiny_capture(tmp_path, frames=4)
     (root / "images/cam01/000001.png").unlink()
-    (root / "images/cam00/000002.png").rename(root / "images/cam00/take5_000002.png")
+    (root / "images/cam00/000002.png").rename(
+        root / "images/cam00/take5_000002.png"
+    )
     layout = read_capture(root)
     dataset = CaptureDataset(layout, items(layout))
     assert [f for c, f in dataset.items if c == "cam01"] == [0, 2, 3]
@@ -93,7 +110,9 @@ def test_frames_pair_by_number_not_by_position(tmp_path):
 
 
 def test_a_band_round_the_outline_is_left_out_of_the_loss(tmp_path):
-    layout = CaptureReader(ignore_band=3)(write_tiny_capture(tmp_path), Thresholds())
+    layout = CaptureReader(ignore_band=3)(
+        write_tiny_capture(tmp_path), Thresholds()
+    )
     frame = CaptureDataset(layout, items(layout))[0]
     band = frame.unsure[0, 0] > 0
     person = frame.mask[0, 0] > 0.5
@@ -140,9 +159,12 @@ def test_frames_with_too_few_joints_are_dropped_and_counted(tmp_path):
     layout = read_capture(root)
     assert layout.frames == (0, 3)
     assert any(
-        "1 of 4 frames dropped, with fewer than 12 joints" in n for n in layout.notes
+        "1 of 4 frames dropped, with fewer than 12 joints" in n
+        for n in layout.notes
     )
-    assert any("fewer than 3 of the shoulders and hips: 2" in n for n in layout.notes)
+    assert any(
+        "fewer than 3 of the shoulders and hips: 2" in n for n in layout.notes
+    )
     assert read_capture(root, Thresholds(min_joints=5, min_hubs=0)).frames == (
         0,
         1,
@@ -162,7 +184,9 @@ def test_an_upper_body_without_hips_is_read(tmp_path):
     layout = read_capture(root)
     assert layout.frames == (0, 1, 2, 3)
     hips = np.stack([layout.landmarks.p[f][[23, 24]] for f in range(4)])
-    np.testing.assert_allclose(hips, truth[:, [23, 24]], atol=0.07)  # size by the arms
+    np.testing.assert_allclose(
+        hips, truth[:, [23, 24]], atol=0.07
+    )  # size by the arms
     down = hips.mean(1) - truth[:, [11, 12]].mean(1)
     np.testing.assert_allclose(down, down[:1].repeat(4, axis=0), atol=1e-9)
     assert (
@@ -171,8 +195,12 @@ def test_an_upper_body_without_hips_is_read(tmp_path):
     p[2] = truth[2]  # one frame shows them: its trunk is the others'
     write_landmarks(root, p=p, frame_id=np.arange(4))
     landmarks = read_capture(root).landmarks
-    np.testing.assert_allclose(landmarks.p[0][[23, 24]], truth[0, [23, 24]], atol=0.02)
-    np.testing.assert_allclose(landmarks.p[0][[23, 24], 2], truth[0, [23, 24], 2])
+    np.testing.assert_allclose(
+        landmarks.p[0][[23, 24]], truth[0, [23, 24]], atol=0.02
+    )
+    np.testing.assert_allclose(
+        landmarks.p[0][[23, 24], 2], truth[0, [23, 24], 2]
+    )
 
 
 def test_a_frame_out_of_a_cameras_view_is_dropped_for_that_camera(tmp_path):
@@ -182,7 +210,9 @@ def test_a_frame_out_of_a_cameras_view_is_dropped_for_that_camera(tmp_path):
     write_landmarks(root, p=p, frame_id=np.arange(4))
     layout = read_capture(root)
     assert layout.frames == (0, 1, 3)
-    assert any("camera cam00: 1 frames dropped" in note for note in layout.notes)
+    assert any(
+        "camera cam00: 1 frames dropped" in note for note in layout.notes
+    )
 
 
 def test_a_picture_without_labels_counts_as_ignore(tmp_path):
@@ -198,14 +228,18 @@ def test_bilevel_and_grey_files_are_read(tmp_path):
     (root / "masks/cam00/000000.png").write_bytes(
         png(32, 24, depth=1, kind=0, row=b"\xff" * 4)
     )
-    cv2.imwrite(str(root / "images/cam00/000000.png"), np.full((24, 32), 51, np.uint8))
+    cv2.imwrite(
+        str(root / "images/cam00/000000.png"), np.full((24, 32), 51, np.uint8)
+    )
     (frame,) = every_frame(root)
     assert (frame.mask == 1).all()
     assert torch.allclose(frame.image, torch.tensor(0.2))
 
 
 def test_a_jpeg_without_its_end_is_found_whatever_the_decoder_says(tmp_path):
-    noise = np.random.default_rng(0).integers(0, 255, (32, 32, 3), dtype=np.uint8)
+    noise = np.random.default_rng(0).integers(
+        0, 255, (32, 32, 3), dtype=np.uint8
+    )
     data = cv2.imencode(".jpg", noise)[1].tobytes()
     assert not cut_off(data)
     assert not cut_off(data + b"trailing bytes of some camera")
@@ -223,7 +257,11 @@ def test_an_exif_rotation_is_not_applied(tmp_path):
     block = b"Exif\0\0" + tiff
     data = path.read_bytes()
     path.write_bytes(
-        data[:2] + b"\xff\xe1" + struct.pack(">H", len(block) + 2) + block + data[2:]
+        data[:2]
+        + b"\xff\xe1"
+        + struct.pack(">H", len(block) + 2)
+        + block
+        + data[2:]
     )
     assert cv2.imread(str(path)).shape == (32, 24, 3)
     assert torch.equal(every_frame(root)[0].image, plain)
@@ -239,7 +277,12 @@ def test_cache_keeps_within_its_bound_and_changes_nothing(tmp_path):
         assert 0 < cache.currsize <= cache.maxsize
     assert cache.currsize == cache.maxsize
     shutil.rmtree(tmp_path / "images")
-    assert cached[0].image.shape == (1, 3, 24, 32)  # the last one used is still held
+    assert cached[0].image.shape == (
+        1,
+        3,
+        24,
+        32,
+    )  # the last one used is still held
     with pytest.raises(DataError, match="does not exist"):
         cached[2]
 
@@ -249,7 +292,8 @@ def test_loose_calibration_habits_are_accepted(tmp_path):
     root = write_tiny_capture(tmp_path)
     t = ring_camera(0.0, (32, 24))["t"]
     edit_json(
-        root / "cameras.json", lambda rig: rig["cam00"].update(t=[[x] for x in t])
+        root / "cameras.json",
+        lambda rig: rig["cam00"].update(t=[[x] for x in t]),
     )
     edit_json(root / "cameras.json", lambda rig: rig["cam00"].pop("dist"))
     layout = read_capture(root)

@@ -18,16 +18,21 @@ from gsgan.utils.errors import ConfigError
 
 LENS = (-0.25, 0.08, 0.002, -0.001, 0.01)
 RATIONAL = (0.1, 0.02, 0.001, 0.002, 0.01, 0.3, 0.05, 0.01)
-SPOT = np.array([0.9, -0.1, 1.7])  # metres, where `spot_capture` puts a white spot
+SPOT = np.array(
+    [0.9, -0.1, 1.7]
+)  # metres, where `spot_capture` puts a white spot
 
 
 def spot_capture(
     root: Path, size: tuple[int, int], dist: tuple[float, ...], skew: float
 ) -> Path:
     """One camera whose picture shows nothing but a soft white spot at `SPOT`."""
-    write_tiny_capture(root, cameras=1, frames=1, size=size, dist=dist or (0,) * 5)
+    write_tiny_capture(
+        root, cameras=1, frames=1, size=size, dist=dist or (0,) * 5
+    )
     edit_json(
-        root / "cameras.json", lambda rig: rig["cam00"]["K"][0].__setitem__(1, skew)
+        root / "cameras.json",
+        lambda rig: rig["cam00"]["K"][0].__setitem__(1, skew),
     )
     camera = json.loads((root / "cameras.json").read_text())["cam00"]
     x, y, z = np.array(camera["R"]) @ SPOT + camera["t"]
@@ -54,7 +59,10 @@ def centroid(image: torch.Tensor) -> torch.Tensor:
     grey = image.mean(0)
     grey = grey * (grey > 0.02)
     v, u = (torch.arange(n) + 0.5 for n in grey.shape)
-    return torch.stack([(grey.sum(0) * u).sum(), (grey.sum(1) * v).sum()]) / grey.sum()
+    return (
+        torch.stack([(grey.sum(0) * u).sum(), (grey.sum(1) * v).sum()])
+        / grey.sum()
+    )
 
 
 @pytest.mark.parametrize(
@@ -62,14 +70,18 @@ def centroid(image: torch.Tensor) -> torch.Tensor:
     [((), 0), (LENS, 0), (RATIONAL, 0), (LENS[:4], 0), (LENS, 20)],
     ids=["none", "5", "8", "4", "skewed"],
 )
-@pytest.mark.parametrize("crop", [None, PersonCrop(0.8)], ids=["full", "person"])
+@pytest.mark.parametrize(
+    "crop", [None, PersonCrop(0.8)], ids=["full", "person"]
+)
 @pytest.mark.parametrize("size", [None, 60, 300])
 def test_a_point_in_space_stays_on_its_spot(tmp_path, lens, skew, crop, size):
     """K, R and t of the frame put a 3D point where the picture shows it, whatever was done."""
     (frame,) = every_frame(
         spot_capture(tmp_path, (160, 120), lens, skew), crop=crop, size=size
     )
-    expected, _ = frame.camera.project(torch.from_numpy(SPOT).float()[None, None])
+    expected, _ = frame.camera.project(
+        torch.from_numpy(SPOT).float()[None, None]
+    )
     assert frame.image.shape[-2:] == frame.camera.size
     assert torch.allclose(centroid(frame.image[0]), expected[0, 0], atol=0.1)
 
@@ -89,7 +101,9 @@ def test_labels_are_never_mixed(tmp_path):
     root = write_tiny_capture(tmp_path, labels=True, size=(64, 48), dist=LENS)
     for path in (root / "labels").rglob("*.png"):
         labels = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        cv2.imwrite(str(path), np.where(labels == 2, 200, labels).astype(np.uint8))
+        cv2.imwrite(
+            str(path), np.where(labels == 2, 200, labels).astype(np.uint8)
+        )
     for frame in every_frame(root, size=40, crop=PersonCrop()):
         assert set(frame.labels.unique().tolist()) == {0, 1, 200}
 
@@ -98,7 +112,8 @@ def test_the_crop_comes_from_skeleton_and_camera_alone(tmp_path):
     root = write_tiny_capture(tmp_path)
     before = read_capture(root)
     windows = [
-        CaptureDataset(before, [i], crop=PersonCrop()).window(i) for i in items(before)
+        CaptureDataset(before, [i], crop=PersonCrop()).window(i)
+        for i in items(before)
     ]
     for path in (root / "masks").rglob("*.png"):
         cv2.imwrite(str(path), np.zeros((24, 32), np.uint8))
@@ -119,10 +134,14 @@ def test_crop_is_square_and_has_the_margin_in_metres(tmp_path):
     # focal 480 at 3 m is 160 px a metre: from 0.3 m below the low joint to 0.3 above the high one
     assert window == Crop(200 - 144, 200 - 96, (192, 192))
     usable[0] = False
-    assert PersonCrop(0.3).window(view, joints, usable) == Crop(152, 152, (96, 96))
+    assert PersonCrop(0.3).window(view, joints, usable) == Crop(
+        152, 152, (96, 96)
+    )
 
 
-def test_crop_beyond_the_border_is_black_and_follows_only_what_is_in_view(tmp_path):
+def test_crop_beyond_the_border_is_black_and_follows_only_what_is_in_view(
+    tmp_path,
+):
     layout = read_capture(
         write_tiny_capture(tmp_path, cameras=1, frames=1, size=(400, 400))
     )
@@ -143,7 +162,9 @@ def test_crop_beyond_the_border_is_black_and_follows_only_what_is_in_view(tmp_pa
 def test_crop_without_joints_in_front_is_the_whole_picture(tmp_path):
     layout = read_capture(write_tiny_capture(tmp_path))
     behind = np.tile([0.0, -50.0, 0.9], (33, 1))
-    window = PersonCrop().window(layout.cameras["cam00"], behind, np.ones(33, bool))
+    window = PersonCrop().window(
+        layout.cameras["cam00"], behind, np.ones(33, bool)
+    )
     assert window == square_window((24, 32)) == Crop(-4, 0, (32, 32))
 
 
@@ -170,5 +191,7 @@ def test_real_joints_lie_on_the_person_in_the_crop(real_capture):
         hits, total = hits + int((near[v, u] > 0.5).sum()), total + len(u)
         mask = cv2.imread(str(layout.mask_path(*item)), cv2.IMREAD_GRAYSCALE)
         kept = cut(mask, dataset.window(item)).sum() / mask.sum()
-        assert kept > 0.999, f"{item}: the crop cuts off {1 - kept:.2%} of the person"
+        assert kept > 0.999, (
+            f"{item}: the crop cuts off {1 - kept:.2%} of the person"
+        )
     assert hits / total > 0.9

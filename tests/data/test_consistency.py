@@ -23,7 +23,9 @@ from gsgan.utils.errors import DataError
 
 @pytest.fixture
 def root(tmp_path):
-    return write_tiny_capture(tmp_path / "c", cameras=4, frames=3, size=(64, 96))
+    return write_tiny_capture(
+        tmp_path / "c", cameras=4, frames=3, size=(64, 96)
+    )
 
 
 def read(root: Path, consistency: Consistency = SKELETON_LIMITS) -> Layout:
@@ -65,11 +67,15 @@ def test_a_camera_that_is_wholly_wrong_is_refused(root, change, message):
 
 def test_the_share_of_joints_inside_a_mask():
     K = np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
-    camera = CameraEntry("c", K, np.eye(3), np.zeros(3), np.zeros(8), (100, 100))
+    camera = CameraEntry(
+        "c", K, np.eye(3), np.zeros(3), np.zeros(8), (100, 100)
+    )
     mask = np.zeros((100, 100), np.uint8)
     mask[40:60, 40:60] = 255
     # at 2 m a pixel is 2 cm: 5 px, 11 px (1 px outside), 20 px and far off the middle
-    joints = np.array([[0.1, 0, 2], [0.22, 0, 2], [0.4, 0, 2], [9.0, 0, 2], [0, 0, -2]])
+    joints = np.array(
+        [[0.1, 0, 2], [0.22, 0, 2], [0.4, 0, 2], [9.0, 0, 2], [0, 0, -2]]
+    )
     assert inside_share(mask, camera, joints, 0.05) == pytest.approx(2 / 3)
     assert inside_share(mask, camera, joints, 0.5) == 1
     assert np.isnan(inside_share(0 * mask, camera, joints, 0.05))
@@ -93,13 +99,22 @@ def test_joint_distance_in_metres():
     mask[10:20, 20:40] = True
     distance = mask_distance(mask)
     pixels = np.array(
-        [[30.5, 15.5], [44.5, 15.5], [30.5, 29.5], [-5, 15], [np.nan, 3], [45, 15]]
+        [
+            [30.5, 15.5],
+            [44.5, 15.5],
+            [30.5, 29.5],
+            [-5, 15],
+            [np.nan, 3],
+            [45, 15],
+        ]
     )
     depth = np.array([2.0, 2.0, 4.0, 2.0, 2.0, -1.0])
     seen = np.ones(6, bool)
     metres = joint_distance(distance, pixels, depth, seen, focal=100.0)
     assert metres[:3] == pytest.approx([0, 5 * 2 / 100, 10 * 4 / 100])
-    assert np.isnan(metres[3:]).all()  # off the picture, unknown, behind the camera
+    assert np.isnan(
+        metres[3:]
+    ).all()  # off the picture, unknown, behind the camera
 
 
 def test_far_cameras_are_those_beyond_the_factor():

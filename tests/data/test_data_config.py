@@ -46,7 +46,10 @@ def test_capture_config_builds_and_reads(ten_frames):
     assert data.crop.margin == conf("capture").crop.margin
     wide = instantiate(conf("capture", f"root={ten_frames}", "crop.margin=0.5"))
     assert wide.crop.margin == 0.5
-    assert instantiate(conf("capture", f"root={ten_frames}", "crop=null")).crop is None
+    assert (
+        instantiate(conf("capture", f"root={ten_frames}", "crop=null")).crop
+        is None
+    )
     assert (
         instantiate(conf("capture", f"root={ten_frames}", "crop=person")).crop
         is not None
@@ -58,14 +61,22 @@ def test_capture_config_builds_and_reads(ten_frames):
     ("name", "write", "body", "camera", "skeleton"),
     [
         ("thuman4", write_thuman4, "smplx", "cam02", "smplx -> mediapipe33"),
-        ("avatarrex", write_avatarrex, "smplx", "22010708", "smplx -> mediapipe33"),
+        (
+            "avatarrex",
+            write_avatarrex,
+            "smplx",
+            "22010708",
+            "smplx -> mediapipe33",
+        ),
         ("easymocap", write_easymocap, "smpl", "10", "smpl24 -> mediapipe33"),
     ],
 )
 def test_configs_of_published_formats_read_them_in_worker_processes(
     request, tmp_path, name, write, body, camera, skeleton
 ):
-    subject = request.getfixturevalue("subject" if body == "smpl" else "smplx_subject")
+    subject = request.getfixturevalue(
+        "subject" if body == "smpl" else "smplx_subject"
+    )
     words = [
         f"root={write(tmp_path / name, subject)}",
         "size=16",
@@ -98,8 +109,12 @@ def test_synthetic_config_reads_what_the_generator_would_make(ten_frames):
     assert data.source.func.__name__ == "ensure_scene"
     given = dict(data.source.keywords)
     assert given.pop("workers") == 2
-    assert SceneSettings(**given) == SceneSettings(size=48, frames=12, test_frames=3)
-    made = instantiate(conf("synthetic", f"root={ten_frames}", "skeleton=mediapipe33"))
+    assert SceneSettings(**given) == SceneSettings(
+        size=48, frames=12, test_frames=3
+    )
+    made = instantiate(
+        conf("synthetic", f"root={ten_frames}", "skeleton=mediapipe33")
+    )
     assert made.dataset("train")[0].image.shape[-2:] == (128, 128)
 
 

@@ -16,7 +16,12 @@ import torch
 from commands import quiet_trainer
 from make import edit_json, skeletons, write_tiny_capture
 
-from gsgan.data.datamodule import GsganData, StepSampler, count_labels, pass_order
+from gsgan.data.datamodule import (
+    GsganData,
+    StepSampler,
+    count_labels,
+    pass_order,
+)
 from gsgan.data.formats.capture import read_capture
 from gsgan.effects import EffectSettings, decide
 from gsgan.scene import Frame
@@ -60,7 +65,9 @@ def test_processes_share_the_draws_of_a_step():
         draws(StepSampler(11, 2, 6, seed=0, replicas=2, rank=r), range(2))
         for r in (0, 1)
     ]
-    joined = [pair[r][2 * s + i] for s in range(12) for r in (0, 1) for i in (0, 1)]
+    joined = [
+        pair[r][2 * s + i] for s in range(12) for r in (0, 1) for i in (0, 1)
+    ]
     assert joined == alone
 
 
@@ -89,9 +96,15 @@ class Recorder(lightning.LightningModule):
         return torch.optim.SGD(self.parameters(), lr=0.1)
 
 
-def fit(root: Path, folder: Path, epochs: int, ckpt: Path | None = None) -> Recorder:
+def fit(
+    root: Path, folder: Path, epochs: int, ckpt: Path | None = None
+) -> Recorder:
     data = GsganData(
-        str(root), batch_size=2, steps_per_epoch=3, seed=5, test_cameras=["cam01"]
+        str(root),
+        batch_size=2,
+        steps_per_epoch=3,
+        seed=5,
+        test_cameras=["cam01"],
     )
     model = Recorder()
     trainer = quiet_trainer(folder, max_epochs=epochs)
@@ -103,10 +116,14 @@ def fit(root: Path, folder: Path, epochs: int, ckpt: Path | None = None) -> Reco
 def test_lightning_trains_validates_and_resumes_in_order(ten_frames, tmp_path):
     whole = fit(ten_frames, tmp_path / "whole", 4)
     assert len(whole.seen) == 4 * 3 * 2
-    assert len(whole.validated) == 4 * 2  # 4 held-out pictures in twos, every epoch
+    assert (
+        len(whole.validated) == 4 * 2
+    )  # 4 held-out pictures in twos, every epoch
     assert len(set(whole.seen[:16])) == 16  # 2 cameras × 8 frames, one pass
     first = fit(ten_frames, tmp_path / "part", 2)
-    second = fit(ten_frames, tmp_path / "part", 4, ckpt=tmp_path / "part" / "last.ckpt")
+    second = fit(
+        ten_frames, tmp_path / "part", 4, ckpt=tmp_path / "part" / "last.ckpt"
+    )
     assert first.seen + second.seen == whole.seen
 
 
@@ -115,7 +132,11 @@ def test_lightning_trains_validates_and_resumes_in_order(ten_frames, tmp_path):
 
 def test_loaders_and_datasets(ten_frames):
     data = GsganData(
-        str(ten_frames), size=16, batch_size=2, test_cameras=["cam02"], crop="person"
+        str(ten_frames),
+        size=16,
+        batch_size=2,
+        test_cameras=["cam02"],
+        crop="person",
     )
     batch = next(iter(data.train_dataloader()))
     assert isinstance(batch, Frame)
@@ -148,7 +169,9 @@ def test_batches_travel_as_bytes_and_become_the_datasets_numbers(tmp_path):
         item = (names[int(batch.camera_index[i])], int(batch.frame_id[i]))
         one = dataset[dataset.items.index(item)]
         for name in ("image", "mask", "labels"):
-            assert torch.equal(getattr(on_device, name)[i : i + 1], getattr(one, name))
+            assert torch.equal(
+                getattr(on_device, name)[i : i + 1], getattr(one, name)
+            )
 
 
 def test_on_a_gpu_batches_are_pinned_and_copied_while_the_host_goes_on(
@@ -163,8 +186,15 @@ def test_on_a_gpu_batches_are_pinned_and_copied_while_the_host_goes_on(
         current_epoch=0,
     )
     assert data.train_dataloader().pin_memory
-    frame, moved, pinned, plain = data.dataset("train")[0], [], [], torch.Tensor.to
-    monkeypatch.setattr(torch.Tensor, "pin_memory", lambda x: pinned.append(x) or x)
+    frame, moved, pinned, plain = (
+        data.dataset("train")[0],
+        [],
+        [],
+        torch.Tensor.to,
+    )
+    monkeypatch.setattr(
+        torch.Tensor, "pin_memory", lambda x: pinned.append(x) or x
+    )
     monkeypatch.setattr(
         torch.Tensor,
         "to",
@@ -182,7 +212,9 @@ def watched(**keys: Any) -> list[tuple[int, int]]:
     return [(int(f.camera_index), int(f.frame_id)) for f in frames]
 
 
-def test_pictures_watched_while_training_are_spread_over_held_out_poses(ten_frames):
+def test_pictures_watched_while_training_are_spread_over_held_out_poses(
+    ten_frames,
+):
     keys = {"root": str(ten_frames), "test_frames": "5-9"}
     assert watched(**keys, val_images=99) == [
         (c, f) for c in range(3) for f in range(5, 10)
@@ -213,7 +245,10 @@ def test_notes_reach_the_log(tmp_path, caplog):
     with caplog.at_level(logging.WARNING, logger="gsgan"):
         GsganData(str(root), test_frames=[3, 77]).setup()
     assert "lengths converted from mm to metres" in caplog.text
-    assert "1 frames of the splits are not usable or do not exist: 77" in caplog.text
+    assert (
+        "1 frames of the splits are not usable or do not exist: 77"
+        in caplog.text
+    )
 
 
 def test_scene_info(ten_frames):
@@ -237,7 +272,8 @@ def test_scene_info(ten_frames):
 def test_scene_info_sees_the_lens_of_training_cameras_only(tmp_path):
     root = write_tiny_capture(tmp_path, meta={"body": "free"})
     edit_json(
-        root / "cameras.json", lambda rig: rig["cam01"].update(dist=[0.1, 0, 0, 0])
+        root / "cameras.json",
+        lambda rig: rig["cam01"].update(dist=[0.1, 0, 0, 0]),
     )
     assert GsganData(str(root)).info.has_distortion
     info = GsganData(str(root), test_cameras=["cam01"]).info
@@ -263,7 +299,10 @@ def test_the_held_out_split_decides_no_effect(tmp_path):
         rig["cam02"]["K"][1][1] *= 1.5
 
     edit_json(root / "cameras.json", nearer)
-    for image in (*root.glob("images/cam02/*"), *root.glob("images/*/0000[89]*")):
+    for image in (
+        *root.glob("images/cam02/*"),
+        *root.glob("images/*/0000[89]*"),
+    ):
         cv2.imwrite(str(image), 255 - cv2.imread(str(image)))
     assert decisions() == before
 
@@ -290,7 +329,9 @@ def test_a_capture_may_be_posed_by_the_users_own_smpl_file(tmp_path):
 
 def test_labels_are_counted_without_the_ignore_value(tmp_path):
     root = write_tiny_capture(tmp_path, cameras=1, frames=2, labels=True)
-    cv2.imwrite(str(root / "labels/cam00/000001.png"), np.full((24, 32), 255, np.uint8))
+    cv2.imwrite(
+        str(root / "labels/cam00/000001.png"), np.full((24, 32), 255, np.uint8)
+    )
     layout = read_capture(root)
     assert count_labels(layout, (("cam00", 0), ("cam00", 1))) == 3
     assert count_labels(layout, (("cam00", 1),)) == 1
@@ -340,7 +381,9 @@ def test_batches_need_one_size(ten_frames):
 def test_the_real_capture_is_read_whole(real_capture):
     data = GsganData(str(real_capture), size=128, crop="person", info_samples=4)
     assert data.layout.camera_names == ("cam01", "cam02", "cam03", "cam04")
-    assert all(list(files) == list(range(70)) for files in data.layout.images.values())
+    assert all(
+        list(files) == list(range(70)) for files in data.layout.images.values()
+    )
     assert data.layout.notes == ()
     assert len(data.dataset("train")) == 4 * 56
     assert data.splits.test_frames == tuple(range(56, 70))

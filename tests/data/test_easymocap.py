@@ -7,7 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from capture_frames import check_cameras, check_images, check_poses, check_skeletons
+from capture_frames import (
+    check_cameras,
+    check_images,
+    check_poses,
+    check_skeletons,
+)
 from make import edit_json
 from writers.common import write_picture
 from writers.easymocap import (
@@ -42,7 +47,9 @@ def read(root: Path, smpl: Path | None = None, **settings: Any) -> Layout:
 @pytest.fixture(scope="module")
 def written(tmp_path_factory, subject):
     """Keypoints and fits; do not write into it."""
-    return write_easymocap(tmp_path_factory.mktemp("easymocap") / "take", subject)
+    return write_easymocap(
+        tmp_path_factory.mktemp("easymocap") / "take", subject
+    )
 
 
 def edit_people(
@@ -51,7 +58,9 @@ def edit_people(
     edit_json(root / f"keypoints3d/{frame:06d}.json", change)
 
 
-def refused(root: Path, *parts: str, smpl: Path | None = None, **settings: Any) -> None:
+def refused(
+    root: Path, *parts: str, smpl: Path | None = None, **settings: Any
+) -> None:
     with pytest.raises(DataError) as caught:
         read(root, smpl, **settings)
     assert "\n" not in str(caught.value)
@@ -64,7 +73,14 @@ def refused(root: Path, *parts: str, smpl: Path | None = None, **settings: Any) 
     [
         ["Camera_B2", "Camera_B10"],
         ["2", "10", "a"],
-        ["rate -2", "rate -0.5", "rate 1e-3", "rate 0.05", "rate 0.5", "rate 10"],
+        [
+            "rate -2",
+            "rate -0.5",
+            "rate 1e-3",
+            "rate 0.05",
+            "rate 0.5",
+            "rate 10",
+        ],
         ["1400000000000000001", "1400000000000000002"],
         ["cam", "cam 1", "cam_1"],
     ],
@@ -84,7 +100,9 @@ def test_cameras_are_paired_by_name_and_have_their_images(written, subject):
     assert layout.notes == ()
 
 
-@pytest.mark.parametrize("options", [{"sizes": False}, {"lens": "D"}, {"both": False}])
+@pytest.mark.parametrize(
+    "options", [{"sizes": False}, {"lens": "D"}, {"both": False}]
+)
 def test_other_ways_to_write_the_calibration(root, subject, options):
     write_calibration(root, subject, **options)
     check_cameras(read(root), subject.cameras)
@@ -104,19 +122,25 @@ def test_keypoints_are_the_landmarks_that_body_25_knows(written, subject):
                 )
         assert np.allclose(conf, expected)
         unknown = layout.landmarks.p[frame][conf == 0]
-        assert np.linalg.norm(unknown, axis=-1).min() > 0.5  # stand-ins are never zero
+        assert (
+            np.linalg.norm(unknown, axis=-1).min() > 0.5
+        )  # stand-ins are never zero
     meta = layout.meta
     assert (meta.skeleton_source, meta.body) == ("body25 -> mediapipe33", None)
     assert layout.poses is None
 
 
 def test_hands_give_the_fingers(tmp_path, subject):
-    root = write_easymocap(tmp_path / "take", subject, hands=True, output="output/")
+    root = write_easymocap(
+        tmp_path / "take", subject, hands=True, output="output/"
+    )
     landmarks = read(root).landmarks
     hands = hand_joints(subject, 2)[:, :3].reshape(2, 21, 3)
     for side in (0, 1):  # knuckles of the little finger, index, and thumb
         for landmark, joint in ((17, 17), (19, 5), (21, 2)):
-            assert np.allclose(landmarks.p[2][landmark + side], hands[side, joint])
+            assert np.allclose(
+                landmarks.p[2][landmark + side], hands[side, joint]
+            )
             assert landmarks.visibility[2][landmark + side] == 0.8
 
 
@@ -125,7 +149,10 @@ def test_fits_give_skeletons_and_poses(written, subject, smpl_file):
     check_skeletons(layout, subject)
     check_poses(layout, subject)
     assert layout.meta.skeleton_source == "smpl24 -> mediapipe33"
-    assert (layout.meta.body.kind, layout.meta.body.file) == ("smpl", str(smpl_file))
+    assert (layout.meta.body.kind, layout.meta.body.file) == (
+        "smpl",
+        str(smpl_file),
+    )
 
 
 def test_which_skeleton_is_taken(root, smpl_file):
@@ -162,7 +189,10 @@ def test_omissions_are_noted(root, subject):
     ):
         assert any(note in held for held in layout.notes), note
     refused(
-        root, "has no person 7 in the 3 of its 3 files", "(found: 0, 1, 5)", person=7
+        root,
+        "has no person 7 in the 3 of its 3 files",
+        "(found: 0, 1, 5)",
+        person=7,
     )
 
 
@@ -175,13 +205,17 @@ def test_joints_without_confidence_are_unknown(root):
         people[0]["keypoints3d"][6] = [float("nan"), 0, 0, 1]
 
     def without_confidence(people: list[Any]) -> None:
-        people[0]["keypoints3d"] = [joint[:3] for joint in people[0]["keypoints3d"]]
+        people[0]["keypoints3d"] = [
+            joint[:3] for joint in people[0]["keypoints3d"]
+        ]
 
     edit_people(root, change)
     edit_people(root, without_confidence, frame=2)
     landmarks = read(root).landmarks
     assert landmarks.visibility[1][[13, 15, 16]].tolist() == [0, 0, 0]
-    assert np.allclose(landmarks.p[1][15], landmarks.p[0][15])  # as in the frame before
+    assert np.allclose(
+        landmarks.p[1][15], landmarks.p[0][15]
+    )  # as in the frame before
     assert set(landmarks.visibility[2]) == {0, 1}
 
 
@@ -191,7 +225,9 @@ def test_joints_without_confidence_are_unknown(root):
 def test_a_persons_own_mask_goes_before_nobodys(tmp_path, subject):
     root = write_easymocap(tmp_path / "take", subject, person=3, pid=True)
     write_picture(root / "mask/1/000000.png", np.full((40, 40), 255, np.uint8))
-    write_picture(root / "mask/1/000000_0.png", np.full((40, 40), 255, np.uint8))
+    write_picture(
+        root / "mask/1/000000_0.png", np.full((40, 40), 255, np.uint8)
+    )
     layout = read(root, person=3)
     assert layout.mask_path("1", 0).name == "000000_3.png"
     assert layout.mask_path("2", 2).name == "000002_3.png"

@@ -81,7 +81,11 @@ def _thuman4(root: Path, _: object) -> None:
 FORMATS = {
     "capture": (_capture, CaptureReader(), None),
     "zju_original": (zju.write_original, ZjuReader(), "smpl"),
-    "zju_313": (lambda root, s: zju.write_313(root, s, (1, 2, 3)), ZjuReader(), "smpl"),
+    "zju_313": (
+        lambda root, s: zju.write_313(root, s, (1, 2, 3)),
+        ZjuReader(),
+        "smpl",
+    ),
     "zju_refined": (zju.write_refined, ZjuReader(), "smpl"),
     "thuman4": (_thuman4, Thuman4Reader(), "smplx"),
     "avatarrex": (

@@ -28,7 +28,9 @@ def two_frames(root: Path, settings: dict[str, object]) -> list[Frame]:
 
 
 @pytest.mark.parametrize(("unit", "per_metre"), [("m", 1), ("mm", 1000)])
-def test_skeletons_have_33_or_75_or_105_joints_in_metres(tmp_path, unit, per_metre):
+def test_skeletons_have_33_or_75_or_105_joints_in_metres(
+    tmp_path, unit, per_metre
+):
     root = write_tiny_capture(tmp_path, unit=unit)
     extra = write_hands(root, 4, per_metre), write_face(root, 4, per_metre)
     joints = np.concatenate([skeletons(4), *extra], axis=1)
@@ -39,7 +41,9 @@ def test_skeletons_have_33_or_75_or_105_joints_in_metres(tmp_path, unit, per_met
         ("holistic", 105),
     ):
         settings = HANDS | {"skeleton": skeleton}
-        for number, frame in zip((0, 2), two_frames(root, settings), strict=True):
+        for number, frame in zip(
+            (0, 2), two_frames(root, settings), strict=True
+        ):
             np.testing.assert_allclose(
                 frame.skeleton[0], joints[number, :count], atol=1e-6
             )
@@ -134,19 +138,30 @@ def test_fitted_poses_have_their_fingers_with_hands_alone(root):
     with pytest.raises(
         ConfigError, match=r"made body_pose.npz without hands; run it again"
     ):
-        assert GsganData(str(root), size=32, skeleton="mediapipe33_hands").layout
+        assert GsganData(
+            str(root), size=32, skeleton="mediapipe33_hands"
+        ).layout
     assert GsganData(str(root), **HANDS).layout.poses is None  # to fit anew
     poses["transl"][:, 0] = 2.0
-    with_hands = {"theta_hands": np.ones((4, 56, 3)), "transl_hands": np.ones((4, 3))}
+    with_hands = {
+        "theta_hands": np.ones((4, 56, 3)),
+        "transl_hands": np.ones((4, 3)),
+    }
     np.savez(root / "body_pose.npz", **poses, **with_hands)
     for skeleton, value, x in (
         ("mediapipe33", 0.0, 2.0),
         ("mediapipe33_hands", 1.0, 1.0),
     ):
-        body = GsganData(str(root), size=32, skeleton=skeleton).dataset("train")[0].body
+        body = (
+            GsganData(str(root), size=32, skeleton=skeleton)
+            .dataset("train")[0]
+            .body
+        )
         assert body.theta.unique().tolist() == [value]
         assert body.transl[0, 0] == x
     with_hands["theta_hands"] = np.ones((4, 20, 3))
     np.savez(root / "body_pose.npz", **poses, **with_hands)
-    with pytest.raises(DataError, match=r"'theta_hands' must have shape \(4, 56, 3\)"):
+    with pytest.raises(
+        DataError, match=r"'theta_hands' must have shape \(4, 56, 3\)"
+    ):
         read_capture(root)

@@ -52,7 +52,9 @@ def test_headers_of_large_captures_are_checked_in_steps(tmp_path, monkeypatch):
         lambda path, *rest: (read.append(path), check(path, *rest)),
     )
     read_capture(root)
-    assert len([path for path in read if "images" in path.parts]) == 6  # every fourth
+    assert (
+        len([path for path in read if "images" in path.parts]) == 6
+    )  # every fourth
 
 
 @pytest.mark.parametrize(

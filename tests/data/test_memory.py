@@ -34,7 +34,9 @@ def resident() -> int:
 def layout(tmp_path_factory):
     root = tmp_path_factory.mktemp("memory") / "c"
     return read_capture(
-        write_tiny_capture(root, cameras=2, frames=6, size=(256, 256), suffix="jpg")
+        write_tiny_capture(
+            root, cameras=2, frames=6, size=(256, 256), suffix="jpg"
+        )
     )
 
 
@@ -70,8 +72,12 @@ def index_bytes(root: Path) -> int:
 
 
 def test_the_index_takes_a_kilobyte_a_picture(tmp_path):
-    few = write_tiny_capture(tmp_path / "few", cameras=2, frames=10, size=(16, 16))
-    many = write_tiny_capture(tmp_path / "many", cameras=2, frames=110, size=(16, 16))
+    few = write_tiny_capture(
+        tmp_path / "few", cameras=2, frames=10, size=(16, 16)
+    )
+    many = write_tiny_capture(
+        tmp_path / "many", cameras=2, frames=110, size=(16, 16)
+    )
     index_bytes(few)  # what is imported or made once
     grown = index_bytes(many) - index_bytes(few)
     assert 0 < grown / 200 < 1500  # a picture on the disk has 50 000 and more

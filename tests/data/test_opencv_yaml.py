@@ -8,14 +8,14 @@ from gsgan.data.calibration import MAX_YAML_BYTES, read_opencv_yaml
 from gsgan.utils.errors import DataError
 
 HEAD = "%YAML:1.0\n---\n"
-MATRIX = (
-    "M: !!opencv-matrix\n   rows: 2\n   cols: 1\n   dt: d\n   data: [ 1., -2.5e-3 ]\n"
-)
+MATRIX = "M: !!opencv-matrix\n   rows: 2\n   cols: 1\n   dt: d\n   data: [ 1., -2.5e-3 ]\n"
 
 
 def test_opencvs_files_are_read_as_opencv_reads_them(tmp_path):
     names, rng = ["01", "cam a", "1e3", "ü"], np.random.default_rng(0)
-    matrices = {f"M_{i}": rng.standard_normal(rng.integers(1, 15, 2)) for i in range(5)}
+    matrices = {
+        f"M_{i}": rng.standard_normal(rng.integers(1, 15, 2)) for i in range(5)
+    }
     write_opencv(tmp_path / "rig.yml", names, {**matrices, "H_1": 1920})
     found = read_opencv_yaml(tmp_path / "rig.yml")
     for key, matrix in matrices.items():
@@ -55,7 +55,9 @@ DAMAGE = {
 def test_damage_is_one_sentence(tmp_path, text):
     path = tmp_path / "a.yml"
     path.write_text(text)
-    with pytest.raises(DataError, match="is not readable as OpenCV YAML") as failure:
+    with pytest.raises(
+        DataError, match="is not readable as OpenCV YAML"
+    ) as failure:
         read_opencv_yaml(path)
     assert str(path) in str(failure.value)
     assert "\n" not in str(failure.value)

@@ -37,16 +37,21 @@ def test_mask_rules(grey, rule, expected):
     assert np.array_equal(read_mask([(rule, grey)], RULES), expected)
 
 
-def test_masks_are_joined_by_their_maximum_and_must_agree_in_size(grey, tmp_path):
+def test_masks_are_joined_by_their_maximum_and_must_agree_in_size(
+    grey, tmp_path
+):
     other = tmp_path / "other.png"
     cv2.imwrite(str(other), VALUES[:, ::-1])
     mask = read_mask([("threshold", grey), ("threshold", other)], RULES)
     assert np.array_equal(mask, [[0, 0, 0], [255, 255, 255]])
     mixed = read_mask([("grey", grey), ("threshold", other)], RULES)
-    assert np.array_equal(mixed, np.maximum(VALUES, [[0, 0, 0], [255, 255, 255]]))
+    assert np.array_equal(
+        mixed, np.maximum(VALUES, [[0, 0, 0], [255, 255, 255]])
+    )
     cv2.imwrite(str(other), VALUES.T)
     with pytest.raises(
-        DataError, match=r"other.png and .*grey.png, masks of one image, differ in size"
+        DataError,
+        match=r"other.png and .*grey.png, masks of one image, differ in size",
     ):
         read_mask([("grey", grey), ("grey", other)], RULES)
 
@@ -65,7 +70,8 @@ def test_the_ringing_of_a_jpeg_is_no_person(tmp_path):
     cv2.imwrite(str(tmp_path / "m.JPG"), mask)
     ringing, sound = MaskFile("nonzero", "m.JPG"), mask_file("m.JPG")
     first, second = (
-        read_mask([(f.rule, tmp_path / f.path)], PixelRules()) for f in (ringing, sound)
+        read_mask([(f.rule, tmp_path / f.path)], PixelRules())
+        for f in (ringing, sound)
     )
     assert np.count_nonzero(first) > np.count_nonzero(mask)
     np.testing.assert_array_equal(second, mask)
@@ -75,7 +81,9 @@ def test_the_ringing_of_a_jpeg_is_no_person(tmp_path):
 def test_labels_go_through_their_table(grey):
     table = [255] * 256
     table[0], table[1], table[200] = 0, 2, 1
-    labels = read_labels(grey, PixelRules(label_table=tuple(table)), ["none", "a", "b"])
+    labels = read_labels(
+        grey, PixelRules(label_table=tuple(table)), ["none", "a", "b"]
+    )
     assert np.array_equal(labels, [[0, 2, 255], [255, 1, 255]])
     with pytest.raises(
         DataError, match=r"grey.png holds the label 200; the dataset names 2 "

@@ -17,16 +17,26 @@ from gsgan.utils.errors import ConfigError, DataError
 NAMES = sorted(
     {p.stem for p in (config_folder() / "protocol").glob("*.yaml")} - {"none"}
 )
-SCORED = {"zju_humannerf": 16, "paper_zju": 16, "zju_gauhuman": 17}  # frames a camera
+SCORED = {
+    "zju_humannerf": 16,
+    "paper_zju": 16,
+    "zju_gauhuman": 17,
+}  # frames a camera
 SCORED |= {"thuman4_posevocab": 500, "paper_thuman4": 500}
 ONE = Protocol(
-    "one", train_cameras=[0], test_cameras=None, train_frames="0-5", test_frames="0-9:4"
+    "one",
+    train_cameras=[0],
+    test_cameras=None,
+    train_frames="0-5",
+    test_frames="0-9:4",
 )
 
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
-    return write_tiny_capture(tmp_path_factory.mktemp("capture"), cameras=4, frames=10)
+    return write_tiny_capture(
+        tmp_path_factory.mktemp("capture"), cameras=4, frames=10
+    )
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +54,8 @@ def test_frames_may_have_a_step():
 
 
 @pytest.mark.parametrize(
-    "value", ["0-99999999999", "5000000000", 10**10, "9" * 5000, ["0-600", "601-1200"]]
+    "value",
+    ["0-99999999999", "5000000000", 10**10, "9" * 5000, ["0-600", "601-1200"]],
 )
 def test_frames_without_end_are_refused(value, monkeypatch):
     monkeypatch.setattr("gsgan.data.splits.MAX_LISTED_FRAMES", 1000)
@@ -82,8 +93,9 @@ def test_new_poses_seen_by_a_camera_that_trains(layout):
         ("cam02", 9),
     )
     assert splits.reasons == {"novel_view": "protocol poses has none"}
-    assert "90 frames of protocol poses are not usable or do not exist: 10-99" in (
-        splits.notes
+    assert (
+        "90 frames of protocol poses are not usable or do not exist: 10-99"
+        in (splits.notes)
     )
 
 
@@ -140,7 +152,11 @@ def test_protocols_that_do_not_fit(layout, changes, error, message):
         ("truth_outline", 0.5, "must be soft or hard; got 0.5"),
         ("ssim_window", 7, "must be gaussian or uniform; got 7"),
         ("lpips_channels", "RGB", "must be rgb or bgr; got 'RGB'"),
-        ("region", "mask", "must be full or body_box_cleared or body_box; got 'mask'"),
+        (
+            "region",
+            "mask",
+            "must be full or body_box_cleared or body_box; got 'mask'",
+        ),
         ("lpips_region", None, "must be full or mask_crop_512; got None"),
         (
             "lpips_range",
@@ -151,7 +167,9 @@ def test_protocols_that_do_not_fit(layout, changes, error, message):
     ],
 )
 def test_measures_are_named_ones(name, value, message):
-    with pytest.raises(ConfigError, match=f"protocol.measures.{name} {message}"):
+    with pytest.raises(
+        ConfigError, match=f"protocol.measures.{name} {message}"
+    ):
         MetricVariants(**{name: value})
 
 
@@ -166,10 +184,14 @@ def test_measures_take_what_yaml_gives():
 
 
 def test_frames_by_subject():
-    protocol = replace(ONE, train_frames={377: "0-569"}, test_frames={377: "0-569:30"})
+    protocol = replace(
+        ONE, train_frames={377: "0-569"}, test_frames={377: "0-569:30"}
+    )
     assert replace(protocol, subject="377").frames("train") == "0-569"
     assert replace(protocol, subject=377).record()["test_frames"] == "0-569:30"
-    with pytest.raises(ConfigError, match=r"protocol.subject is 378: .* one of 377"):
+    with pytest.raises(
+        ConfigError, match=r"protocol.subject is 378: .* one of 377"
+    ):
         replace(protocol, subject=378).frames("test")
 
 
@@ -197,14 +219,16 @@ def test_the_data_follows_the_protocol_and_records_it(root):
     record = data.protocol_record(["vgg"])
     assert json.loads(json.dumps(record)) == record  # plain values
     assert record["name"] == "one"
-    (padded,) = record["departures"]  # 16 of 32 pixels, but the pictures are 32 x 24
+    (padded,) = record[
+        "departures"
+    ]  # 16 of 32 pixels, but the pictures are 32 x 24
     assert padded.startswith("images are padded to squares with black")
     whole = GsganData(str(root), protocol=ONE).protocol_record(["vgg"])
     assert whole["departures"] == []
     assert GsganData(str(root)).protocol_record(["vgg"]) is None
-    cut = GsganData(str(root), size=16, crop="person", protocol=ONE).protocol_record(
-        ["vgg"]
-    )
+    cut = GsganData(
+        str(root), size=16, crop="person", protocol=ONE
+    ).protocol_record(["vgg"])
     assert len(cut["departures"]) == 1
 
 
@@ -213,14 +237,22 @@ def test_cameras_of_other_sizes_depart_from_the_scale(root):
     name, camera = list(data.layout.cameras.items())[-1]
     data.layout.cameras[name] = replace(camera, size=(48, 64))
     departures = data.protocol_record(["vgg"])["departures"]
-    assert "images are scored at scale 0.25, requested: 0.5 (data.size)" in departures
+    assert (
+        "images are scored at scale 0.25, requested: 0.5 (data.size)"
+        in departures
+    )
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_protocol_composes_and_is_whole(compose, name):
     from hydra.utils import instantiate
 
-    overrides = ["data=capture", "data.root=/none", f"protocol={name}", "size=tiny"]
+    overrides = [
+        "data=capture",
+        "data.root=/none",
+        f"protocol={name}",
+        "size=tiny",
+    ]
     if "humannerf" in name or name == "paper_zju":
         overrides.append("protocol.subject=394")
     config = compose("train", *overrides)
@@ -238,6 +270,7 @@ def test_the_frames_of_zju_are_those_that_were_scored(compose):
     """ceil(n / 30) pictures a camera: the published counts."""
     config = compose("train", "data=capture", "protocol=zju_humannerf")
     counts = {
-        k: len(parse_frames(v, k)) for k, v in config.protocol.test_frames.items()
+        k: len(parse_frames(v, k))
+        for k, v in config.protocol.test_frames.items()
     }
     assert counts == {377: 19, 386: 18, 387: 18, 392: 19, 393: 22, 394: 16}

@@ -23,20 +23,28 @@ def test_default_splits_hold_out_the_last_frames(layout):
     assert splits.test_frames == (8, 9)
     assert len(splits.items["train"]) == 24
     assert not splits.items["novel_view"]
-    assert splits.reasons == {"novel_view": "no camera is held out (data.test_cameras)"}
+    assert splits.reasons == {
+        "novel_view": "no camera is held out (data.test_cameras)"
+    }
     assert set(splits.items["novel_pose"]) == {
         (c, f) for c in layout.cameras for f in (8, 9)
     }
     assert (
-        make_splits(layout, test_share=0).reasons["novel_pose"].startswith("no frame")
+        make_splits(layout, test_share=0)
+        .reasons["novel_pose"]
+        .startswith("no frame")
     )
 
 
 def test_splits_of_the_config_with_ranges_and_the_rest(layout):
-    splits = make_splits(layout, test_cameras=["cam01"], train_frames=["0-2", 5])
+    splits = make_splits(
+        layout, test_cameras=["cam01"], train_frames=["0-2", 5]
+    )
     assert splits.train_cameras == ("cam00", "cam02")
     assert splits.test_frames == (3, 4, 6, 7, 8, 9)
-    assert set(splits.items["novel_view"]) == {("cam01", f) for f in (0, 1, 2, 5)}
+    assert set(splits.items["novel_view"]) == {
+        ("cam01", f) for f in (0, 1, 2, 5)
+    }
     assert {f for _, f in splits.items["novel_pose"]} == {3, 4, 6, 7, 8, 9}
     assert splits.reasons == {}
     assert make_splits(layout, train_cameras=["cam02"]).test_cameras == (
@@ -80,10 +88,17 @@ def test_train_poses_are_far_from_each_other_and_held_out_frames_stay(layout):
 
 
 def test_splits_of_meta_json_give_way_to_the_config(tmp_path):
-    held = {"test_cameras": ["cam01"], "train_frames": [0, 1], "test_frames": [2, 3]}
+    held = {
+        "test_cameras": ["cam01"],
+        "train_frames": [0, 1],
+        "test_frames": [2, 3],
+    }
     layout = read_capture(write_tiny_capture(tmp_path, splits=held))
     splits = make_splits(layout)
-    assert (splits.train_cameras, splits.test_cameras) == (("cam00",), ("cam01",))
+    assert (splits.train_cameras, splits.test_cameras) == (
+        ("cam00",),
+        ("cam01",),
+    )
     assert (splits.train_frames, splits.test_frames) == ((0, 1), (2, 3))
     mine = make_splits(layout, test_cameras=[], test_frames=[0])
     assert (mine.train_cameras, mine.test_cameras) == (("cam00", "cam01"), ())
@@ -111,7 +126,11 @@ def test_frames_that_are_not_there_are_noted(layout):
             DataError,
             "nothing to train on .* 0 train frames; .* 0-9",
         ),
-        ({"train_cameras": []}, DataError, "nothing to train on with cameras none"),
+        (
+            {"train_cameras": []},
+            DataError,
+            "nothing to train on with cameras none",
+        ),
         (
             {"train_cameras": ["cam00"], "test_cameras": ["cam00"]},
             ConfigError,
@@ -133,7 +152,11 @@ def test_frames_that_are_not_there_are_noted(layout):
             ConfigError,
             "data.train_cameras must be a list of camera names",
         ),
-        ({"test_share": 1.0}, ConfigError, r"data.test_share must be in \[0, 1\)"),
+        (
+            {"test_share": 1.0},
+            ConfigError,
+            r"data.test_share must be in \[0, 1\)",
+        ),
     ],
 )
 def test_splits_that_cannot_be(layout, keys, error, message):

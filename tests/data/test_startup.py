@@ -13,7 +13,9 @@ from gsgan.data.datamodule import GsganData, default_workers
 from gsgan.data.dataset import CaptureDataset
 from gsgan.skeleton import MEDIAPIPE33
 
-MOUTH = [MEDIAPIPE33.names.index(name) for name in ("mouth_left", "mouth_right")]
+MOUTH = [
+    MEDIAPIPE33.names.index(name) for name in ("mouth_left", "mouth_right")
+]
 
 
 @pytest.fixture
@@ -46,7 +48,9 @@ def test_painting_takes_as_many_operators_without_a_mouth_as_with_one(
 
 def test_looking_a_scene_over_holds_few_images_at_once(tmp_path, monkeypatch):
     """8 moments of 4 cameras are compared; all of them at 1330 × 1150 would be gigabytes."""
-    root = write_tiny_capture(tmp_path / "c", cameras=4, frames=12, size=(48, 48))
+    root = write_tiny_capture(
+        tmp_path / "c", cameras=4, frames=12, size=(48, 48)
+    )
     alive: weakref.WeakSet = weakref.WeakSet()
     maximum, reads = 0, 0
     plain = CaptureDataset.__getitem__

@@ -44,7 +44,9 @@ def test_a_mask_in_the_colours_is_read_whatever_its_alpha(tmp_path):
 
 @pytest.mark.parametrize("value", [1, 100, 127])
 def test_masks_that_never_reach_one_half_are_named(tmp_path, value):
-    cv2.imwrite(str(tmp_path / "m.png"), np.where(SOFT > 99, value, 0).astype(np.uint8))
+    cv2.imwrite(
+        str(tmp_path / "m.png"), np.where(SOFT > 99, value, 0).astype(np.uint8)
+    )
     with pytest.raises(DataError, match=rf"m\.png holds 0 and {value} alone"):
         mask_of(tmp_path / "m.png")
 
@@ -69,14 +71,28 @@ def test_the_reported_masks():
 
 @needs_reports
 def test_yaml_without_its_directive_is_read():
-    found = read_calibration(REPORTS / "calibration" / "no_directive" / "intri.yml")
+    found = read_calibration(
+        REPORTS / "calibration" / "no_directive" / "intri.yml"
+    )
     assert list(found.cameras) == ["cam01", "cam02", "cam03"]
 
 
 @needs_reports
-def test_a_scene_of_nerfstudio_is_named():
-    with pytest.raises(DataError, match=r"transforms\.json is a scene of nerfstudio"):
-        read_calibration(REPORTS / "calibration" / "transforms.json")
+def test_a_scene_of_nerfstudio_is_read():
+    """One K for all frames, OpenGL's axes, and a unit of length that is not metres."""
+    found = read_calibration(REPORTS / "calibration" / "transforms.json")
+    assert list(found.cameras) == ["cam01", "cam02", "cam03"]
+    assert not found.metric
+    camera = found.cameras["cam01"]
+    assert camera.size == (128, 96)
+    assert tuple(camera.K[[0, 1, 0, 1], [0, 1, 2, 2]]) == (150, 150, 48, 64)
+    # The file's last column is the camera's centre, its third one points away from the scene.
+    np.testing.assert_allclose(
+        -camera.R.T @ camera.t, [0.635742, -3.136213, 1.0], atol=1e-6
+    )
+    np.testing.assert_allclose(
+        camera.R[2], [-0.198572, 0.979588, -0.031235], atol=1e-6
+    )
 
 
 # -- landmarks
@@ -103,7 +119,9 @@ def write_frames(folder: Path, people: list) -> Path:
 
 
 def triples(count: int) -> list[float]:
-    return [x for joint in range(count) for x in (10.0 + joint, 20.0 + joint, 0.9)]
+    return [
+        x for joint in range(count) for x in (10.0 + joint, 20.0 + joint, 0.9)
+    ]
 
 
 def test_null_people_are_nobody(tmp_path):
@@ -124,7 +142,9 @@ def test_the_keys_of_2017_are_read_and_unknown_ones_named(tmp_path):
     )
     np.testing.assert_array_equal(old.px, new.px)
     with pytest.raises(DataError, match=r"keypoints\.json.*found joints2d"):
-        read_detections(write_frames(tmp_path / "other", [{"joints2d": triples(25)}]))
+        read_detections(
+            write_frames(tmp_path / "other", [{"joints2d": triples(25)}])
+        )
 
 
 def test_openposes_18_joints(tmp_path):
@@ -133,7 +153,9 @@ def test_openposes_18_joints(tmp_path):
     )
     # MediaPipe's nose, left shoulder, right wrist, left hip: OpenPose's 0, 5, 4, 11
     for landmark, joint in ((0, 0), (11, 5), (16, 4), (23, 11)):
-        np.testing.assert_allclose(found.px[0, landmark], [10.5 + joint, 20.5 + joint])
+        np.testing.assert_allclose(
+            found.px[0, landmark], [10.5 + joint, 20.5 + joint]
+        )
 
 
 def body_25b() -> tuple[np.ndarray, list[float]]:
@@ -155,7 +177,9 @@ def test_body_25b_is_told_from_body_25_by_the_middle_of_the_hips(tmp_path):
     )
     for landmark, joint in ((0, 0), (11, 5), (16, 10), (23, 11), (28, 16)):
         np.testing.assert_allclose(found.px[0, landmark], coco[joint] + 0.5)
-    np.testing.assert_allclose(found.px[0, 32], [42.5, 102.5])  # the right big toe
+    np.testing.assert_allclose(
+        found.px[0, 32], [42.5, 102.5]
+    )  # the right big toe
 
 
 def test_25_joints_without_hips_are_doubtful(tmp_path):
@@ -173,15 +197,21 @@ def test_25_joints_without_hips_are_doubtful(tmp_path):
     inputs, detections = with_detections(inputs, {"a": told, "b": untold})
     assert inputs.notes == ["first", f"b: {note}"]
     assert list(detections) == ["a", "b"]
-    others = write_frames(tmp_path / "others", [{"pose_keypoints_2d": triples(18)}])
+    others = write_frames(
+        tmp_path / "others", [{"pose_keypoints_2d": triples(18)}]
+    )
     assert read_detections(others).notes == ()
 
 
 @needs_reports
 def test_the_reported_detections():
-    nobody = read_detections(REPORTS / "detections" / "null_person" / "cam01_json")
+    nobody = read_detections(
+        REPORTS / "detections" / "null_person" / "cam01_json"
+    )
     assert nobody.px.shape[0] > 0
-    old = read_detections(REPORTS / "prepare" / "landmarks" / "old_keys" / "cam01_json")
+    old = read_detections(
+        REPORTS / "prepare" / "landmarks" / "old_keys" / "cam01_json"
+    )
     assert (old.conf[:, [11, 12, 23, 24]] > 0).all()
     other = read_detections(
         REPORTS / "prepare" / "landmarks" / "body_25b" / "cam01_json"

@@ -60,9 +60,15 @@ def test_read_equals_written(written, smplx_subject, smplx_file):
             layout.poses.transl[frame][None],
         )
         motion = SmplMotion(
-            np.array([frame]), theta, transl, s.params["betas"].astype(float), face
+            np.array([frame]),
+            theta,
+            transl,
+            s.params["betas"].astype(float),
+            face,
         )
-        assert np.allclose(posed(s.model, motion)[0][0], s.vertices[i], atol=1e-6)
+        assert np.allclose(
+            posed(s.model, motion)[0][0], s.vertices[i], atol=1e-6
+        )
     meta = layout.meta
     assert (meta.skeleton_source, meta.up_axis, meta.fps) == (
         "smplx -> mediapipe33",
@@ -78,11 +84,14 @@ def test_hands_move_their_landmarks(root, smplx_file):
     bent = read(root, smplx_file)
     edit_npz(
         root / "smpl_params.npz",
-        lambda arrays: [arrays.pop(f"{s}_hand_pose") for s in ("left", "right")],
+        lambda arrays: [
+            arrays.pop(f"{s}_hand_pose") for s in ("left", "right")
+        ],
     )
     flat = read(root, smplx_file)
     assert any(
-        "has no left_hand_pose and right_hand_pose" in note for note in flat.notes
+        "has no left_hand_pose and right_hand_pose" in note
+        for note in flat.notes
     )
     moved = np.linalg.norm(bent.landmarks.p[3] - flat.landmarks.p[3], axis=-1)
     moved[bent.landmarks.visibility[3] == 0] = 0  # stand-ins
@@ -112,20 +121,31 @@ def test_listed_files_are_left_out(tmp_path, smplx_subject, smplx_file):
     layout = read(root, smplx_file)
     named = read_missing(root / "missing_img_files.txt", layout.cameras)
     assert named == {("cam01", 2), ("cam02", 3), ("cam00", 99)}
-    assert (2 in layout.images["cam01"], 3 in layout.images["cam02"]) == (False, False)
+    assert (2 in layout.images["cam01"], 3 in layout.images["cam02"]) == (
+        False,
+        False,
+    )
     assert "3 images named in" in layout.notes[0]
     assert "2 of them with a file" in layout.notes[0]
 
 
 def test_a_lens_is_not_applied_but_noted(tmp_path, smplx_subject, smplx_file):
-    root = write_thuman4(tmp_path / "s", smplx_subject, distCoeff=[0.1, 0, 0, 0, 0])
+    root = write_thuman4(
+        tmp_path / "s", smplx_subject, distCoeff=[0.1, 0, 0, 0, 0]
+    )
     layout = read(root, smplx_file)
     assert not any(camera.distorted for camera in layout.cameras.values())
-    assert any("gives 3 cameras lens distortion" in note for note in layout.notes)
-    assert read(root, smplx_file, undistort=True).cameras["cam00"].dist[0] == 0.1
+    assert any(
+        "gives 3 cameras lens distortion" in note for note in layout.notes
+    )
+    assert (
+        read(root, smplx_file, undistort=True).cameras["cam00"].dist[0] == 0.1
+    )
 
 
-def test_frames_without_finite_parameters_are_dropped_and_named(root, smplx_file):
+def test_frames_without_finite_parameters_are_dropped_and_named(
+    root, smplx_file
+):
     def change(arrays: dict[str, Any]) -> None:
         arrays["body_pose"][1, 7] = np.nan
         for key in arrays.keys() - {"betas"}:
@@ -136,7 +156,8 @@ def test_frames_without_finite_parameters_are_dropped_and_named(root, smplx_file
     assert layout.frames == (0, 2)
     assert any("NaN or infinity at frames 1" in note for note in layout.notes)
     assert any(
-        "without a row in smpl_params.npz: 1, 3" in note for note in layout.notes
+        "without a row in smpl_params.npz: 1, 3" in note
+        for note in layout.notes
     )
 
 
@@ -162,10 +183,15 @@ def test_the_unsure_band_is_an_option(root, smplx_file):
     def unsure(**settings: Any) -> np.ndarray | None:
         layout = read(root, smplx_file, consistency=NO_LOOK, **settings)
         files = layout.mask_files("cam00", 0)
-        return read_unsure(files, read_mask(files, layout.pixels), layout.pixels)
+        return read_unsure(
+            files, read_mask(files, layout.pixels), layout.pixels
+        )
 
     assert unsure() is None
-    band, both = unsure(ignore_band=5), unsure(ignore_band=5, ignore_alpha=(5, 250))
+    band, both = (
+        unsure(ignore_band=5),
+        unsure(ignore_band=5, ignore_alpha=(5, 250)),
+    )
     assert np.flatnonzero(band[20]).tolist() == [22, 23, 24, 25]
     assert np.flatnonzero(both[20]).tolist() == [*range(8), 22, 23, 24, 25]
     layout = read(root, smplx_file, consistency=NO_LOOK, ignore_band=5)

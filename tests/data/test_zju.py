@@ -11,7 +11,12 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from capture_frames import check_cameras, check_images, check_poses, check_skeletons
+from capture_frames import (
+    check_cameras,
+    check_images,
+    check_poses,
+    check_skeletons,
+)
 from writers import zju as writers
 from writers.common import make_subject, write_picture
 
@@ -33,7 +38,9 @@ def read(root: Path, smpl: Path | None, **settings: Any) -> Layout:
 
 
 def frame_of(layout: Layout, camera: int, frame: int, **given: Any) -> Frame:
-    return CaptureDataset(layout, [(layout.camera_names[camera], frame)], **given)[0]
+    return CaptureDataset(
+        layout, [(layout.camera_names[camera], frame)], **given
+    )[0]
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +51,9 @@ def written(tmp_path_factory, subject):
     )
 
 
-def test_the_original_release_is_read_as_it_was_written(written, subject, smpl_file):
+def test_the_original_release_is_read_as_it_was_written(
+    written, subject, smpl_file
+):
     layout = read(written, smpl_file)
     assert layout.camera_names == ("Camera_B1", "Camera_B2", "Camera_B3")
     assert layout.frames == (0, 1, 2, 3)
@@ -52,15 +61,22 @@ def test_the_original_release_is_read_as_it_was_written(written, subject, smpl_f
     check_skeletons(layout, subject)
     check_poses(layout, subject)
     check_images(layout, subject)
-    assert layout.notes == ("lengths of the cameras converted from mm to metres",)
+    assert layout.notes == (
+        "lengths of the cameras converted from mm to metres",
+    )
     meta = layout.meta
-    assert (meta.skeleton_source, meta.up_axis) == ("smpl24 -> mediapipe33", "-z")
+    assert (meta.skeleton_source, meta.up_axis) == (
+        "smpl24 -> mediapipe33",
+        "-z",
+    )
     assert (meta.body.kind, meta.body.file) == ("smpl", str(smpl_file))
     assert np.allclose(meta.body.betas, subject.shapes)
     assert meta.label_names == CIHP
 
 
-def test_scores_have_the_labels_that_training_ignores(subject, smpl_file, tmp_path):
+def test_scores_have_the_labels_that_training_ignores(
+    subject, smpl_file, tmp_path
+):
     plain = replace(
         subject, cameras=[replace(c, dist=np.zeros(5)) for c in subject.cameras]
     )
@@ -88,7 +104,9 @@ def test_the_outline_of_the_labels_is_ignored_as_wide_as_asked(
         labels = frame_of(layout, 0, 0, ignore_band=True).labels
         found[band] = int((labels == 255).sum())
         kept = labels[0].numpy() != 255
-        assert np.array_equal(labels[0].numpy()[kept], subject.labels[0][0][kept])
+        assert np.array_equal(
+            labels[0].numpy()[kept], subject.labels[0][0][kept]
+        )
     assert found[0] == 0 < found[3] < found[5]
 
 
@@ -128,7 +146,9 @@ def test_the_refit_goes_before_the_first_fit_which_has_no_pose_blend_shapes(
     root = writers.write_original(tmp_path / "s", first, params="params")
     check_skeletons(read(root, smpl_file), first)
     check_poses(read(root, smpl_file), first, blend=False)
-    moved = replace(subject, Th=subject.Th + 0.01, vertices=subject.vertices + 0.01)
+    moved = replace(
+        subject, Th=subject.Th + 0.01, vertices=subject.vertices + 0.01
+    )
     moved = replace(moved, joints=subject.joints + 0.01)
     writers.write_original(root, moved)
     check_skeletons(read(root, smpl_file), moved)
@@ -211,7 +231,12 @@ def test_the_config_trains_with_segmentation_on_cihp_labels(
     avatar = build_avatar(config, info, data.labelled("train")).eval()
     painting = avatar(*data.dataset("train")[0].inputs)
     assert "class vote over 9 images" in avatar.segmentation_why
-    assert painting.segmentation.shape == (1, avatar.segmentation.classes, 32, 32)
+    assert painting.segmentation.shape == (
+        1,
+        avatar.segmentation.classes,
+        32,
+        32,
+    )
     assert set(avatar.segmentation.map.names) < set(CIHP)
     assert torch.isfinite(painting.image).all()
 

@@ -38,7 +38,9 @@ def parameters(avatar) -> int:
         ("colour_correction", "on", True),
     ],
 )
-def test_off_builds_no_parameter_and_calls_no_operator(build, effect, word, adds):
+def test_off_builds_no_parameter_and_calls_no_operator(
+    build, effect, word, adds
+):
     _, off, frame = build(NONE)
     _, on, _ = build(NONE, f"effects.{effect}={word}")
     assert (parameters(on) > parameters(off)) == adds
@@ -58,7 +60,9 @@ def test_the_mean_of_all_maps_is_the_identity_and_unseen_cameras_keep_theirs():
     torch.testing.assert_close(colour.affine.mean(0), identity)
     maps = colour.of_cameras(torch.tensor([0, 1, 2, 3]))
     assert torch.equal(maps[2], identity)
-    assert torch.equal(maps[[1, 0, 3]], colour.affine)  # by name, whatever the order
+    assert torch.equal(
+        maps[[1, 0, 3]], colour.affine
+    )  # by name, whatever the order
 
 
 def test_images_are_mapped_and_the_background_stays_black():
@@ -112,7 +116,9 @@ def test_degrees_above_the_active_one_are_neither_computed_nor_moved(build):
 def test_decisions_are_stored_and_taken_up_again(capture, inside, tmp_path):
     folder = tmp_path / "run"
     words = ("effects.view_dependence=1", "effects.colour_correction=on")
-    result = inside("train", *arguments(capture, folder), *words, "evaluate=false")
+    result = inside(
+        "train", *arguments(capture, folder), *words, "evaluate=false"
+    )
     assert result.returncode == 0, result.stderr
     assert re.search(r"colour_correction .*on", result.stdout)
     assert re.search(r"view_dependence .*1", result.stdout)
@@ -122,11 +128,15 @@ def test_decisions_are_stored_and_taken_up_again(capture, inside, tmp_path):
     stored = checkpoint["gsgan"]["effects"]
     assert stored["view_dependence"]["value"] == 1
     assert stored["cameras"] == ["cam00", "cam01"]
-    result = inside("evaluate", f"run={folder}", "splits=[novel_pose]", "grid_rows=1")
+    result = inside(
+        "evaluate", f"run={folder}", "splits=[novel_pose]", "grid_rows=1"
+    )
     assert result.returncode == 0, result.stderr
 
 
-def test_a_trained_avatar_has_what_its_checkpoint_says_not_what_the_scene_says_now(run):
+def test_a_trained_avatar_has_what_its_checkpoint_says_not_what_the_scene_says_now(
+    run,
+):
     """The decision is made once: evaluation does not decide again."""
     config = load_config(run)
     OmegaConf.update(config, "effects.antialias", "on")
@@ -137,7 +147,12 @@ def test_a_trained_avatar_has_what_its_checkpoint_says_not_what_the_scene_says_n
 
 def test_all_means_all_that_this_model_can_have(build):
     _, avatar, frame = build("effects=all", "model=splat_only")
-    every = {"view_dependence", "antialias", "colour_correction", "random_background"}
+    every = {
+        "view_dependence",
+        "antialias",
+        "colour_correction",
+        "random_background",
+    }
     every |= {"body_points"}
     assert {name for name, effect in avatar.effects if effect.on} == every
     assert torch.isfinite(avatar(*frame.inputs).image).all()
@@ -166,7 +181,10 @@ def test_paintings_follow_the_lens_with_every_map(build, tmp_path):
         assert getattr(painting, name).shape[-2:] == frame.image.shape[-2:]
         assert torch.isfinite(getattr(painting, name)).all()
     assert (
-        0 <= float(painting.splat_alpha.min()) <= float(painting.splat_alpha.max()) <= 1
+        0
+        <= float(painting.splat_alpha.min())
+        <= float(painting.splat_alpha.max())
+        <= 1
     )
 
     def overlap(alpha: torch.Tensor) -> float:

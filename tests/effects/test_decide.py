@@ -6,7 +6,13 @@ import pytest
 
 from gsgan.data.scene_info import SceneInfo
 from gsgan.data.surface_colours import SurfaceColours
-from gsgan.effects import EFFECT_NAMES, Effects, EffectSettings, ModelParts, decide
+from gsgan.effects import (
+    EFFECT_NAMES,
+    Effects,
+    EffectSettings,
+    ModelParts,
+    decide,
+)
 from gsgan.effects.decide import CHOICES
 from gsgan.utils.errors import ConfigError
 
@@ -38,7 +44,11 @@ def test_a_plain_scene_calls_for_what_it_always_had():
     ("change", "effect", "value"),
     [
         ({"surface": GLOSSY}, "view_dependence", 2),
-        ({"surface": replace(ALIKE, difference=0.07)}, "colour_correction", "on"),
+        (
+            {"surface": replace(ALIKE, difference=0.07)},
+            "colour_correction",
+            "on",
+        ),
         ({"has_distortion": True}, "distortion", "undistort"),
         ({"scale_train": (40.0, 60.0)}, "antialias", "on"),
         ({"body_inside": 1.0}, "body_points", "on"),
@@ -52,7 +62,9 @@ def test_each_call_turns_on_its_own_effect_and_no_other(change, effect, value):
     )
     assert getattr(after, effect).value == value
     assert {
-        n for n in EFFECT_NAMES if getattr(before, n).value != getattr(after, n).value
+        n
+        for n in EFFECT_NAMES
+        if getattr(before, n).value != getattr(after, n).value
     } == {effect}
 
 
@@ -82,7 +94,9 @@ def test_scales_that_are_to_be_rendered_call_for_antialias(scales):
     assert "differ by" in found.why
 
 
-@pytest.mark.parametrize("scales", [(1,), (2, 1), (0, 1), ("a", 1), (1, float("nan"))])
+@pytest.mark.parametrize(
+    "scales", [(1,), (2, 1), (0, 1), ("a", 1), (1, float("nan"))]
+)
 def test_rendered_scales_are_two_rising_numbers(scales):
     with pytest.raises(ConfigError, match="rendered_scales"):
         EffectSettings(rendered_scales=scales)
@@ -104,17 +118,25 @@ def test_the_degree_follows_the_number_of_cameras(cameras, degree):
             {},
             "no camera of this data has a lens coefficient",
         ),
-        ({"colour_correction": "on"}, {"n_train_cameras": 1}, "one training camera"),
+        (
+            {"colour_correction": "on"},
+            {"n_train_cameras": 1},
+            "one training camera",
+        ),
         ({"body_points": "on"}, {"has_body_pose": False}, "no body pose"),
         ({"body_points": "on"}, {"body": "smpl"}, "no model file"),
         ({"only": ["distortion"]}, {}, "effects.distortion=on is not possible"),
     ],
 )
-def test_forcing_the_impossible_is_one_sentence_or_left_out(setting, change, why):
+def test_forcing_the_impossible_is_one_sentence_or_left_out(
+    setting, change, why
+):
     with pytest.raises(ConfigError, match=why) as caught:
         decide(scene(**change), EffectSettings(**setting))
     assert "\n" not in str(caught.value)
-    lenient = decide(scene(**change), EffectSettings(**setting, impossible="off"))
+    lenient = decide(
+        scene(**change), EffectSettings(**setting, impossible="off")
+    )
     assert not getattr(lenient, next(iter(setting)), lenient.distortion).on
 
 
@@ -124,7 +146,9 @@ def test_a_lens_that_painting_does_not_know_is_refused_or_undistorted():
         ConfigError, match=r"distortion=project is not possible: .*k4, k5, k6"
     ):
         decide(rational, EffectSettings(distortion="project"))
-    lenient = decide(rational, EffectSettings(distortion="project", impossible="off"))
+    lenient = decide(
+        rational, EffectSettings(distortion="project", impossible="off")
+    )
     assert lenient.distortion.value == "undistort"
     assert "k4" in lenient.distortion.why
 
@@ -133,7 +157,10 @@ def test_a_lens_that_painting_does_not_know_is_refused_or_undistorted():
 def test_a_list_leaves_lenses_to_their_own_word(word):
     bent = scene(has_distortion=True)
     found = decide(bent, EffectSettings(distortion=word, only=["antialias"]))
-    assert found.distortion == decide(bent, EffectSettings(distortion=word)).distortion
+    assert (
+        found.distortion
+        == decide(bent, EffectSettings(distortion=word)).distortion
+    )
     assert found.distortion.on == (word != "off")
     named = decide(bent, EffectSettings(distortion=word, only=["distortion"]))
     assert named.distortion.on
@@ -142,13 +169,19 @@ def test_a_list_leaves_lenses_to_their_own_word(word):
 @pytest.mark.parametrize(
     ("model", "effect", "why"),
     [
-        (ModelParts(points=False), "body_points", "has no points on the skeleton"),
+        (
+            ModelParts(points=False),
+            "body_points",
+            "has no points on the skeleton",
+        ),
         (ModelParts(splats=False), "antialias", "has no Gaussians"),
     ],
 )
 def test_an_effect_that_the_model_lacks_is_off_or_refused(model, effect, why):
     auto = decide(
-        scene(body_inside=1.0, scale_train=(51.0, 590.0)), EffectSettings(), model
+        scene(body_inside=1.0, scale_train=(51.0, 590.0)),
+        EffectSettings(),
+        model,
     )
     assert why in getattr(auto, effect).why
     assert not getattr(auto, effect).on
@@ -165,12 +198,18 @@ def test_an_effect_that_the_model_lacks_is_off_or_refused(model, effect, why):
 @pytest.mark.parametrize(
     ("wrong", "named"),
     [
-        ({"antialias": "maybe"}, "effects.antialias must be one of auto, on, off"),
+        (
+            {"antialias": "maybe"},
+            "effects.antialias must be one of auto, on, off",
+        ),
         ({"view_dependence": 4}, "effects.view_dependence must be one of"),
         ({"degree_cameras": [4, 2, 8]}, "three rising numbers"),
         ({"only": ["colours"]}, "effects.only must list some of"),
         ({"only": "antialias"}, "effects.only must list some of"),
-        ({"impossible": "maybe"}, "effects.impossible must be one of error, off"),
+        (
+            {"impossible": "maybe"},
+            "effects.impossible must be one of error, off",
+        ),
     ],
 )
 def test_wrong_settings_are_named(wrong, named):
@@ -206,7 +245,9 @@ def test_forced_values_win_over_the_scene():
     assert found.degree == 3
     assert on(found) == {"view_dependence", "antialias"}
     assert decide(scene(), EffectSettings(view_dependence="on")).degree == 2
-    assert on(decide(scene(), EffectSettings(only=["antialias"]))) == {"antialias"}
+    assert on(decide(scene(), EffectSettings(only=["antialias"]))) == {
+        "antialias"
+    }
 
 
 def test_a_run_is_not_resumed_with_other_effects():

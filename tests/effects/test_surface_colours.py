@@ -24,7 +24,10 @@ def ball(
     K = np.array([[160.0, 0, SIZE / 2], [0, 160.0, SIZE / 2], [0, 0, 1]])
     v, u = np.mgrid[:SIZE, :SIZE] + 0.5
     rays = (
-        np.stack([(u - SIZE / 2) / 160, (v - SIZE / 2) / 160, np.ones_like(u)], -1) @ R
+        np.stack(
+            [(u - SIZE / 2) / 160, (v - SIZE / 2) / 160, np.ones_like(u)], -1
+        )
+        @ R
     )
     a, b = (rays**2).sum(-1), rays @ centre
     root = b**2 - a * (centre @ centre - RADIUS**2)
@@ -34,7 +37,11 @@ def ball(
     ) / RADIUS
     light = 0.3 + 0.4 * np.clip(normal[..., 0], 0, 1)
     texture = 1 + 0.1 * np.sin(4 * normal[..., 2] + moment)
-    colour = (light * texture)[..., None] * np.array([1.0, 0.8, 0.7]) * np.array(gain)
+    colour = (
+        (light * texture)[..., None]
+        * np.array([1.0, 0.8, 0.7])
+        * np.array(gain)
+    )
     towards = np.clip(-(normal @ forward), 0, 1)
     colour += gloss * (towards[..., None] ** 30)
     image = np.where(hit[..., None], colour, 0).clip(0, 1)
@@ -45,7 +52,12 @@ def ball(
     )
     tensor = {
         name: torch.tensor(value, dtype=torch.float32)[None]
-        for name, value in {"K": K, "R": R, "t": -R @ centre, "p": joints}.items()
+        for name, value in {
+            "K": K,
+            "R": R,
+            "t": -R @ centre,
+            "p": joints,
+        }.items()
     }
     return Frame(
         image=torch.tensor(image, dtype=torch.float32).permute(2, 0, 1)[None],
@@ -63,7 +75,10 @@ def moments(
 ) -> list[list[Frame]]:
     gains = tint or [(1.0, 1.0, 1.0)] * len(angles)
     return [
-        [ball(a, m, gain=g, **options) for a, g in zip(angles, gains, strict=True)]
+        [
+            ball(a, m, gain=g, **options)
+            for a, g in zip(angles, gains, strict=True)
+        ]
         for m in range(count)
     ]
 
@@ -71,7 +86,9 @@ def moments(
 def test_light_from_one_side_is_no_tint():
     frames = moments()
     means = [float(f.image.sum() / f.mask.sum()) for f in frames[0]]
-    assert max(means) - min(means) > 0.3  # what a mean over the person would fall for
+    assert (
+        max(means) - min(means) > 0.3
+    )  # what a mean over the person would fall for
     seen = surface_colours(frames)
     assert seen.difference < 0.02
     assert seen.residual < 0.05
@@ -95,17 +112,23 @@ def test_highlights_are_what_is_left():
 def test_without_shared_surface_nothing_is_claimed(damage):
     from dataclasses import replace
 
-    frames = moments(angles=(0.0, np.pi)) if damage == "far apart" else moments()
+    frames = (
+        moments(angles=(0.0, np.pi)) if damage == "far apart" else moments()
+    )
     if damage == "coarse":
         frames = [
-            [replace(f, camera=replace(f.camera, K=f.camera.K * 0.3)) for f in m]
+            [
+                replace(f, camera=replace(f.camera, K=f.camera.K * 0.3))
+                for f in m
+            ]
             for m in frames
         ]
     if damage == "few moments":
         frames = frames[:2]
     if damage == "empty masks":
         frames = [
-            [replace(f, mask=f.mask * 0, image=f.image * 0) for f in m] for m in frames
+            [replace(f, mask=f.mask * 0, image=f.image * 0) for f in m]
+            for m in frames
         ]
     # a joint 1 km off: carving so wide a box would take all memory
     if damage == "astray":

@@ -19,7 +19,13 @@ def copied(run, tmp_path):
 
 def evaluated(compose, folder, *overrides: str) -> pd.DataFrame:
     evaluate_config(
-        compose("evaluate", f"run={folder}", "device=cpu", "lpips.nets=[]", *overrides)
+        compose(
+            "evaluate",
+            f"run={folder}",
+            "device=cpu",
+            "lpips.nets=[]",
+            *overrides,
+        )
     )
     return pd.read_csv(folder / "scores.csv")
 
@@ -52,11 +58,16 @@ def test_an_interrupted_scoring_goes_on(copied, compose, monkeypatch, capsys):
     assert not (copied / ".scoring").exists()
 
 
-def test_the_config_of_the_caller_stays_as_it_is(copied, capture, compose, tmp_path):
+def test_the_config_of_the_caller_stays_as_it_is(
+    copied, capture, compose, tmp_path
+):
     """Its null for LPIPS' networks means those of each run."""
     (copied / "checkpoints/last.ckpt").unlink()
     data = ("data=capture", f"data.root={capture}")
-    for given in ([f"run={copied}"], [f"predictions={tmp_path / 'none'}", *data]):
+    for given in (
+        [f"run={copied}"],
+        [f"predictions={tmp_path / 'none'}", *data],
+    ):
         config = compose("evaluate", "device=cpu", *given)
         before = config.copy()
         with pytest.raises(DataError):
@@ -64,7 +75,9 @@ def test_the_config_of_the_caller_stays_as_it_is(copied, capture, compose, tmp_p
         assert config == before
 
 
-def test_scores_of_other_settings_are_not_used(copied, compose, monkeypatch, capsys):
+def test_scores_of_other_settings_are_not_used(
+    copied, compose, monkeypatch, capsys
+):
     with monkeypatch.context() as patch:
         interrupt(patch, after=3)
         with pytest.raises(KeyboardInterrupt):
@@ -85,7 +98,9 @@ def test_a_damaged_file_is_written_again(copied, compose, capsys):
 def test_a_part_of_the_images_is_scored_and_marked(copied, compose):
     table = evaluated(compose, copied, "score_images=1")
     assert table.groupby(["split", "variant"]).size().max() == 1
-    marks = json.loads((copied / "metrics.json").read_text())["novel_view"]["full"]
+    marks = json.loads((copied / "metrics.json").read_text())["novel_view"][
+        "full"
+    ]
     assert any("at most 1" in mark for mark in marks["marks"])
     with pytest.raises(ConfigError, match="score_images"):
         evaluated(compose, copied, "score_images=0")

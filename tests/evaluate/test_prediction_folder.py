@@ -44,7 +44,9 @@ ALL = (
 def test_every_padding_of_a_number_is_read(tmp_path):
     folder = read(touch(tmp_path, *ALL))
     assert folder.files["B (2)", 12] == ALL[3]
-    assert set(folder.files) == {item for items in EXPECTED.values() for item in items}
+    assert set(folder.files) == {
+        item for items in EXPECTED.values() for item in items
+    }
 
 
 @pytest.mark.parametrize(
@@ -103,7 +105,10 @@ def frame() -> Frame:
 
 
 def one(
-    tmp_path: Path, pixels: np.ndarray, name: str = "3.png", background: str = "black"
+    tmp_path: Path,
+    pixels: np.ndarray,
+    name: str = "3.png",
+    background: str = "black",
 ) -> PredictionFolder:
     assert cv2.imwrite(str(tmp_path / name), pixels)
     return PredictionFolder(tmp_path, {("cam", 3): name}, background)
@@ -126,7 +131,9 @@ def test_images_are_rgb_and_keep_their_alpha(tmp_path):
         frame(), ("cam", 3)
     )
     assert found.alphas["full"].aminmax() == pytest.approx((0.2, 0.2))
-    assert float(found.images["full"][0, 0, 2, 2]) == pytest.approx(0.2 * 128 / 255)
+    assert float(found.images["full"][0, 0, 2, 2]) == pytest.approx(
+        0.2 * 128 / 255
+    )
 
 
 @pytest.mark.parametrize(
@@ -154,7 +161,9 @@ def test_images_of_another_kind_are_refused(tmp_path, pixels, message):
 def test_truncated_files_are_refused(tmp_path, kept, suffix):
     name = f"3.{suffix}"
     folder = one(
-        tmp_path, np.random.default_rng(0).integers(0, 255, (*SIZE, 3), np.uint8), name
+        tmp_path,
+        np.random.default_rng(0).integers(0, 255, (*SIZE, 3), np.uint8),
+        name,
     )
     path = tmp_path / name
     path.write_bytes(path.read_bytes()[:kept])
@@ -167,11 +176,16 @@ def test_truncated_files_are_refused(tmp_path, kept, suffix):
 
 def test_an_unexpected_background_is_refused(tmp_path):
     with pytest.raises(
-        DataError, match=r"has a white background, expected black; give images on black"
+        DataError,
+        match=r"has a white background, expected black; give images on black",
     ):
         one(tmp_path, person(behind=255)).predict(frame(), ("cam", 3))
-    with pytest.raises(DataError, match=r"has a black background, expected white"):
+    with pytest.raises(
+        DataError, match=r"has a black background, expected white"
+    ):
         one(tmp_path, person(), background="white").predict(frame(), ("cam", 3))
-    one(tmp_path, person(behind=255), background="white").predict(frame(), ("cam", 3))
+    one(tmp_path, person(behind=255), background="white").predict(
+        frame(), ("cam", 3)
+    )
     # bad, but not the other one
     one(tmp_path, person(behind=90)).predict(frame(), ("cam", 3))

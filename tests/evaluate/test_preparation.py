@@ -29,13 +29,17 @@ def test_the_box_is_round_the_posed_vertices_where_there_is_a_mesh(data):
     boxes, frame = BodyBoxes(data), data.dataset("train")[1]
     assert boxes.departures == []
     vertices = free_body().posed_vertices(frame.body)[0]
-    assert torch.equal(boxes.corners(frame, 0), box_corners(vertices, VERTEX_MARGIN))
+    assert torch.equal(
+        boxes.corners(frame, 0), box_corners(vertices, VERTEX_MARGIN)
+    )
     assert torch.equal(
         boxes.masks(frame)[0], box_mask(boxes.corners(frame, 0), frame.camera)
     )
 
 
-def test_else_it_is_round_the_seen_joints_with_a_larger_margin_and_says_so(data):
+def test_else_it_is_round_the_seen_joints_with_a_larger_margin_and_says_so(
+    data,
+):
     boxes, frame = BodyBoxes(data), data.dataset("train")[1]
     boxes.body = None
     assert (
@@ -47,14 +51,18 @@ def test_else_it_is_round_the_seen_joints_with_a_larger_margin_and_says_so(data)
     away = frame.skeleton.clone()
     away[0, 0] = 100.0  # a stand-in of a joint that was not seen
     frame = dataclasses.replace(frame, skeleton=away, visibility=seen)
-    assert torch.equal(boxes.corners(frame, 0), box_corners(away[0, 1:], JOINT_MARGIN))
+    assert torch.equal(
+        boxes.corners(frame, 0), box_corners(away[0, 1:], JOINT_MARGIN)
+    )
     mask = boxes.masks(frame)
     assert 0.01 < float(mask.float().mean()) < 0.9
     assert bool(mask[frame.mask > 0.5].float().mean() > 0.99)
 
 
 @pytest.mark.parametrize("background", ["black", "white"])
-def test_what_is_painted_outside_the_box_is_cleared_and_only_there(data, background):
+def test_what_is_painted_outside_the_box_is_cleared_and_only_there(
+    data, background
+):
     prepare = Preparation(
         MetricVariants(region="body_box_cleared", background=background),
         BodyBoxes(data),

@@ -28,7 +28,12 @@ def scored(split: str) -> Scored:
         "version": "1",
     }  # fmt: skip
     row = {"split": split, "variant": "full", "camera": "001", "frame": 3}
-    row |= {"psnr": 1 / 3, "ssim": math.inf, "lpips_alex": 1e-05, "miou": math.nan}
+    row |= {
+        "psnr": 1 / 3,
+        "ssim": math.inf,
+        "lpips_alex": 1e-05,
+        "miou": math.nan,
+    }
     rows = pd.DataFrame([row], columns=HEADER)
     return Scored({split: {"full": variant()}}, rows, facts)
 
@@ -40,8 +45,16 @@ def test_the_csv_keeps_every_digit(tmp_path):
         (line,) = csv.DictReader(stream)
     assert tuple(line) == HEADER
     assert float(line["psnr"]) == 1 / 3
-    assert (line["ssim"], line["miou"], line["lpips_alex"]) == ("inf", "", "1e-05")
-    assert (line["split"], line["camera"], line["frame"]) == ("novel_pose", "001", "3")
+    assert (line["ssim"], line["miou"], line["lpips_alex"]) == (
+        "inf",
+        "",
+        "1e-05",
+    )
+    assert (line["split"], line["camera"], line["frame"]) == (
+        "novel_pose",
+        "001",
+        "3",
+    )
 
 
 def test_nothing_that_json_does_not_have_is_written(tmp_path):

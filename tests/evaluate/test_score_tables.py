@@ -102,7 +102,9 @@ def test_cameras_have_rows_where_asked_for():
 
 
 def test_metrics_json_has_the_promised_shape(tmp_path):
-    write_scored(Scored(results(), pd.DataFrame(columns=HEADER), FACTS), tmp_path)
+    write_scored(
+        Scored(results(), pd.DataFrame(columns=HEADER), FACTS), tmp_path
+    )
     stored = json.loads((tmp_path / "metrics.json").read_text())
     assert set(stored) == {"novel_view", "novel_pose"}
     for split in stored.values():

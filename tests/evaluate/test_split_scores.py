@@ -55,18 +55,22 @@ def test_means_by_camera_and_over_all():
     def predict(f: Frame, item: tuple[str, int]) -> Prediction:
         return Prediction({FULL: f.image + errors[item]}, {})
 
-    scores = score_split([(item, f) for item in errors], predict, scorer()).variants[
-        FULL
-    ]
+    scores = score_split(
+        [(item, f) for item in errors], predict, scorer()
+    ).variants[FULL]
     assert scores["psnr"] == pytest.approx(40.0, abs=1e-3)
     assert scores["images"] == 3
     cameras = scores["cameras"]
-    assert [cameras[c]["psnr"] for c in "ab"] == pytest.approx([30.0, 60.0], abs=1e-3)
+    assert [cameras[c]["psnr"] for c in "ab"] == pytest.approx(
+        [30.0, 60.0], abs=1e-3
+    )
 
 
 def test_only_the_inside_of_the_box_counts_where_a_protocol_says_so():
     generator = torch.Generator().manual_seed(0)
-    image, target = (torch.rand(1, 3, 24, 24, generator=generator) for _ in range(2))
+    image, target = (
+        torch.rand(1, 3, 24, 24, generator=generator) for _ in range(2)
+    )
     box = torch.zeros(1, 1, 24, 24, dtype=torch.bool)
     box[..., 4:14, 6:20] = True
     measures = MetricVariants(region="body_box")
@@ -78,7 +82,9 @@ def test_only_the_inside_of_the_box_counts_where_a_protocol_says_so():
     assert result["ssim"] == pytest.approx(
         float(ssim(image[part], target[part])), abs=1e-6
     )
-    unseen = image_scores(image, target, box=torch.zeros_like(box), measures=measures)
+    unseen = image_scores(
+        image, target, box=torch.zeros_like(box), measures=measures
+    )
     both = means([result, unseen])  # unseen: counted, not averaged
     assert both["psnr_left_out"] == both["ssim_left_out"] == 1
     assert both["psnr"] == result["psnr"]
@@ -86,9 +92,13 @@ def test_only_the_inside_of_the_box_counts_where_a_protocol_says_so():
 
 def test_the_window_of_ssim_is_the_protocols():
     generator = torch.Generator().manual_seed(0)
-    image, target = (torch.rand(1, 3, 24, 24, generator=generator) for _ in range(2))
+    image, target = (
+        torch.rand(1, 3, 24, 24, generator=generator) for _ in range(2)
+    )
     found = image_scores(
-        image, target, measures=MetricVariants(ssim_window="uniform", ssim_range=2)
+        image,
+        target,
+        measures=MetricVariants(ssim_window="uniform", ssim_range=2),
     )
     expected = float(ssim_uniform(image, target, value_range=2))
     assert found["ssim"] == pytest.approx(expected, abs=1e-9)
@@ -141,7 +151,9 @@ def test_flicker_needs_consecutive_frames_of_one_camera_and_window():
         (("b", 5), moved),
     ]
     predict = Mock(
-        side_effect=[Prediction({FULL: f.image + i % 2 * noise}, {}) for i in range(5)]
+        side_effect=[
+            Prediction({FULL: f.image + i % 2 * noise}, {}) for i in range(5)
+        ]
     )
     found = score_split(items, predict, scorer())
     assert ["flicker" in row for row in found.rows[FULL]] == [
@@ -153,7 +165,9 @@ def test_flicker_needs_consecutive_frames_of_one_camera_and_window():
     ]
     # rounded to 8 bits; the ground truth stands still, so the warped form is the same
     assert found.variants[FULL]["flicker"] == pytest.approx(0.1, abs=1e-2)
-    assert found.variants[FULL]["warped_flicker"] == pytest.approx(0.1, abs=1e-2)
+    assert found.variants[FULL]["warped_flicker"] == pytest.approx(
+        0.1, abs=1e-2
+    )
     assert (
         found.variants[FLOOR_VARIANT]["flicker"] == 0
     )  # the ground truth stands still
@@ -177,7 +191,9 @@ def test_shares_of_trunk_and_limbs_need_labels_with_names():
     for names in (CLOTHES, ()):
         prepare = Preparation(MetricVariants(), None, label_names=names)
         split = score_split(
-            [(("a", 0), f)], lambda f, _: Prediction({FULL: image}, {}), Scorer(prepare)
+            [(("a", 0), f)],
+            lambda f, _: Prediction({FULL: image}, {}),
+            Scorer(prepare),
         )
         found[names] = split.variants[FULL]
     assert found[CLOTHES]["area_trunk"] == found[CLOTHES]["area_limbs"] > 0.2
@@ -191,21 +207,33 @@ def test_an_image_that_is_not_finite_is_an_error_that_names_it():
     f = person()
     broken = f.image.clone()
     broken[0, 0, 3, 3] = torch.nan
-    with pytest.raises(GsganError, match=r"camera a, frame 0: 1 values .* not finite"):
+    with pytest.raises(
+        GsganError, match=r"camera a, frame 0: 1 values .* not finite"
+    ):
         score_split(
-            [(("a", 0), f)], lambda f, _: Prediction({FULL: broken}, {}), scorer()
+            [(("a", 0), f)],
+            lambda f, _: Prediction({FULL: broken}, {}),
+            scorer(),
         )
 
 
 def segmentation(predicted: torch.Tensor, classes: int) -> torch.Tensor:
-    return torch.nn.functional.one_hot(predicted, classes).float().permute(0, 3, 1, 2)
+    return (
+        torch.nn.functional.one_hot(predicted, classes)
+        .float()
+        .permute(0, 3, 1, 2)
+    )
 
 
 def test_miou_counts_classes_of_the_truth_only():
     """Class 1 half right, class 2 absent from the truth but predicted once, 255 ignored."""
     labels = torch.tensor([[[0, 0, 1, 1, 255]]])
-    result = miou(confusion(segmentation(torch.tensor([[[0, 2, 1, 0, 1]]]), 3), labels))
-    assert result["miou"] == pytest.approx(1 / 2)  # class 1: 1 of {2 true, 1 predicted}
+    result = miou(
+        confusion(segmentation(torch.tensor([[[0, 2, 1, 0, 1]]]), 3), labels)
+    )
+    assert result["miou"] == pytest.approx(
+        1 / 2
+    )  # class 1: 1 of {2 true, 1 predicted}
     assert result["miou_with_background"] == pytest.approx((1 / 3 + 1 / 2) / 2)
 
 
@@ -218,7 +246,8 @@ def test_miou_is_torchmetrics_jaccard_index_over_the_split():
     maps = segmentation(predicted, 4)
     f = frame_of(torch.zeros(1, 3, 9, 9), torch.zeros(1, 1, 9, 9))
     frames = [
-        (("ab"[i > 0], i), replace(f, labels=labels[i : i + 1])) for i in range(3)
+        (("ab"[i > 0], i), replace(f, labels=labels[i : i + 1]))
+        for i in range(3)
     ]
     found = score_split(
         frames,
@@ -233,7 +262,9 @@ def test_miou_is_torchmetrics_jaccard_index_over_the_split():
         each = MulticlassJaccardIndex(4, average=None, ignore_index=255)
         return each(predicted[images], labels[images])
 
-    assert whole["miou"] == pytest.approx(float(jaccard(slice(3))[1:].mean()), abs=1e-6)
+    assert whole["miou"] == pytest.approx(
+        float(jaccard(slice(3))[1:].mean()), abs=1e-6
+    )
     assert whole["miou_with_background"] == pytest.approx(
         float(jaccard(slice(3)).mean()), abs=1e-6
     )

@@ -38,7 +38,10 @@ def test_a_sequence_of_ply_files_and_its_card(bare, tmp_path, inside):
         "export", *given, "overwrite=true", "licence=cc-by-nc-4.0", "frames=1"
     )
     assert again.returncode == 0, again.stderr
-    assert sorted(p.name for p in out.glob("*.ply")) == ["000004.ply", "notes.ply"]
+    assert sorted(p.name for p in out.glob("*.ply")) == [
+        "000004.ply",
+        "notes.ply",
+    ]
     assert "license: cc-by-nc-4.0" in (out / "MODEL_CARD.md").read_text()
 
 
@@ -94,7 +97,10 @@ def test_the_rest_pose_as_glb(bare, tmp_path, inside):
     result = inside("export", f"run={bare}", "format=gltf", f"out={out}")
     assert result.returncode == 0, result.stderr
     assert out.read_bytes()[:4] == b"glTF"
-    assert "KHR_gaussian_splatting" in (tmp_path / "rest.MODEL_CARD.md").read_text()
+    assert (
+        "KHR_gaussian_splatting"
+        in (tmp_path / "rest.MODEL_CARD.md").read_text()
+    )
 
 
 def test_a_trained_run_as_safetensors_with_its_scores(run, tmp_path, inside):
@@ -112,7 +118,10 @@ def test_safetensors_name_no_class_but_gsgans_own(run, tmp_path):
     from gsgan.run.stored import CHECKPOINT, read_checkpoint
 
     facts = read_checkpoint(run / CHECKPOINT)["gsgan"]
-    content, path = weights_bytes(run, load(run), facts), tmp_path / "a.safetensors"
+    content, path = (
+        weights_bytes(run, load(run), facts),
+        tmp_path / "a.safetensors",
+    )
     path.write_bytes(content)
     assert load_weights(path).splats is not None
     target = b"gsgan.model.deformation.Deformation"

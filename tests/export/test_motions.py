@@ -17,7 +17,12 @@ from gsgan.body.shape import free_space, shaped_body
 from gsgan.body.skinned import carry
 from gsgan.body.smpl import read_smpl
 from gsgan.export.glb import to_y_up
-from gsgan.export.motions import BodyMotion, bvh_text, captured_motion, motion_glb
+from gsgan.export.motions import (
+    BodyMotion,
+    bvh_text,
+    captured_motion,
+    motion_glb,
+)
 from gsgan.motion.bvh import read_bvh
 from gsgan.motion.gltf_file import GltfFile, local_matrix
 from gsgan.motion.gltf_motion import read_gltf_motion
@@ -52,8 +57,13 @@ def test_bvh_is_read_back_within_a_millimetre(tmp_path, person, dance, up):
     at = [rig.names.index(name) for name in person.joint_names]
     found = rig.posed()[:, at] / 100
     assert np.abs(found - joints_of(motion)).max() < MILLIMETRE
-    turned = to_y_up(up) @ motion.body.transforms(dance)[..., :3, :3].double().numpy()
-    np.testing.assert_allclose(rig.rotations[:, at] @ to_y_up(up), turned, atol=1e-4)
+    turned = (
+        to_y_up(up)
+        @ motion.body.transforms(dance)[..., :3, :3].double().numpy()
+    )
+    np.testing.assert_allclose(
+        rig.rotations[:, at] @ to_y_up(up), turned, atol=1e-4
+    )
 
 
 def test_glb_is_read_back_within_a_millimetre(tmp_path, person, dance):
@@ -74,7 +84,8 @@ def test_both_files_drive_the_subject_alike(tmp_path, dance, proportions):
     (tmp_path / "a.bvh").write_text(bvh_text(motion))
     (tmp_path / "a.glb").write_bytes(motion_glb(motion))
     bvh, glb = (
-        read_motion(tmp_path / name, Source(proportions)) for name in ("a.bvh", "a.glb")
+        read_motion(tmp_path / name, Source(proportions))
+        for name in ("a.bvh", "a.glb")
     )
     assert bvh.fps == glb.fps == 30
     assert bvh.unit == "centimetres"
@@ -91,7 +102,9 @@ def test_another_program_opens_the_mesh(person, dance):
     np.testing.assert_array_equal(mesh.faces, person.faces)
 
 
-def test_the_files_own_skinning_gives_the_posed_vertices(tmp_path, person, dance):
+def test_the_files_own_skinning_gives_the_posed_vertices(
+    tmp_path, person, dance
+):
     path = tmp_path / "a.glb"
     path.write_bytes(motion_glb(BodyMotion(person, dance, 25.0, "z")))
     glb = GltfFile(path)
@@ -110,7 +123,9 @@ def test_the_files_own_skinning_gives_the_posed_vertices(tmp_path, person, dance
 
     # glTF's formula: the weighted sum of joint matrices times inverse bind matrices.
     skin = doc.skins[0]
-    bind = glb.accessor(skin.inverseBindMatrices).reshape(-1, 4, 4).swapaxes(1, 2)
+    bind = (
+        glb.accessor(skin.inverseBindMatrices).reshape(-1, 4, 4).swapaxes(1, 2)
+    )
     matrices = np.stack([worlds[joint] for joint in skin.joints]) @ bind
     attributes = doc.meshes[0].primitives[0].attributes
     weights = glb.accessor(attributes.WEIGHTS_0)
@@ -129,14 +144,18 @@ def test_a_body_of_smpl(tmp_path, shared):
     path = shared("smpl.pkl", lambda path: write_smpl(path, kind="smpl"))
     model = read_smpl(path)
     body = model.as_body()
-    theta = 0.3 * torch.randn(4, 24, 3, generator=torch.Generator().manual_seed(0))
+    theta = 0.3 * torch.randn(
+        4, 24, 3, generator=torch.Generator().manual_seed(0)
+    )
     poses = BodyPose(theta=theta, transl=torch.rand(4, 3))
     motion = BodyMotion(body, poses, 30.0, "y")
     out = tmp_path / "a.bvh"
     out.write_text(bvh_text(motion))
     rig = read_bvh(out)
     at = [rig.names.index(name) for name in body.joint_names]
-    assert np.abs(rig.posed()[:, at] / 100 - joints_of(motion)).max() < MILLIMETRE
+    assert (
+        np.abs(rig.posed()[:, at] / 100 - joints_of(motion)).max() < MILLIMETRE
+    )
 
 
 @pytest.mark.parametrize("kind", ["bvh", "motion_glb"])
@@ -148,10 +167,16 @@ def test_a_capture_and_a_run(capture, on_body, tmp_path, inside, kind):
     assert result.returncode == 0, result.stderr
     assert "6 frames at 30" in result.stdout
     motion = captured_motion(Path(capture), None, 30.0)
-    expected = bvh_text(motion).encode() if kind == "bvh" else motion_glb(motion)
+    expected = (
+        bvh_text(motion).encode() if kind == "bvh" else motion_glb(motion)
+    )
     assert out.read_bytes() == expected
     assert list(tmp_path.glob("*.MODEL_CARD.md")) == []
-    refused(inside("export", f"capture={capture}", *given), "exists", "overwrite=true")
+    refused(
+        inside("export", f"capture={capture}", *given),
+        "exists",
+        "overwrite=true",
+    )
 
     # The held-out poses of a run, whose body has the person's shape.
     run = (f"run={on_body()}", "motion=novel_pose", "overwrite=true", "fps=25")
@@ -167,12 +192,18 @@ def test_a_capture_and_a_run(capture, on_body, tmp_path, inside, kind):
 
 def test_what_has_no_motion_is_refused(bare, capture, tmp_path, inside):
     out = f"out={tmp_path / 'a.bvh'}"
-    refused(inside("export", f"run={bare}", "format=bvh", out), "moves without a body")
+    refused(
+        inside("export", f"run={bare}", "format=bvh", out),
+        "moves without a body",
+    )
     refused(
         inside("export", f"capture={capture}", f"out={tmp_path / 'a.ply'}"),
         "format=ply needs run",
     )
-    refused(inside("export", f"capture={tmp_path}", "format=bvh", out), "cameras.json")
+    refused(
+        inside("export", f"capture={tmp_path}", "format=bvh", out),
+        "cameras.json",
+    )
 
 
 def test_no_body_poses(tmp_path, inside):

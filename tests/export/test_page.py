@@ -72,10 +72,12 @@ def opened(chromium, avatar):
         pages.append(made)
         made.on("pageerror", lambda error: problems.append(str(error)))
         made.on(
-            "console", lambda m: problems.append(m.text) if m.type == "error" else None
+            "console",
+            lambda m: problems.append(m.text) if m.type == "error" else None,
         )
         made.on(
-            "request", lambda r: problems.append(r.url) if r.url != address else None
+            "request",
+            lambda r: problems.append(r.url) if r.url != address else None,
         )
         made.goto(address)
         until(made, "window.gsgan")
@@ -101,12 +103,20 @@ def cameras(centre: np.ndarray) -> list[Camera]:
     """Four cameras round the person."""
     found = []
     for azimuth, height in ((0.0, 0.2), (1.7, 1.0), (3.0, -0.5), (4.5, 0.0)):
-        eye = centre + np.array([2.5 * np.sin(azimuth), -2.5 * np.cos(azimuth), height])
+        eye = centre + np.array(
+            [2.5 * np.sin(azimuth), -2.5 * np.cos(azimuth), height]
+        )
         ahead = (centre - eye) / np.linalg.norm(centre - eye)
-        right = np.cross(ahead, [0, 0, 1]) / np.linalg.norm(np.cross(ahead, [0, 0, 1]))
+        right = np.cross(ahead, [0, 0, 1]) / np.linalg.norm(
+            np.cross(ahead, [0, 0, 1])
+        )
         R = np.stack([right, np.cross(ahead, right), ahead])
         K = np.array(
-            [[1.2 * SIDE, 2, SIDE / 2 + 3], [0, 1.3 * SIDE, SIDE / 2], [0, 0, 1]]
+            [
+                [1.2 * SIDE, 2, SIDE / 2 + 3],
+                [0, 1.3 * SIDE, SIDE / 2],
+                [0, 0, 1],
+            ]
         )
         given = (torch.from_numpy(x)[None].float() for x in (K, R, -R @ eye))
         found.append(Camera(*given, (SIDE, SIDE)))
@@ -117,16 +127,24 @@ def drawn(browser_page, camera: Camera) -> np.ndarray:
     """``[H, W, 3]``: what the page draws of its pose."""
     height, width = camera.size
     plain = {
-        name: getattr(camera, name)[0].flatten().tolist() for name in ("K", "R", "t")
+        name: getattr(camera, name)[0].flatten().tolist()
+        for name in ("K", "R", "t")
     }
-    data = browser_page.evaluate(PIXELS, plain | {"width": width, "height": height})
+    data = browser_page.evaluate(
+        PIXELS, plain | {"width": width, "height": height}
+    )
     pixels = np.frombuffer(base64.b64decode(data), np.uint8)
     return pixels.reshape(height, width, 4)[::-1, :, :3] / 255
 
 
-def psnr_in_box(image: np.ndarray, truth: np.ndarray, alpha: np.ndarray) -> float:
+def psnr_in_box(
+    image: np.ndarray, truth: np.ndarray, alpha: np.ndarray
+) -> float:
     rows, columns = np.nonzero(alpha > 0.02)
-    box = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
+    box = (
+        slice(rows.min(), rows.max() + 1),
+        slice(columns.min(), columns.max() + 1),
+    )
     return float(-10 * np.log10(np.square(image - truth)[box].mean()))
 
 
@@ -137,7 +155,9 @@ def test_the_page_draws_what_gsgan_draws(opened, avatar, dance, landmarks):
         p = torch.from_numpy(landmarks[i : i + 1]).float()
         for camera in cameras(landmarks[i].mean(0)):
             with torch.no_grad():
-                truth = model(p, torch.ones(p.shape[:2]), camera, dance[i : i + 1])
+                truth = model(
+                    p, torch.ones(p.shape[:2]), camera, dance[i : i + 1]
+                )
             colour = truth.features[0, :3].movedim(0, -1).clamp(0, 1).numpy()
             alpha = truth.splat_alpha[0, 0].numpy()
             assert psnr_in_box(drawn(made, camera), colour, alpha) > 40
@@ -153,9 +173,9 @@ def test_poses_of_landmarks_are_the_solvers(opened, avatar, signing):
         given = torch.from_numpy(p)[None].float()
         pose = run.avatar.body_pose(given, torch.ones(given.shape[:2]))
         body = run.body
-        truth = torch.cat([body.posed_landmarks(pose), body.posed_hands(pose)], dim=1)[
-            0
-        ]
+        truth = torch.cat(
+            [body.posed_landmarks(pose), body.posed_hands(pose)], dim=1
+        )[0]
         np.testing.assert_allclose(np.array(found), truth, atol=1e-4)
     unseen = signing[3].copy()
     unseen[11] = np.nan
@@ -184,7 +204,9 @@ def test_a_dragged_hand_moves_as_in_the_viewer(opened, avatar):
     for name in ("right wrist", "left ankle", "head", "body"):
         made.evaluate("gsgan.show(0)")
         target = position(before, name) + np.array([0.1, -0.05, 0.12])
-        made.evaluate("([n, x]) => gsgan.avatar.drag(n, x)", [name, target.tolist()])
+        made.evaluate(
+            "([n, x]) => gsgan.avatar.drag(n, x)", [name, target.tolist()]
+        )
         p = torch.from_numpy(dragged(before, name, target))[None].float()
         pose = run.avatar.body_pose(p, torch.ones(p.shape[:2]))
         truth = run.body.posed_landmarks(pose)[0]
@@ -192,7 +214,9 @@ def test_a_dragged_hand_moves_as_in_the_viewer(opened, avatar):
         np.testing.assert_allclose(found, truth, atol=2e-4)
 
 
-def test_it_plays_and_survives_sizes_a_lost_context_and_a_second_page(opened, avatar):
+def test_it_plays_and_survives_sizes_a_lost_context_and_a_second_page(
+    opened, avatar
+):
     first, second = opened(), opened()
     (camera, *_) = cameras(np.array([0, 0, 1.0]))
     image = drawn(first, camera)
@@ -212,7 +236,9 @@ def test_it_plays_and_survives_sizes_a_lost_context_and_a_second_page(opened, av
     np.testing.assert_array_equal(drawn(first, camera), image)
 
 
-def test_the_camera_by_mouse_keys_and_wheel_and_the_saved_image(opened, tmp_path):
+def test_the_camera_by_mouse_keys_and_wheel_and_the_saved_image(
+    opened, tmp_path
+):
     made = opened()
     orbit = made.evaluate("({...gsgan.orbit})")
     made.mouse.move(200, 200)
@@ -259,15 +285,25 @@ def test_the_webcam_example_by_recorded_landmarks(
     (avatar[0] / "landmarks.json").write_text(
         json.dumps({"fps": 30, "frames": [frame]})
     )
-    made, problems = chromium.new_page(viewport={"width": 200, "height": 200}), []
+    made, problems = (
+        chromium.new_page(viewport={"width": 200, "height": 200}),
+        [],
+    )
     made.on("pageerror", lambda error: problems.append(str(error)))
-    made.on("console", lambda m: problems.append(m.text) if m.type == "error" else None)
+    made.on(
+        "console",
+        lambda m: problems.append(m.text) if m.type == "error" else None,
+    )
     made.goto(f"{served}/webcam.html?avatar={source}&recording=landmarks.json")
     until(made, "window.avatar?.landmarks.length")
     made.wait_for_timeout(500)
-    found = np.array(made.evaluate("avatar.landmarks.map(x => avatar.toStandard(x))"))
+    found = np.array(
+        made.evaluate("avatar.landmarks.map(x => avatar.toStandard(x))")
+    )
     for a, b in ((11, 13), (12, 14), (23, 25), (26, 28)):
-        bones = [(x[b] - x[a]) / np.linalg.norm(x[b] - x[a]) for x in (found, p)]
+        bones = [
+            (x[b] - x[a]) / np.linalg.norm(x[b] - x[a]) for x in (found, p)
+        ]
         assert bones[0] @ bones[1] > 0.8  # the tiny subject and its body differ
     made.close()
     assert not problems
@@ -275,13 +311,17 @@ def test_the_webcam_example_by_recorded_landmarks(
 
 def test_the_script_is_built_from_its_sources(tmp_path):
     sources = [*sorted(WEB.glob("*.ts")), WEB / "solve.wasm"]
-    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
+    digest = hashlib.sha256(
+        b"".join(path.read_bytes() for path in sources)
+    ).hexdigest()
     built = (WEB / "gsgan.js").read_text()
     assert built.startswith(f"// {digest}\n"), (
         "run npm ci and npm run build in export/web"
     )
     if ESBUILD.exists():
-        command = json.loads((WEB / "package.json").read_text())["scripts"]["build"]
+        command = json.loads((WEB / "package.json").read_text())["scripts"][
+            "build"
+        ]
         command = command.replace(
             "outfile=gsgan.js", f"outfile={tmp_path / 'gsgan.js'}"
         )

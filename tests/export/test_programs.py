@@ -19,7 +19,9 @@ from gsgan.run.stored import read_checkpoint
 from gsgan.utils.errors import ConfigError, DataError
 
 PARITY = 1e-3
-SHALLOW = "model.generator.multipliers=[1,2]"  # the other levels only repeat these
+SHALLOW = (
+    "model.generator.multipliers=[1,2]"  # the other levels only repeat these
+)
 MODELS = {
     "supersampled": ("size.supersample=2", "effects.body_points=off", SHALLOW),
     "full": (SHALLOW,),
@@ -46,13 +48,17 @@ def painted(build):
         generator = torch.Generator().manual_seed(0)
         with torch.no_grad():
             for parameter in avatar.parameters():
-                parameter += 0.03 * torch.randn(parameter.shape, generator=generator)
+                parameter += 0.03 * torch.randn(
+                    parameter.shape, generator=generator
+                )
         return avatar.freeze(), frame
 
     return run
 
 
-def unet_inputs(avatar, frame) -> tuple[dict[str, torch.Tensor], list[torch.Tensor]]:
+def unet_inputs(
+    avatar, frame
+) -> tuple[dict[str, torch.Tensor], list[torch.Tensor]]:
     """The inputs of an ONNX program for a frame, and the image and alpha to expect."""
     found = {}
 
@@ -68,16 +74,24 @@ def unet_inputs(avatar, frame) -> tuple[dict[str, torch.Tensor], list[torch.Tens
         }
         if avatar.splat_channels == 0:
             names = {"F": "skeleton", "S": "segmentation"}
-        found.update({names.get(name, name): value for name, value in given.items()})
+        found.update(
+            {names.get(name, name): value for name, value in given.items()}
+        )
 
     hooks = [avatar.pose_encoder.register_forward_pre_hook(pose)]
-    hooks += [avatar.generator.register_forward_pre_hook(unet, with_kwargs=True)]
+    hooks += [
+        avatar.generator.register_forward_pre_hook(unet, with_kwargs=True)
+    ]
     with torch.no_grad():
-        painting = avatar(frame.skeleton, frame.visibility, frame.camera, frame.body)
+        painting = avatar(
+            frame.skeleton, frame.visibility, frame.camera, frame.body
+        )
     for hook in hooks:
         hook.remove()
     given = {
-        k: v.contiguous() for k, v in found.items() if k is not None and v is not None
+        k: v.contiguous()
+        for k, v in found.items()
+        if k is not None and v is not None
     }
     return given, [painting.image.clamp(0, 1), painting.alpha.clamp(0, 1)]
 
@@ -114,7 +128,12 @@ def test_torch_export_paints_what_the_avatar_paints(model, painted):
     with torch.no_grad():
         want = avatar(frame.skeleton, frame.visibility, camera, frame.body)
         image, alpha = program(
-            frame.skeleton, frame.visibility, camera.K, camera.R, camera.t, *body
+            frame.skeleton,
+            frame.visibility,
+            camera.K,
+            camera.R,
+            camera.t,
+            *body,
         )
     assert (image - want.image.clamp(0, 1)).abs().max() < PARITY
     assert (alpha - want.alpha.clamp(0, 1)).abs().max() < PARITY
@@ -134,7 +153,8 @@ def test_safetensors_give_the_run_back(run, build, tmp_path):
     again = load_weights(path)
     given = frame.skeleton, frame.camera
     assert torch.equal(
-        avatar.render(*given, body=frame.body), again.render(*given, body=frame.body)
+        avatar.render(*given, body=frame.body),
+        again.render(*given, body=frame.body),
     )
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(DataError, match="not a readable safetensors"):

@@ -9,7 +9,13 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from gsgan.export.splats import Splats, glb_bytes, in_world, ply_bytes, splats_of
+from gsgan.export.splats import (
+    Splats,
+    glb_bytes,
+    in_world,
+    ply_bytes,
+    splats_of,
+)
 from gsgan.scene import Gaussians
 from gsgan.splat import rasterise, sh_to_colour
 
@@ -27,7 +33,9 @@ def posed(build):
         generator = torch.Generator().manual_seed(0)
         with torch.no_grad():
             for parameter in avatar.splats.parameters():
-                parameter += 0.05 * torch.randn(parameter.shape, generator=generator)
+                parameter += 0.05 * torch.randn(
+                    parameter.shape, generator=generator
+                )
         for part in avatar.modules():
             if hasattr(part, "active_degree"):
                 part.active_degree = part.sh_degree
@@ -38,16 +46,20 @@ def posed(build):
 
 def splats_and_truth(avatar, frame) -> tuple[Splats, Gaussians]:
     with torch.no_grad():
-        splats = splats_of(avatar, frame.skeleton, frame.visibility > 0, frame.body)
-        painting = avatar(frame.skeleton, frame.visibility, frame.camera, frame.body)
+        splats = splats_of(
+            avatar, frame.skeleton, frame.visibility > 0, frame.body
+        )
+        painting = avatar(
+            frame.skeleton, frame.visibility, frame.camera, frame.body
+        )
     return splats, painting.gaussians
 
 
 def read_ply(content: bytes) -> Gaussians:
     """As 3D Gaussian splatting's own reader: sigmoid, exp, harmonics channel by channel."""
-    raw = trimesh.load(io.BytesIO(content), "ply", process=False).metadata["_ply_raw"][
-        "vertex"
-    ]
+    raw = trimesh.load(io.BytesIO(content), "ply", process=False).metadata[
+        "_ply_raw"
+    ]["vertex"]
     assert raw["length"] == len(raw["data"]["x"])
     assert list(raw["properties"]) == NAMES
     column = {
@@ -96,7 +108,9 @@ def test_a_ply_read_back_is_the_gaussians(case, posed):
     view = torch.nn.functional.normalize(
         truth.means - frame.camera.centre[:, None], dim=-1
     )
-    colour = sh_to_colour(read.features.unflatten(-1, (16, 3)), view).clamp_min(0)
+    colour = sh_to_colour(read.features.unflatten(-1, (16, 3)), view).clamp_min(
+        0
+    )
     # frames of a skinned body shear: their harmonics are fitted
     tolerance = 0.02 if case == "lbs" else 2e-5
     assert (colour - truth.features[..., :3]).abs().max() < tolerance
@@ -108,19 +122,27 @@ def test_a_ply_drawn_is_step_ones_image(posed):
     splats, _ = splats_and_truth(avatar, frame)
     read = read_ply(ply_bytes(splats))
     view = read.means - frame.camera.centre[:, None]
-    colour = sh_to_colour(read.features.unflatten(-1, (16, 3)), view).clamp_min(0)
-    read = Gaussians(read.means, read.quats, read.scales, read.opacities, colour)
+    colour = sh_to_colour(read.features.unflatten(-1, (16, 3)), view).clamp_min(
+        0
+    )
+    read = Gaussians(
+        read.means, read.quats, read.scales, read.opacities, colour
+    )
     drawn = rasterise(read, frame.camera, settings=avatar.accuracy)
     avatar.window_margin = None
     with torch.no_grad():
-        painting = avatar(frame.skeleton, frame.visibility, frame.camera, frame.body)
+        painting = avatar(
+            frame.skeleton, frame.visibility, frame.camera, frame.body
+        )
     assert (drawn.features - painting.features[:, :3]).abs().max() < 1e-4
 
 
 def test_harmonics_turn_with_their_part():
     generator = torch.Generator().manual_seed(0)
     sh = torch.randn(1, 5, 16, 3, generator=generator, dtype=torch.float64)
-    turns = torch.from_numpy(Rotation.random(5, random_state=0).as_matrix())[None]
+    turns = torch.from_numpy(Rotation.random(5, random_state=0).as_matrix())[
+        None
+    ]
     view = torch.randn(1, 5, 3, generator=generator, dtype=torch.float64)
     own = (turns.mT @ view[..., None])[..., 0]
     torch.testing.assert_close(
@@ -131,7 +153,9 @@ def test_harmonics_turn_with_their_part():
 def test_what_is_not_drawn_has_finite_numbers():
     one = np.ones((2, 3), np.float32)
     opacities = np.array([0, 1], np.float32)
-    splats = Splats(one, one, np.eye(4, dtype=np.float32)[:2], opacities, one[:, None])
+    splats = Splats(
+        one, one, np.eye(4, dtype=np.float32)[:2], opacities, one[:, None]
+    )
     read = read_ply(ply_bytes(splats))
     assert all(torch.isfinite(x).all() for x in (read.opacities, read.features))
     np.testing.assert_allclose(read.opacities[0], opacities, atol=1e-7)
@@ -152,16 +176,24 @@ def test_a_glb_holds_the_same_gaussians(posed):
             continue
         accessor = gltf.accessors[at]
         view = gltf.bufferViews[accessor.bufferView]
-        raw = gltf.binary_blob()[view.byteOffset : view.byteOffset + view.byteLength]
+        raw = gltf.binary_blob()[
+            view.byteOffset : view.byteOffset + view.byteLength
+        ]
         read[name.removeprefix("KHR_gaussian_splatting:")] = np.frombuffer(
             raw, "<f4"
         ).reshape(accessor.count, -1)
-    harmonics = [f"SH_DEGREE_{l}_COEF_{m}" for l in range(3) for m in range(2 * l + 1)]
+    harmonics = [
+        f"SH_DEGREE_{l}_COEF_{m}" for l in range(3) for m in range(2 * l + 1)
+    ]
     assert set(read) == {"POSITION", "ROTATION", "SCALE", "OPACITY", *harmonics}
-    np.testing.assert_array_equal(np.stack([read[n] for n in harmonics], 1), splats.sh)
+    np.testing.assert_array_equal(
+        np.stack([read[n] for n in harmonics], 1), splats.sh
+    )
     np.testing.assert_array_equal(read["POSITION"], truth.means[0])
     np.testing.assert_allclose(read["OPACITY"][:, 0], truth.opacities[0])
-    turn = Rotation.from_quat(read["ROTATION"]).as_matrix()  # x y z w, as glTF has it
+    turn = Rotation.from_quat(
+        read["ROTATION"]
+    ).as_matrix()  # x y z w, as glTF has it
     axes = turn * read["SCALE"][:, None]
     known = truth.covariances[0].numpy()
     np.testing.assert_allclose(

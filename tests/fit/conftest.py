@@ -37,7 +37,9 @@ def fitted(people, tmp_path_factory):
     """These people with their registered body poses; read only."""
     root = shutil.copytree(people, tmp_path_factory.mktemp("fitted") / "people")
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
-        config = compose_config("fit", [f"data.root={root}", *QUICK, "fit.keep=true"])
+        config = compose_config(
+            "fit", [f"data.root={root}", *QUICK, "fit.keep=true"]
+        )
     return run_fit(config)
 
 
@@ -45,8 +47,17 @@ def fitted(people, tmp_path_factory):
 def fit(compose, people, tmp_path):
     """Fits and returns the written poses: ``fit("fit.sweeps=1", root=…)``."""
 
-    def run(*overrides: str, root: Path = people, name: str = "out", keep: bool = True):
-        given = (f"data.root={root}", f"out={tmp_path / name}", f"fit.keep={keep}")
+    def run(
+        *overrides: str,
+        root: Path = people,
+        name: str = "out",
+        keep: bool = True,
+    ):
+        given = (
+            f"data.root={root}",
+            f"out={tmp_path / name}",
+            f"fit.keep={keep}",
+        )
         out = run_fit(compose("fit", *given, *QUICK, *overrides))
         return dict(np.load(out / "body_pose.npz"))
 

@@ -47,7 +47,9 @@ def ready(people: Path, compose, *overrides: str, turn: float = 0.0) -> Fitter:
     )
     body = shaped_body(fit_shape(frames.skeletons, frames.visibility))
     pose = Solver(body).solve(frames.skeletons, frames.visibility)
-    noise = torch.randn(pose.theta.shape, generator=torch.Generator().manual_seed(0))
+    noise = torch.randn(
+        pose.theta.shape, generator=torch.Generator().manual_seed(0)
+    )
     return Fitter(
         instantiate(config.fit),
         frames,
@@ -71,7 +73,9 @@ def test_held_out_frames_are_solved_by_their_skeleton(fitted, fit, people):
     assert found["registered"].tolist() == [0, 1, 2]
     again = fit(name="driven", keep=False)
     assert again["registered"].tolist() == []
-    np.testing.assert_allclose(again["theta"][3:], found["theta"][3:], atol=1e-5)
+    np.testing.assert_allclose(
+        again["theta"][3:], found["theta"][3:], atol=1e-5
+    )
     assert np.abs(again["theta"][:3] - found["theta"][:3]).max() > 1e-3
     assert found["frame_id"].tolist() == [0, 1, 2, 3, 4]
     data = GsganData(str(fitted), size=48)
@@ -83,7 +87,9 @@ def test_held_out_frames_are_solved_by_their_skeleton(fitted, fit, people):
     p = torch.from_numpy(np.stack([landmarks.p[f] for f in (3, 4)])).float()
     solved = Solver(shaped_body(BodyShape(**shape))).solve(p, torch.ones(2, 33))
     np.testing.assert_allclose(found["theta"][3:], solved.theta, atol=0.05)
-    np.testing.assert_allclose(0.01 * found["transl"][3:], solved.transl, atol=1e-3)
+    np.testing.assert_allclose(
+        0.01 * found["transl"][3:], solved.transl, atol=1e-3
+    )
     both = fit("fit.held_out=true")
     assert both["registered"].tolist() == [0, 1, 2, 3, 4]
     assert np.abs(both["theta"][3:] - found["theta"][3:]).max() > 1e-3
@@ -119,15 +125,22 @@ def test_fingers_follow_the_hands_of_every_frame(people, fit, tmp_path):
         assert not one["theta"][:, fingers].any()
         apart = np.abs(one["theta"] - one["theta_hands"])[:, trunk]
         assert apart.max() < 0.02
-        assert np.abs(one["transl"] - one["transl_hands"]).max() < 0.2  # centimetres
+        assert (
+            np.abs(one["transl"] - one["transl_hands"]).max() < 0.2
+        )  # centimetres
 
 
 def test_what_is_written_is_read(fitted, people, compose):
-    data, plain = GsganData(str(fitted), size=48), GsganData(str(people), size=48)
+    data, plain = (
+        GsganData(str(fitted), size=48),
+        GsganData(str(people), size=48),
+    )
     frame = data.dataset("train")[0]
     poses, stored = data.layout.poses, np.load(fitted / "body_pose.npz")
     assert poses.fitted
-    np.testing.assert_allclose(frame.body.theta[0], stored["theta"][0], atol=1e-6)
+    np.testing.assert_allclose(
+        frame.body.theta[0], stored["theta"][0], atol=1e-6
+    )
     np.testing.assert_allclose(
         frame.body.transl[0], 0.01 * stored["transl"][0], atol=1e-6
     )
@@ -139,7 +152,9 @@ def test_what_is_written_is_read(fitted, people, compose):
     report = json.loads((fitted / "body_fit.json").read_text())
     assert set(report["frames"]) == {"0", "1", "2"}
     assert len(report["joints"]) == 33
-    config = compose("train", "data=capture", f"data.root={fitted}", "size=tiny")
+    config = compose(
+        "train", "data=capture", f"data.root={fitted}", "size=tiny"
+    )
     assert "fitted poses" in training_record(config, data)
     assert "fitted poses" not in training_record(config, plain)
 
@@ -154,7 +169,13 @@ def test_scores_say_that_held_out_frames_were_registered(
     )
     root = shutil.copytree(people, tmp_path / "both")
     run_fit(
-        compose("fit", f"data.root={root}", *QUICK, "fit.held_out=true", "fit.sweeps=1")
+        compose(
+            "fit",
+            f"data.root={root}",
+            *QUICK,
+            "fit.held_out=true",
+            "fit.sweeps=1",
+        )
     )
     marks = make_scorer(config, GsganData(str(root)), []).marks
     assert "body poses of 2 held-out frames fitted to their own masks" in marks
@@ -177,7 +198,9 @@ def test_unseen_joints(fit, people, tmp_path):
     assert np.isfinite(found["theta"]).all()
 
 
-def test_a_fit_before_training_writes_poses_into_the_capture(people, compose, tmp_path):
+def test_a_fit_before_training_writes_poses_into_the_capture(
+    people, compose, tmp_path
+):
     root = str(shutil.copytree(people, tmp_path / "plain"))
     data = GsganData(root, size=48)
     assert data.lacks_body
@@ -198,7 +221,9 @@ def test_a_fit_before_training_reads_the_data_as_the_run_does(
         "distortion": "project",
         "train_frames": "0-1",
     }
-    data = GsganData(str(shutil.copytree(people, tmp_path / "plain")), size=48, **keys)
+    data = GsganData(
+        str(shutil.copytree(people, tmp_path / "plain")), size=48, **keys
+    )
 
     def fit_body(seen, settings, device):
         given.append(device)
@@ -212,11 +237,15 @@ def test_a_fit_before_training_reads_the_data_as_the_run_does(
     assert given == [device]
     same = set(vars(data)) - {"size", "crop"}
     assert {"cache_mb", "limits", "lens", "split_keys", "skeleton"} <= same
-    assert all(fitted[key] == getattr(data, key) for key in same - {"layout", "splits"})
+    assert all(
+        fitted[key] == getattr(data, key) for key in same - {"layout", "splits"}
+    )
     assert (fitted["size"], fitted["crop"].margin, data.size) == (128, 0.2, 48)
 
 
-def test_of_two_processes_one_fits(people, fitted, compose, tmp_path, monkeypatch):
+def test_of_two_processes_one_fits(
+    people, fitted, compose, tmp_path, monkeypatch
+):
     """The second finds the poses that the first wrote while it waited."""
     root, fits, waits = (
         shutil.copytree(people, tmp_path / "both"),
@@ -267,7 +296,8 @@ def test_colours_are_not_used(fit, fitted, people, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "hole", ["no mask of a moment", "a bystander in a moment", "a crumb in one mask"]
+    "hole",
+    ["no mask of a moment", "a bystander in a moment", "a crumb in one mask"],
 )
 def test_an_empty_mask_does_not_affect_other_frames(
     fit, people, tmp_path, capsys, hole
@@ -307,7 +337,9 @@ def test_masks_without_anyone_are_refused(compose, people, tmp_path):
 
 def test_outside_the_image_alpha_costs_nothing(people, tmp_path, compose):
     """Pixels of a window outside the camera's image are unsure, and the fit ignores them."""
-    oblong = write_tiny_capture(tmp_path / "oblong", cameras=2, frames=2, size=(96, 64))
+    oblong = write_tiny_capture(
+        tmp_path / "oblong", cameras=2, frames=2, size=(96, 64)
+    )
     data = GsganData(str(oblong), size=48)
     frames = MaskedFrames(data, torch.device("cpu"))
     frame = frames.silhouettes(0)[0]
@@ -317,12 +349,19 @@ def test_outside_the_image_alpha_costs_nothing(people, tmp_path, compose):
     everything = torch.ones_like(frame.mask)
     assert float(_wrong(everything, frame)[beyond].max()) == 0
     inside = GsganData(str(people), size=48)
-    assert MaskedFrames(inside, torch.device("cpu")).silhouettes(0)[0].unsure is None
+    assert (
+        MaskedFrames(inside, torch.device("cpu")).silhouettes(0)[0].unsure
+        is None
+    )
 
 
 def test_the_rims_of_an_undistorted_image_are_unsure(tmp_path):
     bent = write_tiny_capture(
-        tmp_path / "bent", cameras=2, frames=2, size=(96, 96), dist=(0.3, 0, 0, 0, 0)
+        tmp_path / "bent",
+        cameras=2,
+        frames=2,
+        size=(96, 96),
+        dist=(0.3, 0, 0, 0, 0),
     )
     frame = MaskedFrames(
         GsganData(str(bent), size=48), torch.device("cpu")
@@ -343,7 +382,9 @@ def test_the_rims_of_an_undistorted_image_are_unsure(tmp_path):
     ],
 )
 def test_wrong_settings_are_one_sentence(inside, people, overrides, words):
-    refused(inside("fit", f"data.root={people}", "out=a", *QUICK, *overrides), words)
+    refused(
+        inside("fit", f"data.root={people}", "out=a", *QUICK, *overrides), words
+    )
 
 
 def test_an_earlier_fit_is_not_replaced_unasked(compose, fitted):
@@ -354,7 +395,9 @@ def test_an_earlier_fit_is_not_replaced_unasked(compose, fitted):
 def test_poses_of_another_source_are_never_replaced(compose, capture):
     there = (capture / "body_pose.npz").read_bytes()
     with pytest.raises(ConfigError, match="did not make"):
-        run_fit(compose("fit", f"data.root={capture}", "overwrite=true", *QUICK))
+        run_fit(
+            compose("fit", f"data.root={capture}", "overwrite=true", *QUICK)
+        )
     assert (capture / "body_pose.npz").read_bytes() == there
 
 
@@ -362,7 +405,10 @@ def test_other_formats_are_refused(compose, people, tmp_path):
     with pytest.raises(ConfigError, match="data=capture"):
         run_fit(
             compose(
-                "fit", "data=zju_mocap", f"data.root={people}", f"out={tmp_path / 'a'}"
+                "fit",
+                "data=zju_mocap",
+                f"data.root={people}",
+                f"out={tmp_path / 'a'}",
             )
         )
 
@@ -437,5 +483,7 @@ def test_cameras_rotate():
         (["model=image_to_image"], False),
     ],
 )
-def test_only_models_that_move_with_a_body_need_a_fit(compose, overrides, moves):
+def test_only_models_that_move_with_a_body_need_a_fit(
+    compose, overrides, moves
+):
     assert moves_with_body(compose("train", *overrides)) is moves

@@ -14,7 +14,9 @@ from gsgan.losses.photometric import d_ssim, photometric
 
 
 def picture(seed: int = 0) -> torch.Tensor:
-    return torch.rand(1, 3, 24, 24, generator=torch.Generator().manual_seed(seed))
+    return torch.rand(
+        1, 3, 24, 24, generator=torch.Generator().manual_seed(seed)
+    )
 
 
 def test_d_ssim_is_one_minus_ssim():
@@ -31,7 +33,9 @@ def test_d_ssim_is_one_minus_ssim():
 
 def test_photometric_weights():
     a, b = torch.full((1, 3, 16, 16), 0.5), torch.full((1, 3, 16, 16), 0.3)
-    assert math.isclose(float(photometric(a, b, l1=1, l2=0, ssim=0)), 0.2, rel_tol=1e-5)
+    assert math.isclose(
+        float(photometric(a, b, l1=1, l2=0, ssim=0)), 0.2, rel_tol=1e-5
+    )
     assert math.isclose(
         float(photometric(a, b, l1=0, l2=1, ssim=0)), 0.04, rel_tol=1e-5
     )

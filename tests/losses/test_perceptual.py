@@ -10,7 +10,9 @@ from gsgan.utils.errors import ConfigError
 
 
 def picture(seed: int = 0, size: int = 64) -> torch.Tensor:
-    return torch.rand(1, 3, size, size, generator=torch.Generator().manual_seed(seed))
+    return torch.rand(
+        1, 3, size, size, generator=torch.Generator().manual_seed(seed)
+    )
 
 
 def test_the_random_network_is_marked_fixed_and_not_saved():
@@ -34,9 +36,13 @@ def test_layer_weights_are_measured_then_frozen():
     loss(picture(0), picture(0) * 0)
     assert torch.equal(loss.layer_loss, frozen)
     assert int(loss.calls) == 2
-    resumed = Perceptual("random", warmup=2)  # the weights are in the checkpoint
+    resumed = Perceptual(
+        "random", warmup=2
+    )  # the weights are in the checkpoint
     resumed.load_state_dict(loss.state_dict())
-    assert torch.equal(resumed(picture(3), picture(4)), loss(picture(3), picture(4)))
+    assert torch.equal(
+        resumed(picture(3), picture(4)), loss(picture(3), picture(4))
+    )
     assert torch.equal(resumed.layer_loss, frozen)
 
 
@@ -57,12 +63,16 @@ def test_pretrained_networks_see_a_difference_and_pass_its_gradient(net, form):
     assert float(image.grad.abs().max()) > 0
     resumed = Perceptual(net=net, form=form)
     resumed.load_state_dict(loss.state_dict())
-    assert torch.equal(resumed(picture(2), picture(3)), loss(picture(2), picture(3)))
+    assert torch.equal(
+        resumed(picture(2), picture(3)), loss(picture(2), picture(3))
+    )
 
 
 @pytest.mark.usefixtures("weights")
 def test_the_papers_layers_are_the_first_four_of_vgg():
-    shapes = [tuple(f.shape[1:]) for f in Perceptual().network(picture(size=32))]
+    shapes = [
+        tuple(f.shape[1:]) for f in Perceptual().network(picture(size=32))
+    ]
     assert shapes == [(64, 32, 32), (128, 16, 16), (256, 8, 8), (512, 4, 4)]
 
 
@@ -97,7 +107,9 @@ def test_unknown_values_are_refused(given, named):
 
 def coordinates(batch: int, height: int, width: int) -> torch.Tensor:
     """Images whose channels are the row, the column and the place in the batch."""
-    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    y, x = torch.meshgrid(
+        torch.arange(height), torch.arange(width), indexing="ij"
+    )
     b = torch.arange(batch)[:, None, None].expand(batch, height, width)
     return torch.stack([y.expand_as(b), x.expand_as(b), b], dim=1).float()
 
@@ -118,7 +130,9 @@ def test_crops_are_whole_squares_around_pixels_of_the_person():
     assert torch.equal(
         cut[:, 0], (top[:, None, None] + steps[:, None]).expand(10, 32, 32)
     )
-    assert torch.equal(cut[:, 1], (left[:, None, None] + steps).expand(10, 32, 32))
+    assert torch.equal(
+        cut[:, 1], (left[:, None, None] + steps).expand(10, 32, 32)
+    )
     assert ((top[:5] >= 40 - 16) & (top[:5] < 44 - 16)).all()
     assert (top[5:] == 0).all()
     assert (left[5:] == 0).all()

@@ -25,4 +25,6 @@ def test_pixel_losses_are_those_of_the_sure_pixels_alone():
 def test_nothing_changes_without_them():
     image, target, unsure = pictures()
     assert without_unsure(target, image, None) is target
-    assert photometric(image, target, unsure=0 * unsure) == photometric(image, target)
+    assert photometric(image, target, unsure=0 * unsure) == photometric(
+        image, target
+    )

@@ -12,7 +12,9 @@ from gsgan.scene import Camera, distort
 
 def camera(size: tuple[int, int] = (20, 20), focal: float = 10.0) -> Camera:
     """At the origin, looking along +z, the axis through the picture's middle."""
-    K = torch.tensor([[[focal, 0, size[1] / 2], [0, focal, size[0] / 2], [0, 0, 1]]])
+    K = torch.tensor(
+        [[[focal, 0, size[1] / 2], [0, focal, size[0] / 2], [0, 0, 1]]]
+    )
     return Camera(K, torch.eye(3)[None], torch.zeros(1, 3), size)
 
 
@@ -45,12 +47,16 @@ def test_a_box_behind_the_camera_covers_nothing_and_one_around_it_everything():
     ahead = torch.tensor([[-0.4, -0.4, 1.0], [0.4, 0.4, 2.0]])
     behind = ahead * torch.tensor([1.0, 1.0, -1.0])
     assert not box_mask(box_corners(behind, 0.0), camera()).any()
-    assert box_mask(box_corners(torch.cat([ahead, behind]), 0.0), camera()).all()
+    assert box_mask(
+        box_corners(torch.cat([ahead, behind]), 0.0), camera()
+    ).all()
 
 
 def test_points_on_the_edge_are_inside_and_flat_polygons_cover_nothing():
     triangle = np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 3.0]])
-    centres = np.stack(np.meshgrid(np.arange(3) + 0.5, np.arange(3) + 0.5), axis=-1)
+    centres = np.stack(
+        np.meshgrid(np.arange(3) + 0.5, np.arange(3) + 0.5), axis=-1
+    )
     expected = [[True, True, True], [True, True, False], [True, False, False]]
     assert inside_hull(triangle, centres).tolist() == expected
     assert inside_hull(triangle[::-1], centres).tolist() == expected
@@ -66,9 +72,14 @@ def test_a_lens_bends_the_box_with_the_image():
     seen = box_mask(corners, replace(pinhole, dist=lens))[0]
     nothing = replace(pinhole, dist=torch.zeros(1, 5))
     assert torch.equal(box_mask(corners, nothing), box_mask(corners, pinhole))
-    shown = distort(torch.tensor([[[0.8, 0.0], [0.8, 0.8]]]), lens)[0][0] * 100 + 100
+    shown = (
+        distort(torch.tensor([[[0.8, 0.0], [0.8, 0.8]]]), lens)[0][0] * 100
+        + 100
+    )
     # last centre left of the side
     assert seen[100].nonzero().amax() == int(shown[0, 0] - 0.5)
     diagonal = seen.diagonal().nonzero().amax()
     assert diagonal == int(shown[1, 0] - 0.5)
-    assert diagonal < seen[100].nonzero().amax()  # a barrel: corners are drawn in
+    assert (
+        diagonal < seen[100].nonzero().amax()
+    )  # a barrel: corners are drawn in

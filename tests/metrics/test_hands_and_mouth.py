@@ -38,13 +38,17 @@ def spread(
 
 def signer(joints: int = 75) -> Frame:
     """Left hand 20 x 10 pixels, right hand 4 x 0, mouth 10 wide, ears behind it; grey noise."""
-    K = torch.tensor([[[FOCAL, 0, SIZE[1] / 2], [0, FOCAL, SIZE[0] / 2], [0, 0, 1]]])
+    K = torch.tensor(
+        [[[FOCAL, 0, SIZE[1] / 2], [0, FOCAL, SIZE[0] / 2], [0, 0, 1]]]
+    )
     p = torch.zeros(1, joints, 3) + torch.tensor([0.0, 0.0, DEPTH])
     p[0, LEFT] = unprojected(spread((20, 40), (30, 40)))
     p[0, RIGHT] = unprojected(spread((80.5, 84.5), (60.5, 60.5)))
     p[0, CORNERS] = unprojected(spread((65.2, 55.2), (20.3, 20.3), 2))
     p[0, EARS] = unprojected(spread((70, 50), (15, 15), 2), DEPTH + 0.1)
-    image = torch.rand(1, 3, *SIZE, generator=torch.Generator().manual_seed(0)) / 2
+    image = (
+        torch.rand(1, 3, *SIZE, generator=torch.Generator().manual_seed(0)) / 2
+    )
     zero = torch.zeros(1, dtype=torch.int64)
     camera = Camera(K, torch.eye(3)[None], torch.zeros(1, 3), SIZE)
     mask = torch.ones(1, 1, *SIZE)
@@ -98,10 +102,14 @@ def test_a_box_is_clipped_at_the_border_and_gone_beyond_it():
     f = unseen(signer(), RIGHT)
     cut = hands_and_mouth(moved(f, LEFT, -30), TEMPLATE)[HANDS]
     assert torch.equal(cut, rectangle((27, 43), (0, 13)))
-    gone = hands_and_mouth(moved(f, LEFT, -41), TEMPLATE)[HANDS]  # all but the margin
+    gone = hands_and_mouth(moved(f, LEFT, -41), TEMPLATE)[
+        HANDS
+    ]  # all but the margin
     assert not gone.any()
     behind = replace(f, skeleton=f.skeleton * torch.tensor([1.0, 1.0, -1.0]))
-    assert not any(box.any() for box in hands_and_mouth(behind, TEMPLATE).values())
+    assert not any(
+        box.any() for box in hands_and_mouth(behind, TEMPLATE).values()
+    )
 
 
 def test_no_mouth_from_behind_and_the_same_size_from_the_side():
@@ -120,7 +128,9 @@ def test_no_mouth_from_behind_and_the_same_size_from_the_side():
 
 def test_lips_take_the_place_of_the_mouths_corners():
     f = signer(77)
-    lips = replace(TEMPLATE, names=(*TEMPLATE.names, "mouth_outer_0", "mouth_outer_6"))
+    lips = replace(
+        TEMPLATE, names=(*TEMPLATE.names, "mouth_outer_0", "mouth_outer_6")
+    )
     f.skeleton[0, 75:] = unprojected(spread((50, 62), (20, 28), 2))
     boxes = hands_and_mouth(f, lips)
     # 25 % of 12 pixels: 3
@@ -134,17 +144,29 @@ def test_a_lens_moves_the_boxes_with_the_landmarks():
     boxes = hands_and_mouth(replace(f, camera=bent), TEMPLATE)
     pixels = bent.project(f.skeleton)[0][0, LEFT]
     assert (
-        float((pixels - f.camera.project(f.skeleton)[0][0, LEFT]).norm(dim=-1).max())
+        float(
+            (pixels - f.camera.project(f.skeleton)[0][0, LEFT])
+            .norm(dim=-1)
+            .max()
+        )
         > 1.5
     )
     low, high = pixels.amin(dim=0), pixels.amax(dim=0)
     margin = 0.15 * (high - low).max()
-    (x0, y0), (x1, y1) = ((v - 0.5).tolist() for v in (low - margin, high + margin))
-    expected = rectangle((math.ceil(y0), int(y1) + 1), (math.ceil(x0), int(x1) + 1))
-    assert torch.equal(boxes[HANDS] & ~rectangle((50, 100), (60, 120)), expected)
+    (x0, y0), (x1, y1) = (
+        (v - 0.5).tolist() for v in (low - margin, high + margin)
+    )
+    expected = rectangle(
+        (math.ceil(y0), int(y1) + 1), (math.ceil(x0), int(x1) + 1)
+    )
+    assert torch.equal(
+        boxes[HANDS] & ~rectangle((50, 100), (60, 120)), expected
+    )
 
 
-def scored(predicted: torch.Tensor, *frames: Frame, skeleton: str = NAME) -> dict:
+def scored(
+    predicted: torch.Tensor, *frames: Frame, skeleton: str = NAME
+) -> dict:
     scorer = Scorer(Preparation(MetricVariants(), None, skeleton))
     items = [(("a", i), f) for i, f in enumerate(frames)]
     return score_split(
@@ -186,5 +208,7 @@ def test_a_skeleton_without_hands_has_no_such_scores_and_the_record_says_so():
     found = scored(f.image + 0.1, f, skeleton="mediapipe33")
     for metric in BOX_METRICS:
         assert found[metric] is None
-        assert found[f"{metric}_reason"] == "the skeleton mediapipe33 has no hands"
+        assert (
+            found[f"{metric}_reason"] == "the skeleton mediapipe33 has no hands"
+        )
     assert found["boxes"] is None

@@ -6,7 +6,10 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from torchmetrics.image import PeakSignalNoiseRatio, StructuralSimilarityIndexMeasure
+from torchmetrics.image import (
+    PeakSignalNoiseRatio,
+    StructuralSimilarityIndexMeasure,
+)
 
 from gsgan.metrics.image import (
     edge_f1,
@@ -42,7 +45,9 @@ def pair(count: int = 3, size: int = 32) -> tuple[torch.Tensor, torch.Tensor]:
 
 def test_psnr_closed_form_and_one_score_per_image():
     target = torch.zeros(2, 3, 8, 8)
-    image = torch.stack([torch.full((3, 8, 8), 0.1), torch.full((3, 8, 8), 0.01)])
+    image = torch.stack(
+        [torch.full((3, 8, 8), 0.1), torch.full((3, 8, 8), 0.01)]
+    )
     torch.testing.assert_close(psnr(image, target), torch.tensor([20.0, 40.0]))
 
 
@@ -67,7 +72,10 @@ def test_psnr_is_torchmetrics_mean_per_image():
         float(metric(image, target)), abs=1e-6
     )
     pooled = PeakSignalNoiseRatio(data_range=1.0).double()
-    assert abs(float(pooled(image, target)) - float(psnr(image, target).mean())) > 1
+    assert (
+        abs(float(pooled(image, target)) - float(psnr(image, target).mean()))
+        > 1
+    )
 
 
 @pytest.mark.parametrize("value_range", [1.0, 2.0])
@@ -112,7 +120,9 @@ def test_the_persons_box_leaves_the_background_out():
     image = target.clone()
     image[..., 5:15, 8:12] = 0.1
     box = person_box(mask)
-    torch.testing.assert_close(psnr_where(image, target, box), torch.tensor([20.0]))
+    torch.testing.assert_close(
+        psnr_where(image, target, box), torch.tensor([20.0])
+    )
     # 40 of 400 pixels
     assert float(psnr(image, target)) == pytest.approx(20 + 10 * math.log10(10))
 
@@ -158,7 +168,9 @@ def test_high_frequencies_of_known_waves():
     def picture(a: float, b: float) -> torch.Tensor:
         return (a * slow + b * fast).expand(1, 3, 32, 32)
 
-    share = high_frequencies(picture(1.0, 0.5), picture(0.3, 1.0))  # energies 0.25 of 1
+    share = high_frequencies(
+        picture(1.0, 0.5), picture(0.3, 1.0)
+    )  # energies 0.25 of 1
     torch.testing.assert_close(share, torch.tensor([0.25], dtype=torch.float64))
     assert float(
         high_frequencies(picture(2.0, 1.0), picture(1.0, 1.0))
@@ -185,7 +197,8 @@ def test_edge_ratio_counts_opencvs_edge_pixels():
     image, target = (x.float() for x in pair(1))
     grey = [
         cv2.cvtColor(
-            (x[0] * 255).round().byte().permute(1, 2, 0).numpy(), cv2.COLOR_RGB2GRAY
+            (x[0] * 255).round().byte().permute(1, 2, 0).numpy(),
+            cv2.COLOR_RGB2GRAY,
         )
         for x in (image, target)
     ]
@@ -197,7 +210,9 @@ def test_edge_ratio_counts_opencvs_edge_pixels():
 
 def test_edges_in_the_persons_box_leave_out_those_elsewhere():
     image, target = square(6), square(6)
-    image[..., 26:34, 26:34] = 1.0  # an edge that the truth lacks, outside the box
+    image[..., 26:34, 26:34] = (
+        1.0  # an edge that the truth lacks, outside the box
+    )
     where = torch.zeros(1, 1, 40, 40, dtype=torch.bool)
     where[..., 4:20, 4:20] = True
     f1, ratio = edge_scores(image, target, where)
@@ -219,11 +234,19 @@ def test_an_edge_at_the_boxs_border_may_match_one_just_outside():
 def test_flicker_is_the_change_of_the_error_in_the_box_of_both_frames():
     mask, later = (square(at)[:, :1] for at in (8, 12))
     truth = square(8), square(12)
-    shifted = truth[0] + 0.1, truth[1] + 0.1  # an error that stays does not flicker
+    shifted = (
+        truth[0] + 0.1,
+        truth[1] + 0.1,
+    )  # an error that stays does not flicker
     assert (
-        float(flicker(shifted[1], truth[1], later, (shifted[0], truth[0], mask))) < 1e-6
+        float(
+            flicker(shifted[1], truth[1], later, (shifted[0], truth[0], mask))
+        )
+        < 1e-6
     )
-    image = truth[1] + 0.2 * mask * later  # in 8 x 8 of the 16 x 16 pixels round both
+    image = (
+        truth[1] + 0.2 * mask * later
+    )  # in 8 x 8 of the 16 x 16 pixels round both
     found = float(flicker(image, truth[1], later, (truth[0], truth[0], mask)))
     assert found == pytest.approx(0.2 * 64 / 256, abs=1e-6)
     empty = torch.zeros_like(mask)

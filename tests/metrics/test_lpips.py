@@ -39,7 +39,9 @@ def pattern() -> torch.Tensor:
 
 
 def changed(image: torch.Tensor) -> dict[str, torch.Tensor]:
-    blur = torch.nn.functional.avg_pool2d(image, 5, 1, 2, count_include_pad=False)
+    blur = torch.nn.functional.avg_pool2d(
+        image, 5, 1, 2, count_include_pad=False
+    )
     return {"blur": blur, "faint": 0.7 * image + 0.1}
 
 
@@ -52,9 +54,13 @@ def networks():
 def test_the_original_packages_numbers(networks, net, change, fed):
     image = pattern()
     measures = MetricVariants(lpips_range=fed)
-    scores = LpipsAgainst(image, None, networks, measures)(changed(image)[change])
+    scores = LpipsAgainst(image, None, networks, measures)(
+        changed(image)[change]
+    )
     assert set(scores) == {"lpips_vgg", "lpips_alex"}
-    assert scores[f"lpips_{net}"] == pytest.approx(ORIGINAL[net, change, fed], rel=1e-4)
+    assert scores[f"lpips_{net}"] == pytest.approx(
+        ORIGINAL[net, change, fed], rel=1e-4
+    )
 
 
 def test_torchmetrics_distance_of_the_same_networks(networks):
@@ -62,9 +68,13 @@ def test_torchmetrics_distance_of_the_same_networks(networks):
     from torchmetrics.functional.image.lpips import _LPIPS
 
     theirs = _LPIPS(net="alex", pnet_rand=True).eval()
-    convolutions = [m for m in theirs.net.modules() if isinstance(m, torch.nn.Conv2d)]
+    convolutions = [
+        m for m in theirs.net.modules() if isinstance(m, torch.nn.Conv2d)
+    ]
     ours = [
-        m for m in networks["alex"].network.modules() if isinstance(m, torch.nn.Conv2d)
+        m
+        for m in networks["alex"].network.modules()
+        if isinstance(m, torch.nn.Conv2d)
     ]
     for mine, other in zip(ours, convolutions, strict=True):
         other.load_state_dict(mine.state_dict())
@@ -80,7 +90,9 @@ def test_equal_images_have_no_distance_and_a_black_one_is_finite(networks):
     image = torch.zeros(1, 3, 64, 64)
     scores = LpipsAgainst(image, None, networks)(image)
     assert scores == {"lpips_vgg": 0.0, "lpips_alex": 0.0}
-    assert math.isfinite(LpipsAgainst(image, None, networks)(image + 1)["lpips_vgg"])
+    assert math.isfinite(
+        LpipsAgainst(image, None, networks)(image + 1)["lpips_vgg"]
+    )
 
 
 def test_the_gradient_of_a_black_image_is_finite(networks):
@@ -99,12 +111,15 @@ def test_the_persons_box_has_the_errors_near_it_alone(networks):
     far[..., 40:60, 110:124] = 0.5
     scores = LpipsAgainst(target, mask, {"alex": networks["alex"]})
     assert set(scores(near)) == ALEX
-    assert scores(near)["lpips_alex_person"] > 10 * scores(far)["lpips_alex_person"]
+    assert (
+        scores(near)["lpips_alex_person"]
+        > 10 * scores(far)["lpips_alex_person"]
+    )
     assert scores(near)["lpips_alex_person"] > 2 * scores(near)["lpips_alex"]
     assert scores(far)["lpips_alex"] > 0.005
-    nobody = LpipsAgainst(target, torch.zeros_like(mask), {"alex": networks["alex"]})(
-        near
-    )
+    nobody = LpipsAgainst(
+        target, torch.zeros_like(mask), {"alex": networks["alex"]}
+    )(near)
     assert math.isnan(nobody["lpips_alex_person"])
     assert math.isfinite(nobody["lpips_alex"])
 
@@ -125,7 +140,9 @@ def test_the_crop_is_what_the_network_sees(networks):
     target = pattern()[..., :64, :64]
     image = changed(target)["blur"]
     mask = torch.zeros(1, 1, 64, 64)
-    mask[..., 60:63, 60:63] = 1  # with 50 px round it: rows and columns 10 to 63
+    mask[..., 60:63, 60:63] = (
+        1  # with 50 px round it: rows and columns 10 to 63
+    )
     elsewhere = image.clone()
     elsewhere[..., :10, :] = 1 - elsewhere[..., :10, :]
     measures = MetricVariants(lpips_region="mask_crop_512", background="white")
@@ -133,11 +150,15 @@ def test_the_crop_is_what_the_network_sees(networks):
     found = []
     for predicted in (image, elsewhere):
         lpips = LpipsAgainst(target, mask, only, measures)
-        own = image_scores(predicted, target, mask, measures=measures, lpips=lpips)
+        own = image_scores(
+            predicted, target, mask, measures=measures, lpips=lpips
+        )
         found.append(own["lpips_alex"])
     squares = [mask_crop(x[0], mask[0], 1.0)[None] for x in (image, target)]
     with torch.no_grad():
-        assert found[0] == pytest.approx(float(networks["alex"](*squares)), abs=1e-6)
+        assert found[0] == pytest.approx(
+            float(networks["alex"](*squares)), abs=1e-6
+        )
     assert found[0] == found[1]
     nobody = LpipsAgainst(target, torch.zeros_like(mask), only, measures)(image)
     assert math.isnan(nobody["lpips_alex"])
@@ -167,6 +188,8 @@ def test_what_the_networks_get_is_described():
 
 
 def test_unknown_networks_are_refused_and_none_leaves_lpips_out():
-    with pytest.raises(ConfigError, match=r"lpips\.nets must be one of vgg, alex"):
+    with pytest.raises(
+        ConfigError, match=r"lpips\.nets must be one of vgg, alex"
+    ):
         build_lpips(["squeeze"])
     assert build_lpips([]) == {}

@@ -9,7 +9,12 @@ import torch
 from torch import Tensor
 
 from gsgan.metrics.image import flicker
-from gsgan.metrics.motion import MIN_FLOW_SIDE, Motion, truth_motion, warped_flicker
+from gsgan.metrics.motion import (
+    MIN_FLOW_SIDE,
+    Motion,
+    truth_motion,
+    warped_flicker,
+)
 
 SIDE = 64
 STEP = 3  # pixels by which the person moves to the right between the two frames
@@ -21,7 +26,9 @@ def noise(seed: int) -> Tensor:
     """Smooth noise about 0, ``[1, 3, SIDE, SIDE]``, with a deviation of 1."""
     values = np.random.default_rng(seed).normal(size=(SIDE, SIDE, 3))
     smooth = cv2.GaussianBlur(values, (0, 0), 1.5)
-    return torch.from_numpy(smooth / smooth.std()).float().permute(2, 0, 1)[None]
+    return (
+        torch.from_numpy(smooth / smooth.std()).float().permute(2, 0, 1)[None]
+    )
 
 
 def person(left: int, grow: int = 0) -> Tensor:

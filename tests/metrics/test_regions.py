@@ -28,7 +28,8 @@ def test_eight_bits():
     image = torch.tensor([0.0, 0.9 / 255, 1.2 / 255, 1.0]).view(1, 1, 1, 4)
     assert torch.equal(eight_bits(image, "none"), image)
     rounded, cut = (
-        (eight_bits(image, how) * 255).flatten().tolist() for how in ("rounded", "cut")
+        (eight_bits(image, how) * 255).flatten().tolist()
+        for how in ("rounded", "cut")
     )
     assert rounded == pytest.approx([0, 1, 1, 255])
     assert cut == pytest.approx([0, 0, 1, 255])
@@ -38,7 +39,9 @@ def test_eight_bits():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_what_is_8_bit_already_stays(how, dtype):
     stored = torch.arange(256).to(dtype).view(1, 1, 16, 16) / 255
-    assert torch.equal((eight_bits(stored, how) * 255).round(), (stored * 255).round())
+    assert torch.equal(
+        (eight_bits(stored, how) * 255).round(), (stored * 255).round()
+    )
 
 
 def test_cleared_pixels_are_background():
@@ -48,12 +51,18 @@ def test_cleared_pixels_are_background():
 
 
 def test_a_hard_outline_is_the_image_as_it_was_taken():
-    taken = torch.tensor([0.8, 0.8, 0.8, 0.8]).view(1, 1, 1, 4).expand(1, 3, 1, 4)
+    taken = (
+        torch.tensor([0.8, 0.8, 0.8, 0.8]).view(1, 1, 1, 4).expand(1, 3, 1, 4)
+    )
     mask = torch.tensor([1.0, 0.5, 0.49, 0.0]).view(1, 1, 1, 4)
     found = hard_outline(taken * mask, mask)
     assert found[0, 0, 0].tolist() == pytest.approx([0.8, 0.8, 0.0, 0.0])
     assert (
-        float(hard_outline(torch.ones(1, 3, 1, 1), torch.full((1, 1, 1, 1), 0.6)).max())
+        float(
+            hard_outline(
+                torch.ones(1, 3, 1, 1), torch.full((1, 1, 1, 1), 0.6)
+            ).max()
+        )
         == 1.0
     )
 
@@ -108,7 +117,11 @@ def test_the_crop_shrinks_as_opencv_interpolates():
     [
         ((10, 14, 20, 30), 1, (slice(10, 14), slice(20, 30))),
         ((10, 14, 20, 30), 16, (slice(4, 20), slice(17, 33))),
-        ((0, 4, 36, 40), 16, (slice(0, 16), slice(24, 40))),  # pushed in at the border
+        (
+            (0, 4, 36, 40),
+            16,
+            (slice(0, 16), slice(24, 40)),
+        ),  # pushed in at the border
         # as far as the picture reaches
         ((10, 14, 20, 30), 64, (slice(0, 40), slice(0, 40))),
     ],

@@ -24,7 +24,11 @@ INSIDE = 16 * 16
 
 def test_shares_of_an_error_that_is_the_same_everywhere_are_those_of_the_area():
     found = region_shares(TARGET + 0.1, TARGET, MASK, PARTS)
-    expected = {"outline": AREA - INSIDE, "trunk": INSIDE / 2, "limbs": INSIDE / 2}
+    expected = {
+        "outline": AREA - INSIDE,
+        "trunk": INSIDE / 2,
+        "limbs": INSIDE / 2,
+    }
     for name, pixels in expected.items():
         assert found[f"area_{name}"] == pytest.approx(pixels / AREA)
         assert found[f"error_{name}"] == pytest.approx(pixels / AREA, abs=1e-5)
@@ -91,7 +95,13 @@ def test_limbs_of_both_sets_of_parts(names, limbs):
 
 
 def test_limbs_of_joints():
-    for name in ("left_hip", "right_knee", "left_foot", "right_elbow", "left_index2"):
+    for name in (
+        "left_hip",
+        "right_knee",
+        "left_foot",
+        "right_elbow",
+        "left_index2",
+    ):
         assert is_limb(name)
     for name in ("spine2", "neck", "head", "jaw", "left_shoulder", "left_eye"):
         assert not is_limb(name)

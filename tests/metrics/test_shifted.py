@@ -56,9 +56,13 @@ def test_two_pixels_are_too_far():
 
 def test_colours_that_are_wrong_stay_wrong():
     image = TARGET + 0.1
-    assert float(psnr_shifted(image, TARGET, MASK)) == pytest.approx(20, abs=1e-4)
+    assert float(psnr_shifted(image, TARGET, MASK)) == pytest.approx(
+        20, abs=1e-4
+    )
     moved = image.roll(1, dims=-2)
-    assert float(psnr_shifted(moved, TARGET, MASK)) == pytest.approx(20, abs=1e-4)
+    assert float(psnr_shifted(moved, TARGET, MASK)) == pytest.approx(
+        20, abs=1e-4
+    )
 
 
 def test_it_is_never_below_the_psnr_in_the_box():
@@ -71,4 +75,6 @@ def test_it_is_never_below_the_psnr_in_the_box():
 def test_a_box_at_the_images_border_and_an_empty_one():
     everywhere = torch.ones_like(MASK)
     assert float(psnr_shifted(TARGET, TARGET, everywhere)) == math.inf
-    assert math.isnan(float(psnr_shifted(TARGET, TARGET, torch.zeros_like(MASK))))
+    assert math.isnan(
+        float(psnr_shifted(TARGET, TARGET, torch.zeros_like(MASK)))
+    )

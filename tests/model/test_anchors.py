@@ -14,7 +14,9 @@ def sphere(count: int) -> torch.Tensor:
     z = 1 - 2 * i / count
     turn = torch.pi * (1 + 5**0.5) * i
     radius = (1 - z**2).sqrt()
-    return 0.3 * torch.stack([radius * turn.cos(), radius * turn.sin(), z], dim=-1)
+    return 0.3 * torch.stack(
+        [radius * turn.cos(), radius * turn.sin(), z], dim=-1
+    )
 
 
 def points_of(rest: torch.Tensor, items: int = 2) -> Points:
@@ -34,7 +36,14 @@ def points_of(rest: torch.Tensor, items: int = 2) -> Points:
 def network(rest: torch.Tensor, **settings) -> Deformation:
     torch.manual_seed(0)
     made = Deformation(
-        rest, 1.7, joints=33, width=16, layers=2, features=2, normals=True, **settings
+        rest,
+        1.7,
+        joints=33,
+        width=16,
+        layers=2,
+        features=2,
+        normals=True,
+        **settings,
     )
     torch.nn.init.normal_(made.head.weight, std=0.05)
     if made.table is not None:
@@ -65,7 +74,9 @@ def test_residuals_between_anchors_are_means_of_their_anchors():
     torch.testing.assert_close(psi.share.sum(1), torch.ones(800))
     assert len(psi.embedding) == 100
     found = psi.residuals(points_of(rest), **given()).means
-    at = psi.residuals(points_of(rest), **given(), chosen=psi.anchors.expand(2, -1))
+    at = psi.residuals(
+        points_of(rest), **given(), chosen=psi.anchors.expand(2, -1)
+    )
     assert found.shape == (2, 800, 3)
     assert torch.equal(at.means, found[:, psi.anchors])
     smallest = found[:, psi.anchors].amin(1, keepdim=True)
@@ -84,7 +95,9 @@ def test_each_point_has_residuals_of_its_own():
 
 
 @pytest.mark.parametrize("anchors", [None, 100])
-def test_chosen_points_have_the_gaussians_and_gradients_they_have_among_all(anchors):
+def test_chosen_points_have_the_gaussians_and_gradients_they_have_among_all(
+    anchors,
+):
     rest = sphere(400)
     psi = network(rest, anchors=anchors).train()
     points = points_of(rest)
@@ -126,7 +139,9 @@ def test_anchors_come_back_from_a_checkpoint():
 
 def test_points_near_the_image_are_found(build):
     _, avatar, frame = build("model=splat_only", "size.image=48")
-    means = avatar.residuals(frame.skeleton, frame.visibility > 0, frame.body)[0].means
+    means = avatar.residuals(frame.skeleton, frame.visibility > 0, frame.body)[
+        0
+    ].means
     every = seen_points(means, frame.camera, reach=10.0)
     assert every.shape[1] == means.shape[1]
     pixels, _ = frame.camera.project(means)

@@ -72,7 +72,9 @@ def test_gradients_reach_every_trained_part(build):
     left_of_zero(avatar).train()(*frame.inputs).image.square().sum().backward()
     for part in ("deformation", "pose_encoder", "generator"):
         grads = [p.grad for p in getattr(avatar, part).parameters()]
-        assert any(g is not None and float(g.abs().max()) > 0 for g in grads), part
+        assert any(g is not None and float(g.abs().max()) > 0 for g in grads), (
+            part
+        )
     # trained on its own
     assert all(p.grad is None for p in avatar.segmentation.parameters())
 
@@ -81,7 +83,8 @@ def test_a_missing_body_pose_is_solved_from_the_skeleton(build):
     _, avatar, frame = build()
     solved = avatar.body_pose(frame.skeleton, frame.visibility)
     given, bare = (
-        avatar(*dataclasses.replace(frame, body=b).inputs) for b in (solved, None)
+        avatar(*dataclasses.replace(frame, body=b).inputs)
+        for b in (solved, None)
     )
     assert avatar.needs_body
     assert torch.equal(bare.segmentation, given.segmentation)
@@ -114,7 +117,9 @@ def test_one_camera_gives_psi_no_normals(build):
 
 
 def test_data_without_body_pose_builds_no_segmentation(build, tmp_path):
-    root = write_tiny_capture(tmp_path / "bare", cameras=2, frames=4, size=(48, 48))
+    root = write_tiny_capture(
+        tmp_path / "bare", cameras=2, frames=4, size=(48, 48)
+    )
     _, avatar, frame = build(f"data.root={root}")
     assert avatar.segmentation is None
     assert avatar.segmentation_why == "the data has no body pose"
@@ -124,8 +129,15 @@ def test_data_without_body_pose_builds_no_segmentation(build, tmp_path):
 def test_segmentation_of_a_model_file(build, tiny, tmp_path):
     write_smpl(tmp_path / "smpl.pkl", vertices=500)
     data, _, frame = build()
-    bare = {"body": "smpl", "label_names": (), "n_labels": 0, "has_labels": False}
-    scene = dataclasses.replace(data.info, **bare, body_file=str(tmp_path / "smpl.pkl"))
+    bare = {
+        "body": "smpl",
+        "label_names": (),
+        "n_labels": 0,
+        "has_labels": False,
+    }
+    scene = dataclasses.replace(
+        data.info, **bare, body_file=str(tmp_path / "smpl.pkl")
+    )
     avatar = build_avatar(tiny(), scene)
     assert avatar.segmentation_why == "parts by the body's joints"
     # this data has no labels to learn from

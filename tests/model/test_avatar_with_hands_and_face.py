@@ -27,7 +27,9 @@ AXES = torch.tensor([1.0, 1, -1])  # left, up, front from the capture's x, z, y
 @pytest.fixture(scope="module")
 def signing(capture, tmp_path_factory):
     """The small capture with hands and a face."""
-    root = shutil.copytree(capture, tmp_path_factory.mktemp("signing") / "capture")
+    root = shutil.copytree(
+        capture, tmp_path_factory.mktemp("signing") / "capture"
+    )
     write_hands(root, 6)
     write_face(root, 6)
     return root
@@ -64,7 +66,9 @@ def test_every_model_takes_hands_and_a_face(build, signing, model, skeleton):
 
 
 @pytest.mark.parametrize("body_points", ["on", "off"])
-def test_lips_that_move_by_5_mm_move_the_pose_codes_by_order_1(made, body_points):
+def test_lips_that_move_by_5_mm_move_the_pose_codes_by_order_1(
+    made, body_points
+):
     """Through Ψ's input and the pose encoder's, with finite slopes."""
     _, avatar, frame = made(f"effects.body_points={body_points}")
     psi, valid = avatar.deformation, frame.visibility > 0
@@ -79,12 +83,24 @@ def test_lips_that_move_by_5_mm_move_the_pose_codes_by_order_1(made, body_points
         p.requires_grad_()
         painting = avatar(p, frame.visibility, frame.camera, frame.body)
         frames = bone_frames(p, valid, avatar.template)
-        given = p, valid, frames, frame.camera, avatar.template, avatar.body_height
+        given = (
+            p,
+            valid,
+            frames,
+            frame.camera,
+            avatar.template,
+            avatar.body_height,
+        )
         inputs.append(pose_inputs(*given))
-        (painting.image.square().sum() + inputs[-1][0].square().sum()).backward()
+        (
+            painting.image.square().sum() + inputs[-1][0].square().sum()
+        ).backward()
         assert p.grad.isfinite().all()
         assert (p.grad[0, 75:87].norm(dim=-1) > 0).all()
-    changes = [taken[1] - taken[0], *(b - a for a, b in zip(*inputs, strict=True))]
+    changes = [
+        taken[1] - taken[0],
+        *(b - a for a, b in zip(*inputs, strict=True)),
+    ]
     for change in changes:
         change = change.reshape(105, -1)
         torch.testing.assert_close(
@@ -122,7 +138,9 @@ def test_a_run_with_a_face_is_trained_loaded_and_driven_without(
     assert avatar.render(p[:, :33], camera).isfinite().all()
     q, seen, body = inputs_of(avatar, rest_pose(data.info.proportions), 0)
     assert not seen[:, 33:].any()
-    code = face_code(q, bone_frames(q, seen > 0, avatar.template).head, avatar.template)
+    code = face_code(
+        q, bone_frames(q, seen > 0, avatar.template).head, avatar.template
+    )
     torch.testing.assert_close(code, torch.zeros(1, 30, 3), atol=1e-3, rtol=0)
     assert np.isfinite(splats_of(avatar, q, seen > 0, body).means).all()
 
@@ -151,7 +169,9 @@ def test_fingers_move_what_is_on_the_body(handed):
     assert len(moved & fingers) > 8
 
 
-def test_a_skeleton_without_hands_drives_it_and_hands_drive_one_without(handed, build):
+def test_a_skeleton_without_hands_drives_it_and_hands_drive_one_without(
+    handed, build
+):
     _, avatar, frame = handed("model=splat_only")
     given = frame.skeleton[0], frame.camera
     whole = avatar.render(*given)
@@ -164,12 +184,16 @@ def test_a_skeleton_without_hands_drives_it_and_hands_drive_one_without(handed, 
     lost[HANDS] = torch.nan
     assert torch.equal(avatar.render(lost, given[1]), bare)
     _, plain, frame = build("model=splat_only")
-    assert torch.equal(plain.render(*given), plain.render(given[0][:33], given[1]))
+    assert torch.equal(
+        plain.render(*given), plain.render(given[0][:33], given[1])
+    )
 
 
 def test_a_missing_hand_rests_on_its_arm(handed):
     """Through rendering: no hand at the origin or elsewhere, in G or in S."""
-    _, avatar, frame = handed("effects.body_points=on", "model.segmentation.mode=hands")
+    _, avatar, frame = handed(
+        "effects.body_points=on", "model.segmentation.mode=hands"
+    )
     p = frame.skeleton[0].clone()
     p[33:54] = torch.nan
     drive = Drive(p[None].numpy(), np.ones((1, 75)), None, [0], "")

@@ -30,7 +30,9 @@ def body():
 
 
 def rest(body, batch: int = 1) -> BodyPose:
-    return BodyPose(torch.zeros(batch, len(body.joints), 3), torch.zeros(batch, 3))
+    return BodyPose(
+        torch.zeros(batch, len(body.joints), 3), torch.zeros(batch, 3)
+    )
 
 
 def test_at_rest_the_points_are_vertices_and_their_frames_the_worlds(body):
@@ -53,7 +55,10 @@ def test_a_turned_body_turns_points_and_frames(body):
     torch.testing.assert_close(after.frames[0, 7], quarter, atol=1e-6, rtol=0)
     between = before.means[0] - before.means[0, :1]
     torch.testing.assert_close(
-        after.means[0] - after.means[0, :1], between @ quarter.mT, atol=1e-5, rtol=0
+        after.means[0] - after.means[0, :1],
+        between @ quarter.mT,
+        atol=1e-5,
+        rtol=0,
     )
 
 
@@ -63,19 +68,26 @@ def test_a_shapes_last_bits_choose_no_other_points(body):
     )
     noisy = replace(body, vertices=body.vertices * noise)
     points, same = (
-        BodyPoints(b, 1.7, points=2000, controls=50).points for b in (body, noisy)
+        BodyPoints(b, 1.7, points=2000, controls=50).points
+        for b in (body, noisy)
     )
     chosen = points.chosen
     assert torch.equal(same.chosen, chosen)
     assert torch.equal(same.learnt.near, points.learnt.near)
-    other = BodyPoints(replace(noisy, template=None), 1.7, points=2000).points.chosen
+    other = BodyPoints(
+        replace(noisy, template=None), 1.7, points=2000
+    ).points.chosen
     assert not torch.equal(other, chosen)  # what the template is for
 
 
 def test_learnt_weights_start_as_the_bodys_and_find_another_persons(body):
     torch.manual_seed(0)
-    poses = replace(rest(body, 8), theta=0.4 * torch.randn(8, len(body.joints), 3))
-    own, learnt = (BodyPoints(body, 1.7, points=300, controls=n) for n in (0, 60))
+    poses = replace(
+        rest(body, 8), theta=0.4 * torch.randn(8, len(body.joints), 3)
+    )
+    own, learnt = (
+        BodyPoints(body, 1.7, points=300, controls=n) for n in (0, 60)
+    )
     assert (learnt(poses).means - own(poses).means).norm(dim=-1).max() < 0.01
     other = BodyPoints(body, 1.7, points=300, controls=60)
     with torch.no_grad():
@@ -97,7 +109,11 @@ def test_learnt_weights_start_as_the_bodys_and_find_another_persons(body):
         field *= 1e4
     weight = learnt.points.weights[1]
     torch.testing.assert_close(weight.sum(1), torch.ones(300))
-    assert torch.autograd.grad(learnt(poses).means.sum(), field)[0].isfinite().all()
+    assert (
+        torch.autograd.grad(learnt(poses).means.sum(), field)[0]
+        .isfinite()
+        .all()
+    )
 
 
 def test_in_a_high_kick_stretched_shapes_reach_their_neighbours(body):
@@ -106,7 +122,9 @@ def test_in_a_high_kick_stretched_shapes_reach_their_neighbours(body):
     kick = rest(body)
     kick.theta[0, body.joint_names.index("upperleg01.L"), 0] = -2.6
     points = placed(kick)
-    assert torch.equal(points.means, BodyPoints(body, 1.7, stretch=False)(kick).means)
+    assert torch.equal(
+        points.means, BodyPoints(body, 1.7, stretch=False)(kick).means
+    )
     torch.testing.assert_close(
         placed(rest(body)).shapes, points.shapes * 0 + torch.eye(3)
     )
@@ -115,12 +133,12 @@ def test_in_a_high_kick_stretched_shapes_reach_their_neighbours(body):
     posed = (points.means[0, b] - points.means[0, a]).norm(dim=-1)
     pulled = posed > 1.5 * edge.norm(dim=1).squeeze()
     assert pulled.sum() > 100
-    reach = (points.shapes[0, a] @ edge).squeeze(-1).norm(dim=-1)[pulled] / posed[
+    reach = (points.shapes[0, a] @ edge).squeeze(-1).norm(dim=-1)[
         pulled
-    ]
-    plain = (points.frames[0, a] @ edge).squeeze(-1).norm(dim=-1)[pulled] / posed[
+    ] / posed[pulled]
+    plain = (points.frames[0, a] @ edge).squeeze(-1).norm(dim=-1)[
         pulled
-    ]
+    ] / posed[pulled]
     assert plain.median() < 0.6
     assert 0.85 < reach.median() < 1.15
 
@@ -133,7 +151,9 @@ def test_normals_point_out_of_the_posed_body(body):
     pose = replace(rest(body), theta=0.15 * torch.randn(1, len(body.joints), 3))
     placed = BodyPoints(body, 1.7)
     points = placed(pose)
-    mesh = trimesh.Trimesh(points.means[0].numpy(), body.faces.numpy(), process=False)
+    mesh = trimesh.Trimesh(
+        points.means[0].numpy(), body.faces.numpy(), process=False
+    )
     face = torch.tensor(mesh.face_normals, dtype=torch.float32)
     agree = (points.normals[0][body.faces[:, 0]] * face).sum(-1)
     assert agree.median() > 0.97
@@ -149,7 +169,11 @@ def test_normals_point_out_of_the_posed_body(body):
             [[1.0, 0, 0], [0, 1, 0], [0, 0, 0]],
             [0.0, 0, 1],
         ),
-        ("flattened to a line", [[1.0, 0, 0], [0, 0, 0], [0, 0, 0]], [0.0, 0, 0]),
+        (
+            "flattened to a line",
+            [[1.0, 0, 0], [0, 0, 0], [0, 0, 0]],
+            [0.0, 0, 0],
+        ),
         ("shrunk to nothing", [[0.0, 0, 0], [0, 0, 0], [0, 0, 0]], [0.0, 0, 0]),
         (
             "shrunk to a tenth",
@@ -169,7 +193,9 @@ def test_stability_normals_of_a_skin_that_is(name, A, expected):
 
 
 def test_a_vertex_without_a_face_has_no_normal():
-    corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [5, 5, 5], [2, 0, 0]])
+    corners = torch.tensor(
+        [[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [5, 5, 5], [2, 0, 0]]
+    )
     faces = torch.tensor([[0, 1, 2], [0, 1, 4]])  # the second has no area
     found = vertex_normals(corners, faces)
     up, none = [0.0, 0, 1], [0.0, 0, 0]
@@ -180,10 +206,14 @@ def test_on_the_body_nothing_is_densified_and_off_it_no_body_is_built(build):
     _, avatar, frame = build(ON)
     assert avatar.densify is None
     painting = avatar(*frame.inputs)
-    assert painting.gaussians.means.shape[1] == avatar.body_points.n_points == 500
+    assert (
+        painting.gaussians.means.shape[1] == avatar.body_points.n_points == 500
+    )
     _, plain, frame = build("effects.body_points=off")
     assert plain.body_points is None
-    assert plain(*frame.inputs).gaussians.means.shape[1] == plain.densify.n_points
+    assert (
+        plain(*frame.inputs).gaussians.means.shape[1] == plain.densify.n_points
+    )
 
 
 def test_untrained_gaussians_sit_on_the_surface(build):
@@ -214,22 +244,30 @@ def test_a_trained_avatar_without_its_body_is_refused_in_one_sentence(
     for place in ("assemble", "class_vote"):
         monkeypatch.setattr(f"gsgan.run.{place}.open_body", lambda *_: None)
     with pytest.raises(
-        DataError, match=rf"{said},? .*cannot be built.* no model file; set data\.smpl"
+        DataError,
+        match=rf"{said},? .*cannot be built.* no model file; set data\.smpl",
     ):
         load_avatar(tmp_path, config, data)
 
 
 def test_a_fitting_body_lies_in_its_mask_and_a_shifted_one_leaves_it(body):
-    given = TINY | {"size": 64, "train_cameras": 2, "test_cameras": 0, "frames": 2}
+    given = TINY | {
+        "size": 64,
+        "train_cameras": 2,
+        "test_cameras": 0,
+        "frames": 2,
+    }
     root = ensure_scene(**given | {"test_frames": 0}, workers=1, progress=False)
     frame = GsganData(root=root, size=64).dataset("train")[0]
     exact = body_inside(frame, body)
     pose = frame.body
     away = replace(
-        frame, body=replace(pose, transl=pose.transl + torch.tensor([0.3, 0.3, 0]))
+        frame,
+        body=replace(pose, transl=pose.transl + torch.tensor([0.3, 0.3, 0])),
     )
     gone = replace(
-        frame, body=replace(pose, transl=pose.transl + torch.tensor([0, 0, 50.0]))
+        frame,
+        body=replace(pose, transl=pose.transl + torch.tensor([0, 0, 50.0])),
     )
     assert exact > 0.99
     assert body_inside(away, body) < 0.8
@@ -237,16 +275,24 @@ def test_a_fitting_body_lies_in_its_mask_and_a_shifted_one_leaves_it(body):
     nobody = replace(frame, mask=torch.zeros_like(frame.mask))
     # a mask that failed tells nothing of the pose
     assert body_inside(nobody, body) is None
-    behind = replace(frame, skeleton=2 * frame.camera.centre[:, None] - frame.skeleton)
+    behind = replace(
+        frame, skeleton=2 * frame.camera.centre[:, None] - frame.skeleton
+    )
     assert body_inside(behind, body) == exact  # whatever the joints say
 
 
 def test_low_pass_is_the_models_for_F_and_S_whatever_the_accuracy(build):
     _, avatar, _ = build("accuracy=draft")
-    assert avatar.accuracy.low_pass == avatar.segmentation.accuracy.low_pass == 0.0833
+    assert (
+        avatar.accuracy.low_pass
+        == avatar.segmentation.accuracy.low_pass
+        == 0.0833
+    )
     assert avatar.accuracy.name == "draft"
     _, usual, _ = build("model.low_pass=0.3")
-    assert usual.accuracy.low_pass == usual.segmentation.accuracy.low_pass == 0.3
+    assert (
+        usual.accuracy.low_pass == usual.segmentation.accuracy.low_pass == 0.3
+    )
 
 
 @pytest.mark.parametrize("key", ["low_pass", "supersample"])
@@ -260,14 +306,20 @@ def test_what_is_the_models_is_not_the_accuracys_too(tiny, key):
 @pytest.mark.parametrize(
     ("amount", "maximum"), [(0.15, 1.0), (0.4, 2.5)], ids=["near", "far"]
 )
-def test_normals_are_those_of_the_posed_mesh_part_by_part(body, amount, maximum):
+def test_normals_are_those_of_the_posed_mesh_part_by_part(
+    body, amount, maximum
+):
     """Mean angle to the posed mesh's own normals, degrees; A alone is several times as far off."""
     torch.manual_seed(0)
-    pose = replace(rest(body, 4), theta=amount * torch.randn(4, len(body.joints), 3))
+    pose = replace(
+        rest(body, 4), theta=amount * torch.randn(4, len(body.joints), 3)
+    )
     placed = BodyPoints(body, 1.7)
     points = placed(pose)
     plain = moved_normals(points.frames, placed.rest_normals)
-    truth = torch.stack([vertex_normals(means, body.faces) for means in points.means])
+    truth = torch.stack(
+        [vertex_normals(means, body.faces) for means in points.means]
+    )
 
     def angle(normals):
         cosine = (functional.normalize(normals, dim=-1) * truth).sum(-1)
@@ -277,9 +329,9 @@ def test_normals_are_those_of_the_posed_mesh_part_by_part(body, amount, maximum)
     for label in body.vertex_labels.unique():
         part = body.vertex_labels == label
         assert found[:, part].mean() < maximum, body.label_names[label]
-        assert found[:, part].mean() < 0.6 * before[:, part].mean(), body.label_names[
-            label
-        ]
+        assert found[:, part].mean() < 0.6 * before[:, part].mean(), (
+            body.label_names[label]
+        )
 
 
 def test_the_jacobian_is_that_of_the_learnt_weights(body):
@@ -287,11 +339,17 @@ def test_the_jacobian_is_that_of_the_learnt_weights(body):
     torch.manual_seed(0)
     placed = BodyPoints(body, 1.7, controls=400)
     with torch.no_grad():
-        placed.points.learnt.field.copy_(torch.randn_like(placed.points.learnt.field))
-        pose = replace(rest(body), theta=0.4 * torch.randn(1, len(body.joints), 3))
+        placed.points.learnt.field.copy_(
+            torch.randn_like(placed.points.learnt.field)
+        )
+        pose = replace(
+            rest(body), theta=0.4 * torch.randn(1, len(body.joints), 3)
+        )
         points = placed(pose)
         bones = placed.points.with_bones(pose).bones
-        own = placed.gradients(placed.points.bone_index, placed.points.bone_weight)
+        own = placed.gradients(
+            placed.points.bone_index, placed.points.bone_weight
+        )
         wrong = stretched(points.frames, bones, *own)
     a, b = body.faces[:, 0], body.faces[:, 1]
     edge = (body.vertices[b] - body.vertices[a]).float().unsqueeze(-1)
@@ -300,7 +358,9 @@ def test_the_jacobian_is_that_of_the_learnt_weights(body):
     def off(jacobian):
         """Median relative error; the mean of both ends cancels the second order of the step."""
         predicted = ((jacobian[0, a] + jacobian[0, b]) / 2 @ edge).squeeze(-1)
-        return ((predicted - moved).norm(dim=-1) / edge.norm(dim=1).squeeze()).median()
+        return (
+            (predicted - moved).norm(dim=-1) / edge.norm(dim=1).squeeze()
+        ).median()
 
     assert off(points.stretched) < 0.03
     assert off(points.stretched) < 0.5 * off(wrong)
@@ -309,7 +369,9 @@ def test_the_jacobian_is_that_of_the_learnt_weights(body):
 def test_neighbours_of_a_subset_are_neighbours_on_the_surface(body):
     """Points of two fingers or of two thighs may be near each other, but not along the skin."""
     everything = torch.arange(len(body.vertices))
-    edges = torch.cat([body.faces[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
+    edges = torch.cat(
+        [body.faces[:, pair] for pair in ([0, 1], [1, 2], [2, 0])]
+    )
     edges = torch.cat([edges, edges.flip(1)]).unique(dim=0)
     assert torch.equal(
         neighbours_on_surface(body.vertices, body.faces, everything), edges
@@ -327,7 +389,9 @@ def test_neighbours_of_a_subset_are_neighbours_on_the_surface(body):
 
 
 def test_the_terms_of_the_stretch_are_renewed_every_so_many_iterations(body):
-    points = BodyPoints(body, 1.7, points=300, controls=20, stretch_every=3).train()
+    points = BodyPoints(
+        body, 1.7, points=300, controls=20, stretch_every=3
+    ).train()
     pose = BodyPose(torch.zeros(1, len(body.joints), 3), torch.zeros(1, 3))
     field = points.points.learnt.field
     found = []

@@ -39,7 +39,9 @@ def test_stability_an_opacity_and_a_scale_beyond_their_bounds_come_back():
         net.table[:, at] = 40.0  # logits: saturated
     pose, root = torch.zeros(1, 99), torch.zeros(1, 3)
     gaussians = net.compose(
-        points, net.residuals(points, pose, root, torch.eye(3)[None]), torch.ones(1, 3)
+        points,
+        net.residuals(points, pose, root, torch.eye(3)[None]),
+        torch.ones(1, 3),
     )
     (
         gaussians.opacities.sum()

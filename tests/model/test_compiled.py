@@ -30,7 +30,11 @@ def both(
 def test_photometric(monkeypatch, shape, near):
     torch.manual_seed(0)
     target = torch.rand(shape, dtype=torch.float64)
-    image = target + 1e-4 * torch.rand_like(target) if near else torch.rand_like(target)
+    image = (
+        target + 1e-4 * torch.rand_like(target)
+        if near
+        else torch.rand_like(target)
+    )
     image[..., 0, 0] = target[..., 0, 0]  # where L1 has no slope
     image.requires_grad_()
 
@@ -71,11 +75,14 @@ def test_geometry(monkeypatch, bound):
     raw = [x.requires_grad_() for x in raw]
     rest = torch.zeros(B, N, 1, 3, **wide), torch.zeros(B, N, 29, **wide)
     weights = [
-        torch.randn(*shape, **wide) for shape in ((B, N, 3), (B, N, 3, 3), (B, N))
+        torch.randn(*shape, **wide)
+        for shape in ((B, N, 3), (B, N, 3, 3), (B, N))
     ]
 
     def run():
-        made = psi.compose(points, Residuals(*raw, *rest), torch.ones(B, 3, **wide))
+        made = psi.compose(
+            points, Residuals(*raw, *rest), torch.ones(B, 3, **wide)
+        )
         found = [made.means, made.covariances, made.opacities]
         loss = sum((x * w).sum() for x, w in zip(found, weights, strict=True))
         return [x.detach() for x in found] + list(
@@ -95,11 +102,21 @@ def test_psi_in_training_is_psi(batch, embedding, normals):
     torch.manual_seed(0)
     N, wide = 40, {"dtype": torch.float64}
     psi = Deformation(
-        torch.randn(N, 3), 1.7, width=8, layers=3, embedding=embedding, normals=normals
+        torch.randn(N, 3),
+        1.7,
+        width=8,
+        layers=3,
+        embedding=embedding,
+        normals=normals,
     ).double()
     torch.nn.init.normal_(psi.head.weight)
-    places, facing = torch.randn(batch, N, 3, **wide), torch.randn(batch, N, 3, **wide)
-    points = Points(places, places, places, places, places, torch.arange(N), facing)
+    places, facing = (
+        torch.randn(batch, N, 3, **wide),
+        torch.randn(batch, N, 3, **wide),
+    )
+    points = Points(
+        places, places, places, places, places, torch.arange(N), facing
+    )
     pose, root = torch.randn(batch, 99, **wide), torch.zeros(batch, 3, **wide)
     found = []
     for needed in (False, True):

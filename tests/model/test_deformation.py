@@ -19,7 +19,9 @@ def densify():
 
 
 def rest(batch: int = 1) -> torch.Tensor:
-    return torch.tensor(MEDIAPIPE33.rest_positions).expand(batch, -1, -1).clone()
+    return (
+        torch.tensor(MEDIAPIPE33.rest_positions).expand(batch, -1, -1).clone()
+    )
 
 
 def small(densify: Densify, **options) -> Deformation:
@@ -59,7 +61,9 @@ def test_step_zero_is_exactly_the_initial_gaussians(densify):
 
 
 def test_billions_of_layers_are_refused(densify):
-    with pytest.raises(ConfigError, match="layers must be a number from 2 to 1000"):
+    with pytest.raises(
+        ConfigError, match="layers must be a number from 2 to 1000"
+    ):
         small(densify, layers=2**31)
 
 
@@ -125,7 +129,9 @@ def test_residuals_in_the_pelvis_frame_do_not_know_the_heading(densify):
         q = p @ R.T + move
         pelvis = bone_frames(q, torch.ones(1, 33, dtype=torch.bool)).hubs[:, 0]
         moved = replace(
-            points, means=points.means @ R.T + move, normals=points.normals @ R.T
+            points,
+            means=points.means @ R.T + move,
+            normals=points.normals @ R.T,
         )
         root = q[:, 23:25].mean(1)
         code = psi.pose_code(q, root, pelvis, None)
@@ -139,19 +145,25 @@ def test_the_step_scales_offsets_up_to_the_same_bound(densify):
     for value, expected in ((1.0, 0.1), (1e4, 20.0)):
         slow.head.bias.data[:3] = value
         moved = (run(slow, densify, p).means - at_rest).norm(dim=-1)
-        reach = 3**0.5 * slow.mean_bound * slow.body_height * math.tanh(expected)
+        reach = (
+            3**0.5 * slow.mean_bound * slow.body_height * math.tanh(expected)
+        )
         torch.testing.assert_close(
             moved, torch.full_like(moved, reach), rtol=1e-4, atol=0
         )
 
 
-def test_a_pose_far_from_training_counts_as_the_nearest_that_psi_learnt(densify):
+def test_a_pose_far_from_training_counts_as_the_nearest_that_psi_learnt(
+    densify,
+):
     psi, p, pelvis = small(densify, pose_limit=1.5), rest(), torch.eye(3)[None]
     psi.head.weight.data.normal_(0, 0.3)
     points = densify(p)
     axes = torch.linalg.qr(torch.randn(99, 4))[0]
     codes = (
-        torch.randn(400, 4) @ torch.diag(torch.tensor([4.0, 3.0, 2.0, 1.0])) @ axes.T
+        torch.randn(400, 4)
+        @ torch.diag(torch.tensor([4.0, 3.0, 2.0, 1.0]))
+        @ axes.T
     )
 
     def sh(code):
@@ -165,7 +177,9 @@ def test_a_pose_far_from_training_counts_as_the_nearest_that_psi_learnt(densify)
     torch.testing.assert_close((sh(within), sh(within + aside)), raw)
     means = points.means + torch.tensor([-0.1, 0.1])[:, None, None]
     psi.store_poses(codes, means, torch.zeros(2, 3), pelvis)
-    torch.testing.assert_close((sh(within), sh(within + aside)), (raw[0], raw[0]))
+    torch.testing.assert_close(
+        (sh(within), sh(within + aside)), (raw[0], raw[0])
+    )
     limits = [
         sh(codes.mean(0) + far * psi.pose_axes[:, :4].mT.sum(0)[None])
         for far in (9, 90)
@@ -173,11 +187,15 @@ def test_a_pose_far_from_training_counts_as_the_nearest_that_psi_learnt(densify)
     torch.testing.assert_close(*limits)
     assert (limits[1] - raw[0]).abs().max() > 0.1
     away = [replace(points, means=points.means + 9 * far) for far in (1, 10)]
-    found = [psi.residuals(x, within, torch.zeros(1, 3), pelvis).sh for x in away]
+    found = [
+        psi.residuals(x, within, torch.zeros(1, 3), pelvis).sh for x in away
+    ]
     torch.testing.assert_close(*found)
     psi.train()
     torch.testing.assert_close((sh(within), sh(within + aside)), raw)
     old = {
-        name: x for name, x in psi.state_dict().items() if not name.startswith("pose_")
+        name: x
+        for name, x in psi.state_dict().items()
+        if not name.startswith("pose_")
     }
     small(densify).load_state_dict(old)

@@ -6,7 +6,10 @@ import pytest
 import torch
 
 MODELS = [
-    *((model, "none") for model in ("full", "wo_gcn", "lbs_splat", "image_to_image")),
+    *(
+        (model, "none")
+        for model in ("full", "wo_gcn", "lbs_splat", "image_to_image")
+    ),
     *(
         (model, "all")
         for model in ("full", "wo_seg", "lbs_splat", "splat_only", "harmonic")
@@ -75,7 +78,9 @@ def test_gradients_still_reach_the_skeleton(build):
     _, avatar, frame = build()
     frozen = left_of_zero(avatar).freeze()
     with torch.inference_mode():
-        frozen(*frame.inputs)  # what is kept from here on can be used with gradients
+        frozen(
+            *frame.inputs
+        )  # what is kept from here on can be used with gradients
     p = frame.skeleton.clone().requires_grad_()
     frozen(p, frame.visibility, frame.camera, frame.body).image.sum().backward()
     assert float(p.grad.abs().max()) > 0

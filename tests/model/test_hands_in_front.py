@@ -28,7 +28,9 @@ def overlaps(scene: Scene, camera: str, frame: int) -> torch.Tensor:
     )
     character, both = scene.character, np.ones(SIZE * SIZE, bool)
     for name in HANDS:
-        faces = character.faces[character.labels == character.label_names.index(name)]
+        faces = character.faces[
+            character.labels == character.label_names.index(name)
+        ]
         both &= Tracer(scene.mesh(frame)[0], faces).first(starts, rays)[0] >= 0
     return torch.from_numpy(both.reshape(1, SIZE, SIZE))
 

@@ -5,7 +5,12 @@ import math
 import pytest
 import torch
 
-from gsgan.model.harmonic import Harmonic, distilled, harmonics, ridge_regression
+from gsgan.model.harmonic import (
+    Harmonic,
+    distilled,
+    harmonics,
+    ridge_regression,
+)
 from gsgan.run.runs import load
 from gsgan.skeleton.densify import Points, even_sphere
 from gsgan.train.run import start_from
@@ -48,10 +53,16 @@ STRETCHED = {
 
 
 @pytest.mark.parametrize("frames", STRETCHED.values(), ids=STRETCHED)
-def test_degenerate_normals_and_frames_give_finite_gaussians_and_gradients(frames):
+def test_degenerate_normals_and_frames_give_finite_gaussians_and_gradients(
+    frames,
+):
     torch.manual_seed(0)
     normals = torch.stack(
-        [torch.zeros(3), torch.full((3,), math.nan), torch.tensor([0, 0.6, 0.8])]
+        [
+            torch.zeros(3),
+            torch.full((3,), math.nan),
+            torch.tensor([0, 0.6, 0.8]),
+        ]
     )
     model = Harmonic(torch.zeros(3, 3), 1.7, features=2, sh_degree=1)
     for raw in model.parameters():
@@ -75,9 +86,15 @@ def poses_of(data):
 
 @pytest.mark.parametrize("frozen", [False, True])
 @pytest.mark.parametrize("points", ["on", "off"])
-def test_residuals_without_the_pose_are_distilled_exactly(build, points, frozen):
-    data, avatar, frame = build("model=splat_only", f"effects.body_points={points}")
-    torch.nn.init.normal_(avatar.deformation.table, std=0.1)  # the network's are zero
+def test_residuals_without_the_pose_are_distilled_exactly(
+    build, points, frozen
+):
+    data, avatar, frame = build(
+        "model=splat_only", f"effects.body_points={points}"
+    )
+    torch.nn.init.normal_(
+        avatar.deformation.table, std=0.1
+    )  # the network's are zero
     avatar = avatar.freeze() if frozen else avatar.eval()
     found = distilled(avatar, poses_of(data))
     assert isinstance(found.deformation, Harmonic)
@@ -85,7 +102,9 @@ def test_residuals_without_the_pose_are_distilled_exactly(build, points, frozen)
     ours, theirs = (x(*frame.inputs).image for x in (found, avatar))
     torch.testing.assert_close(ours, theirs.detach(), atol=2e-5, rtol=0)
     again = distilled(found, poses_of(data))
-    assert torch.equal(again.deformation.coefficients, found.deformation.coefficients)
+    assert torch.equal(
+        again.deformation.coefficients, found.deformation.coefficients
+    )
 
 
 def test_the_regression_finds_linear_maps_and_prefers_the_mean():
@@ -112,12 +131,16 @@ def test_an_avatar_without_psi_is_refused(build):
 SMALLER = "model=harmonic size.body_points=400 size.features=1"
 
 
-def test_training_starts_at_the_least_squares_fit_and_the_other_weights(run, build):
+def test_training_starts_at_the_least_squares_fit_and_the_other_weights(
+    run, build
+):
     data, avatar, frame = build("model/deformation=harmonic")
     start_from(avatar, data, run)
     trained = load(run, device="cpu")
     p, _, camera, body, _ = frame.inputs
-    ours, theirs = (x.eval().render(p, camera, body=body) for x in (avatar, trained))
+    ours, theirs = (
+        x.eval().render(p, camera, body=body) for x in (avatar, trained)
+    )
     assert float((ours - theirs).abs().mean()) < 0.01
     assert all(x.requires_grad for x in avatar.deformation.parameters())
     for name, weights in trained.generator.state_dict().items():
@@ -126,9 +149,14 @@ def test_training_starts_at_the_least_squares_fit_and_the_other_weights(run, bui
 
 @pytest.mark.parametrize(
     ("given", "message"),
-    [("model=splat_only", "add model=harmonic"), (SMALLER, "has other Gaussians")],
+    [
+        ("model=splat_only", "add model=harmonic"),
+        (SMALLER, "has other Gaussians"),
+    ],
 )
-def test_training_does_not_start_at_another_kind_of_run(run, build, given, message):
+def test_training_does_not_start_at_another_kind_of_run(
+    run, build, given, message
+):
     data, avatar, _ = build(*given.split())
     with pytest.raises(ConfigError, match=message):
         start_from(avatar, data, run)

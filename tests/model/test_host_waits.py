@@ -37,9 +37,14 @@ class Reads(TorchDispatchMode):
         name = func.overloadpacket.__name__
         if any(name.startswith(read) for read in READS):
             self.seen[name] += 1
-        if name == "lift_fresh":  # an index that is a list, or a tensor made of numbers
+        if (
+            name == "lift_fresh"
+        ):  # an index that is a list, or a tensor made of numbers
             self.seen["a copy of numbers"] += 1
-        if name == "repeat_interleave" and (kwargs or {}).get("output_size") is None:
+        if (
+            name == "repeat_interleave"
+            and (kwargs or {}).get("output_size") is None
+        ):
             self.seen[name] += 1
         if name.startswith("index") and any(
             isinstance(i, torch.Tensor) and i.dtype == torch.bool
@@ -169,7 +174,9 @@ def test_a_bare_skeleton_is_solved_on_the_host_and_reads_nothing_back(
 def test_the_window_is_read_back_once(build, monkeypatch):
     _, avatar, frame = build()
     lists, plain = [], torch.Tensor.tolist
-    monkeypatch.setattr(torch.Tensor, "tolist", lambda x: lists.append(x) or plain(x))
+    monkeypatch.setattr(
+        torch.Tensor, "tolist", lambda x: lists.append(x) or plain(x)
+    )
     with Reads() as reads:
         avatar.window(frame.skeleton, frame.camera)
     assert len(lists) == 1

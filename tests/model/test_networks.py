@@ -26,7 +26,10 @@ def inputs(height: int, width: int, batch: int = 2):
 def test_generator_sees_what_supersampling_averages():
     F, S, p2d, g = inputs(17, 12)
     net = Generator(5, 4, 8, 35, 2, base=4)
-    assert net.content.stem.in_channels == generator().content.stem.in_channels + 4 * 5
+    assert (
+        net.content.stem.in_channels
+        == generator().content.stem.in_channels + 4 * 5
+    )
     fine = torch.rand(2, 5, 34, 24, requires_grad=True)
     image = net(F, S, p2d, g, fine)
     assert image.shape == (2, 4, 17, 12)
@@ -37,13 +40,17 @@ def test_generator_sees_what_supersampling_averages():
 
 
 @pytest.mark.parametrize("times", [2, 3])
-def test_the_stem_on_fine_pixels_is_the_stem_on_their_averages_and_channels(times):
+def test_the_stem_on_fine_pixels_is_the_stem_on_their_averages_and_channels(
+    times,
+):
     """Of a window whose sides are multiples of the stride, and of one that is padded."""
     F, S, p2d, _ = inputs(16, 11)
     net = Generator(5, 4, 8, 35, times, base=4)
     fine = torch.randn(2, 5, 16 * times, 11 * times)
     F = functional.avg_pool2d(fine, times)
-    content = torch.cat([F, S, p2d, functional.pixel_unshuffle(fine, times)], dim=1)
+    content = torch.cat(
+        [F, S, p2d, functional.pixel_unshuffle(fine, times)], dim=1
+    )
     plain = net.content.stem(functional.pad(content, (0, 5)))
     quick = net._stem(net._padded(F), [S, p2d], fine)
     torch.testing.assert_close(quick, plain, atol=1e-5, rtol=1e-5)
@@ -52,7 +59,9 @@ def test_the_stem_on_fine_pixels_is_the_stem_on_their_averages_and_channels(time
 def test_a_transposed_convolution_is_a_convolution_after_upsampling():
     weight, h = torch.randn(3, 5, 3, 3), torch.randn(2, 5, 4, 7)
     plain = functional.conv2d(
-        functional.interpolate(h, scale_factor=2.0, mode="nearest"), weight, padding=1
+        functional.interpolate(h, scale_factor=2.0, mode="nearest"),
+        weight,
+        padding=1,
     )
     quick = functional.conv_transpose2d(
         h, upsampled_kernel(weight), stride=2, padding=1
@@ -63,13 +72,17 @@ def test_a_transposed_convolution_is_a_convolution_after_upsampling():
 def test_generator_refuses_a_fine_F_it_was_not_built_for():
     F, S, p2d, g = inputs(16, 12)
     net = Generator(5, 4, 8, 35, 2, base=4)
-    with pytest.raises(ValueError, match=r"fine must be \(32, 24\) pixels, got None"):
+    with pytest.raises(
+        ValueError, match=r"fine must be \(32, 24\) pixels, got None"
+    ):
         net(F, S, p2d, g)
     with pytest.raises(
         ValueError, match=r"fine must be \(32, 24\) pixels, got \(48, 36\)"
     ):
         net(F, S, p2d, g, torch.zeros(2, 5, 48, 36))
-    with pytest.raises(ValueError, match=r"fine must be None pixels, got \(32, 24\)"):
+    with pytest.raises(
+        ValueError, match=r"fine must be None pixels, got \(32, 24\)"
+    ):
         generator()(F, S, p2d, g, torch.zeros(2, 5, 32, 24))
 
 
@@ -77,8 +90,12 @@ def test_generator_with_rgb_skip_starts_at_step_one_colour_and_alpha():
     F, S, p2d, g = inputs(16, 16)
     alpha = torch.rand(2, 1, 16, 16)
     painted = generator(rgb_skip=True)(F, S, p2d, g, alpha=alpha)
-    torch.testing.assert_close(painted, torch.cat([F[:, :3], alpha], 1), rtol=0, atol=0)
-    with pytest.raises(ValueError, match="rgb_skip=True, so alpha must be given"):
+    torch.testing.assert_close(
+        painted, torch.cat([F[:, :3], alpha], 1), rtol=0, atol=0
+    )
+    with pytest.raises(
+        ValueError, match="rgb_skip=True, so alpha must be given"
+    ):
         generator(rgb_skip=True)(F, S, p2d, g)
 
 
@@ -91,7 +108,9 @@ def test_generator_uses_every_input():
         torch.nn.init.normal_(style.from_map.weight, std=0.1)
     given = [x.requires_grad_() for x in inputs(16, 16)]
     net(*given).square().sum().backward()
-    assert all(x.grad is not None and float(x.grad.abs().max()) > 0 for x in given)
+    assert all(
+        x.grad is not None and float(x.grad.abs().max()) > 0 for x in given
+    )
 
 
 def test_style_starts_as_plain_normalisation():
@@ -110,7 +129,10 @@ def test_style_starts_as_plain_normalisation():
 def test_discriminator_judges_every_scale():
     maps = Discriminator(scales=2, base=4, layers=3)(torch.rand(2, 3, 32, 32))
     assert len(maps) == 2
-    assert [len(scale) for scale in maps] == [4, 4]  # three feature maps and the logits
+    assert [len(scale) for scale in maps] == [
+        4,
+        4,
+    ]  # three feature maps and the logits
     assert maps[0][-1].shape[1] == 1
     assert maps[0][0].shape[-1] == 2 * maps[1][0].shape[-1]
 
@@ -130,7 +152,9 @@ def test_a_judge_without_normalisation_sees_contrast():
     for norm, sees in (("none", True), ("instance", False)):
         judge = Discriminator(scales=1, base=4, layers=3, norm=norm)
         sharp, soft = judge(image)[0][-1], judge(0.5 * image)[0][-1]
-        assert (float((sharp - soft).abs().max()) > 0.01 * float(sharp.std())) is sees
+        assert (
+            float((sharp - soft).abs().max()) > 0.01 * float(sharp.std())
+        ) is sees
     with pytest.raises(ConfigError, match="norm must be one of instance, none"):
         Discriminator(norm="batch")
 
@@ -177,7 +201,9 @@ def test_a_generator_of_patches(times):
     assert len(net.up) == len(generator().up) - 1
     given = [net._padded(x) for x in (F, S, p2d)]
     if fine is not None:
-        given.append(functional.pixel_unshuffle(net._padded(fine, times), times))
+        given.append(
+            functional.pixel_unshuffle(net._padded(fine, times), times)
+        )
     plain = net.content.stem(torch.cat(given, dim=1))
     torch.testing.assert_close(
         net._stem(given[0], [S, p2d], fine), plain, atol=1e-5, rtol=1e-5

@@ -42,9 +42,13 @@ def rest_pose(batch: int = 1) -> BodyPose:
 def test_probabilities_sum_to_one_and_cover_the_body():
     S = Segmentation(free_body(), points=2000)(rest_pose(), facing_camera())
     assert S.shape == (1, len(free_body().label_names), SIZE, SIZE)
-    torch.testing.assert_close(S.sum(1), torch.ones(1, SIZE, SIZE), atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        S.sum(1), torch.ones(1, SIZE, SIZE), atol=1e-4, rtol=0
+    )
     person = S.argmax(1)[0] > 0
-    assert person[:, SIZE // 2].sum() > SIZE // 2  # it stands in the middle column
+    assert (
+        person[:, SIZE // 2].sum() > SIZE // 2
+    )  # it stands in the middle column
     assert not person[0].any()
 
 
@@ -95,12 +99,18 @@ def fit_to(
 
 def test_without_labels_two_numbers_learn_from_masks_and_nothing_else_moves():
     segmentation = without_labels(scale=0.3)
-    assert [p.shape for p in segmentation.parameters() if p.requires_grad] == [(2,)]
-    before = {name: value.clone() for name, value in segmentation.state_dict().items()}
+    assert [p.shape for p in segmentation.parameters() if p.requires_grad] == [
+        (2,)
+    ]
+    before = {
+        name: value.clone() for name, value in segmentation.state_dict().items()
+    }
     losses = fit_to(segmentation, body_mask())
     assert losses[-1] < 0.8 * losses[0]
     moved = {
-        k for k, v in segmentation.state_dict().items() if not torch.equal(v, before[k])
+        k
+        for k, v in segmentation.state_dict().items()
+        if not torch.equal(v, before[k])
     }
     assert moved == {"common"}
     assert bool((segmentation.common != 0).all())
@@ -123,7 +133,9 @@ def test_common_is_added_to_all_log_scales_and_all_logits():
 
 def test_silhouette_loss_is_binary_cross_entropy_of_the_sure_pixels():
     generator = torch.Generator().manual_seed(0)
-    alpha, mask = (torch.rand(2, 1, 5, 7, generator=generator) for _ in range(2))
+    alpha, mask = (
+        torch.rand(2, 1, 5, 7, generator=generator) for _ in range(2)
+    )
     alpha.requires_grad_()
     unsure = torch.zeros(2, 1, 5, 7)
     unsure[..., 2] = 0.3
@@ -135,7 +147,9 @@ def test_silhouette_loss_is_binary_cross_entropy_of_the_sure_pixels():
     assert bool((alpha.grad[~sure] == 0).all())
     assert bool((alpha.grad[sure] != 0).all())
     # none is sure
-    assert float(silhouette_loss(alpha, mask, torch.ones_like(mask)).detach()) == 0
+    assert (
+        float(silhouette_loss(alpha, mask, torch.ones_like(mask)).detach()) == 0
+    )
 
 
 @pytest.mark.parametrize("truth", [0.0, 1.0])
@@ -145,7 +159,9 @@ def test_stability_silhouette_loss_where_alpha_is_0_or_1(value, truth):
     loss = silhouette_loss(alpha, torch.full_like(alpha, truth).detach())
     loss.backward()
     expected = 0 if value == truth else -math.log(1e-6)
-    assert math.isclose(float(loss.detach()), expected, rel_tol=1e-5, abs_tol=1e-5)
+    assert math.isclose(
+        float(loss.detach()), expected, rel_tol=1e-5, abs_tol=1e-5
+    )
     assert torch.isfinite(alpha.grad).all()
     if value != truth:  # there is a way back
         assert bool((alpha.grad.sign() == (1 if value > truth else -1)).all())
@@ -157,7 +173,8 @@ def test_stability_silhouette_loss_where_alpha_is_0_or_1(value, truth):
 def test_hands_only_are_two_classes_and_all_else_background_that_hides():
     names = free_body().label_names
     some, all_parts = (
-        Segmentation(free_body(), points=1500, mode=m) for m in ("hands", "body")
+        Segmentation(free_body(), points=1500, mode=m)
+        for m in ("hands", "body")
     )
     with torch.no_grad():
         S, whole = (x(rest_pose(), facing_camera()) for x in (some, all_parts))
@@ -165,7 +182,9 @@ def test_hands_only_are_two_classes_and_all_else_background_that_hides():
     hands = [names.index("left_hand"), names.index("right_hand")]
     # as hidden as before
     torch.testing.assert_close(S[:, 1:], whole[:, hands], atol=1e-5, rtol=0)
-    torch.testing.assert_close(S.sum(1), torch.ones(1, SIZE, SIZE), atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        S.sum(1), torch.ones(1, SIZE, SIZE), atol=1e-4, rtol=0
+    )
     trunk = whole[:, names.index("upper_clothes")] > 0.9
     assert trunk.any()
     assert (S[:, 0][trunk] > 0.9).all()  # the body is background
@@ -212,7 +231,9 @@ def test_a_class_without_a_vertex_is_not_learned_and_scored_as_missed():
     truth = segmentation.truth(labels)
     alone = truth.clone()
     alone[truth == segmentation.classes] = IGNORE
-    torch.testing.assert_close(segmentation_loss(S, truth), segmentation_loss(S, alone))
+    torch.testing.assert_close(
+        segmentation_loss(S, truth), segmentation_loss(S, alone)
+    )
     scored, to_find = segmentation.to_score(S, labels)
     assert scored.shape[1] == len(body.label_names)
     assert int(to_find.max()) == len(body.label_names) - 1
@@ -246,7 +267,9 @@ def test_a_trained_S_is_loaded_whether_or_not_labels_are_at_hand(
     assert avatar.segmentation.common is None
 
 
-def test_labels_of_held_out_images_alone_teach_nothing(build, capture, tmp_path):
+def test_labels_of_held_out_images_alone_teach_nothing(
+    build, capture, tmp_path
+):
     some = shutil.copytree(capture, tmp_path / "some")
     for path in (some / "labels").rglob("*.png"):
         if int(path.stem) < 4:  # those that train

@@ -6,7 +6,13 @@ import torch
 from test_motion_readers import Y_DOWN, standard, write_pose
 
 from gsgan.motion.clip import is_own
-from gsgan.motion.retarget import expressed, face_in_head, joined, retargeted, steadied
+from gsgan.motion.retarget import (
+    expressed,
+    face_in_head,
+    joined,
+    retargeted,
+    steadied,
+)
 from gsgan.motion.rotations import rotation
 from gsgan.skeleton import (
     HOLISTIC,
@@ -68,7 +74,10 @@ def offsets_of(q: np.ndarray, rest: np.ndarray) -> np.ndarray:
     """``[F, 30, 3]`` metres, in the axes of each frame's head."""
     face, body = torch.from_numpy(q[:, FACE]), torch.from_numpy(q[:, :33])
     return (
-        in_head(face, body, bone_frames(body).hubs[:, HEAD], MEDIAPIPE33).numpy() - rest
+        in_head(
+            face, body, bone_frames(body).hubs[:, HEAD], MEDIAPIPE33
+        ).numpy()
+        - rest
     )
 
 
@@ -97,13 +106,17 @@ def check(found: np.ndarray, moves: np.ndarray) -> None:
     assert np.abs(found[:, STILL]).max() < 0.0015
 
 
-def test_a_mouth_that_opens_opens_the_subjects(tmp_path, talking, signer, rest, moves):
+def test_a_mouth_that_opens_opens_the_subjects(
+    tmp_path, talking, signer, rest, moves
+):
     q = driven(write_face(tmp_path / "a.pose", talking), signer, rest)
     assert np.isnan(q[:, 33:75]).all()  # the file has no hands
     check(offsets_of(q, rest), moves)
 
 
-def test_the_source_may_be_turned_and_the_heads_of_both_differ(talking, rest, moves):
+def test_the_source_may_be_turned_and_the_heads_of_both_differ(
+    talking, rest, moves
+):
     turned = 500 * steadied(talking[:, FACE] @ TURNED.T) + 7
     check(expressed(turned, rest) - rest, moves)
 
@@ -111,7 +124,9 @@ def test_the_source_may_be_turned_and_the_heads_of_both_differ(talking, rest, mo
 def test_another_shape_of_face_is_no_expression(talking, rest, moves):
     wide = talking[:, FACE] + 0.1 * rest[::-1] * (1, 0, 0)
     one = expressed(wide[:1], rest)
-    np.testing.assert_allclose(one[0], rest, atol=1e-9)  # a single frame is at rest
+    np.testing.assert_allclose(
+        one[0], rest, atol=1e-9
+    )  # a single frame is at rest
 
 
 def test_a_file_may_lack_landmarks(tmp_path, talking, signer, rest, moves):
@@ -123,7 +138,9 @@ def test_a_file_may_lack_landmarks(tmp_path, talking, signer, rest, moves):
     check(np.where(np.isnan(found), moves, found), moves)
 
 
-def test_missing_faces_rest_and_short_gaps_are_bridged(tmp_path, talking, signer, rest):
+def test_missing_faces_rest_and_short_gaps_are_bridged(
+    tmp_path, talking, signer, rest
+):
     p = talking.copy()
     p[1, FACE] = np.nan
     p[5:11, FACE] = np.nan  # six frames
@@ -133,7 +150,9 @@ def test_missing_faces_rest_and_short_gaps_are_bridged(tmp_path, talking, signer
     height = float(limb_length_sum(torch.from_numpy(signer.rest[None])))
     whole, seen = complete_skeleton(torch.from_numpy(q), None, HOLISTIC, height)
     assert not seen[5:11, FACE].any()
-    code = face_code(whole, bone_frames(whole, seen > 0, HOLISTIC).head, HOLISTIC)
+    code = face_code(
+        whole, bone_frames(whole, seen > 0, HOLISTIC).head, HOLISTIC
+    )
     np.testing.assert_allclose(code[5:11], 0, atol=1e-3)
     assert code[3:5, LOWER, 1].max() * CODE_UNIT < -0.010
     for template in TEMPLATES.values():  # the smaller ones leave the face out
@@ -176,6 +195,8 @@ def test_clips_with_and_without_a_face(talking, signer, rest, moves):
     bare = p.copy()
     bare[:, FACE] = np.nan
     found = joined([p, p[::-1].copy(), bare], signer, 7)
-    np.testing.assert_allclose(offsets_of(found[:31], rest), moves[[3] * 31], atol=1e-6)
+    np.testing.assert_allclose(
+        offsets_of(found[:31], rest), moves[[3] * 31], atol=1e-6
+    )
     assert np.isnan(found[31:, FACE]).all()
     assert np.isfinite(found[:, :75]).all()

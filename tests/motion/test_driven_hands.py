@@ -8,7 +8,12 @@ from test_motion_readers import Y_DOWN, standard, write_pose
 
 from gsgan.motion.clip import is_own, up_axis
 from gsgan.motion.retarget import PALM_LANDMARKS, joined, retargeted
-from gsgan.skeleton import HOLISTIC, MEDIAPIPE33, complete_skeleton, limb_length_sum
+from gsgan.skeleton import (
+    HOLISTIC,
+    MEDIAPIPE33,
+    complete_skeleton,
+    limb_length_sum,
+)
 from gsgan.skeleton.hands import FINGER_BONES, HAND_NAMES
 from gsgan.skeleton.proportions import (
     HAND_JOINTS,
@@ -35,7 +40,11 @@ def fingers(p: np.ndarray) -> np.ndarray:
 
 def angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Degrees between vectors."""
-    cos = (a * b).sum(-1) / np.linalg.norm(a, axis=-1) / np.linalg.norm(b, axis=-1)
+    cos = (
+        (a * b).sum(-1)
+        / np.linalg.norm(a, axis=-1)
+        / np.linalg.norm(b, axis=-1)
+    )
     return np.degrees(np.arccos(cos.clip(-1, 1)))
 
 
@@ -60,32 +69,42 @@ def driven(path, signer) -> np.ndarray:
     return retargeted(p @ (upright(up_axis(motion)) @ Y_DOWN), signer)
 
 
-def test_the_figure_has_the_lengths_of_finger_bones(signing, signer, proportions):
+def test_the_figure_has_the_lengths_of_finger_bones(
+    signing, signer, proportions
+):
     rest = signer.rest_with_hands
     true = np.linalg.norm(fingers(signing), axis=-1)[0]
     np.testing.assert_allclose(
         np.linalg.norm(fingers(rest[None]), axis=-1)[0], true, rtol=1e-4
     )
     palms = hand_frame(np.stack([rest[LEFT], rest[RIGHT]]), *PALM_LANDMARKS)
-    np.testing.assert_allclose(palms[0], np.eye(3), atol=1e-9)  # along +X, palm down
+    np.testing.assert_allclose(
+        palms[0], np.eye(3), atol=1e-9
+    )  # along +X, palm down
     np.testing.assert_allclose(palms[1], np.diag([-1.0, 1, -1]), atol=1e-9)
     assert proportions.hands is None
     template = proportions.rest_with_hands  # of the right size, at the wrists
     np.testing.assert_allclose(template[33:], rest[33:], atol=0.06)
-    half = replace(signer, joints=tuple(map(tuple, signer.rest / 2)), hands=None)
+    half = replace(
+        signer, joints=tuple(map(tuple, signer.rest / 2)), hands=None
+    )
     np.testing.assert_allclose(half.rest_with_hands, template / 2, atol=0.01)
 
 
 def test_a_hand_that_was_never_seen_mirrors_the_other(signing, signer):
     seen = torch.ones(signing.shape[:2]).bool()
     seen[:, LEFT] = False
-    one = measure_proportions(torch.from_numpy(signing), seen, "z").rest_with_hands
+    one = measure_proportions(
+        torch.from_numpy(signing), seen, "z"
+    ).rest_with_hands
     np.testing.assert_allclose(one[RIGHT], signer.rest_with_hands[RIGHT])
     away = [one[at] - one[wrist] for wrist, at in HAND_JOINTS.items()]
     np.testing.assert_allclose(away[0], away[1] * (-1, 1, 1), atol=1e-12)
 
 
-def test_fingers_of_a_pose_file_keep_their_directions(tmp_path, signing, signer):
+def test_fingers_of_a_pose_file_keep_their_directions(
+    tmp_path, signing, signer
+):
     q = driven(write_holistic(tmp_path / "a.pose", signing), signer)
     assert q.shape == signing.shape
     assert angles(fingers(q), fingers(signing)).max() < 1
@@ -130,7 +149,9 @@ def test_clips_with_and_without_hands(signing, signer):
     np.testing.assert_array_equal(found[19:31], other)
     between = np.r_[12:19, 31:38]
     assert np.isnan(found[between][:, LEFT]).all()
-    lengths = np.linalg.norm(fingers(signer.rest_with_hands[None]), axis=-1)[:, 1]
+    lengths = np.linalg.norm(fingers(signer.rest_with_hands[None]), axis=-1)[
+        :, 1
+    ]
     moving = np.linalg.norm(fingers(found[between])[:, 1], axis=-1)
     np.testing.assert_allclose(moving, lengths.repeat(14, 0))
     assert np.abs(np.diff(found[10:20, RIGHT], axis=0)).max() < 0.1
@@ -143,7 +164,10 @@ def test_landmarks_with_hands(tmp_path, signing, signer):
     assert motion.p.shape == (12, 75, 3)
     assert is_own(motion, signer)
     np.testing.assert_array_equal(motion.p, signing)
-    assert angles(fingers(retargeted(1.2 * p, signer)), fingers(signing)).max() < 1e-3
+    assert (
+        angles(fingers(retargeted(1.2 * p, signer)), fingers(signing)).max()
+        < 1e-3
+    )
 
 
 def test_a_transition_keeps_the_place_of_the_hips(signing, signer):

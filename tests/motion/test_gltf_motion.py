@@ -56,7 +56,9 @@ def test_any_convention_is_the_same_motion(
     assert np.abs(read.p - bvh.p).max() < limit
 
 
-def test_a_character_of_the_dataset_moves_alike(tmp_path, person, acted, expected):
+def test_a_character_of_the_dataset_moves_alike(
+    tmp_path, person, acted, expected
+):
     path = write_gltf(
         tmp_path / "a.glb", person, acted, STEP, **CONVENTIONS["mixamo"](person)
     )
@@ -67,7 +69,10 @@ def test_a_character_of_the_dataset_moves_alike(tmp_path, person, acted, expecte
 
 
 def arm_turned(
-    times: list[float], values: np.ndarray, interpolation: str, kind: str = "rotation"
+    times: list[float],
+    values: np.ndarray,
+    interpolation: str,
+    kind: str = "rotation",
 ) -> TinyGlb:
     """A person with keys of the left arm."""
     glb = TinyGlb()
@@ -88,14 +93,20 @@ def arm_angles(glb: TinyGlb, path) -> np.ndarray:
 
 
 def about_z(*degrees: float) -> np.ndarray:
-    return Rotation.from_euler("z", np.array(degrees)[:, None], degrees=True).as_quat()
+    return Rotation.from_euler(
+        "z", np.array(degrees)[:, None], degrees=True
+    ).as_quat()
 
 
 def test_steps_hold_and_lines_turn_at_a_constant_speed(tmp_path):
     keys = about_z(0, 90, 30)
     held = arm_angles(arm_turned([0, 1, 2], keys, "STEP"), tmp_path / "a.glb")
-    np.testing.assert_allclose(held[[0, 23, 24, 47, 48]], [0, 0, 90, 90, 30], atol=1e-3)
-    turned = arm_angles(arm_turned([0, 1, 2], keys, "LINEAR"), tmp_path / "a.glb")
+    np.testing.assert_allclose(
+        held[[0, 23, 24, 47, 48]], [0, 0, 90, 90, 30], atol=1e-3
+    )
+    turned = arm_angles(
+        arm_turned([0, 1, 2], keys, "LINEAR"), tmp_path / "a.glb"
+    )
     np.testing.assert_allclose(
         turned[[0, 6, 12, 24, 36, 48]], [0, 22.5, 45, 90, 60, 30], atol=1e-3
     )
@@ -124,7 +135,9 @@ def test_cubic_splines_use_both_tangents(tmp_path):
 
 def test_one_of_several_animations(tmp_path, proportions):
     glb = arm_turned([0, 1], about_z(0, 90), "LINEAR")
-    glb.doc.animations += arm_turned([0, 1], about_z(0, 90), "LINEAR").doc.animations
+    glb.doc.animations += arm_turned(
+        [0, 1], about_z(0, 90), "LINEAR"
+    ).doc.animations
     stored = glb.accessor(np.array([[0], [3]], "f4"), "SCALAR")
     glb.doc.animations[1].name = "wave"
     glb.doc.animations[1].samplers[0].input = stored
@@ -148,7 +161,9 @@ def test_buffers_in_the_text_and_beside_it(tmp_path):
     beside, _ = read_gltf_motion(path)
     text = base64.b64encode(glb.blob).decode()
     content = json.loads(path.read_text())
-    content["buffers"][0]["uri"] = f"data:application/octet-stream;base64,{text}"
+    content["buffers"][0]["uri"] = (
+        f"data:application/octet-stream;base64,{text}"
+    )
     path.write_text(json.dumps(content))
     inside, _ = read_gltf_motion(path)
     np.testing.assert_array_equal(inside.rotations, beside.rotations)
@@ -217,7 +232,12 @@ def test_damaged_bytes_end_in_one_sentence(tmp_path, proportions, suffix):
     whole = arm_turned([0, 1], about_z(0, 90), "LINEAR")
     data = save(whole, tmp_path / f"whole.{suffix}").read_bytes()
     path = tmp_path / f"a.{suffix}"
-    for damaged in (data[: len(data) // 2], b"HIERARCHY", b"{}", b'{"nodes": 3}'):
+    for damaged in (
+        data[: len(data) // 2],
+        b"HIERARCHY",
+        b"{}",
+        b'{"nodes": 3}',
+    ):
         path.write_bytes(damaged)
         with pytest.raises(DataError) as error:
             read_motion(path, Source(proportions))

@@ -96,7 +96,10 @@ def test_body_poses_of_the_free_body(tmp_path, dance, landmarks, proportions):
     path = tmp_path / "a.npz"
     theta = dance.theta.numpy().copy()
     np.savez(
-        path, theta=theta, transl=dance.transl.numpy(), frame_id=np.arange(len(theta))
+        path,
+        theta=theta,
+        transl=dance.transl.numpy(),
+        frame_id=np.arange(len(theta)),
     )
     p, motion = standard(path, proportions)
     np.testing.assert_allclose(p, landmarks, atol=1e-5)
@@ -118,7 +121,9 @@ def test_body_poses_of_a_fitted_body(tmp_path, dance):
     path = tmp_path / "body_pose.npz"
     np.savez(path, theta=dance.theta.numpy(), transl=100 * dance.transl.numpy())
     posed = shaped_body(shape).posed_landmarks(dance).double()
-    own = measure_proportions(posed, torch.ones(posed.shape[:2], dtype=torch.bool), "z")
+    own = measure_proportions(
+        posed, torch.ones(posed.shape[:2], dtype=torch.bool), "z"
+    )
     p, motion = standard(path, own)
     np.testing.assert_allclose(p, posed, atol=1e-5)
     assert motion.fps == 50
@@ -173,7 +178,9 @@ def test_mediapipe(tmp_path, landmarks, proportions, style):
     content = {
         "python": {
             "fps": 25,
-            "frames": [{"pose_world_landmarks": {"landmark": f}} for f in frames],
+            "frames": [
+                {"pose_world_landmarks": {"landmark": f}} for f in frames
+            ],
         },
         "tasks": [{"worldLandmarks": [f], "landmarks": [f]} for f in frames],
         "bare": frames,
@@ -192,7 +199,9 @@ def test_mediapipe(tmp_path, landmarks, proportions, style):
     p, motion = standard(path, proportions)
     assert up_axis(motion) == "-y"
     assert motion.fps == (25 if style in ("python", "npz") else None)
-    np.testing.assert_allclose(p @ (upright("-y") @ Y_DOWN), landmarks, atol=1e-9)
+    np.testing.assert_allclose(
+        p @ (upright("-y") @ Y_DOWN), landmarks, atol=1e-9
+    )
 
 
 @pytest.mark.parametrize(
@@ -200,12 +209,18 @@ def test_mediapipe(tmp_path, landmarks, proportions, style):
     [
         ([], "holds no frames"),
         ([{"pose_landmarks": []}], "frame 0: no pose_world_landmarks"),
-        ([{"pose_world_landmarks": [{"x": 1}] * 33}], "frame 0: expected 33 landmarks"),
+        (
+            [{"pose_world_landmarks": [{"x": 1}] * 33}],
+            "frame 0: expected 33 landmarks",
+        ),
         (
             [{"pose_world_landmarks": [[0, 0, 0]] * 17}],
             "frame 0: expected 33 landmarks",
         ),
-        ([{"pose_world_landmarks": None}], "none of 1 frames has shoulders and hips"),
+        (
+            [{"pose_world_landmarks": None}],
+            "none of 1 frames has shoulders and hips",
+        ),
     ],
 )
 def test_bad_json(tmp_path, proportions, content, message):
@@ -215,7 +230,9 @@ def test_bad_json(tmp_path, proportions, content, message):
         standard(path, proportions)
 
 
-def test_pose_files_with_axes_of_unknown_scale(tmp_path, landmarks, proportions):
+def test_pose_files_with_axes_of_unknown_scale(
+    tmp_path, landmarks, proportions
+):
     names = [n.upper() for n in MEDIAPIPE33.names]
 
     def write(path, q, layout, name="POSE_WORLD_LANDMARKS"):
@@ -249,7 +266,9 @@ def test_people_filmed_from_the_waist_up_stand_upright(
     spine = p[:, 11:13].mean(1) - p[:, 23:25].mean(1)
     np.testing.assert_allclose(spine[:, :2], 0, atol=1e-9)
     assert (spine[:, 2] > 0.4).all()
-    across = [x[:, 11] - x[:, 12] for x in (p @ (upright("-y") @ Y_DOWN), landmarks)]
+    across = [
+        x[:, 11] - x[:, 12] for x in (p @ (upright("-y") @ Y_DOWN), landmarks)
+    ]
     across = [x / np.linalg.norm(x, axis=-1, keepdims=True) for x in across]
     # image landmarks, not the world's
     assert (across[0] * across[1]).sum(-1).min() > 0.9
@@ -277,9 +296,13 @@ def test_bvh(tmp_path, proportions):
     for joint, position in at.items():
         truth[:, joint] = position
     # the reader turns the first frame towards -Y
-    ours, theirs = (np.arctan2(*(x[0, 23] - x[0, 24])[[1, 0]]) for x in (p, truth))
+    ours, theirs = (
+        np.arctan2(*(x[0, 23] - x[0, 24])[[1, 0]]) for x in (p, truth)
+    )
     yaw = rotation(np.array([0, 0, theirs - ours]))
-    np.testing.assert_allclose(directions(p @ yaw.T), directions(truth), atol=1e-4)
+    np.testing.assert_allclose(
+        directions(p @ yaw.T), directions(truth), atol=1e-4
+    )
     q = retargeted(p, proportions)
     assert np.isfinite(q).all()
     path.write_text(path.read_text().replace("LeftLeg", "Tentacle"))
@@ -313,7 +336,12 @@ def write_amc(folder: Path) -> Path:
         "  length 0.45",
         "  angle deg",
     ]
-    lines += [":root", "  order TX TY TZ RX RY RZ", "  axis XYZ", "  position 0 0 0"]
+    lines += [
+        ":root",
+        "  order TX TY TZ RX RY RZ",
+        "  axis XYZ",
+        "  position 0 0 0",
+    ]
     lines += ["  orientation 0 0 0", ":bonedata"]
     for name, _, way, length, dof in BONES_OF_ASF:
         axis = "0 90 0" if name == "lradius" else "0 0 0"
@@ -333,7 +361,10 @@ def write_amc(folder: Path) -> Path:
     lines += [":hierarchy", "  begin", "    root lhipjoint rhipjoint thorax"]
     for parent in dict.fromkeys(b[1] for b in BONES_OF_ASF if b[1] != "root"):
         lines.append(
-            "    " + " ".join([parent, *(b[0] for b in BONES_OF_ASF if b[1] == parent)])
+            "    "
+            + " ".join(
+                [parent, *(b[0] for b in BONES_OF_ASF if b[1] == parent)]
+            )
         )
     (folder / "07.asf").write_text("\n".join([*lines, "  end"]))
     frames = [":FULLY-SPECIFIED", ":DEGREES"]
@@ -365,7 +396,9 @@ def test_amc(tmp_path, proportions):
     assert motion.file_up == "y"
     along = directions(p)
     np.testing.assert_allclose(along[0, :2], [[1, 0, 0]] * 2, atol=1e-9)
-    np.testing.assert_allclose(along[1, :2], [[0, 0, -1], [-1, 0, 0]], atol=1e-9)
+    np.testing.assert_allclose(
+        along[1, :2], [[0, 0, -1], [-1, 0, 0]], atol=1e-9
+    )
     np.testing.assert_allclose(
         along[:, 4:], np.tile([0, 0, -1.0], (2, 4, 1)), atol=1e-9
     )
@@ -375,10 +408,18 @@ def test_amc(tmp_path, proportions):
     ("file", "damage", "message"),
     [
         ("07_01.amc", lambda t: t[:-40], "not a complete AMC motion .*gives"),
-        ("07_01.amc", lambda t: t.replace("lfemur", "tail"), "moves a bone tail"),
+        (
+            "07_01.amc",
+            lambda t: t.replace("lfemur", "tail"),
+            "moves a bone tail",
+        ),
         ("07_01.amc", lambda t: "", "is empty"),
         ("07_01.amc", lambda t: t.replace("17", "nan"), "not finite"),
-        ("07.asf", lambda t: t[: len(t) // 2], "not a complete (ASF skeleton|AMC)"),
+        (
+            "07.asf",
+            lambda t: t[: len(t) // 2],
+            "not a complete (ASF skeleton|AMC)",
+        ),
         (
             "07.asf",
             lambda t: t.replace("name lhand", "nome lhand"),
@@ -416,7 +457,9 @@ def test_a_section_of_an_asf_that_is_cut_off_is_named(
     else:
         own, _, _ = own.rpartition("end")
     asf.write_text(f"{before}:{section}\n{own}{sign}{others}")
-    with pytest.raises(DataError, match=rf"07\.asf .*section :{section} is {damage}"):
+    with pytest.raises(
+        DataError, match=rf"07\.asf .*section :{section} is {damage}"
+    ):
         standard(path, proportions)
 
 
@@ -439,7 +482,9 @@ def test_other_files(tmp_path, proportions):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(DataError, match=message):
             standard(tmp_path / name, proportions)
-    with pytest.raises(DataError, match="does not exist; give a file, or novel_pose"):
+    with pytest.raises(
+        DataError, match="does not exist; give a file, or novel_pose"
+    ):
         standard(tmp_path / "c.bvh", proportions)
     np.savez(tmp_path / "d.npz", image=np.zeros(3))
     with pytest.raises(DataError, match="no known kind of motion"):
@@ -467,11 +512,15 @@ def test_frames_without_a_trunk(tmp_path, landmarks, proportions):
     assert motion.filled == 4
     np.testing.assert_array_equal(motion.p[0], landmarks[1])
     np.testing.assert_array_equal(motion.p[11], landmarks[10])
-    np.testing.assert_allclose(motion.p[3, 15], landmarks[[2, 2, 5], 15].mean(0))
+    np.testing.assert_allclose(
+        motion.p[3, 15], landmarks[[2, 2, 5], 15].mean(0)
+    )
     whole, _ = standard(tmp_path / "a.npz", proportions)
     assert np.isfinite(whole).all()
     np.savez(tmp_path / "a.npz", p=np.full_like(p, np.nan))
-    with pytest.raises(DataError, match="none of 12 frames has shoulders and hips"):
+    with pytest.raises(
+        DataError, match="none of 12 frames has shoulders and hips"
+    ):
         standard(tmp_path / "a.npz", proportions)
 
 
@@ -500,7 +549,9 @@ def test_joints_out_of_sight(tmp_path, landmarks, proportions):
     np.savez(tmp_path / "a.npz", p=p)
     whole, _ = standard(tmp_path / "a.npz", proportions)
     assert np.isfinite(whole).all()
-    middle = (whole[4, 15] - whole[4, 13]) - (landmarks[4, 15] - landmarks[4, 13])
+    middle = (whole[4, 15] - whole[4, 13]) - (
+        landmarks[4, 15] - landmarks[4, 13]
+    )
     assert np.linalg.norm(middle) < 0.04
     np.testing.assert_array_equal(whole[:, 13], landmarks[:, 13])
     assert np.linalg.norm(whole[0, 28] - landmarks[0, 28]) > 1e-3
@@ -511,7 +562,10 @@ def test_joints_out_of_sight(tmp_path, landmarks, proportions):
 @pytest.mark.skipif(not REAL.is_dir(), reason="no motion files here")
 def test_real_files(proportions):
     for path in sorted(REAL.rglob("*.*")):
-        if path.suffix in (".bvh", ".pose") or path.name in ("02_03.amc", "03_02.amc"):
+        if path.suffix in (".bvh", ".pose") or path.name in (
+            "02_03.amc",
+            "03_02.amc",
+        ):
             if path.name == "openpose.pose":
                 with pytest.raises(DataError, match="without depth"):
                     standard(path, proportions)
@@ -524,7 +578,8 @@ def test_real_files(proportions):
                 own, torch.ones(own.shape[:2], dtype=torch.bool), "z"
             )
             lengths = [
-                np.linalg.norm(f.rest[13] - f.rest[11]) for f in (again, proportions)
+                np.linalg.norm(f.rest[13] - f.rest[11])
+                for f in (again, proportions)
             ]
             assert lengths[0] == pytest.approx(lengths[1], rel=1e-5), path
             assert (q[:, 23:25, 2].mean(1) > q[:, 29:33, 2].min(1)).all(), path
@@ -537,16 +592,26 @@ def published(
     F = len(root)
     zeros = {n: np.zeros((F, n)) for n in (3, 6, 90)}
     x = np.concatenate([root, body, zeros[3], zeros[6], zeros[90]], axis=1)
-    amass = {"trans": moves, "gender": np.array("neutral"), "betas": np.zeros(16)}
+    amass = {
+        "trans": moves,
+        "gender": np.array("neutral"),
+        "betas": np.zeros(16),
+    }
     parts = {"root_orient": root, "pose_body": body, "pose_hand": zeros[90]}
     parts |= {"pose_jaw": zeros[3], "pose_eye": zeros[6]}
     smplx = amass | parts | {"poses": x, "mocap_frame_rate": np.array(60.0)}
-    smplx |= {"surface_model_type": np.array("smplx"), "num_betas": np.array(16)}
+    smplx |= {
+        "surface_model_type": np.array("smplx"),
+        "num_betas": np.array(16),
+    }
     smplx |= {"mocap_time_length": np.array(F / 60)}
     smpl = np.concatenate([body, zeros[6]], axis=1)
     return {
         "amass_smplh": amass
-        | {"poses": x[:, [*range(66), *range(75, 165)]], "dmpls": np.zeros((F, 8))}
+        | {
+            "poses": x[:, [*range(66), *range(75, 165)]],
+            "dmpls": np.zeros((F, 8)),
+        }
         | {"mocap_framerate": np.array(60.0)},
         "amass_smplx": smplx | {"markers_latent": np.zeros((53, 3))},
         "stage_two": smplx | {"latent_labels": np.array(["ARIEL"] * 53)},
@@ -563,21 +628,36 @@ def published(
 
 @pytest.mark.parametrize(
     "name",
-    ["amass_smplh", "amass_smplx", "stage_two", "parts_only", "humman", "aist", "zju"],
+    [
+        "amass_smplh",
+        "amass_smplx",
+        "stage_two",
+        "parts_only",
+        "humman",
+        "aist",
+        "zju",
+    ],
 )
 def test_published_keys_of_the_smpl_family(tmp_path, shared, proportions, name):
     from writers.smpl import write_smpl
 
     model = shared("smplx.npz", lambda path: write_smpl(path, kind="smplx"))
     rng = np.random.default_rng(2)
-    root, body = np.tile([0.1, 0.9, 0.2], (4, 1)), 0.3 * rng.standard_normal((4, 63))
+    root, body = (
+        np.tile([0.1, 0.9, 0.2], (4, 1)),
+        0.3 * rng.standard_normal((4, 63)),
+    )
     moves = rng.standard_normal((4, 3))
     files = published(root, body, moves)
     skinned = read_smpl(model)
     if name == "zju":  # rotates about the model's origin
-        J0 = skinned.rest_joints(torch.zeros(1, 10, dtype=torch.float64))[0, 0].numpy()
+        J0 = skinned.rest_joints(torch.zeros(1, 10, dtype=torch.float64))[
+            0, 0
+        ].numpy()
         R = torch.from_numpy(rotation(root)).numpy()
-        poses = np.concatenate([np.zeros((4, 3)), body, np.zeros((4, 6))], axis=1)
+        poses = np.concatenate(
+            [np.zeros((4, 3)), body, np.zeros((4, 6))], axis=1
+        )
         files[name] = {"poses": poses, "Rh": root, "Th": moves + J0 - (R @ J0)}
         files[name] |= {"shapes": np.zeros((4, 10))}
     path = tmp_path / {"aist": "a.pkl", "zju": "a.npy"}.get(name, "a.npz")
@@ -589,12 +669,12 @@ def test_published_keys_of_the_smpl_family(tmp_path, shared, proportions, name):
         np.savez(path, **files[name])
     motion = read_motion(path, Source(proportions, model))
     theta = torch.zeros(4, len(skinned.parents), 3, dtype=torch.float64)
-    theta[:, :22] = torch.from_numpy(np.concatenate([root, body], axis=1)).reshape(
-        4, 22, 3
-    )
-    joints = skinned.pose(theta, theta.new_zeros(1, 1), torch.from_numpy(moves))[
-        1
-    ].numpy()
+    theta[:, :22] = torch.from_numpy(
+        np.concatenate([root, body], axis=1)
+    ).reshape(4, 22, 3)
+    joints = skinned.pose(
+        theta, theta.new_zeros(1, 1), torch.from_numpy(moves)
+    )[1].numpy()
     np.testing.assert_allclose(
         motion.p[:, list(SMPL_AT)], joints[:, list(SMPL_AT.values())], atol=1e-6
     )
@@ -609,7 +689,9 @@ def test_published_keys_of_the_smpl_family(tmp_path, shared, proportions, name):
         (Path("x"), "pathlib"),
     ],
 )
-def test_other_pickles_are_one_sentence(tmp_path, proportions, content, message):
+def test_other_pickles_are_one_sentence(
+    tmp_path, proportions, content, message
+):
     (tmp_path / "a.pkl").write_bytes(pickle.dumps(content))
     with pytest.raises(DataError, match=message):
         read_motion(tmp_path / "a.pkl", Source(proportions))

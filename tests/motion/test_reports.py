@@ -46,7 +46,11 @@ def in_body(p: np.ndarray) -> np.ndarray:
     hips, shoulders = p[:, [23, 24]], p[:, [11, 12]]
     up = shoulders.mean(1) - hips.mean(1)
     left = hips[:, 0] - hips[:, 1]
-    left -= up * (left * up).sum(-1, keepdims=True) / (up * up).sum(-1, keepdims=True)
+    left -= (
+        up
+        * (left * up).sum(-1, keepdims=True)
+        / (up * up).sum(-1, keepdims=True)
+    )
     axes = np.stack([left, np.cross(up, left), up], axis=1)
     axes /= np.linalg.norm(axes, axis=-1, keepdims=True)
     return np.einsum("fij,fbj->fbi", axes, directions(p))
@@ -114,7 +118,9 @@ def test_bones_that_do_stretch_keep_their_channels(tmp_path, chest):
         ("Hips\n{", "Hips{", "utf-8"),
     ],
 )
-def test_spaces_line_ends_and_marks_do_not_matter(tmp_path, before, after, encoding):
+def test_spaces_line_ends_and_marks_do_not_matter(
+    tmp_path, before, after, encoding
+):
     text = BVH.replace("{chest}", "0 0 0")
     changed = text.replace(before, after) if before else text
     motion = read_bvh(written(tmp_path, changed + "\x1a", encoding))
@@ -196,7 +202,9 @@ def test_zeros_are_missing_in_every_format(tmp_path, landmarks, proportions):
     p[3:6, 13] = 0  # a left elbow
     np.savez(tmp_path / "p.npz", p=p)
     np.save(tmp_path / "p.npy", {"p": p}, allow_pickle=True)
-    frames = [[{"x": x, "y": y, "z": z} for x, y, z in frame] for frame in p.tolist()]
+    frames = [
+        [{"x": x, "y": y, "z": z} for x, y, z in frame] for frame in p.tolist()
+    ]
     (tmp_path / "p.json").write_text(json.dumps(frames))
     for name in ("p.npz", "p.npy", "p.json"):
         clip = read_motion(tmp_path / name, Source(proportions))
@@ -205,11 +213,17 @@ def test_zeros_are_missing_in_every_format(tmp_path, landmarks, proportions):
         assert np.isfinite(clip.p[:, 11]).all(), name
 
 
-def test_a_visibility_of_zero_everywhere_is_none(tmp_path, landmarks, proportions):
+def test_a_visibility_of_zero_everywhere_is_none(
+    tmp_path, landmarks, proportions
+):
     def point(xyz: list[float], visibility: float) -> dict[str, float]:
-        return dict(zip(("x", "y", "z", "visibility"), [*xyz, visibility], strict=True))
+        return dict(
+            zip(("x", "y", "z", "visibility"), [*xyz, visibility], strict=True)
+        )
 
-    frames = [[point(xyz, 0.0) for xyz in frame] for frame in landmarks.tolist()]
+    frames = [
+        [point(xyz, 0.0) for xyz in frame] for frame in landmarks.tolist()
+    ]
     path = tmp_path / "p.json"
     path.write_text(json.dumps(frames))
     assert (read_motion(path, Source(proportions)).visibility == 1).all()
@@ -221,19 +235,25 @@ def test_a_visibility_of_zero_everywhere_is_none(tmp_path, landmarks, proportion
 def test_tensorflow_js_in_three_dimensions(tmp_path, landmarks, proportions):
     def pose(frame: list[list[float]]) -> dict:
         points = [{"x": x, "y": y, "z": z, "score": 0.9} for x, y, z in frame]
-        return {"keypoints": [{"x": 1, "y": 2, "score": 1}] * 33, "keypoints3D": points}
+        return {
+            "keypoints": [{"x": 1, "y": 2, "score": 1}] * 33,
+            "keypoints3D": points,
+        }
 
-    for name, wrap in (("flat", lambda one: one), ("people", lambda one: [one])):
+    for name, wrap in (
+        ("flat", lambda one: one),
+        ("people", lambda one: [one]),
+    ):
         path = tmp_path / f"{name}.json"
-        path.write_text(json.dumps([wrap(pose(frame)) for frame in landmarks.tolist()]))
+        path.write_text(
+            json.dumps([wrap(pose(frame)) for frame in landmarks.tolist()])
+        )
         clip = read_motion(path, Source(proportions))
         np.testing.assert_allclose(clip.p, landmarks)
         assert (clip.visibility == 0.9).all()
 
 
-TRC = (
-    "PathFileType\t4\t(X/Y/Z)\tm.trc\n{keys}\n{values}\nFrame#\tTime\t{markers}\n\t\t\n"
-)
+TRC = "PathFileType\t4\t(X/Y/Z)\tm.trc\n{keys}\n{values}\nFrame#\tTime\t{markers}\n\t\t\n"
 MARKERS = {
     "LShoulder": 11,
     "RShoulder": 12,
@@ -251,12 +271,18 @@ def write_trc(
     keys = ["DataRate", "CameraRate", "NumFrames", "NumMarkers"] + (
         ["Units"] if units else []
     )
-    values = ["25", "25", str(len(p)), str(len(MARKERS))] + ([units] if units else [])
+    values = ["25", "25", str(len(p)), str(len(MARKERS))] + (
+        [units] if units else []
+    )
     markers = "\t\t\t".join(prefix + name for name in MARKERS)
-    text = TRC.format(keys="\t".join(keys), values="\t".join(values), markers=markers)
+    text = TRC.format(
+        keys="\t".join(keys), values="\t".join(values), markers=markers
+    )
     for i, frame in enumerate(p):
         row = [
-            x for joint in MARKERS.values() for x in (frame[joint][[1, 2, 0]] * scale)
+            x
+            for joint in MARKERS.values()
+            for x in (frame[joint][[1, 2, 0]] * scale)
         ]
         text += "\t".join(map(str, [i + 1, i / 25, *row])) + "\n"
     path.write_text(text)

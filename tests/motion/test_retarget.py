@@ -40,16 +40,22 @@ def test_a_person_is_put_on_its_own_bones_unchanged(landmarks, proportions):
     np.testing.assert_allclose(q, landmarks, atol=0.1)
 
 
-def test_another_person_keeps_directions_and_gets_the_lengths(landmarks, proportions):
+def test_another_person_keeps_directions_and_gets_the_lengths(
+    landmarks, proportions
+):
     q = retargeted(stretched(landmarks), proportions)
     np.testing.assert_allclose(directions(q), directions(landmarks), atol=1e-9)
     for bone in BONES:
         lengths = np.linalg.norm(q[:, bone[1]] - q[:, bone[0]], axis=-1)
-        np.testing.assert_allclose(lengths, length(proportions.rest, bone), rtol=1e-9)
+        np.testing.assert_allclose(
+            lengths, length(proportions.rest, bone), rtol=1e-9
+        )
     face, own = q[:, HEAD_LANDMARKS], proportions.rest[list(HEAD_LANDMARKS)]
     np.testing.assert_allclose(
         np.linalg.norm(face[:, :, None] - face[:, None], axis=-1),
-        np.broadcast_to(np.linalg.norm(own[:, None] - own, axis=-1), (len(q), 11, 11)),
+        np.broadcast_to(
+            np.linalg.norm(own[:, None] - own, axis=-1), (len(q), 11, 11)
+        ),
         atol=1e-9,
     )
     way = middle(q, HIPS)[-1] - middle(q, HIPS)[0]
@@ -87,7 +93,9 @@ def test_joined_clips_keep_their_frames_their_speed_and_the_bones(proportions):
 
 def test_the_standard_pose_stands_upright(proportions):
     rest = proportions.rest
-    left = [n.startswith("left") or n.endswith("left") for n in MEDIAPIPE33.names]
+    left = [
+        n.startswith("left") or n.endswith("left") for n in MEDIAPIPE33.names
+    ]
     assert (rest[left][:, 0] > 0).all()
     assert rest[0, 1] < rest[7, 1]  # the nose is in front (-Y) of the ears
     assert rest[31, 1] < rest[29, 1]  # toes in front of heels
@@ -125,8 +133,8 @@ def test_feet_on_the_ground_and_a_walker_on_a_treadmill(proportions):
     assert np.abs(middle(on, HIPS)[:, :2] - centre[:2]).max() < 0.3
     free = placed(walk, proportions, centre, 30, ground=False, stay=False)
     np.testing.assert_allclose(middle(free, HIPS)[0, :2], centre[:2], atol=1e-9)
-    assert np.linalg.norm(np.ptp(middle(free, HIPS)[:, :2], axis=0)) == pytest.approx(
-        4, abs=1e-6
-    )
+    assert np.linalg.norm(
+        np.ptp(middle(free, HIPS)[:, :2], axis=0)
+    ) == pytest.approx(4, abs=1e-6)
     assert np.ptp(free[:, HEELS_AND_TOES, 2].min(1)) == pytest.approx(0.5)
     assert free[:, HEELS_AND_TOES, 2].min() == pytest.approx(proportions.ground)

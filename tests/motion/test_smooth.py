@@ -21,9 +21,13 @@ def swing(amplitude: float, hertz: float, noise: float) -> np.ndarray:
     return p
 
 
-def filtered(p: np.ndarray, times: np.ndarray = TIMES, **settings: float) -> np.ndarray:
+def filtered(
+    p: np.ndarray, times: np.ndarray = TIMES, **settings: float
+) -> np.ndarray:
     smooth = OneEuro(**settings)
-    return np.stack([smooth(own, t) for own, t in zip(p, times.tolist(), strict=True)])
+    return np.stack(
+        [smooth(own, t) for own, t in zip(p, times.tolist(), strict=True)]
+    )
 
 
 def delay(p: np.ndarray, hertz: float) -> tuple[float, float]:

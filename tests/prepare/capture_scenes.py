@@ -27,7 +27,9 @@ def ring(
     for i, angle in enumerate(angles):
         raw = ring_camera(angle, size)
         values = {key: raw[key] for key in ("K", "R", "t")}
-        entry = make_camera("ring", f"cam{i}", **values, dist=dist, size=size[::-1])
+        entry = make_camera(
+            "ring", f"cam{i}", **values, dist=dist, size=size[::-1]
+        )
         cameras.append(entry)
     return cameras
 
@@ -73,7 +75,9 @@ def write_toml(
     for i, c in enumerate(cameras):
         K = centred_at_zero(c).tolist()
         text += f"[cam_{i:02d}]\nname = {json.dumps(c.name)}\n"
-        text += f"size = [{float(c.size[1])}, {float(c.size[0])}]\nmatrix = {K}\n"
+        text += (
+            f"size = [{float(c.size[1])}, {float(c.size[0])}]\nmatrix = {K}\n"
+        )
         text += f"distortions = {c.dist[:lens].tolist()}\n"
         text += f"rotation = {cv2.Rodrigues(c.R)[0].ravel().tolist()}\n"
         text += f"translation = {(c.t * unit).tolist()}\n" + (
@@ -116,7 +120,10 @@ def quiet() -> Console:
 
 
 def write_project(
-    root: Path, cameras: int = 3, frames: int = 6, size: tuple[int, int] = (96, 80)
+    root: Path,
+    cameras: int = 3,
+    frames: int = 6,
+    size: tuple[int, int] = (96, 80),
 ) -> Path:
     """A folder with videos, calibration, 2D landmarks (pose/) and masks of a known person."""
     write_tiny_capture(
@@ -126,7 +133,10 @@ def write_project(
         size=size,
         dist=[-0.1, 0.05, 0.001, -0.001, 0.0],
     )
-    truth, rig = skeletons(frames), json.loads((root / "cameras.json").read_text())
+    truth, rig = (
+        skeletons(frames),
+        json.loads((root / "cameras.json").read_text()),
+    )
     (root / "videos").mkdir()
     (root / "pose").mkdir()
     for name, camera in rig.items():

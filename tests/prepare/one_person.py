@@ -11,7 +11,11 @@ from gsgan.body.shape import free_space
 from gsgan.body.solve import Solver
 from gsgan.fit.shape import without_surface
 
-HEIGHT, DISTANCE, PITCH = 1.3, 3.2, 0.13  # metres, metres, radians: of the camera
+HEIGHT, DISTANCE, PITCH = (
+    1.3,
+    3.2,
+    0.13,
+)  # metres, metres, radians: of the camera
 RATE = 5.0  # frames per second
 STILL = 8  # frames between quarters of a turn, with arms that move
 
@@ -30,7 +34,9 @@ def turning(frames: int) -> np.ndarray:
             ("arm_b", 0.4 * sign * np.cos(0.7 * f)),
             ("elbow", 0.3 + 0.3 * np.sin(0.5 * f)),
         ):
-            q[:, solver.rig.names.index(f"{side}_{number}")] = torch.from_numpy(values)
+            q[:, solver.rig.names.index(f"{side}_{number}")] = torch.from_numpy(
+                values
+            )
     root = axis_angle_to_matrix(torch.from_numpy(angle))
     p = solver.points(
         solver.transforms(q, root, solver.joints), solver.landmarks
@@ -49,7 +55,9 @@ def world_landmarks(p: np.ndarray, seed: int = 0) -> np.ndarray:
     )
 
 
-def film(folder: Path, frames: int = 18, size=(360, 640), focal: float = 520.0) -> Path:
+def film(
+    folder: Path, frames: int = 18, size=(360, 640), focal: float = 520.0
+) -> Path:
     """me.avi, landmarks/me.npz and masks/me/ in a folder; ``size`` is (w, h)."""
     p = turning(frames)
     px = focal * p[..., :2] / p[..., 2:] + np.array(size) / 2

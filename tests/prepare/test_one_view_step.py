@@ -35,7 +35,9 @@ def problem_and_state(*, smooth: bool, shape: bool) -> tuple[Problem, State]:
         return torch.randn(*size, generator=generator, dtype=torch.float64)
 
     truth = turning(FRAMES)
-    u = torch.from_numpy(truth[..., :2] / truth[..., 2:]) + 0.01 * noise(FRAMES, 33, 2)
+    u = torch.from_numpy(truth[..., :2] / truth[..., 2:]) + 0.01 * noise(
+        FRAMES, 33, 2
+    )
     weight = 0.5 + 0.1 * noise(FRAMES, 33).abs()
     weight[1, 15] = 0  # a landmark that is not seen
     u[1, 15] = torch.nan
@@ -62,7 +64,9 @@ def robust(r: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
     return (weight / (1 + square)).sqrt()
 
 
-def dense_step(problem: Problem, at: State) -> tuple[torch.Tensor, torch.Tensor]:
+def dense_step(
+    problem: Problem, at: State
+) -> tuple[torch.Tensor, torch.Tensor]:
     """The changes of poses and shared numbers, by the Jacobian of all residuals in one matrix."""
     seen = problem.seen
     solver = problem.solver(at.shared)
@@ -85,7 +89,9 @@ def dense_step(problem: Problem, at: State) -> tuple[torch.Tensor, torch.Tensor]
 
     def data(X: torch.Tensor, ground: torch.Tensor) -> torch.Tensor:
         frames = zip(X, seen.u, world, problem.noise, strict=True)
-        return torch.stack([problem.residuals(x, ground, *own) for x, *own in frames])
+        return torch.stack(
+            [problem.residuals(x, ground, *own) for x, *own in frames]
+        )
 
     def accelerations(X: torch.Tensor) -> torch.Tensor:
         step = seen.time.diff()[:, None, None]
@@ -93,16 +99,24 @@ def dense_step(problem: Problem, at: State) -> tuple[torch.Tensor, torch.Tensor]
         return 2 * speed.diff(dim=0) / (step[1:] + step[:-1]) / ACCELERATION
 
     def slides(X: torch.Tensor) -> torch.Tensor:
-        return X.diff(dim=0)[:, FOOT_JOINTS] / seen.time.diff()[:, None, None] / SLIDING
+        return (
+            X.diff(dim=0)[:, FOOT_JOINTS]
+            / seen.time.diff()[:, None, None]
+            / SLIDING
+        )
 
     # Weights of the groups of residuals, at the state.
     standing = problem.standing
     feet = standing[:, :2].amax(1) * standing[:, 2:].amax(1)
-    confidence = torch.cat([seen.weight, seen.weight, standing, feet[:, None]], dim=1)
+    confidence = torch.cat(
+        [seen.weight, seen.weight, standing, feet[:, None]], dim=1
+    )
     r = data(X, at.shared[:PLANE])
     by_group = []
     for group in range(confidence.shape[1]):
-        by_group.append(robust(r[:, RESIDUAL_GROUPS.eq(group)], confidence[:, group]))
+        by_group.append(
+            robust(r[:, RESIDUAL_GROUPS.eq(group)], confidence[:, group])
+        )
     of_data = torch.stack(by_group, dim=1)[:, RESIDUAL_GROUPS]
     both = seen.time[2:] - seen.time[:-2]
     known = (both < MAX_TIME_GAP)[:, None] * both[:, None] * ACCELERATIONS
@@ -122,7 +136,10 @@ def dense_step(problem: Problem, at: State) -> tuple[torch.Tensor, torch.Tensor]
             problem.too_large(shared[PLANE:])[None],
         ]
         if problem.smooth:
-            parts += [of_accelerations * accelerations(X), of_slides * slides(X)]
+            parts += [
+                of_accelerations * accelerations(X),
+                of_slides * slides(X),
+            ]
         return torch.cat([part.flatten() for part in parts])
 
     z = torch.zeros(F * D + len(at.shared), dtype=torch.float64)
@@ -145,7 +162,9 @@ def test_step_by_blocks_equals_the_dense_step(smooth, shape):
     np.testing.assert_allclose(new.shared - at.shared, ds, rtol=1e-6, atol=1e-8)
 
     # The first three numbers are the root's rotation.
-    np.testing.assert_allclose((new.q - at.q)[:, 3:], dq[:, 3:], rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(
+        (new.q - at.q)[:, 3:], dq[:, 3:], rtol=1e-6, atol=1e-8
+    )
     turned = torch.linalg.matrix_exp(
         torch.linalg.cross(
             torch.eye(3, dtype=torch.float64).expand(FRAMES, 3, 3),

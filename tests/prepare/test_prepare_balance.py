@@ -33,7 +33,10 @@ def toml_of(qca: Path, out: Path) -> Path:
     text = ""
     for camera in ElementTree.parse(qca).getroot().iter("camera"):
         window, pose, lens = (
-            {key: float(value) for key, value in camera.find(tag).attrib.items()}
+            {
+                key: float(value)
+                for key, value in camera.find(tag).attrib.items()
+            }
             for tag in ("fov_video", "transform", "intrinsic")
         )
         R = np.diag([1, -1, -1]) @ [
@@ -45,28 +48,33 @@ def toml_of(qca: Path, out: Path) -> Path:
             for kind in ("focalLength", "centerPoint")
             for axis in "UV"
         )
-        names = ("radialDistortion1", "radialDistortion2", "tangentalDistortion1")
+        names = (
+            "radialDistortion1",
+            "radialDistortion2",
+            "tangentalDistortion1",
+        )
         dist = [
-            lens[name] for name in (*names, "tangentalDistortion2", "radialDistortion3")
+            lens[name]
+            for name in (*names, "tangentalDistortion2", "radialDistortion3")
         ]
         text += f"[{camera.get('serial')}]\n"
         text += f"size = [{window['right'] + 1}, {window['bottom'] + 1}]\n"
-        text += (
-            f"matrix = [[{f_u}, 0.0, {c_u}], [0.0, {f_v}, {c_v}], [0.0, 0.0, 1.0]]\n"
-        )
-        text += (
-            f"distortions = {dist}\nrotation = {cv2.Rodrigues(R)[0].ravel().tolist()}\n"
-        )
+        text += f"matrix = [[{f_u}, 0.0, {c_u}], [0.0, {f_v}, {c_v}], [0.0, 0.0, 1.0]]\n"
+        text += f"distortions = {dist}\nrotation = {cv2.Rodrigues(R)[0].ravel().tolist()}\n"
         text += f"translation = {t.tolist()}\n"
     out.write_text(text)
     return out
 
 
-@pytest.mark.skipif(not (DATA / "balance_videos").is_dir(), reason="no balance videos")
+@pytest.mark.skipif(
+    not (DATA / "balance_videos").is_dir(), reason="no balance videos"
+)
 def test_real_videos_become_a_capture_that_trains(tmp_path, check):
     """The calibration is a degree or two off; the joints end within 6 px of the detections."""
     source = DATA / "balance_videos"
-    calibration = str(toml_of(source / "Calib.qca.txt", tmp_path / "Calib.toml"))
+    calibration = str(
+        toml_of(source / "Calib.qca.txt", tmp_path / "Calib.toml")
+    )
     given = Options(str(source), str(tmp_path / "out"), calibration=calibration)
     out = prepare(given, Console(file=io.StringIO()))
     numbers = json.loads((out / "prepare.json").read_text())
@@ -75,15 +83,30 @@ def test_real_videos_become_a_capture_that_trains(tmp_path, check):
     assert error["plain"] > error["robust"] > error["flips"] > error["refined"]
     assert error["smoothed"] < 6
     assert (
-        max(camera["error_px"]["smoothed"] for camera in numbers["cameras"].values())
+        max(
+            camera["error_px"]["smoothed"]
+            for camera in numbers["cameras"].values()
+        )
         < 9
     )
     assert numbers["frames_dropped"] == []
-    assert min(camera["frames_written"] for camera in numbers["cameras"].values()) == 70
-    assert check(out, tmp_path / "check.html", Console(file=io.StringIO())).errors == 0
+    assert (
+        min(camera["frames_written"] for camera in numbers["cameras"].values())
+        == 70
+    )
+    assert (
+        check(out, tmp_path / "check.html", Console(file=io.StringIO())).errors
+        == 0
+    )
     done = subprocess.run(
         [
-            *(sys.executable, "-m", "gsgan.train", "data=capture", f"data.root={out}"),
+            *(
+                sys.executable,
+                "-m",
+                "gsgan.train",
+                "data=capture",
+                f"data.root={out}",
+            ),
             *("experiment=smoke", f"hydra.run.dir={tmp_path / 'run'}"),
         ],
         env=os.environ | {"OMP_NUM_THREADS": "1"},
@@ -95,11 +118,15 @@ def test_real_videos_become_a_capture_that_trains(tmp_path, check):
     assert (tmp_path / "run" / "metrics.json").is_file()
 
 
-@pytest.mark.skipif(not (DATA / "hands_videos").is_dir(), reason="no videos of hands")
+@pytest.mark.skipif(
+    not (DATA / "hands_videos").is_dir(), reason="no videos of hands"
+)
 def test_gestures_in_front_of_webcams(tmp_path):
     """His legs are outside every image."""
     source = str(DATA / "hands_videos")
-    given = Options(source, str(tmp_path / "out"), frames="6-60", offsets={"cam_1": -1})
+    given = Options(
+        source, str(tmp_path / "out"), frames="6-60", offsets={"cam_1": -1}
+    )
     out = prepare(given, Console(file=io.StringIO()))
     numbers = json.loads((out / "prepare.json").read_text())
     cameras = numbers["cameras"].values()
@@ -107,6 +134,9 @@ def test_gestures_in_front_of_webcams(tmp_path):
     assert max(camera["face_px"] for camera in cameras) < 6
     assert sum(camera["hands_swapped"] for camera in cameras) < 5
     for part, share in (("hands", 0.8), ("face", 0.9)):
-        assert np.isfinite(np.load(out / f"{part}3d.npz")["p"]).all(-1).mean() > share
+        assert (
+            np.isfinite(np.load(out / f"{part}3d.npz")["p"]).all(-1).mean()
+            > share
+        )
     assert np.isnan(np.load(out / "landmarks3d.npz")["p"][:, 25:]).all()
     assert len(read_capture(out).frames) > 50

@@ -17,13 +17,16 @@ def equal(found, expected, lens: int = 5) -> None:
         np.testing.assert_allclose(read.K, camera.K, atol=1e-9)
         np.testing.assert_allclose(read.R, camera.R, atol=1e-9)
         np.testing.assert_allclose(read.t, camera.t, atol=1e-9)
-        np.testing.assert_allclose(read.dist[:lens], camera.dist[:lens], atol=1e-12)
+        np.testing.assert_allclose(
+            read.dist[:lens], camera.dist[:lens], atol=1e-12
+        )
 
 
 def test_pose2sim_toml(tmp_path):
     cameras = ring(dist=(*LENS[:4], 0))
     equal(
-        read_calibration(write_toml(tmp_path / "Calib.toml", cameras)).cameras, cameras
+        read_calibration(write_toml(tmp_path / "Calib.toml", cameras)).cameras,
+        cameras,
     )
 
 
@@ -67,7 +70,9 @@ def test_caliscope(tmp_path):
         )
         np.testing.assert_allclose(camera.R, matrix, atol=1e-12)
         np.testing.assert_allclose(camera.t, [0.125, -0.25, 1.5])
-        np.testing.assert_allclose(camera.dist[:5], [-0.3, 0.05, -0.004, 0.002, 0.06])
+        np.testing.assert_allclose(
+            camera.dist[:5], [-0.3, 0.05, -0.004, 0.002, 0.06]
+        )
         assert camera.size == (720, 1280)
     videos = ["cam_0", "cam_3"]
     assert pair_cameras(videos, list(calibration.cameras), {}) == {
@@ -81,7 +86,9 @@ def test_caliscope(tmp_path):
 
 def test_fisheye_is_refused(tmp_path):
     path = write_toml(tmp_path / "Calib.toml", ring())
-    path.write_text(path.read_text().replace("fisheye = false", "fisheye = true", 1))
+    path.write_text(
+        path.read_text().replace("fisheye = false", "fisheye = true", 1)
+    )
     with pytest.raises(DataError, match=r"cam_00.*fisheye"):
         read_calibration(path)
 
@@ -89,7 +96,8 @@ def test_fisheye_is_refused(tmp_path):
 def test_own_json_has_its_unit(tmp_path):
     cameras = ring(dist=LENS)
     equal(
-        read_calibration(write_own(tmp_path / "cameras.json", cameras)).cameras, cameras
+        read_calibration(write_own(tmp_path / "cameras.json", cameras)).cameras,
+        cameras,
     )
     (tmp_path / "meta.json").write_text('{"unit": "mm"}')
     found = read_calibration(tmp_path / "cameras.json").cameras
@@ -98,7 +106,10 @@ def test_own_json_has_its_unit(tmp_path):
 
 def test_pixel_centre_is_a_setting(tmp_path):
     path = write_toml(tmp_path / "Calib.toml", ring())
-    half, zero = read_calibration(path, pixel_centre=0.5), read_calibration(path)
+    half, zero = (
+        read_calibration(path, pixel_centre=0.5),
+        read_calibration(path),
+    )
     shift = zero.cameras["cam0"].K - half.cameras["cam0"].K
     np.testing.assert_allclose(shift, [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 

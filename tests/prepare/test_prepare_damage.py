@@ -58,11 +58,23 @@ def test_the_tool_reads_images_as_stored_and_by_number(tmp_path, monkeypatch):
     detector = load_detector(monkeypatch)
     data = cv2.imencode(".jpg", np.zeros((4, 6, 3), np.uint8))[1].tobytes()
     # orientation (0x112) 6: turned by 90 degrees
-    tiff = b"Exif\0\0II*\0" + struct.pack("<IHHHIHHI", 8, 1, 0x112, 3, 1, 6, 0, 0)
-    turned = data[:2] + b"\xff\xe1" + struct.pack(">H", len(tiff) + 2) + tiff + data[2:]
+    tiff = b"Exif\0\0II*\0" + struct.pack(
+        "<IHHHIHHI", 8, 1, 0x112, 3, 1, 6, 0, 0
+    )
+    turned = (
+        data[:2]
+        + b"\xff\xe1"
+        + struct.pack(">H", len(tiff) + 2)
+        + tiff
+        + data[2:]
+    )
     for name in ("10.jpg", "9.jpg"):
         (tmp_path / name).write_bytes(turned)
-    assert cv2.imread(str(tmp_path / "9.jpg")).shape == (6, 4, 3)  # the tag is valid
+    assert cv2.imread(str(tmp_path / "9.jpg")).shape == (
+        6,
+        4,
+        3,
+    )  # the tag is valid
     count, images = detector.open_source(tmp_path, 0)
     read = list(images)
     assert (count, [number for number, _ in read]) == (2, [9, 10])
@@ -97,10 +109,14 @@ def test_results_with_other_keys_are_removed_by_stage(tmp_path):
         kept.name,
         f"{kept.name}.npz",
     }
-    assert len(list(tmp_path.iterdir())) == 10  # stages that the run did not use stay
+    assert (
+        len(list(tmp_path.iterdir())) == 10
+    )  # stages that the run did not use stay
 
 
-def test_an_old_dataset_stays_when_the_new_one_cannot_be_moved(tmp_path, monkeypatch):
+def test_an_old_dataset_stays_when_the_new_one_cannot_be_moved(
+    tmp_path, monkeypatch
+):
     new, out, replace = tmp_path / "new", tmp_path / "out", os.replace
     for folder in (new, out):
         folder.mkdir()
@@ -135,13 +151,17 @@ def test_options_of_the_wrong_kind(more):
 def test_strong_lenses_are_undistorted_to_the_corners():
     camera = ring(dist=(-0.3, 0, 0, 0, 0))[0]
     h, w = camera.size
-    straight = np.array([[0, 0], [w, 0], [0, h], [w, h], [w / 3, h / 4]], np.float64)
+    straight = np.array(
+        [[0, 0], [w, 0], [0, h], [w, h], [w / 3, h / 4]], np.float64
+    )
     rays = np.c_[straight, np.ones(5)] @ np.linalg.inv(camera.K).T
-    bent = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), camera.K, camera.dist)[0][
-        :, 0
-    ]
+    bent = cv2.projectPoints(
+        rays, np.zeros(3), np.zeros(3), camera.K, camera.dist
+    )[0][:, 0]
     assert np.abs(bent - straight)[:4].max() > 20
-    np.testing.assert_allclose(undistort_points(camera, bent), straight, atol=1e-3)
+    np.testing.assert_allclose(
+        undistort_points(camera, bent), straight, atol=1e-3
+    )
 
 
 def person(tmp_path: Path) -> Path:
@@ -166,7 +186,10 @@ def opencv_yaml(folder: Path, name: str) -> Path:
 READERS = {
     "intri": (read_calibration, lambda p: opencv_yaml(p, "intri.yml")),
     "extri": (read_calibration, lambda p: opencv_yaml(p, "extri.yml")),
-    "toml": (read_calibration, lambda p: write_toml(p / "Calib.toml", ring(dist=LENS))),
+    "toml": (
+        read_calibration,
+        lambda p: write_toml(p / "Calib.toml", ring(dist=LENS)),
+    ),
     "json": (
         read_calibration,
         lambda p: write_own(p / "cameras.json", ring(dist=LENS)),

@@ -31,7 +31,9 @@ def person(frames: int = FRAMES) -> np.ndarray:
         np.random.default_rng(1).uniform(-0.05, 0.05, (30, 3)),
     )
     hands = [
-        np.stack([body[f, wrist] + hand(0.1 * f + wrist) for f in range(frames)])
+        np.stack(
+            [body[f, wrist] + hand(0.1 * f + wrist) for f in range(frames)]
+        )
         for wrist in (15, 16)
     ]
     return np.concatenate([body, *hands, body[:, :1] + face], axis=1)
@@ -50,7 +52,9 @@ def swap(uv: np.ndarray, swapped: np.ndarray) -> np.ndarray:
 def off(found: Solution, p: np.ndarray, part: slice) -> float:
     """Metres, the worst joint; NaN counts as infinite."""
     return float(
-        np.nan_to_num(np.linalg.norm(found.p - p, axis=-1), nan=np.inf)[:, part].max()
+        np.nan_to_num(np.linalg.norm(found.p - p, axis=-1), nan=np.inf)[
+            :, part
+        ].max()
     )
 
 

@@ -45,7 +45,12 @@ def test_the_axis_a_person_stands_along():
 
 def test_masks_lose_their_haze_and_their_crumbs():
     mask = np.zeros((20, 20), np.uint8)
-    mask[2:12, 2:12], mask[12, 2:12], mask[15, 15], mask[18, 2:8] = 255, 128, 255, 40
+    mask[2:12, 2:12], mask[12, 2:12], mask[15, 15], mask[18, 2:8] = (
+        255,
+        128,
+        255,
+        40,
+    )
     found = tidy(mask, (0.3, 0.8))
     assert (found[2:12, 2:12] == 255).all()
     assert found[12, 5] == round(255 * (128 / 255 - 0.3) / 0.5)
@@ -56,7 +61,12 @@ def test_masks_lose_their_haze_and_their_crumbs():
 
 
 def test_given_masks_by_number_and_by_person(tmp_path):
-    for name in ("a/000001.png", "a/000007.png", "b/000001_0.png", "b/000002_0.png"):
+    for name in (
+        "a/000001.png",
+        "a/000007.png",
+        "b/000001_0.png",
+        "b/000002_0.png",
+    ):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
     found = find_masks(tmp_path, ["a", "b"])

@@ -22,10 +22,14 @@ pytestmark = pytest.mark.skipif(
 
 @pytest.fixture(scope="module")
 def project(tmp_path_factory):
-    return write_project(tmp_path_factory.mktemp("killed") / "project", 3, 4, (64, 48))
+    return write_project(
+        tmp_path_factory.mktemp("killed") / "project", 3, 4, (64, 48)
+    )
 
 
-def killed(run: Callable[[], object], stop: Callable[[Path, int], bool]) -> bool:
+def killed(
+    run: Callable[[], object], stop: Callable[[Path, int], bool]
+) -> bool:
     """Whether a child that runs this was killed, at the first file for which ``stop`` says so.
 
     It dies as an image is to be written, or another file, written under another name, is to take
@@ -60,12 +64,18 @@ def killed(run: Callable[[], object], stop: Callable[[Path, int], bool]) -> bool
 
 
 def images(out: Path) -> dict[str, bytes]:
-    paths = sorted((out / "images").rglob("*")) + sorted((out / "masks").rglob("*"))
-    return {str(p.relative_to(out)): p.read_bytes() for p in paths if p.is_file()}
+    paths = sorted((out / "images").rglob("*")) + sorted(
+        (out / "masks").rglob("*")
+    )
+    return {
+        str(p.relative_to(out)): p.read_bytes() for p in paths if p.is_file()
+    }
 
 
 STAGES: dict[str, Callable[[Path, int], bool]] = {
-    "a mask, its image written": lambda place, n: "masks" in place.parts and n > 8,
+    "a mask, its image written": lambda place, n: (
+        "masks" in place.parts and n > 8
+    ),
     "the numbers": lambda place, _: place.name == "prepare.json",
     "the whole dataset": lambda place, _: place.name == "out",
 }
@@ -98,8 +108,12 @@ def test_an_earlier_dataset_outlives_a_kill(project, whole, tmp_path):
     again = options(project, out=str(out), workers=1, overwrite=True)
     assert killed(lambda: prepare(again, quiet()), STAGES["the numbers"])
     assert len(read_capture(out).frames) == 3  # the earlier one is still there
-    assert killed(lambda: prepare(again, quiet()), lambda place, _: place == out)
-    assert len(read_capture(tmp_path / ".out.old").frames) == 3  # moved aside, not lost
+    assert killed(
+        lambda: prepare(again, quiet()), lambda place, _: place == out
+    )
+    assert (
+        len(read_capture(tmp_path / ".out.old").frames) == 3
+    )  # moved aside, not lost
     prepare(again, quiet())
     assert images(out) == whole
     assert not (tmp_path / ".out.old").exists()

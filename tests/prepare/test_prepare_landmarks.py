@@ -14,7 +14,11 @@ from gsgan.utils.errors import DataError
 
 
 def triples(count: int, first: float = 0.0) -> list[float]:
-    return [v for j in range(count) for v in (first + 10 * j, first + 10 * j + 1, 0.9)]
+    return [
+        v
+        for j in range(count)
+        for v in (first + 10 * j, first + 10 * j + 1, 0.9)
+    ]
 
 
 def write_people(folder: Path, frame: int, *people: dict) -> None:
@@ -105,8 +109,14 @@ def test_joints_beyond_the_image_are_not_seen():
         ('{"x": 1}', "neither 'people'"),
         ('{"people": [3]}', "a person must hold"),
         ('{"people": [{"pose_keypoints_2d": [1, 2]}]}', "x, y, confidence"),
-        ('{"people": [{"pose_keypoints_2d": ["a", 1, 1]}]}', "x, y, confidence"),
-        ('{"people": [{"pose_keypoints_2d": [1, 2, 0.5]}]}', "of 17 .COCO., 18"),
+        (
+            '{"people": [{"pose_keypoints_2d": ["a", 1, 1]}]}',
+            "x, y, confidence",
+        ),
+        (
+            '{"people": [{"pose_keypoints_2d": [1, 2, 0.5]}]}',
+            "of 17 .COCO., 18",
+        ),
     ],
 )
 def test_damaged_json_names_the_file(tmp_path, content, what):
@@ -120,7 +130,10 @@ def test_cameras_meet_by_number_and_offset(tmp_path):
     for name, ids in (("a", [0, 1, 2]), ("b", [3, 4])):
         px = np.zeros((len(ids), BODY, 2)) + np.array(ids)[:, None, None]
         np.savez(
-            tmp_path / f"{name}.npz", px=px, conf=np.ones(px.shape[:2]), frame_id=ids
+            tmp_path / f"{name}.npz",
+            px=px,
+            conf=np.ones(px.shape[:2]),
+            frame_id=ids,
         )
     cameras = {n: read_detections(tmp_path / f"{n}.npz") for n in "ab"}
     frames, px, conf = gather(cameras, {"b": -2})

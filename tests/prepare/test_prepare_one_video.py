@@ -25,7 +25,9 @@ def aligned(p, truth):
     """Points after the rigid motion that brings them nearest to the true ones."""
     a, b = p - p.mean((0, 1)), truth - truth.mean((0, 1))
     U, _, V = np.linalg.svd(np.einsum("fni,fnj->ij", a, b))
-    return a @ U @ np.diag([1, 1, np.linalg.det(U @ V)]) @ V + truth.mean((0, 1))
+    return a @ U @ np.diag([1, 1, np.linalg.det(U @ V)]) @ V + truth.mean(
+        (0, 1)
+    )
 
 
 def options(video, **more) -> Options:
@@ -56,7 +58,12 @@ def test_focal_length_and_landmarks_are_found(guess):
     seen = Seen(
         *map(
             torch.tensor,
-            (u, np.ones(u.shape[:2]), world_landmarks(truth), np.arange(48) / 10),
+            (
+                u,
+                np.ones(u.shape[:2]),
+                world_landmarks(truth),
+                np.arange(48) / 10,
+            ),
         )
     )
     found = solve_view(seen, noise=0.001, height=TALL)
@@ -66,8 +73,13 @@ def test_focal_length_and_landmarks_are_found(guess):
 
 
 def test_a_video_becomes_a_capture_that_training_reads(filmed, tmp_path):
-    out = prepare(options(filmed, out=str(tmp_path / "capture")), Console(quiet=True))
-    capture, numbers = read_capture(out), json.loads((out / "prepare.json").read_text())
+    out = prepare(
+        options(filmed, out=str(tmp_path / "capture")), Console(quiet=True)
+    )
+    capture, numbers = (
+        read_capture(out),
+        json.loads((out / "prepare.json").read_text()),
+    )
     assert list(capture.cameras) == ["me"]
     found = np.load(out / "landmarks3d.npz")
     p, truth = found["p"], turning(18)[found["frame_id"]]
@@ -120,7 +132,10 @@ def test_videos_without_a_whole_person_end_in_one_sentence(
 
 def test_long_large_videos_are_sampled(tmp_path):
     video = cv2.VideoWriter(
-        str(tmp_path / "me.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 60, (2400, 16)
+        str(tmp_path / "me.avi"),
+        cv2.VideoWriter_fourcc(*"MJPG"),
+        60,
+        (2400, 16),
     )
     for f in range(330):
         video.write(np.full((16, 2400, 3), f // 2, np.uint8))
@@ -133,7 +148,9 @@ def test_long_large_videos_are_sampled(tmp_path):
 
 def test_vertical_phone_videos_are_turned_as_their_metadata_say(tmp_path):
     path = tmp_path / "me.mp4"
-    video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 10, (64, 32))
+    video = cv2.VideoWriter(
+        str(path), cv2.VideoWriter_fourcc(*"mp4v"), 10, (64, 32)
+    )
     stored = np.zeros((32, 64, 3), np.uint8)
     stored[:, :32] = 255  # the left half
     for _ in range(12):
@@ -158,13 +175,17 @@ def test_vertical_phone_videos_are_turned_as_their_metadata_say(tmp_path):
 )
 def test_the_focal_length_that_a_phone_states(tmp_path, stated, found):
     av, path = pytest.importorskip("av"), tmp_path / "phone.mov"
-    with av.open(str(path), "w", options={"movflags": "use_metadata_tags"}) as file:
+    with av.open(
+        str(path), "w", options={"movflags": "use_metadata_tags"}
+    ) as file:
         if stated:
             file.metadata[FOCAL_KEY] = stated
         stream = file.add_stream("mpeg4", rate=10)
         stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
         file.mux(
-            stream.encode(av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8)))
+            stream.encode(
+                av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8))
+            )
         )
         file.mux(stream.encode())
     assert stated_focal(path) == found
@@ -184,5 +205,7 @@ def test_a_moving_camera_is_measured(tmp_path):
 
 
 def test_a_frame_without_a_landmark_hides_no_doubtful_pose():
-    errors = np.array([[1.0, 2], [np.nan, 2], [np.nan, np.nan], [20, 30], [2, 2]])
+    errors = np.array(
+        [[1.0, 2], [np.nan, 2], [np.nan, np.nan], [20, 30], [2, 2]]
+    )
     assert doubtful_poses(errors).tolist() == [False, False, False, True, False]

@@ -12,8 +12,14 @@ from gsgan.utils.errors import DataError
 
 MARKERS = {
     "Nose": 0,
-    **{f"L{part}": 2 * i + 11 for i, part in enumerate(("Shoulder", "Elbow", "Wrist"))},
-    **{f"R{part}": 2 * i + 12 for i, part in enumerate(("Shoulder", "Elbow", "Wrist"))},
+    **{
+        f"L{part}": 2 * i + 11
+        for i, part in enumerate(("Shoulder", "Elbow", "Wrist"))
+    },
+    **{
+        f"R{part}": 2 * i + 12
+        for i, part in enumerate(("Shoulder", "Elbow", "Wrist"))
+    },
     "LHip": 23,
     "RHip": 24,
     "Lknee": 25,
@@ -40,7 +46,9 @@ def write_trc(path: Path, p: np.ndarray, unit: str = "m") -> Path:
     ]
     for f, frame in enumerate(p):
         row = (
-            np.vstack([frame[list(MARKERS.values())], [[9, 9, 9]]])[:, [1, 2, 0]]
+            np.vstack([frame[list(MARKERS.values())], [[9, 9, 9]]])[
+                :, [1, 2, 0]
+            ]
             * scale
         )
         cells = [
@@ -71,7 +79,10 @@ def test_trc_units_axes_and_names_are_converted(tmp_path, proportions, unit):
     [
         (lambda text: "hello", "cannot be read as a .trc file"),
         (lambda text: text.replace("\tm\n", "\tfeet\n"), "Units is 'feet'"),
-        (lambda text: text.replace("1.58", "x.yz"), "cannot be read as a .trc file"),
+        (
+            lambda text: text.replace("1.58", "x.yz"),
+            "cannot be read as a .trc file",
+        ),
         (
             lambda text: text.replace("Shoulder", "Sh").replace("Hip", "H"),
             "no shoulders and hips",

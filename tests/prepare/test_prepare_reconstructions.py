@@ -53,7 +53,9 @@ def write_colmap(
         name = f"{camera.name}/000000.jpg"
         if binary:
             number = list(CAMERA_MODELS).index(model)
-            lenses.append(struct.pack(f"<iiQQ{len(values)}d", i, number, w, h, *values))
+            lenses.append(
+                struct.pack(f"<iiQQ{len(values)}d", i, number, w, h, *values)
+            )
             points = struct.pack("<Qddqddq", 2, 1.5, 2.5, 7, 3.5, 4.5, -1)
             head = struct.pack("<i7di", 10 + i, *pose, i)
             images.append(head + name.encode() + b"\0" + points)
@@ -71,7 +73,9 @@ def write_colmap(
     return folder / f"cameras.{suffix}"
 
 
-def equal(found: dict[str, CameraEntry], expected: Sequence[CameraEntry]) -> None:
+def equal(
+    found: dict[str, CameraEntry], expected: Sequence[CameraEntry]
+) -> None:
     assert list(found) == [camera.name for camera in expected]
     for camera in expected:
         read = found[camera.name]
@@ -148,7 +152,9 @@ def test_other_lenses_of_colmap_are_refused_by_name(tmp_path, model):
     (tmp_path / "images.bin").write_bytes(struct.pack("<Q", 0))
     binary = tmp_path / "cameras.bin"
     number = list(CAMERA_MODELS).index(model)
-    packed = struct.pack(f"<QiiQQ{len(values)}d", 1, 1, number, 640, 480, *values)
+    packed = struct.pack(
+        f"<QiiQQ{len(values)}d", 1, 1, number, 640, 480, *values
+    )
     binary.write_bytes(packed)
     for path in (text, binary):
         with pytest.raises(
@@ -162,7 +168,12 @@ def test_damaged_models_end_in_one_sentence(tmp_path):
         path = write_colmap(tmp_path, ring(), "OPENCV", binary)
         for file in (path, path.with_stem("images")):
             whole = file.read_bytes()
-            for damaged in (whole[: len(whole) // 2], b"", b"\xff" * 40, b"1 2 3\n"):
+            for damaged in (
+                whole[: len(whole) // 2],
+                b"",
+                b"\xff" * 40,
+                b"1 2 3\n",
+            ):
                 file.write_bytes(damaged)
                 with pytest.raises(DataError) as error:
                     read_calibration(path)
@@ -174,7 +185,9 @@ def test_damaged_models_end_in_one_sentence(tmp_path):
             read_calibration(path)
 
 
-def write_nerfstudio(path: Path, cameras: Sequence[CameraEntry], own: bool) -> Path:
+def write_nerfstudio(
+    path: Path, cameras: Sequence[CameraEntry], own: bool
+) -> Path:
     """A scene with intrinsics of each frame, or of all."""
     frames = []
     for camera in cameras:
@@ -215,13 +228,21 @@ def test_the_camera_looks_along_minus_z_in_nerfstudio(tmp_path):
     pose = np.eye(4)
     pose[2, 3] = 4
     frame = {"file_path": "./images/a.jpg", "transform_matrix": pose.tolist()}
-    content = {"camera_angle_x": np.pi / 2, "w": 640, "h": 480, "frames": [frame]}
+    content = {
+        "camera_angle_x": np.pi / 2,
+        "w": 640,
+        "h": 480,
+        "frames": [frame],
+    }
     path = tmp_path / "transforms.json"
     path.write_text(json.dumps(content))
     camera = read_calibration(path).cameras["a"]
     u, v, depth = camera.K @ (camera.R @ [0, 1, 0] + camera.t)
     assert depth == pytest.approx(4)
-    assert (u / depth, v / depth) == (pytest.approx(320), pytest.approx(240 - 320 / 4))
+    assert (u / depth, v / depth) == (
+        pytest.approx(320),
+        pytest.approx(240 - 320 / 4),
+    )
 
 
 @pytest.mark.parametrize(
@@ -284,7 +305,9 @@ def test_the_persons_height_gives_the_scale_and_the_up_axis(tmp_path):
     def distances(q: np.ndarray) -> np.ndarray:
         return np.linalg.norm(q[:, 11:29, None] - q[:, None, 11:29], axis=-1)
 
-    ratio = distances(p) / np.where(distances(truth) > 0.1, distances(truth), np.nan)
+    ratio = distances(p) / np.where(
+        distances(truth) > 0.1, distances(truth), np.nan
+    )
     height = float(np.nanmedian(ratio))
     np.testing.assert_allclose(ratio[np.isfinite(ratio)], height, rtol=0.03)
     centres = [np.linalg.norm(layout.cameras[a].centre - layout.cameras[b].centre)
@@ -299,8 +322,12 @@ def test_the_persons_height_gives_the_scale_and_the_up_axis(tmp_path):
     # Another height is another scale; a unit leaves the world as it is.
     usual = prepare(options(project, out=str(tmp_path / "usual")), quiet())
     q = np.load(usual / "landmarks3d.npz")["p"]
-    np.testing.assert_allclose(distances(q) * 1.8 / 1.7, distances(p), atol=0.01)
-    kept = prepare(options(project, out=str(tmp_path / "kept"), unit="m"), quiet())
+    np.testing.assert_allclose(
+        distances(q) * 1.8 / 1.7, distances(p), atol=0.01
+    )
+    kept = prepare(
+        options(project, out=str(tmp_path / "kept"), unit="m"), quiet()
+    )
     q = np.load(kept / "landmarks3d.npz")["p"]
     difference = np.abs(distances(q) / unit - distances(truth))
     assert np.nanmax(difference) < 0.05

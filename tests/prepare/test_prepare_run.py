@@ -39,12 +39,16 @@ def test_videos_become_a_capture_that_training_reads(project):
     found = np.load(out / "landmarks3d.npz")
     known = np.isfinite(found["p"]).all(-1)
     assert known.mean() > 0.9
-    np.testing.assert_allclose(found["p"][known], skeletons(FRAMES)[known], atol=0.02)
+    np.testing.assert_allclose(
+        found["p"][known], skeletons(FRAMES)[known], atol=0.02
+    )
     assert np.nanmedian(found["reproj_px"]) < 0.2
     assert not layout.cameras["cam01"].distorted
     given = json.loads((project / "cameras.json").read_text())["cam01"]
     np.testing.assert_allclose(layout.cameras["cam01"].K, given["K"])
-    hands = np.load(out / "hands3d.npz")  # no hands were given: there, and missing
+    hands = np.load(
+        out / "hands3d.npz"
+    )  # no hands were given: there, and missing
     assert np.isnan(hands["p"]).all()
     assert (hands["conf"] == 0).all()
 
@@ -67,7 +71,9 @@ def test_the_numbers_have_every_stage_and_the_dataset_is_checked(
     ]
     assert numbers["cameras"]["cam02"]["frames_written"] == FRAMES
     assert numbers["settings"]["solve"]["smoothing"] == 0.02
-    assert (out / "check.html").read_text().count("data:image/jpeg;base64,") >= CAMERAS
+    assert (out / "check.html").read_text().count(
+        "data:image/jpeg;base64,"
+    ) >= CAMERAS
     assert json.loads((out / "check.json").read_text())["errors"] == 0
 
 
@@ -77,7 +83,9 @@ def test_images_are_undistorted_and_scaled(project):
     assert camera.size == (SIZE[1] // 2, SIZE[0] // 2)
     given = json.loads((project / "cameras.json").read_text())["cam00"]
     np.testing.assert_allclose(camera.K[:2], np.array(given["K"])[:2] / 2)
-    mask = cv2.imread(str(out / "masks" / "cam00" / "000002.png"), cv2.IMREAD_GRAYSCALE)
+    mask = cv2.imread(
+        str(out / "masks" / "cam00" / "000002.png"), cv2.IMREAD_GRAYSCALE
+    )
     p = np.load(out / "landmarks3d.npz")["p"][2]
     x = p @ camera.R.T + camera.t
     uv = (x / x[:, 2:]) @ camera.K.T
@@ -92,9 +100,13 @@ def test_the_same_again_is_left_alone_and_another_refused(project):
     assert (out / "meta.json").stat().st_mtime_ns == before
     with pytest.raises(DataError, match="overwrite=true"):
         prepare(options(project, scale=0.5), quiet())
-    prepare(options(project, scale=0.5, overwrite=True, keep_work=False), quiet())
+    prepare(
+        options(project, scale=0.5, overwrite=True, keep_work=False), quiet()
+    )
     assert read_capture(out).cameras["cam00"].size == (40, 48)
-    assert [p.name for p in out.parent.iterdir() if p.name.startswith(".")] == []
+    assert [
+        p.name for p in out.parent.iterdir() if p.name.startswith(".")
+    ] == []
 
 
 def test_other_folders_are_never_overwritten(project):
@@ -121,7 +133,10 @@ def test_offsets_move_a_cameras_numbers(project):
         range(1, FRAMES)
     )  # frame 6 is its own alone
     with pytest.raises(ConfigError, match="offsets name cam09"):
-        prepare(options(project, offsets={"cam09": 1}, out=str(project / "x")), quiet())
+        prepare(
+            options(project, offsets={"cam09": 1}, out=str(project / "x")),
+            quiet(),
+        )
 
 
 def test_folders_of_images_need_a_frame_rate(project):
@@ -148,7 +163,9 @@ def one_video(project: Path) -> None:
 
 def no_detections(project: Path) -> None:
     def change(arrays):
-        arrays["left"] = arrays["px"][:, :21].copy()  # hands alone do not make a person
+        arrays["left"] = arrays["px"][
+            :, :21
+        ].copy()  # hands alone do not make a person
         arrays["px"][:] = np.nan
 
     for path in (project / "pose").iterdir():
@@ -175,7 +192,11 @@ def no_detections(project: Path) -> None:
             {},
             "no landmarks of the camera cam01",
         ),
-        (lambda p: (p / "pose" / "cam01.npz").write_bytes(b"PK"), {}, r"cam01\.npz"),
+        (
+            lambda p: (p / "pose" / "cam01.npz").write_bytes(b"PK"),
+            {},
+            r"cam01\.npz",
+        ),
         (
             lambda p: (p / "videos" / "cam01.avi").write_bytes(b"RIFF"),
             {},
@@ -188,7 +209,11 @@ def no_detections(project: Path) -> None:
         ),
         (no_detections, {}, "no body joint of any frame came out in 3D"),
         (lambda p: None, {"frames": "90-99"}, "frames=90-99 leaves no frame"),
-        (lambda p: None, {"cameras": {"cam00": "cam01"}}, "more than one video"),
+        (
+            lambda p: None,
+            {"cameras": {"cam00": "cam01"}},
+            "more than one video",
+        ),
         (lambda p: None, {"unit": "inch"}, "unit must be one of"),
         (lambda p: None, {"source": None}, "give source="),
         (one_video, {}, "only the camera cam00"),
@@ -213,8 +238,12 @@ def test_every_key_of_the_config_is_understood(project, compose, capsys):
     )
     command(config)
     assert "is ready" in capsys.readouterr().out
-    defaults = instantiate(compose("prepare", "source=a", "out=b"), _convert_="all")
-    records = (given.record() for given in (Options(**defaults), Options("a", "b")))
+    defaults = instantiate(
+        compose("prepare", "source=a", "out=b"), _convert_="all"
+    )
+    records = (
+        given.record() for given in (Options(**defaults), Options("a", "b"))
+    )
     # as JSON: tuples are lists
     ours, plain = (json.loads(json.dumps(x)) for x in records)
     assert ours == plain
@@ -267,7 +296,8 @@ def test_the_tool_runs_once_per_camera(project, monkeypatch):
 
 def test_the_message_of_a_failing_tool_is_its_last_line(project, monkeypatch):
     with pytest.raises(
-        DataError, match=r"cam01\.avi: the MediaPipe tool failed: the stub refuses"
+        DataError,
+        match=r"cam01\.avi: the MediaPipe tool failed: the stub refuses",
     ):
         prepare(with_stub(project, monkeypatch, bad="cam01"), quiet())
     assert not (project.parent / "out").exists()
@@ -276,19 +306,29 @@ def test_the_message_of_a_failing_tool_is_its_last_line(project, monkeypatch):
 def test_the_environment_is_only_made_with_setup(project):
     missing = MediaPipe(folder=str(project / "nothing"))
     with pytest.raises(ConfigError, match="add setup=true"):
-        prepare(options(project, landmarks="mediapipe", mediapipe=missing), quiet())
+        prepare(
+            options(project, landmarks="mediapipe", mediapipe=missing), quiet()
+        )
     assert not (project / "nothing").exists()
 
 
 def test_errors_of_the_check_are_errors_of_the_command(project, monkeypatch):
-    finding = {"level": "error", "topic": "body", "sentence": "a person of 2.95 m"}
+    finding = {
+        "level": "error",
+        "topic": "body",
+        "sentence": "a person of 2.95 m",
+    }
 
     def found(_root: Path, page: Path, _console: Console) -> None:
-        page.with_suffix(".json").write_text(json.dumps({"findings": [finding]}))
+        page.with_suffix(".json").write_text(
+            json.dumps({"findings": [finding]})
+        )
 
     monkeypatch.setattr("gsgan.prepare.run.check_capture", found)
     console = Console(file=io.StringIO(), width=100)
     for _ in range(2):  # the dataset that exists is not ready either
-        with pytest.raises(DataError, match=r"a person of 2\.95 m.*check\.html"):
+        with pytest.raises(
+            DataError, match=r"a person of 2\.95 m.*check\.html"
+        ):
             prepare(options(project), console)
     assert "is ready" not in console.file.getvalue()

@@ -31,14 +31,18 @@ def test_undistortion_inverts_the_lens():
     stored = np.r_[distorted_pixels(vars(camera), p), [[np.nan, 3.0]]]
     straight = undistort_points(camera, stored)
     np.testing.assert_allclose(straight[:-1], rig.project(p)[0][0], atol=1e-4)
-    assert np.abs(straight[:-1] - stored[:-1]).max() > 1  # the lens does something
+    assert (
+        np.abs(straight[:-1] - stored[:-1]).max() > 1
+    )  # the lens does something
     assert np.isnan(straight[-1]).all()
 
 
 def test_exact_detections_give_exact_points():
     rig, p, uv, conf = seen(ring())
     truth = p.reshape(-1, 3)
-    np.testing.assert_allclose(plain(rig, flat(uv), flat(conf)), truth, atol=1e-9)
+    np.testing.assert_allclose(
+        plain(rig, flat(uv), flat(conf)), truth, atol=1e-9
+    )
     points = robust(rig, flat(uv), flat(conf))
     np.testing.assert_allclose(points.p, truth, atol=1e-9)
     assert points.error.max() < 1e-6
@@ -47,9 +51,13 @@ def test_exact_detections_give_exact_points():
 def test_one_outlier_is_rejected():
     rig, p, uv, conf = seen(ring(), noise=1.0)
     uv[2, :, 15] += [300, -200]  # one camera detects the left wrist elsewhere
-    found = plain(rig, flat(uv), flat(conf)), robust(rig, flat(uv), flat(conf)).p
+    found = (
+        plain(rig, flat(uv), flat(conf)),
+        robust(rig, flat(uv), flat(conf)).p,
+    )
     off = [
-        np.linalg.norm(one.reshape(p.shape) - p, axis=-1)[:, 15].max() for one in found
+        np.linalg.norm(one.reshape(p.shape) - p, axis=-1)[:, 15].max()
+        for one in found
     ]
     assert off[0] > 0.1
     assert off[1] < 0.01
@@ -117,18 +125,27 @@ def relative(rig: CameraArray) -> CameraArray:
 
 def test_refinement_of_two_cameras_and_of_nothing_stays_finite():
     rig, p, uv, conf = seen(ring(angles=(0.0, 1.3)), noise=1.0)
-    found = refine_cameras(rig, rig, p.reshape(-1, 3), flat(uv), flat(conf), *PRIORS)
+    found = refine_cameras(
+        rig, rig, p.reshape(-1, 3), flat(uv), flat(conf), *PRIORS
+    )
     assert np.isfinite(found.R).all()
     np.testing.assert_allclose(np.linalg.det(found.R), 1)
     nothing = refine_cameras(
-        rig, rig, np.full((5, 3), np.nan), flat(uv)[:, :5], np.zeros((2, 5)), *PRIORS
+        rig,
+        rig,
+        np.full((5, 3), np.nan),
+        flat(uv)[:, :5],
+        np.zeros((2, 5)),
+        *PRIORS,
     )
     np.testing.assert_allclose(nothing.R, rig.R)
 
 
 def test_smoothing_keeps_a_parabola_and_its_gaps():
     time = np.arange(40) / 60
-    p = np.stack([time, 3 * time**2, 1 - time], axis=-1)[:, None].repeat(2, axis=1)
+    p = np.stack([time, 3 * time**2, 1 - time], axis=-1)[:, None].repeat(
+        2, axis=1
+    )
     p[10:14, 0] = np.nan
     weight = np.ones(p.shape[:2])
     weight[20, 1] = 0
@@ -205,7 +222,8 @@ def test_nobody_seen_ends_without_joints_or_warnings():
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("rotation_prior", 0), ("refinements", -1), ("smoothing", -1)]
+    ("name", "value"),
+    [("rotation_prior", 0), ("refinements", -1), ("smoothing", -1)],
 )
 def test_settings_out_of_range_are_named(name, value):
     with pytest.raises(ConfigError, match=name):

@@ -105,8 +105,15 @@ def test_held_out_frames_are_the_scored_images(
     scored = expected(folder, split, background, drive == "skeleton")
     for camera in dict.fromkeys(camera for camera, _ in scored):
         out = tmp_path / camera
-        given = (f"run={folder}", f"motion={split}", f"camera={camera}", f"out={out}")
-        result = inside("render", *given, f"background={background}", f"drive={drive}")
+        given = (
+            f"run={folder}",
+            f"motion={split}",
+            f"camera={camera}",
+            f"out={out}",
+        )
+        result = inside(
+            "render", *given, f"background={background}", f"drive={drive}"
+        )
         assert result.returncode == 0, result.stderr
         frames = {frame for c, frame in scored if c == camera}
         assert {p.name for p in out.glob("*.png")} == {
@@ -123,7 +130,12 @@ def test_held_out_frames_are_the_scored_images(
 
 def test_a_motion_of_another_person(render, motion, tmp_path):
     result = render(
-        f"motion={motion}", "out=frames", "fps=15", "start=1", "frames=4", "pixels=40"
+        f"motion={motion}",
+        "out=frames",
+        "fps=15",
+        "start=1",
+        "frames=4",
+        "pixels=40",
     )
     assert result.returncode == 0, result.stderr
     assert (
@@ -143,7 +155,10 @@ def test_smoothing_delays_all_frames_but_the_first(render, motion, tmp_path):
     given = (f"motion={motion}", "pixels=32", "frames=4", "camera=cam00")
     for folder, options in (
         ("plain", ()),
-        ("smooth", ("smooth.enabled=true", "smooth.min_cutoff=0.2", "smooth.beta=0")),
+        (
+            "smooth",
+            ("smooth.enabled=true", "smooth.min_cutoff=0.2", "smooth.beta=0"),
+        ),
     ):
         result = render(*given, f"out={folder}", *options)
         assert result.returncode == 0, result.stderr
@@ -164,24 +179,31 @@ def test_clips_become_one_motion(render, motion, landmarks, tmp_path):
     p[:, :33], p[:, 75:] = landmarks[::-1], landmarks[:, :30]
     np.savez(other, p=0.9 * p, fps=30)
     result = render(
-        f"motion=[{motion},{other}]", "transition=0.2", "out=frames", "pixels=32"
+        f"motion=[{motion},{other}]",
+        "transition=0.2",
+        "out=frames",
+        "pixels=32",
     )
     assert result.returncode == 0, result.stderr
     assert f"face in {len(p)}; 0.2 s from each to the next" in result.stdout
     between = 5  # frames at 30 per second
     assert (
-        len(list((tmp_path / "frames").glob("*.png"))) == 2 * len(landmarks) + between
+        len(list((tmp_path / "frames").glob("*.png")))
+        == 2 * len(landmarks) + between
     )
     refused(render("motion=[]", "out=none"), "names no file")
     refused(
-        render(f"motion=[{motion},gone.pose]", "out=none"), "gone.pose does not exist"
+        render(f"motion=[{motion},gone.pose]", "out=none"),
+        "gone.pose does not exist",
     )
 
 
 def test_a_run_without_its_dataset(render, bare, motion, tmp_path):
     copy = shutil.copytree(bare, tmp_path / "copy")
     config = copy / ".hydra" / "config.yaml"
-    config.write_text(config.read_text().replace("root: /", "root: /no/longer/there/"))
+    config.write_text(
+        config.read_text().replace("root: /", "root: /no/longer/there/")
+    )
     ok = render(f"run={copy}", f"motion={motion}", "out=a", "frames=1")
     assert ok.returncode == 0, ok.stderr
 
@@ -215,7 +237,9 @@ def test_the_up_axis_of_a_rig_can_be_given(render, tmp_path):
         assert up in result.stdout
 
 
-def test_a_body_pose_drives_an_avatar_with_a_body(inside, run, capture, tmp_path):
+def test_a_body_pose_drives_an_avatar_with_a_body(
+    inside, run, capture, tmp_path
+):
     motion = f"motion={capture / 'body_pose.npz'}"
     result = inside(
         "render", f"run={run}", motion, "retarget=false", "out=a", "frames=2"
@@ -240,17 +264,27 @@ def test_residuals_can_be_distilled(inside, on_body, tmp_path):
 
 def test_a_video(render, tmp_path):
     av = pytest.importorskip("av")
-    result = render("motion=novel_pose", "background=white", "out=a.mp4", "fps=7.5")
+    result = render(
+        "motion=novel_pose", "background=white", "out=a.mp4", "fps=7.5"
+    )
     assert result.returncode == 0, result.stderr
     with av.open(str(tmp_path / "a.mp4")) as container:
         stream = container.streams.video[0]
-        frames = [f.to_ndarray(format="rgb24") for f in container.decode(video=0)]
-        assert (stream.codec_context.name, float(stream.average_rate)) == ("h264", 7.5)
+        frames = [
+            f.to_ndarray(format="rgb24") for f in container.decode(video=0)
+        ]
+        assert (stream.codec_context.name, float(stream.average_rate)) == (
+            "h264",
+            7.5,
+        )
     assert [f.shape for f in frames] == [(32, 32, 3)] * 2
     assert verify(tmp_path / "a.mp4").synthetic
     refused(render("out=a.mp4"), "exists; give overwrite=true")
     assert (
-        render("out=a.mp4", "overwrite=true", "frames=2", "pixels=33").returncode == 0
+        render(
+            "out=a.mp4", "overwrite=true", "frames=2", "pixels=33"
+        ).returncode
+        == 0
     )
     with av.open(str(tmp_path / "a.mp4")) as container:
         assert container.streams.video[0].width == 34  # H.264 has even sides
@@ -275,23 +309,37 @@ def test_backgrounds(render, tmp_path):
         ("wall.png", (10, 20, 30)),
     ):
         result = render(
-            "motion=novel_pose", f"background='{name}'", f"out={name.strip('#')}.d/x"
+            "motion=novel_pose",
+            f"background='{name}'",
+            f"out={name.strip('#')}.d/x",
         )
         assert result.returncode == 0, result.stderr
         assert (
-            tuple(read(tmp_path / f"{name.strip('#')}.d" / "x" / "000004.png")[0, 0])
+            tuple(
+                read(tmp_path / f"{name.strip('#')}.d" / "x" / "000004.png")[
+                    0, 0
+                ]
+            )
             == colour
         )
-    assert render("motion=novel_pose", "background=alpha", "out=clear").returncode == 0
+    assert (
+        render("motion=novel_pose", "background=alpha", "out=clear").returncode
+        == 0
+    )
     assert render("motion=novel_pose", "out=black").returncode == 0
     clear, black = (
-        read(tmp_path / x / "000004.png").astype(float) for x in ("clear", "black")
+        read(tmp_path / x / "000004.png").astype(float)
+        for x in ("clear", "black")
     )
     assert clear.shape == (32, 32, 4)
     assert clear[0, 0, 3] == 0
-    np.testing.assert_allclose(clear[..., :3] * clear[..., 3:] / 255, black, atol=1.5)
+    np.testing.assert_allclose(
+        clear[..., :3] * clear[..., 3:] / 255, black, atol=1.5
+    )
     refused(render("background=alpha", "out=a.mp4"), "needs PNG files")
-    refused(render("background=nocolour", "out=a"), "is neither a colour nor a file")
+    refused(
+        render("background=nocolour", "out=a"), "is neither a colour nor a file"
+    )
 
 
 def test_cameras(render, bare, capture, motion, tmp_path):
@@ -306,10 +354,16 @@ def test_cameras(render, bare, capture, motion, tmp_path):
     one = tmp_path / "one.json"
     one.write_text(json.dumps({"cam00": calibration["cam00"]}))
     assert (
-        render(f"motion={motion}", f"camera={one}", "out=a", "frames=1").returncode == 0
+        render(
+            f"motion={motion}", f"camera={one}", "out=a", "frames=1"
+        ).returncode
+        == 0
     )
     assert (
-        render(f"motion={motion}", "camera=cam00", "out=b", "frames=1").returncode == 0
+        render(
+            f"motion={motion}", "camera=cam00", "out=b", "frames=1"
+        ).returncode
+        == 0
     )
     np.testing.assert_array_equal(
         read(tmp_path / "a/000000.png"), read(tmp_path / "b/000000.png")
@@ -317,7 +371,9 @@ def test_cameras(render, bare, capture, motion, tmp_path):
     path = tmp_path / "path.json"
     path.write_text(json.dumps(calibration))
     assert (
-        render(f"motion={motion}", f"camera={path}", "out=c", "frames=3").returncode
+        render(
+            f"motion={motion}", f"camera={path}", "out=c", "frames=3"
+        ).returncode
         == 0
     )
     refused(
@@ -338,7 +394,10 @@ def test_cameras(render, bare, capture, motion, tmp_path):
         (("out=a.avi",), "must be a .mp4 file, or a folder"),
         (("out=a", "motion=none.bvh"), "motion=none.bvh does not exist"),
         (("out=a", "fps=0"), "fps must be a number above 0"),
-        (("out=a", "motion=novel_pose", "start=9"), "start=9: the motion has 2 frames"),
+        (
+            ("out=a", "motion=novel_pose", "start=9"),
+            "start=9: the motion has 2 frames",
+        ),
         (("out=a", "orbit.elevation=90"), "orbit.elevation must be"),
         (("out=a", "retarget=maybe"), "retarget must be one of auto"),
         (("out=a", "drive=body"), "drive must be one of None, skeleton"),
@@ -347,7 +406,10 @@ def test_cameras(render, bare, capture, motion, tmp_path):
             "is not supported for a list",
         ),
         (("out=a", "camera=0"), "camera=0 is neither a camera"),
-        (("out=a.npz/frames",), "a.npz/frames cannot be written (Not a directory)"),
+        (
+            ("out=a.npz/frames",),
+            "a.npz/frames cannot be written (Not a directory)",
+        ),
         (("out=a.npz/a.mp4",), "a.npz/a.mp4 cannot be written (File exists)"),
     ],
 )
@@ -361,7 +423,9 @@ def test_other_folders_are_not_touched(render, motion, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "000000.png").write_text("mine")
     for more in ((), ("overwrite=true",)):
-        refused(render(f"motion={motion}", "out=mine", *more), "holds no render")
+        refused(
+            render(f"motion={motion}", "out=mine", *more), "holds no render"
+        )
     assert (tmp_path / "mine" / "000000.png").read_text() == "mine"
 
 
@@ -371,7 +435,9 @@ def test_the_picture_of_the_avatar(bare, landmarks):
     config = load_config(bare)
     frame = build_data(config).dataset("train")[0]
     with torch.no_grad():
-        painting = avatar(frame.skeleton, torch.ones(1, 33), frame.camera, maps=False)
+        painting = avatar(
+            frame.skeleton, torch.ones(1, 33), frame.camera, maps=False
+        )
     image = avatar.render(frame.skeleton, frame.camera)
     assert torch.equal(image, painting.image.clamp(0, 1))
     assert painting.features is None

@@ -33,7 +33,13 @@ def variant(images: int = 3, **held: Any) -> dict[str, Any]:
 
 def protocol(name: str, **held: Any) -> dict[str, Any]:
     """A protocol's record, as it stands beside scores."""
-    return {"name": name, "subject": None, "scale": 0.5, "departures": [], **held}
+    return {
+        "name": name,
+        "subject": None,
+        "scale": 0.5,
+        "departures": [],
+        **held,
+    }
 
 
 def write_run(
@@ -64,7 +70,9 @@ def write_run(
         "seed": seed, "iterations": 7000, "train_seconds": 600.0, "device": "cpu", "torch": "2",
     }  # fmt: skip
     folder.mkdir(parents=True)
-    (folder / "metrics.json").write_text(json.dumps(dict.fromkeys(splits, variants)))
+    (folder / "metrics.json").write_text(
+        json.dumps(dict.fromkeys(splits, variants))
+    )
     (folder / "facts.json").write_text(json.dumps(held | (facts or {})))
     return folder
 
@@ -78,7 +86,9 @@ def zju(subject: int) -> dict[str, Any]:
     }
 
 
-def report_of(spec: TableSpec, *folders: Path, allow_dirty: bool = False) -> Report:
+def report_of(
+    spec: TableSpec, *folders: Path, allow_dirty: bool = False
+) -> Report:
     """The table of run folders."""
     runs, out = read_runs(find_runs([str(folder) for folder in folders]))
     paper = None if spec.paper is None else read_paper(spec.paper)

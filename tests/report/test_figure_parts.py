@@ -81,7 +81,9 @@ def test_details_are_squares_that_hold_the_head_and_the_hands(name):
         assert columns.start <= column <= columns.stop
 
     # A hand that was not detected, or lies outside the image, is not shown.
-    left = [i for i, joint in enumerate(template.names) if joint.startswith("left_")]
+    left = [
+        i for i, joint in enumerate(template.names) if joint.startswith("left_")
+    ]
     visibility[:, left] = 0
     hidden = detail_boxes(template, skeleton, visibility, camera)
     assert "left hand" not in hidden
@@ -94,12 +96,18 @@ def test_a_panel_holds_its_image():
     image[0, 0, 3, 1] = 1.0  # the lower right pixel is red
     with rc_context(STYLE):
         panels = [[Panel(image, "note"), Panel(image)]]
-        figure, axes = draw_panels(panels, titles=["one", "$x^$"], names=["row"])
+        figure, axes = draw_panels(
+            panels, titles=["one", "$x^$"], names=["row"]
+        )
         drawn = rendered(figure)  # and no title is a formula
     box, height = axes[0, 1].get_window_extent(), drawn.shape[0]
     corner = drawn[round(height - box.y0) - 3, round(box.x1) - 3]
     assert corner.tolist() == [255, 0, 0]
-    assert drawn[round(height - box.y1) + 3, round(box.x0) + 3].tolist() == [0, 0, 0]
+    assert drawn[round(height - box.y1) + 3, round(box.x0) + 3].tolist() == [
+        0,
+        0,
+        0,
+    ]
     assert figure.get_size_inches()[0] == COLUMN_WIDTH
     assert figure.get_size_inches()[1] < TALLEST + 0.5  # with text
 
@@ -129,9 +137,12 @@ def test_shots_are_spread_over_frames_and_cameras(data):
 
 
 def test_an_empty_split_names_those_with_images(build):
-    data = build("data.test_cameras=[]", "data.train_cameras=[cam00,cam01,cam02]")[0]
+    data = build(
+        "data.test_cameras=[]", "data.train_cameras=[cam00,cam01,cam02]"
+    )[0]
     with pytest.raises(
-        DataError, match=r"no camera is held out.*use split=train, split=novel_pose"
+        DataError,
+        match=r"no camera is held out.*use split=train, split=novel_pose",
     ):
         choose_items(data, "novel_view", frames=None, camera=None, count=1)
 
@@ -143,7 +154,9 @@ def test_windows_hold_the_joints_and_have_one_size(data):
     assert len({shot.truth.shape for shot in shots}) == 1
     for shot in shots:
         height, width = shot.window.size
-        pixels, _ = shot.window.camera(shot.frame.camera).project(shot.frame.skeleton)
+        pixels, _ = shot.window.camera(shot.frame.camera).project(
+            shot.frame.skeleton
+        )
         inside = (pixels >= 0) & (pixels <= torch.tensor([width, height]))
         reach, _ = shot.frame.camera.project(shot.frame.skeleton)
         in_picture = (reach >= 0) & (reach <= 32)

@@ -18,7 +18,9 @@ from gsgan.run.stored import load_config
 
 FEW = ("shots.strip=2",)
 
-pytestmark = pytest.mark.slow  # make test runs `report run=` as the README has it
+pytestmark = (
+    pytest.mark.slow
+)  # make test runs `report run=` as the README has it
 
 
 @pytest.fixture
@@ -77,7 +79,9 @@ def expected(run: Path, found: dict) -> dict:
             image = avatar(*frame.inputs).image.clamp(0, 1)
         score = {
             "psnr": pytest.approx(float(psnr(image, frame.image)), abs=1e-4),
-            "edge_f1": pytest.approx(float(edge_f1(image, frame.image)), abs=1e-9),
+            "edge_f1": pytest.approx(
+                float(edge_f1(image, frame.image)), abs=1e-9
+            ),
         }
         numbers[name] = dict.fromkeys(panels, score)
     return numbers
@@ -90,10 +94,16 @@ def expected(run: Path, found: dict) -> dict:
         ({"data__train_frames": "0-2"}, ("differ in data", "frames, split")),
     ],
 )
-def test_runs_on_other_data_are_refused(run, twin, tmp_path, inside, change, words):
+def test_runs_on_other_data_are_refused(
+    run, twin, tmp_path, inside, change, words
+):
     edit(twin, **change)
     result = inside(
-        "report", f"run={run}", f"compare=[{twin}]", f"out={tmp_path / 'out'}", *FEW
+        "report",
+        f"run={run}",
+        f"compare=[{twin}]",
+        f"out={tmp_path / 'out'}",
+        *FEW,
     )
     refused(result, str(run), str(twin), *words)
     assert not list((tmp_path / "out").glob("*.p*"))
@@ -120,7 +130,11 @@ def test_a_collapsed_run_is_not_drawn(twin, tmp_path, inside):
             value.fill_(float("nan"))
     torch.save(checkpoint, path)
     result = inside(
-        "report", f"run={twin}", f"out={tmp_path / 'out'}", "figures=strip", *FEW
+        "report",
+        f"run={twin}",
+        f"out={tmp_path / 'out'}",
+        "figures=strip",
+        *FEW,
     )
     refused(result, str(twin), "not finite")
 
@@ -132,7 +146,10 @@ def test_a_collapsed_run_is_not_drawn(twin, tmp_path, inside):
         (("run=/nowhere",), ("/nowhere", "not a run folder")),
         (("compare=[{run}]",), ("a run is given twice",)),
         (("compare=[/nowhere]",), ("/nowhere", "not a run folder")),
-        (("figures=[strip,stripe]",), ("figures must be one of comparison", "stripe")),
+        (
+            ("figures=[strip,stripe]",),
+            ("figures must be one of comparison", "stripe"),
+        ),
         (("figures=[ablation,strip]",), ("figures=ablation compares runs",)),
         (("frames=[a]",), ("frames must be a whole number",)),
         (("shots.strip=0", "figures=strip"), ("shots.strip", "at least 1")),

@@ -23,11 +23,15 @@ def sweep(tmp_path):
             write_run(folder / f"{model}_{seed}", model, seed, psnr=psnr)
     (folder / "unfinished" / ".hydra").mkdir(parents=True)
     (folder / "unfinished" / ".hydra" / "config.yaml").write_text("seed: 0\n")
-    (folder / "unfinished" / "unfinished.txt").write_text("it was killed by SIGKILL")
+    (folder / "unfinished" / "unfinished.txt").write_text(
+        "it was killed by SIGKILL"
+    )
     return folder
 
 
-def test_it_writes_all_files_and_names_what_it_left_out(sweep, tmp_path, inside):
+def test_it_writes_all_files_and_names_what_it_left_out(
+    sweep, tmp_path, inside
+):
     result = inside("report", f"runs=[{sweep}]", "table=ablation", "out=tables")
     assert result.returncode == 0, result.stderr
     assert "30.50 ± 0.71" in result.stdout
@@ -35,7 +39,9 @@ def test_it_writes_all_files_and_names_what_it_left_out(sweep, tmp_path, inside)
     assert "it was killed by SIGKILL" in result.stdout
     out = tmp_path / "tables"
     assert {path.name for path in out.iterdir()} == FILES
-    held = pd.read_csv(out / "report.csv").set_index(["table", "row", "column"])["mean"]
+    held = pd.read_csv(out / "report.csv").set_index(
+        ["table", "row", "column"]
+    )["mean"]
     assert held.loc[:, "w/o S", "PSNR dB ↑"].item() == pytest.approx(30.375)
     assert not (tmp_path / "outputs").exists()  # Hydra left nothing
 
@@ -46,12 +52,21 @@ def test_a_wrong_value_ends_in_one_message_before_anything_is_written(
     runs = f"runs=[{sweep}]"
     refused(inside("report"), "runs and run are not set")
     refused(inside("report", "runs=[]"), "runs and run are not set")
-    refused(inside("report", f"runs=[{tmp_path}/gone]"), "gone' contains no run folder")
     refused(
-        inside("report", runs, "out=a", "table=zju"), "is of zju_mocap", "table=plain"
+        inside("report", f"runs=[{tmp_path}/gone]"),
+        "gone' contains no run folder",
     )
-    refused(inside("report", runs, "out=a", "table.metrics=[fid]"), "fid", "psnr")
-    refused(inside("report", runs, "out=a", "table.rows=[{model: full}]"), "model")
+    refused(
+        inside("report", runs, "out=a", "table=zju"),
+        "is of zju_mocap",
+        "table=plain",
+    )
+    refused(
+        inside("report", runs, "out=a", "table.metrics=[fid]"), "fid", "psnr"
+    )
+    refused(
+        inside("report", runs, "out=a", "table.rows=[{model: full}]"), "model"
+    )
     page = tmp_path / "page.md"
     page.write_text("a file")
     assert not (tmp_path / "a").exists()

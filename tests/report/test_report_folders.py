@@ -21,7 +21,9 @@ def test_a_sweep_is_searched_and_each_run_taken_once(tmp_path):
     assert find_runs(given) == [flat, deep]
 
 
-@pytest.mark.parametrize("entry", ["absent", "x*", "a/metrics.json", "empty", ""])
+@pytest.mark.parametrize(
+    "entry", ["absent", "x*", "a/metrics.json", "empty", ""]
+)
 def test_an_entry_without_a_run_is_refused(tmp_path, monkeypatch, entry):
     write_run(tmp_path / "a")
     (tmp_path / "empty").mkdir()
@@ -35,8 +37,13 @@ def test_an_entry_without_a_run_is_refused(tmp_path, monkeypatch, entry):
 def test_name_and_seed_come_from_the_facts(tmp_path):
     run = read_run(write_run(tmp_path / "a", "wo_gcn", 3, psnr=30.0))
     assert (run.name, run.seed, run.data["name"]) == ("wo_gcn", 3, "synthetic")
-    predicted = write_run(tmp_path / "b", None, None, facts={"method": "gauhuman"})
-    assert (read_run(predicted).name, read_run(predicted).seed) == ("gauhuman", None)
+    predicted = write_run(
+        tmp_path / "b", None, None, facts={"method": "gauhuman"}
+    )
+    assert (read_run(predicted).name, read_run(predicted).seed) == (
+        "gauhuman",
+        None,
+    )
 
 
 def trained(folder, config, **facts):
@@ -49,10 +56,13 @@ def trained(folder, config, **facts):
 
 def test_settings_are_without_the_seed(tmp_path, tiny):
     runs = [
-        read_run(trained(tmp_path / str(seed), tiny(f"seed={seed}"))) for seed in (4, 5)
+        read_run(trained(tmp_path / str(seed), tiny(f"seed={seed}")))
+        for seed in (4, 5)
     ]
     assert runs[0].settings == runs[1].settings
-    other = read_run(trained(tmp_path / "other", tiny("training.pose_noise=0.5")))
+    other = read_run(
+        trained(tmp_path / "other", tiny("training.pose_noise=0.5"))
+    )
     assert other.settings != runs[0].settings
 
 
@@ -64,7 +74,9 @@ def test_settings_are_without_the_seed(tmp_path, tiny):
         ("facts.json", "{", "damaged"),
     ],
 )
-def test_a_damaged_file_is_named_and_its_run_left_out(tmp_path, file, text, message):
+def test_a_damaged_file_is_named_and_its_run_left_out(
+    tmp_path, file, text, message
+):
     whole = write_run(tmp_path / "whole", psnr=30.0)
     broken = write_run(tmp_path / "broken", psnr=30.0)
     (broken / file).write_text(text)
@@ -81,7 +93,9 @@ def test_a_run_that_was_scored_half_way_is_left_out(tmp_path, tiny):
     assert read_runs([run])[1] == {}
     facts = json.loads((run / "facts.json").read_text())
     (run / "facts.json").write_text(json.dumps(facts | {"iterations": 3}))
-    assert read_runs([run])[1] == {run: "scored after 3 of at least 12 iterations"}
+    assert read_runs([run])[1] == {
+        run: "scored after 3 of at least 12 iterations"
+    }
 
 
 def test_an_unfinished_run_and_a_broken_config_are_left_out(tmp_path, tiny):

@@ -2,7 +2,15 @@
 
 import pytest
 from omegaconf import OmegaConf
-from report_folders import protocol, report_of, row, table, texts, write_run, zju
+from report_folders import (
+    protocol,
+    report_of,
+    row,
+    table,
+    texts,
+    write_run,
+    zju,
+)
 
 from gsgan.report.paper import read_paper
 from gsgan.report.runs import NAME
@@ -22,7 +30,9 @@ def paper_run(folder, **held):
 
 
 def test_beside_the_same_data_subject_protocol_and_split(tmp_path):
-    (grid,) = report_of(table(**ABLATION, **VIEW), paper_run(tmp_path / "a")).grids
+    (grid,) = report_of(
+        table(**ABLATION, **VIEW), paper_run(tmp_path / "a")
+    ).grids
     labels = [r.label for r in grid.rows]
     assert labels[:2] == ["full", "full (as printed)"]
     printed = row(grid, "full (as printed)")
@@ -38,7 +48,10 @@ APART = {
         {"data": None, "record": None},
         "of synthetic, the paper's of zju_mocap",
     ),
-    "another subject": ({"data": zju(386)}, "CoreView_386, the paper's of subject 377"),
+    "another subject": (
+        {"data": zju(386)},
+        "CoreView_386, the paper's of subject 377",
+    ),
     "no protocol": ({"record": None}, "of protocol none"),
     "another protocol": (
         {"record": protocol("zju_gauhuman")},
@@ -59,7 +72,9 @@ def test_otherwise_they_have_a_table_of_their_own_with_the_reason(
         table(**ABLATION, **VIEW), paper_run(tmp_path / "a", **held)
     ).grids
     assert all(r.kind != "paper" for r in ours.rows)
-    assert all(r.kind == "paper" and "(as printed)" in r.label for r in paper.rows)
+    assert all(
+        r.kind == "paper" and "(as printed)" in r.label for r in paper.rows
+    )
     assert message in paper.remarks[0]
     departed = ("n/a", "zju_mocap", "the paper's, read as paper_zju", "n/a")
     assert all(r.origin == departed for r in paper.rows)
@@ -81,7 +96,9 @@ def test_only_runs_of_experiment_paper_have_the_papers_name(
 ):
     rows = [{"run": "full"}, {"run": "full", "label": "C", "variant": "splat"}]
     rows.append({"run": "wo_seg", "label": "w/o S"})
-    runs = [paper_run(tmp_path / name, model=name) for name in ("full", "wo_seg")]
+    runs = [
+        paper_run(tmp_path / name, model=name) for name in ("full", "wo_seg")
+    ]
     for run in runs if experiment else ():
         (run / ".hydra").mkdir()
         held = {
@@ -89,12 +106,16 @@ def test_only_runs_of_experiment_paper_have_the_papers_name(
             "overrides": {"task": overrides},
         }
         OmegaConf.save({"hydra": held}, run / ".hydra" / "hydra.yaml")
-    (grid,) = report_of(table(**(ABLATION | VIEW | {"rows": rows})), *runs).grids
+    (grid,) = report_of(
+        table(**(ABLATION | VIEW | {"rows": rows})), *runs
+    ).grids
     ours = [r.label for r in grid.rows if r.kind != "paper"]
     assert (f"{NAME}, w/o S" in ours) == (departed == "")
     assert ours.count(NAME) == (departed == "")
     notes = " ".join(note for r in grid.rows for note in r.notes)
-    assert (f"differs from experiment=paper: {departed}" in notes) == bool(departed)
+    assert (f"differs from experiment=paper: {departed}" in notes) == bool(
+        departed
+    )
     assert ("no config says whether" in notes) == (departed is None)
 
 
@@ -129,5 +150,7 @@ def test_every_printed_value_is_a_number(name):
 
 
 def test_an_unknown_entry_is_refused():
-    with pytest.raises(ConfigError, match=r"table\.paper=tables: paper\.yaml has zju"):
+    with pytest.raises(
+        ConfigError, match=r"table\.paper=tables: paper\.yaml has zju"
+    ):
         read_paper("tables")

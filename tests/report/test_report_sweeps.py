@@ -13,7 +13,10 @@ KEY = "training.step_two.adversarial"
 
 def swept(folder: Path, weight: float, seed: int, psnr: float, **more) -> Path:
     run = write_run(folder / f"{weight}_{seed}", "full", seed, psnr=psnr)
-    config = {"seed": seed, "training": {"step_two": {"adversarial": weight, **more}}}
+    config = {
+        "seed": seed,
+        "training": {"step_two": {"adversarial": weight, **more}},
+    }
     (run / ".hydra").mkdir()
     (run / ".hydra" / "config.yaml").write_text(yaml.safe_dump(config))
     return run
@@ -27,7 +30,9 @@ def test_values_of_a_setting_are_rows_in_their_order(tmp_path):
     ]
     (grid,) = report_of(table(by=[KEY]), *runs).grids
     labels = [r.label for r in grid.rows if r.kind == "run"]
-    assert labels == [f"full, adversarial {w}" for w in ("0", "0.002", "2", "10")]
+    assert labels == [
+        f"full, adversarial {w}" for w in ("0", "0.002", "2", "10")
+    ]
     assert texts(row(grid, "full, adversarial 2"))[0] == "32.50 ± 0.71"
 
 
@@ -39,7 +44,9 @@ def test_a_setting_of_an_earlier_version_has_its_present_name(tmp_path):
         config = {"training": {"rollback": {key: 3}}}
         (run / ".hydra" / "config.yaml").write_text(yaml.safe_dump(config))
         runs.append(run)
-    (grid,) = report_of(table(by=["training.rollback.max_restorations"]), *runs).grids
+    (grid,) = report_of(
+        table(by=["training.rollback.max_restorations"]), *runs
+    ).grids
     labels = [r.label for r in grid.rows if r.kind == "run"]
     assert labels == ["full, max restorations 3"]
 
@@ -60,7 +67,9 @@ def test_a_setting_that_a_run_does_not_have_is_named(tmp_path):
         ConfigError, match=r"table\.by: .*has no setting training\.nothing"
     ):
         report_of(table(by=["training.nothing"]), swept(tmp_path, 0.5, 0, 30.0))
-    with pytest.raises(ConfigError, match=rf"table\.by: .*has no setting {KEY}"):
+    with pytest.raises(
+        ConfigError, match=rf"table\.by: .*has no setting {KEY}"
+    ):
         report_of(table(by=[KEY]), write_run(tmp_path / "bare", psnr=30.0))
 
 

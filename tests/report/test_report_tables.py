@@ -36,7 +36,10 @@ def test_mean_spread_seeds_and_floor(tmp_path):
     full = row(grid, "full")
     assert texts(full) == ["31.00 ± 1.00", "n/a"]
     assert full.cells[1].notes == ("n/a: left out by lpips.nets",)
-    assert (full.cells[0].mean, full.cells[0].spread) == (31.0, 1.0)  # divided by n - 1
+    assert (full.cells[0].mean, full.cells[0].spread) == (
+        31.0,
+        1.0,
+    )  # divided by n - 1
     assert full.origin == ("3", "synthetic, person", "none", "abc123")
     floor = row(grid, "all background (floor)")
     assert (texts(floor), floor.kind) == (["15.50", "n/a"], "floor")
@@ -86,7 +89,9 @@ def test_the_best_of_several_rows_is_emphasised(tmp_path):
             **(lower | {"lpips_vgg": 0.2, "edge_ratio": 0.9}),
         ),
     ]
-    (grid,) = report_of(table(metrics=["psnr", "lpips_vgg", "edge_ratio"]), *runs).grids
+    (grid,) = report_of(
+        table(metrics=["psnr", "lpips_vgg", "edge_ratio"]), *runs
+    ).grids
     found = {r.label: [cell.best for cell in r.cells] for r in grid.rows}
     assert found == {
         "a": [False, True, False],
@@ -118,7 +123,9 @@ def test_the_table_of_signs_has_boxes_of_one_kind(tmp_path):
     spec = instantiate(OmegaConf.load(config_folder() / "table" / "slp.yaml"))
     boxes = "skeleton holistic; hands: their landmarks"
     runs = [
-        write_run(tmp_path / model, model, psnr=psnr, psnr_hands=psnr - 6, boxes=boxes)
+        write_run(
+            tmp_path / model, model, psnr=psnr, psnr_hands=psnr - 6, boxes=boxes
+        )
         for model, psnr in (
             ("full", 33.0),
             ("image_to_image", 29.0),
@@ -137,21 +144,35 @@ def test_the_table_of_signs_has_boxes_of_one_kind(tmp_path):
     )
     with pytest.raises(ConfigError, match="differ in boxes of hands and mouth"):
         report_of(spec, *runs, other)
-    (grid,) = report_of(table(), *runs, other).grids  # which shows no score of boxes
+    (grid,) = report_of(
+        table(), *runs, other
+    ).grids  # which shows no score of boxes
     assert len(grid.remarks) == 1
 
 
 MIXTURES = {
-    "other data": ({"data": {"name": "capture", "root": "me"}}, "differ in data"),
+    "other data": (
+        {"data": {"name": "capture", "root": "me"}},
+        "differ in data",
+    ),
     "other fingerprint": (
-        {"data": {"name": "synthetic", "root": "person", "fingerprint": "beef"}},
+        {
+            "data": {
+                "name": "synthetic",
+                "root": "person",
+                "fingerprint": "beef",
+            }
+        },
         "differ in data .*: f00d and beef",
     ),
     "a protocol": (
         {"record": protocol("paper_zju")},
         "differ in protocol: none and paper_zju",
     ),
-    "other images": ({"floor": {"psnr": 15.6}}, "all-background image: 15.5 and 15.6"),
+    "other images": (
+        {"floor": {"psnr": 15.6}},
+        "all-background image: 15.5 and 15.6",
+    ),
     "fewer images": ({"images": 2}, "images scored: 3 and 2"),
     "changed code": ({"facts": {"dirty": True}}, "uncommitted changes"),
     "another LPIPS": (
@@ -197,7 +218,10 @@ def test_every_pair_of_seeds_is_compared(tmp_path):
     """One that does not tell its iterations must not hide that two others differ."""
     runs = [
         write_run(
-            tmp_path / str(seed), seed=seed, psnr=30.0, facts={"iterations": done}
+            tmp_path / str(seed),
+            seed=seed,
+            psnr=30.0,
+            facts={"iterations": done},
         )
         for seed, done in enumerate((7000, None, 10))
     ]
@@ -210,7 +234,8 @@ def test_a_method_of_a_models_name_is_not_pooled_with_it(tmp_path):
     facts = {"method": "full", "iterations": None}
     method = write_run(tmp_path / "b", None, None, psnr=20.0, facts=facts)
     with pytest.raises(
-        ConfigError, match="differ in kind: a model trained here and predictions"
+        ConfigError,
+        match="differ in kind: a model trained here and predictions",
     ):
         report_of(table(), model, method)
 
@@ -241,9 +266,15 @@ def test_several_commits_stand_together_and_changed_code_where_allowed(
 
 
 def test_one_grid_takes_runs_that_scored_other_splits(tmp_path):
-    both = write_run(tmp_path / "a", psnr=30.0, record=protocol("p"), splits=SPLITS)
+    both = write_run(
+        tmp_path / "a", psnr=30.0, record=protocol("p"), splits=SPLITS
+    )
     one = write_run(
-        tmp_path / "b", "wo_seg", psnr=29.0, record=protocol("p"), splits=SPLITS[:1]
+        tmp_path / "b",
+        "wo_seg",
+        psnr=29.0,
+        record=protocol("p"),
+        splits=SPLITS[:1],
     )
     grids = report_of(table(splits=SPLITS), both, one).grids
     assert len(grids) == 2
@@ -252,7 +283,10 @@ def test_one_grid_takes_runs_that_scored_other_splits(tmp_path):
         "wo_seg",
         "all background (floor)",
     ]
-    assert [r.label for r in grids[1].rows] == ["full", "all background (floor)"]
+    assert [r.label for r in grids[1].rows] == [
+        "full",
+        "all background (floor)",
+    ]
 
 
 def test_runs_of_other_rows_are_named_and_left_out(tmp_path):
@@ -276,7 +310,11 @@ def test_a_split_that_no_run_scored_is_refused(tmp_path):
         report_of(table(splits=["novel_view"]), run)
 
 
-SUBJECTS = {"subjects": ["377", "386"], "metrics": ["psnr"], "data": "zju_mocap"}
+SUBJECTS = {
+    "subjects": ["377", "386"],
+    "metrics": ["psnr"],
+    "data": "zju_mocap",
+}
 
 
 def test_subjects_are_columns_with_a_mean_over_them_by_seed(tmp_path):
@@ -327,10 +365,16 @@ def test_other_subjects_are_left_out_and_other_data_refused(tmp_path):
 
 def test_a_mean_over_subjects_refuses_other_protocols(tmp_path):
     one = write_run(
-        tmp_path / "a", data=zju(377), psnr=30.0, record=protocol("p", subject=377)
+        tmp_path / "a",
+        data=zju(377),
+        psnr=30.0,
+        record=protocol("p", subject=377),
     )
     two = write_run(
-        tmp_path / "b", data=zju(386), psnr=30.0, record=protocol("p", subject=386)
+        tmp_path / "b",
+        data=zju(386),
+        psnr=30.0,
+        record=protocol("p", subject=386),
     )
     report_of(table(**SUBJECTS), one, two)  # the subject is theirs to differ in
     three = write_run(
@@ -353,9 +397,21 @@ def test_signs_and_digits(value, text):
     [
         ("metrics", [], "metrics must be a list of at least one"),
         ("metrics", ["fid"], "metrics must be one of psnr, .*got 'fid'"),
-        ("splits", "novel_pose", "splits must be one of train, novel_view, novel_pose"),
-        ("variants", ["floor"], "variants must be one of full, splat, got 'floor'"),
-        ("rows", [{"run": "full", "variant": "floor"}], "variants must be one of"),
+        (
+            "splits",
+            "novel_pose",
+            "splits must be one of train, novel_view, novel_pose",
+        ),
+        (
+            "variants",
+            ["floor"],
+            "variants must be one of full, splat, got 'floor'",
+        ),
+        (
+            "rows",
+            [{"run": "full", "variant": "floor"}],
+            "variants must be one of",
+        ),
     ],
 )
 def test_a_wrong_value_is_refused_by_key(key, value, message):

@@ -30,7 +30,10 @@ def report():
         ),
     ]
     grid = Grid(
-        "novel_pose: 100% [f00d]", ["PSNR ↑", "mIoU [a] ↑"], rows, ("Row − full.",)
+        "novel_pose: 100% [f00d]",
+        ["PSNR ↑", "mIoU [a] ↑"],
+        rows,
+        ("Row − full.",),
     )
     return Report("A & B", [grid], {"bad_run": "damaged <x>"})
 
@@ -54,9 +57,14 @@ def test_markdown_tables_have_as_many_cells_in_every_row(report):
 def test_latex_is_escaped_balanced_and_rectangular(report):
     text = write.files_of(report)["report.tex"]
     for name in ("table", "tabular"):
-        begins, ends = (text.count(rf"\{word}{{{name}}}") for word in ("begin", "end"))
+        begins, ends = (
+            text.count(rf"\{word}{{{name}}}") for word in ("begin", "end")
+        )
         assert begins == ends == 1
-    assert [text.count(rule) for rule in (r"\toprule", r"\bottomrule")] == [1, 1]
+    assert [text.count(rule) for rule in (r"\toprule", r"\bottomrule")] == [
+        1,
+        1,
+    ]
     body = text[text.index(r"\toprule") : text.index(r"\bottomrule")]
     lines = [line for line in body.splitlines() if line.endswith(r"\\")]
     assert [len(re.findall(r"(?<!\\)&", line)) for line in lines] == [6] * 4
@@ -65,7 +73,9 @@ def test_latex_is_escaped_balanced_and_rectangular(report):
     plain = re.sub(r"(?m)^%.*$|\{%$", "", text)  # without comments
     assert not re.search(r"(?<!\\)[%#_^~]", plain)
     assert plain.isascii()
-    assert text.count("{") - text.count(r"\{") == text.count("}") - text.count(r"\}")
+    assert text.count("{") - text.count(r"\{") == text.count("}") - text.count(
+        r"\}"
+    )
     assert r"Left out: bad\_run: damaged \textless{}x\textgreater{}" in text
 
 

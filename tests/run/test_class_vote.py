@@ -58,7 +58,9 @@ def picture(labels: torch.Tensor) -> Frame:
         BodyPose(torch.zeros(1, 1, 3), torch.zeros(1, 3)),
     )
     labels = labels[None].long()
-    return frame_of(blank, 1 + blank[:, :1], camera=camera(), body=body, labels=labels)
+    return frame_of(
+        blank, 1 + blank[:, :1], camera=camera(), body=body, labels=labels
+    )
 
 
 # --- what is seen ------------------------------------------------------------------------------
@@ -69,7 +71,9 @@ def test_a_plate_hides_what_lies_behind_it_and_nothing_beside_it():
     beside = torch.tensor([[0.7, 0.0, 2.3]])
     close = plate(2.01, half=0.1)  # within the tolerance
     points = torch.cat([front, behind, beside, close])
-    shown = seen(points, neighbour_distance(points, 4), camera(), tolerance=0.03)
+    shown = seen(
+        points, neighbour_distance(points, 4), camera(), tolerance=0.03
+    )
     front_seen, behind_seen, beside_seen, close_seen = shown.split(
         [len(front), len(behind), 1, len(close)]
     )
@@ -86,17 +90,28 @@ def test_a_plate_hides_what_lies_behind_it_and_nothing_beside_it():
         [[0.0, 0.0, 0.0]],
         [[float("nan"), 0.0, 2.0]],
         [[float("inf"), 0.0, 2.0]],
-        [[1e7, 0.0, 2.0]],  # a depth map that reached so far would fill the memory
+        [
+            [1e7, 0.0, 2.0]
+        ],  # a depth map that reached so far would fill the memory
         [[0.3, 0.0, 1e-3]],
     ],
-    ids=["behind", "at the lens", "nan", "inf", "far outside", "grazing the lens"],
+    ids=[
+        "behind",
+        "at the lens",
+        "nan",
+        "inf",
+        "far outside",
+        "grazing the lens",
+    ],
 )
 def test_odd_points_are_not_seen_and_hide_nothing(odd):
     points = torch.cat([plate(2.0), torch.tensor(odd)])
     shown = seen(points, torch.full((len(points),), 0.05), camera(), 0.03)
     assert shown[:-1].all()
     assert not shown[-1]
-    assert not seen(torch.tensor(odd), torch.tensor([0.05]), camera(), 0.03).any()
+    assert not seen(
+        torch.tensor(odd), torch.tensor([0.05]), camera(), 0.03
+    ).any()
 
 
 # --- the vote ----------------------------------------------------------------------------------
@@ -118,7 +133,9 @@ def test_majority_ties_and_the_unseen():
     # the first of equals, where none has won
     assert tied.labels.unique().tolist() == [1, 2]
     right_only = torch.where(left == 2, 2, 255)
-    few = class_vote(body, [picture(left), picture(other), picture(right_only)], 4)
+    few = class_vote(
+        body, [picture(left), picture(other), picture(right_only)], 4
+    )
     # the left is tied throughout: its nearest neighbours decide
     assert (few.labels == 2).all()
 
@@ -156,11 +173,16 @@ def zju(tmp_path_factory):
     )
     body = np.where(x > 0, CIHP.index("coat"), CIHP.index("dress"))
     legs = np.where(y > 0.5, CIHP.index("pants"), CIHP.index("skirt"))
-    parts = np.where(y > 1.45, CIHP.index("hat"), np.where(y > 1.0, body, legs)).astype(
-        np.uint8
+    parts = np.where(
+        y > 1.45, CIHP.index("hat"), np.where(y > 1.0, body, legs)
+    ).astype(np.uint8)
+    labels = [
+        [draw(c, v, parts)[1] for c in subject.cameras]
+        for v in subject.vertices
+    ]
+    write_original(
+        root / "CoreView_377", dataclasses.replace(subject, labels=labels)
     )
-    labels = [[draw(c, v, parts)[1] for c in subject.cameras] for v in subject.vertices]
-    write_original(root / "CoreView_377", dataclasses.replace(subject, labels=labels))
     return root / "CoreView_377", smpl, torch.from_numpy(parts).long()
 
 
@@ -172,7 +194,9 @@ def frames_of(folder, smpl):
     layout = ZjuReader()(folder, Thresholds(), str(smpl))
     items = [(c, f) for c, files in layout.images.items() for f in files]
     betas = () if layout.meta.body is None else layout.meta.body.betas
-    return CaptureDataset(layout, items), open_body("smpl", str(smpl), betas, CIHP)
+    return CaptureDataset(layout, items), open_body(
+        "smpl", str(smpl), betas, CIHP
+    )
 
 
 @pytest.mark.slow
@@ -252,18 +276,25 @@ def test_votes_are_kept_in_the_checkpoint_and_not_held_again(
     loaded, _ = load_avatar(tmp_path, config, data)
     frame = data.dataset("train")[0]
     with torch.no_grad():
-        S, again = (a.segmentation(frame.body, frame.camera) for a in (avatar, loaded))
+        S, again = (
+            a.segmentation(frame.body, frame.camera) for a in (avatar, loaded)
+        )
     assert torch.equal(S, again)
 
 
 @pytest.mark.parametrize(
     ("votes", "words"),
     [
-        (torch.ones(7).long(), "labels of 7 vertices do not fit this free body"),
+        (
+            torch.ones(7).long(),
+            "labels of 7 vertices do not fit this free body",
+        ),
         (None, "no training image with labels"),
     ],
 )
-def test_votes_of_another_body_and_no_votes_are_refused(foreign, tiny, votes, words):
+def test_votes_of_another_body_and_no_votes_are_refused(
+    foreign, tiny, votes, words
+):
     config = tiny(f"data.root={foreign}")
     with pytest.raises(DataError, match=words):
         build_avatar(config, build_data(config).info, vertex_labels=votes)

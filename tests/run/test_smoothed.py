@@ -24,8 +24,12 @@ def test_it_is_off_by_default(compose, drive):
 
 
 @pytest.mark.parametrize("command", ["render", "view"])
-def test_body_poses_follow_the_joints_and_gaps_start_anew(compose, drive, command):
-    found = smoothed(compose(command, "run=x", "smooth.enabled=true"), drive, 30.0)
+def test_body_poses_follow_the_joints_and_gaps_start_anew(
+    compose, drive, command
+):
+    found = smoothed(
+        compose(command, "run=x", "smooth.enabled=true"), drive, 30.0
+    )
     assert found.body is None
     assert found.text == "a motion, smoothed"
     late = np.abs(found.p - drive.p).max(axis=(1, 2))

@@ -4,16 +4,28 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from gsgan.run.stored import CHECKPOINT, CONFIG, RENAMED_KEYS, hydra_record, read_config
+from gsgan.run.stored import (
+    CHECKPOINT,
+    CONFIG,
+    RENAMED_KEYS,
+    hydra_record,
+    read_config,
+)
 from gsgan.train.resume import checkpoint_to_resume
 from gsgan.utils.errors import ConfigError, DataError
 
 
-def test_a_config_of_an_earlier_version_names_classes_where_they_are_now(tmp_path):
+def test_a_config_of_an_earlier_version_names_classes_where_they_are_now(
+    tmp_path,
+):
     path = tmp_path / CONFIG
     path.parent.mkdir()
-    path.write_text("data: {}\nmodel: {_target_: gsgan.model.assemble.AvatarParts}\n")
-    assert read_config(tmp_path).model._target_ == "gsgan.run.assemble.AvatarParts"
+    path.write_text(
+        "data: {}\nmodel: {_target_: gsgan.model.assemble.AvatarParts}\n"
+    )
+    assert (
+        read_config(tmp_path).model._target_ == "gsgan.run.assemble.AvatarParts"
+    )
 
 
 def write_config(folder, text):
@@ -34,7 +46,10 @@ def test_a_config_of_an_earlier_version_has_the_keys_of_now(tmp_path):
         """,
     )
     config = read_config(tmp_path)
-    assert config.data.reader.consistency == {"refused_below": 0.3, "far_camera": 10}
+    assert config.data.reader.consistency == {
+        "refused_below": 0.3,
+        "far_camera": 10,
+    }
     assert config.fit == {"min_mask": 0.2}
     assert config.model == {"window_minimum": 24}
     assert config.training.rollback == {"max_restorations": 5}
@@ -58,10 +73,15 @@ def test_a_run_of_an_earlier_version_is_resumed(tmp_path):
     checkpoint.parent.mkdir()
     state = {"gsgan": {"marks": [], "record": before}, "state_dict": {}}
     torch.save(state, checkpoint)
-    now = {"training": {"rollback": {"max_restorations": 5, "slower": 0.5}}, "seed": 0}
+    now = {
+        "training": {"rollback": {"max_restorations": 5, "slower": 0.5}},
+        "seed": 0,
+    }
     assert checkpoint_to_resume(tmp_path, now, []) == checkpoint
     now["training"]["rollback"]["max_restorations"] = 4
-    with pytest.raises(ConfigError, match=r"\(training.rollback.max_restorations\)"):
+    with pytest.raises(
+        ConfigError, match=r"\(training.rollback.max_restorations\)"
+    ):
         checkpoint_to_resume(tmp_path, now, [])
 
 

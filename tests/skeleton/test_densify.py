@@ -47,32 +47,43 @@ def test_limb_points_lie_on_their_cylinders(sampler):
     p = noisy(0)
     points = densify(sampler=sampler)(p)
     lengths = bone_frames(p).lengths[0]
-    tolerance = 1e-12 if sampler == "even" else 1e-7  # the shipped file is float32
+    tolerance = (
+        1e-12 if sampler == "even" else 1e-7
+    )  # the shipped file is float32
     for limb, (a, b) in enumerate(MEDIAPIPE33.limbs):
         offset = points.means[0, 200 * limb : 200 * (limb + 1)] - p[0, a]
         axis = torch.nn.functional.normalize(p[0, b] - p[0, a], dim=0)
         height = offset @ axis
         radius = (offset - height[:, None] * axis).norm(dim=-1)
         torch.testing.assert_close(
-            radius, (0.1 * lengths[limb]).expand_as(radius), atol=tolerance, rtol=0
+            radius,
+            (0.1 * lengths[limb]).expand_as(radius),
+            atol=tolerance,
+            rtol=0,
         )
         assert height.min() >= 0
         assert height.max() <= lengths[limb]
         # spread over the whole surface
         assert height.mean() / lengths[limb] == pytest.approx(0.5, abs=0.05)
-        mean_radial = (offset - height[:, None] * axis).mean(0).norm() / lengths[limb]
+        mean_radial = (offset - height[:, None] * axis).mean(
+            0
+        ).norm() / lengths[limb]
         assert mean_radial < 0.01
 
 
 @pytest.mark.parametrize("sampler", SAMPLERS)
 def test_face_points_lie_on_the_sphere(sampler):
     p = noisy(1)
-    points = densify(sampler=sampler, face_radius_scale=0.7)(p).means[0, 4400:4900]
+    points = densify(sampler=sampler, face_radius_scale=0.7)(p).means[
+        0, 4400:4900
+    ]
     face = p[0, :11]
     longest = torch.pdist(face).max()
     radius = (points - face.mean(0)).norm(dim=-1)
     expected = 0.7 * (longest.square() + 1e-6).sqrt()
-    torch.testing.assert_close(radius, expected.expand_as(radius), atol=1e-7, rtol=0)
+    torch.testing.assert_close(
+        radius, expected.expand_as(radius), atol=1e-7, rtol=0
+    )
 
 
 @pytest.mark.parametrize("sampler", SAMPLERS)
@@ -187,7 +198,9 @@ def test_unseen_joints_mark_their_points():
     d = densify()
     lost = ~d(noisy(0, batch=4), valid).valid
     parts = [d.part_id[lost[b]].unique().tolist() for b in range(4)]
-    assert parts[0] == [k for k, limb in enumerate(MEDIAPIPE33.limbs) if 15 in limb]
+    assert parts[0] == [
+        k for k, limb in enumerate(MEDIAPIPE33.limbs) if 15 in limb
+    ]
     assert parts[1] == [22]
     assert parts[2] == [0, 2, 23]
     assert parts[3] == []
@@ -247,8 +260,12 @@ def test_even_samplers_return_the_requested_number(n):
 @pytest.mark.slow
 def test_shipped_templates_can_be_made_again():
     pytest.importorskip("trimesh")
-    script = Path(__file__).parents[2] / "scripts" / "make_skeleton_templates.py"
-    spec = importlib.util.spec_from_file_location("make_skeleton_templates", script)
+    script = (
+        Path(__file__).parents[2] / "scripts" / "make_skeleton_templates.py"
+    )
+    spec = importlib.util.spec_from_file_location(
+        "make_skeleton_templates", script
+    )
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     made = module.make_templates()
@@ -267,10 +284,22 @@ def test_shipped_templates_can_be_made_again():
     ("options", "message"),
     [
         ({"torso": "ball"}, "torso must be one of fit, cube, got 'ball'"),
-        ({"sampler": "random"}, "sampler must be one of even, trimesh, got 'random'"),
-        ({"face_points": 0}, "face_points must be a whole number of at least 1, got 0"),
-        ({"radius_ratio": 0.0}, "radius_ratio must be a number above 0, got 0.0"),
-        ({"sampler": "trimesh", "points_per_limb": 64}, "has 200 cylinder points.*64"),
+        (
+            {"sampler": "random"},
+            "sampler must be one of even, trimesh, got 'random'",
+        ),
+        (
+            {"face_points": 0},
+            "face_points must be a whole number of at least 1, got 0",
+        ),
+        (
+            {"radius_ratio": 0.0},
+            "radius_ratio must be a number above 0, got 0.0",
+        ),
+        (
+            {"sampler": "trimesh", "points_per_limb": 64},
+            "has 200 cylinder points.*64",
+        ),
     ],
 )
 def test_unknown_options_are_named(options, message):

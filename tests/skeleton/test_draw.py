@@ -36,7 +36,9 @@ def slow_drawing(p: Tensor, valid: Tensor, cam: Any, sigma: float) -> Tensor:
                     t = (((c - a) @ d) / (d @ d)).clamp(0, 1)
                     d2 = (c - a - t * d).square().sum()
                     value = torch.exp(-d2 / (2 * sigma**2))
-                    image[group, y, x] = torch.maximum(image[group, y, x], value)
+                    image[group, y, x] = torch.maximum(
+                        image[group, y, x], value
+                    )
     return image
 
 
@@ -66,7 +68,9 @@ def test_shape_range_and_groups():
         )
 
 
-@pytest.mark.parametrize(("height", "sigma"), [(512, 2.5), (256, 1.25), (64, 0.8)])
+@pytest.mark.parametrize(
+    ("height", "sigma"), [(512, 2.5), (256, 1.25), (64, 0.8)]
+)
 def test_line_width_scales_with_the_image(height, sigma):
     """A vertical spine-side line: the value k pixels away is exp(-k² / 2 sigma²)."""
     p, cam = rest(), camera((height, height))
@@ -85,7 +89,9 @@ def test_line_width_scales_with_the_image(height, sigma):
 
 def test_far_pixels_are_exact_zeros():
     """No denormals: they would slow every layer that follows."""
-    image = draw_skeleton(rest().float(), None, camera((128, 128)).to(torch.float32))
+    image = draw_skeleton(
+        rest().float(), None, camera((128, 128)).to(torch.float32)
+    )
     tiny = torch.finfo(torch.float32).tiny
     assert (image == 0).double().mean() > 0.5
     assert ((image == 0) | (image > tiny)).all()
@@ -96,17 +102,24 @@ def test_unseen_joints_and_joints_behind_the_camera_are_not_drawn():
     valid = torch.ones(1, 33, dtype=torch.bool)
     valid[0, [13, 15, 19]] = False
     empty = (
-        (draw_skeleton(p, valid, cam)[0].amax((1, 2)) == 0).nonzero().flatten().tolist()
+        (draw_skeleton(p, valid, cam)[0].amax((1, 2)) == 0)
+        .nonzero()
+        .flatten()
+        .tolist()
     )
     assert [GROUPS[g] for g in empty] == ["left_arm", "left_hand"]
 
-    behind = dataclasses.replace(cam, t=cam.t - torch.tensor([0.0, 0.0, 5.0]).to(cam.t))
+    behind = dataclasses.replace(
+        cam, t=cam.t - torch.tensor([0.0, 0.0, 5.0]).to(cam.t)
+    )
     assert (draw_skeleton(p, None, behind) == 0).all()
 
 
 def test_a_limb_through_the_camera_is_not_drawn_and_has_finite_gradients():
     p, cam = rest(), camera((32, 32))
-    p[0, 15] = cam.centre[0] + torch.tensor([0.0, 0.0, 0.2], dtype=torch.float64)
+    p[0, 15] = cam.centre[0] + torch.tensor(
+        [0.0, 0.0, 0.2], dtype=torch.float64
+    )
     p[0, 16] = cam.centre[0]
     p.requires_grad_()
     image = draw_skeleton(p, None, cam)
@@ -140,7 +153,9 @@ def test_coincident_joints_draw_a_dot():
     grid = torch.arange(64, dtype=torch.float64) + 0.5
     y, x = torch.meshgrid(grid, grid, indexing="ij")
     d2 = (x - px[0, 11, 0]).square() + (y - px[0, 11, 1]).square()
-    torch.testing.assert_close(image, torch.exp(-d2 / (2 * 0.8**2)), atol=2e-2, rtol=0)
+    torch.testing.assert_close(
+        image, torch.exp(-d2 / (2 * 0.8**2)), atol=2e-2, rtol=0
+    )
 
 
 def test_gradcheck():

@@ -4,7 +4,14 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from skeleton_poses import DEGENERATE, REST, assert_rotation, noisy, rest, rotation
+from skeleton_poses import (
+    DEGENERATE,
+    REST,
+    assert_rotation,
+    noisy,
+    rest,
+    rotation,
+)
 from torch import Tensor
 
 from gsgan.skeleton import MEDIAPIPE33, bone_frames, omega, rotation_from_6d
@@ -18,7 +25,9 @@ LIMB = {limb: k for k, limb in enumerate(MEDIAPIPE33.limbs)}
 def test_rest_hubs_are_the_body_axes():
     f = bone_frames(rest())
     eye = torch.eye(3, dtype=torch.float64)
-    torch.testing.assert_close(f.hubs[0], eye.expand(3, 3, 3), atol=1e-12, rtol=0)
+    torch.testing.assert_close(
+        f.hubs[0], eye.expand(3, 3, 3), atol=1e-12, rtol=0
+    )
     torch.testing.assert_close(f.torso[0], eye, atol=1e-12, rtol=0)
 
 
@@ -29,8 +38,12 @@ def test_limb_frames_point_along_the_bones():
     bones = p[:, end] - p[:, start]
     directions = torch.tensor(MEDIAPIPE33.rest_directions, dtype=torch.float64)
     pointing = (f.limbs @ directions.unsqueeze(-1)).squeeze(-1)
-    torch.testing.assert_close(pointing, torch.nn.functional.normalize(bones, dim=-1))
-    torch.testing.assert_close(f.lengths, (bones.square().sum(-1) + 1e-6).sqrt())
+    torch.testing.assert_close(
+        pointing, torch.nn.functional.normalize(bones, dim=-1)
+    )
+    torch.testing.assert_close(
+        f.lengths, (bones.square().sum(-1) + 1e-6).sqrt()
+    )
 
 
 def test_local_rotation_is_relative_to_the_parent():
@@ -48,22 +61,30 @@ def test_swing_is_the_shortest_rotation():
     b = (rotation(3) @ a.mT).mT
     v = torch.linalg.cross(a, b)[0]
     K = torch.stack(
-        [torch.linalg.cross(v, e) for e in torch.eye(3, dtype=torch.float64)], dim=-1
+        [torch.linalg.cross(v, e) for e in torch.eye(3, dtype=torch.float64)],
+        dim=-1,
     )
-    expected = torch.eye(3, dtype=torch.float64) + K + K @ K / (1 + (a * b).sum())
+    expected = (
+        torch.eye(3, dtype=torch.float64) + K + K @ K / (1 + (a * b).sum())
+    )
     torch.testing.assert_close(Swing.of(a).to(b.unsqueeze(0))[0, 0], expected)
 
 
 @given(angle=st.floats(-0.05, 0.05), roll=st.floats(0, 6.28))
 def test_swing_near_the_antipode_still_hits_its_target(angle, roll):
     a = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
-    x, y = torch.tensor([roll], dtype=torch.float64).cos(), torch.tensor([roll]).sin()
+    x, y = (
+        torch.tensor([roll], dtype=torch.float64).cos(),
+        torch.tensor([roll]).sin(),
+    )
     s, c = torch.tensor([angle]).sin(), torch.tensor([angle]).cos()
     b = torch.stack([s * x, s * y, -c], dim=-1).to(torch.float64)
     b = torch.nn.functional.normalize(b, dim=-1)
     R = Swing.of(a).to(b.unsqueeze(0))
     assert_rotation(R)
-    torch.testing.assert_close((R @ a.unsqueeze(-1))[0, :, :, 0], b, atol=1e-9, rtol=0)
+    torch.testing.assert_close(
+        (R @ a.unsqueeze(-1))[0, :, :, 0], b, atol=1e-9, rtol=0
+    )
 
 
 def test_only_the_hubs_of_omega_depend_on_rigid_motions():
@@ -95,14 +116,18 @@ def test_omega_layout():
     # a face joint's code takes its rest line from the ears to its line now, in the head's frame
     ears = (p[0, 7] + p[0, 8]) / 2
     now = torch.nn.functional.normalize(p[0, 9] - ears, dim=0)
-    at_rest = torch.nn.functional.normalize(REST[9] - REST[[7, 8]].mean(0), dim=0)
+    at_rest = torch.nn.functional.normalize(
+        REST[9] - REST[[7, 8]].mean(0), dim=0
+    )
     torch.testing.assert_close(f.hubs[0, HEAD] @ code[9] @ at_rest, now)
 
 
 def test_omega_is_identity_without_swing():
     """A pose built from the rest directions: every limb and face code is the identity."""
     p = rest()
-    for (a, b), d in zip(MEDIAPIPE33.limbs, MEDIAPIPE33.rest_directions, strict=True):
+    for (a, b), d in zip(
+        MEDIAPIPE33.limbs, MEDIAPIPE33.rest_directions, strict=True
+    ):
         if (a, b) not in ((17, 19), (18, 20), (29, 31), (30, 32)):
             p[0, b] = p[0, a] + 0.2 * torch.tensor(d, dtype=torch.float64)
     code = rotation_from_6d(omega(p, None, EYE))[0]
@@ -136,7 +161,9 @@ def test_a_line_along_the_spine_is_replaced_by_the_other():
 def test_zero_length_bone_keeps_its_parents_frame():
     f = bone_frames(DEGENERATE["limb of zero length"])
     eye = torch.eye(3, dtype=torch.float64)
-    torch.testing.assert_close(f.local[0, LIMB[(13, 15)]], eye, atol=1e-12, rtol=0)
+    torch.testing.assert_close(
+        f.local[0, LIMB[(13, 15)]], eye, atol=1e-12, rtol=0
+    )
     assert f.lengths[0, LIMB[(13, 15)]] == pytest.approx(1e-3)
 
 
@@ -146,7 +173,13 @@ def test_gradcheck():
 
     def values(p: Tensor) -> tuple[Tensor, ...]:
         f = bone_frames(p)
-        return f.hubs, f.limbs, f.lengths, f.torso, omega(p, None, R_cam, frames=f)
+        return (
+            f.hubs,
+            f.limbs,
+            f.lengths,
+            f.torso,
+            omega(p, None, R_cam, frames=f),
+        )
 
     assert torch.autograd.gradcheck(values, (p,), fast_mode=True)
 
@@ -172,9 +205,15 @@ def test_constants_from_inference_mode_can_be_used_for_training():
     [
         ({"p": torch.zeros(1, 32, 3)}, r"p must .*\[B, 33, 3\].*\[1, 32, 3\]"),
         ({"p": torch.zeros(33, 3)}, r"p must .*\[33, 3\]"),
-        ({"p": torch.zeros(1, 33, 3, dtype=torch.int64)}, r"p must be a float.*int64"),
+        (
+            {"p": torch.zeros(1, 33, 3, dtype=torch.int64)},
+            r"p must be a float.*int64",
+        ),
         ({"valid": torch.ones(1, 33)}, r"valid must be a bool.*float32"),
-        ({"valid": torch.ones(2, 33, dtype=torch.bool)}, r"valid must.*\[2, 33\]"),
+        (
+            {"valid": torch.ones(2, 33, dtype=torch.bool)},
+            r"valid must.*\[2, 33\]",
+        ),
     ],
 )
 def test_misuse_is_named(change, message):

@@ -12,7 +12,9 @@ NAN = float("nan")
 HANDS_FEET_HEAD = [*range(11), *range(17, 23), *range(29, 33)]
 
 
-def lose(p: torch.Tensor, joints: list[int], value: float = NAN) -> torch.Tensor:
+def lose(
+    p: torch.Tensor, joints: list[int], value: float = NAN
+) -> torch.Tensor:
     p = p.clone()
     p[:, joints] = value
     return p
@@ -40,7 +42,9 @@ def test_missing_limbs_have_the_subjects_size():
     trunk = list(MEDIAPIPE33.torso)
     gone = [j for j in range(33) if j not in trunk]
     p = rest() * 1.25
-    q, valid = sanitise(lose(p, gone), body_height=1.25 * MEDIAPIPE33.limb_length_sum)
+    q, valid = sanitise(
+        lose(p, gone), body_height=1.25 * MEDIAPIPE33.limb_length_sum
+    )
     torch.testing.assert_close(q, p, atol=1e-9, rtol=0)
     assert valid[0].nonzero().flatten().tolist() == sorted(trunk)
 
@@ -61,7 +65,9 @@ def test_filled_in_joints_follow_the_bent_limb():
     forearm = torch.nn.functional.normalize(p[0, 15] - p[0, 13], dim=0)
     assert ((q[0, [17, 19, 21]] - q[0, 15]) @ forearm > 0.02).all()
     lengths = (q[0, [17, 19, 21]] - q[0, 15]).norm(dim=-1)
-    torch.testing.assert_close(lengths, (REST[[17, 19, 21]] - REST[15]).norm(dim=-1))
+    torch.testing.assert_close(
+        lengths, (REST[[17, 19, 21]] - REST[15]).norm(dim=-1)
+    )
 
 
 def test_the_face_is_aligned_with_its_seen_joints():
@@ -84,7 +90,9 @@ def test_invisible_joints_are_filled_in():
 
 @given(
     seed=st.integers(0, 1000),
-    lost=st.sets(st.sampled_from([j for j in range(33) if j not in (11, 12, 23)])),
+    lost=st.sets(
+        st.sampled_from([j for j in range(33) if j not in (11, 12, 23)])
+    ),
 )
 def test_filled_in_joints_move_with_the_body(seed, lost):
     p, R = noisy(seed), rotation(seed + 1)
@@ -120,7 +128,8 @@ def test_a_skeleton_without_a_trunk_is_refused():
     p = lose(noisy(0, batch=3), [])
     p[1, [11, 24]] = NAN
     with pytest.raises(
-        ValueError, match=r"in 1 of 3 skeletons .*item 1: left_shoulder, right_hip\)"
+        ValueError,
+        match=r"in 1 of 3 skeletons .*item 1: left_shoulder, right_hip\)",
     ):
         sanitise(p)
 
@@ -155,7 +164,9 @@ def test_limb_length_sum():
     start, end = (list(x) for x in zip(*MEDIAPIPE33.limbs, strict=True))
     expected = (p[:, end] - p[:, start]).norm(dim=-1).sum(-1)
     torch.testing.assert_close(limb_length_sum(p), expected)
-    assert limb_length_sum(rest()).item() == pytest.approx(MEDIAPIPE33.limb_length_sum)
+    assert limb_length_sum(rest()).item() == pytest.approx(
+        MEDIAPIPE33.limb_length_sum
+    )
 
 
 def test_limb_length_sum_accounts_for_missing_limbs():

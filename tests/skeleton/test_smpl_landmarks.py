@@ -46,7 +46,9 @@ def test_joints_alone():
         "ankle": 7,
     }
     for name, joint in (numbers | {"foot_index": 10, "index": 22}).items():
-        np.testing.assert_array_equal(p[NAMES.index(f"left_{name}")], joints[joint])
+        np.testing.assert_array_equal(
+            p[NAMES.index(f"left_{name}")], joints[joint]
+        )
         np.testing.assert_array_equal(
             p[NAMES.index(f"right_{name}")], joints[joint + 1]
         )
@@ -57,7 +59,9 @@ def test_vertices_add_face_heels_and_hands():
     p, conf = to_mediapipe33(joint_positions("smpl"), arrays["v_template"])
     found = confidences(conf)
     assert found[0.0] == {"mouth_left", "mouth_right"}
-    assert found[0.5] == both("eye_inner", "eye_outer", "index", "pinky", "thumb")
+    assert found[0.5] == both(
+        "eye_inner", "eye_outer", "index", "pinky", "thumb"
+    )
     difference = np.linalg.norm(p - free_landmarks(), axis=1)
     same = [NAMES.index(name) for name in found[1.0]]
     # the writer put them on the free body's landmarks
@@ -75,10 +79,15 @@ def test_smplx_has_real_knuckles():
     p, conf = to_mediapipe33(joints, arrays["v_template"], kind="smplx")
     assert confidences(conf)[0.5] == both("eye_inner", "eye_outer")
     difference = np.linalg.norm(p - free_landmarks(), axis=1)
-    assert difference[[NAMES.index(n) for n in confidences(conf)[1.0]]].max() < 0.03
+    assert (
+        difference[[NAMES.index(n) for n in confidences(conf)[1.0]]].max()
+        < 0.03
+    )
     bare, conf = to_mediapipe33(joints, kind="smplx")
     assert confidences(conf)[1.0] == both(*LIMBS, "index", "pinky", "thumb")
-    assert confidences(conf)[0.5] == both("eye", "eye_inner", "eye_outer", "foot_index")
+    assert confidences(conf)[0.5] == both(
+        "eye", "eye_inner", "eye_outer", "foot_index"
+    )
     np.testing.assert_array_equal(bare[NAMES.index("right_pinky")], joints[46])
 
 
@@ -95,8 +104,12 @@ def test_batches_and_points_that_are_not_finite():
 
 def test_missing_landmarks_are_filled_in_later():
     """With joints alone the whole face is unknown; the skeleton still has finite frames."""
-    joints = torch.from_numpy(to_mediapipe33(joint_positions("smpl"))[0]).float()[None]
-    conf = torch.from_numpy(to_mediapipe33(joint_positions("smpl"))[1]).float()[None]
+    joints = torch.from_numpy(
+        to_mediapipe33(joint_positions("smpl"))[0]
+    ).float()[None]
+    conf = torch.from_numpy(to_mediapipe33(joint_positions("smpl"))[1]).float()[
+        None
+    ]
     height = limb_length_sum(joints, conf > 0)
     p, valid = sanitise(joints, conf, MEDIAPIPE33, float(height))
     frames = bone_frames(p, valid, MEDIAPIPE33)
@@ -109,7 +122,8 @@ def test_wrong_shapes_name_the_argument():
     with pytest.raises(ValueError, match="kind"):
         to_mediapipe33(np.zeros((24, 3)), kind="smplh")
     with pytest.raises(
-        ValueError, match=r"joints must have shape \[..., 55, 3\], got \[24, 3\]"
+        ValueError,
+        match=r"joints must have shape \[..., 55, 3\], got \[24, 3\]",
     ):
         to_mediapipe33(np.zeros((24, 3)), kind="smplx")
     with pytest.raises(ValueError, match="vertices"):

@@ -49,8 +49,15 @@ def test_gnn_edges_join_the_components(t):
 
 @every_template
 def test_tables_have_a_row_per_joint(t):
-    assert len(t.names) == len(set(t.names)) == len(t.rest_positions) == len(t.mirror)
-    drawn = {joint for _, group in t.draw_groups for edge in group for joint in edge}
+    assert (
+        len(t.names)
+        == len(set(t.names))
+        == len(t.rest_positions)
+        == len(t.mirror)
+    )
+    drawn = {
+        joint for _, group in t.draw_groups for edge in group for joint in edge
+    }
     assert drawn == set(range(len(t.names)))
 
 
@@ -103,7 +110,9 @@ def test_rest_pose_is_a_person():
 
 def test_rest_directions_are_unit_and_mirrored():
     directions = np.asarray(T.rest_directions)
-    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-12)
+    np.testing.assert_allclose(
+        np.linalg.norm(directions, axis=1), 1, atol=1e-12
+    )
     for (a, b), d in zip(T.limbs, directions, strict=True):
         twin = T.limbs.index((T.mirror[a], T.mirror[b]))
         np.testing.assert_allclose(directions[twin], d * [-1, 1, 1], atol=1e-12)
@@ -111,5 +120,7 @@ def test_rest_directions_are_unit_and_mirrored():
 
 @pytest.mark.parametrize("up", ["", "w", "+z", "-"])
 def test_an_up_axis_has_one_of_six_names(up):
-    with pytest.raises(DataError, match="up must be one of x, y, z, -x, -y, -z, got"):
+    with pytest.raises(
+        DataError, match="up must be one of x, y, z, -x, -y, -z, got"
+    ):
         upright(up)

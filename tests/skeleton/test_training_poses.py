@@ -25,7 +25,9 @@ def poses():
     return training_poses(p)
 
 
-def test_the_training_poses_are_one_deviation_away_and_the_distance_is_linear(poses):
+def test_the_training_poses_are_one_deviation_away_and_the_distance_is_linear(
+    poses,
+):
     steps = torch.tensor([0.0, 0.2, 0.4, 1.0]).double()
     found = poses.distance(moved(WRIST, steps))
     # in one of the two directions
@@ -49,4 +51,8 @@ def test_place_and_turn_of_the_whole_body_and_fingers_do_not_count(poses):
 def test_a_single_training_frame_has_a_distance_too():
     found = training_poses(REST[None])
     assert float(found.distance(REST[None])) == 0
-    assert 0 < float(found.distance(moved(WRIST, torch.tensor([0.3]).double()))) < 100
+    assert (
+        0
+        < float(found.distance(moved(WRIST, torch.tensor([0.3]).double())))
+        < 100
+    )

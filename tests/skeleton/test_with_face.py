@@ -81,18 +81,24 @@ def test_a_face_at_rest_has_the_code_zero_however_the_head_is_turned():
     torch.testing.assert_close(
         code_of(p), torch.zeros(1, 30, 3, dtype=F64), atol=1e-10, rtol=0
     )
-    assert face_code(p[:, :33], bone_frames(p[:, :33]).head, MEDIAPIPE33) is None
+    assert (
+        face_code(p[:, :33], bone_frames(p[:, :33]).head, MEDIAPIPE33) is None
+    )
 
 
 def test_a_lip_that_moves_by_5_mm_changes_the_code_by_1():
     p = head_turned(REST)
     moved = p.clone()
-    moved[:, LIP] -= 0.005 * (p[:, 11] - p[:, 23]) / (p[:, 11] - p[:, 23]).norm()
+    moved[:, LIP] -= (
+        0.005 * (p[:, 11] - p[:, 23]) / (p[:, 11] - p[:, 23]).norm()
+    )
     change = code_of(moved) - code_of(p)
     assert change[0, LIP - 75].norm().item() == pytest.approx(1)
     change[0, LIP - 75] = 0
     assert change.abs().max() < 1e-9
-    own, before = (omega(x, None, torch.eye(3, dtype=F64)[None], T) for x in (moved, p))
+    own, before = (
+        omega(x, None, torch.eye(3, dtype=F64)[None], T) for x in (moved, p)
+    )
     assert (own - before)[0, LIP].norm().item() == pytest.approx(1)
     assert own.shape == (1, 105, 6)
     assert torch.equal(own[:, :75], before[:, :75])
@@ -102,7 +108,9 @@ def test_a_lip_that_moves_by_5_mm_changes_the_code_by_1():
 def test_codes_of_the_other_joints_are_those_without_a_face():
     p, R = head_turned(REST), rotation(4)[None]
     ours = omega(p, None, R, T)
-    assert torch.equal(ours[:, :75], omega(p[:, :75], None, R, MEDIAPIPE33_HANDS))
+    assert torch.equal(
+        ours[:, :75], omega(p[:, :75], None, R, MEDIAPIPE33_HANDS)
+    )
 
 
 @pytest.mark.parametrize(
@@ -114,7 +122,9 @@ def test_a_missing_face_rests_on_the_turned_head(lost):
     p[:, lost] = torch.nan
     q, valid = sanitise(p, None, T)
     assert (~valid[0]).nonzero().flatten().tolist() == sorted(lost)
-    if 0 in lost:  # the head is lost, its face is not: nothing moves what was seen
+    if (
+        0 in lost
+    ):  # the head is lost, its face is not: nothing moves what was seen
         assert torch.equal(q[:, FACE], turned[:, FACE])
         return
     torch.testing.assert_close(q, turned, atol=1e-9, rtol=0)
@@ -137,11 +147,15 @@ def test_a_persons_own_face_rests_in_place_of_the_templates():
     p = torch.cat([REST[:, :75], own[None]], 1)
     local = in_head(p[:, FACE], p, bone_frames(p, None, T).hubs[:, HEAD], T)
     mine = T.with_face([(x, y, z) for x, y, z in local[0].tolist()])
-    torch.testing.assert_close(torch.tensor(mine.rest_positions, dtype=F64)[None], p)
+    torch.testing.assert_close(
+        torch.tensor(mine.rest_positions, dtype=F64)[None], p
+    )
     lost = head_turned(p, 7)
     whole = lost.clone()
     lost[:, FACE] = torch.nan
-    torch.testing.assert_close(sanitise(lost, None, mine)[0], whole, atol=1e-9, rtol=0)
+    torch.testing.assert_close(
+        sanitise(lost, None, mine)[0], whole, atol=1e-9, rtol=0
+    )
 
 
 def test_slopes_are_finite_where_the_head_vanishes():
@@ -155,9 +169,13 @@ def test_slopes_are_finite_where_the_head_vanishes():
 
 def test_skeletons_with_and_without_a_face_drive_each_others_templates():
     for joints, t in ((33, MEDIAPIPE33_HANDS), (33, T), (75, T)):
-        q, seen = complete_skeleton(REST[0, :joints], None, t, t.limb_length_sum)
+        q, seen = complete_skeleton(
+            REST[0, :joints], None, t, t.limb_length_sum
+        )
         whole = len(t.names)
-        torch.testing.assert_close(q, REST[:, :whole].float(), atol=1e-5, rtol=0)
+        torch.testing.assert_close(
+            q, REST[:, :whole].float(), atol=1e-5, rtol=0
+        )
         assert seen[0].tolist() == [1.0] * joints + [0.0] * (whole - joints)
     for template in (MEDIAPIPE33, MEDIAPIPE33_HANDS):
         q, seen = complete_skeleton(REST, None, template, T.limb_length_sum)
@@ -169,7 +187,8 @@ def test_brows_eyes_and_lips_are_drawn_in_channels_of_their_own():
     view = camera((256, 256))
     image = draw_skeleton(REST, None, view, T)
     assert torch.equal(
-        image[:, :18], draw_skeleton(REST[:, :75], None, view, MEDIAPIPE33_HANDS)
+        image[:, :18],
+        draw_skeleton(REST[:, :75], None, view, MEDIAPIPE33_HANDS),
     )
     rows = (image[0, 18:].amax(-1) > 0.6).float()  # brows over eyes over lips
     heights = (rows * torch.arange(256)).sum(-1) / rows.sum(-1)

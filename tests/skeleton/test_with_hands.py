@@ -57,7 +57,9 @@ def test_the_rest_pose_has_hands():
         np.testing.assert_allclose(
             rest[hand][[0, 5, 17, 2]], rest[[wrist, index, pinky, thumb]]
         )
-        tips = np.linalg.norm(rest[hand][[8, 12, 16, 20]] - rest[wrist], axis=-1)
+        tips = np.linalg.norm(
+            rest[hand][[8, 12, 16, 20]] - rest[wrist], axis=-1
+        )
         assert (tips > 0.13).all()
         assert (tips < 0.22).all()
 
@@ -65,7 +67,9 @@ def test_the_rest_pose_has_hands():
 def test_size_is_that_of_the_body_without_hands():
     p = noisy(0)
     assert T.limb_length_sum == MEDIAPIPE33.limb_length_sum
-    torch.testing.assert_close(limb_length_sum(p, None, T), limb_length_sum(p[:, :33]))
+    torch.testing.assert_close(
+        limb_length_sum(p, None, T), limb_length_sum(p[:, :33])
+    )
 
 
 def test_frames_of_the_body_are_the_same_with_and_without_hands():
@@ -94,7 +98,9 @@ def test_a_turned_forearm_turns_the_fingers_frames():
     """What no bone of the 33 landmarks shows: the hand turns about the forearm's axis."""
     p, hand = REST.clone(), HANDS[0]
     axis = torch.nn.functional.normalize(p[0, 15] - p[0, 13], dim=0)
-    K = torch.linalg.cross(axis.expand(3, 3), torch.eye(3, dtype=F64), dim=-1).mT
+    K = torch.linalg.cross(
+        axis.expand(3, 3), torch.eye(3, dtype=F64), dim=-1
+    ).mT
     turn = torch.eye(3, dtype=F64) + K + (1 - 0.0) * (K @ K)  # a quarter
     p[:, hand] = p[:, 15:16] + (p[:, hand] - p[:, 15:16]) @ turn.mT
     index = T.limbs.index((33 + 5, 33 + 6))
@@ -194,6 +200,8 @@ def test_fingers_are_drawn_in_channels_of_their_own():
 
 def test_a_palm_points_out_of_the_left_hand_and_into_the_right():
     """In the rest pose the palms face the thighs: the left one -x, the right one +x."""
-    left, right = (palm_frames(REST[:, hand][:, PALM])[0, :, 2] for hand in HANDS)
+    left, right = (
+        palm_frames(REST[:, hand][:, PALM])[0, :, 2] for hand in HANDS
+    )
     assert left[0] < -0.7
     assert right[0] < -0.7

@@ -11,7 +11,9 @@ from torch import Tensor
 from gsgan.scene import Camera, Gaussians, Raster
 from gsgan.splat import ACCURACY, Accuracy, native, rasterise
 
-needs_native = pytest.mark.skipif(not native.available(), reason=native.why_not())
+needs_native = pytest.mark.skipif(
+    not native.available(), reason=native.why_not()
+)
 # Not gsplat: it draws float32 on CUDA only, these scenes are float64 on the CPU; see test_gsplat.
 BACKENDS = ["reference", "torch", pytest.param("native", marks=needs_native)]
 
@@ -25,7 +27,9 @@ def camera(
 ) -> Camera:
     """At the origin, looking along +z, principal point in the middle of the image."""
     H, W = size
-    K = torch.tensor([[focal, 0, W / 2], [0, focal, H / 2], [0, 0, 1]], dtype=dtype)
+    K = torch.tensor(
+        [[focal, 0, W / 2], [0, focal, H / 2], [0, 0, 1]], dtype=dtype
+    )
     R, t = torch.eye(3, dtype=dtype), torch.zeros(3, dtype=dtype)
     return Camera(
         K.repeat(batch, 1, 1), R.repeat(batch, 1, 1), t.repeat(batch, 1), size
@@ -62,7 +66,9 @@ def one(
 def join(*parts: Gaussians) -> Gaussians:
     """All Gaussians of the parts in one item."""
     names = ("means", "quats", "scales", "opacities", "features")
-    return Gaussians(*(torch.cat([getattr(p, n) for p in parts], dim=1) for n in names))
+    return Gaussians(
+        *(torch.cat([getattr(p, n) for p in parts], dim=1) for n in names)
+    )
 
 
 def with_covariances(gaussians: Gaussians) -> Gaussians:
@@ -91,7 +97,8 @@ def loss(raster: Raster) -> Tensor:
     g = torch.Generator().manual_seed(7)
     outputs = raster.features, raster.alpha
     weights = [
-        torch.randn(x.shape, generator=g, dtype=torch.float64).to(x) for x in outputs
+        torch.randn(x.shape, generator=g, dtype=torch.float64).to(x)
+        for x in outputs
     ]
     return sum((x * w).sum() for x, w in zip(outputs, weights, strict=True))
 
@@ -127,7 +134,9 @@ def naive(
     )
     image = torch.zeros(gaussians.features.shape[-1], H, W, dtype=torch.float64)
     left = torch.ones(H, W, dtype=torch.float64)
-    y, x = torch.meshgrid(torch.arange(H) + 0.5, torch.arange(W) + 0.5, indexing="ij")
+    y, x = torch.meshgrid(
+        torch.arange(H) + 0.5, torch.arange(W) + 0.5, indexing="ij"
+    )
     pixels = torch.stack([x, y], -1).double()
     for i in order:
         p = R @ gaussians.means[0, i] + t
@@ -143,7 +152,9 @@ def naive(
             n = math.hypot(qx, qy, qz) or 1.0
             skew = [[0, -qz, qy], [qz, 0, -qx], [-qy, qx, 0]]
             skew = torch.tensor(skew, dtype=torch.float64) / n
-            M = torch.matrix_exp(angle * skew) @ torch.diag(gaussians.scales[0, i])
+            M = torch.matrix_exp(angle * skew) @ torch.diag(
+                gaussians.scales[0, i]
+            )
             cov3 = M @ M.T
         else:
             cov3 = gaussians.covariances[0, i]
@@ -194,8 +205,15 @@ def turned(cam: Camera, skew: float = 3.0, offset: float = 2.5) -> Camera:
         [[0, -0.1, 0.05], [0.1, 0, 0.2], [-0.05, -0.2, 0]], dtype=cam.K.dtype
     )
     K = cam.K.clone()
-    K[:, 0, 1], K[:, 0, 2], K[:, 1, 1] = skew, K[:, 0, 2] + offset, K[:, 1, 1] * 0.8
+    K[:, 0, 1], K[:, 0, 2], K[:, 1, 1] = (
+        skew,
+        K[:, 0, 2] + offset,
+        K[:, 1, 1] * 0.8,
+    )
     R = torch.matrix_exp(axis).expand_as(cam.R).clone()
     return replace(
-        cam, K=K, R=R, t=cam.t + torch.tensor([0.1, -0.05, 0.3], dtype=cam.t.dtype)
+        cam,
+        K=K,
+        R=R,
+        t=cam.t + torch.tensor([0.1, -0.05, 0.3], dtype=cam.t.dtype),
     )

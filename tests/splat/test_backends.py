@@ -54,8 +54,12 @@ def test_one_gaussian_matches_the_closed_form(backend, settings):
 @every_backend
 def test_two_layers_blend_front_to_back(backend):
     far = one((0, 0, 3.0), scale=(50.0,) * 3, opacity=0.5, features=(0.0, 1.0))
-    near = one((0, 0, 2.0), scale=(50.0,) * 3, opacity=0.25, features=(1.0, 0.0))
-    raster = rasterise(join(far, near), camera((1, 1)), settings=DENSE, backend=backend)
+    near = one(
+        (0, 0, 2.0), scale=(50.0,) * 3, opacity=0.25, features=(1.0, 0.0)
+    )
+    raster = rasterise(
+        join(far, near), camera((1, 1)), settings=DENSE, backend=backend
+    )
     torch.testing.assert_close(
         raster.features.flatten(), torch.tensor([0.25, 0.375]).double()
     )
@@ -66,7 +70,9 @@ def test_two_layers_blend_front_to_back(backend):
 @pytest.mark.parametrize("shape", ["quats", "covariances"])
 def test_equals_naive_loops(backend, shape):
     gaussians, cam = cloud(25), turned(camera((17, 23), focal=18.0))
-    gaussians = with_covariances(gaussians) if shape == "covariances" else gaussians
+    gaussians = (
+        with_covariances(gaussians) if shape == "covariances" else gaussians
+    )
     image, alpha = naive(gaussians, cam)
     raster = rasterise(gaussians, cam, settings=DENSE, backend=backend)
     torch.testing.assert_close(raster.features[0], image, rtol=0, atol=1e-10)
@@ -84,7 +90,9 @@ def test_equals_naive_loops(backend, shape):
 def test_equals_the_reference_with_the_same_settings(
     backend, settings, n, channels, size
 ):
-    assert_like_reference(cloud(n, channels), turned(camera(size)), settings, backend)
+    assert_like_reference(
+        cloud(n, channels), turned(camera(size)), settings, backend
+    )
 
 
 @fast_backend
@@ -111,13 +119,21 @@ def test_float32_is_near_the_reference_in_float64(backend, settings):
 def test_gradient_of_an_opaque_layer_includes_the_layer_behind(backend, dtype):
     # Layers behind alpha = 1 are invisible, but are in the gradient of the opaque layer:
     # d image / d alpha_front = c_front - c_back, exactly.
-    front = one((1 / 30, 1 / 30, 2.0), scale=(0.1,) * 3, opacity=1.0, features=(0.75,))
-    back = one((1 / 30, 1 / 30, 3.0), scale=(50.0,) * 3, opacity=1.0, features=(0.25,))
+    front = one(
+        (1 / 30, 1 / 30, 2.0), scale=(0.1,) * 3, opacity=1.0, features=(0.75,)
+    )
+    back = one(
+        (1 / 30, 1 / 30, 3.0), scale=(50.0,) * 3, opacity=1.0, features=(0.25,)
+    )
     gaussians = leaves(join(front, back).to(dtype))
-    raster = rasterise(gaussians, camera(dtype=dtype), settings=DENSE, backend=backend)
+    raster = rasterise(
+        gaussians, camera(dtype=dtype), settings=DENSE, backend=backend
+    )
     raster.features[0, 0, 12, 16].backward()
     want = torch.tensor([[0.5, 0.0]], dtype=dtype)
-    torch.testing.assert_close(gaussians.opacities.grad, want, rtol=0, atol=1e-6)
+    torch.testing.assert_close(
+        gaussians.opacities.grad, want, rtol=0, atol=1e-6
+    )
     want = torch.tensor([[[1.0], [0.0]]], dtype=dtype)
     torch.testing.assert_close(gaussians.features.grad, want, rtol=0, atol=1e-6)
 
@@ -145,7 +161,10 @@ def test_finer_settings_are_more_accurate(backend):
     want = rasterise(gaussians, cam, settings="exact").features
     errors = [
         float(
-            (rasterise(gaussians, cam, settings=s, backend=backend).features - want)
+            (
+                rasterise(gaussians, cam, settings=s, backend=backend).features
+                - want
+            )
             .abs()
             .max()
         )
@@ -167,9 +186,13 @@ def test_antialias_keeps_the_energy_of_a_small_gaussian(backend):
     sigma = 0.05
     gaussians = one((0.0, 0.0, 2.0), scale=(sigma * 2 / 30,) * 3, opacity=0.5)
     settings = replace(DENSE, antialias=True)
-    raster = rasterise(gaussians, camera((25, 25)), settings=settings, backend=backend)
+    raster = rasterise(
+        gaussians, camera((25, 25)), settings=settings, backend=backend
+    )
     # Sampled at pixel centres, a Gaussian of variance v sums to 1 + 4 exp(-2 pi² v) of its area.
-    sampling = 1 + 4 * math.exp(-2 * math.pi**2 * (sigma**2 + settings.low_pass))
+    sampling = 1 + 4 * math.exp(
+        -2 * math.pi**2 * (sigma**2 + settings.low_pass)
+    )
     want = 0.5 * 2 * math.pi * sigma**2 * sampling
     assert raster.alpha.sum().item() == pytest.approx(want, rel=1e-4)
 
@@ -193,9 +216,9 @@ def test_a_batch_equals_its_items(backend):
             (both.features, single.features),
             (both.alpha, single.alpha),
         ):
-            w = torch.randn(whole.shape, generator=weights, dtype=torch.float64)[
-                i : i + 1
-            ]
+            w = torch.randn(
+                whole.shape, generator=weights, dtype=torch.float64
+            )[i : i + 1]
             total = total + (part * w).sum()
         total.backward()
         for name, grad in gradients(g, c).items():

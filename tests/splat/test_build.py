@@ -57,24 +57,33 @@ def load_afresh(monkeypatch):
         ({"CXX": "/bin/false", "PATH": ""}, "/bin/false"),
         ({"CXX": "", "PATH": "/nowhere"}, "No C++ compiler is found"),
         ({"CXX": "{fake}"}, "no luck"),
-        ({"GSGAN_CACHE": "{fake}"}, "GSGAN_CACHE"),  # no folder: it cannot be written
+        (
+            {"GSGAN_CACHE": "{fake}"},
+            "GSGAN_CACHE",
+        ),  # no folder: it cannot be written
     ],
 )
-def test_what_cannot_be_built_is_one_sentence(tmp_path, load_afresh, environment, word):
+def test_what_cannot_be_built_is_one_sentence(
+    tmp_path, load_afresh, environment, word
+):
     # Answers --version like a compiler, then fails with a message.
     fake = tmp_path / "fake"
     fake.write_text(
         '#!/bin/sh\n[ "$1" = --version ] && exit 0\necho "x.cpp:1: error: no luck" >&2\nexit 1\n'
     )
     fake.chmod(0o755)
-    given = {name: value.format(fake=fake) for name, value in environment.items()}
+    given = {
+        name: value.format(fake=fake) for name, value in environment.items()
+    }
     yes, reason = load_afresh(tmp_path / "cache", **given)
     assert not yes
     assert word in reason
     assert reason[:1].isupper()
     assert reason.endswith(".")
     assert "\n" not in reason
-    assert not [path for path in (tmp_path / "cache").rglob("*") if path.is_file()]
+    assert not [
+        path for path in (tmp_path / "cache").rglob("*") if path.is_file()
+    ]
 
 
 @pytest.fixture(scope="module")

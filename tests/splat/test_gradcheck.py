@@ -13,7 +13,13 @@ from splat_scenes import (
     with_covariances,
 )
 
-from gsgan.splat import ACCURACY, native_project, project, rasterise, sh_to_colour
+from gsgan.splat import (
+    ACCURACY,
+    native_project,
+    project,
+    rasterise,
+    sh_to_colour,
+)
 
 EXACT = ACCURACY["exact"]
 DRAWN = ("means", "factors", "opacities", "depths")
@@ -24,8 +30,12 @@ every_shape = pytest.mark.parametrize("shape", ["quats", "covariances"])
 def scene(shape: str, n: int = 3, batch: int = 1):
     """A few Gaussians, a small camera, and the names of the given tensors."""
     gaussians = cloud(n, 2, scale=0.15, batch=batch)
-    gaussians = with_covariances(gaussians) if shape == "covariances" else gaussians
-    names = [name for name, value in vars(gaussians).items() if value is not None]
+    gaussians = (
+        with_covariances(gaussians) if shape == "covariances" else gaussians
+    )
+    names = [
+        name for name, value in vars(gaussians).items() if value is not None
+    ]
     return (
         gaussians,
         turned(camera((3, 4), focal=4.0, batch=batch), skew=0.7, offset=0.5),
@@ -51,7 +61,9 @@ def pinhole(K, like):
 def test_view_dependent_colours(backend, degree):
     gaussians, cam, _ = scene("quats")
     g = torch.Generator().manual_seed(1)
-    sh = 0.3 * torch.randn(1, 3, (degree + 1) ** 2, 3, generator=g, dtype=torch.float64)
+    sh = 0.3 * torch.randn(
+        1, 3, (degree + 1) ** 2, 3, generator=g, dtype=torch.float64
+    )
 
     def image(sh, means, R, t):
         seen_by = replace(cam, R=R, t=t)
@@ -77,12 +89,17 @@ def test_antialiased_batches(backend, shape):
         return raster.features, raster.alpha
 
     assert checked(
-        image, *(getattr(gaussians, name) for name in names), cam.K, cam.R, cam.t
+        image,
+        *(getattr(gaussians, name) for name in names),
+        cam.K,
+        cam.R,
+        cam.t,
     )
 
 
 @pytest.mark.parametrize(
-    "projection", [project, pytest.param(native_project.project, marks=needs_native)]
+    "projection",
+    [project, pytest.param(native_project.project, marks=needs_native)],
 )
 @every_shape
 @pytest.mark.parametrize("antialias", [False, True])
@@ -100,5 +117,9 @@ def test_projection_alone(projection, shape, antialias):
         return tuple(getattr(projected, name) for name in DRAWN)
 
     assert checked(
-        ellipses, *(getattr(gaussians, name) for name in names), cam.K, cam.R, cam.t
+        ellipses,
+        *(getattr(gaussians, name) for name in names),
+        cam.K,
+        cam.R,
+        cam.t,
     )

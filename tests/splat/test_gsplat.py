@@ -71,20 +71,38 @@ class StandIn:
         covars=None,
     ):
         self.calls.append(
-            SimpleNamespace(**{k: v for k, v in locals().items() if k != "self"})
+            SimpleNamespace(
+                **{k: v for k, v in locals().items() if k != "self"}
+            )
         )
         B, N = opacities.shape
         assert means.shape == (B, N, 3)
         assert viewmats.shape == (B, 1, 4, 4)
         assert Ks.shape == (B, 1, 3, 3)
-        tensors = (means, quats, scales, covars, opacities, colors, viewmats, Ks)
+        tensors = (
+            means,
+            quats,
+            scales,
+            covars,
+            opacities,
+            colors,
+            viewmats,
+            Ks,
+        )
         assert all(x.dtype == torch.float32 for x in tensors if x is not None)
         assert torch.equal(
             viewmats[..., 3, :], torch.tensor([0.0, 0, 0, 1]).expand(B, 1, 4)
         )
-        assert (sh_degree, backgrounds, radius_clip, tile_size) == (None, None, 0.0, 16)
+        assert (sh_degree, backgrounds, radius_clip, tile_size) == (
+            None,
+            None,
+            0.0,
+            16,
+        )
         assert far_plane >= 1e10
-        K = Ks[:, 0].detach() * torch.tensor([[1.0, 0, 1], [0, 1, 1], [0, 0, 1]])
+        K = Ks[:, 0].detach() * torch.tensor(
+            [[1.0, 0, 1], [0, 1, 1], [0, 0, 1]]
+        )
         if covars is not None:
             quats = scales = None
             covars = covars.triu() + covars.triu(1).mT
@@ -98,7 +116,12 @@ class StandIn:
         # Not by rasterise: skew is in the transform, which is no rotation.
         ellipses = project(
             Gaussians(means, quats, scales, opacities, colors, covars),
-            Camera(K, viewmats[:, 0, :3, :3], viewmats[:, 0, :3, 3], (height, width)),
+            Camera(
+                K,
+                viewmats[:, 0, :3, :3],
+                viewmats[:, 0, :3, 3],
+                (height, width),
+            ),
             settings,
         )
         images = reference.composite(ellipses, (height, width), settings)
@@ -128,10 +151,14 @@ def scene(
     gaussians = cloud(30, channels, batch=batch)
     if shape == "covariances":
         gaussians = with_covariances(gaussians)
-        skew = torch.randn(batch, 30, 3, 3, generator=torch.Generator().manual_seed(0))
+        skew = torch.randn(
+            batch, 30, 3, 3, generator=torch.Generator().manual_seed(0)
+        )
         skewed = gaussians.covariances + 1e-3 * (skew - skew.mT).double()
         gaussians = replace(gaussians, covariances=skewed)
-    return gaussians.to(torch.float32), turned(camera(batch=batch)).to(torch.float32)
+    return gaussians.to(torch.float32), turned(camera(batch=batch)).to(
+        torch.float32
+    )
 
 
 def drawn(gaussians, cam, backend, settings=STANDARD):
@@ -163,7 +190,9 @@ def assert_same(got, want, tolerance=2e-5):
 @pytest.mark.parametrize("channels", [1, 5])
 def test_values_and_gradients_are_those_of_the_reference(mock, shape, channels):
     gaussians, cam = scene(shape, channels)
-    assert_same(drawn(gaussians, cam, "gsplat"), drawn(gaussians, cam, "reference"))
+    assert_same(
+        drawn(gaussians, cam, "gsplat"), drawn(gaussians, cam, "reference")
+    )
     assert mock.calls[-1].packed is False
     assert (mock.calls[-1].quats is None) == (shape == "covariances")
 
@@ -185,7 +214,9 @@ def test_a_camera_far_from_the_origin_costs_no_digits(mock):
     offset = torch.tensor([8192.0, -4096.0, 16384.0])
     gaussians = replace(gaussians, means=gaussians.means + offset)
     cam = replace(cam, t=cam.t - cam.R @ offset)
-    assert_same(drawn(gaussians, cam, "gsplat"), drawn(gaussians, cam, "reference"))
+    assert_same(
+        drawn(gaussians, cam, "gsplat"), drawn(gaussians, cam, "reference")
+    )
     assert mock.calls[-1].means.abs().max() < 10
 
 
@@ -194,7 +225,10 @@ def test_unusable_quaternions_are_the_identity_and_length_does_not_matter(mock):
     quats += [(2e18, 1e18, 0.0, 0.0), (1e-15, 0, 0, 1e-15)]
     gaussians = join(*(one(quat=q, scale=(0.1, 0.2, 0.3)) for q in quats))
     gaussians, cam = gaussians.to(torch.float32), scene(batch=1)[1]
-    got, want = drawn(gaussians, cam, "gsplat"), drawn(gaussians, cam, "reference")
+    got, want = (
+        drawn(gaussians, cam, "gsplat"),
+        drawn(gaussians, cam, "reference"),
+    )
     assert error(got[0].features, want[0].features) < 2e-5
     assert mock.calls[-1].quats[0, 0].tolist() == [1, 0, 0, 0]
     assert got[1]["quats"].isfinite().all()
@@ -279,7 +313,9 @@ ninja: build stopped: subcommand failed."""
 class Older(StandIn):
     """gsplat 1.5.2's asserts: no batch dimensions."""
 
-    def rasterization(self, means, quats, scales, opacities, colors, viewmats, Ks, **_):
+    def rasterization(
+        self, means, quats, scales, opacities, colors, viewmats, Ks, **_
+    ):
         N = means.shape[0]
         assert means.shape == (N, 3), means.shape
 
@@ -291,7 +327,12 @@ class Newer(StandIn):
         super().__init__(cap=0.99)
 
     def rasterization(
-        self, *args, with_ut=False, with_eval3d=False, global_z_order=True, **given
+        self,
+        *args,
+        with_ut=False,
+        with_eval3d=False,
+        global_z_order=True,
+        **given,
     ):
         return super().rasterization(*args, **given)
 
@@ -317,7 +358,12 @@ class Newer(StandIn):
             broken(RuntimeError("no kernel image\nfor this device")),
             *("cpu", "float32", [BROKEN, "(RuntimeError: no kernel image)"]),
         ),
-        (broken(AssertionError()), "cpu", "float32", [BROKEN, "(AssertionError)"]),
+        (
+            broken(AssertionError()),
+            "cpu",
+            "float32",
+            [BROKEN, "(AssertionError)"],
+        ),
         (Older(), "cpu", "float32", [BROKEN, "1.5.3 or newer is needed"]),
         (
             broken(RuntimeError(BUILD)),
@@ -327,9 +373,13 @@ class Newer(StandIn):
         ),
     ],
 )
-def test_where_it_cannot_draw_torch_does(monkeypatch, module, device, dtype, messages):
+def test_where_it_cannot_draw_torch_does(
+    monkeypatch, module, device, dtype, messages
+):
     install(monkeypatch, module, device)
-    name, reason = resolve_backend("gsplat", CPU, replace(STANDARD, dtype=dtype))
+    name, reason = resolve_backend(
+        "gsplat", CPU, replace(STANDARD, dtype=dtype)
+    )
     assert name == "torch"
     assert all(message in reason for message in messages)
 
@@ -349,7 +399,9 @@ def unsuited_cases():
 
 
 @pytest.mark.parametrize("message", list(unsuited_cases()))
-def test_unsupported_inputs_use_torch_and_log_once(mock, caplog, monkeypatch, message):
+def test_unsupported_inputs_use_torch_and_log_once(
+    mock, caplog, monkeypatch, message
+):
     monkeypatch.setattr(sys.modules["gsgan.splat.rasterise"], "_logged", set())
     gaussians, cam = unsuited_cases()[message]
     resolve_backend("gsplat", CPU, STANDARD)  # measures the cap
@@ -388,7 +440,9 @@ def test_the_package_draws_the_same_as_torch(shape, antialias):
     cap, problem = gsplat_backend._measured_cap(gaussians.means.device)
     assert cap is not None, problem
     settings = replace(STANDARD, alpha_max=cap, antialias=antialias)
-    assert resolve_backend("auto", gaussians.means.device, settings)[0] == "gsplat"
+    assert (
+        resolve_backend("auto", gaussians.means.device, settings)[0] == "gsplat"
+    )
     got = drawn(gaussians, cam, "gsplat", settings)
     assert_same(got, drawn(gaussians, cam, "torch", settings), tolerance=1e-3)
 
@@ -397,14 +451,18 @@ def test_the_extra_admits_no_version_without_batches():
     import tomllib
     from pathlib import Path
 
-    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
+    project = tomllib.loads(
+        (Path(__file__).parents[2] / "pyproject.toml").read_text()
+    )
     (requirement,) = project["project"]["optional-dependencies"]["gsplat"]
     specifier = (
         importlib.import_module("packaging.requirements")
         .Requirement(requirement)
         .specifier
     )
-    assert [version for version in ("1.5.0", "1.5.2") if version in specifier] == []
+    assert [
+        version for version in ("1.5.0", "1.5.2") if version in specifier
+    ] == []
     assert "1.5.3" in specifier
 
 
@@ -416,6 +474,8 @@ def test_a_newer_version_draws_too(monkeypatch):
     got = gsplat_backend.draw(
         gaussians.to(torch.float32), cam.to(torch.float32), settings
     )[0]
-    want = rasterise(gaussians, cam, settings=settings, backend="torch").features
+    want = rasterise(
+        gaussians, cam, settings=settings, backend="torch"
+    ).features
     assert error(got, want) < 1e-4
     gsplat_backend._measured_cap.cache_clear()

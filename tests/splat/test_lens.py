@@ -26,7 +26,9 @@ def test_as_opencv_has_it(dist):
     bent = distort(x, lens)[0]
     before = np.concatenate([x[0].numpy(), np.ones((len(x[0]), 1))], axis=1)
     zero = np.zeros(3)
-    theirs = cv2.projectPoints(before, zero, zero, np.eye(3), np.array(dist))[0][:, 0]
+    theirs = cv2.projectPoints(before, zero, zero, np.eye(3), np.array(dist))[
+        0
+    ][:, 0]
     assert np.abs(bent[0].numpy() - theirs).max() < 1e-12
 
 
@@ -52,14 +54,18 @@ def test_the_fold_is_where_the_slope_first_vanishes():
 
 def test_the_fold_is_computed_once_for_the_cameras_of_a_lens(monkeypatch):
     found, plain = [], torch.linalg.eigvals
-    monkeypatch.setattr(torch.linalg, "eigvals", lambda x: found.append(x) or plain(x))
+    monkeypatch.setattr(
+        torch.linalg, "eigvals", lambda x: found.append(x) or plain(x)
+    )
     whole = camera(BARREL)
     points = torch.tensor([[[0.1, 0.2, 1.0]]])
     window = Window(((8, 16),), (16, 16), whole.size)
     with torch.inference_mode():
         seen = whole.project(points)[0]
     for other in (window.camera(whole), whole.crop(8, 16, (16, 16))):
-        assert torch.equal(other.project(points)[0], seen - torch.tensor([16.0, 8.0]))
+        assert torch.equal(
+            other.project(points)[0], seen - torch.tensor([16.0, 8.0])
+        )
         bend(points, other.dist, near=0.01)
     assert len(found) == 1
     # a lens that learns is computed every time
@@ -79,9 +85,9 @@ def shows(dist, points: torch.Tensor) -> np.ndarray:
     """Pixels at which OpenCV shows points ``[N, 3]`` in the test camera."""
     K = camera(None).K[0].double().numpy()
     zero = np.zeros(3)
-    return cv2.projectPoints(points.double().numpy(), zero, zero, K, np.array(dist))[0][
-        :, 0
-    ]
+    return cv2.projectPoints(
+        points.double().numpy(), zero, zero, K, np.array(dist)
+    )[0][:, 0]
 
 
 def splats(
@@ -99,21 +105,28 @@ POINTS = torch.tensor(
 def test_points_beyond_the_fold_are_shown_at_its_rim():
     lens = [-0.5, 0.0, 0.0, 0.0, 0.0]  # shown at most at 0.544
     far = torch.tensor(
-        [[[0.9, 0.0, 1.0], [50.0, 0.0, 1.0], [3.0, -4.0, 1.0]]], requires_grad=True
+        [[[0.9, 0.0, 1.0], [50.0, 0.0, 1.0], [3.0, -4.0, 1.0]]],
+        requires_grad=True,
     )
     seen, _ = camera(lens).project(far)
     radius = ((seen - torch.tensor([24.0, 20.0])) / 50).norm(dim=-1)
-    torch.testing.assert_close(radius, torch.full((1, 3), 0.5443), atol=1e-3, rtol=0)
+    torch.testing.assert_close(
+        radius, torch.full((1, 3), 0.5443), atol=1e-3, rtol=0
+    )
     seen.sum().backward()
     assert torch.isfinite(far.grad).all()
 
 
 @pytest.mark.parametrize("backend", ["reference", "torch", "native"])
 @pytest.mark.parametrize("dist", [BARREL, PINCUSHION])
-def test_a_splat_lands_where_the_lens_shows_it_in_the_shape_it_shows(dist, backend):
+def test_a_splat_lands_where_the_lens_shows_it_in_the_shape_it_shows(
+    dist, backend
+):
     """Against many points drawn from the Gaussian, each projected by OpenCV."""
     means = torch.tensor([[[0.3, -0.22, 1.0]]])
-    axes = torch.tensor([[0.05, 0.01, 0.0], [0.0, 0.03, 0.01], [0.0, 0.0, 0.04]])
+    axes = torch.tensor(
+        [[0.05, 0.01, 0.0], [0.0, 0.03, 0.01], [0.0, 0.0, 0.04]]
+    )
     splat = splats(means, (axes @ axes.T)[None, None], torch.ones(1, 1, 1))
     high = accuracy("high")
     alpha = (
@@ -130,23 +143,31 @@ def test_a_splat_lands_where_the_lens_shows_it_in_the_shape_it_shows(dist, backe
     spread = (at - centre).flatten(0, 1)
     shape = (spread * weight.flatten()[:, None]).T @ spread
     generator = torch.Generator().manual_seed(0)
-    drawn = means[0, 0] + torch.randn(20_000, 3, generator=generator) @ (0.2 * axes).T
+    drawn = (
+        means[0, 0]
+        + torch.randn(20_000, 3, generator=generator) @ (0.2 * axes).T
+    )
     theirs = torch.from_numpy(shows(dist, drawn))
-    wanted = torch.cov(theirs.T) / 0.2**2  # small shapes: what the first order is about
+    wanted = (
+        torch.cov(theirs.T) / 0.2**2
+    )  # small shapes: what the first order is about
     assert (
-        float((centre - torch.from_numpy(shows(dist, means[0]))[0]).abs().max()) < 0.05
+        float((centre - torch.from_numpy(shows(dist, means[0]))[0]).abs().max())
+        < 0.05
     )
     wanted += high.low_pass * torch.eye(2)
     torch.testing.assert_close(shape, wanted, rtol=0.03, atol=0.05)
-    pinhole = rasterise(splat, camera(None), settings=high, backend=backend).alpha[0, 0]
+    pinhole = rasterise(
+        splat, camera(None), settings=high, backend=backend
+    ).alpha[0, 0]
     assert float((pinhole - alpha).abs().max()) > 0.05  # the lens did something
 
 
 def test_gradients_through_the_lens_are_right():
     lens = torch.tensor([BARREL], dtype=torch.float64)
-    x = torch.cat([POINTS, torch.tensor([[0.1, 0.1, -1.0], [0.2, 0.1, 0.0]])]).double()[
-        None
-    ]
+    x = torch.cat(
+        [POINTS, torch.tensor([[0.1, 0.1, -1.0], [0.2, 0.1, 0.0]])]
+    ).double()[None]
     x = x.clone().requires_grad_()
 
     def moved(p, d):
@@ -159,7 +180,9 @@ def test_gradients_through_the_lens_are_right():
             lambda p, m=m: bend(p, lens, 0.01)[0][0, m], x
         )
         torch.testing.assert_close(jacobian[0, m], derivative[:, 0, m])
-    assert torch.equal(points[0, 4:], x[0, 4:])  # behind the camera nothing moves
+    assert torch.equal(
+        points[0, 4:], x[0, 4:]
+    )  # behind the camera nothing moves
 
 
 def test_hard_points_stay_finite_and_out_of_the_picture():
@@ -188,6 +211,7 @@ def test_what_lies_beyond_the_fold_is_not_painted():
     means = torch.tensor([[[0.95, 0.0, 1.0]]])
     splat = splats(means, 1e-4 * torch.eye(3)[None, None], torch.ones(1, 1, 1))
     wide = replace(
-        camera([-0.5, 0, 0, 0, 0]), K=camera(None).K * torch.tensor([[0.4], [0.4], [1]])
+        camera([-0.5, 0, 0, 0, 0]),
+        K=camera(None).K * torch.tensor([[0.4], [0.4], [1]]),
     )
     assert float(rasterise(splat, wide).alpha.max()) == 0

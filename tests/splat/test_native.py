@@ -73,9 +73,9 @@ def one(
     ones = torch.ones(1, n, dtype=dtype)
     return Projected(
         means=torch.tensor(mean, dtype=torch.float64).expand(1, n, 2),
-        factors=torch.tensor([1 / sigma, 0, 1 / sigma], dtype=torch.float64).expand(
-            1, n, 3
-        ),
+        factors=torch.tensor(
+            [1 / sigma, 0, 1 / sigma], dtype=torch.float64
+        ).expand(1, n, 3),
         opacities=opacity * ones,
         features=ones.unsqueeze(-1),
         depths=ones.double(),
@@ -85,7 +85,9 @@ def one(
 
 
 def with_leaves(p: Projected) -> tuple[list[Tensor], Projected]:
-    leaves = [getattr(p, name).detach().clone().requires_grad_() for name in LEAVES]
+    leaves = [
+        getattr(p, name).detach().clone().requires_grad_() for name in LEAVES
+    ]
     return leaves, replace(p, **dict(zip(LEAVES, leaves, strict=True)))
 
 
@@ -107,7 +109,9 @@ def test_accuracy_of_the_exponential(dtype):
 
 def test_cap_stops_value_and_gradient():
     leaves, q = with_leaves(one((0.5, 0.5), 1.0, 3.0))
-    features, alpha, *_ = native.composite(q, (1, 1), replace(EXACT, alpha_max=0.9))
+    features, alpha, *_ = native.composite(
+        q, (1, 1), replace(EXACT, alpha_max=0.9)
+    )
     assert features.item() == pytest.approx(0.9)
     assert alpha.item() == pytest.approx(0.9)
     gradients = torch.autograd.grad(features.sum() + alpha.sum(), leaves[:4])
@@ -120,7 +124,9 @@ def test_stop_is_by_incoming_transmittance():
     p = one((0.5, 0.5), 0.5, 3.0, n=9)
     for bound, want in ((0.25, 0.875), (0.26, 0.75)):
         leaves, q = with_leaves(p)
-        alpha = native.composite(q, (1, 1), replace(EXACT, transmittance_min=bound))[1]
+        alpha = native.composite(
+            q, (1, 1), replace(EXACT, transmittance_min=bound)
+        )[1]
         assert alpha.item() == want
         (g,) = torch.autograd.grad(alpha.sum(), leaves[2])
         assert (g[0] != 0).sum() == (3 if bound == 0.25 else 2)
@@ -136,14 +142,18 @@ def test_bits_of_projection_and_image_do_not_depend_on_threads(dtype):
         image, gradients = draw(gaussians, view, settings, "native")
         results.append([image.features, image.alpha, *gradients.values()])
     for other in results[1:]:
-        assert all(torch.equal(x, y) for x, y in zip(results[0], other, strict=True))
+        assert all(
+            torch.equal(x, y) for x, y in zip(results[0], other, strict=True)
+        )
 
 
 def test_memory_budget_of_the_backward_changes_no_bit(monkeypatch):
     leaves, q = with_leaves(scene(B=2, N=50, size=(64, 80), sigmas=(2.0, 20.0)))
     images = [x for x in native.composite(q, (64, 80), EXACT) if x is not None]
     g = torch.Generator().manual_seed(1)
-    loss = sum((x * torch.randn(x.shape, generator=g).double()).sum() for x in images)
+    loss = sum(
+        (x * torch.randn(x.shape, generator=g).double()).sum() for x in images
+    )
     whole = torch.autograd.grad(loss, leaves, retain_graph=True)
     for budget in (0, 20_000):
         monkeypatch.setattr(native, "SLOT_BYTES", budget)
@@ -172,8 +182,12 @@ def test_strided_inputs_and_gradients():
     leaves, q = with_leaves(strided)
     features = native.composite(q, (21, 35), EXACT)[0]
     assert torch.equal(features, native.composite(p, (21, 35), EXACT)[0])
-    (strange,) = torch.autograd.grad(features.sum(), leaves[3], retain_graph=True)
-    (plain,) = torch.autograd.grad(features, leaves[3], torch.ones_like(features))
+    (strange,) = torch.autograd.grad(
+        features.sum(), leaves[3], retain_graph=True
+    )
+    (plain,) = torch.autograd.grad(
+        features, leaves[3], torch.ones_like(features)
+    )
     assert torch.equal(strange, plain)
 
 
@@ -182,7 +196,9 @@ def test_values_that_are_not_finite_are_refused(name):
     p = scene(B=2, N=5)
     value = getattr(p, name).clone()
     value[1, 3] = float("nan")
-    p = replace(p, **{name: value, "visible": torch.ones(2, 5, dtype=torch.bool)})
+    p = replace(
+        p, **{name: value, "visible": torch.ones(2, 5, dtype=torch.bool)}
+    )
     with pytest.raises(ValueError, match="Gaussian 3 of batch item 1"):
         native.composite(p, (21, 35), HIGH)
     hidden = replace(p, visible=torch.tensor([[True] * 5, [False] * 5]))

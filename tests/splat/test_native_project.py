@@ -5,11 +5,26 @@ from dataclasses import replace
 
 import pytest
 import torch
-from splat_scenes import camera, cloud, join, leaves, one, turned, with_covariances
+from splat_scenes import (
+    camera,
+    cloud,
+    join,
+    leaves,
+    one,
+    turned,
+    with_covariances,
+)
 
 from gsgan.body import compiled
 from gsgan.scene import Camera, Gaussians
-from gsgan.splat import ACCURACY, Accuracy, build, native, native_project, project
+from gsgan.splat import (
+    ACCURACY,
+    Accuracy,
+    build,
+    native,
+    native_project,
+    project,
+)
 from gsgan.splat.project import Projected
 
 pytestmark = pytest.mark.skipif(
@@ -17,7 +32,10 @@ pytestmark = pytest.mark.skipif(
 )
 
 DRAWN = ("means", "factors", "opacities", "depths")
-WIDE = {name: replace(setting, dtype="float64") for name, setting in ACCURACY.items()}
+WIDE = {
+    name: replace(setting, dtype="float64")
+    for name, setting in ACCURACY.items()
+}
 
 
 def scene(shape: str) -> tuple[Gaussians, Camera]:
@@ -25,11 +43,19 @@ def scene(shape: str) -> tuple[Gaussians, Camera]:
     odd = [
         one((0.0, 0.0, -2.0)),
         one((9.0, 0.1, 2.0), scale=(0.1, 2.0, 0.5), quat=(0.3, 0.1, 0.9, -0.2)),
-        one((-9.0, -7.0, 2.0), scale=(3.0, 0.2, 4.0), quat=(0.3, -0.1, 0.9, 0.2)),
+        one(
+            (-9.0, -7.0, 2.0), scale=(3.0, 0.2, 4.0), quat=(0.3, -0.1, 0.9, 0.2)
+        ),
         one((0.1, 9.0, 2.0), scale=(0.1, 0.2, 9.0)),
         one((0.0, 0.0, 2.0), quat=(0.0, 0.0, 0.0, 0.0), scale=(0.1, 0.2, 0.3)),
-        one((0.1, 0.2, 2.0), quat=(1e-15, 3e-15, 0.0, 1e-15), scale=(0.1, 0.2, 0.3)),
-        one((0.1, 0.2, 2.0), quat=(0.9, 0.1, 0.2, 0.3), scale=(20.0, 2e-3, 2e-3)),
+        one(
+            (0.1, 0.2, 2.0),
+            quat=(1e-15, 3e-15, 0.0, 1e-15),
+            scale=(0.1, 0.2, 0.3),
+        ),
+        one(
+            (0.1, 0.2, 2.0), quat=(0.9, 0.1, 0.2, 0.3), scale=(20.0, 2e-3, 2e-3)
+        ),
         one((0.1, 0.2, 2.0), opacity=0.0),
     ]
     gaussians = join(*odd, cloud(300, 1))
@@ -45,7 +71,9 @@ def scene(shape: str) -> tuple[Gaussians, Camera]:
             ).double()
         )
         # Not symmetric, and some not positive definite: a caller may pass these.
-        gaussians = replace(gaussians, covariances=gaussians.covariances + 0.1 * skew)
+        gaussians = replace(
+            gaussians, covariances=gaussians.covariances + 0.1 * skew
+        )
     return gaussians, turned(camera(batch=2))
 
 
@@ -63,7 +91,9 @@ def with_gradients(run, gaussians: Gaussians, cam: Camera, settings: Accuracy):
     total.backward()
     tensors = {**vars(gaussians), **vars(cam)}
     return p, {
-        k: v.grad for k, v in tensors.items() if torch.is_tensor(v) and k != "features"
+        k: v.grad
+        for k, v in tensors.items()
+        if torch.is_tensor(v) and k != "features"
     }
 
 
@@ -72,12 +102,17 @@ def with_gradients(run, gaussians: Gaussians, cam: Camera, settings: Accuracy):
 @pytest.mark.parametrize("shape", ["quats", "covariances"])
 def test_equals_the_portable_projection(name, antialias, shape):
     settings = replace(WIDE[name], antialias=antialias)
-    got, got_grads = with_gradients(native_project.project, *scene(shape), settings)
+    got, got_grads = with_gradients(
+        native_project.project, *scene(shape), settings
+    )
     want, want_grads = with_gradients(project, *scene(shape), settings)
     assert torch.equal(got.visible, want.visible)
     assert 100 < got.visible.sum() < got.visible.numel()
     for field in (*DRAWN, "extents"):
-        a, b = getattr(got, field)[got.visible], getattr(want, field)[want.visible]
+        a, b = (
+            getattr(got, field)[got.visible],
+            getattr(want, field)[want.visible],
+        )
         torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-12, msg=field)
     for field, grad in want_grads.items():
         off = (got_grads[field] - grad).abs().max() / grad.abs().max()
@@ -93,7 +128,9 @@ def test_float32_is_rounded_once():
     assert torch.equal(got.means[got.visible], wide.means[got.visible])
     assert torch.equal(got.factors[got.visible], wide.factors[got.visible])
     assert torch.equal(got.opacities, wide.opacities.float())
-    assert torch.equal(got.depths, wide.depths)  # float32 would make close ones equal
+    assert torch.equal(
+        got.depths, wide.depths
+    )  # float32 would make close ones equal
     assert got.extents.dtype == torch.float32
 
 

@@ -10,7 +10,9 @@ from splat_scenes import camera, cloud, one
 from gsgan.splat import ACCURACY, project
 from gsgan.splat.project import rotations
 
-EXACT, HIGH, STANDARD = (ACCURACY[name] for name in ("exact", "high", "standard"))
+EXACT, HIGH, STANDARD = (
+    ACCURACY[name] for name in ("exact", "high", "standard")
+)
 
 
 def covariance(projected):
@@ -23,7 +25,9 @@ def covariance(projected):
 def test_mean_and_covariance_of_a_gaussian_on_the_axis():
     gaussians = one((0.0, 0.0, 2.0), scale=(0.1, 0.2, 0.3))
     p = project(gaussians, camera((24, 32), focal=30.0), EXACT)
-    torch.testing.assert_close(p.means[0, 0], torch.tensor([16.0, 12.0]).double())
+    torch.testing.assert_close(
+        p.means[0, 0], torch.tensor([16.0, 12.0]).double()
+    )
     want = torch.diag(torch.tensor([1.5**2 + 0.3, 3.0**2 + 0.3])).double()
     torch.testing.assert_close(covariance(p)[0, 0], want)
     assert p.depths.item() == 2.0
@@ -66,11 +70,15 @@ def test_singular_covariances_are_drawn():
 
 
 def test_opacity_aware_extent_is_the_box_of_the_ellipse():
-    gaussians = one(scale=(0.1, 0.2, 0.3), quat=(0.9, 0.1, 0.2, 0.3), opacity=0.7)
+    gaussians = one(
+        scale=(0.1, 0.2, 0.3), quat=(0.9, 0.1, 0.2, 0.3), opacity=0.7
+    )
     p = project(gaussians, camera((200, 200)), STANDARD)
     level = 2 * math.log(0.7 * 255)
     want = (level * covariance(p)[0, 0].diagonal()).sqrt()
-    torch.testing.assert_close(p.extents[0, 0].double(), want, rtol=3e-3, atol=0)
+    torch.testing.assert_close(
+        p.extents[0, 0].double(), want, rtol=3e-3, atol=0
+    )
     # rounded up: it may not lose a pixel
     assert (p.extents[0, 0].double() >= want).all()
 
@@ -104,13 +112,18 @@ def test_an_opacity_below_alpha_min_has_no_extent(opacity, visible):
 )
 def test_visible_where_the_footprint_overlaps_the_image(x, visible):
     # Half the image is 16 px at 15 px/m: 1.067 m; the footprint of 0.1 m reaches 5.1 px.
-    assert project(one((x, 0.0, 2.0)), camera(), STANDARD).visible.item() is visible
+    assert (
+        project(one((x, 0.0, 2.0)), camera(), STANDARD).visible.item()
+        is visible
+    )
 
 
 def test_extents_and_visibility_have_no_gradient():
     gaussians = cloud(5)
     p = project(
-        replace(gaussians, means=gaussians.means.requires_grad_()), camera(), HIGH
+        replace(gaussians, means=gaussians.means.requires_grad_()),
+        camera(),
+        HIGH,
     )
     assert p.means.requires_grad
     assert not p.extents.requires_grad

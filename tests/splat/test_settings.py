@@ -71,7 +71,9 @@ def test_exact_uses_the_reference_unless_a_backend_is_requested():
 
 
 def test_cuda_does_not_use_native():
-    name, reason = resolve_backend("native", torch.device("cuda"), ACCURACY["high"])
+    name, reason = resolve_backend(
+        "native", torch.device("cuda"), ACCURACY["high"]
+    )
     assert name == "torch"
     assert "CPU only" in reason
 
@@ -106,7 +108,10 @@ def test_output_has_the_dtype_of_the_input(name, dtype):
 
 
 def test_exact_computes_float32_inputs_in_float64():
-    gaussians, cam = cloud(200, dtype=torch.float32), camera(dtype=torch.float32)
+    gaussians, cam = (
+        cloud(200, dtype=torch.float32),
+        camera(dtype=torch.float32),
+    )
     got = rasterise(gaussians, cam, settings="exact").features
     want = rasterise(
         gaussians.to(torch.float64), cam.to(torch.float64), settings="exact"

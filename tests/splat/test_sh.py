@@ -71,14 +71,19 @@ def test_colours_are_not_clamped_and_the_length_of_a_direction_does_not_matter()
     sh[..., 2, :] = -2.0
     up = torch.tensor([[[0.0, 0, 1]]])
     torch.testing.assert_close(
-        sh_to_colour(sh, 7 * up), torch.full((1, 1, 3), 0.5 - 2 * 0.4886025119029199)
+        sh_to_colour(sh, 7 * up),
+        torch.full((1, 1, 3), 0.5 - 2 * 0.4886025119029199),
     )
 
 
 def test_gradients_and_a_zero_direction():
     g = torch.Generator().manual_seed(0)
-    sh = torch.randn(1, 3, 16, 3, generator=g, dtype=torch.float64, requires_grad=True)
-    d = torch.randn(1, 3, 3, generator=g, dtype=torch.float64, requires_grad=True)
+    sh = torch.randn(
+        1, 3, 16, 3, generator=g, dtype=torch.float64, requires_grad=True
+    )
+    d = torch.randn(
+        1, 3, 3, generator=g, dtype=torch.float64, requires_grad=True
+    )
     assert torch.autograd.gradcheck(sh_to_colour, (sh, d))
     zero = torch.zeros(1, 3, 3, dtype=torch.float64, requires_grad=True)
     sh_to_colour(sh, zero).sum().backward()
@@ -87,7 +92,8 @@ def test_gradients_and_a_zero_direction():
 
 def test_wrong_shapes_and_degrees_are_refused():
     with pytest.raises(
-        ValueError, match=r"sh must have shape \[B, N, \(d\+1\)², 3\].*\[1, 2, 5, 3"
+        ValueError,
+        match=r"sh must have shape \[B, N, \(d\+1\)², 3\].*\[1, 2, 5, 3",
     ):
         sh_to_colour(torch.zeros(1, 2, 5, 3), torch.zeros(1, 2, 3))
     with pytest.raises(ValueError, match="0 to 3"):

@@ -24,7 +24,9 @@ def test_it_is_the_mean_of_the_larger_image(backend, name):
     for image in ("features", "alpha"):
         mean = avg_pool2d(getattr(larger, image), 3)
         assert mean.shape[-2:] == (7, 10)
-        torch.testing.assert_close(getattr(found, image), mean, rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(
+            getattr(found, image), mean, rtol=1e-12, atol=1e-12
+        )
     assert torch.equal(found.fine, larger.features)
     assert larger.fine is None
 
@@ -42,7 +44,10 @@ def test_more_samples_approach_the_integral_over_a_pixel(backend):
     for fine in (1, 2, 4, 8):
         settings = replace(HIGH, low_pass=1 / 12, supersample=fine)
         drawn = rasterise(
-            scene, camera((8, 10), focal=12.0), settings=settings, backend=backend
+            scene,
+            camera((8, 10), focal=12.0),
+            settings=settings,
+            backend=backend,
         )
         errors.append(float((drawn.features - truth).square().mean().sqrt()))
     assert errors == sorted(errors, reverse=True)
@@ -56,7 +61,9 @@ def test_gradients_match_the_mean(backend):
     scene, cam = cloud(4, 2), camera((4, 5), focal=6.0)
 
     def draw(means, opacities, features, focal):
-        changed = replace(scene, means=means, opacities=opacities, features=features)
+        changed = replace(
+            scene, means=means, opacities=opacities, features=features
+        )
         K = cam.K + torch.diag(torch.cat([focal, focal.new_zeros(1)]))
         raster = rasterise(
             changed, replace(cam, K=K), settings=settings, backend=backend
@@ -69,4 +76,6 @@ def test_gradients_match_the_mean(backend):
         scene.features,
         torch.zeros(2, dtype=torch.float64),
     )
-    assert torch.autograd.gradcheck(draw, [x.clone().requires_grad_() for x in inputs])
+    assert torch.autograd.gradcheck(
+        draw, [x.clone().requires_grad_() for x in inputs]
+    )

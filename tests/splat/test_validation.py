@@ -12,7 +12,9 @@ from gsgan.splat import rasterise
 
 def spoilt(field, value, index=(0, 2)):
     """A cloud with one entry replaced."""
-    gaussians = with_covariances(cloud(5)) if field == "covariances" else cloud(5)
+    gaussians = (
+        with_covariances(cloud(5)) if field == "covariances" else cloud(5)
+    )
     tensor = getattr(gaussians, field).clone()
     tensor[index] = value
     return replace(gaussians, **{field: tensor})
@@ -34,7 +36,8 @@ def spoilt(field, value, index=(0, 2)):
 def test_invalid_gaussians_are_refused(field, value, expected):
     gaussians = spoilt(field, value)
     with pytest.raises(
-        ValueError, match=rf"Gaussians.{field} must be {expected} at item 0, Gauss"
+        ValueError,
+        match=rf"Gaussians.{field} must be {expected} at item 0, Gauss",
     ):
         rasterise(gaussians, camera())
 
@@ -48,7 +51,9 @@ def test_opposite_infinities_do_not_hide_each_other():
 
 def test_large_but_finite_numbers_pass():
     gaussians = cloud(5, dtype=torch.float32)
-    gaussians = replace(gaussians, features=torch.full_like(gaussians.features, 3e38))
+    gaussians = replace(
+        gaussians, features=torch.full_like(gaussians.features, 3e38)
+    )
     raster = rasterise(gaussians, camera(dtype=torch.float32))
     assert torch.isfinite(raster.alpha).all()
     assert float(raster.features.max()) > 0
@@ -56,7 +61,9 @@ def test_large_but_finite_numbers_pass():
 
 def test_unused_tensors_may_have_any_values():
     gaussians = with_covariances(cloud(5))
-    unused = replace(gaussians, quats=torch.full((1, 5, 4), float("nan")).double())
+    unused = replace(
+        gaussians, quats=torch.full((1, 5, 4), float("nan")).double()
+    )
     want = rasterise(gaussians, camera())
     assert torch.equal(rasterise(unused, camera()).features, want.features)
 
@@ -64,8 +71,16 @@ def test_unused_tensors_may_have_any_values():
 @pytest.mark.parametrize(
     ("field", "shape", "message"),
     [
-        ("means", (1, 5, 2), r"means must have shape \[B, N, 3\], got \[1, 5, 2\]"),
-        ("quats", (2, 5, 4), r"quats must have shape \[1, 5, 4\], got \[2, 5, 4\]"),
+        (
+            "means",
+            (1, 5, 2),
+            r"means must have shape \[B, N, 3\], got \[1, 5, 2\]",
+        ),
+        (
+            "quats",
+            (2, 5, 4),
+            r"quats must have shape \[1, 5, 4\], got \[2, 5, 4\]",
+        ),
         ("scales", (1, 5), r"scales must have shape \[1, 5, 3\], got \[1, 5\]"),
         (
             "opacities",
@@ -77,16 +92,28 @@ def test_unused_tensors_may_have_any_values():
             (1, 4, 3),
             r"features must have shape \[1, 5, C\], got \[1, 4, 3\]",
         ),
-        ("features", (1, 5, 0), r"features must have at least one channel, got 0"),
+        (
+            "features",
+            (1, 5, 0),
+            r"features must have at least one channel, got 0",
+        ),
         (
             "covariances",
             (1, 5, 6),
             r"covariances must have shape \[1, 5, 3, 3\], got \[1, 5, 6\]",
         ),
-        ("K", (1, 4, 4), r"Camera: K must have shape \[B, 3, 3\], got \[1, 4, 4\]"),
+        (
+            "K",
+            (1, 4, 4),
+            r"Camera: K must have shape \[B, 3, 3\], got \[1, 4, 4\]",
+        ),
         ("R", (1, 4), r"Camera: R must have shape \[B, 3, 3\], got \[1, 4\]"),
         ("dist", (1, 4), "dist must have shape"),
-        ("t", (1, 3, 1), r"Camera: t must have shape \[B, 3\], got \[1, 3, 1\]"),
+        (
+            "t",
+            (1, 3, 1),
+            r"Camera: t must have shape \[B, 3\], got \[1, 3, 1\]",
+        ),
         (
             "t",
             (2, 3),
@@ -109,7 +136,9 @@ def test_images_without_pixels_are_refused(size):
 
 
 def test_quats_without_scales_are_refused():
-    with pytest.raises(ValueError, match="give quats and scales, or covariances"):
+    with pytest.raises(
+        ValueError, match="give quats and scales, or covariances"
+    ):
         replace(cloud(5), scales=None)
 
 
@@ -126,7 +155,9 @@ def test_mixed_devices_and_dtypes_are_refused(field, to, what):
     owner = "Camera" if field in "KRt" else "Gaussians"
     moved = getattr(records[owner], field).to(to)
     records[owner] = replace(records[owner], **{field: moved})
-    with pytest.raises(ValueError, match=f"{owner}.{field} must have the {what}"):
+    with pytest.raises(
+        ValueError, match=f"{owner}.{field} must have the {what}"
+    ):
         rasterise(*records.values())
 
 
@@ -170,9 +201,18 @@ def cam_with(**changes):
             cam_with(R=((0, 0, 0), -1.0)),
             r"Camera.R of item 0 must be a rotation: it mirrors",
         ),
-        (cam_with(R=((0, 0, 1), 0.1)), r"Camera.R of item 0 must be a rotation"),
-        (cam_with(t=((0, 0), float("nan"))), r"Camera.t of item 0 must be finite"),
-        (camera(batch=2), r"camera must have the batch size of gaussians, 1, got 2"),
+        (
+            cam_with(R=((0, 0, 1), 0.1)),
+            r"Camera.R of item 0 must be a rotation",
+        ),
+        (
+            cam_with(t=((0, 0), float("nan"))),
+            r"Camera.t of item 0 must be finite",
+        ),
+        (
+            camera(batch=2),
+            r"camera must have the batch size of gaussians, 1, got 2",
+        ),
         (
             camera(dtype=torch.float32),
             r"Camera.K must have the dtype of Gaussians.means",

@@ -3,7 +3,12 @@
 import pytest
 import torch
 
-from stability.cases.case import REFUSED, STATUSES, all_cases, assert_as_expected
+from stability.cases.case import (
+    REFUSED,
+    STATUSES,
+    all_cases,
+    assert_as_expected,
+)
 
 CASES = all_cases()
 DRAWN = [case for case in CASES if case.subject in ("Gaussians", "scenes")]
@@ -27,7 +32,9 @@ def test_every_case_has_a_name_of_its_own_and_a_known_status():
     assert all(case.expect in STATUSES for case in CASES)
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.subject}: {case.name}")
+@pytest.mark.parametrize(
+    "case", CASES, ids=lambda case: f"{case.subject}: {case.name}"
+)
 def test_float32(case):
     for backend in case.backends():
         assert_as_expected(case, backend)

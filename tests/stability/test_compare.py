@@ -85,9 +85,23 @@ def warning(inputs, factor=1.0):
             "x",
             "",
         ),
-        (refusing, "refused", math.nan, math.nan, "", "Message: x must be nicer"),
+        (
+            refusing,
+            "refused",
+            math.nan,
+            math.nan,
+            "",
+            "Message: x must be nicer",
+        ),
         (warning, "warned", 0, 0, None, "Message: x is odd"),
-        (lambda i: warning(i, 1.1), "finite only", 0.1, 0.1, "x", "Message: x is odd"),
+        (
+            lambda i: warning(i, 1.1),
+            "finite only",
+            0.1,
+            0.1,
+            "x",
+            "Message: x is odd",
+        ),
     ],
 )
 def test_status_errors_worst_input_and_message(
@@ -95,9 +109,13 @@ def test_status_errors_worst_input_and_message(
 ):
     row = compared(run)
     assert row.status == status
-    assert row.value_error == pytest.approx(values, rel=1e-5, abs=1e-6, nan_ok=True)
+    assert row.value_error == pytest.approx(
+        values, rel=1e-5, abs=1e-6, nan_ok=True
+    )
     if not math.isnan(gradients):
-        assert row.gradient_error == pytest.approx(gradients, rel=1e-5, abs=1e-6)
+        assert row.gradient_error == pytest.approx(
+            gradients, rel=1e-5, abs=1e-6
+        )
     assert worst is None or row.worst_input == worst
     assert row.note == note
 

@@ -23,7 +23,9 @@ def test_half_precision_normalises_what_its_squares_cannot_hold(size):
 @pytest.mark.parametrize("half", HALVES)
 def test_geometry_and_rasteriser_stay_in_float32_under_autocast(build, half):
     """F, alpha, S and Ĝ bit for bit; the image to the type's own rounding."""
-    _, avatar, frame = build("size.rgb_skip=false")  # else the image starts as F itself
+    _, avatar, frame = build(
+        "size.rgb_skip=false"
+    )  # else the image starts as F itself
     with torch.no_grad():
         plain = avatar(*frame.inputs)
         with torch.autocast("cpu", dtype=half):
@@ -34,5 +36,7 @@ def test_geometry_and_rasteriser_stay_in_float32_under_autocast(build, half):
     assert torch.equal(mixed.gaussians.covariances, plain.gaussians.covariances)
     assert mixed.image.dtype == torch.float32
     # of the largest value an untrained network paints, which is beyond what an image holds
-    limit = (0.08 if half == torch.bfloat16 else 0.02) * float(plain.image.abs().max())
+    limit = (0.08 if half == torch.bfloat16 else 0.02) * float(
+        plain.image.abs().max()
+    )
     assert float((mixed.image - plain.image).abs().max()) < limit

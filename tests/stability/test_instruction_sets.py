@@ -33,6 +33,8 @@ def run_suite(environment: dict[str, str], *arguments: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("environment", [PORTABLE, AVX2], ids=["portable", "avx2"])
+@pytest.mark.parametrize(
+    "environment", [PORTABLE, AVX2], ids=["portable", "avx2"]
+)
 def test_every_case(environment):
     run_suite(environment, str(HERE), "--ignore", __file__)

@@ -12,7 +12,9 @@ def test_the_usual_forms_float32_slope_is_wrong_on_nearly_flat_images():
     """Why D-SSIM is not kornia's: the same images, the same window, float32 against float64."""
 
     def slope(loss, dtype):
-        image, target = (x.float().to(dtype) for x in PAIRS["nearly flat images"])
+        image, target = (
+            x.float().to(dtype) for x in PAIRS["nearly flat images"]
+        )
         image.requires_grad_()
         loss(image, target).backward()
         return image.grad.double()

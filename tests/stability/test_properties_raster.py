@@ -11,7 +11,12 @@ from hypothesis import strategies as st
 from gsgan.splat import ACCURACY, project, rasterise
 from gsgan.splat.project import rotations
 from gsgan.splat.reference import _alphas, _pixel_chunks, _sorted
-from stability.cases.case import Inputs, Tolerance, assert_as_expected, drawing_backends
+from stability.cases.case import (
+    Inputs,
+    Tolerance,
+    assert_as_expected,
+    drawing_backends,
+)
 from stability.cases.raster import (
     HIGH,
     Size,
@@ -48,11 +53,15 @@ def scenes(
     # 1, as the quaternion of a ball has a gradient of rounding only.
     scale, ratio = draw(st.floats(*log_scale)), draw(st.floats(0.05, 4))
     distance = 10 ** draw(st.floats(-1, 2))
-    opacities = draw(st.sampled_from([(0.0, 1.0), (0.0, 0.01), (0.9, 1.0), (1.0, 1.0)]))
+    opacities = draw(
+        st.sampled_from([(0.0, 1.0), (0.0, 0.01), (0.9, 1.0), (1.0, 1.0)])
+    )
     n = draw(st.integers(1, 10))
 
     def rand(*shape: int) -> torch.Tensor:
-        return torch.rand(1, n, *shape, generator=generator, dtype=torch.float64)
+        return torch.rand(
+            1, n, *shape, generator=generator, dtype=torch.float64
+        )
 
     # Pixels over the image and round it, depths from behind the camera to twice the distance.
     pixels = torch.tensor([size[1], size[0]]) * (2 * rand(2) - 0.5)
@@ -76,7 +85,9 @@ def test_values_and_gradients_are_finite_and_alpha_in_0_to_1(backend, drawn):
     leaves = {k: v.float().requires_grad_() for k, v in scene.items()}
     outputs = render(leaves, backend, size=size, settings=HIGH)
     generator = torch.Generator().manual_seed(3)
-    weighted = (x * torch.randn(x.shape, generator=generator) for x in outputs.values())
+    weighted = (
+        x * torch.randn(x.shape, generator=generator) for x in outputs.values()
+    )
     torch.stack([x.sum() for x in weighted]).sum().backward()
     for name, value in {
         **outputs,
@@ -102,7 +113,9 @@ def test_values_and_gradients_are_right(backend, accuracy, drawn):
         size=size,
         settings=accuracy,
         tolerance=Tolerance(2e-5, 3e-3),
-        gradient_floor=dict.fromkeys(scene, max(10 * accuracy.alpha_min, 1e-30)),
+        gradient_floor=dict.fromkeys(
+            scene, max(10 * accuracy.alpha_min, 1e-30)
+        ),
     )
     for dtype in (torch.float32, torch.float64):
         assert_as_expected(case, backend, dtype)
@@ -110,7 +123,9 @@ def test_values_and_gradients_are_right(backend, accuracy, drawn):
 
 @every_backend
 @given(
-    scenes(), st.tuples(*[st.floats(-3, 3)] * 3), st.tuples(*[st.floats(-10, 10)] * 3)
+    scenes(),
+    st.tuples(*[st.floats(-3, 3)] * 3),
+    st.tuples(*[st.floats(-10, 10)] * 3),
 )
 def test_moving_world_and_camera_together_changes_nothing(
     backend, drawn, axis_angle, shift
@@ -128,7 +143,9 @@ def test_moving_world_and_camera_together_changes_nothing(
         "R": R,
         "t": scene["t"] - R @ shift,
     }
-    got, want = (render(x, backend, size=size, settings=HIGH) for x in (moved, still))
+    got, want = (
+        render(x, backend, size=size, settings=HIGH) for x in (moved, still)
+    )
     for name in want:
         limit = 1e-6 * max(1.0, float(want[name].abs().max()))
         torch.testing.assert_close(got[name], want[name], atol=limit, rtol=0)
@@ -136,7 +153,9 @@ def test_moving_world_and_camera_together_changes_nothing(
 
 @every_backend
 @given(scenes())
-def test_the_order_of_the_list_and_an_opacity_of_0_change_nothing(backend, drawn):
+def test_the_order_of_the_list_and_an_opacity_of_0_change_nothing(
+    backend, drawn
+):
     """The gradient at an opacity of 0 is what the Gaussian would add: images are linear in it."""
     scene, size = drawn
     draw = partial(render, backend=backend, size=size, settings=uncut(HIGH))
@@ -145,16 +164,23 @@ def test_the_order_of_the_list_and_an_opacity_of_0_change_nothing(backend, drawn
     kept = {**scene, "opacities": 0.5 * scene["opacities"]}
     more = {
         **kept,
-        **{k: torch.cat([kept[k].flip(1), kept[k][:, :1]], dim=1) for k in lists},
+        **{
+            k: torch.cat([kept[k].flip(1), kept[k][:, :1]], dim=1)
+            for k in lists
+        },
     }
     opacity = torch.zeros(1, dtype=torch.float64, requires_grad=True)
-    more["opacities"] = torch.cat([more["opacities"][:, :n], opacity[None]], dim=1)
+    more["opacities"] = torch.cat(
+        [more["opacities"][:, :n], opacity[None]], dim=1
+    )
     if len(torch.unique(scene["means"], dim=1)[0]) < n:
         return  # two at one place: their order is that of the list
     got, want = draw(more), draw(kept)
     for name, value in want.items():
         limit = 1e-9 * max(1.0, float(value.abs().max()))
-        torch.testing.assert_close(got[name].detach(), value, atol=limit, rtol=0)
+        torch.testing.assert_close(
+            got[name].detach(), value, atol=limit, rtol=0
+        )
     got["features"].sum().backward()
     with torch.no_grad():
         half = {
@@ -177,8 +203,12 @@ def error_bound(projected, size, accuracy):
     for pixels in _pixel_chunks(projected, size):
         whole = _alphas(front_to_back, pixels, ACCURACY["exact"])
         lost = whole - _alphas(front_to_back, pixels, accuracy)
-        before = torch.cat([torch.ones_like(whole[..., :1]), 1 - whole], -1).cumprod(-1)
-        chunks.append((before[..., :-1] * lost).sum(-1) + accuracy.transmittance_min)
+        before = torch.cat(
+            [torch.ones_like(whole[..., :1]), 1 - whole], -1
+        ).cumprod(-1)
+        chunks.append(
+            (before[..., :-1] * lost).sum(-1) + accuracy.transmittance_min
+        )
     return torch.cat(chunks, dim=1).unflatten(-1, size).unsqueeze(1)
 
 
@@ -192,6 +222,10 @@ def test_the_error_of_a_setting_stays_under_its_bound(backend, name, drawn):
     gaussians, camera = records(scene, size)
     exact = ACCURACY["exact"]
     bound = error_bound(project(gaussians, camera, exact), size, accuracy)
-    got = rasterise(gaussians, camera, settings=accuracy, backend=backend).features
-    want = rasterise(gaussians, camera, settings=exact, backend="reference").features
+    got = rasterise(
+        gaussians, camera, settings=accuracy, backend=backend
+    ).features
+    want = rasterise(
+        gaussians, camera, settings=exact, backend="reference"
+    ).features
     assert ((got - want).abs() <= bound + 1e-12).all()

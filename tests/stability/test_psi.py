@@ -26,7 +26,9 @@ def test_a_vanishing_limb_starts_at_the_least_scale():
     p = DEGENERATE["limb of zero length"].float()
     psi, points = small_psi(*FLOAT32), some_points(*FLOAT32)(p)
     with torch.no_grad():
-        made = psi(p, points, torch.tensor([[0.0, 1, 4]]), torch.eye(3).unsqueeze(0))
+        made = psi(
+            p, points, torch.tensor([[0.0, 1, 4]]), torch.eye(3).unsqueeze(0)
+        )
     sigma = made.covariances.diagonal(dim1=-2, dim2=-1).sqrt()[..., 0]
     minimum = psi.scale_range[0] * psi.body_height
     torch.testing.assert_close(
@@ -35,12 +37,16 @@ def test_a_vanishing_limb_starts_at_the_least_scale():
 
 
 @given(st.fixed_dictionaries(dict.fromkeys(NAMES, VALUES)), st.integers(0, 100))
-def test_any_residuals_make_gaussians_within_bounds_with_finite_slopes(values, seed):
+def test_any_residuals_make_gaussians_within_bounds_with_finite_slopes(
+    values, seed
+):
     inputs = {k: v.float() for k, v in ordinary_residuals(seed).items()}
     for name, value in values.items():
         inputs[name] = (inputs[name] + value).requires_grad_()
     made, psi = composed(inputs), small_psi(*FLOAT32)
-    reach = (made["means"] - some_points(*FLOAT32)(inputs["p"]).means).abs().amax()
+    reach = (
+        (made["means"] - some_points(*FLOAT32)(inputs["p"]).means).abs().amax()
+    )
     assert reach <= psi.mean_bound * psi.body_height * 3**0.5 * 1.0001
     assert ((made["opacities"] > 0) & (made["opacities"] < 1)).all()
     low, high = (bound * psi.body_height for bound in psi.scale_range)
@@ -54,16 +60,24 @@ def test_any_residuals_make_gaussians_within_bounds_with_finite_slopes(values, s
 
 
 @given(st.fixed_dictionaries(dict.fromkeys(NAMES, VALUES)), XYZ, XYZ)
-def test_gaussians_turn_and_move_with_the_skeleton_and_the_eye(values, angles, metres):
+def test_gaussians_turn_and_move_with_the_skeleton_and_the_eye(
+    values, angles, metres
+):
     inputs = ordinary_residuals(3)
     inputs |= {name: inputs[name] + value for name, value in values.items()}
     here, R = composed(inputs), rotation(angles)
     shift = torch.tensor(metres, dtype=torch.float64)
-    there = composed({**inputs, **{k: inputs[k] @ R.mT + shift for k in ("p", "eye")}})
+    there = composed(
+        {**inputs, **{k: inputs[k] @ R.mT + shift for k in ("p", "eye")}}
+    )
     torch.testing.assert_close(
         there["means"], here["means"] @ R.mT + shift, atol=1e-9, rtol=0
     )
     expected = R @ here["covariances"] @ R.mT
-    torch.testing.assert_close(there["covariances"], expected, atol=1e-6, rtol=1e-9)
+    torch.testing.assert_close(
+        there["covariances"], expected, atol=1e-6, rtol=1e-9
+    )
     for name in ("opacities", "features"):
-        torch.testing.assert_close(there[name], here[name], atol=1e-6, rtol=1e-9)
+        torch.testing.assert_close(
+            there[name], here[name], atol=1e-6, rtol=1e-9
+        )

@@ -65,19 +65,28 @@ def run(tmp_path, monkeypatch):
     return go
 
 
-def test_every_row_is_in_the_table_and_every_case_on_the_page(run, tmp_path, capsys):
+def test_every_row_is_in_the_table_and_every_case_on_the_page(
+    run, tmp_path, capsys
+):
     page = tmp_path / "page.md"
     run(ROWS, "--page", str(page))
     records = json.loads((tmp_path / "stability.json").read_text())["rows"]
     # JSON has no NaN
     assert [r["value_error"] for r in records] == [1e-6, 3e-2, None, None]
-    for text in ((tmp_path / "stability.md").read_text(), capsys.readouterr().out):
+    for text in (
+        (tmp_path / "stability.md").read_text(),
+        capsys.readouterr().out,
+    ):
         assert (
             "| needle | scenes | native | 0.030 | 0.060 | means | finite only |  |"
             in text
         )
-        assert "| needle | scenes | reference | ∞ | ∞ | means | right |  |" in text
-        assert "| mirror | scenes | - | – | – | means | refused | det -1 |" in text
+        assert (
+            "| needle | scenes | reference | ∞ | ∞ | means | right |  |" in text
+        )
+        assert (
+            "| mirror | scenes | - | – | – | means | refused | det -1 |" in text
+        )
     text = page.read_text()
     assert text.startswith("# Results: numerically hard cases\n\nCommit: ")
     assert "## Scenes" in text

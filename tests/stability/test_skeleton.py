@@ -51,13 +51,16 @@ def skeletons(draw: st.DrawFn, trunk: bool = False) -> Tensor:
     trunk may collapse too, or the skeleton be one of the hard ones."""
     joints = st.sampled_from(list(range(33)) if trunk else EASY_JOINTS)
     p = noisy(
-        draw(st.integers(0, 2**16)), sigma=draw(st.sampled_from([0.0, 1e-4, 0.05, 0.3]))
+        draw(st.integers(0, 2**16)),
+        sigma=draw(st.sampled_from([0.0, 1e-4, 0.05, 0.3])),
     )
     if trunk and draw(st.booleans()):
         p = DEGENERATE[draw(st.sampled_from(sorted(DEGENERATE)))].clone()
     for a, b in draw(st.lists(st.tuples(joints, joints), max_size=4)):
         p[:, a] = p[:, b]  # coincident
-    for a, b, c in draw(st.lists(st.tuples(joints, joints, joints), max_size=2)):
+    for a, b, c in draw(
+        st.lists(st.tuples(joints, joints, joints), max_size=2)
+    ):
         p[:, a] = p[:, b] + draw(st.sampled_from([-1.0, 0.5, 1.0, 2.0])) * (
             p[:, c] - p[:, b]
         )
@@ -122,13 +125,19 @@ def test_any_skeleton_has_rotations_for_frames_and_finite_slopes(p):
     densify = few_points(torch.float32, CPU)
     frames = bone_frames(leaf)
     R = all_frames(frames).detach()
-    torch.testing.assert_close(R.mT @ R, torch.eye(3).expand_as(R), atol=2e-5, rtol=0)
+    torch.testing.assert_close(
+        R.mT @ R, torch.eye(3).expand_as(R), atol=2e-5, rtol=0
+    )
     assert (torch.linalg.det(R) > 0).all()
     points = densify(leaf, None, frames)
     assert points.means.isfinite().all()
     assert (points.scales > 0).all()
-    code = omega(leaf, None, torch.eye(3)[None].expand(len(leaf), 3, 3), frames=frames)
-    total = points.means.sum() + points.scales.sum() + (code * code.detach()).sum()
+    code = omega(
+        leaf, None, torch.eye(3)[None].expand(len(leaf), 3, 3), frames=frames
+    )
+    total = (
+        points.means.sum() + points.scales.sum() + (code * code.detach()).sum()
+    )
     total.backward()
     assert leaf.grad.isfinite().all()
 
@@ -148,7 +157,9 @@ def test_frames_and_points_turn_and_move_with_the_skeleton(p, angles, metres):
     torch.testing.assert_close(there.means, expected, atol=1e-6, rtol=0)
     torch.testing.assert_close(there.scales, here.scales, atol=1e-9, rtol=0)
     torch.testing.assert_close(there.frames, R @ here.frames, atol=1e-6, rtol=0)
-    torch.testing.assert_close(there.normals, here.normals @ R.mT, atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        there.normals, here.normals @ R.mT, atol=1e-6, rtol=0
+    )
     torch.testing.assert_close(there.local(), here.local(), atol=1e-6, rtol=0)
 
 
@@ -161,8 +172,12 @@ def test_a_mirrored_skeleton_has_mirrored_frames(p):
     other = [index[(mirror[a], mirror[b])] for a, b in MEDIAPIPE33.limbs]
     a, b = bone_frames(p), bone_frames((p @ M)[:, mirror])
     torch.testing.assert_close(b.hubs, M @ a.hubs @ M, atol=1e-6, rtol=0)
-    torch.testing.assert_close(b.limbs, M @ a.limbs[:, other] @ M, atol=1e-6, rtol=0)
-    torch.testing.assert_close(b.lengths, a.lengths[:, other], atol=1e-9, rtol=0)
+    torch.testing.assert_close(
+        b.limbs, M @ a.limbs[:, other] @ M, atol=1e-6, rtol=0
+    )
+    torch.testing.assert_close(
+        b.lengths, a.lengths[:, other], atol=1e-9, rtol=0
+    )
 
 
 def test_gradcheck_below_the_least_length():
@@ -173,6 +188,14 @@ def test_gradcheck_below_the_least_length():
     def values(p: Tensor) -> tuple[Tensor, ...]:
         frames = bone_frames(p)
         points = few_points(torch.float64, CPU)(p, None, frames)
-        return frames.hubs, frames.limbs, frames.torso, points.means, points.scales
+        return (
+            frames.hubs,
+            frames.limbs,
+            frames.torso,
+            points.means,
+            points.scales,
+        )
 
-    assert torch.autograd.gradcheck(values, (p,), fast_mode=True, eps=1e-8, atol=1e-4)
+    assert torch.autograd.gradcheck(
+        values, (p,), fast_mode=True, eps=1e-8, atol=1e-4
+    )

@@ -25,9 +25,13 @@ def make(tiny, tmp_path):
     def run(phases: tuple[int, int, int], *overrides: str):
         names = ("segmentation", "step_one", "step_two")
         schedule = [
-            f"training.schedule.{k}={n}" for k, n in zip(names, phases, strict=True)
+            f"training.schedule.{k}={n}"
+            for k, n in zip(names, phases, strict=True)
         ]
-        always = ("training.schedule.discriminator_start=0", "size.rgb_skip=false")
+        always = (
+            "training.schedule.discriminator_start=0",
+            "size.rgb_skip=false",
+        )
         data, module = build_training(tiny(*schedule, *always, *overrides))
         trainer = quiet_trainer(tmp_path, max_epochs=1)
 
@@ -51,16 +55,24 @@ def assert_finite(module: AvatarTraining, steps: int) -> None:
         assert value.isfinite().all(), name
     for optimiser in module.trainer.optimizers:
         for state in optimiser.state.values():
-            assert all(torch.as_tensor(v).isfinite().all() for v in state.values())
+            assert all(
+                torch.as_tensor(v).isfinite().all() for v in state.values()
+            )
 
 
-def assert_psi_learns(module: AvatarTraining, fit: Callable, frame: Frame) -> None:
+def assert_psi_learns(
+    module: AvatarTraining, fit: Callable, frame: Frame
+) -> None:
     """In five iterations on a frame, after which everything is finite."""
-    before = [p.detach().clone() for p in module.avatar.deformation.parameters()]
+    before = [
+        p.detach().clone() for p in module.avatar.deformation.parameters()
+    ]
     fit([frame] * 5)
     assert_finite(module, 5)
     after = module.avatar.deformation.parameters()
-    assert not all(torch.equal(a, b) for a, b in zip(before, after, strict=True))
+    assert not all(
+        torch.equal(a, b) for a, b in zip(before, after, strict=True)
+    )
 
 
 PARTS = {
@@ -91,7 +103,9 @@ def poison(
     ("part", "value"),
     [(part, math.inf if part == "psi" else math.nan) for part in PARTS],
 )
-def test_a_gradient_that_is_not_finite_skips_its_step_and_is_counted(make, part, value):
+def test_a_gradient_that_is_not_finite_skips_its_step_and_is_counted(
+    make, part, value
+):
     """The second of three iterations is spoiled: the part rests there, and learns after it."""
     phases, name = PARTS[part]
     module, frame, fit = make(phases)
@@ -116,7 +130,9 @@ def test_training_on_an_image_without_a_person_stays_finite(make):
     """Empty mask, black image, no label: every loss is finite, and nothing is skipped."""
     module, frame, fit = make((2, 2, 2), "training.rollback.collapse=0")
     labels = torch.full_like(frame.labels, 255)
-    empty = replace(frame, image=frame.image * 0, mask=frame.mask * 0, labels=labels)
+    empty = replace(
+        frame, image=frame.image * 0, mask=frame.mask * 0, labels=labels
+    )
     fit([empty] * 6)
     assert_finite(module, 6)
 
@@ -128,7 +144,9 @@ def test_a_few_steps_from_all_hard_skeletons_stay_finite(make):
     assert_psi_learns(module, fit, batch)
 
 
-@pytest.mark.parametrize("turn", [2.6, pytest.param(torch.pi, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "turn", [2.6, pytest.param(torch.pi, marks=pytest.mark.slow)]
+)
 def test_a_few_steps_from_points_on_a_folded_body_stay_finite(make, turn):
     """Every joint turned so far that skinning flattens what lies between two bones."""
     words = ("effects.body_points=on", "effects.view_dependence=1")

@@ -86,15 +86,21 @@ def write_gltf(
 
     glb.doc.nodes.append(
         pygltflib.Node(
-            name="Armature", rotation=list(Z_TO_Y_UP), scale=[scale] * 3, children=[1]
+            name="Armature",
+            rotation=list(Z_TO_Y_UP),
+            scale=[scale] * 3,
+            children=[1],
         )
     )
     glb.doc.scenes.append(pygltflib.Scene(nodes=[0]))
     times = glb.accessor(
-        (2.5 + step * np.arange(len(motion.joints))).astype("f4")[:, None], "SCALAR"
+        (2.5 + step * np.arange(len(motion.joints))).astype("f4")[:, None],
+        "SCALAR",
     )
     animation = pygltflib.Animation(name="moves")
-    for j, (bone, parent) in enumerate(zip(bones, character.parents, strict=True)):
+    for j, (bone, parent) in enumerate(
+        zip(bones, character.parents, strict=True)
+    ):
         turns, moves = world[:, j], places[:, j]
         if parent >= 0:
             above = np.swapaxes(world[:, parent], 1, 2)
@@ -112,7 +118,14 @@ def write_gltf(
             if not every_channel and np.allclose(values, values[-1], atol=1e-9):
                 continue
             add_channel(
-                glb, animation, 1 + j, kind, times, values[:-1], interpolation, shorts
+                glb,
+                animation,
+                1 + j,
+                kind,
+                times,
+                values[:-1],
+                interpolation,
+                shorts,
             )
     glb.doc.animations.append(animation)
     if skin:
@@ -137,7 +150,9 @@ def add_channel(
 ) -> None:
     """Keys of a node's property; cubic splines get tangents of differences."""
     if interpolation == "CUBICSPLINE" and values.ndim == 2:
-        tangents = np.gradient(values, axis=0) if len(values) > 1 else 0 * values
+        tangents = (
+            np.gradient(values, axis=0) if len(values) > 1 else 0 * values
+        )
         values = np.stack([tangents, values, tangents], axis=1)
     more = {}
     rows = values.reshape(-1, values.shape[-1])
@@ -149,13 +164,17 @@ def add_channel(
     animation.samplers.append(
         pygltflib.AnimationSampler(
             input=times,
-            output=glb.accessor(rows, {3: "VEC3", 4: "VEC4"}[rows.shape[1]], **more),
+            output=glb.accessor(
+                rows, {3: "VEC3", 4: "VEC4"}[rows.shape[1]], **more
+            ),
             interpolation=interpolation,
         )
     )
     target = pygltflib.AnimationChannelTarget(node=node, path=kind)
     animation.channels.append(
-        pygltflib.AnimationChannel(sampler=len(animation.samplers) - 1, target=target)
+        pygltflib.AnimationChannel(
+            sampler=len(animation.samplers) - 1, target=target
+        )
     )
 
 
@@ -222,7 +241,10 @@ CONVENTIONS = {
         "scale": 0.0254,
         "interpolation": "STEP",
     },
-    "cubic": lambda c: {"name": NAMES["rokoko"], "interpolation": "CUBICSPLINE"},
+    "cubic": lambda c: {
+        "name": NAMES["rokoko"],
+        "interpolation": "CUBICSPLINE",
+    },
     "few_channels": lambda c: {"name": NAMES["cmu"], "every_channel": False},
     "without_skin": lambda c: {"name": NAMES["bandai_namco"], "skin": False},
     "vrm_0": lambda c: {"name": scrambled, "extension": "VRM"},

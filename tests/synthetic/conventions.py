@@ -14,8 +14,19 @@ from gsgan.motion.rotations import between, rotation
 from gsgan.motion.standard import known_joints
 
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-X_FORWARD = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # Z up; the person faces +X
-LIMBS = ("UpLeg", "Leg", "Foot", "ToeBase", "Shoulder", "Arm", "ForeArm", "Hand")
+X_FORWARD = np.array(
+    [[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]
+)  # Z up; the person faces +X
+LIMBS = (
+    "UpLeg",
+    "Leg",
+    "Foot",
+    "ToeBase",
+    "Shoulder",
+    "Arm",
+    "ForeArm",
+    "Hand",
+)
 
 
 def write_bvh(
@@ -51,7 +62,11 @@ def write_bvh(
         ends: end sites; otherwise joints of their own, as some tools write.
     """
     B = np.eye(3) if axes is None else axes
-    Z = zero(character, B) if zero else np.tile(B.T, (len(character.bones), 1, 1))
+    Z = (
+        zero(character, B)
+        if zero
+        else np.tile(B.T, (len(character.bones), 1, 1))
+    )
     bones = [*roots, *character.bones]
     parents = [
         *range(-1, len(roots) - 1),
@@ -74,8 +89,14 @@ def write_bvh(
         kind = "JOINT" if parents[j] >= 0 else "ROOT"
         label = bones[j] if j < len(roots) else name(bones[j])
         lines.extend([f"{pad}{kind} {label}", pad + "{"])
-        lines.append(pad + "\tOFFSET " + " ".join(f"{x:.8f}" for x in offsets[j]))
-        moves = ["Xposition", "Yposition", "Zposition"] if everywhere or first else []
+        lines.append(
+            pad + "\tOFFSET " + " ".join(f"{x:.8f}" for x in offsets[j])
+        )
+        moves = (
+            ["Xposition", "Yposition", "Zposition"]
+            if everywhere or first
+            else []
+        )
         channels = [*moves, *(f"{a}rotation" for a in order)]
         lines.append(f"{pad}\tCHANNELS {len(channels)} {' '.join(channels)}")
         columns.append((j, bool(moves)))
@@ -94,10 +115,17 @@ def write_bvh(
         elif not children:
             columns.append((None, False))
             lines.extend(
-                [f"{pad}\tJOINT {label}_tip", pad + "\t{", pad + "\t\tOFFSET 0 0 0.01"]
+                [
+                    f"{pad}\tJOINT {label}_tip",
+                    pad + "\t{",
+                    pad + "\t\tOFFSET 0 0 0.01",
+                ]
             )
             lines.extend(
-                [pad + "\t\tCHANNELS 3 Zrotation Xrotation Yrotation", pad + "\t}"]
+                [
+                    pad + "\t\tCHANNELS 3 Zrotation Xrotation Yrotation",
+                    pad + "\t}",
+                ]
             )
         lines.append(pad + "}")
 
@@ -109,7 +137,11 @@ def write_bvh(
             if j is None:
                 row += [0.0, 0.0, 0.0]
                 continue
-            R = world[f, j] if parents[j] < 0 else world[f, parents[j]].T @ world[f, j]
+            R = (
+                world[f, j]
+                if parents[j] < 0
+                else world[f, parents[j]].T @ world[f, j]
+            )
             row += list(local[f, j]) if moves else []
             row += list(Rotation.from_matrix(R).as_euler(order, degrees=True))
         lines.append(" ".join(f"{x:.8f}" for x in row))
@@ -119,7 +151,12 @@ def write_bvh(
 
 # -- recorded motions
 
-CMU = {"root": "Hips", "lowerback": "Spine", "upperback": "Spine1", "thorax": "Spine2"}
+CMU = {
+    "root": "Hips",
+    "lowerback": "Spine",
+    "upperback": "Spine1",
+    "thorax": "Spine2",
+}
 CMU |= {"lowerneck": "Neck", "upperneck": "Neck1", "head": "Head"}
 CMU_SIDED = {"clavicle": "Shoulder", "lowerforearmtwist": "ForeArmTwist"}
 CMU_SIDED |= {"fingers": "HandMiddle1", "thumb": "HandThumb1"}
@@ -140,7 +177,10 @@ def recorded(path: Path, every: int) -> tuple[Bones, Animation]:
     known = {j: bone for bone, j in known_joints(rig.names).items()}
 
     def bone(j: int) -> str:
-        name, side = rig.names[j], {"l": "Left", "r": "Right"}.get(rig.names[j][0], "")
+        name, side = (
+            rig.names[j],
+            {"l": "Left", "r": "Right"}.get(rig.names[j][0], ""),
+        )
         return (
             CMU.get(name)
             or (side + CMU_SIDED.get(name[1:], "")) * (name[1:] in CMU_SIDED)
@@ -151,7 +191,11 @@ def recorded(path: Path, every: int) -> tuple[Bones, Animation]:
         parent = rig.parents[j]
         return parent if parent < 0 or parent in kept else above(parent)
 
-    kept = [j for j, n in enumerate(rig.names) if not n.endswith((" end", "hipjoint"))]
+    kept = [
+        j
+        for j, n in enumerate(rig.names)
+        if not n.endswith((" end", "hipjoint"))
+    ]
     parents = [kept.index(above(j)) if above(j) >= 0 else -1 for j in kept]
     B = Y_UP.T
     moved = Animation(
@@ -175,17 +219,23 @@ def turned(
     for j, (bone, parent) in enumerate(
         zip(character.bones, character.parents, strict=True)
     ):
-        A[j] = turns.get(bone, np.eye(3)) @ (A[parent] if parent >= 0 else np.eye(3))
+        A[j] = turns.get(bone, np.eye(3)) @ (
+            A[parent] if parent >= 0 else np.eye(3)
+        )
     return np.swapaxes(A, 1, 2) @ axes.T
 
 
-def lowered(character: Character, axes: np.ndarray, degrees: float) -> np.ndarray:
+def lowered(
+    character: Character, axes: np.ndarray, degrees: float
+) -> np.ndarray:
     """The arms ``degrees`` below the horizontal."""
     turn = {
         "Left": np.radians([0.0, degrees, 0]),
         "Right": np.radians([0.0, -degrees, 0]),
     }
-    return turned(character, axes, {f"{s}Arm": rotation(x) for s, x in turn.items()})
+    return turned(
+        character, axes, {f"{s}Arm": rotation(x) for s, x in turn.items()}
+    )
 
 
 def seated(character: Character, axes: np.ndarray) -> np.ndarray:
@@ -196,7 +246,9 @@ def seated(character: Character, axes: np.ndarray) -> np.ndarray:
     )
     turns = {f"{side}UpLeg": forward for side in ("Left", "Right")}
     return turned(
-        character, axes, turns | {f"{side}Leg": back for side in ("Left", "Right")}
+        character,
+        axes,
+        turns | {f"{side}Leg": back for side in ("Left", "Right")},
     )
 
 
@@ -307,9 +359,15 @@ CONVENTIONS = {
         roots=("joint_Root",),
     ),
     "bones_along_y": convention(
-        "blender", axes=np.eye(3), scale=1.0, order="YZX", zero=lambda c, a: along(c, 1)
+        "blender",
+        axes=np.eye(3),
+        scale=1.0,
+        order="YZX",
+        zero=lambda c, a: along(c, 1),
     ),
-    "joint_orients": convention("rokoko", order="XZY", zero=lambda c, a: random(c)),
+    "joint_orients": convention(
+        "rokoko", order="XZY", zero=lambda c, a: random(c)
+    ),
     "x_forward": convention(
         "vrm", axes=X_FORWARD, scale=1.0, order="YXZ", everywhere=True
     ),

@@ -27,7 +27,13 @@ LIMBS = {  # of the left side
     "Foot": ("Leg", (0.085, -0.01, 0.09)),
     "ToeBase": ("Foot", (0.085, -0.14, 0.03)),
 }
-ROWS = {"Thumb": -0.05, "Index": -0.03, "Middle": -0.01, "Ring": 0.012, "Pinky": 0.03}
+ROWS = {
+    "Thumb": -0.05,
+    "Index": -0.03,
+    "Middle": -0.01,
+    "Ring": 0.012,
+    "Pinky": 0.03,
+}
 for finger, y in ROWS.items():
     for k in range(1, 5):
         x = 0.69 + 0.02 * k if finger == "Thumb" else 0.73 + 0.03 * k
@@ -36,7 +42,13 @@ for finger, y in ROWS.items():
             above,
             (x, y - 0.01 * k * (finger == "Thumb"), 1.405),
         )
-SHAPES = ("blink_left", "blink_right", "mouth_open", "smile_left", "brow_up_left")
+SHAPES = (
+    "blink_left",
+    "blink_right",
+    "mouth_open",
+    "smile_left",
+    "brow_up_left",
+)
 
 
 def mannequin(without: Callable[[str], bool] = lambda bone: False) -> Character:
@@ -87,7 +99,9 @@ def mannequin(without: Callable[[str], bool] = lambda bone: False) -> Character:
     )
 
 
-def inside(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def inside(
+    points: np.ndarray, vertices: np.ndarray, faces: np.ndarray
+) -> np.ndarray:
     """Whether each point ``[N, 3]`` is within a mesh that is open above and below.
 
     A ray in a horizontal direction leaves the mesh where it hits a face from behind: three of
@@ -129,5 +143,6 @@ def assert_limits(
             assert angle.max() <= limit, (name, motion.passages[angle.argmax()])
     for name in ("LeftForeArm", "LeftHand", "RightForeArm", "RightHand"):
         assert (
-            np.abs(np.degrees(twist(local(person, motion, name), 0))).max() < twisted
+            np.abs(np.degrees(twist(local(person, motion, name), 0))).max()
+            < twisted
         ), name

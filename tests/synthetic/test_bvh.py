@@ -59,7 +59,13 @@ def angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def makehuman(bone: str) -> str:
-    side = "_L" if bone.startswith("Left") else "_R" if bone.startswith("Right") else ""
+    side = (
+        "_L"
+        if bone.startswith("Left")
+        else "_R"
+        if bone.startswith("Right")
+        else ""
+    )
     stem = bone.removeprefix("Left").removeprefix("Right")
     limb = LIMB_NAMES.get(stem, stem).split()[0]
     return limb.removeprefix("Hand") + side if limb != "Hand" else "Hand" + side
@@ -97,7 +103,10 @@ def test_a_written_motion_is_read_back(
     assert angles(read.rotations, expected).max() < 0.02
     moved = read.joints - read.joints[:, :1]
     np.testing.assert_allclose(
-        moved, (signing.joints - signing.joints[:, :1]) @ yaw.T, atol=0.01, rtol=0
+        moved,
+        (signing.joints - signing.joints[:, :1]) @ yaw.T,
+        atol=0.01,
+        rtol=0,
     )
 
 
@@ -137,9 +146,14 @@ def test_other_proportions_and_missing_bones(tmp_path, person, signing):
     motion = RecordedMotion(plain, path).at(np.array([0.5]))
     assert motion.rotations.shape == (1, len(plain.bones), 3, 3)
     few = write_bvh(
-        tmp_path / "b.bvh", plain, Choreography(plain).at(np.array([22.0])), STEP
+        tmp_path / "b.bvh",
+        plain,
+        Choreography(plain).at(np.array([22.0])),
+        STEP,
     )
-    read = RecordedMotion(person, few).at(np.array([0.0, 1.0]))  # a single frame stays
+    read = RecordedMotion(person, few).at(
+        np.array([0.0, 1.0])
+    )  # a single frame stays
     np.testing.assert_array_equal(read.joints[0], read.joints[1])
 
 
@@ -153,7 +167,8 @@ def test_any_times_are_interpolated_and_named(tmp_path, person, signing):
     arms = [person.bones.index(bone) for bone in ("LeftHand", "RightHand")]
     np.testing.assert_allclose(half[arms], apart[arms] / 2, atol=2e-3)
     np.testing.assert_array_equal(
-        motion.at(np.array([99.0])).joints, motion.at(np.array([59 * STEP])).joints
+        motion.at(np.array([99.0])).joints,
+        motion.at(np.array([59 * STEP])).joints,
     )
     assert near.passages == ("clip 0",)
     assert set(near.shapes) == {"blink_left", "blink_right"}
@@ -161,7 +176,9 @@ def test_any_times_are_interpolated_and_named(tmp_path, person, signing):
 
 @pytest.mark.parametrize(("metres", "kept"), [(0.8, True), (9.0, False)])
 def test_long_ways_become_a_treadmill(tmp_path, person, metres, kept):
-    path = write_bvh(tmp_path / "a.bvh", person, travelling(person, metres), STEP)
+    path = write_bvh(
+        tmp_path / "a.bvh", person, travelling(person, metres), STEP
+    )
     hips = RecordedMotion(person, path).at(np.arange(60) * STEP).joints[:, 0]
     assert np.abs(hips[:, :2] - hips[:, :2].mean(axis=0)).max() <= ROOM
     assert np.ptp(hips[:, 1]) == pytest.approx(metres if kept else 0, abs=0.01)
@@ -179,10 +196,15 @@ def test_feet_are_put_on_the_floor(tmp_path, person, signing):
 
 def test_a_file_without_a_required_joint(tmp_path, person, signing):
     path = write_bvh(
-        tmp_path / "a.bvh", person, signing, STEP, name=lambda b: b.replace("Leg", "X")
+        tmp_path / "a.bvh",
+        person,
+        signing,
+        STEP,
+        name=lambda b: b.replace("Leg", "X"),
     )
     with pytest.raises(
-        DataError, match=r"a\.bvh: no joint found for LeftUpLeg, LeftLeg, .*LeftUpX"
+        DataError,
+        match=r"a\.bvh: no joint found for LeftUpLeg, LeftLeg, .*LeftUpX",
     ):
         RecordedMotion(person, path)
     assert len(REQUIRED) == 13
@@ -218,7 +240,10 @@ def two_people(text: str) -> str:
             lambda text: text[:-30] + " nan" + text[-20:],
             "numbers found|not finite|could not",
         ),
-        (lambda text: text.replace("OFFSET 0.00000000", "OFFSET nan", 1), "not finite"),
+        (
+            lambda text: text.replace("OFFSET 0.00000000", "OFFSET nan", 1),
+            "not finite",
+        ),
         (
             lambda text: text.replace("CHANNELS 3", "CHANNELS 99", 1),
             "is not a complete BVH file",
@@ -228,11 +253,16 @@ def two_people(text: str) -> str:
             "is not a complete BVH file",
         ),
         (lambda text: "", "HIERARCHY"),
-        (lambda text: text.replace("ROOT", "JOINT", 1), "JOINT Hips is out of place"),
+        (
+            lambda text: text.replace("ROOT", "JOINT", 1),
+            "JOINT Hips is out of place",
+        ),
         (two_people, "more than one person"),
     ],
 )
-def test_damaged_files_end_in_one_sentence(tmp_path, person, whole, damage, message):
+def test_damaged_files_end_in_one_sentence(
+    tmp_path, person, whole, damage, message
+):
     path = tmp_path / "a.bvh"
     path.write_text(damage(whole))
     with pytest.raises(DataError, match=message) as error:

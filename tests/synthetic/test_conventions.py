@@ -54,15 +54,21 @@ def as_t_pose(tmp_path_factory, person, acted):
 def test_landmarks_agree_and_the_subject_moves_alike(
     tmp_path, person, acted, source, as_t_pose, name
 ):
-    path = write_bvh(tmp_path / "a.bvh", person, acted, STEP, **CONVENTIONS[name])
+    path = write_bvh(
+        tmp_path / "a.bvh", person, acted, STEP, **CONVENTIONS[name]
+    )
     p, expected = (read_motion(file, source).p for file in (path, as_t_pose))
     assert np.abs(p - expected).max() < 1e-3
     times = np.arange(len(acted.joints)) * STEP
     read, expected = (
         RecordedMotion(person, file).at(times) for file in (path, as_t_pose)
     )
-    away = np.linalg.norm(axis_angle(expected.rotations.mT @ read.rotations), axis=-1)
-    assert np.degrees(away).max() < 2.5  # arms lowered by 85 degrees: 2.0, of twist
+    away = np.linalg.norm(
+        axis_angle(expected.rotations.mT @ read.rotations), axis=-1
+    )
+    assert (
+        np.degrees(away).max() < 2.5
+    )  # arms lowered by 85 degrees: 2.0, of twist
     assert np.abs(read.joints - expected.joints).max() < 1e-3
 
 
@@ -71,7 +77,10 @@ def test_landmarks_agree_and_the_subject_moves_alike(
     "clip",  # running, climbing, uneven ground
     [
         "02_03",
-        *(pytest.param(clip, marks=pytest.mark.slow) for clip in ("01_14", "03_01")),
+        *(
+            pytest.param(clip, marks=pytest.mark.slow)
+            for clip in ("01_14", "03_01")
+        ),
     ],
 )
 def test_recorded_motions_agree(tmp_path, source, clip):
@@ -93,7 +102,8 @@ def test_one_frame_of_a_run(tmp_path, source):
     one = Animation(motion.rotations[:1], motion.joints[:1], {}, ())
     p, expected = (
         read_motion(
-            write_bvh(tmp_path / "a.bvh", rig, one, 0.1, **CONVENTIONS[name]), source
+            write_bvh(tmp_path / "a.bvh", rig, one, 0.1, **CONVENTIONS[name]),
+            source,
         ).p
         for name in ("bones_along_x", "t_pose")
     )
@@ -108,20 +118,28 @@ def test_resting_feet_of_splayed_rigs_are_flat():
     path = CMU / "02_03.amc"
     turns = standard_motion(read_amc(path, asf_of(path))[0], path).turns
     for side in SIDES:
-        assert np.degrees(np.abs(np.arcsin(turns[side + "Foot"][:, 2, 0]))).mean() < 10
+        assert (
+            np.degrees(np.abs(np.arcsin(turns[side + "Foot"][:, 2, 0]))).mean()
+            < 10
+        )
 
 
 @pytest.fixture(scope="module")
 def draw(person, acted, tmp_path_factory):
     """Draws two frames of a convention's file as ground truth is drawn: ``[2, H, W, 3]``."""
-    character, folder = load_character("blouse"), tmp_path_factory.mktemp("drawn")
+    character, folder = (
+        load_character("blouse"),
+        tmp_path_factory.mktemp("drawn"),
+    )
     appearance = Appearance(character)
 
     def images(name: str) -> np.ndarray:
         path = write_bvh(
             folder / f"{name}.bvh", person, acted, STEP, **CONVENTIONS[name]
         )
-        poses = RecordedMotion(character, path).at(np.array([20.0, 50.0]) * STEP)
+        poses = RecordedMotion(character, path).at(
+            np.array([20.0, 50.0]) * STEP
+        )
         pairs = zip(poses.rotations, poses.joints, strict=True)
         skinned = [character.skinned(*pose) for pose in pairs]
         view = from_front(64, focal=80, height=0.9)

@@ -10,7 +10,12 @@ from gsgan.synthetic.choreography import EVERYDAY
 from gsgan.synthetic.controls import frame_times
 from gsgan.synthetic.far import FAR
 from gsgan.synthetic.posing import Choreography
-from gsgan.synthetic.scene_setup import SceneSettings, extent, load_character, ring
+from gsgan.synthetic.scene_setup import (
+    SceneSettings,
+    extent,
+    load_character,
+    ring,
+)
 
 # Degrees since a T pose; a squat's hip and a kneeling foot are near what people can do.
 LIMITS = {
@@ -21,7 +26,14 @@ LIMITS = {
     "Head": 30,
     "Shoulder": 30,
 }
-LIMITS |= {"Arm": 125, "ForeArm": 150, "Hand": 95, "UpLeg": 140, "Leg": 150, "Foot": 65}
+LIMITS |= {
+    "Arm": 125,
+    "ForeArm": 150,
+    "Hand": 95,
+    "UpLeg": 140,
+    "Leg": 150,
+    "Foot": 65,
+}
 LIMITS |= {"ToeBase": 60}
 
 
@@ -60,7 +72,8 @@ def test_hands_and_knees_rest_where_the_key_poses_place_them(polo, moves):
     still = np.abs(times - begin - 0.25 * (FAR.ends[-1] - begin)).argmin()
     assert motion.passages[still] == "crawl"
     height = {
-        bone: motion.joints[still, polo.bones.index(bone), 2] for bone in polo.bones
+        bone: motion.joints[still, polo.bones.index(bone), 2]
+        for bone in polo.bones
     }
     for side in SIDES:
         assert height[side + "Hand"] == pytest.approx(0.08, abs=0.02)

@@ -28,7 +28,9 @@ VRM = {
 
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory):
-    return read_character(TinyGlb().write(tmp_path_factory.mktemp("glb") / "tiny.glb"))
+    return read_character(
+        TinyGlb().write(tmp_path_factory.mktemp("glb") / "tiny.glb")
+    )
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +38,9 @@ def original():
     """The file that the avatar "polo" was baked from."""
     source = VALID / "White_M_1_Casual.glb"
     return (
-        source if source.is_file() else pytest.skip(f"no original avatar at {source}")
+        source
+        if source.is_file()
+        else pytest.skip(f"no original avatar at {source}")
     )
 
 
@@ -57,8 +61,12 @@ def landmark(character, name: str) -> np.ndarray:
 def test_geometry_is_metric_upright_and_faces_minus_y(tiny):
     np.testing.assert_allclose(tiny.vertices[:, 2].min(), 0, atol=1e-6)
     np.testing.assert_allclose(np.ptp(tiny.vertices[:, 2]), 1.77, atol=1e-5)
-    np.testing.assert_allclose(joint(tiny, "LeftHand"), [0.7, 0, 1.42], atol=1e-5)
-    assert landmark(tiny, "left_foot_index")[1] < joint(tiny, "LeftFoot")[1] - 0.1
+    np.testing.assert_allclose(
+        joint(tiny, "LeftHand"), [0.7, 0, 1.42], atol=1e-5
+    )
+    assert (
+        landmark(tiny, "left_foot_index")[1] < joint(tiny, "LeftFoot")[1] - 0.1
+    )
     assert tiny.parents[0] == -1
     assert (tiny.parents < np.arange(len(tiny.bones))).all()
     np.testing.assert_allclose(tiny.bone_weight.sum(1), 1)
@@ -70,13 +78,17 @@ def test_a_sparse_morph_moves_only_its_vertices(tiny):
     assert set(tiny.shapes) == {"mouth_open"}
     moved = np.flatnonzero(tiny.shapes["mouth_open"].any(1))
     assert len(moved) == 8
-    np.testing.assert_allclose(tiny.shapes["mouth_open"][moved, 2], -0.01, atol=1e-7)
+    np.testing.assert_allclose(
+        tiny.shapes["mouth_open"][moved, 2], -0.01, atol=1e-7
+    )
 
 
 @pytest.mark.parametrize("unit", [0.01, 1.0, 3.7, 100.0])
 def test_the_unit_is_found_from_the_height(tmp_path, unit, tiny):
     other = read_character(TinyGlb(unit=unit).write(tmp_path / "a.glb"))
-    scale = 1.7 / 1.77 if unit in (0.01, 3.7) else 1  # no usual unit: 1.7 m tall
+    scale = (
+        1.7 / 1.77 if unit in (0.01, 3.7) else 1
+    )  # no usual unit: 1.7 m tall
     np.testing.assert_allclose(other.vertices, scale * tiny.vertices, atol=1e-5)
     np.testing.assert_allclose(other.shapes["mouth_open"], scale * tiny.shapes["mouth_open"],
                                atol=1e-6)  # fmt: skip
@@ -85,7 +97,10 @@ def test_the_unit_is_found_from_the_height(tmp_path, unit, tiny):
 def test_another_heading_and_place_make_no_difference(tmp_path, tiny):
     glb = TinyGlb()
     root = pygltflib.Node(
-        name="Armature", translation=[3, 1, 2], rotation=[0, 1, 0, 0], children=[0]
+        name="Armature",
+        translation=[3, 1, 2],
+        rotation=[0, 1, 0, 0],
+        children=[0],
     )
     glb.doc.nodes.append(root)
     other = read_character(glb.write(tmp_path / "a.glb"))
@@ -116,7 +131,9 @@ def test_the_four_largest_of_eight_weights_are_kept(tmp_path):
     attributes = glb.doc.meshes[0].primitives[0].attributes
     count = glb.doc.accessors[attributes.POSITION].count
     rows = np.arange(8, dtype="u1")[None].repeat(count, 0)
-    weights = np.array([[0, 0.1, 0, 0.2, 0.05, 0.3, 0, 0.35]], "f4").repeat(count, 0)
+    weights = np.array([[0, 0.1, 0, 0.2, 0.05, 0.3, 0, 0.35]], "f4").repeat(
+        count, 0
+    )
     for k in (0, 1):
         joints = np.ascontiguousarray(rows[:, 4 * k : 4 * k + 4])
         setattr(attributes, f"JOINTS_{k}", glb.accessor(joints, "VEC4"))
@@ -138,7 +155,9 @@ def test_textures_factors_and_coverage(tmp_path):
     np.testing.assert_array_equal(plain.colour[0, 0], [200, 150, 120, 255])
     material.alphaMode, material.alphaCutoff = "MASK", 0.3
     colour = Image.fromarray(np.full((4, 4, 4), (180, 180, 180, 100), np.uint8))
-    material.pbrMetallicRoughness.baseColorTexture.index = glb.texture(colour, "WEBP")
+    material.pbrMetallicRoughness.baseColorTexture.index = glb.texture(
+        colour, "WEBP"
+    )
     material.pbrMetallicRoughness.baseColorFactor = [0.5, 1, 1, 0.5]
     masked = read_character(glb.write(tmp_path / "masked.glb")).surfaces[0]
     assert masked.cutoff == 0.3
@@ -183,14 +202,22 @@ def test_names_of_vrm_thumbs_and_fingers():
 def test_labels_and_landmarks_without_colours_fingers_or_eyes(tiny):
     name = np.array(tiny.label_names)[tiny.labels]
     assert tiny.label_names == free_body().label_names
-    assert {"upper_clothes", "face_neck", "left_hand", "right_shoe"} <= set(name)
+    assert {"upper_clothes", "face_neck", "left_hand", "right_shoe"} <= set(
+        name
+    )
     centre = tiny.vertices[tiny.faces].mean(1)
     assert (centre[name == "left_hand", 0] > 0.6).all()
     body = free_body()
-    assert tiny.anchor_names == (*body.landmark_names, *body.hand_names, *FACE_NAMES)
+    assert tiny.anchor_names == (
+        *body.landmark_names,
+        *body.hand_names,
+        *FACE_NAMES,
+    )
     tip, knuckle = (landmark(tiny, f"left_middle_{k}") for k in ("tip", "mcp"))
     assert tip[0] >= knuckle[0] >= joint(tiny, "LeftHand")[0]
-    np.testing.assert_allclose(landmark(tiny, "right_hip"), joint(tiny, "RightUpLeg"))
+    np.testing.assert_allclose(
+        landmark(tiny, "right_hip"), joint(tiny, "RightUpLeg")
+    )
 
 
 def test_names_of_materials_decide_labels(tmp_path):
@@ -223,7 +250,9 @@ BAD = {
     "do not include LeftHand": lambda glb: setattr(
         glb.doc.nodes[LEFT_HAND], "name", "Paw"
     ),
-    "no triangles": lambda glb: setattr(glb.doc.meshes[0].primitives[0], "mode", 1),
+    "no triangles": lambda glb: setattr(
+        glb.doc.meshes[0].primitives[0], "mode", 1
+    ),
     "separate file": lambda glb: glb.doc.images.__setitem__(
         0, pygltflib.Image(uri="skin.png")
     ),
@@ -312,7 +341,10 @@ def test_face_landmarks_of_avatars_lie_on_the_face(avatar):
 def test_avatars_are_their_originals(original):
     """The bake moved no vertex by more than its quantisation, and kept landmarks and labels."""
     pytest.importorskip("meshoptimizer")
-    both = whole, baked = read_character(original), read_character(AVATARS["polo"])
+    both = whole, baked = (
+        read_character(original),
+        read_character(AVATARS["polo"]),
+    )
     distance, _ = cKDTree(whole.vertices).query(baked.vertices)
     assert distance.max() < 5e-5
     before, after = (c.landmarks(c.vertices, c.joints) for c in both)
@@ -322,7 +354,9 @@ def test_avatars_are_their_originals(original):
     np.testing.assert_allclose(*counts, rtol=0.02)
 
 
-def test_compressed_files_without_the_decoder_name_the_extra(original, monkeypatch):
+def test_compressed_files_without_the_decoder_name_the_extra(
+    original, monkeypatch
+):
     monkeypatch.setitem(sys.modules, "meshoptimizer", None)
     with pytest.raises(DataError, match=re.escape("pip install 'gsgan[gltf]'")):
         read_character(original)
@@ -330,7 +364,9 @@ def test_compressed_files_without_the_decoder_name_the_extra(original, monkeypat
 
 def test_normal_maps_of_avatars_have_y_up(avatar):
     """A bump's slopes are those of one surface: d(slope x)/dy = d(slope y)/dx, y up."""
-    x, y, z = np.moveaxis(avatar.surfaces[0].normal.astype(float) / 127.5 - 1, -1, 0)
+    x, y, z = np.moveaxis(
+        avatar.surfaces[0].normal.astype(float) / 127.5 - 1, -1, 0
+    )
     down = np.gradient(x / np.maximum(z, 0.2), axis=0)
     across = np.gradient(y / np.maximum(z, 0.2), axis=1)
     assert np.corrcoef(down.ravel(), across.ravel())[0, 1] < -0.3

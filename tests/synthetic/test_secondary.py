@@ -16,21 +16,35 @@ TIMES = np.linspace(0, 4, 25)
 
 def leg(label=2):
     """A trouser leg down to z = 0.05 that hangs on a chain of bones; rows 2.5 cm apart."""
-    heights, around = np.linspace(0.98, 0.05, 38), np.arange(16) * 2 * np.pi / 16
+    heights, around = (
+        np.linspace(0.98, 0.05, 38),
+        np.arange(16) * 2 * np.pi / 16,
+    )
     z, angle = (
-        x.ravel() for x in np.meshgrid(heights, np.append(around, 0), indexing="ij")
+        x.ravel()
+        for x in np.meshgrid(heights, np.append(around, 0), indexing="ij")
     )
     v = np.stack([0.08 * np.cos(angle), 0.08 * np.sin(angle), z], axis=1)
-    i, j = (x.ravel() for x in np.meshgrid(np.arange(37), np.arange(16), indexing="ij"))
+    i, j = (
+        x.ravel()
+        for x in np.meshgrid(np.arange(37), np.arange(16), indexing="ij")
+    )
     # the last column is the first again, as at a uv seam
     a, b = 17 * i + j, 17 * i + j + 1
     faces = np.concatenate(
         [np.stack([a, a + 17, b], 1), np.stack([b, a + 17, b + 17], 1)]
     )
-    c = character([(v, faces, np.zeros((len(v), 2)))], bones=BONES, joints=JOINTS)
+    c = character(
+        [(v, faces, np.zeros((len(v), 2)))], bones=BONES, joints=JOINTS
+    )
     below = np.clip((0.53 - z) / 0.06, 0, 1)
     index, weight = np.zeros((len(v), 4), int), np.zeros((len(v), 4))
-    index[:, 0], index[:, 1], weight[:, 0], weight[:, 1] = 1, 2, 1 - below, below
+    index[:, 0], index[:, 1], weight[:, 0], weight[:, 1] = (
+        1,
+        2,
+        1 - below,
+        below,
+    )
     return replace(
         c,
         normals=np.stack([np.cos(angle), np.sin(angle), 0 * z], axis=1),
@@ -54,9 +68,9 @@ class Swing:
         F, turn = len(times), 2 * np.pi * np.asarray(times)
         R = np.tile(np.eye(3), (F, len(BONES), 1, 1))
         angle = self.bend * (1 + np.sin(turn))
-        R[:, 2:] = Rotation.from_rotvec(angle[:, None] * [1.0, 0, 0]).as_matrix()[
-            :, None
-        ]
+        R[:, 2:] = Rotation.from_rotvec(
+            angle[:, None] * [1.0, 0, 0]
+        ).as_matrix()[:, None]
         joints = np.zeros((F, len(BONES), 3))
         joints[:, 0] = JOINTS[0]
         joints[:, 0, 1] += self.reach * np.sin(turn) + self.drift * times
@@ -80,7 +94,10 @@ def test_hems_sway_and_the_waist_does_not():
     c, motion = leg(), Swing(reach=0.15)
     secondary = Secondary(c, motion)
     offset = np.array(
-        [y - x for x, _, y, _, _ in (frame(c, secondary, motion, t) for t in TIMES)]
+        [
+            y - x
+            for x, _, y, _, _ in (frame(c, secondary, motion, t) for t in TIMES)
+        ]
     )
     size = np.linalg.norm(offset, axis=-1)
     z = c.vertices[:, 2]
@@ -117,10 +134,15 @@ def test_a_moment_does_not_depend_on_what_else_is_asked():
 def test_the_mesh_does_not_tear():
     c, motion = leg(), Swing(0.15, 0.5)
     secondary = Secondary(c, motion)
-    first, last = np.arange(0, len(c.vertices), 17), np.arange(16, len(c.vertices), 17)
+    first, last = (
+        np.arange(0, len(c.vertices), 17),
+        np.arange(16, len(c.vertices), 17),
+    )
     for t in TIMES[::4]:
         x, _, y, n, wrinkles = frame(c, secondary, motion, t)
-        np.testing.assert_allclose(y[first], y[last], atol=1e-12)  # across the seam
+        np.testing.assert_allclose(
+            y[first], y[last], atol=1e-12
+        )  # across the seam
         np.testing.assert_allclose(n[first], n[last], atol=1e-9)
         assert np.array_equal(wrinkles.slope[first], wrinkles.slope[last])
         offset = y - x
@@ -148,12 +170,15 @@ def test_wrinkles_deepen_as_a_joint_bends():
     assert not slopes[0].any()
     assert 0 < slopes[1].max() < slopes[2].max() < 1
     z = c.vertices[:, 2]
-    assert slopes[2].argmax() in np.flatnonzero(np.abs(z - 0.5) < 0.1)  # at the knee
+    assert slopes[2].argmax() in np.flatnonzero(
+        np.abs(z - 0.5) < 0.1
+    )  # at the knee
     # the shank moves towards +y as the leg turns about +x: folds are deepest behind the knee
     knee = np.abs(z - 0.5) < 0.05
     y = c.vertices[:, 1]
     assert (
-        slopes[2][knee & (y > 0.05)].mean() > 1.3 * slopes[2][knee & (y < -0.05)].mean()
+        slopes[2][knee & (y > 0.05)].mean()
+        > 1.3 * slopes[2][knee & (y < -0.05)].mean()
     )
 
 

@@ -11,7 +11,12 @@ from gsgan.motion.rotations import axis_angle
 from gsgan.synthetic.controls import frame_times
 from gsgan.synthetic.gltf import AVATARS, read_character
 from gsgan.synthetic.posing import Choreography
-from gsgan.synthetic.scene_setup import VERSION, Scene, SceneSettings, dataset_key
+from gsgan.synthetic.scene_setup import (
+    VERSION,
+    Scene,
+    SceneSettings,
+    dataset_key,
+)
 from gsgan.synthetic.signs import HELD_OUT, SIGNS, split_signs
 from gsgan.utils.errors import ConfigError
 
@@ -35,14 +40,18 @@ def polo():
 
 @pytest.fixture(scope="module")
 def signing(polo):
-    return Choreography(polo, programme=SIGNS).at(frame_times(120, SIGNS.duration))
+    return Choreography(polo, programme=SIGNS).at(
+        frame_times(120, SIGNS.duration)
+    )
 
 
 def test_other_scenes_are_what_they_were():
     assert VERSION == 2
     assert dataset_key(SceneSettings()) == "polo-128-c1f9a02e2386"
     assert dataset_key(SceneSettings(size=256)) == "polo-256-d319f51dfd30"
-    assert dataset_key(SceneSettings(motion="signs")) != dataset_key(SceneSettings())
+    assert dataset_key(SceneSettings(motion="signs")) != dataset_key(
+        SceneSettings()
+    )
 
 
 def test_signs_are_short_and_some_are_held_out_whole():
@@ -59,7 +68,9 @@ def test_signs_are_short_and_some_are_held_out_whole():
     assert {names[i] for i in test} == set(HELD_OUT)
     assert {names[i] for i in train} == set(seconds) - set(HELD_OUT)
     few_train, few = split_signs(names, 7)
-    assert few_train == train  # the other frames of unseen signs do not train either
+    assert (
+        few_train == train
+    )  # the other frames of unseen signs do not train either
     assert set(few) < set(test)
     assert split_signs(names, 0) == (list(range(120)), [])
     with pytest.raises(
@@ -80,7 +91,9 @@ def test_motion_is_smooth(polo):
     assert np.linalg.norm(axis_angle(turned), axis=-1).max() < 0.7
     assert all((w >= 0).all() and (w <= 1).all() for w in moves.shapes.values())
     feet = [polo.bones.index(f"{side}ToeBase") for side in SIDES]
-    assert np.ptp(moves.joints[:, feet], axis=0).max() < 1e-3  # the person stands still
+    assert (
+        np.ptp(moves.joints[:, feet], axis=0).max() < 1e-3
+    )  # the person stands still
     for shape in (
         "mouth_open",
         "mouth_round",
@@ -94,15 +107,21 @@ def test_motion_is_smooth(polo):
 def test_hands_touch_and_do_not_pass_through_each_other(polo):
     bones = np.array(polo.bones)[polo.dominant_bones()]
     arms = [
-        np.flatnonzero([b.startswith((f"{side}Hand", f"{side}ForeArm")) for b in bones])
+        np.flatnonzero(
+            [b.startswith((f"{side}Hand", f"{side}ForeArm")) for b in bones]
+        )
         for side in SIDES
     ]
     meshes = [polo.faces[np.isin(polo.faces, arm).all(axis=1)] for arm in arms]
     rows = zip(SIGNS.passages, SIGNS.ends, strict=True)
     start = {name: end - seconds for (name, _, seconds), end in rows}
-    times = np.array([start[name] + since for name, (since, _) in TOGETHER.items()])
+    times = np.array(
+        [start[name] + since for name, (since, _) in TOGETHER.items()]
+    )
     moves = Choreography(polo, programme=SIGNS).at(times)
-    for name, R, joints in zip(TOGETHER, moves.rotations, moves.joints, strict=True):
+    for name, R, joints in zip(
+        TOGETHER, moves.rotations, moves.joints, strict=True
+    ):
         vertices, _ = polo.skinned(R, joints)
         left, right = (vertices[arm] for arm in arms)
         near = cKDTree(left).query(right)[0].min()
@@ -124,7 +143,9 @@ def test_a_scene_of_signs_is_split_by_sign_before_frontal_cameras():
         np.arctan2(*(centres[:, :2] - vertices[:, :2].mean(0)).T * [[1], [-1]])
     )
     assert np.abs(around).max() < 75
-    assert all(around[:6].min() < angle < around[:6].max() for angle in around[6:])
+    assert all(
+        around[:6].min() < angle < around[:6].max() for angle in around[6:]
+    )
     assert np.diff(np.sort(around)).min() > 5
     assert ((centres[:, 2] > 1.1) & (centres[:, 2] < 1.7)).all()
     head = vertices[vertices[:, 2] > vertices[:, 2].max() - 0.25]
@@ -132,4 +153,6 @@ def test_a_scene_of_signs_is_split_by_sign_before_frontal_cameras():
         pixels = view.project(head)
         assert pixels.min() > 0
         assert pixels.max() < 48
-        assert view.project(vertices)[:, 1].max() > 60  # feet are below the image
+        assert (
+            view.project(vertices)[:, 1].max() > 60
+        )  # feet are below the image

@@ -44,7 +44,9 @@ def fingerprint(root):
     digest = hashlib.sha256()
     for path in sorted(root.rglob("*")):
         if path.is_file():
-            digest.update(str(path.relative_to(root)).encode() + path.read_bytes())
+            digest.update(
+                str(path.relative_to(root)).encode() + path.read_bytes()
+            )
     return digest.hexdigest()
 
 
@@ -60,9 +62,15 @@ def test_layout(dataset):
     meta = json.loads((dataset / "meta.json").read_text())
     cameras = json.loads((dataset / "cameras.json").read_text())
     splits = meta["splits"]
-    assert sorted(cameras) == sorted(splits["train_cameras"] + splits["test_cameras"])
+    assert sorted(cameras) == sorted(
+        splits["train_cameras"] + splits["test_cameras"]
+    )
     assert sorted(splits["train_frames"] + splits["test_frames"]) == [0, 1, 2]
-    assert (meta["unit"], meta["up_axis"], meta["pixel_centre"]) == ("m", "z", 0.5)
+    assert (meta["unit"], meta["up_axis"], meta["pixel_centre"]) == (
+        "m",
+        "z",
+        0.5,
+    )
     assert meta["made_by"]["rays_per_pixel"] == 1
     assert meta["background"] == "black"
     for camera in cameras.values():
@@ -75,7 +83,12 @@ def test_layout(dataset):
         assert len(images(dataset, kind)) == 6
     with np.load(dataset / "landmarks3d.npz", allow_pickle=False) as f:
         assert f["p"].shape == (3, 33, 3)
-        assert f["conf"].shape == f["n_views"].shape == f["reproj_px"].shape == (3, 33)
+        assert (
+            f["conf"].shape
+            == f["n_views"].shape
+            == f["reproj_px"].shape
+            == (3, 33)
+        )
         assert f["frame_id"].tolist() == [0, 1, 2]
     with np.load(dataset / "hands3d.npz", allow_pickle=False) as f:
         assert f["p"].shape == (3, 42, 3)
@@ -86,7 +99,8 @@ def test_layout(dataset):
 
 def test_mask_labels_and_image_agree(dataset):
     for image, mask, labels in zip(
-        *(images(dataset, k) for k in ("images", "masks", "labels")), strict=True
+        *(images(dataset, k) for k in ("images", "masks", "labels")),
+        strict=True,
     ):
         assert image.shape == (32, 32, 3)
         assert mask.shape == labels.shape == (32, 32)
@@ -98,15 +112,21 @@ def test_mask_labels_and_image_agree(dataset):
 
 
 @pytest.mark.parametrize("avatar", EACH_AVATAR)
-def test_the_baked_avatars_have_landmarks_labels_and_no_body_pose(avatar, tmp_path):
+def test_the_baked_avatars_have_landmarks_labels_and_no_body_pose(
+    avatar, tmp_path
+):
     root = tiny(tmp_path, avatar=avatar)
     assert not (root / "body_pose.npz").exists()
     assert "body" not in json.loads((root / "meta.json").read_text())
-    hands, face = (np.load(root / f"{name}3d.npz") for name in ("hands", "face"))
+    hands, face = (
+        np.load(root / f"{name}3d.npz") for name in ("hands", "face")
+    )
     assert hands["p"].shape == (3, 42, 3)
     assert face["p"].shape == (3, len(face["names"]), 3)
     assert not GsganData(root=str(root)).info.has_body_pose
-    for mask, labels in zip(images(root, "masks"), images(root, "labels"), strict=True):
+    for mask, labels in zip(
+        images(root, "masks"), images(root, "labels"), strict=True
+    ):
         assert ((labels > 0) == (mask >= 128)).mean() >= 0.995
 
 
@@ -114,7 +134,9 @@ def test_the_baked_avatars_have_landmarks_labels_and_no_body_pose(avatar, tmp_pa
 def test_landmarks_of_the_baked_avatars_lie_on_their_parts(avatar):
     """Both eyes and the mouth on the face, wrists on arms or hands, toes on shoes."""
     scene = Scene(
-        SceneSettings(**TINY | {"avatar": avatar, "size": 160, "train_cameras": 2})
+        SceneSettings(
+            **TINY | {"avatar": avatar, "size": 160, "train_cameras": 2}
+        )
     )
     names, points = scene.landmarks()
     expected = {
@@ -123,8 +145,14 @@ def test_landmarks_of_the_baked_avatars_lie_on_their_parts(avatar):
         "nose": "face",
         "left_thumb": "hand",
     }
-    expected |= {"right_index": "hand", "left_foot_index": "shoe", "right_heel": "shoe"}
-    labels = scene.posed(1).render(scene.views["cam00"], 4)[2]  # from before the person
+    expected |= {
+        "right_index": "hand",
+        "left_foot_index": "shoe",
+        "right_heel": "shoe",
+    }
+    labels = scene.posed(1).render(scene.views["cam00"], 4)[
+        2
+    ]  # from before the person
     for name, part in expected.items():
         u, v = np.floor(
             scene.views["cam00"].project(points[1, [names.index(name)]])[0]
@@ -136,7 +164,9 @@ def test_landmarks_of_the_baked_avatars_lie_on_their_parts(avatar):
 
 def test_person_is_in_view_and_fills_it():
     scene = Scene(
-        SceneSettings(avatar="free_body", secondary=False, frames=24, test_frames=6)
+        SceneSettings(
+            avatar="free_body", secondary=False, frames=24, test_frames=6
+        )
     )
     top, bottom = [], []
     for frame in range(24):
@@ -152,7 +182,9 @@ def test_person_is_in_view_and_fills_it():
 
 def test_test_cameras_are_between_training_cameras():
     scene = Scene(
-        SceneSettings(avatar="free_body", secondary=False, frames=2, test_frames=1)
+        SceneSettings(
+            avatar="free_body", secondary=False, frames=2, test_frames=1
+        )
     )
     angle = {
         name: math.atan2(view.centre[0], -view.centre[1])
@@ -185,13 +217,19 @@ def test_without_secondary_motion_the_mesh_is_skinned_and_landmarks_stay():
     np.testing.assert_array_equal(still.landmarks()[1], moving.landmarks()[1])
 
 
-def test_the_free_bodys_pose_puts_its_landmarks_where_the_file_has_them(dataset):
+def test_the_free_bodys_pose_puts_its_landmarks_where_the_file_has_them(
+    dataset,
+):
     pose, p = (
         np.load(dataset / "body_pose.npz"),
         np.load(dataset / "landmarks3d.npz")["p"],
     )
-    pose = BodyPose(torch.from_numpy(pose["theta"]), torch.from_numpy(pose["transl"]))
-    np.testing.assert_allclose(free_body().posed_landmarks(pose).numpy(), p, atol=1e-6)
+    pose = BodyPose(
+        torch.from_numpy(pose["theta"]), torch.from_numpy(pose["transl"])
+    )
+    np.testing.assert_allclose(
+        free_body().posed_landmarks(pose).numpy(), p, atol=1e-6
+    )
 
 
 # ---------------------------------------------------------------- the cache
@@ -255,7 +293,9 @@ def test_two_processes_at_once(tmp_path):
     printed = {p.communicate()[0].strip() for p in processes}
     assert [p.returncode for p in processes] == [0, 0]
     assert len(printed) == 1
-    folders = [p for p in (tmp_path / "data" / "synthetic").iterdir() if p.is_dir()]
+    folders = [
+        p for p in (tmp_path / "data" / "synthetic").iterdir() if p.is_dir()
+    ]
     assert [str(p) for p in folders] == list(printed)
 
 
@@ -272,7 +312,12 @@ def test_key_depends_on_every_parameter():
     changed = [
         SceneSettings(**{name: value})
         for name, value in (
-            *(("size", 64), ("train_cameras", 5), ("test_cameras", 1), ("frames", 61)),
+            *(
+                ("size", 64),
+                ("train_cameras", 5),
+                ("test_cameras", 1),
+                ("frames", 61),
+            ),
             *(
                 ("test_frames", 14),
                 ("rays_per_pixel", 5),
@@ -284,7 +329,12 @@ def test_key_depends_on_every_parameter():
                 ("lens", (0.1, 0, 0, 0)),
                 ("lens", (0.1, 0, 0, 0, 0)),
             ),
-            *(("tint", 0.1), ("tint", 0.2), ("gloss", 0.1), ("test_scale", (2.0,))),
+            *(
+                ("tint", 0.1),
+                ("tint", 0.2),
+                ("gloss", 0.1),
+                ("test_scale", (2.0,)),
+            ),
         )
     ]
     changed.append(SceneSettings(test_scale=(2.0,), tint=0.1))
@@ -307,7 +357,10 @@ def test_key_depends_on_every_parameter():
         ({"gloss": 2}, "gloss must be a number from 0.0 to 1.0"),
         ({"test_scale": [9]}, "test_scale must be"),
         ({"test_scale": [2], "test_cameras": 0}, "set test_cameras"),
-        ({"avatar": "nobody"}, "avatar must be blouse, polo, free_body or the path"),
+        (
+            {"avatar": "nobody"},
+            "avatar must be blouse, polo, free_body or the path",
+        ),
         (
             {"motion": "waltz"},
             "far or the path of a .bvh, .amc, .glb, .gltf, .vrma file",

@@ -9,7 +9,12 @@ from mannequin import SHAPES, assert_limits, inside, local, mannequin
 
 from gsgan.motion.rig import SIDES, Pose, Rig
 from gsgan.motion.rotations import axis_angle, rotation
-from gsgan.synthetic.choreography import COMBINATION, EVERYDAY, PASSAGES, held_out
+from gsgan.synthetic.choreography import (
+    COMBINATION,
+    EVERYDAY,
+    PASSAGES,
+    held_out,
+)
 from gsgan.synthetic.controls import frame_times, passages_at
 from gsgan.synthetic.footsteps import Footsteps
 from gsgan.synthetic.free_subject import free_character
@@ -26,11 +31,20 @@ LIMITS = {
     "Head": 30,
     "Shoulder": 30,
 }
-LIMITS |= {"Arm": 125, "ForeArm": 150, "Hand": 60, "UpLeg": 125, "Leg": 150, "Foot": 50}
+LIMITS |= {
+    "Arm": 125,
+    "ForeArm": 150,
+    "Hand": 60,
+    "UpLeg": 125,
+    "Leg": 150,
+    "Foot": 50,
+}
 LIMITS |= {"ToeBase": 35} | {
     f"Hand{finger}1": 95 for finger in ("Index", "Middle", "Pinky")
 }
-LIMITS |= {f"Hand{finger}2": 110 for finger in ("Thumb", "Index", "Middle", "Pinky")}
+LIMITS |= {
+    f"Hand{finger}2": 110 for finger in ("Thumb", "Index", "Middle", "Pinky")
+}
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +78,9 @@ def test_knees_and_elbows_are_hinges(person, dense):
     _, moves = dense
     for side, sign in (("Left", 1), ("Right", -1)):
         knee = axis_angle(local(person, moves, side + "Leg"))
-        assert knee[:, 0].min() > 0  # flexion, about the axis to the person's left
+        assert (
+            knee[:, 0].min() > 0
+        )  # flexion, about the axis to the person's left
         assert np.abs(knee[:, 1:]).max() < 0.1
         elbow = axis_angle(local(person, moves, side + "ForeArm"))
         assert (-sign * elbow[:, 2]).min() > 0
@@ -72,7 +88,9 @@ def test_knees_and_elbows_are_hinges(person, dense):
 
 def test_motion_is_smooth_and_repeatable(person, dense):
     times, moves = dense
-    assert np.linalg.norm(np.diff(moves.joints[:, 0], axis=0), axis=1).max() < 0.04
+    assert (
+        np.linalg.norm(np.diff(moves.joints[:, 0], axis=0), axis=1).max() < 0.04
+    )
     turned = np.swapaxes(moves.rotations[:-1], -1, -2) @ moves.rotations[1:]
     # fingers, in a 50th second
     assert np.linalg.norm(axis_angle(turned), axis=-1).max() < 0.5
@@ -88,7 +106,9 @@ def test_motion_is_smooth_and_repeatable(person, dense):
 def test_bones_keep_their_lengths(person, dense):
     _, moves = dense
     for j, parent in enumerate(person.parents[1:], 1):
-        now = np.linalg.norm(moves.joints[:, j] - moves.joints[:, parent], axis=-1)
+        now = np.linalg.norm(
+            moves.joints[:, j] - moves.joints[:, parent], axis=-1
+        )
         assert np.ptp(now) < 1e-9
 
 
@@ -106,7 +126,9 @@ def test_standing_feet_do_not_slide(person, seed):
             joint(person, moves, side + "ToeBase"),
             joint(person, moves, side + "Foot"),
         )
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], state.height < 1e-9, [0]])))
+        edges = np.flatnonzero(
+            np.diff(np.concatenate([[0], state.height < 1e-9, [0]]))
+        )
         for begin, end in edges.reshape(-1, 2):
             assert np.ptp(toe[begin:end], axis=0).max() < 1e-3
             flat = ankle[begin:end][state.pitch[begin:end] < 1e-9]
@@ -125,7 +147,9 @@ def test_soles_stay_on_the_floor(person, free):
 def arms_in_trunk(body, moves) -> np.ndarray:
     """``[F]`` share of the vertices of forearms and hands that lie within the trunk."""
     names = np.array(body.bones)[
-        body.bone_index[np.arange(len(body.vertices)), body.bone_weight.argmax(axis=1)]
+        body.bone_index[
+            np.arange(len(body.vertices)), body.bone_weight.argmax(axis=1)
+        ]
     ]
     of_trunk = np.isin(
         names, ["Hips", "Spine", "Spine1", "Spine2", "spine02", "Neck", "Head"]
@@ -148,7 +172,9 @@ def arms_in_trunk(body, moves) -> np.ndarray:
 def test_arms_do_not_pass_through_the_trunk(free):
     moves = Choreography(free).at(frame_times(70, EVERYDAY.duration))
     assert (arms_in_trunk(free, moves) > 0.005).mean() <= 0.02
-    signs = Choreography(free, programme=SIGNS).at(frame_times(40, SIGNS.duration))
+    signs = Choreography(free, programme=SIGNS).at(
+        frame_times(40, SIGNS.duration)
+    )
     assert arms_in_trunk(free, signs).max() < 0.02
     # the measure sees hands in the belly
     pushed = replace(
@@ -166,7 +192,9 @@ def test_rest_poses_do_not_matter(person):
     choreography = Choreography(person)
     # arms down, knees bent
     standing = choreography.at(EVERYDAY.duration - np.array([1e-3]))
-    vertices, normals = person.skinned(standing.rotations[0], standing.joints[0])
+    vertices, normals = person.skinned(
+        standing.rotations[0], standing.joints[0]
+    )
     down = replace(
         person, vertices=vertices, normals=normals, joints=standing.joints[0]
     )
@@ -187,14 +215,18 @@ def test_fingers_curl_towards_the_palm(person):
                 pose.rotation(pose.parent(bone)) @ rotation(0.7 * hinge)[None]
             )
         for finger in ("Index", "Middle", "Ring", "Pinky"):
-            base, tip = (pose.position(f"{side}Hand{finger}{k}")[0] for k in (1, 4))
+            base, tip = (
+                pose.position(f"{side}Hand{finger}{k}")[0] for k in (1, 4)
+            )
             assert tip[2] < base[2] - 0.03  # palms look down in a T pose
         little = person.joints[person.bones.index(f"{side}HandPinky1")]
         tip, rest = (
             pose.position(side + "HandThumb4")[0],
             rig.joint[side + "HandThumb4"],
         )
-        assert np.linalg.norm(tip - little) < np.linalg.norm(rest - little) - 0.02
+        assert (
+            np.linalg.norm(tip - little) < np.linalg.norm(rest - little) - 0.02
+        )
         assert sign * tip[0] > 0
 
 
@@ -242,7 +274,9 @@ def test_held_out_frames_are_blocks_and_one_whole_passage():
     rest = [i for i in test if i not in combination]
     # blocks, not single frames
     assert all(i - 1 in rest or i + 1 in rest for i in rest)
-    assert {names[i] for i in range(84) if i not in test} == set(names) - {COMBINATION}
+    assert {names[i] for i in range(84) if i not in test} == set(names) - {
+        COMBINATION
+    }
     assert set(names) == {passage[0] for passage in PASSAGES}
 
 

@@ -21,7 +21,11 @@ from gsgan.utils.errors import ConfigError
 
 LENS = (-0.28, 0.09, 0.001, -0.0008, -0.01)
 # Three cameras: the tints of two would be each other's inverse, as their mean is none.
-TINY = tiny_characters.TINY | {"size": 48, "train_cameras": 3, "rays_per_pixel": 2}
+TINY = tiny_characters.TINY | {
+    "size": 48,
+    "train_cameras": 3,
+    "rays_per_pixel": 2,
+}
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +34,9 @@ def scene(tmp_path_factory):
     cache = tmp_path_factory.mktemp("cache")
 
     def run(**options):
-        return ensure_scene(cache=cache, workers=1, progress=False, **TINY, **options)
+        return ensure_scene(
+            cache=cache, workers=1, progress=False, **TINY, **options
+        )
 
     return run
 
@@ -42,16 +48,18 @@ def stage():
 
 def images(root, kind, camera):
     paths = sorted((root / kind / camera).glob("*.png"))
-    return np.stack([cv2.imread(str(p), cv2.IMREAD_UNCHANGED) for p in paths]).astype(
-        float
-    )
+    return np.stack(
+        [cv2.imread(str(p), cv2.IMREAD_UNCHANGED) for p in paths]
+    ).astype(float)
 
 
 # ---------------------------------------------------------------- the default person
 
 
 def test_options_without_effect_give_the_default_persons_folder():
-    nothing = SceneSettings(**TINY, lens=[0.0] * 5, tint=0, gloss=0, test_scale=[])
+    nothing = SceneSettings(
+        **TINY, lens=[0.0] * 5, tint=0, gloss=0, test_scale=[]
+    )
     assert nothing == SceneSettings(**TINY)
     assert dataset_key(nothing) == dataset_key(SceneSettings(**TINY))
 
@@ -60,7 +68,9 @@ def test_person_and_motion_of_a_variant_are_the_default_ones(scene):
     plain, tinted = scene(), scene(tint=0.1)
     for name in ("landmarks3d.npz", "hands3d.npz", "body_pose.npz"):
         assert (plain / name).read_bytes() == (tinted / name).read_bytes()
-    assert (plain / "cameras.json").read_text() == (tinted / "cameras.json").read_text()
+    assert (plain / "cameras.json").read_text() == (
+        tinted / "cameras.json"
+    ).read_text()
 
 
 # ---------------------------------------------------------------- lenses
@@ -86,7 +96,9 @@ def test_the_ray_of_a_points_pixel_hits_the_point(stage):
             [view.project(points), np.ones((len(points), 1))], axis=1
         )
         pinhole = pixel @ np.linalg.inv(view.K).T @ view.R
-        rays = view.bend(pinhole / np.linalg.norm(pinhole, axis=1, keepdims=True))
+        rays = view.bend(
+            pinhole / np.linalg.norm(pinhole, axis=1, keepdims=True)
+        )
         off = np.linalg.norm(np.cross(points - view.centre, rays), axis=1)
         assert off.max() < 1e-8
 
@@ -117,7 +129,9 @@ def test_tints_differ_between_cameras_and_average_to_none():
     gaps = [np.abs(A[i] - A[j]).max() for i in range(6) for j in range(i)]
     assert min(gaps) > 0.01
     again, other = make_tints(0.08, 6, seed=0), make_tints(0.08, 6, seed=1)
-    assert all(np.array_equal(s.A, t.A) for s, t in zip(tints, again, strict=True))
+    assert all(
+        np.array_equal(s.A, t.A) for s, t in zip(tints, again, strict=True)
+    )
     assert not np.array_equal(tints[0].A, other[0].A)
 
 
@@ -141,18 +155,26 @@ def test_each_training_camera_keeps_its_tint_over_all_frames(scene):
             images(plain, "images", camera), images(tinted, "images", camera), masks,
             strict=True,
         ):  # fmt: skip
-            sure = (mask == 255) & (after.max(axis=-1) < 255) & (after.min(axis=-1) > 0)
+            sure = (
+                (mask == 255)
+                & (after.max(axis=-1) < 255)
+                & (after.min(axis=-1) > 0)
+            )
             rgb = np.concatenate(
                 [before[sure][:, ::-1] / 255, np.ones((sure.sum(), 1))], axis=1
             )
-            found = np.linalg.lstsq(rgb, after[sure][:, ::-1] / 255, rcond=None)[0].T
+            found = np.linalg.lstsq(
+                rgb, after[sure][:, ::-1] / 255, rcond=None
+            )[0].T
             np.testing.assert_allclose(found[:, :3], tint.A, atol=0.03)
             np.testing.assert_allclose(found[:, 3], tint.b, atol=0.01)
 
 
 def test_held_out_cameras_are_neutral_and_no_file_contains_the_tints(scene):
     plain, tinted = scene(), scene(tint=0.1)
-    assert np.array_equal(*(images(r, "images", "cam03") for r in (plain, tinted)))
+    assert np.array_equal(
+        *(images(r, "images", "cam03") for r in (plain, tinted))
+    )
     gain = repr(float(make_tints(0.1, 3, 0)[0].A[0, 0]))[:8]
     for path in tinted.rglob("*.json"):
         assert gain not in path.read_text()
@@ -173,15 +195,22 @@ def test_scaled_test_cameras_see_the_person_at_their_scale(scene, stage):
     views = Scene(SceneSettings(**TINY, test_scale=(0.5, 2.0))).views
     for scale in (0.5, 2.0):
         twin = f"cam03_x{scale:g}"
-        assert layout.cameras[twin].K[0, 0] == scale * layout.cameras["cam03"].K[0, 0]
+        assert (
+            layout.cameras[twin].K[0, 0]
+            == scale * layout.cameras["cam03"].K[0, 0]
+        )
         expected = scale * (views["cam03"].project(p) - middle) + middle
         np.testing.assert_allclose(views[twin].project(p), expected)
     area = {c: images(root, "masks", c).sum() for c in splits["test_cameras"]}
     assert area["cam03_x0.5"] == pytest.approx(area["cam03"] / 4, rel=0.05)
     small = images(root, "images", "cam03_x0.5")[0]
     shrunk = cv2.resize(
-        images(root, "images", "cam03")[0], (24, 24), interpolation=cv2.INTER_AREA
+        images(root, "images", "cam03")[0],
+        (24, 24),
+        interpolation=cv2.INTER_AREA,
     )
     assert np.abs(small[12:36, 12:36] - shrunk).mean() < 6
     for camera in ("cam00", "cam03"):
-        assert np.array_equal(*(images(r, "images", camera) for r in (scene(), root)))
+        assert np.array_equal(
+            *(images(r, "images", camera) for r in (scene(), root))
+        )

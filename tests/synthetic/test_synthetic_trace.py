@@ -11,7 +11,13 @@ from gsgan.motion.character import Surface
 from gsgan.synthetic import trace
 from gsgan.synthetic.camera import SceneCamera, pixel_offsets, pixel_rays
 from gsgan.synthetic.textures import Textures, linear
-from gsgan.synthetic.trace import Appearance, Light, PosedCharacter, Wrinkles, encode
+from gsgan.synthetic.trace import (
+    Appearance,
+    Light,
+    PosedCharacter,
+    Wrinkles,
+    encode,
+)
 
 GREY = 0.21586  # linear light of sRGB 128
 MATT = Light(direction=(0, 3, 4), sun=(0.4, 0.3, 0.2), sky=(0.3,) * 3, ground=(0.1,) * 3,
@@ -34,7 +40,9 @@ def lumpy(seed=0):
     for scale, middle in (((0.3, 0.2, 0.5), (0, 0, 0)), ((0.6, 0.03, 0.03), (0.4, 0, 0.2)),
                           ((0.02, 0.02, 0.5), (-0.2, 0.1, -0.6))):  # fmt: skip
         ball = trimesh.creation.icosphere(subdivisions=2)
-        v = ball.vertices * (1 + 0.15 * rng.normal(size=(len(ball.vertices), 1)))
+        v = ball.vertices * (
+            1 + 0.15 * rng.normal(size=(len(ball.vertices), 1))
+        )
         v = v * scale + middle
         parts.append((v, ball.faces, rng.random((len(v), 2))))
     return character(parts, labels=[1, 2, 3])
@@ -42,7 +50,9 @@ def lumpy(seed=0):
 
 def test_square_covers_exactly_its_pixels():
     # 2 m below the camera: 20 px / m / 2 m, 10 pixels wide
-    _, alpha, labels = posed(character([square(1.0, 0.5)])).render(from_above(), 4)
+    _, alpha, labels = posed(character([square(1.0, 0.5)])).render(
+        from_above(), 4
+    )
     expected = np.zeros((20, 20))
     expected[5:15, 5:15] = 1
     assert np.array_equal(alpha, expected)
@@ -56,10 +66,14 @@ def test_shading_matches_the_formula():
 
 
 def test_the_back_of_cloth_is_lit_on_its_own_side():
-    below = SceneCamera(from_above().K, np.eye(3), np.array([0, 0, 1.0]), (20, 20))
+    below = SceneCamera(
+        from_above().K, np.eye(3), np.array([0, 0, 1.0]), (20, 20)
+    )
     image, alpha, _ = posed(character([square(1.0, 0.5)])).render(below, 1)
     assert alpha[10, 10] == 1
-    np.testing.assert_allclose(image[10, 10], encode(np.full(3, GREY * 0.1)), rtol=2e-4)
+    np.testing.assert_allclose(
+        image[10, 10], encode(np.full(3, GREY * 0.1)), rtol=2e-4
+    )
 
 
 def test_shadow_falls_away_from_the_sun():
@@ -69,7 +83,9 @@ def test_shadow_falls_away_from_the_sun():
     image, _, labels = posed(c, light).render(view, 1)
     assert set(np.unique(labels)) == {0, 1, 2}
     shaded, lit = at(view, image, (-0.5, 0, 0)), at(view, image, (-0.8, 0, 0))
-    assert np.all(shaded < 0.85 * lit)  # 0.5 m high, light from +x at 45°: 0.5 m to -x
+    assert np.all(
+        shaded < 0.85 * lit
+    )  # 0.5 m high, light from +x at 45°: 0.5 m to -x
     np.testing.assert_allclose(lit, at(view, image, (0.7, 0.6, 0)), rtol=0.02)
     soft, _, _ = posed(c, replace(light, spread=0.2)).render(view, 64)
     edge = at(view, soft, (-0.5, 0.1, 0))
@@ -78,14 +94,20 @@ def test_shadow_falls_away_from_the_sun():
 
 def test_the_sky_is_darker_under_cover():
     c = character([square(0.0, 1.0), square(0.3, 0.5)])
-    sky = PosedCharacter(Appearance(c), c.vertices, c.normals, MATT).attributes[:, 6:8]
-    np.testing.assert_allclose(sky[4:, 0], 1)  # nothing is above the upper square
+    sky = PosedCharacter(Appearance(c), c.vertices, c.normals, MATT).attributes[
+        :, 6:8
+    ]
+    np.testing.assert_allclose(
+        sky[4:, 0], 1
+    )  # nothing is above the upper square
     assert np.all(sky[4:, 1] < 0.9)
 
 
 def test_a_coarse_sphere_has_no_facets_in_its_shadow():
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
-    c = character([(ball.vertices, ball.faces, np.zeros((len(ball.vertices), 2)))])
+    c = character(
+        [(ball.vertices, ball.faces, np.zeros((len(ball.vertices), 2)))]
+    )
     dark = replace(
         MATT, direction=(1, 0, 0), sun=(1, 1, 1), sky=(0,) * 3, ground=(0,) * 3
     )
@@ -95,13 +117,18 @@ def test_a_coarse_sphere_has_no_facets_in_its_shadow():
     for angle in (0.15, 0.3, 0.6, 0.9):
         point = 0.5 * np.array([np.sin(angle), -np.cos(angle), 0])
         expected = encode(GREY * np.array([np.sin(angle)]))
-        np.testing.assert_allclose(at(view, image, point)[0], expected, atol=0.05)
+        np.testing.assert_allclose(
+            at(view, image, point)[0], expected, atol=0.05
+        )
 
 
 def test_texture_is_upright():
     colours = np.zeros((64, 64, 4), np.uint8)
     colours[:32, :32], colours[:32, 32:] = (255, 0, 0, 255), (0, 255, 0, 255)
-    colours[32:, :32], colours[32:, 32:] = (0, 0, 255, 255), (255, 255, 255, 255)
+    colours[32:, :32], colours[32:, 32:] = (
+        (0, 0, 255, 255),
+        (255, 255, 255, 255),
+    )
     c = character([square(1.0, 0.5)], [Surface("four", colours)])
     image, _, _ = posed(c).render(from_above(), 1)
     # top left is red: v runs down, +y is up in the image
@@ -113,7 +140,9 @@ def test_texture_is_upright():
 
 def test_fine_texture_is_averaged_as_light():
     checks = np.indices((512, 512)).sum(axis=0) % 2 * 255
-    colours = np.dstack([checks] * 3 + [np.full((512, 512), 255)]).astype(np.uint8)
+    colours = np.dstack([checks] * 3 + [np.full((512, 512), 255)]).astype(
+        np.uint8
+    )
     c = character([square(1.0, 0.5)], [Surface("checks", colours)])
     image, _, _ = posed(c).render(from_above(), 1)
     expected = encode(0.5 * (0.8 * np.array(MATT.sun) + 0.3))
@@ -127,7 +156,8 @@ def test_textures_are_bilinear_and_repeat():
     colours[0, 1] = 255
     textures = Textures((Surface("two", colours), plain()))
     uv = np.array(
-        [[0.25, 0.5], [0.75, 0.3], [0.5, 0.5], [1.25, 7.0], [-0.25, 0.5]], np.float32
+        [[0.25, 0.5], [0.75, 0.3], [0.5, 0.5], [1.25, 7.0], [-0.25, 0.5]],
+        np.float32,
     )
     zero = np.zeros(5, int)
     rgb, coverage, normal = textures(zero, uv, zero)
@@ -151,7 +181,9 @@ def test_rays_and_sun_pass_through_cut_outs():
     assert at(view, labels, (0.4, 0, 0.5)) == 1
     assert alpha[30, 30] == 1
     hole, shaded = at(view, image, (-0.1, 0, 0)), at(view, image, (-0.66, 0, 0))
-    assert np.all(hole > 1.2 * shaded)  # the sun shines through the hole, 0.2 m to -x
+    assert np.all(
+        hole > 1.2 * shaded
+    )  # the sun shines through the hole, 0.2 m to -x
     opaque = character(
         [square(0.5, 0.5), square(0.0, 1.0)], [replace(holey, cutoff=0), dark]
     )
@@ -159,10 +191,14 @@ def test_rays_and_sun_pass_through_cut_outs():
 
 
 def test_normal_map_tilts_towards_its_axes():
-    tilted = np.array([[[128 + 76, 128, 128 + 102]]], np.uint8)  # 0.6 along +u, 0.8 up
+    tilted = np.array(
+        [[[128 + 76, 128, 128 + 102]]], np.uint8
+    )  # 0.6 along +u, 0.8 up
     c = character([square(1.0, 0.5)], [plain(normal=tilted)])
     bright = [
-        posed(c, replace(MATT, direction=d)).render(from_above(), 1)[0][10, 10, 0]
+        posed(c, replace(MATT, direction=d)).render(from_above(), 1)[0][
+            10, 10, 0
+        ]
         for d in ((0.6, 0, 0.8), (-0.6, 0, 0.8), (0, 0.6, 0.8))
     ]
     assert bright[0] > bright[2] > bright[1]
@@ -170,9 +206,9 @@ def test_normal_map_tilts_towards_its_axes():
     up = np.array([[[128, 128 + 76, 128 + 102]]], np.uint8)
     c = character([square(1.0, 0.5)], [plain(normal=up)])
     bright = [
-        posed(c, replace(MATT, direction=(0, y, 0.8))).render(from_above(), 1)[0][
-            10, 10, 0
-        ]
+        posed(c, replace(MATT, direction=(0, y, 0.8))).render(from_above(), 1)[
+            0
+        ][10, 10, 0]
         for y in (0.6, -0.6)
     ]
     assert bright[0] > bright[1]
@@ -187,9 +223,9 @@ def test_wrinkles_tilt_normals():
         from_above(), 1
     )
     assert np.array_equal(smooth, posed(c, light).render(from_above(), 1)[0])
-    folded, _, _ = posed(c, light, Wrinkles(phase, 0 * phase + 0.5, across)).render(
-        from_above(), 1
-    )
+    folded, _, _ = posed(
+        c, light, Wrinkles(phase, 0 * phase + 0.5, across)
+    ).render(from_above(), 1)
     assert np.ptp(folded[10, 5:15, 0]) > 0.05
     np.testing.assert_allclose(folded[6, 5:15], folded[13, 5:15], atol=1e-5)
 
@@ -198,7 +234,9 @@ def test_gloss_is_of_clothes_only():
     light = replace(MATT, direction=(0, 0, 1), gloss=0.5)
     for label, shines in ((2, True), (3, False)):
         c = character([square(1.0, 0.5)], labels=[label])
-        dull, glossy = (posed(c, x).render(from_above(), 1)[0] for x in (MATT, light))
+        dull, glossy = (
+            posed(c, x).render(from_above(), 1)[0] for x in (MATT, light)
+        )
         matt = posed(c, replace(light, gloss=0)).render(from_above(), 1)[0]
         assert np.array_equal(matt, glossy) != shines
         assert dull.max() < glossy.max()
@@ -256,7 +294,10 @@ def test_masks_and_labels_agree_with_a_z_buffer(view):
     mask, other = alpha > 0.5, coverage > 0.5
     assert mask.sum() > 1500
     assert (mask & other).sum() >= 0.995 * (mask | other).sum()
-    assert np.minimum(alpha, coverage).sum() >= 0.99 * np.maximum(alpha, coverage).sum()
+    assert (
+        np.minimum(alpha, coverage).sum()
+        >= 0.99 * np.maximum(alpha, coverage).sum()
+    )
     assert (labels[mask] > 0).mean() >= 0.995
     pure = (blocks == blocks[..., :1]).all(axis=-1)
     assert np.array_equal(labels[pure], blocks[pure][:, 0])
@@ -307,8 +348,12 @@ def test_rays_are_spread_about_pixel_centres(rays):
     assert len(np.unique(offsets, axis=0)) == rays
     assert offsets.min() >= 0
     assert offsets.max() < 1
-    np.testing.assert_allclose(np.sort(offsets[:, 0]), (np.arange(rays) + 0.5) / rays)
-    np.testing.assert_allclose(offsets.mean(axis=0), 0.5, atol=0.13 if rays > 1 else 0)
+    np.testing.assert_allclose(
+        np.sort(offsets[:, 0]), (np.arange(rays) + 0.5) / rays
+    )
+    np.testing.assert_allclose(
+        offsets.mean(axis=0), 0.5, atol=0.13 if rays > 1 else 0
+    )
     view = from_above()
     origin, directions = pixel_rays(view, np.array([3]), np.array([4]), rays)
     pixel = view.project(origin + directions)

@@ -26,13 +26,24 @@ def plain(rgb=(128, 128, 128), **surface):
 def square(z, half, uv=((0, 1), (1, 1), (1, 0), (0, 0))):
     """Vertices, faces and uv of two triangles facing up at a height; +y is up in its texture."""
     v = np.array(
-        [[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]], float
+        [
+            [-half, -half, z],
+            [half, -half, z],
+            [half, half, z],
+            [-half, half, z],
+        ],
+        float,
     )
     return v, np.array([[0, 1, 2], [0, 2, 3]]), np.array(uv, float)
 
 
 def character(
-    parts, surfaces=None, labels=None, bones=("Hips",), joints=None, weights=None
+    parts,
+    surfaces=None,
+    labels=None,
+    bones=("Hips",),
+    joints=None,
+    weights=None,
 ):
     """A character of parts ``(vertices, faces, uv)``, each with its own surface and label."""
     count = np.cumsum([0, *(len(p[0]) for p in parts)])
@@ -59,7 +70,9 @@ def character(
         surfaces=tuple(surfaces),
         bones=bones,
         parents=np.arange(len(bones)) - 1,
-        joints=np.zeros((len(bones), 3)) if joints is None else np.array(joints, float),
+        joints=np.zeros((len(bones), 3))
+        if joints is None
+        else np.array(joints, float),
         bone_index=index,
         bone_weight=weight,
         shapes={},
@@ -89,4 +102,6 @@ def from_front(size=64, distance=3.0, focal=64.0, height=0.0):
     """A camera in front of the person, looking along +y."""
     K = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
     R = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    return SceneCamera(K, R, -R @ np.array([0, -distance, height]), (size, size))
+    return SceneCamera(
+        K, R, -R @ np.array([0, -distance, height]), (size, size)
+    )

@@ -35,9 +35,18 @@ for side, s in (("Left", 1), ("Right", -1)):
         f"{side}Leg": ((0.09 * s, 0.5, 0), (0.07, 0.4, 0.07)),
         f"{side}Foot": ((0.09 * s, 0.05, 0.06), (0.05, 0.05, 0.13)),
     }
-CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+CORNERS = np.array(
+    [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
+)
 SIDES = np.array(
-    [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    [
+        [0, 1, 3, 2],
+        [4, 6, 7, 5],
+        [0, 4, 5, 1],
+        [2, 3, 7, 6],
+        [0, 2, 6, 4],
+        [1, 5, 7, 3],
+    ]
 )
 
 
@@ -73,7 +82,9 @@ class GlbWriter:
         indices = pygltflib.AccessorSparseIndices(
             bufferView=self.view(at.astype("u2").tobytes()), componentType=5123
         )
-        rows = pygltflib.AccessorSparseValues(bufferView=self.view(values.tobytes()))
+        rows = pygltflib.AccessorSparseValues(
+            bufferView=self.view(values.tobytes())
+        )
         sparse = pygltflib.Sparse(count=len(at), indices=indices, values=rows)
         accessor = pygltflib.Accessor(
             componentType=5126, count=count, type="VEC3", sparse=sparse
@@ -103,9 +114,13 @@ class TinyGlb(GlbWriter):
         for bone, (parent, _) in BONES.items():
             step = joints[bone] - (joints[parent] if parent else 0)
             name = (names or {}).get(bone, prefix + bone)
-            self.doc.nodes.append(pygltflib.Node(name=name, translation=step.tolist()))
+            self.doc.nodes.append(
+                pygltflib.Node(name=name, translation=step.tolist())
+            )
             if parent:
-                self.doc.nodes[order.index(parent)].children.append(order.index(bone))
+                self.doc.nodes[order.index(parent)].children.append(
+                    order.index(bone)
+                )
         x = np.concatenate(
             [unit * (np.array(c) + CORNERS * h) for c, h in BOXES.values()]
         )
@@ -113,7 +128,9 @@ class TinyGlb(GlbWriter):
         quads = (first + SIDES).reshape(-1, 4)
         faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
         owner = np.repeat([order.index(bone) for bone in BOXES], 8)
-        index = np.stack([owner, 0 * owner, 0 * owner, 0 * owner], 1).astype(np.uint8)
+        index = np.stack([owner, 0 * owner, 0 * owner, 0 * owner], 1).astype(
+            np.uint8
+        )
         # sums to a half
         weight = np.tile(np.array([128, 0, 0, 0], np.uint8), (len(x), 1))
         bind = np.tile(np.eye(4), (len(order), 1, 1))
@@ -128,20 +145,28 @@ class TinyGlb(GlbWriter):
         step = np.tile([0, -0.01 * unit, 0], (8, 1)).astype("f4")
         primitive = pygltflib.Primitive(
             attributes=attributes,
-            indices=self.accessor(faces.ravel().astype("u2")[:, None], "SCALAR"),
+            indices=self.accessor(
+                faces.ravel().astype("u2")[:, None], "SCALAR"
+            ),
             material=0,
             targets=[{"POSITION": self.sparse(self.head, step, len(x))}],
         )
         self.doc.meshes.append(
-            pygltflib.Mesh(primitives=[primitive], extras={"targetNames": ["jawOpen"]})
+            pygltflib.Mesh(
+                primitives=[primitive], extras={"targetNames": ["jawOpen"]}
+            )
         )
         matrices = self.accessor(bind.reshape(-1, 16).astype("f4"), "MAT4")
         self.doc.skins.append(
-            pygltflib.Skin(inverseBindMatrices=matrices, joints=list(range(len(order))))
+            pygltflib.Skin(
+                inverseBindMatrices=matrices, joints=list(range(len(order)))
+            )
         )
         self.doc.nodes.append(pygltflib.Node(name="person", mesh=0, skin=0))
         self.doc.scenes.append(pygltflib.Scene(nodes=[0, len(order)]))
-        colour = Image.fromarray(np.full((4, 6, 4), (200, 150, 120, 128), np.uint8))
+        colour = Image.fromarray(
+            np.full((4, 6, 4), (200, 150, 120, 128), np.uint8)
+        )
         info = pygltflib.TextureInfo(index=self.texture(colour, "PNG"))
         shader = pygltflib.PbrMetallicRoughness(baseColorTexture=info)
         self.doc.materials.append(

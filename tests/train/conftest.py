@@ -14,7 +14,9 @@ from gsgan.train.run import build_training
 def make(tiny, tmp_path):
     """(module, trainer, data) of the tiny config; the trainer fits the whole smoke schedule."""
 
-    def run(*overrides: str, **trainer) -> tuple[AvatarTraining, Trainer, object]:
+    def run(
+        *overrides: str, **trainer
+    ) -> tuple[AvatarTraining, Trainer, object]:
         data, module = build_training(tiny(*overrides))
         epochs = math.ceil(module.schedule.total / module.schedule.epoch)
         options = {"max_epochs": epochs, "limit_val_batches": 0} | trainer

@@ -12,7 +12,9 @@ from splat_scenes import camera, cloud
 
 from gsgan.splat import ACCURACY, rasterise
 
-pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+pytestmark = pytest.mark.skipif(
+    not torch.cuda.is_available(), reason="needs CUDA"
+)
 
 
 @pytest.mark.parametrize("name", ["high", "standard"])
@@ -36,16 +38,24 @@ def test_an_avatar_paints_the_same(build):
     _, avatar, frame = build()
     with torch.no_grad():
         image = avatar.eval()(*frame.inputs).image
-        on_cuda = avatar.cuda()(*frame.to(torch.device("cuda")).inputs).image.cpu()
+        on_cuda = avatar.cuda()(
+            *frame.to(torch.device("cuda")).inputs
+        ).image.cpu()
         with torch.autocast("cuda", dtype=torch.bfloat16):
-            half = avatar(*frame.to(torch.device("cuda")).inputs).image.float().cpu()
+            half = (
+                avatar(*frame.to(torch.device("cuda")).inputs)
+                .image.float()
+                .cpu()
+            )
     assert float((on_cuda - image).abs().max()) < 1e-2  # TF32
     assert float((half - image).abs().mean()) < 2e-2
 
 
 @pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
 def test_every_phase_trains(make, precision):
-    module, trainer, data = make(accelerator="gpu", devices=1, precision=precision)
+    module, trainer, data = make(
+        accelerator="gpu", devices=1, precision=precision
+    )
     trainer.fit(module, data)
     assert module.step == module.schedule.total
     assert not module.skipped.steps

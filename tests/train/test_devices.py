@@ -55,8 +55,12 @@ def place(request, monkeypatch):
         for cache in CACHES:  # of real tensors
             cache.cache_clear()
         monkeypatch.setattr(gsplat_backend, "DEVICE", "meta")
-        monkeypatch.setattr(gsplat_backend, "why_not", lambda settings, device: "")
-        monkeypatch.setattr(gsplat_backend, "given_up", lambda settings, device: "")
+        monkeypatch.setattr(
+            gsplat_backend, "why_not", lambda settings, device: ""
+        )
+        monkeypatch.setattr(
+            gsplat_backend, "given_up", lambda settings, device: ""
+        )
         monkeypatch.setattr(gsplat_backend, "draw", drawn)
         # knows no meta
         monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())
@@ -82,7 +86,9 @@ def drawn(gaussians, camera, settings):
         gaussians.features,
     )
     one = sum(x.sum() for x in (*parts, camera.K, camera.R, camera.t))
-    features = one.expand(len(camera), gaussians.features.shape[-1], *camera.size)
+    features = one.expand(
+        len(camera), gaussians.features.shape[-1], *camera.size
+    )
     return features, features[:, :1]
 
 
@@ -96,7 +102,9 @@ def gradients(module: AvatarTraining) -> set[str]:
     """Lets the module make backward passes without steps; the optimisers whose parameters all had
     a gradient are added to the set."""
     groups, found = (
-        parameter_groups(module.avatar, module.feature_head, module.discriminator),
+        parameter_groups(
+            module.avatar, module.feature_head, module.discriminator
+        ),
         set(),
     )
     names = {id(p): name for name, p in module.named_parameters()}
@@ -117,8 +125,15 @@ def gradients(module: AvatarTraining) -> set[str]:
 
 ONE_EACH = (
     *("training.schedule.segmentation=1", "training.schedule.step_one=1"),
-    *("training.schedule.step_two=1", "training.schedule.discriminator_start=0"),
-    *("training.schedule.degree_every=0", "training.average=null", "effects=all"),
+    *(
+        "training.schedule.step_two=1",
+        "training.schedule.discriminator_start=0",
+    ),
+    *(
+        "training.schedule.degree_every=0",
+        "training.average=null",
+        "effects=all",
+    ),
 )
 
 
@@ -131,7 +146,9 @@ def start(make):
         frame = data.dataset("train")[0]
         lens = torch.tensor([[-0.2, 0.05, 0.001, 0.0, 0.0]])
         frame = replace(frame, camera=replace(frame.camera, dist=lens))
-        return module, module.avatar.window(frame.skeleton, frame.camera).frame(frame)
+        return module, module.avatar.window(frame.skeleton, frame.camera).frame(
+            frame
+        )
 
     return run
 
@@ -158,11 +175,21 @@ def test_layers_and_export(start, place):
         for layer in layers(avatar):
             image = shown(layer, rendering, behind)
             assert image.shape == (*truth.camera.size, 3)
-        splats = splats_of(avatar, frame.skeleton, frame.visibility > 0, frame.body)
+        splats = splats_of(
+            avatar, frame.skeleton, frame.visibility > 0, frame.body
+        )
         assert splats.means.shape == rendering.gaussians.means[0].shape
-        if not rendering.image.is_meta:  # programs are exported from a copy on the host
+        if (
+            not rendering.image.is_meta
+        ):  # programs are exported from a copy on the host
             camera = truth.camera
-            given = (truth.skeleton, truth.visibility, camera.K, camera.R, camera.t)
+            given = (
+                truth.skeleton,
+                truth.visibility,
+                camera.K,
+                camera.R,
+                camera.t,
+            )
             program = programs.Whole(programs.unfrozen(avatar), camera.size)
             image, _ = program(*given, truth.body.theta, truth.body.transl)
             assert image.device.type == "cpu"

@@ -20,7 +20,9 @@ class Spoil(Callback):
         self.change, self.first, self.once = change, first, once
 
     def on_train_batch_start(self, trainer, module, batch, batch_idx):
-        if module.step == self.first or (module.step > self.first and not self.once):
+        if module.step == self.first or (
+            module.step > self.first and not self.once
+        ):
             self.change(module, batch)
 
 
@@ -56,7 +58,11 @@ CASES = {
         lambda _, batch: batch.body.theta.fill_(NAN),
         r"body.theta of the data is not",
     ),
-    "psi": (9, weights("avatar.deformation", 1e20), "weights of psi have exploded"),
+    "psi": (
+        9,
+        weights("avatar.deformation", 1e20),
+        "weights of psi have exploded",
+    ),
     "segmentation": (
         1,
         weights("avatar.segmentation", NAN),
@@ -122,7 +128,10 @@ def test_a_collapsed_discriminator_is_undone_and_stops_the_run_when_it_recurs(
     make, capsys
 ):
     spoil = Spoil(weights("discriminator", 0.0), 26)
-    words = ("training.rollback.max_restorations=1", "training.schedule.step_two=20")
+    words = (
+        "training.rollback.max_restorations=1",
+        "training.schedule.step_two=20",
+    )
     module, trainer, data = make(*LONGER, *words, callbacks=[spoil])
     with pytest.raises(GsganError, match="the discriminator has collapsed"):
         trainer.fit(module, data)

@@ -14,7 +14,12 @@ def trained(inside, capture, tmp_path):
 
     def run(*arguments: str):
         folder = tmp_path / "run"
-        given = ["size=tiny", "training=smoke", "data=capture", f"data.root={capture}"]
+        given = [
+            "size=tiny",
+            "training=smoke",
+            "data=capture",
+            f"data.root={capture}",
+        ]
         given += ["data.size=32", "data.crop=null", "lpips.nets=[]"]
         result = inside("train", *given, f"hydra.run.dir={folder}", *arguments)
         return result, folder
@@ -36,14 +41,18 @@ def test_callbacks_are_built_from_their_group(tiny):
 
 
 def test_a_run_that_a_callback_stops_is_not_scored_and_resumes(trained):
-    stopper = "+callbacks.stop={_target_: lightning.pytorch.callbacks.EarlyStopping"
+    stopper = (
+        "+callbacks.stop={_target_: lightning.pytorch.callbacks.EarlyStopping"
+    )
     stopper += ", monitor: val/psnr, mode: max, patience: 1, min_delta: 1000}"
     long = ("training.schedule.epoch=1", "training.schedule.step_one=20")
     result, folder = trained(stopper, *long)
     assert result.returncode == STOPPED, result.stdout + result.stderr
     assert "stopped by a callback" in result.stdout
     assert not (folder / "metrics.json").exists()
-    result, _ = trained(*long)  # callbacks may differ between the parts of a run
+    result, _ = trained(
+        *long
+    )  # callbacks may differ between the parts of a run
     assert result.returncode == 0, result.stdout + result.stderr
     assert (folder / "metrics.json").is_file()
 

@@ -17,13 +17,17 @@ def skipping(make, *overrides):
 
 
 def test_non_finite_gradients_far_apart_never_stop_a_run(make):
-    module = skipping(make, "training.max_skipped=3", "training.skip_window=100")
+    module = skipping(
+        make, "training.max_skipped=3", "training.skip_window=100"
+    )
     for step in range(0, 2000, 60):  # two in every window
         module.skipped.add(step)
     assert len(module.skipped.steps) == 2
 
 
-def test_a_resumed_run_starts_counting_anew_and_may_change_the_limit(make, tiny):
+def test_a_resumed_run_starts_counting_anew_and_may_change_the_limit(
+    make, tiny
+):
     from gsgan.run.stored import record
 
     module = skipping(make, "training.max_skipped=20")
@@ -50,7 +54,9 @@ def test_ranks_decide_together_whether_the_person_has_vanished():
         rank.watch(**dict(zip(("alpha", "mask"), maps, strict=True)))
     assert ranks[0].problem() == ""
     assert "has vanished" in ranks[1].problem()
-    held = [torch.stack([rank.means["alpha"], rank.means["mask"]]) for rank in ranks]
+    held = [
+        torch.stack([rank.means["alpha"], rank.means["mask"]]) for rank in ranks
+    ]
 
     def over_ranks(value):
         return torch.stack(held).mean(0)

@@ -22,7 +22,9 @@ def snapshot(module: torch.nn.Module) -> dict[str, torch.Tensor]:
     return {name: value.clone() for name, value in module.state_dict().items()}
 
 
-def moved(before: dict[str, torch.Tensor], module: torch.nn.Module, part: str) -> bool:
+def moved(
+    before: dict[str, torch.Tensor], module: torch.nn.Module, part: str
+) -> bool:
     after = module.state_dict()
     return any(
         not torch.equal(before[name], after[name])
@@ -70,10 +72,14 @@ def test_a_short_run_improves_step_one(make):
     )  # fmt: skip
     frame = data.dataset("train")[0]
     with torch.no_grad():
-        before = float((module.avatar(*frame.inputs).colour - frame.image).abs().mean())
+        before = float(
+            (module.avatar(*frame.inputs).colour - frame.image).abs().mean()
+        )
     trainer.fit(module, data)
     with torch.no_grad():
-        after = float((module.avatar(*frame.inputs).colour - frame.image).abs().mean())
+        after = float(
+            (module.avatar(*frame.inputs).colour - frame.image).abs().mean()
+        )
     assert after < 0.7 * before
 
 
@@ -145,7 +151,9 @@ def test_feature_head_commutes_with_blending(make):
     torch.nn.init.ones_(module.feature_head.bias)
     painting = module.avatar(*frame.inputs)
     empty = replace(
-        painting, features=painting.features * 0, splat_alpha=painting.splat_alpha * 0
+        painting,
+        features=painting.features * 0,
+        splat_alpha=painting.splat_alpha * 0,
     )
     blank = replace(frame, image=frame.image * 0, mask=frame.mask * 0)
     assert float(module.step_one_loss(empty, blank).detach()) == pytest.approx(
@@ -184,7 +192,9 @@ def alpha_share(module, frame) -> float:
         )
 
 
-def test_a_run_driven_into_the_collapse_is_caught_and_brought_back(make, capsys):
+def test_a_run_driven_into_the_collapse_is_caught_and_brought_back(
+    make, capsys
+):
     """The collapse: every opacity falls to nothing, and no NaN says so."""
     module, trainer, data = make(*LONGER)
     frame, seen = data.dataset("train")[0], []
@@ -208,7 +218,9 @@ def test_a_run_driven_into_the_collapse_is_caught_and_brought_back(make, capsys)
 
 @pytest.mark.parametrize("model", ["lbs_splat", "image_to_image", "splat_only"])
 def test_baselines_train_with_the_same_schedule(make, model):
-    module, trainer, data = make(f"model={model}", "training.schedule.stretch=1")
+    module, trainer, data = make(
+        f"model={model}", "training.schedule.stretch=1"
+    )
     before = snapshot(module)
     trainer.fit(module, data)
     both = module.schedule.step_one + module.schedule.step_two
@@ -223,7 +235,10 @@ def test_bf16_leaves_the_gradients_of_step_one_alone(make, model):
     """S and Step I are computed in float32, also backwards: bf16 trains the same weights."""
     found = []
     for precision in ("32-true", "bf16-mixed"):
-        short = ("training.schedule.segmentation=2", "training.schedule.step_one=4")
+        short = (
+            "training.schedule.segmentation=2",
+            "training.schedule.step_one=4",
+        )
         module, trainer, data = make(
             f"model={model}",
             *short,
@@ -244,7 +259,9 @@ def test_every_phase_runs_under_bf16_autocast(make):
     with torch.autocast("cpu", dtype=torch.bfloat16):
         assert module.avatar.window(frame.skeleton, frame.camera) is not None
         mixed = module.avatar(*frame.inputs)
-        maps = module.step_two.discriminator_maps(module.discriminator, mixed, frame)
+        maps = module.step_two.discriminator_maps(
+            module.discriminator, mixed, frame
+        )
         terms = module.step_two_terms(mixed, frame, maps)
         torch.stack(list(terms.values())).sum().backward()
     assert torch.equal(plain.features, mixed.features)
@@ -268,7 +285,8 @@ def test_float16_is_refused_before_anything_trains(make, monkeypatch):
 
 def test_the_discriminators_rate_spans_the_gan_alone(make):
     module, _, _ = make(
-        "training.schedule.step_two=40", "training.schedule.discriminator_start=20"
+        "training.schedule.step_two=40",
+        "training.schedule.discriminator_start=20",
     )
     start, end = module.schedule.adversarial_span
     recipe = module.recipes["discriminator"].rate
@@ -276,7 +294,9 @@ def test_the_discriminators_rate_spans_the_gan_alone(make):
     for module.step in (start, end - 1):
         rates.append(module._rate("discriminator"))
     assert rates[0] == recipe.peak
-    assert rates[1] < 0.2 * recipe.peak  # it fell within the GAN phase, not before
+    assert (
+        rates[1] < 0.2 * recipe.peak
+    )  # it fell within the GAN phase, not before
 
 
 def test_a_comparing_gan_runs_the_discriminator_in_full_precision():
@@ -285,7 +305,9 @@ def test_a_comparing_gan_runs_the_discriminator_in_full_precision():
         torch.rand(1, 3, 16, 16),
     )
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        kinds = {gan: discriminate(critic, image, gan)[0][-1].dtype for gan in FORMS}
+        kinds = {
+            gan: discriminate(critic, image, gan)[0][-1].dtype for gan in FORMS
+        }
     assert kinds.pop("relativistic") == torch.float32
     assert set(kinds.values()) == {torch.bfloat16}
 
@@ -302,11 +324,15 @@ def test_maps_shared_by_both_losses_give_the_gradients_of_two_passes(gan):
     assert all(p.grad is None for p in critic.parameters())
     found, image.grad = image.grad, None
     maps.loss().backward()
-    assert image.grad is None  # the discriminator's loss does not reach the generator
+    assert (
+        image.grad is None
+    )  # the discriminator's loss does not reach the generator
     of_critic = [p.grad.clone() for p in critic.parameters()]
 
     real, fake = critic(target), critic(image)
-    expected = 0.5 * generator_loss(real, fake, gan) + 2 * feature_matching(real, fake)
+    expected = 0.5 * generator_loss(real, fake, gan) + 2 * feature_matching(
+        real, fake
+    )
     torch.testing.assert_close(sum(terms.values()), expected)
     torch.testing.assert_close(found, torch.autograd.grad(expected, image)[0])
     apart = discriminator_loss(critic(target), critic(image.detach()), gan)

@@ -36,7 +36,13 @@ def test_step_two_compares_on_white_by_alpha_and_mask():
     def terms(loss: StepTwoLoss) -> dict[str, torch.Tensor]:
         painting = Rendering(image, alpha)
         return loss.terms(
-            painting, frame, anchor=None, perceptual=None, draws=None, maps=None, step=0
+            painting,
+            frame,
+            anchor=None,
+            perceptual=None,
+            draws=None,
+            maps=None,
+            step=0,
         )
 
     found = terms(weights)
@@ -47,11 +53,13 @@ def test_step_two_compares_on_white_by_alpha_and_mask():
         2 * float(0.5 * off.abs().mean() + 3 * off.square().mean()), rel=1e-5
     )
     (slope,) = torch.autograd.grad(found["alpha"], alpha)
-    expected = -2 * (0.5 * off.sign() + 6 * off).sum(1, keepdim=True) / off.numel()
-    torch.testing.assert_close(slope, expected)
-    assert torch.autograd.grad(found["photometric"], alpha, allow_unused=True) == (
-        None,
+    expected = (
+        -2 * (0.5 * off.sign() + 6 * off).sum(1, keepdim=True) / off.numel()
     )
+    torch.testing.assert_close(slope, expected)
+    assert torch.autograd.grad(
+        found["photometric"], alpha, allow_unused=True
+    ) == (None,)
     assert set(terms(replace(weights, alpha=0.0))) == {"photometric"}
 
 
@@ -62,15 +70,21 @@ def test_the_generators_fourth_channel_learns_from_alpha_alone(make):
     frame = data.dataset("train")[0]
     last = module.avatar.generator.paint.weight
     painting = module.avatar(*frame.inputs)
-    maps = module.step_two.discriminator_maps(module.discriminator, painting, frame)
+    maps = module.step_two.discriminator_maps(
+        module.discriminator, painting, frame
+    )
     terms = module.step_two_terms(painting, frame, maps)
     assert {"alpha", "photometric", "anchor", "adversarial"} <= set(terms)
     slopes = {
-        name: torch.autograd.grad(term, last, retain_graph=True, allow_unused=True)[0]
+        name: torch.autograd.grad(
+            term, last, retain_graph=True, allow_unused=True
+        )[0]
         for name, term in terms.items()
     }
     assert bool(slopes["alpha"][3].any())
-    assert bool(slopes["alpha"][:3].any())  # the image on white is its colours, too
+    assert bool(
+        slopes["alpha"][:3].any()
+    )  # the image on white is its colours, too
     for name in terms.keys() - {"alpha", "anchor"}:
         assert bool(slopes[name][:3].any()), name
         assert not slopes[name][3].any(), name
@@ -79,7 +93,10 @@ def test_the_generators_fourth_channel_learns_from_alpha_alone(make):
 
 def test_on_black_step_one_compares_the_splats_alpha_with_the_mask():
     features, alpha = leaves(5, 1)
-    frame, colour = seen_person(), torch.tensor([0.2, 0.9, 0.5]).view(1, 3, 1, 1)
+    frame, colour = (
+        seen_person(),
+        torch.tensor([0.2, 0.9, 0.5]).view(1, 3, 1, 1),
+    )
     painting = Rendering(None, features=features, splat_alpha=alpha)
     with_alpha, without = StepOneLoss(alpha=0.3), StepOneLoss(alpha=0.0)
     on_black = with_alpha(painting, frame, None, None)

@@ -8,8 +8,12 @@ from gsgan.train.optimisers import MovingAverage
 from gsgan.utils.errors import ConfigError
 
 
-def test_the_average_is_scored_and_comes_back_from_a_checkpoint(make, tmp_path, tiny):
-    module, trainer, data = make("training.average=0.9", "training.schedule.step_one=0")
+def test_the_average_is_scored_and_comes_back_from_a_checkpoint(
+    make, tmp_path, tiny
+):
+    module, trainer, data = make(
+        "training.average=0.9", "training.schedule.step_one=0"
+    )
     frame = data.dataset("train")[0]
     assert module.shown is module.avatar
     trainer.fit(module, data)
@@ -28,7 +32,10 @@ def test_the_average_is_scored_and_comes_back_from_a_checkpoint(make, tmp_path, 
     config = tiny("training.average=0.9", "training.schedule.step_one=0")
     loaded, _ = load_avatar(tmp_path / "run", config, data)
     with torch.no_grad():
-        expected, found = module.shown(*frame.inputs).image, loaded(*frame.inputs).image
+        expected, found = (
+            module.shown(*frame.inputs).image,
+            loaded(*frame.inputs).image,
+        )
     torch.testing.assert_close(found, expected)
 
 
@@ -56,7 +63,9 @@ def test_the_average_is_updated_when_the_config_says(make):
     steps = range(
         module.schedule.total - module.schedule.step_two, module.schedule.total
     )
-    assert int(module.average.copy.n_averaged) == sum(step % 5 == 0 for step in steps)
+    assert int(module.average.copy.n_averaged) == sum(
+        step % 5 == 0 for step in steps
+    )
     with pytest.raises(
         ConfigError, match="average_every must be a number of at least 1"
     ):

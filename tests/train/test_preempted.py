@@ -19,7 +19,8 @@ SLURM = {"SLURM_JOB_ID": "7", "SLURM_NTASKS": "1", "SLURM_NTASKS_PER_NODE": "1",
 def asked_at(monkeypatch):
     """``asked_at(5)``: SIGUSR1 in that iteration; afterwards the handlers are as before."""
     before = {
-        number: signal.getsignal(number) for number in (signal.SIGUSR1, signal.SIGUSR2)
+        number: signal.getsignal(number)
+        for number in (signal.SIGUSR1, signal.SIGUSR2)
     }
     step, handlers = AvatarTraining.training_step, []
 
@@ -48,7 +49,9 @@ def test_a_preempted_run_ends_with_the_same_weights(
             "trainer=cpu",
             f"data.root={capture}",
         )
-        result = inside("train", *TINY, *given, f"hydra.run.dir={tmp_path / name}")
+        result = inside(
+            "train", *TINY, *given, f"hydra.run.dir={tmp_path / name}"
+        )
         path = tmp_path / name / "checkpoints" / "last.ckpt"
         return result, torch.load(path, weights_only=True)
 
@@ -63,7 +66,9 @@ def test_a_preempted_run_ends_with_the_same_weights(
     # the end of its epoch
     assert "stopped by a signal at iteration 8" in stopped.stdout
     assert state["gsgan"]["step"] == 8
-    assert "StopOnSignal" in str(handlers[0])  # Lightning's requeueing left it in place
+    assert "StopOnSignal" in str(
+        handlers[0]
+    )  # Lightning's requeueing left it in place
     resumed, found = train("stopped")
     assert resumed.returncode == 0, resumed.stderr
     assert found["gsgan"]["step"] == expected["gsgan"]["step"] > 8

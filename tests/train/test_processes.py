@@ -20,17 +20,24 @@ class Losses(Callback):
         self.path, self.held = path, []
 
     def on_train_batch_end(self, trainer, *_):
-        self.held.append({k: float(v) for k, v in trainer.callback_metrics.items()})
+        self.held.append(
+            {k: float(v) for k, v in trainer.callback_metrics.items()}
+        )
         if trainer.is_global_zero:
             self.path.write_text(json.dumps(self.held))
 
 
-def test_two_processes_have_the_losses_of_one_with_the_whole_batch(make, tmp_path):
+def test_two_processes_have_the_losses_of_one_with_the_whole_batch(
+    make, tmp_path
+):
     """In float32 sums are rounded differently: 2e-6 of the loss is what was measured."""
     found = []
     for batch, more in ((2, {}), (1, TWO)):
         path = tmp_path / f"{batch}.json"
-        given = {"use_distributed_sampler": False, "callbacks": [Losses(path)]} | more
+        given = {
+            "use_distributed_sampler": False,
+            "callbacks": [Losses(path)],
+        } | more
         torch.manual_seed(0)
         module, trainer, data = make(
             f"data.batch_size={batch}", "model.window_margin=null", **given
@@ -56,7 +63,9 @@ def test_processes_skip_together_and_stop_together(make):
         use_distributed_sampler=False,
         **TWO,
     )
-    with pytest.raises(Exception, match="stopped at iteration 7: 3 of the last"):
+    with pytest.raises(
+        Exception, match="stopped at iteration 7: 3 of the last"
+    ):
         trainer.fit(module, data)
 
 
@@ -66,5 +75,7 @@ def test_another_number_of_processes_is_refused(make):
     module.on_save_checkpoint(checkpoint)
     assert checkpoint["gsgan"]["processes"] == 1
     checkpoint["gsgan"]["processes"] = 2
-    with pytest.raises(ConfigError, match="trained by 2 processes, and 1 would draw"):
+    with pytest.raises(
+        ConfigError, match="trained by 2 processes, and 1 would draw"
+    ):
         module.on_load_checkpoint(checkpoint)

@@ -71,7 +71,10 @@ def waits(tiny, tmp_path):
         schedule = [
             f"training.schedule.{name}={3 * (name == phase)}" for name in phases
         ]
-        always = ("training.schedule.discriminator_start=0", "model.backend=native")
+        always = (
+            "training.schedule.discriminator_start=0",
+            "model.backend=native",
+        )
         data, module = build_training(tiny(*schedule, *always))
         change(module)
         counter = PerIteration()
@@ -127,7 +130,9 @@ def test_scoring_an_image_reads_no_more_values_than_these(tiny):
 
     def counted(number):
         with HostWaits() as mode:
-            score_split(list(zip(items, frames, strict=True))[:number], predict, scorer)
+            score_split(
+                list(zip(items, frames, strict=True))[:number], predict, scorer
+            )
         return mode.counted
 
     one, two, three = (counted(number) for number in (1, 2, 3))

@@ -36,9 +36,19 @@ def test_a_recipe_makes_one_training_of_all_its_processes(
     for variable in STARTERS[starter].split():
         monkeypatch.setenv(*variable.split("="))
     given = [a for a in arguments if not a.startswith("hydra.")]
-    trainer = instantiate(compose("train", *given, *ON_CPU).trainer, logger=False)
-    assert (trainer.world_size, trainer.num_nodes, trainer.num_devices) == (8, 2, 4)
+    trainer = instantiate(
+        compose("train", *given, *ON_CPU).trainer, logger=False
+    )
+    assert (trainer.world_size, trainer.num_nodes, trainer.num_devices) == (
+        8,
+        2,
+        4,
+    )
     environment = trainer.strategy.cluster_environment
     assert environment.creates_processes_externally
-    ranks = environment.global_rank(), environment.local_rank(), environment.node_rank()
+    ranks = (
+        environment.global_rank(),
+        environment.local_rank(),
+        environment.node_rank(),
+    )
     assert ranks == (5, 1, 1)

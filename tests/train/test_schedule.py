@@ -4,20 +4,30 @@ import math
 
 import pytest
 
-from gsgan.train.schedule import SEGMENTATION, STEP_ONE, STEP_TWO, Rate, Schedule
+from gsgan.train.schedule import (
+    SEGMENTATION,
+    STEP_ONE,
+    STEP_TWO,
+    Rate,
+    Schedule,
+)
 from gsgan.utils.errors import ConfigError
 
 
 def test_phases_follow_each_other():
-    s = Schedule(segmentation=2, step_one=3, step_two=4, discriminator_start=1, epoch=4)
-    assert [s.phase(i) for i in range(9)] == [SEGMENTATION] * 2 + [STEP_ONE] * 3 + [
-        STEP_TWO
-    ] * 4
+    s = Schedule(
+        segmentation=2, step_one=3, step_two=4, discriminator_start=1, epoch=4
+    )
+    assert [s.phase(i) for i in range(9)] == [SEGMENTATION] * 2 + [
+        STEP_ONE
+    ] * 3 + [STEP_TWO] * 4
     assert s.total == 9
     assert [s.adversarial(i) for i in range(9)] == [False] * 6 + [True] * 3
     assert s.bounds(STEP_TWO) == (5, 9)
     assert s.adversarial_span == (6, 9)
-    late = Schedule(segmentation=2, step_one=3, step_two=4, discriminator_start=9)
+    late = Schedule(
+        segmentation=2, step_one=3, step_two=4, discriminator_start=9
+    )
     assert late.adversarial_span == (9, 9)
     assert not any(late.adversarial(i) for i in range(9))
 
@@ -38,13 +48,17 @@ def test_impossible_schedules_are_refused(wrong):
 def test_rate_holds_then_descends_to_its_end():
     rate = Rate(peak=2.0, hold=0.5, final=0.1)
     assert rate.at(0, 0, 100) == rate.at(50, 0, 100) == 2.0
-    assert math.isclose(rate.at(75, 0, 100), 2.0 * (0.1 + 0.9 * 0.5), rel_tol=1e-9)
+    assert math.isclose(
+        rate.at(75, 0, 100), 2.0 * (0.1 + 0.9 * 0.5), rel_tol=1e-9
+    )
     assert math.isclose(rate.at(100, 0, 100), 0.2, rel_tol=1e-9)
     values = [rate.at(i, 0, 100) for i in range(101)]
     assert values == sorted(values, reverse=True)
 
 
-@pytest.mark.parametrize(("shape", "half"), [("linear", 0.505), ("exponential", 0.1)])
+@pytest.mark.parametrize(
+    ("shape", "half"), [("linear", 0.505), ("exponential", 0.1)]
+)
 def test_rate_shapes(shape, half):
     rate = Rate(peak=1.0, hold=0.0, final=0.01, shape=shape)
     assert math.isclose(rate.at(50, 0, 100), half, rel_tol=1e-9)
@@ -59,7 +73,13 @@ def test_impossible_rates_are_refused(wrong):
 
 def test_rate_warms_up():
     rate = Rate(peak=1.0, hold=1.0, warmup=3)
-    assert [rate.at(i, 10, 20) for i in range(10, 15)] == [0.25, 0.5, 0.75, 1.0, 1.0]
+    assert [rate.at(i, 10, 20) for i in range(10, 15)] == [
+        0.25,
+        0.5,
+        0.75,
+        1.0,
+        1.0,
+    ]
 
 
 def test_the_degree_is_raised_by_the_schedule():

@@ -86,7 +86,9 @@ def test_gradients_of_a_part_are_those_of_its_pixels_in_the_whole_image(
     )
     avatar = module.avatar.train()
     frame = next(iter(data.train_dataloader())).unpacked()
-    whole = Window(corners=((0, 0),) * len(frame), size=(48, 48), whole=(48, 48))
+    whole = Window(
+        corners=((0, 0),) * len(frame), size=(48, 48), whole=(48, 48)
+    )
     part = whole.part(16, torch.full((len(frame), 2), 0.5))
 
     def gradients(seen: Window) -> dict[str, torch.Tensor]:
@@ -120,7 +122,9 @@ def test_gradients_of_a_part_are_those_of_its_pixels_in_the_whole_image(
 def test_step_one_has_a_perceptual_loss_where_asked(make, model):
     """After its share of Step I, and with a gradient that reaches Ψ; else none is built."""
     words = (f"model={model}", "training.step_one.perceptual=0.5")
-    module, trainer, data = make(*words, "training.step_one.perceptual_from=0.5")
+    module, trainer, data = make(
+        *words, "training.step_one.perceptual_from=0.5"
+    )
     logged = {}
     module._log = lambda name, value: logged.setdefault(name, []).append(
         (module.step, float(value))

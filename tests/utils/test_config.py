@@ -21,7 +21,9 @@ SRC = Path(__file__).parents[2] / "src" / "gsgan"
 
 
 def options(group: str) -> list[str]:
-    return sorted(path.stem for path in (config_folder() / group).glob("[!_]*.yaml"))
+    return sorted(
+        path.stem for path in (config_folder() / group).glob("[!_]*.yaml")
+    )
 
 
 GROUPS = (
@@ -40,14 +42,22 @@ def test_every_option_composes(compose):
     """The groups do not depend on each other: the i-th options of all are composed together."""
     choices = {group: options(group) for group in GROUPS}
     for i in range(max(map(len, choices.values()))):
-        given = (f"{group}={found[i % len(found)]}" for group, found in choices.items())
+        given = (
+            f"{group}={found[i % len(found)]}"
+            for group, found in choices.items()
+        )
         config = compose("train", *given)
         OmegaConf.to_container(config.training, resolve=True)
         model = OmegaConf.to_container(config.model, resolve=True)
         assert model["_target_"].startswith("gsgan.")
-    found = importlib.util.find_spec("hydra_plugins.hydra_optuna_sweeper") is not None
+    found = (
+        importlib.util.find_spec("hydra_plugins.hydra_optuna_sweeper")
+        is not None
+    )
     for experiment in options("experiment"):
-        if experiment == "search" and not found:  # its sweeper is in the extra sweep
+        if (
+            experiment == "search" and not found
+        ):  # its sweeper is in the extra sweep
             continue
         config = compose("train", f"experiment={experiment}")
         OmegaConf.to_container(config.training, resolve=True)
@@ -74,7 +84,11 @@ def differences(a, b, at: str = "") -> set[str]:
         (
             "splat_only",
             {
-                *("model.segmentation", "model.pose_encoder", "model.generator"),
+                *(
+                    "model.segmentation",
+                    "model.pose_encoder",
+                    "model.generator",
+                ),
                 *("training.schedule.stretch", "equal_time"),
             },
         ),
@@ -87,19 +101,25 @@ def test_an_ablation_changes_what_it_says_and_nothing_else(
     full = OmegaConf.to_container(compose("train", *chosen))
     other = OmegaConf.to_container(compose("train", *chosen, f"model={model}"))
     found = {".".join(key.split(".")[:3]) for key in differences(full, other)}
-    assert {next(c for c in changed if key.startswith(c)) for key in found} == changed
+    assert {
+        next(c for c in changed if key.startswith(c)) for key in found
+    } == changed
 
 
 def test_demo_is_what_train_does_by_default_without_a_generator(compose):
     plain = compose("train", "model=splat_only", "score_images=42")
     assert compose("train", "experiment=demo") == plain
-    whole = compose("train", "experiment=demo", "model=full", "score_images=null")
+    whole = compose(
+        "train", "experiment=demo", "model=full", "score_images=null"
+    )
     assert whole == compose("train")
 
 
 def test_every_top_level_key_is_read_by_code(compose):
     code = "\n".join(path.read_text() for path in SRC.rglob("*.py"))
-    yaml = "\n".join(path.read_text() for path in config_folder().rglob("*.yaml"))
+    yaml = "\n".join(
+        path.read_text() for path in config_folder().rglob("*.yaml")
+    )
     for name in ("train", "evaluate"):
         for key in compose(name):
             named = rf'(config|stored)\.({key}\b|get\("{key}"\))'
@@ -110,7 +130,9 @@ def test_every_top_level_key_is_read_by_code(compose):
 
 
 def test_every_size_key_is_used(compose):
-    yaml = "\n".join(path.read_text() for path in config_folder().rglob("*.yaml"))
+    yaml = "\n".join(
+        path.read_text() for path in config_folder().rglob("*.yaml")
+    )
     keys = set(compose("train").size)
     for key in keys:
         assert re.search(rf"\$\{{.*\bsize\.{key}\b", yaml), (
@@ -123,7 +145,9 @@ def test_every_size_key_is_used(compose):
 def test_missing_config_folder_is_said(monkeypatch, tmp_path):
     import gsgan.utils.config as module
 
-    monkeypatch.setattr(module, "__file__", str(tmp_path / "a" / "b" / "config.py"))
+    monkeypatch.setattr(
+        module, "__file__", str(tmp_path / "a" / "b" / "config.py")
+    )
     with pytest.raises(Exception, match="config folder is missing"):
         config_folder()
 
@@ -165,7 +189,8 @@ def test_unknown_values_become_one_sentence(tiny, override, named):
 
 
 MANY = [
-    f"training.recipes.psi.rate.{key}=0.{i}" for i, key in enumerate(("hold", "final"))
+    f"training.recipes.psi.rate.{key}=0.{i}"
+    for i, key in enumerate(("hold", "final"))
 ] + [
     f"training.step_two.{key}=0.25"
     for key in ("l1", "l2", "ssim", "perceptual", "anchor")
@@ -225,7 +250,9 @@ def test_bf16_only_on_gpus_that_have_it(monkeypatch, capability, precision):
     from gsgan.utils.config import gpu_precision
 
     monkeypatch.setattr("torch.cuda.is_available", lambda: True)
-    monkeypatch.setattr("torch.cuda.get_device_capability", lambda *_: capability)
+    monkeypatch.setattr(
+        "torch.cuda.get_device_capability", lambda *_: capability
+    )
     assert gpu_precision() == precision
 
 

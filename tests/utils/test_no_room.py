@@ -34,23 +34,31 @@ def test_training_on_a_full_disk_ends_in_one_sentence_and_is_resumed(
         calls.append(file)
         full() if len(calls) > 3 else sync(file)
 
-    given = [*TINY, f"data.root={capture}", f"hydra.run.dir={run}", "evaluate=false"]
+    given = [
+        *TINY,
+        f"data.root={capture}",
+        f"hydra.run.dir={run}",
+        "evaluate=false",
+    ]
     monkeypatch.setattr(os, "fsync", fills_up)
     result = inside("train", *given)
     assert result.returncode == 1
     assert "Traceback" not in result.stderr
-    assert "cannot be written (No space left on device): make room" in result.stderr
-    kept = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)["gsgan"][
-        "step"
-    ]
+    assert (
+        "cannot be written (No space left on device): make room"
+        in result.stderr
+    )
+    kept = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)[
+        "gsgan"
+    ]["step"]
     assert 0 < kept < 16
     monkeypatch.setattr("hydra.core.utils._save_config", full)
     assert "cannot be written (No space" in inside("train", *given).stderr
     monkeypatch.undo()
     assert inside("train", *given).returncode == 0
     assert (
-        torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)["gsgan"][
-            "step"
-        ]
+        torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)[
+            "gsgan"
+        ]["step"]
         == 16
     )

@@ -27,7 +27,9 @@ def parsed(argument: str) -> object:
 
 
 @pytest.mark.parametrize("path", ODD)
-@pytest.mark.parametrize("key", ["motion", "data.root", "+on.root", "hydra.run.dir"])
+@pytest.mark.parametrize(
+    "key", ["motion", "data.root", "+on.root", "hydra.run.dir"]
+)
 def test_odd_paths_arrive_as_typed(key, path):
     assert str(parsed(f"{key}={path}")) == path
 

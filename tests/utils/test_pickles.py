@@ -75,14 +75,20 @@ def test_python_2_pickles_with_chumpy_and_scipy(tmp_path, protocol):
 
 def test_an_object_array_gives_its_dict(tmp_path):
     content = {"cams": {"K": [np.eye(3)] * 2}, "ims": [{"ims": ["a\\b.jpg"]}]}
-    np.save(tmp_path / "annots.npy", np.array(content, dtype=object), allow_pickle=True)
+    np.save(
+        tmp_path / "annots.npy",
+        np.array(content, dtype=object),
+        allow_pickle=True,
+    )
     found = read_npy(tmp_path / "annots.npy")
     np.testing.assert_array_equal(found["cams"]["K"][1], np.eye(3))
     assert found["ims"] == content["ims"]
     several = np.array([{"a": 1}, np.zeros(2), "x"], dtype=object)
     np.save(tmp_path / "several.npy", several, allow_pickle=True)
     assert read_npy(tmp_path / "several.npy")[0] == {"a": 1}
-    np.testing.assert_array_equal(read_npy(tmp_path / "several.npy")[1], np.zeros(2))
+    np.testing.assert_array_equal(
+        read_npy(tmp_path / "several.npy")[1], np.zeros(2)
+    )
 
 
 def test_plain_npy_and_npz(tmp_path):
@@ -170,12 +176,16 @@ def test_the_attacks_would_run_in_the_plain_unpickler(tmp_path):
 
 # --- allowed names, used to do harm ------------------------------------------------------------
 
-ARRAY = b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(I0\ntS'b'\ntR"
+ARRAY = (
+    b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(I0\ntS'b'\ntR"
+)
 
 
 def dtype(spec: bytes) -> bytes:
     return (
-        b"cnumpy\ndtype\n(S'" + spec + b"'\nI0\nI1\ntR(I3\nS'<'\nNNNI-1\nI-1\nI63\ntb"
+        b"cnumpy\ndtype\n(S'"
+        + spec
+        + b"'\nI0\nI1\ntR(I3\nS'<'\nNNNI-1\nI-1\nI63\ntb"
     )
 
 
@@ -184,7 +194,9 @@ def array(shape: bytes, kind: bytes, content: bytes) -> bytes:
 
 
 def sparse(**state: object) -> bytes:
-    return python2.dumps(python2.Instance("scipy.sparse.csc", "csc_matrix", state))
+    return python2.dumps(
+        python2.Instance("scipy.sparse.csc", "csc_matrix", state)
+    )
 
 
 CHUMPY, ENCODE = b"cchumpy.ch\nCh\n", b"c_codecs\nencode\n"
@@ -194,7 +206,10 @@ MISUSES = {
         array(b"I1000000000000\n", dtype(b"f8"), b"S''\n"),
         "other con",
     ),
-    "one object for many": (array(b"I9\n", dtype(b"O8"), b"(lNa"), "other content"),
+    "one object for many": (
+        array(b"I9\n", dtype(b"O8"), b"(lNa"),
+        "other content",
+    ),
     "bytes as objects": (
         array(b"I1\n", dtype(b"O8"), b"S'12345678'\n"),
         "no list of them",
@@ -203,10 +218,16 @@ MISUSES = {
         array(b"I-1\nI-1\n", dtype(b"f8"), b"S'12345678'\n"),
         "other content",
     ),
-    "a record type": (array(b"I1\n", dtype(b"V8"), b"S'12345678'\n"), "type 'V8'"),
+    "a record type": (
+        array(b"I1\n", dtype(b"V8"), b"S'12345678'\n"),
+        "type 'V8'",
+    ),
     "several types in one": (dtype(b"f8,O") + b".", "type 'f8,O'"),
     "a new array outright": (b"cnumpy\nndarray\n(I9\ntR.", "not callable"),
-    "code for a function": (ENCODE + b"(N(dS'__code__'\nNstb.", "__code__ must be set"),
+    "code for a function": (
+        ENCODE + b"(N(dS'__code__'\nNstb.",
+        "__code__ must be set",
+    ),
     "a state for a stand-in class": (
         CHUMPY + b"(N(dS'array'\nNstb.",
         "missing 1 required",
@@ -217,12 +238,17 @@ MISUSES = {
     ),
     "a sparse row out of bounds": (
         sparse(
-            _shape=(2, 1), data=np.ones(1), indices=NONE + 7, indptr=np.array([0, 1])
+            _shape=(2, 1),
+            data=np.ones(1),
+            indices=NONE + 7,
+            indptr=np.array([0, 1]),
         ),
         "ind",
     ),
     "a sparse matrix of a petabyte": (
-        sparse(_shape=(10**8, 10**7), data=np.ones(0), indices=NONE, indptr=NONE),
+        sparse(
+            _shape=(10**8, 10**7), data=np.ones(0), indices=NONE, indptr=NONE
+        ),
         "sparse matrix of shape",
     ),
     "bytes that are not there": (

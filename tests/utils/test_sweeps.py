@@ -28,15 +28,25 @@ def hydra_config(*overrides: str):
 
 def plugin(name: str):
     missing = importlib.util.find_spec(f"hydra_plugins.hydra_{name}") is None
-    return pytest.mark.skipif(missing, reason="the extra sweep is not installed")
+    return pytest.mark.skipif(
+        missing, reason="the extra sweep is not installed"
+    )
 
 
 def test_a_jobs_folder_follows_from_what_it_changes():
-    names = {hydra_config(*given).sweep.subdir for given in (["seed=1"], ["seed=2"])}
+    names = {
+        hydra_config(*given).sweep.subdir for given in (["seed=1"], ["seed=2"])
+    }
     assert names == {"seed-1", "seed-2"}
-    assert hydra_config("model=full", "seed=1").sweep.subdir == "model-full_seed-1"
-    assert hydra_config("seed=1", "model=full").sweep.subdir == "model-full_seed-1"
-    places = {hydra_config(f"data.root=/data/{name}").sweep.subdir for name in "ab"}
+    assert (
+        hydra_config("model=full", "seed=1").sweep.subdir == "model-full_seed-1"
+    )
+    assert (
+        hydra_config("seed=1", "model=full").sweep.subdir == "model-full_seed-1"
+    )
+    places = {
+        hydra_config(f"data.root=/data/{name}").sweep.subdir for name in "ab"
+    }
     assert len(places) == 2  # two captures never share a folder
     assert hydra_config().sweep.subdir == "defaults"
 
@@ -47,12 +57,18 @@ def job(tmp_path, monkeypatch):
 
     def run(line: str, objective: str | None = None):
         settings = SimpleNamespace(
-            runtime=SimpleNamespace(output_dir=str(tmp_path), config_sources=[]),
-            overrides=SimpleNamespace(task=["seed=1"], hydra=["hydra.mode=MULTIRUN"]),
+            runtime=SimpleNamespace(
+                output_dir=str(tmp_path), config_sources=[]
+            ),
+            overrides=SimpleNamespace(
+                task=["seed=1"], hydra=["hydra.mode=MULTIRUN"]
+            ),
         )
         monkeypatch.setattr(sweeps.HydraConfig, "get", lambda: settings)
         status = sweeps._status
-        monkeypatch.setattr(sweeps, "_status", lambda command: status([*SHELL, line]))
+        monkeypatch.setattr(
+            sweeps, "_status", lambda command: status([*SHELL, line])
+        )
         score = sweeps.run_job("train", objective)
         monkeypatch.undo()
         return score, sweeps.unfinished(tmp_path)
@@ -65,7 +81,10 @@ def job(tmp_path, monkeypatch):
     [
         ("true", None),
         ("kill -KILL $$", "it was killed by SIGKILL"),
-        (f"exit {sweeps.STOPPED}", "it was stopped by a signal, after a checkpoint"),
+        (
+            f"exit {sweeps.STOPPED}",
+            "it was stopped by a signal, after a checkpoint",
+        ),
         ("exit 1", "it ended with a traceback"),
     ],
 )
@@ -74,7 +93,9 @@ def test_a_jobs_end_is_recorded_and_no_exception(job, line, why):
 
 
 def test_a_job_returns_the_score_that_a_search_asks_for(job, tmp_path):
-    (tmp_path / "metrics.json").write_text('{"novel_pose": {"full": {"psnr": 21.5}}}')
+    (tmp_path / "metrics.json").write_text(
+        '{"novel_pose": {"full": {"psnr": 21.5}}}'
+    )
     assert job("true", "novel_pose.full.psnr") == (21.5, None)
     score, why = job("true", "novel_pose.full.lpips")
     assert score is None
@@ -131,19 +152,33 @@ def test_a_signal_reaches_the_job_first_then_the_launcher(tmp_path):
 def test_slurm_gets_one_task_per_device():
     given = ("trainer=ddp", "trainer.devices=4", "trainer.num_nodes=2")
     launcher = hydra_config("hydra/launcher=slurm", *given).launcher
-    assert (launcher.tasks_per_node, launcher.gpus_per_node, launcher.nodes) == (
+    assert (
+        launcher.tasks_per_node,
+        launcher.gpus_per_node,
+        launcher.nodes,
+    ) == (
         4,
         4,
         2,
     )
     assert launcher.max_num_timeout > 0
     assert (
-        hydra_config("hydra/launcher=slurm", "trainer=gpu").launcher.tasks_per_node == 1
+        hydra_config(
+            "hydra/launcher=slurm", "trainer=gpu"
+        ).launcher.tasks_per_node
+        == 1
     )
 
 
-def sweep(folder: Path, capture: Path, *given: str) -> subprocess.CompletedProcess[str]:
-    fixed = [*TINY, f"data.root={capture}", f"hydra.sweep.dir={folder}", "trainer=cpu"]
+def sweep(
+    folder: Path, capture: Path, *given: str
+) -> subprocess.CompletedProcess[str]:
+    fixed = [
+        *TINY,
+        f"data.root={capture}",
+        f"hydra.sweep.dir={folder}",
+        "trainer=cpu",
+    ]
     fixed += [
         f"training.schedule.{name}=1"
         for name in ("step_one", "step_two", "segmentation")
@@ -171,7 +206,9 @@ def test_a_failed_job_is_named_and_ends_no_other(capture, tmp_path, launcher):
     done = sweep(tmp_path / "sweep", capture, "seed=-1,0", *given)
     assert done.returncode == 1, done.stdout + done.stderr
     assert "1 jobs are unfinished" in done.stdout
-    bad, good = sorted(path for path in (tmp_path / "sweep").iterdir() if path.is_dir())
+    bad, good = sorted(
+        path for path in (tmp_path / "sweep").iterdir() if path.is_dir()
+    )
     assert "seed must be a whole number" in sweeps.unfinished(bad)
     assert sweeps.unfinished(good) is None
     assert (good / "checkpoints" / "last.ckpt").is_file()
@@ -195,5 +232,6 @@ def test_a_search_that_is_started_again_repeats_nothing(capture, tmp_path):
     again = sweep(tmp_path / "sweep", capture, *given, "hydra.sweeper.n_jobs=1")
     assert again.stdout.count("trained and scored before") == 2
     assert found == {
-        p: p.stat().st_mtime_ns for p in (tmp_path / "sweep").rglob("metrics.json")
+        p: p.stat().st_mtime_ns
+        for p in (tmp_path / "sweep").rglob("metrics.json")
     }

@@ -53,16 +53,18 @@ def test_a_joint_goes_to_the_pointer_where_bones_reach(name):
     moved = dragged(REST, name, target)
     assert np.linalg.norm(position(moved, name) - target) < 2e-3
     others = [i for i in range(33) if np.array_equal(moved[i], REST[i])]
-    assert (len(others) > 20) == (name != BODY_HANDLE and name != HEAD_HANDLE) or len(
-        others
-    ) == 22
+    assert (len(others) > 20) == (
+        name != BODY_HANDLE and name != HEAD_HANDLE
+    ) or len(others) == 22
 
 
 def test_a_straight_limb_bends():
     chain = np.array([[0.0, 0, 0], [0, -0.3, 0], [0, -0.6, 0]])
     bent = fabrik(chain, np.array([0.0, -0.4, 0]))
     np.testing.assert_allclose(bent[-1], [0, -0.4, 0], atol=2e-3)
-    np.testing.assert_allclose(np.linalg.norm(np.diff(bent, axis=0), axis=1), 0.3)
+    np.testing.assert_allclose(
+        np.linalg.norm(np.diff(bent, axis=0), axis=1), 0.3
+    )
 
 
 def test_out_of_reach_is_straight():
@@ -75,7 +77,10 @@ def test_out_of_reach_is_straight():
 
 @pytest.mark.parametrize(
     ("name", "joints"),
-    [("left wrist", [15, 19, *range(33, 54)]), ("head", [0, 7, *range(75, 105)])],
+    [
+        ("left wrist", [15, 19, *range(33, 54)]),
+        ("head", [0, 7, *range(75, 105)]),
+    ],
 )
 def test_hands_and_face_go_along(name, joints):
     """The landmarks that skeletons with hands and a face have beside the 33."""

@@ -12,7 +12,11 @@ HOST = "127.0.0.1:8080"
     [
         (HOST, None, "127.0.0.1"),  # no browser
         (HOST, f"http://{HOST}", "127.0.0.1"),
-        ("localhost:9999", "http://localhost:9999", "127.0.0.1"),  # a forwarded port
+        (
+            "localhost:9999",
+            "http://localhost:9999",
+            "127.0.0.1",
+        ),  # a forwarded port
         ("[::1]:8080", "http://[::1]:8080", "::1"),
         ("192.168.0.7:8080", "http://192.168.0.7:8080", "0.0.0.0"),
         ("studio.lab:8080", "http://studio.lab:8080", "Studio.lab"),
@@ -39,7 +43,9 @@ def test_other_pages_are_refused(host, origin):
 
 
 def test_visers_server_refuses_them():
-    viser = pytest.importorskip("viser", reason="the extra view is not installed")
+    viser = pytest.importorskip(
+        "viser", reason="the extra view is not installed"
+    )
     from websockets.exceptions import InvalidStatus
     from websockets.sync.client import connect
 

@@ -40,17 +40,23 @@ class Page:
             self.added.append((name, given))
             options = given[1] if name == "add_dropdown" else ()
             return Control(
-                value=numbers[-1] if numbers else value, options=options, content=""
+                value=numbers[-1] if numbers else value,
+                options=options,
+                content="",
             )
 
         return add
 
 
 def test_every_layer_is_rendered_from_a_bare_skeleton(run, compose):
-    config = compose("view", f"run={run}", f"device={DEVICE}", "motion=novel_pose")
+    config = compose(
+        "view", f"run={run}", f"device={DEVICE}", "motion=novel_pose"
+    )
     loaded = Run.load(config)
     assert next(loaded.avatar.parameters()).device.type == DEVICE
-    drive = replace(drive_of(config, loaded, 30.0), body=None)  # the body is solved
+    drive = replace(
+        drive_of(config, loaded, 30.0), body=None
+    )  # the body is solved
     show = Show(
         *(loaded.avatar, loaded.body, drive, lambda motion: drive),
         *(lambda size: torch.zeros(3, *size), 32, 30.0, 10.0),
@@ -79,4 +85,8 @@ def test_every_layer_is_rendered_from_a_bare_skeleton(run, compose):
         images.append(session.image.tobytes())
     assert len(set(images)) >= len(images) - 1
     drawn = {name for name, _ in client.scene.added}
-    assert {"add_line_segments", "add_mesh_simple", "add_gaussian_splats"} <= drawn
+    assert {
+        "add_line_segments",
+        "add_mesh_simple",
+        "add_gaussian_splats",
+    } <= drawn

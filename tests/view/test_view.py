@@ -19,7 +19,13 @@ PATIENCE = 60.0  # seconds
 def served(compose, run):
     from gsgan.view.server import Viewer
 
-    given = (f"run={run}", "port=0", "device=cpu", "max_upload=1", "background=white")
+    given = (
+        f"run={run}",
+        "port=0",
+        "device=cpu",
+        "max_upload=1",
+        "background=white",
+    )
     made = Viewer(compose("view", *given))
     yield made
     made.stop()
@@ -41,9 +47,13 @@ def open_page(viewer, chromium):
         page = chromium.new_page(viewport={"width": 800, "height": 500})
         pages.append(page)
         page.on("pageerror", lambda error: problems.append(str(error)))
-        page.on("console", lambda m: problems.append(m.text) if is_problem(m) else None)
+        page.on(
+            "console",
+            lambda m: problems.append(m.text) if is_problem(m) else None,
+        )
         page.goto(
-            f"http://127.0.0.1:{viewer.server.get_port()}", timeout=1000 * PATIENCE
+            f"http://127.0.0.1:{viewer.server.get_port()}",
+            timeout=1000 * PATIENCE,
         )
         until(lambda: set(viewer.sessions) - known, page)
         session = viewer.sessions[(set(viewer.sessions) - known).pop()]
@@ -58,7 +68,9 @@ def open_page(viewer, chromium):
 
 def is_problem(message) -> bool:
     # viser's splats are quads of two coordinates, of which three.js looks for the third
-    return message.type == "error" and "computeBoundingSphere" not in message.text
+    return (
+        message.type == "error" and "computeBoundingSphere" not in message.text
+    )
 
 
 def until(holds, page) -> None:
@@ -72,7 +84,9 @@ def until(holds, page) -> None:
 def on_screen(session, point) -> tuple[float, float]:
     """Where the browser shows a point of the world, pixels."""
     camera = session.camera(1.0).resize((500, 800))
-    pixels, _ = camera.project(torch.tensor(point, dtype=torch.float32)[None, None])
+    pixels, _ = camera.project(
+        torch.tensor(point, dtype=torch.float32)[None, None]
+    )
     return tuple(pixels[0, 0].tolist())
 
 
@@ -156,9 +170,13 @@ def test_the_body_lies_on_the_skeleton(open_page, run, compose):
         pose = session.drive.body[:1]
         vertices = viewer.show.body.posed_vertices(pose)[0]
         np.testing.assert_allclose(mesh.vertices, vertices, atol=1e-5)
-        session.drag("left wrist", session.joints()[15] + 0.2)  # the pose is now solved
+        session.drag(
+            "left wrist", session.joints()[15] + 0.2
+        )  # the pose is now solved
         until(lambda: session._nodes and session._nodes[0] is not mesh, page)
-        assert np.abs(session._nodes[0].vertices - vertices.numpy()).max() > 0.05
+        assert (
+            np.abs(session._nodes[0].vertices - vertices.numpy()).max() > 0.05
+        )
         page.close()
 
 
@@ -180,7 +198,9 @@ def upload(page, path) -> None:
     chosen.value.set_files(path)
 
 
-def test_a_motion_is_loaded_and_bad_files_are_reported(open_page, capture, tmp_path):
+def test_a_motion_is_loaded_and_bad_files_are_reported(
+    open_page, capture, tmp_path
+):
     page, session = open_page()
     bad = tmp_path / "bad.bvh"
     bad.write_text("HIERARCHY\nROOT")
@@ -239,10 +259,15 @@ def test_another_machines_address_is_refused(bare, inside):
         inside("view", f"run={bare}", "host=203.0.113.1", "motion=rest"),
         "host=203.0.113.1",
     )
-    refused(inside("view", f"run={bare}", "port=70000", "motion=rest"), "port must be")
+    refused(
+        inside("view", f"run={bare}", "port=70000", "motion=rest"),
+        "port must be",
+    )
     refused(inside("view"), "run is not set")
     refused(
-        inside("view", f"run={bare}", "motion=none.bvh"), "none.bvh", "does not exist"
+        inside("view", f"run={bare}", "motion=none.bvh"),
+        "none.bvh",
+        "does not exist",
     )
 
 

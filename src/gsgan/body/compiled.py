@@ -130,7 +130,9 @@ def solve(
     job = _Job(len(p), build.threads())
     for name, value in (*counts.items(), *numbers.items()):
         setattr(job, name, value)
-    build.point(job, [f"of_{name}" for name in constants], list(constants.values()))
+    build.point(
+        job, [f"of_{name}" for name in constants], list(constants.values())
+    )
 
     # Without hands, their addresses are null.
     frames: list[Tensor | None] = [x.contiguous() for x in body]

@@ -11,7 +11,14 @@ from torch.nn.functional import normalize
 
 from gsgan.body.free import Body
 from gsgan.body.lbs import axis_angle_to_matrix, left_jacobian, shortest_turn
-from gsgan.skeleton.hands import FINGERS, HAND, MIN_PALM, PALM, PINKY, palm_frames
+from gsgan.skeleton.hands import (
+    FINGERS,
+    HAND,
+    MIN_PALM,
+    PALM,
+    PINKY,
+    palm_frames,
+)
 from gsgan.utils.tensors import constant, matvec
 
 # Per number, for the thumb and for the fingers: flexion, turn to the side and twist of the first
@@ -125,7 +132,9 @@ class Fingers(nn.Module):
             placed=self.placed(seen),
         )
 
-    def _turned(self, R: Tensor, hands: Tensor, seen: Tensor, steps: int) -> Tensor:
+    def _turned(
+        self, R: Tensor, hands: Tensor, seen: Tensor, steps: int
+    ) -> Tensor:
         """Turns ``[B, 20, 3]`` on hands that are turned by ``R [B, 2, 3, 3]`` since rest."""
         # The observed bones in the axes of hands at rest, with the body's lengths.
         R = R.repeat_interleave(len(FINGERS), dim=1)
@@ -133,7 +142,9 @@ class Fingers(nn.Module):
         lengths = self.bones.norm(dim=-1, keepdim=True)
         bones = lengths * normalize(bones, dim=-1, eps=1e-9)
 
-        weight = seen[:, self.chains[:, 1:]].to(bones) / FINGER_LANDMARK_NOISE**2
+        weight = (
+            seen[:, self.chains[:, 1:]].to(bones) / FINGER_LANDMARK_NOISE**2
+        )
         numbers = self._start(bones, weight)
         for _ in range(steps):
             numbers = numbers - self._step(numbers, bones, weight)
@@ -184,7 +195,9 @@ class Fingers(nn.Module):
         before = axis_angle_to_matrix((first.unsqueeze(-1) * own).sum(2))
         beyond = (now[:, :, 1:].sum(2).unsqueeze(-2) @ before).squeeze(-2)
         second = _shown_turn(others, rest[:, :, 1:].sum(2), beyond)
-        return torch.cat([first, second], dim=2).clamp(self.minimum, self.maximum)
+        return torch.cat([first, second], dim=2).clamp(
+            self.minimum, self.maximum
+        )
 
     def _step(self, numbers: Tensor, bones: Tensor, weight: Tensor) -> Tensor:
         """``[B, 10, 5]``: what a Gauss-Newton step subtracts."""
@@ -235,7 +248,9 @@ def _palms(hands: Tensor) -> Tensor:
     return hands.unflatten(1, (2, HAND)).index_select(2, palm)
 
 
-def _placed(x: Tensor, hands: Tensor, seen: Tensor, R: Tensor) -> tuple[Tensor, Tensor]:
+def _placed(
+    x: Tensor, hands: Tensor, seen: Tensor, R: Tensor
+) -> tuple[Tensor, Tensor]:
     """Rotations ``[B, 2, 3, 3]`` and shifts ``[B, 2, 3]`` that move ``x`` to the landmarks seen.
 
     They minimise the distances of ``x [B, 42, 3]``, by Gauss-Newton steps from ``R``. Their
@@ -283,7 +298,9 @@ def _axes(
         thumb: ``[10]`` bool.
     """
     # Directions of both bones, [10, 2, 3], and the hands' axes for each finger.
-    along = normalize(torch.stack([bones[:, 0], bones[:, 1:].sum(1)], dim=1), dim=-1)
+    along = normalize(
+        torch.stack([bones[:, 0], bones[:, 1:].sum(1)], dim=1), dim=-1
+    )
     out = palms[..., 2] * palms.new_tensor([[1.0], [-1.0]])
     out = out.repeat_interleave(len(FINGERS), dim=0).unsqueeze(1)
     pinky = pinky.repeat_interleave(len(FINGERS), dim=0).unsqueeze(1)

@@ -32,7 +32,9 @@ class Body(MarkedBody):
     surface_names: tuple[str, ...]  # skin, hair, eye and the garments
     landmark_names: tuple[str, ...]  # of the 33
     hand_landmarks: Tensor  # [42, 3] metres
-    hand_bone: Tensor  # [42] int64, the joint that each hand landmark moves with
+    hand_bone: (
+        Tensor  # [42] int64, the joint that each hand landmark moves with
+    )
     hand_names: tuple[str, ...]  # of the 42
 
     def posed_hands(self, pose: BodyPose) -> Tensor:
@@ -40,11 +42,15 @@ class Body(MarkedBody):
         return carry(self.transforms(pose), self.hand_landmarks, self.hand_bone)
 
 
-def majority_vertex_labels(faces: Tensor, face_labels: Tensor, vertices: int) -> Tensor:
+def majority_vertex_labels(
+    faces: Tensor, face_labels: Tensor, vertices: int
+) -> Tensor:
     """``[V]`` int64: the label of most faces around a vertex, the lowest one on a tie."""
     # Votes of each label at each vertex, counted in one call.
     classes = int(face_labels.max()) + 1
-    votes = torch.zeros(vertices * classes, dtype=torch.int64, device=faces.device)
+    votes = torch.zeros(
+        vertices * classes, dtype=torch.int64, device=faces.device
+    )
     slot = faces * classes + face_labels[:, None]
     votes.index_add_(0, slot.flatten(), torch.ones_like(slot).flatten())
     return votes.view(vertices, classes).argmax(dim=1)
@@ -76,7 +82,13 @@ def read_body(path: Path) -> Body:
     try:
         with np.load(path, allow_pickle=False) as archive:
             return _body(dict(archive))
-    except (KeyError, ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+    except (
+        KeyError,
+        ValueError,
+        OSError,
+        EOFError,
+        zipfile.BadZipFile,
+    ) as error:
         raise DataError(
             f"{path} is missing or cannot be read as a body ({error}): reinstall gsgan, or bake it "
             "with scripts/bake_free_body.py"
@@ -88,7 +100,9 @@ def _body(arrays: dict[str, np.ndarray]) -> Body:
 
     def tensor(name: str) -> Tensor:
         whole = arrays[name].dtype.kind in "iu"
-        return torch.from_numpy(arrays[name].astype(np.int64 if whole else np.float32))
+        return torch.from_numpy(
+            arrays[name].astype(np.int64 if whole else np.float32)
+        )
 
     def names(name: str) -> tuple[str, ...]:
         return tuple(map(str, arrays[name]))

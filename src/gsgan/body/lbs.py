@@ -154,7 +154,9 @@ class KinematicPlan(NamedTuple):
 
     level_sizes: list[int]
     order: tuple[int, ...]  # joints, level by level
-    parents: tuple[int, ...]  # of each joint in `order`; a root is its own parent
+    parents: tuple[
+        int, ...
+    ]  # of each joint in `order`; a root is its own parent
     # by level, from the second: places of the parents in the level above
     parent_places: tuple[tuple[int, ...], ...]
     inverse: tuple[int, ...]  # place of each joint in `order`
@@ -165,10 +167,14 @@ def kinematic_plan(parents: tuple[int, ...]) -> KinematicPlan:
     """The plan of a skeleton with these parents, -1 for a root."""
     levels = kinematic_levels(parents)
     order = tuple(chain.from_iterable(levels))
-    own_parents = [joint if parents[joint] < 0 else parents[joint] for joint in order]
+    own_parents = [
+        joint if parents[joint] < 0 else parents[joint] for joint in order
+    ]
     parent_places = []
     for above, level in pairwise(levels):
-        parent_places.append(tuple(above.index(parents[joint]) for joint in level))
+        parent_places.append(
+            tuple(above.index(parents[joint]) for joint in level)
+        )
     return KinematicPlan(
         level_sizes=list(map(len, levels)),
         order=order,
@@ -221,7 +227,9 @@ def blend_transforms(
 
     # One lookup averages the transforms of all poses: its table has a row for each bone.
     bones = transforms[:, :, :3].transpose(0, 1).flatten(1)
-    blended = embedding_bag(bone_index, bones, per_sample_weights=weight, mode="sum")
+    blended = embedding_bag(
+        bone_index, bones, per_sample_weights=weight, mode="sum"
+    )
     affine = blended.unflatten(1, (-1, 3, 4)).transpose(0, 1)
     return affine[..., :3], affine[..., 3]
 

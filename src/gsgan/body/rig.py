@@ -30,7 +30,11 @@ FREE: dict[str, Chain] = {
     "neck": (("neck01", 0.5), ("head", 0.5)),
     "collar": (("clavicle.{}", 1.0),),
     "arm": (("upperarm01.{}", 0.8), ("upperarm02.{}", 0.2)),
-    "forearm": (("lowerarm01.{}", 0.5), ("lowerarm02.{}", 0.1), ("wrist.{}", 0.4)),
+    "forearm": (
+        ("lowerarm01.{}", 0.5),
+        ("lowerarm02.{}", 0.1),
+        ("wrist.{}", 0.4),
+    ),
     "hand": (("wrist.{}", 1.0),),
     "thumb": (("finger1-1.{}", 1.0),),
     "thigh": (("upperleg01.{}", 0.8), ("upperleg02.{}", 0.2)),
@@ -97,7 +101,9 @@ class Turn(NamedTuple):
     """A rotation at a joint, and the numbers that it depends on."""
 
     joint: int
-    axes: dict[str, Tensor]  # axis times share, by number; turns may share numbers
+    axes: dict[
+        str, Tensor
+    ]  # axis times share, by number; turns may share numbers
 
 
 @dataclass(frozen=True)
@@ -106,7 +112,9 @@ class Limb:
 
     hub: int  # the bone frame that it hangs on, `PELVIS` or `CHEST`
     points: tuple[int, int, int]  # landmarks of its first, middle and end joint
-    numbers: tuple[int, int, int, int]  # the swing's two axes, the twist, and the hinge
+    numbers: tuple[
+        int, int, int, int
+    ]  # the swing's two axes, the twist, and the hinge
     # [3, 3] of the swing, the first as near to the hinge as can be; and of the twist, along the
     # upper bone
     axes: Tensor
@@ -246,7 +254,9 @@ def _leg(turns: _Turns, side: str, axes: dict[str, Tensor]) -> LimbAxes:
     turns.put("thigh", _swing(f"{side}_thigh", thigh, flat), slice(0, 1))
     turns.put("thigh", {f"{side}_thigh_twist": thigh})
     turns.put("shank", {f"{side}_knee": knee})
-    turns.put("shank", {f"{side}_knee_side": tilt, f"{side}_shank_twist": shank})
+    turns.put(
+        "shank", {f"{side}_knee_side": tilt, f"{side}_shank_twist": shank}
+    )
     turns.put("foot", _named(f"{side}_foot", axes))
     turns.put("toe", {f"{side}_toe": axes["x"]})
     return LimbAxes(upper=thigh, flat=flat, lower=shank)
@@ -268,7 +278,9 @@ def _across(v: Tensor, along: Tensor) -> Tensor:
     return normalize(v - (v @ along) * along, dim=0)
 
 
-def _rig(body: MarkedBody, turns: _Turns, limbs: dict[str, LimbAxes]) -> BodyRig:
+def _rig(
+    body: MarkedBody, turns: _Turns, limbs: dict[str, LimbAxes]
+) -> BodyRig:
     """The tensors of turns and limbs."""
     # Turns by the depth of their joints; those of one joint keep their order.
     depth = [0]
@@ -277,7 +289,9 @@ def _rig(body: MarkedBody, turns: _Turns, limbs: dict[str, LimbAxes]) -> BodyRig
     ordered = sorted(turns, key=lambda turn: depth[turn.joint])
 
     # The numbers in the order of the turns, with the root's translation after its rotation.
-    found = list(dict.fromkeys(chain.from_iterable(turn.axes for turn in ordered)))
+    found = list(
+        dict.fromkeys(chain.from_iterable(turn.axes for turn in ordered))
+    )
     names = (*found[:3], *(f"transl_{k}" for k in XYZ), *found[3:])
 
     # A joint without a turn moves with the last turn of the nearest joint above it.
@@ -307,7 +321,9 @@ def _rig(body: MarkedBody, turns: _Turns, limbs: dict[str, LimbAxes]) -> BodyRig
     # A turn moves the landmarks that follow it, except those at its joint.
     joints = torch.tensor([turn.joint for turn in ordered])
     carriers = torch.tensor([carrier(int(j)) for j in body.landmark_bone])
-    there = (body.landmarks[:, None] - body.joints[joints]).norm(dim=-1) < AT_JOINT
+    there = (body.landmarks[:, None] - body.joints[joints]).norm(
+        dim=-1
+    ) < AT_JOINT
     moved = (ancestors(torch.tensor(parents))[carriers] & ~there).mT  # [T, 33]
     reaches = torch.zeros(len(names), len(carriers), dtype=torch.bool)
     for i, number in zip(entry_turn, entry_number, strict=True):
@@ -366,7 +382,8 @@ def _limb(names: tuple[str, ...], words: str, axes: LimbAxes) -> Limb:
     """A limb of its side, name and joints, as in ``left arm shoulder elbow wrist``."""
     side, limb, first, middle, end = words.split()
     bend = torch.atan2(
-        torch.linalg.cross(axes.upper, axes.lower).norm(), axes.upper @ axes.lower
+        torch.linalg.cross(axes.upper, axes.lower).norm(),
+        axes.upper @ axes.lower,
     )
     across = torch.linalg.cross(axes.upper, axes.flat)
     return Limb(

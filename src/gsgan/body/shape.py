@@ -84,7 +84,9 @@ class BodyShape:
         for name, shape in SHAPES.items():
             value = getattr(self, name)
             found.append(list(shape if value is None else value.shape))
-        if self.coefficients.ndim != 1 or found != list(map(list, SHAPES.values())):
+        if self.coefficients.ndim != 1 or found != list(
+            map(list, SHAPES.values())
+        ):
             raise ValueError(
                 f"BodyShape: expected coefficients [K], stretch [{len(STRETCHED)}], offsets "
                 f"{list(LANDMARKS)}, hands {list(HANDS_SHAPE)}, spine [1], got "
@@ -119,7 +121,11 @@ class BodyShape:
             ValueError: when the count is that of no shape.
         """
         # Hands and spine are left out if they are None.
-        sizes = [free_space().coefficients, len(STRETCHED), math.prod(LANDMARKS)]
+        sizes = [
+            free_space().coefficients,
+            len(STRETCHED),
+            math.prod(LANDMARKS),
+        ]
         hands = math.prod(HANDS_SHAPE)
         counts = [sum(sizes) + more for more in (0, 1, hands, hands + 1)]
         if values.ndim != 1 or len(values) not in counts:
@@ -127,7 +133,9 @@ class BodyShape:
             raise ValueError(
                 f"BodyShape: expected {known} numbers, got {list(values.shape)}"
             )
-        K, stretch, offsets, more = values.split([*sizes, len(values) - sum(sizes)])
+        K, stretch, offsets, more = values.split(
+            [*sizes, len(values) - sum(sizes)]
+        )
         has_hands = len(more) >= hands
         has_spine = len(more) in (1, hands + 1)
         return cls(
@@ -158,7 +166,9 @@ class ShapeSpace(Generic[B]):
 
     def neutral(self) -> BodyShape:
         """The shape of `body` itself."""
-        return BodyShape(torch.zeros(self.coefficients), torch.ones(len(STRETCHED)))
+        return BodyShape(
+            torch.zeros(self.coefficients), torch.ones(len(STRETCHED))
+        )
 
     def shaped(self, shape: BodyShape) -> B:
         """The body in a shape; differentiable in the shape's tensors.
@@ -234,7 +244,9 @@ def _stretched(body: B, stretch: Tensor) -> B:
     # Each joint moves with its parent's part.
     places = [joints[0]]
     for joint, parent in enumerate(body.parents[1:], start=1):
-        places.append(places[parent] + S[parent] @ (joints[joint] - joints[parent]))
+        places.append(
+            places[parent] + S[parent] @ (joints[joint] - joints[parent])
+        )
     moved = torch.stack(places)
     shift = moved - matvec(S, joints)
 
@@ -277,7 +289,9 @@ def _with_hands(body: B, hands: Tensor) -> B:
     # Wrists have moves of their own.
     wrists = [body.joint_names.index(name) for name in WRISTS]
     at = body.joints[wrists] + hands[:, 0]
-    joints = (body.joints + moves[sides]).index_copy(0, torch.tensor(wrists), at)
+    joints = (body.joints + moves[sides]).index_copy(
+        0, torch.tensor(wrists), at
+    )
     changes: dict[str, Any] = {
         "vertices": vertices,
         "landmarks": landmarks,
@@ -362,4 +376,6 @@ def open_body(
             f"{file} has {model.shapedirs.shape[-1]} shape coefficients, the data gives "
             f"{len(betas)}; give the model file that the data was fitted with"
         )
-    return model.as_body(betas, fitting_parts(tuple(label_names), model.joint_names))
+    return model.as_body(
+        betas, fitting_parts(tuple(label_names), model.joint_names)
+    )

@@ -47,7 +47,9 @@ class SkinnedBody:
     vertex_labels: Tensor  # [V] int64 part of each vertex, see label_names
     label_names: tuple[str, ...]  # of each part, background first
     label_source: Literal["own", "guess", "vote"] = "own"
-    template: Tensor | None = None  # [V, 3] metres, the body before it is shaped
+    template: Tensor | None = (
+        None  # [V, 3] metres, the body before it is shaped
+    )
 
     def __post_init__(self) -> None:
         check_weights(self.bone_weight)
@@ -130,7 +132,9 @@ class MarkedBody(SkinnedBody):
         return carry(self.transforms(pose), self.landmarks, self.landmark_bone)
 
 
-def carry(transforms: Tensor, points: Tensor, bones: Tensor | None = None) -> Tensor:
+def carry(
+    transforms: Tensor, points: Tensor, bones: Tensor | None = None
+) -> Tensor:
     """``[B, N, 3]``: points ``[N, 3]`` moved rigidly with their bones; None: one of each bone."""
     T = transforms if bones is None else transforms[:, bones]
     return matvec(T[..., :3, :3], points.to(T)) + T[..., :3, 3]
@@ -174,7 +178,9 @@ class WeightGradients(nn.Module):
         operator = surface_gradient(body.vertices, body.faces, chosen)
         places = body.vertices[chosen].float()
         buffers = {
-            "homogeneous": torch.cat([places, torch.ones_like(places[:, :1])], dim=1),
+            "homogeneous": torch.cat(
+                [places, torch.ones_like(places[:, :1])], dim=1
+            ),
             "rows": torch.from_numpy(operator.indptr[:-1]).long(),
             "columns": torch.from_numpy(operator.indices).long(),
             "values": torch.from_numpy(operator.data).float(),
@@ -202,7 +208,11 @@ class WeightGradients(nn.Module):
         dense = weight.new_zeros(len(weight), self.joints)
         dense.scatter_add_(1, index, weight)
         slopes = embedding_bag(
-            self.columns, dense, self.rows, mode="sum", per_sample_weights=self.values
+            self.columns,
+            dense,
+            self.rows,
+            mode="sum",
+            per_sample_weights=self.values,
         )
         slopes = slopes.unflatten(0, (-1, 3))
 
@@ -216,10 +226,14 @@ class WeightGradients(nn.Module):
         factors = slopes.unsqueeze(-1) * self.homogeneous[:, None, None]
         columns = 4 * bones.unsqueeze(-1) + torch.arange(4, device=bones.device)
         columns = columns.unsqueeze(1).expand_as(factors)
-        return columns.flatten(2).flatten(0, 1), factors.flatten(2).flatten(0, 1)
+        return columns.flatten(2).flatten(0, 1), factors.flatten(2).flatten(
+            0, 1
+        )
 
 
-def surface_gradient(vertices: Tensor, faces: Tensor, chosen: Tensor) -> csr_array:
+def surface_gradient(
+    vertices: Tensor, faces: Tensor, chosen: Tensor
+) -> csr_array:
     """The gradient along the surface of numbers that are known at some of its vertices.
 
     Args:
@@ -242,7 +256,11 @@ def surface_gradient(vertices: Tensor, faces: Tensor, chosen: Tensor) -> csr_arr
     # Least squares in the tangent plane: (Σ step stepᵀ) gradient = Σ step (difference).
     square = x.new_zeros(count, 3, 3)
     square.index_add_(0, a, step.unsqueeze(2) * step.unsqueeze(1))
-    size = square.diagonal(dim1=1, dim2=2).sum(dim=1).clamp_min(1e-12)[:, None, None]
+    size = (
+        square.diagonal(dim1=1, dim2=2)
+        .sum(dim=1)
+        .clamp_min(1e-12)[:, None, None]
+    )
     across = normals.unsqueeze(2) * normals.unsqueeze(1)
     square = square + size * (across + 1e-6 * torch.eye(3).to(x))
     share = torch.linalg.solve(square[a], step)  # [E, 3]
@@ -259,7 +277,9 @@ def surface_gradient(vertices: Tensor, faces: Tensor, chosen: Tensor) -> csr_arr
     return csr_array(plus - minus)
 
 
-def neighbours_on_surface(vertices: Tensor, faces: Tensor, chosen: Tensor) -> Tensor:
+def neighbours_on_surface(
+    vertices: Tensor, faces: Tensor, chosen: Tensor
+) -> Tensor:
     """``[E, 2]`` pairs of chosen vertices, in both orders, that are next to each other.
 
     Each vertex belongs to the chosen one that is nearest along the edges; two chosen vertices are

@@ -44,7 +44,9 @@ KEYS = (
     "f",
 )
 SMPLX_JOINT_COUNT = 55
-WEIGHT_TOLERANCE = 1e-3  # of the sum of a vertex's weights, and of negative weights
+WEIGHT_TOLERANCE = (
+    1e-3  # of the sum of a vertex's weights, and of negative weights
+)
 
 Floats = NDArray[np.float64]
 
@@ -63,7 +65,9 @@ def read_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], tuple[int, ...]]:
     raw = _raw(path)
     v_template = expect_array(raw, "v_template", (None, 3), path)
     V = len(v_template)
-    parents = _parents(expect_array(raw, "kintree_table", (2, None), path), path)
+    parents = _parents(
+        expect_array(raw, "kintree_table", (2, None), path), path
+    )
     J = len(parents)
     directions = expect_array(raw, "shapedirs", (V, 3, None), path)
     S = directions.shape[-1]
@@ -92,12 +96,16 @@ def read_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], tuple[int, ...]]:
 
 def _raw(path: Path) -> dict[str, Any]:
     """The content of a model file, which has all `KEYS`."""
-    content = read_npz(path, KEYS) if zipfile.is_zipfile(path) else read_pickle(path)
+    content = (
+        read_npz(path, KEYS) if zipfile.is_zipfile(path) else read_pickle(path)
+    )
     if not isinstance(content, dict):
         raise DataError(
             f"{path} holds a {type(content).__name__}; expected an SMPL model, a dict"
         )
-    missing = [key for key in KEYS if not isinstance(content.get(key), np.ndarray)]
+    missing = [
+        key for key in KEYS if not isinstance(content.get(key), np.ndarray)
+    ]
     if missing:
         raise DataError(
             f"{path} is not an SMPL model: it has no array {', '.join(missing)}; give the model "
@@ -113,7 +121,9 @@ def _parents(table: NDArray[Any], path: Path) -> tuple[int, ...]:
     for parent in table[0, 1:]:
         parents.append(column.get(int(parent), -1))
 
-    broken = [j for j, parent in enumerate(parents) if j and not 0 <= parent < j]
+    broken = [
+        j for j, parent in enumerate(parents) if j and not 0 <= parent < j
+    ]
     found = f"no earlier parent for joint {broken[0]}" if broken else None
     if len(column) != table.shape[1] or len(column) < 2:
         found = f"{len(column)} joints in {table.shape[1]} columns"
@@ -168,7 +178,9 @@ class SkinnedModel:
     v_template: Tensor  # [V, 3] metres, the mean shape
     shapedirs: Tensor  # [V, 3, S]
     expression_dirs: Tensor  # [V, 3, E]; E is 0 but for SMPL-X
-    posedirs: Tensor  # [V, 3, 9 (J - 1)], per row-major entry of each joint's R - 1
+    posedirs: (
+        Tensor  # [V, 3, 9 (J - 1)], per row-major entry of each joint's R - 1
+    )
     J_regressor: Tensor  # [J, V]
     weights: Tensor  # [V, J], rows sum to 1
     parents: tuple[int, ...]  # of each joint, -1 for the root
@@ -199,7 +211,9 @@ class SkinnedModel:
         """``[J, 3, ...]`` of the vertices' ``[V, 3, ...]``."""
         return (self.J_regressor @ x.flatten(1)).unflatten(1, x.shape[1:])
 
-    def rest_vertices(self, betas: Tensor, expression: Tensor | None = None) -> Tensor:
+    def rest_vertices(
+        self, betas: Tensor, expression: Tensor | None = None
+    ) -> Tensor:
         """``[B, V, 3]`` metres, the shaped body at rest.
 
         Args:
@@ -212,7 +226,9 @@ class SkinnedModel:
         shaped = _add("betas", self.v_template, self.shapedirs, betas)
         return _add("expression", shaped, self.expression_dirs, expression)
 
-    def rest_joints(self, betas: Tensor, expression: Tensor | None = None) -> Tensor:
+    def rest_joints(
+        self, betas: Tensor, expression: Tensor | None = None
+    ) -> Tensor:
         """``[B, J, 3]`` metres, the joints of the shaped body at rest; arguments as above."""
         mean, shape, face = self.joint_shapes
         shaped = _add("betas", mean, shape, betas)
@@ -245,7 +261,9 @@ class SkinnedModel:
         # The transforms of the shaped skeleton's joints.
         rotations = axis_angle_to_matrix(theta.to(self.v_template))
         rest = self.rest_joints(betas, expression).expand(len(theta), -1, -1)
-        transforms = forward_kinematics(rest, self.parents, rotations, transl.to(rest))
+        transforms = forward_kinematics(
+            rest, self.parents, rotations, transl.to(rest)
+        )
 
         # The shape in this pose, before skinning.
         vertices = self.rest_vertices(betas, expression)
@@ -256,7 +274,9 @@ class SkinnedModel:
         A, t = blend_transforms(transforms, *self.bones)
         return skin(vertices, A, t), carry(transforms, rest)
 
-    def as_body(self, betas: ArrayLike = (), parts: Parts = "clothes") -> MarkedBody:
+    def as_body(
+        self, betas: ArrayLike = (), parts: Parts = "clothes"
+    ) -> MarkedBody:
         """The shaped body as a `MarkedBody`: float32, one part per vertex, no blend shapes.
 
         A vertex belongs to the part of the joint with its largest skinning weight, on a tie to that
@@ -281,7 +301,10 @@ class SkinnedModel:
         names = part_names(parts, self.joint_names)
 
         # The part of each vertex, by its joint with the largest weight, the first of equals.
-        own = [names.index(part_of_joint(parts, joint)) for joint in self.joint_names]
+        own = [
+            names.index(part_of_joint(parts, joint))
+            for joint in self.joint_names
+        ]
         first = torch.from_numpy(self.weights.numpy().argmax(axis=1))
 
         index, weight = self.bones
@@ -304,7 +327,9 @@ class SkinnedModel:
             landmark_bone=bones,
         )
 
-    def landmarks(self, vertices: Tensor, joints: Tensor) -> tuple[Tensor, Tensor]:
+    def landmarks(
+        self, vertices: Tensor, joints: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """MediaPipe's 33 landmarks ``[33, 3]`` at rest, and the joint ``[33]`` that carries each.
 
         A landmark that the model does not have is NaN and carried by the root: the mouth; and
@@ -329,7 +354,9 @@ class SkinnedModel:
                 carriers[name] = int(largest[vertex])
             for name, (joint, _) in table.midpoints.items():
                 carriers[name] = joint
-        bones = torch.tensor([carriers.get(name, 0) for name in MEDIAPIPE33.names])
+        bones = torch.tensor(
+            [carriers.get(name, 0) for name in MEDIAPIPE33.names]
+        )
         return torch.from_numpy(p), bones
 
 
@@ -346,7 +373,9 @@ def _add(
             f"got {list(coefficients.shape)}"
         )
     given = coefficients.to(base)
-    return base + (directions[..., : given.shape[1]] @ given.mT).permute(2, 0, 1)
+    return base + (directions[..., : given.shape[1]] @ given.mT).permute(
+        2, 0, 1
+    )
 
 
 def read_smpl(path: Path | str) -> SkinnedModel:
@@ -364,7 +393,9 @@ def read_smpl(path: Path | str) -> SkinnedModel:
     return SkinnedModel(kind=kind, parents=parents, **tensors)
 
 
-def from_zju(Rh: ArrayLike, Th: ArrayLike, J0: ArrayLike) -> tuple[Floats, Floats]:
+def from_zju(
+    Rh: ArrayLike, Th: ArrayLike, J0: ArrayLike
+) -> tuple[Floats, Floats]:
     """Root rotation and translation of :class:`SkinnedModel` from EasyMocap's and ZJU-MoCap's.
 
     Theirs is ``R(Rh) x + Th`` of the body posed with an unrotated root, about the model's origin;
@@ -384,4 +415,6 @@ def from_zju(Rh: ArrayLike, Th: ArrayLike, J0: ArrayLike) -> tuple[Floats, Float
     orient = np.asarray(Rh, np.float64)
     root = np.asarray(J0, np.float64)
     R = axis_angle_to_matrix(torch.from_numpy(orient)).numpy()
-    return orient, np.asarray(Th, np.float64) + (R @ root[..., None])[..., 0] - root
+    return orient, np.asarray(Th, np.float64) + (R @ root[..., None])[
+        ..., 0
+    ] - root

@@ -95,7 +95,9 @@ def part_names(parts: Parts, joint_names: tuple[str, ...]) -> tuple[str, ...]:
     return CLOTHES if parts == "clothes" else CIHP
 
 
-def fitting_parts(label_names: tuple[str, ...], joint_names: tuple[str, ...]) -> Parts:
+def fitting_parts(
+    label_names: tuple[str, ...], joint_names: tuple[str, ...]
+) -> Parts:
     """The set of parts with these names; the free body's if there is none."""
     parts: Parts
     for parts in get_args(Parts):

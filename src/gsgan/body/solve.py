@@ -49,17 +49,30 @@ LANDMARK_NOISE = 0.004
 FACE_NOISE = 0.008
 KNUCKLE_NOISE = 0.007
 HIP_NOISE = 0.05  # of estimated hips: nothing else keeps the trunk from tilting
-KNUCKLES = slice(17, 23)  # of 33 landmarks: pinky, index and thumb of both hands
-ON_HANDS = ((17, 19, 21), (18, 20, 22))  # the 33 landmarks that hand landmarks replace
-ROBUST = 5.0  # standard deviations at which the loss of a landmark becomes linear
+KNUCKLES = slice(
+    17, 23
+)  # of 33 landmarks: pinky, index and thumb of both hands
+ON_HANDS = (
+    (17, 19, 21),
+    (18, 20, 22),
+)  # the 33 landmarks that hand landmarks replace
+ROBUST = (
+    5.0  # standard deviations at which the loss of a landmark becomes linear
+)
 MAX_STEPS = 10  # Levenberg-Marquardt steps at most
 MIN_IMPROVEMENT = 1e-3  # relative change of the cost at which a frame stops
-GRADIENT_STEPS = 8  # error of gradients: a few percent if a landmark hardly matters
+GRADIENT_STEPS = (
+    8  # error of gradients: a few percent if a landmark hardly matters
+)
 FIRST_DAMPING = 1e-3  # at the first step
-DAMPING_DECREASE = 0.2  # factor of the damping after a step that lowers the cost
+DAMPING_DECREASE = (
+    0.2  # factor of the damping after a step that lowers the cost
+)
 DAMPING_INCREASE = 20.0  # and after one that does not
 FLOOR = 1e-3  # on the diagonal: the root has no prior
-CHUNK_FRAMES = 64  # frames at a time: their matrices fit into a processor's cache
+CHUNK_FRAMES = (
+    64  # frames at a time: their matrices fit into a processor's cache
+)
 # Between these bends, radians, the weight of the twist rises from 0 to 1.
 STRAIGHT_BEND = 0.1
 SHARP_BEND = 0.4
@@ -108,7 +121,9 @@ class Solver(nn.Module):
     prior: Tensor  # [D, D] precisions
     minimum: Tensor  # [D] minimum of each number
     matrix: Tensor  # [D, 3 T] from numbers to the turns' axis-angles
-    follows: Tensor  # [E, N, 1] bool, whether a landmark follows an entry's turn
+    follows: (
+        Tensor  # [E, N, 1] bool, whether a landmark follows an entry's turn
+    )
     jumps: Tensor  # [n, T + 1]
     before: Tensor  # [T] the turn before each, T for the root's
     rest_hubs: Tensor  # [3, 3, 3] frames of pelvis, chest and head
@@ -130,7 +145,9 @@ class Solver(nn.Module):
         own = body.landmarks[:BODY]
         with torch.no_grad():
             rig = self.rig = build_rig(body)
-            rest, _ = sanitise(torch.where(known[:, None], own, torch.nan)[None])
+            rest, _ = sanitise(
+                torch.where(known[:, None], own, torch.nan)[None]
+            )
             matrix = body.joints.new_zeros(len(rig.names), len(rig.joint), 3)
             matrix[rig.entry_number, rig.entry_turn] = rig.entry_axis.to(matrix)
             precision, minimum = prior(rig)
@@ -146,7 +163,9 @@ class Solver(nn.Module):
                 "matrix": matrix.flatten(1),
                 "follows": follows[rig.entry_turn, :, None],
                 "jumps": _jumps(rig.parent),
-                "before": torch.where(rig.parent < 0, len(rig.parent), rig.parent),
+                "before": torch.where(
+                    rig.parent < 0, len(rig.parent), rig.parent
+                ),
                 "rest_hubs": bone_frames(rest).hubs[0],
                 "rest_hips": rest[0, MEDIAPIPE33.hips].mean(0),
                 "replaced": replaced,
@@ -201,7 +220,9 @@ class Solver(nn.Module):
         found = None
         hands = skeleton[:, BODY:WITH_HAND_JOINTS]
         if self.fingers is not None and hands.shape[1]:
-            seen = (visibility[:, BODY:WITH_HAND_JOINTS] > 0) & hands.isfinite().all(-1)
+            seen = (
+                visibility[:, BODY:WITH_HAND_JOINTS] > 0
+            ) & hands.isfinite().all(-1)
             near = torch.where(seen.unsqueeze(-1), hands - shift, 0.0)
             found = self.fingers(near, seen)
             replaced = (found.placed.unsqueeze(-1) & self.replaced).any(1)
@@ -216,7 +237,9 @@ class Solver(nn.Module):
         thetas = []
         transls = []
         weights = weight.detach().split(CHUNK_FRAMES)
-        for near, near_weight in zip(p.split(CHUNK_FRAMES), weights, strict=True):
+        for near, near_weight in zip(
+            p.split(CHUNK_FRAMES), weights, strict=True
+        ):
             theta, transl = self._solve(near, near_weight)
             thetas.append(theta)
             transls.append(transl)
@@ -239,7 +262,9 @@ class Solver(nn.Module):
         hands = None
         if self.fingers is not None and p.shape[1] > BODY:
             landmarks = p[:, BODY:WITH_HAND_JOINTS]
-            seen = (shown[:, BODY:WITH_HAND_JOINTS] > 0) & landmarks.isfinite().all(-1)
+            seen = (
+                shown[:, BODY:WITH_HAND_JOINTS] > 0
+            ) & landmarks.isfinite().all(-1)
             hands = (landmarks, seen)
         theta, transl = compiled.solve(
             *self.job(),
@@ -279,7 +304,9 @@ class Solver(nn.Module):
             own["parent"] = self.rig.parent
 
             # Constants of the template, for the frames of trunk and head.
-            template = constants(MEDIAPIPE33, self.joints.device, self.joints.dtype)
+            template = constants(
+                MEDIAPIPE33, self.joints.device, self.joints.dtype
+            )
             own["head_from_eyes"] = template.head_from_eyes
             own["torso"] = template.torso
             own["head"] = template.head_points
@@ -287,14 +314,18 @@ class Solver(nn.Module):
             # The numbers of each joint that bends trunk and neck, and its share of the bend.
             names = (*SPINE, "neck")
             axes = [self._axes(name) / len(SPINE) for name in SPINE]
-            own["bend_numbers"] = torch.tensor([self.rig.numbers(n) for n in names])
+            own["bend_numbers"] = torch.tensor(
+                [self.rig.numbers(n) for n in names]
+            )
             own["bend_hub"] = torch.tensor([0] * len(SPINE) + [1])
             own["bend_axes"] = torch.stack([*axes, self._axes("neck")])
 
             # One row per limb.
             for name in ("hub", "points", "numbers", "axes", "bend"):
                 values = [getattr(limb, name) for limb in self.rig.limbs]
-                own[f"limb_{name}"] = torch.stack(list(map(torch.as_tensor, values)))
+                own[f"limb_{name}"] = torch.stack(
+                    list(map(torch.as_tensor, values))
+                )
 
             # The finger solver's own constants, if the body has fingers.
             if self.fingers is not None:
@@ -317,7 +348,9 @@ class Solver(nn.Module):
         hips = list(MEDIAPIPE33.hips)
         held = torch.zeros_like(self.precision)
         held[hips] = 1 / HIP_NOISE**2
-        return self.precision * valid + held * ~valid[:, hips].any(1, keepdim=True)
+        return self.precision * valid + held * ~valid[:, hips].any(
+            1, keepdim=True
+        )
 
     def at_rest(self, skeleton: Tensor, visibility: Tensor) -> Tensor:
         """``[B, joints]`` bool: joints at rest in `solve`, for want of landmarks that are visible
@@ -330,7 +363,9 @@ class Solver(nn.Module):
         if fingers is not None:
             placed = fingers.placed(hands)
             seen = seen & ~(placed.unsqueeze(-1) & self.replaced).any(1)
-            seen = torch.cat([seen, placed.repeat_interleave(len(PALM), dim=1)], dim=1)
+            seen = torch.cat(
+                [seen, placed.repeat_interleave(len(PALM), dim=1)], dim=1
+            )
 
         # The numbers that they show; the root's always.
         n = seen.shape[1]
@@ -339,7 +374,9 @@ class Solver(nn.Module):
         free[:, :6] = True
 
         # The joints that these numbers move.
-        moved = torch.zeros(len(visibility), self.parents, device=visibility.device)
+        moved = torch.zeros(
+            len(visibility), self.parents, device=visibility.device
+        )
         joints = self.joint[self.entry_turn].expand(len(visibility), -1)
         moved = moved.scatter_add(1, joints, free[:, self.entry_number].float())
         if fingers is not None:
@@ -378,7 +415,9 @@ class Solver(nn.Module):
         # The spine shares the turn from pelvis to chest, the neck has that from chest to head.
         bend = log_of(pelvis.mT @ chest)
         for name in SPINE:
-            q[:, self.rig.numbers(name)] = bend @ self._axes(name).mT / len(SPINE)
+            q[:, self.rig.numbers(name)] = (
+                bend @ self._axes(name).mT / len(SPINE)
+            )
         nod = log_of(chest.mT @ head)
         q[:, self.rig.numbers("neck")] = nod @ self._axes("neck").mT
         for limb in self.rig.limbs:
@@ -386,7 +425,9 @@ class Solver(nn.Module):
 
         # The root is where the middle of the hips is right.
         hips = p[:, MEDIAPIPE33.hips].mean(1)
-        q[:, 3:6] = hips - self.joints[0] - pelvis @ (self.rest_hips - self.joints[0])
+        q[:, 3:6] = (
+            hips - self.joints[0] - pelvis @ (self.rest_hips - self.joints[0])
+        )
         return q, pelvis
 
     def _guess_limb(self, limb: Limb, p: Tensor, hub: Tensor) -> Tensor:
@@ -407,13 +448,16 @@ class Solver(nn.Module):
         lower = (lower.unsqueeze(1) @ axis_angle_to_matrix(swing)).squeeze(1)
         normal = torch.linalg.cross(along.expand_as(lower), lower)
         bend = torch.atan2(normal.norm(dim=-1), lower @ along)
-        twist = torch.atan2(normal @ torch.linalg.cross(along, flat), normal @ flat)
-        twist = twist * ((bend - STRAIGHT_BEND) / (SHARP_BEND - STRAIGHT_BEND)).clamp(
-            0, 1
+        twist = torch.atan2(
+            normal @ torch.linalg.cross(along, flat), normal @ flat
         )
+        twist = twist * (
+            (bend - STRAIGHT_BEND) / (SHARP_BEND - STRAIGHT_BEND)
+        ).clamp(0, 1)
         by_axis = swing @ axes[:2].mT
         return torch.cat(
-            [by_axis, twist.unsqueeze(1), (bend - limb.bend).unsqueeze(1)], dim=1
+            [by_axis, twist.unsqueeze(1), (bend - limb.bend).unsqueeze(1)],
+            dim=1,
         )
 
     # -- the steps
@@ -456,7 +500,9 @@ class Solver(nn.Module):
         before_R = before[..., :3, :3]
         origin = matvec(before_R, self.joints[self.joint])
         origin = origin + before[..., :3, 3]
-        origin = torch.cat([origin[:, :1] + q[:, None, 3:6], origin[:, 1:]], dim=1)
+        origin = torch.cat(
+            [origin[:, :1] + q[:, None, 3:6], origin[:, 1:]], dim=1
+        )
 
         # World axes about which a number turns, and arms from there to the landmarks that follow.
         v = (q @ self.matrix).unflatten(1, (-1, 3))
@@ -492,12 +538,19 @@ class Solver(nn.Module):
         return NormalEquations(
             cost=2 * ROBUST**2 * (root - 1).sum(-1) + penalty.sum(-1),
             gradient=gradient + pull + stop * below,
-            matrix=weighted @ J.mT + self.prior + torch.diag_embed(stop + FLOOR),
+            matrix=weighted @ J.mT
+            + self.prior
+            + torch.diag_embed(stop + FLOOR),
             weight=w,
         )
 
     def descend(
-        self, q: Tensor, root: Tensor, p: Tensor, weight: Tensor, steps: int = MAX_STEPS
+        self,
+        q: Tensor,
+        root: Tensor,
+        p: Tensor,
+        weight: Tensor,
+        steps: int = MAX_STEPS,
     ) -> tuple[Tensor, Tensor]:
         """Numbers and root rotation after at most ``steps``; one that raises the cost is undone."""
         best_q = q
@@ -520,7 +573,9 @@ class Solver(nn.Module):
             change = (new.cost - best.cost).abs()
             done = done | (change <= MIN_IMPROVEMENT * best.cost)
             easier = damping * DAMPING_DECREASE
-            damping = torch.where(better[:, None], easier, damping * DAMPING_INCREASE)
+            damping = torch.where(
+                better[:, None], easier, damping * DAMPING_INCREASE
+            )
             best_q = _chosen(better, q, best_q)
             best_root = _chosen(better, root, best_root)
             best = NormalEquations(*map(partial(_chosen, better), new, best))
@@ -528,7 +583,9 @@ class Solver(nn.Module):
                 break
         return best_q, best_root
 
-    def _last_steps(self, q: Tensor, root: Tensor, p: Tensor, weight: Tensor) -> Tensor:
+    def _last_steps(
+        self, q: Tensor, root: Tensor, p: Tensor, weight: Tensor
+    ) -> Tensor:
         """Steps with a fixed matrix, which hardly move a solution.
 
         The derivative of their result approaches that of the exact solution, whose matrix is not

@@ -8,7 +8,13 @@ import numpy as np
 
 from gsgan.check.report import Finding, listed
 from gsgan.check.settings import Limits
-from gsgan.check.views import CheckedData, MaskView, body_silhouette, grouped, overlap
+from gsgan.check.views import (
+    CheckedData,
+    MaskView,
+    body_silhouette,
+    grouped,
+    overlap,
+)
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.formats.consistency import spread
 
@@ -38,7 +44,9 @@ class CameraScore:
     name: str  # of the camera
     inside: float  # mean share of joints inside the mask
     overlap: float  # mean overlap of mask and estimated silhouette
-    fullness: float  # median area of the mask over that of the estimated silhouette
+    fullness: (
+        float  # median area of the mask over that of the estimated silhouette
+    )
     # Mean overlap with other calibrations, best first, by the name of their camera or
     # `MIRRORED_IMAGES`.
     rivals: dict[str, float]
@@ -51,11 +59,16 @@ class CameraScore:
 
     def beaten(self, limits: Limits) -> bool:
         """Whether another calibration fits the masks better, and well."""
-        return self.best_rival > max(self.overlap + limits.better_fit, CREDIBLE_OVERLAP)
+        return self.best_rival > max(
+            self.overlap + limits.better_fit, CREDIBLE_OVERLAP
+        )
 
     def oversized(self, limits: Limits) -> bool:
         """Whether the masks are far larger than the body, and most of the body lies in them."""
-        return self.fullness > limits.fullness and self.inside > SHARE_OF_ANY_CAMERA
+        return (
+            self.fullness > limits.fullness
+            and self.inside > SHARE_OF_ANY_CAMERA
+        )
 
     def wrong(self, limits: Limits) -> bool:
         """Whether calibration or masks are wrong as a whole."""
@@ -66,10 +79,14 @@ class CameraScore:
     def close_rivals(self, limits: Limits) -> list[str]:
         """The other calibrations that fit about as well as the best."""
         lowest = self.best_rival - limits.better_fit
-        return [name for name, overlap in self.rivals.items() if overlap > lowest]
+        return [
+            name for name, overlap in self.rivals.items() if overlap > lowest
+        ]
 
 
-def score_cameras(subject: CheckedData, views: Sequence[MaskView]) -> list[CameraScore]:
+def score_cameras(
+    subject: CheckedData, views: Sequence[MaskView]
+) -> list[CameraScore]:
     """Scores every camera of which an image could be read."""
     scores = []
     for name, own in grouped(views).items():
@@ -78,7 +95,9 @@ def score_cameras(subject: CheckedData, views: Sequence[MaskView]) -> list[Camer
         camera = subject.cameras[name]
         rivals = dict[str, float]()
         for rival, other in calibrations(camera, subject.cameras):
-            rivals[rival] = max(rivals.get(rival, 0.0), _fit(subject, chosen, other))
+            rivals[rival] = max(
+                rivals.get(rival, 0.0), _fit(subject, chosen, other)
+            )
         best_first = sorted(rivals.items(), key=lambda rival: -rival[1])
 
         # Empty masks tell nothing about joints.
@@ -122,7 +141,9 @@ def calibrations(
             yield name, other
 
 
-def _fit(subject: CheckedData, views: Sequence[MaskView], camera: CameraEntry) -> float:
+def _fit(
+    subject: CheckedData, views: Sequence[MaskView], camera: CameraEntry
+) -> float:
     """Mean overlap of the masks with the silhouettes estimated for a camera."""
     overlaps = []
     for view in views:
@@ -187,7 +208,9 @@ def calibration_findings(
     # All cameras are off, so no single one is the cause.
     off = [score for score in scores if not score.inside >= min_inside]
     if len(scores) > 1 and not beaten and not big and off == scores:
-        shares = listed(f"{score.name} {percent(score.inside)}" for score in scores)
+        shares = listed(
+            f"{score.name} {percent(score.inside)}" for score in scores
+        )
         text = (
             f"in every camera joints lie outside the masks (inside: {shares}): axes, unit, size or "
             "frame numbers of the skeleton are wrong, K does not follow a crop, or the masks "
@@ -261,7 +284,9 @@ def _of_one(
     )
 
 
-def small_errors(scores: Sequence[CameraScore], limits: Limits) -> list[Finding]:
+def small_errors(
+    scores: Sequence[CameraScore], limits: Limits
+) -> list[Finding]:
     """Findings on cameras, of those without other ones, whose joints lie just outside the masks."""
     metres = {s.name: s.outside for s in scores if np.isfinite(s.outside)}
 

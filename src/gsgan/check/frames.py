@@ -101,7 +101,9 @@ def skeleton_doubts(subject: CheckedData, limits: Limits) -> list[Doubt]:
     joints = int(subject.visible.any(0).sum())
     seen = subject.visible.sum(1) / max(joints, 1)
     few = seen[:, None] < limits.seen_share
-    doubt("unseen", "", few, lambda row, _: f"{seen[row]:.0%} of the joints seen")
+    doubt(
+        "unseen", "", few, lambda row, _: f"{seen[row]:.0%} of the joints seen"
+    )
 
     # Joints far from 2D detections, as a share of the median focal length.
     pixels = reprojection_errors(subject)

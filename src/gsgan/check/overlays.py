@@ -74,7 +74,9 @@ def tile(subject: CheckedData, view: MaskView) -> Bytes:
     size = (TILE_HEIGHT, round(TILE_HEIGHT * ASPECT))
 
     def shown(image: Bytes) -> Bytes:
-        return resize(take(image, window, mapping, exact=False), size, exact=False)
+        return resize(
+            take(image, window, mapping, exact=False), size, exact=False
+        )
 
     layout = subject.layout
     image = read_colour(layout.image_path(view.camera, view.frame))

@@ -118,7 +118,9 @@ class CheckReport:
         for section in self.sections:
             found += section.findings
         # Sorting keeps the order of the sections within each level.
-        return tuple(sorted(found, key=lambda finding: finding.level != "error"))
+        return tuple(
+            sorted(found, key=lambda finding: finding.level != "error")
+        )
 
     @property
     def errors(self) -> int:
@@ -158,8 +160,12 @@ def page(report: CheckReport) -> str:
     """The report as one HTML file: no scripts, images embedded, nothing fetched."""
     # Names from the dataset are escaped.
     environment = Environment(autoescape=True, trim_blocks=True)
-    colour = "error" if report.errors else "warning" if report.warnings else "good"
-    return environment.from_string(REPORT_PAGE).render(report=report, colour=colour)
+    colour = (
+        "error" if report.errors else "warning" if report.warnings else "good"
+    )
+    return environment.from_string(REPORT_PAGE).render(
+        report=report, colour=colour
+    )
 
 
 def print_report(report: CheckReport, console: Console) -> None:
@@ -171,7 +177,9 @@ def print_report(report: CheckReport, console: Console) -> None:
 
     # The most severe findings come last, next to the prompt.
     for finding in reversed(report.findings):
-        start = Text(f"{finding.level}, {finding.topic}: ", STYLES[finding.level])
+        start = Text(
+            f"{finding.level}, {finding.topic}: ", STYLES[finding.level]
+        )
         console.print(start.append(finding.sentence, "default not bold"))
     style = STYLES["error"] if report.errors else "bold"
     console.print(Text(f"Check of a dataset: {report.verdict}", style))

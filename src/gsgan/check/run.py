@@ -61,7 +61,9 @@ def check_data(
         # The reader stops at the first problem; captures are searched for all.
         messages = [str(error)]
         if isinstance(data.reader, CaptureReader) and data.root is not None:
-            messages += capture_problems(Path(data.root).expanduser(), data.limits)
+            messages += capture_problems(
+                Path(data.root).expanduser(), data.limits
+            )
         return unreadable(data.root, messages)
     return CheckReport(
         str(measured.subject.layout.root),
@@ -146,4 +148,6 @@ def write_report(report: CheckReport, path: Path, console: Console) -> None:
         write_atomically(path, page(report))
     write_json(path.with_suffix(".json"), content)
     print_report(report, console)
-    console.print(f"report: {path}", markup=False, highlight=False, soft_wrap=True)
+    console.print(
+        f"report: {path}", markup=False, highlight=False, soft_wrap=True
+    )

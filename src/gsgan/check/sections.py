@@ -12,7 +12,12 @@ from rich.console import Console
 
 from gsgan.check import overlays, views
 from gsgan.check.calibration import calibration_findings, percent, score_cameras
-from gsgan.check.frames import frame_findings, mask_doubts, shortened, skeleton_doubts
+from gsgan.check.frames import (
+    frame_findings,
+    mask_doubts,
+    shortened,
+    skeleton_doubts,
+)
 from gsgan.check.report import Figure, Finding, Section, Table, counted
 from gsgan.check.settings import Limits, Sampling
 from gsgan.check.views import CheckedData
@@ -79,7 +84,9 @@ def geometry_of(subject: CheckedData) -> Geometry:
     return Geometry(distances, stature, up, float(lean), far)
 
 
-def geometry_findings(subject: CheckedData, geometry: Geometry) -> list[Finding]:
+def geometry_findings(
+    subject: CheckedData, geometry: Geometry
+) -> list[Finding]:
     """Findings on implausible units, a camera in another unit, and an up axis that is not up."""
     found = [Finding("error", "units", text) for text in geometry.far.values()]
 
@@ -112,8 +119,14 @@ def geometry_table(subject: CheckedData, geometry: Geometry) -> Table:
             f"{geometry.distance:.2f} m (median; {near:.2f} to {far:.2f})",
         ),
         ("person's height", f"{geometry.stature:.2f} m, from limb lengths"),
-        ("up axis", f"{meta.up_axis}; the trunk leans {geometry.lean:.0f}° from it"),
-        ("frames per second", "not given" if meta.fps is None else f"{meta.fps:g}"),
+        (
+            "up axis",
+            f"{meta.up_axis}; the trunk leans {geometry.lean:.0f}° from it",
+        ),
+        (
+            "frames per second",
+            "not given" if meta.fps is None else f"{meta.fps:g}",
+        ),
     )
     return Table(("what", "how much"), rows)
 
@@ -191,7 +204,9 @@ class Measurements:
         items += views.cut_items(subject, sampling.images)
         self.views, broken = views.measure(subject, items, sampling, console)
         if len(broken) > LISTED_BROKEN:
-            broken[LISTED_BROKEN:] = [f"{len(broken)} sampled images cannot be read"]
+            broken[LISTED_BROKEN:] = [
+                f"{len(broken)} sampled images cannot be read"
+            ]
         self.broken = [Finding("error", "files", text) for text in broken]
 
         # Cameras, and the names of those that are wrong as a whole.
@@ -244,7 +259,10 @@ class Measurements:
 
 def sections(m: Measurements) -> Sequence[Section]:
     """Every section, in reading order."""
-    units = (geometry_table(m.subject, m.geometry), lens_table(m.subject, m.geometry))
+    units = (
+        geometry_table(m.subject, m.geometry),
+        lens_table(m.subject, m.geometry),
+    )
     found = geometry_findings(m.subject, m.geometry)
 
     # One strip of images per camera.
@@ -274,7 +292,9 @@ def _contents(m: Measurements) -> Section:
     # Cameras, frames and images.
     images = sum(map(len, subject.pairs.values()))
     labels = sum(map(len, layout.labels.values()))
-    poses = "none" if layout.poses is None else f"{len(layout.poses.theta)} frames"
+    poses = (
+        "none" if layout.poses is None else f"{len(layout.poses.theta)} frames"
+    )
     contents = [
         ("layout", layout.meta.layout),
         ("cameras", f"{len(subject.cameras)}: {', '.join(subject.cameras)}"),
@@ -310,7 +330,9 @@ def _contents(m: Measurements) -> Section:
         lacking = sorted(set(frames) - set(files))
         if lacking:
             text = f"{len(lacking)} of the {len(frames)} frames: {shortened(lacking)}"
-            found.append(Finding("warning", "files", f"camera {name} lacks {text}"))
+            found.append(
+                Finding("warning", "files", f"camera {name} lacks {text}")
+            )
     table = Table(("what", "how much"), contents)
     return Section("Contents", (table,), found)
 
@@ -335,9 +357,7 @@ def _split(data: GsganData, name: str) -> str:
     if not items:
         return f"empty: {data.splits.reasons.get(name, '')}"
     cameras = counted(len(items.cameras), "camera")
-    return (
-        f"{counted(len(items), 'image')}: {cameras}, frames {shortened(items.frames)}"
-    )
+    return f"{counted(len(items), 'image')}: {cameras}, frames {shortened(items.frames)}"
 
 
 def _agreement(m: Measurements) -> Section:
@@ -345,7 +365,9 @@ def _agreement(m: Measurements) -> Section:
     rows = []
     for score in m.cameras:
         # In centimetres.
-        outside = "–" if np.isnan(score.outside) else f"{100 * score.outside:.1f}"
+        outside = (
+            "–" if np.isnan(score.outside) else f"{100 * score.outside:.1f}"
+        )
         rows.append(
             (
                 score.name,
@@ -366,7 +388,9 @@ def _agreement(m: Measurements) -> Section:
     )
     table = Table(headers, rows)
     min_inside = m.subject.consistency.min_inside
-    found = calibration_findings(m.cameras, m.limits, min_inside, m.geometry.far)
+    found = calibration_findings(
+        m.cameras, m.limits, min_inside, m.geometry.far
+    )
     return Section(
         "Skeleton, masks and cameras",
         (table,),

@@ -104,7 +104,9 @@ def subject_of(data: GsganData) -> CheckedData:
     consistency = Consistency()
     if hasattr(reader, "consistency"):
         consistency = reader.consistency
-        data.reader = replace(reader, consistency=replace(consistency, frames=0))
+        data.reader = replace(
+            reader, consistency=replace(consistency, frames=0)
+        )
 
     layout = data.layout
     pairs = {}
@@ -136,7 +138,9 @@ class MaskView:
 
     camera: str
     frame: int
-    outside: Float  # [J] metres by which joints lie outside the mask, NaN = unknown
+    outside: (
+        Float  # [J] metres by which joints lie outside the mask, NaN = unknown
+    )
     tolerance: float  # metres by which joints may lie outside
     fullness: float  # area of the mask over that of the estimated silhouette
     mask: Bool  # [h, w] small mask
@@ -185,7 +189,9 @@ def sampled_items(subject: CheckedData, images: int) -> list[Item]:
     items = []
     for name, files in subject.pairs.items():
         # A camera without these moments gives other ones.
-        chosen = [frame for frame in files if frame in moments] or spread(files, each)
+        chosen = [frame for frame in files if frame in moments] or spread(
+            files, each
+        )
         for frame in chosen:
             items.append((name, frame))
     return items
@@ -278,7 +284,9 @@ def _view(subject: CheckedData, item: Item, sampling: Sampling) -> MaskView:
     pixels, depth = project(camera, p)
     metre_per_pixel = float(np.median(depth[visible])) / focal
     seen = visible & inside(entry, p)
-    outside = joint_distance(mask_distance(mask), pixels, depth, seen, focal)  # [J]
+    outside = joint_distance(
+        mask_distance(mask), pixels, depth, seen, focal
+    )  # [J]
 
     # A small mask, and the map from the whole image to it: by the camera's K, then the scale.
     height, width = mask.shape
@@ -289,7 +297,9 @@ def _view(subject: CheckedData, item: Item, sampling: Sampling) -> MaskView:
         camera=name,
         frame=number,
         outside=outside,
-        tolerance=max(subject.consistency.joint_tolerance, TOLERANCE * metre_per_pixel),
+        tolerance=max(
+            subject.consistency.joint_tolerance, TOLERANCE * metre_per_pixel
+        ),
         fullness=float(mask.sum() / max(1, int(body.sum()))),
         mask=cv2.resize(soft, small, interpolation=cv2.INTER_AREA) > 0.5,
         to_small=scale @ K @ np.linalg.inv(entry.K),

@@ -159,7 +159,9 @@ def read_calibration(
             notes: list[str] = []
             cameras = reader(path, unit_scale, pixel_centre, notes)
             if not cameras:
-                raise DataError(f"{path} ({name}) lists no camera that can be used")
+                raise DataError(
+                    f"{path} ({name}) lists no camera that can be used"
+                )
             metric = unit_scale is not None or name not in WITHOUT_SCALE
             return Calibration(path, name, cameras, tuple(notes), metric)
     raise DataError(f"{path} is not a known calibration; expected {KNOWN}")
@@ -176,7 +178,9 @@ def read_conventions(path: Path, content: Mapping[str, Any]) -> Conventions:
     """
     # Only the unit has no default.
     unit = choose(path, content, "unit", None, tuple(METRES))
-    background = choose(path, content, "background", "scene", ("scene", "black"))
+    background = choose(
+        path, content, "background", "scene", ("scene", "black")
+    )
     return Conventions(
         scale=METRES[unit],
         pixel_centre=choose(path, content, "pixel_centre", 0.5, (0, 0.5)),
@@ -200,7 +204,9 @@ def choose(
     # Lists and objects are refused first: they cannot be compared with every allowed value.
     if isinstance(value, (list, dict)) or value not in allowed:
         names = ", ".join(map(str, allowed))
-        raise DataError(f"{path}: '{key}' is {value!r}; expected one of {names}")
+        raise DataError(
+            f"{path}: '{key}' is {value!r}; expected one of {names}"
+        )
     return value
 
 
@@ -224,8 +230,12 @@ def read_cameras(
     for name, entry in content.items():
         where = f"{path}, camera {name}"
         # The lens may be missing: then it is a pinhole.
-        if not isinstance(entry, dict) or not {"K", "R", "t", "size"} <= set(entry):
-            raise DataError(f"{where}: expected an object with K, R, t, dist and size")
+        if not isinstance(entry, dict) or not {"K", "R", "t", "size"} <= set(
+            entry
+        ):
+            raise DataError(
+                f"{where}: expected an object with K, R, t, dist and size"
+            )
 
         # Stored as [width, height], while sizes are (H, W) everywhere else.
         width, height = numbers(where, entry["size"], "size", (2,))
@@ -308,9 +318,13 @@ def _read_toml(
         # A camera's name is the table's, unless the table has one.
         name = str(entry.get("name", table))
         if name in cameras:
-            raise DataError(f"{path} names two cameras {name}; give each its own name")
+            raise DataError(
+                f"{path} names two cameras {name}; give each its own name"
+            )
         where = f"{path}, [{table}]"
-        cameras[name] = _toml_camera(where, name, entry, scale or 1.0, pixel_centre)
+        cameras[name] = _toml_camera(
+            where, name, entry, scale or 1.0, pixel_centre
+        )
     return cameras
 
 
@@ -324,7 +338,9 @@ def _toml_camera(
     # All keys are needed; a missing one is most likely misspelt.
     for key in TOML_KEYS:
         if key not in entry:
-            raise DataError(f"{where} lacks '{key}'; expected {', '.join(TOML_KEYS)}")
+            raise DataError(
+                f"{where} lacks '{key}'; expected {', '.join(TOML_KEYS)}"
+            )
 
     # Fisheye lenses have another model of distortion.
     if entry.get("fisheye"):
@@ -387,7 +403,9 @@ def read_opencv_yaml(path: Path) -> dict[str, Any]:
 
         # Names of entries are text; a file of other content has none.
         values = yaml.load(text, _Loader)
-        if isinstance(values, dict) and all(isinstance(key, str) for key in values):
+        if isinstance(values, dict) and all(
+            isinstance(key, str) for key in values
+        ):
             return values
     except (
         OSError,
@@ -503,14 +521,17 @@ def _read_nerfstudio(
     return read_nerfstudio(path, scale or 1.0)
 
 
-Reader = Callable[[Path, float | None, float, list[str]], dict[str, CameraEntry]]
+Reader = Callable[
+    [Path, float | None, float, list[str]], dict[str, CameraEntry]
+]
 """Cameras of a path, metres in a unit (None: the format's own), K's pixel centre; gains notes."""
 # The test of a path and a file's head, and the reader of each format; the first that fits is taken.
 FORMATS: dict[str, tuple[Callable[[Path, str], bool], Reader]] = {
     "COLMAP": (lambda path, _: is_colmap(path), _read_colmap),
     "OpenCV YAML": (
         lambda _, head: (
-            head.lstrip().startswith(("%YAML", "---")) or "!!opencv-matrix" in head
+            head.lstrip().startswith(("%YAML", "---"))
+            or "!!opencv-matrix" in head
         ),
         _read_yaml,
     ),

@@ -68,7 +68,9 @@ class CameraEntry:
         """Whether `Camera` can hold its distortion: five coefficients at most."""
         return self.distorted and not self.dist[5:].any()
 
-    def seen(self, window: Crop, size: tuple[int, int] | None, *, lens: bool) -> Camera:
+    def seen(
+        self, window: Crop, size: tuple[int, int] | None, *, lens: bool
+    ) -> Camera:
         """The camera of a window of the image.
 
         Args:

@@ -158,7 +158,9 @@ def undistort_map(
         seen[:2, 2] -= (crop.left, crop.top)
         size = crop.size[::-1]
         eye = np.eye(3)
-        maps = cv2.initUndistortRectifyMap(stored, dist, eye, seen, size, cv2.CV_32FC1)
+        maps = cv2.initUndistortRectifyMap(
+            stored, dist, eye, seen, size, cv2.CV_32FC1
+        )
         pixels = np.stack(maps, axis=-1)
     else:
         pixels = (through_lens(K, dist, u, v) - 0.5).astype(np.float32)
@@ -262,7 +264,9 @@ def fold_radius(
     radii = np.linspace(0, np.hypot(x, y).max(), samples)  # [samples]
 
     # The lens model folds back where the distorted radius no longer grows.
-    radial = np.where(np.isin(np.arange(8), (2, 3)), 0, dist)  # without p1 and p2
+    radial = np.where(
+        np.isin(np.arange(8), (2, 3)), 0, dist
+    )  # without p1 and p2
     along_x = np.stack([radii, np.zeros(samples)], axis=-1)
     shown = distort(along_x, radial)[:, 0]  # [samples]
     folded = np.flatnonzero(np.diff(shown) <= 0)
@@ -289,7 +293,11 @@ def take(
     mode = cv2.INTER_NEAREST if exact else cv2.INTER_LINEAR
     # Pixels outside the image are 0: the default border.
     taken = cv2.remap(
-        image, mapping[..., 0], mapping[..., 1], mode, borderMode=cv2.BORDER_CONSTANT
+        image,
+        mapping[..., 0],
+        mapping[..., 1],
+        mode,
+        borderMode=cv2.BORDER_CONSTANT,
     )
     return np.asarray(taken, np.uint8)
 
@@ -311,7 +319,9 @@ def resize(
         mode = cv2.INTER_AREA
     else:
         mode = cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(image, size[::-1], interpolation=mode), np.uint8)
+    return np.asarray(
+        cv2.resize(image, size[::-1], interpolation=mode), np.uint8
+    )
 
 
 def black_out(

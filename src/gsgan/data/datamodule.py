@@ -20,7 +20,13 @@ from lightning import LightningDataModule
 from torch.utils.data import DataLoader, Subset
 
 from gsgan.data.crop import PersonCrop
-from gsgan.data.dataset import CaptureDataset, ImageCache, Lens, StepSampler, pass_order
+from gsgan.data.dataset import (
+    CaptureDataset,
+    ImageCache,
+    Lens,
+    StepSampler,
+    pass_order,
+)
 from gsgan.data.formats.capture import FACE_FILE, HANDS_FILE, CaptureReader
 from gsgan.data.layout import Layout
 from gsgan.data.protocol import Protocol
@@ -191,12 +197,16 @@ class GsganData(LightningDataModule):
         if skeleton.expression and layout.face is None:
             raise self._lacks(FACE_FILE, layout, "mediapipe33_hands")
         if skeleton.palms:
-            layout = replace(layout, meta=replace(layout.meta, skeleton=self.skeleton))
+            layout = replace(
+                layout, meta=replace(layout.meta, skeleton=self.skeleton)
+            )
 
         # Body poses, as `body` chooses them.
         poses = layout.poses
         if self.body == "none":
-            return replace(layout, poses=None, meta=replace(layout.meta, body=None))
+            return replace(
+                layout, poses=None, meta=replace(layout.meta, body=None)
+            )
         if poses is None:
             return layout
         if self.body == "fit" and not poses.fitted:
@@ -225,7 +235,9 @@ class GsganData(LightningDataModule):
     def lacks_body(self) -> bool:
         """Whether `gsgan.fit` is still to make the body poses."""
         # gsgan.fit works on captures, not on published datasets.
-        fits = self.body in ("auto", "fit") and isinstance(self.reader, CaptureReader)
+        fits = self.body in ("auto", "fit") and isinstance(
+            self.reader, CaptureReader
+        )
         return fits and self.layout.poses is None
 
     @cached_property
@@ -268,7 +280,9 @@ class GsganData(LightningDataModule):
 
         # `layout` refuses a capture without a face.
         assert self.layout.face is not None
-        return face_at_rest(self.layout.landmarks, self.layout.face, self.trained)
+        return face_at_rest(
+            self.layout.landmarks, self.layout.face, self.trained
+        )
 
     @property
     def registered_held_out(self) -> tuple[int, ...]:
@@ -278,7 +292,9 @@ class GsganData(LightningDataModule):
             return ()
 
         # A frame that some camera trains on is not held out.
-        held_out = set(self.splits.items["novel_pose"].frames) - set(self.trained)
+        held_out = set(self.splits.items["novel_pose"].frames) - set(
+            self.trained
+        )
         return tuple(sorted(held_out & poses.registered))
 
     @property
@@ -295,7 +311,11 @@ class GsganData(LightningDataModule):
 
         # A batch needs images of one size.
         sizes = {camera.size for camera in layout.cameras.values()}
-        if self.size is None and self.batch_size > 1 and (self.crop or len(sizes) > 1):
+        if (
+            self.size is None
+            and self.batch_size > 1
+            and (self.crop or len(sizes) > 1)
+        ):
             raise ConfigError(
                 "data.size is not set and images differ in size, so batches of "
                 f"{self.batch_size} cannot be made; set data.size (e.g. 512) or data.batch_size=1"
@@ -334,7 +354,9 @@ class GsganData(LightningDataModule):
         assert self.source is not None  # checked in __init__
         return self.source()
 
-    def protocol_record(self, lpips_nets: Sequence[str]) -> dict[str, Any] | None:
+    def protocol_record(
+        self, lpips_nets: Sequence[str]
+    ) -> dict[str, Any] | None:
         """The record next to every score: the protocol and this run's departures from it.
 
         Args:
@@ -350,7 +372,9 @@ class GsganData(LightningDataModule):
         # Cameras of unlike sizes are scored at unlike scales; cropped images have none.
         scales = None
         if self.crop is None:
-            scales = [self.size / max(size) if self.size else 1.0 for size in sizes]
+            scales = [
+                self.size / max(size) if self.size else 1.0 for size in sizes
+            ]
 
         # The departures of images and backbone are found by the protocol itself.
         departures = self.protocol.departures(
@@ -373,7 +397,9 @@ class GsganData(LightningDataModule):
         for split in SPLITS[1:]:
             tested += self.splits.items[split].cameras
         train = self.dataset("train")
-        found = scene_info(self.layout, self.splits, train, self.info_samples, tested)
+        found = scene_info(
+            self.layout, self.splits, train, self.info_samples, tested
+        )
         return replace(found, face=self.face)
 
     @property

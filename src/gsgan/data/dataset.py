@@ -140,7 +140,9 @@ class CaptureDataset(Dataset[Frame]):
         body = None
         poses = self.layout.poses
         if poses is not None:
-            body = BodyPose(_float(poses.theta[frame]), _float(poses.transl[frame]))
+            body = BodyPose(
+                _float(poses.theta[frame]), _float(poses.transl[frame])
+            )
 
         # Every part has a batch dimension of 1; bytes become floats only on request.
         found = Frame(
@@ -181,7 +183,9 @@ class CaptureDataset(Dataset[Frame]):
         # A white image, cropped and resized like the item's: what stays white is inside.
         white = np.full(self._entry(item).size, 255, np.uint8)
         taken = self._fitting(item)(white, True)
-        return None if taken.all() else unit(torch.from_numpy(taken))[None, None]
+        return (
+            None if taken.all() else unit(torch.from_numpy(taken))[None, None]
+        )
 
     def _entry(self, item: Item) -> CameraEntry:
         """The calibrated camera of an item."""
@@ -213,7 +217,9 @@ class CaptureDataset(Dataset[Frame]):
         """Whether the camera's images keep their distortion, with ``camera.dist`` set."""
         return self.lens == "raw" and camera.keeps_lens
 
-    def _mapping(self, camera: CameraEntry, window: Crop) -> NDArray[np.float32] | None:
+    def _mapping(
+        self, camera: CameraEntry, window: Crop
+    ) -> NDArray[np.float32] | None:
         """Positions of the window's pixels in the stored image; None for a pinhole."""
         # No mapping is needed if the image stays as it is.
         if not camera.distorted or self.lens == "ignore" or self._raw(camera):
@@ -240,7 +246,9 @@ class CaptureDataset(Dataset[Frame]):
         labels = self._label_image(item)
         if labels is not None:
             if self.ignore_band:
-                labels = pixels.with_ignored_border(labels, mask, rules.ignore_band)
+                labels = pixels.with_ignored_border(
+                    labels, mask, rules.ignore_band
+                )
             labels = fit(labels, True)
         if unsure is not None:
             unsure = fit(unsure, True)
@@ -380,6 +388,8 @@ def pass_order(
 ) -> torch.Tensor:
     """``[items]`` the order of a shuffled pass, a pure function of its arguments."""
     # A hash of seed and number, so that neighbouring seeds give unrelated orders.
-    mixed = np.random.SeedSequence([seed, number]).generate_state(1, np.uint64)[0]
+    mixed = np.random.SeedSequence([seed, number]).generate_state(1, np.uint64)[
+        0
+    ]
     generator = torch.Generator().manual_seed(int(mixed) >> 1)
     return torch.randperm(items, generator=generator)

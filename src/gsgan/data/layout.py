@@ -167,7 +167,9 @@ def dataset_folder(root: str | Path, expected: str) -> Path:
     # A wrong path is the most frequent mistake, so the message says what is expected.
     folder = Path(root).expanduser()
     if not folder.is_dir():
-        problem = "is a file, not a folder" if folder.exists() else "does not exist"
+        problem = (
+            "is a file, not a folder" if folder.exists() else "does not exist"
+        )
         raise DataError(
             f"data.root={root} {problem}; expected the folder that holds {expected}"
         )
@@ -190,7 +192,9 @@ def assemble(found: Found, limits: Thresholds) -> Layout:
     notes = list(found.notes)
 
     # Frames need a skeleton, and cameras must fit the skeletons.
-    images = drop_frames(root, found.images, landmarks, found.poses, limits, notes)
+    images = drop_frames(
+        root, found.images, landmarks, found.poses, limits, notes
+    )
     check_geometry(
         root, cameras, images, landmarks, limits, calibration, found.unit_hint
     )

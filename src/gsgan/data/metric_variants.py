@@ -70,7 +70,9 @@ class MetricVariants:
                 # Ranges are shown as lists, as a config writes them.
                 listed = []
                 for choice in choices:
-                    shown = list(choice) if isinstance(choice, tuple) else choice
+                    shown = (
+                        list(choice) if isinstance(choice, tuple) else choice
+                    )
                     listed.append(str(shown))
                 raise ConfigError(
                     f"protocol.measures.{name} must be {' or '.join(listed)}; got {value!r}"

@@ -81,7 +81,9 @@ def read_mask(files: Sequence[tuple[str, Path]], rules: PixelRules) -> Bytes:
     for rule, path in files[1:]:
         mask = _one_mask(rule, path, rules)
         if mask.shape != joined.shape:
-            raise DataError(f"{path} and {first}, masks of one image, differ in size")
+            raise DataError(
+                f"{path} and {first}, masks of one image, differ in size"
+            )
         joined = np.maximum(joined, mask)
     return joined
 
@@ -130,7 +132,9 @@ def _one_mask(rule: str, path: Path, rules: PixelRules) -> Bytes:
     return np.asarray(person, np.uint8)
 
 
-def read_labels(path: Path, rules: PixelRules, names: Sequence[str] | None) -> Bytes:
+def read_labels(
+    path: Path, rules: PixelRules, names: Sequence[str] | None
+) -> Bytes:
     """``[H, W]`` part numbers, mapped by the rules' table; 255 is "ignore".
 
     Args:

@@ -42,8 +42,14 @@ PINHOLES = (
     "OPENCV",
     "FULL_OPENCV",
 )
-ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")  # with one focal length
-POINT_BYTES = 24  # of a 2D point in images.bin: x, y, and the number of the 3D point
+ONE_FOCAL = (
+    "SIMPLE_PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+)  # with one focal length
+POINT_BYTES = (
+    24  # of a 2D point in images.bin: x, y, and the number of the 3D point
+)
 # Errors of reading a damaged file.
 DAMAGE = (ArithmeticError, LookupError, OSError, struct.error, ValueError)
 # OpenGL's camera axes, x right, y up, z backward, in OpenCV's.
@@ -141,7 +147,10 @@ def _one_pose(
 
 def is_colmap(path: Path) -> bool:
     """Whether a file is one of COLMAP's models, by its name."""
-    return path.stem in ("cameras", "images") and path.suffix in (".txt", ".bin")
+    return path.stem in ("cameras", "images") and path.suffix in (
+        ".txt",
+        ".bin",
+    )
 
 
 def read_colmap(path: Path, scale: float) -> dict[str, CameraEntry]:
@@ -164,7 +173,9 @@ def read_colmap(path: Path, scale: float) -> dict[str, CameraEntry]:
             )
     binary = path.suffix == ".bin"
     try:
-        lenses = _binary_lenses(lens_path) if binary else _text_lenses(lens_path)
+        lenses = (
+            _binary_lenses(lens_path) if binary else _text_lenses(lens_path)
+        )
     except DAMAGE as error:
         raise _damaged(lens_path, error) from None
     try:
@@ -214,11 +225,15 @@ def _text_lenses(path: Path) -> dict[int, Lens]:
             number, model, width, height, *values = line.split()
             size = (int(height), int(width))
             where = f"{path}, camera {number}"
-            lenses[int(number)] = _lens(where, model, size, list(map(float, values)))
+            lenses[int(number)] = _lens(
+                where, model, size, list(map(float, values))
+            )
     return lenses
 
 
-def _text_images(path: Path, lenses: Mapping[int, Lens]) -> Iterator[CalibratedImage]:
+def _text_images(
+    path: Path, lenses: Mapping[int, Lens]
+) -> Iterator[CalibratedImage]:
     """The images of a text file: lines ``number qw qx qy qz tx ty tz camera name``, each with
     a line of points below."""
     lines = iter(read_text(path).splitlines())
@@ -238,14 +253,18 @@ def _binary_lenses(path: Path) -> dict[int, Lens]:
         for _ in range(count):
             number, model, width, height = _unpacked(stream, "<iiQQ")
             names = list(CAMERA_MODELS)
-            name = names[model] if 0 <= model < len(names) else f"number {model}"
+            name = (
+                names[model] if 0 <= model < len(names) else f"number {model}"
+            )
             parameters = _unpacked(stream, f"<{CAMERA_MODELS.get(name, 0)}d")
             where = f"{path}, camera {number}"
             lenses[number] = _lens(where, name, (height, width), parameters)
     return lenses
 
 
-def _binary_images(path: Path, lenses: Mapping[int, Lens]) -> Iterator[CalibratedImage]:
+def _binary_images(
+    path: Path, lenses: Mapping[int, Lens]
+) -> Iterator[CalibratedImage]:
     """The images of records of number, pose, camera, name and points."""
     with path.open("rb") as stream:
         (count,) = _unpacked(stream, "<Q")
@@ -277,7 +296,9 @@ def _view(
 ) -> CalibratedImage:
     """An image of a camera with the pose qw qx qy qz tx ty tz, world to camera."""
     if camera not in lenses:
-        raise ValueError(f"{name} is of camera {camera}, which the cameras file lacks")
+        raise ValueError(
+            f"{name} is of camera {camera}, which the cameras file lacks"
+        )
     qw, qx, qy, qz, *t = pose
     R = Rotation.from_quat([qx, qy, qz, qw]).as_matrix()
     return CalibratedImage(
@@ -290,7 +311,9 @@ def _view(
 
 def is_nerfstudio(head: str) -> bool:
     """Whether the start of a file is that of a scene of nerfstudio."""
-    return head.lstrip().startswith("{") and bool(re.search(r'"frames"\s*:\s*\[', head))
+    return head.lstrip().startswith("{") and bool(
+        re.search(r'"frames"\s*:\s*\[', head)
+    )
 
 
 def read_nerfstudio(path: Path, scale: float) -> dict[str, CameraEntry]:
@@ -312,9 +335,13 @@ def read_nerfstudio(path: Path, scale: float) -> dict[str, CameraEntry]:
     views = []
     for i, frame in enumerate(frames):
         where = f"{path}, frame {i}"
-        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+        if not isinstance(frame, dict) or not isinstance(
+            frame.get("file_path"), str
+        ):
             raise DataError(f"{where}: expected an object with file_path")
-        pose = numbers(where, frame.get("transform_matrix"), "transform_matrix", (4, 4))
+        pose = numbers(
+            where, frame.get("transform_matrix"), "transform_matrix", (4, 4)
+        )
         R = (pose[:3, :3] @ OPENGL).T
         lens = _nerfstudio_lens(where, {**content, **frame})
         views.append(CalibratedImage(frame["file_path"], lens, R, pose[:3, 3]))
@@ -332,7 +359,9 @@ def _nerfstudio_lens(where: str, values: Mapping[str, Any]) -> Lens:
 
     def value(key: str, default: float | None = None) -> float:
         if values.get(key, default) is None:
-            raise DataError(f"{where}: '{key}' is missing, for this frame and for all")
+            raise DataError(
+                f"{where}: '{key}' is missing, for this frame and for all"
+            )
         return float(numbers(where, values.get(key, default), key, ()))
 
     # The focal length, or the angle of view that gives it.

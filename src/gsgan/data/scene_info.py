@@ -15,7 +15,11 @@ from gsgan.data.layout import Layout
 from gsgan.data.pixels import IGNORE_LABEL, read_labels
 from gsgan.data.skeletons import body_height
 from gsgan.data.splits import Item, Splits
-from gsgan.data.surface_colours import SurfaceColours, body_inside, surface_colours
+from gsgan.data.surface_colours import (
+    SurfaceColours,
+    body_inside,
+    surface_colours,
+)
 from gsgan.scene import NEAR
 from gsgan.skeleton.joints import BODY
 from gsgan.skeleton.proportions import Proportions, measure_proportions
@@ -141,7 +145,9 @@ def scene_info(
     if layout.hands is not None:
         whole = whole.with_hands(layout.hands)
     whole_p, whole_valid = whole.joints(frames)
-    completed = np.stack([dataset.skeletons.p[frame] for frame in frames])  # [F, J, 3]
+    completed = np.stack(
+        [dataset.skeletons.p[frame] for frame in frames]
+    )  # [F, J, 3]
 
     # The skinned body, whose file is the user's.
     body = layout.meta.body
@@ -166,7 +172,9 @@ def scene_info(
         body_inside=_body_inside(layout, dataset, samples),
         scale_train=_scale(dataset, samples),
         poses=training_poses(torch.from_numpy(completed)),
-        proportions=measure_proportions(whole_p, whole_valid, layout.meta.up_axis),
+        proportions=measure_proportions(
+            whole_p, whole_valid, layout.meta.up_axis
+        ),
         **_lenses(layout, cameras, set(tested) - cameras),
     )
 
@@ -203,7 +211,9 @@ def _lenses(
     # Held-out cameras are those that do not train.
     training = [layout.cameras[name] for name in cameras]
     held_out = [layout.cameras[name] for name in tested]
-    rational = [camera.dist[5:] for camera in training + held_out]  # k4, k5 and k6
+    rational = [
+        camera.dist[5:] for camera in training + held_out
+    ]  # k4, k5 and k6
     return {
         "has_distortion": any(camera.distorted for camera in training),
         "held_out_distortion": any(camera.distorted for camera in held_out),

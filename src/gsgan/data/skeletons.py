@@ -186,7 +186,9 @@ def whole_frame_ids(raw: NDArray[Any], where: str) -> NDArray[np.int64]:
     values, counts = np.unique(ids, return_counts=True)
     repeated = values[counts > 1]
     if len(repeated):
-        raise DataError(f"{where}: frame_id {repeated[0]} appears more than once")
+        raise DataError(
+            f"{where}: frame_id {repeated[0]} appears more than once"
+        )
     return ids
 
 
@@ -283,7 +285,9 @@ def bone_lengths(p: Float, bones: Sequence[tuple[int, int]]) -> Float:
     """``[..., B]`` lengths of bones of ``p [..., J, 3]``; NaN if an end is NaN."""
     # The joints at the two ends of every bone.
     starts, ends = np.array(bones).T
-    return np.asarray(np.linalg.norm(p[..., ends, :] - p[..., starts, :], axis=-1))
+    return np.asarray(
+        np.linalg.norm(p[..., ends, :] - p[..., starts, :], axis=-1)
+    )
 
 
 def body_height(p: Tensor, valid: Tensor) -> float:

@@ -43,7 +43,9 @@ class Items(Sequence[Item]):
 
     def __init__(self, frames: Mapping[str, Ints]) -> None:
         # Cameras without an item are left out.
-        self._of = {name: numbers for name, numbers in frames.items() if len(numbers)}
+        self._of = {
+            name: numbers for name, numbers in frames.items() if len(numbers)
+        }
         # The places at which the cameras' items end, after a leading 0.
         self._ends = np.cumsum([0, *map(len, self._of.values())])
 
@@ -145,7 +147,9 @@ def make_splits(
         ConfigError: on a malformed value, or one camera or frame on both sides.
     """
     if not 0 <= test_share < 1:
-        raise ConfigError(f"data.test_share must be in [0, 1), got {test_share}")
+        raise ConfigError(
+            f"data.test_share must be in [0, 1), got {test_share}"
+        )
 
     # By default all cameras train, and the last frames are held out.
     everyone = layout.camera_names
@@ -264,7 +268,9 @@ def _splits(
     )
 
 
-def _items(layout: Layout, cameras: Sequence[str], frames: Sequence[int]) -> Items:
+def _items(
+    layout: Layout, cameras: Sequence[str], frames: Sequence[int]
+) -> Items:
     """The cameras' images of the frames, those that exist."""
     # Both arrays are without repetitions.
     wanted = np.array(frames, np.int64)
@@ -411,7 +417,9 @@ def parse_names(value: Any, where: str) -> tuple[str, ...]:
     if isinstance(value, int):
         return (str(value),)
     if not isinstance(value, Iterable):
-        raise ConfigError(f"{where} must be a list of camera names, got {value!r}")
+        raise ConfigError(
+            f"{where} must be a list of camera names, got {value!r}"
+        )
     return tuple(dict.fromkeys(map(str, value)))
 
 
@@ -445,7 +453,9 @@ def parse_frames(value: Any, where: str) -> tuple[int, ...]:
 
         # Bounds, checked before the numbers take memory.
         if len(numbers) + len(frames) > MAX_LISTED_FRAMES:
-            raise ConfigError(f"{where} names more than {MAX_LISTED_FRAMES} frames")
+            raise ConfigError(
+                f"{where} names more than {MAX_LISTED_FRAMES} frames"
+            )
         if numbers[-1] > LARGEST_FRAME:
             raise ConfigError(
                 f"{where} names frame {numbers[-1]}; frame numbers end at {LARGEST_FRAME}"

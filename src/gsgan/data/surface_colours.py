@@ -59,7 +59,9 @@ class SurfaceColours:
     residual: float
 
 
-def surface_colours(moments: Sequence[Sequence[Frame]]) -> SurfaceColours | None:
+def surface_colours(
+    moments: Sequence[Sequence[Frame]],
+) -> SurfaceColours | None:
     """Compares cameras pairwise.
 
     Args:
@@ -69,7 +71,9 @@ def surface_colours(moments: Sequence[Sequence[Frame]]) -> SurfaceColours | None
     Returns:
         None if no two cameras share enough surface, or images are too coarse.
     """
-    if not moments or any(_metres_per_pixel(frame) > COARSEST for frame in moments[0]):
+    if not moments or any(
+        _metres_per_pixel(frame) > COARSEST for frame in moments[0]
+    ):
         return None
 
     # By pair of cameras: the differences of colour at points that both see, frame by frame.
@@ -144,7 +148,9 @@ def _hull(frames: Sequence[Frame]) -> Float:
     low = joints.min(0) - AIR
     high = joints.max(0) + AIR
     axes = [np.arange(a, b, VOXEL) for a, b in zip(low, high, strict=True)]
-    voxels = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)  # [V, 3]
+    voxels = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(
+        -1, 3
+    )  # [V, 3]
 
     # Each mask carves; voxels outside its image stay.
     for frame in frames:
@@ -163,7 +169,9 @@ def _place(frame: Frame, points: Float) -> tuple[Ints, Bool, Float]:
     at, depth = frame.camera.project(world)
 
     # Clipped before the conversion, since far pixels do not fit into integers.
-    pixels = np.floor(at[0].numpy()).clip(-1, max(height, width)).astype(np.int64)
+    pixels = (
+        np.floor(at[0].numpy()).clip(-1, max(height, width)).astype(np.int64)
+    )
     inside = (depth[0].numpy() > VOXEL) & (pixels >= 0).all(1)
     inside &= (pixels[:, 0] < width) & (pixels[:, 1] < height)
     return pixels, inside, depth[0].double().numpy()

@@ -79,8 +79,12 @@ def drop_frames(
             f"{len(ids)} of {len(frames)} frames dropped, {reason}: {spans(ids)}"
         )
     if len(gone) == len(frames):
-        reasons = "; ".join(f"{len(ids)} {reason}" for reason, ids in dropped.items())
-        raise DataError(f"{root} ({landmarks.source}) has no usable frame: {reasons}")
+        reasons = "; ".join(
+            f"{len(ids)} {reason}" for reason, ids in dropped.items()
+        )
+        raise DataError(
+            f"{root} ({landmarks.source}) has no usable frame: {reasons}"
+        )
     return {name: files.without(gone) for name, files in images.items()}
 
 
@@ -102,7 +106,9 @@ def _unusable(
     # Enough joints, and enough of the trunk.
     valid = landmarks.visibility[frame] > 0
     if valid.sum() < limits.min_joints:
-        return f"with fewer than {limits.min_joints} joints (NaN or confidence 0)"
+        return (
+            f"with fewer than {limits.min_joints} joints (NaN or confidence 0)"
+        )
 
     # Hips may be estimated from the shoulders, see `gsgan.data.skeletons.hips_below`: then they
     # differ, while hips that were merely filled in are the same.
@@ -272,7 +278,9 @@ def drop_unmasked(
     frame = lost[camera][0]
     if missing > limits.max_missing_masks * count:
         # The file that the user may expect: named like the image, in the folder of masks.
-        path = (expected[camera] / Path(images[camera][frame]).name).with_suffix(".png")
+        path = (
+            expected[camera] / Path(images[camera][frame]).name
+        ).with_suffix(".png")
         raise DataError(
             f"{path} does not exist; every image needs a mask, and {len(lost[camera])} of the "
             f"{len(images[camera])} of camera {camera} are missing: {missing / count:.0%} of all "
@@ -282,7 +290,10 @@ def drop_unmasked(
         f"{missing} of {count} images have no mask and are left out "
         f"(first: camera {camera}, frame {frame})"
     )
-    return {name: files.without(lost.get(name, ())) for name, files in images.items()}
+    return {
+        name: files.without(lost.get(name, ()))
+        for name, files in images.items()
+    }
 
 
 def check_images(

@@ -27,9 +27,7 @@ CHOICES: dict[str, tuple[str | int, ...]] = {
 
 # Reasons that more than one rule gives.
 FORCED = "set in the config"
-TOO_LITTLE = (
-    "the cameras share too little surface, or images are too coarse, to compare colours"
-)
+TOO_LITTLE = "the cameras share too little surface, or images are too coarse, to compare colours"
 RATIONAL = (
     "a lens has coefficients beyond the fifth (k4, k5, k6), which rendering does not support; "
     "choose effects.distortion=undistort"
@@ -97,7 +95,9 @@ class EffectSettings:
             )
 
         # A single name is a mistake: its letters would be taken for effects.
-        listed = [self.only] if isinstance(self.only, str) else list(self.only or ())
+        listed = (
+            [self.only] if isinstance(self.only, str) else list(self.only or ())
+        )
         if isinstance(self.only, str) or set(listed) - set(CHOICES):
             raise ConfigError(
                 f"effects.only must list some of {', '.join(CHOICES)}; got {listed}"
@@ -179,7 +179,9 @@ def _one(
     reason = _impossible(name, info, requested) or model.lacks(name)
     if reason is not None:
         if requested != AUTO and settings.impossible == "error":
-            raise ConfigError(f"effects.{name}={requested} is not possible: {reason}")
+            raise ConfigError(
+                f"effects.{name}={requested} is not possible: {reason}"
+            )
         return Effect("undistort" if reason == RATIONAL else off, reason)
 
     # Decided by rule, or forced; "on" stands for the usual mode or degree.
@@ -197,8 +199,14 @@ def _impossible(name: str, info: SceneInfo, requested: str | int) -> str | None:
     # Lenses that are all pinholes need nothing.
     if name == "distortion":
         if not (info.has_distortion or info.held_out_distortion):
-            return "no camera of this data has a lens coefficient other than zero"
-        return RATIONAL if requested == "project" and info.has_rational_lens else None
+            return (
+                "no camera of this data has a lens coefficient other than zero"
+            )
+        return (
+            RATIONAL
+            if requested == "project" and info.has_rational_lens
+            else None
+        )
 
     # Corrections are relative to other cameras.
     if name == "colour_correction" and info.n_train_cameras < 2:
@@ -227,19 +235,24 @@ def _view_dependence(info: SceneInfo, settings: EffectSettings) -> Effect:
     left = info.surface.residual
     limit = settings.view_residual
     if left < limit:
-        return Effect(0, f"shared surface differs by only {left:.3f} (limit {limit:g})")
+        return Effect(
+            0, f"shared surface differs by only {left:.3f} (limit {limit:g})"
+        )
     why = f"shared surface differs by {left:.3f} (limit {limit:g}); {cameras} cameras"
     return Effect(degree, why)
 
 
 def max_degree(info: SceneInfo, settings: EffectSettings) -> int:
     """The highest degree, 0 to 3, that this number of training cameras can resolve."""
-    return sum(info.n_train_cameras >= count for count in settings.degree_cameras)
+    return sum(
+        info.n_train_cameras >= count for count in settings.degree_cameras
+    )
 
 
 def _distortion(info: SceneInfo, settings: EffectSettings) -> Effect:
     return Effect(
-        "undistort", "a lens coefficient is not zero: images are undistorted when read"
+        "undistort",
+        "a lens coefficient is not zero: images are undistorted when read",
     )
 
 
@@ -248,9 +261,13 @@ def _antialias(info: SceneInfo, settings: EffectSettings) -> Effect:
     low, high = info.scale_train
     smallest, largest = settings.rendered_scales
     ratio = max(high * float(largest), high) / min(low * float(smallest), low)
-    measured = f"training and rendered images differ by {ratio:.2f} times in scale"
+    measured = (
+        f"training and rendered images differ by {ratio:.2f} times in scale"
+    )
     if ratio < settings.scale_ratio:
-        return Effect(OFF, f"{measured} at most (limit {settings.scale_ratio:g})")
+        return Effect(
+            OFF, f"{measured} at most (limit {settings.scale_ratio:g})"
+        )
     return Effect("on", f"{measured} (limit {settings.scale_ratio:g})")
 
 
@@ -263,13 +280,17 @@ def _colour_correction(info: SceneInfo, settings: EffectSettings) -> Effect:
     measured = f"two cameras differ by {seen.difference:.3f} on shared surface"
     highlights = settings.colour_share * seen.residual
     if seen.difference < settings.colour_difference:
-        return Effect(OFF, f"{measured} at most (limit {settings.colour_difference:g})")
+        return Effect(
+            OFF, f"{measured} at most (limit {settings.colour_difference:g})"
+        )
     if seen.difference < highlights:
         return Effect(
-            OFF, f"{measured}, which highlights can cause (limit {highlights:.3f})"
+            OFF,
+            f"{measured}, which highlights can cause (limit {highlights:.3f})",
         )
     return Effect(
-        "on", f"{measured} (limit {max(highlights, settings.colour_difference):.3f})"
+        "on",
+        f"{measured} (limit {max(highlights, settings.colour_difference):.3f})",
     )
 
 
@@ -290,7 +311,9 @@ def _random_background(info: SceneInfo, settings: EffectSettings) -> Effect:
     measured = f"the person's darkest percent has brightness {info.darkest:.2f}"
     limit = f"limit {settings.dark:g}"
     if info.darkest < settings.dark:
-        return Effect("on", f"{measured} ({limit}): on black it could turn transparent")
+        return Effect(
+            "on", f"{measured} ({limit}): on black it could turn transparent"
+        )
     return Effect(OFF, f"{measured} ({limit})")
 
 

@@ -120,4 +120,6 @@ class Effects:
 
 
 # The fields that are effects.
-EFFECT_NAMES = tuple(field.name for field in fields(Effects) if field.name != "cameras")
+EFFECT_NAMES = tuple(
+    field.name for field in fields(Effects) if field.name != "cameras"
+)

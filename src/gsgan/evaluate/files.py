@@ -67,9 +67,13 @@ def write_scored(scored: Scored, folder: Path) -> None:
     """Writes the four files atomically; metrics.json is last, so if it is new, all of them are."""
     # Everything is formatted before the first file is written.
     origin = json.dumps(scored.origin, indent=2, allow_nan=False)
-    table = scored.rows.to_csv(columns=list(HEADER), index=False, lineterminator="\n")
+    table = scored.rows.to_csv(
+        columns=list(HEADER), index=False, lineterminator="\n"
+    )
     write_atomically(folder / SCORES_FILE, table)
-    write_atomically(folder / TABLE_FILE, markdown(scored.results, scored.origin))
+    write_atomically(
+        folder / TABLE_FILE, markdown(scored.results, scored.origin)
+    )
     write_atomically(folder / FACTS_FILE, origin)
 
     # The last file.
@@ -81,7 +85,10 @@ def write_scored(scored: Scored, folder: Path) -> None:
 
 
 def rows(
-    results: Results, metrics: Sequence[str] = tuple(METRICS), *, cameras: bool = False
+    results: Results,
+    metrics: Sequence[str] = tuple(METRICS),
+    *,
+    cameras: bool = False,
 ) -> Iterator[list[str]]:
     """One formatted row per split and variant, and per camera if ``cameras``; None is ``n/a``."""
 
@@ -96,7 +103,12 @@ def rows(
 
     for split, variants in results.items():
         for variant, scores in variants.items():
-            yield [split, VARIANTS[variant], str(scores["images"]), *formatted(scores)]
+            yield [
+                split,
+                VARIANTS[variant],
+                str(scores["images"]),
+                *formatted(scores),
+            ]
             if cameras:
                 for camera, means in scores["cameras"].items():
                     yield [split, f"  {camera}", "", *formatted(means)]
@@ -130,7 +142,9 @@ def notes(results: Results) -> list[str]:
         missing: dict[str, list[str]] = {}
         for metric in METRICS:
             if scores[metric] is None:
-                missing.setdefault(scores[f"{metric}_reason"], []).append(metric)
+                missing.setdefault(scores[f"{metric}_reason"], []).append(
+                    metric
+                )
         for reason, metrics in missing.items():
             found[f"{', '.join(metrics)} n/a: {reason}"] = None
     return list(found)
@@ -145,15 +159,21 @@ def _protocol_notes(protocol: dict[str, Any]) -> Iterator[str]:
         yield f"departs from {protocol['name']}: {departure}"
 
 
-def print_table(results: Results, origin: dict[str, Any], console: Console) -> None:
+def print_table(
+    results: Results, origin: dict[str, Any], console: Console
+) -> None:
     """Prints the table, its caption and its notes."""
     # Columns of metrics; those of hands only if they were scored.
     table = Table(title=TITLE, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("variant", no_wrap=True)
-    hands = any(scores[FULL]["psnr_hands"] is not None for scores in results.values())
+    hands = any(
+        scores[FULL]["psnr_hands"] is not None for scores in results.values()
+    )
     shown = WITH_HANDS if hands else IN_TERMINAL
     for metric in shown:
-        table.add_column(METRICS[metric].short_heading, justify="right", no_wrap=True)
+        table.add_column(
+            METRICS[metric].short_heading, justify="right", no_wrap=True
+        )
 
     # The split is a row of its own: a column for it would not fit a narrow terminal.
     previous = None
@@ -181,5 +201,12 @@ def markdown(results: Results, origin: dict[str, Any]) -> str:
     listed = "\n".join(f"- {note}" for note in notes(results))
 
     # An empty list of notes takes no line.
-    parts = (f"# {TITLE}", caption(origin), by_split, listed, "## By camera", by_camera)
+    parts = (
+        f"# {TITLE}",
+        caption(origin),
+        by_split,
+        listed,
+        "## By camera",
+        by_camera,
+    )
     return "\n\n".join(filter(None, parts)) + "\n"

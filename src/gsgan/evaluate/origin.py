@@ -55,7 +55,9 @@ def trained(folder: Path, **training: Any) -> Method:
     )
 
 
-def origin(method: Method, data: GsganData, device: torch.device) -> dict[str, Any]:
+def origin(
+    method: Method, data: GsganData, device: torch.device
+) -> dict[str, Any]:
     """The content of facts.json."""
     commit, dirty = _commit()
     # The method's name and data go elsewhere; its other fields follow the protocol.
@@ -83,8 +85,13 @@ def fingerprint(data: GsganData) -> str:
     on the contents of images, nor on the place of the files."""
     # All inputs that images depend on, without the images: reading them would take long.
     layout = data.layout
-    cameras = {name: list(camera.size) for name, camera in layout.cameras.items()}
-    splits = {name: list(map(list, items)) for name, items in data.splits.items.items()}
+    cameras = {
+        name: list(camera.size) for name, camera in layout.cameras.items()
+    }
+    splits = {
+        name: list(map(list, items))
+        for name, items in data.splits.items.items()
+    }
     content: dict[str, Any] = {
         "cameras": cameras,
         "frames": list(layout.frames),

@@ -94,7 +94,9 @@ class BodyBoxes:
         """``[8, 3]`` metres: the box of one item of a frame."""
         # The vertices, else the visible joints with a larger margin.
         if self.body is not None and frame.body is not None:
-            vertices = self.body.to(frame.skeleton.device).posed_vertices(frame.body)
+            vertices = self.body.to(frame.skeleton.device).posed_vertices(
+                frame.body
+            )
             return box_corners(vertices[index], VERTEX_MARGIN)
         visible = frame.visibility[index] > 0
         return box_corners(frame.skeleton[index][visible], JOINT_MARGIN)
@@ -140,7 +142,9 @@ class Preparation:
             mask = (mask >= 0.5).to(mask)
         return on_background(image, mask, self.background)
 
-    def image(self, prediction: Prediction, variant: str, box: Tensor | None) -> Tensor:
+    def image(
+        self, prediction: Prediction, variant: str, box: Tensor | None
+    ) -> Tensor:
         """``[B, 3, H, W]`` a prediction on the protocol's background, by its alpha."""
         image = prediction.images[variant].clamp(0, 1)
         background = self.background
@@ -148,7 +152,9 @@ class Preparation:
         # An image with alpha is on black, any other one on the protocol's background already.
         alpha = prediction.alphas.get(variant)
         if alpha is not None:
-            image = on_background(image, alpha.clamp(0, 1), background).clamp(0, 1)
+            image = on_background(image, alpha.clamp(0, 1), background).clamp(
+                0, 1
+            )
 
         # Rounding, then clearing, as the scoring scripts do.
         image = eight_bits(image, self.measures.eight_bits)
@@ -211,7 +217,9 @@ class PredictionFolder:
         self._check_background(path, image, frame.mask)
         return Prediction({FULL: image}, {})
 
-    def _check_background(self, path: Path, image: Tensor, mask: Tensor) -> None:
+    def _check_background(
+        self, path: Path, image: Tensor, mask: Tensor
+    ) -> None:
         """Refuses an opaque image whose background has mostly the other colour."""
         # [n, 3]: the pixels without any of the person.
         behind = image.permute(0, 2, 3, 1)[mask[:, 0] == 0]
@@ -221,7 +229,9 @@ class PredictionFolder:
         else:
             name = "black"
             other = (behind < CLOSE).all(-1)
-        if float(other.float().mean()) > WRONG_BACKGROUND:  # NaN without background
+        if (
+            float(other.float().mean()) > WRONG_BACKGROUND
+        ):  # NaN without background
             raise DataError(
                 f"{path} has a {name} background, expected {self.background}; give "
                 f"images on {self.background} or with alpha"
@@ -252,7 +262,9 @@ def read_folder(
     """
     # The pattern must name the frame and the camera.
     fields = set(FIELD.findall(pattern))
-    if not ("frame" in fields <= set(FIELDS) and fields & {"camera", "camera_index"}):
+    if not (
+        "frame" in fields <= set(FIELDS) and fields & {"camera", "camera_index"}
+    ):
         raise ConfigError(
             f"predictions_pattern={pattern} must have {{frame}} and {{camera}} or "
             "{camera_index}, may have {split}, and no other field"

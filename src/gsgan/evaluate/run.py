@@ -106,7 +106,9 @@ def write_distances(
         beside: a folder of scores on the training's own capture, whose curve is drawn as well.
     """
     # The distance of each frame's pose, by image.
-    table = rows.loc[rows["variant"] == FULL, ["split", "camera", "frame", *COLUMNS]]
+    table = rows.loc[
+        rows["variant"] == FULL, ["split", "camera", "frame", *COLUMNS]
+    ]
 
     # Frames repeat in the table: the distance of each is computed once.
     frames, places = np.unique(table["frame"], return_inverse=True)
@@ -114,7 +116,9 @@ def write_distances(
     p = np.stack([skeletons[frame] for frame in frames.tolist()])
     distances = poses.distance(torch.from_numpy(p))
     table.insert(3, "distance", distances.numpy()[places].round(3))
-    write_atomically(folder / CSV, table.to_csv(index=False, lineterminator="\n"))
+    write_atomically(
+        folder / CSV, table.to_csv(index=False, lineterminator="\n")
+    )
 
     # The curve, and the one of the training's own capture.
     curves = {"scored here": table}
@@ -125,7 +129,9 @@ def write_distances(
     # One sentence for the terminal.
     parts = []
     for own in _bins(table):
-        parts.append(f"{own.low:g} to {own.high:g}: {own.psnr:.2f} dB ({own.images:g})")
+        parts.append(
+            f"{own.low:g} to {own.high:g}: {own.psnr:.2f} dB ({own.images:g})"
+        )
     means = "; ".join(parts)
     text = f"PSNR in box by distance from the training poses, in deviations (images): {means}"
     console.print(text, markup=False, highlight=False, soft_wrap=True)
@@ -173,7 +179,9 @@ def _plot(curves: dict[str, pd.DataFrame]) -> bytes:
             markersize=3,
         )
 
-    axes.set_xlabel("distance from the training poses, in their standard deviations")
+    axes.set_xlabel(
+        "distance from the training poses, in their standard deviations"
+    )
     axes.set_ylabel("PSNR in the person's box, dB")
     axes.grid(alpha=0.3)
     axes.legend()
@@ -211,7 +219,9 @@ def evaluate_config(config: DictConfig) -> Results:
         others = ["data_root", "data_smpl", "drive", "other_capture"]
     for key in others:
         if config.get(key) is not None:
-            raise ConfigError(f"{key}= cannot be given with {kind}=; leave it out")
+            raise ConfigError(
+                f"{key}= cannot be given with {kind}=; leave it out"
+            )
 
     # Another capture is named by `other_capture` alone.
     if config.get("other_capture") is not None and config.data_root is not None:
@@ -225,7 +235,9 @@ def evaluate_config(config: DictConfig) -> Results:
             f"background must be black, white or null; got {config.background!r}"
         )
     if config.get("drive") not in (None, "skeleton"):
-        raise ConfigError(f"drive must be skeleton or null; got {config.drive!r}")
+        raise ConfigError(
+            f"drive must be skeleton or null; got {config.drive!r}"
+        )
     if not config.splits or not set(config.splits) <= set(HELD_OUT_SPLITS):
         raise ConfigError(
             f"splits must be a list of {' and '.join(HELD_OUT_SPLITS)}; got {config.splits}"
@@ -322,7 +334,9 @@ def other_capture(stored: DictConfig, given: str | DictConfig) -> DictConfig:
     # Only keys that the data has can be changed.
     OmegaConf.set_struct(config, True)
     try:
-        config.data.merge_with({"root": given} if isinstance(given, str) else given)
+        config.data.merge_with(
+            {"root": given} if isinstance(given, str) else given
+        )
     except ConfigKeyError as error:
         raise ConfigError(
             f"other_capture: {str(error).splitlines()[0]} of the run's data"
@@ -382,7 +396,11 @@ def _out(config: DictConfig, root: Path, method: str) -> Path:
     out = root.with_name(f"{root.name}_scores")
     if config.out is not None:
         out = Path(config.out).expanduser().resolve()
-    if root in (out, *out.parents) or out.is_file() or (out / ".hydra").exists():
+    if (
+        root in (out, *out.parents)
+        or out.is_file()
+        or (out / ".hydra").exists()
+    ):
         raise ConfigError(
             f"out={out} is inside the predictions, a file or a run folder; choose another folder"
         )
@@ -480,7 +498,9 @@ def evaluate_method(
     # metrics.json is the last file: if it is new, all others are.
     write_scored(joined, folder)
     shutil.rmtree(folder / FOLDER, ignore_errors=True)
-    console.print(f"scores: {folder}", markup=False, highlight=False, soft_wrap=True)
+    console.print(
+        f"scores: {folder}", markup=False, highlight=False, soft_wrap=True
+    )
     return joined.results
 
 
@@ -519,7 +539,9 @@ def _score(
     # Flicker compares with the frame before, which must be rendered again.
     done = tally.images
     if done:
-        console.print(f"{title}: {done} of {len(places)} images were scored before")
+        console.print(
+            f"{title}: {done} of {len(places)} images were scored before"
+        )
         before = dataset.items[places[done - 1]]
         frame = dataset[places[done - 1]].to(device)
         tally.look_at(before, frame, predict(frame, before))
@@ -564,7 +586,9 @@ def _joined_splits(
     return Scored(results, pd.DataFrame(rows, columns=HEADER), origin)
 
 
-def make_scorer(config: DictConfig, data: GsganData, marks: Sequence[str]) -> Scorer:
+def make_scorer(
+    config: DictConfig, data: GsganData, marks: Sequence[str]
+) -> Scorer:
     """The scorer of a dataset: its protocol's measures, on the config's background.
 
     Raises:
@@ -599,7 +623,9 @@ def make_scorer(config: DictConfig, data: GsganData, marks: Sequence[str]) -> Sc
         # The record says what was asked for, and the departures what was done.
         asked = record["measures"]["background"]
         if asked != measures.background:
-            different = f"background is {measures.background}, asked for: {asked}"
+            different = (
+                f"background is {measures.background}, asked for: {asked}"
+            )
             record["departures"].append(different)
         if boxes is not None:
             record["departures"] += boxes.departures

@@ -39,7 +39,12 @@ from gsgan.metrics.names import (
     PART_METRICS,
     SPLAT,
 )
-from gsgan.metrics.regions import BACKGROUNDS, cleared, describe_boxes, rectangle
+from gsgan.metrics.regions import (
+    BACKGROUNDS,
+    cleared,
+    describe_boxes,
+    rectangle,
+)
 from gsgan.metrics.segmentation import confusion, miou
 from gsgan.metrics.shares import region_shares
 from gsgan.metrics.shifted import psnr_shifted
@@ -91,7 +96,9 @@ def image_scores(
     # Values beyond the range of a display do not count.
     measures = measures or MetricVariants()
     image = image.clamp(0, 1)
-    scores: dict[str, Any] = {"high_frequencies": high_frequencies(image, target)}
+    scores: dict[str, Any] = {
+        "high_frequencies": high_frequencies(image, target)
+    }
 
     # PSNR and SSIM in the region and the variant that the protocol asks for.
     pooling = measures.psnr_pooling
@@ -217,7 +224,9 @@ class SplitScores:
     grid: list[dict[str, Tensor]] = field(default_factory=list)
 
 
-def painter(avatar: Avatar, *, solve: bool = False, colours: bool = True) -> Predict:
+def painter(
+    avatar: Avatar, *, solve: bool = False, colours: bool = True
+) -> Predict:
     """The predictions of an avatar in eval mode: I_pred as ``full``, Step I's colour as ``splat``,
     each with its own alpha.
 
@@ -246,7 +255,11 @@ def painter(avatar: Avatar, *, solve: bool = False, colours: bool = True) -> Pre
         # Parts, in the classes that are scored.
         parts = painting.segmentation
         labels = frame.labels
-        if avatar.segmentation is not None and parts is not None and labels is not None:
+        if (
+            avatar.segmentation is not None
+            and parts is not None
+            and labels is not None
+        ):
             parts, labels = avatar.segmentation.to_score(parts, labels)
         return Prediction(
             images,
@@ -381,7 +394,9 @@ class Tally:
             # The same variant of the frame before.
             if last is not None and motion is not None:
                 before = (last.images[name], last.target, last.frame.mask)
-                own["flicker"] = float(flicker(image, target, frame.mask, before))
+                own["flicker"] = float(
+                    flicker(image, target, frame.mask, before)
+                )
                 error_before = last.images[name] - last.target
                 moved = warped_flicker(image - target, error_before, motion)
                 own["warped_flicker"] = moved
@@ -395,7 +410,11 @@ class Tally:
         self._add_parts(camera, frame, prediction)
 
     def _images(
-        self, item: Item, frame: Frame, prediction: Prediction, box: Tensor | None
+        self,
+        item: Item,
+        frame: Frame,
+        prediction: Prediction,
+        box: Tensor | None,
     ) -> dict[str, Tensor]:
         """The images of every variant as the protocol scores them, by the body's ``box``.
 
@@ -420,15 +439,21 @@ class Tally:
         images[FLOOR_VARIANT] = torch.full_like(frame.image, prepare.background)
         return images
 
-    def _add_parts(self, camera: str, frame: Frame, prediction: Prediction) -> None:
+    def _add_parts(
+        self, camera: str, frame: Frame, prediction: Prediction
+    ) -> None:
         """Counts the pixels of a segmentation, if there is one."""
         parts = prediction.segmentation
         if parts is None or frame.labels is None:
-            self.no_parts = NO_LABELS if parts is not None else prediction.no_parts
+            self.no_parts = (
+                NO_LABELS if parts is not None else prediction.no_parts
+            )
             return
 
         # Sums of confusion matrices by camera, and the score of this image.
-        labels = frame.labels if prediction.labels is None else prediction.labels
+        labels = (
+            frame.labels if prediction.labels is None else prediction.labels
+        )
         matrix = confusion(parts, labels)
         held = self.matrices.get(camera, torch.zeros_like(matrix))
         self.matrices[camera] = held + matrix
@@ -464,7 +489,10 @@ def _follows(item: Item, frame: Frame, before: Item, last: Frame) -> bool:
 
 
 def _variant(
-    rows: Sequence[Row], matrices: dict[str, Tensor], no_parts: str, scorer: Scorer
+    rows: Sequence[Row],
+    matrices: dict[str, Tensor],
+    no_parts: str,
+    scorer: Scorer,
 ) -> dict[str, Any]:
     """One variant as in metrics.json."""
     # Means over all images.
@@ -504,7 +532,9 @@ def _common(scorer: Scorer, images: int) -> dict[str, Any]:
     return {
         "images": images,
         "marks": list(scorer.marks),
-        "lpips_input": lpips_input(scorer.prepare.measures) if scorer.lpips else None,
+        "lpips_input": lpips_input(scorer.prepare.measures)
+        if scorer.lpips
+        else None,
         "boxes": describe_boxes(scorer.prepare.skeleton),
     }
 

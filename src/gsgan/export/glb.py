@@ -16,7 +16,9 @@ GENERATOR = f"gsgan {__version__}"
 ARRAY_BUFFER = 34962
 ELEMENT_ARRAY_BUFFER = 34963
 # glTF's numbers of component types.
-COMPONENTS = {np.dtype(kind): number for number, kind in COMPONENT_TYPES.items()}
+COMPONENTS = {
+    np.dtype(kind): number for number, kind in COMPONENT_TYPES.items()
+}
 
 
 class GlbContent:
@@ -27,7 +29,9 @@ class GlbContent:
         self.views: list[dict[str, int]] = []
         self.accessors: list[dict[str, Any]] = []
 
-    def add(self, array: np.ndarray[Any, Any], target: int | None = None) -> int:
+    def add(
+        self, array: np.ndarray[Any, Any], target: int | None = None
+    ) -> int:
         """The number of a new accessor.
 
         Args:

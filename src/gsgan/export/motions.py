@@ -98,7 +98,9 @@ def bvh_text(motion: BodyMotion) -> str:
         kind = "JOINT" if parent >= 0 else "ROOT"
         channels = "3 Zrotation Xrotation Yrotation"
         if parent < 0:
-            channels = "6 Xposition Yposition Zposition Zrotation Xrotation Yrotation"
+            channels = (
+                "6 Xposition Yposition Zposition Zrotation Xrotation Yrotation"
+            )
         lines.append(f"{pad}{kind} {body.joint_names[j]}")
         lines.append(pad + "{")
         lines.append(f"{pad}\tOFFSET {_row(offset)}")
@@ -182,7 +184,9 @@ def _mesh(content: GlbContent, body: SkinnedBody) -> dict[str, object]:
     # The attributes of vertices, then the faces.
     values = {
         "POSITION": body.vertices.numpy().astype("<f4"),
-        "NORMAL": vertex_normals(body.vertices, body.faces).numpy().astype("<f4"),
+        "NORMAL": vertex_normals(body.vertices, body.faces)
+        .numpy()
+        .astype("<f4"),
         "JOINTS_0": bones.numpy().astype("<u2"),
         "WEIGHTS_0": weights.numpy().astype("<f4"),
     }
@@ -228,7 +232,9 @@ def _animation(content: GlbContent, motion: BodyMotion) -> dict[str, object]:
     root = motion.body.joints[0].numpy().astype("<f4")
     moves = root + motion.poses.transl.numpy().astype("<f4")
     samplers = [{"input": keys, "output": content.add(moves)}]
-    channels = [{"sampler": 0, "target": {"node": FIRST_JOINT, "path": "translation"}}]
+    channels = [
+        {"sampler": 0, "target": {"node": FIRST_JOINT, "path": "translation"}}
+    ]
     for j in range(theta.shape[1]):
         quaternions = Rotation.from_rotvec(theta[:, j]).as_quat().astype("<f4")
         samplers.append({"input": keys, "output": content.add(quaternions)})

@@ -33,7 +33,9 @@ from gsgan.utils.provenance import SOFTWARE, SOURCE_TYPE, XMP
 
 WEB = Path(__file__).with_name("web")
 PAGE_VERSION = 2  # of the block
-ALPHA_MIN = 1 / 255  # smallest alpha that the page draws, if the avatar's own is less
+ALPHA_MIN = (
+    1 / 255
+)  # smallest alpha that the page draws, if the avatar's own is less
 KINDS = {
     "int8": "i1",
     "uint8": "u1",
@@ -102,7 +104,10 @@ def _hash(text: str) -> str:
 
 
 def block(
-    run: Run, avatar: Avatar, motions: Mapping[str, tuple[Drive, float]], name: str
+    run: Run,
+    avatar: Avatar,
+    motions: Mapping[str, tuple[Drive, float]],
+    name: str,
 ) -> bytes:
     """The avatar's header and arrays, deflated; see web/content.ts.
 
@@ -153,7 +158,9 @@ def block(
 def quantised(values: NDArray, maximum: int) -> tuple[NDArray, NDArray]:
     """Whole numbers within ± ``maximum`` and their step; a matrix has one step per row."""
     size = np.abs(values)
-    largest = size.max(axis=-1, keepdims=True) if values.ndim == 2 else size.max()
+    largest = (
+        size.max(axis=-1, keepdims=True) if values.ndim == 2 else size.max()
+    )
     step = np.maximum(largest, 1e-12) / maximum  # rows of zeros have a step too
     kind = np.int8 if maximum < 128 else np.int16
     return np.rint(values / step).astype(kind), np.asarray(step, np.float32)
@@ -178,7 +185,9 @@ def gaussians_of(avatar: Avatar) -> tuple[Plain, Arrays]:
     table = linear.coefficients.detach().double()[..., :numbers].clone()
     table[..., :3] *= linear.mean_step
     table[:, 0, 3] += 1
-    table[:, 0, 7:10] += (on_body.sigma * points.spacing).log()[:, None].double()
+    table[:, 0, 7:10] += (
+        (on_body.sigma * points.spacing).log()[:, None].double()
+    )
     table[:, 0, 10] += math.log(linear.opacity / (1 - linear.opacity))
 
     # The first harmonic is constant and needs 16 bits; for the others 8 bits suffice. Numbers
@@ -202,7 +211,9 @@ def gaussians_of(avatar: Avatar) -> tuple[Plain, Arrays]:
 
     # The header: bounds of the residuals in metres, and the settings of the rasteriser.
     settings = avatar.accuracy
-    scales = [math.log(limit * linear.body_height) for limit in linear.scale_range]
+    scales = [
+        math.log(limit * linear.body_height) for limit in linear.scale_range
+    ]
     header: Plain = {
         "count": len(table),
         "degree": degree,
@@ -227,7 +238,9 @@ def gaussians_of(avatar: Avatar) -> tuple[Plain, Arrays]:
     # The arrays, in the smallest types that hold their values.
     return header, {
         "mean": np.rint((means - low) / step).astype(np.uint16),
-        "normal": np.rint(32767 * on_body.rest_normals.numpy()).astype(np.int16),
+        "normal": np.rint(32767 * on_body.rest_normals.numpy()).astype(
+            np.int16
+        ),
         "bone": bones.astype(np.uint8),
         "weight": np.rint(65535 * weight).astype(np.uint16),
         "first": first,
@@ -279,7 +292,9 @@ def body_of(run: Run) -> tuple[Plain, Arrays]:
     return header, {
         "landmark": landmarks,
         "carrier": carrier.astype(np.uint8),
-        "body": np.frombuffer(solver_block(run.avatar.solver, body.parents), np.uint8),
+        "body": np.frombuffer(
+            solver_block(run.avatar.solver, body.parents), np.uint8
+        ),
     }
 
 
@@ -294,7 +309,9 @@ def solver_block(solver: Solver, parents: tuple[int, ...]) -> bytes:
     for name in compiled.COUNTS:
         integers.append(counts[name])
     floats = [numbers[name] for name in compiled.NUMBERS]
-    head = np.array(integers, "<i8").tobytes() + np.array(floats, "<f8").tobytes()
+    head = (
+        np.array(integers, "<i8").tobytes() + np.array(floats, "<f8").tobytes()
+    )
 
     # Addresses of the constants follow; those of a frame's arrays are set by the page.
     given = [constants[name].numpy() for name in compiled.CONSTANTS]

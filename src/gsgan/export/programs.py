@@ -61,8 +61,12 @@ class Whole(nn.Module):
             K, R, t: ``[1, 3, 3]``, ``[1, 3, 3]``, ``[1, 3]`` of the camera.
             theta, transl: pose of the skinned body, if the avatar needs one.
         """
-        body = None if theta is None or transl is None else BodyPose(theta, transl)
-        rendering = self.avatar(skeleton, visibility, Camera(K, R, t, self.size), body)
+        body = (
+            None if theta is None or transl is None else BodyPose(theta, transl)
+        )
+        rendering = self.avatar(
+            skeleton, visibility, Camera(K, R, t, self.size), body
+        )
         assert rendering.image is not None and rendering.alpha is not None  # noqa: PT018
         return rendering.image.clamp(0, 1), rendering.alpha.clamp(0, 1)
 
@@ -130,8 +134,13 @@ class PoseAndGenerator(nn.Module):
         self.generator = avatar.generator
 
         # Images that the avatar does not render have no channels.
-        classes = 0 if avatar.segmentation is None else avatar.segmentation.classes
-        self.channels = {"features": avatar.splat_channels, "segmentation": classes}
+        classes = (
+            0 if avatar.segmentation is None else avatar.segmentation.classes
+        )
+        self.channels = {
+            "features": avatar.splat_channels,
+            "segmentation": classes,
+        }
 
     def inputs(self) -> tuple[dict[str, Tensor], dict[str, int]]:
         """Examples by name, for the exporter; of images, the pixels per pixel of the output."""
@@ -192,7 +201,9 @@ def onnx_program(avatar: Avatar) -> bytes:
         import onnx  # noqa: F401
         import onnxscript  # noqa: F401
     except ImportError:
-        raise ConfigError("format=onnx needs: pip install 'gsgan[export]'") from None
+        raise ConfigError(
+            "format=onnx needs: pip install 'gsgan[export]'"
+        ) from None
     networks = PoseAndGenerator(unfrozen(avatar)).eval()
     given, times = networks.inputs()
 

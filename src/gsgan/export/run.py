@@ -13,7 +13,12 @@ from omegaconf import DictConfig, open_dict
 from rich.console import Console
 
 from gsgan import __version__
-from gsgan.export.motions import BodyMotion, bvh_text, captured_motion, motion_glb
+from gsgan.export.motions import (
+    BodyMotion,
+    bvh_text,
+    captured_motion,
+    motion_glb,
+)
 from gsgan.export.page import block, page, refuse_unsuitable
 from gsgan.export.splats import glb_bytes, ply_bytes, splats_of
 from gsgan.metrics.names import FLOOR_VARIANT, VARIANTS
@@ -195,7 +200,11 @@ def export_config(config: DictConfig) -> None:
     if config.verify is not None:
         path = Path(config.verify).expanduser()
         found = verify(path)
-        state = "marked as synthetic" if found.synthetic else "not marked as synthetic"
+        state = (
+            "marked as synthetic"
+            if found.synthetic
+            else "not marked as synthetic"
+        )
         tell(f"{path.name}: {state}")
         tell(found.summary())
         return
@@ -210,7 +219,9 @@ def export_config(config: DictConfig) -> None:
     if kind in MOTIONS:
         motion = _motion(config, console)
         _write(out, bvh_text(motion) if kind == "bvh" else motion_glb(motion))
-        tell(f"written: {out}, {len(motion.poses.theta)} frames at {motion.fps:g}")
+        tell(
+            f"written: {out}, {len(motion.poses.theta)} frames at {motion.fps:g}"
+        )
         return
     run = Run.load(config)
 
@@ -221,7 +232,11 @@ def export_config(config: DictConfig) -> None:
         tell(drive.text)
         numbers = range(len(drive.p)) if sequence else range(1)
         for i in track(numbers, "writing", console):
-            name = out / f"{drive.numbers[i]:06d}{ENDINGS[kind]}" if sequence else out
+            name = (
+                out / f"{drive.numbers[i]:06d}{ENDINGS[kind]}"
+                if sequence
+                else out
+            )
             _write(name, _splats(run, drive, i, kind))
 
         # A shorter sequence replaces a longer one: files of later frames are removed.
@@ -266,15 +281,27 @@ def _place(config: DictConfig, kind: str) -> Path:
         raise ConfigError(f"out is not set: give out=<file>{ending}{folders}")
     out = Path(config.out).expanduser()
     if out.suffix.lower() != ending and (out.suffix or kind != "ply"):
-        raise ConfigError(f"out={out}: format={kind} needs a {ending} file{folders}")
+        raise ConfigError(
+            f"out={out}: format={kind} needs a {ending} file{folders}"
+        )
 
     # Nothing is overwritten unless the user says so.
     folder = not out.suffix
     if out.exists() and out.is_dir() != folder:
-        found = "a file; expected a folder" if folder else "a folder; expected a file"
+        found = (
+            "a file; expected a folder"
+            if folder
+            else "a folder; expected a file"
+        )
         raise ConfigError(f"out={out} is {found}")
-    if out.exists() and not config.overwrite and (not folder or any(out.iterdir())):
-        raise ConfigError(f"out={out} exists; give overwrite=true or another name")
+    if (
+        out.exists()
+        and not config.overwrite
+        and (not folder or any(out.iterdir()))
+    ):
+        raise ConfigError(
+            f"out={out} exists; give overwrite=true or another name"
+        )
     return out
 
 
@@ -307,8 +334,14 @@ def _poses(config: DictConfig, run: Run) -> Drive:
     # Some of its frames, if the user asks for them.
     start = whole("start", config.start, 0)
     if start >= len(drive.p):
-        raise ConfigError(f"start={start}: the motion has {len(drive.p)} frames")
-    end = None if config.frames is None else start + whole("frames", config.frames, 1)
+        raise ConfigError(
+            f"start={start}: the motion has {len(drive.p)} frames"
+        )
+    end = (
+        None
+        if config.frames is None
+        else start + whole("frames", config.frames, 1)
+    )
     return drive.rows(np.arange(len(drive.p))[start:end])
 
 

@@ -198,7 +198,9 @@ def glb_bytes(splats: Splats, up: str) -> bytes:
     }
     for l in range(degree + 1):
         for m in range(2 * l + 1):
-            arrays[f"{EXTENSION}:SH_DEGREE_{l}_COEF_{m}"] = splats.sh[:, l * l + m]
+            arrays[f"{EXTENSION}:SH_DEGREE_{l}_COEF_{m}"] = splats.sh[
+                :, l * l + m
+            ]
 
     # All attributes lie one after the other in a single buffer.
     glb = GlbContent()

@@ -48,7 +48,9 @@ def weights_bytes(folder: Path, avatar: Avatar, facts: dict[str, Any]) -> bytes:
     config = OmegaConf.to_container(read_config(folder), resolve=False)
     metadata = {"format": "pt", "config": json.dumps(config)}
     metadata["gsgan"] = json.dumps({key: facts.get(key) for key in KEPT_FACTS})
-    state = {key: value.contiguous() for key, value in avatar.state_dict().items()}
+    state = {
+        key: value.contiguous() for key, value in avatar.state_dict().items()
+    }
     return save(state, metadata)
 
 
@@ -73,9 +75,12 @@ def load_weights(path: str | Path, *, device: str = "auto") -> Avatar:
     try:
         with safe_open(path, "pt") as file:
             metadata = file.metadata() or {}
-            state = {f"avatar.{key}": file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+            names = file.keys()
+            state = {f"avatar.{name}": file.get_tensor(name) for name in names}
     except (OSError, SafetensorError) as error:
-        raise DataError(f"{path}: not a readable safetensors file ({error})") from None
+        raise DataError(
+            f"{path}: not a readable safetensors file ({error})"
+        ) from None
 
     # The metadata of files by other programs lack these keys.
     if not {"config", "gsgan"} <= metadata.keys():
@@ -87,7 +92,10 @@ def load_weights(path: str | Path, *, device: str = "auto") -> Avatar:
     try:
         config = OmegaConf.create(json.loads(metadata["config"]))
         _refuse_other_classes(path, config)
-        checkpoint = {"gsgan": json.loads(metadata["gsgan"]), "state_dict": state}
+        checkpoint = {
+            "gsgan": json.loads(metadata["gsgan"]),
+            "state_dict": state,
+        }
         avatar = avatar_of(path, config, checkpoint)
     except DAMAGED as error:
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
@@ -101,7 +109,9 @@ def _refuse_other_classes(path: Path, config: Any) -> None:
     """A config names the classes that it builds: only those in conf/ are taken from a file that may
     come from anybody."""
     # The classes that the shipped configs name.
-    shipped = "\n".join(file.read_text() for file in config_folder().rglob("*.yaml"))
+    shipped = "\n".join(
+        file.read_text() for file in config_folder().rglob("*.yaml")
+    )
     known = {"", *re.findall(r"_target_: *([\w.]+)", shipped)}
 
     # Every node of the config is visited, however deep it lies.

@@ -25,7 +25,9 @@ CONTROL_SPREAD = 1.5  # of the controls' influence, in distances between them
 # standard deviation of a Gaussian, as a share of the points' spacing
 SIGMA = 0.7
 OPACITY = 0.95
-LOOSE_WEIGHT = 0.25  # weight of landmarks of face and palm, whose definitions differ
+LOOSE_WEIGHT = (
+    0.25  # weight of landmarks of face and palm, whose definitions differ
+)
 LOOSE_LANDMARKS = (*range(11), *range(17, 23))
 ANGLE = 0.1  # radians of a joint's turn that cost as much as a landmark `noise` away
 
@@ -101,7 +103,9 @@ class FittedSurface(nn.Module):
         self.body = body
         self.accuracy = accuracy
         self.points = SkinnedPoints(body, points)
-        normals = vertex_normals(body.vertices.float(), body.faces)[self.points.chosen]
+        normals = vertex_normals(body.vertices.float(), body.faces)[
+            self.points.chosen
+        ]
         self.register_buffer("normals", normals, persistent=False)
 
         # The weights with which the controls move each point.
@@ -123,7 +127,9 @@ class FittedSurface(nn.Module):
         bones = self.body.transforms(pose)
         points = self.points
         A, t = blend_transforms(bones, points.bone_index, points.bone_weight)
-        distance = self.basis @ (MAX_CLOTHES * torch.tanh(self.offsets / MAX_CLOTHES))
+        distance = self.basis @ (
+            MAX_CLOTHES * torch.tanh(self.offsets / MAX_CLOTHES)
+        )
         means = skin(points.means + distance.unsqueeze(-1) * self.normals, A, t)
 
         # round Gaussians, which turn and stretch with the skin
@@ -173,7 +179,9 @@ class Fitter:
         self.frames = frames
         self.seed = seed
         device = frames.device
-        surface = FittedSurface(body.to(device), settings.points, settings.accuracy)
+        surface = FittedSurface(
+            body.to(device), settings.points, settings.accuracy
+        )
         self.surface = surface.to(device)
 
         # the change of each frame's angles and translation
@@ -249,7 +257,9 @@ class Fitter:
             turned = (pose.theta[0] - self.start.theta[i]) / ANGLE
             loss = (
                 share
-                + settings.landmarks * (self.weight[i] * robust).sum() / len(robust)
+                + settings.landmarks
+                * (self.weight[i] * robust).sum()
+                / len(robust)
                 + settings.prior * turned.square().sum() / self.bones
             )
 
@@ -312,7 +322,9 @@ class Fitter:
         held = self.settings.hold * self.settings.sweeps
         rest = max(self.settings.sweeps - held, 1e-9)
         fallen = min(max(self.swept - held, 0) / rest, 1)
-        factor = FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * fallen))
+        factor = FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (
+            1 + math.cos(math.pi * fallen)
+        )
 
         # Both optimisers share the course of the rate.
         surface_rate = self.settings.surface_rate * factor

@@ -39,7 +39,9 @@ class Silhouette:
     def cut(self, window: Window) -> "Silhouette":
         """The part of the image inside a window."""
         unsure = None if self.unsure is None else window.cut(self.unsure)
-        return Silhouette(window.cut(self.mask), window.camera(self.camera), unsure)
+        return Silhouette(
+            window.cut(self.mask), window.camera(self.camera), unsure
+        )
 
 
 class MaskedFrames:
@@ -81,7 +83,9 @@ class MaskedFrames:
             used = spread_frames(layout.landmarks, used, max_frames)
         items: list[Item] = []
         for turn, frame in enumerate(used):
-            seeing = [camera for camera in cameras if frame in layout.images[camera]]
+            seeing = [
+                camera for camera in cameras if frame in layout.images[camera]
+            ]
             for camera in rotated(seeing, max_cameras, turn):
                 items.append((camera, frame))
         self.dataset = CaptureDataset(
@@ -115,7 +119,9 @@ class MaskedFrames:
 
     def silhouettes(self, i: int) -> list[Silhouette]:
         """The masks of the i-th frame, one per camera."""
-        return [self._silhouette(place) for place in self._places[self.frames[i]]]
+        return [
+            self._silhouette(place) for place in self._places[self.frames[i]]
+        ]
 
     def _read(self, place: int) -> tuple[Bytes, Bytes | None]:
         """A mask and its unsure pixels, 0..255.
@@ -126,7 +132,9 @@ class MaskedFrames:
         mask, unsure = self.dataset.mask(place)
         inside = self.dataset.inside(place)
         if inside is not None:
-            outside = np.where(inside[0, 0].numpy() < 0.5, 255, 0).astype(np.uint8)
+            outside = np.where(inside[0, 0].numpy() < 0.5, 255, 0).astype(
+                np.uint8
+            )
             unsure = outside if unsure is None else np.maximum(unsure, outside)
         return mask, unsure
 
@@ -171,21 +179,26 @@ class MaskedFrames:
         # The usual area is that of masks with a person.
         known = [area for area in areas if area > 0]
         usual = float(np.quantile(known, USUAL)) if known else np.inf
-        return [place for place, area in enumerate(areas) if area >= minimum * usual]
+        return [
+            place for place, area in enumerate(areas) if area >= minimum * usual
+        ]
 
     def _stacked(self, by_frame: Mapping[int, NDArray[np.float64]]) -> Tensor:
         values = np.stack([by_frame[frame] for frame in self.frames])
         return torch.from_numpy(values).to(self.device, torch.float32)
 
 
-def rotated(cameras: Sequence[str], maximum: int | None, turn: int) -> list[str]:
+def rotated(
+    cameras: Sequence[str], maximum: int | None, turn: int
+) -> list[str]:
     """At most so many cameras, evenly spaced; the next turn takes their neighbours."""
     if maximum is None or len(cameras) <= maximum:
         return list(cameras)
 
     # The cameras are evenly spaced, and each turn begins one camera later.
     places = [
-        (turn + place) % len(cameras) for place in evenly_spaced(len(cameras), maximum)
+        (turn + place) % len(cameras)
+        for place in evenly_spaced(len(cameras), maximum)
     ]
     return [cameras[place] for place in sorted(places)]
 

@@ -24,7 +24,12 @@ from gsgan.body.solve import ON_HANDS, Solver
 from gsgan.data.calibration import METRES
 from gsgan.data.crop import PersonCrop
 from gsgan.data.datamodule import GsganData
-from gsgan.data.formats.capture import LANDMARKS_FILE, POSES_FILE, SHAPE, CaptureReader
+from gsgan.data.formats.capture import (
+    LANDMARKS_FILE,
+    POSES_FILE,
+    SHAPE,
+    CaptureReader,
+)
 from gsgan.data.scene_info import refuse_swapped_sides
 from gsgan.data.validation import spans
 from gsgan.fit.fitter import Fit, Fitter
@@ -93,21 +98,35 @@ def fit_report(
 
 def _medians(values: dict[str, Tensor], at: Any) -> dict[str, float]:
     """The median of a part of each set's values."""
-    return {name: float(value[at].nanmedian()) for name, value in values.items()}
+    return {
+        name: float(value[at].nanmedian()) for name, value in values.items()
+    }
 
 
-def summary(report: dict[str, Any], folder: Path, masked: MaskedFrames) -> list[str]:
+def summary(
+    report: dict[str, Any], folder: Path, masked: MaskedFrames
+) -> list[str]:
     """The lines that the command prints."""
     before = report["solved"]
     after = report["registered"]
 
     # the joints with the largest distances, and the frames with the smallest overlaps
-    distances = {joint: x["registered"] for joint, x in report["joints"].items()}
-    overlaps = {frame: x["iou"]["registered"] for frame, x in report["frames"].items()}
-    joints = sorted(distances, key=lambda joint: -np.nan_to_num(distances[joint]))
+    distances = {
+        joint: x["registered"] for joint, x in report["joints"].items()
+    }
+    overlaps = {
+        frame: x["iou"]["registered"] for frame, x in report["frames"].items()
+    }
+    joints = sorted(
+        distances, key=lambda joint: -np.nan_to_num(distances[joint])
+    )
     frames = sorted(overlaps, key=lambda frame: np.nan_to_num(overlaps[frame]))
-    worst = ", ".join(f"{joint} {distances[joint]:.0f}" for joint in joints[:WORST])
-    lowest = ", ".join(f"{frame} {overlaps[frame]:.3f}" for frame in frames[:WORST])
+    worst = ", ".join(
+        f"{joint} {distances[joint]:.0f}" for joint in joints[:WORST]
+    )
+    lowest = ", ".join(
+        f"{frame} {overlaps[frame]:.3f}" for frame in frames[:WORST]
+    )
     return [
         f"{len(masked.frames)} frames, masks of {', '.join(masked.cameras)}: overlap (IoU) with "
         f"the body's surface {before['iou']:.3f} solved from the skeletons, {after['iou']:.3f} "
@@ -121,7 +140,9 @@ def summary(report: dict[str, Any], folder: Path, masked: MaskedFrames) -> list[
 SIZE = 128  # pixels of the images that the fit before training uses
 IMAGE_MARGIN = 0.2  # metres around the person in these images
 LOCK = ".body_fit.lock"
-FRAMES_AT_ONCE = 500  # frames whose poses are solved at once, which bounds memory
+FRAMES_AT_ONCE = (
+    500  # frames whose poses are solved at once, which bounds memory
+)
 
 
 def run_fit(config: DictConfig) -> Path:
@@ -243,7 +264,9 @@ def fit_body(
         kept=registered if _keeps(settings) else None,
     )
     lines = summary(report, folder, frames)
-    console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+    console.print(
+        "\n".join(lines), markup=False, highlight=False, soft_wrap=True
+    )
     return folder
 
 
@@ -277,7 +300,9 @@ def _registered(fitter: Fitter, settings: Fit, console: Console) -> BodyPose:
     """The poses after all steps of the fit."""
     # The surface comes first, in the solved poses; surface and poses follow together.
     with progress(console) as bars:
-        for _ in bars.track(range(settings.surface_steps), description="surface"):
+        for _ in bars.track(
+            range(settings.surface_steps), description="surface"
+        ):
             fitter.surface_step()
         for _ in bars.track(range(settings.sweeps), description="poses"):
             fitter.sweep()
@@ -364,7 +389,10 @@ def _joints(
 
 
 def _solve(
-    data: GsganData, shape: BodyShape, frames: Sequence[int], hands: bool = False
+    data: GsganData,
+    shape: BodyShape,
+    frames: Sequence[int],
+    hands: bool = False,
 ) -> BodyPose:
     """The poses of the frames, solved from skeletons with or without hands."""
     try:
@@ -408,7 +436,9 @@ def _solve_with_fingers(
 
 def _by_hands(data: GsganData) -> bool:
     """Whether the skeleton has hands and the data their landmarks."""
-    return data.layout.hands is not None and bool(TEMPLATES[data.skeleton].palms)
+    return data.layout.hands is not None and bool(
+        TEMPLATES[data.skeleton].palms
+    )
 
 
 def _fingers(shape: BodyShape) -> list[int]:
@@ -417,7 +447,10 @@ def _fingers(shape: BodyShape) -> list[int]:
 
 
 def _refined(
-    data: GsganData, shape: BodyShape, frames: Sequence[int], registered: BodyPose
+    data: GsganData,
+    shape: BodyShape,
+    frames: Sequence[int],
+    registered: BodyPose,
 ) -> BodyShape:
     """The shape with this person's landmarks in registered poses, and with the person's hands.
 

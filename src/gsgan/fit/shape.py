@@ -49,7 +49,10 @@ UNSURE = 0.1
 # Effective number of independent frames: systematic errors are the same in all of them.
 INDEPENDENT = 4.0
 FOREARMS = [[13, 15], [14, 16]]  # elbow and wrist
-SIZES = (0.75, 1.35)  # minimum and maximum size of a hand, as a share of the body's
+SIZES = (
+    0.75,
+    1.35,
+)  # minimum and maximum size of a hand, as a share of the body's
 MAX_HAND_MOVE = 0.05  # maximum move of a hand, metres
 NUMBERS = 99  # of the offsets: x, y, z of 33 landmarks
 LENGTH_STEPS = 10
@@ -137,7 +140,9 @@ def fit_hands(
     # The wrist landmark at rest, as it moves with the forearm and as it moves with the hand: the
     # wrist joint goes to the former, and the hand moves by the difference.
     forearms = body.transforms(poses)[:, body.hand_bone[wrists]]
-    on_arm = _at_rest(forearms[..., :3, :3], forearms[..., :3, 3], hands[:, wrists])
+    on_arm = _at_rest(
+        forearms[..., :3, :3], forearms[..., :3, 3], hands[:, wrists]
+    )
     in_hand = _at_rest(found.rotations, found.shifts, hands[:, wrists])
 
     # The medians over frames that show the hand with its forearm.
@@ -173,7 +178,10 @@ def fit_offsets(
     # The landmarks in the person's skeletons, moved back to the rest pose.
     body = shaped_body(shape)
     bones = body.transforms(poses)[:, body.landmark_bone]
-    moved = _at_rest(bones[..., :3, :3], bones[..., :3, 3], skeletons) - body.landmarks
+    moved = (
+        _at_rest(bones[..., :3, :3], bones[..., :3, 3], skeletons)
+        - body.landmarks
+    )
     moved = _median(moved, (visibility > 0).unsqueeze(-1))
 
     # The offsets add to those that the shape has.
@@ -284,7 +292,9 @@ def _pairs() -> _Pairs:
     )
 
 
-def _fit_lengths(space: ShapeSpace[MarkedBody], p: Tensor, seen: Tensor) -> Tensor:
+def _fit_lengths(
+    space: ShapeSpace[MarkedBody], p: Tensor, seen: Tensor
+) -> Tensor:
     """Numbers of the shape whose distances between landmarks are the medians over the frames.
 
     With the residuals r and the prior's precisions Λ, the cost ``Σ 2 (√(1 + r²) - 1) + xᵀ Λ x`` is
@@ -369,7 +379,9 @@ def _fit_landmarks(
             solver = Solver(space.shaped(shape_of(space, x)))
             weight = solver.weights(seen)
             q, root = solver.guess(p) if held is None else held
-            q, root = solver.descend(q, root, p, weight, POSE_STEPS if held else 10)
+            q, root = solver.descend(
+                q, root, p, weight, POSE_STEPS if held else 10
+            )
             held = (q, root)
             at = solver.linear(q, root, p)
             _, g, H, w = solver.normal(q, at, weight)

@@ -52,7 +52,9 @@ def _over_scales(term: Term, real: Maps, fake: Maps) -> Tensor:
     return torch.stack(losses).sum()
 
 
-def discriminator_loss(real: Maps, fake: Maps, form: str = "logistic") -> Tensor:
+def discriminator_loss(
+    real: Maps, fake: Maps, form: str = "logistic"
+) -> Tensor:
     """The discriminator's loss: mean over positions, sum over scales.
 
     Args:

@@ -95,7 +95,9 @@ class Perceptual(nn.Module):
             if net == "vgg":
                 self.network.stages = self.network.stages[:VGG_LAYERS]
         if crop is not None:
-            self.description += f", {crops} of {crop}² around the person in each image"
+            self.description += (
+                f", {crops} of {crop}² around the person in each image"
+            )
 
         # The mean loss of each layer over the first calls; LPIPS is one number.
         layers = 1
@@ -114,7 +116,9 @@ class Perceptual(nn.Module):
         if isinstance(self.network, Lpips):
             with torch.no_grad():
                 truth = self.network.features(target)
-            return self.network.distance(self.network.features(image), truth).mean()
+            return self.network.distance(
+                self.network.features(image), truth
+            ).mean()
 
         # The squared distance of each layer's features.
         with torch.no_grad():
@@ -129,7 +133,9 @@ class Perceptual(nn.Module):
         if self.training:
             warm = self.calls < self.warmup
             self.calls += warm
-            step = (_over_processes(loss.detach()) - self.layer_loss) / self.calls
+            step = (
+                _over_processes(loss.detach()) - self.layer_loss
+            ) / self.calls
             self.layer_loss += torch.where(warm, step, 0.0)
 
         # Weights are the inverse means, scaled to a sum of 1.
@@ -172,7 +178,9 @@ def crop_person(
     top = (centre // width - rows // 2).clamp(0, height - rows)
     left = (centre % width - columns // 2).clamp(0, width - columns)
     y = top[..., None] + torch.arange(rows, device=mask.device)  # [B, N, rows]
-    x = left[..., None] + torch.arange(columns, device=mask.device)  # [B, N, columns]
+    x = left[..., None] + torch.arange(
+        columns, device=mask.device
+    )  # [B, N, columns]
 
     # One gather per image: [B, N, rows, columns, C].
     batch = torch.arange(len(mask), device=mask.device)[:, None, None, None]
@@ -196,14 +204,18 @@ def _over_processes(value: Tensor) -> Tensor:
     return value / distributed.get_world_size()
 
 
-def _leave_out(module: nn.Module, state: dict[str, Any], prefix: str, _: Any) -> None:
+def _leave_out(
+    module: nn.Module, state: dict[str, Any], prefix: str, _: Any
+) -> None:
     """Removes a module's weights from a state dict."""
     for key in list(state):
         if key.startswith(prefix):
             del state[key]
 
 
-def _put_back(module: nn.Module, state: dict[str, Any], prefix: str, *_: Any) -> None:
+def _put_back(
+    module: nn.Module, state: dict[str, Any], prefix: str, *_: Any
+) -> None:
     """Adds the network's weights to a state dict that lacks them, as strict loading requires."""
     network = module.get_submodule("network")
     for key, value in [*network.named_parameters(), *network.named_buffers()]:
@@ -222,7 +234,9 @@ def _random_stages(width: int) -> nn.ModuleList:
 
         # He's initialisation, by a generator of its own.
         with torch.no_grad():
-            conv.weight.normal_(0, (2 / (9 * inputs)) ** 0.5, generator=generator)
+            conv.weight.normal_(
+                0, (2 / (9 * inputs)) ** 0.5, generator=generator
+            )
             conv.bias.zero_()  # type: ignore[union-attr]
         stages.append(nn.Sequential(conv, nn.LeakyReLU(0.2)))
     return nn.ModuleList(stages)

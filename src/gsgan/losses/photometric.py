@@ -185,7 +185,9 @@ class _Photometric(torch.autograd.Function):
         return ctx.gradient * grad, None, None, None, None
 
 
-def without_unsure(target: Tensor, image: Tensor, unsure: Tensor | None) -> Tensor:
+def without_unsure(
+    target: Tensor, image: Tensor, unsure: Tensor | None
+) -> Tensor:
     """The target, with the image itself at pixels that must not contribute to a loss.
 
     A per-pixel loss and its gradient are exactly 0 there; losses over windows (SSIM, networks)
@@ -195,4 +197,8 @@ def without_unsure(target: Tensor, image: Tensor, unsure: Tensor | None) -> Tens
         target, image: ``[B, 3, H, W]``.
         unsure: ``[B, 1, H, W]``, above 0 at those pixels; None for none.
     """
-    return target if unsure is None else torch.where(unsure > 0, image.detach(), target)
+    return (
+        target
+        if unsure is None
+        else torch.where(unsure > 0, image.detach(), target)
+    )

@@ -112,7 +112,9 @@ def outline(mask: Tensor) -> Tensor:
 def ssim_where(image: Tensor, target: Tensor, *regions: Tensor) -> list[Tensor]:
     """SSIM's mean over each region ``[B, 1, H, W]``, with windows that reach beyond it; NaN for an
     empty region."""
-    similar = (1 - d_ssim_map(image, target)).mean(dim=1, keepdim=True)  # [B, 1, H, W]
+    similar = (1 - d_ssim_map(image, target)).mean(
+        dim=1, keepdim=True
+    )  # [B, 1, H, W]
     means = []
     for region in regions:
         total = (similar * region).flatten(1).sum(dim=1)
@@ -137,7 +139,9 @@ def ssim(image: Tensor, target: Tensor, *, value_range: float = 1.0) -> Tensor:
     return 1 - d_ssim_map(image, target, k=k).flatten(1).mean(dim=1)
 
 
-def ssim_uniform(image: Tensor, target: Tensor, *, value_range: float = 1.0) -> Tensor:
+def ssim_uniform(
+    image: Tensor, target: Tensor, *, value_range: float = 1.0
+) -> Tensor:
     """Structural similarity with scikit-image's defaults: a uniform window of 7 pixels, sample
     covariances, no windows across the border.
 
@@ -172,7 +176,9 @@ def ssim_uniform(image: Tensor, target: Tensor, *, value_range: float = 1.0) -> 
     return similar.flatten(1).mean(dim=1).to(image.dtype)
 
 
-def high_frequencies(image: Tensor, target: Tensor, *, above: float = 0.25) -> Tensor:
+def high_frequencies(
+    image: Tensor, target: Tensor, *, above: float = 0.25
+) -> Tensor:
     """High-frequency energy relative to the ground truth's: below 1 is blurred, noise raises it.
 
     Args:
@@ -184,7 +190,9 @@ def high_frequencies(image: Tensor, target: Tensor, *, above: float = 0.25) -> T
     """
     # The frequencies of a real spectrum: half of the columns are enough.
     height, width = image.shape[-2:]
-    rows = torch.fft.fftfreq(height, device=image.device)[:, None]  # cycles per pixel
+    rows = torch.fft.fftfreq(height, device=image.device)[
+        :, None
+    ]  # cycles per pixel
     columns = torch.fft.rfftfreq(width, device=image.device)[None]
     high = (rows.square() + columns.square()).sqrt() > above
 

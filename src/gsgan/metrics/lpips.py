@@ -17,7 +17,9 @@ LPIPS_NETS = ("vgg", "alex")
 LpipsScores = Callable[[Tensor], dict[str, float]]
 
 
-def build_lpips(nets: Sequence[str], path: str | None = None) -> dict[str, Lpips]:
+def build_lpips(
+    nets: Sequence[str], path: str | None = None
+) -> dict[str, Lpips]:
     """The networks of LPIPS, with weights that exist.
 
     Args:
@@ -88,7 +90,9 @@ class LpipsAgainst:
 
             # The score of the region that the protocol asks for.
             if self.measures.lpips_region == "full":
-                scores[f"lpips_{net}"] = float(network.distance(features, truth))
+                scores[f"lpips_{net}"] = float(
+                    network.distance(features, truth)
+                )
             elif square is None:
                 scores[f"lpips_{net}"] = math.nan
             else:

@@ -76,7 +76,9 @@ def truth_motion(
     return Motion(places, person & (missed <= FLOW_TOLERANCE))
 
 
-def warped_flicker(error: Tensor, error_before: Tensor, motion: Motion) -> float:
+def warped_flicker(
+    error: Tensor, error_before: Tensor, motion: Motion
+) -> float:
     """Mean |e - e'| of the known pixels: e' is the error of the frame before, moved.
 
     It is 0 for an error that moves with the person, whatever its size.

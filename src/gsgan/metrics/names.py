@@ -42,7 +42,9 @@ IMAGE_METRICS = {
     # name, short name, digits, direction that is better
     "psnr": Metric("PSNR dB", "PSNR", 2, "↑"),
     "psnr_person": Metric("PSNR dB in box", "in box", 2, "↑"),
-    "psnr_inside": Metric("PSNR dB in box off the outline", "off the outline", 2, "↑"),
+    "psnr_inside": Metric(
+        "PSNR dB in box off the outline", "off the outline", 2, "↑"
+    ),
     "psnr_person_shifted": Metric("PSNR dB in box, shifted", "shifted", 2, "↑"),
     "ssim": Metric("SSIM", "SSIM", 4, "↑"),
     "ssim_person": Metric("SSIM in box", "SSIM in box", 4, "↑"),
@@ -80,6 +82,8 @@ BOX_METRICS = ("psnr_hands", "ssim_hands", "psnr_mouth", "ssim_mouth")
 # of segmentations
 PART_METRICS = {
     "miou": Metric("mIoU", "mIoU", 4, "↑"),
-    "miou_with_background": Metric("mIoU with background", "with background", 4, "↑"),
+    "miou_with_background": Metric(
+        "mIoU with background", "with background", 4, "↑"
+    ),
 }
 METRICS = IMAGE_METRICS | PART_METRICS

@@ -168,7 +168,9 @@ def box_mask(corners: Tensor, camera: Camera) -> Tensor:
     x_cam = camera.to_camera(corners.to(camera.K)[None])[0]
     seen = in_front(x_cam.double())
     if len(seen) == 0:
-        return torch.zeros(1, *camera.size, dtype=torch.bool, device=corners.device)
+        return torch.zeros(
+            1, *camera.size, dtype=torch.bool, device=corners.device
+        )
 
     # The outline of the box, without the lens.
     K = camera.K[0].double()
@@ -232,7 +234,9 @@ def inside_hull(hull: Float, points: Float) -> Bool:
 # -- boxes of hands and mouth
 
 
-def hands_and_mouth(frame: Frame, template: SkeletonTemplate) -> dict[str, Tensor]:
+def hands_and_mouth(
+    frame: Frame, template: SkeletonTemplate
+) -> dict[str, Tensor]:
     """The pixels in the boxes of both hands, `HANDS`, and of the mouth, `MOUTH`.
 
     A box surrounds the projected landmarks with a margin, is at least `MIN_BOX` pixels wide and
@@ -257,14 +261,20 @@ def hands_and_mouth(frame: Frame, template: SkeletonTemplate) -> dict[str, Tenso
     hands = []
     for wrist, *_ in template.palms:
         own = slice(wrist, wrist + HAND)
-        box = landmark_box(pixels[:, own], seen[:, own], camera.size, HAND_MARGIN)
+        box = landmark_box(
+            pixels[:, own], seen[:, own], camera.size, HAND_MARGIN
+        )
         hands.append(box)
 
     # The mouth, of the lips if there are any, else a square.
-    corners = [template.names.index(f"mouth_{side}") for side in ("left", "right")]
+    corners = [
+        template.names.index(f"mouth_{side}") for side in ("left", "right")
+    ]
     lips = lip_landmarks(template)
     if lips:
-        mouth = landmark_box(pixels[:, lips], seen[:, lips], camera.size, LIP_MARGIN)
+        mouth = landmark_box(
+            pixels[:, lips], seen[:, lips], camera.size, LIP_MARGIN
+        )
     else:
         around = mouth_square(frame.skeleton[:, corners], camera)
         known = seen[:, corners].all(dim=1, keepdim=True)

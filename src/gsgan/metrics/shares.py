@@ -11,7 +11,9 @@ from gsgan.data.pixels import IGNORE_LABEL
 from gsgan.metrics.image import outline
 
 
-def trunk_and_limbs(labels: Tensor, names: tuple[str, ...]) -> dict[str, Tensor]:
+def trunk_and_limbs(
+    labels: Tensor, names: tuple[str, ...]
+) -> dict[str, Tensor]:
     """The pixels of ``trunk``, which has the head, and of ``limbs``, by part labels.
 
     Clothes have one label each: trousers and skirts are limbs, sleeves are trunk.
@@ -23,7 +25,9 @@ def trunk_and_limbs(labels: Tensor, names: tuple[str, ...]) -> dict[str, Tensor]
     Returns:
         ``[B, 1, H, W]`` bool each.
     """
-    table = torch.zeros(IGNORE_LABEL + 1, dtype=torch.bool, device=labels.device)
+    table = torch.zeros(
+        IGNORE_LABEL + 1, dtype=torch.bool, device=labels.device
+    )
     table[: len(names)] = torch.tensor([is_limb(name) for name in names])
     limbs = table[labels]
     known = (labels > 0) & (labels != IGNORE_LABEL)

@@ -34,12 +34,16 @@ def psnr_shifted(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
     height, width = truth.shape[-2:]
 
     # The box and `REACH` pixels around it, with cubic values halfway between the pixels.
-    padded = functional.pad(image, (REACH, REACH, REACH, REACH), mode="replicate")
+    padded = functional.pad(
+        image, (REACH, REACH, REACH, REACH), mode="replicate"
+    )
     bottom = rows.stop + 2 * REACH
     right = columns.stop + 2 * REACH
     around = padded[..., rows.start : bottom, columns.start : right]
     size = (2 * around.shape[-2] - 1, 2 * around.shape[-1] - 1)
-    fine = functional.interpolate(around, size, mode="bicubic", align_corners=True)
+    fine = functional.interpolate(
+        around, size, mode="bicubic", align_corners=True
+    )
     fine[..., ::2, ::2] = around  # exact
 
     # The sums of squared errors of all blocks, by shift.
@@ -50,7 +54,9 @@ def psnr_shifted(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
             moved = fine[..., y:, x:][..., ::2, ::2][..., :height, :width]
             squared = (moved - truth).square().mean(dim=1, keepdim=True)
             blocks = functional.pad(squared, beyond)
-            sums.append(functional.avg_pool2d(blocks, BLOCK, divisor_override=1))
+            sums.append(
+                functional.avg_pool2d(blocks, BLOCK, divisor_override=1)
+            )
 
     # Every block takes its best shift.
     least = torch.stack(sums).amin(dim=0)

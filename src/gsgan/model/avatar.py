@@ -14,13 +14,26 @@ from gsgan.body.solve import Solver
 from gsgan.effects import Effects
 from gsgan.model.body_points import BodyPoints
 from gsgan.model.colour import ColourCorrection
-from gsgan.model.deformation import Deformation, ResidualGaussians, Residuals, bounded
+from gsgan.model.deformation import (
+    Deformation,
+    ResidualGaussians,
+    Residuals,
+    bounded,
+)
 from gsgan.model.generator import Generator
 from gsgan.model.pose_graph import pose_inputs
 from gsgan.model.rendering import Rendering
 from gsgan.model.segmentation import Segmentation
 from gsgan.model.surface import SurfaceGaussians
-from gsgan.scene import BodyPose, Camera, Gaussians, Raster, Window, body_window, cat
+from gsgan.scene import (
+    BodyPose,
+    Camera,
+    Gaussians,
+    Raster,
+    Window,
+    body_window,
+    cat,
+)
 from gsgan.skeleton import (
     MEDIAPIPE33,
     BoneFrames,
@@ -107,7 +120,9 @@ class Avatar(nn.Module):
     """
 
     # Replaced by benches: the context in which each stage runs, by its name.
-    stage: Callable[[str], AbstractContextManager[None]] = staticmethod(unwatched)
+    stage: Callable[[str], AbstractContextManager[None]] = staticmethod(
+        unwatched
+    )
 
     def __init__(
         self,
@@ -232,7 +247,9 @@ class Avatar(nn.Module):
         # Joints that were not seen are replaced, on the CPU.
         visibility = None if visibility is None else visibility.cpu()
         height = self.limb_length_sum
-        p, seen = complete_skeleton(skeleton.cpu(), visibility, self.template, height)
+        p, seen = complete_skeleton(
+            skeleton.cpu(), visibility, self.template, height
+        )
 
         # One camera serves all skeletons.
         if len(camera) not in (1, len(p)):
@@ -286,7 +303,9 @@ class Avatar(nn.Module):
         """
         # The body and the window need values, so they are found before the transfer to the device.
         device = next(self.parameters()).device
-        prepared = self.prepared(skeleton, visibility, camera, body, camera_index)
+        prepared = self.prepared(
+            skeleton, visibility, camera, body, camera_index
+        )
         rendering = self._rendered(
             prepared.to(device),
             pose_noise=pose_noise,
@@ -317,7 +336,9 @@ class Avatar(nn.Module):
         seen = camera if window is None else window.camera(camera)
         return Prepared(skeleton, visibility, seen, body, camera_index, window)
 
-    def body_pose(self, skeleton: Tensor, visibility: Tensor) -> BodyPose | None:
+    def body_pose(
+        self, skeleton: Tensor, visibility: Tensor
+    ) -> BodyPose | None:
         """The body pose of skeletons ``[B, J, 3]``, see `Solver.solve`; None if none is needed."""
         if self.solver is None:
             return None
@@ -330,11 +351,16 @@ class Avatar(nn.Module):
             return None
 
         # The window's sides suit the generator's stride.
-        sides = {"multiple": self.window_multiple, "minimum": self.window_minimum}
+        sides = {
+            "multiple": self.window_multiple,
+            "minimum": self.window_minimum,
+        }
         margin = self.window_margin
         near = self.accuracy.near
         with self.stage("window"), full_precision(skeleton.device):
-            return body_window(skeleton, camera, margin=margin, near=near, **sides)
+            return body_window(
+                skeleton, camera, margin=margin, near=near, **sides
+            )
 
     def _rendered(
         self,
@@ -360,7 +386,9 @@ class Avatar(nn.Module):
                     body = follows.points.with_bones(body)
 
             # Step I's part: Ĝ and its splatted features F.
-            gaussians = self.splat(p, valid, frames, camera, body, pose_noise, reach)
+            gaussians = self.splat(
+                p, valid, frames, camera, body, pose_noise, reach
+            )
             if gaussians is not None:
                 raster = self._rasterised(gaussians, camera, supersample)
 
@@ -372,14 +400,25 @@ class Avatar(nn.Module):
                         S = self.segmentation(body, camera)  # Sec. 3.4
                 with self.stage("p₂D"):
                     width = line_width(camera)
-                    drawn = draw_skeleton(p, valid, camera, self.template, width)
+                    drawn = draw_skeleton(
+                        p, valid, camera, self.template, width
+                    )
                 with self.stage("Ω"):
                     pose = pose_inputs(
-                        p, valid, frames, camera, self.template, self.body_height
+                        p,
+                        valid,
+                        frames,
+                        camera,
+                        self.template,
+                        self.body_height,
                     )
 
         # Sec. 3.5: the pose code and the UNet run in the precision of the trainer.
-        if generate and self.generator is not None and self.pose_encoder is not None:
+        if (
+            generate
+            and self.generator is not None
+            and self.pose_encoder is not None
+        ):
             with self.stage("pose encoder"):
                 g = self.pose_encoder(*pose)
             with self.stage("UNet"):
@@ -404,7 +443,9 @@ class Avatar(nn.Module):
         if self.generator is None:
             image = raster.features[:, :3]
             alpha = raster.alpha
-        rendering = Rendering(image, alpha, raster.features, raster.alpha, S, gaussians)
+        rendering = Rendering(
+            image, alpha, raster.features, raster.alpha, S, gaussians
+        )
 
         # Step I's colour and I_pred take on the tint of the training camera.
         if self.colour is None or camera_index is None:
@@ -448,10 +489,16 @@ class Avatar(nn.Module):
         bound = getattr(self.generator, "feature_bound", None)
         if bound is None:
             return gaussians  # type: ignore[no-any-return]
-        return replace(gaussians, features=bounded(gaussians.features, -bound, bound))
+        return replace(
+            gaussians, features=bounded(gaussians.features, -bound, bound)
+        )
 
     def points(
-        self, p: Tensor, valid: Tensor, frames: BoneFrames, body: BodyPose | None
+        self,
+        p: Tensor,
+        valid: Tensor,
+        frames: BoneFrames,
+        body: BodyPose | None,
     ) -> Points:
         """G: Alg. 1's points, or points on the body's surface where that effect is on."""
         with self.stage("densify"):
@@ -471,16 +518,22 @@ class Avatar(nn.Module):
         points = self.points(p, valid, frames, body)
         pelvis = frames.hubs[:, 0]
         code = self._code(p, frames)
-        return points, self.deformation.residuals(points, code, root_of(p), pelvis)
+        return points, self.deformation.residuals(
+            points, code, root_of(p), pelvis
+        )
 
     def _code(self, p: Tensor, frames: BoneFrames) -> Tensor:
         """``[B, 3 J]`` Ψ's code of a pose, without noise."""
         assert self.deformation is not None
         face = face_code(p, frames.head, self.template)
-        return self.deformation.pose_code(p, root_of(p), frames.hubs[:, 0], None, face)
+        return self.deformation.pose_code(
+            p, root_of(p), frames.hubs[:, 0], None, face
+        )
 
     @torch.no_grad()
-    def store_poses(self, p: Tensor, valid: Tensor, body: BodyPose | None) -> None:
+    def store_poses(
+        self, p: Tensor, valid: Tensor, body: BodyPose | None
+    ) -> None:
         """Stores the spread of training poses ``[F, J, 3]`` in Ψ; arguments as for `splat`."""
         if isinstance(self.deformation, Deformation):
             # The means give the places of the anchors in the training poses.
@@ -551,7 +604,11 @@ def seen_points(means: Tensor, camera: Camera, reach: float) -> Tensor:
 
     # All items have as many points as the one with most; the stable sort puts these first.
     count = int(inside.sum(1).max().clamp_min(1))
-    return inside.byte().sort(dim=1, descending=True, stable=True).indices[:, :count]
+    return (
+        inside.byte()
+        .sort(dim=1, descending=True, stable=True)
+        .indices[:, :count]
+    )
 
 
 def line_width(camera: Camera) -> float:

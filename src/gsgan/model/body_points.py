@@ -35,7 +35,9 @@ SKIN = 2.1  # square metres, the surface of a body of the stature
 STATURE = 1.75  # metres
 MIN_POINTS = 5000
 MAX_POINTS = 100_000
-MIN_WEIGHT = 1e-3  # a possible weight below it starts there, so that it can grow
+MIN_WEIGHT = (
+    1e-3  # a possible weight below it starts there, so that it can grow
+)
 
 
 class LearntWeights(nn.Module):
@@ -77,14 +79,20 @@ class LearntWeights(nn.Module):
         )
 
         # A point's shares of its controls fall with distance; they sum to 1.
-        share = functional.softmax(-2 * (distance / distance.mean()).square(), dim=1)
+        share = functional.softmax(
+            -2 * (distance / distance.mean()).square(), dim=1
+        )
 
         # The body's weights as a dense table, each row of sum 1.
         own = bone_weight / bone_weight.sum(1, keepdim=True)
-        dense = places.new_zeros(len(places), joints).scatter_add_(1, bone_index, own)
+        dense = places.new_zeros(len(places), joints).scatter_add_(
+            1, bone_index, own
+        )
 
         # The average weights of each control's points, carried back to the points.
-        interpolate = places.new_zeros(len(places), count).scatter_add_(1, near, share)
+        interpolate = places.new_zeros(len(places), count).scatter_add_(
+            1, near, share
+        )
         total = interpolate.sum(0).clamp_min(1e-6).unsqueeze(1)
         # weights of the neighbourhood
         around = interpolate @ (interpolate.mT @ dense / total)
@@ -122,7 +130,9 @@ class LearntWeights(nn.Module):
         def make() -> Tensor:
             # The field at the controls near each point, for the point's bones alone.
             moved = self.field[self.near.unsqueeze(-1), self.index.unsqueeze(1)]
-            return (self.start + (self.share.unsqueeze(-1) * moved).sum(1)).softmax(1)
+            return (
+                self.start + (self.share.unsqueeze(-1) * moved).sum(1)
+            ).softmax(1)
 
         return derived(self, "weights", make, self.field)
 
@@ -175,7 +185,12 @@ class SkinnedPoints(nn.Module):
             self.register_buffer(name, value, persistent=False)
 
         # The learnt weights start at the body's, as they are on the template.
-        own = template[chosen], self.bone_index, self.bone_weight, len(body.joints)
+        own = (
+            template[chosen],
+            self.bone_index,
+            self.bone_weight,
+            len(body.joints),
+        )
         self.learnt = LearntWeights(*own, controls) if controls else None
 
     def __len__(self) -> int:
@@ -186,7 +201,9 @@ class SkinnedPoints(nn.Module):
         if pose.bones is not None:
             return pose
         rotations = axis_angle_to_matrix(pose.theta)
-        bones = forward_kinematics(self.joints, self.parents, rotations, pose.transl)
+        bones = forward_kinematics(
+            self.joints, self.parents, rotations, pose.transl
+        )
         return replace(pose, bones=bones)
 
     @property
@@ -217,14 +234,20 @@ class SkinnedGaussians(nn.Module):
     """
 
     def __init__(
-        self, body: SkinnedBody, points: int | None, opacity: float, scale: float
+        self,
+        body: SkinnedBody,
+        points: int | None,
+        opacity: float,
+        scale: float,
     ) -> None:
         super().__init__()
 
         # Quats start at the identity.
         self.points = SkinnedPoints(body, points)
         count = len(self.points)
-        self.quats = nn.Parameter(torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1))
+        self.quats = nn.Parameter(
+            torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)
+        )
 
         # Scales start as spheres of a size that fits the spacing of the points.
         spacing = (scale * self.points.spacing).log()
@@ -247,7 +270,9 @@ class SkinnedGaussians(nn.Module):
         def make() -> Tensor:
             # Axes of the Gaussians at rest: a rotation times the scales.
             unit = functional.normalize(self.quats, dim=-1, eps=1e-6)
-            return quaternion_to_rotation_matrix(unit) * log_scales.exp().unsqueeze(-2)
+            return quaternion_to_rotation_matrix(
+                unit
+            ) * log_scales.exp().unsqueeze(-2)
 
         # Covariances A Σ Aᵀ, from the transformed axes.
         axes = A @ derived(self, "axes", make, *self.parameters(recurse=False))
@@ -326,7 +351,9 @@ class BodyPoints(nn.Module):
         # Places at rest tell Ψ one point from another; normals move with the pose.
         rest = (self.points.means - self.points.means.mean(dim=0)) / body_height
         self.register_buffer("rest_points", rest, persistent=False)
-        normals = vertex_normals(body.vertices.float(), body.faces)[self.points.chosen]
+        normals = vertex_normals(body.vertices.float(), body.faces)[
+            self.points.chosen
+        ]
         self.register_buffer("rest_normals", normals, persistent=False)
 
         # Each point is a part of its own, because its skinning gives it a frame of its own.
@@ -337,7 +364,9 @@ class BodyPoints(nn.Module):
         # The stretch's terms need the gradients of the weights over the surface. Where the
         # weights are fixed, the terms are fixed too.
         self.stretch = stretch
-        self.stretch_every = whole("model.body_points.stretch_every", stretch_every, 1)
+        self.stretch_every = whole(
+            "model.body_points.stretch_every", stretch_every, 1
+        )
         self.renew()
         if stretch:
             self.gradients = WeightGradients(body, self.points.chosen)
@@ -408,7 +437,9 @@ class BodyPoints(nn.Module):
 
         # Shapes and normals follow the stretch of the surface.
         jacobian = (
-            stretched(A, pose.bones, *self.stretch_terms()) if self.stretch else None
+            stretched(A, pose.bones, *self.stretch_terms())
+            if self.stretch
+            else None
         )
 
         # Shapes start as spheres of a share of the spacing at rest.

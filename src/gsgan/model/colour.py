@@ -29,7 +29,8 @@ class ColourCorrection(nn.Module):
 
         # The last row, after those of the training cameras, is the identity of held-out ones.
         rows = [
-            trained.index(name) if name in trained else len(trained) for name in cameras
+            trained.index(name) if name in trained else len(trained)
+            for name in cameras
         ]
         # by name, not number: other data may order cameras differently
         self.register_buffer("rows", torch.tensor(rows), persistent=False)
@@ -37,7 +38,9 @@ class ColourCorrection(nn.Module):
     @property
     def affine(self) -> Tensor:
         """``[C, 3, 4]`` the maps ``[A | b]``, of mean ``[1 | 0]``."""
-        identity = torch.eye(3, 4, dtype=self.offsets.dtype, device=self.offsets.device)
+        identity = torch.eye(
+            3, 4, dtype=self.offsets.dtype, device=self.offsets.device
+        )
         return identity + self.offsets - self.offsets.mean(dim=0)
 
     def of_cameras(self, camera_index: Tensor) -> Tensor:
@@ -46,7 +49,9 @@ class ColourCorrection(nn.Module):
         identity = torch.eye(3, 4, dtype=affine.dtype, device=affine.device)
         return torch.cat([affine, identity[None]])[self.rows[camera_index]]
 
-    def forward(self, image: Tensor, alpha: Tensor, camera_index: Tensor) -> Tensor:
+    def forward(
+        self, image: Tensor, alpha: Tensor, camera_index: Tensor
+    ) -> Tensor:
         """The image as these cameras record it, ``A c + b alpha``, in full precision.
 
         Args:

@@ -34,7 +34,8 @@ def has_geometry(raw: Tensor, means: Tensor, *fixed: Tensor) -> bool:
         and raw.dtype in build.DTYPES
         and means.dtype == raw.dtype
         and not any(
-            x.requires_grad or x.dtype not in (raw.dtype, torch.bool) for x in fixed
+            x.requires_grad or x.dtype not in (raw.dtype, torch.bool)
+            for x in fixed
         )
         and native.available()
     )
@@ -71,7 +72,11 @@ class _Geometry(torch.autograd.Function):
 
         # The job points to the inputs and to empty outputs, which the compiled code fills.
         B, N, _ = raw.shape
-        outputs = raw.new_empty(B, N, 3), raw.new_empty(B, N, 3, 3), raw.new_empty(B, N)
+        outputs = (
+            raw.new_empty(B, N, 3),
+            raw.new_empty(B, N, 3, 3),
+            raw.new_empty(B, N),
+        )
         job, _held = _job(raw, fixed, numbers)
         build.point(job, [f"out_{name}" for name in OUTPUTS], outputs)
         build.function("compose", raw.dtype)(ctypes.byref(job))
@@ -93,7 +98,9 @@ class _Geometry(torch.autograd.Function):
         incoming = [None if g is None else g.contiguous() for g in grads]
         d_raw = raw.new_empty(*raw.shape[:2], RESIDUALS)
         build.point(
-            job, [*(f"g_{name}" for name in OUTPUTS), "d_raw"], [*incoming, d_raw]
+            job,
+            [*(f"g_{name}" for name in OUTPUTS), "d_raw"],
+            [*incoming, d_raw],
         )
         build.function("compose_backward", raw.dtype)(ctypes.byref(job))
         # an output's mean is the given one and an offset
@@ -111,6 +118,8 @@ def _job(
 
     # The tensors must live as long as the job, which holds addresses only.
     held = [rows, *(x.detach().contiguous() for x in fixed)]
-    job = _Job(rows.shape[0] * rows.shape[1], build.threads(), rows.stride(1), *numbers)
+    job = _Job(
+        rows.shape[0] * rows.shape[1], build.threads(), rows.stride(1), *numbers
+    )
     build.point(job, INPUTS, held)
     return job, held

@@ -26,7 +26,13 @@ from gsgan.utils.tensors import (
 
 NEAREST_ANCHORS = 3  # anchors between which the MLP's output is interpolated
 POSE_AXES = 20  # principal directions of the training poses' codes
-POSE_BUFFERS = ("pose_mean", "pose_axes", "pose_spread", "place_mean", "place_spread")
+POSE_BUFFERS = (
+    "pose_mean",
+    "pose_axes",
+    "pose_spread",
+    "place_mean",
+    "place_spread",
+)
 # inside the root that normalises a quaternion: q0 + δq ≈ 0 stays finite
 QUAT_FLOOR = 1e-12
 
@@ -151,9 +157,13 @@ class ResidualGaussians(nn.Module):
         opacities = opacities[..., 0]
 
         # The factor on the means sets how fast they move.
-        return Residuals(self.mean_step * means, quats, scales, opacities, sh, features)
+        return Residuals(
+            self.mean_step * means, quats, scales, opacities, sh, features
+        )
 
-    def compose(self, points: Points, residuals: Residuals, eye: Tensor) -> Gaussians:
+    def compose(
+        self, points: Points, residuals: Residuals, eye: Tensor
+    ) -> Gaussians:
         """Ĝ = G + ΔG: bounds and activations, then colour as seen from ``eye`` ``[B, 3]``.
 
         Returns:
@@ -161,7 +171,9 @@ class ResidualGaussians(nn.Module):
         """
         # Ĝ's geometry, in world axes.
         frames = points.frames
-        means, covariances, opacities = self._geometry(points, frames, residuals)
+        means, covariances, opacities = self._geometry(
+            points, frames, residuals
+        )
 
         # The colour comes from the harmonics and the direction from the eye.
         colour = colour_from(eye, means, frames, residuals.sh)
@@ -187,7 +199,13 @@ class ResidualGaussians(nn.Module):
         # The compiled version has the same formulas; it is used if it supports the tensors.
         parts = (residuals.means, residuals.quats, residuals.scales)
         raw = torch.cat([*parts, residuals.opacities.unsqueeze(-1)], dim=-1)
-        fixed = (points.means, frames, points.shapes, points.scales, points.valid)
+        fixed = (
+            points.means,
+            frames,
+            points.shapes,
+            points.scales,
+            points.valid,
+        )
         if compiled.has_geometry(raw, *fixed):
             numbers = (
                 (bound or 0.0) * height,
@@ -201,7 +219,9 @@ class ResidualGaussians(nn.Module):
 
         # Means move in the frame of their body part, within the bound.
         offset = (
-            residuals.means if bound is None else bound * torch.tanh(residuals.means)
+            residuals.means
+            if bound is None
+            else bound * torch.tanh(residuals.means)
         )
         means = points.means + matvec(frames, offset * height)
 
@@ -344,7 +364,13 @@ class Deformation(ResidualGaussians):
         self.pose_frame = pose_frame
         self.pose_limit = pose_limit
         size = 3 * joints
-        shapes = (size,), (size, POSE_AXES), (POSE_AXES,), (points, 3), (points, 3)
+        shapes = (
+            (size,),
+            (size, POSE_AXES),
+            (POSE_AXES,),
+            (points, 3),
+            (points, 3),
+        )
         for name, shape in zip(POSE_BUFFERS, shapes, strict=True):
             value = math.inf if name.endswith("spread") else 0.0
             self.register_buffer(name, torch.full(shape, value))
@@ -365,12 +391,16 @@ class Deformation(ResidualGaussians):
         self.from_normal = nn.Linear(3, width, bias=False) if normals else None
 
         # The last layer starts at zero: so do all residuals.
-        self.trunk = nn.ModuleList(nn.Linear(width, width) for _ in range(layers - 1))
+        self.trunk = nn.ModuleList(
+            nn.Linear(width, width) for _ in range(layers - 1)
+        )
         self.head = nn.Linear(width, sum(self.parts))
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias)
         self.table = (
-            nn.Parameter(torch.zeros(every, sum(self.parts))) if free_table else None
+            nn.Parameter(torch.zeros(every, sum(self.parts)))
+            if free_table
+            else None
         )
 
     def _place_anchors(self, rest_points: Tensor, count: int) -> Tensor:
@@ -400,7 +430,9 @@ class Deformation(ResidualGaussians):
         places of their points ``[F, N, 3]``; root and pelvis as for `residuals`."""
         # The principal directions of the codes, and the standard deviation along each.
         self.pose_mean.copy_(codes.mean(0))
-        _, spread, axes = torch.linalg.svd(codes - self.pose_mean, full_matrices=False)
+        _, spread, axes = torch.linalg.svd(
+            codes - self.pose_mean, full_matrices=False
+        )
 
         # Few poses have fewer directions than the buffer; the rest keep a spread of 0.
         known = min(POSE_AXES, len(spread))
@@ -431,7 +463,9 @@ class Deformation(ResidualGaussians):
         along = ((code - self.pose_mean) @ axes).clamp(-far, far)
 
         # Without stored poses the spread is infinite, and the code stays as it is.
-        return torch.where(far.isfinite().all(), self.pose_mean + along @ axes.mT, code)
+        return torch.where(
+            far.isfinite().all(), self.pose_mean + along @ axes.mT, code
+        )
 
     def _load_from_state_dict(
         self, state: dict[str, Tensor], prefix: str, *rest: Any
@@ -477,8 +511,14 @@ class Deformation(ResidualGaussians):
         B, A, _ = raw.shape
 
         # Anchors and shares of the points that are wanted.
-        near = self.near.expand(B, -1, -1) if chosen is None else self.near[chosen]
-        share = self.share.expand(B, -1, -1) if chosen is None else self.share[chosen]
+        near = (
+            self.near.expand(B, -1, -1) if chosen is None else self.near[chosen]
+        )
+        share = (
+            self.share.expand(B, -1, -1)
+            if chosen is None
+            else self.share[chosen]
+        )
 
         # One table holds the whole batch: the anchors of item b begin at row A · b.
         first = A * torch.arange(B, device=raw.device)
@@ -493,7 +533,12 @@ class Deformation(ResidualGaussians):
         return spread.unflatten(0, (B, -1))
 
     def _network(
-        self, means: Tensor, normals: Tensor, pose: Tensor, root: Tensor, pelvis: Tensor
+        self,
+        means: Tensor,
+        normals: Tensor,
+        pose: Tensor,
+        root: Tensor,
+        pelvis: Tensor,
     ) -> Tensor:
         """``[B, A, C]`` the MLP's output at the anchors."""
         # A rendered pose is limited to what the training poses show; training is not.
@@ -507,7 +552,9 @@ class Deformation(ResidualGaussians):
         # The places of the anchors are limited likewise.
         if limit is not None:
             far = limit * self.place_spread
-            position = self.place_mean + (position - self.place_mean).clamp(-far, far)
+            position = self.place_mean + (position - self.place_mean).clamp(
+                -far, far
+            )
 
         # Normals turn with the axes that places are given in.
         if self.pose_frame == "pelvis":
@@ -551,7 +598,13 @@ class Deformation(ResidualGaussians):
             return found
 
         return derived(
-            self, "point part", make, layer.weight, layer.bias, own, self.rest_code
+            self,
+            "point part",
+            make,
+            layer.weight,
+            layer.bias,
+            own,
+            self.rest_code,
         )
 
     def _trained(self, code: Tensor, normals: Tensor, pose: Tensor) -> Tensor:
@@ -589,7 +642,9 @@ def _unit_quat(residual: Tensor) -> Tensor:
     return quat * torch.rsqrt(squared_norm(quat) + QUAT_FLOOR)
 
 
-def colour_from(eye: Tensor, means: Tensor, frames: Tensor, sh: Tensor) -> Tensor:
+def colour_from(
+    eye: Tensor, means: Tensor, frames: Tensor, sh: Tensor
+) -> Tensor:
     """``[B, N, 3]`` colours of harmonics ``sh [B, N, (d+1)², 3]`` as seen from ``eye [B, 3]``.
 
     Directions are turned back by ``frames [B, N, 3, 3]``, as in 3DGS-Avatar: an arm that turns
@@ -622,7 +677,9 @@ def positional_encoding(x: Tensor, octaves: int) -> Tensor:
         return x
 
     # Each coordinate gets its own angles, in the order of the coordinates.
-    frequencies = math.pi * 2.0 ** torch.arange(octaves, device=x.device, dtype=x.dtype)
+    frequencies = math.pi * 2.0 ** torch.arange(
+        octaves, device=x.device, dtype=x.dtype
+    )
     angles = (x.unsqueeze(-1) * frequencies).flatten(-2)
     return torch.cat([x, angles.sin(), angles.cos()], dim=-1)
 

@@ -20,7 +20,9 @@ class PatchDiscriminator(nn.Module):
     Source: pix2pixHD (Wang et al., 2018).
     """
 
-    def __init__(self, base: int = 64, layers: int = 4, norm: str = "instance") -> None:
+    def __init__(
+        self, base: int = 64, layers: int = 4, norm: str = "instance"
+    ) -> None:
         super().__init__()
         whole("training.discriminator.layers", layers, 2)
         one_of("training.discriminator.norm", norm, ("instance", "none"))
@@ -35,12 +37,18 @@ class PatchDiscriminator(nn.Module):
         for i, channels in enumerate(widths):
             stride = 2 if i < layers - 1 else 1
             conv = nn.Conv2d(
-                previous, channels, 4, stride=stride, padding=2 if stride == 1 else 1
+                previous,
+                channels,
+                4,
+                stride=stride,
+                padding=2 if stride == 1 else 1,
             )
             between: list[nn.Module] = (
                 [nn.InstanceNorm2d(channels)] if normal and i > 0 else []
             )
-            blocks.append(nn.Sequential(conv, *between, nn.LeakyReLU(LEAKY_SLOPE)))
+            blocks.append(
+                nn.Sequential(conv, *between, nn.LeakyReLU(LEAKY_SLOPE))
+            )
             previous = channels
 
         # The last layer gives one logit per patch.

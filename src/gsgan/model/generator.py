@@ -10,7 +10,9 @@ from torch.nn import functional
 from gsgan.utils.checks import one_of
 from gsgan.utils.tensors import derived, full_precision
 
-NORM_FLOOR = 1e-6  # inside the root: an all-zero pixel (empty background) stays zero
+NORM_FLOOR = (
+    1e-6  # inside the root: an all-zero pixel (empty background) stays zero
+)
 SLOPE = 0.2
 MIDDLE_BLOCKS = 2  # convolutions at the coarsest level
 
@@ -22,7 +24,9 @@ class Encoder(nn.Module):
     stride, followed by a 3×3.
     """
 
-    def __init__(self, inputs: int, channels: Sequence[int], patch: int = 1) -> None:
+    def __init__(
+        self, inputs: int, channels: Sequence[int], patch: int = 1
+    ) -> None:
         super().__init__()
 
         # The stem reads single pixels, or patches of them.
@@ -34,9 +38,12 @@ class Encoder(nn.Module):
 
         # Each level halves the resolution, then refines what it has.
         self.down = nn.ModuleList(
-            nn.Conv2d(a, b, 3, stride=2, padding=1) for a, b in pairwise(channels)
+            nn.Conv2d(a, b, 3, stride=2, padding=1)
+            for a, b in pairwise(channels)
         )
-        self.refine = nn.ModuleList(nn.Conv2d(c, c, 3, padding=1) for c in channels[1:])
+        self.refine = nn.ModuleList(
+            nn.Conv2d(c, c, 3, padding=1) for c in channels[1:]
+        )
 
     def forward(self, x: Tensor) -> list[Tensor]:
         """``[B, inputs, H, W]`` to levels ``[B, channels[l], h / 2^l, w / 2^l]``, h = H / patch."""
@@ -62,7 +69,9 @@ class StyleModulation(nn.Module):
     much of the image is background. Both maps start at zero: the style starts as the identity.
     """
 
-    def __init__(self, channels: int, style_channels: int, pose_channels: int) -> None:
+    def __init__(
+        self, channels: int, style_channels: int, pose_channels: int
+    ) -> None:
         super().__init__()
         self.from_map = nn.Conv2d(style_channels, 2 * channels, 1)
         self.from_pose = nn.Linear(pose_channels, 2 * channels)
@@ -81,15 +90,21 @@ class StyleModulation(nn.Module):
         # The style map adds its own at each pixel; a 1×1 convolution is a matrix product.
         weight = self.from_map.weight.flatten(1).mT.expand(len(h), -1, -1)
         styles = style.permute(0, 2, 3, 1).flatten(1, 2)
-        modulation = torch.baddbmm(modulation + self.from_map.bias, styles, weight)
+        modulation = torch.baddbmm(
+            modulation + self.from_map.bias, styles, weight
+        )
         modulation = modulation.unflatten(1, rows.shape[1:3])
 
         # Scale and shift of every pixel's channels.
         gamma, beta = modulation.chunk(2, dim=-1)
         # In float32 at least: half precision loses squares above 256 and below 2e-4.
         wide = rows.to(torch.promote_types(h.dtype, torch.float32))
-        unit = functional.rms_norm(wide, wide.shape[-1:], eps=NORM_FLOOR).to(h.dtype)
-        return _activate(torch.addcmul(beta + unit, unit, gamma)).permute(0, 3, 1, 2)
+        unit = functional.rms_norm(wide, wide.shape[-1:], eps=NORM_FLOOR).to(
+            h.dtype
+        )
+        return _activate(torch.addcmul(beta + unit, unit, gamma)).permute(
+            0, 3, 1, 2
+        )
 
 
 class DecoderLevel(nn.Module):
@@ -102,20 +117,25 @@ class DecoderLevel(nn.Module):
         # at low resolution, where it is cheap
         self.reduce = nn.Conv2d(inputs, channels, 1)
         self.convs = nn.ModuleList(
-            nn.Conv2d(c, channels, 3, padding=1) for c in (2 * channels, channels)
+            nn.Conv2d(c, channels, 3, padding=1)
+            for c in (2 * channels, channels)
         )
         self.styles = nn.ModuleList(
             StyleModulation(channels, style_channels, pose) for _ in range(2)
         )
 
-    def forward(self, h: Tensor, skip: Tensor, style: Tensor, g: Tensor) -> Tensor:
+    def forward(
+        self, h: Tensor, skip: Tensor, style: Tensor, g: Tensor
+    ) -> Tensor:
         # The first convolution also joins the skip.
         first, second = self.convs
         h = self._join(self.reduce(h), skip, first.weight, first.bias)  # type: ignore[arg-type]
         h = self.styles[0](h, style, g)
         return self.styles[1](second(h), style, g)  # type: ignore[no-any-return]
 
-    def _join(self, h: Tensor, skip: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    def _join(
+        self, h: Tensor, skip: Tensor, weight: Tensor, bias: Tensor
+    ) -> Tensor:
         """A 3×3 convolution of ``h``, upsampled to the nearest, and ``skip`` as further channels.
 
         Two of three pixels under a kernel on an upsampled image are equal, so a transposed
@@ -123,8 +143,12 @@ class DecoderLevel(nn.Module):
         """
         # The kernel has a part for the upsampled map, and one for the skip.
         C = h.shape[1]
-        kernel = derived(self, "upper", lambda: upsampled_kernel(weight[:, :C]), weight)
-        lower = derived(self, "lower", lambda: channels_last(weight[:, C:]), weight)
+        kernel = derived(
+            self, "upper", lambda: upsampled_kernel(weight[:, :C]), weight
+        )
+        lower = derived(
+            self, "lower", lambda: channels_last(weight[:, C:]), weight
+        )
         upsampled = functional.conv_transpose2d(h, kernel, stride=2, padding=1)
         return upsampled + functional.conv2d(skip, lower, bias, padding=1)
 
@@ -169,7 +193,11 @@ class Generator(nn.Module):
         feature_bound: float = 1e3,
     ) -> None:
         super().__init__()
-        one_of("model.generator.patch", patch, [2**i for i in range(len(multipliers))])
+        one_of(
+            "model.generator.patch",
+            patch,
+            [2**i for i in range(len(multipliers))],
+        )
 
         # The whole network halves the resolution this often; images are padded to a multiple of
         # it.
@@ -239,7 +267,9 @@ class Generator(nn.Module):
         given = None if fine is None else tuple(fine.shape[-2:])
         expected = None if k == 1 else (k * height, k * width)
         if given != expected:
-            raise ValueError(f"Generator: fine must be {expected} pixels, got {given}")
+            raise ValueError(
+                f"Generator: fine must be {expected} pixels, got {given}"
+            )
 
         # E_c and E_s give features at every level.
         features = self._padded(F)
@@ -257,7 +287,9 @@ class Generator(nn.Module):
             painted = self.paint(h.to(self.paint.weight.dtype))
 
         # Pixels of a patch are its channels; the padding is cut off.
-        painted = functional.pixel_shuffle(painted, self.patch)[..., :height, :width]
+        painted = functional.pixel_shuffle(painted, self.patch)[
+            ..., :height, :width
+        ]
 
         # The painted image is a correction of Step I's colour and alpha.
         if self.rgb_skip:
@@ -284,9 +316,14 @@ class Generator(nn.Module):
         stride = self.patch
         padding = int(self.patch == 1)
         weight = stem.weight
-        kernel = derived(self, "fine", lambda: fine_kernel(weight, C, k), weight)
+        kernel = derived(
+            self, "fine", lambda: fine_kernel(weight, C, k), weight
+        )
         rest = derived(
-            self, "rest", lambda: channels_last(weight[:, C : -C * k * k]), weight
+            self,
+            "rest",
+            lambda: channels_last(weight[:, C : -C * k * k]),
+            weight,
         )
 
         # The fine part has a stride and padding in fine pixels.
@@ -311,7 +348,11 @@ def fine_kernel(weight: Tensor, C: int, k: int) -> Tensor:
     """``[O, C, n k, n k]``: the part of a stem's ``weight`` that reads F, as one kernel on F's fine
     pixels: its first C channels read their averages, its last C k² each single one."""
     # Weights of single fine pixels, as a kernel over the fine grid.
-    fine = weight[:, -C * k * k :].unflatten(1, (C, k, k)).permute(0, 1, 4, 2, 5, 3)
+    fine = (
+        weight[:, -C * k * k :]
+        .unflatten(1, (C, k, k))
+        .permute(0, 1, 4, 2, 5, 3)
+    )
 
     # Weights of the averages, spread over the k² fine pixels of each.
     mean = weight[:, :C, :, None, :, None] / (k * k)

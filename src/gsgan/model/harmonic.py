@@ -30,7 +30,9 @@ RATES = {
     "sh": 10.0,
     "features": 10.0,
 }
-UNIT = math.sqrt(4 * math.pi)  # makes the first harmonic 1, and the mean square of each
+UNIT = math.sqrt(
+    4 * math.pi
+)  # makes the first harmonic 1, and the mean square of each
 # joints, visibility, body: `gsgan.run.drive`
 Pose = tuple[Tensor, Tensor, BodyPose | None]
 
@@ -109,7 +111,9 @@ class Harmonic(ResidualGaussians):
 
         # A residual that does not follow the normals has slopes of zero.
         for name, constant in self.constants.items():
-            none = constant.new_zeros(len(constant), HARMONICS - 1, constant.shape[-1])
+            none = constant.new_zeros(
+                len(constant), HARMONICS - 1, constant.shape[-1]
+            )
             slopes = self.slopes.get(name, none)
             found.append(torch.cat([constant.unsqueeze(1), slopes], dim=1))
         return torch.cat(found, dim=-1)
@@ -128,11 +132,15 @@ class Harmonic(ResidualGaussians):
         given = list(self.slopes.values())
         parts = {}
         if given:
-            slopes = derived(self, "slopes", lambda: torch.cat(given, dim=-1), *given)
+            slopes = derived(
+                self, "slopes", lambda: torch.cat(given, dim=-1), *given
+            )
             # a product with N small matrices takes longer
             moved = (harmonics(points.normals)[..., 1:, None] * slopes).sum(-2)
             sizes = [x.shape[-1] for x in given]
-            parts = dict(zip(self.slopes, moved.split(sizes, dim=-1), strict=True))
+            parts = dict(
+                zip(self.slopes, moved.split(sizes, dim=-1), strict=True)
+            )
 
         # Constants and moving parts are added; harmonics of colour that are not active are left
         # out, and so are features that nothing reads.
@@ -144,12 +152,16 @@ class Harmonic(ResidualGaussians):
         for name, constant in self.constants.items():
             used = active.get(name, constant.shape[-1])
             values = constant.expand(len(points.means), -1, -1)[..., :used]
-            found.append(values + parts[name][..., :used] if name in parts else values)
+            found.append(
+                values + parts[name][..., :used] if name in parts else values
+            )
 
         # All residuals in the order of `Residuals`, of the chosen points.
         raw = torch.cat(found, dim=-1)
         if chosen is not None:
-            raw = raw.gather(1, chosen.unsqueeze(-1).expand(-1, -1, raw.shape[-1]))
+            raw = raw.gather(
+                1, chosen.unsqueeze(-1).expand(-1, -1, raw.shape[-1])
+            )
         return self._parted(raw)
 
 
@@ -199,7 +211,9 @@ def distilled(
     )
     settings: dict[str, Any] = {name: getattr(psi, name) for name in same}
     settings["scale_min"], settings["scale_max"] = psi.scale_range
-    fitted = Harmonic(avatar.rest_points, psi.body_height, follow=follow, **settings)
+    fitted = Harmonic(
+        avatar.rest_points, psi.body_height, follow=follow, **settings
+    )
 
     # The fit over all poses. `Harmonic` multiplies its means by mean_step, so they are divided.
     maps, mean = ridge_regression(_samples(found, poses), ridge)
@@ -209,14 +223,18 @@ def distilled(
     # Each residual gets its columns: a linear map, or the mean over the poses.
     parts = (x.split(psi.parts, dim=-1) for x in (maps, mean))
     for name, linear, constant in zip(RATES, *parts, strict=True):
-        fitted.constants[name].copy_(linear[:, 0] if name in follow else constant)
+        fitted.constants[name].copy_(
+            linear[:, 0] if name in follow else constant
+        )
         if name in follow:
             fitted.slopes[name].copy_(linear[:, 1:])
     found.deformation = fitted
     return found.freeze()
 
 
-def _samples(avatar: Avatar, poses: Iterable[Pose]) -> Iterator[tuple[Tensor, Tensor]]:
+def _samples(
+    avatar: Avatar, poses: Iterable[Pose]
+) -> Iterator[tuple[Tensor, Tensor]]:
     """Harmonics ``[N, 9]`` and residuals ``[N, C]`` of each pose."""
     for p, visibility, given in poses:
         # Ψ's residuals in this pose, without noise.

@@ -43,7 +43,9 @@ class GraphLayer(nn.Module):
         # The adjacency starts as the joint itself with a little of its neighbours.
         self.register_buffer("mask", mask, persistent=False)
         identity = torch.eye(joints)
-        self.adjacency = nn.Parameter(identity + NEIGHBOUR_WEIGHT * (mask - identity))
+        self.adjacency = nn.Parameter(
+            identity + NEIGHBOUR_WEIGHT * (mask - identity)
+        )
 
         # Every joint has weights of its own.
         self.weight = nn.Parameter(torch.empty(joints, inputs, outputs))
@@ -106,7 +108,9 @@ class PoseGraph(nn.Module):
         )
         self.channels = len(template.edges)
         inputs = 2 * joint_channels
-        start = torch.randn(self.channels, inputs) * (READOUT_START / math.sqrt(inputs))
+        start = torch.randn(self.channels, inputs) * (
+            READOUT_START / math.sqrt(inputs)
+        )
         self.readout = nn.Parameter(start)
         self.readout_bias = nn.Parameter(torch.zeros(self.channels))
 
@@ -119,7 +123,9 @@ class PoseGraph(nn.Module):
         h = self.layers[-1](h)
 
         # Each number of g is a weighted sum over the two joints of its edge.
-        pairs = torch.cat([h[:, self.edges[:, 0]], h[:, self.edges[:, 1]]], dim=-1)
+        pairs = torch.cat(
+            [h[:, self.edges[:, 0]], h[:, self.edges[:, 1]]], dim=-1
+        )
         return (pairs * self.readout).sum(-1) + self.readout_bias
 
 

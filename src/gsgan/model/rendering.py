@@ -58,7 +58,9 @@ class Rendering:
             "corrected",
         )
         held = {
-            name: value for name in names if (value := getattr(self, name)) is not None
+            name: value
+            for name in names
+            if (value := getattr(self, name)) is not None
         }
         whole = {name: window.paste(value) for name, value in held.items()}
 

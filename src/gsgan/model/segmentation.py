@@ -66,14 +66,22 @@ class Segmentation(SkinnedGaussians):
 
         # The classes of S, and how the data's labels map to them.
         self.accuracy = accuracy
-        self.map = class_map(body.label_names, body.vertex_labels, mode, hands_face)
+        self.map = class_map(
+            body.label_names, body.vertex_labels, mode, hands_face
+        )
         # Voted labels are saved, so that the vote is not repeated; the body's own are not.
         self.voted = body.label_source == "vote"
-        self.register_buffer("vertex_labels", body.vertex_labels, persistent=self.voted)
-        self.register_buffer("truth_table", self.map.as_table(), persistent=False)
+        self.register_buffer(
+            "vertex_labels", body.vertex_labels, persistent=self.voted
+        )
+        self.register_buffer(
+            "truth_table", self.map.as_table(), persistent=False
+        )
 
         # The class of each vertex is fixed.
-        self.register_buffer("one_hot", self._classes_of_points(), persistent=False)
+        self.register_buffer(
+            "one_hot", self._classes_of_points(), persistent=False
+        )
         self.register_load_state_dict_post_hook(_classes_as_loaded)
         self.all_classed = bool((self.one_hot.sum(dim=1) > 0).all())
 
@@ -107,14 +115,20 @@ class Segmentation(SkinnedGaussians):
         """
         return self.truth_table[labels]
 
-    def to_score(self, segmentation: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
+    def to_score(
+        self, segmentation: Tensor, labels: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """S with empty channels for the classes that no vertex has, and its ground truth."""
-        padded = functional.pad(segmentation, (0, 0, 0, 0, 0, len(self.map.absent)))
+        padded = functional.pad(
+            segmentation, (0, 0, 0, 0, 0, len(self.map.absent))
+        )
         return padded, self.truth(labels)
 
     def _classes_of_points(self) -> Tensor:
         labels = self.vertex_labels[self.points.chosen]
-        return functional.one_hot(self.truth_table[labels], self.classes)[:, 1:].float()
+        return functional.one_hot(self.truth_table[labels], self.classes)[
+            :, 1:
+        ].float()
 
     def gaussians(self, pose: BodyPose) -> Gaussians:
         """The body's Gaussians in pose: covariances A Σ Aᵀ, features = one-hot class."""
@@ -191,7 +205,9 @@ def segmentation_loss(segmentation: Tensor, labels: Tensor) -> Tensor:
     log = (segmentation + PROBABILITY_FLOOR).log()
 
     # The mean is over pixels with a label, and 0 where there are none.
-    total = functional.nll_loss(log, labels, ignore_index=IGNORE, reduction="sum")
+    total = functional.nll_loss(
+        log, labels, ignore_index=IGNORE, reduction="sum"
+    )
     return total / (labels != IGNORE).sum().clamp_min(1)
 
 
@@ -267,7 +283,9 @@ def class_map(
     kept = [0, *sorted(present)]
 
     # Labels without a vertex are numbered after the channels.
-    absent = [label for label in range(1, len(label_names)) if label not in present]
+    absent = [
+        label for label in range(1, len(label_names)) if label not in present
+    ]
     number = {label: i for i, label in enumerate([*kept, *absent])}
     return ClassMap(
         names=tuple(label_names[label] for label in kept),
@@ -288,5 +306,7 @@ def _hands(label_names: Sequence[str], face: bool) -> ClassMap:
         )
 
     # The requested groups are numbered from 1; all else is background.
-    table = tuple(1 + requested.index(g) if g in requested else 0 for g in groups)
+    table = tuple(
+        1 + requested.index(g) if g in requested else 0 for g in groups
+    )
     return ClassMap(names=("background", *requested), absent=(), table=table)

@@ -83,8 +83,12 @@ class SurfaceGaussians(SkinnedGaussians):
         means = skin(self.points.means + offsets, A, t)
 
         # Bounds of the scales in metres, and the harmonics that are active.
-        low, high = (math.log(bound * self.body_height) for bound in self.scale_range)
-        sh = self.sh[:, : (self.active_degree + 1) ** 2].expand(len(A), -1, -1, -1)
+        low, high = (
+            math.log(bound * self.body_height) for bound in self.scale_range
+        )
+        sh = self.sh[:, : (self.active_degree + 1) ** 2].expand(
+            len(A), -1, -1, -1
+        )
         return self.deformed(
             A,
             means,

@@ -20,7 +20,9 @@ from gsgan.utils.files import read_text
 
 INCH = 0.0254
 ROOT = "root"
-CMU_FPS = 120.0  # frames per second of CMU's clips; the format does not store it
+CMU_FPS = (
+    120.0  # frames per second of CMU's clips; the format does not store it
+)
 
 
 def asf_of(amc: Path) -> Path:
@@ -31,7 +33,9 @@ def asf_of(amc: Path) -> Path:
     """
     subject, _, _ = amc.stem.partition("_")
     found = sorted(amc.parent.glob("*.asf"))
-    named = [path for path in found if path.stem in (amc.stem, subject)] or found
+    named = [
+        path for path in found if path.stem in (amc.stem, subject)
+    ] or found
     if len(named) != 1:
         raise DataError(
             f"{amc} needs its skeleton, an .asf file: found {len(named)} beside it; give "
@@ -84,7 +88,9 @@ class _Bone:
     """A bone of the skeleton: its end from its start, its axes and its angles' names."""
 
     def __init__(self, words: dict[str, list[str]], radians: float) -> None:
-        direction = np.array(words.get("direction", ["0", "0", "0"]), dtype=float)
+        direction = np.array(
+            words.get("direction", ["0", "0", "0"]), dtype=float
+        )
         length, *_ = words.get("length", ["0"])
         self.end = direction * float(length)
 
@@ -172,7 +178,9 @@ def _refuse_cut(name: str, lines: list[list[str]]) -> None:
     """Raises a ValueError if a section is missing, or ends before a part of it does."""
     keys = [key for key, *_ in lines]
     if not keys:
-        raise ValueError(f"its section :{name} is missing; is the file cut off?")
+        raise ValueError(
+            f"its section :{name} is missing; is the file cut off?"
+        )
     if keys.count("begin") != keys.count("end"):
         raise ValueError(f"its section :{name} is cut off: a begin has no end")
 
@@ -202,7 +210,9 @@ def _read_frames(
             frames.append({})
         elif frames:
             if key not in bones:
-                raise ValueError(f"it moves a bone {key}, which the skeleton lacks")
+                raise ValueError(
+                    f"it moves a bone {key}, which the skeleton lacks"
+                )
             frames[-1][key] = list(map(float, numbers))
     if not frames:
         raise ValueError("it has no frames")
@@ -218,7 +228,9 @@ def _read_frames(
                     f"frame {number} gives {given} of {expected} numbers for {name}"
                 )
 
-    values = {name: np.array([frame[name] for frame in frames]) for name in moving}
+    values = {
+        name: np.array([frame[name] for frame in frames]) for name in moving
+    }
     if not all(np.isfinite(numbers).all() for numbers in values.values()):
         raise ValueError("a number is not finite")
     return values

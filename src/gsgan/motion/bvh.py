@@ -11,7 +11,9 @@ from gsgan.motion.standard import RigMotion
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import read_text
 
-SLOWEST = 1.0  # seconds between two frames from which the number is read as a rate
+SLOWEST = (
+    1.0  # seconds between two frames from which the number is read as a rate
+)
 # Share of the longest bone: joints that leave their places by less are at rest.
 REST_TOLERANCE = 1e-3
 
@@ -71,7 +73,9 @@ def _read_hierarchy(words: list[str]) -> list[_Joint]:
             joint = _Joint(name=next(rest), parent=above[-1] if above else -1)
             if word == "End":
                 joint.name += " end"
-            for part in iter(rest.__next__, "{"):  # names may have several words
+            for part in iter(
+                rest.__next__, "{"
+            ):  # names may have several words
                 joint.name += " " + part
             above.append(len(joints))
             joints.append(joint)
@@ -94,7 +98,9 @@ def _read_values(text: str, columns: int) -> tuple[Array, float]:
     """
     head = re.match(r"\s*Frames\s*:\s*(\d+)\s+Frame\s+Time\s*:\s*(\S+)", text)
     if head is None:
-        raise ValueError("'Frames:' and 'Frame Time:' are expected after MOTION")
+        raise ValueError(
+            "'Frames:' and 'Frame Time:' are expected after MOTION"
+        )
     frames = int(head[1])
     frame_time = float(head[2])
     numbers = text[head.end() :].split()
@@ -108,7 +114,9 @@ def _read_values(text: str, columns: int) -> tuple[Array, float]:
     return np.array(numbers, dtype=float).reshape(frames, columns), frame_time
 
 
-def _rig_motion(joints: list[_Joint], values: Array, frame_time: float) -> RigMotion:
+def _rig_motion(
+    joints: list[_Joint], values: Array, frame_time: float
+) -> RigMotion:
     """World rotations and the root's path from the channels' values ``[F, columns]``."""
     offsets = np.array([joint.offset for joint in joints])
     if not (np.isfinite(values).all() and np.isfinite(offsets).all()):

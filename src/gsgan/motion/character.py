@@ -47,7 +47,9 @@ class Character:
     shapes: dict[str, Array]  # face shape name → [V, 3] offsets at weight 1
     # landmarks: 33 MediaPipe, then 42 of the hands, then the face's
     anchor_names: tuple[str, ...]
-    anchor_joint: Ints  # [L] the bone whose joint is the landmark, -1 for vertices
+    anchor_joint: (
+        Ints  # [L] the bone whose joint is the landmark, -1 for vertices
+    )
     anchor_vertex: Ints  # [L] the vertex that is the landmark, -1 for joints
 
     def skinned(
@@ -63,11 +65,15 @@ class Character:
         rest = self.vertices if offsets is None else self.vertices + offsets
         vertices = np.zeros_like(rest)
         normals = np.zeros_like(rest)
-        for index, weight in zip(self.bone_index.T, self.bone_weight.T, strict=True):
+        for index, weight in zip(
+            self.bone_index.T, self.bone_weight.T, strict=True
+        ):
             R = rotations[index]
             turned = np.einsum("vij,vj->vi", R, rest - self.joints[index])
             vertices += weight[:, None] * (turned + joints[index])
-            normals += weight[:, None] * np.einsum("vij,vj->vi", R, self.normals)
+            normals += weight[:, None] * np.einsum(
+                "vij,vj->vi", R, self.normals
+            )
         return vertices, unit(normals)
 
     def dominant_bones(self) -> Ints:
@@ -95,7 +101,11 @@ class Character:
 class Animation:
     """A character's poses at F moments."""
 
-    rotations: Array  # [F, J, 3, 3] world rotations of the bones since the rest pose
+    rotations: (
+        Array  # [F, J, 3, 3] world rotations of the bones since the rest pose
+    )
     joints: Array  # [F, J, 3] posed joint positions, metres
     shapes: dict[str, Array]  # face shape name → [F] weights
-    passages: tuple[str, ...]  # [F] name of the part of the motion, such as "walk"
+    passages: tuple[
+        str, ...
+    ]  # [F] name of the part of the motion, such as "walk"

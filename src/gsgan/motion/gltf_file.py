@@ -55,7 +55,9 @@ class GltfFile:
         DataError: when it is no glTF 2 file, or requires an unsupported extension.
     """
 
-    def __init__(self, path: Path, unsupported: tuple[str, ...] = UNSUPPORTED) -> None:
+    def __init__(
+        self, path: Path, unsupported: tuple[str, ...] = UNSUPPORTED
+    ) -> None:
         data = path.read_bytes()
         self.path = path
         if data[:4] == b"glTF":
@@ -66,7 +68,9 @@ class GltfFile:
             raise DataError(f"{path}: not a glTF 2 file; export it as .glb")
         for name in self.doc.extensionsRequired or ():
             if name in unsupported:
-                raise DataError(f"{path}: {name} is not supported; export it without")
+                raise DataError(
+                    f"{path}: {name} is not supported; export it without"
+                )
 
         # Caches of the buffers and of their views.
         self._buffers: dict[int, bytes] = {}
@@ -100,7 +104,9 @@ class GltfFile:
         if a.bufferView is None:
             values = np.zeros((a.count, width), kind)
         else:
-            values = self._rows(a.bufferView, a.byteOffset, a.count, kind, width).copy()
+            values = self._rows(
+                a.bufferView, a.byteOffset, a.count, kind, width
+            ).copy()
 
         # A sparse accessor replaces some rows.
         if a.sparse is not None:
@@ -119,7 +125,9 @@ class GltfFile:
 
     def image(self, texture: int) -> Bytes:
         """``[h, w, 4]`` sRGB and coverage of a texture, at most 2048 pixels a side."""
-        image = Image.open(io.BytesIO(self.image_bytes(texture))).convert("RGBA")
+        image = Image.open(io.BytesIO(self.image_bytes(texture))).convert(
+            "RGBA"
+        )
         image.thumbnail((MAX_IMAGE_SIDE, MAX_IMAGE_SIDE))
         return np.asarray(image)
 
@@ -137,7 +145,12 @@ class GltfFile:
         return bytes(data)
 
     def _rows(
-        self, view: int, offset: int | None, count: int, kind: np.dtype[Any], width: int
+        self,
+        view: int,
+        offset: int | None,
+        count: int,
+        kind: np.dtype[Any],
+        width: int,
     ) -> np.ndarray[Any, Any]:
         """``[count, width]`` values of a buffer view, without a copy."""
         data, stride = self._view(view)
@@ -201,7 +214,11 @@ class GltfFile:
         # Attributes may be filtered.
         decoded = decoder.decode_vertex_buffer(count, stride, data)
         decoded = decoded.view(np.uint8).ravel()
-        filters = {"OCTAHEDRAL": "oct", "QUATERNION": "quat", "EXPONENTIAL": "exp"}
+        filters = {
+            "OCTAHEDRAL": "oct",
+            "QUATERNION": "quat",
+            "EXPONENTIAL": "exp",
+        }
         name = packed.get("filter", "NONE")
         if name != "NONE":
             unfilter = getattr(decoder, f"decode_filter_{filters[name]}")

@@ -8,7 +8,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from gsgan.motion.clip import JUST_BEYOND, usual_rate
-from gsgan.motion.gltf_file import FILE_ERRORS, GltfFile, local_matrix, posed_matrix
+from gsgan.motion.gltf_file import (
+    FILE_ERRORS,
+    GltfFile,
+    local_matrix,
+    posed_matrix,
+)
 from gsgan.motion.humanoid import humanoid_bones
 from gsgan.motion.rotations import Array
 from gsgan.motion.standard import RigMotion
@@ -34,7 +39,9 @@ class _Channel(NamedTuple):
     interpolation: str  # STEP, LINEAR or CUBICSPLINE
 
 
-def read_gltf_motion(path: Path, animation: str | None = None) -> tuple[RigMotion, str]:
+def read_gltf_motion(
+    path: Path, animation: str | None = None
+) -> tuple[RigMotion, str]:
     """Reads the animation of a skeleton.
 
     The joints are those of the skins or of VRM's humanoid; without both, the animated nodes. The
@@ -65,7 +72,9 @@ def read_gltf_motion(path: Path, animation: str | None = None) -> tuple[RigMotio
         rig = _rig_motion(glb, nodes, channels, times)
     except FILE_ERRORS as error:
         reason = str(error).split("\n")[0] or type(error).__name__
-        raise DataError(f"{path}: damaged ({reason}); export it again") from error
+        raise DataError(
+            f"{path}: damaged ({reason}); export it again"
+        ) from error
 
     # A part of the file is named only if there are others.
     count = len(glb.doc.animations)
@@ -150,7 +159,9 @@ def _channels(
         if interpolation == "CUBICSPLINE":
             values = values.reshape(len(times), 3, -1)
         if len(values) != len(times) or values.shape[-1] != PROPERTIES[path]:
-            raise ValueError(f"{len(times)} keys have values of shape {values.shape}")
+            raise ValueError(
+                f"{len(times)} keys have values of shape {values.shape}"
+            )
         if not (np.isfinite(times).all() and np.isfinite(values).all()):
             raise ValueError("a key is not a number")
         if (np.diff(times) <= 0).any():
@@ -222,7 +233,9 @@ def _rig_motion(
     for node in nodes:
         rest = local_matrix(glb.doc.nodes[node])
         locals_at_rest[node] = rest
-        locals_posed[node] = _posed(glb.doc.nodes[node], node, rest, channels, times)
+        locals_posed[node] = _posed(
+            glb.doc.nodes[node], node, rest, channels, times
+        )
     rest = _worlds(glb, nodes, locals_at_rest)
     posed = _worlds(glb, nodes, locals_posed)
 
@@ -249,7 +262,9 @@ def _rig_motion(
         offsets=offsets,
         rotations=rotations,
         root=posed[:, 0, :3, 3],
-        frame_time=float(times[1] - times[0]) if len(times) > 1 else 1 / KEY_RATES[0],
+        frame_time=float(times[1] - times[0])
+        if len(times) > 1
+        else 1 / KEY_RATES[0],
         local=local,
     )
 
@@ -275,14 +290,22 @@ def _posed(
     for path, own in values.items():
         if (node, path) in channels:
             channel = channels[node, path]
-            sampled[path] = _sampled(channel, times, rotation=path == "rotation")
+            sampled[path] = _sampled(
+                channel, times, rotation=path == "rotation"
+            )
         else:
             constant = np.array(own, np.float64)
-            sampled[path] = np.broadcast_to(constant, (len(times), len(constant)))
-    return posed_matrix(sampled["translation"], sampled["rotation"], sampled["scale"])
+            sampled[path] = np.broadcast_to(
+                constant, (len(times), len(constant))
+            )
+    return posed_matrix(
+        sampled["translation"], sampled["rotation"], sampled["scale"]
+    )
 
 
-def _worlds(glb: GltfFile, nodes: list[int], local: Mapping[int, Array]) -> Array:
+def _worlds(
+    glb: GltfFile, nodes: list[int], local: Mapping[int, Array]
+) -> Array:
     """``[..., J, 4, 4]`` from the axes of nodes, parents first, to the world's."""
     worlds: dict[int, Array] = {}
     for node in nodes:

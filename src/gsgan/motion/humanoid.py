@@ -13,7 +13,9 @@ from gsgan.motion.rotations import Array
 # Mixamo's names of bones; those of limbs, side and fingers follow "Left" or "Right".
 LIMB_BONES = ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot")
 SIDE_BONES = ("Shoulder", "ToeBase", "ToeEnd", "Eye")
-FINGER_BONE_NAMES = [f"Hand{finger}{k}" for finger in FINGERS for k in (1, 2, 3, 4)]
+FINGER_BONE_NAMES = [
+    f"Hand{finger}{k}" for finger in FINGERS for k in (1, 2, 3, 4)
+]
 
 
 def _on_both_sides(names: Iterable[str]) -> list[str]:
@@ -68,7 +70,9 @@ def vrm_bone(name: str, version: int) -> str | None:
         return side + VRM_LIMBS[limb]
 
     # Fingers have numbered segments in Mixamo's names.
-    match = re.fullmatch(r"(\w+?)(Metacarpal|Proximal|Intermediate|Distal)", rest)
+    match = re.fullmatch(
+        r"(\w+?)(Metacarpal|Proximal|Intermediate|Distal)", rest
+    )
     if match is None:
         return None
     finger = {"Little": "Pinky"}.get(match[1], match[1])
@@ -89,15 +93,21 @@ def humanoid_bones(
     names: Iterable[str | None], extensions: Mapping[str, Any]
 ) -> dict[int, str]:
     """Node number → Mixamo's bone name, of a document's node names and extensions."""
-    version_1 = extensions.get("VRMC_vrm") or extensions.get("VRMC_vrm_animation")
+    version_1 = extensions.get("VRMC_vrm") or extensions.get(
+        "VRMC_vrm_animation"
+    )
     if version_1:
         bones = version_1["humanoid"]["humanBones"]
-        pairs = [(bone["node"], vrm_bone(name, 1)) for name, bone in bones.items()]
+        pairs = [
+            (bone["node"], vrm_bone(name, 1)) for name, bone in bones.items()
+        ]
     elif "VRM" in extensions:
         bones = extensions["VRM"]["humanoid"]["humanBones"]
         pairs = [(bone["node"], vrm_bone(bone["bone"], 0)) for bone in bones]
     else:
-        pairs = [(node, mixamo_bone(name or "")) for node, name in enumerate(names)]
+        pairs = [
+            (node, mixamo_bone(name or "")) for node, name in enumerate(names)
+        ]
 
     # The first node of each bone counts.
     found: dict[str, int] = {}

@@ -37,7 +37,12 @@ class Orbit:
             above("orbit.distance", self.distance)
 
     def cameras(
-        self, p: Float, subject: Proportions, scene: SceneInfo, size: int, trained: int
+        self,
+        p: Float,
+        subject: Proportions,
+        scene: SceneInfo,
+        size: int,
+        trained: int,
     ) -> Camera:
         """One camera per skeleton ``[F, 33, 3]``, on a circle around the centre of the motion.
 

@@ -22,7 +22,11 @@ LEFT_RIGHT_SHOULDER = [11, 12]
 LEFT_RIGHT_HIP = [23, 24]
 TRUNK_LENGTH = 0.5  # metres from shoulder to hip
 TRC_HEADER = 5  # lines before the first frame; markers are named in the fourth
-TRC_AXES = [2, 0, 1]  # Pose2Sim writes (y, z, x) so that y is up: columns of x, y, z
+TRC_AXES = [
+    2,
+    0,
+    1,
+]  # Pose2Sim writes (y, z, x) so that y is up: columns of x, y, z
 
 
 class Points3D(NamedTuple):
@@ -37,7 +41,9 @@ def json_files(path: Path) -> dict[int, Path]:
     """A folder's JSON files by frame number, in increasing order."""
     files = frame_files(path.parent, path.name, (".json",))
     if not files:
-        raise DataError(f"{path} holds no JSON files; expected one per frame, numbered")
+        raise DataError(
+            f"{path} holds no JSON files; expected one per frame, numbered"
+        )
     return {number: path.parent / files[number] for number in sorted(files)}
 
 
@@ -71,7 +77,9 @@ def _read_trc(path: Path) -> tuple[Ints, Float]:
             if line.strip():
                 rows.append(_numbers(line, columns))
     except (OSError, ValueError, IndexError) as error:
-        raise DataError(f"{path} cannot be read as a .trc file ({error})") from None
+        raise DataError(
+            f"{path} cannot be read as a .trc file ({error})"
+        ) from None
 
     # The header's columns are shifted if it has a number there: Units is then left out.
     unit = header.get("Units")

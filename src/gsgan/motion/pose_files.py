@@ -77,7 +77,9 @@ def read_pose(path: Path, subject: Proportions) -> Clip:
     # The body. Hips that are guesses are placed below the shoulders.
     p, visibility = file.landmarks(name, MEDIAPIPE33.names)
     person = visibility[:, SHOULDERS].all(1)
-    guessed_hips = person.any() and np.median(visibility[person][:, HIPS]) < GUESSED
+    guessed_hips = (
+        person.any() and np.median(visibility[person][:, HIPS]) < GUESSED
+    )
     if guessed_hips:
         visibility[:, HIPS] = 0
     p = _to_metres(path, p, visibility, subject, pixels=name == IMAGE_PART)
@@ -92,7 +94,9 @@ def read_pose(path: Path, subject: Proportions) -> Clip:
     points = [p]
     confidences = [visibility]
     if any(part.confidence.any() for part in (*hands, face)):
-        rest = [subject.rest_with_hands[joints] for joints in HAND_JOINTS.values()]
+        rest = [
+            subject.rest_with_hands[joints] for joints in HAND_JOINTS.values()
+        ]
         points += _parts_to_metres(hands, rest, HAND_LENGTHS)
         confidences += [hand.confidence for hand in hands]
 
@@ -149,7 +153,9 @@ class _PoseFile:
                 f"{path} is not a valid .pose file ({type(error).__name__})"
             ) from error
         if self.data.ndim != 4 or 0 in self.data.shape[:2]:
-            raise DataError(f"{path} has no frames with a person; expected a motion")
+            raise DataError(
+                f"{path} has no frames with a person; expected a motion"
+            )
         self.fps = pose.body.fps
 
         # The points of all parts are in one array, part by part.

@@ -44,7 +44,11 @@ WORLD_KEYS = (
 )
 # Keys of SMPL's parameters: AMASS, HuMMan, smplx, AIST++, ZJU-MoCap.
 POSE_KEYS = ("poses", "pose", "smpl_poses", "body_pose", "pose_body")
-PART_KEYS = ("pose_jaw", "pose_eye", "pose_hand")  # parts of SMPL-X, after the body
+PART_KEYS = (
+    "pose_jaw",
+    "pose_eye",
+    "pose_hand",
+)  # parts of SMPL-X, after the body
 ROOT_KEYS = ("Rh", "root_orient", "global_orient")
 MOVE_KEYS = ("trans", "transl", "smpl_trans", "Th")
 # Of the shape coefficients.
@@ -153,7 +157,9 @@ def read_dictionary(path: Path, source: Source) -> Clip:
     return _by_names(path, arrays, source)
 
 
-def _by_names(path: Path, arrays: dict[str, NDArray[Any]], source: Source) -> Clip:
+def _by_names(
+    path: Path, arrays: dict[str, NDArray[Any]], source: Source
+) -> Clip:
     rate = _first(arrays, RATE_KEYS)
     fps = None if rate is None else rate_of(path, rate)
     if "p" in arrays:
@@ -208,7 +214,9 @@ def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Clip:
     p = arrays["p"].astype(np.float64)
     conf = np.ones(p.shape[:2])
     if "conf" in arrays:
-        conf = expect_array(arrays, "conf", p.shape[:2], path).astype(np.float64)
+        conf = expect_array(arrays, "conf", p.shape[:2], path).astype(
+            np.float64
+        )
     conf = np.where(np.isfinite(p).all(-1), np.nan_to_num(conf), 0.0)
 
     # People filmed from the waist up get hips below their shoulders.
@@ -217,7 +225,9 @@ def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Clip:
     body = np.nan_to_num(p[:, :BODY])
     placed = hips_below(body, seen)
     if no_hips.any() and (placed != body).any():
-        p[no_hips, :BODY] = np.where(seen[no_hips, :, None], p[no_hips, :BODY], np.nan)
+        p[no_hips, :BODY] = np.where(
+            seen[no_hips, :, None], p[no_hips, :BODY], np.nan
+        )
         for hip, shoulder in zip(HIPS, SHOULDERS, strict=True):
             p[no_hips, hip] = placed[no_hips, hip]
             conf[no_hips, hip] = conf[no_hips, shoulder]
@@ -255,7 +265,9 @@ def _body_pose(
 
     # The free body in the shape that gsgan.fit has stored, if any.
     shape = path.with_name(SHAPE)
-    subject = open_body("free", betas=read_shape(shape) if shape.is_file() else ())
+    subject = open_body(
+        "free", betas=read_shape(shape) if shape.is_file() else ()
+    )
     assert subject is not None
     poses = BodyPose(
         theta=torch.from_numpy(np.nan_to_num(theta)).float(),
@@ -316,7 +328,9 @@ def _smpl(
     motion = smpl_motion.SmplMotion(np.arange(F), theta, moves, shapes)
     p, conf = smpl_motion.landmarks_of(model, motion)
     p[~known] = np.nan
-    return Clip(path=path, p=p, visibility=conf, fps=fps, up=None, unit="metres")
+    return Clip(
+        path=path, p=p, visibility=conf, fps=fps, up=None, unit="metres"
+    )
 
 
 def _smpl_poses(path: Path, arrays: dict[str, Any]) -> Float:
@@ -409,7 +423,11 @@ def read_mediapipe_json(path: Path, source: Source) -> Clip:
 
 def _landmark_row(where: str, frame: Any) -> Float:
     """``[33, 4]`` x, y, z, visibility of a frame; NaN and 0 if no person was detected."""
-    if isinstance(frame, list) and len(frame) == 1 and isinstance(frame[0], dict):
+    if (
+        isinstance(frame, list)
+        and len(frame) == 1
+        and isinstance(frame[0], dict)
+    ):
         frame = frame[0]  # TensorFlow.js returns a list of people
     points = frame
     if isinstance(frame, dict):
@@ -449,7 +467,9 @@ def _numbers(point: Any) -> list[Any]:
     return [point.get("x"), point.get("y"), point.get("z"), visibility]
 
 
-def _with_visibility(path: Path, points: NDArray[Any], visibility: Any) -> Float:
+def _with_visibility(
+    path: Path, points: NDArray[Any], visibility: Any
+) -> Float:
     """Landmarks ``[F, 33, 4]`` with visibility.
 
     Args:
@@ -467,7 +487,9 @@ def _with_visibility(path: Path, points: NDArray[Any], visibility: Any) -> Float
     elif visibility is None:
         visibility = np.ones(points.shape[:2])
     if visibility.shape != points.shape[:2]:
-        raise DataError(f"{path}: 'visibility' must have shape {points.shape[:2]}")
+        raise DataError(
+            f"{path}: 'visibility' must have shape {points.shape[:2]}"
+        )
     p = np.concatenate([points[..., :3], visibility[..., None]], axis=-1)
     return p.astype(np.float64)
 
@@ -559,7 +581,9 @@ def read_trc(path: Path, source: Source) -> Clip:
         names = lines[1].split()
         values = lines[2].split()
         fps = rate_of(path, float(values[names.index("DataRate")]))
-    return Clip(path=path, p=p, visibility=conf, fps=fps, up=None, unit="metres")
+    return Clip(
+        path=path, p=p, visibility=conf, fps=fps, up=None, unit="metres"
+    )
 
 
 def _read_pose(path: Path, source: Source) -> Clip:

@@ -51,7 +51,9 @@ RIG_JOINTS = ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot")
 LEFT_LANDMARKS = (11, 13, 15, 23, 25, 27)
 
 
-def retargeted(p: Float, subject: Proportions, scale: float | None = None) -> Float:
+def retargeted(
+    p: Float, subject: Proportions, scale: float | None = None
+) -> Float:
     """The subject's landmarks ``[F, J, 3]`` in the poses of another person.
 
     Trunk and limbs keep their directions and get the subject's lengths; face, hands and feet are
@@ -206,7 +208,9 @@ def _aligned(p: Tensor, onto: Tensor, weight: Tensor) -> Tensor:
     return centre + scale[:, None, None] * a @ U @ Vh
 
 
-def _posed_hand(p: Float, subject: Proportions, wrist: int) -> tuple[Float, Float]:
+def _posed_hand(
+    p: Float, subject: Proportions, wrist: int
+) -> tuple[Float, Float]:
     """The subject's hand in the pose of landmarks ``[F, 21, 3]``.
 
     Returns:
@@ -224,7 +228,9 @@ def _posed_hand(p: Float, subject: Proportions, wrist: int) -> tuple[Float, Floa
     return q, palm
 
 
-def _extend(q: Float, p: Float, rest: Float, bones: Iterable[tuple[int, int]]) -> None:
+def _extend(
+    q: Float, p: Float, rest: Float, bones: Iterable[tuple[int, int]]
+) -> None:
     """Places the ends of bones of ``q`` in the directions of ``p``, at the lengths of ``rest``."""
     for a, b in bones:
         way = unit(p[:, b] - p[:, a])

@@ -21,7 +21,11 @@ FINGERS = ("Thumb", "Index", "Middle", "Ring", "Pinky")
 SIGN = {"Left": 1.0, "Right": -1.0}
 # Chains of bones, from the hips outwards.
 SPINE = ("Spine", "Spine1", "Spine2")
-PALM_FINGERS = ("Index", "Middle", "Pinky")  # fingers whose bases give the hand's axes
+PALM_FINGERS = (
+    "Index",
+    "Middle",
+    "Pinky",
+)  # fingers whose bases give the hand's axes
 ARM = ("Arm", "ForeArm", "Hand")
 LEG = ("UpLeg", "Leg", "Foot")
 REQUIRED = ("Hips", *(side + bone for side in SIDES for bone in LEG + ARM))
@@ -79,7 +83,9 @@ def rest_turns(joint: Mapping[str, Array]) -> dict[str, Array]:
             along, _ = limb_axes(part, side)
             upper = between(along, middle - first)
             turns[side + part[0]] = upper
-            turns[side + part[1]] = between(middle - first, end - middle) @ upper
+            turns[side + part[1]] = (
+                between(middle - first, end - middle) @ upper
+            )
 
         # The hand turns with its palm if that is known, else with the forearm.
         hand = turns[side + "ForeArm"]
@@ -315,7 +321,9 @@ class Pose:
         neutral = between(upper[..., 0], lower[..., 0]) @ upper
         angle = FOREARM_TWIST * twist(neutral.mT @ turn, axis=0)
         x_axis = np.eye(3)[0]
-        self.set_turn(side + "ForeArm", neutral @ rotation(angle[:, None] * x_axis))
+        self.set_turn(
+            side + "ForeArm", neutral @ rotation(angle[:, None] * x_axis)
+        )
         self.set_turn(side + "Hand", turn)
 
     def lowest(self, side: str) -> Array:
@@ -324,7 +332,10 @@ class Pose:
         for bone in (side + "Foot", side + "ToeBase"):
             points = self.rig.soles[bone]
             if len(points):
-                up = self.rotation(bone)[:, 2] @ (points - self.rig.joint[bone]).T
+                up = (
+                    self.rotation(bone)[:, 2]
+                    @ (points - self.rig.joint[bone]).T
+                )
                 heights.append(self.position(bone)[:, 2] + up.min(axis=-1))
         return np.min(heights, axis=0)
 

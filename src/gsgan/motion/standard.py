@@ -34,13 +34,17 @@ MAX_NEUTRAL_TILT = np.radians(10)
 MAX_UPRIGHT_TILT = np.radians(30)
 # Share of frames in which a person stands, in motions on the floor.
 MIN_STANDING_SHARE = 0.1
-SAME_TILT = np.radians(1)  # frames within this tilt of the best one are used too
+SAME_TILT = np.radians(
+    1
+)  # frames within this tilt of the best one are used too
 MAX_REFERENCES = 100  # number of frames for calibration
 # Share of knees and toes behind the body above which left and right are exchanged.
 BACKWARDS = 0.8
 # Minimum sine of the slope from ankle to toes of a flat foot: steeper ones are in the air.
 STEEPEST = -0.7
-MIN_BEND = 0.15  # minimum mean sine of the bend at which a limb's plane is known
+MIN_BEND = (
+    0.15  # minimum mean sine of the bend at which a limb's plane is known
+)
 # Leg lengths: feet up to this height above the lowest of a second stand on the floor.
 HOVER = 0.06
 # Metres from the origin that a motion may reach before its drift is subtracted.
@@ -68,7 +72,12 @@ FINGER_ALIASES = {
     "Pinky": "pinky|little",
 }
 # Mixamo's numbers of the parts of fingers.
-PHALANX_NUMBERS = {"metacarpal": 1, "proximal": 1, "intermediate": 2, "distal": 3}
+PHALANX_NUMBERS = {
+    "metacarpal": 1,
+    "proximal": 1,
+    "intermediate": 2,
+    "distal": 3,
+}
 # Words that mean a side.
 SIDE_WORDS = {"l": "Left", "r": "Right", "left": "Left", "right": "Right"}
 
@@ -146,9 +155,7 @@ class RigMotion:
         str, ...
     ]  # of the J joints, parents first; end sites are called "<joint> end"
     parents: tuple[int, ...]  # [J], -1 for roots
-    offsets: (
-        Array  # [J, 3] from the parent in the zero pose, units and axes of the file
-    )
+    offsets: Array  # [J, 3] from the parent in the zero pose, units and axes of the file
     rotations: Array  # [F, J, 3, 3] world, axes of the file
     root: Array  # [F, 3] position of the first joint
     frame_time: float  # seconds
@@ -193,7 +200,9 @@ class StandardMotion:
 class Reference:
     """Poses in which bones have known turns: they calibrate the joints' own axes."""
 
-    rotations: Array  # [N, J, 3, 3] world rotations of the joints, axes of the file
+    rotations: (
+        Array  # [N, J, 3, 3] world rotations of the joints, axes of the file
+    )
     axes: Array  # [N, 3, 3] rows left, back, up of the person, axes of the file
     joints: Array  # [N, J, 3] positions, axes of the file
     zero: bool  # whether it is the zero pose
@@ -267,7 +276,9 @@ def body_joints(rig: RigMotion, path: Path) -> dict[str, int]:
         DataError: when a joint of the limbs is not found, or the file holds two people.
     """
     known = known_joints(rig.names)
-    missing = [bone for bone in REQUIRED if bone not in known and bone != "Hips"]
+    missing = [
+        bone for bone in REQUIRED if bone not in known and bone != "Hips"
+    ]
     if missing:
         names = [name for name in rig.names if not name.endswith(" end")]
         raise DataError(
@@ -283,7 +294,9 @@ def body_joints(rig: RigMotion, path: Path) -> dict[str, int]:
     for side, bone in product(SIDES, ("UpLeg", "Arm")):
         counts.append(_count(rig, side + bone))
     if not shared or min(counts) > 1:
-        raise DataError(f"{path} holds more than one person; give a file of one")
+        raise DataError(
+            f"{path} holds more than one person; give a file of one"
+        )
     known.setdefault("Hips", shared[-1])
 
     # The joint after a finger's last bone is its end.
@@ -327,7 +340,9 @@ def _across(p: Array, known: dict[str, int], bone: str) -> Array:
     return left - right
 
 
-def _upward(p: Array, known: dict[str, int], usual: Array | None = None) -> Array:
+def _upward(
+    p: Array, known: dict[str, int], usual: Array | None = None
+) -> Array:
     """The coordinate axis ``[3]`` that points up.
 
     Along it, the shoulders are above the hips and these above the feet in the largest share of the
@@ -344,7 +359,10 @@ def _upward(p: Array, known: dict[str, int], usual: Array | None = None) -> Arra
 
     # The usual axis, if the person stands along it in enough poses.
     standing = (cosine > np.cos(MAX_UPRIGHT_TILT)).mean(axis=0)
-    if usual is not None and standing[(axes @ usual).argmax()] > MIN_STANDING_SHARE:
+    if (
+        usual is not None
+        and standing[(axes @ usual).argmax()] > MIN_STANDING_SHARE
+    ):
         return usual
 
     # The mean direction decides between axes with the same share.
@@ -472,7 +490,9 @@ def _turns(
 
     # A joint's turn is R @ C: its world rotation R in the person's axes, times the constant C
     # that gives the known turns in the reference poses.
-    to_rest = reference.rotations.mT @ reference.axes.mT[:, None]  # [N, J, 3, 3]
+    to_rest = (
+        reference.rotations.mT @ reference.axes.mT[:, None]
+    )  # [N, J, 3, 3]
     R = axes @ rig.rotations
     turns = {}
     for bone, j in known.items():
@@ -493,7 +513,9 @@ def _follow_positions(
     at_rest: list[dict[str, Array]], known: dict[str, int], reference: Reference
 ) -> None:
     """Adds the turns of the trunk and the feet of frames in which the person does not stand."""
-    for turn, A, p in zip(at_rest, reference.axes, reference.joints, strict=True):
+    for turn, A, p in zip(
+        at_rest, reference.axes, reference.joints, strict=True
+    ):
         # The trunk, by the line from hips to shoulders.
         trunk = A @ (_middle(p, known, "Arm") - _middle(p, known, "UpLeg"))
         turn["Hips"] = between(np.array([0.0, 0, 1]), trunk)
@@ -575,8 +597,12 @@ def _flatten_feet(turns: dict[str, Array], joints: dict[str, Array]) -> None:
         ahead = unit(joints[toe] - joints[foot])
         down = float(np.median(ahead[rests, 2]).clip(STEEPEST, 0))
         flat = np.array([0, -np.sqrt(1 - down**2), down])
-        turns[foot] = turns[foot] @ between(flat, _local(turns, joints, foot, toe))
-        turns[toe] = turns[toe] @ _mean(turns[toe][rests].mT @ turns[foot][rests])
+        turns[foot] = turns[foot] @ between(
+            flat, _local(turns, joints, foot, toe)
+        )
+        turns[toe] = turns[toe] @ _mean(
+            turns[toe][rests].mT @ turns[foot][rests]
+        )
 
 
 def _local(

@@ -19,10 +19,10 @@ from gsgan.utils.arrays import Bool, Float, Ints
 MIN_VIEWS = 2
 UNIT_FOCAL = 1000.0  # pixels; errors are then thousandths of the focal length
 MAX_EVALUATIONS = 30  # of the optimiser
-LOSS_SCALE = (
-    5.0  # error at which a detection counts half, thousandths of the focal length
+LOSS_SCALE = 5.0  # error at which a detection counts half, thousandths of the focal length
+COST_TOLERANCE = (
+    1e-7  # relative change of the cost at which the refinement ends
 )
-COST_TOLERANCE = 1e-7  # relative change of the cost at which the refinement ends
 # Square pixels: keeps the residual's scaling finite at an error of 0.
 MIN_SQUARE = 1e-12
 
@@ -234,7 +234,9 @@ def _sparsity(
     return sparse.vstack([detections, priors]).tocsr()
 
 
-def camera_moves(before: CameraArray, after: CameraArray) -> tuple[Float, Float]:
+def camera_moves(
+    before: CameraArray, after: CameraArray
+) -> tuple[Float, Float]:
     """Each camera's rotation ``[C]`` in degrees, and its move ``[C]`` in millimetres."""
     turned = np.linalg.norm(_turns(before, after), axis=-1)
     moved = np.linalg.norm(after.centres - before.centres, axis=-1)

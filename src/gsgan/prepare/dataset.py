@@ -93,7 +93,11 @@ def write_files(root: Path, outcome: Outcome, key: str) -> None:
         "up_axis": options.up_axis or standing_axis(p),
         "skeleton": "mediapipe33",
         "pixel_centre": 0.5,
-        "made_by": {"generator": MADE_BY, "version": gsgan.__version__, "key": key},
+        "made_by": {
+            "generator": MADE_BY,
+            "version": gsgan.__version__,
+            "key": key,
+        },
     }
     write_json(root / "meta.json", meta)
 
@@ -140,7 +144,9 @@ def exists(out: Path, key: str, overwrite: bool) -> bool:
     if not isinstance(made_by, dict) or made_by.get("generator") != MADE_BY:
         raise DataError(f"{out} holds something else; choose another out")
     if made_by.get("key") != key and not overwrite:
-        raise DataError(f"{out} was made with other settings; add overwrite=true")
+        raise DataError(
+            f"{out} was made with other settings; add overwrite=true"
+        )
     return bool(made_by.get("key") == key)
 
 

@@ -30,7 +30,9 @@ CONFIDENT = 0.5
 BLURRED = 0.3  # share of the usual sharpness
 JUMP = 0.5  # of the person's size from image to image: the detector found somebody else
 SHARP_SIZE = 256  # pixels: sharpness is measured on the person at this height
-MAX_CORNERS = 200  # maximum corners of the background, which show a moving camera
+MAX_CORNERS = (
+    200  # maximum corners of the background, which show a moving camera
+)
 MIN_CORNERS = 20  # minimum number of them
 
 LeftOut = dict[str, Bool]
@@ -224,7 +226,9 @@ def _flow(before: Bytes, after: Bytes, box: Ints) -> Float:
     if points is None or len(points) < MIN_CORNERS:
         return np.zeros(2)
     start = np.asarray(points, np.float32)
-    moved, found, _ = cv2.calcOpticalFlowPyrLK(before, after, start, start.copy())
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(
+        before, after, start, start.copy()
+    )
     steps = (moved - start)[found.ravel() == 1].reshape(-1, 2)
     return np.median(steps, axis=0) if len(steps) else np.zeros(2)
 

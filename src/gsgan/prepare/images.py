@@ -18,7 +18,9 @@ from gsgan.utils.errors import DataError
 from gsgan.utils.files import writing
 from gsgan.utils.frame_files import frame_files, last_number
 
-MIN_BLOB = 0.02  # share of the largest piece of a mask: smaller ones are removed
+MIN_BLOB = (
+    0.02  # share of the largest piece of a mask: smaller ones are removed
+)
 JPEG_QUALITY = 95  # of jpg, 1 to 100
 PNG_COMPRESSION = 3  # 0..9; higher is smaller and slower
 
@@ -34,7 +36,9 @@ def scaled(camera: CameraEntry, scale: float) -> CameraEntry:
     return replace(camera, K=K, dist=np.zeros_like(camera.dist), size=(h, w))
 
 
-def find_masks(folder: Path, names: Iterable[str]) -> dict[str, dict[int, Path]]:
+def find_masks(
+    folder: Path, names: Iterable[str]
+) -> dict[str, dict[int, Path]]:
     """Given masks by camera and frame number: <camera>/%06d.png, or %06d_<person>.png.
 
     Raises:
@@ -46,8 +50,12 @@ def find_masks(folder: Path, names: Iterable[str]) -> dict[str, dict[int, Path]]
 
         # Names such as 000012_1.png have the number of a person after that of the frame.
         paths = place.glob("*")
-        stems = [path.stem for path in paths if path.suffix.lower() in IMAGE_SUFFIXES]
-        of_persons = stems and all(re.fullmatch(r"\d+_\d+", stem) for stem in stems)
+        stems = [
+            path.stem for path in paths if path.suffix.lower() in IMAGE_SUFFIXES
+        ]
+        of_persons = stems and all(
+            re.fullmatch(r"\d+_\d+", stem) for stem in stems
+        )
         number = _first_number if of_persons else last_number
         files = frame_files(folder, name, IMAGE_SUFFIXES, number)
         if not files:

@@ -34,7 +34,9 @@ UNTOLD = (
     "and hips"
 )
 MESH_LANDMARKS = 468  # landmarks of MediaPipe's face mesh
-PIXEL_CENTRE = 0.5  # added to detectors that count from the centre of the first pixel
+PIXEL_CENTRE = (
+    0.5  # added to detectors that count from the centre of the first pixel
+)
 OPENPOSE_KEYS = (
     "pose_keypoints_2d",
     "hand_left_keypoints_2d",
@@ -115,7 +117,9 @@ def gather(
     # Frames that a camera lacks stay NaN.
     px = np.full((len(ids), len(frames), ALL, 2), np.nan)
     conf = np.zeros(px.shape[:3])
-    for c, (own, found) in enumerate(zip(ids, detections.values(), strict=True)):
+    for c, (own, found) in enumerate(
+        zip(ids, detections.values(), strict=True)
+    ):
         valid = own >= 0
         at = np.searchsorted(frames, own[valid])
         px[c, at] = found.px[valid]
@@ -159,10 +163,14 @@ def _read_json(path: Path) -> Detections:
 
 def _read_npz(path: Path) -> Detections:
     """Detections in an npz file, as `gsgan.prepare` writes MediaPipe's."""
-    arrays = read_arrays(path, ("px", "conf", "left", "right", "face", "frame_id"))
+    arrays = read_arrays(
+        path, ("px", "conf", "left", "right", "face", "frame_id")
+    )
     body = expect_array(arrays, "px", (None, BODY, 2), path).astype(np.float64)
     F = len(body)
-    frame_id = whole_frame_ids(expect_array(arrays, "frame_id", (F,), path), str(path))
+    frame_id = whole_frame_ids(
+        expect_array(arrays, "frame_id", (F,), path), str(path)
+    )
 
     # The body.
     px = np.full((F, ALL, 2), np.nan)
@@ -216,7 +224,9 @@ def _read_people(path: Path) -> list[_Person]:
 
     # The content may be anything: whatever is wrong with it is one error.
     try:
-        return [_person(person, keys) for person in people if person is not None]
+        return [
+            _person(person, keys) for person in people if person is not None
+        ]
     except (
         ArithmeticError,
         AttributeError,
@@ -288,7 +298,9 @@ def _joints(
     def put(joints: list[int], triples: Float) -> None:
         confidence = triples[:, 2]
         seen = known(triples) & (confidence > 0)
-        px[joints] = np.where(seen[:, None], triples[:, :2] + PIXEL_CENTRE, np.nan)
+        px[joints] = np.where(
+            seen[:, None], triples[:, :2] + PIXEL_CENTRE, np.nan
+        )
         conf[joints] = np.where(seen, confidence, 0.0)
 
     # Joints of the body, then those of each whole hand.

@@ -160,7 +160,9 @@ def ensure_environment(
         DataError: when creating it fails.
     """
     place = environment_of(tool)
-    python = place / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
+    python = place / (
+        "Scripts/python.exe" if sys.platform == "win32" else "bin/python"
+    )
     if (place / READY).is_file() and python.exists():
         return python
     if not setup:
@@ -214,7 +216,9 @@ def ensure_environment(
 def _run(command: list[str], what: str) -> None:
     """Runs a command; ``what`` begins the message if it fails."""
     try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            command, capture_output=True, text=True, check=False
+        )
     except OSError as error:
         raise DataError(
             f"{what}: {command[0]} cannot be started ({error.strerror})"
@@ -224,4 +228,6 @@ def _run(command: list[str], what: str) -> None:
 
 
 def _last_line(text: str) -> str:
-    return (text.strip().splitlines() or ["it ended without a message"])[-1].strip()
+    return (text.strip().splitlines() or ["it ended without a message"])[
+        -1
+    ].strip()

@@ -18,7 +18,14 @@ from gsgan.data.cameras import CameraEntry
 from gsgan.prepare import landmarks
 from gsgan.prepare.camera_array import CameraArray
 from gsgan.prepare.cleanse import cleanse, smooth
-from gsgan.prepare.frames import SAMPLING, LeftOut, check_enough, left_out, look, sample
+from gsgan.prepare.frames import (
+    SAMPLING,
+    LeftOut,
+    check_enough,
+    left_out,
+    look,
+    sample,
+)
 from gsgan.prepare.mediapipe import find_people
 from gsgan.prepare.one_view import (
     FOOT_JOINTS,
@@ -102,7 +109,9 @@ class Detected:
         )
 
 
-def solve_video(options: Options, stages: StageFolder, console: Console) -> Filmed:
+def solve_video(
+    options: Options, stages: StageFolder, console: Console
+) -> Filmed:
     """Camera, joints and masks of the video ``options.source``.
 
     Raises:
@@ -114,7 +123,9 @@ def solve_video(options: Options, stages: StageFolder, console: Console) -> Film
         folder = stages.path("frames", [*stamp(video), SAMPLING])
         source, time = sample(video, folder)
     numbers = np.array(list(source.files))
-    found, masks = find_people(options, {source.name: source}, stages, console.print)
+    found, masks = find_people(
+        options, {source.name: source}, stages, console.print
+    )
     detected, there = _read(found[source.name], numbers, source.size)
     there &= np.isin(numbers, list(masks[source.name]))
 
@@ -193,11 +204,18 @@ def doubtful_poses(errors: Float) -> Bool:
     return medians > DOUBTFUL * nanmedian(medians, axis=0)
 
 
-def _read(path: Path, numbers: Ints, size: tuple[int, int]) -> tuple[Detected, Bool]:
+def _read(
+    path: Path, numbers: Ints, size: tuple[int, int]
+) -> tuple[Detected, Bool]:
     """Detections at these frame numbers ``[F]``, and which of the frames have any."""
     # The arrays of depth, which only MediaPipe's files have.
     found = landmarks.read_detections(path)
-    depth = {"world": (BODY, 3), "left_z": (HAND,), "right_z": (HAND,), "faces": ()}
+    depth = {
+        "world": (BODY, 3),
+        "left_z": (HAND,),
+        "right_z": (HAND,),
+        "faces": (),
+    }
     arrays = {} if path.is_dir() else read_arrays(path, depth)
     if "world" not in arrays:
         raise DataError(
@@ -423,22 +441,30 @@ def _measured(
     }
 
 
-def _notes(found: Mapping[str, Any], options: Options, natural: float) -> list[str]:
+def _notes(
+    found: Mapping[str, Any], options: Options, natural: float
+) -> list[str]:
     """Sentences on what was estimated, and on what is in doubt."""
     # The estimates.
     focal = f"focal length {found['focal_px']:.0f} pixels, {found['focal_mm']:.0f} mm on film"
     if options.focal is None:
         stated = found["focal_stated"]
-        origin = f" from the {stated:g} mm that the file states" if stated else ""
+        origin = (
+            f" from the {stated:g} mm that the file states" if stated else ""
+        )
         uncertainty = f"{found['focal_uncertainty']:.0%}"
         focal += f", ± {uncertainty}, estimated{origin}; focal=<mm> sets it"
     notes = [focal]
     if options.height is None:
-        notes.append(f"height {natural:.2f} m, as a usual person; height=<m> sets it")
+        notes.append(
+            f"height {natural:.2f} m, as a usual person; height=<m> sets it"
+        )
     if found["left_out"]:
         counts = found["left_out"].items()
         reasons = ", ".join(f"{reason} {count}" for reason, count in counts)
-        notes.append(f"left out of {found['sampled']} sampled images: {reasons}")
+        notes.append(
+            f"left out of {found['sampled']} sampled images: {reasons}"
+        )
 
     # The doubts, each with its limit.
     seconds = found["seconds"]
@@ -447,7 +473,9 @@ def _notes(found: Mapping[str, Any], options: Options, natural: float) -> list[s
     others = found["several_faces"]
     feet = found["feet_seen"]
     if seconds < MIN_SECONDS:
-        notes.append(f"doubtful: {seconds:.1f} seconds are short, 20 to 40 are better")
+        notes.append(
+            f"doubtful: {seconds:.1f} seconds are short, 20 to 40 are better"
+        )
     if turned < MIN_CAMERA_TURN:
         notes.append(
             f"doubtful: only {turned} of 360 degrees were filmed; training guesses the rest"
@@ -457,7 +485,9 @@ def _notes(found: Mapping[str, Any], options: Options, natural: float) -> list[s
             f"doubtful: the background moved by {moved:.0%} of the image; it counts as still"
         )
     if others > MAX_OTHER_FACES:
-        notes.append(f"doubtful: {others:.0%} of the images show more than one face")
+        notes.append(
+            f"doubtful: {others:.0%} of the images show more than one face"
+        )
     if feet < MIN_FEET_SEEN:
         notes.append(
             f"doubtful: feet are in {feet:.0%} of the images; legs and distance are guesses"

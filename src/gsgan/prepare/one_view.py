@@ -47,7 +47,9 @@ from gsgan.utils.arrays import Float, evenly_spaced
 
 KEYFRAMES = 50  # maximum number of frames for shape and focal length
 FOCAL_SPREAD = 0.12  # standard deviation of the guess's logarithm
-FIRST_NOISE = 0.01  # of landmarks in the first steps, share of the person's size
+FIRST_NOISE = (
+    0.01  # of landmarks in the first steps, share of the person's size
+)
 # Standard deviation in metres of the detector's own 3D landmarks, given 2D landmarks with that
 # noise; more accurate 2D landmarks constrain depth more, so the 3D ones get less weight.
 WORLD_SPREAD = 0.08
@@ -63,11 +65,15 @@ OUTLIER = 3.0  # standard deviations at which a landmark counts half
 # would fit best.
 USUAL_HEIGHT = 1.7
 HEIGHT_SPREAD = 0.003
-LIMB_PRIOR = 0.05  # weight of the prior of arms and legs, which would make them shorter
+LIMB_PRIOR = (
+    0.05  # weight of the prior of arms and legs, which would make them shorter
+)
 MAX_TIME_GAP = 0.5  # seconds: motion is not smooth over a longer gap
 ZOOMS = np.arange(-4, 5) / 10  # logarithms of focal lengths to try
 ZOOM_STEPS = 8  # Gauss-Newton steps for each focal length
-ZOOM_NEIGHBOURS = 2  # neighbours on each side of the minimum in the parabola fit
+ZOOM_NEIGHBOURS = (
+    2  # neighbours on each side of the minimum in the parabola fit
+)
 MAX_VIEW_STEPS = 20  # maximum number of Gauss-Newton steps
 MIN_GAIN = 1e-4  # relative change of the cost at which the solver stops
 MIN_STANDING = 8  # landmarks of feet: fewer do not show the ground
@@ -169,7 +175,9 @@ class Blocks(NamedTuple):
     """Blocks of the normal equations by the unknowns: see the top of this module."""
 
     pose_pose: Tensor  # [F, D, D]
-    below: list[Tensor]  # [F - 1, D, D], [F - 2, D, D]: one and two frames later
+    below: list[
+        Tensor
+    ]  # [F - 1, D, D], [F - 2, D, D]: one and two frames later
     pose_shared: Tensor  # [F, D, 3 + S]
     shared_shared: Tensor  # [3 + S, 3 + S]
     g_pose: Tensor  # [F, D]
@@ -215,7 +223,9 @@ def solve_view(
     has_ground = bool(standing.sum() >= MIN_STANDING)
     keyframes = torch.tensor(evenly_spaced(len(seen.u), KEYFRAMES, ends=True))
 
-    def problem(frames: Tensor, noise: float, zoom: float, **options: bool) -> Problem:
+    def problem(
+        frames: Tensor, noise: float, zoom: float, **options: bool
+    ) -> Problem:
         return Problem(
             seen[frames],
             noise,
@@ -425,7 +435,9 @@ class Problem:
         )
 
         # Cauchy's cost of each group, and the weights with which squares have the same gradient.
-        squares = r.new_zeros(weight.shape).index_add_(1, RESIDUAL_GROUPS, r.square())
+        squares = r.new_zeros(weight.shape).index_add_(
+            1, RESIDUAL_GROUPS, r.square()
+        )
         squares = squares / OUTLIER**2
         cost = (weight * OUTLIER**2 * squares.log1p()).sum()
         w = (weight / (1 + squares))[:, RESIDUAL_GROUPS]
@@ -502,7 +514,9 @@ class Problem:
         # The inverse of H_pose_pose times [H_pose_shared, g_pose], with damping on its diagonal.
         H = blocks.pose_pose
         H = H + torch.diag_embed(damping * torch.diagonal(H, dim1=-2, dim2=-1))
-        columns = torch.cat([blocks.pose_shared, blocks.g_pose[..., None]], dim=-1)
+        columns = torch.cat(
+            [blocks.pose_shared, blocks.g_pose[..., None]], dim=-1
+        )
         columns = columns.reshape(F * D, -1)
         if self.smooth:
             solved = _solve_banded(H, blocks.below, columns)
@@ -561,7 +575,9 @@ class Problem:
 
         # Shared numbers: by landmarks and the prior.
         shared_shared = torch.einsum("fni,fnj->ij", G, WG) + self.prior.diag()
-        g_shared = torch.einsum("fni,fn->i", G, found.g) + self.prior * at.shared
+        g_shared = (
+            torch.einsum("fni,fn->i", G, found.g) + self.prior * at.shared
+        )
 
         # By the ground, whose residuals also depend on the shape.
         by_ground = torch.einsum("fni,fnj->ij", G, found.cross)
@@ -600,7 +616,9 @@ class Problem:
 
         def rest(x: Tensor) -> Tensor:
             body = self.space.shaped(shape_of(self.space, x))
-            return torch.cat([body.joints[solver.joint], body.landmarks.nan_to_num()])
+            return torch.cat(
+                [body.joints[solver.joint], body.landmarks.nan_to_num()]
+            )
 
         moves = torch.func.jacfwd(rest)(at.shared[PLANE:])  # [T + 33, 3, S]
         T = len(solver.joint)
@@ -615,7 +633,9 @@ class Problem:
         carried = torch.einsum("nt,ftis->fnis", follows, before)
         return carried + R[:, solver.carrier] @ of_landmarks
 
-    def minimise(self, at: State, steps: int = MAX_VIEW_STEPS) -> tuple[State, float]:
+    def minimise(
+        self, at: State, steps: int = MAX_VIEW_STEPS
+    ) -> tuple[State, float]:
         """The solution, and its cost."""
         # Levenberg-Marquardt: a step that raises the cost is undone.
         best = self.cost(at)

@@ -5,7 +5,11 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsgan.data.calibration import Calibration, find_calibration, read_calibration
+from gsgan.data.calibration import (
+    Calibration,
+    find_calibration,
+    read_calibration,
+)
 from gsgan.data.cameras import CameraEntry
 from gsgan.motion.points import UNITS
 from gsgan.prepare.camera_array import MIN_VIEWS
@@ -75,7 +79,9 @@ class Options:
     def __post_init__(self) -> None:
         # Options that must be given.
         if not self.source:
-            raise ConfigError("give source=<folder with the videos, or one video>")
+            raise ConfigError(
+                "give source=<folder with the videos, or one video>"
+            )
         if not self.out:
             raise ConfigError("give out=<folder to make>")
 
@@ -127,7 +133,9 @@ class Options:
     def record(self) -> dict[str, Any]:
         """The settings that the dataset depends on, as plain values."""
         return {
-            key: value for key, value in asdict(self).items() if key not in FREE_OPTIONS
+            key: value
+            for key, value in asdict(self).items()
+            if key not in FREE_OPTIONS
         }
 
     def folder(self, name: str) -> Path:
@@ -143,7 +151,9 @@ class Inputs:
     calibration: Calibration
     # in the order of the sources, with their names and sizes
     cameras: Sequence[CameraEntry]
-    notes: Sequence[str]  # one sentence for each thing that was converted or left out
+    notes: Sequence[
+        str
+    ]  # one sentence for each thing that was converted or left out
     fps: float
 
 
@@ -163,7 +173,9 @@ def read_inputs(options: Options) -> Inputs:
         )
 
     # The calibration, in a file that is given or found.
-    path = folder if options.calibration is None else options.folder("calibration")
+    path = (
+        folder if options.calibration is None else options.folder("calibration")
+    )
     if path.is_dir():
         path = find_calibration(path)
     # None stands for the format's own unit.
@@ -184,18 +196,24 @@ def read_inputs(options: Options) -> Inputs:
     cameras = []
     for name, source in sources.items():
         camera = calibration.cameras[pairs[name]]
-        fitted, note = fit_size(camera, name, source.size, options.crop_px, path)
+        fitted, note = fit_size(
+            camera, name, source.size, options.crop_px, path
+        )
         cameras.append(fitted)
         if note is not None:
             notes.append(note)
     unused = sorted(set(calibration.cameras) - set(pairs.values()))
     if unused:
-        notes.append(f"calibrated without a video, left out: {', '.join(unused)}")
+        notes.append(
+            f"calibrated without a video, left out: {', '.join(unused)}"
+        )
     notes += recording_notes(sources)
 
     # The median of the videos' rates, if none is given.
     rates = sorted(source.fps for source in sources.values() if source.fps)
     if options.fps is None and not rates:
-        raise ConfigError("images have no frame rate; give fps=<frames per second>")
+        raise ConfigError(
+            "images have no frame rate; give fps=<frames per second>"
+        )
     fps = float(options.fps or rates[len(rates) // 2])
     return Inputs(sources, calibration, cameras, notes, fps)

@@ -16,7 +16,11 @@ from gsgan.data.splits import parse_frames
 from gsgan.data.validation import Thresholds, check_distance
 from gsgan.motion.rotations import between
 from gsgan.prepare import landmarks
-from gsgan.prepare.camera_array import CameraArray, camera_moves, undistort_points
+from gsgan.prepare.camera_array import (
+    CameraArray,
+    camera_moves,
+    undistort_points,
+)
 from gsgan.prepare.dataset import (
     Outcome,
     exists,
@@ -49,11 +53,15 @@ def summarise(outcome: Outcome) -> dict[str, Any]:
     # The numbers of each camera.
     inputs = outcome.inputs
     solution = outcome.solution
-    turned, moved = camera_moves(CameraArray.of(inputs.cameras), solution.cameras)
+    turned, moved = camera_moves(
+        CameraArray.of(inputs.cameras), solution.cameras
+    )
     cameras = {}
     for c, name in enumerate(inputs.sources):
         error = solution.error[c]
-        by_stage = {stage: median(px[c]) for stage, px in solution.stages.items()}
+        by_stage = {
+            stage: median(px[c]) for stage, px in solution.stages.items()
+        }
         cameras[name] = {
             "error_px": by_stage,
             "turned_degrees": float(turned[c]),
@@ -74,9 +82,13 @@ def summarise(outcome: Outcome) -> dict[str, Any]:
 
     found = known(solution.p[:, :BODY]).mean(0)
     return {
-        "error_px": {stage: median(px) for stage, px in solution.stages.items()},
+        "error_px": {
+            stage: median(px) for stage, px in solution.stages.items()
+        },
         "cameras": cameras,
-        "joints_found": dict(zip(MEDIAPIPE33.names, found.tolist(), strict=True)),
+        "joints_found": dict(
+            zip(MEDIAPIPE33.names, found.tolist(), strict=True)
+        ),
         "joints_removed": solution.removed,
         "frames": len(frames),
         "frames_dropped": dropped,
@@ -93,9 +105,13 @@ def summarise(outcome: Outcome) -> dict[str, Any]:
 def _late_clocks(solution: Solution, names: Iterable[str]) -> list[str]:
     """Notes on cameras whose clocks are late."""
     notes = []
-    for name, delay, gain in zip(names, solution.delay, solution.gain, strict=True):
+    for name, delay, gain in zip(
+        names, solution.delay, solution.gain, strict=True
+    ):
         if abs(delay) > DELAY and gain > DELAY_GAIN:
-            text = f"its clock seems {delay:+.1f} frames late; if so, set offsets="
+            text = (
+                f"its clock seems {delay:+.1f} frames late; if so, set offsets="
+            )
             notes.append(f"{name}: {text}{{{name}: {round(delay)}}}")
     return notes
 
@@ -120,7 +136,15 @@ def print_summary(numbers: Mapping[str, Any], console: Console) -> None:
             )
         )
     rows.append(("all", *_errors(stages)))
-    headers = ("camera", *stages, "turned", "moved", "swapped", "late", "images")
+    headers = (
+        "camera",
+        *stages,
+        "turned",
+        "moved",
+        "swapped",
+        "late",
+        "images",
+    )
     title = (
         "Median error in pixels by stage; refinement, swapped sides, frames that clocks "
         "are late"
@@ -134,7 +158,9 @@ def print_summary(numbers: Mapping[str, Any], console: Console) -> None:
     ]
     dropped = numbers["frames_dropped"]
     if dropped:
-        notes.append(f"{len(dropped)} frames were dropped: no skeleton or no mask")
+        notes.append(
+            f"{len(dropped)} frames were dropped: no skeleton or no mask"
+        )
     console.print("\n".join(notes), markup=False, highlight=False)
 
 
@@ -148,7 +174,9 @@ def _number(value: float, form: str) -> str:
     return "-" if np.isnan(value) else format(value, form)
 
 
-STAGE_VERSION = 5  # incremented when the same settings begin to give another result
+STAGE_VERSION = (
+    5  # incremented when the same settings begin to give another result
+)
 
 
 def prepare(options: Options, console: Console) -> Path:
@@ -164,9 +192,13 @@ def prepare(options: Options, console: Console) -> Path:
     # The same dataset, if it exists.
     out = options.folder("out")
     inputs = None if options.one_camera else read_inputs(options)
-    key = digest([STAGE_VERSION, options.record(), _fingerprint(options, inputs)])
+    key = digest(
+        [STAGE_VERSION, options.record(), _fingerprint(options, inputs)]
+    )
     if exists(out, key, options.overwrite):
-        console.print(f"{out} exists already, made from the same images and settings")
+        console.print(
+            f"{out} exists already, made from the same images and settings"
+        )
         # A run may have been killed before its last file.
         if not (out / "check.json").is_file():
             check_capture(out, out / "check.html", console)
@@ -185,7 +217,9 @@ def prepare(options: Options, console: Console) -> Path:
         extra = {"one_camera": filmed.numbers}
         options = replace(options, face=False)
     else:
-        found, masks = find_people(options, inputs.sources, stages, console.print)
+        found, masks = find_people(
+            options, inputs.sources, stages, console.print
+        )
         inputs, detections = with_detections(inputs, found)
         frames, uv, conf = _undistorted(options, inputs, detections)
         if not inputs.calibration.metric:
@@ -216,7 +250,9 @@ def prepare(options: Options, console: Console) -> Path:
         f"python -m gsgan.fit data=capture data.root={out}",
         f"python -m gsgan.train data=capture data.root={out}",
     )
-    console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+    console.print(
+        "\n".join(lines), markup=False, highlight=False, soft_wrap=True
+    )
     return out
 
 
@@ -306,7 +342,9 @@ def _undistorted(
     return frames, uv, conf
 
 
-def _in_metres(options: Options, inputs: Inputs, uv: Float, conf: Float) -> Inputs:
+def _in_metres(
+    options: Options, inputs: Inputs, uv: Float, conf: Float
+) -> Inputs:
     """The inputs with cameras in metres, of a calibration without a scale.
 
     The person, triangulated in the given world, gets the height of ``options`` or the usual one.
@@ -324,10 +362,14 @@ def _in_metres(options: Options, inputs: Inputs, uv: Float, conf: Float) -> Inpu
     # The body's joints in the world of the calibration.
     uv = uv[:, :, :BODY]
     C, F, J = uv.shape[:3]
-    rig, pixels = CameraArray.of(inputs.cameras).normalised(uv.reshape(C, -1, 2))
+    rig, pixels = CameraArray.of(inputs.cameras).normalised(
+        uv.reshape(C, -1, 2)
+    )
     p = robust(rig, pixels, conf[:, :, :BODY].reshape(C, -1)).p.reshape(F, J, 3)
     seen = torch.from_numpy(known(p))
-    limbs = limb_length_sum(torch.from_numpy(np.nan_to_num(p)), seen).nanmedian()
+    limbs = limb_length_sum(
+        torch.from_numpy(np.nan_to_num(p)), seen
+    ).nanmedian()
     if not limbs > 0:
         raise DataError(
             f"{inputs.calibration.path}: no limb was seen by two cameras; do frame numbers agree?"
@@ -338,7 +380,9 @@ def _in_metres(options: Options, inputs: Inputs, uv: Float, conf: Float) -> Inpu
     usual = limb_length_sum(rest) / MEDIAPIPE33.stature
     height = options.height or USUAL_HEIGHT
     scale = height / float(limbs / usual)
-    assumed = "" if options.height else ", as a usual person; height=<m> sets it"
+    assumed = (
+        "" if options.height else ", as a usual person; height=<m> sets it"
+    )
     note = f"the calibration has no scale: the person is {height:.2f} m tall{assumed}"
 
     # The turn that takes the person's upward direction to z.

@@ -42,7 +42,9 @@ REFINED = 200  # maximum number of frames that refine the cameras, evenly spaced
 LAG = 6  # frames by which clocks are compared, either way
 
 
-def match_hands(cameras: CameraArray, uv: Float, weight: Float, wrists: Float) -> Bool:
+def match_hands(
+    cameras: CameraArray, uv: Float, weight: Float, wrists: Float
+) -> Bool:
     """The cameras and frames ``[C, F]`` in which left and right hand are swapped.
 
     Each view starts with the assignment whose hands are nearer to the wrists of the pose; then one
@@ -60,7 +62,9 @@ def match_hands(cameras: CameraArray, uv: Float, weight: Float, wrists: Float) -
     C, F, _ = weight.shape
     roots = uv.reshape(C, F, 2, HAND, 2)[:, :, :, 0]
     root_weight = weight.reshape(C, F, 2, HAND, 1)[:, :, :, 0]
-    distance = np.linalg.norm(roots[:, :, :, None] - wrists[:, :, None], axis=-1)
+    distance = np.linalg.norm(
+        roots[:, :, :, None] - wrists[:, :, None], axis=-1
+    )
 
     # A hand is left out if one wrist is unknown: its distances cannot be compared.
     known = np.isfinite(distance).all(-1, keepdims=True)
@@ -122,7 +126,9 @@ class Solution:
     left_out: Bool  # [C, F, 2] detected hands that are not the person's, or are repeats
     delay: Float  # [C] of each camera's clock, see `clock_errors`
     gain: Float  # [C] of correcting that clock
-    stages: dict[str, Float]  # name of each stage and its body errors [C, F, 33]
+    stages: dict[
+        str, Float
+    ]  # name of each stage and its body errors [C, F, 33]
     removed: dict[str, int]  # number of joints removed, by reason
 
     @property
@@ -271,7 +277,9 @@ def correct(cameras: CameraArray, uv: Float, conf: Float) -> Corrected:
     wrists = np.where(np.isfinite(own), own, projected.reshape(own.shape))
 
     # Sides of the hands.
-    swapped = match_hands(cameras, sided[:, :, HANDS], weight[:, :, HANDS], wrists)
+    swapped = match_hands(
+        cameras, sided[:, :, HANDS], weight[:, :, HANDS], wrists
+    )
     swapped = swapped[..., None]
     sided = apply_flips(sided, swapped, [HAND_PAIRS])
     weight = apply_flips(weight, swapped, [HAND_PAIRS])
@@ -281,7 +289,9 @@ def correct(cameras: CameraArray, uv: Float, conf: Float) -> Corrected:
     left_out = misfits(points.error.reshape(conf.shape)[:, :, HANDS])
     weight[:, :, HANDS] *= ~left_out.repeat(HAND, axis=-1)
     points = robust(cameras, _flat(sided), _flat(weight))
-    return Corrected(sided, weight, np.dstack([flips, swapped]), left_out, points)
+    return Corrected(
+        sided, weight, np.dstack([flips, swapped]), left_out, points
+    )
 
 
 def _flat(values: Float) -> Float:
@@ -295,7 +305,9 @@ def _mean_seen(values: Float, weight: Float) -> Float:
     return values.sum(0) / np.maximum(views, 1)
 
 
-def clock_errors(cameras: CameraArray, uv: Float, weight: Float) -> tuple[Float, Float]:
+def clock_errors(
+    cameras: CameraArray, uv: Float, weight: Float
+) -> tuple[Float, Float]:
     """Each camera's delay against the others, and the gain of correcting it.
 
     Delays are in frames; with a positive delay the camera shows a later moment than the others at
@@ -321,7 +333,9 @@ def clock_errors(cameras: CameraArray, uv: Float, weight: Float) -> tuple[Float,
     for c in range(C):
         # The joints as the other cameras see them, in this camera.
         others = np.arange(C) != c
-        points = robust(cameras[others], _flat(uv[others]), _flat(weight[others]))
+        points = robust(
+            cameras[others], _flat(uv[others]), _flat(weight[others])
+        )
         projected, _ = cameras.project(points.p)
         expected = projected[c].reshape(uv.shape[1:])
         seen = np.where((weight[c] > 0)[..., None], uv[c], np.nan)

@@ -28,7 +28,9 @@ VIDEO_SUFFIXES = (
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 INSIDE = ("videos", "images")  # where EasyMocap and Pose2Sim projects keep them
 
-DIFFERENT = 0.01  # share by which frame rates or lengths must differ to be noted
+DIFFERENT = (
+    0.01  # share by which frame rates or lengths must differ to be noted
+)
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,9 @@ def find_sources(folder: Path, rotate: bool = False) -> dict[str, Recording]:
 def _sources_in(folder: Path, rotate: bool) -> dict[str, Recording]:
     """The recordings in a folder by name; other files do not count."""
     sources: dict[str, Recording] = {}
-    for path in sorted(folder.iterdir(), key=lambda path: natural_order(path.name)):
+    for path in sorted(
+        folder.iterdir(), key=lambda path: natural_order(path.name)
+    ):
         if path.name.startswith("."):
             continue
 
@@ -160,7 +164,9 @@ def opened(path: Path, rotate: bool) -> cv2.VideoCapture:
     """
     video = cv2.VideoCapture(str(path))
     if not video.isOpened():
-        raise DataError(f"{path} cannot be opened as a video; convert it to H.264 MP4")
+        raise DataError(
+            f"{path} cannot be opened as a video; convert it to H.264 MP4"
+        )
     video.set(cv2.CAP_PROP_ORIENTATION_AUTO, int(rotate))
     return video
 
@@ -207,9 +213,7 @@ def pair_cameras(
         if len(matching) != 1 or matching[0] in pairs.values():
             problem = "no one camera of the calibration matches"
             if len(matching) == 1:
-                problem = (
-                    f"the camera {matching[0]} matches more than one video, among them"
-                )
+                problem = f"the camera {matching[0]} matches more than one video, among them"
             raise DataError(
                 f"{problem} {source} ({both}); set cameras={{video: calibration name}}"
             )
@@ -271,8 +275,12 @@ def recording_notes(sources: Mapping[str, Recording]) -> list[str]:
     # Rates and counts that differ.
     notes = []
     for what, values in (("frame rates", rates), ("numbers of frames", counts)):
-        if values and max(values.values()) > (1 + DIFFERENT) * min(values.values()):
-            text = ", ".join(f"{name} {value:g}" for name, value in values.items())
+        if values and max(values.values()) > (1 + DIFFERENT) * min(
+            values.values()
+        ):
+            text = ", ".join(
+                f"{name} {value:g}" for name, value in values.items()
+            )
             notes.append(f"{what} differ ({text}); frames are paired by number")
 
     # Rotations that are not applied.

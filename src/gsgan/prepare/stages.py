@@ -15,7 +15,9 @@ from gsgan.utils.console import progress
 from gsgan.utils.files import writing
 
 Result = TypeVar("Result")
-Advance = Callable[[int, int], None]  # takes the number of steps done and in total
+Advance = Callable[
+    [int, int], None
+]  # takes the number of steps done and in total
 KEY_LENGTH = 12
 
 

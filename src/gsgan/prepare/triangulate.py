@@ -12,16 +12,18 @@ from gsgan.skeleton.joints import known
 from gsgan.utils.arrays import Bool, Float, Ints, nanmedian
 
 # Errors are in thousandths of the focal length: pixels, at a focal length of 1000 pixels.
-HALF_WEIGHT_ERROR = 3.5  # error at which a detection counts half (Cauchy's weight)
-MAX_MEDIAN_ERROR = 35.0  # median error beyond which detections contradict each other
+HALF_WEIGHT_ERROR = (
+    3.5  # error at which a detection counts half (Cauchy's weight)
+)
+MAX_MEDIAN_ERROR = (
+    35.0  # median error beyond which detections contradict each other
+)
 # maximum ratio of a point's uncertainty along the rays to that across: above, they are too parallel
 MAX_ELONGATION = 20.0
 # mean loss per detection that a swap must save; an error of HALF_WEIGHT_ERROR costs 0.7
 FLIP_GAIN = 0.15
 FAR_ERROR = 1e6  # pixels: stands for an infinite error
-MIN_DETERMINANT = (
-    1e-15  # determinant over trace³: below it the equations are singular in float64
-)
+MIN_DETERMINANT = 1e-15  # determinant over trace³: below it the equations are singular in float64
 ITERATIONS = 10  # of reweighting
 QUICK_ITERATIONS = 3  # of reweighting, in the search for swapped sides
 POINTS_AT_ONCE = (
@@ -30,7 +32,9 @@ POINTS_AT_ONCE = (
 MAX_PAIRS = 60  # pairs of cameras tried as a start; of more, a spread-out part
 # minimum number of a group: hips at the border of an image do not tell left from right
 MIN_GROUP = 3
-PROGRESSION = 7919  # a prime: spreads the chosen camera pairs when there are too many
+PROGRESSION = (
+    7919  # a prime: spreads the chosen camera pairs when there are too many
+)
 
 Pairs = tuple[tuple[int, int], ...]
 
@@ -41,7 +45,9 @@ class Triangulated:
 
     p: Float  # [N, 3] metres, NaN = missing
     weight: Float  # [C, N] final weight of each detection, 0 = not used
-    error: Float  # [C, N] reprojection error in undistorted pixels, NaN = not seen
+    error: (
+        Float  # [C, N] reprojection error in undistorted pixels, NaN = not seen
+    )
 
 
 def plain(cameras: CameraArray, uv: Float, weight: Float) -> Float:
@@ -143,7 +149,9 @@ def robust_cost(error: Float, weight: Float) -> Float:
     return (np.log1p((far / HALF_WEIGHT_ERROR) ** 2) * weight).sum(0)
 
 
-def _rows(cameras: CameraArray, uv: Float, weight: Float) -> tuple[Float, Float]:
+def _rows(
+    cameras: CameraArray, uv: Float, weight: Float
+) -> tuple[Float, Float]:
     """The rows ``a [C, N, 2, 3]`` and ``b [C, N, 2]`` of linear equations.
 
     With ``K R X + K t = (x, y, z)``, z being the depth, the error in pixels is ``u - x / z``;
@@ -242,13 +250,17 @@ def points_and_cost(
     """Points ``[F, J, 3]`` of ``uv [C, F, J, 2]``, ``weight [C, F, J]``, and their cost ``[F]``."""
     C, F, J = weight.shape
     flat = weight.reshape(C, -1)
-    found = robust(cameras, uv.reshape(C, -1, 2), flat, QUICK_ITERATIONS, np.inf)
+    found = robust(
+        cameras, uv.reshape(C, -1, 2), flat, QUICK_ITERATIONS, np.inf
+    )
     seen = np.where(np.isfinite(found.error), flat, 0.0)
     cost = robust_cost(found.error, seen)
     return found.p.reshape(F, J, 3), cost.reshape(F, J).sum(-1)
 
 
-def _group_flips(cameras: CameraArray, uv: Float, weight: Float, pairs: Pairs) -> Bool:
+def _group_flips(
+    cameras: CameraArray, uv: Float, weight: Float, pairs: Pairs
+) -> Bool:
     """The swaps ``[C, F]`` of one group."""
     # The joints of a pair become adjacent: j and j ^ 1.
     joints = np.ravel(pairs)
@@ -301,7 +313,9 @@ def cheapest_flips(
     cost = cost_of(flips, active)
     for _ in range(C):
         # The cost of changing each camera, in the active frames.
-        trials = np.stack([cost_of(flips[:, active] ^ one, active) for one in toggles])
+        trials = np.stack(
+            [cost_of(flips[:, active] ^ one, active) for one in toggles]
+        )
         saved = cost[active] - trials - price[:, active]
 
         # The camera whose change saves most is changed.

@@ -71,7 +71,9 @@ class Output:
 
         # Only a folder that a render wrote is written to again. Its frames are removed,
         # since it may have more of them than the new one.
-        if self.out.exists() and (not self.out.is_dir() or any(self.out.glob("[!.]*"))):
+        if self.out.exists() and (
+            not self.out.is_dir() or any(self.out.glob("[!.]*"))
+        ):
             if not (self.out / RECORD).is_file():
                 raise ConfigError(
                     f"out={self.out} is not empty and holds no render; give another folder"
@@ -126,7 +128,9 @@ def encoded(images: Iterable[Bytes], fps: float) -> bytes:
                 try:
                     rate = Fraction(fps).limit_denominator(100_000)
                     options = {"crf": VIDEO_QUALITY}
-                    stream = container.add_stream("libx264", rate=rate, options=options)
+                    stream = container.add_stream(
+                        "libx264", rate=rate, options=options
+                    )
                 except Exception as error:  # PyAV's own kinds
                     raise DataError(
                         f"this build of av has no H.264 encoder ({error}); give a folder as out"
@@ -145,7 +149,9 @@ def encoded(images: Iterable[Bytes], fps: float) -> bytes:
             sides = ((0, image.shape[0] % 2), (0, image.shape[1] % 2), (0, 0))
             padded = np.ascontiguousarray(np.pad(image, sides, mode="edge"))
             container.mux(
-                stream.encode(av.VideoFrame.from_ndarray(padded, format="rgb24"))
+                stream.encode(
+                    av.VideoFrame.from_ndarray(padded, format="rgb24")
+                )
             )
 
         # The encoder holds back frames until it is flushed.

@@ -109,7 +109,9 @@ def _output(config: DictConfig) -> Output:
     # Every other ending is most likely a mistake.
     out = Path(config.out).expanduser()
     if out.suffix and out.suffix.lower() != ".mp4" and not out.is_dir():
-        raise ConfigError(f"out={out} must be a .mp4 file, or a folder for PNG files")
+        raise ConfigError(
+            f"out={out} must be a .mp4 file, or a folder for PNG files"
+        )
     return Output(out, float(above("fps", config.fps)), bool(config.provenance))
 
 
@@ -242,11 +244,17 @@ def _images(
         try:
             with torch.no_grad():
                 p, visibility, body = inputs_of(run.avatar, drive, i)
-                found = run.avatar(p, visibility, camera, body, colours, maps=False)
+                found = run.avatar(
+                    p, visibility, camera, body, colours, maps=False
+                )
             assert found.image is not None
             assert found.alpha is not None
             yield eight_bits(
-                found.image[0].cpu(), found.alpha[0].cpu(), paint_on(camera.size)
+                found.image[0].cpu(),
+                found.alpha[0].cpu(),
+                paint_on(camera.size),
             )
         except ValueError as error:
-            raise DataError(f"frame {number} cannot be rendered ({error})") from error
+            raise DataError(
+                f"frame {number} cannot be rendered ({error})"
+            ) from error

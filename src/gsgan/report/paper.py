@@ -39,7 +39,10 @@ class PaperTable:
             record = run.protocol(split)
             for mine, printed in (
                 (f"of {run.data.get('name')}", f"of {self.data}"),
-                (f"of protocol {record['name']}", f"of protocol {self.protocol}"),
+                (
+                    f"of protocol {record['name']}",
+                    f"of protocol {self.protocol}",
+                ),
                 (f"of {split}", f"of {self.split}"),
             ):
                 if mine != printed:
@@ -67,7 +70,9 @@ class PaperTable:
                 subject = self.subject if column == metric else column
                 texts.append(held["values"].get(subject, {}).get(metric))
             row = self._row(held["label"], texts, (note,))
-            found.setdefault(held.get("beside") or held["label"], []).append(row)
+            found.setdefault(held.get("beside") or held["label"], []).append(
+                row
+            )
         return found
 
     def grid(self, why: str) -> Grid:
@@ -90,7 +95,10 @@ class PaperTable:
         return Grid(title, [METRICS[m].heading for m in shown], rows, remarks)
 
     def _row(
-        self, label: str, texts: Iterable[str | None], notes: tuple[str, ...] = ()
+        self,
+        label: str,
+        texts: Iterable[str | None],
+        notes: tuple[str, ...] = (),
     ) -> Row:
         # The paper states neither seeds nor commits.
         cells = [Cell(NOT_HAD if text is None else text) for text in texts]
@@ -110,5 +118,7 @@ def read_paper(name: str) -> PaperTable:
     # The keys of a table are the fields of `PaperTable`.
     tables: Any = OmegaConf.to_container(OmegaConf.load(FILE))
     if name not in tables:
-        raise ConfigError(f"table.paper={name}: {FILE.name} has {', '.join(tables)}")
+        raise ConfigError(
+            f"table.paper={name}: {FILE.name} has {', '.join(tables)}"
+        )
     return PaperTable(**tables[name])

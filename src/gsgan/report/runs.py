@@ -28,7 +28,11 @@ METHOD = re.compile(
     r"[+~]*(?!model=)(model|training|effects|accuracy|size|segments)[.@=]"
 )
 # Settings that change no result.
-WITHOUT_EFFECT = ("model.backend", "training.log_every", "training.perceptual.path")
+WITHOUT_EFFECT = (
+    "model.backend",
+    "training.log_every",
+    "training.perceptual.path",
+)
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,9 @@ class ScoredRun:
     # ``name`` of the data group's choice, ``root`` (the folder's name) and ``fingerprint``.
     data: dict[str, Any]
     seed: int | None  # None for predictions
-    scores: dict[str, dict[str, dict[str, Any]]]  # {split: {variant: {metric: value}}}
+    scores: dict[
+        str, dict[str, dict[str, Any]]
+    ]  # {split: {variant: {metric: value}}}
     # The training config by dotted key, without seed and paths; None for predictions.
     settings: dict[str, Any] | None = None
     # The changes of ``experiment=paper`` on the command line, where its models are those of the
@@ -128,10 +134,14 @@ def check_same(
             text = f"{expected} and {value}"
             if isinstance(value, dict):
                 keys = sorted(value.keys() | expected.keys())
-                text = ", ".join(k for k in keys if value.get(k) != expected.get(k))
+                text = ", ".join(
+                    k for k in keys if value.get(k) != expected.get(k)
+                )
                 same = not text
             elif isinstance(value, float):
-                same = math.isclose(value, expected, rel_tol=0, abs_tol=SCORE_TOLERANCE)
+                same = math.isclose(
+                    value, expected, rel_tol=0, abs_tol=SCORE_TOLERANCE
+                )
             else:
                 same = value == expected
             if not same:
@@ -174,7 +184,9 @@ def _runs_inside(folder: Path) -> Iterator[Path]:
             yield Path(at)
 
 
-def read_runs(folders: Sequence[Path]) -> tuple[list[ScoredRun], dict[Path, str]]:
+def read_runs(
+    folders: Sequence[Path],
+) -> tuple[list[ScoredRun], dict[Path, str]]:
     """The runs that can be read, and why the others cannot."""
     runs = []
     left_out = {}
@@ -197,12 +209,17 @@ def read_run(folder: Path, *, scored: bool = True) -> ScoredRun:
     # A run that is still training, or was never scored, is named as such.
     for name in (METRICS_FILE, FACTS_FILE):
         if scored and not (folder / name).is_file():
-            why = unfinished(folder) or "the run is not finished, or was not scored"
+            why = (
+                unfinished(folder)
+                or "the run is not finished, or was not scored"
+            )
             raise DataError(f"{folder}: no {name}; {why}")
 
     # A damaged file has one message, whatever its parser says.
     try:
-        scores = json.loads((folder / METRICS_FILE).read_text()) if scored else {}
+        scores = (
+            json.loads((folder / METRICS_FILE).read_text()) if scored else {}
+        )
         found = folder / FACTS_FILE
         facts = json.loads(found.read_text()) if found.is_file() else {}
         settings = _read_settings(folder)
@@ -218,7 +235,9 @@ def read_run(folder: Path, *, scored: bool = True) -> ScoredRun:
         OmegaConfBaseException,
     ) as error:
         reason = str(error).splitlines()[0]
-        raise DataError(f"{folder}: damaged ({reason}); score the run again") from None
+        raise DataError(
+            f"{folder}: damaged ({reason}); score the run again"
+        ) from None
 
     run = ScoredRun(
         folder=folder,
@@ -261,7 +280,9 @@ def flat(value: Any, at: str = "") -> Iterator[tuple[str, Any]]:
         yield at, value
 
 
-def _departures(hydra: DictConfig, chosen: Mapping[str, Any]) -> list[str] | None:
+def _departures(
+    hydra: DictConfig, chosen: Mapping[str, Any]
+) -> list[str] | None:
     if not chosen:
         return None
 
@@ -291,5 +312,7 @@ def by_settings(run: ScoredRun, keys: Sequence[str]) -> ScoredRun:
             raise ConfigError(
                 f"table.by: {run} has no setting {key} (a row is over all seeds)"
             )
-        parts.append(f"{key.rpartition('.')[2].replace('_', ' ')} {run.settings[key]}")
+        parts.append(
+            f"{key.rpartition('.')[2].replace('_', ' ')} {run.settings[key]}"
+        )
     return replace(run, name=", ".join(parts))

@@ -51,7 +51,10 @@ SPREAD_REMARK = (
     "Mean ± sample standard deviation over seeds, as many as the column seeds says; one seed has "
     "no spread."
 )
-SPLIT_TITLES = {"novel_view": " (held-out cameras)", "novel_pose": " (held-out poses)"}
+SPLIT_TITLES = {
+    "novel_view": " (held-out cameras)",
+    "novel_pose": " (held-out poses)",
+}
 # values of a protocol that differ by subject
 PER_SUBJECT = ("subject", "train_frames", "test_frames")
 UNCOMMITTED = "uncommitted changes of the code (allow_dirty=true allows them)"
@@ -108,7 +111,9 @@ class Part:
     def names(self) -> list[str]:
         """The names of models and methods; the full model is first."""
         names = {run.name for run in self.runs}
-        return sorted(names, key=lambda name: (name != "full", natural_order(name)))
+        return sorted(
+            names, key=lambda name: (name != "full", natural_order(name))
+        )
 
     @property
     def rows(self) -> list[RowSpec]:
@@ -150,37 +155,58 @@ class Part:
         frame.loc[shown_larger, "value"] *= 1000
 
         # Of equal rows, such as the floors of all runs, one with a value is kept.
-        frame.loc[frame.variant == FLOOR_VARIANT, ["name", "seed"]] = "", NO_SEED
+        frame.loc[frame.variant == FLOOR_VARIANT, ["name", "seed"]] = (
+            "",
+            NO_SEED,
+        )
         frame = frame.sort_values("value", kind="stable", na_position="last")
         frame = frame.drop_duplicates(names[:4]).sort_index()
         if self.metric is None:
             return frame
 
         # The mean over subjects, seed by seed, if all subjects have scores of the same seeds.
-        wide = frame.pivot(index=[*names[:2], "seed"], columns="column", values="value")
-        means = wide.reindex(columns=self.spec.subjects).mean(axis=1, skipna=False)
-        whole = means.groupby(level=names[:2]).transform(lambda own: own.notna().all())
-        mean = means.where(whole).rename("value").reset_index().assign(column=MEAN)
-        mean["note"] = mean.value.map(lambda value: NO_MEAN if pd.isna(value) else None)
+        wide = frame.pivot(
+            index=[*names[:2], "seed"], columns="column", values="value"
+        )
+        means = wide.reindex(columns=self.spec.subjects).mean(
+            axis=1, skipna=False
+        )
+        whole = means.groupby(level=names[:2]).transform(
+            lambda own: own.notna().all()
+        )
+        mean = (
+            means.where(whole).rename("value").reset_index().assign(column=MEAN)
+        )
+        mean["note"] = mean.value.map(
+            lambda value: NO_MEAN if pd.isna(value) else None
+        )
         return pd.concat([frame, mean])
 
     def cell(self, name: str, variant: str, column: str) -> Cell:
         """Mean ± sample standard deviation (n - 1) over seeds; one seed has no spread."""
         at = self.scores
         metric = self.columns[column]
-        own = at[(at["name"] == name) & (at.variant == variant) & (at.column == column)]
+        own = at[
+            (at["name"] == name)
+            & (at.variant == variant)
+            & (at.column == column)
+        ]
 
         # A note names its seeds unless it is about all of them.
         notes = []
         for note, few in own.groupby("note", sort=False):
-            seeds = "" if len(few) == len(own) else f"seed {', '.join(few.seed)}: "
+            seeds = (
+                "" if len(few) == len(own) else f"seed {', '.join(few.seed)}: "
+            )
             notes.append(f"{seeds}{note}")
 
         # Without a value, the notes tell why.
         values = own.value.dropna()
         if values.empty:
             reasons = notes or ["no scored run"]
-            return Cell(NOT_HAD, notes=tuple(f"{NOT_HAD}: {why}" for why in reasons))
+            return Cell(
+                NOT_HAD, notes=tuple(f"{NOT_HAD}: {why}" for why in reasons)
+            )
 
         # The spread is printed with the digits of the mean.
         mean = float(values.mean())
@@ -201,7 +227,9 @@ class Part:
             for run in self.of(None, column):
                 if run.images(self.split):
                     scored.append(run)
-                    facts.append(_column_facts(run, self, column == MEAN, allow_dirty))
+                    facts.append(
+                        _column_facts(run, self, column == MEAN, allow_dirty)
+                    )
             check_same(where, scored, facts)
             if column == MEAN:
                 continue
@@ -248,7 +276,9 @@ def _column_facts(
     return facts | {
         DATA: str(run.data.get("fingerprint")),
         "images scored": run.images(split),
-        "PSNR of an all-background image": run.of(split, FLOOR_VARIANT).get("psnr"),
+        "PSNR of an all-background image": run.of(split, FLOOR_VARIANT).get(
+            "psnr"
+        ),
         "values of the protocol": record,
     }
 
@@ -276,7 +306,9 @@ def make_tables(config: DictConfig) -> None:
             write_atomically(folder / name, content)
     except OSError as error:
         where = error.filename or folder
-        raise ConfigError(f"{where} cannot be written: {error.strerror}") from None
+        raise ConfigError(
+            f"{where} cannot be written: {error.strerror}"
+        ) from None
 
     # The terminal shows the same tables without origins.
     console = make_console()
@@ -315,7 +347,9 @@ def build(
             for metric in [None] if spec.subjects is None else spec.metrics:
                 parts.append(Part(spec, taken, split, metric))
     if not parts:
-        reasons = "; ".join(f"{folder}: {why}" for folder, why in left_out.items())
+        reasons = "; ".join(
+            f"{folder}: {why}" for folder, why in left_out.items()
+        )
         raise ConfigError(
             f"table {spec.name}: no run is left that has scored an image of "
             f"{' or '.join(spec.splits)} ({reasons or 'none left out'})"
@@ -385,7 +419,9 @@ def _grid(part: Part, paper: PaperTable | None) -> Grid:
 
     # The floor is last, and never marked as the best.
     floor = [part.cell("", FLOOR_VARIANT, column) for column in columns]
-    rows.append(Row(FLOOR_LABEL, floor, (NOT_HAD, *_origin(part.runs)), "floor"))
+    rows.append(
+        Row(FLOOR_LABEL, floor, (NOT_HAD, *_origin(part.runs)), "floor")
+    )
 
     # The metric is in the headings, or in the title if subjects are the columns.
     title = f"{part.split}{SPLIT_TITLES.get(part.split, '')}"
@@ -395,7 +431,9 @@ def _grid(part: Part, paper: PaperTable | None) -> Grid:
         remarks.append(f"Boxes: {boxes}.")
     if part.metric is None:
         return Grid(title, list(map(part.heading, columns)), rows, remarks)
-    return Grid(f"{part.heading(part.metric)}, {title}", list(columns), rows, remarks)
+    return Grid(
+        f"{part.heading(part.metric)}, {title}", list(columns), rows, remarks
+    )
 
 
 def _row(part: Part, spec: RowSpec, *, beside_paper: bool) -> Row:
@@ -437,7 +475,11 @@ def _value(
     # The evaluation writes why it left out a metric.
     held = run.of(split, variant)
     if held.get(metric) is None:
-        why = "not scored" if held else f"no {variant} image of {split} was scored"
+        why = (
+            "not scored"
+            if held
+            else f"no {variant} image of {split} was scored"
+        )
         return None, str(held.get(f"{metric}_reason", why))
     note = None
     if left_out := held.get(f"{metric}_left_out"):
@@ -472,7 +514,10 @@ def _with_best(rows: Sequence[Row], part: Part) -> list[Row]:
             mean = cells[i].mean
             if mean is not None and part.written(metric, mean) == printed:
                 cells[i] = replace(cells[i], best=True)
-    return [replace(row, cells=cells) for row, cells in zip(rows, found, strict=True)]
+    return [
+        replace(row, cells=cells)
+        for row, cells in zip(rows, found, strict=True)
+    ]
 
 
 def _origin(runs: Sequence[ScoredRun]) -> tuple[str, ...]:

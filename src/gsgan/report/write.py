@@ -53,7 +53,9 @@ class Report:
 
     title: str
     grids: Sequence[Grid]
-    left_out: Mapping[str, str] = field(default_factory=dict)  # reasons by folder
+    left_out: Mapping[str, str] = field(
+        default_factory=dict
+    )  # reasons by folder
 
     def notes(self) -> dict[str, str]:
         """A number for every note, in the order of appearance."""
@@ -88,7 +90,9 @@ class Format:
     """The parts of one text format; ``italic``, ``bold`` and ``raised`` are patterns."""
 
     escape: Callable[[str], str]
-    table: Callable[[str, list[str], list[list[str]]], str]  # of title, header and rows
+    table: Callable[
+        [str, list[str], list[list[str]]], str
+    ]  # of title, header and rows
     italic: str
     bold: str
     raised: str  # for the numbers of notes
@@ -100,7 +104,9 @@ class Format:
         def cell(text: str, marks: Sequence[str], pattern: str) -> str:
             written = pattern.format(self.escape(text))
             if marks:
-                written += self.raised.format(" ".join(notes[mark] for mark in marks))
+                written += self.raised.format(
+                    " ".join(notes[mark] for mark in marks)
+                )
             return written
 
         # The best values are bold; labels of rows that are not runs are italic.
@@ -110,7 +116,9 @@ class Format:
             pattern = "{}" if row.kind == "run" else self.italic
             line = [cell(row.label, row.notes, pattern)]
             for c in row.cells:
-                line.append(cell(c.text, c.notes, self.bold if c.best else "{}"))
+                line.append(
+                    cell(c.text, c.notes, self.bold if c.best else "{}")
+                )
             if with_origin:
                 line += map(self.escape, row.origin)
             rows.append(line)
@@ -140,7 +148,9 @@ def _escape_markdown(text: str) -> str:
     return re.sub(r"(?<!\w)_|_(?!\w)", r"\\_", text)
 
 
-def _markdown_table(title: str, header: list[str], rows: list[list[str]]) -> str:
+def _markdown_table(
+    title: str, header: list[str], rows: list[list[str]]
+) -> str:
     return f"**{title}**\n\n{markdown_table(header, rows)}"
 
 
@@ -173,7 +183,9 @@ def _escape_latex(text: str) -> str:
     """Text for LaTeX; letters that pdfLaTeX's fonts lack are written as their code point."""
     written = ""
     for letter in text.translate(LATEX_LETTERS):
-        written += letter if letter < "\u0180" else f"{{[}}U+{ord(letter):04X}{{]}}"
+        written += (
+            letter if letter < "\u0180" else f"{{[}}U+{ord(letter):04X}{{]}}"
+        )
     return written
 
 
@@ -210,9 +222,7 @@ LATEX = Format(
 def files_of(report: Report) -> dict[str, str]:
     """The files of a report by name; LaTeX has a ``table`` per grid, for ``\\input``."""
     # Wide tables are scaled to the width of the text.
-    packages = (
-        "% needs \\usepackage{booktabs} and, for wide tables, \\usepackage{graphicx}"
-    )
+    packages = "% needs \\usepackage{booktabs} and, for wide tables, \\usepackage{graphicx}"
     return {
         "report.md": f"# {MARKDOWN.escape(report.title)}\n\n{MARKDOWN.body(report)}\n",
         "report.tex": f"{packages}\n\n{LATEX.body(report)}\n",

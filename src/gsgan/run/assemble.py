@@ -59,7 +59,10 @@ def moves_with_body(config: DictConfig) -> bool:
     """Whether a config's model has parts that move with a skinned body, if the data has one."""
     # S and Gaussians on the body always need it; placing G there is an effect.
     model = config.model
-    if model.get("segmentation") is not None or model.get("surface") is not None:
+    if (
+        model.get("segmentation") is not None
+        or model.get("surface") is not None
+    ):
         return True
     on_body = _effect_settings(config).requested("body_points") != OFF
     return model.get("body_points") is not None and on_body
@@ -99,10 +102,15 @@ def build_avatar(
     torch.manual_seed(config.seed)
     with naming_group("model"):
         parts: AvatarParts = instantiate(config.model)()
-        effects = effects or decide(scene, _effect_settings(config), parts.in_effects)
+        effects = effects or decide(
+            scene, _effect_settings(config), parts.in_effects
+        )
 
         # S needs the body with a label per vertex.
-        labelled: tuple[SkinnedBody | None, str] = None, "the model leaves it out"
+        labelled: tuple[SkinnedBody | None, str] = (
+            None,
+            "the model leaves it out",
+        )
         if parts.segmentation is not None:
             labelled = labelled_body(scene, images, vertex_labels)
         return _assembled(parts, scene, effects, labelled, config.seed)
@@ -191,7 +199,9 @@ def _assembled(
     """
     template = template_of(scene.skeleton, scene.face)
     # The stature follows from limb lengths, which no pose changes.
-    body_height = float(scene.body_height) * template.stature / template.limb_length_sum
+    body_height = (
+        float(scene.body_height) * template.stature / template.limb_length_sum
+    )
     formation: dict[str, Any] = {
         "low_pass": parts.low_pass,
         "antialias": effects.antialias.on,
@@ -216,7 +226,10 @@ def _assembled(
         if body_points:
             own["mean_step"] = body_points.mean_step
         # A config with normals=null leaves it to the number of cameras.
-        if getattr(parts.deformation, "keywords", {}).get("normals", False) is None:
+        if (
+            getattr(parts.deformation, "keywords", {}).get("normals", False)
+            is None
+        ):
             own["normals"] = scene.n_train_cameras > 1
         deformation = parts.deformation(
             rest_points=points.rest_points,
@@ -225,17 +238,23 @@ def _assembled(
             **own,
         )
     if parts.surface:
-        surface = parts.surface(body=_required_body(scene, "model.surface"), **sizes)
+        surface = parts.surface(
+            body=_required_body(scene, "model.surface"), **sizes
+        )
 
     # S forms its images like F.
     segmentation = None
     if parts.segmentation and labelled[0] is not None:
-        segmentation = parts.segmentation(body=labelled[0], labelled=scene.has_labels)
+        segmentation = parts.segmentation(
+            body=labelled[0], labelled=scene.has_labels
+        )
         segmentation.accuracy = replace(segmentation.accuracy, **formation)
         segmentation.backend = parts.backend
 
     # Parts on a body need its solver for skeletons without a body pose.
-    on_a_body = any(part is not None for part in (body_points, surface, segmentation))
+    on_a_body = any(
+        part is not None for part in (body_points, surface, segmentation)
+    )
 
     # The rest: the generator and the colour corrections.
     torch.manual_seed(seed + 2)
@@ -243,7 +262,9 @@ def _assembled(
     return Avatar(
         effects=effects,
         template=template,
-        accuracy=replace(parts.accuracy, supersample=parts.supersample, **formation),
+        accuracy=replace(
+            parts.accuracy, supersample=parts.supersample, **formation
+        ),
         limb_length_sum=float(scene.body_height),
         body_height=body_height,
         deformation=deformation,
@@ -253,12 +274,16 @@ def _assembled(
         segmentation=segmentation,
         segmentation_why=labelled[1],
         pose_encoder=parts.pose_encoder,
-        generator=_generator(parts, template, deformation or surface, segmentation),
+        generator=_generator(
+            parts, template, deformation or surface, segmentation
+        ),
         colour=ColourCorrection(effects.cameras, scene.camera_names)
         if colours
         else None,
         poses=scene.poses,
-        solver=Solver(_required_body(scene, "the model")) if on_a_body else None,
+        solver=Solver(_required_body(scene, "the model"))
+        if on_a_body
+        else None,
         **{name: getattr(parts, name) for name in OPTIONS},
     )
 
@@ -286,7 +311,9 @@ def _generator(
 
 def _effect_settings(config: DictConfig) -> EffectSettings:
     """The effects group of a config; commands that score other methods have none."""
-    return instantiate(config.effects) if "effects" in config else EffectSettings()
+    return (
+        instantiate(config.effects) if "effects" in config else EffectSettings()
+    )
 
 
 @contextmanager
@@ -295,7 +322,9 @@ def naming_group(group: str) -> Iterator[None]:
     try:
         yield
     except (TypeError, ValueError, RuntimeError) as error:
-        raise ConfigError(f"{group}: {str(error).partition(chr(10))[0]}") from error
+        raise ConfigError(
+            f"{group}: {str(error).partition(chr(10))[0]}"
+        ) from error
 
 
 def _required_body(scene: SceneInfo, part: str) -> MarkedBody:
@@ -306,7 +335,9 @@ def _required_body(scene: SceneInfo, part: str) -> MarkedBody:
         )
 
     # The body itself may be absent: model files of SMPL are the user's.
-    body = open_body(scene.body, scene.body_file, scene.betas, scene.label_names)
+    body = open_body(
+        scene.body, scene.body_file, scene.betas, scene.label_names
+    )
     if body is None:
         raise DataError(
             f"{part} cannot be built: the data's poses are of the body {scene.body!r}, of which "

@@ -44,7 +44,9 @@ def labelled_body(
     # S needs a body that can be posed.
     if not scene.has_body_pose:
         return None, "the data has no body pose"
-    body = open_body(scene.body, scene.body_file, scene.betas, scene.label_names)
+    body = open_body(
+        scene.body, scene.body_file, scene.betas, scene.label_names
+    )
     if body is None:
         return None, (
             f"the data's poses are of the body {scene.body!r}, of which there is no model file"
@@ -76,7 +78,9 @@ def labelled_body(
                 f"the checkpoint's labels of {len(vertex_labels)} vertices do not fit this "
                 f"{scene.body} body or its data; give the model file and the data of the training"
             )
-        return body.voted(vertex_labels, names), "parts voted when training began"
+        return body.voted(
+            vertex_labels, names
+        ), "parts voted when training began"
 
     # A new avatar votes over its training images.
     if not images:
@@ -102,7 +106,9 @@ class Votes(NamedTuple):
     images: int  # number of images used
 
 
-def class_vote(body: SkinnedBody, images: Subset[Frame], n_labels: int) -> Votes:
+def class_vote(
+    body: SkinnedBody, images: Subset[Frame], n_labels: int
+) -> Votes:
     """Votes over frames of one item each, for ``n_labels`` labels, background included.
 
     Each vertex gets a vote for the label at its pixel from every image in which the body does not
@@ -135,7 +141,9 @@ def class_vote(body: SkinnedBody, images: Subset[Frame], n_labels: int) -> Votes
     return Votes(labels, float(decided.double().mean()), len(chosen))
 
 
-def _count(votes: Tensor, body: SkinnedBody, reach: Tensor, frame: Frame) -> None:
+def _count(
+    votes: Tensor, body: SkinnedBody, reach: Tensor, frame: Frame
+) -> None:
     """Adds one image's votes to ``[V, n_labels]``."""
     if frame.labels is None or frame.body is None:
         return
@@ -152,10 +160,14 @@ def _count(votes: Tensor, body: SkinnedBody, reach: Tensor, frame: Frame) -> Non
     vertex = inside.nonzero().squeeze(-1)
     label = frame.labels[0, row[vertex], column[vertex]]
     valid = (label > 0) & (label != IGNORE) & (label < votes.shape[1])
-    votes[vertex[valid], label[valid]] += 1  # each vertex once: no index occurs twice
+    votes[vertex[valid], label[valid]] += (
+        1  # each vertex once: no index occurs twice
+    )
 
 
-def seen(points: Tensor, reach: Tensor, camera: Camera, tolerance: float) -> Tensor:
+def seen(
+    points: Tensor, reach: Tensor, camera: Camera, tolerance: float
+) -> Tensor:
     """``[V]`` bool: points not hidden behind others, each a disc that faces the camera.
 
     The depth map's cells are a fraction of the discs, so the result does not depend on the image
@@ -193,7 +205,9 @@ def seen(points: Tensor, reach: Tensor, camera: Camera, tolerance: float) -> Ten
     # A point is seen if it is not much deeper than the nearest disc over its cell.
     at = (pixel[ahead] / cell).floor().long()
     at = at - at.amin(0) + MAX_RADIUS_CELLS
-    nearest = _depth_map(at, depth[ahead], (radius / cell).clamp_max(MAX_RADIUS_CELLS))
+    nearest = _depth_map(
+        at, depth[ahead], (radius / cell).clamp_max(MAX_RADIUS_CELLS)
+    )
     visible[ahead] = depth[ahead] <= nearest[at[:, 1], at[:, 0]] + tolerance
     return visible
 
@@ -225,10 +239,14 @@ def _majority(votes: Tensor) -> tuple[Tensor, Tensor]:
     # Vertices without votes have a maximum of zero, which all labels share.
     maximum = votes.amax(dim=1)
     winners = votes == maximum[:, None]
-    return winners.int().argmax(dim=1), (maximum > 0) & (winners.sum(dim=1) == 1)
+    return winners.int().argmax(dim=1), (maximum > 0) & (
+        winners.sum(dim=1) == 1
+    )
 
 
-def _from_the_nearest(vertices: Tensor, labels: Tensor, decided: Tensor) -> Tensor:
+def _from_the_nearest(
+    vertices: Tensor, labels: Tensor, decided: Tensor
+) -> Tensor:
     """Labels ``[V]``, those not decided taken from the nearest decided vertex."""
     known = decided.nonzero().squeeze(-1)
     _, nearest = cKDTree(vertices[known]).query(vertices[~decided])

@@ -26,7 +26,13 @@ from gsgan.motion.clip import (
     up_axis,
 )
 from gsgan.motion.readers import Source, read_motion
-from gsgan.motion.retarget import expressed, face_in_head, joined, placed, retargeted
+from gsgan.motion.retarget import (
+    expressed,
+    face_in_head,
+    joined,
+    placed,
+    retargeted,
+)
 from gsgan.motion.smooth import OneEuro
 from gsgan.run.runs import Run
 from gsgan.scene import BodyPose, Camera, cat
@@ -131,7 +137,9 @@ def smoothed(config: DictConfig, drive: Drive, fps: float) -> Drive:
     joints = []
     for number, p in zip(drive.numbers, drive.p, strict=True):
         joints.append(smooth(p, number / fps))
-    return replace(drive, p=np.stack(joints), body=None, text=f"{drive.text}, smoothed")
+    return replace(
+        drive, p=np.stack(joints), body=None, text=f"{drive.text}, smoothed"
+    )
 
 
 def with_motion(config: DictConfig, motion: str) -> DictConfig:
@@ -147,13 +155,19 @@ def _chosen(config: DictConfig, run: Run, fps: float) -> Drive:
         found = _held_out(config, run, split)
         frame = found.numbers[0]
         still = found.rows(np.zeros(1, np.int64))
-        return replace(still, text=f"frame {frame} of {split}, held still", camera=None)
+        return replace(
+            still, text=f"frame {frame} of {split}, held still", camera=None
+        )
 
     # Several files: one after the other, with transitions.
     if OmegaConf.is_list(config.motion):
         if config.retarget is False:
-            raise ConfigError("retarget=false is not supported for a list of motions")
-        clips = [_from_file(config, run, str(path), fps) for path in config.motion]
+            raise ConfigError(
+                "retarget=false is not supported for a list of motions"
+            )
+        clips = [
+            _from_file(config, run, str(path), fps) for path in config.motion
+        ]
         seconds = float(above("transition", config.transition))
         return _joined(clips, run.proportions, seconds, fps)
 
@@ -203,7 +217,9 @@ def _held_out(config: DictConfig, run: Run, split: str) -> Drive:
         seen = cat([dataset.camera(item) for item in items]), index
     return Drive(
         p=np.stack([dataset.skeletons.p[frame] for frame in frames]),
-        visibility=np.stack([dataset.skeletons.visibility[frame] for frame in frames]),
+        visibility=np.stack(
+            [dataset.skeletons.visibility[frame] for frame in frames]
+        ),
         body=body,
         numbers=frames,
         text=text,
@@ -216,7 +232,9 @@ def _joined(
 ) -> Drive:
     """Clips one after the other, with transitions of ``seconds``."""
     if not clips:
-        raise ConfigError("motion=[] names no file; expected motion=[a.pose,b.pose]")
+        raise ConfigError(
+            "motion=[] names no file; expected motion=[a.pose,b.pose]"
+        )
 
     # Joints that a clip lacks (hands, a face) are unknown in its frames. Transitions are
     # made in standard axes.
@@ -225,7 +243,9 @@ def _joined(
     parts = []
     for clip in clips:
         lacking = (0, joints - clip.p.shape[1])
-        padded = np.pad(clip.p, ((0, 0), lacking, (0, 0)), constant_values=np.nan)
+        padded = np.pad(
+            clip.p, ((0, 0), lacking, (0, 0)), constant_values=np.nan
+        )
         parts.append(padded @ standard.T)
     between = max(1, round(seconds * fps) - 1)
     p = joined(parts, proportions, between) @ standard
@@ -310,7 +330,9 @@ def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
 
     # One line on what was read and what was made of it.
     bones = "bones as they are" if own else "on the subject's bones"
-    assumed = "" if config.motion_fps or motion.fps else " (assumed: give motion_fps)"
+    assumed = (
+        "" if config.motion_fps or motion.fps else " (assumed: give motion_fps)"
+    )
     text = (
         f"{motion.path.name}{motion.part}: {_frames(len(motion))} at {rate:.5g} per "
         f"second{assumed}, {motion.unit}, {(motion.file_up or up).upper()} up -> "
@@ -409,4 +431,6 @@ def distilled_of(config: DictConfig, run: Run) -> Avatar:
     # The fit takes poses at even distances, from the first to the last.
     drive = drive_of(with_motion(config, "train"), run, 1.0)
     chosen = evenly_spaced(len(drive.p), DISTILLED, ends=True)
-    return distilled(run.avatar, (inputs_of(run.avatar, drive, i) for i in chosen))
+    return distilled(
+        run.avatar, (inputs_of(run.avatar, drive, i) for i in chosen)
+    )

@@ -104,7 +104,10 @@ def avatar_of(
 
 
 def _trained(
-    folder: Path, config: DictConfig, checkpoint: dict[str, Any], scene: SceneInfo
+    folder: Path,
+    config: DictConfig,
+    checkpoint: dict[str, Any],
+    scene: SceneInfo,
 ) -> Avatar:
     # The avatar's weights: the averaged ones, once averaging has begun.
     stored = checkpoint["gsgan"]
@@ -119,7 +122,9 @@ def _trained(
     labels = state.get("segmentation.vertex_labels")
     effects = Effects.from_plain(stored["effects"])
     try:
-        avatar = build_avatar(config, scene, effects=effects, vertex_labels=labels)
+        avatar = build_avatar(
+            config, scene, effects=effects, vertex_labels=labels
+        )
     except (TypeError, ValueError, OverflowError) as error:
         reason = str(error).split("\n")[0]
         raise DataError(
@@ -209,7 +214,9 @@ class Run:
     @property
     def body_file(self) -> str | None:
         """The user's model file of the body, or None."""
-        return self.paths.smpl or absolute_path(self.folder, self.scene.body_file)
+        return self.paths.smpl or absolute_path(
+            self.folder, self.scene.body_file
+        )
 
     @property
     def proportions(self) -> Proportions:
@@ -224,4 +231,6 @@ class Run:
         # Without a face of its own the avatar gets the template's.
         template = self.avatar.template
         template = template if template.expression else HOLISTIC
-        return constants(template, torch.device("cpu"), torch.float64).face_rest.numpy()
+        return constants(
+            template, torch.device("cpu"), torch.float64
+        ).face_rest.numpy()

@@ -94,7 +94,9 @@ def read_config(folder: Path) -> DictConfig:
         )
     config = read_yaml(path)
     if not {"data", "model"} <= config.keys():
-        raise DataError(f"{path}: expected the config of a run with data and model")
+        raise DataError(
+            f"{path}: expected the config of a run with data and model"
+        )
     return config
 
 
@@ -110,8 +112,14 @@ def read_yaml(path: Path) -> DictConfig:
         for before, now in MOVED.items():
             text = text.replace(before, now)
         config = OmegaConf.create(text)
-    except (UnicodeDecodeError, yaml.YAMLError, OmegaConfBaseException) as error:
-        raise DataError(f"{path}: damaged ({str(error).splitlines()[0]})") from None
+    except (
+        UnicodeDecodeError,
+        yaml.YAMLError,
+        OmegaConfBaseException,
+    ) as error:
+        raise DataError(
+            f"{path}: damaged ({str(error).splitlines()[0]})"
+        ) from None
     if not isinstance(config, DictConfig):
         raise DataError(f"{path}: damaged (expected keys with values)")
     rename_keys(config)
@@ -145,7 +153,9 @@ def load_config(folder: Path, paths: DataPaths | None = None) -> DictConfig:
     # Only a run that read a model file can read another copy of it.
     if paths.smpl is not None and OmegaConf.select(config, "data.smpl") is None:
         # Skeletons would then be those of SMPL fits, and the scores of another model.
-        raise ConfigError(f"data_smpl: {folder} was trained without a body model file")
+        raise ConfigError(
+            f"data_smpl: {folder} was trained without a body model file"
+        )
 
     # Paths of the run, unless the user gives others.
     for key, what in (("root", "dataset"), ("smpl", "body model file")):
@@ -185,7 +195,11 @@ def hydra_record(folder: Path) -> DictConfig:
 def choices(folder: Path) -> dict[str, Any]:
     """The config groups' choices that Hydra recorded in a run folder; empty without a record."""
     found = OmegaConf.select(hydra_record(folder), "hydra.runtime.choices")
-    return {} if found is None else {str(key): value for key, value in found.items()}
+    return (
+        {}
+        if found is None
+        else {str(key): value for key, value in found.items()}
+    )
 
 
 def record(config: DictConfig) -> dict[str, Any]:
@@ -225,7 +239,8 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
     # Other programs' checkpoints lack these entries.
     if not (
-        isinstance(checkpoint, dict) and {"gsgan", "state_dict"} <= checkpoint.keys()
+        isinstance(checkpoint, dict)
+        and {"gsgan", "state_dict"} <= checkpoint.keys()
     ):
         raise DataError(
             f"{path}: not a checkpoint of gsgan (no entries 'gsgan' and 'state_dict')"

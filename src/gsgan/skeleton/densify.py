@@ -54,7 +54,9 @@ class Points:
 
     means: Tensor  # [B, N, 3] metres, world frame
     rotations: Tensor  # [B, P, 3, 3] frames of the parts in the world
-    origins: Tensor  # [B, P, 3] metres, world frame: origin of each part's frame
+    origins: (
+        Tensor  # [B, P, 3] metres, world frame: origin of each part's frame
+    )
     scales: Tensor  # [B, N] metres, initial standard deviation, isotropic
     valid: Tensor  # [B, N] bool, False on parts whose joints are unseen
     part_id: Tensor  # [N] int64 into the parts
@@ -169,7 +171,12 @@ class Densify(nn.Module):
         one_of("Densify: sampler", sampler, get_args(Sampler))
 
         # Every part has at least one point.
-        counts = (points_per_limb, face_points, torso_points, points_per_finger_bone)
+        counts = (
+            points_per_limb,
+            face_points,
+            torso_points,
+            points_per_finger_bone,
+        )
         for name, count in zip(COUNT_NAMES, counts, strict=True):
             whole(f"Densify: {name}", count, 1)
 
@@ -180,7 +187,9 @@ class Densify(nn.Module):
         self.finger_radius_ratio = above(
             "Densify: finger_radius_ratio", finger_radius_ratio
         )
-        self.face_radius_scale = above("Densify: face_radius_scale", face_radius_scale)
+        self.face_radius_scale = above(
+            "Densify: face_radius_scale", face_radius_scale
+        )
         self.torso = one_of("Densify: torso", torso, get_args(Torso))
         self.sigma = above("Densify: sigma", sigma)
         self._make_buffers(sampler, dtype or torch.get_default_dtype())
@@ -210,13 +219,17 @@ class Densify(nn.Module):
         along = _limb_axes(t).mT.numpy()
         finger = even_cylinder(n_bone)
         limbs = _turned(cylinder, self.radius_ratio, along[list(t.measured)])
-        bones = _turned(finger, self.finger_radius_ratio, along[list(t.fingers)])
+        bones = _turned(
+            finger, self.finger_radius_ratio, along[list(t.fingers)]
+        )
 
         def buffer(name: str, value: object) -> None:
             tensor = torch.as_tensor(np.asarray(value))
             if tensor.is_floating_point():
                 tensor = tensor.to(dtype)
-            self.register_buffer(name, tensor, persistent=not name.startswith("_"))
+            self.register_buffer(
+                name, tensor, persistent=not name.startswith("_")
+            )
 
         # The order of the points: limbs, bones of hands, face, torso.
         face = len(t.limbs)
@@ -245,7 +258,10 @@ class Densify(nn.Module):
         self.register_buffer("rest_points", (means - root) / t.stature)
 
     def forward(
-        self, p: Tensor, valid: Tensor | None = None, frames: BoneFrames | None = None
+        self,
+        p: Tensor,
+        valid: Tensor | None = None,
+        frames: BoneFrames | None = None,
     ) -> Points:
         """Moves the points to a pose.
 
@@ -302,7 +318,9 @@ class Densify(nn.Module):
         means.append(self._torso_points @ box_axes + origins[:, -1:])
 
         # Stretching a cylinder or a box along its axes does not change its normals.
-        turned = rotations.index_select(1, self.part_id) @ self.normals.unsqueeze(-1)
+        turned = rotations.index_select(
+            1, self.part_id
+        ) @ self.normals.unsqueeze(-1)
         limb_sigma = frames.lengths * self._limb_sigma
         sigma = torch.cat([limb_sigma, self._hub_sigma(radius, edges)], dim=1)
         return Points(
@@ -333,7 +351,9 @@ class Densify(nn.Module):
     def _torso_edges(self, q: Tensor, torso: Tensor) -> Tensor:
         """``[B, 3]`` metres: left-right, up, front."""
         if self.torso == "cube":
-            return self._longest(q, self._torso_pairs).unsqueeze(1).expand(-1, 3)
+            return (
+                self._longest(q, self._torso_pairs).unsqueeze(1).expand(-1, 3)
+            )
         # The lines between the shoulders, between the hips, and along the spine.
         l_sh, r_sh, l_hip, r_hip = torso.unbind(1)
         spine = (l_sh + r_sh - l_hip - r_hip) * 0.5
@@ -355,7 +375,9 @@ class Densify(nn.Module):
         limb = float(self.sigma * (limb_area / self.counts[0]) ** 0.5)
         sigmas = [limb] * len(self.template.limbs)
         for i in self.template.fingers:
-            sigmas[i] = float(self.sigma * (finger_area / self.counts[3]) ** 0.5)
+            sigmas[i] = float(
+                self.sigma * (finger_area / self.counts[3]) ** 0.5
+            )
         return sigmas
 
     def _hub_sigma(self, radius: Tensor, edges: Tensor) -> Tensor:
@@ -402,7 +424,9 @@ def even_sphere(n: int) -> Samples:
     return Samples(points, points.copy())
 
 
-def even_box(n: int, extents: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Samples:
+def even_box(
+    n: int, extents: tuple[float, float, float] = (1.0, 1.0, 1.0)
+) -> Samples:
     """``n`` points on the unit box, per face in proportion to its area when scaled to ``extents``.
 
     Faces are filled by the R2 sequence (Roberts 2018), a two-dimensional golden ratio.

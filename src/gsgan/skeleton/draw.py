@@ -90,7 +90,11 @@ def _segment_ends(template: SkeletonTemplate, device: torch.device) -> Tensor:
 
 
 def _distance2(
-    a: Tensor, b: Tensor, shown: Tensor, size: tuple[int, int], counts: list[int]
+    a: Tensor,
+    b: Tensor,
+    shown: Tensor,
+    size: tuple[int, int],
+    counts: list[int],
 ) -> Tensor:
     """``[B, groups, h, w]`` squared pixels to each group's nearest segment; huge if none is drawn.
 
@@ -109,8 +113,12 @@ def _distance2(
     away = torch.where(shown, 0.0, 1e4 * float(max(h, w)))
 
     # Pixel centres from the segments' first ends, and the segments' own axes.
-    x = torch.arange(w, device=a.device, dtype=a.dtype) + 0.5 - a[..., :1]  # [B, S, w]
-    y = torch.arange(h, device=a.device, dtype=a.dtype) + 0.5 - a[..., 1:]  # [B, S, h]
+    x = (
+        torch.arange(w, device=a.device, dtype=a.dtype) + 0.5 - a[..., :1]
+    )  # [B, S, w]
+    y = (
+        torch.arange(h, device=a.device, dtype=a.dtype) + 0.5 - a[..., 1:]
+    )  # [B, S, h]
     forward = d / length2
     sideways = d * length2.rsqrt()
 
@@ -134,7 +142,11 @@ def _distance2(
 
 
 def _nearest(
-    along_x: Tensor, along_y: Tensor, across_x: Tensor, across_y: Tensor, length: Tensor
+    along_x: Tensor,
+    along_y: Tensor,
+    across_x: Tensor,
+    across_y: Tensor,
+    length: Tensor,
 ) -> Tensor:
     """``[B, h, w]`` squared pixels to the nearest of one group's segments ``[B, S, ...]``."""
     # The distance along the segment beyond its ends, and that from its line.

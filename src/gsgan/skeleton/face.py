@@ -12,7 +12,9 @@ from torch import Tensor
 from gsgan.skeleton.template import MEDIAPIPE33, Edge, SkeletonTemplate, Vector
 from gsgan.skeleton.tensors import constants
 
-LIP_POINTS = 12  # round the outer edge: 0 left corner, 3 top, 6 right corner, 9 bottom
+LIP_POINTS = (
+    12  # round the outer edge: 0 left corner, 3 top, 6 right corner, 9 bottom
+)
 BROW_POINTS = 5  # from the nose outwards
 LID_POINTS = ("inner", "upper", "outer", "lower")
 SIDES = ("left", "right")
@@ -90,7 +92,8 @@ def face_groups(start: int) -> tuple[tuple[str, tuple[Edge, ...]], ...]:
 
     def joined(*chains: tuple[str, ...]) -> tuple[Edge, ...]:
         numbers = (
-            [start + FACE_NAMES.index(name) for name in chain] for chain in chains
+            [start + FACE_NAMES.index(name) for name in chain]
+            for chain in chains
         )
         return tuple(pair for chain in numbers for pair in pairwise(chain))
 
@@ -112,7 +115,9 @@ def face_links(start: int) -> tuple[Edge, ...]:
         ends[f"{side}_eye_inner"] = lid[0]
         ends[f"{side}_eye_outer"] = lid[2]
     names = MEDIAPIPE33.names
-    return tuple((names.index(a), start + FACE_NAMES.index(b)) for a, b in ends.items())
+    return tuple(
+        (names.index(a), start + FACE_NAMES.index(b)) for a, b in ends.items()
+    )
 
 
 def in_head(
@@ -131,7 +136,9 @@ def in_head(
     return (points - middle) @ head
 
 
-def face_code(p: Tensor, head: Tensor, template: SkeletonTemplate) -> Tensor | None:
+def face_code(
+    p: Tensor, head: Tensor, template: SkeletonTemplate
+) -> Tensor | None:
     """``[B, E, 3]`` offsets of the face's landmarks from the face at rest, in units of `CODE_UNIT`.
 
     Offsets are in the head's axes; they are zero for a face at rest, however the head turns, and so

@@ -16,9 +16,20 @@ from torch.nn.functional import pad
 
 from gsgan.skeleton.face import face_code
 from gsgan.skeleton.hands import palm_frames
-from gsgan.skeleton.rotation6d import across, rotation_from_6d, rotation_to_6d, unit
+from gsgan.skeleton.rotation6d import (
+    across,
+    rotation_from_6d,
+    rotation_to_6d,
+    unit,
+)
 from gsgan.skeleton.template import CHEST, HEAD, MEDIAPIPE33, SkeletonTemplate
-from gsgan.skeleton.tensors import FOLDED, Constants, Level, check_skeleton, constants
+from gsgan.skeleton.tensors import (
+    FOLDED,
+    Constants,
+    Level,
+    check_skeleton,
+    constants,
+)
 from gsgan.utils.tensors import squared_norm
 
 MIN_LENGTH = 1e-3
@@ -55,7 +66,9 @@ def root_of(p: Tensor, template: SkeletonTemplate = MEDIAPIPE33) -> Tensor:
 
 
 def bone_frames(
-    p: Tensor, valid: Tensor | None = None, template: SkeletonTemplate = MEDIAPIPE33
+    p: Tensor,
+    valid: Tensor | None = None,
+    template: SkeletonTemplate = MEDIAPIPE33,
 ) -> BoneFrames:
     """The frames of trunk, head and limbs.
 

@@ -36,7 +36,16 @@ MIN_PALM = 1e-3  # metres: a smaller palm has no frame
 # The connections that MediaPipe draws.
 HAND_EDGES = (
     *((0, 1), (1, 2), (2, 3), (3, 4), (0, 5), (5, 6), (6, 7), (7, 8)),
-    *((5, 9), (9, 10), (10, 11), (11, 12), (9, 13), (13, 14), (14, 15), (15, 16)),
+    *(
+        (5, 9),
+        (9, 10),
+        (10, 11),
+        (11, 12),
+        (9, 13),
+        (13, 14),
+        (14, 15),
+        (15, 16),
+    ),
     *((13, 17), (17, 18), (18, 19), (19, 20), (0, 17)),
 )
 
@@ -60,4 +69,6 @@ def palm_frames(palm: Tensor) -> Tensor:
     across = index - pinky
     across = across - (across * along).sum(-1, keepdim=True) * along
     across = normalize(across, dim=-1, eps=MIN_PALM)
-    return torch.stack([along, across, torch.linalg.cross(along, across)], dim=-1)
+    return torch.stack(
+        [along, across, torch.linalg.cross(along, across)], dim=-1
+    )

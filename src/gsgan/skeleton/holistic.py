@@ -26,12 +26,21 @@ from gsgan.skeleton.hands import (
     WRIST,
     hand_names,
 )
-from gsgan.skeleton.template import MEDIAPIPE33, N_HUBS, Edge, SkeletonTemplate, Vector
+from gsgan.skeleton.template import (
+    MEDIAPIPE33,
+    N_HUBS,
+    Edge,
+    SkeletonTemplate,
+    Vector,
+)
 from gsgan.utils.checks import one_of
 
 POSE = MEDIAPIPE33
 STARTS = (len(POSE.names), len(POSE.names) + HAND)  # each hand's wrist
-POSE_ARMS = ((11, 13, 15), (12, 14, 16))  # shoulder, elbow and wrist of the pose
+POSE_ARMS = (
+    (11, 13, 15),
+    (12, 14, 16),
+)  # shoulder, elbow and wrist of the pose
 HUBS_WITH_PALMS = N_HUBS + len(STARTS)
 # Lengths of a straight finger's bones and of the thumb's last ones, metres.
 FINGER_LENGTHS = {
@@ -122,10 +131,14 @@ def _with_hands() -> SkeletonTemplate:
 
     # The right hand at rest is the mirror image of the left one.
     left = _hand_at_rest()
-    rest = np.concatenate([np.asarray(POSE.rest_positions), left, left * [-1, 1, 1]])
+    rest = np.concatenate(
+        [np.asarray(POSE.rest_positions), left, left * [-1, 1, 1]]
+    )
 
     # Edges to draw and for the graph network, within hands and from wrist to hand.
-    edges = tuple((start + a, start + b) for start in STARTS for a, b in HAND_EDGES)
+    edges = tuple(
+        (start + a, start + b) for start in STARTS for a, b in HAND_EDGES
+    )
     wrists = tuple(
         (arm[-1], start) for arm, start in zip(POSE_ARMS, STARTS, strict=True)
     )
@@ -133,7 +146,10 @@ def _with_hands() -> SkeletonTemplate:
     # The hands' own forearms have no cylinder; left and right hands exchange in the mirror.
     fingers = set(range(len(POSE.limbs), len(limbs))) - set(bare)
     left_start, right_start = STARTS
-    swapped = [*range(right_start, right_start + HAND), *range(left_start, right_start)]
+    swapped = [
+        *range(right_start, right_start + HAND),
+        *range(left_start, right_start),
+    ]
     names = [name.replace("wrist", "hand_wrist") for name in hand_names()]
     wrist, index, pinky = PALM
     return replace(
@@ -147,7 +163,9 @@ def _with_hands() -> SkeletonTemplate:
         mirror=(*POSE.mirror, *swapped),
         draw_groups=(*POSE.draw_groups, *groups),
         gnn_edges=(*POSE.gnn_edges, *edges, *wrists),
-        palms=tuple((start + wrist, start + index, start + pinky) for start in STARTS),
+        palms=tuple(
+            (start + wrist, start + index, start + pinky) for start in STARTS
+        ),
         fingers=tuple(sorted(fingers)),
         bare=tuple(bare),
     )
@@ -187,7 +205,9 @@ TEMPLATES = {
 """Templates by the values of ``data.skeleton``; each begins with the joints of the one before."""
 
 
-def template_of(skeleton: str, face: Sequence[Vector] | None) -> SkeletonTemplate:
+def template_of(
+    skeleton: str, face: Sequence[Vector] | None
+) -> SkeletonTemplate:
     """A template by its name, with a person's own face at rest if it is known."""
     template = TEMPLATES[skeleton]
     return template if face is None else template.with_face(face)

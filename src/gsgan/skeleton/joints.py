@@ -49,7 +49,29 @@ _COCO = {landmark: joint for joint, landmark in enumerate(_SHARED)}
 _BODY_25 = dict(
     zip(
         _SHARED + _FEET,
-        (0, 16, 15, 18, 17, 5, 2, 6, 3, 7, 4, 12, 9, 13, 10, 14, 11, 21, 24, 19, 22),
+        (
+            0,
+            16,
+            15,
+            18,
+            17,
+            5,
+            2,
+            6,
+            3,
+            7,
+            4,
+            12,
+            9,
+            13,
+            10,
+            14,
+            11,
+            21,
+            24,
+            19,
+            22,
+        ),
         strict=True,
     )
 )

@@ -121,7 +121,11 @@ def measure_proportions(
         ends = [pinky, index, thumb]
         frames = hand_frame(q, wrist, pinky, index)  # [F, 3, 3]
         held = _local(frames, q[:, ends] - q[:, wrist, None])  # [3, 3]
-        rest[ends] = rest[wrist] + held * (BODY_SIDES[wrist], 1.0, BODY_SIDES[wrist])
+        rest[ends] = rest[wrist] + held * (
+            BODY_SIDES[wrist],
+            1.0,
+            BODY_SIDES[wrist],
+        )
     _place_feet(rest, q)
     _place_head(rest, q, hubs)
     hands = _hands(p.double().numpy() @ to_standard, valid.numpy())
@@ -155,7 +159,12 @@ def _place_limbs(rest: Float, q: Float) -> None:
 
     # Arms point to the sides, legs down; each bone starts where the one before it ends.
     down = (0, 0, -1)
-    ways = {ARMS[0]: (1, 0, 0), ARMS[1]: (-1, 0, 0), LEGS[0]: down, LEGS[1]: down}
+    ways = {
+        ARMS[0]: (1, 0, 0),
+        ARMS[1]: (-1, 0, 0),
+        LEGS[0]: down,
+        LEGS[1]: down,
+    }
     for limb, way in ways.items():
         for a, b in limb:
             rest[b] = rest[a] + median_length(q[:, a], q[:, b]) * np.array(way)
@@ -175,7 +184,9 @@ def _place_feet(rest: Float, q: Float) -> None:
         size = np.linalg.norm(ahead, axis=-1, keepdims=True)
         back = -ahead / np.maximum(size, 1e-9)
         above = np.broadcast_to([0.0, 0, 1], back.shape)
-        axes = np.stack([np.cross(back, above), back, above], axis=-1)  # [F, 3, 3]
+        axes = np.stack(
+            [np.cross(back, above), back, above], axis=-1
+        )  # [F, 3, 3]
 
         held = _local(axes, stands[:, foot] - stands[:, ankle, None])
         rest[foot] = rest[ankle] + held
@@ -234,7 +245,9 @@ def _hands(p: Float, seen: Bool) -> dict[int, Float]:
 def _hand(p: Float, wrist: Float) -> Float:
     """``[21, 3]`` medians of a hand ``[F, 21, 3]`` from the pose's wrist ``[F, 3]``, in the palm's
     axes; fingers have the median lengths of their bones."""
-    local = (p - wrist[:, None]) @ hand_frame(p, WRIST, PINKY, INDEX)  # [F, 21, 3]
+    local = (p - wrist[:, None]) @ hand_frame(
+        p, WRIST, PINKY, INDEX
+    )  # [F, 21, 3]
     median = np.median(local, axis=0)
 
     # Medians of positions shorten bones, so each bone gets its median length, parents first.
@@ -251,7 +264,9 @@ def _standing_hands(rest: Float, hands: Mapping[int, Float]) -> Float:
     # The signs turn the palm's axes into the standard axes of that side.
     placed = []
     for wrist, hand in hands.items():
-        placed.append(rest[wrist] + hand * (BODY_SIDES[wrist], 1.0, BODY_SIDES[wrist]))
+        placed.append(
+            rest[wrist] + hand * (BODY_SIDES[wrist], 1.0, BODY_SIDES[wrist])
+        )
     return np.concatenate(placed)
 
 
@@ -317,7 +332,9 @@ def hand_frame(
 def part_frame(along: Float, across: Float) -> Float:
     """``[..., 3, 3]`` columns: a direction, another made orthogonal to it, their cross product."""
     # Gram-Schmidt: each direction becomes a unit vector, zero vectors stay zero.
-    first = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-9)
+    first = along / np.maximum(
+        np.linalg.norm(along, axis=-1, keepdims=True), 1e-9
+    )
     second = across - (across * first).sum(-1, keepdims=True) * first
     size = np.linalg.norm(second, axis=-1, keepdims=True)
     second = second / np.maximum(size, 1e-9)

@@ -57,7 +57,9 @@ def rotation_from_6d(x: Tensor, eps: float = 1e-5) -> Tensor:
     second = unit(torch.where(unusable, orthogonal_to(first.detach()), part))
     # Once more: after cancellation the first pass leaves a part along the first column.
     second = unit(across(first, second))
-    return torch.stack([first, second, torch.linalg.cross(first, second)], dim=-1)
+    return torch.stack(
+        [first, second, torch.linalg.cross(first, second)], dim=-1
+    )
 
 
 def orthogonal_to(axis: Tensor) -> Tensor:

@@ -9,7 +9,13 @@ from torch.nn.functional import pad
 
 from gsgan.skeleton.frames import bone_frames, hubs_of, palms_of, swings
 from gsgan.skeleton.holistic import TEMPLATES
-from gsgan.skeleton.template import CHEST, HEAD, MEDIAPIPE33, N_HUBS, SkeletonTemplate
+from gsgan.skeleton.template import (
+    CHEST,
+    HEAD,
+    MEDIAPIPE33,
+    N_HUBS,
+    SkeletonTemplate,
+)
 from gsgan.skeleton.tensors import Constants, check_skeleton, constants
 from gsgan.utils.tensors import constant, matvec
 
@@ -19,7 +25,9 @@ MIN_TRUNK_JOINTS = 3
 
 
 def limb_length_sum(
-    p: Tensor, valid: Tensor | None = None, template: SkeletonTemplate = MEDIAPIPE33
+    p: Tensor,
+    valid: Tensor | None = None,
+    template: SkeletonTemplate = MEDIAPIPE33,
 ) -> Tensor:
     """The sum of limb lengths, h_body: a measure of the subject's size, the same in every pose.
 
@@ -125,7 +133,9 @@ def complete_skeleton(
     """
     J = len(template.names)
     p = skeleton.reshape(-1, *skeleton.shape[-2:]).to(torch.float32)
-    shown = torch.ones_like(p[..., 0]) if visibility is None else visibility.to(p)
+    shown = (
+        torch.ones_like(p[..., 0]) if visibility is None else visibility.to(p)
+    )
     shown = shown.reshape(-1, shown.shape[-1])
 
     # The joints of each template are the first ones of the next larger template.
@@ -138,7 +148,9 @@ def complete_skeleton(
     return p, valid * shown
 
 
-def _estimated_hips(p: Tensor, valid: Tensor, template: SkeletonTemplate) -> Tensor:
+def _estimated_hips(
+    p: Tensor, valid: Tensor, template: SkeletonTemplate
+) -> Tensor:
     """``[B, J]`` bool: estimated hips of skeletons that show both shoulders and no hip.
 
     Hips are estimates if they are finite and apart: zeros are none.
@@ -166,7 +178,9 @@ def _refuse_without_trunk(valid: Tensor, template: SkeletonTemplate) -> None:
     # The message names the joints that each of them lacks.
     lost = []
     for item in bad:
-        names = [template.names[j] for j in template.torso if not valid[item, j]]
+        names = [
+            template.names[j] for j in template.torso if not valid[item, j]
+        ]
         lost.append(f"item {item}: {', '.join(names)}")
     raise ValueError(
         f"sanitise: p needs {MIN_TRUNK_JOINTS} of the four shoulders and hips, but in "
@@ -207,9 +221,13 @@ def _filled(
     q = _complete_face(q, valid, template, known, scale)
 
     # Limbs, level by level.
-    for level, bones in zip(c.levels, _bones(template, p.device, p.dtype), strict=True):
+    for level, bones in zip(
+        c.levels, _bones(template, p.device, p.dtype), strict=True
+    ):
         if template.palms:  # their knuckles may have been placed
-            hubs, _, limbs = known.tensor_split((N_HUBS, template.n_hubs), dim=1)
+            hubs, _, limbs = known.tensor_split(
+                (N_HUBS, template.n_hubs), dim=1
+            )
             palms = palms_of(q, hubs[:, CHEST : CHEST + 1], c)
             known = torch.cat([hubs, palms, limbs], dim=1)
 
@@ -227,7 +245,9 @@ def _filled(
             starts = c.starts[level.limbs]
             ends = c.ends[level.limbs]
             found = q.index_select(1, ends) - q.index_select(1, starts)
-            known = torch.cat([known, parent @ swings(found, parent, level)], dim=1)
+            known = torch.cat(
+                [known, parent @ swings(found, parent, level)], dim=1
+            )
     return torch.where(is_seen, p, q + root)
 
 
@@ -329,7 +349,11 @@ def _complete_trunk(
 
 
 def _complete_face(
-    q: Tensor, valid: Tensor, template: SkeletonTemplate, hubs: Tensor, scale: Tensor
+    q: Tensor,
+    valid: Tensor,
+    template: SkeletonTemplate,
+    hubs: Tensor,
+    scale: Tensor,
 ) -> Tensor:
     """Places unseen joints of the face, then unseen landmarks of lips, brows and lids, at rest.
 

@@ -7,8 +7,15 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 APART = -0.3  # maximum cosine of a swapped pair's line against the other pairs'
-OPPOSED = -0.6  # maximum cosine of swapped lines against the left by feet and head
-SIDE_PAIRS = {"hips": (23, 24), "shoulders": (11, 12), "ears": (7, 8), "eyes": (2, 5)}
+OPPOSED = (
+    -0.6
+)  # maximum cosine of swapped lines against the left by feet and head
+SIDE_PAIRS = {
+    "hips": (23, 24),
+    "shoulders": (11, 12),
+    "ears": (7, 8),
+    "eyes": (2, 5),
+}
 NOSE_JOINT = 0
 LEG_JOINTS = ((25, 27, 29, 31), (26, 28, 30, 32))  # knee, ankle, heel, toes
 
@@ -45,8 +52,12 @@ def refuse_swapped(p: Tensor, valid: Tensor) -> None:
     # The left, as it follows from the head: the eyes are above the nose, the ears behind it.
     ears = p[:, SIDE_PAIRS["ears"]].mean(1)
     eyes = p[:, SIDE_PAIRS["eyes"]].mean(1)
-    by_head = torch.linalg.cross(eyes - p[:, NOSE_JOINT], p[:, NOSE_JOINT] - ears)
-    by_head = seen(by_head, (NOSE_JOINT, *SIDE_PAIRS["ears"], *SIDE_PAIRS["eyes"]))
+    by_head = torch.linalg.cross(
+        eyes - p[:, NOSE_JOINT], p[:, NOSE_JOINT] - ears
+    )
+    by_head = seen(
+        by_head, (NOSE_JOINT, *SIDE_PAIRS["ears"], *SIDE_PAIRS["eyes"])
+    )
 
     # The lines from right to left that the names of the landmarks state.
     named = [seen(p[:, a] - p[:, b], (a, b)) for a, b in SIDE_PAIRS.values()]

@@ -80,13 +80,23 @@ TABLES = {
     "smplx": LandmarkTable(
         counts=(55, 10475),
         joints=_LIMB_JOINTS
-        | _sides({"index": (25, 40), "pinky": (31, 46), "thumb": (38, 53)}, SAME_POINT)
-        | {name: (number, NEARBY) for name, (number, _) in _eyes(23, 24).items()},
+        | _sides(
+            {"index": (25, 40), "pinky": (31, 46), "thumb": (38, 53)},
+            SAME_POINT,
+        )
+        | {
+            name: (number, NEARBY)
+            for name, (number, _) in _eyes(23, 24).items()
+        },
         vertices={
             "nose": (9120, SAME_POINT),
             **_eyes(9448, 9929),
             **_sides(
-                {"ear": (6, 616), "heel": (8846, 8635), "foot_index": (5770, 8463)},
+                {
+                    "ear": (6, 616),
+                    "heel": (8846, 8635),
+                    "foot_index": (5770, 8463),
+                },
                 SAME_POINT,
             ),
         },

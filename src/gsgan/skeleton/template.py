@@ -33,14 +33,18 @@ class SkeletonTemplate:
 
     names: tuple[str, ...]  # of the J joints
     edges: tuple[Edge, ...]  # the connections that the landmark detector draws
-    limbs: tuple[Edge, ...]  # (parent joint, child joint) of the bones with a cylinder
+    limbs: tuple[
+        Edge, ...
+    ]  # (parent joint, child joint) of the bones with a cylinder
     # per limb, the frame that its own is relative to: 0 pelvis, 1 chest, 2 head, 3 + h palm h,
     # n_hubs + l limb l
     limb_parents: tuple[int, ...]
     # per limb, unit, in its parent's frame; not the rest pose: chosen so that the opposite
     # direction, where the swing is undefined, is out of reach
     rest_directions: tuple[Vector, ...]
-    rest_positions: tuple[Vector, ...]  # J points of an A-pose on the ground y = 0
+    rest_positions: tuple[
+        Vector, ...
+    ]  # J points of an A-pose on the ground y = 0
     stature: float  # metres, sole to crown of the rest pose
     # pairs of joints, left and right
     shoulders: Edge
@@ -49,7 +53,9 @@ class SkeletonTemplate:
     eyes: Edge
     nose: int
     face: tuple[int, ...]  # joints inside the head's sphere
-    mirror: tuple[int, ...]  # per joint, its counterpart (itself on the midline)
+    mirror: tuple[
+        int, ...
+    ]  # per joint, its counterpart (itself on the midline)
     # (name, segments) of drawn channels
     draw_groups: tuple[tuple[str, tuple[Edge, ...]], ...]
     # the edges connected to one component, for message passing
@@ -57,7 +63,9 @@ class SkeletonTemplate:
     # wrist, index's and little finger's knuckles
     palms: tuple[tuple[int, int, int], ...] = ()
     fingers: tuple[int, ...] = ()  # limbs that are bones of hands
-    bare: tuple[int, ...] = ()  # limbs without a cylinder: another limb lies there
+    bare: tuple[
+        int, ...
+    ] = ()  # limbs without a cylinder: another limb lies there
     # the last joints: landmarks of a face, which rest on the head
     expression: tuple[int, ...] = ()
 
@@ -129,8 +137,12 @@ class SkeletonTemplate:
     def rest_torso(self) -> Vector:
         """Metres: edges (left-right, up, front) of the trunk's box in the rest pose."""
         # As wide as shoulders or hips, as high as the spine, half as deep as wide.
-        l_sh, r_sh, l_hip, r_hip = np.asarray(self.rest_positions)[list(self.torso)]
-        width = float(max(np.linalg.norm(l_sh - r_sh), np.linalg.norm(l_hip - r_hip)))
+        l_sh, r_sh, l_hip, r_hip = np.asarray(self.rest_positions)[
+            list(self.torso)
+        ]
+        width = float(
+            max(np.linalg.norm(l_sh - r_sh), np.linalg.norm(l_hip - r_hip))
+        )
         height = float(np.linalg.norm((l_sh + r_sh - l_hip - r_hip) / 2))
         return width, height, width / 2
 
@@ -195,7 +207,17 @@ _POSE_NAMES = (
     "left_foot_index",
     "right_foot_index",
 )
-_FACE_EDGES = ((0, 1), (1, 2), (2, 3), (3, 7), (0, 4), (4, 5), (5, 6), (6, 8), (9, 10))
+_FACE_EDGES = (
+    (0, 1),
+    (1, 2),
+    (2, 3),
+    (3, 7),
+    (0, 4),
+    (4, 5),
+    (5, 6),
+    (6, 8),
+    (9, 10),
+)
 _TORSO_EDGES = ((11, 12), (11, 23), (12, 24), (23, 24))
 _L_ARM = ((11, 13), (13, 15))
 _R_ARM = ((12, 14), (14, 16))
@@ -205,7 +227,9 @@ _L_LEG = ((23, 25), (25, 27))
 _R_LEG = ((24, 26), (26, 28))
 _L_FOOT = ((27, 29), (27, 31), (29, 31))
 _R_FOOT = ((28, 30), (28, 32), (30, 32))
-_POSE_LIMBS = _L_ARM + _R_ARM + _L_HAND + _R_HAND + _L_LEG + _R_LEG + _L_FOOT + _R_FOOT
+_POSE_LIMBS = (
+    _L_ARM + _R_ARM + _L_HAND + _R_HAND + _L_LEG + _R_LEG + _L_FOOT + _R_FOOT
+)
 _EDGES = (
     *_FACE_EDGES[:8],
     (9, 10),

@@ -10,7 +10,13 @@ import torch
 from torch import Tensor
 
 from gsgan.skeleton.rotation6d import across, orthogonal_to, unit
-from gsgan.skeleton.template import CHEST, HEAD, N_HUBS, PELVIS, SkeletonTemplate
+from gsgan.skeleton.template import (
+    CHEST,
+    HEAD,
+    N_HUBS,
+    PELVIS,
+    SkeletonTemplate,
+)
 from gsgan.utils.tensors import squared_norm
 
 FOLDED = 1e-4
@@ -22,7 +28,9 @@ class Swing(NamedTuple):
 
     rest: Tensor
     straight: Tensor  # [M, 3, 3] first half turn of usual swings
-    folded: Tensor  # [M, 3, 3] first two half turns of nearly opposite directions
+    folded: (
+        Tensor  # [M, 3, 3] first two half turns of nearly opposite directions
+    )
 
     @classmethod
     def of(cls, rest: Tensor) -> Swing:
@@ -74,7 +82,9 @@ class Constants(NamedTuple):
     head_from_eyes: Tensor  # [3, 3] the head's axes in those of eyes and nose
     head_points: Tensor  # [5] left ear, right ear, left eye, right eye, nose
     torso: Tensor  # [4] left and right shoulder, left and right hip
-    palms: Tensor  # [3 H] wrist, index's and little finger's knuckle of each hand
+    palms: (
+        Tensor  # [3 H] wrist, index's and little finger's knuckle of each hand
+    )
     measured: Tensor  # limbs that measure the subject's size
     fingers: Tensor  # limbs that are bones of hands
     face_turned: Tensor  # [F] face joints but the nose
@@ -140,7 +150,9 @@ def _constants(
         place[joint] = N_HUBS + k
     for joint, limb in t.incoming.items():
         place[joint] = N_HUBS + len(turned) + limb
-    posed = [joint for joint in range(len(t.names)) if joint not in t.expression]
+    posed = [
+        joint for joint in range(len(t.names)) if joint not in t.expression
+    ]
 
     # Everything on the device, in the dtype of the skeletons.
     return Constants(

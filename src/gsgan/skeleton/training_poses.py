@@ -67,7 +67,9 @@ def training_poses(p: Tensor) -> TrainingPoses:
     mean = x.mean(0)
 
     # Principal axes, and the standard deviation along each.
-    _, spread, axes = torch.linalg.svd((x - mean) / len(x) ** 0.5, full_matrices=False)
+    _, spread, axes = torch.linalg.svd(
+        (x - mean) / len(x) ** 0.5, full_matrices=False
+    )
     varied = spread > NOISE
     share = 1 - NOISE**2 / (spread[varied] ** 2 + NOISE**2)
     rows = (share.sqrt()[:, None] * axes[varied]).tolist()

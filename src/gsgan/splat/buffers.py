@@ -42,7 +42,9 @@ def zeros(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
     first = -memory.ctypes.data % CACHE_LINE
 
     # Sliced in numpy: autograd forbids in-place changes of views made by torch.
-    array = memory[first : first + used].view(_DTYPE_NAMES[dtype]).reshape(shape)
+    array = (
+        memory[first : first + used].view(_DTYPE_NAMES[dtype]).reshape(shape)
+    )
 
     # The array lives as long as the tensors that share its memory.
     if size >= LARGE:

@@ -102,7 +102,9 @@ def job_type(
         addresses: names of tensors' addresses.
         results: names of 64-bit integers that the kernel sets.
     """
-    fields: list[tuple[str, Any]] = [(name, ctypes.c_int64) for name in integers]
+    fields: list[tuple[str, Any]] = [
+        (name, ctypes.c_int64) for name in integers
+    ]
     fields += [(name, ctypes.c_double) for name in numbers]
     fields += [(name, ctypes.c_void_p) for name in addresses]
     fields += [(name, ctypes.c_int64) for name in results]
@@ -172,7 +174,9 @@ def compiler() -> list[str]:
     named = shlex.split(os.environ.get("CXX", ""))
     if named:
         if shutil.which(named[0]) is None:
-            raise Unavailable(f"The compiler {named[0]!r} from CXX is not found.")
+            raise Unavailable(
+                f"The compiler {named[0]!r} from CXX is not found."
+            )
         return named
 
     # The first one that is installed.
@@ -215,7 +219,9 @@ def _source() -> str:
         raise Unavailable(
             f"The kernel's source {SOURCE} or {KERNEL_HEADERS} is missing; reinstall gsgan."
         )
-    return "\0".join(path.read_text(encoding="utf-8") for path in (SOURCE, *headers))
+    return "\0".join(
+        path.read_text(encoding="utf-8") for path in (SOURCE, *headers)
+    )
 
 
 def _version(command: list[str]) -> str:
@@ -231,7 +237,13 @@ def _cpu() -> str:
     info = Path("/proc/cpuinfo")
     if info.is_file():
         # Processors of one kind have the same lines.
-        fields = ("model name", "flags", "CPU implementer", "CPU part", "Features")
+        fields = (
+            "model name",
+            "flags",
+            "CPU implementer",
+            "CPU part",
+            "Features",
+        )
         found = info.read_text(errors="replace").splitlines()
         lines += sorted({line for line in found if line.startswith(fields)})
     return "\n".join(lines)
@@ -245,11 +257,15 @@ def _build(command: list[str], library: Path) -> None:
     """
     # The message has the first error of the first set of flags that has one.
     message = ""
-    with tempfile.TemporaryDirectory(dir=library.parent, prefix="build-") as work:
+    with tempfile.TemporaryDirectory(
+        dir=library.parent, prefix="build-"
+    ) as work:
         target = Path(work) / "native.so"
         for flags in _flags():
             # The library appears under its name only when it is complete.
-            done = _run([*command, *BASE_FLAGS, *flags, str(SOURCE), "-o", str(target)])
+            done = _run(
+                [*command, *BASE_FLAGS, *flags, str(SOURCE), "-o", str(target)]
+            )
             if done.returncode == 0 and target.is_file():
                 os.replace(target, library)
                 return

@@ -26,7 +26,11 @@ def check(gaussians: Gaussians, camera: Camera) -> None:
 def _tensors(record: Gaussians | Camera) -> dict[str, Tensor]:
     """The tensors of a record by the names that messages have."""
     owner = type(record).__name__
-    return {f"{owner}.{k}": v for k, v in vars(record).items() if isinstance(v, Tensor)}
+    return {
+        f"{owner}.{k}": v
+        for k, v in vars(record).items()
+        if isinstance(v, Tensor)
+    }
 
 
 def _check_types(gaussians: Gaussians, camera: Camera) -> None:
@@ -131,4 +135,9 @@ def _all_valid(gaussians: Gaussians) -> bool:
     low, high = torch.aminmax(gaussians.opacities)
     scales = used.get("Gaussians.scales")
     positive = scales is None or float(scales.amin()) > 0
-    return math.isfinite(total) and positive and float(low) >= 0 and float(high) <= 1
+    return (
+        math.isfinite(total)
+        and positive
+        and float(low) >= 0
+        and float(high) <= 1
+    )

@@ -74,7 +74,10 @@ def differences(settings: Accuracy, device: torch.device) -> list[str]:
 
 def given_up(settings: Accuracy, device: torch.device) -> str:
     """How gsplat's result differs from the settings, in one sentence."""
-    found = ["it stops pixels one layer earlier", *differences(settings, device)]
+    found = [
+        "it stops pixels one layer earlier",
+        *differences(settings, device),
+    ]
     return (
         f"Drawing with gsplat, the fastest backend here; differences from the settings "
         f"{settings.name!r}: {'; '.join(found)}; backend=torch has none."
@@ -160,10 +163,14 @@ def _usable(quats: Tensor) -> Tensor:
     largest = quats.detach().abs().amax(-1, keepdim=True)
     usable = largest > QUAT_MIN
     identity = functional.pad(torch.ones_like(quats[..., :1]), (0, 3))
-    return torch.where(usable, quats / torch.where(usable, largest, 1.0), identity)
+    return torch.where(
+        usable, quats / torch.where(usable, largest, 1.0), identity
+    )
 
 
-def _seen_from_the_camera(means: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+def _seen_from_the_camera(
+    means: Tensor, camera: Camera
+) -> tuple[Tensor, Tensor]:
     """Means ``[B, N, 3]`` relative to the camera's centre, and the ``[B, 4, 4]`` view transform.
 
     They are computed in float64, so that a camera far from the origin costs no digits. gsplat has
@@ -177,7 +184,9 @@ def _seen_from_the_camera(means: Tensor, camera: Camera) -> tuple[Tensor, Tensor
 
     # The shear of the skew, as the left factor of the transform.
     K = camera.K.detach()
-    shear = torch.eye(3, dtype=K.dtype, device=K.device).repeat(len(camera), 1, 1)
+    shear = torch.eye(3, dtype=K.dtype, device=K.device).repeat(
+        len(camera), 1, 1
+    )
     shear[:, 0, 1] = K[:, 0, 1] / K[:, 0, 0]
     # [shear [R t]; 0 0 0 1]
     top = shear @ torch.cat([camera.R, left], dim=-1)
@@ -234,7 +243,9 @@ def first_error(error: Exception) -> str:
     first error, which is far below "Error building extension"."""
     # Without such a line, the first line of the error.
     lines = str(error).strip().splitlines()
-    causes = [line for line in lines if re.search(r"\b(fatal )?error\b\s*:", line)]
+    causes = [
+        line for line in lines if re.search(r"\b(fatal )?error\b\s*:", line)
+    ]
     return ": ".join([type(error).__name__, *(causes or lines)[:1]])
 
 

@@ -36,7 +36,9 @@ def as_pinhole_sees(
         The Gaussians, as covariances, and the cameras without their lenses.
     """
     assert camera.dist is not None
-    means, jacobian, beyond = bend(camera.to_camera(gaussians.means), camera.dist, near)
+    means, jacobian, beyond = bend(
+        camera.to_camera(gaussians.means), camera.dist, near
+    )
 
     # The derivative J of the move, in world axes, moves Σ to J Σ Jᵀ.
     R = camera.R.unsqueeze(1)
@@ -63,7 +65,9 @@ def _covariances(gaussians: Gaussians) -> Tensor:
     return axes @ axes.mT
 
 
-def bend(x_cam: Tensor, dist: Tensor, near: float) -> tuple[Tensor, Tensor, Tensor]:
+def bend(
+    x_cam: Tensor, dist: Tensor, near: float
+) -> tuple[Tensor, Tensor, Tensor]:
     """Moves points so that a pinhole shows them where the lens does, at the same depth.
 
     With x = z n and the lens's distortion d(n), whose derivative is D, a point (x, z) moves to
@@ -103,5 +107,11 @@ def bend(x_cam: Tensor, dist: Tensor, near: float) -> tuple[Tensor, Tensor, Tens
     top = torch.cat([slope, by_depth.unsqueeze(-1)], dim=-1)
     bottom = constant((0.0, 0.0, 1.0), top).expand(*top.shape[:-2], 1, 3)
     eye = torch.eye(3, dtype=top.dtype, device=top.device)
-    jacobian = torch.where(moves.unsqueeze(-1), torch.cat([top, bottom], dim=-2), eye)
-    return torch.where(moves, moved, x_cam), jacobian, (ahead & beyond).squeeze(-1)
+    jacobian = torch.where(
+        moves.unsqueeze(-1), torch.cat([top, bottom], dim=-2), eye
+    )
+    return (
+        torch.where(moves, moved, x_cam),
+        jacobian,
+        (ahead & beyond).squeeze(-1),
+    )

@@ -33,7 +33,12 @@ _ELLIPSES = (
 _IMAGES = ("out_features", "out_alpha", "out_average")
 _IMAGE_GRADS = ("g_features", "g_alpha", "g_average")
 _ELLIPSE_GRADS = ("d_means", "d_factors", "d_opacities", "d_features")
-AVERAGES = (1, 2, 4, 8)  # supersampling that is averaged here: divisors of a tile
+AVERAGES = (
+    1,
+    2,
+    4,
+    8,
+)  # supersampling that is averaged here: divisors of a tile
 
 # struct Job of kernels/job.h
 _Job = build.job_type(
@@ -148,7 +153,15 @@ class _Composite(torch.autograd.Function):
         grad_enabled: bool,
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         # The kernel reads contiguous arrays.
-        tensors = [means, factors, opacities, features, depths, extents, visible]
+        tensors = [
+            means,
+            factors,
+            opacities,
+            features,
+            depths,
+            extents,
+            visible,
+        ]
         inputs = [x.detach().contiguous() for x in tensors]
         B, _, C = features.shape
         dtype = features.dtype

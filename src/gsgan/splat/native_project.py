@@ -39,12 +39,21 @@ _GRADS = tuple(f"d_{name}" for name in (*_GAUSSIANS, *_CAMERA))
 # struct ProjectJob of kernels/ewa.h
 _Job = build.job_type(
     integers=("B", "N", "H", "W", "threads", "antialias"),
-    numbers=("near", "low_pass", "alpha_min", "reach", "extent_margin", "quat_min"),
+    numbers=(
+        "near",
+        "low_pass",
+        "alpha_min",
+        "reach",
+        "extent_margin",
+        "quat_min",
+    ),
     addresses=(*_GAUSSIANS, *_CAMERA, *_PROJECTED, *_PROJECTED_GRADS, *_GRADS),
 )
 
 
-def project(gaussians: Gaussians, camera: Camera, settings: Accuracy) -> Projected:
+def project(
+    gaussians: Gaussians, camera: Camera, settings: Accuracy
+) -> Projected:
     """``gsgan.splat.project.project`` on the CPU, with the same arguments.
 
     It is differentiable once. The result is bit-identical for any number of threads.
@@ -140,7 +149,8 @@ class _Project(torch.autograd.Function):
         if build.function("project_backward", held[0].dtype)(ctypes.byref(job)):
             raise MemoryError("project: out of memory")
         return tuple(
-            g if need else None for g, need in zip(outgoing, needed, strict=True)
+            g if need else None
+            for g, need in zip(outgoing, needed, strict=True)
         )
 
 

@@ -43,7 +43,9 @@ class Projected:
     visible: Tensor  # [B, N] bool
 
 
-def project(gaussians: Gaussians, camera: Camera, settings: Accuracy) -> Projected:
+def project(
+    gaussians: Gaussians, camera: Camera, settings: Accuracy
+) -> Projected:
     """Projects Gaussians onto the image.
 
     The result is differentiable in means, quats, scales, covariances, opacities, features, K, R, t.
@@ -124,7 +126,9 @@ def rotations(quats: Tensor) -> Tensor:
     Quaternions are w x y z. Quaternions whose largest component is below 1e-20 (zero ones too) give
     the identity and no gradient.
     """
-    return torch.stack(_rotation_entries(quats, -1), dim=-1).unflatten(-1, (3, 3))
+    return torch.stack(_rotation_entries(quats, -1), dim=-1).unflatten(
+        -1, (3, 3)
+    )
 
 
 def _rotation_entries(quats: Tensor, dim: int) -> list[Tensor]:
@@ -260,7 +264,9 @@ def _footprint(
         reach = torch.full_like(opacities, settings.radius_sigmas)
     elif settings.extent == "opacity" and settings.alpha_min > 0:
         # alpha >= alpha_min if q <= 2 ln(o / alpha_min), and |dx| <= sqrt(q Σ_xx).
-        reach = (2 * torch.log(opacities / settings.alpha_min).clamp_min(0)).sqrt()
+        reach = (
+            2 * torch.log(opacities / settings.alpha_min).clamp_min(0)
+        ).sqrt()
     else:
         reach = torch.full_like(opacities, math.sqrt(2 * EXP_UNDERFLOW))
 

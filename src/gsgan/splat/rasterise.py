@@ -9,7 +9,14 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from gsgan.scene import Camera, Gaussians, Raster
-from gsgan.splat import checks, gsplat_backend, native, native_project, reference, tiles
+from gsgan.splat import (
+    checks,
+    gsplat_backend,
+    native,
+    native_project,
+    reference,
+    tiles,
+)
 from gsgan.splat.lens import as_pinhole_sees
 from gsgan.splat.project import project
 from gsgan.splat.settings import Accuracy, accuracy
@@ -66,7 +73,9 @@ def rasterise(
 
     # The backend depends on the device, the settings and the input.
     name, message = resolve_backend(backend, device, settings)
-    if name == "gsplat" and (reason := gsplat_backend.unsuited(gaussians, camera)):
+    if name == "gsplat" and (
+        reason := gsplat_backend.unsuited(gaussians, camera)
+    ):
         name = "torch"
         message = f"Drawing with the torch backend: {reason}"
     if message and message not in _logged:
@@ -120,19 +129,22 @@ def resolve_backend(
     # The fastest backend of the device, unless nothing may be skipped.
     if name == "auto" and settings.is_dense:
         return "reference", ""
-    if name == "gsplat" or (name == "auto" and device.type == gsplat_backend.DEVICE):
+    if name == "gsplat" or (
+        name == "auto" and device.type == gsplat_backend.DEVICE
+    ):
         if why_not := gsplat_backend.why_not(settings, device):
             return "torch", f"Drawing with the torch backend: {why_not}"
         return "gsplat", gsplat_backend.given_up(settings, device)
 
     # The native backend, or torch without its kernel. Other devices always get torch.
     if device.type != "cpu":
-        why_not = (
-            f"The native backend runs on CPU only; drawing with torch on {device}."
-        )
+        why_not = f"The native backend runs on CPU only; drawing with torch on {device}."
         return "torch", why_not if name == "native" else ""
     if why_not := native.why_not():
-        return "torch", f"Drawing with the torch backend, which is slower: {why_not}"
+        return (
+            "torch",
+            f"Drawing with the torch backend, which is slower: {why_not}",
+        )
     return "native", ""
 
 
@@ -226,7 +238,11 @@ def _rasterise(
 
     # An operator has no optional outputs: an empty tensor stands for None.
     fine = features.new_empty(0) if raster.fine is None else raster.fine
-    return raster.features.contiguous(), raster.alpha.contiguous(), fine.contiguous()
+    return (
+        raster.features.contiguous(),
+        raster.alpha.contiguous(),
+        fine.contiguous(),
+    )
 
 
 @_rasterise.register_fake
@@ -253,5 +269,7 @@ def _rasterise_shapes(
     if factor == 1:
         fine = features.new_empty(0)
     else:
-        fine = features.new_empty(batch, channels, factor * height, factor * width)
+        fine = features.new_empty(
+            batch, channels, factor * height, factor * width
+        )
     return image, alpha, fine

@@ -31,10 +31,16 @@ def composite(
     front_to_back = _sorted(projected)
     chunks = []
     for pixels in _pixel_chunks(projected, size):
-        weights, left = _blend(_alphas(front_to_back, pixels, settings), settings)
-        chunks.append(torch.cat([weights @ front_to_back.features, 1 - left], dim=-1))
+        weights, left = _blend(
+            _alphas(front_to_back, pixels, settings), settings
+        )
+        chunks.append(
+            torch.cat([weights @ front_to_back.features, 1 - left], dim=-1)
+        )
     image = torch.cat(chunks, dim=1).mT.unflatten(-1, size)
-    return image[:, : projected.features.shape[-1]], image[:, -1:]  # zeros if N is 0
+    return image[:, : projected.features.shape[-1]], image[
+        :, -1:
+    ]  # zeros if N is 0
 
 
 def _sorted(projected: Projected) -> Projected:
@@ -48,13 +54,19 @@ def _sorted(projected: Projected) -> Projected:
     return Projected(**found)
 
 
-def _pixel_chunks(projected: Projected, size: tuple[int, int]) -> tuple[Tensor, ...]:
+def _pixel_chunks(
+    projected: Projected, size: tuple[int, int]
+) -> tuple[Tensor, ...]:
     """Pixel centres ``[P, 2]`` row by row, in chunks of at most CHUNK_ELEMENTS alphas."""
     # Pixel centres are at +0.5.
     H, W = size
-    y, x = torch.meshgrid(torch.arange(H) + 0.5, torch.arange(W) + 0.5, indexing="ij")
+    y, x = torch.meshgrid(
+        torch.arange(H) + 0.5, torch.arange(W) + 0.5, indexing="ij"
+    )
     pixels = torch.stack([x, y], dim=-1).to(projected.features).reshape(-1, 2)
-    return pixels.split(max(1, CHUNK_ELEMENTS // max(1, projected.depths.numel())))
+    return pixels.split(
+        max(1, CHUNK_ELEMENTS // max(1, projected.depths.numel()))
+    )
 
 
 def _alphas(projected: Projected, pixels: Tensor, settings: Accuracy) -> Tensor:
@@ -68,7 +80,9 @@ def _alphas(projected: Projected, pixels: Tensor, settings: Accuracy) -> Tensor:
     # Masked before exp: invisible Gaussians then get exactly zero gradients, never 0 * inf.
     drawn = projected.visible.unsqueeze(1).expand_as(q)
     if settings.extent == "sigma":
-        drawn = drawn & (d.detach().abs() <= projected.extents.unsqueeze(1)).all(-1)
+        drawn = drawn & (
+            d.detach().abs() <= projected.extents.unsqueeze(1)
+        ).all(-1)
     q = torch.where(drawn, q, 0.0)
     opacities = torch.where(drawn, projected.opacities.unsqueeze(1), 0.0)
     alpha = opacities * torch.exp(-0.5 * q)

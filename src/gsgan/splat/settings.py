@@ -37,23 +37,31 @@ class Accuracy:
     near: float = 0.01  # metres; Gaussians whose mean is nearer are not drawn
     # Near 1 the gradient of hidden layers is lost in float32 rounding: 1 is for float64.
     alpha_max: float = 0.999
-    low_pass: float = 0.3  # square pixels, added to the diagonal of every 2D covariance
+    low_pass: float = (
+        0.3  # square pixels, added to the diagonal of every 2D covariance
+    )
     # Half fields of view, to which x/z and y/z are clamped in the projection's Jacobian, >= 1.
     fov_clamp: float = 1.3
     # Whether opacities are multiplied by sqrt(det before / det after) of the low-pass.
     antialias: bool = False
-    supersample: int = 1  # draw this many times larger, low-pass included, then average
+    supersample: int = (
+        1  # draw this many times larger, low-pass included, then average
+    )
 
     def __post_init__(self) -> None:
         # The cut-offs of contributions.
         self._require("alpha_min", 0 <= self.alpha_min < 1, "in [0, 1)")
-        self._require("transmittance_min", 0 <= self.transmittance_min < 1, "in [0, 1)")
+        self._require(
+            "transmittance_min", 0 <= self.transmittance_min < 1, "in [0, 1)"
+        )
         self._require(
             "extent",
             self.extent in _EXTENTS,
             f"one of {', '.join(_EXTENTS)}",
         )
-        self._require("dtype", self.dtype in _DTYPES, f"one of {', '.join(_DTYPES)}")
+        self._require(
+            "dtype", self.dtype in _DTYPES, f"one of {', '.join(_DTYPES)}"
+        )
         self._require("radius_sigmas", self.radius_sigmas > 0, "> 0")
 
         # The projection, and the limits of opacity.
@@ -91,7 +99,10 @@ class Accuracy:
     @property
     def is_dense(self) -> bool:
         """Whether every Gaussian contributes to every pixel."""
-        return self.extent == "all" and self.alpha_min == self.transmittance_min == 0
+        return (
+            self.extent == "all"
+            and self.alpha_min == self.transmittance_min == 0
+        )
 
 
 ACCURACY = {

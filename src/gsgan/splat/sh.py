@@ -11,7 +11,8 @@ _C0 = math.sqrt(1 / (4 * math.pi))
 _C1 = math.sqrt(3 / (4 * math.pi))
 _C2 = tuple(math.sqrt(k / math.pi) for k in (15 / 4, 5 / 16, 15 / 16))
 _C3 = tuple(
-    math.sqrt(k / math.pi) for k in (35 / 32, 105 / 4, 21 / 32, 7 / 16, 105 / 16)
+    math.sqrt(k / math.pi)
+    for k in (35 / 32, 105 / 4, 21 / 32, 7 / 16, 105 / 16)
 )
 
 MAX_DEGREE = 3
@@ -34,7 +35,9 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
         ValueError: when the degree is not 0 to 3.
     """
     if degree not in range(MAX_DEGREE + 1):
-        raise ValueError(f"sh_basis: degree must be 0 to {MAX_DEGREE}, got {degree}")
+        raise ValueError(
+            f"sh_basis: degree must be 0 to {MAX_DEGREE}, got {degree}"
+        )
 
     # Each degree adds its harmonics from m = -degree to degree.
     x, y, z = directions.unbind(-1)

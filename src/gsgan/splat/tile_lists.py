@@ -34,7 +34,11 @@ class Tiling:
     @classmethod
     def for_device(cls, device: torch.device) -> Tiling:
         """Blocks that fit into the cache of a CPU, or that occupy a GPU."""
-        return cls() if device.type == "cpu" else cls(layers=32, block_elements=1 << 24)
+        return (
+            cls()
+            if device.type == "cpu"
+            else cls(layers=32, block_elements=1 << 24)
+        )
 
 
 @dataclass(frozen=True)
@@ -52,7 +56,9 @@ class TileLists:
     starts: Tensor
     counts: Tensor
     depths: list[int]  # the counts again, on the host, transferred at once
-    box: Tensor | None  # [B * N + 1, 2] half-sizes outside of which nothing is drawn
+    box: (
+        Tensor | None
+    )  # [B * N + 1, 2] half-sizes outside of which nothing is drawn
 
 
 def tile_lists(
@@ -73,7 +79,9 @@ def tile_lists(
 
     # Rows of all ellipses, front to back within each batch item.
     order = projected.depths.argsort(dim=1, stable=True)
-    order = (order + N * torch.arange(B, device=order.device).unsqueeze(1)).flatten()
+    order = (
+        order + N * torch.arange(B, device=order.device).unsqueeze(1)
+    ).flatten()
 
     # Pairs of ellipse and tile that the ellipse's box intersects.
     first, last = _pixel_box(projected, size, order)
@@ -83,7 +91,9 @@ def tile_lists(
     spans = (last - first + 1).clamp_min(0) * visible
     rows, tile_xy = _pairs(order, first, spans)
     tiles = B * grid[0] * grid[1]
-    tile = (rows // max(N, 1) * grid[0] + tile_xy[:, 1]) * grid[1] + tile_xy[:, 0]
+    tile = (rows // max(N, 1) * grid[0] + tile_xy[:, 1]) * grid[1] + tile_xy[
+        :, 0
+    ]
 
     # Pairs whose ellipse does not reach the tile are sorted behind the last tile.
     if settings.alpha_min > 0:
@@ -107,7 +117,9 @@ def tile_lists(
         starts=starts[deepest],
         counts=counts[:listed],
         depths=depths[:listed],
-        box=with_empty_row(projected.extents) if settings.extent == "sigma" else None,
+        box=with_empty_row(projected.extents)
+        if settings.extent == "sigma"
+        else None,
     )
 
 

@@ -87,7 +87,9 @@ class _Composite(torch.autograd.Function):
         B, _, V = values.shape
         walk = _Walk(geometry, opacities, values, lists, settings, tiling)
         needs_grad = any(ctx.needs_input_grad)
-        canvas = values.new_zeros(B * lists.grid[0] * lists.grid[1], V, tiling.tile**2)
+        canvas = values.new_zeros(
+            B * lists.grid[0] * lists.grid[1], V, tiling.tile**2
+        )
         saved: list[list[tuple[Tensor, Tensor]]] = []
         for chunk in walk.chunks():
             sums, blocks = walk.forward(chunk, needs_grad)
@@ -107,7 +109,9 @@ class _Composite(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         # The walk adds up the gradients of all chunks.
         geometry, opacities, values = ctx.saved_tensors
-        walk = _Walk(geometry, opacities, values, ctx.lists, ctx.settings, ctx.tiling)
+        walk = _Walk(
+            geometry, opacities, values, ctx.lists, ctx.settings, ctx.tiling
+        )
         canvas = _to_tiles(grad, ctx.lists, ctx.tiling)
         with full_precision(grad.device):
             for chunk, blocks in zip(walk.chunks(), ctx.saved, strict=True):
@@ -168,8 +172,12 @@ class _Walk:
 
         # The centre of each listed tile in the image.
         tile = lists.tiles % (lists.grid[0] * lists.grid[1])
-        corner = torch.stack([tile % lists.grid[1], tile // lists.grid[1]], dim=-1)
-        self.centres = (corner * tiling.tile + tiling.tile / 2).to(geometry.dtype)
+        corner = torch.stack(
+            [tile % lists.grid[1], tile // lists.grid[1]], dim=-1
+        )
+        self.centres = (corner * tiling.tile + tiling.tile / 2).to(
+            geometry.dtype
+        )
 
         # exp of less is 0 or subnormal: slow, and below every alpha_min.
         self.min_exponent = math.log(torch.finfo(dtype).tiny)
@@ -196,7 +204,9 @@ class _Walk:
 
     def chunks(self) -> Iterator[slice]:
         """Ranges of listed tiles that are processed together."""
-        tiles = max(1, self.tiling.block_elements // (self.tiling.layers * self.pixels))
+        tiles = max(
+            1, self.tiling.block_elements // (self.tiling.layers * self.pixels)
+        )
         for start in range(0, len(self.lists.tiles), tiles):
             yield slice(start, start + tiles)
 
@@ -209,7 +219,9 @@ class _Walk:
         starts = self.lists.starts[chunk]
         counts = self.lists.counts[chunk]
         depths = self.lists.depths[chunk]
-        sums = self.values.new_zeros(len(starts), self.values.shape[-1], self.pixels)
+        sums = self.values.new_zeros(
+            len(starts), self.values.shape[-1], self.pixels
+        )
         before = self.values.new_ones(len(starts), self.pixels)
         rows = torch.arange(len(starts), device=starts.device)
         blocks: list[tuple[Tensor, Tensor]] = []
@@ -267,14 +279,18 @@ class _Walk:
         behind = torch.zeros_like(grad[:, 0])
         for number, (rows, before) in reversed(list(enumerate(blocks))):
             # α_i and T_i, computed as in the forward pass
-            ids = self._ids(starts[rows], counts[rows], number * self.tiling.layers)
+            ids = self._ids(
+                starts[rows], counts[rows], number * self.tiling.layers
+            )
             place = self._place(ids, rows, chunk)
             exponential, u, v = self._exponential(ids, place, rows, chunk)
             alpha, passes = self._alpha(exponential, ids, want_mask=True)
             assert passes is not None
             transmittance, _ = self._transmittances(alpha, before)
             if self.settings.transmittance_min > 0:
-                keep = _indicator(transmittance, self.settings.transmittance_min)
+                keep = _indicator(
+                    transmittance, self.settings.transmittance_min
+                )
                 alpha.mul_(keep)
                 passes.mul_(keep)
 
@@ -283,7 +299,9 @@ class _Walk:
             seen = self.values[ids] @ grad_here
             hidden, behind[rows] = _behind(alpha, seen, behind[rows])
             d_alpha = seen.sub_(hidden).mul_(transmittance).mul_(passes)
-            self._add(self.values_grad, ids, alpha.mul_(transmittance) @ grad_here.mT)
+            self._add(
+                self.values_grad, ids, alpha.mul_(transmittance) @ grad_here.mT
+            )
             sums = self._whitened_sums(place, d_alpha.mul_(exponential), u, v)
             self._add(self.sums, ids, sums)
 
@@ -292,7 +310,9 @@ class _Walk:
         place = offset + torch.arange(self.tiling.layers, device=starts.device)
         inside = place < counts.unsqueeze(1)
         place = torch.where(inside, starts.unsqueeze(1) + place, 0)
-        return torch.where(inside, self.lists.ids[place], len(self.geometry) - 1)
+        return torch.where(
+            inside, self.lists.ids[place], len(self.geometry) - 1
+        )
 
     def _place(self, ids: Tensor, rows: Tensor, chunk: slice) -> _Place:
         x, y, p, k, r = self.geometry[ids].unbind(-1)
@@ -303,7 +323,9 @@ class _Walk:
         v = (r * dy).clamp_(-U_MAX, U_MAX)
         w = p * k
         dtype = self.values.dtype
-        return _Place(u.to(dtype), v.to(dtype), p.to(dtype), w.to(dtype), r.to(dtype))
+        return _Place(
+            u.to(dtype), v.to(dtype), p.to(dtype), w.to(dtype), r.to(dtype)
+        )
 
     def _exponential(
         self,
@@ -323,10 +345,14 @@ class _Walk:
         if self.lists.box is not None:
             box = self.lists.box[ids]
             means = self.geometry[ids][..., :2]
-            place_of_mean = (means - self.centres[chunk][rows].unsqueeze(1)).to(box)
+            place_of_mean = (means - self.centres[chunk][rows].unsqueeze(1)).to(
+                box
+            )
             for axis in range(2):
                 distance = self.xy[axis] - place_of_mean[..., axis, None]
-                exponential.mul_(_indicator(-distance.abs(), -box[..., axis, None]))
+                exponential.mul_(
+                    _indicator(-distance.abs(), -box[..., axis, None])
+                )
         return exponential, u, v
 
     def _alpha(
@@ -345,17 +371,23 @@ class _Walk:
                 torch.le(alpha, self.settings.alpha_max, out=below)
                 passes.mul_(below)
         if self.settings.alpha_min > 0:
-            alpha = functional.threshold(alpha, self.below_alpha_min, 0.0, inplace=True)
+            alpha = functional.threshold(
+                alpha, self.below_alpha_min, 0.0, inplace=True
+            )
         return alpha.clamp_(max=self.settings.alpha_max), passes
 
     def _weights(self, alpha: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
         """Weights ``[T, K, P]`` and the transmittance ``[T, P]`` behind the block."""
         weights, after = self._transmittances(alpha, before)
         if self.settings.transmittance_min > 0:
-            alpha = alpha.mul_(_indicator(weights, self.settings.transmittance_min))
+            alpha = alpha.mul_(
+                _indicator(weights, self.settings.transmittance_min)
+            )
         return weights.mul_(alpha), after
 
-    def _transmittances(self, alpha: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
+    def _transmittances(
+        self, alpha: Tensor, before: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Before each layer ``[T, K, P]``, and after the last ``[T, P]``; without cut-off."""
         through = 1 - alpha
         layers = torch.empty_like(alpha)
@@ -364,7 +396,9 @@ class _Walk:
             torch.mul(layers[:, k - 1], through[:, k - 1], out=layers[:, k])
         return layers, layers[:, -1] * through[:, -1]
 
-    def _whitened_sums(self, place: _Place, g: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    def _whitened_sums(
+        self, place: _Place, g: Tensor, u: Tensor, v: Tensor
+    ) -> Tensor:
         """``[T, K, 6]`` sums over pixels of ``g`` times 1, u, v, u², u v, v²; overwrites u, v."""
         # u² is u (u_0 + p x + w y), with u_0 at the tile's centre; u v and v² likewise.
         one = g.sum(-1)
@@ -379,7 +413,9 @@ class _Walk:
         total.index_add_(0, ids.flatten(), part.flatten(0, 1))
 
 
-def _behind(alpha: Tensor, seen: Tensor, behind: Tensor) -> tuple[Tensor, Tensor]:
+def _behind(
+    alpha: Tensor, seen: Tensor, behind: Tensor
+) -> tuple[Tensor, Tensor]:
     """The values behind each layer ``[T, K, P]``, and behind the layer in front of the block."""
     layers = torch.empty_like(alpha)
     layers[:, -1] = behind
@@ -388,7 +424,9 @@ def _behind(alpha: Tensor, seen: Tensor, behind: Tensor) -> tuple[Tensor, Tensor
     return layers, torch.lerp(layers[:, 0], seen[:, 0], alpha[:, 0])
 
 
-def _geometry_gradient(geometry: Tensor, opacities: Tensor, sums: Tensor) -> Tensor:
+def _geometry_gradient(
+    geometry: Tensor, opacities: Tensor, sums: Tensor
+) -> Tensor:
     """Gradients of ellipses, from sums over all pixels.
 
     At (dx, dy) from the mean, ``u = p (dx + k dy)``, ``v = r dy``, ``alpha = o e`` with
@@ -436,7 +474,9 @@ def _indicator(x: Tensor, minimum: float | Tensor) -> Tensor:
     return torch.ge(x, minimum, out=torch.empty_like(x))
 
 
-def _from_tiles(canvas: Tensor, B: int, lists: TileLists, tiling: Tiling) -> Tensor:
+def _from_tiles(
+    canvas: Tensor, B: int, lists: TileLists, tiling: Tiling
+) -> Tensor:
     """``[B * rows * columns, V, P]`` → ``[B, V, H, W]``."""
     H, W = lists.size
     tiles = canvas.view(B, *lists.grid, -1, tiling.tile, tiling.tile)

@@ -46,7 +46,9 @@ ABSENT_FINGERS = (  # thumb to pinky
     AbsentFinger(first=0.45, step=0.13, thumbwards=-0.2),
 )
 STEP = 0.0005  # metres between the rays cast at the face
-Anchors = dict[str, tuple[int, int]]  # landmark → joint and vertex, one of them -1
+Anchors = dict[
+    str, tuple[int, int]
+]  # landmark → joint and vertex, one of them -1
 
 
 def with_anchors(c: Character) -> Character:
@@ -117,7 +119,10 @@ def _hand(c: Character, main: Ints, side: str) -> Anchors:
             elif last >= 0 and len(tip):
                 # The tip is the outermost vertex of the last bone.
                 outwards = c.joints[last] - c.joints[c.parents[last]]
-                found[name] = -1, int(tip[(c.vertices[tip] @ outwards).argmax()])
+                found[name] = (
+                    -1,
+                    int(tip[(c.vertices[tip] @ outwards).argmax()]),
+                )
             else:
                 place = (absent.first + absent.step * k) * along
                 target = wrist + length * (place + absent.thumbwards * ahead)
@@ -215,11 +220,15 @@ class _Face:
         front = np.full(x.size, c.vertices[:, 1].min() - 1)
         start = np.column_stack([x.ravel(), front, z.ravel()])
         ray = np.tile(np.array([0, 1, 0], np.float32), (len(start), 1))
-        face, share = Tracer(c.vertices, c.faces).first(start.astype(np.float32), ray)
+        face, share = Tracer(c.vertices, c.faces).first(
+            start.astype(np.float32), ray
+        )
 
         # Vertex, hair and colour at each hit.
         corners = c.faces[face]
-        nearest = np.take_along_axis(corners, share.argmax(axis=1)[:, None], axis=1)
+        nearest = np.take_along_axis(
+            corners, share.argmax(axis=1)[:, None], axis=1
+        )
         self.vertex = np.where(face >= 0, nearest[:, 0], -1).reshape(shape)
         self.hair = (c.labels[face] == LABEL_NAMES.index("hair")).reshape(shape)
         uv = np.einsum("nk,nki->ni", share, c.uv[corners])
@@ -258,7 +267,9 @@ class _Face:
         level = self.skin & (np.abs(below - 0.25) < 0.45)
         if not level.any():
             level = self.skin
-        for side, sign, eye in zip(("left", "right"), (1, -1), self.eyes, strict=True):
+        for side, sign, eye in zip(
+            ("left", "right"), (1, -1), self.eyes, strict=True
+        ):
             found |= self._eye(side, sign, eye)
             found |= self._brow(side, sign, eye)
 
@@ -266,7 +277,9 @@ class _Face:
             outwards = np.where(level, sign * x[:, 0], -np.inf)
             ear = x[outwards > outwards.max() - 0.012].mean(axis=0)
             far = np.linalg.norm(x - ear, axis=1)
-            found[f"{side}_ear"] = int(np.where(self.skin, far, np.inf).argmin())
+            found[f"{side}_ear"] = int(
+                np.where(self.skin, far, np.inf).argmin()
+            )
 
         for k, point in enumerate(self._lips()):
             found[f"mouth_outer_{k}"] = self.at(*point)
@@ -336,7 +349,8 @@ class _Face:
         limit = 0.06 * self.d
         height = usual + np.clip(height - usual, middle - limit, middle + limit)
         return {
-            f"{side}_brow_{k}": self.at(x[k], height[k]) for k in range(BROW_POINTS)
+            f"{side}_brow_{k}": self.at(x[k], height[k])
+            for k in range(BROW_POINTS)
         }
 
     def _lips(self) -> list[tuple[float, float]]:
@@ -376,7 +390,9 @@ class _Face:
         return points
 
 
-def _nearest(c: Character, among: Ints, target: Array, joint: int) -> tuple[int, int]:
+def _nearest(
+    c: Character, among: Ints, target: Array, joint: int
+) -> tuple[int, int]:
     """The nearest of some vertices as (-1, vertex), or a joint if there are none."""
     if len(among) == 0:
         return joint, -1

@@ -69,7 +69,9 @@ def pixel_offsets(rays: int) -> Array:
     return np.mod(0.5 + lattice, 1.0)
 
 
-def pixel_rays(view: SceneCamera, x: Ints, y: Ints, rays: int) -> tuple[Array, Array]:
+def pixel_rays(
+    view: SceneCamera, x: Ints, y: Ints, rays: int
+) -> tuple[Array, Array]:
     """Origin ``[3]`` and unit directions ``[N*rays, 3]`` of a pinhole's pixels ``x, y [N]``."""
     # Positions of the rays in the image, and their directions in the world.
     offset = pixel_offsets(rays)
@@ -86,7 +88,9 @@ def look_at(
     """A camera at an azimuth: 0 in front of the person, growing towards the person's left."""
     # The camera's axes, in world coordinates.
     direction = np.array([math.sin(azimuth), -math.cos(azimuth), 0.0])
-    centre = np.array([middle[0], middle[1], height]) + direction * CAMERA_DISTANCE
+    centre = (
+        np.array([middle[0], middle[1], height]) + direction * CAMERA_DISTANCE
+    )
     forward = middle - centre
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])

@@ -347,7 +347,9 @@ def freestyle(c: Controls, s: Array, style: Style) -> None:
     )
 
 
-def _free_arm(c: Controls, side: int, s: Array, phase: float, amplitude: float) -> None:
+def _free_arm(
+    c: Controls, side: int, s: Array, phase: float, amplitude: float
+) -> None:
     """An arm of `freestyle`, in spherical coordinates about the shoulder."""
     # From 0 (down) to half a turn (up), and from 0 (in front) to a quarter turn (sideways).
     rise = 1.25 + 1.1 * amplitude * _wander(s, 2.5, phase)
@@ -394,7 +396,9 @@ PASSAGES: tuple[tuple[str, Passage, float], ...] = (
 EVERYDAY = Programme(PASSAGES)
 
 
-def held_out(names: Sequence[str], test_frames: int, block: int = 3) -> list[int]:
+def held_out(
+    names: Sequence[str], test_frames: int, block: int = 3
+) -> list[int]:
     """The held-out frames: the combination passage first, then blocks inside the others.
 
     Blocks lie in the middle of passages: their neighbours in time are training frames, the extreme

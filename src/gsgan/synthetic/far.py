@@ -61,7 +61,9 @@ def keyed(keys: dict[float, dict[str, Any]]) -> Passage:
                 # A free foot is lifted on its way.
                 c.free[...] = 1
                 far = np.linalg.norm(way[..., :2], axis=-1)
-                c.step[..., 3] += STEP_ARC * far * np.sin(np.pi * share[:, None])
+                c.step[..., 3] += (
+                    STEP_ARC * far * np.sin(np.pi * share[:, None])
+                )
             elif name == "wrist":
                 # A wrist passes its shoulder sideways, so that the arm does not fold.
                 length = np.linalg.norm(ends, axis=-1, keepdims=True)

@@ -8,7 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsgan.synthetic.controls import STANCE, Array, Programme, controls_at, smoothstep
+from gsgan.synthetic.controls import (
+    STANCE,
+    Array,
+    Programme,
+    controls_at,
+    smoothstep,
+)
 
 PERIOD = 1.0  # seconds from step to step of a foot
 SWING = 0.42  # seconds of a step
@@ -25,7 +31,9 @@ class FootState(NamedTuple):
     height: Array  # [F] metres
     pitch: Array  # [F] radians, positive lifts the heel
     toes: Array  # [F] minimum share of the pitch that the toes take
-    load: Array  # [F] 1 while the foot swings and the other one carries the body
+    load: (
+        Array  # [F] 1 while the foot swings and the other one carries the body
+    )
 
 
 class Footsteps:
@@ -42,7 +50,9 @@ class Footsteps:
         self.height: list[Array] = []  # per foot [K] metres, 0 for no step
         for foot in range(2):
             start = turns + foot * PERIOD / 2
-            goals, march = _standing(start + SWING + STAND / 2, seed, foot, programme)
+            goals, march = _standing(
+                start + SWING + STAND / 2, seed, foot, programme
+            )
 
             # The foot steps from place to place.
             place = _first_place(foot)

@@ -11,7 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from gsgan.body.skinned import vertex_normals
 from gsgan.motion.character import Bytes, Character, Ints, Surface
-from gsgan.motion.gltf_file import FILE_ERRORS, UNSUPPORTED, GltfFile, local_matrix
+from gsgan.motion.gltf_file import (
+    FILE_ERRORS,
+    UNSUPPORTED,
+    GltfFile,
+    local_matrix,
+)
 from gsgan.motion.humanoid import (
     REQUIRED_BONES,
     WANTED,
@@ -35,7 +40,12 @@ Z_UP = np.array(
     ]
 )
 HEIGHTS = (1.2, 2.3)  # metres: heights that are taken as they are
-UNIT_LENGTHS = (1.0, 0.01, 0.001, 0.0254)  # metres per unit of a file, likeliest first
+UNIT_LENGTHS = (
+    1.0,
+    0.01,
+    0.001,
+    0.0254,
+)  # metres per unit of a file, likeliest first
 # Required by a file, these would change the meshes and textures that are read here.
 UNSUPPORTED_LOOKS = ("KHR_draco_mesh_compression", "KHR_texture_basisu")
 TRIANGLES = 4  # glTF's number of this primitive mode
@@ -61,7 +71,9 @@ def read_character(path: Path) -> Character:
             skin, no triangles, or not the bones of a person.
     """
     if not path.is_file():
-        raise DataError(f"{path}: no such file; expected a rigged character as .glb")
+        raise DataError(
+            f"{path}: no such file; expected a rigged character as .glb"
+        )
     try:
         glb = GltfFile(path, (*UNSUPPORTED, *UNSUPPORTED_LOOKS))
         return _character(glb, _Skeleton(glb))
@@ -174,10 +186,14 @@ def _parts(glb: GltfFile, skeleton: _Skeleton) -> list[_Part]:
     return parts
 
 
-def _part(glb: GltfFile, skeleton: _Skeleton, number: int, primitive: Any) -> _Part:
+def _part(
+    glb: GltfFile, skeleton: _Skeleton, number: int, primitive: Any
+) -> _Part:
     node = skeleton.nodes[number]
     mesh = glb.doc.meshes[node.mesh]
-    attributes = {k: v for k, v in vars(primitive.attributes).items() if v is not None}
+    attributes = {
+        k: v for k, v in vars(primitive.attributes).items() if v is not None
+    }
 
     # Positions and normals in world axes. Missing normals are made of the faces later.
     position = glb.accessor(attributes["POSITION"])
@@ -273,7 +289,9 @@ def _bound(
     )
 
 
-def _four_largest(glb: GltfFile, attributes: dict[str, int]) -> tuple[Ints, Array]:
+def _four_largest(
+    glb: GltfFile, attributes: dict[str, int]
+) -> tuple[Ints, Array]:
     """Joints in the skin ``[V, 4]`` of the four largest weights, and these, summing to 1."""
     # A file stores four joints and weights per vertex in each of its sets.
     joint_sets = []
@@ -312,7 +330,9 @@ def _surface(glb: GltfFile, material: int) -> Surface:
     base = _base_texture(glb, material)
     shader = entry.pbrMetallicRoughness
     colour = glb.image(base.index) if base else white
-    factor = np.array((shader and shader.baseColorFactor) or (1, 1, 1, 1), np.float64)
+    factor = np.array(
+        (shader and shader.baseColorFactor) or (1, 1, 1, 1), np.float64
+    )
     if (factor != 1).any():
         colour = _scaled(colour, factor)
 
@@ -371,7 +391,9 @@ def _standing(skeleton: _Skeleton, vertices: Array) -> _Standing:
     # The first unit that makes a person's height.
     height = float(np.ptp(vertices[:, 2]))
     if not 0 < height < np.inf:
-        raise ValueError("its mesh is flat or has positions that are not numbers")
+        raise ValueError(
+            "its mesh is flat or has positions that are not numbers"
+        )
     low, high = HEIGHTS
     scale = 1.7 / height
     for unit in UNIT_LENGTHS:
@@ -388,7 +410,9 @@ def _standing(skeleton: _Skeleton, vertices: Array) -> _Standing:
 def _unit_normals(normals: Array, vertices: Array, faces: Ints) -> Array:
     """Unit normals; missing ones are means of the faces' normals, weighted by area."""
     # The file's normals, where it has any.
-    made = vertex_normals(torch.from_numpy(vertices), torch.from_numpy(faces)).numpy()
+    made = vertex_normals(
+        torch.from_numpy(vertices), torch.from_numpy(faces)
+    ).numpy()
     given = np.abs(normals).sum(axis=1, keepdims=True) > 0
     normals = np.where(given, normals, made)
 

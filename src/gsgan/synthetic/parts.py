@@ -170,7 +170,9 @@ def _bone_labels(c: Character) -> tuple[Ints, Ints, np.ndarray]:
 
 def _named(c: Character, names: np.ndarray) -> Ints:
     """``[F]`` the label in the name of the material, else of the mesh; -1 for skin, 0 for none."""
-    found = np.array([_label_of(surface.name) for surface in c.surfaces])[c.material]
+    found = np.array([_label_of(surface.name) for surface in c.surfaces])[
+        c.material
+    ]
     distinct, which = np.unique(names, return_inverse=True)
     of_mesh = np.array([_label_of(name) for name in distinct])[which]
     return np.where(found != 0, found, of_mesh)
@@ -180,7 +182,10 @@ def _label_of(name: str) -> int:
     """The label that a name contains; -1 for skin, 0 for none."""
     if name in LABEL:
         return LABEL[name]
-    words = [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])", name)]
+    words = [
+        word.lower()
+        for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])", name)
+    ]
     for label, stems in WORDS.items():
         beginnings = tuple(stems.split())
         if any(word.startswith(beginnings) for word in words):
@@ -196,7 +201,9 @@ def texture_lab(c: Character, uv: Array, material: Ints) -> Array:
         h, w = surface.colour.shape[:2]
         texel = np.minimum(uv[at] % 1 * (w, h), (w - 1, h - 1)).astype(int)
         colour[at] = surface.colour[texel[:, 1], texel[:, 0], :3] / 255
-    lab = cv2.cvtColor(colour[:, None].astype(np.float32), cv2.COLOR_RGB2LAB)[:, 0]
+    lab = cv2.cvtColor(colour[:, None].astype(np.float32), cv2.COLOR_RGB2LAB)[
+        :, 0
+    ]
     return lab.astype(np.float64)
 
 

@@ -9,7 +9,17 @@ from typing import NamedTuple
 import numpy as np
 
 from gsgan.motion.character import Animation, Character
-from gsgan.motion.rig import ARM, FINGERS, LEG, SIDES, SIGN, SPINE, Pose, Rig, frame
+from gsgan.motion.rig import (
+    ARM,
+    FINGERS,
+    LEG,
+    SIDES,
+    SIGN,
+    SPINE,
+    Pose,
+    Rig,
+    frame,
+)
 from gsgan.motion.rotations import Array, blend, matvec, rotation, unit
 from gsgan.synthetic import controls
 from gsgan.synthetic.choreography import EVERYDAY
@@ -24,8 +34,16 @@ from gsgan.synthetic.footsteps import FootState, Footsteps
 
 X, Y, Z = np.eye(3)
 # Flexion of a finger's joints at full curl, radians; the thumb's first joint turns in its saddle.
-FLEXION = {"Thumb": (0.5, 0.6, 0.9)} | dict.fromkeys(FINGERS[1:], (1.4, 1.7, 1.1))
-FINGER_FAN = (0, 1.5, 0.5, -0.5, -1.5)  # a finger's place, in spreads towards the thumb
+FLEXION = {"Thumb": (0.5, 0.6, 0.9)} | dict.fromkeys(
+    FINGERS[1:], (1.4, 1.7, 1.1)
+)
+FINGER_FAN = (
+    0,
+    1.5,
+    0.5,
+    -0.5,
+    -1.5,
+)  # a finger's place, in spreads towards the thumb
 KNUCKLE = 0.1  # metres from the wrist, of hands without fingers
 # The forearm's range, radians from mid-way.
 PRONATION = -1.3
@@ -51,7 +69,10 @@ class Choreography:
     """
 
     def __init__(
-        self, character: Character, seed: int = 0, programme: Programme = EVERYDAY
+        self,
+        character: Character,
+        seed: int = 0,
+        programme: Programme = EVERYDAY,
     ) -> None:
         self.rig = Rig(character)
         self.seed = seed
@@ -97,7 +118,9 @@ class Choreography:
             grip = self._gripping(c, i, side)
             self._arm(pose, c, i, side, grip, placed)
             self._hand(pose, c, i, side, grip, placed)
-        return pose.motion(self._face(c, times), passages_at(times, self.programme))
+        return pose.motion(
+            self._face(c, times), passages_at(times, self.programme)
+        )
 
     def _foot(self, pose: Pose, side: str, foot: FootState) -> Array:
         """Turns a foot, its toes flat while they stand; returns the ankle's position ``[F, 3]``."""
@@ -112,7 +135,9 @@ class Choreography:
         pose.set_turn(side + "Foot", tilt)
         lifted = np.maximum(0.5 * smoothstep(foot.height / 0.05), foot.toes)
         toe_pitch = foot.pitch * lifted
-        pose.set_turn(side + "ToeBase", heading @ rotation(toe_pitch[:, None] * X))
+        pose.set_turn(
+            side + "ToeBase", heading @ rotation(toe_pitch[:, None] * X)
+        )
 
         stand = scale * np.column_stack([foot.place[:, :2], foot.height])
         to_ball = heading @ (toe * (0, 1, 1))
@@ -127,7 +152,9 @@ class Choreography:
 
         # The knuckle's place, from the middle of the shoulders.
         middle = (joint["LeftArm"] + joint["RightArm"]) / 2
-        origin = pose.position(chest) + pose.rotation(chest) @ (middle - joint[chest])
+        origin = pose.position(chest) + pose.rotation(chest) @ (
+            middle - joint[chest]
+        )
         place = scale * np.array([SIGN[side], 1, 1]) * c.knuckle[:, i]
         knuckle = origin + matvec(pose.turn(chest), place)
 
@@ -144,7 +171,9 @@ class Choreography:
         heading = rotation(c.path[:, 2:] * Z)
         grip = matvec(heading, c.grip[:, i] * np.array([SIGN[side], 1, 1]))
         wrist = c.path * (1, 1, 0) + grip
-        return PlacedHand(wrist=scale * wrist, turn=heading @ _hand_turn(c, i, side))
+        return PlacedHand(
+            wrist=scale * wrist, turn=heading @ _hand_turn(c, i, side)
+        )
 
     def _arm(
         self,
@@ -173,7 +202,9 @@ class Choreography:
         # The collarbone rises and goes forwards with a wrist that is high or far in front.
         lift = 0.4 * smoothstep((wrist[:, 2] + 0.15) / 0.6) - 0.05
         forth = 0.25 * smoothstep((-wrist[:, 1] - 0.2) / 0.3)
-        raised = np.stack([0 * lift, -lift * SIGN[side], -forth * SIGN[side]], axis=1)
+        raised = np.stack(
+            [0 * lift, -lift * SIGN[side], -forth * SIGN[side]], axis=1
+        )
         if side + "Shoulder" in self.rig.index:
             pose.bend((side + "Shoulder",), raised)
 
@@ -208,7 +239,9 @@ class Choreography:
 
         # Only the first joint of a finger spreads and takes the additional bend.
         thumbwards = -SIGN[side] * self.rig.turns[side + "Hand"][:, 2]
-        for bone, finger, joint, hinge, straight, across in self.rig.fingers[side]:
+        for bone, finger, joint, hinge, straight, across in self.rig.fingers[
+            side
+        ]:
             k = FINGERS.index(finger)
             is_first = float(joint == 0)
             curl = c.curl[:, i, k, None]

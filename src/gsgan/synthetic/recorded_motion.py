@@ -56,7 +56,9 @@ class RecordedMotion:
 
         # Times of the frames, from 0.
         self.duration = len(read.root) * read.frame_time
-        self._times = np.arange(len(read.root), dtype=np.float64) * read.frame_time
+        self._times = (
+            np.arange(len(read.root), dtype=np.float64) * read.frame_time
+        )
 
         # Turns of the bones, with collarbones that follow the upper arms.
         standard = standard_motion(read, path)
@@ -78,7 +80,9 @@ class RecordedMotion:
         # Legs that go straight down from wider hips would cross below narrow ones.
         width = float(np.median(np.linalg.norm(left - right, axis=1)))
         width = width * self.rig.leg / standard.leg
-        self._apart = max(0.0, width - self.rig.length("LeftUpLeg", "RightUpLeg")) / 2
+        self._apart = (
+            max(0.0, width - self.rig.length("LeftUpLeg", "RightUpLeg")) / 2
+        )
         self._settle(read.frame_time)
 
     def _settle(self, step: float) -> None:
@@ -144,7 +148,9 @@ class RecordedMotion:
         return pose.motion(blinks(times, self.duration, self.seed), names)
 
 
-def _held(ball: Array, low: NDArray[np.bool_], leg: float, step: float) -> Array:
+def _held(
+    ball: Array, low: NDArray[np.bool_], leg: float, step: float
+) -> Array:
     """``[F, 2]`` shifts that keep a foot in place while it rests, and fade between such times."""
     still = np.zeros_like(ball)
     if len(ball) < 2:

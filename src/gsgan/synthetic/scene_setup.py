@@ -140,7 +140,9 @@ class SceneSettings:
     lens: tuple[float, ...] | None = None  # OpenCV's distortion coefficients
     tint: float | None = None  # maximum change of a channel's gain
     gloss: float | None = None  # added highlight of clothes
-    test_scale: tuple[float, ...] | None = None  # zooms of copies of the test cameras
+    test_scale: tuple[float, ...] | None = (
+        None  # zooms of copies of the test cameras
+    )
 
     def __post_init__(self) -> None:
         # Whole numbers.
@@ -207,7 +209,9 @@ class SceneSettings:
         )
 
 
-def _is_list_within(raw: object, values: Array, low: float, high: float) -> bool:
+def _is_list_within(
+    raw: object, values: Array, low: float, high: float
+) -> bool:
     """Whether a parameter is a list whose elements are all numbers from low to high."""
     if not isinstance(raw, Sequence) or len(values) != len(raw):
         return False
@@ -309,7 +313,9 @@ class Scene:
 
         self.tints: dict[str, Tint] = {}
         if settings.tint:
-            tints = make_tints(settings.tint, settings.train_cameras, settings.seed)
+            tints = make_tints(
+                settings.tint, settings.train_cameras, settings.seed
+            )
             self.tints = dict(zip(self.train_cameras, tints, strict=True))
 
     def _moving(self) -> Moving:
@@ -350,12 +356,16 @@ class Scene:
         if self.secondary is None:
             return vertices, normals, None
         rotations = self.motion.rotations[frame]
-        return self.secondary(float(self.times[frame]), rotations, vertices, normals)
+        return self.secondary(
+            float(self.times[frame]), rotations, vertices, normals
+        )
 
     def posed(self, frame: int) -> PosedCharacter:
         """The character at one frame, ready to be rendered."""
         vertices, normals, wrinkles = self.mesh(frame)
-        return PosedCharacter(self.appearance, vertices, normals, self.light, wrinkles)
+        return PosedCharacter(
+            self.appearance, vertices, normals, self.light, wrinkles
+        )
 
     def landmarks(self) -> tuple[tuple[str, ...], Array]:
         """Names and positions ``[F, L, 3]`` (metres) of the landmarks of all frames.
@@ -383,7 +393,9 @@ class Scene:
         for name, shape in character.shapes.items():
             if name in motion.shapes:
                 offsets = offsets + motion.shapes[name][frame] * shape
-        return character.skinned(motion.rotations[frame], motion.joints[frame], offsets)
+        return character.skinned(
+            motion.rotations[frame], motion.joints[frame], offsets
+        )
 
 
 def extent(
@@ -450,8 +462,12 @@ def front(settings: SceneSettings, points: Array) -> list[SceneCamera]:
 
     # Test cameras, half-way between neighbours.
     for k in range(settings.test_cameras):
-        gap = int((k + 0.5) * (settings.train_cameras - 1) / settings.test_cameras)
-        places.append(((gap + 1) * step - CAMERA_ARC / 2, ARC_TEST_HEIGHTS[k % 2]))
+        gap = int(
+            (k + 0.5) * (settings.train_cameras - 1) / settings.test_cameras
+        )
+        places.append(
+            ((gap + 1) * step - CAMERA_ARC / 2, ARC_TEST_HEIGHTS[k % 2])
+        )
     return _cameras_at(places, points, settings.size)
 
 

@@ -31,7 +31,12 @@ from gsgan.body.free import free_body
 from gsgan.skeleton.joints import BODY, FACE, HANDS
 from gsgan.synthetic.camera import SceneCamera
 from gsgan.synthetic.free_subject import free_pose
-from gsgan.synthetic.scene_setup import FREE_BODY, Scene, SceneSettings, dataset_key
+from gsgan.synthetic.scene_setup import (
+    FREE_BODY,
+    Scene,
+    SceneSettings,
+    dataset_key,
+)
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import cache_root, write_atomically
 
@@ -74,12 +79,16 @@ def ensure_scene(
 
     # The name of the folder identifies the content.
     settings = SceneSettings(**parameters)
-    root = (cache or cache_root()) / "data" / "synthetic" / dataset_key(settings)
+    root = (
+        (cache or cache_root()) / "data" / "synthetic" / dataset_key(settings)
+    )
     if not _is_complete(root):
         try:
             root.mkdir(parents=True, exist_ok=True)
             with FileLock(root.with_name(f".{root.name}.lock")):
-                if not _is_complete(root):  # else made while this process waited
+                if not _is_complete(
+                    root
+                ):  # else made while this process waited
                     _write(root, settings, workers, progress)
         except OSError as error:
             raise DataError(
@@ -93,14 +102,18 @@ def _is_complete(root: Path) -> bool:
     return (root / "meta.json").is_file()
 
 
-def _write(root: Path, settings: SceneSettings, workers: int, progress: bool) -> None:
+def _write(
+    root: Path, settings: SceneSettings, workers: int, progress: bool
+) -> None:
     from rich.console import Console
     from rich.progress import Progress
 
     # The progress bar counts frames.
     scene = Scene(settings)
     count = f"{settings.frames} frames, {len(scene.views)} cameras"
-    bar = Progress(console=Console(stderr=True), disable=not progress, transient=True)
+    bar = Progress(
+        console=Console(stderr=True), disable=not progress, transient=True
+    )
     with bar:
         task = bar.add_task(
             f"tracing the synthetic person ({count})", total=settings.frames
@@ -112,14 +125,20 @@ def _write(root: Path, settings: SceneSettings, workers: int, progress: bool) ->
         else:
             # Progress is the number of images of the camera that is traced last.
             last = root / "labels" / list(scene.views)[-1]
-            for _ in _trace_in_processes(root, settings, min(workers, settings.frames)):
+            for _ in _trace_in_processes(
+                root, settings, min(workers, settings.frames)
+            ):
                 bar.update(task, completed=len(list(last.glob("*.png"))))
 
     # meta.json is written last: it marks the dataset as complete.
     _write_skeletons(root, scene)
     cameras = {name: _calibration(view) for name, view in scene.views.items()}
-    write_atomically(root / "cameras.json", json.dumps(cameras, indent=1) + "\n")
-    write_atomically(root / "meta.json", json.dumps(_meta(scene), indent=1) + "\n")
+    write_atomically(
+        root / "cameras.json", json.dumps(cameras, indent=1) + "\n"
+    )
+    write_atomically(
+        root / "meta.json", json.dumps(_meta(scene), indent=1) + "\n"
+    )
 
 
 def _trace_in_processes(
@@ -131,12 +150,25 @@ def _trace_in_processes(
         DataError: with a failed worker's last line of output.
     """
     # One thread per worker; the modules come from where this process has them.
-    environment = dict(os.environ, OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
-    environment["PYTHONPATH"] = os.pathsep.join(p or os.getcwd() for p in sys.path)
-    command = [sys.executable, "-c", WORKER, str(root), json.dumps(asdict(settings))]
+    environment = dict(
+        os.environ, OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1"
+    )
+    environment["PYTHONPATH"] = os.pathsep.join(
+        p or os.getcwd() for p in sys.path
+    )
+    command = [
+        sys.executable,
+        "-c",
+        WORKER,
+        str(root),
+        json.dumps(asdict(settings)),
+    ]
 
     # Workers are killed if this process is interrupted or one of them fails.
-    with tempfile.TemporaryFile("w+") as errors, contextlib.ExitStack() as stack:
+    with (
+        tempfile.TemporaryFile("w+") as errors,
+        contextlib.ExitStack() as stack,
+    ):
         running = []
         for first in range(workers):
             process = subprocess.Popen(
@@ -183,13 +215,18 @@ def trace_frames(root: Path, scene: Scene, frames: Iterable[int]) -> None:
         person = None  # posed for the first image that does not exist
         for name, view in scene.views.items():
             # Only images that do not exist are traced, so that a run that was killed can go on.
-            paths = [root / kind / name / f"{frame:06d}.png" for kind in IMAGE_FOLDERS]
+            paths = [
+                root / kind / name / f"{frame:06d}.png"
+                for kind in IMAGE_FOLDERS
+            ]
             if all(path.is_file() for path in paths):
                 continue
 
             # The image in the colours of its camera.
             person = person or scene.posed(frame)
-            image, alpha, labels = person.render(view, scene.settings.rays_per_pixel)
+            image, alpha, labels = person.render(
+                view, scene.settings.rays_per_pixel
+            )
             if name in scene.tints:
                 image = scene.tints[name](image, alpha)
             # OpenCV writes blue, green, red.

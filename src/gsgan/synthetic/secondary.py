@@ -270,7 +270,9 @@ class Secondary:
             far = np.clip(far, 0, 1)
             bones = [self._index[b] for b in cloth.bones if b in self._index]
             carried = self._skin[:, bones].sum(axis=1)
-            loose += cloth.share * of_label * carried * far * far * (3 - 2 * far)
+            loose += (
+                cloth.share * of_label * carried * far * far * (3 - 2 * far)
+            )
         return loose
 
     def _springs(self, motion: Moving) -> tuple[Array, Array]:
@@ -384,7 +386,9 @@ class Secondary:
         )
 
 
-def _filtered(numerator: list[float], denominator: list[float], signal: Array) -> Array:
+def _filtered(
+    numerator: list[float], denominator: list[float], signal: Array
+) -> Array:
     """Samples ``[T, …]`` after a transfer function in s (bilinear transform), from rest."""
     b, a = bilinear(numerator, denominator, SAMPLE_RATE)
 

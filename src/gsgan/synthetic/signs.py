@@ -118,9 +118,13 @@ def _shape(
         c.spread[:, side] += weight * (shape.spread - c.spread[:, side])
 
 
-def _mix(share: Array, start: Sequence[float], end: Sequence[float]) -> list[Array]:
+def _mix(
+    share: Array, start: Sequence[float], end: Sequence[float]
+) -> list[Array]:
     """From ``start`` to ``end`` by a share ``[F]``, axis by axis."""
-    return [(1 - share) * a + share * b for a, b in zip(start, end, strict=True)]
+    return [
+        (1 - share) * a + share * b for a, b in zip(start, end, strict=True)
+    ]
 
 
 def _there(s: Array, start: float = 0.3, end: float = 0.7) -> Array:
@@ -422,7 +426,9 @@ SIGNS = Programme(
 )
 
 
-def split_signs(names: Sequence[str], test_frames: int) -> tuple[list[int], list[int]]:
+def split_signs(
+    names: Sequence[str], test_frames: int
+) -> tuple[list[int], list[int]]:
     """Training and held-out frames: signs in `HELD_OUT` are whole in the held-out split.
 
     Frames of these signs beyond ``test_frames`` are in neither split.

@@ -18,18 +18,24 @@ from gsgan.synthetic.camera import SceneCamera, pixel_rays
 from gsgan.synthetic.textures import Textures, srgb
 
 Array = NDArray[np.float64]
-Floats = NDArray[np.floating[Any]]  # float32: enough for light, and twice as fast
+Floats = NDArray[
+    np.floating[Any]
+]  # float32: enough for light, and twice as fast
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 Colour = tuple[float, float, float]
 
-BLOCK_RAYS = 1 << 15  # rays traced at once: their arrays stay in the processor's cache
+BLOCK_RAYS = (
+    1 << 15
+)  # rays traced at once: their arrays stay in the processor's cache
 # exponent of the highlight's lobe: falls to half within about 19 degrees
 SHININESS = 12.0
 GLOSSY_PARTS = ("upper_clothes", "lower_clothes", "left_shoe", "right_shoe")
 SKY_RAYS = 48  # directions in which each vertex looks for the sky
 SKY_OFFSET = 3e-3  # metres from the surface to sky rays
-SHADOW_OFFSET = 1e-3  # metres from the surface to shadow rays; less gives speckles
+SHADOW_OFFSET = (
+    1e-3  # metres from the surface to shadow rays; less gives speckles
+)
 LAYERS = 32  # cut-out surfaces that one ray passes at most
 SHOULDER = 0.5  # linear light from which the tone curve is compressed
 
@@ -44,7 +50,9 @@ class Light:
     sky: Colour = (0.58, 0.62, 0.68)  # from straight above
     ground: Colour = (0.38, 0.35, 0.32)  # from straight below
     spread: float = 0.06  # tangent of half the sun's width: soft shadows
-    shine: float = 0.04  # highlight (Blinn-Phong) of everything, as a share of the sun
+    shine: float = (
+        0.04  # highlight (Blinn-Phong) of everything, as a share of the sun
+    )
     gloss: float = 0.0  # the same, added for clothes and shoes
 
 
@@ -57,7 +65,9 @@ class Wrinkles:
 
     phase: Floats  # [V] radians, linear within faces
     slope: Floats  # [V] 0 where cloth is smooth
-    across: Floats  # [V, 3] unit, world: the direction from one fold to the next
+    across: (
+        Floats  # [V, 3] unit, world: the direction from one fold to the next
+    )
 
 
 def wave(phase: Floats) -> Floats:
@@ -85,7 +95,9 @@ class Appearance:
         self.faces = character.faces.astype(np.int32)
         self.uv = character.uv.astype(np.float32)
         self.textures = Textures(character.surfaces)
-        self.cutoff = np.array([s.cutoff for s in character.surfaces], np.float32)
+        self.cutoff = np.array(
+            [s.cutoff for s in character.surfaces], np.float32
+        )
         self.bumpy = any(s.normal is not None for s in character.surfaces)
 
         # 1 on faces of clothes and shoes, which get the added gloss.
@@ -104,7 +116,9 @@ class Appearance:
         first_edge = corners[:, 1] - corners[:, 0]
         second_edge = corners[:, 2] - corners[:, 0]
         twice_area = np.linalg.norm(np.cross(first_edge, second_edge), axis=1)
-        texels = np.abs(twice_uv) * self.textures.size(character.material).prod(axis=1)
+        texels = np.abs(twice_uv) * self.textures.size(character.material).prod(
+            axis=1
+        )
         ratio = np.maximum(texels, 1e-9) / np.maximum(twice_area, 1e-12)
         self.density = 0.5 * np.log2(ratio)
 
@@ -156,7 +170,9 @@ class Tracer:
             return face, bary
 
         # Rays that hit a hole go on behind it.
-        travelled = np.zeros(len(face), np.float32)  # metres until the last hole
+        travelled = np.zeros(
+            len(face), np.float32
+        )  # metres until the last hole
         going = np.arange(len(face))
         for _ in range(LAYERS):
             going = going[face[going] >= 0]
@@ -166,17 +182,23 @@ class Tracer:
             travelled[going] += distance[going] + np.float32(1e-5)
             towards = directions[going]
             start = origins[going] + travelled[going, None] * towards
-            face[going], bary[going], distance[going] = self._run(start, towards)
+            face[going], bary[going], distance[going] = self._run(
+                start, towards
+            )
         return face, bary
 
     def blocked(self, origins: Floats, directions: Floats) -> Bools:
         """Whether each ray ``[N]`` meets the mesh."""
         if self._solid is not None:
             return self.first(origins, directions)[0] >= 0
-        hit: NDArray[np.int32] = self._scene.run(origins, directions, query="OCCLUDED")
+        hit: NDArray[np.int32] = self._scene.run(
+            origins, directions, query="OCCLUDED"
+        )
         return hit >= 0  # 0 for a hit, whatever the face, and -1 for a miss
 
-    def _run(self, origins: Floats, directions: Floats) -> tuple[Ints, Floats, Floats]:
+    def _run(
+        self, origins: Floats, directions: Floats
+    ) -> tuple[Ints, Floats, Floats]:
         """Face, barycentric weights and distance of the first hit, whether solid or not."""
         hit = self._scene.run(origins, directions, query="INTERSECT", output=1)
         u = hit["u"]
@@ -222,7 +244,10 @@ class PosedCharacter:
         self.flat = np.where(outwards < 0, -flat, flat)
 
         # Tangents along u, for the normal maps.
-        along_u = first_edge * appearance.dv[:, 1:] - second_edge * appearance.du[:, 1:]
+        along_u = (
+            first_edge * appearance.dv[:, 1:]
+            - second_edge * appearance.du[:, 1:]
+        )
         tangent = _unit(along_u * appearance.mirrored[:, None])
         self.tangent = tangent.astype(np.float32)
 
@@ -311,7 +336,9 @@ class PosedCharacter:
         disc = _disc(rays)[k % rays] * np.float32(self.light.spread)
         # Metres between neighbouring rays, at 1 m from the camera.
         spacing = 1 / (view.K[0, 0] * np.sqrt(rays))
-        light[k] = self._shade(start[k], towards[k], face[k], bary[k], disc, spacing)
+        light[k] = self._shade(
+            start[k], towards[k], face[k], bary[k], disc, spacing
+        )
         return face, light
 
     def _shade(
@@ -330,11 +357,15 @@ class PosedCharacter:
         point = here[:, :3]
 
         # Shadow rays start on the smooth surface (Hanika 2021): no facets in shadows.
-        depth = ((point[:, None] - corners[:, :, :3]) * corners[:, :, 3:6]).sum(axis=2)
+        depth = ((point[:, None] - corners[:, :, :3]) * corners[:, :, 3:6]).sum(
+            axis=2
+        )
         lifted = point - _blend(bary * np.minimum(depth, 0), corners[:, :, 3:6])
 
         # The colour, at the mip level whose texels are as far apart as the rays.
-        level = looks.density[face] + np.log2(_norm(point - eye)[:, 0] * spacing)
+        level = looks.density[face] + np.log2(
+            _norm(point - eye)[:, 0] * spacing
+        )
         colour, _, bump = looks.textures(
             surface=looks.character.material[face],
             uv=here[:, 8:10],
@@ -365,7 +396,9 @@ class PosedCharacter:
         k = k[~self.tracer.blocked(start, towards[k])]
         half = _unit(towards[k] - ray[k])
         lobe = np.maximum(_dot(normal[k], half), 0) ** np.float32(SHININESS)
-        shine = self.light.shine + self.light.gloss * looks.glossy[face[k], None]
+        shine = (
+            self.light.shine + self.light.gloss * looks.glossy[face[k], None]
+        )
         sun = np.array(self.light.sun, np.float32)
         out[k] += (colour[k] + shine * lobe) * facing[k, None] * sun
         return out

@@ -64,7 +64,8 @@ class ImageGrid(Callback):
         # Only the first process has collected rows.
         if self._collected:
             write_grid(
-                self._collected, self.folder / f"step_{_training(module).step:06d}.png"
+                self._collected,
+                self.folder / f"step_{_training(module).step:06d}.png",
             )
 
 
@@ -82,7 +83,9 @@ class ProgressLines(Callback):
         self._clock = time.monotonic()
         self._first = _training(module).step
 
-    def on_validation_end(self, trainer: Trainer, module: LightningModule) -> None:
+    def on_validation_end(
+        self, trainer: Trainer, module: LightningModule
+    ) -> None:
         if not trainer.is_global_zero:
             return
         module = _training(module)
@@ -91,7 +94,9 @@ class ProgressLines(Callback):
         step = module.step
         total = module.schedule.total
         scores = trainer.callback_metrics
-        line = f"{step:>6}/{total} {module.schedule.phase(max(0, step - 1)):<12}"
+        line = (
+            f"{step:>6}/{total} {module.schedule.phase(max(0, step - 1)):<12}"
+        )
         line += f" held-out PSNR {float(scores['val/psnr']):5.2f} dB"
         if module.avatar.generator is not None and "val/psnr_splat" in scores:
             line += f" (Step I's colour {float(scores['val/psnr_splat']):5.2f})"
@@ -123,9 +128,13 @@ class StopOnSignal(Callback):
     def _ask(self, *_: Any) -> None:
         self.asked = True
 
-    def on_train_epoch_end(self, trainer: Trainer, module: LightningModule) -> None:
+    def on_train_epoch_end(
+        self, trainer: Trainer, module: LightningModule
+    ) -> None:
         # over all processes, which need not have had the signal in the same epoch
-        self.asked = trainer.strategy.reduce_boolean_decision(self.asked, all=False)
+        self.asked = trainer.strategy.reduce_boolean_decision(
+            self.asked, all=False
+        )
         trainer.should_stop |= self.asked
 
 
@@ -133,7 +142,10 @@ class AtomicCheckpoints(TorchCheckpointIO):
     """Writes a new file and renames it, so that a killed run leaves a whole checkpoint."""
 
     def save_checkpoint(
-        self, checkpoint: dict[str, Any], path: Any, storage_options: Any | None = None
+        self,
+        checkpoint: dict[str, Any],
+        path: Any,
+        storage_options: Any | None = None,
     ) -> None:
         # The checkpoint is complete in memory before a file is touched.
         buffer = io.BytesIO()

@@ -40,8 +40,12 @@ def describe(
     )
     processes = data.loading_processes
     megabytes = data.cache_mb / data.loading_processes
-    each = "" if processes == 1 else f" in each of {processes} loading processes"
-    table.add_row("cache of images", f"{megabytes:,.0f} MB{each} (data.cache_mb)")
+    each = (
+        "" if processes == 1 else f" in each of {processes} loading processes"
+    )
+    table.add_row(
+        "cache of images", f"{megabytes:,.0f} MB{each} (data.cache_mb)"
+    )
 
     # The parts and their sizes.
     plain = getattr(avatar.deformation, "from_normal", avatar) is None
@@ -57,7 +61,8 @@ def describe(
     for name, part in parts.items():
         if part is not None:
             table.add_row(
-                name, f"{sum(p.numel() for p in part.parameters()):,} parameters"
+                name,
+                f"{sum(p.numel() for p in part.parameters()):,} parameters",
             )
 
     # The Gaussians.
@@ -66,7 +71,8 @@ def describe(
         apart = on_body.pixels_apart(info.scale_train[1])
         number = f"{len(on_body.points):,} on the body"
         table.add_row(
-            "Gaussians", f"{number}, {apart:.1f} pixels apart in the training images"
+            "Gaussians",
+            f"{number}, {apart:.1f} pixels apart in the training images",
         )
 
     # The losses that need other networks or labels.
@@ -74,19 +80,24 @@ def describe(
         every = module.step_two.perceptual_every
         when = "every iteration" if every == 1 else f"every {every} iterations"
         table.add_row(
-            "perceptual loss", f"{module.perceptual.description}; {when} of Step II"
+            "perceptual loss",
+            f"{module.perceptual.description}; {when} of Step II",
         )
     if avatar.segmentation is None:
         table.add_row("segmentation S", f"not built: {avatar.segmentation_why}")
     else:
         source = (
-            "part labels" if info.has_labels else "masks: the data has no part labels"
+            "part labels"
+            if info.has_labels
+            else "masks: the data has no part labels"
         )
         table.add_row("", f"{avatar.segmentation_why}; S learns from {source}")
 
     # The rasteriser, the precision and the schedule.
     if avatar.splats is not None:
-        backend = resolve_backend(avatar.backend, device_of(config), avatar.accuracy)[0]
+        backend = resolve_backend(
+            avatar.backend, device_of(config), avatar.accuracy
+        )[0]
         table.add_row("rasteriser", backend)
     table.add_row("precision", _precision(str(config.trainer.precision)))
     s = module.schedule

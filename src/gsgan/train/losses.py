@@ -57,7 +57,8 @@ class StepOneLoss:
         """The loss of a rendering of ``frame`` over ``background [B, 3, 1, 1]``, None for black;
         ``head`` is the linear readout of F. In full precision, autocast or not."""
         with full_precision(frame.image.device):
-            assert rendering.features is not None and rendering.splat_alpha is not None  # noqa: PT018
+            assert rendering.features is not None
+            assert rendering.splat_alpha is not None
             assert rendering.colour is not None
 
             # Ground truth and rendering are both put on the random background.
@@ -75,8 +76,12 @@ class StepOneLoss:
             if head is not None:
                 # The bias is weighted by alpha, so that the readout commutes with blending. One
                 # product, because a convolution with few channels is slower on a CPU.
-                seen = torch.cat([rendering.features, rendering.splat_alpha], dim=1)
-                weight = torch.cat([head.weight.flatten(1), head.bias[:, None]], dim=1)  # type: ignore[index]
+                seen = torch.cat(
+                    [rendering.features, rendering.splat_alpha], dim=1
+                )
+                weight = torch.cat(
+                    [head.weight.flatten(1), head.bias[:, None]], dim=1
+                )  # type: ignore[index]
                 read = (weight @ seen.flatten(2)).unflatten(2, seen.shape[2:])
                 loss = loss + self.feature_head * photometric(
                     read + behind, target, unsure=frame.unsure, **pixels
@@ -134,7 +139,11 @@ class DiscriminatorMaps:
     """
 
     def __init__(
-        self, discriminator: Discriminator, image: Tensor, target: Tensor, gan: str
+        self,
+        discriminator: Discriminator,
+        image: Tensor,
+        target: Tensor,
+        gan: str,
     ) -> None:
         self.image = image
         self.gan = gan
@@ -167,7 +176,9 @@ class DiscriminatorMaps:
     def difference(self) -> Tensor:
         """``[scales]`` mean absolute differences of the logits of both images."""
         pairs = zip(self.fake, self.real, strict=True)
-        return torch.stack([(a[-1] - b[-1]).detach().abs().mean() for a, b in pairs])
+        return torch.stack(
+            [(a[-1] - b[-1]).detach().abs().mean() for a, b in pairs]
+        )
 
     def loss(self) -> Tensor:
         """The discriminator's loss."""
@@ -190,7 +201,9 @@ class _Through(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
         # The gradient is of the copy alone. The graph is kept for the discriminator's loss.
-        (grad,) = torch.autograd.grad(ctx.terms, ctx.copy, grads, retain_graph=True)
+        (grad,) = torch.autograd.grad(
+            ctx.terms, ctx.copy, grads, retain_graph=True
+        )
         return grad, None
 
 
@@ -228,7 +241,9 @@ class StepTwoLoss:
         # Unsure pixels show the image itself in the target.
         assert rendering.image is not None
         target = without_unsure(frame.image, rendering.image, frame.unsure)
-        return DiscriminatorMaps(discriminator, rendering.image, target, self.gan)
+        return DiscriminatorMaps(
+            discriminator, rendering.image, target, self.gan
+        )
 
     @property
     def adversarial_terms(self) -> bool:
@@ -269,7 +284,9 @@ class StepTwoLoss:
         if self.alpha:
             white = image + 1 - alpha
             truth = frame.image + 1 - frame.mask
-            terms["alpha"] = self.alpha * by_pixel(white, truth, unsure=frame.unsure)
+            terms["alpha"] = self.alpha * by_pixel(
+                white, truth, unsure=frame.unsure
+            )
 
         # L_Ψ and L_perc, which is weighted as much more as it is computed less often.
         if anchor is not None:

@@ -32,7 +32,12 @@ from gsgan.train.optimisers import (
     clip,
     parameter_groups,
 )
-from gsgan.train.rollback import Rollback, SkippedSteps, likely_cause, save_batch
+from gsgan.train.rollback import (
+    Rollback,
+    SkippedSteps,
+    likely_cause,
+    save_batch,
+)
 from gsgan.train.schedule import SEGMENTATION, SPLATTING, STEP_ONE, Schedule
 from gsgan.utils.checks import above, at_least, whole
 from gsgan.utils.errors import ConfigError, GsganError
@@ -54,7 +59,9 @@ def fitted_schedule(schedule: Schedule, avatar: Avatar) -> Schedule:
     )
 
 
-def compares(avatar: Avatar, step_one: StepOneLoss, step_two: StepTwoLoss) -> bool:
+def compares(
+    avatar: Avatar, step_one: StepOneLoss, step_two: StepTwoLoss
+) -> bool:
     """Whether a step of an avatar's training has L_perc."""
     if avatar.generator is not None and step_two.perceptual:
         return True
@@ -127,7 +134,9 @@ class AvatarTraining(LightningModule):
 
         # Random changes of the input.
         self.pose_noise = pose_noise
-        self.window = None if window is None else whole("training.window", window, 16)
+        self.window = (
+            None if window is None else whole("training.window", window, 16)
+        )
         self.window_reach = above("training.window_reach", window_reach)
         self.seed = seed
         # Step I over a random colour, so that black clothes do not become transparent.
@@ -229,7 +238,9 @@ class AvatarTraining(LightningModule):
         if self.window is not None:
             if window is None:
                 size = frame.camera.size
-                window = Window(corners=((0, 0),) * len(frame), size=size, whole=size)
+                window = Window(
+                    corners=((0, 0),) * len(frame), size=size, whole=size
+                )
             window = window.part(
                 self.window, self._random(torch.rand, 3, len(frame), 2)
             )
@@ -243,7 +254,9 @@ class AvatarTraining(LightningModule):
 
     def _train_step_one(self, frame: Frame) -> None:
         # Only Step I's colour is rendered; no image is generated.
-        rendering = self._computed(partial(self._rendered, frame, generate=False))
+        rendering = self._computed(
+            partial(self._rendered, frame, generate=False)
+        )
         if rendering is None:
             return
 
@@ -269,11 +282,15 @@ class AvatarTraining(LightningModule):
 
     def _train_step_two(self, frame: Frame) -> None:
         # I_pred is rendered, and judged by the discriminator while the GAN trains.
-        rendering = self._computed(partial(self._rendered, frame, generate=True))
+        rendering = self._computed(
+            partial(self._rendered, frame, generate=True)
+        )
         if rendering is None:
             return
         maps = None
-        if self.discriminator is not None and self.schedule.adversarial(self.step):
+        if self.discriminator is not None and self.schedule.adversarial(
+            self.step
+        ):
             maps = self.step_two.discriminator_maps(
                 self.discriminator, rendering, frame
             )
@@ -288,7 +305,9 @@ class AvatarTraining(LightningModule):
 
         # One step of the discriminator, on the same maps.
         if maps is not None:
-            self._descend({"step_two/discriminator": maps.loss()}, "discriminator")
+            self._descend(
+                {"step_two/discriminator": maps.loss()}, "discriminator"
+            )
 
     def _rendered(self, frame: Frame, *, generate: bool) -> Rendering:
         # The training's own settings: noise on the pose, and less work where the schedule allows
@@ -336,14 +355,17 @@ class AvatarTraining(LightningModule):
 
         # The terms that the config adds.
         return terms | {
-            name: loss(rendering, frame) for name, loss in self.extra_losses.items()
+            name: loss(rendering, frame)
+            for name, loss in self.extra_losses.items()
         }
 
     # -- optimisers
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
         # The names tell which of Lightning's list each optimiser is.
-        groups = parameter_groups(self.avatar, self.feature_head, self.discriminator)
+        groups = parameter_groups(
+            self.avatar, self.feature_head, self.discriminator
+        )
         check_recipes(self.recipes, groups)
         self._names = list(groups)
         return [self.recipes[name].build(groups[name]) for name in self._names]
@@ -351,7 +373,11 @@ class AvatarTraining(LightningModule):
     def _optimisers(self) -> dict[str, Any]:
         found = self.optimizers()
         return dict(
-            zip(self._names, found if isinstance(found, list) else [found], strict=True)
+            zip(
+                self._names,
+                found if isinstance(found, list) else [found],
+                strict=True,
+            )
         )
 
     def _splatting(self) -> list[str]:
@@ -387,7 +413,9 @@ class AvatarTraining(LightningModule):
         # The likely cause is found from the data, the weights of every optimiser and the losses.
         stop = self.skipped.add(self.step)
         held = {
-            name: [p for group in optimiser.param_groups for p in group["params"]]
+            name: [
+                p for group in optimiser.param_groups for p in group["params"]
+            ]
             for name, optimiser in self._optimisers().items()
         }
         cause = likely_cause(self._frame, held, losses, problem)
@@ -437,7 +465,9 @@ class AvatarTraining(LightningModule):
             for name, optimiser in optimisers.items()
         ]
         if not bool(torch.isfinite(torch.stack(norms)).all()):
-            self._skip(losses, f"a gradient of {', '.join(names)} was not finite")
+            self._skip(
+                losses, f"a gradient of {', '.join(names)} was not finite"
+            )
             return
 
         # The rates follow the schedule, times the factor of each group.
@@ -469,13 +499,17 @@ class AvatarTraining(LightningModule):
 
         # The person, Ψ or the discriminator has collapsed: the optimisers restart from the kept
         # state.
-        optimisers = [wrapped.optimizer for wrapped in self._optimisers().values()]
+        optimisers = [
+            wrapped.optimizer for wrapped in self._optimisers().values()
+        ]
         if not self.rollback.restore(self, optimisers):
             raise self._stopped(
                 f"{what}, also after {self.rollback.done} returns to a good state; start again "
                 "with a lower training.recipes.psi.rate.peak"
             )
-        count = f"{self.rollback.done} of at most {self.rollback.max_restorations}"
+        count = (
+            f"{self.rollback.done} of at most {self.rollback.max_restorations}"
+        )
         self.print(
             f"iteration {self.step}: {what}; back to the last good state, Ψ's learning rate times "
             f"{self.rollback.rate:g} ({count})"
@@ -507,9 +541,9 @@ class AvatarTraining(LightningModule):
     def _pose_noise(self, skeleton: Tensor) -> Tensor | None:
         if not self.pose_noise:
             return None
-        return self.pose_noise * self._random(torch.randn, 1, *skeleton.shape).to(
-            skeleton
-        )
+        return self.pose_noise * self._random(
+            torch.randn, 1, *skeleton.shape
+        ).to(skeleton)
 
     def _crop_draws(self, images: int) -> Tensor | None:
         """Random numbers that place the perceptual loss's crops; None without crops."""
@@ -529,8 +563,14 @@ class AvatarTraining(LightningModule):
             ("psnr_splat", rendering.colour),
         ):
             if image is not None:
-                score = psnr(image.clamp(0, 1), frame.image).clamp_max(PSNR_CAP).mean()
-                self.log(f"val/{name}", score, batch_size=len(frame), sync_dist=True)
+                score = (
+                    psnr(image.clamp(0, 1), frame.image)
+                    .clamp_max(PSNR_CAP)
+                    .mean()
+                )
+                self.log(
+                    f"val/{name}", score, batch_size=len(frame), sync_dist=True
+                )
         return rendering
 
     def on_validation_epoch_end(self) -> None:

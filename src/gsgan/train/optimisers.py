@@ -53,7 +53,9 @@ class Recipe:
 
 
 def parameter_groups(
-    avatar: Avatar, feature_head: nn.Module | None, discriminator: nn.Module | None
+    avatar: Avatar,
+    feature_head: nn.Module | None,
+    discriminator: nn.Module | None,
 ) -> dict[str, list[tuple[list[nn.Parameter], float]]]:
     """Groups of (parameters, rate multiplier) by optimiser, for the parts that are built."""
     # S learns alone, in the first phase.
@@ -63,7 +65,9 @@ def parameter_groups(
 
     # Ψ, the readout of F and the learnt skinning weights share an optimiser.
     if avatar.splats is not None:
-        head = list(feature_head.parameters()) if feature_head is not None else []
+        head = (
+            list(feature_head.parameters()) if feature_head is not None else []
+        )
         groups["psi"] = [*avatar.splats.parameter_groups(), (head, 1.0)]
         if (on_body := avatar.body_points) is not None:
             groups["psi"].append((list(on_body.parameters()), on_body.rate))
@@ -75,7 +79,9 @@ def parameter_groups(
     # The pose code learns with the generator, and the discriminator against them.
     if avatar.generator is not None and avatar.pose_encoder is not None:
         encoder = avatar.pose_encoder.parameters()
-        groups["generator"] = [([*avatar.generator.parameters(), *encoder], 1.0)]
+        groups["generator"] = [
+            ([*avatar.generator.parameters(), *encoder], 1.0)
+        ]
     if discriminator is not None:
         groups["discriminator"] = [(list(discriminator.parameters()), 1.0)]
     return groups
@@ -97,7 +103,9 @@ def check_recipes(recipes: dict[str, Recipe], names: Iterable[str]) -> None:
 def clip(optimiser: torch.optim.Optimizer, largest: float | None) -> Tensor:
     """Clips all gradients together and returns their norm before clipping."""
     # One norm for all parameters; without a limit the norm is only measured.
-    parameters = [p for group in optimiser.param_groups for p in group["params"]]
+    parameters = [
+        p for group in optimiser.param_groups for p in group["params"]
+    ]
     return nn.utils.clip_grad_norm_(
         parameters, float("inf") if largest is None else largest
     )

@@ -15,7 +15,9 @@ from gsgan.utils.checks import between, whole
 from gsgan.utils.files import write_atomically, writing
 
 MAX_WEIGHT = 1e6  # a weight beyond it has exploded
-BRIGHTEST = 10.0  # mean of an image whose ground truth is within 0 and 1, likewise
+BRIGHTEST = (
+    10.0  # mean of an image whose ground truth is within 0 and 1, likewise
+)
 # mean difference of a discriminator's logits that no longer follow the image
 SAME = 1e-7
 
@@ -82,11 +84,13 @@ class Rollback:
         means = dict(zip(names, over_ranks(held).tolist(), strict=True))
 
         # The share of the masks that the rendered person covers.
-        share = means["alpha"] / means["mask"] if means.get("mask") else float("inf")
+        share = (
+            means["alpha"] / means["mask"]
+            if means.get("mask")
+            else float("inf")
+        )
         if share < self.collapse:
-            return (
-                f"the rendered person has vanished (alpha is {share:.1%} of the masks')"
-            )
+            return f"the rendered person has vanished (alpha is {share:.1%} of the masks')"
 
         # Colours far outside the images' range.
         if (mean := means.get("colour", 0.0)) > BRIGHTEST:
@@ -101,7 +105,9 @@ class Rollback:
 
     def keep(self, module: nn.Module) -> None:
         """Keeps a copy of the state."""
-        self._state = {k: v.detach().clone() for k, v in module.state_dict().items()}
+        self._state = {
+            k: v.detach().clone() for k, v in module.state_dict().items()
+        }
 
     def restore(
         self, module: nn.Module, optimisers: Sequence[torch.optim.Optimizer]
@@ -161,14 +167,17 @@ def likely_cause(
         problem: what was noticed, the answer if all of these are finite.
     """
     # The data comes first: values that are not finite there explain all others.
-    items = f"frame {frame.frame_id.tolist()}, camera {frame.camera_index.tolist()}"
+    items = (
+        f"frame {frame.frame_id.tolist()}, camera {frame.camera_index.tolist()}"
+    )
     if bad := _not_finite(asdict(frame)):
         return f"{', '.join(bad)} of the data is not finite ({items}, counted from 0)"
 
     # The weights of each optimiser come next, by their largest absolute value.
     for name, held in parameters.items():
         largest = max(
-            (float(p.detach().abs().max()) for p in held if p.numel()), key=_or_infinite
+            (float(p.detach().abs().max()) for p in held if p.numel()),
+            key=_or_infinite,
         )
         if not _or_infinite(largest) <= MAX_WEIGHT:
             return (
@@ -193,7 +202,9 @@ def _not_finite(values: Mapping[str, Any], before: str = "") -> list[str]:
     for name, value in values.items():
         if isinstance(value, Mapping):
             found += _not_finite(value, f"{before}{name}.")
-        elif isinstance(value, Tensor) and not bool(torch.isfinite(value).all()):
+        elif isinstance(value, Tensor) and not bool(
+            torch.isfinite(value).all()
+        ):
             found.append(before + name)
     return found
 
@@ -202,6 +213,8 @@ def save_batch(path: Path, step: int, frame: Frame, cause: str) -> None:
     """Writes the batch of a run that stops, as plain tensors that ``torch.load`` reads."""
     # The file is written whole or not at all.
     stream = io.BytesIO()
-    torch.save({"step": step, "cause": cause, "frame": asdict(frame.to("cpu"))}, stream)
+    torch.save(
+        {"step": step, "cause": cause, "frame": asdict(frame.to("cpu"))}, stream
+    )
     with writing(path):
         write_atomically(path, stream.getvalue())

@@ -97,7 +97,9 @@ def run_training(config: DictConfig) -> None:
             start_from(module.avatar, data, Path(config.distil).expanduser())
     else:
         done = int(read_checkpoint(resume)["gsgan"]["step"])
-        if done >= module.schedule.total and _has_results(config, folder, resume):
+        if done >= module.schedule.total and _has_results(
+            config, folder, resume
+        ):
             console.print(
                 f"{folder}: trained and scored before; nothing to do (gsgan.evaluate scores it "
                 "again)",
@@ -136,7 +138,9 @@ def _has_results(config: DictConfig, folder: Path, checkpoint: Path) -> bool:
     """Whether the results that the config asks for are newer than the checkpoint."""
     wanted = {"metrics.json": config.evaluate, PAGE: config.page}
     return all(
-        is_written(folder / name, checkpoint) for name, on in wanted.items() if on
+        is_written(folder / name, checkpoint)
+        for name, on in wanted.items()
+        if on
     )
 
 
@@ -188,7 +192,8 @@ def _store_poses(avatar: Avatar, data: GsganData) -> None:
     body = None
     if poses is not None:
         parts = (
-            np.stack([part[f] for f in frames]) for part in (poses.theta, poses.transl)
+            np.stack([part[f] for f in frames])
+            for part in (poses.theta, poses.transl)
         )
         body = BodyPose(*(torch.from_numpy(x).float() for x in parts))
     avatar.store_poses(p.float(), valid, body)
@@ -212,16 +217,22 @@ def start_from(avatar: Avatar, data: GsganData, run: Path) -> None:
     frames = data.dataset("train")
     once = {frame: i for i, (_, frame) in enumerate(frames.items)}.values()
     poses = (frames[i].inputs for i in once)
-    fitted = distilled(trained, ((p, seen, body) for p, seen, _, body, _ in poses))
+    fitted = distilled(
+        trained, ((p, seen, body) for p, seen, _, body, _ in poses)
+    )
 
     # Other points at rest would need other residuals, so both avatars must have the same.
     state = {"rest_points": fitted.rest_points, **fitted.state_dict()}
     own = avatar.state_dict()
     own["rest_points"] = avatar.rest_points
-    alike = all(x.shape == own[name].shape for name, x in state.items() if name in own)
+    alike = all(
+        x.shape == own[name].shape for name, x in state.items() if name in own
+    )
     if not (
         alike
-        and torch.allclose(state.pop("rest_points"), avatar.rest_points, atol=1e-3)
+        and torch.allclose(
+            state.pop("rest_points"), avatar.rest_points, atol=1e-3
+        )
     ):
         raise ConfigError(
             f"distil: {run} has other Gaussians; give its data, size and effects"
@@ -239,7 +250,9 @@ def _write_page(folder: Path, data: GsganData) -> None:
         "overwrite": True,
     }
     given |= {"motion": "train", "fps": data.layout.meta.fps or FPS}
-    export_config(cast(DictConfig, OmegaConf.merge(defaults_of("export"), given)))
+    export_config(
+        cast(DictConfig, OmegaConf.merge(defaults_of("export"), given))
+    )
 
 
 def _fit(
@@ -257,7 +270,9 @@ def _fit(
             trainer.validate(module, data, verbose=False)
         else:
             console.print(f"resuming from {resume}", soft_wrap=True)
-        trainer.fit(module, data, ckpt_path=None if resume is None else str(resume))
+        trainer.fit(
+            module, data, ckpt_path=None if resume is None else str(resume)
+        )
     except SystemExit as error:  # Lightning's answer to Ctrl-C and SIGTERM
         console.print(
             f"interrupted at iteration {module.step}; the same command with "

@@ -18,7 +18,10 @@ STRETCHED_STEPS = (
     "degree_every",
     "coarse",
 )
-SPLATTING = ("psi", "colour")  # optimisers of the parts that make Step I's image
+SPLATTING = (
+    "psi",
+    "colour",
+)  # optimisers of the parts that make Step I's image
 # iterations of S, at most, where two numbers learn from masks (docs/effects.md)
 FROM_MASKS = 800
 
@@ -54,7 +57,12 @@ class Schedule:
             )
 
     def fitted(
-        self, *, segmentation: bool, from_masks: bool, splats: bool, generator: bool
+        self,
+        *,
+        segmentation: bool,
+        from_masks: bool,
+        splats: bool,
+        generator: bool,
     ) -> Schedule:
         """The schedule of a model with these parts, stretched.
 
@@ -64,7 +72,8 @@ class Schedule:
         """
         # All lengths but those of S and the epoch are stretched.
         numbers = {
-            name: round(getattr(self, name) * self.stretch) for name in STRETCHED_STEPS
+            name: round(getattr(self, name) * self.stretch)
+            for name in STRETCHED_STEPS
         }
 
         # A step without parts to train gives its iterations to the other one.
@@ -93,18 +102,23 @@ class Schedule:
         """The phase that iteration ``step`` (from 0) belongs to."""
         if step < self.segmentation:
             return SEGMENTATION
-        return STEP_ONE if step < self.segmentation + self.step_one else STEP_TWO
+        return (
+            STEP_ONE if step < self.segmentation + self.step_one else STEP_TWO
+        )
 
     def degree(self, step: int, maximum: int) -> int:
         """The degree of the spherical harmonics at an iteration, up to ``maximum``."""
         if self.degree_every == 0:
             return maximum
-        return min(maximum, max(0, step - self.segmentation) // self.degree_every)
+        return min(
+            maximum, max(0, step - self.segmentation) // self.degree_every
+        )
 
     def fine(self, step: int) -> bool:
         """Whether F is supersampled at an iteration: not in the first ``coarse`` of Step I."""
         return not (
-            self.phase(step) == STEP_ONE and step - self.segmentation < self.coarse
+            self.phase(step) == STEP_ONE
+            and step - self.segmentation < self.coarse
         )
 
     def share_of_step_one(self, step: int) -> float:
@@ -121,7 +135,9 @@ class Schedule:
         }
         return ends[phase]
 
-    def span(self, optimiser: str, recipe_span: str = "both") -> tuple[int, int]:
+    def span(
+        self, optimiser: str, recipe_span: str = "both"
+    ) -> tuple[int, int]:
         """First iteration of an optimiser, and the first after its last, see `Recipe`."""
         # S and the discriminator have spans of their own.
         if optimiser == "segmentation":
@@ -150,7 +166,9 @@ class Schedule:
 
 
 _SHAPES = {
-    "cosine": lambda x, final: final + (1 - final) * 0.5 * (1 + math.cos(math.pi * x)),
+    "cosine": lambda x, final: (
+        final + (1 - final) * 0.5 * (1 + math.cos(math.pi * x))
+    ),
     "linear": lambda x, final: 1 + (final - 1) * x,
     "exponential": lambda x, final: final**x,
 }

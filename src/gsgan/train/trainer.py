@@ -40,7 +40,9 @@ def build_trainer(
     logger = instantiate(config.logger, **version)
 
     # Callbacks of the config, beside those that every run has.
-    own = [instantiate(callback) for callback in (config.callbacks or {}).values()]
+    own = [
+        instantiate(callback) for callback in (config.callbacks or {}).values()
+    ]
     used: list[Any] = [
         *callbacks,
         *own,
@@ -79,7 +81,9 @@ def device_of(config: DictConfig) -> torch.device:
     ranks = (os.environ.get(name) for name in LOCAL_RANKS)
     rank = int(next(filter(None, ranks), 0))
     chosen = config.trainer.devices
-    return torch.device("cuda", chosen[rank] if OmegaConf.is_list(chosen) else rank)
+    return torch.device(
+        "cuda", chosen[rank] if OmegaConf.is_list(chosen) else rank
+    )
 
 
 def quiet_lightning() -> None:
@@ -88,8 +92,12 @@ def quiet_lightning() -> None:
     for name in ("lightning.pytorch", "lightning.fabric", "lightning"):
         logging.getLogger(name).setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", message=".*does not have many workers.*")
-    warnings.filterwarnings("ignore", message=".*Checkpoint directory .* exists.*")
+    warnings.filterwarnings(
+        "ignore", message=".*Checkpoint directory .* exists.*"
+    )
     warnings.filterwarnings(
         "ignore", message=".*is smaller than the logging interval.*"
     )
-    warnings.filterwarnings("ignore", message=".*isinstance.treespec, LeafSpec.*")
+    warnings.filterwarnings(
+        "ignore", message=".*isinstance.treespec, LeafSpec.*"
+    )

@@ -47,7 +47,9 @@ def expect_array(
 
     # Signed and unsigned integers, and floats.
     if array.dtype.kind not in "iuf":
-        raise DataError(f"{path}: '{name}' must hold numbers, found {array.dtype}")
+        raise DataError(
+            f"{path}: '{name}' must hold numbers, found {array.dtype}"
+        )
     return array
 
 

@@ -36,14 +36,23 @@ def at_least(name: str, value: Any, minimum: float) -> Any:
 
 def above(name: str, value: Any, bound: float = 0) -> Any:
     """A number above ``bound``."""
-    _require(is_number(value) and value > bound, name, f"a number above {bound}", value)
+    _require(
+        is_number(value) and value > bound,
+        name,
+        f"a number above {bound}",
+        value,
+    )
     return value
 
 
 def whole(name: str, value: Any, minimum: int) -> int:
     """A whole number of at least ``minimum``."""
     # True and False are integers of Python.
-    good = isinstance(value, int) and not isinstance(value, bool) and value >= minimum
+    good = (
+        isinstance(value, int)
+        and not isinstance(value, bool)
+        and value >= minimum
+    )
     _require(good, name, f"a whole number of at least {minimum}", value)
     return int(value)
 
@@ -52,6 +61,8 @@ def one_of(name: str, value: Any, choices: Iterable[Any]) -> Any:
     """One of the choices."""
     # Types are compared too: True equals 1, and is not meant by it.
     choices = tuple(choices)
-    known = any(type(value) is type(choice) and value == choice for choice in choices)
+    known = any(
+        type(value) is type(choice) and value == choice for choice in choices
+    )
     _require(known, name, f"one of {', '.join(map(str, choices))}", value)
     return value

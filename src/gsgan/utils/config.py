@@ -13,7 +13,11 @@ from pathlib import Path
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.plugins import Plugins
-from hydra.errors import CompactHydraException, HydraException, InstantiationException
+from hydra.errors import (
+    CompactHydraException,
+    HydraException,
+    InstantiationException,
+)
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.types import RunMode
 from hydra.utils import get_method
@@ -25,8 +29,13 @@ from gsgan.utils.errors import GsganError
 from gsgan.utils.sweeps import note, run_job
 
 FAILED = 1
-CONFIG_ENTRY_POINTS = "gsgan.conf"  # group of entry points of installed packages
-BFLOAT16_SINCE = (8, 0)  # compute capability: before it bfloat16 is emulated or refused
+CONFIG_ENTRY_POINTS = (
+    "gsgan.conf"  # group of entry points of installed packages
+)
+BFLOAT16_SINCE = (
+    8,
+    0,
+)  # compute capability: before it bfloat16 is emulated or refused
 # Bytes of the name of a sweep's folder: file systems take 255, and files beside it need some.
 LONGEST_NAME = 200
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
@@ -120,7 +129,9 @@ OmegaConf.register_new_resolver("gpu_precision", gpu_precision, replace=True)
 OmegaConf.register_new_resolver("if_gpu", if_gpu, replace=True)
 
 
-def entry(name: str, task: Callable[[DictConfig], object] | str) -> Callable[[], None]:
+def entry(
+    name: str, task: Callable[[DictConfig], object] | str
+) -> Callable[[], None]:
     """A command with Hydra's grammar and one-sentence errors.
 
     Each job of a sweep (``-m``) is the same command in a process of its own.
@@ -162,7 +173,9 @@ def entry(name: str, task: Callable[[DictConfig], object] | str) -> Callable[[],
         # Paths that Hydra's grammar cannot read as they are.
         sys.argv[1:] = map(quoted, sys.argv[1:])
         command = hydra.main(
-            version_base="1.3", config_path=str(config_folder()), config_name=name
+            version_base="1.3",
+            config_path=str(config_folder()),
+            config_name=name,
         )(run)
 
         # Errors come through to here, also those of files that Hydra itself writes.
@@ -171,7 +184,11 @@ def entry(name: str, task: Callable[[DictConfig], object] | str) -> Callable[[],
             command()
         except CompactHydraException as error:
             cause = error.__cause__
-            more = f"\n{cause}" if isinstance(cause, OmegaConfBaseException) else ""
+            more = (
+                f"\n{cause}"
+                if isinstance(cause, OmegaConfBaseException)
+                else ""
+            )
             print(f"{error}{more}", file=sys.stderr)
             sys.exit(FAILED)
         except OSError as error:
@@ -240,7 +257,9 @@ def _raised_here(error: BaseException) -> bool:
     at = error.__traceback__
     while at is not None and at.tb_next is not None:
         at = at.tb_next
-    return at is not None and at.tb_frame.f_globals["__name__"].startswith("gsgan.")
+    return at is not None and at.tb_frame.f_globals["__name__"].startswith(
+        "gsgan."
+    )
 
 
 def _without_worker(error: GsganError) -> str:
@@ -248,7 +267,11 @@ def _without_worker(error: GsganError) -> str:
     text = str(error)
     if not text.startswith("Caught "):
         return text
-    return text.rpartition(f"{type(error).__name__}: ")[2].strip().rpartition("\n")[2]
+    return (
+        text.rpartition(f"{type(error).__name__}: ")[2]
+        .strip()
+        .rpartition("\n")[2]
+    )
 
 
 def _remove_unused_folder() -> None:
@@ -267,4 +290,6 @@ def _remove_unused_folder() -> None:
 
 def _print_error(message: str) -> None:
     console = Console(stderr=True, soft_wrap=True)
-    console.print(f"gsgan: {message}", style="bold red", markup=False, highlight=False)
+    console.print(
+        f"gsgan: {message}", style="bold red", markup=False, highlight=False
+    )

@@ -79,7 +79,9 @@ def working(console: Console, what: str) -> Iterator[None]:
         return
 
     # A log file gets the line only if the work takes long.
-    say = Timer(SLOW_SECONDS, console.print, [f"{what} …"], {"highlight": False})
+    say = Timer(
+        SLOW_SECONDS, console.print, [f"{what} …"], {"highlight": False}
+    )
     say.daemon = True
     say.start()
     try:
@@ -96,11 +98,16 @@ def progress(console: Console, disable: bool = False) -> Progress:
         MofNCompleteColumn(),
         TimeRemainingColumn(),
     )
-    return LoggedProgress(*columns, console=console, transient=True, disable=disable)
+    return LoggedProgress(
+        *columns, console=console, transient=True, disable=disable
+    )
 
 
 def track(
-    items: Iterable[Item], description: str, console: Console, total: int | None = None
+    items: Iterable[Item],
+    description: str,
+    console: Console,
+    total: int | None = None,
 ) -> Iterator[Item]:
     """The items one by one, with their number and the remaining time shown by `progress`."""
     with progress(console) as bars:

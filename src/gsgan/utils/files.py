@@ -94,7 +94,9 @@ def _plain(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_plain(item) for item in value]
     # JSON has no NaN and no infinity.
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+    return (
+        None if isinstance(value, float) and not np.isfinite(value) else value
+    )
 
 
 def read_json(path: Path) -> dict[str, Any]:

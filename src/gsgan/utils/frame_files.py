@@ -35,7 +35,9 @@ class FrameFiles(Mapping[int, str]):
         self.frames = np.array(sorted(names), np.int64)
         # Encoded together, which is faster; no name holds a slash.
         held = [names[frame] for frame in self.frames.tolist()]
-        self._names = np.array(os.fsencode("/".join(held)).split(b"/")[: len(held)])
+        self._names = np.array(
+            os.fsencode("/".join(held)).split(b"/")[: len(held)]
+        )
 
     def __getitem__(self, frame: int) -> str:
         # The frames are sorted, so that a binary search finds them.
@@ -165,6 +167,8 @@ def natural_order(name: str) -> list[Any]:
     """Sort key: ``Camera_B2`` before ``Camera_B10``, ``rate -1e-3`` before ``rate 0.5``."""
     # Numbers after a space, such as values of settings, may have a sign and decimals. Decimal
     # keeps all digits. The pattern's matches have odd places.
-    parts: list[Any] = re.split(r"((?<= )-?\d+(?:\.\d+)?(?:e[+-]?\d{1,3})?|\d+)", name)
+    parts: list[Any] = re.split(
+        r"((?<= )-?\d+(?:\.\d+)?(?:e[+-]?\d{1,3})?|\d+)", name
+    )
     parts[1::2] = map(Decimal, parts[1::2])
     return parts

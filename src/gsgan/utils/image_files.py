@@ -43,7 +43,9 @@ def read_header(path: Path) -> tuple[tuple[int, int], int, str]:
         raise unreadable(path, error) from None
     except Exception:  # Pillow raises many kinds on damage
         pass
-    raise DataError(f"{path} is not a valid PNG or JPEG file; copy or export it again")
+    raise DataError(
+        f"{path} is not a valid PNG or JPEG file; copy or export it again"
+    )
 
 
 def check_image(
@@ -107,7 +109,9 @@ def read_stored(path: Path) -> NDArray[np.uint8]:
     return image[..., :3] if image.ndim == 3 else image
 
 
-def read_with_alpha(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
+def read_with_alpha(
+    path: Path,
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
     """``[H, W, 3]`` uint8 RGB as stored and ``[H, W]`` alpha, None if the file has none.
 
     Raises:
@@ -115,7 +119,9 @@ def read_with_alpha(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | 
     """
     image = _decode_8_bit(path)
     if image.ndim != 3 or image.shape[2] not in (3, 4):
-        raise DataError(f"{path} is a grey image; expected RGB, with or without alpha")
+        raise DataError(
+            f"{path} is a grey image; expected RGB, with or without alpha"
+        )
     # OpenCV decodes to BGR, or BGRA.
     rgb = np.ascontiguousarray(image[..., 2::-1])
     alpha = None
@@ -124,7 +130,9 @@ def read_with_alpha(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | 
     return rgb, alpha
 
 
-def read_alpha(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]] | None:
+def read_alpha(
+    path: Path,
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]] | None:
     """``[H, W, 3]`` colours as stored and ``[H, W]`` alpha of an 8-bit file; None without alpha.
 
     Raises:

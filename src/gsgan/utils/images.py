@@ -18,7 +18,9 @@ PAGE_JPEG_QUALITY = 88  # of images within pages, 1 to 100
 Background = Tensor | None
 
 
-def background(name: str, video: bool) -> Callable[[tuple[int, int]], Background]:
+def background(
+    name: str, video: bool
+) -> Callable[[tuple[int, int]], Background]:
     """A function from an image's ``(H, W)`` to its background ``[3, H, W]``, or None to keep alpha.
 
     Args:
@@ -72,7 +74,9 @@ def eight_bits(image: Tensor, alpha: Tensor, behind: Background) -> Bytes:
     # the quotient would be noise.
     if behind is None:
         shown = alpha >= 0.5 / 255
-        straight = torch.where(shown, image / alpha.clamp_min(1e-6), 0.0).clamp(0, 1)
+        straight = torch.where(shown, image / alpha.clamp_min(1e-6), 0.0).clamp(
+            0, 1
+        )
         image = torch.cat([straight, alpha])
     else:
         image = image + (1 - alpha) * behind
@@ -105,5 +109,7 @@ def caption(image: Bytes, text: str, colour: tuple[int, int, int]) -> Bytes:
 def encode(image: Bytes) -> bytes:
     """A JPEG of an RGB image."""
     settings = [cv2.IMWRITE_JPEG_QUALITY, PAGE_JPEG_QUALITY]
-    _, data = cv2.imencode(".jpg", image[..., ::-1], settings)  # OpenCV takes BGR
+    _, data = cv2.imencode(
+        ".jpg", image[..., ::-1], settings
+    )  # OpenCV takes BGR
     return data.tobytes()

@@ -39,7 +39,9 @@ class _DType:
 
     def __init__(self, name: str, *_align_and_copy: Any) -> None:
         self.value = np.dtype(name)
-        _expect(self.value.kind in "biufcSUO", f"it holds arrays of type {name!r}")
+        _expect(
+            self.value.kind in "biufcSUO", f"it holds arrays of type {name!r}"
+        )
 
     def __setstate__(self, state: Any) -> None:
         # The second entry of numpy's state is the byte order.
@@ -74,7 +76,9 @@ class _Array(np.ndarray):
 
 def _bytes(content: Any) -> bytes:
     # Bytes of Python 2 arrive as text.
-    return content.encode("latin1") if isinstance(content, str) else bytes(content)
+    return (
+        content.encode("latin1") if isinstance(content, str) else bytes(content)
+    )
 
 
 def _reconstruct(*_class_shape_and_code: Any) -> NDArray[Any]:
@@ -110,11 +114,14 @@ class _Sparse(_Chumpy):
 
         shape = self.state.get("_shape") or self.state["shape"]
         _expect(
-            math.prod(shape) * 8 <= LARGEST_ARRAY, f"a sparse matrix of shape {shape}"
+            math.prod(shape) * 8 <= LARGEST_ARRAY,
+            f"a sparse matrix of shape {shape}",
         )
 
         # Indices beyond the shape are refused before anything is unpacked.
-        parts = tuple(_array(self.state[key]) for key in ("data", "indices", "indptr"))
+        parts = tuple(
+            _array(self.state[key]) for key in ("data", "indices", "indptr")
+        )
         matrix = scipy.sparse.csc_matrix(parts, shape)
         matrix.check_format(full_check=True)
         return np.asarray(matrix.toarray(), np.float64)
@@ -131,8 +138,12 @@ def _scalar(dtype: _DType, content: Any) -> Any:
     return np.frombuffer(_bytes(content), dtype.value)[0]
 
 
-def _from_buffer(content: Any, dtype: _DType, shape: Any, order: Any) -> NDArray[Any]:
-    return np.frombuffer(content, dtype.value).reshape(shape, order=order).copy()
+def _from_buffer(
+    content: Any, dtype: _DType, shape: Any, order: Any
+) -> NDArray[Any]:
+    return (
+        np.frombuffer(content, dtype.value).reshape(shape, order=order).copy()
+    )
 
 
 def _encode(text: str, _encoding: str) -> bytes:
@@ -196,7 +207,9 @@ def _as_data_error(path: Path, what: str) -> Iterator[None]:
     except FileNotFoundError:
         raise DataError(f"{path} does not exist") from None
     except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror or error}") from None
+        raise DataError(
+            f"{path} cannot be read: {error.strerror or error}"
+        ) from None
     except _Refused as error:
         # The name in a damaged file may have line breaks.
         name = " ".join(str(error).split())
@@ -253,8 +266,12 @@ def read_npz(
         found = {}
         for name in members if names is None else members.keys() & set(names):
             size = members[name].file_size
-            _expect(size <= LARGEST_ARRAY, f"{name} would unpack to {size} bytes")
-            found[name] = _read_array(io.BytesIO(archive.read(members[name])), objects)
+            _expect(
+                size <= LARGEST_ARRAY, f"{name} would unpack to {size} bytes"
+            )
+            found[name] = _read_array(
+                io.BytesIO(archive.read(members[name])), objects
+            )
         return found
 
 

@@ -18,7 +18,9 @@ from PIL.PngImagePlugin import PngInfo
 from gsgan import __version__
 from gsgan.utils.errors import DataError
 
-SOURCE_TYPE = "http://cv.iptc.org/newscodes/digitalsourcetype/trainedAlgorithmicMedia"
+SOURCE_TYPE = (
+    "http://cv.iptc.org/newscodes/digitalsourcetype/trainedAlgorithmicMedia"
+)
 SOFTWARE = f"gsgan {__version__}"
 PNG_KEY = "XML:com.adobe.xmp"
 MP4_UUID = bytes.fromhex("be7acfcb97a942e89c71999491e3afac")
@@ -102,7 +104,9 @@ def verify(path: Path) -> Provenance:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror or error}") from None
+        raise DataError(
+            f"{path} cannot be read: {error.strerror or error}"
+        ) from None
     try:
         xmp = _mp4_xmp(data) if mime == "video/mp4" else _image_xmp(data)
     except (OSError, ValueError, struct.error, SyntaxError):

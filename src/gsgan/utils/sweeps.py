@@ -52,13 +52,19 @@ def run_job(command: str, objective: str | None) -> float | None:
 
     # The job has the overrides of the sweep, but is a single run in a folder of its own.
     given = (*settings.overrides.task, *settings.overrides.hydra)
-    arguments = [override for override in given if not OF_THE_SWEEP.match(override)]
+    arguments = [
+        override for override in given if not OF_THE_SWEEP.match(override)
+    ]
     quoted = str(folder).replace("\\", "\\\\").replace("'", "\\'")
     own = ["hydra.mode=RUN", f"hydra.run.dir='{quoted}'"]
     for source in settings.runtime.config_sources:
-        if source.provider == "command-line":  # --config-dir, of which Hydra takes one
+        if (
+            source.provider == "command-line"
+        ):  # --config-dir, of which Hydra takes one
             own += ["--config-dir", source.path]
-    status = _status([sys.executable, "-m", f"gsgan.{command}", *arguments, *own])
+    status = _status(
+        [sys.executable, "-m", f"gsgan.{command}", *arguments, *own]
+    )
 
     # The mark goes when the job has ended well and has the score that is asked for.
     if status == 0:

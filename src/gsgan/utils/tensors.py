@@ -18,10 +18,14 @@ Result = TypeVar("Result")
 M_TRIM_THRESHOLD = -1
 M_MMAP_THRESHOLD = -3
 KEPT = 1 << 30  # bytes of freed memory that the process keeps
-LARGEST = 1 << 25  # bytes; glibc takes larger blocks from the system in any case
+LARGEST = (
+    1 << 25
+)  # bytes; glibc takes larger blocks from the system in any case
 
 
-def constant(values: Any, like: Tensor, dtype: torch.dtype | None = None) -> Tensor:
+def constant(
+    values: Any, like: Tensor, dtype: torch.dtype | None = None
+) -> Tensor:
     """Nested tuples of numbers as a tensor on the device of ``like``, of its dtype unless another
     is given; read only."""
     # torch.export sees a stand-in, which must not be kept.
@@ -88,7 +92,9 @@ def pick_device(name: str) -> torch.device:
     try:
         return torch.empty(0, device=name).device
     except (RuntimeError, AssertionError) as error:
-        raise ConfigError(f"device={name}: not usable here; try device=cpu") from error
+        raise ConfigError(
+            f"device={name}: not usable here; try device=cpu"
+        ) from error
 
 
 def keep_freed_memory() -> None:
@@ -109,7 +115,9 @@ def derived(
     """``make()``, a function of these weights alone. In a frozen module (one with a dictionary
     ``derived``) it is kept until a weight changes or moves."""
     # While training every call computes anew.
-    kept: dict[str, tuple[Any, Result]] | None = getattr(module, "derived", None)
+    kept: dict[str, tuple[Any, Result]] | None = getattr(
+        module, "derived", None
+    )
     if kept is None:
         return make()
 

@@ -26,7 +26,11 @@ def refusal(host: str | None, origin: str | None, served: str) -> str | None:
     try:
         ipaddress.ip_address(name)
     except ValueError:
-        if name not in ("localhost", served.lower(), socket.gethostname().lower()):
+        if name not in (
+            "localhost",
+            served.lower(),
+            socket.gethostname().lower(),
+        ):
             return "open the viewer by the address that it prints"
 
     # The page has the address that it connects to.

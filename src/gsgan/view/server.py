@@ -66,7 +66,9 @@ class Viewer:
 
         # The settings and the first motion of all browsers.
         drive = read(config.motion or self.run.data.watched[0])
-        size = whole("pixels", config.pixels or self.run.stored.data.size or 512, 16)
+        size = whole(
+            "pixels", config.pixels or self.run.stored.data.size or 512, 16
+        )
         behind: Any = background(str(config.background), video=True)
         self.show = Show(
             avatar=self.run.avatar,
@@ -94,9 +96,13 @@ class Viewer:
         # avatar on a public address.
         logging.getLogger("websockets").setLevel(logging.WARNING)
         with contextlib.redirect_stdout(io.StringIO()), guarded(host):
-            self.server = viser.ViserServer(host, port, label="gsgan", verbose=False)
+            self.server = viser.ViserServer(
+                host, port, label="gsgan", verbose=False
+            )
         self.server.request_share_url = lambda verbose=True: None  # type: ignore[method-assign]
-        self.server.gui.configure_theme(show_share_button=False, control_width="medium")
+        self.server.gui.configure_theme(
+            show_share_button=False, control_width="medium"
+        )
         self._camera(size)
 
         # A session per browser, and one thread that renders for all.
@@ -141,7 +147,9 @@ class Viewer:
         orbit = Orbit()
         proportions = self.run.proportions
         trained = self.run.stored.data.size or size
-        camera = orbit.cameras(p[:1], proportions, self.run.scene, size, trained)
+        camera = orbit.cameras(
+            p[:1], proportions, self.run.scene, size, trained
+        )
 
         # The same camera in viser's terms.
         up = upright(proportions.up)[2]
@@ -154,7 +162,9 @@ class Viewer:
 
     def _join(self, client: Any) -> None:
         _bound_uploads(client, self._limit)
-        self.sessions[client.client_id] = Session(client, self.show, self._wake.set)
+        self.sessions[client.client_id] = Session(
+            client, self.show, self._wake.set
+        )
         self._wake.set()
 
     def _leave(self, client: Any) -> None:

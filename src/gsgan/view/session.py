@@ -26,11 +26,11 @@ from gsgan.utils.provenance import png_bytes
 from gsgan.view.drag import HANDLE_NAMES, dragged, position
 
 IDLE_SECONDS = 0.1  # between two checks whether an image is due
-RESTS = 0.3  # seconds without movement after which the full-size image is rendered
-MIN_SCALE = 0.25  # of the images while something moves
-MAX_ASPECT = (
-    3.0  # of width to height or of height to width, since a browser window can have any
+RESTS = (
+    0.3  # seconds without movement after which the full-size image is rendered
 )
+MIN_SCALE = 0.25  # of the images while something moves
+MAX_ASPECT = 3.0  # of width to height or of height to width, since a browser window can have any
 SPEED_OVER = 2.0  # seconds over which the displayed rate is averaged
 YELLOW = (255, 200, 0)
 GREY = (160, 165, 175)
@@ -49,7 +49,9 @@ class Show:
     body: SkinnedBody | None  # that the avatar moves with
     drive: Drive  # the first motion
     read: Callable[[str], Drive]  # reads the motion in an uploaded file
-    behind: Callable[[tuple[int, int]], torch.Tensor]  # background [3, H, W] of a size
+    behind: Callable[
+        [tuple[int, int]], torch.Tensor
+    ]  # background [3, H, W] of a size
     size: int  # height of a full-size image, pixels
     fps: float  # frames per second of a motion that plays
     rate: float  # images per second to reach while something moves
@@ -58,7 +60,9 @@ class Show:
 class Session:
     """One client of the server; only the rendering thread calls `step`."""
 
-    def __init__(self, client: Any, show: Show, wake: Callable[[], None]) -> None:
+    def __init__(
+        self, client: Any, show: Show, wake: Callable[[], None]
+    ) -> None:
         self.client = client
         self.show = show
         self._wake = wake
@@ -203,7 +207,9 @@ class Session:
                     position=position(self.joints(), name),
                 )
                 gizmo.on_update(
-                    lambda event, name=name: self.drag(name, event.target.position)
+                    lambda event, name=name: self.drag(
+                        name, event.target.position
+                    )
                 )
                 gizmos[name] = gizmo
             self._gizmos = gizmos
@@ -289,7 +295,9 @@ class Session:
         # A running mean of the time of a full-size image.
         took = time.monotonic() - now
         whole = took / share**2
-        self.seconds = 0.7 * self.seconds + 0.3 * whole if self.seconds else whole
+        self.seconds = (
+            0.7 * self.seconds + 0.3 * whole if self.seconds else whole
+        )
         return 0.0
 
     def camera(self, share: float) -> Camera:
@@ -346,7 +354,9 @@ class Session:
             status = f"{rate:.1f} at {status}"
         self.status.value = status
 
-    def _place(self, splats: Gaussians | None, p: Float, pose: BodyPose | None) -> None:
+    def _place(
+        self, splats: Gaussians | None, p: Float, pose: BodyPose | None
+    ) -> None:
         """Draws skeleton, body and Gaussians, and moves the handles that are not being dragged."""
         scene = self.client.scene
         avatar = self.show.avatar

@@ -89,7 +89,9 @@ def network_of(net: str) -> Network:
         ConfigError: unless the name is ``vgg`` or ``alex``.
     """
     if net not in NETWORKS:
-        raise ConfigError(f"a pretrained network must be vgg or alex; got {net!r}")
+        raise ConfigError(
+            f"a pretrained network must be vgg or alex; got {net!r}"
+        )
     return NETWORKS[net]
 
 
@@ -111,7 +113,9 @@ def find(net: str, path: str | Path | None = None) -> FoundWeights | None:
     # A given path must have them: no other place is searched.
     network = network_of(net)
     if path is not None:
-        return FoundWeights(_given(network, Path(path).expanduser()), "the given path")
+        return FoundWeights(
+            _given(network, Path(path).expanduser()), "the given path"
+        )
 
     # Then the places where they may be already.
     cached = cache_folder() / network.file
@@ -132,7 +136,9 @@ def get(net: str, path: str | Path | None = None) -> FoundWeights:
         ConfigError: on an unknown network.
         DataError: if a path is given and no weights are there, or if the download fails.
     """
-    return find(net, path) or FoundWeights(download(net), "torchvision's server")
+    return find(net, path) or FoundWeights(
+        download(net), "torchvision's server"
+    )
 
 
 def cache_folder() -> Path:
@@ -161,7 +167,10 @@ def download(net: str) -> Path:
                 torch.hub.download_url_to_file(
                     network.url, str(target), hash_prefix=digits
                 )
-            except (OSError, RuntimeError) as error:  # RuntimeError: another hash
+            except (
+                OSError,
+                RuntimeError,
+            ) as error:  # RuntimeError: another hash
                 raise DataError(
                     f"the weights of {network.title} are not on this machine, and they could not "
                     f"be downloaded ({error}): {how_to_get(net)}"

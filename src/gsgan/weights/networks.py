@@ -41,7 +41,9 @@ class FeatureNetwork(nn.Module):
     def __init__(self, stages: nn.ModuleList) -> None:
         super().__init__()
         self.stages = stages.requires_grad_(False)
-        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1))
+        self.register_buffer(
+            "mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1)
+        )
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1))
 
     def forward(self, image: Tensor) -> list[Tensor]:
@@ -118,7 +120,9 @@ class Lpips(nn.Module):
         self.network = pretrained(net, path)
         state = state_of_heads(net)
         for layer in range(len(TAPS[net])):
-            self.register_buffer(f"head{layer}", state[f"lin{layer}.model.1.weight"])
+            self.register_buffer(
+                f"head{layer}", state[f"lin{layer}.model.1.weight"]
+            )
 
     def features(self, image: Tensor) -> list[Tensor]:
         """Unit-length features of images ``[B, 3, H, W]`` in [0, 1]."""
@@ -134,15 +138,21 @@ class Lpips(nn.Module):
         """The distance of two images in each layer, as maps ``[B, 1, h, w]``."""
         # A head is a convolution of 1 x 1: the weighted sum over channels.
         maps = []
-        for layer, (ours, theirs) in enumerate(zip(features, others, strict=True)):
+        for layer, (ours, theirs) in enumerate(
+            zip(features, others, strict=True)
+        ):
             head = self.get_buffer(f"head{layer}")
             maps.append(functional.conv2d((ours - theirs).square(), head))
         return maps
 
-    def distance(self, features: Sequence[Tensor], others: Sequence[Tensor]) -> Tensor:
+    def distance(
+        self, features: Sequence[Tensor], others: Sequence[Tensor]
+    ) -> Tensor:
         """The distance ``[B]`` of two images, given their features."""
         maps = self.layers(features, others)
-        return torch.stack([layer.mean(dim=(1, 2, 3)) for layer in maps]).sum(dim=0)
+        return torch.stack([layer.mean(dim=(1, 2, 3)) for layer in maps]).sum(
+            dim=0
+        )
 
     def distance_map(
         self,

@@ -13,6 +13,12 @@ def write_avatarrex(root: Path, subject: SmplxSubject) -> Path:
     lens = {"distCoeff": [0.0] * 5, "rectifyAlpha": 0.0}
     root.mkdir(parents=True)
     write_rig(
-        root, subject, SERIALS, "calibration_full.json", "{}", "{}/mask/pha", lens
+        root,
+        subject,
+        SERIALS,
+        "calibration_full.json",
+        "{}",
+        "{}/mask/pha",
+        lens,
     )
     return root

@@ -15,7 +15,9 @@ from gsgan.body.smpl import SkinnedModel, read_smpl
 from gsgan.body.smpl_names import CIHP, part_of_joint
 
 LENS = (-0.22, 0.06, 0.001, -0.0007, 0.01)
-COLOURS = np.random.default_rng(3).integers(60, 255, (len(CIHP), 3)).astype(np.uint8)
+COLOURS = (
+    np.random.default_rng(3).integers(60, 255, (len(CIHP), 3)).astype(np.uint8)
+)
 MIDDLE = 0.85  # metres above the floor, at which cameras stand
 
 
@@ -72,9 +74,12 @@ def make_subject(
         pose_blend=pose_blend,
     )
     R = np.stack([cv2.Rodrigues(r)[0] for r in Rh])
-    vertices, joints = (x.numpy() @ R.transpose(0, 2, 1) + Th[:, None] for x in (v, j))
+    vertices, joints = (
+        x.numpy() @ R.transpose(0, 2, 1) + Th[:, None] for x in (v, j)
+    )
     rig = [
-        ring_camera(2 * np.pi * i / cameras + 0.1, size, dist) for i in range(cameras)
+        ring_camera(2 * np.pi * i / cameras + 0.1, size, dist)
+        for i in range(cameras)
     ]
     parts = _vertex_parts(model)
     drawn = [[draw(camera, body, parts) for camera in rig] for body in vertices]
@@ -98,13 +103,19 @@ def _motion(frames: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     time = np.linspace(0, 1, frames)
     poses = np.zeros((frames, 24, 3))
     poses[:, 16, 2], poses[:, 17, 2] = -0.6 + 0.4 * time, 0.6 - 0.5 * time
-    poses[:, 18, 1], poses[:, 4, 0], poses[:, 3, 0] = -0.8 * time, 0.5 * time, 0.1
-    upright = cv2.Rodrigues(np.array([-np.pi / 2, 0, 0]))[0]  # y up becomes -z up
+    poses[:, 18, 1], poses[:, 4, 0], poses[:, 3, 0] = (
+        -0.8 * time,
+        0.5 * time,
+        0.1,
+    )
+    upright = cv2.Rodrigues(np.array([-np.pi / 2, 0, 0]))[
+        0
+    ]  # y up becomes -z up
     Rh = np.stack(
         [
-            cv2.Rodrigues(cv2.Rodrigues(np.array([0, 0, 0.3 + 0.5 * t]))[0] @ upright)[
-                0
-            ][:, 0]
+            cv2.Rodrigues(
+                cv2.Rodrigues(np.array([0, 0, 0.3 + 0.5 * t]))[0] @ upright
+            )[0][:, 0]
             for t in time
         ]
     )
@@ -112,7 +123,9 @@ def _motion(frames: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return poses.reshape(frames, 72), Rh, Th
 
 
-def ring_camera(angle: float, size: tuple[int, int], dist: tuple[float, ...]) -> Camera:
+def ring_camera(
+    angle: float, size: tuple[int, int], dist: tuple[float, ...]
+) -> Camera:
     """A camera 3.2 m away that sees the whole person, z pointing down."""
     w, h = size
     forward = np.array([np.cos(angle), np.sin(angle), 0.0])
@@ -140,14 +153,20 @@ def draw(
     w, h = camera.size
     depth = (body @ camera.R.T + camera.t)[:, 2]
     rotation = cv2.Rodrigues(camera.R)[0]
-    pixels = cv2.projectPoints(body, rotation, camera.t, camera.K, camera.dist)[0][:, 0]
-    place = np.rint(pixels).astype(int)  # OpenCV's pixel centres lie at whole numbers
+    pixels = cv2.projectPoints(body, rotation, camera.t, camera.K, camera.dist)[
+        0
+    ][:, 0]
+    place = np.rint(pixels).astype(
+        int
+    )  # OpenCV's pixel centres lie at whole numbers
     inside = ((place >= 0) & (place < (w, h))).all(axis=1)
     far_first = np.argsort(-depth[inside], kind="stable")
     u, v = place[inside][far_first].T
     labels = np.zeros((h, w), np.uint8)
     labels[v, u] = parts[inside][far_first]
-    image = np.where(labels[..., None] > 0, COLOURS[labels], 90).astype(np.uint8)
+    image = np.where(labels[..., None] > 0, COLOURS[labels], 90).astype(
+        np.uint8
+    )
     return image, labels
 
 

@@ -83,14 +83,24 @@ def write_easymocap(
     write_calibration(root, subject)
     for i, frame in enumerate(subject.frames):
         for c, name in enumerate(NAMES):
-            person_mask = np.where(subject.labels[i][c] > 0, 255, 0).astype(np.uint8)
+            person_mask = np.where(subject.labels[i][c] > 0, 255, 0).astype(
+                np.uint8
+            )
             tail = f"_{person}" if pid else ""
-            write_picture(root / f"images/{name}/{frame:06d}.jpg", subject.images[i][c])
-            write_picture(root / f"mask/{name}/{frame:06d}{tail}.png", person_mask)
+            write_picture(
+                root / f"images/{name}/{frame:06d}.jpg", subject.images[i][c]
+            )
+            write_picture(
+                root / f"mask/{name}/{frame:06d}{tail}.png", person_mask
+            )
         joints = body_25(subject, i)
         if hands:
             joints = np.concatenate([joints, hand_joints(subject, i)])
-        rows = {"Rh": subject.Rh[i], "Th": subject.Th[i], "poses": subject.poses[i]}
+        rows = {
+            "Rh": subject.Rh[i],
+            "Th": subject.Th[i],
+            "poses": subject.poses[i],
+        }
         rows |= {"shapes": subject.shapes}
         entries = {
             "keypoints3d": {"keypoints3d": joints.tolist()},

@@ -30,22 +30,35 @@ def chumpy(values: np.ndarray) -> Instance:
 def chumpy_select(values: np.ndarray, shape: tuple[int, ...]) -> Instance:
     """``chumpy.reordering.Select``: a block of a longer chumpy array."""
     longer = chumpy(np.concatenate([values.ravel(), np.zeros(5)]))
-    state = {"a": longer, "idxs": np.arange(values.size), "preferred_shape": shape}
+    state = {
+        "a": longer,
+        "idxs": np.arange(values.size),
+        "preferred_shape": shape,
+    }
     return Instance("chumpy.reordering", "Select", state)
 
 
 def csc(dense: np.ndarray, module: str = "scipy.sparse.csc") -> Instance:
     """``csc_matrix`` of a dense one."""
     column, row = np.nonzero(dense.T)
-    starts = np.searchsorted(column, np.arange(dense.shape[1] + 1)).astype(np.int32)
-    state = {"format": "csc", "_shape": dense.shape, "maxprint": 50, "indptr": starts}
+    starts = np.searchsorted(column, np.arange(dense.shape[1] + 1)).astype(
+        np.int32
+    )
+    state = {
+        "format": "csc",
+        "_shape": dense.shape,
+        "maxprint": 50,
+        "indptr": starts,
+    }
     state |= {"data": dense.T[column, row], "indices": row.astype(np.int32)}
     return Instance(module, "csc_matrix", state)
 
 
 def dumps(value: Any, protocol: int = 2) -> bytes:
     """A pickle of protocol 0 or 2 of dicts, tuples, numbers, text, arrays and instances."""
-    return (b"\x80\x02" if protocol == 2 else b"") + _write(value, protocol) + b"."
+    return (
+        (b"\x80\x02" if protocol == 2 else b"") + _write(value, protocol) + b"."
+    )
 
 
 def _write(value: Any, protocol: int) -> bytes:
@@ -66,7 +79,8 @@ def _write(value: Any, protocol: int) -> bytes:
         return b"c__builtin__\nset\n((l" + items + b"tR"
     if isinstance(value, dict):
         items = (
-            _write(k, protocol) + _write(v, protocol) + b"s" for k, v in value.items()
+            _write(k, protocol) + _write(v, protocol) + b"s"
+            for k, v in value.items()
         )
         return b"(d" + b"".join(items)
     if isinstance(value, Instance):
@@ -87,12 +101,21 @@ def _instance(value: Instance, protocol: int) -> bytes:
     state = _write(value.state, protocol) + b"b"
     if protocol == 2:
         return name + b")\x81" + state
-    return b"ccopy_reg\n_reconstructor\n(" + name + b"c__builtin__\nobject\nNtR" + state
+    return (
+        b"ccopy_reg\n_reconstructor\n("
+        + name
+        + b"c__builtin__\nobject\nNtR"
+        + state
+    )
 
 
 def _array(array: np.ndarray, protocol: int) -> bytes:
     spec = array.dtype.str[1:]
-    dtype = b"cnumpy\ndtype\n(" + _string(spec.encode(), protocol) + b"I0\nI1\ntR(I3\n"
+    dtype = (
+        b"cnumpy\ndtype\n("
+        + _string(spec.encode(), protocol)
+        + b"I0\nI1\ntR(I3\n"
+    )
     dtype += (
         _string(b"<" if array.dtype.itemsize > 1 else b"|", protocol)
         + b"NNNI-1\nI-1\nI0\ntb"

@@ -119,11 +119,18 @@ def _instance(value: python2.Instance) -> Any:
 def _stub_modules() -> Iterator[None]:
     """Classes named as chumpy's and scipy's, importable for as long as something is pickled."""
     before = dict(sys.modules)
-    for module, name in (("scipy.sparse._csc", "csc_matrix"), ("chumpy.ch", "Ch")):
+    for module, name in (
+        ("scipy.sparse._csc", "csc_matrix"),
+        ("chumpy.ch", "Ch"),
+    ):
         parts = module.split(".")
         for end in range(1, len(parts) + 1):
-            sys.modules[".".join(parts[:end])] = types.ModuleType(".".join(parts[:end]))
-        setattr(sys.modules[module], name, type(name, (), {"__module__": module}))
+            sys.modules[".".join(parts[:end])] = types.ModuleType(
+                ".".join(parts[:end])
+            )
+        setattr(
+            sys.modules[module], name, type(name, (), {"__module__": module})
+        )
     try:
         yield
     finally:
@@ -133,7 +140,9 @@ def _stub_modules() -> Iterator[None]:
 
 
 @lru_cache(maxsize=4)
-def smpl_arrays(kind: Kind, vertices: int | None = None) -> dict[str, np.ndarray]:
+def smpl_arrays(
+    kind: Kind, vertices: int | None = None
+) -> dict[str, np.ndarray]:
     """The arrays of a model: the free body with SMPL's joints. Do not write into them.
 
     Convention: as SMPL's, Y up, facing +Z. Where the landmark table names a vertex, it lies on the
@@ -162,7 +171,8 @@ def smpl_arrays(kind: Kind, vertices: int | None = None) -> dict[str, np.ndarray
     parents[0] = 2**32 - 1  # the sentinel of the original files
     return {
         "v_template": points,
-        "shapedirs": 0.01 * rng.standard_normal((V, 3, 10 if kind == "smpl" else 20)),
+        "shapedirs": 0.01
+        * rng.standard_normal((V, 3, 10 if kind == "smpl" else 20)),
         "posedirs": _few(rng, (V, 3, 9 * (J - 1))),
         "J_regressor": _regressor(points, joints),
         "weights": weights / weights.sum(axis=1, keepdims=True),
@@ -174,24 +184,36 @@ def smpl_arrays(kind: Kind, vertices: int | None = None) -> dict[str, np.ndarray
 def joint_positions(kind: Kind) -> np.ndarray:
     """``[J, 3]`` the free body's joints under SMPL's names, Y up."""
     body = free_body()
-    bones, landmarks, hands = body.joint_names, body.landmark_names, body.hand_names
+    bones, landmarks, hands = (
+        body.joint_names,
+        body.landmark_names,
+        body.hand_names,
+    )
 
     def position(joint: str) -> np.ndarray:
         side, _, limb = joint.partition("_")
         if limb[:-1] in FINGERS:
-            knuckle = KNUCKLES.get(limb[:-1], ("mcp", "pip", "dip"))[int(limb[-1]) - 1]
+            knuckle = KNUCKLES.get(limb[:-1], ("mcp", "pip", "dip"))[
+                int(limb[-1]) - 1
+            ]
             return body.hand_landmarks[
                 hands.index(f"{side}_{limb[:-1]}_{knuckle}")
             ].numpy()
         if limb == "eye":
             return body.landmarks[landmarks.index(joint)].numpy()
         if joint == "jaw":
-            return body.landmarks[landmarks.index("mouth_left")].numpy() * [0, 1, 1]
+            return body.landmarks[landmarks.index("mouth_left")].numpy() * [
+                0,
+                1,
+                1,
+            ]
         name = FREE_BONES.get(joint) or FREE_BONES[limb].format(side[0].upper())
         return body.joints[bones.index(name)].numpy()
 
     return _y_up(
-        np.stack([position(joint) for joint in JOINT_NAMES[kind]]).astype(np.float64)
+        np.stack([position(joint) for joint in JOINT_NAMES[kind]]).astype(
+            np.float64
+        )
     )
 
 
@@ -202,7 +224,9 @@ def bone_to_joint(kind: Kind) -> np.ndarray:
     for number, joint in enumerate(names):
         side, _, limb = joint.partition("_")
         if limb[:-1] in FINGERS:
-            own[f"finger{FINGERS[limb[:-1]]}-{limb[-1]}.{side[0].upper()}"] = number
+            own[f"finger{FINGERS[limb[:-1]]}-{limb[-1]}.{side[0].upper()}"] = (
+                number
+            )
         elif bone := FREE_BONES.get(joint) or FREE_BONES.get(limb):
             own[bone.format(side[0].upper())] = number
     found: list[int] = []
@@ -222,11 +246,16 @@ def special_vertices(kind: Kind) -> dict[int, tuple[np.ndarray, int]]:
     for landmark, (vertex, _) in TABLES[kind].vertices.items():
         if not landmark.endswith(("inner", "outer")):
             place = body.landmark_names.index(landmark)
-            found[vertex] = (body.landmarks[place], int(body.landmark_bone[place]))
+            found[vertex] = (
+                body.landmarks[place],
+                int(body.landmark_bone[place]),
+            )
     for landmark, (_, vertex) in TABLES[kind].midpoints.items():
         place = body.hand_names.index(f"{landmark}_tip")
         found[vertex] = (body.hand_landmarks[place], int(body.hand_bone[place]))
-    return {v: (_y_up(p.double().numpy()), bone) for v, (p, bone) in found.items()}
+    return {
+        v: (_y_up(p.double().numpy()), bone) for v, (p, bone) in found.items()
+    }
 
 
 def _y_up(points: np.ndarray) -> np.ndarray:
@@ -247,7 +276,9 @@ def _regressor(points: np.ndarray, joints: np.ndarray) -> np.ndarray:
     for row, joint in zip(regressor, joints, strict=True):
         near = np.argsort(((points - joint) ** 2).sum(axis=1))[:SUPPORT]
         affine = np.concatenate([points[near].T, np.ones((1, len(near)))])
-        row[near] = np.linalg.lstsq(affine, np.append(joint, 1.0), rcond=None)[0]
+        row[near] = np.linalg.lstsq(affine, np.append(joint, 1.0), rcond=None)[
+            0
+        ]
     return regressor
 
 
@@ -263,6 +294,12 @@ def posed(
     model: SkinnedModel, motion: SmplMotion, pose_blend: bool = True
 ) -> list[np.ndarray]:
     """Vertices ``[F, V, 3]`` and joints ``[F, J, 3]`` of a reader's motion, metres."""
-    face = None if motion.expression is None else torch.from_numpy(motion.expression)
-    given = (torch.from_numpy(x) for x in (motion.theta, motion.betas, motion.transl))
+    face = (
+        None
+        if motion.expression is None
+        else torch.from_numpy(motion.expression)
+    )
+    given = (
+        torch.from_numpy(x) for x in (motion.theta, motion.betas, motion.transl)
+    )
     return [x.numpy() for x in model.pose(*given, face, pose_blend=pose_blend)]

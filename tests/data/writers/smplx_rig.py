@@ -57,7 +57,9 @@ def smplx_once() -> Path:
 
 
 @cache
-def smplx_subject(smplx: Path, cameras: int = 3, frames: int = 4) -> SmplxSubject:
+def smplx_subject(
+    smplx: Path, cameras: int = 3, frames: int = 4
+) -> SmplxSubject:
     """A subject who turns, lifts the arms and closes the hands; do not write into it."""
     model = read_smpl(smplx)
     params = smplx_params(model, frames)
@@ -91,9 +93,15 @@ def smplx_params(model: SkinnedModel, frames: int) -> dict[str, np.ndarray]:
     J0 = model.rest_joints(torch.zeros(1, 10).double())[0, 0].numpy()
     time = np.linspace(0, 1, frames)
     upright = cv2.Rodrigues(np.array([-np.pi / 2, 0, 0]))[0]
-    turns = [cv2.Rodrigues(np.array([0, 0, 0.3 + 0.5 * t]))[0] @ upright for t in time]
+    turns = [
+        cv2.Rodrigues(np.array([0, 0, 0.3 + 0.5 * t]))[0] @ upright
+        for t in time
+    ]
     body = np.zeros((frames, 21, 3))
-    body[:, 15, 2], body[:, 16, 2] = -0.6 + 0.4 * time, 0.6 - 0.5 * time  # shoulders
+    body[:, 15, 2], body[:, 16, 2] = (
+        -0.6 + 0.4 * time,
+        0.6 - 0.5 * time,
+    )  # shoulders
     body[:, 17, 1], body[:, 3, 0], body[:, 2, 0] = -0.8 * time, 0.5 * time, 0.1
     hands = np.zeros((frames, 15, 3))
     hands[:, :, 2] = 0.4 * time[:, None]
@@ -119,7 +127,8 @@ def _posed(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and joints, the root turned here."""
     p = {
-        key: torch.from_numpy(value.astype(np.float64)) for key, value in params.items()
+        key: torch.from_numpy(value.astype(np.float64))
+        for key, value in params.items()
     }
     count = len(p["transl"])
     still, eyes = torch.zeros(count, 3).double(), torch.zeros(count, 6).double()
@@ -134,10 +143,12 @@ def _posed(
     theta = torch.cat(parts, dim=1).reshape(count, 55, 3)
     face = p["expression"]
     points = [x.numpy() for x in model.pose(theta, p["betas"], still, face)]
-    pelvis = model.rest_joints(p["betas"].expand(count, -1), face)[:, :1].numpy()
-    R = np.stack([cv2.Rodrigues(r)[0] for r in p["global_orient"].numpy()]).transpose(
-        0, 2, 1
-    )
+    pelvis = model.rest_joints(p["betas"].expand(count, -1), face)[
+        :, :1
+    ].numpy()
+    R = np.stack(
+        [cv2.Rodrigues(r)[0] for r in p["global_orient"].numpy()]
+    ).transpose(0, 2, 1)
     vertices, joints = (
         (x - pelvis) @ R + pelvis + p["transl"].numpy()[:, None] for x in points
     )
@@ -155,7 +166,9 @@ def write_rig(
 ) -> None:
     """Calibration, parameters, pictures and masks; ``lens``: further keys of each camera."""
     entries = {}
-    for c, (name, camera) in enumerate(zip(names, subject.cameras, strict=True)):
+    for c, (name, camera) in enumerate(
+        zip(names, subject.cameras, strict=True)
+    ):
         entries[name] = {
             "K": camera.K.ravel().tolist(),
             "R": camera.R.ravel().tolist(),
@@ -165,7 +178,11 @@ def write_rig(
         }
         for i, frame in enumerate(subject.frames):
             file = f"{frame:08d}.jpg"
-            write_picture(root / images.format(name) / file, subject.images[i][c])
-            write_picture(root / masks.format(name) / file, subject.alphas[i][c])
+            write_picture(
+                root / images.format(name) / file, subject.images[i][c]
+            )
+            write_picture(
+                root / masks.format(name) / file, subject.alphas[i][c]
+            )
     (root / calibration).write_text(json.dumps(entries))
     np.savez(root / "smpl_params.npz", **subject.params)

@@ -15,7 +15,13 @@ def write_thuman4(
     names = [f"cam{i:02d}" for i in range(len(subject.cameras))]
     root.mkdir(parents=True)
     write_rig(
-        root, subject, names, "calibration.json", "images/{}", "masks/{}", dict(lens)
+        root,
+        subject,
+        names,
+        "calibration.json",
+        "images/{}",
+        "masks/{}",
+        dict(lens),
     )
     (root / "missing_img_files.txt").write_text(
         "".join(f"{line}\r\n" for line in missing)

@@ -51,9 +51,13 @@ def write_original(
             labels = subject.labels[i][c]
             write_picture(root / paths[c], subject.images[i][c])
             if "mask_cihp" in masks:
-                write_picture(root / f"mask_cihp/{name}/{frame:06d}.png", labels)
+                write_picture(
+                    root / f"mask_cihp/{name}/{frame:06d}.png", labels
+                )
             if "mask" in masks:
-                ones = np.repeat((labels > 0)[..., None], 3, -1).astype(np.uint8)
+                ones = np.repeat((labels > 0)[..., None], 3, -1).astype(
+                    np.uint8
+                )
                 write_picture(root / f"mask/{name}/{frame:06d}.png", ones)
     write_object(root / "annots.npy", {"cams": _cams(subject), "ims": ims})
     _params(root, params, subject, poses)
@@ -61,33 +65,45 @@ def write_original(
 
 
 def write_313(
-    root: Path, subject: Subject, numbers: tuple[int, ...], renamed: bool = False
+    root: Path,
+    subject: Subject,
+    numbers: tuple[int, ...],
+    renamed: bool = False,
 ) -> Path:
     """Subjects 313 and 315: ``Camera (1)``, frames from 1, nested lists; long names or, renamed,
     ``Camera (1)/0001.jpg``."""
     ims = []
     for i, frame in enumerate(subject.frames):
         stems = [
-            f"{frame:04d}" if renamed else OLD_NAME.format(n, frame) for n in numbers
+            f"{frame:04d}" if renamed else OLD_NAME.format(n, frame)
+            for n in numbers
         ]
         ims.append(
             {
                 "ims": [
-                    f"Camera ({n})/{s}.jpg" for n, s in zip(numbers, stems, strict=True)
+                    f"Camera ({n})/{s}.jpg"
+                    for n, s in zip(numbers, stems, strict=True)
                 ]
             }
         )
         for c, (n, stem) in enumerate(zip(numbers, stems, strict=True)):
-            write_picture(root / f"Camera ({n})" / f"{stem}.jpg", subject.images[i][c])
             write_picture(
-                root / f"mask_cihp/Camera ({n})" / f"{stem}.png", subject.labels[i][c]
+                root / f"Camera ({n})" / f"{stem}.jpg", subject.images[i][c]
             )
-    write_object(root / "annots.npy", {"cams": _cams(subject, nested=True), "ims": ims})
+            write_picture(
+                root / f"mask_cihp/Camera ({n})" / f"{stem}.png",
+                subject.labels[i][c],
+            )
+    write_object(
+        root / "annots.npy", {"cams": _cams(subject, nested=True), "ims": ims}
+    )
     _params(root, "params", subject)
     return root
 
 
-def write_refined(root: Path, subject: Subject, listed: str = "backslash") -> Path:
+def write_refined(
+    root: Path, subject: Subject, listed: str = "backslash"
+) -> Path:
     """my_377 and its like: images/00, mask/00, smpl_params. Paths are listed with a "backslash" or
     "slash", or in annots_new.npy alone ("none")."""
     names = [f"{i:02d}" for i in range(len(subject.cameras))]
@@ -97,7 +113,8 @@ def write_refined(root: Path, subject: Subject, listed: str = "backslash") -> Pa
         ims.append(
             {
                 "ims": [
-                    p.replace("/", "\\") if listed == "backslash" else p for p in paths
+                    p.replace("/", "\\") if listed == "backslash" else p
+                    for p in paths
                 ]
             }
         )
@@ -107,7 +124,8 @@ def write_refined(root: Path, subject: Subject, listed: str = "backslash") -> Pa
             write_picture(root / f"mask/{name}/{frame:06d}.png", person)
     file = "annots_new.npy" if listed == "none" else "annots.npy"
     write_object(
-        root / file, {"cams": _cams(subject), "ims": [] if listed == "none" else ims}
+        root / file,
+        {"cams": _cams(subject), "ims": [] if listed == "none" else ims},
     )
     _params(root, "smpl_params", subject)
     return root

@@ -12,7 +12,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gsgan.splat import ACCURACY, BACKENDS, Accuracy, gsplat_backend, resolve_backend
+from gsgan.splat import (
+    ACCURACY,
+    BACKENDS,
+    Accuracy,
+    gsplat_backend,
+    resolve_backend,
+)
 
 Inputs = dict[str, Tensor]
 Outputs = Mapping[str, Tensor]
@@ -81,7 +87,9 @@ class Case:
     expect: str = RIGHT
     note: str = ""
 
-    def build(self, dtype: torch.dtype, device: torch.device | str = "cpu") -> Inputs:
+    def build(
+        self, dtype: torch.dtype, device: torch.device | str = "cpu"
+    ) -> Inputs:
         """The inputs, floating ones rounded to ``dtype``."""
         return {
             k: v.to(device, dtype) if v.is_floating_point() else v.to(device)
@@ -98,7 +106,11 @@ class Case:
 
     def outputs(self, inputs: Inputs, backend: str = "reference") -> Outputs:
         """Runs the case; the default is what others are compared with."""
-        return self.run(inputs) if self.settings is None else self.run(inputs, backend)
+        return (
+            self.run(inputs)
+            if self.settings is None
+            else self.run(inputs, backend)
+        )
 
 
 def drawing_backends(
@@ -108,7 +120,9 @@ def drawing_backends(
     device = torch.device(device)
     names = (name for name in BACKENDS if name != "auto")
     found = [
-        name for name in names if resolve_backend(name, device, settings)[0] == name
+        name
+        for name in names
+        if resolve_backend(name, device, settings)[0] == name
     ]
     if "gsplat" in found and gsplat_backend.differences(settings, device):
         found.remove("gsplat")
@@ -135,7 +149,9 @@ class Row(NamedTuple):
     case: str
     subject: str
     backend: str
-    value_error: float  # as in ``Tolerance``; NaN where nothing could be compared
+    value_error: (
+        float  # as in ``Tolerance``; NaN where nothing could be compared
+    )
     gradient_error: float
     # the one with that gradient error; empty where all gradients are exact
     worst_input: str
@@ -157,7 +173,9 @@ def compare(
     where only the one of float64 is.
     """
     inputs = case.build(dtype, device)
-    exact = {k: v.double() if v.is_floating_point() else v for k, v in inputs.items()}
+    exact = {
+        k: v.double() if v.is_floating_point() else v for k, v in inputs.items()
+    }
     if not case.same_numbers:
         exact = case.build(torch.float64, device)
     value_error, gradient_error, worst = math.nan, math.nan, ""
@@ -169,7 +187,10 @@ def compare(
         exact_outputs, exact_slopes, _ = _run(case, exact, "reference")
         floors, tolerance = case.gradient_floor or {}, case.tolerance.at(dtype)
         value_error = max(
-            (_error(outputs[k], v, minimum=1.0) for k, v in exact_outputs.items())
+            (
+                _error(outputs[k], v, minimum=1.0)
+                for k, v in exact_outputs.items()
+            )
         )
         errors = {
             k: _error(slopes[k], v, floor=floors.get(k, 0))
@@ -180,9 +201,14 @@ def compare(
         worst = worst if gradient_error > 0 else ""
         pairs = [(outputs[k], v) for k, v in exact_outputs.items()]
         pairs += [(slopes[k], v) for k, v in exact_slopes.items()]
-        if not all((got.isfinite() | ~want.isfinite()).all() for got, want in pairs):
+        if not all(
+            (got.isfinite() | ~want.isfinite()).all() for got, want in pairs
+        ):
             status = NOT_FINITE
-        elif value_error <= tolerance.values and gradient_error <= tolerance.gradients:
+        elif (
+            value_error <= tolerance.values
+            and gradient_error <= tolerance.gradients
+        ):
             status = WARNED if message else RIGHT
         else:
             status = FINITE_ONLY
@@ -209,10 +235,13 @@ def assert_as_expected(
     )
 
 
-def _run(case: Case, inputs: Inputs, backend: str) -> tuple[Inputs, Inputs, str]:
+def _run(
+    case: Case, inputs: Inputs, backend: str
+) -> tuple[Inputs, Inputs, str]:
     """Outputs, gradients by input, and the text of warnings."""
     leaves = {
-        k: v.clone().requires_grad_(v.is_floating_point()) for k, v in inputs.items()
+        k: v.clone().requires_grad_(v.is_floating_point())
+        for k, v in inputs.items()
     }
     generator = torch.Generator().manual_seed(0)
     total = torch.zeros((), dtype=torch.float64)
@@ -221,10 +250,13 @@ def _run(case: Case, inputs: Inputs, backend: str) -> tuple[Inputs, Inputs, str]
         outputs = dict(case.outputs(leaves, backend))
         for _, value in sorted(outputs.items()):
             # Drawn for every output, so that weights do not depend on which ones carry a graph.
-            weights = torch.randn(value.shape, generator=generator).to(value.device)
+            weights = torch.randn(value.shape, generator=generator).to(
+                value.device
+            )
             if value.requires_grad:
                 total = (
-                    total.to(value.device) + (value.double() * weights.double()).sum()
+                    total.to(value.device)
+                    + (value.double() * weights.double()).sum()
                 )
         if total.requires_grad:
             total.backward()
@@ -248,7 +280,9 @@ def _error(
     """
     got, want = got.double(), want.double()
     same = (got == want) | (got.isnan() & want.isnan())
-    difference = (got - want).abs().nan_to_num(nan=math.inf, posinf=math.inf)[~same]
+    difference = (
+        (got - want).abs().nan_to_num(nan=math.inf, posinf=math.inf)[~same]
+    )
     largest = [
         float(x[x.isfinite()].abs().amax()) if x.isfinite().any() else 0
         for x in (got, want)

@@ -32,7 +32,9 @@ def _vector(*xyz: float) -> Tensor:
 
 def _through(s: Tensor, count: float, *direction: float) -> Tensor:
     """``[T, 3]``: so many lengths of 1 mm to either side of zero, along a direction."""
-    return count * MIN_LENGTH * s[:, None] * normalize(_vector(*direction), dim=0)
+    return (
+        count * MIN_LENGTH * s[:, None] * normalize(_vector(*direction), dim=0)
+    )
 
 
 def _line(p: Tensor, joints: tuple[int, int], half: Tensor) -> None:
@@ -109,7 +111,9 @@ def _shoulders_round_the_hips(s: Tensor) -> Tensor:
     p = rest(len(s))
     angle = math.pi + 0.2 * s
     cos, sin, zero = angle.cos(), angle.sin(), torch.zeros_like(s)
-    turn = torch.stack([cos, zero, sin, zero, zero + 1, zero, -sin, zero, cos], dim=-1)
+    turn = torch.stack(
+        [cos, zero, sin, zero, zero + 1, zero, -sin, zero, cos], dim=-1
+    )
     p[:, :23] = p[:, :23] @ turn.unflatten(-1, (3, 3)).mT
     return p
 
@@ -121,7 +125,10 @@ CROSSINGS: dict[str, tuple[Path, str]] = {
         _shrinking_forearm,
         "Below 1 mm its swing fades to none: at most 20 times step / 1 mm.",
     ),
-    "an arm through straight": (_bending_arm, "At most 8 times the bend's step."),
+    "an arm through straight": (
+        _bending_arm,
+        "At most 8 times the bend's step.",
+    ),
     "a forearm past its fold, two degrees beside": (
         partial(_bending_arm, around=math.pi, across=0.035),
         "The roll goes round with the way to the antipode: at most 8 times step / 2 degrees.",

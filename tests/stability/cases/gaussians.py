@@ -54,7 +54,9 @@ def cases() -> Iterator[Case]:
         yield _case(f"C = {channels}", partial(_thirty, channels=channels))
     for size in ((1, 1), (1, 40), (31, 2), (17, 33)):
         yield _case(
-            f"an image of {size[0]} x {size[1]}", partial(_thirty, size=size), size=size
+            f"an image of {size[0]} x {size[1]}",
+            partial(_thirty, size=size),
+            size=size,
         )
     yield from _layers()
     yield from _orders()
@@ -89,7 +91,11 @@ def _opacities() -> Iterator[Case]:
     }
     front, wide = (0.0, 0.0, 0.5), (5.0, 6.0, 7.0)
     yield _alone(
-        "opacity 1 in front of everything", front, options, scales=wide, opacity=1.0
+        "opacity 1 in front of everything",
+        front,
+        options,
+        scales=wide,
+        opacity=1.0,
     )
 
 
@@ -99,7 +105,9 @@ def _sizes() -> Iterator[Case]:
         yield _alone(f"scales of {scale:g} m", scales=scales, quat=TILTED)
     large = {"scales": (10.0, 14.0, 8.0), "opacity": 0.5}
     yield _alone("larger than the image", (0.3, 0.2, 3.0), **large)
-    yield _case("far below a pixel", lambda: {**cloud(200, scale=1e-4), **pinhole()})
+    yield _case(
+        "far below a pixel", lambda: {**cloud(200, scale=1e-4), **pinhole()}
+    )
     yield _case(
         "below a pixel, anti-aliased",
         lambda: {**cloud(200, scale=3e-3), **pinhole()},
@@ -110,15 +118,24 @@ def _sizes() -> Iterator[Case]:
         "note": "Nothing is skipped: what is left of its opacity is far below any cut-off.",
     }
     yield _alone(
-        "1e-6 m, anti-aliased", options=options, scales=(1e-6, 2e-6, 3e-6), quat=TILTED
+        "1e-6 m, anti-aliased",
+        options=options,
+        scales=(1e-6, 2e-6, 3e-6),
+        quat=TILTED,
     )
 
 
 def _sparse(
-    name: str, scales: Numbers, quat: Numbers, mean: Numbers = AHEAD, **options: Any
+    name: str,
+    scales: Numbers,
+    quat: Numbers,
+    mean: Numbers = AHEAD,
+    **options: Any,
 ) -> Case:
     """One hard Gaussian among small ordinary ones, through a long lens."""
-    others = cloud(8, scale=0.006, extent=(0.1, 0.08, 0.1), middle=(0.0, 0.0, 2.1))
+    others = cloud(
+        8, scale=0.006, extent=(0.1, 0.08, 0.1), middle=(0.0, 0.0, 2.1)
+    )
     hard = gaussians([mean], scales=scales, quat=quat)
     return _case(
         name, lambda: {**among(others, hard), **pinhole(focal=600.0)}, **options
@@ -147,10 +164,16 @@ def _needles() -> Iterator[Case]:
     )
     long = "needle 1e4:1 on the image itself, 6000 px long"
     yield _sparse(long, (20.0, 2e-3, 2e-3), _turned(45), note=note)
-    yield _sparse("needle towards the camera", (1e-4, 1e-4, 1.0), (1.0, 0.0, 0.0, 0.0))
+    yield _sparse(
+        "needle towards the camera", (1e-4, 1e-4, 1.0), (1.0, 0.0, 0.0, 0.0)
+    )
     settings = replace(HIGH, antialias=True)
     yield _sparse(
-        "needle, anti-aliased", NEEDLE, _turned(45), settings=settings, note=note
+        "needle, anti-aliased",
+        NEEDLE,
+        _turned(45),
+        settings=settings,
+        note=note,
     )
     for name, turn in (
         ("seen flat", 0.0),
@@ -179,7 +202,9 @@ def _low_passes() -> Iterator[Case]:
             _turned(degrees),
             settings=replace(settings, antialias=antialias),
         )
-    yield _sparse(f"{name}pancake seen edge on", PANCAKE, EDGE_ON, settings=settings)
+    yield _sparse(
+        f"{name}pancake seen edge on", PANCAKE, EDGE_ON, settings=settings
+    )
     for times in (2, 3):
         yield _sparse(
             f"{name}needle drawn {times} times as large and averaged",
@@ -206,7 +231,9 @@ FLAT = (("of rank 1", (0.04, 0.0, 0.0)), ("zero", (0.0, 0.0, 0.0)))
 
 def _with_covariance(diagonal: Numbers) -> Inputs:
     scene = {
-        **among(_as_covariances(cloud()), _as_covariances(gaussians([ON_PIXEL]))),
+        **among(
+            _as_covariances(cloud()), _as_covariances(gaussians([ON_PIXEL]))
+        ),
         **pinhole(),
     }
     R = rotation((0.8, 0.4, 0.3))
@@ -223,18 +250,28 @@ def _as_covariances(scene: Inputs) -> Inputs:
 def _quaternions() -> Iterator[Case]:
     shape = (0.1, 0.2, 0.3)
     for name, length in (("tiny", 1e-15), ("huge", 1e15), ("of length 3", 3.0)):
-        direction = torch.tensor([0.8, 0.4, 0.3, 0.2]) / math.sqrt(0.93) * length
-        yield _alone(f"quaternion {name}", scales=shape, quat=direction.tolist())
+        direction = (
+            torch.tensor([0.8, 0.4, 0.3, 0.2]) / math.sqrt(0.93) * length
+        )
+        yield _alone(
+            f"quaternion {name}", scales=shape, quat=direction.tolist()
+        )
     options = {
         "note": "Noise, not a direction: drawn as the identity, and it gets no gradient."
     }
     for name, length in (("zero", 0.0), ("1e-30", 1e-30)):
         quat = (0.0, length, 0.0, 0.0)
-        yield _alone(f"quaternion {name}", options=options, scales=shape, quat=quat)
+        yield _alone(
+            f"quaternion {name}", options=options, scales=shape, quat=quat
+        )
 
 
 def _places() -> Iterator[Case]:
-    small, usual, metres = (0.011, 0.009, 0.01), (0.1, 0.2, 0.3), (1.0, 1.2, 0.8)
+    small, usual, metres = (
+        (0.011, 0.009, 0.01),
+        (0.1, 0.2, 0.3),
+        (1.0, 1.2, 0.8),
+    )
     for name, mean, scales in (
         ("just past the near plane", (0.001, 0.0005, 0.0101), small),
         ("just before the near plane", (0.001, 0.0005, 0.0099), small),
@@ -244,8 +281,16 @@ def _places() -> Iterator[Case]:
         ("at the camera's centre", (0.0, 0.0, 0.0), usual),
         ("at z = 1e-30", (0.3, 0.2, 1e-30), usual),
         ("far off-axis", (1e6, 1e5, 1.0), usual),
-        ("off-axis and close, reaching into the image", (3.0, 0.5, 0.2), metres),
-        ("off-axis, past the near plane, metres wide", (0.5, 0.2, 0.0101), metres),
+        (
+            "off-axis and close, reaching into the image",
+            (3.0, 0.5, 0.2),
+            metres,
+        ),
+        (
+            "off-axis, past the near plane, metres wide",
+            (0.5, 0.2, 0.0101),
+            metres,
+        ),
         ("1e6 m away", (1e5, -1e5, 1e6), (1e4, 2e4, 3e4)),
     ):
         yield _alone(f"mean {name}", mean, scales=scales)
@@ -285,7 +330,9 @@ def _coincident(n: int, opacity: float, size: Size) -> Inputs:
 
 def _stacked(n: int, opacity: float, size: Size) -> Inputs:
     """From 2 to 2.5 m, in random order; far enough apart for float32 to tell their depths."""
-    order = torch.randperm(n, generator=torch.Generator().manual_seed(2)).tolist()
+    order = torch.randperm(
+        n, generator=torch.Generator().manual_seed(2)
+    ).tolist()
     means = [(0.0, 0.0, 2 + 0.5 * i / n) for i in order]
     return {**gaussians(means, opacity=opacity), **pinhole(size)}
 
@@ -335,7 +382,10 @@ def _two_views(
         step = torch.zeros_like(inputs["t"])
         step[:, axis] = 1e-6
         moved = render(
-            {**inputs, "t": inputs["t"] + step}, backend, size=size, settings=settings
+            {**inputs, "t": inputs["t"] + step},
+            backend,
+            size=size,
+            settings=settings,
         )
         change[f"change along {name}"] = moved["features"] - still["features"]
     return {**still, **change}

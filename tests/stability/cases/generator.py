@@ -17,8 +17,14 @@ TIMES = 2  # F is drawn so many times larger each way, and averaged
 
 def cases() -> Iterator[Case]:
     """All of them."""
-    half_empty, empty = partial(_inputs, person=0.5), partial(_inputs, person=0.0)
-    huge, large = partial(_inputs, scale=1e9), partial(_inputs, scale=1e6, shift=0.5)
+    half_empty, empty = (
+        partial(_inputs, person=0.5),
+        partial(_inputs, person=0.0),
+    )
+    huge, large = (
+        partial(_inputs, scale=1e9),
+        partial(_inputs, scale=1e6, shift=0.5),
+    )
     unbiased = partial(_painted, biased=False)
     clamped = "F is clamped to ± 1e3 before it enters; beyond, its slope is 0."
     zero = "Normalising a pixel that is zero in every channel: it stays zero."
@@ -54,14 +60,19 @@ def cases() -> Iterator[Case]:
 
 
 @lru_cache(maxsize=8)
-def _generator(dtype: torch.dtype, device: torch.device, biased: bool) -> Generator:
+def _generator(
+    dtype: torch.dtype, device: torch.device, biased: bool
+) -> Generator:
     """A small one whose style is not at its start, with or without biases."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         F, S, p2d = CHANNELS.values()
         made = Generator(F, S, p2d, POSE, TIMES, base=4)
         for module in made.modules():
-            if isinstance(module, StyleModulation) and module.from_map is not None:
+            if (
+                isinstance(module, StyleModulation)
+                and module.from_map is not None
+            ):
                 nn.init.normal_(module.from_map.weight, std=0.1)
                 nn.init.normal_(module.from_pose.weight, std=0.1)
     if not biased:
@@ -71,14 +82,18 @@ def _generator(dtype: torch.dtype, device: torch.device, biased: bool) -> Genera
     return made.to(device, dtype)
 
 
-def _inputs(scale: float = 1.0, shift: float = 0.0, person: float = 1.0) -> Inputs:
+def _inputs(
+    scale: float = 1.0, shift: float = 0.0, person: float = 1.0
+) -> Inputs:
     """Random maps; beyond ``person`` of the width every channel is zero."""
     generator = torch.Generator().manual_seed(0)
 
     def rand(*shape: int) -> Tensor:
         return torch.rand(1, *shape, generator=generator, dtype=torch.float64)
 
-    made = {name: rand(channels, SIDE, SIDE) for name, channels in CHANNELS.items()}
+    made = {
+        name: rand(channels, SIDE, SIDE) for name, channels in CHANNELS.items()
+    }
     made["fine"] = rand(CHANNELS["F"], TIMES * SIDE, TIMES * SIDE)
     for name in ("F", "fine"):
         made[name] = scale * (made[name] - shift)
@@ -88,7 +103,9 @@ def _inputs(scale: float = 1.0, shift: float = 0.0, person: float = 1.0) -> Inpu
 
 
 def _painted(inputs: Inputs, biased: bool = True) -> Outputs:
-    F, S, p2d, g, fine = (inputs[name] for name in ("F", "S", "p2d", "g", "fine"))
+    F, S, p2d, g, fine = (
+        inputs[name] for name in ("F", "S", "p2d", "g", "fine")
+    )
     generator = _generator(F.dtype, F.device, biased)
     # the avatar bounds what is splatted, see Avatar.bounded
     bound = generator.feature_bound

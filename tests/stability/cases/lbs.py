@@ -35,7 +35,9 @@ def cases() -> Iterator[Case]:
     yield _case("an ordinary pose")
     for name, factor in (("two", 2.0), ("a half", 0.5), ("a millionth", 1e-6)):
         note = {"note": "They are divided by their sum."}
-        yield _case(f"weights that sum to {name}", note, weights=WEIGHTS * factor)
+        yield _case(
+            f"weights that sum to {name}", note, weights=WEIGHTS * factor
+        )
     for name, row in (
         ("a vertex without weight", [0.0, 0.0]),
         ("a negative weight", [1.5, -0.5]),
@@ -58,18 +60,30 @@ def _arm(**changes: Any) -> Inputs:
         ],
         "joints": [[0.0, 0, 0], [0.3, 0, 0], [0.6, 0, 0]],
     } | changes
-    inputs = {k: torch.as_tensor(v, dtype=torch.float64) for k, v in made.items()}
+    inputs = {
+        k: torch.as_tensor(v, dtype=torch.float64) for k, v in made.items()
+    }
     scales = torch.tensor([0.03, 0.05, 0.02], dtype=torch.float64).expand(4, 3)
-    return {**inputs, "theta": inputs["theta"].unsqueeze(0), "scales": scales.clone()}
+    return {
+        **inputs,
+        "theta": inputs["theta"].unsqueeze(0),
+        "scales": scales.clone(),
+    }
 
 
-def _case(name: str, options: dict[str, Any] | None = None, **changes: Any) -> Case:
-    return Case("LBS", name, partial(_arm, **changes), _skinned, **(options or {}))
+def _case(
+    name: str, options: dict[str, Any] | None = None, **changes: Any
+) -> Case:
+    return Case(
+        "LBS", name, partial(_arm, **changes), _skinned, **(options or {})
+    )
 
 
 def _skinned(inputs: Inputs) -> dict[str, Tensor]:
     """Points, covariances and normals ``[1, 4, ...]`` of the posed, perhaps scaled arm."""
-    check_weights(inputs["weights"].detach())  # as every body does when it is made
+    check_weights(
+        inputs["weights"].detach()
+    )  # as every body does when it is made
     R = axis_angle_to_matrix(inputs["theta"])
     bones = forward_kinematics(
         inputs["joints"], PARENTS, R, torch.zeros_like(R[:, 0, 0])
@@ -80,8 +94,13 @@ def _skinned(inputs: Inputs) -> dict[str, Tensor]:
         bones = torch.cat([bones[:, :, :3] * size, last], dim=2)
     A, t = blend_transforms(bones, BONES.to(R.device), inputs["weights"])
     axes = A * inputs["scales"][:, None]
-    up = torch.tensor([0.48, 0.6, 0.64], device=A.device, dtype=A.dtype).expand(4, 3)
-    posed = {"means": skin(inputs["points"], A, t), "covariances": axes @ axes.mT}
+    up = torch.tensor([0.48, 0.6, 0.64], device=A.device, dtype=A.dtype).expand(
+        4, 3
+    )
+    posed = {
+        "means": skin(inputs["points"], A, t),
+        "covariances": axes @ axes.mT,
+    }
     return {**posed, "normals": moved_normals(A, up)}
 
 
@@ -109,7 +128,11 @@ def _turns() -> Iterator[Case]:
         "note": "Bones move nearly alike: the gradients of weights and joints are differences of "
         "equal numbers, and count as 0 below 1e-6.",
     }
-    for name, angle in (("zero", 0.0), ("1e-9", 1e-9), ("a turn but for 0.003", 6.28)):
+    for name, angle in (
+        ("zero", 0.0),
+        ("1e-9", 1e-9),
+        ("a turn but for 0.003", 6.28),
+    ):
         yield _case(f"joints turned by {name}", alike, theta=angle * axis)
     yield _case("joints turned by half a turn", theta=math.pi * axis)
     yield _case(
@@ -124,13 +147,16 @@ def _images() -> Iterator[Case]:
     camera = pinhole(focal=40.0, t=(-0.35, 0.02, 1.0))
     twisted = [[0.0, 0, 0], [math.pi, 0, 0], [0.0, 0, 0]]
     folded = [[0.0, 0, 0], [0, 0, math.pi], [0.0, 0, 0]]
-    flat = (
-        "Half and half of two opposite bones is flat: the covariance has rank 1 or 2."
-    )
+    flat = "Half and half of two opposite bones is flat: the covariance has rank 1 or 2."
     for name, key, value, note in (
         ("elbow collapsed by twisting half a turn", "theta", twisted, flat),
         ("elbow collapsed by folding half a turn", "theta", folded, flat),
-        ("bone scale 0", "bone scale", [1.0, 0.0, 1.0], "Gaussians shrink to a point."),
+        (
+            "bone scale 0",
+            "bone scale",
+            [1.0, 0.0, 1.0],
+            "Gaussians shrink to a point.",
+        ),
         (
             "all bones of scale 0",
             "bone scale",
@@ -139,4 +165,6 @@ def _images() -> Iterator[Case]:
         ),
     ):
         arm = {**_arm(**{key: value}), **camera}
-        yield raster_case("LBS", name, lambda arm=arm: arm, draw=_rendered, note=note)
+        yield raster_case(
+            "LBS", name, lambda arm=arm: arm, draw=_rendered, note=note
+        )

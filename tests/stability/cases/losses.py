@@ -26,7 +26,9 @@ _case = partial(Case, "losses")
 
 def _random(seed: int = 0) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
-    return torch.rand(1, 3, SIDE, SIDE, generator=generator, dtype=torch.float64)
+    return torch.rand(
+        1, 3, SIDE, SIDE, generator=generator, dtype=torch.float64
+    )
 
 
 def _flat(value: float) -> Tensor:
@@ -44,7 +46,10 @@ PAIRS = {
     "equal grey": (_flat(0.7), _flat(0.7)),
     "white and white": (_flat(1), _flat(1)),
     "two greys": (_flat(0.7), _flat(0.4)),
-    "nearly flat images": (0.9 + 1e-3 * _random(), 0.9 + 1e-3 * _random().flip(-1)),
+    "nearly flat images": (
+        0.9 + 1e-3 * _random(),
+        0.9 + 1e-3 * _random().flip(-1),
+    ),
 }
 """Pairs of images in [0, 1] by name."""
 
@@ -68,7 +73,9 @@ def cases() -> Iterator[Case]:
             ),
         ):
             title, note = f"{what} of {name}", NOTES.get(name, "")
-            yield _case(title, pair, run, tolerance=Tolerance(1e-6, 5e-4), note=note)
+            yield _case(
+                title, pair, run, tolerance=Tolerance(1e-6, 5e-4), note=note
+            )
         note = "PSNR is infinite: reported as such, counted, and kept out of means."
         note = note if torch.equal(image, target) else ""
         yield _case(f"PSNR and SSIM of {name}", pair, _scores, note=note)
@@ -90,9 +97,13 @@ def cases() -> Iterator[Case]:
                 partial(_adversarial, norm="none", form="relativistic"),
             ),
         ):
-            yield _case(f"{what} of {name}", pair, run, tolerance=Tolerance(1e-5, 1e-3))
+            yield _case(
+                f"{what} of {name}", pair, run, tolerance=Tolerance(1e-5, 1e-3)
+            )
     # Discriminators that are certain, of the truth and of its opposite.
-    logits = torch.tensor([[1e4, -1e4, 90.0, -90.0, 0.0, 1.0]], dtype=torch.float64)
+    logits = torch.tensor(
+        [[1e4, -1e4, 90.0, -90.0, 0.0, 1.0]], dtype=torch.float64
+    )
     for form in FORMS:
         inputs = partial(dict, real=logits, fake=logits.flip(-1))
         yield _case(
@@ -112,7 +123,9 @@ def cases() -> Iterator[Case]:
         S = torch.full((1, 3, 4, 4), probability, dtype=torch.float64)
         S[:, 0] = 1 - 2 * probability
         inputs = partial(dict, S=S, labels=torch.full((1, 4, 4), label))
-        yield _case(f"segmentation loss, {name}", inputs, _segmentation, note=note)
+        yield _case(
+            f"segmentation loss, {name}", inputs, _segmentation, note=note
+        )
     for name, alpha in (("nothing painted", 0.0), ("something painted", 0.3)):
         yield _case(f"empty mask, {name}", partial(_empty, alpha), _step_one)
 
@@ -144,7 +157,9 @@ def _discriminator(
 
 def _perceptual(inputs: Inputs) -> Outputs:
     image, target = inputs["image"], inputs["target"]
-    return {"L_perc": _perceptual_loss(image.dtype, image.device)(image, target)}
+    return {
+        "L_perc": _perceptual_loss(image.dtype, image.device)(image, target)
+    }
 
 
 def _adversarial(inputs: Inputs, norm: str, form: str) -> Outputs:

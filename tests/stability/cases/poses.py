@@ -53,7 +53,9 @@ def _nearly_folded() -> Tensor:
         beyond = [j for i, j in MEDIAPIPE33.limbs if i == c]
         back = normalize(p[:, a] - p[:, b], dim=-1)
         front = back.new_tensor([[0.0, 0.0, 1.0]]).expand_as(back)
-        p[:, c] = p[:, b] + 0.25 * (back + 0.035 * torch.linalg.cross(back, front))
+        p[:, c] = p[:, b] + 0.25 * (
+            back + 0.035 * torch.linalg.cross(back, front)
+        )
         p[:, beyond] = p[:, c : c + 1] - (REST[beyond] - REST[c])
     return p
 
@@ -63,7 +65,9 @@ def _antipodal() -> Tensor:
     p = rest()
     for limb in (0, 2, 12, 14):
         a, b = MEDIAPIPE33.limbs[limb]
-        p[:, b] = p[:, a] - 0.3 * torch.tensor(MEDIAPIPE33.rest_directions[limb]).to(p)
+        p[:, b] = p[:, a] - 0.3 * torch.tensor(
+            MEDIAPIPE33.rest_directions[limb]
+        ).to(p)
     return p
 
 
@@ -78,7 +82,10 @@ def _collinear_head() -> Tensor:
     return _placed(line, face)
 
 
-_SPINE = {11: (0.0, 1.5, 0.0), 12: (0.0, 1.3, 0.0)}  # the shoulder line runs along it
+_SPINE = {
+    11: (0.0, 1.5, 0.0),
+    12: (0.0, 1.3, 0.0),
+}  # the shoulder line runs along it
 
 DEGENERATE: dict[str, Tensor] = {
     "an ordinary pose": rest(),

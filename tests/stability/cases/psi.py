@@ -24,9 +24,9 @@ NAMES = tuple(field.name for field in fields(Residuals))
 @lru_cache(maxsize=8)
 def some_points(dtype: torch.dtype, device: torch.device) -> Densify:
     """Densify with so many points that none starts wider than Ψ allows."""
-    return Densify(points_per_limb=40, face_points=60, torso_points=80, dtype=dtype).to(
-        device
-    )
+    return Densify(
+        points_per_limb=40, face_points=60, torso_points=80, dtype=dtype
+    ).to(device)
 
 
 @lru_cache(maxsize=8)
@@ -53,7 +53,13 @@ def ordinary_residuals(seed: int = 0, sigma: float = 0.3) -> Inputs:
     n = some_points(torch.float64, torch.device("cpu")).n_points
     generator = torch.Generator().manual_seed(seed)
     sh = ((SH_DEGREE + 1) ** 2, 3)
-    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh": sh}
+    shapes = {
+        "means": (3,),
+        "quats": (4,),
+        "scales": (3,),
+        "opacities": (),
+        "sh": sh,
+    }
     made = {
         name: sigma
         * torch.randn(1, n, *shape, generator=generator, dtype=torch.float64)
@@ -71,10 +77,14 @@ def composed(inputs: Inputs, frame: Numbers | None = None) -> dict[str, Tensor]:
     p = inputs["p"]
     points = some_points(p.dtype, p.device)(p)
     if frame is not None:
-        frames = p.new_tensor(frame).view(1, 1, 3, 3).expand_as(points.rotations)
+        frames = (
+            p.new_tensor(frame).view(1, 1, 3, 3).expand_as(points.rotations)
+        )
         points = replace(points, rotations=frames)
     residuals = Residuals(**{name: inputs[name] for name in NAMES})
-    made = small_psi(p.dtype, p.device).compose(points, residuals, inputs["eye"])
+    made = small_psi(p.dtype, p.device).compose(
+        points, residuals, inputs["eye"]
+    )
     return {
         "means": made.means,
         # in square centimetres, so that an error counts against the size of a Gaussian
@@ -89,7 +99,9 @@ def _changed(**changes: float | Tensor) -> Inputs:
     made = ordinary_residuals()
     for key, value in changes.items():
         made[key] = (
-            torch.as_tensor(value, dtype=torch.float64).expand_as(made[key]).clone()
+            torch.as_tensor(value, dtype=torch.float64)
+            .expand_as(made[key])
+            .clone()
         )
     return made
 
@@ -102,7 +114,12 @@ def cases() -> Iterator[Case]:
         _close_camera(),
     ):
         yield Case(
-            "Ψ", name, partial(_changed, **changes), composed, note=note, **options
+            "Ψ",
+            name,
+            partial(_changed, **changes),
+            composed,
+            note=note,
+            **options,
         )
     for name, (frame, note) in FRAMES.items():
         run = partial(composed, frame=frame)
@@ -134,13 +151,14 @@ def _residuals() -> Iterator[Row]:
     for value in (1e3, -1e3):
         note = "The mean stays a quarter of a body height away; the slope is 0."
         yield f"means' tanh saturated at {value:g}", note, {}, {"means": value}
-        note = (
-            f"Clamped before the exponential: nothing overflows, the slope is 0. {same}"
+        note = f"Clamped before the exponential: nothing overflows, the slope is 0. {same}"
+        yield (
+            f"scales' exponent at {value:g}",
+            note,
+            round_ones,
+            {"scales": value},
         )
-        yield f"scales' exponent at {value:g}", note, round_ones, {"scales": value}
-        note = (
-            "Clamped to ± 8, where the sigmoid is off 0 and 1; the slope beyond is 0."
-        )
+        note = "Clamped to ± 8, where the sigmoid is off 0 and 1; the slope beyond is 0."
         yield f"opacity's logit at {value:g}", note, {}, {"opacities": value}
         yield (
             f"colour at {value:g}",
@@ -177,13 +195,28 @@ def _close_camera() -> Row:
     note = "The direction it is seen from turns by step / 1 mm; float32 places it to 1e-4 of 1 mm."
     eye = mean + torch.tensor([[6e-4, 0.0, 8e-4]], dtype=torch.float64)
     within = {"tolerance": Tolerance(1e-4, 1e-3)}
-    return "camera a millimetre from a Gaussian's middle", note, within, {"eye": eye}
+    return (
+        "camera a millimetre from a Gaussian's middle",
+        note,
+        within,
+        {"eye": eye},
+    )
 
 
 COS, SIN = math.cos(2.6), math.sin(2.6)
 FRAMES = {
     "an elbow folded by 150 degrees": (
-        ((1 + COS) / 2, -SIN / 2, 0.0, SIN / 2, (1 + COS) / 2, 0.0, 0.0, 0.0, 1.0),
+        (
+            (1 + COS) / 2,
+            -SIN / 2,
+            0.0,
+            SIN / 2,
+            (1 + COS) / 2,
+            0.0,
+            0.0,
+            0.0,
+            1.0,
+        ),
         "Half and half: a quarter as wide there.",
     ),
     "two bones half a turn apart": (

@@ -31,7 +31,14 @@ ON_PIXEL = (0.5 * 2 / FOCAL, 0.5 * 2 / FOCAL, 2.0)
 
 Numbers = Sequence[float]
 Size = tuple[int, int]
-_GAUSSIANS = ("means", "quats", "scales", "covariances", "opacities", "features")
+_GAUSSIANS = (
+    "means",
+    "quats",
+    "scales",
+    "covariances",
+    "opacities",
+    "features",
+)
 
 
 def raster_case(
@@ -59,14 +66,21 @@ def render(
     depths = wide[..., 2:].to(gaussians.means)
     values = torch.cat([gaussians.features, depths], dim=-1)
     raster = rasterise(
-        replace(gaussians, features=values), camera, settings=settings, backend=backend
+        replace(gaussians, features=values),
+        camera,
+        settings=settings,
+        backend=backend,
     )
     features, depth = raster.features[:, :-1], raster.features[:, -1:]
     return {"features": features, "alpha": raster.alpha, "depth": depth}
 
 
 def rendered(
-    gaussians: Gaussians, inputs: Inputs, backend: str, size: Size, settings: Accuracy
+    gaussians: Gaussians,
+    inputs: Inputs,
+    backend: str,
+    size: Size,
+    settings: Accuracy,
 ) -> dict[str, Tensor]:
     """Features and alpha of Gaussians that a case made, seen by the camera of its inputs."""
     camera = Camera(inputs["K"], inputs["R"], inputs["t"], size)
@@ -77,7 +91,9 @@ def rendered(
 def records(inputs: Inputs, size: Size) -> tuple[Gaussians, Camera]:
     """The scene as the records that ``rasterise`` takes."""
     parts: dict[str, Any] = {name: _joined(inputs, name) for name in _GAUSSIANS}
-    return Gaussians(**parts), Camera(inputs["K"], inputs["R"], inputs["t"], size)
+    return Gaussians(**parts), Camera(
+        inputs["K"], inputs["R"], inputs["t"], size
+    )
 
 
 def _joined(inputs: Inputs, name: str) -> Tensor | None:
@@ -87,13 +103,20 @@ def _joined(inputs: Inputs, name: str) -> Tensor | None:
 
 def among(others: Inputs, hard: Inputs) -> Inputs:
     """The hard Gaussians first, then the others, as inputs of their own."""
-    return {**hard, **{f"other {name}": value for name, value in others.items()}}
+    return {
+        **hard,
+        **{f"other {name}": value for name, value in others.items()},
+    }
 
 
 def uncut(settings: Accuracy) -> Accuracy:
     """The same settings without a cut-off."""
     return replace(
-        settings, name="uncut", alpha_min=0.0, transmittance_min=0.0, extent="all"
+        settings,
+        name="uncut",
+        alpha_min=0.0,
+        transmittance_min=0.0,
+        extent="all",
     )
 
 
@@ -109,7 +132,9 @@ def pinhole(
 ) -> Inputs:
     """K, R and t; the principal point (x, y) is the image's middle unless given."""
     x, y = centre or (size[1] / 2, size[0] / 2)
-    K = torch.tensor([[focal, skew, x], [0.0, focal * aspect, y], [0.0, 0.0, 1.0]])
+    K = torch.tensor(
+        [[focal, skew, x], [0.0, focal * aspect, y], [0.0, 0.0, 1.0]]
+    )
     return {
         "K": K.double().unsqueeze(0),
         "R": rotation(axis_angle).unsqueeze(0),
@@ -120,7 +145,9 @@ def pinhole(
 def rotation(axis_angle: Numbers) -> Tensor:
     """``[3, 3]`` rotation matrix of an axis times an angle in radians."""
     x, y, z = axis_angle
-    skew = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64)
+    skew = torch.tensor(
+        [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64
+    )
     return torch.matrix_exp(skew)
 
 
@@ -135,11 +162,17 @@ def gaussians(
     n = len(means)
     generator = torch.Generator().manual_seed(1)
     return {
-        "means": torch.tensor([[list(mean) for mean in means]], dtype=torch.float64),
+        "means": torch.tensor(
+            [[list(mean) for mean in means]], dtype=torch.float64
+        ),
         "quats": torch.tensor(list(quat), dtype=torch.float64).repeat(1, n, 1),
-        "scales": torch.tensor(list(scales), dtype=torch.float64).repeat(1, n, 1),
+        "scales": torch.tensor(list(scales), dtype=torch.float64).repeat(
+            1, n, 1
+        ),
         "opacities": torch.full((1, n), opacity, dtype=torch.float64),
-        "features": torch.rand(1, n, 3, generator=generator, dtype=torch.float64),
+        "features": torch.rand(
+            1, n, 3, generator=generator, dtype=torch.float64
+        ),
     }
 
 
@@ -158,7 +191,9 @@ def cloud(
     generator = torch.Generator().manual_seed(seed)
 
     def rand(*shape: int) -> Tensor:
-        return torch.rand(batch, n, *shape, generator=generator, dtype=torch.float64)
+        return torch.rand(
+            batch, n, *shape, generator=generator, dtype=torch.float64
+        )
 
     low, high = opacity
     place = torch.tensor([list(extent), list(middle)], dtype=torch.float64)

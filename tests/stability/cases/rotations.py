@@ -12,7 +12,9 @@ from stability.cases.raster import rotation
 
 _case = partial(Case, "6D rotations")
 
-_STAND_IN = "A column without a direction gives way to a fixed axis, without a slope."
+_STAND_IN = (
+    "A column without a direction gives way to a fixed axis, without a slope."
+)
 _ANGLE = "Rounding counts by one over the angle between the columns."
 
 # Name, the two columns, note.

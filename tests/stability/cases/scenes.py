@@ -16,8 +16,14 @@ _case = partial(raster_case, "scenes")
 
 def _scene(**camera: Any) -> Inputs:
     """A cloud seen by a turned camera two and a half metres away."""
-    turned: dict[str, Any] = {"axis_angle": (0.3, -0.4, 0.2), "t": (0.1, -0.2, 2.5)}
-    return {**cloud(40, middle=(0.2, -0.3, 0.1)), **pinhole(**{**turned, **camera})}
+    turned: dict[str, Any] = {
+        "axis_angle": (0.3, -0.4, 0.2),
+        "t": (0.1, -0.2, 2.5),
+    }
+    return {
+        **cloud(40, middle=(0.2, -0.3, 0.1)),
+        **pinhole(**{**turned, **camera}),
+    }
 
 
 def _far() -> Inputs:
@@ -92,7 +98,9 @@ def cases() -> Iterator[Case]:
         ("Gaussians in metres, cameras in millimetres", ("t",), 5e-4, other),
     ):
         scene = partial(_times, dict.fromkeys(parts, 1e3))
-        yield _case(name, scene, tolerance=Tolerance(gradients=within), note=note)
+        yield _case(
+            name, scene, tolerance=Tolerance(gradients=within), note=note
+        )
     inside = {**cloud(40, scale=0.2, middle=(0.0, 0.0, 0.0)), **pinhole()}
     yield _case("camera inside the body", lambda: inside)
     for name, camera in CAMERAS.items():
@@ -106,7 +114,10 @@ def cases() -> Iterator[Case]:
 def _times(factors: dict[str, Any]) -> Inputs:
     """The scene with some of its numbers multiplied."""
     scene = _scene()
-    return {**scene, **{name: scene[name] * factor for name, factor in factors.items()}}
+    return {
+        **scene,
+        **{name: scene[name] * factor for name, factor in factors.items()},
+    }
 
 
 def _with_nan() -> Inputs:

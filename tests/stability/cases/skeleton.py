@@ -50,7 +50,9 @@ NOTES = {
 def cases() -> Iterator[Case]:
     """All of them."""
     for name, p in DEGENERATE.items():
-        within = Tolerance(1e-4 if name == "folded back but for two degrees" else 1e-5)
+        within = Tolerance(
+            1e-4 if name == "folded back but for two degrees" else 1e-5
+        )
         make, note = partial(dict, p=p), NOTES.get(name, "")
         yield _case(name, make, frames_and_points, tolerance=within, note=note)
     yield from _lost()
@@ -75,9 +77,9 @@ def cases() -> Iterator[Case]:
 @lru_cache(maxsize=8)
 def few_points(dtype: torch.dtype, device: torch.device) -> Densify:
     """Densify with a handful of points per part."""
-    return Densify(points_per_limb=3, face_points=5, torso_points=6, dtype=dtype).to(
-        device
-    )
+    return Densify(
+        points_per_limb=3, face_points=5, torso_points=6, dtype=dtype
+    ).to(device)
 
 
 def frames_and_points(inputs: Inputs) -> dict[str, Tensor]:
@@ -125,9 +127,14 @@ def _lost() -> Iterator[Case]:
     note = "Stand-ins hang on what was seen; a lost joint's own gradient is 0."
     for name, value in (("NaN", math.nan), ("infinite", math.inf)):
         yield _case(
-            f"eight joints {name}", partial(_losing, many, value), _sanitised, note=note
+            f"eight joints {name}",
+            partial(_losing, many, value),
+            _sanitised,
+            note=note,
         )
-    yield _case("all joints but the trunk's unseen", _only_trunk, _sanitised, note=note)
+    yield _case(
+        "all joints but the trunk's unseen", _only_trunk, _sanitised, note=note
+    )
     two = partial(_losing, [11, 24], math.nan)
     yield _case("two joints of the trunk lost", two, _sanitised, expect=REFUSED)
 
@@ -137,7 +144,12 @@ def _camera_in_the_forearm() -> Inputs:
     p = rest()
     eye = 0.6 * p[0, 13] + 0.4 * p[0, 15]
     camera = pinhole(focal=20.0, axis_angle=(0.4, 2.2, 0.1))
-    return {"p": p, "K": camera["K"], "R": camera["R"], "t": -(camera["R"] @ eye)}
+    return {
+        "p": p,
+        "K": camera["K"],
+        "R": camera["R"],
+        "t": -(camera["R"] @ eye),
+    }
 
 
 def _seen_from_within(
@@ -157,4 +169,7 @@ def _seen_from_within(
     )
     camera = Camera(inputs["K"], inputs["R"], inputs["t"], size)
     lines = draw_skeleton(p, None, camera, sigma_px=30.0)
-    return {**rendered(gaussians, inputs, backend, size, settings), "lines": lines}
+    return {
+        **rendered(gaussians, inputs, backend, size, settings),
+        "lines": lines,
+    }

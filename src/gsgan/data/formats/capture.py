@@ -109,7 +109,9 @@ def read_capture(
     drop_frames: Any = None,
 ) -> Layout:
     """The capture in a folder, see `CaptureReader`; ``limits`` are `Thresholds()` when None."""
-    return CaptureReader(drop_frames, consistency)(root, limits or Thresholds(), smpl)
+    return CaptureReader(drop_frames, consistency)(
+        root, limits or Thresholds(), smpl
+    )
 
 
 def _find(
@@ -133,8 +135,12 @@ def _find(
 
     # Images, masks and labels.
     images = _index_images(root, cameras)
-    masks = {name: frame_files(root, f"masks/{name}", MASKS) for name in cameras}
-    labels = {name: frame_files(root, f"labels/{name}", MASKS) for name in cameras}
+    masks = {
+        name: frame_files(root, f"masks/{name}", MASKS) for name in cameras
+    }
+    labels = {
+        name: frame_files(root, f"labels/{name}", MASKS) for name in cameras
+    }
 
     # Landmarks; hands and face are optional.
     joints = SKELETONS[meta.skeleton]
@@ -143,10 +149,14 @@ def _find(
     )
     hands = None
     if (root / HANDS_FILE).exists():
-        hands = _read_landmarks(root / HANDS_FILE, 2 * HAND, conventions, limits, notes)
+        hands = _read_landmarks(
+            root / HANDS_FILE, 2 * HAND, conventions, limits, notes
+        )
     face = None
     if (root / FACE_FILE).exists():
-        face = _read_landmarks(root / FACE_FILE, FACE, conventions, limits, notes)
+        face = _read_landmarks(
+            root / FACE_FILE, FACE, conventions, limits, notes
+        )
         _refuse_other_names(root / FACE_FILE)
 
     # Body poses, which may also name the body.
@@ -205,7 +215,9 @@ def capture_problems(root: Path, limits: Thresholds) -> list[str]:
     cameras_path = root / "cameras.json"
     cameras_json = attempt(lambda: read_json(cameras_path))
     if cameras_json is not None:
-        cameras = attempt(lambda: read_cameras(cameras_path, cameras_json, conventions))
+        cameras = attempt(
+            lambda: read_cameras(cameras_path, cameras_json, conventions)
+        )
         if cameras is not None:
             attempt(lambda: _index_images(root, cameras))
 
@@ -218,13 +230,17 @@ def capture_problems(root: Path, limits: Thresholds) -> list[str]:
     ):
         file = root / name
         if name == LANDMARKS_FILE or file.exists():
-            attempt(partial(_read_landmarks, file, count, conventions, limits, []))
+            attempt(
+                partial(_read_landmarks, file, count, conventions, limits, [])
+            )
     if meta is not None and (root / POSES_FILE).exists():
         attempt(lambda: _read_poses(root, meta, conventions))
     return problems
 
 
-def _read_meta(path: Path, content: Mapping[str, Any], smpl: str | None) -> Meta:
+def _read_meta(
+    path: Path, content: Mapping[str, Any], smpl: str | None
+) -> Meta:
     """Facts about the capture from the content of meta.json, where only ``unit`` is required."""
     # Optional facts, each checked before it is used.
     fps = content.get("fps")
@@ -252,7 +268,9 @@ def _read_meta(path: Path, content: Mapping[str, Any], smpl: str | None) -> Meta
         unit=choose(path, content, "unit", None, tuple(METRES)),
         fps=None if fps is None else float(fps),
         up_axis=choose(path, content, "up_axis", "z", UP_AXES),
-        skeleton=choose(path, content, "skeleton", "mediapipe33", tuple(SKELETONS)),
+        skeleton=choose(
+            path, content, "skeleton", "mediapipe33", tuple(SKELETONS)
+        ),
         body=body,
         label_names=None if names is None else tuple(map(str, names)),
         splits=splits,
@@ -290,7 +308,9 @@ def _index_images(
             )
 
     # A camera without images is most likely a mistake too.
-    images = {name: frame_files(root, f"images/{name}", IMAGES) for name in cameras}
+    images = {
+        name: frame_files(root, f"images/{name}", IMAGES) for name in cameras
+    }
     for name, files in images.items():
         if not files:
             raise DataError(
@@ -312,12 +332,16 @@ def _read_landmarks(
     # Positions in metres; exact zeros are missing joints.
     p = expect_array(arrays, "p", (None, joints, 3), path).astype(np.float64)
     p = zeros_as_missing(p) * conventions.scale
-    ids = whole_frame_ids(expect_array(arrays, "frame_id", (len(p),), path), str(path))
+    ids = whole_frame_ids(
+        expect_array(arrays, "frame_id", (len(p),), path), str(path)
+    )
 
     # Without confidences, every joint counts fully.
     conf = np.ones(p.shape[:2])
     if "conf" in arrays:
-        conf = expect_array(arrays, "conf", p.shape[:2], path).astype(np.float64)
+        conf = expect_array(arrays, "conf", p.shape[:2], path).astype(
+            np.float64
+        )
     return make_landmarks(ids, p, conf, limits.max_reach, notes, path.name)
 
 
@@ -332,7 +356,9 @@ def _refuse_other_names(path: Path) -> None:
         )
 
 
-def _read_poses(root: Path, meta: Meta, conventions: Conventions) -> tuple[Poses, Meta]:
+def _read_poses(
+    root: Path, meta: Meta, conventions: Conventions
+) -> tuple[Poses, Meta]:
     """The poses of frames in which all numbers are finite, and ``meta`` with the body and its
     shape."""
     path = root / POSES_FILE
@@ -342,11 +368,15 @@ def _read_poses(root: Path, meta: Meta, conventions: Conventions) -> tuple[Poses
     # A shape file comes from gsgan.fit: then the body is the free one in the person's shape.
     fitted = (root / SHAPE).exists()
     if fitted:
-        meta = replace(meta, body=BodyModel("free", betas=read_shape(root / SHAPE)))
+        meta = replace(
+            meta, body=BodyModel("free", betas=read_shape(root / SHAPE))
+        )
     bones = None if meta.body is None else BODY_BONES[meta.body.kind]
 
     # Frames, those that were registered to masks, and the cameras of those masks.
-    ids = whole_frame_ids(expect_array(arrays, "frame_id", (None,), path), str(path))
+    ids = whole_frame_ids(
+        expect_array(arrays, "frame_id", (None,), path), str(path)
+    )
     registered: frozenset[int] = frozenset()
     if "registered" in arrays:
         found = expect_array(arrays, "registered", (None,), path)
@@ -358,7 +388,9 @@ def _read_poses(root: Path, meta: Meta, conventions: Conventions) -> tuple[Poses
     rotations = []
     moves = []
     for suffix in suffixes:
-        theta = expect_array(arrays, f"theta{suffix}", (len(ids), bones, 3), path)
+        theta = expect_array(
+            arrays, f"theta{suffix}", (len(ids), bones, 3), path
+        )
         rotations.append(theta.astype(np.float64))
         transl = expect_array(arrays, f"transl{suffix}", (len(ids), 3), path)
         moves.append(transl.astype(np.float64))
@@ -376,7 +408,9 @@ def _read_poses(root: Path, meta: Meta, conventions: Conventions) -> tuple[Poses
         poses.append(
             Poses(
                 theta=dict(zip(frames, theta[rows], strict=True)),
-                transl=dict(zip(frames, conventions.scale * transl[rows], strict=True)),
+                transl=dict(
+                    zip(frames, conventions.scale * transl[rows], strict=True)
+                ),
                 fitted=fitted,
                 registered=registered,
                 fitted_to=fitted_to,
@@ -394,7 +428,9 @@ def _read_poses(root: Path, meta: Meta, conventions: Conventions) -> tuple[Poses
     betas = expect_array(arrays, "betas", (None,), path).astype(np.float64)
     if not np.isfinite(betas).all():
         raise DataError(f"{path}: 'betas' must hold finite numbers")
-    return own, replace(meta, body=replace(meta.body, betas=tuple(betas.tolist())))
+    return own, replace(
+        meta, body=replace(meta.body, betas=tuple(betas.tolist()))
+    )
 
 
 def read_shape(path: Path) -> tuple[float, ...]:

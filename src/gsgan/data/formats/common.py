@@ -69,7 +69,9 @@ class FolderReader:
             header_stride=20,
         )
         found = self.find(folder, limits, smpl)
-        return finish(found, limits, self.consistency, self.hint, self.drop_frames)
+        return finish(
+            found, limits, self.consistency, self.hint, self.drop_frames
+        )
 
     def find(self, root: Path, limits: Thresholds, smpl: str | None) -> Found:
         """The dataset's files, each checked separately.
@@ -103,9 +105,13 @@ def finish(
     # Frames that the user leaves out.
     if drop_frames is not None:
         gone = parse_frames(drop_frames, "data.reader.drop_frames")
-        images = {name: files.without(gone) for name, files in found.images.items()}
+        images = {
+            name: files.without(gone) for name, files in found.images.items()
+        }
         if not any(images.values()):
-            raise ConfigError(f"data.reader.drop_frames={drop_frames} leaves no frame")
+            raise ConfigError(
+                f"data.reader.drop_frames={drop_frames} leaves no frame"
+            )
         found = replace(found, images=images)
 
     # Files against each other, then a few masks against the joints.
@@ -114,7 +120,9 @@ def finish(
     return layout
 
 
-def body_model(root: Path, smpl: str | None, kind: str) -> tuple[Path, SkinnedModel]:
+def body_model(
+    root: Path, smpl: str | None, kind: str
+) -> tuple[Path, SkinnedModel]:
     """The user's body model file and the model in it.
 
     Args:
@@ -194,6 +202,8 @@ class _Masks(Mapping[int, tuple[MaskFile, ...]]):
         return len(self.files)
 
 
-def one_mask_each(files: Mapping[str, Mapping[int, str]], rule: str) -> MaskIndex:
+def one_mask_each(
+    files: Mapping[str, Mapping[int, str]], rule: str
+) -> MaskIndex:
     """Masks by camera and frame, one file per image, all of one rule."""
     return {name: _Masks(paths, rule) for name, paths in files.items()}

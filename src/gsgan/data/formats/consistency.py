@@ -100,7 +100,9 @@ def check_consistency(
     # The mean share of each camera; the message shows all, since one may be wrong.
     inside = {name: np.mean(found) for name, found in shares.items()}
     if inside and min(inside.values()) < limits.refused_below:
-        text = ", ".join(f"{name} {share:.0%}" for name, share in inside.items())
+        text = ", ".join(
+            f"{name} {share:.0%}" for name, share in inside.items()
+        )
         raise DataError(
             f"{layout.root}: joints lie outside the masks (inside: {text}); {hint}: "
             "python -m gsgan.check finds the wrong camera"
@@ -138,7 +140,9 @@ def mask_distance(mask: Bool) -> Float:
 
     # OpenCV measures the distance to the nearest zero.
     outside = (~mask).astype(np.uint8)
-    distance = cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    distance = cv2.distanceTransform(
+        outside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE
+    )
     return distance.astype(np.float64)
 
 
@@ -167,7 +171,9 @@ def joint_distance(
 
     # A distance of d pixels is d * depth / focal metres at the joint.
     metres = np.full(len(pixels), np.nan)
-    metres[usable] = distance[row[usable], column[usable]] * depth[usable] / focal
+    metres[usable] = (
+        distance[row[usable], column[usable]] * depth[usable] / focal
+    )
     return metres
 
 
@@ -194,7 +200,9 @@ def inside_share(
     shown = through_lens(camera.K, camera.dist, straight[:, 0], straight[:, 1])
     everyone = np.ones(len(joints), bool)
     distance = mask_distance(small)
-    outside = joint_distance(distance, shown / step, depth, everyone, focal)  # [N]
+    outside = joint_distance(
+        distance, shown / step, depth, everyone, focal
+    )  # [N]
 
     # The tolerance in metres, but at least some pixels of the small mask.
     known = ~np.isnan(outside)

@@ -80,7 +80,9 @@ class EasymocapReader(FolderReader):
         # Images of the cameras that have a folder, and their calibrations.
         notes: list[str] = []
         names = _camera_folders(root, self.contents)
-        images = {name: frame_files(root, f"images/{name}", IMAGES) for name in names}
+        images = {
+            name: frame_files(root, f"images/{name}", IMAGES) for name in names
+        }
         for name, files in images.items():
             if not files:
                 raise DataError(
@@ -90,7 +92,9 @@ class EasymocapReader(FolderReader):
 
         # The person's SMPL fits, if the user has the model, else the keypoints.
         kind, place = _source(root, smpl)
-        people = _read_people(root, place, frames_of(images), self.person, notes)
+        people = _read_people(
+            root, place, frames_of(images), self.person, notes
+        )
         motion = None
         body = None
         if kind == "smpl":
@@ -125,7 +129,10 @@ class EasymocapReader(FolderReader):
         )
 
     def _cameras(
-        self, root: Path, images: Mapping[str, Mapping[int, str]], notes: list[str]
+        self,
+        root: Path,
+        images: Mapping[str, Mapping[int, str]],
+        notes: list[str],
     ) -> dict[str, CameraEntry]:
         """The cameras that have images, by name, in natural order."""
         # Every folder of images needs a camera of the same name.
@@ -186,7 +193,9 @@ def _masks(
     found = {}
     for name in names:
         # Keys hold the frame and the person.
-        files = frame_files(root, f"mask/{name}", (".png", ".jpg"), _frame_and_person)
+        files = frame_files(
+            root, f"mask/{name}", (".png", ".jpg"), _frame_and_person
+        )
         own: dict[int, tuple[MaskFile, ...]] = {}
         # A mask without an id comes first, so that the person's own replaces it.
         for key, path in sorted(files.items()):
@@ -249,7 +258,10 @@ def _read_people(
         people = _people(root / files[frame])
         seen |= set(people)
         if person in people:
-            found[frame] = (f"{root / files[frame]}, person {person}", people[person])
+            found[frame] = (
+                f"{root / files[frame]}, person {person}",
+                people[person],
+            )
         else:
             lacking.append(frame)
 
@@ -261,7 +273,9 @@ def _read_people(
             f"that belong to images (found: {ids}); set data.reader.person"
         )
     if lacking:
-        notes.append(f"{folder} lacks person {person} at frames {spans(lacking)}")
+        notes.append(
+            f"{folder} lacks person {person} at frames {spans(lacking)}"
+        )
     return found
 
 
@@ -270,7 +284,9 @@ def _people(path: Path) -> dict[int, Mapping[str, Any]]:
     content = read_json_value(path)
     # Some versions wrap the list in an object.
     if isinstance(content, Mapping):
-        content = next((content[key] for key in PEOPLE_KEYS if key in content), None)
+        content = next(
+            (content[key] for key in PEOPLE_KEYS if key in content), None
+        )
     entries = content if isinstance(content, list) else [None]
     people: dict[int, Mapping[str, Any]] = {}
     for entry in entries:

@@ -112,7 +112,9 @@ def _only(model: SkinnedModel, vertices: list[int]) -> SkinnedModel:
         shapedirs=with_joints(model.shapedirs),
         expression_dirs=with_joints(model.expression_dirs),
         posedirs=torch.cat([model.posedirs[vertices], still]),
-        J_regressor=torch.cat([eye.new_zeros(joints, len(vertices)), eye], dim=1),
+        J_regressor=torch.cat(
+            [eye.new_zeros(joints, len(vertices)), eye], dim=1
+        ),
         weights=torch.cat([model.weights[vertices], eye]),
     )
 
@@ -140,7 +142,9 @@ def zju_motion(
 
         # Poses without the root get an unrotated one.
         pose = columns["poses"][-1]
-        pose = np.concatenate([np.zeros(ZJU_SIZES["poses"][0] - len(pose)), pose])
+        pose = np.concatenate(
+            [np.zeros(ZJU_SIZES["poses"][0] - len(pose)), pose]
+        )
         columns["poses"][-1] = pose
         turn = float(np.abs(pose[:3]).max())
         if turn > ROOT_TOLERANCE:
@@ -183,7 +187,9 @@ def _parameter(
     values = as_floats(content[key]).reshape(-1)
     if len(values) not in sizes:
         found = getattr(content[key], "shape", type(content[key]).__name__)
-        raise DataError(f"{where}: '{key}' must hold {expected} numbers, found {found}")
+        raise DataError(
+            f"{where}: '{key}' must hold {expected} numbers, found {found}"
+        )
     if not np.isfinite(values).all():
         raise DataError(
             f"{where}: '{key}' must hold finite numbers, found NaN or infinity"

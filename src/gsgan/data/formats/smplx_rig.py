@@ -120,7 +120,9 @@ class SmplxRigReader(FolderReader):
                 fps=self.fps,
                 up_axis=up_axis(cameras.values()),
                 skeleton_source="smplx -> mediapipe33",
-                body=BodyModel("smplx", str(file), tuple(motion.betas[0].tolist())),
+                body=BodyModel(
+                    "smplx", str(file), tuple(motion.betas[0].tolist())
+                ),
                 layout=self.layout,
             ),
             cameras=cameras,
@@ -230,7 +232,9 @@ def _leave_out(images: Files, path: Path, notes: list[str]) -> None:
             raise DataError(f"{path} leaves no image of camera {camera}")
 
 
-def read_missing(path: Path, cameras: Mapping[str, Any]) -> set[tuple[str, int]]:
+def read_missing(
+    path: Path, cameras: Mapping[str, Any]
+) -> set[tuple[str, int]]:
     """The (camera, frame) pairs of a list of images, with slashes or backslashes.
 
     Raises:
@@ -292,13 +296,17 @@ def read_motion(
     first = 0
     for key, width in POSES.items():
         if key in arrays:
-            theta[:, first : first + width] = _rows(arrays, key, width, path, count)
+            theta[:, first : first + width] = _rows(
+                arrays, key, width, path, count
+            )
         first += width
 
     # The hands are then flat, which the user should know.
     absent = [key for key in HAND_POSES if key not in arrays]
     if absent:
-        notes.append(f"{path} has no {' and '.join(absent)}: taken as flat hands")
+        notes.append(
+            f"{path} has no {' and '.join(absent)}: taken as flat hands"
+        )
 
     # The shape and, if there is one, the expression.
     betas = _coefficients(arrays, "betas", model.shapedirs.shape[-1], path)[0]

@@ -16,7 +16,9 @@ from gsgan.data.formats.smplx_rig import SmplxRigReader
 class Thuman4Reader(SmplxRigReader):
     """Reads a subject of THuman4.0; settings as `SmplxRigReader`."""
 
-    contents: ClassVar[str] = "calibration.json, smpl_params.npz, images/ and masks/"
+    contents: ClassVar[str] = (
+        "calibration.json, smpl_params.npz, images/ and masks/"
+    )
     layout: ClassVar[str] = "THuman4.0"
     calibration: ClassVar[str] = "calibration.json"
     images: ClassVar[str] = "images/{camera}"

@@ -35,7 +35,12 @@ from gsgan.data.pixels import IGNORE_LABEL, MaskFile, PixelRules, mask_file
 from gsgan.data.skeletons import make_landmarks
 from gsgan.data.validation import Thresholds, frames_of
 from gsgan.utils.errors import DataError
-from gsgan.utils.frame_files import FrameFiles, frame_files, frame_of, last_number
+from gsgan.utils.frame_files import (
+    FrameFiles,
+    frame_files,
+    frame_of,
+    last_number,
+)
 from gsgan.utils.pickles import read_npy
 
 Files = Mapping[str, Mapping[int, str]]
@@ -62,7 +67,9 @@ class ZjuReader(FolderReader):
     ignore_band: int = 5
     max_missing_masks: float = 0.5
 
-    contents: ClassVar[str] = "a ZJU-MoCap subject (annots.npy and camera folders)"
+    contents: ClassVar[str] = (
+        "a ZJU-MoCap subject (annots.npy and camera folders)"
+    )
     hint: ClassVar[str] = (
         "check that cameras, SMPL parameters and masks come from one release (the refined my_* "
         "ones do not fit CoreView images)"
@@ -79,7 +86,9 @@ class ZjuReader(FolderReader):
         cameras = self._cameras(root, annots, images)
 
         # The SMPL fit that the release has, the best first.
-        kinds = [kind for kind, folder in FITS.items() if (root / folder).is_dir()]
+        kinds = [
+            kind for kind, folder in FITS.items() if (root / folder).is_dir()
+        ]
         if not kinds:
             looked = "/, ".join(FITS.values())
             raise DataError(
@@ -100,7 +109,9 @@ class ZjuReader(FolderReader):
                 unit="mm",
                 up_axis=up_axis(cameras.values()),
                 skeleton_source="smpl24 -> mediapipe33",
-                body=BodyModel("smpl", str(file), tuple(motion.betas[0].tolist())),
+                body=BodyModel(
+                    "smpl", str(file), tuple(motion.betas[0].tolist())
+                ),
                 label_names=CIHP if labels else None,
                 layout="ZJU-MoCap",
             ),
@@ -172,7 +183,9 @@ def read_annots(root: Path) -> Annots:
         DataError: when there is none, it is damaged, or its cameras are not complete.
     """
     # The file that every release has, under one of two names.
-    path = next((root / name for name in ANNOTS if (root / name).exists()), None)
+    path = next(
+        (root / name for name in ANNOTS if (root / name).exists()), None
+    )
     if path is None:
         raise DataError(
             f"{root} is not a ZJU-MoCap subject: it has no annots.npy (copies that other projects "
@@ -183,7 +196,9 @@ def read_annots(root: Path) -> Annots:
     content = read_npy(path)
     cams = content.get("cams") if isinstance(content, dict) else None
     if not isinstance(cams, dict):
-        raise DataError(f"{path} has no 'cams'; expected a dict with cams and ims")
+        raise DataError(
+            f"{path} has no 'cams'; expected a dict with cams and ims"
+        )
 
     # The cameras' folders are those of the first frame's images; some copies list no images.
     folders = []
@@ -265,7 +280,9 @@ def frame_number(stem: str) -> int | None:
     return frame_of(named[1]) if named else last_number(stem)
 
 
-def _index_images(root: Path, folders: Mapping[str, str]) -> dict[str, FrameFiles]:
+def _index_images(
+    root: Path, folders: Mapping[str, str]
+) -> dict[str, FrameFiles]:
     """The images of each camera by frame number."""
     # A single camera may have none, but not all of them.
     images = {}

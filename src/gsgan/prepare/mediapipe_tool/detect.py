@@ -35,7 +35,9 @@ SUFFIXES = (".jpg", ".jpeg", ".png")
 JOINTS = 33
 HAND = 21
 FACE = 468
-MARGIN = 0.15  # of the mask's crop beyond the joints, share of the person's height
+MARGIN = (
+    0.15  # of the mask's crop beyond the joints, share of the person's height
+)
 
 
 def main() -> None:
@@ -44,7 +46,9 @@ def main() -> None:
         # MediaPipe has no option for the number of threads; the allowed processors bound it.
         allowed = sorted(os.sched_getaffinity(0))
         first = options.slot * options.threads
-        chosen = {allowed[(first + i) % len(allowed)] for i in range(options.threads)}
+        chosen = {
+            allowed[(first + i) % len(allowed)] for i in range(options.threads)
+        }
         os.sched_setaffinity(0, chosen)
     cv2.setNumThreads(options.threads or -1)
     count, images = open_source(Path(options.source), options.rotate)
@@ -57,7 +61,10 @@ def main() -> None:
         landmarks = detector.landmarks(image)
         for name, value in (*landmarks.items(), ("frame_id", frame)):
             found.setdefault(name, []).append(value)
-        if folder and (mask := detector.mask(image, landmarks["px"])) is not None:
+        if (
+            folder
+            and (mask := detector.mask(image, landmarks["px"])) is not None
+        ):
             cv2.imwrite(str(folder / f"{frame:06d}.png"), mask)
         print(done, max(done, count), flush=True)
     if not found:
@@ -72,7 +79,9 @@ def main() -> None:
     part.replace(out)
 
 
-def open_source(path: Path, rotate: int) -> tuple[int, Iterator[tuple[int, Any]]]:
+def open_source(
+    path: Path, rotate: int
+) -> tuple[int, Iterator[tuple[int, Any]]]:
     """Number of images (0: unknown), and an iterator of (frame number, BGR image)."""
     if path.is_dir():
         files = {
@@ -85,12 +94,16 @@ def open_source(path: Path, rotate: int) -> tuple[int, Iterator[tuple[int, Any]]
         )
     video = cv2.VideoCapture(str(path))
     video.set(cv2.CAP_PROP_ORIENTATION_AUTO, int(rotate))
-    return int(video.get(cv2.CAP_PROP_FRAME_COUNT)), enumerate(read_video(video))
+    return int(video.get(cv2.CAP_PROP_FRAME_COUNT)), enumerate(
+        read_video(video)
+    )
 
 
 def read_image(path: Path) -> Any:
     """The image as stored: calibrations ignore EXIF rotation."""
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    image = cv2.imread(
+        str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    )
     if image is None:
         raise SystemExit(f"{path} is damaged")
     return image
@@ -120,7 +133,9 @@ class Detector:
         found = self.body.process(rgb)
         size = image.shape[1], image.shape[0]
         pose = found.pose_landmarks
-        visibility = [p.visibility for p in pose.landmark] if pose else [0.0] * JOINTS
+        visibility = (
+            [p.visibility for p in pose.landmark] if pose else [0.0] * JOINTS
+        )
         hands = {
             side: getattr(found, f"{side}_hand_landmarks", None)
             for side in ("left", "right")
@@ -131,7 +146,10 @@ class Detector:
             "world": space(found.pose_world_landmarks),
             "faces": len(self.faces.process(rgb).detections or ()),
             **{side: pixels(hand, size, HAND) for side, hand in hands.items()},
-            **{f"{side}_z": depth(hand, size, HAND) for side, hand in hands.items()},
+            **{
+                f"{side}_z": depth(hand, size, HAND)
+                for side, hand in hands.items()
+            },
             "face": pixels(getattr(found, "face_landmarks", None), size, FACE),
         }
 

@@ -6,7 +6,13 @@ import torch
 
 from gsgan.metrics.image import psnr
 from gsgan.report.figures.layout import Drawing, Panel, draw_panels, written
-from gsgan.report.figures.subjects import Numbers, Shot, Subject, finite, measure
+from gsgan.report.figures.subjects import (
+    Numbers,
+    Shot,
+    Subject,
+    finite,
+    measure,
+)
 from gsgan.scene import Camera
 from gsgan.skeleton import SkeletonTemplate
 from gsgan.skeleton.hands import HAND
@@ -34,7 +40,9 @@ def details(subjects: Sequence[Subject], shots: Sequence[Shot]) -> Drawing:
         # The boxes are those of the joints, in pixels of the window that is shown.
         shown = shot.window.frame(shot.frame)
         template = subjects[0].avatar.template
-        boxes = detail_boxes(template, shown.skeleton, shown.visibility, shown.camera)
+        boxes = detail_boxes(
+            template, shown.skeleton, shown.visibility, shown.camera
+        )
         titles += [f"frame {shot.item[1]}", *boxes]
 
         # The image and its details, the truth first.
@@ -47,7 +55,9 @@ def details(subjects: Sequence[Subject], shots: Sequence[Shot]) -> Drawing:
         for subject in subjects:
             image = subject.image(shot)
             found = measure(image, shot.truth)
-            rows[subject.name].append(Panel(image, written(found["psnr"], 2, " dB")))
+            rows[subject.name].append(
+                Panel(image, written(found["psnr"], 2, " dB"))
+            )
             for name, box in boxes.items():
                 part = image[..., *box]
                 score = finite(psnr(part, shot.truth[..., *box]))
@@ -56,7 +66,9 @@ def details(subjects: Sequence[Subject], shots: Sequence[Shot]) -> Drawing:
             numbers[shot.name][subject.name] = found
 
     # One title per column, one name per row.
-    figure, _ = draw_panels(list(rows.values()), titles=titles, names=list(rows))
+    figure, _ = draw_panels(
+        list(rows.values()), titles=titles, names=list(rows)
+    )
     caption = (
         "The ground truth and each run's image, beside them the head and the hands, magnified, "
         "with PSNR."
@@ -89,8 +101,13 @@ def detail_boxes(
             for name in ("wrist", "pinky", "index", "thumb")
         ]
         parts[f"{side} hand"] = (joints, DETAIL_HAND_MARGIN)
-    for side, (wrist, *_) in zip(("left", "right"), template.palms, strict=False):
-        parts[f"{side} hand"] = (list(range(wrist, wrist + HAND)), DETAIL_HAND_MARGIN)
+    for side, (wrist, *_) in zip(
+        ("left", "right"), template.palms, strict=False
+    ):
+        parts[f"{side} hand"] = (
+            list(range(wrist, wrist + HAND)),
+            DETAIL_HAND_MARGIN,
+        )
 
     # A square around the part's joints that lie in the image.
     pixels, depth = camera.project(skeleton)
@@ -113,10 +130,12 @@ def detail_boxes(
         # It is moved into the image where it would leave it.
         middle = (low + high) / 2
         left = min(
-            max(round(float(middle[0]) - side_length / 2), 0), width - side_length
+            max(round(float(middle[0]) - side_length / 2), 0),
+            width - side_length,
         )
         top = min(
-            max(round(float(middle[1]) - side_length / 2), 0), height - side_length
+            max(round(float(middle[1]) - side_length / 2), 0),
+            height - side_length,
         )
         boxes[name] = (
             slice(top, top + side_length),

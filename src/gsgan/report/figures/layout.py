@@ -35,7 +35,9 @@ class Drawing:
 
     figure: Figure
     caption: str  # whole sentences, Markdown
-    numbers: dict[str, Any]  # by image, panel and score; None if a score is not defined
+    numbers: dict[
+        str, Any
+    ]  # by image, panel and score; None if a score is not defined
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,9 @@ def draw_panels(
     rows = len(panels)
     columns = len(panels[0])
     page_width = COLUMN_WIDTH if columns <= 3 else PAGE_WIDTH
-    tall = min(page_width / columns * aspect, TALLEST) + note_lines * FONT * LINE
+    tall = (
+        min(page_width / columns * aspect, TALLEST) + note_lines * FONT * LINE
+    )
     title_height = FONT * LINE if titles else 0
     figure = Figure(figsize=(page_width, rows * tall + title_height))
     # Nearly no space is left between images, which are drawn without ticks and frames.

@@ -19,7 +19,13 @@ from torch.nn import functional
 
 from gsgan.metrics.image import psnr
 from gsgan.report.figures.details import details
-from gsgan.report.figures.layout import STYLE, Drawing, Panel, draw_panels, written
+from gsgan.report.figures.layout import (
+    STYLE,
+    Drawing,
+    Panel,
+    draw_panels,
+    written,
+)
 from gsgan.report.figures.subjects import (
     Numbers,
     Shot,
@@ -92,9 +98,7 @@ def comparison(
         if detail:
             panels.append(below)
     figure, axes = draw_panels(panels, titles=["truth", *images[0]])
-    caption = (
-        "The ground truth and each run's image, with PSNR and the F1 of Canny edges"
-    )
+    caption = "The ground truth and each run's image, with PSNR and the F1 of Canny edges"
     if not detail:
         return Drawing(figure, f"{caption}.", numbers)
 
@@ -104,7 +108,9 @@ def comparison(
         width = columns.stop - columns.start
         height = rows.stop - rows.start
         for entire, below in zip(axes[2 * i], axes[2 * i + 1], strict=True):
-            frame = Rectangle(corner, width, height, fill=False, ec=VERMILLION, lw=0.8)
+            frame = Rectangle(
+                corner, width, height, fill=False, ec=VERMILLION, lw=0.8
+            )
             entire.add_patch(frame)
             below.spines[:].set(visible=True, color=VERMILLION, linewidth=1.6)
     caption += (
@@ -125,7 +131,9 @@ def most_disputed(images: Tensor, share: float) -> tuple[slice, slice]:
     spread = images.var(dim=0, unbiased=False).mean(dim=0)[None, None]
     height = max(1, round(share * spread.shape[-2]))
     width = max(1, round(share * spread.shape[-1]))
-    sums = functional.avg_pool2d(spread.double(), (height, width), stride=1)[0, 0]
+    sums = functional.avg_pool2d(spread.double(), (height, width), stride=1)[
+        0, 0
+    ]
     top, left = divmod(int(sums.argmax()), sums.shape[1])
     return slice(top, top + height), slice(left, left + width)
 
@@ -140,7 +148,9 @@ def _measured(
     for shot in shots:
         held = {subject.name: subject.image(shot) for subject in subjects}
         images.append(held)
-        scores = {name: measure(image, shot.truth) for name, image in held.items()}
+        scores = {
+            name: measure(image, shot.truth) for name, image in held.items()
+        }
         numbers[shot.name] = scores
     return images, numbers
 
@@ -225,7 +235,9 @@ def make_figures(config: DictConfig) -> None:
         f"figures: {out}: {', '.join(made)} ({CAPTIONS} has their captions, {NUMBERS_FILE} their "
         "numbers)"
     )
-    console.print("\n".join(lines), soft_wrap=True, markup=False, highlight=False)
+    console.print(
+        "\n".join(lines), soft_wrap=True, markup=False, highlight=False
+    )
 
 
 def _names(config: DictConfig, *, alone: bool) -> list[str]:
@@ -238,10 +250,14 @@ def _names(config: DictConfig, *, alone: bool) -> list[str]:
                 f"figures={name} compares runs, but there is one; add others as "
                 "compare=[<folder>,…]"
             )
-    return names or [name for name in FIGURES if not (alone and name in COMPARE)]
+    return names or [
+        name for name in FIGURES if not (alone and name in COMPARE)
+    ]
 
 
-def _draw(name: str, subjects: Sequence[Subject], config: DictConfig) -> Drawing:
+def _draw(
+    name: str, subjects: Sequence[Subject], config: DictConfig
+) -> Drawing:
     """One figure with its whole caption."""
     # All runs are of the data of the first one.
     data = subjects[0].data

@@ -85,7 +85,9 @@ def choose_items(
     cameras = list(dict.fromkeys(name for name, _ in items))
     if camera not in (None, *cameras):
         names = ", ".join(cameras)
-        raise ConfigError(f"camera {camera} is not in split {split}, which has {names}")
+        raise ConfigError(
+            f"camera {camera} is not in split {split}, which has {names}"
+        )
     if one_camera:
         camera = camera or cameras[0]
 
@@ -100,8 +102,14 @@ def choose_items(
     if frames is None:
         frames = [known[i] for i in evenly_spaced(len(known), count)]
     if lacking := [frame for frame in frames if frame not in known]:
-        of = f"split {split}" if camera is None else f"camera {camera} in split {split}"
-        raise ConfigError(f"frames: {of} lacks {spans(lacking)}; it has {spans(known)}")
+        of = (
+            f"split {split}"
+            if camera is None
+            else f"camera {camera} in split {split}"
+        )
+        raise ConfigError(
+            f"frames: {of} lacks {spans(lacking)}; it has {spans(known)}"
+        )
 
     # The i-th of n frames is shown by the camera at (i + 1/2) / n of its cameras.
     chosen = []
@@ -160,7 +168,9 @@ class Subject:
         if shot.item not in self._images:
             device = next(self.avatar.parameters()).device
             with torch.no_grad():
-                image = self.avatar(*shot.frame.to(device).inputs, maps=False).image
+                image = self.avatar(
+                    *shot.frame.to(device).inputs, maps=False
+                ).image
             assert image is not None
             if not image.isfinite().all():
                 where = f"{self.run.folder}: its image of {shot.name}"
@@ -185,7 +195,9 @@ def open_subjects(
         )
     subjects = [_open(folder, moved, device) for folder in folders]
     runs = [subject.run for subject in subjects]
-    check_same("figures", runs, [{DATA: run.data["fingerprint"]} for run in runs])
+    check_same(
+        "figures", runs, [{DATA: run.data["fingerprint"]} for run in runs]
+    )
 
     # Equal names get the place of the run.
     models = [subject.name for subject in subjects]
@@ -195,7 +207,9 @@ def open_subjects(
     return subjects
 
 
-def _open(folder: Path, moved: DataPaths, device: torch.device | str) -> Subject:
+def _open(
+    folder: Path, moved: DataPaths, device: torch.device | str
+) -> Subject:
     # The run's seed and data are those of the config that is opened.
     config = load_config(folder, moved)
     data = build_data(config)
@@ -211,7 +225,10 @@ def _open(folder: Path, moved: DataPaths, device: torch.device | str) -> Subject
     step = int(read_checkpoint(folder / CHECKPOINT)["gsgan"]["step"])
     total = run.planned(segmentation=avatar.segmentation is not None)
     if step < total:
-        marks = [*marks, f"{folder} is unfinished: {step} of {total} iterations"]
+        marks = [
+            *marks,
+            f"{folder} is unfinished: {step} of {total} iterations",
+        ]
     return Subject(name, run, data, avatar.to(device), marks)
 
 
