@@ -74,6 +74,7 @@ class StepOneLoss:
                 rendering.colour + behind, target, unsure=frame.unsure, **pixels
             )
             if head is not None:
+                assert head.bias is not None
                 # The bias is weighted by alpha, so that the readout commutes with blending. One
                 # product, because a convolution with few channels is slower on a CPU.
                 seen = torch.cat(
@@ -81,7 +82,7 @@ class StepOneLoss:
                 )
                 weight = torch.cat(
                     [head.weight.flatten(1), head.bias[:, None]], dim=1
-                )  # type: ignore[index]
+                )
                 read = (weight @ seen.flatten(2)).unflatten(2, seen.shape[2:])
                 loss = loss + self.feature_head * photometric(
                     read + behind, target, unsure=frame.unsure, **pixels
