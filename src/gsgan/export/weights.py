@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gsgan.model.avatar import Avatar
@@ -90,8 +90,7 @@ def load_weights(path: str | Path, *, device: str = "auto") -> Avatar:
 
     # A damaged config can fail anywhere in the building of the avatar.
     try:
-        config = OmegaConf.create(json.loads(metadata["config"]))
-        _refuse_other_classes(path, config)
+        config = checked_config(path, json.loads(metadata["config"]))
         checkpoint = {
             "gsgan": json.loads(metadata["gsgan"]),
             "state_dict": state,
@@ -105,17 +104,29 @@ def load_weights(path: str | Path, *, device: str = "auto") -> Avatar:
     return avatar.to(pick_device(device))
 
 
-def _refuse_other_classes(path: Path, config: Any) -> None:
-    """A config names the classes that it builds: only those in conf/ are taken from a file that may
-    come from anybody."""
+def checked_config(path: Path, plain: Any) -> DictConfig:
+    """What an avatar is built from, the model and the seed, of a config that may come from anybody.
+
+    Interpolations are resolved. A config names the classes that it builds: only those in conf/ are
+    taken, also where an interpolation makes the name.
+
+    Args:
+        path: the file, for messages.
+        plain: the config as plain values.
+
+    Raises:
+        DataError: when the config names another class, or has an interpolation inside another.
+    """
     # The classes that the shipped configs name.
     shipped = "\n".join(
         file.read_text() for file in config_folder().rglob("*.yaml")
     )
     known = {"", *re.findall(r"_target_: *([\w.]+)", shipped)}
 
-    # Every node of the config is visited, however deep it lies.
-    pending = [OmegaConf.to_container(config)]
+    # Every value of the config is visited, however deep it lies.
+    config = OmegaConf.create(plain)
+    model = OmegaConf.to_container(config["model"], resolve=True)
+    pending: list[Any] = [model]
     while pending:
         node = pending.pop()
         if isinstance(node, list):
@@ -127,3 +138,10 @@ def _refuse_other_classes(path: Path, config: Any) -> None:
                     "configs; load the run folder that it was exported from"
                 )
             pending += node.values()
+        elif isinstance(node, str) and "${" in node:
+            # It would be resolved when the avatar is built, after this check.
+            raise DataError(
+                f"{path}: its config has {node!r} after interpolation; load the run folder that "
+                "it was exported from"
+            )
+    return OmegaConf.create({"model": model, "seed": int(config["seed"])})
