@@ -116,16 +116,14 @@ def test_a_trained_run_as_safetensors_with_its_scores(run, tmp_path, inside):
     assert "marked: perceptual loss" in card
 
 
-def test_safetensors_name_no_class_but_gsgans_own(run, tmp_path):
-    from gsgan.export.weights import load_weights, weights_bytes
-    from gsgan.run.runs import load
-    from gsgan.run.stored import CHECKPOINT, read_checkpoint, read_config
+def test_safetensors_name_no_class_but_gsgans_own(run, compose, tmp_path):
+    from gsgan.export.weights import load_weights, safetensors_file
+    from gsgan.run.runs import Run
+    from gsgan.run.stored import read_config
 
-    facts = read_checkpoint(run / CHECKPOINT)["gsgan"]
-    content, path = (
-        weights_bytes(run, load(run), facts),
-        tmp_path / "a.safetensors",
-    )
+    config = compose("export", f"run={run}", "+device=cpu")
+    content = safetensors_file(Run.load(config))
+    path = tmp_path / "a.safetensors"
     path.write_bytes(content)
     assert load_weights(path).splats is not None
     target = b"gsgan.model.deformation.Deformation"
