@@ -350,7 +350,7 @@ def test_the_jacobian_is_that_of_the_learnt_weights(body):
         own = placed.gradients(
             placed.points.bone_index, placed.points.bone_weight
         )
-        wrong = stretched(points.frames, bones, *own)
+        wrong = stretched(points.frames, bones, placed.points.means, *own)
     a, b = body.faces[:, 0], body.faces[:, 1]
     edge = (body.vertices[b] - body.vertices[a]).float().unsqueeze(-1)
     moved = points.means[0, b] - points.means[0, a]
