@@ -105,7 +105,8 @@ def test_upload_then_load_by_name(run, folder, hub, inside, tmp_path):
     # What is not there, and what needs the data.
     result = inside("render", "run=somebody/else", "motion=rest", "out=other")
     refused(result, "somebody/else", "no such folder", hub.address)
-    result = inside("render", "run=somebody/me", "out=other")
+    given = ("run=somebody/me", "motion=novel_pose", "out=other")
+    result = inside("render", *given)
     refused(result, "without its dataset", "motion=")
 
 

@@ -38,11 +38,17 @@ def avatar_files(run: Run) -> dict[str, bytes]:
 
 
 @torch.no_grad()
-def preview(run: Run, drive: Drive) -> bytes:
-    """A PNG file of a motion's first pose from the front, on white, marked as synthetic."""
-    size = int(run.stored.data.size or 512)
+def preview(run: Run, drive: Drive, size: int) -> bytes:
+    """A PNG file of a motion's first pose from the front, on white, marked as synthetic.
+
+    Args:
+        run: the avatar's.
+        drive: the motion.
+        size: pixels of the square image.
+    """
+    trained = run.stored.data.size or size
     camera = Orbit().cameras(
-        drive.p[:1], run.proportions, run.scene, size=size, trained=size
+        drive.p[:1], run.proportions, run.scene, size=size, trained=trained
     )
     p, visibility, body = inputs_of(run.avatar, drive, 0)
     image = run.avatar.render(

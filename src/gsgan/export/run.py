@@ -57,6 +57,7 @@ ENDINGS = {
 }
 MOTIONS = ("bvh", "motion_glb")  # formats that hold a motion and no avatar
 CARD = "MODEL_CARD.md"
+PREVIEW_SIZE = 512  # pixels, of runs whose images have sizes of their own
 
 
 def export_config(config: DictConfig) -> None:
@@ -212,7 +213,7 @@ def _hub(
     name = config.upload or out.name
     files = avatar_files(run)
     files[CARD_FILE] = card(run, "hub", name, config.licence).encode()
-    files[PREVIEW] = preview(run, drive)
+    files[PREVIEW] = preview(run, drive, run.stored.data.size or PREVIEW_SIZE)
     for file, content in files.items():
         _write(out / file, content)
     tell(f"written: {out}, {', '.join(files)}")

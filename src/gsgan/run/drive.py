@@ -149,7 +149,9 @@ def with_motion(config: DictConfig, motion: str) -> DictConfig:
 
 def _chosen(config: DictConfig, run: Run, fps: float) -> Drive:
     """The motion of a config: files, a split, the rest pose, or one held-out frame."""
-    # Without a motion: one held-out frame, held still.
+    # Without a motion: one held-out frame, held still. A shared avatar has no frames.
+    if config.motion is None and run.is_shared:
+        return rest_pose(run.proportions)
     if config.motion is None:
         split, _ = run.data.watched
         found = _held_out(config, run, split)

@@ -216,6 +216,11 @@ class Run:
             paths=paths,
         )
 
+    @property
+    def is_shared(self) -> bool:
+        """Whether it is a shared avatar, which has no dataset."""
+        return is_shared(self.folder)
+
     @cached_property
     def data(self) -> GsganData:
         """The run's dataset.
@@ -223,7 +228,7 @@ class Run:
         Raises:
             DataError: when it is missing, as it is for every shared avatar.
         """
-        if is_shared(self.folder):
+        if self.is_shared:
             raise DataError(
                 f"{self.folder}: a shared avatar comes without its dataset; give motion=<file> or "
                 "motion=rest, and camera=orbit or a calibration file"

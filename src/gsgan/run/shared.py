@@ -27,6 +27,10 @@ ENTRIES = {"config", "gsgan"}
 FACTS = ("effects", "scene", "marks", "step")
 # owner/name, and a branch, tag or commit after @
 REPOSITORY = re.compile(r"[\w-][\w.-]*/[\w-][\w.-]*(@[\w./-]+)?")
+# The avatar that comes with gsgan, its name for `find_avatar`, and a motion for it.
+DEMO = "demo"
+DEMO_FOLDER = Path(__file__).with_name("demo")
+DEMO_MOTION = DEMO_FOLDER / "dance.npz"
 NEEDS_HUB = "the Hugging Face Hub needs: pip install 'gsgan[hub]'"
 # Errors of code that is given a damaged config or facts.
 DAMAGED = (
@@ -43,18 +47,22 @@ def find_avatar(name: str | Path) -> Path:
     """The folder of an avatar.
 
     Args:
-        name: a run folder, the folder of a shared avatar, or ``owner/name`` or
-            ``owner/name@revision`` on the Hugging Face Hub, which is downloaded into the cache of
-            huggingface_hub. A folder comes before a name on the Hub.
+        name: a run folder, the folder of a shared avatar, ``demo`` for the avatar that comes with
+            gsgan, or ``owner/name`` or ``owner/name@revision`` on the Hugging Face Hub, which is
+            downloaded into the cache of huggingface_hub. A folder comes before the other names.
 
     Raises:
         DataError: when the Hub has no such avatar, or cannot be reached.
         ConfigError: when the package huggingface_hub is missing.
     """
     folder = Path(name).expanduser()
-    if folder.exists() or not REPOSITORY.fullmatch(str(name)):
-        return folder  # its reader says what is missing
-    return _downloaded(str(name))
+    if folder.exists():
+        return folder
+    if str(name) == DEMO:
+        return DEMO_FOLDER
+    if REPOSITORY.fullmatch(str(name)):
+        return _downloaded(str(name))
+    return folder  # its reader says what is missing
 
 
 def _downloaded(name: str) -> Path:
