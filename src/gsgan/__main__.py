@@ -9,7 +9,7 @@ COMMANDS = {
     "gsgan.evaluate": "score a run, run=<folder>, or any method's images, predictions=<folder>",
     "gsgan.render": "drive an avatar: run=<folder> motion=<file> out=<video.mp4|folder>",
     "gsgan.view": "look at an avatar in the browser, drag its joints: run=<folder>",
-    "gsgan.export": "write .ply, .glb, .onnx, .pt2, .safetensors, .bvh: run=<folder> out=<file>",
+    "gsgan.export": "write .ply, .glb, .usdc, .html, .onnx, .bvh and more: run=<folder> out=<file>",
     "gsgan.report": "tables of scored runs, runs=[<folder>,…], and figures of a run, run=<folder>",
     "gsgan.weights": "find or download the networks of the perceptual loss and of LPIPS",
     "gsgan.bench": "measure milliseconds from skeleton to image: speed",

@@ -22,8 +22,8 @@ def test_a_sequence_of_ply_files_and_its_card(bare, tmp_path, inside):
     result = inside("export", *given)
     assert result.returncode == 0, result.stderr
     files = sorted(path.name for path in out.iterdir())
-    assert files == ["000004.ply", "000005.ply", "MODEL_CARD.md"]
-    first, second = ((out / name).read_bytes() for name in files[:2])
+    assert files == ["MODEL_CARD.md", "frame000004.ply", "frame000005.ply"]
+    first, second = ((out / name).read_bytes() for name in files[1:])
     assert first[:3] == b"ply"
     assert first != second
     card = (out / "MODEL_CARD.md").read_text()
@@ -43,7 +43,7 @@ def test_a_sequence_of_ply_files_and_its_card(bare, tmp_path, inside):
     )
     assert again.returncode == 0, again.stderr
     assert sorted(p.name for p in out.glob("*.ply")) == [
-        "000004.ply",
+        "frame000004.ply",
         "notes.ply",
     ]
     assert "license: cc-by-nc-4.0" in (out / "MODEL_CARD.md").read_text()

@@ -22,6 +22,8 @@ HOLDS = {
     "splatting. They show Step I's colour; the generator's image needs gsgan.",
     "gltf": "The avatar's Gaussians in one pose, as KHR_gaussian_splatting. They show Step I's "
     "colour; the generator's image needs gsgan.",
+    "usd": "The avatar's Gaussians in one pose, or in the poses of a motion, as OpenUSD's "
+    "ParticleField3DGaussianSplat. They show Step I's colour; the generator's image needs gsgan.",
     "onnx": "Pose encoder and generator: images of the splats and the skeleton in, image and alpha "
     "out. Rasterisation is not part of it.",
     "torch": "The whole avatar as a program of `torch.export`: skeleton and camera in, image and "

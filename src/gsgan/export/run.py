@@ -24,7 +24,8 @@ from gsgan.export.motions import (
     motion_glb,
 )
 from gsgan.export.page import block, page, refuse_unsuitable
-from gsgan.export.splats import glb_bytes, ply_bytes, splats_of
+from gsgan.export.splats import Splats, glb_bytes, ply_bytes, splats_of
+from gsgan.export.usd import refuse_missing_usd, usd_bytes
 from gsgan.export.weights import safetensors_file
 from gsgan.run.drive import (
     REST,
@@ -46,6 +47,7 @@ from gsgan.utils.provenance import verify
 ENDINGS = {
     "ply": ".ply",
     "gltf": ".glb",
+    "usd": ".usdc",
     "onnx": ".onnx",
     "torch": ".pt2",
     "safetensors": ".safetensors",
@@ -91,6 +93,8 @@ def export_config(config: DictConfig) -> None:
     out = _place(config, kind)
     sequence = kind == "ply" and not out.suffix
     _check_upload(config, kind)
+    if kind == "usd":
+        refuse_missing_usd()
     with open_dict(config):
         config.device = "cpu"
     if kind in MOTIONS:
@@ -105,7 +109,7 @@ def export_config(config: DictConfig) -> None:
         _hub(config, run, out, tell)
         return
 
-    if kind in ("ply", "gltf"):
+    if kind in ("ply", "gltf", "usd"):
         _write_poses(config, run, out, console)
 
     # A page, or its content for a page of the user's own.
@@ -130,25 +134,33 @@ def _write(path: Path, content: str | bytes) -> None:
 def _write_poses(
     config: DictConfig, run: Run, out: Path, console: Console
 ) -> None:
-    """Writes Gaussians in one pose per file: one file, or a sequence of .ply files in a folder."""
-    # A glTF file without a motion shows the rest pose.
+    """Writes Gaussians in one pose per file: one file, or a sequence of .ply files in a folder. A
+    .usdc file has all poses of a motion."""
+    # Without a motion a scene's file shows the rest pose.
     kind = config.format
-    rest = config.motion is None and kind == "gltf"
+    rest = config.motion is None and kind in ("gltf", "usd")
     drive = _poses(with_motion(config, REST) if rest else config, run)
     console.print(drive.text, markup=False, highlight=False, soft_wrap=True)
+    frames = track(range(len(drive.p)), "writing", console)
+    if kind == "usd":
+        poses = (_posed(run, drive, i) for i in frames)
+        fps = float(config.fps)
+        _write(out, usd_bytes(poses, fps, run.proportions.up))
+        return
     if out.suffix:
         _write(out, _splats(run, drive, 0, kind))
         return
 
-    # Files are named by the numbers of their frames.
-    names = [f"{number:06d}.ply" for number in drive.numbers]
-    for i in track(range(len(names)), "writing", console):
+    # Files are named by the numbers of their frames, after a prefix: SuperSplat plays such files as
+    # a sequence.
+    names = [f"frame{number:06d}.ply" for number in drive.numbers]
+    for i in frames:
         _write(out / names[i], _splats(run, drive, i, kind))
 
     # A shorter sequence replaces a longer one: files of later frames are removed.
     if (out / CARD).is_file():
         with writing(out):
-            for path in out.glob("[0-9]" * 6 + ".ply"):
+            for path in out.glob("frame" + "[0-9]" * 6 + ".ply"):
                 if path.name not in names:
                     path.unlink()
 
@@ -288,10 +300,15 @@ def _motion(config: DictConfig, console: Console) -> BodyMotion:
 
 
 @torch.no_grad()
+def _posed(run: Run, drive: Drive, i: int) -> Splats:
+    """The Gaussians of frame i."""
+    p, visibility, body = inputs_of(run.avatar, drive, i)
+    return splats_of(run.avatar, p, visibility > 0, body)
+
+
 def _splats(run: Run, drive: Drive, i: int, kind: str) -> bytes:
     """The content of a .ply or .glb file of frame i."""
-    p, visibility, body = inputs_of(run.avatar, drive, i)
-    splats = splats_of(run.avatar, p, visibility > 0, body)
+    splats = _posed(run, drive, i)
     if kind == "gltf":
         return glb_bytes(splats, run.proportions.up)
     return ply_bytes(splats, run.avatar.accuracy.antialias)

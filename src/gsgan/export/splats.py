@@ -186,7 +186,7 @@ def glb_bytes(splats: Splats, up: str) -> bytes:
     Scales and opacities are linear, quaternions x y z w. A node turns the world, whose up axis is
     ``up``, to glTF's: Y up, a person in the standard pose faces +Z.
 
-    Source: KHR_gaussian_splatting as ratified in 2026, kernel ``ellipse``.
+    Source: KHR_gaussian_splatting, the release candidate of 2026, kernel ``ellipse``.
     """
     # One attribute per property, and one per spherical harmonic.
     degree = math.isqrt(splats.sh.shape[1]) - 1
