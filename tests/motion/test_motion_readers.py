@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from torch.utils._pytree import tree_map
 
 from gsgan.body.shape import free_space, shaped_body
 from gsgan.body.smpl import read_smpl
@@ -618,6 +619,24 @@ def published(
         "parts_only": {k: v for k, v in smplx.items() if k != "poses"},
         "humman": {"betas": np.zeros((F, 10)), "body_pose": smpl}
         | {"global_orient": root, "transl": moves},
+        "wham": {
+            "pose": np.full((F, 72), 0.7),  # in the camera's axes
+            "trans": np.full((F, 3), 5.0),
+            "pose_world": np.concatenate([root, smpl], axis=1),
+            "trans_world": moves,
+            "betas": np.zeros((F, 10)),
+            "frame_ids": np.arange(F),
+        },
+        "gvhmr": {
+            "smpl_params_incam": {"body_pose": np.full((F, 63), 0.7)},
+            "smpl_params_global": {
+                "body_pose": body,
+                "global_orient": root,
+                "transl": moves,
+                "betas": np.zeros((F, 10)),
+            },
+            "K_fullimg": np.tile(np.eye(3), (F, 1, 1)),
+        },
         "aist": {
             "smpl_poses": np.concatenate([root, smpl], axis=1),
             "smpl_trans": 95 * moves,
@@ -634,6 +653,8 @@ def published(
         "stage_two",
         "parts_only",
         "humman",
+        "wham",
+        "gvhmr",
         "aist",
         "zju",
     ],
@@ -660,9 +681,15 @@ def test_published_keys_of_the_smpl_family(tmp_path, shared, proportions, name):
         )
         files[name] = {"poses": poses, "Rh": root, "Th": moves + J0 - (R @ J0)}
         files[name] |= {"shapes": np.zeros((4, 10))}
-    path = tmp_path / {"aist": "a.pkl", "zju": "a.npy"}.get(name, "a.npz")
+    suffixes = {"aist": "a.pkl", "zju": "a.npy", "gvhmr": "a.pt"}
+    path = tmp_path / suffixes.get(name, "a.npz")
     if path.suffix == ".pkl":
         path.write_bytes(pickle.dumps(files[name]))
+    elif path.suffix == ".pt":
+        tensors = tree_map(
+            lambda x: torch.from_numpy(np.asarray(x)), files[name]
+        )
+        torch.save(tensors, path)
     elif path.suffix == ".npy":
         np.save(path, np.array(files[name]), allow_pickle=True)
     else:
@@ -678,6 +705,28 @@ def test_published_keys_of_the_smpl_family(tmp_path, shared, proportions, name):
     np.testing.assert_allclose(
         motion.p[:, list(SMPL_AT)], joints[:, list(SMPL_AT.values())], atol=1e-6
     )
+
+
+def test_files_of_joblib_are_refused_with_a_way_to_convert_them(
+    tmp_path, proportions
+):
+    """WHAM's own files are pickles of joblib's classes."""
+    joblib = pytest.importorskip("joblib")
+    person = {"pose_world": np.zeros((2, 72)), "trans_world": np.zeros((2, 3))}
+    joblib.dump({0: person}, tmp_path / "wham_output.pkl")
+    with pytest.raises(DataError, match=r"joblib.*numpy\.savez"):
+        read_motion(tmp_path / "wham_output.pkl", Source(proportions))
+
+
+@pytest.mark.parametrize("content", [{"a": 1}, [1], Path("x"), b"text"])
+def test_other_pt_files_are_one_sentence(tmp_path, proportions, content):
+    path = tmp_path / "a.pt"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        torch.save(content, path)
+    with pytest.raises(DataError, match="smpl_params_global"):
+        read_motion(path, Source(proportions))
 
 
 @pytest.mark.parametrize(

@@ -42,15 +42,24 @@ WORLD_KEYS = (
     "POSE_WORLD_LANDMARKS",
     "keypoints3D",  # TensorFlow.js, metres from the hips
 )
-# Keys of SMPL's parameters: AMASS, HuMMan, smplx, AIST++, ZJU-MoCap.
-POSE_KEYS = ("poses", "pose", "smpl_poses", "body_pose", "pose_body")
+# Keys of SMPL's parameters: WHAM, AMASS, HuMMan, smplx, AIST++, ZJU-MoCap. WHAM's have poses in
+# the camera's axes too, so those of the world come first.
+POSE_KEYS = (
+    "pose_world",
+    "poses",
+    "pose",
+    "smpl_poses",
+    "body_pose",
+    "pose_body",
+)
 PART_KEYS = (
     "pose_jaw",
     "pose_eye",
     "pose_hand",
 )  # parts of SMPL-X, after the body
 ROOT_KEYS = ("Rh", "root_orient", "global_orient")
-MOVE_KEYS = ("trans", "transl", "smpl_trans", "Th")
+MOVE_KEYS = ("trans_world", "trans", "transl", "smpl_trans", "Th")
+GVHMR_KEY = "smpl_params_global"  # GVHMR's parameters in the world's axes
 # Of the shape coefficients.
 SHAPE_KEYS = ("betas", "shapes")
 # Numbers of poses of SMPL-X's body, SMPL, SMPL-H, SMPL-X.
@@ -154,6 +163,30 @@ def read_dictionary(path: Path, source: Source) -> Clip:
     for key, values in arrays.items():
         if not values.size:
             raise DataError(f"{path}: {key!r} must be an array of numbers")
+    return _by_names(path, arrays, source)
+
+
+def read_gvhmr(path: Path, source: Source) -> Clip:
+    """SMPL-X parameters in the world's axes, in the .pt file that GVHMR writes."""
+    # Tensors and plain values only: a file from somebody else cannot run code.
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:
+        reason = str(error).partition("\n")[0]
+        raise DataError(
+            f"{path} is not a readable .pt file of tensors ({reason}); save its "
+            f"{GVHMR_KEY!r} as arrays with numpy.savez"
+        ) from None
+    parameters = content.get(GVHMR_KEY) if isinstance(content, dict) else None
+    if not isinstance(parameters, dict):
+        raise DataError(
+            f"{path} has no {GVHMR_KEY!r}; expected the hmr4d_results.pt of GVHMR"
+        )
+    arrays = {
+        key: value.numpy()
+        for key, value in parameters.items()
+        if key in ARRAYS and isinstance(value, torch.Tensor)
+    }
     return _by_names(path, arrays, source)
 
 
@@ -595,6 +628,7 @@ READERS: dict[str, Callable[[Path, Source], Clip]] = {
     ".npz": read_npz,
     ".pkl": read_dictionary,
     ".npy": read_dictionary,
+    ".pt": read_gvhmr,
     ".json": read_mediapipe_json,
     **dict.fromkeys(RIGS, _read_rig),
     ".trc": read_trc,
