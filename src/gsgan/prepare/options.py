@@ -56,6 +56,7 @@ class Options:
     crop_px: int = 16
     height: float | None = None
     focal: float | None = None
+    person: tuple[float, float, float, float] | None = None
     landmark_noise: float = 0.008
     offsets: Mapping[str, int] | None = None
     frames: Any = None
@@ -106,6 +107,25 @@ class Options:
                 f"mask_levels must rise within 0..1, got {self.mask_levels}"
             )
         self._check_mappings()
+        if self.person is not None:
+            self._check_person(self.person)
+
+    def _check_person(self, box: Sequence[float]) -> None:
+        within = len(box) == 4 and all(0 <= share <= 1 for share in box)
+        if not (within and box[0] < box[2] and box[1] < box[3]):
+            raise ConfigError(
+                "person must be [left, top, right, bottom], shares of the image's width and "
+                f"height from 0 to 1, got {list(box)}"
+            )
+        if not self.one_camera:
+            raise ConfigError(
+                "person chooses one of several people in one video of one camera; with several "
+                "cameras, give landmarks and masks of the person"
+            )
+        if not self.needs_tool:
+            raise ConfigError(
+                "person chooses whom MediaPipe finds, but landmarks and masks are given"
+            )
 
     def _check_mappings(self) -> None:
         for name in ("cameras", "offsets"):
