@@ -16,7 +16,7 @@ from gsgan.body.shape import BodyShape, shaped_body
 from gsgan.data.calibration import Calibration
 from gsgan.data.cameras import CameraEntry
 from gsgan.prepare import landmarks
-from gsgan.prepare.camera_array import CameraArray
+from gsgan.prepare.camera_array import FILM, USUAL_FOCAL, CameraArray
 from gsgan.prepare.cleanse import cleanse, smooth
 from gsgan.prepare.frames import (
     SAMPLING,
@@ -57,10 +57,6 @@ from gsgan.utils.arrays import Bool, Float, Ints, expect_array, nanmedian
 from gsgan.utils.errors import DataError
 from gsgan.utils.pickles import read_arrays
 
-# The diagonal of film in millimetres, to which equivalent focal lengths refer.
-FILM = np.hypot(36.0, 24.0)
-# Millimetres: phones' main cameras have 24 to 28 and record a part of their image.
-USUAL_FOCAL = 30.0
 # Apple's phones state the focal length here, in millimetres; not the recorded part of the image.
 FOCAL_KEY = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
 # Transfer functions of HDR video, by their numbers in ITU-T H.273.
