@@ -460,9 +460,8 @@ def distort(points: Tensor, dist: Tensor) -> tuple[Tensor, Tensor]:
     k1, k2, p1, p2, k3 = (c.unsqueeze(-1) for c in dist.unbind(-1))
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2 * (
-        k1 + r2 * (2 * k2 + 3 * r2 * k3)
-    )  # of radial, by x it is slope * x
+    # of radial, by x it is slope * x
+    slope = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))
     shown = [
         x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
         y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,

@@ -32,9 +32,8 @@ class Body(MarkedBody):
     surface_names: tuple[str, ...]  # skin, hair, eye and the garments
     landmark_names: tuple[str, ...]  # of the 33
     hand_landmarks: Tensor  # [42, 3] metres
-    hand_bone: (
-        Tensor  # [42] int64, the joint that each hand landmark moves with
-    )
+    # [42] int64, the joint that each hand landmark moves with
+    hand_bone: Tensor
     hand_names: tuple[str, ...]  # of the 42
 
     def posed_hands(self, pose: BodyPose) -> Tensor:

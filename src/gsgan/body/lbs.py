@@ -154,9 +154,8 @@ class KinematicPlan(NamedTuple):
 
     level_sizes: list[int]
     order: tuple[int, ...]  # joints, level by level
-    parents: tuple[
-        int, ...
-    ]  # of each joint in `order`; a root is its own parent
+    # of each joint in `order`; a root is its own parent
+    parents: tuple[int, ...]
     # by level, from the second: places of the parents in the level above
     parent_places: tuple[tuple[int, ...], ...]
     inverse: tuple[int, ...]  # place of each joint in `order`

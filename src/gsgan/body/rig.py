@@ -101,9 +101,8 @@ class Turn(NamedTuple):
     """A rotation at a joint, and the numbers that it depends on."""
 
     joint: int
-    axes: dict[
-        str, Tensor
-    ]  # axis times share, by number; turns may share numbers
+    # axis times share, by number; turns may share numbers
+    axes: dict[str, Tensor]
 
 
 @dataclass(frozen=True)
@@ -112,9 +111,8 @@ class Limb:
 
     hub: int  # the bone frame that it hangs on, `PELVIS` or `CHEST`
     points: tuple[int, int, int]  # landmarks of its first, middle and end joint
-    numbers: tuple[
-        int, int, int, int
-    ]  # the swing's two axes, the twist, and the hinge
+    # the swing's two axes, the twist, and the hinge
+    numbers: tuple[int, int, int, int]
     # [3, 3] of the swing, the first as near to the hinge as can be; and of the twist, along the
     # upper bone
     axes: Tensor

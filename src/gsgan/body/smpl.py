@@ -44,9 +44,8 @@ KEYS = (
     "f",
 )
 SMPLX_JOINT_COUNT = 55
-WEIGHT_TOLERANCE = (
-    1e-3  # of the sum of a vertex's weights, and of negative weights
-)
+# of the sum of a vertex's weights, and of negative weights
+WEIGHT_TOLERANCE = 1e-3
 
 Floats = NDArray[np.float64]
 
@@ -178,9 +177,8 @@ class SkinnedModel:
     v_template: Tensor  # [V, 3] metres, the mean shape
     shapedirs: Tensor  # [V, 3, S]
     expression_dirs: Tensor  # [V, 3, E]; E is 0 but for SMPL-X
-    posedirs: (
-        Tensor  # [V, 3, 9 (J - 1)], per row-major entry of each joint's R - 1
-    )
+    # [V, 3, 9 (J - 1)], per row-major entry of each joint's R - 1
+    posedirs: Tensor
     J_regressor: Tensor  # [J, V]
     weights: Tensor  # [V, J], rows sum to 1
     parents: tuple[int, ...]  # of each joint, -1 for the root

@@ -49,30 +49,23 @@ LANDMARK_NOISE = 0.004
 FACE_NOISE = 0.008
 KNUCKLE_NOISE = 0.007
 HIP_NOISE = 0.05  # of estimated hips: nothing else keeps the trunk from tilting
-KNUCKLES = slice(
-    17, 23
-)  # of 33 landmarks: pinky, index and thumb of both hands
-ON_HANDS = (
-    (17, 19, 21),
-    (18, 20, 22),
-)  # the 33 landmarks that hand landmarks replace
-ROBUST = (
-    5.0  # standard deviations at which the loss of a landmark becomes linear
-)
+# of 33 landmarks: pinky, index and thumb of both hands
+KNUCKLES = slice(17, 23)
+# the 33 landmarks that hand landmarks replace
+ON_HANDS = ((17, 19, 21), (18, 20, 22))
+# standard deviations at which the loss of a landmark becomes linear
+ROBUST = 5.0
 MAX_STEPS = 10  # Levenberg-Marquardt steps at most
 MIN_IMPROVEMENT = 1e-3  # relative change of the cost at which a frame stops
-GRADIENT_STEPS = (
-    8  # error of gradients: a few percent if a landmark hardly matters
-)
+# error of gradients: a few percent if a landmark hardly matters
+GRADIENT_STEPS = 8
 FIRST_DAMPING = 1e-3  # at the first step
-DAMPING_DECREASE = (
-    0.2  # factor of the damping after a step that lowers the cost
-)
+# factor of the damping after a step that lowers the cost
+DAMPING_DECREASE = 0.2
 DAMPING_INCREASE = 20.0  # and after one that does not
 FLOOR = 1e-3  # on the diagonal: the root has no prior
-CHUNK_FRAMES = (
-    64  # frames at a time: their matrices fit into a processor's cache
-)
+# frames at a time: their matrices fit into a processor's cache
+CHUNK_FRAMES = 64
 # Between these bends, radians, the weight of the twist rises from 0 to 1.
 STRAIGHT_BEND = 0.1
 SHARP_BEND = 0.4
@@ -121,9 +114,8 @@ class Solver(nn.Module):
     prior: Tensor  # [D, D] precisions
     minimum: Tensor  # [D] minimum of each number
     matrix: Tensor  # [D, 3 T] from numbers to the turns' axis-angles
-    follows: (
-        Tensor  # [E, N, 1] bool, whether a landmark follows an entry's turn
-    )
+    # [E, N, 1] bool, whether a landmark follows an entry's turn
+    follows: Tensor
     jumps: Tensor  # [n, T + 1]
     before: Tensor  # [T] the turn before each, T for the root's
     rest_hubs: Tensor  # [3, 3, 3] frames of pelvis, chest and head

@@ -44,9 +44,8 @@ class CameraScore:
     name: str  # of the camera
     inside: float  # mean share of joints inside the mask
     overlap: float  # mean overlap of mask and estimated silhouette
-    fullness: (
-        float  # median area of the mask over that of the estimated silhouette
-    )
+    # median area of the mask over that of the estimated silhouette
+    fullness: float
     # Mean overlap with other calibrations, best first, by the name of their camera or
     # `MIRRORED_IMAGES`.
     rivals: dict[str, float]

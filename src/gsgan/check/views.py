@@ -138,9 +138,8 @@ class MaskView:
 
     camera: str
     frame: int
-    outside: (
-        Float  # [J] metres by which joints lie outside the mask, NaN = unknown
-    )
+    # [J] metres by which joints lie outside the mask, NaN = unknown
+    outside: Float
     tolerance: float  # metres by which joints may lie outside
     fullness: float  # area of the mask over that of the estimated silhouette
     mask: Bool  # [h, w] small mask
@@ -284,9 +283,8 @@ def _view(subject: CheckedData, item: Item, sampling: Sampling) -> MaskView:
     pixels, depth = project(camera, p)
     metre_per_pixel = float(np.median(depth[visible])) / focal
     seen = visible & inside(entry, p)
-    outside = joint_distance(
-        mask_distance(mask), pixels, depth, seen, focal
-    )  # [J]
+    # [J]
+    outside = joint_distance(mask_distance(mask), pixels, depth, seen, focal)
 
     # A small mask, and the map from the whole image to it: by the camera's K, then the scale.
     height, width = mask.shape

@@ -264,9 +264,8 @@ def fold_radius(
     radii = np.linspace(0, np.hypot(x, y).max(), samples)  # [samples]
 
     # The lens model folds back where the distorted radius no longer grows.
-    radial = np.where(
-        np.isin(np.arange(8), (2, 3)), 0, dist
-    )  # without p1 and p2
+    # without p1 and p2
+    radial = np.where(np.isin(np.arange(8), (2, 3)), 0, dist)
     along_x = np.stack([radii, np.zeros(samples)], axis=-1)
     shown = distort(along_x, radial)[:, 0]  # [samples]
     folded = np.flatnonzero(np.diff(shown) <= 0)

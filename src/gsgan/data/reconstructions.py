@@ -47,9 +47,8 @@ ONE_FOCAL = (
     "SIMPLE_RADIAL",
     "RADIAL",
 )  # with one focal length
-POINT_BYTES = (
-    24  # of a 2D point in images.bin: x, y, and the number of the 3D point
-)
+# of a 2D point in images.bin: x, y, and the number of the 3D point
+POINT_BYTES = 24
 # Errors of reading a damaged file.
 DAMAGE = (ArithmeticError, LookupError, OSError, struct.error, ValueError)
 # OpenGL's camera axes, x right, y up, z backward, in OpenCV's.

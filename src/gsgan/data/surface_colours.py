@@ -148,9 +148,8 @@ def _hull(frames: Sequence[Frame]) -> Float:
     low = joints.min(0) - AIR
     high = joints.max(0) + AIR
     axes = [np.arange(a, b, VOXEL) for a, b in zip(low, high, strict=True)]
-    voxels = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(
-        -1, 3
-    )  # [V, 3]
+    # [V, 3]
+    voxels = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
 
     # Each mask carves; voxels outside its image stay.
     for frame in frames:

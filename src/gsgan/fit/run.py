@@ -140,9 +140,8 @@ def summary(
 SIZE = 128  # pixels of the images that the fit before training uses
 IMAGE_MARGIN = 0.2  # metres around the person in these images
 LOCK = ".body_fit.lock"
-FRAMES_AT_ONCE = (
-    500  # frames whose poses are solved at once, which bounds memory
-)
+# frames whose poses are solved at once, which bounds memory
+FRAMES_AT_ONCE = 500
 
 
 def run_fit(config: DictConfig) -> Path:

@@ -49,10 +49,8 @@ UNSURE = 0.1
 # Effective number of independent frames: systematic errors are the same in all of them.
 INDEPENDENT = 4.0
 FOREARMS = [[13, 15], [14, 16]]  # elbow and wrist
-SIZES = (
-    0.75,
-    1.35,
-)  # minimum and maximum size of a hand, as a share of the body's
+# minimum and maximum size of a hand, as a share of the body's
+SIZES = (0.75, 1.35)
 MAX_HAND_MOVE = 0.05  # maximum move of a hand, metres
 NUMBERS = 99  # of the offsets: x, y, z of 33 landmarks
 LENGTH_STEPS = 10

@@ -178,9 +178,8 @@ def crop_person(
     top = (centre // width - rows // 2).clamp(0, height - rows)
     left = (centre % width - columns // 2).clamp(0, width - columns)
     y = top[..., None] + torch.arange(rows, device=mask.device)  # [B, N, rows]
-    x = left[..., None] + torch.arange(
-        columns, device=mask.device
-    )  # [B, N, columns]
+    # [B, N, columns]
+    x = left[..., None] + torch.arange(columns, device=mask.device)
 
     # One gather per image: [B, N, rows, columns, C].
     batch = torch.arange(len(mask), device=mask.device)[:, None, None, None]

@@ -35,9 +35,8 @@ SKIN = 2.1  # square metres, the surface of a body of the stature
 STATURE = 1.75  # metres
 MIN_POINTS = 5000
 MAX_POINTS = 100_000
-MIN_WEIGHT = (
-    1e-3  # a possible weight below it starts there, so that it can grow
-)
+# a possible weight below it starts there, so that it can grow
+MIN_WEIGHT = 1e-3
 
 
 class LearntWeights(nn.Module):

@@ -10,9 +10,8 @@ from torch.nn import functional
 from gsgan.utils.checks import one_of
 from gsgan.utils.tensors import derived, full_precision
 
-NORM_FLOOR = (
-    1e-6  # inside the root: an all-zero pixel (empty background) stays zero
-)
+# inside the root: an all-zero pixel (empty background) stays zero
+NORM_FLOOR = 1e-6
 SLOPE = 0.2
 MIDDLE_BLOCKS = 2  # convolutions at the coarsest level
 

@@ -20,9 +20,8 @@ from gsgan.utils.files import read_text
 
 INCH = 0.0254
 ROOT = "root"
-CMU_FPS = (
-    120.0  # frames per second of CMU's clips; the format does not store it
-)
+# frames per second of CMU's clips; the format does not store it
+CMU_FPS = 120.0
 
 
 def asf_of(amc: Path) -> Path:

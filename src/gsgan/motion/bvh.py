@@ -11,9 +11,8 @@ from gsgan.motion.standard import RigMotion
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import read_text
 
-SLOWEST = (
-    1.0  # seconds between two frames from which the number is read as a rate
-)
+# seconds between two frames from which the number is read as a rate
+SLOWEST = 1.0
 # Share of the longest bone: joints that leave their places by less are at rest.
 REST_TOLERANCE = 1e-3
 

@@ -34,17 +34,15 @@ MAX_NEUTRAL_TILT = np.radians(10)
 MAX_UPRIGHT_TILT = np.radians(30)
 # Share of frames in which a person stands, in motions on the floor.
 MIN_STANDING_SHARE = 0.1
-SAME_TILT = np.radians(
-    1
-)  # frames within this tilt of the best one are used too
+# frames within this tilt of the best one are used too
+SAME_TILT = np.radians(1)
 MAX_REFERENCES = 100  # number of frames for calibration
 # Share of knees and toes behind the body above which left and right are exchanged.
 BACKWARDS = 0.8
 # Minimum sine of the slope from ankle to toes of a flat foot: steeper ones are in the air.
 STEEPEST = -0.7
-MIN_BEND = (
-    0.15  # minimum mean sine of the bend at which a limb's plane is known
-)
+# minimum mean sine of the bend at which a limb's plane is known
+MIN_BEND = 0.15
 # Leg lengths: feet up to this height above the lowest of a second stand on the floor.
 HOVER = 0.06
 # Metres from the origin that a motion may reach before its drift is subtracted.
@@ -151,9 +149,8 @@ def _stem(stem: str, sided: bool) -> tuple[str, int]:
 class RigMotion:
     """The motion of a rig in a file: joints and their world rotations since the zero pose."""
 
-    names: tuple[
-        str, ...
-    ]  # of the J joints, parents first; end sites are called "<joint> end"
+    # of the J joints, parents first; end sites are called "<joint> end"
+    names: tuple[str, ...]
     parents: tuple[int, ...]  # [J], -1 for roots
     offsets: Array  # [J, 3] from the parent in the zero pose, units and axes of the file
     rotations: Array  # [F, J, 3, 3] world, axes of the file
@@ -200,9 +197,8 @@ class StandardMotion:
 class Reference:
     """Poses in which bones have known turns: they calibrate the joints' own axes."""
 
-    rotations: (
-        Array  # [N, J, 3, 3] world rotations of the joints, axes of the file
-    )
+    # [N, J, 3, 3] world rotations of the joints, axes of the file
+    rotations: Array
     axes: Array  # [N, 3, 3] rows left, back, up of the person, axes of the file
     joints: Array  # [N, J, 3] positions, axes of the file
     zero: bool  # whether it is the zero pose
@@ -490,9 +486,8 @@ def _turns(
 
     # A joint's turn is R @ C: its world rotation R in the person's axes, times the constant C
     # that gives the known turns in the reference poses.
-    to_rest = (
-        reference.rotations.mT @ reference.axes.mT[:, None]
-    )  # [N, J, 3, 3]
+    # [N, J, 3, 3]
+    to_rest = reference.rotations.mT @ reference.axes.mT[:, None]
     R = axes @ rig.rotations
     turns = {}
     for bone, j in known.items():

@@ -20,9 +20,8 @@ MIN_VIEWS = 2
 UNIT_FOCAL = 1000.0  # pixels; errors are then thousandths of the focal length
 MAX_EVALUATIONS = 30  # of the optimiser
 LOSS_SCALE = 5.0  # error at which a detection counts half, thousandths of the focal length
-COST_TOLERANCE = (
-    1e-7  # relative change of the cost at which the refinement ends
-)
+# relative change of the cost at which the refinement ends
+COST_TOLERANCE = 1e-7
 # Square pixels: keeps the residual's scaling finite at an error of 0.
 MIN_SQUARE = 1e-12
 

@@ -30,9 +30,8 @@ CONFIDENT = 0.5
 BLURRED = 0.3  # share of the usual sharpness
 JUMP = 0.5  # of the person's size from image to image: the detector found somebody else
 SHARP_SIZE = 256  # pixels: sharpness is measured on the person at this height
-MAX_CORNERS = (
-    200  # maximum corners of the background, which show a moving camera
-)
+# maximum corners of the background, which show a moving camera
+MAX_CORNERS = 200
 MIN_CORNERS = 20  # minimum number of them
 
 LeftOut = dict[str, Bool]

@@ -18,9 +18,8 @@ from gsgan.utils.errors import DataError
 from gsgan.utils.files import writing
 from gsgan.utils.frame_files import frame_files, last_number
 
-MIN_BLOB = (
-    0.02  # share of the largest piece of a mask: smaller ones are removed
-)
+# share of the largest piece of a mask: smaller ones are removed
+MIN_BLOB = 0.02
 JPEG_QUALITY = 95  # of jpg, 1 to 100
 PNG_COMPRESSION = 3  # 0..9; higher is smaller and slower
 

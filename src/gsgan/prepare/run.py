@@ -174,9 +174,8 @@ def _number(value: float, form: str) -> str:
     return "-" if np.isnan(value) else format(value, form)
 
 
-STAGE_VERSION = (
-    5  # incremented when the same settings begin to give another result
-)
+# incremented when the same settings begin to give another result
+STAGE_VERSION = 5
 
 
 def prepare(options: Options, console: Console) -> Path:

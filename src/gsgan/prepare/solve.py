@@ -126,9 +126,8 @@ class Solution:
     left_out: Bool  # [C, F, 2] detected hands that are not the person's, or are repeats
     delay: Float  # [C] of each camera's clock, see `clock_errors`
     gain: Float  # [C] of correcting that clock
-    stages: dict[
-        str, Float
-    ]  # name of each stage and its body errors [C, F, 33]
+    # name of each stage and its body errors [C, F, 33]
+    stages: dict[str, Float]
     removed: dict[str, int]  # number of joints removed, by reason
 
     @property

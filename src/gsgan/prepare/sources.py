@@ -28,9 +28,8 @@ VIDEO_SUFFIXES = (
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 INSIDE = ("videos", "images")  # where EasyMocap and Pose2Sim projects keep them
 
-DIFFERENT = (
-    0.01  # share by which frame rates or lengths must differ to be noted
-)
+# share by which frame rates or lengths must differ to be noted
+DIFFERENT = 0.01
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,8 @@ from gsgan.utils.console import progress
 from gsgan.utils.files import writing
 
 Result = TypeVar("Result")
-Advance = Callable[
-    [int, int], None
-]  # takes the number of steps done and in total
+# takes the number of steps done and in total
+Advance = Callable[[int, int], None]
 KEY_LENGTH = 12
 
 

@@ -12,12 +12,10 @@ from gsgan.skeleton.joints import known
 from gsgan.utils.arrays import Bool, Float, Ints, nanmedian
 
 # Errors are in thousandths of the focal length: pixels, at a focal length of 1000 pixels.
-HALF_WEIGHT_ERROR = (
-    3.5  # error at which a detection counts half (Cauchy's weight)
-)
-MAX_MEDIAN_ERROR = (
-    35.0  # median error beyond which detections contradict each other
-)
+# error at which a detection counts half (Cauchy's weight)
+HALF_WEIGHT_ERROR = 3.5
+# median error beyond which detections contradict each other
+MAX_MEDIAN_ERROR = 35.0
 # maximum ratio of a point's uncertainty along the rays to that across: above, they are too parallel
 MAX_ELONGATION = 20.0
 # mean loss per detection that a swap must save; an error of HALF_WEIGHT_ERROR costs 0.7
@@ -26,15 +24,13 @@ FAR_ERROR = 1e6  # pixels: stands for an infinite error
 MIN_DETERMINANT = 1e-15  # determinant over trace³: below it the equations are singular in float64
 ITERATIONS = 10  # of reweighting
 QUICK_ITERATIONS = 3  # of reweighting, in the search for swapped sides
-POINTS_AT_ONCE = (
-    100_000  # points processed at once: bounds the memory, changes nothing else
-)
+# points processed at once: bounds the memory, changes nothing else
+POINTS_AT_ONCE = 100_000
 MAX_PAIRS = 60  # pairs of cameras tried as a start; of more, a spread-out part
 # minimum number of a group: hips at the border of an image do not tell left from right
 MIN_GROUP = 3
-PROGRESSION = (
-    7919  # a prime: spreads the chosen camera pairs when there are too many
-)
+# a prime: spreads the chosen camera pairs when there are too many
+PROGRESSION = 7919
 
 Pairs = tuple[tuple[int, int], ...]
 
@@ -45,9 +41,8 @@ class Triangulated:
 
     p: Float  # [N, 3] metres, NaN = missing
     weight: Float  # [C, N] final weight of each detection, 0 = not used
-    error: (
-        Float  # [C, N] reprojection error in undistorted pixels, NaN = not seen
-    )
+    # [C, N] reprojection error in undistorted pixels, NaN = not seen
+    error: Float
 
 
 def plain(cameras: CameraArray, uv: Float, weight: Float) -> Float:

@@ -44,9 +44,8 @@ class ScoredRun:
     # ``name`` of the data group's choice, ``root`` (the folder's name) and ``fingerprint``.
     data: dict[str, Any]
     seed: int | None  # None for predictions
-    scores: dict[
-        str, dict[str, dict[str, Any]]
-    ]  # {split: {variant: {metric: value}}}
+    # {split: {variant: {metric: value}}}
+    scores: dict[str, dict[str, dict[str, Any]]]
     # The training config by dotted key, without seed and paths; None for predictions.
     settings: dict[str, Any] | None = None
     # The changes of ``experiment=paper`` on the command line, where its models are those of the

@@ -54,9 +54,8 @@ class Points:
 
     means: Tensor  # [B, N, 3] metres, world frame
     rotations: Tensor  # [B, P, 3, 3] frames of the parts in the world
-    origins: (
-        Tensor  # [B, P, 3] metres, world frame: origin of each part's frame
-    )
+    # [B, P, 3] metres, world frame: origin of each part's frame
+    origins: Tensor
     scales: Tensor  # [B, N] metres, initial standard deviation, isotropic
     valid: Tensor  # [B, N] bool, False on parts whose joints are unseen
     part_id: Tensor  # [N] int64 into the parts

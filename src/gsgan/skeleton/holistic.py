@@ -37,10 +37,8 @@ from gsgan.utils.checks import one_of
 
 POSE = MEDIAPIPE33
 STARTS = (len(POSE.names), len(POSE.names) + HAND)  # each hand's wrist
-POSE_ARMS = (
-    (11, 13, 15),
-    (12, 14, 16),
-)  # shoulder, elbow and wrist of the pose
+# shoulder, elbow and wrist of the pose
+POSE_ARMS = (11, 13, 15), (12, 14, 16)
 HUBS_WITH_PALMS = N_HUBS + len(STARTS)
 # Lengths of a straight finger's bones and of the thumb's last ones, metres.
 FINGER_LENGTHS = {

@@ -184,9 +184,8 @@ def _place_feet(rest: Float, q: Float) -> None:
         size = np.linalg.norm(ahead, axis=-1, keepdims=True)
         back = -ahead / np.maximum(size, 1e-9)
         above = np.broadcast_to([0.0, 0, 1], back.shape)
-        axes = np.stack(
-            [np.cross(back, above), back, above], axis=-1
-        )  # [F, 3, 3]
+        # [F, 3, 3]
+        axes = np.stack([np.cross(back, above), back, above], axis=-1)
 
         held = _local(axes, stands[:, foot] - stands[:, ankle, None])
         rest[foot] = rest[ankle] + held
@@ -245,9 +244,8 @@ def _hands(p: Float, seen: Bool) -> dict[int, Float]:
 def _hand(p: Float, wrist: Float) -> Float:
     """``[21, 3]`` medians of a hand ``[F, 21, 3]`` from the pose's wrist ``[F, 3]``, in the palm's
     axes; fingers have the median lengths of their bones."""
-    local = (p - wrist[:, None]) @ hand_frame(
-        p, WRIST, PINKY, INDEX
-    )  # [F, 21, 3]
+    # [F, 21, 3]
+    local = (p - wrist[:, None]) @ hand_frame(p, WRIST, PINKY, INDEX)
     median = np.median(local, axis=0)
 
     # Medians of positions shorten bones, so each bone gets its median length, parents first.

@@ -46,9 +46,8 @@ ABSENT_FINGERS = (  # thumb to pinky
     AbsentFinger(first=0.45, step=0.13, thumbwards=-0.2),
 )
 STEP = 0.0005  # metres between the rays cast at the face
-Anchors = dict[
-    str, tuple[int, int]
-]  # landmark → joint and vertex, one of them -1
+# landmark → joint and vertex, one of them -1
+Anchors = dict[str, tuple[int, int]]
 
 
 def with_anchors(c: Character) -> Character:

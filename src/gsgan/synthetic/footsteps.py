@@ -31,9 +31,8 @@ class FootState(NamedTuple):
     height: Array  # [F] metres
     pitch: Array  # [F] radians, positive lifts the heel
     toes: Array  # [F] minimum share of the pitch that the toes take
-    load: (
-        Array  # [F] 1 while the foot swings and the other one carries the body
-    )
+    # [F] 1 while the foot swings and the other one carries the body
+    load: Array
 
 
 class Footsteps:

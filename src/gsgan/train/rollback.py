@@ -15,9 +15,8 @@ from gsgan.utils.checks import between, whole
 from gsgan.utils.files import write_atomically, writing
 
 MAX_WEIGHT = 1e6  # a weight beyond it has exploded
-BRIGHTEST = (
-    10.0  # mean of an image whose ground truth is within 0 and 1, likewise
-)
+# mean of an image whose ground truth is within 0 and 1, likewise
+BRIGHTEST = 10.0
 # mean difference of a discriminator's logits that no longer follow the image
 SAME = 1e-7
 

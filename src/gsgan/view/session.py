@@ -26,9 +26,8 @@ from gsgan.utils.provenance import png_bytes
 from gsgan.view.drag import HANDLE_NAMES, dragged, position
 
 IDLE_SECONDS = 0.1  # between two checks whether an image is due
-RESTS = (
-    0.3  # seconds without movement after which the full-size image is rendered
-)
+# seconds without movement after which the full-size image is rendered
+RESTS = 0.3
 MIN_SCALE = 0.25  # of the images while something moves
 MAX_ASPECT = 3.0  # of width to height or of height to width, since a browser window can have any
 SPEED_OVER = 2.0  # seconds over which the displayed rate is averaged
@@ -49,9 +48,8 @@ class Show:
     body: SkinnedBody | None  # that the avatar moves with
     drive: Drive  # the first motion
     read: Callable[[str], Drive]  # reads the motion in an uploaded file
-    behind: Callable[
-        [tuple[int, int]], torch.Tensor
-    ]  # background [3, H, W] of a size
+    # background [3, H, W] of a size
+    behind: Callable[[tuple[int, int]], torch.Tensor]
     size: int  # height of a full-size image, pixels
     fps: float  # frames per second of a motion that plays
     rate: float  # images per second to reach while something moves

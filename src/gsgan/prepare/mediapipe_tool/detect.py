@@ -35,9 +35,8 @@ SUFFIXES = (".jpg", ".jpeg", ".png")
 JOINTS = 33
 HAND = 21
 FACE = 468
-MARGIN = (
-    0.15  # of the mask's crop beyond the joints, share of the person's height
-)
+# of the mask's crop beyond the joints, share of the person's height
+MARGIN = 0.15
 
 
 def main() -> None:

@@ -35,9 +35,8 @@ class Drawing:
 
     figure: Figure
     caption: str  # whole sentences, Markdown
-    numbers: dict[
-        str, Any
-    ]  # by image, panel and score; None if a score is not defined
+    # by image, panel and score; None if a score is not defined
+    numbers: dict[str, Any]
 
 
 @dataclass(frozen=True)
