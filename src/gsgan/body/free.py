@@ -78,6 +78,7 @@ def read_body(path: Path) -> Body:
     Raises:
         DataError: when the file is missing, damaged or lacks an array.
     """
+    # The file is part of gsgan: a damaged one is a damaged installation.
     try:
         with np.load(path, allow_pickle=False) as archive:
             return _body(dict(archive))
@@ -108,6 +109,8 @@ def _body(arrays: dict[str, np.ndarray]) -> Body:
 
     # Divided by their sum, weights are shares again.
     weight = torch.from_numpy(arrays["bone_weight"].astype(np.float32))
+
+    # Labels are stored by face, and bodies have them by vertex.
     vertices = tensor("vertices")
     faces = tensor("faces")
     face_labels = tensor("face_labels")

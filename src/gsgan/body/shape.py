@@ -121,6 +121,7 @@ class BodyShape:
             ValueError: when the count is that of no shape.
         """
         # Hands and spine are left out if they are None.
+        # Hands and spine were added later: arrays without them are still valid.
         sizes = [
             free_space().coefficients,
             len(STRETCHED),
@@ -133,6 +134,8 @@ class BodyShape:
             raise ValueError(
                 f"BodyShape: expected {known} numbers, got {list(values.shape)}"
             )
+
+        # What follows the three groups that every shape has.
         K, stretch, offsets, more = values.split(
             [*sizes, len(values) - sum(sizes)]
         )
@@ -262,6 +265,7 @@ def _stretched(body: B, stretch: Tensor) -> B:
     def carried(points: Tensor, bone: Tensor) -> Tensor:
         return matvec(S[bone], points) + shift[bone]
 
+    # Landmarks are carried by one bone each, as rigidly as its part.
     changes: dict[str, Any] = {
         "vertices": skin(body.vertices, A, t.squeeze(-1)),
         "joints": moved,
@@ -359,18 +363,23 @@ def open_body(
     Raises:
         DataError: when the file cannot be read or is of another body.
     """
+    # The free body needs no file.
     if kind == "free":
         if not betas:
             return free_body()
         return shaped_body(BodyShape.of_flat(torch.tensor(betas)))
     if kind is None or file is None:
         return None
+
+    # The user's file must be of the model that the poses were made with.
     model = read_smpl(file)
     if model.kind != kind:
         raise DataError(
             f"{file} is a model of kind {model.kind} ({len(model.parents)} joints), but the data's "
             f"poses are of {kind}; give that model's file"
         )
+
+    # More coefficients than the file has would be dropped silently.
     if len(betas) > model.shapedirs.shape[-1]:
         raise DataError(
             f"{file} has {model.shapedirs.shape[-1]} shape coefficients, the data gives "

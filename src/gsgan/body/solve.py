@@ -128,12 +128,15 @@ class Solver(nn.Module):
     reaches: Tensor
 
     def __init__(self, body: MarkedBody) -> None:
+        # Landmarks that the body lacks have no weight.
         super().__init__()
         self.parents = len(body.parents)
         self.fingers = Fingers(body) if isinstance(body, Body) else None
         known = body.landmarks.isfinite().all(-1)
         if isinstance(body, Body):
             body = _with_palms(body)
+
+        # Constants of the steps: all of them follow from the body at rest.
         own = body.landmarks[:BODY]
         with torch.no_grad():
             rig = self.rig = build_rig(body)
@@ -148,6 +151,7 @@ class Solver(nn.Module):
             for hand, replaced_landmarks in enumerate(ON_HANDS):
                 replaced[hand, list(replaced_landmarks)] = True
 
+            # The tensors that the steps read, by their names as buffers.
             held = {
                 "precision": known / _noise().square(),
                 "prior": precision,
@@ -195,6 +199,8 @@ class Solver(nn.Module):
                 f"Solver: the skeleton must have {', '.join(map(str, SKELETON_SIZES))} joints, got "
                 f"{skeleton.shape[1]}"
             )
+
+        # Gradients need the steps in torch.
         if not self._live(skeleton) and compiled.available(skeleton):
             return self._compiled(skeleton, visibility)
 
@@ -248,6 +254,7 @@ class Solver(nn.Module):
 
     def _compiled(self, skeleton: Tensor, visibility: Tensor) -> BodyPose:
         """`solve` by compiled code."""
+        # The compiled solver runs on the CPU, in the dtype of the skeleton.
         p = skeleton.cpu()
         shown = visibility.to("cpu", skeleton.dtype)
         body, valid = sanitise(p[:, :BODY], shown[:, :BODY])
@@ -258,6 +265,8 @@ class Solver(nn.Module):
                 shown[:, BODY:WITH_HAND_JOINTS] > 0
             ) & landmarks.isfinite().all(-1)
             hands = (landmarks, seen)
+
+        # It makes the same steps as the code below, frame by frame.
         theta, transl = compiled.solve(
             *self.job(),
             body=(body, shown[:, :BODY], valid),
@@ -337,6 +346,7 @@ class Solver(nn.Module):
 
         If neither hip is valid, both hold the trunk weakly, as `sanitise` completed them.
         """
+        # Nothing else keeps a trunk without hips from tilting.
         hips = list(MEDIAPIPE33.hips)
         held = torch.zeros_like(self.precision)
         held[hips] = 1 / HIP_NOISE**2
@@ -377,6 +387,7 @@ class Solver(nn.Module):
 
     def _solve(self, p: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
         """Pose ``[B, J, 3]`` and translation ``[B, 3]`` of landmarks ``[B, N, 3]``."""
+        # Only the last steps carry gradients.
         with torch.no_grad():
             q, root = self.guess(p.detach())
             q, root = self.descend(q, root, p.detach(), weight)
@@ -400,6 +411,7 @@ class Solver(nn.Module):
 
     def guess(self, p: Tensor) -> tuple[Tensor, Tensor]:
         """Numbers ``[B, D]`` and the root's rotation ``[B, 3, 3]`` of finite joints."""
+        # Frames of pelvis, chest and head, since rest.
         hubs = bone_frames(p[:, :BODY]).hubs @ self.rest_hubs.mT
         pelvis, chest, head = hubs.unbind(1)
         q = p.new_zeros(len(p), len(self.prior))
@@ -457,6 +469,7 @@ class Solver(nn.Module):
     def rotations(self, q: Tensor, root: Tensor) -> Tensor:
         """``[B, T, 3, 3]`` of each turn."""
         # The root's turn is about its rotation so far.
+        # Every number adds its share of its axes to the axis-angle of a turn.
         R = axis_angle_to_matrix((q @ self.matrix).unflatten(1, (-1, 3)))
         return torch.cat([R[:, :1] @ root.unsqueeze(1), R[:, 1:]], dim=1)
 
@@ -479,10 +492,12 @@ class Solver(nn.Module):
 
     def points(self, T: Tensor, landmarks: Tensor) -> Tensor:
         """``[B, N, 3]`` the posed landmarks."""
+        # Each landmark moves with one turn.
         return carry(T, landmarks, self.carrier[: len(landmarks)])
 
     def linear(self, q: Tensor, root: Tensor, p: Tensor) -> Linear:
         """Residuals to ``p [B, N, 3]`` and their derivatives, the root's about its rotation."""
+        # The posed landmarks; skeletons without hands have fewer.
         n = p.shape[1]
         T = self.transforms(q, root, self.joints)
         x = self.points(T, self.landmarks[:n])
@@ -517,6 +532,7 @@ class Solver(nn.Module):
         ``2 k² (sqrt(1 + w |r|² / k²) - 1)``, with k = `ROBUST`. Its gradient is that of least
         squares with the weight ``w / sqrt(1 + w |r|² / k²)``.
         """
+        # The loss and its weight share this root.
         root = (1 + weight * at.residual.square().sum(-1) / ROBUST**2).sqrt()
         w = weight / root
         J = at.by_number.flatten(2)
@@ -545,12 +561,15 @@ class Solver(nn.Module):
         steps: int = MAX_STEPS,
     ) -> tuple[Tensor, Tensor]:
         """Numbers and root rotation after at most ``steps``; one that raises the cost is undone."""
+        # The best numbers so far, and the equations at these.
         best_q = q
         best_root = root
         best = self.normal(q, self.linear(q, root, p), weight)
         damping = q.new_full((len(q), 1), FIRST_DAMPING)
         done = torch.zeros(len(q), dtype=torch.bool, device=q.device)
         for _ in range(steps):
+            # Marquardt's damping scales with the diagonal: numbers have
+            # different units.
             diagonal = torch.diagonal(best.matrix, dim1=-2, dim2=-1)
             scaled = best.matrix + torch.diag_embed(damping * diagonal)
             q = best_q + _solved(scaled, -best.gradient)
@@ -583,6 +602,7 @@ class Solver(nn.Module):
         The derivative of their result approaches that of the exact solution, whose matrix is not
         Gauss-Newton's.
         """
+        # A fixed matrix needs no derivative of its own.
         with torch.no_grad():
             H = self.normal(q, self.linear(q, root, p), weight).matrix
         for _ in range(GRADIENT_STEPS if self._live(p) else 1):
@@ -608,6 +628,7 @@ def _with_palms(body: Body) -> Body:
 
 def _settings() -> dict[str, float]:
     """The numbers of `compiled.NUMBERS`."""
+    # Names are those in kernels/solve.h.
     return {
         "converged": MIN_IMPROVEMENT,
         "damping": FIRST_DAMPING,
@@ -636,6 +657,7 @@ def _noise() -> Tensor:
 
 def _jumps(parent: Tensor) -> Tensor:
     """``[n, T + 1]`` the turn 1, 2, 4, ... before each; T, the identity, is before the root's."""
+    # Twice as far each time, until every turn arrives at the identity.
     T = len(parent)
     jump = torch.cat([torch.where(parent < 0, T, parent), torch.tensor([T])])
     found = []

@@ -127,10 +127,15 @@ def _one_pose(
     """The mean rotation and the median centre of the images of one camera."""
     if len(group) == 1:
         return group[0].R, group[0].centre
+
+    # Several images of a camera that stands still differ by the
+    # reconstruction's noise alone.
     rotations = Rotation.from_matrix(np.stack([view.R for view in group]))
     mean = rotations.mean()
     centres = np.stack([view.centre for view in group])
     centre = np.median(centres, axis=0)
+
+    # The largest deviation tells a camera that moves.
     turned = np.degrees((rotations * mean.inv()).magnitude().max())
     moved = np.linalg.norm(centres - centre, axis=1).max()
     if turned > MAX_TURN or moved > MAX_MOVE * extent:
@@ -162,6 +167,7 @@ def read_colmap(path: Path, scale: float) -> dict[str, CameraEntry]:
     Raises:
         DataError: when one is missing or damaged, or a lens is not one of OpenCV's.
     """
+    # The model is two files: lenses, and the images that refer to them.
     lens_path = path.with_stem("cameras")
     image_path = path.with_stem("images")
     for file in (lens_path, image_path):
@@ -170,6 +176,8 @@ def read_colmap(path: Path, scale: float) -> dict[str, CameraEntry]:
                 f"{file} does not exist; COLMAP's cameras{path.suffix} and images{path.suffix} "
                 "belong together"
             )
+
+    # Each file is read by itself, so that a message names the damaged one.
     binary = path.suffix == ".bin"
     try:
         lenses = (

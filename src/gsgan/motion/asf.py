@@ -227,6 +227,7 @@ def _read_frames(
                     f"frame {number} gives {given} of {expected} numbers for {name}"
                 )
 
+    # One array per bone; a number that is not finite is damage.
     values = {
         name: np.array([frame[name] for frame in frames]) for name in moving
     }

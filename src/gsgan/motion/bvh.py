@@ -100,6 +100,8 @@ def _read_values(text: str, columns: int) -> tuple[Array, float]:
         raise ValueError(
             "'Frames:' and 'Frame Time:' are expected after MOTION"
         )
+
+    # A file that was cut off has fewer numbers than it announces.
     frames = int(head[1])
     frame_time = float(head[2])
     numbers = text[head.end() :].split()
@@ -117,6 +119,7 @@ def _rig_motion(
     joints: list[_Joint], values: Array, frame_time: float
 ) -> RigMotion:
     """World rotations and the root's path from the channels' values ``[F, columns]``."""
+    # Numbers that are no numbers would spread through the hierarchy.
     offsets = np.array([joint.offset for joint in joints])
     if not (np.isfinite(values).all() and np.isfinite(offsets).all()):
         raise ValueError("a number is not finite")
@@ -141,6 +144,8 @@ def _rig_motion(
             given = given + offsets[j]
         local[:, j] = given
         rotations[:, j] = R
+
+    # Names and parents in the order of the joints.
     names = []
     parents = []
     for joint in joints:

@@ -101,6 +101,9 @@ class GltfFile:
         a = self.doc.accessors[index]
         kind = np.dtype(COMPONENT_TYPES[a.componentType])
         width = WIDTHS[a.type]
+
+        # An accessor without a view is all zeros, which a sparse part may
+        # replace.
         if a.bufferView is None:
             values = np.zeros((a.count, width), kind)
         else:
@@ -174,6 +177,7 @@ class GltfFile:
     def _buffer(self, index: int) -> bytes:
         """A buffer: the file's binary chunk, text in base64, or a file in the same folder."""
         if index not in self._buffers:
+            # A buffer without a URI is the binary chunk of a .glb.
             uri = self.doc.buffers[index].uri
             if uri is None:
                 data = self.doc.binary_blob() or b""
@@ -181,6 +185,8 @@ class GltfFile:
                 _, _, text = uri.partition(",")
                 data = base64.b64decode(text)
             else:
+                # Only files beside this one are read: a URI could name any file
+                # of the user.
                 folder = self.path.parent.resolve()
                 file = (folder / unquote(uri)).resolve()
                 if not file.is_relative_to(folder) or not file.is_file():
@@ -200,6 +206,8 @@ class GltfFile:
             raise DataError(
                 f"{self.path} is compressed (EXT_meshopt_compression): pip install 'gsgan[gltf]'"
             ) from None
+
+        # The mode tells what the bytes hold.
         count = packed["count"]
         stride = packed["byteStride"]
 

@@ -66,6 +66,8 @@ def read_pose(path: Path, subject: Proportions) -> Clip:
     Raises:
         DataError: when the package is missing, the file is damaged or has no depth.
     """
+    # Landmarks in the image are preferred: those of the world have a depth of
+    # their own.
     file = _PoseFile(path)
     name = IMAGE_PART if IMAGE_PART in file.parts else WORLD_PART
     if name not in file.parts or "Z" not in file.parts[name].layout:
@@ -242,10 +244,15 @@ def _parts_to_metres(
             x, y, z = squares.T
             rows.append(np.stack([x + y, z], axis=1))
         points.append(p)
+
+    # Pairs that were not seen have no equation; without any, the scale is
+    # unknown.
     table = np.concatenate(rows)
     table = table[np.isfinite(table).all(1)]
     if not len(table):
         return [np.full_like(p, np.nan) for p in points]
+
+    # Squares of scales cannot be negative.
     squares, _ = nnls(table, np.ones(len(table)))
     flat, deep = np.sqrt(squares)
     return [p * (flat, flat, deep) for p in points]

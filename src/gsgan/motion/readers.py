@@ -162,10 +162,14 @@ def _by_names(
 ) -> Clip:
     rate = _first(arrays, RATE_KEYS)
     fps = None if rate is None else rate_of(path, rate)
+
+    # Each kind of motion has an array that no other kind has.
     if "p" in arrays:
         return _landmarks(path, arrays, fps)
     if "theta" in arrays:
         return _body_pose(path, arrays, fps, source)
+
+    # MediaPipe's world landmarks, whose fourth number is the visibility.
     world = _first(arrays, WORLD_KEYS)
     if world is not None:
         p = _with_visibility(path, world, arrays.get("visibility"))
@@ -211,6 +215,8 @@ def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Clip:
             f"{path}: 'p' must have shape [F, {BODY}, 3], with hands [F, {hands}, 3], or "
             f"with hands and face [F, {face}, 3]; got {list(arrays['p'].shape)}"
         )
+
+    # Landmarks that are not finite have no confidence.
     p = arrays["p"].astype(np.float64)
     conf = np.ones(p.shape[:2])
     if "conf" in arrays:
@@ -232,6 +238,7 @@ def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Clip:
             p[no_hips, hip] = placed[no_hips, hip]
             conf[no_hips, hip] = conf[no_hips, shoulder]
 
+    # Unit, frame rate and axis are in the meta.json of the same folder.
     meta = _meta(path)
     return Clip(
         path=path,
@@ -247,6 +254,7 @@ def _body_pose(
     path: Path, arrays: dict[str, Any], fps: float | None, source: Source
 ) -> Clip:
     """Poses of the free body as `gsgan.fit` writes them, or of SMPL."""
+    # SMPL's files call the translation "trans"; lengths become metres.
     theta = expect_array(arrays, "theta", (None, None, 3), path)
     F, bones, _ = theta.shape
     if "trans" in arrays:
@@ -397,6 +405,7 @@ def read_mediapipe_json(path: Path, source: Source) -> Clip:
     A frame is an object with one of `WORLD_KEYS`, or the 33 landmarks themselves; a landmark is
     ``{x, y, z, visibility}`` or a list of these numbers.
     """
+    # The list of frames is the whole file, or one entry of it.
     frames = read_json_value(path)
     fps = None
     if isinstance(frames, dict):
@@ -407,6 +416,8 @@ def read_mediapipe_json(path: Path, source: Source) -> Clip:
             f"{path} holds no frames; expected a list, or an object with 'frames', of MediaPipe's "
             "pose_world_landmarks"
         )
+
+    # Each frame is read by itself, so that a message can name it.
     rows = []
     for i, frame in enumerate(frames):
         rows.append(_landmark_row(f"{path}, frame {i}", frame))
@@ -482,6 +493,8 @@ def _with_visibility(
             f"{path}: the world landmarks must have shape (any, {BODY}, 3 or 4), found "
             f"{points.shape}"
         )
+
+    # A separate array of visibilities comes before the fourth number.
     if visibility is None and points.shape[2] > 3:
         visibility = points[..., 3]
     elif visibility is None:

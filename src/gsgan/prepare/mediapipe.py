@@ -132,6 +132,7 @@ def _detect(command: list[str], source: Path, advance: Advance) -> None:
             text=True,
         ) as process,
     ):
+        # A line of progress for each image; an interrupt ends the tool too.
         try:
             assert process.stdout is not None
             for line in process.stdout:
@@ -141,6 +142,8 @@ def _detect(command: list[str], source: Path, advance: Advance) -> None:
         except BaseException:
             process.kill()
             raise
+
+        # The tool's last line of errors is the reason of its failure.
         if process.wait():
             errors.seek(0)
             raise DataError(

@@ -80,6 +80,7 @@ def summarise(outcome: Outcome) -> dict[str, Any]:
     frames = outcome.frames.tolist()
     dropped = [frame for frame in frames if frame not in kept]
 
+    # The share of frames in which each joint came out in 3D.
     found = known(solution.p[:, :BODY]).mean(0)
     return {
         "error_px": {
@@ -390,6 +391,8 @@ def _in_metres(
     if options.up_axis is None and upward is not None:
         turn = between(upward, np.array([0.0, 0, 1]))
         note += "; the world was turned so that the person stands along z"
+
+    # Every camera follows the turn, and its distances follow the scale.
     cameras = []
     for camera in inputs.cameras:
         cameras.append(replace(camera, R=camera.R @ turn.T, t=scale * camera.t))
@@ -447,6 +450,7 @@ def _write_images(
     cameras = {camera.name: camera for camera in inputs.cameras}
     offsets = options.offsets or {}
 
+    # One camera's images; `each_camera` runs cameras side by side.
     def one(name: str, advance: Advance) -> list[int]:
         return write_images(
             root=root,

@@ -236,6 +236,9 @@ def _refined(
     cameras = start
     F = weight.shape[1]
     at = np.array(evenly_spaced(F, REFINED, ends=True))
+
+    # The prior pulls towards the given cameras, not towards those of the last
+    # round.
     for _ in range(settings.refinements):
         p = found.points.p.reshape(F, -1, 3)[at]
         cameras = refine_cameras(

@@ -117,6 +117,8 @@ def _sources_in(folder: Path, rotate: bool) -> dict[str, Recording]:
             source = video_recording(path, rotate)
         else:
             continue
+
+        # A folder and a video, or two videos, may have the same name.
         if source.name in sources:
             raise DataError(
                 f"{folder} holds the camera {source.name} twice; remove {path.name}"
@@ -131,6 +133,7 @@ def video_recording(path: Path, rotate: bool) -> Recording:
     Raises:
         DataError: when it cannot.
     """
+    # What the header tells; the length may be wrong.
     video = opened(path, rotate)
     fps = float(video.get(cv2.CAP_PROP_FPS))
     turned = int(video.get(cv2.CAP_PROP_ORIENTATION_META))

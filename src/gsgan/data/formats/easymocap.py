@@ -106,6 +106,7 @@ class EasymocapReader(FolderReader):
         else:
             ids, p, conf = _read_keypoints(people)
 
+        # Everything in the reader's terms; the layout has no part labels.
         return Found(
             root=root,
             meta=Meta(
@@ -254,6 +255,8 @@ def _read_people(
     lacking = []
     seen = set[int]()
     there = sorted(set(frames) & set(files))
+
+    # Frames without the person are left out later, with a note.
     for frame in there:
         people = _people(root / files[frame])
         seen |= set(people)
