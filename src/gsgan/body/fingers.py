@@ -271,6 +271,7 @@ def _placed(
     # Σ (|a|² - a aᵀ) v = Σ a × b.
     eye = torch.eye(3, dtype=x.dtype, device=x.device)
     for _ in range(PLACING):
+        # Gauss-Newton on the rotation: the matrix of inertia, and the torque.
         now = away @ R.mT
         H = (share * now).mT @ now
         H = (torch.einsum("...ii", H)[..., None, None] + MIN_PALM**2) * eye - H
@@ -317,6 +318,8 @@ def _axes(
     cosine = (before * along).sum(-1)
     bend = torch.where(thumb[:, None], 0.0, torch.atan2(sine, cosine))
 
+    # A finger's numbers: bend, spread and twist of its first joint, bend and
+    # spread of the second.
     axes = [flexion[:, 0], side[:, 0], along[:, 0], flexion[:, 1], side[:, 1]]
     none = torch.zeros_like(bend[:, 0])
     origins = [bend[:, 0], none, none, bend[:, 1], none]

@@ -121,7 +121,6 @@ class BodyShape:
             ValueError: when the count is that of no shape.
         """
         # Hands and spine are left out if they are None.
-        # Hands and spine were added later: arrays without them are still valid.
         sizes = [
             free_space().coefficients,
             len(STRETCHED),
@@ -192,6 +191,9 @@ class ShapeSpace(Generic[B]):
 
         # Bones are stretched; then what belongs to this person's skeletons is moved.
         body = _stretched(replace(self.body, **moved), shape.stretch)
+
+        # Offsets of landmarks, the curve of the back, and hands come after
+        # stretching.
         if shape.offsets is not None:
             body = replace(body, landmarks=body.landmarks + shape.offsets)
         if shape.spine is not None:
@@ -262,6 +264,7 @@ def _stretched(body: B, stretch: Tensor) -> B:
         blended = blended + share.unsqueeze(-1) * maps[bone]
     A, t = blended.unflatten(-1, (3, 4)).split((3, 1), dim=-1)
 
+    # Points that belong to one bone move with its part alone.
     def carried(points: Tensor, bone: Tensor) -> Tensor:
         return matvec(S[bone], points) + shift[bone]
 

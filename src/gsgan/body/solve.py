@@ -143,9 +143,14 @@ class Solver(nn.Module):
             rest, _ = sanitise(
                 torch.where(known[:, None], own, torch.nan)[None]
             )
+
+            # A number turns about its axes; several turns may share a number.
             matrix = body.joints.new_zeros(len(rig.names), len(rig.joint), 3)
             matrix[rig.entry_number, rig.entry_turn] = rig.entry_axis.to(matrix)
             precision, minimum = prior(rig)
+
+            # The landmarks that follow each turn, and those that a hand's own
+            # landmarks replace.
             follows = ancestors(rig.parent)[rig.carrier].mT
             replaced = torch.zeros(len(ON_HANDS), BODY, dtype=torch.bool)
             for hand, replaced_landmarks in enumerate(ON_HANDS):
@@ -221,12 +226,20 @@ class Solver(nn.Module):
             seen = (
                 visibility[:, BODY:WITH_HAND_JOINTS] > 0
             ) & hands.isfinite().all(-1)
+
+            # The finger solver says which hands can be placed, and where.
             near = torch.where(seen.unsqueeze(-1), hands - shift, 0.0)
             found = self.fingers(near, seen)
+
+            # Of a placed hand, the landmarks of the palm count instead of the
+            # three of the 33.
             replaced = (found.placed.unsqueeze(-1) & self.replaced).any(1)
             placed = found.placed.repeat_interleave(len(PALM), dim=1)
             held = placed.to(weight) / LANDMARK_NOISE**2
             weight = torch.cat([weight.masked_fill(replaced, 0), held], dim=1)
+
+            # They are the body's own palm where the hand was placed, so that
+            # their errors agree.
             own = self.landmarks[BODY:].unflatten(0, (2, -1))
             at = own @ found.rotations.mT + found.shifts.unsqueeze(-2)
             p = torch.cat([p, at.flatten(1, 2)], dim=1)
@@ -338,6 +351,7 @@ class Solver(nn.Module):
 
     def _axes(self, name: str) -> Tensor:
         """``[3, 3]`` unit axes, by rows, of the numbers of a chain."""
+        # Joints of a chain share the axis: their sum has its direction.
         rows = self.matrix[self.rig.numbers(name)]
         return normalize(rows.unflatten(1, (-1, 3)).sum(1))
 
@@ -361,6 +375,8 @@ class Solver(nn.Module):
         shown = (visibility > 0) & skeleton.isfinite().all(-1)
         seen = shown[:, :BODY]
         hands = shown[:, BODY:WITH_HAND_JOINTS]
+
+        # A placed hand counts by its palm.
         fingers = self.fingers if hands.shape[1] else None
         if fingers is not None:
             placed = fingers.placed(hands)
@@ -379,6 +395,8 @@ class Solver(nn.Module):
         moved = torch.zeros(
             len(visibility), self.parents, device=visibility.device
         )
+
+        # A joint moves if any number that turns it is free.
         joints = self.joint[self.entry_turn].expand(len(visibility), -1)
         moved = moved.scatter_add(1, joints, free[:, self.entry_number].float())
         if fingers is not None:
@@ -469,7 +487,6 @@ class Solver(nn.Module):
     def rotations(self, q: Tensor, root: Tensor) -> Tensor:
         """``[B, T, 3, 3]`` of each turn."""
         # The root's turn is about its rotation so far.
-        # Every number adds its share of its axes to the axis-angle of a turn.
         R = axis_angle_to_matrix((q @ self.matrix).unflatten(1, (-1, 3)))
         return torch.cat([R[:, :1] @ root.unsqueeze(1), R[:, 1:]], dim=1)
 
@@ -483,6 +500,8 @@ class Solver(nn.Module):
         top = torch.cat([R, shift.unsqueeze(-1)], dim=-1)
         bottom = constant((0.0, 0.0, 0.0, 1.0), R).expand(*R.shape[:2], 1, 4)
         T = torch.cat([top, bottom], dim=-2)
+
+        # The last one, the identity, stands for the world.
         T = torch.cat([T, torch.eye(4).to(T).expand(len(T), 1, 4, 4)], dim=1)
 
         # Products of 2, 4, 8, ... turns: with the product that ends 1, 2, 4, ... turns before.
@@ -513,6 +532,9 @@ class Solver(nn.Module):
 
         # World axes about which a number turns, and arms from there to the landmarks that follow.
         v = (q @ self.matrix).unflatten(1, (-1, 3))
+
+        # The Jacobian turns a change of the axis-angle into the rotation that
+        # it adds.
         turned = before_R @ left_jacobian(v)
         axes = matvec(turned[:, self.entry_turn], self.entry_axis)
         arms = x.unsqueeze(1) - origin[:, self.entry_turn].unsqueeze(2)
@@ -583,6 +605,9 @@ class Solver(nn.Module):
             better = (new.cost < best.cost) & ~done
             change = (new.cost - best.cost).abs()
             done = done | (change <= MIN_IMPROVEMENT * best.cost)
+
+            # A better step brings the next one nearer to Newton's, a worse one
+            # to gradient descent.
             easier = damping * DAMPING_DECREASE
             damping = torch.where(
                 better[:, None], easier, damping * DAMPING_INCREASE

@@ -52,6 +52,7 @@ def skeleton_doubts(subject: CheckedData, limits: Limits) -> list[Doubt]:
     names = template.names
     found = list[Doubt]()
 
+    # Each kind of doubt is a table of flags by frame and joint.
     def doubt(
         kind: str,
         what: str,

@@ -107,8 +107,7 @@ def geometry_findings(
 
 def geometry_table(subject: CheckedData, geometry: Geometry) -> Table:
     """A table of units and sizes."""
-    # The nearest and the farthest camera.
-    # Distances show a wrong unit at once, and so does the height.
+    # Distances and height show a wrong unit at once.
     meta = subject.layout.meta
     distances = geometry.distances.values()
     near = min(distances)

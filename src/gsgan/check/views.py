@@ -108,6 +108,7 @@ def subject_of(data: GsganData) -> CheckedData:
             reader, consistency=replace(consistency, frames=0)
         )
 
+    # Images and landmarks of all frames, in their order.
     layout = data.layout
     pairs = {}
     for name in layout.camera_names:
@@ -251,6 +252,7 @@ def measure(
         )
         results = list(found)
 
+    # Images that cannot be read are findings.
     views = []
     broken = []
     for result in results:

@@ -154,6 +154,8 @@ def undistort_map(
         # OpenCV's own function is ten times as fast, but ignores skew.
         stored = K.copy()
         stored[:2, 2] -= 0.5  # to OpenCV's pixel centres
+
+        # The window's corner becomes the origin.
         seen = stored.copy()
         seen[:2, 2] -= (crop.left, crop.top)
         size = crop.size[::-1]

@@ -378,6 +378,8 @@ def _nerfstudio_lens(where: str, values: Mapping[str, Any]) -> Lens:
     if "camera_angle_x" in values:
         focal = width / 2 / np.tan(value("camera_angle_x") / 2)
     fx = value("fl_x", focal)
+
+    # The principal point is the middle of the image unless it is given.
     K = np.array([[fx, 0, 0], [0, value("fl_y", fx), 0], [0, 0, 1.0]])
     K[0, 2] = value("cx", width / 2)
     K[1, 2] = value("cy", height / 2)

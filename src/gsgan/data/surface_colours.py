@@ -96,6 +96,8 @@ def surface_colours(
             median = np.median(pair, axis=0)
             medians.append(median)
             residuals.append(pair - median)
+
+    # Without two cameras that share enough surface, nothing can be told.
     if not medians:
         return None
     brightness = np.abs(np.concatenate(residuals).mean(axis=1))
@@ -201,6 +203,8 @@ def _colours(frame: Frame, points: Float) -> Float:
     side = 2 * int(2 * sigma) + 1
     mask = frame.mask[0, 0].numpy()
     rgb = frame.image[0].permute(1, 2, 0).contiguous().numpy()
+
+    # The background is black: dividing by the blurred mask leaves it out.
     soft = np.asarray(cv2.GaussianBlur(mask, (side, side), sigma), np.float32)
     image = np.asarray(cv2.GaussianBlur(rgb, (side, side), sigma), np.float32)
     rows = pixels[front, 1]

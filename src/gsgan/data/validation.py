@@ -235,6 +235,9 @@ def drop_unseen(
         rows = np.searchsorted(frames, files.frames)
         seen = inside(cameras[name], joints[rows]) & valid[rows]
         enough = seen.sum(1) >= limits.min_joints_in_view
+
+        # Some frames may show too little; a camera that never sees the person
+        # is wrong.
         if not enough.any():
             raise DataError(
                 f"{calibration}, camera {name}: no frame has {limits.min_joints_in_view} joints "

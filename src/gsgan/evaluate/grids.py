@@ -73,6 +73,8 @@ def write_grid(
     images = [image for row in rows for image in row.values()]
     height = max(image.shape[-2] for image in images)
     width = max(image.shape[-1] for image in images)
+
+    # Images of other sizes are padded at the right and at the bottom.
     lines = []
     for row in rows:
         padded = []

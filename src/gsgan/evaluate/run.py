@@ -465,6 +465,9 @@ def evaluate_method(
         dataset = data.dataset(split)
         count = len(dataset)
         places = evenly_spaced(count, config.get("score_images") or count)
+
+        # Scores of a trained method are kept: a run that was interrupted goes
+        # on.
         kept = None
         if poses is not None:
             key = _key(method, data, scorer, grid_rows, len(places))

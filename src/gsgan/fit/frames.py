@@ -81,6 +81,9 @@ class MaskedFrames:
         used = layout.frames if held_out else data.trained
         if max_frames is not None:
             used = spread_frames(layout.landmarks, used, max_frames)
+
+        # Each frame takes other cameras in turn, so that few images see all
+        # sides.
         items: list[Item] = []
         for turn, frame in enumerate(used):
             seeing = [

@@ -302,6 +302,8 @@ def _fit_lengths(
     a, b, sigma = _pairs()
     lengths = (p[:, a] - p[:, b]).norm(dim=-1)
     target = _median(lengths, seen[:, a] & seen[:, b]).log()
+
+    # Pairs that were never seen, or that the body lacks, have no target.
     own = space.body.landmarks
     used = target.isfinite() & (own[a] - own[b]).isfinite().all(-1)
     a = a[used]
@@ -394,6 +396,9 @@ def _fit_landmarks(
         # the shape's normal equations after eliminating every pose
         w = w.repeat_interleave(3, dim=1).unsqueeze(-1)
         J = at.by_number.flatten(2).mT
+
+        # The poses are eliminated frame by frame (Schur complement): what is
+        # left is the shape's system.
         C = J.mT @ (w * G)
         direct = G.mT @ (w * G)
         slope = (G.mT @ (w * at.residual.flatten(1).unsqueeze(-1))).squeeze(-1)

@@ -84,6 +84,9 @@ class Perceptual(nn.Module):
         self.network: FeatureNetwork | Lpips
         self.mark = None
         self.description = f"{NETWORKS[net].title}, {form}"
+
+        # A random network, LPIPS with its learnt weights, or the features
+        # alone.
         if weights == RANDOM:
             self.network = FeatureNetwork(_random_stages(width))
             self.mark = "perceptual loss: fixed random network, not VGG-16"

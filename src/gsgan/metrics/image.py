@@ -247,6 +247,7 @@ def edge_scores(
             edges = edges & inside
             truth = truth & inside
 
+        # Without true edges, neither precision nor recall is defined.
         count = edges.sum()
         expected = truth.sum()
         if not expected:

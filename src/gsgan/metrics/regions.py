@@ -184,6 +184,8 @@ def box_mask(corners: Tensor, camera: Camera) -> Tensor:
     rows = np.arange(height) + 0.5
     shown = np.stack(np.meshgrid(columns, rows), axis=-1)  # [H, W, 2]
     if camera.dist is not None:
+        # Pixels of a lens are straightened: the box has straight edges in a
+        # pinhole only.
         focal = K[:2, :2].cpu().numpy()
         centre = K[:2, 2].cpu().numpy()
         rays = (shown - centre) @ np.linalg.inv(focal).T

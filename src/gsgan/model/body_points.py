@@ -368,6 +368,7 @@ class BodyPoints(nn.Module):
         )
         self.renew()
         if stretch:
+            # Without learnt weights, their gradients are constants.
             self.gradients = WeightGradients(body, self.points.chosen)
             if self.points.learnt is None:
                 columns, factors = self.gradients(*self.points.weights)

@@ -272,6 +272,8 @@ def _motion(path: Path, skeleton: _Skeleton) -> RigMotion:
     for name in names[1:]:
         starts.append(bones[parents[name]].end)
         above.append(index[parents[name]])
+
+    # The bones that have no child, and where they end.
     last = []
     at_last = []
     ends = []

@@ -76,6 +76,8 @@ def _read_hierarchy(words: list[str]) -> list[_Joint]:
                 rest.__next__, "{"
             ):  # names may have several words
                 joint.name += " " + part
+
+            # It is open until its closing brace.
             above.append(len(joints))
             joints.append(joint)
         elif word == "OFFSET":
@@ -130,6 +132,7 @@ def _rig_motion(
     local[:, 0] = 0.0
     columns = iter(values.T)
     for j, joint in enumerate(joints):
+        # The rotation so far: the parent's, then this joint's channels.
         R = np.eye(3) if joint.parent < 0 else rotations[:, joint.parent]
         given = local[:, j].copy()
         for channel in joint.channels:
@@ -140,6 +143,8 @@ def _rig_motion(
                 R = R @ rotation(angle * np.eye(3)[axis])
             else:
                 given[:, axis] = column
+
+        # Both ways of writing positions occur.
         if joint.parent >= 0 and _counts_from_offset(given, offsets[j]):
             given = given + offsets[j]
         local[:, j] = given

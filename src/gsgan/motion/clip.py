@@ -105,6 +105,9 @@ def checked(motion: Clip, min_visibility: float) -> Clip:
     if body is not None:
         share = np.rint(share)
         body = body[torch.from_numpy(nearest)]
+
+    # Landmarks are mixed; one that only one side has is taken from the nearer
+    # frame.
     p = np.where(known[..., None], motion.p, np.nan)
     filled = mixed(p[before], p[after], share)
     filled = np.where(np.isfinite(filled), filled, p[nearest])
@@ -186,12 +189,16 @@ def completed(motion: Clip, up: str) -> Float:
     p = whole[:, :BODY]
     known: Bool = np.asarray(np.isfinite(p).all(-1))
     times = np.arange(len(p))
+
+    # Parents come first: a joint that is not seen follows its parent.
     for joint, parent in PARENT.items():
         offset = p[:, joint] - p[:, parent]
         seen = known[:, joint] & known[:, parent]
         if seen.mean() < MIN_SEEN:
             known[:, joint] = False
         elif not seen.all():
+            # In between, the bone turns from where it was to where it is seen
+            # again.
             gaps = ~seen
             for axis in range(3):
                 filled = np.interp(times, times[seen], offset[seen, axis])

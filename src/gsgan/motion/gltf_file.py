@@ -60,12 +60,16 @@ class GltfFile:
     ) -> None:
         data = path.read_bytes()
         self.path = path
+
+        # Binary files begin with a magic number, others are JSON.
         if data[:4] == b"glTF":
             self.doc = pygltflib.GLTF2.load_from_bytes(data)
         elif data.lstrip()[:1] == b"{":
             self.doc = pygltflib.GLTF2.gltf_from_json(data.decode())
         else:
             raise DataError(f"{path}: not a glTF 2 file; export it as .glb")
+
+        # A required extension that is ignored would give wrong positions.
         for name in self.doc.extensionsRequired or ():
             if name in unsupported:
                 raise DataError(

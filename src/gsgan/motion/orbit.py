@@ -74,6 +74,8 @@ class Orbit:
         cosine = np.cos(azimuth)
         level = np.cos(elevation)
         height = np.full(F, np.sin(elevation))
+
+        # The direction from the person to the camera.
         away = np.stack([level * sine, -level * cosine, height], axis=1)
 
         # Extrinsics, in the axes of the world.

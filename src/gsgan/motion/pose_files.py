@@ -66,8 +66,8 @@ def read_pose(path: Path, subject: Proportions) -> Clip:
     Raises:
         DataError: when the package is missing, the file is damaged or has no depth.
     """
-    # Landmarks in the image are preferred: those of the world have a depth of
-    # their own.
+    # The body in the image if the file has it, else in the world; either needs
+    # a depth.
     file = _PoseFile(path)
     name = IMAGE_PART if IMAGE_PART in file.parts else WORLD_PART
     if name not in file.parts or "Z" not in file.parts[name].layout:

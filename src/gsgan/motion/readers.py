@@ -234,6 +234,8 @@ def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Clip:
         p[no_hips, :BODY] = np.where(
             seen[no_hips, :, None], p[no_hips, :BODY], np.nan
         )
+
+        # Their confidence is that of the shoulders from which they hang.
         for hip, shoulder in zip(HIPS, SHOULDERS, strict=True):
             p[no_hips, hip] = placed[no_hips, hip]
             conf[no_hips, hip] = conf[no_hips, shoulder]
@@ -449,6 +451,8 @@ def _landmark_row(where: str, frame: Any) -> Float:
                 "coordinates, without metric depth"
             )
         points = frame[key]
+
+    # Some versions wrap the landmarks once more.
     if isinstance(points, dict):
         points = points.get("landmark", points.get("landmarks"))
     if isinstance(points, list) and len(points) == 1:

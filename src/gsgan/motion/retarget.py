@@ -97,6 +97,8 @@ def retargeted(
 
     # Hands: turned as the palm's three landmarks of the pose, or better as the hand's own.
     for wrist, ends in HAND_LANDMARKS.items():
+        # The hand turns with the line of the knuckles, or with its own
+        # landmarks.
         first, second = ends[:2]
         axes = hand_frame(p, wrist, first, second)
         turn = axes @ hand_frame(rest, wrist, first, second).T

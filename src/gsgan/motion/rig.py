@@ -181,6 +181,8 @@ class Rig:
             self.index[name] = j
             self.joint[name] = character.joints[j]
         self.turns = rest_turns(self.joint)
+
+        # Motions scale with these lengths.
         self.leg = self._limb_length(LEG)
         self.arm = self._limb_length(ARM)
 

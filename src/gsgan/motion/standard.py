@@ -111,6 +111,8 @@ def _bone(name: str) -> tuple[str, int]:
             side = word
         else:
             stem += word
+
+    # The side may be a prefix of the stem itself, as in "lthigh".
     match = re.match(r"(left|right|l|r)(.+)", stem)
     if not side and match and _stem(match[2], sided=True)[0]:
         side, stem = match.groups()
@@ -229,6 +231,8 @@ def standard_motion(
 
     # The axis that points up, and left and right.
     zero = rig.zero_pose()[None]
+
+    # A zero pose that stands tells which axis is up.
     highest = _upward(zero, known)
     stands = tilts(zero, known, highest).max() < MAX_STANDING_TILT
     zero_axis = highest if stands else None
@@ -286,6 +290,8 @@ def body_joints(rig: RigMotion, path: Path) -> dict[str, int]:
     above_left = _line(rig, known["LeftUpLeg"])
     above_right = _line(rig, known["RightUpLeg"])
     shared = [j for j in above_left if j in above_right]
+
+    # Every limb several times means several skeletons.
     counts = []
     for side, bone in product(SIDES, ("UpLeg", "Arm")):
         counts.append(_count(rig, side + bone))
@@ -457,6 +463,8 @@ def _reference(
     if neutral:
         chosen = np.flatnonzero(worst < best + SAME_TILT)
     else:
+        # Without a neutral pose, the frames in which at least the trunk is
+        # upright.
         trunk = tilt[:, 0]
         limit = max(MAX_UPRIGHT_TILT, float(trunk.min()) + SAME_TILT)
         chosen = np.flatnonzero(trunk < limit)
@@ -569,6 +577,7 @@ def _point_hands(turns: dict[str, Array], joints: dict[str, Array]) -> None:
             thumb = thumb * (0, 1, 1)
             calibration = calibration @ between(np.array([0.0, -1, 0]), thumb)
 
+        # The fingers turn with the hand.
         for bone in turns:
             if bone.startswith(hand):
                 turns[bone] = turns[bone] @ calibration
@@ -652,6 +661,8 @@ def _trunk(rig: RigMotion, known: dict[str, int], R: Array) -> dict[str, Array]:
     # The spine is above both arms but not above the legs; the file's bones are interpolated.
     hips = [*_line(rig, known["LeftUpLeg"]), known["Hips"]]
     spine = [j for j in left if j in right and j not in hips]
+
+    # The standard's joints lie at even steps along the file's spine.
     chain = [known["Hips"], *spine]
     for k, bone in enumerate(SPINE, 1):
         at = k * len(spine) / len(SPINE)

@@ -52,6 +52,8 @@ def find_masks(
         stems = [
             path.stem for path in paths if path.suffix.lower() in IMAGE_SUFFIXES
         ]
+
+        # EasyMocap's masks are named by frame and person.
         of_persons = stems and all(
             re.fullmatch(r"\d+_\d+", stem) for stem in stems
         )
@@ -133,6 +135,7 @@ def write_images(
     if camera.distorted:
         mapping = undistort_map(camera.K, camera.dist, window)
 
+    # A recording may change its size in between.
     def write(path: Path, pixels: Bytes, number: int, where: Path) -> None:
         if pixels.shape[:2] != camera.size:
             raise DataError(

@@ -209,6 +209,7 @@ def prepare(options: Options, console: Console) -> Path:
     stages = StageFolder(out.parent / f".{out.name}.prepare")
     extra: dict[str, object] = {}
     if inputs is None:
+        # One camera: the body is solved in its view, and joints come from it.
         filmed = solve_video(options, stages, console)
         inputs = filmed.inputs
         masks = filmed.masks
@@ -217,6 +218,7 @@ def prepare(options: Options, console: Console) -> Path:
         extra = {"one_camera": filmed.numbers}
         options = replace(options, face=False)
     else:
+        # Several cameras: detections, then triangulation.
         found, masks = find_people(
             options, inputs.sources, stages, console.print
         )

@@ -70,9 +70,13 @@ def match_hands(
     known = np.isfinite(distance).all(-1, keepdims=True)
     loss = HAND * root_weight * np.log1p((distance / WRIST_SCALE) ** 2)
     loss = np.where(known, loss, 0.0)
+
+    # What keeping or swapping the hands costs, by their distances to the
+    # wrists.
     kept = loss[..., 0, 0] + loss[..., 1, 1]
     swapped = loss[..., 0, 1] + loss[..., 1, 0]
 
+    # The errors of the triangulated hands are added.
     def cost_of(flips: Bool, at: Ints) -> Float:
         sided = apply_flips(uv[:, at], flips[..., None], [OWN_PAIRS])
         seen = apply_flips(weight[:, at], flips[..., None], [OWN_PAIRS])

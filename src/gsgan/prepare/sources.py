@@ -103,6 +103,8 @@ def _sources_in(folder: Path, rotate: bool) -> dict[str, Recording]:
         if path.is_dir():
             files = frame_files(folder, path.name, IMAGE_SUFFIXES)
         if files:
+            # All images of a folder have one size, which is checked when they
+            # are read.
             paths = {number: folder / files[number] for number in sorted(files)}
             size = read_header(next(iter(paths.values())))[0]
             source = Recording(
@@ -213,6 +215,7 @@ def pair_cameras(
         if source in named:
             matching = [named[source]]
         if len(matching) != 1 or matching[0] in pairs.values():
+            # None matches, several do, or another video has it.
             problem = "no one camera of the calibration matches"
             if len(matching) == 1:
                 problem = f"the camera {matching[0]} matches more than one video, among them"

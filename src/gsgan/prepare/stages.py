@@ -35,6 +35,7 @@ def each_camera(
     console = Console(stderr=True)
     bars = progress(console, disable=not console.is_terminal)
 
+    # A task reports its progress by `advance`, where it can also be stopped.
     def run(name: str) -> Result:
         row = bars.add_task(f"{what}: {name}", total=None)
 

@@ -79,6 +79,7 @@ def robust(
         iterations: of reweighting.
         max_error: maximum median error of a point.
     """
+    # Points do not depend on each other.
     p = []
     weights = []
     errors = []
@@ -102,6 +103,7 @@ def _robust(
     iterations: int,
     max_error: float,
 ) -> Triangulated:
+    # A start that a few wrong detections do not spoil.
     weight = np.where(known(uv), weight, 0.0)
     a, b = _rows(cameras, uv, weight)
     p = _best_pair(cameras, uv, weight, a, b)
@@ -154,6 +156,8 @@ def _rows(
     """
     # Detections that are not used may be NaN.
     uv = np.where((weight > 0)[..., None], uv, 0.0)
+
+    # The first two rows of K [R t], less the third times the pixel.
     KR = (cameras.K @ cameras.R)[:, None]
     Kt = np.einsum("cij,cj->ci", cameras.K, cameras.t)[:, None]
     a = uv[..., None] * KR[:, :, 2:] - KR[:, :, :2]
@@ -169,6 +173,8 @@ def _solve(a: Float, b: Float, weight: Float) -> tuple[Float, Float]:
     right = np.einsum("cnki,cnk->ni", a, b * w)
     size = np.einsum("nii->n", information)
     regular = np.linalg.det(information) > MIN_DETERMINANT * size**3
+
+    # Singular systems are replaced by the identity, and their result by NaN.
     enough = ((weight > 0).sum(0) >= MIN_VIEWS) & regular
     safe = np.where(enough[:, None, None], information, np.eye(3))
     p = np.linalg.solve(safe, right[..., None])[..., 0]
@@ -183,8 +189,12 @@ def _best_pair(
     b: Float,
 ) -> Float:
     """The points ``[N, 3]`` with the smallest robust cost: of a camera pair, or linear from all."""
+    # The linear solution of all cameras is the first candidate.
     best, _ = _solve(a, b, weight)
     cost = robust_cost(cameras.errors(best, uv), weight)
+
+    # A detection that is wrong in one camera spoils the pairs with that camera
+    # only.
     pairs = [list(pair) for pair in combinations(range(len(cameras)), 2)]
     if len(pairs) > MAX_PAIRS:
         pairs = [pairs[k * PROGRESSION % len(pairs)] for k in range(MAX_PAIRS)]
@@ -243,11 +253,14 @@ def points_and_cost(
     weight: Float,
 ) -> tuple[Float, Float]:
     """Points ``[F, J, 3]`` of ``uv [C, F, J, 2]``, ``weight [C, F, J]``, and their cost ``[F]``."""
+    # Frames and joints are points like any others.
     C, F, J = weight.shape
     flat = weight.reshape(C, -1)
     found = robust(
         cameras, uv.reshape(C, -1, 2), flat, QUICK_ITERATIONS, np.inf
     )
+
+    # Points that were not found cost nothing here: they would favour no side.
     seen = np.where(np.isfinite(found.error), flat, 0.0)
     cost = robust_cost(found.error, seen)
     return found.p.reshape(F, J, 3), cost.reshape(F, J).sum(-1)
@@ -264,6 +277,8 @@ def _group_flips(
     weight = weight[:, :, joints]
     C, F, _ = weight.shape
 
+    # Points and cost of any choice of flips; a few rounds of reweighting are
+    # enough.
     def points(flips: Bool, frames: Ints) -> tuple[Float, Float]:
         flips = flips[..., None]
         sided = apply_flips(uv[:, frames], flips, adjacent)

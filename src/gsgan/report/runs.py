@@ -132,6 +132,7 @@ def check_same(
             other, expected = first.setdefault(what, (run, value))
             text = f"{expected} and {value}"
             if isinstance(value, dict):
+                # Of records, the keys that differ are named.
                 keys = sorted(value.keys() | expected.keys())
                 text = ", ".join(
                     k for k in keys if value.get(k) != expected.get(k)
@@ -219,6 +220,8 @@ def read_run(folder: Path, *, scored: bool = True) -> ScoredRun:
         scores = (
             json.loads((folder / METRICS_FILE).read_text()) if scored else {}
         )
+
+        # Figures may show runs that are not scored.
         found = folder / FACTS_FILE
         facts = json.loads(found.read_text()) if found.is_file() else {}
         settings = _read_settings(folder)

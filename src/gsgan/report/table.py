@@ -147,6 +147,8 @@ class Part:
                     value, note = _value(run, self.split, variant, metric)
                     seed = str(run.seed)
                     rows.append((run.name, variant, column, seed, value, note))
+
+        # One line per score: pandas then takes means over any of the columns.
         names = ["name", "variant", "column", "seed", "value", "note"]
         frame = pd.DataFrame(rows, columns=names)
 
@@ -448,6 +450,8 @@ def _row(part: Part, spec: RowSpec, *, beside_paper: bool) -> Row:
     # Next to the paper's numbers, a row is named as the paper's method if all its runs are.
     notes = list(dict.fromkeys(_marks(runs, part.split)))
     if beside_paper:
+        # Beside the paper's numbers, what differs from the paper's settings is
+        # said.
         departures = [run.departures for run in runs]
         if None in departures:
             notes.append("no config says whether it is experiment=paper")
@@ -496,6 +500,8 @@ def _with_best(rows: Sequence[Row], part: Part) -> list[Row]:
             mean = cells[i].mean
             if mean is not None:
                 means.append(mean)
+
+        # A single number is not the best of anything.
         better = METRICS[metric].better
         if len(means) < 2 or not better:
             continue

@@ -111,6 +111,7 @@ class Format:
         with_origin = self.origin and any(row.origin for row in grid.rows)
         rows = []
         for row in grid.rows:
+            # Rows that are no runs are in italics, best cells are bold.
             pattern = "{}" if row.kind == "run" else self.italic
             line = [cell(row.label, row.notes, pattern)]
             for c in row.cells:

@@ -81,6 +81,8 @@ class Drive:
         """The frames at some indices, numbered from 0 if an index repeats."""
         # Files are named by number, so numbers must not repeat.
         numbers = [self.numbers[i] for i in chosen]
+
+        # Frames that occur twice cannot keep their numbers as file names.
         if len(set(numbers)) < len(numbers):
             numbers = list(range(len(numbers)))
 
@@ -247,6 +249,8 @@ def _joined(
             clip.p, ((0, 0), lacking, (0, 0)), constant_values=np.nan
         )
         parts.append(padded @ standard.T)
+
+    # Frames between two clips are made by `joined`.
     between = max(1, round(seconds * fps) - 1)
     p = joined(parts, proportions, between) @ standard
 
@@ -278,6 +282,8 @@ def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
     asf = None if skeleton is None else Path(skeleton).expanduser()
     up = None if config.up is None else one_of("up", config.up, UP_AXES)
     animation = None if config.animation is None else str(config.animation)
+
+    # What the readers need to know of the subject.
     source = Source(proportions, model, asf, up, animation)
     motion = read_motion(Path(path).expanduser(), source)
     motion = checked(motion, float(config.min_visibility))

@@ -239,12 +239,16 @@ class Densify(nn.Module):
         buffer("part_id", np.repeat(parts, [*counts, n_face, n_torso]))
         buffer("template_points", np.concatenate(points))
         buffer("normals", np.concatenate(normals))
+
+        # The shapes that every skeleton places anew.
         buffer("_limb_points", limbs.points)
         buffer("_bone_points", bones.points)
         buffer("_limb_sigma", self._sigma_by_limb())
         buffer("_face_points", sphere.points)
         buffer("_torso_points", box.points)
         buffer("_torso_rest", torso_rest)
+
+        # The joints that face and torso are measured by, and all pairs of them.
         buffer("_face", t.face)
         buffer("_face_pairs", np.array(list(combinations(t.face, 2))).T)
         buffer("_torso_pairs", np.array(list(combinations(t.torso, 2))).T)

@@ -120,6 +120,9 @@ def _with_hands() -> SkeletonTemplate:
         limbs += _limbs(side)
         parents += [parents[forearm], *[HUBS_WITH_PALMS + first] * len(FINGERS)]
         directions += [POSE.rest_directions[forearm]] * (1 + len(FINGERS))
+
+        # The first bone of a finger follows the palm, each further one the bone
+        # before.
         for k, chain in enumerate(_chains(start)):
             place = HUBS_WITH_PALMS + len(parents)
             parents += [N_HUBS + side, place, place + 1]

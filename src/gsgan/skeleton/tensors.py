@@ -121,6 +121,8 @@ def _constants(
 
     # Limbs by level, each with the position of its parent's frame.
     ordered = list(chain.from_iterable(t.levels))
+
+    # Frames are stored hubs first, then limbs level by level.
     starts, ends = zip(*t.limbs, strict=True)
     position = dict(enumerate(range(t.n_hubs)))
     for k, limb in enumerate(ordered):

@@ -74,6 +74,9 @@ def project(
     t = camera.t.to(wide)
     x_cam = R @ gaussians.means.to(wide).mT + t.unsqueeze(-1)
     in_front = x_cam.detach()[:, 2] > settings.near
+
+    # Gaussians behind the camera are moved in front, so that nothing divides by
+    # 0.
     ahead = constant(((0.0,), (0.0,), (1.0,)), x_cam)
     x_cam = torch.where(in_front.unsqueeze(1), x_cam, ahead)
     depths = x_cam[:, 2]

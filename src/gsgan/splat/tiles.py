@@ -193,6 +193,7 @@ class _Walk:
 
     def gradients(self) -> tuple[Tensor, Tensor, Tensor]:
         """The gradients of geometry ``[B, N, 5]``, opacities ``[B, N]``, values ``[B, N, V]``."""
+        # The last row is the transparent one, which has no gradient.
         sums = self.sums[:-1].to(self.geometry)
         opacities = self.opacities[:-1].to(self.geometry)
         geometry = _geometry_gradient(self.geometry[:-1], opacities, sums)
@@ -315,12 +316,16 @@ class _Walk:
         )
 
     def _place(self, ids: Tensor, rows: Tensor, chunk: slice) -> _Place:
+        # The mean relative to the centre of the tile, in the dtype of the
+        # geometry.
         x, y, p, k, r = self.geometry[ids].unbind(-1)
         centre_x, centre_y = self.centres[chunk][rows].unsqueeze(1).unbind(-1)
         dx = centre_x - x
         dy = centre_y - y
         u = (p * (dx + k * dy)).clamp_(-U_MAX, U_MAX)
         v = (r * dy).clamp_(-U_MAX, U_MAX)
+
+        # Only now in the dtype of the values: large numbers have cancelled.
         w = p * k
         dtype = self.values.dtype
         return _Place(

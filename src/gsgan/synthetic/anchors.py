@@ -302,6 +302,8 @@ class _Face:
             ball = self.c.with_descendants(self.c.bones.index(bone))
             seen = np.isin(self.main[self.vertex], ball) & (self.vertex >= 0)
             if seen.any():
+                # Corners and lids are where the visible part of the eyeball
+                # ends.
                 rows, columns = np.nonzero(seen)
                 left = self.x[columns.max()]
                 right = self.x[columns.min()]
@@ -369,6 +371,8 @@ class _Face:
             jump = jump * (below[:, None] & central)
             slit = jump > 0.1 * jump.max()
             if slit.any():
+                # The line of the lips, and the corners of the mouth at its
+                # ends.
                 columns = np.flatnonzero(slit.any(axis=0))
                 heights = self.z[jump.argmax(axis=0)[columns]]
                 line = np.interp(self.x, self.x[columns], heights)

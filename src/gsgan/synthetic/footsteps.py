@@ -60,6 +60,9 @@ class Footsteps:
             for goal, minimum in zip(goals, march, strict=True):
                 move = goal - place
                 distance = np.linalg.norm(move[:2])
+
+                # A foot steps if its goal is far enough, or if the passage
+                # marches.
                 far = distance > MIN_STEP or abs(move[2]) > MIN_TURN
                 steps = minimum > 0.03 or far
                 shift.append(move * steps)

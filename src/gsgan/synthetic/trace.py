@@ -385,9 +385,13 @@ class PosedCharacter:
         # Light of the sun where nothing blocks it, with the highlight.
         towards = self._sun_directions(disc)
         facing = _dot(normal, towards)[:, 0]
+
+        # Only points that face the sun, and that nothing shades.
         k = np.flatnonzero(facing > 0)
         start = lifted[k] + np.float32(SHADOW_OFFSET) * flat[k]
         k = k[~self.tracer.blocked(start, towards[k])]
+
+        # Blinn-Phong's highlight, about half-way between sun and camera.
         half = _unit(towards[k] - ray[k])
         lobe = np.maximum(_dot(normal[k], half), 0) ** np.float32(SHININESS)
         shine = (
@@ -429,6 +433,8 @@ class PosedCharacter:
         ring = np.sqrt(1 - z * z)
         sphere = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
 
+        # The light that arrives, and what would if nothing were in the way, on
+        # both sides.
         sky = np.mean(self.light.sky)
         ground = np.mean(self.light.ground)
         arrived = np.zeros((len(X), 2), np.float32)
@@ -441,6 +447,7 @@ class PosedCharacter:
             light = ground + (sky - ground) * (0.5 + 0.5 * d[2])
             weight = np.abs(cosine) * np.float32(light)
 
+            # Rays start a little above the surface, which would block them.
             start = X + np.float32(SKY_OFFSET) * np.sign(cosine)[:, None] * N
             free = ~self.tracer.blocked(start, np.tile(d, (len(X), 1)))
             possible[rows, inside] += weight

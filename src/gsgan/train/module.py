@@ -221,6 +221,8 @@ class AvatarTraining(LightningModule):
 
         # The frame in a window, trained by the phase that the iteration belongs to.
         frame = self._cut(frame)
+
+        # The phases follow each other; each trains other parts.
         phase = self.schedule.phase(self.step)
         self._frame = frame
         if phase == SEGMENTATION:
@@ -262,6 +264,8 @@ class AvatarTraining(LightningModule):
 
         # L_Ψ and, in the later part of Step I, L_perc of the same image.
         terms = {"step_one/loss": self.step_one_loss(rendering, frame)}
+
+        # The perceptual loss joins after a share of Step I.
         weight = self.step_one.perceptual
         done = self.schedule.share_of_step_one(self.step)
         if (

@@ -107,6 +107,7 @@ def run_training(config: DictConfig) -> None:
             )
             return
 
+    # What remains is checked, recorded and printed before the work begins.
     refuse_long_cpu_run(config, data, module, module.schedule.total - done)
     module.code = training_code()
     describe(console, folder, config, data, module)

@@ -180,6 +180,7 @@ def entry(
         try:
             command()
         except CompactHydraException as error:
+            # The cause names the key; Hydra's own sentence does not.
             cause = error.__cause__
             more = (
                 f"\n{cause}"

@@ -249,6 +249,7 @@ class Session:
         # A motion that plays goes on by the frames that have passed since the last image.
         now = time.monotonic()
         if self.play.value and len(self.drive.p) > 1:
+            # A frame that is due later is waited for; late frames are skipped.
             early = self.started + 1 / self.show.fps - now
             if early > 0:
                 return early
@@ -325,6 +326,8 @@ class Session:
         current = self._current()
         camera = self.camera(share)
         p, visibility, body = inputs_of(avatar, current, 0)
+
+        # Maps are computed only if a layer shows them.
         maps = layer != FINAL_IMAGE or self.splats.value
         with torch.no_grad():
             rendering = avatar(p, visibility, camera, body, maps=maps)
@@ -386,6 +389,8 @@ class Session:
                 line_width=3.0,
             )
             self._nodes.append(lines)
+
+        # The body is posed on the CPU: the browser needs its vertices.
         if self.mesh.value and body is not None and pose is not None:
             vertices = body.posed_vertices(pose.to("cpu"))[0]
             mesh = scene.add_mesh_simple(

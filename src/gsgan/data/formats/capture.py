@@ -152,6 +152,8 @@ def _find(
         hands = _read_landmarks(
             root / HANDS_FILE, 2 * HAND, conventions, limits, notes
         )
+
+    # A face of other landmarks is refused by its names.
     face = None
     if (root / FACE_FILE).exists():
         face = _read_landmarks(
@@ -385,6 +387,8 @@ def _read_poses(
 
     # The poses, and those that follow the hands too.
     suffixes = ["", "_hands"] if "theta_hands" in arrays else [""]
+
+    # Poses with hands are stored beside those without.
     rotations = []
     moves = []
     for suffix in suffixes:

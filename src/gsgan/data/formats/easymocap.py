@@ -95,6 +95,8 @@ class EasymocapReader(FolderReader):
         people = _read_people(
             root, place, frames_of(images), self.person, notes
         )
+
+        # Landmarks on the fitted body, or the keypoints themselves.
         motion = None
         body = None
         if kind == "smpl":
@@ -142,6 +144,7 @@ class EasymocapReader(FolderReader):
         notes += calibration.notes
         known = calibration.cameras
 
+        # The size of the images is not in the calibration.
         cameras = {}
         for name, files in images.items():
             if name not in known:

@@ -74,6 +74,8 @@ def landmarks_of(
         expression = None
         if motion.expression is not None:
             expression = torch.from_numpy(motion.expression[part])
+
+        # Only the vertices that are landmarks are posed.
         found, joints = small.pose(
             torch.from_numpy(motion.theta[part]),
             torch.from_numpy(motion.betas[part]),

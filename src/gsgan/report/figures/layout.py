@@ -68,6 +68,8 @@ def draw_panels(
         height, width = panel.image.shape[-2:]
         aspect = max(aspect, height / width)
         note_lines = max(note_lines, len(panel.note.splitlines()))
+
+    # The size of the page follows from the images: none is stretched.
     rows = len(panels)
     columns = len(panels[0])
     page_width = COLUMN_WIDTH if columns <= 3 else PAGE_WIDTH

@@ -133,6 +133,8 @@ def make_shots(
     shots: list[Shot] = []
     for first in range(0, len(frames), batch_size):
         batch = frames[first : first + batch_size]
+
+        # One window size for all frames of a batch.
         boxes = body_window(
             torch.cat([frame.skeleton for frame in batch]),
             cat([frame.camera for frame in batch]),
