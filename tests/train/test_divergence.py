@@ -59,7 +59,7 @@ def test_what_is_not_finite_is_skipped_and_stops_the_run_when_it_recurs(
     first, change, cause = CASES[case]
     spoil = Spoil(change, first)
     module, trainer, data = make("training.max_skipped=2", callbacks=[spoil])
-    with pytest.raises(GsganError, match=rf"iteration {first + 1}: 2 of"):
+    with pytest.raises(GsganError, match=rf"iteration {first + 1}.* 2 of"):
         trainer.fit(module, data)
     assert list(module.skipped.steps) == [first, first + 1]
     assert re.search(
