@@ -269,6 +269,8 @@ def surface_gradient(
     rows = (3 * a.unsqueeze(1) + torch.arange(3)).flatten().numpy()
     ends = b.repeat_interleave(3).numpy()
     starts = a.repeat_interleave(3).numpy()
+
+    # Sparse: a point depends on its few neighbours only.
     values = share.flatten().numpy()
     shape = (3 * count, count)
     plus = csr_array((values, (rows, ends)), shape)

@@ -69,6 +69,8 @@ def read_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], tuple[int, ...]]:
     parents = _parents(
         expect_array(raw, "kintree_table", (2, None), path), path
     )
+
+    # SMPL-X keeps directions of shape and of expression in one array.
     J = len(parents)
     directions = expect_array(raw, "shapedirs", (V, 3, None), path)
     S = directions.shape[-1]

@@ -612,6 +612,8 @@ class Solver(nn.Module):
             damping = torch.where(
                 better[:, None], easier, damping * DAMPING_INCREASE
             )
+
+            # A worse step is undone, with its equations.
             best_q = _chosen(better, q, best_q)
             best_root = _chosen(better, root, best_root)
             best = NormalEquations(*map(partial(_chosen, better), new, best))

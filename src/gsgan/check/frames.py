@@ -60,6 +60,7 @@ def skeleton_doubts(subject: CheckedData, limits: Limits) -> list[Doubt]:
         text: Callable[[int, int], str],
     ) -> None:
         """Adds the frames in which any of the flags ``[F, N]`` holds."""
+        # One doubt a frame, which lists the joints.
         for row in np.flatnonzero(flags.any(1)).tolist():
             texts = []
             for place in np.flatnonzero(flags[row]).tolist():

@@ -164,6 +164,8 @@ def person_window(view: MaskView, joints: Float, size: tuple[int, int]) -> Crop:
     low = box.min(0)
     high = box.max(0)
     across, along = np.maximum((high - low) * (1 + 2 * TILE_MARGIN), 8)
+
+    # Tiles of one shape: the box grows in one direction.
     height = max(along, across / ASPECT)
     width = height * ASPECT
     left, top = (low + high) / 2 - (width / 2, height / 2)

@@ -333,6 +333,7 @@ def _contents(m: Measurements) -> Section:
     for name, files in subject.pairs.items():
         lacking = sorted(set(frames) - set(files))
         if lacking:
+            # Long lists of numbers are shortened to ranges.
             text = f"{len(lacking)} of the {len(frames)} frames: {shortened(lacking)}"
             found.append(
                 Finding("warning", "files", f"camera {name} lacks {text}")

@@ -113,6 +113,8 @@ def subject_of(data: GsganData) -> CheckedData:
     pairs = {}
     for name in layout.camera_names:
         pairs[name] = sorted(layout.images[name])
+
+    # Landmarks as arrays over all frames.
     p = []
     visibility = []
     for frame in layout.frames:

@@ -107,6 +107,8 @@ def fixed_cameras(
     for name, group in groups.items():
         where = f"{path}, camera {name}"
         R, centre = _one_pose(where, group, float(extent))
+
+        # All images of a camera share one lens.
         lens = group[0].lens
         cameras[name] = make_camera(
             where,
@@ -377,6 +379,8 @@ def _nerfstudio_lens(where: str, values: Mapping[str, Any]) -> Lens:
     focal = None
     if "camera_angle_x" in values:
         focal = width / 2 / np.tan(value("camera_angle_x") / 2)
+
+    # Without a second focal length, pixels are square.
     fx = value("fl_x", focal)
 
     # The principal point is the middle of the image unless it is given.

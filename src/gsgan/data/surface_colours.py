@@ -82,6 +82,7 @@ def surface_colours(
         points = _hull(frames)
         colours = [_colours(frame, points) for frame in frames]
         for i, j in combinations(range(len(frames)), 2):
+            # Points that one of the two does not see are NaN.
             difference = colours[i] - colours[j]
             both = difference[~np.isnan(difference[:, 0])]
             if len(both) >= MIN_SHARED:

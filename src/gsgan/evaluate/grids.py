@@ -77,6 +77,7 @@ def write_grid(
     # Images of other sizes are padded at the right and at the bottom.
     lines = []
     for row in rows:
+        # The images of a row beside each other.
         padded = []
         for image in row.values():
             h, w = image.shape[-2:]

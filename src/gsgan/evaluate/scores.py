@@ -188,6 +188,8 @@ def means(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
                 reason = NO_LPIPS
             elif metric in LABEL_METRICS and not left_out:
                 reason = NO_NAMED_LABELS
+
+            # Metrics with a value have no reason.
             result[f"{metric}_reason"] = reason
     return result
 

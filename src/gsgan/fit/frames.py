@@ -91,6 +91,8 @@ class MaskedFrames:
             ]
             for camera in rotated(seeing, max_cameras, turn):
                 items.append((camera, frame))
+
+        # Images at the data's own size and crop.
         self.dataset = CaptureDataset(
             layout, items, data.size, data.crop, lens=data.lens
         )
@@ -169,6 +171,8 @@ class MaskedFrames:
             skeleton = torch.from_numpy(landmarks.p[frame]).to(
                 self.device, torch.float32
             )
+
+            # Masks are measured around the skeleton: other people do not count.
             seen = around(skeleton, self._silhouette(place))
             mask = seen.mask
             if seen.unsure is not None:

@@ -73,6 +73,7 @@ def fit_report(
         ("registered", before, found),
         ("driven", body, driven),
     ):
+        # Joints that were not seen have no distance.
         metres = (of_body.posed_landmarks(pose) - masked.skeletons).norm(dim=-1)
         distance[name] = torch.where(visible, 1000 * metres, torch.nan)
         overlap[name] = fitter.overlap(pose)

@@ -257,6 +257,7 @@ class _Pairs(NamedTuple):
 
 
 def _pairs() -> _Pairs:
+    # Pairs of landmarks whose distance no pose changes, or hardly.
     names = MEDIAPIPE33.names
     first: list[int] = []
     second: list[int] = []
@@ -310,6 +311,8 @@ def _fit_lengths(
     b = b[used]
     sigma = sigma[used]
     target = target[used]
+
+    # Without any length the body's size is unknown.
     if not len(a):
         raise DataError(
             "fit_shape: no frame shows a limb of which the body has both ends"
@@ -403,6 +406,8 @@ def _fit_landmarks(
         direct = G.mT @ (w * G)
         slope = (G.mT @ (w * at.residual.flatten(1).unsqueeze(-1))).squeeze(-1)
         solved = torch.linalg.solve(H, torch.cat([C, g.unsqueeze(-1)], dim=-1))
+
+        # The prior keeps what no landmark shows.
         A = (direct - C.mT @ solved[..., :-1]).sum(0) * share + prior.diag()
         slope = slope - (C.mT @ solved[..., -1:]).squeeze(-1)
         b = slope.sum(0) * share + prior * x

@@ -188,6 +188,8 @@ def crop_person(
     batch = torch.arange(len(mask), device=mask.device)[:, None, None, None]
     y = y[..., :, None]
     x = x[..., None, :]
+
+    # All squares of all images at once, by their indices.
     cut = []
     for image in images:
         squares = image.movedim(1, -1)[batch, y, x]

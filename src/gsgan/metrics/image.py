@@ -257,6 +257,8 @@ def edge_scores(
         # F1 is the harmonic mean of precision and recall.
         precision = (edges & near_truth).sum() / max(count, 1)
         recall = (truth & near_edges).sum() / expected
+
+        # The harmonic mean of both; 0 if no edge is near.
         f1 = 0.0
         total = precision + recall
         if total:

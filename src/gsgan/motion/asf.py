@@ -135,6 +135,7 @@ def _read_skeleton(path: Path) -> _Skeleton:
         else:
             sections[section].append(line)
 
+    # A file that was cut off ends within a section.
     for name in ("root", "bonedata", "hierarchy"):
         _refuse_cut(name, sections[name])
 

@@ -49,6 +49,8 @@ def read_bvh(path: Path) -> RigMotion:
         if words[:1] != ["HIERARCHY"] or not motion:
             raise ValueError("HIERARCHY and MOTION are expected")
         joints = _read_hierarchy(words[1:])
+
+        # Each frame has a number for every channel.
         columns = sum(len(joint.channels) for joint in joints)
         values, frame_time = _read_values(motion[0], columns)
         return _rig_motion(joints, values, frame_time)
@@ -137,6 +139,8 @@ def _rig_motion(
         given = local[:, j].copy()
         for channel in joint.channels:
             axis = "XYZ".index(channel[0].upper())
+
+            # Channels have their columns in the order of the joints.
             column = next(columns)
             if channel.lower().endswith("rotation"):
                 angle = np.radians(column[:, None])

@@ -231,6 +231,9 @@ class GltfFile:
             "QUATERNION": "quat",
             "EXPONENTIAL": "exp",
         }
+
+        # Filters are the format's names for quantised normals, rotations and
+        # numbers.
         name = packed.get("filter", "NONE")
         if name != "NONE":
             unfilter = getattr(decoder, f"decode_filter_{filters[name]}")

@@ -208,6 +208,7 @@ def _sampled(channel: _Channel, times: Array, rotation: bool) -> Array:
     times = times.clip(keys[0], keys[-1])
     before = np.searchsorted(keys, times + SAME_TIME, side="right") - 1
     if len(keys) == 1 or channel.interpolation == "STEP":
+        # A single key, or steps: the value of the key before.
         values = channel.values
         if channel.interpolation == "CUBICSPLINE":
             values = values[:, 1]
@@ -306,6 +307,7 @@ def _posed(
                 channel, times, rotation=path == "rotation"
             )
         else:
+            # A property without keys is the same in all frames.
             constant = np.array(own, np.float64)
             sampled[path] = np.broadcast_to(
                 constant, (len(times), len(constant))

@@ -69,6 +69,8 @@ class Orbit:
         share = np.arange(F) / max(F, 1)
         turned = np.radians(self.start + 360 * self.turns * share)
         azimuth = heading(p[0] @ to_world) + turned
+
+        # The height stays the same during the turn.
         elevation = np.radians(self.elevation)
         sine = np.sin(azimuth)
         cosine = np.cos(azimuth)

@@ -261,6 +261,8 @@ def _body_pose(
     F, bones, _ = theta.shape
     if "trans" in arrays:
         arrays = {**arrays, "transl": arrays["trans"]}
+
+    # Lengths have the unit of the capture.
     meta = _meta(path)
     scale = METRES.get(meta.get("unit", "m"), 1.0)
     transl = scale * expect_array(arrays, "transl", (F, 3), path)
@@ -318,8 +320,12 @@ def _smpl(
     model = read_smpl(source.smpl)
     poses = _smpl_poses(path, arrays)
     F = len(poses)
+
+    # Without a translation the person stays in place.
     moves = np.asarray(_first(arrays, MOVE_KEYS, np.zeros((F, 3))), np.float64)
     moves = moves.reshape(F, 3) / arrays.get(SCALE_KEY, 1.0)
+
+    # One shape for the motion: the median over frames.
     betas = np.asarray(_first(arrays, SHAPE_KEYS, np.zeros(10)), np.float64)
     betas = np.median(betas.reshape(-1, betas.shape[-1]), axis=0)
     betas = betas[: model.shapedirs.shape[-1]]
@@ -573,6 +579,7 @@ def _read_rig(path: Path, source: Source) -> Clip:
     else:
         unit = f"units of {100 * metres:.3g} cm"
 
+    # Landmarks at the joints of the subject's bones.
     p = rig_landmarks(standard, source.subject)
     return Clip(
         path=path,

@@ -140,6 +140,7 @@ def finger_hinges(
     opposite = joint[side + "HandPinky1"] + 0.03 * palm
 
     for finger in FINGERS:
+        # Each phalanx is bent against the one before.
         before = forward
         for k, (bone, end) in enumerate(phalanges(joint, side, finger)[:3]):
             along = unit(joint[end] - joint[bone])

@@ -239,6 +239,7 @@ def standard_motion(
     if up is None:
         axis = _upward(posed, known, usual=zero_axis)
     else:
+        # The user's axis, with its sign.
         axis = np.zeros(3)
         axis["xyz".index(up[-1])] = -1.0 if up.startswith("-") else 1.0
     known = _by_side(posed, known, axis)
@@ -544,6 +545,9 @@ def _bend_in_plane(turns: dict[str, Array], joints: dict[str, Array]) -> None:
         local = matvec(turns[first].mT, lower)
         away = local @ hinge
         forward = local @ np.cross(hinge, along)
+
+        # As a complex number: its angle is the direction of the bend, and its
+        # size the weight.
         bend = forward + 1j * away
         mean = (bend * np.hypot(forward, away)).mean()
         if abs(mean) <= MIN_BEND**2:

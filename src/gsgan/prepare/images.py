@@ -149,6 +149,7 @@ def write_images(
     written = list[int]()
     last = max(frames, default=-1)
     for number, image in source.images():
+        # The offset of the camera's clock, in frames.
         frame = number + offset
         if frame > last:
             break

@@ -95,6 +95,8 @@ def run_tool(
         python = ensure_environment(tool, options.setup, say)
 
         def one(name: str, advance: Advance) -> None:
+            # The tool has its own environment, so everything goes through the
+            # command line.
             given = {
                 "source": str(sources[name].path),
                 "out": str(results[name]),
@@ -136,6 +138,7 @@ def _detect(command: list[str], source: Path, advance: Advance) -> None:
         try:
             assert process.stdout is not None
             for line in process.stdout:
+                # Other lines are MediaPipe's own messages.
                 done, _, count = line.partition(" ")
                 if done.isdigit() and count.strip().isdigit():
                     advance(int(done), int(count))

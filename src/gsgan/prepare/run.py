@@ -58,6 +58,7 @@ def summarise(outcome: Outcome) -> dict[str, Any]:
     )
     cameras = {}
     for c, name in enumerate(inputs.sources):
+        # The errors after each stage tell which one went wrong.
         error = solution.error[c]
         by_stage = {
             stage: median(px[c]) for stage, px in solution.stages.items()
@@ -231,6 +232,8 @@ def prepare(options: Options, console: Console) -> Path:
     # The dataset, in a folder of its own until it is complete; a run that was killed leaves one.
     root = stages.path("dataset", key)
     shutil.rmtree(root, ignore_errors=True)
+
+    # The dataset appears at once, when it is complete.
     written = _write_images(options, inputs, masks, frames, solution, root)
     outcome = Outcome(options, inputs, frames, solution, written)
     write_files(root, outcome, key)
@@ -332,6 +335,8 @@ def _undistorted(
     frames = frames[chosen]
     px = px[:, chosen, joints]
     conf = conf[:, chosen, joints]
+
+    # Parts that the user leaves out count as not seen.
     conf[:, :, HANDS] *= options.hands
     conf[:, :, FACE] *= options.face
     sizes = np.array([camera.size[::-1] for camera in inputs.cameras])
@@ -368,6 +373,8 @@ def _in_metres(
         uv.reshape(C, -1, 2)
     )
     p = robust(rig, pixels, conf[:, :, :BODY].reshape(C, -1)).p.reshape(F, J, 3)
+
+    # The median over frames: single joints may be wrong.
     seen = torch.from_numpy(known(p))
     limbs = limb_length_sum(
         torch.from_numpy(np.nan_to_num(p)), seen

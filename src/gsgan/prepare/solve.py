@@ -187,6 +187,8 @@ def solve(
         "plain": cameras.errors(linear, flat_uv),
         "robust": robust(cameras, flat_uv, flat_weight).error,
     }
+
+    # Swapped sides first: they would bend the cameras.
     found = correct(cameras, scaled, weight)
     stages["flips"] = found.points.error
     cameras, found = _refined(cameras, scaled, weight, found, settings)
@@ -332,6 +334,8 @@ def clock_errors(
     C, F, _ = weight.shape
     delay = np.full(C, np.nan)
     gain = np.full(C, np.nan)
+
+    # Two cameras cannot tell whose clock is late.
     lag = min(LAG, F - 1)
     cameras, uv = cameras.normalised(uv)
     if C <= MIN_VIEWS or lag < 1:

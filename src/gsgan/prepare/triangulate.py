@@ -281,6 +281,8 @@ def _group_flips(
     # enough.
     def points(flips: Bool, frames: Ints) -> tuple[Float, Float]:
         flips = flips[..., None]
+
+        # Weights belong to their detections.
         sided = apply_flips(uv[:, frames], flips, adjacent)
         seen = apply_flips(weight[:, frames], flips, adjacent)
         return points_and_cost(cameras, sided, seen)
@@ -331,6 +333,8 @@ def cheapest_flips(
         # The camera whose change saves most is changed.
         best = saved.argmax(0)
         better = saved.max(0) > 0
+
+        # Frames in which nothing is saved are done.
         active = active[better]
         best = best[better]
         if not len(active):

@@ -183,6 +183,8 @@ def seen(
     pixel = pixels[0]
     depth = depths[0]
     radius = reach * camera.focal[0].mean() / depth
+
+    # Points behind the camera have no place in the image.
     ahead = (depth > tolerance) & pixel.isfinite().all(-1)
     visible = torch.zeros_like(ahead)
     if not ahead.any():

@@ -222,6 +222,8 @@ class Densify(nn.Module):
             finger, self.finger_radius_ratio, along[list(t.fingers)]
         )
 
+        # Names with an underscore follow from the settings: checkpoints do not
+        # hold them.
         def buffer(name: str, value: object) -> None:
             tensor = torch.as_tensor(np.asarray(value))
             if tensor.is_floating_point():

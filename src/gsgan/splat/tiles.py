@@ -92,6 +92,7 @@ class _Composite(torch.autograd.Function):
         )
         saved: list[list[tuple[Tensor, Tensor]]] = []
         for chunk in walk.chunks():
+            # Blocks are needed again if anything has a gradient.
             sums, blocks = walk.forward(chunk, needs_grad)
             canvas[lists.tiles[chunk]] = sums
             saved.append(blocks)
@@ -217,6 +218,7 @@ class _Walk:
         save: bool,
     ) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
         """Blended values ``[T, V, P]``, and for each block its tiles and incoming transmittance."""
+        # The lists of the chunk's tiles, the longest first.
         starts = self.lists.starts[chunk]
         counts = self.lists.counts[chunk]
         depths = self.lists.depths[chunk]

@@ -110,6 +110,8 @@ def _hand(c: Character, main: Ints, side: str) -> Anchors:
     for finger, absent in zip(FINGERS, ABSENT_FINGERS, strict=True):
         for k, part in enumerate(THUMB if finger == "Thumb" else SEGMENTS):
             name = f"{side.lower()}_{finger.lower()}_{part}"
+
+            # Rigs may have fewer phalanges, or no fingers.
             bone = at.get(f"{side}Hand{finger}{k + 1}")
             last = at.get(f"{side}Hand{finger}{k}", -1)
             tip = np.flatnonzero(main == last)
@@ -275,6 +277,8 @@ class _Face:
             # The vertex nearest to the mean of the outermost ones.
             outwards = np.where(level, sign * x[:, 0], -np.inf)
             ear = x[outwards > outwards.max() - 0.012].mean(axis=0)
+
+            # The vertex of skin nearest to the middle of the ear's outer part.
             far = np.linalg.norm(x - ear, axis=1)
             found[f"{side}_ear"] = int(
                 np.where(self.skin, far, np.inf).argmin()
@@ -386,6 +390,8 @@ class _Face:
         for k in range(LIP_POINTS):
             angle = 2 * np.pi * k / LIP_POINTS
             x = centre + half * np.cos(angle)
+
+            # The lower lip is thicker than the upper one.
             rise = np.sin(angle)
             thickness = (0.11 if rise > 0 else 0.14) * d
             height = float(np.interp(x, self.x, line))

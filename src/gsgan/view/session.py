@@ -347,6 +347,8 @@ class Session:
         # The size of the image, and the rate over the last seconds.
         now = time.monotonic()
         self.times.append(now)
+
+        # The rate over the last moments, not since the start.
         recent = [x for x in self.times if x > now - SPEED_OVER]
         height, width = self.image.shape[:2]
         status = f"{width} × {height}"

@@ -100,6 +100,7 @@ class EasymocapReader(FolderReader):
         motion = None
         body = None
         if kind == "smpl":
+            # SMPL's joints need the user's model.
             file, model = body_model(root / place, smpl, "smpl")
             motion = zju_motion(people, model)
             body = BodyModel("smpl", str(file), tuple(motion.betas[0].tolist()))

@@ -71,6 +71,8 @@ def landmarks_of(
     conf = []
     for first in range(0, len(motion.ids), CHUNK):
         part = slice(first, first + CHUNK)
+
+        # Only SMPL-X has expressions.
         expression = None
         if motion.expression is not None:
             expression = torch.from_numpy(motion.expression[part])

@@ -175,6 +175,8 @@ class Detector:
         reach = MARGIN * (high - low).max()
         left, top = np.clip(low - reach, 0, [width - 1, height - 1]).astype(int)
         right, bottom = np.clip(high + reach, 1, [width, height]).astype(int)
+
+        # A person at the border may leave no pixels.
         if right - left < 2 or bottom - top < 2:
             return None
 

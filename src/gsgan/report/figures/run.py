@@ -198,6 +198,8 @@ def make_figures(config: DictConfig) -> None:
     out = folders[0] / "figures"
     if config.out is not None:
         out = Path(config.out).expanduser()
+
+    # Every run's config is read before the first avatar is loaded.
     moved = DataPaths.from_config(config)
     for folder in folders:
         load_config(folder, moved)

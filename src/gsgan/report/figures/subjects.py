@@ -218,6 +218,8 @@ def _open(
     avatar, marks = load_avatar(folder, config, data)
     run = read_run(folder, scored=False)
     found = run.data | {"fingerprint": fingerprint(data)}
+
+    # The figures' data may differ from those of the scores.
     run = replace(run, seed=config.seed, data=found)
     name = TITLES.get(run.name, run.name)
     if run.name == "full" and run.departures == []:
