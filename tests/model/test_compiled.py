@@ -4,9 +4,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from gsgan.body import open_body
 from gsgan.losses import photometric
 from gsgan.model import compiled
+from gsgan.model.body_points import BodyPoints
 from gsgan.model.deformation import Deformation, Residuals
+from gsgan.scene import BodyPose
 from gsgan.skeleton.densify import Points
 from gsgan.splat import native
 
@@ -45,6 +48,42 @@ def test_photometric(monkeypatch, shape, near):
     torch.testing.assert_close(
         *both(monkeypatch, photometric, "_compiled", run), **CLOSE
     )
+
+
+@pytest.mark.parametrize("stretch", [True, False])
+@pytest.mark.parametrize("batch", [1, 2])
+def test_points_on_a_skinned_body(monkeypatch, stretch, batch):
+    """Values, and the gradient of the skinning weights, far from the origin too."""
+    torch.manual_seed(0)
+    body = open_body("free", None, None, None)
+    placed = BodyPoints(body, 1.7, points=300, controls=20, stretch=stretch)
+    placed = placed.double()
+    field = placed.points.learnt.field
+    torch.nn.init.normal_(field)
+    wide = {"dtype": torch.float64}
+    theta = 0.5 * torch.randn(batch, len(body.joints), 3, **wide)
+    transl = torch.tensor([[30.0, -3.0, 1.0]], **wide).expand(batch, 3)
+    weights = torch.randn(batch, 300, 3, **wide)
+
+    def run():
+        placed.renew()
+        points = placed(BodyPose(theta, transl))
+        (slope,) = torch.autograd.grad((points.means * weights).sum(), field)
+        found = [points.means, points.frames, points.origins, points.normals]
+        found += [points.stretched] if stretch else []
+        return [x.detach() for x in found] + [slope]
+
+    torch.testing.assert_close(
+        *both(monkeypatch, compiled, "has_skinned", run), **CLOSE
+    )
+
+
+def test_a_gradient_of_the_bones_takes_the_tensor_operations():
+    body = open_body("free", None, None, None)
+    placed = BodyPoints(body, 1.7, points=100)
+    theta = torch.zeros(1, len(body.joints), 3, requires_grad=True)
+    placed(BodyPose(theta, torch.zeros(1, 3))).stretched.sum().backward()
+    assert theta.grad.abs().sum() > 0
 
 
 @pytest.mark.parametrize("bound", [0.25, None])

@@ -5,6 +5,8 @@ import json
 import os
 import struct
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -44,6 +46,29 @@ def test_a_half_made_environment_is_made_again(tmp_path):
             tool.ensure_environment(missing, True, print)
         (place / "half").touch()
     assert (place / tool.MARKER).is_file()
+
+
+def test_commands_that_start_at_once_make_one_environment(
+    tmp_path, monkeypatch
+):
+    made = []
+
+    def run(command, what):
+        made.append(what)
+        (tmp_path / "env" / "bin").mkdir(exist_ok=True)
+        (tmp_path / "env" / "bin" / "python").touch()
+        time.sleep(0.05)
+
+    monkeypatch.setattr(tool, "_run", run)
+    given = MediaPipe(folder=str(tmp_path / "env"), python=sys.executable)
+    with ThreadPoolExecutor(2) as pool:
+        found = list(
+            pool.map(
+                tool.ensure_environment, [given] * 2, [True] * 2, [str] * 2
+            )
+        )
+    assert found[0] == found[1]
+    assert len(made) == 3  # environment, packages, a first start: once each
 
 
 def load_detector(monkeypatch):

@@ -246,7 +246,11 @@ def blend_transforms(
 
 
 def stretched(
-    A: Tensor, transforms: Tensor, columns: Tensor, factors: Tensor
+    A: Tensor,
+    transforms: Tensor,
+    vertices: Tensor,
+    bones: Tensor,
+    slopes: Tensor,
 ) -> Tensor:
     """The Jacobian of skinning at each vertex: how the surface about it turns and stretches.
 
@@ -257,7 +261,8 @@ def stretched(
     Args:
         A: ``[B, V, 3, 3]`` from :func:`blend_transforms`.
         transforms: ``[B, J, 4, 4]`` from :func:`forward_kinematics`.
-        columns, factors: from :class:`gsgan.body.skinned.WeightGradients`.
+        vertices: ``[V, 3]`` at rest.
+        bones, slopes: from :class:`gsgan.body.skinned.WeightGradients`.
 
     Returns:
         ``[B, V, 3, 3]``: ``A + Σ_b (ΔB_b x_c) ∇w_bᵀ``.
@@ -266,16 +271,12 @@ def stretched(
     """
     # Gradients sum to zero: less the root's place, numbers are as small as distances of bones.
     turns, places = transforms[:, :, :3].split((3, 1), dim=-1)
-    affine = torch.cat([turns, places - places[:, :1]], dim=-1)
+    places = places - places[:, :1]
 
-    # One lookup sums the terms of all poses: its table has a row for each bone and column, and its
-    # numbers are the poses and axes.
-    table = affine.permute(1, 3, 0, 2).flatten(2).flatten(0, 1)
-    terms = embedding_bag(
-        columns, table, per_sample_weights=factors.to(table), mode="sum"
-    )
-    terms = terms.unflatten(1, (-1, 3)).unflatten(0, (-1, 3))
-    return A + terms.permute(2, 0, 3, 1)
+    # Where each bone carries the vertex, [B, V, KEPT, 3].
+    moved = turns[:, bones] @ vertices.to(turns)[:, None, :, None]
+    moved = (moved + places[:, bones]).squeeze(-1)
+    return A + moved.mT @ slopes.to(moved)
 
 
 def skin(vertices: Tensor, A: Tensor, t: Tensor) -> Tensor:

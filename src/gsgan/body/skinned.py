@@ -163,7 +163,6 @@ class WeightGradients(nn.Module):
     Source: ours.
     """
 
-    homogeneous: Tensor  # [N, 4] rest positions and 1
     # The gradient operator as a compressed sparse matrix, 3 rows per vertex.
     rows: Tensor
     columns: Tensor
@@ -175,11 +174,7 @@ class WeightGradients(nn.Module):
 
         # The rows of the operator are the axes of each vertex.
         operator = surface_gradient(body.vertices, body.faces, chosen)
-        places = body.vertices[chosen].float()
         buffers = {
-            "homogeneous": torch.cat(
-                [places, torch.ones_like(places[:, :1])], dim=1
-            ),
             "rows": torch.from_numpy(operator.indptr[:-1]).long(),
             "columns": torch.from_numpy(operator.indices).long(),
             "values": torch.from_numpy(operator.data).float(),
@@ -198,9 +193,8 @@ class WeightGradients(nn.Module):
             index, weight: ``[N, n]`` bones of each chosen vertex and their weights.
 
         Returns:
-            ``[3 N, 4 KEPT_BONES]``: for each chosen vertex and axis, columns of the bones'
-            transforms, int64 from 0 to 4 J, and their factors: products of the vertex's position
-            and the gradients.
+            ``[N, KEPT_BONES]`` int64 bones, and the gradients ``[N, KEPT_BONES, 3]`` of their
+            weights, per metre.
         """
         # The gradients [N, 3, J] of all bones' weights.
         weight = (weight / weight.sum(dim=1, keepdim=True)).to(self.values)
@@ -220,14 +214,7 @@ class WeightGradients(nn.Module):
         _, bones = change.topk(min(KEPT_BONES, self.joints), dim=1)
         slopes = slopes.gather(2, bones.unsqueeze(1).expand(-1, 3, -1))
         slopes = slopes - slopes.mean(dim=2, keepdim=True)
-
-        # Times the vertex's homogeneous position, [N, 3, KEPT, 4].
-        factors = slopes.unsqueeze(-1) * self.homogeneous[:, None, None]
-        columns = 4 * bones.unsqueeze(-1) + torch.arange(4, device=bones.device)
-        columns = columns.unsqueeze(1).expand_as(factors)
-        return columns.flatten(2).flatten(0, 1), factors.flatten(2).flatten(
-            0, 1
-        )
+        return bones, slopes.mT.contiguous()
 
 
 def surface_gradient(

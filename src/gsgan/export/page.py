@@ -252,20 +252,13 @@ def gaussians_of(avatar: Avatar) -> tuple[Plain, Arrays]:
 
 
 def slopes_of(on_body: BodyPoints) -> tuple[NDArray, NDArray]:
-    """Bones ``[N, n]`` and the gradients ``[N, n, 3]`` of their weights, 1 / metre.
-
-    Source: `gsgan.body.skinned.WeightGradients`, whose factors are these times (x, 1).
-    """
+    """Bones ``[N, n]`` and the gradients ``[N, n, 3]`` of their weights, 1 / metre."""
     count = on_body.n_points
     if not on_body.stretch:
         return np.zeros((count, 1), np.uint8), np.zeros((count, 1, 3))
 
-    # Each bone has four columns, x y z 1; the factor of the last one is the gradient itself.
-    columns, factors = on_body.stretch_terms()
-    shape = (count, 3, -1, 4)
-    bones = columns.view(shape)[:, 0, :, 0] // 4
-    gradients = factors.view(shape)[..., 3]
-    return bones.numpy().astype(np.uint8), gradients.numpy().swapaxes(1, 2)
+    bones, slopes = on_body.stretch_terms()
+    return bones.numpy().astype(np.uint8), slopes.numpy()
 
 
 def body_of(run: Run) -> tuple[Plain, Arrays]:

@@ -20,6 +20,7 @@ from gsgan.body import (
 from gsgan.body.lbs import stretched
 from gsgan.body.skinned import WeightGradients, vertex_normals
 from gsgan.body.subdivide import subdivided
+from gsgan.model import compiled
 from gsgan.scene import BodyPose, Gaussians
 from gsgan.skeleton import Points
 from gsgan.utils.checks import above, whole
@@ -301,15 +302,16 @@ class BodyPoints(nn.Module):
             `gsgan.body.lbs.stretched`.
         stretch_every: iterations of training between updates of the stretch's terms, which change
             slowly with the learnt weights.
+        scale_spacings: largest standard deviation of a Gaussian, in median distances of
+            neighbouring points; None: Ψ's own bound.
         controls: of `LearntWeights`; 0 keeps the body's skinning weights.
         rate: of these weights' learning, times that of Ψ.
     """
 
     rest_points: Tensor
     rest_normals: Tensor
-    part_id: Tensor
-    own_columns: Tensor
-    own_factors: Tensor
+    own_bones: Tensor
+    own_slopes: Tensor
     _terms: tuple[Tensor, Tensor] | None
     _age: int
 
@@ -325,6 +327,7 @@ class BodyPoints(nn.Module):
         mean_step: float = 1.0,
         stretch: bool = True,
         stretch_every: int = 1,
+        scale_spacings: float | None = None,
         controls: int = 0,
         rate: float = 1.0,
     ) -> None:
@@ -347,6 +350,14 @@ class BodyPoints(nn.Module):
         self.mean_step = mean_step
         self.rate = above("model.body_points.rate", rate)
 
+        # The bound of Ψ's scales, in body heights.
+        self.scale_max = None
+        if scale_spacings is not None:
+            above("model.body_points.scale_spacings", scale_spacings)
+            self.scale_max = (
+                scale_spacings * self.pixels_apart(1.0) / body_height
+            )
+
         # Places at rest tell Ψ one point from another; normals move with the pose.
         rest = (self.points.means - self.points.means.mean(dim=0)) / body_height
         self.register_buffer("rest_points", rest, persistent=False)
@@ -354,11 +365,6 @@ class BodyPoints(nn.Module):
             self.points.chosen
         ]
         self.register_buffer("rest_normals", normals, persistent=False)
-
-        # Each point is a part of its own, because its skinning gives it a frame of its own.
-        self.register_buffer(
-            "part_id", torch.arange(len(self.points)), persistent=False
-        )
 
         # The stretch's terms need the gradients of the weights over the surface. Where the
         # weights are fixed, the terms are fixed too.
@@ -371,9 +377,9 @@ class BodyPoints(nn.Module):
             # Without learnt weights, their gradients are constants.
             self.gradients = WeightGradients(body, self.points.chosen)
             if self.points.learnt is None:
-                columns, factors = self.gradients(*self.points.weights)
-                self.register_buffer("own_columns", columns, persistent=False)
-                self.register_buffer("own_factors", factors, persistent=False)
+                steep, slopes = self.gradients(*self.points.weights)
+                self.register_buffer("own_bones", steep, persistent=False)
+                self.register_buffer("own_slopes", slopes, persistent=False)
 
     @property
     def n_points(self) -> int:
@@ -385,10 +391,10 @@ class BodyPoints(nn.Module):
         return scale * float(self.points.spacing.median())
 
     def stretch_terms(self) -> tuple[Tensor, Tensor]:
-        """Columns and factors of `gsgan.body.lbs.stretched`, of the weights that move the means."""
+        """Bones and slopes of `gsgan.body.lbs.stretched`, of the weights that move the means."""
         learnt = self.points.learnt
         if learnt is None:
-            return self.own_columns, self.own_factors
+            return self.own_bones, self.own_slopes
 
         def make() -> tuple[Tensor, Tensor]:
             return self.gradients(*self.points.weights)
@@ -423,39 +429,50 @@ class BodyPoints(nn.Module):
 
         Normals, and shapes if ``stretch`` is set, are moved by the Jacobian of the skinning.
         """
-        pose = self.points.with_bones(pose)
-        assert pose.bones is not None
-
-        # The means, moved by LBS.
-        A, t = self.points.blend(pose)
-        means = skin(self.points.means, A, t)
-
-        # Only the means give the weights a gradient.
-        if not pose.bones.requires_grad:
-            A = A.detach()
-            t = t.detach()
-
-        # Shapes and normals follow the stretch of the surface.
-        jacobian = (
-            stretched(A, pose.bones, *self.stretch_terms())
-            if self.stretch
-            else None
-        )
+        bones = self.points.with_bones(pose).bones
+        assert bones is not None
+        terms = self.stretch_terms() if self.stretch else None
+        means, A, t, jacobian, normals = self._skinned(bones, terms)
 
         # Shapes start as spheres of a share of the spacing at rest.
-        scales = (self.sigma * self.points.spacing).expand(len(A), -1)
+        scales = (self.sigma * self.points.spacing).expand(len(means), -1)
         return Points(
             means=means,
             rotations=A,
             origins=t,
             scales=scales,
             valid=torch.ones_like(scales, dtype=torch.bool),
-            part_id=self.part_id,
-            normals=moved_normals(
-                A if jacobian is None else jacobian, self.rest_normals
-            ),
+            part_id=None,
+            normals=normals,
             stretched=jacobian,
         )
+
+    def _skinned(
+        self, bones: Tensor, terms: tuple[Tensor, Tensor] | None
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor]:
+        """Means, frames, origins, Jacobians and normals; in compiled code if it can be used."""
+        weights = self.points.weights
+        rest = self.points.means
+        if compiled.has_skinned(bones, weights[1]):
+            return compiled.skinned(
+                bones, rest, self.rest_normals, weights, terms, NORMAL_FLOOR
+            )
+
+        # The means, moved by LBS. Only they give the weights a gradient.
+        A, t = blend_transforms(bones, *weights)
+        means = skin(rest, A, t)
+        if not bones.requires_grad:
+            A = A.detach()
+            t = t.detach()
+
+        # Shapes and normals follow the stretch of the surface.
+        jacobian = None
+        if terms is not None:
+            jacobian = stretched(A, bones, rest, *terms)
+        normals = moved_normals(
+            A if jacobian is None else jacobian, self.rest_normals
+        )
+        return means, A, t, jacobian, normals
 
 
 def points_for(body_height: float, scale: float, spacing: float) -> int:

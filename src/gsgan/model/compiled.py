@@ -1,6 +1,7 @@
-"""The geometry of Ĝ from Ψ's raw residuals in compiled code, on CPUs.
+"""Points on a skinned body, and the geometry of Ĝ, in compiled code, on CPUs.
 
-`gsgan.model.deformation.Deformation` calls it, and defines the same by tensor operations.
+`gsgan.model.body_points.BodyPoints` calls `skinned`, `gsgan.model.deformation.Deformation` calls
+`geometry`; both define the same by tensor operations.
 """
 
 import ctypes
@@ -25,6 +26,126 @@ _Job = build.job_type(
         "d_raw",
     ),
 )
+
+SKINNED = ("means", "frames", "origins", "shapes", "normals")
+SKIN_INPUTS = (
+    "bones",
+    "rest",
+    "normals",
+    "index",
+    "weight",
+    "steep",
+    "slopes",
+)
+# struct SkinJob of kernels/skin.h
+_SkinJob = build.job_type(
+    ("poses", "count", "threads", "joints", "followed", "kept"),
+    ("floor",),
+    (*SKIN_INPUTS, *(f"out_{name}" for name in SKINNED), "g_means", "d_weight"),
+)
+
+
+def has_skinned(bones: Tensor, weight: Tensor) -> bool:
+    """Whether `skinned` can be used: on a CPU, where no transform of a bone needs a gradient."""
+    return (
+        bones.device.type == "cpu"
+        and bones.dtype in build.DTYPES
+        and weight.dtype == bones.dtype
+        and not bones.requires_grad
+        and native.available()
+    )
+
+
+def skinned(
+    bones: Tensor,
+    rest: Tensor,
+    normals: Tensor,
+    weights: tuple[Tensor, Tensor],
+    slopes: tuple[Tensor, Tensor] | None,
+    floor: float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor]:
+    """Points on a skinned body in B poses; means are differentiable once, in the weights.
+
+    Args:
+        bones: ``[B, J, 4, 4]``.
+        rest, normals: ``[N, 3]`` at rest.
+        weights: ``[N, n]`` bones of each point and their weights, which are divided by their sum.
+        slopes: of `gsgan.body.skinned.WeightGradients`; None: shapes follow the frames alone.
+        floor: share of the area at rest at which a normal fades.
+
+    Returns:
+        Means ``[B, N, 3]``, frames and origins (A and t of LBS), the Jacobians ``[B, N, 3, 3]``
+        (None without slopes) and normals ``[B, N, 3]``.
+    """
+    index, weight = weights
+    steep, slope = (None, None) if slopes is None else slopes
+    inputs = (bones, rest, normals, index, weight, steep, slope)
+    means, frames, origins, shapes, turned = _Skin.apply(floor, *inputs)
+    return means, frames, origins, None if slopes is None else shapes, turned
+
+
+class _Skin(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, floor: float, *inputs: Tensor | None
+    ) -> tuple[Tensor, ...]:
+        bones, rest = inputs[:2]
+        assert bones is not None
+        assert rest is not None
+
+        # The job points to the inputs and to empty outputs, which the compiled code fills.
+        size = (len(bones), len(rest))
+        means, origins, normals = (bones.new_empty(*size, 3) for _ in range(3))
+        frames, shapes = (bones.new_empty(*size, 3, 3) for _ in range(2))
+        outputs = (means, frames, origins, shapes, normals)
+        job, _held = _skin_job(floor, inputs)
+        build.point(job, [f"out_{name}" for name in SKINNED], outputs)
+        build.function("skin", bones.dtype)(ctypes.byref(job))
+
+        # Only the means have a gradient.
+        ctx.floor = floor
+        ctx.save_for_backward(*inputs)
+        ctx.mark_non_differentiable(frames, origins, shapes, normals)
+        return outputs
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, g_means: Tensor, *_: Any) -> tuple[Any, ...]:  # type: ignore[override]
+        inputs = ctx.saved_tensors
+        weight = inputs[SKIN_INPUTS.index("weight")]
+        job, _held = _skin_job(ctx.floor, inputs)
+        incoming = g_means.contiguous()
+        d_weight = torch.empty_like(
+            weight, memory_format=torch.contiguous_format
+        )
+        build.point(job, ("g_means", "d_weight"), (incoming, d_weight))
+        build.function("skin_backward", weight.dtype)(ctypes.byref(job))
+        gradients: list[Any] = [None] * (1 + len(inputs))
+        gradients[1 + SKIN_INPUTS.index("weight")] = d_weight
+        return tuple(gradients)
+
+
+def _skin_job(
+    floor: float, inputs: tuple[Tensor | None, ...]
+) -> tuple[ctypes.Structure, list[Tensor | None]]:
+    """The job without its outputs, and the tensors it points to."""
+    # The tensors must live as long as the job, which holds addresses only.
+    held = [None if x is None else x.detach().contiguous() for x in inputs]
+    bones, rest, _, index, _, steep, _ = held
+    assert bones is not None
+    assert rest is not None
+    assert index is not None
+    job = _SkinJob(
+        len(bones),
+        len(rest),
+        build.threads(),
+        bones.shape[1],
+        index.shape[1],
+        0 if steep is None else steep.shape[1],
+        floor,
+    )
+    build.point(job, SKIN_INPUTS, held)
+    return job, held
 
 
 def has_geometry(raw: Tensor, means: Tensor, *fixed: Tensor) -> bool:

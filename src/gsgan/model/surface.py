@@ -26,6 +26,8 @@ class SurfaceGaussians(SkinnedGaussians):
         opacity, scale: initial values, see `SkinnedGaussians`.
         mean_bound: largest distance of a mean from its vertex, body heights.
         scale_min, scale_max: body heights, the range of every scale.
+        scale_spacings: replaces scale_max where given: the largest scale in median distances of
+            neighbouring points.
         logit_bound: opacity logits are kept within ± this.
 
     Source: the baselines of the paper's Sec. 4.
@@ -43,6 +45,7 @@ class SurfaceGaussians(SkinnedGaussians):
         mean_bound: float = 0.25,
         scale_min: float = 1e-4,
         scale_max: float = 0.06,
+        scale_spacings: float | None = None,
         logit_bound: float = 8.0,
     ) -> None:
         super().__init__(body, points, opacity, scale)
@@ -59,6 +62,9 @@ class SurfaceGaussians(SkinnedGaussians):
         # Bounds of what is learned.
         self.mean_bound = mean_bound
         self.logit_bound = logit_bound
+        if scale_spacings is not None:
+            spacing = float(self.points.spacing.median())
+            scale_max = scale_spacings * spacing / self.body_height
         self.scale_range = (scale_min, scale_max)
 
         # Means start at their vertices, colours at grey.

@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
+from filelock import FileLock
+
 from gsgan.prepare.images import find_masks
 from gsgan.prepare.landmarks import find_landmarks
 from gsgan.prepare.options import MEDIAPIPE, MediaPipe, Options
@@ -187,6 +189,19 @@ def ensure_environment(
             "MediaPipe needs Python 3.11 or 3.12: set mediapipe.python=<path>"
         )
 
+    # Two commands that start at once must not both write the folder.
+    with writing(place):
+        place.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(place.with_name(f".{place.name}.lock")):
+            if not (place / READY).is_file():
+                _create(place, base, python, say)
+    return python
+
+
+def _create(
+    place: Path, base: str, python: Path, say: Callable[[str], None]
+) -> None:
+    """Creates the environment at ``place`` with ``base``, which becomes ``python``."""
     # The folder, marked as made here.
     with writing(place):
         if place.exists():
@@ -216,7 +231,6 @@ def ensure_environment(
     _run([str(python), "-c", "import mediapipe"], "MediaPipe does not start")
     with writing(place):
         (place / READY).touch()
-    return python
 
 
 def _run(command: list[str], what: str) -> None:

@@ -225,6 +225,8 @@ def _assembled(
         own: dict[str, Any] = {}
         if body_points:
             own["mean_step"] = body_points.mean_step
+            if body_points.scale_max is not None:
+                own["scale_max"] = body_points.scale_max
         # A config with normals=null leaves it to the number of cameras.
         if (
             getattr(parts.deformation, "keywords", {}).get("normals", False)

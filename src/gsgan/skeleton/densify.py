@@ -58,7 +58,8 @@ class Points:
     origins: Tensor
     scales: Tensor  # [B, N] metres, initial standard deviation, isotropic
     valid: Tensor  # [B, N] bool, False on parts whose joints are unseen
-    part_id: Tensor  # [N] int64 into the parts
+    # [N] int64 into the parts; None: each point is a part of its own
+    part_id: Tensor | None
     normals: Tensor  # [B, N, 3] outward, world frame, unit length
     # [B, N, 3, 3] linear maps for covariances if they differ from `frames`
     stretched: Tensor | None = None
@@ -66,6 +67,8 @@ class Points:
     @property
     def frames(self) -> Tensor:
         """``[B, N, 3, 3]``: each point's part frame."""
+        if self.part_id is None:
+            return self.rotations
         return self.rotations.index_select(1, self.part_id)
 
     @property
@@ -75,7 +78,7 @@ class Points:
 
     def take(self, chosen: Tensor) -> "Points":
         """The points of these numbers, ``[B, M]`` int64; each is a part of its own."""
-        parts = self.part_id[chosen]
+        parts = chosen if self.part_id is None else self.part_id[chosen]
         stretched = self.stretched
         return Points(
             means=_rows(self.means, chosen),
@@ -83,7 +86,7 @@ class Points:
             origins=_rows(self.origins, parts),
             scales=_rows(self.scales, chosen),
             valid=_rows(self.valid, chosen),
-            part_id=torch.arange(chosen.shape[1], device=chosen.device),
+            part_id=None,
             normals=_rows(self.normals, chosen),
             stretched=None if stretched is None else _rows(stretched, chosen),
         )
@@ -93,7 +96,10 @@ class Points:
 
         The frames have to be rotations, as those of `Densify` are.
         """
-        offset = self.means - self.origins.index_select(1, self.part_id)
+        origins = self.origins
+        if self.part_id is not None:
+            origins = origins.index_select(1, self.part_id)
+        offset = self.means - origins
         return (offset.unsqueeze(-2) @ self.frames).squeeze(-2)
 
 

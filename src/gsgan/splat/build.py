@@ -66,6 +66,8 @@ _FUNCTIONS = (
     # parts of the model, losses and body
     "compose",
     "compose_backward",
+    "skin",
+    "skin_backward",
     "photometric",
     "solve",
 )

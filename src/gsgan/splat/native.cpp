@@ -21,6 +21,7 @@
 #include "kernels/forward.h"
 #include "kernels/photometric.h"
 #include "kernels/project.h"
+#include "kernels/skin.h"
 #include "kernels/solve.h"
 
 #ifdef _OPENMP
@@ -132,6 +133,10 @@ int gsgan_compose_backward_float32(const ComposeJob* job) {
 int gsgan_compose_backward_float64(const ComposeJob* job) {
   return gsgan::compose_backward<double>(*job);
 }
+int gsgan_skin_float32(const SkinJob* job) { return gsgan::skin<float>(*job); }
+int gsgan_skin_float64(const SkinJob* job) { return gsgan::skin<double>(*job); }
+int gsgan_skin_backward_float32(const SkinJob* job) { return gsgan::skin_backward<float>(*job); }
+int gsgan_skin_backward_float64(const SkinJob* job) { return gsgan::skin_backward<double>(*job); }
 int64_t gsgan_solve_job_size() { return sizeof(SolveJob); }
 int gsgan_solve_float32(const SolveJob* job) { return gsgan::solve<float>(*job); }
 int gsgan_solve_float64(const SolveJob* job) { return gsgan::solve<double>(*job); }
