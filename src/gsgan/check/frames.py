@@ -245,6 +245,8 @@ def jumped(distance: Float, limit: float) -> Bool:
     """
     # A row of zeros before and after: the first and last frame have one neighbour.
     known = np.pad(np.nan_to_num(distance), ((1, 1), (0, 0)))
+
+    # A tie counts as a peak: two equal jumps are both named.
     before = known[:-2]
     here = known[1:-1]
     after = known[2:]

@@ -337,6 +337,7 @@ def body_silhouette(
     ]
     for a, b in [*template.limbs, *outline]:
         if drawn[a] and drawn[b]:
+            # As thick as at the end that is farther away.
             width = thickness(2 * FLESH * min(metre[a], metre[b]), size)
             cv2.line(canvas, at[a].tolist(), at[b].tolist(), 1, width)
 

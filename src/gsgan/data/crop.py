@@ -198,6 +198,8 @@ def undistort(points: Float, dist: Float) -> Float:
     if points.size == 0:
         return points
     eye = np.eye(3)
+
+    # Iterative, since the lens model has no inverse in closed form.
     raw = _undistort(
         points[:, None],
         eye,
@@ -269,6 +271,8 @@ def fold_radius(
     # without p1 and p2
     radial = np.where(np.isin(np.arange(8), (2, 3)), 0, dist)
     along_x = np.stack([radii, np.zeros(samples)], axis=-1)
+
+    # Along one axis: without tangential terms all directions are alike.
     shown = distort(along_x, radial)[:, 0]  # [samples]
     folded = np.flatnonzero(np.diff(shown) <= 0)
     return float(radii[folded[0]]) if len(folded) else None
@@ -315,6 +319,7 @@ def resize(
     if image.shape[:2] == size:
         return image
     if exact:
+        # A mean of labels would be another label.
         mode = cv2.INTER_NEAREST_EXACT
     elif size[0] < image.shape[0]:
         mode = cv2.INTER_AREA

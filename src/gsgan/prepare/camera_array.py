@@ -65,6 +65,7 @@ class CameraArray:
         Thresholds in such pixels hold for images of any size, and cameras of different sizes count
         alike.
         """
+        # The first two rows of K, and the pixels, scale alike.
         ratio = UNIT_FOCAL / self.focal
         K = self.K.copy()
         K[:, :2] *= ratio[:, None, None]
@@ -100,6 +101,9 @@ class CameraArray:
         """
         pixels, depth = self.project(p)
         error = np.linalg.norm(pixels - uv, axis=-1)
+
+        # A point behind the camera contradicts the detection, however near its
+        # pixel is.
         behind = np.where(np.isfinite(error), np.inf, np.nan)
         return np.where(depth <= NEAR, behind, error)
 
@@ -113,6 +117,8 @@ def undistort_points(camera: CameraEntry, px: Float) -> Float:
     homogeneous = np.c_[px[seen], np.ones(seen.sum())]
     rays = homogeneous @ np.linalg.inv(camera.K).T
     straight = undistort(rays[:, :2], camera.dist)
+
+    # Back to pixels by the same K.
     result = np.full(px.shape, np.nan)
     result[seen] = straight @ camera.K[:2, :2].T + camera.K[:2, 2]
     return result
@@ -159,11 +165,14 @@ def refine_cameras(
     square = LOSS_SCALE**2
     poses = 6 * len(start)
 
+    # Rotations are small turns of the start, since rotation matrices have no
+    # free parameters.
     def cameras_at(x: Float) -> CameraArray:
         changes = x[:poses].reshape(-1, 2, 3)
         R = Rotation.from_rotvec(changes[:, 0]).as_matrix() @ start.R
         return replace(start, R=R, t=start.t + changes[:, 1])
 
+    # Turns and moves in units of their standard deviations.
     def priors(cameras: CameraArray) -> Float:
         turned = _turns(given, cameras) / np.radians(rotation_prior)
         moved = (cameras.centres - given.centres) / position_prior
@@ -197,6 +206,7 @@ def refine_cameras(
     def world_priors(x: Float) -> Float:
         return priors(_similar(cameras, x))
 
+    # Seven numbers: three of a turn, three of a move, and the scale.
     world = least_squares(world_priors, np.zeros(7))
     return _similar(cameras, world.x)
 
@@ -204,6 +214,9 @@ def refine_cameras(
 def _similar(cameras: CameraArray, x: Float) -> CameraArray:
     """The cameras in a world turned by ``x[:3]``, moved by ``x[3:6]``, scaled by exp ``x[6]``."""
     turn = Rotation.from_rotvec(x[:3]).as_matrix()
+
+    # x_cam = R x + t stays the same up to the scale, so centres move and t
+    # follows from them.
     R = cameras.R @ turn
     centres = np.exp(x[6]) * cameras.centres @ turn + x[3:6]
     return replace(cameras, R=R, t=-np.einsum("cij,cj->ci", R, centres))
@@ -219,6 +232,8 @@ def _sparsity(
     # Two rows per detection: u and v.
     at_camera = 6 * camera[:, None] + np.arange(6)
     at_point = 6 * cameras + 3 * point[:, None] + np.arange(3)
+
+    # Nine columns per row: six of the camera, three of the point.
     columns = np.c_[at_camera, at_point].repeat(2, axis=0)
     rows = np.arange(len(columns)).repeat(9)
     parameters = 6 * cameras + 3 * points
@@ -237,6 +252,7 @@ def camera_moves(
     before: CameraArray, after: CameraArray
 ) -> tuple[Float, Float]:
     """Each camera's rotation ``[C]`` in degrees, and its move ``[C]`` in millimetres."""
+    # A rotation vector is as long as its angle.
     turned = np.linalg.norm(_turns(before, after), axis=-1)
     moved = np.linalg.norm(after.centres - before.centres, axis=-1)
     return np.degrees(turned), 1000 * moved
@@ -244,4 +260,5 @@ def camera_moves(
 
 def _turns(before: CameraArray, after: CameraArray) -> Float:
     """Rotation vectors ``[C, 3]`` from the orientations before to those after."""
+    # The turn that takes the first orientation to the second, in camera axes.
     return Rotation.from_matrix(after.R @ before.R.mT).as_rotvec()

@@ -69,6 +69,7 @@ class Rollback:
 
         It is "" for nothing, and None for a state that is not good enough to be kept.
         """
+        # Nothing was rendered yet.
         if not self.means:
             return ""
 
