@@ -88,6 +88,8 @@ def run_tool(
     folders = {}
     for name, source in sources.items():
         key = [source.fingerprint(), source.rotate, tool_key(), parts, masks]
+        if options.person is not None:
+            key.append(list(options.person))
         folders[name] = stages.path(f"mediapipe-{name}", key)
         results[name] = folders[name].with_suffix(".npz")
 
@@ -105,6 +107,7 @@ def run_tool(
                 "masks": str(folders[name]) if masks else "",
                 **parts,
                 "rotate": sources[name].rotate,
+                "person": options.person and list(options.person),
                 "slot": missing.index(name) % options.workers,
                 "threads": tool.threads,
             }

@@ -17,6 +17,7 @@ from gsgan.data.validation import Thresholds, check_distance
 from gsgan.motion.rotations import between
 from gsgan.prepare import landmarks
 from gsgan.prepare.camera_array import (
+    FILM,
     CameraArray,
     camera_moves,
     undistort_points,
@@ -28,12 +29,19 @@ from gsgan.prepare.dataset import (
     standing_direction,
     write_files,
 )
+from gsgan.prepare.from_person import calibrate_from_person
 from gsgan.prepare.images import write_images
 from gsgan.prepare.landmarks import Detections
 from gsgan.prepare.mediapipe import find_people, tool_key
 from gsgan.prepare.one_camera import solve_video
 from gsgan.prepare.one_view import USUAL_HEIGHT
-from gsgan.prepare.options import MEDIAPIPE, Inputs, Options, read_inputs
+from gsgan.prepare.options import (
+    MEDIAPIPE,
+    PERSON,
+    Inputs,
+    Options,
+    read_inputs,
+)
 from gsgan.prepare.solve import Solution, median, solve
 from gsgan.prepare.sources import stamp
 from gsgan.prepare.stages import Advance, StageFolder, digest, each_camera
@@ -44,6 +52,7 @@ from gsgan.utils.arrays import Float, Ints
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import read_json, write_json
 
+MIN_ANGLE = 30.0  # degrees between the rays of cameras found from the person
 DELAY = 0.5  # frames: larger delays of a clock are noted
 DELAY_GAIN = 0.05  # share of the error that correcting a delay must remove
 
@@ -225,6 +234,8 @@ def prepare(options: Options, console: Console) -> Path:
         )
         inputs, detections = with_detections(inputs, found)
         frames, uv, conf = _undistorted(options, inputs, detections)
+        if options.calibration == PERSON:
+            inputs = _from_person(options, inputs, uv, conf, console)
         if not inputs.calibration.metric:
             inputs = _in_metres(options, inputs, uv, conf)
         solution = _solved(options, inputs, frames, uv, conf, console)
@@ -347,6 +358,34 @@ def _undistorted(
     for c, camera in enumerate(inputs.cameras):
         uv[c] = undistort_points(camera, px[c])
     return frames, uv, conf
+
+
+def _from_person(
+    options: Options,
+    inputs: Inputs,
+    uv: Float,
+    conf: Float,
+    console: Console,
+) -> Inputs:
+    """The inputs with cameras that are found from the person, and notes on how well they agree."""
+    with console.status("finding the cameras from the person"):
+        found = calibrate_from_person(inputs.cameras, uv, conf, options.focal)
+    notes = [*inputs.notes]
+    for camera, error in zip(found.cameras, found.error, strict=True):
+        focal = float(camera.K[0, 0])
+        film = focal / float(np.hypot(*camera.size)) * FILM
+        notes.append(
+            f"{camera.name}: found from the person, {error:.1f} pixels off its landmarks, focal "
+            f"length {focal:.0f} pixels ({film:.0f} mm on film)"
+        )
+
+    # Cameras that look the same way show no depth.
+    if found.angle < MIN_ANGLE:
+        notes.append(
+            f"doubtful: the cameras look at the person from within {found.angle:.0f} degrees; "
+            "positions and focal lengths are uncertain, calibrate with a board"
+        )
+    return replace(inputs, cameras=found.cameras, notes=notes)
 
 
 def _in_metres(

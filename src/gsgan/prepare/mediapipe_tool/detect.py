@@ -1,9 +1,10 @@
 """Finds body, hand and face landmarks, and the person's mask, in one video or folder of images.
 
 Runs in its own environment (requirements.txt beside it). `gsgan.prepare.mediapipe` starts it with a
-JSON object: source, out, masks (a folder, or empty), hands, face, rotate, threads (processors; 0 is
-all), slot (number among those that run at once). Prints a line ``<images done> <images in total>``
-per image. Writes an npz:
+JSON object: source, out, masks (a folder, or empty), hands, face, rotate, person (left, top, right,
+bottom of the person in the first image, shares of width and height; null: whoever is seen best),
+threads (processors; 0 is all), slot (number among those that run at once). Prints a line
+``<images done> <images in total>`` per image. Writes an npz:
 
     px (F,33,2), conf (F,33)     pixels of the image as stored, first pixel's centre at (0.5, 0.5)
     left, right (F,21,2)         the person's hands; NaN = not found
@@ -37,6 +38,12 @@ HAND = 21
 FACE = 468
 # of the mask's crop beyond the joints, share of the person's height
 MARGIN = 0.15
+# Around a chosen person: how far the next image is searched beyond the joints, share of the
+# person's height, and how many joints of this confidence show where the person is.
+SEARCHED = 0.15
+SURE = 0.5
+MIN_SURE = 12
+GREY = 127
 
 
 def main() -> None:
@@ -60,8 +67,13 @@ def main() -> None:
     # The landmarks of each image, and its mask as a file.
     found: dict[str, list[Any]] = {}
     detector = Detector(options)
+    follower = Follower(options.person) if options.person else None
     for done, (frame, image) in enumerate(images, start=1):
+        if follower is not None:
+            image = follower.alone(image)
         landmarks = detector.landmarks(image)
+        if follower is not None:
+            follower.follow(landmarks["px"], landmarks["conf"])
         for name, value in (*landmarks.items(), ("frame_id", frame)):
             found.setdefault(name, []).append(value)
         if (
@@ -119,6 +131,38 @@ def read_image(path: Path) -> Any:
 def read_video(video: cv2.VideoCapture) -> Iterator[Any]:
     while (read := video.read())[0]:
         yield read[1]
+
+
+class Follower:
+    """One person among several: the others are painted over, as far as they are beside it.
+
+    Args:
+        box: left, top, right, bottom in the first image, shares of width and height.
+    """
+
+    def __init__(self, box: list[float]) -> None:
+        self.shares = np.array(box)
+        self.box: Any = None  # pixels: low and high corner, [2, 2]
+
+    def alone(self, image: Any) -> Any:
+        """The image, grey outside the box."""
+        size = np.array([image.shape[1], image.shape[0]])
+        if self.box is None:
+            self.box = self.shares.reshape(2, 2) * size
+        reach = SEARCHED * np.ptp(self.box, axis=0).max()
+        low = self.box[0] - reach
+        high = self.box[1] + reach
+        left, top = np.clip(low, 0, size).astype(int)
+        right, bottom = np.clip(high, 0, size).astype(int)
+        shown = np.full_like(image, GREY)
+        shown[top:bottom, left:right] = image[top:bottom, left:right]
+        return shown
+
+    def follow(self, px: Any, conf: Any) -> None:
+        """Moves the box to landmarks ``[33, 2]``, if they show a person."""
+        sure = (conf > SURE) & np.isfinite(px).all(-1)
+        if sure.sum() >= MIN_SURE:
+            self.box = np.stack([px[sure].min(0), px[sure].max(0)])
 
 
 class Detector:
