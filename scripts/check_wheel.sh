@@ -66,5 +66,4 @@ test -s run/metrics.json
 for command in prepare check fit; do
   "$python" -m gsgan.$command --help >help.txt
 done
-"$python" -m gsgan.bench speed --help >help.txt
 echo "the wheel works from $folder"

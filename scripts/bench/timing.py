@@ -7,8 +7,7 @@ from collections.abc import Callable, Hashable, Mapping
 from typing import TypeVar
 
 import torch
-
-from gsgan.bench.speed import timed
+from speed import timed
 
 Key = TypeVar("Key", bound=Hashable)
 

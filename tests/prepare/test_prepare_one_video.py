@@ -122,9 +122,9 @@ def hips_cut_off(arrays):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (nobody, "only 0 of 18 sampled images show one whole person"),
-        (no_depth, "one camera needs the array world"),
-        (hips_cut_off, "shoulders or hips cut off: "),
+        (nobody, " 0 of 18 "),
+        (no_depth, "world"),
+        (hips_cut_off, "shoulders or hips"),
     ],
 )
 def test_videos_without_a_whole_person_end_in_one_sentence(

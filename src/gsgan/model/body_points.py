@@ -37,9 +37,8 @@ SKIN = 2.1  # square metres, the surface of a body of the stature
 STATURE = 1.75  # metres
 MIN_POINTS = 5000
 MAX_POINTS = 100_000
-MIN_WEIGHT = (
-    1e-3  # a possible weight below it starts there, so that it can grow
-)
+# a possible weight below it starts there, so that it can grow
+MIN_WEIGHT = 1e-3
 
 
 class LearntWeights(nn.Module):
@@ -390,6 +389,7 @@ class BodyPoints(nn.Module):
         )
         self.renew()
         if stretch:
+            # Without learnt weights, their gradients are constants.
             self.gradients = WeightGradients(body, self.points.chosen)
             if self.points.learnt is None:
                 steep, slopes = self.gradients(*self.points.weights)

@@ -32,9 +32,8 @@ RATES = {
     "sh": 10.0,
     "features": 10.0,
 }
-UNIT = math.sqrt(
-    4 * math.pi
-)  # makes the first harmonic 1, and the mean square of each
+# makes the first harmonic 1, and the mean square of each
+UNIT = math.sqrt(4 * math.pi)
 # joints, visibility, body: `gsgan.run.drive`
 Pose = tuple[Tensor, Tensor, BodyPose | None]
 

@@ -24,9 +24,8 @@ USUAL_FOCAL = 30.0
 UNIT_FOCAL = 1000.0  # pixels; errors are then thousandths of the focal length
 MAX_EVALUATIONS = 30  # of the optimiser
 LOSS_SCALE = 5.0  # error at which a detection counts half, thousandths of the focal length
-COST_TOLERANCE = (
-    1e-7  # relative change of the cost at which the refinement ends
-)
+# relative change of the cost at which the refinement ends
+COST_TOLERANCE = 1e-7
 # Square pixels: keeps the residual's scaling finite at an error of 0.
 MIN_SQUARE = 1e-12
 
@@ -70,6 +69,7 @@ class CameraArray:
         Thresholds in such pixels hold for images of any size, and cameras of different sizes count
         alike.
         """
+        # The first two rows of K, and the pixels, scale alike.
         ratio = UNIT_FOCAL / self.focal
         K = self.K.copy()
         K[:, :2] *= ratio[:, None, None]
@@ -105,6 +105,9 @@ class CameraArray:
         """
         pixels, depth = self.project(p)
         error = np.linalg.norm(pixels - uv, axis=-1)
+
+        # A point behind the camera contradicts the detection, however near its
+        # pixel is.
         behind = np.where(np.isfinite(error), np.inf, np.nan)
         return np.where(depth <= NEAR, behind, error)
 
@@ -138,6 +141,8 @@ def undistort_points(camera: CameraEntry, px: Float) -> Float:
     homogeneous = np.c_[px[seen], np.ones(seen.sum())]
     rays = homogeneous @ np.linalg.inv(camera.K).T
     straight = undistort(rays[:, :2], camera.dist)
+
+    # Back to pixels by the same K.
     result = np.full(px.shape, np.nan)
     result[seen] = straight @ camera.K[:2, :2].T + camera.K[:2, 2]
     return result
@@ -188,6 +193,8 @@ def refine_cameras(
     size = 6 if focal_prior is None else 7
     poses = size * len(start)
 
+    # Rotations are small turns of the start, since rotation matrices have no
+    # free parameters.
     def cameras_at(x: Float) -> CameraArray:
         changes = x[:poses].reshape(-1, size)
         R = Rotation.from_rotvec(changes[:, :3]).as_matrix() @ start.R
@@ -198,6 +205,7 @@ def refine_cameras(
         K[:, [0, 1], [0, 1]] *= np.exp(changes[:, 6:])
         return replace(moved, K=K)
 
+    # Turns and moves in units of their standard deviations.
     def priors(cameras: CameraArray) -> Float:
         turned = _turns(given, cameras) / np.radians(rotation_prior)
         moved = (cameras.centres - given.centres) / position_prior
@@ -234,6 +242,7 @@ def refine_cameras(
     def world_priors(x: Float) -> Float:
         return priors(_similar(cameras, x))
 
+    # Seven numbers: three of a turn, three of a move, and the scale.
     world = least_squares(world_priors, np.zeros(7))
     return _similar(cameras, world.x)
 
@@ -241,6 +250,9 @@ def refine_cameras(
 def _similar(cameras: CameraArray, x: Float) -> CameraArray:
     """The cameras in a world turned by ``x[:3]``, moved by ``x[3:6]``, scaled by exp ``x[6]``."""
     turn = Rotation.from_rotvec(x[:3]).as_matrix()
+
+    # x_cam = R x + t stays the same up to the scale, so centres move and t
+    # follows from them.
     R = cameras.R @ turn
     centres = np.exp(x[6]) * cameras.centres @ turn + x[3:6]
     return replace(cameras, R=R, t=-np.einsum("cij,cj->ci", R, centres))
@@ -257,6 +269,8 @@ def _sparsity(
     # Two rows per detection: u and v.
     at_camera = size * camera[:, None] + np.arange(size)
     at_point = size * cameras + 3 * point[:, None] + np.arange(3)
+
+    # A row's columns: those of its camera, then three of its point.
     columns = np.c_[at_camera, at_point].repeat(2, axis=0)
     rows = np.arange(len(columns)).repeat(size + 3)
     parameters = size * cameras + 3 * points
@@ -276,6 +290,7 @@ def camera_moves(
     before: CameraArray, after: CameraArray
 ) -> tuple[Float, Float]:
     """Each camera's rotation ``[C]`` in degrees, and its move ``[C]`` in millimetres."""
+    # A rotation vector is as long as its angle.
     turned = np.linalg.norm(_turns(before, after), axis=-1)
     moved = np.linalg.norm(after.centres - before.centres, axis=-1)
     return np.degrees(turned), 1000 * moved
@@ -283,4 +298,5 @@ def camera_moves(
 
 def _turns(before: CameraArray, after: CameraArray) -> Float:
     """Rotation vectors ``[C, 3]`` from the orientations before to those after."""
+    # The turn that takes the first orientation to the second, in camera axes.
     return Rotation.from_matrix(after.R @ before.R.mT).as_rotvec()

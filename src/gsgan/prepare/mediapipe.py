@@ -99,6 +99,8 @@ def run_tool(
         python = ensure_environment(tool, options.setup, say)
 
         def one(name: str, advance: Advance) -> None:
+            # The tool has its own environment, so everything goes through the
+            # command line.
             given = {
                 "source": str(sources[name].path),
                 "out": str(results[name]),
@@ -137,15 +139,19 @@ def _detect(command: list[str], source: Path, advance: Advance) -> None:
             text=True,
         ) as process,
     ):
+        # A line of progress for each image; an interrupt ends the tool too.
         try:
             assert process.stdout is not None
             for line in process.stdout:
+                # Other lines are MediaPipe's own messages.
                 done, _, count = line.partition(" ")
                 if done.isdigit() and count.strip().isdigit():
                     advance(int(done), int(count))
         except BaseException:
             process.kill()
             raise
+
+        # The tool's last line of errors is the reason of its failure.
         if process.wait():
             errors.seek(0)
             raise DataError(

@@ -173,9 +173,8 @@ class Inputs:
     calibration: Calibration
     # in the order of the sources, with their names and sizes
     cameras: Sequence[CameraEntry]
-    notes: Sequence[
-        str
-    ]  # one sentence for each thing that was converted or left out
+    # one sentence for each thing that was converted or left out
+    notes: Sequence[str]
     fps: float
 
 

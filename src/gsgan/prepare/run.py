@@ -67,6 +67,7 @@ def summarise(outcome: Outcome) -> dict[str, Any]:
     )
     cameras = {}
     for c, name in enumerate(inputs.sources):
+        # The errors after each stage tell which one went wrong.
         error = solution.error[c]
         by_stage = {
             stage: median(px[c]) for stage, px in solution.stages.items()
@@ -89,6 +90,7 @@ def summarise(outcome: Outcome) -> dict[str, Any]:
     frames = outcome.frames.tolist()
     dropped = [frame for frame in frames if frame not in kept]
 
+    # The share of frames in which each joint came out in 3D.
     found = known(solution.p[:, :BODY]).mean(0)
     return {
         "error_px": {
@@ -183,9 +185,8 @@ def _number(value: float, form: str) -> str:
     return "-" if np.isnan(value) else format(value, form)
 
 
-STAGE_VERSION = (
-    5  # incremented when the same settings begin to give another result
-)
+# incremented when the same settings begin to give another result
+STAGE_VERSION = 5
 
 
 def prepare(options: Options, console: Console) -> Path:
@@ -218,6 +219,7 @@ def prepare(options: Options, console: Console) -> Path:
     stages = StageFolder(out.parent / f".{out.name}.prepare")
     extra: dict[str, object] = {}
     if inputs is None:
+        # One camera: the body is solved in its view, and joints come from it.
         filmed = solve_video(options, stages, console)
         inputs = filmed.inputs
         masks = filmed.masks
@@ -226,6 +228,7 @@ def prepare(options: Options, console: Console) -> Path:
         extra = {"one_camera": filmed.numbers}
         options = replace(options, face=False)
     else:
+        # Several cameras: detections, then triangulation.
         found, masks = find_people(
             options, inputs.sources, stages, console.print
         )
@@ -240,6 +243,8 @@ def prepare(options: Options, console: Console) -> Path:
     # The dataset, in a folder of its own until it is complete; a run that was killed leaves one.
     root = stages.path("dataset", key)
     shutil.rmtree(root, ignore_errors=True)
+
+    # The dataset appears at once, when it is complete.
     written = _write_images(options, inputs, masks, frames, solution, root)
     outcome = Outcome(options, inputs, frames, solution, written)
     write_files(root, outcome, key)
@@ -341,6 +346,8 @@ def _undistorted(
     frames = frames[chosen]
     px = px[:, chosen, joints]
     conf = conf[:, chosen, joints]
+
+    # Parts that the user leaves out count as not seen.
     conf[:, :, HANDS] *= options.hands
     conf[:, :, FACE] *= options.face
     sizes = np.array([camera.size[::-1] for camera in inputs.cameras])
@@ -405,6 +412,8 @@ def _in_metres(
         uv.reshape(C, -1, 2)
     )
     p = robust(rig, pixels, conf[:, :, :BODY].reshape(C, -1)).p.reshape(F, J, 3)
+
+    # The median over frames: single joints may be wrong.
     seen = torch.from_numpy(known(p))
     limbs = limb_length_sum(
         torch.from_numpy(np.nan_to_num(p)), seen
@@ -430,6 +439,8 @@ def _in_metres(
     if options.up_axis is None and upward is not None:
         turn = between(upward, np.array([0.0, 0, 1]))
         note += "; the world was turned so that the person stands along z"
+
+    # Every camera follows the turn, and its distances follow the scale.
     cameras = []
     for camera in inputs.cameras:
         cameras.append(replace(camera, R=camera.R @ turn.T, t=scale * camera.t))
@@ -487,6 +498,7 @@ def _write_images(
     cameras = {camera.name: camera for camera in inputs.cameras}
     offsets = options.offsets or {}
 
+    # One camera's images; `each_camera` runs cameras side by side.
     def one(name: str, advance: Advance) -> list[int]:
         return write_images(
             root=root,

@@ -36,9 +36,8 @@ SUFFIXES = (".jpg", ".jpeg", ".png")
 JOINTS = 33
 HAND = 21
 FACE = 468
-MARGIN = (
-    0.15  # of the mask's crop beyond the joints, share of the person's height
-)
+# of the mask's crop beyond the joints, share of the person's height
+MARGIN = 0.15
 # Around a chosen person: how far the next image is searched beyond the joints, share of the
 # person's height, and how many joints of this confidence show where the person is.
 SEARCHED = 0.15
@@ -58,10 +57,14 @@ def main() -> None:
         }
         os.sched_setaffinity(0, chosen)
     cv2.setNumThreads(options.threads or -1)
+
+    # The images, one at a time: a video does not fit into the memory.
     count, images = open_source(Path(options.source), options.rotate)
     folder = Path(options.masks) if options.masks else None
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
+
+    # The landmarks of each image, and its mask as a file.
     found: dict[str, list[Any]] = {}
     detector = Detector(options)
     follower = Follower(options.person) if options.person else None
@@ -81,6 +84,8 @@ def main() -> None:
         print(done, max(done, count), flush=True)
     if not found:
         raise SystemExit(f"{options.source} holds no image that can be decoded")
+
+    # The results appear at once, when they are complete.
     out = Path(options.out)
     part = out.with_name(f".{out.name}")
     with part.open("wb") as stream:
@@ -104,6 +109,8 @@ def open_source(
         return len(files), (
             (frame, read_image(files[frame])) for frame in sorted(files)
         )
+
+    # The length that a video's header gives may be wrong or 0.
     video = cv2.VideoCapture(str(path))
     video.set(cv2.CAP_PROP_ORIENTATION_AUTO, int(rotate))
     return int(video.get(cv2.CAP_PROP_FRAME_COUNT)), enumerate(
@@ -173,6 +180,7 @@ class Detector:
         )
 
     def landmarks(self, image: Any) -> dict[str, Any]:
+        # MediaPipe reads RGB; parts that it did not find are None.
         rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
         found = self.body.process(rgb)
         size = image.shape[1], image.shape[0]
@@ -184,6 +192,8 @@ class Detector:
             side: getattr(found, f"{side}_hand_landmarks", None)
             for side in ("left", "right")
         }
+
+        # Absent parts become NaN, so that every image has the same arrays.
         return {
             "px": pixels(pose, size, JOINTS),
             "conf": np.array(visibility, np.float32),
@@ -201,14 +211,21 @@ class Detector:
         """0..255 of the whole image, found in a crop around the person; None: nobody there."""
         if not np.isfinite(px).all():
             return None
+
+        # The box of the landmarks with a margin, inside the image.
         height, width = image.shape[:2]
         low = px.min(0)
         high = px.max(0)
         reach = MARGIN * (high - low).max()
         left, top = np.clip(low - reach, 0, [width - 1, height - 1]).astype(int)
         right, bottom = np.clip(high + reach, 1, [width, height]).astype(int)
+
+        # A person at the border may leave no pixels.
         if right - left < 2 or bottom - top < 2:
             return None
+
+        # The segmenter works at a fixed size: a crop gives the person more
+        # pixels.
         crop = cv2.cvtColor(image[top:bottom, left:right], cv2.COLOR_BGR2RGB)
         alpha = self.segmenter.process(crop).segmentation_mask
         if alpha is None:

@@ -1,4 +1,4 @@
-"""``python -m gsgan.bench speed``: milliseconds from skeleton to image, by stage."""
+"""Milliseconds from skeleton to image, by stage; options: conf/bench_speed.yaml."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -12,16 +12,17 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from omegaconf import DictConfig
-from torch import Tensor
-
-from gsgan.bench.common import (
+from bench_tables import (
     check_whole,
     environment,
     markdown,
     number,
     sentence,
 )
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+from torch import Tensor
+
 from gsgan.data.datamodule import GsganData
 from gsgan.model.avatar import Avatar, unwatched
 from gsgan.run.assemble import build_avatar, build_data
@@ -31,6 +32,7 @@ from gsgan.scene import Frame, cat
 from gsgan.splat import BACKENDS, resolve_backend
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import one_of
+from gsgan.utils.config import entry
 from gsgan.utils.console import make_console, progress
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.files import write_atomically, write_json
@@ -73,6 +75,8 @@ def run(config: DictConfig, folder: Path) -> None:
     if config.threads is not None:
         check_whole(config, threads=1)
         torch.set_num_threads(config.threads)
+
+    # The machine is part of the result.
     console = make_console()
     device = pick_device(config.device)
     where = environment(device)
@@ -135,6 +139,7 @@ def load_subject(
     # A trained run, with its own data and config.
     moved = DataPaths(config.data_root, config.data_smpl)
     if config.run is not None:
+        # A trained run with frames of its own data.
         folder = Path(config.run).expanduser()
         stored = load_config(folder, moved)
         data = build_data(stored)
@@ -378,6 +383,8 @@ def settings_of(
         found["channels of F"] = avatar.splat_channels
         found["supersampling of F"] = avatar.accuracy.supersample
         found["SH degree"] = avatar.splats.sh_degree
+
+    # The number of Gaussians, on the body or on the skeleton.
     placed = avatar.body_points or avatar.densify
     if placed is not None:
         found["Gaussians"] = placed.n_points
@@ -414,3 +421,12 @@ def text(
     if marks:
         lines.append("\n".join(f"- {mark}" for mark in marks))
     return "\n\n".join(lines)
+
+
+def bench(config: DictConfig) -> None:
+    """Times an avatar and writes the result into Hydra's output folder."""
+    run(config, Path(HydraConfig.get().runtime.output_dir))
+
+
+if __name__ == "__main__":
+    entry("bench_speed", bench)()

@@ -1,1 +1,0 @@
-"""The time that an avatar takes: ``python -m gsgan.bench speed``."""

@@ -1,0 +1,7 @@
+"""The benchmark scripts can be imported."""
+
+import sys
+
+from commands import ROOT
+
+sys.path.insert(0, str(ROOT / "scripts" / "bench"))
