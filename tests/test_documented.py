@@ -390,6 +390,8 @@ def test_every_documented_command_runs(
         arguments = tiny_training(arguments, capture)
     if name.startswith("scripts/bench/"):
         arguments = tiny_bench(Path(name).stem, arguments, capture)
+    if name == "gsgan.demo":
+        arguments += ["frames=2", "pixels=64"]
     if name == "gsgan.fit":
         arguments += ["size.image=32", "fit.points=200", "fit.surface_steps=2"]
         arguments += ["fit.sweeps=1", f"out={tmp_path / 'fit'}"]

@@ -1,6 +1,7 @@
 """``python -m gsgan`` lists the commands."""
 
 COMMANDS = {
+    "gsgan.demo": "a picture and a video of a ready avatar, without training",
     "gsgan.prepare": "make a dataset from videos: source=<folder> out=<folder>",
     "gsgan.check": "check a dataset before training: data=capture data.root=<folder>",
     "gsgan.fit": "fit the body to a capture's masks: data=capture data.root=<folder>",

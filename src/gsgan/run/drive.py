@@ -179,7 +179,9 @@ def with_motion(config: DictConfig, motion: str) -> DictConfig:
 
 def _chosen(options: MotionOptions, run: Run, fps: float) -> Drive:
     """The motion of options: files, a split, the rest pose, or one held-out frame."""
-    # Without a motion: one held-out frame, held still.
+    # Without a motion: one held-out frame, held still. A shared avatar has no frames.
+    if options.motion is None and run.is_shared:
+        return rest_pose(run.proportions)
     if options.motion is None:
         split, _ = run.data.watched
         found = _held_out(options, run, split)
