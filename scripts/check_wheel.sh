@@ -69,4 +69,5 @@ test -s demo/picture.png
 for command in prepare check fit; do
   "$python" -m gsgan.$command --help >help.txt
 done
+"$python" -m gsgan.bench speed --help >help.txt
 echo "the wheel works from $folder"

@@ -12,6 +12,7 @@ COMMANDS = {
     "gsgan.export": "write .ply, .glb, .onnx, .pt2, .safetensors, .bvh: run=<folder> out=<file>",
     "gsgan.report": "tables of scored runs, runs=[<folder>,…], and figures of a run, run=<folder>",
     "gsgan.weights": "find or download the networks of the perceptual loss and of LPIPS",
+    "gsgan.bench": "measure milliseconds from skeleton to image: speed",
 }
 
 
