@@ -47,7 +47,7 @@ def test_a_loaded_avatar_renders_what_evaluation_paints(run, scored, tmp_path):
         painting.image.clamp(0, 1), painting.alpha.clamp(0, 1), 1.0
     )
     assert torch.equal(on_white, expected.clamp(0, 1))
-    with pytest.raises(ValueError, match="expected 1 or 3 cameras, got 2"):
+    with pytest.raises(ValueError, match=r" 3 cameras.* 2"):
         avatar.render(
             frame.skeleton.repeat(3, 1, 1),
             cat([frame.camera] * 2),

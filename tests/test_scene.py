@@ -30,7 +30,7 @@ def test_projection_closed_form():
 
 
 def test_tensors_are_tensors():
-    with pytest.raises(ValueError, match="t must be a tensor"):
+    with pytest.raises(ValueError, match=r"t .*tensor"):
         camera(t=[0, 0, 0])
 
 
@@ -73,9 +73,9 @@ def test_records_move_slice_and_stack():
     assert len(both[:1].body.theta) == 1
     with pytest.raises(TypeError, match="slice"):
         both[0]
-    with pytest.raises(ValueError, match="labels is present in some"):
+    with pytest.raises(ValueError, match="labels"):
         cat([frame, dataclasses.replace(frame, labels=None)])
-    with pytest.raises(ValueError, match="size differs"):
+    with pytest.raises(ValueError, match="size"):
         cat([camera(size=(4, 4)), camera(size=(5, 4))])
     with pytest.raises(ValueError, match="at least one"):
         cat([])

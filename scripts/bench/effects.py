@@ -11,12 +11,12 @@ from typing import Any
 import bench_common
 import pandas as pd
 import torch
+from bench_tables import NOTHING, check_whole, markdown, sentence
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from timing import interleaved, median
 
-from gsgan.bench.common import NOTHING, check_whole, markdown, sentence
 from gsgan.effects import decide as decide_effects
 from gsgan.fit.run import fit_before_training
 from gsgan.run.assemble import build_data
@@ -166,7 +166,7 @@ def decide(row: Row, base: Sequence[str]) -> None:
         )
     data = build_data(config)
     if data.lacks_body:
-        fit_before_training(data, config.fit, torch.device("cpu"))
+        fit_before_training(data, instantiate(config.fit), torch.device("cpu"))
         data = build_data(config)
     decisions = decide_effects(data.info, instantiate(config.effects))
     found = getattr(decisions, row.effect)

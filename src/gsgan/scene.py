@@ -82,6 +82,8 @@ class Camera(TensorRecord):
         _check("Camera", "t", self.t, None, 3)
         if self.dist is not None:
             _check("Camera", "dist", self.dist, None, 5)
+
+        # Broadcasting would accept one camera for many.
         batches = {
             v.shape[0]
             for v in (self.K, self.R, self.t, self.dist)
@@ -320,6 +322,7 @@ class Window:
         for (top, left), (row, column) in zip(
             self.corners, at.tolist(), strict=True
         ):
+            # Inside its box, however near to the border.
             y = round(row * self.size[0] - size[0] / 2)
             x = round(column * self.size[1] - size[1] / 2)
             y = min(max(0, y), self.size[0] - size[0])
@@ -456,17 +459,19 @@ def distort(points: Tensor, dist: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         The points ``[B, M, 2]`` and their derivatives ``[B, M, 2, 2]``.
     """
+    # Radial terms in r², then tangential ones.
     x, y = points.unbind(-1)
     k1, k2, p1, p2, k3 = (c.unsqueeze(-1) for c in dist.unbind(-1))
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2 * (
-        k1 + r2 * (2 * k2 + 3 * r2 * k3)
-    )  # of radial, by x it is slope * x
+    # of radial, by x it is slope * x
+    slope = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))
     shown = [
         x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
         y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
     ]
+
+    # The derivatives; the mixed ones are equal.
     across = slope * x * y + 2 * p1 * x + 2 * p2 * y
     rows = [
         torch.stack(
@@ -514,6 +519,8 @@ def _fold_radius(dist: Tensor) -> Tensor:
     companion = torch.zeros(*k1.shape, 3, 3, dtype=k1.dtype, device=k1.device)
     companion[..., 0, :] = torch.stack([-3 * k1, -5 * k2, -7 * k3], dim=-1)
     companion[..., 1, 0] = companion[..., 2, 1] = 1
+
+    # The smallest positive radius is the largest root in 1/s.
     roots = torch.linalg.eigvals(companion)
     real = roots.imag.abs() < 1e-9 * roots.abs()
     return torch.where(real, roots.real, 0).clamp_min(0).amax(dim=-1).rsqrt()

@@ -177,9 +177,7 @@ def test_majority_label_and_its_tie():
 
 
 def test_pose_of_another_body_is_refused():
-    with pytest.raises(
-        ValueError, match=r"\[B, 56, 3, 3\], got \[1, 24, 3, 3\]"
-    ):
+    with pytest.raises(ValueError, match=r"\[B, 56, 3, 3\].*\[1, 24, 3, 3\]"):
         free_body().pose(BodyPose(torch.zeros(1, 24, 3), torch.zeros(1, 3)))
 
 

@@ -360,12 +360,10 @@ def test_open_body_chooses_parts_by_the_labels_names(tmp_path):
         assert not open_body("smpl", path, (), names).shares_labels(names)
     with pytest.raises(
         DataError,
-        match=r"kind smpl \(24 joints\), but the data's poses are of sm",
+        match=r"smpl .*24.* smplx",
     ):
         open_body("smplx", path)
-    with pytest.raises(
-        DataError, match="10 shape coefficients, the data gives 11"
-    ):
+    with pytest.raises(DataError, match=r"10 .*11"):
         open_body("smpl", path, (0.0,) * 11)
 
 
@@ -373,35 +371,35 @@ def test_open_body_chooses_parts_by_the_labels_names(tmp_path):
 
 NAN = np.full((SMALL, 3), np.nan)
 WRONG = {
-    "key": ({"drop": ("posedirs", "f")}, "no array posedirs, f"),
+    "key": ({"drop": ("posedirs", "f")}, "posedirs, f"),
     "template": (
         {"replace": {"v_template": np.zeros((SMALL, 2))}},
-        r"found \(120, 2\)",
+        r"\(120, 2\)",
     ),
-    "nan": ({"replace": {"v_template": NAN}}, "'v_template' must hold finite"),
+    "nan": ({"replace": {"v_template": NAN}}, "v_template"),
     "posedirs": (
         {"replace": {"posedirs": np.zeros((SMALL, 3, 135))}},
-        r"'posedirs' must have shape \(120, 3, 207\), found \(120, 3, 135\)",
+        r"posedirs.*\(120, 3, 207\).*\(120, 3, 135\)",
     ),
     "vertices": (
         {"replace": {"weights": np.ones((7, 24))}},
-        r"\(120, 24\), found \(7, 24\)",
+        r"\(120, 24\).*\(7, 24\)",
     ),
     "weights": (
         {"replace": {"weights": np.ones((SMALL, 24))}},
-        "vertex 0 sum to 24",
+        "vertex 0 .*24",
     ),
     "faces": (
         {"replace": {"f": np.array([[0, 1, SMALL]])}},
-        "below 120, found 0 to 120",
+        "120.* 0 to 120",
     ),
     "text": (
         {"replace": {"f": np.array([["a", "b", "c"]])}},
-        "must hold numbers",
+        "'f'",
     ),
     "tree": (
         {"replace": {"kintree_table": np.zeros((2, 24), int)}},
-        "found 1 joints in 24 columns",
+        "1 joints.*24 columns",
     ),
     "order": (
         {
@@ -411,11 +409,11 @@ WRONG = {
                 )
             }
         },
-        "no earlier parent for joint 1",
+        "joint 1",
     ),
     "regressor": (
         {"replace": {"J_regressor": np.zeros((SMALL, 24))}, "sparse": False},
-        r"'J_regressor' must have shape \(24, 120\)",
+        r"J_regressor.*\(24, 120\)",
     ),
 }
 
@@ -432,15 +430,15 @@ def test_a_model_file_of_another_body_is_refused(small, name):
 def test_files_that_are_not_models_are_refused(tmp_path):
     path = tmp_path / "other.pkl"
     path.write_bytes(pickle.dumps([1, 2]))
-    with pytest.raises(DataError, match="holds a list; expected an SMPL model"):
+    with pytest.raises(DataError, match="list"):
         read_smpl(path)
     path.write_bytes(python2.dumps({"poses": np.zeros((1, 72))}))
-    with pytest.raises(DataError, match="is not an SMPL model"):
+    with pytest.raises(DataError, match=r"other\.pkl"):
         read_smpl(path)
     path.write_bytes(b"cos\nsystem\n(S'true'\ntR.")
     with pytest.raises(DataError, match=r"os\.system"):
         read_smpl(path)
-    with pytest.raises(DataError, match="does not exist"):
+    with pytest.raises(DataError, match=r"absent\.pkl"):
         read_smpl(tmp_path / "absent.pkl")
 
 
@@ -457,5 +455,5 @@ def test_a_model_of_another_kind_is_generic(tmp_path):
         "background",
         "joint0",
     )
-    with pytest.raises(ValueError, match="parts must be 'joints'"):
+    with pytest.raises(ValueError, match=r"parts.*joints"):
         model.as_body()

@@ -253,9 +253,7 @@ def test_too_few_trunk_joints_are_refused_by_name(solver, poses):
         ValueError, match="item 1: left_shoulder, right_shoulder"
     ):
         solver.solve(p, seen)
-    with pytest.raises(
-        ValueError, match="must have 33, 75, 105 joints, got 20"
-    ):
+    with pytest.raises(ValueError, match=r"33, 75, 105 .*20"):
         solver.solve(p[:, :20], seen[:, :20])
 
 
@@ -273,7 +271,7 @@ def test_swapped_sides_are_refused_by_name(solver, poses, kind):
     )
     with pytest.raises(
         ValueError,
-        match=f"left and right are swapped: .* the left of {where} lies",
+        match=f"left .* right .*{where}",
     ):
         refuse_swapped(p, seen > 0)
     refuse_swapped(
@@ -321,5 +319,5 @@ def test_bodies_of_the_users_files_follow_their_landmarks(tmp_path, kind):
 def test_a_body_of_unknown_joints_is_refused():
     body = free_body()
     named = replace(body, joint_names=tuple(f"bone{i}" for i in range(56)))
-    with pytest.raises(ValueError, match="got bone0, bone1, bone2"):
+    with pytest.raises(ValueError, match="bone0, bone1, bone2"):
         Solver(named)

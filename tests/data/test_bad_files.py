@@ -39,6 +39,8 @@ from gsgan.utils.frame_files import last_number
 
 pytestmark = pytest.mark.usefixtures("model_once")
 Damage = Callable[[Path], object]
+# What the message must name, as a pattern, and the damage.
+Case = tuple[str, Damage]
 NEVER = Path("/tmp/never")
 
 
@@ -156,112 +158,67 @@ def cmyk(root: Path) -> None:
 
 
 GREY = np.zeros((24, 32), np.uint8)
-CAPTURE: dict[str, Damage] = {
-    "cameras.json does not exist": remove("cameras.json"),
-    "cameras.json is not valid JSON.*line 1": write(
-        "cameras.json", b'{"cam00": '
+CAPTURE: list[Case] = [
+    (r"cameras\.json", remove("cameras.json")),
+    (r"cameras\.json.*line 1", write("cameras.json", b'{"cam00": ')),
+    (r"cameras\.json.*list", write("cameras.json", b"[]")),
+    (r"cameras\.json", write("cameras.json", b"{}")),
+    ("cam00.*K, R, t", write("cameras.json", b'{"cam00": 3}')),
+    ("images/cam01.*cam00", remove("images/cam01")),
+    ("cam07.*cam00, cam01", write("images/cam07/000000.png", b"")),
+    ("images", remove("images")),
+    ("images/cam00", empty("images/cam00")),
+    (r"cam01.*'K'.*\(3, 3\)", camera(K=[[1], [2, 3]])),
+    ("cam01.*K ", camera(K=[[30, 0, 0], [0, 30, 0], [16, 12, 1]])),
+    ("cam01.*-30", camera(K=[[-30, 0, 16], [0, 30, 12], [0, 0, 1]])),
+    (r"cam01.*R .*0\.21", camera(R=np.diag([1.0, 1.1, 1.0]).tolist())),
+    ("cam01.*R mirror", camera(R=np.diag([1, 1, -1]).tolist())),
+    ("cam01.*dist", camera(dist=[0.1, 0.2, 0.3])),
+    (r"cam01.*size.*32\.5", camera(size=[32.5, 24])),
+    (r"000000\.png.*32x24.*24x32", camera(size=[24, 32])),
+    ("cam01.*100%", edited("cameras.json", turned_round)),
+    ("cam01.* 4 joints", camera(K=[[30, 0, 900], [0, 30, 12], [0, 0, 1]])),
+    (r"meta\.json", remove("meta.json")),
+    ("'unit'.*None.*m, cm, mm", meta(unit=None)),
+    (r"0\.003.* m .*'unit'", meta(unit="mm")),
+    ("'fps'.*0", meta(fps=0)),
+    ("'splits'", meta(splits=[1])),
+    ("'label_names'", meta(label_names="a")),
+    (r"landmarks3d\.npz", write("landmarks3d.npz", b"PK\x03\x04" + bytes(40))),
+    (r"landmarks3d\.npz.*nothing was run", landmarks(p=np.array([[Evil()]]))),
+    (r"'p'.*\(any, 33, 3\)", landmarks(p=np.zeros((4, 25, 3)))),
+    ("'p'.*<U1", landmarks(p=np.full((4, 33, 3), "a"))),
+    ("frame_id 1 ", landmarks(frame_id=np.array([0, 1, 1, 2]))),
+    ("'frame_id'", landmarks(frame_id=np.arange(4) + 0.5)),
+    ("frame_id .*time", landmarks(frame_id=np.arange(4) + 1_700_000_000_123)),
+    (
+        "'frame_id'",
+        lambda root: np.savez(root / "landmarks3d.npz", p=skeletons(4)),
     ),
-    "must hold a JSON object, found list": write("cameras.json", b"[]"),
-    "lists no camera": write("cameras.json", b"{}"),
-    "cam00: expected an object with K, R, t": write(
-        "cameras.json", b'{"cam00": 3}'
+    (" 4 .* 12 joints", landmarks(p=np.full((4, 33, 3), np.nan))),
+    (" 4 .*landmarks3d", landmarks(frame_id=np.arange(100, 104))),
+    (r"hands3d\.npz.*'p'.*\(any, 42, 3\)", hands(p=np.zeros((4, 21, 3)))),
+    (r"hands3d\.npz.*'conf'.*\(4, 42\)", hands(conf=np.ones((4, 33)))),
+    (r"hands3d\.npz.*frame_id 0 ", hands(frame_id=np.zeros(4))),
+    (r"face3d\.npz.*'p'.*\(any, 30, 3\)", face(p=np.zeros((4, 468, 3)))),
+    ("'names'.*mouth_outer_0", face(names=np.array(["lip"] * 30))),
+    (r"'theta'.*\(4, any, 3\)", poses(theta=np.zeros((4, 168)))),
+    (r"masks/cam00/000000\.png", image("masks/*/*.png", GREY)),
+    (
+        r"000001\.png.* 16 bits",
+        image("masks/cam00/000001.png", GREY.astype(np.uint16)),
     ),
-    r"images/cam01 does not exist; there are cam00": remove("images/cam01"),
-    "has the camera cam07, which .*lists cam00, cam01": write(
-        "images/cam07/000000.png", b""
+    (r"123456\.png", write("images/cam00/20240131120000123456.png", b"")),
+    (r"masks/cam01/000002\.png", remove("masks/cam01/000002.png")),
+    (r"000001\.png.*16x12", image("masks/cam01/000001.png", GREY[::2, ::2])),
+    (r"000001\.png", write("images/cam00/000001.png", b"")),
+    (r"000000\.jpg.*CMYK", cmyk),
+    (
+        r"000001\.png.*palette",
+        write("masks/cam00/000001.png", png(32, 24, 8, 3, bytes(32))),
     ),
-    "images does not exist": remove("images"),
-    "images/cam00 holds no frames": empty("images/cam00"),
-    r"'K' must hold finite numbers of shape \(3, 3\)": camera(K=[[1], [2, 3]]),
-    "K must be .*found": camera(K=[[30, 0, 0], [0, 30, 0], [16, 12, 1]]),
-    "cam01: the focal lengths in K": camera(
-        K=[[-30, 0, 16], [0, 30, 12], [0, 0, 1]]
-    ),
-    "cam01: R is not a rotation.*by 0.21": camera(
-        R=np.diag([1.0, 1.1, 1.0]).tolist()
-    ),
-    "R mirrors": camera(R=np.diag([1, 1, -1]).tolist()),
-    "dist must hold 4, 5 or 8 finite numbers": camera(dist=[0.1, 0.2, 0.3]),
-    r"size must be \[width, height\] in pixels": camera(size=[32.5, 24]),
-    "000000.png is 32x24 pixels.*cameras.json has 24x32": camera(size=[24, 32]),
-    "cam01: 100% of the joints lie behind it": edited(
-        "cameras.json", turned_round
-    ),
-    "cam01: no frame has 4 joints": camera(
-        K=[[30, 0, 900], [0, 30, 12], [0, 0, 1]]
-    ),
-    "meta.json does not exist": remove("meta.json"),
-    "'unit' is None; expected one of m, cm, mm": meta(unit=None),
-    "cameras stand 0.003.* m from the person.*check 'unit'": meta(unit="mm"),
-    "'fps' is 0; expected a number above 0": meta(fps=0),
-    "'splits' must be an object": meta(splits=[1]),
-    "'label_names' must list": meta(label_names="a"),
-    "landmarks3d.npz is not a valid npz": write(
-        "landmarks3d.npz", b"PK\x03\x04" + bytes(40)
-    ),
-    "asks for pickled Python objects.*nothing was run": landmarks(
-        p=np.array([[Evil()]])
-    ),
-    r"'p' must have shape \(any, 33, 3\)": landmarks(p=np.zeros((4, 25, 3))),
-    "'p' must hold numbers, found <U1": landmarks(p=np.full((4, 33, 3), "a")),
-    "frame_id 1 appears more than once": landmarks(
-        frame_id=np.array([0, 1, 1, 2])
-    ),
-    "'frame_id' must hold whole numbers": landmarks(
-        frame_id=np.arange(4) + 0.5
-    ),
-    "frame_id .* is a time stamp": landmarks(
-        frame_id=np.arange(4) + 1_700_000_000_123
-    ),
-    "has no array 'frame_id'": lambda root: np.savez(
-        root / "landmarks3d.npz", p=skeletons(4)
-    ),
-    "no usable frame: 4 with fewer than 12 joints": landmarks(
-        p=np.full((4, 33, 3), np.nan)
-    ),
-    "no usable frame: 4 without a row in landmarks3d": landmarks(
-        frame_id=np.arange(100, 104)
-    ),
-    r"hands3d.npz: .*'p' must have shape \(any, 42, 3\)": hands(
-        p=np.zeros((4, 21, 3))
-    ),
-    r"hands3d.npz: .*'conf' must have shape \(4, 42\)": hands(
-        conf=np.ones((4, 33))
-    ),
-    "hands3d.npz: .*frame_id 0 appears more than once": hands(
-        frame_id=np.zeros(4)
-    ),
-    r"face3d.npz: .*'p' must have shape \(any, 30, 3\)": face(
-        p=np.zeros((4, 468, 3))
-    ),
-    "'names' must be those .*from mouth_outer_0 to": face(
-        names=np.array(["lip"] * 30)
-    ),
-    r"'theta' must have shape \(4, any, 3\)": poses(theta=np.zeros((4, 168))),
-    "masks/cam00/000000.png shows no person, nor": image("masks/*/*.png", GREY),
-    "000001.png has 16 bits a channel": image(
-        "masks/cam00/000001.png", GREY.astype(np.uint16)
-    ),
-    "123456.png has no frame number up to": write(
-        "images/cam00/20240131120000123456.png", b""
-    ),
-    "000002.png does not exist; every image needs a mask": remove(
-        "masks/cam01/000002.png"
-    ),
-    "000001.png is 16x12 pixels .*the image": image(
-        "masks/cam01/000001.png", GREY[::2, ::2]
-    ),
-    "000001.png is not a valid PNG or JPEG": write(
-        "images/cam00/000001.png", b""
-    ),
-    "000000.jpg is a CMYK JPEG": cmyk,
-    "is a palette PNG": write(
-        "masks/cam00/000001.png", png(32, 24, 8, 3, bytes(32))
-    ),
-    "frame 1 is there twice, as 000001.png and 0001.png": write(
-        "images/cam00/0001.png", b""
-    ),
-}
+    (r"000001\.png.*0001\.png", write("images/cam00/0001.png", b"")),
+]
 
 
 # -- published formats
@@ -287,42 +244,40 @@ def out_of_the_folder(content: Any) -> None:
     content["ims"][0].update(ims=["../x/0.jpg", *content["ims"][0]["ims"][1:]])
 
 
-ZJU: dict[str, Damage] = {
-    "is not a ZJU-MoCap subject: it has no annots.npy": remove("annots.npy"),
-    "annots.npy is not a valid .npy file": cut("annots.npy", 0.5),
-    r"annots.npy asks for (posix|nt|os)\.system": lambda root: write_object(
-        root / "annots.npy", {"cams": Evil()}
+ZJU: list[Case] = [
+    (r"annots\.npy", remove("annots.npy")),
+    (r"annots\.npy", cut("annots.npy", 0.5)),
+    (
+        r"annots\.npy.*(posix|nt|os)\.system",
+        lambda root: write_object(root / "annots.npy", {"cams": Evil()}),
     ),
-    "annots.npy has no 'cams'": annots(lambda c: c.pop("cams")),
-    "found 3 K, 3 R, 3 T, 0 D, 3 image folders": annots(
-        lambda c: c["cams"].pop("D")
+    (r"annots\.npy.*'cams'", annots(lambda c: c.pop("cams"))),
+    ("3 K, 3 R, 3 T, 0 D, 3 image", annots(lambda c: c["cams"].pop("D"))),
+    ("3 D, 0 image", annots(lambda c: c.update(ims=[]))),
+    ("images", remove("Camera_B1", "Camera_B2", "Camera_B3")),
+    (r"annots\.npy.*T .*0\.00\d+ m", T_times(1e-3)),
+    ("new_params/", remove("new_params")),
+    (
+        "new_params",
+        lambda root: [
+            path.rename(path.with_name(f"9{path.name}"))
+            for path in (root / "new_params").iterdir()
+        ],
     ),
-    "3 D, 0 image folders": annots(lambda c: c.update(ims=[])),
-    "no camera folder holds images": remove(
-        "Camera_B1", "Camera_B2", "Camera_B3"
+    (r"2\.npy.*'poses'.* 72 .*69", params(poses=np.zeros((1, 66)))),
+    (r"2\.npy.*'poses'.* 0", params(poses=np.full((1, 72), 0.1))),
+    ("'Rh'", params(Rh=np.full((1, 3), np.nan))),
+    (r"2\.npy.*'Rh'", objects("new_params/2.npy", lambda c: c.pop("Rh"))),
+    (
+        "inside: .*%",
+        objects(
+            "new_params/*.npy",
+            lambda c: c.update(Th=c["Th"] + [[0.6, 0.8, 0.0]]),
+        ),
     ),
-    r"annots.npy: T is 0.00\d+ m long .*expected 0.05-20 m": T_times(1e-3),
-    "has no SMPL parameters; expected one of .*new_params/": remove(
-        "new_params"
-    ),
-    "new_params has no parameters of any frame": lambda root: [
-        path.rename(path.with_name(f"9{path.name}"))
-        for path in (root / "new_params").iterdir()
-    ],
-    "2.npy: 'poses' must hold 72 or 69 numbers": params(
-        poses=np.zeros((1, 66))
-    ),
-    "2.npy: the first 3 numbers of 'poses' must be 0": params(
-        poses=np.full((1, 72), 0.1)
-    ),
-    "'Rh' must hold finite numbers": params(Rh=np.full((1, 3), np.nan)),
-    "2.npy has no 'Rh'": objects("new_params/2.npy", lambda c: c.pop("Rh")),
-    "joints lie outside the masks .*check that cameras": objects(
-        "new_params/*.npy", lambda c: c.update(Th=c["Th"] + [[0.6, 0.8, 0.0]])
-    ),
-    "100% of all 12 images have no mask": remove("mask", "mask_cihp"),
-    "which is not a folder in it": annots(out_of_the_folder),
-}
+    ("100% .*12 images", remove("mask", "mask_cihp")),
+    (r"annots.*\.\./x", annots(out_of_the_folder)),
+]
 
 
 def people(
@@ -331,77 +286,71 @@ def people(
     return edited(f"{kind}/000001.json", change)
 
 
-EASYMOCAP: dict[str, Damage] = {
-    "extri.yml lacks .*T_10": replaced("extri.yml", "T_10:", "T_11:"),
-    "extri.yml does not exist; a folder of EasyMocap holds": remove(
-        "extri.yml"
+EASYMOCAP: list[Case] = [
+    (r"extri\.yml.*T_10", replaced("extri.yml", "T_10:", "T_11:")),
+    (r"extri\.yml", remove("extri.yml")),
+    (
+        "images/4 .*1, 2, 10",
+        lambda root: shutil.copytree(root / "images/1", root / "images/4"),
     ),
-    "images/4 is not a camera of .*lists 1, 2, 10": lambda root: (
-        shutil.copytree(root / "images/1", root / "images/4")
+    ("images", remove("images")),
+    ("images/2", empty("images/2")),
+    (
+        r"images/2/000000\.jpg.*40x40.*80x40",
+        replaced("intri.yml", "W_2: 40", "W_2: 80"),
     ),
-    "images holds no folder of a camera.*extract the frames": remove("images"),
-    "images/2 holds no images": empty("images/2"),
-    "images/2/000000.jpg is 40x40.*80x40": replaced(
-        "intri.yml", "W_2: 40", "W_2: 80"
-    ),
-    "person 0: 'keypoints3d' must have shape": people(
-        lambda p: p[0].pop("keypoints3d")
-    ),
-    "needs a whole 'id' that no other has, found 0": people(
-        lambda p: p.append(p[0])
-    ),
-    "must hold a list of people": people(lambda p: p.append(3)),
-    "000001.json is not valid JSON": write(
-        "keypoints3d/000001.json", b"[" * 5000
-    ),
-    "joints lie outside.*one person": image(
-        "mask/*/*.png", np.eye(40, dtype=np.uint8) * 255
-    ),
-    "mask/1/000000.png does not exist; every image needs a mask": remove(
-        "mask"
-    ),
-}
+    ("person 0.*'keypoints3d'", people(lambda p: p[0].pop("keypoints3d"))),
+    ("'id'.*0", people(lambda p: p.append(p[0]))),
+    (r"000001\.json", people(lambda p: p.append(3))),
+    (r"000001\.json.*JSON", write("keypoints3d/000001.json", b"[" * 5000)),
+    ("inside: .*%", image("mask/*/*.png", np.eye(40, dtype=np.uint8) * 255)),
+    (r"mask/1/000000\.png", remove("mask")),
+]
 
 
 def fitted(**values: Any) -> Damage:
     return arrays("smpl_params.npz", lambda held: held.update(values))
 
 
-THUMAN4: dict[str, Damage] = {
-    "line 1: expected an image such as cam00/00000012.jpg": write(
-        "missing_img_files.txt", b"\xffnothing here\n"
+THUMAN4: list[Case] = [
+    (
+        r"missing_img_files\.txt.*line 1",
+        write("missing_img_files.txt", b"\xffnothing here\n"),
     ),
-    "leaves no image of camera cam01": write(
-        "missing_img_files.txt",
-        b"".join(b"cam01/%08d.jpg\n" % i for i in range(4)),
+    (
+        r"missing_img_files\.txt.*cam01",
+        write(
+            "missing_img_files.txt",
+            b"".join(b"cam01/%08d.jpg\n" % i for i in range(4)),
+        ),
     ),
-    "images/cam01 holds no images": remove("images/cam01"),
-    "calibration.json does not exist; a folder of THuman4.0 holds": remove(
-        "calibration.json"
+    ("images/cam01", remove("images/cam01")),
+    (r"calibration\.json", remove("calibration.json")),
+    (
+        "cam02.*K, R and T",
+        edited("calibration.json", lambda c: c["cam02"].pop("R")),
     ),
-    "camera cam02: expected K, R and T": edited(
-        "calibration.json", lambda c: c["cam02"].pop("R")
+    (
+        r"cam02.*'K'.*\(9,\)",
+        edited("calibration.json", lambda c: c["cam02"].update(K=[1, 2])),
     ),
-    r"cam02: 'K' must hold finite numbers of shape \(9,\)": edited(
-        "calibration.json", lambda c: c["cam02"].update(K=[1, 2])
+    (r"\(4, 63\).*\(4, 69\)", fitted(body_pose=np.zeros((4, 69)))),
+    (r"\(4, 45\).*PCA", fitted(left_hand_pose=np.zeros((4, 12)))),
+    (
+        r"smpl_params\.npz.*transl",
+        arrays("smpl_params.npz", lambda a: a.pop("transl")),
     ),
-    r"shape \(4, 63\), found \(4, 69\)": fitted(body_pose=np.zeros((4, 69))),
-    r"\(4, 45\), found .*without PCA": fitted(left_hand_pose=np.zeros((4, 12))),
-    "smpl_params.npz has no array transl": arrays(
-        "smpl_params.npz", lambda a: a.pop("transl")
+    (" 30 .* 10", fitted(betas=np.ones((1, 30)))),
+    ("'betas'", fitted(betas=np.full((1, 10), np.nan))),
+    (r"smpl_params\.npz", fitted(transl=np.full((4, 3), np.inf))),
+    (
+        r"smpl_params\.npz.*system.*nothing was run",
+        fitted(betas=np.array(Evil())),
     ),
-    "has 30 coefficients, the model file 10": fitted(betas=np.ones((1, 30))),
-    "'betas' must hold finite numbers": fitted(betas=np.full((1, 10), np.nan)),
-    "no finite one of a frame that has images": fitted(
-        transl=np.full((4, 3), np.inf)
-    ),
-    "smpl_params.npz asks for .*system.*nothing was run": fitted(
-        betas=np.array(Evil())
-    ),
-}
+]
 
 
-FORMATS: dict[str, tuple[dict[str, Damage], Callable[[Path], object]]] = {
+FORMATS: dict[str, tuple[list[Case], Callable[[Path], object]]] = {
     "capture": (CAPTURE, read_capture),
     "zju": (
         ZJU,
@@ -431,45 +380,41 @@ def written(tmp_path_factory, subject, smpl_file):
 
 
 @pytest.mark.parametrize(
-    ("kind", "message"),
-    [(kind, message) for kind, (bad, _) in FORMATS.items() for message in bad],
+    ("kind", "fact", "damage"),
+    [(kind, *case) for kind, (cases, _) in FORMATS.items() for case in cases],
 )
-def test_damage_is_refused_in_one_sentence(written, tmp_path, kind, message):
+def test_damage_is_refused_in_one_sentence(
+    written, tmp_path, kind, fact, damage
+):
     root = Path(shutil.copytree(written[kind], tmp_path / kind))
-    FORMATS[kind][0][message](root)
-    with pytest.raises(DataError, match=message) as caught:
+    damage(root)
+    with pytest.raises(DataError, match=fact) as caught:
         FORMATS[kind][1](root)
     assert "\n" not in str(caught.value)
     assert str(root) in str(caught.value)
     assert not NEVER.exists()
 
 
-BAD_WHEN_DECODED: dict[str, Damage] = {
-    "images/cam00/000001.jpg is damaged": cut("images/cam00/000001.jpg", 0.995),
-    "masks/cam00/000001.png is damaged": cut("masks/cam00/000001.png", 0.6),
-    "images/cam00/000001.jpg does not exist": remove("images/cam00/000001.jpg"),
-    "is 16x12 pixels .*cam00 has 32x24": image(
-        "images/cam00/000001.jpg", GREY[::2, ::2]
-    ),
-    "000001.png holds 0 and 1 alone; expected alpha": image(
-        "masks/cam00/000001.png", GREY + 1
-    ),
-    "000001.png holds the label 3; the dataset names 3": image(
-        "labels/cam00/000001.png", GREY + 3
-    ),
-}
+BAD_WHEN_DECODED: list[Case] = [
+    (r"images/cam00/000001\.jpg", cut("images/cam00/000001.jpg", 0.995)),
+    (r"masks/cam00/000001\.png", cut("masks/cam00/000001.png", 0.6)),
+    (r"images/cam00/000001\.jpg", remove("images/cam00/000001.jpg")),
+    ("16x12.*32x24", image("images/cam00/000001.jpg", GREY[::2, ::2])),
+    (r"000001\.png.*0 and 1", image("masks/cam00/000001.png", GREY + 1)),
+    (r"000001\.png.* 3.* 3", image("labels/cam00/000001.png", GREY + 3)),
+]
 
 
-@pytest.mark.parametrize("message", BAD_WHEN_DECODED)
-def test_a_damaged_image_is_refused_when_it_is_read(tmp_path, message):
+@pytest.mark.parametrize(("fact", "damage"), BAD_WHEN_DECODED)
+def test_a_damaged_image_is_refused_when_it_is_read(tmp_path, fact, damage):
     names = {"label_names": ["background", "upper", "lower"]}
     layout = read_capture(
         write_tiny_capture(tmp_path, suffix="jpg", labels=True, meta=names)
     )
     dataset = CaptureDataset(layout, items(layout))
-    BAD_WHEN_DECODED[message](tmp_path)
+    damage(tmp_path)
     assert dataset[0].frame_id == 0
-    with pytest.raises(DataError, match=message) as caught:
+    with pytest.raises(DataError, match=fact) as caught:
         dataset[1]
     assert "\n" not in str(caught.value)
 
@@ -484,29 +429,21 @@ def zju(root: Path, smpl: Path | None, **settings: Any) -> Layout:
 
 
 def test_model_files_that_do_not_fit(written, tmp_path):
-    with pytest.raises(
-        DataError, match=r"SMPL parameters but no joints.*data.smpl=/path"
-    ):
+    with pytest.raises(DataError, match=r"data\.smpl=/path"):
         zju(written["zju"], None)
-    with pytest.raises(
-        ConfigError, match=r"data.smpl=.*none.pkl does not exist"
-    ):
+    with pytest.raises(ConfigError, match=r"data\.smpl=.*none\.pkl"):
         zju(written["zju"], tmp_path / "none.pkl")
     write_smpl(tmp_path / "x.npz", "smplx", vertices=60)
-    with pytest.raises(
-        DataError, match=r"x.npz is a model of 55 joints.*SMPL \(24 joints\)"
-    ):
+    with pytest.raises(DataError, match=r"x\.npz.* 55 .*24"):
         zju(written["zju"], tmp_path / "x.npz")
     write_smpl(tmp_path / "small.pkl", vertices=60)
-    with pytest.raises(
-        DataError, match=r"small.pkl has 60 vertices; expected the 6890 of SMPL"
-    ):
+    with pytest.raises(DataError, match=r"small\.pkl.* 60 .*6890"):
         zju(written["zju"], tmp_path / "small.pkl")
 
 
 @pytest.mark.parametrize(
     ("frames", "message"),
-    [("a-b", "must be frame numbers"), ("0-9", "leaves no frame")],
+    [("a-b", "'a-b'"), ("0-9", "0-9")],
 )
 def test_frames_to_drop_that_cannot_be(written, frames, message):
     with pytest.raises(
@@ -516,12 +453,10 @@ def test_frames_to_drop_that_cannot_be(written, frames, message):
 
 
 def test_wrong_folders_and_frame_numbers(tmp_path):
-    with pytest.raises(
-        DataError, match=r"nowhere does not exist; expected the folder"
-    ):
+    with pytest.raises(DataError, match="nowhere"):
         read_capture(tmp_path / "nowhere")
     (tmp_path / "file").touch()
-    with pytest.raises(DataError, match="file is a file, not a folder"):
+    with pytest.raises(DataError, match=r"\bfile\b"):
         read_capture(tmp_path / "file")
     assert last_number("frame_0000000000000012") == 12
     assert last_number("1000000001") is None

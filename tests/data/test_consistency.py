@@ -48,10 +48,10 @@ def in_mm(rig: dict) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (scale_K(0.5), r"inside: .*cam02 \d%, .*gsgan.check finds"),
+        (scale_K(0.5), r"cam02 \d%.*gsgan\.check"),
         (
             in_mm,
-            r"camera cam02 stands 3\.13e\+03 m from the person, the median camera 3 m",
+            r"cam02.*3\.13e\+03 m.* 3 m",
         ),
     ],
 )
@@ -90,7 +90,7 @@ def test_the_config_passes_its_settings(root, compose):
     config = compose("train", "data=capture", f"data.root={root}", *keys)
     assert instantiate(config.data).layout.frames == (0, 2)
     config = compose("train", "data=capture", f"data.root={root}")
-    with pytest.raises(DataError, match="joints lie outside the masks"):
+    with pytest.raises(DataError, match=r"inside: .*%"):
         _ = instantiate(config.data).layout
 
 

@@ -148,7 +148,7 @@ def test_loaders_and_datasets(ten_frames):
     assert {camera for camera, _ in views.items} == {"cam02"}
     assert [frame for _, frame in poses.items] == [8, 9, 8, 9]
     with pytest.raises(
-        ValueError, match="split must be one of train, novel_view, novel_pose"
+        ValueError, match=r"split.*train, novel_view, novel_pose"
     ):
         data.dataset("test")
     all_trained = GsganData(str(ten_frames), test_share=0)
@@ -323,7 +323,7 @@ def test_a_capture_may_be_posed_by_the_users_own_smpl_file(tmp_path):
     )
     assert GsganData(str(root)).info.body_file is None
     np.savez(root / "body_pose.npz", **poses, betas=np.array([np.nan]))
-    with pytest.raises(DataError, match="'betas' must hold finite numbers"):
+    with pytest.raises(DataError, match="betas"):
         GsganData(str(root)).setup()
 
 
@@ -346,20 +346,20 @@ def test_labels_are_counted_without_the_ignore_value(tmp_path):
     [
         (
             {"batch_size": 0},
-            "data.batch_size must be a whole number of at least 1, got 0",
+            r"data\.batch_size.*0",
         ),
         (
             {"steps_per_epoch": 0},
-            "data.steps_per_epoch must be a whole number of at least 1",
+            r"data\.steps_per_epoch",
         ),
-        ({"workers": -1}, "data.workers must be a whole number of at least 0"),
-        ({"seed": -1}, "data.seed must be a whole number of at least 0"),
+        ({"workers": -1}, r"data\.workers"),
+        ({"seed": -1}, r"data\.seed"),
         (
             {"cache_mb": "much"},
-            "data.cache_mb must be a number of at least 0, got 'much'",
+            r"data\.cache_mb.*'much'",
         ),
-        ({"crop": "face"}, "data.crop must be null or person, got 'face'"),
-        ({"root": None}, "data.root is not set: give the folder of a capture"),
+        ({"crop": "face"}, r"data\.crop.*'face'"),
+        ({"root": None}, r"data\.root"),
     ],
 )
 def test_config_values_out_of_range(ten_frames, keys, message):
@@ -369,9 +369,7 @@ def test_config_values_out_of_range(ten_frames, keys, message):
 
 def test_batches_need_one_size(ten_frames):
     GsganData(str(ten_frames), batch_size=2).setup()
-    with pytest.raises(
-        ConfigError, match=r"data.size is not set and images differ in size"
-    ):
+    with pytest.raises(ConfigError, match=r"data\.size"):
         GsganData(str(ten_frames), batch_size=2, crop="person").setup()
 
 

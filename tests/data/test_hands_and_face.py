@@ -135,9 +135,7 @@ def test_fitted_poses_have_their_fingers_with_hands_alone(root):
         "frame_id": np.arange(4),
     }
     np.savez(root / "body_pose.npz", **poses)
-    with pytest.raises(
-        ConfigError, match=r"made body_pose.npz without hands; run it again"
-    ):
+    with pytest.raises(ConfigError, match=r"body_pose\.npz"):
         assert GsganData(
             str(root), size=32, skeleton="mediapipe33_hands"
         ).layout
@@ -161,7 +159,5 @@ def test_fitted_poses_have_their_fingers_with_hands_alone(root):
         assert body.transl[0, 0] == x
     with_hands["theta_hands"] = np.ones((4, 20, 3))
     np.savez(root / "body_pose.npz", **poses, **with_hands)
-    with pytest.raises(
-        DataError, match=r"'theta_hands' must have shape \(4, 56, 3\)"
-    ):
+    with pytest.raises(DataError, match=r"theta_hands.*\(4, 56, 3\)"):
         read_capture(root)

@@ -36,7 +36,7 @@ def test_items_are_a_sequence():
     assert items.frames == [2, 5]
     with pytest.raises(IndexError):
         items[3]
-    with pytest.raises(ValueError, match="not in the split"):
+    with pytest.raises(ValueError, match="split"):
         items.index(("a", 2))
     assert not Items({})
     assert Items({}).frames == []
@@ -64,7 +64,7 @@ def test_links_out_of_a_dataset_are_refused(tmp_path, place):
     root = write_tiny_capture(tmp_path / "c")
     (root / place).rename(tmp_path / "elsewhere")
     (root / place).symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(DataError, match="outside the dataset"):
+    with pytest.raises(DataError, match="dataset"):
         read_capture(root)
 
 

@@ -51,7 +51,7 @@ def test_masks_are_joined_by_their_maximum_and_must_agree_in_size(
     cv2.imwrite(str(other), VALUES.T)
     with pytest.raises(
         DataError,
-        match=r"other.png and .*grey.png, masks of one image, differ in size",
+        match=r"other\.png.*grey\.png",
     ):
         read_mask([("grey", grey), ("grey", other)], RULES)
 
@@ -85,9 +85,7 @@ def test_labels_go_through_their_table(grey):
         grey, PixelRules(label_table=tuple(table)), ["none", "a", "b"]
     )
     assert np.array_equal(labels, [[0, 2, 255], [255, 1, 255]])
-    with pytest.raises(
-        DataError, match=r"grey.png holds the label 200; the dataset names 2 "
-    ):
+    with pytest.raises(DataError, match=r"grey\.png.* 200.* 2 "):
         read_labels(grey, RULES, ["none", "a"])
 
 

@@ -49,7 +49,7 @@ def test_frames_may_have_a_step():
     assert len(parse_frames("0-495:5", "x")) == 100
     assert len(parse_frames("0-480:30", "x")) == 17
     assert parse_frames(["0-6:3", 1], "x") == (0, 1, 3, 6)
-    with pytest.raises(ConfigError, match="x must be frame numbers or ranges"):
+    with pytest.raises(ConfigError, match=r"^x .*"):
         parse_frames("0-9:0", "x")
 
 
@@ -105,36 +105,40 @@ def test_new_poses_seen_by_a_camera_that_trains(layout):
         (
             {"train_cameras": [21]},
             DataError,
-            "protocol one requests camera 21; the capture has 4: cam00, cam01",
+            "one .*camera 21.* 4: cam00, cam01",
         ),
-        ({"train_cameras": [-1]}, DataError, "requests camera -1"),
+        ({"train_cameras": [-1]}, DataError, "camera -1"),
         (
             {"test_cameras": ["cam9"]},
             DataError,
-            "requests camera cam9; the capture has 4: cam00",
+            "camera cam9.* 4: cam00",
         ),
         (
             {"test_cameras": [0]},
             ConfigError,
-            "frame 0 of camera cam00 is in both splits",
+            "frame 0 .*cam00",
         ),
         (
             {"train_frames": "50-60"},
             DataError,
-            "nothing to train on with cameras cam00",
+            "cameras cam00",
         ),
         (
             {"train_frames": {"377": "0-3"}},
             ConfigError,
-            "protocol.subject is None: the frames",
+            r"protocol\.subject.*None",
         ),
         (
             {"test_frames": "x"},
             ConfigError,
-            "protocol.test_frames must be frame numbers",
+            r"protocol\.test_frames",
         ),
-        ({"scale": 0}, ConfigError, "protocol.scale must be a number"),
-        ({"train_cameras": None}, ConfigError, "both null; name one of them"),
+        ({"scale": 0}, ConfigError, r"protocol\.scale"),
+        (
+            {"train_cameras": None},
+            ConfigError,
+            r"protocol\.train_cameras.*protocol\.test_cameras",
+        ),
     ],
 )
 def test_protocols_that_do_not_fit(layout, changes, error, message):
@@ -145,30 +149,30 @@ def test_protocols_that_do_not_fit(layout, changes, error, message):
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        *((name, "x", "must be .* or .*; got 'x'") for name in CHOICES),
-        ("background", "grey", "must be black or white; got 'grey'"),
-        ("psnr_pooling", "split", "must be image or channels"),
-        ("eight_bits", True, "must be none or rounded or cut; got True"),
-        ("truth_outline", 0.5, "must be soft or hard; got 0.5"),
-        ("ssim_window", 7, "must be gaussian or uniform; got 7"),
-        ("lpips_channels", "RGB", "must be rgb or bgr; got 'RGB'"),
+        *((name, "x", "'x'") for name in CHOICES),
+        ("background", "grey", "black.*white.*'grey'"),
+        ("psnr_pooling", "split", "image.*channels"),
+        ("eight_bits", True, "rounded.*True"),
+        ("truth_outline", 0.5, r"soft.*0\.5"),
+        ("ssim_window", 7, "uniform.*7"),
+        ("lpips_channels", "RGB", "bgr.*'RGB'"),
         (
             "region",
             "mask",
-            "must be full or body_box_cleared or body_box; got 'mask'",
+            "body_box_cleared.*'mask'",
         ),
-        ("lpips_region", None, "must be full or mask_crop_512; got None"),
+        ("lpips_region", None, "mask_crop_512.*None"),
         (
             "lpips_range",
             [0, 255],
-            r"must be \[-1.0, 1.0\] or \[0.0, 1.0\]; got \(0, 255\)",
+            r"\[-1\.0, 1\.0\].*\(0, 255\)",
         ),
-        ("ssim_range", True, "must be 1.0 or 2.0; got True"),
+        ("ssim_range", True, r"2\.0.*True"),
     ],
 )
 def test_measures_are_named_ones(name, value, message):
     with pytest.raises(
-        ConfigError, match=f"protocol.measures.{name} {message}"
+        ConfigError, match=f"protocol.measures.{name}.*{message}"
     ):
         MetricVariants(**{name: value})
 
@@ -189,9 +193,7 @@ def test_frames_by_subject():
     )
     assert replace(protocol, subject="377").frames("train") == "0-569"
     assert replace(protocol, subject=377).record()["test_frames"] == "0-569:30"
-    with pytest.raises(
-        ConfigError, match=r"protocol.subject is 378: .* one of 377"
-    ):
+    with pytest.raises(ConfigError, match=r"protocol\.subject.*378.*377"):
         replace(protocol, subject=378).frames("test")
 
 

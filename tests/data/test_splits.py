@@ -119,43 +119,47 @@ def test_frames_that_are_not_there_are_noted(layout):
         (
             {"train_cameras": ["cam9"]},
             DataError,
-            "has no camera cam9; it has cam00, cam01, cam02",
+            "cam9.*cam00, cam01, cam02",
         ),
         (
             {"train_frames": "50-60"},
             DataError,
-            "nothing to train on .* 0 train frames; .* 0-9",
+            " 0 train frames.* 0-9",
         ),
         (
             {"train_cameras": []},
             DataError,
-            "nothing to train on with cameras none",
+            "cameras none",
         ),
         (
             {"train_cameras": ["cam00"], "test_cameras": ["cam00"]},
             ConfigError,
-            "data.train_cameras and data.test_cameras share cam00",
+            r"data\.train_cameras.*data\.test_cameras.*cam00",
         ),
-        ({"train_frames": "0-5", "test_frames": "5-9"}, ConfigError, "share 5"),
+        (
+            {"train_frames": "0-5", "test_frames": "5-9"},
+            ConfigError,
+            r"data\.train_frames.*data\.test_frames.* 5",
+        ),
         (
             {"train_frames": "5-0"},
             ConfigError,
-            "data.train_frames must be frame numbers .*'5-0'",
+            r"data\.train_frames.*'5-0'",
         ),
         (
             {"test_frames": 0.5},
             ConfigError,
-            "data.test_frames must be frame numbers .* 0.5",
+            r"data\.test_frames.* 0\.5",
         ),
         (
             {"train_cameras": 1.5},
             ConfigError,
-            "data.train_cameras must be a list of camera names",
+            r"data\.train_cameras",
         ),
         (
             {"test_share": 1.0},
             ConfigError,
-            r"data.test_share must be in \[0, 1\)",
+            r"data\.test_share",
         ),
     ],
 )

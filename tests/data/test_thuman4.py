@@ -201,9 +201,7 @@ def test_the_unsure_band_is_an_option(root, smplx_file):
 
 
 def test_settings_out_of_range():
-    with pytest.raises(
-        ConfigError, match="ignore_band must be a whole number of at least 0"
-    ):
+    with pytest.raises(ConfigError, match="ignore_band"):
         Thuman4Reader(ignore_band=-1)
-    with pytest.raises(ConfigError, match="two rising alphas"):
+    with pytest.raises(ConfigError, match="ignore_alpha"):
         Thuman4Reader(ignore_alpha=(250, 5))

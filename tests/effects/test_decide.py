@@ -116,16 +116,24 @@ def test_the_degree_follows_the_number_of_cameras(cameras, degree):
         (
             {"distortion": "undistort"},
             {},
-            "no camera of this data has a lens coefficient",
+            r"effects\.distortion=undistort",
         ),
         (
             {"colour_correction": "on"},
             {"n_train_cameras": 1},
-            "one training camera",
+            r"effects\.colour_correction=on",
         ),
-        ({"body_points": "on"}, {"has_body_pose": False}, "no body pose"),
-        ({"body_points": "on"}, {"body": "smpl"}, "no model file"),
-        ({"only": ["distortion"]}, {}, "effects.distortion=on is not possible"),
+        (
+            {"body_points": "on"},
+            {"has_body_pose": False},
+            r"effects\.body_points=on.*body pose",
+        ),
+        (
+            {"body_points": "on"},
+            {"body": "smpl"},
+            r"effects\.body_points=on.*file",
+        ),
+        ({"only": ["distortion"]}, {}, r"effects\.distortion=on"),
     ],
 )
 def test_forcing_the_impossible_is_one_sentence_or_left_out(
@@ -142,9 +150,7 @@ def test_forcing_the_impossible_is_one_sentence_or_left_out(
 
 def test_a_lens_that_painting_does_not_know_is_refused_or_undistorted():
     rational = scene(has_distortion=True, has_rational_lens=True)
-    with pytest.raises(
-        ConfigError, match=r"distortion=project is not possible: .*k4, k5, k6"
-    ):
+    with pytest.raises(ConfigError, match=r"distortion=project.*k4, k5, k6"):
         decide(rational, EffectSettings(distortion="project"))
     lenient = decide(
         rational, EffectSettings(distortion="project", impossible="off")
@@ -186,9 +192,7 @@ def test_an_effect_that_the_model_lacks_is_off_or_refused(model, effect, why):
     assert why in getattr(auto, effect).why
     assert not getattr(auto, effect).on
     forced = EffectSettings(**{effect: "on"})
-    with pytest.raises(
-        ConfigError, match=rf"effects\.{effect}=on is not possible: .*{why}"
-    ):
+    with pytest.raises(ConfigError, match=rf"effects\.{effect}=on"):
         decide(scene(), forced, model)
     assert not getattr(
         decide(scene(), replace(forced, impossible="off"), model), effect
@@ -200,15 +204,15 @@ def test_an_effect_that_the_model_lacks_is_off_or_refused(model, effect, why):
     [
         (
             {"antialias": "maybe"},
-            "effects.antialias must be one of auto, on, off",
+            r"effects\.antialias.*auto, on, off",
         ),
-        ({"view_dependence": 4}, "effects.view_dependence must be one of"),
-        ({"degree_cameras": [4, 2, 8]}, "three rising numbers"),
-        ({"only": ["colours"]}, "effects.only must list some of"),
-        ({"only": "antialias"}, "effects.only must list some of"),
+        ({"view_dependence": 4}, r"effects\.view_dependence"),
+        ({"degree_cameras": [4, 2, 8]}, r"effects\.degree_cameras"),
+        ({"only": ["colours"]}, r"effects\.only"),
+        ({"only": "antialias"}, r"effects\.only"),
         (
             {"impossible": "maybe"},
-            "effects.impossible must be one of error, off",
+            r"effects\.impossible.*error, off",
         ),
     ],
 )
@@ -256,7 +260,5 @@ def test_a_run_is_not_resumed_with_other_effects():
         decide(scene(darkest=1.0), EffectSettings()),
     )
     before.check_same(before.plain())
-    with pytest.raises(
-        ConfigError, match=r"effects\.random_background: the run began with on"
-    ):
+    with pytest.raises(ConfigError, match=r"effects\.random_background.* on"):
         now.check_same(before.plain())

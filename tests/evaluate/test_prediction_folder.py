@@ -65,9 +65,9 @@ def test_patterns_without_a_split(tmp_path, pattern, names):
 @pytest.mark.parametrize(
     ("pattern", "message"),
     [
-        ("{camera}.png", "must have {frame} and"),
-        ("{frame}.png", "{camera} or {camera_index}"),
-        ("{camera}/{view}/{frame}.png", "no other field"),
+        ("{camera}.png", "{frame}"),
+        ("{frame}.png", "{camera}"),
+        ("{camera}/{view}/{frame}.png", "{split}"),
     ],
 )
 def test_invalid_patterns(tmp_path, pattern, message):
@@ -77,24 +77,24 @@ def test_invalid_patterns(tmp_path, pattern, message):
 
 def test_a_missing_image_is_named(tmp_path):
     touch(tmp_path, *ALL[:3])
-    with pytest.raises(DataError, match=r"lacks 1 of 4 .* camera B \(2\), frame 12, expected as "
-                                        r"novel_pose/B \(2\)/000012.png"):  # fmt: skip
+    expected = r"1 of 4 .*B \(2\).*novel_pose/B \(2\)/000012\.png"
+    with pytest.raises(DataError, match=expected):
         read(tmp_path)
 
 
 def test_a_folder_with_other_names_and_a_file_are_refused(tmp_path):
     touch(tmp_path, "view/0.png", ".DS_Store")
-    with pytest.raises(DataError, match=r"lacks 4 of 4 "):
+    with pytest.raises(DataError, match="4 of 4"):
         read(tmp_path)
     for place in ("nowhere", "view/0.png"):
-        with pytest.raises(DataError, match="is not a folder"):
+        with pytest.raises(DataError, match="predictions="):
             read(tmp_path / place)
 
 
 def test_a_repeated_image_is_named(tmp_path):
     touch(tmp_path, *ALL, "novel_view/cam10/005.png")
-    with pytest.raises(DataError, match=r"camera cam10, frame 5 twice, as novel_view/cam10/005.png "
-                                        r"and novel_view/cam10/5.png"):  # fmt: skip
+    both = r"novel_view/cam10/005\.png .*novel_view/cam10/5\.png"
+    with pytest.raises(DataError, match=both):
         read(tmp_path)
 
 
@@ -143,7 +143,7 @@ def test_images_are_rgb_and_keep_their_alpha(tmp_path):
         (person()[..., 0], "grey"),
         (
             person()[:5],
-            r"is 8x5 pixels .* truth of camera cam, frame 3, as scored, has 8x6",
+            "8x5 .*cam, frame 3.* 8x6",
         ),
     ],
 )
@@ -177,12 +177,10 @@ def test_truncated_files_are_refused(tmp_path, kept, suffix):
 def test_an_unexpected_background_is_refused(tmp_path):
     with pytest.raises(
         DataError,
-        match=r"has a white background, expected black; give images on black",
+        match=r"white.*black",
     ):
         one(tmp_path, person(behind=255)).predict(frame(), ("cam", 3))
-    with pytest.raises(
-        DataError, match=r"has a black background, expected white"
-    ):
+    with pytest.raises(DataError, match=r"black.*white"):
         one(tmp_path, person(), background="white").predict(frame(), ("cam", 3))
     one(tmp_path, person(behind=255), background="white").predict(
         frame(), ("cam", 3)

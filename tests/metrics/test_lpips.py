@@ -188,8 +188,6 @@ def test_what_the_networks_get_is_described():
 
 
 def test_unknown_networks_are_refused_and_none_leaves_lpips_out():
-    with pytest.raises(
-        ConfigError, match=r"lpips\.nets must be one of vgg, alex"
-    ):
+    with pytest.raises(ConfigError, match=r"lpips\.nets.*vgg, alex"):
         build_lpips(["squeeze"])
     assert build_lpips([]) == {}

@@ -61,9 +61,7 @@ def test_step_zero_is_exactly_the_initial_gaussians(densify):
 
 
 def test_billions_of_layers_are_refused(densify):
-    with pytest.raises(
-        ConfigError, match="layers must be a number from 2 to 1000"
-    ):
+    with pytest.raises(ConfigError, match=r"layers.*2 .*1000"):
         small(densify, layers=2**31)
 
 

@@ -72,17 +72,11 @@ def test_a_transposed_convolution_is_a_convolution_after_upsampling():
 def test_generator_refuses_a_fine_F_it_was_not_built_for():
     F, S, p2d, g = inputs(16, 12)
     net = Generator(5, 4, 8, 35, 2, base=4)
-    with pytest.raises(
-        ValueError, match=r"fine must be \(32, 24\) pixels, got None"
-    ):
+    with pytest.raises(ValueError, match=r"fine.*\(32, 24\).*None"):
         net(F, S, p2d, g)
-    with pytest.raises(
-        ValueError, match=r"fine must be \(32, 24\) pixels, got \(48, 36\)"
-    ):
+    with pytest.raises(ValueError, match=r"fine.*\(32, 24\).*\(48, 36\)"):
         net(F, S, p2d, g, torch.zeros(2, 5, 48, 36))
-    with pytest.raises(
-        ValueError, match=r"fine must be None pixels, got \(32, 24\)"
-    ):
+    with pytest.raises(ValueError, match=r"fine.*None.*\(32, 24\)"):
         generator()(F, S, p2d, g, torch.zeros(2, 5, 32, 24))
 
 
@@ -93,9 +87,7 @@ def test_generator_with_rgb_skip_starts_at_step_one_colour_and_alpha():
     torch.testing.assert_close(
         painted, torch.cat([F[:, :3], alpha], 1), rtol=0, atol=0
     )
-    with pytest.raises(
-        ValueError, match="rgb_skip=True, so alpha must be given"
-    ):
+    with pytest.raises(ValueError, match=r"rgb_skip=True.*alpha"):
         generator(rgb_skip=True)(F, S, p2d, g)
 
 
@@ -155,7 +147,7 @@ def test_a_judge_without_normalisation_sees_contrast():
         assert (
             float((sharp - soft).abs().max()) > 0.01 * float(sharp.std())
         ) is sees
-    with pytest.raises(ConfigError, match="norm must be one of instance, none"):
+    with pytest.raises(ConfigError, match=r"norm.*instance, none"):
         Discriminator(norm="batch")
 
 
@@ -208,7 +200,7 @@ def test_a_generator_of_patches(times):
     torch.testing.assert_close(
         net._stem(given[0], [S, p2d], fine), plain, atol=1e-5, rtol=1e-5
     )
-    with pytest.raises(ConfigError, match="patch must be one of 1, 2, 4"):
+    with pytest.raises(ConfigError, match=r"patch.*1, 2, 4"):
         generator(patch=3)
 
 

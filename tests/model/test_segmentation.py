@@ -208,9 +208,9 @@ def test_classes_of_modes_and_labels_without_a_vertex():
 @pytest.mark.parametrize(
     ("mode", "names", "words"),
     [
-        ("hands", CIHP, "no left_hand and no right_hand"),
-        ("hand", CLOTHES, "mode must be one of body, hands, got 'hand'"),
-        ("none", CLOTHES, "mode must be one of body, hands, got 'none'"),
+        ("hands", CIHP, "left_hand.*right_hand"),
+        ("hand", CLOTHES, "mode.*body, hands.*'hand'"),
+        ("none", CLOTHES, "mode.*body, hands.*'none'"),
     ],
 )
 def test_modes_that_cannot_be_are_one_sentence(mode, names, words):

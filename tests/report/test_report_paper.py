@@ -150,7 +150,5 @@ def test_every_printed_value_is_a_number(name):
 
 
 def test_an_unknown_entry_is_refused():
-    with pytest.raises(
-        ConfigError, match=r"table\.paper=tables: paper\.yaml has zju"
-    ):
+    with pytest.raises(ConfigError, match=r"table\.paper=tables.*zju"):
         read_paper("tables")

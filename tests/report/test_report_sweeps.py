@@ -53,26 +53,20 @@ def test_a_setting_of_an_earlier_version_has_its_present_name(tmp_path):
 
 def test_without_it_they_are_refused_and_so_is_any_other_difference(tmp_path):
     runs = [swept(tmp_path, weight, 0, 30.0) for weight in (0.0, 0.5)]
-    with pytest.raises(ConfigError, match="the same row and seed"):
+    with pytest.raises(ConfigError, match="seed"):
         report_of(table(), *runs)
     other = swept(tmp_path, 0.5, 1, 30.0, perceptual=3.0)
-    with pytest.raises(
-        ConfigError, match=r"differ in settings: training\.step_two\.perceptual"
-    ):
+    with pytest.raises(ConfigError, match=r"training\.step_two\.perceptual"):
         report_of(table(by=[KEY]), *runs, other)
 
 
 def test_a_setting_that_a_run_does_not_have_is_named(tmp_path):
-    with pytest.raises(
-        ConfigError, match=r"table\.by: .*has no setting training\.nothing"
-    ):
+    with pytest.raises(ConfigError, match=r"table\.by.*training\.nothing"):
         report_of(table(by=["training.nothing"]), swept(tmp_path, 0.5, 0, 30.0))
-    with pytest.raises(
-        ConfigError, match=rf"table\.by: .*has no setting {KEY}"
-    ):
+    with pytest.raises(ConfigError, match=rf"table\.by.*{KEY}"):
         report_of(table(by=[KEY]), write_run(tmp_path / "bare", psnr=30.0))
 
 
 def test_rows_cannot_be_given_beside_by():
-    with pytest.raises(ConfigError, match=r"table\.rows must be null"):
+    with pytest.raises(ConfigError, match=r"table\.by.*table\.rows"):
         table(by=[KEY], rows=[{"run": "full"}])

@@ -144,9 +144,7 @@ def test_background_ignored_and_unknown_pixels_have_no_vote():
     body = rigid(plate(2.0))
     labels = torch.zeros(SIZE, SIZE)
     labels[:, ::3], labels[:, 1::3] = 255, 9
-    with pytest.raises(
-        DataError, match=r"in none of 1 images .* or choose model=wo_seg"
-    ):
+    with pytest.raises(DataError, match=r" 1 images .*model=wo_seg"):
         class_vote(body, [picture(labels)], 4)
     labels[SIZE // 2] = 3
     assert (class_vote(body, [picture(labels)] * 2, 4).labels == 3).all()
@@ -287,9 +285,9 @@ def test_votes_are_kept_in_the_checkpoint_and_not_held_again(
     [
         (
             torch.ones(7).long(),
-            "labels of 7 vertices do not fit this free body",
+            " 7 vertices .*free",
         ),
-        (None, "no training image with labels"),
+        (None, "model=wo_seg"),
     ],
 )
 def test_votes_of_another_body_and_no_votes_are_refused(

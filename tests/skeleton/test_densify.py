@@ -283,22 +283,22 @@ def test_shipped_templates_can_be_made_again():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"torso": "ball"}, "torso must be one of fit, cube, got 'ball'"),
+        ({"torso": "ball"}, "torso.*fit, cube.*'ball'"),
         (
             {"sampler": "random"},
-            "sampler must be one of even, trimesh, got 'random'",
+            "sampler.*even, trimesh.*'random'",
         ),
         (
             {"face_points": 0},
-            "face_points must be a whole number of at least 1, got 0",
+            "face_points.*1.*0",
         ),
         (
             {"radius_ratio": 0.0},
-            "radius_ratio must be a number above 0, got 0.0",
+            r"radius_ratio.*0\.0",
         ),
         (
             {"sampler": "trimesh", "points_per_limb": 64},
-            "has 200 cylinder points.*64",
+            "200.*64",
         ),
     ],
 )

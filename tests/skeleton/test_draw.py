@@ -179,5 +179,5 @@ def test_a_crop_equals_the_window_of_the_image():
 
 
 def test_misuse_is_named():
-    with pytest.raises(ValueError, match="camera must hold 2 cameras, got 1"):
+    with pytest.raises(ValueError, match=r"camera.* 2 .* 1"):
         draw_skeleton(rest(2), None, camera((8, 8)))

@@ -203,16 +203,16 @@ def test_constants_from_inference_mode_can_be_used_for_training():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"p": torch.zeros(1, 32, 3)}, r"p must .*\[B, 33, 3\].*\[1, 32, 3\]"),
-        ({"p": torch.zeros(33, 3)}, r"p must .*\[33, 3\]"),
+        ({"p": torch.zeros(1, 32, 3)}, r"p .*\[B, 33, 3\].*\[1, 32, 3\]"),
+        ({"p": torch.zeros(33, 3)}, r"p .*\[33, 3\]"),
         (
             {"p": torch.zeros(1, 33, 3, dtype=torch.int64)},
-            r"p must be a float.*int64",
+            "p .*int64",
         ),
-        ({"valid": torch.ones(1, 33)}, r"valid must be a bool.*float32"),
+        ({"valid": torch.ones(1, 33)}, "valid .*float32"),
         (
             {"valid": torch.ones(2, 33, dtype=torch.bool)},
-            r"valid must.*\[2, 33\]",
+            r"valid .*\[2, 33\]",
         ),
     ],
 )
@@ -222,7 +222,5 @@ def test_misuse_is_named(change, message):
 
 
 def test_omega_misuse_is_named():
-    with pytest.raises(
-        ValueError, match=r"R_cam must have shape \[1, 3, 3\], got \[3, 3\]"
-    ):
+    with pytest.raises(ValueError, match=r"R_cam.*\[1, 3, 3\].*\[3, 3\]"):
         omega(rest(), None, EYE[0])

@@ -129,7 +129,7 @@ def test_a_skeleton_without_a_trunk_is_refused():
     p[1, [11, 24]] = NAN
     with pytest.raises(
         ValueError,
-        match=r"in 1 of 3 skeletons .*item 1: left_shoulder, right_hip\)",
+        match=r"1 of 3 .*item 1.*left_shoulder, right_hip",
     ):
         sanitise(p)
 
@@ -151,11 +151,9 @@ def test_estimated_hips_hold_a_trunk_of_which_only_the_shoulders_are_seen():
 
 
 def test_misuse_is_named():
-    with pytest.raises(ValueError, match=r"sanitise: p must .*\[B, 33, 3\]"):
+    with pytest.raises(ValueError, match=r"p .*\[B, 33, 3\]"):
         sanitise(torch.zeros(1, 24, 3))
-    with pytest.raises(
-        ValueError, match=r"visibility must have shape \[1, 33\], got \[33\]"
-    ):
+    with pytest.raises(ValueError, match=r"visibility.*\[1, 33\].*\[33\]"):
         sanitise(noisy(0), torch.ones(33))
 
 

@@ -123,7 +123,7 @@ def test_wrong_shapes_name_the_argument():
         to_mediapipe33(np.zeros((24, 3)), kind="smplh")
     with pytest.raises(
         ValueError,
-        match=r"joints must have shape \[..., 55, 3\], got \[24, 3\]",
+        match=r"joints.*55, 3\].*\[24, 3\]",
     ):
         to_mediapipe33(np.zeros((24, 3)), kind="smplx")
     with pytest.raises(ValueError, match="vertices"):

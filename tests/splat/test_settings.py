@@ -52,16 +52,14 @@ def test_values_of_the_presets():
     ],
 )
 def test_values_out_of_range_are_refused(field, value):
-    with pytest.raises(ValueError, match=f"Accuracy: {field} must be"):
+    with pytest.raises(ValueError, match=f"Accuracy.*{field}"):
         replace(ACCURACY["high"], **{field: value})
 
 
 def test_unknown_names_are_refused():
-    with pytest.raises(
-        ValueError, match="expected one of exact, high, standard, draft"
-    ):
+    with pytest.raises(ValueError, match="exact, high, standard, draft"):
         accuracy("best")
-    with pytest.raises(ValueError, match="backend must be one of auto"):
+    with pytest.raises(ValueError, match=r"backend.*auto"):
         resolve_backend("gpu", CPU, ACCURACY["high"])
 
 

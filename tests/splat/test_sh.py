@@ -93,10 +93,10 @@ def test_gradients_and_a_zero_direction():
 def test_wrong_shapes_and_degrees_are_refused():
     with pytest.raises(
         ValueError,
-        match=r"sh must have shape \[B, N, \(d\+1\)², 3\].*\[1, 2, 5, 3",
+        match=r"sh .*\[1, 2, 5, 3",
     ):
         sh_to_colour(torch.zeros(1, 2, 5, 3), torch.zeros(1, 2, 3))
     with pytest.raises(ValueError, match="0 to 3"):
         sh_to_colour(torch.zeros(1, 2, 25, 3), torch.zeros(1, 2, 3))
-    with pytest.raises(ValueError, match="degree must be 0 to 3, got 4"):
+    with pytest.raises(ValueError, match=r"degree.*3.*4"):
         sh_basis(torch.zeros(3), 4)

@@ -23,21 +23,21 @@ def spoilt(field, value, index=(0, 2)):
 @pytest.mark.parametrize(
     ("field", "value", "expected"),
     [
-        ("means", float("nan"), "finite, got nan"),
-        ("quats", float("nan"), "finite, got nan"),
-        ("scales", 0.0, "finite and > 0, got 0"),
-        ("scales", -0.1, "finite and > 0, got -0.1"),
-        ("opacities", 1.5, r"in \[0, 1\], got 1.5"),
-        ("opacities", float("nan"), r"in \[0, 1\], got nan"),
-        ("features", float("inf"), "finite, got inf"),
-        ("covariances", float("nan"), "finite, got nan"),
+        ("means", float("nan"), "nan"),
+        ("quats", float("nan"), "nan"),
+        ("scales", 0.0, "> 0.* 0"),
+        ("scales", -0.1, r"> 0.*-0\.1"),
+        ("opacities", 1.5, r"\[0, 1\].*1\.5"),
+        ("opacities", float("nan"), r"\[0, 1\].*nan"),
+        ("features", float("inf"), "inf"),
+        ("covariances", float("nan"), "nan"),
     ],
 )
 def test_invalid_gaussians_are_refused(field, value, expected):
     gaussians = spoilt(field, value)
     with pytest.raises(
         ValueError,
-        match=rf"Gaussians.{field} must be {expected} at item 0, Gauss",
+        match=rf"Gaussians.{field}.*{expected}.* item 0",
     ):
         rasterise(gaussians, camera())
 
@@ -45,7 +45,7 @@ def test_invalid_gaussians_are_refused(field, value, expected):
 def test_opposite_infinities_do_not_hide_each_other():
     gaussians = spoilt("means", float("inf"))
     gaussians.means[0, 3] = float("-inf")
-    with pytest.raises(ValueError, match=r"2 of 5 are not"):
+    with pytest.raises(ValueError, match="2 of 5"):
         rasterise(gaussians, camera())
 
 
@@ -74,50 +74,50 @@ def test_unused_tensors_may_have_any_values():
         (
             "means",
             (1, 5, 2),
-            r"means must have shape \[B, N, 3\], got \[1, 5, 2\]",
+            r"means.*\[B, N, 3\].*\[1, 5, 2\]",
         ),
         (
             "quats",
             (2, 5, 4),
-            r"quats must have shape \[1, 5, 4\], got \[2, 5, 4\]",
+            r"quats.*\[1, 5, 4\].*\[2, 5, 4\]",
         ),
-        ("scales", (1, 5), r"scales must have shape \[1, 5, 3\], got \[1, 5\]"),
+        ("scales", (1, 5), r"scales.*\[1, 5, 3\].*\[1, 5\]"),
         (
             "opacities",
             (1, 5, 1),
-            r"opacities must have shape \[1, 5\], got \[1, 5, 1\]",
+            r"opacities.*\[1, 5\].*\[1, 5, 1\]",
         ),
         (
             "features",
             (1, 4, 3),
-            r"features must have shape \[1, 5, C\], got \[1, 4, 3\]",
+            r"features.*\[1, 5, C\].*\[1, 4, 3\]",
         ),
         (
             "features",
             (1, 5, 0),
-            r"features must have at least one channel, got 0",
+            "features.* 0",
         ),
         (
             "covariances",
             (1, 5, 6),
-            r"covariances must have shape \[1, 5, 3, 3\], got \[1, 5, 6\]",
+            r"covariances.*\[1, 5, 3, 3\].*\[1, 5, 6\]",
         ),
         (
             "K",
             (1, 4, 4),
-            r"Camera: K must have shape \[B, 3, 3\], got \[1, 4, 4\]",
+            r"K.*\[B, 3, 3\].*\[1, 4, 4\]",
         ),
-        ("R", (1, 4), r"Camera: R must have shape \[B, 3, 3\], got \[1, 4\]"),
-        ("dist", (1, 4), "dist must have shape"),
+        ("R", (1, 4), r"R.*\[B, 3, 3\].*\[1, 4\]"),
+        ("dist", (1, 4), r"dist.*\[1, 4\]"),
         (
             "t",
             (1, 3, 1),
-            r"Camera: t must have shape \[B, 3\], got \[1, 3, 1\]",
+            r"t.*\[B, 3\].*\[1, 3, 1\]",
         ),
         (
             "t",
             (2, 3),
-            r"Camera: K, R, t and dist must share one batch size, got 1, 1, 2",
+            "1, 1, 2",
         ),
     ],
 )
@@ -129,16 +129,12 @@ def test_wrong_shapes_are_refused(field, shape, message):
 
 @pytest.mark.parametrize("size", [(0, 32), (24, 0), (-1, 4), (2.5, 4), (24,)])
 def test_images_without_pixels_are_refused(size):
-    with pytest.raises(
-        ValueError, match=r"size must be \(H, W\) with both at least 1, got \("
-    ):
+    with pytest.raises(ValueError, match=r"size.*\(H, W\)"):
         replace(camera(), size=size)
 
 
 def test_quats_without_scales_are_refused():
-    with pytest.raises(
-        ValueError, match="give quats and scales, or covariances"
-    ):
+    with pytest.raises(ValueError, match=r"quats.*scales.*covariances"):
         replace(cloud(5), scales=None)
 
 
@@ -146,8 +142,8 @@ def test_quats_without_scales_are_refused():
 @pytest.mark.parametrize(
     ("to", "what"),
     [
-        ("meta", "device of Gaussians.means, cpu, got meta"),
-        (torch.float32, "dtype of .*float32"),
+        ("meta", "cpu.*meta"),
+        (torch.float32, "float32"),
     ],
 )
 def test_mixed_devices_and_dtypes_are_refused(field, to, what):
@@ -155,17 +151,13 @@ def test_mixed_devices_and_dtypes_are_refused(field, to, what):
     owner = "Camera" if field in "KRt" else "Gaussians"
     moved = getattr(records[owner], field).to(to)
     records[owner] = replace(records[owner], **{field: moved})
-    with pytest.raises(
-        ValueError, match=f"{owner}.{field} must have the {what}"
-    ):
+    with pytest.raises(ValueError, match=f"{owner}.{field}.*{what}"):
         rasterise(*records.values())
 
 
 def test_integer_tensors_are_refused():
     whole = {k: v.long() for k, v in vars(cloud(5)).items() if v is not None}
-    with pytest.raises(
-        ValueError, match=r"means must be floating point, got torch.int64"
-    ):
+    with pytest.raises(ValueError, match=r"means.*int64"):
         rasterise(Gaussians(**whole), camera())
 
 
@@ -183,39 +175,39 @@ def cam_with(**changes):
     [
         (
             cam_with(K=((0, 0, 0), 0.0)),
-            r"Camera.K of item 0 must be of fx, fy > 0, got \[\[0.0",
+            r"Camera\.K.*item 0.*\[\[0\.0",
         ),
         (
             cam_with(K=((0, 1, 1), -3.0)),
-            r"Camera.K of item 0 must be of fx, fy > 0, got \[\[30.0",
+            r"Camera\.K.*item 0.*\[\[30\.0",
         ),
         (
             cam_with(K=((0, 2, 2), 2.0)),
-            r"Camera.K of item 0 must be \[fx s cx; 0 fy cy; 0 0 1\]",
+            r"Camera\.K.*item 0",
         ),
         (
             cam_with(K=((0, 1, 0), 2.0)),
-            r"Camera.K of item 0 must be \[fx s cx; 0 fy cy; 0 0 1\]",
+            r"Camera\.K.*item 0",
         ),
         (
             cam_with(R=((0, 0, 0), -1.0)),
-            r"Camera.R of item 0 must be a rotation: it mirrors",
+            r"Camera\.R.*item 0.*mirror",
         ),
         (
             cam_with(R=((0, 0, 1), 0.1)),
-            r"Camera.R of item 0 must be a rotation",
+            r"Camera\.R.*item 0",
         ),
         (
             cam_with(t=((0, 0), float("nan"))),
-            r"Camera.t of item 0 must be finite",
+            r"Camera\.t.*item 0",
         ),
         (
             camera(batch=2),
-            r"camera must have the batch size of gaussians, 1, got 2",
+            "camera.* 1.* 2",
         ),
         (
             camera(dtype=torch.float32),
-            r"Camera.K must have the dtype of Gaussians.means",
+            r"Camera\.K.*dtype",
         ),
     ],
 )

@@ -96,8 +96,6 @@ def test_every_row_is_in_the_table_and_every_case_on_the_page(
 
 def test_an_unexpected_status_is_written_and_ends_in_an_error(run, tmp_path):
     bad = ROWS[0]._replace(status="not finite")
-    with pytest.raises(
-        SystemExit, match=r"1 of 5 cases .* needle \(torch\): expected right"
-    ):
+    with pytest.raises(SystemExit, match=r"1 of 5 .*needle \(torch\)"):
         run([*ROWS, bad])
     assert (tmp_path / "stability.md").is_file()

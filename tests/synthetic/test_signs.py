@@ -73,9 +73,7 @@ def test_signs_are_short_and_some_are_held_out_whole():
     )  # the other frames of unseen signs do not train either
     assert set(few) < set(test)
     assert split_signs(names, 0) == (list(range(120)), [])
-    with pytest.raises(
-        ConfigError, match=r"roof, cancel, peek, which have 30 of 120 frames"
-    ):
+    with pytest.raises(ConfigError, match=r"roof, cancel, peek.* 30 .*120"):
         split_signs(names, 31)
 
 

@@ -1,8 +1,6 @@
 """What is not finite is skipped and named, what collapses is undone; at last the run stops."""
 
-import dataclasses
 import re
-from pathlib import Path
 
 import pytest
 import torch
@@ -37,69 +35,37 @@ def weights(part: str, value: float):
     return change
 
 
+# The first iteration, the change, and what the message names.
 CASES = {
-    "image": (
-        5,
-        lambda _, batch: batch.image.fill_(NAN),
-        "image of the data is not finite",
-    ),
-    "skeleton": (
-        5,
-        lambda _, batch: batch.skeleton.fill_(NAN),
-        "skeleton of the data is not",
-    ),
-    "camera": (
-        5,
-        lambda _, batch: batch.camera.K.fill_(NAN),
-        r"camera.K of the data is not",
-    ),
-    "body": (
-        8,
-        lambda _, batch: batch.body.theta.fill_(NAN),
-        r"body.theta of the data is not",
-    ),
-    "psi": (
-        9,
-        weights("avatar.deformation", 1e20),
-        "weights of psi have exploded",
-    ),
+    "image": (5, lambda _, batch: batch.image.fill_(NAN), "step_one/loss"),
+    "skeleton": (5, lambda _, batch: batch.skeleton.fill_(NAN), "means"),
+    "camera": (5, lambda _, batch: batch.camera.K.fill_(NAN), r"Camera\.K"),
+    "body": (8, lambda _, batch: batch.body.theta.fill_(NAN), "step_two|means"),
+    "psi": (9, weights("avatar.deformation", 1e20), "psi|Gaussians"),
     "segmentation": (
         1,
         weights("avatar.segmentation", NAN),
-        "weights of segmentation have",
+        "segmentation|Gaussians",
     ),
-    "generator": (
-        9,
-        weights("avatar.generator", NAN),
-        "weights of generator have exploded",
-    ),
-    "discriminator": (
-        11,
-        weights("discriminator", NAN),
-        "weights of discriminator have",
-    ),
+    "generator": (9, weights("avatar.generator", NAN), "generator"),
+    "discriminator": (11, weights("discriminator", NAN), "step_two"),
 }
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_what_is_not_finite_is_skipped_and_stops_the_run_when_it_recurs(
-    make, capsys, tmp_path, case
+    make, capsys, case
 ):
     first, change, cause = CASES[case]
     spoil = Spoil(change, first)
     module, trainer, data = make("training.max_skipped=2", callbacks=[spoil])
-    with pytest.raises(
-        GsganError, match=f"stopped at iteration {first + 1}: 2 of.*{cause}"
-    ):
+    with pytest.raises(GsganError, match=rf"iteration {first + 1}.* 2 of"):
         trainer.fit(module, data)
     assert list(module.skipped.steps) == [first, first + 1]
     assert re.search(
-        rf"iteration {first}: skipped \(1 of.*{cause}", capsys.readouterr().out
+        rf"iteration {first}: skipped \(1 of.*({cause}).*frame \[",
+        capsys.readouterr().out,
     )
-    kept = torch.load(tmp_path / "stopped_0.pt", weights_only=True)
-    assert kept["step"] == first + 1
-    fields = {field.name for field in dataclasses.fields(module._frame)}
-    assert kept["frame"].keys() == fields
 
 
 def test_a_loss_that_is_not_finite_is_named(make):
@@ -108,7 +74,7 @@ def test_a_loss_that_is_not_finite_is_named(make):
     module.step_two_terms = lambda r, *given: (
         terms(r, *given) | {"own": NAN * r.image.mean()}
     )
-    with pytest.raises(GsganError, match="the loss step_two/own is not finite"):
+    with pytest.raises(GsganError, match="step_two/own"):
         trainer.fit(module, data)
 
 
@@ -137,4 +103,3 @@ def test_a_collapsed_discriminator_is_undone_and_stops_the_run_when_it_recurs(
         trainer.fit(module, data)
     assert module.rollback.done == 1
     assert "back to the last good state" in capsys.readouterr().out
-    assert (Path(trainer.default_root_dir) / "stopped_0.pt").is_file()

@@ -108,12 +108,10 @@ def test_psis_rate_ends_with_step_one_however_long_step_two_is(make):
 
 def test_a_span_that_is_not_read_is_refused(make):
     module, _, _ = make("+training.recipes.generator.span=step_one")
-    with pytest.raises(ConfigError, match="is read for psi and colour only"):
+    with pytest.raises(ConfigError, match=r"span.*psi.*colour"):
         module.configure_optimizers()
 
 
 def test_a_span_is_both_steps_or_the_first():
-    with pytest.raises(
-        ConfigError, match="span must be one of both, step_one, got 'all'"
-    ):
+    with pytest.raises(ConfigError, match=r"span.*both, step_one.*'all'"):
         Recipe(Rate(1e-3), span="all")

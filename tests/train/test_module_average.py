@@ -66,7 +66,5 @@ def test_the_average_is_updated_when_the_config_says(make):
     assert int(module.average.copy.n_averaged) == sum(
         step % 5 == 0 for step in steps
     )
-    with pytest.raises(
-        ConfigError, match="average_every must be a number of at least 1"
-    ):
+    with pytest.raises(ConfigError, match="average_every"):
         make("training.average_every=0")

@@ -63,9 +63,7 @@ def test_processes_skip_together_and_stop_together(make):
         use_distributed_sampler=False,
         **TWO,
     )
-    with pytest.raises(
-        Exception, match="stopped at iteration 7: 3 of the last"
-    ):
+    with pytest.raises(Exception, match=r"iteration 7.* 3 of"):
         trainer.fit(module, data)
 
 
@@ -75,7 +73,5 @@ def test_another_number_of_processes_is_refused(make):
     module.on_save_checkpoint(checkpoint)
     assert checkpoint["gsgan"]["processes"] == 1
     checkpoint["gsgan"]["processes"] = 2
-    with pytest.raises(
-        ConfigError, match="trained by 2 processes, and 1 would draw"
-    ):
+    with pytest.raises(ConfigError, match=r" 2 processes.* 1 "):
         module.on_load_checkpoint(checkpoint)

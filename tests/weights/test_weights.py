@@ -139,16 +139,16 @@ def test_files_that_are_no_weights_are_refused_and_run_no_code(tmp_path):
             pretrained("alex", path)
     assert not marker.exists()
     torch.save({"0.weight": "text"}, path)
-    with pytest.raises(DataError, match="not torchvision's weights of AlexNet"):
+    with pytest.raises(DataError, match="AlexNet"):
         pretrained("alex", path)
 
 
 def test_another_networks_weights_are_refused_by_name(state, tmp_path):
     path = tmp_path / "alex.pth"
     torch.save(state, path)
-    with pytest.raises(DataError, match="not torchvision's weights of VGG-16"):
+    with pytest.raises(DataError, match="VGG-16"):
         pretrained("vgg", path)
-    with pytest.raises(DataError, match=f"no weights of AlexNet.*{ALEX.file}"):
+    with pytest.raises(DataError, match=f"AlexNet.*{ALEX.file}"):
         find("alex", tmp_path / "nothing")
     with pytest.raises(ConfigError, match="vgg or alex"):
         find("squeeze")

@@ -73,6 +73,8 @@ def run(config: DictConfig, folder: Path) -> None:
     if config.threads is not None:
         check_whole(config, threads=1)
         torch.set_num_threads(config.threads)
+
+    # The machine is part of the result.
     console = make_console()
     device = pick_device(config.device)
     where = environment(device)
@@ -135,6 +137,7 @@ def load_subject(
     # A trained run, with its own data and config.
     moved = DataPaths(config.data_root, config.data_smpl)
     if config.run is not None:
+        # A trained run with frames of its own data.
         folder = Path(config.run).expanduser()
         stored = load_config(folder, moved)
         data = build_data(stored)
@@ -378,6 +381,8 @@ def settings_of(
         found["channels of F"] = avatar.splat_channels
         found["supersampling of F"] = avatar.accuracy.supersample
         found["SH degree"] = avatar.splats.sh_degree
+
+    # The number of Gaussians, on the body or on the skeleton.
     placed = avatar.body_points or avatar.densify
     if placed is not None:
         found["Gaussians"] = placed.n_points

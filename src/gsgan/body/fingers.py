@@ -142,9 +142,13 @@ class Fingers(nn.Module):
         lengths = self.bones.norm(dim=-1, keepdim=True)
         bones = lengths * normalize(bones, dim=-1, eps=1e-9)
 
+        # Landmarks that were not seen have no weight.
         weight = (
             seen[:, self.chains[:, 1:]].to(bones) / FINGER_LANDMARK_NOISE**2
         )
+
+        # Limits hold after each step: a joint cannot leave its range on the
+        # way.
         numbers = self._start(bones, weight)
         for _ in range(steps):
             numbers = numbers - self._step(numbers, bones, weight)
@@ -178,6 +182,7 @@ class Fingers(nn.Module):
 
     def _turns(self, numbers: Tensor) -> tuple[Tensor, Tensor]:
         """``[B, 10, 3]`` of first and second joints."""
+        # Three numbers turn the first joint, two the second.
         first, second = (numbers.unsqueeze(-1) * self.axes).split([3, 2], dim=2)
         return first.sum(2), second.sum(2)
 
@@ -215,8 +220,13 @@ class Fingers(nn.Module):
 
         # Derivatives [B, 10, 5, 3, 3]: the first joint moves all landmarks, the second two.
         own, others = self.axes.split([3, 2], dim=1)
+
+        # The Jacobian turns a change of a number into the turn that it adds.
         own = own @ left_jacobian(first_turn).mT
         others = others @ (first @ left_jacobian(second_turn)).mT
+
+        # The second joint turns about the middle landmark, which therefore
+        # stays.
         arms = torch.cat([torch.zeros_like(middle), beyond], dim=2)
         J = torch.cat([_velocities(own, x), _velocities(others, arms)], dim=2)
 
@@ -231,12 +241,15 @@ def _shown_turn(axes: Tensor, rest: Tensor, now: Tensor) -> Tensor:
     """``[B, 10, n]`` components along axes of the shortest turns from ``rest`` to ``now``."""
     rest = normalize(rest, dim=-1, eps=1e-9)
     now = normalize(now, dim=-1, eps=1e-9)
+
+    # Components along other axes are turns that the joint cannot make.
     turn = shortest_turn(rest, now)
     return matvec(axes, turn)
 
 
 def _velocities(axes: Tensor, arms: Tensor) -> Tensor:
     """``[B, 10, n, 3, 3]`` of landmarks with arms ``[B, 10, 3, 3]``, by axes ``[B, 10, n, 3]``."""
+    # A turn about an axis moves the end of an arm by their cross product.
     axis, arm = torch.broadcast_tensors(axes.unsqueeze(3), arms.unsqueeze(2))
     return torch.linalg.cross(axis, arm)
 
@@ -256,6 +269,7 @@ def _placed(
     They minimise the distances of ``x [B, 42, 3]``, by Gauss-Newton steps from ``R``. Their
     gradients are always finite, unlike those of an SVD.
     """
+    # Landmarks that were not seen have no share.
     x = x.unflatten(1, (2, HAND))
     y = hands.unflatten(1, (2, HAND))
     w = seen.to(hands).unsqueeze(-1).unflatten(1, (2, HAND))
@@ -271,6 +285,7 @@ def _placed(
     # Σ (|a|² - a aᵀ) v = Σ a × b.
     eye = torch.eye(3, dtype=x.dtype, device=x.device)
     for _ in range(PLACING):
+        # Gauss-Newton on the rotation: the matrix of inertia, and the torque.
         now = away @ R.mT
         H = (share * now).mT @ now
         H = (torch.einsum("...ii", H)[..., None, None] + MIN_PALM**2) * eye - H
@@ -281,6 +296,8 @@ def _placed(
 
 def _bones(x: Tensor, chains: Tensor) -> Tensor:
     """``[..., 10, 3, 3]`` from base to middle, and from there to the two landmarks beyond."""
+    # Both further bones start at the middle: the second joint turns them
+    # together.
     base, middle, next_one, tip = x[..., chains, :].unbind(-2)
     return torch.stack([middle - base, next_one - middle, tip - middle], dim=-2)
 
@@ -309,6 +326,8 @@ def _axes(
     # A joint flexes towards its aim.
     aim = torch.where(thumb[:, None, None], pinky - places, out)
     flexion = normalize(torch.linalg.cross(along, aim), dim=-1)
+
+    # Spread is about the axis that is across the bone and its flexion.
     side = torch.linalg.cross(along, flexion)
 
     # The bend at rest, of fingers only.
@@ -317,6 +336,8 @@ def _axes(
     cosine = (before * along).sum(-1)
     bend = torch.where(thumb[:, None], 0.0, torch.atan2(sine, cosine))
 
+    # A finger's numbers: bend, spread and twist of its first joint, bend and
+    # spread of the second.
     axes = [flexion[:, 0], side[:, 0], along[:, 0], flexion[:, 1], side[:, 1]]
     none = torch.zeros_like(bend[:, 0])
     origins = [bend[:, 0], none, none, bend[:, 1], none]

@@ -32,9 +32,8 @@ class Body(MarkedBody):
     surface_names: tuple[str, ...]  # skin, hair, eye and the garments
     landmark_names: tuple[str, ...]  # of the 33
     hand_landmarks: Tensor  # [42, 3] metres
-    hand_bone: (
-        Tensor  # [42] int64, the joint that each hand landmark moves with
-    )
+    # [42] int64, the joint that each hand landmark moves with
+    hand_bone: Tensor
     hand_names: tuple[str, ...]  # of the 42
 
     def posed_hands(self, pose: BodyPose) -> Tensor:
@@ -79,6 +78,7 @@ def read_body(path: Path) -> Body:
     Raises:
         DataError: when the file is missing, damaged or lacks an array.
     """
+    # The file is part of gsgan: a damaged one is a damaged installation.
     try:
         with np.load(path, allow_pickle=False) as archive:
             return _body(dict(archive))
@@ -109,6 +109,8 @@ def _body(arrays: dict[str, np.ndarray]) -> Body:
 
     # Divided by their sum, weights are shares again.
     weight = torch.from_numpy(arrays["bone_weight"].astype(np.float32))
+
+    # Labels are stored by face, and bodies have them by vertex.
     vertices = tensor("vertices")
     faces = tensor("faces")
     face_labels = tensor("face_labels")

@@ -22,6 +22,8 @@ def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
     Rodrigues' formula, and below 1e-6 squared radians its Taylor series: values and gradients are
     finite at zero rotation.
     """
+    # A safe angle where the series is used: the unused branch must not give NaN
+    # gradients.
     squared = (axis_angle * axis_angle).sum(-1)[..., None, None]
     is_small = squared < 1e-6
     angle = torch.where(is_small, torch.ones_like(squared), squared).sqrt()
@@ -38,6 +40,8 @@ def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
 
 def shortest_turn(a: Tensor, b: Tensor) -> Tensor:
     """Axis-angle ``[..., 3]`` of the shortest rotations from unit ``a`` to ``b [..., 3]``."""
+    # The cross product has the length of the angle's sine; parallel vectors
+    # have no axis.
     axis = torch.linalg.cross(a, b)
     sine = axis.norm(dim=-1, keepdim=True)
     cosine = (a * b).sum(-1, keepdim=True)
@@ -46,6 +50,7 @@ def shortest_turn(a: Tensor, b: Tensor) -> Tensor:
 
 def left_jacobian(v: Tensor) -> Tensor:
     """``[..., 3, 3]``: the rotation, applied last, that a change of the axis-angle ``v`` adds."""
+    # A safe angle where the series is used, as in `axis_angle_to_matrix`.
     squared = v.square().sum(-1)[..., None, None]
     small = squared < 1e-4
     safe = torch.where(small, torch.ones_like(squared), squared)
@@ -71,6 +76,7 @@ def _cross_matrix(v: Tensor) -> Tensor:
 
 def kinematic_levels(parents: Sequence[int]) -> list[list[int]]:
     """Joints by depth, roots (parent -1) first; each parent comes before its children."""
+    # Parents come first, so a parent's depth is known.
     depth: list[int] = []
     for parent in parents:
         depth.append(0 if parent < 0 else depth[parent] + 1)
@@ -97,6 +103,7 @@ def forward_kinematics(
     Raises:
         ValueError: when the shape of rotations or transl does not match.
     """
+    # Broadcasting would accept other shapes silently.
     J = len(parents)
     if rotations.ndim != 4 or rotations.shape[1:] != (J, 3, 3):
         raise ValueError(
@@ -154,9 +161,8 @@ class KinematicPlan(NamedTuple):
 
     level_sizes: list[int]
     order: tuple[int, ...]  # joints, level by level
-    parents: tuple[
-        int, ...
-    ]  # of each joint in `order`; a root is its own parent
+    # of each joint in `order`; a root is its own parent
+    parents: tuple[int, ...]
     # by level, from the second: places of the parents in the level above
     parent_places: tuple[tuple[int, ...], ...]
     inverse: tuple[int, ...]  # place of each joint in `order`
@@ -167,9 +173,13 @@ def kinematic_plan(parents: tuple[int, ...]) -> KinematicPlan:
     """The plan of a skeleton with these parents, -1 for a root."""
     levels = kinematic_levels(parents)
     order = tuple(chain.from_iterable(levels))
+
+    # A root is its own parent, so that its offset is zero.
     own_parents = [
         joint if parents[joint] < 0 else parents[joint] for joint in order
     ]
+
+    # Each level is looked up in the level above it alone.
     parent_places = []
     for above, level in pairwise(levels):
         parent_places.append(
@@ -193,6 +203,7 @@ def check_weights(bone_weight: Tensor) -> None:
     Raises:
         ValueError: when a vertex has no weight, a negative one, or one that is not finite.
     """
+    # Weights are divided by their sum, which must be positive.
     total = bone_weight.sum(-1)
     good = (total > 0) & total.isfinite() & (bone_weight >= 0).all(-1)
     if not bool(good.all()):

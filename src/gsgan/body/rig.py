@@ -101,9 +101,8 @@ class Turn(NamedTuple):
     """A rotation at a joint, and the numbers that it depends on."""
 
     joint: int
-    axes: dict[
-        str, Tensor
-    ]  # axis times share, by number; turns may share numbers
+    # axis times share, by number; turns may share numbers
+    axes: dict[str, Tensor]
 
 
 @dataclass(frozen=True)
@@ -112,9 +111,8 @@ class Limb:
 
     hub: int  # the bone frame that it hangs on, `PELVIS` or `CHEST`
     points: tuple[int, int, int]  # landmarks of its first, middle and end joint
-    numbers: tuple[
-        int, int, int, int
-    ]  # the swing's two axes, the twist, and the hinge
+    # the swing's two axes, the twist, and the hinge
+    numbers: tuple[int, int, int, int]
     # [3, 3] of the swing, the first as near to the hinge as can be; and of the twist, along the
     # upper bone
     axes: Tensor
@@ -215,6 +213,7 @@ def _swing(name: str, along: Tensor, flat: Tensor) -> dict[str, Tensor]:
 
 def _arm(turns: _Turns, side: str, axes: dict[str, Tensor]) -> LimbAxes:
     """Adds the turns of an arm from the collarbone to the thumb."""
+    # Unit directions from shoulder to elbow, and from elbow to wrist.
     along = limb_axes(turns.body)
     upper = along[turns.joint("arm")]
     lower = along[turns.joint("forearm")]
@@ -227,6 +226,7 @@ def _arm(turns: _Turns, side: str, axes: dict[str, Tensor]) -> LimbAxes:
     flat = _across(hinge, upper)
     across = torch.linalg.cross(lower, hinge)
 
+    # Of a forearm of several bones, the first has the hinge, and all share the twist.
     first = slice(0, 1)
     collar = {"y": axes["y"], "z": axes["z"]}
     turns.put("collar", _named(f"{side}_collar", collar))
@@ -380,11 +380,14 @@ def trunk_covariance() -> Tensor:
 
 def _limb(names: tuple[str, ...], words: str, axes: LimbAxes) -> Limb:
     """A limb of its side, name and joints, as in ``left arm shoulder elbow wrist``."""
+    # The angle between the bones at rest, from which the hinge is counted.
     side, limb, first, middle, end = words.split()
     bend = torch.atan2(
         torch.linalg.cross(axes.upper, axes.lower).norm(),
         axes.upper @ axes.lower,
     )
+
+    # The swing turns about two axes across the upper bone.
     across = torch.linalg.cross(axes.upper, axes.flat)
     return Limb(
         hub=CHEST if limb == "arm" else PELVIS,

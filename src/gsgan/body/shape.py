@@ -133,6 +133,8 @@ class BodyShape:
             raise ValueError(
                 f"BodyShape: expected {known} numbers, got {list(values.shape)}"
             )
+
+        # What follows the three groups that every shape has.
         K, stretch, offsets, more = values.split(
             [*sizes, len(values) - sum(sizes)]
         )
@@ -189,6 +191,9 @@ class ShapeSpace(Generic[B]):
 
         # Bones are stretched; then what belongs to this person's skeletons is moved.
         body = _stretched(replace(self.body, **moved), shape.stretch)
+
+        # Offsets of landmarks, the curve of the back, and hands come after
+        # stretching.
         if shape.offsets is not None:
             body = replace(body, landmarks=body.landmarks + shape.offsets)
         if shape.spine is not None:
@@ -259,9 +264,11 @@ def _stretched(body: B, stretch: Tensor) -> B:
         blended = blended + share.unsqueeze(-1) * maps[bone]
     A, t = blended.unflatten(-1, (3, 4)).split((3, 1), dim=-1)
 
+    # Points that belong to one bone move with its part alone.
     def carried(points: Tensor, bone: Tensor) -> Tensor:
         return matvec(S[bone], points) + shift[bone]
 
+    # Landmarks are carried by one bone each, as rigidly as its part.
     changes: dict[str, Any] = {
         "vertices": skin(body.vertices, A, t.squeeze(-1)),
         "joints": moved,
@@ -359,18 +366,23 @@ def open_body(
     Raises:
         DataError: when the file cannot be read or is of another body.
     """
+    # The free body needs no file.
     if kind == "free":
         if not betas:
             return free_body()
         return shaped_body(BodyShape.of_flat(torch.tensor(betas)))
     if kind is None or file is None:
         return None
+
+    # The user's file must be of the model that the poses were made with.
     model = read_smpl(file)
     if model.kind != kind:
         raise DataError(
             f"{file} is a model of kind {model.kind} ({len(model.parents)} joints), but the data's "
             f"poses are of {kind}; give that model's file"
         )
+
+    # More coefficients than the file has would be dropped silently.
     if len(betas) > model.shapedirs.shape[-1]:
         raise DataError(
             f"{file} has {model.shapedirs.shape[-1]} shape coefficients, the data gives "

@@ -47,9 +47,8 @@ class SkinnedBody:
     vertex_labels: Tensor  # [V] int64 part of each vertex, see label_names
     label_names: tuple[str, ...]  # of each part, background first
     label_source: Literal["own", "guess", "vote"] = "own"
-    template: Tensor | None = (
-        None  # [V, 3] metres, the body before it is shaped
-    )
+    # [V, 3] metres, the body before it is shaped
+    template: Tensor | None = None
 
     def __post_init__(self) -> None:
         check_weights(self.bone_weight)
@@ -257,6 +256,8 @@ def surface_gradient(
     rows = (3 * a.unsqueeze(1) + torch.arange(3)).flatten().numpy()
     ends = b.repeat_interleave(3).numpy()
     starts = a.repeat_interleave(3).numpy()
+
+    # Sparse: a point depends on its few neighbours only.
     values = share.flatten().numpy()
     shape = (3 * count, count)
     plus = csr_array((values, (rows, ends)), shape)

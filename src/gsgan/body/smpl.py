@@ -44,9 +44,8 @@ KEYS = (
     "f",
 )
 SMPLX_JOINT_COUNT = 55
-WEIGHT_TOLERANCE = (
-    1e-3  # of the sum of a vertex's weights, and of negative weights
-)
+# of the sum of a vertex's weights, and of negative weights
+WEIGHT_TOLERANCE = 1e-3
 
 Floats = NDArray[np.float64]
 
@@ -62,12 +61,16 @@ def read_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], tuple[int, ...]]:
         DataError: when the file is missing, damaged, holds forbidden classes, lacks an array, or
             an array's shape or values are wrong.
     """
+    # The number of vertices, of joints and of coefficients follow from the
+    # first arrays.
     raw = _raw(path)
     v_template = expect_array(raw, "v_template", (None, 3), path)
     V = len(v_template)
     parents = _parents(
         expect_array(raw, "kintree_table", (2, None), path), path
     )
+
+    # SMPL-X keeps directions of shape and of expression in one array.
     J = len(parents)
     directions = expect_array(raw, "shapedirs", (V, 3, None), path)
     S = directions.shape[-1]
@@ -78,6 +81,7 @@ def read_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], tuple[int, ...]]:
         elif S == 20:
             S = 10
 
+    # The other arrays must fit these numbers.
     directions = _finite(directions, "shapedirs", path)
     posedirs = expect_array(raw, "posedirs", (V, 3, 9 * (J - 1)), path)
     regressor = expect_array(raw, "J_regressor", (J, V), path)
@@ -103,6 +107,9 @@ def _raw(path: Path) -> dict[str, Any]:
         raise DataError(
             f"{path} holds a {type(content).__name__}; expected an SMPL model, a dict"
         )
+
+    # Fitted parameters are also a dict, and are given in place of the model by
+    # mistake.
     missing = [
         key for key in KEYS if not isinstance(content.get(key), np.ndarray)
     ]
@@ -116,11 +123,14 @@ def _raw(path: Path) -> dict[str, Any]:
 
 def _parents(table: NDArray[Any], path: Path) -> tuple[int, ...]:
     """Parent of each joint from the kinematic tree (row 0 the parents, row 1 the joints)."""
+    # A joint's number is the column that names it, whatever the order of the
+    # columns.
     column = {int(joint): place for place, joint in enumerate(table[1])}
     parents = [-1]
     for parent in table[0, 1:]:
         parents.append(column.get(int(parent), -1))
 
+    # Forward kinematics visits each parent before its children.
     broken = [
         j for j, parent in enumerate(parents) if j and not 0 <= parent < j
     ]
@@ -178,9 +188,8 @@ class SkinnedModel:
     v_template: Tensor  # [V, 3] metres, the mean shape
     shapedirs: Tensor  # [V, 3, S]
     expression_dirs: Tensor  # [V, 3, E]; E is 0 but for SMPL-X
-    posedirs: (
-        Tensor  # [V, 3, 9 (J - 1)], per row-major entry of each joint's R - 1
-    )
+    # [V, 3, 9 (J - 1)], per row-major entry of each joint's R - 1
+    posedirs: Tensor
     J_regressor: Tensor  # [J, V]
     weights: Tensor  # [V, J], rows sum to 1
     parents: tuple[int, ...]  # of each joint, -1 for the root
@@ -297,6 +306,8 @@ class SkinnedModel:
                 f"SkinnedModel.as_body: parts must be 'joints' for a model of "
                 f"{len(self.parents)} joints, got {parts!r}"
             )
+
+        # In float64, as the model's own arrays are.
         shape = torch.from_numpy(np.atleast_2d(np.asarray(betas, np.float64)))
         names = part_names(parts, self.joint_names)
 
@@ -307,6 +318,7 @@ class SkinnedModel:
         ]
         first = torch.from_numpy(self.weights.numpy().argmax(axis=1))
 
+        # Everything else follows the shape.
         index, weight = self.bones
         vertices = self.rest_vertices(shape)[0]
         joints = self.rest_joints(shape)[0]
@@ -335,9 +347,12 @@ class SkinnedModel:
         A landmark that the model does not have is NaN and carried by the root: the mouth; and
         without SMPL's or SMPL-X's own vertices also face, heels and most of the hands.
         """
+        # An unknown model has no landmarks.
         if self.kind not in TABLES:
             unknown = joints.new_full((len(MEDIAPIPE33.names), 3), torch.nan)
             return unknown, torch.zeros(len(unknown), dtype=torch.int64)
+
+        # A reduced model lacks the vertices that are landmarks.
         table = TABLES[self.kind]
         whole = len(vertices) == table.counts[1]
         p, _ = to_mediapipe33(

@@ -49,30 +49,23 @@ LANDMARK_NOISE = 0.004
 FACE_NOISE = 0.008
 KNUCKLE_NOISE = 0.007
 HIP_NOISE = 0.05  # of estimated hips: nothing else keeps the trunk from tilting
-KNUCKLES = slice(
-    17, 23
-)  # of 33 landmarks: pinky, index and thumb of both hands
-ON_HANDS = (
-    (17, 19, 21),
-    (18, 20, 22),
-)  # the 33 landmarks that hand landmarks replace
-ROBUST = (
-    5.0  # standard deviations at which the loss of a landmark becomes linear
-)
+# of 33 landmarks: pinky, index and thumb of both hands
+KNUCKLES = slice(17, 23)
+# the 33 landmarks that hand landmarks replace
+ON_HANDS = ((17, 19, 21), (18, 20, 22))
+# standard deviations at which the loss of a landmark becomes linear
+ROBUST = 5.0
 MAX_STEPS = 10  # Levenberg-Marquardt steps at most
 MIN_IMPROVEMENT = 1e-3  # relative change of the cost at which a frame stops
-GRADIENT_STEPS = (
-    8  # error of gradients: a few percent if a landmark hardly matters
-)
+# error of gradients: a few percent if a landmark hardly matters
+GRADIENT_STEPS = 8
 FIRST_DAMPING = 1e-3  # at the first step
-DAMPING_DECREASE = (
-    0.2  # factor of the damping after a step that lowers the cost
-)
+# factor of the damping after a step that lowers the cost
+DAMPING_DECREASE = 0.2
 DAMPING_INCREASE = 20.0  # and after one that does not
 FLOOR = 1e-3  # on the diagonal: the root has no prior
-CHUNK_FRAMES = (
-    64  # frames at a time: their matrices fit into a processor's cache
-)
+# frames at a time: their matrices fit into a processor's cache
+CHUNK_FRAMES = 64
 # Between these bends, radians, the weight of the twist rises from 0 to 1.
 STRAIGHT_BEND = 0.1
 SHARP_BEND = 0.4
@@ -121,9 +114,8 @@ class Solver(nn.Module):
     prior: Tensor  # [D, D] precisions
     minimum: Tensor  # [D] minimum of each number
     matrix: Tensor  # [D, 3 T] from numbers to the turns' axis-angles
-    follows: (
-        Tensor  # [E, N, 1] bool, whether a landmark follows an entry's turn
-    )
+    # [E, N, 1] bool, whether a landmark follows an entry's turn
+    follows: Tensor
     jumps: Tensor  # [n, T + 1]
     before: Tensor  # [T] the turn before each, T for the root's
     rest_hubs: Tensor  # [3, 3, 3] frames of pelvis, chest and head
@@ -136,26 +128,35 @@ class Solver(nn.Module):
     reaches: Tensor
 
     def __init__(self, body: MarkedBody) -> None:
+        # Landmarks that the body lacks have no weight.
         super().__init__()
         self.parents = len(body.parents)
         self.fingers = Fingers(body) if isinstance(body, Body) else None
         known = body.landmarks.isfinite().all(-1)
         if isinstance(body, Body):
             body = _with_palms(body)
+
+        # Constants of the steps: all of them follow from the body at rest.
         own = body.landmarks[:BODY]
         with torch.no_grad():
             rig = self.rig = build_rig(body)
             rest, _ = sanitise(
                 torch.where(known[:, None], own, torch.nan)[None]
             )
+
+            # A number turns about its axes; several turns may share a number.
             matrix = body.joints.new_zeros(len(rig.names), len(rig.joint), 3)
             matrix[rig.entry_number, rig.entry_turn] = rig.entry_axis.to(matrix)
             precision, minimum = prior(rig)
+
+            # The landmarks that follow each turn, and those that a hand's own
+            # landmarks replace.
             follows = ancestors(rig.parent)[rig.carrier].mT
             replaced = torch.zeros(len(ON_HANDS), BODY, dtype=torch.bool)
             for hand, replaced_landmarks in enumerate(ON_HANDS):
                 replaced[hand, list(replaced_landmarks)] = True
 
+            # The tensors that the steps read, by their names as buffers.
             held = {
                 "precision": known / _noise().square(),
                 "prior": precision,
@@ -203,6 +204,8 @@ class Solver(nn.Module):
                 f"Solver: the skeleton must have {', '.join(map(str, SKELETON_SIZES))} joints, got "
                 f"{skeleton.shape[1]}"
             )
+
+        # Gradients need the steps in torch.
         if not self._live(skeleton) and compiled.available(skeleton):
             return self._compiled(skeleton, visibility)
 
@@ -223,12 +226,20 @@ class Solver(nn.Module):
             seen = (
                 visibility[:, BODY:WITH_HAND_JOINTS] > 0
             ) & hands.isfinite().all(-1)
+
+            # The finger solver says which hands can be placed, and where.
             near = torch.where(seen.unsqueeze(-1), hands - shift, 0.0)
             found = self.fingers(near, seen)
+
+            # Of a placed hand, the landmarks of the palm count instead of the
+            # three of the 33.
             replaced = (found.placed.unsqueeze(-1) & self.replaced).any(1)
             placed = found.placed.repeat_interleave(len(PALM), dim=1)
             held = placed.to(weight) / LANDMARK_NOISE**2
             weight = torch.cat([weight.masked_fill(replaced, 0), held], dim=1)
+
+            # They are the body's own palm where the hand was placed, so that
+            # their errors agree.
             own = self.landmarks[BODY:].unflatten(0, (2, -1))
             at = own @ found.rotations.mT + found.shifts.unsqueeze(-2)
             p = torch.cat([p, at.flatten(1, 2)], dim=1)
@@ -256,6 +267,7 @@ class Solver(nn.Module):
 
     def _compiled(self, skeleton: Tensor, visibility: Tensor) -> BodyPose:
         """`solve` by compiled code."""
+        # The compiled solver runs on the CPU, in the dtype of the skeleton.
         p = skeleton.cpu()
         shown = visibility.to("cpu", skeleton.dtype)
         body, valid = sanitise(p[:, :BODY], shown[:, :BODY])
@@ -266,6 +278,8 @@ class Solver(nn.Module):
                 shown[:, BODY:WITH_HAND_JOINTS] > 0
             ) & landmarks.isfinite().all(-1)
             hands = (landmarks, seen)
+
+        # It makes the same steps as the code below, frame by frame.
         theta, transl = compiled.solve(
             *self.job(),
             body=(body, shown[:, :BODY], valid),
@@ -337,6 +351,7 @@ class Solver(nn.Module):
 
     def _axes(self, name: str) -> Tensor:
         """``[3, 3]`` unit axes, by rows, of the numbers of a chain."""
+        # Joints of a chain share the axis: their sum has its direction.
         rows = self.matrix[self.rig.numbers(name)]
         return normalize(rows.unflatten(1, (-1, 3)).sum(1))
 
@@ -345,6 +360,7 @@ class Solver(nn.Module):
 
         If neither hip is valid, both hold the trunk weakly, as `sanitise` completed them.
         """
+        # Nothing else keeps a trunk without hips from tilting.
         hips = list(MEDIAPIPE33.hips)
         held = torch.zeros_like(self.precision)
         held[hips] = 1 / HIP_NOISE**2
@@ -359,6 +375,8 @@ class Solver(nn.Module):
         shown = (visibility > 0) & skeleton.isfinite().all(-1)
         seen = shown[:, :BODY]
         hands = shown[:, BODY:WITH_HAND_JOINTS]
+
+        # A placed hand counts by its palm.
         fingers = self.fingers if hands.shape[1] else None
         if fingers is not None:
             placed = fingers.placed(hands)
@@ -377,6 +395,8 @@ class Solver(nn.Module):
         moved = torch.zeros(
             len(visibility), self.parents, device=visibility.device
         )
+
+        # A joint moves if any number that turns it is free.
         joints = self.joint[self.entry_turn].expand(len(visibility), -1)
         moved = moved.scatter_add(1, joints, free[:, self.entry_number].float())
         if fingers is not None:
@@ -385,6 +405,7 @@ class Solver(nn.Module):
 
     def _solve(self, p: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
         """Pose ``[B, J, 3]`` and translation ``[B, 3]`` of landmarks ``[B, N, 3]``."""
+        # Only the last steps carry gradients.
         with torch.no_grad():
             q, root = self.guess(p.detach())
             q, root = self.descend(q, root, p.detach(), weight)
@@ -408,6 +429,7 @@ class Solver(nn.Module):
 
     def guess(self, p: Tensor) -> tuple[Tensor, Tensor]:
         """Numbers ``[B, D]`` and the root's rotation ``[B, 3, 3]`` of finite joints."""
+        # Frames of pelvis, chest and head, since rest.
         hubs = bone_frames(p[:, :BODY]).hubs @ self.rest_hubs.mT
         pelvis, chest, head = hubs.unbind(1)
         q = p.new_zeros(len(p), len(self.prior))
@@ -478,6 +500,8 @@ class Solver(nn.Module):
         top = torch.cat([R, shift.unsqueeze(-1)], dim=-1)
         bottom = constant((0.0, 0.0, 0.0, 1.0), R).expand(*R.shape[:2], 1, 4)
         T = torch.cat([top, bottom], dim=-2)
+
+        # The last one, the identity, stands for the world.
         T = torch.cat([T, torch.eye(4).to(T).expand(len(T), 1, 4, 4)], dim=1)
 
         # Products of 2, 4, 8, ... turns: with the product that ends 1, 2, 4, ... turns before.
@@ -487,10 +511,12 @@ class Solver(nn.Module):
 
     def points(self, T: Tensor, landmarks: Tensor) -> Tensor:
         """``[B, N, 3]`` the posed landmarks."""
+        # Each landmark moves with one turn.
         return carry(T, landmarks, self.carrier[: len(landmarks)])
 
     def linear(self, q: Tensor, root: Tensor, p: Tensor) -> Linear:
         """Residuals to ``p [B, N, 3]`` and their derivatives, the root's about its rotation."""
+        # The posed landmarks; skeletons without hands have fewer.
         n = p.shape[1]
         T = self.transforms(q, root, self.joints)
         x = self.points(T, self.landmarks[:n])
@@ -506,6 +532,9 @@ class Solver(nn.Module):
 
         # World axes about which a number turns, and arms from there to the landmarks that follow.
         v = (q @ self.matrix).unflatten(1, (-1, 3))
+
+        # The Jacobian turns a change of the axis-angle into the rotation that
+        # it adds.
         turned = before_R @ left_jacobian(v)
         axes = matvec(turned[:, self.entry_turn], self.entry_axis)
         arms = x.unsqueeze(1) - origin[:, self.entry_turn].unsqueeze(2)
@@ -525,6 +554,7 @@ class Solver(nn.Module):
         ``2 k² (sqrt(1 + w |r|² / k²) - 1)``, with k = `ROBUST`. Its gradient is that of least
         squares with the weight ``w / sqrt(1 + w |r|² / k²)``.
         """
+        # The loss and its weight share this root.
         root = (1 + weight * at.residual.square().sum(-1) / ROBUST**2).sqrt()
         w = weight / root
         J = at.by_number.flatten(2)
@@ -553,12 +583,15 @@ class Solver(nn.Module):
         steps: int = MAX_STEPS,
     ) -> tuple[Tensor, Tensor]:
         """Numbers and root rotation after at most ``steps``; one that raises the cost is undone."""
+        # The best numbers so far, and the equations at these.
         best_q = q
         best_root = root
         best = self.normal(q, self.linear(q, root, p), weight)
         damping = q.new_full((len(q), 1), FIRST_DAMPING)
         done = torch.zeros(len(q), dtype=torch.bool, device=q.device)
         for _ in range(steps):
+            # Marquardt's damping scales with the diagonal: numbers have
+            # different units.
             diagonal = torch.diagonal(best.matrix, dim1=-2, dim2=-1)
             scaled = best.matrix + torch.diag_embed(damping * diagonal)
             q = best_q + _solved(scaled, -best.gradient)
@@ -572,10 +605,15 @@ class Solver(nn.Module):
             better = (new.cost < best.cost) & ~done
             change = (new.cost - best.cost).abs()
             done = done | (change <= MIN_IMPROVEMENT * best.cost)
+
+            # A better step brings the next one nearer to Newton's, a worse one
+            # to gradient descent.
             easier = damping * DAMPING_DECREASE
             damping = torch.where(
                 better[:, None], easier, damping * DAMPING_INCREASE
             )
+
+            # A worse step is undone, with its equations.
             best_q = _chosen(better, q, best_q)
             best_root = _chosen(better, root, best_root)
             best = NormalEquations(*map(partial(_chosen, better), new, best))
@@ -591,6 +629,7 @@ class Solver(nn.Module):
         The derivative of their result approaches that of the exact solution, whose matrix is not
         Gauss-Newton's.
         """
+        # A fixed matrix needs no derivative of its own.
         with torch.no_grad():
             H = self.normal(q, self.linear(q, root, p), weight).matrix
         for _ in range(GRADIENT_STEPS if self._live(p) else 1):
@@ -616,6 +655,7 @@ def _with_palms(body: Body) -> Body:
 
 def _settings() -> dict[str, float]:
     """The numbers of `compiled.NUMBERS`."""
+    # Names are those in kernels/solve.h.
     return {
         "converged": MIN_IMPROVEMENT,
         "damping": FIRST_DAMPING,
@@ -644,6 +684,7 @@ def _noise() -> Tensor:
 
 def _jumps(parent: Tensor) -> Tensor:
     """``[n, T + 1]`` the turn 1, 2, 4, ... before each; T, the identity, is before the root's."""
+    # Twice as far each time, until every turn arrives at the identity.
     T = len(parent)
     jump = torch.cat([torch.where(parent < 0, T, parent), torch.tensor([T])])
     found = []

@@ -87,9 +87,13 @@ def _split(faces: Ints, middles: Ints) -> Ints:
     for turn in range(3):
         a, b, c = np.roll(faces, -turn, axis=1).T
         ab, bc, _ = np.roll(middles, -turn, axis=1).T
+
+        # One halved edge gives two triangles.
         one = (number == 1) & halved[:, turn]
         for triangle in ((a, ab, c), (ab, b, c)):
             found.append(np.stack(triangle, axis=1)[one])
+
+        # Two halved edges give three.
         two = (number == 2) & ~halved[:, (turn + 2) % 3]
         for triangle in ((ab, b, bc), (a, ab, bc), (a, bc, c)):
             found.append(np.stack(triangle, axis=1)[two])

@@ -44,9 +44,8 @@ class CameraScore:
     name: str  # of the camera
     inside: float  # mean share of joints inside the mask
     overlap: float  # mean overlap of mask and estimated silhouette
-    fullness: (
-        float  # median area of the mask over that of the estimated silhouette
-    )
+    # median area of the mask over that of the estimated silhouette
+    fullness: float
     # Mean overlap with other calibrations, best first, by the name of their camera or
     # `MIRRORED_IMAGES`.
     rivals: dict[str, float]
@@ -109,6 +108,7 @@ def score_cameras(
             if view.mask.any():
                 inside.append(view.inside)
                 outside.append(view.distance)
+
         scores.append(
             CameraScore(
                 name,
@@ -179,6 +179,7 @@ def calibration_findings(
     # Masks far larger than the body: one finding for all of them, which then do not count.
     big = [s for s in scores if s.oversized(limits) and s.name not in named]
     if big:
+        # One sentence names all of them with their sizes.
         sizes = []
         for score in big:
             sizes.append(f"{score.name} {score.fullness:.1f}")
@@ -254,6 +255,8 @@ def _of_one(
     error = not score.inside >= limits.inside_error
     if score.beaten(limits):
         error = True
+
+        # The rivals by name; mirrored images are a case of their own.
         names = []
         advice = "check its R, t and folder name"
         rivals = score.close_rivals(limits)

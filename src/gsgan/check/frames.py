@@ -52,6 +52,7 @@ def skeleton_doubts(subject: CheckedData, limits: Limits) -> list[Doubt]:
     names = template.names
     found = list[Doubt]()
 
+    # Each kind of doubt is a table of flags by frame and joint.
     def doubt(
         kind: str,
         what: str,
@@ -59,6 +60,7 @@ def skeleton_doubts(subject: CheckedData, limits: Limits) -> list[Doubt]:
         text: Callable[[int, int], str],
     ) -> None:
         """Adds the frames in which any of the flags ``[F, N]`` holds."""
+        # One doubt a frame, which lists the joints.
         for row in np.flatnonzero(flags.any(1)).tolist():
             texts = []
             for place in np.flatnonzero(flags[row]).tolist():
@@ -243,6 +245,8 @@ def jumped(distance: Float, limit: float) -> Bool:
     """
     # A row of zeros before and after: the first and last frame have one neighbour.
     known = np.pad(np.nan_to_num(distance), ((1, 1), (0, 0)))
+
+    # A tie counts as a peak: two equal jumps are both named.
     before = known[:-2]
     here = known[1:-1]
     after = known[2:]

@@ -78,6 +78,7 @@ def tile(subject: CheckedData, view: MaskView) -> Bytes:
             take(image, window, mapping, exact=False), size, exact=False
         )
 
+    # The image, the mask and the joints in the same window.
     layout = subject.layout
     image = read_colour(layout.image_path(view.camera, view.frame))
     canvas = np.ascontiguousarray(shown(image))
@@ -144,6 +145,8 @@ def person_window(view: MaskView, joints: Float, size: tuple[int, int]) -> Crop:
     # The joints inside the image, and the corners of the mask's box in pixels of the whole image.
     limit = np.array(size[::-1])
     points = [np.clip(joints, 0, limit)]
+
+    # The mask was shrunk: its box is scaled back to the image.
     rows, columns = np.nonzero(view.mask)
     if len(rows):
         first = (columns.min(), rows.min())
@@ -151,6 +154,8 @@ def person_window(view: MaskView, joints: Float, size: tuple[int, int]) -> Crop:
         small = np.array([first, last])
         scale = np.diag(view.to_small)[:2]
         points.append((small - view.to_small[:2, 2]) / scale)
+
+    # Without mask and joints, the whole image is shown.
     box = np.concatenate(points)
     if len(box) == 0:
         box = np.array([(0, 0), limit])
@@ -159,6 +164,8 @@ def person_window(view: MaskView, joints: Float, size: tuple[int, int]) -> Crop:
     low = box.min(0)
     high = box.max(0)
     across, along = np.maximum((high - low) * (1 + 2 * TILE_MARGIN), 8)
+
+    # Tiles of one shape: the box grows in one direction.
     height = max(along, across / ASPECT)
     width = height * ASPECT
     left, top = (low + high) / 2 - (width / 2, height / 2)

@@ -107,7 +107,7 @@ def geometry_findings(
 
 def geometry_table(subject: CheckedData, geometry: Geometry) -> Table:
     """A table of units and sizes."""
-    # The nearest and the farthest camera.
+    # Distances and height show a wrong unit at once.
     meta = subject.layout.meta
     distances = geometry.distances.values()
     near = min(distances)
@@ -150,6 +150,8 @@ def lens_table(subject: CheckedData, geometry: Geometry) -> Table:
                 str(len(subject.pairs[name])),
             )
         )
+
+    # Every camera has a row, however many there are.
     headers = (
         "camera",
         "pixels",
@@ -243,6 +245,8 @@ class Measurements:
         doubtful = {}
         for frame, text in self.reasons.items():
             doubtful[str(frame)] = text
+
+        # Settings are part of the record: scores depend on them.
         return {
             "readable": True,
             "cameras": cameras,
@@ -329,6 +333,7 @@ def _contents(m: Measurements) -> Section:
     for name, files in subject.pairs.items():
         lacking = sorted(set(frames) - set(files))
         if lacking:
+            # Long lists of numbers are shortened to ranges.
             text = f"{len(lacking)} of the {len(frames)} frames: {shortened(lacking)}"
             found.append(
                 Finding("warning", "files", f"camera {name} lacks {text}")
@@ -387,6 +392,8 @@ def _agreement(m: Measurements) -> Section:
         "mask / body",
     )
     table = Table(headers, rows)
+
+    # Findings by the thresholds that the reader of the data uses too.
     min_inside = m.subject.consistency.min_inside
     found = calibration_findings(
         m.cameras, m.limits, min_inside, m.geometry.far

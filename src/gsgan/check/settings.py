@@ -34,24 +34,20 @@ class Limits:
         ConfigError: when a value is not a number above 0.
     """
 
-    inside_error: float = (
-        0.7  # minimum share of joints inside the masks of a camera
-    )
+    # minimum share of joints inside the masks of a camera
+    inside_error: float = 0.7
     fullness: float = 2.0  # times the area of the estimated silhouette
-    better_fit: float = (
-        0.05  # overlap by which another calibration must fit better
-    )
+    # overlap by which another calibration must fit better
+    better_fit: float = 0.05
     outside: float = 0.004  # metres, mean of a camera's joints
     frame_outside: float = 0.3  # share of one image's joints
     area_jump: float = 0.35  # change of the mask's area over the silhouette's
-    joint_jump: float = (
-        0.2  # metres from the midpoint of the neighbours in time
-    )
+    # metres from the midpoint of the neighbours in time
+    joint_jump: float = 0.2
     limb_share: float = 0.3  # share of a limb's median length
     seen_share: float = 0.7  # minimum share of the joints that are seen
-    reprojection: float = (
-        0.05  # of the focal length, a joint from its 2D detections
-    )
+    # of the focal length, a joint from its 2D detections
+    reprojection: float = 0.05
     doubtful: float = 0.5  # share of the frames
 
     def __post_init__(self) -> None:

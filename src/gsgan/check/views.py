@@ -108,10 +108,13 @@ def subject_of(data: GsganData) -> CheckedData:
             reader, consistency=replace(consistency, frames=0)
         )
 
+    # Images and landmarks of all frames, in their order.
     layout = data.layout
     pairs = {}
     for name in layout.camera_names:
         pairs[name] = sorted(layout.images[name])
+
+    # Landmarks as arrays over all frames.
     p = []
     visibility = []
     for frame in layout.frames:
@@ -138,9 +141,8 @@ class MaskView:
 
     camera: str
     frame: int
-    outside: (
-        Float  # [J] metres by which joints lie outside the mask, NaN = unknown
-    )
+    # [J] metres by which joints lie outside the mask, NaN = unknown
+    outside: Float
     tolerance: float  # metres by which joints may lie outside
     fullness: float  # area of the mask over that of the estimated silhouette
     mask: Bool  # [h, w] small mask
@@ -252,6 +254,7 @@ def measure(
         )
         results = list(found)
 
+    # Images that cannot be read are findings.
     views = []
     broken = []
     for result in results:
@@ -284,9 +287,8 @@ def _view(subject: CheckedData, item: Item, sampling: Sampling) -> MaskView:
     pixels, depth = project(camera, p)
     metre_per_pixel = float(np.median(depth[visible])) / focal
     seen = visible & inside(entry, p)
-    outside = joint_distance(
-        mask_distance(mask), pixels, depth, seen, focal
-    )  # [J]
+    # [J]
+    outside = joint_distance(mask_distance(mask), pixels, depth, seen, focal)
 
     # A small mask, and the map from the whole image to it: by the camera's K, then the scale.
     height, width = mask.shape
@@ -335,6 +337,7 @@ def body_silhouette(
     ]
     for a, b in [*template.limbs, *outline]:
         if drawn[a] and drawn[b]:
+            # As thick as at the end that is farther away.
             width = thickness(2 * FLESH * min(metre[a], metre[b]), size)
             cv2.line(canvas, at[a].tolist(), at[b].tolist(), 1, width)
 

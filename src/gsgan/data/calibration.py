@@ -162,6 +162,9 @@ def read_calibration(
                 raise DataError(
                     f"{path} ({name}) lists no camera that can be used"
                 )
+
+            # COLMAP and nerfstudio have no unit: the person's height gives it
+            # later.
             metric = unit_scale is not None or name not in WITHOUT_SCALE
             return Calibration(path, name, cameras, tuple(notes), metric)
     raise DataError(f"{path} is not a known calibration; expected {KNOWN}")

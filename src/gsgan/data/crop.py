@@ -154,6 +154,8 @@ def undistort_map(
         # OpenCV's own function is ten times as fast, but ignores skew.
         stored = K.copy()
         stored[:2, 2] -= 0.5  # to OpenCV's pixel centres
+
+        # The window's corner becomes the origin.
         seen = stored.copy()
         seen[:2, 2] -= (crop.left, crop.top)
         size = crop.size[::-1]
@@ -196,6 +198,8 @@ def undistort(points: Float, dist: Float) -> Float:
     if points.size == 0:
         return points
     eye = np.eye(3)
+
+    # Iterative, since the lens model has no inverse in closed form.
     raw = _undistort(
         points[:, None],
         eye,
@@ -264,10 +268,11 @@ def fold_radius(
     radii = np.linspace(0, np.hypot(x, y).max(), samples)  # [samples]
 
     # The lens model folds back where the distorted radius no longer grows.
-    radial = np.where(
-        np.isin(np.arange(8), (2, 3)), 0, dist
-    )  # without p1 and p2
+    # without p1 and p2
+    radial = np.where(np.isin(np.arange(8), (2, 3)), 0, dist)
     along_x = np.stack([radii, np.zeros(samples)], axis=-1)
+
+    # Along one axis: without tangential terms all directions are alike.
     shown = distort(along_x, radial)[:, 0]  # [samples]
     folded = np.flatnonzero(np.diff(shown) <= 0)
     return float(radii[folded[0]]) if len(folded) else None
@@ -314,6 +319,7 @@ def resize(
     if image.shape[:2] == size:
         return image
     if exact:
+        # A mean of labels would be another label.
         mode = cv2.INTER_NEAREST_EXACT
     elif size[0] < image.shape[0]:
         mode = cv2.INTER_AREA

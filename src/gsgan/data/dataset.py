@@ -250,6 +250,9 @@ class CaptureDataset(Dataset[Frame]):
                     labels, mask, rules.ignore_band
                 )
             labels = fit(labels, True)
+
+        # The mask is resampled last: labels and unsure pixels refer to its
+        # stored outline.
         if unsure is not None:
             unsure = fit(unsure, True)
         mask = fit(mask, rules.mask_sampling == "nearest")

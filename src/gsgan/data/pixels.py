@@ -124,10 +124,13 @@ def _one_mask(rule: str, path: Path, rules: PixelRules) -> Bytes:
         values = read_mask_values(path)
         lowest = rules.threshold
     else:
+        # Any channel above 0 marks the person.
         values = read_stored(path)
         lowest = 1
         if values.ndim == 3:
             values = np.bitwise_or.reduce(values, axis=-1)
+
+    # OpenCV's threshold keeps what is greater.
     _, person = cv2.threshold(values, lowest - 1, 255, cv2.THRESH_BINARY)
     return np.asarray(person, np.uint8)
 

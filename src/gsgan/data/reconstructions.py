@@ -47,9 +47,8 @@ ONE_FOCAL = (
     "SIMPLE_RADIAL",
     "RADIAL",
 )  # with one focal length
-POINT_BYTES = (
-    24  # of a 2D point in images.bin: x, y, and the number of the 3D point
-)
+# of a 2D point in images.bin: x, y, and the number of the 3D point
+POINT_BYTES = 24
 # Errors of reading a damaged file.
 DAMAGE = (ArithmeticError, LookupError, OSError, struct.error, ValueError)
 # OpenGL's camera axes, x right, y up, z backward, in OpenCV's.
@@ -108,6 +107,8 @@ def fixed_cameras(
     for name, group in groups.items():
         where = f"{path}, camera {name}"
         R, centre = _one_pose(where, group, float(extent))
+
+        # All images of a camera share one lens.
         lens = group[0].lens
         cameras[name] = make_camera(
             where,
@@ -128,10 +129,15 @@ def _one_pose(
     """The mean rotation and the median centre of the images of one camera."""
     if len(group) == 1:
         return group[0].R, group[0].centre
+
+    # Several images of a camera that stands still differ by the
+    # reconstruction's noise alone.
     rotations = Rotation.from_matrix(np.stack([view.R for view in group]))
     mean = rotations.mean()
     centres = np.stack([view.centre for view in group])
     centre = np.median(centres, axis=0)
+
+    # The largest deviation tells a camera that moves.
     turned = np.degrees((rotations * mean.inv()).magnitude().max())
     moved = np.linalg.norm(centres - centre, axis=1).max()
     if turned > MAX_TURN or moved > MAX_MOVE * extent:
@@ -163,6 +169,7 @@ def read_colmap(path: Path, scale: float) -> dict[str, CameraEntry]:
     Raises:
         DataError: when one is missing or damaged, or a lens is not one of OpenCV's.
     """
+    # The model is two files: lenses, and the images that refer to them.
     lens_path = path.with_stem("cameras")
     image_path = path.with_stem("images")
     for file in (lens_path, image_path):
@@ -171,6 +178,8 @@ def read_colmap(path: Path, scale: float) -> dict[str, CameraEntry]:
                 f"{file} does not exist; COLMAP's cameras{path.suffix} and images{path.suffix} "
                 "belong together"
             )
+
+    # Each file is read by itself, so that a message names the damaged one.
     binary = path.suffix == ".bin"
     try:
         lenses = (
@@ -370,7 +379,11 @@ def _nerfstudio_lens(where: str, values: Mapping[str, Any]) -> Lens:
     focal = None
     if "camera_angle_x" in values:
         focal = width / 2 / np.tan(value("camera_angle_x") / 2)
+
+    # Without a second focal length, pixels are square.
     fx = value("fl_x", focal)
+
+    # The principal point is the middle of the image unless it is given.
     K = np.array([[fx, 0, 0], [0, value("fl_y", fx), 0], [0, 0, 1.0]])
     K[0, 2] = value("cx", width / 2)
     K[1, 2] = value("cy", height / 2)

@@ -145,9 +145,8 @@ def scene_info(
     if layout.hands is not None:
         whole = whole.with_hands(layout.hands)
     whole_p, whole_valid = whole.joints(frames)
-    completed = np.stack(
-        [dataset.skeletons.p[frame] for frame in frames]
-    )  # [F, J, 3]
+    # [F, J, 3]
+    completed = np.stack([dataset.skeletons.p[frame] for frame in frames])
 
     # The skinned body, whose file is the user's.
     body = layout.meta.body
@@ -211,9 +210,8 @@ def _lenses(
     # Held-out cameras are those that do not train.
     training = [layout.cameras[name] for name in cameras]
     held_out = [layout.cameras[name] for name in tested]
-    rational = [
-        camera.dist[5:] for camera in training + held_out
-    ]  # k4, k5 and k6
+    # k4, k5 and k6
+    rational = [camera.dist[5:] for camera in training + held_out]
     return {
         "has_distortion": any(camera.distorted for camera in training),
         "held_out_distortion": any(camera.distorted for camera in held_out),

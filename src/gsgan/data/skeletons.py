@@ -153,6 +153,8 @@ def make_landmarks(
     visibility = visibility[order]
     valid = visibility > 0
     p = fill_missing(p[order], valid, ids)
+
+    # Hands and faces have no hips.
     if p.shape[1] == len(MEDIAPIPE33.names):
         p = hips_below(p, valid)
     frames = ids.tolist()

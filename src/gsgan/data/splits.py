@@ -442,6 +442,7 @@ def parse_frames(value: Any, where: str) -> tuple[int, ...]:
         match = FRAME_RANGE.fullmatch(str(part))
         numbers = range(0)
         if match:
+            # A step of 0 would be endless.
             first, last, step = match.groups()
             step = int(step or 1)
             if step > 0:

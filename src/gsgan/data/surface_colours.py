@@ -82,6 +82,7 @@ def surface_colours(
         points = _hull(frames)
         colours = [_colours(frame, points) for frame in frames]
         for i, j in combinations(range(len(frames)), 2):
+            # Points that one of the two does not see are NaN.
             difference = colours[i] - colours[j]
             both = difference[~np.isnan(difference[:, 0])]
             if len(both) >= MIN_SHARED:
@@ -96,6 +97,8 @@ def surface_colours(
             median = np.median(pair, axis=0)
             medians.append(median)
             residuals.append(pair - median)
+
+    # Without two cameras that share enough surface, nothing can be told.
     if not medians:
         return None
     brightness = np.abs(np.concatenate(residuals).mean(axis=1))
@@ -148,9 +151,8 @@ def _hull(frames: Sequence[Frame]) -> Float:
     low = joints.min(0) - AIR
     high = joints.max(0) + AIR
     axes = [np.arange(a, b, VOXEL) for a, b in zip(low, high, strict=True)]
-    voxels = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(
-        -1, 3
-    )  # [V, 3]
+    # [V, 3]
+    voxels = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
 
     # Each mask carves; voxels outside its image stay.
     for frame in frames:
@@ -202,6 +204,8 @@ def _colours(frame: Frame, points: Float) -> Float:
     side = 2 * int(2 * sigma) + 1
     mask = frame.mask[0, 0].numpy()
     rgb = frame.image[0].permute(1, 2, 0).contiguous().numpy()
+
+    # The background is black: dividing by the blurred mask leaves it out.
     soft = np.asarray(cv2.GaussianBlur(mask, (side, side), sigma), np.float32)
     image = np.asarray(cv2.GaussianBlur(rgb, (side, side), sigma), np.float32)
     rows = pixels[front, 1]

@@ -79,6 +79,7 @@ def drop_frames(
             f"{len(ids)} of {len(frames)} frames dropped, {reason}: {spans(ids)}"
         )
     if len(gone) == len(frames):
+        # All reasons, since each may have another cause.
         reasons = "; ".join(
             f"{len(ids)} {reason}" for reason, ids in dropped.items()
         )
@@ -116,6 +117,8 @@ def _unusable(
     trunk = valid[hubs]
     left_hip, right_hip = landmarks.p[frame][hubs[2:]]
     estimated = trunk[:2].all() and (left_hip != right_hip).any()
+
+    # Hubs are the joints from which the trunk's frames are made.
     if trunk.sum() < limits.min_hubs and not estimated:
         return f"with fewer than {limits.min_hubs} of the shoulders and hips"
 
@@ -235,6 +238,9 @@ def drop_unseen(
         rows = np.searchsorted(frames, files.frames)
         seen = inside(cameras[name], joints[rows]) & valid[rows]
         enough = seen.sum(1) >= limits.min_joints_in_view
+
+        # Some frames may show too little; a camera that never sees the person
+        # is wrong.
         if not enough.any():
             raise DataError(
                 f"{calibration}, camera {name}: no frame has {limits.min_joints_in_view} joints "

@@ -101,6 +101,7 @@ def rows(
             cells.append("n/a" if value is None else f"{value:.{digits}f}")
         return cells
 
+    # One row per variant, and below it one per camera.
     for split, variants in results.items():
         for variant, scores in variants.items():
             yield [
@@ -139,6 +140,8 @@ def notes(results: Results) -> list[str]:
         if not scores["images"]:
             found[f"{split}: {scores['psnr_reason']}"] = None
             continue
+
+        # Metrics that lack for the same reason share a note.
         missing: dict[str, list[str]] = {}
         for metric in METRICS:
             if scores[metric] is None:

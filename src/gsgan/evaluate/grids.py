@@ -73,8 +73,11 @@ def write_grid(
     images = [image for row in rows for image in row.values()]
     height = max(image.shape[-2] for image in images)
     width = max(image.shape[-1] for image in images)
+
+    # Images of other sizes are padded at the right and at the bottom.
     lines = []
     for row in rows:
+        # The images of a row beside each other.
         padded = []
         for image in row.values():
             h, w = image.shape[-2:]

@@ -36,6 +36,8 @@ class KeptScores:
             state = torch.load(self.path, map_location="cpu", weights_only=True)
         except (OSError, RuntimeError, UnpicklingError, EOFError):
             return
+
+        # Other settings would give other scores.
         if state["key"] == self.key:
             tally.load_state_dict(state["tally"])
 

@@ -294,6 +294,9 @@ def read_folder(
                 "camera_index": str(cameras.index(camera)),
                 "frame": f"{frame:06d}",
             }
+
+            # Numbers are compared without their zeros: programs pad them
+            # differently.
             name = _filled(pattern, values)
             found = stored.get(_unpadded(name), [])
             if not found:

@@ -1,12 +1,14 @@
 """Scores a run folder, or a folder of any method's images, on the held-out splits."""
 
+from __future__ import annotations
+
 import io
 import json
 import shutil
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -197,6 +199,32 @@ HELD_OUT_SPLITS = ("novel_view", "novel_pose")
 BY_SKELETON = "driven by skeletons alone"
 
 
+@dataclass(frozen=True)
+class ScoreOptions:
+    """What is scored and how; conf/evaluate.yaml explains the keys."""
+
+    lpips_nets: Sequence[str]
+    lpips_path: str | None = None
+    background: str | None = None
+    splits: Sequence[str] = HELD_OUT_SPLITS
+    score_images: int | None = None
+    grid_rows: int = 4
+
+    @classmethod
+    def from_config(
+        cls, config: DictConfig, nets: Sequence[str] = LPIPS_NETS
+    ) -> ScoreOptions:
+        """The options of a config; ``nets`` are those of LPIPS if it names none."""
+        # Training has some of the keys of evaluation.
+        given = {}
+        for key in ("background", "splits", "score_images", "grid_rows"):
+            if config.get(key) is not None:
+                given[key] = config[key]
+        if config.lpips.nets is not None:
+            nets = config.lpips.nets
+        return cls(list(nets), config.lpips.path, **given)
+
+
 def evaluate_config(config: DictConfig) -> Results:
     """Scores ``config.run`` or ``config.predictions``.
 
@@ -254,8 +282,8 @@ def evaluate_folder(
     # By default the networks of LPIPS that the run was configured with.
     folder = Path(config.run).expanduser()
     stored = read_config(folder)
-    own = OmegaConf.select(stored, "lpips.nets", default=list(LPIPS_NETS))
-    config = _with_lpips(config, own)
+    own = OmegaConf.select(stored, "lpips.nets", default=LPIPS_NETS)
+    options = ScoreOptions.from_config(config, own)
 
     # The weights, and the number of steps, the time and the code that made them.
     checkpoint = read_checkpoint(folder / CHECKPOINT)
@@ -297,7 +325,7 @@ def evaluate_folder(
     solve = config.drive is not None
     return evaluate_method(
         out,
-        config,
+        options,
         console,
         data,
         predict=painter(avatar.to(device), solve=solve, colours=not other),
@@ -305,14 +333,8 @@ def evaluate_folder(
         device=device,
         marks=marks,
         poses=avatar.poses,
+        beside=folder if other else None,
     )
-
-
-def _with_lpips(config: DictConfig, nets: Sequence[str]) -> DictConfig:
-    """The config with these networks of LPIPS where it names none."""
-    if config.lpips.nets is not None:
-        return config
-    return cast(DictConfig, OmegaConf.merge(config, {"lpips": {"nets": nets}}))
 
 
 def other_capture(stored: DictConfig, given: str | DictConfig) -> DictConfig:
@@ -356,7 +378,6 @@ def evaluate_predictions(
     # Without a name, the folder's name is that of the method.
     root = Path(config.predictions).expanduser()
     name = config.method or root.resolve().name
-    config = _with_lpips(config, list(LPIPS_NETS))
 
     # The data, and a folder for the results that holds no others.
     data = build_data(config)
@@ -381,7 +402,7 @@ def evaluate_predictions(
         chosen = HydraConfig.get().runtime.choices.get("data")
     return evaluate_method(
         out,
-        config,
+        ScoreOptions.from_config(config),
         console,
         data,
         predict=folder.predict,
@@ -426,7 +447,7 @@ def _out(config: DictConfig, root: Path, method: str) -> Path:
 
 def evaluate_method(
     folder: Path,
-    config: DictConfig,
+    options: ScoreOptions,
     console: Console,
     data: GsganData,
     predict: Predict,
@@ -435,19 +456,21 @@ def evaluate_method(
     device: torch.device,
     marks: Sequence[str] = (),
     poses: TrainingPoses | None = None,
+    beside: Path | None = None,
 ) -> Results:
     """Scores a method's predictions and writes metrics.json, scores.csv, facts.json, metrics.md and
     ``grids/``; nothing is written before everything is scored.
 
     Args:
         folder: for the results.
-        config: for ``lpips``, and, if set, ``background``, ``splits`` and ``grid_rows``.
+        options: what is scored and how.
         console: prints progress and the table.
         data: with the splits.
         predict, method: the method, and what facts.json states about it.
         device: of the frames.
         marks: notes that the tables must carry.
         poses: of the training; with them also distance.csv and distance.png.
+        beside: see `write_distances`.
 
     Returns:
         As in metrics.json.
@@ -455,19 +478,20 @@ def evaluate_method(
     Raises:
         GsganError: when a prediction cannot be scored.
     """
-    # Settings that commands of other packages may lack have defaults.
-    scorer = make_scorer(config, data, marks)
-    grid_rows = 4 if config.get("grid_rows") is None else config.grid_rows
+    scorer = make_scorer(options, data, marks)
 
     # Every split, or some of its images. Only scores of a run are kept until all are there.
     scores: dict[str, SplitScores] = {}
-    for split in config.get("splits") or HELD_OUT_SPLITS:
+    for split in options.splits:
         dataset = data.dataset(split)
         count = len(dataset)
-        places = evenly_spaced(count, config.get("score_images") or count)
+        places = evenly_spaced(count, options.score_images or count)
+
+        # Scores of a trained method are kept: a run that was interrupted goes
+        # on.
         kept = None
         if poses is not None:
-            key = _key(method, data, scorer, grid_rows, len(places))
+            key = _key(method, data, scorer, options.grid_rows, len(places))
             kept = KeptScores(folder / FOLDER / f"{split}.pt", key)
         scores[split] = _score(
             f"scoring {split}",
@@ -475,7 +499,7 @@ def evaluate_method(
             places,
             predict,
             scorer,
-            grid_rows=grid_rows,
+            grid_rows=options.grid_rows,
             device=device,
             kept=kept,
             console=console,
@@ -488,12 +512,7 @@ def evaluate_method(
     joined = _joined_splits(scores, scorer, data, origin(method, data, device))
     print_table(joined.results, joined.origin, console)
     if poses is not None:
-        own = (
-            None
-            if config.get("other_capture") is None
-            else Path(config.run).expanduser()
-        )
-        write_distances(folder, joined.rows, data, poses, console, own)
+        write_distances(folder, joined.rows, data, poses, console, beside)
 
     # metrics.json is the last file: if it is new, all others are.
     write_scored(joined, folder)
@@ -587,9 +606,9 @@ def _joined_splits(
 
 
 def make_scorer(
-    config: DictConfig, data: GsganData, marks: Sequence[str]
+    options: ScoreOptions, data: GsganData, marks: Sequence[str]
 ) -> Scorer:
-    """The scorer of a dataset: its protocol's measures, on the config's background.
+    """The scorer of a dataset: its protocol's measures, on the chosen background.
 
     Raises:
         ConfigError: on an unknown network of LPIPS, or a number of images that is not one.
@@ -599,7 +618,7 @@ def make_scorer(
 
     # A background other than the protocol's is marked, and departs from it.
     measures = _measures(data)
-    background = config.get("background")
+    background: Any = options.background
     if background not in (None, measures.background):
         measures = replace(measures, background=background)
         marks.append(f"scored on {background}")
@@ -612,13 +631,13 @@ def make_scorer(
         )
 
     # Some images of each split alone.
-    if config.get("score_images") is not None:
-        maximum = whole("score_images", config.score_images, 1)
+    if options.score_images is not None:
+        maximum = whole("score_images", options.score_images, 1)
         marks.append(f"at most {maximum} evenly spaced images of each split")
 
     # The protocol, and what departs from it.
     boxes = BodyBoxes(data) if measures.needs_body_box else None
-    record = data.protocol_record(config.lpips.nets)
+    record = data.protocol_record(options.lpips_nets)
     if record is not None:
         # The record says what was asked for, and the departures what was done.
         asked = record["measures"]["background"]
@@ -636,7 +655,7 @@ def make_scorer(
             data.skeleton,
             data.layout.meta.label_names or (),
         ),
-        lpips=build_lpips(config.lpips.nets, config.lpips.path),
+        lpips=build_lpips(options.lpips_nets, options.lpips_path),
         marks=marks,
         protocol=record,
     )

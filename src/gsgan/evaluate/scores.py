@@ -107,6 +107,8 @@ def image_scores(
     if measures.region == "body_box":
         assert box is not None
         background = BACKGROUNDS[measures.background]
+
+        # Only the box of the body counts, before the protocol's background.
         scores["psnr"] = psnr_where(image, target, box, pooling=pooling)
         scores["ssim"] = _inside(
             box,
@@ -178,6 +180,7 @@ def means(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
         # Why there is no score.
         if not finite:
+            # The reason is printed in place of the number.
             reason = "no image has a finite score" if left_out else "no image"
             if metric in MOTION_METRICS:
                 reason = NO_PAIR
@@ -185,6 +188,8 @@ def means(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
                 reason = NO_LPIPS
             elif metric in LABEL_METRICS and not left_out:
                 reason = NO_NAMED_LABELS
+
+            # Metrics with a value have no reason.
             result[f"{metric}_reason"] = reason
     return result
 

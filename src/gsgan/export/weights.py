@@ -22,8 +22,8 @@ from gsgan.utils.tensors import pick_device
 
 
 def facts_of(run: Run) -> dict[str, Any]:
-    """What an avatar is built from beside its weights, as plain values: entries ``config`` and
-    ``gsgan``, see `gsgan.run.shared`.
+    """The facts that an avatar is built from beside its weights, as plain values: entries
+    ``config`` and ``gsgan``, see `gsgan.run.shared`.
 
     Raises:
         DataError: when the config names a class that is not one of gsgan's own configs.

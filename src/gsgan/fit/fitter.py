@@ -25,9 +25,8 @@ CONTROL_SPREAD = 1.5  # of the controls' influence, in distances between them
 # standard deviation of a Gaussian, as a share of the points' spacing
 SIGMA = 0.7
 OPACITY = 0.95
-LOOSE_WEIGHT = (
-    0.25  # weight of landmarks of face and palm, whose definitions differ
-)
+# weight of landmarks of face and palm, whose definitions differ
+LOOSE_WEIGHT = 0.25
 LOOSE_LANDMARKS = (*range(11), *range(17, 23))
 ANGLE = 0.1  # radians of a joint's turn that cost as much as a landmark `noise` away
 

@@ -81,6 +81,9 @@ class MaskedFrames:
         used = layout.frames if held_out else data.trained
         if max_frames is not None:
             used = spread_frames(layout.landmarks, used, max_frames)
+
+        # Each frame takes other cameras in turn, so that few images see all
+        # sides.
         items: list[Item] = []
         for turn, frame in enumerate(used):
             seeing = [
@@ -88,6 +91,8 @@ class MaskedFrames:
             ]
             for camera in rotated(seeing, max_cameras, turn):
                 items.append((camera, frame))
+
+        # Images at the data's own size and crop.
         self.dataset = CaptureDataset(
             layout, items, data.size, data.crop, lens=data.lens
         )
@@ -166,6 +171,8 @@ class MaskedFrames:
             skeleton = torch.from_numpy(landmarks.p[frame]).to(
                 self.device, torch.float32
             )
+
+            # Masks are measured around the skeleton: other people do not count.
             seen = around(skeleton, self._silhouette(place))
             mask = seen.mask
             if seen.unsure is not None:

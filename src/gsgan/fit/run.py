@@ -73,6 +73,7 @@ def fit_report(
         ("registered", before, found),
         ("driven", body, driven),
     ):
+        # Joints that were not seen have no distance.
         metres = (of_body.posed_landmarks(pose) - masked.skeletons).norm(dim=-1)
         distance[name] = torch.where(visible, 1000 * metres, torch.nan)
         overlap[name] = fitter.overlap(pose)
@@ -140,9 +141,8 @@ def summary(
 SIZE = 128  # pixels of the images that the fit before training uses
 IMAGE_MARGIN = 0.2  # metres around the person in these images
 LOCK = ".body_fit.lock"
-FRAMES_AT_ONCE = (
-    500  # frames whose poses are solved at once, which bounds memory
-)
+# frames whose poses are solved at once, which bounds memory
+FRAMES_AT_ONCE = 500
 
 
 def run_fit(config: DictConfig) -> Path:
@@ -163,7 +163,7 @@ def run_fit(config: DictConfig) -> Path:
 
 
 def fit_before_training(
-    data: GsganData, settings: DictConfig, device: torch.device
+    data: GsganData, settings: Fit, device: torch.device
 ) -> None:
     """Fits the body of a capture that has no body poses, and writes it into the capture.
 
@@ -171,7 +171,7 @@ def fit_before_training(
 
     Args:
         data: the capture, read as the run reads it.
-        settings: the config group ``fit``.
+        settings: of the fit.
         device: of the run.
 
     Raises:
@@ -187,7 +187,7 @@ def fit_before_training(
             stack.enter_context(FileLock(root / LOCK))
         # Another process may have made the poses while this one waited.
         if not (root / POSES_FILE).exists():
-            fit_body(seen, instantiate(settings), device=device)
+            fit_body(seen, settings, device=device)
 
 
 def fit_body(

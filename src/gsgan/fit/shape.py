@@ -49,10 +49,8 @@ UNSURE = 0.1
 # Effective number of independent frames: systematic errors are the same in all of them.
 INDEPENDENT = 4.0
 FOREARMS = [[13, 15], [14, 16]]  # elbow and wrist
-SIZES = (
-    0.75,
-    1.35,
-)  # minimum and maximum size of a hand, as a share of the body's
+# minimum and maximum size of a hand, as a share of the body's
+SIZES = (0.75, 1.35)
 MAX_HAND_MOVE = 0.05  # maximum move of a hand, metres
 NUMBERS = 99  # of the offsets: x, y, z of 33 landmarks
 LENGTH_STEPS = 10
@@ -259,6 +257,7 @@ class _Pairs(NamedTuple):
 
 
 def _pairs() -> _Pairs:
+    # Pairs of landmarks whose distance no pose changes, or hardly.
     names = MEDIAPIPE33.names
     first: list[int] = []
     second: list[int] = []
@@ -304,12 +303,16 @@ def _fit_lengths(
     a, b, sigma = _pairs()
     lengths = (p[:, a] - p[:, b]).norm(dim=-1)
     target = _median(lengths, seen[:, a] & seen[:, b]).log()
+
+    # Pairs that were never seen, or that the body lacks, have no target.
     own = space.body.landmarks
     used = target.isfinite() & (own[a] - own[b]).isfinite().all(-1)
     a = a[used]
     b = b[used]
     sigma = sigma[used]
     target = target[used]
+
+    # Without any length the body's size is unknown.
     if not len(a):
         raise DataError(
             "fit_shape: no frame shows a limb of which the body has both ends"
@@ -396,10 +399,15 @@ def _fit_landmarks(
         # the shape's normal equations after eliminating every pose
         w = w.repeat_interleave(3, dim=1).unsqueeze(-1)
         J = at.by_number.flatten(2).mT
+
+        # The poses are eliminated frame by frame (Schur complement): what is
+        # left is the shape's system.
         C = J.mT @ (w * G)
         direct = G.mT @ (w * G)
         slope = (G.mT @ (w * at.residual.flatten(1).unsqueeze(-1))).squeeze(-1)
         solved = torch.linalg.solve(H, torch.cat([C, g.unsqueeze(-1)], dim=-1))
+
+        # The prior keeps what no landmark shows.
         A = (direct - C.mT @ solved[..., :-1]).sum(0) * share + prior.diag()
         slope = slope - (C.mT @ solved[..., -1:]).squeeze(-1)
         b = slope.sum(0) * share + prior * x

@@ -44,6 +44,7 @@ COMPARING = ("relativistic",)
 
 def _over_scales(term: Term, real: Maps, fake: Maps) -> Tensor:
     """The sum over scales of a term's mean over positions, in float32."""
+    # Positions of a scale count alike, and so do scales.
     losses = []
     for real_scale, fake_scale in zip(real, fake, strict=True):
         # Logits may come in half precision.
@@ -80,6 +81,7 @@ def feature_matching(real: Maps, fake: Maps) -> Tensor:
 
     Source: paper Sec. 3.5.
     """
+    # Real features are a target: they get no gradient.
     loss = real[0][0].new_zeros(())
     for real_scale, fake_scale in zip(real, fake, strict=True):
         # The logits are not among the features.

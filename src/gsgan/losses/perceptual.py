@@ -84,6 +84,9 @@ class Perceptual(nn.Module):
         self.network: FeatureNetwork | Lpips
         self.mark = None
         self.description = f"{NETWORKS[net].title}, {form}"
+
+        # A random network, LPIPS with its learnt weights, or the features
+        # alone.
         if weights == RANDOM:
             self.network = FeatureNetwork(_random_stages(width))
             self.mark = "perceptual loss: fixed random network, not VGG-16"
@@ -178,14 +181,15 @@ def crop_person(
     top = (centre // width - rows // 2).clamp(0, height - rows)
     left = (centre % width - columns // 2).clamp(0, width - columns)
     y = top[..., None] + torch.arange(rows, device=mask.device)  # [B, N, rows]
-    x = left[..., None] + torch.arange(
-        columns, device=mask.device
-    )  # [B, N, columns]
+    # [B, N, columns]
+    x = left[..., None] + torch.arange(columns, device=mask.device)
 
     # One gather per image: [B, N, rows, columns, C].
     batch = torch.arange(len(mask), device=mask.device)[:, None, None, None]
     y = y[..., :, None]
     x = x[..., None, :]
+
+    # All squares of all images at once, by their indices.
     cut = []
     for image in images:
         squares = image.movedim(1, -1)[batch, y, x]

@@ -112,9 +112,8 @@ def outline(mask: Tensor) -> Tensor:
 def ssim_where(image: Tensor, target: Tensor, *regions: Tensor) -> list[Tensor]:
     """SSIM's mean over each region ``[B, 1, H, W]``, with windows that reach beyond it; NaN for an
     empty region."""
-    similar = (1 - d_ssim_map(image, target)).mean(
-        dim=1, keepdim=True
-    )  # [B, 1, H, W]
+    # [B, 1, H, W]
+    similar = (1 - d_ssim_map(image, target)).mean(dim=1, keepdim=True)
     means = []
     for region in regions:
         total = (similar * region).flatten(1).sum(dim=1)
@@ -190,9 +189,8 @@ def high_frequencies(
     """
     # The frequencies of a real spectrum: half of the columns are enough.
     height, width = image.shape[-2:]
-    rows = torch.fft.fftfreq(height, device=image.device)[
-        :, None
-    ]  # cycles per pixel
+    # cycles per pixel
+    rows = torch.fft.fftfreq(height, device=image.device)[:, None]
     columns = torch.fft.rfftfreq(width, device=image.device)[None]
     high = (rows.square() + columns.square()).sqrt() > above
 
@@ -249,6 +247,7 @@ def edge_scores(
             edges = edges & inside
             truth = truth & inside
 
+        # Without true edges, neither precision nor recall is defined.
         count = edges.sum()
         expected = truth.sum()
         if not expected:
@@ -258,6 +257,8 @@ def edge_scores(
         # F1 is the harmonic mean of precision and recall.
         precision = (edges & near_truth).sum() / max(count, 1)
         recall = (truth & near_edges).sum() / expected
+
+        # The harmonic mean of both; 0 if no edge is near.
         f1 = 0.0
         total = precision + recall
         if total:

@@ -102,6 +102,7 @@ class LpipsAgainst:
 
             # The score in the person's box, from the map of the whole image.
             if self.mask is not None:
+                # The box of the person, from the same features.
                 inside = math.nan
                 if self.box is not None:
                     rows, columns = self.box

@@ -184,8 +184,12 @@ def box_mask(corners: Tensor, camera: Camera) -> Tensor:
     rows = np.arange(height) + 0.5
     shown = np.stack(np.meshgrid(columns, rows), axis=-1)  # [H, W, 2]
     if camera.dist is not None:
+        # Pixels of a lens are straightened: the box has straight edges in a
+        # pinhole only.
         focal = K[:2, :2].cpu().numpy()
         centre = K[:2, 2].cpu().numpy()
+
+        # Pixels as rays, without the lens.
         rays = (shown - centre) @ np.linalg.inv(focal).T
         dist = camera.dist[0].double().cpu().numpy()
         straight = undistort(rays.reshape(-1, 2), dist)
@@ -270,6 +274,8 @@ def hands_and_mouth(
     corners = [
         template.names.index(f"mouth_{side}") for side in ("left", "right")
     ]
+
+    # Skeletons with a face have lips; others only the corners of the mouth.
     lips = lip_landmarks(template)
     if lips:
         mouth = landmark_box(
@@ -366,6 +372,8 @@ def landmark_box(
     y = torch.arange(height, device=pixels.device) + 0.5
     middle_x, middle_y = middle.unsqueeze(-1).unbind(1)
     half_width, half_height = half.unsqueeze(-1).unbind(1)
+
+    # Rows and columns inside the box, and their product.
     columns = (x - middle_x).abs() <= half_width
     rows = (y - middle_y).abs() <= half_height
     box = rows.unsqueeze(-1) & columns.unsqueeze(-2)

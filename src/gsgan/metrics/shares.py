@@ -64,6 +64,7 @@ def region_shares(
         regions[name] = part & person & ~border
         labelled |= bool(part.any())
 
+    # Shares of a part that no image of the data labels are unknown, not 0.
     shares = {}
     for name, region in regions.items():
         defined = labelled or name == "outline"

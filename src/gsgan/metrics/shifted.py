@@ -51,6 +51,7 @@ def psnr_shifted(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
     sums = []
     for y in range(4 * REACH + 1):
         for x in range(4 * REACH + 1):
+            # A step in the finer image is half a pixel.
             moved = fine[..., y:, x:][..., ::2, ::2][..., :height, :width]
             squared = (moved - truth).square().mean(dim=1, keepdim=True)
             blocks = functional.pad(squared, beyond)

@@ -10,9 +10,8 @@ from torch.nn import functional
 from gsgan.utils.checks import one_of
 from gsgan.utils.tensors import derived, full_precision
 
-NORM_FLOOR = (
-    1e-6  # inside the root: an all-zero pixel (empty background) stays zero
-)
+# inside the root: an all-zero pixel (empty background) stays zero
+NORM_FLOOR = 1e-6
 SLOPE = 0.2
 MIDDLE_BLOCKS = 2  # convolutions at the coarsest level
 
@@ -73,6 +72,8 @@ class StyleModulation(nn.Module):
         self, channels: int, style_channels: int, pose_channels: int
     ) -> None:
         super().__init__()
+
+        # Scale and shift of each channel, from the map and from the pose.
         self.from_map = nn.Conv2d(style_channels, 2 * channels, 1)
         self.from_pose = nn.Linear(pose_channels, 2 * channels)
         for layer in (self.from_map, self.from_pose):
@@ -149,6 +150,9 @@ class DecoderLevel(nn.Module):
         lower = derived(
             self, "lower", lambda: channels_last(weight[:, C:]), weight
         )
+
+        # A convolution of joined channels is the sum of the convolutions of its
+        # parts.
         upsampled = functional.conv_transpose2d(h, kernel, stride=2, padding=1)
         return upsampled + functional.conv2d(skip, lower, bias, padding=1)
 

@@ -18,9 +18,8 @@ from gsgan.utils.errors import ConfigError
 from gsgan.utils.tensors import full_precision
 
 IGNORE = 255
-PROBABILITY_FLOOR = (
-    1e-6  # inside logarithms, so that a class without splats has a gradient
-)
+# inside logarithms, so that a class without splats has a gradient
+PROBABILITY_FLOOR = 1e-6
 HANDS = ("left_hand", "right_hand")
 FACE_CLASS = "face_neck"
 

@@ -20,9 +20,8 @@ from gsgan.utils.files import read_text
 
 INCH = 0.0254
 ROOT = "root"
-CMU_FPS = (
-    120.0  # frames per second of CMU's clips; the format does not store it
-)
+# frames per second of CMU's clips; the format does not store it
+CMU_FPS = 120.0
 
 
 def asf_of(amc: Path) -> Path:
@@ -136,6 +135,7 @@ def _read_skeleton(path: Path) -> _Skeleton:
         else:
             sections[section].append(line)
 
+    # A file that was cut off ends within a section.
     for name in ("root", "bonedata", "hierarchy"):
         _refuse_cut(name, sections[name])
 
@@ -228,6 +228,7 @@ def _read_frames(
                     f"frame {number} gives {given} of {expected} numbers for {name}"
                 )
 
+    # One array per bone; a number that is not finite is damage.
     values = {
         name: np.array([frame[name] for frame in frames]) for name in moving
     }
@@ -272,6 +273,8 @@ def _motion(path: Path, skeleton: _Skeleton) -> RigMotion:
     for name in names[1:]:
         starts.append(bones[parents[name]].end)
         above.append(index[parents[name]])
+
+    # The bones that have no child, and where they end.
     last = []
     at_last = []
     ends = []

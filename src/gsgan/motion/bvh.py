@@ -11,9 +11,8 @@ from gsgan.motion.standard import RigMotion
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import read_text
 
-SLOWEST = (
-    1.0  # seconds between two frames from which the number is read as a rate
-)
+# seconds between two frames from which the number is read as a rate
+SLOWEST = 1.0
 # Share of the longest bone: joints that leave their places by less are at rest.
 REST_TOLERANCE = 1e-3
 
@@ -50,6 +49,8 @@ def read_bvh(path: Path) -> RigMotion:
         if words[:1] != ["HIERARCHY"] or not motion:
             raise ValueError("HIERARCHY and MOTION are expected")
         joints = _read_hierarchy(words[1:])
+
+        # Each frame has a number for every channel.
         columns = sum(len(joint.channels) for joint in joints)
         values, frame_time = _read_values(motion[0], columns)
         return _rig_motion(joints, values, frame_time)
@@ -77,6 +78,8 @@ def _read_hierarchy(words: list[str]) -> list[_Joint]:
                 rest.__next__, "{"
             ):  # names may have several words
                 joint.name += " " + part
+
+            # It is open until its closing brace.
             above.append(len(joints))
             joints.append(joint)
         elif word == "OFFSET":
@@ -101,6 +104,8 @@ def _read_values(text: str, columns: int) -> tuple[Array, float]:
         raise ValueError(
             "'Frames:' and 'Frame Time:' are expected after MOTION"
         )
+
+    # A file that was cut off has fewer numbers than it announces.
     frames = int(head[1])
     frame_time = float(head[2])
     numbers = text[head.end() :].split()
@@ -118,6 +123,7 @@ def _rig_motion(
     joints: list[_Joint], values: Array, frame_time: float
 ) -> RigMotion:
     """World rotations and the root's path from the channels' values ``[F, columns]``."""
+    # Numbers that are no numbers would spread through the hierarchy.
     offsets = np.array([joint.offset for joint in joints])
     if not (np.isfinite(values).all() and np.isfinite(offsets).all()):
         raise ValueError("a number is not finite")
@@ -128,20 +134,27 @@ def _rig_motion(
     local[:, 0] = 0.0
     columns = iter(values.T)
     for j, joint in enumerate(joints):
+        # The rotation so far: the parent's, then this joint's channels.
         R = np.eye(3) if joint.parent < 0 else rotations[:, joint.parent]
         given = local[:, j].copy()
         for channel in joint.channels:
             axis = "XYZ".index(channel[0].upper())
+
+            # Channels have their columns in the order of the joints.
             column = next(columns)
             if channel.lower().endswith("rotation"):
                 angle = np.radians(column[:, None])
                 R = R @ rotation(angle * np.eye(3)[axis])
             else:
                 given[:, axis] = column
+
+        # Both ways of writing positions occur.
         if joint.parent >= 0 and _counts_from_offset(given, offsets[j]):
             given = given + offsets[j]
         local[:, j] = given
         rotations[:, j] = R
+
+    # Names and parents in the order of the joints.
     names = []
     parents = []
     for joint in joints:

@@ -47,9 +47,8 @@ class Character:
     shapes: dict[str, Array]  # face shape name → [V, 3] offsets at weight 1
     # landmarks: 33 MediaPipe, then 42 of the hands, then the face's
     anchor_names: tuple[str, ...]
-    anchor_joint: (
-        Ints  # [L] the bone whose joint is the landmark, -1 for vertices
-    )
+    # [L] the bone whose joint is the landmark, -1 for vertices
+    anchor_joint: Ints
     anchor_vertex: Ints  # [L] the vertex that is the landmark, -1 for joints
 
     def skinned(
@@ -101,11 +100,9 @@ class Character:
 class Animation:
     """A character's poses at F moments."""
 
-    rotations: (
-        Array  # [F, J, 3, 3] world rotations of the bones since the rest pose
-    )
+    # [F, J, 3, 3] world rotations of the bones since the rest pose
+    rotations: Array
     joints: Array  # [F, J, 3] posed joint positions, metres
     shapes: dict[str, Array]  # face shape name → [F] weights
-    passages: tuple[
-        str, ...
-    ]  # [F] name of the part of the motion, such as "walk"
+    # [F] name of the part of the motion, such as "walk"
+    passages: tuple[str, ...]

@@ -55,19 +55,16 @@ class Clip:
     p: Float
     visibility: Float  # [F, J] in [0, 1]
     fps: float | None  # frames per second, or None if unknown
-    up: (
-        str | None
-    )  # the axis that points up, or None to infer it from the skeleton
+    # the axis that points up, or None to infer it from the skeleton
+    up: str | None
     unit: str  # of the file's lengths, in words
-    file_up: str | None = (
-        None  # the up axis of the file, if up is that of converted landmarks
-    )
+    # the up axis of the file, if up is that of converted landmarks
+    file_up: str | None = None
     part: str = ""  # which part of the file it is, in words, if it has several
     # [F] poses of the subject's body that the landmarks come from, or None
     body: BodyPose | None = None
-    filled: int = (
-        0  # number of frames without shoulders and hips, see `checked`
-    )
+    # number of frames without shoulders and hips, see `checked`
+    filled: int = 0
     # whether hands and face are not where they are on the body, so that the motion must be
     # retargeted
     detached: bool = False
@@ -108,6 +105,9 @@ def checked(motion: Clip, min_visibility: float) -> Clip:
     if body is not None:
         share = np.rint(share)
         body = body[torch.from_numpy(nearest)]
+
+    # Landmarks are mixed; one that only one side has is taken from the nearer
+    # frame.
     p = np.where(known[..., None], motion.p, np.nan)
     filled = mixed(p[before], p[after], share)
     filled = np.where(np.isfinite(filled), filled, p[nearest])
@@ -130,9 +130,8 @@ class Neighbours(NamedTuple):
     """The nearest known frames of each of F frames."""
 
     before: NDArray[np.int64]  # [F]; a known frame is its own neighbour
-    after: NDArray[
-        np.int64
-    ]  # [F]; the same as before if there is none on one side
+    # [F]; the same as before if there is none on one side
+    after: NDArray[np.int64]
     share: Float  # [F] of the latter, in [0, 1]
 
 
@@ -190,12 +189,16 @@ def completed(motion: Clip, up: str) -> Float:
     p = whole[:, :BODY]
     known: Bool = np.asarray(np.isfinite(p).all(-1))
     times = np.arange(len(p))
+
+    # Parents come first: a joint that is not seen follows its parent.
     for joint, parent in PARENT.items():
         offset = p[:, joint] - p[:, parent]
         seen = known[:, joint] & known[:, parent]
         if seen.mean() < MIN_SEEN:
             known[:, joint] = False
         elif not seen.all():
+            # In between, the bone turns from where it was to where it is seen
+            # again.
             gaps = ~seen
             for axis in range(3):
                 filled = np.interp(times, times[seen], offset[seen, axis])

@@ -60,12 +60,16 @@ class GltfFile:
     ) -> None:
         data = path.read_bytes()
         self.path = path
+
+        # Binary files begin with a magic number, others are JSON.
         if data[:4] == b"glTF":
             self.doc = pygltflib.GLTF2.load_from_bytes(data)
         elif data.lstrip()[:1] == b"{":
             self.doc = pygltflib.GLTF2.gltf_from_json(data.decode())
         else:
             raise DataError(f"{path}: not a glTF 2 file; export it as .glb")
+
+        # A required extension that is ignored would give wrong positions.
         for name in self.doc.extensionsRequired or ():
             if name in unsupported:
                 raise DataError(
@@ -101,6 +105,9 @@ class GltfFile:
         a = self.doc.accessors[index]
         kind = np.dtype(COMPONENT_TYPES[a.componentType])
         width = WIDTHS[a.type]
+
+        # An accessor without a view is all zeros, which a sparse part may
+        # replace.
         if a.bufferView is None:
             values = np.zeros((a.count, width), kind)
         else:
@@ -174,6 +181,7 @@ class GltfFile:
     def _buffer(self, index: int) -> bytes:
         """A buffer: the file's binary chunk, text in base64, or a file in the same folder."""
         if index not in self._buffers:
+            # A buffer without a URI is the binary chunk of a .glb.
             uri = self.doc.buffers[index].uri
             if uri is None:
                 data = self.doc.binary_blob() or b""
@@ -181,6 +189,8 @@ class GltfFile:
                 _, _, text = uri.partition(",")
                 data = base64.b64decode(text)
             else:
+                # Only files beside this one are read: a URI could name any file
+                # of the user.
                 folder = self.path.parent.resolve()
                 file = (folder / unquote(uri)).resolve()
                 if not file.is_relative_to(folder) or not file.is_file():
@@ -200,6 +210,8 @@ class GltfFile:
             raise DataError(
                 f"{self.path} is compressed (EXT_meshopt_compression): pip install 'gsgan[gltf]'"
             ) from None
+
+        # The mode tells what the bytes hold.
         count = packed["count"]
         stride = packed["byteStride"]
 
@@ -219,6 +231,9 @@ class GltfFile:
             "QUATERNION": "quat",
             "EXPONENTIAL": "exp",
         }
+
+        # Filters are the format's names for quantised normals, rotations and
+        # numbers.
         name = packed.get("filter", "NONE")
         if name != "NONE":
             unfilter = getattr(decoder, f"decode_filter_{filters[name]}")

@@ -59,6 +59,7 @@ def read_gltf_motion(
         DataError: when the file is damaged, or has no animation of a skeleton.
     """
     try:
+        # Any error of a parser means that the file is damaged.
         glb = GltfFile(path)
         nodes = _joints(glb)
         number = _chosen(glb, animation)
@@ -103,6 +104,9 @@ def _joints(glb: GltfFile) -> list[int]:
                     and channel.target.node is not None
                 ):
                     joints.add(channel.target.node)
+
+    # A joint's place depends on every node above it, whether or not that is a
+    # joint.
     above = set()
     for joint in joints:
         above.update(glb.ancestors(joint))
@@ -152,12 +156,19 @@ def _channels(
         path = channel.target.path
         if node not in nodes or path not in PROPERTIES:
             continue
+
+        # A sampler has the times of the keys and their values.
         sampler = animation.samplers[channel.sampler]
         times = glb.accessor(sampler.input)[:, 0]
         values = glb.accessor(sampler.output)
         interpolation = sampler.interpolation or "LINEAR"
+
+        # A cubic key has three values: the tangent before it, its value, and
+        # the tangent after it.
         if interpolation == "CUBICSPLINE":
             values = values.reshape(len(times), 3, -1)
+
+        # Broken keys would turn into joints at impossible places much later.
         if len(values) != len(times) or values.shape[-1] != PROPERTIES[path]:
             raise ValueError(
                 f"{len(times)} keys have values of shape {values.shape}"
@@ -197,6 +208,7 @@ def _sampled(channel: _Channel, times: Array, rotation: bool) -> Array:
     times = times.clip(keys[0], keys[-1])
     before = np.searchsorted(keys, times + SAME_TIME, side="right") - 1
     if len(keys) == 1 or channel.interpolation == "STEP":
+        # A single key, or steps: the value of the key before.
         values = channel.values
         if channel.interpolation == "CUBICSPLINE":
             values = values[:, 1]
@@ -228,6 +240,7 @@ def _rig_motion(
     times: Array,
 ) -> RigMotion:
     """World rotations since the nodes' own pose, and the joints' places, at times ``[F]``."""
+    # From each node's axes to the world's, at rest and in every frame.
     locals_at_rest = {}
     locals_posed = {}
     for node in nodes:
@@ -294,6 +307,7 @@ def _posed(
                 channel, times, rotation=path == "rotation"
             )
         else:
+            # A property without keys is the same in all frames.
             constant = np.array(own, np.float64)
             sampled[path] = np.broadcast_to(
                 constant, (len(times), len(constant))

@@ -75,6 +75,8 @@ def vrm_bone(name: str, version: int) -> str | None:
     )
     if match is None:
         return None
+
+    # VRM 1 names the bones of the thumb Metacarpal, Proximal and Distal.
     finger = {"Little": "Pinky"}.get(match[1], match[1])
     segments = ["Proximal", "Intermediate", "Distal"]
     if finger == "Thumb" and version == 1:
@@ -97,6 +99,7 @@ def humanoid_bones(
         "VRMC_vrm_animation"
     )
     if version_1:
+        # Version 1 lists bones by name, version 0 as a list.
         bones = version_1["humanoid"]["humanBones"]
         pairs = [
             (bone["node"], vrm_bone(name, 1)) for name, bone in bones.items()

@@ -69,11 +69,15 @@ class Orbit:
         share = np.arange(F) / max(F, 1)
         turned = np.radians(self.start + 360 * self.turns * share)
         azimuth = heading(p[0] @ to_world) + turned
+
+        # The height stays the same during the turn.
         elevation = np.radians(self.elevation)
         sine = np.sin(azimuth)
         cosine = np.cos(azimuth)
         level = np.cos(elevation)
         height = np.full(F, np.sin(elevation))
+
+        # The direction from the person to the camera.
         away = np.stack([level * sine, -level * cosine, height], axis=1)
 
         # Extrinsics, in the axes of the world.

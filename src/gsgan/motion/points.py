@@ -93,6 +93,8 @@ def _read_trc(path: Path) -> tuple[Ints, Float]:
     # The joints that MediaPipe has too.
     table = np.array(rows).reshape(-1, columns)
     F = len(table)
+
+    # Frame number and time come first, then three columns per marker.
     coordinates = table[:, 2:].reshape(F, len(markers), 3)
     coordinates = coordinates[..., TRC_AXES]
     p = np.full((F, BODY, 3), np.nan)
@@ -100,6 +102,8 @@ def _read_trc(path: Path) -> tuple[Ints, Float]:
         joint = _joint(name)
         if joint is not None:
             p[:, joint] = coordinates[:, marker]
+
+    # Some programs write zeros for markers that were not seen.
     p = zeros_as_missing(p)
     if not np.isfinite(p[:, LEFT_RIGHT_SHOULDER + LEFT_RIGHT_HIP]).any():
         raise DataError(

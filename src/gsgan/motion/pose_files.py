@@ -66,6 +66,8 @@ def read_pose(path: Path, subject: Proportions) -> Clip:
     Raises:
         DataError: when the package is missing, the file is damaged or has no depth.
     """
+    # The body in the image if the file has it, else in the world; either needs
+    # a depth.
     file = _PoseFile(path)
     name = IMAGE_PART if IMAGE_PART in file.parts else WORLD_PART
     if name not in file.parts or "Z" not in file.parts[name].layout:
@@ -77,6 +79,8 @@ def read_pose(path: Path, subject: Proportions) -> Clip:
     # The body. Hips that are guesses are placed below the shoulders.
     p, visibility = file.landmarks(name, MEDIAPIPE33.names)
     person = visibility[:, SHOULDERS].all(1)
+
+    # MediaPipe gives hips outside of the image, too.
     guessed_hips = (
         person.any() and np.median(visibility[person][:, HIPS]) < GUESSED
     )
@@ -206,6 +210,8 @@ def _to_metres(
         ends = [a, b]
         visible = (visibility[:, ends] > 0.2).all(1)
         seen = visible & np.isfinite(p[:, ends]).all((1, 2))
+
+        # Each bone's squared parts, over the square of its length.
         squares = (p[seen, b] - p[seen, a]) ** 2
         rows.append(squares / length(subject.rest, (a, b)) ** 2)
     table = np.concatenate(rows)
@@ -239,13 +245,20 @@ def _parts_to_metres(
         p = np.where(part.confidence[..., None] > 0, part.p, np.nan)
         for a, b in lengths:
             squares = (p[:, b] - p[:, a]) ** 2 / length(at_rest, (a, b)) ** 2
+
+            # x and y are pixels, z has another scale.
             x, y, z = squares.T
             rows.append(np.stack([x + y, z], axis=1))
         points.append(p)
+
+    # Pairs that were not seen have no equation; without any, the scale is
+    # unknown.
     table = np.concatenate(rows)
     table = table[np.isfinite(table).all(1)]
     if not len(table):
         return [np.full_like(p, np.nan) for p in points]
+
+    # Squares of scales cannot be negative.
     squares, _ = nnls(table, np.ones(len(table)))
     flat, deep = np.sqrt(squares)
     return [p * (flat, flat, deep) for p in points]

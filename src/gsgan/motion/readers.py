@@ -195,10 +195,14 @@ def _by_names(
 ) -> Clip:
     rate = _first(arrays, RATE_KEYS)
     fps = None if rate is None else rate_of(path, rate)
+
+    # Each kind of motion has an array that no other kind has.
     if "p" in arrays:
         return _landmarks(path, arrays, fps)
     if "theta" in arrays:
         return _body_pose(path, arrays, fps, source)
+
+    # MediaPipe's world landmarks, whose fourth number is the visibility.
     world = _first(arrays, WORLD_KEYS)
     if world is not None:
         p = _with_visibility(path, world, arrays.get("visibility"))
@@ -244,6 +248,8 @@ def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Clip:
             f"{path}: 'p' must have shape [F, {BODY}, 3], with hands [F, {hands}, 3], or "
             f"with hands and face [F, {face}, 3]; got {list(arrays['p'].shape)}"
         )
+
+    # Landmarks that are not finite have no confidence.
     p = arrays["p"].astype(np.float64)
     conf = np.ones(p.shape[:2])
     if "conf" in arrays:
@@ -261,10 +267,13 @@ def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Clip:
         p[no_hips, :BODY] = np.where(
             seen[no_hips, :, None], p[no_hips, :BODY], np.nan
         )
+
+        # Their confidence is that of the shoulders from which they hang.
         for hip, shoulder in zip(HIPS, SHOULDERS, strict=True):
             p[no_hips, hip] = placed[no_hips, hip]
             conf[no_hips, hip] = conf[no_hips, shoulder]
 
+    # Unit, frame rate and axis are in the meta.json of the same folder.
     meta = _meta(path)
     return Clip(
         path=path,
@@ -280,10 +289,13 @@ def _body_pose(
     path: Path, arrays: dict[str, Any], fps: float | None, source: Source
 ) -> Clip:
     """Poses of the free body as `gsgan.fit` writes them, or of SMPL."""
+    # SMPL's files call the translation "trans"; lengths become metres.
     theta = expect_array(arrays, "theta", (None, None, 3), path)
     F, bones, _ = theta.shape
     if "trans" in arrays:
         arrays = {**arrays, "transl": arrays["trans"]}
+
+    # Lengths have the unit of the capture.
     meta = _meta(path)
     scale = METRES.get(meta.get("unit", "m"), 1.0)
     transl = scale * expect_array(arrays, "transl", (F, 3), path)
@@ -341,8 +353,12 @@ def _smpl(
     model = read_smpl(source.smpl)
     poses = _smpl_poses(path, arrays)
     F = len(poses)
+
+    # Without a translation the person stays in place.
     moves = np.asarray(_first(arrays, MOVE_KEYS, np.zeros((F, 3))), np.float64)
     moves = moves.reshape(F, 3) / arrays.get(SCALE_KEY, 1.0)
+
+    # One shape for the motion: the median over frames.
     betas = np.asarray(_first(arrays, SHAPE_KEYS, np.zeros(10)), np.float64)
     betas = np.median(betas.reshape(-1, betas.shape[-1]), axis=0)
     betas = betas[: model.shapedirs.shape[-1]]
@@ -430,6 +446,7 @@ def read_mediapipe_json(path: Path, source: Source) -> Clip:
     A frame is an object with one of `WORLD_KEYS`, or the 33 landmarks themselves; a landmark is
     ``{x, y, z, visibility}`` or a list of these numbers.
     """
+    # The list of frames is the whole file, or one entry of it.
     frames = read_json_value(path)
     fps = None
     if isinstance(frames, dict):
@@ -440,6 +457,8 @@ def read_mediapipe_json(path: Path, source: Source) -> Clip:
             f"{path} holds no frames; expected a list, or an object with 'frames', of MediaPipe's "
             "pose_world_landmarks"
         )
+
+    # Each frame is read by itself, so that a message can name it.
     rows = []
     for i, frame in enumerate(frames):
         rows.append(_landmark_row(f"{path}, frame {i}", frame))
@@ -471,6 +490,8 @@ def _landmark_row(where: str, frame: Any) -> Float:
                 "coordinates, without metric depth"
             )
         points = frame[key]
+
+    # Some versions wrap the landmarks once more.
     if isinstance(points, dict):
         points = points.get("landmark", points.get("landmarks"))
     if isinstance(points, list) and len(points) == 1:
@@ -515,6 +536,8 @@ def _with_visibility(
             f"{path}: the world landmarks must have shape (any, {BODY}, 3 or 4), found "
             f"{points.shape}"
         )
+
+    # A separate array of visibilities comes before the fourth number.
     if visibility is None and points.shape[2] > 3:
         visibility = points[..., 3]
     elif visibility is None:
@@ -589,6 +612,7 @@ def _read_rig(path: Path, source: Source) -> Clip:
     else:
         unit = f"units of {100 * metres:.3g} cm"
 
+    # Landmarks at the joints of the subject's bones.
     p = rig_landmarks(standard, source.subject)
     return Clip(
         path=path,

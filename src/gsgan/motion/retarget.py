@@ -97,6 +97,8 @@ def retargeted(
 
     # Hands: turned as the palm's three landmarks of the pose, or better as the hand's own.
     for wrist, ends in HAND_LANDMARKS.items():
+        # The hand turns with the line of the knuckles, or with its own
+        # landmarks.
         first, second = ends[:2]
         axes = hand_frame(p, wrist, first, second)
         turn = axes @ hand_frame(rest, wrist, first, second).T
@@ -305,6 +307,8 @@ def joined(clips: Sequence[Float], subject: Proportions, n: int) -> Float:
             speeds[0] = a[-1] - a[-2]
         if len(b) > 1:
             speeds[1] = b[1] - b[0]
+
+        # Speeds are per frame, and so are the spline's positions.
         path = CubicHermiteSpline(
             x=[0, n + 1],
             y=np.nan_to_num(ends),
@@ -329,6 +333,7 @@ def face_in_head(p: Float) -> Float:
 
 def heading(p: Float) -> float:
     """The direction that the hips of ``[J, 3]`` face: radians about the up axis, 0 towards -Y."""
+    # The pelvis' third axis points to the front.
     front = bone_frames(torch.from_numpy(p[None, :BODY])).hubs[0, PELVIS, :, 2]
     return float(torch.atan2(front[0], -front[1]))
 

@@ -140,6 +140,7 @@ def finger_hinges(
     opposite = joint[side + "HandPinky1"] + 0.03 * palm
 
     for finger in FINGERS:
+        # Each phalanx is bent against the one before.
         before = forward
         for k, (bone, end) in enumerate(phalanges(joint, side, finger)[:3]):
             along = unit(joint[end] - joint[bone])
@@ -181,6 +182,8 @@ class Rig:
             self.index[name] = j
             self.joint[name] = character.joints[j]
         self.turns = rest_turns(self.joint)
+
+        # Motions scale with these lengths.
         self.leg = self._limb_length(LEG)
         self.arm = self._limb_length(ARM)
 

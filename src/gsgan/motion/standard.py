@@ -34,17 +34,15 @@ MAX_NEUTRAL_TILT = np.radians(10)
 MAX_UPRIGHT_TILT = np.radians(30)
 # Share of frames in which a person stands, in motions on the floor.
 MIN_STANDING_SHARE = 0.1
-SAME_TILT = np.radians(
-    1
-)  # frames within this tilt of the best one are used too
+# frames within this tilt of the best one are used too
+SAME_TILT = np.radians(1)
 MAX_REFERENCES = 100  # number of frames for calibration
 # Share of knees and toes behind the body above which left and right are exchanged.
 BACKWARDS = 0.8
 # Minimum sine of the slope from ankle to toes of a flat foot: steeper ones are in the air.
 STEEPEST = -0.7
-MIN_BEND = (
-    0.15  # minimum mean sine of the bend at which a limb's plane is known
-)
+# minimum mean sine of the bend at which a limb's plane is known
+MIN_BEND = 0.15
 # Leg lengths: feet up to this height above the lowest of a second stand on the floor.
 HOVER = 0.06
 # Metres from the origin that a motion may reach before its drift is subtracted.
@@ -113,6 +111,8 @@ def _bone(name: str) -> tuple[str, int]:
             side = word
         else:
             stem += word
+
+    # The side may be a prefix of the stem itself, as in "lthigh".
     match = re.match(r"(left|right|l|r)(.+)", stem)
     if not side and match and _stem(match[2], sided=True)[0]:
         side, stem = match.groups()
@@ -151,9 +151,8 @@ def _stem(stem: str, sided: bool) -> tuple[str, int]:
 class RigMotion:
     """The motion of a rig in a file: joints and their world rotations since the zero pose."""
 
-    names: tuple[
-        str, ...
-    ]  # of the J joints, parents first; end sites are called "<joint> end"
+    # of the J joints, parents first; end sites are called "<joint> end"
+    names: tuple[str, ...]
     parents: tuple[int, ...]  # [J], -1 for roots
     offsets: Array  # [J, 3] from the parent in the zero pose, units and axes of the file
     rotations: Array  # [F, J, 3, 3] world, axes of the file
@@ -200,9 +199,8 @@ class StandardMotion:
 class Reference:
     """Poses in which bones have known turns: they calibrate the joints' own axes."""
 
-    rotations: (
-        Array  # [N, J, 3, 3] world rotations of the joints, axes of the file
-    )
+    # [N, J, 3, 3] world rotations of the joints, axes of the file
+    rotations: Array
     axes: Array  # [N, 3, 3] rows left, back, up of the person, axes of the file
     joints: Array  # [N, J, 3] positions, axes of the file
     zero: bool  # whether it is the zero pose
@@ -233,12 +231,15 @@ def standard_motion(
 
     # The axis that points up, and left and right.
     zero = rig.zero_pose()[None]
+
+    # A zero pose that stands tells which axis is up.
     highest = _upward(zero, known)
     stands = tilts(zero, known, highest).max() < MAX_STANDING_TILT
     zero_axis = highest if stands else None
     if up is None:
         axis = _upward(posed, known, usual=zero_axis)
     else:
+        # The user's axis, with its sign.
         axis = np.zeros(3)
         axis["xyz".index(up[-1])] = -1.0 if up.startswith("-") else 1.0
     known = _by_side(posed, known, axis)
@@ -290,6 +291,8 @@ def body_joints(rig: RigMotion, path: Path) -> dict[str, int]:
     above_left = _line(rig, known["LeftUpLeg"])
     above_right = _line(rig, known["RightUpLeg"])
     shared = [j for j in above_left if j in above_right]
+
+    # Every limb several times means several skeletons.
     counts = []
     for side, bone in product(SIDES, ("UpLeg", "Arm")):
         counts.append(_count(rig, side + bone))
@@ -461,6 +464,8 @@ def _reference(
     if neutral:
         chosen = np.flatnonzero(worst < best + SAME_TILT)
     else:
+        # Without a neutral pose, the frames in which at least the trunk is
+        # upright.
         trunk = tilt[:, 0]
         limit = max(MAX_UPRIGHT_TILT, float(trunk.min()) + SAME_TILT)
         chosen = np.flatnonzero(trunk < limit)
@@ -490,9 +495,8 @@ def _turns(
 
     # A joint's turn is R @ C: its world rotation R in the person's axes, times the constant C
     # that gives the known turns in the reference poses.
-    to_rest = (
-        reference.rotations.mT @ reference.axes.mT[:, None]
-    )  # [N, J, 3, 3]
+    # [N, J, 3, 3]
+    to_rest = reference.rotations.mT @ reference.axes.mT[:, None]
     R = axes @ rig.rotations
     turns = {}
     for bone, j in known.items():
@@ -541,6 +545,9 @@ def _bend_in_plane(turns: dict[str, Array], joints: dict[str, Array]) -> None:
         local = matvec(turns[first].mT, lower)
         away = local @ hinge
         forward = local @ np.cross(hinge, along)
+
+        # As a complex number: its angle is the direction of the bend, and its
+        # size the weight.
         bend = forward + 1j * away
         mean = (bend * np.hypot(forward, away)).mean()
         if abs(mean) <= MIN_BEND**2:
@@ -574,6 +581,7 @@ def _point_hands(turns: dict[str, Array], joints: dict[str, Array]) -> None:
             thumb = thumb * (0, 1, 1)
             calibration = calibration @ between(np.array([0.0, -1, 0]), thumb)
 
+        # The fingers turn with the hand.
         for bone in turns:
             if bone.startswith(hand):
                 turns[bone] = turns[bone] @ calibration
@@ -657,6 +665,8 @@ def _trunk(rig: RigMotion, known: dict[str, int], R: Array) -> dict[str, Array]:
     # The spine is above both arms but not above the legs; the file's bones are interpolated.
     hips = [*_line(rig, known["LeftUpLeg"]), known["Hips"]]
     spine = [j for j in left if j in right and j not in hips]
+
+    # The standard's joints lie at even steps along the file's spine.
     chain = [known["Hips"], *spine]
     for k, bone in enumerate(SPINE, 1):
         at = k * len(spine) / len(SPINE)

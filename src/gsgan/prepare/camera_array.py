@@ -17,12 +17,15 @@ from gsgan.skeleton.joints import known
 from gsgan.utils.arrays import Bool, Float, Ints
 
 MIN_VIEWS = 2
+# The diagonal of film in millimetres, to which equivalent focal lengths refer.
+FILM = float(np.hypot(36.0, 24.0))
+# Millimetres: phones' main cameras have 24 to 28 and record a part of their image.
+USUAL_FOCAL = 30.0
 UNIT_FOCAL = 1000.0  # pixels; errors are then thousandths of the focal length
 MAX_EVALUATIONS = 30  # of the optimiser
 LOSS_SCALE = 5.0  # error at which a detection counts half, thousandths of the focal length
-COST_TOLERANCE = (
-    1e-7  # relative change of the cost at which the refinement ends
-)
+# relative change of the cost at which the refinement ends
+COST_TOLERANCE = 1e-7
 # Square pixels: keeps the residual's scaling finite at an error of 0.
 MIN_SQUARE = 1e-12
 
@@ -66,13 +69,14 @@ class CameraArray:
         Thresholds in such pixels hold for images of any size, and cameras of different sizes count
         alike.
         """
+        # The first two rows of K, and the pixels, scale alike.
         ratio = UNIT_FOCAL / self.focal
         K = self.K.copy()
         K[:, :2] *= ratio[:, None, None]
         scale = np.expand_dims(ratio, tuple(range(1, uv.ndim)))
         return replace(self, K=K), uv * scale
 
-    def __getitem__(self, cameras: Bool | slice) -> CameraArray:
+    def __getitem__(self, cameras: Bool | slice | list[int]) -> CameraArray:
         return CameraArray(self.K[cameras], self.R[cameras], self.t[cameras])
 
     def entries(self, cameras: Sequence[CameraEntry]) -> list[CameraEntry]:
@@ -101,8 +105,31 @@ class CameraArray:
         """
         pixels, depth = self.project(p)
         error = np.linalg.norm(pixels - uv, axis=-1)
+
+        # A point behind the camera contradicts the detection, however near its
+        # pixel is.
         behind = np.where(np.isfinite(error), np.inf, np.nan)
         return np.where(depth <= NEAR, behind, error)
+
+
+def film_camera(name: str, size: tuple[int, int], focal: float) -> CameraEntry:
+    """A camera at the origin, its principal point at the centre of its images.
+
+    Args:
+        name: of the camera.
+        size: ``(H, W)`` of its images.
+        focal: millimetres on film of 36 x 24 mm.
+    """
+    h, w = size
+    pixels = focal * float(np.hypot(h, w)) / FILM
+    return CameraEntry(
+        name=name,
+        K=np.array([[pixels, 0, w / 2], [0, pixels, h / 2], [0, 0, 1]]),
+        R=np.eye(3),
+        t=np.zeros(3),
+        dist=np.zeros(8),
+        size=size,
+    )
 
 
 def undistort_points(camera: CameraEntry, px: Float) -> Float:
@@ -114,6 +141,8 @@ def undistort_points(camera: CameraEntry, px: Float) -> Float:
     homogeneous = np.c_[px[seen], np.ones(seen.sum())]
     rays = homogeneous @ np.linalg.inv(camera.K).T
     straight = undistort(rays[:, :2], camera.dist)
+
+    # Back to pixels by the same K.
     result = np.full(px.shape, np.nan)
     result[seen] = straight @ camera.K[:2, :2].T + camera.K[:2, 2]
     return result
@@ -127,15 +156,17 @@ def refine_cameras(
     weight: Float,
     rotation_prior: float,
     position_prior: float,
+    focal_prior: float | None = None,
 ) -> CameraArray:
     """The cameras with the smallest reprojection error, near the given ones.
 
     Bundle adjustment of poses and points (`scipy.optimize.least_squares`); the loss is Cauchy's; K
-    is fixed. Points with fewer than two views are left out. Landmarks cannot determine the world's
-    origin, orientation or scale; the priors fix them by the smallest change of the given
-    calibration.
+    is fixed unless ``focal_prior`` is given. Points with fewer than two views are left out.
+    Landmarks cannot determine the world's origin, orientation or scale; the priors fix them by the
+    smallest change of the given calibration.
 
-    The parameters are a rotation vector and a move of each camera, then a move of each point.
+    The parameters are a rotation vector and a move of each camera, and the logarithm of its focal
+    length's factor if that is not fixed; then a move of each point.
 
     Args:
         given: centre of the priors.
@@ -145,6 +176,7 @@ def refine_cameras(
         weight: ``[C, N]`` their confidence, 0 = not seen.
         rotation_prior: standard deviation of the orientations of ``given``, degrees.
         position_prior: standard deviation of its positions, metres.
+        focal_prior: standard deviation of the logarithms of its focal lengths; None fixes them.
     """
     # The points that are used.
     weight = np.where(known(uv), weight, 0.0)
@@ -158,17 +190,29 @@ def refine_cameras(
     uv = uv[camera, point]
     weight = weight[camera, point]
     square = LOSS_SCALE**2
-    poses = 6 * len(start)
+    size = 6 if focal_prior is None else 7
+    poses = size * len(start)
 
+    # Rotations are small turns of the start, since rotation matrices have no
+    # free parameters.
     def cameras_at(x: Float) -> CameraArray:
-        changes = x[:poses].reshape(-1, 2, 3)
-        R = Rotation.from_rotvec(changes[:, 0]).as_matrix() @ start.R
-        return replace(start, R=R, t=start.t + changes[:, 1])
+        changes = x[:poses].reshape(-1, size)
+        R = Rotation.from_rotvec(changes[:, :3]).as_matrix() @ start.R
+        moved = replace(start, R=R, t=start.t + changes[:, 3:6])
+        if focal_prior is None:
+            return moved
+        K = start.K.copy()
+        K[:, [0, 1], [0, 1]] *= np.exp(changes[:, 6:])
+        return replace(moved, K=K)
 
+    # Turns and moves in units of their standard deviations.
     def priors(cameras: CameraArray) -> Float:
         turned = _turns(given, cameras) / np.radians(rotation_prior)
         moved = (cameras.centres - given.centres) / position_prior
-        return np.c_[turned, moved].ravel()
+        if focal_prior is None:
+            return np.c_[turned, moved].ravel()
+        zoomed = np.log(cameras.focal / given.focal) / focal_prior
+        return np.c_[turned, moved, zoomed].ravel()
 
     def residuals(x: Float) -> Float:
         cameras = cameras_at(x)
@@ -185,7 +229,7 @@ def refine_cameras(
     found = least_squares(
         residuals,
         np.zeros(poses + p.size),
-        jac_sparsity=_sparsity(camera, point, len(start), len(p)),
+        jac_sparsity=_sparsity(camera, point, len(start), len(p), size),
         x_scale="jac",
         ftol=COST_TOLERANCE,
         max_nfev=MAX_EVALUATIONS,
@@ -198,6 +242,7 @@ def refine_cameras(
     def world_priors(x: Float) -> Float:
         return priors(_similar(cameras, x))
 
+    # Seven numbers: three of a turn, three of a move, and the scale.
     world = least_squares(world_priors, np.zeros(7))
     return _similar(cameras, world.x)
 
@@ -205,6 +250,9 @@ def refine_cameras(
 def _similar(cameras: CameraArray, x: Float) -> CameraArray:
     """The cameras in a world turned by ``x[:3]``, moved by ``x[3:6]``, scaled by exp ``x[6]``."""
     turn = Rotation.from_rotvec(x[:3]).as_matrix()
+
+    # x_cam = R x + t stays the same up to the scale, so centres move and t
+    # follows from them.
     R = cameras.R @ turn
     centres = np.exp(x[6]) * cameras.centres @ turn + x[3:6]
     return replace(cameras, R=R, t=-np.einsum("cij,cj->ci", R, centres))
@@ -215,22 +263,26 @@ def _sparsity(
     point: Ints,
     cameras: int,
     points: int,
+    size: int,
 ) -> sparse.csr_matrix:
-    """The parameters that each residual depends on: its camera's 6 and its point's 3."""
+    """The parameters that each residual depends on: its camera's ``size`` and its point's 3."""
     # Two rows per detection: u and v.
-    at_camera = 6 * camera[:, None] + np.arange(6)
-    at_point = 6 * cameras + 3 * point[:, None] + np.arange(3)
+    at_camera = size * camera[:, None] + np.arange(size)
+    at_point = size * cameras + 3 * point[:, None] + np.arange(3)
+
+    # A row's columns: those of its camera, then three of its point.
     columns = np.c_[at_camera, at_point].repeat(2, axis=0)
-    rows = np.arange(len(columns)).repeat(9)
-    parameters = 6 * cameras + 3 * points
+    rows = np.arange(len(columns)).repeat(size + 3)
+    parameters = size * cameras + 3 * points
     detections = sparse.coo_matrix(
         (np.ones(columns.size), (rows, columns.ravel())),
         shape=(len(columns), parameters),
     )
 
-    # Six rows per camera: its priors.
-    priors = sparse.kron(np.eye(cameras), np.ones((6, 6)), format="coo")
-    priors.resize(6 * cameras, parameters)
+    # As many rows per camera: its priors.
+    block = np.ones((size, size))
+    priors = sparse.kron(np.eye(cameras), block, format="coo")
+    priors.resize(size * cameras, parameters)
     return sparse.vstack([detections, priors]).tocsr()
 
 
@@ -238,6 +290,7 @@ def camera_moves(
     before: CameraArray, after: CameraArray
 ) -> tuple[Float, Float]:
     """Each camera's rotation ``[C]`` in degrees, and its move ``[C]`` in millimetres."""
+    # A rotation vector is as long as its angle.
     turned = np.linalg.norm(_turns(before, after), axis=-1)
     moved = np.linalg.norm(after.centres - before.centres, axis=-1)
     return np.degrees(turned), 1000 * moved
@@ -245,4 +298,5 @@ def camera_moves(
 
 def _turns(before: CameraArray, after: CameraArray) -> Float:
     """Rotation vectors ``[C, 3]`` from the orientations before to those after."""
+    # The turn that takes the first orientation to the second, in camera axes.
     return Rotation.from_matrix(after.R @ before.R.mT).as_rotvec()

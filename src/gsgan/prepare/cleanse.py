@@ -34,17 +34,15 @@ HAND_BONES = tuple(
 FINGERS_OF_BOTH = tuple(
     (start + a, start + b) for start in HAND_ROOTS for a, b in FINGER_BONES
 )
-FINGER_NOISE = (
-    0.02  # metres by which noise alone changes the length of a finger's bone
-)
+# metres by which noise alone changes the length of a finger's bone
+FINGER_NOISE = 0.02
 MAX_REACH = 1.5  # metres from the median joint of the frame
 # Maximum difference of a length from its median, as a share of it.
 BONE = 0.3
 HAND_BONE = 0.3
 FINGER_BONE = 0.5
-MAX_WRIST_GAP = (
-    0.1  # maximum distance from the pose's wrist to the hand's, metres
-)
+# maximum distance from the pose's wrist to the hand's, metres
+MAX_WRIST_GAP = 0.1
 FACE_RADIUS = 0.15  # maximum distance from the middle of the face, metres
 DEGREE = 2  # of the polynomial that smooths
 KERNEL_END = 3  # standard deviations at which the smoothing kernel ends

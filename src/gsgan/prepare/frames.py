@@ -30,9 +30,8 @@ CONFIDENT = 0.5
 BLURRED = 0.3  # share of the usual sharpness
 JUMP = 0.5  # of the person's size from image to image: the detector found somebody else
 SHARP_SIZE = 256  # pixels: sharpness is measured on the person at this height
-MAX_CORNERS = (
-    200  # maximum corners of the background, which show a moving camera
-)
+# maximum corners of the background, which show a moving camera
+MAX_CORNERS = 200
 MIN_CORNERS = 20  # minimum number of them
 
 LeftOut = dict[str, Bool]
@@ -136,6 +135,7 @@ def left_out(px: Float, conf: Float, sharp: Float) -> LeftOut:
     same = good.copy()
     before = -1
     for f in np.flatnonzero(good).tolist():
+        # In the frames between, the person may have moved as far each time.
         reach = JUMP * (f - before) * size[f]
         if before < 0 or np.linalg.norm(middle[f] - middle[before]) < reach:
             before = f
@@ -179,6 +179,8 @@ def look(files: Sequence[Path], px: Float) -> tuple[Float, float]:
     before: Bytes | None = None
     for f, path in enumerate(files):
         image = read_grey(path)
+
+        # The box of the person, in which sharpness is measured.
         seen = px[f][known(px[f])]
         box = np.zeros(4, np.int64)
         if len(seen):

@@ -18,9 +18,8 @@ from gsgan.utils.errors import DataError
 from gsgan.utils.files import writing
 from gsgan.utils.frame_files import frame_files, last_number
 
-MIN_BLOB = (
-    0.02  # share of the largest piece of a mask: smaller ones are removed
-)
+# share of the largest piece of a mask: smaller ones are removed
+MIN_BLOB = 0.02
 JPEG_QUALITY = 95  # of jpg, 1 to 100
 PNG_COMPRESSION = 3  # 0..9; higher is smaller and slower
 
@@ -53,6 +52,8 @@ def find_masks(
         stems = [
             path.stem for path in paths if path.suffix.lower() in IMAGE_SUFFIXES
         ]
+
+        # EasyMocap's masks are named by frame and person.
         of_persons = stems and all(
             re.fullmatch(r"\d+_\d+", stem) for stem in stems
         )
@@ -134,6 +135,7 @@ def write_images(
     if camera.distorted:
         mapping = undistort_map(camera.K, camera.dist, window)
 
+    # A recording may change its size in between.
     def write(path: Path, pixels: Bytes, number: int, where: Path) -> None:
         if pixels.shape[:2] != camera.size:
             raise DataError(
@@ -147,6 +149,7 @@ def write_images(
     written = list[int]()
     last = max(frames, default=-1)
     for number, image in source.images():
+        # The offset of the camera's clock, in frames.
         frame = number + offset
         if frame > last:
             break

@@ -34,9 +34,8 @@ UNTOLD = (
     "and hips"
 )
 MESH_LANDMARKS = 468  # landmarks of MediaPipe's face mesh
-PIXEL_CENTRE = (
-    0.5  # added to detectors that count from the centre of the first pixel
-)
+# added to detectors that count from the centre of the first pixel
+PIXEL_CENTRE = 0.5
 OPENPOSE_KEYS = (
     "pose_keypoints_2d",
     "hand_left_keypoints_2d",

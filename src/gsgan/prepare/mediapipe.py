@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
+from filelock import FileLock
+
 from gsgan.prepare.images import find_masks
 from gsgan.prepare.landmarks import find_landmarks
 from gsgan.prepare.options import MEDIAPIPE, MediaPipe, Options
@@ -86,6 +88,8 @@ def run_tool(
     folders = {}
     for name, source in sources.items():
         key = [source.fingerprint(), source.rotate, tool_key(), parts, masks]
+        if options.person is not None:
+            key.append(list(options.person))
         folders[name] = stages.path(f"mediapipe-{name}", key)
         results[name] = folders[name].with_suffix(".npz")
 
@@ -95,12 +99,15 @@ def run_tool(
         python = ensure_environment(tool, options.setup, say)
 
         def one(name: str, advance: Advance) -> None:
+            # The tool has its own environment, so everything goes through the
+            # command line.
             given = {
                 "source": str(sources[name].path),
                 "out": str(results[name]),
                 "masks": str(folders[name]) if masks else "",
                 **parts,
                 "rotate": sources[name].rotate,
+                "person": options.person and list(options.person),
                 "slot": missing.index(name) % options.workers,
                 "threads": tool.threads,
             }
@@ -132,15 +139,19 @@ def _detect(command: list[str], source: Path, advance: Advance) -> None:
             text=True,
         ) as process,
     ):
+        # A line of progress for each image; an interrupt ends the tool too.
         try:
             assert process.stdout is not None
             for line in process.stdout:
+                # Other lines are MediaPipe's own messages.
                 done, _, count = line.partition(" ")
                 if done.isdigit() and count.strip().isdigit():
                     advance(int(done), int(count))
         except BaseException:
             process.kill()
             raise
+
+        # The tool's last line of errors is the reason of its failure.
         if process.wait():
             errors.seek(0)
             raise DataError(
@@ -181,6 +192,19 @@ def ensure_environment(
             "MediaPipe needs Python 3.11 or 3.12: set mediapipe.python=<path>"
         )
 
+    # Two commands that start at once must not both write the folder.
+    with writing(place):
+        place.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(place.with_name(f".{place.name}.lock")):
+            if not (place / READY).is_file():
+                _create(place, base, python, say)
+    return python
+
+
+def _create(
+    place: Path, base: str, python: Path, say: Callable[[str], None]
+) -> None:
+    """Creates the environment at ``place`` with ``base``, which becomes ``python``."""
     # The folder, marked as made here.
     with writing(place):
         if place.exists():
@@ -210,7 +234,6 @@ def ensure_environment(
     _run([str(python), "-c", "import mediapipe"], "MediaPipe does not start")
     with writing(place):
         (place / READY).touch()
-    return python
 
 
 def _run(command: list[str], what: str) -> None:

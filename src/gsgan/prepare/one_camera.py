@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from gsgan.body.shape import BodyShape, shaped_body
 from gsgan.data.calibration import Calibration
 from gsgan.data.cameras import CameraEntry
 from gsgan.prepare import landmarks
-from gsgan.prepare.camera_array import CameraArray
+from gsgan.prepare.camera_array import FILM, USUAL_FOCAL, CameraArray
 from gsgan.prepare.cleanse import cleanse, smooth
 from gsgan.prepare.frames import (
     SAMPLING,
@@ -57,12 +57,10 @@ from gsgan.utils.arrays import Bool, Float, Ints, expect_array, nanmedian
 from gsgan.utils.errors import DataError
 from gsgan.utils.pickles import read_arrays
 
-# The diagonal of film in millimetres, to which equivalent focal lengths refer.
-FILM = np.hypot(36.0, 24.0)
-# Millimetres: phones' main cameras have 24 to 28 and record a part of their image.
-USUAL_FOCAL = 30.0
 # Apple's phones state the focal length here, in millimetres; not the recorded part of the image.
 FOCAL_KEY = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
+# Transfer functions of HDR video, by their numbers in ITU-T H.273.
+HDR_TRANSFERS = {16: "PQ", 18: "HLG"}
 # Errors of focal lengths over the solution's own estimate, on synthetic scenes.
 OVERCONFIDENT = 3.0
 DOUBTFUL = 3.0  # a frame with this many times the usual error is left out
@@ -140,8 +138,8 @@ def solve_video(
 
     # The solution starts from a focal length that is given, stated or usual.
     with console.status("solving for the camera, the body and its poses"):
-        stated = stated_focal(video)
-        first = options.focal or stated or USUAL_FOCAL
+        metadata = read_metadata(video)
+        first = options.focal or metadata.focal or USUAL_FOCAL
         guess = float(np.hypot(*source.size) * first / FILM)
         view = _solve(options, detected[used], time[used], source.size, guess)
 
@@ -178,7 +176,8 @@ def solve_video(
     # The numbers and notes of the report.
     measured = _measured(view, camera, p, time[kept], seen, left)
     measured["background_moved"] = moved
-    measured["focal_stated"] = stated
+    measured["focal_stated"] = metadata.focal
+    measured["hdr"] = metadata.hdr
     notes = _notes(measured, options, natural_height(view.shape))
     fps = 1 / float(np.median(np.diff(time)))
     inputs = Inputs(
@@ -252,20 +251,24 @@ def _read(
     return detected, there
 
 
-def stated_focal(video: Path) -> float | None:
-    """The focal length in a video's metadata, in millimetres.
+class Metadata(NamedTuple):
+    """What a video's metadata state."""
 
-    None if the metadata have none, or without the extra ``render``.
-    """
+    focal: float | None = None  # millimetres on film of 36 x 24 mm
+    hdr: str | None = None  # the transfer function of HDR colours
+
+
+def read_metadata(video: Path) -> Metadata:
+    """The metadata of a video; nothing is known without the extra ``render``."""
     try:
         import av
     except ImportError:
-        return None
+        return Metadata()
     with av.open(str(video)) as file:
         stated = re.match(r"[\d.]+", file.metadata.get(FOCAL_KEY, ""))
-    if stated is None:
-        return None
-    return float(stated[0]) or None
+        transfer = file.streams.video[0].codec_context.color_trc
+    focal = None if stated is None else float(stated[0]) or None
+    return Metadata(focal, HDR_TRANSFERS.get(transfer))
 
 
 def _solve(
@@ -466,12 +469,22 @@ def _notes(
             f"left out of {found['sampled']} sampled images: {reasons}"
         )
 
-    # The doubts, each with its limit.
+    return notes + _doubts(found)
+
+
+def _doubts(found: Mapping[str, Any]) -> list[str]:
+    """Sentences on what is in doubt, each with its limit."""
+    notes = list[str]()
+    if found["hdr"]:
+        notes.append(
+            f"doubtful: the video's colours are HDR ({found['hdr']}) and are not converted, so the "
+            "avatar's will be wrong; film without HDR, or convert the video"
+        )
+
+    # The film: how long, from how many sides, by a camera that stands still.
     seconds = found["seconds"]
     turned = found["degrees_seen"]
     moved = found["background_moved"]
-    others = found["several_faces"]
-    feet = found["feet_seen"]
     if seconds < MIN_SECONDS:
         notes.append(
             f"doubtful: {seconds:.1f} seconds are short, 20 to 40 are better"
@@ -484,9 +497,14 @@ def _notes(
         notes.append(
             f"doubtful: the background moved by {moved:.0%} of the image; it counts as still"
         )
+
+    # The people in it.
+    others = found["several_faces"]
+    feet = found["feet_seen"]
     if others > MAX_OTHER_FACES:
         notes.append(
-            f"doubtful: {others:.0%} of the images show more than one face"
+            f"doubtful: {others:.0%} of the images show more than one face; "
+            "person=[left,top,right,bottom] chooses one"
         )
     if feet < MIN_FEET_SEEN:
         notes.append(

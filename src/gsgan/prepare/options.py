@@ -12,7 +12,7 @@ from gsgan.data.calibration import (
 )
 from gsgan.data.cameras import CameraEntry
 from gsgan.motion.points import UNITS
-from gsgan.prepare.camera_array import MIN_VIEWS
+from gsgan.prepare.camera_array import MIN_VIEWS, USUAL_FOCAL, film_camera
 from gsgan.prepare.solve import SolveSettings
 from gsgan.prepare.sources import (
     Recording,
@@ -26,6 +26,8 @@ from gsgan.utils.checks import above, between, one_of, whole
 from gsgan.utils.errors import ConfigError, DataError
 
 MEDIAPIPE = "mediapipe"
+# The calibration that is found from the landmarks of the person, where there is no file.
+PERSON = "person"
 # Options that do not change the dataset.
 FREE_OPTIONS = ("out", "setup", "workers", "overwrite", "keep_work")
 
@@ -56,6 +58,7 @@ class Options:
     crop_px: int = 16
     height: float | None = None
     focal: float | None = None
+    person: tuple[float, float, float, float] | None = None
     landmark_noise: float = 0.008
     offsets: Mapping[str, int] | None = None
     frames: Any = None
@@ -106,6 +109,25 @@ class Options:
                 f"mask_levels must rise within 0..1, got {self.mask_levels}"
             )
         self._check_mappings()
+        if self.person is not None:
+            self._check_person(self.person)
+
+    def _check_person(self, box: Sequence[float]) -> None:
+        within = len(box) == 4 and all(0 <= share <= 1 for share in box)
+        if not (within and box[0] < box[2] and box[1] < box[3]):
+            raise ConfigError(
+                "person must be [left, top, right, bottom], shares of the image's width and "
+                f"height from 0 to 1, got {list(box)}"
+            )
+        if not self.one_camera:
+            raise ConfigError(
+                "person chooses one of several people in one video of one camera; with several "
+                "cameras, give landmarks and masks of the person"
+            )
+        if not self.needs_tool:
+            raise ConfigError(
+                "person chooses whom MediaPipe finds, but landmarks and masks are given"
+            )
 
     def _check_mappings(self) -> None:
         for name in ("cameras", "offsets"):
@@ -151,9 +173,8 @@ class Inputs:
     calibration: Calibration
     # in the order of the sources, with their names and sizes
     cameras: Sequence[CameraEntry]
-    notes: Sequence[
-        str
-    ]  # one sentence for each thing that was converted or left out
+    # one sentence for each thing that was converted or left out
+    notes: Sequence[str]
     fps: float
 
 
@@ -172,19 +193,12 @@ def read_inputs(options: Options) -> Inputs:
             f"offsets name {unknown[0]}, but the videos are {', '.join(sources)}"
         )
 
-    # The calibration, in a file that is given or found.
-    path = (
-        folder if options.calibration is None else options.folder("calibration")
-    )
-    if path.is_dir():
-        path = find_calibration(path)
-    # None stands for the format's own unit.
-    scale = None if options.unit is None else UNITS[options.unit]
-    calibration = read_calibration(path, scale, options.pixel_centre)
+    # The calibration.
     if len(sources) < MIN_VIEWS:
         raise DataError(
             f"{folder} holds only the camera {next(iter(sources), 'none')}; 3D needs two"
         )
+    calibration = _calibration(options, folder, sources)
 
     # The cameras in the order of the sources, with a note on each difference.
     pairs = pair_cameras(
@@ -197,7 +211,7 @@ def read_inputs(options: Options) -> Inputs:
     for name, source in sources.items():
         camera = calibration.cameras[pairs[name]]
         fitted, note = fit_size(
-            camera, name, source.size, options.crop_px, path
+            camera, name, source.size, options.crop_px, calibration.path
         )
         cameras.append(fitted)
         if note is not None:
@@ -217,3 +231,25 @@ def read_inputs(options: Options) -> Inputs:
         )
     fps = float(options.fps or rates[len(rates) // 2])
     return Inputs(sources, calibration, cameras, notes, fps)
+
+
+def _calibration(
+    options: Options, folder: Path, sources: Mapping[str, Recording]
+) -> Calibration:
+    """The calibration of a file that is given or found, or cameras that are yet to be found."""
+    if options.calibration == PERSON:
+        focal = options.focal or USUAL_FOCAL
+        cameras = {
+            name: film_camera(name, source.size, focal)
+            for name, source in sources.items()
+        }
+        return Calibration(folder, "found from the person", cameras, (), False)
+
+    # None stands for the format's own unit.
+    path = (
+        folder if options.calibration is None else options.folder("calibration")
+    )
+    if path.is_dir():
+        path = find_calibration(path)
+    scale = None if options.unit is None else UNITS[options.unit]
+    return read_calibration(path, scale, options.pixel_centre)

@@ -17,6 +17,7 @@ from gsgan.data.validation import Thresholds, check_distance
 from gsgan.motion.rotations import between
 from gsgan.prepare import landmarks
 from gsgan.prepare.camera_array import (
+    FILM,
     CameraArray,
     camera_moves,
     undistort_points,
@@ -28,12 +29,19 @@ from gsgan.prepare.dataset import (
     standing_direction,
     write_files,
 )
+from gsgan.prepare.from_person import calibrate_from_person
 from gsgan.prepare.images import write_images
 from gsgan.prepare.landmarks import Detections
 from gsgan.prepare.mediapipe import find_people, tool_key
 from gsgan.prepare.one_camera import solve_video
 from gsgan.prepare.one_view import USUAL_HEIGHT
-from gsgan.prepare.options import MEDIAPIPE, Inputs, Options, read_inputs
+from gsgan.prepare.options import (
+    MEDIAPIPE,
+    PERSON,
+    Inputs,
+    Options,
+    read_inputs,
+)
 from gsgan.prepare.solve import Solution, median, solve
 from gsgan.prepare.sources import stamp
 from gsgan.prepare.stages import Advance, StageFolder, digest, each_camera
@@ -44,6 +52,7 @@ from gsgan.utils.arrays import Float, Ints
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import read_json, write_json
 
+MIN_ANGLE = 30.0  # degrees between the rays of cameras found from the person
 DELAY = 0.5  # frames: larger delays of a clock are noted
 DELAY_GAIN = 0.05  # share of the error that correcting a delay must remove
 
@@ -58,6 +67,7 @@ def summarise(outcome: Outcome) -> dict[str, Any]:
     )
     cameras = {}
     for c, name in enumerate(inputs.sources):
+        # The errors after each stage tell which one went wrong.
         error = solution.error[c]
         by_stage = {
             stage: median(px[c]) for stage, px in solution.stages.items()
@@ -80,6 +90,7 @@ def summarise(outcome: Outcome) -> dict[str, Any]:
     frames = outcome.frames.tolist()
     dropped = [frame for frame in frames if frame not in kept]
 
+    # The share of frames in which each joint came out in 3D.
     found = known(solution.p[:, :BODY]).mean(0)
     return {
         "error_px": {
@@ -174,9 +185,8 @@ def _number(value: float, form: str) -> str:
     return "-" if np.isnan(value) else format(value, form)
 
 
-STAGE_VERSION = (
-    5  # incremented when the same settings begin to give another result
-)
+# incremented when the same settings begin to give another result
+STAGE_VERSION = 5
 
 
 def prepare(options: Options, console: Console) -> Path:
@@ -209,6 +219,7 @@ def prepare(options: Options, console: Console) -> Path:
     stages = StageFolder(out.parent / f".{out.name}.prepare")
     extra: dict[str, object] = {}
     if inputs is None:
+        # One camera: the body is solved in its view, and joints come from it.
         filmed = solve_video(options, stages, console)
         inputs = filmed.inputs
         masks = filmed.masks
@@ -217,11 +228,14 @@ def prepare(options: Options, console: Console) -> Path:
         extra = {"one_camera": filmed.numbers}
         options = replace(options, face=False)
     else:
+        # Several cameras: detections, then triangulation.
         found, masks = find_people(
             options, inputs.sources, stages, console.print
         )
         inputs, detections = with_detections(inputs, found)
         frames, uv, conf = _undistorted(options, inputs, detections)
+        if options.calibration == PERSON:
+            inputs = _from_person(options, inputs, uv, conf, console)
         if not inputs.calibration.metric:
             inputs = _in_metres(options, inputs, uv, conf)
         solution = _solved(options, inputs, frames, uv, conf, console)
@@ -229,6 +243,8 @@ def prepare(options: Options, console: Console) -> Path:
     # The dataset, in a folder of its own until it is complete; a run that was killed leaves one.
     root = stages.path("dataset", key)
     shutil.rmtree(root, ignore_errors=True)
+
+    # The dataset appears at once, when it is complete.
     written = _write_images(options, inputs, masks, frames, solution, root)
     outcome = Outcome(options, inputs, frames, solution, written)
     write_files(root, outcome, key)
@@ -330,6 +346,8 @@ def _undistorted(
     frames = frames[chosen]
     px = px[:, chosen, joints]
     conf = conf[:, chosen, joints]
+
+    # Parts that the user leaves out count as not seen.
     conf[:, :, HANDS] *= options.hands
     conf[:, :, FACE] *= options.face
     sizes = np.array([camera.size[::-1] for camera in inputs.cameras])
@@ -340,6 +358,34 @@ def _undistorted(
     for c, camera in enumerate(inputs.cameras):
         uv[c] = undistort_points(camera, px[c])
     return frames, uv, conf
+
+
+def _from_person(
+    options: Options,
+    inputs: Inputs,
+    uv: Float,
+    conf: Float,
+    console: Console,
+) -> Inputs:
+    """The inputs with cameras that are found from the person, and notes on how well they agree."""
+    with console.status("finding the cameras from the person"):
+        found = calibrate_from_person(inputs.cameras, uv, conf, options.focal)
+    notes = [*inputs.notes]
+    for camera, error in zip(found.cameras, found.error, strict=True):
+        focal = float(camera.K[0, 0])
+        film = focal / float(np.hypot(*camera.size)) * FILM
+        notes.append(
+            f"{camera.name}: found from the person, {error:.1f} pixels off its landmarks, focal "
+            f"length {focal:.0f} pixels ({film:.0f} mm on film)"
+        )
+
+    # Cameras that look the same way show no depth.
+    if found.angle < MIN_ANGLE:
+        notes.append(
+            f"doubtful: the cameras look at the person from within {found.angle:.0f} degrees; "
+            "positions and focal lengths are uncertain, calibrate with a board"
+        )
+    return replace(inputs, cameras=found.cameras, notes=notes)
 
 
 def _in_metres(
@@ -366,6 +412,8 @@ def _in_metres(
         uv.reshape(C, -1, 2)
     )
     p = robust(rig, pixels, conf[:, :, :BODY].reshape(C, -1)).p.reshape(F, J, 3)
+
+    # The median over frames: single joints may be wrong.
     seen = torch.from_numpy(known(p))
     limbs = limb_length_sum(
         torch.from_numpy(np.nan_to_num(p)), seen
@@ -391,6 +439,8 @@ def _in_metres(
     if options.up_axis is None and upward is not None:
         turn = between(upward, np.array([0.0, 0, 1]))
         note += "; the world was turned so that the person stands along z"
+
+    # Every camera follows the turn, and its distances follow the scale.
     cameras = []
     for camera in inputs.cameras:
         cameras.append(replace(camera, R=camera.R @ turn.T, t=scale * camera.t))
@@ -448,6 +498,7 @@ def _write_images(
     cameras = {camera.name: camera for camera in inputs.cameras}
     offsets = options.offsets or {}
 
+    # One camera's images; `each_camera` runs cameras side by side.
     def one(name: str, advance: Advance) -> list[int]:
         return write_images(
             root=root,

@@ -70,9 +70,13 @@ def match_hands(
     known = np.isfinite(distance).all(-1, keepdims=True)
     loss = HAND * root_weight * np.log1p((distance / WRIST_SCALE) ** 2)
     loss = np.where(known, loss, 0.0)
+
+    # What keeping or swapping the hands costs, by their distances to the
+    # wrists.
     kept = loss[..., 0, 0] + loss[..., 1, 1]
     swapped = loss[..., 0, 1] + loss[..., 1, 0]
 
+    # The errors of the triangulated hands are added.
     def cost_of(flips: Bool, at: Ints) -> Float:
         sided = apply_flips(uv[:, at], flips[..., None], [OWN_PAIRS])
         seen = apply_flips(weight[:, at], flips[..., None], [OWN_PAIRS])
@@ -126,9 +130,8 @@ class Solution:
     left_out: Bool  # [C, F, 2] detected hands that are not the person's, or are repeats
     delay: Float  # [C] of each camera's clock, see `clock_errors`
     gain: Float  # [C] of correcting that clock
-    stages: dict[
-        str, Float
-    ]  # name of each stage and its body errors [C, F, 33]
+    # name of each stage and its body errors [C, F, 33]
+    stages: dict[str, Float]
     removed: dict[str, int]  # number of joints removed, by reason
 
     @property
@@ -184,6 +187,8 @@ def solve(
         "plain": cameras.errors(linear, flat_uv),
         "robust": robust(cameras, flat_uv, flat_weight).error,
     }
+
+    # Swapped sides first: they would bend the cameras.
     found = correct(cameras, scaled, weight)
     stages["flips"] = found.points.error
     cameras, found = _refined(cameras, scaled, weight, found, settings)
@@ -237,6 +242,9 @@ def _refined(
     cameras = start
     F = weight.shape[1]
     at = np.array(evenly_spaced(F, REFINED, ends=True))
+
+    # The prior pulls towards the given cameras, not towards those of the last
+    # round.
     for _ in range(settings.refinements):
         p = found.points.p.reshape(F, -1, 3)[at]
         cameras = refine_cameras(
@@ -326,6 +334,8 @@ def clock_errors(
     C, F, _ = weight.shape
     delay = np.full(C, np.nan)
     gain = np.full(C, np.nan)
+
+    # Two cameras cannot tell whose clock is late.
     lag = min(LAG, F - 1)
     cameras, uv = cameras.normalised(uv)
     if C <= MIN_VIEWS or lag < 1:

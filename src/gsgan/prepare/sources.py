@@ -28,9 +28,8 @@ VIDEO_SUFFIXES = (
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 INSIDE = ("videos", "images")  # where EasyMocap and Pose2Sim projects keep them
 
-DIFFERENT = (
-    0.01  # share by which frame rates or lengths must differ to be noted
-)
+# share by which frame rates or lengths must differ to be noted
+DIFFERENT = 0.01
 
 
 @dataclass(frozen=True)
@@ -104,6 +103,8 @@ def _sources_in(folder: Path, rotate: bool) -> dict[str, Recording]:
         if path.is_dir():
             files = frame_files(folder, path.name, IMAGE_SUFFIXES)
         if files:
+            # All images of a folder have one size, which is checked when they
+            # are read.
             paths = {number: folder / files[number] for number in sorted(files)}
             size = read_header(next(iter(paths.values())))[0]
             source = Recording(
@@ -118,6 +119,8 @@ def _sources_in(folder: Path, rotate: bool) -> dict[str, Recording]:
             source = video_recording(path, rotate)
         else:
             continue
+
+        # A folder and a video, or two videos, may have the same name.
         if source.name in sources:
             raise DataError(
                 f"{folder} holds the camera {source.name} twice; remove {path.name}"
@@ -132,6 +135,7 @@ def video_recording(path: Path, rotate: bool) -> Recording:
     Raises:
         DataError: when it cannot.
     """
+    # What the header tells; the length may be wrong.
     video = opened(path, rotate)
     fps = float(video.get(cv2.CAP_PROP_FPS))
     turned = int(video.get(cv2.CAP_PROP_ORIENTATION_META))
@@ -211,6 +215,7 @@ def pair_cameras(
         if source in named:
             matching = [named[source]]
         if len(matching) != 1 or matching[0] in pairs.values():
+            # None matches, several do, or another video has it.
             problem = "no one camera of the calibration matches"
             if len(matching) == 1:
                 problem = f"the camera {matching[0]} matches more than one video, among them"

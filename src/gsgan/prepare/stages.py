@@ -15,9 +15,8 @@ from gsgan.utils.console import progress
 from gsgan.utils.files import writing
 
 Result = TypeVar("Result")
-Advance = Callable[
-    [int, int], None
-]  # takes the number of steps done and in total
+# takes the number of steps done and in total
+Advance = Callable[[int, int], None]
 KEY_LENGTH = 12
 
 
@@ -36,6 +35,7 @@ def each_camera(
     console = Console(stderr=True)
     bars = progress(console, disable=not console.is_terminal)
 
+    # A task reports its progress by `advance`, where it can also be stopped.
     def run(name: str) -> Result:
         row = bars.add_task(f"{what}: {name}", total=None)
 

@@ -12,12 +12,10 @@ from gsgan.skeleton.joints import known
 from gsgan.utils.arrays import Bool, Float, Ints, nanmedian
 
 # Errors are in thousandths of the focal length: pixels, at a focal length of 1000 pixels.
-HALF_WEIGHT_ERROR = (
-    3.5  # error at which a detection counts half (Cauchy's weight)
-)
-MAX_MEDIAN_ERROR = (
-    35.0  # median error beyond which detections contradict each other
-)
+# error at which a detection counts half (Cauchy's weight)
+HALF_WEIGHT_ERROR = 3.5
+# median error beyond which detections contradict each other
+MAX_MEDIAN_ERROR = 35.0
 # maximum ratio of a point's uncertainty along the rays to that across: above, they are too parallel
 MAX_ELONGATION = 20.0
 # mean loss per detection that a swap must save; an error of HALF_WEIGHT_ERROR costs 0.7
@@ -26,15 +24,13 @@ FAR_ERROR = 1e6  # pixels: stands for an infinite error
 MIN_DETERMINANT = 1e-15  # determinant over trace³: below it the equations are singular in float64
 ITERATIONS = 10  # of reweighting
 QUICK_ITERATIONS = 3  # of reweighting, in the search for swapped sides
-POINTS_AT_ONCE = (
-    100_000  # points processed at once: bounds the memory, changes nothing else
-)
+# points processed at once: bounds the memory, changes nothing else
+POINTS_AT_ONCE = 100_000
 MAX_PAIRS = 60  # pairs of cameras tried as a start; of more, a spread-out part
 # minimum number of a group: hips at the border of an image do not tell left from right
 MIN_GROUP = 3
-PROGRESSION = (
-    7919  # a prime: spreads the chosen camera pairs when there are too many
-)
+# a prime: spreads the chosen camera pairs when there are too many
+PROGRESSION = 7919
 
 Pairs = tuple[tuple[int, int], ...]
 
@@ -45,9 +41,8 @@ class Triangulated:
 
     p: Float  # [N, 3] metres, NaN = missing
     weight: Float  # [C, N] final weight of each detection, 0 = not used
-    error: (
-        Float  # [C, N] reprojection error in undistorted pixels, NaN = not seen
-    )
+    # [C, N] reprojection error in undistorted pixels, NaN = not seen
+    error: Float
 
 
 def plain(cameras: CameraArray, uv: Float, weight: Float) -> Float:
@@ -84,6 +79,7 @@ def robust(
         iterations: of reweighting.
         max_error: maximum median error of a point.
     """
+    # Points do not depend on each other.
     p = []
     weights = []
     errors = []
@@ -107,6 +103,7 @@ def _robust(
     iterations: int,
     max_error: float,
 ) -> Triangulated:
+    # A start that a few wrong detections do not spoil.
     weight = np.where(known(uv), weight, 0.0)
     a, b = _rows(cameras, uv, weight)
     p = _best_pair(cameras, uv, weight, a, b)
@@ -159,6 +156,8 @@ def _rows(
     """
     # Detections that are not used may be NaN.
     uv = np.where((weight > 0)[..., None], uv, 0.0)
+
+    # The first two rows of K [R t], less the third times the pixel.
     KR = (cameras.K @ cameras.R)[:, None]
     Kt = np.einsum("cij,cj->ci", cameras.K, cameras.t)[:, None]
     a = uv[..., None] * KR[:, :, 2:] - KR[:, :, :2]
@@ -174,6 +173,8 @@ def _solve(a: Float, b: Float, weight: Float) -> tuple[Float, Float]:
     right = np.einsum("cnki,cnk->ni", a, b * w)
     size = np.einsum("nii->n", information)
     regular = np.linalg.det(information) > MIN_DETERMINANT * size**3
+
+    # Singular systems are replaced by the identity, and their result by NaN.
     enough = ((weight > 0).sum(0) >= MIN_VIEWS) & regular
     safe = np.where(enough[:, None, None], information, np.eye(3))
     p = np.linalg.solve(safe, right[..., None])[..., 0]
@@ -188,8 +189,12 @@ def _best_pair(
     b: Float,
 ) -> Float:
     """The points ``[N, 3]`` with the smallest robust cost: of a camera pair, or linear from all."""
+    # The linear solution of all cameras is the first candidate.
     best, _ = _solve(a, b, weight)
     cost = robust_cost(cameras.errors(best, uv), weight)
+
+    # A detection that is wrong in one camera spoils the pairs with that camera
+    # only.
     pairs = [list(pair) for pair in combinations(range(len(cameras)), 2)]
     if len(pairs) > MAX_PAIRS:
         pairs = [pairs[k * PROGRESSION % len(pairs)] for k in range(MAX_PAIRS)]
@@ -248,11 +253,14 @@ def points_and_cost(
     weight: Float,
 ) -> tuple[Float, Float]:
     """Points ``[F, J, 3]`` of ``uv [C, F, J, 2]``, ``weight [C, F, J]``, and their cost ``[F]``."""
+    # Frames and joints are points like any others.
     C, F, J = weight.shape
     flat = weight.reshape(C, -1)
     found = robust(
         cameras, uv.reshape(C, -1, 2), flat, QUICK_ITERATIONS, np.inf
     )
+
+    # Points that were not found cost nothing here: they would favour no side.
     seen = np.where(np.isfinite(found.error), flat, 0.0)
     cost = robust_cost(found.error, seen)
     return found.p.reshape(F, J, 3), cost.reshape(F, J).sum(-1)
@@ -269,8 +277,12 @@ def _group_flips(
     weight = weight[:, :, joints]
     C, F, _ = weight.shape
 
+    # Points and cost of any choice of flips; a few rounds of reweighting are
+    # enough.
     def points(flips: Bool, frames: Ints) -> tuple[Float, Float]:
         flips = flips[..., None]
+
+        # Weights belong to their detections.
         sided = apply_flips(uv[:, frames], flips, adjacent)
         seen = apply_flips(weight[:, frames], flips, adjacent)
         return points_and_cost(cameras, sided, seen)
@@ -321,6 +333,8 @@ def cheapest_flips(
         # The camera whose change saves most is changed.
         best = saved.argmax(0)
         better = saved.max(0) > 0
+
+        # Frames in which nothing is saved are done.
         active = active[better]
         best = best[better]
         if not len(active):

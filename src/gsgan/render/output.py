@@ -74,6 +74,7 @@ class Output:
         if self.out.exists() and (
             not self.out.is_dir() or any(self.out.glob("[!.]*"))
         ):
+            # Only folders that gsgan wrote are emptied.
             if not (self.out / RECORD).is_file():
                 raise ConfigError(
                     f"out={self.out} is not empty and holds no render; give another folder"

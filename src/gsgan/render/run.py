@@ -172,6 +172,8 @@ def _cameras(
             f"camera={name} is neither a camera of the run's data nor a file; choose orbit or one "
             f"of {', '.join(entries)}"
         )
+
+    # The camera of the run's data, as it was seen in training.
     crop = run.data.crop
     lens = run.stored.data.get("lens") == "project"
     return of_entry(entries[name], drive.p, size, crop, lens), None
@@ -243,6 +245,7 @@ def _images(
         # A pose with too few known joints cannot be completed.
         try:
             with torch.no_grad():
+                # Frame by frame: a long motion does not fit into the memory.
                 p, visibility, body = inputs_of(run.avatar, drive, i)
                 found = run.avatar(
                     p, visibility, camera, body, colours, maps=False

@@ -44,9 +44,8 @@ class ScoredRun:
     # ``name`` of the data group's choice, ``root`` (the folder's name) and ``fingerprint``.
     data: dict[str, Any]
     seed: int | None  # None for predictions
-    scores: dict[
-        str, dict[str, dict[str, Any]]
-    ]  # {split: {variant: {metric: value}}}
+    # {split: {variant: {metric: value}}}
+    scores: dict[str, dict[str, dict[str, Any]]]
     # The training config by dotted key, without seed and paths; None for predictions.
     settings: dict[str, Any] | None = None
     # The changes of ``experiment=paper`` on the command line, where its models are those of the
@@ -133,6 +132,7 @@ def check_same(
             other, expected = first.setdefault(what, (run, value))
             text = f"{expected} and {value}"
             if isinstance(value, dict):
+                # Of records, the keys that differ are named.
                 keys = sorted(value.keys() | expected.keys())
                 text = ", ".join(
                     k for k in keys if value.get(k) != expected.get(k)
@@ -220,6 +220,8 @@ def read_run(folder: Path, *, scored: bool = True) -> ScoredRun:
         scores = (
             json.loads((folder / METRICS_FILE).read_text()) if scored else {}
         )
+
+        # Figures may show runs that are not scored.
         found = folder / FACTS_FILE
         facts = json.loads(found.read_text()) if found.is_file() else {}
         settings = _read_settings(folder)

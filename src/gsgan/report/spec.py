@@ -48,9 +48,8 @@ class TableSpec:
     metrics: Sequence[str]
     splits: Sequence[str]  # one grid each
     rows: Sequence[RowSpec] | None = None  # None: a row per name
-    by: Sequence[str] | None = (
-        None  # settings whose values have rows of their own
-    )
+    # settings whose values have rows of their own
+    by: Sequence[str] | None = None
     variants: Sequence[str] = (FULL,)
     subjects: Sequence[str] | None = None  # columns, with a grid per metric
     data: str | None = None  # the only data set of the runs

@@ -143,10 +143,13 @@ class Part:
             if column == MEAN:
                 continue
             for run in self.of(None, column):
+                # Values that lack carry the reason as a note.
                 for variant in (FULL, SPLAT, FLOOR_VARIANT):
                     value, note = _value(run, self.split, variant, metric)
                     seed = str(run.seed)
                     rows.append((run.name, variant, column, seed, value, note))
+
+        # One line per score: pandas then takes means over any of the columns.
         names = ["name", "variant", "column", "seed", "value", "note"]
         frame = pd.DataFrame(rows, columns=names)
 
@@ -300,6 +303,8 @@ def make_tables(config: DictConfig) -> None:
     # Files are written into a folder named after the time, unless ``out`` names one.
     now = f"{datetime.now():%Y-%m-%d_%H-%M-%S}"
     folder = Path(str(config.out or f"runs/report/{now}")).expanduser()
+
+    # All formats are made before the first file is written.
     files = files_of(report)
     try:
         for name, content in files.items():
@@ -412,6 +417,7 @@ def _grid(part: Part, paper: PaperTable | None) -> Grid:
     for spec in part.rows:
         rows.append(_row(part, spec, beside_paper=paper is not None))
         if spec.variant == FULL:
+            # The paper's row stands below the same model's.
             rows += printed.pop(spec.run, [])
     for left in printed.values():
         rows += left
@@ -448,6 +454,8 @@ def _row(part: Part, spec: RowSpec, *, beside_paper: bool) -> Row:
     # Next to the paper's numbers, a row is named as the paper's method if all its runs are.
     notes = list(dict.fromkeys(_marks(runs, part.split)))
     if beside_paper:
+        # Beside the paper's numbers, what differs from the paper's settings is
+        # said.
         departures = [run.departures for run in runs]
         if None in departures:
             notes.append("no config says whether it is experiment=paper")
@@ -463,6 +471,7 @@ def _row(part: Part, spec: RowSpec, *, beside_paper: bool) -> Row:
     for column in part.columns:
         cells.append(part.cell(spec.run, spec.variant, column))
         if column != MEAN:
+            # Columns may have different numbers of seeds.
             counts.append(len(part.of(spec.run, column)))
     seeds = " to ".join(map(str, sorted({min(counts), max(counts)})))
     return Row(label, cells, (seeds, *_origin(runs)), notes=tuple(notes))
@@ -496,6 +505,8 @@ def _with_best(rows: Sequence[Row], part: Part) -> list[Row]:
             mean = cells[i].mean
             if mean is not None:
                 means.append(mean)
+
+        # A single number is not the best of anything.
         better = METRICS[metric].better
         if len(means) < 2 or not better:
             continue

@@ -53,9 +53,8 @@ class Report:
 
     title: str
     grids: Sequence[Grid]
-    left_out: Mapping[str, str] = field(
-        default_factory=dict
-    )  # reasons by folder
+    # reasons by folder
+    left_out: Mapping[str, str] = field(default_factory=dict)
 
     def notes(self) -> dict[str, str]:
         """A number for every note, in the order of appearance."""
@@ -90,9 +89,8 @@ class Format:
     """The parts of one text format; ``italic``, ``bold`` and ``raised`` are patterns."""
 
     escape: Callable[[str], str]
-    table: Callable[
-        [str, list[str], list[list[str]]], str
-    ]  # of title, header and rows
+    # of title, header and rows
+    table: Callable[[str, list[str], list[list[str]]], str]
     italic: str
     bold: str
     raised: str  # for the numbers of notes
@@ -113,6 +111,7 @@ class Format:
         with_origin = self.origin and any(row.origin for row in grid.rows)
         rows = []
         for row in grid.rows:
+            # Rows that are no runs are in italics, best cells are bold.
             pattern = "{}" if row.kind == "run" else self.italic
             line = [cell(row.label, row.notes, pattern)]
             for c in row.cells:

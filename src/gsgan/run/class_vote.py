@@ -160,9 +160,8 @@ def _count(
     vertex = inside.nonzero().squeeze(-1)
     label = frame.labels[0, row[vertex], column[vertex]]
     valid = (label > 0) & (label != IGNORE) & (label < votes.shape[1])
-    votes[vertex[valid], label[valid]] += (
-        1  # each vertex once: no index occurs twice
-    )
+    # each vertex once: no index occurs twice
+    votes[vertex[valid], label[valid]] += 1
 
 
 def seen(
@@ -184,6 +183,8 @@ def seen(
     pixel = pixels[0]
     depth = depths[0]
     radius = reach * camera.focal[0].mean() / depth
+
+    # Points behind the camera have no place in the image.
     ahead = (depth > tolerance) & pixel.isfinite().all(-1)
     visible = torch.zeros_like(ahead)
     if not ahead.any():

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gsgan.data.splits import SPLITS
 from gsgan.model.avatar import Avatar
-from gsgan.model.harmonic import Harmonic, distilled
+from gsgan.model.harmonic import distilled
 from gsgan.motion.clip import (
     FPS,
     Clip,
@@ -48,7 +48,6 @@ from gsgan.skeleton.proportions import (
 from gsgan.skeleton.sides import refuse_swapped
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import above, one_of
-from gsgan.utils.config import defaults_of
 from gsgan.utils.errors import ConfigError, DataError
 
 Float = NDArray[np.float64]
@@ -81,6 +80,8 @@ class Drive:
         """The frames at some indices, numbered from 0 if an index repeats."""
         # Files are named by number, so numbers must not repeat.
         numbers = [self.numbers[i] for i in chosen]
+
+        # Frames that occur twice cannot keep their numbers as file names.
         if len(set(numbers)) < len(numbers):
             numbers = list(range(len(numbers)))
 
@@ -99,24 +100,53 @@ class Drive:
         )
 
 
+@dataclass(frozen=True)
+class MotionOptions:
+    """The options of a motion; conf/render.yaml explains them.
+
+    Raises:
+        ConfigError: when one has an invalid value.
+    """
+
+    motion: str | list[str] | None = None
+    transition: float = 0.3
+    drive: str | None = None
+    camera: str | int | None = None
+    retarget: str | bool = "auto"
+    ground: bool = True
+    stay: bool = True
+    min_visibility: float = 0.1
+    motion_fps: float | None = None
+    up: str | None = None
+    smpl: str | None = None
+    skeleton: str | None = None
+    animation: str | int | None = None
+
+    def __post_init__(self) -> None:
+        above("transition", self.transition)
+        one_of("drive", self.drive, (None, "skeleton"))
+        one_of("retarget", self.retarget, ("auto", True, False))
+        one_of("up", self.up, (None, *UP_AXES))
+
+
 def drive_of(config: DictConfig, run: Run, fps: float) -> Drive:
     """The whole motion of a config at ``fps`` frames per second.
 
-    Options of `gsgan.render` that the config lacks take their defaults.
+    Options of `MotionOptions` that the config lacks take their defaults.
 
     Raises:
         ConfigError: when an option has an invalid value.
         DataError: when the motion cannot be read.
     """
-    # Other commands have some of the options of `gsgan.render`, and some of their own.
-    defaults = defaults_of("render")
-    given = {key: value for key, value in config.items() if key in defaults}
-    config = cast(DictConfig, OmegaConf.merge(defaults, given))
+    # Commands have options of their own beside these.
+    plain: Any = OmegaConf.to_container(config, resolve=True)
+    names = [field.name for field in fields(MotionOptions)]
+    given = {name: plain[name] for name in names if name in plain}
+    options = MotionOptions(**given)
 
     # With drive=skeleton the body follows from the joints, as for a motion without one.
-    one_of("drive", config.drive, (None, "skeleton"))
-    found = _chosen(config, run, fps)
-    return found if config.drive is None else replace(found, body=None)
+    found = _chosen(options, run, fps)
+    return found if options.drive is None else replace(found, body=None)
 
 
 def smoothed(config: DictConfig, drive: Drive, fps: float) -> Drive:
@@ -147,14 +177,14 @@ def with_motion(config: DictConfig, motion: str) -> DictConfig:
     return cast(DictConfig, OmegaConf.merge(config, {"motion": motion}))
 
 
-def _chosen(config: DictConfig, run: Run, fps: float) -> Drive:
-    """The motion of a config: files, a split, the rest pose, or one held-out frame."""
+def _chosen(options: MotionOptions, run: Run, fps: float) -> Drive:
+    """The motion of options: files, a split, the rest pose, or one held-out frame."""
     # Without a motion: one held-out frame, held still. A shared avatar has no frames.
-    if config.motion is None and run.is_shared:
+    if options.motion is None and run.is_shared:
         return rest_pose(run.proportions)
-    if config.motion is None:
+    if options.motion is None:
         split, _ = run.data.watched
-        found = _held_out(config, run, split)
+        found = _held_out(options, run, split)
         frame = found.numbers[0]
         still = found.rows(np.zeros(1, np.int64))
         return replace(
@@ -162,26 +192,25 @@ def _chosen(config: DictConfig, run: Run, fps: float) -> Drive:
         )
 
     # Several files: one after the other, with transitions.
-    if OmegaConf.is_list(config.motion):
-        if config.retarget is False:
+    if isinstance(options.motion, list):
+        if options.retarget is False:
             raise ConfigError(
                 "retarget=false is not supported for a list of motions"
             )
         clips = [
-            _from_file(config, run, str(path), fps) for path in config.motion
+            _from_file(options, run, str(path), fps) for path in options.motion
         ]
-        seconds = float(above("transition", config.transition))
-        return _joined(clips, run.proportions, seconds, fps)
+        return _joined(clips, run.proportions, options.transition, fps)
 
     # A name, or else a file.
-    if config.motion == REST:
+    if options.motion == REST:
         return rest_pose(run.proportions)
-    if config.motion in SPLITS:
-        return _held_out(config, run, config.motion)
-    return _from_file(config, run, config.motion, fps)
+    if options.motion in SPLITS:
+        return _held_out(options, run, options.motion)
+    return _from_file(options, run, options.motion, fps)
 
 
-def _held_out(config: DictConfig, run: Run, split: str) -> Drive:
+def _held_out(options: MotionOptions, run: Run, split: str) -> Drive:
     """Frames of a split, seen by one camera."""
     dataset = run.data.dataset(split)
     if not dataset.items:
@@ -192,7 +221,7 @@ def _held_out(config: DictConfig, run: Run, split: str) -> Drive:
     # The frames of the chosen camera. Another view of the motion (an orbit, a file) takes
     # the frames of the first camera. YAML reads a name like "7" as a number.
     first = dataset.items[0][0]
-    camera = first if config.camera is None else str(config.camera)
+    camera = first if options.camera is None else str(options.camera)
     own = camera in dict(dataset.items)
     shown = camera if own else first
     items = [item for item in dataset.items if item[0] == shown]
@@ -249,6 +278,8 @@ def _joined(
             clip.p, ((0, 0), lacking, (0, 0)), constant_values=np.nan
         )
         parts.append(padded @ standard.T)
+
+    # Frames between two clips are made by `joined`.
     between = max(1, round(seconds * fps) - 1)
     p = joined(parts, proportions, between) @ standard
 
@@ -271,34 +302,39 @@ def _shown(p: Float, proportions: Proportions) -> Float:
     return visibility
 
 
-def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
+def _from_file(
+    options: MotionOptions, run: Run, path: str, fps: float
+) -> Drive:
     # The clip, as the file has it.
     proportions = run.proportions
-    smpl = config.smpl or run.body_file
-    skeleton = config.skeleton
+    smpl = options.smpl or run.body_file
+    skeleton = options.skeleton
     model = None if smpl is None else Path(smpl).expanduser()
     asf = None if skeleton is None else Path(skeleton).expanduser()
-    up = None if config.up is None else one_of("up", config.up, UP_AXES)
-    animation = None if config.animation is None else str(config.animation)
-    source = Source(proportions, model, asf, up, animation)
+    animation = None if options.animation is None else str(options.animation)
+
+    # What the readers need to know of the subject.
+    source = Source(proportions, model, asf, options.up, animation)
     motion = read_motion(Path(path).expanduser(), source)
-    motion = checked(motion, float(config.min_visibility))
+    motion = checked(motion, float(options.min_visibility))
     _refuse_swapped(motion)
 
     # The user's rate comes before the file's, but the file's up axis before the user's.
-    rate = config.motion_fps or motion.fps
+    rate = options.motion_fps or motion.fps
     rate = float(above("motion_fps", rate)) if rate else FPS
-    up = (None if motion.file_up else up) or motion.up or up_axis(motion)
+    up = None if motion.file_up else options.up
+    up = up or motion.up or up_axis(motion)
 
     # Bones that are the subject's own already are left as they are. A list of motions is
     # always retargeted, because transitions need every joint.
-    choice = one_of("retarget", config.retarget, ("auto", True, False))
-    own = is_own(motion, proportions) if choice == "auto" else not choice
-    if choice is False and motion.detached:
+    own = not options.retarget
+    if options.retarget == "auto":
+        own = is_own(motion, proportions)
+    if options.retarget is False and motion.detached:
         raise ConfigError(
             f"retarget=false is not supported for {motion.path}: leave retarget out"
         )
-    own = own and not motion.detached and not OmegaConf.is_list(config.motion)
+    own = own and not motion.detached and not isinstance(options.motion, list)
 
     # Joints are interpolated in time; visibility and body pose are of the nearest frame.
     times = frame_times(len(motion), rate, fps)
@@ -324,8 +360,8 @@ def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
             proportions,
             centre,
             fps,
-            ground=config.ground,
-            stay=config.stay,
+            ground=options.ground,
+            stay=options.stay,
         )
         p = p @ standard
         visibility = _shown(p, proportions)
@@ -333,7 +369,9 @@ def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
     # One line on what was read and what was made of it.
     bones = "bones as they are" if own else "on the subject's bones"
     assumed = (
-        "" if config.motion_fps or motion.fps else " (assumed: give motion_fps)"
+        ""
+        if options.motion_fps or motion.fps
+        else " (assumed: give motion_fps)"
     )
     text = (
         f"{motion.path.name}{motion.part}: {_frames(len(motion))} at {rate:.5g} per "
@@ -425,14 +463,12 @@ def inputs_of(
 
 def distilled_of(config: DictConfig, run: Run) -> Avatar:
     """A run's avatar with Ψ's residuals as linear functions, fitted over training poses: see
-    `gsgan.model.harmonic.distilled`."""
-    # An avatar that was trained with linear residuals needs no fit.
-    if isinstance(run.avatar.deformation, Harmonic):
-        return run.avatar
-
+    `gsgan.model.harmonic.distilled`. The offsets of pose are part of them."""
     # The fit takes poses at even distances, from the first to the last.
     drive = drive_of(with_motion(config, "train"), run, 1.0)
     chosen = evenly_spaced(len(drive.p), DISTILLED, ends=True)
     return distilled(
-        run.avatar, (inputs_of(run.avatar, drive, i) for i in chosen)
+        run.avatar,
+        (inputs_of(run.avatar, drive, i) for i in chosen),
+        keep_offsets=False,
     )

@@ -150,7 +150,7 @@ def refusing_damage(path: Path) -> Iterator[None]:
 
 
 def checked_config(path: Path, plain: Any) -> DictConfig:
-    """What an avatar is built from, of a config that may come from anybody.
+    """The part of a config that an avatar is built from, of one that may come from anybody.
 
     Interpolations are resolved. A config names the classes that it builds: only those in conf/ are
     taken, also where an interpolation makes the name.

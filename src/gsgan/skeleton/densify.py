@@ -54,9 +54,8 @@ class Points:
 
     means: Tensor  # [B, N, 3] metres, world frame
     rotations: Tensor  # [B, P, 3, 3] frames of the parts in the world
-    origins: (
-        Tensor  # [B, P, 3] metres, world frame: origin of each part's frame
-    )
+    # [B, P, 3] metres, world frame: origin of each part's frame
+    origins: Tensor
     scales: Tensor  # [B, N] metres, initial standard deviation, isotropic
     valid: Tensor  # [B, N] bool, False on parts whose joints are unseen
     # [N] int64 into the parts; None: each point is a part of its own
@@ -229,6 +228,8 @@ class Densify(nn.Module):
             finger, self.finger_radius_ratio, along[list(t.fingers)]
         )
 
+        # Names with an underscore follow from the settings: checkpoints do not
+        # hold them.
         def buffer(name: str, value: object) -> None:
             tensor = torch.as_tensor(np.asarray(value))
             if tensor.is_floating_point():
@@ -246,12 +247,16 @@ class Densify(nn.Module):
         buffer("part_id", np.repeat(parts, [*counts, n_face, n_torso]))
         buffer("template_points", np.concatenate(points))
         buffer("normals", np.concatenate(normals))
+
+        # The shapes that every skeleton places anew.
         buffer("_limb_points", limbs.points)
         buffer("_bone_points", bones.points)
         buffer("_limb_sigma", self._sigma_by_limb())
         buffer("_face_points", sphere.points)
         buffer("_torso_points", box.points)
         buffer("_torso_rest", torso_rest)
+
+        # The joints that face and torso are measured by, and all pairs of them.
         buffer("_face", t.face)
         buffer("_face_pairs", np.array(list(combinations(t.face, 2))).T)
         buffer("_torso_pairs", np.array(list(combinations(t.torso, 2))).T)

@@ -113,12 +113,10 @@ def _distance2(
     away = torch.where(shown, 0.0, 1e4 * float(max(h, w)))
 
     # Pixel centres from the segments' first ends, and the segments' own axes.
-    x = (
-        torch.arange(w, device=a.device, dtype=a.dtype) + 0.5 - a[..., :1]
-    )  # [B, S, w]
-    y = (
-        torch.arange(h, device=a.device, dtype=a.dtype) + 0.5 - a[..., 1:]
-    )  # [B, S, h]
+    # [B, S, w]
+    x = torch.arange(w, device=a.device, dtype=a.dtype) + 0.5 - a[..., :1]
+    # [B, S, h]
+    y = torch.arange(h, device=a.device, dtype=a.dtype) + 0.5 - a[..., 1:]
     forward = d / length2
     sideways = d * length2.rsqrt()
 

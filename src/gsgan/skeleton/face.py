@@ -12,9 +12,8 @@ from torch import Tensor
 from gsgan.skeleton.template import MEDIAPIPE33, Edge, SkeletonTemplate, Vector
 from gsgan.skeleton.tensors import constants
 
-LIP_POINTS = (
-    12  # round the outer edge: 0 left corner, 3 top, 6 right corner, 9 bottom
-)
+# round the outer edge: 0 left corner, 3 top, 6 right corner, 9 bottom
+LIP_POINTS = 12
 BROW_POINTS = 5  # from the nose outwards
 LID_POINTS = ("inner", "upper", "outer", "lower")
 SIDES = ("left", "right")

@@ -61,6 +61,7 @@ class BoneFrames:
 
 def root_of(p: Tensor, template: SkeletonTemplate = MEDIAPIPE33) -> Tensor:
     """``[B, 3]`` metres: the middle of the hips of joints ``[B, J, 3]``."""
+    # The middle, since the template has no joint between the hips.
     left, right = template.hips
     return (p[:, left] + p[:, right]) / 2
 
@@ -146,6 +147,7 @@ def _trunk(q: Tensor, c: Constants) -> Tensor:
     They share the up axis, the long baseline from hips to shoulders; the left axis comes from the
     hips, the shoulders, or both.
     """
+    # Up is from the middle of the hips to that of the shoulders.
     l_sh, r_sh, l_hip, r_hip = q.index_select(1, c.torso).unbind(1)
     spine = (l_sh + r_sh - l_hip - r_hip) * 0.5
     up = _faded(spine, c.axes[1]).unsqueeze(1)
@@ -204,6 +206,8 @@ def palms_of(q: Tensor, chest: Tensor, c: Constants) -> Tensor:
     Fingers' swings then start from the palm, which turns with the forearm as no bone shows.
     """
     frames = palm_frames(q.index_select(1, c.palms).unflatten(1, (-1, 3)))
+
+    # A palm whose landmarks coincide has a frame of zeros.
     lost = frames.square().sum((-2, -1), keepdim=True) < MIN_SQUARES
     return torch.where(lost, chest, frames)
 
@@ -223,6 +227,7 @@ def _faded(v: Tensor, fallback: Tensor) -> Tensor:
 
 def _shortened(v: Tensor) -> tuple[Tensor, Tensor]:
     """v divided by the larger of its length and `MIN_LENGTH`, and the result's squared length."""
+    # Clamped as a square: the root of 0 has no gradient.
     length2 = squared_norm(v)
     shortened = v * length2.clamp_min(MIN_LENGTH**2).rsqrt()
     return shortened, (length2 / MIN_LENGTH**2).clamp_max(1)
@@ -282,6 +287,8 @@ def omega(
 
     # In the order of the joints, then the landmarks of the face.
     rotations = [pelvis_chest, (chest.mT @ head).unsqueeze(1), face, f.local]
+
+    # Each joint picks its rotation from the list.
     by_joint = torch.cat(rotations, dim=1).index_select(1, c.omega_order)
     code = rotation_to_6d(by_joint)
     offsets = face_code(p, head, template)

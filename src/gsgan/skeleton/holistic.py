@@ -37,10 +37,8 @@ from gsgan.utils.checks import one_of
 
 POSE = MEDIAPIPE33
 STARTS = (len(POSE.names), len(POSE.names) + HAND)  # each hand's wrist
-POSE_ARMS = (
-    (11, 13, 15),
-    (12, 14, 16),
-)  # shoulder, elbow and wrist of the pose
+# shoulder, elbow and wrist of the pose
+POSE_ARMS = (11, 13, 15), (12, 14, 16)
 HUBS_WITH_PALMS = N_HUBS + len(STARTS)
 # Lengths of a straight finger's bones and of the thumb's last ones, metres.
 FINGER_LENGTHS = {
@@ -122,6 +120,9 @@ def _with_hands() -> SkeletonTemplate:
         limbs += _limbs(side)
         parents += [parents[forearm], *[HUBS_WITH_PALMS + first] * len(FINGERS)]
         directions += [POSE.rest_directions[forearm]] * (1 + len(FINGERS))
+
+        # The first bone of a finger follows the palm, each further one the bone
+        # before.
         for k, chain in enumerate(_chains(start)):
             place = HUBS_WITH_PALMS + len(parents)
             parents += [N_HUBS + side, place, place + 1]

@@ -82,6 +82,8 @@ class Proportions:
         template = np.array(HOLISTIC.rest_positions)
         own_palm = _palm_length(rest)
         template_palm = _palm_length(template)
+
+        # Each hand from its wrist, in the palm's axes.
         hands = {}
         for wrist, joints in HAND_JOINTS.items():
             hand = _hand(template[None, joints], template[None, wrist])
@@ -91,6 +93,7 @@ class Proportions:
     @property
     def leg(self) -> float:
         """Length of thigh and shin, metres."""
+        # The left leg stands for both.
         thigh, shin = LEGS[0]
         return length(self.rest, thigh) + length(self.rest, shin)
 
@@ -184,10 +187,10 @@ def _place_feet(rest: Float, q: Float) -> None:
         size = np.linalg.norm(ahead, axis=-1, keepdims=True)
         back = -ahead / np.maximum(size, 1e-9)
         above = np.broadcast_to([0.0, 0, 1], back.shape)
-        axes = np.stack(
-            [np.cross(back, above), back, above], axis=-1
-        )  # [F, 3, 3]
+        # [F, 3, 3]
+        axes = np.stack([np.cross(back, above), back, above], axis=-1)
 
+        # Medians over these frames, in the foot's own axes.
         held = _local(axes, stands[:, foot] - stands[:, ankle, None])
         rest[foot] = rest[ankle] + held
 
@@ -245,9 +248,8 @@ def _hands(p: Float, seen: Bool) -> dict[int, Float]:
 def _hand(p: Float, wrist: Float) -> Float:
     """``[21, 3]`` medians of a hand ``[F, 21, 3]`` from the pose's wrist ``[F, 3]``, in the palm's
     axes; fingers have the median lengths of their bones."""
-    local = (p - wrist[:, None]) @ hand_frame(
-        p, WRIST, PINKY, INDEX
-    )  # [F, 21, 3]
+    # [F, 21, 3]
+    local = (p - wrist[:, None]) @ hand_frame(p, WRIST, PINKY, INDEX)
     median = np.median(local, axis=0)
 
     # Medians of positions shorten bones, so each bone gets its median length, parents first.
@@ -285,6 +287,8 @@ def upright(up: str) -> Float:
     """
     if up not in UP_AXES:
         raise DataError(f"up must be one of {', '.join(UP_AXES)}, got {up!r}")
+
+    # Z up is the standard; other axes are turned onto it.
     axis = "xyz".index(up[-1])
     sign = -1 if up[:-1] else 1
     above = np.eye(3)[axis] * sign

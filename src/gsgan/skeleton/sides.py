@@ -7,9 +7,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 APART = -0.3  # maximum cosine of a swapped pair's line against the other pairs'
-OPPOSED = (
-    -0.6
-)  # maximum cosine of swapped lines against the left by feet and head
+# maximum cosine of swapped lines against the left by feet and head
+OPPOSED = -0.6
 SIDE_PAIRS = {
     "hips": (23, 24),
     "shoulders": (11, 12),

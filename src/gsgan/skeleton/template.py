@@ -33,18 +33,16 @@ class SkeletonTemplate:
 
     names: tuple[str, ...]  # of the J joints
     edges: tuple[Edge, ...]  # the connections that the landmark detector draws
-    limbs: tuple[
-        Edge, ...
-    ]  # (parent joint, child joint) of the bones with a cylinder
+    # (parent joint, child joint) of the bones with a cylinder
+    limbs: tuple[Edge, ...]
     # per limb, the frame that its own is relative to: 0 pelvis, 1 chest, 2 head, 3 + h palm h,
     # n_hubs + l limb l
     limb_parents: tuple[int, ...]
     # per limb, unit, in its parent's frame; not the rest pose: chosen so that the opposite
     # direction, where the swing is undefined, is out of reach
     rest_directions: tuple[Vector, ...]
-    rest_positions: tuple[
-        Vector, ...
-    ]  # J points of an A-pose on the ground y = 0
+    # J points of an A-pose on the ground y = 0
+    rest_positions: tuple[Vector, ...]
     stature: float  # metres, sole to crown of the rest pose
     # pairs of joints, left and right
     shoulders: Edge
@@ -53,9 +51,8 @@ class SkeletonTemplate:
     eyes: Edge
     nose: int
     face: tuple[int, ...]  # joints inside the head's sphere
-    mirror: tuple[
-        int, ...
-    ]  # per joint, its counterpart (itself on the midline)
+    # per joint, its counterpart (itself on the midline)
+    mirror: tuple[int, ...]
     # (name, segments) of drawn channels
     draw_groups: tuple[tuple[str, tuple[Edge, ...]], ...]
     # the edges connected to one component, for message passing
@@ -63,9 +60,8 @@ class SkeletonTemplate:
     # wrist, index's and little finger's knuckles
     palms: tuple[tuple[int, int, int], ...] = ()
     fingers: tuple[int, ...] = ()  # limbs that are bones of hands
-    bare: tuple[
-        int, ...
-    ] = ()  # limbs without a cylinder: another limb lies there
+    # limbs without a cylinder: another limb lies there
+    bare: tuple[int, ...] = ()
     # the last joints: landmarks of a face, which rest on the head
     expression: tuple[int, ...] = ()
 

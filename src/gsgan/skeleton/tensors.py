@@ -28,9 +28,8 @@ class Swing(NamedTuple):
 
     rest: Tensor
     straight: Tensor  # [M, 3, 3] first half turn of usual swings
-    folded: (
-        Tensor  # [M, 3, 3] first two half turns of nearly opposite directions
-    )
+    # [M, 3, 3] first two half turns of nearly opposite directions
+    folded: Tensor
 
     @classmethod
     def of(cls, rest: Tensor) -> Swing:
@@ -82,9 +81,8 @@ class Constants(NamedTuple):
     head_from_eyes: Tensor  # [3, 3] the head's axes in those of eyes and nose
     head_points: Tensor  # [5] left ear, right ear, left eye, right eye, nose
     torso: Tensor  # [4] left and right shoulder, left and right hip
-    palms: (
-        Tensor  # [3 H] wrist, index's and little finger's knuckle of each hand
-    )
+    # [3 H] wrist, index's and little finger's knuckle of each hand
+    palms: Tensor
     measured: Tensor  # limbs that measure the subject's size
     fingers: Tensor  # limbs that are bones of hands
     face_turned: Tensor  # [F] face joints but the nose
@@ -123,6 +121,8 @@ def _constants(
 
     # Limbs by level, each with the position of its parent's frame.
     ordered = list(chain.from_iterable(t.levels))
+
+    # Frames are stored hubs first, then limbs level by level.
     starts, ends = zip(*t.limbs, strict=True)
     position = dict(enumerate(range(t.n_hubs)))
     for k, limb in enumerate(ordered):

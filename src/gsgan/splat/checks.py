@@ -48,6 +48,7 @@ def _check_types(gaussians: Gaussians, camera: Camera) -> None:
             f"rasterise: Gaussians.means must be floating point, got {means.dtype}"
         )
     for name, value in {**_tensors(gaussians), **_tensors(camera)}.items():
+        # Mixed tensors would fail deep inside a backend.
         for what in ("device", "dtype"):
             have = getattr(value, what)
             want = getattr(means, what)

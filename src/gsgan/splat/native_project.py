@@ -62,6 +62,8 @@ def project(
     """
     # Cameras are in float64, Gaussians in the precision of the settings or a higher one.
     dtype = torch.promote_types(gaussians.means.dtype, settings.torch_dtype)
+
+    # Camera and bounds are few numbers: float64 costs nothing.
     K = camera.K.to(torch.float64)
     R = camera.R.to(torch.float64)
     t = camera.t.to(torch.float64)

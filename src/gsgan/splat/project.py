@@ -84,6 +84,8 @@ def project(
     limits = field_of_view(K, camera.size, settings.fov_clamp)
     JW = _jacobian(K, R, ratios, depths, limits)
     a, b, c, det_before = _covariance_2d(gaussians, JW)
+
+    # det(Σ + l I) = det Σ + l tr Σ + l²
     low = settings.low_pass
     det = det_before + low * (a + c) + low * low
     a = a + low
@@ -149,6 +151,8 @@ def _rotation_entries(quats: Tensor, dim: int) -> list[Tensor]:
     yy = y * y
     zz = z * z
     two = 2 / (w * w + xx + yy + zz)
+
+    # Products that two entries share.
     xy = x * y
     xz = x * z
     yz = y * z
@@ -174,6 +178,8 @@ def _covariance_2d(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Entries a, b, c of ``J W Σ Wᵀ Jᵀ`` (square pixels) and its determinant, each ``[B, N]``."""
     wide = JW.dtype
+
+    # The two rows of J W, each [B, 3, N].
     row_x = JW[:, 0]
     row_y = JW[:, 1]
 
@@ -232,6 +238,7 @@ def field_of_view(
 
     The corners of the image bound them, which holds with skew and an off-centre principal point.
     """
+    # Rays through the four corners, as x/z and y/z.
     H, W = size
     corners = filled(((0, W, 0, W), (0, 0, H, H)), K) - K[:, :2, 2:]
     # linalg.inv would make the host wait for its check of the result.
@@ -284,5 +291,6 @@ def _footprint(
 
 def _safe_sqrt(x: Tensor) -> Tensor:
     """Square root whose gradient at 0 is 0."""
+    # A value that is not used must not give an infinite gradient.
     positive = x > 0
     return torch.where(positive, torch.where(positive, x, 1.0).sqrt(), 0.0)

@@ -91,6 +91,8 @@ def rasterise(
 
     # A backend that averages by itself has averaged alpha, too.
     height, width = camera.size
+
+    # The same camera with more pixels.
     larger = camera.resize((height * factor, width * factor))
     with tiles.full_precision(device):
         features, alpha, average = _draw(name, gaussians, larger, settings)

@@ -38,9 +38,8 @@ def composite(
             torch.cat([weights @ front_to_back.features, 1 - left], dim=-1)
         )
     image = torch.cat(chunks, dim=1).mT.unflatten(-1, size)
-    return image[:, : projected.features.shape[-1]], image[
-        :, -1:
-    ]  # zeros if N is 0
+    # zeros if N is 0
+    return image[:, : projected.features.shape[-1]], image[:, -1:]
 
 
 def _sorted(projected: Projected) -> Projected:

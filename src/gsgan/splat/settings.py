@@ -37,16 +37,14 @@ class Accuracy:
     near: float = 0.01  # metres; Gaussians whose mean is nearer are not drawn
     # Near 1 the gradient of hidden layers is lost in float32 rounding: 1 is for float64.
     alpha_max: float = 0.999
-    low_pass: float = (
-        0.3  # square pixels, added to the diagonal of every 2D covariance
-    )
+    # square pixels, added to the diagonal of every 2D covariance
+    low_pass: float = 0.3
     # Half fields of view, to which x/z and y/z are clamped in the projection's Jacobian, >= 1.
     fov_clamp: float = 1.3
     # Whether opacities are multiplied by sqrt(det before / det after) of the low-pass.
     antialias: bool = False
-    supersample: int = (
-        1  # draw this many times larger, low-pass included, then average
-    )
+    # draw this many times larger, low-pass included, then average
+    supersample: int = 1
 
     def __post_init__(self) -> None:
         # The cut-offs of contributions.

@@ -56,9 +56,8 @@ class TileLists:
     starts: Tensor
     counts: Tensor
     depths: list[int]  # the counts again, on the host, transferred at once
-    box: (
-        Tensor | None
-    )  # [B * N + 1, 2] half-sizes outside of which nothing is drawn
+    # [B * N + 1, 2] half-sizes outside of which nothing is drawn
+    box: Tensor | None
 
 
 def tile_lists(

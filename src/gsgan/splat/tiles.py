@@ -92,6 +92,7 @@ class _Composite(torch.autograd.Function):
         )
         saved: list[list[tuple[Tensor, Tensor]]] = []
         for chunk in walk.chunks():
+            # Blocks are needed again if anything has a gradient.
             sums, blocks = walk.forward(chunk, needs_grad)
             canvas[lists.tiles[chunk]] = sums
             saved.append(blocks)
@@ -193,6 +194,7 @@ class _Walk:
 
     def gradients(self) -> tuple[Tensor, Tensor, Tensor]:
         """The gradients of geometry ``[B, N, 5]``, opacities ``[B, N]``, values ``[B, N, V]``."""
+        # The last row is the transparent one, which has no gradient.
         sums = self.sums[:-1].to(self.geometry)
         opacities = self.opacities[:-1].to(self.geometry)
         geometry = _geometry_gradient(self.geometry[:-1], opacities, sums)
@@ -216,6 +218,7 @@ class _Walk:
         save: bool,
     ) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
         """Blended values ``[T, V, P]``, and for each block its tiles and incoming transmittance."""
+        # The lists of the chunk's tiles, the longest first.
         starts = self.lists.starts[chunk]
         counts = self.lists.counts[chunk]
         depths = self.lists.depths[chunk]
@@ -315,12 +318,16 @@ class _Walk:
         )
 
     def _place(self, ids: Tensor, rows: Tensor, chunk: slice) -> _Place:
+        # The mean relative to the centre of the tile, in the dtype of the
+        # geometry.
         x, y, p, k, r = self.geometry[ids].unbind(-1)
         centre_x, centre_y = self.centres[chunk][rows].unsqueeze(1).unbind(-1)
         dx = centre_x - x
         dy = centre_y - y
         u = (p * (dx + k * dy)).clamp_(-U_MAX, U_MAX)
         v = (r * dy).clamp_(-U_MAX, U_MAX)
+
+        # Only now in the dtype of the values: large numbers have cancelled.
         w = p * k
         dtype = self.values.dtype
         return _Place(
@@ -335,6 +342,7 @@ class _Walk:
         chunk: slice,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """``exp(-q / 2)`` of each pixel, and u and v of ``q = u² + v²``; each ``[T, K, P]``."""
+        # u and v at every pixel: constant, x and y parts times the basis.
         u = torch.stack([place.u, place.p, place.w], dim=-1) @ self.basis
         no_x = torch.zeros_like(place.v)
         v = torch.stack([place.v, no_x, place.r], dim=-1) @ self.basis
@@ -365,11 +373,14 @@ class _Walk:
         alpha = exponential * self.opacities[ids].unsqueeze(-1)
         passes = None
         if want_mask:
+            # A capped or skipped alpha does not change with its inputs.
             passes = _indicator(alpha, self.settings.alpha_min)
             if self.settings.alpha_max < 1:
                 below = torch.empty_like(alpha)
                 torch.le(alpha, self.settings.alpha_max, out=below)
                 passes.mul_(below)
+
+        # In place: these arrays are the largest.
         if self.settings.alpha_min > 0:
             alpha = functional.threshold(
                 alpha, self.below_alpha_min, 0.0, inplace=True
@@ -378,6 +389,7 @@ class _Walk:
 
     def _weights(self, alpha: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
         """Weights ``[T, K, P]`` and the transmittance ``[T, P]`` behind the block."""
+        # w_i = α_i T_i, and 0 once T_i is below the cut-off.
         weights, after = self._transmittances(alpha, before)
         if self.settings.transmittance_min > 0:
             alpha = alpha.mul_(
@@ -389,6 +401,7 @@ class _Walk:
         self, alpha: Tensor, before: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Before each layer ``[T, K, P]``, and after the last ``[T, P]``; without cut-off."""
+        # T_{k+1} = T_k (1 - α_k), layer by layer.
         through = 1 - alpha
         layers = torch.empty_like(alpha)
         layers[:, 0] = before
@@ -417,6 +430,8 @@ def _behind(
     alpha: Tensor, seen: Tensor, behind: Tensor
 ) -> tuple[Tensor, Tensor]:
     """The values behind each layer ``[T, K, P]``, and behind the layer in front of the block."""
+    # B_{i-1} = α_i c_i + (1 - α_i) B_i is a linear interpolation from B_i to
+    # c_i.
     layers = torch.empty_like(alpha)
     layers[:, -1] = behind
     for k in range(alpha.shape[1] - 1, 0, -1):
@@ -450,6 +465,7 @@ def _geometry_gradient(
     Returns:
         ``[M, 5]``.
     """
+    # The sums have no factor of the opacity yet.
     _, _, p, k, r = geometry.unbind(-1)
     _, u, v, uu, uv, vv = (sums * opacities.unsqueeze(-1)).unbind(-1)
     gradients = [
@@ -479,6 +495,8 @@ def _from_tiles(
 ) -> Tensor:
     """``[B * rows * columns, V, P]`` → ``[B, V, H, W]``."""
     H, W = lists.size
+
+    # Pixels beyond the image's edge are cut off.
     tiles = canvas.view(B, *lists.grid, -1, tiling.tile, tiling.tile)
     rows = tiles.permute(0, 3, 1, 4, 2, 5)  # [B, V, rows, tile, columns, tile]
     image = rows.flatten(4, 5).flatten(2, 3)
@@ -490,6 +508,8 @@ def _to_tiles(image: Tensor, lists: TileLists, tiling: Tiling) -> Tensor:
     H, W = lists.size
     rows, columns = lists.grid
     side = tiling.tile
+
+    # Tiles at the right and lower edge may reach beyond the image.
     padded = functional.pad(image, (0, columns * side - W, 0, rows * side - H))
     tiles = padded.unflatten(3, (columns, side)).unflatten(2, (rows, side))
     return tiles.permute(0, 2, 4, 1, 3, 5).flatten(4, 5).flatten(0, 2)

@@ -46,9 +46,8 @@ ABSENT_FINGERS = (  # thumb to pinky
     AbsentFinger(first=0.45, step=0.13, thumbwards=-0.2),
 )
 STEP = 0.0005  # metres between the rays cast at the face
-Anchors = dict[
-    str, tuple[int, int]
-]  # landmark → joint and vertex, one of them -1
+# landmark → joint and vertex, one of them -1
+Anchors = dict[str, tuple[int, int]]
 
 
 def with_anchors(c: Character) -> Character:
@@ -111,6 +110,8 @@ def _hand(c: Character, main: Ints, side: str) -> Anchors:
     for finger, absent in zip(FINGERS, ABSENT_FINGERS, strict=True):
         for k, part in enumerate(THUMB if finger == "Thumb" else SEGMENTS):
             name = f"{side.lower()}_{finger.lower()}_{part}"
+
+            # Rigs may have fewer phalanges, or no fingers.
             bone = at.get(f"{side}Hand{finger}{k + 1}")
             last = at.get(f"{side}Hand{finger}{k}", -1)
             tip = np.flatnonzero(main == last)
@@ -276,6 +277,8 @@ class _Face:
             # The vertex nearest to the mean of the outermost ones.
             outwards = np.where(level, sign * x[:, 0], -np.inf)
             ear = x[outwards > outwards.max() - 0.012].mean(axis=0)
+
+            # The vertex of skin nearest to the middle of the ear's outer part.
             far = np.linalg.norm(x - ear, axis=1)
             found[f"{side}_ear"] = int(
                 np.where(self.skin, far, np.inf).argmin()
@@ -303,6 +306,8 @@ class _Face:
             ball = self.c.with_descendants(self.c.bones.index(bone))
             seen = np.isin(self.main[self.vertex], ball) & (self.vertex >= 0)
             if seen.any():
+                # Corners and lids are where the visible part of the eyeball
+                # ends.
                 rows, columns = np.nonzero(seen)
                 left = self.x[columns.max()]
                 right = self.x[columns.min()]
@@ -370,6 +375,8 @@ class _Face:
             jump = jump * (below[:, None] & central)
             slit = jump > 0.1 * jump.max()
             if slit.any():
+                # The line of the lips, and the corners of the mouth at its
+                # ends.
                 columns = np.flatnonzero(slit.any(axis=0))
                 heights = self.z[jump.argmax(axis=0)[columns]]
                 line = np.interp(self.x, self.x[columns], heights)
@@ -383,6 +390,8 @@ class _Face:
         for k in range(LIP_POINTS):
             angle = 2 * np.pi * k / LIP_POINTS
             x = centre + half * np.cos(angle)
+
+            # The lower lip is thicker than the upper one.
             rise = np.sin(angle)
             thickness = (0.11 if rise > 0 else 0.14) * d
             height = float(np.interp(x, self.x, line))

@@ -93,6 +93,8 @@ def look_at(
     )
     forward = middle - centre
     forward /= np.linalg.norm(forward)
+
+    # Its axes: right, down and forwards, which make no roll.
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
     R = np.stack([right, np.cross(forward, right), forward])

@@ -37,12 +37,10 @@ class Controls:
         # [F, 3] body axes, metres from the standing position
         self.pelvis = still(0, 0, -0.004)
         self.lean = still(0, 0, 0)  # [F, 3] body axes, axis-angle of the pelvis
-        self.spine = still(
-            0, 0, 0
-        )  # [F, 3] axis-angle, distributed over the spine
-        self.head = still(
-            0, 0, 0
-        )  # [F, 3] axis-angle, distributed over neck and head
+        # [F, 3] axis-angle, distributed over the spine
+        self.spine = still(0, 0, 0)
+        # [F, 3] axis-angle, distributed over neck and head
+        self.head = still(0, 0, 0)
 
         # [F, 2, 3] mirrored, chest axes: the wrist, metres from the shoulder
         self.wrist = both(0.12, -0.05, -0.52)
@@ -50,9 +48,8 @@ class Controls:
         self.elbow = both(0.35, 1.0, -0.2)
         # [F, 2] forearm twist, radians from mid-way, positive: palm up
         self.palm = still(0, 0)
-        self.flex = still(
-            0, 0
-        )  # [F, 2] wrist flexion towards the palm, radians
+        # [F, 2] wrist flexion towards the palm, radians
+        self.flex = still(0, 0)
         # [F, 2, 5] finger flexion in [0, 1], thumb first
         self.curl = both(0.25, 0.25, 0.25, 0.25, 0.25)
         # [F, 2, 5] added to the curl of the first joint of each finger
@@ -83,9 +80,8 @@ class Controls:
 
         # [F] minimum height of steps, metres; 0: only as high as needed
         self.march = np.zeros(frames)
-        self.swing = np.zeros(
-            frames
-        )  # [F] share of the arms' swing with the legs
+        # [F] share of the arms' swing with the legs
+        self.swing = np.zeros(frames)
 
         # [F] the face
         self.mouth = np.zeros(frames)  # opening with vowels, in [0, 1]

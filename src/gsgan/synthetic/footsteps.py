@@ -31,9 +31,8 @@ class FootState(NamedTuple):
     height: Array  # [F] metres
     pitch: Array  # [F] radians, positive lifts the heel
     toes: Array  # [F] minimum share of the pitch that the toes take
-    load: (
-        Array  # [F] 1 while the foot swings and the other one carries the body
-    )
+    # [F] 1 while the foot swings and the other one carries the body
+    load: Array
 
 
 class Footsteps:
@@ -61,6 +60,9 @@ class Footsteps:
             for goal, minimum in zip(goals, march, strict=True):
                 move = goal - place
                 distance = np.linalg.norm(move[:2])
+
+                # A foot steps if its goal is far enough, or if the passage
+                # marches.
                 far = distance > MIN_STEP or abs(move[2]) > MIN_TURN
                 steps = minimum > 0.03 or far
                 shift.append(move * steps)

@@ -395,6 +395,8 @@ def _standing(skeleton: _Skeleton, vertices: Array) -> _Standing:
             "its mesh is flat or has positions that are not numbers"
         )
     low, high = HEIGHTS
+
+    # The unit that gives a plausible height, or else a usual one.
     scale = 1.7 / height
     for unit in UNIT_LENGTHS:
         if low <= unit * height <= high:
@@ -443,6 +445,8 @@ def _character(glb: GltfFile, skeleton: _Skeleton) -> Character:
     for part in parts:
         end = start + len(part.vertices)
         faces.append(start + part.faces)
+
+        # Parts without a shape do not move with it.
         for name, offsets in part.shapes.items():
             total = shapes.setdefault(name, np.zeros_like(vertices))
             total[start:end] = standing.scale * offsets @ standing.turn.T

@@ -247,6 +247,8 @@ class Choreography:
             curl = c.curl[:, i, k, None]
             aside = is_first * FINGER_FAN[k] * c.spread[:, i, None] * thumbwards
             flexion = curl + is_first * c.bend[:, i, k, None]
+
+            # From the pose at rest, in which fingers may be bent.
             flexion = FLEXION[finger][joint] * flexion - straight
             turn = rotation(flexion * hinge + curl * across + aside)
             pose.world[bone] = pose.rotation(pose.parent(bone)) @ turn

@@ -91,12 +91,15 @@ class RecordedMotion:
         leg = self.rig.leg
         pose = self._pose(self._turns, self._hips)
         lows = [pose.lowest(side) for side in SIDES]
+
+        # The floor under the feet, and the smoothed path, are taken away.
         floor = floor_under(np.minimum(*lows), leg, step)
         shift = np.column_stack([-drift(self._hips[:, :2], step), -floor])
         self._hips = self._hips + shift
 
         self._ankles = []
         for side, low in zip(SIDES, lows, strict=True):
+            # The ball of the foot stands still while the heel rises.
             toe = side + "ToeBase"
             if toe not in self.rig.index:
                 toe = side + "Foot"
@@ -165,6 +168,7 @@ def _held(
     frames = [np.zeros(0, dtype=int)]
     shift = [np.zeros((0, 2))]
     for begin, end in edges.reshape(-1, 2):
+        # A foot that slides further is not at rest.
         run = ball[begin:end]
         if np.linalg.norm(np.ptp(run, axis=0)) < CONTACT_HEIGHT * 2 * leg:
             frames.append(np.arange(begin, end))

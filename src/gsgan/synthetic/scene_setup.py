@@ -140,9 +140,8 @@ class SceneSettings:
     lens: tuple[float, ...] | None = None  # OpenCV's distortion coefficients
     tint: float | None = None  # maximum change of a channel's gain
     gloss: float | None = None  # added highlight of clothes
-    test_scale: tuple[float, ...] | None = (
-        None  # zooms of copies of the test cameras
-    )
+    # zooms of copies of the test cameras
+    test_scale: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         # Whole numbers.

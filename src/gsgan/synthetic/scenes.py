@@ -111,6 +111,8 @@ def _write(
     # The progress bar counts frames.
     scene = Scene(settings)
     count = f"{settings.frames} frames, {len(scene.views)} cameras"
+
+    # The bar is on stderr, apart from results.
     bar = Progress(
         console=Console(stderr=True), disable=not progress, transient=True
     )

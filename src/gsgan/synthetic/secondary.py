@@ -236,6 +236,8 @@ class Secondary:
         # Smoothing over each vertex and its neighbours along the edges.
         start = self._corner
         end = np.roll(self._faces, 1, axis=1).ravel()
+
+        # Each vertex with itself and its neighbours.
         every = np.arange(W)
         rows = np.r_[start, end, every]
         columns = np.r_[end, start, every]

@@ -91,6 +91,8 @@ class Textures:
         bottom = start + high[:, 1] * size[:, 0]
         left = low[:, 0]
         right = high[:, 0]
+
+        # Bilinear between four texels.
         out = self._texels[top + left] * ((1 - x) * (1 - y))
         out += self._texels[top + right] * (x * (1 - y))
         out += self._texels[bottom + left] * ((1 - x) * y)
@@ -108,6 +110,9 @@ def _pyramid(surface: Surface) -> Iterator[Floats]:
     shrink = max(1.0, max(h, w) / MAX_TEXELS)
     h = max(1, round(h / shrink))
     w = max(1, round(w / shrink))
+
+    # Colour and normal in one array; colours are averaged as light, not as
+    # bytes.
     texels = np.zeros((h, w, 8), np.float32)
     colour = surface.colour.astype(np.float32) / 255
     colour[..., :3] = linear(colour[..., :3])

@@ -18,24 +18,21 @@ from gsgan.synthetic.camera import SceneCamera, pixel_rays
 from gsgan.synthetic.textures import Textures, srgb
 
 Array = NDArray[np.float64]
-Floats = NDArray[
-    np.floating[Any]
-]  # float32: enough for light, and twice as fast
+# float32: enough for light, and twice as fast
+Floats = NDArray[np.floating[Any]]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 Colour = tuple[float, float, float]
 
-BLOCK_RAYS = (
-    1 << 15
-)  # rays traced at once: their arrays stay in the processor's cache
+# rays traced at once: their arrays stay in the processor's cache
+BLOCK_RAYS = 1 << 15
 # exponent of the highlight's lobe: falls to half within about 19 degrees
 SHININESS = 12.0
 GLOSSY_PARTS = ("upper_clothes", "lower_clothes", "left_shoe", "right_shoe")
 SKY_RAYS = 48  # directions in which each vertex looks for the sky
 SKY_OFFSET = 3e-3  # metres from the surface to sky rays
-SHADOW_OFFSET = (
-    1e-3  # metres from the surface to shadow rays; less gives speckles
-)
+# metres from the surface to shadow rays; less gives speckles
+SHADOW_OFFSET = 1e-3
 LAYERS = 32  # cut-out surfaces that one ray passes at most
 SHOULDER = 0.5  # linear light from which the tone curve is compressed
 
@@ -50,9 +47,8 @@ class Light:
     sky: Colour = (0.58, 0.62, 0.68)  # from straight above
     ground: Colour = (0.38, 0.35, 0.32)  # from straight below
     spread: float = 0.06  # tangent of half the sun's width: soft shadows
-    shine: float = (
-        0.04  # highlight (Blinn-Phong) of everything, as a share of the sun
-    )
+    # highlight (Blinn-Phong) of everything, as a share of the sun
+    shine: float = 0.04
     gloss: float = 0.0  # the same, added for clothes and shoes
 
 
@@ -65,9 +61,8 @@ class Wrinkles:
 
     phase: Floats  # [V] radians, linear within faces
     slope: Floats  # [V] 0 where cloth is smooth
-    across: (
-        Floats  # [V, 3] unit, world: the direction from one fold to the next
-    )
+    # [V, 3] unit, world: the direction from one fold to the next
+    across: Floats
 
 
 def wave(phase: Floats) -> Floats:
@@ -170,9 +165,8 @@ class Tracer:
             return face, bary
 
         # Rays that hit a hole go on behind it.
-        travelled = np.zeros(
-            len(face), np.float32
-        )  # metres until the last hole
+        # metres until the last hole
+        travelled = np.zeros(len(face), np.float32)
         going = np.arange(len(face))
         for _ in range(LAYERS):
             going = going[face[going] >= 0]
@@ -391,9 +385,13 @@ class PosedCharacter:
         # Light of the sun where nothing blocks it, with the highlight.
         towards = self._sun_directions(disc)
         facing = _dot(normal, towards)[:, 0]
+
+        # Only points that face the sun, and that nothing shades.
         k = np.flatnonzero(facing > 0)
         start = lifted[k] + np.float32(SHADOW_OFFSET) * flat[k]
         k = k[~self.tracer.blocked(start, towards[k])]
+
+        # Blinn-Phong's highlight, about half-way between sun and camera.
         half = _unit(towards[k] - ray[k])
         lobe = np.maximum(_dot(normal[k], half), 0) ** np.float32(SHININESS)
         shine = (
@@ -435,6 +433,8 @@ class PosedCharacter:
         ring = np.sqrt(1 - z * z)
         sphere = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
 
+        # The light that arrives, and what would if nothing were in the way, on
+        # both sides.
         sky = np.mean(self.light.sky)
         ground = np.mean(self.light.ground)
         arrived = np.zeros((len(X), 2), np.float32)
@@ -447,6 +447,7 @@ class PosedCharacter:
             light = ground + (sky - ground) * (0.5 + 0.5 * d[2])
             weight = np.abs(cosine) * np.float32(light)
 
+            # Rays start a little above the surface, which would block them.
             start = X + np.float32(SKY_OFFSET) * np.sign(cosine)[:, None] * N
             free = ~self.tracer.blocked(start, np.tile(d, (len(X), 1)))
             possible[rows, inside] += weight

@@ -176,6 +176,7 @@ class DiscriminatorMaps:
     @property
     def difference(self) -> Tensor:
         """``[scales]`` mean absolute differences of the logits of both images."""
+        # The last map of each scale has the logits.
         pairs = zip(self.fake, self.real, strict=True)
         return torch.stack(
             [(a[-1] - b[-1]).detach().abs().mean() for a, b in pairs]

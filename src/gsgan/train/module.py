@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
-from pathlib import Path
 from typing import Any, TypeVar
 
 import gsgan.utils.compat  # noqa: F401  (must come before lightning)
@@ -32,12 +31,7 @@ from gsgan.train.optimisers import (
     clip,
     parameter_groups,
 )
-from gsgan.train.rollback import (
-    Rollback,
-    SkippedSteps,
-    likely_cause,
-    save_batch,
-)
+from gsgan.train.rollback import Rollback, SkippedSteps
 from gsgan.train.schedule import SEGMENTATION, SPLATTING, STEP_ONE, Schedule
 from gsgan.utils.checks import above, at_least, whole
 from gsgan.utils.errors import ConfigError, GsganError
@@ -221,6 +215,8 @@ class AvatarTraining(LightningModule):
 
         # The frame in a window, trained by the phase that the iteration belongs to.
         frame = self._cut(frame)
+
+        # The phases follow each other; each trains other parts.
         phase = self.schedule.phase(self.step)
         self._frame = frame
         if phase == SEGMENTATION:
@@ -262,6 +258,8 @@ class AvatarTraining(LightningModule):
 
         # L_Ψ and, in the later part of Step I, L_perc of the same image.
         terms = {"step_one/loss": self.step_one_loss(rendering, frame)}
+
+        # The perceptual loss joins after a share of Step I.
         weight = self.step_one.perceptual
         done = self.schedule.share_of_step_one(self.step)
         if (
@@ -405,42 +403,31 @@ class AvatarTraining(LightningModule):
         # A failed iteration counts as skipped.
         if not failed:
             return found
-        self._skip({}, problem or "another process could not render its images")
+        self._skip(problem or "another process could not render its images")
         return None
 
-    def _skip(self, losses: Mapping[str, Tensor], problem: str) -> None:
+    def _skip(self, problem: str) -> None:
         """Counts a skipped iteration and prints why; after too many the run stops."""
-        # The likely cause is found from the data, the weights of every optimiser and the losses.
+        frames = self._frame.frame_id.tolist()
+        cameras = self._frame.camera_index.tolist()
+        cause = f"{problem} (frame {frames}, camera index {cameras})"
         stop = self.skipped.add(self.step)
-        held = {
-            name: [
-                p for group in optimiser.param_groups for p in group["params"]
-            ]
-            for name, optimiser in self._optimisers().items()
-        }
-        cause = likely_cause(self._frame, held, losses, problem)
         count = self.skipped.count
 
         # The run stops if too many were skipped, else it goes on.
         if stop:
             raise self._stopped(
-                f"{count} were skipped; likely cause: {cause}; correct it, or go on with a larger "
-                "training.max_skipped"
+                f"{count} were skipped: {cause}; lower training.recipes.*.rate.peak, or go on with "
+                "a larger training.max_skipped"
             )
         self.print(
             f"iteration {self.step}: skipped ({count}, at most {self.skipped.maximum}): {cause}"
         )
 
     def _stopped(self, why: str) -> GsganError:
-        """The error that ends a run, with the batch saved."""
-        path = (
-            Path(self.trainer.default_root_dir)
-            / f"stopped_{self.trainer.global_rank}.pt"
-        )
-        save_batch(path, self.step, self._frame, why)
+        """The error that ends a run."""
         return GsganError(
-            f"training stopped at iteration {self.step}: {why} (its batch: {path}; the last good "
-            "checkpoint is kept)"
+            f"training stopped at iteration {self.step}: {why} (the last good checkpoint is kept)"
         )
 
     def _descend(self, losses: Mapping[str, Tensor], *names: str) -> None:
@@ -465,9 +452,9 @@ class AvatarTraining(LightningModule):
             for name, optimiser in optimisers.items()
         ]
         if not bool(torch.isfinite(torch.stack(norms)).all()):
-            self._skip(
-                losses, f"a gradient of {', '.join(names)} was not finite"
-            )
+            bad = [name for name, x in losses.items() if not x.isfinite()]
+            what = f"the loss {', '.join(bad)}" if bad else "a gradient"
+            self._skip(f"{what} of {', '.join(names)} is not finite")
             return
 
         # The rates follow the schedule, times the factor of each group.

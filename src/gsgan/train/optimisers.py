@@ -142,6 +142,7 @@ class MovingAverage(nn.Module):
 
     def update(self, module: nn.Module, step: int) -> None:
         """Adds the module's present weights to the average, at every ``every``-th iteration."""
+        # By the iteration, so that a resumed run updates in the same ones.
         if step % self.every == 0:
             self.copy.update_parameters(module)
 

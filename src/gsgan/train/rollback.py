@@ -1,23 +1,17 @@
-"""Guards of the training: skipped steps, their likely cause, and the return from a collapse."""
+"""Guards of the training: skipped steps, and the return from a collapse."""
 
-import io
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from gsgan.scene import Frame
 from gsgan.utils.checks import between, whole
-from gsgan.utils.files import write_atomically, writing
 
-MAX_WEIGHT = 1e6  # a weight beyond it has exploded
-BRIGHTEST = (
-    10.0  # mean of an image whose ground truth is within 0 and 1, likewise
-)
+# mean of an image whose ground truth is within 0 and 1: beyond it Ψ has exploded
+BRIGHTEST = 10.0
 # mean difference of a discriminator's logits that no longer follow the image
 SAME = 1e-7
 
@@ -75,6 +69,7 @@ class Rollback:
 
         It is "" for nothing, and None for a state that is not good enough to be kept.
         """
+        # Nothing was rendered yet.
         if not self.means:
             return ""
 
@@ -150,71 +145,3 @@ class SkippedSteps:
     def count(self) -> str:
         """For messages."""
         return f"{len(self.steps)} of the last {self.window} iterations"
-
-
-def likely_cause(
-    frame: Frame,
-    parameters: Mapping[str, Sequence[Tensor]],
-    losses: Mapping[str, Tensor],
-    problem: str,
-) -> str:
-    """Why an iteration has no finite gradient: its data, the weights, a loss, in this order.
-
-    Args:
-        frame: the batch.
-        parameters: by optimiser.
-        losses: the terms by name; empty where they could not be computed.
-        problem: what was noticed, the answer if all of these are finite.
-    """
-    # The data comes first: values that are not finite there explain all others.
-    items = (
-        f"frame {frame.frame_id.tolist()}, camera {frame.camera_index.tolist()}"
-    )
-    if bad := _not_finite(asdict(frame)):
-        return f"{', '.join(bad)} of the data is not finite ({items}, counted from 0)"
-
-    # The weights of each optimiser come next, by their largest absolute value.
-    for name, held in parameters.items():
-        largest = max(
-            (float(p.detach().abs().max()) for p in held if p.numel()),
-            key=_or_infinite,
-        )
-        if not _or_infinite(largest) <= MAX_WEIGHT:
-            return (
-                f"the weights of {name} have exploded (up to {largest:.3g}): resume from the last "
-                f"checkpoint with a lower training.recipes.{name}.rate.peak"
-            )
-
-    # The terms of the loss come last.
-    if bad := _not_finite(dict(losses)):
-        return f"the loss {', '.join(bad)} is not finite ({items})"
-    return problem
-
-
-def _or_infinite(value: float) -> float:
-    return float("inf") if value != value else value
-
-
-def _not_finite(values: Mapping[str, Any], before: str = "") -> list[str]:
-    """Names of the tensors that hold NaN or infinity."""
-    # Nested values are named by their path.
-    found = []
-    for name, value in values.items():
-        if isinstance(value, Mapping):
-            found += _not_finite(value, f"{before}{name}.")
-        elif isinstance(value, Tensor) and not bool(
-            torch.isfinite(value).all()
-        ):
-            found.append(before + name)
-    return found
-
-
-def save_batch(path: Path, step: int, frame: Frame, cause: str) -> None:
-    """Writes the batch of a run that stops, as plain tensors that ``torch.load`` reads."""
-    # The file is written whole or not at all.
-    stream = io.BytesIO()
-    torch.save(
-        {"step": step, "cause": cause, "frame": asdict(frame.to("cpu"))}, stream
-    )
-    with writing(path):
-        write_atomically(path, stream.getvalue())

@@ -22,7 +22,7 @@ from rich.console import Console
 
 from gsgan.data.datamodule import GsganData
 from gsgan.evaluate.origin import trained, training_code
-from gsgan.evaluate.run import evaluate_method
+from gsgan.evaluate.run import ScoreOptions, evaluate_method
 from gsgan.evaluate.scores import painter
 from gsgan.export.run import export_config
 from gsgan.fit.run import fit_before_training
@@ -107,6 +107,7 @@ def run_training(config: DictConfig) -> None:
             )
             return
 
+    # What remains is checked, recorded and printed before the work begins.
     refuse_long_cpu_run(config, data, module, module.schedule.total - done)
     module.code = training_code()
     describe(console, folder, config, data, module)
@@ -158,7 +159,7 @@ def build_training(
     with working(console, "reading the data"):
         data = build_data(config)
     if data.lacks_body and moves_with_body(config):
-        fit_before_training(data, config.fit, device_of(config))
+        fit_before_training(data, instantiate(config.fit), device_of(config))
         with working(console, "reading the data with its body"):
             data = build_data(config)
 
@@ -310,7 +311,7 @@ def _evaluate(
     avatar = module.shown.eval()
     evaluate_method(
         folder,
-        config,
+        ScoreOptions.from_config(config),
         console,
         data,
         predict=painter(avatar),

@@ -18,10 +18,8 @@ STRETCHED_STEPS = (
     "degree_every",
     "coarse",
 )
-SPLATTING = (
-    "psi",
-    "colour",
-)  # optimisers of the parts that make Step I's image
+# optimisers of the parts that make Step I's image
+SPLATTING = ("psi", "colour")
 # iterations of S, at most, where two numbers learn from masks (docs/effects.md)
 FROM_MASKS = 800
 

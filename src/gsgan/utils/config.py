@@ -29,13 +29,10 @@ from gsgan.utils.errors import GsganError
 from gsgan.utils.sweeps import note, run_job
 
 FAILED = 1
-CONFIG_ENTRY_POINTS = (
-    "gsgan.conf"  # group of entry points of installed packages
-)
-BFLOAT16_SINCE = (
-    8,
-    0,
-)  # compute capability: before it bfloat16 is emulated or refused
+# group of entry points of installed packages
+CONFIG_ENTRY_POINTS = "gsgan.conf"
+# compute capability: before it bfloat16 is emulated or refused
+BFLOAT16_SINCE = 8, 0
 # Bytes of the name of a sweep's folder: file systems take 255, and files beside it need some.
 LONGEST_NAME = 200
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
@@ -183,6 +180,7 @@ def entry(
         try:
             command()
         except CompactHydraException as error:
+            # The cause names the key; Hydra's own sentence does not.
             cause = error.__cause__
             more = (
                 f"\n{cause}"

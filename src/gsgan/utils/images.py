@@ -109,7 +109,6 @@ def caption(image: Bytes, text: str, colour: tuple[int, int, int]) -> Bytes:
 def encode(image: Bytes) -> bytes:
     """A JPEG of an RGB image."""
     settings = [cv2.IMWRITE_JPEG_QUALITY, PAGE_JPEG_QUALITY]
-    _, data = cv2.imencode(
-        ".jpg", image[..., ::-1], settings
-    )  # OpenCV takes BGR
+    # OpenCV takes BGR
+    _, data = cv2.imencode(".jpg", image[..., ::-1], settings)
     return data.tobytes()

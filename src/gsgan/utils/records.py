@@ -72,6 +72,8 @@ def cat(records: Sequence[S]) -> S:
             raise ValueError(
                 f"cat: {type(first).__name__}.{field.name} is present in some records only"
             )
+
+        # Records may hold other records.
         if isinstance(values[0], TensorRecord):
             changes[field.name] = cat(values)
         elif isinstance(values[0], Tensor):

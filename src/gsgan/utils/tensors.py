@@ -18,9 +18,8 @@ Result = TypeVar("Result")
 M_TRIM_THRESHOLD = -1
 M_MMAP_THRESHOLD = -3
 KEPT = 1 << 30  # bytes of freed memory that the process keeps
-LARGEST = (
-    1 << 25
-)  # bytes; glibc takes larger blocks from the system in any case
+# bytes; glibc takes larger blocks from the system in any case
+LARGEST = 1 << 25
 
 
 def constant(

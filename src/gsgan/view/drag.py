@@ -90,8 +90,13 @@ def dragged(p: Float, name: str, target: Float) -> Float:
 
     # The chain bends, then the joints behind it follow its end.
     handle = HANDLES[name]
+
+    # The chain bends so that its end reaches the target, with its bones'
+    # lengths.
     chain = list(handle.chain)
     q[chain] = fabrik(p[chain], target)
+
+    # What hangs at the end turns with the last bone, or moves along.
     before, end = chain[-2:]
     turn = between(p[end] - p[before], q[end] - q[before])
     turned = _present(p, handle.turned)

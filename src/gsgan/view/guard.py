@@ -48,6 +48,7 @@ def guarded(served: str) -> Iterator[None]:
     """
     from websockets.asyncio import server  # viser's
 
+    # A request from another page is refused before viser sees it.
     def check(inner: Any, connection: Any, request: Any) -> Any:
         host = request.headers.get("Host")
         origin = request.headers.get("Origin")

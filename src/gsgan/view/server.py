@@ -218,6 +218,7 @@ def _bound_uploads(client: Any, limit: int) -> None:
     connection = client._websock_connection
 
     def check(_: int, message: Any) -> None:
+        # All uploads of a browser count together.
         held = 0
         for upload in uploads.values():
             held += max(upload["total_bytes"], upload["transferred_bytes"])

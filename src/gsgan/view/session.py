@@ -26,9 +26,8 @@ from gsgan.utils.provenance import png_bytes
 from gsgan.view.drag import HANDLE_NAMES, dragged, position
 
 IDLE_SECONDS = 0.1  # between two checks whether an image is due
-RESTS = (
-    0.3  # seconds without movement after which the full-size image is rendered
-)
+# seconds without movement after which the full-size image is rendered
+RESTS = 0.3
 MIN_SCALE = 0.25  # of the images while something moves
 MAX_ASPECT = 3.0  # of width to height or of height to width, since a browser window can have any
 SPEED_OVER = 2.0  # seconds over which the displayed rate is averaged
@@ -49,9 +48,8 @@ class Show:
     body: SkinnedBody | None  # that the avatar moves with
     drive: Drive  # the first motion
     read: Callable[[str], Drive]  # reads the motion in an uploaded file
-    behind: Callable[
-        [tuple[int, int]], torch.Tensor
-    ]  # background [3, H, W] of a size
+    # background [3, H, W] of a size
+    behind: Callable[[tuple[int, int]], torch.Tensor]
     size: int  # height of a full-size image, pixels
     fps: float  # frames per second of a motion that plays
     rate: float  # images per second to reach while something moves
@@ -251,6 +249,7 @@ class Session:
         # A motion that plays goes on by the frames that have passed since the last image.
         now = time.monotonic()
         if self.play.value and len(self.drive.p) > 1:
+            # A frame that is due later is waited for; late frames are skipped.
             early = self.started + 1 / self.show.fps - now
             if early > 0:
                 return early
@@ -327,6 +326,8 @@ class Session:
         current = self._current()
         camera = self.camera(share)
         p, visibility, body = inputs_of(avatar, current, 0)
+
+        # Maps are computed only if a layer shows them.
         maps = layer != FINAL_IMAGE or self.splats.value
         with torch.no_grad():
             rendering = avatar(p, visibility, camera, body, maps=maps)
@@ -346,6 +347,8 @@ class Session:
         # The size of the image, and the rate over the last seconds.
         now = time.monotonic()
         self.times.append(now)
+
+        # The rate over the last moments, not since the start.
         recent = [x for x in self.times if x > now - SPEED_OVER]
         height, width = self.image.shape[:2]
         status = f"{width} × {height}"
@@ -388,6 +391,8 @@ class Session:
                 line_width=3.0,
             )
             self._nodes.append(lines)
+
+        # The body is posed on the CPU: the browser needs its vertices.
         if self.mesh.value and body is not None and pose is not None:
             vertices = body.posed_vertices(pose.to("cpu"))[0]
             mesh = scene.add_mesh_simple(

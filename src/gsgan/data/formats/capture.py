@@ -128,6 +128,8 @@ def _find(
     meta_path = root / "meta.json"
     meta_json = read_json(meta_path)
     meta = _read_meta(meta_path, meta_json, smpl)
+
+    # Unit, pixel centre and background are conventions of all files.
     conventions = read_conventions(meta_path, meta_json)
     if conventions.scale != 1.0:
         notes.append(f"lengths converted from {meta.unit} to metres")
@@ -152,6 +154,8 @@ def _find(
         hands = _read_landmarks(
             root / HANDS_FILE, 2 * HAND, conventions, limits, notes
         )
+
+    # A face of other landmarks is refused by its names.
     face = None
     if (root / FACE_FILE).exists():
         face = _read_landmarks(
@@ -246,11 +250,15 @@ def _read_meta(
     fps = content.get("fps")
     if fps is not None and not (is_number(fps) and fps > 0):
         raise DataError(f"{path}: 'fps' is {fps!r}; expected a number above 0")
+
+    # The first label is the background, so one name is not enough.
     names = content.get("label_names")
     if names is not None and not (isinstance(names, list) and len(names) > 1):
         raise DataError(
             f"{path}: 'label_names' must list the background and every part by name"
         )
+
+    # Their content is checked when the splits are made.
     splits = content.get("splits") or {}
     if not isinstance(splits, dict):
         raise DataError(
@@ -385,6 +393,8 @@ def _read_poses(
 
     # The poses, and those that follow the hands too.
     suffixes = ["", "_hands"] if "theta_hands" in arrays else [""]
+
+    # Poses with hands are stored beside those without.
     rotations = []
     moves = []
     for suffix in suffixes:

@@ -200,9 +200,8 @@ def inside_share(
     shown = through_lens(camera.K, camera.dist, straight[:, 0], straight[:, 1])
     everyone = np.ones(len(joints), bool)
     distance = mask_distance(small)
-    outside = joint_distance(
-        distance, shown / step, depth, everyone, focal
-    )  # [N]
+    # [N]
+    outside = joint_distance(distance, shown / step, depth, everyone, focal)
 
     # The tolerance in metres, but at least some pixels of the small mask.
     known = ~np.isnan(outside)

@@ -95,9 +95,12 @@ class EasymocapReader(FolderReader):
         people = _read_people(
             root, place, frames_of(images), self.person, notes
         )
+
+        # Landmarks on the fitted body, or the keypoints themselves.
         motion = None
         body = None
         if kind == "smpl":
+            # SMPL's joints need the user's model.
             file, model = body_model(root / place, smpl, "smpl")
             motion = zju_motion(people, model)
             body = BodyModel("smpl", str(file), tuple(motion.betas[0].tolist()))
@@ -106,6 +109,7 @@ class EasymocapReader(FolderReader):
         else:
             ids, p, conf = _read_keypoints(people)
 
+        # Everything in the reader's terms; the layout has no part labels.
         return Found(
             root=root,
             meta=Meta(
@@ -141,6 +145,7 @@ class EasymocapReader(FolderReader):
         notes += calibration.notes
         known = calibration.cameras
 
+        # The size of the images is not in the calibration.
         cameras = {}
         for name, files in images.items():
             if name not in known:
@@ -254,6 +259,8 @@ def _read_people(
     lacking = []
     seen = set[int]()
     there = sorted(set(frames) & set(files))
+
+    # Frames without the person are left out later, with a note.
     for frame in there:
         people = _people(root / files[frame])
         seen |= set(people)

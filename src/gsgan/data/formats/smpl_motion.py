@@ -71,9 +71,13 @@ def landmarks_of(
     conf = []
     for first in range(0, len(motion.ids), CHUNK):
         part = slice(first, first + CHUNK)
+
+        # Only SMPL-X has expressions.
         expression = None
         if motion.expression is not None:
             expression = torch.from_numpy(motion.expression[part])
+
+        # Only the vertices that are landmarks are posed.
         found, joints = small.pose(
             torch.from_numpy(motion.theta[part]),
             torch.from_numpy(motion.betas[part]),

@@ -254,6 +254,8 @@ def read_missing(
         for folder in image.parts[:-1]:
             if folder in cameras:
                 camera = folder
+
+        # A line that names no image of a camera is damage.
         frame = last_number(image.stem)
         if camera is None or frame is None:
             raise DataError(
@@ -293,6 +295,8 @@ def read_motion(
     transl = _rows(arrays, "transl", 3, path)
     count = len(transl)
     theta = np.zeros((count, sum(POSES.values())))
+
+    # All joints in one array, in the order of SMPL-X; absent ones stay at rest.
     first = 0
     for key, width in POSES.items():
         if key in arrays:

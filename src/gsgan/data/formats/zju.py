@@ -305,6 +305,7 @@ def _index_masks(
 
     # CIHP's part labels, which JPEG compression would damage; as masks, every part is the person.
     for name, folder in folders.items():
+        # Part labels, whose pixels above 0 are the person.
         parts = _mask_files(root, "mask_cihp", name, folder)
         masks[name] = {}
         labels[name] = {}

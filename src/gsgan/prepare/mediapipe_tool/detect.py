@@ -1,9 +1,10 @@
 """Finds body, hand and face landmarks, and the person's mask, in one video or folder of images.
 
 Runs in its own environment (requirements.txt beside it). `gsgan.prepare.mediapipe` starts it with a
-JSON object: source, out, masks (a folder, or empty), hands, face, rotate, threads (processors; 0 is
-all), slot (number among those that run at once). Prints a line ``<images done> <images in total>``
-per image. Writes an npz:
+JSON object: source, out, masks (a folder, or empty), hands, face, rotate, person (left, top, right,
+bottom of the person in the first image, shares of width and height; null: whoever is seen best),
+threads (processors; 0 is all), slot (number among those that run at once). Prints a line
+``<images done> <images in total>`` per image. Writes an npz:
 
     px (F,33,2), conf (F,33)     pixels of the image as stored, first pixel's centre at (0.5, 0.5)
     left, right (F,21,2)         the person's hands; NaN = not found
@@ -35,9 +36,14 @@ SUFFIXES = (".jpg", ".jpeg", ".png")
 JOINTS = 33
 HAND = 21
 FACE = 468
-MARGIN = (
-    0.15  # of the mask's crop beyond the joints, share of the person's height
-)
+# of the mask's crop beyond the joints, share of the person's height
+MARGIN = 0.15
+# Around a chosen person: how far the next image is searched beyond the joints, share of the
+# person's height, and how many joints of this confidence show where the person is.
+SEARCHED = 0.15
+CERTAIN = 0.5
+MIN_CERTAIN = 12
+PAINTED_GREY = 127
 
 
 def main() -> None:
@@ -51,14 +57,23 @@ def main() -> None:
         }
         os.sched_setaffinity(0, chosen)
     cv2.setNumThreads(options.threads or -1)
+
+    # The images, one at a time: a video does not fit into the memory.
     count, images = open_source(Path(options.source), options.rotate)
     folder = Path(options.masks) if options.masks else None
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
+
+    # The landmarks of each image, and its mask as a file.
     found: dict[str, list[Any]] = {}
     detector = Detector(options)
+    follower = Follower(options.person) if options.person else None
     for done, (frame, image) in enumerate(images, start=1):
+        if follower is not None:
+            image = follower.alone(image)
         landmarks = detector.landmarks(image)
+        if follower is not None:
+            follower.follow(landmarks["px"], landmarks["conf"])
         for name, value in (*landmarks.items(), ("frame_id", frame)):
             found.setdefault(name, []).append(value)
         if (
@@ -69,6 +84,8 @@ def main() -> None:
         print(done, max(done, count), flush=True)
     if not found:
         raise SystemExit(f"{options.source} holds no image that can be decoded")
+
+    # The results appear at once, when they are complete.
     out = Path(options.out)
     part = out.with_name(f".{out.name}")
     with part.open("wb") as stream:
@@ -92,6 +109,8 @@ def open_source(
         return len(files), (
             (frame, read_image(files[frame])) for frame in sorted(files)
         )
+
+    # The length that a video's header gives may be wrong or 0.
     video = cv2.VideoCapture(str(path))
     video.set(cv2.CAP_PROP_ORIENTATION_AUTO, int(rotate))
     return int(video.get(cv2.CAP_PROP_FRAME_COUNT)), enumerate(
@@ -114,6 +133,38 @@ def read_video(video: cv2.VideoCapture) -> Iterator[Any]:
         yield read[1]
 
 
+class Follower:
+    """One person among several: the others are painted over, as far as they are beside it.
+
+    Args:
+        box: left, top, right, bottom in the first image, shares of width and height.
+    """
+
+    def __init__(self, box: list[float]) -> None:
+        self.shares = np.array(box)
+        self.box: Any = None  # pixels: low and high corner, [2, 2]
+
+    def alone(self, image: Any) -> Any:
+        """The image, grey outside the box."""
+        size = np.array([image.shape[1], image.shape[0]])
+        if self.box is None:
+            self.box = self.shares.reshape(2, 2) * size
+        reach = SEARCHED * np.ptp(self.box, axis=0).max()
+        low = self.box[0] - reach
+        high = self.box[1] + reach
+        left, top = np.clip(low, 0, size).astype(int)
+        right, bottom = np.clip(high, 0, size).astype(int)
+        shown = np.full_like(image, PAINTED_GREY)
+        shown[top:bottom, left:right] = image[top:bottom, left:right]
+        return shown
+
+    def follow(self, px: Any, conf: Any) -> None:
+        """Moves the box to landmarks ``[33, 2]``, if they show a person."""
+        sure = (conf > CERTAIN) & np.isfinite(px).all(-1)
+        if sure.sum() >= MIN_CERTAIN:
+            self.box = np.stack([px[sure].min(0), px[sure].max(0)])
+
+
 class Detector:
     """The detectors of one video: they track the person from image to image."""
 
@@ -129,6 +180,7 @@ class Detector:
         )
 
     def landmarks(self, image: Any) -> dict[str, Any]:
+        # MediaPipe reads RGB; parts that it did not find are None.
         rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
         found = self.body.process(rgb)
         size = image.shape[1], image.shape[0]
@@ -140,6 +192,8 @@ class Detector:
             side: getattr(found, f"{side}_hand_landmarks", None)
             for side in ("left", "right")
         }
+
+        # Absent parts become NaN, so that every image has the same arrays.
         return {
             "px": pixels(pose, size, JOINTS),
             "conf": np.array(visibility, np.float32),
@@ -157,14 +211,21 @@ class Detector:
         """0..255 of the whole image, found in a crop around the person; None: nobody there."""
         if not np.isfinite(px).all():
             return None
+
+        # The box of the landmarks with a margin, inside the image.
         height, width = image.shape[:2]
         low = px.min(0)
         high = px.max(0)
         reach = MARGIN * (high - low).max()
         left, top = np.clip(low - reach, 0, [width - 1, height - 1]).astype(int)
         right, bottom = np.clip(high + reach, 1, [width, height]).astype(int)
+
+        # A person at the border may leave no pixels.
         if right - left < 2 or bottom - top < 2:
             return None
+
+        # The segmenter works at a fixed size: a crop gives the person more
+        # pixels.
         crop = cv2.cvtColor(image[top:bottom, left:right], cv2.COLOR_BGR2RGB)
         alpha = self.segmenter.process(crop).segmentation_mask
         if alpha is None:

@@ -58,6 +58,8 @@ def details(subjects: Sequence[Subject], shots: Sequence[Shot]) -> Drawing:
             rows[subject.name].append(
                 Panel(image, written(found["psnr"], 2, " dB"))
             )
+
+            # The details beside the image, with their own score.
             for name, box in boxes.items():
                 part = image[..., *box]
                 score = finite(psnr(part, shot.truth[..., *box]))
@@ -120,6 +122,8 @@ def detail_boxes(
         points = pixels[0, joints][counts[joints]]
         if len(points) == 0:
             continue
+
+        # A square keeps the proportions of what it magnifies.
         low = points.amin(dim=0)
         high = points.amax(dim=0)
         extent = float((high - low).max())

@@ -35,9 +35,8 @@ class Drawing:
 
     figure: Figure
     caption: str  # whole sentences, Markdown
-    numbers: dict[
-        str, Any
-    ]  # by image, panel and score; None if a score is not defined
+    # by image, panel and score; None if a score is not defined
+    numbers: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -69,6 +68,8 @@ def draw_panels(
         height, width = panel.image.shape[-2:]
         aspect = max(aspect, height / width)
         note_lines = max(note_lines, len(panel.note.splitlines()))
+
+    # The size of the page follows from the images: none is stretched.
     rows = len(panels)
     columns = len(panels[0])
     page_width = COLUMN_WIDTH if columns <= 3 else PAGE_WIDTH

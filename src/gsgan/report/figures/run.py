@@ -82,6 +82,8 @@ def comparison(
     for shot, held in zip(shots, images, strict=True):
         box = most_disputed(torch.cat(list(held.values())), DETAIL)
         boxes.append(box)
+
+        # The truth first, then each run with its scores.
         true_detail = shot.truth[..., *box]
         above = [Panel(shot.truth)]
         below = [Panel(true_detail)]
@@ -97,6 +99,8 @@ def comparison(
         panels.append(above)
         if detail:
             panels.append(below)
+
+    # Below each row of images the magnified boxes, if there are any.
     figure, axes = draw_panels(panels, titles=["truth", *images[0]])
     caption = "The ground truth and each run's image, with PSNR and the F1 of Canny edges"
     if not detail:
@@ -194,6 +198,8 @@ def make_figures(config: DictConfig) -> None:
     out = folders[0] / "figures"
     if config.out is not None:
         out = Path(config.out).expanduser()
+
+    # Every run's config is read before the first avatar is loaded.
     moved = DataPaths.from_config(config)
     for folder in folders:
         load_config(folder, moved)
@@ -213,6 +219,9 @@ def make_figures(config: DictConfig) -> None:
         for name in track(names, "drawing", console=console, transient=True):
             drawing = _draw(name, subjects, config)
             made[name] = drawing
+
+            # Vectors for print and pixels for pages, without a date: files of
+            # equal content are equal.
             for kind, metadata in METADATA.items():
                 stream = io.BytesIO()
                 drawing.figure.savefig(

@@ -133,6 +133,8 @@ def make_shots(
     shots: list[Shot] = []
     for first in range(0, len(frames), batch_size):
         batch = frames[first : first + batch_size]
+
+        # One window size for all frames of a batch.
         boxes = body_window(
             torch.cat([frame.skeleton for frame in batch]),
             cat([frame.camera for frame in batch]),
@@ -216,6 +218,8 @@ def _open(
     avatar, marks = load_avatar(folder, config, data)
     run = read_run(folder, scored=False)
     found = run.data | {"fingerprint": fingerprint(data)}
+
+    # The figures' data may differ from those of the scores.
     run = replace(run, seed=config.seed, data=found)
     name = TITLES.get(run.name, run.name)
     if run.name == "full" and run.departures == []:
