@@ -1,7 +1,9 @@
 """The groups callbacks, debug and logger, run on the tiny capture."""
 
+from pathlib import Path
+
 import pytest
-from commands import refused
+from commands import refused, train
 from lightning.pytorch.loggers import wandb as wandb_logger
 
 from gsgan.run.stored import CHECKPOINT
@@ -55,6 +57,54 @@ def test_a_run_that_a_callback_stops_is_not_scored_and_resumes(trained):
     )  # callbacks may differ between the parts of a run
     assert result.returncode == 0, result.stdout + result.stderr
     assert (folder / "metrics.json").is_file()
+
+
+@pytest.mark.parametrize(
+    ("name", "package"),
+    [
+        ("csv", "lightning"),
+        ("tensorboard", "tensorboard"),
+        ("mlflow", "mlflow"),
+    ],
+)
+def test_a_logger_keeps_the_scores_in_the_run_folder(
+    trained, monkeypatch, name, package
+):
+    """Without a server or an account; the files are read by the logger's own package."""
+    pytest.importorskip(package, reason=f"{package} is not installed")
+    monkeypatch.setenv("MLFLOW_ALLOW_FILE_STORE", "true")  # see docs/train.md
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    result, folder = trained(f"logger={name}", "evaluate=false")
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "val/psnr" in logged(name, folder)
+
+
+def test_wandb_offline_keeps_the_scores_in_the_run_folder(capture, tmp_path):
+    """In a process of its own, at whose end wandb completes its file."""
+    pytest.importorskip("wandb", reason="wandb is not installed")
+    folder = tmp_path / "run"
+    given = ("logger=wandb", "logger.offline=true", "evaluate=false")
+    result = train(capture, folder, *given)
+    assert result.returncode == 0, result.stdout + result.stderr
+    content = next(folder.rglob("run-*.wandb")).read_bytes()
+    assert b"val/psnr" in content
+
+
+def logged(name: str, folder: Path) -> set[str]:
+    """Names of the values that a logger has written."""
+    if name == "csv":
+        path = next(folder.rglob("metrics.csv"))
+        return set(path.read_text().partition("\n")[0].split(","))
+    if name == "tensorboard":
+        from tensorboard.backend.event_processing import event_accumulator
+
+        path = next(folder.rglob("events.out.tfevents.*"))
+        events = event_accumulator.EventAccumulator(str(path)).Reload()
+        return set(events.Tags()["scalars"])
+    return {
+        str(path.relative_to(path.parents[1]))
+        for path in folder.rglob("mlruns/*/*/metrics/*/*")
+    }
 
 
 def test_a_logger_whose_package_is_missing_is_named(trained, monkeypatch):
