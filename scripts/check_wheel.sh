@@ -50,7 +50,8 @@ for file in (
     *("body/assets/free_body.npz", "body/assets/body_space.npz", "body/assets/ATTRIBUTION.md"),
     *(f"synthetic/avatars/{name}" for name in ("blouse.glb", "polo.glb", "LICENSE", "ATTRIBUTION.md")),
     *(f"export/web/{name}" for name in ("gsgan.js", "page.html", "page.css")),
-    *("splat/native.cpp", "splat/kernels/tile.h", "skeleton/templates.npz"),
+    *(f"run/demo/{name}" for name in ("config.json", "model.safetensors", "README.md", "dance.npz")),
+  *("splat/native.cpp", "splat/kernels/tile.h", "skeleton/templates.npz"),
 ):
     assert (package / file).is_file(), f"the wheel lacks {file}"
 if any(map(shutil.which, build.COMPILERS)):
@@ -63,7 +64,10 @@ test -s run/metrics.json
 "$python" -m gsgan.evaluate run="$folder/run"
 "$python" -m gsgan.report run="$folder/run" runs="$folder/run" figures=[strip]
 "$python" -m gsgan
+"$python" -m gsgan.demo out="$folder/demo" frames=5 pixels=128
+test -s demo/picture.png
 for command in prepare check fit; do
   "$python" -m gsgan.$command --help >help.txt
 done
+"$python" -m gsgan.bench speed --help >help.txt
 echo "the wheel works from $folder"

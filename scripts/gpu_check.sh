@@ -49,7 +49,7 @@ step() {
   fi
 }
 
-speed=("$python" scripts/bench/speed.py device="$device" size=full)
+speed=("$python" -m gsgan.bench speed device="$device" size=full)
 # the default person, traced small and enlarged: tracing at 512² would take most of the time
 data=(data=synthetic data.source.size=128 data.source.train_cameras=4 data.source.test_cameras=1
   data.source.frames=12 data.source.test_frames=2 data.source.rays_per_pixel=4)

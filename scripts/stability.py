@@ -23,9 +23,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 sys.path.insert(0, str(Path(__file__).resolve().parent / "bench"))
 
 from bench_common import Bench, records
-from bench_tables import markdown, number, sentence
 from stability.cases.case import compare_all
 
+from gsgan.bench.common import markdown, number, sentence
 from gsgan.utils.errors import GsganError
 from gsgan.utils.files import write_atomically
 

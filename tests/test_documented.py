@@ -388,8 +388,15 @@ def test_every_documented_command_runs(
         if "-m" in arguments:
             arguments = shorter_sweep(arguments, tmp_path)
         arguments = tiny_training(arguments, capture)
+    if name == "gsgan.bench":
+        arguments = [
+            arguments[0],
+            *tiny_bench(arguments[0], arguments[1:], capture),
+        ]
     if name.startswith("scripts/bench/"):
         arguments = tiny_bench(Path(name).stem, arguments, capture)
+    if name == "gsgan.demo":
+        arguments += ["frames=2", "pixels=64"]
     if name == "gsgan.fit":
         arguments += ["size.image=32", "fit.points=200", "fit.surface_steps=2"]
         arguments += ["fit.sweeps=1", f"out={tmp_path / 'fit'}"]

@@ -69,9 +69,12 @@ def test_evaluate_finds_a_dataset_that_moved(run, capture, tmp_path, inside):
     }  # the scores of both splits stay
 
 
-@pytest.mark.parametrize("command", ["evaluate", "report"])
+@pytest.mark.parametrize("command", ["evaluate", "report", "bench speed"])
 def test_a_model_file_is_refused_for_a_run_that_read_none(command, run, inside):
-    result = inside(command, f"run={run}", "data_smpl=/SMPL_NEUTRAL.pkl")
+    command, *first = command.split()
+    result = inside(
+        command, *first, f"run={run}", "data_smpl=/SMPL_NEUTRAL.pkl"
+    )
     refused(result, "data_smpl", "was trained without a body model file")
 
 
@@ -82,6 +85,13 @@ def test_a_dataset_that_is_gone_is_asked_for(run, tmp_path, inside):
         str(tmp_path / "away"),
         "does not exist",
         "data_root=<where it is now>",
+    )
+
+
+def test_nothing_has_moved_where_there_is_no_run(inside):
+    refused(
+        inside("bench", "speed", "data_root=/x"),
+        "data_root and data_smpl require run=",
     )
 
 

@@ -10,6 +10,9 @@ import pytest
 from commands import ROOT
 from PIL import Image
 
+from gsgan.run.shared import DEMO_FOLDER
+from gsgan.utils.provenance import verify
+
 FOLDER = ROOT / "docs" / "examples"
 TINY = ["size=tiny", "data.size=32", "data.body=none"]
 FEW = [
@@ -74,6 +77,51 @@ def test_a_loss_and_an_ablation_of_your_own(script, capture, tmp_path):
     assert all("smooth" in path.read_text().partition("\n")[0] for path in logs)
     table = (tmp_path / "runs" / "own_loss_table" / "report.md").read_text()
     assert "wo_normals" in table
+
+
+def test_gaussians_are_fitted_to_an_image(script, tmp_path):
+    image = str(DEMO_FOLDER / "preview.png")
+    psnr = script("fit_image").main(image, str(tmp_path / "a.png"), 60)
+    assert psnr > 22  # 30.4 after 300 iterations, 9.7 before the first
+    with Image.open(tmp_path / "a.png") as found:
+        assert found.size == (128, 128)
+
+
+def test_gaussians_follow_a_pose(script, tmp_path):
+    script("densify_and_pose").main(str(tmp_path / "a.png"))
+    with Image.open(tmp_path / "a.png") as file:
+        pixels = np.asarray(file).astype(int)
+    still, moved = pixels[:, :256], pixels[:, 256:]
+    changed = np.abs(moved - still).max(axis=-1) > 20
+    # One arm has moved: the legs, and the other arm, have not.
+    assert changed[:, :128].mean() > 0.01
+    assert not changed[130:].any()
+    assert not changed[:, 150:].any()
+
+
+def test_the_avatar_is_driven_into_a_video(script, tmp_path):
+    av = pytest.importorskip("av")
+    out = tmp_path / "a.mp4"
+    script("drive_avatar").main(out, frames=3)
+    assert verify(out).synthetic
+    with av.open(out) as container:
+        frames = [x.to_ndarray(format="rgb24") for x in container.decode()]
+    assert len(frames) == 3
+    assert frames[0].min() < 60  # somebody is there, on white
+
+
+def test_the_notebook_runs(tmp_path, monkeypatch):
+    nbclient = pytest.importorskip("nbclient")
+    nbformat = pytest.importorskip("nbformat")
+    pytest.importorskip("av")
+    monkeypatch.setenv("GSGAN_NOTEBOOK_PIXELS", "64")
+    monkeypatch.setenv("GSGAN_NOTEBOOK_FRAMES", "2")
+    monkeypatch.setenv("PYTHONPATH", str(ROOT / "src"), prepend=os.pathsep)
+    book = nbformat.read(FOLDER / "first_look.ipynb", as_version=4)
+    assert not any(cell.get("outputs") for cell in book.cells)
+    place = {"metadata": {"path": str(tmp_path)}}
+    nbclient.NotebookClient(book, timeout=300, resources=place).execute()
+    assert (tmp_path / "dance.mp4").is_file()
 
 
 def test_the_page_lists_the_scripts():

@@ -103,8 +103,8 @@ def test_each_step_runs_once_and_its_options_exist(tmp_path, compose, device):
                 for word in words
                 if word.startswith("tests")
             )
-        elif words[0].endswith("speed.py"):
-            compose("bench_speed", *without_folder(words[1:]))
+        elif words[1] == "gsgan.bench":
+            compose(f"bench_{words[2]}", *without_folder(words[3:]))
         elif words[0].endswith("raster.py"):
             options = OmegaConf.load(ROOT / words[0].replace(".py", ".yaml"))
             assert {word.split("=")[0] for word in words[1:]} <= set(options)

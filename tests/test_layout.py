@@ -26,7 +26,7 @@ PARTS = (
     "metrics",
     "run",
 )
-ENTRIES = 27
+ENTRIES = 28
 # lines at most; a file of one purpose is not split to be shorter
 FILES = sorted(PACKAGE.rglob("*.py"))
 

@@ -17,7 +17,6 @@ from typing import Any
 
 import pandas as pd
 import torch
-from bench_tables import check_whole, environment, sentence
 from hydra.utils import instantiate
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
@@ -34,6 +33,7 @@ from rich.progress import (
     TimeElapsedColumn,
 )
 
+from gsgan.bench.common import check_whole, environment, sentence
 from gsgan.scene import Frame
 from gsgan.splat import Accuracy, buffers
 from gsgan.utils.config import config_folder

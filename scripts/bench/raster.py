@@ -17,11 +17,11 @@ from typing import Any
 import bench_common
 import pandas as pd
 import torch
-from bench_tables import NOTHING, check_whole, markdown, number, sentence
 from omegaconf import DictConfig, OmegaConf
 from timing import interleaved, median
 from torch import Tensor
 
+from gsgan.bench.common import NOTHING, check_whole, markdown, number, sentence
 from gsgan.body.free import free_body
 from gsgan.scene import Camera, Gaussians, Raster
 from gsgan.skeleton import MEDIAPIPE33, Densify

@@ -11,10 +11,16 @@ from typing import Any
 import bench_common
 import pandas as pd
 import torch
-from bench_tables import NOTHING, check_whole, markdown, number, sentence
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
-from speed import (
+from timing import interleaved
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+from torch.utils.flop_counter import flop_registry
+
+from gsgan.bench.common import NOTHING, check_whole, markdown, number, sentence
+from gsgan.bench.speed import (
     REST_STAGE,
     TOTAL,
     load_subject,
@@ -22,12 +28,6 @@ from speed import (
     measure,
     without_denormals,
 )
-from timing import interleaved
-from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
-from torch.utils.flop_counter import flop_registry
-
 from gsgan.model.avatar import Avatar, unwatched
 from gsgan.scene import Camera, Frame, Gaussians
 from gsgan.splat import Accuracy

@@ -7,7 +7,8 @@ from collections.abc import Callable, Hashable, Mapping
 from typing import TypeVar
 
 import torch
-from speed import timed
+
+from gsgan.bench.speed import timed
 
 Key = TypeVar("Key", bound=Hashable)
 

@@ -19,9 +19,14 @@ import bench_common
 import numpy as np
 import pandas as pd
 import torch
-from bench_tables import NOTHING, check_whole, markdown, number, sentence
 from omegaconf import DictConfig, OmegaConf
-from speed import (
+from timing import interleaved
+from torch import Tensor
+from torch.nn import functional
+
+from gsgan.bench import common
+from gsgan.bench.common import NOTHING, markdown, number
+from gsgan.bench.speed import (
     PRECISIONS,
     deciles,
     make_painter,
@@ -30,10 +35,6 @@ from speed import (
     spread,
     without_denormals,
 )
-from timing import interleaved
-from torch import Tensor
-from torch.nn import functional
-
 from gsgan.data.datamodule import GsganData
 from gsgan.metrics.image import edge_f1, psnr, ssim
 from gsgan.model.avatar import Avatar
@@ -179,7 +180,7 @@ def run(config: DictConfig, folder: Path) -> None:
         ConfigError: on a wrong value.
         DataError: when a run or its data cannot be read.
     """
-    check_whole(config, repeats=1, images=1)
+    common.check_whole(config, repeats=1, images=1)
     above("patience", config.patience)
     one_of("split", config.split, ("novel_pose", "novel_view"))
     one_of("quality", config.quality, QUALITIES)
@@ -501,9 +502,7 @@ def text(
         f"{QUALITIES[metric][3]:g} of its score ({QUALITIES[metric][0]})."
     )
     listed = "\n".join(f"- {note}" for note in notes)
-    machine = f"{sentence(where)}."
-    parts = (machine, heading, table(frame, metric), listed)
-    return "\n\n".join(parts).strip()
+    return f"{common.sentence(where)}.\n\n{heading}\n\n{table(frame, metric)}\n\n{listed}".strip()
 
 
 def table(frame: pd.DataFrame, metric: str) -> str:

@@ -1,6 +1,7 @@
 """``python -m gsgan`` lists the commands."""
 
 COMMANDS = {
+    "gsgan.demo": "a picture and a video of a ready avatar, without training",
     "gsgan.prepare": "make a dataset from videos: source=<folder> out=<folder>",
     "gsgan.check": "check a dataset before training: data=capture data.root=<folder>",
     "gsgan.fit": "fit the body to a capture's masks: data=capture data.root=<folder>",
@@ -11,6 +12,7 @@ COMMANDS = {
     "gsgan.export": "write .ply, .glb, .onnx, .pt2, .safetensors, .bvh: run=<folder> out=<file>",
     "gsgan.report": "tables of scored runs, runs=[<folder>,…], and figures of a run, run=<folder>",
     "gsgan.weights": "find or download the networks of the perceptual loss and of LPIPS",
+    "gsgan.bench": "measure milliseconds from skeleton to image: speed",
 }
 
 

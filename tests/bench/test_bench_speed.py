@@ -1,18 +1,23 @@
-"""scripts/bench/speed.py: stages, precision and memory of a tiny avatar, and error messages."""
+"""`gsgan.bench speed`: stages, precision and memory of a tiny avatar, and error messages."""
 
 import json
 import platform
-import runpy
-import sys
-from types import SimpleNamespace
 
 import pandas as pd
 import pytest
 import torch
-from bench_tables import cpu_name, environment, number, sentence
-from commands import ROOT, refused
-from speed import deciles, in_batches, make_painter, measure, spread, text
+from commands import refused
 
+from gsgan.bench.__main__ import main
+from gsgan.bench.common import cpu_name, environment, number, sentence
+from gsgan.bench.speed import (
+    deciles,
+    in_batches,
+    make_painter,
+    measure,
+    spread,
+    text,
+)
 from gsgan.model.avatar import UNWATCHED, unwatched
 from gsgan.utils.errors import ConfigError
 
@@ -29,30 +34,6 @@ ALL = [
     "Ω",
 ]
 ALL += ["pose encoder", "UNet", "paste"]
-
-
-@pytest.fixture
-def command(tmp_path, monkeypatch, capfd):
-    """Runs the script in this process."""
-
-    def run(*arguments: str) -> SimpleNamespace:
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(sys, "argv", ["speed.py", *arguments])
-        monkeypatch.setattr(
-            "gsgan.utils.tensors.keep_freed_memory", lambda: None
-        )
-        code = 0
-        try:
-            runpy.run_path(
-                str(ROOT / "scripts" / "bench" / "speed.py"),
-                run_name="__main__",
-            )
-        except SystemExit as end:
-            code = end.code or 0
-        out, err = capfd.readouterr()
-        return SimpleNamespace(returncode=code, stdout=out, stderr=err)
-
-    return run
 
 
 @pytest.fixture
@@ -205,7 +186,7 @@ def test_the_table_adds_up():
 
 
 @pytest.mark.slow
-def test_the_command_times_a_run(run, tmp_path, command):
+def test_the_command_times_a_run(run, tmp_path, inside):
     out = tmp_path / "out"
     given = [
         f"run={run}",
@@ -214,7 +195,7 @@ def test_the_command_times_a_run(run, tmp_path, command):
         "poses=2",
         f"hydra.run.dir={out}",
     ]
-    done = command(*given)
+    done = inside("bench", "speed", *given)
     assert done.returncode == 0, done.stderr
     found = json.loads((out / "speed.json").read_text())
     assert list(found["times_ms"]["stages"]) == ALL
@@ -234,7 +215,7 @@ def test_the_command_times_a_run(run, tmp_path, command):
 
 
 def test_the_command_times_an_untrained_avatar_at_its_size(
-    capture, tmp_path, command
+    capture, tmp_path, inside
 ):
     out = tmp_path / "out"
     given = [
@@ -244,7 +225,9 @@ def test_the_command_times_an_untrained_avatar_at_its_size(
         "frames=1",
         "warmup=0",
     ]
-    done = command(*given, "model=splat_only", f"hydra.run.dir={out}")
+    done = inside(
+        "bench", "speed", *given, "model=splat_only", f"hydra.run.dir={out}"
+    )
     assert done.returncode == 0, done.stderr
     found = json.loads((out / "speed.json").read_text())
     assert found["settings"]["image"] == "64 x 64"
@@ -262,8 +245,14 @@ def test_the_command_times_an_untrained_avatar_at_its_size(
         ("backend=vulkan", ["backend", "native"]),
         ("run=/nowhere", ["/nowhere", "not a run folder"]),
         ("device=cuda:99", ["device=cuda:99"]),
-        ("data_root=/x", ["data_root and data_smpl require run="]),
     ],
 )
-def test_what_makes_no_sense_ends_in_one_sentence(command, given, words):
-    refused(command(given), *words)
+def test_what_makes_no_sense_ends_in_one_sentence(inside, given, words):
+    refused(inside("bench", "speed", given), *words)
+
+
+@pytest.mark.parametrize("words", [(), ("trade-off", "run=x")])
+def test_another_subject_is_refused(monkeypatch, words):
+    monkeypatch.setattr("sys.argv", ["bench", *words])
+    with pytest.raises(SystemExit, match="the first word must be speed"):
+        main()

@@ -1,11 +1,15 @@
 """``python -m gsgan.export``: files, cards and refusals of the real command."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from commands import refused
+from omegaconf import OmegaConf
 from PIL import Image
+from safetensors.torch import save_file
 
 from gsgan.export.splats import Splats, ply_bytes
 from gsgan.utils.errors import DataError
@@ -112,16 +116,14 @@ def test_a_trained_run_as_safetensors_with_its_scores(run, tmp_path, inside):
     assert "marked: perceptual loss" in card
 
 
-def test_safetensors_name_no_class_but_gsgans_own(run, tmp_path):
-    from gsgan.export.weights import load_weights, weights_bytes
-    from gsgan.run.runs import load
-    from gsgan.run.stored import CHECKPOINT, read_checkpoint
+def test_safetensors_name_no_class_but_gsgans_own(run, compose, tmp_path):
+    from gsgan.export.weights import load_weights, safetensors_file
+    from gsgan.run.runs import Run
+    from gsgan.run.stored import read_config
 
-    facts = read_checkpoint(run / CHECKPOINT)["gsgan"]
-    content, path = (
-        weights_bytes(run, load(run), facts),
-        tmp_path / "a.safetensors",
-    )
+    config = compose("export", f"run={run}", "+device=cpu")
+    content = safetensors_file(Run.load(config))
+    path = tmp_path / "a.safetensors"
     path.write_bytes(content)
     assert load_weights(path).splats is not None
     target = b"gsgan.model.deformation.Deformation"
@@ -132,6 +134,19 @@ def test_safetensors_name_no_class_but_gsgans_own(run, tmp_path):
     ):
         path.write_bytes(content.replace(target, other.ljust(len(target))))
         with pytest.raises(DataError, match="not a class of gsgan"):
+            load_weights(path)
+
+    # An interpolation makes a value, and with it the name of a class.
+    for text in (
+        "${oc.create:{_target_: os.getcwd}}",
+        "\\${oc.create:{_target_: os.getcwd}}",  # resolved, it is the one above
+    ):
+        config = OmegaConf.to_container(read_config(run))
+        config["model"]["supersample"] = text
+        tensors = {"a": torch.zeros(1)}
+        metadata = {"config": json.dumps(config), "gsgan": "{}"}
+        save_file(tensors, path, metadata)
+        with pytest.raises(DataError, match="getcwd"):
             load_weights(path)
     path.write_bytes(content.replace(b'\\"model\\"', b'\\"modem\\"'))
     with pytest.raises(DataError, match="metadata is damaged"):

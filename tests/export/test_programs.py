@@ -14,8 +14,8 @@ from gsgan.export.programs import (
     torch_program,
     unfrozen,
 )
-from gsgan.export.weights import load_weights, weights_bytes
-from gsgan.run.stored import read_checkpoint
+from gsgan.export.weights import load_weights, safetensors_file
+from gsgan.run.runs import Run
 from gsgan.utils.errors import ConfigError, DataError
 
 PARITY = 1e-3
@@ -145,11 +145,11 @@ def test_splat_only_has_no_onnx(painted):
         onnx_program(painted("model=splat_only")[0])
 
 
-def test_safetensors_give_the_run_back(run, build, tmp_path):
+def test_safetensors_give_the_run_back(run, build, compose, tmp_path):
     avatar, (_, _, frame) = gsgan.load(run), build()
-    facts = read_checkpoint(run / "checkpoints" / "last.ckpt")["gsgan"]
     path = tmp_path / "a.safetensors"
-    path.write_bytes(weights_bytes(run, avatar, facts))
+    config = compose("export", f"run={run}", "+device=cpu")
+    path.write_bytes(safetensors_file(Run.load(config)))
     again = load_weights(path)
     given = frame.skeleton, frame.camera
     assert torch.equal(

@@ -1,18 +1,22 @@
 """Writes the export that a config describes."""
 
-import json
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-import yaml
 from omegaconf import DictConfig, open_dict
 from rich.console import Console
 
-from gsgan import __version__
+from gsgan.export.card import card
+from gsgan.export.hub import (
+    CARD_FILE,
+    PREVIEW,
+    avatar_files,
+    preview,
+    refuse_missing_hub,
+    upload,
+)
 from gsgan.export.motions import (
     BodyMotion,
     bvh_text,
@@ -21,7 +25,7 @@ from gsgan.export.motions import (
 )
 from gsgan.export.page import block, page, refuse_unsuitable
 from gsgan.export.splats import glb_bytes, ply_bytes, splats_of
-from gsgan.metrics.names import FLOOR_VARIANT, VARIANTS
+from gsgan.export.weights import safetensors_file
 from gsgan.run.drive import (
     REST,
     Drive,
@@ -36,139 +40,9 @@ from gsgan.utils.checks import above, one_of, whole
 from gsgan.utils.console import make_console, track
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.files import write_atomically, writing
-from gsgan.utils.pages import markdown
 from gsgan.utils.provenance import verify
 
-LINEAR = (
-    "without its networks: Step I's colour, with residuals linear in the harmonics of each "
-    "Gaussian's normal."
-)
-# What a model card says about the content of each format.
-HOLDS = {
-    "ply": "The avatar's Gaussians in one pose per file, in the convention of 3D Gaussian "
-    "splatting. They show Step I's colour; the generator's image needs gsgan.",
-    "gltf": "The avatar's Gaussians in one pose, as KHR_gaussian_splatting. They show Step I's "
-    "colour; the generator's image needs gsgan.",
-    "onnx": "Pose encoder and generator: images of the splats and the skeleton in, image and alpha "
-    "out. Rasterisation is not part of it.",
-    "torch": "The whole avatar as a program of `torch.export`: skeleton and camera in, image and "
-    "alpha out. Import `gsgan.splat` before loading it.",
-    "html": f"A page that renders the avatar in a browser, {LINEAR}",
-    "bin": f"The avatar of a web page, for gsgan.js in a page of your own, {LINEAR}",
-    "safetensors": "The weights, with the config as metadata: "
-    "`gsgan.export.weights.load_weights(file)` gives the avatar.",
-}
-# Metrics of a model card, and their headings.
-SCORES = {
-    "psnr": "PSNR ↑",
-    "ssim": "SSIM ↑",
-    "lpips_vgg": "LPIPS-VGG ↓",
-    "lpips_alex": "LPIPS-Alex ↓",
-    "edge_f1": "edge F1 ↑",
-}
-USE = """\
-Images of this one person in new poses and from new cameras, with the person's consent: sign
-language, research, telepresence, film. Its images are synthetic: say so where they are shown
-(`gsgan.render` writes it into the files' metadata).
-
-Not intended for deceiving anyone about what the person did or said, or for identifying people.
-Poses and cameras far from the training data give worse images than the scores suggest."""
-
-
-def card(run: Run, kind: str, name: str, licence: str | None) -> str:
-    """The text of a model card.
-
-    Args:
-        run: the avatar's.
-        kind: a key of `HOLDS`.
-        name: of the exported file or folder.
-        licence: of the weights, or None if the user gave none.
-    """
-    facts = _read(run.folder / "facts.json")
-    data = facts.get("data", {})
-
-    # The card's header is read by hubs such as Hugging Face.
-    head = {
-        "license": licence or "other",
-        "library_name": "gsgan",
-        "tags": ["gaussian-splatting", "human-avatar", "synthetic-media"],
-    }
-
-    # How the avatar was trained; unknown facts are left out.
-    identity = [data.get(key) for key in ("name", "root", "fingerprint")]
-    about = {
-        "data": " ".join(str(value) for value in identity if value),
-        "training cameras": run.scene.n_train_cameras,
-        "image size": run.stored.data.size,
-        "protocol": facts.get("protocol") or "none",
-        "model": facts.get("model"),
-        "iterations": run.checkpoint["step"],
-        "seed": run.stored.get("seed"),
-        "gsgan": facts.get("version", __version__),
-        "commit": facts.get("commit"),
-    }
-    known = []
-    for key, value in about.items():
-        if value not in (None, ""):
-            known.append((key, str(value)))
-
-    # Scores, and what makes them incomparable with others.
-    scores = [_scores(run.folder)]
-    scores += [f"- marked: {mark}" for mark in run.checkpoint.get("marks", [])]
-    parts = [
-        f"---\n{yaml.safe_dump(head, sort_keys=False)}---",
-        f"# {name}\n\nOne person's avatar, trained with gsgan (GaussianGAN). {HOLDS[kind]}",
-        f"## Data and training\n\n{markdown(('', ''), known)}",
-        f"## Effects\n\n{markdown(('effect', '', 'why'), run.avatar.effects.rows())}",
-        "## Scores on held-out images\n\n" + "\n\n".join(scores),
-        f"## Intended use\n\n{USE}",
-        "## Licence\n\n" + (licence or _licence(data.get("name"))),
-    ]
-    return "\n\n".join(parts) + "\n"
-
-
-def _licence(data: str | None) -> str:
-    if data == "synthetic":
-        owner = (
-            "The default person is a character under the MIT licence; weights trained on it are "
-            "too."
-        )
-    else:
-        owner = (
-            "The weights show a person: that person and the owner of the training images decide "
-            "what may be done with them. State it with licence=."
-        )
-    return f"gsgan itself is under Apache-2.0. {owner}"
-
-
-def _scores(folder: Path) -> str:
-    # One row per split and variant that a user of the file can render.
-    table = []
-    for split, variants in _read(folder / "metrics.json").items():
-        for variant, scores in variants.items():
-            if variant != FLOOR_VARIANT:
-                numbers = [_number(scores.get(key)) for key in SCORES]
-                table.append((split, VARIANTS[variant], *numbers))
-
-    if not table:
-        return "Not evaluated: run `python -m gsgan.evaluate` first."
-    return markdown(("split", "", *SCORES.values()), table)
-
-
-def _number(value: float | None) -> str:
-    return "n/a" if value is None else f"{value:.4g}"
-
-
-def _read(path: Path) -> dict[str, Any]:
-    # A run that has not been evaluated lacks these files.
-    try:
-        found = json.loads(path.read_text())
-    except (OSError, ValueError):
-        return {}
-    return found if isinstance(found, dict) else {}
-
-
-# The ending of each format's files; a model card lies beside each file.
+# The ending of each format's files, or nothing for a folder; a model card lies beside each file.
 ENDINGS = {
     "ply": ".ply",
     "gltf": ".glb",
@@ -179,9 +53,11 @@ ENDINGS = {
     "bin": ".bin",
     "bvh": ".bvh",
     "motion_glb": ".glb",
+    "hub": "",
 }
 MOTIONS = ("bvh", "motion_glb")  # formats that hold a motion and no avatar
 CARD = "MODEL_CARD.md"
+PREVIEW_SIZE = 512  # pixels, of runs whose images have sizes of their own
 
 
 def export_config(config: DictConfig) -> None:
@@ -213,7 +89,8 @@ def export_config(config: DictConfig) -> None:
     # that they name no device.
     kind = one_of("format", config.format, tuple(ENDINGS))
     out = _place(config, kind)
-    sequence = not out.suffix
+    sequence = kind == "ply" and not out.suffix
+    _check_upload(config, kind)
     with open_dict(config):
         config.device = "cpu"
     if kind in MOTIONS:
@@ -224,28 +101,12 @@ def export_config(config: DictConfig) -> None:
         )
         return
     run = Run.load(config)
+    if kind == "hub":
+        _hub(config, run, out, tell)
+        return
 
-    # Gaussians in one pose per file; a glTF file without a motion shows the rest pose.
     if kind in ("ply", "gltf"):
-        rest = config.motion is None and kind == "gltf"
-        drive = _poses(with_motion(config, REST) if rest else config, run)
-        tell(drive.text)
-        numbers = range(len(drive.p)) if sequence else range(1)
-        for i in track(numbers, "writing", console):
-            name = (
-                out / f"{drive.numbers[i]:06d}{ENDINGS[kind]}"
-                if sequence
-                else out
-            )
-            _write(name, _splats(run, drive, i, kind))
-
-        # A shorter sequence replaces a longer one: files of later frames are removed.
-        if sequence and (out / CARD).is_file():
-            kept = {f"{number:06d}.ply" for number in drive.numbers}
-            with writing(out):
-                for path in out.glob("[0-9]" * 6 + ".ply"):
-                    if path.name not in kept:
-                        path.unlink()
+        _write_poses(config, run, out, console)
 
     # A page, or its content for a page of the user's own.
     elif kind in ("html", "bin"):
@@ -266,6 +127,32 @@ def _write(path: Path, content: str | bytes) -> None:
         write_atomically(path, content)
 
 
+def _write_poses(
+    config: DictConfig, run: Run, out: Path, console: Console
+) -> None:
+    """Writes Gaussians in one pose per file: one file, or a sequence of .ply files in a folder."""
+    # A glTF file without a motion shows the rest pose.
+    kind = config.format
+    rest = config.motion is None and kind == "gltf"
+    drive = _poses(with_motion(config, REST) if rest else config, run)
+    console.print(drive.text, markup=False, highlight=False, soft_wrap=True)
+    if out.suffix:
+        _write(out, _splats(run, drive, 0, kind))
+        return
+
+    # Files are named by the numbers of their frames.
+    names = [f"{number:06d}.ply" for number in drive.numbers]
+    for i in track(range(len(names)), "writing", console):
+        _write(out / names[i], _splats(run, drive, i, kind))
+
+    # A shorter sequence replaces a longer one: files of later frames are removed.
+    if (out / CARD).is_file():
+        with writing(out):
+            for path in out.glob("[0-9]" * 6 + ".ply"):
+                if path.name not in names:
+                    path.unlink()
+
+
 def _place(config: DictConfig, kind: str) -> Path:
     """``out``, checked: a file of the format's ending, or a folder for a sequence of .ply files."""
     # A capture has motion, but no avatar.
@@ -276,17 +163,16 @@ def _place(config: DictConfig, kind: str) -> Path:
 
     # The name must say the format: a file with its ending, or a folder for .ply files.
     ending = ENDINGS[kind]
-    folders = " or a folder" if kind == "ply" else ""
+    places = {"ply": "a .ply file or a folder", "hub": "a folder"}
+    place = places.get(kind, f"a {ending} file")
     if config.out is None:
-        raise ConfigError(f"out is not set: give out=<file>{ending}{folders}")
+        raise ConfigError(f"out is not set: format={kind} needs {place}")
     out = Path(config.out).expanduser()
-    if out.suffix.lower() != ending and (out.suffix or kind != "ply"):
-        raise ConfigError(
-            f"out={out}: format={kind} needs a {ending} file{folders}"
-        )
+    folder = kind == "hub" or (kind == "ply" and not out.suffix)
+    if not folder and out.suffix.lower() != ending:
+        raise ConfigError(f"out={out}: format={kind} needs {place}")
 
     # Nothing is overwritten unless the user says so.
-    folder = not out.suffix
     if out.exists() and out.is_dir() != folder:
         found = (
             "a file; expected a folder"
@@ -303,6 +189,37 @@ def _place(config: DictConfig, kind: str) -> Path:
             f"out={out} exists; give overwrite=true or another name"
         )
     return out
+
+
+def _check_upload(config: DictConfig, kind: str) -> None:
+    """Refuses options of an upload that cannot be met, before anything is computed."""
+    if config.upload is None:
+        if config.private:
+            raise ConfigError("private=true requires upload=<owner/name>")
+        return
+    if kind != "hub":
+        raise ConfigError("upload requires format=hub")
+    refuse_missing_hub(config.upload)
+
+
+def _hub(
+    config: DictConfig, run: Run, out: Path, tell: Callable[[str], None]
+) -> None:
+    """Writes the folder of a shared avatar, and uploads it if the user asks for it."""
+    # The preview shows the first pose of the motion; the rest pose needs no dataset.
+    rest = config.motion is None
+    drive = _poses(with_motion(config, REST) if rest else config, run)
+    tell(drive.text)
+    name = config.upload or out.name
+    files = avatar_files(run)
+    files[CARD_FILE] = card(run, "hub", name, config.licence).encode()
+    files[PREVIEW] = preview(run, drive, run.stored.data.size or PREVIEW_SIZE)
+    for file, content in files.items():
+        _write(out / file, content)
+    tell(f"written: {out}, {', '.join(files)}")
+    if config.upload is not None:
+        address = upload(files, config.upload, bool(config.private))
+        tell(f"uploaded: {address}")
 
 
 def _block(
@@ -383,11 +300,7 @@ def _splats(run: Run, drive: Drive, i: int, kind: str) -> bytes:
 def _program(config: DictConfig, run: Run, kind: str) -> bytes:
     """The content of a .onnx, .pt2 or .safetensors file."""
     if kind == "safetensors":
-        from gsgan.export.weights import weights_bytes
-
-        # The scene as plain values, with the fields that this version reads.
-        facts = run.checkpoint | {"scene": asdict(run.scene)}
-        return weights_bytes(run.folder, run.avatar, facts)
+        return safetensors_file(run)
     from gsgan.export.programs import onnx_program, torch_program
 
     # The other formats need the exporters of torch, which take long to import.

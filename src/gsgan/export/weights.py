@@ -1,57 +1,55 @@
 """Weights as safetensors: what `gsgan.load` needs of a run, in one file without pickle."""
 
 import json
-import re
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from safetensors.torch import save
 
 from gsgan.model.avatar import Avatar
-from gsgan.run.runs import avatar_of
-from gsgan.run.stored import read_config
-from gsgan.utils.config import config_folder
-from gsgan.utils.errors import ConfigError, DataError
+from gsgan.run.runs import Run, avatar_of
+from gsgan.run.shared import (
+    ENTRIES,
+    FACTS,
+    checked_config,
+    read_weights,
+    refusing_damage,
+)
+from gsgan.utils.errors import DataError
 from gsgan.utils.tensors import pick_device
 
-KEPT_FACTS = ("effects", "scene", "marks")  # of a checkpoint's facts
-DAMAGED = (
-    AttributeError,
-    LookupError,
-    RecursionError,
-    TypeError,
-    ValueError,
-    OmegaConfBaseException,
-)
-NEEDS_SAFETENSORS = "safetensors files need: pip install 'gsgan[export]'"
 
-
-def weights_bytes(folder: Path, avatar: Avatar, facts: dict[str, Any]) -> bytes:
-    """A .safetensors file of the avatar of a run folder.
-
-    Args:
-        folder: the run's.
-        avatar: its avatar.
-        facts: ``gsgan`` of its checkpoint.
+def facts_of(run: Run) -> dict[str, Any]:
+    """The facts that an avatar is built from beside its weights, as plain values: entries
+    ``config`` and ``gsgan``, see `gsgan.run.shared`.
 
     Raises:
-        ConfigError: when the package safetensors is missing.
+        DataError: when the config names a class that is not one of gsgan's own configs.
     """
-    try:
-        from safetensors.torch import save
-    except ImportError:
-        raise ConfigError(NEEDS_SAFETENSORS) from None
+    config = checked_config(run.folder, run.stored)
+    # The scene as plain values, with the fields that this version reads.
+    facts = run.checkpoint | {"scene": asdict(run.scene)}
+    return {
+        "config": OmegaConf.to_container(config),
+        "gsgan": {key: facts.get(key) for key in FACTS},
+    }
 
-    # The metadata are what an avatar is built from: its config, and facts about its
-    # scene.
-    config = OmegaConf.to_container(read_config(folder), resolve=False)
-    metadata = {"format": "pt", "config": json.dumps(config)}
-    metadata["gsgan"] = json.dumps({key: facts.get(key) for key in KEPT_FACTS})
+
+def safetensors_file(run: Run) -> bytes:
+    """A .safetensors file that `load_weights` reads: weights, and `facts_of` as metadata."""
+    facts = facts_of(run)
+    metadata = {key: json.dumps(value) for key, value in facts.items()}
+    return weights_bytes(run.avatar, metadata)
+
+
+def weights_bytes(avatar: Avatar, metadata: dict[str, str]) -> bytes:
+    """A .safetensors file of an avatar's weights."""
     state = {
         key: value.contiguous() for key, value in avatar.state_dict().items()
     }
-    return save(state, metadata)
+    return save(state, {"format": "pt"} | metadata)
 
 
 def load_weights(path: str | Path, *, device: str = "auto") -> Avatar:
@@ -63,67 +61,23 @@ def load_weights(path: str | Path, *, device: str = "auto") -> Avatar:
 
     Raises:
         DataError: when it is missing, damaged, of another program, or names classes of one.
-        ConfigError: when the package safetensors is missing.
     """
-    try:
-        from safetensors import SafetensorError, safe_open
-    except ImportError:
-        raise ConfigError(NEEDS_SAFETENSORS) from None
-
     # Weights and metadata, without pickle.
     path = Path(path).expanduser()
-    try:
-        with safe_open(path, "pt") as file:
-            metadata = file.metadata() or {}
-            names = file.keys()
-            state = {f"avatar.{name}": file.get_tensor(name) for name in names}
-    except (OSError, SafetensorError) as error:
-        raise DataError(
-            f"{path}: not a readable safetensors file ({error})"
-        ) from None
+    state, metadata = read_weights(path)
 
     # The metadata of files by other programs lack these keys.
-    if not {"config", "gsgan"} <= metadata.keys():
+    if not metadata.keys() >= ENTRIES:
         raise DataError(
             f"{path}: not written by gsgan.export (its metadata has no config)"
         )
 
     # A damaged config can fail anywhere in the building of the avatar.
-    try:
-        config = OmegaConf.create(json.loads(metadata["config"]))
-        _refuse_other_classes(path, config)
+    with refusing_damage(path):
+        config = checked_config(path, json.loads(metadata["config"]))
         checkpoint = {
             "gsgan": json.loads(metadata["gsgan"]),
             "state_dict": state,
         }
         avatar = avatar_of(path, config, checkpoint)
-    except DAMAGED as error:
-        reason = f"{type(error).__name__}: {error}".splitlines()[0]
-        raise DataError(
-            f"{path}: its metadata is damaged ({reason}); export it again"
-        ) from None
     return avatar.to(pick_device(device))
-
-
-def _refuse_other_classes(path: Path, config: Any) -> None:
-    """A config names the classes that it builds: only those in conf/ are taken from a file that may
-    come from anybody."""
-    # The classes that the shipped configs name.
-    shipped = "\n".join(
-        file.read_text() for file in config_folder().rglob("*.yaml")
-    )
-    known = {"", *re.findall(r"_target_: *([\w.]+)", shipped)}
-
-    # Every node of the config is visited, however deep it lies.
-    pending = [OmegaConf.to_container(config)]
-    while pending:
-        node = pending.pop()
-        if isinstance(node, list):
-            pending += node
-        elif isinstance(node, dict):
-            if node.get("_target_", "") not in known:
-                raise DataError(
-                    f"{path} names {node['_target_']!r}, which is not a class of gsgan's own "
-                    "configs; load the run folder that it was exported from"
-                )
-            pending += node.values()

@@ -21,9 +21,10 @@ from gsgan.body.lbs import stretched
 from gsgan.body.skinned import WeightGradients, vertex_normals
 from gsgan.body.subdivide import subdivided
 from gsgan.model import compiled
+from gsgan.model.pose_offsets import PoseOffsets
 from gsgan.scene import BodyPose, Gaussians
 from gsgan.skeleton import Points
-from gsgan.utils.checks import above, whole
+from gsgan.utils.checks import above, at_least, whole
 from gsgan.utils.tensors import derived, farthest_points, matvec, squared_norm
 
 # share of the area at rest, below which rounding errors dominate a normal
@@ -60,6 +61,9 @@ class LearntWeights(nn.Module):
     start: Tensor
     near: Tensor
     share: Tensor
+    control_bones: (
+        Tensor  # [C, n] int64, the bones that each control may follow
+    )
 
     def __init__(
         self,
@@ -73,7 +77,8 @@ class LearntWeights(nn.Module):
 
         # The controls are spread over the body, and each point is near a few of them.
         count = min(controls, len(places))
-        at = places[farthest_points(places, count)]
+        chosen = farthest_points(places, count)
+        at = places[chosen]
         distance, near = torch.cdist(places, at).topk(
             min(NEAREST_CONTROLS, count), largest=False
         )
@@ -120,6 +125,7 @@ class LearntWeights(nn.Module):
             "start": start,
             "near": near,
             "share": share,
+            "control_bones": index[chosen],
         }.items():
             self.register_buffer(name, value, persistent=False)
         self.field = nn.Parameter(places.new_zeros(count, joints))
@@ -305,7 +311,8 @@ class BodyPoints(nn.Module):
         scale_spacings: largest standard deviation of a Gaussian, in median distances of
             neighbouring points; None: Ψ's own bound.
         controls: of `LearntWeights`; 0 keeps the body's skinning weights.
-        rate: of these weights' learning, times that of Ψ.
+        pose_offsets: metres that a parameter of `PoseOffsets` is worth; 0: none.
+        rate: of the learning of weights and offsets, times that of Ψ.
     """
 
     rest_points: Tensor
@@ -329,6 +336,7 @@ class BodyPoints(nn.Module):
         stretch_every: int = 1,
         scale_spacings: float | None = None,
         controls: int = 0,
+        pose_offsets: float = 0.0,
         rate: float = 1.0,
     ) -> None:
         super().__init__()
@@ -349,6 +357,13 @@ class BodyPoints(nn.Module):
         self.sigma = sigma
         self.mean_step = mean_step
         self.rate = above("model.body_points.rate", rate)
+
+        # Where joints bend, points leave their place on the body.
+        self.offsets = None
+        learnt = self.points.learnt
+        at_least("model.body_points.pose_offsets", pose_offsets, 0)
+        if pose_offsets > 0 and learnt is not None:
+            self.offsets = PoseOffsets(learnt.control_bones, pose_offsets)
 
         # The bound of Ψ's scales, in body heights.
         self.scale_max = None
@@ -433,6 +448,9 @@ class BodyPoints(nn.Module):
         assert bones is not None
         terms = self.stretch_terms() if self.stretch else None
         means, A, t, jacobian, normals = self._skinned(bones, terms)
+        offset = self.offset(pose)
+        if offset is not None:
+            means = means + matvec(A, offset)
 
         # Shapes start as spheres of a share of the spacing at rest.
         scales = (self.sigma * self.points.spacing).expand(len(means), -1)
@@ -446,6 +464,14 @@ class BodyPoints(nn.Module):
             normals=normals,
             stretched=jacobian,
         )
+
+    def offset(self, pose: BodyPose) -> Tensor | None:
+        """``[B, N, 3]`` metres by which points leave their place at rest; None: they do not."""
+        learnt = self.points.learnt
+        if self.offsets is None or learnt is None:
+            return None
+        found: Tensor = self.offsets(pose.theta, learnt.near, learnt.share)
+        return found
 
     def _skinned(
         self, bones: Tensor, terms: tuple[Tensor, Tensor] | None

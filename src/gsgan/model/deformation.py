@@ -33,6 +33,7 @@ POSE_BUFFERS = (
     "place_mean",
     "place_spread",
 )
+MAX_SHARE = 0.999  # of the bound of the means, whose residual is finite
 # inside the root that normalises a quaternion: q0 + δq ≈ 0 stays finite
 QUAT_FLOOR = 1e-12
 
@@ -240,6 +241,16 @@ class ResidualGaussians(nn.Module):
         )
         opacities = torch.sigmoid(logits) * points.valid.to(logits.dtype)
         return means, axes @ axes.mT, opacities
+
+    def with_offset(self, means: Tensor, offset: Tensor) -> Tensor:
+        """Residuals ``[B, N, 3]`` of means that are moved by ``offset`` besides, metres in the
+        frames of their points."""
+        if self.mean_bound is None:
+            return means + offset / self.body_height
+        share = torch.tanh(means) + offset / (
+            self.mean_bound * self.body_height
+        )
+        return torch.atanh(share.clamp(-MAX_SHARE, MAX_SHARE))
 
     def pose_code(
         self,

@@ -3,12 +3,14 @@
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from copy import deepcopy
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from gsgan.model.avatar import Avatar
+from gsgan.model.body_points import BodyPoints
 from gsgan.model.deformation import ResidualGaussians, Residuals
 from gsgan.scene import BodyPose
 from gsgan.skeleton import Points
@@ -171,6 +173,7 @@ def distilled(
     *,
     follow: Sequence[str] = FOLLOW,
     ridge: float = RIDGE,
+    keep_offsets: bool = True,
 ) -> Avatar:
     """A frozen copy of an avatar with `Harmonic` residuals in Ψ's place: the least-squares fit to
     Ψ's over poses. An avatar that has such residuals already is copied.
@@ -182,6 +185,7 @@ def distilled(
         follow: see `Harmonic`; the others get their mean over the poses.
         ridge: penalty of each squared coefficient but the first, beside the mean over poses of the
             squared error.
+        keep_offsets: False makes the offsets of `gsgan.model.pose_offsets` part of the residuals.
 
     Raises:
         ConfigError: when the avatar has no Ψ.
@@ -193,7 +197,9 @@ def distilled(
         raise ConfigError(
             "only avatars with Ψ have residuals to distil (model=full, splat_only)"
         )
-    if isinstance(psi, Harmonic):
+    on_body = None if keep_offsets else found.body_points
+    moves = on_body is not None and on_body.offsets is not None
+    if isinstance(psi, Harmonic) and not moves:
         return found
 
     # All features are fitted, also those that a frozen avatar leaves out.
@@ -215,7 +221,8 @@ def distilled(
     )
 
     # The fit over all poses. `Harmonic` multiplies its means by mean_step, so they are divided.
-    maps, mean = ridge_regression(_samples(found, poses), ridge)
+    samples = _samples(found, psi, on_body, poses)
+    maps, mean = ridge_regression(samples, ridge)
     maps[..., :3] /= psi.mean_step
     mean[..., :3] /= psi.mean_step
 
@@ -228,17 +235,30 @@ def distilled(
         if name in follow:
             fitted.slopes[name].copy_(linear[:, 1:])
     found.deformation = fitted
+    if on_body is not None:
+        on_body.offsets = None
     return found.freeze()
 
 
 def _samples(
-    avatar: Avatar, poses: Iterable[Pose]
+    avatar: Avatar,
+    psi: ResidualGaussians,
+    on_body: BodyPoints | None,
+    poses: Iterable[Pose],
 ) -> Iterator[tuple[Tensor, Tensor]]:
-    """Harmonics ``[N, 9]`` and residuals ``[N, C]`` of each pose."""
+    """Harmonics ``[N, 9]`` and residuals ``[N, C]`` of each pose.
+
+    With ``on_body`` the residuals of means include its offsets.
+    """
     for p, visibility, given in poses:
         # Ψ's residuals in this pose, without noise.
         body = avatar.body_pose(p, visibility) if given is None else given
         points, residuals = avatar.residuals(p, visibility > 0, body)
+        if on_body is not None and body is not None:
+            offset = on_body.offset(body)
+            if offset is not None:
+                means = psi.with_offset(residuals.means, offset)
+                residuals = replace(residuals, means=means)
 
         # The columns are in the order of `Harmonic.coefficients`.
         values = [

@@ -25,8 +25,8 @@ from gsgan.skeleton.joints import BODY, FLIP_GROUPS, known
 from gsgan.utils.arrays import Float, evenly_spaced
 from gsgan.utils.errors import DataError
 
-FRAMES = 150  # maximum number of frames that are used, evenly spaced
-CONFIDENT = 0.5  # minimum confidence of a landmark
+USED_FRAMES = 150  # maximum number of frames that are used, evenly spaced
+SEEN_CONFIDENCE = 0.5  # minimum confidence of a landmark
 # Millimetres on film of 36 x 24 mm: the solution starts from each of these.
 START_FOCALS = (26.0, 40.0, 65.0)
 FOCAL_PRIOR = (
@@ -79,9 +79,11 @@ def calibrate_from_person(
 
     # Frames with the person in two cameras, evenly spaced.
     uv = uv[:, :, :BODY]
-    weight = np.where(known(uv) & (conf[:, :, :BODY] > CONFIDENT), 1.0, 0.0)
+    weight = np.where(
+        known(uv) & (conf[:, :, :BODY] > SEEN_CONFIDENCE), 1.0, 0.0
+    )
     shared = np.flatnonzero((weight.sum(2) > 0).sum(0) >= 2)
-    frames = shared[evenly_spaced(len(shared), FRAMES)]
+    frames = shared[evenly_spaced(len(shared), USED_FRAMES)]
     uv = uv[:, frames]
     weight = weight[:, frames]
 
@@ -113,7 +115,8 @@ def _solution(
     near = rig
 
     # Landmarks and cameras together. Detectors swap sides, which a first solution shows.
-    sided, seen = pixels, weight
+    sided = pixels
+    seen = weight
     for _ in range(ROUNDS):
         flat = sided.reshape(C, -1, 2)
         points = robust(rig, flat, seen.reshape(C, -1)).p

@@ -480,11 +480,11 @@ def _doubts(found: Mapping[str, Any]) -> list[str]:
             f"doubtful: the video's colours are HDR ({found['hdr']}) and are not converted, so the "
             "avatar's will be wrong; film without HDR, or convert the video"
         )
+
+    # The film: how long, from how many sides, by a camera that stands still.
     seconds = found["seconds"]
     turned = found["degrees_seen"]
     moved = found["background_moved"]
-    others = found["several_faces"]
-    feet = found["feet_seen"]
     if seconds < MIN_SECONDS:
         notes.append(
             f"doubtful: {seconds:.1f} seconds are short, 20 to 40 are better"
@@ -497,6 +497,10 @@ def _doubts(found: Mapping[str, Any]) -> list[str]:
         notes.append(
             f"doubtful: the background moved by {moved:.0%} of the image; it counts as still"
         )
+
+    # The people in it.
+    others = found["several_faces"]
+    feet = found["feet_seen"]
     if others > MAX_OTHER_FACES:
         notes.append(
             f"doubtful: {others:.0%} of the images show more than one face; "

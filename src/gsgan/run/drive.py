@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gsgan.data.splits import SPLITS
 from gsgan.model.avatar import Avatar
-from gsgan.model.harmonic import Harmonic, distilled
+from gsgan.model.harmonic import distilled
 from gsgan.motion.clip import (
     FPS,
     Clip,
@@ -179,7 +179,9 @@ def with_motion(config: DictConfig, motion: str) -> DictConfig:
 
 def _chosen(options: MotionOptions, run: Run, fps: float) -> Drive:
     """The motion of options: files, a split, the rest pose, or one held-out frame."""
-    # Without a motion: one held-out frame, held still.
+    # Without a motion: one held-out frame, held still. A shared avatar has no frames.
+    if options.motion is None and run.is_shared:
+        return rest_pose(run.proportions)
     if options.motion is None:
         split, _ = run.data.watched
         found = _held_out(options, run, split)
@@ -461,14 +463,12 @@ def inputs_of(
 
 def distilled_of(config: DictConfig, run: Run) -> Avatar:
     """A run's avatar with Ψ's residuals as linear functions, fitted over training poses: see
-    `gsgan.model.harmonic.distilled`."""
-    # An avatar that was trained with linear residuals needs no fit.
-    if isinstance(run.avatar.deformation, Harmonic):
-        return run.avatar
-
+    `gsgan.model.harmonic.distilled`. The offsets of pose are part of them."""
     # The fit takes poses at even distances, from the first to the last.
     drive = drive_of(with_motion(config, "train"), run, 1.0)
     chosen = evenly_spaced(len(drive.p), DISTILLED, ends=True)
     return distilled(
-        run.avatar, (inputs_of(run.avatar, drive, i) for i in chosen)
+        run.avatar,
+        (inputs_of(run.avatar, drive, i) for i in chosen),
+        keep_offsets=False,
     )

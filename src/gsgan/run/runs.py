@@ -18,9 +18,15 @@ from gsgan.data.scene_info import SceneInfo
 from gsgan.effects import Effects
 from gsgan.model.avatar import Avatar
 from gsgan.run.assemble import build_avatar, build_data
+from gsgan.run.shared import (
+    CONFIG_FILE,
+    find_avatar,
+    is_shared,
+    read_shared,
+    refusing_damage,
+)
 from gsgan.run.stored import (
     CHECKPOINT,
-    CONFIG,
     DataPaths,
     absolute_path,
     load_config,
@@ -43,22 +49,41 @@ Float = NDArray[np.float64]
 def load(
     run: str | Path, *, smpl: str | Path | None = None, device: str = "auto"
 ) -> Avatar:
-    """The trained, frozen avatar of a run folder, to `render`; the dataset is not needed.
+    """A trained, frozen avatar, to `render`; the dataset is not needed.
 
     Args:
-        run: the folder that ``gsgan.train`` printed.
-        smpl: the body model file, if the run read one and it has moved.
+        run: the folder that ``gsgan.train`` printed, or an avatar that was shared: a folder that
+            ``gsgan.export format=hub`` wrote, or ``owner/name`` or ``owner/name@revision`` on the
+            Hugging Face Hub. A folder comes before a name on the Hub.
+        smpl: the body model file, if the run read one and it has moved or was not shared.
         device: ``auto``, ``cpu``, ``cuda`` or another torch device.
 
     Raises:
-        GsganError: when the folder holds no run or no checkpoint, its checkpoint is damaged, or the
-            model file is missing.
+        GsganError: when the folder holds no run or no checkpoint, its checkpoint is damaged, the
+            Hub has no such avatar, or the model file is missing.
     """
+    folder = find_avatar(run)
+    avatar, _, _ = read_avatar(folder, None if smpl is None else str(smpl))
+    return avatar.to(pick_device(device))
+
+
+def read_avatar(
+    folder: Path, smpl: str | None = None
+) -> tuple[Avatar, DictConfig, dict[str, Any]]:
+    """The trained, frozen avatar of a run folder or of a shared avatar's; its config, and ``gsgan``
+    of its checkpoint."""
+    # A shared avatar may come from anybody, and be damaged anywhere.
+    if is_shared(folder):
+        with refusing_damage(folder / CONFIG_FILE):
+            config, checkpoint = read_shared(folder)
+            avatar = avatar_of(folder, config, checkpoint, smpl)
+        return avatar, config, checkpoint["gsgan"]
+
     # The config says how the avatar is built, and the checkpoint has its weights.
-    folder = Path(run).expanduser()
     config = read_config(folder)
     checkpoint = read_checkpoint(folder / CHECKPOINT)
-    return avatar_of(folder, config, checkpoint, smpl).to(pick_device(device))
+    avatar = avatar_of(folder, config, checkpoint, smpl)
+    return avatar, config, checkpoint["gsgan"]
 
 
 def load_avatar(
@@ -87,7 +112,7 @@ def avatar_of(
     folder: Path,
     config: DictConfig,
     checkpoint: dict[str, Any],
-    smpl: str | Path | None = None,
+    smpl: str | None = None,
 ) -> Avatar:
     """The trained, frozen avatar of a checkpoint.
 
@@ -99,7 +124,7 @@ def avatar_of(
     """
     # The body model file may lie elsewhere than when the avatar was trained.
     scene = stored_scene(checkpoint["gsgan"]["scene"])
-    file = absolute_path(folder, scene.body_file) if smpl is None else str(smpl)
+    file = absolute_path(folder, scene.body_file) if smpl is None else smpl
     return _trained(folder, config, checkpoint, replace(scene, body_file=file))
 
 
@@ -128,14 +153,14 @@ def _trained(
     except (TypeError, ValueError, OverflowError) as error:
         reason = str(error).split("\n")[0]
         raise DataError(
-            f"{folder / CONFIG}: no avatar can be built from it: {reason}"
+            f"{folder}: no avatar can be built from its config: {reason}"
         ) from error
 
     # S is missing if its body cannot be opened; the weights would not fit.
     if "segmentation.quats" in state and avatar.segmentation is None:
         raise DataError(
-            f"{folder}: trained with S, which cannot be built now: {avatar.segmentation_why}; set "
-            f"data.smpl in {folder / CONFIG} to the model file"
+            f"{folder}: trained with S, which cannot be built now: {avatar.segmentation_why}; give "
+            "the body model file (smpl=, or data_smpl= on the command line)"
         )
 
     # The weights do not fit if the config was changed after the training.
@@ -143,14 +168,14 @@ def _trained(
         avatar.load_state_dict(state)
     except RuntimeError as error:
         raise DataError(
-            f"{folder / CHECKPOINT}: its weights do not fit the config {folder / CONFIG}"
+            f"{folder}: the weights do not fit the config"
         ) from error
     return avatar.freeze()
 
 
 @dataclass
 class Run:
-    """A run folder; its dataset is opened only where it is needed.
+    """A run folder, or a shared avatar; the dataset is opened only where it is needed.
 
     Args:
         folder: of the run.
@@ -180,22 +205,34 @@ class Run:
             )
 
         # The dataset itself is opened later, and only by commands that need it.
-        folder = Path(config.run).expanduser()
+        folder = find_avatar(str(config.run))
         paths = DataPaths.from_config(config)
-        stored = read_config(folder)
-        checkpoint = read_checkpoint(folder / CHECKPOINT)
-        avatar = avatar_of(folder, stored, checkpoint, paths.smpl)
+        avatar, stored, checkpoint = read_avatar(folder, paths.smpl)
         return cls(
             folder=folder,
             stored=stored,
-            checkpoint=checkpoint["gsgan"],
+            checkpoint=checkpoint,
             avatar=avatar.to(pick_device(config.device)),
             paths=paths,
         )
 
+    @property
+    def is_shared(self) -> bool:
+        """Whether it is a shared avatar, which has no dataset."""
+        return is_shared(self.folder)
+
     @cached_property
     def data(self) -> GsganData:
-        """The run's dataset."""
+        """The run's dataset.
+
+        Raises:
+            DataError: when it is missing, as it is for every shared avatar.
+        """
+        if self.is_shared:
+            raise DataError(
+                f"{self.folder}: a shared avatar comes without its dataset; give motion=<file> or "
+                "motion=rest, and camera=orbit or a calibration file"
+            )
         return build_data(load_config(self.folder, self.paths))
 
     @property

@@ -12,7 +12,14 @@ import numpy as np
 from omegaconf import DictConfig
 
 from gsgan.motion.orbit import Orbit
-from gsgan.run.drive import Drive, distilled_of, drive_of, smoothed, with_motion
+from gsgan.run.drive import (
+    REST,
+    Drive,
+    distilled_of,
+    drive_of,
+    smoothed,
+    with_motion,
+)
 from gsgan.run.runs import Run
 from gsgan.skeleton.proportions import upright
 from gsgan.utils.checks import above, between, whole
@@ -65,7 +72,8 @@ class Viewer:
             return smoothed(config, drive, fps)
 
         # The settings and the first motion of all browsers.
-        drive = read(config.motion or self.run.data.watched[0])
+        first = REST if self.run.is_shared else self.run.data.watched[0]
+        drive = read(config.motion or first)
         size = whole(
             "pixels", config.pixels or self.run.stored.data.size or 512, 16
         )

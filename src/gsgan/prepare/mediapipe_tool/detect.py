@@ -41,9 +41,9 @@ MARGIN = 0.15
 # Around a chosen person: how far the next image is searched beyond the joints, share of the
 # person's height, and how many joints of this confidence show where the person is.
 SEARCHED = 0.15
-SURE = 0.5
-MIN_SURE = 12
-GREY = 127
+CERTAIN = 0.5
+MIN_CERTAIN = 12
+PAINTED_GREY = 127
 
 
 def main() -> None:
@@ -154,14 +154,14 @@ class Follower:
         high = self.box[1] + reach
         left, top = np.clip(low, 0, size).astype(int)
         right, bottom = np.clip(high, 0, size).astype(int)
-        shown = np.full_like(image, GREY)
+        shown = np.full_like(image, PAINTED_GREY)
         shown[top:bottom, left:right] = image[top:bottom, left:right]
         return shown
 
     def follow(self, px: Any, conf: Any) -> None:
         """Moves the box to landmarks ``[33, 2]``, if they show a person."""
-        sure = (conf > SURE) & np.isfinite(px).all(-1)
-        if sure.sum() >= MIN_SURE:
+        sure = (conf > CERTAIN) & np.isfinite(px).all(-1)
+        if sure.sum() >= MIN_CERTAIN:
             self.box = np.stack([px[sure].min(0), px[sure].max(0)])
 
 

@@ -1,4 +1,4 @@
-"""Milliseconds from skeleton to image, by stage; options: conf/bench_speed.yaml."""
+"""``python -m gsgan.bench speed``: milliseconds from skeleton to image, by stage."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -12,17 +12,16 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from bench_tables import (
+from omegaconf import DictConfig
+from torch import Tensor
+
+from gsgan.bench.common import (
     check_whole,
     environment,
     markdown,
     number,
     sentence,
 )
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
-from torch import Tensor
-
 from gsgan.data.datamodule import GsganData
 from gsgan.model.avatar import Avatar, unwatched
 from gsgan.run.assemble import build_avatar, build_data
@@ -32,7 +31,6 @@ from gsgan.scene import Frame, cat
 from gsgan.splat import BACKENDS, resolve_backend
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import one_of
-from gsgan.utils.config import entry
 from gsgan.utils.console import make_console, progress
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.files import write_atomically, write_json
@@ -421,12 +419,3 @@ def text(
     if marks:
         lines.append("\n".join(f"- {mark}" for mark in marks))
     return "\n\n".join(lines)
-
-
-def bench(config: DictConfig) -> None:
-    """Times an avatar and writes the result into Hydra's output folder."""
-    run(config, Path(HydraConfig.get().runtime.output_dir))
-
-
-if __name__ == "__main__":
-    entry("bench_speed", bench)()

@@ -1,0 +1,1 @@
+"""The time that an avatar takes: ``python -m gsgan.bench speed``."""

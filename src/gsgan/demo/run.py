@@ -1,0 +1,67 @@
+"""Renders the avatar that comes with gsgan: a picture, and a video of a dance."""
+
+from importlib.util import find_spec
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+from omegaconf import DictConfig, OmegaConf
+
+from gsgan.export.hub import preview
+from gsgan.render.run import render_config
+from gsgan.run.drive import drive_of
+from gsgan.run.runs import Run
+from gsgan.run.shared import DEMO, DEMO_MOTION
+from gsgan.utils.checks import whole
+from gsgan.utils.config import defaults_of
+from gsgan.utils.console import make_console
+from gsgan.utils.files import write_atomically, writing
+
+FPS = 25  # of the dance
+PICTURE = 14  # the frame that the picture shows
+
+
+def demo_config(config: DictConfig) -> None:
+    """Writes the picture and the video into the folder of a config.
+
+    Raises:
+        ConfigError: when an option has an invalid value, or the video exists.
+        DataError: when a file cannot be written.
+    """
+    # Without an encoder the video is a folder of PNG files.
+    out = Path(config.out).expanduser()
+    pixels = whole("pixels", config.pixels, 16)
+    video = out / ("dance.mp4" if find_spec("av") else "dance")
+    given = {
+        "run": DEMO,
+        "motion": str(DEMO_MOTION),
+        "out": str(video),
+        "overwrite": config.overwrite,
+        "fps": FPS,
+        "frames": config.frames,
+        "pixels": pixels,
+        "background": "white",
+    }
+    settings = cast(DictConfig, OmegaConf.merge(defaults_of("render"), given))
+    render_config(settings)
+
+    # The picture shows one pose of the dance from the front.
+    run = Run.load(settings)
+    drive = drive_of(settings, run, FPS)
+    picture = out / "picture.png"
+    content = preview(run, drive.rows(np.array([PICTURE])), pixels)
+    with writing(picture):
+        write_atomically(picture, content)
+
+    # What can be tried next.
+    lines = [f"written: {picture}"]
+    if video.suffix != ".mp4":
+        lines.append("for a video in place of PNG files: pip install av")
+    lines += [
+        "a motion of your own: python -m gsgan.render run=demo motion=<file> out=video.mp4",
+        "in the browser:       python -m gsgan.view run=demo",
+        "an avatar of your own: docs/data.md",
+    ]
+    console = make_console()
+    for line in lines:
+        console.print(line, markup=False, highlight=False, soft_wrap=True)

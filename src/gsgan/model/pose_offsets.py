@@ -1,0 +1,47 @@
+"""Offsets of a body's points that depend on how the bones about them turn."""
+
+import torch
+from torch import Tensor, nn
+
+from gsgan.body import axis_angle_to_matrix
+
+
+class PoseOffsets(nn.Module):
+    """Linear in the rotations of the bones that a point follows, and zero in the rest pose.
+
+    Skin and cloth bulge and fold where joints bend. Each control has a linear map from its own
+    bones' rotations less the identity, so that no joint moves points far from it, and a pose far
+    from the training poses is a sum of bends that were seen. Points get the average of the controls
+    near them.
+
+    Args:
+        bones: ``[C, n]`` int64, the bones that each control follows.
+        step: metres that a parameter of 1 is worth: with Adam, how fast offsets learn.
+
+    Source: ours; sparse, local pose correctives as in STAR (Osman et al., 2020), learnt from
+    images.
+    """
+
+    bones: Tensor
+
+    def __init__(self, bones: Tensor, step: float) -> None:
+        super().__init__()
+        self.register_buffer("bones", bones, persistent=False)
+        self.step = step
+        count, followed = bones.shape
+        self.field = nn.Parameter(torch.zeros(count, 9 * followed, 3))
+
+    def forward(self, theta: Tensor, near: Tensor, share: Tensor) -> Tensor:
+        """``[B, N, 3]`` metres, at rest.
+
+        Args:
+            theta: ``[B, J, 3]`` axis-angle, rotations of the joints.
+            near, share: ``[N, k]`` the controls near each point, and their weights.
+        """
+        # What bends at each control, [B, C, 9 n].
+        turned = axis_angle_to_matrix(theta) - torch.eye(3).to(theta)
+        given = turned.flatten(2)[:, self.bones].flatten(2)
+
+        # The controls' offsets, then those of the points.
+        offsets = self.step * torch.einsum("bck,ckj->bcj", given, self.field)
+        return (offsets[:, near] * share.unsqueeze(-1)).sum(dim=2)
