@@ -11,12 +11,12 @@ from typing import Any
 import bench_common
 import pandas as pd
 import torch
-from bench_tables import NOTHING, check_whole, markdown, sentence
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from timing import interleaved, median
 
+from gsgan.bench.common import NOTHING, check_whole, markdown, sentence
 from gsgan.effects import decide as decide_effects
 from gsgan.fit.run import fit_before_training
 from gsgan.run.assemble import build_data

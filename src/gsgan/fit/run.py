@@ -139,7 +139,7 @@ def summary(
 
 
 SIZE = 128  # pixels of the images that the fit before training uses
-IMAGE_MARGIN = 0.2  # metres around the person in these images
+PERSON_MARGIN = 0.2  # metres around the person in the images of a fit
 LOCK = ".body_fit.lock"
 # frames whose poses are solved at once, which bounds memory
 FRAMES_AT_ONCE = 500
@@ -181,7 +181,7 @@ def fit_before_training(
     # small images around the person
     seen = copy(data)
     seen.size = SIZE
-    seen.crop = PersonCrop(margin=IMAGE_MARGIN)
+    seen.crop = PersonCrop(margin=PERSON_MARGIN)
     with ExitStack() as stack:
         with writing(root):
             stack.enter_context(FileLock(root / LOCK))

@@ -52,7 +52,7 @@ FOREARMS = [[13, 15], [14, 16]]  # elbow and wrist
 # minimum and maximum size of a hand, as a share of the body's
 SIZES = (0.75, 1.35)
 MAX_HAND_MOVE = 0.05  # maximum move of a hand, metres
-NUMBERS = 99  # of the offsets: x, y, z of 33 landmarks
+OFFSET_COUNT = 99  # x, y, z of 33 landmarks
 LENGTH_STEPS = 10
 STEPS = 8
 POSE_STEPS = 4
@@ -215,7 +215,7 @@ def _usable(skeletons: Tensor, visibility: Tensor) -> tuple[Tensor, Tensor]:
 
 def shape_of(space: ShapeSpace[B], x: Tensor) -> BodyShape:
     """The shape of the numbers: coefficients, logarithms of stretches, the spine, offsets."""
-    sizes = [space.coefficients, len(STRETCHED), 1, NUMBERS]
+    sizes = [space.coefficients, len(STRETCHED), 1, OFFSET_COUNT]
     coefficients, stretch, spine, offsets = x.split(sizes)
     return BodyShape(
         coefficients,
@@ -240,7 +240,7 @@ def shape_prior(space: ShapeSpace[MarkedBody]) -> Tensor:
     sigmas = [1.0] * space.coefficients
     sigmas += [STRETCH] * len(STRETCHED)
     sigmas += [DEPTH]
-    sigmas += [OFFSET * 2**0.5] * NUMBERS
+    sigmas += [OFFSET * 2**0.5] * OFFSET_COUNT
     precisions = [1 / sigma**2 for sigma in sigmas]
     return torch.tensor(precisions, dtype=torch.float64)
 
@@ -324,7 +324,7 @@ def _fit_lengths(
         return ((q[a] - q[b]).norm(dim=-1).log() - target) / sigma
 
     prior = shape_prior(space)
-    prior[-NUMBERS:] *= 100  # the offsets hardly change here
+    prior[-OFFSET_COUNT:] *= 100  # the offsets hardly change here
 
     # The robust cost lets a few wrong distances pass.
     def cost(x: Tensor) -> Tensor:
@@ -373,7 +373,7 @@ def _fit_landmarks(
     p = p - p[:, MEDIAPIPE33.hips].mean(1, keepdim=True)
     prior = shape_prior(space)
     share = min(1.0, INDEPENDENT / len(p))
-    own = len(x) - NUMBERS
+    own = len(x) - OFFSET_COUNT
     symmetric = torch.func.jacfwd(partial(_offsets, space))(x[own:])
     held: tuple[Tensor, Tensor] | None = None
     for _ in range(STEPS):

@@ -2,6 +2,7 @@
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from gsgan.body import axis_angle_to_matrix
 
@@ -38,9 +39,10 @@ class PoseOffsets(nn.Module):
             theta: ``[B, J, 3]`` axis-angle, rotations of the joints.
             near, share: ``[N, k]`` the controls near each point, and their weights.
         """
-        # What bends at each control, [B, C, 9 n].
-        turned = axis_angle_to_matrix(theta) - torch.eye(3).to(theta)
-        given = turned.flatten(2)[:, self.bones].flatten(2)
+        # What bends at each control, [B, C, 9 n]. The root turns the whole body and bends nothing.
+        turned = axis_angle_to_matrix(theta[:, 1:]) - torch.eye(3).to(theta)
+        bent = functional.pad(turned.flatten(2), (0, 0, 1, 0))
+        given = bent[:, self.bones].flatten(2)
 
         # The controls' offsets, then those of the points.
         offsets = self.step * torch.einsum("bck,ckj->bcj", given, self.field)

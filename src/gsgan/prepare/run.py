@@ -52,6 +52,7 @@ from gsgan.utils.arrays import Float, Ints
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import read_json, write_json
 
+MAX_FOCAL_RATIO = 1.6  # between a camera found from the person and the median
 MIN_ANGLE = 30.0  # degrees between the rays of cameras found from the person
 DELAY = 0.5  # frames: larger delays of a clock are noted
 DELAY_GAIN = 0.05  # share of the error that correcting a delay must remove
@@ -370,14 +371,29 @@ def _from_person(
     """The inputs with cameras that are found from the person, and notes on how well they agree."""
     with console.status("finding the cameras from the person"):
         found = calibrate_from_person(inputs.cameras, uv, conf, options.focal)
+    films = np.array(
+        [
+            camera.K[0, 0] / np.hypot(*camera.size) * FILM
+            for camera in found.cameras
+        ]
+    )
     notes = [*inputs.notes]
-    for camera, error in zip(found.cameras, found.error, strict=True):
-        focal = float(camera.K[0, 0])
-        film = focal / float(np.hypot(*camera.size)) * FILM
+    for camera, error, film in zip(
+        found.cameras, found.error, films, strict=True
+    ):
         notes.append(
             f"{camera.name}: found from the person, {error:.1f} pixels off its landmarks, focal "
-            f"length {focal:.0f} pixels ({film:.0f} mm on film)"
+            f"length {camera.K[0, 0]:.0f} pixels ({film:.0f} mm on film)"
         )
+
+    # A focal length unlike the others is more often an error than a zoom.
+    apart = films / np.median(films)
+    for camera, ratio in zip(found.cameras, apart, strict=True):
+        if not 1 / MAX_FOCAL_RATIO < ratio < MAX_FOCAL_RATIO:
+            notes.append(
+                f"doubtful: {camera.name} has {ratio:.1f} times the median focal length; give "
+                "focal=<mm on film> if all cameras are alike"
+            )
 
     # Cameras that look the same way show no depth.
     if found.angle < MIN_ANGLE:
