@@ -245,7 +245,7 @@ def test_a_trained_avatar_without_its_body_is_refused_in_one_sentence(
         monkeypatch.setattr(f"gsgan.run.{place}.open_body", lambda *_: None)
     with pytest.raises(
         DataError,
-        match=rf"{said}.*data\.smpl",
+        match=rf"{said}.*data.smpl",
     ):
         load_avatar(tmp_path, config, data)
 

@@ -61,9 +61,9 @@ class LearntWeights(nn.Module):
     start: Tensor
     near: Tensor
     share: Tensor
-    control_bones: (
-        Tensor  # [C, n] int64, the bones that each control may follow
-    )
+    # [C, n] int64, the bones that each control may follow, and how much it does at first
+    control_bones: Tensor
+    control_weights: Tensor
 
     def __init__(
         self,
@@ -126,6 +126,9 @@ class LearntWeights(nn.Module):
             "near": near,
             "share": share,
             "control_bones": index[chosen],
+            "control_weights": ((dense + around) / 2)[chosen].gather(
+                1, index[chosen]
+            ),
         }.items():
             self.register_buffer(name, value, persistent=False)
         self.field = nn.Parameter(places.new_zeros(count, joints))
@@ -363,7 +366,9 @@ class BodyPoints(nn.Module):
         learnt = self.points.learnt
         at_least("model.body_points.pose_offsets", pose_offsets, 0)
         if pose_offsets > 0 and learnt is not None:
-            self.offsets = PoseOffsets(learnt.control_bones, pose_offsets)
+            self.offsets = PoseOffsets(
+                learnt.control_bones, learnt.control_weights, pose_offsets
+            )
 
         # The bound of Ψ's scales, in body heights.
         self.scale_max = None

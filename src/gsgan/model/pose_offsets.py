@@ -17,6 +17,8 @@ class PoseOffsets(nn.Module):
 
     Args:
         bones: ``[C, n]`` int64, the bones that each control follows.
+        weight: ``[C, n]`` how much it follows them: a bone moves what it carries, since offsets of
+            bones that only happened to turn at the same time are wrong in other poses.
         step: metres that a parameter of 1 is worth: with Adam, how fast offsets learn.
 
     Source: ours; sparse, local pose correctives as in STAR (Osman et al., 2020), learnt from
@@ -24,10 +26,12 @@ class PoseOffsets(nn.Module):
     """
 
     bones: Tensor
+    weight: Tensor
 
-    def __init__(self, bones: Tensor, step: float) -> None:
+    def __init__(self, bones: Tensor, weight: Tensor, step: float) -> None:
         super().__init__()
         self.register_buffer("bones", bones, persistent=False)
+        self.register_buffer("weight", weight, persistent=False)
         self.step = step
         count, followed = bones.shape
         self.field = nn.Parameter(torch.zeros(count, 9 * followed, 3))
@@ -42,8 +46,10 @@ class PoseOffsets(nn.Module):
         # What bends at each control, [B, C, 9 n]. The root turns the whole body and bends nothing.
         turned = axis_angle_to_matrix(theta[:, 1:]) - torch.eye(3).to(theta)
         bent = functional.pad(turned.flatten(2), (0, 0, 1, 0))
-        given = bent[:, self.bones].flatten(2)
+        given = bent[:, self.bones] * self.weight.unsqueeze(-1)
 
         # The controls' offsets, then those of the points.
-        offsets = self.step * torch.einsum("bck,ckj->bcj", given, self.field)
+        offsets = self.step * torch.einsum(
+            "bck,ckj->bcj", given.flatten(2), self.field
+        )
         return (offsets[:, near] * share.unsqueeze(-1)).sum(dim=2)
