@@ -122,7 +122,7 @@ def test_every_top_level_key_is_read_by_code(compose):
     )
     for name in ("train", "evaluate"):
         for key in compose(name):
-            named = rf'(config|stored)\.({key}\b|get\("{key}"\))'
+            named = rf'(config|stored|options)\.({key}\b|get\("{key}"\))'
             read = re.search(named, code) or re.search(
                 rf"\$\{{(oc\.select:)?{key}\b", yaml
             )
