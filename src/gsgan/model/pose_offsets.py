@@ -52,4 +52,10 @@ class PoseOffsets(nn.Module):
         offsets = self.step * torch.einsum(
             "bck,ckj->bcj", given.flatten(2), self.field
         )
-        return (offsets[:, near] * share.unsqueeze(-1)).sum(dim=2)
+
+        # One lookup averages the offsets of all poses: its table has a row for each control.
+        table = offsets.transpose(0, 1).flatten(1)
+        found = functional.embedding_bag(
+            near, table, per_sample_weights=share.to(table), mode="sum"
+        )
+        return found.unflatten(1, (-1, 3)).transpose(0, 1)
