@@ -60,6 +60,48 @@ def write_trc(path: Path, p: np.ndarray, unit: str = "m") -> Path:
     return path
 
 
+def write_c3d(path: Path, p: np.ndarray, unit: str, names=None) -> Path:
+    """By another program's library: z up, joints with a prefix, an unknown marker beside."""
+    ezc3d = pytest.importorskip("ezc3d")
+    file = ezc3d.c3d()
+    names = names or [f"Subject1:{name}" for name in MARKERS]
+    points = np.ones((4, len(names) + 1, len(p)))
+    scale = {"m": 1, "mm": 1000}[unit]
+    places = scale * p[:, list(MARKERS.values())].transpose(2, 1, 0)
+    points[:3, : len(MARKERS)] = places[:, : len(names)]
+    file["parameters"]["POINT"]["RATE"]["value"] = [120.0]
+    file["parameters"]["POINT"]["UNITS"]["value"] = [unit]
+    file["parameters"]["POINT"]["LABELS"]["value"] = [*names, "Wand"]
+    file["data"]["points"] = points
+    file.write(str(path))
+    return path
+
+
+@pytest.mark.parametrize("unit", ["m", "mm"])
+def test_joints_of_c3d_are_read(tmp_path, proportions, unit):
+    p = skeletons(4)
+    p[2, 15] = np.nan
+    path = write_c3d(tmp_path / "a.c3d", p, unit)
+    found = read_points3d(path)
+    joints = list(MARKERS.values())
+    np.testing.assert_allclose(found.p[:, joints], p[:, joints], atol=1e-6)
+    assert found.conf[2, 15] == 0
+    assert found.frames.tolist() == [1, 2, 3, 4]
+    assert read_motion(path, Source(proportions)).fps == 120
+
+
+def test_markers_on_the_skin_and_damaged_c3d_are_refused(tmp_path):
+    skin = [f"M{i}" for i in range(len(MARKERS))]
+    path = write_c3d(tmp_path / "a.c3d", skeletons(2), "m", skin)
+    with pytest.raises(DataError, match=r"a\.c3d.*M3"):
+        read_points3d(path)
+    for size in (0, 10, 600, len(path.read_bytes()) - 40):
+        cut = tmp_path / "cut.c3d"
+        cut.write_bytes(path.read_bytes()[:size])
+        with pytest.raises(DataError, match=r"cut\.c3d"):
+            read_points3d(cut)
+
+
 @pytest.mark.parametrize("unit", ["m", "mm"])
 def test_trc_units_axes_and_names_are_converted(tmp_path, proportions, unit):
     p = skeletons(4)

@@ -1,6 +1,8 @@
-"""3D joints that Pose2Sim triangulated: .trc files."""
+"""3D joints of markerless motion capture: .trc files (Pose2Sim) and .c3d files."""
 
 import re
+import warnings
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -8,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsgan.data.skeletons import whole_frame_ids
+from gsgan.motion.clip import rate_of
 from gsgan.skeleton.joints import BODY, known, zeros_as_missing
 from gsgan.skeleton.template import MEDIAPIPE33
-from gsgan.utils.errors import DataError
+from gsgan.utils.errors import ConfigError, DataError, GsganError
 from gsgan.utils.files import read_text
 from gsgan.utils.frame_files import frame_files
 
@@ -35,6 +38,17 @@ class Points3D(NamedTuple):
     frames: Ints  # [F] increasing
     p: Float  # [F, 33, 3] metres, in the calibration's world; NaN = missing
     conf: Float  # [F, 33] 0 = missing
+    fps: float | None  # frames per second, if the file has them
+
+
+class Markers(NamedTuple):
+    """The content of a file: M named markers in F frames, in the order of the file."""
+
+    frames: Ints  # [F]
+    names: list[str]
+    places: Float  # [F, M, 3] in the file's unit; NaN = missing
+    unit: str | None
+    fps: float | None
 
 
 def json_files(path: Path) -> dict[int, Path]:
@@ -48,23 +62,49 @@ def json_files(path: Path) -> dict[int, Path]:
 
 
 def read_points3d(path: Path) -> Points3D:
-    """3D joints of a .trc file; exact zeros are missing.
+    """3D joints of a .trc or .c3d file; exact zeros are missing.
 
     Raises:
         DataError: when it is damaged, or without shoulders and hips.
+        ConfigError: for a .c3d file without the extra ``c3d``.
     """
-    frames, p = _read_trc(path)
-    order = np.argsort(frames)
+    found = (
+        _read_c3d(path) if path.suffix.lower() == ".c3d" else _read_trc(path)
+    )
+    if found.unit is not None and found.unit not in UNITS:
+        raise DataError(
+            f"{path}: Units is {found.unit!r}; expected one of {', '.join(UNITS)}"
+        )
+
+    # The joints that MediaPipe has too.
+    p = np.full((len(found.places), BODY, 3), np.nan)
+    for marker, name in enumerate(found.names):
+        joint = _joint(name)
+        if joint is not None:
+            p[:, joint] = found.places[:, marker]
+
+    # Some programs write zeros for markers that were not seen.
+    p = zeros_as_missing(p)
+    if not np.isfinite(p[:, LEFT_RIGHT_SHOULDER + LEFT_RIGHT_HIP]).any():
+        raise DataError(
+            f"{path} has no shoulders and hips; expected joints such as LShoulder and LHip, found "
+            f"{', '.join(found.names)}"
+        )
+    p *= _metres(p) if found.unit is None else UNITS[found.unit]
+    order = np.argsort(found.frames)
     p = p[order]
 
     # A joint without all coordinates is missing.
     seen = known(p)
-    p = np.where(seen[..., None], p, np.nan)
-    return Points3D(frames=frames[order], p=p, conf=seen.astype(np.float64))
+    return Points3D(
+        frames=found.frames[order],
+        p=np.where(seen[..., None], p, np.nan),
+        conf=seen.astype(np.float64),
+        fps=found.fps,
+    )
 
 
-def _read_trc(path: Path) -> tuple[Ints, Float]:
-    """Frame numbers ``[F]`` and joints ``[F, 33, 3]`` in metres, in the order of the file."""
+def _read_trc(path: Path) -> Markers:
     try:
         lines = read_text(path).splitlines()
         header = dict(zip(lines[1].split(), lines[2].split(), strict=False))
@@ -85,34 +125,58 @@ def _read_trc(path: Path) -> tuple[Ints, Float]:
     unit = header.get("Units")
     if unit is not None and re.fullmatch(r"[\d.]+", unit):
         unit = None
-    if unit is not None and unit not in UNITS:
-        raise DataError(
-            f"{path}: Units is {unit!r}; expected one of {', '.join(UNITS)}"
-        )
-
-    # The joints that MediaPipe has too.
-    table = np.array(rows).reshape(-1, columns)
-    F = len(table)
+    fps = None
+    with suppress(KeyError, ValueError):
+        fps = rate_of(path, float(header["DataRate"]))
 
     # Frame number and time come first, then three columns per marker.
-    coordinates = table[:, 2:].reshape(F, len(markers), 3)
-    coordinates = coordinates[..., TRC_AXES]
-    p = np.full((F, BODY, 3), np.nan)
-    for marker, name in enumerate(markers):
-        joint = _joint(name)
-        if joint is not None:
-            p[:, joint] = coordinates[:, marker]
+    table = np.array(rows).reshape(-1, columns)
+    places = table[:, 2:].reshape(len(table), len(markers), 3)
+    return Markers(
+        frames=whole_frame_ids(table[:, 0], str(path)),
+        names=markers,
+        places=places[..., TRC_AXES],
+        unit=unit,
+        fps=fps,
+    )
 
-    # Some programs write zeros for markers that were not seen.
-    p = zeros_as_missing(p)
-    if not np.isfinite(p[:, LEFT_RIGHT_SHOULDER + LEFT_RIGHT_HIP]).any():
+
+def _read_c3d(path: Path) -> Markers:
+    try:
+        import c3d
+    except ImportError:
+        raise ConfigError(
+            f"{path}: .c3d files need the package c3d: pip install 'gsgan[c3d]'"
+        ) from None
+    try:
+        # The package warns of missing analog channels and incomplete blocks.
+        with path.open("rb") as file, warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            reader = c3d.Reader(file)
+            names = [label.strip() for label in reader.point_labels]
+            unit = reader.get("POINT:UNITS")
+            read = [(n, points) for n, points, _ in reader.read_frames()]
+            fps = rate_of(path, float(reader.point_rate))
+    except GsganError:
+        raise
+    # The package raises whatever its parsing meets in a damaged file.
+    except Exception as error:
         raise DataError(
-            f"{path} has no shoulders and hips; expected markers such as LShoulder and LHip, found "
-            f"{', '.join(markers)}"
-        )
+            f"{path} cannot be read as a .c3d file ({error})"
+        ) from None
 
-    scale = _metres(p) if unit is None else UNITS[unit]
-    return whole_frame_ids(table[:, 0], str(path)), p * scale
+    # A point has three coordinates, a residual that is negative if it was not seen, and a number of
+    # cameras. Names of groups come before a colon, as in a .trc file.
+    points = np.array([points[: len(names)] for _, points in read], np.float64)
+    points = points.reshape(len(read), -1, 5)
+    places = np.where(points[..., 3:4] < 0, np.nan, points[..., :3])
+    return Markers(
+        frames=np.array([number for number, _ in read], np.int64),
+        names=names[: places.shape[1]],
+        places=places,
+        unit=None if unit is None else unit.string_value.strip() or None,
+        fps=fps,
+    )
 
 
 def _numbers(line: str, count: int) -> list[float]:

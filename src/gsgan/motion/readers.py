@@ -1,7 +1,6 @@
 """Readers of motion files, one per format."""
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,7 +27,7 @@ from gsgan.skeleton.joints import BODY, FACE, zeros_as_missing
 from gsgan.skeleton.proportions import HIPS, SHOULDERS, Proportions
 from gsgan.utils.arrays import as_floats, expect_array
 from gsgan.utils.errors import ConfigError, DataError
-from gsgan.utils.files import read_json, read_json_value, read_text
+from gsgan.utils.files import read_json, read_json_value
 from gsgan.utils.pickles import read_arrays, read_npy, read_pickle
 
 Float = NDArray[np.float64]
@@ -629,17 +628,16 @@ def _read_rig(path: Path, source: Source) -> Clip:
 # -- triangulated and detected points
 
 
-def read_trc(path: Path, source: Source) -> Clip:
-    """Markers triangulated by Pose2Sim; other marker sets are not supported."""
-    _, p, conf = read_points3d(path)
-    fps = None
-    with suppress(ValueError, IndexError):  # read_points3d has read the header
-        lines = read_text(path).splitlines()
-        names = lines[1].split()
-        values = lines[2].split()
-        fps = rate_of(path, float(values[names.index("DataRate")]))
+def read_markers(path: Path, source: Source) -> Clip:
+    """Joints of markerless motion capture (.trc, .c3d); markers on the skin are not supported."""
+    found = read_points3d(path)
     return Clip(
-        path=path, p=p, visibility=conf, fps=fps, up=None, unit="metres"
+        path=path,
+        p=found.p,
+        visibility=found.conf,
+        fps=found.fps,
+        up=None,
+        unit="metres",
     )
 
 
@@ -655,6 +653,7 @@ READERS: dict[str, Callable[[Path, Source], Clip]] = {
     ".pt": read_gvhmr,
     ".json": read_mediapipe_json,
     **dict.fromkeys(RIGS, _read_rig),
-    ".trc": read_trc,
+    ".trc": read_markers,
+    ".c3d": read_markers,
     ".pose": _read_pose,
 }
