@@ -28,11 +28,12 @@ def test_it_writes_a_picture_and_a_video(tmp_path, inside):
 
 
 def test_without_an_encoder_it_writes_png_files(tmp_path, inside, monkeypatch):
+    """Into a folder that has the name of the avatar, too."""
     monkeypatch.setattr("gsgan.demo.run.find_spec", lambda name: None)
-    result = inside("demo", "out=first", "pixels=64", "frames=2")
+    result = inside("demo", "out=demo", "pixels=64", "frames=2")
     assert result.returncode == 0, result.stdout + result.stderr
     assert "pip install av" in result.stdout
-    images = sorted((tmp_path / "first" / "dance").glob("*.png"))
+    images = sorted((tmp_path / "demo" / "dance").glob("*.png"))
     assert [path.name for path in images] == ["000000.png", "000001.png"]
 
 

@@ -11,7 +11,7 @@ from gsgan.export.hub import preview
 from gsgan.render.run import render_config
 from gsgan.run.drive import drive_of
 from gsgan.run.runs import Run
-from gsgan.run.shared import DEMO, DEMO_MOTION
+from gsgan.run.shared import DEMO_FOLDER, DEMO_MOTION
 from gsgan.utils.checks import whole
 from gsgan.utils.config import defaults_of
 from gsgan.utils.console import make_console
@@ -33,7 +33,7 @@ def demo_config(config: DictConfig) -> None:
     pixels = whole("pixels", config.pixels, 16)
     video = out / ("dance.mp4" if find_spec("av") else "dance")
     given = {
-        "run": DEMO,
+        "run": str(DEMO_FOLDER),
         "motion": str(DEMO_MOTION),
         "out": str(video),
         "overwrite": config.overwrite,
