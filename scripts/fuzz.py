@@ -79,14 +79,15 @@ def seeds(home: Path, run: Path) -> dict[str, list[tuple[Path, Reader]]]:
     from gsgan.body.smpl import read_smpl
     from gsgan.data.calibration import read_calibration
     from gsgan.data.formats.capture import read_capture
-    from gsgan.export.weights import load_weights, weights_bytes
+    from gsgan.export.weights import load_weights, safetensors_file
     from gsgan.motion.readers import Source, read_motion
-    from gsgan.run.runs import load
+    from gsgan.run.runs import Run, load
     from gsgan.run.stored import CHECKPOINT, read_checkpoint
     from gsgan.skeleton import MEDIAPIPE33
     from gsgan.skeleton.proportions import measure_proportions
     from gsgan.synthetic.gltf import read_character
     from gsgan.synthetic.posing import Choreography
+    from gsgan.utils.config import defaults_of
 
     p = skeletons(8)
     source = Source(
@@ -171,9 +172,9 @@ def seeds(home: Path, run: Path) -> dict[str, list[tuple[Path, Reader]]]:
     own = Path(shutil.copytree(run, home / "run"))
     checkpoint = own / CHECKPOINT
     weights = home / "a.safetensors"
-    weights.write_bytes(
-        weights_bytes(own, load(own), read_checkpoint(checkpoint)["gsgan"])
-    )
+    options = defaults_of("render")
+    options.run = str(own)
+    weights.write_bytes(safetensors_file(Run.load(options)))
     add("ckpt", checkpoint, lambda path: load(path.parents[1]))
     torch.save({"gsgan": Hostile()}, home / "hostile.ckpt")
     add("ckpt", home / "hostile.ckpt", read_checkpoint)

@@ -172,6 +172,7 @@ def test_a_splatting_baseline(tiny):
         "mean_bound",
         "scale_min",
         "scale_max",
+        "scale_spacings",
         "logit_bound",
         "points",
     )

@@ -44,6 +44,7 @@ def avatar(build, tmp_path, dance, landmarks):
     data, avatar, _ = build(
         "model=harmonic", "effects.body_points=on", "effects.view_dependence=1"
     )
+    avatar.body_points.offsets = None  # they are part of a copy's residuals
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for numbers in (

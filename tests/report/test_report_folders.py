@@ -107,7 +107,7 @@ def test_an_unfinished_run_and_a_broken_config_are_left_out(tmp_path, tiny):
     assert not runs
     reasons = {folder.name: reason for folder, reason in out.items()}
     assert "not finished" in reasons["a"]
-    assert "broken" in reasons["b"]
+    assert "config.yaml" in reasons["b"]
     assert "no facts.json" in reasons["c"]
 
 
