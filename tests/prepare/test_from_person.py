@@ -1,12 +1,18 @@
 """Cameras that are found from the person: synthetic views of known cameras."""
 
+import json
+
 import numpy as np
 import pytest
+from capture_scenes import options, quiet, write_project
+from make import skeletons
 from one_person import turning
 from scipy.spatial.transform import Rotation
 
+from gsgan.prepare import from_person
 from gsgan.prepare.camera_array import CameraArray, film_camera
 from gsgan.prepare.from_person import calibrate_from_person
+from gsgan.prepare.run import prepare
 from gsgan.skeleton.joints import FLIP_GROUPS
 from gsgan.utils.errors import DataError
 
@@ -98,6 +104,40 @@ def test_two_cameras_need_their_focal_length():
 def test_cameras_that_share_no_frame_are_refused():
     truth = ring((0, 60, 120))
     uv, conf = seen_by(truth, frames=30)
-    conf[0, 10:], conf[1, :10], conf[1, 20:], conf[2, :20] = 0, 0, 0, 0
+    for camera, frame in enumerate((0, 10, 20)):
+        alone = np.zeros(30)
+        alone[frame : frame + 10] = 1
+        conf[camera] *= alone[:, None]
     with pytest.raises(DataError, match="frame numbers"):
         calibrate_from_person(truth, uv, conf, None)
+
+
+def test_videos_without_a_calibration_become_a_capture(tmp_path):
+    """Of unlike focal guesses the right one is found, and the height gives the scale."""
+    project = write_project(tmp_path / "project", cameras=4, frames=16)
+    (project / "cameras.json").unlink()
+    out = prepare(options(project, calibration="person", height=1.8), quiet())
+    found = np.load(out / "landmarks3d.npz")
+    p, truth = found["p"], skeletons(16)[found["frame_id"]]
+    a, b = p[:, 11:29], truth[:, 11:29]
+    mine = np.linalg.norm(a[:, :, None] - a[:, None], axis=-1)
+    theirs = np.linalg.norm(b[:, :, None] - b[:, None], axis=-1)
+    ratio = (mine / np.where(theirs > 0.2, theirs, np.nan)).ravel()
+    ratio = ratio[np.isfinite(ratio)]
+    assert np.quantile(abs(ratio / np.median(ratio) - 1), 0.9) < 0.05
+    notes = json.loads((out / "prepare.json").read_text())["notes"]
+    assert sum("found from the person" in note for note in notes) == 4
+
+
+def test_a_start_from_which_no_camera_is_placed_is_not_the_end(monkeypatch):
+    truth = ring((0, 70, 150))
+    solution = from_person._solution
+
+    def fails_at_first(guess, *rest):
+        if guess[0].K[0, 0] < 900:
+            raise DataError("cannot be placed")
+        return solution(guess, *rest)
+
+    monkeypatch.setattr(from_person, "_solution", fails_at_first)
+    found = calibrate_from_person(truth, *seen_by(truth), None)
+    assert found.error.max() < 0.1

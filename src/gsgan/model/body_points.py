@@ -374,9 +374,8 @@ class BodyPoints(nn.Module):
         self.scale_max = None
         if scale_spacings is not None:
             above("model.body_points.scale_spacings", scale_spacings)
-            self.scale_max = (
-                scale_spacings * self.pixels_apart(1.0) / body_height
-            )
+            spacing = float(self.points.spacing.median())
+            self.scale_max = scale_spacings * spacing / body_height
 
         # Places at rest tell Ψ one point from another; normals move with the pose.
         rest = (self.points.means - self.points.means.mean(dim=0)) / body_height

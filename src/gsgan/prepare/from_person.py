@@ -8,7 +8,7 @@ point is the image's centre, and lenses have no distortion. The result has no sc
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import combinations, permutations
+from itertools import combinations
 from typing import NamedTuple
 
 import cv2
@@ -29,17 +29,15 @@ USED_FRAMES = 150  # maximum number of frames that are used, evenly spaced
 SEEN_CONFIDENCE = 0.5  # minimum confidence of a landmark
 # Millimetres on film of 36 x 24 mm: the solution starts from each of these.
 START_FOCALS = (26.0, 40.0, 65.0)
-FOCAL_PRIOR = (
-    0.5  # standard deviation of the logarithm of an unknown focal length
-)
-GIVEN_PRIOR = 0.01  # and of a given one
+# Standard deviation of the logarithm of a focal length: of an unknown and of a given one.
+FOCAL_PRIOR = 0.5
+GIVEN_PRIOR = 0.01
 # Landmarks of a true pair agree to this distance in the plane at depth 1, which is generous because
 # detectors disagree by some percent of the person's size.
 MAX_DISTANCE = 0.01
 MIN_COMMON = 60  # landmarks in both of two cameras, over all frames
-GOOD_ANGLE = np.radians(
-    20
-)  # between the rays of a pair: larger ones count alike
+# Between the rays of a pair: larger angles count alike.
+GOOD_ANGLE = np.radians(20)
 FREE_ROTATION = 180.0  # degrees: priors so wide that they only fix the world
 FREE_POSITION = 10.0  # distances of the first two cameras
 ROUNDS = 3  # of the bundle adjustment, with swapped sides corrected in between
@@ -87,17 +85,25 @@ def calibrate_from_person(
     uv = uv[:, frames]
     weight = weight[:, frames]
 
-    # The solution of each start; the one whose landmarks agree best is kept.
+    # The solution of each start; the one whose landmarks agree best is kept. From a wrong focal
+    # length it may be impossible to place a camera, which another start can.
     best = None
+    failure = None
     for start in START_FOCALS if focal is None else (focal,):
         guess = [
             film_camera(camera.name, camera.size, start) for camera in cameras
         ]
         prior = FOCAL_PRIOR if focal is None else GIVEN_PRIOR
-        found = _solution(guess, uv, weight, prior)
+        try:
+            found = _solution(guess, uv, weight, prior)
+        except DataError as error:
+            failure = error
+            continue
         if best is None or np.nanmean(found.error) < np.nanmean(best.error):
             best = found
-    assert best is not None
+    if best is None:
+        assert failure is not None
+        raise failure
     return best
 
 
@@ -262,7 +268,7 @@ def _ray_angle(rig: CameraArray, points: Float, weight: Float) -> float:
     """The median over points of the largest angle between two of their rays, degrees."""
     rays = _unit(points - rig.centres[:, None])
     largest = np.zeros(len(points))
-    for a, b in permutations(range(len(rig)), 2):
+    for a, b in combinations(range(len(rig)), 2):
         cosine = (rays[a] * rays[b]).sum(-1).clip(-1, 1)
         both = (weight[a] > 0) & (weight[b] > 0)
         largest = np.maximum(largest, np.where(both, np.arccos(cosine), 0.0))
