@@ -174,7 +174,7 @@ def seeds(home: Path, run: Path) -> dict[str, list[tuple[Path, Reader]]]:
     weights = home / "a.safetensors"
     options = defaults_of("render")
     options.run = str(own)
-    weights.write_bytes(safetensors_file(Run.load(options)))
+    weights.write_bytes(safetensors_file(Run.from_config(options)))
     add("ckpt", checkpoint, lambda path: load(path.parents[1]))
     torch.save({"gsgan": Hostile()}, home / "hostile.ckpt")
     add("ckpt", home / "hostile.ckpt", read_checkpoint)

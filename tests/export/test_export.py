@@ -66,16 +66,16 @@ def test_a_ply_says_how_it_is_filtered(bare, tmp_path, inside, monkeypatch):
     assert marked.replace(line, b"\n") == plain
 
     # The command, with and without the effect.
-    load = Run.load
+    load = Run.from_config
     for antialias in (False, True):
 
-        def changed(config, antialias=antialias):
-            run = load(config)
+        def changed(config, device, antialias=antialias):
+            run = load(config, device)
             accuracy = replace(run.avatar.accuracy, antialias=antialias)
             run.avatar.accuracy = accuracy
             return run
 
-        monkeypatch.setattr(Run, "load", changed)
+        monkeypatch.setattr(Run, "from_config", changed)
         out = tmp_path / f"{antialias}.ply"
         result = inside("export", f"run={bare}", f"out={out}")
         assert result.returncode == 0, result.stderr
@@ -122,7 +122,7 @@ def test_safetensors_name_no_class_but_gsgans_own(run, compose, tmp_path):
     from gsgan.run.stored import read_config
 
     config = compose("export", f"run={run}", "+device=cpu")
-    content = safetensors_file(Run.load(config))
+    content = safetensors_file(Run.from_config(config))
     path = tmp_path / "a.safetensors"
     path.write_bytes(content)
     assert load_weights(path).splats is not None

@@ -20,7 +20,7 @@ def drive() -> Drive:
 
 def test_it_is_off_by_default(compose, drive):
     for command in ("render", "view"):
-        assert smoothed(compose(command, "run=x"), drive, 30.0) is drive
+        assert smoothed(compose(command, "run=x").smooth, drive, 30.0) is drive
 
 
 @pytest.mark.parametrize("command", ["render", "view"])
@@ -28,7 +28,7 @@ def test_body_poses_follow_the_joints_and_gaps_start_anew(
     compose, drive, command
 ):
     found = smoothed(
-        compose(command, "run=x", "smooth.enabled=true"), drive, 30.0
+        compose(command, "run=x", "smooth.enabled=true").smooth, drive, 30.0
     )
     assert found.body is None
     assert found.text == "a motion, smoothed"

@@ -30,12 +30,10 @@ def test_every_process_probes_and_fits_on_its_own_gpu(
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     for name in ("LOCAL_RANK", "SLURM_LOCALID"):
         monkeypatch.delenv(name, raising=False)
-    config = OmegaConf.create(
-        {"trainer": {"accelerator": "auto", "devices": devices}}
-    )
+    settings = OmegaConf.create({"accelerator": "auto", "devices": devices})
     first = 0 if devices == "auto" else devices[0]
-    assert device_of(config) == torch.device("cuda", first)
+    assert device_of(settings) == torch.device("cuda", first)
     monkeypatch.setenv(launcher, "2")
-    assert device_of(config) == torch.device("cuda", expected)
-    config.trainer.accelerator = "cpu"
-    assert device_of(config) == torch.device("cpu")
+    assert device_of(settings) == torch.device("cuda", expected)
+    settings.accelerator = "cpu"
+    assert device_of(settings) == torch.device("cpu")

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 
-from gsgan.run.drive import drive_of
+from gsgan.run.drive import MotionOptions, drive_of
 from gsgan.run.runs import Run
 from gsgan.view.session import Session, Show
 
@@ -52,10 +52,10 @@ def test_every_layer_is_rendered_from_a_bare_skeleton(run, compose):
     config = compose(
         "view", f"run={run}", f"device={DEVICE}", "motion=novel_pose"
     )
-    loaded = Run.load(config)
+    loaded = Run.from_config(config)
     assert next(loaded.avatar.parameters()).device.type == DEVICE
     drive = replace(
-        drive_of(config, loaded, 30.0), body=None
+        drive_of(MotionOptions.from_config(config), loaded, 30.0), body=None
     )  # the body is solved
     show = Show(
         *(loaded.avatar, loaded.body, drive, lambda motion: drive),

@@ -9,7 +9,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsgan.export.hub import preview
 from gsgan.render.run import render_config
-from gsgan.run.drive import drive_of
+from gsgan.run.drive import MotionOptions, drive_of
 from gsgan.run.runs import Run
 from gsgan.run.shared import DEMO_FOLDER, DEMO_MOTION
 from gsgan.utils.checks import whole
@@ -46,8 +46,9 @@ def demo_config(config: DictConfig) -> None:
     render_config(settings)
 
     # The picture shows one pose of the dance from the front.
-    run = Run.load(settings)
-    drive = drive_of(settings, run, FPS)
+    run = Run.load(DEMO_FOLDER)
+    motion = MotionOptions(motion=str(DEMO_MOTION))
+    drive = drive_of(motion, run, FPS)
     picture = out / "picture.png"
     content = preview(run, drive.rows(np.array([PICTURE])), pixels)
     with writing(picture):

@@ -1,11 +1,12 @@
 """Writes the export that a config describes."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from omegaconf import DictConfig, open_dict
+from omegaconf import DictConfig
 from rich.console import Console
 
 from gsgan.export.card import card
@@ -30,10 +31,10 @@ from gsgan.export.weights import safetensors_file
 from gsgan.run.drive import (
     REST,
     Drive,
+    MotionOptions,
     distilled_of,
     drive_of,
     inputs_of,
-    with_motion,
 )
 from gsgan.run.runs import Run
 from gsgan.scene import BodyPose, cat
@@ -95,8 +96,6 @@ def export_config(config: DictConfig) -> None:
     _check_upload(config, kind)
     if kind == "usd":
         refuse_missing_usd()
-    with open_dict(config):
-        config.device = "cpu"
     if kind in MOTIONS:
         motion = _motion(config, console)
         _write(out, bvh_text(motion) if kind == "bvh" else motion_glb(motion))
@@ -104,7 +103,7 @@ def export_config(config: DictConfig) -> None:
             f"written: {out}, {len(motion.poses.theta)} frames at {motion.fps:g}"
         )
         return
-    run = Run.load(config)
+    run = Run.from_config(config, device="cpu")
     if kind == "hub":
         _hub(config, run, out, tell)
         return
@@ -138,8 +137,10 @@ def _write_poses(
     .usdc file has all poses of a motion."""
     # Without a motion a scene's file shows the rest pose.
     kind = config.format
-    rest = config.motion is None and kind in ("gltf", "usd")
-    drive = _poses(with_motion(config, REST) if rest else config, run)
+    options = MotionOptions.from_config(config)
+    if options.motion is None and kind in ("gltf", "usd"):
+        options = replace(options, motion=REST)
+    drive = _poses(options, config, run)
     console.print(drive.text, markup=False, highlight=False, soft_wrap=True)
     frames = track(range(len(drive.p)), "writing", console)
     if kind == "usd":
@@ -219,8 +220,10 @@ def _hub(
 ) -> None:
     """Writes the folder of a shared avatar, and uploads it if the user asks for it."""
     # The preview shows the first pose of the motion; the rest pose needs no dataset.
-    rest = config.motion is None
-    drive = _poses(with_motion(config, REST) if rest else config, run)
+    options = MotionOptions.from_config(config)
+    if options.motion is None:
+        options = replace(options, motion=REST)
+    drive = _poses(options, config, run)
     tell(drive.text)
     name = config.upload or out.name
     files = avatar_files(run)
@@ -242,23 +245,24 @@ def _block(
 ) -> bytes:
     """The content of a .bin file, and of a page; each motion is one of its own."""
     refuse_unsuitable(run.avatar)
-    chosen = config.motion or ()
+    options = MotionOptions.from_config(config)
+    chosen = options.motion or []
     if isinstance(chosen, str):
         chosen = [chosen]
 
     # Motions are named by their files.
     motions = {}
     for motion in chosen:
-        drive = _poses(with_motion(config, str(motion)), run)
+        drive = _poses(replace(options, motion=motion), config, run)
         tell(drive.text)
         motions[Path(motion).stem] = drive, float(config.fps)
-    return block(run, distilled_of(config, run), motions, name)
+    return block(run, distilled_of(options, run), motions, name)
 
 
-def _poses(config: DictConfig, run: Run) -> Drive:
+def _poses(options: MotionOptions, config: DictConfig, run: Run) -> Drive:
     """The frames to export; by default a held-out one."""
     # The whole motion; its length is known only now.
-    drive = drive_of(config, run, float(above("fps", config.fps)))
+    drive = drive_of(options, run, float(above("fps", config.fps)))
 
     # Some of its frames, if the user asks for them.
     start = whole("start", config.start, 0)
@@ -283,13 +287,13 @@ def _motion(config: DictConfig, console: Console) -> BodyMotion:
         return captured_motion(capture, config.data_smpl, fps)
 
     # The body that the avatar moves with, whose poses are those of the motion or solved.
-    run = Run.load(config)
+    run = Run.from_config(config, device="cpu")
     body = run.body
     if body is None:
         raise ConfigError(
             f"run={run.folder}: its avatar moves without a body; give capture=<folder>"
         )
-    drive = _poses(config, run)
+    drive = _poses(MotionOptions.from_config(config), config, run)
     console.print(drive.text, markup=False, highlight=False, soft_wrap=True)
     poses = []
     for i in track(range(len(drive.p)), "posing", console):

@@ -18,6 +18,7 @@ from gsgan.motion.orbit import Orbit
 from gsgan.render.output import Output
 from gsgan.run.drive import (
     Drive,
+    MotionOptions,
     distilled_of,
     drive_of,
     inputs_of,
@@ -49,12 +50,13 @@ def render_config(config: DictConfig) -> None:
     output = _output(config)
     paint_on = background(str(config.background), output.video)
     fps = float(above("fps", config.fps))
-    run = Run.load(config)
+    motion = MotionOptions.from_config(config)
+    run = Run.from_config(config)
     if config.distilled:
-        run.avatar = distilled_of(config, run)
+        run.avatar = distilled_of(motion, run)
 
     # The motion, and the camera of each frame.
-    drive = smoothed(config, drive_of(config, run, fps), fps)
+    drive = smoothed(config.smooth, drive_of(motion, run, fps), fps)
     drive = _chosen(drive, config, fps)
     console.print(drive.text, markup=False, highlight=False, soft_wrap=True)
     cameras, index = _cameras(config, run, drive)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -128,29 +129,29 @@ class MotionOptions:
         one_of("retarget", self.retarget, ("auto", True, False))
         one_of("up", self.up, (None, *UP_AXES))
 
+    @classmethod
+    def from_config(cls, config: DictConfig) -> MotionOptions:
+        """The options of a command; those that it lacks take their defaults."""
+        # Commands have options of their own beside these.
+        plain: Any = OmegaConf.to_container(config, resolve=True)
+        names = [field.name for field in fields(cls)]
+        return cls(**{name: plain[name] for name in names if name in plain})
 
-def drive_of(config: DictConfig, run: Run, fps: float) -> Drive:
-    """The whole motion of a config at ``fps`` frames per second.
 
-    Options of `MotionOptions` that the config lacks take their defaults.
+def drive_of(options: MotionOptions, run: Run, fps: float) -> Drive:
+    """The whole motion at ``fps`` frames per second.
 
     Raises:
-        ConfigError: when an option has an invalid value.
+        ConfigError: when the options do not go together, or with the run.
         DataError: when the motion cannot be read.
     """
-    # Commands have options of their own beside these.
-    plain: Any = OmegaConf.to_container(config, resolve=True)
-    names = [field.name for field in fields(MotionOptions)]
-    given = {name: plain[name] for name in names if name in plain}
-    options = MotionOptions(**given)
-
     # With drive=skeleton the body follows from the joints, as for a motion without one.
     found = _chosen(options, run, fps)
     return found if options.drive is None else replace(found, body=None)
 
 
-def smoothed(config: DictConfig, drive: Drive, fps: float) -> Drive:
-    """The motion after the filter ``config.smooth``, if that is enabled.
+def smoothed(settings: Mapping[str, Any], drive: Drive, fps: float) -> Drive:
+    """The motion after the filter of the config group ``smooth``, if it is enabled.
 
     Joints are smoothed from the past alone. Body poses follow from them.
 
@@ -158,10 +159,10 @@ def smoothed(config: DictConfig, drive: Drive, fps: float) -> Drive:
         ConfigError: on a setting of the filter that is out of range.
     """
     # The other settings are those of the filter.
-    settings = dict(config.smooth)
-    if not settings.pop("enabled"):
+    own = dict(settings)
+    if not own.pop("enabled"):
         return drive
-    smooth = OneEuro(**settings)
+    smooth = OneEuro(**own)
 
     # Held-out frames may be apart; then the filter starts anew.
     joints = []
@@ -170,11 +171,6 @@ def smoothed(config: DictConfig, drive: Drive, fps: float) -> Drive:
     return replace(
         drive, p=np.stack(joints), body=None, text=f"{drive.text}, smoothed"
     )
-
-
-def with_motion(config: DictConfig, motion: str) -> DictConfig:
-    """A copy of a config with another motion."""
-    return cast(DictConfig, OmegaConf.merge(config, {"motion": motion}))
 
 
 def _chosen(options: MotionOptions, run: Run, fps: float) -> Drive:
@@ -461,11 +457,11 @@ def inputs_of(
     return p, visibility, avatar.body_pose(p, visibility)
 
 
-def distilled_of(config: DictConfig, run: Run) -> Avatar:
+def distilled_of(options: MotionOptions, run: Run) -> Avatar:
     """A run's avatar with Ψ's residuals as linear functions, fitted over training poses: see
     `gsgan.model.harmonic.distilled`. The offsets of pose are part of them."""
     # The fit takes poses at even distances, from the first to the last.
-    drive = drive_of(with_motion(config, "train"), run, 1.0)
+    drive = drive_of(replace(options, motion="train"), run, 1.0)
     chosen = evenly_spaced(len(drive.p), DISTILLED, ends=True)
     return distilled(
         run.avatar,

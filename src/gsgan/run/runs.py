@@ -192,8 +192,8 @@ class Run:
     paths: DataPaths = field(default_factory=DataPaths)
 
     @classmethod
-    def load(cls, config: DictConfig) -> Run:
-        """The run of ``config.run``.
+    def from_config(cls, config: DictConfig, device: str | None = None) -> Run:
+        """The run that a command's config names, on its device or on another.
 
         Raises:
             ConfigError: when it is not set.
@@ -203,16 +203,35 @@ class Run:
             raise ConfigError(
                 "run is not set: give run=<the folder that gsgan.train printed>"
             )
-
-        # The dataset itself is opened later, and only by commands that need it.
-        folder = find_avatar(str(config.run))
         paths = DataPaths.from_config(config)
+        return cls.load(config.run, paths, device or config.device)
+
+    @classmethod
+    def load(
+        cls,
+        name: str | Path,
+        paths: DataPaths | None = None,
+        device: str = "auto",
+    ) -> Run:
+        """A run folder, or a shared avatar.
+
+        Args:
+            name: as ``run`` of `load`.
+            paths: of its dataset and body model file, if they have moved.
+            device: as for `load`.
+
+        Raises:
+            DataError: when the folder holds no run, or a damaged one.
+        """
+        # The dataset itself is opened later, and only by commands that need it.
+        folder = find_avatar(name)
+        paths = paths or DataPaths()
         avatar, stored, checkpoint = read_avatar(folder, paths.smpl)
         return cls(
             folder=folder,
             stored=stored,
             checkpoint=checkpoint,
-            avatar=avatar.to(pick_device(config.device)),
+            avatar=avatar.to(pick_device(device)),
             paths=paths,
         )
 

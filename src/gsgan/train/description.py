@@ -6,23 +6,22 @@ import gsgan.utils.compat  # noqa: F401  (must come before lightning)
 
 # isort: split
 import torch
-from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
 from gsgan.data.datamodule import GsganData
 from gsgan.splat import resolve_backend
 from gsgan.train.module import AvatarTraining
-from gsgan.train.trainer import device_of
 from gsgan.utils.config import BFLOAT16_SINCE
 
 
 def describe(
     console: Console,
     folder: Path,
-    config: DictConfig,
     data: GsganData,
     module: AvatarTraining,
+    device: torch.device,
+    precision: str,
 ) -> None:
     """Prints the data, the parts with their sizes, the effects and the stand-ins in use."""
     info = data.info
@@ -95,11 +94,9 @@ def describe(
 
     # The rasteriser, the precision and the schedule.
     if avatar.splats is not None:
-        backend = resolve_backend(
-            avatar.backend, device_of(config), avatar.accuracy
-        )[0]
+        backend = resolve_backend(avatar.backend, device, avatar.accuracy)[0]
         table.add_row("rasteriser", backend)
-    table.add_row("precision", _precision(str(config.trainer.precision)))
+    table.add_row("precision", _precision(precision))
     s = module.schedule
     table.add_row(
         "schedule",

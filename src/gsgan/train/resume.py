@@ -5,27 +5,27 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig
-
 from gsgan.data.datamodule import GsganData
 from gsgan.evaluate.files import NAMES
 from gsgan.evaluate.kept import FOLDER as SCORING
-from gsgan.run.stored import CHECKPOINT, read_checkpoint, record, rename_keys
+from gsgan.run.stored import CHECKPOINT, read_checkpoint, rename_keys
 from gsgan.utils.errors import ConfigError
 
 PAGE = "avatar.html"
 
 
-def training_record(config: DictConfig, data: GsganData) -> dict[str, Any]:
+def training_record(
+    settings: Mapping[str, Any], data: GsganData
+) -> dict[str, Any]:
     """Settings that must not change when a run is resumed, and the poses that `gsgan.fit`
     made, whose file may be overwritten under the same name."""
-    settings = record(config)
+    kept = dict(settings)
 
     # Fitted poses are compared by their content.
     poses = data.layout.poses
     if poses is not None and poses.fitted:
-        settings["fitted poses"] = poses.digest(data.layout.frames)
-    return settings
+        kept["fitted poses"] = poses.digest(data.layout.frames)
+    return kept
 
 
 def checkpoint_to_resume(

@@ -1,9 +1,11 @@
 """One training run from config to metrics.json."""
 
+from __future__ import annotations
+
 import json
 import sys
 import time
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from signal import SIGTERM
 from typing import cast
@@ -16,6 +18,7 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from lightning import Trainer, seed_everything
+from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
@@ -37,9 +40,9 @@ from gsgan.run.assemble import (
     naming_group,
 )
 from gsgan.run.runs import load
-from gsgan.run.stored import read_checkpoint
+from gsgan.run.stored import read_checkpoint, record
 from gsgan.scene import BodyPose
-from gsgan.train.callbacks import StopOnSignal
+from gsgan.train.callbacks import ImageGrid, StopOnSignal
 from gsgan.train.description import describe
 from gsgan.train.module import AvatarTraining
 from gsgan.train.resume import (
@@ -64,6 +67,45 @@ DISCRIMINATOR_SALT = 1000
 MAX_STORED_POSES = 100  # at most, whose spread is stored: all are posed at once
 
 
+@dataclass(frozen=True)
+class TrainOptions:
+    """The keys of conf/train.yaml beside its groups.
+
+    Args:
+        seed: of all random numbers.
+        resume: continue an earlier part of the run in its folder.
+        distil: folder of a run with Ψ from whose residuals training starts, or None.
+        scores: how the trained avatar is scored; None: it is not.
+        page: write a web page of the avatar.
+        max_cpu_hours: a longer run is refused; None: no limit, since the user chose the device.
+    """
+
+    seed: int
+    resume: bool
+    distil: Path | None
+    scores: ScoreOptions | None
+    page: bool
+    max_cpu_hours: float | None
+
+    @classmethod
+    def from_config(cls, config: DictConfig) -> TrainOptions:
+        """The options of a config."""
+        distil = config.distil
+        # A device that the user chose is accepted.
+        chosen = not OmegaConf.is_interpolation(config.trainer, "accelerator")
+        limited = not chosen and config.trainer.accelerator == "cpu"
+        return cls(
+            seed=config.seed,
+            resume=config.resume,
+            distil=None if distil is None else Path(distil).expanduser(),
+            scores=ScoreOptions.from_config(config)
+            if config.evaluate
+            else None,
+            page=config.page,
+            max_cpu_hours=config.cpu_hours if limited else None,
+        )
+
+
 def run_training(config: DictConfig) -> None:
     """Trains, evaluates and prints where the results are.
 
@@ -78,28 +120,28 @@ def run_training(config: DictConfig) -> None:
     stop = StopOnSignal()
     # A black background decays into denormals, which are slow on CPUs.
     torch.set_flush_denormal(True)
-    if config.evaluate:
+    options = TrainOptions.from_config(config)
+    if options.scores is not None:
         # Missing weights fail now, not after hours of training.
-        build_lpips(config.lpips.nets, config.lpips.path)
+        build_lpips(options.scores.lpips_nets, options.scores.lpips_path)
 
     # The data and the untrained model.
     data, module = build_training(config, console)
-    seed_everything(config.seed, workers=True, verbose=False)
+    seed_everything(options.seed, workers=True, verbose=False)
 
     # An earlier part of the run in the same folder is continued.
     resume = None
     done = 0
-    if config.resume:
+    if options.resume:
         resume = checkpoint_to_resume(folder, module.record, module.marks)
     if resume is None:
         remove_old_results(folder)
-        if config.distil is not None:
-            start_from(module.avatar, data, Path(config.distil).expanduser())
+        if options.distil is not None:
+            start_from(module.avatar, data, options.distil)
     else:
         done = int(read_checkpoint(resume)["gsgan"]["step"])
-        if done >= module.schedule.total and _has_results(
-            config, folder, resume
-        ):
+        finished = done >= module.schedule.total
+        if finished and _has_results(options, folder, resume):
             console.print(
                 f"{folder}: trained and scored before; nothing to do (gsgan.evaluate scores it "
                 "again)",
@@ -108,14 +150,30 @@ def run_training(config: DictConfig) -> None:
             return
 
     # What remains is checked, recorded and printed before the work begins.
-    refuse_long_cpu_run(config, data, module, module.schedule.total - done)
+    refuse_long_cpu_run(
+        options.max_cpu_hours, data, module, module.schedule.total - done
+    )
     module.code = training_code()
-    describe(console, folder, config, data, module)
+    device = device_of(config.trainer)
+    precision = str(config.trainer.precision)
+    describe(console, folder, data, module, device, precision)
 
     # Training.
     module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     logs = "logs" if resume is None else f"logs_{done:06d}"
-    trainer = build_trainer(config, folder, module, data, console, logs, stop)
+    trainer = build_trainer(
+        config.trainer,
+        folder,
+        module,
+        data,
+        console,
+        logger=_logger(config.logger, logs),
+        callbacks=[
+            stop,
+            ImageGrid(folder / "grids", config.grid_rows),
+            *map(instantiate, (config.callbacks or {}).values()),
+        ],
+    )
     _fit(trainer, module, data, resume, folder, console)
     if module.step < module.schedule.total:
         cause = "signal" if stop.asked else "callback"
@@ -128,20 +186,28 @@ def run_training(config: DictConfig) -> None:
 
     # Scores and the web page.
     if trainer.is_global_zero:
-        if config.evaluate:
-            _evaluate(trainer, module, data, config, folder, console)
-        if config.page:
+        if options.scores is not None:
+            _evaluate(trainer, module, data, options, folder, console)
+        if options.page:
             _write_page(folder, data)
         console.print(f"run folder: {folder}", soft_wrap=True)
 
 
-def _has_results(config: DictConfig, folder: Path, checkpoint: Path) -> bool:
-    """Whether the results that the config asks for are newer than the checkpoint."""
-    wanted = {"metrics.json": config.evaluate, PAGE: config.page}
-    return all(
-        is_written(folder / name, checkpoint)
-        for name, on in wanted.items()
-        if on
+def _logger(settings: DictConfig, folder: str) -> Logger:
+    """The logger of the config group; a part of a resumed run has its own folder for files."""
+    # It would overwrite the files of an earlier part.
+    version = {"version": folder} if "version" in settings else {}
+    logger: Logger = instantiate(settings, **version)
+    return logger
+
+
+def _has_results(options: TrainOptions, folder: Path, checkpoint: Path) -> bool:
+    """Whether the results that the options ask for are newer than the checkpoint."""
+    scored = options.scores is None or is_written(
+        folder / "metrics.json", checkpoint
+    )
+    return scored and (
+        not options.page or is_written(folder / PAGE, checkpoint)
     )
 
 
@@ -159,7 +225,9 @@ def build_training(
     with working(console, "reading the data"):
         data = build_data(config)
     if data.lacks_body and moves_with_body(config):
-        fit_before_training(data, instantiate(config.fit), device_of(config))
+        fit_before_training(
+            data, instantiate(config.fit), device_of(config.trainer)
+        )
         with working(console, "reading the data with its body"):
             data = build_data(config)
 
@@ -176,7 +244,7 @@ def build_training(
     with naming_group("training"):
         return data, instantiate(config.training)(
             avatar,
-            record=training_record(config, data),
+            record=training_record(record(config), data),
             scene=json.loads(json.dumps(asdict(data.info))),
         )
 
@@ -288,7 +356,7 @@ def _evaluate(
     trainer: Trainer,
     module: AvatarTraining,
     data: GsganData,
-    config: DictConfig,
+    options: TrainOptions,
     folder: Path,
     console: Console,
 ) -> None:
@@ -301,7 +369,7 @@ def _evaluate(
     # Facts about the training are written beside the scores.
     method = trained(
         folder,
-        seed=config.seed,
+        seed=options.seed,
         iterations=module.step,
         train_seconds=module.train_seconds,
         trained_by=module.code,
@@ -309,9 +377,10 @@ def _evaluate(
 
     # The average of the weights is scored, if there is one.
     avatar = module.shown.eval()
+    assert options.scores is not None
     evaluate_method(
         folder,
-        ScoreOptions.from_config(config),
+        options.scores,
         console,
         data,
         predict=painter(avatar),
@@ -323,12 +392,13 @@ def _evaluate(
 
 
 def refuse_long_cpu_run(
-    config: DictConfig, data: GsganData, module: AvatarTraining, iterations: int
+    max_hours: float | None,
+    data: GsganData,
+    module: AvatarTraining,
+    iterations: int,
 ) -> None:
-    """Refuses a run that would take very long because ``trainer=auto`` found no GPU."""
-    # A CPU that the user chose is accepted.
-    chosen = not OmegaConf.is_interpolation(config.trainer, "accelerator")
-    if chosen or config.trainer.accelerator != "cpu":
+    """Refuses a run of more hours on a CPU, which ``trainer=auto`` chose as it found no GPU."""
+    if max_hours is None:
         return
 
     # The time of one rendering, measured after a warm-up.
@@ -341,7 +411,7 @@ def refuse_long_cpu_run(
 
     # The estimate for the whole run, against the limit of the config.
     hours = STEP_PER_RENDERING * seconds * iterations / 3600
-    if hours > config.cpu_hours:
+    if hours > max_hours:
         raise ConfigError(
             f"no GPU is found, and on this CPU {iterations:,} iterations would take about "
             f"{hours:.0f} hours: size=small training=demo (without experiment= and protocol=) "

@@ -3,6 +3,7 @@
 import logging
 import os
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,13 @@ import torch
 from hydra.utils import instantiate
 from lightning import Callback, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
+from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from gsgan.data.datamodule import GsganData
 from gsgan.run.stored import CHECKPOINT
-from gsgan.train.callbacks import AtomicCheckpoints, ImageGrid, ProgressLines
+from gsgan.train.callbacks import AtomicCheckpoints, ProgressLines
 from gsgan.train.module import AvatarTraining
 
 # what launchers call a process' rank on its machine
@@ -26,27 +28,27 @@ LOCAL_RANKS = ("LOCAL_RANK", "SLURM_LOCALID")
 
 
 def build_trainer(
-    config: DictConfig,
+    settings: DictConfig,
     folder: Path,
     module: AvatarTraining,
     data: GsganData,
     console: Console,
-    logs: str,
-    *callbacks: Callback,
+    logger: Logger | None,
+    callbacks: Sequence[Callback],
 ) -> Trainer:
-    """The Trainer of the config, as long as the schedule."""
-    # A logger overwrites its files: each part of a resumed run has a folder of its own.
-    version = {"version": logs} if "version" in config.logger else {}
-    logger = instantiate(config.logger, **version)
+    """The Trainer of a run, as long as the schedule.
 
-    # Callbacks of the config, beside those that every run has.
-    own = [
-        instantiate(callback) for callback in (config.callbacks or {}).values()
-    ]
+    Args:
+        settings: the config group ``trainer``.
+        folder: of the run.
+        module: what is trained.
+        data: its dataset.
+        console: for progress.
+        logger: of the curves.
+        callbacks: beside those that every run has.
+    """
     used: list[Any] = [
         *callbacks,
-        *own,
-        ImageGrid(folder / "grids", config.grid_rows),
         ProgressLines(console),
         ModelCheckpoint(
             dirpath=folder / CHECKPOINT.parent,
@@ -62,7 +64,7 @@ def build_trainer(
 
     # An epoch is as long as the loader, so the schedule is rounded up to whole epochs.
     return instantiate(
-        config.trainer,
+        settings,
         max_epochs=-(-module.schedule.total // len(data.train_dataloader())),
         callbacks=used,
         default_root_dir=folder,
@@ -72,15 +74,15 @@ def build_trainer(
     )
 
 
-def device_of(config: DictConfig) -> torch.device:
-    """Where Lightning will put the model of a process."""
-    if config.trainer.accelerator == "cpu" or not torch.cuda.is_available():
+def device_of(settings: DictConfig) -> torch.device:
+    """Where Lightning will put the model of a process, by the config group ``trainer``."""
+    if settings.accelerator == "cpu" or not torch.cuda.is_available():
         return torch.device("cpu")
 
     # The launcher's rank of a process picks its GPU.
     ranks = (os.environ.get(name) for name in LOCAL_RANKS)
     rank = int(next(filter(None, ranks), 0))
-    chosen = config.trainer.devices
+    chosen = settings.devices
     return torch.device(
         "cuda", chosen[rank] if OmegaConf.is_list(chosen) else rank
     )

@@ -6,6 +6,7 @@ import logging
 import socket
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,10 +16,10 @@ from gsgan.motion.orbit import Orbit
 from gsgan.run.drive import (
     REST,
     Drive,
+    MotionOptions,
     distilled_of,
     drive_of,
     smoothed,
-    with_motion,
 )
 from gsgan.run.runs import Run
 from gsgan.skeleton.proportions import upright
@@ -62,14 +63,16 @@ class Viewer:
     def __init__(self, config: DictConfig) -> None:
         # The avatar.
         viser = import_viser()
-        self.run = Run.load(config)
+        options = MotionOptions.from_config(config)
+        self.run = Run.from_config(config)
         fps = float(above("fps", config.fps))
         if config.distilled:
-            self.run.avatar = distilled_of(config, self.run)
+            self.run.avatar = distilled_of(options, self.run)
 
         def read(motion: str) -> Drive:
-            drive = drive_of(with_motion(config, motion), self.run, fps)
-            return smoothed(config, drive, fps)
+            chosen = replace(options, motion=motion)
+            drive = drive_of(chosen, self.run, fps)
+            return smoothed(config.smooth, drive, fps)
 
         # The settings and the first motion of all browsers.
         first = REST if self.run.is_shared else self.run.data.watched[0]
