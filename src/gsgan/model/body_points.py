@@ -21,6 +21,7 @@ from gsgan.body.lbs import stretched
 from gsgan.body.skinned import WeightGradients, vertex_normals
 from gsgan.body.subdivide import subdivided
 from gsgan.model import compiled
+from gsgan.model.interpolation import Interpolation
 from gsgan.model.pose_offsets import PoseOffsets
 from gsgan.scene import BodyPose, Gaussians
 from gsgan.skeleton import Points
@@ -61,6 +62,8 @@ class LearntWeights(nn.Module):
     start: Tensor
     near: Tensor
     share: Tensor
+    entries: Tensor
+    entry_shares: Tensor
     # [C, n] int64, the bones that each control may follow, and how much it does at first
     control_bones: Tensor
     control_weights: Tensor
@@ -119,12 +122,18 @@ class LearntWeights(nn.Module):
             .masked_fill(~possible, -30.0)
         )
 
+        # The entries of the field that each point's bones have at its controls, N · BONES rows.
+        entries = near.unsqueeze(1) * joints + index.unsqueeze(2)
+        shares = share.unsqueeze(1).expand_as(entries)
+
         # The tables follow from the body, so that checkpoints do not hold them.
         for name, value in {
             "index": index,
             "start": start,
             "near": near,
             "share": share,
+            "entries": entries.flatten(0, 1),
+            "entry_shares": shares.flatten(0, 1),
             "control_bones": index[chosen],
             "control_weights": ((dense + around) / 2)[chosen].gather(
                 1, index[chosen]
@@ -132,16 +141,23 @@ class LearntWeights(nn.Module):
         }.items():
             self.register_buffer(name, value, persistent=False)
         self.field = nn.Parameter(places.new_zeros(count, joints))
+        self._interpolate = Interpolation()
+        self._interpolate_field = Interpolation()
+
+    def interpolated(self, values: Tensor) -> Tensor:
+        """``[N, C]`` values of the controls ``[A, C]`` at the points."""
+        return self._interpolate(values, self.near, self.share)
 
     def forward(self) -> Tensor:
         """``[N, BONES]``: the weights of bones ``index``; rows sum to 1."""
 
         def make() -> Tensor:
-            # The field at the controls near each point, for the point's bones alone.
-            moved = self.field[self.near.unsqueeze(-1), self.index.unsqueeze(1)]
-            return (
-                self.start + (self.share.unsqueeze(-1) * moved).sum(1)
-            ).softmax(1)
+            # The field at each point, for the point's bones alone.
+            field = self.field.view(-1, 1)
+            moved = self._interpolate_field(
+                field, self.entries, self.entry_shares
+            )
+            return (self.start + moved.view_as(self.start)).softmax(1)
 
         return derived(self, "weights", make, self.field)
 
@@ -474,7 +490,7 @@ class BodyPoints(nn.Module):
         learnt = self.points.learnt
         if self.offsets is None or learnt is None:
             return None
-        found: Tensor = self.offsets(pose.theta, learnt.near, learnt.share)
+        found: Tensor = self.offsets(pose.theta, learnt.interpolated)
         return found
 
     def _skinned(

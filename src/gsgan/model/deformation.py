@@ -12,6 +12,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from gsgan.model import compiled
+from gsgan.model.interpolation import Interpolation
 from gsgan.scene import Gaussians
 from gsgan.skeleton import Points, root_of
 from gsgan.splat.sh import sh_to_colour
@@ -432,6 +433,7 @@ class Deformation(ResidualGaussians):
         self.register_buffer("anchors", anchors)
         self.register_buffer("near", torch.from_numpy(near))
         self.register_buffer("share", share)
+        self.interpolate = Interpolation()
         return places
 
     def store_poses(
@@ -519,29 +521,13 @@ class Deformation(ResidualGaussians):
 
     def _interpolated(self, raw: Tensor, chosen: Tensor | None) -> Tensor:
         """The anchors' ``raw [B, A, C]`` at the points ``chosen [B, M]``, or at all."""
-        B, A, _ = raw.shape
-
-        # Anchors and shares of the points that are wanted.
-        near = (
-            self.near.expand(B, -1, -1) if chosen is None else self.near[chosen]
-        )
-        share = (
-            self.share.expand(B, -1, -1)
-            if chosen is None
-            else self.share[chosen]
-        )
-
-        # One table holds the whole batch: the anchors of item b begin at row A · b.
-        first = A * torch.arange(B, device=raw.device)
-        spread = functional.embedding_bag(
-            (near + first[:, None, None]).flatten(0, 1),
-            raw.flatten(0, 1),
-            mode="sum",
-            per_sample_weights=share.flatten(0, 1).to(raw.dtype),
-        )
-
-        # The rows of all items are split into items again.
-        return spread.unflatten(0, (B, -1))
+        items = []
+        for i, values in enumerate(raw):
+            wanted = None if chosen is None else chosen[i]
+            items.append(
+                self.interpolate(values, self.near, self.share, wanted)
+            )
+        return torch.stack(items)
 
     def _network(
         self,

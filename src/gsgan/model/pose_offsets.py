@@ -1,5 +1,7 @@
 """Offsets of a body's points that depend on how the bones about them turn."""
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -36,12 +38,14 @@ class PoseOffsets(nn.Module):
         count, followed = bones.shape
         self.field = nn.Parameter(torch.zeros(count, 9 * followed, 3))
 
-    def forward(self, theta: Tensor, near: Tensor, share: Tensor) -> Tensor:
+    def forward(
+        self, theta: Tensor, interpolate: Callable[[Tensor], Tensor]
+    ) -> Tensor:
         """``[B, N, 3]`` metres, at rest.
 
         Args:
             theta: ``[B, J, 3]`` axis-angle, rotations of the joints.
-            near, share: ``[N, k]`` the controls near each point, and their weights.
+            interpolate: gives the points ``[N, C]`` values of the controls ``[A, C]``.
         """
         # What bends at each control, [B, C, 9 n]. The root turns the whole body and bends nothing.
         turned = axis_angle_to_matrix(theta[:, 1:]) - torch.eye(3).to(theta)
@@ -53,9 +57,7 @@ class PoseOffsets(nn.Module):
             "bck,ckj->bcj", given.flatten(2), self.field
         )
 
-        # One lookup averages the offsets of all poses: its table has a row for each control.
+        # The offsets of all poses at once: the table has a row for each control.
         table = offsets.transpose(0, 1).flatten(1)
-        found = functional.embedding_bag(
-            near, table, per_sample_weights=share.to(table), mode="sum"
-        )
+        found = interpolate(table)
         return found.unflatten(1, (-1, 3)).transpose(0, 1)
