@@ -52,7 +52,7 @@ class Interpolation:
 
         # On a CPU the gradient multiplies the transpose.
         trained = torch.is_grad_enabled() and values.requires_grad
-        if trained and not values.is_cuda:
+        if trained and values.device.type == "cpu":
             transpose = self._transpose(near, share, len(values))
             found: Tensor = _Interpolated.apply(
                 values, rows, weights, chosen, transpose
