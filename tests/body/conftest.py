@@ -15,8 +15,9 @@ def solver():
 @pytest.fixture(scope="session")
 def poses():
     """Of a motion that signs and makes fists, on which no setting was tuned."""
-    from gsgan.synthetic.free_subject import free_character, free_pose
-    from gsgan.synthetic.posing import Choreography
+    from mannequin import choreography
 
-    motion = Choreography(free_character(), seed=11)
+    from gsgan.synthetic.free_subject import free_character, free_pose
+
+    motion = choreography(free_character())
     return free_pose(motion.at(np.arange(0.4, motion.duration, 0.5)))
