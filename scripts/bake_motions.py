@@ -5,7 +5,7 @@
 Every motion is sampled where it is quick: between samples, the file as it is played places no
 vertex further than `TOLERANCE` from where the generator does. Both avatars of gsgan have a take of
 their own, since hands and feet have places, and arms and legs differ. The result is deterministic;
-it takes 10 minutes.
+it takes 5 minutes of one core.
 """
 
 import argparse
@@ -177,10 +177,9 @@ def bake(name: str, folder: Path, tolerance: float) -> None:
         end = end[split]
         middle = (begin + end) / 2
         times = np.sort(np.concatenate([times, middle]))
-        begin, end = (
-            np.concatenate([begin, middle]),
-            np.concatenate([middle, end]),
-        )
+        ends = np.concatenate([middle, end])
+        begin = np.concatenate([begin, middle])
+        end = ends
 
     # Measured at even times that are no samples.
     at = np.arange(0.0, programme.duration, 0.0137)
