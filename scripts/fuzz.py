@@ -69,7 +69,7 @@ def seeds(home: Path, run: Path) -> dict[str, list[tuple[Path, Reader]]]:
     from capture_scenes import ring, write_toml
     from conventions import write_bvh
     from make import skeletons, write_face, write_hands, write_tiny_capture
-    from mannequin import mannequin
+    from mannequin import choreography, mannequin
     from test_motion_readers import write_amc, write_pose
     from test_prepare_damage import opencv_yaml
     from test_prepare_reconstructions import write_colmap, write_nerfstudio
@@ -86,7 +86,6 @@ def seeds(home: Path, run: Path) -> dict[str, list[tuple[Path, Reader]]]:
     from gsgan.skeleton import MEDIAPIPE33
     from gsgan.skeleton.proportions import measure_proportions
     from gsgan.synthetic.gltf import read_character
-    from gsgan.synthetic.posing import Choreography
     from gsgan.utils.config import defaults_of
 
     p = skeletons(8)
@@ -128,10 +127,10 @@ def seeds(home: Path, run: Path) -> dict[str, list[tuple[Path, Reader]]]:
         add("pkl", home / name, read_smpl if name == "body.pkl" else move)
     person = mannequin()
     move_file = write_bvh(
-        home / "a.bvh", person, Choreography(person).at(np.ones(4)), 1 / 30
+        home / "a.bvh", person, choreography(person).at(np.ones(4)), 1 / 30
     )
     add("bvh", move_file, move)
-    moves = Choreography(person).at(np.arange(4) / 30)
+    moves = choreography(person).at(np.arange(4) / 30)
     for suffix in ("glb", "gltf", "vrma"):
         add(
             "glb",

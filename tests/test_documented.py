@@ -181,13 +181,11 @@ def place(capture, run, bare, on_body, model_file, tmp_path_factory):
 
     def moving(name: str) -> Path:
         from conventions import write_bvh
-        from mannequin import mannequin
-
-        from gsgan.synthetic.posing import Choreography
+        from mannequin import choreography, mannequin
 
         person = mannequin()
         return write_bvh(
-            folder() / name, person, Choreography(person).at(np.ones(2)), 1 / 30
+            folder() / name, person, choreography(person).at(np.ones(2)), 1 / 30
         )
 
     def rendered() -> Path:

@@ -1,5 +1,6 @@
 """Scripts of docs/reliability.md, small: each ends with an error where a promise fails."""
 
+import importlib
 import subprocess
 import sys
 
@@ -8,6 +9,7 @@ import pytest
 from commands import ENVIRONMENT, ROOT
 
 from gsgan.synthetic.scene_setup import load_character
+from gsgan.synthetic.takes import MOTIONS
 
 
 @pytest.mark.parametrize(
@@ -56,3 +58,27 @@ def test_a_print_changes_the_colours_in_its_box_and_no_shape(tmp_path):
     )  # more than compressing it again does
     assert changed[:, :half].mean() > 0.01
     assert changed[:, half:].mean() < 0.001
+
+
+@pytest.fixture
+def bake(monkeypatch):
+    """The module scripts/bake_motions.py."""
+    monkeypatch.syspath_prepend(str(ROOT / "scripts"))
+    return importlib.import_module("bake_motions")
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+@pytest.mark.parametrize("avatar", ["polo", "blouse"])
+def test_the_motions_are_those_of_their_generator(bake, name, avatar):
+    programme = bake.PROGRAMMES[name]
+    subject = bake.Subject(load_character(avatar), programme)
+    times = np.random.default_rng(0).uniform(0, programme.duration, 40)
+    assert subject.error(MOTIONS[name], times).max() < 3e-4
+
+
+@pytest.mark.slow
+def test_a_motion_can_be_baked_again(bake, tmp_path):
+    bake.bake("signs", tmp_path, 0.01)
+    subject = bake.Subject(load_character("polo"), bake.PROGRAMMES["signs"])
+    times = np.linspace(0, 24, 40)
+    assert 1e-4 < subject.error(tmp_path / "signs.npz", times).max() < 0.01

@@ -27,10 +27,10 @@ from gsgan.body.solve import Solver
 from gsgan.fit.shape import fit_hands, fit_shape
 from gsgan.motion.character import Animation, Character
 from gsgan.scene import BodyPose
-from gsgan.synthetic.controls import frame_times
-from gsgan.synthetic.posing import Choreography
+from gsgan.synthetic.passages import frame_times
 from gsgan.synthetic.recorded_motion import RecordedMotion
-from gsgan.synthetic.scene_setup import PROGRAMMES, load_character
+from gsgan.synthetic.scene_setup import load_character
+from gsgan.synthetic.takes import MOTIONS
 
 JOINTS, NEAREST = (
     75,
@@ -54,10 +54,10 @@ PARTS = {  # by the name of a point's bone, first match
 
 
 def animation(character: Character, clip: str) -> Animation:
-    """The poses of ``file:first second:last second:frames``, or of a choreography."""
-    if (name := clip.split(":")[0]) in PROGRAMMES:
-        _, seed, frames = clip.split(":")
-        source = Choreography(character, int(seed), PROGRAMMES[name])
+    """The poses of ``file:first second:last second:frames``, or of ``motion:frames``."""
+    if (name := clip.split(":")[0]) in MOTIONS:
+        frames = clip.split(":")[1]
+        source = RecordedMotion(character, MOTIONS[name])
         return source.at(frame_times(int(frames), source.duration))
     path, first, last, frames = clip.rsplit(":", 3)
     source = RecordedMotion(character, Path(path).expanduser(), collars=COLLARS)

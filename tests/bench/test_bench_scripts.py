@@ -82,7 +82,7 @@ def test_roofline_measures_each_stage(script, tmp_path, capture):
 
 
 def test_surface_measures_each_part(script, tmp_path):
-    clips = ["train=[choreography:0:5]", "test=[held@choreography:1:2]"]
+    clips = ["train=[choreography:5]", "test=[held@far:2]"]
     assert not script("surface", *clips, "points=400")
     table = read(tmp_path, "surface")
     assert set(table) == {"training", "held"}

@@ -1,7 +1,12 @@
 """Fixtures of the tests of the solve."""
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
 
 
 @pytest.fixture(scope="session")
@@ -14,9 +19,13 @@ def solver():
 
 @pytest.fixture(scope="session")
 def poses():
-    """Of a motion that signs and makes fists, on which no setting was tuned."""
+    """Of a motion that signs and makes fists, on which no setting was tuned.
+
+    The generator bends fingers about the body's own hinges; a file's motion turns them aside too.
+    """
+    from motions.posing import Choreography
+
     from gsgan.synthetic.free_subject import free_character, free_pose
-    from gsgan.synthetic.posing import Choreography
 
     motion = Choreography(free_character(), seed=11)
     return free_pose(motion.at(np.arange(0.4, motion.duration, 0.5)))

@@ -1,14 +1,18 @@
 """S shows the hand in front where hands cross and touch, against ray-traced labels."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
+from commands import ROOT
 from tiny_characters import TINY
 
 from gsgan.body import open_body
 from gsgan.data.datamodule import GsganData
 from gsgan.model.segmentation import HANDS, Segmentation
-from gsgan.synthetic import ensure_scene
+from gsgan.motion.character import Character
+from gsgan.synthetic import ensure_scene, scene_setup
 from gsgan.synthetic.camera import pixel_rays
 from gsgan.synthetic.scene_setup import Scene, SceneSettings
 from gsgan.synthetic.trace import Tracer
@@ -36,8 +40,20 @@ def overlaps(scene: Scene, camera: str, frame: int) -> torch.Tensor:
 
 
 @pytest.mark.slow
-def test_the_hand_in_front_is_in_front(tmp_path):
-    """With the exact body; docs/sign_language.md has the default person with a fitted one."""
+def test_the_hand_in_front_is_in_front(tmp_path, monkeypatch):
+    """With the exact body; docs/sign_language.md has the default person with a fitted one.
+
+    The generator of the signs places hands on this body so that they touch; those of a motion's
+    file pass into each other.
+    """
+    monkeypatch.syspath_prepend(str(ROOT / "scripts"))
+    from motions.posing import Choreography
+    from motions.signs import SIGNS
+
+    def signing(character: Character, _path: Path, seed: int) -> Choreography:
+        return Choreography(character, seed, SIGNS)
+
+    monkeypatch.setattr(scene_setup, "RecordedMotion", signing)
     root = ensure_scene(cache=tmp_path, workers=1, progress=False, **SCENE)
     scene, data = Scene(SceneSettings(**SCENE)), GsganData(str(root), size=SIZE)
     dataset = data.dataset("train")

@@ -9,14 +9,13 @@ import pytest
 from animated_glb import CONVENTIONS, add_channel, save, write_gltf
 from conventions import CONVENTIONS as BVH
 from conventions import write_bvh
-from mannequin import mannequin
+from mannequin import choreography, mannequin
 from scipy.spatial.transform import Rotation
 from tiny_glb import BONES, TinyGlb
 
 from gsgan.motion.character import Animation
 from gsgan.motion.gltf_motion import read_gltf_motion
 from gsgan.motion.readers import Source, read_motion
-from gsgan.synthetic.posing import Choreography
 from gsgan.synthetic.recorded_motion import RecordedMotion
 from gsgan.utils.errors import ConfigError, DataError
 
@@ -30,7 +29,7 @@ def person():
 
 @pytest.fixture(scope="module")
 def acted(person) -> Animation:
-    return Choreography(person).at(np.linspace(0, 40, 40))
+    return choreography(person).at(np.linspace(0, 40, 40))
 
 
 @pytest.fixture(scope="module")

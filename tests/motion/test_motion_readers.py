@@ -277,12 +277,10 @@ def test_people_filmed_from_the_waist_up_stand_upright(
 
 def test_bvh(tmp_path, proportions):
     from conventions import write_bvh
-    from mannequin import mannequin
-
-    from gsgan.synthetic.posing import Choreography
+    from mannequin import choreography, mannequin
 
     person = mannequin()
-    signing = Choreography(person).at(21 + np.arange(30) / 30)
+    signing = choreography(person).at(21 + np.arange(30) / 30)
     path = write_bvh(tmp_path / "a.bvh", person, signing, 1 / 30, scale=100.0)
     p, motion = standard(path, proportions)
     assert motion.unit == "centimetres"

@@ -224,12 +224,10 @@ def test_the_subjects_own_motion_is_left_alone(render, capture, tmp_path):
 
 def test_the_up_axis_of_a_rig_can_be_given(render, tmp_path):
     from conventions import write_bvh
-    from mannequin import mannequin
-
-    from gsgan.synthetic.posing import Choreography
+    from mannequin import choreography, mannequin
 
     person = mannequin()
-    signing = Choreography(person).at(21 + np.arange(2) / 30)
+    signing = choreography(person).at(21 + np.arange(2) / 30)
     path = write_bvh(tmp_path / "a.bvh", person, signing, 1 / 30, scale=100.0)
     for given, up in (((), "Z up"), (("up=-y",), "-Y up")):
         result = render(f"motion={path}", f"out={up[0]}", *given)

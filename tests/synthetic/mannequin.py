@@ -8,6 +8,8 @@ from embreex.rtcore_scene import EmbreeScene
 
 from gsgan.motion.character import Animation, Character
 from gsgan.motion.rotations import axis_angle, twist
+from gsgan.synthetic.recorded_motion import RecordedMotion
+from gsgan.synthetic.takes import MOTIONS
 
 TRUNK = {
     "Hips": (None, (0, 0.02, 0.98)),
@@ -146,3 +148,8 @@ def assert_limits(
             np.abs(np.degrees(twist(local(person, motion, name), 0))).max()
             < twisted
         ), name
+
+
+def choreography(person: Character) -> RecordedMotion:
+    """The everyday choreography on a character."""
+    return RecordedMotion(person, MOTIONS["choreography"])

@@ -5,13 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conventions import Y_UP, write_bvh
-from mannequin import mannequin
+from mannequin import choreography, mannequin
 
 from gsgan.motion.character import Animation
 from gsgan.motion.rig import REQUIRED
 from gsgan.motion.rotations import axis_angle, rotation
 from gsgan.motion.standard import ROOM, known_joints
-from gsgan.synthetic.posing import Choreography
 from gsgan.synthetic.recorded_motion import RecordedMotion
 from gsgan.utils.errors import DataError
 
@@ -34,7 +33,7 @@ def person():
 @pytest.fixture(scope="module")
 def signing(person):
     """Two seconds of signing, sampled as a file would be."""
-    return Choreography(person).at(21 + np.arange(60) * STEP)
+    return choreography(person).at(21 + np.arange(60) * STEP)
 
 
 @pytest.fixture(scope="module")
@@ -148,7 +147,7 @@ def test_other_proportions_and_missing_bones(tmp_path, person, signing):
     few = write_bvh(
         tmp_path / "b.bvh",
         plain,
-        Choreography(plain).at(np.array([22.0])),
+        choreography(plain).at(np.array([22.0])),
         STEP,
     )
     read = RecordedMotion(person, few).at(

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conventions import CONVENTIONS, recorded, write_bvh
-from mannequin import mannequin
+from mannequin import choreography, mannequin
 from tiny_characters import from_front
 
 from gsgan.motion.asf import asf_of, read_amc
@@ -14,7 +14,6 @@ from gsgan.motion.readers import Source, read_motion
 from gsgan.motion.rig import SIDES
 from gsgan.motion.rotations import axis_angle
 from gsgan.motion.standard import standard_motion
-from gsgan.synthetic.posing import Choreography
 from gsgan.synthetic.recorded_motion import RecordedMotion
 from gsgan.synthetic.scene_setup import load_character
 from gsgan.synthetic.trace import Appearance, Light, PosedCharacter
@@ -32,7 +31,7 @@ def person():
 @pytest.fixture(scope="module")
 def acted(person) -> Animation:
     """Three frames of rest, as recordings begin, then frames of the whole choreography."""
-    moves = Choreography(person).at(np.linspace(0, 40, 60))
+    moves = choreography(person).at(np.linspace(0, 40, 60))
     eye = np.broadcast_to(np.eye(3), (3, len(person.bones), 3, 3))
     rotations = np.concatenate([eye, moves.rotations])
     joints = np.concatenate([np.stack([person.joints] * 3), moves.joints])

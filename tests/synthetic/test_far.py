@@ -2,20 +2,19 @@
 
 import numpy as np
 import pytest
-from mannequin import assert_limits, local, mannequin
+from mannequin import assert_limits, choreography, local, mannequin
 
 from gsgan.motion.rig import SIDES
 from gsgan.motion.rotations import axis_angle
-from gsgan.synthetic.choreography import EVERYDAY
-from gsgan.synthetic.controls import frame_times
-from gsgan.synthetic.far import FAR
-from gsgan.synthetic.posing import Choreography
+from gsgan.synthetic.passages import frame_times
+from gsgan.synthetic.recorded_motion import RecordedMotion
 from gsgan.synthetic.scene_setup import (
     SceneSettings,
     extent,
     load_character,
     ring,
 )
+from gsgan.synthetic.takes import MOTIONS
 
 # Degrees since a T pose; a squat's hip and a kneeling foot are near what people can do.
 LIMITS = {
@@ -43,15 +42,19 @@ def polo():
 
 
 @pytest.fixture(scope="module")
-def moves(polo):
-    times = frame_times(420, FAR.duration)
-    return times, Choreography(polo, 0, FAR).at(times)
+def far(polo):
+    return RecordedMotion(polo, MOTIONS["far"])
 
 
-@pytest.mark.parametrize("seed", [0, 1])  # whose leading hands differ
-def test_joints_stay_within_their_limits(seed):
+@pytest.fixture(scope="module")
+def moves(far):
+    times = frame_times(420, far.duration)
+    return times, far.at(times)
+
+
+def test_joints_stay_within_their_limits(moves):
     person = mannequin()
-    moves = Choreography(person, seed, FAR).at(frame_times(420, FAR.duration))
+    moves = RecordedMotion(person, MOTIONS["far"]).at(moves[0])
     assert_limits(person, moves, LIMITS, twisted=60)
     for side in SIDES:
         # forwards
@@ -67,9 +70,9 @@ def test_the_person_is_on_the_floor_and_not_in_it(polo, moves):
 
 
 def test_hands_and_knees_rest_where_the_key_poses_place_them(polo, moves):
-    times, motion = moves
-    begin = FAR.ends[-2]
-    still = np.abs(times - begin - 0.25 * (FAR.ends[-1] - begin)).argmin()
+    _times, motion = moves
+    crawls = np.flatnonzero(np.array(motion.passages) == "crawl")
+    still = crawls[len(crawls) // 4]
     assert motion.passages[still] == "crawl"
     height = {
         bone: motion.joints[still, polo.bones.index(bone), 2]
@@ -85,15 +88,14 @@ def test_the_person_goes_far_below_the_everyday_choreography(polo, moves):
     _times, motion = moves
     hips = motion.joints[:, polo.bones.index("Hips"), 2]
     assert hips.min() < 0.25
-    everyday = Choreography(polo).at(frame_times(200, EVERYDAY.duration))
+    everyday = choreography(polo).at(np.linspace(0, 35, 200))
     assert everyday.joints[:, polo.bones.index("Hips"), 2].min() > 0.5
 
 
-def test_every_camera_sees_the_whole_person(polo):
-    source = Choreography(polo, 0, FAR)
+def test_every_camera_sees_the_whole_person(polo, far):
     settings = SceneSettings(size=64, motion="far")
-    points = extent(polo, source, samples=40, stride=200)
-    for view in ring(settings, extent(polo, source)):
+    points = extent(polo, far, samples=40, stride=200)
+    for view in ring(settings, extent(polo, far)):
         x = points @ view.R.T + view.t
         pixel = x @ view.K.T
         pixel = pixel[:, :2] / pixel[:, 2:]

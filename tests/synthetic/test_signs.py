@@ -2,22 +2,20 @@
 
 import numpy as np
 import pytest
-from mannequin import assert_limits, inside, mannequin
+from mannequin import assert_limits, inside
 from scipy.spatial import cKDTree
 from tiny_characters import TINY
 
-from gsgan.motion.rig import SIDES
+from gsgan.motion.rig import SIDES, Rig
 from gsgan.motion.rotations import axis_angle
-from gsgan.synthetic.controls import frame_times
 from gsgan.synthetic.gltf import AVATARS, read_character
-from gsgan.synthetic.posing import Choreography
+from gsgan.synthetic.passages import HELD_OUT, frame_times, split_signs
+from gsgan.synthetic.recorded_motion import RecordedMotion
 from gsgan.synthetic.scene_setup import (
-    VERSION,
     Scene,
     SceneSettings,
-    dataset_key,
 )
-from gsgan.synthetic.signs import HELD_OUT, SIGNS, split_signs
+from gsgan.synthetic.takes import MOTIONS, read_take
 from gsgan.utils.errors import ConfigError
 
 # Signs of both hands: seconds from their start, and the arms' largest gap then, metres.
@@ -40,33 +38,25 @@ def polo():
 
 @pytest.fixture(scope="module")
 def signing(polo):
-    return Choreography(polo, programme=SIGNS).at(
-        frame_times(120, SIGNS.duration)
-    )
+    source = RecordedMotion(polo, MOTIONS["signs"])
+    return source.at(frame_times(120, source.duration))
 
 
-def test_other_scenes_are_what_they_were():
-    assert VERSION == 2
-    assert dataset_key(SceneSettings()) == "polo-128-c1f9a02e2386"
-    assert dataset_key(SceneSettings(size=256)) == "polo-256-d319f51dfd30"
-    assert dataset_key(SceneSettings(motion="signs")) != dataset_key(
-        SceneSettings()
-    )
+@pytest.fixture(scope="module")
+def take(polo):
+    return read_take(MOTIONS["signs"], Rig(polo))
 
 
-def test_signs_are_short_and_some_are_held_out_whole():
-    seconds = {name: duration for name, _, duration in SIGNS.passages}
-    assert len(seconds) == 12
-    assert all(1.5 <= duration <= 2.5 for duration in seconds.values())
-    assert set(HELD_OUT) < set(seconds)
-    moves = Choreography(mannequin(), programme=SIGNS).at(
-        frame_times(120, SIGNS.duration)
-    )
-    names = moves.passages
+def test_signs_are_short_and_some_are_held_out_whole(take, signing):
+    seconds = np.diff(take.ends, prepend=0)
+    assert len(set(take.passages)) == len(seconds) == 12
+    assert ((seconds > 1.5) & (seconds < 2.5)).all()
+    assert set(HELD_OUT) < set(take.passages)
+    names = signing.passages
     train, test = split_signs(names, 30)
     assert len(test) == 30
     assert {names[i] for i in test} == set(HELD_OUT)
-    assert {names[i] for i in train} == set(seconds) - set(HELD_OUT)
+    assert {names[i] for i in train} == set(take.passages) - set(HELD_OUT)
     few_train, few = split_signs(names, 7)
     assert (
         few_train == train
@@ -83,8 +73,8 @@ def test_wrists_and_fingers_stay_within_their_limits(polo, signing):
 
 
 def test_motion_is_smooth(polo):
-    times = np.arange(0, SIGNS.duration, 0.02)
-    moves = Choreography(polo, programme=SIGNS).at(times)
+    source = RecordedMotion(polo, MOTIONS["signs"])
+    moves = source.at(np.arange(0, source.duration, 0.02))
     turned = np.swapaxes(moves.rotations[:-1], -1, -2) @ moves.rotations[1:]
     assert np.linalg.norm(axis_angle(turned), axis=-1).max() < 0.7
     assert all((w >= 0).all() and (w <= 1).all() for w in moves.shapes.values())
@@ -102,7 +92,7 @@ def test_motion_is_smooth(polo):
         assert moves.shapes[shape].max() > 0.5
 
 
-def test_hands_touch_and_do_not_pass_through_each_other(polo):
+def test_hands_touch_and_do_not_pass_through_each_other(polo, take):
     bones = np.array(polo.bones)[polo.dominant_bones()]
     arms = [
         np.flatnonzero(
@@ -111,12 +101,11 @@ def test_hands_touch_and_do_not_pass_through_each_other(polo):
         for side in SIDES
     ]
     meshes = [polo.faces[np.isin(polo.faces, arm).all(axis=1)] for arm in arms]
-    rows = zip(SIGNS.passages, SIGNS.ends, strict=True)
-    start = {name: end - seconds for (name, _, seconds), end in rows}
+    start = dict(zip(take.passages, [0, *take.ends], strict=False))
     times = np.array(
         [start[name] + since for name, (since, _) in TOGETHER.items()]
     )
-    moves = Choreography(polo, programme=SIGNS).at(times)
+    moves = RecordedMotion(polo, MOTIONS["signs"]).at(times)
     for name, R, joints in zip(
         TOGETHER, moves.rotations, moves.joints, strict=True
     ):

@@ -94,11 +94,13 @@ def rest_turns(joint: Mapping[str, Array]) -> dict[str, Array]:
             hand = hand_axes(joint, side) @ standard
         turns[side + "Hand"] = hand
 
-        # Fingers turn from the hand's direction to their own.
+        # Fingers turn from the hand's direction to their own; a bone without end has the direction
+        # of the one before.
         for finger in FINGERS:
             for bone, following in phalanges(joint, side, finger):
                 along = joint[following] - joint[bone]
                 turns[bone] = between(hand[:, 0] * SIGN[side], along) @ hand
+                turns[following] = turns[bone]
     return turns
 
 

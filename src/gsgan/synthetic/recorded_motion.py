@@ -1,4 +1,4 @@
-"""The motion of a rig's file on a character."""
+"""The motion of a file on a character."""
 
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from gsgan.motion.readers import read_rig
 from gsgan.motion.rig import LEG, SIDES, SIGN, Pose, Rig
 from gsgan.motion.rotations import Array, blend
 from gsgan.motion.standard import drift, floor_under, standard_motion
-from gsgan.synthetic.posing import blinks
+from gsgan.synthetic.takes import Take, read_take
 
 # A foot rests while it is this low and slow.
 CONTACT_HEIGHT = 0.04  # leg lengths
@@ -23,17 +23,18 @@ SECTION = 2.5  # seconds that share a passage's name
 class RecordedMotion:
     """The motion of a file on a character, at any times; after its end the last frame stays.
 
-    The person faces -Y in the first frame. A motion within `ROOM` of the middle of its path stays
-    as recorded. Of a longer one, only what is faster than the smoothed path is kept, so that the
-    person stays near the origin and walks as on a treadmill: its feet slide backwards. Where a
-    foot rests in the remaining motion, it is held in place. One foot is on the floor except in
-    jumps, which lose `HOVER`.
+    In a motion of gsgan, ankles and soles go where its take has them, by the length of the legs. In
+    a rig's file, the person faces -Y in the first frame. A motion within `ROOM` of the middle of
+    its path stays as recorded. Of a longer one, only what is faster than the smoothed path is kept,
+    so that the person stays near the origin and walks as on a treadmill: its feet slide backwards.
+    Where a foot rests in the remaining motion, it is held in place. One foot is on the floor except
+    in jumps, which lose `HOVER`.
 
     Args:
         character: the subject. What its rig or the file lacks rests on its parent.
-        path: a BVH file of a person, joints named as by Mixamo, MakeHuman, CMU, Blender, VRM, …;
-            an AMC file with its ASF skeleton beside it; or a glTF file or VRM animation, of which
-            the longest animation is taken.
+        path: one of `MOTIONS`; a BVH file of a person, joints named as by Mixamo, MakeHuman, CMU,
+            Blender, VRM, …; an AMC file with its ASF skeleton beside it; or a glTF file or VRM
+            animation, of which the longest animation is taken.
         seed: of the blinks.
         collars: share of the upper arms' turns that collarbones take, for files such as CMU's
             whose collarbones do not move; None leaves them as they are.
@@ -51,7 +52,34 @@ class RecordedMotion:
     ) -> None:
         self.rig = Rig(character)
         self.seed = seed
-        self.name = path.stem
+        self._shapes: dict[str, Array] = {}
+        if path.suffix == ".npz":
+            self._play(read_take(path, self.rig))
+        else:
+            self._retarget(path, collars)
+
+    def _play(self, take: Take) -> None:
+        """Takes a motion that comes with gsgan."""
+        self._times = take.times
+        self.duration = float(take.times[-1])
+        self._turns = take.turns
+        self._shapes = take.shapes
+        self._passages = take.passages
+        self._ends = take.ends
+
+        # Soles come to their heights, whatever the height of the ankle above them.
+        leg = self.rig.leg
+        self._hips = self._hips_of(leg * take.thighs)
+        pose = self._pose(self._turns, self._hips)
+        self._ankles = []
+        for side in SIDES:
+            ankle = leg * take.feet[side]
+            ankle[:, 2] += pose.position(side + "Foot")[:, 2]
+            ankle[:, 2] -= pose.lowest(side)
+            self._ankles.append(ankle)
+
+    def _retarget(self, path: Path, collars: float | None) -> None:
+        """Reads the motion of a rig."""
         read = read_rig(path).motion
 
         # Times of the frames, from 0.
@@ -59,6 +87,11 @@ class RecordedMotion:
         self._times = (
             np.arange(len(read.root), dtype=np.float64) * read.frame_time
         )
+
+        # Names of even parts.
+        sections = np.arange(1 + self.duration // SECTION, dtype=int)
+        self._passages = tuple(f"{path.stem} {k}" for k in sections)
+        self._ends = SECTION * (1 + sections)
 
         # Turns of the bones, with collarbones that follow the upper arms.
         standard = standard_motion(read, path)
@@ -70,12 +103,10 @@ class RecordedMotion:
                 self._turns[side + "Shoulder"] = blend(chest, arm, collars)
 
         # The middle of the thighs' joints goes where it is in the file, by the length of the legs.
-        joint = self.rig.joint
-        offset = (joint["LeftUpLeg"] + joint["RightUpLeg"]) / 2 - joint["Hips"]
         left = standard.joints["LeftUpLeg"]
         right = standard.joints["RightUpLeg"]
         thighs = (left + right) / 2 * self.rig.leg / standard.leg
-        self._hips = thighs - self._turns["Hips"] @ offset
+        self._hips = self._hips_of(thighs)
 
         # Legs that go straight down from wider hips would cross below narrow ones.
         width = float(np.median(np.linalg.norm(left - right, axis=1)))
@@ -84,6 +115,12 @@ class RecordedMotion:
             max(0.0, width - self.rig.length("LeftUpLeg", "RightUpLeg")) / 2
         )
         self._settle(read.frame_time)
+
+    def _hips_of(self, thighs: Array) -> Array:
+        """Places ``[F, 3]`` of the hips at which the thighs' joints have a middle ``[F, 3]``."""
+        joint = self.rig.joint
+        offset = (joint["LeftUpLeg"] + joint["RightUpLeg"]) / 2 - joint["Hips"]
+        return thighs - self._turns["Hips"] @ offset
 
     def _settle(self, step: float) -> None:
         """Moves the hips near the origin and to the floor, and finds the ankles' targets."""
@@ -146,9 +183,13 @@ class RecordedMotion:
         for side, target, pole in zip(SIDES, ankles, knees, strict=True):
             pose.reach(side, LEG, target, pole)
 
-        sections = (times // SECTION).astype(int)
-        names = tuple(f"{self.name} {k}" for k in sections)
-        return pose.motion(blinks(times, self.duration, self.seed), names)
+        # The face, and the names of the passages.
+        shapes = blinks(times, self.duration, self.seed)
+        for name, weights in self._shapes.items():
+            shapes[name] = np.interp(times, self._times, weights)
+        index = np.searchsorted(self._ends, times, side="right")
+        index = index.clip(max=len(self._ends) - 1)
+        return pose.motion(shapes, tuple(self._passages[i] for i in index))
 
 
 def _held(
@@ -190,3 +231,13 @@ def _interpolated(turns: Array, known: Array, times: Array) -> Array:
         return np.repeat(turns, len(times), axis=0)
     between = Slerp(known, Rotation.from_matrix(turns))
     return np.asarray(between(times).as_matrix())
+
+
+def blinks(times: Array, duration: float, seed: int) -> dict[str, Array]:
+    """Weights of the face shapes of both eyes at times ``[F]``: a blink every three seconds."""
+    # Moments in the middle of blinks.
+    random = np.random.default_rng([seed, 1])
+    moments = np.cumsum(random.uniform(1.5, 4.5, int(duration / 1.5) + 1))
+    near = np.exp(-(((times[:, None] - moments) / 0.08) ** 2))
+    closed = near.sum(axis=1).clip(0, 1)
+    return {"blink_left": closed, "blink_right": closed}

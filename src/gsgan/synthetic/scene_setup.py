@@ -18,15 +18,12 @@ from gsgan.data.cameras import DISTORTION_LENGTHS
 from gsgan.motion.character import Character
 from gsgan.motion.readers import RIGS
 from gsgan.synthetic.camera import SceneCamera, look_at, through_lens, zoomed
-from gsgan.synthetic.choreography import EVERYDAY, held_out
-from gsgan.synthetic.controls import frame_times
-from gsgan.synthetic.far import FAR
 from gsgan.synthetic.free_subject import free_character, free_pose
 from gsgan.synthetic.gltf import AVATARS, read_character
-from gsgan.synthetic.posing import Choreography
+from gsgan.synthetic.passages import frame_times, held_out, split_signs
 from gsgan.synthetic.recorded_motion import RecordedMotion
 from gsgan.synthetic.secondary import Moving, Secondary
-from gsgan.synthetic.signs import SIGNS, split_signs
+from gsgan.synthetic.takes import MOTIONS
 from gsgan.synthetic.trace import Appearance, Light, PosedCharacter, Wrinkles
 from gsgan.utils.arrays import as_floats
 from gsgan.utils.checks import between, one_of, whole
@@ -85,8 +82,8 @@ def _centred(x: Array) -> Array:
     return x / max(1.0, float(largest))
 
 
-VERSION = 2
-"""Version of the generator. Raise it when any pixel changes: datasets are then made again."""
+VERSION = 3
+"""Version of the images. Raise it when any pixel changes: datasets are then made again."""
 
 # Names of avatars.
 DEFAULT = "polo"
@@ -94,8 +91,6 @@ FREE_BODY = "free_body"
 # Names of motions.
 CHOREOGRAPHY = "choreography"
 SIGNING = "signs"
-FURTHER = "far"
-PROGRAMMES = {CHOREOGRAPHY: EVERYDAY, SIGNING: SIGNS, FURTHER: FAR}
 
 CAMERA_ARC = math.radians(150)  # in front of a person who signs
 CAMERA_HEIGHTS = (1.35, 0.95, 1.75)  # metres, in turn around the person
@@ -121,7 +116,8 @@ OPTIONAL_LISTS = {"lens": (-math.inf, math.inf), "test_scale": (0.25, 4)}
 class SceneSettings:
     """The parameters of a synthetic dataset, as in conf/data/synthetic.yaml.
 
-    Together with `VERSION` they determine every byte. Disabled effects are stored as None.
+    Together with `VERSION` and the motion's file they determine every byte. Disabled effects are
+    stored as None.
 
     Raises:
         ConfigError: naming the parameter that is out of range.
@@ -133,7 +129,7 @@ class SceneSettings:
     frames: int = 84
     test_frames: int = 21  # held out, of all frames
     rays_per_pixel: int = 16
-    seed: int = 0  # of the motion's style and of the tints
+    seed: int = 0  # of blinks and tints
     avatar: str = DEFAULT  # name, or path of a .glb
     motion: str = CHOREOGRAPHY  # name, or path of a motion file of a rig
     secondary: bool = True  # sway and wrinkles of cloth
@@ -177,8 +173,8 @@ class SceneSettings:
             f"avatar must be {', '.join(named)} or the path of a rigged .glb, got {self.avatar!r}",
         )
         _require(
-            self.motion in tuple(PROGRAMMES) or str(self.motion).endswith(RIGS),
-            f"motion must be {', '.join(PROGRAMMES)} or the path of a {', '.join(RIGS)} file, "
+            self.motion in tuple(MOTIONS) or str(self.motion).endswith(RIGS),
+            f"motion must be {', '.join(MOTIONS)} or the path of a {', '.join(RIGS)} file, "
             f"got {self.motion!r}",
         )
         one_of("data.source.secondary", self.secondary, (True, False))
@@ -231,12 +227,12 @@ def dataset_key(settings: SceneSettings) -> str:
     Raises:
         DataError: when a file does not exist.
     """
-    # A file is replaced by the hash of its content.
+    # A file is replaced by the hash of its content: that of an avatar of gsgan by `VERSION`.
     parameters = asdict(settings)
-    for name in ("avatar", "motion"):
-        if parameters[name] in (*AVATARS, FREE_BODY, *PROGRAMMES):
-            continue
-        path = Path(parameters[name]).expanduser()
+    files = {"motion": motion_file(settings.motion)}
+    if settings.avatar not in (*AVATARS, FREE_BODY):
+        files["avatar"] = Path(settings.avatar).expanduser()
+    for name, path in files.items():
         if not path.is_file():
             raise DataError(f"data.source.{name}: {path} does not exist")
         parameters[name] = hashlib.sha256(path.read_bytes()).hexdigest()
@@ -251,6 +247,11 @@ def dataset_key(settings: SceneSettings) -> str:
         if getattr(settings, effect):
             key += f"-{effect}"
     return key
+
+
+def motion_file(motion: str) -> Path:
+    """The file of ``data.source.motion``, a name in `MOTIONS` or a path."""
+    return MOTIONS.get(motion) or Path(motion).expanduser()
 
 
 def load_character(avatar: str) -> Character:
@@ -318,14 +319,9 @@ class Scene:
             self.tints = dict(zip(self.train_cameras, tints, strict=True))
 
     def _moving(self) -> Moving:
-        """The choreography or the recorded motion on this character."""
-        # Names of choreographies, else the file of a recording.
-        settings = self.settings
-        if settings.motion in PROGRAMMES:
-            programme = PROGRAMMES[settings.motion]
-            return Choreography(self.character, settings.seed, programme)
-        path = Path(settings.motion).expanduser()
-        return RecordedMotion(self.character, path, settings.seed)
+        """The motion on this character."""
+        path = motion_file(self.settings.motion)
+        return RecordedMotion(self.character, path, self.settings.seed)
 
     def _cameras(self) -> dict[str, SceneCamera]:
         """All cameras by name: for training, for testing, then zoomed copies of the latter."""

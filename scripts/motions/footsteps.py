@@ -1,14 +1,13 @@
 """Steps that follow the choreography: feet stand still, or swing to where they will be needed.
 
-Units and axes are those of :mod:`gsgan.synthetic.controls`.
+Units and axes are those of :mod:`motions.controls`.
 """
 
 import math
 from typing import NamedTuple
 
 import numpy as np
-
-from gsgan.synthetic.controls import (
+from motions.controls import (
     STANCE,
     Array,
     Programme,

@@ -7,6 +7,16 @@ person and are scaled to the character's own arms and legs.
 from typing import NamedTuple
 
 import numpy as np
+from motions import controls
+from motions.choreography import EVERYDAY
+from motions.controls import (
+    Controls,
+    Programme,
+    controls_at,
+    passages_at,
+    smoothstep,
+)
+from motions.footsteps import FootState, Footsteps
 
 from gsgan.motion.character import Animation, Character
 from gsgan.motion.rig import (
@@ -21,16 +31,6 @@ from gsgan.motion.rig import (
     frame,
 )
 from gsgan.motion.rotations import Array, blend, matvec, rotation, unit
-from gsgan.synthetic import controls
-from gsgan.synthetic.choreography import EVERYDAY
-from gsgan.synthetic.controls import (
-    Controls,
-    Programme,
-    controls_at,
-    passages_at,
-    smoothstep,
-)
-from gsgan.synthetic.footsteps import FootState, Footsteps
 
 X, Y, Z = np.eye(3)
 # Flexion of a finger's joints at full curl, radians; the thumb's first joint turns in its saddle.
@@ -64,7 +64,7 @@ class Choreography:
 
     Args:
         character: the subject.
-        seed: of amplitudes, phases, leading hands and blinks.
+        seed: of amplitudes, phases and leading hands.
         programme: the passages.
     """
 
@@ -254,8 +254,8 @@ class Choreography:
             pose.world[bone] = pose.rotation(pose.parent(bone)) @ turn
 
     def _face(self, c: Controls, times: Array) -> dict[str, Array]:
-        """Weights of the face shapes."""
-        shapes = blinks(times, self.duration, self.seed)
+        """Weights of the face shapes; the player adds blinks."""
+        shapes = {}
 
         # An opening mouth alternates between round and wide vowels.
         mouth = c.mouth.clip(0, 1)
@@ -304,16 +304,6 @@ def _freed(c: Controls, i: int, foot: FootState) -> FootState:
         pitch=foot.pitch + free * (pitch - foot.pitch),
         toes=foot.toes + free * (toes - foot.toes),
     )
-
-
-def blinks(times: Array, duration: float, seed: int) -> dict[str, Array]:
-    """Weights of the face shapes of both eyes at times ``[F]``: a blink every three seconds."""
-    # Moments in the middle of blinks.
-    random = np.random.default_rng([seed, 1])
-    moments = np.cumsum(random.uniform(1.5, 4.5, int(duration / 1.5) + 1))
-    near = np.exp(-(((times[:, None] - moments) / 0.08) ** 2))
-    closed = near.sum(axis=1).clip(0, 1)
-    return {"blink_left": closed, "blink_right": closed}
 
 
 def _follow_feet(c: Controls, feet: list[FootState]) -> None:

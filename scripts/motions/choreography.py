@@ -1,15 +1,13 @@
-"""The everyday choreography: passages from walking to a free style, and its held-out frames.
+"""The everyday choreography: passages from walking to a free style.
 
-Units and axes are those of :mod:`gsgan.synthetic.controls`. Passages write into neutral controls
+Units and axes are those of :mod:`motions.controls`. Passages write into neutral controls
 ``c``, given times ``s [F]`` in [0, 1] through the passage.
 """
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
-
-from gsgan.synthetic.controls import (
+from motions.controls import (
     TAU,
     WALK,
     Array,
@@ -22,7 +20,7 @@ from gsgan.synthetic.controls import (
     smoothstep,
 )
 
-COMBINATION = "squat_and_wave"
+from gsgan.synthetic.passages import COMBINATION
 
 
 def walk(c: Controls, s: Array, style: Style) -> None:
@@ -394,44 +392,3 @@ PASSAGES: tuple[tuple[str, Passage, float], ...] = (
     ("freestyle", freestyle, 5.0),
 )
 EVERYDAY = Programme(PASSAGES)
-
-
-def held_out(
-    names: Sequence[str], test_frames: int, block: int = 3
-) -> list[int]:
-    """The held-out frames: the combination passage first, then blocks inside the others.
-
-    Blocks lie in the middle of passages: their neighbours in time are training frames, the extreme
-    of the movement is not. The combination is never in the training split.
-
-    Args:
-        names: the passage of each frame.
-        test_frames: number of frames to hold out, fewer than all.
-        block: frames per block, at least 1.
-    """
-    combined = []
-    others: dict[str, list[int]] = {}
-    for i, name in enumerate(names):
-        if name == COMBINATION:
-            combined.append(i)
-        else:
-            others.setdefault(name, []).append(i)
-    chosen = combined[:test_frames]
-
-    # Rounds through the other passages, the longest first, each giving a block per round.
-    order = sorted(others.values(), key=len, reverse=True)
-    while len(chosen) < test_frames:
-        before = len(chosen)
-        for run in order:
-            free = [i for i in run if i not in chosen]
-            # One frame of each passage stays in training as long as possible.
-            size = min(block, test_frames - len(chosen), len(free) - 1)
-            size = max(size, 0)
-            begin = (len(free) - size + 1) // 2
-            chosen += free[begin : begin + size]
-
-        # If no passage has a frame to spare, the first free frames are taken.
-        if len(chosen) == before:
-            left = [i for i in range(len(names)) if i not in chosen]
-            chosen += left[: test_frames - len(chosen)]
-    return sorted(chosen)

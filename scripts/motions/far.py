@@ -1,6 +1,6 @@
 """The far choreography: what the everyday one never shows, to drive avatars far from training.
 
-Units and axes are those of :mod:`gsgan.synthetic.controls`. far.yaml has the key poses.
+Units and axes are those of :mod:`motions.controls`. far.yaml has the key poses.
 """
 
 from pathlib import Path
@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 import yaml
-
-from gsgan.synthetic.controls import (
+from motions.controls import (
     Array,
     Controls,
     Passage,

@@ -1,6 +1,6 @@
 """Sign language in front of chest and face: twelve signs, of which three are never trained on.
 
-Units and axes are those of :mod:`gsgan.synthetic.controls`; knuckles are the middle fingers', in
+Units and axes are those of :mod:`motions.controls`; knuckles are the middle fingers', in
 mirrored chest axes from the middle of the shoulders: the mouth is at (0, -0.18, 0.16). The signs
 are gestures with the hand shapes, contacts and occlusions of signs, and have no meaning.
 """
@@ -9,8 +9,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-
-from gsgan.synthetic.controls import (
+from motions.controls import (
     TAU,
     Array,
     Controls,
@@ -20,7 +19,6 @@ from gsgan.synthetic.controls import (
     rotate,
     smoothstep,
 )
-from gsgan.utils.errors import ConfigError
 
 Value = Array | float  # a number, or one per frame [F]
 
@@ -404,8 +402,6 @@ def peek(c: Controls, s: Array, style: Style) -> None:
     )
 
 
-# A contact, a crossing, and hands before the face.
-HELD_OUT = ("roof", "cancel", "peek")
 SIGNS = Programme(
     (
         ("hello", hello, 1.6),
@@ -424,38 +420,3 @@ SIGNS = Programme(
     resting=at_ease,
     blend=0.4,
 )
-
-
-def split_signs(
-    names: Sequence[str], test_frames: int
-) -> tuple[list[int], list[int]]:
-    """Training and held-out frames: signs in `HELD_OUT` are whole in the held-out split.
-
-    Frames of these signs beyond ``test_frames`` are in neither split.
-
-    Args:
-        names: the sign of each frame.
-        test_frames: number of frames to hold out; 0: all signs train.
-
-    Raises:
-        ConfigError: when the signs in `HELD_OUT` have fewer frames.
-    """
-    # Frames of the held-out signs, and all others.
-    unseen = []
-    seen = []
-    for i, name in enumerate(names):
-        if name in HELD_OUT:
-            unseen.append(i)
-        else:
-            seen.append(i)
-    if test_frames > len(unseen):
-        raise ConfigError(
-            f"synthetic data: motion=signs holds out the signs {', '.join(HELD_OUT)}, which have "
-            f"{len(unseen)} of {len(names)} frames; test_frames must be at most that"
-        )
-    if test_frames == 0:
-        return list(range(len(names))), []
-
-    # The test frames are spread evenly over those of the held-out signs.
-    test = [unseen[k * len(unseen) // test_frames] for k in range(test_frames)]
-    return seen, test

@@ -152,11 +152,6 @@ class Programme:
         return index.clip(max=len(self.passages) - 1)
 
 
-def frame_times(frames: int, duration: float) -> Array:
-    """``[F]`` seconds: even samples of a motion, in the middle of each step."""
-    return (np.arange(frames) + 0.5) * duration / frames
-
-
 def passages_at(times: Array, programme: Programme) -> tuple[str, ...]:
     """The passage at each of the times ``[F]``, seconds."""
     return tuple(programme.passages[i][0] for i in programme.index_at(times))
