@@ -2,16 +2,18 @@
 
 import io
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
+import fsspec
 import numpy as np
 import pytest
 from commands import refused, train
 from lightning.pytorch.loggers import wandb as wandb_logger
 from PIL import Image
 
-from gsgan.run.stored import CHECKPOINT
+from gsgan.run.stored import CHECKPOINT, read_checkpoint
 from gsgan.utils.sweeps import STOPPED
 
 
@@ -47,21 +49,38 @@ def test_callbacks_are_built_from_their_group(tiny):
     assert list(config.callbacks) == ["learning_rate", "device_stats"]
 
 
-def test_a_run_that_a_callback_stops_is_not_scored_and_resumes(trained):
-    stopper = (
-        "+callbacks.stop={_target_: lightning.pytorch.callbacks.EarlyStopping"
-    )
-    stopper += ", monitor: val/psnr, mode: max, patience: 1, min_delta: 1000}"
+def test_a_run_that_a_callback_stops_resumes_from_a_remote_copy(trained):
+    """The checkpoint is taken from another place, as on a machine without the run folder."""
     long = ("training.schedule.epoch=1", "training.schedule.step_one=20")
-    result, folder = trained(stopper, *long)
+    result, folder = trained(
+        "callbacks=[early_stop,remote]",
+        "callbacks.early_stop.patience=1",
+        "callbacks.early_stop.min_delta=1000",
+        "callbacks.remote.dirpath=memory://bucket/run",
+        *long,
+    )
     assert result.returncode == STOPPED, result.stdout + result.stderr
     assert "stopped by a callback" in result.stdout
     assert not (folder / "metrics.json").exists()
-    result, _ = trained(
-        *long
-    )  # callbacks may differ between the parts of a run
+
+    remote = fsspec.filesystem("memory")
+    copy = remote.cat("/bucket/run/last.ckpt")
+    step = read_checkpoint(folder / CHECKPOINT)["gsgan"]["step"]
+    shutil.rmtree(folder)
+    (folder / CHECKPOINT).parent.mkdir(parents=True)
+    (folder / CHECKPOINT).write_bytes(copy)
+    assert read_checkpoint(folder / CHECKPOINT)["gsgan"]["step"] == step
+
+    # callbacks may differ between the parts of a run
+    result, _ = trained(*long)
     assert result.returncode == 0, result.stdout + result.stderr
+    assert "resuming from" in result.stdout
     assert (folder / "metrics.json").is_file()
+
+
+def test_a_remote_copy_without_an_address_is_refused(trained):
+    result, _ = trained("callbacks=[remote]")
+    refused(result, "callbacks.remote.dirpath")
 
 
 @pytest.mark.parametrize(

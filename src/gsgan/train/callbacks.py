@@ -166,7 +166,10 @@ class StopOnSignal(Callback):
 
 
 class AtomicCheckpoints(TorchCheckpointIO):
-    """Writes a new file and renames it, so that a killed run leaves a whole checkpoint."""
+    """Writes a new file and renames it, so that a killed run leaves a whole checkpoint.
+
+    Those at addresses such as s3://bucket/run are written by Lightning, also completely or not.
+    """
 
     def save_checkpoint(
         self,
@@ -174,6 +177,10 @@ class AtomicCheckpoints(TorchCheckpointIO):
         path: Any,
         storage_options: Any | None = None,
     ) -> None:
+        if "://" in str(path):
+            super().save_checkpoint(checkpoint, path, storage_options)
+            return
+
         # The checkpoint is complete in memory before a file is touched.
         buffer = io.BytesIO()
         torch.save(checkpoint, buffer)
