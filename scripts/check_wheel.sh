@@ -63,8 +63,8 @@ END
 test -s run/metrics.json
 "$python" -m gsgan.evaluate run="$folder/run"
 "$python" -m gsgan.report run="$folder/run" runs="$folder/run" figures=[strip]
-"$python" -m gsgan
-"$python" -m gsgan.demo out="$folder/demo" frames=5 pixels=128
+"$folder/venv/bin/gsgan"
+"$folder/venv/bin/gsgan" demo out="$folder/demo" frames=5 pixels=128
 test -s demo/picture.png
 for command in prepare check fit; do
   "$python" -m gsgan.$command --help >help.txt

@@ -66,7 +66,7 @@ class Hostile:
 def seeds(home: Path, run: Path) -> dict[str, list[tuple[Path, Reader]]]:
     """Whole and hostile files by kind, each in a folder with what its reader needs beside it."""
     from animated_glb import write_gltf
-    from capture_scenes import ring, write_toml
+    from capture_scenes import ring, write_qualisys, write_toml
     from conventions import write_bvh
     from make import skeletons, write_face, write_hands, write_tiny_capture
     from mannequin import choreography, mannequin
@@ -157,6 +157,11 @@ def seeds(home: Path, run: Path) -> dict[str, list[tuple[Path, Reader]]]:
         )
     add(
         "calibration", write_toml(home / "Calib.toml", ring()), read_calibration
+    )
+    add(
+        "calibration",
+        write_qualisys(home / "a.qca.txt", ring()),
+        read_calibration,
     )
     for name in ("cameras.bin", "images.bin"):
         place = folder(f"colmap_{name[:-4]}")

@@ -4,11 +4,15 @@ import json
 import shutil
 import subprocess
 import sys
+import tomllib
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
 import torch
-from commands import ENVIRONMENT, arguments, refused
+from commands import ENVIRONMENT, ROOT, arguments, refused
+
+import gsgan.__main__
 
 METRICS = {"psnr", "ssim", "lpips_vgg", "lpips_alex", "edge_f1", "miou"}
 
@@ -139,6 +143,30 @@ def test_the_list_of_commands(tmp_path):
     )
     assert "gsgan.train" in result.stdout
     assert "gsgan.evaluate" in result.stdout
+
+
+def test_one_program_runs_every_command(tmp_path):
+    """``gsgan train`` is ``python -m gsgan.train``: the same output, the same status."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    target = EntryPoint("gsgan", project["scripts"]["gsgan"], "console_scripts")
+    assert target.load() is gsgan.__main__.main
+
+    def ran(*words: str) -> tuple[int, str, str]:
+        done = subprocess.run(
+            [sys.executable, "-m", *words],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        return done.returncode, done.stdout, done.stderr
+
+    for words in (("demo", "--help"), ("render", "run=nowhere")):
+        command, *rest = words
+        assert ran("gsgan", *words) == ran(f"gsgan.{command}", *rest)
+    status, _, message = ran("gsgan", "nonsense")
+    assert status == 1
+    assert "gsgan.nonsense is not a command" in message
 
 
 def weights(run: Path) -> dict[str, torch.Tensor]:

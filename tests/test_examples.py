@@ -1,16 +1,22 @@
 """The scripts of docs/examples/ run, on tiny data; the commands they start run in this process."""
 
 import importlib
+import json
 import os
 import re
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
+import trimesh
 from commands import ROOT
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
-from gsgan.run.shared import DEMO_FOLDER
+import gsgan
+from gsgan.export.splats import splats_of
+from gsgan.run.shared import DEMO_FOLDER, DEMO_MOTION
 from gsgan.utils.provenance import verify
 
 FOLDER = ROOT / "docs" / "examples"
@@ -108,6 +114,34 @@ def test_the_avatar_is_driven_into_a_video(script, tmp_path):
         frames = [x.to_ndarray(format="rgb24") for x in container.decode()]
     assert len(frames) == 3
     assert frames[0].min() < 60  # somebody is there, on white
+
+
+def test_skinned_splats_follow_the_motion(script, tmp_path):
+    """By the formula of linear blend skinning they come to where gsgan's Gaussians are."""
+    script("skinned_splats").main(tmp_path, frames=2)
+    skin = json.loads((tmp_path / "skin.json").read_text())
+    vertices = trimesh.load(tmp_path / "rest.ply", process=False).vertices
+    bones, weights = np.array(skin["bones"]), np.array(skin["weights"])
+    assert bones.shape == weights.shape == (len(vertices), 4)
+    np.testing.assert_allclose(weights.sum(1), 1, atol=1e-6)
+
+    # The second frame, by its bones' moves since the T-pose.
+    turns = Rotation.from_quat(skin["quaternions"][1]).as_matrix()
+    moved = np.einsum("jab,nb->nja", turns, vertices) + skin["translations"][1]
+    rows = np.arange(len(vertices))[:, None]
+    found = (weights[..., None] * moved[rows, bones]).sum(1)
+
+    # The avatar's Gaussians in that pose, with the offsets that Ψ gives them.
+    avatar = gsgan.load("demo")
+    with np.load(DEMO_MOTION) as file:
+        skeleton = torch.from_numpy(file["p"][1:2])
+    seen = torch.ones(skeleton.shape[:2])
+    with torch.no_grad():
+        body = avatar.body_pose(skeleton, seen)
+        expected = splats_of(avatar, skeleton, seen > 0, body).means
+    apart = np.linalg.norm(found - expected, axis=1)
+    assert np.median(apart) < 0.003
+    assert np.linalg.norm(vertices - expected, axis=1).mean() > 0.1
 
 
 def test_the_notebook_runs(tmp_path, monkeypatch):

@@ -1,4 +1,7 @@
-"""``python -m gsgan`` lists the commands."""
+"""``python -m gsgan`` lists the commands; ``gsgan train …`` is ``python -m gsgan.train …``."""
+
+import runpy
+import sys
 
 COMMANDS = {
     "gsgan.demo": "a picture and a video of a ready avatar, without training",
@@ -17,10 +20,19 @@ COMMANDS = {
 
 
 def main() -> None:
-    """Prints one line per command."""
-    for name, what in COMMANDS.items():
-        print(f"python -m {name:<16} {what}")
-    print("Each prints its choices and its whole config with --help.")
+    """Runs the command that the first argument names; without one, prints one line per command."""
+    if sys.argv[1:] in ([], ["-h"], ["--help"]):
+        for name, what in COMMANDS.items():
+            print(f"python -m {name:<16} {what}")
+        print("Each prints its choices and its whole config with --help.")
+        return
+
+    # The command sees its own arguments, as after python -m.
+    module = f"gsgan.{sys.argv.pop(1)}"
+    if module not in COMMANDS:
+        known = ", ".join(name.removeprefix("gsgan.") for name in COMMANDS)
+        sys.exit(f"{module} is not a command; expected one of {known}")
+    runpy.run_module(module, run_name="__main__", alter_sys=True)
 
 
 if __name__ == "__main__":

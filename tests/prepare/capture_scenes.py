@@ -87,6 +87,38 @@ def write_toml(
     return path
 
 
+def write_qualisys(
+    path: Path, cameras: Sequence[CameraEntry], left: int = 0, rows: int = 1080
+) -> Path:
+    """Qualisys' XML: 1/64 pixel, mm, y up, z back; a window of the sensor, stored with ``rows``
+    of 1080 rows."""
+    text = "<?xml version='1.0' encoding='ASCII'?>\n<calibration>\n<cameras>\n"
+    for c in cameras:
+        height, width = np.array(c.size) * 1080 // rows
+        R = np.diag([1, -1, -1]) @ c.R
+        turn = "".join(
+            f'r{i + 1}{j + 1}="{R[i, j]}" ' for i in range(3) for j in range(3)
+        )
+        place = "".join(
+            f'{axis}="{x}" '
+            for axis, x in zip("xyz", c.centre * 1000, strict=True)
+        )
+        # of the whole sensor, from the centre of its first pixel
+        K = c.K * 1080 / rows
+        K[:2, 2] -= 0.5
+        k1, k2, p1, p2, k3 = c.dist[:5]
+        text += f"""<camera active="1" serial="{c.name}" video_resolution="{rows}p">
+<fov_video left="{left}" top="0" right="{left + width - 1}" bottom="{height - 1}"/>
+<transform {turn}{place}/>
+<intrinsic focalLengthU="{64 * K[0, 0]}" focalLengthV="{64 * K[1, 1]}"
+ centerPointU="{64 * (K[0, 2] + left)}" centerPointV="{64 * K[1, 2]}"
+ radialDistortion1="{k1}" radialDistortion2="{k2}" radialDistortion3="{k3}"
+ tangentalDistortion1="{p1}" tangentalDistortion2="{p2}"/></camera>
+"""
+    path.write_text(text + "</cameras></calibration>\n")
+    return path
+
+
 def write_own(path: Path, cameras: Sequence[CameraEntry]) -> Path:
     """cameras.json of the bring-your-own layout."""
     content = {

@@ -6,9 +6,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from xml.etree import ElementTree
 
-import cv2
 import numpy as np
 import pytest
 from rich.console import Console
@@ -28,54 +26,13 @@ pytestmark = [
 ]
 
 
-def toml_of(qca: Path, out: Path) -> Path:
-    """Pose2Sim's demo has its calibration in Qualisys' format: 1/64 pixel, mm, y up, z back."""
-    text = ""
-    for camera in ElementTree.parse(qca).getroot().iter("camera"):
-        window, pose, lens = (
-            {
-                key: float(value)
-                for key, value in camera.find(tag).attrib.items()
-            }
-            for tag in ("fov_video", "transform", "intrinsic")
-        )
-        R = np.diag([1, -1, -1]) @ [
-            [pose[f"r{i}{j}"] for j in (1, 2, 3)] for i in (1, 2, 3)
-        ]
-        t = -R @ [pose[axis] / 1000 for axis in "xyz"]
-        f_u, f_v, c_u, c_v = (
-            lens[f"{kind}{axis}"] / 64
-            for kind in ("focalLength", "centerPoint")
-            for axis in "UV"
-        )
-        names = (
-            "radialDistortion1",
-            "radialDistortion2",
-            "tangentalDistortion1",
-        )
-        dist = [
-            lens[name]
-            for name in (*names, "tangentalDistortion2", "radialDistortion3")
-        ]
-        text += f"[{camera.get('serial')}]\n"
-        text += f"size = [{window['right'] + 1}, {window['bottom'] + 1}]\n"
-        text += f"matrix = [[{f_u}, 0.0, {c_u}], [0.0, {f_v}, {c_v}], [0.0, 0.0, 1.0]]\n"
-        text += f"distortions = {dist}\nrotation = {cv2.Rodrigues(R)[0].ravel().tolist()}\n"
-        text += f"translation = {t.tolist()}\n"
-    out.write_text(text)
-    return out
-
-
 @pytest.mark.skipif(
     not (DATA / "balance_videos").is_dir(), reason="no balance videos"
 )
 def test_real_videos_become_a_capture_that_trains(tmp_path, check):
     """The calibration is a degree or two off; the joints end within 6 px of the detections."""
     source = DATA / "balance_videos"
-    calibration = str(
-        toml_of(source / "Calib.qca.txt", tmp_path / "Calib.toml")
-    )
-    given = Options(str(source), str(tmp_path / "out"), calibration=calibration)
+    given = Options(str(source), str(tmp_path / "out"))
     out = prepare(given, Console(file=io.StringIO()))
     numbers = json.loads((out / "prepare.json").read_text())
     error = numbers["error_px"]

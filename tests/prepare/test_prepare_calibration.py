@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from capture_scenes import LENS, ring, write_own, write_toml
+from capture_scenes import LENS, ring, write_own, write_qualisys, write_toml
 
 from gsgan.data.calibration import find_calibration, read_calibration
 from gsgan.prepare.sources import pair_cameras
@@ -34,6 +34,71 @@ def test_aniposelib_toml_in_millimetres(tmp_path):
     cameras = ring(dist=LENS)
     path = write_toml(tmp_path / "calibration.toml", cameras, unit=1000, lens=5)
     equal(read_calibration(path, unit_scale=1e-3).cameras, cameras)
+
+
+@pytest.mark.parametrize(("left", "rows"), [(0, 1080), (24, 1080), (24, 540)])
+def test_qualisys(tmp_path, left, rows):
+    """The window of the sensor that a video shows, and videos of fewer rows."""
+    cameras = ring(dist=LENS)
+    path = write_qualisys(tmp_path / "Calib.qca.txt", cameras, left, rows)
+    assert find_calibration(tmp_path) == path
+    calibration = read_calibration(path)
+    equal(calibration.cameras, cameras)
+    assert calibration.metric
+
+
+# One camera of a real file (Pose2Sim's demo), and the numbers of its conversion by Pose2Sim.
+QUALISYS = """<calibration><cameras><camera active="1" serial="cam01" model="none">
+<fov_video bottom="1919" left="0" right="1087" top="0"/>
+<transform r11="0.5536380477336265" r12="0.8046719867383512" r13="0.2144479094331626"
+ r21="-0.4345300743838753" r22="0.05946489349975602" r23="0.8986921279821063"
+ r31="0.7104002579937896" r32="-0.5907342212870501" r33="0.3825762057979294"
+ x="1460.2323709212087" y="-1909.1590482454608" z="1896.5058524092062"/>
+<intrinsic centerPointU="34110.316406" centerPointV="60680.792969"
+ focalLengthU="107599.671875" focalLengthV="107588.828125"
+ radialDistortion1="-0.046183" radialDistortion2="0.139983" radialDistortion3="0.000000"
+ tangentalDistortion1="0.000608" tangentalDistortion2="0.00069"/></camera>
+<camera active="0" serial="cam02"/><camera calibrated="false" serial="cam03"/>
+</cameras></calibration>"""
+
+
+def test_a_camera_of_a_real_file_of_qualisys(tmp_path):
+    path = tmp_path / "Calib.qca.txt"
+    path.write_text(QUALISYS)
+    (camera,) = read_calibration(path, pixel_centre=0.5).cameras.values()
+    assert camera.size == (1920, 1088)
+    K = [
+        [1681.244873046875, 0, 532.97369384375],
+        [0, 1681.075439453125, 948.137390140625],
+        [0, 0, 1],
+    ]
+    np.testing.assert_allclose(camera.K, K)
+    np.testing.assert_allclose(
+        camera.centre, [1.46023, -1.90916, 1.89651], atol=1e-5
+    )
+    # The camera stands high and looks at the middle of the room, its image upright.
+    assert (camera.R @ -camera.centre)[2] > 0
+    assert camera.R[1, 2] < -0.8
+    np.testing.assert_allclose(
+        camera.dist[:5], [-0.046183, 0.139983, 0.000608, 0.00069, 0]
+    )
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "fact"),
+    [
+        ("</cameras>", "", "XML"),
+        ('serial="cam01"', "", "serial"),
+        ("<transform", "<position", "cam01 lacks <transform>"),
+        ('r11="0.5536380477336265"', "", "cam01.*r11"),
+        ('focalLengthU="107599.671875"', 'focalLengthU="x"', "focalLengthU"),
+    ],
+)
+def test_a_damaged_file_of_qualisys_is_refused(tmp_path, before, after, fact):
+    path = tmp_path / "Calib.qca.txt"
+    path.write_text(QUALISYS.replace(before, after, 1))
+    with pytest.raises(DataError, match=fact):
+        read_calibration(path)
 
 
 CALISCOPE = """

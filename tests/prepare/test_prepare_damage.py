@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from capture_scenes import LENS, ring, write_own, write_toml
+from capture_scenes import LENS, ring, write_own, write_qualisys, write_toml
 from make import damaged, skeletons
 from test_prepare_points3d import write_trc
 from writers.easymocap import write_calibration
@@ -218,6 +218,10 @@ READERS = {
     "json": (
         read_calibration,
         lambda p: write_own(p / "cameras.json", ring(dist=LENS)),
+    ),
+    "qualisys": (
+        read_calibration,
+        lambda p: write_qualisys(p / "a.qca.txt", ring(dist=LENS)),
     ),
     "openpose": (lambda p: read_detections(p.parent), person),
     "npz": (read_detections, tool_npz),

@@ -385,6 +385,37 @@ def test_cameras(render, bare, capture, motion, tmp_path):
     )
 
 
+def test_a_calibration_without_a_unit_needs_one(
+    render, capture, motion, tmp_path
+):
+    """nerfstudio's scene of a camera in cm gives the image of the camera itself."""
+    cam = json.loads((capture / "cameras.json").read_text())["cam00"]
+    R, t, K = (np.array(cam[key], dtype=float) for key in ("R", "t", "K"))
+    pose = np.eye(4)
+    pose[:3, :3] = R.T @ np.diag([1, -1, -1])
+    pose[:3, 3] = -R.T @ t.reshape(3) * 100
+    w, h = cam["size"]
+    names = ("fl_x", "fl_y", "cx", "cy", "w", "h")
+    values = (K[0, 0], K[1, 1], K[0, 2], K[1, 2], w, h)
+    scene = dict(zip(names, values, strict=True))
+    frame = {"file_path": "cam00.png", "transform_matrix": pose.tolist()}
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps(scene | {"frames": [frame]}))
+
+    given = (f"motion={motion}", "frames=1")
+    refused(render(*given, f"camera={path}", "out=a"), "camera_unit=m")
+    bad = render(*given, f"camera={path}", "camera_unit=ft", "out=a")
+    refused(bad, "camera_unit=ft")
+    result = render(*given, f"camera={path}", "camera_unit=cm", "out=a")
+    assert result.returncode == 0, result.stderr
+    render(*given, "camera=cam00", "out=b")
+    np.testing.assert_allclose(
+        read(tmp_path / "a/000000.png").astype(int),
+        read(tmp_path / "b/000000.png").astype(int),
+        atol=1,
+    )
+
+
 @pytest.mark.parametrize(
     ("args", "message"),
     [

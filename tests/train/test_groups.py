@@ -1,12 +1,19 @@
 """The groups callbacks, debug and logger, run on the tiny capture."""
 
+import io
+import re
+import shutil
 from pathlib import Path
+from typing import Any
 
+import fsspec
+import numpy as np
 import pytest
 from commands import refused, train
 from lightning.pytorch.loggers import wandb as wandb_logger
+from PIL import Image
 
-from gsgan.run.stored import CHECKPOINT
+from gsgan.run.stored import CHECKPOINT, read_checkpoint
 from gsgan.utils.sweeps import STOPPED
 
 
@@ -42,21 +49,38 @@ def test_callbacks_are_built_from_their_group(tiny):
     assert list(config.callbacks) == ["learning_rate", "device_stats"]
 
 
-def test_a_run_that_a_callback_stops_is_not_scored_and_resumes(trained):
-    stopper = (
-        "+callbacks.stop={_target_: lightning.pytorch.callbacks.EarlyStopping"
-    )
-    stopper += ", monitor: val/psnr, mode: max, patience: 1, min_delta: 1000}"
+def test_a_run_that_a_callback_stops_resumes_from_a_remote_copy(trained):
+    """The checkpoint is taken from another place, as on a machine without the run folder."""
     long = ("training.schedule.epoch=1", "training.schedule.step_one=20")
-    result, folder = trained(stopper, *long)
+    result, folder = trained(
+        "callbacks=[early_stop,remote]",
+        "callbacks.early_stop.patience=1",
+        "callbacks.early_stop.min_delta=1000",
+        "callbacks.remote.dirpath=memory://bucket/run",
+        *long,
+    )
     assert result.returncode == STOPPED, result.stdout + result.stderr
     assert "stopped by a callback" in result.stdout
     assert not (folder / "metrics.json").exists()
-    result, _ = trained(
-        *long
-    )  # callbacks may differ between the parts of a run
+
+    remote = fsspec.filesystem("memory")
+    copy = remote.cat("/bucket/run/last.ckpt")
+    step = read_checkpoint(folder / CHECKPOINT)["gsgan"]["step"]
+    shutil.rmtree(folder)
+    (folder / CHECKPOINT).parent.mkdir(parents=True)
+    (folder / CHECKPOINT).write_bytes(copy)
+    assert read_checkpoint(folder / CHECKPOINT)["gsgan"]["step"] == step
+
+    # callbacks may differ between the parts of a run
+    result, _ = trained(*long)
     assert result.returncode == 0, result.stdout + result.stderr
+    assert "resuming from" in result.stdout
     assert (folder / "metrics.json").is_file()
+
+
+def test_a_remote_copy_without_an_address_is_refused(trained):
+    result, _ = trained("callbacks=[remote]")
+    refused(result, "callbacks.remote.dirpath")
 
 
 @pytest.mark.parametrize(
@@ -77,6 +101,13 @@ def test_a_logger_keeps_the_scores_in_the_run_folder(
     result, folder = trained(f"logger={name}", "evaluate=false")
     assert result.returncode == 0, result.stdout + result.stderr
     assert "val/psnr" in logged(name, folder)
+    if name != "csv":
+        shown = grids_of(name, folder)
+        files = sorted(folder.glob("grids/*.png"))
+        assert len(shown) == len(files)
+        # the last one, in the pixels of the file
+        last, file = Image.open(shown[-1]), Image.open(files[-1])
+        assert np.array_equal(np.asarray(last), np.asarray(file))
 
 
 def test_wandb_offline_keeps_the_scores_in_the_run_folder(capture, tmp_path):
@@ -88,6 +119,8 @@ def test_wandb_offline_keeps_the_scores_in_the_run_folder(capture, tmp_path):
     assert result.returncode == 0, result.stdout + result.stderr
     content = next(folder.rglob("run-*.wandb")).read_bytes()
     assert b"val/psnr" in content
+    shown = list(folder.rglob("media/images/val/grid*.png"))
+    assert len(shown) == len(list(folder.glob("grids/*.png")))
 
 
 def logged(name: str, folder: Path) -> set[str]:
@@ -96,15 +129,31 @@ def logged(name: str, folder: Path) -> set[str]:
         path = next(folder.rglob("metrics.csv"))
         return set(path.read_text().partition("\n")[0].split(","))
     if name == "tensorboard":
-        from tensorboard.backend.event_processing import event_accumulator
-
-        path = next(folder.rglob("events.out.tfevents.*"))
-        events = event_accumulator.EventAccumulator(str(path)).Reload()
-        return set(events.Tags()["scalars"])
+        return set(tensorboard_events(folder).Tags()["scalars"])
     return {
         str(path.relative_to(path.parents[1]))
         for path in folder.rglob("mlruns/*/*/metrics/*/*")
     }
+
+
+def tensorboard_events(folder: Path):
+    """What TensorBoard reads from the file of a run."""
+    from tensorboard.backend.event_processing import event_accumulator
+
+    path = next(folder.rglob("events.out.tfevents.*")).parent
+    return event_accumulator.EventAccumulator(str(path)).Reload()
+
+
+def grids_of(name: str, folder: Path) -> list[Any]:
+    """Grids of images that a logger has written, as files, by iteration."""
+    if name == "tensorboard":
+        shown = tensorboard_events(folder).Images("val/grid")
+        return [io.BytesIO(image.encoded_image_string) for image in shown]
+    # named val~grid+step+<iteration>+timestamp+…, in older versions val#grid%step%…
+    shown = folder.rglob("artifacts/images/val*grid*.png")
+    return sorted(
+        shown, key=lambda path: int(re.findall(r"step.(\d+)", path.name)[0])
+    )
 
 
 def test_a_logger_whose_package_is_missing_is_named(trained, monkeypatch):

@@ -1,5 +1,5 @@
 """Calibration files, recognised by their content: cameras.json, OpenCV YAML, TOML, nerfstudio,
-and by their name: COLMAP.
+Qualisys, and by their name: COLMAP.
 
 cameras.json is the bring-your-own layout's calibration:
 ``{camera: {K 3x3, R 3x3, t 3, dist 0/4/5/8, size [w, h]}}``
@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ import yaml
 
 from gsgan.data.cameras import CameraEntry, make_camera, numbers
 from gsgan.data.reconstructions import (
+    OPENGL,
     is_colmap,
     is_nerfstudio,
     read_colmap,
@@ -42,15 +44,20 @@ PATTERNS = (
     "transforms.json",
     "cameras.txt",
     "cameras.bin",
+    "*.qca.txt",
 )
 # folders of a project that hold calibrations, beside those named like calibration
 PLACES = ("sparse", "sparse/0", "colmap/sparse/0")
 KNOWN = (
     "OpenCV YAML (intri.yml beside extri.yml), TOML of Pose2Sim, aniposelib or caliscope, COLMAP's "
-    "cameras and images (.txt or .bin), nerfstudio's transforms.json, or cameras.json"
+    "cameras and images (.txt or .bin), nerfstudio's transforms.json, Qualisys' .qca.txt, or "
+    "cameras.json"
 )
 # formats whose worlds have no scale and any orientation
 WITHOUT_SCALE = ("COLMAP", "nerfstudio")
+# Qualisys counts in parts of a pixel, of a sensor with this many rows that are stored.
+SUBPIXELS = 64
+QUALISYS_ROWS = 1080
 # of a camera's table in TOML
 TOML_KEYS = ("size", "matrix", "distortions", "rotation", "translation")
 # tables that are no cameras
@@ -509,6 +516,103 @@ def _opencv_rotation(where: str, name: str, extri: Mapping[str, Any]) -> Any:
     return R
 
 
+# -- Qualisys
+
+
+def _read_qualisys(
+    path: Path,
+    scale: float | None,
+    pixel_centre: float,
+    notes: list[str],
+) -> dict[str, CameraEntry]:
+    """The cameras of Qualisys' XML by serial number; lengths are in mm.
+
+    Cameras that are turned off or not calibrated are left out. Without a window of the video the
+    size is (0, 0).
+    """
+    try:
+        root = ElementTree.fromstring(path.read_bytes())
+    except (ElementTree.ParseError, LookupError, ValueError) as error:
+        raise DataError(f"{path} is not readable as XML: {error}") from None
+
+    cameras: dict[str, CameraEntry] = {}
+    for element in root.iter("camera"):
+        if element.get("active") == "0" or element.get("calibrated") == "false":
+            continue
+        name = element.get("serial")
+        if name is None or name in cameras:
+            raise DataError(
+                f"{path} has a camera without a 'serial' of its own, {name}"
+            )
+        where = f"{path}, camera {name}"
+        cameras[name] = _qualisys_camera(
+            where, name, element, scale or METRES["mm"], pixel_centre
+        )
+    return cameras
+
+
+def _qualisys_camera(
+    where: str,
+    name: str,
+    camera: ElementTree.Element,
+    scale: float,
+    pixel_centre: float,
+) -> CameraEntry:
+    def values(element: str, *keys: str) -> Float:
+        found = camera.find(element)
+        if found is None:
+            raise DataError(f"{where} lacks <{element}>; export it again")
+        raw = [found.get(key) for key in keys]
+        return numbers(where, raw, f"{element} {' '.join(keys)}", (len(keys),))
+
+    # Axes are rows; y points up and z backward.
+    rows = (f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))
+    R = OPENGL @ values("transform", *rows).reshape(3, 3)
+    t = -R @ values("transform", "x", "y", "z")
+
+    # The window of the sensor that the video shows, in pixels of all rows.
+    left, top, height, width = 0.0, 0.0, 0.0, 0.0
+    if camera.find("fov_video") is not None:
+        left, top, right, bottom = values(
+            "fov_video", "left", "top", "right", "bottom"
+        )
+        height, width = bottom - top + 1, right - left + 1
+
+    # A video of fewer rows, such as 540p, is a smaller image of the same window.
+    stored = re.match(r"(\d+)p$", camera.get("video_resolution", ""))
+    zoom = int(stored[1]) / QUALISYS_ROWS if stored else 1.0
+
+    # Focal lengths and principal point are in parts of a pixel, the lens is OpenCV's.
+    parts = values(
+        "intrinsic",
+        "focalLengthU",
+        "focalLengthV",
+        "centerPointU",
+        "centerPointV",
+    )
+    fx, fy, cx, cy = zoom * parts / SUBPIXELS
+    cx -= zoom * (left + pixel_centre - 0.5)
+    cy -= zoom * (top + pixel_centre - 0.5)
+    lens = values(
+        "intrinsic",
+        "radialDistortion1",
+        "radialDistortion2",
+        "tangentalDistortion1",
+        "tangentalDistortion2",
+        "radialDistortion3",
+    )
+    return make_camera(
+        where,
+        name,
+        K=[[fx, 0, cx], [0, fy, cy], [0, 0, 1]],
+        R=R,
+        t=t,
+        dist=lens,
+        size=(round(height * zoom), round(width * zoom)),
+        scale=scale,
+    )
+
+
 # -- all formats
 
 
@@ -537,6 +641,10 @@ FORMATS: dict[str, tuple[Callable[[Path, str], bool], Reader]] = {
             or "!!opencv-matrix" in head
         ),
         _read_yaml,
+    ),
+    "Qualisys": (
+        lambda _, head: "<calibration" in head and "<camera" in head,
+        _read_qualisys,
     ),
     "nerfstudio": (lambda _, head: is_nerfstudio(head), _read_nerfstudio),
     "cameras.json": (lambda _, head: head.lstrip().startswith("{"), _read_json),

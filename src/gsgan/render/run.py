@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from torch import Tensor
 
-from gsgan.data.calibration import read_calibration
+from gsgan.data.calibration import METRES, read_calibration
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import PersonCrop, square_window
 from gsgan.model.avatar import Avatar
@@ -167,7 +167,7 @@ def _cameras(
     # A calibration file, or a camera of the run's data.
     path = Path(name).expanduser()
     if path.is_file():
-        return from_file(path, drive.p, size), None
+        return from_file(path, drive.p, size, config.camera_unit), None
     entries = run.data.layout.cameras
     if name not in entries:
         raise ConfigError(
@@ -206,14 +206,35 @@ def of_entry(
     return entry.seen(window, (size, size), lens=lens)
 
 
-def from_file(path: Path, p: NDArray[np.float64], size: int) -> Camera:
+def from_file(
+    path: Path, p: NDArray[np.float64], size: int, unit: str | None
+) -> Camera:
     """The camera of a calibration file, or its cameras, one per skeleton ``[F, 33, 3]``.
 
+    Args:
+        path: the file.
+        p: metres.
+        size: pixels.
+        unit: of the file's lengths: m, cm or mm; None for the format's own.
+
     Raises:
-        DataError: when it cannot be read, or the number of cameras is neither 1 nor F.
+        ConfigError: on another unit.
+        DataError: when it cannot be read, has no unit, or the number of cameras is neither 1 nor F.
     """
+    if unit is not None and unit not in METRES:
+        raise ConfigError(
+            f"camera_unit={unit} is not a unit; choose one of {', '.join(METRES)}"
+        )
+    scale = None if unit is None else METRES[unit]
+    calibration = read_calibration(path, scale)
+    if not calibration.metric:
+        raise DataError(
+            f"{path} ({calibration.format}) has no unit of length; give "
+            "camera_unit=m, cm or mm, after aligning and scaling its world to the motion's"
+        )
+
     # One camera for all frames, or one for each; both need an image size for their window.
-    found = list(read_calibration(path).cameras.values())
+    found = list(calibration.cameras.values())
     if len(found) not in (1, len(p)):
         raise DataError(
             f"{path} holds {len(found)} cameras; expected 1, or {len(p)}, one per frame"

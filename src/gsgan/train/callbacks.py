@@ -8,9 +8,17 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+import numpy as np
 import torch
 from lightning import Callback, LightningModule, Trainer
+from lightning.pytorch.loggers import (
+    Logger,
+    MLFlowLogger,
+    TensorBoardLogger,
+    WandbLogger,
+)
 from lightning.pytorch.plugins.io import TorchCheckpointIO
+from PIL import Image
 from rich.console import Console
 from torch import Tensor
 
@@ -28,7 +36,8 @@ def _training(module: LightningModule) -> AvatarTraining:
 
 class ImageGrid(Callback):
     """Writes ground truth, Step I's colour, S, I_pred and error at each validation, as
-    ``folder/step_000000.png`` with ``rows`` images spread over the validation frames."""
+    ``folder/step_000000.png`` with ``rows`` images spread over the validation frames, and sends
+    the grid to the loggers that show images."""
 
     def __init__(self, folder: Path, rows: int = 4) -> None:
         self.folder = folder
@@ -62,10 +71,28 @@ class ImageGrid(Callback):
         self, trainer: Trainer, module: LightningModule
     ) -> None:
         # Only the first process has collected rows.
-        if self._collected:
-            write_grid(
-                self._collected,
-                self.folder / f"step_{_training(module).step:06d}.png",
+        if not self._collected:
+            return
+        step = _training(module).step
+        path = self.folder / f"step_{step:06d}.png"
+        write_grid(self._collected, path)
+        for logger in trainer.loggers:
+            send_grid(logger, path, step)
+
+
+def send_grid(logger: Logger, path: Path, step: int) -> None:
+    """Sends a PNG to a logger of TensorBoard, Weights & Biases or MLflow as ``val/grid``."""
+    image = Image.open(path)
+    match logger:
+        case TensorBoardLogger():
+            logger.experiment.add_image(
+                "val/grid", np.asarray(image), step, dataformats="HWC"
+            )
+        case WandbLogger():
+            logger.log_image("val/grid", [image], step)
+        case MLFlowLogger():
+            logger.experiment.log_image(
+                logger.run_id, image, key="val/grid", step=step
             )
 
 
@@ -139,7 +166,10 @@ class StopOnSignal(Callback):
 
 
 class AtomicCheckpoints(TorchCheckpointIO):
-    """Writes a new file and renames it, so that a killed run leaves a whole checkpoint."""
+    """Writes a new file and renames it, so that a killed run leaves a whole checkpoint.
+
+    Those at addresses such as s3://bucket/run are written by Lightning, also completely or not.
+    """
 
     def save_checkpoint(
         self,
@@ -147,6 +177,10 @@ class AtomicCheckpoints(TorchCheckpointIO):
         path: Any,
         storage_options: Any | None = None,
     ) -> None:
+        if "://" in str(path):
+            super().save_checkpoint(checkpoint, path, storage_options)
+            return
+
         # The checkpoint is complete in memory before a file is touched.
         buffer = io.BytesIO()
         torch.save(checkpoint, buffer)
