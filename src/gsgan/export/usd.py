@@ -35,7 +35,7 @@ def refuse_missing_usd() -> None:
 def usd_bytes(poses: Iterable[Splats], fps: float, up: str) -> bytes:
     """A binary .usdc file with one prim of Gaussians, ``/Avatar/Gaussians``.
 
-    Convention: metres, Y up, a person in the standard pose faces +Z. Scales and opacities are
+    Lengths are in metres, Y is up, a person in the standard pose faces +Z. Scales and opacities are
     linear. A single pose has values without a time, a motion has time samples from 0 on.
 
     Args:

@@ -205,7 +205,7 @@ class Avatar(nn.Module):
     def freeze(self) -> Self:
         """Ends training and speeds up rendering: what depends on weights alone is computed once.
 
-        Convention: images are the same up to rounding, and follow weights that are loaded later.
+        Images are the same up to rounding, and follow weights that are loaded later.
         Weights get no gradient; skeleton and camera do.
         """
         self.eval().requires_grad_(False)
@@ -229,7 +229,7 @@ class Avatar(nn.Module):
     ) -> Tensor:
         """The image ``[B, 3, H, W]`` of a new pose, RGB in [0, 1], corrected for no camera.
 
-        Convention: the image stays on the avatar's device. Inputs are best left on the CPU: the
+        The image stays on the avatar's device. Inputs are best left on the CPU: the
         body is solved there while a GPU still renders the image before.
 
         Args:
@@ -282,7 +282,7 @@ class Avatar(nn.Module):
     ) -> Rendering:
         """Renders poses: I_pred and every map that led to it.
 
-        Convention: a window round the person is rendered, and pasted into the whole image. Cameras
+        A window round the person is rendered, and pasted into the whole image. Cameras
         that see a window already (`Window.camera`) are rendered as they are. Inputs may be on the
         CPU: body and window are then found there, and nothing is read back from the avatar's
         device.

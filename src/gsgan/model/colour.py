@@ -12,7 +12,7 @@ class ColourCorrection(nn.Module):
     """An affine colour map per training camera, for exposure and white balance; held-out cameras
     keep the image.
 
-    Convention: images are on black, so the constant term is weighted by alpha and the background
+    Images are on black, so the constant term is weighted by alpha and the background
     stays black. The mean of all maps is exactly the identity: otherwise the person could take on a
     tint and every map its inverse, and held-out cameras would show that tint.
 

@@ -773,7 +773,7 @@ class _Bounded(torch.autograd.Function):
 def bounded(x: Tensor, low: float, high: float) -> Tensor:
     """``x`` clamped to [low, high], with a gradient that leads back.
 
-    Convention: beyond a bound the gradient is 0 where a step against it would lead further out, and
+    Beyond a bound the gradient is 0 where a step against it would lead further out, and
     passes where it leads back. With a plain clamp, a parameter that crossed its bound would never
     learn again.
     """

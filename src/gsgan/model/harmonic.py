@@ -41,7 +41,7 @@ Pose = tuple[Tensor, Tensor, BodyPose | None]
 def harmonics(normals: Tensor) -> Tensor:
     """``[..., 9]``: the real spherical harmonics of degrees 0 to 2, the first one 1.
 
-    Convention: `gsgan.splat.sh.sh_basis` times √(4π). A normal of length r has r and r² times the
+    They are `gsgan.splat.sh.sh_basis` times √(4π). A normal of length r has r and r² times the
     harmonics of degree 1 and 2: where skinning flattens the surface, and normals fade to zero, the
     first one alone is left. A normal that is not finite counts as zero.
 

@@ -237,7 +237,7 @@ def silhouette_loss(
 class ClassMap:
     """The classes of S, and the class of each of the data's labels.
 
-    Convention: class 0 is the background. Labels that no vertex has are numbered after the
+    Class 0 is the background. Labels that no vertex has are numbered after the
     channels: S cannot learn them, and scores count them as missed.
     """
 

@@ -140,7 +140,7 @@ class ProgressLines(Callback):
 class StopOnSignal(Callback):
     """Ends training after the epoch, once its checkpoint is written, if a scheduler asked for it.
 
-    Convention: SIGUSR1 and SIGUSR2 ask, which SLURM sends before a job's time is up; from the
+    SIGUSR1 and SIGUSR2 ask, which SLURM sends before a job's time is up; from the
     construction on. Lightning installs no handler of its own where there is one.
     """
 

@@ -114,7 +114,7 @@ def clip(optimiser: torch.optim.Optimizer, largest: float | None) -> Tensor:
 class MovingAverage(nn.Module):
     """An exponential moving average of a module's parameters, updated every ``every`` iterations.
 
-    Convention: the average starts as a copy at the first update and forgets it quickly: the decay
+    The average starts as a copy at the first update and forgets it quickly: the decay
     at update n is ``min(decay ** every, (1 + n) / (10 + n))``. Buffers are copied, not
     averaged.
     """

@@ -24,7 +24,7 @@ class Rollback:
     good; Ψ explodes, and its colours with it; the discriminator's logits of real and generated
     images become equal.
 
-    Convention: all values are averaged over recent iterations, so that a fall within an epoch is
+    All values are averaged over recent iterations, so that a fall within an epoch is
     seen. Optimisers restart after a restoration, because their momenta point into the collapse.
 
     Settings: conf/training/long.yaml.
