@@ -24,8 +24,8 @@ def interleaved(
     """Times actions round robin, so that other load on the machine affects all of them alike.
 
     Times are milliseconds of wall clock, with the device synchronised. Each action is called once
-    to warm up. If that took longer than ``patience``, it is called once more, and the shorter of the two
-    calls is its only sample.
+    to warm up. If that took longer than ``patience``, it is called once more, and the shorter of
+    the two calls is its only sample.
 
     Args:
         actions: what to call, by name.
