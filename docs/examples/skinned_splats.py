@@ -21,7 +21,6 @@ from gsgan.run.drive import Drive, inputs_of, rest_pose
 from gsgan.run.runs import Run
 from gsgan.run.shared import DEMO_MOTION
 from gsgan.scene import BodyPose
-from gsgan.utils.config import defaults_of
 
 FPS = 25
 BONES = 4  # of each Gaussian, at most
@@ -31,10 +30,7 @@ BONES = 4  # of each Gaussian, at most
 def main(
     out: Path, name: str = "demo", motion: Path = DEMO_MOTION, frames: int = 100
 ) -> None:
-    config = defaults_of("render")
-    config.run = name
-    config.device = "cpu"
-    run = Run.load(config)
+    run = Run.load(name, device="cpu")
     avatar = run.avatar
     points = avatar.body_points.points
     out.mkdir(parents=True, exist_ok=True)
