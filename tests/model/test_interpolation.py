@@ -43,6 +43,13 @@ def test_gradients_agree_with_finite_differences(tables):
     )
 
 
+def test_half_precision_trains_on_a_cpu(tables):
+    values = torch.ones(7, 2, dtype=torch.bfloat16, requires_grad=True)
+    Interpolation()(values, *tables).sum().backward()
+    assert values.grad.dtype == torch.bfloat16
+    assert values.grad.abs().sum() > 0
+
+
 def test_tables_that_a_checkpoint_replaces_are_not_used_again(tables):
     near, share = tables
     interpolate = Interpolation()

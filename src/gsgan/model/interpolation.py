@@ -20,8 +20,8 @@ class Interpolation:
     """Averages of controls' values at points.
 
     The gradient of a lookup sorts all of its indices in every iteration. Points keep their
-    controls, so here the transposed matrix is made once and multiplied. On a GPU a lookup's own
-    gradient is used.
+    controls, so here the transposed matrix is made once and multiplied. On a GPU, and in half
+    precision, a lookup's own gradient is used.
     """
 
     def __init__(self) -> None:
@@ -50,9 +50,10 @@ class Interpolation:
             rows = near[chosen]
             weights = share[chosen]
 
-        # On a CPU the gradient multiplies the transpose.
+        # On a CPU the gradient multiplies the transpose, in precisions that scipy has.
         trained = torch.is_grad_enabled() and values.requires_grad
-        if trained and values.device.type == "cpu":
+        known = values.dtype in (torch.float32, torch.float64)
+        if trained and known and values.device.type == "cpu":
             transpose = self._transpose(near, share, len(values))
             found: Tensor = _Interpolated.apply(
                 values, rows, weights, chosen, transpose

@@ -168,7 +168,7 @@ class StopOnSignal(Callback):
 class AtomicCheckpoints(TorchCheckpointIO):
     """Writes a new file and renames it, so that a killed run leaves a whole checkpoint.
 
-    Those at addresses such as s3://bucket/run are written by Lightning, also completely or not.
+    Lightning itself writes those at addresses such as s3://bucket/run.
     """
 
     def save_checkpoint(
