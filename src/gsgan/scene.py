@@ -227,11 +227,14 @@ class BodyPose(TensorRecord):
         theta: ``[B, bones, 3]`` axis-angle of each bone relative to its parent, radians.
         transl: ``[B, 3]`` metres, added to the root.
         bones: ``[B, bones, 4, 4]`` transforms of the bones since rest, where they are known.
+        offsets: ``[B, C, 3]`` metres at rest: how the surface at the avatar's controls differs
+            from what the pose tells, in registered training frames; else None.
     """
 
     theta: Tensor
     transl: Tensor
     bones: Tensor | None = None
+    offsets: Tensor | None = None
 
 
 @dataclass(frozen=True)

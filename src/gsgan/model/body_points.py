@@ -490,7 +490,9 @@ class BodyPoints(nn.Module):
         learnt = self.points.learnt
         if self.offsets is None or learnt is None:
             return None
-        found: Tensor = self.offsets(pose.theta, learnt.interpolated)
+        found: Tensor = self.offsets(
+            pose.theta, learnt.interpolated, pose.offsets
+        )
         return found
 
     def _skinned(

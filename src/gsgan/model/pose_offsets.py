@@ -1,6 +1,7 @@
 """Offsets of a body's points that depend on how the bones about them turn."""
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -10,7 +11,7 @@ from gsgan.body import axis_angle_to_matrix
 
 
 class PoseOffsets(nn.Module):
-    """Linear in the rotations of the bones that a point follows, and zero in the rest pose.
+    """Linear in the rotations of the bones that a point follows, and constant in the rest pose.
 
     Skin and cloth bulge and fold where joints bend. Each control has a linear map from its own
     bones' rotations less the identity, so that no joint moves points far from it, and a pose far
@@ -37,27 +38,52 @@ class PoseOffsets(nn.Module):
         self.step = step
         count, followed = bones.shape
         self.field = nn.Parameter(torch.zeros(count, 9 * followed, 3))
+        self.rest = nn.Parameter(torch.zeros(count, 3))
+        self.register_load_state_dict_pre_hook(_without_rest)
+
+    @torch.no_grad()
+    def start(self, rest: Tensor, field: Tensor) -> None:
+        """Sets the controls' offsets: ``[C, 3]`` metres in the rest pose, ``[C, 9 n, 3]`` per
+        bend."""
+        self.rest.copy_(rest / self.step)
+        self.field.copy_(field / self.step)
+
+    def bends(self, theta: Tensor) -> Tensor:
+        """``[B, C, 9 n]``: what bends at each control in poses ``theta [B, J, 3]``, axis-angle."""
+        # The root turns the whole body and bends nothing.
+        turned = axis_angle_to_matrix(theta[:, 1:]) - torch.eye(3).to(theta)
+        bent = functional.pad(turned.flatten(2), (0, 0, 1, 0))
+        given = bent[:, self.bones] * self.weight.unsqueeze(-1)
+        return given.flatten(2)
 
     def forward(
-        self, theta: Tensor, interpolate: Callable[[Tensor], Tensor]
+        self,
+        theta: Tensor,
+        interpolate: Callable[[Tensor], Tensor],
+        further: Tensor | None = None,
     ) -> Tensor:
         """``[B, N, 3]`` metres, at rest.
 
         Args:
             theta: ``[B, J, 3]`` axis-angle, rotations of the joints.
             interpolate: gives the points ``[N, C]`` values of the controls ``[A, C]``.
+            further: ``[B, C, 3]`` metres, added to the controls' offsets.
         """
-        # What bends at each control, [B, C, 9 n]. The root turns the whole body and bends nothing.
-        turned = axis_angle_to_matrix(theta[:, 1:]) - torch.eye(3).to(theta)
-        bent = functional.pad(turned.flatten(2), (0, 0, 1, 0))
-        given = bent[:, self.bones] * self.weight.unsqueeze(-1)
-
         # The controls' offsets, then those of the points.
-        offsets = self.step * torch.einsum(
-            "bck,ckj->bcj", given.flatten(2), self.field
-        )
+        offsets = torch.einsum("bck,ckj->bcj", self.bends(theta), self.field)
+        offsets = self.step * (self.rest + offsets)
+        if further is not None:
+            offsets = offsets + further
 
         # The offsets of all poses at once: the table has a row for each control.
         table = offsets.transpose(0, 1).flatten(1)
         found = interpolate(table)
         return found.unflatten(1, (-1, 3)).transpose(0, 1)
+
+
+def _without_rest(
+    offsets: nn.Module, state: dict[str, Tensor], prefix: str, *_: Any
+) -> None:
+    """Offsets of checkpoints before 2026-11-27 are zero in the rest pose."""
+    assert isinstance(offsets, PoseOffsets)
+    state.setdefault(f"{prefix}rest", torch.zeros_like(offsets.rest))

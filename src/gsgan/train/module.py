@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any, TypeVar
 
@@ -31,6 +32,7 @@ from gsgan.train.optimisers import (
     clip,
     parameter_groups,
 )
+from gsgan.train.registration import Registered, Registration
 from gsgan.train.rollback import Rollback, SkippedSteps
 from gsgan.train.schedule import SEGMENTATION, SPLATTING, STEP_ONE, Schedule
 from gsgan.utils.checks import above, at_least, whole
@@ -77,6 +79,8 @@ class AvatarTraining(LightningModule):
         pose_noise, window, window_reach, max_skipped, skip_window, log_every, average,
             average_every: see conf/training/long.yaml.
         rollback: recovers from a collapse of the rendered person.
+        registration: of the body's surface to the training images, before the first iteration;
+            None: the surface is where the body's pose tells.
         extra_losses: further terms of Step II by name: modules of a rendering and its frame.
         record: plain config values stored with every checkpoint.
         scene: facts about the scene as plain values, likewise, for `gsgan.load`.
@@ -104,6 +108,7 @@ class AvatarTraining(LightningModule):
         average: float | None = None,
         average_every: int = 1,
         rollback: Rollback | None = None,
+        registration: Registration | None = None,
         extra_losses: dict[str, nn.Module] | None = None,
         record: dict[str, Any] | None = None,
         scene: dict[str, Any] | None = None,
@@ -140,6 +145,10 @@ class AvatarTraining(LightningModule):
         self.log_every = at_least("training.log_every", log_every, 1)
         self.skipped = SkippedSteps(max_skipped, skip_window)
         self.rollback = rollback or Rollback()
+
+        # Where the surface of training frames is; known once it is registered.
+        self.registration = registration
+        self.registered: Registered | None = None
 
         # Facts that checkpoints store.
         self.record = record or {}
@@ -215,6 +224,9 @@ class AvatarTraining(LightningModule):
 
         # The frame in a window, trained by the phase that the iteration belongs to.
         frame = self._cut(frame)
+        if self.registered is not None and frame.body is not None:
+            offsets = self.registered.of(frame.frame_id).to(frame.body.theta)
+            frame = replace(frame, body=replace(frame.body, offsets=offsets))
 
         # The phases follow each other; each trains other parts.
         phase = self.schedule.phase(self.step)
@@ -582,6 +594,8 @@ class AvatarTraining(LightningModule):
             "effects": self.avatar.effects.plain(),
             "scene": self.scene,
         }
+        if self.registered is not None:
+            checkpoint["registered"] = self.registered._asdict()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         # The avatar and the number of processes must be those of the earlier part.
@@ -594,6 +608,8 @@ class AvatarTraining(LightningModule):
             )
 
         # Counters go on where the earlier part ended.
+        if "registered" in checkpoint:
+            self.registered = Registered(**checkpoint["registered"])
         self.step = state["step"]
         self.rollback.done = state["rollbacks"]
         self.seconds_before = state["train_seconds"]

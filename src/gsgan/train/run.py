@@ -136,8 +136,7 @@ def run_training(config: DictConfig) -> None:
         resume = checkpoint_to_resume(folder, module.record, module.marks)
     if resume is None:
         remove_old_results(folder)
-        if options.distil is not None:
-            start_from(module.avatar, data, options.distil)
+        _prepare_avatar(module, data, options.distil, console)
     else:
         done = int(read_checkpoint(resume)["gsgan"]["step"])
         finished = done >= module.schedule.total
@@ -191,6 +190,22 @@ def run_training(config: DictConfig) -> None:
         if options.page:
             _write_page(folder, data)
         console.print(f"run folder: {folder}", soft_wrap=True)
+
+
+def _prepare_avatar(
+    module: AvatarTraining,
+    data: GsganData,
+    distil: Path | None,
+    console: Console,
+) -> None:
+    """What a new run does before its first iteration: it starts from the run ``distil``, or
+    registers the body's surface to the training images."""
+    if distil is not None:
+        start_from(module.avatar, data, distil)
+    elif module.registration is not None:
+        module.registered = module.registration(
+            module.avatar, data.dataset("train"), console
+        )
 
 
 def _logger(settings: DictConfig, folder: str) -> Logger:

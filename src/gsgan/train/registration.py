@@ -1,0 +1,585 @@
+"""Registration of a body's surface to the training images, before Ψ learns.
+
+Where the body's surface moves otherwise than the person's, a print lies on other pixels in every
+frame, and training averages it away. Here optical flow tells how the surface of each frame differs
+from the body's. The part of it that depends on the pose becomes the start of `PoseOffsets`; the
+rest, such as cloth that sways, is applied to its frame in training alone.
+"""
+
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rich.console import Console
+from scipy import linalg, sparse
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from gsgan.body import blend_transforms, skin
+from gsgan.data.dataset import CaptureDataset
+from gsgan.data.splits import spread_frames
+from gsgan.model.avatar import Avatar
+from gsgan.model.body_points import BodyPoints, LearntWeights, moved_normals
+from gsgan.scene import BodyPose, Camera, Frame, Gaussians
+from gsgan.skeleton.training_poses import pose_in_pelvis
+from gsgan.splat import rasterise
+from gsgan.utils.arrays import evenly_spaced
+from gsgan.utils.checks import above, at_least, whole
+from gsgan.utils.console import track
+
+Float = NDArray[Any]
+Matrix = NDArray[np.float64]
+
+# Gaussians of the drawn texture: opacity, and standard deviation as a share of the spacing.
+OPACITY = 0.95
+SIGMA = 0.6
+# metres behind the drawn surface at which a point is hidden
+HIDDEN = 0.03
+# the least cosine of the angle between a point's normal and the camera
+FACING = 0.2
+# pixels by which masks shrink: outlines of the drawing are the body's, not the person's
+OUTLINE = 3
+# pixels: flow that does not lead back to where it came from is not trusted
+ROUND_TRIP = 0.7
+# smaller eigenvalue of the structure tensor at which flow is trusted by half
+TEXTURED = 8e-4
+# pixels: longer flow counts less
+LONG = 4.0
+# neighbours of a control whose offsets are alike
+NEIGHBOURS = 6
+# alignments of a frame's surface to one texture
+STEPS = 2
+# rounds through all frames: chains, then one with the average texture
+CHAINS = 2
+CHAIN = "chain"
+AVERAGE = "average"
+# ridges of the fit of linear offsets, of which the best on left-out frames is taken
+RIDGES = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
+FOLDS = 3
+
+
+class Texture(NamedTuple):
+    """Colours ``[N, 3]`` of a body's points and their weights ``[N]``, 0 where none is known."""
+
+    colours: Tensor
+    weights: Tensor
+
+
+class Registered(NamedTuple):
+    """What the images say of the surface beside what depends on the pose.
+
+    ``offsets [F, C, 3]`` metres at rest, of the controls in the training frames ``frames``.
+    """
+
+    frames: list[int]
+    offsets: Tensor
+
+    def of(self, frame_id: Tensor) -> Tensor:
+        """``[B, C, 3]`` for frames ``[B]``; zeros for frames that were not registered."""
+        places = {frame: i for i, frame in enumerate(self.frames)}
+        zero = torch.zeros_like(self.offsets[0])
+        found = [
+            self.offsets[places[frame]] if frame in places else zero
+            for frame in frame_id.tolist()
+        ]
+        return torch.stack(found)
+
+
+@dataclass(frozen=True)
+class Registration:
+    """Settings of the registration; calling it registers an avatar's body to its training images.
+
+    Args:
+        frames: training frames that are registered, at most; poses far from each other are chosen.
+        cameras: of each frame, at most.
+        smooth: weight of the differences between neighbouring controls' offsets.
+        small: weight of the offsets' own length.
+
+    Source: ours.
+    """
+
+    frames: int = 100
+    cameras: int = 8
+    smooth: float = 0.006
+    small: float = 0.0006
+
+    def __post_init__(self) -> None:
+        whole("training.registration.frames", self.frames, 2)
+        whole("training.registration.cameras", self.cameras, 1)
+        at_least("training.registration.smooth", self.smooth, 0)
+        above("training.registration.small", self.small)
+
+    def __call__(
+        self, avatar: Avatar, dataset: CaptureDataset, console: Console
+    ) -> Registered | None:
+        """Registers the body's surface, and starts the avatar's `PoseOffsets` with the result.
+
+        None, and nothing is done, where the avatar has no such offsets or only one frame trains.
+        """
+        placed = avatar.body_points
+        if placed is None or placed.offsets is None:
+            return None
+        frames = sorted({frame for _, frame in dataset.items})
+        if len(frames) < 2:
+            return None
+        frames = spread_frames(dataset.skeletons, frames, self.frames)
+
+        # The surface of every frame, and what of it the pose explains.
+        surface = Surface(avatar, dataset, self)
+        offsets = surface.registered(frames, console)
+        theta = torch.cat([surface.pose(frame).theta for frame in frames])
+        bends = placed.offsets.bends(theta)
+        rest, field = linear_fit(bends, offsets)
+
+        # Offsets of the pose start there; the rest is of the frames alone.
+        with torch.no_grad():
+            placed.offsets.start(rest, field)
+        explained = rest + torch.einsum("fck,ckj->fcj", bends, field)
+        return Registered(frames, offsets - explained)
+
+
+def linear_fit(bends: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
+    """The ridge regression of offsets ``[F, C, 3]`` on bends ``[F, C, K]``.
+
+    The ridge is the one whose error is least on frames that were left out.
+
+    Returns:
+        ``[C, 3]`` the offsets without a bend, and ``[C, K, 3]`` those per bend.
+    """
+    ones = torch.ones_like(bends[..., :1])
+    inputs = torch.cat([bends, ones], dim=-1).transpose(0, 1).double()
+    wanted = offsets.transpose(0, 1).double()
+
+    def fitted(chosen: Tensor, ridge: float) -> Tensor:
+        x = inputs[:, chosen]
+        square = x.mT @ x + ridge * torch.eye(x.shape[-1]).to(x)
+        return torch.linalg.solve(square, x.mT @ wanted[:, chosen])
+
+    def error(ridge: float) -> float:
+        total = 0.0
+        for fold in range(FOLDS):
+            left_out = torch.arange(len(offsets)) % FOLDS == fold
+            found = inputs[:, left_out] @ fitted(~left_out, ridge)
+            total += float((wanted[:, left_out] - found).square().sum())
+        return total
+
+    every = torch.ones(len(offsets), dtype=torch.bool)
+    found = fitted(every, min(RIDGES, key=error)).to(offsets)
+    return found[:, -1], found[:, :-1]
+
+
+@dataclass(frozen=True)
+class View:
+    """One training image: the camera, ``image [h, w, 3]`` and ``inside [h, w]``, which fades
+    towards the outline of the mask."""
+
+    camera: Camera
+    image: Float
+    inside: Float
+
+
+class Posed(NamedTuple):
+    """A frame: its images, and the body's pose."""
+
+    views: list[View]
+    pose: BodyPose
+
+
+class Drawn(NamedTuple):
+    """A texture as a view sees it: colours ``[h, w, 3]``, whether they are known, metres of
+    depth."""
+
+    colours: Float
+    known: Float
+    depth: Float
+
+
+class Surface:
+    """A body's points in the frames of a dataset, and offsets of its controls from flow.
+
+    Args:
+        avatar: with points on a body, and offsets that follow the pose.
+        dataset: training images.
+        settings: of the registration.
+    """
+
+    def __init__(
+        self, avatar: Avatar, dataset: CaptureDataset, settings: Registration
+    ) -> None:
+        placed = avatar.body_points
+        assert isinstance(placed, BodyPoints)
+        assert placed.points.learnt is not None
+        self.avatar = avatar
+        self.placed = placed
+        self.dataset = dataset
+        self.settings = settings
+        self.controls: LearntWeights = placed.points.learnt
+        self.count = len(self.controls.field)
+
+        # Where each frame's images are in the dataset.
+        self.places: dict[int, list[int]] = {}
+        for place, (_, frame) in enumerate(dataset.items):
+            self.places.setdefault(frame, []).append(place)
+
+        # How the points follow the controls, and how the controls are held.
+        share = self.controls.share.numpy()
+        near = self.controls.near.numpy()
+        points = np.repeat(np.arange(len(near)), near.shape[1])
+        self.spread = sparse.csr_matrix(
+            (share.ravel(), (points, near.ravel())), (len(near), self.count)
+        )
+        self.held = self._held()
+
+    def _held(self) -> Matrix:
+        """``[3 C, 3 C]`` the weights that keep offsets small and neighbours alike."""
+        # Places of the controls: the average of their points.
+        weight = self.spread.T
+        rest = self.placed.points.means.numpy()
+        places = (weight @ rest) / weight.sum(1)
+
+        # Differences between each control and its neighbours.
+        count = min(NEIGHBOURS + 1, self.count)
+        _, near = cKDTree(np.asarray(places)).query(places, k=count)
+        rows = np.arange(near[:, 1:].size)
+        ones = np.ones(len(rows))
+        shape = (len(rows), self.count)
+        own = np.repeat(np.arange(self.count), count - 1)
+        apart = sparse.csr_matrix((ones, (rows, own)), shape)
+        apart -= sparse.csr_matrix((ones, (rows, near[:, 1:].ravel())), shape)
+
+        # The same for each axis.
+        one = self.settings.smooth * (apart.T @ apart).toarray()
+        one += self.settings.small * np.eye(self.count)
+        return np.kron(np.eye(3), one)
+
+    # -- frames
+
+    def _frame(self, frame: int) -> Posed:
+        # The images are cut to the person.
+        places = self.places[frame]
+        chosen = evenly_spaced(len(places), self.settings.cameras)
+        views = [self._view(self._item(places[i])) for i in chosen]
+        return Posed(views, self.pose(frame))
+
+    def pose(self, frame: int) -> BodyPose:
+        """The body's pose in a frame, with the transforms of its bones."""
+        item = self._item(self.places[frame][0])
+        pose = item.body
+        if pose is None:
+            pose = self.avatar.body_pose(item.skeleton, item.visibility)
+        assert pose is not None
+        return self.placed.points.with_bones(pose)
+
+    def _item(self, place: int) -> Frame:
+        item = self.dataset[place]
+        return item.unpacked() if self.dataset.packed else item
+
+    def _view(self, item: Frame) -> View:
+        # Only the part with the person is compared.
+        window = self.avatar.window(item.skeleton, item.camera)
+        if window is not None:
+            item = window.frame(item)
+
+        # The mask, less its outline and pixels whose mask is not sure.
+        inside = (item.mask[0, 0] > 0.9).float()
+        if item.unsure is not None:
+            inside = inside * (1 - item.unsure[0, 0])
+        size = 2 * OUTLINE + 1
+        kernel = np.ones((size, size), np.uint8)
+        shrunk = cv2.erode(inside.numpy(), kernel)
+        image = item.image[0].permute(1, 2, 0).contiguous()
+        return View(
+            camera=item.camera,
+            image=image.numpy(),
+            inside=cv2.GaussianBlur(shrunk, (0, 0), OUTLINE / 2),
+        )
+
+    # -- the chain of frames
+
+    def registered(self, frames: Sequence[int], console: Console) -> Tensor:
+        """``[F, C, 3]`` metres at rest: offsets of the controls in each frame."""
+        # The second chain starts from the average surface of the first: seen from several sides,
+        # a texture only fits together on a surface of the right shape.
+        order, before = self._order(frames)
+        offsets = np.zeros((len(frames), self.count, 3))
+        textures: dict[int, Texture] = {}
+        rounds = [*[CHAIN] * CHAINS, AVERAGE]
+        steps = [(what, i) for what in rounds for i in order]
+        with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+            for what, i in track(steps, "registering the surface", console):
+                if what == CHAIN and i == order[0]:
+                    mean = offsets.mean(0)
+                    offsets[i] = mean
+                    textures.clear()
+
+                # Each frame of a chain is aligned with the one before it, whose pose is the most
+                # alike; at the end all are aligned with the average of their textures.
+                texture = average(textures.values()) if textures else None
+                if what == CHAIN and texture is not None:
+                    texture = filled(textures[before[i]], texture)
+                    offsets[i] = offsets[before[i]]
+                frame = self._frame(frames[i])
+                if texture is not None:
+                    offsets[i] = self._aligned(
+                        frame, offsets[i], mean, texture, pool
+                    )
+                textures[i] = self._texture(frame, offsets[i], pool)
+        return torch.from_numpy(offsets).float()
+
+    def _order(
+        self, frames: Sequence[int]
+    ) -> tuple[list[int], NDArray[np.int32]]:
+        """The order in which frames are aligned, and the frame before each: a minimum spanning
+        tree of the poses, from the pose that is the most like all others."""
+        p, _ = self.dataset.skeletons.joints(frames)
+        poses = pose_in_pelvis(p.float())
+        apart = torch.cdist(poses, poses).numpy()
+        root = int(apart.mean(1).argmin())
+        # equal poses are neighbours too, and scipy takes 0 for no edge
+        tree = minimum_spanning_tree(apart + 1e-6)
+        order, before = breadth_first_order(tree, root, directed=False)
+        return order.tolist(), before
+
+    # -- one frame
+
+    def _moved(
+        self, pose: BodyPose, offsets: Matrix
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Means ``[N, 3]``, linear maps ``[N, 3, 3]`` and normals ``[N, 3]`` of the points."""
+        points = self.placed.points
+        assert pose.bones is not None
+        A, t = blend_transforms(pose.bones, *points.weights)
+        rest = points.means + torch.from_numpy(self.spread @ offsets).float()
+        normals = moved_normals(A, self.placed.rest_normals)
+        return skin(rest, A, t)[0], A[0], normals[0]
+
+    @torch.no_grad()
+    def _aligned(
+        self,
+        frame: Posed,
+        offsets: Matrix,
+        mean: Matrix,
+        texture: Texture,
+        pool: ThreadPoolExecutor,
+    ) -> Matrix:
+        """Offsets ``[C, 3]``, held near ``mean``, that move a texture to where it is in the
+        images."""
+        per_control = len(self.placed.points) * len(frame.views) / self.count
+        for _ in range(STEPS):
+            moved = self._moved(frame.pose, offsets)
+
+            # The normal equations of all views: J δ is the flow.
+            found = pool.map(
+                lambda view, moved=moved: self._equations(view, moved, texture),
+                frame.views,
+            )
+            square = self.held.copy()
+            right = -self.held @ (offsets - mean).T.ravel()
+            for part, side in found:
+                square += part / per_control
+                right += side / per_control
+            change = linalg.solve(square, right, assume_a="pos")
+            offsets = offsets + change.reshape(3, self.count).T
+        return offsets
+
+    @torch.no_grad()
+    def _equations(
+        self,
+        view: View,
+        moved: tuple[Tensor, Tensor, Tensor],
+        texture: Texture,
+    ) -> tuple[Matrix, Matrix]:
+        """``[3 C, 3 C]`` and ``[3 C]``: the normal equations of one view, in metres."""
+        means, A, normals = moved
+        drawn = self._draw(view, means, texture)
+        flow, trust = flow_between(drawn, view)
+
+        # Flow and its trust at the points that the view sees.
+        pixels, facing = seen(view, means, normals, drawn.depth)
+        at = sampled(np.dstack([flow, trust]), pixels)
+        length = np.linalg.norm(at[:, :2], axis=1)
+        weight = at[:, 2] * (facing > FACING)
+        weight = weight * np.minimum(1, LONG / np.maximum(length, 1e-6))
+        chosen = torch.from_numpy(np.flatnonzero(weight > 0.05))
+
+        # How pixels move with offsets at rest; pixels per metre make both sides metres.
+        slope = projected_slope(view.camera, means[chosen]) @ A[chosen]
+        per_metre = slope.norm(dim=(1, 2)).mean().clamp_min(1e-6)
+        J = (slope / per_metre).numpy()
+        goal = at[chosen, :2] / float(per_metre)
+        w = weight[chosen]
+        follow = self.spread[chosen.numpy()]
+        square = np.zeros((3 * self.count, 3 * self.count))
+        right = np.zeros(3 * self.count)
+        for row in range(2):
+            parts = [follow.multiply(J[:, row, k, None]) for k in range(3)]
+            B = sparse.hstack(parts).tocsr()
+            weighted = B.T.multiply(w).tocsr()
+            square += (weighted @ B).toarray()
+            right += weighted @ goal[:, row]
+        return square, right
+
+    @torch.no_grad()
+    def _draw(self, view: View, means: Tensor, texture: Texture) -> Drawn:
+        known = (texture.weights > 0.02).float().unsqueeze(1)
+        depth = view.camera.project(means.unsqueeze(0))[1][0].unsqueeze(1)
+        count = len(means)
+        scales = (SIGMA * self.placed.points.spacing).unsqueeze(1)
+        upright = torch.tensor([1.0, 0.0, 0.0, 0.0])
+        raster = rasterise(
+            Gaussians(
+                means=means.unsqueeze(0),
+                quats=upright.expand(1, count, 4),
+                scales=scales.expand(1, count, 3),
+                opacities=torch.full((1, count), OPACITY),
+                features=torch.cat(
+                    [texture.colours * known, known, depth], dim=1
+                ).unsqueeze(0),
+            ),
+            view.camera,
+            settings="standard",
+        )
+
+        # Blends of known colours and of depths, without the background.
+        blended = raster.features[0].permute(1, 2, 0).numpy()
+        alpha = raster.alpha[0, 0].numpy()
+        share = blended[..., 3:4]
+        return Drawn(
+            colours=blended[..., :3] / np.maximum(share, 1e-3),
+            known=(share[..., 0] > 0.6).astype(np.float32),
+            depth=blended[..., 4] / np.maximum(alpha, 1e-3),
+        )
+
+    @torch.no_grad()
+    def _texture(
+        self, frame: Posed, offsets: Matrix, pool: ThreadPoolExecutor
+    ) -> Texture:
+        """The colours of the points in a frame; views that face a point count most."""
+        means, _, normals = self._moved(frame.pose, offsets)
+        nothing = Texture(torch.zeros(len(means), 3), torch.ones(len(means)))
+
+        def read(view: View) -> tuple[Float, Float]:
+            depth = self._draw(view, means, nothing).depth
+            pixels, facing = seen(view, means, normals, depth)
+            at = sampled(np.dstack([view.image, view.inside]), pixels)
+            return at[:, :3], (at[:, 3] > 0.3) * np.maximum(facing, 0) ** 4
+
+        # The average over the views.
+        colours = torch.zeros(len(means), 3)
+        weights = torch.zeros(len(means))
+        for colour, weight in pool.map(read, frame.views):
+            colours += torch.from_numpy(colour * weight[:, None])
+            weights += torch.from_numpy(weight)
+        return Texture(colours / weights.clamp_min(1e-6)[:, None], weights)
+
+
+def average(textures: Iterable[Texture]) -> Texture:
+    """The average of textures, each point's colours by their weights."""
+    known = list(textures)
+    weights = torch.stack([texture.weights for texture in known])
+    colours = torch.stack([texture.colours for texture in known])
+    total = weights.sum(0)
+    mean = (colours * weights.unsqueeze(2)).sum(0)
+    return Texture(mean / total.clamp_min(1e-6)[:, None], total)
+
+
+def filled(texture: Texture, other: Texture) -> Texture:
+    """A texture, and another one where its colours are not known."""
+    known = texture.weights > 0.05
+    return Texture(
+        torch.where(known[:, None], texture.colours, other.colours),
+        torch.where(known, texture.weights, other.weights),
+    )
+
+
+def flow_between(drawn: Drawn, view: View) -> tuple[Float, Float]:
+    """Flow ``[h, w, 2]`` in pixels from a drawing to an image, and its trust ``[h, w]`` in [0, 1].
+
+    Source: OpenCV's dense inverse search (Kroeger et al., 2016).
+    """
+    # Where nothing is drawn or nobody is, both images are alike and nothing flows.
+    certain = (drawn.known * (view.inside > 0))[..., None] > 0
+    image = np.where(certain, drawn.colours, view.image)
+    a = grey(image)
+    b = grey(view.image)
+    # OpenCV's type hints lack this class.
+    create: Any = cv2.DISOpticalFlow_create  # type: ignore[attr-defined]
+    search = create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    # The way back only decides on trust, and is searched at half the resolution.
+    back = search.calc(b, a, None)
+    search.setFinestScale(0)
+    forth = search.calc(a, b, None)
+
+    # Flow is trusted where it leads back, and where there is texture in both directions.
+    height, width = a.shape
+    x, y = np.meshgrid(
+        np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)
+    )
+    returned = cv2.remap(
+        back, x + forth[..., 0], y + forth[..., 1], cv2.INTER_LINEAR
+    )
+    astray = np.square(forth + returned).sum(-1)
+    textured = cv2.cornerMinEigenVal(b.astype(np.float32) / 255, 17)
+    trust = np.exp(-astray / ROUND_TRIP**2) * textured / (textured + TEXTURED)
+    return forth, trust * view.inside * drawn.known
+
+
+def grey(image: Float) -> NDArray[Any]:
+    """Grey levels ``[h, w]`` of RGB in [0, 1]."""
+    levels = (image.clip(0, 1) * 255).round().astype(np.uint8)
+    return cv2.cvtColor(levels, cv2.COLOR_RGB2GRAY)
+
+
+def seen(
+    view: View, means: Tensor, normals: Tensor, depth: Float
+) -> tuple[Float, Float]:
+    """Pixels ``[N, 2]`` of points, and the cosine ``[N]`` at which they face the camera; 0 for
+    points that something hides, or outside the image."""
+    pixels, far = view.camera.project(means.unsqueeze(0))
+    at = pixels[0].numpy()
+    distance = far[0].numpy()
+    towards = view.camera.centre[0] - means
+    towards = towards / towards.norm(dim=1, keepdim=True)
+    facing = (normals * towards).sum(1).numpy()
+
+    # The drawn depth is that of the nearest surface.
+    height, width = depth.shape
+    inside = ((at > 0.5) & (at < [width - 0.5, height - 0.5])).all(1)
+    shown = distance < sampled(depth, at) + HIDDEN
+    return at, facing * (inside & shown)
+
+
+def sampled(image: Float, pixels: Float) -> Float:
+    """``[N, ...]`` an image ``[h, w, ...]`` at pixels ``[N, 2]``, whose centres are at +0.5."""
+    # OpenCV remaps images of at most 32,767 columns, and counts from the centre of a pixel.
+    rows = np.array_split(
+        (pixels - 0.5).astype(np.float32), len(pixels) // 32_000 + 1
+    )
+    found = [
+        cv2.remap(
+            image,
+            part[:, None, 0].copy(),
+            part[:, None, 1].copy(),
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+        for part in rows
+    ]
+    return np.concatenate(found)[:, 0]
+
+
+def projected_slope(camera: Camera, means: Tensor) -> Tensor:
+    """``[N, 2, 3]`` pixels per metre: how points' pixels move with them, without lens
+    distortion."""
+    x, y, z = camera.to_camera(means.unsqueeze(0))[0].unbind(1)
+    fx, fy = camera.focal[0]
+    nothing = torch.zeros_like(z)
+    across = torch.stack([fx / z, nothing, -fx * x / z.square()], dim=1)
+    down = torch.stack([nothing, fy / z, -fy * y / z.square()], dim=1)
+    return torch.stack([across, down], dim=1) @ camera.R[0]
