@@ -16,10 +16,10 @@ from gsgan.scene import BodyPose, Camera, Frame, Gaussians
 from gsgan.splat import rasterise
 from gsgan.train.registration import (
     Drawn,
+    MovingSurface,
     Registered,
     Registration,
-    Surface,
-    View,
+    TrainingView,
     flow_between,
     linear_fit,
     projected_slope,
@@ -137,7 +137,7 @@ def avatar_of(placed) -> SimpleNamespace:
 
 
 def test_the_surface_of_each_frame_is_found(painted):
-    surface = Surface(avatar_of(painted.placed), painted, Registration())
+    surface = MovingSurface(avatar_of(painted.placed), painted, Registration())
     found = surface.registered(range(4), Console(quiet=True))
     assert found.isfinite().all()
 
@@ -157,7 +157,7 @@ def test_a_body_whose_surface_is_right_stays(painted):
         torch.stack([pose.theta[0] for pose in painted.poses]),
         torch.zeros_like(painted.offsets),
     )
-    surface = Surface(avatar_of(painted.placed), still, Registration())
+    surface = MovingSurface(avatar_of(painted.placed), still, Registration())
     found = surface.registered(range(4), Console(quiet=True))
     # a third of a pixel
     assert found.norm(dim=2).median() < 0.0035
@@ -166,7 +166,7 @@ def test_a_body_whose_surface_is_right_stays(painted):
 def test_what_the_pose_explains_starts_the_offsets(painted):
     placed = deepcopy(painted.placed)
     registered = Registration()(avatar_of(placed), painted, Console(quiet=True))
-    surface = Surface(avatar_of(painted.placed), painted, Registration())
+    surface = MovingSurface(avatar_of(painted.placed), painted, Registration())
     whole = surface.registered(range(4), Console(quiet=True))
     with torch.no_grad():
         for frame, pose in enumerate(painted.poses):
@@ -205,7 +205,7 @@ def test_flow_is_that_of_the_images_and_untrusted_where_nothing_is():
 
     inside = np.zeros((80, 96), np.float32)
     inside[20:60, 20:70] = 1
-    view = View(camera(0.0), pattern(x - 1.5, y + 1), inside)
+    view = TrainingView(camera(0.0), pattern(x - 1.5, y + 1), inside)
     known = np.ones_like(inside)
     known[:, 60:] = 0
     flow, trust = flow_between(Drawn(pattern(x, y), known, inside), view)
@@ -219,7 +219,7 @@ def test_flow_is_that_of_the_images_and_untrusted_where_nothing_is():
 def test_flat_images_are_not_trusted():
     flat = np.full((64, 64, 3), 0.5, np.float32)
     inside = np.ones((64, 64), np.float32)
-    view = View(camera(0.0), flat, inside)
+    view = TrainingView(camera(0.0), flat, inside)
     flow, trust = flow_between(Drawn(flat, inside, inside), view)
     assert np.isfinite(flow).all()
     assert trust.max() < 0.01

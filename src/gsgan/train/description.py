@@ -74,6 +74,14 @@ def describe(
             f"{number}, {apart:.1f} pixels apart in the training images",
         )
 
+    if module.registered is not None:
+        metres = module.registered.offsets.norm(dim=2).median()
+        table.add_row(
+            "registered surface",
+            f"in {len(module.registered.frames)} frames; it moves by "
+            f"{1000 * float(metres):.0f} mm (median) beside what poses explain",
+        )
+
     # The losses that need other networks or labels.
     if module.perceptual is not None:
         every = module.step_two.perceptual_every

@@ -37,8 +37,8 @@ Float = NDArray[Any]
 Matrix = NDArray[np.float64]
 
 # Gaussians of the drawn texture: opacity, and standard deviation as a share of the spacing.
-OPACITY = 0.95
-SIGMA = 0.6
+PAINT_OPACITY = 0.95
+PAINT_SIGMA = 0.6
 # metres behind the drawn surface at which a point is hidden
 HIDDEN = 0.03
 # the least cosine of the angle between a point's normal and the camera
@@ -54,7 +54,7 @@ LONG = 4.0
 # neighbours of a control whose offsets are alike
 NEIGHBOURS = 6
 # alignments of a frame's surface to one texture
-STEPS = 2
+ALIGNMENTS = 2
 # rounds through all frames: chains, then one with the average texture
 CHAINS = 2
 CHAIN = "chain"
@@ -131,7 +131,7 @@ class Registration:
         frames = spread_frames(dataset.skeletons, frames, self.frames)
 
         # The surface of every frame, and what of it the pose explains.
-        surface = Surface(avatar, dataset, self)
+        surface = MovingSurface(avatar, dataset, self)
         offsets = surface.registered(frames, console)
         theta = torch.cat([surface.pose(frame).theta for frame in frames])
         bends = placed.offsets.bends(theta)
@@ -175,7 +175,7 @@ def linear_fit(bends: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @dataclass(frozen=True)
-class View:
+class TrainingView:
     """One training image: the camera, ``image [h, w, 3]`` and ``inside [h, w]``, which fades
     towards the outline of the mask."""
 
@@ -187,7 +187,7 @@ class View:
 class Posed(NamedTuple):
     """A frame: its images, and the body's pose."""
 
-    views: list[View]
+    views: list[TrainingView]
     pose: BodyPose
 
 
@@ -200,7 +200,7 @@ class Drawn(NamedTuple):
     depth: Float
 
 
-class Surface:
+class MovingSurface:
     """A body's points in the frames of a dataset, and offsets of its controls from flow.
 
     Args:
@@ -280,7 +280,7 @@ class Surface:
         item = self.dataset[place]
         return item.unpacked() if self.dataset.packed else item
 
-    def _view(self, item: Frame) -> View:
+    def _view(self, item: Frame) -> TrainingView:
         # Only the part with the person is compared.
         window = self.avatar.window(item.skeleton, item.camera)
         if window is not None:
@@ -294,7 +294,7 @@ class Surface:
         kernel = np.ones((size, size), np.uint8)
         shrunk = cv2.erode(inside.numpy(), kernel)
         image = item.image[0].permute(1, 2, 0).contiguous()
-        return View(
+        return TrainingView(
             camera=item.camera,
             image=image.numpy(),
             inside=cv2.GaussianBlur(shrunk, (0, 0), OUTLINE / 2),
@@ -371,7 +371,7 @@ class Surface:
         """Offsets ``[C, 3]``, held near ``mean``, that move a texture to where it is in the
         images."""
         per_control = len(self.placed.points) * len(frame.views) / self.count
-        for _ in range(STEPS):
+        for _ in range(ALIGNMENTS):
             moved = self._moved(frame.pose, offsets)
 
             # The normal equations of all views: J δ is the flow.
@@ -391,7 +391,7 @@ class Surface:
     @torch.no_grad()
     def _equations(
         self,
-        view: View,
+        view: TrainingView,
         moved: tuple[Tensor, Tensor, Tensor],
         texture: Texture,
     ) -> tuple[Matrix, Matrix]:
@@ -426,18 +426,20 @@ class Surface:
         return square, right
 
     @torch.no_grad()
-    def _draw(self, view: View, means: Tensor, texture: Texture) -> Drawn:
+    def _draw(
+        self, view: TrainingView, means: Tensor, texture: Texture
+    ) -> Drawn:
         known = (texture.weights > 0.02).float().unsqueeze(1)
         depth = view.camera.project(means.unsqueeze(0))[1][0].unsqueeze(1)
         count = len(means)
-        scales = (SIGMA * self.placed.points.spacing).unsqueeze(1)
+        scales = (PAINT_SIGMA * self.placed.points.spacing).unsqueeze(1)
         upright = torch.tensor([1.0, 0.0, 0.0, 0.0])
         raster = rasterise(
             Gaussians(
                 means=means.unsqueeze(0),
                 quats=upright.expand(1, count, 4),
                 scales=scales.expand(1, count, 3),
-                opacities=torch.full((1, count), OPACITY),
+                opacities=torch.full((1, count), PAINT_OPACITY),
                 features=torch.cat(
                     [texture.colours * known, known, depth], dim=1
                 ).unsqueeze(0),
@@ -464,7 +466,7 @@ class Surface:
         means, _, normals = self._moved(frame.pose, offsets)
         nothing = Texture(torch.zeros(len(means), 3), torch.ones(len(means)))
 
-        def read(view: View) -> tuple[Float, Float]:
+        def read(view: TrainingView) -> tuple[Float, Float]:
             depth = self._draw(view, means, nothing).depth
             pixels, facing = seen(view, means, normals, depth)
             at = sampled(np.dstack([view.image, view.inside]), pixels)
@@ -498,7 +500,7 @@ def filled(texture: Texture, other: Texture) -> Texture:
     )
 
 
-def flow_between(drawn: Drawn, view: View) -> tuple[Float, Float]:
+def flow_between(drawn: Drawn, view: TrainingView) -> tuple[Float, Float]:
     """Flow ``[h, w, 2]`` in pixels from a drawing to an image, and its trust ``[h, w]`` in [0, 1].
 
     Source: OpenCV's dense inverse search (Kroeger et al., 2016).
@@ -537,7 +539,7 @@ def grey(image: Float) -> NDArray[Any]:
 
 
 def seen(
-    view: View, means: Tensor, normals: Tensor, depth: Float
+    view: TrainingView, means: Tensor, normals: Tensor, depth: Float
 ) -> tuple[Float, Float]:
     """Pixels ``[N, 2]`` of points, and the cosine ``[N]`` at which they face the camera; 0 for
     points that something hides, or outside the image."""

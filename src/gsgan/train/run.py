@@ -198,8 +198,8 @@ def _prepare_avatar(
     distil: Path | None,
     console: Console,
 ) -> None:
-    """What a new run does before its first iteration: it starts from the run ``distil``, or
-    registers the body's surface to the training images."""
+    """Starts a new run's avatar from the run ``distil``, or registers its surface to the training
+    images."""
     if distil is not None:
         start_from(module.avatar, data, distil)
     elif module.registration is not None:
