@@ -27,7 +27,7 @@ ENV PATH=/opt/venv/bin:$PATH
 RUN pip install --no-cache-dir --extra-index-url https://download.pytorch.org/whl/${WHEELS} \
     torch==${TORCH} torchvision==${VISION}
 WORKDIR /opt/gsgan
-COPY pyproject.toml README.md LICENSE ./
+COPY pyproject.toml README.md LICENSE hatch_build.py ./
 COPY conf conf
 COPY src src
 RUN pip install --no-cache-dir ".[${EXTRAS}]"

@@ -141,3 +141,43 @@ def test_two_processes_build_at_once(tmp_path, quick_compiler):
         builder.join()
     assert answers == [(True, ""), (True, "")]
     assert len(list((tmp_path / "native").iterdir())) == 1
+
+
+@needs_kernel
+def test_without_a_compiler_the_kernels_of_the_wheel_are_loaded(
+    tmp_path, monkeypatch, load_afresh
+):
+    # The compiled library of this machine stands for the wheel's.
+    load_afresh(tmp_path)
+    (library,) = (tmp_path / "native").glob("*.so")
+    monkeypatch.setattr(build, "PACKAGED", library)
+    assert load_afresh(tmp_path / "other", CXX="/nowhere") == (True, "")
+
+    # A processor without the wheel's instructions does not load it.
+    monkeypatch.setattr(build.platform, "machine", lambda: "x86_64")
+    monkeypatch.setattr(
+        "torch.backends.cpu.get_cpu_capability", lambda: "DEFAULT"
+    )
+    found, reason = load_afresh(tmp_path / "other", CXX="/nowhere")
+    assert not found
+    assert "/nowhere" in reason
+
+
+@pytest.mark.slow
+def test_a_wheel_with_kernels_has_the_platforms_name_and_every_function(
+    tmp_path,
+):
+    subprocess.run(
+        [
+            *(sys.executable, "-m", "build", "--wheel"),
+            *("--outdir", str(tmp_path), str(Path(__file__).parents[2])),
+        ],
+        env={**os.environ, "GSGAN_WHEEL_KERNELS": "1"},
+        check=True,
+    )
+    (wheel,) = tmp_path.glob("*.whl")
+    assert wheel.name.startswith("gsgan-")
+    assert "-py3-none-linux_" in wheel.name
+    shutil.unpack_archive(wheel, tmp_path / "wheel", "zip")
+    library = tmp_path / "wheel" / "gsgan" / "splat" / "prebuilt.so"
+    assert build.open_library(library) is not None

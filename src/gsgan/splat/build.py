@@ -3,7 +3,8 @@
 The shared library is compiled by the system's compiler into a user cache (``GSGAN_CACHE``, else
 ``$XDG_CACHE_HOME/gsgan``, else ``~/.cache/gsgan``; subfolder ``native``) and loaded from there
 later. A file's name is a hash of all that it depends on, so that no stale file is loaded.
-``GSGAN_MARCH`` (e.g. ``x86-64``) compiles for that processor instead of this one.
+``GSGAN_MARCH`` (e.g. ``x86-64``) compiles for that processor instead of this one. Where nothing can
+be compiled, a library that came with the wheel is loaded.
 """
 
 import ctypes
@@ -23,25 +24,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gsgan.splat.flags import BASE_FLAGS
 from gsgan.utils.files import cache_root
 
 # The kernels are one program, which includes the headers.
 SOURCE = Path(__file__).with_name("native.cpp")
 KERNEL_HEADERS = SOURCE.with_name("kernels")
+# In wheels that were built with GSGAN_WHEEL_KERNELS=1 (hatch_build.py).
+PACKAGED = SOURCE.with_name("prebuilt.so")
 COMPILERS = ("c++", "g++", "clang++")
 COMPILE_SECONDS = 300.0  # after which the compiler counts as hanging
 
-# No -ffast-math: NaN and infinity keep their meaning, sums keep their order.
-BASE_FLAGS = (
-    "-std=c++17",
-    "-O3",
-    "-fPIC",
-    "-shared",
-    "-fopenmp-simd",
-    "-fno-math-errno",
-    "-fno-trapping-math",
-    "-ffp-contract=fast",
-)
 # Tried in this order: some compilers have no OpenMP (Apple's clang) or no flags for this CPU.
 _NATIVE_FLAGS = (
     ("-march=native", "-mprefer-vector-width=512", "-fopenmp"),
@@ -162,12 +155,22 @@ def _load_once() -> tuple[ctypes.CDLL | None, str]:
             _build(command, path)
             loaded = open_library(path)
     except Unavailable as reason:
-        return None, str(reason)
+        packaged = _packaged()
+        return packaged, "" if packaged else str(reason)
     except OSError as error:
         return None, f"The native kernel cannot be built: {error}."
     if loaded is None:
         return None, "The native kernel was compiled but cannot be loaded."
     return loaded, ""
+
+
+def _packaged() -> ctypes.CDLL | None:
+    """The library of the wheel, if there is one and this processor has its instructions."""
+    # Those of x86-64-v3, by what torch found.
+    plain = torch.backends.cpu.get_cpu_capability() == "DEFAULT"
+    if platform.machine() == "x86_64" and plain:
+        return None
+    return open_library(PACKAGED)
 
 
 def compiler() -> list[str]:

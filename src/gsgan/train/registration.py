@@ -104,8 +104,8 @@ class Registration:
     Source: ours.
     """
 
-    frames: int = 100
-    cameras: int = 8
+    frames: int = 64
+    cameras: int = 6
     smooth: float = 0.006
     small: float = 0.0006
 

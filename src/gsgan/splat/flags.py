@@ -1,0 +1,18 @@
+"""The compiler's flags for the kernels: for `gsgan.splat.build`, and for wheels that carry them."""
+
+# No -ffast-math: NaN and infinity keep their meaning, sums keep their order.
+BASE_FLAGS = (
+    "-std=c++17",
+    "-O3",
+    "-fPIC",
+    "-shared",
+    "-fopenmp-simd",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-ffp-contract=fast",
+)
+# The processors on which a wheel's kernels run: those with AVX2 and FMA, and all 64-bit ARM ones.
+WHEEL_FLAGS = {
+    "x86_64": ("-march=x86-64-v3", "-fopenmp"),
+    "aarch64": ("-march=armv8-a", "-fopenmp"),
+}
