@@ -109,6 +109,13 @@ def test_a_logger_keeps_the_scores_in_the_run_folder(
         last, file = Image.open(shown[-1]), Image.open(files[-1])
         assert np.array_equal(np.asarray(last), np.asarray(file))
 
+        # the clip plays, with the truth beside the avatar
+        clip = Image.open(clip_of(name, folder))
+        assert clip.n_frames > 1
+        assert clip.width == 2 * clip.height
+    # other loggers have nothing painted for them
+    assert (folder / "held_out.gif").exists() == (name != "csv")
+
 
 def test_wandb_offline_keeps_the_scores_in_the_run_folder(capture, tmp_path):
     """In a process of its own, at whose end wandb completes its file."""
@@ -121,6 +128,7 @@ def test_wandb_offline_keeps_the_scores_in_the_run_folder(capture, tmp_path):
     assert b"val/psnr" in content
     shown = list(folder.rglob("media/images/val/grid*.png"))
     assert len(shown) == len(list(folder.glob("grids/*.png")))
+    assert list(folder.rglob("media/videos/val/clip*.gif"))
 
 
 def logged(name: str, folder: Path) -> set[str]:
@@ -154,6 +162,14 @@ def grids_of(name: str, folder: Path) -> list[Any]:
     return sorted(
         shown, key=lambda path: int(re.findall(r"step.(\d+)", path.name)[0])
     )
+
+
+def clip_of(name: str, folder: Path) -> Any:
+    """The clip that a logger has, as a file."""
+    if name == "tensorboard":
+        (shown,) = tensorboard_events(folder).Images("val/clip")
+        return io.BytesIO(shown.encoded_image_string)
+    return next(folder.rglob("artifacts/held_out.gif"))
 
 
 def test_a_logger_whose_package_is_missing_is_named(trained, monkeypatch):

@@ -22,12 +22,19 @@ from PIL import Image
 from rich.console import Console
 from torch import Tensor
 
+from gsgan.data.dataset import CaptureDataset
 from gsgan.evaluate.grids import grid_rows, write_grid
 from gsgan.scene import Frame
 from gsgan.utils.files import write_atomically
 
 if TYPE_CHECKING:
     from gsgan.train.module import AvatarTraining
+
+
+SHOWING_IMAGES = (TensorBoardLogger, WandbLogger, MLFlowLogger)
+CLIP_FRAMES = 60  # at most
+CLIP_MS = 125  # per frame
+CLIP_PIXELS = 256  # height of an image, at most
 
 
 def _training(module: LightningModule) -> AvatarTraining:
@@ -94,6 +101,83 @@ def send_grid(logger: Logger, path: Path, step: int) -> None:
             logger.experiment.log_image(
                 logger.run_id, image, key="val/grid", step=step
             )
+
+
+class HeldOutClip(Callback):
+    """Sends a clip to the loggers that show images when training ends, as ``val/clip``.
+
+    It shows held-out frames of one camera in their order, ground truth on the left and the avatar
+    on the right. The file is ``held_out.gif`` in the run folder; other loggers cost nothing.
+    """
+
+    def __init__(self, folder: Path, dataset: CaptureDataset) -> None:
+        self.path = folder / "held_out.gif"
+        self.dataset = dataset
+
+    def on_train_end(self, trainer: Trainer, module: LightningModule) -> None:
+        loggers = [
+            logger
+            for logger in trainer.loggers
+            if isinstance(logger, SHOWING_IMAGES)
+        ]
+        if not loggers or not trainer.is_global_zero or not len(self.dataset):
+            return
+
+        # The frames of the first camera, painted and made small.
+        first, _ = self.dataset.items[0]
+        places = [
+            place
+            for place, (camera, _) in enumerate(self.dataset.items)
+            if camera == first
+        ]
+        places.sort(key=lambda place: self.dataset.items[place][1])
+        images = [
+            self._pair(_training(module), self.dataset[place])
+            for place in places[:CLIP_FRAMES]
+        ]
+        images[0].save(
+            self.path,
+            save_all=True,
+            append_images=images[1:],
+            duration=CLIP_MS,
+            loop=0,
+        )
+        for logger in loggers:
+            send_clip(logger, self.path, _training(module).step)
+
+    @staticmethod
+    @torch.no_grad()
+    def _pair(module: AvatarTraining, frame: Frame) -> Image.Image:
+        rendering = module.shown(*frame.to(module.device).inputs)
+        assert rendering.image is not None
+        pair = torch.cat([frame.image, rendering.image.cpu()], dim=3)[0]
+        levels = (pair.clamp(0, 1) * 255).round().byte()
+        image = Image.fromarray(levels.permute(1, 2, 0).numpy())
+        image.thumbnail((2 * CLIP_PIXELS, CLIP_PIXELS))
+        return image
+
+
+def send_clip(logger: Logger, path: Path, step: int) -> None:
+    """Sends a GIF to a logger of TensorBoard, Weights & Biases or MLflow as ``val/clip``."""
+    match logger:
+        case TensorBoardLogger():
+            from tensorboard.compat.proto.summary_pb2 import Summary
+
+            # TensorBoard plays a GIF that is encoded already.
+            width, height = Image.open(path).size
+            image = Summary.Image(
+                height=height,
+                width=width,
+                colorspace=3,
+                encoded_image_string=path.read_bytes(),
+            )
+            value = Summary.Value(tag="val/clip", image=image)
+            writer = logger.experiment._get_file_writer()
+            writer.add_summary(Summary(value=[value]), step)
+        case WandbLogger():
+            logger.log_video("val/clip", [str(path)], step, format=["gif"])
+        case MLFlowLogger():
+            logger.experiment.log_artifact(logger.run_id, path)
 
 
 class ProgressLines(Callback):

@@ -42,7 +42,7 @@ from gsgan.run.assemble import (
 from gsgan.run.runs import load
 from gsgan.run.stored import read_checkpoint, record
 from gsgan.scene import BodyPose
-from gsgan.train.callbacks import ImageGrid, StopOnSignal
+from gsgan.train.callbacks import HeldOutClip, ImageGrid, StopOnSignal
 from gsgan.train.description import describe
 from gsgan.train.module import AvatarTraining
 from gsgan.train.resume import (
@@ -170,6 +170,7 @@ def run_training(config: DictConfig) -> None:
         callbacks=[
             stop,
             ImageGrid(folder / "grids", config.grid_rows),
+            HeldOutClip(folder, data.dataset(data.watched[0])),
             *map(instantiate, (config.callbacks or {}).values()),
         ],
     )
