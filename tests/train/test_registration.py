@@ -32,7 +32,7 @@ ON = "effects.body_points=on"
 REGISTERED = (
     "model=splat_only",
     ON,
-    "+training.registration={_target_: gsgan.train.registration.Registration}",
+    "registration=flow",
 )
 SIZE = 192
 BENT = "upperarm01.L"

@@ -123,10 +123,12 @@ class Registration:
         None, and nothing is done, where the avatar has no such offsets or only one frame trains.
         """
         placed = avatar.body_points
-        if placed is None or placed.offsets is None:
-            return None
         frames = sorted({frame for _, frame in dataset.items})
-        if len(frames) < 2:
+        if placed is None or placed.offsets is None or len(frames) < 2:
+            console.print(
+                "registration: left out; it needs points on a body, with "
+                "model.body_points.pose_offsets, and two training frames"
+            )
             return None
         frames = spread_frames(dataset.skeletons, frames, self.frames)
 
