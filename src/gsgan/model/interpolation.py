@@ -69,12 +69,24 @@ class Interpolation:
         """``[A, N]``, made anew if a table has changed."""
         made_of = (near.data_ptr(), near._version, share.dtype, controls)
         if self._kept is None or self._kept.made_of != made_of:
-            points = torch.arange(len(near)).repeat_interleave(near.shape[1])
-            at = (near.flatten().numpy(), points.numpy())
-            shape = (controls, len(near))
-            matrix = csr_matrix((share.flatten().numpy(), at), shape)
-            self._kept = _Kept(made_of, matrix)
+            matrix = interpolation_matrix(near, share, controls)
+            self._kept = _Kept(made_of, matrix.T.tocsr())
         return self._kept.transpose
+
+
+def interpolation_matrix(
+    near: Tensor, share: Tensor, controls: int
+) -> csr_matrix:
+    """``[N, A]``: its product with the controls' values are the values at the points.
+
+    Args:
+        near: ``[N, k]`` int64, the controls of each point.
+        share: ``[N, k]`` their weights.
+        controls: A.
+    """
+    points = torch.arange(len(near)).repeat_interleave(near.shape[1])
+    at = (points.numpy(), near.flatten().numpy())
+    return csr_matrix((share.flatten().numpy(), at), (len(near), controls))
 
 
 class _Interpolated(torch.autograd.Function):

@@ -30,6 +30,7 @@ class PoseOffsets(nn.Module):
 
     bones: Tensor
     weight: Tensor
+    rest: Tensor
 
     def __init__(self, bones: Tensor, weight: Tensor, step: float) -> None:
         super().__init__()
@@ -38,14 +39,15 @@ class PoseOffsets(nn.Module):
         self.step = step
         count, followed = bones.shape
         self.field = nn.Parameter(torch.zeros(count, 9 * followed, 3))
-        self.rest = nn.Parameter(torch.zeros(count, 3))
+        # Constant offsets are not trained: the residuals of Ψ can learn the same.
+        self.register_buffer("rest", torch.zeros(count, 3))
         self.register_load_state_dict_pre_hook(_without_rest)
 
     @torch.no_grad()
     def start(self, rest: Tensor, field: Tensor) -> None:
         """Sets the controls' offsets: ``[C, 3]`` metres in the rest pose, ``[C, 9 n, 3]`` per
         bend."""
-        self.rest.copy_(rest / self.step)
+        self.rest.copy_(rest)
         self.field.copy_(field / self.step)
 
     def bends(self, theta: Tensor) -> Tensor:
@@ -71,7 +73,7 @@ class PoseOffsets(nn.Module):
         """
         # The controls' offsets, then those of the points.
         offsets = torch.einsum("bck,ckj->bcj", self.bends(theta), self.field)
-        offsets = self.step * (self.rest + offsets)
+        offsets = self.rest + self.step * offsets
         if further is not None:
             offsets = offsets + further
 
