@@ -53,8 +53,6 @@ def camera(angle: float) -> Camera:
 class Painted:
     """Images of a patterned body whose surface differs from its points by ``offsets [F, C, 3]``."""
 
-    packed = False
-
     def __init__(self, body, placed, thetas, offsets) -> None:
         self.body = body
         self.placed = placed
@@ -245,7 +243,7 @@ def test_slopes_are_those_of_the_projection():
 
 
 def test_frames_that_were_not_registered_have_no_offsets():
-    registered = Registered([3, 8], torch.ones(2, 5, 3))
+    registered = Registered(torch.tensor([3, 8]), torch.ones(2, 5, 3))
     found = registered.of(torch.tensor([8, 4]))
     assert found[0].eq(1).all()
     assert found[1].eq(0).all()
@@ -279,7 +277,7 @@ def test_only_training_frames_have_offsets_of_their_own(tiny):
     frame = data.dataset("train")[0]
     controls = len(module.avatar.body_points.points.learnt.field)
     module.registered = Registered(
-        frame.frame_id.tolist(), torch.full((1, controls, 3), 0.01)
+        frame.frame_id, torch.full((1, controls, 3), 0.01)
     )
     module.trainer = None
     module.validation_step(frame, 0)
@@ -305,4 +303,25 @@ def test_a_resumed_run_keeps_the_registered_surface(
     _, module = build_training(tiny(*REGISTERED))
     module.on_load_checkpoint(torch.load(path, weights_only=True))
     assert torch.equal(module.registered.offsets, kept["offsets"])
-    assert module.registered.frames == kept["frames"]
+    assert torch.equal(module.registered.frames, kept["frames"])
+
+
+def test_training_moves_the_surface_of_its_frames(make):
+    module, trainer, data = make(*REGISTERED)
+    frames = torch.tensor(data.trained)
+    controls = len(module.avatar.body_points.points.learnt.field)
+    module.registered = Registered(
+        frames, 0.001 * torch.randn(len(frames), controls, 3)
+    )
+    given = []
+    forward = module.avatar.forward
+
+    def watched(p, seen, camera, body=None, *rest, **options):
+        if module.avatar.training:
+            given.append(body.offsets)
+        return forward(p, seen, camera, body, *rest, **options)
+
+    module.avatar.forward = watched
+    trainer.fit(module, data)
+    assert given
+    assert all(offsets.abs().max() > 0 for offsets in given)

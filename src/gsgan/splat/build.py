@@ -156,7 +156,7 @@ def _load_once() -> tuple[ctypes.CDLL | None, str]:
             loaded = open_library(path)
     except Unavailable as reason:
         packaged = _packaged()
-        return packaged, "" if packaged else str(reason)
+        return packaged, str(reason) if packaged is None else ""
     except OSError as error:
         return None, f"The native kernel cannot be built: {error}."
     if loaded is None:

@@ -11,7 +11,7 @@ BASE_FLAGS = (
     "-fno-trapping-math",
     "-ffp-contract=fast",
 )
-# The processors on which a wheel's kernels run: those with AVX2 and FMA, and all 64-bit ARM ones.
+# Further flags of a wheel's kernels, by machine: x86-64 processors need AVX2 and FMA.
 WHEEL_FLAGS = {
     "x86_64": ("-march=x86-64-v3", "-fopenmp"),
     "aarch64": ("-march=armv8-a", "-fopenmp"),

@@ -18,16 +18,16 @@ from lightning.pytorch.loggers import (
     WandbLogger,
 )
 from lightning.pytorch.plugins.io import TorchCheckpointIO
-from PIL import Image
+from PIL import Image, ImageOps
 from rich.console import Console
 from torch import Tensor
 
-from gsgan.data.dataset import CaptureDataset
 from gsgan.evaluate.grids import grid_rows, write_grid
 from gsgan.scene import Frame
 from gsgan.utils.files import write_atomically
 
 if TYPE_CHECKING:
+    from gsgan.data.dataset import CaptureDataset
     from gsgan.train.module import AvatarTraining
 
 
@@ -106,8 +106,9 @@ def send_grid(logger: Logger, path: Path, step: int) -> None:
 class HeldOutClip(Callback):
     """Sends a clip to the loggers that show images when training ends, as ``val/clip``.
 
-    It shows held-out frames of one camera in their order, ground truth on the left and the avatar
-    on the right. The file is ``held_out.gif`` in the run folder; other loggers cost nothing.
+    It shows held-out frames of one camera in their order (training frames where nothing is held
+    out), ground truth on the left and the avatar on the right. The file is ``held_out.gif`` in the
+    run folder. With other loggers no image is rendered.
     """
 
     def __init__(self, folder: Path, dataset: CaptureDataset) -> None:
@@ -123,7 +124,7 @@ class HeldOutClip(Callback):
         if not loggers or not trainer.is_global_zero or not len(self.dataset):
             return
 
-        # The frames of the first camera, painted and made small.
+        # The frames of the first camera, rendered and made small.
         first, _ = self.dataset.items[0]
         places = [
             place
@@ -135,6 +136,8 @@ class HeldOutClip(Callback):
             self._pair(_training(module), self.dataset[place])
             for place in places[:CLIP_FRAMES]
         ]
+        # Images that are cut to the person differ in size, and those of a GIF must not.
+        images = [ImageOps.pad(image, images[0].size) for image in images]
         images[0].save(
             self.path,
             save_all=True,

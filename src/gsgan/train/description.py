@@ -74,12 +74,13 @@ def describe(
             f"{number}, {apart:.1f} pixels apart in the training images",
         )
 
+    # The surface of the training frames.
     if module.registered is not None:
         metres = module.registered.offsets.norm(dim=2).median()
         table.add_row(
-            "registered surface",
-            f"in {len(module.registered.frames)} frames; it moves by "
-            f"{1000 * float(metres):.0f} mm (median) beside what poses explain",
+            "registration",
+            f"{len(module.registered)} frames; their surface is {1000 * float(metres):.0f} mm "
+            "(median) from where their poses put it",
         )
 
     # The losses that need other networks or labels.

@@ -80,7 +80,7 @@ class AvatarTraining(LightningModule):
             average_every: see conf/training/long.yaml.
         rollback: recovers from a collapse of the rendered person.
         registration: of the body's surface to the training images, before the first iteration;
-            None: the surface is where the body's pose tells.
+            None: the surface is where linear blend skinning puts it.
         extra_losses: further terms of Step II by name: modules of a rendering and its frame.
         record: plain config values stored with every checkpoint.
         scene: facts about the scene as plain values, likewise, for `gsgan.load`.
@@ -204,6 +204,8 @@ class AvatarTraining(LightningModule):
             )
 
     def on_train_start(self) -> None:
+        if self.registered is not None:
+            self.registered = self.registered.to(self.device)
         self._began = time.monotonic()
 
     def on_train_end(self) -> None:
@@ -224,8 +226,9 @@ class AvatarTraining(LightningModule):
 
         # The frame in a window, trained by the phase that the iteration belongs to.
         frame = self._cut(frame)
-        if self.registered is not None and frame.body is not None:
-            offsets = self.registered.of(frame.frame_id).to(frame.body.theta)
+        if self.registered is not None:
+            assert frame.body is not None
+            offsets = self.registered.of(frame.frame_id)
             frame = replace(frame, body=replace(frame.body, offsets=offsets))
 
         # The phases follow each other; each trains other parts.
@@ -595,7 +598,7 @@ class AvatarTraining(LightningModule):
             "scene": self.scene,
         }
         if self.registered is not None:
-            checkpoint["registered"] = self.registered._asdict()
+            checkpoint["registered"] = dict(vars(self.registered))
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         # The avatar and the number of processes must be those of the earlier part.

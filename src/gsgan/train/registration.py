@@ -1,9 +1,9 @@
 """Registration of a body's surface to the training images, before Ψ learns.
 
-Where the body's surface moves otherwise than the person's, a print lies on other pixels in every
-frame, and training averages it away. Here optical flow tells how the surface of each frame differs
-from the body's. The part of it that depends on the pose becomes the start of `PoseOffsets`; the
-rest, such as cloth that sways, is applied to its frame in training alone.
+Where the body's surface moves differently from the person's, a print lies on other pixels in every
+frame, and training averages it away. Here the difference is estimated for each frame by optical
+flow. What the pose explains of it initialises `PoseOffsets`; the rest, such as cloth that sways, is
+applied to its frame in training alone.
 """
 
 from collections.abc import Iterable, Sequence
@@ -26,12 +26,14 @@ from gsgan.data.dataset import CaptureDataset
 from gsgan.data.splits import spread_frames
 from gsgan.model.avatar import Avatar
 from gsgan.model.body_points import BodyPoints, LearntWeights, moved_normals
+from gsgan.model.interpolation import interpolation_matrix
 from gsgan.scene import BodyPose, Camera, Frame, Gaussians
 from gsgan.skeleton.training_poses import pose_in_pelvis
 from gsgan.splat import rasterise
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import above, at_least, whole
-from gsgan.utils.console import track
+from gsgan.utils.console import progress
+from gsgan.utils.records import TensorRecord
 
 Float = NDArray[Any]
 Matrix = NDArray[np.float64]
@@ -55,10 +57,8 @@ LONG = 4.0
 NEIGHBOURS = 6
 # alignments of a frame's surface to one texture
 ALIGNMENTS = 2
-# rounds through all frames: chains, then one with the average texture
+# chains through all frames, before they are aligned with the average texture
 CHAINS = 2
-CHAIN = "chain"
-AVERAGE = "average"
 # ridges of the fit of linear offsets, of which the best on left-out frames is taken
 RIDGES = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
 FOLDS = 3
@@ -71,24 +71,26 @@ class Texture(NamedTuple):
     weights: Tensor
 
 
-class Registered(NamedTuple):
-    """What the images say of the surface beside what depends on the pose.
+@dataclass(frozen=True)
+class Registered(TensorRecord):
+    """The part of the registered surface that the pose does not explain.
 
-    ``offsets [F, C, 3]`` metres at rest, of the controls in the training frames ``frames``.
+    Args:
+        frames: ``[F]`` int64, numbers of the registered training frames.
+        offsets: ``[F, C, 3]`` metres at rest, of the controls in these frames.
     """
 
-    frames: list[int]
+    frames: Tensor
     offsets: Tensor
+
+    def __len__(self) -> int:
+        return len(self.frames)
 
     def of(self, frame_id: Tensor) -> Tensor:
         """``[B, C, 3]`` for frames ``[B]``; zeros for frames that were not registered."""
-        places = {frame: i for i, frame in enumerate(self.frames)}
-        zero = torch.zeros_like(self.offsets[0])
-        found = [
-            self.offsets[places[frame]] if frame in places else zero
-            for frame in frame_id.tolist()
-        ]
-        return torch.stack(found)
+        # A product with zeros and ones, which does not make the CPU wait for a GPU.
+        same = (frame_id.unsqueeze(1) == self.frames).to(self.offsets)
+        return torch.einsum("bf,fcj->bcj", same, self.offsets)
 
 
 @dataclass(frozen=True)
@@ -143,7 +145,7 @@ class Registration:
         with torch.no_grad():
             placed.offsets.start(rest, field)
         explained = rest + torch.einsum("fck,ckj->fcj", bends, field)
-        return Registered(frames, offsets - explained)
+        return Registered(torch.tensor(frames), offsets - explained)
 
 
 def linear_fit(bends: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
@@ -229,17 +231,14 @@ class MovingSurface:
         for place, (_, frame) in enumerate(dataset.items):
             self.places.setdefault(frame, []).append(place)
 
-        # How the points follow the controls, and how the controls are held.
-        share = self.controls.share.numpy()
-        near = self.controls.near.numpy()
-        points = np.repeat(np.arange(len(near)), near.shape[1])
-        self.spread = sparse.csr_matrix(
-            (share.ravel(), (points, near.ravel())), (len(near), self.count)
+        # How the points follow the controls, and how the controls' offsets are regularised.
+        self.spread = interpolation_matrix(
+            self.controls.near, self.controls.share, self.count
         )
-        self.held = self._held()
+        self.regulariser = self._regulariser()
 
-    def _held(self) -> Matrix:
-        """``[3 C, 3 C]`` the weights that keep offsets small and neighbours alike."""
+    def _regulariser(self) -> Matrix:
+        """``[3 C, 3 C]``: the quadratic form that is small for small, smooth offsets."""
         # Places of the controls: the average of their points.
         weight = self.spread.T
         rest = self.placed.points.means.numpy()
@@ -266,21 +265,14 @@ class MovingSurface:
         # The images are cut to the person.
         places = self.places[frame]
         chosen = evenly_spaced(len(places), self.settings.cameras)
-        views = [self._view(self._item(places[i])) for i in chosen]
+        views = [self._view(self.dataset[places[i]]) for i in chosen]
         return Posed(views, self.pose(frame))
 
     def pose(self, frame: int) -> BodyPose:
         """The body's pose in a frame, with the transforms of its bones."""
-        item = self._item(self.places[frame][0])
-        pose = item.body
-        if pose is None:
-            pose = self.avatar.body_pose(item.skeleton, item.visibility)
+        pose = self.dataset[self.places[frame][0]].body
         assert pose is not None
         return self.placed.points.with_bones(pose)
-
-    def _item(self, place: int) -> Frame:
-        item = self.dataset[place]
-        return item.unpacked() if self.dataset.packed else item
 
     def _view(self, item: Frame) -> TrainingView:
         # Only the part with the person is compared.
@@ -306,31 +298,39 @@ class MovingSurface:
 
     def registered(self, frames: Sequence[int], console: Console) -> Tensor:
         """``[F, C, 3]`` metres at rest: offsets of the controls in each frame."""
-        # The second chain starts from the average surface of the first: seen from several sides,
-        # a texture only fits together on a surface of the right shape.
         order, before = self._order(frames)
         offsets = np.zeros((len(frames), self.count, 3))
-        textures: dict[int, Texture] = {}
-        rounds = [*[CHAIN] * CHAINS, AVERAGE]
-        steps = [(what, i) for what in rounds for i in order]
-        with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-            for what, i in track(steps, "registering the surface", console):
-                if what == CHAIN and i == order[0]:
-                    mean = offsets.mean(0)
+        with (
+            ThreadPoolExecutor(torch.get_num_threads()) as pool,
+            progress(console) as bars,
+        ):
+            for chain in range(CHAINS):
+                # The second chain starts from the mean surface of the first: textures seen from
+                # several sides only fit together on a surface of the right shape.
+                mean = offsets.mean(0)
+                textures: dict[int, Texture] = {}
+                title = f"registering the surface, chain {chain + 1}"
+                for i in bars.track(order, description=title):
+                    # Each frame is aligned with the one before it, whose pose is the most alike.
+                    frame = self._frame(frames[i])
                     offsets[i] = mean
-                    textures.clear()
+                    if textures:
+                        texture = filled(
+                            textures[before[i]], average(textures.values())
+                        )
+                        offsets[i] = self._aligned(
+                            frame, offsets[before[i]], mean, texture, pool
+                        )
+                    textures[i] = self._texture(frame, offsets[i], pool)
 
-                # Each frame of a chain is aligned with the one before it, whose pose is the most
-                # alike; at the end all are aligned with the average of their textures.
-                texture = average(textures.values()) if textures else None
-                if what == CHAIN and texture is not None:
-                    texture = filled(textures[before[i]], texture)
-                    offsets[i] = offsets[before[i]]
+            # At the end all frames are aligned with the average of their textures.
+            title = "registering the surface, average"
+            for i in bars.track(order, description=title):
                 frame = self._frame(frames[i])
-                if texture is not None:
-                    offsets[i] = self._aligned(
-                        frame, offsets[i], mean, texture, pool
-                    )
+                texture = average(textures.values())
+                offsets[i] = self._aligned(
+                    frame, offsets[i], mean, texture, pool
+                )
                 textures[i] = self._texture(frame, offsets[i], pool)
         return torch.from_numpy(offsets).float()
 
@@ -381,8 +381,8 @@ class MovingSurface:
                 lambda view, moved=moved: self._equations(view, moved, texture),
                 frame.views,
             )
-            square = self.held.copy()
-            right = -self.held @ (offsets - mean).T.ravel()
+            square = self.regulariser.copy()
+            right = -self.regulariser @ (offsets - mean).T.ravel()
             for part, side in found:
                 square += part / per_control
                 right += side / per_control
