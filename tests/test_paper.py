@@ -17,6 +17,7 @@ OURS = {  # what gsgan adds to the paper's method, and the value that leaves it 
     "effects.colour_correction": "off",
     "effects.antialias": "off",
     "effects.random_background": "off",
+    "effects.registration": "off",
     "model.deformation.normals": False,
     "model.deformation.free_table": False,
     "model.deformation.embedding": 0,
@@ -136,6 +137,7 @@ UNLISTED = (
     *(
         "model.body_points",
         "training.recipes.colour",
+        "training.registration",
         "training.schedule.stretch",
         "training.schedule.coarse",
     ),

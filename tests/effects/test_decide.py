@@ -254,6 +254,49 @@ def test_forced_values_win_over_the_scene():
     }
 
 
+PRINTED = {
+    "body_inside": 1.0,
+    "texture": 0.6,
+    "scale_train": (190.0, 220.0),
+}
+
+
+def test_fine_print_on_a_body_is_registered():
+    found = decide(scene(**PRINTED), EffectSettings()).registration
+    assert found.on
+    assert "0.60" in found.why
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"texture": 0.1}, "little that flow can follow"),
+        ({"scale_train": (90.0, 110.0)}, "off by less than a pixel"),
+        ({"n_train_cameras": 1}, "does not see depth"),
+        ({"body_inside": 0.5}, "no Gaussians are on a body"),
+        ({"has_body_pose": False}, "no Gaussians are on a body"),
+    ],
+)
+def test_why_a_surface_is_not_registered(changes, why):
+    found = decide(scene(**{**PRINTED, **changes}), EffectSettings())
+    assert not found.registration.on
+    assert why in found.registration.why
+
+
+def test_registration_without_a_body_is_refused_or_left_out():
+    settings = EffectSettings(registration="on", body_points="off")
+    with pytest.raises(ConfigError, match="no Gaussians are on a body"):
+        decide(scene(**PRINTED), settings)
+    settings = replace(settings, impossible="off")
+    assert not decide(scene(**PRINTED), settings).registration.on
+
+
+def test_checkpoints_from_before_an_effect_existed_are_read():
+    stored = decide(scene(), EffectSettings()).plain()
+    del stored["registration"]
+    assert not Effects.from_plain(stored).registration.on
+
+
 def test_a_run_is_not_resumed_with_other_effects():
     before, now = (
         decide(scene(), EffectSettings()),

@@ -32,7 +32,7 @@ ON = "effects.body_points=on"
 REGISTERED = (
     "model=splat_only",
     ON,
-    "registration=flow",
+    "effects.registration=on",
 )
 SIZE = 192
 BENT = "upperarm01.L"
@@ -257,6 +257,17 @@ def test_models_without_offsets_are_not_registered(tiny):
         module.avatar, data.dataset("train"), Console(quiet=True)
     )
     assert found is None
+
+
+def test_whether_a_run_registers_is_decided_by_its_scene(tiny):
+    _, module = build_training(tiny("model=splat_only", ON))
+    effect = module.avatar.effects.registration
+    assert not effect.on
+    assert "less than a pixel" in effect.why
+    _, module = build_training(
+        tiny("model=splat_only", ON, "effects.texture=0", "effects.fine=0")
+    )
+    assert module.avatar.effects.registration.on
 
 
 def test_a_negative_weight_is_refused():

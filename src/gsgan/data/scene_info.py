@@ -5,6 +5,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from torch.utils.data import Subset
@@ -20,6 +21,7 @@ from gsgan.data.surface_colours import (
     body_inside,
     surface_colours,
 )
+from gsgan.data.texture import WINDOW, grey, texture
 from gsgan.scene import NEAR
 from gsgan.skeleton.joints import BODY
 from gsgan.skeleton.proportions import Proportions, measure_proportions
@@ -62,6 +64,7 @@ class SceneInfo:
         surface: colour differences between training cameras on the same surface, or None if
             they share too little.
         darkest: brightness in [0, 1] of the person's darkest percent.
+        texture: mean over the person's pixels, without a margin, of `gsgan.data.texture.texture`.
         body_inside: share of the posed body that lies inside the masks of training images; None
             without a body pose or mesh.
         proportions: the subject's proportions.
@@ -93,6 +96,7 @@ class SceneInfo:
     scale_train: tuple[float, float] = (1.0, 1.0)
     surface: SurfaceColours | None = None
     darkest: float = 0.0
+    texture: float = 0.0
     body_inside: float | None = None
     proportions: Proportions | None = None
     face: tuple[Vector, ...] | None = None
@@ -168,6 +172,7 @@ def scene_info(
         train_cameras=names,
         surface=_shared_surface(dataset, names, samples),
         darkest=_darkest(dataset, samples),
+        texture=_texture(dataset, samples),
         body_inside=_body_inside(layout, dataset, samples),
         scale_train=_scale(dataset, samples),
         poses=training_poses(torch.from_numpy(completed)),
@@ -265,6 +270,22 @@ def _darkest(dataset: CaptureDataset, samples: int) -> float:
             brightness.append(brightest_channel[frame.mask > SOLID])
     solid = torch.cat(brightness).numpy()
     return float(np.percentile(solid, 1)) if solid.size else 0.0
+
+
+def _texture(dataset: CaptureDataset, samples: int) -> float:
+    """The mean texture of the person's pixels."""
+    # Pixels nearer to the outline than this see it in their windows.
+    kernel = np.ones((WINDOW + 2, WINDOW + 2), np.uint8)
+    found = [np.zeros(0)]
+    for indices in _sampled(dataset, samples):
+        for index in indices:
+            frame = dataset[index]
+            solid = (frame.mask[0, 0] > SOLID).numpy().astype(np.uint8)
+            inside = cv2.erode(solid, kernel, borderValue=0) > 0
+            levels = grey(frame.image[0].permute(1, 2, 0).numpy())
+            found.append(texture(levels)[inside])
+    pixels = np.concatenate(found)
+    return float(pixels.mean()) if pixels.size else 0.0
 
 
 def _body_inside(

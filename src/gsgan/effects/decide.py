@@ -23,6 +23,7 @@ CHOICES: dict[str, tuple[str | int, ...]] = {
     "colour_correction": ON_OFF,
     "body_points": ON_OFF,
     "random_background": ON_OFF,
+    "registration": ON_OFF,
 }
 
 # Reasons that more than one rule gives.
@@ -52,6 +53,7 @@ class EffectSettings:
     colour_correction: str | bool = AUTO
     body_points: str | bool = AUTO
     random_background: str | bool = AUTO
+    registration: str | bool = AUTO
 
     # Restrictions of all of them, and what happens to a forced effect that is not possible.
     only: Sequence[str] | None = None
@@ -66,6 +68,8 @@ class EffectSettings:
     scale_ratio: float = 1.3
     dark: float = 0.25
     body_inside: float = 0.95
+    texture: float = 0.4
+    fine: float = 150.0
 
     def __post_init__(self) -> None:
         # Each requested value is one of the effect's.
@@ -159,9 +163,18 @@ def decide(
     Raises:
         ConfigError: when a forced effect is not possible in this scene or model.
     """
-    # Each effect by itself: none depends on another.
+    # Each effect by itself.
     model = model or ModelParts()
     found = {name: _one(name, info, settings, model) for name in CHOICES}
+
+    # What is registered is a body that carries Gaussians.
+    if found["registration"].on and not found["body_points"].on:
+        if found["registration"].forced and settings.impossible == "error":
+            raise ConfigError(
+                "effects.registration=on is not possible: no Gaussians are on a body, since "
+                + found["body_points"].why
+            )
+        found["registration"] = Effect(OFF, "no Gaussians are on a body")
     cameras = info.train_cameras if found["colour_correction"].on else ()
     return Effects(**found, cameras=cameras)
 
@@ -317,6 +330,28 @@ def _random_background(info: SceneInfo, settings: EffectSettings) -> Effect:
     return Effect(OFF, f"{measured} ({limit})")
 
 
+def _registration(info: SceneInfo, settings: EffectSettings) -> Effect:
+    # One camera sees no depth: its flow moves surface sideways that should move towards it.
+    if info.n_train_cameras < 2:
+        return Effect(OFF, "one training camera does not see depth")
+
+    # The body's surface is off by less than a coarse pixel.
+    scale = info.scale_train[1]
+    if scale < settings.fine:
+        return Effect(
+            OFF,
+            f"training images have {scale:.0f} pixels per metre (limit {settings.fine:g}): the "
+            "body's surface is off by less than a pixel",
+        )
+
+    # Flow follows fine print; plain cloth gives it nothing to follow.
+    measured = f"the person's texture is {info.texture:.2f} in the mean"
+    limit = f"limit {settings.texture:g}"
+    if info.texture < settings.texture:
+        return Effect(OFF, f"{measured} ({limit}): little that flow can follow")
+    return Effect("on", f"{measured} ({limit})")
+
+
 # The rule that decides each effect if its value is `auto`.
 _RULES: dict[str, Callable[[SceneInfo, EffectSettings], Effect]] = {
     "view_dependence": _view_dependence,
@@ -325,4 +360,5 @@ _RULES: dict[str, Callable[[SceneInfo, EffectSettings], Effect]] = {
     "colour_correction": _colour_correction,
     "body_points": _body_points,
     "random_background": _random_background,
+    "registration": _registration,
 }

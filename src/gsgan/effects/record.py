@@ -49,6 +49,7 @@ class Effects:
         colour_correction: an affine colour map per training camera.
         body_points: G lies on the surface of the posed body, not on the skeleton's shapes.
         random_background: Step I compares images over a random colour.
+        registration: before Ψ learns, optical flow locates the surface in the training images.
         cameras: training cameras in the order of the colour corrections.
     """
 
@@ -59,6 +60,7 @@ class Effects:
     colour_correction: Effect = _DEFAULT
     body_points: Effect = _DEFAULT
     random_background: Effect = _DEFAULT
+    registration: Effect = _DEFAULT
     cameras: tuple[str, ...] = ()
 
     def __iter__(self) -> Iterator[tuple[str, Effect]]:
@@ -98,7 +100,12 @@ class Effects:
     @classmethod
     def from_plain(cls, values: Mapping[str, Any]) -> Effects:
         """The inverse of `plain`."""
-        found = {name: Effect(**values[name]) for name in EFFECT_NAMES}
+        # Checkpoints from before an effect existed lack it.
+        found = {
+            name: Effect(**values[name])
+            for name in EFFECT_NAMES
+            if name in values
+        }
         return cls(**found, cameras=tuple(values["cameras"]))
 
     def check_same(self, stored: Mapping[str, Any]) -> None:

@@ -79,8 +79,8 @@ class AvatarTraining(LightningModule):
         pose_noise, window, window_reach, max_skipped, skip_window, log_every, average,
             average_every: see conf/training/long.yaml.
         rollback: recovers from a collapse of the rendered person.
-        registration: of the body's surface to the training images, before the first iteration;
-            None: the surface is where linear blend skinning puts it.
+        registration: of the body's surface to the training images, before the first iteration,
+            if the avatar's effects have it.
         extra_losses: further terms of Step II by name: modules of a rendering and its frame.
         record: plain config values stored with every checkpoint.
         scene: facts about the scene as plain values, likewise, for `gsgan.load`.
@@ -147,7 +147,7 @@ class AvatarTraining(LightningModule):
         self.rollback = rollback or Rollback()
 
         # Where the surface of training frames is; known once it is registered.
-        self.registration = registration
+        self.registration = registration or Registration()
         self.registered: Registered | None = None
 
         # Facts that checkpoints store.

@@ -24,6 +24,7 @@ from torch import Tensor
 from gsgan.body import blend_transforms, skin
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.splits import spread_frames
+from gsgan.data.texture import grey, texture
 from gsgan.model.avatar import Avatar
 from gsgan.model.body_points import BodyPoints, LearntWeights, moved_normals
 from gsgan.model.interpolation import interpolation_matrix
@@ -49,8 +50,6 @@ FACING = 0.2
 OUTLINE = 3
 # pixels: flow that does not lead back to where it came from is not trusted
 ROUND_TRIP = 0.7
-# smaller eigenvalue of the structure tensor at which flow is trusted by half
-TEXTURED = 8e-4
 # pixels: longer flow counts less
 LONG = 4.0
 # neighbours of a control whose offsets are alike
@@ -529,15 +528,8 @@ def flow_between(drawn: Drawn, view: TrainingView) -> tuple[Float, Float]:
         back, x + forth[..., 0], y + forth[..., 1], cv2.INTER_LINEAR
     )
     astray = np.square(forth + returned).sum(-1)
-    textured = cv2.cornerMinEigenVal(b.astype(np.float32) / 255, 17)
-    trust = np.exp(-astray / ROUND_TRIP**2) * textured / (textured + TEXTURED)
+    trust = np.exp(-astray / ROUND_TRIP**2) * texture(b)
     return forth, trust * view.inside * drawn.known
-
-
-def grey(image: Float) -> NDArray[Any]:
-    """Grey levels ``[h, w]`` of RGB in [0, 1]."""
-    levels = (image.clip(0, 1) * 255).round().astype(np.uint8)
-    return cv2.cvtColor(levels, cv2.COLOR_RGB2GRAY)
 
 
 def seen(

@@ -203,7 +203,7 @@ def _prepare_avatar(
     images."""
     if distil is not None:
         start_from(module.avatar, data, distil)
-    elif module.registration is not None:
+    elif module.avatar.effects.registration.on:
         module.registered = module.registration(
             module.avatar, data.dataset("train"), console
         )
