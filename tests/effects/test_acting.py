@@ -53,6 +53,20 @@ def test_off_builds_no_parameter_and_calls_no_operator(
         assert not off.accuracy.antialias
 
 
+def test_dense_gaussians_on_a_body_need_no_generator(build):
+    """Its inputs S and the pose code go with it."""
+    body = "effects.body_points=on"
+    _, dense, frame = build(body, "effects.gaussians=0")
+    assert dense.generator is None
+    assert dense.segmentation is None
+    assert dense.pose_encoder is None
+    assert "Step I's colour" in dense.effects.generator.why
+    _, forced, _ = build(body, "effects.gaussians=0", "effects.generator=on")
+    assert forced.generator is not None
+    _, same, _ = build(body, "model=splat_only")
+    assert calls(dense, frame) == calls(same, frame)
+
+
 def test_the_mean_of_all_maps_is_the_identity_and_unseen_cameras_keep_theirs():
     colour = ColourCorrection(["b", "a", "d"], ["a", "b", "c", "d"])
     torch.nn.init.normal_(colour.offsets, std=0.3)
@@ -157,7 +171,8 @@ def test_all_means_all_that_this_model_can_have(build):
     assert {name for name, effect in avatar.effects if effect.on} == every
     assert torch.isfinite(avatar(*frame.inputs).image).all()
     _, avatar, frame = build("effects=all", "model=image_to_image")
-    assert {name for name, effect in avatar.effects if effect.on} == set()
+    left = {name for name, effect in avatar.effects if effect.on}
+    assert left == {"generator"}
     assert torch.isfinite(avatar(*frame.inputs).image).all()
 
 

@@ -24,7 +24,10 @@ CHOICES: dict[str, tuple[str | int, ...]] = {
     "body_points": ON_OFF,
     "random_background": ON_OFF,
     "registration": ON_OFF,
+    "generator": ON_OFF,
 }
+# Parts of the camera and of the method: effects.only and effects=none keep them.
+KEPT = ("distortion", "generator")
 
 # Reasons that more than one rule gives.
 FORCED = "set in the config"
@@ -54,6 +57,7 @@ class EffectSettings:
     body_points: str | bool = AUTO
     random_background: str | bool = AUTO
     registration: str | bool = AUTO
+    generator: str | bool = AUTO
 
     # Restrictions of all of them, and what happens to a forced effect that is not possible.
     only: Sequence[str] | None = None
@@ -70,6 +74,7 @@ class EffectSettings:
     body_inside: float = 0.95
     texture: float = 0.4
     fine: float = 150.0
+    gaussians: float = 1.0
 
     def __post_init__(self) -> None:
         # Each requested value is one of the effect's.
@@ -114,9 +119,9 @@ class EffectSettings:
         if self.only is None:
             return value
 
-        # Effects that are not listed are off, but distortion is a property of the camera.
+        # Effects that are not listed are off.
         if name not in self.only:
-            return value if name == "distortion" else "off"
+            return value if name in KEPT else "off"
 
         # Listed effects are on.
         return "on" if value in (AUTO, "off", 0) else value
@@ -130,22 +135,26 @@ class ModelParts:
         splats: it renders Gaussians.
         points: it places Gaussians on the skeleton.
         body_points: its config has a part that places them on a body instead.
+        generator: it has a generator.
+        gaussians: Gaussians per pixel of the person in training images, if they are on a body;
+            None where that is not known.
     """
 
     splats: bool = True
     points: bool = True
     body_points: bool = True
+    generator: bool = True
+    gaussians: float | None = None
 
     def lacks(self, effect: str) -> str | None:
         """The reason why the model cannot have an effect; None if it can."""
-        # Images are undistorted before any model sees them.
-        if effect == "distortion":
+        # Images are undistorted before any model sees them; a generator needs no Gaussians.
+        if effect in ("distortion", "generator"):
             return None
         if effect == "body_points":
             if not self.points:
                 return "this model has no points on the skeleton"
             return None if self.body_points else "the model leaves them out"
-
         # All other effects are of Gaussians.
         return None if self.splats else "this model has no Gaussians"
 
@@ -163,24 +172,22 @@ def decide(
     Raises:
         ConfigError: when a forced effect is not possible in this scene or model.
     """
-    # Each effect by itself.
+    # Two effects depend on whether Gaussians are on a body; all others decide by themselves.
     model = model or ModelParts()
-    found = {name: _one(name, info, settings, model) for name in CHOICES}
-
-    # What is registered is a body that carries Gaussians.
-    if found["registration"].on and not found["body_points"].on:
-        if found["registration"].forced and settings.impossible == "error":
-            raise ConfigError(
-                "effects.registration=on is not possible: no Gaussians are on a body, since "
-                + found["body_points"].why
-            )
-        found["registration"] = Effect(OFF, "no Gaussians are on a body")
+    on_body = _one("body_points", info, settings, model)
+    found = {
+        name: _one(name, info, settings, model, on_body) for name in CHOICES
+    }
     cameras = info.train_cameras if found["colour_correction"].on else ()
     return Effects(**found, cameras=cameras)
 
 
 def _one(
-    name: str, info: SceneInfo, settings: EffectSettings, model: ModelParts
+    name: str,
+    info: SceneInfo,
+    settings: EffectSettings,
+    model: ModelParts,
+    body_points: Effect | None = None,
 ) -> Effect:
     # Off by request.
     requested = settings.requested(name)
@@ -188,8 +195,15 @@ def _one(
     if requested in (OFF, 0):
         return Effect(off, FORCED)
 
+    # Whether to have a generator at all is the model's choice.
+    if name == "generator" and not model.generator:
+        return Effect(OFF, "the model leaves it out")
+
     # Not possible in this scene or model. Lenses that cannot be rendered are undistorted.
     reason = _impossible(name, info, requested) or model.lacks(name)
+    on_body = body_points is not None and body_points.on
+    if name == "registration" and not on_body:
+        reason = "no Gaussians are on a body"
     if reason is not None:
         if requested != AUTO and settings.impossible == "error":
             raise ConfigError(
@@ -198,6 +212,8 @@ def _one(
         return Effect("undistort" if reason == RATIONAL else off, reason)
 
     # Decided by rule, or forced; "on" stands for the usual mode or degree.
+    if requested == AUTO and name == "generator":
+        return _generator(model, settings, on_body)
     if requested == AUTO:
         return _RULES[name](info, settings)
     if name == "distortion" and requested == "on":
@@ -350,6 +366,27 @@ def _registration(info: SceneInfo, settings: EffectSettings) -> Effect:
     if info.texture < settings.texture:
         return Effect(OFF, f"{measured} ({limit}): little that flow can follow")
     return Effect("on", f"{measured} ({limit})")
+
+
+def _generator(
+    model: ModelParts, settings: EffectSettings, on_body: bool
+) -> Effect:
+    # Without Gaussians nothing else paints; Alg. 1's points are far from the surface.
+    if not model.splats:
+        return Effect("on", "this model has no Gaussians: nothing else paints")
+    if not on_body:
+        return Effect("on", "Gaussians start from the skeleton's shapes")
+    if model.gaussians is None:
+        return Effect("on", "the number of Gaussians is not known")
+
+    # Where Gaussians are as dense as pixels, their own colours are as sharp as the generator's.
+    measured = (
+        f"{model.gaussians:.2g} Gaussians per pixel of the person "
+        f"(limit {settings.gaussians:g})"
+    )
+    if model.gaussians < settings.gaussians:
+        return Effect("on", measured)
+    return Effect(OFF, f"{measured}: Step I's colour is as good")
 
 
 # The rule that decides each effect if its value is `auto`.

@@ -50,6 +50,7 @@ class Effects:
         body_points: G lies on the surface of the posed body, not on the skeleton's shapes.
         random_background: Step I compares images over a random colour.
         registration: before Ψ learns, optical flow locates the surface in the training images.
+        generator: the image is the generator's; else it is Step I's colour.
         cameras: training cameras in the order of the colour corrections.
     """
 
@@ -61,6 +62,8 @@ class Effects:
     body_points: Effect = _DEFAULT
     random_background: Effect = _DEFAULT
     registration: Effect = _DEFAULT
+    # Models without one had none before this effect existed, and all others had one.
+    generator: Effect = Effect("on", _DEFAULT.why)
     cameras: tuple[str, ...] = ()
 
     def __iter__(self) -> Iterator[tuple[str, Effect]]:

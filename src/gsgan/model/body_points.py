@@ -541,6 +541,20 @@ def points_for(body_height: float, scale: float, spacing: float) -> int:
     return int(min(max(MIN_POINTS, round(count, -2)), MAX_POINTS))
 
 
+def points_per_pixel(count: int, body_height: float, scale: float) -> float:
+    """Points on a body per pixel that the person covers in training images.
+
+    Args:
+        count: points.
+        body_height: metres.
+        scale: pixels per metre at the person.
+
+    Source: the mean projected area of a convex body is a quarter of its surface (Cauchy).
+    """
+    area = SKIN * (body_height / STATURE) ** 2
+    return 4 * count / (area * scale**2)
+
+
 def moved_normals(A: Tensor, normals: Tensor) -> Tensor:
     """``[B, N, 3]`` normals of a surface that linear maps ``A`` ``[B, N, 3, 3]`` move.
 

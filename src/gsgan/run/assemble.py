@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -20,7 +21,12 @@ from gsgan.data.scene_info import SceneInfo
 from gsgan.effects import Effects, EffectSettings, ModelParts, decide
 from gsgan.effects.record import OFF
 from gsgan.model.avatar import Avatar
-from gsgan.model.body_points import BodyPoints
+from gsgan.model.body_points import (
+    AUTO,
+    BodyPoints,
+    points_for,
+    points_per_pixel,
+)
 from gsgan.model.colour import ColourCorrection
 from gsgan.model.deformation import ResidualGaussians
 from gsgan.model.generator import Generator
@@ -103,8 +109,14 @@ def build_avatar(
     with naming_group("model"):
         parts: AvatarParts = instantiate(config.model)()
         effects = effects or decide(
-            scene, _effect_settings(config), parts.in_effects
+            scene, _effect_settings(config), parts.in_effects(scene)
         )
+
+        # Pose code and S are inputs of the generator.
+        if not effects.generator.on:
+            parts = replace(
+                parts, generator=None, pose_encoder=None, segmentation=None
+            )
 
         # S needs the body with a label per vertex.
         labelled: tuple[SkinnedBody | None, str] = (
@@ -150,7 +162,7 @@ class AvatarParts:
 
     # Some models have these, too.
     surface: Callable[..., SurfaceGaussians] | None = None
-    body_points: Callable[..., BodyPoints] | None = None
+    body_points: partial[BodyPoints] | None = None
     low_pass: float = 0.3
     supersample: int = 1
     backend: str = "auto"
@@ -175,14 +187,35 @@ class AvatarParts:
                 "nothing paints; give a deformation, a surface or a generator"
             )
 
-    @property
-    def in_effects(self) -> ModelParts:
+    def in_effects(self, scene: SceneInfo) -> ModelParts:
         """The parts that effects act on."""
         return ModelParts(
             splats=self.densify is not None or self.surface is not None,
             points=self.densify is not None,
             body_points=self.body_points is not None,
+            generator=self.generator is not None,
+            gaussians=self._gaussians_per_pixel(scene),
         )
+
+    def _gaussians_per_pixel(self, scene: SceneInfo) -> float | None:
+        """Gaussians on the body per pixel of the person; None without a body."""
+        if self.body_points is None or self.densify is None:
+            return None
+
+        # The number that the config gives, or that of the body's vertices.
+        template = template_of(scene.skeleton, scene.face)
+        height = _body_height(scene, template)
+        scale = scene.scale_train[1]
+        chosen = self.body_points.keywords
+        count = chosen.get("points")
+        if count == AUTO:
+            count = points_for(height, scale, chosen["spacing"])
+        if count is None:
+            body = open_body(scene.body, scene.body_file, scene.betas)
+            if body is None:
+                return None
+            count = len(body.vertices)
+        return points_per_pixel(count, height, scale)
 
 
 def _assembled(
@@ -198,10 +231,7 @@ def _assembled(
     of the others. ``labelled``: S's body, and where its labels come from or why there is none.
     """
     template = template_of(scene.skeleton, scene.face)
-    # The stature follows from limb lengths, which no pose changes.
-    body_height = (
-        float(scene.body_height) * template.stature / template.limb_length_sum
-    )
+    body_height = _body_height(scene, template)
     formation: dict[str, Any] = {
         "low_pass": parts.low_pass,
         "antialias": effects.antialias.on,
@@ -288,6 +318,12 @@ def _assembled(
         else None,
         **{name: getattr(parts, name) for name in OPTIONS},
     )
+
+
+def _body_height(scene: SceneInfo, template: SkeletonTemplate) -> float:
+    """The person's stature in metres; it follows from limb lengths, which no pose changes."""
+    limbs = float(scene.body_height)
+    return limbs * template.stature / template.limb_length_sum
 
 
 def _generator(
