@@ -10,8 +10,9 @@ of landmarks and 3 % of frames missing) with a detector's depth, both with true 
 ``mediapipe``'s with its masks. The other cameras are moved into the estimated world by a similarity
 and join the capture, on which an avatar is trained from the video alone. With ``--video`` the
 truth is a capture of several real cameras instead, one of which, of the video's name, took the
-video; landmarks and masks are MediaPipe's. Scores are given twice: with the skeletons that were
-estimated from the video, and with the true ones, moved into the estimated world. Further words
+video; landmarks and masks are MediaPipe's. Scores are given three times: with the skeletons that
+were estimated from the video as they are; with the same, each frame aligned with the truth by a
+rigid motion; and with the true ones, moved into the estimated world. Further words
 are overrides of `gsgan.train`. Finished steps are kept: the same command continues.
 """
 
@@ -135,7 +136,8 @@ def join(
 ) -> list[int]:
     """The capture with the scene's cameras but the video's in its world; returns its frames.
 
-    A second one beside it, ``true``, has the scene's landmarks.
+    Beside it, ``aligned`` has its landmarks after a rigid motion of each frame towards the truth,
+    and ``true`` has the scene's.
     """
     found = dict(np.load(capture / "landmarks3d.npz"))
     frames = found["frame_id"]
@@ -156,8 +158,8 @@ def join(
     print(
         f"focal length: {100 * (focal - 1):+.1f} %; {len(frames)} frames; scale {s:.3f}"
     )
-    true = folder.with_name("true")
-    for old in (folder, true):
+    aligned, true = folder.with_name("aligned"), folder.with_name("true")
+    for old in (folder, aligned, true):
         shutil.rmtree(old, ignore_errors=True)
     shutil.copytree(capture, folder)
     cameras = json.loads((folder / "cameras.json").read_text())
@@ -172,8 +174,15 @@ def join(
                 if int(path.stem) in frames:
                     shutil.copy(path, folder / kind / name)
     (folder / "cameras.json").write_text(json.dumps(cameras))
+    moved = (truth - b) @ A / s
+    for own_p, known, goal in zip(found["p"], seen, moved, strict=True):
+        if known.sum() > 2:
+            _, turn, shift = similarity(own_p[:33][known], goal[known], False)
+            own_p[:] = own_p @ turn.T + shift
+    shutil.copytree(folder, aligned)
+    np.savez(aligned / "landmarks3d.npz", **found)
     shutil.copytree(folder, true)
-    found["p"][:, :33] = (truth - b) @ A / s
+    found["p"][:, :33] = moved
     np.savez(true / "landmarks3d.npz", **found)
     return frames.tolist()
 
@@ -268,14 +277,12 @@ def main() -> None:
     where = [f"data.root={folder}/joined", f"hydra.run.dir={folder}/run"]
     run("gsgan.train", "experiment=one_camera", *where, *splits, *overrides)
     same = [word.replace("data.", "on.") for word in splits]
-    run(
-        "gsgan.evaluate",
-        f"run={folder}/run",
-        f"other_capture={folder}/true",
-        *same,
-    )
-    show(folder / "run" / "metrics.json", "estimated skeletons")
-    show(folder / "run" / "on" / "true" / "metrics.json", "true skeletons")
+    show(folder / "run" / "metrics.json", "estimated skeletons, as they are")
+    for kind in ("aligned", "true"):
+        other = f"other_capture={folder}/{kind}"
+        run("gsgan.evaluate", f"run={folder}/run", other, *same)
+        metrics = folder / "run" / "on" / kind / "metrics.json"
+        show(metrics, f"{kind} skeletons")
     print(
         f"prepare {(prepared - began) / 60:.1f} min, train and score "
         f"{(time.monotonic() - prepared) / 60:.1f} min"
