@@ -276,10 +276,10 @@ def main() -> None:
     splits.append(f"data.test_frames=[{','.join(map(str, held))}]")
     where = [f"data.root={folder}/joined", f"hydra.run.dir={folder}/run"]
     run("gsgan.train", "experiment=one_camera", *where, *splits, *overrides)
-    same = [word.replace("data.", "on.") for word in splits]
+    same = [word.replace("data.", "+other_capture.") for word in splits]
     show(folder / "run" / "metrics.json", "estimated skeletons, as they are")
     for kind in ("aligned", "true"):
-        other = f"other_capture={folder}/{kind}"
+        other = f"+other_capture.root={folder}/{kind}"
         run("gsgan.evaluate", f"run={folder}/run", other, *same)
         metrics = folder / "run" / "on" / kind / "metrics.json"
         show(metrics, f"{kind} skeletons")

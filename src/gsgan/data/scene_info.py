@@ -21,7 +21,7 @@ from gsgan.data.surface_colours import (
     body_inside,
     surface_colours,
 )
-from gsgan.data.texture import WINDOW, grey, texture
+from gsgan.data.texture import SIDE, grey, texture
 from gsgan.scene import NEAR
 from gsgan.skeleton.joints import BODY
 from gsgan.skeleton.proportions import Proportions, measure_proportions
@@ -275,7 +275,7 @@ def _darkest(dataset: CaptureDataset, samples: int) -> float:
 def _texture(dataset: CaptureDataset, samples: int) -> float:
     """The mean texture of the person's pixels."""
     # Pixels nearer to the outline than this see it in their windows.
-    kernel = np.ones((WINDOW + 2, WINDOW + 2), np.uint8)
+    kernel = np.ones((SIDE + 2, SIDE + 2), np.uint8)
     found = [np.zeros(0)]
     for indices in _sampled(dataset, samples):
         for index in indices:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from gsgan.utils.arrays import Bytes
 
 # pixels: side of the squares whose gradients are looked at
-WINDOW = 17
+SIDE = 17
 # smaller eigenvalue of the structure tensor at which texture counts by half
 TEXTURED = 8e-4
 
@@ -25,5 +25,5 @@ def texture(levels: Bytes) -> NDArray[Any]:
 
     Source: the smaller eigenvalue of the structure tensor (Shi and Tomasi, 1994).
     """
-    eigenvalue = cv2.cornerMinEigenVal(levels.astype(np.float32) / 255, WINDOW)
+    eigenvalue = cv2.cornerMinEigenVal(levels.astype(np.float32) / 255, SIDE)
     return eigenvalue / (eigenvalue + TEXTURED)
