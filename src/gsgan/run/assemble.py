@@ -232,47 +232,27 @@ def _assembled(
     """
     template = template_of(scene.skeleton, scene.face)
     body_height = _body_height(scene, template)
+    sizes = {"body_height": body_height, "sh_degree": effects.degree}
     formation: dict[str, Any] = {
         "low_pass": parts.low_pass,
         "antialias": effects.antialias.on,
     }
 
-    # The points that Gaussians start from: on the skinned body, or on the skeleton's
-    # shapes.
+    # The points, and Ψ, which moves them; or Gaussians that move with the body alone.
     torch.manual_seed(seed + 1)
-    body_points = None
-    if parts.densify and parts.body_points and effects.body_points.on:
-        body = _required_body(scene, "effects.body_points=on")
-        body_points = parts.body_points(
-            body=body, body_height=body_height, scale=scene.scale_train[1]
-        )
-
-    # Ψ, which moves these points, or Gaussians that move with the body alone.
-    sizes = {"body_height": body_height, "sh_degree": effects.degree}
-    deformation = surface = None
+    body_points = _body_points(parts, scene, effects, body_height)
     points = body_points or parts.densify
+    deformation = surface = None
     if parts.deformation and points:
-        own: dict[str, Any] = {}
-        if body_points:
-            own["mean_step"] = body_points.mean_step
-            if body_points.scale_max is not None:
-                own["scale_max"] = body_points.scale_max
-        # A config with normals=null leaves it to the number of cameras.
-        if (
-            getattr(parts.deformation, "keywords", {}).get("normals", False)
-            is None
-        ):
-            own["normals"] = scene.n_train_cameras > 1
         deformation = parts.deformation(
             rest_points=points.rest_points,
             joints=len(template.names),
             **sizes,
-            **own,
+            **_set_by_scene(parts, scene, body_points),
         )
     if parts.surface:
-        surface = parts.surface(
-            body=_required_body(scene, "model.surface"), **sizes
-        )
+        body = _required_body(scene, "model.surface")
+        surface = parts.surface(body=body, **sizes)
 
     # S forms its images like F.
     segmentation = None
@@ -284,13 +264,17 @@ def _assembled(
         segmentation.backend = parts.backend
 
     # Parts on a body need its solver for skeletons without a body pose.
-    on_a_body = any(
-        part is not None for part in (body_points, surface, segmentation)
-    )
+    solver = None
+    if body_points or surface or segmentation:
+        solver = Solver(_required_body(scene, "the model"))
 
     # The rest: the generator and the colour corrections.
     torch.manual_seed(seed + 2)
-    colours = effects.colour_correction.on
+    splats = deformation or surface
+    generator = _generator(parts, template, splats, segmentation)
+    colour = None
+    if effects.colour_correction.on:
+        colour = ColourCorrection(effects.cameras, scene.camera_names)
     return Avatar(
         effects=effects,
         template=template,
@@ -306,18 +290,42 @@ def _assembled(
         segmentation=segmentation,
         segmentation_why=labelled[1],
         pose_encoder=parts.pose_encoder,
-        generator=_generator(
-            parts, template, deformation or surface, segmentation
-        ),
-        colour=ColourCorrection(effects.cameras, scene.camera_names)
-        if colours
-        else None,
+        generator=generator,
+        colour=colour,
         poses=scene.poses,
-        solver=Solver(_required_body(scene, "the model"))
-        if on_a_body
-        else None,
+        solver=solver,
         **{name: getattr(parts, name) for name in OPTIONS},
     )
+
+
+def _body_points(
+    parts: AvatarParts, scene: SceneInfo, effects: Effects, body_height: float
+) -> BodyPoints | None:
+    """Points on the skinned body; None where Gaussians start from the skeleton's shapes."""
+    if not (parts.densify and parts.body_points and effects.body_points.on):
+        return None
+    return parts.body_points(
+        body=_required_body(scene, "effects.body_points=on"),
+        body_height=body_height,
+        scale=scene.scale_train[1],
+    )
+
+
+def _set_by_scene(
+    parts: AvatarParts, scene: SceneInfo, body_points: BodyPoints | None
+) -> dict[str, Any]:
+    """Arguments of Ψ that the scene or the points decide."""
+    found: dict[str, Any] = {}
+    if body_points is not None:
+        found["mean_step"] = body_points.mean_step
+        if body_points.scale_max is not None:
+            found["scale_max"] = body_points.scale_max
+
+    # A config with normals=null leaves it to the number of cameras.
+    given = getattr(parts.deformation, "keywords", {})
+    if given.get("normals", False) is None:
+        found["normals"] = scene.n_train_cameras > 1
+    return found
 
 
 def _body_height(scene: SceneInfo, template: SkeletonTemplate) -> float:
