@@ -72,7 +72,7 @@ class EffectSettings:
     scale_ratio: float = 1.3
     dark: float = 0.25
     body_inside: float = 0.95
-    texture: float = 0.4
+    texture: float = 0.5
     fine: float = 150.0
     gaussians: float = 1.0
 
