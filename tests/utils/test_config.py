@@ -97,13 +97,21 @@ def differences(a, b, at: str = "") -> set[str]:
 def test_an_ablation_changes_what_it_says_and_nothing_else(
     compose, model, changed, experiment
 ):
-    chosen = [] if experiment is None else [f"experiment={experiment}"]
+    chosen = ["effects.generator=on"]
+    if experiment is not None:
+        chosen.append(f"experiment={experiment}")
     full = OmegaConf.to_container(compose("train", *chosen))
     other = OmegaConf.to_container(compose("train", *chosen, f"model={model}"))
     found = {".".join(key.split(".")[:3]) for key in differences(full, other)}
     assert {
         next(c for c in changed if key.startswith(c)) for key in found
     } == changed
+
+
+@pytest.mark.parametrize("model", ["wo_seg", "wo_feat", "wo_gcn"])
+def test_ablations_of_the_generator_keep_it(compose, model):
+    assert compose("train").effects.generator == "auto"
+    assert compose("train", f"model={model}").effects.generator == "on"
 
 
 def test_demo_is_what_train_does_by_default_without_a_generator(compose):
