@@ -216,6 +216,16 @@ def test_a_run_driven_into_the_collapse_is_caught_and_brought_back(
     assert module.step == module.schedule.total
 
 
+def test_a_collapse_in_the_first_epoch_returns_to_the_start(make, capsys):
+    """Ψ can make the person vanish before there is a good state at an epoch's end."""
+    module, trainer, data = make(*LONGER, "training.schedule.epoch=12")
+    push_opacities_down(module, until=1)
+    trainer.fit(module, data)
+    assert "iteration 12: the rendered person" in capsys.readouterr().out
+    assert module.rollback.done == 1
+    assert module.step == module.schedule.total
+
+
 @pytest.mark.parametrize("model", ["lbs_splat", "image_to_image", "splat_only"])
 def test_baselines_train_with_the_same_schedule(make, model):
     module, trainer, data = make(

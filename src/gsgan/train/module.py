@@ -231,6 +231,10 @@ class AvatarTraining(LightningModule):
             offsets = self.registered.of(frame.frame_id)
             frame = replace(frame, body=replace(frame.body, offsets=offsets))
 
+        # A person who vanishes before the first epoch ends returns to here.
+        if self.step == self.schedule.segmentation:
+            self.rollback.keep(self)
+
         # The phases follow each other; each trains other parts.
         phase = self.schedule.phase(self.step)
         self._frame = frame
