@@ -56,12 +56,14 @@ def test_off_builds_no_parameter_and_calls_no_operator(
 def test_dense_gaussians_on_a_body_need_no_generator(build):
     """Its inputs S and the pose code go with it."""
     body = "effects.body_points=on"
-    _, dense, frame = build(body, "effects.gaussians=0")
+    _, dense, frame = build(body, "effects.gaussians_per_pixel=0")
     assert dense.generator is None
     assert dense.segmentation is None
     assert dense.pose_encoder is None
     assert "Step I's colour" in dense.effects.generator.why
-    _, forced, _ = build(body, "effects.gaussians=0", "effects.generator=on")
+    _, forced, _ = build(
+        body, "effects.gaussians_per_pixel=0", "effects.generator=on"
+    )
     assert forced.generator is not None
     _, same, _ = build(body, "model=splat_only")
     assert calls(dense, frame) == calls(same, frame)

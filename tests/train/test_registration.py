@@ -265,7 +265,12 @@ def test_whether_a_run_registers_is_decided_by_its_scene(tiny):
     assert not effect.on
     assert "less than a pixel" in effect.why
     _, module = build_training(
-        tiny("model=splat_only", ON, "effects.texture=0", "effects.fine=0")
+        tiny(
+            "model=splat_only",
+            ON,
+            "effects.texture=0",
+            "effects.pixels_per_metre=0",
+        )
     )
     assert module.avatar.effects.registration.on
 

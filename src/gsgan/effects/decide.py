@@ -73,8 +73,8 @@ class EffectSettings:
     dark: float = 0.25
     body_inside: float = 0.95
     texture: float = 0.5
-    fine: float = 150.0
-    gaussians: float = 1.0
+    pixels_per_metre: float = 150.0
+    gaussians_per_pixel: float = 1.0
 
     def __post_init__(self) -> None:
         # Each requested value is one of the effect's.
@@ -353,15 +353,15 @@ def _registration(info: SceneInfo, settings: EffectSettings) -> Effect:
 
     # The body's surface is off by less than a coarse pixel.
     scale = info.scale_train[1]
-    if scale < settings.fine:
+    if scale < settings.pixels_per_metre:
         return Effect(
             OFF,
-            f"training images have {scale:.0f} pixels per metre (limit {settings.fine:g}): the "
-            "body's surface is off by less than a pixel",
+            f"training images have {scale:.0f} pixels per metre (limit "
+            f"{settings.pixels_per_metre:g}): the body's surface is off by less than a pixel",
         )
 
     # Flow follows fine print; plain cloth gives it nothing to follow.
-    measured = f"the person's texture is {info.texture:.2f} in the mean"
+    measured = f"the person's texture is {info.texture:.2f} on average"
     limit = f"limit {settings.texture:g}"
     if info.texture < settings.texture:
         return Effect(OFF, f"{measured} ({limit}): little that flow can follow")
@@ -382,9 +382,9 @@ def _generator(
     # Where Gaussians are as dense as pixels, their own colours are as sharp as the generator's.
     measured = (
         f"{model.gaussians:.2g} Gaussians per pixel of the person "
-        f"(limit {settings.gaussians:g})"
+        f"(limit {settings.gaussians_per_pixel:g})"
     )
-    if model.gaussians < settings.gaussians:
+    if model.gaussians < settings.gaussians_per_pixel:
         return Effect("on", measured)
     return Effect(OFF, f"{measured}: Step I's colour is as good")
 
