@@ -72,7 +72,7 @@ class EffectSettings:
     scale_ratio: float = 1.3
     dark: float = 0.25
     body_inside: float = 0.95
-    texture: float = 0.5
+    texture: float = 0.6
     pixels_per_metre: float = 150.0
     gaussians_per_pixel: float = 1.0
 
