@@ -56,7 +56,6 @@ def given(items: int = 2) -> dict[str, torch.Tensor]:
     return {
         "pose": torch.randn(items, 99, generator=generator),
         "root": torch.zeros(items, 3),
-        "pelvis": torch.eye(3).expand(items, -1, -1),
     }
 
 
@@ -103,13 +102,12 @@ def test_chosen_points_have_the_gaussians_and_gradients_they_have_among_all(
     points = points_of(rest)
     p = torch.randn(2, 33, 3, generator=torch.Generator().manual_seed(2))
     eye = torch.tensor([[0.0, 0.0, 5.0]]).expand(2, -1)
-    pelvis = torch.eye(3).expand(2, -1, -1)
     chosen = torch.stack([torch.arange(50, 120), torch.arange(300, 370)])
 
     def gradients(
         among: torch.Tensor | None,
     ) -> tuple[torch.Tensor, list[torch.Tensor]]:
-        made = psi(p, points, eye, pelvis, chosen=among)
+        made = psi(p, points, eye, chosen=among)
         values = torch.cat(
             [made.means, made.features, made.covariances.flatten(2)], dim=-1
         )

@@ -161,7 +161,7 @@ def test_psi_in_training_is_psi(batch, embedding, normals):
     for needed in (False, True):
         facing.requires_grad_(needed)
         psi.zero_grad()
-        made = psi.residuals(points, pose, root, torch.eye(3)[None])
+        made = psi.residuals(points, pose, root)
         (made.features.square().sum() + made.means.sum()).backward()
         slopes = [p.grad for p in psi.parameters() if p.grad is not None]
         found.append([made.features.detach(), *slopes])

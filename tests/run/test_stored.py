@@ -30,7 +30,7 @@ def test_a_config_of_an_earlier_version_names_classes_where_they_are_now(
 
 def write_config(folder, text):
     path = folder / CONFIG
-    path.parent.mkdir()
+    path.parent.mkdir(exist_ok=True)
     path.write_text(text)
 
 
@@ -53,6 +53,17 @@ def test_a_config_of_an_earlier_version_has_the_keys_of_now(tmp_path):
     assert config.fit == {"min_mask": 0.2}
     assert config.model == {"window_minimum": 24}
     assert config.training.rollback == {"max_restorations": 5}
+
+
+def test_a_key_that_is_gone_is_left_out_if_nothing_else_was_possible(tmp_path):
+    text = "data: {{}}\nmodel: {{deformation: {{layers: 2, pose_frame: {}}}}}\n"
+    write_config(tmp_path, text.format("world"))
+    assert read_config(tmp_path).model.deformation == {"layers": 2}
+    write_config(tmp_path, text.format("pelvis"))
+    with pytest.raises(
+        ConfigError, match=r"another model.deformation.pose_frame"
+    ):
+        read_config(tmp_path)
 
 
 def test_a_config_of_now_stays_as_it_is(tmp_path):

@@ -26,9 +26,7 @@ def test_a_vanishing_limb_starts_at_the_least_scale():
     p = DEGENERATE["limb of zero length"].float()
     psi, points = small_psi(*FLOAT32), some_points(*FLOAT32)(p)
     with torch.no_grad():
-        made = psi(
-            p, points, torch.tensor([[0.0, 1, 4]]), torch.eye(3).unsqueeze(0)
-        )
+        made = psi(p, points, torch.tensor([[0.0, 1, 4]]))
     sigma = made.covariances.diagonal(dim1=-2, dim2=-1).sqrt()[..., 0]
     minimum = psi.scale_range[0] * psi.body_height
     torch.testing.assert_close(

@@ -478,9 +478,8 @@ class Avatar(nn.Module):
                 chosen = seen_points(points.means, camera, reach)
             with self.stage("Ψ"):  # Sec. 3.3: Ĝ = G + Ψ(p)
                 face = face_code(p, frames.head, self.template)
-                pelvis = frames.hubs[:, 0]
                 gaussians = self.deformation(
-                    p, points, camera.centre, pelvis, pose_noise, face, chosen
+                    p, points, camera.centre, pose_noise, face, chosen
                 )
         else:
             return None
@@ -516,19 +515,14 @@ class Avatar(nn.Module):
         # G in the pose, from the same frames as the pose code.
         frames = bone_frames(p, valid, self.template)
         points = self.points(p, valid, frames, body)
-        pelvis = frames.hubs[:, 0]
         code = self._code(p, frames)
-        return points, self.deformation.residuals(
-            points, code, root_of(p), pelvis
-        )
+        return points, self.deformation.residuals(points, code, root_of(p))
 
     def _code(self, p: Tensor, frames: BoneFrames) -> Tensor:
         """``[B, 3 J]`` Ψ's code of a pose, without noise."""
         assert self.deformation is not None
         face = face_code(p, frames.head, self.template)
-        return self.deformation.pose_code(
-            p, root_of(p), frames.hubs[:, 0], None, face
-        )
+        return self.deformation.pose_code(p, root_of(p), None, face)
 
     @torch.no_grad()
     def store_poses(
@@ -539,9 +533,8 @@ class Avatar(nn.Module):
             # The means give the places of the anchors in the training poses.
             frames = bone_frames(p, valid, self.template)
             means = self.points(p, valid, frames, body).means
-            pelvis = frames.hubs[:, 0]
             self.deformation.store_poses(
-                self._code(p, frames), means, root_of(p), pelvis
+                self._code(p, frames), means, root_of(p)
             )
 
     def _rasterised(

@@ -69,8 +69,6 @@ class ResidualGaussians(nn.Module):
     Source: paper Sec. 3.3.
     """
 
-    pose_frame = "world"
-
     def __init__(
         self,
         body_height: float,
@@ -117,7 +115,6 @@ class ResidualGaussians(nn.Module):
         points: Points,
         pose: Tensor,
         root: Tensor,
-        pelvis: Tensor,
         chosen: Tensor | None = None,
     ) -> Residuals:
         """ΔG of posed points.
@@ -126,7 +123,6 @@ class ResidualGaussians(nn.Module):
             points: all of them.
             pose: ``[B, 3 J]`` of `pose_code`.
             root: ``[B, 3]`` metres.
-            pelvis: ``[B, 3, 3]`` its axes (columns).
             chosen: ``[B, M]`` numbers of the points whose residuals are returned; None: all.
         """
         raise NotImplementedError
@@ -257,7 +253,6 @@ class ResidualGaussians(nn.Module):
         self,
         p: Tensor,
         root: Tensor,
-        pelvis: Tensor,
         noise: Tensor | None,
         face: Tensor | None = None,
     ) -> Tensor:
@@ -266,15 +261,12 @@ class ResidualGaussians(nn.Module):
         Args:
             p: ``[B, J, 3]`` metres.
             root: ``[B, 3]`` metres.
-            pelvis: ``[B, 3, 3]`` the pelvis frame (columns are its axes).
             noise: ``[B, J, 3]`` in the code's units, or None.
             face: ``[B, E, 3]`` in place of the last E joints, since an expression in body heights
                 would be a hundredth of the code; None: E is 0.
         """
         # Joints are about the root, so that the person's place in the world changes nothing.
         code = (p - root[:, None]) / self.body_height
-        if self.pose_frame == "pelvis":
-            code = code @ pelvis
 
         # Landmarks of the face have a code of their own.
         if face is not None:
@@ -290,7 +282,6 @@ class ResidualGaussians(nn.Module):
         p: Tensor,
         points: Points,
         eye: Tensor,
-        pelvis: Tensor,
         noise: Tensor | None = None,
         face: Tensor | None = None,
         chosen: Tensor | None = None,
@@ -299,8 +290,8 @@ class ResidualGaussians(nn.Module):
         the points ``chosen [B, M]`` alone, if these are given."""
         # The residuals depend on the pose alone, not on the camera.
         root = root_of(p)
-        code = self.pose_code(p, root, pelvis, noise, face)
-        residuals = self.residuals(points, code, root, pelvis, chosen)
+        code = self.pose_code(p, root, noise, face)
+        residuals = self.residuals(points, code, root, chosen)
 
         # Residuals are of the chosen points only, so G must be as well.
         if chosen is not None:
@@ -351,13 +342,11 @@ class Deformation(ResidualGaussians):
         position_octaves: int = 2,
         normals: bool = False,
         free_table: bool = True,
-        pose_frame: str = "world",
         pose_limit: float | None = 2.0,
         anchors: int | None = None,
         **settings: Any,
     ) -> None:
         super().__init__(body_height, **settings)
-        one_of("model.deformation.pose_frame", pose_frame, ("world", "pelvis"))
         between(
             "model.deformation: layers",
             whole("model.deformation: layers", layers, 2),
@@ -373,7 +362,6 @@ class Deformation(ResidualGaussians):
             rest_points = self._place_anchors(rest_points, anchors)
         points = len(rest_points)
         self.position_octaves = position_octaves
-        self.pose_frame = pose_frame
         self.pose_limit = pose_limit
         size = 3 * joints
         shapes = (
@@ -436,11 +424,9 @@ class Deformation(ResidualGaussians):
         self.interpolate = Interpolation()
         return places
 
-    def store_poses(
-        self, codes: Tensor, means: Tensor, root: Tensor, pelvis: Tensor
-    ) -> None:
+    def store_poses(self, codes: Tensor, means: Tensor, root: Tensor) -> None:
         """Stores the spread of the training poses' codes ``[F, 3 J]``, see `_within`, and of the
-        places of their points ``[F, N, 3]``; root and pelvis as for `residuals`."""
+        places of their points ``[F, N, 3]``; root as for `residuals`."""
         # The principal directions of the codes, and the standard deviation along each.
         self.pose_mean.copy_(codes.mean(0))
         _, spread, axes = torch.linalg.svd(
@@ -455,14 +441,13 @@ class Deformation(ResidualGaussians):
         # The places that the MLP is computed at, their mean and standard deviation.
         if self.anchored:
             means = means[:, self.anchors]
-        places = self._places(means, root, pelvis)
+        places = self._places(means, root)
         self.place_mean.copy_(places.mean(0))
         self.place_spread.copy_(places.std(0, correction=0))
 
-    def _places(self, means: Tensor, root: Tensor, pelvis: Tensor) -> Tensor:
+    def _places(self, means: Tensor, root: Tensor) -> Tensor:
         """Means ``[B, N, 3]`` about the root, in body heights."""
-        places = (means - root[:, None]) / self.body_height
-        return places @ pelvis if self.pose_frame == "pelvis" else places
+        return (means - root[:, None]) / self.body_height
 
     def _within(self, code: Tensor, limit: float) -> Tensor:
         """The code nearest to ``[B, 3 J]`` among those that vary as the training poses' do, by
@@ -492,7 +477,6 @@ class Deformation(ResidualGaussians):
         points: Points,
         pose: Tensor,
         root: Tensor,
-        pelvis: Tensor,
         chosen: Tensor | None = None,
     ) -> Residuals:
         """See `ResidualGaussians.residuals`."""
@@ -502,7 +486,7 @@ class Deformation(ResidualGaussians):
         if self.anchored:
             means = means[:, self.anchors]
             normals = normals[:, self.anchors]
-        raw = self._network(means, normals, pose, root, pelvis)
+        raw = self._network(means, normals, pose, root)
 
         # From the anchors to the points, each with residuals of its own.
         if self.anchored:
@@ -535,7 +519,6 @@ class Deformation(ResidualGaussians):
         normals: Tensor,
         pose: Tensor,
         root: Tensor,
-        pelvis: Tensor,
     ) -> Tensor:
         """``[B, A, C]`` the MLP's output at the anchors."""
         # A rendered pose is limited to what the training poses show; training is not.
@@ -544,7 +527,7 @@ class Deformation(ResidualGaussians):
             pose = self._within(pose, limit)
         # Only a skeleton's gradient passes through Ψ's inputs, not one of skinning weights.
         means = means if root.requires_grad else means.detach()
-        position = self._places(means, root, pelvis)
+        position = self._places(means, root)
 
         # The places of the anchors are limited likewise.
         if limit is not None:
@@ -553,9 +536,6 @@ class Deformation(ResidualGaussians):
                 -far, far
             )
 
-        # Normals turn with the axes that places are given in.
-        if self.pose_frame == "pelvis":
-            normals = normals @ pelvis
         code = positional_encoding(position, self.position_octaves)
 
         # In training, the trunk is one operation, if no gradient passes to its inputs.

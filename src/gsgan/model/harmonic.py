@@ -124,10 +124,9 @@ class Harmonic(ResidualGaussians):
         points: Points,
         pose: Tensor,
         root: Tensor,
-        pelvis: Tensor,
         chosen: Tensor | None = None,
     ) -> Residuals:
-        """ΔG of posed points; pose, root and pelvis are not used."""
+        """ΔG of posed points; pose and root are not used."""
         # The part that follows the normals; the first harmonic is 1, and its factor is the
         # constant.
         given = list(self.slopes.values())

@@ -28,6 +28,8 @@ RENAMED_KEYS = {
     "model.window_least": "window_minimum",
     "training.rollback.most": "max_restorations",
 }
+# Keys that configs of runs before 2026-11-28 have, and the only value that there is now.
+REMOVED_KEYS = {"model.deformation.pose_frame": "world"}
 CONFIG = Path(".hydra") / "config.yaml"
 # Keys that may differ between a run and its continuation: they do not change what it learns.
 FREE_KEYS = (
@@ -127,11 +129,22 @@ def read_yaml(path: Path) -> DictConfig:
 
 
 def rename_keys(settings: MutableMapping[str, Any]) -> None:
-    """Gives the keys of a config, or of its `record`, their present names, in place."""
+    """Gives the keys of a config, or of its `record`, their present names, in place.
+
+    Raises:
+        ConfigError: when a key that is gone had another value than the code has now.
+    """
     for before, now in RENAMED_KEYS.items():
         group, last = _group(settings, before)
         if last in group:
             group[now] = group.pop(last)
+    for key, value in REMOVED_KEYS.items():
+        group, last = _group(settings, key)
+        if group.pop(last, value) != value:
+            raise ConfigError(
+                f"the run was trained with another {key} than {value}, which this version "
+                "of gsgan does not have; use the version that it was trained with"
+            )
 
 
 def _group(

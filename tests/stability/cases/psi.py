@@ -238,6 +238,5 @@ def _step_zero(
     p = inputs["p"]
     points = some_points(p.dtype, p.device)(p)
     camera = Camera(inputs["K"], inputs["R"], inputs["t"], size)
-    pelvis = torch.eye(3, dtype=p.dtype, device=p.device).unsqueeze(0)
-    gaussians = small_psi(p.dtype, p.device)(p, points, camera.centre, pelvis)
+    gaussians = small_psi(p.dtype, p.device)(p, points, camera.centre)
     return rendered(gaussians, inputs, backend, size, settings)
