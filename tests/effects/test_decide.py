@@ -337,6 +337,23 @@ def test_a_generator_is_kept_or_left_out_on_request():
     assert not decide(scene(), settings).generator.on
 
 
+def test_scores_say_that_a_generator_was_left_out_which_the_model_has():
+    dense = ModelParts(gaussians=3.2)
+    found = decide(scene(**ON_BODY), EffectSettings(), dense)
+    (mark,) = found.marks
+    assert mark.startswith("without the model's generator: ")
+    assert "3.2 Gaussians per pixel" in mark
+    (mark,) = decide(scene(), EffectSettings(generator="off")).marks
+    assert mark.endswith("set in the config")
+    assert not decide(scene(), EffectSettings(generator="on")).marks
+    # splat_only has none, which its name says.
+    for requested in ("auto", "on", "off"):
+        settings = EffectSettings(generator=requested)
+        without = ModelParts(generator=False)
+        assert not decide(scene(), settings, without).marks
+    assert not Effects().marks
+
+
 def test_a_run_is_not_resumed_with_other_effects():
     before, now = (
         decide(scene(), EffectSettings()),

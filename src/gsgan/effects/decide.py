@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from gsgan.effects.record import OFF, Effect, Effects
+from gsgan.effects.record import LEFT_OUT, OFF, Effect, Effects
 from gsgan.utils.checks import is_number, one_of
 from gsgan.utils.errors import ConfigError
 
@@ -189,15 +189,15 @@ def _one(
     model: ModelParts,
     body_points: Effect | None = None,
 ) -> Effect:
+    # Whether to have a generator at all is the model's choice.
+    if name == "generator" and not model.generator:
+        return Effect(OFF, LEFT_OUT)
+
     # Off by request.
     requested = settings.requested(name)
     off: str | int = 0 if name == "view_dependence" else OFF
     if requested in (OFF, 0):
         return Effect(off, FORCED)
-
-    # Whether to have a generator at all is the model's choice.
-    if name == "generator" and not model.generator:
-        return Effect(OFF, "the model leaves it out")
 
     # Not possible in this scene or model. Lenses that cannot be rendered are undistorted.
     reason = _impossible(name, info, requested) or model.lacks(name)

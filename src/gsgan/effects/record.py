@@ -11,6 +11,7 @@ from rich.table import Table
 from gsgan.utils.errors import ConfigError
 
 OFF = "off"
+LEFT_OUT = "the model leaves it out"  # why an effect is off
 HEADERS = ("effect", "", "why")
 
 
@@ -74,6 +75,13 @@ class Effects:
     def degree(self) -> int:
         """Degree of the spherical harmonics."""
         return int(self.view_dependence.value)
+
+    @property
+    def marks(self) -> list[str]:
+        """Notes that scores must carry, since the model's name says otherwise."""
+        if self.generator.on or self.generator.why == LEFT_OUT:
+            return []
+        return [f"without the model's generator: {self.generator.why}"]
 
     def rows(self) -> list[tuple[str, str, str]]:
         """One row per effect: name, value, why."""

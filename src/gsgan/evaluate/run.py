@@ -331,7 +331,7 @@ def evaluate_folder(
         predict=painter(avatar.to(device), solve=solve, colours=not other),
         method=method,
         device=device,
-        marks=marks,
+        marks=[*marks, *avatar.effects.marks],
         poses=avatar.poses,
         beside=folder if other else None,
     )

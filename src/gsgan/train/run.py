@@ -402,7 +402,7 @@ def _evaluate(
         predict=painter(avatar),
         method=method,
         device=device,
-        marks=module.marks,
+        marks=[*module.marks, *avatar.effects.marks],
         poses=avatar.poses,
     )
 
