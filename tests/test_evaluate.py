@@ -63,6 +63,21 @@ def painted(
     return root
 
 
+def test_a_trained_avatar_is_loaded_without_measuring_the_scene_again(
+    run, monkeypatch
+):
+    """It would read images of every camera, which takes a minute of a long capture."""
+    from gsgan.run.assemble import build_data
+    from gsgan.run.runs import load_avatar
+    from gsgan.run.stored import load_config
+
+    config = load_config(run)
+    data = build_data(config)
+    monkeypatch.setattr("gsgan.data.datamodule.scene_info", None)
+    avatar, _ = load_avatar(run, config, data)
+    assert avatar.poses is not None
+
+
 @pytest.fixture
 def copy(painted: Path, tmp_path: Path) -> Path:
     return shutil.copytree(painted, tmp_path / "mine" / "other")

@@ -58,7 +58,7 @@ from gsgan.run.stored import (
 from gsgan.skeleton.training_poses import TrainingPoses
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import whole
-from gsgan.utils.console import make_console, track
+from gsgan.utils.console import make_console, track, working
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.files import write_atomically
 from gsgan.utils.tensors import pick_device
@@ -293,15 +293,19 @@ def evaluate_folder(
     other = config.get("other_capture") is not None
     out = folder
     if other:
-        avatar = avatar_of(folder, stored, checkpoint, config.data_smpl)
-        data = build_data(other_capture(stored, config.other_capture))
+        with working(console, "building the avatar"):
+            avatar = avatar_of(folder, stored, checkpoint, config.data_smpl)
+        with working(console, "reading the data"):
+            data = build_data(other_capture(stored, config.other_capture))
         name = Path(data.layout.root).resolve().name
         out = folder / "on" / name
         marks = [*state["marks"], f"on another capture: {name}", BY_SKELETON]
     else:
         stored = load_config(folder, DataPaths.from_config(config))
-        data = build_data(stored)
-        avatar, marks = load_avatar(folder, stored, data)
+        with working(console, "reading the data"):
+            data = build_data(stored)
+        with working(console, "building the avatar"):
+            avatar, marks = load_avatar(folder, stored, data)
 
     # Scores of other settings have folders of their own, so that the protocol's scores stay.
     if config.background not in (None, _measures(data).background):
@@ -380,7 +384,8 @@ def evaluate_predictions(
     name = config.method or root.resolve().name
 
     # The data, and a folder for the results that holds no others.
-    data = build_data(config)
+    with working(console, "reading the data"):
+        data = build_data(config)
     out = _out(config, root.resolve(), name)
 
     # The images must have the size of the ground truth.

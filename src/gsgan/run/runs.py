@@ -98,11 +98,11 @@ def load_avatar(
     """
     # Facts that depend on where the data is now replace the stored ones.
     checkpoint = read_checkpoint(folder / CHECKPOINT)
-    info = data.info
+    body = data.layout.meta.body
     scene = replace(
         stored_scene(checkpoint["gsgan"]["scene"]),
-        body_file=info.body_file,
-        camera_names=info.camera_names,
+        body_file=None if body is None else body.file,
+        camera_names=data.layout.camera_names,
     )
     marks = list(checkpoint["gsgan"]["marks"])
     return _trained(folder, config, checkpoint, scene), marks
