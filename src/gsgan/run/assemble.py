@@ -19,7 +19,7 @@ from gsgan.body.skinned import MarkedBody
 from gsgan.body.solve import Solver
 from gsgan.data.scene_info import SceneInfo
 from gsgan.effects import Effects, EffectSettings, ModelParts, decide
-from gsgan.effects.record import OFF
+from gsgan.effects.record import LEFT_OUT, OFF
 from gsgan.model.avatar import Avatar
 from gsgan.model.body_points import (
     AUTO,
@@ -119,10 +119,7 @@ def build_avatar(
             )
 
         # S needs the body with a label per vertex.
-        labelled: tuple[SkinnedBody | None, str] = (
-            None,
-            "the model leaves it out",
-        )
+        labelled: tuple[SkinnedBody | None, str] = (None, LEFT_OUT)
         if parts.segmentation is not None:
             labelled = labelled_body(scene, images, vertex_labels)
         return _assembled(parts, scene, effects, labelled, config.seed)

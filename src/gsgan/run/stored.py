@@ -129,15 +129,18 @@ def read_yaml(path: Path) -> DictConfig:
 
 
 def rename_keys(settings: MutableMapping[str, Any]) -> None:
-    """Gives the keys of a config, or of its `record`, their present names, in place.
+    """Gives a config, or its `record`, the keys of now, in place.
 
     Raises:
         ConfigError: when a key that is gone had another value than the code has now.
     """
+    # Keys with another name now.
     for before, now in RENAMED_KEYS.items():
         group, last = _group(settings, before)
         if last in group:
             group[now] = group.pop(last)
+
+    # Keys that are gone.
     for key, value in REMOVED_KEYS.items():
         group, last = _group(settings, key)
         if group.pop(last, value) != value:
