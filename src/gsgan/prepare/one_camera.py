@@ -26,6 +26,7 @@ from gsgan.prepare.frames import (
     look,
     sample,
 )
+from gsgan.prepare.lifter import with_lifter
 from gsgan.prepare.mediapipe import find_people
 from gsgan.prepare.one_view import (
     FOOT_JOINTS,
@@ -54,7 +55,6 @@ from gsgan.skeleton.joints import (
     WRIST_JOINTS,
 )
 from gsgan.utils.arrays import Bool, Float, Ints, expect_array, nanmedian
-from gsgan.utils.errors import DataError
 from gsgan.utils.pickles import read_arrays
 
 # Apple's phones state the focal length here, in millimetres; not the recorded part of the image.
@@ -89,7 +89,7 @@ class Filmed:
 
 @dataclass(frozen=True)
 class Detected:
-    """Detections of the landmark tool in F frames: pixels, confidence, its own guesses in depth."""
+    """Detections in F frames: pixels, confidence, and a detector's own guesses of depth or NaN."""
 
     px: Float  # [F, 105, 2]
     conf: Float  # [F, 105]
@@ -113,7 +113,7 @@ def solve_video(
     """Camera, joints and masks of the video ``options.source``.
 
     Raises:
-        DataError: when too few frames show one whole person, or landmarks have no depth.
+        DataError: when too few frames show one whole person.
     """
     # Images of the video, and the detections in them.
     video = options.folder("source")
@@ -216,11 +216,6 @@ def _read(
         "faces": (),
     }
     arrays = {} if path.is_dir() else read_arrays(path, depth)
-    if "world" not in arrays:
-        raise DataError(
-            f"{path}: one camera needs the array world (F,33,3) of MediaPipe's world landmarks; "
-            "give landmarks=mediapipe, or videos of two calibrated cameras"
-        )
     F = len(found.frame_id)
     sizes = np.array([size[::-1]])
     px, conf = landmarks.inside(found.px[None], found.conf[None], sizes)
@@ -237,14 +232,11 @@ def _read(
         values = expect_array(arrays, name, shape, path)
         return np.asarray(values, np.float64)[order][at]
 
-    # Frames without depth are not used.
-    world = depths("world", np.nan)
-    known = there & np.isfinite(world).all((1, 2))
     hand_z = [depths("left_z", np.nan), depths("right_z", np.nan)]
     detected = Detected(
         px=px[0, at],
-        conf=conf[0, at] * known[:, None],
-        world=np.nan_to_num(world),
+        conf=conf[0, at] * there[:, None],
+        world=depths("world", np.nan),
         hand_z=np.concatenate(hand_z, axis=1),
         faces=depths("faces", 1.0).astype(np.int64),
     )
@@ -294,10 +286,12 @@ def _solve(
     # Offsets from the principal point, which is in the middle of the image.
     middle = np.array(size[::-1]) / 2
     u = np.nan_to_num(px - middle) / guess
+    offsets = torch.from_numpy(u)
+    weight = torch.from_numpy(conf)
     given = Seen(
-        u=torch.from_numpy(u),
-        weight=torch.from_numpy(conf),
-        world=torch.from_numpy(world),
+        u=offsets,
+        weight=weight,
+        world=with_lifter(torch.from_numpy(world), offsets, weight),
         time=torch.from_numpy(time),
     )
     return solve_view(

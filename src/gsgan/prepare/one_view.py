@@ -37,11 +37,12 @@ import torch
 from scipy.linalg import solveh_banded
 from torch import Tensor
 
-from gsgan.body.lbs import axis_angle_to_matrix, shortest_turn
+from gsgan.body.lbs import axis_angle_to_matrix
 from gsgan.body.rig import ancestors
 from gsgan.body.shape import BodyShape, free_space
 from gsgan.body.solve import FLOOR, Solver, below_minimum
 from gsgan.fit.shape import shape_of, shape_prior, without_surface
+from gsgan.prepare.lifter import diagonal, ray_rotation
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.utils.arrays import Float, evenly_spaced
 
@@ -100,7 +101,8 @@ class Seen:
     # [F, 33, 2] offsets from the principal point over the guessed focal length
     u: Tensor
     weight: Tensor  # [F, 33] confidence, 0 = not seen
-    # [F, 33, 3] the detector's own 3D landmarks, metres from the middle of the hips
+    # [F, 33, 3] landmarks in 3D by a detector, the lifter or both, metres from the middle of the
+    # hips, as a camera sees them that looks at the person
     world: Tensor
     time: Tensor  # [F] seconds, increasing
 
@@ -115,10 +117,7 @@ class Seen:
     @property
     def size(self) -> Tensor:
         """``[F]`` the person's size in the image: the diagonal of the landmarks' box."""
-        visible = self.weight[..., None] > 0
-        lower = torch.where(visible, self.u, 9e9).amin(1)
-        upper = torch.where(visible, self.u, -9e9).amax(1)
-        return (upper - lower).norm(dim=-1)
+        return diagonal(self.u, self.weight)
 
 
 @dataclass(frozen=True)
@@ -320,13 +319,7 @@ class Problem:
 
         # The detector assumes that the person is in the middle of the image: its landmarks are
         # turned to the direction in which the camera sees the person.
-        w = seen.weight.unsqueeze(-1)
-        total = (w * seen.u.nan_to_num()).sum(1)
-        middle = total / w.sum(1).clamp_min(1e-9)
-        rays = torch.cat([middle, torch.ones_like(middle[:, :1])], dim=1)
-        rays = rays / rays.norm(dim=1, keepdim=True)
-        forward = rays.new_tensor([0.0, 0, 1]).expand_as(rays)
-        R = axis_angle_to_matrix(shortest_turn(forward, rays)).unsqueeze(1)
+        R = ray_rotation(seen.u, seen.weight).unsqueeze(1)
         self.world = (R @ seen.world.unsqueeze(-1))[..., 0]
 
     def solver(self, shared: Tensor) -> Solver:
