@@ -204,6 +204,22 @@ def test_a_generator_of_patches(times):
         generator(patch=3)
 
 
+def test_a_refinement_ends_a_generator_of_patches():
+    """It starts at Step I's image, paints any size, and all of it learns."""
+    F, S, p2d, g = inputs(21, 13)
+    alpha = torch.rand(2, 1, 21, 13)
+    net = Generator(5, 4, 8, 35, base=4, patch=2, refine=True, rgb_skip=True)
+    first = torch.cat([F[:, :3], alpha], dim=1)
+    torch.testing.assert_close(net(F, S, p2d, g, alpha=alpha), first)
+
+    torch.nn.init.normal_(net.paint.weight, std=0.1)
+    painted = net(F, S, p2d, g, alpha=alpha)
+    assert painted.shape == first.shape
+    painted.square().sum().backward()
+    for parameter in net.refinement.parameters():
+        assert bool(parameter.grad.abs().sum() > 0)
+
+
 @pytest.mark.parametrize("skip", [False, True])
 def test_the_image_has_all_its_digits_under_bf16(skip):
     """The last layer in bfloat16 would round the image to 8 bits of mantissa."""

@@ -157,6 +157,24 @@ class DecoderLevel(nn.Module):
         return upsampled + functional.conv2d(skip, lower, bias, padding=1)
 
 
+class Refinement(nn.Module):
+    """From pixels of patches to those of the image, with half of the channels."""
+
+    def __init__(self, channels: int, patch: int) -> None:
+        super().__init__()
+        self.patch = patch
+        self.channels = channels // 2
+        self.spread = nn.Conv2d(
+            channels, self.channels * patch**2, 3, padding=1
+        )
+        self.conv = nn.Conv2d(self.channels, self.channels, 3, padding=1)
+
+    def forward(self, h: Tensor) -> Tensor:
+        """``[B, C, h, w]`` to ``[B, C / 2, patch h, patch w]``."""
+        fine = functional.pixel_shuffle(self.spread(h), self.patch)
+        return _activate(self.conv(_activate(fine)))
+
+
 class Generator(nn.Module):
     """F ⊕ S ⊕ p₂D and g to the image and its alpha.
 
@@ -171,6 +189,7 @@ class Generator(nn.Module):
         multipliers: channels of each level in units of ``base``; each level halves the resolution.
         patch: a power of 2: one pixel of the finest level covers patch × patch pixels, which are
             its channels. The first levels of ``multipliers`` are then left out.
+        refine: with a patch, a last level of convolutions at the image's resolution.
         feature_bound: of the Gaussians' features, which `Avatar` clamps: that is cheaper than
             clamping images of them.
 
@@ -192,6 +211,7 @@ class Generator(nn.Module):
         base: int = 32,
         multipliers: Sequence[int] = (1, 2, 4, 8, 8),
         patch: int = 1,
+        refine: bool = False,
         style_share: float = 0.5,
         rgb_skip: bool = False,
         feature_bound: float = 1e3,
@@ -238,8 +258,14 @@ class Generator(nn.Module):
             for i in reversed(range(len(channels) - 1))
         )
 
-        # The last layer paints RGB and alpha for every pixel of a patch.
-        self.paint = nn.Conv2d(channels[0], 4 * patch**2, 3, padding=1)
+        # The last layer paints RGB and alpha, without a refinement for every pixel of a patch.
+        self.refinement = Refinement(channels[0], patch) if refine else None
+        painted = 4 * patch**2
+        width = channels[0]
+        if self.refinement is not None:
+            painted = 4
+            width = self.refinement.channels
+        self.paint = nn.Conv2d(width, painted, 3, padding=1)
         if rgb_skip:
             start_at_zero(self.paint)
 
@@ -287,13 +313,15 @@ class Generator(nn.Module):
             h = style(conv(h), styles[-1], g)
         for i, level in enumerate(self.up):
             h = level(h, skips[-2 - i], styles[-2 - i], g)
+        if self.refinement is not None:
+            h = self.refinement(h)
         with full_precision(h.device):  # bf16 would round the image to 8 bits
             painted = self.paint(h.to(self.paint.weight.dtype))
 
-        # Pixels of a patch are its channels; the padding is cut off.
-        painted = functional.pixel_shuffle(painted, self.patch)[
-            ..., :height, :width
-        ]
+        # Without a refinement, pixels of a patch are its channels; the padding is cut off.
+        if self.refinement is None:
+            painted = functional.pixel_shuffle(painted, self.patch)
+        painted = painted[..., :height, :width]
 
         # The painted image is a correction of Step I's colour and alpha.
         if self.rgb_skip:
