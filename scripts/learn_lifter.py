@@ -27,7 +27,7 @@ from gsgan.body.lbs import axis_angle_to_matrix
 from gsgan.body.shape import BodyShape, free_space
 from gsgan.body.solve import Solver
 from gsgan.fit.shape import without_surface
-from gsgan.prepare.lifter import HIPS, WEIGHTS, Lifter, ray_rotation
+from gsgan.prepare.lifter import HIP_JOINTS, WEIGHTS, Lifter, ray_rotation
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.skeleton.joints import BODY
 from gsgan.synthetic.free_subject import free_character, free_pose
@@ -69,7 +69,7 @@ def read_clip(path: Path, solver: Solver) -> Clip:
 
     # The numbers of the poses, from their landmarks about the hips.
     p = free_body().posed_landmarks(pose)[:, :BODY].double()
-    p = p - p[:, HIPS].mean(1, keepdim=True)
+    p = p - p[:, HIP_JOINTS].mean(1, keepdim=True)
     weight = solver.weights(torch.ones(p.shape[:2], dtype=torch.bool))
     q, root = solver.descend(*solver.guess(p), p, weight)
     return Clip(q.float(), root.float())
@@ -160,7 +160,7 @@ class Poses:
         transforms = self.solver.transforms(*flat, joints)
         p = self.solver.points(transforms, landmarks)
         p = p.unflatten(0, (BATCH, WINDOW))
-        return p - p[:, :, HIPS].mean(2, keepdim=True)
+        return p - p[:, :, HIP_JOINTS].mean(2, keepdim=True)
 
 
 class Sample(NamedTuple):

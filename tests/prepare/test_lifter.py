@@ -10,7 +10,7 @@ import torch
 from one_person import turning, world_landmarks
 
 from gsgan.body.lbs import axis_angle_to_matrix
-from gsgan.prepare.lifter import HIPS, Lifter, ray_rotation, with_lifter
+from gsgan.prepare.lifter import HIP_JOINTS, Lifter, ray_rotation, with_lifter
 
 FRAMES = 60
 SCRIPT = Path(__file__).parents[2] / "scripts" / "learn_lifter.py"
@@ -31,7 +31,7 @@ def lifted(u, weight):
 
 def error(found, truth, u, weight):
     """Median distance in metres, after the best scale of all frames."""
-    own = truth - truth[:, HIPS].mean(1, keepdim=True)
+    own = truth - truth[:, HIP_JOINTS].mean(1, keepdim=True)
     own = own @ ray_rotation(u, weight)
     scale = (found * own).sum() / found.square().sum()
     return float((scale * found - own).norm(dim=-1).median())
@@ -45,7 +45,7 @@ def test_a_turning_person_is_lifted():
 def test_the_mean_with_a_detectors_guess_is_better_than_either():
     truth, u, weight = seen()
     world = torch.from_numpy(world_landmarks(truth.numpy()))
-    own = world - world[:, HIPS].mean(1, keepdim=True)
+    own = world - world[:, HIP_JOINTS].mean(1, keepdim=True)
     both = with_lifter(world, u, weight)
     turned = own @ ray_rotation(u, weight)  # the detector's axes are the ray's
     alone = error(lifted(u, weight), truth, u, weight)

@@ -22,7 +22,7 @@ WEIGHTS = Path(__file__).with_name("lifter.npz")
 CHANNELS = 192
 # Frames between the three that a block reads; an output depends on 14 frames before and after it.
 DILATIONS = (1, 2, 4, 1, 2, 4)
-HIPS = list(MEDIAPIPE33.hips)
+HIP_JOINTS = list(MEDIAPIPE33.hips)
 # What stands in for landmarks that a detector's set lacks, such as OpenPose's: eyes for their
 # corners, the nose for the mouth, wrists for fingers.
 STAND_INS = {
@@ -143,8 +143,8 @@ def with_lifter(world: Tensor, u: Tensor, weight: Tensor) -> Tensor:
     lifted = found.clone().to(world)
 
     # Both from the middle of the hips; the detector's are scaled to the lifter's.
-    lifted = lifted - lifted[:, HIPS].mean(1, keepdim=True)
-    own = world - world[:, HIPS].mean(1, keepdim=True)
+    lifted = lifted - lifted[:, HIP_JOINTS].mean(1, keepdim=True)
+    own = world - world[:, HIP_JOINTS].mean(1, keepdim=True)
     w = weight.unsqueeze(-1)
     scale = (w * own * lifted).nansum() / (w * own.square()).nansum()
     return torch.where(own.isfinite(), (scale * own + lifted) / 2, lifted)

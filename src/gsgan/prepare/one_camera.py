@@ -26,11 +26,10 @@ from gsgan.prepare.frames import (
     look,
     sample,
 )
-from gsgan.prepare.lifter import with_lifter
+from gsgan.prepare.lifter import HIP_JOINTS, with_lifter
 from gsgan.prepare.mediapipe import find_people
 from gsgan.prepare.one_view import (
     FOOT_JOINTS,
-    HIP_JOINTS,
     USUAL_HEIGHT,
     Seen,
     View,

@@ -42,7 +42,7 @@ from gsgan.body.rig import ancestors
 from gsgan.body.shape import BodyShape, free_space
 from gsgan.body.solve import FLOOR, Solver, below_minimum
 from gsgan.fit.shape import shape_of, shape_prior, without_surface
-from gsgan.prepare.lifter import diagonal, ray_rotation
+from gsgan.prepare.lifter import HIP_JOINTS, diagonal, ray_rotation
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.utils.arrays import Float, evenly_spaced
 
@@ -90,7 +90,6 @@ LIMB = re.compile(r"arm_|elbow$|thigh_|knee$")
 GROUP_SIZES = torch.tensor([2] * 33 + [3] * 33 + [1] * 4 + [2])
 RESIDUAL_GROUPS = torch.arange(len(GROUP_SIZES)).repeat_interleave(GROUP_SIZES)
 PLANE = 3  # numbers of the ground, the first of `State.shared`
-HIP_JOINTS = list(MEDIAPIPE33.hips)
 TRUNK_JOINTS = list(MEDIAPIPE33.torso)
 
 
