@@ -79,7 +79,7 @@ class Poses:
     """Random motions of random bodies.
 
     Args:
-        clips: with at least two frames.
+        clips: with more than `WINDOW` frames.
         solver: of the free body.
         rng: draws everything but what torch draws.
     """
@@ -156,8 +156,10 @@ class Poses:
 
         # The landmarks of one of the bodies.
         joints, landmarks = self.bodies[self.rng.integers(BODIES)]
-        flat = numbers.flatten(0, 1), torch.stack(root).flatten(0, 1)
-        transforms = self.solver.transforms(*flat, joints)
+        rotations = torch.stack(root).flatten(0, 1)
+        transforms = self.solver.transforms(
+            numbers.flatten(0, 1), rotations, joints
+        )
         p = self.solver.points(transforms, landmarks)
         p = p.unflatten(0, (BATCH, WINDOW))
         return p - p[:, :, HIP_JOINTS].mean(2, keepdim=True)
@@ -181,7 +183,7 @@ def filmed(p: Tensor) -> Sample:
     """A motion as a random phone sees it."""
     B, W = p.shape[:2]
 
-    # The person faces anywhere, and turns in most samples by up to about a whole turn.
+    # The person faces anywhere, and turns in most samples, by half a turn (standard deviation).
     turn = torch.randn(B, 1) * math.pi * (torch.rand(B, 1) < 0.6)
     facing = 2 * math.pi * torch.rand(B, 1) + turn * torch.linspace(0, 1, W)
 
@@ -197,7 +199,7 @@ def filmed(p: Tensor) -> Sample:
     swap = torch.rand(B, 1, 1, 1) < 0.5
     seen = torch.where(swap, mirrored, seen)
 
-    # 2 to 6 metres away, not always in the middle; the focal length is 12 % off.
+    # 2 to 6 metres away, not always in the middle; the focal length is 12 % off (standard deviation).
     place = torch.rand(B, 1, 1, 3) * torch.tensor([0.8, 0.6, 4.0])
     place = place + torch.tensor([-0.4, -0.3, 2.0])
     in_camera = seen + place
@@ -249,7 +251,7 @@ def main() -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("clips", type=Path, nargs="*")
-    parser.add_argument("--steps", type=int, default=12000)
+    parser.add_argument("--steps", type=int, default=8000)
     parser.add_argument("--out", type=Path, default=WEIGHTS)
     given = parser.parse_args()
 

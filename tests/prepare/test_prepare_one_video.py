@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import shutil
 import struct
 import sys
 from types import SimpleNamespace
@@ -98,8 +99,6 @@ def test_a_video_becomes_a_capture_that_training_reads(filmed, tmp_path):
 
 def spoiled(filmed, tmp_path, change):
     """The film with changed landmarks."""
-    import shutil
-
     folder = shutil.copytree(filmed.parent, tmp_path / "film")
     arrays = dict(np.load(folder / "landmarks/me.npz"))
     change(arrays)
@@ -111,17 +110,38 @@ def nobody(arrays):
     arrays["conf"][:] = 0
 
 
-def as_openpose(arrays):
-    """Without depth, and without joints that BODY_25 lacks."""
-    del arrays["world"]
-    arrays["conf"][:, [1, 3, 4, 6, 9, 10, *range(17, 23)]] = 0
+# OpenPose's BODY_25, by the numbers of MediaPipe's landmarks; neck and middle of the hips are
+# between two, and the small toes, which MediaPipe lacks, are not found.
+BODY_25 = [
+    *[(0,), (11, 12), (12,), (14,), (16,), (11,), (13,), (15,), (23, 24)],
+    *[(24,), (26,), (28,), (23,), (25,), (27,), (5,), (2,), (8,), (7,)],
+    *[(31,), None, (29,), (32,), None, (30,)],
+]
 
 
-def test_landmarks_without_depth_are_lifted(filmed, tmp_path):
-    """As those of OpenPose: the lifter alone gives depth."""
-    out = prepare(
-        options(spoiled(filmed, tmp_path, as_openpose)), Console(quiet=True)
-    )
+def write_openpose(folder):
+    """The film's landmarks as OpenPose's files, one per frame."""
+    pixels = np.load(folder / "landmarks/me.npz")["px"] - 0.5
+    out = folder / "openpose/me_json"
+    out.mkdir(parents=True)
+    for f, px in enumerate(pixels):
+        keypoints = []
+        for landmarks in BODY_25:
+            if landmarks is None:
+                keypoints += [0, 0, 0]
+            else:
+                keypoints += [*px[list(landmarks)].mean(0).tolist(), 0.9]
+        people = [{"pose_keypoints_2d": keypoints}]
+        text = json.dumps({"version": 1.3, "people": people})
+        (out / f"me_{f:012d}_keypoints.json").write_text(text)
+    return out.parent
+
+
+def test_openposes_landmarks_are_lifted(filmed, tmp_path):
+    """They have no depth: the lifter alone gives it."""
+    folder = shutil.copytree(filmed.parent, tmp_path / "film")
+    given = options(folder / "me.avi", landmarks=str(write_openpose(folder)))
+    out = prepare(given, Console(quiet=True))
     found = np.load(out / "landmarks3d.npz")
     p, truth = found["p"], turning(18)[found["frame_id"]]
     assert len(p) >= 16

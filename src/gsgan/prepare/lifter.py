@@ -1,8 +1,8 @@
 """The lifter: landmarks of one camera over time to places in three dimensions.
 
-A small network over frames that has seen motion capture through random phones
-(scripts/learn_lifter.py). A detector guesses depth from what it sees in one image; the lifter from
-how landmarks move and how bodies do. Their errors differ, so their mean is better than either
+A small network over frames, trained on motion capture projected into random phones
+(scripts/learn_lifter.py). A detector estimates depth from one image, the lifter from how landmarks
+move. Their errors differ: on four real videos their mean was better than either
 (docs/results/one_camera.md).
 """
 
@@ -130,7 +130,7 @@ def with_lifter(world: Tensor, u: Tensor, weight: Tensor) -> Tensor:
             lifter's alone.
         u, weight: as for `Lifter.forward`, without a batch.
     """
-    # Landmarks that no frame has; the lifter has always seen most of them.
+    # Landmarks that no frame has are replaced: nearly all were given in the lifter's training.
     read = list(range(BODY))
     for stand_in, landmarks in STAND_INS.items():
         for landmark in landmarks:

@@ -206,7 +206,7 @@ def _read(
     path: Path, numbers: Ints, size: tuple[int, int]
 ) -> tuple[Detected, Bool]:
     """Detections at these frame numbers ``[F]``, and which of the frames have any."""
-    # The arrays of depth, which only MediaPipe's files have.
+    # The arrays of depth, which only MediaPipe's files have; their rows are in the file's order.
     found = landmarks.read_detections(path)
     depth = {
         "world": (BODY, 3),
@@ -214,21 +214,23 @@ def _read(
         "right_z": (HAND,),
         "faces": (),
     }
-    arrays = {} if path.is_dir() else read_arrays(path, depth)
+    arrays = {}
+    if not path.is_dir():
+        arrays = read_arrays(path, ("frame_id", *depth))
     F = len(found.frame_id)
     sizes = np.array([size[::-1]])
     px, conf = landmarks.inside(found.px[None], found.conf[None], sizes)
 
-    # Rows of the file are in its own order, those of `found` by frame number.
+    # Rows of `found` are by frame number.
     at = np.searchsorted(found.frame_id, numbers).clip(max=F - 1)
     there = found.frame_id[at] == numbers
-    order = np.argsort(read_arrays(path, ("frame_id",))["frame_id"])
 
     def depths(name: str, default: float) -> Float:
         shape = (F, *depth[name])
         if name not in arrays:
             return np.full((len(at), *depth[name]), default)
         values = expect_array(arrays, name, shape, path)
+        order = np.argsort(arrays["frame_id"])
         return np.asarray(values, np.float64)[order][at]
 
     hand_z = [depths("left_z", np.nan), depths("right_z", np.nan)]

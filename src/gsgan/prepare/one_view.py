@@ -51,7 +51,7 @@ FOCAL_SPREAD = 0.12  # standard deviation of the guess's logarithm
 FIRST_NOISE = (
     0.01  # of landmarks in the first steps, share of the person's size
 )
-# Standard deviation in metres of the detector's own 3D landmarks, given 2D landmarks with that
+# Standard deviation in metres of the given 3D landmarks, where 2D landmarks have that
 # noise; more accurate 2D landmarks constrain depth more, so the 3D ones get less weight.
 WORLD_SPREAD = 0.08
 ACCELERATION = 8.0  # standard deviation, metres per square second
@@ -332,7 +332,7 @@ class Problem:
         return solver
 
     def start(self) -> State:
-        """The detector's own 3D landmarks, placed to fit those in 2D best, and a usual shape."""
+        """The given 3D landmarks, placed to fit those in 2D best, and a usual shape."""
         shared = torch.zeros_like(self.prior)
         solver = self.solver(shared)
         u = self.seen.u.nan_to_num() / self.zoom
@@ -382,7 +382,7 @@ class Problem:
             ground: ``[3]`` of the plane.
             u, world, noise: of the frame, ``[33, 2]``, ``[33, 3]``, ``[1]``.
         """
-        # Differences from the landmarks in the image and from the detector's own 3D landmarks.
+        # Differences from the landmarks in the image and from those in 3D.
         a, b, c = ground
         projected = self.zoom * x[:, :2] / x[:, 2:].clamp_min(MIN_DEPTH)
         from_hips = x - x[HIP_JOINTS].mean(0) - world
@@ -409,7 +409,7 @@ class Problem:
         seen = self.seen
         F = len(X)
 
-        # The detector's own 3D landmarks have an arbitrary scale: the best one is used.
+        # The given 3D landmarks have an arbitrary scale: the best one is used.
         from_hips = X - X[:, HIP_JOINTS].mean(1, keepdim=True)
         w = seen.weight.unsqueeze(-1)
         own_size = (w * from_hips.square()).sum()
