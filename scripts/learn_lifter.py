@@ -199,7 +199,7 @@ def filmed(p: Tensor) -> Sample:
     swap = torch.rand(B, 1, 1, 1) < 0.5
     seen = torch.where(swap, mirrored, seen)
 
-    # 2 to 6 metres away, not always in the middle; the focal length is 12 % off (standard deviation).
+    # 2 to 6 metres away, not always in the middle; the focal length has a deviation of 12 %.
     place = torch.rand(B, 1, 1, 3) * torch.tensor([0.8, 0.6, 4.0])
     place = place + torch.tensor([-0.4, -0.3, 2.0])
     in_camera = seen + place
