@@ -93,12 +93,14 @@ def test_each_point_has_residuals_of_its_own():
     torch.testing.assert_close(found.sh, expected.sh)
 
 
-@pytest.mark.parametrize("anchors", [None, 100])
+@pytest.mark.parametrize(
+    ("anchors", "light"), [(None, False), (100, False), (100, True)]
+)
 def test_chosen_points_have_the_gaussians_and_gradients_they_have_among_all(
-    anchors,
+    anchors, light
 ):
     rest = sphere(400)
-    psi = network(rest, anchors=anchors).train()
+    psi = network(rest, anchors=anchors, light=light).train()
     points = points_of(rest)
     p = torch.randn(2, 33, 3, generator=torch.Generator().manual_seed(2))
     eye = torch.tensor([[0.0, 0.0, 5.0]]).expand(2, -1)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsgan.splat.sh import sh_basis, sh_to_colour
+from gsgan.splat.sh import brightened, sh_basis, sh_to_colour
 
 
 def sphere(n: int = 24) -> tuple[torch.Tensor, torch.Tensor]:
@@ -100,3 +100,15 @@ def test_wrong_shapes_and_degrees_are_refused():
         sh_to_colour(torch.zeros(1, 2, 25, 3), torch.zeros(1, 2, 3))
     with pytest.raises(ValueError, match=r"degree.*3.*4"):
         sh_basis(torch.zeros(3), 4)
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+def test_brightened_harmonics_give_colours_times_a_factor(degree):
+    generator = torch.Generator().manual_seed(0)
+    sh = torch.randn(2, 5, (degree + 1) ** 2, 3, generator=generator)
+    view = torch.randn(2, 5, 3, generator=generator)
+    factor = torch.rand(2, 5, 1, generator=generator)
+    torch.testing.assert_close(
+        sh_to_colour(brightened(sh, factor), view),
+        factor * sh_to_colour(sh, view),
+    )

@@ -1,7 +1,7 @@
 """Ψ: the pose-guided deformation of fixed Gaussians G into Ĝ (paper Sec. 3.3)."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -13,9 +13,11 @@ from torch.nn import functional
 
 from gsgan.model import compiled
 from gsgan.model.interpolation import Interpolation
+from gsgan.model.light import RATE, SharedLight
 from gsgan.scene import Gaussians
 from gsgan.skeleton import Points, root_of
-from gsgan.splat.sh import sh_to_colour
+from gsgan.skeleton.densify import rows_of
+from gsgan.splat.sh import brightened, sh_to_colour
 from gsgan.utils.checks import between, one_of, whole
 from gsgan.utils.tensors import (
     constant,
@@ -311,6 +313,7 @@ class Deformation(ResidualGaussians):
         anchors: number of points at which the MLP is computed, spread over the body; its output is
             interpolated between them, and each point adds residuals of its own (``free_table``).
             None: all points.
+        light: colours are multiplied by a `SharedLight`.
         settings: of `ResidualGaussians`.
 
     The other settings are explained in conf/model/deformation/psi.yaml.
@@ -344,6 +347,7 @@ class Deformation(ResidualGaussians):
         free_table: bool = True,
         pose_limit: float | None = 2.0,
         anchors: int | None = None,
+        light: bool = False,
         **settings: Any,
     ) -> None:
         super().__init__(body_height, **settings)
@@ -402,6 +406,16 @@ class Deformation(ResidualGaussians):
             if free_table
             else None
         )
+        self.light = SharedLight() if light else None
+
+    def parameter_groups(self) -> list[tuple[list[nn.Parameter], float]]:
+        """(parameters, multiplier of the learning rate)."""
+        if self.light is None:
+            return super().parameter_groups()
+        lights = list(self.light.parameters())
+        known = set(lights)
+        others = [x for x in self.parameters() if x not in known]
+        return [(others, 1.0), (lights, RATE)]
 
     def _place_anchors(self, rest_points: Tensor, count: int) -> Tensor:
         """Chooses the anchors and the points' shares of them; returns the anchors ``[A, 3]``.
@@ -501,7 +515,16 @@ class Deformation(ResidualGaussians):
             raw = raw + (
                 table if chosen is None else functional.embedding(chosen, table)
             )
-        return self._parted(raw)
+        residuals = self._parted(raw)
+
+        # Colours are lit by where the points face in this pose.
+        if self.light is None:
+            return residuals
+        normals = points.normals
+        if chosen is not None:
+            normals = rows_of(normals, chosen)
+        sh = brightened(residuals.sh, self.light(normals))
+        return replace(residuals, sh=sh)
 
     def _interpolated(self, raw: Tensor, chosen: Tensor | None) -> Tensor:
         """The anchors' ``raw [B, A, C]`` at the points ``chosen [B, M]``, or at all."""

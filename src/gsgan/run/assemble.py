@@ -318,10 +318,12 @@ def _set_by_scene(
         if body_points.scale_max is not None:
             found["scale_max"] = body_points.scale_max
 
-    # A config with normals=null leaves it to the number of cameras.
+    # A config with normals=null or light=null leaves it to the number of cameras.
     given = getattr(parts.deformation, "keywords", {})
-    if given.get("normals", False) is None:
-        found["normals"] = scene.n_train_cameras > 1
+    several = scene.n_train_cameras > 1
+    for name, value in {"normals": several, "light": not several}.items():
+        if given.get(name, False) is None:
+            found[name] = value
     return found
 
 

@@ -81,14 +81,14 @@ class Points:
         parts = chosen if self.part_id is None else self.part_id[chosen]
         stretched = self.stretched
         return Points(
-            means=_rows(self.means, chosen),
-            rotations=_rows(self.rotations, parts),
-            origins=_rows(self.origins, parts),
-            scales=_rows(self.scales, chosen),
-            valid=_rows(self.valid, chosen),
+            means=rows_of(self.means, chosen),
+            rotations=rows_of(self.rotations, parts),
+            origins=rows_of(self.origins, parts),
+            scales=rows_of(self.scales, chosen),
+            valid=rows_of(self.valid, chosen),
             part_id=None,
-            normals=_rows(self.normals, chosen),
-            stretched=None if stretched is None else _rows(stretched, chosen),
+            normals=rows_of(self.normals, chosen),
+            stretched=None if stretched is None else rows_of(stretched, chosen),
         )
 
     def local(self) -> Tensor:
@@ -103,7 +103,7 @@ class Points:
         return (offset.unsqueeze(-2) @ self.frames).squeeze(-2)
 
 
-def _rows(values: Tensor, chosen: Tensor) -> Tensor:
+def rows_of(values: Tensor, chosen: Tensor) -> Tensor:
     """``[B, M, ...]``: the rows ``[B, M]`` of each item of ``values [B, N, ...]``."""
     own = values.shape[2:]
     index = chosen.view(*chosen.shape, *(1 for _ in own))

@@ -103,3 +103,13 @@ def sh_to_colour(sh: Tensor, directions: Tensor) -> Tensor:
     # The sum over coefficients, channel by channel.
     basis = sh_basis(torch.nn.functional.normalize(directions, dim=-1), degree)
     return (basis.unsqueeze(-1) * sh).sum(-2) + 0.5
+
+
+def brightened(sh: Tensor, factor: Tensor) -> Tensor:
+    """Coefficients ``[B, N, (d+1)², 3]`` of colours that are ``factor [B, N, 1]`` times as bright.
+
+    Colours are those of `sh_to_colour`, of which 0.5 is not in the series.
+    """
+    scaled = factor.unsqueeze(2) * sh
+    constant = scaled[:, :, :1] + (factor - 1).unsqueeze(2) * (0.5 / _C0)
+    return torch.cat([constant, scaled[:, :, 1:]], dim=2)

@@ -1,0 +1,83 @@
+"""A light that all points share, found with one camera."""
+
+import math
+
+import pytest
+import torch
+from torch.nn import functional
+
+from gsgan.model.light import GAMMA, SharedLight
+
+
+def directions(count: int) -> torch.Tensor:
+    """``[1, count, 3]`` unit vectors, spread evenly."""
+    random = torch.randn(
+        1, count, 3, generator=torch.Generator().manual_seed(0)
+    )
+    return functional.normalize(random, dim=-1)
+
+
+def lambert(normals: torch.Tensor, sun: torch.Tensor) -> torch.Tensor:
+    """``[1, N, 1]`` encoded brightness under a sun twice as bright as the sky."""
+    cosine = (normals @ sun).relu().unsqueeze(-1)
+    return (1 + 2 * cosine).pow(1 / GAMMA)
+
+
+def test_a_sphere_is_as_bright_as_without_light():
+    light = SharedLight()
+    with torch.no_grad():
+        light.log_sun.fill_(1.0)
+        light.slope.fill_(-0.4)
+        found = light(directions(100_000))
+    assert found.pow(GAMMA).mean().item() == pytest.approx(1, abs=0.01)
+
+
+def test_the_sun_is_found_from_one_side_and_holds_on_the_other():
+    """Points of unknown colours that turn before one camera, which sees them while they face it."""
+    sun = functional.normalize(torch.tensor([0.3, -0.8, 0.5]), dim=0)
+    rest = directions(300)
+    colours = torch.rand(
+        1, 300, 1, generator=torch.Generator().manual_seed(1)
+    )
+    light = SharedLight()
+    learnt = torch.nn.Parameter(torch.full((1, 300, 1), 0.5))
+    optimiser = torch.optim.Adam([learnt, *light.parameters()], lr=0.02)
+
+    # A person turns about z; the camera looks along y.
+    views = []
+    for angle in torch.linspace(0, 2 * math.pi, 25)[:-1].tolist():
+        c, s = math.cos(angle), math.sin(angle)
+        turn = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        views.append(rest @ turn.T)
+    for _ in range(400):
+        loss = torch.zeros(())
+        for normals in views:
+            seen = (normals[..., 1:2] < -0.1).float()
+            error = learnt * light(normals) - colours * lambert(normals, sun)
+            loss = loss + (seen * error).square().mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+
+    found = functional.normalize(light.direction.detach(), dim=0)
+    assert (found @ sun).item() > math.cos(math.radians(5))
+    with torch.no_grad():
+        for normals in views:
+            hidden = normals[..., 1:2] > 0.1
+            expected = (colours * lambert(normals, sun))[hidden]
+            painted = (learnt * light(normals))[hidden]
+            assert (painted - expected).abs().mean() < 0.02
+
+
+def test_stability_normals_and_a_direction_of_zero():
+    light = SharedLight()
+    normals = torch.tensor([[[0.0, 0, 0], [0, 0, 1], [1e-20, 0, 0]]])
+    normals.requires_grad_()
+    with torch.no_grad():
+        light.direction.zero_()
+        light.slope.fill_(50.0)
+    factor = light(normals)
+    factor.sum().backward()
+    assert (factor > 0).all()
+    for x in (normals, *light.parameters()):
+        assert x.grad.isfinite().all()
