@@ -303,6 +303,23 @@ def test_checkpoints_from_before_an_effect_existed_are_read():
     assert found.generator.on
 
 
+@pytest.mark.parametrize(
+    ("changes", "parts", "value", "why"),
+    [
+        ({"n_train_cameras": 1, "seen_round": 330.0}, {}, "on", "330 of 360"),
+        ({"n_train_cameras": 1, "seen_round": 90.0}, {}, "off", "90 of 360"),
+        ({"seen_round": 360.0}, {}, "off", "several training cameras"),
+        ({"n_train_cameras": 1}, {"network": False}, "off", "no Ψ"),
+    ],
+)
+def test_light_is_found_by_one_camera_about_which_the_person_turns(
+    changes, parts, value, why
+):
+    found = decide(scene(**changes), EffectSettings(), ModelParts(**parts))
+    assert found.light.value == value
+    assert why in found.light.why
+
+
 ON_BODY = {"body_inside": 1.0}
 
 

@@ -94,7 +94,7 @@ def test_each_point_has_residuals_of_its_own():
 
 
 @pytest.mark.parametrize(
-    ("anchors", "light"), [(None, False), (100, False), (100, True)]
+    ("anchors", "light"), [(None, None), (100, None), (100, "z")]
 )
 def test_chosen_points_have_the_gaussians_and_gradients_they_have_among_all(
     anchors, light

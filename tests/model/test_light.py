@@ -24,7 +24,7 @@ def lambert(normals: torch.Tensor, sun: torch.Tensor) -> torch.Tensor:
 
 
 def test_a_sphere_is_as_bright_as_without_light():
-    light = SharedLight()
+    light = SharedLight("z")
     with torch.no_grad():
         light.log_sun.fill_(1.0)
         light.slope.fill_(-0.4)
@@ -36,10 +36,8 @@ def test_the_sun_is_found_from_one_side_and_holds_on_the_other():
     """Points of unknown colours that turn before one camera, which sees them while they face it."""
     sun = functional.normalize(torch.tensor([0.3, -0.8, 0.5]), dim=0)
     rest = directions(300)
-    colours = torch.rand(
-        1, 300, 1, generator=torch.Generator().manual_seed(1)
-    )
-    light = SharedLight()
+    colours = torch.rand(1, 300, 1, generator=torch.Generator().manual_seed(1))
+    light = SharedLight("z")
     learnt = torch.nn.Parameter(torch.full((1, 300, 1), 0.5))
     optimiser = torch.optim.Adam([learnt, *light.parameters()], lr=0.02)
 
@@ -69,8 +67,18 @@ def test_the_sun_is_found_from_one_side_and_holds_on_the_other():
             assert (painted - expected).abs().mean() < 0.02
 
 
+@pytest.mark.parametrize(("up", "axis"), [("y", 1), ("-y", 1), ("-z", 2)])
+def test_light_comes_from_above_at_first(up, axis):
+    sign = -1.0 if up.startswith("-") else 1.0
+    normals = torch.zeros(1, 2, 3)
+    normals[0, :, axis] = torch.tensor([sign, -sign])
+    above, below = SharedLight(up)(normals)[0, :, 0].tolist()
+    assert above == pytest.approx((2 / 1.25) ** (1 / GAMMA))
+    assert below == pytest.approx((1 / 1.25) ** (1 / GAMMA))
+
+
 def test_stability_normals_and_a_direction_of_zero():
-    light = SharedLight()
+    light = SharedLight("z")
     normals = torch.tensor([[[0.0, 0, 0], [0, 0, 1], [1e-20, 0, 0]]])
     normals.requires_grad_()
     with torch.no_grad():

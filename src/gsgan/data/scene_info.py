@@ -33,6 +33,11 @@ from gsgan.utils.errors import DataError
 
 # mask value of solid pixels: those at the outline are darkened by the black behind them
 SOLID = 0.9
+# Directions round the person are counted in so many sectors, in so many images of each camera.
+SECTORS = 12
+MAX_SIDES = 500
+SHOULDERS = [11, 12]
+HIPS = [23, 24]
 # Images per requested sample on which the posed body is compared with masks.
 MAX_BODY_IMAGES = 2
 
@@ -65,6 +70,7 @@ class SceneInfo:
             they share too little.
         darkest: brightness in [0, 1] of the person's darkest percent.
         texture: mean over the person's pixels, without a margin, of `gsgan.data.texture.texture`.
+        seen_round: degrees round the person, of 360, from which training cameras film him.
         body_inside: share of the posed body that lies inside the masks of training images; None
             without a body pose or mesh.
         proportions: the subject's proportions.
@@ -97,6 +103,7 @@ class SceneInfo:
     surface: SurfaceColours | None = None
     darkest: float = 0.0
     texture: float = 0.0
+    seen_round: float = 0.0
     body_inside: float | None = None
     proportions: Proportions | None = None
     face: tuple[Vector, ...] | None = None
@@ -173,6 +180,7 @@ def scene_info(
         surface=_shared_surface(dataset, names, samples),
         darkest=_darkest(dataset, samples),
         texture=_texture(dataset, samples),
+        seen_round=_seen_round(dataset),
         body_inside=_body_inside(layout, dataset, samples),
         scale_train=_scale(dataset, samples),
         poses=training_poses(torch.from_numpy(completed)),
@@ -242,6 +250,28 @@ def _scale(dataset: CaptureDataset, samples: int) -> tuple[float, float]:
             scales.append(focal / max(depth, NEAR))
         medians.append(float(np.median(scales)))
     return min(medians), max(medians)
+
+
+def _seen_round(dataset: CaptureDataset) -> float:
+    """Degrees round the person, of 360, from which cameras film him, in `SECTORS`."""
+    sectors = set()
+    for indices in _sampled(dataset, MAX_SIDES):
+        for index in indices:
+            # The person's own axes: to the left, and to the front.
+            item = dataset.items[index]
+            joints = dataset.skeletons.p[item[1]]
+            left, right = joints[SHOULDERS]
+            hips = joints[HIPS].mean(0)
+            across = left - right
+            front = np.cross(across, (left + right) / 2 - hips)
+
+            # The direction of the camera about the trunk.
+            towards = dataset.camera(item).centre[0].numpy() - hips
+            sine = towards @ front * np.linalg.norm(across)
+            cosine = towards @ across * np.linalg.norm(front)
+            turn = np.arctan2(sine, cosine) / (2 * np.pi)
+            sectors.add(int(turn * SECTORS // 1) % SECTORS)
+    return 360 / SECTORS * len(sectors)
 
 
 def _sampled(dataset: CaptureDataset, samples: int) -> list[list[int]]:

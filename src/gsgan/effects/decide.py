@@ -24,6 +24,7 @@ CHOICES: dict[str, tuple[str | int, ...]] = {
     "body_points": ON_OFF,
     "random_background": ON_OFF,
     "registration": ON_OFF,
+    "light": ON_OFF,
     "generator": ON_OFF,
 }
 # Parts of the camera and of the method: effects.only and effects=none keep them.
@@ -57,6 +58,7 @@ class EffectSettings:
     body_points: str | bool = AUTO
     random_background: str | bool = AUTO
     registration: str | bool = AUTO
+    light: str | bool = AUTO
     generator: str | bool = AUTO
 
     # Restrictions of all of them, and what happens to a forced effect that is not possible.
@@ -74,6 +76,7 @@ class EffectSettings:
     body_inside: float = 0.95
     texture: float = 0.6
     pixels_per_metre: float = 150.0
+    seen_round: float = 300.0
     gaussians_per_pixel: float = 1.0
 
     def __post_init__(self) -> None:
@@ -134,6 +137,7 @@ class ModelParts:
     Args:
         splats: it renders Gaussians.
         points: it places Gaussians on the skeleton.
+        network: Ψ is a network.
         body_points: its config has a part that places them on a body instead.
         generator: it has a generator.
         gaussians: Gaussians per pixel of the person in training images, if they are on a body;
@@ -142,6 +146,7 @@ class ModelParts:
 
     splats: bool = True
     points: bool = True
+    network: bool = True
     body_points: bool = True
     generator: bool = True
     gaussians: float | None = None
@@ -155,6 +160,8 @@ class ModelParts:
             if not self.points:
                 return "this model has no points on the skeleton"
             return None if self.body_points else "the model leaves them out"
+        if effect == "light" and not self.network:
+            return "this model has no Ψ that is a network"
         # All other effects are of Gaussians.
         return None if self.splats else "this model has no Gaussians"
 
@@ -368,6 +375,19 @@ def _registration(info: SceneInfo, settings: EffectSettings) -> Effect:
     return Effect("on", f"{measured} ({limit})")
 
 
+def _light(info: SceneInfo, settings: EffectSettings) -> Effect:
+    # Several cameras see each point from all sides, and Ψ gets its normal.
+    if info.n_train_cameras > 1:
+        return Effect(OFF, "several training cameras see how surfaces are lit")
+
+    # Only a person who turns shows where the light comes from.
+    measured = f"the camera films {info.seen_round:.0f} of 360 degrees round the person"
+    limit = f"limit {settings.seen_round:g}"
+    if info.seen_round < settings.seen_round:
+        return Effect(OFF, f"{measured} ({limit})")
+    return Effect("on", f"one training camera; {measured} ({limit})")
+
+
 def _generator(
     model: ModelParts, settings: EffectSettings, on_body: bool
 ) -> Effect:
@@ -398,4 +418,5 @@ _RULES: dict[str, Callable[[SceneInfo, EffectSettings], Effect]] = {
     "body_points": _body_points,
     "random_background": _random_background,
     "registration": _registration,
+    "light": _light,
 }

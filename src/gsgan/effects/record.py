@@ -51,6 +51,7 @@ class Effects:
         body_points: G lies on the surface of the posed body, not on the skeleton's shapes.
         random_background: Step I compares images over a random colour.
         registration: before Ψ learns, optical flow locates the surface in the training images.
+        light: colours are multiplied by a light that all points share.
         generator: the image is the generator's; else it is Step I's colour.
         cameras: training cameras in the order of the colour corrections.
     """
@@ -63,6 +64,7 @@ class Effects:
     body_points: Effect = _DEFAULT
     random_background: Effect = _DEFAULT
     registration: Effect = _DEFAULT
+    light: Effect = _DEFAULT
     # Models without one had none before this effect existed, and all others had one.
     generator: Effect = Effect("on", _DEFAULT.why)
     cameras: tuple[str, ...] = ()

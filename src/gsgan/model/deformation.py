@@ -313,7 +313,7 @@ class Deformation(ResidualGaussians):
         anchors: number of points at which the MLP is computed, spread over the body; its output is
             interpolated between them, and each point adds residuals of its own (``free_table``).
             None: all points.
-        light: colours are multiplied by a `SharedLight`.
+        light: the world's up axis: colours are multiplied by a `SharedLight`; None: they are not.
         settings: of `ResidualGaussians`.
 
     The other settings are explained in conf/model/deformation/psi.yaml.
@@ -347,7 +347,7 @@ class Deformation(ResidualGaussians):
         free_table: bool = True,
         pose_limit: float | None = 2.0,
         anchors: int | None = None,
-        light: bool = False,
+        light: str | None = None,
         **settings: Any,
     ) -> None:
         super().__init__(body_height, **settings)
@@ -406,7 +406,7 @@ class Deformation(ResidualGaussians):
             if free_table
             else None
         )
-        self.light = SharedLight() if light else None
+        self.light = SharedLight(light) if light else None
 
     def parameter_groups(self) -> list[tuple[list[nn.Parameter], float]]:
         """(parameters, multiplier of the learning rate)."""

@@ -6,26 +6,38 @@ from torch.nn import functional
 
 RATE = 3.0  # of the learning, times that of Ψ
 GAMMA = 2.2  # exponent that makes an encoded colour linear
-MAX_SLOPE = 0.8  # the sky is at most this share brighter above than at the horizon
+MAX_SLOPE = (
+    0.8  # the sky is at most this share brighter above than at the horizon
+)
 
 
 class SharedLight(nn.Module):
     """How bright a surface is by its normal, for colours that are learnt beside it.
 
     One camera shows a point only while it faces that camera, so that what it looks like when it is
-    turned away is a guess of Ψ. A point turns through the light as the person turns: sun and sky are
-    found from what is seen, and then hold for every direction.
+    turned away is a guess of Ψ. A point turns through the light as the person turns: sun and sky
+    are found from what is seen, and then hold for every direction.
 
-    Linear light is ``1 + slope z + sun max(0, n · direction)`` over its mean over all normals. Its
-    2.2th root multiplies encoded colours. At first the sun stands straight above, as bright as the
-    sky.
+    Linear light is ``1 + slope (n · up) + sun max(0, n · direction)`` over its mean over all
+    normals. Its 2.2th root multiplies encoded colours. At first the sun is straight above and as
+    bright as the sky.
+
+    Args:
+        up: the world's up axis, e.g. "z" or "-y".
 
     Source: ours; Lambert's law.
     """
 
-    def __init__(self) -> None:
+    up: Tensor
+
+    def __init__(self, up: str) -> None:
         super().__init__()
-        self.direction = nn.Parameter(torch.tensor([0.0, 0.0, 0.5]))
+        axis = torch.zeros(3)
+        axis["xyz".index(up[-1])] = -1.0 if up.startswith("-") else 1.0
+        self.register_buffer("up", axis, persistent=False)
+
+        # The sun's direction has any length; a short one turns faster.
+        self.direction = nn.Parameter(axis / 2)
         self.log_sun = nn.Parameter(torch.tensor(0.0))
         self.slope = nn.Parameter(torch.tensor(0.0))
 
@@ -42,7 +54,7 @@ class SharedLight(nn.Module):
 
         # The sky and the ground shine on everything.
         slope = MAX_SLOPE * torch.tanh(self.slope)
-        light = light + 1 + slope * unit[..., 2]
+        light = light + 1 + slope * (unit @ self.up)
 
         # max(0, cos) is a quarter in the mean over all directions.
         mean = 1 + sun / 4

@@ -28,7 +28,7 @@ from gsgan.model.body_points import (
     points_per_pixel,
 )
 from gsgan.model.colour import ColourCorrection
-from gsgan.model.deformation import ResidualGaussians
+from gsgan.model.deformation import Deformation, ResidualGaussians
 from gsgan.model.generator import Generator
 from gsgan.model.segmentation import Segmentation
 from gsgan.model.surface import SurfaceGaussians
@@ -189,6 +189,9 @@ class AvatarParts:
         return ModelParts(
             splats=self.densify is not None or self.surface is not None,
             points=self.densify is not None,
+            network=issubclass(
+                getattr(self.deformation, "func", object), Deformation
+            ),
             body_points=self.body_points is not None,
             generator=self.generator is not None,
             gaussians=self._gaussians_per_pixel(scene),
@@ -245,7 +248,7 @@ def _assembled(
             rest_points=points.rest_points,
             joints=len(template.names),
             **sizes,
-            **_set_by_scene(parts, scene, body_points),
+            **_set_by_scene(parts, scene, effects, body_points),
         )
     if parts.surface:
         body = _required_body(scene, "model.surface")
@@ -309,7 +312,10 @@ def _body_points(
 
 
 def _set_by_scene(
-    parts: AvatarParts, scene: SceneInfo, body_points: BodyPoints | None
+    parts: AvatarParts,
+    scene: SceneInfo,
+    effects: Effects,
+    body_points: BodyPoints | None,
 ) -> dict[str, Any]:
     """Arguments of Ψ that the scene or the points decide."""
     found: dict[str, Any] = {}
@@ -318,12 +324,13 @@ def _set_by_scene(
         if body_points.scale_max is not None:
             found["scale_max"] = body_points.scale_max
 
-    # A config with normals=null or light=null leaves it to the number of cameras.
+    # A config with normals=null leaves it to the number of cameras.
     given = getattr(parts.deformation, "keywords", {})
-    several = scene.n_train_cameras > 1
-    for name, value in {"normals": several, "light": not several}.items():
-        if given.get(name, False) is None:
-            found[name] = value
+    if given.get("normals", False) is None:
+        found["normals"] = scene.n_train_cameras > 1
+    if effects.light.on:
+        assert scene.proportions is not None
+        found["light"] = scene.proportions.up
     return found
 
 
