@@ -195,6 +195,24 @@ def test_the_jacobian_predicts_where_neighbours_go(bent_tube, turn):
         assert off < 0.4 * off_plain
 
 
+@pytest.mark.parametrize("limit", [0.1, 0.3])
+def test_the_stretch_has_a_limit(bent_tube, limit):
+    theta = torch.zeros(1, 2, 3, dtype=D)
+    theta[0, 1, 2] = 2.8
+    bones = bent_tube.transforms(
+        BodyPose(theta=theta, transl=torch.zeros(1, 3, dtype=D))
+    )
+    A, _ = blend_transforms(bones, bent_tube.bone_index, bent_tube.bone_weight)
+    given = (A, bones, bent_tube.vertices, *stretch_terms(bent_tube))
+    pulled = torch.linalg.matrix_norm(stretched(*given) - A)
+    limited = torch.linalg.matrix_norm(stretched(*given, limit) - A)
+    assert pulled.max() > 2 * limit
+    torch.testing.assert_close(limited, pulled.clamp_max(limit))
+    # A Gaussian is then longer by this share at most.
+    longest = torch.linalg.matrix_norm(stretched(*given, limit), ord=2)
+    assert longest.max() <= 1 + limit + 1e-9
+
+
 def test_all_bones_turned_alike_stretch_nothing_far_from_the_origin(bent_tube):
     bones = torch.eye(4).repeat(1, 2, 1, 1)
     bones[..., :3, :3] = rz(70).float()

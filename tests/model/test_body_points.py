@@ -1,5 +1,6 @@
 """G on a skinned body: where the points are, that nothing else is built, that Ψ learns there."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -437,3 +438,31 @@ def test_no_gaussian_is_larger_than_two_spacings(tiny, model):
     largest = torch.linalg.eigvalsh(gaussians.covariances).amax().sqrt()
     limit = 2 * float(placed.spacing.median())
     assert float(largest) == pytest.approx(limit, rel=1e-2)
+
+
+def test_no_gaussian_is_a_needle_in_200_poses_far_from_training(tiny):
+    """The largest that two spacings allow are half as long again where skinning stretches most."""
+    _, module = build_training(tiny("model=splat_only", ON))
+    avatar = module.avatar.eval()
+    psi, placed = avatar.deformation, avatar.body_points
+    generator = torch.Generator().manual_seed(0)
+    size = (200, avatar.solver.parents, 3)
+    theta = 0.8 * torch.randn(size, generator=generator)
+    eye = torch.tensor([[0.0, -3.0, 1.0]])
+    longest = []
+    with torch.no_grad():
+        psi.table[:, 7:10] = 20.0
+        raw = psi._parted(psi._active(psi.table)[None])
+        for turns in theta:
+            pose = BodyPose(turns[None], torch.zeros(1, 3))
+            gaussians = psi.compose(placed(pose), raw, eye)
+            values = torch.linalg.eigvalsh(gaussians.covariances)
+            longest.append(values.amax().sqrt())
+    limit = 2 * float(placed.points.spacing.median())
+    assert max(longest) <= 1.5 * limit * 1.01
+    # Without the limit there are such needles in the same poses.
+    placed.stretch_limit = math.inf
+    with torch.no_grad():
+        pose = BodyPose(theta[:20], torch.zeros(20, 3))
+        jacobian = placed(pose).stretched
+    assert torch.linalg.matrix_norm(jacobian, ord=2).max() > 2

@@ -50,14 +50,22 @@ def test_photometric(monkeypatch, shape, near):
     )
 
 
-@pytest.mark.parametrize("stretch", [True, False])
+@pytest.mark.parametrize(
+    ("stretch", "limit"), [(True, None), (True, 0.2), (False, None)]
+)
 @pytest.mark.parametrize("batch", [1, 2])
-def test_points_on_a_skinned_body(monkeypatch, stretch, batch):
+def test_points_on_a_skinned_body(monkeypatch, stretch, limit, batch):
     """Values, and the gradient of the skinning weights, far from the origin too."""
     torch.manual_seed(0)
     body = open_body("free", None, None, None)
-    placed = BodyPoints(body, 1.7, points=300, controls=20, stretch=stretch)
-    placed = placed.double()
+    placed = BodyPoints(
+        body,
+        1.7,
+        points=300,
+        controls=20,
+        stretch=stretch,
+        stretch_limit=limit,
+    ).double()
     field = placed.points.learnt.field
     torch.nn.init.normal_(field)
     wide = {"dtype": torch.float64}

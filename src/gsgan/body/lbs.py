@@ -4,6 +4,7 @@ Units are metres; vectors are columns, ``x_posed = A @ x_rest + t``; batch first
 rest frame is aligned with the world's axes: zero rotations are the rest pose.
 """
 
+import math
 from collections.abc import Sequence
 from functools import lru_cache
 from itertools import chain, pairwise
@@ -251,6 +252,7 @@ def stretched(
     vertices: Tensor,
     bones: Tensor,
     slopes: Tensor,
+    limit: float = math.inf,
 ) -> Tensor:
     """The Jacobian of skinning at each vertex: how the surface about it turns and stretches.
 
@@ -263,6 +265,7 @@ def stretched(
         transforms: ``[B, J, 4, 4]`` from :func:`forward_kinematics`.
         vertices: ``[V, 3]`` at rest.
         bones, slopes: from :class:`gsgan.body.skinned.WeightGradients`.
+        limit: largest Frobenius norm of the sum, which is scaled down to it.
 
     Returns:
         ``[B, V, 3, 3]``: ``A + Σ_b (ΔB_b x_c) ∇w_bᵀ``.
@@ -276,7 +279,13 @@ def stretched(
     # Where each bone carries the vertex, [B, V, KEPT, 3].
     moved = turns[:, bones] @ vertices.to(turns)[:, None, :, None]
     moved = (moved + places[:, bones]).squeeze(-1)
-    return A + moved.mT @ slopes.to(moved)
+    pulled = moved.mT @ slopes.to(moved)
+
+    # Without a limit the scale would be infinite divided by the norm.
+    if math.isfinite(limit):
+        norm = torch.linalg.matrix_norm(pulled, keepdim=True)
+        pulled = pulled * (limit / norm.clamp_min(limit))
+    return A + pulled
 
 
 def skin(vertices: Tensor, A: Tensor, t: Tensor) -> Tensor:

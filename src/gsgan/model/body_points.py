@@ -325,6 +325,8 @@ class BodyPoints(nn.Module):
         mean_step: of Ψ: its means move by this share of what they would on a skeleton's points.
         stretch: shapes and normals also follow the stretch of the surface, see
             `gsgan.body.lbs.stretched`.
+        stretch_limit: how much longer the stretch makes a Gaussian at most, as a share of its
+            length; None: no limit.
         stretch_every: iterations of training between updates of the stretch's terms, which change
             slowly with the learnt weights.
         scale_spacings: largest standard deviation of a Gaussian, in median distances of
@@ -352,6 +354,7 @@ class BodyPoints(nn.Module):
         sigma: float = 0.7,
         mean_step: float = 1.0,
         stretch: bool = True,
+        stretch_limit: float | None = None,
         stretch_every: int = 1,
         scale_spacings: float | None = None,
         controls: int = 0,
@@ -404,6 +407,11 @@ class BodyPoints(nn.Module):
         # The stretch's terms need the gradients of the weights over the surface. Where the
         # weights are fixed, the terms are fixed too.
         self.stretch = stretch
+        self.stretch_limit = math.inf
+        if stretch_limit is not None:
+            self.stretch_limit = above(
+                "model.body_points.stretch_limit", stretch_limit
+            )
         self.stretch_every = whole(
             "model.body_points.stretch_every", stretch_every, 1
         )
@@ -503,7 +511,13 @@ class BodyPoints(nn.Module):
         rest = self.points.means
         if compiled.has_skinned(bones, weights[1]):
             return compiled.skinned(
-                bones, rest, self.rest_normals, weights, terms, NORMAL_FLOOR
+                bones,
+                rest,
+                self.rest_normals,
+                weights,
+                terms,
+                NORMAL_FLOOR,
+                self.stretch_limit,
             )
 
         # The means, moved by LBS. Only they give the weights a gradient.
@@ -516,7 +530,7 @@ class BodyPoints(nn.Module):
         # Shapes and normals follow the stretch of the surface.
         jacobian = None
         if terms is not None:
-            jacobian = stretched(A, bones, rest, *terms)
+            jacobian = stretched(A, bones, rest, *terms, self.stretch_limit)
         normals = moved_normals(
             A if jacobian is None else jacobian, self.rest_normals
         )

@@ -40,7 +40,7 @@ SKIN_INPUTS = (
 # struct SkinJob of kernels/skin.h
 _SkinJob = build.job_type(
     ("poses", "count", "threads", "joints", "followed", "kept"),
-    ("floor",),
+    ("floor", "limit"),
     (*SKIN_INPUTS, *(f"out_{name}" for name in SKINNED), "g_means", "d_weight"),
 )
 
@@ -63,6 +63,7 @@ def skinned(
     weights: tuple[Tensor, Tensor],
     slopes: tuple[Tensor, Tensor] | None,
     floor: float,
+    limit: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor]:
     """Points on a skinned body in B poses; means are differentiable once, in the weights.
 
@@ -72,6 +73,7 @@ def skinned(
         weights: ``[N, n]`` bones of each point and their weights, which are divided by their sum.
         slopes: of `gsgan.body.skinned.WeightGradients`; None: shapes follow the frames alone.
         floor: share of the area at rest at which a normal fades.
+        limit: of `gsgan.body.lbs.stretched`.
 
     Returns:
         Means ``[B, N, 3]``, frames and origins (A and t of LBS), the Jacobians ``[B, N, 3, 3]``
@@ -80,14 +82,16 @@ def skinned(
     index, weight = weights
     steep, slope = (None, None) if slopes is None else slopes
     inputs = (bones, rest, normals, index, weight, steep, slope)
-    means, frames, origins, shapes, turned = _Skin.apply(floor, *inputs)
+    means, frames, origins, shapes, turned = _Skin.apply(
+        (floor, limit), *inputs
+    )
     return means, frames, origins, None if slopes is None else shapes, turned
 
 
 class _Skin(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, floor: float, *inputs: Tensor | None
+        ctx: Any, bounds: tuple[float, float], *inputs: Tensor | None
     ) -> tuple[Tensor, ...]:
         bones, rest = inputs[:2]
         assert bones is not None
@@ -98,12 +102,12 @@ class _Skin(torch.autograd.Function):
         means, origins, normals = (bones.new_empty(*size, 3) for _ in range(3))
         frames, shapes = (bones.new_empty(*size, 3, 3) for _ in range(2))
         outputs = (means, frames, origins, shapes, normals)
-        job, _held = _skin_job(floor, inputs)
+        job, _held = _skin_job(bounds, inputs)
         build.point(job, [f"out_{name}" for name in SKINNED], outputs)
         build.function("skin", bones.dtype)(ctypes.byref(job))
 
         # Only the means have a gradient.
-        ctx.floor = floor
+        ctx.bounds = bounds
         ctx.save_for_backward(*inputs)
         ctx.mark_non_differentiable(frames, origins, shapes, normals)
         return outputs
@@ -113,7 +117,7 @@ class _Skin(torch.autograd.Function):
     def backward(ctx: Any, g_means: Tensor, *_: Any) -> tuple[Any, ...]:  # type: ignore[override]
         inputs = ctx.saved_tensors
         weight = inputs[SKIN_INPUTS.index("weight")]
-        job, _held = _skin_job(ctx.floor, inputs)
+        job, _held = _skin_job(ctx.bounds, inputs)
         incoming = g_means.contiguous()
         d_weight = torch.empty_like(
             weight, memory_format=torch.contiguous_format
@@ -126,7 +130,7 @@ class _Skin(torch.autograd.Function):
 
 
 def _skin_job(
-    floor: float, inputs: tuple[Tensor | None, ...]
+    bounds: tuple[float, float], inputs: tuple[Tensor | None, ...]
 ) -> tuple[ctypes.Structure, list[Tensor | None]]:
     """The job without its outputs, and the tensors it points to."""
     # The tensors must live as long as the job, which holds addresses only.
@@ -142,7 +146,7 @@ def _skin_job(
         bones.shape[1],
         index.shape[1],
         0 if steep is None else steep.shape[1],
-        floor,
+        *bounds,
     )
     build.point(job, SKIN_INPUTS, held)
     return job, held

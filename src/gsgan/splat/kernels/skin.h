@@ -12,6 +12,7 @@ struct SkinJob {
   int64_t poses, count, threads;
   int64_t joints, followed, kept;         // bones: of the body, of a point, with a slope
   double floor;                           // share of the area at which a normal fades
+  double limit;                           // largest norm of what slopes add to a frame
   const void* bones;                      // [poses, joints, 4, 4]
   const void *rest, *normals;             // [count, 3]
   const int64_t* index;                   // [count, followed]
@@ -51,18 +52,23 @@ double blended(const SkinJob& job, const T* bones, int64_t i, double* affine) {
   return total;
 }
 
-// The frame and the slopes of the weights: A + sum of (bone x) slope^T. The slopes sum to zero, so
-// that places can be given from the root's, where numbers are small.
+// The frame and the slopes of the weights: A + sum of (bone x) slope^T, whose norm is limited. The
+// slopes sum to zero, so that places can be given from the root's, where numbers are small.
 template <class T>
 void stretched(const SkinJob& job, const T* bones, const T* x, int64_t i, double* J) {
+  double pulled[9] = {}, squared = 0;
   for (int64_t b = 0; b < job.kept; ++b) {
     const int64_t row = i * job.kept + b;
     const T* slope = static_cast<const T*>(job.slopes) + 3 * row;
     double place[3];
     moved_by(bones + 16 * job.steep[row], x, place);
     for (int r = 0; r < 3; ++r)
-      for (int k = 0; k < 3; ++k) J[3 * r + k] += (place[r] - bones[4 * r + 3]) * slope[k];
+      for (int k = 0; k < 3; ++k) pulled[3 * r + k] += (place[r] - bones[4 * r + 3]) * slope[k];
   }
+  for (double value : pulled) squared += value * value;
+  const double norm = std::sqrt(squared);
+  const double share = norm > job.limit ? job.limit / norm : 1;
+  for (int k = 0; k < 9; ++k) J[k] += share * pulled[k];
 }
 
 // The cofactors of J times the normal at rest, of length one where the surface is not flat.
