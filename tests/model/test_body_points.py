@@ -441,7 +441,7 @@ def test_no_gaussian_is_larger_than_two_spacings(tiny, model):
 
 
 def test_no_gaussian_is_a_needle_in_200_poses_far_from_training(tiny):
-    """The largest that two spacings allow are half as long again where skinning stretches most."""
+    """The largest that two spacings allow are a quarter longer where skinning stretches most."""
     _, module = build_training(tiny("model=splat_only", ON))
     avatar = module.avatar.eval()
     psi, placed = avatar.deformation, avatar.body_points
@@ -459,7 +459,7 @@ def test_no_gaussian_is_a_needle_in_200_poses_far_from_training(tiny):
             values = torch.linalg.eigvalsh(gaussians.covariances)
             longest.append(values.amax().sqrt())
     limit = 2 * float(placed.points.spacing.median())
-    assert max(longest) <= 1.5 * limit * 1.01
+    assert max(longest) <= 1.25 * limit * 1.01
     # Without the limit there are such needles in the same poses.
     placed.stretch_limit = math.inf
     with torch.no_grad():
