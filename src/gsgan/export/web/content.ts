@@ -11,6 +11,7 @@ export interface Header {
   weights: number; // bones of each Gaussian
   slopes: number; // bones whose weights change along the surface
   slopeStep: number; // of their gradients, 1 / metre
+  stretch: number | null; // largest norm of what they add to a frame; null: any
   range: [number, number]; // least and step of the quantised means, metres
   bound: number; // of the means' residuals, metres
   height: number; // metres: the unit of these residuals where they have no bound

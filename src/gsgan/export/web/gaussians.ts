@@ -29,6 +29,7 @@ export class Gaussians {
   private readonly weight: Float32Array;
   private readonly slopeBone: Uint8Array; // [N, slopes]
   private readonly slope: Float32Array; // [N, slopes, 3] gradients of skinning weights
+  private readonly pulled = new Float64Array(9); // what they add to one point's frame
   private readonly rest: Float32Array;
   private readonly normal: Float32Array;
   private readonly first: Float32Array; // [N, numbers] of the first harmonic
@@ -130,18 +131,24 @@ export class Gaussians {
     return this.h.bound ? this.h.bound * Math.tanh(x) : this.h.height * x;
   }
 
-  /** Adds the stretch of the surface to A: gsgan.body.lbs.stretched. */
+  /** Adds the stretch of the surface to A, up to its limit: gsgan.body.lbs.stretched. */
   private stretch(i: number, A: Float64Array, bones: ArrayLike<number>): void {
-    const { rest, slope, slopeBone } = this, n = this.h.slopes;
+    const { rest, slope, slopeBone, pulled } = this, n = this.h.slopes;
+    pulled.fill(0);
     const x = rest[3 * i]!, y = rest[3 * i + 1]!, z = rest[3 * i + 2]!;
     for (let k = n * i; k < n * (i + 1); ++k) {
       const at = 12 * slopeBone[k]!, u = slope[3 * k]!, v = slope[3 * k + 1]!, w = slope[3 * k + 2]!;
       for (let row = 0; row < 3; ++row) {
         const of = at + 3 * row, place = bones[at + 9 + row]! - bones[9 + row]!; // from the root's
         const moved = bones[of]! * x + bones[of + 1]! * y + bones[of + 2]! * z + place;
-        A[3 * row]! += moved * u, A[3 * row + 1]! += moved * v, A[3 * row + 2]! += moved * w;
+        pulled[3 * row]! += moved * u, pulled[3 * row + 1]! += moved * v, pulled[3 * row + 2]! += moved * w;
       }
     }
+    let squared = 0;
+    for (const value of pulled) squared += value * value;
+    const limit = this.h.stretch ?? Infinity;
+    const share = Math.min(1, limit / Math.sqrt(squared)); // 1 where nothing is pulled
+    for (let e = 0; e < 9; ++e) A[e]! += share * pulled[e]!;
   }
 
   /** R S of the raw quaternion and log scales. */
