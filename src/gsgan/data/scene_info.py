@@ -24,7 +24,12 @@ from gsgan.data.surface_colours import (
 from gsgan.data.texture import SIDE, grey, texture
 from gsgan.scene import NEAR
 from gsgan.skeleton.joints import BODY
-from gsgan.skeleton.proportions import Proportions, measure_proportions
+from gsgan.skeleton.proportions import (
+    HIPS,
+    SHOULDERS,
+    Proportions,
+    measure_proportions,
+)
 from gsgan.skeleton.sides import refuse_swapped
 from gsgan.skeleton.template import Vector
 from gsgan.skeleton.training_poses import TrainingPoses, training_poses
@@ -36,8 +41,6 @@ SOLID = 0.9
 # Directions round the person are counted in so many sectors, in so many images of each camera.
 SECTORS = 12
 MAX_SIDES = 500
-SHOULDERS = [11, 12]
-HIPS = [23, 24]
 # Images per requested sample on which the posed body is compared with masks.
 MAX_BODY_IMAGES = 2
 
@@ -260,8 +263,8 @@ def _seen_round(dataset: CaptureDataset) -> float:
             # The person's own axes: to the left, and to the front.
             item = dataset.items[index]
             joints = dataset.skeletons.p[item[1]]
-            left, right = joints[SHOULDERS]
-            hips = joints[HIPS].mean(0)
+            left, right = joints[list(SHOULDERS)]
+            hips = joints[list(HIPS)].mean(0)
             across = left - right
             front = np.cross(across, (left + right) / 2 - hips)
 

@@ -6,7 +6,7 @@ from torch.nn import functional
 
 RATE = 3.0  # of the learning, times that of Ψ
 GAMMA = 2.2  # exponent that makes an encoded colour linear
-MAX_SLOPE = (
+MAX_SKY_SLOPE = (
     0.8  # the sky is at most this share brighter above than at the horizon
 )
 
@@ -53,7 +53,7 @@ class SharedLight(nn.Module):
         light = sun * functional.relu(unit @ towards)
 
         # The sky and the ground shine on everything.
-        slope = MAX_SLOPE * torch.tanh(self.slope)
+        slope = MAX_SKY_SLOPE * torch.tanh(self.slope)
         light = light + 1 + slope * (unit @ self.up)
 
         # max(0, cos) is a quarter in the mean over all directions.
