@@ -6,9 +6,7 @@ from torch.nn import functional
 
 RATE = 3.0  # of the learning, times that of Ψ
 GAMMA = 2.2  # exponent that makes an encoded colour linear
-MAX_SKY_SLOPE = (
-    0.8  # the sky is at most this share brighter above than at the horizon
-)
+MAX_SKY_SLOPE = 0.8  # share by which the sky above is brighter, at most
 
 
 class SharedLight(nn.Module):
