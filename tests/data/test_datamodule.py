@@ -272,8 +272,8 @@ def test_scene_info(ten_frames):
 def test_sides_from_which_cameras_film_the_person(tmp_path):
     root = write_tiny_capture(tmp_path, cameras=4, frames=14)
     one = {"train_cameras": ["cam00"], "test_frames": [12, 13]}
-    assert GsganData(str(root), **one).info.seen_round <= 60
-    assert GsganData(str(root), test_frames=[12, 13]).info.seen_round >= 120
+    assert GsganData(str(root), **one).info.degrees_seen <= 60
+    assert GsganData(str(root), test_frames=[12, 13]).info.degrees_seen >= 120
 
     # The person turns by 30 degrees from frame to frame before one camera.
     landmarks = dict(np.load(root / "landmarks3d.npz"))
@@ -281,7 +281,7 @@ def test_sides_from_which_cameras_film_the_person(tmp_path):
         c, s = np.cos(k * np.pi / 6), np.sin(k * np.pi / 6)
         joints[:, :2] = joints[:, :2] @ np.array([[c, s], [-s, c]])
     np.savez(root / "landmarks3d.npz", **landmarks)
-    assert GsganData(str(root), **one).info.seen_round >= 300
+    assert GsganData(str(root), **one).info.degrees_seen >= 300
 
 
 def test_scene_info_sees_the_lens_of_training_cameras_only(tmp_path):

@@ -306,9 +306,9 @@ def test_checkpoints_from_before_an_effect_existed_are_read():
 @pytest.mark.parametrize(
     ("changes", "parts", "value", "why"),
     [
-        ({"n_train_cameras": 1, "seen_round": 330.0}, {}, "on", "330 of 360"),
-        ({"n_train_cameras": 1, "seen_round": 90.0}, {}, "off", "90 of 360"),
-        ({"seen_round": 360.0}, {}, "off", "several training cameras"),
+        ({"n_train_cameras": 1, "degrees_seen": 330}, {}, "on", "330 of 360"),
+        ({"n_train_cameras": 1, "degrees_seen": 90}, {}, "off", "90 of 360"),
+        ({"degrees_seen": 360}, {}, "off", "several training cameras"),
         ({"n_train_cameras": 1}, {"network": False}, "off", "no Ψ"),
     ],
 )

@@ -110,14 +110,14 @@ def test_what_is_off_builds_no_parameter(build, model, absent):
 
 
 def test_one_camera_gives_psi_a_shared_light_in_place_of_normals(build):
-    one = ("data.train_cameras=[cam00]", "effects.seen_round=0")
+    one = "data.train_cameras=[cam00]"
     several = build("model=splat_only")[1].deformation
     assert several.from_normal is not None
     assert several.light is None
-    single = build("model=splat_only", *one)[1].deformation
+    turned = build("model=splat_only", one, "effects.degrees_seen=0")
+    single = turned[1].deformation
     assert single.from_normal is None
     assert single.light is not None
-    one = "data.train_cameras=[cam00]"
     build("model=harmonic", one, "effects.body_points=on")
 
 

@@ -281,7 +281,7 @@ def stretched(
     moved = (moved + places[:, bones]).squeeze(-1)
     pulled = moved.mT @ slopes.to(moved)
 
-    # Without a limit the scale would be infinite divided by the norm.
+    # An infinite limit would be divided by itself.
     if math.isfinite(limit):
         norm = torch.linalg.matrix_norm(pulled, keepdim=True)
         pulled = pulled * (limit / norm.clamp_min(limit))

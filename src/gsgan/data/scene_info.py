@@ -25,9 +25,8 @@ from gsgan.data.texture import SIDE, grey, texture
 from gsgan.scene import NEAR
 from gsgan.skeleton.joints import BODY
 from gsgan.skeleton.proportions import (
-    HIPS,
-    SHOULDERS,
     Proportions,
+    degrees_seen,
     measure_proportions,
 )
 from gsgan.skeleton.sides import refuse_swapped
@@ -38,9 +37,6 @@ from gsgan.utils.errors import DataError
 
 # mask value of solid pixels: those at the outline are darkened by the black behind them
 SOLID = 0.9
-# Directions round the person are counted in so many sectors, in so many images of each camera.
-SECTORS = 12
-MAX_SIDES = 500
 # Images per requested sample on which the posed body is compared with masks.
 MAX_BODY_IMAGES = 2
 
@@ -73,7 +69,7 @@ class SceneInfo:
             they share too little.
         darkest: brightness in [0, 1] of the person's darkest percent.
         texture: mean over the person's pixels, without a margin, of `gsgan.data.texture.texture`.
-        seen_round: degrees round the person, of 360, from which training cameras film him.
+        degrees_seen: of 360 around the person, from which training cameras see the training frames.
         body_inside: share of the posed body that lies inside the masks of training images; None
             without a body pose or mesh.
         proportions: the subject's proportions.
@@ -106,7 +102,7 @@ class SceneInfo:
     surface: SurfaceColours | None = None
     darkest: float = 0.0
     texture: float = 0.0
-    seen_round: float = 0.0
+    degrees_seen: int = 0
     body_inside: float | None = None
     proportions: Proportions | None = None
     face: tuple[Vector, ...] | None = None
@@ -162,6 +158,8 @@ def scene_info(
     # [F, J, 3]
     completed = np.stack([dataset.skeletons.p[frame] for frame in frames])
 
+    centres = np.stack([layout.cameras[name].centre for name in names])
+
     # The skinned body, whose file is the user's.
     body = layout.meta.body
     labelled = bool(layout.labels)
@@ -183,7 +181,7 @@ def scene_info(
         surface=_shared_surface(dataset, names, samples),
         darkest=_darkest(dataset, samples),
         texture=_texture(dataset, samples),
-        seen_round=_seen_round(dataset),
+        degrees_seen=degrees_seen(completed, centres),
         body_inside=_body_inside(layout, dataset, samples),
         scale_train=_scale(dataset, samples),
         poses=training_poses(torch.from_numpy(completed)),
@@ -253,28 +251,6 @@ def _scale(dataset: CaptureDataset, samples: int) -> tuple[float, float]:
             scales.append(focal / max(depth, NEAR))
         medians.append(float(np.median(scales)))
     return min(medians), max(medians)
-
-
-def _seen_round(dataset: CaptureDataset) -> float:
-    """Degrees round the person, of 360, from which cameras film him, in `SECTORS`."""
-    sectors = set()
-    for indices in _sampled(dataset, MAX_SIDES):
-        for index in indices:
-            # The person's own axes: to the left, and to the front.
-            item = dataset.items[index]
-            joints = dataset.skeletons.p[item[1]]
-            left, right = joints[list(SHOULDERS)]
-            hips = joints[list(HIPS)].mean(0)
-            across = left - right
-            front = np.cross(across, (left + right) / 2 - hips)
-
-            # The direction of the camera about the trunk.
-            towards = dataset.camera(item).centre[0].numpy() - hips
-            sine = towards @ front * np.linalg.norm(across)
-            cosine = towards @ across * np.linalg.norm(front)
-            turn = np.arctan2(sine, cosine) / (2 * np.pi)
-            sectors.add(int(turn * SECTORS // 1) % SECTORS)
-    return 360 / SECTORS * len(sectors)
 
 
 def _sampled(dataset: CaptureDataset, samples: int) -> list[list[int]]:

@@ -76,7 +76,7 @@ class EffectSettings:
     body_inside: float = 0.95
     texture: float = 0.6
     pixels_per_metre: float = 150.0
-    seen_round: float = 300.0
+    degrees_seen: float = 300.0
     gaussians_per_pixel: float = 1.0
 
     def __post_init__(self) -> None:
@@ -381,9 +381,11 @@ def _light(info: SceneInfo, settings: EffectSettings) -> Effect:
         return Effect(OFF, "several training cameras see how surfaces are lit")
 
     # Only a person who turns shows where the light comes from.
-    measured = f"the camera films {info.seen_round:.0f} of 360 degrees round the person"
-    limit = f"limit {settings.seen_round:g}"
-    if info.seen_round < settings.seen_round:
+    measured = (
+        f"the camera sees the person from {info.degrees_seen} of 360 degrees"
+    )
+    limit = f"limit {settings.degrees_seen:g}"
+    if info.degrees_seen < settings.degrees_seen:
         return Effect(OFF, f"{measured} ({limit})")
     return Effect("on", f"one training camera; {measured} ({limit})")
 

@@ -211,7 +211,7 @@ def gaussians_of(avatar: Avatar) -> tuple[Plain, Arrays]:
 
     # The header: bounds of the residuals in metres, and the settings of the rasteriser.
     settings = avatar.accuracy
-    limit = on_body.stretch_limit
+    stretch = on_body.stretch_limit
     scales = [
         math.log(limit * linear.body_height) for limit in linear.scale_range
     ]
@@ -222,7 +222,7 @@ def gaussians_of(avatar: Avatar) -> tuple[Plain, Arrays]:
         "weights": weight.shape[1],
         "slopes": slopes.shape[1],
         "slopeStep": float(slope_step),
-        "stretch": limit if math.isfinite(limit) else None,
+        "stretch": stretch if math.isfinite(stretch) else None,
         "range": (low, step),
         "bound": (linear.mean_bound or 0) * linear.body_height,
         "height": linear.body_height,

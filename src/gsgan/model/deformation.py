@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from gsgan.model import compiled
 from gsgan.model.interpolation import Interpolation
-from gsgan.model.light import RATE, SharedLight
+from gsgan.model.light import LIGHT_RATE, SharedLight
 from gsgan.scene import Gaussians
 from gsgan.skeleton import Points, root_of
 from gsgan.skeleton.densify import rows_of
@@ -412,10 +412,12 @@ class Deformation(ResidualGaussians):
         """(parameters, multiplier of the learning rate)."""
         if self.light is None:
             return super().parameter_groups()
-        lights = list(self.light.parameters())
-        known = set(lights)
-        others = [x for x in self.parameters() if x not in known]
-        return [(others, 1.0), (lights, RATE)]
+        others = [
+            parameter
+            for name, parameter in self.named_parameters()
+            if not name.startswith("light.")
+        ]
+        return [(others, 1.0), (list(self.light.parameters()), LIGHT_RATE)]
 
     def _place_anchors(self, rest_points: Tensor, count: int) -> Tensor:
         """Chooses the anchors and the points' shares of them; returns the anchors ``[A, 3]``.

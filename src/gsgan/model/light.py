@@ -4,7 +4,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-RATE = 3.0  # of the learning, times that of Ψ
+from gsgan.skeleton.proportions import upright
+
+LIGHT_RATE = 3.0  # of the learning, times that of Ψ
 GAMMA = 2.2  # exponent that makes an encoded colour linear
 MAX_SKY_SLOPE = 0.8  # share by which the sky above is brighter, at most
 
@@ -30,8 +32,7 @@ class SharedLight(nn.Module):
 
     def __init__(self, up: str) -> None:
         super().__init__()
-        axis = torch.zeros(3)
-        axis["xyz".index(up[-1])] = -1.0 if up.startswith("-") else 1.0
+        axis = torch.from_numpy(upright(up)[2]).float()
         self.register_buffer("up", axis, persistent=False)
 
         # The sun's direction has any length; a short one turns faster.

@@ -53,6 +53,7 @@ from gsgan.skeleton.joints import (
     RIGHT,
     WRIST_JOINTS,
 )
+from gsgan.skeleton.proportions import degrees_seen
 from gsgan.utils.arrays import Bool, Float, Ints, expect_array, nanmedian
 from gsgan.utils.pickles import read_arrays
 
@@ -70,7 +71,6 @@ MIN_CAMERA_TURN = 300  # degrees
 MAX_BACKGROUND_MOVE = 0.03  # share of the image
 MAX_OTHER_FACES = 0.2  # share of the images
 MIN_FEET_SEEN = 0.5  # share of the images
-TURN_SECTORS = 12
 SHOULDER_JOINTS = [11, 12]
 SWAPPED = [j for pair in (*ARM_PAIRS[:3], *LEG_PAIRS[:3]) for j in pair]
 
@@ -412,14 +412,6 @@ def _measured(
     focal = float(camera.K[0, 0])
     diagonal = float(np.hypot(*camera.size))
 
-    # The sectors of directions from which the camera saw the person.
-    left_shoulder, right_shoulder = SHOULDER_JOINTS
-    side = p[:, left_shoulder, :2] - p[:, right_shoulder, :2]
-    toward = camera.centre[:2] - p[:, HIP_JOINTS, :2].mean(1)
-    facing = np.arctan2(side[:, 0], side[:, 1])
-    turn = facing - np.arctan2(toward[:, 0], toward[:, 1])
-    directions = np.unique(np.floor(TURN_SECTORS * (turn / (2 * np.pi) % 1)))
-
     # Reasons that left out a frame.
     counts = {}
     for reason, frames in left.items():
@@ -429,7 +421,7 @@ def _measured(
         "focal_px": focal,
         "focal_mm": focal / diagonal * FILM,
         "focal_uncertainty": OVERCONFIDENT * view.spread,
-        "degrees_seen": 360 // TURN_SECTORS * len(directions),
+        "degrees_seen": degrees_seen(p, camera.centre[None]),
         "seconds": float(np.ptp(time)),
         "sampled": len(next(iter(left.values()))),
         "left_out": counts,

@@ -24,6 +24,7 @@ UP_AXES = ("x", "y", "z", "-x", "-y", "-z")
 SHOULDERS = (11, 12)
 EARS = (7, 8)
 HIPS = (23, 24)
+SECTORS = 12  # of directions around the person
 ARMS = ((11, 13), (13, 15)), ((12, 14), (14, 16))
 LEGS = ((23, 25), (25, 27)), ((24, 26), (26, 28))
 # All bones of the limbs, parents first.
@@ -343,3 +344,25 @@ def part_frame(along: Float, across: Float) -> Float:
     size = np.linalg.norm(second, axis=-1, keepdims=True)
     second = second / np.maximum(size, 1e-9)
     return np.stack([first, second, np.cross(first, second)], axis=-1)
+
+
+def degrees_seen(p: Float, centres: Float) -> int:
+    """Degrees around the person, of 360, from which cameras see the frames, in `SECTORS`.
+
+    Args:
+        p: ``[F, J, 3]`` metres; shoulders and hips are finite.
+        centres: ``[C, 3]`` metres, the cameras' positions.
+    """
+    # The trunk's own axes: to the left and to the front.
+    hips = middle(p, HIPS)
+    left, right = (p[:, joint] for joint in SHOULDERS)
+    across = left - right
+    front = np.cross(across, middle(p, SHOULDERS) - hips)
+
+    # The direction of each camera about the trunk, as a share of a turn, [C, F].
+    towards = centres[:, None] - hips
+    sine = (towards * front).sum(-1) * np.linalg.norm(across, axis=-1)
+    cosine = (towards * across).sum(-1) * np.linalg.norm(front, axis=-1)
+    turn = np.arctan2(sine, cosine) / (2 * np.pi)
+    sectors = np.unique(np.floor(SECTORS * turn) % SECTORS)
+    return 360 // SECTORS * len(sectors)

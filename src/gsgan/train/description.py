@@ -64,12 +64,7 @@ def describe(
                 f"{sum(p.numel() for p in part.parameters()):,} parameters",
             )
 
-    # The light and the Gaussians.
-    if getattr(avatar.deformation, "light", None) is not None:
-        table.add_row(
-            "light",
-            "a sun and a sky that all points share, found in training",
-        )
+    # The Gaussians.
     on_body = avatar.body_points
     if on_body is not None:
         apart = on_body.pixels_apart(info.scale_train[1])
