@@ -69,12 +69,18 @@ def draw_skeleton(
     # Masked before the arithmetic: pixels of unseen joints are arbitrary.
     a = torch.where(shown, pixels.index_select(1, starts), 0.0)
     b = torch.where(shown, pixels.index_select(1, ends), 0.0)
+    # Zero below the bound, within which a line reaches so many pixels.
     counts = [len(group) for _, group in template.draw_groups]
-    distance2 = _distance2(a, b, shown, camera.size, counts)
-
-    # Zero below the bound: denormal numbers would slow down all later operations.
-    exponent = (distance2 * (-0.5 / sigma**2)).clamp_min(MIN_EXPONENT)
-    return exponent.exp() - math.exp(MIN_EXPONENT)
+    reach = sigma * math.sqrt(-2 * MIN_EXPONENT)
+    boxes = _boxes(a, b, shown, camera.size, counts, reach)
+    image = a.new_zeros(len(p), len(counts), *camera.size)
+    for i, distance2 in enumerate(
+        _distances2(a, b, shown, camera.size, counts, boxes)
+    ):
+        # Denormal numbers would slow down all later operations.
+        exponent = (distance2 * (-0.5 / sigma**2)).clamp_min(MIN_EXPONENT)
+        image[:, i, *boxes[i]] = exponent.exp() - math.exp(MIN_EXPONENT)
+    return image
 
 
 @lru_cache(maxsize=64)
@@ -89,14 +95,46 @@ def _segment_ends(template: SkeletonTemplate, device: torch.device) -> Tensor:
         return torch.tensor(segments, device=device).T
 
 
-def _distance2(
+def _boxes(
     a: Tensor,
     b: Tensor,
     shown: Tensor,
     size: tuple[int, int],
     counts: list[int],
-) -> Tensor:
-    """``[B, groups, h, w]`` squared pixels to each group's nearest segment; huge if none is drawn.
+    reach: float,
+) -> list[tuple[slice, slice]]:
+    """The rows and columns that each group's lines reach in any item of the batch.
+
+    On a GPU these are all: it would have to be waited for.
+    """
+    h, w = size
+    if a.device.type != "cpu" or torch.compiler.is_compiling():
+        return [(slice(0, h), slice(0, w))] * len(counts)
+
+    # The box [groups, 2] of the ends that are shown, as whole pixels of the image.
+    limits = a.new_tensor((w, h))
+    first = torch.where(shown, torch.minimum(a, b), math.inf).amin(0)
+    last = torch.where(shown, torch.maximum(a, b), -math.inf).amax(0)
+    low = torch.stack([x.amin(0) for x in first.split(counts)]) - reach
+    high = torch.stack([x.amax(0) for x in last.split(counts)]) + reach
+    starts = low.floor().clamp_min(0).minimum(limits).int().tolist()
+    stops = high.ceil().clamp_min(0).minimum(limits).int().tolist()
+    return [
+        (slice(y0, y1), slice(x0, x1))
+        for (x0, y0), (x1, y1) in zip(starts, stops, strict=True)
+    ]
+
+
+def _distances2(
+    a: Tensor,
+    b: Tensor,
+    shown: Tensor,
+    size: tuple[int, int],
+    counts: list[int],
+    boxes: list[tuple[slice, slice]],
+) -> list[Tensor]:
+    """``[B, rows, columns]`` squared pixels to each group's nearest segment, in the group's box;
+    huge if none is drawn.
 
     In a segment's own axes a pixel is ``along`` lengths from its middle and ``across`` pixels
     from its line. Both are affine: the sum of a column term and a row term.
@@ -127,8 +165,9 @@ def _distance2(
     across_y = (y * -sideways[..., :1]).unsqueeze(-1)
     length = length2.sqrt().unsqueeze(-1)
 
-    # Group by group, so that the temporaries [B, segments, h, w] fit into the cache.
+    # Group by group, so that the temporaries [B, segments, rows, columns] fit into the cache.
     groups = zip(
+        boxes,
         along_x.split(counts, dim=1),
         along_y.split(counts, dim=1),
         across_x.split(counts, dim=1),
@@ -136,7 +175,16 @@ def _distance2(
         length.split(counts, dim=1),
         strict=True,
     )
-    return torch.stack([_nearest(*group) for group in groups], dim=1)
+    return [
+        _nearest(
+            along_x[..., columns],
+            along_y[..., rows, :],
+            across_x[..., columns],
+            across_y[..., rows, :],
+            length,
+        )
+        for (rows, columns), along_x, along_y, across_x, across_y, length in groups
+    ]
 
 
 def _nearest(
@@ -146,7 +194,7 @@ def _nearest(
     across_y: Tensor,
     length: Tensor,
 ) -> Tensor:
-    """``[B, h, w]`` squared pixels to the nearest of one group's segments ``[B, S, ...]``."""
+    """``[B, rows, columns]`` squared pixels to the nearest of one group's segments ``[B, S, ...]``."""
     # The distance along the segment beyond its ends, and that from its line.
     beyond = F.softshrink(along_x + along_y, 0.5) * length  # 0 between the ends
     across = across_x + across_y
