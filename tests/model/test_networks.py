@@ -118,6 +118,15 @@ def test_style_starts_as_plain_normalisation():
     ).all()
 
 
+def test_the_style_of_a_batch_is_that_of_each_image():
+    style = StyleModulation(6, 3, 35)
+    torch.nn.init.normal_(style.from_map.weight)
+    torch.nn.init.normal_(style.from_pose.weight)
+    given = torch.randn(2, 6, 4, 5), torch.randn(2, 3, 4, 5), torch.randn(2, 35)
+    each = [style(*(x[i : i + 1] for x in given)) for i in range(2)]
+    torch.testing.assert_close(style(*given), torch.cat(each))
+
+
 def test_discriminator_judges_every_scale():
     maps = Discriminator(scales=2, base=4, layers=3)(torch.rand(2, 3, 32, 32))
     assert len(maps) == 2

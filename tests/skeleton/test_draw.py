@@ -9,7 +9,7 @@ import torch
 from skeleton_poses import camera, noisy, rest
 from torch import Tensor
 
-from gsgan.skeleton import MEDIAPIPE33, draw_skeleton
+from gsgan.skeleton import MEDIAPIPE33, draw, draw_skeleton
 
 GROUPS = [name for name, _ in MEDIAPIPE33.draw_groups]
 
@@ -176,6 +176,25 @@ def test_a_crop_equals_the_window_of_the_image():
     window = draw_skeleton(p, None, cam.crop(10, 20, (40, 30)))
     # both at the floor of sigma
     torch.testing.assert_close(window, whole[:, :, 10:50, 20:50])
+
+
+def test_a_group_is_drawn_where_its_lines_reach(monkeypatch):
+    """Drawn over the whole image it is the same to the last bit."""
+    p, cam = noisy(2, batch=2), camera((240, 180), batch=2)
+    valid = torch.ones(2, 33, dtype=torch.bool)
+    valid[:, [13, 15]] = False  # no left arm, and a hand without its wrist
+    boxed = draw_skeleton(p, valid, cam)
+
+    def whole(*arguments: Any) -> list[tuple[slice, slice]]:
+        boxes.extend(found(*arguments))
+        return [(slice(0, 240), slice(0, 180))] * len(GROUPS)
+
+    found, boxes = draw._boxes, []
+    monkeypatch.setattr(draw, "_boxes", whole)
+    assert torch.equal(boxed, draw_skeleton(p, valid, cam))
+    heights = [max(0, rows.stop - rows.start) for rows, _ in boxes]
+    assert heights[GROUPS.index("left_arm")] == 0
+    assert 0 < heights[GROUPS.index("head")] < 120
 
 
 def test_misuse_is_named():

@@ -91,6 +91,36 @@ def with_leaves(p: Projected) -> tuple[list[Tensor], Projected]:
     return leaves, replace(p, **dict(zip(LEAVES, leaves, strict=True)))
 
 
+def test_many_channels_are_rows_and_have_the_values_of_few():
+    """Features for networks are channels last; colours of three channels are planes."""
+    p = replace(scene(), features=torch.rand(1, 40, 6, dtype=torch.float64))
+    halves = [replace(p, features=x) for x in p.features.split(3, dim=2)]
+    weight = torch.rand(1, 6, 21, 35, dtype=torch.float64)
+
+    leaves, many = with_leaves(p)
+    drawn = native.composite(many, (21, 35), HIGH)[0]
+    assert drawn.is_contiguous(memory_format=torch.channels_last)
+    assert not drawn.is_contiguous()
+    found = torch.autograd.grad((drawn * weight).sum(), leaves)
+
+    few = [with_leaves(half) for half in halves]
+    planes = [native.composite(x, (21, 35), HIGH)[0] for _, x in few]
+    assert all(x.is_contiguous() for x in planes)
+    assert torch.equal(drawn, torch.cat(planes, dim=1))
+    loss = (torch.cat(planes, dim=1) * weight).sum()
+    parts = [
+        torch.autograd.grad(loss, leaves, retain_graph=True)
+        for leaves, _ in few
+    ]
+    for name, got, first, second in zip(LEAVES, found, *parts, strict=True):
+        both = (
+            torch.cat([first, second], 2)
+            if name == "features"
+            else first + second
+        )
+        torch.testing.assert_close(got, both)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_accuracy_of_the_exponential(dtype):
     # 4001 pixels in a row of one Gaussian whose mean is on the first centre: -q/2 = -(x / 317)^2.

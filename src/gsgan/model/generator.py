@@ -1,6 +1,7 @@
 """The generator: a UNet with two encoders, modulated by the pose (paper Sec. 3.5)."""
 
 from collections.abc import Sequence
+from functools import partial
 from itertools import pairwise
 
 import torch
@@ -82,23 +83,27 @@ class StyleModulation(nn.Module):
     def forward(self, h: Tensor, style: Tensor, g: Tensor) -> Tensor:
         """``h`` ``[B, C, h, w]``, styled by ``style`` ``[B, Cs, h, w]`` and ``g`` ``[B, 35]`` and
         activated."""
-        # channels last in memory: channels of a pixel are a row
-        rows = h.permute(0, 2, 3, 1)
+        # The pose gives each channel of an item a scale and a shift.
+        given = self.from_map.bias + self.from_pose(g)
 
-        # The pose gives each channel a scale and a shift.
-        modulation = self.from_pose(g).unsqueeze(1)
-
-        # The style map adds its own at each pixel; a 1×1 convolution is a matrix product.
-        weight = self.from_map.weight.flatten(1).mT.expand(len(h), -1, -1)
-        styles = style.permute(0, 2, 3, 1).flatten(1, 2)
-        modulation = torch.baddbmm(
-            modulation + self.from_map.bias, styles, weight
+        # The style map adds its own at each pixel; a 1×1 convolution is a matrix product. Channels
+        # last in memory: channels of a pixel are a row.
+        weight = self.from_map.weight.flatten(1)
+        items = [
+            functional.linear(styles, weight, bias)
+            for styles, bias in zip(
+                style.permute(0, 2, 3, 1), given, strict=True
+            )
+        ]
+        # Stacking copies, which is not needed for one image.
+        modulation = (
+            items[0].unsqueeze(0) if len(items) == 1 else torch.stack(items)
         )
-        modulation = modulation.unflatten(1, rows.shape[1:3])
 
         # Scale and shift of every pixel's channels.
         gamma, beta = modulation.chunk(2, dim=-1)
         # In float32 at least: half precision loses squares above 256 and below 2e-4.
+        rows = h.permute(0, 2, 3, 1)
         wide = rows.to(torch.promote_types(h.dtype, torch.float32))
         unit = functional.rms_norm(wide, wide.shape[-1:], eps=NORM_FLOOR).to(
             h.dtype
@@ -153,8 +158,9 @@ class DecoderLevel(nn.Module):
 
         # A convolution of joined channels is the sum of the convolutions of its
         # parts.
-        upsampled = functional.conv_transpose2d(h, kernel, stride=2, padding=1)
-        return upsampled + functional.conv2d(skip, lower, bias, padding=1)
+        joined = functional.conv2d(skip, lower, bias, padding=1)
+        joined += functional.conv_transpose2d(h, kernel, stride=2, padding=1)
+        return joined
 
 
 class Refinement(nn.Module):
@@ -329,43 +335,48 @@ class Generator(nn.Module):
                 raise ValueError(
                     "Generator: built with rgb_skip=True, so alpha must be given"
                 )
-            return torch.cat([F[:, :3], alpha], dim=1) + painted
+            painted[:, :3] += F[:, :3]
+            painted[:, 3:] += alpha
         return painted
 
     def _stem(
         self, features: Tensor, others: list[Tensor], fine: Tensor | None
     ) -> Tensor:
-        """E_c's stem on F, S, p₂D and F's fine pixels, without forming them as channels."""
-        # Without fine pixels the stem is an ordinary convolution of all inputs.
-        stem = self.content.stem
+        """E_c's stem on F, S, p₂D and F's fine pixels, without joining their channels.
+
+        A convolution of joined channels is the sum of the convolutions of its parts.
+        """
+        weight = self.content.stem.weight
+        bias = self.content.stem.bias
         k = self.supersample
         C = features.shape[1]
-        if fine is None:
-            padded = [self._padded(x) for x in others]
-            return stem(torch.cat([features, *padded], dim=1))  # type: ignore[no-any-return]
-
-        # The convolution is split into a part for F with its fine pixels and a part for the rest.
         stride = self.patch
         padding = int(self.patch == 1)
-        weight = stem.weight
-        kernel = derived(
-            self, "fine", lambda: fine_kernel(weight, C, k), weight
-        )
-        rest = derived(
-            self,
-            "rest",
-            lambda: channels_last(weight[:, C : -C * k * k]),
-            weight,
-        )
 
-        # The fine part has a stride and padding in fine pixels.
-        fine = self._padded(fine, k)
-        h = functional.conv2d(fine, kernel, stem.bias, k * stride, k * padding)
+        # The part for F; with fine pixels it has a stride and padding in these.
+        if fine is None:
+            kernel = derived(
+                self, "F", lambda: channels_last(weight[:, :C]), weight
+            )
+            h = functional.conv2d(features, kernel, bias, stride, padding)
+        else:
+            kernel = derived(
+                self, "fine", lambda: fine_kernel(weight, C, k), weight
+            )
+            fine = self._padded(fine, k)
+            h = functional.conv2d(fine, kernel, bias, k * stride, k * padding)
 
-        # S and p₂D have the resolution of the image.
-        if others:
-            given = self._padded(torch.cat(others, dim=1))
-            h = h + functional.conv2d(given, rest, None, stride, padding)
+        # The parts for S and p₂D.
+        first = C
+        for i, given in enumerate(others):
+            part = weight[:, first : first + given.shape[1]]
+            kernel = derived(
+                self, f"part {i}", partial(channels_last, part), weight
+            )
+            h += functional.conv2d(
+                self._padded(given), kernel, None, stride, padding
+            )
+            first += given.shape[1]
         return h
 
     def _padded(self, x: Tensor, times: int = 1) -> Tensor:

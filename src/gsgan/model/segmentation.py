@@ -165,7 +165,11 @@ class Segmentation(SkinnedGaussians):
             if self.all_classed
             else raster.features.sum(dim=1, keepdim=True)
         )
-        return torch.cat([(1 - covered).clamp_min(0), raster.features], dim=1)
+        rest = (1 - covered).clamp_min(0)
+
+        # Joined channels last, as the generator reads them.
+        rows = [x.movedim(1, -1) for x in (rest, raster.features)]
+        return torch.cat(rows, dim=-1).movedim(-1, 1)
 
     def loss(self, frame: Frame) -> Tensor:
         """The loss of a frame: on its labels, or on its mask where the data has no labels."""
@@ -201,7 +205,8 @@ def segmentation_loss(segmentation: Tensor, labels: Tensor) -> Tensor:
     """
     # Labels without a channel are ignored.
     labels = torch.where(labels < segmentation.shape[1], labels, IGNORE)
-    log = (segmentation + PROBABILITY_FLOOR).log()
+    # The backward pass of nll_loss takes planes alone.
+    log = (segmentation + PROBABILITY_FLOOR).log().contiguous()
 
     # The mean is over pixels with a label, and 0 where there are none.
     total = functional.nll_loss(

@@ -73,7 +73,8 @@ def draw_skeleton(
     counts = [len(group) for _, group in template.draw_groups]
     reach = sigma * math.sqrt(-2 * MIN_EXPONENT)
     boxes = _boxes(a, b, shown, camera.size, counts, reach)
-    image = a.new_zeros(len(p), len(counts), *camera.size)
+    # channels last in memory, as the generator reads them
+    image = a.new_zeros(len(p), *camera.size, len(counts)).movedim(-1, 1)
     for i, distance2 in enumerate(
         _distances2(a, b, shown, camera.size, counts, boxes)
     ):
@@ -183,7 +184,10 @@ def _distances2(
             across_y[..., rows, :],
             length,
         )
-        for (rows, columns), along_x, along_y, across_x, across_y, length in groups
+        for (
+            rows,
+            columns,
+        ), along_x, along_y, across_x, across_y, length in groups
     ]
 
 
@@ -194,7 +198,7 @@ def _nearest(
     across_y: Tensor,
     length: Tensor,
 ) -> Tensor:
-    """``[B, rows, columns]`` squared pixels to the nearest of one group's segments ``[B, S, ...]``."""
+    """``[B, rows, columns]`` squared pixels to the nearest segment of a group ``[B, S, ...]``."""
     # The distance along the segment beyond its ends, and that from its line.
     beyond = F.softshrink(along_x + along_y, 0.5) * length  # 0 between the ends
     across = across_x + across_y

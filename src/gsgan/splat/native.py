@@ -33,6 +33,7 @@ _ELLIPSES = (
 _IMAGES = ("out_features", "out_alpha", "out_average")
 _IMAGE_GRADS = ("g_features", "g_alpha", "g_average")
 _ELLIPSE_GRADS = ("d_means", "d_factors", "d_opacities", "d_features")
+COLOURS = 3  # features of more channels are for networks
 AVERAGES = (
     1,
     2,
@@ -53,6 +54,7 @@ _Job = build.job_type(
         "box",  # whether extents cut off pixels
         "slot_bytes",
         "times",
+        "rows",  # whether features are channels last
     ),
     numbers=("alpha_min", "transmittance_min", "alpha_max"),
     addresses=(*_ELLIPSES, *_IMAGES, *_IMAGE_GRADS, *_ELLIPSE_GRADS),
@@ -97,7 +99,8 @@ def composite(
             each way.
 
     Returns:
-        features ``[B, C, H, W]`` premultiplied, channels last if they are averaged; alpha
+        features ``[B, C, H, W]`` premultiplied, channels last if they are averaged or more than
+        colours; alpha
         ``[B, 1, H / times, W / times]``, and averaged features ``[B, C, H / times, W / times]`` or
         None. Differentiable once in means, factors, opacities and features.
 
@@ -167,17 +170,14 @@ class _Composite(torch.autograd.Function):
         dtype = features.dtype
         coarse = (size[0] // times, size[1] // times)
 
-        # Supersampled features are channels last: each pixel's channels are averaged together.
-        alpha = zeros((B, 1, *coarse), dtype)
-        average = None
-        if times == 1:
-            drawn = zeros((B, C, *size), dtype)
-        else:
-            drawn = zeros((B, *size, C), dtype).permute(0, 3, 1, 2)
-            average = zeros((B, C, *coarse), dtype)
-
         # The kernel writes into the outputs and keeps its tile lists for the backward pass.
         job = _job(size, settings, inputs, times)
+        alpha = zeros((B, 1, *coarse), dtype)
+        average = None if times == 1 else zeros((B, C, *coarse), dtype)
+        if job.rows:
+            drawn = zeros((B, *size, C), dtype).permute(0, 3, 1, 2)
+        else:
+            drawn = zeros((B, C, *size), dtype)
         job.keep = grad_enabled and any(ctx.needs_input_grad)
         build.point(job, _IMAGES, [drawn, alpha, average])
         plan = _Plan(dtype)
@@ -203,7 +203,7 @@ class _Composite(torch.autograd.Function):
 
         # Gradients of the outputs, in the memory format of the outputs.
         incoming = [None if g is None else g.contiguous() for g in grads]
-        if ctx.times > 1 and grads[0] is not None:
+        if job.rows and grads[0] is not None:
             incoming[0] = grads[0].contiguous(memory_format=torch.channels_last)
         build.point(job, _IMAGE_GRADS, incoming)
 
@@ -240,6 +240,8 @@ def _job(
         box=settings.extent == "sigma",
         slot_bytes=SLOT_BYTES,
         times=times,
+        # Networks read channels last; each pixel's channels are averaged together.
+        rows=times > 1 or C > COLOURS,
         alpha_min=settings.alpha_min,
         transmittance_min=settings.transmittance_min,
         alpha_max=settings.alpha_max,

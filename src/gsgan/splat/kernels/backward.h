@@ -118,17 +118,16 @@ template <class T> void load_gradients(const Job& job, const Tile& tile, Scratch
     else
       std::fill_n(to, PIXELS, T(0));
   };
-  if (job.times == 1) {
-    for (int64_t c = 0; c < job.C; ++c)
-      read(job.g_features, tile.b * job.C + c, s.image.get() + c * PIXELS);
-    read(job.g_alpha, tile.b, s.alpha_grad.get());
-    return;
-  }
-  if (job.g_features)
+  if (job.g_features && job.rows)
     read_pixels(static_cast<const T*>(job.g_features) + tile.b * job.C * plane, job.W, job.C, tile,
                 s.image.get());
   else
-    std::fill_n(s.image.get(), job.C * PIXELS, T(0));
+    for (int64_t c = 0; c < job.C; ++c)
+      read(job.g_features, tile.b * job.C + c, s.image.get() + c * PIXELS);
+  if (job.times == 1) {
+    read(job.g_alpha, tile.b, s.alpha_grad.get());
+    return;
+  }
   std::fill_n(s.alpha_grad.get(), PIXELS, T(0));
   const int64_t coarse = plane / (job.times * job.times);
   const auto spread = [&](const void* planes, int64_t index, T* to) {

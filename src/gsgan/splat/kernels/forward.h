@@ -87,15 +87,17 @@ void forward_tile(const Job& job, const Inputs<T>& in, Plan<T>& plan, int64_t in
   }
   plan.chunks_done[index] = chunk;
   for (int k = 0; k < PIXELS; ++k) s.transmittance[k] = T(1) - s.transmittance[k];
-  if (job.times == 1) {
+  if (job.rows)
+    write_pixels(features, job.W, job.C, tile, s.image.get());
+  else
     for (int64_t c = 0; c < job.C; ++c)
       write_plane(features + c * plane, job.W, tile, s.image.get() + c * PIXELS);
+  if (job.times == 1) {
     write_plane(alpha, job.W, tile, s.transmittance.get());
     return;
   }
   const int64_t coarse = plane / (job.times * job.times);
   T* average = static_cast<T*>(job.out_average) + tile.b * job.C * coarse;
-  write_pixels(features, job.W, job.C, tile, s.image.get());
   for (int64_t c = 0; c < job.C; ++c)
     write_average(average + c * coarse, job.W, job.times, tile, s.image.get() + c * PIXELS);
   write_average(alpha, job.W, job.times, tile, s.transmittance.get());

@@ -17,8 +17,8 @@ struct Job {
   int64_t keep;        // whether a backward pass will follow
   int64_t box;         // whether pixels outside the extents are skipped, whatever their alpha
   int64_t slot_bytes;  // memory for per-entry gradients in the backward pass
-  int64_t times;       // pixels averaged each way; above 1 (a divisor of TILE) features and their
-                       // gradient are channels last, and alpha is averaged
+  int64_t times;       // pixels averaged each way, a divisor of TILE; above 1 alpha is averaged
+  int64_t rows;        // whether features and their gradient are channels last
   double alpha_min, transmittance_min, alpha_max;
   const double *means, *factors;
   const void *opacities, *features;
