@@ -77,6 +77,61 @@ def test_light_comes_from_above_at_first(up, axis):
     assert below == pytest.approx((1 / 1.25) ** (1 / GAMMA))
 
 
+def sheet(side: float, height: float, spacing: float = 0.02) -> torch.Tensor:
+    """``[1, N, 3]`` points of a level square around the origin."""
+    line = torch.arange(-side / 2, side / 2, spacing) + 0.003
+    x, y = torch.meshgrid(line, line, indexing="xy")
+    return torch.stack([x, y, torch.full_like(x, height)], -1).reshape(1, -1, 3)
+
+
+@pytest.mark.parametrize("up", [torch.eye(3)[2], torch.tensor([0.6, 0, 0.8])])
+def test_a_shadow_lies_where_the_sun_is_hidden(up):
+    """A small square above a large one, with the sun along its normal or slanting."""
+    light = SharedLight("z")
+    with torch.no_grad():
+        light.direction.copy_(3 * up)
+    ground, screen = sheet(1.0, 0.0), sheet(0.4, 0.3)
+    lit = light.lit(torch.cat([ground, screen], dim=1))[0, :, 0]
+    below, above = lit.split([ground.shape[1], screen.shape[1]])
+    assert (above == 1).all()  # a surface does not shade itself
+
+    # The shadow is moved by the slope of the sun; its edge is three cells wide.
+    moved = ground[0, :, :2] + 0.3 * up[:2] / up[2]
+    inside = moved.abs().amax(-1)
+    assert (below[inside < 0.15] == 0).all()
+    assert (below[inside > 0.26] == 1).all()
+    assert ((below > 0) & (below < 1)).any()
+
+    # What is shaded has the light of the sky alone.
+    normals = torch.eye(3)[2].expand(1, len(lit), 3)
+    factors = light(normals, lit[None, :, None])[0, :, 0]
+    dark = factors[: len(below)][below == 0]
+    torch.testing.assert_close(
+        dark, (1 / 1.25) ** (1 / GAMMA) * torch.ones_like(dark)
+    )
+
+
+def test_shadows_of_a_batch_are_those_of_each_and_move_with_the_person():
+    light = SharedLight("z")
+    torch.manual_seed(0)
+    people = torch.rand(2, 500, 3)
+    each = [light.lit(people[i : i + 1]) for i in range(2)]
+    assert torch.equal(light.lit(people), torch.cat(each))
+    away = light.lit(people + torch.tensor([100.0, -50.0, 3.0]))
+    assert (away - light.lit(people)).abs().mean() < 0.01
+
+
+def test_stability_shadows_of_points_beyond_the_map_and_of_no_sun():
+    light = SharedLight("z")
+    far = torch.cat(
+        [sheet(1.0, 0.0), torch.tensor([[[1e4, -1e4, 2.0]]])], dim=1
+    )
+    assert light.lit(far).isfinite().all()
+    with torch.no_grad():
+        light.direction.zero_()
+    assert (light.lit(sheet(1.0, 0.0)) == 1).all()
+
+
 def test_stability_normals_and_a_direction_of_zero():
     light = SharedLight("z")
     normals = torch.tensor([[[0.0, 0, 0], [0, 0, 1], [1e-20, 0, 0]]])

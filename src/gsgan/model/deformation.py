@@ -519,13 +519,15 @@ class Deformation(ResidualGaussians):
             )
         residuals = self._parted(raw)
 
-        # Colours are lit by where the points face in this pose.
+        # Colours are lit by where the points face in this pose, and by what shades them.
         if self.light is None:
             return residuals
         normals = points.normals
+        lit = self.light.lit(points.means)
         if chosen is not None:
             normals = rows_of(normals, chosen)
-        sh = brightened(residuals.sh, self.light(normals))
+            lit = rows_of(lit, chosen)
+        sh = brightened(residuals.sh, self.light(normals, lit))
         return replace(residuals, sh=sh)
 
     def _interpolated(self, raw: Tensor, chosen: Tensor | None) -> Tensor:

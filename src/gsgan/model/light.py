@@ -10,6 +10,13 @@ LIGHT_RATE = 3.0  # of the learning, times that of Ψ
 GAMMA = 2.2  # exponent that makes an encoded colour linear
 MAX_SKY_SLOPE = 0.8  # share by which the sky above is brighter, at most
 
+# The shadow map (docs/results/one_camera.md#cast-shadows).
+CELL = 0.025  # metres: the size of its cells
+CELLS = 160  # each way
+SHADE = 0.05  # metres: a point that is so much nearer to the sun shades another
+SOFT = 0.02  # metres: around that, a shadow begins gradually
+NEIGHBOURS = [x + CELLS * y for x in (-1, 0, 1) for y in (-1, 0, 1)]
+
 
 class SharedLight(nn.Module):
     """How bright a surface is by its normal, for colours that are learnt beside it.
@@ -18,14 +25,14 @@ class SharedLight(nn.Module):
     turned away is a guess of Ψ. A point turns through the light as the person turns: sun and sky
     are found from what is seen, and then hold for every direction.
 
-    Linear light is ``1 + slope (n · up) + sun max(0, n · direction)`` over its mean over all
-    normals. Its 2.2th root multiplies encoded colours. At first the sun is straight above and as
-    bright as the sky.
+    Linear light is ``1 + slope (n · up) + lit sun max(0, n · direction)`` over its mean over all
+    normals in the sun. Its 2.2th root multiplies encoded colours. At first the sun is straight
+    above and as bright as the sky.
 
     Args:
         up: the world's up axis, e.g. "z" or "-y".
 
-    Source: ours; Lambert's law.
+    Source: ours; Lambert's law; shadow maps (Williams 1978) of points.
     """
 
     up: Tensor
@@ -40,21 +47,66 @@ class SharedLight(nn.Module):
         self.log_sun = nn.Parameter(torch.tensor(0.0))
         self.slope = nn.Parameter(torch.tensor(0.0))
 
-    def forward(self, normals: Tensor) -> Tensor:
+    @property
+    def towards(self) -> Tensor:
+        """``[3]`` the sun's direction, of length one."""
+        return functional.normalize(self.direction, dim=0, eps=1e-6)
+
+    @torch.no_grad()
+    def lit(self, means: Tensor) -> Tensor:
+        """``[B, N, 1]`` shares of the sun that reach points ``[B, N, 3]`` past each other.
+
+        A shadow map: the plane across the sun is divided into cells, each of which keeps how near
+        to the sun its nearest point is. A point is shaded as far as the cells around it hold points
+        that are nearer by more than `SHADE`. There is no gradient.
+        """
+        # Axes across the sun; a direction of zero has none, and then nothing is shaded.
+        towards = self.towards
+        other = functional.one_hot(towards.abs().argmin(), 3).to(towards)
+        first = torch.linalg.cross(towards, other)
+        first = functional.normalize(first, dim=0, eps=1e-6)
+        second = torch.linalg.cross(towards, first)
+        column, row, near = (
+            means @ torch.stack([first, second, towards], 1)
+        ).unbind(-1)
+
+        # The cell of each point; those beyond the map count for its border.
+        index = CELLS * cell_of(row) + cell_of(column)
+
+        # The nearest point of each cell.
+        nearest = near.new_full((len(means), CELLS**2), -torch.inf)
+        nearest.scatter_reduce_(1, index, near, "amax")
+
+        # The mean over the cells around a point makes the edge of a shadow soft.
+        total = torch.zeros_like(near)
+        for offset in NEIGHBOURS:
+            excess = near - nearest.gather(1, index + offset)
+            total += ((excess + SHADE) / SOFT + 0.5).clamp_(0, 1)
+        return (total / len(NEIGHBOURS)).unsqueeze(-1)
+
+    def forward(self, normals: Tensor, lit: Tensor | None = None) -> Tensor:
         """``[B, N, 1]`` factors of colours, for normals ``[B, N, 3]`` in world axes.
 
         Normals of any length count by their direction; one of zero gets the light of the horizon.
+        ``lit`` is what `lit` returns; None: nothing is shaded.
         """
-        # The sun shines on what faces it.
+        # The sun shines on what faces it and is not in the shade of something else.
         unit = functional.normalize(normals, dim=-1, eps=1e-6)
-        towards = functional.normalize(self.direction, dim=0, eps=1e-6)
+        facing = functional.relu(unit @ self.towards).unsqueeze(-1)
+        if lit is not None:
+            facing = facing * lit
         sun = self.log_sun.exp()
-        light = sun * functional.relu(unit @ towards)
 
         # The sky and the ground shine on everything.
         slope = MAX_SKY_SLOPE * torch.tanh(self.slope)
-        light = light + 1 + slope * (unit @ self.up)
+        sky = 1 + slope * (unit @ self.up).unsqueeze(-1)
 
         # max(0, cos) is a quarter in the mean over all directions.
         mean = 1 + sun / 4
-        return (light / mean).pow(1 / GAMMA).unsqueeze(-1)
+        return ((sky + sun * facing) / mean).pow(1 / GAMMA)
+
+
+def cell_of(place: Tensor) -> Tensor:
+    """``[B, N]`` cells of the shadow map, its border left out, for places ``[B, N]`` in metres."""
+    cells = (place - place.mean(dim=1, keepdim=True)) / CELL + CELLS // 2
+    return cells.clamp(1, CELLS - 2).long()
