@@ -24,7 +24,7 @@ SHALLOW = (
 )
 MODELS = {
     "supersampled": ("size.supersample=2", "effects.body_points=off", SHALLOW),
-    "full": (SHALLOW,),
+    "full": ("effects.light=on", SHALLOW),
     "no S, no graph": ("model=wo_seg", "model/pose_encoder=linear"),
     "image_to_image": ("model=image_to_image",),
     "lbs": ("model=lbs_splat",),
