@@ -308,11 +308,12 @@ def test_checkpoints_from_before_an_effect_existed_are_read():
     [
         ({"n_train_cameras": 1, "degrees_seen": 330}, {}, "on", "330 of 360"),
         ({"n_train_cameras": 1, "degrees_seen": 90}, {}, "off", "90 of 360"),
-        ({"degrees_seen": 360}, {}, "off", "several training cameras"),
+        ({"degrees_seen": 360}, {}, "on", "360 of 360"),
+        ({"degrees_seen": 270}, {}, "off", "270 of 360"),
         ({"n_train_cameras": 1}, {"network": False}, "off", "no Ψ"),
     ],
 )
-def test_light_is_found_by_one_camera_about_which_the_person_turns(
+def test_light_is_found_where_the_person_is_seen_from_all_sides(
     changes, parts, value, why
 ):
     found = decide(scene(**changes), EffectSettings(), ModelParts(**parts))

@@ -376,18 +376,14 @@ def _registration(info: SceneInfo, settings: EffectSettings) -> Effect:
 
 
 def _light(info: SceneInfo, settings: EffectSettings) -> Effect:
-    # Several cameras see each point from all sides, and Ψ gets its normal.
-    if info.n_train_cameras > 1:
-        return Effect(OFF, "several training cameras see how surfaces are lit")
-
-    # Only a person who turns shows where the light comes from.
+    # Only a person who is seen from all sides shows where the light comes from.
     measured = (
-        f"the camera sees the person from {info.degrees_seen} of 360 degrees"
+        f"the person is seen from {info.degrees_seen} of 360 degrees "
+        f"(limit {settings.degrees_seen:g})"
     )
-    limit = f"limit {settings.degrees_seen:g}"
     if info.degrees_seen < settings.degrees_seen:
-        return Effect(OFF, f"{measured} ({limit})")
-    return Effect("on", f"one training camera; {measured} ({limit})")
+        return Effect(OFF, measured)
+    return Effect("on", measured)
 
 
 def _generator(
