@@ -21,9 +21,9 @@ NEIGHBOURS = [x + CELLS * y for x in (-1, 0, 1) for y in (-1, 0, 1)]
 class SharedLight(nn.Module):
     """How bright a surface is by its normal, for colours that are learnt beside it.
 
-    One camera shows a point only while it faces that camera, so that what it looks like when it is
-    turned away is a guess of Ψ. A point turns through the light as the person turns: sun and sky
-    are found from what is seen, and then hold for every direction.
+    One camera shows a point only while it faces that camera, and no camera shows poses that were
+    not filmed, so that what a point looks like otherwise is a guess of Ψ. A point turns through the
+    light as the person moves: sun and sky are found from what is seen, and then hold everywhere.
 
     Linear light is ``1 + slope (n · up) + lit sun max(0, n · direction)`` over its mean over all
     normals in the sun. Its 2.2th root multiplies encoded colours. At first the sun is straight

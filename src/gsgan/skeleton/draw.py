@@ -69,7 +69,7 @@ def draw_skeleton(
     # Masked before the arithmetic: pixels of unseen joints are arbitrary.
     a = torch.where(shown, pixels.index_select(1, starts), 0.0)
     b = torch.where(shown, pixels.index_select(1, ends), 0.0)
-    # Zero below the bound, within which a line reaches so many pixels.
+    # A line is zero beyond so many pixels, so that each group is drawn in its box alone.
     counts = [len(group) for _, group in template.draw_groups]
     reach = sigma * math.sqrt(-2 * MIN_EXPONENT)
     boxes = _boxes(a, b, shown, camera.size, counts, reach)
@@ -106,7 +106,7 @@ def _boxes(
 ) -> list[tuple[slice, slice]]:
     """The rows and columns that each group's lines reach in any item of the batch.
 
-    On a GPU these are all: it would have to be waited for.
+    On a GPU these are all, since reading the ends would make the host wait.
     """
     h, w = size
     if a.device.type != "cpu" or torch.compiler.is_compiling():
