@@ -12,10 +12,10 @@ MAX_SKY_SLOPE = 0.8  # share by which the sky above is brighter, at most
 
 # The shadow map (docs/results/one_camera.md#cast-shadows).
 CELL = 0.025  # metres: the size of its cells
-CELLS = 160  # each way
+MAP_CELLS = 160  # each way
 SHADE = 0.05  # metres: a point that is so much nearer to the sun shades another
 SOFT = 0.02  # metres: around that, a shadow begins gradually
-NEIGHBOURS = [x + CELLS * y for x in (-1, 0, 1) for y in (-1, 0, 1)]
+AROUND = [x + MAP_CELLS * y for x in (-1, 0, 1) for y in (-1, 0, 1)]
 
 
 class SharedLight(nn.Module):
@@ -71,18 +71,18 @@ class SharedLight(nn.Module):
         ).unbind(-1)
 
         # The cell of each point; those beyond the map count for its border.
-        index = CELLS * cell_of(row) + cell_of(column)
+        index = MAP_CELLS * cell_of(row) + cell_of(column)
 
         # The nearest point of each cell.
-        nearest = near.new_full((len(means), CELLS**2), -torch.inf)
+        nearest = near.new_full((len(means), MAP_CELLS**2), -torch.inf)
         nearest.scatter_reduce_(1, index, near, "amax")
 
         # The mean over the cells around a point makes the edge of a shadow soft.
         total = torch.zeros_like(near)
-        for offset in NEIGHBOURS:
+        for offset in AROUND:
             excess = near - nearest.gather(1, index + offset)
             total += ((excess + SHADE) / SOFT + 0.5).clamp_(0, 1)
-        return (total / len(NEIGHBOURS)).unsqueeze(-1)
+        return (total / len(AROUND)).unsqueeze(-1)
 
     def forward(self, normals: Tensor, lit: Tensor | None = None) -> Tensor:
         """``[B, N, 1]`` factors of colours, for normals ``[B, N, 3]`` in world axes.
@@ -108,5 +108,5 @@ class SharedLight(nn.Module):
 
 def cell_of(place: Tensor) -> Tensor:
     """``[B, N]`` cells of the shadow map, its border left out, for places ``[B, N]`` in metres."""
-    cells = (place - place.mean(dim=1, keepdim=True)) / CELL + CELLS // 2
-    return cells.clamp(1, CELLS - 2).long()
+    cells = (place - place.mean(dim=1, keepdim=True)) / CELL + MAP_CELLS // 2
+    return cells.clamp(1, MAP_CELLS - 2).long()

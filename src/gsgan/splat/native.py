@@ -33,7 +33,7 @@ _ELLIPSES = (
 _IMAGES = ("out_features", "out_alpha", "out_average")
 _IMAGE_GRADS = ("g_features", "g_alpha", "g_average")
 _ELLIPSE_GRADS = ("d_means", "d_factors", "d_opacities", "d_features")
-COLOURS = 3  # features of more channels are for networks
+IMAGE_CHANNELS = 3  # of colours; features of more channels are for networks
 AVERAGES = (
     1,
     2,
@@ -241,7 +241,7 @@ def _job(
         slot_bytes=SLOT_BYTES,
         times=times,
         # Networks read channels last; each pixel's channels are averaged together.
-        rows=times > 1 or C > COLOURS,
+        rows=times > 1 or C > IMAGE_CHANNELS,
         alpha_min=settings.alpha_min,
         transmittance_min=settings.transmittance_min,
         alpha_max=settings.alpha_max,
