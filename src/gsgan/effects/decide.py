@@ -376,7 +376,7 @@ def _registration(info: SceneInfo, settings: EffectSettings) -> Effect:
 
 
 def _light(info: SceneInfo, settings: EffectSettings) -> Effect:
-    # Only a person who is seen from all sides shows where the light comes from.
+    # Seen from few sides, too few directions of normals are seen to find the light.
     measured = (
         f"the person is seen from {info.degrees_seen} of 360 degrees "
         f"(limit {settings.degrees_seen:g})"

@@ -83,27 +83,23 @@ class StyleModulation(nn.Module):
     def forward(self, h: Tensor, style: Tensor, g: Tensor) -> Tensor:
         """``h`` ``[B, C, h, w]``, styled by ``style`` ``[B, Cs, h, w]`` and ``g`` ``[B, 35]`` and
         activated."""
-        # The pose gives each channel of an item a scale and a shift.
-        given = self.from_map.bias + self.from_pose(g)
+        # channels last in memory: channels of a pixel are a row
+        rows = h.permute(0, 2, 3, 1)
 
-        # The style map adds its own at each pixel; a 1×1 convolution is a matrix product. Channels
-        # last in memory: channels of a pixel are a row.
-        weight = self.from_map.weight.flatten(1)
-        items = [
-            functional.linear(styles, weight, bias)
-            for styles, bias in zip(
-                style.permute(0, 2, 3, 1), given, strict=True
-            )
-        ]
-        # Stacking copies, which is not needed for one image.
-        modulation = (
-            items[0].unsqueeze(0) if len(items) == 1 else torch.stack(items)
+        # The pose gives each channel a scale and a shift.
+        modulation = self.from_pose(g).unsqueeze(1)
+
+        # The style map adds its own at each pixel; a 1×1 convolution is a matrix product.
+        weight = self.from_map.weight.flatten(1).mT.expand(len(h), -1, -1)
+        styles = style.permute(0, 2, 3, 1).flatten(1, 2)
+        modulation = torch.baddbmm(
+            modulation + self.from_map.bias, styles, weight
         )
+        modulation = modulation.unflatten(1, rows.shape[1:3])
 
         # Scale and shift of every pixel's channels.
         gamma, beta = modulation.chunk(2, dim=-1)
         # In float32 at least: half precision loses squares above 256 and below 2e-4.
-        rows = h.permute(0, 2, 3, 1)
         wide = rows.to(torch.promote_types(h.dtype, torch.float32))
         unit = functional.rms_norm(wide, wide.shape[-1:], eps=NORM_FLOOR).to(
             h.dtype

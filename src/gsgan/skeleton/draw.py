@@ -69,11 +69,13 @@ def draw_skeleton(
     # Masked before the arithmetic: pixels of unseen joints are arbitrary.
     a = torch.where(shown, pixels.index_select(1, starts), 0.0)
     b = torch.where(shown, pixels.index_select(1, ends), 0.0)
+
     # A line is zero beyond so many pixels, so that each group is drawn in its box alone.
     counts = [len(group) for _, group in template.draw_groups]
     reach = sigma * math.sqrt(-2 * MIN_EXPONENT)
     boxes = _boxes(a, b, shown, camera.size, counts, reach)
-    # channels last in memory, as the generator reads them
+
+    # The image is channels last in memory, as the generator reads it.
     image = a.new_zeros(len(p), *camera.size, len(counts)).movedim(-1, 1)
     for i, distance2 in enumerate(
         _distances2(a, b, shown, camera.size, counts, boxes)
@@ -176,19 +178,19 @@ def _distances2(
         length.split(counts, dim=1),
         strict=True,
     )
-    return [
-        _nearest(
-            along_x[..., columns],
-            along_y[..., rows, :],
-            across_x[..., columns],
-            across_y[..., rows, :],
-            length,
+    found = []
+    for box, along_x, along_y, across_x, across_y, length in groups:
+        rows, columns = box
+        found.append(
+            _nearest(
+                along_x[..., columns],
+                along_y[..., rows, :],
+                across_x[..., columns],
+                across_y[..., rows, :],
+                length,
+            )
         )
-        for (
-            rows,
-            columns,
-        ), along_x, along_y, across_x, across_y, length in groups
-    ]
+    return found
 
 
 def _nearest(
