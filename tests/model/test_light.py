@@ -23,12 +23,18 @@ def lambert(normals: torch.Tensor, sun: torch.Tensor) -> torch.Tensor:
     return (1 + 2 * cosine).pow(1 / GAMMA)
 
 
+def open_sky(normals: torch.Tensor) -> torch.Tensor:
+    """``[1, N, 1]``: nothing is shaded."""
+    return torch.ones_like(normals[..., :1])
+
+
 def test_a_sphere_is_as_bright_as_without_light():
     light = SharedLight("z")
     with torch.no_grad():
         light.log_sun.fill_(1.0)
         light.slope.fill_(-0.4)
-        found = light(directions(100_000))
+        normals = directions(100_000)
+        found = light(normals, open_sky(normals))
     assert found.pow(GAMMA).mean().item() == pytest.approx(1, abs=0.01)
 
 
@@ -51,7 +57,8 @@ def test_the_sun_is_found_from_one_side_and_holds_on_the_other():
         loss = torch.zeros(())
         for normals in views:
             seen = (normals[..., 1:2] < -0.1).float()
-            error = learnt * light(normals) - colours * lambert(normals, sun)
+            factors = light(normals, open_sky(normals))
+            error = learnt * factors - colours * lambert(normals, sun)
             loss = loss + (seen * error).square().mean()
         optimiser.zero_grad()
         loss.backward()
@@ -63,7 +70,8 @@ def test_the_sun_is_found_from_one_side_and_holds_on_the_other():
         for normals in views:
             hidden = normals[..., 1:2] > 0.1
             expected = (colours * lambert(normals, sun))[hidden]
-            painted = (learnt * light(normals))[hidden]
+            factors = light(normals, open_sky(normals))
+            painted = (learnt * factors)[hidden]
             assert (painted - expected).abs().mean() < 0.02
 
 
@@ -72,7 +80,8 @@ def test_light_comes_from_above_at_first(up, axis):
     sign = -1.0 if up.startswith("-") else 1.0
     normals = torch.zeros(1, 2, 3)
     normals[0, :, axis] = torch.tensor([sign, -sign])
-    above, below = SharedLight(up)(normals)[0, :, 0].tolist()
+    light = SharedLight(up)
+    above, below = light(normals, open_sky(normals))[0, :, 0].tolist()
     assert above == pytest.approx((2 / 1.25) ** (1 / GAMMA))
     assert below == pytest.approx((1 / 1.25) ** (1 / GAMMA))
 
@@ -139,7 +148,7 @@ def test_stability_normals_and_a_direction_of_zero():
     with torch.no_grad():
         light.direction.zero_()
         light.slope.fill_(50.0)
-    factor = light(normals)
+    factor = light(normals, open_sky(normals))
     factor.sum().backward()
     assert (factor > 0).all()
     for x in (normals, *light.parameters()):

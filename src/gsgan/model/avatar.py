@@ -375,10 +375,9 @@ class Avatar(nn.Module):
         p, visibility, camera, body, camera_index, _ = prepared
         raster = S = image = alpha = None
         with full_precision(p.device):
-            # The frames of the bones serve densify, the face code and Ω.
+            valid = visibility > 0
             with self.stage("skeleton"):
-                valid = visibility > 0
-                frames = bone_frames(p, valid, self.template)
+                frames = self.bone_frames(p, valid)
             follows = self.body_points or self.surface or self.segmentation
             if body is not None and follows is not None:
                 with self.stage("bones"):
@@ -404,6 +403,7 @@ class Avatar(nn.Module):
                         p, valid, camera, self.template, width
                     )
                 with self.stage("Ω"):
+                    assert frames is not None
                     pose = pose_inputs(
                         p,
                         valid,
@@ -456,7 +456,7 @@ class Avatar(nn.Module):
         self,
         p: Tensor,
         valid: Tensor,
-        frames: BoneFrames,
+        frames: BoneFrames | None,
         camera: Camera,
         body: BodyPose | None,
         pose_noise: Tensor | None = None,
@@ -477,7 +477,7 @@ class Avatar(nn.Module):
             if reach is not None:
                 chosen = seen_points(points.means, camera, reach)
             with self.stage("Ψ"):  # Sec. 3.3: Ĝ = G + Ψ(p)
-                face = face_code(p, frames.head, self.template)
+                face = self._face_code(p, frames)
                 gaussians = self.deformation(
                     p, points, camera.centre, pose_noise, face, chosen
                 )
@@ -492,11 +492,27 @@ class Avatar(nn.Module):
             gaussians, features=bounded(gaussians.features, -bound, bound)
         )
 
+    def bone_frames(self, p: Tensor, valid: Tensor) -> BoneFrames | None:
+        """The frames of the bones, if densify, the face code or Ω reads them."""
+        if (
+            self.densify is None
+            and self.generator is None
+            and not self.template.expression
+        ):
+            return None
+        return bone_frames(p, valid, self.template)
+
+    def _face_code(self, p: Tensor, frames: BoneFrames | None) -> Tensor | None:
+        """`face_code`; None for a skeleton without a face."""
+        if frames is None:
+            return None
+        return face_code(p, frames.head, self.template)
+
     def points(
         self,
         p: Tensor,
         valid: Tensor,
-        frames: BoneFrames,
+        frames: BoneFrames | None,
         body: BodyPose | None,
     ) -> Points:
         """G: Alg. 1's points, or points on the body's surface where that effect is on."""
@@ -513,15 +529,15 @@ class Avatar(nn.Module):
         assert self.deformation is not None
 
         # G in the pose, from the same frames as the pose code.
-        frames = bone_frames(p, valid, self.template)
+        frames = self.bone_frames(p, valid)
         points = self.points(p, valid, frames, body)
         code = self._code(p, frames)
         return points, self.deformation.residuals(points, code, root_of(p))
 
-    def _code(self, p: Tensor, frames: BoneFrames) -> Tensor:
+    def _code(self, p: Tensor, frames: BoneFrames | None) -> Tensor:
         """``[B, 3 J]`` Ψ's code of a pose, without noise."""
         assert self.deformation is not None
-        face = face_code(p, frames.head, self.template)
+        face = self._face_code(p, frames)
         return self.deformation.pose_code(p, root_of(p), None, face)
 
     @torch.no_grad()
@@ -531,7 +547,7 @@ class Avatar(nn.Module):
         """Stores the spread of training poses ``[F, J, 3]`` in Ψ; arguments as for `splat`."""
         if isinstance(self.deformation, Deformation):
             # The means give the places of the anchors in the training poses.
-            frames = bone_frames(p, valid, self.template)
+            frames = self.bone_frames(p, valid)
             means = self.points(p, valid, frames, body).means
             self.deformation.store_poses(
                 self._code(p, frames), means, root_of(p)

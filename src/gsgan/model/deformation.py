@@ -502,33 +502,33 @@ class Deformation(ResidualGaussians):
         if self.anchored:
             means = means[:, self.anchors]
             normals = normals[:, self.anchors]
-        raw = self._network(means, normals, pose, root)
-
-        # From the anchors to the points, each with residuals of its own.
-        if self.anchored:
-            raw = self._interpolated(raw, chosen)
-        elif chosen is not None:
-            index = chosen.unsqueeze(-1).expand(-1, -1, raw.shape[-1])
-            raw = raw.gather(1, index)
+        raw = self._at_points(self._network(means, normals, pose, root), chosen)
 
         # The table adds what neighbours do not share.
         if self.table is not None:
             table = self._active(self.table)
-            raw = raw + (
+            raw += (
                 table if chosen is None else functional.embedding(chosen, table)
             )
         residuals = self._parted(raw)
 
-        # Colours are lit by where the points face in this pose, and by what shades them.
+        # Colours are lit by where the points face in this pose, and by what shades them, which is
+        # found where the MLP is computed.
         if self.light is None:
             return residuals
+        lit = self._at_points(self.light.lit(means), chosen)
         normals = points.normals
-        lit = self.light.lit(points.means)
         if chosen is not None:
             normals = rows_of(normals, chosen)
-            lit = rows_of(lit, chosen)
         sh = brightened(residuals.sh, self.light(normals, lit))
         return replace(residuals, sh=sh)
+
+    def _at_points(self, values: Tensor, chosen: Tensor | None) -> Tensor:
+        """Values where the MLP is computed ``[B, A, C]`` at the points ``chosen [B, M]``, or at
+        all."""
+        if self.anchored:
+            return self._interpolated(values, chosen)
+        return values if chosen is None else rows_of(values, chosen)
 
     def _interpolated(self, raw: Tensor, chosen: Tensor | None) -> Tensor:
         """The anchors' ``raw [B, A, C]`` at the points ``chosen [B, M]``, or at all."""
@@ -538,7 +538,8 @@ class Deformation(ResidualGaussians):
             items.append(
                 self.interpolate(values, self.near, self.share, wanted)
             )
-        return torch.stack(items)
+        # A stack of one would copy it.
+        return items[0].unsqueeze(0) if len(items) == 1 else torch.stack(items)
 
     def _network(
         self,

@@ -84,26 +84,25 @@ class SharedLight(nn.Module):
             total += ((excess + SHADE) / SOFT + 0.5).clamp_(0, 1)
         return (total / len(AROUND)).unsqueeze(-1)
 
-    def forward(self, normals: Tensor, lit: Tensor | None = None) -> Tensor:
-        """``[B, N, 1]`` factors of colours, for normals ``[B, N, 3]`` in world axes.
+    def forward(self, normals: Tensor, lit: Tensor) -> Tensor:
+        """``[B, N, 1]`` factors of colours.
 
-        Normals of any length count by their direction; one of zero gets the light of the horizon.
-        ``lit`` is what `lit` returns; None: nothing is shaded.
+        Args:
+            normals: ``[B, N, 3]`` in world axes, of length one. Where a body's surface is crushed
+                they are shorter, and the light depends less on them.
+            lit: ``[B, N, 1]`` shares of the sun that reach the points, see `lit`.
         """
         # The sun shines on what faces it and is not in the shade of something else.
-        unit = functional.normalize(normals, dim=-1, eps=1e-6)
-        facing = functional.relu(unit @ self.towards).unsqueeze(-1)
-        if lit is not None:
-            facing = facing * lit
         sun = self.log_sun.exp()
-
-        # The sky and the ground shine on everything.
         slope = MAX_SKY_SLOPE * torch.tanh(self.slope)
-        sky = 1 + slope * (unit @ self.up).unsqueeze(-1)
+        facing, above = (
+            normals @ torch.stack([sun * self.towards, slope * self.up], dim=1)
+        ).split(1, dim=-1)
 
-        # max(0, cos) is a quarter in the mean over all directions.
-        mean = 1 + sun / 4
-        return ((sky + sun * facing) / mean).pow(1 / GAMMA)
+        # The sky and the ground shine on everything. max(0, cos) is a quarter in the mean over all
+        # directions.
+        linear = torch.addcmul(1 + above, functional.relu(facing), lit)
+        return (linear / (1 + sun / 4)).pow(1 / GAMMA)
 
 
 def cell_of(place: Tensor) -> Tensor:

@@ -111,5 +111,5 @@ def brightened(sh: Tensor, factor: Tensor) -> Tensor:
     Colours are those of `sh_to_colour`, of which 0.5 is not in the series.
     """
     scaled = factor.unsqueeze(2) * sh
-    constant = scaled[:, :, :1] + (factor - 1).unsqueeze(2) * (0.5 / _C0)
-    return torch.cat([constant, scaled[:, :, 1:]], dim=2)
+    scaled[:, :, 0].add_(factor - 1, alpha=0.5 / _C0)
+    return scaled
