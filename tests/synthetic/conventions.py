@@ -327,6 +327,16 @@ NAMES = {
         _trunk("pelvis spine_01 spine_02 spine_03 neck_01 head"),
         lambda side, part: f"{part.lower()}_{side[0].lower()}",
     ),
+    "character_creator": _named(
+        "Thigh Calf Foot ToeBase Clavicle Upperarm Forearm Hand",
+        {
+            k: f"CC_Base_{v}"
+            for k, v in _trunk(
+                "Hip Waist Spine01 Spine02 NeckTwist01 Head"
+            ).items()
+        },
+        lambda side, part: f"CC_Base_{side[0]}_{part}",
+    ),
     "cmu": _named(
         "femur tibia foot toes clavicle humerus radius hand",
         _trunk("root lowerback upperback thorax lowerneck head"),
@@ -375,6 +385,9 @@ CONVENTIONS = {
         "xsens", order="ZYX", zero=lambda c, a: turned(c, np.eye(3), {})
     ),
     "seated": convention("prefixed", zero=seated, everywhere=True),
+    "arms_lowered_little": convention(
+        "character_creator", zero=lambda c, a: lowered(c, a, 20)
+    ),
     "extra_roots_and_ends": convention(
         "unreal", roots=("World", "Armature"), ends=False
     ),

@@ -117,8 +117,8 @@ def _bone(name: str) -> tuple[str, int]:
     if not side and match and _stem(match[2], sided=True)[0]:
         side, stem = match.groups()
 
-    # Mixamo's and VRoid's prefixes.
-    stem = re.sub(r"^(mixamorig|j?bip)\d*(c(?=hips|head))?", "", stem)
+    # Prefixes of Mixamo, VRoid and Character Creator.
+    stem = re.sub(r"^(mixamorig|j?bip|ccbase)\d*(c(?=hips|head))?", "", stem)
     bone, rank = _stem(stem, sided=bool(side))
     if bone and side:
         bone = SIDE_WORDS[side] + bone
