@@ -14,6 +14,8 @@ from gsgan.splat import resolve_backend
 from gsgan.train.module import AvatarTraining
 from gsgan.utils.config import BFLOAT16_SINCE
 
+Row = tuple[str, str]  # a name, and what is said of it
+
 
 def describe(
     console: Console,
@@ -24,29 +26,56 @@ def describe(
     precision: str,
 ) -> None:
     """Prints the data, the parts with their sizes, the effects and the stand-ins in use."""
-    info = data.info
-    avatar = module.avatar
+    # The data, the parts and what they learn from, then how they are trained.
+    table = Table(title=f"gsgan: {folder}", show_header=False)
+    schedule = module.schedule
+    rows = [
+        *_data(data),
+        *_parts(module),
+        *_gaussians(module, data),
+        *_losses(module, data),
+        *_rasteriser(module, device),
+        ("precision", _precision(precision)),
+        (
+            "schedule",
+            f"segmentation {schedule.segmentation}, Step I {schedule.step_one}, "
+            f"Step II {schedule.step_two}",
+        ),
+    ]
+    for name, text in rows:
+        table.add_row(name, text)
+    console.print(table)
 
-    # The data.
+    # The stand-ins and the effects.
+    for mark in module.marks:
+        console.print(f"stand-in in use: {mark}", highlight=False)
+    console.print(module.avatar.effects.table())
+
+
+def _data(data: GsganData) -> list[Row]:
+    """The images, and the memory that is kept for them."""
+    info = data.info
     held_out = ", ".join(
         f"{len(data.dataset(name))} {name}" for name in data.eval_names
     )
-    table = Table(title=f"gsgan: {folder}", show_header=False)
-    table.add_row(
-        "data",
-        f"{len(data.dataset('train'))} training images: {info.n_train_cameras} cameras, "
-        f"{info.frames} frames; held out: {held_out}",
-    )
     processes = data.loading_processes
-    megabytes = data.cache_mb / data.loading_processes
+    megabytes = data.cache_mb / processes
     each = (
         "" if processes == 1 else f" in each of {processes} loading processes"
     )
-    table.add_row(
-        "cache of images", f"{megabytes:,.0f} MB{each} (data.cache_mb)"
-    )
+    return [
+        (
+            "data",
+            f"{len(data.dataset('train'))} training images: {info.n_train_cameras} cameras, "
+            f"{info.frames} frames; held out: {held_out}",
+        ),
+        ("cache of images", f"{megabytes:,.0f} MB{each} (data.cache_mb)"),
+    ]
 
-    # The parts and their sizes.
+
+def _parts(module: AvatarTraining) -> list[Row]:
+    """The networks and their sizes."""
+    avatar = module.avatar
     plain = getattr(avatar.deformation, "from_normal", avatar) is None
     parts = {
         "Ψ, without normals" if plain else "Ψ": avatar.deformation,
@@ -57,64 +86,73 @@ def describe(
         "discriminator": module.discriminator,
         "segmentation S": avatar.segmentation,
     }
+    rows = []
     for name, part in parts.items():
         if part is not None:
-            table.add_row(
-                name,
-                f"{sum(p.numel() for p in part.parameters()):,} parameters",
-            )
+            size = sum(p.numel() for p in part.parameters())
+            rows.append((name, f"{size:,} parameters"))
+    return rows
 
-    # The Gaussians.
-    on_body = avatar.body_points
+
+def _gaussians(module: AvatarTraining, data: GsganData) -> list[Row]:
+    """The Gaussians on the body, and where registration found its surface."""
+    rows = []
+    on_body = module.avatar.body_points
     if on_body is not None:
-        apart = on_body.pixels_apart(info.scale_train[1])
+        apart = on_body.pixels_apart(data.info.scale_train[1])
         number = f"{len(on_body.points):,} on the body"
-        table.add_row(
-            "Gaussians",
-            f"{number}, {apart:.1f} pixels apart in the training images",
+        rows.append(
+            (
+                "Gaussians",
+                f"{number}, {apart:.1f} pixels apart in the training images",
+            )
         )
-
-    # The surface of the training frames.
     if module.registered is not None:
         metres = module.registered.offsets.norm(dim=2).median()
-        table.add_row(
-            "registration",
-            f"{len(module.registered)} frames; their surface is {1000 * float(metres):.0f} mm "
-            "(median) from where their poses put it",
+        rows.append(
+            (
+                "registration",
+                f"{len(module.registered)} frames; their surface is "
+                f"{1000 * float(metres):.0f} mm (median) from where their poses put it",
+            )
         )
+    return rows
 
-    # The losses that need other networks or labels.
+
+def _losses(module: AvatarTraining, data: GsganData) -> list[Row]:
+    """The losses that need other networks or labels."""
+    rows = []
     if module.perceptual is not None:
         every = module.step_two.perceptual_every
         when = "every iteration" if every == 1 else f"every {every} iterations"
-        table.add_row(
-            "perceptual loss",
-            f"{module.perceptual.description}; {when} of Step II",
+        rows.append(
+            (
+                "perceptual loss",
+                f"{module.perceptual.description}; {when} of Step II",
+            )
         )
+
+    # The segmentation has a row of its size, if it is built.
+    avatar = module.avatar
     if avatar.segmentation is None:
-        table.add_row("segmentation S", f"not built: {avatar.segmentation_why}")
+        rows.append(("segmentation S", f"not built: {avatar.segmentation_why}"))
     else:
         source = (
             "part labels"
-            if info.has_labels
+            if data.info.has_labels
             else "masks: the data has no part labels"
         )
-        table.add_row("", f"{avatar.segmentation_why}; S learns from {source}")
+        rows.append(("", f"{avatar.segmentation_why}; S learns from {source}"))
+    return rows
 
-    # The rasteriser, the precision and the schedule.
-    if avatar.splats is not None:
-        backend = resolve_backend(avatar.backend, device, avatar.accuracy)[0]
-        table.add_row("rasteriser", backend)
-    table.add_row("precision", _precision(precision))
-    s = module.schedule
-    table.add_row(
-        "schedule",
-        f"segmentation {s.segmentation}, Step I {s.step_one}, Step II {s.step_two}",
-    )
-    console.print(table)
-    for mark in module.marks:
-        console.print(f"stand-in in use: {mark}", highlight=False)
-    console.print(avatar.effects.table())
+
+def _rasteriser(module: AvatarTraining, device: torch.device) -> list[Row]:
+    """The rasteriser's backend, if anything is splatted."""
+    avatar = module.avatar
+    if avatar.splats is None:
+        return []
+    backend, _ = resolve_backend(avatar.backend, device, avatar.accuracy)
+    return [("rasteriser", backend)]
 
 
 def _precision(chosen: str) -> str:
