@@ -23,23 +23,29 @@ def chaos(tmp_path_factory):
     print(dict(made.counts))
 
 
-def survives(chaos, stage: str) -> None:
+def survives(chaos, stage: str, ways: tuple[str, ...] = WAYS) -> None:
     truth = chaos.prepare(stage)
     if stage == "train":  # the input of the others
         shutil.copytree(
             chaos.folder / "whole" / "train" / "run", chaos.base / "run"
         )
-    for way in WAYS:
+    for way in ways:
         chaos.kill(stage, way, truth)
     assert not chaos.problems
     assert chaos.kills(stage) >= 2  # the others came too late
 
 
-@pytest.mark.parametrize("stage", ["data", "prepare"])
+@pytest.mark.parametrize(
+    ("stage", "ways"),
+    [
+        ("data", ("operation", "SIGKILL", "SIGTERM")),
+        ("prepare", ("operation", "no space", "SIGINT")),
+    ],
+)
 def test_a_command_that_is_killed_finishes_when_it_is_started_again(
-    chaos, stage
+    chaos, stage, ways
 ):
-    survives(chaos, stage)
+    survives(chaos, stage, ways)
 
 
 @pytest.mark.slow

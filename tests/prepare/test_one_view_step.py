@@ -143,7 +143,7 @@ def dense_step(
         return torch.cat([part.flatten() for part in parts])
 
     z = torch.zeros(F * D + len(at.shared), dtype=torch.float64)
-    J = torch.autograd.functional.jacobian(residuals, z)
+    J = torch.func.jacfwd(residuals)(z)
     fixed = torch.cat([torch.zeros(F * D, dtype=torch.bool), ~problem.free])
     J[:, fixed] = 0
     H = J.mT @ J + fixed.double().diag()
