@@ -385,7 +385,7 @@ CONVENTIONS = {
         "xsens", order="ZYX", zero=lambda c, a: turned(c, np.eye(3), {})
     ),
     "seated": convention("prefixed", zero=seated, everywhere=True),
-    "arms_lowered_little": convention(
+    "arms_20_degrees_down": convention(
         "character_creator", zero=lambda c, a: lowered(c, a, 20)
     ),
     "extra_roots_and_ends": convention(

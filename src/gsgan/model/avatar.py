@@ -377,7 +377,7 @@ class Avatar(nn.Module):
         with full_precision(p.device):
             valid = visibility > 0
             with self.stage("skeleton"):
-                frames = self.bone_frames(p, valid)
+                frames = self._bone_frames(p, valid)
             follows = self.body_points or self.surface or self.segmentation
             if body is not None and follows is not None:
                 with self.stage("bones"):
@@ -492,7 +492,7 @@ class Avatar(nn.Module):
             gaussians, features=bounded(gaussians.features, -bound, bound)
         )
 
-    def bone_frames(self, p: Tensor, valid: Tensor) -> BoneFrames | None:
+    def _bone_frames(self, p: Tensor, valid: Tensor) -> BoneFrames | None:
         """The frames of the bones, if densify, the face code or Ω reads them."""
         if (
             self.densify is None
@@ -529,7 +529,7 @@ class Avatar(nn.Module):
         assert self.deformation is not None
 
         # G in the pose, from the same frames as the pose code.
-        frames = self.bone_frames(p, valid)
+        frames = self._bone_frames(p, valid)
         points = self.points(p, valid, frames, body)
         code = self._code(p, frames)
         return points, self.deformation.residuals(points, code, root_of(p))
@@ -547,7 +547,7 @@ class Avatar(nn.Module):
         """Stores the spread of training poses ``[F, J, 3]`` in Ψ; arguments as for `splat`."""
         if isinstance(self.deformation, Deformation):
             # The means give the places of the anchors in the training poses.
-            frames = self.bone_frames(p, valid)
+            frames = self._bone_frames(p, valid)
             means = self.points(p, valid, frames, body).means
             self.deformation.store_poses(
                 self._code(p, frames), means, root_of(p)

@@ -58,7 +58,8 @@ class SharedLight(nn.Module):
 
         A shadow map: the plane across the sun is divided into cells, each of which keeps how near
         to the sun its nearest point is. A point is shaded as far as the cells around it hold points
-        that are nearer by more than `SHADE`. There is no gradient.
+        that are nearer by more than `SHADE`. Points farther apart than the cells cast lighter
+        shadows. There is no gradient.
         """
         # Axes across the sun; a direction of zero has none, and then nothing is shaded.
         towards = self.towards

@@ -58,8 +58,8 @@ ACCELERATION = 8.0  # standard deviation, metres per square second
 ACCELERATIONS = 10.0  # independent accelerations per second
 SLIDING = 0.1  # speed of a standing foot, metres per second
 GROUND = 0.02  # distance of a standing foot from the ground, metres
-# Horizontal distance from trunk to standing feet, metres. It is more than the usual 8 cm, since the
-# frames of a stance are not independent.
+# Standard deviation of the horizontal distance from trunk to standing feet, metres. It is more than
+# the usual 8 cm, since the frames of a stance are not independent.
 BALANCE = 0.3
 STANDING_SPEED = 0.25  # metres per second: a slower foot stands
 OUTLIER = 3.0  # standard deviations at which a landmark counts half
