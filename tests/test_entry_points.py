@@ -145,28 +145,30 @@ def test_the_list_of_commands(tmp_path):
     assert "gsgan.evaluate" in result.stdout
 
 
-def test_one_program_runs_every_command(tmp_path):
+def test_one_program_runs_every_command(tmp_path, inside, monkeypatch):
     """``gsgan train`` is ``python -m gsgan.train``: the same output, the same status."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     target = EntryPoint("gsgan", project["scripts"]["gsgan"], "console_scripts")
     assert target.load() is gsgan.__main__.main
 
-    def ran(*words: str) -> tuple[int, str, str]:
+    for words in (("demo", "--help"), ("render", "run=nowhere")):
+        command, *rest = words
         done = subprocess.run(
-            [sys.executable, "-m", *words],
+            [sys.executable, "-m", "gsgan", *words],
             cwd=tmp_path,
+            env=ENVIRONMENT,
             capture_output=True,
             text=True,
             check=False,
         )
-        return done.returncode, done.stdout, done.stderr
-
-    for words in (("demo", "--help"), ("render", "run=nowhere")):
-        command, *rest = words
-        assert ran("gsgan", *words) == ran(f"gsgan.{command}", *rest)
-    status, _, message = ran("gsgan", "nonsense")
-    assert status == 1
-    assert "gsgan.nonsense is not a command" in message
+        assert vars(inside(command, *rest)) == {
+            "returncode": done.returncode,
+            "stdout": done.stdout,
+            "stderr": done.stderr,
+        }
+    monkeypatch.setattr(sys, "argv", ["gsgan", "nonsense"])
+    with pytest.raises(SystemExit, match=r"gsgan\.nonsense is not a command"):
+        gsgan.__main__.main()
 
 
 def weights(run: Path) -> dict[str, torch.Tensor]:

@@ -48,8 +48,7 @@ def modules_after(statement: str) -> set[str]:
     return {name.partition(".")[0] for name in result.stdout.split()}
 
 
-def test_importing_gsgan_loads_nothing_and_the_rasteriser_torch_alone():
-    assert "torch" not in modules_after("import gsgan")
+def test_importing_the_rasteriser_loads_torch_alone():
     loaded = modules_after("import gsgan.splat")
     assert "torch" in loaded
     assert not loaded & set(HEAVY)

@@ -134,9 +134,14 @@ def avatar_of(placed) -> SimpleNamespace:
     return SimpleNamespace(body_points=placed, window=lambda *_: None)
 
 
-def test_the_surface_of_each_frame_is_found(painted):
+@pytest.fixture(scope="module")
+def found(painted):
+    """The offsets of each frame, before any is explained by the pose."""
     surface = MovingSurface(avatar_of(painted.placed), painted, Registration())
-    found = surface.registered(range(4), Console(quiet=True))
+    return surface.registered(range(4), Console(quiet=True))
+
+
+def test_the_surface_of_each_frame_is_found(painted, found):
     assert found.isfinite().all()
 
     def apart(offsets):
@@ -161,17 +166,15 @@ def test_a_body_whose_surface_is_right_stays(painted):
     assert found.norm(dim=2).median() < 0.0035
 
 
-def test_what_the_pose_explains_starts_the_offsets(painted):
+def test_what_the_pose_explains_starts_the_offsets(painted, found):
     placed = deepcopy(painted.placed)
     registered = Registration()(avatar_of(placed), painted, Console(quiet=True))
-    surface = MovingSurface(avatar_of(painted.placed), painted, Registration())
-    whole = surface.registered(range(4), Console(quiet=True))
     with torch.no_grad():
         for frame, pose in enumerate(painted.poses):
             rest = registered.of(torch.tensor([frame]))
-            found = placed.offset(replace(pose, offsets=rest))[0]
-            expected = placed.points.learnt.interpolated(whole[frame])
-            torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
+            explained = placed.offset(replace(pose, offsets=rest))[0]
+            expected = placed.points.learnt.interpolated(found[frame])
+            torch.testing.assert_close(explained, expected, atol=1e-4, rtol=0)
 
 
 def test_linear_offsets_are_found_and_noise_is_not():

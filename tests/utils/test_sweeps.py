@@ -170,23 +170,47 @@ def test_slurm_gets_one_task_per_device():
     )
 
 
-def sweep(
-    folder: Path, capture: Path, *given: str
-) -> subprocess.CompletedProcess[str]:
-    fixed = [
+def sweep_words(folder: Path, capture: Path) -> list[str]:
+    """A sweep's command without what it changes."""
+    steps = ("step_one", "step_two", "segmentation")
+    return [
+        "-m",
         *TINY,
         f"data.root={capture}",
         f"hydra.sweep.dir={folder}",
         "trainer=cpu",
+        *(f"training.schedule.{name}=1" for name in steps),
     ]
-    fixed += [
-        f"training.schedule.{name}=1"
-        for name in ("step_one", "step_two", "segmentation")
-    ]
-    command = [sys.executable, "-m", "gsgan.train", "-m", *fixed, *given]
+
+
+def sweep(
+    folder: Path, capture: Path, *given: str
+) -> subprocess.CompletedProcess[str]:
+    words = [*sweep_words(folder, capture), *given]
+    command = [sys.executable, "-m", "gsgan.train", *words]
     return subprocess.run(command, check=False, capture_output=True, text=True)
 
 
+ONE_FAILS = ("seed=-1,0", "model=splat_only", "evaluate=false")
+
+
+def one_has_failed(folder: Path, done) -> None:
+    """The first of two jobs has ended with an error, the second well, and the sweep says so."""
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert "1 jobs are unfinished" in done.stdout
+    bad, good = sorted(path for path in folder.iterdir() if path.is_dir())
+    assert "seed must be a whole number" in sweeps.unfinished(bad)
+    assert sweeps.unfinished(good) is None
+    assert (good / "checkpoints" / "last.ckpt").is_file()
+
+
+def test_a_failed_job_is_named_and_ends_no_other(capture, tmp_path, inside):
+    folder = tmp_path / "sweep"
+    done = inside("train", *sweep_words(folder, capture), *ONE_FAILS)
+    one_has_failed(folder, done)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "launcher",
     [
@@ -196,22 +220,14 @@ def sweep(
         ),
         pytest.param(
             ("hydra/launcher=ray", "+hydra.launcher.ray.init.num_cpus=2"),
-            marks=(plugin("ray_launcher"), pytest.mark.slow),
+            marks=plugin("ray_launcher"),
         ),
     ],
     ids=["joblib", "ray"],
 )
-def test_a_failed_job_is_named_and_ends_no_other(capture, tmp_path, launcher):
-    given = ("model=splat_only", "evaluate=false", *launcher)
-    done = sweep(tmp_path / "sweep", capture, "seed=-1,0", *given)
-    assert done.returncode == 1, done.stdout + done.stderr
-    assert "1 jobs are unfinished" in done.stdout
-    bad, good = sorted(
-        path for path in (tmp_path / "sweep").iterdir() if path.is_dir()
-    )
-    assert "seed must be a whole number" in sweeps.unfinished(bad)
-    assert sweeps.unfinished(good) is None
-    assert (good / "checkpoints" / "last.ckpt").is_file()
+def test_launchers_name_a_failed_job(capture, tmp_path, launcher):
+    folder = tmp_path / "sweep"
+    one_has_failed(folder, sweep(folder, capture, *ONE_FAILS, *launcher))
 
 
 @pytest.mark.slow
