@@ -143,7 +143,7 @@ class Painter:
 @contextmanager
 def changed(avatar: Avatar, way: Way) -> Iterator[None]:
     """Gives the avatar the accuracy and window of a way, and restores its own afterwards."""
-    before = avatar.accuracy, avatar.window_margin
+    before = avatar.accuracy, avatar.window_margin, avatar.generator_margin
     # how pixels are formed belongs to the model, not to the preset
     if way.accuracy is not None:
         formed = {
@@ -151,11 +151,12 @@ def changed(avatar: Avatar, way: Way) -> Iterator[None]:
             for k in ("low_pass", "supersample", "antialias")
         }
         avatar.accuracy = replace(way.accuracy, **formed)
-    avatar.window_margin = None if way.whole else avatar.window_margin
+    if way.whole:
+        avatar.window_margin = avatar.generator_margin = None
     try:
         yield
     finally:
-        avatar.accuracy, avatar.window_margin = before
+        avatar.accuracy, avatar.window_margin, avatar.generator_margin = before
         set_backend(avatar, "auto")
 
 

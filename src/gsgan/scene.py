@@ -8,6 +8,7 @@ and one pose per batch item; images are RGB in [0, 1].
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -333,6 +334,16 @@ class Window:
             corners.append((top + y, left + x))
         return Window(tuple(corners), size, self.whole)
 
+    def within(self, window: Window) -> Window:
+        """Boxes of images that are themselves boxes: where they are in the whole images."""
+        corners = tuple(
+            (top + outer_top, left + outer_left)
+            for (top, left), (outer_top, outer_left) in zip(
+                self.corners, window.corners, strict=True
+            )
+        )
+        return Window(corners, self.size, window.whole)
+
     def camera(self, camera: Camera) -> Camera:
         """The cameras of the boxes."""
         shift = torch.zeros_like(camera.K)
@@ -343,8 +354,20 @@ class Window:
             camera,
             K=camera.K - shift,
             size=self.size,
-            whole_height=self.whole[0],
+            whole_height=camera.whole_height or self.whole[0],
         )
+
+    def raster(self, raster: Raster) -> Raster:
+        """The boxes of what was splatted."""
+        fine = raster.fine
+        if fine is not None:
+            k = fine.shape[-1] // raster.alpha.shape[-1]
+            corners = tuple((k * top, k * left) for top, left in self.corners)
+            height, width = self.size
+            fine = replace(
+                self, corners=corners, size=(k * height, k * width)
+            ).cut(fine)
+        return Raster(self.cut(raster.features), self.cut(raster.alpha), fine)
 
     def cut(self, images: Tensor) -> Tensor:
         """``[B, ..., H, W]`` reduced to the boxes."""
@@ -429,7 +452,6 @@ def body_window(
         .minimum(everywhere)
     )
 
-    # All boxes of a batch have the size of the largest, each about its own centre.
     bounds = torch.cat([low, high], dim=-1).long().tolist()
     w = _side(
         max(minimum, *(x1 - x0 for x0, _, x1, _ in bounds)), multiple, width
@@ -442,6 +464,50 @@ def body_window(
         for x0, y0, x1, y1 in bounds
     )
     return Window(corners, (h, w), (height, width))
+
+
+def painted_window(alpha: Tensor, *, margin: int, multiple: int) -> Window:
+    """The boxes round the pixels of images where something was splatted.
+
+    They begin at multiples of ``multiple`` pixels, so that strided convolutions group the same
+    pixels as in the whole images.
+
+    Args:
+        alpha: ``[B, 1, H, W]``, on the CPU.
+        margin: pixels kept round every pixel above 0.
+        multiple: of the corners and sides, pixels, where the image has room.
+    """
+    rows = _painted_range(alpha.amax(dim=(1, 3)), margin, multiple)
+    columns = _painted_range(alpha.amax(dim=(1, 2)), margin, multiple)
+    return Window(
+        corners=tuple(zip(rows.starts, columns.starts, strict=True)),
+        size=(rows.side, columns.side),
+        whole=(alpha.shape[2], alpha.shape[3]),
+    )
+
+
+class _Ranges(NamedTuple):
+    """Where the boxes begin along one side of their images, and how long they are, pixels."""
+
+    starts: list[int]
+    side: int
+
+
+def _painted_range(alpha: Tensor, margin: int, multiple: int) -> _Ranges:
+    """Round what is above 0 in each row of ``[B, L]``."""
+    starts = []
+    side = multiple
+    for line in alpha:
+        painted = line.nonzero().flatten().tolist() or [0]
+        first = max(0, painted[0] - margin)
+        start = first // multiple * multiple
+        starts.append(start)
+        side = max(side, painted[-1] + 1 + margin - start)
+
+    # All boxes are as long as the longest.
+    limit = alpha.shape[1]
+    side = _side(side, multiple, limit)
+    return _Ranges([min(start, limit - side) for start in starts], side)
 
 
 def _side(length: int, multiple: int, limit: int) -> int:

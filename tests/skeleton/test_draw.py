@@ -47,8 +47,9 @@ def test_against_the_slow_reference():
     valid = torch.ones(1, 33, dtype=torch.bool)
     valid[0, [15, 30]] = False
     fast = draw_skeleton(p, valid, cam)[0]
+    # lines end where they are exp(-16)
     torch.testing.assert_close(
-        fast, slow_drawing(p, valid, cam, 0.8), atol=1e-9, rtol=0
+        fast, slow_drawing(p, valid, cam, 0.8), atol=1.2e-7, rtol=0
     )
 
 
@@ -83,7 +84,7 @@ def test_line_width_scales_with_the_image(height, sigma):
     pixel = torch.tensor([column + 0.5, row + 0.5], dtype=torch.float64)
     distance = float((pixel - a) @ normal)
     assert float(image[row, column]) == pytest.approx(
-        math.exp(-(distance**2) / 2 / sigma**2)
+        math.exp(-(distance**2) / 2 / sigma**2), abs=1.2e-7
     )
 
 

@@ -41,6 +41,7 @@ class Whole(nn.Module):
 
         # A window would have another size in every pose.
         avatar.window_margin = None
+        avatar.generator_margin = None
 
     def forward(
         self,

@@ -33,6 +33,7 @@ from gsgan.scene import (
     Window,
     body_window,
     cat,
+    painted_window,
 )
 from gsgan.skeleton import (
     MEDIAPIPE33,
@@ -92,6 +93,20 @@ class Prepared(NamedTuple):
         )
 
 
+class GeneratorInputs(NamedTuple):
+    """What the generator gets besides F.
+
+    Args:
+        S: ``[B, classes, H, W]`` probabilities, or None.
+        drawn: ``[B, groups, H, W]`` p₂D.
+        pose: Ω and the joints, see `pose_inputs`.
+    """
+
+    S: Tensor | None
+    drawn: Tensor
+    pose: tuple[Tensor, Tensor]
+
+
 class Avatar(nn.Module):
     """One person: Gaussians, segmentation, pose code and generator.
 
@@ -115,6 +130,8 @@ class Avatar(nn.Module):
         backend: that rasterises F, see `gsgan.splat.rasterise`.
         window_margin, window_multiple, window_minimum: of the rendered window, metres and pixels;
             see `gsgan.scene.body_window`. No margin renders whole images.
+        generator_margin: pixels round what is splatted that the generator paints, on the CPU and
+            not in training; None paints the whole window.
 
     Source: paper Fig. 3 and Sec. 3.
     """
@@ -147,6 +164,7 @@ class Avatar(nn.Module):
         window_margin: float | None = 0.25,
         window_multiple: int = 16,
         window_minimum: int = 32,
+        generator_margin: int | None = 8,
     ) -> None:
         super().__init__()
 
@@ -160,6 +178,7 @@ class Avatar(nn.Module):
         self.window_margin = window_margin
         self.window_multiple = window_multiple
         self.window_minimum = window_minimum
+        self.generator_margin = generator_margin
 
         # Parts of Step I: G, Ψ or the surface's Gaussians.
         self.deformation = deformation
@@ -306,7 +325,7 @@ class Avatar(nn.Module):
         prepared = self.prepared(
             skeleton, visibility, camera, body, camera_index
         )
-        rendering = self._rendered(
+        rendering, painted = self._rendered(
             prepared.to(device),
             pose_noise=pose_noise,
             generate=generate,
@@ -314,12 +333,17 @@ class Avatar(nn.Module):
             reach=reach,
         )
 
+        # The part of the whole image that was rendered.
+        window = prepared.window
+        if painted is not None:
+            window = painted if window is None else painted.within(window)
+
         # Image and maps in the whole image.
         rendering = rendering if maps else rendering.only_image()
-        if prepared.window is None:
+        if window is None:
             return rendering
         with self.stage("paste"):
-            return rendering.pasted(prepared.window)
+            return rendering.pasted(window)
 
     def prepared(
         self,
@@ -370,10 +394,11 @@ class Avatar(nn.Module):
         generate: bool,
         supersample: bool,
         reach: float | None,
-    ) -> Rendering:
-        """The drawings and images that the cameras see (paper Fig. 3)."""
+    ) -> tuple[Rendering, Window | None]:
+        """The drawings and images that the cameras see (paper Fig. 3), and of which part of their
+        images they are; None means all."""
         p, visibility, camera, body, camera_index, _ = prepared
-        raster = S = image = alpha = None
+        raster = S = image = alpha = painted = None
         with full_precision(p.device):
             valid = visibility > 0
             with self.stage("skeleton"):
@@ -391,53 +416,24 @@ class Avatar(nn.Module):
             if gaussians is not None:
                 raster = self._rasterised(gaussians, camera, supersample)
 
-            # The generator's other inputs: S, the drawn skeleton p₂D and the rotations Ω.
+            # The generator paints where something was splatted, and has other inputs.
             if generate and self.generator is not None:
-                if self.segmentation is not None:
-                    # trained on its own, then frozen
-                    with self.stage("S"), torch.no_grad():
-                        S = self.segmentation(body, camera)  # Sec. 3.4
-                with self.stage("p₂D"):
-                    width = line_width(camera)
-                    drawn = draw_skeleton(
-                        p, valid, camera, self.template, width
-                    )
-                with self.stage("Ω"):
-                    assert frames is not None
-                    pose = pose_inputs(
-                        p,
-                        valid,
-                        frames,
-                        camera,
-                        self.template,
-                        self.body_height,
-                    )
+                painted = None if raster is None else self._painted(raster)
+                if painted is not None and raster is not None:
+                    raster = painted.raster(raster)
+                    camera = painted.camera(camera)
+                inputs = self._generator_inputs(p, valid, frames, camera, body)
 
         # Sec. 3.5: the pose code and the UNet run in the precision of the trainer.
-        if (
-            generate
-            and self.generator is not None
-            and self.pose_encoder is not None
-        ):
-            with self.stage("pose encoder"):
-                g = self.pose_encoder(*pose)
-            with self.stage("UNet"):
-                # image_to_image: the drawing stands in F's place
-                maps = {"F": drawn, "p2d": None}
-                if raster is not None:
-                    maps = {
-                        "F": raster.features,
-                        "fine": raster.fine,
-                        "alpha": raster.alpha,
-                    }
-                    maps["p2d"] = drawn
-                generated = self.generator(S=S, g=g, **maps).to(p.dtype)
+        if generate and self.generator is not None:
+            S = inputs.S
+            generated = self._generated(inputs, raster).to(p.dtype)
             image = generated[:, :3]
             alpha = generated[:, 3:]
 
         # Nothing is splatted in image_to_image.
         if raster is None:
-            return Rendering(image, alpha, segmentation=S)
+            return Rendering(image, alpha, segmentation=S), None
 
         # Step I's colour is the image where there is no generator.
         if self.generator is None:
@@ -448,9 +444,75 @@ class Avatar(nn.Module):
         )
 
         # Step I's colour and I_pred take on the tint of the training camera.
-        if self.colour is None or camera_index is None:
-            return rendering
-        return self._corrected(rendering, raster, self.colour, camera_index)
+        if self.colour is not None and camera_index is not None:
+            rendering = self._corrected(
+                rendering, raster, self.colour, camera_index
+            )
+        return rendering, painted
+
+    def _generator_inputs(
+        self,
+        p: Tensor,
+        valid: Tensor,
+        frames: BoneFrames | None,
+        camera: Camera,
+        body: BodyPose | None,
+    ) -> GeneratorInputs:
+        """What the generator gets besides F."""
+        S = None
+        if self.segmentation is not None:
+            # trained on its own, then frozen
+            with self.stage("S"), torch.no_grad():
+                S = self.segmentation(body, camera)  # Sec. 3.4
+        with self.stage("p₂D"):
+            width = line_width(camera)
+            drawn = draw_skeleton(p, valid, camera, self.template, width)
+        with self.stage("Ω"):
+            assert frames is not None
+            height = self.body_height
+            pose = pose_inputs(p, valid, frames, camera, self.template, height)
+        return GeneratorInputs(S, drawn, pose)
+
+    def _generated(
+        self, inputs: GeneratorInputs, raster: Raster | None
+    ) -> Tensor:
+        """``[B, 4, H, W]`` I_pred and its alpha."""
+        assert self.generator is not None
+        assert self.pose_encoder is not None
+        with self.stage("pose encoder"):
+            g = self.pose_encoder(*inputs.pose)
+        with self.stage("UNet"):
+            # image_to_image: the drawing stands in F's place
+            maps = {"F": inputs.drawn, "p2d": None}
+            if raster is not None:
+                maps = {
+                    "F": raster.features,
+                    "fine": raster.fine,
+                    "alpha": raster.alpha,
+                    "p2d": inputs.drawn,
+                }
+            generated: Tensor = self.generator(S=inputs.S, g=g, **maps)
+        return generated
+
+    def _painted(self, raster: Raster) -> Window | None:
+        """The part of the images that the generator paints; None means all.
+
+        On a GPU this is all, since reading the part would make the host wait; in training too, for
+        the losses compare whole windows.
+        """
+        if (
+            self.generator is None
+            or self.generator_margin is None
+            or self.training
+            or raster.alpha.device.type != "cpu"
+            or torch.compiler.is_compiling()
+        ):
+            return None
+        return painted_window(
+            raster.alpha,
+            margin=self.generator_margin,
+            multiple=self.window_multiple,
+        )
 
     def splat(
         self,

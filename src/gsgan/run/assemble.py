@@ -48,6 +48,7 @@ OPTIONS = (
     "window_margin",
     "window_multiple",
     "window_minimum",
+    "generator_margin",
 )  # of `Avatar`
 
 
@@ -143,7 +144,7 @@ class AvatarParts:
         pose_encoder, generator: Ω (or the flat skeleton) to g; the UNet. Without them Step I's
             colour is the image (``splat_only``).
         low_pass, supersample, backend: of F, and of S as far as it has them.
-        window_margin, window_multiple, window_minimum: of `Avatar`.
+        window_margin, window_multiple, window_minimum, generator_margin: of `Avatar`.
 
     Raises:
         ValueError: on parts that do not go together.
@@ -166,6 +167,7 @@ class AvatarParts:
     window_margin: float | None = 0.25
     window_multiple: int = 16
     window_minimum: int = 32
+    generator_margin: int | None = 8
 
     def __post_init__(self) -> None:
         one_of("model.backend", self.backend, BACKENDS)

@@ -16,8 +16,8 @@ MIN_SEGMENT_PX = 1e-2
 """Pixels: a shorter segment is drawn as a point, with a finite slope."""
 MIN_SIGMA = 0.8
 """Pixels: the minimum line width."""
-MIN_EXPONENT = -60.0
-"""Below this exponent a line is exactly zero: at 1e-26, eleven sigmas away."""
+MIN_EXPONENT = -16.0
+"""Below this exponent a line is exactly zero: at 1e-7, 5.7 sigmas away."""
 
 
 def draw_skeleton(
