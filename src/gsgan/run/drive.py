@@ -301,19 +301,7 @@ def _shown(p: Float, proportions: Proportions) -> Float:
 def _from_file(
     options: MotionOptions, run: Run, path: str, fps: float
 ) -> Drive:
-    # The clip, as the file has it.
-    proportions = run.proportions
-    smpl = options.smpl or run.body_file
-    skeleton = options.skeleton
-    model = None if smpl is None else Path(smpl).expanduser()
-    asf = None if skeleton is None else Path(skeleton).expanduser()
-    animation = None if options.animation is None else str(options.animation)
-
-    # What the readers need to know of the subject.
-    source = Source(proportions, model, asf, options.up, animation)
-    motion = read_motion(Path(path).expanduser(), source)
-    motion = checked(motion, float(options.min_visibility))
-    _refuse_swapped(motion)
+    motion = _clip(options, run, Path(path).expanduser())
 
     # The user's rate comes before the file's, but the file's up axis before the user's.
     rate = options.motion_fps or motion.fps
@@ -325,42 +313,20 @@ def _from_file(
     # always retargeted, because transitions need every joint.
     own = not options.retarget
     if options.retarget == "auto":
-        own = is_own(motion, proportions)
-    if options.retarget is False and motion.detached:
-        raise ConfigError(
-            f"retarget=false is not supported for {motion.path}: leave retarget out"
-        )
+        own = is_own(motion, run.proportions)
     own = own and not motion.detached and not isinstance(options.motion, list)
 
     # Joints are interpolated in time; visibility and body pose are of the nearest frame.
-    times = frame_times(len(motion), rate, fps)
-    nearest = np.rint(times).astype(int)
-    visibility = motion.visibility[nearest]
     body = None
     if own:
+        nearest = np.rint(frame_times(len(motion), rate, fps)).astype(int)
         p = resampled(motion.p, rate, fps)
+        visibility = motion.visibility[nearest]
         if motion.body is not None and run.avatar.needs_body:
             body = motion.body[torch.from_numpy(nearest)]
     else:
-        # In standard axes: expressions on the subject's face, directions on the subject's
-        # bones, and the place in the scene.
-        standard = upright(proportions.up)
-        centre = standard @ np.array(run.scene.centre)
-        p = completed(motion, up)
-        if p.shape[1] > FACE.start:
-            p = p if motion.detached else face_in_head(p)
-            p[:, FACE] = expressed(p[:, FACE], run.face)
-        p = retargeted(resampled(p, rate, fps), proportions)
-        p = placed(
-            p,
-            proportions,
-            centre,
-            fps,
-            ground=options.ground,
-            stay=options.stay,
-        )
-        p = p @ standard
-        visibility = _shown(p, proportions)
+        p = _on_subject(options, run, motion, up, rate, fps)
+        visibility = _shown(p, run.proportions)
 
     # One line on what was read and what was made of it.
     bones = "bones as they are" if own else "on the subject's bones"
@@ -383,6 +349,65 @@ def _from_file(
         numbers=list(range(len(p))),
         text=text,
     )
+
+
+def _clip(options: MotionOptions, run: Run, path: Path) -> Clip:
+    """The motion as its file has it, checked."""
+    # What the readers need to know of the subject.
+    smpl = options.smpl or run.body_file
+    skeleton = options.skeleton
+    source = Source(
+        run.proportions,
+        None if smpl is None else Path(smpl).expanduser(),
+        None if skeleton is None else Path(skeleton).expanduser(),
+        options.up,
+        None if options.animation is None else str(options.animation),
+    )
+    motion = checked(read_motion(path, source), float(options.min_visibility))
+    _refuse_swapped(motion)
+
+    # Joints that belong to no bones have to be retargeted.
+    if options.retarget is False and motion.detached:
+        raise ConfigError(
+            f"retarget=false is not supported for {motion.path}: leave retarget out"
+        )
+    return motion
+
+
+def _on_subject(
+    options: MotionOptions,
+    run: Run,
+    motion: Clip,
+    up: str,
+    rate: float,
+    fps: float,
+) -> Float:
+    """``[F, J, 3]`` the motion on the subject's bones, in the scene.
+
+    Args:
+        up: the motion's vertical axis.
+        rate: the motion's frames per second.
+        fps: those of the result.
+    """
+    # In standard axes: expressions on the subject's face, directions on the subject's
+    # bones, and the place in the scene.
+    proportions = run.proportions
+    standard = upright(proportions.up)
+    centre = standard @ np.array(run.scene.centre)
+    p = completed(motion, up)
+    if p.shape[1] > FACE.start:
+        p = p if motion.detached else face_in_head(p)
+        p[:, FACE] = expressed(p[:, FACE], run.face)
+    p = retargeted(resampled(p, rate, fps), proportions)
+    p = placed(
+        p,
+        proportions,
+        centre,
+        fps,
+        ground=options.ground,
+        stay=options.stay,
+    )
+    return p @ standard
 
 
 def _hands_and_face(p: Float) -> str:
