@@ -312,3 +312,17 @@ def test_a_name_that_hydra_does_not_know_ends_in_a_sentence(
             inside("train", *arguments(capture, tmp_path / "run"), argument),
             word,
         )
+
+
+def test_without_held_out_images_a_run_ends_well(capture, tmp_path, inside):
+    """All frames and cameras train: nothing is scored, and the scores say so."""
+    folder = tmp_path / "run"
+    nothing = ("data.test_cameras=[]", "data.test_frames=0")
+    trained = inside("train", *arguments(capture, folder), *nothing)
+    assert trained.returncode == 0, trained.stderr
+    assert "no camera is held out" in trained.stdout
+    assert (folder / "metrics.json").is_file()
+    again = inside("evaluate", f"run={folder}")
+    assert again.returncode == 0, again.stderr
+    table = inside("report", f"runs={folder}", f"out={tmp_path / 'table'}")
+    assert table.returncode == 0, table.stderr

@@ -516,7 +516,7 @@ def evaluate_method(
             write_grid(found.grid, folder / "grids" / f"{split}.png")
     joined = _joined_splits(scores, scorer, data, origin(method, data, device))
     print_table(joined.results, joined.origin, console)
-    if poses is not None:
+    if poses is not None and not joined.rows.empty:
         write_distances(folder, joined.rows, data, poses, console, beside)
 
     # metrics.json is the last file: if it is new, all others are.
