@@ -248,6 +248,8 @@ def place(capture, run, bare, on_body, model_file, tmp_path_factory):
         "/path/to/predictions": predictions,
         "/path/to/sweep": lambda: run,
         "data.test_frames=300-399": lambda: "data.test_frames=4-5",
+        "runs=[runs/study/*/on/*]": lambda: f"runs=[{run.parent}]",
+        "runs=runs/study_512": lambda: f"runs={run.parent}",
         "runs=runs/study": lambda: f"runs={run.parent}",
     }
 
@@ -276,6 +278,9 @@ def tiny_training(arguments: list[str], capture: Path) -> list[str]:
     ]
     if not any(a.startswith("data.root=") for a in given):
         given.append(f"data.root={capture}")
+    # a page is of a body, which the skeletons of the tiny capture fit better
+    if "experiment=one_camera" in given:
+        given.append("effects.body_points=on")
     # three cameras stand in for 24
     if {"experiment=paper", "data=thuman4"} <= set(given):
         given += ["protocol.test_cameras=[cam02]", "protocol.test_frames=2-3"]

@@ -326,3 +326,15 @@ def test_without_held_out_images_a_run_ends_well(capture, tmp_path, inside):
     assert again.returncode == 0, again.stderr
     table = inside("report", f"runs={folder}", f"out={tmp_path / 'table'}")
     assert table.returncode == 0, table.stderr
+
+
+def test_a_page_that_the_avatar_cannot_have_is_refused_before_training(
+    capture, tmp_path, inside
+):
+    folder = tmp_path / "run"
+    given = (*arguments(capture, folder), "effects.body_points=off")
+    refused(
+        inside("train", *given, "page=true"), "page=true", "skinned body",
+        "page=false",
+    )  # fmt: skip
+    assert not (folder / "checkpoints").exists()

@@ -27,6 +27,7 @@ from gsgan.data.datamodule import GsganData
 from gsgan.evaluate.origin import trained, training_code
 from gsgan.evaluate.run import ScoreOptions, evaluate_method
 from gsgan.evaluate.scores import painter
+from gsgan.export.page import refuse_unsuitable
 from gsgan.export.run import export_config
 from gsgan.fit.run import fit_before_training
 from gsgan.metrics.lpips import build_lpips
@@ -127,6 +128,8 @@ def run_training(config: DictConfig) -> None:
 
     # The data and the untrained model.
     data, module = build_training(config, console)
+    if options.page:
+        _refuse_page(module.avatar)
     seed_everything(options.seed, workers=True, verbose=False)
 
     # An earlier part of the run in the same folder is continued.
@@ -323,6 +326,16 @@ def start_from(avatar: Avatar, data: GsganData, run: Path) -> None:
             f"distil: {run} has other Gaussians; give its data, size and effects"
         )
     avatar.load_state_dict(state, strict=False)
+
+
+def _refuse_page(avatar: Avatar) -> None:
+    """Refuses a web page that the avatar cannot have, before it is trained."""
+    try:
+        refuse_unsuitable(avatar)
+    except ConfigError as error:
+        raise ConfigError(
+            f"page=true: {error}; page=false trains without a page"
+        ) from error
 
 
 def _write_page(folder: Path, data: GsganData) -> None:
