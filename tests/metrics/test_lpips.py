@@ -187,6 +187,13 @@ def test_what_the_networks_get_is_described():
     assert lpips_input(crop) == "[0,1] mask crop 512"
 
 
+def test_images_too_small_for_the_networks_are_refused(networks):
+    image = torch.zeros(1, 3, 31, 64)
+    with pytest.raises(ConfigError, match=r"at least 32 pixels.*64 × 31"):
+        LpipsAgainst(image, None, networks)
+    assert LpipsAgainst(image, None, {})(image) == {}
+
+
 def test_unknown_networks_are_refused_and_none_leaves_lpips_out():
     with pytest.raises(ConfigError, match=r"lpips\.nets.*vgg, alex"):
         build_lpips(["squeeze"])

@@ -10,9 +10,11 @@ from gsgan.data.metric_variants import MetricVariants
 from gsgan.metrics.image import person_box
 from gsgan.metrics.regions import BACKGROUNDS, mask_crop, rectangle
 from gsgan.utils.checks import one_of
+from gsgan.utils.errors import ConfigError
 from gsgan.weights.networks import Lpips
 
 LPIPS_NETS = ("vgg", "alex")
+MIN_SIDE = 32  # pixels: AlexNet's last map is empty for smaller images
 # The scores of an image by metric.
 LpipsScores = Callable[[Tensor], dict[str, float]]
 
@@ -45,6 +47,9 @@ class LpipsAgainst:
         mask: ``[1, 1, H, W]`` of the person; None leaves the scores in the person's box out.
         networks: by name, from `build_lpips`.
         measures: range, channels and region; None takes the defaults.
+
+    Raises:
+        ConfigError: where there are networks, and the images are too small for them.
     """
 
     @torch.no_grad()
@@ -60,7 +65,13 @@ class LpipsAgainst:
         self.measures = measures or MetricVariants()
         self.mask = mask
         self.box = None if mask is None else rectangle(person_box(mask)[0])
-        self.size = (target.shape[-2], target.shape[-1])
+        height, width = target.shape[-2:]
+        self.size = (height, width)
+        if networks and min(height, width) < MIN_SIDE:
+            raise ConfigError(
+                f"LPIPS needs images of at least {MIN_SIDE} pixels each way, got "
+                f"{width} × {height}; lpips.nets=[] leaves it out"
+            )
 
         # The ground truth's features, of the whole image and of the square.
         whole = self._seen(target)
