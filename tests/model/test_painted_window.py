@@ -5,7 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gsgan.scene import cat, painted_window
+from gsgan.model.painted import painted_window
+from gsgan.scene import cat
 
 
 def alpha_at(*boxes: tuple[int, int, int, int]) -> torch.Tensor:

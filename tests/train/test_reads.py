@@ -21,8 +21,12 @@ from gsgan.evaluate.scores import Preparation, Scorer, painter, score_split
 from gsgan.train.run import build_training
 
 SOURCE = Path(gsgan.__file__).parent
-# checks of values, and boxes of p₂D's lines
-ON_CPU_ONLY = (SOURCE / "splat" / "checks.py", SOURCE / "skeleton" / "draw.py")
+# checks of values, boxes of p₂D's lines, and the box that the generator paints
+ON_CPU_ONLY = (
+    SOURCE / "splat" / "checks.py",
+    SOURCE / "skeleton" / "draw.py",
+    SOURCE / "model" / "painted.py",
+)
 READS = {
     *("item", "tolist", "cpu", "numpy", "nonzero", "unique", "masked_select"),
     *("__bool__", "__int__", "__float__", "__index__"),
@@ -32,8 +36,8 @@ READS = {
 class HostWaits(TorchFunctionMode):
     """Counts the calls in gsgan's source that read a tensor's values, by module and name.
 
-    The checks of `rasterise`'s values and the boxes of p₂D's lines are left out: they are read on
-    a CPU only.
+    The checks of `rasterise`'s values, the boxes of p₂D's lines and the box that the generator
+    paints are left out: they are read on a CPU only.
     """
 
     def __init__(self) -> None:

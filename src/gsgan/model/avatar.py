@@ -21,6 +21,7 @@ from gsgan.model.deformation import (
     bounded,
 )
 from gsgan.model.generator import Generator
+from gsgan.model.painted import painted_window
 from gsgan.model.pose_graph import pose_inputs
 from gsgan.model.rendering import Rendering
 from gsgan.model.segmentation import Segmentation
@@ -33,7 +34,6 @@ from gsgan.scene import (
     Window,
     body_window,
     cat,
-    painted_window,
 )
 from gsgan.skeleton import (
     MEDIAPIPE33,
