@@ -451,6 +451,7 @@ def body_window(
         .minimum(everywhere)
     )
 
+    # All boxes of a batch have the size of the largest, each about its own centre.
     bounds = torch.cat([low, high], dim=-1).long().tolist()
     w = _side(
         max(minimum, *(x1 - x0 for x0, _, x1, _ in bounds)), multiple, width

@@ -56,8 +56,9 @@ FREE_KEYS = (
     # When a diverged training gives up.
     "training.max_skipped",
     "training.skip_window",
-    # Backends compute the same image.
+    # Backends compute the same image; the generator's box is not used in training.
     "model.backend",
+    "model.generator_margin",
 )
 
 
