@@ -21,10 +21,8 @@ def test_boxes_hold_all_that_is_painted_and_begin_at_multiples():
     alpha = alpha_at((20, 40, 30, 50), (3, 10, 80, 96))
     window = painted_window(alpha, margin=5, multiple=16)
     assert window.whole == (64, 96)
-    assert window.size == (
-        48,
-        48,
-    )  # rows 0 to 45 of the first, columns 16 to 55
+    # rows 0 to 45 of the first, columns 16 to 55
+    assert window.size == (48, 48)
     assert window.corners == ((0, 16), (0, 48))
     assert torch.equal(window.paste(window.cut(alpha)), alpha)
 
