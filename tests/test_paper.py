@@ -26,7 +26,6 @@ OURS = {  # what gsgan adds to the paper's method, and the value that leaves it 
     "model.low_pass": 0.3,
     "model.supersample": 1,
     "model.window_margin": None,
-    "model.generator_margin": None,
     "training.average": None,
     "training.pose_noise": 0.0,
     "training.recipes.psi.clip": None,
