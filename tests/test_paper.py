@@ -92,6 +92,7 @@ def test_it_builds_with_the_papers_models(build, model):
     assert avatar.effects.degree == 3
     assert avatar.body_points is None
     assert avatar.window(frame.skeleton, frame.camera) is None
+    assert avatar.generator_margin is None
     assert avatar(*frame.inputs).image.shape == frame.image.shape
 
 

@@ -10,7 +10,12 @@ from torch.nn import functional
 
 from gsgan.utils.checks import one_of, whole
 from gsgan.weights.files import NETWORKS
-from gsgan.weights.networks import FeatureNetwork, Lpips, pretrained
+from gsgan.weights.networks import (
+    MIN_PIXELS,
+    FeatureNetwork,
+    Lpips,
+    pretrained,
+)
 
 FEATURES = "features"
 LPIPS = "lpips"
@@ -18,8 +23,6 @@ PRETRAINED = "pretrained"
 RANDOM = "random"
 # relu1_2, relu2_2, relu3_3, relu4_3, as Johnson et al.
 VGG_LAYERS = 4
-# Pixels: AlexNet's last map is empty for smaller crops.
-MIN_CROP = 32
 # Weight of a pixel off the person, so that a crop exists without a person.
 ANYWHERE = 1e-6
 
@@ -75,7 +78,7 @@ class Perceptual(nn.Module):
         one_of(f"{key}.net", net, ("vgg", "alex"))
         one_of(f"{key}.form", form, (FEATURES, LPIPS))
         if crop is not None:
-            whole(f"{key}.crop", crop, MIN_CROP)
+            whole(f"{key}.crop", crop, MIN_PIXELS)
         self.crop = crop
         self.crops = whole(f"{key}.crops", crops, 1)
         self.warmup = warmup

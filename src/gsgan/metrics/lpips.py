@@ -11,10 +11,9 @@ from gsgan.metrics.image import person_box
 from gsgan.metrics.regions import BACKGROUNDS, mask_crop, rectangle
 from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError
-from gsgan.weights.networks import Lpips
+from gsgan.weights.networks import MIN_PIXELS, Lpips
 
 LPIPS_NETS = ("vgg", "alex")
-MIN_SIDE = 32  # pixels: AlexNet's last map is empty for smaller images
 # The scores of an image by metric.
 LpipsScores = Callable[[Tensor], dict[str, float]]
 
@@ -67,9 +66,9 @@ class LpipsAgainst:
         self.box = None if mask is None else rectangle(person_box(mask)[0])
         height, width = target.shape[-2:]
         self.size = (height, width)
-        if networks and min(height, width) < MIN_SIDE:
+        if networks and min(height, width) < MIN_PIXELS:
             raise ConfigError(
-                f"LPIPS needs images of at least {MIN_SIDE} pixels each way, got "
+                f"LPIPS needs images of at least {MIN_PIXELS} pixels each way, got "
                 f"{width} × {height}; lpips.nets=[] leaves it out"
             )
 

@@ -94,7 +94,7 @@ class Prepared(NamedTuple):
 
 
 class GeneratorInputs(NamedTuple):
-    """What the generator gets besides F.
+    """The inputs of the generator besides F.
 
     Args:
         S: ``[B, classes, H, W]`` probabilities, or None.
@@ -395,8 +395,10 @@ class Avatar(nn.Module):
         supersample: bool,
         reach: float | None,
     ) -> tuple[Rendering, Window | None]:
-        """The drawings and images that the cameras see (paper Fig. 3), and of which part of their
-        images they are; None means all."""
+        """The drawings and images that the cameras see (paper Fig. 3).
+
+        The window is the part of the cameras' images that these show; None means all.
+        """
         p, visibility, camera, body, camera_index, _ = prepared
         raster = S = image = alpha = painted = None
         with full_precision(p.device):
@@ -458,7 +460,7 @@ class Avatar(nn.Module):
         camera: Camera,
         body: BodyPose | None,
     ) -> GeneratorInputs:
-        """What the generator gets besides F."""
+        """The inputs of the generator besides F."""
         S = None
         if self.segmentation is not None:
             # trained on its own, then frozen

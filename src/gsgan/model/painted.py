@@ -35,7 +35,7 @@ class _Ranges(NamedTuple):
 
 
 def _painted_range(alpha: Tensor, margin: int, multiple: int) -> _Ranges:
-    """Round what is above 0 in each row of ``[B, L]``."""
+    """The boxes round the values above 0 in each row of ``[B, L]``."""
     starts = []
     side = multiple
     for line in alpha:

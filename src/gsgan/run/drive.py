@@ -356,12 +356,13 @@ def _clip(options: MotionOptions, run: Run, path: Path) -> Clip:
     # What the readers need to know of the subject.
     smpl = options.smpl or run.body_file
     skeleton = options.skeleton
+    animation = options.animation
     source = Source(
-        run.proportions,
-        None if smpl is None else Path(smpl).expanduser(),
-        None if skeleton is None else Path(skeleton).expanduser(),
-        options.up,
-        None if options.animation is None else str(options.animation),
+        subject=run.proportions,
+        smpl=None if smpl is None else Path(smpl).expanduser(),
+        skeleton=None if skeleton is None else Path(skeleton).expanduser(),
+        up=options.up,
+        animation=None if animation is None else str(animation),
     )
     motion = checked(read_motion(path, source), float(options.min_visibility))
     _refuse_swapped(motion)

@@ -24,6 +24,8 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 TAPS = {"vgg": (3, 8, 15, 22, 29), "alex": (1, 4, 7, 9, 11)}
 # Added to the squared norm of features, as in torchmetrics: the gradient is finite at zero.
 EPSILON = 1e-8
+# Sides of the smallest image: AlexNet's last map is empty for smaller ones.
+MIN_PIXELS = 32
 
 
 class FeatureNetwork(nn.Module):
