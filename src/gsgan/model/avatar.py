@@ -93,6 +93,23 @@ class Prepared(NamedTuple):
         )
 
 
+class Posed(NamedTuple):
+    """Poses and what is computed once of them for all parts of an avatar.
+
+    Args:
+        p: ``[B, J, 3]`` metres, world, finite.
+        valid: ``[B, J]`` bool, the joints that were seen.
+        frames: of the bones; None where nothing reads them.
+        body: B poses of the skinned body, with the transforms of its bones; None where none is
+            needed.
+    """
+
+    p: Tensor
+    valid: Tensor
+    frames: BoneFrames | None
+    body: BodyPose | None
+
+
 class GeneratorInputs(NamedTuple):
     """The inputs of the generator besides F.
 
@@ -399,22 +416,16 @@ class Avatar(nn.Module):
 
         The window is the part of the cameras' images that these show; None means all.
         """
-        p, visibility, camera, body, camera_index, _ = prepared
+        camera = prepared.camera
+        camera_index = prepared.camera_index
         raster = S = image = alpha = painted = None
-        with full_precision(p.device):
-            valid = visibility > 0
-            with self.stage("skeleton"):
-                frames = self._bone_frames(p, valid)
-            follows = self.body_points or self.surface or self.segmentation
-            if body is not None and follows is not None:
-                with self.stage("bones"):
-                    # The bones are computed once for G and S.
-                    body = follows.points.with_bones(body)
+        with full_precision(camera.K.device):
+            posed = self._posed(
+                prepared.skeleton, prepared.visibility > 0, prepared.body
+            )
 
             # Step I's part: Ĝ and its splatted features F.
-            gaussians = self.splat(
-                p, valid, frames, camera, body, pose_noise, reach
-            )
+            gaussians = self.splat(posed, camera, pose_noise, reach)
             if gaussians is not None:
                 raster = self._rasterised(gaussians, camera, supersample)
 
@@ -424,12 +435,12 @@ class Avatar(nn.Module):
                 if painted is not None and raster is not None:
                     raster = painted.raster(raster)
                     camera = painted.camera(camera)
-                inputs = self._generator_inputs(p, valid, frames, camera, body)
+                inputs = self._generator_inputs(posed, camera)
 
         # Sec. 3.5: the pose code and the UNet run in the precision of the trainer.
         if generate and self.generator is not None:
             S = inputs.S
-            generated = self._generated(inputs, raster).to(p.dtype)
+            generated = self._generated(inputs, raster).to(posed.p.dtype)
             image = generated[:, :3]
             alpha = generated[:, 3:]
 
@@ -452,27 +463,47 @@ class Avatar(nn.Module):
             )
         return rendering, painted
 
+    def _posed(self, p: Tensor, valid: Tensor, body: BodyPose | None) -> Posed:
+        """Poses with the frames and bones that the avatar's parts read."""
+        # Densify, the face code and Ω read the frames of the skeleton's bones.
+        frames = None
+        if (
+            self.densify is not None
+            or self.generator is not None
+            or self.template.expression
+        ):
+            with self.stage("skeleton"):
+                frames = bone_frames(p, valid, self.template)
+
+        # The body's bones are computed once for G and S.
+        follows = self.body_points or self.surface or self.segmentation
+        if body is not None and follows is not None:
+            with self.stage("bones"):
+                body = follows.points.with_bones(body)
+        return Posed(p, valid, frames, body)
+
     def _generator_inputs(
-        self,
-        p: Tensor,
-        valid: Tensor,
-        frames: BoneFrames | None,
-        camera: Camera,
-        body: BodyPose | None,
+        self, posed: Posed, camera: Camera
     ) -> GeneratorInputs:
         """The inputs of the generator besides F."""
         S = None
         if self.segmentation is not None:
             # trained on its own, then frozen
             with self.stage("S"), torch.no_grad():
-                S = self.segmentation(body, camera)  # Sec. 3.4
+                S = self.segmentation(posed.body, camera)  # Sec. 3.4
+        skeletons = (posed.p, posed.valid)
         with self.stage("p₂D"):
             width = line_width(camera)
-            drawn = draw_skeleton(p, valid, camera, self.template, width)
+            drawn = draw_skeleton(*skeletons, camera, self.template, width)
         with self.stage("Ω"):
-            assert frames is not None
-            height = self.body_height
-            pose = pose_inputs(p, valid, frames, camera, self.template, height)
+            assert posed.frames is not None
+            pose = pose_inputs(
+                *skeletons,
+                posed.frames,
+                camera,
+                self.template,
+                self.body_height,
+            )
         return GeneratorInputs(S, drawn, pose)
 
     def _generated(
@@ -518,11 +549,8 @@ class Avatar(nn.Module):
 
     def splat(
         self,
-        p: Tensor,
-        valid: Tensor,
-        frames: BoneFrames | None,
+        posed: Posed,
         camera: Camera,
-        body: BodyPose | None,
         pose_noise: Tensor | None = None,
         reach: float | None = None,
     ) -> Gaussians | None:
@@ -533,17 +561,21 @@ class Avatar(nn.Module):
         if self.surface is not None:
             # The baseline's Gaussians follow the body and need no residuals.
             with self.stage("surface"):
-                gaussians = self.surface(body, camera.centre)
+                gaussians = self.surface(posed.body, camera.centre)
         elif self.deformation is not None:
             # Points far from what the cameras see are left out, which saves time in training.
-            points = self.points(p, valid, frames, body)
+            points = self.points(posed)
             chosen = None
             if reach is not None:
                 chosen = seen_points(points.means, camera, reach)
             with self.stage("Ψ"):  # Sec. 3.3: Ĝ = G + Ψ(p)
-                face = self._face_code(p, frames)
                 gaussians = self.deformation(
-                    p, points, camera.centre, pose_noise, face, chosen
+                    posed.p,
+                    points,
+                    camera.centre,
+                    pose_noise,
+                    self._face_code(posed),
+                    chosen,
                 )
         else:
             return None
@@ -556,66 +588,46 @@ class Avatar(nn.Module):
             gaussians, features=bounded(gaussians.features, -bound, bound)
         )
 
-    def _bone_frames(self, p: Tensor, valid: Tensor) -> BoneFrames | None:
-        """The frames of the bones, if densify, the face code or Ω reads them."""
-        if (
-            self.densify is None
-            and self.generator is None
-            and not self.template.expression
-        ):
-            return None
-        return bone_frames(p, valid, self.template)
-
-    def _face_code(self, p: Tensor, frames: BoneFrames | None) -> Tensor | None:
+    def _face_code(self, posed: Posed) -> Tensor | None:
         """`face_code`; None for a skeleton without a face."""
-        if frames is None:
+        if posed.frames is None:
             return None
-        return face_code(p, frames.head, self.template)
+        return face_code(posed.p, posed.frames.head, self.template)
 
-    def points(
-        self,
-        p: Tensor,
-        valid: Tensor,
-        frames: BoneFrames | None,
-        body: BodyPose | None,
-    ) -> Points:
+    def points(self, posed: Posed) -> Points:
         """G: Alg. 1's points, or points on the body's surface where that effect is on."""
         with self.stage("densify"):
             if self.body_points is not None:
-                return self.body_points(body)  # type: ignore[no-any-return]
+                return self.body_points(posed.body)  # type: ignore[no-any-return]
             assert self.densify is not None
-            return self.densify(p, valid, frames)  # type: ignore[no-any-return]
+            return self.densify(posed.p, posed.valid, posed.frames)  # type: ignore[no-any-return]
 
     def residuals(
         self, p: Tensor, valid: Tensor, body: BodyPose | None
     ) -> tuple[Points, Residuals]:
-        """G in pose and Ψ's ΔG without noise; arguments as for `splat`."""
+        """G in pose and Ψ's ΔG without noise; arguments as for `Posed`."""
         assert self.deformation is not None
-
-        # G in the pose, from the same frames as the pose code.
-        frames = self._bone_frames(p, valid)
-        points = self.points(p, valid, frames, body)
-        code = self._code(p, frames)
+        posed = self._posed(p, valid, body)
+        points = self.points(posed)
+        code = self._code(posed)
         return points, self.deformation.residuals(points, code, root_of(p))
 
-    def _code(self, p: Tensor, frames: BoneFrames | None) -> Tensor:
-        """``[B, 3 J]`` Ψ's code of a pose, without noise."""
+    def _code(self, posed: Posed) -> Tensor:
+        """``[B, 3 J]`` Ψ's code of poses, without noise."""
         assert self.deformation is not None
-        face = self._face_code(p, frames)
-        return self.deformation.pose_code(p, root_of(p), None, face)
+        face = self._face_code(posed)
+        return self.deformation.pose_code(posed.p, root_of(posed.p), None, face)
 
     @torch.no_grad()
     def store_poses(
         self, p: Tensor, valid: Tensor, body: BodyPose | None
     ) -> None:
-        """Stores the spread of training poses ``[F, J, 3]`` in Ψ; arguments as for `splat`."""
+        """Stores the spread of training poses in Ψ; arguments as for `Posed`."""
         if isinstance(self.deformation, Deformation):
             # The means give the places of the anchors in the training poses.
-            frames = self._bone_frames(p, valid)
-            means = self.points(p, valid, frames, body).means
-            self.deformation.store_poses(
-                self._code(p, frames), means, root_of(p)
-            )
+            posed = self._posed(p, valid, body)
+            means = self.points(posed).means
+            self.deformation.store_poses(self._code(posed), means, root_of(p))
 
     def _rasterised(
         self, gaussians: Gaussians, camera: Camera, supersample: bool
