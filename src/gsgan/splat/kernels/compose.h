@@ -2,8 +2,11 @@
 // Definitions: model/deformation.py, whose tensor operations are the reference.
 #pragma once
 
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
+
+#include "simd.h"
 
 extern "C" {
 
@@ -27,7 +30,9 @@ struct ComposeJob {
 namespace gsgan {
 
 constexpr int RESIDUALS = 11;
+constexpr int COMPOSE_BLOCK = 64;  // points whose exponentials are computed together
 constexpr double NO_TURN = 1e-15;  // a shorter quaternion turns nothing, and has no slope
+constexpr double LOG2_E = 1.4426950408889634;
 
 inline double within(double x, double low, double high) {
   return x < low ? low : x > high ? high : x;
@@ -36,6 +41,40 @@ inline double within(double x, double low, double high) {
 // The gradient of a bounded value: 0 where a step against it would lead further out.
 inline double leading_back(double x, double low, double high, double g) {
   return (x > high && g < 0) || (x < low && g > 0) ? 0 : g;
+}
+
+// exp of numbers that are not positive, in place; the count is a multiple of a register's lanes.
+INLINE void exp_of_negative(double* x, int count) {
+  for (int i = 0; i < count; i += Simd<double>::W)
+    store(x + i, exp2_of_negative<double>(load(x + i) * LOG2_E));
+}
+
+// The exponentials of a block of points, by register: libm's, one by one, take longer than all else.
+struct Exponentials {
+  double start[COMPOSE_BLOCK];                 // logarithm of the size at rest
+  alignas(64) double mean[3][COMPOSE_BLOCK];   // exp(-2 |residual|)
+  alignas(64) double scale[3][COMPOSE_BLOCK];  // exp(bounded logarithm - largest logarithm)
+  alignas(64) double logit[COMPOSE_BLOCK];     // exp(-|bounded logit|)
+};
+
+template <class T>
+void exponentials(const ComposeJob& job, int64_t first, int count, Exponentials& e) {
+  for (int j = 0; j < COMPOSE_BLOCK; ++j) {
+    const int64_t i = first + std::min(j, count - 1);  // the last point fills the block
+    const T* raw = static_cast<const T*>(job.raw) + i * job.stride;
+    e.start[j] = std::log(double(static_cast<const T*>(job.scales)[i]));
+    for (int k = 0; k < 3; ++k) {
+      e.mean[k][j] = -2 * std::abs(double(raw[k]));
+      e.scale[k][j] =
+          within(e.start[j] + raw[7 + k], job.scale_low, job.scale_high) - job.scale_high;
+    }
+    e.logit[j] = -std::abs(within(job.logit + raw[10], -job.logit_bound, job.logit_bound));
+  }
+  for (int k = 0; k < 3; ++k) {
+    exp_of_negative(e.mean[k], COMPOSE_BLOCK);
+    exp_of_negative(e.scale[k], COMPOSE_BLOCK);
+  }
+  exp_of_negative(e.logit, COMPOSE_BLOCK);
 }
 
 // One point's intermediate values.
@@ -47,14 +86,17 @@ struct Composed {
   double logit, opacity;
 };
 
-template <class T> Composed composed(const ComposeJob& job, int64_t i) {
+// Point i, the j-th of a block; largest: the largest scale.
+template <class T>
+Composed composed(const ComposeJob& job, int64_t i, const Exponentials& e, int j, double largest) {
   const T* raw = static_cast<const T*>(job.raw) + i * job.stride;
   const T* frame = static_cast<const T*>(job.frames) + 9 * i;
   const T* shape = static_cast<const T*>(job.shapes) + 9 * i;
   Composed c;
   for (int k = 0; k < 9; ++k) c.F[k] = frame[k], c.S[k] = shape[k];
   for (int k = 0; k < 3; ++k) {
-    c.bent[k] = job.mean_bound > 0 ? std::tanh(double(raw[k])) : double(raw[k]);
+    const double tanh = std::copysign((1 - e.mean[k][j]) / (1 + e.mean[k][j]), double(raw[k]));
+    c.bent[k] = job.mean_bound > 0 ? tanh : double(raw[k]);
     c.offset[k] = c.bent[k] * (job.mean_bound > 0 ? job.mean_bound : job.unit);
   }
   const double q[4] = {1.0 + raw[3], double(raw[4]), double(raw[5]), double(raw[6])};
@@ -65,21 +107,19 @@ template <class T> Composed composed(const ComposeJob& job, int64_t i) {
                        2 * (x * y + w * z),     1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
                        2 * (x * z - w * y),     2 * (y * z + w * x),     1 - 2 * (x * x + y * y)};
   for (int k = 0; k < 9; ++k) c.R[k] = R[k];
-  const double start = std::log(double(static_cast<const T*>(job.scales)[i]));
   for (int k = 0; k < 3; ++k) {
-    c.log_scale[k] = start + raw[7 + k];
-    c.scale[k] = std::exp(within(c.log_scale[k], job.scale_low, job.scale_high));
+    c.log_scale[k] = e.start[j] + raw[7 + k];
+    c.scale[k] = largest * e.scale[k][j];
   }
   for (int r = 0; r < 9; r += 3)
     for (int k = 0; k < 3; ++k)
       c.A[r + k] = (c.S[r] * R[k] + c.S[r + 1] * R[3 + k] + c.S[r + 2] * R[6 + k]) * c.scale[k];
   c.logit = job.logit + raw[10];
-  c.opacity = 1 / (1 + std::exp(-within(c.logit, -job.logit_bound, job.logit_bound)));
+  c.opacity = (c.logit < 0 ? e.logit[j] : 1) / (1 + e.logit[j]);
   return c;
 }
 
-template <class T> void compose_one(const ComposeJob& job, int64_t i) {
-  const Composed c = composed<T>(job, i);
+template <class T> void compose_one(const ComposeJob& job, int64_t i, const Composed& c) {
   const T* mean = static_cast<const T*>(job.means) + 3 * i;
   T* out_mean = static_cast<T*>(job.out_means) + 3 * i;
   T* covariance = static_cast<T*>(job.out_covariances) + 9 * i;
@@ -94,8 +134,7 @@ template <class T> void compose_one(const ComposeJob& job, int64_t i) {
   static_cast<T*>(job.out_opacities)[i] = T(job.valid[i] ? c.opacity : 0);
 }
 
-template <class T> void compose_one_backward(const ComposeJob& job, int64_t i) {
-  const Composed c = composed<T>(job, i);
+template <class T> void compose_one_backward(const ComposeJob& job, int64_t i, const Composed& c) {
   T* out = static_cast<T*>(job.d_raw) + RESIDUALS * i;
   for (int k = 0; k < RESIDUALS; ++k) out[k] = 0;
   if (job.g_means) {
@@ -143,15 +182,26 @@ template <class T> void compose_one_backward(const ComposeJob& job, int64_t i) {
   }
 }
 
-template <class T> int compose(const ComposeJob& job) {
+template <class T, class F> void compose_all(const ComposeJob& job, F&& f) {
+  const int64_t blocks = (job.count + COMPOSE_BLOCK - 1) / COMPOSE_BLOCK;
+  const double largest = std::exp(job.scale_high);
 #pragma omp parallel for schedule(static) num_threads(int(job.threads))
-  for (int64_t i = 0; i < job.count; ++i) compose_one<T>(job, i);
+  for (int64_t block = 0; block < blocks; ++block) {
+    const int64_t first = block * COMPOSE_BLOCK;
+    const int count = int(std::min<int64_t>(COMPOSE_BLOCK, job.count - first));
+    Exponentials e;
+    exponentials<T>(job, first, count, e);
+    for (int j = 0; j < count; ++j) f(first + j, composed<T>(job, first + j, e, j, largest));
+  }
+}
+
+template <class T> int compose(const ComposeJob& job) {
+  compose_all<T>(job, [&](int64_t i, const Composed& c) { compose_one<T>(job, i, c); });
   return 0;
 }
 
 template <class T> int compose_backward(const ComposeJob& job) {
-#pragma omp parallel for schedule(static) num_threads(int(job.threads))
-  for (int64_t i = 0; i < job.count; ++i) compose_one_backward<T>(job, i);
+  compose_all<T>(job, [&](int64_t i, const Composed& c) { compose_one_backward<T>(job, i, c); });
   return 0;
 }
 
