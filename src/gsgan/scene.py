@@ -33,6 +33,7 @@ __all__ = [
 
 NEAR = 0.01  # metres: nearer points are not projected
 RIM = 0.999  # share of a lens's fold radius: points beyond it are shown there
+FAR = 1e4  # of x/z, y/z: the rim of a lens that does not fold
 
 
 def _check(owner: str, name: str, value: Tensor, *shape: int | None) -> None:
@@ -514,11 +515,12 @@ def distort_within(points: Tensor, dist: Tensor) -> Tensor:
 
     The polynomial folds points beyond that radius back into the image, which no lens does.
     """
-    radius = points.norm(dim=-1, keepdim=True).clamp_min(
-        torch.finfo(points.dtype).tiny
-    )
+    radius = points.norm(dim=-1, keepdim=True)
     rim = RIM * fold_radius(dist).to(points.dtype)[:, None, None]
-    return distort(points * (rim / radius).clamp_max(1), dist)[0]
+
+    # Quotients are finite, and so is their gradient, at the axis and for lenses that never fold.
+    rim = rim.clamp_max(FAR)
+    return distort(points * (rim / torch.maximum(radius, rim)), dist)[0]
 
 
 def fold_radius(dist: Tensor) -> Tensor:

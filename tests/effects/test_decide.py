@@ -14,6 +14,7 @@ from gsgan.effects import (
     decide,
 )
 from gsgan.effects.decide import CHOICES
+from gsgan.run.assemble import build_data
 from gsgan.utils.errors import ConfigError
 
 ALIKE = SurfaceColours(difference=0.01, residual=0.05)
@@ -171,6 +172,12 @@ def test_a_list_leaves_lenses_to_their_own_word(word):
     assert found.distortion.on == (word != "off")
     named = decide(bent, EffectSettings(distortion=word, only=["distortion"]))
     assert named.distortion.on
+
+
+def test_images_are_read_as_the_list_of_effects_says(tiny):
+    """The data has the lens that the table of effects names."""
+    config = tiny("effects.only=[distortion]", "effects.distortion=off")
+    assert build_data(config).lens == "undistort"
 
 
 @pytest.mark.parametrize(

@@ -18,9 +18,11 @@ from gsgan.prepare.one_view import (
     PLANE,
     RESIDUAL_GROUPS,
     SLIDING,
+    ZOOMS,
     Problem,
     Seen,
     State,
+    _best_zoom,
 )
 
 FRAMES = 4
@@ -173,3 +175,13 @@ def test_step_by_blocks_equals_the_dense_step(smooth, shape):
         )
     )
     np.testing.assert_allclose(new.root, turned @ at.root, rtol=1e-6, atol=1e-8)
+
+
+def test_a_cost_that_falls_to_the_end_of_the_range_has_its_best_focal_length_there():
+    """A parabola through its last values has a maximum in place of a minimum."""
+    for end in (-1, 1):
+        away = ZOOMS - end * (ZOOMS[-1] + 0.1)
+        cost = 2000 * np.log1p((away / 0.1) ** 2)
+        zoom, spread = _best_zoom(np.concatenate([cost[::-1], cost]))
+        assert zoom == pytest.approx(end * ZOOMS[-1])
+        assert spread == 1

@@ -5,6 +5,7 @@ import json
 import shutil
 import struct
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import cv2
@@ -17,10 +18,19 @@ from rich.console import Console
 from gsgan.data.formats.capture import read_capture
 from gsgan.prepare.frames import look, sample
 from gsgan.prepare.mediapipe import SCRIPT
-from gsgan.prepare.one_camera import FOCAL_KEY, doubtful_poses, read_metadata
+from gsgan.prepare.one_camera import (
+    FOCAL_KEY,
+    Detected,
+    doubtful_poses,
+    read_metadata,
+    with_right_sides,
+)
 from gsgan.prepare.one_view import Seen, solve_view
 from gsgan.prepare.options import Options
 from gsgan.prepare.run import prepare
+from gsgan.skeleton import MEDIAPIPE33
+from gsgan.skeleton.hands import HAND
+from gsgan.skeleton.joints import ALL, BODY, HANDS, LEFT, WRIST_JOINTS
 from gsgan.utils.errors import ConfigError, DataError
 
 TALL = 1.88  # metres, the person of `turning`
@@ -314,3 +324,46 @@ def test_a_frame_without_a_landmark_hides_no_doubtful_pose():
         [[1.0, 2], [np.nan, 2], [np.nan, np.nan], [20, 30], [2, 2]]
     )
     assert doubtful_poses(errors).tolist() == [False, False, False, True, False]
+
+
+@pytest.mark.parametrize("with_body", [True, False])
+def test_hands_follow_the_sides_of_the_body(with_body):
+    """Frames in which a detector exchanges left and right, of hands and body or of the body alone;
+    in one of them a hand was not seen."""
+    frames = 24
+    x = turning(frames)
+    rng = np.random.default_rng(0)
+    px = np.full((frames, ALL, 2), np.nan)
+    px[:, :BODY] = 500 * x[..., :2] / x[..., 2:]
+    hands = px[:, WRIST_JOINTS].repeat(HAND, axis=1)
+    hands[:, 1:HAND] += rng.normal(0, 10, (frames, HAND - 1, 2))
+    hands[:, HAND + 1 :] += rng.normal(0, 10, (frames, HAND - 1, 2))
+    px[:, HANDS] = hands
+    right = Detected(
+        px=px,
+        conf=np.isfinite(px).all(-1) * 1.0,
+        world=world_landmarks(x),
+        hand_z=rng.normal(0, 1, (frames, 2 * HAND)),
+        faces=np.ones(frames, np.int64),
+    )
+    right.conf[12, LEFT] = 0
+
+    wrong = replace(
+        right,
+        px=right.px.copy(),
+        conf=right.conf.copy(),
+        world=right.world.copy(),
+        hand_z=right.hand_z.copy(),
+    )
+    mixed = [5, 6, 12, 19]
+    mirror = list(MEDIAPIPE33.mirror)
+    for values in (wrong.px[:, :BODY], wrong.conf[:, :BODY], wrong.world):
+        values[mixed] = values[mixed][:, mirror]
+    if with_body:
+        for values in (wrong.px[:, HANDS], wrong.conf[:, HANDS], wrong.hand_z):
+            values[mixed] = np.roll(values[mixed], HAND, axis=1)
+    found = with_right_sides(wrong)
+    for name in ("px", "conf", "world", "hand_z"):
+        np.testing.assert_array_equal(
+            getattr(found, name), getattr(right, name)
+        )

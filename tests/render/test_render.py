@@ -4,12 +4,14 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 import torch
 from commands import refused
+from make import write_tiny_capture
 from omegaconf import OmegaConf
 from PIL import Image
 
@@ -19,7 +21,7 @@ from gsgan.evaluate.predictions import Preparation
 from gsgan.evaluate.scores import painter
 from gsgan.render import run as render_run
 from gsgan.run.assemble import build_data
-from gsgan.run.runs import load, load_avatar
+from gsgan.run.runs import Run, load, load_avatar
 from gsgan.run.stored import CHECKPOINT, CONFIG, load_config
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.train.run import build_training
@@ -56,6 +58,11 @@ def fitted(capture, tiny, tmp_path):
     shape.stretch[2] = 1.2
     np.savez(root / "body_shape.npz", **shape.arrays())
     config = tiny(f"data.root={root}", "effects.body_points=on")
+    return begun(config, tmp_path / "run")
+
+
+def begun(config, folder: Path) -> Path:
+    """A run folder of an avatar near its start."""
     _, module = build_training(config)
     with torch.no_grad():
         for parameter in module.avatar.splats.parameters():
@@ -63,10 +70,10 @@ def fitted(capture, tiny, tmp_path):
     checkpoint = {"state_dict": module.state_dict()}
     module.on_save_checkpoint(checkpoint)
     for name in (CHECKPOINT, CONFIG):
-        (tmp_path / "run" / name).parent.mkdir(parents=True)
-    torch.save(checkpoint, tmp_path / "run" / CHECKPOINT)
-    OmegaConf.save(config, tmp_path / "run" / CONFIG)
-    return tmp_path / "run"
+        (folder / name).parent.mkdir(parents=True)
+    torch.save(checkpoint, folder / CHECKPOINT)
+    OmegaConf.save(config, folder / CONFIG)
+    return folder
 
 
 def expected(
@@ -506,3 +513,55 @@ def test_a_swapped_motion_is_refused_and_an_extreme_frame_is_not(
     result = render(f"motion={tmp_path / 'b.npz'}", "out=b", "start=11")
     assert result.returncode == 0, result.stderr
     assert len(list((tmp_path / "b").glob("*.png"))) == 3
+
+
+SPLATS = ("model=splat_only", "effects=none")
+CROPPED = "data.crop={_target_:gsgan.data.crop.PersonCrop,margin:0.05}"
+
+
+def test_crops_at_the_images_own_scale_are_as_large_as_the_largest(
+    inside, tiny, tmp_path
+):
+    """With data.size=null every frame's crop has a size of its own."""
+    config = tiny(*SPLATS, "data.size=null", CROPPED)
+    run = begun(config, tmp_path / "run")
+    dataset = build_data(config).dataset("train")
+    camera = dataset.items[0][0]
+    sizes = {dataset.camera(x).size for x in dataset.items if x[0] == camera}
+    assert len(sizes) > 1
+    result = inside("render", f"run={run}", "motion=train", "out=a")
+    assert result.returncode == 0, result.stderr
+    shown = {read(path).shape[:2] for path in tmp_path.glob("a/*.png")}
+    assert shown == {max(sizes)}
+
+
+def test_images_that_are_not_square_keep_their_shape(inside, tiny, tmp_path):
+    write_tiny_capture(tmp_path / "wide", frames=4, size=(48, 32))
+    config = tiny(*SPLATS, f"data.root={tmp_path / 'wide'}", "data.size=null")
+    run = begun(config, tmp_path / "run")
+    motion = ("motion=train", "frames=1")
+    for more, size in (("pixels=null", (32, 48)), ("pixels=64", (64, 96))):
+        out = f"out=a{size[0]}"
+        result = inside("render", f"run={run}", *motion, more, out)
+        assert result.returncode == 0, result.stderr
+        (path,) = tmp_path.glob(f"a{size[0]}/*.png")
+        assert read(path).shape[:2] == size
+
+
+@pytest.mark.parametrize("effect", ["project", "undistort"])
+def test_a_camera_of_the_data_keeps_the_lens_that_was_rendered_in_training(
+    tiny, tmp_path, landmarks, effect
+):
+    root = tmp_path / "lens"
+    write_tiny_capture(root, dist=(-0.2, 0.05, 0, 0, 0))
+    config = tiny(
+        "model=splat_only",
+        f"data.root={root}",
+        f"effects.distortion={effect}",
+        "effects.body_points=off",
+    )
+    run = Run.load(begun(config, tmp_path / "run"), device="cpu")
+    drive = SimpleNamespace(p=landmarks, camera=None)
+    options = OmegaConf.create({"camera": "cam00", "pixels": None})
+    seen, _ = render_run._cameras(options, run, drive)
+    assert (seen.dist is not None) == (effect == "project")

@@ -215,3 +215,17 @@ def test_what_lies_beyond_the_fold_is_not_painted():
         K=camera(None).K * torch.tensor([[0.4], [0.4], [1]]),
     )
     assert float(rasterise(splat, wide).alpha.max()) == 0
+
+
+@pytest.mark.parametrize("dist", [BARREL, PINCUSHION, [0.1, 0, 0, 0, 0]])
+def test_a_skeleton_has_a_finite_gradient_through_every_lens(dist):
+    """Lenses that fold and that never do; on the axis, in the image, and beyond the fold."""
+    x = torch.tensor(
+        [[[0.0, 0.0, 2.0], [0.3, -0.2, 2.0], [9.0, 7.0, 2.0]]],
+        requires_grad=True,
+    )
+    pixels, _ = camera(dist).project(x)
+    pixels.square().sum().backward()
+    assert torch.isfinite(pixels).all()
+    assert torch.isfinite(x.grad).all()
+    assert bool((x.grad[0, 1] != 0).any())

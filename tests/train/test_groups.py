@@ -9,6 +9,7 @@ from typing import Any
 import fsspec
 import numpy as np
 import pytest
+import torch
 from commands import refused, train
 from lightning.pytorch.loggers import wandb as wandb_logger
 from PIL import Image
@@ -176,3 +177,9 @@ def test_a_logger_whose_package_is_missing_is_named(trained, monkeypatch):
     monkeypatch.setattr(wandb_logger, "_WANDB_AVAILABLE", False)
     result, _ = trained("logger=wandb")
     refused(result, "wandb")
+
+
+def test_a_gpu_that_is_not_there_is_named(trained, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    result, _ = trained("trainer=gpu")
+    refused(result, "trainer", "No supported gpu backend found")

@@ -279,18 +279,18 @@ def test_every_phase_runs_under_bf16_autocast(make):
     assert float((plain.image - mixed.image).abs().max().detach()) < 0.05
 
 
-def test_float16_is_refused_before_anything_trains(make, monkeypatch):
+def test_other_precisions_are_refused_before_anything_trains(make, monkeypatch):
     """Said to a trainer as a GPU's would have it: on a CPU Lightning takes bf16 in its place."""
     module, _, _ = make()
-    for precision in ("16-mixed", "16-true"):
+    for precision in ("16-mixed", "16-true", "bf16-true", "64-true"):
         module.trainer = Trainer(accelerator="cpu", logger=False)
         monkeypatch.setattr(Trainer, "precision", precision)
         with pytest.raises(
             ConfigError, match=f"precision={precision}.*bf16-mixed"
         ):
-            module.on_fit_start()
+            module.setup("validate")
     monkeypatch.setattr(Trainer, "precision", "bf16-mixed")
-    module.on_fit_start()
+    module.setup("validate")
 
 
 def test_the_discriminators_rate_spans_the_gan_alone(make):

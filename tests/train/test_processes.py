@@ -1,12 +1,15 @@
 """Two processes train as one process with the whole batch, and stop together."""
 
 import json
+import math
 import os
+from types import SimpleNamespace
 
 import pytest
 import torch
 from lightning import Callback
 
+from gsgan.train.callbacks import WholeSchedule
 from gsgan.utils.errors import ConfigError
 
 TWO = {"devices": 2, "strategy": "ddp_fork_find_unused_parameters_true"}
@@ -75,3 +78,30 @@ def test_another_number_of_processes_is_refused(make):
     checkpoint["gsgan"]["processes"] = 2
     with pytest.raises(ConfigError, match=r" 2 processes.* 1 "):
         module.on_load_checkpoint(checkpoint)
+
+
+@pytest.mark.parametrize("processes", [1, 2, 4])
+def test_the_schedule_is_trained_to_its_end_by_any_number_of_processes(
+    make, processes
+):
+    """With one pass over the data per epoch, whose length depends on the number of processes."""
+    module, _, data = make("data.steps_per_epoch=null")
+    steps = math.ceil(len(data.dataset("train")) / processes)
+    module.step = 1
+    trainer = SimpleNamespace(
+        num_training_batches=steps,
+        current_epoch=3,
+        fit_loop=SimpleNamespace(max_epochs=-1),
+    )
+    WholeSchedule().on_train_start(trainer, module)
+    epochs = trainer.fit_loop.max_epochs - 3
+    left = module.schedule.total - 1
+    assert (epochs - 1) * steps < left <= epochs * steps
+
+
+def test_a_run_trains_to_its_end_with_one_pass_per_epoch(make):
+    module, trainer, data = make(
+        "data.steps_per_epoch=null", max_epochs=-1, callbacks=[WholeSchedule()]
+    )
+    trainer.fit(module, data)
+    assert module.step == module.schedule.total

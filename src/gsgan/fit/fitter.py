@@ -178,9 +178,10 @@ class Fitter:
         self.frames = frames
         self.seed = seed
         device = frames.device
-        surface = FittedSurface(
-            body.to(device), settings.points, settings.accuracy
-        )
+
+        # Points are chosen on the host; what moves them is where the masks are.
+        surface = FittedSurface(body, settings.points, settings.accuracy)
+        surface.body = body.to(device)
         self.surface = surface.to(device)
 
         # the change of each frame's angles and translation

@@ -207,7 +207,7 @@ def in_front(x_cam: Tensor) -> Tensor:
     """
     # The pairs of which one corner is beyond the plane.
     beyond = x_cam[:, 2] > NEAR
-    first, second = CORNER_PAIRS.unbind(1)
+    first, second = CORNER_PAIRS.to(x_cam.device).unbind(1)
     crosses = beyond[first] != beyond[second]
     a = x_cam[first[crosses]]
     b = x_cam[second[crosses]]

@@ -217,7 +217,7 @@ def distilled(
     settings["scale_min"], settings["scale_max"] = psi.scale_range
     fitted = Harmonic(
         avatar.rest_points, psi.body_height, follow=follow, **settings
-    )
+    ).to(avatar.rest_points.device)
 
     # The fit over all poses. `Harmonic` multiplies its means by mean_step, so they are divided.
     samples = _samples(found, psi, on_body, poses)
@@ -249,10 +249,15 @@ def _samples(
 
     With ``on_body`` the residuals of means include its offsets.
     """
+    device = avatar.rest_points.device
     for p, visibility, given in poses:
-        # Ψ's residuals in this pose, without noise.
+        # The body is solved on the host, like the inputs.
         body = avatar.body_pose(p, visibility) if given is None else given
-        points, residuals = avatar.residuals(p, visibility > 0, body)
+        body = None if body is None else body.to(device)
+
+        # Ψ's residuals in this pose, without noise.
+        valid = (visibility > 0).to(device)
+        points, residuals = avatar.residuals(p.to(device), valid, body)
         if on_body is not None and body is not None:
             offset = on_body.offset(body)
             if offset is not None:

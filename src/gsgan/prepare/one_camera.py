@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -140,7 +140,8 @@ def solve_video(
         metadata = read_metadata(video)
         first = options.focal or metadata.focal or USUAL_FOCAL
         guess = float(np.hypot(*source.size) * first / FILM)
-        view = _solve(options, detected[used], time[used], source.size, guess)
+        sided = with_right_sides(detected[used])
+        view = _solve(options, sided, time[used], source.size, guess)
 
     # Frames that fit much worse than the others are left out, too.
     doubtful = doubtful_poses(view.error.numpy())
@@ -152,7 +153,7 @@ def solve_video(
     camera, p = _in_world(source, view, guess, options.height)
     p = p[good]
     kept = used[good]
-    seen = detected[kept]
+    seen = sided[np.flatnonzero(good)]
     joints, removed = _with_hands(p, seen, camera, time[kept], options)
 
     # The solution in the form of several cameras, without sides and clocks to correct.
@@ -244,6 +245,32 @@ def _read(
     return detected, there
 
 
+def with_right_sides(seen: Detected) -> Detected:
+    """The detections with left and right exchanged where the detector confused them."""
+    # Sides of the body that change for a few frames are the detector's mistake.
+    swapped = exchanged(seen.world[:, SWAPPED])
+    mirror = list(MEDIAPIPE33.mirror)
+    px = seen.px.copy()
+    conf = seen.conf.copy()
+    world = seen.world.copy()
+    for values in (px[:, :BODY], conf[:, :BODY], world):
+        values[swapped] = values[swapped][:, mirror]
+
+    # Each hand is at the wrist that is nearer to it; a hand that was not seen does not count.
+    hands = [LEFT.start, RIGHT.start]
+    known = np.where(conf[..., None] > 0, px, np.nan)
+    wrists = known[:, WRIST_JOINTS]
+    own = np.linalg.norm(known[:, hands] - wrists, axis=-1)
+    other = np.linalg.norm(known[:, hands] - wrists[:, ::-1], axis=-1)
+    crossed = np.nansum(other, axis=1) < np.nansum(own, axis=1)
+
+    # Left and right hand take each other's place.
+    hand_z = seen.hand_z.copy()
+    for values in (px[:, HANDS], conf[:, HANDS], hand_z):
+        values[crossed] = np.roll(values[crossed], HAND, axis=1)
+    return replace(seen, px=px, conf=conf, world=world, hand_z=hand_z)
+
+
 class Metadata(NamedTuple):
     """What a video's metadata state."""
 
@@ -273,26 +300,18 @@ def _solve(
 ) -> View:
     """The solution, which starts from a focal length of ``guess`` pixels."""
     # Landmarks of little confidence count as not seen.
-    px = seen.px[:, :BODY].copy()
     conf = seen.conf[:, :BODY].copy()
-    world = seen.world.copy()
     conf[conf <= options.solve.min_confidence] = 0
-
-    # Detectors confuse left and right in some frames.
-    swapped = exchanged(world[:, SWAPPED])
-    mirror = list(MEDIAPIPE33.mirror)
-    for values in (px, conf, world):
-        values[swapped] = values[swapped][:, mirror]
 
     # Offsets from the principal point, which is in the middle of the image.
     middle = np.array(size[::-1]) / 2
-    u = np.nan_to_num(px - middle) / guess
+    u = np.nan_to_num(seen.px[:, :BODY] - middle) / guess
     offsets = torch.from_numpy(u)
     weight = torch.from_numpy(conf)
     given = Seen(
         u=offsets,
         weight=weight,
-        world=with_lifter(torch.from_numpy(world), offsets, weight),
+        world=with_lifter(torch.from_numpy(seen.world), offsets, weight),
         time=torch.from_numpy(time),
     )
     return solve_view(

@@ -688,6 +688,9 @@ def _best_zoom(costs: Float) -> tuple[float, float]:
     best = int(np.clip(cost.argmin(), ZOOM_NEIGHBOURS, last - ZOOM_NEIGHBOURS))
     near = slice(best - ZOOM_NEIGHBOURS, best + ZOOM_NEIGHBOURS + 1)
     a, b, _ = np.polyfit(ZOOMS[near], cost[near], 2)
+    if a <= 0:
+        # Near an end of the range the cost may fall towards it without a minimum.
+        return float(ZOOMS[cost.argmin()]), 1.0
     zoom = float(np.clip(-b / (2 * a), ZOOMS[0], ZOOMS[-1]))
     return zoom, float(max(a, 1.0) ** -0.5)
 

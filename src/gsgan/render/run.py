@@ -150,8 +150,9 @@ def _cameras(
     if drive.camera is not None:
         camera, index = drive.camera
         if config.pixels is not None:
+            height, width = camera.size
             side = whole("pixels", config.pixels, 1)
-            camera = camera.resize((side, side))
+            camera = camera.resize((side, round(side * width / height)))
         return camera, index
 
     # All others give square images, by default as large as in training.
@@ -177,7 +178,7 @@ def _cameras(
 
     # The camera of the run's data, as it was seen in training.
     crop = run.data.crop
-    lens = run.stored.data.get("lens") == "project"
+    lens = run.data.lens == "raw"
     return of_entry(entries[name], drive.p, size, crop, lens), None
 
 
@@ -202,7 +203,8 @@ def of_entry(
     if crop is not None:
         joints = p.reshape(-1, 3)
         known: NDArray[np.bool_] = np.asarray(np.isfinite(joints).all(-1))
-        window = crop.window(entry, joints, known)
+        dist = entry.dist if lens and entry.keeps_lens else None
+        window = crop.window(entry, joints, known, dist)
     return entry.seen(window, (size, size), lens=lens)
 
 

@@ -55,7 +55,7 @@ OPTIONS = (
 def build_data(config: DictConfig) -> GsganData:
     """The data module of a config, its dataset made if need be, read and checked."""
     # Images are undistorted when they are read, so the dataset knows that effect.
-    distortion = _effect_settings(config).distortion
+    distortion = _effect_settings(config).requested("distortion")
     data: GsganData = instantiate(config.data, distortion=distortion)
     data.prepare_data()
     data.setup()

@@ -241,7 +241,11 @@ def _held_out(options: MotionOptions, run: Run, split: str) -> Drive:
     if own:
         text += f" of camera {camera}"
         index = torch.tensor([layout.camera_names.index(shown)] * len(items))
-        seen = cat([dataset.camera(item) for item in items]), index
+        cameras = [dataset.camera(item) for item in items]
+
+        # Crops at the images' own scale differ in size; all are rendered as large as the largest.
+        largest = max(camera.size for camera in cameras)
+        seen = cat([camera.resize(largest) for camera in cameras]), index
     return Drive(
         p=np.stack([dataset.skeletons.p[frame] for frame in frames]),
         visibility=np.stack(

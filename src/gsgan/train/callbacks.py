@@ -124,7 +124,8 @@ class HeldOutClip(Callback):
         if not loggers or not trainer.is_global_zero or not len(self.dataset):
             return
 
-        # The frames of the first camera, rendered and made small.
+        # The frames of the first camera, rendered as after training and made small.
+        module.eval()
         first, _ = self.dataset.items[0]
         places = [
             place
@@ -222,6 +223,19 @@ class ProgressLines(Callback):
             left = spent / done * (total - step)
             line += f"  {done / spent:5.1f} it/s, {left / 60:4.1f} min left"
         self.console.print(line, highlight=False, soft_wrap=True)
+
+
+class WholeSchedule(Callback):
+    """Sets the number of epochs to those that the rest of the schedule takes.
+
+    An epoch's length depends on the number of processes, which may change when a run is resumed.
+    """
+
+    def on_train_start(self, trainer: Trainer, module: LightningModule) -> None:
+        training = _training(module)
+        left = training.schedule.total - training.step
+        epochs = -(-left // int(trainer.num_training_batches))
+        trainer.fit_loop.max_epochs = trainer.current_epoch + epochs
 
 
 class StopOnSignal(Callback):

@@ -195,12 +195,13 @@ class AvatarTraining(LightningModule):
             return self.avatar
         return self.average.module.eval()  # type: ignore[return-value]
 
-    def on_fit_start(self) -> None:
-        """Refuses float16: gradients would be clipped before unscaling."""
-        if self.trainer.precision in ("16-true", "16-mixed"):
+    def setup(self, stage: str) -> None:
+        """Refuses precisions that are not supported."""
+        if self.trainer.precision not in ("32-true", "bf16-mixed"):
             raise ConfigError(
-                f"trainer.precision={self.trainer.precision}: float16 loses this training's small "
-                "gradients, and scaled ones cannot be clipped; choose bf16-mixed or 32-true"
+                f"trainer.precision={self.trainer.precision} is not supported; choose 32-true or "
+                "bf16-mixed (float16 loses this training's small gradients, and scaled ones "
+                "cannot be clipped)"
             )
 
     def on_train_start(self) -> None:

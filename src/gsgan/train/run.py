@@ -166,8 +166,6 @@ def run_training(config: DictConfig) -> None:
     trainer = build_trainer(
         config.trainer,
         folder,
-        module,
-        data,
         console,
         logger=_logger(config.logger, logs),
         callbacks=[

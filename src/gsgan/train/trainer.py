@@ -18,10 +18,12 @@ from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
-from gsgan.data.datamodule import GsganData
 from gsgan.run.stored import CHECKPOINT
-from gsgan.train.callbacks import AtomicCheckpoints, ProgressLines
-from gsgan.train.module import AvatarTraining
+from gsgan.train.callbacks import (
+    AtomicCheckpoints,
+    ProgressLines,
+    WholeSchedule,
+)
 
 # what launchers call a process' rank on its machine
 LOCAL_RANKS = ("LOCAL_RANK", "SLURM_LOCALID")
@@ -30,8 +32,6 @@ LOCAL_RANKS = ("LOCAL_RANK", "SLURM_LOCALID")
 def build_trainer(
     settings: DictConfig,
     folder: Path,
-    module: AvatarTraining,
-    data: GsganData,
     console: Console,
     logger: Logger | None,
     callbacks: Sequence[Callback],
@@ -41,14 +41,13 @@ def build_trainer(
     Args:
         settings: the config group ``trainer``.
         folder: of the run.
-        module: what is trained.
-        data: its dataset.
         console: for progress.
         logger: of the curves.
         callbacks: beside those that every run has.
     """
     used: list[Any] = [
         *callbacks,
+        WholeSchedule(),
         ProgressLines(console),
         ModelCheckpoint(
             dirpath=folder / CHECKPOINT.parent,
@@ -62,10 +61,10 @@ def build_trainer(
     if console.is_terminal:
         used.append(RichProgressBar())
 
-    # An epoch is as long as the loader, so the schedule is rounded up to whole epochs.
+    # `WholeSchedule` sets the number of epochs.
     return instantiate(
         settings,
-        max_epochs=-(-module.schedule.total // len(data.train_dataloader())),
+        max_epochs=-1,
         callbacks=used,
         default_root_dir=folder,
         plugins=[AtomicCheckpoints()],

@@ -234,7 +234,10 @@ def one_sentence(error: BaseException) -> str | None:
         where = str(error).rpartition("full_key: ")[2] or "the config"
         if isinstance(cause, (ValueError, TypeError)):
             return f"{where}: {cause}"
-        return f"{where}: {str(error).splitlines()[0]}"
+
+        # Other errors may say little without the name of the class.
+        which = str(error).splitlines()[0]
+        return f"{where}: {which} {cause or ''}".rstrip()
 
     # A full disk, a bad override, or a value that gsgan refuses.
     if isinstance(error, OSError) and error.errno in NO_ROOM:
