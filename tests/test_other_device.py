@@ -1,0 +1,119 @@
+"""Host and device are kept apart, also where no GPU shows it."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from hydra.utils import instantiate
+from other_device import Remote, other_device
+
+from gsgan.body import free_body
+from gsgan.data.metric_variants import MetricVariants
+from gsgan.evaluate.predictions import BodyBoxes, Preparation
+from gsgan.evaluate.scores import Scorer, Tally, painter
+from gsgan.fit.fitter import Fitter
+from gsgan.fit.frames import MaskedFrames
+from gsgan.model.harmonic import distilled
+from gsgan.scene import BodyPose
+
+
+def test_the_device_refuses_what_a_gpu_refuses(monkeypatch):
+    with other_device(monkeypatch) as there:
+        x = torch.ones(3, device=there)
+        host = torch.arange(3)
+        assert (x + 1).sum().item() == 6
+        assert x[host].device == there
+        for refused in (lambda: x + host, lambda: host[x > 0], x.numpy):
+            with pytest.raises((RuntimeError, TypeError)):
+                refused()
+
+
+@pytest.mark.parametrize(
+    ("model", "effects"),
+    [
+        ("full", "all"),
+        ("splat_only", "auto"),
+        ("lbs_splat", "all"),
+        ("image_to_image", "auto"),
+    ],
+)
+def test_an_avatar_renders_there_as_here(build, monkeypatch, model, effects):
+    _, avatar, frame = build(f"model={model}", f"effects={effects}")
+    dist = torch.tensor([[-0.2, 0.05, 0.001, 0.0, 0.0]])
+    cameras = (frame.camera, replace(frame.camera, dist=dist))
+    avatar.freeze()
+    expected = [avatar.render(frame.skeleton, camera) for camera in cameras]
+    with other_device(monkeypatch) as there:
+        avatar.to(there)
+        found = [avatar.render(frame.skeleton, camera) for camera in cameras]
+    for image, other in zip(found, expected, strict=True):
+        assert isinstance(image, Remote)
+        torch.testing.assert_close(image.held, other, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("region", ["full", "body_box", "body_box_cleared"])
+def test_scores_there_are_those_of_here(build, monkeypatch, region):
+    data, avatar, frame = build("effects.body_points=on")
+    avatar.freeze()
+    preparation = Preparation(
+        MetricVariants(region=region),
+        None if region == "full" else BodyBoxes(data),
+        data.skeleton,
+        data.layout.meta.label_names or (),
+    )
+
+    def scores(frame):
+        tally = Tally(Scorer(preparation))
+        item = data.dataset("train").items[0]
+        tally.add(
+            item, frame, painter(avatar, solve=True)(frame, item), show=True
+        )
+        return tally.result().rows["full"][0]
+
+    expected = scores(frame)
+    with other_device(monkeypatch) as there, torch.no_grad():
+        avatar.to(there)
+        found = scores(frame.to(there))
+    for name, value in expected.items():
+        if isinstance(value, float):
+            assert found[name] == pytest.approx(value, rel=1e-4, nan_ok=True)
+
+
+def test_an_avatar_is_distilled_there(build, monkeypatch):
+    _, avatar, frame = build("effects.body_points=on", "model=splat_only")
+    avatar.freeze()
+    poses = [(frame.skeleton, frame.visibility, None)] * 3
+    avatar.body_pose(frame.skeleton, frame.visibility)  # constants of the host
+    expected = distilled(avatar, poses, keep_offsets=False)
+    image = expected.render(frame.skeleton, frame.camera)
+    with other_device(monkeypatch) as there:
+        found = distilled(avatar.to(there), poses, keep_offsets=False)
+        shown = found.render(frame.skeleton, frame.camera)
+    assert isinstance(shown, Remote)
+    torch.testing.assert_close(shown.held, image, atol=1e-4, rtol=0)
+
+
+def test_the_surface_of_a_body_is_fitted_there(build, tiny, monkeypatch):
+    """Two steps; poses take no step, since the device has no sparse gradients."""
+    data, _, _ = build("effects.body_points=on", "model=splat_only")
+    settings = replace(instantiate(tiny().fit), points=100)
+    body = free_body()
+
+    def fitted(device):
+        frames = MaskedFrames(data, device, max_frames=2)
+        count = len(frames.frames)
+        start = BodyPose(
+            theta=torch.zeros(count, len(body.parents), 3),
+            transl=torch.zeros(count, 3),
+        )
+        fitter = Fitter(settings, frames, body, start)
+        for _ in range(2):
+            fitter.surface_step()
+        return fitter.surface.offsets.detach()
+
+    expected = fitted(torch.device("cpu"))
+    with other_device(monkeypatch) as there:
+        found = fitted(there)
+    assert isinstance(found, Remote)
+    assert float(expected.abs().max()) > 0
+    torch.testing.assert_close(found.held, expected, atol=1e-4, rtol=1e-3)
