@@ -8,6 +8,7 @@ and indices of the host are allowed.
 from contextlib import contextmanager, nullcontext
 
 import torch
+from torch.optim import optimizer
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
@@ -132,6 +133,12 @@ def other_device(monkeypatch):
     )
     # Compiled code reads its inputs on the host, and would refuse those of a real meta device.
     monkeypatch.setattr(compiled, "available", lambda _: native.available())
+    # The optimisers of Adam are fused on devices that they know.
+    monkeypatch.setattr(
+        optimizer,
+        "_get_fused_kernels_supported_devices",
+        lambda: ["cpu", "meta"],
+    )
     # It knows no meta device.
     monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())
     for cache in CACHES:

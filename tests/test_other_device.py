@@ -4,7 +4,11 @@ from dataclasses import replace
 
 import pytest
 import torch
+from commands import quiet_trainer
 from hydra.utils import instantiate
+from lightning import Callback
+from lightning.pytorch.accelerators import CPUAccelerator
+from lightning.pytorch.strategies import SingleDeviceStrategy
 from other_device import Remote, other_device
 
 from gsgan.body import free_body
@@ -15,6 +19,8 @@ from gsgan.fit.fitter import Fitter
 from gsgan.fit.frames import MaskedFrames
 from gsgan.model.harmonic import distilled
 from gsgan.scene import BodyPose
+from gsgan.train.callbacks import WholeSchedule
+from gsgan.train.run import build_training
 
 
 def test_the_device_refuses_what_a_gpu_refuses(monkeypatch):
@@ -117,3 +123,50 @@ def test_the_surface_of_a_body_is_fitted_there(build, tiny, monkeypatch):
     assert isinstance(found, Remote)
     assert float(expected.abs().max()) > 0
     torch.testing.assert_close(found.held, expected, atol=1e-4, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        pytest.param(("model=full", "effects=all"), marks=pytest.mark.slow),
+        pytest.param(("model=full", "effects=none"), marks=pytest.mark.slow),
+        pytest.param(("model=lbs_splat",), marks=pytest.mark.slow),
+        ("model=image_to_image",),
+    ],
+)
+def test_a_model_trains_there_as_here(tiny, tmp_path, monkeypatch, more):
+    """The losses of every iteration, in all phases."""
+    monkeypatch.setattr(CPUAccelerator, "setup_device", lambda *_: None)
+
+    def losses(device):
+        data, module = build_training(tiny(*more))
+        held = Losses()
+        trainer = quiet_trainer(
+            tmp_path,
+            max_epochs=-1,
+            limit_val_batches=0,
+            strategy=SingleDeviceStrategy(device=device),
+            callbacks=[WholeSchedule(), held],
+        )
+        torch.manual_seed(0)
+        trainer.fit(module, data)
+        return held.found
+
+    expected = losses(torch.device("cpu"))
+    with other_device(monkeypatch) as there:
+        found = losses(there)
+    assert len(found) == len(expected) > 0
+    for a, b in zip(found, expected, strict=True):
+        assert a == pytest.approx(b, rel=1e-3)
+
+
+class Losses(Callback):
+    """The logged values of every iteration."""
+
+    def __init__(self) -> None:
+        self.found: list[dict[str, float]] = []
+
+    def on_train_batch_end(self, trainer, *_):
+        self.found.append(
+            {name: float(x) for name, x in trainer.callback_metrics.items()}
+        )
