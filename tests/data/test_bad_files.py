@@ -183,6 +183,8 @@ CAPTURE: list[Case] = [
     (r"0\.003.* m .*'unit'", meta(unit="mm")),
     ("'fps'.*0", meta(fps=0)),
     ("'splits'", meta(splits=[1])),
+    ("'test_camera'.*train_cameras", meta(splits={"test_camera": ["cam01"]})),
+    ("cam01.*'distortion'.*'dist'", camera(distortion=[0.1, 0, 0, 0])),
     ("'label_names'", meta(label_names="a")),
     (r"landmarks3d\.npz", write("landmarks3d.npz", b"PK\x03\x04" + bytes(40))),
     (r"landmarks3d\.npz.*nothing was run", landmarks(p=np.array([[Evil()]]))),

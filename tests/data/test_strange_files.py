@@ -16,6 +16,7 @@ from gsgan.prepare.landmarks import read_detections
 from gsgan.prepare.options import Inputs
 from gsgan.prepare.run import with_detections
 from gsgan.utils.errors import DataError
+from gsgan.utils.image_files import read_colour
 
 REPORTS = Path(__file__).parents[3] / "shared" / "data" / "reports"
 needs_reports = pytest.mark.skipif(
@@ -42,13 +43,30 @@ def test_a_mask_in_the_colours_is_read_whatever_its_alpha(tmp_path):
     np.testing.assert_array_equal(mask_of(tmp_path / "m.png"), SOFT)
 
 
-@pytest.mark.parametrize("value", [1, 100, 127])
-def test_masks_that_never_reach_one_half_are_named(tmp_path, value):
+@pytest.mark.parametrize("value", [1, 100, 127, 200])
+def test_masks_of_another_value_than_white_are_named(tmp_path, value):
     cv2.imwrite(
         str(tmp_path / "m.png"), np.where(SOFT > 99, value, 0).astype(np.uint8)
     )
     with pytest.raises(DataError, match=rf"m\.png.* {value} "):
         mask_of(tmp_path / "m.png")
+
+
+@pytest.mark.parametrize("colour", [(0, 255, 0), (0, 165, 255), (255, 0, 0)])
+def test_masks_of_one_colour_are_named(tmp_path, colour):
+    """Their grey value would make the person transparent."""
+    filled = (SOFT > 99)[..., None] * np.array(colour, np.uint8)
+    cv2.imwrite(str(tmp_path / "m.png"), filled)
+    with pytest.raises(DataError, match=r"m\.png.*black and white"):
+        mask_of(tmp_path / "m.png")
+
+
+def test_an_image_of_more_than_8_bits_is_named(tmp_path):
+    """Divided by 256, 12 bits are black."""
+    path = tmp_path / "a.png"
+    cv2.imwrite(str(path), np.full((4, 4, 3), 4000, np.uint16))
+    with pytest.raises(DataError, match=r"a\.png has 16 bits"):
+        read_colour(path)
 
 
 def test_an_empty_mask_and_a_faint_soft_one_are_masks(tmp_path):

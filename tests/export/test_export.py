@@ -12,6 +12,7 @@ from PIL import Image
 from safetensors.torch import save_file
 
 from gsgan.export.splats import Splats, ply_bytes
+from gsgan.run.runs import marks_of
 from gsgan.utils.errors import DataError
 from gsgan.utils.provenance import png_bytes
 
@@ -103,7 +104,7 @@ def test_the_rest_pose_as_glb(bare, tmp_path, inside):
     assert out.read_bytes()[:4] == b"glTF"
     assert (
         "KHR_gaussian_splatting"
-        in (tmp_path / "rest.MODEL_CARD.md").read_text()
+        in (tmp_path / "rest.glb.MODEL_CARD.md").read_text()
     )
 
 
@@ -111,9 +112,24 @@ def test_a_trained_run_as_safetensors_with_its_scores(run, tmp_path, inside):
     out = tmp_path / "one.safetensors"
     result = inside("export", f"run={run}", "format=safetensors", f"out={out}")
     assert result.returncode == 0, result.stderr
-    card = (tmp_path / "one.MODEL_CARD.md").read_text()
+    card = (tmp_path / "one.safetensors.MODEL_CARD.md").read_text()
     assert "| novel_pose | final image |" in card
     assert "marked: perceptual loss" in card
+
+    # A card that is somebody's own stays.
+    other = ("format=gltf", f"out={tmp_path / 'me.glb'}")
+    (tmp_path / "me.glb.MODEL_CARD.md").write_text("mine")
+    refused(inside("export", f"run={run}", *other), "MODEL_CARD.md exists")
+    assert (tmp_path / "me.glb.MODEL_CARD.md").read_text() == "mine"
+
+
+def test_an_unfinished_run_says_so():
+    facts = {"marks": ["a mark"], "step": 4, "planned": 16}
+    assert marks_of(facts) == [
+        "a mark",
+        "unfinished: 4 of 16 iterations are trained",
+    ]
+    assert marks_of(facts | {"step": 16}) == ["a mark"]
 
 
 def test_safetensors_name_no_class_but_gsgans_own(run, compose, tmp_path):

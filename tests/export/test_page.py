@@ -349,7 +349,7 @@ def test_an_avatar_without_a_body_is_refused(bare, inside):
 def test_training_writes_the_page(on_body, tmp_path, inside):
     text = (on_body() / "avatar.html").read_text()
     assert "trainedAlgorithmicMedia" in text
-    assert (on_body() / "avatar.MODEL_CARD.md").exists()
+    assert (on_body() / "avatar.html.MODEL_CARD.md").exists()
     given = (
         f"run={on_body()}",
         "format=bin",

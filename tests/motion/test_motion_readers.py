@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from torch.utils._pytree import tree_map
 
 from gsgan.body.shape import free_space, shaped_body
@@ -736,3 +737,46 @@ def test_other_pickles_are_one_sentence(
     (tmp_path / "a.pkl").write_bytes(pickle.dumps(content))
     with pytest.raises(DataError, match=message):
         read_motion(tmp_path / "a.pkl", Source(proportions))
+
+
+def test_rows_of_landmarks_may_be_in_another_order_than_frames(
+    tmp_path, landmarks, proportions
+):
+    order = np.random.default_rng(0).permutation(len(landmarks))
+    path = tmp_path / "a.npz"
+    np.savez(path, p=landmarks[order], frame_id=5 * order, fps=25)
+    p, _ = standard(path, proportions)
+    np.testing.assert_allclose(p, landmarks, atol=1e-6)
+
+
+def test_rotations_of_smpl_in_other_forms(tmp_path, shared, proportions):
+    """Matrices, as 4D-Humans writes them, are converted; the others are refused."""
+    from writers.smpl import write_smpl
+
+    model = shared("smpl.pkl", lambda path: write_smpl(path, kind="smpl"))
+    turns = 0.4 * np.random.default_rng(0).standard_normal((5, 24, 3))
+    moves = {"trans": np.zeros((5, 3)), "fps": 30.0}
+    path = tmp_path / "a.npz"
+    np.savez(path, poses=turns.reshape(5, 72), **moves)
+    expected = read_motion(path, Source(proportions, model)).p
+    matrices = Rotation.from_rotvec(turns.reshape(-1, 3)).as_matrix()
+    matrices = matrices.reshape(5, 24, 3, 3)
+    np.savez(
+        path,
+        body_pose=matrices[:, 1:],
+        global_orient=matrices[:, :1],
+        **moves,
+    )
+    found = read_motion(path, Source(proportions, model)).p
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+    quats = Rotation.from_rotvec(turns.reshape(-1, 3)).as_quat()
+    for poses in (
+        quats.reshape(5, 24, 4),
+        quats.reshape(5, 96),
+        matrices[..., :2].reshape(5, 144),
+        np.degrees(turns).reshape(5, 72),
+    ):
+        np.savez(path, poses=poses, **moves)
+        with pytest.raises(DataError, match=r"a\.npz.*rotation vectors"):
+            read_motion(path, Source(proportions, model))

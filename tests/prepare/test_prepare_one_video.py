@@ -367,3 +367,17 @@ def test_hands_follow_the_sides_of_the_body(with_body):
         np.testing.assert_array_equal(
             getattr(found, name), getattr(right, name)
         )
+
+
+@pytest.mark.parametrize(
+    ("more", "fact"),
+    [
+        ({"calibration": "intri.yml"}, "calibration is not used"),
+        ({"height": 178}, "height .* 178"),
+    ],
+)
+def test_a_calibration_and_a_height_in_centimetres_are_refused(
+    filmed, more, fact
+):
+    with pytest.raises(ConfigError, match=fact):
+        options(filmed, **more)

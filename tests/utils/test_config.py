@@ -14,6 +14,7 @@ from gsgan.utils.config import (
     config_folder,
     folder_name,
     one_sentence,
+    refuse_words_for_truth,
 )
 from gsgan.utils.errors import ConfigError, DataError
 
@@ -272,3 +273,14 @@ def test_the_precision_of_an_old_gpu_is_explained(monkeypatch):
     monkeypatch.setattr("torch.cuda.get_device_capability", lambda *_: (7, 5))
     assert "7.5" in _precision("32-true")
     assert _precision("bf16-mixed") == "bf16-mixed"
+
+
+@pytest.mark.parametrize("word", ["no", "off", "maybe", 1])
+def test_words_are_not_taken_for_true(word):
+    defaults = OmegaConf.create({"overwrite": False, "smooth": {"on": True}})
+    for key in ("overwrite", "smooth.on"):
+        config = defaults.copy()
+        OmegaConf.update(config, key, word)
+        with pytest.raises(ConfigError, match=f"{key} must be true or false"):
+            refuse_words_for_truth(config, defaults)
+    refuse_words_for_truth(defaults, defaults)

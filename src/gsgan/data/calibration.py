@@ -58,6 +58,15 @@ WITHOUT_SCALE = ("COLMAP", "nerfstudio")
 # Qualisys counts in parts of a pixel, of a sensor with this many rows that are stored.
 SUBPIXELS = 64
 QUALISYS_ROWS = 1080
+# names of the lens in other programs' files
+LENS_NAMES = (
+    "distortion",
+    "distortions",
+    "dist_coeffs",
+    "distCoeffs",
+    "distCoef",
+    "D",
+)
 # of a camera's table in TOML
 TOML_KEYS = ("size", "matrix", "distortions", "rotation", "translation")
 # tables that are no cameras
@@ -245,6 +254,14 @@ def read_cameras(
         ):
             raise DataError(
                 f"{where}: expected an object with K, R, t, dist and size"
+            )
+
+        # A lens by another name would be ignored.
+        unknown = sorted(set(entry) & set(LENS_NAMES))
+        if unknown:
+            raise DataError(
+                f"{where}: the lens is named {unknown[0]!r}; expected 'dist', OpenCV's "
+                "coefficients [k1, k2, p1, p2, k3]"
             )
 
         # Stored as [width, height], while sizes are (H, W) everywhere else.

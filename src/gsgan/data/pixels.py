@@ -16,6 +16,8 @@ from gsgan.utils.arrays import Bool, Bytes
 from gsgan.utils.errors import DataError
 from gsgan.utils.image_files import read_alpha, read_grey, read_stored
 
+OPAQUE = 250  # a lower value, alone beside 0, is no alpha of a person
+
 # The part number of pixels without a known part.
 IGNORE_LABEL = 255
 
@@ -109,13 +111,13 @@ def _one_mask(rule: str, path: Path, rules: PixelRules) -> Bytes:
     if rule == "grey":
         mask = read_mask_values(path)
 
-        # A mask of 0 and 1, or of 0 and another low value, was stored as numbers, not as alpha.
+        # A mask of 0 and one other value is a number or a colour, not alpha.
         highest = int(mask.max())
         two_values = mask.min() == 0 and np.isin(mask, (0, highest)).all()
-        if highest == 1 or (0 < highest <= 127 and two_values):
+        if highest == 1 or (0 < highest < OPAQUE and two_values):
             raise DataError(
-                f"{path} holds 0 and {highest} alone; expected alpha from 0 to 255, and a person "
-                "where it is at least 128 (multiply it)"
+                f"{path} holds 0 and {highest} alone; expected alpha from 0 to 255, and 255 where "
+                "the person is (save it in black and white, or multiply it)"
             )
         return mask
 

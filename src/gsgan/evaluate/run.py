@@ -47,7 +47,7 @@ from gsgan.metrics.lpips import LPIPS_NETS, build_lpips
 from gsgan.metrics.names import FLOOR_VARIANT, FULL
 from gsgan.metrics.regions import BACKGROUNDS
 from gsgan.run.assemble import build_data
-from gsgan.run.runs import avatar_of, load_avatar
+from gsgan.run.runs import avatar_of, load_avatar, marks_of
 from gsgan.run.stored import (
     CHECKPOINT,
     DataPaths,
@@ -299,7 +299,7 @@ def evaluate_folder(
             data = build_data(other_capture(stored, config.other_capture))
         name = Path(data.layout.root).resolve().name
         out = folder / "on" / name
-        marks = [*state["marks"], f"on another capture: {name}", BY_SKELETON]
+        marks = [*marks_of(state), f"on another capture: {name}", BY_SKELETON]
     else:
         stored = load_config(folder, DataPaths.from_config(config))
         with working(console, "reading the data"):

@@ -9,7 +9,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsgan import __version__
 from gsgan.metrics.names import FLOOR_VARIANT, FULL, VARIANTS
-from gsgan.run.runs import Run
+from gsgan.run.runs import Run, marks_of
 from gsgan.utils.pages import markdown
 
 LINEAR = (
@@ -105,7 +105,7 @@ def card(run: Run, kind: str, name: str, licence: str | None) -> str:
 
     # Scores, and what makes them incomparable with others.
     scores = [_scores(run.folder)]
-    scores += [f"- marked: {mark}" for mark in run.checkpoint.get("marks", [])]
+    scores += [f"- marked: {mark}" for mark in marks_of(run.checkpoint)]
     parts = [
         f"---\n{yaml.safe_dump(head, sort_keys=False)}---",
         f"# {name}\n\nOne person's avatar, trained with gsgan (GaussianGAN). {HOLDS[kind]}",

@@ -93,6 +93,11 @@ def export_config(config: DictConfig) -> None:
     kind = one_of("format", config.format, tuple(ENDINGS))
     out = _place(config, kind)
     sequence = kind == "ply" and not out.suffix
+    beside = _card_of(out, sequence)
+    if beside.exists() and not config.overwrite:
+        raise ConfigError(
+            f"{beside} exists; give overwrite=true or another name"
+        )
     _check_upload(config, kind)
     if kind == "usd":
         refuse_missing_usd()
@@ -120,7 +125,6 @@ def export_config(config: DictConfig) -> None:
         _write(out, _program(config, run, kind))
 
     # The model card lies beside the file, or in the folder of a sequence.
-    beside = out / CARD if sequence else out.with_name(f"{out.stem}.{CARD}")
     _write(beside, card(run, kind, out.name, config.licence))
     tell(f"written: {out}, {beside.name}")
 
@@ -164,6 +168,10 @@ def _write_poses(
             for path in out.glob("frame" + "[0-9]" * 6 + ".ply"):
                 if path.name not in names:
                     path.unlink()
+
+
+def _card_of(out: Path, sequence: bool) -> Path:
+    return out / CARD if sequence else out.with_name(f"{out.name}.{CARD}")
 
 
 def _place(config: DictConfig, kind: str) -> Path:

@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 from safetensors.torch import save
 
 from gsgan.model.avatar import Avatar
-from gsgan.run.runs import Run, avatar_of
+from gsgan.run.runs import Run, avatar_of, marks_of
 from gsgan.run.shared import (
     ENTRIES,
     FACTS,
@@ -33,7 +33,8 @@ def facts_of(run: Run) -> dict[str, Any]:
     facts = run.checkpoint | {"scene": asdict(run.scene)}
     return {
         "config": OmegaConf.to_container(config),
-        "gsgan": {key: facts.get(key) for key in FACTS},
+        "gsgan": {key: facts.get(key) for key in FACTS}
+        | {"marks": marks_of(facts)},
     }
 
 

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from gsgan.body import free_body, open_body
 from gsgan.body.smpl import SkinnedModel, from_zju, read_smpl
@@ -63,12 +64,18 @@ GVHMR_KEY = "smpl_params_global"  # GVHMR's parameters in the world's axes
 SHAPE_KEYS = ("betas", "shapes")
 # Numbers of poses of SMPL-X's body, SMPL, SMPL-H, SMPL-X.
 WITHOUT_ROOT = (63, 69, 153, 162)
+# Numbers of poses that are quaternions, six numbers or matrices for each joint.
+OTHER_ROTATIONS = {
+    k * n for k in (4, 6, 9) for n in (21, 22, 23, 24, 52, 55)
+} - {n * 3 for n in (22, 24, 52, 55)}
+MAX_TURN = 30.0  # radians: a larger one is in degrees
 RATE_KEYS = ("fps", "mocap_framerate", "mocap_frame_rate")
 SCALE_KEY = "smpl_scaling"  # in AIST++: units of its translations in a metre
 # All arrays that are read, if a file has them.
 ARRAYS = (
     "p",
     "conf",
+    "frame_id",
     "theta",
     "visibility",
     SCALE_KEY,
@@ -257,6 +264,13 @@ def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Clip:
         )
     conf = np.where(np.isfinite(p).all(-1), np.nan_to_num(conf), 0.0)
 
+    # Rows may be in another order than frames.
+    if "frame_id" in arrays:
+        ids = expect_array(arrays, "frame_id", (len(p),), path)
+        order = np.argsort(ids, kind="stable")
+        p = p[order]
+        conf = conf[order]
+
     # People filmed from the waist up get hips below their shoulders.
     seen = conf[:, :BODY] > 0
     no_hips = seen[:, SHOULDERS].all(1) & ~seen[:, HIPS].any(1)
@@ -389,35 +403,59 @@ def _smpl_poses(path: Path, arrays: dict[str, Any]) -> Float:
     (72) and ``Rh``.
     """
     # One row of numbers for each frame.
-    poses = np.asarray(_first(arrays, POSE_KEYS), np.float64)
-    poses = poses.reshape(len(poses), -1)
+    poses = _rotation_vectors(path, _first(arrays, POSE_KEYS))
     root = _first(arrays, ROOT_KEYS)
+    root = None if root is None else _rotation_vectors(path, root)
     if poses.shape[1] in WITHOUT_ROOT:
         if root is None:
             raise DataError(
                 f"{path} has poses without the root's rotation; expected one of "
                 f"{', '.join(ROOT_KEYS)} beside them"
             )
-        root = np.asarray(root, np.float64).reshape(len(poses), 3)
+        root = root.reshape(len(poses), 3)
 
         # SMPL-X's jaw, eyes and hands follow the body.
         columns = [root, poses]
         smplx_body = poses.shape[1] == WITHOUT_ROOT[0]
         if smplx_body and all(key in arrays for key in PART_KEYS):
             for key in PART_KEYS:
-                part = np.asarray(arrays[key], np.float64)
-                columns.append(part.reshape(len(poses), -1))
+                columns.append(_rotation_vectors(path, arrays[key]))
         poses = np.concatenate(columns, axis=1)
     elif "Rh" in arrays:
         # ZJU-MoCap: Rh replaces the empty root.
         root = np.asarray(arrays["Rh"], np.float64).reshape(-1, 3)
         poses = np.concatenate([root, poses[:, 3:]], axis=1)
-    if poses.shape[1] % 3 or poses.shape[1] < 3 * SMPL_BODY:
+    count = poses.shape[1]
+    if count % 3 or count < 3 * SMPL_BODY or count in OTHER_ROTATIONS:
         raise DataError(
-            f"{path}: the poses have {poses.shape[1]} numbers per frame; expected 3 for each of 22 "
-            "or more SMPL joints"
+            f"{path}: the poses have {count} numbers per frame; expected 3 for each of 22 "
+            "or more SMPL joints, rotation vectors in radians"
         )
     return poses
+
+
+def _rotation_vectors(path: Path, values: Any) -> Float:
+    """``[F, 3 n]`` radians, of rotation vectors ``[F, 3 n]`` or ``[F, n, 3]``, or of rotation
+    matrices ``[F, n, 3, 3]``, which 4D-Humans writes."""
+    given = np.asarray(values, np.float64)
+    if given.ndim == 4 and given.shape[2:] == (3, 3):
+        turns = np.full(given.shape[:3], np.nan)
+        known = np.isfinite(given).all((2, 3))
+        turns[known] = Rotation.from_matrix(given[known]).as_rotvec()
+        given = turns
+    if given.ndim > 3 or (given.ndim == 3 and given.shape[2] != 3):
+        raise DataError(
+            f"{path}: poses have the shape {list(given.shape)}; expected rotation vectors "
+            "[F, 3 n] or [F, n, 3], or rotation matrices [F, n, 3, 3]"
+        )
+
+    # A rotation vector is at most a turn or two long.
+    if given.size and np.nanmax(np.abs(given)) > MAX_TURN:
+        raise DataError(
+            f"{path}: poses have angles up to {np.nanmax(np.abs(given)):.0f}; expected rotation "
+            "vectors in radians"
+        )
+    return given.reshape(len(given), -1)
 
 
 def _for_model(theta: Float, model: SkinnedModel) -> Float:

@@ -25,6 +25,7 @@ from gsgan.skeleton.proportions import UP_AXES
 from gsgan.utils.checks import above, between, one_of, whole
 from gsgan.utils.errors import ConfigError, DataError
 
+HEIGHTS = (0.4, 2.8)  # metres, of people
 MEDIAPIPE = "mediapipe"
 # The calibration that is found from the landmarks of the person, where there is no file.
 PERSON = "person"
@@ -96,9 +97,11 @@ class Options:
             raise ConfigError(
                 f"pixel_centre must be 0 or 0.5, got {self.pixel_centre!r}"
             )
-        for name in ("fps", "height", "focal"):
+        for name in ("fps", "focal"):
             if getattr(self, name) is not None:
                 above(name, getattr(self, name))
+        if self.height is not None:
+            between("height", self.height, *HEIGHTS)
         above("landmark_noise", self.landmark_noise)
         whole("workers", self.workers, 1)
         above("scale", between("scale", self.scale, 0, 1))
@@ -109,6 +112,14 @@ class Options:
                 f"mask_levels must rise within 0..1, got {self.mask_levels}"
             )
         self._check_mappings()
+        self._check_one_camera()
+
+    def _check_one_camera(self) -> None:
+        if self.one_camera and self.calibration is not None:
+            raise ConfigError(
+                "calibration is not used with one video, whose camera is estimated; leave it out, "
+                "and give focal=<mm> if you know the lens"
+            )
         if self.person is not None:
             self._check_person(self.person)
 

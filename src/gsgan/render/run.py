@@ -25,7 +25,7 @@ from gsgan.run.drive import (
     joints_of,
     smoothed,
 )
-from gsgan.run.runs import Run
+from gsgan.run.runs import Run, marks_of
 from gsgan.scene import Camera, cat
 from gsgan.skeleton.training_poses import TrainingPoses
 from gsgan.utils.checks import above, whole
@@ -54,6 +54,8 @@ def render_config(config: DictConfig) -> None:
     run = Run.from_config(config)
     if config.distilled:
         run.avatar = distilled_of(motion, run)
+    for mark in marks_of(run.checkpoint):
+        console.print(mark, markup=False, highlight=False, soft_wrap=True)
 
     # The motion, and the camera of each frame.
     drive = smoothed(config.smooth, drive_of(motion, run, fps), fps)

@@ -48,7 +48,7 @@ from gsgan.skeleton.proportions import (
 )
 from gsgan.skeleton.sides import refuse_swapped
 from gsgan.utils.arrays import evenly_spaced
-from gsgan.utils.checks import above, one_of
+from gsgan.utils.checks import above, between, one_of
 from gsgan.utils.errors import ConfigError, DataError
 
 Float = NDArray[np.float64]
@@ -125,6 +125,7 @@ class MotionOptions:
 
     def __post_init__(self) -> None:
         above("transition", self.transition)
+        between("min_visibility", self.min_visibility, 0, 1)
         one_of("drive", self.drive, (None, "skeleton"))
         one_of("retarget", self.retarget, ("auto", True, False))
         one_of("up", self.up, (None, *UP_AXES))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -104,8 +105,19 @@ def load_avatar(
         body_file=None if body is None else body.file,
         camera_names=data.layout.camera_names,
     )
-    marks = list(checkpoint["gsgan"]["marks"])
+    marks = marks_of(checkpoint["gsgan"])
     return _trained(folder, config, checkpoint, scene), marks
+
+
+def marks_of(facts: Mapping[str, Any]) -> list[str]:
+    """Notes that must accompany what a checkpoint's avatar renders and its scores."""
+    marks = list(facts.get("marks") or ())
+    planned = facts.get("planned") or 0
+    if facts["step"] < planned:
+        marks.append(
+            f"unfinished: {facts['step']} of {planned} iterations are trained"
+        )
+    return marks
 
 
 def avatar_of(

@@ -592,6 +592,7 @@ class AvatarTraining(LightningModule):
         # The counters are for a later part of the run, the rest is for scores and `gsgan.load`.
         checkpoint["gsgan"] = {
             "step": self.step,
+            "planned": self.schedule.total,
             "processes": self.processes,
             "rollbacks": self.rollback.done,
             "averaged": self.average is not None and self.average.started,

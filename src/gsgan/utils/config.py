@@ -6,9 +6,10 @@ import os
 import re
 import shutil
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from importlib.metadata import entry_points
 from pathlib import Path
+from typing import Any
 
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.hydra_config import HydraConfig
@@ -25,7 +26,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
-from gsgan.utils.errors import GsganError
+from gsgan.utils.errors import ConfigError, GsganError
 from gsgan.utils.sweeps import note, run_job
 
 FAILED = 1
@@ -76,8 +77,25 @@ def defaults_of(command: str) -> DictConfig:
     options = OmegaConf.load(config_folder() / f"{command}.yaml")
     assert isinstance(options, DictConfig)
     for key in ("defaults", "hydra"):
-        options.pop(key)
+        options.pop(key, None)
     return options
+
+
+def refuse_words_for_truth(config: DictConfig, defaults: DictConfig) -> None:
+    """Refuses words such as ``no`` where the default is true or false: they would count as true."""
+    for key, default in flat(OmegaConf.to_container(defaults, resolve=False)):
+        value = OmegaConf.select(config, key)
+        if isinstance(default, bool) and not isinstance(value, bool):
+            raise ConfigError(f"{key} must be true or false, got {value!r}")
+
+
+def flat(options: Any, parent: str = "") -> Iterator[tuple[str, Any]]:
+    """The values of nested mappings, by their dotted keys."""
+    for name, value in options.items():
+        if isinstance(value, dict):
+            yield from flat(value, f"{parent}{name}.")
+        else:
+            yield f"{parent}{name}", value
 
 
 def folder_name(overrides: str) -> str:
@@ -149,6 +167,7 @@ def entry(
             from gsgan.utils.tensors import keep_freed_memory
 
             keep_freed_memory()
+            refuse_words_for_truth(config, defaults_of(name))
             (get_method(task) if isinstance(task, str) else task)(config)
         except KeyboardInterrupt:
             _print_error("interrupted")
@@ -189,11 +208,16 @@ def entry(
             )
             print(f"{error}{more}", file=sys.stderr)
             sys.exit(FAILED)
+        except BrokenPipeError:
+            # The reader of the output, such as head, has closed it.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            sys.exit(FAILED)
         except OSError as error:
+            # The run folder that Hydra makes may be a file, or not writable.
             message = one_sentence(error)
-            if message is None:
+            if message is None and error.filename is None:
                 raise
-            _print_error(message)
+            _print_error(message or f"{error.filename}: {error.strerror}")
             sys.exit(FAILED)
 
     return main

@@ -16,6 +16,8 @@ from PIL import Image, UnidentifiedImageError
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import unreadable
 
+ORIENTATION = 0x0112  # of EXIF
+TURNED = range(2, 9)  # its values besides upright
 JPEG_SIGNATURE = b"\xff\xd8"
 JPEG_END = b"\xff\xd9"
 JPEG_SCAN = b"\xff\xda"
@@ -25,8 +27,11 @@ def read_header(path: Path) -> tuple[tuple[int, int], int, str]:
     """``(H, W)``, bits per channel and Pillow's mode of a PNG or JPEG; no pixel is decoded.
 
     Raises:
-        DataError: when the file is missing, empty, cut inside its header, or neither format.
+        DataError: when the file is missing, empty, cut inside its header, stored turned, or
+            neither format.
     """
+    header = None
+    turned = None
     try:
         with Image.open(path, formats=("PNG", "JPEG")) as image:
             # Pillow's raw mode names other depths than 8: RGB;16B, L;4.
@@ -36,16 +41,27 @@ def read_header(path: Path) -> tuple[tuple[int, int], int, str]:
                 depth = int(stored[1])
             elif image.mode == "1":
                 depth = 1
-            return (image.height, image.width), depth, image.mode
+            if image.format == "JPEG":
+                turned = image.getexif().get(ORIENTATION)
+            size = (image.height, image.width)
+            mode = image.mode
+            header = size, depth, mode
     except UnidentifiedImageError:
         pass
     except OSError as error:
         raise unreadable(path, error) from None
     except Exception:  # Pillow raises many kinds on damage
         pass
-    raise DataError(
-        f"{path} is not a valid PNG or JPEG file; copy or export it again"
-    )
+    if header is None:
+        raise DataError(
+            f"{path} is not a valid PNG or JPEG file; copy or export it again"
+        )
+    if turned in TURNED:
+        raise DataError(
+            f"{path} is stored turned or mirrored (EXIF orientation {turned}), which some programs "
+            "undo and others do not; save all images upright, and calibrate these"
+        )
+    return header
 
 
 def check_image(
@@ -73,10 +89,9 @@ def check_image(
             f"{path} is {found[1]}x{found[0]} pixels (width x height), but "
             f"{expected_by} has {size[1]}x{size[0]}; scale one of them so that they agree"
         )
-    if depth > 8 or (kind == "labels" and depth != 8):
-        raise DataError(
-            f"{path} has {depth} bits a channel; expected 8 (save it as 8-bit)"
-        )
+    _refuse_deep(path, depth)
+    if kind == "labels" and depth != 8:
+        raise DataError(f"{path} has {depth} bits a channel; expected 8")
     if mode == "CMYK":
         raise DataError(
             f"{path} is a CMYK JPEG; expected RGB or grey (convert it to RGB)"
@@ -87,12 +102,23 @@ def check_image(
         )
 
 
+def _refuse_deep(path: Path, depth: int) -> None:
+    if depth > 8:
+        raise DataError(
+            f"{path} has {depth} bits a channel; expected 8 (save it as 8-bit)"
+        )
+
+
 def read_colour(path: Path) -> NDArray[np.uint8]:
-    """``[H, W, 3]`` uint8 RGB, as stored: EXIF rotations, unknown to calibrations, are not applied.
+    """``[H, W, 3]`` uint8 RGB.
 
     Raises:
-        DataError: when the file is missing, damaged or cut off.
+        DataError: when the file is missing, damaged, cut off or stored turned, or has more than 8
+            bits.
     """
+    # OpenCV would divide 16 bits by 256, which makes 12 bits black.
+    _refuse_deep(path, read_header(path)[1])
+
     # OpenCV decodes to BGR.
     image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)

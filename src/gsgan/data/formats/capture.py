@@ -57,6 +57,7 @@ from gsgan.utils.frame_files import FrameFiles, frame_files
 from gsgan.utils.pickles import read_arrays
 
 Content = TypeVar("Content")
+SPLIT_KEYS = ("train_cameras", "test_cameras", "train_frames", "test_frames")
 LANDMARKS_FILE = "landmarks3d.npz"
 HANDS_FILE = "hands3d.npz"
 FACE_FILE = "face3d.npz"
@@ -263,6 +264,12 @@ def _read_meta(
     if not isinstance(splits, dict):
         raise DataError(
             f"{path}: 'splits' must be an object with train_cameras, test_frames, ..."
+        )
+    unknown = sorted(set(splits) - set(SPLIT_KEYS))
+    if unknown:
+        raise DataError(
+            f"{path}: 'splits' has the unknown key {unknown[0]!r}; expected some of "
+            f"{', '.join(SPLIT_KEYS)}"
         )
 
     # Only SMPL and SMPL-X need the user's model file.
