@@ -34,6 +34,7 @@ from gsgan.data.formats.thuman4 import Thuman4Reader
 from gsgan.data.formats.zju import ZjuReader
 from gsgan.data.layout import Layout
 from gsgan.data.validation import Thresholds
+from gsgan.skeleton import MEDIAPIPE33
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.frame_files import last_number
 
@@ -204,6 +205,10 @@ CAPTURE: list[Case] = [
     (r"hands3d\.npz.*frame_id 0 ", hands(frame_id=np.zeros(4))),
     (r"face3d\.npz.*'p'.*\(any, 30, 3\)", face(p=np.zeros((4, 468, 3)))),
     ("'names'.*mouth_outer_0", face(names=np.array(["lip"] * 30))),
+    (
+        "'names' has the landmarks in another order",
+        landmarks(names=np.array(MEDIAPIPE33.names[::-1])),
+    ),
     (r"'theta'.*\(4, any, 3\)", poses(theta=np.zeros((4, 168)))),
     (r"masks/cam00/000000\.png", image("masks/*/*.png", GREY)),
     (

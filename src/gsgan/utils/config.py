@@ -208,19 +208,29 @@ def entry(
             )
             print(f"{error}{more}", file=sys.stderr)
             sys.exit(FAILED)
-        except BrokenPipeError:
-            # The reader of the output, such as head, has closed it.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            sys.exit(FAILED)
         except OSError as error:
-            # The run folder that Hydra makes may be a file, or not writable.
-            message = one_sentence(error)
-            if message is None and error.filename is None:
-                raise
-            _print_error(message or f"{error.filename}: {error.strerror}")
+            _end(error)
             sys.exit(FAILED)
 
     return main
+
+
+def _end(error: OSError) -> None:
+    """Prints the sentence of a system's error outside a command's task.
+
+    Raises:
+        OSError: the error, when it is a bug's.
+    """
+    # The reader of the output, such as head, has closed it.
+    if isinstance(error, BrokenPipeError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return
+
+    # The run folder that Hydra makes may be a file, or not writable.
+    message = one_sentence(error)
+    if message is None and error.filename is None:
+        raise error
+    _print_error(message or f"{error.filename}: {error.strerror}")
 
 
 def quoted(argument: str) -> str:

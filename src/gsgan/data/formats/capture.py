@@ -45,6 +45,7 @@ from gsgan.data.skeletons import (
     whole_frame_ids,
 )
 from gsgan.data.validation import Thresholds
+from gsgan.skeleton import MEDIAPIPE33
 from gsgan.skeleton.face import FACE, FACE_NAMES
 from gsgan.skeleton.hands import HAND
 from gsgan.skeleton.joints import zeros_as_missing
@@ -342,7 +343,8 @@ def _read_landmarks(
     notes: list[str],
 ) -> Landmarks:
     """Skeletons, hands or faces of every frame."""
-    arrays = read_arrays(path, ("p", "conf", "frame_id"))
+    arrays = read_arrays(path, ("p", "conf", "frame_id", "names"))
+    _refuse_another_order(path, arrays.get("names"))
 
     # Positions in metres; exact zeros are missing joints.
     p = expect_array(arrays, "p", (None, joints, 3), path).astype(np.float64)
@@ -358,6 +360,17 @@ def _read_landmarks(
             np.float64
         )
     return make_landmarks(ids, p, conf, limits.max_reach, notes, path.name)
+
+
+def _refuse_another_order(path: Path, names: Any) -> None:
+    """Refuses the names of the 33 landmarks in another order; other names are nobody's order."""
+    given = () if names is None else tuple(map(str, names.tolist()))
+    own = MEDIAPIPE33.names
+    if given != own and sorted(given) == sorted(own):
+        raise DataError(
+            f"{path}: 'names' has the landmarks in another order than MediaPipe's, from {own[0]} "
+            f"to {own[-1]}; write the columns of p and conf in that order"
+        )
 
 
 def _refuse_other_names(path: Path) -> None:
