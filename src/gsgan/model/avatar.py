@@ -93,7 +93,7 @@ class Prepared(NamedTuple):
         )
 
 
-class Posed(NamedTuple):
+class PosedPerson(NamedTuple):
     """Poses and what is computed once of them for all parts of an avatar.
 
     Args:
@@ -463,7 +463,9 @@ class Avatar(nn.Module):
             )
         return rendering, painted
 
-    def _posed(self, p: Tensor, valid: Tensor, body: BodyPose | None) -> Posed:
+    def _posed(
+        self, p: Tensor, valid: Tensor, body: BodyPose | None
+    ) -> PosedPerson:
         """Poses with the frames and bones that the avatar's parts read."""
         # Densify, the face code and Ω read the frames of the skeleton's bones.
         frames = None
@@ -480,10 +482,10 @@ class Avatar(nn.Module):
         if body is not None and follows is not None:
             with self.stage("bones"):
                 body = follows.points.with_bones(body)
-        return Posed(p, valid, frames, body)
+        return PosedPerson(p, valid, frames, body)
 
     def _generator_inputs(
-        self, posed: Posed, camera: Camera
+        self, posed: PosedPerson, camera: Camera
     ) -> GeneratorInputs:
         """The inputs of the generator besides F."""
         S = None
@@ -549,7 +551,7 @@ class Avatar(nn.Module):
 
     def splat(
         self,
-        posed: Posed,
+        posed: PosedPerson,
         camera: Camera,
         pose_noise: Tensor | None = None,
         reach: float | None = None,
@@ -588,13 +590,13 @@ class Avatar(nn.Module):
             gaussians, features=bounded(gaussians.features, -bound, bound)
         )
 
-    def _face_code(self, posed: Posed) -> Tensor | None:
+    def _face_code(self, posed: PosedPerson) -> Tensor | None:
         """`face_code`; None for a skeleton without a face."""
         if posed.frames is None:
             return None
         return face_code(posed.p, posed.frames.head, self.template)
 
-    def points(self, posed: Posed) -> Points:
+    def points(self, posed: PosedPerson) -> Points:
         """G: Alg. 1's points, or points on the body's surface where that effect is on."""
         with self.stage("densify"):
             if self.body_points is not None:
@@ -605,14 +607,14 @@ class Avatar(nn.Module):
     def residuals(
         self, p: Tensor, valid: Tensor, body: BodyPose | None
     ) -> tuple[Points, Residuals]:
-        """G in pose and Ψ's ΔG without noise; arguments as for `Posed`."""
+        """G in pose and Ψ's ΔG without noise; arguments as for `PosedPerson`."""
         assert self.deformation is not None
         posed = self._posed(p, valid, body)
         points = self.points(posed)
         code = self._code(posed)
         return points, self.deformation.residuals(points, code, root_of(p))
 
-    def _code(self, posed: Posed) -> Tensor:
+    def _code(self, posed: PosedPerson) -> Tensor:
         """``[B, 3 J]`` Ψ's code of poses, without noise."""
         assert self.deformation is not None
         face = self._face_code(posed)
@@ -622,7 +624,7 @@ class Avatar(nn.Module):
     def store_poses(
         self, p: Tensor, valid: Tensor, body: BodyPose | None
     ) -> None:
-        """Stores the spread of training poses in Ψ; arguments as for `Posed`."""
+        """Stores the spread of training poses in Ψ; arguments as for `PosedPerson`."""
         if isinstance(self.deformation, Deformation):
             # The means give the places of the anchors in the training poses.
             posed = self._posed(p, valid, body)
