@@ -96,9 +96,14 @@ def test_a_damaged_file_is_written_again(copied, compose, capsys):
 
 
 def test_a_part_of_the_images_is_scored_and_marked(copied, compose):
-    table = evaluated(compose, copied, "score_images=1")
+    """Beside the scores of all images, which stay."""
+    whole = evaluated(compose, copied)
+    left = evaluated(compose, copied, "score_images=1")
+    pd.testing.assert_frame_equal(left, whole)
+    part = copied / "of_1_images"
+    table = pd.read_csv(part / "scores.csv")
     assert table.groupby(["split", "variant"]).size().max() == 1
-    marks = json.loads((copied / "metrics.json").read_text())["novel_view"][
+    marks = json.loads((part / "metrics.json").read_text())["novel_view"][
         "full"
     ]
     assert any("at most 1" in mark for mark in marks["marks"])

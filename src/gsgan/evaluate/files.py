@@ -63,6 +63,17 @@ class Scored:
     origin: dict[str, Any]
 
 
+def images_scored(folder: Path) -> int:
+    """The number of images that a folder's scores are of, in the split with most; 0 without
+    scores."""
+    path = folder / SCORES_FILE
+    if not path.is_file():
+        return 0
+    rows = pd.read_csv(path)
+    counts = rows.loc[rows["variant"] == FULL, "split"].value_counts()
+    return int(counts.max()) if len(counts) else 0
+
+
 def write_scored(scored: Scored, folder: Path) -> None:
     """Writes the four files atomically; metrics.json is last, so if it is new, all of them are."""
     # Everything is formatted before the first file is written.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -27,6 +28,7 @@ from gsgan.evaluate.files import (
     HEADER,
     Results,
     Scored,
+    images_scored,
     print_table,
     write_scored,
 )
@@ -315,6 +317,8 @@ def evaluate_folder(
         marks = [*marks, BY_SKELETON]
     if len(set(config.splits)) < len(HELD_OUT_SPLITS):
         out = out / config.splits[0]
+    if images_scored(out) > (options.score_images or math.inf):
+        out = out / f"of_{options.score_images}_images"
 
     # What facts.json states about the run.
     method = trained(
