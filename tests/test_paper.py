@@ -5,9 +5,8 @@ import re
 import pytest
 from omegaconf import OmegaConf
 
-from gsgan.report.runs import flat
 from gsgan.run.stored import record
-from gsgan.utils.config import config_folder
+from gsgan.utils.config import config_folder, flat
 
 DATA = sorted(
     path.stem for path in (config_folder() / "data").glob("[!_]*.yaml")

@@ -493,14 +493,19 @@ class Avatar(nn.Module):
             # trained on its own, then frozen
             with self.stage("S"), torch.no_grad():
                 S = self.segmentation(posed.body, camera)  # Sec. 3.4
-        skeletons = (posed.p, posed.valid)
         with self.stage("p₂D"):
-            width = line_width(camera)
-            drawn = draw_skeleton(*skeletons, camera, self.template, width)
+            drawn = draw_skeleton(
+                posed.p,
+                posed.valid,
+                camera,
+                self.template,
+                line_width(camera),
+            )
         with self.stage("Ω"):
             assert posed.frames is not None
             pose = pose_inputs(
-                *skeletons,
+                posed.p,
+                posed.valid,
                 posed.frames,
                 camera,
                 self.template,

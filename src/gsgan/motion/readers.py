@@ -65,10 +65,8 @@ SHAPE_KEYS = ("betas", "shapes")
 # Numbers of poses of SMPL-X's body, SMPL, SMPL-H, SMPL-X.
 WITHOUT_ROOT = (63, 69, 153, 162)
 # Numbers of poses that are quaternions, six numbers or matrices for each joint.
-OTHER_ROTATIONS = {
-    k * n for k in (4, 6, 9) for n in (21, 22, 23, 24, 52, 55)
-} - {n * 3 for n in (22, 24, 52, 55)}
-MAX_TURN = 30.0  # radians: a larger one is in degrees
+OTHER_ROTATIONS = {k * n for k in (4, 6, 9) for n in (21, 22, 23, 24, 52, 55)}
+MAX_ANGLE = 30.0  # radians: a larger one is in degrees
 RATE_KEYS = ("fps", "mocap_framerate", "mocap_frame_rate")
 SCALE_KEY = "smpl_scaling"  # in AIST++: units of its translations in a metre
 # All arrays that are read, if a file has them.
@@ -450,7 +448,7 @@ def _rotation_vectors(path: Path, values: Any) -> Float:
         )
 
     # A rotation vector is at most a turn or two long.
-    if given.size and np.nanmax(np.abs(given)) > MAX_TURN:
+    if given.size and np.nanmax(np.abs(given)) > MAX_ANGLE:
         raise DataError(
             f"{path}: poses have angles up to {np.nanmax(np.abs(given)):.0f}; expected rotation "
             "vectors in radians"

@@ -25,7 +25,7 @@ from gsgan.skeleton.proportions import UP_AXES
 from gsgan.utils.checks import above, between, one_of, whole
 from gsgan.utils.errors import ConfigError, DataError
 
-HEIGHTS = (0.4, 2.8)  # metres, of people
+PERSON_HEIGHTS = (0.4, 2.8)  # metres, of people
 MEDIAPIPE = "mediapipe"
 # The calibration that is found from the landmarks of the person, where there is no file.
 PERSON = "person"
@@ -101,7 +101,7 @@ class Options:
             if getattr(self, name) is not None:
                 above(name, getattr(self, name))
         if self.height is not None:
-            between("height", self.height, *HEIGHTS)
+            between("height", self.height, *PERSON_HEIGHTS)
         above("landmark_noise", self.landmark_noise)
         whole("workers", self.workers, 1)
         above("scale", between("scale", self.scale, 0, 1))

@@ -16,6 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gsgan.evaluate.files import FACTS_FILE, METRICS_FILE
 from gsgan.run.stored import CONFIG, hydra_record, read_yaml, record
+from gsgan.utils.config import flat
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.sweeps import unfinished
 
@@ -270,16 +271,6 @@ def _read_settings(folder: Path) -> dict[str, Any] | None:
     config = read_yaml(folder / CONFIG)
     config.seed = 0  # data and training interpolate it
     return dict(flat(record(config)))
-
-
-def flat(value: Any, at: str = "") -> Iterator[tuple[str, Any]]:
-    """A nested config by dotted key."""
-    # An empty mapping is a value.
-    if isinstance(value, Mapping) and value:
-        for key, held in value.items():
-            yield from flat(held, f"{at}.{key}" if at else str(key))
-    else:
-        yield at, value
 
 
 def _departures(

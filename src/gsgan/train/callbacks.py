@@ -228,7 +228,7 @@ class ProgressLines(Callback):
 class WholeSchedule(Callback):
     """Sets the number of epochs to those that the rest of the schedule takes.
 
-    An epoch's length depends on the number of processes, which may change when a run is resumed.
+    How long an epoch is depends on the number of processes, which is not known before.
     """
 
     def on_train_start(self, trainer: Trainer, module: LightningModule) -> None:

@@ -89,13 +89,14 @@ def refuse_words_for_truth(config: DictConfig, defaults: DictConfig) -> None:
             raise ConfigError(f"{key} must be true or false, got {value!r}")
 
 
-def flat(options: Any, parent: str = "") -> Iterator[tuple[str, Any]]:
+def flat(value: Any, at: str = "") -> Iterator[tuple[str, Any]]:
     """The values of nested mappings, by their dotted keys."""
-    for name, value in options.items():
-        if isinstance(value, dict):
-            yield from flat(value, f"{parent}{name}.")
-        else:
-            yield f"{parent}{name}", value
+    # An empty mapping is a value.
+    if isinstance(value, Mapping) and value:
+        for key, held in value.items():
+            yield from flat(held, f"{at}.{key}" if at else str(key))
+    else:
+        yield at, value
 
 
 def folder_name(overrides: str) -> str:

@@ -43,9 +43,7 @@ def read_header(path: Path) -> tuple[tuple[int, int], int, str]:
                 depth = 1
             if image.format == "JPEG":
                 turned = image.getexif().get(ORIENTATION)
-            size = (image.height, image.width)
-            mode = image.mode
-            header = size, depth, mode
+            header = ((image.height, image.width), depth, image.mode)
     except UnidentifiedImageError:
         pass
     except OSError as error:
