@@ -37,6 +37,13 @@ def test_a_mask_in_the_alpha_channel_is_read(tmp_path, colour):
     np.testing.assert_array_equal(mask_of(tmp_path / "m.png"), SOFT)
 
 
+def test_the_alpha_of_a_cut_out_person_is_the_mask(tmp_path):
+    colours = np.random.default_rng(0).integers(0, 256, (*SOFT.shape, 3))
+    image = np.dstack([colours.astype(np.uint8), SOFT])
+    cv2.imwrite(str(tmp_path / "m.png"), image)
+    np.testing.assert_array_equal(mask_of(tmp_path / "m.png"), SOFT)
+
+
 def test_a_mask_in_the_colours_is_read_whatever_its_alpha(tmp_path):
     image = np.dstack([SOFT, SOFT, SOFT, np.full_like(SOFT, 255)])
     cv2.imwrite(str(tmp_path / "m.png"), image)

@@ -172,6 +172,7 @@ def test_smpl_and_amass(tmp_path, shared, proportions, kind, numbers):
 
 @pytest.mark.parametrize("style", ["python", "tasks", "bare", "lists", "npz"])
 def test_mediapipe(tmp_path, landmarks, proportions, style):
+    landmarks = landmarks - landmarks[:, 23:25].mean(1, keepdims=True)
     q = landmarks @ Y_DOWN.T
     frames = [
         [{"x": x, "y": y, "z": z, "visibility": 0.9} for x, y, z in p]
@@ -230,6 +231,38 @@ def test_bad_json(tmp_path, proportions, content, message):
     path.write_text(json.dumps(content))
     with pytest.raises(DataError, match=message):
         standard(path, proportions)
+
+
+def test_image_landmarks_without_a_name_are_refused(
+    tmp_path, landmarks, proportions
+):
+    """Their numbers are shares of the image, with which a person would be flat and drift."""
+    image = landmarks @ Y_DOWN.T * 0.3 + (0.5, 0.8, 0)
+    path = tmp_path / "a.json"
+    path.write_text(json.dumps(image.tolist()))
+    with pytest.raises(DataError, match="not its image landmarks"):
+        standard(path, proportions)
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("trans", np.zeros((4, 3))),
+        ("trans", np.array("none")),
+        ("betas", np.zeros(0)),
+        ("poses", np.array(3.0)),
+        ("poses", np.zeros((0, 72))),
+    ],
+)
+def test_parameters_of_any_other_shape_are_named(
+    tmp_path, shared, proportions, name, values
+):
+    model = shared("smpl.pkl", lambda path: write_smpl(path, kind="smpl"))
+    arrays = {"poses": np.zeros((5, 72)), "trans": np.zeros((5, 3))}
+    path = tmp_path / "a.npz"
+    np.savez(path, **arrays | {name: values})
+    with pytest.raises(DataError, match=r"a\.npz"):
+        standard(path, proportions, smpl=model)
 
 
 def test_pose_files_with_axes_of_unknown_scale(

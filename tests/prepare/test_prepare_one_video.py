@@ -87,7 +87,11 @@ def test_focal_length_and_landmarks_are_found(guess):
     assert np.median(error) < 0.025
 
 
-def test_a_video_becomes_a_capture_that_training_reads(filmed, tmp_path):
+def test_a_video_becomes_a_capture_that_training_reads(
+    filmed, tmp_path, monkeypatch
+):
+    # Given landmarks are of the video's own pixels, however large it is.
+    monkeypatch.setattr("gsgan.prepare.one_camera.MAX_SIDE", 400)
     out = prepare(
         options(filmed, out=str(tmp_path / "capture")), Console(quiet=True)
     )

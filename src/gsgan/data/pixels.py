@@ -91,18 +91,15 @@ def read_mask(files: Sequence[tuple[str, Path]], rules: PixelRules) -> Bytes:
 
 
 def read_mask_values(path: Path) -> Bytes:
-    """``[H, W]`` 0..255: a file's grey values, or its alpha if the colours are the same everywhere.
+    """``[H, W]`` 0..255: a file's alpha if it varies, else its grey values.
 
     Raises:
         DataError: if the file is missing, damaged or cut off.
     """
-    # Some tools write masks as alpha over a single colour.
+    # Some tools write masks as alpha over one colour, others cut the person out of the image.
     alpha = read_alpha(path)
-    if alpha is not None:
-        # Colours that vary are an image, whose alpha is not the mask.
-        colours, mask = alpha
-        if (colours == colours[0, 0]).all() and mask.min() < mask.max():
-            return mask
+    if alpha is not None and alpha.min() < alpha.max():
+        return alpha
     return read_grey(path)
 
 

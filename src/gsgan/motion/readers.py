@@ -67,6 +67,7 @@ WITHOUT_ROOT = (63, 69, 153, 162)
 # Numbers of poses that are quaternions, six numbers or matrices for each joint.
 OTHER_ROTATIONS = {k * n for k in (4, 6, 9) for n in (21, 22, 23, 24, 52, 55)}
 MAX_ANGLE = 30.0  # radians: a larger one is in degrees
+MAX_FROM_HIPS = 0.2  # metres: MediaPipe's world landmarks start at the middle of the hips
 RATE_KEYS = ("fps", "mocap_framerate", "mocap_frame_rate")
 SCALE_KEY = "smpl_scaling"  # in AIST++: units of its translations in a metre
 # All arrays that are read, if a file has them.
@@ -130,7 +131,14 @@ def read_motion(path: Path, source: Source) -> Clip:
         raise DataError(
             f"{path} has an unknown format; expected one of {', '.join(READERS)}"
         )
-    return _with_missing(reader(path, source))
+    try:
+        return _with_missing(reader(path, source))
+    # Arrays may have any type and shape: whatever is wrong with them is one error.
+    except (ArithmeticError, LookupError, TypeError, ValueError) as error:
+        reason = str(error).partition("\n")[0]
+        raise DataError(
+            f"{path} is damaged, or its values are not as expected ({reason}); export it again"
+        ) from error
 
 
 def _with_missing(clip: Clip) -> Clip:
@@ -482,11 +490,12 @@ def read_mediapipe_json(path: Path, source: Source) -> Clip:
     ``{x, y, z, visibility}`` or a list of these numbers.
     """
     # The list of frames is the whole file, or one entry of it.
-    frames = read_json_value(path)
+    content = read_json_value(path)
+    frames = content
     fps = None
-    if isinstance(frames, dict):
-        fps = frames.get("fps")
-        frames = _first(frames, ("frames", *WORLD_KEYS))
+    if isinstance(content, dict):
+        fps = content.get("fps")
+        frames = _first(content, ("frames", *WORLD_KEYS))
     if not isinstance(frames, list) or not frames:
         raise DataError(
             f"{path} holds no frames; expected a list, or an object with 'frames', of MediaPipe's "
@@ -498,6 +507,16 @@ def read_mediapipe_json(path: Path, source: Source) -> Clip:
     for i, frame in enumerate(frames):
         rows.append(_landmark_row(f"{path}, frame {i}", frame))
     p = np.stack(rows)
+
+    # Lists without a name may be image landmarks; world landmarks start between the hips.
+    named = isinstance(content, dict) and content.keys() & set(WORLD_KEYS)
+    if not named and all(isinstance(frame, list) for frame in frames):
+        middle = np.nanmedian(p[:, HIPS, :3].mean(1), axis=0)
+        if np.linalg.norm(middle) > MAX_FROM_HIPS:
+            raise DataError(
+                f"{path}: the middle of the hips is at {middle.round(2).tolist()}; expected "
+                "MediaPipe's world landmarks, in metres from there, not its image landmarks"
+            )
     return Clip(
         path=path,
         p=p[..., :3],

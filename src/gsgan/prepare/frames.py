@@ -22,8 +22,8 @@ FEW_IMAGES = 60
 MAX_IMAGES = 400
 MIN_IMAGES = 12  # minimum number of usable images for a solution
 MAX_SIDE = 1920  # maximum pixels of the longer side: larger images are reduced
-# The sampled images depend on these and the video.
-SAMPLING = [IMAGE_RATE, FEW_IMAGES, MAX_IMAGES, MAX_SIDE]
+# The sampled images depend on these, their maximum side and the video.
+SAMPLING = [IMAGE_RATE, FEW_IMAGES, MAX_IMAGES]
 TIMES = "times.npz"  # written last
 MIN_JOINTS = 16  # of 33: fewer are not a whole person
 CONFIDENT = 0.5
@@ -38,11 +38,18 @@ LeftOut = dict[str, Bool]
 """Masks ``[F]`` of the frames that are left out, by reason."""
 
 
-def sample(video: Path, folder: Path) -> tuple[Recording, Float]:
+def sample(
+    video: Path, folder: Path, max_side: float = MAX_SIDE
+) -> tuple[Recording, Float]:
     """Evenly spaced images of a video as a folder, and their times ``[F]`` in seconds.
 
     Images are upright, as the metadata say, and numbered as in the video. Times are those of the
     file, so the frame rate may vary. A folder that is complete is left alone.
+
+    Args:
+        video: the file.
+        folder: for the images.
+        max_side: pixels of the longer side, to which larger images are reduced.
 
     Raises:
         DataError: when the video cannot be decoded, or the folder not be written.
@@ -52,7 +59,7 @@ def sample(video: Path, folder: Path) -> tuple[Recording, Float]:
     if not (folder / TIMES).is_file():
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
-        _extract(source, folder)
+        _extract(source, folder, max_side)
 
     # The images as a recording.
     arrays = read_arrays(folder / TIMES, ("number", "time"))
@@ -71,13 +78,13 @@ def sample(video: Path, folder: Path) -> tuple[Recording, Float]:
     return recording, np.asarray(arrays["time"], np.float64)
 
 
-def _extract(source: Recording, folder: Path) -> None:
+def _extract(source: Recording, folder: Path, max_side: float) -> None:
     """Writes evenly spaced images, then their numbers and times."""
     # Seconds between two images, and their scale.
     rate = source.fps or 30.0
     seconds = source.count / rate
     every = max(min(1 / IMAGE_RATE, seconds / FEW_IMAGES), seconds / MAX_IMAGES)
-    shrink = min(1.0, MAX_SIDE / max(source.size))
+    shrink = min(1.0, max_side / max(source.size))
 
     # The header's length may be wrong, so the number of images is bounded.
     video = opened(source.path, True)

@@ -19,6 +19,7 @@ from gsgan.prepare import landmarks
 from gsgan.prepare.camera_array import FILM, USUAL_FOCAL, CameraArray
 from gsgan.prepare.cleanse import cleanse, smooth
 from gsgan.prepare.frames import (
+    MAX_SIDE,
     SAMPLING,
     LeftOut,
     check_enough,
@@ -35,7 +36,7 @@ from gsgan.prepare.one_view import (
     View,
     solve_view,
 )
-from gsgan.prepare.options import Inputs, Options
+from gsgan.prepare.options import MEDIAPIPE, Inputs, Options
 from gsgan.prepare.solve import Solution
 from gsgan.prepare.sources import Recording, stamp
 from gsgan.prepare.stages import StageFolder
@@ -114,11 +115,15 @@ def solve_video(
     Raises:
         DataError: when too few frames show one whole person.
     """
-    # Images of the video, and the detections in them.
+    # Images of the video. Given landmarks and masks are of its own pixels, so it is not reduced.
     video = options.folder("source")
+    given = {options.landmarks, options.masks} != {MEDIAPIPE}
+    max_side = np.inf if given else MAX_SIDE
     with console.status("taking images from the video"):
-        folder = stages.path("frames", [*stamp(video), SAMPLING])
-        source, time = sample(video, folder)
+        folder = stages.path("frames", [*stamp(video), SAMPLING, max_side])
+        source, time = sample(video, folder, max_side)
+
+    # The detections in them.
     numbers = np.array(list(source.files))
     found, masks = find_people(
         options, {source.name: source}, stages, console.print

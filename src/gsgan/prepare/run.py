@@ -187,7 +187,7 @@ def _number(value: float, form: str) -> str:
 
 
 # incremented when the same settings begin to give another result
-STAGE_VERSION = 5
+STAGE_VERSION = 6
 
 
 def prepare(options: Options, console: Console) -> Path:

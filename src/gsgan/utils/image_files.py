@@ -154,10 +154,8 @@ def read_with_alpha(
     return rgb, alpha
 
 
-def read_alpha(
-    path: Path,
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8]] | None:
-    """``[H, W, 3]`` colours as stored and ``[H, W]`` alpha of an 8-bit file; None without alpha.
+def read_alpha(path: Path) -> NDArray[np.uint8] | None:
+    """``[H, W]`` alpha of an 8-bit file; None without alpha.
 
     Raises:
         DataError: when the file is missing, damaged or cut off.
@@ -165,8 +163,7 @@ def read_alpha(
     # The header tells, so that other images are not decoded twice.
     if read_header(path)[2] not in ("LA", "RGBA"):
         return None
-    image = _decode_8_bit(path)
-    return image[..., :3], np.ascontiguousarray(image[..., 3])
+    return np.ascontiguousarray(_decode_8_bit(path)[..., 3])
 
 
 def _decode_8_bit(path: Path) -> NDArray[np.uint8]:
