@@ -257,6 +257,8 @@ def test_image_landmarks_without_a_name_are_refused(
 def test_parameters_of_any_other_shape_are_named(
     tmp_path, shared, proportions, name, values
 ):
+    from writers.smpl import write_smpl
+
     model = shared("smpl.pkl", lambda path: write_smpl(path, kind="smpl"))
     arrays = {"poses": np.zeros((5, 72)), "trans": np.zeros((5, 3))}
     path = tmp_path / "a.npz"

@@ -67,7 +67,9 @@ WITHOUT_ROOT = (63, 69, 153, 162)
 # Numbers of poses that are quaternions, six numbers or matrices for each joint.
 OTHER_ROTATIONS = {k * n for k in (4, 6, 9) for n in (21, 22, 23, 24, 52, 55)}
 MAX_ANGLE = 30.0  # radians: a larger one is in degrees
-MAX_FROM_HIPS = 0.2  # metres: MediaPipe's world landmarks start at the middle of the hips
+MAX_FROM_HIPS = (
+    0.2  # metres: MediaPipe's world landmarks start at the middle of the hips
+)
 RATE_KEYS = ("fps", "mocap_framerate", "mocap_frame_rate")
 SCALE_KEY = "smpl_scaling"  # in AIST++: units of its translations in a metre
 # All arrays that are read, if a file has them.
