@@ -784,6 +784,20 @@ def test_rows_of_landmarks_may_be_in_another_order_than_frames(
     np.testing.assert_allclose(p, landmarks, atol=1e-6)
 
 
+def test_frames_that_a_file_lacks_keep_their_time(
+    tmp_path, landmarks, proportions
+):
+    """Every fifth frame was kept, and nobody was seen in two of these: a motion goes on there."""
+    path = tmp_path / "a.npz"
+    kept = [0, 1, 2, 3, 6, 7, 8, 9, 10, 11]
+    np.savez(path, p=landmarks[kept], frame_id=100 + 5 * np.array(kept), fps=25)
+    p, motion = standard(path, proportions)
+    assert motion.filled == 2
+    np.testing.assert_allclose(p[kept], landmarks[kept], atol=1e-6)
+    between = landmarks[3] + (landmarks[6] - landmarks[3]) / 3
+    np.testing.assert_allclose(p[4], between, atol=0.02)
+
+
 def test_rotations_of_smpl_in_other_forms(tmp_path, shared, proportions):
     """Matrices, as 4D-Humans writes them, are converted; the others are refused."""
     from writers.smpl import write_smpl

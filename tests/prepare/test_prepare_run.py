@@ -20,6 +20,7 @@ from gsgan.prepare.options import MediaPipe, Options
 from gsgan.prepare.run import prepare
 from gsgan.prepare.solve import SolveSettings
 from gsgan.utils.errors import ConfigError, DataError, GsganError
+from gsgan.utils.files import read_json
 
 CAMERAS, FRAMES, SIZE = 3, 6, (96, 80)
 
@@ -124,6 +125,14 @@ def test_a_camera_with_missing_masks_keeps_the_rest(project):
     layout = read_capture(out)
     assert sorted(layout.images["cam01"]) == [1, 2, 4, 5]
     assert sorted(layout.images["cam00"]) == [1, 2, 3, 4, 5]
+
+
+def test_the_rate_of_every_other_frame_is_half_the_videos(project):
+    out = prepare(options(project, frames="1-5:2"), quiet())
+    whole = read_json(out / "prepare.json")["fps"] * 2
+    assert read_json(out / "meta.json")["fps"] == whole / 2
+    again = prepare(options(project, overwrite=True), quiet())
+    assert read_json(again / "meta.json")["fps"] == whole
 
 
 def test_offsets_move_a_cameras_numbers(project):

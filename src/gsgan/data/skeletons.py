@@ -165,6 +165,11 @@ def make_landmarks(
     )
 
 
+def usual_step(frames: NDArray[np.int64]) -> float:
+    """The usual difference between frame numbers ``[F]`` that rise: 2 if every other was kept."""
+    return float(np.median(np.diff(frames))) if len(frames) > 1 else 1.0
+
+
 def whole_frame_ids(raw: NDArray[Any], where: str) -> NDArray[np.int64]:
     """Frame numbers, checked to be whole and unique.
 

@@ -15,7 +15,7 @@ from gsgan.body.smpl import SkinnedModel, from_zju, read_smpl
 from gsgan.data.calibration import METRES
 from gsgan.data.formats import smpl_motion
 from gsgan.data.formats.capture import SHAPE, read_shape
-from gsgan.data.skeletons import hips_below
+from gsgan.data.skeletons import hips_below, usual_step, whole_frame_ids
 from gsgan.motion.asf import asf_of, read_amc
 from gsgan.motion.bvh import read_bvh
 from gsgan.motion.clip import Clip, rate_of, usual_rate
@@ -32,6 +32,7 @@ from gsgan.utils.files import read_json, read_json_value
 from gsgan.utils.pickles import read_arrays, read_npy, read_pickle
 
 Float = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 # Keys of MediaPipe's world landmarks in its several APIs.
 WORLD_KEYS = (
@@ -272,12 +273,11 @@ def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Clip:
         )
     conf = np.where(np.isfinite(p).all(-1), np.nan_to_num(conf), 0.0)
 
-    # Rows may be in another order than frames.
+    # Rows may be in another order than frames, of which some may be missing.
     if "frame_id" in arrays:
-        ids = expect_array(arrays, "frame_id", (len(p),), path)
-        order = np.argsort(ids, kind="stable")
-        p = p[order]
-        conf = conf[order]
+        rows, at = _in_time(path, arrays, len(p))
+        p = _at_times(p[rows], at, np.nan)
+        conf = _at_times(conf[rows], at, 0.0)
 
     # People filmed from the waist up get hips below their shoulders.
     seen = conf[:, :BODY] > 0
@@ -306,6 +306,27 @@ def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Clip:
     )
 
 
+def _in_time(path: Path, arrays: dict[str, Any], F: int) -> tuple[Ints, Ints]:
+    """The rows ``[F]`` of a file by their frame numbers, and the time ``[F]`` of each, in frames.
+
+    Of a motion of which every other frame was kept, this is one frame.
+    """
+    ids = whole_frame_ids(
+        expect_array(arrays, "frame_id", (F,), path), str(path)
+    )
+    rows = np.argsort(ids)
+    ids = ids[rows]
+    steps = np.rint(np.diff(ids) / usual_step(ids)).astype(np.int64)
+    return rows, np.cumsum(np.append(0, steps.clip(min=1)))
+
+
+def _at_times(values: Float, at: Ints, missing: float) -> Float:
+    """Rows of frames ``[F, …]`` at their times ``at [F]``; others are ``missing``."""
+    placed = np.full((at[-1] + 1, *values.shape[1:]), missing)
+    placed[at] = values
+    return placed
+
+
 def _body_pose(
     path: Path, arrays: dict[str, Any], fps: float | None, source: Source
 ) -> Clip:
@@ -315,11 +336,17 @@ def _body_pose(
     F, bones, _ = theta.shape
     if "trans" in arrays:
         arrays = {**arrays, "transl": arrays["trans"]}
+    transl = expect_array(arrays, "transl", (F, 3), path)
+    if "frame_id" in arrays:
+        rows, at = _in_time(path, arrays, F)
+        theta = _at_times(theta[rows], at, np.nan)
+        transl = _at_times(transl[rows], at, np.nan)
+        F = len(theta)
 
     # Lengths have the unit of the capture.
     meta = _meta(path)
     scale = METRES.get(meta.get("unit", "m"), 1.0)
-    transl = scale * expect_array(arrays, "transl", (F, 3), path)
+    transl = scale * transl
     fps = fps or meta.get("fps")
 
     # Another number of bones: SMPL.

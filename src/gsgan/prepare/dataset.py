@@ -14,6 +14,7 @@ import numpy as np
 import gsgan
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.formats.capture import read_capture
+from gsgan.data.skeletons import usual_step
 from gsgan.prepare.images import scaled
 from gsgan.prepare.options import Inputs, Options
 from gsgan.prepare.solve import Solution
@@ -41,6 +42,11 @@ class Outcome:
         """The cameras of the written images."""
         refined = self.solution.cameras.entries(self.inputs.cameras)
         return [scaled(camera, self.options.scale) for camera in refined]
+
+    @property
+    def fps(self) -> float:
+        """Written frames per second: of a video's, each or every n-th was chosen."""
+        return round(self.inputs.fps / usual_step(self.frames), 3)
 
 
 def write_files(root: Path, outcome: Outcome, key: str) -> None:
@@ -88,7 +94,7 @@ def write_files(root: Path, outcome: Outcome, key: str) -> None:
 
     # The facts that a reader needs, and the key of the settings.
     meta = {
-        "fps": outcome.inputs.fps,
+        "fps": outcome.fps,
         "unit": "m",
         "up_axis": options.up_axis or standing_axis(p),
         "skeleton": "mediapipe33",

@@ -184,7 +184,7 @@ def solve_video(
     measured["focal_stated"] = metadata.focal
     measured["hdr"] = metadata.hdr
     notes = _notes(measured, options, natural_height(view.shape))
-    fps = 1 / float(np.median(np.diff(time)))
+    fps = float(np.median(np.diff(numbers) / np.diff(time)))
     inputs = Inputs(
         sources={source.name: source},
         calibration=Calibration(

@@ -104,7 +104,7 @@ def summarise(outcome: Outcome) -> dict[str, Any]:
         "joints_removed": solution.removed,
         "frames": len(frames),
         "frames_dropped": dropped,
-        "fps": inputs.fps,
+        "fps": outcome.fps,
         "calibration": {
             "file": inputs.calibration.path.name,
             "format": inputs.calibration.format,
