@@ -69,6 +69,23 @@ def test_dense_gaussians_on_a_body_need_no_generator(build):
     assert calls(dense, frame) == calls(same, frame)
 
 
+@pytest.mark.parametrize(
+    ("body_points", "limit", "refines"),
+    [("off", 0, True), ("on", 1e6, True), ("on", 0, False)],
+)
+def test_dense_gaussians_on_a_body_need_no_last_level(
+    build, body_points, limit, refines
+):
+    _, avatar, _ = build(
+        f"effects.body_points={body_points}",
+        f"effects.gaussians_per_pixel={limit}",
+        "effects.generator=on",
+        "size.generator_patch=2",
+        "size.generator_refine=auto",
+    )
+    assert (avatar.generator.refinement is not None) == refines
+
+
 def test_the_mean_of_all_maps_is_the_identity_and_unseen_cameras_keep_theirs():
     colour = ColourCorrection(["b", "a", "d"], ["a", "b", "c", "d"])
     torch.nn.init.normal_(colour.offsets, std=0.3)

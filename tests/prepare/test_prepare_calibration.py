@@ -1,5 +1,7 @@
 """Calibration files of other tools are read as the cameras that they describe."""
 
+import json
+
 import numpy as np
 import pytest
 from capture_scenes import LENS, ring, write_own, write_qualisys, write_toml
@@ -155,6 +157,16 @@ def test_fisheye_is_refused(tmp_path):
         path.read_text().replace("fisheye = false", "fisheye = true", 1)
     )
     with pytest.raises(DataError, match=r"cam_00.*fisheye"):
+        read_calibration(path)
+
+
+def test_rotation_vectors_in_degrees_are_refused(tmp_path):
+    path = write_toml(tmp_path / "Calib.toml", ring())
+    text = path.read_text()
+    given = text.partition("rotation = ")[2].partition("\n")[0]
+    degrees = np.degrees(json.loads(given)).tolist()
+    path.write_text(text.replace(given, str(degrees), 1))
+    with pytest.raises(DataError, match=r"cam_00.*in radians"):
         read_calibration(path)
 
 

@@ -40,6 +40,14 @@ def test_openpose_body_25_keeps_the_persons_sides(tmp_path):
     assert np.isnan(found.px[0, 1]).all()
 
 
+def test_shares_of_the_image_are_not_taken_for_pixels(tmp_path):
+    """OpenPose writes them with keypoint_scale=3 and 4."""
+    shares = np.array(triples(25)) / 500
+    write_people(tmp_path / "a_json", 7, {"pose_keypoints_2d": shares.tolist()})
+    with pytest.raises(DataError, match=r"a_json.*not shares of its size"):
+        read_detections(tmp_path / "a_json")
+
+
 @pytest.mark.parametrize("count", SETS)
 def test_every_set_maps_left_to_left(count):
     mapping = SETS[count][1]
@@ -126,7 +134,7 @@ def test_damaged_json_names_the_file(tmp_path, content, what):
 
 def test_cameras_meet_by_number_and_offset(tmp_path):
     for name, ids in (("a", [0, 1, 2]), ("b", [3, 4])):
-        px = np.zeros((len(ids), BODY, 2)) + np.array(ids)[:, None, None]
+        px = np.zeros((len(ids), BODY, 2)) + 10 * np.array(ids)[:, None, None]
         np.savez(
             tmp_path / f"{name}.npz",
             px=px,
@@ -137,6 +145,6 @@ def test_cameras_meet_by_number_and_offset(tmp_path):
     frames, px, conf = gather(cameras, {"b": -2})
     assert frames.tolist() == [0, 1, 2]
     assert conf[1, :, 0].tolist() == [0, 1, 1]
-    assert px[1, 1, 0].tolist() == [3, 3]
+    assert px[1, 1, 0].tolist() == [30, 30]
     # nothing before frame 0
     assert gather(cameras, {"a": -1})[0].tolist() == [0, 1, 3, 4]

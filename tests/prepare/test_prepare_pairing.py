@@ -1,5 +1,6 @@
 """Videos find their calibrated cameras by name."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -45,6 +46,14 @@ def test_a_few_missing_pixels_keep_k_and_are_noted():
     assert (fitted.name, fitted.size) == ("left", (1920, 1080))
     assert fitted.K is camera.K
     assert "1088x1920" in note
+
+
+def test_a_calibration_without_a_size_tells_another_resolution_by_its_centre():
+    camera = ring(size=(540, 960))[0]
+    unsized = replace(camera, size=(0, 0))
+    assert fit_size(unsized, "left", (540, 960), 16, Path("rig"))[1] is None
+    with pytest.raises(DataError, match="left have 480x270 pixels"):
+        fit_size(unsized, "left", (270, 480), 16, Path("rig"))
 
 
 def test_another_resolution_is_refused():

@@ -58,6 +58,9 @@ WITHOUT_SCALE = ("COLMAP", "nerfstudio")
 # Qualisys counts in parts of a pixel, of a sensor with this many rows that are stored.
 SUBPIXELS = 64
 QUALISYS_ROWS = 1080
+MAX_TURN = (
+    12.0  # radians, about two turns: a longer rotation vector is in degrees
+)
 # names of the lens in other programs' files
 LENS_NAMES = (
     "distortion",
@@ -380,7 +383,7 @@ def _toml_camera(
     # A rotation that is no matrix is a Rodrigues vector.
     R = entry["rotation"]
     if as_floats(R).shape != (3, 3):
-        R = cv2.Rodrigues(numbers(where, R, "rotation", (3,)))[0]
+        R = _turned_by(where, R, "rotation")
     return make_camera(
         where,
         name,
@@ -528,9 +531,19 @@ def _opencv_rotation(where: str, name: str, extri: Mapping[str, Any]) -> Any:
     # Files have the matrix, the vector, or both.
     R = extri.get(f"Rot_{name}")
     if R is None and f"R_{name}" in extri:
-        vector = numbers(where, extri[f"R_{name}"], f"R_{name}", (3,))
-        R = cv2.Rodrigues(vector)[0]
+        R = _turned_by(where, extri[f"R_{name}"], f"R_{name}")
     return R
+
+
+def _turned_by(where: str, value: Any, what: str) -> Any:
+    """The matrix ``[3, 3]`` of a Rodrigues vector, whose length is an angle in radians."""
+    vector = numbers(where, value, what, (3,))
+    angle = float(np.linalg.norm(vector))
+    if angle > MAX_TURN:
+        raise DataError(
+            f"{where}: {what} turns by {angle:.0f}; expected a rotation vector in radians"
+        )
+    return cv2.Rodrigues(vector)[0]
 
 
 # -- Qualisys

@@ -33,6 +33,9 @@ UNTOLD = (
     "its 25 joints were read as BODY_25, which cannot be told from BODY_25B: no frame shows neck "
     "and hips"
 )
+MAX_SHARE = (
+    2.0  # of the image's size: a cut-off body may reach beyond the image
+)
 MESH_LANDMARKS = 468  # landmarks of MediaPipe's face mesh
 # added to detectors that count from the centre of the first pixel
 PIXEL_CENTRE = 0.5
@@ -91,6 +94,14 @@ def read_detections(path: Path) -> Detections:
     conf = np.where(known(found.px), np.nan_to_num(found.conf), 0.0)
     conf = np.clip(conf, 0.0, 1.0)[order]
     px = np.where(conf[..., None] > 0, found.px[order], np.nan)
+
+    # Some detectors write shares of the image's size.
+    seen = px[conf > 0]
+    if len(seen) and np.abs(seen).max() <= MAX_SHARE:
+        raise DataError(
+            f"{path}: all landmarks are between {seen.min():.2f} and {seen.max():.2f}; expected "
+            "pixels of the image, not shares of its size"
+        )
     return Detections(found.frame_id[order], px, conf, found.notes)
 
 

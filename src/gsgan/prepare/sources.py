@@ -28,6 +28,8 @@ VIDEO_SUFFIXES = (
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 INSIDE = ("videos", "images")  # where EasyMocap and Pose2Sim projects keep them
 
+# shares of the image between which a principal point lies
+CENTRAL = (0.1, 0.9)
 # share by which frame rates or lengths must differ to be noted
 DIFFERENT = 0.01
 
@@ -254,9 +256,19 @@ def fit_size(
         DataError: when the sizes differ by more: the calibration ``where`` is of another size.
     """
     fitted = replace(camera, name=name, size=size)
+    h, w = size
+    if camera.size == (0, 0):
+        # Without a size, the principal point tells whether the images were larger.
+        centre = camera.K[:2, 2]
+        share = centre / (w, h)
+        if share.min() < CENTRAL[0] or share.max() > CENTRAL[1]:
+            raise DataError(
+                f"{where}: the camera {camera.name} has its principal point at "
+                f"{centre.round().tolist()}, but the images of {name} have {w}x{h} pixels; was it "
+                "calibrated at another size?"
+            )
     if camera.size in (size, (0, 0)):
         return fitted, None
-    h, w = size
     H, W = camera.size
     if max(abs(H - h), abs(W - w)) > crop_px:
         raise DataError(

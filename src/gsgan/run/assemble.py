@@ -109,14 +109,22 @@ def build_avatar(
     torch.manual_seed(config.seed)
     with naming_group("model"):
         parts: AvatarParts = instantiate(config.model)()
-        effects = effects or decide(
-            scene, _effect_settings(config), parts.in_effects(scene)
-        )
+        settings = _effect_settings(config)
+        effects = effects or decide(scene, settings, parts.in_effects(scene))
 
         # Pose code and S are inputs of the generator.
         if not effects.generator.on:
             parts = replace(
                 parts, generator=None, pose_encoder=None, segmentation=None
+            )
+        elif getattr(parts.generator, "keywords", {}).get("refine") == AUTO:
+            # Where Gaussians are as dense as pixels, a last level has nothing to add.
+            gaussians = parts.in_effects(scene).gaussians or 0.0
+            dense = gaussians >= settings.gaussians_per_pixel
+            refine = not (effects.body_points.on and dense)
+            assert parts.generator is not None
+            parts = replace(
+                parts, generator=partial(parts.generator, refine=refine)
             )
 
         # S needs the body with a label per vertex.

@@ -88,9 +88,13 @@ def _parts(module: AvatarTraining) -> list[Row]:
     }
     rows = []
     for name, part in parts.items():
-        if part is not None:
-            size = sum(p.numel() for p in part.parameters())
-            rows.append((name, f"{size:,} parameters"))
+        if part is None:
+            continue
+        size = sum(p.numel() for p in part.parameters())
+        rows.append((name, f"{size:,} parameters"))
+        # A generator of one's own has no patch.
+        if getattr(part, "patch", 1) > 1 and part.refinement is None:
+            rows.append(("", "without a last level at the image's resolution"))
     return rows
 
 
