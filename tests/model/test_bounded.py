@@ -4,7 +4,8 @@ import torch
 from test_harmonic import points_of
 
 from gsgan.model.colour import ColourCorrection
-from gsgan.model.deformation import Deformation, bounded
+from gsgan.model.deformation import Deformation
+from gsgan.model.residual_gaussians import bounded
 
 X = torch.tensor([-3.0, -1.0, 0.0, 1.0, 3.0])
 

@@ -8,7 +8,8 @@ from gsgan.body import open_body
 from gsgan.losses import photometric
 from gsgan.model import compiled
 from gsgan.model.body_points import BodyPoints
-from gsgan.model.deformation import Deformation, Residuals
+from gsgan.model.deformation import Deformation
+from gsgan.model.residual_gaussians import Residuals
 from gsgan.scene import BodyPose
 from gsgan.skeleton.densify import Points
 from gsgan.splat import native

@@ -14,16 +14,12 @@ from gsgan.body.solve import Solver
 from gsgan.effects import Effects
 from gsgan.model.body_points import BodyPoints
 from gsgan.model.colour import ColourCorrection
-from gsgan.model.deformation import (
-    Deformation,
-    ResidualGaussians,
-    Residuals,
-    bounded,
-)
+from gsgan.model.deformation import Deformation
 from gsgan.model.generator import Generator
 from gsgan.model.painted import painted_window
 from gsgan.model.pose_graph import pose_inputs
 from gsgan.model.rendering import Rendering
+from gsgan.model.residual_gaussians import ResidualGaussians, Residuals, bounded
 from gsgan.model.segmentation import Segmentation
 from gsgan.model.surface import SurfaceGaussians
 from gsgan.scene import (

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from gsgan.model.avatar import Avatar
 from gsgan.model.body_points import BodyPoints
-from gsgan.model.deformation import ResidualGaussians, Residuals
+from gsgan.model.residual_gaussians import ResidualGaussians, Residuals
 from gsgan.scene import BodyPose
 from gsgan.skeleton import Points
 from gsgan.splat.sh import sh_basis

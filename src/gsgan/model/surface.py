@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from gsgan.body import SkinnedBody, skin
 from gsgan.model.body_points import SkinnedGaussians
-from gsgan.model.deformation import bounded, colour_from
+from gsgan.model.residual_gaussians import bounded, colour_from
 from gsgan.scene import BodyPose, Gaussians
 from gsgan.utils.checks import one_of
 

@@ -28,8 +28,9 @@ from gsgan.model.body_points import (
     points_per_pixel,
 )
 from gsgan.model.colour import ColourCorrection
-from gsgan.model.deformation import Deformation, ResidualGaussians
+from gsgan.model.deformation import Deformation
 from gsgan.model.generator import Generator
+from gsgan.model.residual_gaussians import ResidualGaussians
 from gsgan.model.segmentation import Segmentation
 from gsgan.model.surface import SurfaceGaussians
 from gsgan.run.class_vote import labelled_body

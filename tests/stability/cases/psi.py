@@ -9,7 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsgan.model.deformation import Deformation, Residuals
+from gsgan.model.deformation import Deformation
+from gsgan.model.residual_gaussians import Residuals
 from gsgan.scene import Camera
 from gsgan.skeleton import MEDIAPIPE33, Densify
 from gsgan.splat import Accuracy

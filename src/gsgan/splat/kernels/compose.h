@@ -1,5 +1,5 @@
 // Raw residuals to the geometry of Gaussians, one point at a time, in double: forward and backward.
-// Definitions: model/deformation.py, whose tensor operations are the reference.
+// Definitions: model/residual_gaussians.py, whose tensor operations are the reference.
 #pragma once
 
 #include <algorithm>
