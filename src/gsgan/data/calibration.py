@@ -58,9 +58,8 @@ WITHOUT_SCALE = ("COLMAP", "nerfstudio")
 # Qualisys counts in parts of a pixel, of a sensor with this many rows that are stored.
 SUBPIXELS = 64
 QUALISYS_ROWS = 1080
-MAX_TURN = (
-    12.0  # radians, about two turns: a longer rotation vector is in degrees
-)
+# radians, about two turns: a longer rotation vector is in degrees
+MAX_TURN = 12.0
 # names of the lens in other programs' files
 LENS_NAMES = (
     "distortion",
