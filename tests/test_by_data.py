@@ -17,7 +17,7 @@ def test_large_captures_train_at_full_size_by_themselves(compose, data):
     assert config.size.image == (512 if large or data == "synthetic" else 128)
     default = data == "synthetic"
     assert config.training.schedule.step_two == (
-        250_000 if large else 4250 if default else 3200
+        250_000 if large else 3800 if default else 3200
     )
     small = compose("train", f"data={data}", "size=small", "training=demo")
     assert (small.size.image, small.training.schedule.step_two) == (128, 3200)
