@@ -111,6 +111,15 @@ def test_a_video_becomes_a_capture_that_training_reads(
     assert "focal" in notes
 
 
+def test_a_video_that_ends_early_is_in_doubt(filmed, tmp_path):
+    folder = shutil.copytree(filmed.parent, tmp_path / "film")
+    content = filmed.read_bytes()
+    (folder / "me.avi").write_bytes(content[: len(content) * 8 // 10])
+    out = prepare(options(folder / "me.avi"), Console(quiet=True))
+    notes = " ".join(json.loads((out / "prepare.json").read_text())["notes"])
+    assert "of the frames that the video should have can be decoded" in notes
+
+
 def spoiled(filmed, tmp_path, change):
     """The film with changed landmarks."""
     folder = shutil.copytree(filmed.parent, tmp_path / "film")

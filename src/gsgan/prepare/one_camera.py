@@ -15,6 +15,7 @@ from rich.console import Console
 from gsgan.body.shape import BodyShape, shaped_body
 from gsgan.data.calibration import Calibration
 from gsgan.data.cameras import CameraEntry
+from gsgan.data.skeletons import usual_step
 from gsgan.prepare import landmarks
 from gsgan.prepare.camera_array import FILM, USUAL_FOCAL, CameraArray
 from gsgan.prepare.cleanse import cleanse, smooth
@@ -38,7 +39,7 @@ from gsgan.prepare.one_view import (
 )
 from gsgan.prepare.options import MEDIAPIPE, Inputs, Options
 from gsgan.prepare.solve import Solution
-from gsgan.prepare.sources import Recording, stamp
+from gsgan.prepare.sources import Recording, stamp, video_recording
 from gsgan.prepare.stages import StageFolder
 from gsgan.prepare.triangulate import exchanged
 from gsgan.skeleton import MEDIAPIPE33
@@ -65,8 +66,9 @@ HDR_TRANSFERS = {16: "PQ", 18: "HLG"}
 # Errors of focal lengths over the solution's own estimate, on synthetic scenes.
 OVERCONFIDENT = 3.0
 DOUBTFUL = 3.0  # a frame with this many times the usual error is left out
-# The result is in doubt with a shorter video, a smaller turn, a background that moves more, more
+# The result is in doubt with a video that ends early, a shorter video, a smaller turn, a background that moves more, more
 # images of several people, or fewer images of the feet.
+MIN_DECODED = 0.9  # share of the frames that the video's header states
 MIN_SECONDS = 8.0  # seconds
 MIN_CAMERA_TURN = 300  # degrees
 MAX_BACKGROUND_MOVE = 0.03  # share of the image
@@ -183,6 +185,8 @@ def solve_video(
     measured["background_moved"] = moved
     measured["focal_stated"] = metadata.focal
     measured["hdr"] = metadata.hdr
+    stated = video_recording(video, rotate=True).count
+    measured["decoded"] = (numbers[-1] + usual_step(numbers)) / stated
     notes = _notes(measured, options, natural_height(view.shape))
     fps = float(np.median(np.diff(numbers) / np.diff(time)))
     inputs = Inputs(
@@ -490,6 +494,12 @@ def _doubts(found: Mapping[str, Any]) -> list[str]:
         notes.append(
             f"doubtful: the video's colours are HDR ({found['hdr']}) and are not converted, so the "
             "avatar's will be wrong; film without HDR, or convert the video"
+        )
+
+    if found["decoded"] < MIN_DECODED:
+        notes.append(
+            f"doubtful: only {found['decoded']:.0%} of the frames that the video should have can "
+            "be decoded; copy it again"
         )
 
     # The film: how long, from how many sides, by a camera that stands still.
