@@ -66,8 +66,8 @@ HDR_TRANSFERS = {16: "PQ", 18: "HLG"}
 # Errors of focal lengths over the solution's own estimate, on synthetic scenes.
 OVERCONFIDENT = 3.0
 DOUBTFUL = 3.0  # a frame with this many times the usual error is left out
-# The result is in doubt with a video that ends early, a shorter video, a smaller turn, a background that moves more, more
-# images of several people, or fewer images of the feet.
+# The result is in doubt with a video that ends early, a shorter video, a smaller turn, a background
+# that moves more, more images of several people, or fewer images of the feet.
 MIN_DECODED = 0.9  # share of the frames that the video's header states
 MIN_SECONDS = 8.0  # seconds
 MIN_CAMERA_TURN = 300  # degrees
