@@ -38,7 +38,7 @@ def survives(chaos, stage: str, ways: tuple[str, ...] = WAYS) -> None:
 @pytest.mark.parametrize(
     ("stage", "ways"),
     [
-        ("data", ("operation", "SIGKILL")),
+        pytest.param("data", ("operation", "SIGKILL"), marks=pytest.mark.slow),
         ("prepare", ("operation", "no space", "SIGINT")),
     ],
 )

@@ -77,6 +77,7 @@ def test_your_own_cameras_then_live(script, tmp_path, capfd):
     assert (frames[0] != frames[3]).any()
 
 
+@pytest.mark.slow
 def test_a_loss_and_an_ablation_of_your_own(script, capture, tmp_path):
     own = script("own_loss")
     own.main(["data=capture", f"data.root={capture}", *EACH_STEP, *SHORT])

@@ -92,6 +92,7 @@ def test_surface_measures_each_part(script, tmp_path):
     assert training["all, less linear offsets"] < 0.8 * training["all"]
 
 
+@pytest.mark.slow
 def test_trade_off_compares_a_multirun(script, tmp_path, run, capture):
     for name in ("one", "two"):
         shutil.copytree(run, tmp_path / "sweep" / name)
@@ -139,6 +140,7 @@ def test_peak_memory_is_what_an_action_takes_on_top_of_what_is_held(script):
     assert held.sum() == 20_000_000
 
 
+@pytest.mark.slow
 def test_effects_decides_without_training(script, tmp_path):
     words = ["train=false", "only=[distortion]", f"base=[{','.join(SCENE)}]"]
     assert not script("effects", *words)

@@ -26,7 +26,7 @@ from gsgan.motion.standard import RigMotion, standard_motion
 from gsgan.scene import BodyPose
 from gsgan.skeleton.joints import BODY, FACE, zeros_as_missing
 from gsgan.skeleton.proportions import HIPS, SHOULDERS, Proportions
-from gsgan.utils.arrays import as_floats, expect_array
+from gsgan.utils.arrays import as_floats, expect_array, nanmedian
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import read_json, read_json_value
 from gsgan.utils.pickles import read_arrays, read_npy, read_pickle
@@ -68,9 +68,10 @@ WITHOUT_ROOT = (63, 69, 153, 162)
 # Numbers of poses that are quaternions, six numbers or matrices for each joint.
 OTHER_ROTATIONS = {k * n for k in (4, 6, 9) for n in (21, 22, 23, 24, 52, 55)}
 MAX_ANGLE = 30.0  # radians: a larger one is in degrees
-MAX_FROM_HIPS = (
-    0.2  # metres: MediaPipe's world landmarks start at the middle of the hips
-)
+# MediaPipe's world landmarks are metres from the middle of the hips, its image landmarks are not,
+# but for their depth.
+MAX_FROM_HIPS = 0.2
+HIPS_DEPTH = 0.05
 RATE_KEYS = ("fps", "mocap_framerate", "mocap_frame_rate")
 SCALE_KEY = "smpl_scaling"  # in AIST++: units of its translations in a metre
 # All arrays that are read, if a file has them.
@@ -537,11 +538,12 @@ def read_mediapipe_json(path: Path, source: Source) -> Clip:
         rows.append(_landmark_row(f"{path}, frame {i}", frame))
     p = np.stack(rows)
 
-    # Lists without a name may be image landmarks; world landmarks start between the hips.
+    # Lists without a name may be image landmarks, of which the depth alone is relative to the hips.
     named = isinstance(content, dict) and content.keys() & set(WORLD_KEYS)
     if not named and all(isinstance(frame, list) for frame in frames):
-        middle = np.nanmedian(p[:, HIPS, :3].mean(1), axis=0)
-        if np.linalg.norm(middle) > MAX_FROM_HIPS:
+        middle = np.nan_to_num(nanmedian(p[:, HIPS, :3].mean(1), axis=0))
+        aside = np.linalg.norm(middle[:2]) > MAX_FROM_HIPS
+        if aside and abs(middle[2]) < HIPS_DEPTH:
             raise DataError(
                 f"{path}: the middle of the hips is at {middle.round(2).tolist()}; expected "
                 "MediaPipe's world landmarks, in metres from there, not its image landmarks"
