@@ -539,7 +539,7 @@ def read_mediapipe_json(path: Path, source: Source) -> Clip:
     p = np.stack(rows)
 
     # Lists without a name may be image landmarks, of which the depth alone is relative to the hips.
-    named = isinstance(content, dict) and content.keys() & set(WORLD_KEYS)
+    named = isinstance(content, dict) and bool(content.keys() & set(WORLD_KEYS))
     if not named and all(isinstance(frame, list) for frame in frames):
         middle = np.nan_to_num(nanmedian(p[:, HIPS, :3].mean(1), axis=0))
         aside = np.linalg.norm(middle[:2]) > MAX_FROM_HIPS

@@ -265,9 +265,10 @@ def fit_size(
             raise DataError(
                 f"{where}: the camera {camera.name} has its principal point at "
                 f"{centre.round().tolist()}, but the images of {name} have {w}x{h} pixels; was it "
-                "calibrated at another size?"
+                "calibrated at another size? Scale its K, or the images"
             )
-    if camera.size in (size, (0, 0)):
+        return fitted, None
+    if camera.size == size:
         return fitted, None
     H, W = camera.size
     if max(abs(H - h), abs(W - w)) > crop_px:
