@@ -119,20 +119,30 @@ def build_avatar(
                 parts, generator=None, pose_encoder=None, segmentation=None
             )
         elif getattr(parts.generator, "keywords", {}).get("refine") == AUTO:
-            # Where Gaussians are as dense as pixels, a last level has nothing to add.
-            gaussians = parts.in_effects(scene).gaussians or 0.0
-            dense = gaussians >= settings.gaussians_per_pixel
-            refine = not (effects.body_points.on and dense)
-            assert parts.generator is not None
-            parts = replace(
-                parts, generator=partial(parts.generator, refine=refine)
-            )
+            gaussians = parts.in_effects(scene).gaussians
+            parts = _with_last_level(parts, gaussians, effects, settings)
 
         # S needs the body with a label per vertex.
         labelled: tuple[SkinnedBody | None, str] = (None, LEFT_OUT)
         if parts.segmentation is not None:
             labelled = labelled_body(scene, images, vertex_labels)
         return _assembled(parts, scene, effects, labelled, config.seed)
+
+
+def _with_last_level(
+    parts: AvatarParts,
+    gaussians: float | None,
+    effects: Effects,
+    settings: EffectSettings,
+) -> AvatarParts:
+    """The parts with a last level of the generator, or without it where G is as dense as pixels.
+
+    ``gaussians``: on the body, for each pixel of the person; None where that is not known.
+    """
+    assert parts.generator is not None
+    dense = gaussians is not None and gaussians >= settings.gaussians_per_pixel
+    refine = not (effects.body_points.on and dense)
+    return replace(parts, generator=partial(parts.generator, refine=refine))
 
 
 @dataclass(frozen=True)
