@@ -50,7 +50,7 @@ def seen_by(cameras, frames: int = 50, noise: float = 0.0, swaps: float = 0.0):
         for pairs in FLIP_GROUPS:
             for left, right in pairs:
                 uv[c, f, [left, right]] = uv[c, f, [right, left]]
-    return uv, np.ones(uv.shape[:3])
+    return uv, np.ones(uv.shape[:3]), np.arange(frames) / 12
 
 
 def differences(found, truth):
@@ -83,9 +83,9 @@ def test_exact_landmarks_give_the_exact_cameras():
 def test_noise_and_swapped_sides_leave_a_usable_calibration():
     """Half a percent of the person's size, a seventh of all views with left and right swapped."""
     truth = ring((0, 60, 120, 220))
-    uv, conf = seen_by(truth, noise=0.005, swaps=0.15)
+    uv, conf, time = seen_by(truth, noise=0.005, swaps=0.15)
     conf[:, :3] = 0  # nobody is there at first
-    found = calibrate_from_person(truth, uv, conf, FOCAL + 3)
+    found = calibrate_from_person(truth, uv, conf, time, FOCAL + 3)
     turned, off = differences(found.cameras, truth)
     assert turned < 1.0
     assert off < 0.04
@@ -93,23 +93,23 @@ def test_noise_and_swapped_sides_leave_a_usable_calibration():
 
 def test_two_cameras_need_their_focal_length():
     truth = ring((0, 50))
-    uv, conf = seen_by(truth)
+    uv, conf, time = seen_by(truth)
     with pytest.raises(DataError, match="focal="):
-        calibrate_from_person(truth, uv, conf, None)
-    found = calibrate_from_person(truth, uv, conf, FOCAL)
+        calibrate_from_person(truth, uv, conf, time, None)
+    found = calibrate_from_person(truth, uv, conf, time, FOCAL)
     turned, _ = differences(found.cameras, truth)
     assert turned < 2.0  # the second camera's is 2 mm longer
 
 
 def test_cameras_that_share_no_frame_are_refused():
     truth = ring((0, 60, 120))
-    uv, conf = seen_by(truth, frames=30)
+    uv, conf, time = seen_by(truth, frames=30)
     for camera, frame in enumerate((0, 10, 20)):
         alone = np.zeros(30)
         alone[frame : frame + 10] = 1
         conf[camera] *= alone[:, None]
     with pytest.raises(DataError, match="frame numbers"):
-        calibrate_from_person(truth, uv, conf, None)
+        calibrate_from_person(truth, uv, conf, time, None)
 
 
 def test_videos_without_a_calibration_become_a_capture(tmp_path):

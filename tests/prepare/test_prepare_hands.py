@@ -7,8 +7,8 @@ from make import skeletons
 
 from gsgan.prepare.camera_array import CameraArray
 from gsgan.prepare.cleanse import cleanse
+from gsgan.prepare.sides import apply_flips
 from gsgan.prepare.solve import Solution, SolveSettings, solve
-from gsgan.prepare.triangulate import apply_flips
 from gsgan.skeleton.hands import FINGERS, HAND
 from gsgan.skeleton.joints import BODY, FACE, HAND_PAIRS, HANDS, LEFT, RIGHT
 

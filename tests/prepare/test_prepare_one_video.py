@@ -375,7 +375,7 @@ def test_hands_follow_the_sides_of_the_body(with_body):
     if with_body:
         for values in (wrong.px[:, HANDS], wrong.conf[:, HANDS], wrong.hand_z):
             values[mixed] = np.roll(values[mixed], HAND, axis=1)
-    found = with_right_sides(wrong)
+    found = with_right_sides(wrong, np.arange(frames) / 12)
     for name in ("px", "conf", "world", "hand_z"):
         np.testing.assert_array_equal(
             getattr(found, name), getattr(right, name)

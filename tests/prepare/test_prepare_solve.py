@@ -13,8 +13,9 @@ from gsgan.prepare.camera_array import (
     undistort_points,
 )
 from gsgan.prepare.cleanse import cleanse, smooth
+from gsgan.prepare.sides import apply_flips, find_flips
 from gsgan.prepare.solve import SolveSettings, clock_errors, median, solve
-from gsgan.prepare.triangulate import apply_flips, find_flips, plain, robust
+from gsgan.prepare.triangulate import plain, robust
 from gsgan.skeleton.joints import FLIP_GROUPS as GROUPS
 from gsgan.utils.errors import ConfigError
 
@@ -83,7 +84,7 @@ def test_planted_flips_are_found_and_corrected():
     flips = planted((4, 12, 3))
     swapped = apply_flips(uv, flips, GROUPS)
     assert np.abs(swapped - uv).max() > 50
-    found = find_flips(rig, swapped, conf, GROUPS)
+    found = find_flips(rig, swapped, conf, np.arange(conf.shape[1]) / 30)
     # Small pairs (the eyes) seen edge-on cannot be determined, and need not.
     np.testing.assert_array_equal(found[..., 1:], flips[..., 1:])
     corrected = apply_flips(swapped, found, GROUPS)
@@ -96,7 +97,7 @@ def test_a_swap_in_all_cameras_is_found_from_the_motion():
     flips = np.zeros((4, 20, 3), bool)
     flips[:, 8:11] = True
     swapped = apply_flips(uv, flips, GROUPS)
-    found = find_flips(rig, swapped, conf, GROUPS)
+    found = find_flips(rig, swapped, conf, np.arange(conf.shape[1]) / 30)
     np.testing.assert_array_equal(found, flips)
 
 

@@ -20,7 +20,8 @@ from gsgan.prepare.camera_array import (
     film_camera,
     refine_cameras,
 )
-from gsgan.prepare.triangulate import apply_flips, find_flips, robust
+from gsgan.prepare.sides import apply_flips, find_flips
+from gsgan.prepare.triangulate import robust
 from gsgan.skeleton.joints import BODY, FLIP_GROUPS, known
 from gsgan.utils.arrays import Float, evenly_spaced
 from gsgan.utils.errors import DataError
@@ -55,6 +56,7 @@ def calibrate_from_person(
     cameras: Sequence[CameraEntry],
     uv: Float,
     conf: Float,
+    time: Float,
     focal: float | None,
 ) -> Calibrated:
     """The cameras' orientations, positions and focal lengths.
@@ -63,6 +65,7 @@ def calibrate_from_person(
         cameras: C cameras, of which names and sizes are used.
         uv: ``[C, F, J, 2]`` pixels of landmarks, the first 33 MediaPipe's.
         conf: ``[C, F, J]`` their confidence.
+        time: ``[F]`` seconds.
         focal: of all cameras, in millimetres on film of 36 x 24 mm; None: unknown.
 
     Raises:
@@ -84,6 +87,7 @@ def calibrate_from_person(
     frames = shared[evenly_spaced(len(shared), USED_FRAMES)]
     uv = uv[:, frames]
     weight = weight[:, frames]
+    time = time[frames]
 
     # The solution of each start; the one whose landmarks agree best is kept. From a wrong focal
     # length it may be impossible to place a camera, which another start can.
@@ -95,7 +99,7 @@ def calibrate_from_person(
         ]
         prior = FOCAL_PRIOR if focal is None else GIVEN_PRIOR
         try:
-            found = _solution(guess, uv, weight, prior)
+            found = _solution(guess, uv, weight, time, prior)
         except DataError as error:
             failure = error
             continue
@@ -108,7 +112,11 @@ def calibrate_from_person(
 
 
 def _solution(
-    guess: list[CameraEntry], uv: Float, weight: Float, focal_prior: float
+    guess: list[CameraEntry],
+    uv: Float,
+    weight: Float,
+    time: Float,
+    focal_prior: float,
 ) -> Calibrated:
     """The cameras near the focal lengths of ``guess``."""
     # In thousandths of the focal length, so that images of all sizes count alike.
@@ -136,7 +144,7 @@ def _solution(
             FREE_POSITION,
             focal_prior,
         )
-        flips = find_flips(rig, pixels, weight, FLIP_GROUPS)
+        flips = find_flips(rig, pixels, weight, time)
         sided = apply_flips(pixels, flips, FLIP_GROUPS)
         seen = apply_flips(weight, flips, FLIP_GROUPS)
 

@@ -38,20 +38,18 @@ from gsgan.prepare.one_view import (
     solve_view,
 )
 from gsgan.prepare.options import MEDIAPIPE, Inputs, Options
+from gsgan.prepare.sides import WHOLE_BODY, sides_of_sequence
 from gsgan.prepare.solve import Solution
 from gsgan.prepare.sources import Recording, stamp, video_recording
 from gsgan.prepare.stages import StageFolder
-from gsgan.prepare.triangulate import exchanged
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.skeleton.hands import HAND
 from gsgan.skeleton.joints import (
     ALL,
-    ARM_PAIRS,
     BODY,
     FLIP_GROUPS,
     HANDS,
     LEFT,
-    LEG_PAIRS,
     RIGHT,
     WRIST_JOINTS,
 )
@@ -75,7 +73,8 @@ MAX_BACKGROUND_MOVE = 0.03  # share of the image
 MAX_OTHER_FACES = 0.2  # share of the images
 MIN_FEET_SEEN = 0.5  # share of the images
 SHOULDER_JOINTS = [11, 12]
-SWAPPED = [j for pair in (*ARM_PAIRS[:3], *LEG_PAIRS[:3]) for j in pair]
+# What contradicting the detector's sides costs in a frame: little, as it confuses many in a row.
+ONE_LABEL_COST = 0.1
 
 
 @dataclass(frozen=True)
@@ -147,7 +146,7 @@ def solve_video(
         metadata = read_metadata(video)
         first = options.focal or metadata.focal or USUAL_FOCAL
         guess = float(np.hypot(*source.size) * first / FILM)
-        sided = with_right_sides(detected[used])
+        sided = with_right_sides(detected[used], time[used])
         view = _solve(options, sided, time[used], source.size, guess)
 
     # Frames that fit much worse than the others are left out, too.
@@ -254,10 +253,16 @@ def _read(
     return detected, there
 
 
-def with_right_sides(seen: Detected) -> Detected:
-    """The detections with left and right exchanged where the detector confused them."""
+def with_right_sides(seen: Detected, time: Float) -> Detected:
+    """The detections with left and right exchanged where the detector confused them.
+
+    Args:
+        seen: in F frames.
+        time: ``[F]`` seconds.
+    """
     # Sides of the body that change for a few frames are the detector's mistake.
-    swapped = exchanged(seen.world[:, SWAPPED])
+    labels = np.full((len(time), len(FLIP_GROUPS)), ONE_LABEL_COST)
+    swapped = sides_of_sequence(seen.world, labels, time, WHOLE_BODY)[:, 0]
     mirror = list(MEDIAPIPE33.mirror)
     px = seen.px.copy()
     conf = seen.conf.copy()

@@ -236,7 +236,7 @@ def prepare(options: Options, console: Console) -> Path:
         inputs, detections = with_detections(inputs, found)
         frames, uv, conf = _undistorted(options, inputs, detections)
         if options.calibration == PERSON:
-            inputs = _from_person(options, inputs, uv, conf, console)
+            inputs = _from_person(options, inputs, frames, uv, conf, console)
         if not inputs.calibration.metric:
             inputs = _in_metres(options, inputs, uv, conf)
         solution = _solved(options, inputs, frames, uv, conf, console)
@@ -364,13 +364,16 @@ def _undistorted(
 def _from_person(
     options: Options,
     inputs: Inputs,
+    frames: Ints,
     uv: Float,
     conf: Float,
     console: Console,
 ) -> Inputs:
     """The inputs with cameras that are found from the person, and notes on how well they agree."""
     with console.status("finding the cameras from the person"):
-        found = calibrate_from_person(inputs.cameras, uv, conf, options.focal)
+        found = calibrate_from_person(
+            inputs.cameras, uv, conf, frames / inputs.fps, options.focal
+        )
     films = np.array(
         [
             camera.K[0, 0] / np.hypot(*camera.size) * FILM

@@ -11,12 +11,14 @@ from gsgan.prepare.camera_array import (
     refine_cameras,
 )
 from gsgan.prepare.cleanse import cleanse, smooth
-from gsgan.prepare.triangulate import (
+from gsgan.prepare.sides import (
     FLIP_GAIN,
-    Triangulated,
     apply_flips,
     cheapest_flips,
     find_flips,
+)
+from gsgan.prepare.triangulate import (
+    Triangulated,
     plain,
     points_and_cost,
     robust,
@@ -189,9 +191,9 @@ def solve(
     }
 
     # Swapped sides first: they would bend the cameras.
-    found = correct(cameras, scaled, weight)
+    found = correct(cameras, scaled, weight, time)
     stages["flips"] = found.points.error
-    cameras, found = _refined(cameras, scaled, weight, found, settings)
+    cameras, found = _refined(cameras, scaled, weight, time, found, settings)
     stages["refined"] = found.points.error
 
     # Remove impossible joints and smooth the rest.
@@ -234,6 +236,7 @@ def _refined(
     start: CameraArray,
     uv: Float,
     weight: Float,
+    time: Float,
     found: Corrected,
     settings: SolveSettings,
 ) -> tuple[CameraArray, Corrected]:
@@ -256,20 +259,23 @@ def _refined(
             rotation_prior=settings.rotation_prior,
             position_prior=settings.position_prior,
         )
-        found = correct(cameras, uv, weight)
+        found = correct(cameras, uv, weight, time)
     return cameras, found
 
 
-def correct(cameras: CameraArray, uv: Float, conf: Float) -> Corrected:
+def correct(
+    cameras: CameraArray, uv: Float, conf: Float, time: Float
+) -> Corrected:
     """Corrects swapped sides of body and hands, leaves strange hands out, and triangulates.
 
     Args:
         cameras: ``C`` cameras.
         uv: ``[C, F, J, 2]`` thousandths of the focal length.
         conf: ``[C, F, J]`` 0 = not seen.
+        time: ``[F]`` seconds.
     """
     # Sides of the body.
-    flips = find_flips(cameras, uv, conf, FLIP_GROUPS)
+    flips = find_flips(cameras, uv, conf, time)
     sided = apply_flips(uv, flips, FLIP_GROUPS)
     weight = apply_flips(conf, flips, FLIP_GROUPS)
     left_out = np.zeros((*conf.shape[:2], 2), bool)

@@ -1,6 +1,5 @@
-"""Triangulation from several cameras, robust against wrong detections and swapped sides."""
+"""Triangulation from several cameras, robust against wrong detections."""
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -9,7 +8,7 @@ import numpy as np
 from gsgan.prepare.camera_array import MIN_VIEWS, CameraArray
 from gsgan.scene import NEAR
 from gsgan.skeleton.joints import known
-from gsgan.utils.arrays import Bool, Float, Ints, nanmedian
+from gsgan.utils.arrays import Float, nanmedian
 
 # Errors are in thousandths of the focal length: pixels, at a focal length of 1000 pixels.
 # error at which a detection counts half (Cauchy's weight)
@@ -18,8 +17,6 @@ HALF_WEIGHT_ERROR = 3.5
 MAX_MEDIAN_ERROR = 35.0
 # maximum ratio of a point's uncertainty along the rays to that across: above, they are too parallel
 MAX_ELONGATION = 20.0
-# mean loss per detection that a swap must save; an error of HALF_WEIGHT_ERROR costs 0.7
-FLIP_GAIN = 0.15
 FAR_ERROR = 1e6  # pixels: stands for an infinite error
 MIN_DETERMINANT = 1e-15  # determinant over trace³: below it the equations are singular in float64
 ITERATIONS = 10  # of reweighting
@@ -27,12 +24,8 @@ QUICK_ITERATIONS = 3  # of reweighting, in the search for swapped sides
 # points processed at once: bounds the memory, changes nothing else
 POINTS_AT_ONCE = 100_000
 MAX_PAIRS = 60  # pairs of cameras tried as a start; of more, a spread-out part
-# minimum number of a group: hips at the border of an image do not tell left from right
-MIN_GROUP = 3
 # a prime: spreads the chosen camera pairs when there are too many
 PROGRESSION = 7919
-
-Pairs = tuple[tuple[int, int], ...]
 
 
 @dataclass(frozen=True)
@@ -209,44 +202,6 @@ def _best_pair(
     return best
 
 
-def find_flips(
-    cameras: CameraArray,
-    uv: Float,
-    weight: Float,
-    groups: Sequence[Pairs],
-) -> Bool:
-    """The groups of joints ``[C, F, G]`` that each camera swapped in each frame.
-
-    Detectors confuse left and right, mostly when a person is seen from behind. Per frame, one
-    camera at a time is changed as long as the triangulated points fit better. That does not
-    determine whether all cameras swapped or none; the smaller motion from frame to frame and, over
-    the whole sequence, the majority of the detections do.
-
-    Args:
-        cameras: ``C`` cameras.
-        uv: ``[C, F, J, 2]`` undistorted pixels.
-        weight: ``[C, F, J]`` their confidence.
-        groups: ``G`` tuples of (left, right) joints that swap together.
-    """
-    # Groups are independent: a detector may confuse the legs only.
-    flips = [_group_flips(cameras, uv, weight, pairs) for pairs in groups]
-    return np.stack(flips, axis=-1)
-
-
-def apply_flips(values: Float, flips: Bool, groups: Sequence[Pairs]) -> Float:
-    """Values ``[C, F, J, ...]`` with left and right exchanged where ``flips [C, F, G]``."""
-    result = values.copy()
-    for g, pairs in enumerate(groups):
-        # The flips of this group, in the dimensions of the values.
-        flipped = np.expand_dims(flips[..., g], tuple(range(2, values.ndim)))
-        left, right = np.array(pairs).T
-        lefts = values[:, :, left]
-        rights = values[:, :, right]
-        result[:, :, left] = np.where(flipped, rights, lefts)
-        result[:, :, right] = np.where(flipped, lefts, rights)
-    return result
-
-
 def points_and_cost(
     cameras: CameraArray,
     uv: Float,
@@ -264,105 +219,3 @@ def points_and_cost(
     seen = np.where(np.isfinite(found.error), flat, 0.0)
     cost = robust_cost(found.error, seen)
     return found.p.reshape(F, J, 3), cost.reshape(F, J).sum(-1)
-
-
-def _group_flips(
-    cameras: CameraArray, uv: Float, weight: Float, pairs: Pairs
-) -> Bool:
-    """The swaps ``[C, F]`` of one group."""
-    # The joints of a pair become adjacent: j and j ^ 1.
-    joints = np.ravel(pairs)
-    adjacent = [tuple((j, j + 1) for j in range(0, len(joints), 2))]
-    uv = uv[:, :, joints]
-    weight = weight[:, :, joints]
-    C, F, _ = weight.shape
-
-    # Points and cost of any choice of flips; a few rounds of reweighting are
-    # enough.
-    def points(flips: Bool, frames: Ints) -> tuple[Float, Float]:
-        flips = flips[..., None]
-
-        # Weights belong to their detections.
-        sided = apply_flips(uv[:, frames], flips, adjacent)
-        seen = apply_flips(weight[:, frames], flips, adjacent)
-        return points_and_cost(cameras, sided, seen)
-
-    def cost_of(flips: Bool, frames: Ints) -> Float:
-        _, cost = points(flips, frames)
-        return cost
-
-    # The swaps that make the points fit better.
-    votes = weight.sum(-1)
-    few = (weight > 0).sum(-1) < MIN_GROUP
-    price = np.where(few, np.inf, FLIP_GAIN * votes)
-    flips = cheapest_flips(cost_of, np.zeros((C, F), bool), price)
-
-    # All cameras or none: by the motion from frame to frame, then by the majority.
-    p, _ = points(flips, np.arange(F))
-    flips = flips ^ exchanged(p)
-    if (votes * flips).sum() > votes.sum() / 2:
-        return ~flips
-    return flips
-
-
-def cheapest_flips(
-    cost_of: Callable[[Bool, Ints], Float],
-    flips: Bool,
-    price: Float,
-) -> Bool:
-    """Flips ``[C, F]``: one camera at a time is changed as long as that saves more than its price.
-
-    Args:
-        cost_of: cost ``[f]`` of flips ``[C, f]`` in these ``f`` frames.
-        flips: ``[C, F]`` initial values.
-        price: ``[C, F]`` that a change must save.
-    """
-    # Frames are active as long as the last change saved something.
-    C, F = flips.shape
-    flips = flips.copy()
-    active = np.arange(F)
-    toggles = np.eye(C, dtype=bool)[:, :, None]
-    cost = cost_of(flips, active)
-    for _ in range(C):
-        # The cost of changing each camera, in the active frames.
-        trials = np.stack(
-            [cost_of(flips[:, active] ^ one, active) for one in toggles]
-        )
-        saved = cost[active] - trials - price[:, active]
-
-        # The camera whose change saves most is changed.
-        best = saved.argmax(0)
-        better = saved.max(0) > 0
-
-        # Frames in which nothing is saved are done.
-        active = active[better]
-        best = best[better]
-        if not len(active):
-            break
-        flips[best, active] ^= True
-        cost[active] = trials[best, better.nonzero()[0]]
-    return flips
-
-
-def exchanged(p: Float) -> Bool:
-    """The frames ``[F]`` whose sides ``p [F, J, 3]`` are exchanged against the first frame's."""
-    # The last known place of each joint, and the index that exchanges the sides.
-    state = np.zeros(len(p), bool)
-    last = p[0]
-    before = known(p[0])
-    swap = np.arange(p.shape[1]) ^ 1
-    for f in range(1, len(p)):
-        # Both joints of a pair must be known, now and before.
-        now = known(p[f])
-        both = before & now & before[swap] & now[swap]
-
-        # The shorter way from the last places of the joints.
-        straight = np.linalg.norm(p[f] - last, axis=-1)[both].sum()
-        crossed = np.linalg.norm(p[f][swap] - last, axis=-1)[both].sum()
-        state[f] = crossed < straight if both.any() else state[f - 1]
-
-        # The last places are those of the first frame's sides.
-        order = swap if state[f] else slice(None)
-        last = np.where(now[order][:, None], p[f][order], last)
-        before = before | now[order]
-    return state
